@@ -1,0 +1,1 @@
+"""A star tracker: from a frame alone to an attitude, or an honest refusal."""

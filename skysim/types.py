@@ -1,0 +1,145 @@
+"""What flows from room to room: frozen arrays with their shapes, frames and units."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+Floats = NDArray[np.float64]
+
+
+class BadInput(ValueError):
+    """The user's input is wrong. The message is one line: what, where, what is allowed."""
+
+
+@dataclass(frozen=True, slots=True)
+class Mount:
+    """Where the camera sits on the vehicle.
+
+    camera_body_m : (3,) entrance pupil in the body frame, whose origin is the bearing centre
+    cam_from_body : rotation of the body frame into the camera frame (+x right, +y down, +z boresight)
+    """
+
+    camera_body_m: Floats
+    cam_from_body: Rotation
+
+
+@dataclass(frozen=True, slots=True)
+class Trajectory:
+    """The vehicle's attitude history, sampled finely enough to be interpolated.
+
+    t_s             : (N,) strictly increasing
+    lab_from_body   : N rotations
+    rate_body_rad_s : (N, 3) angular velocity of body in lab, in body axes
+    """
+
+    t_s: Floats
+    lab_from_body: Rotation
+    rate_body_rad_s: Floats
+
+    def at(self, t_s: float | Floats) -> Rotation:
+        """lab_from_body at any time inside the history.
+
+        Cubic Hermite in the rotation vector from the sample before, with both ends' rates: exact to fourth
+        order in the step. Raises ValueError outside the history.
+        """
+        t = np.atleast_1d(np.asarray(t_s, dtype=float))
+        if t.min() < self.t_s[0] - 1e-9 or t.max() > self.t_s[-1] + 1e-9:
+            raise ValueError(f"time {t.min():.6f}..{t.max():.6f} s is outside {self.t_s[0]}..{self.t_s[-1]} s")
+        k = np.clip(np.searchsorted(self.t_s, t, side="right") - 1, 0, len(self.t_s) - 2)
+        step = self.t_s[k + 1] - self.t_s[k]
+        s = ((t - self.t_s[k]) / step)[:, None]
+        turn = (self.lab_from_body[k].inv() * self.lab_from_body[k + 1]).as_rotvec()
+        begin = self.rate_body_rad_s[k] * step[:, None]
+        # d(rotvec)/dt = omega + rotvec x omega / 2 + ...: the body rate seen from the sample before.
+        end = self.rate_body_rad_s[k + 1] * step[:, None]
+        end = end + np.cross(turn, end) / 2
+        phi = turn * s**2 * (3 - 2 * s) + begin * s * (1 - s) ** 2 - end * s**2 * (1 - s)
+        here = self.lab_from_body[k] * Rotation.from_rotvec(phi)
+        return here if np.ndim(t_s) else here[0]
+
+
+@dataclass(frozen=True, slots=True)
+class Sources:
+    """Everything that shines, stars and LEDs alike, in lab axes.
+
+    id         : (N,) Hipparcos number or LED number
+    place      : (N, 4) homogeneous: (direction, 0) for a star at infinity, (x, y, z in m, 1) for an LED
+    normal     : (N, 3) unit normal of the emitting disc; zeros for a star
+    radius_m   : (N,) radius of the emitting disc; 0 for a star
+    strength   : (N,) star: photons s^-1 m^-2 at the aperture; LED: photons s^-1 sr^-1 along its normal
+    lobe       : (N,) exponent m of the emission lobe cos^m (1 is Lambert's law)
+    period_s, start_s, on_s : (N,) pulse train: lit from start_s for on_s in every period_s
+    magnitude  : (N,) V magnitude of a star; NaN for an LED
+    """
+
+    id: NDArray[np.int64]
+    place: Floats
+    normal: Floats
+    radius_m: Floats
+    strength: Floats
+    lobe: Floats
+    period_s: Floats
+    start_s: Floats
+    on_s: Floats
+    magnitude: Floats
+
+    def __len__(self) -> int:
+        return len(self.id)
+
+    def take(self, which: NDArray[Any]) -> Sources:
+        """The chosen sources, by mask or index."""
+        return Sources(*(getattr(self, name)[which] for name in self.__slots__))
+
+
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """The truth of every source that put light on the frame.
+
+    id           : (N,)
+    xy_px        : (N, 2) pixel at mid-exposure
+    flux_xy_px   : (N, 2) flux-weighted mean pixel over the exposure
+    electrons    : (N,) mean photo-electrons collected in the frame
+    peak_e       : (N,) mean electrons in the source's brightest pixel
+    streak_px    : (N,) path length over the exposure
+    """
+
+    id: NDArray[np.int64]
+    xy_px: Floats
+    flux_xy_px: Floats
+    electrons: Floats
+    peak_e: Floats
+    streak_px: Floats
+
+
+@dataclass(frozen=True, slots=True)
+class Truth:
+    """What the frame was made from.
+
+    t_s           : mid-exposure, seconds from the scene's start
+    lab_from_body : attitude at mid-exposure
+    cam_from_lab  : the camera's attitude at mid-exposure
+    rate_cam_rad_s: (3,) angular velocity in camera axes
+    seen          : the sources on the frame
+    """
+
+    t_s: float
+    lab_from_body: Rotation
+    cam_from_lab: Rotation
+    rate_cam_rad_s: Floats
+    seen: Seen
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """One camera frame: image_dn (H, W), uint16 from a detector or float64 when every noise is off."""
+
+    index: int
+    image_dn: NDArray[Any]
+    t_mid_s: float
+    exposure_s: float
+    saturation_dn: float
