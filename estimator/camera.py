@@ -1,0 +1,98 @@
+"""The believed calibration: pixel to unit vector and back. What the tracker thinks its camera is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from estimator.types import BadImage, Floats
+
+
+@dataclass(frozen=True, slots=True)
+class Camera:
+    """A pinhole with Brown-Conrady distortion, in camera axes +x right, +y down, +z boresight.
+
+    focal_px : focal length over pixel pitch
+    centre_px: principal point (x, y); the middle of pixel (0, 0) is (0, 0)
+    distortion: k1, k2, p1, p2, k3 in OpenCV's order
+    """
+
+    width_px: int
+    height_px: int
+    focal_px: float
+    centre_px: tuple[float, float]
+    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
+
+    @classmethod
+    def from_fov(cls, width_px: int, height_px: int, fov_rad: float) -> Camera:
+        """An undistorted camera from the angle between the middles of the left and right edge columns."""
+        focal_px = (width_px - 1) / 2 / np.tan(fov_rad / 2)
+        return cls(width_px, height_px, float(focal_px), ((width_px - 1) / 2, (height_px - 1) / 2))
+
+    @property
+    def fov_rad(self) -> float:
+        """Horizontal field between the middles of the edge columns of an undistorted image."""
+        return float(2 * np.arctan((self.width_px - 1) / 2 / self.focal_px))
+
+    @property
+    def diagonal_rad(self) -> float:
+        """The greatest angle between two directions on the sensor."""
+        half = np.hypot(self.width_px, self.height_px) / 2
+        return float(2 * np.arctan(half / self.focal_px))
+
+    def zoomed(self, factor: float) -> Camera:
+        """The same camera with its focal length times `factor`."""
+        return replace(self, focal_px=self.focal_px * factor)
+
+    def rays(self, xy_px: Floats) -> Floats:
+        """(N, 2) pixels to (N, 3) unit vectors in camera axes."""
+        distorted = (np.asarray(xy_px, dtype=float) - self.centre_px) / self.focal_px
+        tangent = self._undistort(distorted)
+        rays = np.column_stack([tangent, np.ones(len(tangent))])
+        return rays / np.linalg.norm(rays, axis=1, keepdims=True)
+
+    def pixels(self, vectors_cam: Floats) -> Floats:
+        """(N, 3) vectors in camera axes to (N, 2) pixels; NaN behind the camera."""
+        z = np.where(vectors_cam[:, 2] > 0, vectors_cam[:, 2], np.nan)
+        tangent = vectors_cam[:, :2] / z[:, None]
+        return self._distort(tangent) * self.focal_px + self.centre_px
+
+    def contains(self, xy_px: Floats, margin_px: float = 0.0) -> np.ndarray:
+        """(N,) whether a pixel lies on the sensor, shrunk by the margin."""
+        x, y = xy_px[:, 0], xy_px[:, 1]
+        low, right, bottom = margin_px - 0.5, self.width_px - 0.5 - margin_px, self.height_px - 0.5 - margin_px
+        return (x >= low) & (x <= right) & (y >= low) & (y <= bottom)
+
+    def _distort(self, tangent: Floats) -> Floats:
+        k1, k2, p1, p2, k3 = self.distortion
+        x, y = tangent[:, 0], tangent[:, 1]
+        r2 = x * x + y * y
+        radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        return np.column_stack(
+            [
+                x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+                y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
+            ]
+        )
+
+    def _undistort(self, distorted: Floats) -> Floats:
+        """Fixed-point inverse of the distortion; a lens of some per cent converges to 1e-15 in a few tens."""
+        if not any(self.distortion):
+            return distorted
+        tangent = distorted.copy()
+        for _ in range(50):
+            step = distorted - self._distort(tangent)
+            tangent = tangent + step
+            if np.abs(step).max(initial=0.0) < 1e-15:
+                break
+        return tangent
+
+
+def check_shape(image_shape: tuple[int, ...], camera: Camera) -> None:
+    """Raise BadImage unless the image is the camera's."""
+    if image_shape != (camera.height_px, camera.width_px):
+        height, width = image_shape[:2]
+        raise BadImage(
+            f"the image is {width}x{height} pixels; this camera's are {camera.width_px}x{camera.height_px}"
+        )

@@ -1,0 +1,100 @@
+"""The on-board catalogue's pairs: a k-vector over all angles, and every star's neighbours by angle."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from estimator.types import Floats
+
+
+class PairIndex(NamedTuple):
+    """Pairs of catalogue stars closer than max_angle_rad. A plain tuple, so that compiled code can take it.
+
+    vectors   : (N, 3) unit vectors, brightest star first
+    pair      : (P, 2) star rows, by growing angle;  angle_rad : (P,)
+    kvector   : (P + 2,) kvector[k] = number of pairs with angle <= slope k + offset (Mortari 1997)
+    slope_rad, offset_rad : the k-vector's line
+    first     : (N + 1,) where each star's neighbours begin
+    neighbour : (2 P,) their rows, by growing angle;  separation_rad : (2 P,)
+    """
+
+    vectors: Floats
+    pair: NDArray[np.int32]
+    angle_rad: Floats
+    kvector: NDArray[np.int64]
+    slope_rad: float
+    offset_rad: float
+    first: NDArray[np.int64]
+    neighbour: NDArray[np.int32]
+    separation_rad: Floats
+    max_angle_rad: float
+
+
+def build(vectors: Floats, max_angle_rad: float) -> PairIndex:
+    """Index all pairs of (N, 3) unit vectors up to an angle. Raises ValueError where there are none."""
+    vectors = np.ascontiguousarray(vectors, dtype=float)
+    chord = 2 * np.sin(min(max_angle_rad, np.pi) / 2)
+    pair = cKDTree(vectors).query_pairs(chord, output_type="ndarray").astype(np.int32)
+    if len(pair) < 3:
+        raise ValueError(f"{len(pair)} pairs within {np.degrees(max_angle_rad):.2f} deg: no pattern to find")
+    # The half-chord keeps small angles exact where arccos of a dot product would lose half the digits.
+    angle = 2 * np.arcsin(np.linalg.norm(vectors[pair[:, 0]] - vectors[pair[:, 1]], axis=1) / 2)
+    order = np.argsort(angle, kind="stable")
+    pair, angle = np.ascontiguousarray(pair[order]), angle[order]
+    kvector, slope, offset = line(angle)
+    owner = np.concatenate([pair[:, 0], pair[:, 1]])
+    other = np.concatenate([pair[:, 1], pair[:, 0]])
+    both = np.concatenate([angle, angle])
+    by_owner = np.lexsort((both, owner))
+    first = np.searchsorted(owner[by_owner], np.arange(len(vectors) + 1))
+    return PairIndex(
+        vectors, pair, angle, kvector, slope, offset, first, other[by_owner], both[by_owner], max_angle_rad
+    )
+
+
+def line(angle_rad: Floats) -> tuple[NDArray[np.int64], float, float]:
+    """The k-vector of sorted angles: counts below a line through just under the least and just over the greatest.
+
+    z(k) = slope k + offset with k = 0 .. P + 1; count[k] = #{angle <= z(k)}.
+    """
+    count = len(angle_rad)
+    margin = max(1e-12, 1e-12 * angle_rad[-1])
+    low, high = angle_rad[0] - margin, angle_rad[-1] + margin
+    slope = (high - low) / (count + 1)
+    z = slope * np.arange(count + 2) + low
+    return np.searchsorted(angle_rad, z, side="right"), float(slope), float(low)
+
+
+@numba.njit(cache=True)
+def between(index: PairIndex, low_rad: float, high_rad: float) -> tuple[int, int]:
+    """Half-open range of pairs that holds every angle in [low, high].
+
+    Mortari's formula, j_b = floor((low - q) / m) and j_t = ceil((high - q) / m), may take in a neighbour or two
+    at either end; SHEFEX's eq. 5 has the signs of the error and of q wrong.
+    """
+    last = len(index.kvector) - 1
+    k_low = int(np.floor((low_rad - index.offset_rad) / index.slope_rad))
+    k_high = int(np.ceil((high_rad - index.offset_rad) / index.slope_rad))
+    if k_high < 0 or k_low > last:
+        return 0, 0
+    begin = index.kvector[k_low] if k_low >= 0 else 0
+    end = index.kvector[k_high] if k_high <= last else len(index.angle_rad)
+    return begin, end
+
+
+@numba.njit(cache=True)
+def around(index: PairIndex, star: int, low_rad: float) -> int:
+    """Place of a star's first neighbour at `low_rad` or farther, by bisection."""
+    begin, end = index.first[star], index.first[star + 1]
+    while begin < end:
+        middle = (begin + end) // 2
+        if index.separation_rad[middle] < low_rad:
+            begin = middle + 1
+        else:
+            end = middle
+    return begin

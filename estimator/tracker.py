@@ -1,0 +1,358 @@
+"""The sequence of stages, from a frame to an attitude: for stars at infinity and for lights on a dome."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from estimator import catalog, index
+from estimator.attitude import SOLVERS, covariance
+from estimator.camera import Camera, check_shape
+from estimator.centroid import CENTROIDERS
+from estimator.detect import DETECTORS
+from estimator.identify import ACCEPT_LOG10_CHANCE, IDENTIFIERS, MIN_MATCHES, log10_tail
+from estimator.nearfield import SOLVERS as NEAR_SOLVERS
+from estimator.nearfield import LedMap, Lever, on_sphere, project
+from estimator.types import Attitude, BadImage, Centroids, Floats, StarMatch
+
+NO_STARS = "too few stars detected"
+NO_MATCH = "no identification beyond chance"
+SATURATED = "the frame is saturated"
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """Which algorithm does each stage, and its thresholds.
+
+    centroid_sigma_px : floor of a centroid's error, for what its own noise does not cover
+    base_stars        : among how many of the brightest blobs patterns are sought
+    field_stars       : how many catalogue stars a field should hold on average when patterns are sought
+    """
+
+    detector: str = "local"
+    centroider: str = "cog"
+    identifier: str = "pyramid"
+    solver: str = "quest"
+    threshold_sigma: float = 5.0
+    min_area_px: int = 3
+    max_blobs: int = 100
+    gain_e_dn: float = 1.0
+    saturation: float = float("inf")
+    centroid_sigma_px: float = 0.1
+    base_stars: int = 20
+    field_stars: float = 30.0
+
+
+@dataclass(slots=True)
+class Report:
+    """One frame's answer with what it rests on: the centroids, and seconds spent by stage."""
+
+    attitude: Attitude
+    centroids: Centroids
+    seconds: dict[str, float] = field(default_factory=dict)
+
+
+class Clock:
+    """Seconds between laps, by name."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+        self._last = time.perf_counter()
+
+    def lap(self, name: str) -> None:
+        now = time.perf_counter()
+        self.seconds[name] = self.seconds.get(name, 0.0) + now - self._last
+        self._last = now
+
+
+def see(image: NDArray, camera: Camera, settings: Settings, clock: Clock) -> Centroids:
+    """Detect and centroid. Raises BadImage for a frame that cannot be one of this camera's."""
+    check_shape(image.shape, camera)
+    if np.isfinite(settings.saturation) and np.mean(image >= settings.saturation) > 0.5:
+        raise BadImage(f"{SATURATED}: over half of its pixels are at {settings.saturation:g}")
+    blobs = DETECTORS[settings.detector](
+        image, settings.threshold_sigma, settings.min_area_px, settings.max_blobs
+    )
+    clock.lap("detect")
+    centroids = CENTROIDERS[settings.centroider](image, blobs, settings.gain_e_dn)
+    clock.lap("centroid")
+    sound = camera.contains(centroids.xy_px) & np.isfinite(centroids.sigma_px) & (centroids.flux > 0)
+    return centroids.take(sound)
+
+
+class StarTracker:
+    """Lost in space under the real sky.
+
+    camera  : the believed calibration
+    stars   : the on-board star list
+    vectors : (N, 3) apparent directions of `stars` at the time of the frames
+    focal_uncertainty : relative; 0 for a calibrated camera, 0.05 where only the field of view is known to 5 %.
+        Where it is not 0 the focal length and, with enough stars, the radial distortion are fitted in each frame.
+    """
+
+    def __init__(
+        self,
+        camera: Camera,
+        stars: catalog.StarList,
+        vectors: Floats,
+        settings: Settings = Settings(),  # noqa: B008 - frozen
+        focal_uncertainty: float = 0.0,
+    ) -> None:
+        self.camera, self.settings = camera, settings
+        self.focal_uncertainty = focal_uncertainty
+        self.stars = replace(stars, vectors=vectors)
+        widest = camera.zoomed(1 - focal_uncertainty)
+        field_sr = camera.width_px * camera.height_px / camera.focal_px**2
+        limit = catalog.limit_for_density(stars, field_sr, settings.field_stars)
+        bright = catalog.brighter(self.stars, limit)
+        self.index = index.build(
+            catalog.merge_doubles(bright, 3 / camera.focal_px).vectors, widest.diagonal_rad * 1.02
+        )
+        self.stars = catalog.merge_doubles(self.stars, 2 / camera.focal_px)
+        self.tree = cKDTree(self.stars.vectors)
+
+    def solve(self, image: NDArray) -> Report:
+        """One frame to an attitude. Raises BadImage for bad input; anything else that fails is a status."""
+        clock = Clock()
+        centroids = see(image, self.camera, self.settings, clock)
+        return Report(self.solve_centroids(centroids, clock), centroids, clock.seconds)
+
+    def solve_centroids(self, centroids: Centroids, clock: Clock | None = None) -> Attitude:
+        """The stages after centroiding, for centroids from anywhere (the truth included)."""
+        clock = clock or Clock()
+        if len(centroids) < MIN_MATCHES:
+            return Attitude(NO_STARS)
+        for camera, cam_from_ref in self._lost_in_space(centroids):
+            clock.lap("identify")
+            attitude = self._refined(centroids, camera, cam_from_ref)
+            clock.lap("solve")
+            if attitude.solved:
+                return attitude
+        clock.lap("identify")
+        return Attitude(NO_MATCH)
+
+    def _lost_in_space(self, centroids: Centroids) -> Iterator[tuple[Camera, Rotation]]:
+        """Pyramid at each focal length that is possible; a little effort at all before much at any."""
+        identify = IDENTIFIERS[self.settings.identifier]
+        step, stretch = 0.02, 0.011 if self.focal_uncertainty else 5e-4
+        reach = int(np.ceil(self.focal_uncertainty / step - 0.5))
+        zooms = sorted((n * step for n in range(-reach, reach + 1)), key=abs)
+        few = centroids.take(np.arange(min(len(centroids), 2 * self.settings.base_stars)))
+        for triangles in (60, 600, 3000):
+            for zoom in zooms:
+                camera = self.camera.zoomed(1 + zoom)
+                tolerance_rad = max(1.5 if reach else 1.0, 4 * self.settings.centroid_sigma_px) / camera.focal_px
+                match = identify(
+                    camera.rays(few.xy_px),
+                    self.index,
+                    tolerance_rad,
+                    stretch,
+                    reach > 0,
+                    triangles,
+                    self.settings.base_stars,
+                )
+                if match:
+                    yield camera, match.cam_from_ref
+
+    def _refined(self, centroids: Centroids, camera: Camera, cam_from_ref: Rotation) -> Attitude:
+        """Match the whole field to the full catalogue, fit, tighten, and weigh the result against chance."""
+        fits = self.focal_uncertainty > 0
+        reach_px = np.hypot(camera.width_px, camera.height_px) / 2
+        radii_px = [0.008 * reach_px + 2, 0.004 * reach_px + 2, 4, 3, 2.5, 2.5] if fits else [3, 2.5, 2.5]
+        for radius_px in radii_px:
+            observed, star = self._nearest(centroids, camera, cam_from_ref, radius_px)
+            if len(observed) < MIN_MATCHES:
+                return Attitude(NO_MATCH)
+            xy, vectors = centroids.xy_px[observed], self.stars.vectors[star]
+            if fits:
+                camera, cam_from_ref = fit_camera(camera, cam_from_ref, xy, vectors)
+            sigma_rad = np.hypot(centroids.sigma_px[observed], self.settings.centroid_sigma_px) / camera.focal_px
+            rays = camera.rays(xy)
+            cam_from_ref = SOLVERS[self.settings.solver](rays, vectors, sigma_rad)
+        rows, _ = self._in_field(camera, cam_from_ref)
+        chance = log10_chance(observed, len(centroids), len(rows), radius_px, camera, len(self.index.pair))
+        if chance > ACCEPT_LOG10_CHANCE:
+            return Attitude(NO_MATCH)
+        if abs(camera.focal_px / self.camera.focal_px - 1) > 1.2 * self.focal_uncertainty + 1e-9:
+            return Attitude(NO_MATCH)
+        residual = camera.pixels(cam_from_ref.apply(vectors)) - xy
+        return Attitude(
+            "solved",
+            cam_from_ref,
+            covariance(rays, sigma_rad),
+            StarMatch(observed, star, cam_from_ref, chance),
+            float(np.sqrt(np.mean(residual**2))),
+            camera.focal_px,
+        )
+
+    def _in_field(self, camera: Camera, cam_from_ref: Rotation) -> tuple[NDArray, Floats]:
+        """Rows and pixels of the catalogue stars on the sensor."""
+        boresight = cam_from_ref.inv().apply([0.0, 0.0, 1.0])
+        rows = np.array(self.tree.query_ball_point(boresight, 2 * np.sin(camera.diagonal_rad / 4) * 1.05), int)
+        rows.sort()
+        xy = camera.pixels(cam_from_ref.apply(self.stars.vectors[rows])) if len(rows) else np.empty((0, 2))
+        inside = camera.contains(xy, -2.0)
+        return rows[inside], xy[inside]
+
+    def _nearest(
+        self, centroids: Centroids, camera: Camera, cam_from_ref: Rotation, radius_px: float
+    ) -> tuple[NDArray, NDArray]:
+        """Pairs of centroid and catalogue star that are each other's nearest within a radius."""
+        rows, xy = self._in_field(camera, cam_from_ref)
+        return mutual(centroids.xy_px, xy, radius_px, rows)
+
+
+def log10_chance(
+    observed: NDArray, blobs: int, predicted: int, radius_px: float, camera: Camera, patterns: int
+) -> float:
+    """log10 of how many matches this good were to be expected by chance among all patterns tried.
+
+    A false blob falls within the radius of one of the predicted stars with the probability p = share of the
+    sensor that the circles cover; two matches are spent on the attitude itself. Faint blobs are mostly false, so
+    the matches are weighed among the brightest 15, 30, 60 and all of the blobs, the best counts, and the choice
+    among four is paid for.
+    """
+    p = 1 - np.exp(-predicted * np.pi * radius_px**2 / (camera.width_px * camera.height_px))
+    heads = [head for head in (15, 30, 60) if head < blobs] + [blobs]
+    tails = [log10_tail(max(head - 2, 0), int((observed < head).sum()) - 2, p) for head in heads]
+    return float(min(tails) + np.log10(len(heads)) + np.log10(patterns))
+
+
+def mutual(
+    seen_px: Floats, predicted_px: Floats, radius_px: float, rows: NDArray
+) -> tuple[NDArray, NDArray]:
+    """Indices of pixels and the rows of predictions that are each other's nearest within a radius."""
+    if not len(predicted_px) or not len(seen_px):
+        return np.empty(0, int), np.empty(0, int)
+    apart, nearest = cKDTree(predicted_px).query(seen_px, distance_upper_bound=radius_px)
+    _, back = cKDTree(seen_px).query(predicted_px)
+    hit = np.flatnonzero(np.isfinite(apart))
+    hit = hit[back[nearest[hit]] == hit]
+    return hit, rows[nearest[hit]]
+
+
+def fit_camera(
+    camera: Camera, cam_from_ref: Rotation, xy_px: Floats, vectors_ref: Floats
+) -> tuple[Camera, Rotation]:
+    """Attitude, focal length and (from 12 stars on) the first radial coefficient that fit the pixels best.
+
+    Robust (soft L1 beyond a pixel), so that a wrong pair does not bend the lens.
+    """
+    radial = len(xy_px) >= 12
+    start = np.zeros(5 if radial else 4)
+    start[4:] = camera.distortion[0]
+
+    def model(p: Floats) -> tuple[Camera, Rotation]:
+        k1 = float(p[4]) if radial else camera.distortion[0]
+        lens = replace(camera, focal_px=camera.focal_px * float(np.exp(p[3])), distortion=(k1, 0, 0, 0, 0))
+        return lens, Rotation.from_rotvec(p[:3]) * cam_from_ref
+
+    def residual(p: Floats) -> Floats:
+        lens, turned = model(p)
+        return np.nan_to_num(lens.pixels(turned.apply(vectors_ref)) - xy_px, nan=1e3).ravel()
+
+    scale = np.array([1e-3, 1e-3, 1e-3, 1e-2, 0.3])[: len(start)]
+    return model(least_squares(residual, start, loss="soft_l1", x_scale=scale, max_nfev=40).x)
+
+
+class DomeTracker:
+    """Lost under an LED dome, with a camera on a lever arm about the bearing centre.
+
+    cam_from_ref of the answer is cam_from_lab; `lever` turns it into the vehicle's attitude.
+    """
+
+    def __init__(
+        self,
+        camera: Camera,
+        leds: LedMap,
+        lever: Lever,
+        settings: Settings = Settings(solver="rotation_only"),  # noqa: B008 - frozen
+    ) -> None:
+        self.camera, self.leds, self.lever, self.settings = camera, leds, lever, settings
+        radius = np.linalg.norm(leds.position_m, axis=1)
+        self.radius_m = float(np.median(radius))
+        corners = np.array([[0, 0], [camera.width_px, 0], [0, camera.height_px], [camera.width_px, camera.height_px]])
+        points = self._on_sphere(camera.rays(corners - 0.5))
+        reach_rad = np.arccos(np.clip((points @ points.T).min(), -1, 1))
+        self.index = index.build(leds.position_m / radius[:, None], reach_rad * 1.05)
+        # A dome that is no sphere stretches the angles as the lever stretches an error of range.
+        self.stretch = 2 * float(np.std(radius)) / (self.radius_m - float(np.linalg.norm(lever.camera_body_m))) + 5e-4
+
+    def _on_sphere(self, rays_cam: Floats) -> Floats:
+        """Unit vectors from the bearing centre to where rays meet the mean sphere, in body axes."""
+        rays_body = self.lever.cam_from_body.inv().apply(rays_cam)
+        points = on_sphere(rays_body, self.lever.camera_body_m, self.radius_m)
+        return points / self.radius_m
+
+    def solve(self, image: NDArray) -> Report:
+        """One frame to an attitude. Raises BadImage for bad input; anything else that fails is a status."""
+        clock = Clock()
+        centroids = see(image, self.camera, self.settings, clock)
+        return Report(self.solve_centroids(centroids, clock), centroids, clock.seconds)
+
+    def solve_centroids(self, centroids: Centroids, clock: Clock | None = None) -> Attitude:
+        """The stages after centroiding, for centroids from anywhere (the truth included)."""
+        clock = clock or Clock()
+        if len(centroids) < MIN_MATCHES:
+            return Attitude(NO_STARS)
+        few = centroids.take(np.arange(min(len(centroids), 2 * self.settings.base_stars)))
+        match = IDENTIFIERS[self.settings.identifier](
+            self._on_sphere(self.camera.rays(few.xy_px)),
+            self.index,
+            4 * self.settings.centroid_sigma_px / self.camera.focal_px,
+            self.stretch,
+            False,
+            3000,
+            self.settings.base_stars,
+        )
+        clock.lap("identify")
+        if match is None:
+            return Attitude(NO_MATCH)
+        attitude = self._refined(centroids, match)
+        clock.lap("solve")
+        return attitude
+
+    def _refined(self, centroids: Centroids, match: StarMatch) -> Attitude:
+        """Solve exactly, match every centroid to the LEDs in view, tighten, weigh against chance."""
+        camera, lever = self.camera, self.lever
+        body_from_lab = match.cam_from_ref
+        observed, star = match.observed, match.star
+        for radius_px in (12.0, 4.0, 4.0):
+            rays = camera.rays(centroids.xy_px[observed])
+            sigma_rad = np.hypot(centroids.sigma_px[observed], self.settings.centroid_sigma_px) / camera.focal_px
+            try:
+                body_from_lab, spread = NEAR_SOLVERS[self.settings.solver](
+                    rays, sigma_rad, self.leds.position_m[star], self.leds, lever, body_from_lab
+                )
+            except (ValueError, np.linalg.LinAlgError) as error:
+                return Attitude(f"no attitude: {error}")
+            xy = project(body_from_lab, self.leds.position_m, lever, camera)
+            inside = np.flatnonzero(camera.contains(np.nan_to_num(xy, nan=-1e9)))
+            kept = observed, star
+            observed, star = mutual(centroids.xy_px, xy[inside], radius_px, inside)
+            if len(observed) < MIN_MATCHES:
+                return Attitude(NO_MATCH)
+        observed, star = kept
+        chance = log10_chance(
+            observed, len(centroids), len(inside), radius_px, camera, len(self.index.pair)
+        )
+        if chance > ACCEPT_LOG10_CHANCE:
+            return Attitude(NO_MATCH)
+        cam_from_lab = lever.cam_from_body * body_from_lab
+        R_cam_from_body = lever.cam_from_body.as_matrix()
+        residual = xy[star] - centroids.xy_px[observed]
+        return Attitude(
+            "solved",
+            cam_from_lab,
+            R_cam_from_body @ spread @ R_cam_from_body.T,
+            StarMatch(observed, star, cam_from_lab, chance),
+            float(np.sqrt(np.mean(residual**2))),
+            camera.focal_px,
+        )

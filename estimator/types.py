@@ -1,0 +1,114 @@
+"""What the tracker's stages hand to one another: frozen arrays with their shapes, frames and units."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+class BadImage(ValueError):
+    """The image or the calibration cannot be used. The message is one line: what, and what is allowed."""
+
+
+@dataclass(frozen=True, slots=True)
+class Background:
+    """Sky level and noise of an image, on a coarse grid of tile centres.
+
+    level, noise : (rows, columns) in the image's units; between the centres both are bilinear
+    tile_px      : side of a tile
+    """
+
+    level: Floats
+    noise: Floats
+    tile_px: int
+
+
+@dataclass(frozen=True, slots=True)
+class Blobs:
+    """Connected pixels above the threshold, brightest first.
+
+    box_px    : (N, 4) x0, y0, x1, y1, both ends included
+    xy_px     : (N, 2) brightness-weighted middle of the pixels above the threshold
+    flux      : (N,) sum above the background over those pixels
+    peak      : (N,) greatest value of the image in the blob
+    area_px   : (N,) how many pixels
+    background: the level and noise they were found over
+    """
+
+    box_px: Ints
+    xy_px: Floats
+    flux: Floats
+    peak: Floats
+    area_px: Ints
+    background: Background
+
+    def __len__(self) -> int:
+        return len(self.flux)
+
+
+@dataclass(frozen=True, slots=True)
+class Centroids:
+    """Where the light is, brightest first.
+
+    xy_px    : (N, 2)
+    sigma_px : (N,) standard deviation of each coordinate
+    flux     : (N,) above the background
+    """
+
+    xy_px: Floats
+    sigma_px: Floats
+    flux: Floats
+
+    def __len__(self) -> int:
+        return len(self.flux)
+
+    def take(self, which: NDArray[Any]) -> Centroids:
+        """The chosen centroids, by mask or index."""
+        return Centroids(self.xy_px[which], self.sigma_px[which], self.flux[which])
+
+
+@dataclass(frozen=True, slots=True)
+class StarMatch:
+    """Which centroid is which catalogue star.
+
+    observed : (K,) rows of the centroids
+    star     : (K,) rows of the catalogue
+    cam_from_ref : the attitude that these matches were verified with
+    log10_chance : log10 of the expected number of matches this good by chance over the whole search
+    """
+
+    observed: Ints
+    star: Ints
+    cam_from_ref: Rotation
+    log10_chance: float
+
+
+@dataclass(frozen=True, slots=True)
+class Attitude:
+    """The tracker's answer, or its refusal.
+
+    status          : "solved", or the reason why there is no attitude
+    cam_from_ref    : reference (ICRS for stars, lab for the dome) to camera; None unless solved
+    covariance_rad2 : (3, 3) of the small rotation in camera axes; None unless solved
+    match           : the stars it rests on; None unless solved
+    rms_px          : of the matched centroids' residuals; NaN unless solved
+    focal_px        : the focal length that it was solved with; NaN unless solved
+    """
+
+    status: str
+    cam_from_ref: Rotation | None = None
+    covariance_rad2: Floats | None = None
+    match: StarMatch | None = None
+    rms_px: float = float("nan")
+    focal_px: float = float("nan")
+
+    @property
+    def solved(self) -> bool:
+        return self.cam_from_ref is not None
