@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import datetime
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import erfa
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
@@ -14,18 +16,23 @@ from estimator.types import BadImage, Floats, Ints
 
 SPEED_OF_LIGHT_M_S = 299_792_458.0
 EPOCH_YR = 1991.25
+MAS_RAD = np.pi / 180 / 3.6e6
+SUN_BENDS_RAD = 1.974e-8  # 2 G M_sun / (c^2 1 au)
+TT_MINUS_UTC_DAY = 69.184 / 86400  # since 2017; the leap seconds before change nothing here
 
 
 @dataclass(frozen=True, slots=True)
 class StarList:
     """Stars as the file gives them, brightest first, at the epoch J1991.25 in the ICRS.
 
-    id : (N,); vectors : (N, 3) unit; drift_rad_yr : (N, 3) proper motion, tangent; v_mag : (N,)
+    id : (N,); vectors : (N, 3) unit; drift_rad_yr : (N, 3) proper motion, tangent; parallax_rad : (N,);
+    v_mag : (N,)
     """
 
     id: Ints
     vectors: Floats
     drift_rad_yr: Floats
+    parallax_rad: Floats
     v_mag: Floats
 
     def __len__(self) -> int:
@@ -33,15 +40,34 @@ class StarList:
 
     def take(self, which: NDArray[Any]) -> StarList:
         """The chosen stars, by mask or index."""
-        return StarList(self.id[which], self.vectors[which], self.drift_rad_yr[which], self.v_mag[which])
+        return StarList(*(getattr(self, name)[which] for name in self.__slots__))
+
+
+@dataclass(frozen=True, slots=True)
+class Observer:
+    """Who looks: barycentric position_au and velocity_m_s, (3,) in ICRS axes, and the Julian year."""
+
+    epoch_yr: float
+    position_au: Floats
+    velocity_m_s: Floats
+
+
+def on_earth(time_utc: datetime.datetime) -> Observer:
+    """An observer at the Earth's centre at a date (UTC; naive is UTC), by the IAU's ephemeris `epv00`."""
+    if time_utc.tzinfo is not None:
+        time_utc = time_utc.astimezone(datetime.UTC).replace(tzinfo=None)
+    days = (time_utc - datetime.datetime(2000, 1, 1, 12)) / datetime.timedelta(days=1) + TT_MINUS_UTC_DAY
+    _, barycentric = erfa.epv00(erfa.DJ00, days)
+    metres_per_second = erfa.DAU / erfa.DAYSEC
+    return Observer(2000 + days / 365.25, barycentric["p"], barycentric["v"] * metres_per_second)
 
 
 def read(path: Path) -> StarList:
-    """Read a catalogue file: ECSV with hip, ra_deg, dec_deg, pm_ra_mas_yr, pm_dec_mas_yr, v_mag.
+    """Read a catalogue file: ECSV with hip, ra_deg, dec_deg, pm_ra_mas_yr, pm_dec_mas_yr, parallax_mas, v_mag.
 
     Raises BadImage with one line if it cannot be read.
     """
-    names = ("hip", "ra_deg", "dec_deg", "pm_ra_mas_yr", "pm_dec_mas_yr", "v_mag")
+    names = ("hip", "ra_deg", "dec_deg", "pm_ra_mas_yr", "pm_dec_mas_yr", "parallax_mas", "v_mag")
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
         body = [line for line in lines if line and not line.startswith("#")]
@@ -51,36 +77,55 @@ def read(path: Path) -> StarList:
         table = np.loadtxt(body[1:], delimiter=delimiter, usecols=columns, ndmin=2)
     except (OSError, ValueError, IndexError) as error:
         raise BadImage(f"{path}: not a star catalogue ({error}); allowed: ECSV with {', '.join(names)}") from None
-    hip, ra_deg, dec_deg, pm_ra, pm_dec, v_mag = table.T
-    stars = from_columns(hip.astype(np.int64), np.radians(ra_deg), np.radians(dec_deg), pm_ra, pm_dec, v_mag)
+    hip, ra_deg, dec_deg, *rest, v_mag = table.T
+    stars = from_columns(hip.astype(np.int64), np.radians(ra_deg), np.radians(dec_deg), *rest, v_mag)
     return stars.take(np.argsort(v_mag, kind="stable"))
 
 
 def from_columns(
-    hip: Ints, ra_rad: Floats, dec_rad: Floats, pm_ra_mas_yr: Floats, pm_dec_mas_yr: Floats, v_mag: Floats
+    hip: Ints,
+    ra_rad: Floats,
+    dec_rad: Floats,
+    pm_ra_mas_yr: Floats,
+    pm_dec_mas_yr: Floats,
+    parallax_mas: Floats,
+    v_mag: Floats,
 ) -> StarList:
     """Directions and their drift from spherical coordinates; pm_ra includes cos(dec)."""
     sa, ca, sd, cd = np.sin(ra_rad), np.cos(ra_rad), np.sin(dec_rad), np.cos(dec_rad)
     vectors = np.column_stack([cd * ca, cd * sa, sd])
     east = np.column_stack([-sa, ca, np.zeros_like(sa)])
     north = np.column_stack([-sd * ca, -sd * sa, cd])
-    mas = np.pi / 180 / 3.6e6
-    drift = mas * (pm_ra_mas_yr[:, None] * east + pm_dec_mas_yr[:, None] * north)
-    return StarList(hip, vectors, drift, v_mag)
+    drift = MAS_RAD * (pm_ra_mas_yr[:, None] * east + pm_dec_mas_yr[:, None] * north)
+    return StarList(hip, vectors, drift, MAS_RAD * parallax_mas, v_mag)
 
 
-def at_epoch(stars: StarList, epoch_yr: float, velocity_m_s: Floats | None = None) -> Floats:
-    """(N, 3) unit vectors as seen at an epoch (Julian years) by an observer moving at velocity_m_s (ICRS).
+def at_epoch(stars: StarList, epoch_yr: float) -> Floats:
+    """(N, 3) barycentric unit vectors at a Julian year: R + (t - t0) dR/dt, renormalised."""
+    return unit(stars.vectors + (epoch_yr - EPOCH_YR) * stars.drift_rad_yr)
 
-    Proper motion is a straight line in space: R + (t - t0) dR/dt, renormalised. Aberration is PTASE's eq. 4,
-    (R + v/c) / |R + v/c|: the classical law, at most 0.5 mas from the relativistic one at Earth's speed.
+
+def apparent(stars: StarList, observer: Observer) -> Floats:
+    """(N, 3) unit vectors as an observer sees them.
+
+    Proper motion; parallax, R - pi r; the Sun's bending of light, 2 G M / (c^2 r) cot(psi / 2) away from it;
+    aberration by PTASE's eq. 4, (R + v/c) / |R + v/c|: the classical law, at most 0.5 mas from the relativistic.
+    The Sun is taken at the barycentre, which moves a bent star by less than 0.1 mas beyond 10 degrees from it.
     """
-    vectors = stars.vectors + (epoch_yr - EPOCH_YR) * stars.drift_rad_yr
-    vectors = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
-    if velocity_m_s is not None:
-        vectors = vectors + np.asarray(velocity_m_s) / SPEED_OF_LIGHT_M_S
-        vectors = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
-    return vectors
+    vectors = at_epoch(stars, observer.epoch_yr)
+    vectors = unit(vectors - stars.parallax_rad[:, None] * observer.position_au)
+    distance_au = np.linalg.norm(observer.position_au)
+    from_sun = observer.position_au / distance_au
+    along = vectors @ from_sun
+    # (e - (u.e) u) / (1 + u.e) has the length cot(psi / 2); within a solar radius there is no star to be seen.
+    away = (from_sun - along[:, None] * vectors) / np.maximum(1 + along, 1e-5)[:, None]
+    vectors = unit(vectors + SUN_BENDS_RAD / distance_au * away)
+    return unit(vectors + observer.velocity_m_s / SPEED_OF_LIGHT_M_S)
+
+
+def unit(vectors: Floats) -> Floats:
+    """(N, 3) vectors at length 1."""
+    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
 
 
 def merge_doubles(stars: StarList, closer_than_rad: float) -> StarList:
@@ -90,12 +135,13 @@ def merge_doubles(stars: StarList, closer_than_rad: float) -> StarList:
     total = np.bincount(groups, light)
     merged = [
         np.column_stack([np.bincount(groups, light * column) / total for column in array.T])
-        for array in (stars.vectors, stars.drift_rad_yr)
+        for array in (stars.vectors, stars.drift_rad_yr, stars.parallax_rad[:, None])
     ]
-    vectors = merged[0] / np.linalg.norm(merged[0], axis=1, keepdims=True)
     # The brightest of each group comes first and gives the name.
     _, first = np.unique(groups, return_index=True)
-    result = StarList(stars.id[first], vectors, merged[1], -2.5 * np.log10(total))
+    result = StarList(
+        stars.id[first], unit(merged[0]), merged[1], merged[2][:, 0], -2.5 * np.log10(total)
+    )
     return result.take(np.argsort(result.v_mag, kind="stable"))
 
 

@@ -80,11 +80,18 @@ def see(image: NDArray, camera: Camera, settings: Settings, clock: Clock) -> Cen
     blobs = DETECTORS[settings.detector](
         image, settings.threshold_sigma, settings.min_area_px, settings.max_blobs
     )
+    blobs = blobs.take(whole(blobs.box_px, camera))
     clock.lap("detect")
     centroids = CENTROIDERS[settings.centroider](image, blobs, settings.gain_e_dn)
     clock.lap("centroid")
     sound = camera.contains(centroids.xy_px) & np.isfinite(centroids.sigma_px) & (centroids.flux > 0)
     return centroids.take(sound)
+
+
+def whole(box_px: NDArray, camera: Camera) -> NDArray:
+    """(N,) whether a blob's box keeps off the border: one cut off by it has its centre elsewhere."""
+    x0, y0, x1, y1 = box_px.T
+    return (x0 > 0) & (y0 > 0) & (x1 < camera.width_px - 1) & (y1 < camera.height_px - 1)
 
 
 class StarTracker:
@@ -306,7 +313,7 @@ class DomeTracker:
         match = IDENTIFIERS[self.settings.identifier](
             self._on_sphere(self.camera.rays(few.xy_px)),
             self.index,
-            4 * self.settings.centroid_sigma_px / self.camera.focal_px,
+            max(1.0, 4 * self.settings.centroid_sigma_px) / self.camera.focal_px,
             self.stretch,
             False,
             3000,

@@ -52,6 +52,11 @@ class Blobs:
     def __len__(self) -> int:
         return len(self.flux)
 
+    def take(self, which: NDArray[Any]) -> Blobs:
+        """The chosen blobs, by mask or index."""
+        chosen = (getattr(self, name)[which] for name in ("box_px", "xy_px", "flux", "peak", "area_px"))
+        return Blobs(*chosen, self.background)
+
 
 @dataclass(frozen=True, slots=True)
 class Centroids:

@@ -46,7 +46,10 @@ def quantity(si_unit: str, what: str, examples: str) -> Callable[[Any], float]:
         if not isinstance(value, str):
             raise ValueError(f"{value!r} has no unit; allowed: a {what} such as {examples}")
         try:
-            number = units.Quantity(value).to_value(si_unit)
+            # astropy spells it `inch`; the lab writes `in`.
+            inch = units.def_unit("in", units.imperial.inch)
+            with units.add_enabled_units([inch, units.imperial]):
+                number = units.Quantity(value).to_value(si_unit)
         except (units.UnitsError, TypeError, ValueError) as error:
             raise ValueError(f"{value!r} is not a {what}; allowed: a {what} such as {examples}") from error
         return float(number)
@@ -224,10 +227,11 @@ class Stars(Part):
 
 
 class Psf(Part):
-    """The lens's point-spread function."""
+    """The lens's point-spread function: a Gaussian, or the disc of a lens out of focus with a Gaussian edge."""
 
     kind: str = "gaussian"
-    sigma_px: Annotated[Number, Field(gt=0)] = 0.7
+    sigma_px: Annotated[Number, Field(ge=0.2)] = 0.7
+    radius_px: Annotated[Number, Field(ge=0)] = 0.0
 
     @field_validator("kind")
     @classmethod
@@ -235,6 +239,12 @@ class Psf(Part):
         from skysim.optics import PSFS
 
         return one_of(value, PSFS)
+
+    @model_validator(mode="after")
+    def a_disc_has_a_radius(self) -> Psf:
+        if (self.kind == "disc") != (self.radius_px > 0):
+            raise ValueError(f"radius_px {self.radius_px:g} with kind {self.kind}; allowed: above 0 with disc only")
+        return self
 
 
 class Detector(Part):

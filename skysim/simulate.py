@@ -1,0 +1,180 @@
+"""The whole story: a scene is flown, lit, photographed and solved. Owns the random streams."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from estimator import catalog
+from estimator.camera import Camera
+from estimator.nearfield import LedMap, Lever
+from estimator.tracker import DomeTracker, Report, Settings, StarTracker
+from skysim import catalogue, control, dome, sky, world
+from skysim.detector import expose, saturation_dn
+from skysim.optics import Optics
+from skysim.render import render
+from skysim.scene import CATALOGUES, Dome, Pointing, Scene, Tracker
+from skysim.types import BadInput, Frame, Mount, Sources, Trajectory, Truth
+
+STAGE_ID = {"detector": 1}
+
+Estimator = StarTracker | DomeTracker
+
+
+def rng(seed: int, stage: str, frame: int) -> np.random.Generator:
+    """A stage's random stream for one frame, the same whatever was drawn before: frame 57 renders alone."""
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(STAGE_ID[stage], frame)))
+
+
+@dataclass(frozen=True, slots=True)
+class Lab:
+    """What a scene becomes before the first frame: hardware, lights and the flight."""
+
+    scene: Scene
+    mount: Mount
+    trajectory: Trajectory
+    sources: Sources
+    optics: Optics
+
+
+@dataclass(frozen=True, slots=True)
+class Shot:
+    """One frame, what it was made from, and what the tracker made of it."""
+
+    frame: Frame
+    truth: Truth
+    report: Report
+
+
+def prepare(scene: Scene, frames: int | None = None) -> Lab:
+    """Build the vehicle, fly it to the last exposure, and light the sky or the dome."""
+    vehicle = world.build(scene.vehicle)
+    mount = world.mount(vehicle)
+    last_s = open_s(scene, (frames or scene.exposure.frames) - 1) + scene.exposure.time_s
+    pilot = None
+    if scene.motion.control == "pid":
+        plan = control.plan(scene.motion, lab_from_body_start(scene, mount))
+        pilot = control.pid(plan, vehicle.inertia_kg_m2, scene.vehicle.torque_limit_nm)
+    trajectory = world.fly(
+        vehicle,
+        lab_from_body_start(scene, mount),
+        np.radians(scene.motion.rate_deg_s),
+        last_s + 2e-3,
+        pilot,
+    )
+    return Lab(scene, mount, trajectory, lights(scene), Optics.of(scene.camera))
+
+
+def lab_from_body_start(scene: Scene, mount: Mount) -> Rotation:
+    """The attitude at t = 0. Under the stars the lab's axes are those of the ICRS."""
+    start = scene.motion.start
+    if isinstance(start, Pointing):
+        return sky.cam_from_icrs(start.ra_deg, start.dec_deg, start.roll_deg).inv() * mount.cam_from_body
+    return control.attitude(start)
+
+
+def lights(scene: Scene) -> Sources:
+    """Everything that shines."""
+    if isinstance(scene.light, Dome):
+        return dome.sources(scene.light)
+    stars = catalogue.read(scene.light.catalogue)
+    return sky.sources(stars, scene.start_time, scene.light.limit_mag, Rotation.identity())
+
+
+def open_s(scene: Scene, index: int) -> float:
+    """When the shutter opens for a frame."""
+    return scene.exposure.first_s + index / scene.exposure.rate_hz
+
+
+def shoot(lab: Lab, index: int) -> tuple[Frame, Truth]:
+    """One frame with its truth. Depends on the scene and the index alone."""
+    scene, chip = lab.scene, lab.scene.camera.detector
+    begin, exposure = open_s(scene, index), scene.exposure.time_s
+    falloff = scene.light.led.falloff if isinstance(scene.light, Dome) else "inverse_square"
+    mean_e, seen = render(
+        lab.sources,
+        lab.optics,
+        lab.trajectory,
+        lab.mount,
+        begin,
+        exposure,
+        chip.quantum_efficiency,
+        falloff,
+    )
+    image = expose(mean_e, exposure, chip, rng(scene.seed, "detector", index))
+    middle = begin + exposure / 2
+    lab_from_body = lab.trajectory.at(middle)
+    step = 1e-3
+    turned = lab.trajectory.at(middle + step).inv() * lab_from_body
+    truth = Truth(
+        middle,
+        lab_from_body,
+        lab.mount.cam_from_body * lab_from_body.inv(),
+        lab.mount.cam_from_body.apply(-turned.as_rotvec() / step),
+        seen,
+    )
+    return Frame(index, image, middle, exposure, saturation_dn(chip)), truth
+
+
+def tracker(lab: Lab) -> Estimator:
+    """The star tracker with what it believes of the hardware: the scene's `tracker` section, else the truth."""
+    scene, believed = lab.scene, lab.scene.tracker
+    camera, settings = believed_camera(scene), believed_settings(scene)
+    if isinstance(scene.light, Dome):
+        inside = dome.surface(scene.light.surface)
+        flat = isinstance(inside, dome.Plane)
+        leds = LedMap(
+            lab.sources.id,
+            lab.sources.place[:, :3],
+            np.array([0, 0, -1e6]) if flat else inside.centre_m,
+            np.full(3, 1e6 + inside.height_m) if flat else inside.semi_axes_m,
+        )
+        arm = believed.believed_camera_body_m or lab.mount.camera_body_m
+        return DomeTracker(camera, leds, Lever(np.array(arm), lab.mount.cam_from_body), settings)
+    stars = catalog.read(CATALOGUES / f"{scene.light.catalogue}.ecsv")
+    stars = catalog.brighter(stars, believed.limit_mag)
+    return StarTracker(camera, stars, catalog.apparent(stars, catalog.on_earth(scene.start_time)), settings)
+
+
+def believed_camera(scene: Scene) -> Camera:
+    """The calibration in the tracker's head."""
+    camera = scene.camera
+    focal_m = scene.tracker.believed_focal_length_m or camera.focal_length_m
+    middle = (camera.width_px - 1) / 2, (camera.height_px - 1) / 2
+    return Camera(
+        camera.width_px,
+        camera.height_px,
+        focal_m / camera.pixel_m,
+        camera.principal_point_px or middle,
+        camera.distortion,
+    )
+
+
+def believed_settings(scene: Scene) -> Settings:
+    """The tracker's algorithms and thresholds as the scene names them."""
+    part: Tracker = scene.tracker
+    return Settings(
+        detector=part.detector,
+        centroider=part.centroider,
+        identifier=part.identifier,
+        solver=part.solver,
+        threshold_sigma=part.threshold_sigma,
+        min_area_px=part.min_area_px,
+        gain_e_dn=scene.camera.detector.gain_e_dn,
+        saturation=saturation_dn(scene.camera.detector),
+        centroid_sigma_px=part.centroid_sigma_px,
+    )
+
+
+def run(scene: Scene, frames: int | None = None) -> Iterator[Shot]:
+    """Photograph and solve frame after frame."""
+    if frames is not None and frames < 1:
+        raise BadInput(f"--frames {frames}: allowed: 1 and more")
+    lab = prepare(scene, frames)
+    estimator = tracker(lab)
+    for index in range(frames or scene.exposure.frames):
+        frame, truth = shoot(lab, index)
+        yield Shot(frame, truth, estimator.solve(frame.image_dn))
