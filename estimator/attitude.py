@@ -23,7 +23,9 @@ def quest(vectors_cam: Floats, vectors_ref: Floats, sigma_rad: Floats) -> Rotati
     weight = weight / weight.sum()
     profile = (weight[:, None] * vectors_cam).T @ vectors_ref
     if np.linalg.svd(profile, compute_uv=False)[1] < 1e-14:
-        raise ValueError("all vectors are parallel: the roll about them is unknown; two directions are needed")
+        raise ValueError(
+            "all vectors are parallel: the roll about them is unknown; two directions are needed"
+        )
     best, scalar = Rotation.identity(), -1.0
     for turn in HALF_TURNS:
         quaternion_xyzw = _quest_once(profile * turn)

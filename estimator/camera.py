@@ -61,7 +61,11 @@ class Camera:
     def contains(self, xy_px: Floats, margin_px: float = 0.0) -> np.ndarray:
         """(N,) whether a pixel lies on the sensor, shrunk by the margin."""
         x, y = xy_px[:, 0], xy_px[:, 1]
-        low, right, bottom = margin_px - 0.5, self.width_px - 0.5 - margin_px, self.height_px - 0.5 - margin_px
+        low, right, bottom = (
+            margin_px - 0.5,
+            self.width_px - 0.5 - margin_px,
+            self.height_px - 0.5 - margin_px,
+        )
         return (x >= low) & (x <= right) & (y >= low) & (y <= bottom)
 
     def _distort(self, tangent: Floats) -> Floats:

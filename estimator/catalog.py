@@ -76,7 +76,9 @@ def read(path: Path) -> StarList:
         columns = [header.index(name) for name in names]
         table = np.loadtxt(body[1:], delimiter=delimiter, usecols=columns, ndmin=2)
     except (OSError, ValueError, IndexError) as error:
-        raise BadImage(f"{path}: not a star catalogue ({error}); allowed: ECSV with {', '.join(names)}") from None
+        raise BadImage(
+            f"{path}: not a star catalogue ({error}); allowed: ECSV with {', '.join(names)}"
+        ) from None
     hip, ra_deg, dec_deg, *rest, v_mag = table.T
     stars = from_columns(hip.astype(np.int64), np.radians(ra_deg), np.radians(dec_deg), *rest, v_mag)
     return stars.take(np.argsort(v_mag, kind="stable"))
@@ -139,9 +141,7 @@ def merge_doubles(stars: StarList, closer_than_rad: float) -> StarList:
     ]
     # The brightest of each group comes first and gives the name.
     _, first = np.unique(groups, return_index=True)
-    result = StarList(
-        stars.id[first], unit(merged[0]), merged[1], merged[2][:, 0], -2.5 * np.log10(total)
-    )
+    result = StarList(stars.id[first], unit(merged[0]), merged[1], merged[2][:, 0], -2.5 * np.log10(total))
     return result.take(np.argsort(result.v_mag, kind="stable"))
 
 

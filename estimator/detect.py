@@ -8,7 +8,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.types import BadImage, Background, Blobs, Floats
+from estimator.types import Background, BadImage, Blobs, Floats
 
 TILE_PX = 64
 MAX_BLOBS = 20_000
@@ -66,9 +66,7 @@ def sky(image: NDArray, tile_px: int = TILE_PX) -> Background:
     return Background(level, np.maximum(noise, 0.375 * step / np.sqrt(12)), tile_px)
 
 
-def gather(
-    image: NDArray, background: Background, above: Floats, min_area_px: int, max_blobs: int
-) -> Blobs:
+def gather(image: NDArray, background: Background, above: Floats, min_area_px: int, max_blobs: int) -> Blobs:
     """Label what is more than `above` (on the background's grid) over the level, and keep the brightest."""
     boxes, sums, count = _label(image, background.level, above, MAX_BLOBS)
     if count < 0:
@@ -164,9 +162,7 @@ def _find(parent: NDArray, label: int) -> int:
 
 
 @numba.njit(cache=True)
-def _label(
-    image: NDArray, level: Floats, above: Floats, limit: int
-) -> tuple[NDArray, Floats, int]:
+def _label(image: NDArray, level: Floats, above: Floats, limit: int) -> tuple[NDArray, Floats, int]:
     """Eight-connected blobs in one raster pass, with union-find over provisional labels.
 
     Returns boxes (limit, 4), sums (limit, 5: area, flux, flux x, flux y, peak) and how many; -1 if too many.

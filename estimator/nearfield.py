@@ -53,7 +53,9 @@ def on_sphere(rays_body: Floats, camera_body_m: Floats, radius_m: float) -> Floa
     along = rays_body @ camera_body_m
     under_root = along**2 - camera_body_m @ camera_body_m + radius_m**2
     if radius_m <= np.linalg.norm(camera_body_m):
-        raise ValueError(f"the camera, {np.linalg.norm(camera_body_m)} m out, is not inside radius {radius_m} m")
+        raise ValueError(
+            f"the camera, {np.linalg.norm(camera_body_m)} m out, is not inside radius {radius_m} m"
+        )
     return camera_body_m + (-along + np.sqrt(under_root))[:, None] * rays_body
 
 
@@ -167,4 +169,6 @@ def check(leds: LedMap, lever: Lever) -> None:
     nearest = np.linalg.norm(leds.position_m, axis=1).min()
     reach = np.linalg.norm(lever.camera_body_m)
     if reach >= nearest:
-        raise BadImage(f"the camera is believed {reach:.3f} m from the bearing, the nearest LED {nearest:.3f} m")
+        raise BadImage(
+            f"the camera is believed {reach:.3f} m from the bearing, the nearest LED {nearest:.3f} m"
+        )

@@ -109,7 +109,7 @@ class StarTracker:
         camera: Camera,
         stars: catalog.StarList,
         vectors: Floats,
-        settings: Settings = Settings(),  # noqa: B008 - frozen
+        settings: Settings = Settings(),
         focal_uncertainty: float = 0.0,
     ) -> None:
         self.camera, self.settings = camera, settings
@@ -155,7 +155,9 @@ class StarTracker:
         for triangles in (60, 600, 3000):
             for zoom in zooms:
                 camera = self.camera.zoomed(1 + zoom)
-                tolerance_rad = max(1.5 if reach else 1.0, 4 * self.settings.centroid_sigma_px) / camera.focal_px
+                tolerance_rad = (
+                    max(1.5 if reach else 1.0, 4 * self.settings.centroid_sigma_px) / camera.focal_px
+                )
                 match = identify(
                     camera.rays(few.xy_px),
                     self.index,
@@ -180,7 +182,9 @@ class StarTracker:
             xy, vectors = centroids.xy_px[observed], self.stars.vectors[star]
             if fits:
                 camera, cam_from_ref = fit_camera(camera, cam_from_ref, xy, vectors)
-            sigma_rad = np.hypot(centroids.sigma_px[observed], self.settings.centroid_sigma_px) / camera.focal_px
+            sigma_rad = (
+                np.hypot(centroids.sigma_px[observed], self.settings.centroid_sigma_px) / camera.focal_px
+            )
             rays = camera.rays(xy)
             cam_from_ref = SOLVERS[self.settings.solver](rays, vectors, sigma_rad)
         rows, _ = self._in_field(camera, cam_from_ref)
@@ -202,7 +206,9 @@ class StarTracker:
     def _in_field(self, camera: Camera, cam_from_ref: Rotation) -> tuple[NDArray, Floats]:
         """Rows and pixels of the catalogue stars on the sensor."""
         boresight = cam_from_ref.inv().apply([0.0, 0.0, 1.0])
-        rows = np.array(self.tree.query_ball_point(boresight, 2 * np.sin(camera.diagonal_rad / 4) * 1.05), int)
+        rows = np.array(
+            self.tree.query_ball_point(boresight, 2 * np.sin(camera.diagonal_rad / 4) * 1.05), int
+        )
         rows.sort()
         xy = camera.pixels(cam_from_ref.apply(self.stars.vectors[rows])) if len(rows) else np.empty((0, 2))
         inside = camera.contains(xy, -2.0)
@@ -232,9 +238,7 @@ def log10_chance(
     return float(min(tails) + np.log10(len(heads)) + np.log10(patterns))
 
 
-def mutual(
-    seen_px: Floats, predicted_px: Floats, radius_px: float, rows: NDArray
-) -> tuple[NDArray, NDArray]:
+def mutual(seen_px: Floats, predicted_px: Floats, radius_px: float, rows: NDArray) -> tuple[NDArray, NDArray]:
     """Indices of pixels and the rows of predictions that are each other's nearest within a radius."""
     if not len(predicted_px) or not len(seen_px):
         return np.empty(0, int), np.empty(0, int)
@@ -280,17 +284,21 @@ class DomeTracker:
         camera: Camera,
         leds: LedMap,
         lever: Lever,
-        settings: Settings = Settings(solver="rotation_only"),  # noqa: B008 - frozen
+        settings: Settings = Settings(solver="rotation_only"),
     ) -> None:
         self.camera, self.leds, self.lever, self.settings = camera, leds, lever, settings
         radius = np.linalg.norm(leds.position_m, axis=1)
         self.radius_m = float(np.median(radius))
-        corners = np.array([[0, 0], [camera.width_px, 0], [0, camera.height_px], [camera.width_px, camera.height_px]])
+        corners = np.array(
+            [[0, 0], [camera.width_px, 0], [0, camera.height_px], [camera.width_px, camera.height_px]]
+        )
         points = self._on_sphere(camera.rays(corners - 0.5))
         reach_rad = np.arccos(np.clip((points @ points.T).min(), -1, 1))
         self.index = index.build(leds.position_m / radius[:, None], reach_rad * 1.05)
         # A dome that is no sphere stretches the angles as the lever stretches an error of range.
-        self.stretch = 2 * float(np.std(radius)) / (self.radius_m - float(np.linalg.norm(lever.camera_body_m))) + 5e-4
+        self.stretch = (
+            2 * float(np.std(radius)) / (self.radius_m - float(np.linalg.norm(lever.camera_body_m))) + 5e-4
+        )
 
     def _on_sphere(self, rays_cam: Floats) -> Floats:
         """Unit vectors from the bearing centre to where rays meet the mean sphere, in body axes."""
@@ -333,7 +341,9 @@ class DomeTracker:
         observed, star = match.observed, match.star
         for radius_px in (12.0, 4.0, 4.0):
             rays = camera.rays(centroids.xy_px[observed])
-            sigma_rad = np.hypot(centroids.sigma_px[observed], self.settings.centroid_sigma_px) / camera.focal_px
+            sigma_rad = (
+                np.hypot(centroids.sigma_px[observed], self.settings.centroid_sigma_px) / camera.focal_px
+            )
             try:
                 body_from_lab, spread = NEAR_SOLVERS[self.settings.solver](
                     rays, sigma_rad, self.leds.position_m[star], self.leds, lever, body_from_lab
@@ -347,9 +357,7 @@ class DomeTracker:
             if len(observed) < MIN_MATCHES:
                 return Attitude(NO_MATCH)
         observed, star = kept
-        chance = log10_chance(
-            observed, len(centroids), len(inside), radius_px, camera, len(self.index.pair)
-        )
+        chance = log10_chance(observed, len(centroids), len(inside), radius_px, camera, len(self.index.pair))
         if chance > ACCEPT_LOG10_CHANCE:
             return Attitude(NO_MATCH)
         cam_from_lab = lever.cam_from_body * body_from_lab

@@ -9,12 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from estimator import BadImage as BadImage
+
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
-
-
-class BadImage(ValueError):
-    """The image or the calibration cannot be used. The message is one line: what, and what is allowed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,6 +71,10 @@ class Centroids:
 
     def __len__(self) -> int:
         return len(self.flux)
+
+    @classmethod
+    def none(cls) -> Centroids:
+        return cls(np.empty((0, 2)), np.empty(0), np.empty(0))
 
     def take(self, which: NDArray[Any]) -> Centroids:
         """The chosen centroids, by mask or index."""

@@ -70,4 +70,6 @@ class Optics:
         radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
         u = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x**2)
         v = y * radial + p1 * (r2 + 2 * y**2) + 2 * p2 * x * y
-        return np.stack([u * self.focal_px + self.centre_px[0], v * self.focal_px + self.centre_px[1]], axis=-1)
+        return np.stack(
+            [u * self.focal_px + self.centre_px[0], v * self.focal_px + self.centre_px[1]], axis=-1
+        )

@@ -243,7 +243,9 @@ class Psf(Part):
     @model_validator(mode="after")
     def a_disc_has_a_radius(self) -> Psf:
         if (self.kind == "disc") != (self.radius_px > 0):
-            raise ValueError(f"radius_px {self.radius_px:g} with kind {self.kind}; allowed: above 0 with disc only")
+            raise ValueError(
+                f"radius_px {self.radius_px:g} with kind {self.kind}; allowed: above 0 with disc only"
+            )
         return self
 
 
@@ -334,6 +336,12 @@ class Scene(Part):
         return self
 
 
+class CameraFile(Part):
+    """A file that describes a camera and nothing else."""
+
+    camera: Camera
+
+
 def one_of(value: str, allowed: Mapping[str, Any]) -> str:
     """The value, if it is a key of `allowed`."""
     if value not in allowed:
@@ -359,23 +367,38 @@ def load(name: str | Path, overrides: Mapping[str, str] | None = None) -> Scene:
     Raises BadInput with one line: the key, what is wrong with it, what is allowed, the file and line.
     """
     path = find(str(name))
-    try:
-        text = path.read_text(encoding="utf-8")
-        tree = yaml.safe_load(text)
-    except (OSError, UnicodeDecodeError) as error:
-        raise BadInput(f"{path}: cannot be read: {error}") from error
-    except yaml.YAMLError as error:
-        mark = getattr(error, "problem_mark", None)
-        where = f", line {mark.line + 1}" if mark else ""
-        raise BadInput(f"{path}{where}: not YAML: {getattr(error, 'problem', error)}") from error
-    if not isinstance(tree, dict):
-        raise BadInput(f"{path}: a scene is a mapping of keys to values")
+    tree, text = read_yaml(path)
     for key, value in (overrides or {}).items():
         put(tree, key, value)
     try:
         return Scene.model_validate(tree | {"name": path.stem})
     except ValidationError as error:
-        raise BadInput(explain(error, tree, text, path, overrides or {})) from None
+        raise BadInput(explain(error, Scene, tree, text, path, overrides or {})) from None
+
+
+def load_camera(path: Path) -> Camera:
+    """The `camera` section of a scene, or of a file that has nothing else. Raises BadInput with one line."""
+    tree, text = read_yaml(path)
+    try:
+        return CameraFile.model_validate({"camera": tree.get("camera", {})}).camera
+    except ValidationError as error:
+        raise BadInput(explain(error, CameraFile, tree, text, path, {})) from None
+
+
+def read_yaml(path: Path) -> tuple[dict[str, Any], str]:
+    """A YAML mapping and its text."""
+    try:
+        text = path.read_text(encoding="utf-8")
+        tree = yaml.safe_load(text)
+    except (OSError, UnicodeDecodeError) as error:
+        raise BadInput(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from error
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        where = f", line {mark.line + 1}" if mark else ""
+        raise BadInput(f"{path}{where}: not YAML: {getattr(error, 'problem', error)}") from error
+    if not isinstance(tree, dict):
+        raise BadInput(f"{path}: allowed: a mapping of keys to values")
+    return tree, text
 
 
 def put(tree: dict[str, Any], key: str, value: str) -> None:
@@ -392,14 +415,19 @@ def put(tree: dict[str, Any], key: str, value: str) -> None:
 
 
 def explain(
-    error: ValidationError, tree: dict[str, Any], text: str, path: Path, overrides: Mapping[str, str]
+    error: ValidationError,
+    model: type[BaseModel],
+    tree: dict[str, Any],
+    text: str,
+    path: Path,
+    overrides: Mapping[str, str],
 ) -> str:
     """One line for the first fault: `led.falloff: 'cubic' is none of … (scenes/x.yaml, line 31)`."""
     first = error.errors()[0]
     keys = [str(key) for key in in_tree(first["loc"], tree)]
     message = first["msg"].removeprefix("Value error, ").removeprefix("Input should be ")
     if first["type"] == "extra_forbidden":
-        message = "unknown key" + hint(keys[-1], allowed_keys(first["loc"][:-1]))
+        message = "unknown key" + hint(keys[-1], allowed_keys(model, first["loc"][:-1]))
     elif first["type"] == "missing":
         message = "missing"
     elif first["type"].startswith("union_tag"):
@@ -426,9 +454,9 @@ def in_tree(loc: tuple[int | str, ...], tree: Any) -> list[int | str]:
     return keys
 
 
-def allowed_keys(loc: tuple[int | str, ...]) -> list[str]:
+def allowed_keys(model: type[BaseModel], loc: tuple[int | str, ...]) -> list[str]:
     """The keys that a section takes, found by walking the schema along an error's location."""
-    schema = Scene.model_json_schema(by_alias=True)
+    schema = model.model_json_schema(by_alias=True)
     node: dict[str, Any] = schema
     for key in loc:
         node = resolve(node, schema)

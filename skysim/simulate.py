@@ -11,13 +11,15 @@ from scipy.spatial.transform import Rotation
 from estimator import catalog
 from estimator.camera import Camera
 from estimator.nearfield import LedMap, Lever
-from estimator.tracker import DomeTracker, Report, Settings, StarTracker
+from estimator.tracker import Clock, DomeTracker, Report, Settings, StarTracker
+from estimator.types import Attitude, BadImage, Centroids
 from skysim import catalogue, control, dome, sky, world
+from skysim import scene as scene_schema
 from skysim.detector import expose, saturation_dn
 from skysim.optics import Optics
 from skysim.render import render
 from skysim.scene import CATALOGUES, Dome, Pointing, Scene, Tracker
-from skysim.types import BadInput, Frame, Mount, Sources, Trajectory, Truth
+from skysim.types import Frame, Mount, Sources, Trajectory, Truth
 
 STAGE_ID = {"detector": 1}
 
@@ -42,18 +44,19 @@ class Lab:
 
 @dataclass(frozen=True, slots=True)
 class Shot:
-    """One frame, what it was made from, and what the tracker made of it."""
+    """One frame, what it was made from, what the tracker made of it, and seconds spent making it by stage."""
 
     frame: Frame
     truth: Truth
     report: Report
+    seconds: dict[str, float]
 
 
-def prepare(scene: Scene, frames: int | None = None) -> Lab:
+def prepare(scene: Scene) -> Lab:
     """Build the vehicle, fly it to the last exposure, and light the sky or the dome."""
     vehicle = world.build(scene.vehicle)
     mount = world.mount(vehicle)
-    last_s = open_s(scene, (frames or scene.exposure.frames) - 1) + scene.exposure.time_s
+    last_s = open_s(scene, scene.exposure.frames - 1) + scene.exposure.time_s
     pilot = None
     if scene.motion.control == "pid":
         plan = control.plan(scene.motion, lab_from_body_start(scene, mount))
@@ -89,8 +92,9 @@ def open_s(scene: Scene, index: int) -> float:
     return scene.exposure.first_s + index / scene.exposure.rate_hz
 
 
-def shoot(lab: Lab, index: int) -> tuple[Frame, Truth]:
+def shoot(lab: Lab, index: int, clock: Clock | None = None) -> tuple[Frame, Truth]:
     """One frame with its truth. Depends on the scene and the index alone."""
+    clock = clock or Clock()
     scene, chip = lab.scene, lab.scene.camera.detector
     begin, exposure = open_s(scene, index), scene.exposure.time_s
     falloff = scene.light.led.falloff if isinstance(scene.light, Dome) else "inverse_square"
@@ -104,16 +108,16 @@ def shoot(lab: Lab, index: int) -> tuple[Frame, Truth]:
         chip.quantum_efficiency,
         falloff,
     )
+    clock.lap("render")
     image = expose(mean_e, exposure, chip, rng(scene.seed, "detector", index))
+    clock.lap("detector")
     middle = begin + exposure / 2
-    lab_from_body = lab.trajectory.at(middle)
-    step = 1e-3
-    turned = lab.trajectory.at(middle + step).inv() * lab_from_body
+    lab_from_body, rate_body = lab.trajectory.at(middle), lab.trajectory.rate_at(middle)
     truth = Truth(
         middle,
         lab_from_body,
         lab.mount.cam_from_body * lab_from_body.inv(),
-        lab.mount.cam_from_body.apply(-turned.as_rotvec() / step),
+        lab.mount.cam_from_body.apply(rate_body),
         seen,
     )
     return Frame(index, image, middle, exposure, saturation_dn(chip)), truth
@@ -141,16 +145,15 @@ def tracker(lab: Lab) -> Estimator:
 
 def believed_camera(scene: Scene) -> Camera:
     """The calibration in the tracker's head."""
-    camera = scene.camera
-    focal_m = scene.tracker.believed_focal_length_m or camera.focal_length_m
+    focal_m = scene.tracker.believed_focal_length_m or scene.camera.focal_length_m
+    return calibration(scene.camera).zoomed(focal_m / scene.camera.focal_length_m)
+
+
+def calibration(camera: scene_schema.Camera) -> Camera:
+    """A perfect calibration of a camera, in the tracker's own terms."""
     middle = (camera.width_px - 1) / 2, (camera.height_px - 1) / 2
-    return Camera(
-        camera.width_px,
-        camera.height_px,
-        focal_m / camera.pixel_m,
-        camera.principal_point_px or middle,
-        camera.distortion,
-    )
+    centre = camera.principal_point_px or middle
+    return Camera(camera.width_px, camera.height_px, camera.focal_px, centre, camera.distortion)
 
 
 def believed_settings(scene: Scene) -> Settings:
@@ -169,12 +172,18 @@ def believed_settings(scene: Scene) -> Settings:
     )
 
 
-def run(scene: Scene, frames: int | None = None) -> Iterator[Shot]:
+def run(lab: Lab) -> Iterator[Shot]:
     """Photograph and solve frame after frame."""
-    if frames is not None and frames < 1:
-        raise BadInput(f"--frames {frames}: allowed: 1 and more")
-    lab = prepare(scene, frames)
     estimator = tracker(lab)
-    for index in range(frames or scene.exposure.frames):
-        frame, truth = shoot(lab, index)
-        yield Shot(frame, truth, estimator.solve(frame.image_dn))
+    for index in range(lab.scene.exposure.frames):
+        clock = Clock()
+        frame, truth = shoot(lab, index, clock)
+        yield Shot(frame, truth, answer(estimator, frame), clock.seconds)
+
+
+def answer(estimator: Estimator, frame: Frame) -> Report:
+    """The tracker's report; a frame that it will not look at (empty, saturated) is a status too."""
+    try:
+        return estimator.solve(frame.image_dn)
+    except BadImage as error:
+        return Report(Attitude(str(error)), Centroids.none())

@@ -9,11 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from skysim import BadInput as BadInput
+
 Floats = NDArray[np.float64]
-
-
-class BadInput(ValueError):
-    """The user's input is wrong. The message is one line: what, where, what is allowed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +47,9 @@ class Trajectory:
         """
         t = np.atleast_1d(np.asarray(t_s, dtype=float))
         if t.min() < self.t_s[0] - 1e-9 or t.max() > self.t_s[-1] + 1e-9:
-            raise ValueError(f"time {t.min():.6f}..{t.max():.6f} s is outside {self.t_s[0]}..{self.t_s[-1]} s")
+            raise ValueError(
+                f"time {t.min():.6f}..{t.max():.6f} s is outside {self.t_s[0]}..{self.t_s[-1]} s"
+            )
         k = np.clip(np.searchsorted(self.t_s, t, side="right") - 1, 0, len(self.t_s) - 2)
         step = self.t_s[k + 1] - self.t_s[k]
         s = ((t - self.t_s[k]) / step)[:, None]
@@ -61,6 +61,10 @@ class Trajectory:
         phi = turn * s**2 * (3 - 2 * s) + begin * s * (1 - s) ** 2 - end * s**2 * (1 - s)
         here = self.lab_from_body[k] * Rotation.from_rotvec(phi)
         return here if np.ndim(t_s) else here[0]
+
+    def rate_at(self, t_s: float) -> Floats:
+        """(3,) angular velocity in body axes, linear between the samples."""
+        return np.array([np.interp(t_s, self.t_s, rate) for rate in self.rate_body_rad_s.T])
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,3 +147,27 @@ class Frame:
     t_mid_s: float
     exposure_s: float
     saturation_dn: float
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One frame of a run as people read it: angles in degrees, errors in arcseconds, times in ms.
+
+    truth_deg, estimate_deg : (RA, Dec, roll) of the camera under the stars, (roll, pitch, yaw) of the vehicle
+        under the dome
+    wrong : solved, and more than ten arc-minutes off
+    """
+
+    frame: int
+    t_s: float
+    rate_deg_s: float
+    status: str
+    truth_deg: tuple[float, float, float]
+    estimate_deg: tuple[float, float, float] | None
+    cross_arcsec: float
+    roll_arcsec: float
+    detected: int
+    matched: int
+    rms_px: float
+    time_ms: float
+    wrong: bool

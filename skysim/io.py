@@ -1,0 +1,250 @@
+"""Files in and out: frames, truth, solutions. Nothing is ever half-written."""
+
+from __future__ import annotations
+
+import datetime
+import json
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from skysim.scene import Camera, Scene, Stars
+from skysim.types import BadInput, Frame, Truth
+
+IMAGE_SUFFIXES = (".fits", ".fit", ".fts", ".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp")
+FITS_SUFFIXES = (".fits", ".fit", ".fts")
+
+
+@contextmanager
+def whole(path: Path) -> Iterator[Path]:
+    """A temporary name beside `path` that becomes it once everything is written, or vanishes."""
+    temporary = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
+    try:
+        yield temporary
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def make_folder(path: Path) -> Path:
+    """The folder, made if it is not there. Raises BadInput where that cannot be."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise BadInput(f"{path}: cannot be made a folder: {error.strerror}") from error
+    return path
+
+
+def clear_frames(folder: Path) -> None:
+    """Remove the frames of an earlier run, so that a shorter one leaves no strangers behind it."""
+    for suffix in ("fits", "png", "ecsv"):
+        for path in folder.glob(f"frame_[0-9][0-9][0-9][0-9].{suffix}"):
+            path.unlink()
+
+
+def write_frame(folder: Path, frame: Frame, truth: Truth, scene: Scene) -> None:
+    """frame_NNNN.fits (16 bits, header with WCS under the stars), .png (16 bits) and the truth as .ecsv."""
+    stem = folder / f"frame_{frame.index:04d}"
+    write_fits(stem.with_suffix(".fits"), frame, truth, scene)
+    write_png16(stem.with_suffix(".png"), frame.image_dn)
+    write_truth(stem.with_suffix(".ecsv"), frame, truth, scene)
+
+
+def write_fits(path: Path, frame: Frame, truth: Truth, scene: Scene) -> None:
+    """FITS: uint16 (or float64 of a noise-free frame) with exposure, time, scene, seed."""
+    from astropy.io import fits
+
+    header = fits.Header()
+    header["EXPTIME"] = (frame.exposure_s, "exposure [s]")
+    header["DATE-OBS"] = (mid_time(scene, frame).isoformat(timespec="microseconds"), "mid-exposure [UTC]")
+    header["TMID"] = (frame.t_mid_s, "mid-exposure since the scene's start [s]")
+    header["SCENE"] = (scene.name, "scene")
+    header["SEED"] = (scene.seed, "seed of every random stream")
+    header["FRAME"] = (frame.index, "index of the frame")
+    header["SATURATE"] = (frame.saturation_dn, "saturation [DN]")
+    if isinstance(scene.light, Stars):
+        header.update(wcs(scene.camera, truth.cam_from_lab))
+    with whole(path) as temporary:
+        fits.PrimaryHDU(frame.image_dn, header).writeto(temporary, overwrite=True)
+
+
+def mid_time(scene: Scene, frame: Frame) -> datetime.datetime:
+    return scene.start_time + datetime.timedelta(seconds=frame.t_mid_s)
+
+
+def wcs(camera: Camera, cam_from_icrs: Rotation) -> dict[str, Any]:
+    """Gnomonic WCS of the true pointing (Calabretta & Greisen 2002), without the lens's distortion.
+
+    CD carries pixel offsets to degrees east (xi) and north (eta) of the tangent point; rows of the attitude
+    matrix are the camera's axes in the ICRS, so its products with the local east and north are the CD's columns.
+    """
+    right, down, sight = cam_from_icrs.as_matrix()
+    ra, dec = np.arctan2(sight[1], sight[0]), np.arcsin(np.clip(sight[2], -1, 1))
+    east = np.array([-np.sin(ra), np.cos(ra), 0.0])
+    north = np.array([-np.sin(dec) * np.cos(ra), -np.sin(dec) * np.sin(ra), np.cos(dec)])
+    centre = camera.principal_point_px or ((camera.width_px - 1) / 2, (camera.height_px - 1) / 2)
+    scale = np.degrees(1 / camera.focal_px)
+    return {
+        "CTYPE1": "RA---TAN",
+        "CTYPE2": "DEC--TAN",
+        "CUNIT1": "deg",
+        "CUNIT2": "deg",
+        "RADESYS": "ICRS",
+        "CRVAL1": np.degrees(ra) % 360,
+        "CRVAL2": np.degrees(dec),
+        "CRPIX1": centre[0] + 1,  # FITS counts pixels from 1
+        "CRPIX2": centre[1] + 1,
+        "CD1_1": scale * (right @ east),
+        "CD1_2": scale * (down @ east),
+        "CD2_1": scale * (right @ north),
+        "CD2_2": scale * (down @ north),
+    }
+
+
+def write_png16(path: Path, image_dn: NDArray) -> None:
+    """16-bit PNG of the digital numbers themselves; a noise-free frame is rounded."""
+    numbers = np.clip(np.rint(image_dn), 0, 65535).astype(np.uint16)
+    write_image(path, numbers)
+
+
+def write_image(path: Path, image: NDArray) -> None:
+    """An image by the name's ending. Raises BadInput if it cannot be written."""
+    with whole(path) as temporary:
+        if not cv2.imwrite(str(temporary), image):
+            raise BadInput(f"{path}: cannot be written as an image")
+
+
+def write_truth(path: Path, frame: Frame, truth: Truth, scene: Scene) -> None:
+    """The truth beside the frame: attitude and rates in the header, one row a source."""
+    from astropy.table import Table
+
+    seen = truth.seen
+    table = Table(
+        {
+            "id": seen.id,
+            "x_px": seen.xy_px[:, 0],
+            "y_px": seen.xy_px[:, 1],
+            "flux_x_px": seen.flux_xy_px[:, 0],
+            "flux_y_px": seen.flux_xy_px[:, 1],
+            "electrons": seen.electrons,
+            "peak_e": seen.peak_e,
+            "streak_px": seen.streak_px,
+        }
+    )
+    for name in table.colnames[1:]:
+        table[name].info.format = ".9g"
+    table.meta = {
+        "scene": scene.name,
+        "seed": scene.seed,
+        "frame": frame.index,
+        "t_mid_s": frame.t_mid_s,
+        "exposure_s": frame.exposure_s,
+        "lab_from_body_xyzw": truth.lab_from_body.as_quat().tolist(),
+        "cam_from_lab_xyzw": truth.cam_from_lab.as_quat().tolist(),
+        "rate_cam_rad_s": truth.rate_cam_rad_s.tolist(),
+        "lab": "ICRS axes" if isinstance(scene.light, Stars) else "bearing centre, z up",
+    }
+    write_table(path, table)
+
+
+def write_table(path: Path, table: Any) -> None:
+    """An astropy table as ECSV."""
+    with whole(path) as temporary:
+        table.write(temporary, format="ascii.ecsv", overwrite=True)
+
+
+def write_text(path: Path, text: str) -> None:
+    with whole(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def to_json(data: Any) -> str:
+    """JSON with null for what is not a number."""
+
+    def plain(value: Any) -> Any:
+        if isinstance(value, dict):
+            return {key: plain(item) for key, item in value.items()}
+        if isinstance(value, list | tuple):
+            return [plain(item) for item in value]
+        if isinstance(value, np.generic):
+            value = value.item()
+        return None if isinstance(value, float) and not np.isfinite(value) else value
+
+    return json.dumps(plain(data), indent=1, allow_nan=False)
+
+
+def read_image(path: Path) -> NDArray:
+    """The pixels of a FITS, PNG, TIFF, JPEG or BMP file as they are: (H, W) or (H, W, channels).
+
+    Raises BadInput with one line for a file that is missing, truncated, or no image.
+    """
+    if not path.is_file():
+        raise BadInput(f"{path}: no such file")
+    if path.suffix.lower() not in IMAGE_SUFFIXES:
+        raise BadInput(f"{path}: not an image by its name; allowed: {', '.join(IMAGE_SUFFIXES)}")
+    image = read_fits(path) if path.suffix.lower() in FITS_SUFFIXES else read_picture(path)
+    if image.dtype.kind not in "uif":
+        raise BadInput(f"{path}: pixels of type {image.dtype}; allowed: integers and floats")
+    return image
+
+
+def read_fits(path: Path) -> NDArray:
+    import warnings
+
+    from astropy.io import fits
+    from astropy.utils.exceptions import AstropyWarning
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", AstropyWarning)  # "file may have been truncated" is one
+            with fits.open(path, memmap=False) as hdus:
+                for hdu in hdus:
+                    if getattr(hdu, "is_image", False) and hdu.header.get("NAXIS", 0) > 0:
+                        return np.ascontiguousarray(hdu.data.astype(hdu.data.dtype.newbyteorder("=")))
+    except (OSError, TypeError, ValueError, AstropyWarning, MemoryError) as error:
+        raise BadInput(f"{path}: not a whole FITS file: {' '.join(str(error).split())}") from None
+    raise BadInput(f"{path}: a FITS file without an image")
+
+
+def date_of(path: Path) -> datetime.datetime | None:
+    """DATE-OBS of a FITS file; None for other files and other headers."""
+    if path.suffix.lower() not in FITS_SUFFIXES:
+        return None
+    from astropy.io import fits
+
+    text = fits.getheader(path).get("DATE-OBS")
+    try:
+        return datetime.datetime.fromisoformat(str(text))
+    except ValueError:
+        return None
+
+
+def read_picture(path: Path) -> NDArray:
+    data = np.fromfile(path, np.uint8)
+    try:
+        image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if len(data) else None
+    except cv2.error as error:
+        raise BadInput(f"{path}: cannot be decoded: {' '.join(str(error).split())}") from None
+    if image is None:
+        raise BadInput(f"{path}: cannot be decoded; it may be truncated or not an image")
+    return image
+
+
+def monochrome(image: NDArray) -> NDArray:
+    """Luminance of a colour picture (its alpha channel aside); a monochrome one as it is."""
+    if image.ndim == 2:
+        return image
+    if image.ndim != 3 or image.shape[2] not in (1, 3, 4):
+        raise BadInput(
+            f"an image of shape {image.shape}; allowed: (height, width) and colour with 3 or 4 channels"
+        )
+    if image.shape[2] == 1:
+        return np.ascontiguousarray(image[:, :, 0])
+    return cv2.cvtColor(np.ascontiguousarray(image[:, :, :3]), cv2.COLOR_BGR2GRAY)
