@@ -135,7 +135,8 @@ def check(path: Path, image: NDArray, camera: scene.Camera | None) -> None:
 def solution(found: Report, tracker: StarTracker) -> dict[str, Any]:
     """The numbers of a solved image, at the image's middle."""
     attitude = found.attitude
-    assert attitude.cam_from_ref is not None and attitude.match is not None
+    assert attitude.cam_from_ref is not None
+    assert attitude.match is not None
     camera = tracker.camera.zoomed(attitude.focal_px / tracker.camera.focal_px)
     ra, dec, roll = np.degrees(radecroll_rad(at_middle(camera) * attitude.cam_from_ref))
     return {
@@ -153,7 +154,7 @@ def at_middle(camera: Camera) -> Any:
     from scipy.spatial.transform import Rotation
 
     middle = np.array([(camera.width_px - 1) / 2, (camera.height_px - 1) / 2])
-    sight, below = camera.rays(np.array([middle, middle + [0.0, 1.0]]))
+    sight, below = camera.rays(np.array([middle, [middle[0], middle[1] + 1]]))
     across = np.cross(below - sight, sight)
     across /= np.linalg.norm(across)
     return Rotation.from_matrix(np.array([across, np.cross(sight, across), sight]))

@@ -1,0 +1,164 @@
+"""The conventions of the house, each nailed by a number worked out by hand. Read this file first."""
+
+import mujoco
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from estimator.attitude import radecroll_rad
+from estimator.camera import Camera
+from skysim import scene, world
+from skysim.optics import Optics
+from skysim.sky import cam_from_icrs
+
+# A pinhole whose arithmetic can be done in the head: f = 1000 px, middle of the chip at (320, 240).
+OPTICS = Optics(641, 481, 1000.0, (320.0, 240.0), (0.0,) * 5, 0.7, 0.0, 1.0)
+BELIEVED = Camera(641, 481, 1000.0, (320.0, 240.0))
+EXACT = 1e-12  # double precision on numbers of order one
+
+
+def icrs(ra_deg: float, dec_deg: float) -> np.ndarray:
+    """Unit vector: x to RA 0, y to RA 90, z to the north pole."""
+    ra, dec = np.radians([ra_deg, dec_deg])
+    return np.array([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
+
+
+@pytest.mark.parametrize(
+    ("vector_cam", "pixel"),
+    [
+        ([0.0, 0.0, 1.0], (320.0, 240.0)),  # on the boresight: the principal point
+        ([0.01, 0.0, 1.0], (330.0, 240.0)),  # to the right: larger x
+        ([0.0, -0.01, 1.0], (320.0, 230.0)),  # above: smaller y
+        ([0.02, 0.03, 2.0], (330.0, 255.0)),  # only the direction counts
+    ],
+)
+def test_a_direction_falls_on_the_pixel_worked_out_by_hand(vector_cam, pixel):
+    """Both pieces of code for the one law: the hardware's and the tracker's."""
+    vector = np.array([vector_cam])
+    np.testing.assert_allclose(OPTICS.project(vector)[0], pixel, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(BELIEVED.pixels(vector)[0], pixel, rtol=0, atol=1e-9)
+
+
+def test_pixel_zero_is_the_middle_of_the_first_pixel():
+    """0-based, the integer is the pixel's centre: the chip reaches from -0.5 to width - 0.5."""
+    edges = np.array([[-0.5, -0.5], [-0.51, 0.0], [640.5, 480.5], [640.51, 0.0]])
+    assert BELIEVED.contains(edges).tolist() == [True, False, True, False]
+
+
+def test_arrays_are_indexed_row_first():
+    """A light at pixel (x, y) = (7, 3) brightens image[3, 7]."""
+    from skysim.render import splat
+
+    image = np.zeros((10, 12))
+    splat(image, np.array([[[7.0, 3.0]]]), np.array([[100.0]]), np.zeros(1), np.full(1, 0.3))
+    assert np.unravel_index(image.argmax(), image.shape) == (3, 7)
+
+
+def test_camera_axes_for_a_camera_at_the_origin_of_right_ascension():
+    """Boresight RA 0, Dec 0, north up: right is west (-y of ICRS), down is south (-z), boresight is +x."""
+    expected = [[0, -1, 0], [0, 0, -1], [1, 0, 0]]
+    np.testing.assert_allclose(cam_from_icrs(0, 0, 0).as_matrix(), expected, rtol=0, atol=EXACT)
+
+
+def test_north_is_up_and_east_is_left():
+    """Seen from inside the sphere, as on the sky and unlike on a map of the ground."""
+    look = cam_from_icrs(0, 0, 0)
+    north, east = OPTICS.project(look.apply([icrs(0, 1), icrs(1, 0)]))
+    offset = 1000 * np.tan(np.radians(1))  # 17.4551 px
+    np.testing.assert_allclose(north, (320, 240 - offset), rtol=0, atol=1e-9)
+    np.testing.assert_allclose(east, (320 - offset, 240), rtol=0, atol=1e-9)
+
+
+def test_roll_is_the_position_angle_of_up_from_north_through_east():
+    """At roll 90 the image's up points east: a star to the east is above, a star to the north is right."""
+    look = cam_from_icrs(0, 0, 90)
+    north, east = OPTICS.project(look.apply([icrs(0, 1), icrs(1, 0)]))
+    offset = 1000 * np.tan(np.radians(1))
+    np.testing.assert_allclose(east, (320, 240 - offset), rtol=0, atol=1e-9)
+    np.testing.assert_allclose(north, (320 + offset, 240), rtol=0, atol=1e-9)
+
+
+def test_three_stars_keep_their_handedness():
+    """From the Belt (Mintaka, west, to Alnitak, east) Betelgeuse is north: counter-clockwise on the sky.
+
+    Seen north up, Mintaka is right of Alnitak and Betelgeuse above both; a mirrored image would not do.
+    """
+    mintaka, alnitak, betelgeuse = icrs(83.00, -0.30), icrs(85.19, -1.94), icrs(88.79, 7.41)
+    pixels = OPTICS.project(cam_from_icrs(85, 2, 0).apply([mintaka, alnitak, betelgeuse]))
+    assert pixels[0, 0] > pixels[1, 0] > pixels[2, 0]
+    assert pixels[2, 1] < pixels[0, 1] < pixels[1, 1]
+
+
+def test_the_tracker_reads_the_pointing_that_the_simulator_set():
+    """Vega in the middle (RA 279.2347, Dec +38.7837), up at position angle -25: said once each way."""
+    look = Rotation.from_matrix(hand_made(279.2347, 38.7837, -25.0))
+    np.testing.assert_allclose(np.degrees(radecroll_rad(look)), (279.2347, 38.7837, -25.0), rtol=0, atol=1e-10)
+    assert (look * cam_from_icrs(279.2347, 38.7837, -25.0).inv()).magnitude() < EXACT
+
+
+def hand_made(ra_deg: float, dec_deg: float, roll_deg: float) -> np.ndarray:
+    """Rows right, down, boresight by elementary turns alone: Rz(-roll) applied to (west, south, out)."""
+    turn = Rotation.from_euler("z", ra_deg, degrees=True) * Rotation.from_euler("y", -dec_deg, degrees=True)
+    out, east, north = turn.apply(np.eye(3))  # where x, y, z of a frame at RA 0, Dec 0 go
+    c, s = np.cos(np.radians(roll_deg)), np.sin(np.radians(roll_deg))
+    up, right = c * north + s * east, s * north - c * east
+    return np.array([right, -up, out])
+
+
+def test_a_known_star_at_a_known_pixel():
+    """Sirius (101.2872, -16.7161) seen from a boresight 2 deg south of it, north up: 34.92 px above the middle."""
+    sirius = cam_from_icrs(101.2872, -18.7161, 0).apply(icrs(101.2872, -16.7161))
+    expected = (320.0, 240 - 1000 * np.tan(np.radians(2)))  # 34.9208 px
+    np.testing.assert_allclose(OPTICS.project(sirius[None])[0], expected, rtol=0, atol=1e-9)
+
+
+def test_quaternion_orders():
+    """A quarter turn about z: SciPy and the papers (x, y, z, w), MuJoCo (w, x, y, z)."""
+    half = np.sqrt(0.5)
+    quarter = Rotation.from_euler("z", 90, degrees=True)
+    np.testing.assert_allclose(quarter.as_quat(), [0, 0, half, half], rtol=0, atol=EXACT)
+    np.testing.assert_allclose(quarter.as_quat(scalar_first=True), [half, 0, 0, half], rtol=0, atol=EXACT)
+    quat_wxyz = np.array([half, 0, 0, half])
+    turned = np.zeros(3)
+    mujoco.mju_rotVecQuat(turned, np.array([1.0, 0, 0]), quat_wxyz)
+    np.testing.assert_allclose(turned, [0, 1, 0], rtol=0, atol=EXACT)
+    np.testing.assert_allclose(quarter.apply([1, 0, 0]), [0, 1, 0], rtol=0, atol=EXACT)
+
+
+def test_names_of_rotations_cancel():
+    """v_a = a_from_b.apply(v_b), and neighbours cancel: cam_from_lab = cam_from_body * body_from_lab."""
+    lab_from_body = Rotation.from_euler("z", 90, degrees=True)  # the vehicle has yawed to the left
+    cam_from_body = Rotation.identity()
+    cam_from_lab = cam_from_body * lab_from_body.inv()
+    # Something along lab y lies straight ahead of body x, which is the camera's right.
+    np.testing.assert_allclose(cam_from_lab.apply([0, 1, 0]), [1, 0, 0], rtol=0, atol=EXACT)
+
+
+def test_mujocos_camera_against_ours():
+    """SimSat level: its camera is 15 in up, looks at the zenith, the image's right along lab x, down along lab y.
+
+    MuJoCo's own camera (+y up, looks along -z) then has its x along lab x, y along lab -y, z along lab -z.
+    """
+    vehicle = scene.Vehicle.model_validate({"model": "vehicles/simsat.xml"})
+    ship = world.build(vehicle)
+    data = mujoco.MjData(ship.model)
+    mujoco.mj_forward(ship.model, data)
+    axes = data.camera("star_camera").xmat.reshape(3, 3)
+    np.testing.assert_allclose(axes, np.diag([1.0, -1.0, -1.0]), rtol=0, atol=EXACT)
+    mount = world.mount(ship)
+    np.testing.assert_allclose(mount.camera_body_m, [0, 0, 0.381], rtol=0, atol=EXACT)
+    np.testing.assert_allclose(mount.cam_from_body.as_matrix(), np.eye(3), rtol=0, atol=EXACT)
+
+
+def test_a_tilt_moves_an_apex_led_the_way_worked_out_by_hand():
+    """Roll +10 deg about lab x lifts lab +y: body z leans to -y, so the apex LED falls on the image's +y side.
+
+    Camera 0.381 m up a vehicle tilted by 10 deg stands at (0, -0.381 sin 10, 0.381 cos 10). The apex LED, 1.2192 m
+    up, is seen in body axes at (0, 1.2192 sin 10, 1.2192 cos 10 - 0.381), so v = 1000 * .21171 / .81968 below.
+    """
+    from estimator.nearfield import Lever, project
+
+    body_from_lab = Rotation.from_euler("x", 10, degrees=True).inv()
+    lever = Lever(np.array([0, 0, 0.381]), Rotation.identity())
+    pixel = project(body_from_lab, np.array([[0, 0, 1.2192]]), lever, BELIEVED)[0]
+    np.testing.assert_allclose(pixel, (320.0, 240 + 1000 * 0.2117119 / 0.8196768), rtol=0, atol=1e-3)
