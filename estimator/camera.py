@@ -32,8 +32,10 @@ class Camera:
 
     @property
     def fov_rad(self) -> float:
-        """Horizontal field between the middles of the edge columns of an undistorted image."""
-        return float(2 * np.arctan((self.width_px - 1) / 2 / self.focal_px))
+        """Horizontal field: the angle between the rays of the left and right edges' middle pixels."""
+        row = (self.height_px - 1) / 2
+        left, right = self.rays(np.array([[0.0, row], [self.width_px - 1.0, row]]))
+        return float(np.arctan2(np.linalg.norm(np.cross(left, right)), left @ right))
 
     @property
     def diagonal_rad(self) -> float:

@@ -62,14 +62,14 @@ def on_earth(time_utc: datetime.datetime) -> Observer:
     return Observer(2000 + days / 365.25, barycentric["p"], barycentric["v"] * metres_per_second)
 
 
-def read(path: Path) -> StarList:
+def read(path: str | Path) -> StarList:
     """Read a catalogue file: ECSV with hip, ra_deg, dec_deg, pm_ra_mas_yr, pm_dec_mas_yr, parallax_mas, v_mag.
 
     Raises BadImage with one line if it cannot be read.
     """
     names = ("hip", "ra_deg", "dec_deg", "pm_ra_mas_yr", "pm_dec_mas_yr", "parallax_mas", "v_mag")
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
+        lines = Path(path).read_text(encoding="utf-8").splitlines()
         body = [line for line in lines if line and not line.startswith("#")]
         delimiter = "," if "," in body[0] else None
         header = body[0].replace('"', "").split(delimiter)
@@ -79,8 +79,9 @@ def read(path: Path) -> StarList:
         raise BadImage(
             f"{path}: not a star catalogue ({error}); allowed: ECSV with {', '.join(names)}"
         ) from None
-    hip, ra_deg, dec_deg, *rest, v_mag = table.T
-    stars = from_columns(hip.astype(np.int64), np.radians(ra_deg), np.radians(dec_deg), *rest, v_mag)
+    hip, ra_deg, dec_deg, pm_ra, pm_dec, parallax, v_mag = table.T
+    place = np.radians(ra_deg), np.radians(dec_deg)
+    stars = from_columns(hip.astype(np.int64), *place, pm_ra, pm_dec, parallax, v_mag)
     return stars.take(np.argsort(v_mag, kind="stable"))
 
 

@@ -24,6 +24,7 @@ def local(image: NDArray, threshold_sigma: float = 5.0, min_area_px: int = 3, ma
     image : (H, W), any real dtype. Raises BadImage where there is nothing to look at.
     """
     check(image)
+    image = native(image)
     background = sky(image)
     return gather(image, background, threshold_sigma * background.noise, min_area_px, max_blobs)
 
@@ -33,6 +34,7 @@ def threshold(
 ) -> Blobs:
     """Blobs above one level for the whole frame: its median plus `threshold_sigma` times its noise."""
     check(image)
+    image = native(image)
     background = sky(image)
     level, noise = np.median(background.level), np.median(background.noise)
     flat = Background(np.full((1, 1), level), np.full((1, 1), noise), max(image.shape))
@@ -43,7 +45,9 @@ DETECTORS: dict[str, Detector] = {"local": local, "threshold": threshold}
 
 
 def check(image: NDArray) -> None:
-    """Raise BadImage with one line unless the image is a plain, finite, uneven (H, W) array."""
+    """Raise BadImage with one line unless the image is a plain, finite, uneven (H, W) array of real numbers."""
+    if image.dtype.kind not in "buif":
+        raise BadImage(f"pixels of type {image.dtype} are no brightness; allowed: integers and floats")
     if image.ndim != 2:
         raise BadImage(f"an image of shape {image.shape} is not monochrome; allowed: (height, width)")
     if min(image.shape) < 16:
@@ -53,6 +57,14 @@ def check(image: NDArray) -> None:
         raise BadImage("the image holds NaN or infinite pixels; allowed: finite values")
     if low == high:
         raise BadImage(f"the frame is empty: every pixel is {low}")
+
+
+def native(image: NDArray) -> NDArray:
+    """The image in a type that compiled code takes: FITS files are big-endian, masks are boolean."""
+    kind = {"b": "uint8", "f": "float32" if image.itemsize == 2 else "float64"}.get(image.dtype.kind)
+    if kind and image.itemsize not in (4, 8):
+        return image.astype(kind)
+    return image.astype(image.dtype.newbyteorder("="), copy=False)
 
 
 def sky(image: NDArray, tile_px: int = TILE_PX) -> Background:
@@ -200,6 +212,7 @@ def _label(image: NDArray, level: Floats, above: Floats, limit: int) -> tuple[ND
                 mine = labels
                 parent[mine] = mine
                 boxes[mine] = (x, y, x, y)
+                sums[mine, 4] = image[y, x]
                 labels += 1
             current[x + 1] = mine
             excess = image[y, x] - sky_row[x]

@@ -191,7 +191,7 @@ class StarTracker:
         chance = log10_chance(observed, len(centroids), len(rows), radius_px, camera, len(self.index.pair))
         if chance > ACCEPT_LOG10_CHANCE:
             return Attitude(NO_MATCH)
-        if abs(camera.focal_px / self.camera.focal_px - 1) > 1.2 * self.focal_uncertainty + 1e-9:
+        if abs(camera.fov_rad / self.camera.fov_rad - 1) > 1.2 * self.focal_uncertainty + 1e-9:
             return Attitude(NO_MATCH)
         residual = camera.pixels(cam_from_ref.apply(vectors)) - xy
         return Attitude(
@@ -200,7 +200,7 @@ class StarTracker:
             covariance(rays, sigma_rad),
             StarMatch(observed, star, cam_from_ref, chance),
             float(np.sqrt(np.mean(residual**2))),
-            camera.focal_px,
+            camera,
         )
 
     def _in_field(self, camera: Camera, cam_from_ref: Rotation) -> tuple[NDArray, Floats]:
@@ -369,5 +369,5 @@ class DomeTracker:
             R_cam_from_body @ spread @ R_cam_from_body.T,
             StarMatch(observed, star, cam_from_lab, chance),
             float(np.sqrt(np.mean(residual**2))),
-            camera.focal_px,
+            camera,
         )

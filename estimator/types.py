@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from estimator import BadImage as BadImage
+
+if TYPE_CHECKING:
+    from estimator.camera import Camera
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -52,8 +55,8 @@ class Blobs:
 
     def take(self, which: NDArray[Any]) -> Blobs:
         """The chosen blobs, by mask or index."""
-        chosen = (getattr(self, name)[which] for name in ("box_px", "xy_px", "flux", "peak", "area_px"))
-        return Blobs(*chosen, self.background)
+        names = ("box_px", "xy_px", "flux", "peak", "area_px")
+        return replace(self, **{name: getattr(self, name)[which] for name in names})
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,7 +109,7 @@ class Attitude:
     covariance_rad2 : (3, 3) of the small rotation in camera axes; None unless solved
     match           : the stars it rests on; None unless solved
     rms_px          : of the matched centroids' residuals; NaN unless solved
-    focal_px        : the focal length that it was solved with; NaN unless solved
+    camera          : the calibration that it was solved with, fitted where it was uncertain; None unless solved
     """
 
     status: str
@@ -114,7 +117,7 @@ class Attitude:
     covariance_rad2: Floats | None = None
     match: StarMatch | None = None
     rms_px: float = float("nan")
-    focal_px: float = float("nan")
+    camera: Camera | None = None
 
     @property
     def solved(self) -> bool:

@@ -39,18 +39,19 @@ T = TypeVar("T")
 
 def main() -> None:
     """Run the command; whatever the user got wrong ends as one line and exit code 2."""
-    import click
-
     try:
         code = app(standalone_mode=False)
     except (BadInput, BadImage) as error:
         code = complain(str(error))
     except OSError as error:
         code = complain(f"{error.filename}: {error.strerror}" if error.filename else str(error))
-    except click.ClickException as error:
-        code = complain(error.format_message() or "give a command; see skysim --help")
-    except (click.Abort, KeyboardInterrupt):
+    except (typer.Abort, KeyboardInterrupt):
         code = complain("stopped", 130)
+    except Exception as error:
+        # Usage errors: typer's own since it carries its parser within, click's before that.
+        if not hasattr(error, "format_message"):
+            raise
+        code = complain(" ".join(error.format_message().split()) or "give a command; see skysim --help")
     sys.exit(code if isinstance(code, int) else 0)
 
 
@@ -83,9 +84,11 @@ def run(
         tally.add(shot)
     names = score.angle_names(loaded)
     io.write_table(folder / "solutions.ecsv", score.table(rows, names))
+    picture = tally.picture()
+    io.write_image(folder / "annotated.png", picture)
     page = folder / "report.html"
     command = shlex.join(["skysim", *sys.argv[1:]])
-    report.write_page(page, loaded.title, command, names, rows, tally.median_ms(), tally.picture())
+    report.write_page(page, loaded.title, command, names, rows, tally.median_ms(), picture)
     figures = report.summary(rows) | {"stages_ms": tally.median_ms(), "report": str(page)}
     if json:
         print(io.to_json({"scene": loaded.name, **figures, "rows": report.as_dicts(rows)}))

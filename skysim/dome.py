@@ -32,6 +32,10 @@ class Ellipsoid:
         gradient = (points_m - self.centre_m) / self.semi_axes_m**2
         return -gradient / np.linalg.norm(gradient, axis=1, keepdims=True)
 
+    def as_ellipsoid(self) -> tuple[Floats, Floats]:
+        """Centre and semi-axes, (3,) each, m."""
+        return self.centre_m, self.semi_axes_m
+
 
 @dataclass(frozen=True, slots=True)
 class Plane:
@@ -47,6 +51,11 @@ class Plane:
     def inward(self, points_m: Floats) -> Floats:
         """(N, 3) unit normals, straight down."""
         return np.tile([0.0, 0.0, -1.0], (len(points_m), 1))
+
+    def as_ellipsoid(self) -> tuple[Floats, Floats]:
+        """A sphere so great (1000 km) that it is flat to a micrometre within a metre."""
+        radius_m = 1e6
+        return np.array([0.0, 0.0, self.height_m - radius_m]), np.full(3, radius_m)
 
 
 Surface = Ellipsoid | Plane
@@ -81,6 +90,8 @@ def surface(part: scene.Surface) -> Surface:
     made = SURFACES[part.kind](part)
     if isinstance(made, Ellipsoid) and np.sum((made.centre_m / made.semi_axes_m) ** 2) >= 1:
         raise BadInput("light.surface: the bearing's centre is outside of the dome; check apex and semi_axes")
+    if isinstance(made, Plane) and made.height_m <= 0:
+        raise BadInput("light.surface: the panel is not above the bearing's centre; check apex and offset")
     return made
 
 

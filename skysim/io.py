@@ -5,6 +5,7 @@ from __future__ import annotations
 import datetime
 import json
 import os
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -229,12 +230,27 @@ def date_of(path: Path) -> datetime.datetime | None:
 def read_picture(path: Path) -> NDArray:
     data = np.fromfile(path, np.uint8)
     try:
-        image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if len(data) else None
+        with silent_stderr():
+            image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if len(data) else None
     except cv2.error as error:
         raise BadInput(f"{path}: cannot be decoded: {' '.join(str(error).split())}") from None
     if image is None:
         raise BadInput(f"{path}: cannot be decoded; it may be truncated or not an image")
     return image
+
+
+@contextmanager
+def silent_stderr() -> Iterator[None]:
+    """Keep C libraries quiet: libpng and OpenCV print their complaints on file descriptor 2 themselves."""
+    sys.stderr.flush()
+    kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(nowhere, 2)
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(nowhere)
 
 
 def monochrome(image: NDArray) -> NDArray:

@@ -55,7 +55,8 @@ class Optics:
     @property
     def half_diagonal_rad(self) -> float:
         """Greatest angle from the boresight at which an undistorted camera sees anything."""
-        reach = np.hypot(*np.maximum(self.centre_px, (self.width_px, self.height_px)))
+        centre, size = np.array(self.centre_px), np.array([self.width_px, self.height_px])
+        reach = np.hypot(*np.maximum(centre + 0.5, size - 0.5 - centre))
         return float(np.arctan(reach / self.focal_px))
 
     def project(self, vectors_cam: Floats) -> Floats:

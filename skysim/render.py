@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from math import erf, erfc, pi, sqrt
+from math import cos, erf, erfc, exp, pi, sin, sqrt
 
 import numba
 import numpy as np
@@ -16,6 +16,9 @@ from skysim.types import Floats, Mount, Seen, Sources, Trajectory
 STEP_PX = 0.25
 MAX_STEPS = 2000
 REACH_SIGMA = 6.5  # a Gaussian's share beyond is 1e-10
+NARROW = 3.0  # radius over sigma below which a disc is a sum of Gaussians
+RING_SHARE = ((1 - sqrt(0.6)) / 2, 0.5, (1 + sqrt(0.6)) / 2)  # Gauss-Legendre in r^2 on a disc of radius 1
+RING_WEIGHT = (5 / 18, 8 / 18, 5 / 18)
 
 
 def render(
@@ -36,15 +39,14 @@ def render(
     part by part.
     """
     image = np.zeros((optics.height_px, optics.width_px))
-    seen_by = in_view(sources, optics, trajectory, mount, open_s + exposure_s / 2)
-    near = sources.take(seen_by)
+    moments_s = open_s + exposure_s * np.linspace(0, 1, 9)
+    near = sources.take(in_view(sources, optics, trajectory, mount, moments_s))
     if not len(near):
         return image, Seen(near.id, *(np.empty((0, 2)),) * 2, *(np.empty(0),) * 3)
-    parts = steps_needed(near, optics, trajectory, mount, open_s, exposure_s)
+    streak = path_px(near, optics, trajectory, mount, moments_s)
+    parts = int(np.clip(np.ceil(streak.max() / STEP_PX), 1, MAX_STEPS))
     edges = open_s + exposure_s * np.arange(parts + 1) / parts
-    xy, toward, distance, cos_out, cos_in = look(
-        near, optics, trajectory, mount, (edges[:-1] + edges[1:]) / 2
-    )
+    xy, _, distance, cos_out, cos_in = look(near, optics, trajectory, mount, (edges[:-1] + edges[1:]) / 2)
     starry = near.place[:, 3] == 0
     flux = np.where(
         starry,
@@ -59,7 +61,6 @@ def render(
     sigma = np.sqrt(optics.blur_sigma_px**2 + thin**2 / 4)
     table = splat(image, np.ascontiguousarray(np.nan_to_num(xy, nan=-1e6)), electrons, wide, sigma)
     middle = look(near, optics, trajectory, mount, np.array([open_s + exposure_s / 2]))[0][0]
-    streak = np.linalg.norm(np.diff(xy, axis=0), axis=2).sum(axis=0) * parts / max(parts - 1, 1)
     kept = table[:, 0] > 0
     return image, Seen(
         near.id[kept], middle[kept], table[kept, 2:4], table[kept, 0], table[kept, 1], streak[kept]
@@ -86,29 +87,23 @@ def look(
 
 
 def in_view(
-    sources: Sources, optics: Optics, trajectory: Trajectory, mount: Mount, t_s: float
+    sources: Sources, optics: Optics, trajectory: Trajectory, mount: Mount, t_s: Floats
 ) -> NDArray[np.int64]:
-    """Rows of the sources within the field's circle, with a quarter more for what enters during the exposure."""
+    """Rows of the sources within the field's circle at any of these times, with a quarter more for distortion
+    and for images that reach in from outside."""
     lab_from_body: Rotation = trajectory.at(t_s)
     sight = (mount.cam_from_body * lab_from_body.inv()).inv().apply([0.0, 0.0, 1.0])
     camera_m = lab_from_body.apply(mount.camera_body_m)
-    offset = sources.place[:, :3] - sources.place[:, 3:] * camera_m
-    cosine = offset @ sight / np.linalg.norm(offset, axis=1)
-    return np.flatnonzero(cosine > np.cos(min(1.25 * optics.half_diagonal_rad + 0.02, np.pi)))
+    offset = sources.place[None, :, :3] - sources.place[None, :, 3:] * camera_m[:, None, :]
+    cosine = np.einsum("knj,kj->kn", offset, sight) / np.linalg.norm(offset, axis=2)
+    edge = np.cos(min(1.25 * optics.half_diagonal_rad + 0.02, np.pi))
+    return np.flatnonzero((cosine > edge).any(axis=0))
 
 
-def steps_needed(
-    sources: Sources,
-    optics: Optics,
-    trajectory: Trajectory,
-    mount: Mount,
-    open_s: float,
-    exposure_s: float,
-) -> int:
-    """Parts of the exposure that keep every image within STEP_PX a part, from the paths through nine poses."""
-    xy = look(sources, optics, trajectory, mount, open_s + exposure_s * np.linspace(0, 1, 9))[0]
-    path = np.nan_to_num(np.linalg.norm(np.diff(xy, axis=0), axis=2)).sum(axis=0).max(initial=0.0)
-    return int(np.clip(np.ceil(path / STEP_PX), 1, MAX_STEPS))
+def path_px(sources: Sources, optics: Optics, trajectory: Trajectory, mount: Mount, t_s: Floats) -> Floats:
+    """(N,) length of each image's path through these times."""
+    xy = look(sources, optics, trajectory, mount, t_s)[0]
+    return np.asarray(np.nan_to_num(np.linalg.norm(np.diff(xy, axis=0), axis=2)).sum(axis=0))
 
 
 @numba.njit(cache=True)
@@ -138,8 +133,10 @@ def splat(image: Floats, xy: Floats, electrons: Floats, radius_px: Floats, sigma
         patch = np.zeros((y1 - y0 + 1, x1 - x0 + 1))
         for k in range(parts):
             x, y = xy[k, n, 0] - x0, xy[k, n, 1] - y0
-            if radius_px[n] > 0:
+            if radius_px[n] > NARROW * sigma_px[n]:
                 _add_disc(patch, x, y, electrons[k, n], radius_px[n], sigma_px[n])
+            elif radius_px[n] > 0:
+                _add_narrow_disc(patch, x, y, electrons[k, n], radius_px[n], sigma_px[n])
             else:
                 _add_gaussian(patch, x, y, electrons[k, n], sigma_px[n])
         out[n, 0], out[n, 1] = patch.sum(), patch.max()
@@ -173,21 +170,43 @@ def _add_gaussian(patch: Floats, x: float, y: float, electrons: float, sigma_px:
 
 
 @numba.njit(cache=True)
-def _add_disc(patch: Floats, x: float, y: float, electrons: float, radius_px: float, sigma_px: float) -> None:
-    """A uniform disc with a Gaussian edge, sampled at the pixels' middles.
+def _add_narrow_disc(
+    patch: Floats, x: float, y: float, electrons: float, radius_px: float, sigma_px: float
+) -> None:
+    """A disc of up to three sigma convolved with a Gaussian, as 24 Gaussians on three rings.
 
-    Surface brightness erfc((r - a) / (s sqrt 2)) / 2 over its integral pi (a^2 + s^2), with the pixel's own
-    variance in the edge, s^2 = sigma^2 + 1/12. So smooth an image loses nothing to sampling for s > 0.6 px.
+    Gauss-Legendre over the disc's area, eight places a ring: within 1 % of the peak of the true convolution at
+    a radius of three sigma, 0.1 % at two, and no electron is lost.
+    """
+    for ring in range(3):
+        r = radius_px * sqrt(RING_SHARE[ring])
+        for k in range(8):
+            angle = (k + ring / 2) * pi / 4
+            share = electrons * RING_WEIGHT[ring] / 8
+            _add_gaussian(patch, x + r * cos(angle), y + r * sin(angle), share, sigma_px)
+
+
+@numba.njit(cache=True)
+def _add_disc(patch: Floats, x: float, y: float, electrons: float, radius_px: float, sigma_px: float) -> None:
+    """A uniform disc with a Gaussian edge, wider than three sigma, sampled at the pixels' middles.
+
+    Surface brightness erfc((r - b) / (s sqrt 2)) / 2 over its integral pi ((b^2 + s^2) P(b/s) + b s p(b/s)), P and
+    p the normal distribution and its density, with the pixel's own variance in the edge, s^2 = sigma^2 + 1/12.
+    The edge's own curvature brings it in to b = a - s^2 / (2 a): within 1 % of the peak of the true convolution
+    at a = 3 s. So smooth an image loses nothing to sampling for s > 0.6 px.
     """
     height, width = patch.shape
     edge = sqrt(sigma_px**2 + 1 / 12)
     reach = radius_px + REACH_SIGMA * edge
-    brightness = electrons / (2 * pi * (radius_px**2 + edge**2))
+    inner = radius_px - edge**2 / (2 * radius_px)
+    b = inner / edge
+    area = (b**2 + 1) * erfc(-b / sqrt(2.0)) / 2 + b * exp(-(b**2) / 2) / sqrt(2 * pi)
+    brightness = electrons / (2 * pi * edge**2 * area)
     top, bottom = max(int(np.ceil(y - reach)), 0), min(int(np.floor(y + reach)), height - 1)
     for j in range(top, bottom + 1):
         half = sqrt(max(reach**2 - (j - y) ** 2, 0.0))
         left, right = max(int(np.ceil(x - half)), 0), min(int(np.floor(x + half)), width - 1)
         for i in range(left, right + 1):
             r = sqrt((i - x) ** 2 + (j - y) ** 2)
-            depth = (r - radius_px) / (edge * sqrt(2.0))
+            depth = (r - inner) / (edge * sqrt(2.0))
             patch[j, i] += 2 * brightness if depth < -4.6 else brightness * erfc(depth)

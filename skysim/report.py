@@ -32,20 +32,33 @@ def annotate(
     labels: list[str] | None = None,
     truth_px: Floats | None = None,
 ) -> NDArray[np.uint8]:
-    """The stretched frame with truth crossed (blue), detections squared (red), matched stars circled (green)."""
+    """The stretched frame with truth ticked (blue), detections squared (red), matched stars circled (green).
+
+    Every mark leaves its middle open. A small frame is doubled, so that marks do not bury its stars.
+    """
+    scale = 2 if max(image.shape) < 1000 else 1
     picture = cv2.cvtColor(stretch(image), cv2.COLOR_GRAY2BGR)
-    size = max(5, min(image.shape) // 60)
-    for x, y in truth_px if truth_px is not None else ():
-        cv2.drawMarker(picture, (round(x), round(y)), TRUTH_BGR, cv2.MARKER_TILTED_CROSS, size)
-    for x, y in found_px:
-        corner = (round(x) - size, round(y) - size)
-        cv2.rectangle(picture, corner, (round(x) + size, round(y) + size), FOUND_BGR, 1)
-    for n, (x, y) in enumerate(matched_px):
-        cv2.circle(picture, (round(x), round(y)), size + 3, MATCHED_BGR, 1, cv2.LINE_AA)
+    picture = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_NEAREST)
+    size = max(8, min(picture.shape[:2]) // 70)
+    for x, y in places(truth_px, scale):
+        for dx, dy in ((1, 0), (-1, 0), (0, 1), (0, -1)):
+            begin, end = size - 4, size + 6
+            cv2.line(picture, (x + begin * dx, y + begin * dy), (x + end * dx, y + end * dy), TRUTH_BGR, 1)
+    for x, y in places(found_px, scale):
+        cv2.rectangle(picture, (x - size, y - size), (x + size, y + size), FOUND_BGR, 1)
+    for n, (x, y) in enumerate(places(matched_px, scale)):
+        cv2.circle(picture, (x, y), size + 4, MATCHED_BGR, 1, cv2.LINE_AA)
         if labels:
-            place = (round(x) + size + 5, round(y) + 4)
+            place = (x + size + 6, y + 4)
             cv2.putText(picture, labels[n], place, cv2.FONT_HERSHEY_SIMPLEX, 0.4, MATCHED_BGR, 1, cv2.LINE_AA)
     return picture
+
+
+def places(xy_px: Floats | None, scale: int) -> list[tuple[int, int]]:
+    """Whole pixels of an enlarged picture; the middle of a pixel stays its middle."""
+    if xy_px is None:
+        return []
+    return [(round(x), round(y)) for x, y in xy_px * scale + (scale - 1) / 2]
 
 
 def summary(rows: list[Row]) -> dict[str, Any]:

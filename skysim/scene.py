@@ -21,7 +21,9 @@ from pydantic import (
     BaseModel,
     BeforeValidator,
     ConfigDict,
+    Discriminator,
     Field,
+    Tag,
     ValidationError,
     field_validator,
     model_validator,
@@ -31,6 +33,7 @@ from skysim.types import BadInput
 
 ROOT = Path(__file__).resolve().parents[1]
 SCENES = ROOT / "scenes"
+STEM = "(the file's name)"  # no key that a file could have
 CATALOGUES = ROOT / "data" / "catalogues"
 
 # Only what a quantity parser fills: `dark_e_s` and `rate_deg_s` are bare numbers and keep their unit.
@@ -70,6 +73,7 @@ Mass = Annotated[Number, BeforeValidator(quantity("kg", "mass", '"80 kg"'))]
 Inertia = Annotated[Number, BeforeValidator(quantity("kg m2", "moment of inertia", '"6.0 kg m2"'))]
 Intensity = Annotated[Number, BeforeValidator(quantity("cd", "luminous intensity", '"7.7 mcd"'))]
 Torque = Annotated[Number, BeforeValidator(quantity("N m", "torque", '"0.5 N m"'))]
+SemiAxis = Annotated[Length, Field(gt=0)]
 Triple = tuple[Number, Number, Number]
 
 
@@ -138,10 +142,23 @@ class Pointing(Part):
     roll_deg: Number = 0.0
 
 
+def where_it_starts(value: Any) -> str:
+    """Which of the two starts is meant, so that a slip in one is not answered with the other's keys."""
+    keys = value if isinstance(value, dict) else ()
+    sky = isinstance(value, Pointing) or any(key in keys for key in ("ra_deg", "dec_deg"))
+    return "Pointing" if sky else "Attitude"
+
+
+Start = Annotated[
+    Annotated[Attitude, Tag("Attitude")] | Annotated[Pointing, Tag("Pointing")],
+    Discriminator(where_it_starts),
+]
+
+
 class Motion(Part):
     """How it starts and what it is told to do."""
 
-    start: Attitude | Pointing = Attitude()
+    start: Start = Attitude()
     rate_deg_s: Triple = (0.0, 0.0, 0.0)
     control: Literal["none", "pid"] = "none"
     manoeuvre: tuple[Annotated[Hold | Slew, Field(discriminator="kind")], ...] = ()
@@ -159,7 +176,7 @@ class Surface(Part):
     kind: Literal["sphere", "ellipsoid", "flat"]
     apex_m: Annotated[Length, Field(gt=0)]
     radius_m: Annotated[Length, Field(gt=0)] | None = None
-    semi_axes_m: tuple[Length, Length, Length] | None = None
+    semi_axes_m: tuple[SemiAxis, SemiAxis, SemiAxis] | None = None
     offset_m: tuple[Length, Length, Length] = (0.0, 0.0, 0.0)
 
     @model_validator(mode="after")
@@ -180,8 +197,8 @@ class PatchBoards(Part):
     spacing_m: Annotated[Length, Field(gt=0)]
     pitch_m: Annotated[Length, Field(gt=0)]
     lit: tuple[int, int] = (4, 6)
-    pwm_levels: tuple[Annotated[Number, Field(gt=0, le=1)], ...] = (1.0,)
-    hardware_seed: int = 0
+    pwm_levels: Annotated[tuple[Annotated[Number, Field(gt=0, le=1)], ...], Field(min_length=1)] = (1.0,)
+    hardware_seed: Annotated[int, Field(ge=0)] = 0
 
     @field_validator("lit")
     @classmethod
@@ -325,7 +342,7 @@ class Scene(Part):
     camera: Camera
     exposure: Exposure
     tracker: Tracker = Tracker()
-    name: Annotated[str, Field(exclude=True)] = ""
+    name: Annotated[str, Field(exclude=True, alias=STEM)] = ""
 
     @model_validator(mode="after")
     def one_world(self) -> Scene:
@@ -371,7 +388,7 @@ def load(name: str | Path, overrides: Mapping[str, str] | None = None) -> Scene:
     for key, value in (overrides or {}).items():
         put(tree, key, value)
     try:
-        return Scene.model_validate(tree | {"name": path.stem})
+        return Scene.model_validate(tree | {STEM: path.stem})
     except ValidationError as error:
         raise BadInput(explain(error, Scene, tree, text, path, overrides or {})) from None
 
@@ -395,7 +412,8 @@ def read_yaml(path: Path) -> tuple[dict[str, Any], str]:
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         where = f", line {mark.line + 1}" if mark else ""
-        raise BadInput(f"{path}{where}: not YAML: {getattr(error, 'problem', error)}") from error
+        problem = " ".join(str(getattr(error, "problem", error)).split())
+        raise BadInput(f"{path}{where}: not YAML: {problem}") from error
     if not isinstance(tree, dict):
         raise BadInput(f"{path}: allowed: a mapping of keys to values")
     return tree, text
@@ -404,6 +422,8 @@ def read_yaml(path: Path) -> tuple[dict[str, Any], str]:
 def put(tree: dict[str, Any], key: str, value: str) -> None:
     """Set one dotted key of the raw scene; the value is YAML."""
     *parents, last = key.split(".")
+    if not all((*parents, last)):
+        raise BadInput(f"--set {key}={value}: allowed: path.to.key=value")
     for depth, parent in enumerate(parents):
         tree = tree.setdefault(parent, {})
         if not isinstance(tree, dict):
@@ -423,17 +443,26 @@ def explain(
     overrides: Mapping[str, str],
 ) -> str:
     """One line for the first fault: `led.falloff: 'cubic' is none of … (scenes/x.yaml, line 31)`."""
-    first = error.errors()[0]
+    # A key that is unknown explains one that is missing, so what is missing waits.
+    first = min(error.errors(), key=lambda fault: fault["type"] == "missing")
     keys = [str(key) for key in in_tree(first["loc"], tree)]
-    message = first["msg"].removeprefix("Value error, ").removeprefix("Input should be ")
+    message = re.sub(r"^(Value error, |\w+ should )", "", first["msg"])
     if first["type"] == "extra_forbidden":
         message = "unknown key" + hint(keys[-1], allowed_keys(model, first["loc"][:-1]))
     elif first["type"] == "missing":
         message = "missing"
-    elif first["type"].startswith("union_tag"):
-        message = first["msg"]
+    elif first["type"] == "union_tag_invalid":
+        keys, context = [*keys, "kind"], first["ctx"]
+        message = f"{context['tag']!r} is none of {context['expected_tags'].replace(chr(39), '')}"
+    elif first["type"] == "union_tag_not_found":
+        message = "kind is missing"
+    elif first["type"] in ("model_type", "model_attributes_type"):
+        message = f"{first['input']!r} is not allowed; it should be a mapping of keys to values"
+    elif first["type"] == "value_error" and not keys:  # of the whole scene: the message begins with the key
+        dotted, _, message = message.partition(": ")
+        keys = dotted.split(".")
     elif not first["type"].startswith("value_error"):
-        message = f"{first['input']!r} is not allowed; it should be {message}"
+        message = f"{first['input']!r} is not allowed; it should {message}"
     dotted = ".".join(keys)
     place = "--set" if any(k == dotted or dotted.startswith(k + ".") for k in overrides) else str(path)
     line = line_of(text, keys) if place != "--set" else None
@@ -448,9 +477,9 @@ def in_tree(loc: tuple[int | str, ...], tree: Any) -> list[int | str]:
         if isinstance(tree, dict) and (key in tree or last):
             keys.append(key)
             tree = tree.get(key)
-        elif isinstance(tree, list) and isinstance(key, int) and key < len(tree):
+        elif isinstance(tree, list) and isinstance(key, int) and (key < len(tree) or last):
             keys.append(key)
-            tree = tree[key]
+            tree = tree[key] if key < len(tree) else None
     return keys
 
 
@@ -482,7 +511,7 @@ def kind_of(node: dict[str, Any]) -> str | None:
 def hint(word: str, allowed: list[str]) -> str:
     close = difflib.get_close_matches(word, allowed, 1)
     meant = f"; did you mean {close[0]}?" if close else ""
-    return f"{meant}; allowed: {', '.join(k for k in allowed if k != 'name')}" if allowed else meant
+    return f"{meant}; allowed: {', '.join(k for k in allowed if k != STEM)}" if allowed else meant
 
 
 def line_of(text: str, keys: list[str]) -> int | None:

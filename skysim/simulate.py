@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from estimator import catalog
+from estimator.attitude import SOLVERS
 from estimator.camera import Camera
+from estimator.centroid import CENTROIDERS
+from estimator.detect import DETECTORS
+from estimator.identify import IDENTIFIERS
+from estimator.nearfield import SOLVERS as NEAR_SOLVERS
 from estimator.nearfield import LedMap, Lever
 from estimator.tracker import Clock, DomeTracker, Report, Settings, StarTracker
 from estimator.types import Attitude, BadImage, Centroids
@@ -18,8 +23,8 @@ from skysim import scene as scene_schema
 from skysim.detector import expose, saturation_dn
 from skysim.optics import Optics
 from skysim.render import render
-from skysim.scene import CATALOGUES, Dome, Pointing, Scene, Tracker
-from skysim.types import Frame, Mount, Sources, Trajectory, Truth
+from skysim.scene import CATALOGUES, Dome, Pointing, Scene, one_of
+from skysim.types import BadInput, Frame, Mount, Sources, Trajectory, Truth
 
 STAGE_ID = {"detector": 1}
 
@@ -54,6 +59,7 @@ class Shot:
 
 def prepare(scene: Scene) -> Lab:
     """Build the vehicle, fly it to the last exposure, and light the sky or the dome."""
+    believed_settings(scene)  # a wrong name is told before the flight
     vehicle = world.build(scene.vehicle)
     mount = world.mount(vehicle)
     last_s = open_s(scene, scene.exposure.frames - 1) + scene.exposure.time_s
@@ -128,14 +134,8 @@ def tracker(lab: Lab) -> Estimator:
     scene, believed = lab.scene, lab.scene.tracker
     camera, settings = believed_camera(scene), believed_settings(scene)
     if isinstance(scene.light, Dome):
-        inside = dome.surface(scene.light.surface)
-        flat = isinstance(inside, dome.Plane)
-        leds = LedMap(
-            lab.sources.id,
-            lab.sources.place[:, :3],
-            np.array([0, 0, -1e6]) if flat else inside.centre_m,
-            np.full(3, 1e6 + inside.height_m) if flat else inside.semi_axes_m,
-        )
+        centre_m, semi_axes_m = dome.surface(scene.light.surface).as_ellipsoid()
+        leds = LedMap(lab.sources.id, lab.sources.place[:, :3], centre_m, semi_axes_m)
         arm = believed.believed_camera_body_m or lab.mount.camera_body_m
         return DomeTracker(camera, leds, Lever(np.array(arm), lab.mount.cam_from_body), settings)
     stars = catalog.read(CATALOGUES / f"{scene.light.catalogue}.ecsv")
@@ -157,19 +157,28 @@ def calibration(camera: scene_schema.Camera) -> Camera:
 
 
 def believed_settings(scene: Scene) -> Settings:
-    """The tracker's algorithms and thresholds as the scene names them."""
-    part: Tracker = scene.tracker
+    """The tracker's algorithms and thresholds as the scene names them. Raises BadInput for a wrong name."""
+    part = scene.tracker
+    near = isinstance(scene.light, Dome)
     return Settings(
-        detector=part.detector,
-        centroider=part.centroider,
-        identifier=part.identifier,
-        solver=part.solver,
+        detector=known("detector", part.detector, DETECTORS),
+        centroider=known("centroider", part.centroider, CENTROIDERS),
+        identifier=known("identifier", part.identifier, IDENTIFIERS),
+        solver=known("solver", part.solver, NEAR_SOLVERS if near else SOLVERS),
         threshold_sigma=part.threshold_sigma,
         min_area_px=part.min_area_px,
         gain_e_dn=scene.camera.detector.gain_e_dn,
         saturation=saturation_dn(scene.camera.detector),
         centroid_sigma_px=part.centroid_sigma_px,
     )
+
+
+def known(key: str, name: str, algorithms: Mapping[str, object]) -> str:
+    """The name, if there is such an algorithm: only the estimator knows, and scene.py may not ask it."""
+    try:
+        return one_of(name, algorithms)
+    except ValueError as error:
+        raise BadInput(f"tracker.{key}: {error}") from None
 
 
 def run(lab: Lab) -> Iterator[Shot]:

@@ -112,7 +112,7 @@ def solve(path: Path, solver: Solver, out: Path | None) -> dict[str, Any]:
     answer["time_ms"] = 1e3 * (time.perf_counter() - begin)
     answer |= {"status": found.attitude.status, "bad_input": False}
     if found.attitude.solved:
-        answer |= solution(found, tracker)
+        answer |= solution(found)
     if out:
         io.write_image(out / f"{path.stem}.solved.png", picture(image, found, tracker))
     return answer
@@ -132,12 +132,13 @@ def check(path: Path, image: NDArray, camera: scene.Camera | None) -> None:
         raise BadInput(f"{path}: {size} pixels; this camera's are {camera.width_px}x{camera.height_px}")
 
 
-def solution(found: Report, tracker: StarTracker) -> dict[str, Any]:
+def solution(found: Report) -> dict[str, Any]:
     """The numbers of a solved image, at the image's middle."""
     attitude = found.attitude
     assert attitude.cam_from_ref is not None
     assert attitude.match is not None
-    camera = tracker.camera.zoomed(attitude.focal_px / tracker.camera.focal_px)
+    camera = attitude.camera
+    assert camera is not None
     ra, dec, roll = np.degrees(radecroll_rad(at_middle(camera) * attitude.cam_from_ref))
     return {
         "ra_deg": float(ra),
@@ -145,7 +146,7 @@ def solution(found: Report, tracker: StarTracker) -> dict[str, Any]:
         "roll_deg": float(roll),
         "fov_deg": float(np.degrees(camera.fov_rad)),
         "matches": len(attitude.match.observed),
-        "rms_arcsec": float(np.degrees(attitude.rms_px / attitude.focal_px) * 3600),
+        "rms_arcsec": float(np.degrees(attitude.rms_px / camera.focal_px) * 3600),
     }
 
 

@@ -1,0 +1,21 @@
+"""Ourselves beside the best peer, timed in the same run. `skysim bench` prints what `measure` returns."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from benchmarks import attitude, detect, dynamics, identify, render
+
+AREAS: dict[str, Callable[[], list[dict[str, Any]]]] = {
+    "render": render.measure,
+    "detect": detect.measure,
+    "identify": identify.measure,
+    "attitude": attitude.measure,
+    "dynamics": dynamics.measure,
+}
+
+
+def measure(area: str) -> list[dict[str, Any]]:
+    """The results of one area: {name, value, unit, peer, peer_value, ratio, bar, met}."""
+    return AREAS[area]()

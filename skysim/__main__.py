@@ -1,0 +1,5 @@
+"""`python -m skysim`."""
+
+from skysim.cli import main
+
+main()

@@ -1,0 +1,85 @@
+"""Every code block of the README runs, in its order, in one folder."""
+
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from skysim import BadInput
+from skysim.scene import ROOT, load
+
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+SKYSIM = [sys.executable, "-m", "skysim"]
+
+
+def blocks(language: str) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", README, re.DOTALL)
+
+
+def commands() -> list[list[str]]:
+    """The skysim commands of the shell blocks; `make` is what runs this test."""
+    lines = [line for block in blocks("sh") for line in block.splitlines()]
+    return [shlex.split(line, comments=True)[1:] for line in lines if line.startswith(".venv/bin/skysim")]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    """A folder that looks like the checkout, where every command of the README has been run."""
+    folder = tmp_path_factory.mktemp("readme")
+    for name in ("scenes", "data"):
+        (folder / name).symlink_to(ROOT / name)
+    for command in commands():
+        done = subprocess.run([*SKYSIM, *command], cwd=folder, capture_output=True, text=True)
+        assert done.returncode == 0, f"{command}: {done.stderr}"
+        assert done.stdout, command
+    return folder
+
+
+def test_the_commands_leave_what_the_readme_says(folder):
+    left = {path.name for path in (folder / "out" / "shefex2").iterdir()}
+    assert {"frame_0000.fits", "frame_0000.png", "frame_0000.ecsv"} <= left
+    # `render` came after `run` and cleared its frames, not its results.
+    assert {"solutions.ecsv", "annotated.png", "report.html"} <= left
+
+
+def test_the_python_block_solves_the_frame(folder):
+    (block,) = blocks("python")
+    done = subprocess.run([sys.executable, "-c", block], cwd=folder, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    status, ra, dec, roll = done.stdout.replace("[", " ").replace("]", " ").split()
+    assert status == "solved"
+    # scenes/shefex2.yaml starts at (83, 2, 20) and turns by 0.06 deg before the middle of its first exposure.
+    assert [float(ra), float(dec), float(roll)] == pytest.approx([83.0, 2.0, 20.0], abs=0.08)
+
+
+def test_the_error_message_is_what_a_user_sees(tmp_path, monkeypatch):
+    (block,) = blocks("text")
+    bad = (ROOT / "scenes/afit_simsat.yaml").read_text(encoding="utf-8")
+    (tmp_path / "scenes").mkdir()
+    (tmp_path / "scenes/afit_simsat.yaml").write_text(
+        bad.replace("falloff: inverse_square", "falloff: cubic")
+    )
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(BadInput) as raised:
+        load("scenes/afit_simsat.yaml")
+    assert block.strip() == f"skysim: {raised.value}"
+
+
+def test_every_file_that_the_readme_links_is_there():
+    links = re.findall(r"\]\(([^)#:]+)\)", README)
+    assert links
+    assert [link for link in links if not (ROOT / link).exists()] == []
+
+
+def test_every_name_in_the_table_of_changes_is_in_its_file():
+    """`NAME` in [`file`](file): ten seconds to find it."""
+    rows = re.findall(r"\| ((?:`\w+`(?:, )?)+) in (.*) \|", README)
+    assert len(rows) >= 8
+    for names, places in rows:
+        text = "".join(
+            (ROOT / path).read_text(encoding="utf-8") for path in re.findall(r"\]\(([^)]+)\)", places)
+        )
+        assert [name for name in re.findall(r"`(\w+)`", names) if name not in text] == []

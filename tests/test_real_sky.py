@@ -1,0 +1,85 @@
+"""Real photographs of the night sky, whose attitude two independent solvers agree on.
+
+The folder stands beside the checkout (or where SKYSIM_REAL_SKY says); its README tells how its truth was made.
+"""
+
+import csv
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from skysim import solve
+from skysim.scene import ROOT
+from skysim.sky import cam_from_icrs
+
+FOLDER = Path(os.environ.get("SKYSIM_REAL_SKY", ROOT.parent / "shared" / "real_sky"))
+MANIFEST = FOLDER / "manifest.csv"
+ROWS = list(csv.DictReader(MANIFEST.open())) if MANIFEST.is_file() else []
+TO_SOLVE = [row for row in ROWS if row["expect"] == "solve"]
+NOT_TO_SOLVE = [row for row in ROWS if row["expect"] == "refuse"]
+ANY = [row for row in ROWS if row["expect"] == "any"]
+
+needs_photographs = pytest.mark.skipif(not ROWS, reason=f"no photographs of the real sky in {FOLDER}")
+
+
+def by_file(rows):
+    return pytest.mark.parametrize("row", rows, ids=[row["file"] for row in rows])
+
+
+def answer(row, fov_error: float) -> dict:
+    """What `skysim solve` says of a photograph when told a field of view wrong by so much."""
+    fov_deg = float(row["fov_deg_horizontal"] or 10.0) * (1 + fov_error)
+    return solve.solve(FOLDER / row["file"], solve.make_solver(fov_deg, None), None)
+
+
+def errors_deg(found: dict, row) -> tuple[float, float]:
+    """Cross-boresight and roll error at the image's middle."""
+    true = cam_from_icrs(*(float(row[key]) for key in ("ra_deg", "dec_deg", "roll_deg")))
+    ours = cam_from_icrs(found["ra_deg"], found["dec_deg"], found["roll_deg"])
+    x, y, z = np.degrees((ours * true.inv()).as_rotvec())
+    return float(np.hypot(x, y)), abs(float(z))
+
+
+def check_right(found: dict, row) -> None:
+    assert found["status"] == "solved"
+    cross, roll = errors_deg(found, row)
+    assert cross < 0.05
+    assert roll < 0.2
+    # The manifest's field of view is another's fit of another lens model: half a per cent is agreement.
+    assert found["fov_deg"] == pytest.approx(float(row["fov_deg_horizontal"]), rel=5e-3)
+
+
+@needs_photographs
+@by_file(TO_SOLVE)
+def test_a_photograph_is_solved_with_its_field_known_to_five_per_cent(row):
+    worst = 0.05 if TO_SOLVE.index(row) % 2 else -0.05
+    check_right(answer(row, worst), row)
+
+
+@needs_photographs
+@by_file(NOT_TO_SOLVE)
+def test_a_picture_without_stars_is_refused(row):
+    found = answer(row, 0.0)
+    assert found["status"] != "solved"
+    assert found["ra_deg"] is None
+    assert not found["bad_input"]
+
+
+@pytest.mark.long
+@needs_photographs
+@pytest.mark.parametrize("fov_error", [-0.05, -0.025, 0.0, 0.025, 0.05])
+@by_file(TO_SOLVE)
+def test_a_photograph_is_solved_wherever_its_field_lies_within_five_per_cent(row, fov_error):
+    check_right(answer(row, fov_error), row)
+
+
+@pytest.mark.long
+@needs_photographs
+@pytest.mark.parametrize("fov_error", [-0.05, 0.0, 0.05])
+@by_file(ANY)
+def test_a_hopeless_photograph_may_be_refused_but_not_answered_wrongly(row, fov_error):
+    found = answer(row, fov_error)
+    right = bool(row["ra_deg"]) and found["status"] == "solved" and errors_deg(found, row)[0] < 0.05
+    assert right or found["status"] != "solved"
