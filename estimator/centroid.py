@@ -16,6 +16,7 @@ Centroider = Callable[..., Centroids]
 
 MARGIN_PX = 4
 FIT_HALF_PX = 3
+NARROWEST_PX, WIDEST_PX = 0.2, 3.0  # sigma that a window of 7x7 can tell
 
 
 def cog(image: NDArray, blobs: Blobs, gain_e_dn: float = 1.0) -> Centroids:
@@ -24,7 +25,9 @@ def cog(image: NDArray, blobs: Blobs, gain_e_dn: float = 1.0) -> Centroids:
     x = sum(I x) / sum(I), with var(x) = sum((I / g + noise^2) (x - x_mean)^2) / sum(I)^2 for a gain of g
     electrons a unit. A pixel that lies nearer to another blob's box is left out.
     """
-    return _measured(_cog(native(image), blobs.box_px, blobs.background.level, blobs.background.noise, gain_e_dn))
+    return _measured(
+        _cog(native(image), blobs.box_px, blobs.background.level, blobs.background.noise, gain_e_dn)
+    )
 
 
 def gaussian_fit(image: NDArray, blobs: Blobs, gain_e_dn: float = 1.0) -> Centroids:
@@ -37,7 +40,7 @@ def gaussian_fit(image: NDArray, blobs: Blobs, gain_e_dn: float = 1.0) -> Centro
     the window) keeps its centre of gravity.
     """
     fallback = cog(image, blobs, gain_e_dn)
-    fitted = _fit_all(native(image), blobs.xy_px, blobs.background.noise, gain_e_dn)
+    fitted = _fit_all(native(image), blobs.xy_px, blobs.flux, blobs.background.noise, gain_e_dn)
     good = np.isfinite(fitted[:, 0])
     xy = np.where(good[:, None], fitted[:, :2], fallback.xy_px)
     sigma = np.where(good, fitted[:, 2], fallback.sigma_px)
@@ -98,10 +101,10 @@ def _neighbours(boxes: NDArray, n: int, x0: int, y0: int, x1: int, y1: int) -> N
 @numba.njit(cache=True)
 def _foreign(boxes: NDArray, near: NDArray, n: int, x: int, y: int) -> bool:
     mine = _apart(boxes[n], x, y)
+    nearest = mine
     for m in near:
-        if _apart(boxes[m], x, y) < mine:
-            return True
-    return False
+        nearest = min(nearest, _apart(boxes[m], x, y))
+    return nearest < mine
 
 
 @numba.njit(cache=True)
@@ -113,12 +116,14 @@ def _apart(box: NDArray, x: int, y: int) -> float:
 
 
 @numba.njit(cache=True)
-def _fit_all(image: NDArray, xy: Floats, noise: Floats, gain_e_dn: float) -> Floats:
+def _fit_all(image: NDArray, xy: Floats, flux: Floats, noise: Floats, gain_e_dn: float) -> Floats:
     out = np.full((len(xy), 4), np.nan)
     height, width = image.shape
     for n in range(len(xy)):
         pixel_noise = at(noise, height, width, xy[n, 1], xy[n, 0]) / 0.375
         _fit(image, xy[n, 0], xy[n, 1], pixel_noise, gain_e_dn, out[n])
+        if not out[n, 3] > flux[n] / 2:
+            out[n] = np.nan  # a window on the plateau of a disc sees a little light on a bright sky
     return out
 
 
@@ -126,7 +131,7 @@ def _fit_all(image: NDArray, xy: Floats, noise: Floats, gain_e_dn: float) -> Flo
 def _fit(image: NDArray, x0: float, y0: float, noise: float, gain_e_dn: float, out: Floats) -> None:
     """One Gaussian by Gauss-Newton; leaves `out` NaN where it does not settle inside its window."""
     height, width = image.shape
-    left, top = int(round(x0)) - FIT_HALF_PX, int(round(y0)) - FIT_HALF_PX
+    left, top = round(x0) - FIT_HALF_PX, round(y0) - FIT_HALF_PX
     side = 2 * FIT_HALF_PX + 1
     if left < 0 or top < 0 or left + side > width or top + side > height:
         return
@@ -160,13 +165,15 @@ def _fit(image: NDArray, x0: float, y0: float, noise: float, gain_e_dn: float, o
         step = np.linalg.solve(normal, gradient)
         scale = min(1.0, 0.5 / max(abs(step[0]), abs(step[1]), abs(step[3]), 1e-300))
         p += scale * step
-        p[3] = min(max(p[3], 0.2), 3.0)
+        p[3] = min(max(p[3], NARROWEST_PX), WIDEST_PX)
         if abs(p[0] - x0) > 2 or abs(p[1] - y0) > 2 or p[2] <= 0:
             return
         if max(abs(step[0]), abs(step[1])) < 1e-12:
             settled = True
             break
     if not settled and max(abs(step[0]), abs(step[1])) > 1e-6:
+        return
+    if p[3] <= NARROWEST_PX or p[3] >= WIDEST_PX:
         return
     # The weights are the inverse variances, so the normal matrix is Fisher's: its inverse is Cramer and Rao's.
     covariance = np.linalg.inv(normal)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from math import lgamma, log, pi, sqrt
+from typing import NamedTuple
 
 import numba
 import numpy as np
@@ -19,6 +20,25 @@ ACCEPT_LOG10_CHANCE = -5.0
 MIN_MATCHES = 4
 
 
+class Rules(NamedTuple):
+    """How a search is done. A plain tuple, so that compiled code can take it.
+
+    tolerance, stretch, zooms, triangles, base, missed_dex : as `pyramid` says
+    left, right, top, bottom : tangents of the sensor's edges from the boresight
+    """
+
+    tolerance: float
+    stretch: float
+    zooms: bool
+    triangles: int
+    base: int
+    missed_dex: float
+    left: float
+    right: float
+    top: float
+    bottom: float
+
+
 def pyramid(
     vectors_cam: Floats,
     index: PairIndex,
@@ -27,6 +47,8 @@ def pyramid(
     zooms: bool = False,
     max_triangles: int = 3000,
     base_stars: int = 20,
+    missed_dex: float = 0.0,
+    field_tan: tuple[float, float, float, float] = (-1.0, 1.0, -1.0, 1.0),
 ) -> StarMatch | None:
     """Pyramid (Mortari, Samaan & Junkins 2001): a triangle, a fourth star, then the whole field.
 
@@ -34,6 +56,9 @@ def pyramid(
     tolerance_rad : of a direction; of an angle sqrt(2) times it, plus `stretch` times the angle
     zooms         : whether the stretch is one unknown focal length, which each triangle then measures by itself
     base_stars    : among how many of the brightest the pyramids are sought
+    missed_dex    : what a catalogue star that should be in the field and is not costs, in powers of ten; 0 where
+        nobody knows how faint the camera sees, more where every light is known to shine
+    field_tan     : (left, right, top, bottom) tangents of the field's edges, for missed_dex
     Triangles are taken in an order that changes all three stars soon (their `smart` order), so that one false
     star costs little. A pyramid is only a hypothesis: the attitude that it gives must explain so many of the
     observed stars that, over all that was tried, a match this good is expected less than 1e-5 times by chance.
@@ -41,15 +66,9 @@ def pyramid(
     """
     if len(vectors_cam) < MIN_MATCHES:
         return None
-    observed, star, matrix, chance = _search(
-        np.ascontiguousarray(vectors_cam),
-        index,
-        tolerance_rad,
-        stretch,
-        zooms,
-        max_triangles,
-        min(base_stars, len(vectors_cam)),
-    )
+    base = min(base_stars, len(vectors_cam))
+    rules = Rules(tolerance_rad, stretch, zooms, max_triangles, base, missed_dex, *field_tan)
+    observed, star, matrix, chance = _search(np.ascontiguousarray(vectors_cam), index, rules)
     if len(observed) < MIN_MATCHES or chance > ACCEPT_LOG10_CHANCE:
         return None
     return StarMatch(observed, star, Rotation.from_matrix(matrix), chance)
@@ -57,28 +76,22 @@ def pyramid(
 
 IDENTIFIERS: dict[str, Identifier] = {"pyramid": pyramid}
 
+Found = tuple[NDArray[np.int64], NDArray[np.int64], Floats, float]
+
 
 @numba.njit(cache=True)
-def _search(
-    seen: Floats,
-    index: PairIndex,
-    tolerance: float,
-    stretch: float,
-    zooms: bool,
-    max_triangles: int,
-    base: int,
-) -> tuple[NDArray, NDArray, Floats, float]:
+def _search(seen: Floats, index: PairIndex, rules: Rules) -> Found:
     """Walk the triangles (i, i + dj, i + dj + dk) and stop at the first attitude beyond chance."""
     tried = np.zeros(2, np.int64)
-    for dj in range(1, base - 1):
-        for dk in range(1, base - dj):
-            for i in range(base - dj - dk):
+    for dj in range(1, rules.base - 1):
+        for dk in range(1, rules.base - dj):
+            for i in range(rules.base - dj - dk):
                 corners = np.array([i, i + dj, i + dj + dk])
-                found = _triangle(seen, index, corners, tolerance, stretch, zooms, base, tried)
+                found = _triangle(seen, index, corners, rules, tried)
                 if found[3] < ACCEPT_LOG10_CHANCE:
                     return found
                 tried[0] += 1
-                if tried[0] >= max_triangles:
+                if tried[0] >= rules.triangles:
                     return _nothing()
     return _nothing()
 
@@ -105,77 +118,64 @@ def _triple(u: Floats, v: Floats, w: Floats) -> float:
 
 
 @numba.njit(cache=True)
-def _triangle(
-    seen: Floats,
-    index: PairIndex,
-    corners: NDArray,
-    tolerance: float,
-    stretch: float,
-    zooms: bool,
-    base: int,
-    tried: NDArray,
-) -> tuple[NDArray, NDArray, Floats, float]:
+def _triangle(seen: Floats, index: PairIndex, corners: NDArray, rules: Rules, tried: NDArray) -> Found:
     """Every catalogue triangle like an observed one, of the same handedness, that a fourth star confirms."""
     i, j, k = corners
     ij, ik, jk = _angle(seen[i], seen[j]), _angle(seen[i], seen[k]), _angle(seen[j], seen[k])
-    t_ij, t_ik, t_jk = sqrt(2.0) * tolerance + stretch * np.array([ij, ik, jk])
-    shortest, longest = min(ij, ik, jk), max(ij, ik, jk)
-    if shortest < 4 * t_ij or longest > index.max_angle_rad:
+    t_ij, t_ik, t_jk = sqrt(2.0) * rules.tolerance + rules.stretch * np.array([ij, ik, jk])
+    if min(ij, ik, jk) < 4 * t_ij or max(ij, ik, jk) > index.max_angle_rad:
         return _nothing()
     # Three sides that agree on one focal length leave only what the lens distorts.
-    tight = stretch / 3 if zooms else stretch
+    tight = rules.stretch / 3 if rules.zooms else rules.stretch
     handed = _triple(seen[i], seen[j], seen[k])
     begin, end = between(index, ij - t_ij, ij + t_ij)
     for p in range(begin, end):
-        if abs(index.angle_rad[p] - ij) > t_ij:
+        side = index.angle_rad[p]
+        if abs(side - ij) > t_ij:
             continue
         for flip in range(2):
             a, b = index.pair[p, flip], index.pair[p, 1 - flip]
             place = around(index, a, ik - t_ik)
             while place < index.first[a + 1] and index.separation_rad[place] <= ik + t_ik:
-                c = index.neighbour[place]
+                c, near = index.neighbour[place], index.separation_rad[place]
                 place += 1
                 far = _angle(index.vectors[b], index.vectors[c])
                 if abs(far - jk) > t_jk:
                     continue
                 if handed * _triple(index.vectors[a], index.vectors[b], index.vectors[c]) <= 0:
                     continue
-                near = index.separation_rad[place - 1]
-                zoom = (index.angle_rad[p] + near + far) / (ij + ik + jk) if zooms else 1.0
+                zoom = (side + near + far) / (ij + ik + jk) if rules.zooms else 1.0
                 slip = max(
-                    abs(index.angle_rad[p] - zoom * ij) - tight * ij,
+                    abs(side - zoom * ij) - tight * ij,
                     abs(near - zoom * ik) - tight * ik,
                     abs(far - zoom * jk) - tight * jk,
                 )
-                if slip > sqrt(2.0) * tolerance:
+                if slip > sqrt(2.0) * rules.tolerance:
                     continue
                 tried[1] += 1
-                stars = np.array([a, b, c])
-                zoomed = _zoomed(seen, zoom) if zooms else seen
-                if not _fourth(zoomed, index, corners, stars, tolerance, tight, base):
-                    continue
-                found = _prove(zoomed, index, corners, stars, tolerance, tight, tried[1])
+                zoomed = _zoomed(seen, zoom) if rules.zooms else seen
+                found = _pyramid(zoomed, index, corners, np.array([a, b, c]), rules, tight, tried[1])
                 if found[3] < ACCEPT_LOG10_CHANCE:
                     return found
     return _nothing()
 
 
 @numba.njit(cache=True)
-def _fourth(
+def _pyramid(
     seen: Floats,
     index: PairIndex,
     corners: NDArray,
     stars: NDArray,
-    tolerance: float,
+    rules: Rules,
     stretch: float,
-    base: int,
-) -> bool:
-    """Whether some other bright observed star has its place beside the triangle in the catalogue too."""
-    for r in range(base):
+    hypotheses: int,
+) -> Found:
+    """A triangle with a fourth star is worth proving."""
+    for r in range(rules.base):
         if r == corners[0] or r == corners[1] or r == corners[2]:
             continue
         reach = _angle(seen[corners[0]], seen[r])
-        slack = sqrt(2.0) * tolerance + stretch * reach
+        slack = sqrt(2.0) * rules.tolerance + stretch * reach
         place = around(index, stars[0], reach - slack)
         while place < index.first[stars[0] + 1] and index.separation_rad[place] <= reach + slack:
             d = index.neighbour[place]
@@ -184,10 +184,10 @@ def _fourth(
             for corner in range(1, 3):
                 angle = _angle(seen[corners[corner]], seen[r])
                 slip = abs(_angle(index.vectors[stars[corner]], index.vectors[d]) - angle)
-                fits = fits and slip <= sqrt(2.0) * tolerance + stretch * angle
+                fits = fits and slip <= sqrt(2.0) * rules.tolerance + stretch * angle
             if fits:
-                return True
-    return False
+                return _prove(seen, index, corners, stars, rules, stretch, hypotheses)
+    return _nothing()
 
 
 @numba.njit(cache=True)
@@ -207,22 +207,38 @@ def _prove(
     index: PairIndex,
     corners: NDArray,
     stars: NDArray,
-    tolerance: float,
+    rules: Rules,
     stretch: float,
     hypotheses: int,
-) -> tuple[NDArray, NDArray, Floats, float]:
+) -> Found:
     """Match all observed stars at the triangle's attitude, refine it once, and weigh the match against chance."""
     matrix = _wahba(seen[corners], index.vectors[stars])
     # A triangle's attitude is worse than a star's direction; the refined one needs no such allowance.
-    observed, star, _ = _match(seen, index, stars[0], matrix, 2 * tolerance, stretch)
+    observed, star, _ = _match(seen, index, stars[0], matrix, 2 * rules.tolerance, stretch)
     if len(observed) < MIN_MATCHES:
         return _nothing()
     matrix = _wahba(seen[observed], index.vectors[star])
-    observed, star, expected = _match(seen, index, stars[0], matrix, tolerance, stretch)
+    observed, star, expected = _match(seen, index, stars[0], matrix, rules.tolerance, stretch)
     if len(observed) < MIN_MATCHES:
         return _nothing()
     chance = log10_tail(len(seen) - 3, len(observed) - 3, expected) + np.log10(hypotheses)
+    if rules.missed_dex > 0:
+        missed = max(_expected(index, stars[0], matrix, rules) - len(observed), 0)
+        chance += rules.missed_dex * missed
     return observed, star, _wahba(seen[observed], index.vectors[star]), chance
+
+
+@numba.njit(cache=True)
+def _expected(index: PairIndex, centre: int, matrix: Floats, rules: Rules) -> int:
+    """How many catalogue stars should be in the field at an attitude."""
+    count = 0
+    begin, end = index.first[centre], index.first[centre + 1]
+    for place in range(begin - 1, end):
+        s = centre if place < begin else index.neighbour[place]
+        x, y, z = matrix @ index.vectors[s]
+        inside = z > 0 and rules.left * z < x < rules.right * z and rules.top * z < y < rules.bottom * z
+        count += inside
+    return count
 
 
 @numba.njit(cache=True)

@@ -75,11 +75,12 @@ def between(index: PairIndex, low_rad: float, high_rad: float) -> tuple[int, int
     """Half-open range of pairs that holds every angle in [low, high].
 
     Mortari's formula, j_b = floor((low - q) / m) and j_t = ceil((high - q) / m), may take in a neighbour or two
-    at either end; SHEFEX's eq. 5 has the signs of the error and of q wrong.
+    at either end; SHEFEX's eq. 5 has the signs of the error and of q wrong. A thousandth of a step is added, for
+    an angle that lies on a node of the line together with the range's end, and for the rounding of the two.
     """
     last = len(index.kvector) - 1
-    k_low = int(np.floor((low_rad - index.offset_rad) / index.slope_rad))
-    k_high = int(np.ceil((high_rad - index.offset_rad) / index.slope_rad))
+    k_low = int(np.floor((low_rad - index.offset_rad) / index.slope_rad - 1e-3))
+    k_high = int(np.ceil((high_rad - index.offset_rad) / index.slope_rad + 1e-3))
     if k_high < 0 or k_low > last:
         return 0, 0
     begin = index.kvector[k_low] if k_low >= 0 else 0

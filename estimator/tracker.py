@@ -25,6 +25,7 @@ from estimator.types import Attitude, BadImage, Centroids, Floats, StarMatch
 NO_STARS = "too few stars detected"
 NO_MATCH = "no identification beyond chance"
 SATURATED = "the frame is saturated"
+BORDER = 0.025  # share of the frame's height in which a light may be cut off
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,6 +49,7 @@ class Settings:
     centroid_sigma_px: float = 0.1
     base_stars: int = 20
     field_stars: float = 30.0
+    missed_dex: float = 1.0
 
 
 @dataclass(slots=True)
@@ -162,10 +164,10 @@ class StarTracker:
                     camera.rays(few.xy_px),
                     self.index,
                     tolerance_rad,
-                    stretch,
-                    reach > 0,
-                    triangles,
-                    self.settings.base_stars,
+                    stretch=stretch,
+                    zooms=reach > 0,
+                    max_triangles=triangles,
+                    base_stars=self.settings.base_stars,
                 )
                 if match:
                     yield camera, match.cam_from_ref
@@ -293,6 +295,11 @@ class DomeTracker:
             [[0, 0], [camera.width_px, 0], [0, camera.height_px], [camera.width_px, camera.height_px]]
         )
         points = self._on_sphere(camera.rays(corners - 0.5))
+        tangent = points[:, :2] / points[:, 2:]
+        # Only the well-inside is held against a hypothesis: lights cut off by the border are not detected.
+        middle, half = (tangent.max(axis=0) + tangent.min(axis=0)) / 2, np.ptp(tangent, axis=0) / 2 * 0.95
+        low, high = middle - half, middle + half
+        self.field_tan = float(low[0]), float(high[0]), float(low[1]), float(high[1])
         reach_rad = np.arccos(np.clip((points @ points.T).min(), -1, 1))
         self.index = index.build(leds.position_m / radius[:, None], reach_rad * 1.05)
         # A dome that is no sphere stretches the angles as the lever stretches an error of range.
@@ -301,10 +308,9 @@ class DomeTracker:
         )
 
     def _on_sphere(self, rays_cam: Floats) -> Floats:
-        """Unit vectors from the bearing centre to where rays meet the mean sphere, in body axes."""
-        rays_body = self.lever.cam_from_body.inv().apply(rays_cam)
-        points = on_sphere(rays_body, self.lever.camera_body_m, self.radius_m)
-        return points / self.radius_m
+        """Unit vectors from the bearing centre to where rays meet the mean sphere, in camera axes."""
+        camera_m = self.lever.cam_from_body.apply(self.lever.camera_body_m)
+        return on_sphere(rays_cam, camera_m, self.radius_m) / self.radius_m
 
     def solve(self, image: NDArray) -> Report:
         """One frame to an attitude. Raises BadImage for bad input; anything else that fails is a status."""
@@ -322,10 +328,10 @@ class DomeTracker:
             self._on_sphere(self.camera.rays(few.xy_px)),
             self.index,
             max(1.0, 4 * self.settings.centroid_sigma_px) / self.camera.focal_px,
-            self.stretch,
-            False,
-            3000,
-            self.settings.base_stars,
+            stretch=self.stretch,
+            base_stars=self.settings.base_stars,
+            missed_dex=self.settings.missed_dex,
+            field_tan=self.field_tan,
         )
         clock.lap("identify")
         if match is None:
@@ -337,7 +343,7 @@ class DomeTracker:
     def _refined(self, centroids: Centroids, match: StarMatch) -> Attitude:
         """Solve exactly, match every centroid to the LEDs in view, tighten, weigh against chance."""
         camera, lever = self.camera, self.lever
-        body_from_lab = match.cam_from_ref
+        body_from_lab = lever.cam_from_body.inv() * match.cam_from_ref
         observed, star = match.observed, match.star
         for radius_px in (12.0, 4.0, 4.0):
             rays = camera.rays(centroids.xy_px[observed])
@@ -358,6 +364,8 @@ class DomeTracker:
                 return Attitude(NO_MATCH)
         observed, star = kept
         chance = log10_chance(observed, len(centroids), len(inside), radius_px, camera, len(self.index.pair))
+        expected = np.flatnonzero(camera.contains(np.nan_to_num(xy, nan=-1e9), BORDER * camera.height_px))
+        chance += self.settings.missed_dex * len(np.setdiff1d(expected, star))
         if chance > ACCEPT_LOG10_CHANCE:
             return Attitude(NO_MATCH)
         cam_from_lab = lever.cam_from_body * body_from_lab

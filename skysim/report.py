@@ -175,7 +175,8 @@ PAGE = """<!doctype html>
 </div>
 <h2>The run</h2><img alt="errors, lights and rate against time" src="{{ figure }}">
 <h2>The last solved frame</h2>
-<p class="key"><span>\u2715 blue: truth</span><span>\u25a1 red: detected</span><span>\u25ef green: identified</span></p>
+<p class="key"><span>blue ticks: truth</span><span>red squares: detected</span>
+<span>green circles: identified</span></p>
 <img alt="frame with truth, detections and identified stars" src="{{ picture }}">
 <h2>Where the time goes</h2>
 <p>{% for stage, ms in stages_ms.items() %}{{ stage }} {{ '%.2f'|format(ms) }} ms{{ ', ' if not loop.last }}{% endfor %}

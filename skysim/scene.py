@@ -397,7 +397,7 @@ def load_camera(path: Path) -> Camera:
     """The `camera` section of a scene, or of a file that has nothing else. Raises BadInput with one line."""
     tree, text = read_yaml(path)
     try:
-        return CameraFile.model_validate({"camera": tree.get("camera", {})}).camera
+        return CameraFile.model_validate({key: tree[key] for key in tree if key == "camera"}).camera
     except ValidationError as error:
         raise BadInput(explain(error, CameraFile, tree, text, path, {})) from None
 

@@ -92,7 +92,9 @@ def test_three_stars_keep_their_handedness():
 def test_the_tracker_reads_the_pointing_that_the_simulator_set():
     """Vega in the middle (RA 279.2347, Dec +38.7837), up at position angle -25: said once each way."""
     look = Rotation.from_matrix(hand_made(279.2347, 38.7837, -25.0))
-    np.testing.assert_allclose(np.degrees(radecroll_rad(look)), (279.2347, 38.7837, -25.0), rtol=0, atol=1e-10)
+    np.testing.assert_allclose(
+        np.degrees(radecroll_rad(look)), (279.2347, 38.7837, -25.0), rtol=0, atol=1e-10
+    )
     assert (look * cam_from_icrs(279.2347, 38.7837, -25.0).inv()).magnitude() < EXACT
 
 

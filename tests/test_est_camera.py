@@ -52,9 +52,7 @@ def test_the_distortion_is_opencv_s() -> None:
 def test_the_undistortion_is_opencv_s() -> None:
     pixels = pixels_over(DISTORTED, 500, seed=2)
     done = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-15)
-    oracle = cv2.undistortPointsIter(
-        pixels[:, None], CV_MATRIX, np.array(LENS), np.eye(3), np.eye(3), done
-    ).reshape(-1, 2)
+    oracle = cv2.undistortPoints(pixels[:, None], CV_MATRIX, np.array(LENS), criteria=done).reshape(-1, 2)
     rays = DISTORTED.rays(pixels)
     # 1e-9: both iterate to convergence; OpenCV stops by the pixel error.
     np.testing.assert_allclose(rays[:, :2] / rays[:, 2:], oracle, rtol=0, atol=1e-9)
@@ -84,8 +82,8 @@ def test_the_diagonal_is_the_angle_between_opposite_corners() -> None:
     camera = Camera(659, 493, 24.95e-3 / 9.9e-6, (329.0, 246.0))
     corners = camera.rays(np.array([[-0.5, -0.5], [658.5, 492.5]]))
     assert camera.diagonal_rad == pytest.approx(np.arccos(corners[0] @ corners[1]), abs=1e-12)  # rounding
-    # .03 degree: the paper's figures leave open whether edges or middles of pixels are meant.
-    assert np.degrees(camera.diagonal_rad) == pytest.approx(18.51, abs=0.03)
+    # .05 degree: the papers leave open whether edges or middles of pixels are meant, a pixel of .023 apart.
+    assert np.degrees(camera.diagonal_rad) == pytest.approx(18.51, abs=0.05)
 
 
 def test_a_zoomed_camera_magnifies_angles_from_the_axis() -> None:

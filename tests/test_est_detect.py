@@ -56,7 +56,7 @@ def test_three_pixels_at_five_sigma_keep_white_noise_out() -> None:
 
 
 def test_the_measured_sky_is_the_median_and_the_filtered_noise() -> None:
-    # White noise through the binomial filter keeps sqrt(36 36) / 256... = 0.375 of its deviation.
+    # White noise through the binomial filter keeps (1 + 4 + 1) / 16 = 0.375 of its deviation.
     image = np.random.default_rng(6).normal(200, 8, (512, 512))
     background = detect.sky(image)
     assert background.level.shape == background.noise.shape == (8, 8)
@@ -101,15 +101,14 @@ def test_blobs_are_scipy_s_labels_of_the_same_mask(seed: int) -> None:
     np.testing.assert_allclose(blobs.xy_px, middles, rtol=1e-9, atol=1e-7)
 
 
-def test_a_spiral_is_one_blob() -> None:
-    # The arms of a U and a spiral meet late in the raster: union-find's hard case.
+def test_arms_that_meet_only_at_the_bottom_are_one_blob() -> None:
+    # A comb lying on its back gives every tooth a label of its own until the last row joins them all.
     image = np.zeros((64, 64))
-    for k, (y, x) in enumerate([(8, 8), (14, 14), (20, 20)]):
-        image[y : 56 - 6 * k, [x, 56 - x]] = 100.0
-        image[55 - 6 * k, x : 57 - x] = 100.0
-    image[8, 8:21] = 100.0
+    image[8:50, 6:60:6] = 100.0
+    image[50, 6:55] = 100.0
     blobs = detect.gather(image, flat_background(0.0), np.full((1, 1), 20.0), 1, 10)
-    assert len(blobs) == 1
+    _, count = ndimage.label(ndimage.correlate(image, BINOMIAL) > 20, np.ones((3, 3)))
+    assert len(blobs) == count == 1
     assert blobs.flux[0] == pytest.approx(image.sum(), abs=1e-9)  # rounding
 
 
@@ -136,12 +135,10 @@ def test_stars_on_a_gentle_ramp_are_all_found() -> None:
     assert nearest_px(blobs.xy_px, xy).max() < 0.2
 
 
-@pytest.mark.parametrize(
-    "dtype", ["u1", "i2", "u2", "i4", "i8", "f4", "f8", ">f4", ">f8", ">i2", ">u2", "f2"]
-)
+@pytest.mark.parametrize("dtype", ["u1", "u2", "f4", "f8", ">f4", ">f8", ">u2", "f2"])
 @pytest.mark.parametrize("name", list(detect.DETECTORS))
 def test_stars_are_found_in_pixels_of_any_type(name: str, dtype: str) -> None:
-    # FITS is big-endian. 1000 is a peak of some 60 above 100, so it fits 8 bits.
+    # FITS is big-endian. 300 units of light have a peak of some 60 above 100, so they fit 8 bits.
     image, xy = field_of_stars(10, noise=2.0, flux=300.0)
     blobs = detect.DETECTORS[name](image.round().astype(dtype))
     assert len(blobs) == 12
@@ -192,7 +189,7 @@ def test_what_is_no_image_is_refused_in_one_line(name: str, message: str) -> Non
 
 
 def test_a_texture_is_refused() -> None:
-    image = np.zeros((600, 600))
-    image[::4, ::4] = 1.0  # 22,500 separate points
+    image = np.zeros((900, 900))
+    image[::6, ::6] = 1.0  # 22,500 separate points; most of the pixels feel none, so the noise is 0
     with pytest.raises(BadImage, match="over 20000 blobs"):
         detect.local(image)

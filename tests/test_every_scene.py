@@ -1,0 +1,74 @@
+"""Whatever stands in scenes/ loads, flies, lights enough sources, and repeats itself bit for bit."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from skysim import scene, simulate
+from skysim.simulate import Lab
+
+NAMES = sorted(path.stem for path in scene.SCENES.glob("*.yaml"))
+
+
+def prepared(name: str, frames: int, **overrides: str) -> Lab:
+    return simulate.prepare(scene.load(name, overrides | {"exposure.frames": str(frames)}))
+
+
+@pytest.fixture(scope="module", params=NAMES)
+def lab(request: pytest.FixtureRequest) -> Lab:
+    return prepared(request.param, 2)
+
+
+def test_there_are_scenes() -> None:
+    assert {"afit_simsat", "shefex2"} <= set(NAMES)
+
+
+def test_it_says_what_it_is(lab: Lab) -> None:
+    assert lab.scene.name in NAMES
+    assert 10 < len(lab.scene.title) < 80
+
+
+def test_its_first_frame_shows_at_least_five_sources(lab: Lab) -> None:
+    frame, truth = simulate.shoot(lab, 0)
+    camera, chip = lab.scene.camera, lab.scene.camera.detector
+    assert frame.image_dn.shape == (camera.height_px, camera.width_px)
+    above_noise = truth.seen.peak_e > 5 * np.hypot(chip.read_noise_e, np.sqrt(truth.seen.peak_e))
+    assert above_noise.sum() >= 5
+    # And none of them blinds the chip.
+    assert np.mean(frame.image_dn >= frame.saturation_dn) < 1e-3
+
+
+def test_its_light_is_on_the_frame(lab: Lab) -> None:
+    """Sum above offset and dark, against the truth's electrons, to five sigmas of shot and read noise."""
+    frame, truth = simulate.shoot(lab, 0)
+    chip, pixels = lab.scene.camera.detector, frame.image_dn.size
+    dark_e = (chip.dark_e_s + chip.sky_e_s) * frame.exposure_s
+    found_e = (frame.image_dn.sum(dtype=float) - pixels * chip.offset_dn) * chip.gain_e_dn - pixels * dark_e
+    light_e = truth.seen.electrons.sum()
+    variance = light_e + pixels * (dark_e + chip.read_noise_e**2 + chip.gain_e_dn**2 / 12)
+    # What a star beyond full well loses is less than all it has.
+    clipped_e = truth.seen.electrons[truth.seen.peak_e > chip.full_well_e].sum()
+    assert abs(found_e - light_e) < 5 * np.sqrt(variance) + clipped_e
+
+
+def test_the_same_seed_gives_the_same_bytes_and_another_seed_others(lab: Lab) -> None:
+    name, image = lab.scene.name, simulate.shoot(lab, 0)[0].image_dn
+    again = simulate.shoot(prepared(name, 2), 0)[0].image_dn
+    other = simulate.shoot(prepared(name, 2, seed=str(lab.scene.seed + 1)), 0)[0].image_dn
+    assert image.tobytes() == again.tobytes()
+    assert np.mean(image != other) > 0.1
+
+
+def test_a_frame_alone_is_the_frame_of_a_sequence(lab: Lab) -> None:
+    sequence = [shot.frame.image_dn for shot in simulate.run(lab)]
+    alone, _ = simulate.shoot(prepared(lab.scene.name, 2), 1)
+    assert alone.image_dn.tobytes() == sequence[1].tobytes()
+
+
+def test_its_first_frames_are_solved_and_right(lab: Lab) -> None:
+    for shot in simulate.run(lab):
+        answer = shot.report.attitude
+        assert answer.status == "solved"
+        error = (answer.cam_from_ref * shot.truth.cam_from_lab.inv()).magnitude()
+        assert np.degrees(error) < 10 / 60  # more is what the project calls wrong

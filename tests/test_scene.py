@@ -1,0 +1,352 @@
+"""Units are what they say, and every kind of bad input is one line that helps."""
+
+from __future__ import annotations
+
+import datetime
+from pathlib import Path
+
+import pytest
+from pydantic import ValidationError
+
+from skysim import scene
+from skysim.types import BadInput
+
+AFIT, SHEFEX = scene.SCENES / "afit_simsat.yaml", scene.SCENES / "shefex2.yaml"
+
+
+def line_number(text: str, fragment: str) -> int:
+    (line,) = [n for n, line in enumerate(text.splitlines(), 1) if fragment in line]
+    return line
+
+
+def complaint(path: Path, overrides: dict[str, str] | None = None) -> str:
+    """The one line that a bad scene gets."""
+    with pytest.raises(BadInput) as refusal:
+        scene.load(path, overrides)
+    message = str(refusal.value)
+    assert "\n" not in message
+    assert len(message) < 400
+    return message
+
+
+def spoilt(tmp_path: Path, whole: Path, right: str, wrong: str) -> tuple[str, str]:
+    """The complaint about a scene with one slip in it, and `(file, line N)` of the slip."""
+    text = whole.read_text()
+    assert text.count(right) == 1
+    path = tmp_path / "bad.yaml"
+    path.write_text(text.replace(right, wrong))
+    return complaint(path), f"({path}, line {line_number(text, right.splitlines()[0].strip())})"
+
+
+# Units
+
+
+@pytest.mark.parametrize(
+    ("key", "quantity", "value"),
+    [
+        ("light.surface.apex", "48 in", 1.2192),
+        ("light.surface.apex", "4 ft", 1.2192),
+        ("light.surface.apex", "1219.2 mm", 1.2192),
+        ("light.surface.apex", "1.2192 m", 1.2192),
+        ("camera.pixel", "4.0 um", 4e-6),
+        ("camera.focal_length", "35 mm", 0.035),
+        ("exposure.time", "10 ms", 0.010),
+        ("exposure.time", "1000 us", 0.001),
+        ("exposure.first", "1 min", 60.0),
+        ("vehicle.mass", "176.37 lb", 80.0),
+        ("vehicle.torque_limit", "1 N m", 1.0),
+        ("light.led.intensity", "16 mcd", 0.016),
+    ],
+)
+def test_a_quantity_becomes_si(key: str, quantity: str, value: float) -> None:
+    node: object = scene.load("afit_simsat", {key: quantity})
+    for part in key.split("."):
+        (name,) = [n for n in type(node).model_fields if scene.SI_SUFFIX.sub("", n) == part]
+        node = getattr(node, name)
+    assert node == pytest.approx(value, rel=1e-5)  # a pound is 0.45359 kg
+
+
+def test_afit_says_what_the_thesis_says() -> None:
+    loaded = scene.load("afit_simsat")
+    # Reference §1.1: apex 48 in, semi-axes 38.88 and 28.60 in, pitch 8 mm, tilt +-30 deg, 35 mm, 1600 x 1200.
+    assert loaded.light.surface.apex_m == pytest.approx(48 * 0.0254, abs=1e-12)
+    assert loaded.light.surface.semi_axes_m == pytest.approx((0.987552, 0.987552, 0.72644), abs=1e-12)
+    assert loaded.light.layout.pitch_m == pytest.approx(0.008, abs=1e-15)
+    assert loaded.vehicle.tilt_stop_deg == 30
+    assert (loaded.camera.width_px, loaded.camera.height_px) == (1600, 1200)
+    assert loaded.camera.focal_px == pytest.approx(0.035 / 4e-6, rel=1e-12)
+    assert (loaded.name, loaded.seed) == ("afit_simsat", 1)
+    assert loaded.start_time == datetime.datetime(2012, 3, 1, 12)
+
+
+def test_a_scene_is_frozen() -> None:
+    with pytest.raises(ValidationError, match="frozen"):
+        scene.load("shefex2").seed = 3
+
+
+def test_a_scene_is_found_by_name_and_by_path() -> None:
+    assert scene.load("shefex2") == scene.load(SHEFEX) == scene.load(str(SHEFEX))
+
+
+def test_the_camera_of_a_scene_can_be_read_alone(tmp_path: Path) -> None:
+    text = SHEFEX.read_text()
+    alone = tmp_path / "camera.yaml"
+    alone.write_text(text[text.index("camera:") : text.index("exposure:")])
+    assert scene.load_camera(alone) == scene.load_camera(SHEFEX) == scene.load("shefex2").camera
+
+
+# Overrides
+
+
+def test_an_override_takes_the_place_of_the_file_s_value() -> None:
+    changed = scene.load("afit_simsat", {"camera.detector.bits": "8", "motion.start": "{yaw_deg: 40}"})
+    assert changed.camera.detector.bits == 8
+    assert changed.motion.start == scene.Attitude(yaw_deg=40)
+
+
+def test_an_override_may_add_a_section() -> None:
+    text = {"tracker.believed_camera_body": "['1 in', '0 m', '15 in']"}
+    assert scene.load("afit_simsat", text).tracker.believed_camera_body_m == pytest.approx((0.0254, 0, 0.381))
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "says"),
+    [
+        (
+            "camera.focal_lenght",
+            "25 mm",
+            "camera.focal_lenght: unknown key; did you mean focal_length?; allowed: ",
+        ),
+        (
+            "exposure.time",
+            "-1 ms",
+            "exposure.time: '-1 ms' is not allowed; it should be greater than 0 (--set)",
+        ),
+        (
+            "exposure.frames",
+            "0",
+            "exposure.frames: 0 is not allowed; it should be greater than or equal to 1",
+        ),
+        ("seed.x", "3", "--set seed.x: seed holds a value, not keys"),
+        ("seed", "[", "--set seed: '[' is not YAML"),
+        ("camera..bits", "3", "--set camera..bits=3: allowed: path.to.key=value"),
+        ("camera", "", "camera: None is not allowed; it should be a mapping of keys to values (--set)"),
+        ("exposure.time", "a\nb", "is not a time; allowed: a time such as"),
+    ],
+)
+def test_a_bad_override_is_one_line_and_blamed_on_the_option(key: str, value: str, says: str) -> None:
+    message = complaint(SHEFEX, {key: value})
+    assert says in message
+    assert "--set" in message
+    assert str(SHEFEX) not in message
+
+
+# Slips in a file
+
+
+@pytest.mark.parametrize(
+    ("right", "wrong", "says"),
+    [
+        ("falloff: inverse_square", "falloff: cubic", "light.led.falloff: 'cubic' is none of inverse_square"),
+        ("kind: gaussian", "kind: airy", "camera.psf.kind: 'airy' is none of gaussian, disc"),
+        ("  kind: dome", "  kind: domes", "light.kind: 'domes' is none of dome, stars"),
+        (
+            "kind: ellipsoid",
+            "kind: torus",
+            "light.surface.kind: 'torus' is not allowed; it should be 'sphere', ",
+        ),
+        (
+            "control: pid",
+            "control: lqr",
+            "motion.control: 'lqr' is not allowed; it should be 'none' or 'pid'",
+        ),
+        (
+            'apex: "48 in"',
+            'apexx: "48 in"',
+            "light.surface.apexx: unknown key; did you mean apex?; allowed: kind, ",
+        ),
+        (
+            'apex: "48 in"',
+            'apex: "48 kg"',
+            "light.surface.apex: '48 kg' is not a length; allowed: a length such as",
+        ),
+        (
+            'apex: "48 in"',
+            'apex: "48"',
+            "light.surface.apex: '48' is not a length; allowed: a length such as",
+        ),
+        (
+            'apex: "48 in"',
+            "apex: 48",
+            'light.surface.apex: 48 has no unit; allowed: a length such as "35 mm"',
+        ),
+        (
+            'apex: "48 in"',
+            'apex: "-48 in"',
+            "light.surface.apex: '-48 in' is not allowed; it should be greater than",
+        ),
+        (
+            '"38.88 in", "28.60 in"]',
+            '"38.88 in", "0 in"]',
+            "light.surface.semi_axes.2: '0 in' is not allowed",
+        ),
+        (
+            'time: "10 ms"',
+            'time: "-10 ms"',
+            "exposure.time: '-10 ms' is not allowed; it should be greater than 0",
+        ),
+        ('time: "10 ms"', 'time: "nan ms"', "exposure.time: nan is not a finite number"),
+        ('time: "10 ms"', 'time: "1e400 ms"', "exposure.time: inf is not a finite number"),
+        ("f_number: 8", "f_number: .nan", "camera.f_number: nan is not a finite number"),
+        (
+            "width_px: 1600",
+            "width_px: 1600.5",
+            "camera.width_px: 1600.5 is not allowed; it should be a valid integer",
+        ),
+        (
+            "bits: 12",
+            "bits: 17",
+            "camera.detector.bits: 17 is not allowed; it should be less than or equal to 16",
+        ),
+        ("lit: [3, 6]", "lit: [3, 12]", "allowed: 1 <= least <= most <= 9"),
+        ("lit: [3, 6]", "lit: [3]", "light.layout.lit.1: missing"),
+        ("pwm_levels: [1.0, 0.7, 0.5, 0.35]", "pwm_levels: []", "light.layout.pwm_levels: [] is not allowed"),
+        ("hardware_seed: 2012", "hardware_seed: -1", "light.layout.hardware_seed: -1 is not allowed"),
+        ('"9.0 kg m2"', '"90 kg m2"', "is no rigid body's: each positive, none above the sum of the others"),
+        ("schema: 1", "schema: 2", "schema: 2 is not allowed; it should be 1"),
+        ("seed: 1\n", "seed: one\n", "seed: 'one' is not allowed; it should be a valid integer"),
+        (
+            "2012-03-01T12:00:00",
+            "yesterday",
+            "start_time: 'yesterday' is not allowed; it should be a valid datetime",
+        ),
+        ("title: AFIT", "name: x\ntitle: AFIT", "name: unknown key"),
+        (
+            'duration: "2 s"',
+            'durations: "2 s"',
+            "unknown key; did you mean duration?; allowed: kind, duration",
+        ),
+        ('{kind: hold, duration: "2 s"}', '{kind: wait, duration: "2 s"}', "'wait' is none of hold, slew"),
+        (
+            "pitch_deg: 0",
+            "pich_deg: 0",
+            "motion.start.pich_deg: unknown key; did you mean pitch_deg?; allowed: roll_",
+        ),
+    ],
+)
+def test_a_slip_is_answered_with_its_key_what_is_allowed_and_its_line(
+    tmp_path: Path, right: str, wrong: str, says: str
+) -> None:
+    message, place = spoilt(tmp_path, AFIT, right, wrong)
+    assert says in message
+    assert message.endswith(place)
+
+
+@pytest.mark.parametrize(
+    ("right", "wrong", "says"),
+    [
+        (
+            "ra_deg: 83.0",
+            "ra_deg: 400",
+            "motion.start.ra_deg: 400 is not allowed; it should be less than 360",
+        ),
+        (
+            "dec_deg: 2.0",
+            "dec_deg: -91",
+            "motion.start.dec_deg: -91 is not allowed; it should be greater than",
+        ),
+        ("ra_deg: 83.0", "ra_deg: .nan", "motion.start.ra_deg: nan is not a finite number"),
+        (
+            "dec_deg: 2.0",
+            "decl_deg: 2.0",
+            "motion.start.decl_deg: unknown key; did you mean dec_deg?; allowed: ra_deg",
+        ),
+        ("dec_deg: 2.0, roll_deg: 20.0", "roll_deg: 20.0", "motion.start.dec_deg: missing"),
+        (
+            "ra_deg: 83.0, dec_deg: 2.0, ",
+            "",
+            "motion.start: light of kind stars takes ra_deg, dec_deg, roll_deg",
+        ),
+    ],
+)
+def test_a_slip_in_where_the_camera_points_is_not_taken_for_a_vehicle_s(
+    tmp_path: Path, right: str, wrong: str, says: str
+) -> None:
+    message, place = spoilt(tmp_path, SHEFEX, right, wrong)
+    assert says in message
+    assert message.endswith(place)
+
+
+def test_a_dome_cannot_start_at_a_place_in_the_sky(tmp_path: Path) -> None:
+    right = "start: {roll_deg: 0, pitch_deg: 0, yaw_deg: 0}"
+    message, place = spoilt(tmp_path, AFIT, right, "start: {ra_deg: 83, dec_deg: 2}")
+    assert message == f"motion.start: light of kind dome takes roll_deg, pitch_deg, yaw_deg {place}"
+
+
+def test_a_missing_key_is_named_with_its_section_s_line(tmp_path: Path) -> None:
+    message, _ = spoilt(tmp_path, AFIT, '    apex: "48 in"\n', "")
+    line = line_number(AFIT.read_text(), "surface:")
+    assert message == f"light.surface.apex: missing ({tmp_path / 'bad.yaml'}, line {line})"
+
+
+def test_a_missing_section_is_named(tmp_path: Path) -> None:
+    message, _ = spoilt(tmp_path, AFIT, "seed: 1\n", "")
+    assert message == f"seed: missing ({tmp_path / 'bad.yaml'})"
+
+
+def test_an_exposure_longer_than_its_period_is_refused(tmp_path: Path) -> None:
+    message, place = spoilt(tmp_path, AFIT, 'time: "10 ms"', 'time: "10 s"')
+    assert message == f"exposure: time 10.0 s is longer than the frame period 0.5 s {place}"
+
+
+def test_a_manoeuvre_without_a_controller_is_refused(tmp_path: Path) -> None:
+    message, _ = spoilt(tmp_path, AFIT, "control: pid", "control: none")
+    assert message.startswith("motion: a manoeuvre needs a controller; allowed: control: pid")
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("a: [1, 2", "not YAML"),
+        ("a:\n\t- b", "line 2: not YAML"),
+        ("a: \x00", "not YAML: unacceptable character"),
+        ("", "allowed: a mapping of keys to values"),
+        ("- 1\n- 2\n", "allowed: a mapping of keys to values"),
+        ("just words", "allowed: a mapping of keys to values"),
+        ("1: 2\n", "1: 1 is not allowed"),
+    ],
+)
+def test_what_is_no_scene_at_all_is_one_line(tmp_path: Path, text: str, says: str) -> None:
+    path = tmp_path / "bad.yaml"
+    path.write_text(text)
+    message = complaint(path)
+    assert says in message
+    assert str(path) in message
+
+
+def test_bytes_that_are_no_text_are_one_line(tmp_path: Path) -> None:
+    path = tmp_path / "bad.yaml"
+    path.write_bytes(b"\xff\xfe\x80\x81")
+    assert f"{path}: cannot be read" in complaint(path)
+
+
+@pytest.mark.parametrize("name", ["nosuch", "nosuch.yaml", "scenes/nosuch", "", "."])
+def test_an_unknown_scene_is_answered_with_the_known_ones(name: str) -> None:
+    with pytest.raises(
+        BadInput, match=r"no such scene; allowed: a \.yaml file or one of .*afit_simsat.*shefex2"
+    ):
+        scene.load(name)
+
+
+def test_a_camera_file_without_a_camera_is_one_line(tmp_path: Path) -> None:
+    path = tmp_path / "camera.yaml"
+    path.write_text("title: no camera\n")
+    with pytest.raises(BadInput, match=r"^camera: missing \(.*camera\.yaml\)$"):
+        scene.load_camera(path)
+
+
+def test_every_algorithm_that_the_schema_names_exists() -> None:
+    from skysim.dome import LAYOUTS, SURFACES
+
+    assert set(scene.Surface.model_fields["kind"].annotation.__args__) == set(SURFACES)
+    assert set(scene.PatchBoards.model_fields["kind"].annotation.__args__) == set(LAYOUTS)

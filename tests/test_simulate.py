@@ -1,0 +1,233 @@
+"""The whole chain without noise returns the truth; frames stand alone; the streams are order-free."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from estimator.types import Attitude, Centroids
+from skysim import scene, simulate
+from skysim.simulate import Lab
+from skysim.types import BadInput, Truth
+
+QUIET_DOME = {
+    "camera.detector.noise": "false",
+    "motion.control": "none",
+    "motion.manoeuvre": "[]",
+    "vehicle.centre_of_mass": "['0 m', '0 m', '0 m']",  # balanced: it stays where it is put
+    "exposure.frames": "1",
+}
+# Stars too faint for the catalogue are light in their neighbours' fitting windows (some 10 arcsec of bias), so the
+# bar of 1e-6 deg is for a sky of isolated stars that are all on board.
+QUIET_SKY = {
+    "camera.detector.noise": "false",
+    "motion.rate_deg_s": "[0, 0, 0]",
+    "light.limit_mag": "5",
+    "tracker.limit_mag": "5",
+    "exposure.frames": "1",
+}
+ATTITUDES = [
+    "{roll_deg: 7}",
+    "{roll_deg: -15, pitch_deg: 8, yaw_deg: 100}",
+    "{pitch_deg: -20, yaw_deg: -170}",
+]
+POINTINGS = ["{ra_deg: 83, dec_deg: 2}", "{ra_deg: 300, dec_deg: 20, roll_deg: 77}"]
+
+
+def prepared(name: str, **overrides: str) -> Lab:
+    return simulate.prepare(scene.load(name, {k.replace("__", "."): v for k, v in overrides.items()}))
+
+
+def quiet(name: str, start: str) -> Lab:
+    changes = {"afit_simsat": QUIET_DOME, "shefex2": QUIET_SKY}[name]
+    return simulate.prepare(scene.load(name, changes | {"motion.start": start}))
+
+
+def error_deg(answer: Attitude, truth: Truth) -> float:
+    assert answer.status == "solved"
+    assert answer.cam_from_ref is not None
+    return float(np.degrees((answer.cam_from_ref * truth.cam_from_lab.inv()).magnitude()))
+
+
+def true_centroids(truth: Truth) -> Centroids:
+    """The true pixels, brightest first, as if they had been measured to a hundredth of a pixel."""
+    order = np.argsort(-truth.seen.electrons)
+    count = len(order)
+    return Centroids(truth.seen.flux_xy_px[order], np.full(count, 0.01), truth.seen.electrons[order])
+
+
+# Without noise
+
+
+@pytest.mark.parametrize(
+    ("name", "start"), [("afit_simsat", s) for s in ATTITUDES] + [("shefex2", s) for s in POINTINGS]
+)
+def test_a_noise_free_image_gives_the_true_attitude(name: str, start: str) -> None:
+    lab = quiet(name, start)
+    frame, truth = simulate.shoot(lab, 0)
+    assert frame.image_dn.dtype == np.float64
+    assert error_deg(simulate.tracker(lab).solve(frame.image_dn).attitude, truth) < 1e-6
+
+
+@pytest.mark.parametrize(
+    ("name", "start"), [("afit_simsat", s) for s in ATTITUDES] + [("shefex2", s) for s in POINTINGS]
+)
+def test_true_centroids_give_the_true_attitude(name: str, start: str) -> None:
+    lab = quiet(name, start)
+    _, truth = simulate.shoot(lab, 0)
+    assert error_deg(simulate.tracker(lab).solve_centroids(true_centroids(truth)), truth) < 1e-6
+
+
+def test_true_centroids_under_the_dome_give_the_attitude_to_machine_precision() -> None:
+    # Reference §5: exact PnP noise-free, 1e-14 deg; here both sides know the very same LEDs.
+    lab = quiet("afit_simsat", ATTITUDES[1])
+    _, truth = simulate.shoot(lab, 0)
+    assert error_deg(simulate.tracker(lab).solve_centroids(true_centroids(truth)), truth) < 1e-12
+
+
+def test_a_distorted_lens_that_the_tracker_knows_costs_nothing() -> None:
+    lens = {
+        "camera.distortion": "[-0.2, 0.1, 0.001, -0.002, 0.05]",
+        "camera.principal_point_px": "[340, 230]",
+    }
+    lab = simulate.prepare(scene.load("shefex2", QUIET_SKY | lens))
+    frame, truth = simulate.shoot(lab, 0)
+    assert error_deg(simulate.tracker(lab).solve(frame.image_dn).attitude, truth) < 1e-6
+
+
+def test_a_wrongly_believed_lever_costs_what_the_reference_says() -> None:
+    """Reference §5: 1 mm of lateral lever is .047 deg across (5 LEDs); by geometry 1 mm / 1.22 m = .047 deg."""
+    moved = {"tracker.believed_camera_body": "['1 mm', '0 m', '381 mm']", "motion.start": "{roll_deg: 7}"}
+    lab = simulate.prepare(scene.load("afit_simsat", QUIET_DOME | moved))
+    _, truth = simulate.shoot(lab, 0)
+    error = error_deg(simulate.tracker(lab).solve_centroids(true_centroids(truth)), truth)
+    assert error == pytest.approx(np.degrees(1e-3 / 1.22), rel=0.15)
+
+
+# What the frames are made of
+
+
+def test_the_camera_points_where_the_scene_says() -> None:
+    lab = quiet("shefex2", "{ra_deg: 83, dec_deg: 2, roll_deg: 20}")
+    _, truth = simulate.shoot(lab, 0)
+    right, down, sight = truth.cam_from_lab.as_matrix()
+    ra, dec = np.radians([83.0, 2.0])
+    wanted = [np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)]
+    np.testing.assert_allclose(sight, wanted, rtol=0, atol=1e-14)
+    # Position angle of the image's up: from north through east, and east is to the left.
+    north = np.array([-np.sin(dec) * np.cos(ra), -np.sin(dec) * np.sin(ra), np.cos(dec)])
+    east = np.array([-np.sin(ra), np.cos(ra), 0])
+    assert np.degrees(np.arctan2(-down @ east, -down @ north)) == pytest.approx(20, abs=1e-10)
+    assert -right @ (east * np.cos(np.radians(20)) - north * np.sin(np.radians(20))) == pytest.approx(
+        1, abs=1e-12
+    )
+
+
+def test_the_truth_moves_at_the_rate_of_the_scene() -> None:
+    """A sphere of 120 kg m2 in free flight turns evenly: .5 deg/s for the 2 s between frames 0 and 20."""
+    lab = prepared("shefex2", exposure__frames="21")
+    first, last = (simulate.shoot(lab, k)[1] for k in (0, 20))
+    assert last.t_s - first.t_s == pytest.approx(2.0, abs=1e-12)
+    turned = (last.cam_from_lab * first.cam_from_lab.inv()).magnitude()
+    assert np.degrees(turned) == pytest.approx(1.0, abs=1e-9)
+    assert np.degrees(np.linalg.norm(last.rate_cam_rad_s)) == pytest.approx(0.5, abs=1e-9)
+
+
+def test_streaks_are_rate_times_exposure_times_focal_length() -> None:
+    """Near the axis; .5 deg/s, 40 ms, 2,525 px: .88 px."""
+    lab = prepared("shefex2", exposure__frames="1")
+    seen = simulate.shoot(lab, 0)[1].seen
+    middle = np.hypot(*(seen.xy_px - [329, 246]).T) < 120
+    assert middle.sum() >= 3
+    wanted = np.radians(0.5) * 0.040 * 25e-3 / 9.9e-6
+    np.testing.assert_allclose(seen.streak_px[middle], wanted, rtol=5e-3, atol=0)  # 1 + tan^2 at 120 px: .2 %
+
+
+def test_the_camera_rides_fifteen_inches_above_the_bearing() -> None:
+    lab = prepared("afit_simsat", exposure__frames="1")
+    np.testing.assert_allclose(lab.mount.camera_body_m, [0, 0, 15 * 0.0254], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(lab.mount.cam_from_body.as_matrix(), np.eye(3), rtol=0, atol=1e-12)
+
+
+def test_shutters_open_on_time() -> None:
+    loaded = scene.load("shefex2")
+    assert [simulate.open_s(loaded, k) for k in (0, 1, 39)] == pytest.approx([0.1, 0.2, 4.0], abs=1e-12)
+
+
+# Random streams
+
+
+def test_frames_do_not_depend_on_those_before() -> None:
+    lab = prepared("shefex2", exposure__frames="4")
+    in_order = [simulate.shoot(lab, k)[0].image_dn for k in range(4)]
+    backwards = [simulate.shoot(lab, k)[0].image_dn for k in (3, 2, 1, 0)][::-1]
+    for one, other in zip(in_order, backwards, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_noise_differs_from_frame_to_frame_and_seed_to_seed() -> None:
+    draws = [simulate.rng(seed, "detector", k).standard_normal(1000) for seed, k in ((1, 0), (1, 1), (2, 0))]
+    correlation = np.corrcoef(draws)
+    assert np.abs(correlation[np.triu_indices(3, 1)]).max() < 4 / np.sqrt(1000)
+
+
+def test_the_hardware_s_seed_is_not_the_noise_s() -> None:
+    domes = [prepared("afit_simsat", seed=seed, exposure__frames="1").sources for seed in ("1", "2")]
+    np.testing.assert_array_equal(domes[0].place, domes[1].place)
+    np.testing.assert_array_equal(domes[0].strength, domes[1].strength)
+
+
+# The run
+
+
+@pytest.fixture(scope="module")
+def shots() -> list[simulate.Shot]:
+    return list(simulate.run(prepared("shefex2", exposure__frames="3")))
+
+
+def test_a_run_answers_every_frame(shots: list[simulate.Shot]) -> None:
+    assert [shot.frame.index for shot in shots] == [0, 1, 2]
+    for shot in shots:
+        assert error_deg(shot.report.attitude, shot.truth) < 10 / 60
+        assert all(spent >= 0 for spent in shot.seconds.values())
+
+
+def test_a_blinded_frame_is_a_status_and_no_attitude() -> None:
+    lab = prepared("shefex2", exposure__frames="1", camera__detector__sky_e_s="1e8")
+    (shot,) = simulate.run(lab)
+    assert "saturated" in shot.report.attitude.status
+    assert shot.report.attitude.cam_from_ref is None
+
+
+def test_a_starless_frame_is_a_status_and_no_attitude() -> None:
+    lab = prepared("shefex2", exposure__frames="1", light__limit_mag="-5")
+    (shot,) = simulate.run(lab)
+    assert shot.report.attitude.status != "solved"
+    assert shot.report.attitude.cam_from_ref is None
+    assert len(shot.truth.seen.id) == 0
+
+
+@pytest.mark.parametrize("stage", ["detector", "centroider", "identifier", "solver"])
+@pytest.mark.parametrize("name", ["shefex2", "afit_simsat"])
+def test_an_unknown_algorithm_is_refused_before_the_flight(name: str, stage: str) -> None:
+    loaded = scene.load(name, {f"tracker.{stage}": "magic"})
+    with pytest.raises(BadInput, match=rf"^tracker\.{stage}: 'magic' is none of \w+"):
+        simulate.prepare(loaded)
+
+
+@pytest.mark.parametrize(("name", "solver"), [("shefex2", "rotation_only"), ("afit_simsat", "quest")])
+def test_a_solver_for_the_other_sky_is_refused(name: str, solver: str) -> None:
+    loaded = scene.load(name, {"tracker.solver": solver})
+    with pytest.raises(BadInput, match=rf"^tracker\.solver: '{solver}' is none of "):
+        simulate.prepare(loaded)
+
+
+def test_the_believed_camera_is_the_true_one_unless_told_otherwise() -> None:
+    loaded = scene.load("shefex2", {"camera.distortion": "[-0.2, 0.1, 0, 0, 0]"})
+    believed = simulate.believed_camera(loaded)
+    lens = simulate.Optics.of(loaded.camera)
+    vectors = Rotation.from_rotvec([0.05, -0.08, 0]).apply([[0, 0, 1.0], [0.02, 0, 1.0]])
+    np.testing.assert_allclose(believed.pixels(vectors), lens.project(vectors), rtol=0, atol=1e-10)
+    longer = simulate.believed_camera(scene.load("shefex2", {"tracker.believed_focal_length": "25.25 mm"}))
+    assert longer.focal_px == pytest.approx(lens.focal_px * 1.01, rel=1e-12)
