@@ -74,7 +74,11 @@ def read(path: str | Path) -> StarList:
         delimiter = "," if "," in body[0] else None
         header = body[0].replace('"', "").split(delimiter)
         columns = [header.index(name) for name in names]
+        if not body[1:]:
+            raise ValueError("it has no rows")
         table = np.loadtxt(body[1:], delimiter=delimiter, usecols=columns, ndmin=2)
+        if not np.isfinite(table).all():
+            raise ValueError("some numbers are not finite")
     except (OSError, ValueError, IndexError) as error:
         raise BadImage(
             f"{path}: not a star catalogue ({error}); allowed: ECSV with {', '.join(names)}"

@@ -92,7 +92,7 @@ def rotation_only(
     Minimises the tangent-plane residual of q = b - r, b = A P, with A <- exp([w]) A and the Jacobian
     J_i = D(q) (-[b_i]x), D = [[1/q_z, 0, -q_x/q_z^2], [0, 1/q_z, -q_y/q_z^2]] by Gauss-Newton in camera axes.
     The surface is not used: only where the lights are, and that the camera turns about the bearing centre.
-    Raises ValueError where it does not converge.
+    Raises ValueError where it does not converge, or where the lights leave a turn unknown.
     """
     measured = rays_cam[:, :2] / rays_cam[:, 2:]
     weight = np.repeat(1 / sigma_rad, 2)
@@ -102,7 +102,9 @@ def rotation_only(
         q = b - cam_from_body.apply(lever.camera_body_m)
         jacobian = _jacobian(b, q) * weight[:, None]
         residual = (measured - q[:, :2] / q[:, 2:]).ravel() * weight
-        step, *_ = np.linalg.lstsq(jacobian, residual, rcond=None)
+        step, _, rank, _ = np.linalg.lstsq(jacobian, residual, rcond=None)
+        if rank < 3:
+            raise ValueError(f"{len(rays_cam)} lights leave a turn unknown; two apart are needed")
         body_from_lab = cam_from_body.inv() * Rotation.from_rotvec(step) * cam_from_body * body_from_lab
         if np.linalg.norm(step) < 1e-15:
             break

@@ -53,5 +53,8 @@ def digitise(electrons: Floats, gain_e_dn: float, offset_dn: float, bits: int) -
 
 
 def saturation_dn(chip: Detector) -> float:
-    """The digital number from which a pixel tells nothing more: full well or the converter's end."""
-    return float(min(chip.full_well_e / chip.gain_e_dn + chip.offset_dn, 2**chip.bits - 1))
+    """The digital number from which a pixel tells nothing more: full well, less three sigma of what read-out
+    adds to it, or the converter's end.
+    """
+    well_e = chip.full_well_e - 3 * chip.read_noise_e
+    return float(min(well_e / chip.gain_e_dn + chip.offset_dn, 2**chip.bits - 1))

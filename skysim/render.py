@@ -94,10 +94,15 @@ def in_view(
     lab_from_body: Rotation = trajectory.at(t_s)
     sight = (mount.cam_from_body * lab_from_body.inv()).inv().apply([0.0, 0.0, 1.0])
     camera_m = lab_from_body.apply(mount.camera_body_m)
-    offset = sources.place[None, :, :3] - sources.place[None, :, 3:] * camera_m[:, None, :]
-    cosine = np.einsum("knj,kj->kn", offset, sight) / np.linalg.norm(offset, axis=2)
+    place, near = sources.place[:, :3], sources.place[:, 3:]  # near is 1 for an LED, 0 for a star
+    along = place @ sight.T - near * np.sum(camera_m * sight, axis=1)
+    square = (
+        np.sum(place**2, axis=1)[:, None]
+        - 2 * near * (place @ camera_m.T)
+        + near * np.sum(camera_m**2, axis=1)
+    )
     edge = np.cos(min(1.25 * optics.half_diagonal_rad + 0.02, np.pi))
-    return np.flatnonzero((cosine > edge).any(axis=0))
+    return np.flatnonzero((along > edge * np.sqrt(square)).any(axis=1))
 
 
 def path_px(sources: Sources, optics: Optics, trajectory: Trajectory, mount: Mount, t_s: Floats) -> Floats:

@@ -8,14 +8,12 @@ suffix (`camera.focal_length_m`), so that a unit is always in sight.
 from __future__ import annotations
 
 import datetime
-import difflib
 import math
 import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import yaml
 from pydantic import (
     AfterValidator,
     BaseModel,
@@ -30,6 +28,7 @@ from pydantic import (
 )
 
 from skysim.types import BadInput
+from skysim.yamlfile import explain, put, read_yaml
 
 ROOT = Path(__file__).resolve().parents[1]
 SCENES = ROOT / "scenes"
@@ -400,131 +399,3 @@ def load_camera(path: Path) -> Camera:
         return CameraFile.model_validate({key: tree[key] for key in tree if key == "camera"}).camera
     except ValidationError as error:
         raise BadInput(explain(error, CameraFile, tree, text, path, {})) from None
-
-
-def read_yaml(path: Path) -> tuple[dict[str, Any], str]:
-    """A YAML mapping and its text."""
-    try:
-        text = path.read_text(encoding="utf-8")
-        tree = yaml.safe_load(text)
-    except (OSError, UnicodeDecodeError) as error:
-        raise BadInput(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from error
-    except yaml.YAMLError as error:
-        mark = getattr(error, "problem_mark", None)
-        where = f", line {mark.line + 1}" if mark else ""
-        problem = " ".join(str(getattr(error, "problem", error)).split())
-        raise BadInput(f"{path}{where}: not YAML: {problem}") from error
-    if not isinstance(tree, dict):
-        raise BadInput(f"{path}: allowed: a mapping of keys to values")
-    return tree, text
-
-
-def put(tree: dict[str, Any], key: str, value: str) -> None:
-    """Set one dotted key of the raw scene; the value is YAML."""
-    *parents, last = key.split(".")
-    if not all((*parents, last)):
-        raise BadInput(f"--set {key}={value}: allowed: path.to.key=value")
-    for depth, parent in enumerate(parents):
-        tree = tree.setdefault(parent, {})
-        if not isinstance(tree, dict):
-            raise BadInput(f"--set {key}: {'.'.join(parents[: depth + 1])} holds a value, not keys")
-    try:
-        tree[last] = yaml.safe_load(value)
-    except yaml.YAMLError as error:
-        raise BadInput(f"--set {key}: {value!r} is not YAML") from error
-
-
-def explain(
-    error: ValidationError,
-    model: type[BaseModel],
-    tree: dict[str, Any],
-    text: str,
-    path: Path,
-    overrides: Mapping[str, str],
-) -> str:
-    """One line for the first fault: `led.falloff: 'cubic' is none of … (scenes/x.yaml, line 31)`."""
-    # A key that is unknown explains one that is missing, so what is missing waits.
-    first = min(error.errors(), key=lambda fault: fault["type"] == "missing")
-    keys = [str(key) for key in in_tree(first["loc"], tree)]
-    message = re.sub(r"^(Value error, |\w+ should )", "", first["msg"])
-    if first["type"] == "extra_forbidden":
-        message = "unknown key" + hint(keys[-1], allowed_keys(model, first["loc"][:-1]))
-    elif first["type"] == "missing":
-        message = "missing"
-    elif first["type"] == "union_tag_invalid":
-        keys, context = [*keys, "kind"], first["ctx"]
-        message = f"{context['tag']!r} is none of {context['expected_tags'].replace(chr(39), '')}"
-    elif first["type"] == "union_tag_not_found":
-        message = "kind is missing"
-    elif first["type"] in ("model_type", "model_attributes_type"):
-        message = f"{first['input']!r} is not allowed; it should be a mapping of keys to values"
-    elif first["type"] == "value_error" and not keys:  # of the whole scene: the message begins with the key
-        dotted, _, message = message.partition(": ")
-        keys = dotted.split(".")
-    elif not first["type"].startswith("value_error"):
-        message = f"{first['input']!r} is not allowed; it should {message}"
-    dotted = ".".join(keys)
-    place = "--set" if any(k == dotted or dotted.startswith(k + ".") for k in overrides) else str(path)
-    line = line_of(text, keys) if place != "--set" else None
-    return f"{dotted + ': ' if dotted else ''}{message} ({place}{f', line {line}' if line else ''})"
-
-
-def in_tree(loc: tuple[int | str, ...], tree: Any) -> list[int | str]:
-    """The location without pydantic's own words for the branches of a union."""
-    keys: list[int | str] = []
-    for n, key in enumerate(loc):
-        last = n == len(loc) - 1
-        if isinstance(tree, dict) and (key in tree or last):
-            keys.append(key)
-            tree = tree.get(key)
-        elif isinstance(tree, list) and isinstance(key, int) and (key < len(tree) or last):
-            keys.append(key)
-            tree = tree[key] if key < len(tree) else None
-    return keys
-
-
-def allowed_keys(model: type[BaseModel], loc: tuple[int | str, ...]) -> list[str]:
-    """The keys that a section takes, found by walking the schema along an error's location."""
-    schema = model.model_json_schema(by_alias=True)
-    node: dict[str, Any] = schema
-    for key in loc:
-        node = resolve(node, schema)
-        options = [resolve(option, schema) for option in node.get("anyOf", []) + node.get("oneOf", [])]
-        if key in node.get("properties", {}):
-            node = node["properties"][key]
-        elif isinstance(key, int):
-            node = node.get("items", {})
-        else:
-            named = [o for o in options if key in (o.get("title"), kind_of(o))]
-            node = named[0] if named else node
-    return list(resolve(node, schema).get("properties", {}))
-
-
-def resolve(node: dict[str, Any], schema: dict[str, Any]) -> dict[str, Any]:
-    return schema["$defs"][node["$ref"].rsplit("/", 1)[1]] if "$ref" in node else node
-
-
-def kind_of(node: dict[str, Any]) -> str | None:
-    return node.get("properties", {}).get("kind", {}).get("const")
-
-
-def hint(word: str, allowed: list[str]) -> str:
-    close = difflib.get_close_matches(word, allowed, 1)
-    meant = f"; did you mean {close[0]}?" if close else ""
-    return f"{meant}; allowed: {', '.join(k for k in allowed if k != STEM)}" if allowed else meant
-
-
-def line_of(text: str, keys: list[str]) -> int | None:
-    """The line on which a dotted key stands, or its nearest parent that does."""
-    node = yaml.compose(text, yaml.SafeLoader)
-    line = None
-    for key in keys:
-        found = None
-        if isinstance(node, yaml.MappingNode):
-            found = next(((k, v) for k, v in node.value if k.value == key), None)
-        elif isinstance(node, yaml.SequenceNode) and key.isdigit() and int(key) < len(node.value):
-            found = (node.value[int(key)],) * 2
-        if not found:
-            break
-        line, node = found[0].start_mark.line + 1, found[1]
-    return line

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from scipy.special import erf
+from scipy.special import erf, j1
 
 from estimator import detect
 from estimator.centroid import CENTROIDERS, cog, gaussian_fit
@@ -111,10 +111,31 @@ def test_the_centre_of_gravity_of_a_disc_is_its_middle(radius: float) -> None:
     found = cog(image, detect.local(image, min_area_px=1))
     light = image - 10
     moments = [(light.sum(axis) @ np.arange(128)) / light.sum() for axis in (0, 1)]
-    # The light's own centre but for rounding; the disc's but for its rendering by 200 chords a pixel.
+    # Rounding.
     np.testing.assert_allclose(found.xy_px, [moments], rtol=0, atol=1e-9)
-    np.testing.assert_allclose(found.xy_px, [[x, y]], rtol=0, atol=1e-3)
+    # Pixels sample the disc: its transform 2 J1(z) / z at n cycles a pixel aliases to an S-curve (reference
+    # section 3 has the Gaussian's). The harmonics at their worst, and 1e-4 for the rendering by chords.
+    n = np.arange(1, 50)
+    z = 2 * np.pi * radius * n
+    aliased = np.sum(2 * np.abs(j1(z)) / z / (np.pi * n))
+    np.testing.assert_allclose(found.xy_px, [[x, y]], rtol=0, atol=aliased + 1e-4)
     assert found.flux[0] == pytest.approx(200 * np.pi * radius**2, rel=1e-3)
+
+
+@pytest.mark.parametrize("sigma", [0.3, 0.4, 0.5])
+def test_the_centre_of_gravity_has_the_s_curve_of_theory(sigma: float) -> None:
+    # Reference section 3: the centre of gravity errs by exp(-2 pi^2 sigma^2) / pi sin(2 pi x), wide window.
+    phases = np.linspace(-0.5, 0.5, 21)
+    images = [100 + gaussian((40, 40), 20 + x, 20.0, 1e4, sigma) for x in phases]
+    off = np.array(
+        [
+            cog(im, detect.local(im, min_area_px=1)).xy_px[0, 0] - 20 - x
+            for im, x in zip(images, phases, strict=True)
+        ]
+    )
+    curve = -np.exp(-2 * (np.pi * sigma) ** 2) / np.pi * np.sin(2 * np.pi * phases)
+    # The second harmonic is exp(-8 pi^2 sigma^2) / (2 pi), .0001 at sigma .3.
+    np.testing.assert_allclose(off, curve, rtol=0, atol=2e-4)
 
 
 def test_what_the_fit_cannot_fit_keeps_its_centre_of_gravity() -> None:

@@ -350,3 +350,11 @@ def test_every_algorithm_that_the_schema_names_exists() -> None:
 
     assert set(scene.Surface.model_fields["kind"].annotation.__args__) == set(SURFACES)
     assert set(scene.PatchBoards.model_fields["kind"].annotation.__args__) == set(LAYOUTS)
+
+
+def test_a_key_that_stands_twice_is_refused(tmp_path):
+    """YAML itself would take the last one without a word."""
+    path = tmp_path / "twice.yaml"
+    path.write_text((scene.SCENES / "shefex2.yaml").read_text() + "\nseed: 3\n")
+    with pytest.raises(BadInput, match=r"^seed: stands twice in one section \(.*twice.yaml, line \d+\)$"):
+        scene.load(path)

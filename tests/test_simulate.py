@@ -124,6 +124,18 @@ def test_the_camera_points_where_the_scene_says() -> None:
     )
 
 
+def test_the_truth_is_that_of_mid_exposure() -> None:
+    """The attitude in the truth puts the stars on the pixels in the truth, while the camera slews."""
+    lab = prepared("shefex2", exposure__frames="4")
+    frame, truth = simulate.shoot(lab, 3)
+    assert frame.t_mid_s == truth.t_s == pytest.approx(0.1 + 3 * 0.1 + 0.020, abs=1e-12)
+    rows = {hip: n for n, hip in enumerate(lab.sources.id)}
+    direction = lab.sources.place[[rows[hip] for hip in truth.seen.id], :3]
+    x, y, z = truth.cam_from_lab.apply(direction).T
+    pinhole = np.column_stack([329 + x / z * 25e-3 / 9.9e-6, 246 + y / z * 25e-3 / 9.9e-6])
+    np.testing.assert_allclose(truth.seen.xy_px, pinhole, rtol=0, atol=1e-9)
+
+
 def test_the_truth_moves_at_the_rate_of_the_scene() -> None:
     """A sphere of 120 kg m2 in free flight turns evenly: .5 deg/s for the 2 s between frames 0 and 20."""
     lab = prepared("shefex2", exposure__frames="21")
