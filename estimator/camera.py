@@ -55,9 +55,10 @@ class Camera:
         return rays / np.linalg.norm(rays, axis=1, keepdims=True)
 
     def pixels(self, vectors_cam: Floats) -> Floats:
-        """(N, 3) vectors in camera axes to (N, 2) pixels; NaN behind the camera."""
+        """(N, 3) vectors in camera axes to (N, 2) pixels; NaN behind the camera and beyond the distortion's fold."""
         z = np.where(vectors_cam[:, 2] > 0, vectors_cam[:, 2], np.nan)
         tangent = vectors_cam[:, :2] / z[:, None]
+        tangent[np.sum(tangent**2, axis=1) >= self._fold()] = np.nan
         return self._distort(tangent) * self.focal_px + self.centre_px
 
     def contains(self, xy_px: Floats, margin_px: float = 0.0) -> np.ndarray:
@@ -69,6 +70,17 @@ class Camera:
             self.height_px - 0.5 - margin_px,
         )
         return (x >= low) & (x <= right) & (y >= low) & (y <= bottom)
+
+    def _fold(self) -> float:
+        """Squared tangent at which a barrel distortion turns back: what lies beyond would appear in the field.
+
+        The least positive root of d(r radial)/dr = 1 + 3 k1 r^2 + 5 k2 r^4 + 7 k3 r^6; infinite if there is none.
+        """
+        k1, k2, _, _, k3 = self.distortion
+        if not (k1 or k2 or k3):
+            return np.inf
+        roots = np.roots([7 * k3, 5 * k2, 3 * k1, 1.0])
+        return float(min(roots.real[(np.abs(roots.imag) < 1e-12) & (roots.real > 0)], default=np.inf))
 
     def _distort(self, tangent: Floats) -> Floats:
         k1, k2, p1, p2, k3 = self.distortion

@@ -60,7 +60,7 @@ def pyramid(
         nobody knows how faint the camera sees, more where every light is known to shine
     field_tan     : (left, right, top, bottom) tangents of the field's edges, for missed_dex
     Triangles are taken in an order that changes all three stars soon (their `smart` order), so that one false
-    star costs little. A pyramid is only a hypothesis: the attitude that it gives must explain so many of the
+    star costs little, and from three groups of the index. A pyramid is only a hypothesis: the attitude that it gives must explain so many of the
     observed stars that, over all that was tried, a match this good is expected less than 1e-5 times by chance.
     Returns None rather than a guess.
     """
@@ -139,6 +139,8 @@ def _triangle(seen: Floats, index: PairIndex, corners: NDArray, rules: Rules, tr
             while place < index.first[a + 1] and index.separation_rad[place] <= ik + t_ik:
                 c, near = index.neighbour[place], index.separation_rad[place]
                 place += 1
+                if index.group[c] == index.group[a] or index.group[c] == index.group[b]:
+                    continue
                 far = _angle(index.vectors[b], index.vectors[c])
                 if abs(far - jk) > t_jk:
                     continue
@@ -221,7 +223,7 @@ def _prove(
     observed, star, expected = _match(seen, index, stars[0], matrix, rules.tolerance, stretch)
     if len(observed) < MIN_MATCHES:
         return _nothing()
-    chance = log10_tail(len(seen) - 3, len(observed) - 3, expected) + np.log10(hypotheses)
+    chance = _log10_chance(index.group[star], len(seen), expected) + np.log10(hypotheses)
     if rules.missed_dex > 0:
         missed = max(_expected(index, stars[0], matrix, rules) - len(observed), 0)
         chance += rules.missed_dex * missed
@@ -280,6 +282,26 @@ def _wahba(cam: Floats, ref: Floats) -> Floats:
     sign = np.linalg.det(u) * np.linalg.det(vt)
     u[:, 2] *= sign
     return u @ vt
+
+
+@numba.njit(cache=True)
+def _log10_chance(groups: NDArray, seen: int, p: float) -> float:
+    """log10 of the probability that a false attitude matches this much, three independent matches being spent.
+
+    The first match of each group is as improbable as a star's, p. What follows in a group follows from its
+    pattern, which is everybody's: the second light fixes which way the lattice lies (one in ten), each further
+    one is there or not (one in two). Where each star is its own group this is the binomial tail.
+    """
+    independent, second, further = 0, 0, 0
+    for n in range(len(groups)):
+        before = 0
+        for m in range(n):
+            before += groups[m] == groups[n]
+        independent += before == 0
+        second += before == 1
+        further += before > 1
+    tail = log10_tail(max(seen - 3 - second - further, 0), independent - 3, p)
+    return tail - second - 0.3 * further
 
 
 @numba.njit(cache=True)

@@ -20,7 +20,8 @@ class PairIndex(NamedTuple):
     kvector   : (P + 2,) kvector[k] = number of pairs with angle <= slope k + offset (Mortari 1997)
     slope_rad, offset_rad : the k-vector's line
     first     : (N + 1,) where each star's neighbours begin
-    neighbour : (2 P,) their rows, by growing angle;  separation_rad : (2 P,)
+    neighbour : their rows, by growing angle;  separation_rad : the angles
+    group     : (N,) which stars were made as one; no pair is listed within a group, for its pattern repeats
     """
 
     vectors: Floats
@@ -32,28 +33,46 @@ class PairIndex(NamedTuple):
     first: NDArray[np.int64]
     neighbour: NDArray[np.int32]
     separation_rad: Floats
+    group: NDArray[np.int64]
     max_angle_rad: float
 
 
-def build(vectors: Floats, max_angle_rad: float) -> PairIndex:
-    """Index all pairs of (N, 3) unit vectors up to an angle. Raises ValueError where there are none."""
+def build(vectors: Floats, max_angle_rad: float, group: NDArray[np.int64] | None = None) -> PairIndex:
+    """Index all pairs of (N, 3) unit vectors up to an angle. Raises ValueError where there are none.
+
+    group : (N,) labels of what is not placed independently (LEDs of one patch board); each its own if left out
+    """
+    group = np.arange(len(vectors)) if group is None else np.asarray(group, np.int64)
     vectors = np.ascontiguousarray(vectors, dtype=float)
     chord = 2 * np.sin(min(max_angle_rad, np.pi) / 2)
     pair = cKDTree(vectors).query_pairs(chord, output_type="ndarray").astype(np.int32)
-    if len(pair) < 3:
-        raise ValueError(f"{len(pair)} pairs within {np.degrees(max_angle_rad):.2f} deg: no pattern to find")
     # The half-chord keeps small angles exact where arccos of a dot product would lose half the digits.
     angle = 2 * np.arcsin(np.linalg.norm(vectors[pair[:, 0]] - vectors[pair[:, 1]], axis=1) / 2)
     order = np.argsort(angle, kind="stable")
     pair, angle = np.ascontiguousarray(pair[order]), angle[order]
-    kvector, slope, offset = line(angle)
     owner = np.concatenate([pair[:, 0], pair[:, 1]])
     other = np.concatenate([pair[:, 1], pair[:, 0]])
     both = np.concatenate([angle, angle])
     by_owner = np.lexsort((both, owner))
     first = np.searchsorted(owner[by_owner], np.arange(len(vectors) + 1))
+    neighbour, separation = other[by_owner], both[by_owner]
+    apart = group[pair[:, 0]] != group[pair[:, 1]]
+    pair, angle = pair[apart], angle[apart]
+    if len(pair) < 3:
+        raise ValueError(f"{len(pair)} pairs within {np.degrees(max_angle_rad):.2f} deg: no pattern to find")
+    kvector, slope, offset = line(angle)
     return PairIndex(
-        vectors, pair, angle, kvector, slope, offset, first, other[by_owner], both[by_owner], max_angle_rad
+        vectors,
+        pair,
+        angle,
+        kvector,
+        slope,
+        offset,
+        first,
+        neighbour,
+        separation,
+        group,
+        max_angle_rad,
     )
 
 

@@ -24,13 +24,15 @@ class LedMap:
 
     id         : (N,)
     position_m : (N, 3)
-    centre_m, semi_axes_m : (3,) the ellipsoid x'A x' = 1 that the LEDs sit on; an infinite semi-axis is flat
+    centre_m, semi_axes_m : (3,) the ellipsoid x'A x' = 1 that the LEDs sit on
+    board      : (N,) which LEDs share a patch board, whose lattice is every board's; None where each is by itself
     """
 
     id: Ints
     position_m: Floats
     centre_m: Floats
     semi_axes_m: Floats
+    board: Ints | None = None
 
 
 @dataclass(frozen=True, slots=True)

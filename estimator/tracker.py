@@ -25,7 +25,6 @@ from estimator.types import Attitude, BadImage, Centroids, Floats, StarMatch
 NO_STARS = "too few stars detected"
 NO_MATCH = "no identification beyond chance"
 SATURATED = "the frame is saturated"
-BORDER = 0.025  # share of the frame's height in which a light may be cut off
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +48,7 @@ class Settings:
     centroid_sigma_px: float = 0.1
     base_stars: int = 20
     field_stars: float = 30.0
-    missed_dex: float = 1.0
+    missed_dex: float = 0.5
 
 
 @dataclass(slots=True)
@@ -301,7 +300,7 @@ class DomeTracker:
         low, high = middle - half, middle + half
         self.field_tan = float(low[0]), float(high[0]), float(low[1]), float(high[1])
         reach_rad = np.arccos(np.clip((points @ points.T).min(), -1, 1))
-        self.index = index.build(leds.position_m / radius[:, None], reach_rad * 1.05)
+        self.index = index.build(leds.position_m / radius[:, None], reach_rad * 1.05, leds.board)
         # A dome that is no sphere stretches the angles as the lever stretches an error of range.
         self.stretch = (
             2 * float(np.std(radius)) / (self.radius_m - float(np.linalg.norm(lever.camera_body_m))) + 5e-4
@@ -363,10 +362,8 @@ class DomeTracker:
             if len(observed) < MIN_MATCHES:
                 return Attitude(NO_MATCH)
         observed, star = kept
-        chance = log10_chance(observed, len(centroids), len(inside), radius_px, camera, len(self.index.pair))
-        expected = np.flatnonzero(camera.contains(np.nan_to_num(xy, nan=-1e9), BORDER * camera.height_px))
-        chance += self.settings.missed_dex * len(np.setdiff1d(expected, star))
-        if chance > ACCEPT_LOG10_CHANCE:
+        # The exact geometry must confirm all that the approximate one found.
+        if len(observed) < len(match.observed):
             return Attitude(NO_MATCH)
         cam_from_lab = lever.cam_from_body * body_from_lab
         R_cam_from_body = lever.cam_from_body.as_matrix()
@@ -375,7 +372,7 @@ class DomeTracker:
             "solved",
             cam_from_lab,
             R_cam_from_body @ spread @ R_cam_from_body.T,
-            StarMatch(observed, star, cam_from_lab, chance),
+            StarMatch(observed, star, cam_from_lab, match.log10_chance),
             float(np.sqrt(np.mean(residual**2))),
             camera,
         )

@@ -11,6 +11,7 @@ from skysim import scene
 from skysim.photometry import led_strength_ph_s_sr
 from skysim.types import BadInput, Floats, Sources
 
+HOLES = 9  # on a patch board; LED number = board * HOLES + hole
 GOLDEN_ANGLE_RAD = np.pi * (3 - np.sqrt(5))
 
 
@@ -122,7 +123,7 @@ def patch_boards(part: scene.PatchBoards, inside: Surface, led: scene.Led) -> So
     along = np.cross(normal, across)
     turn = rng.uniform(0, 2 * np.pi, boards)[:, None]
     u, v = across * np.cos(turn) + along * np.sin(turn), along * np.cos(turn) - across * np.sin(turn)
-    lit = [rng.permutation(9)[: rng.integers(part.lit[0], part.lit[1] + 1)] for _ in range(boards)]
+    lit = [rng.permutation(HOLES)[: rng.integers(part.lit[0], part.lit[1] + 1)] for _ in range(boards)]
     board = np.concatenate([np.full(len(holes), b) for b, holes in enumerate(lit)])
     hole = np.concatenate(lit)
     place = (
@@ -135,7 +136,7 @@ def patch_boards(part: scene.PatchBoards, inside: Surface, led: scene.Led) -> So
     scatter = np.exp(led.scatter * rng.standard_normal(count))
     strength = led_strength_ph_s_sr(led.intensity_cd) * scatter
     return Sources(
-        id=(board * 9 + hole).astype(np.int64),
+        id=(board * HOLES + hole).astype(np.int64),
         place=np.column_stack([place, np.ones(count)]),
         normal=normal[board],
         radius_m=np.full(count, led.disc_diameter_m / 2),

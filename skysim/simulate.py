@@ -135,7 +135,8 @@ def tracker(lab: Lab) -> Estimator:
     camera, settings = believed_camera(scene), believed_settings(scene)
     if isinstance(scene.light, Dome):
         centre_m, semi_axes_m = dome.surface(scene.light.surface).as_ellipsoid()
-        leds = LedMap(lab.sources.id, lab.sources.place[:, :3], centre_m, semi_axes_m)
+        board = lab.sources.id // dome.HOLES
+        leds = LedMap(lab.sources.id, lab.sources.place[:, :3], centre_m, semi_axes_m, board)
         arm = believed.believed_camera_body_m or lab.mount.camera_body_m
         return DomeTracker(camera, leds, Lever(np.array(arm), lab.mount.cam_from_body), settings)
     stars = catalog.read(CATALOGUES / f"{scene.light.catalogue}.ecsv")

@@ -41,6 +41,17 @@ def test_what_is_behind_the_camera_has_no_pixel() -> None:
     assert np.isnan(DISTORTED.pixels(np.array([[0.1, 0.1, -1.0], [1.0, 0.0, 0.0]]))).all()
 
 
+def test_a_star_far_off_does_not_fold_back_into_a_barrel_s_field() -> None:
+    # r (1 - .15 r^2) turns back at r = sqrt(1 / .45) = 1.4907; at r = 2.5 it is .156, well within the field.
+    camera = Camera(1600, 1200, 2000.0, (810.5, 590.25), (-0.15, 0.0, 0.0, 0.0, 0.0))
+    pixels = camera.pixels(np.array([[1.4906, 0, 1], [1.4908, 0, 1], [0, 2.5, 1]]))
+    assert np.isnan(pixels).all(axis=1).tolist() == [False, True, True]
+    # A pincushion and a lens whose k2 holds against k1 have no fold.
+    for lens in [(0.15, 0.0, 0.0, 0.0, 0.0), (-0.1, 0.2, 0.0, 0.0, 0.0)]:
+        sharp = Camera(1600, 1200, 2000.0, (810.5, 590.25), lens)
+        assert np.isfinite(sharp.pixels(np.array([[2.5, 0, 1]]))).all()
+
+
 def test_the_distortion_is_opencv_s() -> None:
     rng = np.random.default_rng(1)
     points = np.column_stack([rng.uniform(-0.4, 0.4, (500, 2)), np.ones(500)]) * rng.uniform(1, 9, (500, 1))

@@ -137,14 +137,14 @@ def test_too_few_stars_are_a_status(tracker: StarTracker, count: int) -> None:
 
 def test_spots_that_are_no_stars_are_a_status(tracker: StarTracker) -> None:
     rng = np.random.default_rng(85)
-    answers = [tracker.solve_centroids(centroids(rng.uniform(0, [658, 492], (7, 2)))) for _ in range(20)]
+    answers = [tracker.solve_centroids(centroids(rng.uniform(0, [658, 492], (7, 2)))) for _ in range(10)]
     assert {answer.status for answer in answers} == {NO_MATCH}
     assert {answer.cam_from_ref for answer in answers} == {None}
 
 
 def test_a_mirrored_field_is_a_status(tracker: StarTracker) -> None:
     rng = np.random.default_rng(86)
-    fields = [starfield(tracker, rng, CAMERA, 5.0)[1] for _ in range(10)]
+    fields = [starfield(tracker, rng, CAMERA, 5.0)[1] for _ in range(6)]
     mirrored = [tracker.solve_centroids(centroids(xy * [-1, 1] + [658, 0])) for xy in fields]
     assert not any(answer.solved for answer in mirrored)
 
@@ -229,7 +229,7 @@ def test_a_focal_length_beyond_its_uncertainty_is_refused() -> None:
     vectors = catalog.apparent(stars, OBSERVER)
     wrong = StarTracker(CAMERA.zoomed(1.06), stars, vectors, focal_uncertainty=0.01)
     rng = np.random.default_rng(93)
-    fields = [starfield(wrong, rng, CAMERA, 5.5)[1] for _ in range(4)]
+    fields = [starfield(wrong, rng, CAMERA, 5.5)[1] for _ in range(2)]
     assert not any(wrong.solve_centroids(centroids(xy)).solved for xy in fields)
 
 
@@ -323,5 +323,5 @@ def test_the_dome_tracker_refuses_too_few_and_unknown_lights() -> None:
 def test_a_dome_seen_as_stars_at_infinity_is_not_believed(tracker: StarTracker) -> None:
     leds = dome("sphere")
     rng = np.random.default_rng(98)
-    fields = [under_the_dome(rng, leds, LEVERS["axial"], 0.1)[1] * 0.41 for _ in range(5)]
+    fields = [under_the_dome(rng, leds, LEVERS["axial"], 0.1)[1] * 0.41 for _ in range(2)]
     assert not any(tracker.solve_centroids(centroids(xy)).solved for xy in fields)
