@@ -59,9 +59,10 @@ def pyramid(
     missed_dex    : what a catalogue star that should be in the field and is not costs, in powers of ten; 0 where
         nobody knows how faint the camera sees, more where every light is known to shine
     field_tan     : (left, right, top, bottom) tangents of the field's edges, for missed_dex
-    Triangles are taken in an order that changes all three stars soon (their `smart` order), so that one false
-    star costs little, and from three groups of the index. A pyramid is only a hypothesis: the attitude that it gives must explain so many of the
-    observed stars that, over all that was tried, a match this good is expected less than 1e-5 times by chance.
+    Triangles are taken from three groups of the index, in an order that changes all three stars soon (their
+    `smart` order), so that one false star costs little. A pyramid is only a hypothesis: the attitude that it gives
+    must explain so many of the observed stars that, over all that was tried, a match this good is expected less
+    than 1e-5 times by chance.
     Returns None rather than a guess.
     """
     if len(vectors_cam) < MIN_MATCHES:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from skysim import scene, simulate
+from estimator.nearfield import project
+from skysim import control, scene, simulate
 from skysim.simulate import Lab
 
 NAMES = sorted(path.stem for path in scene.SCENES.glob("*.yaml"))
@@ -72,3 +73,19 @@ def test_its_first_frames_are_solved_and_right(lab: Lab) -> None:
         assert answer.status == "solved"
         error = (answer.cam_from_ref * shot.truth.cam_from_lab.inv()).magnitude()
         assert np.degrees(error) < 10 / 60  # more is what the project calls wrong
+
+
+def test_the_afit_camera_sees_five_leds_all_along_its_manoeuvre():
+    """Two frames a second for the whole manoeuvre, at geometry alone: what is on the chip, by the tracker's map."""
+    loaded = scene.load("afit_simsat")
+    manoeuvre_s = control.plan(loaded.motion).duration_s
+    frames = int((manoeuvre_s - loaded.exposure.first_s) * loaded.exposure.rate_hz)
+    lab = simulate.prepare(scene.load("afit_simsat", {"exposure.frames": str(frames)}))
+    eyes = simulate.tracker(lab)
+    counts = []
+    for index in range(frames):
+        body_from_lab = lab.trajectory.at(simulate.open_s(lab.scene, index)).inv()
+        pixels = project(body_from_lab, eyes.leds.position_m, eyes.lever, eyes.camera)
+        counts.append(int(eyes.camera.contains(np.nan_to_num(pixels, nan=-1e9), 12).sum()))
+    assert frames > 100
+    assert min(counts) >= 5
