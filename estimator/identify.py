@@ -23,7 +23,7 @@ MIN_MATCHES = 4
 class Rules(NamedTuple):
     """How a search is done. A plain tuple, so that compiled code can take it.
 
-    tolerance, stretch, zooms, triangles, base, missed_dex : as `pyramid` says
+    tolerance, stretch, zooms, triangles, checks, base, missed_dex : as `pyramid` says
     left, right, top, bottom : tangents of the sensor's edges from the boresight
     """
 
@@ -31,6 +31,7 @@ class Rules(NamedTuple):
     stretch: float
     zooms: bool
     triangles: int
+    checks: int
     base: int
     missed_dex: float
     left: float
@@ -46,6 +47,7 @@ def pyramid(
     stretch: float = 0.0,
     zooms: bool = False,
     max_triangles: int = 3000,
+    max_checks: int = 20_000_000,
     base_stars: int = 20,
     missed_dex: float = 0.0,
     field_tan: tuple[float, float, float, float] = (-1.0, 1.0, -1.0, 1.0),
@@ -55,6 +57,8 @@ def pyramid(
     vectors_cam   : (N, 3) observed unit vectors, brightest first
     tolerance_rad : of a direction; of an angle sqrt(2) times it, plus `stretch` times the angle
     zooms         : whether the stretch is one unknown focal length, which each triangle then measures by itself
+    max_triangles, max_checks : observed triangles tried, and angles compared, before giving up; the latter bounds
+        the time, at some tens of nanoseconds each
     base_stars    : among how many of the brightest the pyramids are sought
     missed_dex    : what a catalogue star that should be in the field and is not costs, in powers of ten; 0 where
         nobody knows how faint the camera sees, more where every light is known to shine
@@ -68,7 +72,7 @@ def pyramid(
     if len(vectors_cam) < MIN_MATCHES:
         return None
     base = min(base_stars, len(vectors_cam))
-    rules = Rules(tolerance_rad, stretch, zooms, max_triangles, base, missed_dex, *field_tan)
+    rules = Rules(tolerance_rad, stretch, zooms, max_triangles, max_checks, base, missed_dex, *field_tan)
     observed, star, matrix, chance = _search(np.ascontiguousarray(vectors_cam), index, rules)
     if len(observed) < MIN_MATCHES or chance > ACCEPT_LOG10_CHANCE:
         return None
@@ -83,7 +87,7 @@ Found = tuple[NDArray[np.int64], NDArray[np.int64], Floats, float]
 @numba.njit(cache=True)
 def _search(seen: Floats, index: PairIndex, rules: Rules) -> Found:
     """Walk the triangles (i, i + dj, i + dj + dk) and stop at the first attitude beyond chance."""
-    tried = np.zeros(2, np.int64)
+    tried = np.zeros(3, np.int64)  # observed triangles, hypotheses, checks
     for dj in range(1, rules.base - 1):
         for dk in range(1, rules.base - dj):
             for i in range(rules.base - dj - dk):
@@ -92,7 +96,7 @@ def _search(seen: Floats, index: PairIndex, rules: Rules) -> Found:
                 if found[3] < ACCEPT_LOG10_CHANCE:
                     return found
                 tried[0] += 1
-                if tried[0] >= rules.triangles:
+                if tried[0] >= rules.triangles or tried[2] >= rules.checks:
                     return _nothing()
     return _nothing()
 
@@ -131,6 +135,8 @@ def _triangle(seen: Floats, index: PairIndex, corners: NDArray, rules: Rules, tr
     handed = _triple(seen[i], seen[j], seen[k])
     begin, end = between(index, ij - t_ij, ij + t_ij)
     for p in range(begin, end):
+        if tried[2] >= rules.checks:
+            break
         side = index.angle_rad[p]
         if abs(side - ij) > t_ij:
             continue
@@ -140,6 +146,7 @@ def _triangle(seen: Floats, index: PairIndex, corners: NDArray, rules: Rules, tr
             while place < index.first[a + 1] and index.separation_rad[place] <= ik + t_ik:
                 c, near = index.neighbour[place], index.separation_rad[place]
                 place += 1
+                tried[2] += 1
                 if index.group[c] == index.group[a] or index.group[c] == index.group[b]:
                     continue
                 far = _angle(index.vectors[b], index.vectors[c])
@@ -157,7 +164,7 @@ def _triangle(seen: Floats, index: PairIndex, corners: NDArray, rules: Rules, tr
                     continue
                 tried[1] += 1
                 zoomed = _zoomed(seen, zoom) if rules.zooms else seen
-                found = _pyramid(zoomed, index, corners, np.array([a, b, c]), rules, tight, tried[1])
+                found = _pyramid(zoomed, index, corners, np.array([a, b, c]), rules, tight, tried)
                 if found[3] < ACCEPT_LOG10_CHANCE:
                     return found
     return _nothing()
@@ -171,10 +178,11 @@ def _pyramid(
     stars: NDArray,
     rules: Rules,
     stretch: float,
-    hypotheses: int,
+    tried: NDArray,
 ) -> Found:
     """A triangle with a fourth star is worth proving."""
     for r in range(rules.base):
+        tried[2] += 1
         if r == corners[0] or r == corners[1] or r == corners[2]:
             continue
         reach = _angle(seen[corners[0]], seen[r])
@@ -189,7 +197,8 @@ def _pyramid(
                 slip = abs(_angle(index.vectors[stars[corner]], index.vectors[d]) - angle)
                 fits = fits and slip <= sqrt(2.0) * rules.tolerance + stretch * angle
             if fits:
-                return _prove(seen, index, corners, stars, rules, stretch, hypotheses)
+                tried[2] += len(seen) * (index.first[stars[0] + 1] - index.first[stars[0]])
+                return _prove(seen, index, corners, stars, rules, stretch, tried[1])
     return _nothing()
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from estimator.types import Floats
+from estimator.types import BadImage, Floats
 
 
 class PairIndex(NamedTuple):
@@ -38,7 +38,7 @@ class PairIndex(NamedTuple):
 
 
 def build(vectors: Floats, max_angle_rad: float, group: NDArray[np.int64] | None = None) -> PairIndex:
-    """Index all pairs of (N, 3) unit vectors up to an angle. Raises ValueError where there are none.
+    """Index all pairs of (N, 3) unit vectors up to an angle. Raises BadImage where there are none.
 
     group : (N,) labels of what is not placed independently (LEDs of one patch board); each its own if left out
     """
@@ -59,7 +59,9 @@ def build(vectors: Floats, max_angle_rad: float, group: NDArray[np.int64] | None
     apart = group[pair[:, 0]] != group[pair[:, 1]]
     pair, angle = pair[apart], angle[apart]
     if len(pair) < 3:
-        raise ValueError(f"{len(pair)} pairs within {np.degrees(max_angle_rad):.2f} deg: no pattern to find")
+        raise BadImage(
+            f"{len(pair)} pairs of stars within {np.degrees(max_angle_rad):.2f} deg: no pattern to find"
+        )
     kvector, slope, offset = line(angle)
     return PairIndex(
         vectors,

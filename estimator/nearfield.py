@@ -168,7 +168,7 @@ NearSolver = Callable[..., tuple[Rotation, Floats]]
 SOLVERS: dict[str, NearSolver] = {"rotation_only": rotation_only, "ray_on_surface": ray_on_surface}
 
 
-def check(leds: LedMap, lever: Lever) -> None:
+def check_lever(leds: LedMap, lever: Lever) -> None:
     """Raise BadImage unless the lever arm reaches less far than the nearest LED."""
     nearest = np.linalg.norm(leds.position_m, axis=1).min()
     reach = np.linalg.norm(lever.camera_body_m)

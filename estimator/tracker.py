@@ -19,7 +19,7 @@ from estimator.centroid import CENTROIDERS
 from estimator.detect import DETECTORS
 from estimator.identify import ACCEPT_LOG10_CHANCE, IDENTIFIERS, MIN_MATCHES, log10_tail
 from estimator.nearfield import SOLVERS as NEAR_SOLVERS
-from estimator.nearfield import LedMap, Lever, on_sphere, project
+from estimator.nearfield import LedMap, Lever, check_lever, on_sphere, project
 from estimator.types import Attitude, BadImage, Centroids, Floats, StarMatch
 
 NO_STARS = "too few stars detected"
@@ -153,7 +153,7 @@ class StarTracker:
         reach = int(np.ceil(self.focal_uncertainty / step - 0.5))
         zooms = sorted((n * step for n in range(-reach, reach + 1)), key=abs)
         few = centroids.take(np.arange(min(len(centroids), 2 * self.settings.base_stars)))
-        for triangles in (60, 600, 3000):
+        for triangles, checks in ((60, 1_500_000), (600, 3_000_000), (3000, 4_000_000)):
             for zoom in zooms:
                 camera = self.camera.zoomed(1 + zoom)
                 tolerance_rad = (
@@ -166,6 +166,7 @@ class StarTracker:
                     stretch=stretch,
                     zooms=reach > 0,
                     max_triangles=triangles,
+                    max_checks=checks,
                     base_stars=self.settings.base_stars,
                 )
                 if match:
@@ -287,6 +288,7 @@ class DomeTracker:
         lever: Lever,
         settings: Settings = Settings(solver="rotation_only"),
     ) -> None:
+        check_lever(leds, lever)
         self.camera, self.leds, self.lever, self.settings = camera, leds, lever, settings
         radius = np.linalg.norm(leds.position_m, axis=1)
         self.radius_m = float(np.median(radius))
@@ -356,7 +358,8 @@ class DomeTracker:
             except (ValueError, np.linalg.LinAlgError) as error:
                 return Attitude(f"no attitude: {error}")
             xy = project(body_from_lab, self.leds.position_m, lever, camera)
-            inside = np.flatnonzero(camera.contains(np.nan_to_num(xy, nan=-1e9)))
+            # An LED whose middle is just off the chip still shines onto it.
+            inside = np.flatnonzero(camera.contains(np.nan_to_num(xy, nan=-1e9), -30.0))
             kept = observed, star
             observed, star = mutual(centroids.xy_px, xy[inside], radius_px, inside)
             if len(observed) < MIN_MATCHES:

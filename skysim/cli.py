@@ -46,12 +46,14 @@ def main() -> None:
     except OSError as error:
         code = complain(f"{error.filename}: {error.strerror}" if error.filename else str(error))
     except (typer.Abort, KeyboardInterrupt):
-        code = complain("stopped", 130)
+        code = 130
     except Exception as error:
         # Usage errors: typer's own since it carries its parser within, click's before that.
         if not hasattr(error, "format_message"):
             raise
         code = complain(" ".join(error.format_message().split()) or "give a command; see skysim --help")
+    if code == 130:  # typer's own answer to Ctrl-C
+        complain("stopped")
     sys.exit(code if isinstance(code, int) else 0)
 
 
@@ -75,10 +77,11 @@ def run(
 
     loaded = load(scene, frames, seed, set_)
     lab = simulate.prepare(loaded)
+    estimator = simulate.tracker(lab)
     folder = fresh(out or Path("out") / loaded.name)
     rows: list[Row] = []
     tally = score.Tally()
-    for shot in progress(simulate.run(lab), loaded.exposure.frames, loaded.title):
+    for shot in progress(simulate.run(lab, estimator), loaded.exposure.frames, loaded.title):
         io.write_frame(folder, shot.frame, shot.truth, loaded)
         rows.append(score.row(shot, loaded, lab.mount))
         tally.add(shot)
@@ -141,9 +144,9 @@ def solve(
 
     solver = solving.make_solver(fov, camera, time_utc=moment(time))
     io.make_folder(out)
-    answers = [
-        solving.solve(path, solver, out) for path in progress(images, len(images), "solving", quiet=json)
-    ]
+    pictures = io.unlike([out / f"{path.name}.solved.png" for path in images])
+    jobs = progress(list(zip(images, pictures, strict=True)), len(images), "solving", quiet=json)
+    answers = [solving.solve(path, solver, picture) for path, picture in jobs]
     faults = [answer["status"] for answer in answers if answer.pop("bad_input")]
     io.write_text(out / "solutions.json", io.to_json(answers))
     if json:
@@ -263,10 +266,10 @@ def load(name: str, frames: int | None, seed: int | None, sets: list[str] | None
 
 
 def fresh(folder: Path) -> Path:
-    """The folder without the frames of an earlier run."""
+    """The folder without the frames and results of an earlier run, which would speak of other frames."""
     from skysim import io
 
-    io.clear_frames(io.make_folder(folder))
+    io.clear(io.make_folder(folder))
     return folder
 
 
@@ -361,7 +364,7 @@ def print_answers(answers: list[dict[str, Any]], out: Path) -> None:
     heads = ["file", "status", "RA °", "Dec °", "roll °", "fov °", "stars", "rms ″", "ms"]
     lines = [
         [
-            Path(a["file"]).name,
+            a["file"],
             a["status"] if a["time_ms"] is not None else "bad input",
             *(number(a[key], 4) for key in ("ra_deg", "dec_deg", "roll_deg", "fov_deg")),
             str(a["matches"]),

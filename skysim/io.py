@@ -43,19 +43,32 @@ def make_folder(path: Path) -> Path:
     return path
 
 
-def clear_frames(folder: Path) -> None:
-    """Remove the frames of an earlier run, so that a shorter one leaves no strangers behind it."""
+def clear(folder: Path) -> None:
+    """Remove what an earlier run left: its frames and what was said of them."""
     for suffix in ("fits", "png", "ecsv"):
-        for path in folder.glob(f"frame_[0-9][0-9][0-9][0-9].{suffix}"):
+        for path in folder.glob(f"frame_[0-9][0-9][0-9][0-9]*.{suffix}"):
             path.unlink()
+    for name in ("solutions.ecsv", "annotated.png", "report.html"):
+        (folder / name).unlink(missing_ok=True)
+
+
+def unlike(paths: list[Path]) -> list[Path]:
+    """The paths, numbered where one would overwrite another."""
+    seen: dict[Path, int] = {}
+    named = []
+    for path in paths:
+        seen[path] = seen.get(path, 0) + 1
+        again = seen[path] > 1
+        named.append(path.with_name(f"{path.stem}-{seen[path]}{path.suffix}") if again else path)
+    return named
 
 
 def write_frame(folder: Path, frame: Frame, truth: Truth, scene: Scene) -> None:
     """frame_NNNN.fits (16 bits, header with WCS under the stars), .png (16 bits) and the truth as .ecsv."""
     stem = folder / f"frame_{frame.index:04d}"
-    write_fits(stem.with_suffix(".fits"), frame, truth, scene)
-    write_png16(stem.with_suffix(".png"), frame.image_dn)
     write_truth(stem.with_suffix(".ecsv"), frame, truth, scene)
+    write_png16(stem.with_suffix(".png"), frame.image_dn)
+    write_fits(stem.with_suffix(".fits"), frame, truth, scene)  # last: where it is, the others are
 
 
 def write_fits(path: Path, frame: Frame, truth: Truth, scene: Scene) -> None:

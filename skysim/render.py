@@ -14,7 +14,7 @@ from skysim.optics import Optics
 from skysim.types import Floats, Mount, Seen, Sources, Trajectory
 
 STEP_PX = 0.25
-MAX_STEPS = 2000
+MAX_STEPS = 20_000
 REACH_SIGMA = 6.5  # a Gaussian's share beyond is 1e-10
 NARROW = 3.0  # radius over sigma below which a disc is a sum of Gaussians
 RING_SHARE = ((1 - sqrt(0.6)) / 2, 0.5, (1 + sqrt(0.6)) / 2)  # Gauss-Legendre in r^2 on a disc of radius 1

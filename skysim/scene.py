@@ -73,6 +73,7 @@ Inertia = Annotated[Number, BeforeValidator(quantity("kg m2", "moment of inertia
 Intensity = Annotated[Number, BeforeValidator(quantity("cd", "luminous intensity", '"7.7 mcd"'))]
 Torque = Annotated[Number, BeforeValidator(quantity("N m", "torque", '"0.5 N m"'))]
 SemiAxis = Annotated[Length, Field(gt=0)]
+Spin = Annotated[Number, Field(ge=-360, le=360)]
 Triple = tuple[Number, Number, Number]
 
 
@@ -86,6 +87,13 @@ class Part(BaseModel):
         validate_by_name=False,
         alias_generator=lambda name: SI_SUFFIX.sub("", name),
     )
+
+
+def in_our_time(value: datetime.datetime) -> datetime.datetime:
+    """The Earth's ephemeris and straight proper motion hold for a century or so."""
+    if not 1900 <= value.year <= 2100:
+        raise ValueError(f"{value.isoformat()} is outside of 1900 to 2100")
+    return value
 
 
 class Vehicle(Part):
@@ -158,7 +166,7 @@ class Motion(Part):
     """How it starts and what it is told to do."""
 
     start: Start = Attitude()
-    rate_deg_s: Triple = (0.0, 0.0, 0.0)
+    rate_deg_s: tuple[Spin, Spin, Spin] = (0.0, 0.0, 0.0)
     control: Literal["none", "pid"] = "none"
     manoeuvre: tuple[Annotated[Hold | Slew, Field(discriminator="kind")], ...] = ()
 
@@ -206,6 +214,14 @@ class PatchBoards(Part):
             raise ValueError(f"{value} is no range of LEDs on a 3x3 board; allowed: 1 <= least <= most <= 9")
         return value
 
+    @model_validator(mode="after")
+    def boards_fit_beside_each_other(self) -> PatchBoards:
+        if self.spacing_m < 3 * self.pitch_m:
+            raise ValueError(
+                f"spacing {self.spacing_m:g} m: boards of three LEDs at {self.pitch_m:g} m would overlap"
+            )
+        return self
+
 
 class Led(Part):
     """One kind of LED, for the whole dome."""
@@ -239,15 +255,15 @@ class Stars(Part):
 
     kind: Literal["stars"]
     catalogue: str = "hipparcos_hp6.5"
-    limit_mag: Number = 6.5
+    limit_mag: Annotated[Number, Field(ge=0, le=15)] = 6.5
 
 
 class Psf(Part):
     """The lens's point-spread function: a Gaussian, or the disc of a lens out of focus with a Gaussian edge."""
 
     kind: str = "gaussian"
-    sigma_px: Annotated[Number, Field(ge=0.2)] = 0.7
-    radius_px: Annotated[Number, Field(ge=0)] = 0.0
+    sigma_px: Annotated[Number, Field(ge=0.2, le=20)] = 0.7
+    radius_px: Annotated[Number, Field(ge=0, le=200)] = 0.0
 
     @field_validator("kind")
     @classmethod
@@ -277,6 +293,12 @@ class Detector(Part):
     offset_dn: Annotated[Number, Field(ge=0)] = 0.0
     bits: Annotated[int, Field(ge=1, le=16)]
     noise: bool = True
+
+    @model_validator(mode="after")
+    def offset_within_the_converter(self) -> Detector:
+        if self.offset_dn >= 2**self.bits:
+            raise ValueError(f"offset_dn {self.offset_dn:g} is beyond a converter of {self.bits} bits")
+        return self
 
 
 class Camera(Part):
@@ -334,7 +356,7 @@ class Scene(Part):
     schema_version: Annotated[Literal[1], Field(alias="schema")]
     title: str
     seed: Annotated[int, Field(ge=0)]
-    start_time: datetime.datetime
+    start_time: Annotated[datetime.datetime, AfterValidator(in_our_time)]
     vehicle: Vehicle
     motion: Motion
     light: Annotated[Dome | Stars, Field(discriminator="kind")]
@@ -387,9 +409,18 @@ def load(name: str | Path, overrides: Mapping[str, str] | None = None) -> Scene:
     for key, value in (overrides or {}).items():
         put(tree, key, value)
     try:
-        return Scene.model_validate(tree | {STEM: path.stem})
+        return Scene.model_validate(beside(path, tree) | {STEM: path.stem})
     except ValidationError as error:
         raise BadInput(explain(error, Scene, tree, text, path, overrides or {})) from None
+
+
+def beside(path: Path, tree: dict[str, Any]) -> dict[str, Any]:
+    """The scene with its vehicle's MJCF taken from the scene's own folder, where there is one of that name."""
+    vehicle = tree.get("vehicle")
+    if not isinstance(vehicle, dict) or not isinstance(vehicle.get("model"), str):
+        return tree
+    own = path.resolve().parent / vehicle["model"]
+    return tree | {"vehicle": vehicle | {"model": str(own)}} if own.is_file() else tree
 
 
 def load_camera(path: Path) -> Camera:

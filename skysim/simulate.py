@@ -89,6 +89,11 @@ def lights(scene: Scene) -> Sources:
     """Everything that shines."""
     if isinstance(scene.light, Dome):
         return dome.sources(scene.light)
+    if not (CATALOGUES / f"{scene.light.catalogue}.ecsv").is_file():
+        known = ", ".join(sorted(path.stem for path in CATALOGUES.glob("hipparcos*.ecsv")))
+        raise BadInput(
+            f"light.catalogue: {scene.light.catalogue!r} is none of {known}; see skysim catalog build"
+        )
     stars = catalogue.read(scene.light.catalogue)
     return sky.sources(stars, scene.start_time, scene.light.limit_mag, Rotation.identity())
 
@@ -182,9 +187,9 @@ def known(key: str, name: str, algorithms: Mapping[str, object]) -> str:
         raise BadInput(f"tracker.{key}: {error}") from None
 
 
-def run(lab: Lab) -> Iterator[Shot]:
+def run(lab: Lab, estimator: Estimator) -> Iterator[Shot]:
     """Photograph and solve frame after frame."""
-    estimator = tracker(lab)
+    answer(estimator, shoot(lab, 0)[0])  # a frame for the compiler, whose seconds are nobody's
     for index in range(lab.scene.exposure.frames):
         clock = Clock()
         frame, truth = shoot(lab, index, clock)

@@ -81,8 +81,8 @@ def make_solver(
     return Solver(fov_deg, camera, stars, settings, time_utc)
 
 
-def solve(path: Path, solver: Solver, out: Path | None) -> dict[str, Any]:
-    """One file to one answer: the fields of `skysim solve --json`. Writes the annotated PNG into `out`.
+def solve(path: Path, solver: Solver, annotated: Path | None) -> dict[str, Any]:
+    """One file to one answer: the fields of `skysim solve --json`. Writes the annotated PNG.
 
     Bad input does not raise here, for other files wait behind it: its line becomes the status, with
     `bad_input` true for the exit code.
@@ -113,8 +113,8 @@ def solve(path: Path, solver: Solver, out: Path | None) -> dict[str, Any]:
     answer |= {"status": found.attitude.status, "bad_input": False}
     if found.attitude.solved:
         answer |= solution(found)
-    if out:
-        io.write_image(out / f"{path.stem}.solved.png", picture(image, found, tracker))
+    if annotated:
+        io.write_image(annotated, picture(image, found, tracker))
     return answer
 
 

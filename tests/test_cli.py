@@ -126,8 +126,8 @@ def test_render_then_solve_agrees_with_the_wcs_of_the_true_pointing(
 def test_solve_writes_what_it_prints_and_a_picture(skysim: Skysim, rendered: Path, tmp_path: Path) -> None:
     ran = skysim("solve", rendered / "frame_0000.png", "--fov", "14.8", "--json", "--out", tmp_path)
     assert json.loads((tmp_path / "solutions.json").read_text()) == json.loads(ran.out)
-    assert {p.name for p in tmp_path.iterdir()} == {"solutions.json", "frame_0000.solved.png"}
-    height, width, channels = cv2.imread(str(tmp_path / "frame_0000.solved.png")).shape
+    assert {p.name for p in tmp_path.iterdir()} == {"solutions.json", "frame_0000.png.solved.png"}
+    height, width, channels = cv2.imread(str(tmp_path / "frame_0000.png.solved.png")).shape
     assert (height * 659, channels) == (width * 493, 3)
 
 
@@ -194,7 +194,10 @@ def test_an_option_overrides_the_scene(skysim: Skysim, tmp_path: Path) -> None:
         (["afit_simsat", "--set", "light.surface.apex=90 in"], "the bearing's centre is outside of the dome"),
         (["shefex2", "--set", "tracker.identifier=magic"], "tracker.identifier: 'magic' is none of pyramid"),
         (["shefex2", "--set", "tracker.solver=rotation_only"], "tracker.solver: 'rotation_only' is none of "),
-        (["shefex2", "--set", "light.catalogue=nosuch"], "nosuch.ecsv: there is no such catalogue"),
+        (
+            ["shefex2", "--set", "light.catalogue=nosuch"],
+            "light.catalogue: 'nosuch' is none of hipparcos_hp6.5",
+        ),
         (["shefex2", "--set", "vehicle.model=nosuch.xml"], "nosuch.xml: no such file"),
         (["shefex2", "--set", "seed"], "--set seed: allowed: path.to.key=value"),
         (["shefex2", "--set", "seed=["], "--set seed: '[' is not YAML"),

@@ -117,15 +117,15 @@ def test_each_blob_and_each_star_is_matched_once(sky: index.PairIndex) -> None:
 
 
 def test_nothing_but_false_stars_gives_no_attitude(bright_sky: index.PairIndex) -> None:
-    # 1e-5 a field is what is promised; 3,000 fields would show 1e-3 with 95 %.
+    # 1e-5 a field is what is promised; 2,000 fields would show 1.5e-3 with 95 %.
     rng = np.random.default_rng(63)
-    fields = (rng.uniform(0, [658, 492], (rng.integers(4, 13), 2)) for _ in range(3000))
+    fields = (rng.uniform(0, [658, 492], (rng.integers(4, 13), 2)) for _ in range(2000))
     assert sum(solved(xy, bright_sky) is not None for xy in fields) == 0
 
 
 def test_nothing_but_many_false_stars_gives_no_attitude(sky: index.PairIndex) -> None:
     rng = np.random.default_rng(64)
-    fields = (rng.uniform(0, [658, 492], (40, 2)) for _ in range(150))
+    fields = (rng.uniform(0, [658, 492], (40, 2)) for _ in range(60))
     assert sum(solved(xy, sky, triangles=60) is not None for xy in fields) == 0
 
 

@@ -215,7 +215,7 @@ def test_a_radial_distortion_is_found_with_the_focal_length(uncertain: StarTrack
     lens = replace(CAMERA, distortion=(-0.15, 0.0, 0.0, 0.0, 0.0))
     rng = np.random.default_rng(92)
     found = []
-    for _ in range(8):
+    for _ in range(5):
         truth, pixels, _ = starfield(uncertain, rng, lens)
         answer = uncertain.solve_centroids(centroids(pixels))
         assert apart_rad(answer, truth) < 1e-3
@@ -229,7 +229,7 @@ def test_a_focal_length_beyond_its_uncertainty_is_refused() -> None:
     vectors = catalog.apparent(stars, OBSERVER)
     wrong = StarTracker(CAMERA.zoomed(1.06), stars, vectors, focal_uncertainty=0.01)
     rng = np.random.default_rng(93)
-    fields = [starfield(wrong, rng, CAMERA, 5.5)[1] for _ in range(2)]
+    fields = [starfield(wrong, rng, CAMERA, 5.5)[1] for _ in range(1)]
     assert not any(wrong.solve_centroids(centroids(xy)).solved for xy in fields)
 
 

@@ -62,13 +62,13 @@ def test_the_same_seed_gives_the_same_bytes_and_another_seed_others(lab: Lab) ->
 
 
 def test_a_frame_alone_is_the_frame_of_a_sequence(lab: Lab) -> None:
-    sequence = [shot.frame.image_dn for shot in simulate.run(lab)]
+    sequence = [shot.frame.image_dn for shot in simulate.run(lab, simulate.tracker(lab))]
     alone, _ = simulate.shoot(prepared(lab.scene.name, 2), 1)
     assert alone.image_dn.tobytes() == sequence[1].tobytes()
 
 
 def test_its_first_frames_are_solved_and_right(lab: Lab) -> None:
-    for shot in simulate.run(lab):
+    for shot in simulate.run(lab, simulate.tracker(lab)):
         answer = shot.report.attitude
         assert answer.status == "solved"
         error = (answer.cam_from_ref * shot.truth.cam_from_lab.inv()).magnitude()
@@ -87,5 +87,5 @@ def test_the_afit_camera_sees_five_leds_all_along_its_manoeuvre():
         body_from_lab = lab.trajectory.at(simulate.open_s(lab.scene, index)).inv()
         pixels = project(body_from_lab, eyes.leds.position_m, eyes.lever, eyes.camera)
         counts.append(int(eyes.camera.contains(np.nan_to_num(pixels, nan=-1e9), 12).sum()))
-    assert frames > 100
+    assert frames > 50
     assert min(counts) >= 5

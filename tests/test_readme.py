@@ -39,10 +39,12 @@ def folder(tmp_path_factory) -> Path:
 
 
 def test_the_commands_leave_what_the_readme_says(folder):
-    left = {path.name for path in (folder / "out" / "shefex2").iterdir()}
-    assert {"frame_0000.fits", "frame_0000.png", "frame_0000.ecsv"} <= left
-    # `render` came after `run` and cleared its frames, not its results.
-    assert {"solutions.ecsv", "annotated.png", "report.html"} <= left
+    ran = {path.name for path in (folder / "out" / "short").iterdir()}
+    frames = {f"frame_000{n}.{suffix}" for n in (0, 1) for suffix in ("fits", "png", "ecsv")}
+    assert ran == frames | {"solutions.ecsv", "annotated.png", "report.html"}
+    # `render` came after `run` and cleared what the latter said of other frames.
+    rendered = {path.name for path in (folder / "out" / "shefex2").iterdir()}
+    assert rendered == {"frame_0000.fits", "frame_0000.png", "frame_0000.ecsv"}
 
 
 def test_the_python_block_solves_the_frame(folder):

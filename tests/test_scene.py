@@ -222,11 +222,11 @@ def test_a_bad_override_is_one_line_and_blamed_on_the_option(key: str, value: st
         ),
         ("title: AFIT", "name: x\ntitle: AFIT", "name: unknown key"),
         (
-            'duration: "2 s"',
-            'durations: "2 s"',
+            'duration: "1 s"',
+            'durations: "1 s"',
             "unknown key; did you mean duration?; allowed: kind, duration",
         ),
-        ('{kind: hold, duration: "2 s"}', '{kind: wait, duration: "2 s"}', "'wait' is none of hold, slew"),
+        ('{kind: hold, duration: "1 s"}', '{kind: wait, duration: "1 s"}', "'wait' is none of hold, slew"),
         (
             "pitch_deg: 0",
             "pich_deg: 0",
