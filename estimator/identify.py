@@ -317,7 +317,7 @@ def _log10_chance(groups: NDArray, seen: int, p: float) -> float:
 @numba.njit(cache=True)
 def log10_tail(trials: int, hits: int, p: float) -> float:
     """log10 of the probability of `hits` or more in `trials` at probability p each."""
-    if hits <= 0:
+    if hits <= 0 or p >= 1:
         return 0.0
     total = 0.0
     for k in range(hits, trials + 1):

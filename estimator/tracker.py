@@ -188,7 +188,10 @@ class StarTracker:
                 np.hypot(centroids.sigma_px[observed], self.settings.centroid_sigma_px) / camera.focal_px
             )
             rays = camera.rays(xy)
-            cam_from_ref = SOLVERS[self.settings.solver](rays, vectors, sigma_rad)
+            try:
+                cam_from_ref = SOLVERS[self.settings.solver](rays, vectors, sigma_rad)
+            except ValueError as error:
+                return Attitude(f"no attitude: {error}")
         rows, _ = self._in_field(camera, cam_from_ref)
         chance = log10_chance(observed, len(centroids), len(rows), radius_px, camera, len(self.index.pair))
         if chance > ACCEPT_LOG10_CHANCE:
