@@ -50,8 +50,7 @@ def check(image: NDArray) -> None:
         raise BadImage(f"pixels of type {image.dtype} are no brightness; allowed: integers and floats")
     if image.ndim != 2:
         raise BadImage(f"an image of shape {image.shape} is not monochrome; allowed: (height, width)")
-    if min(image.shape) < 16:
-        raise BadImage(f"{image.shape[1]}x{image.shape[0]} pixels are too few; allowed: 16x16 and more")
+    check_size(image)
     low, high = image.min(), image.max()
     if not (np.isfinite(low) and np.isfinite(high)):
         raise BadImage("the image holds NaN or infinite pixels; allowed: finite values")
@@ -65,6 +64,12 @@ def native(image: NDArray) -> NDArray:
     if kind and image.itemsize not in (4, 8):
         return image.astype(kind)
     return image.astype(image.dtype.newbyteorder("="), copy=False)
+
+
+def check_size(image: NDArray) -> None:
+    """Raise BadImage for an image too small to hold a star field."""
+    if min(image.shape) < 16:
+        raise BadImage(f"{image.shape[1]}x{image.shape[0]} pixels are too few; allowed: 16x16 and more")
 
 
 def sky(image: NDArray, tile_px: int = TILE_PX) -> Background:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from estimator import catalog
 from estimator.attitude import radecroll_rad
 from estimator.camera import Camera
-from estimator.detect import check as check_image
+from estimator.detect import check_size
 from estimator.tracker import Report, Settings, StarTracker
 from estimator.types import BadImage
 from skysim import io, report, scene
@@ -104,7 +104,7 @@ def solve(path: Path, solver: Solver, annotated: Path | None) -> dict[str, Any]:
         image = io.read_image(path)
         check(path, image, solver.camera)
         image = io.monochrome(image)
-        check_image(image)
+        check_size(image)
         tracker = solver.tracker(image, io.date_of(path))
         found = tracker.solve(image)
     except (BadInput, BadImage) as error:
