@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -89,6 +89,15 @@ def see(image: NDArray, camera: Camera, settings: Settings, clock: Clock) -> Cen
     return centroids.take(sound)
 
 
+def look(
+    image: NDArray, camera: Camera, settings: Settings, solve: Callable[[Centroids, Clock], Attitude]
+) -> Report:
+    """A frame through all stages, timed."""
+    clock = Clock()
+    centroids = see(image, camera, settings, clock)
+    return Report(solve(centroids, clock), centroids, clock.seconds)
+
+
 def whole(box_px: NDArray, camera: Camera) -> NDArray:
     """(N,) whether a blob's box keeps off the border: one cut off by it has its centre elsewhere."""
     x0, y0, x1, y1 = box_px.T
@@ -128,9 +137,7 @@ class StarTracker:
 
     def solve(self, image: NDArray) -> Report:
         """One frame to an attitude. Raises BadImage for bad input; anything else that fails is a status."""
-        clock = Clock()
-        centroids = see(image, self.camera, self.settings, clock)
-        return Report(self.solve_centroids(centroids, clock), centroids, clock.seconds)
+        return look(image, self.camera, self.settings, self.solve_centroids)
 
     def solve_centroids(self, centroids: Centroids, clock: Clock | None = None) -> Attitude:
         """The stages after centroiding, for centroids from anywhere (the truth included)."""
@@ -318,9 +325,7 @@ class DomeTracker:
 
     def solve(self, image: NDArray) -> Report:
         """One frame to an attitude. Raises BadImage for bad input; anything else that fails is a status."""
-        clock = Clock()
-        centroids = see(image, self.camera, self.settings, clock)
-        return Report(self.solve_centroids(centroids, clock), centroids, clock.seconds)
+        return look(image, self.camera, self.settings, self.solve_centroids)
 
     def solve_centroids(self, centroids: Centroids, clock: Clock | None = None) -> Attitude:
         """The stages after centroiding, for centroids from anywhere (the truth included)."""
