@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from estimator.attitude import quest
+from estimator.attitude import covariance, quest
 from estimator.camera import Camera
 from estimator.types import BadImage, Floats, Ints
 
@@ -159,9 +159,7 @@ def ray_on_surface(
         if moved < 1e-13:
             break
     unit = in_body / radius[:, None]
-    weight = 1 / (sigma_rad * distance) ** 2
-    information = (weight[:, None, None] * (np.eye(3) - np.einsum("ni,nj->nij", unit, unit))).sum(axis=0)
-    return body_from_lab, np.linalg.inv(information)
+    return body_from_lab, covariance(unit, sigma_rad * distance)
 
 
 NearSolver = Callable[..., tuple[Rotation, Floats]]

@@ -98,6 +98,16 @@ def look(
     return Report(solve(centroids, clock), centroids, clock.seconds)
 
 
+def brightest(centroids: Centroids, settings: Settings) -> Centroids:
+    """As many as identification looks at: twice those among which it seeks its patterns."""
+    return centroids.take(np.arange(min(len(centroids), 2 * settings.base_stars)))
+
+
+def direction_sigma_rad(centroids: Centroids, camera: Camera, settings: Settings) -> Floats:
+    """(N,) error of a direction: the centroid's own, and the floor for what that does not cover."""
+    return np.hypot(centroids.sigma_px, settings.centroid_sigma_px) / camera.focal_px
+
+
 def whole(box_px: NDArray, camera: Camera) -> NDArray:
     """(N,) whether a blob's box keeps off the border: one cut off by it has its centre elsewhere."""
     x0, y0, x1, y1 = box_px.T
@@ -159,7 +169,7 @@ class StarTracker:
         step, stretch = 0.02, 0.011 if self.focal_uncertainty else 5e-4
         reach = int(np.ceil(self.focal_uncertainty / step - 0.5))
         zooms = sorted((n * step for n in range(-reach, reach + 1)), key=abs)
-        few = centroids.take(np.arange(min(len(centroids), 2 * self.settings.base_stars)))
+        few = brightest(centroids, self.settings)
         for triangles, checks in ((60, 1_500_000), (600, 3_000_000), (3000, 4_000_000)):
             for zoom in zooms:
                 camera = self.camera.zoomed(1 + zoom)
@@ -191,9 +201,7 @@ class StarTracker:
             xy, vectors = centroids.xy_px[observed], self.stars.vectors[star]
             if fits:
                 camera, cam_from_ref = fit_camera(camera, cam_from_ref, xy, vectors)
-            sigma_rad = (
-                np.hypot(centroids.sigma_px[observed], self.settings.centroid_sigma_px) / camera.focal_px
-            )
+            sigma_rad = direction_sigma_rad(centroids.take(observed), camera, self.settings)
             rays = camera.rays(xy)
             try:
                 cam_from_ref = SOLVERS[self.settings.solver](rays, vectors, sigma_rad)
@@ -332,7 +340,7 @@ class DomeTracker:
         clock = clock or Clock()
         if len(centroids) < MIN_MATCHES:
             return Attitude(NO_STARS)
-        few = centroids.take(np.arange(min(len(centroids), 2 * self.settings.base_stars)))
+        few = brightest(centroids, self.settings)
         match = IDENTIFIERS[self.settings.identifier](
             self._on_sphere(self.camera.rays(few.xy_px)),
             self.index,
@@ -350,15 +358,13 @@ class DomeTracker:
         return attitude
 
     def _refined(self, centroids: Centroids, match: StarMatch) -> Attitude:
-        """Solve exactly, match every centroid to the LEDs in view, tighten, weigh against chance."""
+        """Solve exactly, match every centroid to the LEDs in view, tighten; the search has weighed the chance."""
         camera, lever = self.camera, self.lever
         body_from_lab = lever.cam_from_body.inv() * match.cam_from_ref
         observed, star = match.observed, match.star
         for radius_px in (12.0, 4.0, 4.0):
             rays = camera.rays(centroids.xy_px[observed])
-            sigma_rad = (
-                np.hypot(centroids.sigma_px[observed], self.settings.centroid_sigma_px) / camera.focal_px
-            )
+            sigma_rad = direction_sigma_rad(centroids.take(observed), camera, self.settings)
             try:
                 body_from_lab, spread = NEAR_SOLVERS[self.settings.solver](
                     rays, sigma_rad, self.leds.position_m[star], self.leds, lever, body_from_lab

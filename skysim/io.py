@@ -103,7 +103,6 @@ def wcs(camera: Camera, cam_from_icrs: Rotation) -> dict[str, Any]:
     ra, dec = np.arctan2(sight[1], sight[0]), np.arcsin(np.clip(sight[2], -1, 1))
     east = np.array([-np.sin(ra), np.cos(ra), 0.0])
     north = np.array([-np.sin(dec) * np.cos(ra), -np.sin(dec) * np.sin(ra), np.cos(dec)])
-    centre = camera.principal_point_px or ((camera.width_px - 1) / 2, (camera.height_px - 1) / 2)
     scale = np.degrees(1 / camera.focal_px)
     return {
         "CTYPE1": "RA---TAN",
@@ -113,8 +112,8 @@ def wcs(camera: Camera, cam_from_icrs: Rotation) -> dict[str, Any]:
         "RADESYS": "ICRS",
         "CRVAL1": np.degrees(ra) % 360,
         "CRVAL2": np.degrees(dec),
-        "CRPIX1": centre[0] + 1,  # FITS counts pixels from 1
-        "CRPIX2": centre[1] + 1,
+        "CRPIX1": camera.centre_px[0] + 1,  # FITS counts pixels from 1
+        "CRPIX2": camera.centre_px[1] + 1,
         "CD1_1": scale * (right @ east),
         "CD1_2": scale * (down @ east),
         "CD2_1": scale * (right @ north),

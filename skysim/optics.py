@@ -40,12 +40,11 @@ class Optics:
         """The optics that a scene's camera describes."""
         sigma, radius = PSFS[camera.psf.kind](camera.psf)
         pupil_m = camera.focal_length_m / camera.f_number
-        centre = camera.principal_point_px or ((camera.width_px - 1) / 2, (camera.height_px - 1) / 2)
         return cls(
             camera.width_px,
             camera.height_px,
             camera.focal_px,
-            centre,
+            camera.centre_px,
             camera.distortion,
             sigma,
             radius,

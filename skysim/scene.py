@@ -319,6 +319,11 @@ class Camera(Part):
     def focal_px(self) -> float:
         return self.focal_length_m / self.pixel_m
 
+    @property
+    def centre_px(self) -> tuple[float, float]:
+        """The principal point: as given, or the chip's middle."""
+        return self.principal_point_px or ((self.width_px - 1) / 2, (self.height_px - 1) / 2)
+
 
 class Exposure(Part):
     """When the shutter opens."""

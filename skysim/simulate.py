@@ -157,9 +157,7 @@ def believed_camera(scene: Scene) -> Camera:
 
 def calibration(camera: scene_schema.Camera) -> Camera:
     """A perfect calibration of a camera, in the tracker's own terms."""
-    middle = (camera.width_px - 1) / 2, (camera.height_px - 1) / 2
-    centre = camera.principal_point_px or middle
-    return Camera(camera.width_px, camera.height_px, camera.focal_px, centre, camera.distortion)
+    return Camera(camera.width_px, camera.height_px, camera.focal_px, camera.centre_px, camera.distortion)
 
 
 def believed_settings(scene: Scene) -> Settings:
