@@ -10,7 +10,7 @@ $(READY): pyproject.toml
 	$(BIN)/pip install --quiet --disable-pip-version-check -e '.[dev,catalog]'
 	touch $@
 
-.PHONY: demo test test-long lint setup clean
+.PHONY: demo test test-long test-oracle lint setup clean
 setup: $(READY)
 
 demo: $(READY)
@@ -18,10 +18,14 @@ demo: $(READY)
 	$(BIN)/skysim run shefex2 --out out/shefex2
 
 test: $(READY)
-	$(BIN)/pytest -n 2 -m "not long"
+	NUMBA_NUM_THREADS=1 $(BIN)/pytest -n 2 -m "not long"
 
 test-long: $(READY)
-	$(BIN)/pytest -n 2 -m long
+	NUMBA_NUM_THREADS=1 $(BIN)/pytest -n 2 -m long
+
+test-oracle: $(READY)
+	$(BIN)/pip install --quiet --disable-pip-version-check -e '.[oracle]'
+	$(BIN)/pytest tests/test_oracle_*.py
 
 lint: $(READY)
 	$(BIN)/ruff check .

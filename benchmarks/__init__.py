@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from benchmarks import attitude, detect, dynamics, identify, render
+from benchmarks import attitude, detect, dynamics, identify, instrument
 
 AREAS: dict[str, Callable[[], list[dict[str, Any]]]] = {
-    "render": render.measure,
+    "instrument": instrument.measure,
     "detect": detect.measure,
     "identify": identify.measure,
     "attitude": attitude.measure,

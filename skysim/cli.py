@@ -107,10 +107,13 @@ def render(
     seed: Seed = None,
     out: Out = None,
     set_: Sets = None,
+    preview: Annotated[
+        bool, typer.Option("--preview", help="Also an 8-bit picture of each frame with the truth marked.")
+    ] = False,
     json: Json = False,
 ) -> None:
     """Fly a scene and write its frames with their truth, without solving them."""
-    from skysim import io, simulate
+    from skysim import io, report, simulate
 
     loaded = load(scene, frames, seed, set_)
     lab = simulate.prepare(loaded)
@@ -119,6 +122,9 @@ def render(
     for index in progress(range(loaded.exposure.frames), loaded.exposure.frames, loaded.title):
         frame, truth = simulate.shoot(lab, index)
         io.write_frame(folder, frame, truth, loaded)
+        if preview:
+            picture = report.preview(frame.image_dn, truth.seen)
+            io.write_image(folder / f"frame_{index:04d}.preview.png", picture)
         written.append(str(folder / f"frame_{index:04d}.fits"))
     if json:
         print(io.to_json(written))

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from skysim import scene
-from skysim.photometry import led_strength_ph_s_sr
+from skysim.photometry import Band, led_strength_e_s_sr
 from skysim.types import BadInput, Floats, Sources
 
 HOLES = 9  # on a patch board; LED number = board * HOLES + hole
@@ -104,12 +104,14 @@ def cap(count: int, half_angle_rad: float) -> Floats:
     return np.column_stack([ring * np.cos(n * GOLDEN_ANGLE_RAD), ring * np.sin(n * GOLDEN_ANGLE_RAD), z])
 
 
-def patch_boards(part: scene.PatchBoards, inside: Surface, led: scene.Led) -> Sources:
+def patch_boards(part: scene.PatchBoards, inside: Surface, led: scene.Led, band: Band) -> Sources:
     """3x3 boards glued flat to the surface, each turned at random, with its own choice of LEDs and levels.
 
     Boards are spread evenly over the cap as seen from the bearing. A board is a plane tangent at its middle, so
     that its outer LEDs stand off the surface as on the real thing. Everything random here is the hardware's and
     comes from part.hardware_seed: which LEDs are soldered, how bright each is, the phase of its pulses.
+    Brightness is lognormal about led.intensity_cd: the logarithm's standard deviation is led.scatter, AFIT's
+    Table 2 has .07 to .09.
     """
     rng = np.random.default_rng(part.hardware_seed)
     half = np.radians(part.cap_deg)
@@ -134,14 +136,13 @@ def patch_boards(part: scene.PatchBoards, inside: Surface, led: scene.Led) -> So
     count = len(board)
     level = rng.choice(part.pwm_levels, count)
     scatter = np.exp(led.scatter * rng.standard_normal(count))
-    strength = led_strength_ph_s_sr(led.intensity_cd) * scatter
+    strength = led_strength_e_s_sr(led.intensity_cd, led.spectrum, band) * scatter
     return Sources(
         id=(board * HOLES + hole).astype(np.int64),
         place=np.column_stack([place, np.ones(count)]),
         normal=normal[board],
         radius_m=np.full(count, led.disc_diameter_m / 2),
         strength=strength,
-        lobe=np.full(count, led.lobe_exponent),
         period_s=np.full(count, led.pwm_period_s),
         start_s=rng.uniform(0, led.pwm_period_s, count),
         on_s=level * led.pwm_period_s,
@@ -152,6 +153,6 @@ def patch_boards(part: scene.PatchBoards, inside: Surface, led: scene.Led) -> So
 LAYOUTS = {"patch_boards": patch_boards}
 
 
-def sources(light: scene.Dome) -> Sources:
-    """Every LED of the dome."""
-    return LAYOUTS[light.layout.kind](light.layout, surface(light.surface), light.led)
+def sources(light: scene.Dome, band: Band) -> Sources:
+    """Every LED of the dome, as bright as the chip's band makes it: strength is photo-electrons s^-1 sr^-1."""
+    return LAYOUTS[light.layout.kind](light.layout, surface(light.surface), light.led, band)

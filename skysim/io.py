@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from skysim.scene import Camera, Scene, Stars
+from skysim.camera import Camera
+from skysim.scene import Scene, Stars
 from skysim.types import BadInput, Frame, Truth
 
 IMAGE_SUFFIXES = (".fits", ".fit", ".fts", ".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp")
@@ -149,9 +150,12 @@ def write_truth(path: Path, frame: Frame, truth: Truth, scene: Scene) -> None:
             "electrons": seen.electrons,
             "peak_e": seen.peak_e,
             "streak_px": seen.streak_px,
+            "area_px": seen.area_px,
+            "snr": seen.snr,
+            "saturated": seen.saturated,
         }
     )
-    for name in table.colnames[1:]:
+    for name in table.colnames[1:-1]:
         table[name].info.format = ".9g"
     table.meta = {
         "scene": scene.name,

@@ -1,75 +1,103 @@
-"""The lens as it is: direction to pixel with distortion, and the shape of a point's image."""
+"""The lens as it is: direction to pixel with distortion, and what of the light it lets through."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from skysim import scene
+from skysim.camera import Camera, TwoStops, VignettingTable
 from skysim.types import Floats
 
-# What the lens makes of a point: the standard deviation of a Gaussian and the radius of a disc, convolved.
-PSFS: dict[str, Callable[[scene.Psf], tuple[float, float]]] = {
-    "gaussian": lambda psf: (psf.sigma_px, 0.0),
-    "disc": lambda psf: (psf.sigma_px, psf.radius_px),
-}
+
+def two_stops(part: TwoStops, field_rad: Floats) -> Floats:
+    """Share of the light that passes two equal round stops: the overlap of two circles, over a circle.
+
+    V = (2 / pi) (acos u - u sqrt(1 - u^2)), u = tan(field) / tan(cutoff): seen obliquely, one stop is displaced
+    against the other by u diameters.
+    """
+    u = np.clip(np.tan(np.minimum(field_rad, 1.57)) / np.tan(np.radians(part.cutoff_deg)), 0, 1)
+    return np.asarray(2 / np.pi * (np.arccos(u) - u * np.sqrt(1 - u**2)))
+
+
+def table(part: VignettingTable, field_rad: Floats) -> Floats:
+    """Transmission as it was measured, linear between the angles and level beyond them."""
+    return np.interp(np.degrees(field_rad), part.angle_deg, part.transmission)
+
+
+VIGNETTING: dict[str, Callable[[Any, Floats], Floats]] = {"two_stops": two_stops, "table": table}
 
 
 @dataclass(frozen=True, slots=True)
 class Optics:
     """A lens before a chip, in camera axes +x right, +y down, +z boresight.
 
-    distortion      : k1, k2, p1, p2, k3 (Brown-Conrady in OpenCV's order)
-    blur_sigma_px, blur_radius_px : the point's image: a disc of that radius convolved with that Gaussian
-    collecting_m2   : entrance pupil's area times transmission
+    camera        : focal length, principal point, distortion, point-spread function
+    collecting_m2 : entrance pupil's area times transmission
+    fold_r        : tangent of the field angle at which strong barrel distortion turns back: no image beyond
+    field_rad     : greatest angle from the boresight of anything on the chip
     """
 
-    width_px: int
-    height_px: int
-    focal_px: float
-    centre_px: tuple[float, float]
-    distortion: tuple[float, ...]
-    blur_sigma_px: float
-    blur_radius_px: float
+    camera: Camera
     collecting_m2: float
+    fold_r: float
+    field_rad: float
 
     @classmethod
-    def of(cls, camera: scene.Camera) -> Optics:
+    def of(cls, camera: Camera) -> Optics:
         """The optics that a scene's camera describes."""
-        sigma, radius = PSFS[camera.psf.kind](camera.psf)
-        pupil_m = camera.focal_length_m / camera.f_number
-        return cls(
-            camera.width_px,
-            camera.height_px,
-            camera.focal_px,
-            camera.centre_px,
-            camera.distortion,
-            sigma,
-            radius,
-            np.pi / 4 * pupil_m**2 * camera.transmission,
-        )
-
-    @property
-    def half_diagonal_rad(self) -> float:
-        """Greatest angle from the boresight at which an undistorted camera sees anything."""
-        centre, size = np.array(self.centre_px), np.array([self.width_px, self.height_px])
-        reach = np.hypot(*np.maximum(centre + 0.5, size - 0.5 - centre))
-        return float(np.arctan(reach / self.focal_px))
+        area_m2, turn = np.pi / 4 * camera.pupil_m**2, fold_r(camera.distortion)
+        return cls(camera, float(area_m2 * camera.transmission), turn, field_rad(camera, turn))
 
     def project(self, vectors_cam: Floats) -> Floats:
-        """(..., 3) vectors in camera axes to (..., 2) pixels; NaN behind the camera.
+        """(..., 3) vectors in camera axes to (..., 2) pixels; NaN behind the camera and beyond the fold.
 
         x' = x (1 + k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2), y' likewise (Brown 1971).
         """
         z = np.where(vectors_cam[..., 2] > 0, vectors_cam[..., 2], np.nan)
         x, y = vectors_cam[..., 0] / z, vectors_cam[..., 1] / z
-        k1, k2, p1, p2, k3 = self.distortion
+        focal, centre = self.camera.focal_px, self.camera.centre_px
+        if any(self.camera.distortion):
+            x, y = self._distort(x, y)
+        return np.stack([x * focal + centre[0], y * focal + centre[1]], axis=-1)
+
+    def _distort(self, x: Floats, y: Floats) -> tuple[Floats, Floats]:
+        p1, p2 = self.camera.distortion[2:4]
         r2 = x**2 + y**2
-        radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
-        u = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x**2)
-        v = y * radial + p1 * (r2 + 2 * y**2) + 2 * p2 * x * y
-        return np.stack(
-            [u * self.focal_px + self.centre_px[0], v * self.focal_px + self.centre_px[1]], axis=-1
-        )
+        stretch = np.where(r2 < self.fold_r**2, radial(self.camera.distortion, r2), np.nan)
+        u = x * stretch + 2 * p1 * x * y + p2 * (r2 + 2 * x**2)
+        v = y * stretch + p1 * (r2 + 2 * y**2) + 2 * p2 * x * y
+        return u, v
+
+    def passed(self, cos_field: Floats) -> Floats:
+        """Share of a point's light that the pupil takes in at an angle from the boresight: its foreshortening,
+        cos, and vignetting. Zero behind the camera. Any shape."""
+        cosine = np.maximum(cos_field, 0)
+        part = self.camera.vignetting
+        if part is None:
+            return cosine
+        return cosine * VIGNETTING[part.kind](part, np.arccos(np.minimum(cosine, 1)))
+
+
+def radial(distortion: tuple[float, ...], r2: Floats) -> Floats:
+    """1 + k1 r^2 + k2 r^4 + k3 r^6 of k1, k2, p1, p2, k3 (OpenCV's order)."""
+    k1, k2, _, _, k3 = distortion
+    return 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+
+
+def field_rad(camera: Camera, fold_r: float) -> float:
+    """Angle from the boresight of the chip's farthest corner, distortion undone."""
+    centre, size = np.array(camera.centre_px), np.array([camera.width_px, camera.height_px])
+    corner = np.hypot(*np.maximum(centre + 0.5, size - 0.5 - centre)) / camera.focal_px
+    r = np.linspace(0, min(fold_r, 20 * corner), 4001)
+    return float(np.arctan(np.interp(corner, r * radial(camera.distortion, r**2), r)))
+
+
+def fold_r(distortion: tuple[float, ...]) -> float:
+    """The least r at which r (1 + k1 r^2 + k2 r^4 + k3 r^6) stops growing; infinity if it always grows."""
+    k1, k2, _, _, k3 = distortion
+    s = np.roots([1.0, 3 * k1, 5 * k2, 7 * k3])  # in 1 / r^2, as any of the coefficients may be nothing
+    turns = s.real[(abs(s.imag) < 1e-9 * (1 + abs(s.real))) & (s.real > 1e-12)]
+    return float(1 / np.sqrt(turns.max())) if len(turns) else float("inf")

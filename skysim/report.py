@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skysim.io import write_text
-from skysim.types import Floats, Row
+from skysim.types import Floats, Row, Seen
 
 TRUTH_BGR, FOUND_BGR, MATCHED_BGR = (200, 160, 60), (80, 80, 235), (110, 220, 90)
 
@@ -41,17 +41,57 @@ def annotate(
     picture = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_NEAREST)
     size = max(8, min(picture.shape[:2]) // 70)
     for x, y in places(truth_px, scale):
-        for dx, dy in ((1, 0), (-1, 0), (0, 1), (0, -1)):
-            begin, end = size - 4, size + 6
-            cv2.line(picture, (x + begin * dx, y + begin * dy), (x + end * dx, y + end * dy), TRUTH_BGR, 1)
+        ticks(picture, x, y, size, TRUTH_BGR)
     for x, y in places(found_px, scale):
         cv2.rectangle(picture, (x - size, y - size), (x + size, y + size), FOUND_BGR, 1)
     for n, (x, y) in enumerate(places(matched_px, scale)):
         cv2.circle(picture, (x, y), size + 4, MATCHED_BGR, 1, cv2.LINE_AA)
         if labels:
-            place = (x + size + 6, y + 4)
-            cv2.putText(picture, labels[n], place, cv2.FONT_HERSHEY_SIMPLEX, 0.4, MATCHED_BGR, 1, cv2.LINE_AA)
+            write(picture, labels[n], x + size + 6, y + 4, MATCHED_BGR)
     return picture
+
+
+def preview(image: NDArray, seen: Seen) -> NDArray[np.uint8]:
+    """The stretched frame with every true source ticked at mid-exposure and the brightest forty named.
+
+    Blue for what the detector can measure, red for what is expected to saturate. A small frame is doubled.
+    """
+    scale = 2 if max(image.shape) < 1000 else 1
+    picture = cv2.cvtColor(stretch(image), cv2.COLOR_GRAY2BGR)
+    picture = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_NEAREST)
+    size = max(8, min(picture.shape[:2]) // 70)
+    named = set(np.argsort(-seen.electrons)[:40].tolist())
+    for n, (x, y) in enumerate(places(seen.xy_px, scale)):
+        colour = FOUND_BGR if seen.saturated[n] else TRUTH_BGR
+        ticks(picture, x, y, size, colour)
+        if n in named:
+            write(picture, str(seen.id[n]), x + size + 2, y - size, colour)
+    return picture
+
+
+def ticks(picture: NDArray[np.uint8], x: int, y: int, size: int, colour: tuple[int, int, int]) -> None:
+    """Four strokes that leave the middle open."""
+    for dx, dy in ((1, 0), (-1, 0), (0, 1), (0, -1)):
+        begin, end = size - 4, size + 6
+        cv2.line(picture, (x + begin * dx, y + begin * dy), (x + end * dx, y + end * dy), colour, 1)
+
+
+def write(picture: NDArray[np.uint8], text: str, x: int, y: int, colour: tuple[int, int, int]) -> None:
+    """A small label."""
+    cv2.putText(picture, text, (x, y), cv2.FONT_HERSHEY_SIMPLEX, 0.4, colour, 1, cv2.LINE_AA)
+
+
+def contact_sheet(images: list[NDArray], captions: list[str], scale: int) -> NDArray[np.uint8]:
+    """Frames of one size side by side, each enlarged and named, all stretched alike so that they compare."""
+    low, high = np.percentile(images[0], 30), float(np.percentile(images[0], 99.95))
+    strips = []
+    for image, caption in zip(images, captions, strict=True):
+        grey = (255 * np.sqrt(np.clip((image - low) / (high - low), 0, 1))).astype(np.uint8)
+        large = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_NEAREST)
+        picture = cv2.copyMakeBorder(large, 24, 2, 2, 2, cv2.BORDER_CONSTANT, value=40)
+        write(picture, caption, 6, 16, (255, 255, 255))
+        strips.append(picture)
+    return np.hstack(strips)
 
 
 def places(xy_px: Floats | None, scale: int) -> list[tuple[int, int]]:

@@ -1,24 +1,14 @@
-"""A scene file (YAML) becomes a validated, frozen `Scene`. This module is the only schema.
-
-Two rules name every key. A key whose value carries its own unit has none in its name (`focal_length: "35 mm"`);
-a key whose value is a bare number ends in its unit (`tilt_stop_deg: 30`). In Python the former gains the SI
-suffix (`camera.focal_length_m`), so that a unit is always in sight.
-"""
+"""A scene file (YAML) becomes a validated, frozen `Scene`. With `camera` and `quantity` the only schema."""
 
 from __future__ import annotations
 
 import datetime
-import math
-import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import (
     AfterValidator,
-    BaseModel,
-    BeforeValidator,
-    ConfigDict,
     Discriminator,
     Field,
     Tag,
@@ -27,66 +17,34 @@ from pydantic import (
     model_validator,
 )
 
+from skysim.camera import Camera, with_preset
+from skysim.quantity import (
+    DATA,
+    ROOT,
+    Ascending,
+    Inertia,
+    Intensity,
+    Length,
+    Mass,
+    NotNegative,
+    Number,
+    Part,
+    Positive,
+    SemiAxis,
+    Share,
+    Spin,
+    Time,
+    Torque,
+    Triple,
+    a_table,
+    one_of,
+)
 from skysim.types import BadInput
-from skysim.yamlfile import explain, put, read_yaml
+from skysim.yamlfile import explain, place_of, put, read_yaml
 
-ROOT = Path(__file__).resolve().parents[1]
 SCENES = ROOT / "scenes"
 STEM = "(the file's name)"  # no key that a file could have
-CATALOGUES = ROOT / "data" / "catalogues"
-
-# Only what a quantity parser fills: `dark_e_s` and `rate_deg_s` are bare numbers and keep their unit.
-SI_SUFFIX = re.compile(r"(?<!_deg)(?<!_e)_(m|s|kg|kg_m2|cd|nm)$")
-
-
-def quantity(si_unit: str, what: str, examples: str) -> Callable[[Any], float]:
-    """A validator that turns a quantity such as "48 in" into a float in `si_unit`."""
-
-    def parse(value: Any) -> float:
-        from astropy import units
-
-        if not isinstance(value, str):
-            raise ValueError(f"{value!r} has no unit; allowed: a {what} such as {examples}")
-        try:
-            # astropy spells it `inch`; the lab writes `in`.
-            inch = units.def_unit("in", units.imperial.inch)
-            with units.add_enabled_units([inch, units.imperial]):
-                number = units.Quantity(value).to_value(si_unit)
-        except (units.UnitsError, TypeError, ValueError) as error:
-            raise ValueError(f"{value!r} is not a {what}; allowed: a {what} such as {examples}") from error
-        return float(number)
-
-    return parse
-
-
-def finite(value: float) -> float:
-    if not math.isfinite(value):
-        raise ValueError(f"{value} is not a finite number")
-    return value
-
-
-Number = Annotated[float, AfterValidator(finite)]
-Length = Annotated[Number, BeforeValidator(quantity("m", "length", '"35 mm" or "48 in"'))]
-Time = Annotated[Number, BeforeValidator(quantity("s", "time", '"40 ms" or "1000 us"'))]
-Mass = Annotated[Number, BeforeValidator(quantity("kg", "mass", '"80 kg"'))]
-Inertia = Annotated[Number, BeforeValidator(quantity("kg m2", "moment of inertia", '"6.0 kg m2"'))]
-Intensity = Annotated[Number, BeforeValidator(quantity("cd", "luminous intensity", '"7.7 mcd"'))]
-Torque = Annotated[Number, BeforeValidator(quantity("N m", "torque", '"0.5 N m"'))]
-SemiAxis = Annotated[Length, Field(gt=0)]
-Spin = Annotated[Number, Field(ge=-360, le=360)]
-Triple = tuple[Number, Number, Number]
-
-
-class Part(BaseModel):
-    """Base of every section: frozen, no unknown keys, units out of the YAML names."""
-
-    model_config = ConfigDict(
-        extra="forbid",
-        frozen=True,
-        validate_by_alias=True,
-        validate_by_name=False,
-        alias_generator=lambda name: SI_SUFFIX.sub("", name),
-    )
+CATALOGUES = DATA / "catalogues"
 
 
 def in_our_time(value: datetime.datetime) -> datetime.datetime:
@@ -162,6 +120,33 @@ Start = Annotated[
 ]
 
 
+class JitterLine(Part):
+    """A vibration of one frequency: rms_arcsec about each of the body's axes, phases at random."""
+
+    kind: Literal["line"]
+    frequency_hz: Positive
+    rms_arcsec: tuple[NotNegative, NotNegative, NotNegative]
+
+
+class JitterBand(Part):
+    """Random vibration between two frequencies, power spectral density proportional to f^slope."""
+
+    kind: Literal["band"]
+    from_hz: Positive
+    to_hz: Positive
+    rms_arcsec: tuple[NotNegative, NotNegative, NotNegative]
+    slope: Annotated[Number, Field(ge=-6, le=6)] = 0.0
+
+    @model_validator(mode="after")
+    def a_band(self) -> JitterBand:
+        if self.from_hz >= self.to_hz:
+            raise ValueError(f"from_hz {self.from_hz:g} is not below to_hz {self.to_hz:g}")
+        return self
+
+
+Jitter = Annotated[JitterLine | JitterBand, Field(discriminator="kind")]
+
+
 class Motion(Part):
     """How it starts and what it is told to do."""
 
@@ -169,6 +154,7 @@ class Motion(Part):
     rate_deg_s: tuple[Spin, Spin, Spin] = (0.0, 0.0, 0.0)
     control: Literal["none", "pid"] = "none"
     manoeuvre: tuple[Annotated[Hold | Slew, Field(discriminator="kind")], ...] = ()
+    jitter: tuple[Jitter, ...] = ()
 
     @model_validator(mode="after")
     def somebody_flies_it(self) -> Motion:
@@ -223,13 +209,37 @@ class PatchBoards(Part):
         return self
 
 
+class CosineLobe(Part):
+    """Radiant intensity as cos^exponent of the angle from the normal; 1 is Lambert's law."""
+
+    kind: Literal["cosine"] = "cosine"
+    exponent: NotNegative = 1.0
+
+
+class LobeTable(Part):
+    """Relative intensity against angle as it was measured, 1 on the axis, nothing beyond the last angle."""
+
+    kind: Literal["table"]
+    angle_deg: Ascending
+    intensity: Annotated[tuple[NotNegative, ...], Field(min_length=2)]
+
+    @model_validator(mode="after")
+    def a_table(self) -> LobeTable:
+        a_table(self.angle_deg, self.intensity, "intensity")
+        return self
+
+
+Lobe = Annotated[CosineLobe | LobeTable, Field(discriminator="kind")]
+
+
 class Led(Part):
     """One kind of LED, for the whole dome."""
 
     intensity_cd: Annotated[Intensity, Field(gt=0)]
     disc_diameter_m: Annotated[Length, Field(gt=0)]
     falloff: str = "inverse_square"
-    lobe_exponent: Annotated[Number, Field(ge=0)] = 1.0
+    lobe: Lobe = CosineLobe()
+    spectrum: Literal["white"] | Annotated[Length, Field(ge=300e-9, le=1100e-9)] = "white"
     scatter: Annotated[Number, Field(ge=0, lt=0.5)] = 0.0
     pwm_period_s: Annotated[Time, Field(gt=0)] = 1e-3
 
@@ -258,71 +268,60 @@ class Stars(Part):
     limit_mag: Annotated[Number, Field(ge=0, le=15)] = 6.5
 
 
-class Psf(Part):
-    """The lens's point-spread function: a Gaussian, or the disc of a lens out of focus with a Gaussian edge."""
+class UniformGlow(Part):
+    """The same everywhere: e_s electrons a second in every pixel (a light leak, a lit room)."""
 
-    kind: str = "gaussian"
-    sigma_px: Annotated[Number, Field(ge=0.2, le=20)] = 0.7
-    radius_px: Annotated[Number, Field(ge=0, le=200)] = 0.0
+    kind: Literal["uniform"]
+    e_s: NotNegative
 
-    @field_validator("kind")
-    @classmethod
-    def known_psf(cls, value: str) -> str:
-        from skysim.optics import PSFS
 
-        return one_of(value, PSFS)
+class SkyGlow(Part):
+    """The night sky's surface brightness at the boresight, with a relative slope along the image's axes."""
+
+    kind: Literal["sky"]
+    mag_arcsec2: Annotated[Number, Field(ge=0, le=30)]
+    gradient_per_deg: tuple[Number, Number] = (0.0, 0.0)
+
+
+class MoonGlow(Part):
+    """Moonlight scattered by the air (Krisciunas & Schaefer 1991), the Moon at ra_deg, dec_deg.
+
+    phase_angle_deg : 0 at full moon, 90 at the quarters
+    extinction_mag  : of the air at the zenith, in V
+    moon_zenith_deg, field_zenith_deg : zenith distances of the Moon and of the boresight
+    """
+
+    kind: Literal["moon"]
+    ra_deg: Annotated[Number, Field(ge=0, lt=360)]
+    dec_deg: Annotated[Number, Field(ge=-90, le=90)]
+    phase_angle_deg: Annotated[Number, Field(ge=0, le=180)]
+    extinction_mag: Annotated[Number, Field(ge=0, le=2)] = 0.172
+    moon_zenith_deg: Annotated[Number, Field(ge=0, lt=90)]
+    field_zenith_deg: Annotated[Number, Field(ge=0, lt=90)]
+
+
+class StrayLight(Part):
+    """A bright body outside of the field through baffle and lens, by their point source transmittance.
+
+    ra_deg, dec_deg : where it stands, in the lab's axes (under the stars those of the ICRS)
+    v_mag           : how bright it is; the Sun's -26.74 if left out
+    angle_deg, pst  : irradiance on the chip over irradiance before the lens, against the angle from the boresight
+    """
+
+    kind: Literal["stray"]
+    ra_deg: Annotated[Number, Field(ge=0, lt=360)]
+    dec_deg: Annotated[Number, Field(ge=-90, le=90)]
+    v_mag: Number = -26.74
+    angle_deg: Ascending
+    pst: Annotated[tuple[Share, ...], Field(min_length=2)]
 
     @model_validator(mode="after")
-    def a_disc_has_a_radius(self) -> Psf:
-        if (self.kind == "disc") != (self.radius_px > 0):
-            raise ValueError(
-                f"radius_px {self.radius_px:g} with kind {self.kind}; allowed: above 0 with disc only"
-            )
+    def a_table(self) -> StrayLight:
+        a_table(self.angle_deg, self.pst, "pst")
         return self
 
 
-class Detector(Part):
-    """The chip and its electronics. A step is switched off by its parameter."""
-
-    quantum_efficiency: Annotated[Number, Field(gt=0, le=1)]
-    dark_e_s: Annotated[Number, Field(ge=0)] = 0.0
-    sky_e_s: Annotated[Number, Field(ge=0)] = 0.0
-    read_noise_e: Annotated[Number, Field(ge=0)] = 0.0
-    full_well_e: Annotated[Number, Field(gt=0)]
-    gain_e_dn: Annotated[Number, Field(gt=0)]
-    offset_dn: Annotated[Number, Field(ge=0)] = 0.0
-    bits: Annotated[int, Field(ge=1, le=16)]
-    noise: bool = True
-
-    @model_validator(mode="after")
-    def offset_within_the_converter(self) -> Detector:
-        if self.offset_dn >= 2**self.bits:
-            raise ValueError(f"offset_dn {self.offset_dn:g} is beyond a converter of {self.bits} bits")
-        return self
-
-
-class Camera(Part):
-    """Lens and chip as they are. What the tracker believes of them stands in `tracker`."""
-
-    width_px: Annotated[int, Field(ge=16, le=20000)]
-    height_px: Annotated[int, Field(ge=16, le=20000)]
-    pixel_m: Annotated[Length, Field(gt=0)]
-    focal_length_m: Annotated[Length, Field(gt=0)]
-    f_number: Annotated[Number, Field(gt=0)]
-    transmission: Annotated[Number, Field(gt=0, le=1)] = 1.0
-    distortion: tuple[Number, Number, Number, Number, Number] = (0.0, 0.0, 0.0, 0.0, 0.0)
-    principal_point_px: tuple[Number, Number] | None = None
-    psf: Psf = Psf()
-    detector: Detector
-
-    @property
-    def focal_px(self) -> float:
-        return self.focal_length_m / self.pixel_m
-
-    @property
-    def centre_px(self) -> tuple[float, float]:
-        """The principal point: as given, or the chip's middle."""
-        return self.principal_point_px or ((self.width_px - 1) / 2, (self.height_px - 1) / 2)
+Glow = Annotated[UniformGlow | SkyGlow | MoonGlow | StrayLight, Field(discriminator="kind")]
 
 
 class Exposure(Part):
@@ -365,6 +364,7 @@ class Scene(Part):
     vehicle: Vehicle
     motion: Motion
     light: Annotated[Dome | Stars, Field(discriminator="kind")]
+    background: tuple[Glow, ...] = ()
     camera: Camera
     exposure: Exposure
     tracker: Tracker = Tracker()
@@ -383,13 +383,6 @@ class CameraFile(Part):
     """A file that describes a camera and nothing else."""
 
     camera: Camera
-
-
-def one_of(value: str, allowed: Mapping[str, Any]) -> str:
-    """The value, if it is a key of `allowed`."""
-    if value not in allowed:
-        raise ValueError(f"{value!r} is none of {', '.join(allowed)}")
-    return value
 
 
 def find(name: str) -> Path:
@@ -414,24 +407,42 @@ def load(name: str | Path, overrides: Mapping[str, str] | None = None) -> Scene:
     for key, value in (overrides or {}).items():
         put(tree, key, value)
     try:
-        return Scene.model_validate(beside(path, tree) | {STEM: path.stem})
+        raw = beneath(beside(path, tree), text, path, overrides or {})
+        return Scene.model_validate(raw | {STEM: path.stem})
     except ValidationError as error:
         raise BadInput(explain(error, Scene, tree, text, path, overrides or {})) from None
 
 
+def beneath(tree: dict[str, Any], text: str, path: Path, overrides: Mapping[str, str]) -> dict[str, Any]:
+    """`with_preset`, which knows neither file nor line."""
+    try:
+        return with_preset(tree)
+    except BadInput as error:
+        raise BadInput(f"{error} {place_of(['camera', 'preset'], text, path, overrides)}") from None
+
+
 def beside(path: Path, tree: dict[str, Any]) -> dict[str, Any]:
-    """The scene with its vehicle's MJCF taken from the scene's own folder, where there is one of that name."""
-    vehicle = tree.get("vehicle")
-    if not isinstance(vehicle, dict) or not isinstance(vehicle.get("model"), str):
-        return tree
-    own = path.resolve().parent / vehicle["model"]
-    return tree | {"vehicle": vehicle | {"model": str(own)}} if own.is_file() else tree
+    """The scene with the files that it names taken from its own folder, where there are any of that name."""
+    for keys in (("vehicle", "model"), ("camera", "psf", "file")):
+        tree = anchored(path.resolve().parent, tree, *keys)
+    return tree
+
+
+def anchored(folder: Path, tree: dict[str, Any], key: str, *inner: str) -> dict[str, Any]:
+    """A mapping in which the file named under these keys, if it is in the folder, has its whole path."""
+    value = tree.get(key)
+    if inner and isinstance(value, dict):
+        return tree | {key: anchored(folder, value, *inner)}
+    if not inner and isinstance(value, str) and (folder / value).is_file():
+        return tree | {key: str(folder / value)}
+    return tree
 
 
 def load_camera(path: Path) -> Camera:
     """The `camera` section of a scene, or of a file that has nothing else. Raises BadInput with one line."""
     tree, text = read_yaml(path)
     try:
-        return CameraFile.model_validate({key: tree[key] for key in tree if key == "camera"}).camera
+        own = beside(path, {key: tree[key] for key in tree if key == "camera"})
+        return CameraFile.model_validate(beneath(own, text, path, {})).camera
     except ValidationError as error:
         raise BadInput(explain(error, CameraFile, tree, text, path, {})) from None

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from estimator import catalog
@@ -18,15 +20,20 @@ from estimator.nearfield import SOLVERS as NEAR_SOLVERS
 from estimator.nearfield import LedMap, Lever
 from estimator.tracker import Clock, DomeTracker, Report, Settings, StarTracker
 from estimator.types import Attitude, BadImage, Centroids
-from skysim import catalogue, control, dome, sky, world
-from skysim import scene as scene_schema
-from skysim.detector import expose, saturation_dn
+from skysim import background, catalogue, control, dome, jitter, sky, world
+from skysim.camera import Camera as CameraPart
+from skysim.camera import RollingShutter
+from skysim.detector import Chip, expose, judge, saturation_dn
+from skysim.led import Emitter
 from skysim.optics import Optics
-from skysim.render import render
-from skysim.scene import CATALOGUES, Dome, Pointing, Scene, one_of
+from skysim.photometry import Band
+from skysim.psf import EXTENT
+from skysim.quantity import one_of
+from skysim.render import Window, render
+from skysim.scene import CATALOGUES, Dome, Pointing, Scene
 from skysim.types import BadInput, Frame, Mount, Sources, Trajectory, Truth
 
-STAGE_ID = {"detector": 1}
+STAGE_ID = {"detector": 1, "jitter": 2}
 
 Estimator = StarTracker | DomeTracker
 
@@ -38,13 +45,21 @@ def rng(seed: int, stage: str, frame: int) -> np.random.Generator:
 
 @dataclass(frozen=True, slots=True)
 class Lab:
-    """What a scene becomes before the first frame: hardware, lights and the flight."""
+    """What a scene becomes before the first frame: hardware, lights and the flight.
+
+    canvas : (H, W) where the light of one frame after another is drawn; float64 where noise is off, for such a frame
+             is the truth to many digits, and float32 otherwise
+    """
 
     scene: Scene
     mount: Mount
     trajectory: Trajectory
     sources: Sources
+    emitter: Emitter
     optics: Optics
+    chip: Chip
+    band: Band
+    canvas: NDArray[Any]
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,9 +75,10 @@ class Shot:
 def prepare(scene: Scene) -> Lab:
     """Build the vehicle, fly it to the last exposure, and light the sky or the dome."""
     believed_settings(scene)  # a wrong name is told before the flight
+    EXTENT[scene.camera.psf.kind](scene.camera.psf, scene.camera)  # and so is a measured PSF's bad file
     vehicle = world.build(scene.vehicle)
     mount = world.mount(vehicle)
-    last_s = open_s(scene, scene.exposure.frames - 1) + scene.exposure.time_s
+    last_s = window(scene, scene.exposure.frames - 1).close_s(scene.camera.height_px)
     pilot = None
     if scene.motion.control == "pid":
         plan = control.plan(scene.motion, lab_from_body_start(scene, mount))
@@ -74,7 +90,13 @@ def prepare(scene: Scene) -> Lab:
         last_s + 2e-3,
         pilot,
     )
-    return Lab(scene, mount, trajectory, lights(scene), Optics.of(scene.camera))
+    trajectory = jitter.shake(trajectory, scene.motion.jitter, rng(scene.seed, "jitter", 0))
+    band = Band.of(scene.camera.detector.quantum_efficiency)
+    emitter = Emitter.of(scene.light.led) if isinstance(scene.light, Dome) else Emitter()
+    optics, chip = Optics.of(scene.camera), Chip.of(scene.camera)
+    kind = np.float32 if scene.camera.detector.noise else np.float64
+    canvas = np.empty((scene.camera.height_px, scene.camera.width_px), kind)
+    return Lab(scene, mount, trajectory, lights(scene, band), emitter, optics, chip, band, canvas)
 
 
 def lab_from_body_start(scene: Scene, mount: Mount) -> Rotation:
@@ -85,53 +107,46 @@ def lab_from_body_start(scene: Scene, mount: Mount) -> Rotation:
     return control.attitude(start)
 
 
-def lights(scene: Scene) -> Sources:
-    """Everything that shines."""
+def lights(scene: Scene, band: Band) -> Sources:
+    """Everything that shines, as the band sees it."""
     if isinstance(scene.light, Dome):
-        return dome.sources(scene.light)
+        return dome.sources(scene.light, band)
     if not (CATALOGUES / f"{scene.light.catalogue}.ecsv").is_file():
         known = ", ".join(sorted(path.stem for path in CATALOGUES.glob("hipparcos*.ecsv")))
         raise BadInput(
             f"light.catalogue: {scene.light.catalogue!r} is none of {known}; see skysim catalog build"
         )
     stars = catalogue.read(scene.light.catalogue)
-    return sky.sources(stars, scene.start_time, scene.light.limit_mag, Rotation.identity())
+    return sky.sources(stars, scene.start_time, scene.light.limit_mag, Rotation.identity(), band)
 
 
-def open_s(scene: Scene, index: int) -> float:
-    """When the shutter opens for a frame."""
-    return scene.exposure.first_s + index / scene.exposure.rate_hz
+def window(scene: Scene, index: int) -> Window:
+    """When the chip gathers the light of a frame."""
+    shutter = scene.camera.shutter
+    row_time_s = shutter.row_time_s if isinstance(shutter, RollingShutter) else 0.0
+    begin_s = scene.exposure.first_s + index / scene.exposure.rate_hz
+    return Window(begin_s, scene.exposure.time_s, row_time_s)
 
 
 def shoot(lab: Lab, index: int, clock: Clock | None = None) -> tuple[Frame, Truth]:
     """One frame with its truth. Depends on the scene and the index alone."""
     clock = clock or Clock()
-    scene, chip = lab.scene, lab.scene.camera.detector
-    begin, exposure = open_s(scene, index), scene.exposure.time_s
-    falloff = scene.light.led.falloff if isinstance(scene.light, Dome) else "inverse_square"
-    mean_e, seen = render(
-        lab.sources,
-        lab.optics,
-        lab.trajectory,
-        lab.mount,
-        begin,
-        exposure,
-        chip.quantum_efficiency,
-        falloff,
-    )
+    scene, camera = lab.scene, lab.scene.camera
+    when = window(scene, index)
+    middle_s = when.middle_s(camera.height_px)
+    lab_from_body = lab.trajectory.at(middle_s)
+    cam_from_lab = lab.mount.cam_from_body * lab_from_body.inv()
+    light_e = lab.canvas
+    glow = background.glow_map(scene.background, lab.optics, cam_from_lab, lab.band)
+    background.fill(light_e, glow, when.exposure_s)
+    seen = render(light_e, lab.sources, lab.optics, lab.trajectory, lab.mount, when, lab.emitter)
+    seen = judge(seen, light_e, when.exposure_s, lab.chip)
     clock.lap("render")
-    image = expose(mean_e, exposure, chip, rng(scene.seed, "detector", index))
+    image = expose(light_e, when.exposure_s, lab.chip, rng(scene.seed, "detector", index))
     clock.lap("detector")
-    middle = begin + exposure / 2
-    lab_from_body, rate_body = lab.trajectory.at(middle), lab.trajectory.rate_at(middle)
-    truth = Truth(
-        middle,
-        lab_from_body,
-        lab.mount.cam_from_body * lab_from_body.inv(),
-        lab.mount.cam_from_body.apply(rate_body),
-        seen,
-    )
-    return Frame(index, image, middle, exposure, saturation_dn(chip)), truth
+    rate_cam = lab.mount.cam_from_body.apply(lab.trajectory.rate_at(middle_s))
+    truth = Truth(middle_s, lab_from_body, cam_from_lab, rate_cam, seen)
+    return Frame(index, image, middle_s, when.exposure_s, saturation_dn(camera.detector)), truth
 
 
 def tracker(lab: Lab) -> Estimator:
@@ -151,11 +166,11 @@ def tracker(lab: Lab) -> Estimator:
 
 def believed_camera(scene: Scene) -> Camera:
     """The calibration in the tracker's head."""
-    focal_m = scene.tracker.believed_focal_length_m or scene.camera.focal_length_m
-    return calibration(scene.camera).zoomed(focal_m / scene.camera.focal_length_m)
+    believed_m = scene.tracker.believed_focal_length_m
+    return calibration(scene.camera).zoomed(believed_m / scene.camera.focal_length_m if believed_m else 1.0)
 
 
-def calibration(camera: scene_schema.Camera) -> Camera:
+def calibration(camera: CameraPart) -> Camera:
     """A perfect calibration of a camera, in the tracker's own terms."""
     return Camera(camera.width_px, camera.height_px, camera.focal_px, camera.centre_px, camera.distortion)
 

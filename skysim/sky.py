@@ -1,4 +1,4 @@
-"""Catalogue stars -> apparent directions at a date, and photon flux at the aperture."""
+"""Catalogue stars -> apparent directions at a date, and photo-electrons a square metre of the aperture."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from skysim.catalogue import Catalogue
-from skysim.photometry import star_flux_ph_s_m2
+from skysim.photometry import Band, star_flux_e_s_m2
 from skysim.types import Floats, Sources
 
 J2000_TT = datetime.datetime(2000, 1, 1, 12)
@@ -67,15 +67,16 @@ def days_since_j2000_tt(time: datetime.datetime) -> float:
 
 
 def sources(
-    catalogue: Catalogue, time: datetime.datetime, limit_mag: float, lab_from_icrs: Rotation
+    stars: Catalogue, time: datetime.datetime, limit_mag: float, lab_from_icrs: Rotation, band: Band
 ) -> Sources:
     """The stars to a limiting magnitude as points at infinity that always shine.
 
     limit_mag     : faintest Johnson V kept
     lab_from_icrs : where the laboratory's axes stand among the stars at that moment
-    Returns Sources in lab axes: place is (direction, 0), strength photons s^-1 m^-2 in 400-1000 nm.
+    band          : what the chip makes of their light
+    Returns Sources in lab axes: place is (direction, 0), strength photo-electrons s^-1 m^-2 from V and both colours.
     """
-    kept = catalogue.take(catalogue.v_mag <= limit_mag)
+    kept = stars.take(stars.v_mag <= limit_mag)
     count = len(kept)
     direction = lab_from_icrs.apply(apparent(kept, time)) if count else np.zeros((0, 3))
     zero, one = np.zeros(count), np.ones(count)
@@ -84,8 +85,7 @@ def sources(
         place=np.column_stack([direction, zero]),
         normal=np.zeros((count, 3)),
         radius_m=zero,
-        strength=star_flux_ph_s_m2(kept.v_mag),
-        lobe=zero,
+        strength=star_flux_e_s_m2(kept.v_mag, kept.b_v, kept.v_i, band),
         period_s=one,
         start_s=zero,
         on_s=one,

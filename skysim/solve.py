@@ -18,6 +18,7 @@ from estimator.detect import check_size
 from estimator.tracker import Report, Settings, StarTracker
 from estimator.types import BadImage
 from skysim import io, report, scene
+from skysim.camera import Camera as CameraPart
 from skysim.detector import saturation_dn
 from skysim.scene import CATALOGUES
 from skysim.simulate import calibration
@@ -36,7 +37,7 @@ class Solver:
     """
 
     fov_deg: float | None
-    camera: scene.Camera | None
+    camera: CameraPart | None
     stars: catalog.StarList
     settings: Settings
     time_utc: datetime.datetime | None = None
@@ -120,7 +121,7 @@ def solve(path: Path, solver: Solver, annotated: Path | None) -> dict[str, Any]:
     return answer
 
 
-def check(path: Path, image: NDArray, camera: scene.Camera | None) -> None:
+def check(path: Path, image: NDArray, camera: CameraPart | None) -> None:
     """A known camera makes frames of one size, one channel and one depth; anything else is another's."""
     if camera is None:
         return

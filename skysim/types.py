@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -38,6 +38,15 @@ class Trajectory:
     t_s: Floats
     lab_from_body: Rotation
     rate_body_rad_s: Floats
+    hermite_rad: Floats = field(init=False, repr=False)  # (N - 1, 3, 3) see `at`, worked out once
+
+    def __post_init__(self) -> None:
+        turn = (self.lab_from_body[:-1].inv() * self.lab_from_body[1:]).as_rotvec()
+        step = np.diff(self.t_s)[:, None]
+        begin, end = self.rate_body_rad_s[:-1] * step, self.rate_body_rad_s[1:] * step
+        # d(rotvec)/dt = omega + rotvec x omega / 2 + ...: the body rate seen from the sample before.
+        end = end + np.cross(turn, end) / 2
+        object.__setattr__(self, "hermite_rad", np.stack([turn, begin, end], axis=1))
 
     def at(self, t_s: float | Floats) -> Rotation:
         """lab_from_body at any time inside the history.
@@ -50,16 +59,12 @@ class Trajectory:
             raise ValueError(
                 f"time {t.min():.6f}..{t.max():.6f} s is outside {self.t_s[0]}..{self.t_s[-1]} s"
             )
-        k = np.clip(np.searchsorted(self.t_s, t, side="right") - 1, 0, len(self.t_s) - 2)
-        step = self.t_s[k + 1] - self.t_s[k]
-        s = ((t - self.t_s[k]) / step)[:, None]
-        turn = (self.lab_from_body[k].inv() * self.lab_from_body[k + 1]).as_rotvec()
-        begin = self.rate_body_rad_s[k] * step[:, None]
-        # d(rotvec)/dt = omega + rotvec x omega / 2 + ...: the body rate seen from the sample before.
-        end = self.rate_body_rad_s[k + 1] * step[:, None]
-        end = end + np.cross(turn, end) / 2
-        phi = turn * s**2 * (3 - 2 * s) + begin * s * (1 - s) ** 2 - end * s**2 * (1 - s)
-        here = self.lab_from_body[k] * Rotation.from_rotvec(phi)
+        k = np.minimum(np.maximum(np.searchsorted(self.t_s, t, side="right") - 1, 0), len(self.t_s) - 2)
+        s = (t - self.t_s[k]) / (self.t_s[k + 1] - self.t_s[k])
+        basis = np.stack([s**2 * (3 - 2 * s), s * (1 - s) ** 2, -(s**2) * (1 - s)], axis=1)
+        here = self.lab_from_body[k] * Rotation.from_rotvec(
+            np.einsum("ni,nij->nj", basis, self.hermite_rad[k])
+        )
         return here if np.ndim(t_s) else here[0]
 
     def rate_at(self, t_s: float) -> Floats:
@@ -75,8 +80,9 @@ class Sources:
     place      : (N, 4) homogeneous: (direction, 0) for a star at infinity, (x, y, z in m, 1) for an LED
     normal     : (N, 3) unit normal of the emitting disc; zeros for a star
     radius_m   : (N,) radius of the emitting disc; 0 for a star
-    strength   : (N,) star: photons s^-1 m^-2 at the aperture; LED: photons s^-1 sr^-1 along its normal
-    lobe       : (N,) exponent m of the emission lobe cos^m (1 is Lambert's law)
+    strength   : (N,) in photo-electrons, that is photons weighed with the chip's quantum efficiency at each
+                 wavelength: star: e- s^-1 m^-2 at the aperture; LED: e- s^-1 sr^-1 along its normal. How it falls
+                 off with angle and distance is the dome's (`led.Emitter`)
     period_s, start_s, on_s : (N,) pulse train: lit from start_s for on_s in every period_s
     magnitude  : (N,) V magnitude of a star; NaN for an LED
     """
@@ -86,7 +92,6 @@ class Sources:
     normal: Floats
     radius_m: Floats
     strength: Floats
-    lobe: Floats
     period_s: Floats
     start_s: Floats
     on_s: Floats
@@ -107,9 +112,13 @@ class Seen:
     id           : (N,)
     xy_px        : (N, 2) pixel at mid-exposure
     flux_xy_px   : (N, 2) flux-weighted mean pixel over the exposure
-    electrons    : (N,) mean photo-electrons collected in the frame
+    electrons    : (N,) mean photo-electrons that fell on the chip
     peak_e       : (N,) mean electrons in the source's brightest pixel
     streak_px    : (N,) path length over the exposure
+    area_px      : (N,) noise-equivalent area (sum s)^2 / sum s^2 of its image
+    peak_xy      : (N, 2) the brightest pixel
+    saturated    : (N,) whether that pixel is expected full
+    snr          : (N,) signal to noise of its electrons over that area
     """
 
     id: NDArray[np.int64]
@@ -118,6 +127,10 @@ class Seen:
     electrons: Floats
     peak_e: Floats
     streak_px: Floats
+    area_px: Floats
+    peak_xy: NDArray[np.int64]
+    saturated: NDArray[np.bool_]
+    snr: Floats
 
 
 @dataclass(frozen=True, slots=True)

@@ -74,7 +74,7 @@ def explain(
     """One line for the first fault: `led.falloff: 'cubic' is none of … (scenes/x.yaml, line 31)`."""
     # A key that is unknown explains one that is missing, so what is missing waits.
     first = min(error.errors(), key=lambda fault: fault["type"] == "missing")
-    keys = [str(key) for key in in_tree(first["loc"], tree)]
+    keys = [str(key) for key in in_tree(first["loc"], tree, first["type"] == "missing")]
     message = re.sub(r"^(Value error, |\w+ should )", "", first["msg"])
     if first["type"] == "extra_forbidden":
         message = "unknown key" + hint(keys[-1], allowed_keys(model, first["loc"][:-1]))
@@ -93,16 +93,23 @@ def explain(
     elif not first["type"].startswith("value_error"):
         message = f"{first['input']!r} is not allowed; it should {message}"
     dotted = ".".join(keys)
-    place = "--set" if any(k == dotted or dotted.startswith(k + ".") for k in overrides) else str(path)
-    line = line_of(text, keys) if place != "--set" else None
-    return f"{dotted + ': ' if dotted else ''}{message} ({place}{f', line {line}' if line else ''})"
+    return f"{dotted + ': ' if dotted else ''}{message} {place_of(keys, text, path, overrides)}"
 
 
-def in_tree(loc: tuple[int | str, ...], tree: Any) -> list[int | str]:
-    """The location without pydantic's own words for the branches of a union."""
+def place_of(keys: list[str], text: str, path: Path, overrides: Mapping[str, str]) -> str:
+    """Where a key was given: `(scenes/x.yaml, line 31)` or `(--set)`."""
+    dotted = ".".join(keys)
+    if any(k == dotted or dotted.startswith(k + ".") for k in overrides):
+        return "(--set)"
+    line = line_of(text, keys)
+    return f"({path}{f', line {line}' if line else ''})"
+
+
+def in_tree(loc: tuple[int | str, ...], tree: Any, missing: bool) -> list[int | str]:
+    """The location without pydantic's own words for the branches of a union; its last key may be missing."""
     keys: list[int | str] = []
     for n, key in enumerate(loc):
-        last = n == len(loc) - 1
+        last = missing and n == len(loc) - 1
         if isinstance(tree, dict) and (key in tree or last):
             keys.append(key)
             tree = tree.get(key)
@@ -119,6 +126,7 @@ def allowed_keys(model: type[BaseModel], loc: tuple[int | str, ...]) -> list[str
     for key in loc:
         node = resolve(node, schema)
         options = [resolve(option, schema) for option in node.get("anyOf", []) + node.get("oneOf", [])]
+        options += [resolve(option, schema) for one in options for option in one.get("oneOf", [])]
         if key in node.get("properties", {}):
             node = node["properties"][key]
         elif isinstance(key, int):

@@ -199,6 +199,27 @@ def test_an_option_overrides_the_scene(skysim: Skysim, tmp_path: Path) -> None:
             "light.catalogue: 'nosuch' is none of hipparcos_hp6.5",
         ),
         (["shefex2", "--set", "vehicle.model=nosuch.xml"], "nosuch.xml: no such file"),
+        (
+            ["shefex2", "--set", "camera.preset=nosuch"],
+            "camera.preset: 'nosuch' is none of aps, ec655, lu205c, wat902h2",
+        ),
+        (["shefex2", "--set", "camera.psf={kind: gauss}"], "camera.psf.kind: 'gauss' is none of gaussian, "),
+        (
+            ["shefex2", "--set", "camera.psf={kind: measured, file: nosuch.csv}"],
+            "nosuch.csv",
+        ),
+        (
+            ["shefex2", "--set", "camera.detector.quantum_efficiency=nosuch.csv"],
+            "'nosuch.csv' is none of cmos",
+        ),
+        (
+            ["shefex2", "--set", "background=[{kind: aurora}]"],
+            "background.0.kind: 'aurora' is none of uniform, ",
+        ),
+        (
+            ["shefex2", "--set", "motion.jitter=[{kind: line, frequency_hz: 1e9, rms_arcsec: [1, 1, 1]}]"],
+            "motion.jitter: 1e+09 Hz over ",
+        ),
         (["shefex2", "--set", "seed"], "--set seed: allowed: path.to.key=value"),
         (["shefex2", "--set", "seed=["], "--set seed: '[' is not YAML"),
         (["shefex2", "--frames", "0"], "exposure.frames: 0 is not allowed"),
@@ -361,7 +382,7 @@ def test_a_wrong_option_of_solve_is_one_line(
 
 def test_a_camera_file_with_a_slip_is_one_line(skysim: Skysim, rendered: Path, tmp_path: Path) -> None:
     camera = tmp_path / "camera.yaml"
-    camera.write_text(SHEFEX.read_text().replace('pixel: "9.9 um"', "pixel: 9.9"))
+    camera.write_text(SHEFEX.read_text().replace('focal_length: "25 mm"', "focal_length: 25"))
     said = skysim("solve", rendered / "frame_0000.fits", "--camera", camera).one_line()
-    assert "camera.pixel: 9.9 has no unit" in said
+    assert "camera.focal_length: 25 has no unit" in said
     assert f"({camera}, line " in said

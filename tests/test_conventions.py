@@ -9,10 +9,23 @@ from estimator.attitude import radecroll_rad
 from estimator.camera import Camera
 from skysim import scene, world
 from skysim.optics import Optics
+from skysim.render import Window, render
 from skysim.sky import cam_from_icrs
+from skysim.types import Mount, Sources, Trajectory
 
 # A pinhole whose arithmetic can be done in the head: f = 1000 px, middle of the chip at (320, 240).
-OPTICS = Optics(641, 481, 1000.0, (320.0, 240.0), (0.0,) * 5, 0.7, 0.0, 1.0)
+OPTICS = Optics.of(
+    scene.Camera.model_validate(
+        {
+            "width_px": 641,
+            "height_px": 481,
+            "pixel": "10 um",
+            "focal_length": "10 mm",
+            "f_number": 2,
+            "detector": {"quantum_efficiency": 0.5, "full_well_e": 40000, "gain_e_dn": 10, "bits": 12},
+        }
+    )
+)
 BELIEVED = Camera(641, 481, 1000.0, (320.0, 240.0))
 EXACT = 1e-12  # double precision on numbers of order one
 
@@ -46,12 +59,16 @@ def test_pixel_zero_is_the_middle_of_the_first_pixel():
 
 
 def test_arrays_are_indexed_row_first():
-    """A light at pixel (x, y) = (7, 3) brightens image[3, 7]."""
-    from skysim.render import splat
-
-    image = np.zeros((10, 12))
-    splat(image, np.array([[[7.0, 3.0]]]), np.array([[100.0]]), np.zeros(1), np.full(1, 0.3))
+    """A light 313 px left of the boresight and 237 px above it is at (x, y) = (7, 3) and brightens image[3, 7]."""
+    image = np.zeros((481, 641))
+    still = Trajectory(np.array([0.0, 1.0]), Rotation.identity(2), np.zeros((2, 3)))
+    one, star = np.ones(1), np.array([[-0.313, -0.237, 1.0, 0.0]])
+    place = star / np.linalg.norm(star)
+    light = Sources(np.array([7]), place, np.zeros((1, 3)), 0 * one, 1e9 * one, one, 0 * one, one, 0 * one)
+    seen = render(image, light, OPTICS, still, Mount(np.zeros(3), Rotation.identity()), Window(0.0, 1.0))
+    np.testing.assert_allclose(seen.xy_px, [[7.0, 3.0]], rtol=0, atol=1e-9)
     assert np.unravel_index(image.argmax(), image.shape) == (3, 7)
+    assert seen.peak_xy.tolist() == [[7, 3]]
 
 
 def test_camera_axes_for_a_camera_at_the_origin_of_right_ascension():

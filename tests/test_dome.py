@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from skysim import dome, scene
 from skysim.dome import Ellipsoid, Plane
-from skysim.photometry import led_strength_ph_s_sr
+from skysim.photometry import Band, led_strength_e_s_sr
 from skysim.types import BadInput, Sources
 
 INCH_M = 0.0254
@@ -18,6 +18,7 @@ MEASURED = {"kind": "ellipsoid", "apex": "48 in", "semi_axes": ["38.88 in", "38.
 SPHERE = {"kind": "sphere", "apex": "48 in", "radius": "45 in", "offset": ["1 in", "-2 in", "0.5 in"]}
 BOARDS = {"kind": "patch_boards", "cap_deg": 27, "spacing": "2.6 in", "pitch": "8 mm", "lit": [3, 6]}
 LED = {"intensity": "16 mcd", "disc_diameter": "2 mm", "pwm_period": "1 ms"}
+BAND = Band.of("cmos")
 
 
 def surface(part: dict[str, Any]) -> Any:
@@ -26,7 +27,7 @@ def surface(part: dict[str, Any]) -> Any:
 
 def lit_dome(surface: dict[str, Any] = MEASURED, led: dict[str, Any] = LED, **boards: Any) -> Sources:
     light = {"kind": "dome", "surface": surface, "layout": BOARDS | boards, "led": led}
-    return dome.sources(scene.Dome.model_validate(light))
+    return dome.sources(scene.Dome.model_validate(light), BAND)
 
 
 @pytest.fixture(scope="module")
@@ -212,14 +213,84 @@ def test_boards_are_as_many_in_equal_areas() -> None:
     np.testing.assert_array_equal(counts, 100)
 
 
-def test_intensities_scatter_by_as_much_as_declared(afit: Sources) -> None:
-    logs = np.log(afit.strength / led_strength_ph_s_sr(16e-3))
-    n = len(afit)
-    assert logs.std() == pytest.approx(
-        0.08, abs=4 * 0.08 / np.sqrt(2 * n)
-    )  # four sigma of a standard deviation
-    assert abs(logs.mean()) < 4 * 0.08 / np.sqrt(n)
-    np.testing.assert_array_equal(lit_dome().strength, led_strength_ph_s_sr(16e-3))
+def logs(leds: Sources) -> np.ndarray:
+    """Each LED's brightness against the declared one, its logarithm."""
+    return np.asarray(np.log(leds.strength / led_strength_e_s_sr(16e-3, "white", BAND)))
+
+
+@pytest.mark.parametrize("scatter", [0.07, 0.09])
+def test_intensities_scatter_by_as_much_as_declared(scatter: float) -> None:
+    """Lognormal, as AFIT's Table 2 (reference A8: 7-9 %): moments of the logarithm to four of their sigmas."""
+    drawn = logs(lit_dome(led=LED | {"scatter": scatter}, lit=[9, 9], spacing="1.5 in")) / scatter
+    n = len(drawn)
+    assert n > 4000
+    assert drawn.std() == pytest.approx(1, abs=4 / np.sqrt(2 * n))
+    assert abs(drawn.mean()) < 4 / np.sqrt(n)
+    assert abs(np.mean(drawn**3)) < 4 * np.sqrt(15 / n)
+    assert np.mean(drawn**4) == pytest.approx(3, abs=4 * np.sqrt(96 / n))
+
+
+def test_without_scatter_all_leds_are_equal() -> None:
+    np.testing.assert_array_equal(logs(lit_dome()), 0)
+
+
+def test_neighbours_scatter_on_their_own() -> None:
+    drawn = logs(lit_dome(led=LED | {"scatter": 0.08}, lit=[9, 9], spacing="1.5 in")) / 0.08
+    assert abs(np.mean(drawn[1:] * drawn[:-1])) < 4 / np.sqrt(len(drawn))
+
+
+def test_brightness_belongs_to_the_hardware_and_not_to_the_run() -> None:
+    """The scene's own seed changes nothing, nor does what others draw; the hardware's seed changes all."""
+    built = scene.load("afit_simsat").light
+    rerun = scene.load("afit_simsat", {"seed": "99"}).light
+    first = dome.sources(built, BAND)
+    np.random.default_rng(99).standard_normal(1000)
+    np.testing.assert_array_equal(first.strength, dome.sources(rerun, BAND).strength)
+    rebuilt = scene.load("afit_simsat", {"light.layout.hardware_seed": "7"}).light
+    assert not np.isin(dome.sources(rebuilt, BAND).strength, first.strength).any()
+
+
+# AFIT thesis, Table 2: nine equal LEDs, ranked by brightness in each of 250 images, mean of each rank.
+TABLE_2 = [132.67, 119.61, 115.58, 112.92, 110.17, 108.30, 106.05, 103.61, 100.05]
+
+
+def ranked(scatter: float) -> np.ndarray:
+    """(boards, 9) brightness of full boards from brightest to dimmest, each board's mean 1."""
+    leds = lit_dome(led=LED | {"scatter": scatter}, lit=[9, 9], spacing="1.5 in")
+    boards = leds.strength.reshape(-1, 9)
+    return np.sort(boards / boards.mean(axis=1, keepdims=True), axis=1)[:, ::-1]
+
+
+def test_nine_per_cent_ranks_as_normal_order_statistics() -> None:
+    """Reference A8: Normal order statistics of mean 112, sd 10. Expected ones of nine: 1.485, .932, .572, .275, 0."""
+    upper = np.array([1.485, 0.932, 0.572, 0.275])
+    normal = 1 + 0.09 * np.concatenate([upper, [0], -upper[::-1]])
+    # A lognormal's upper end is longer: by half the square of 1.485 x .09, .009; the mean of 500 boards adds .009.
+    np.testing.assert_allclose(ranked(0.09).mean(axis=0), normal, rtol=0, atol=0.015)
+
+
+def likelihood(boards: np.ndarray) -> float:
+    """How probable Table 2 is among boards, by the standard deviation of its nine values: log density, Normal."""
+    spread, seen = np.log(boards.std(axis=1)), np.log(np.std(TABLE_2) / np.mean(TABLE_2))
+    return float(-((seen - spread.mean()) ** 2) / (2 * spread.var()))
+
+
+def test_table_2_is_a_board_of_nine_per_cent_and_not_of_three_or_thirty() -> None:
+    assert likelihood(ranked(0.08)) > -2  # within two sigma
+    assert likelihood(ranked(0.09)) > -2
+    assert likelihood(ranked(0.03)) < -4.5  # beyond three
+    assert likelihood(ranked(0.30)) < -4.5
+    # Rank by rank within what 99 % of the boards show.
+    low, high = np.percentile(ranked(0.09), [0.5, 99.5], axis=0)
+    seen = np.array(TABLE_2) / np.mean(TABLE_2)
+    assert np.all((seen > low) & (seen < high))
+
+
+def test_strength_is_in_the_chip_s_own_electrons() -> None:
+    light = {"kind": "dome", "surface": MEASURED, "layout": BOARDS, "led": LED | {"spectrum": "640 nm"}}
+    red = dome.sources(scene.Dome.model_validate(light), Band.of(0.5)).strength
+    # By hand: 16 mcd of V(640 nm) = .175 in photons of 3.1038e-19 J, half of them electrons.
+    np.testing.assert_allclose(red, 0.016 / (683 * 0.175) / 3.1038e-19 * 0.5, rtol=1e-4, atol=0)
 
 
 def test_pulses_have_the_levels_of_the_scene_and_random_phases(afit: Sources) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import datetime
 import json
 import warnings
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -122,8 +123,12 @@ def test_truth_comes_back(sky: Shot, written: Path) -> None:
         "electrons": seen.electrons,
         "peak_e": seen.peak_e,
         "streak_px": seen.streak_px,
+        "area_px": seen.area_px,
+        "snr": seen.snr,
     }
-    assert set(table.colnames) == {"id", *columns}
+    assert set(table.colnames) == {"id", "saturated", *columns}
+    assert table["saturated"].dtype == bool
+    np.testing.assert_array_equal(table["saturated"], seen.saturated)
     for name, values in columns.items():
         np.testing.assert_allclose(table[name], values, rtol=1e-8, atol=0)  # nine digits are written
     back = Rotation.from_quat(table.meta["cam_from_lab_xyzw"])
@@ -132,6 +137,15 @@ def test_truth_comes_back(sky: Shot, written: Path) -> None:
     assert (back * truth.lab_from_body.inv()).magnitude() < 1e-15
     np.testing.assert_array_equal(table.meta["rate_cam_rad_s"], truth.rate_cam_rad_s)
     assert (table.meta["scene"], table.meta["seed"], table.meta["t_mid_s"]) == ("shefex2", 2, truth.t_s)
+
+
+def test_which_sources_are_saturated_comes_back(sky: Shot, tmp_path: Path) -> None:
+    loaded, frame, truth = sky
+    every_third = np.arange(len(truth.seen.id)) % 3 == 0
+    truth = replace(truth, seen=replace(truth.seen, saturated=every_third))
+    io.write_truth(tmp_path / "truth.ecsv", frame, truth, loaded)
+    table = Table.read(tmp_path / "truth.ecsv", format="ascii.ecsv")
+    np.testing.assert_array_equal(table["saturated"], every_third)
 
 
 def test_a_shorter_run_leaves_no_frames_of_a_longer_one(tmp_path: Path, sky: Shot) -> None:
@@ -152,8 +166,9 @@ def test_a_shorter_run_leaves_no_frames_of_a_longer_one(tmp_path: Path, sky: Sho
         {"motion__start": "{ra_deg: 0.01, dec_deg: -60, roll_deg: -130}"},
         {"motion__start": "{ra_deg: 200, dec_deg: 88, roll_deg: 10}"},
         {"camera__principal_point_px": "[100, 400]"},
+        {"camera__focus": "10 m"},
     ],
-    ids=["orion", "through RA 0", "near the pole", "off-centre lens"],
+    ids=["orion", "through RA 0", "near the pole", "off-centre lens", "focused nearby"],
 )
 @pytest.mark.filterwarnings("ignore:.*datfix")
 def test_astropy_puts_the_true_stars_on_their_true_pixels(tmp_path: Path, pointing: dict[str, str]) -> None:

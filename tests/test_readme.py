@@ -1,14 +1,19 @@
 """Every code block of the README runs, in its order, in one folder."""
 
+import json
 import re
 import shlex
 import subprocess
 import sys
 from pathlib import Path
+from typing import get_args
 
 import pytest
+import yaml
 
-from skysim import BadInput
+from skysim import BadInput, camera
+from skysim.optics import VIGNETTING
+from skysim.psf import PSFS
 from skysim.scene import ROOT, load
 
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -45,6 +50,37 @@ def test_the_commands_leave_what_the_readme_says(folder):
     # `render` came after `run` and cleared what the latter said of other frames.
     rendered = {path.name for path in (folder / "out" / "shefex2").iterdir()}
     assert rendered == {"frame_0000.fits", "frame_0000.png", "frame_0000.ecsv"}
+
+
+def test_the_camera_block_is_a_camera_that_sees(folder):
+    """The block's lines in a copy of the scene that the text names, flown for two frames by the real command."""
+    (block,) = blocks("yaml")
+    tree = yaml.safe_load((ROOT / "scenes/afit_simsat.yaml").read_text(encoding="utf-8"))
+    mine = yaml.safe_load(block)
+    assert set(mine) == {"camera", "background", "motion"}
+    assert not set(mine["motion"]) & set(tree["motion"])
+    path = folder / "mine.yaml"
+    path.write_text(
+        yaml.safe_dump(tree | mine | {"motion": tree["motion"] | mine["motion"]}, sort_keys=False)
+    )
+    command = [*SKYSIM, "run", str(path), "--frames", "2", "--json"]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    told = json.loads(done.stdout)
+    assert (told["frames"], told["solved"], told["wrong"]) == (2, 2, 0)
+
+
+def test_every_kind_that_the_camera_block_names_is_one():
+    """`# or ...` beside a kind lists the others, all of them."""
+    (block,) = blocks("yaml")
+    rest = re.findall(r"(\w+): \{kind: (\w+)[^#]*# or ([\w, ]+)", block)
+    told = {section: {kind, *others.split(", ")} for section, kind, others in rest}
+    shutters = get_args(get_args(camera.Shutter)[0])
+    assert told == {
+        "vignetting": set(VIGNETTING),
+        "psf": set(PSFS),
+        "shutter": {get_args(part.model_fields["kind"].annotation)[0] for part in shutters},
+    }
 
 
 def test_the_python_block_solves_the_frame(folder):

@@ -3,12 +3,22 @@
 from __future__ import annotations
 
 import datetime
+import math
+import re
 from pathlib import Path
+from typing import get_args
 
 import pytest
 from pydantic import ValidationError
 
-from skysim import scene
+from skysim import camera, scene
+from skysim.background import BACKGROUNDS
+from skysim.dome import LAYOUTS, SURFACES
+from skysim.jitter import SPECTRA
+from skysim.led import LOBES
+from skysim.optics import VIGNETTING
+from skysim.psf import PSFS
+from skysim.quantity import SI_SUFFIX
 from skysim.types import BadInput
 
 AFIT, SHEFEX = scene.SCENES / "afit_simsat.yaml", scene.SCENES / "shefex2.yaml"
@@ -50,6 +60,8 @@ def spoilt(tmp_path: Path, whole: Path, right: str, wrong: str) -> tuple[str, st
         ("light.surface.apex", "1.2192 m", 1.2192),
         ("camera.pixel", "4.0 um", 4e-6),
         ("camera.focal_length", "35 mm", 0.035),
+        ("camera.focus", "33 in", 0.8382),
+        ("camera.focus", "infinity", math.inf),
         ("exposure.time", "10 ms", 0.010),
         ("exposure.time", "1000 us", 0.001),
         ("exposure.first", "1 min", 60.0),
@@ -61,7 +73,7 @@ def spoilt(tmp_path: Path, whole: Path, right: str, wrong: str) -> tuple[str, st
 def test_a_quantity_becomes_si(key: str, quantity: str, value: float) -> None:
     node: object = scene.load("afit_simsat", {key: quantity})
     for part in key.split("."):
-        (name,) = [n for n in type(node).model_fields if scene.SI_SUFFIX.sub("", n) == part]
+        (name,) = [n for n in type(node).model_fields if SI_SUFFIX.sub("", n) == part]
         node = getattr(node, name)
     assert node == pytest.approx(value, rel=1e-5)  # a pound is 0.45359 kg
 
@@ -74,7 +86,9 @@ def test_afit_says_what_the_thesis_says() -> None:
     assert loaded.light.layout.pitch_m == pytest.approx(0.008, abs=1e-15)
     assert loaded.vehicle.tilt_stop_deg == 30
     assert (loaded.camera.width_px, loaded.camera.height_px) == (1600, 1200)
-    assert loaded.camera.focal_px == pytest.approx(0.035 / 4e-6, rel=1e-12)
+    # Focused at 33 in: the chip is 36.53 mm from the lens (§1.2).
+    assert loaded.camera.focal_px == pytest.approx(1 / (1 / 0.035 - 1 / 0.8382) / 4e-6, rel=1e-12)
+    assert loaded.camera.image_distance_m == pytest.approx(36.53e-3, abs=5e-6)
     assert (loaded.name, loaded.seed) == ("afit_simsat", 1)
     assert loaded.start_time == datetime.datetime(2012, 3, 1, 12)
 
@@ -148,7 +162,6 @@ def test_a_bad_override_is_one_line_and_blamed_on_the_option(key: str, value: st
     ("right", "wrong", "says"),
     [
         ("falloff: inverse_square", "falloff: cubic", "light.led.falloff: 'cubic' is none of inverse_square"),
-        ("kind: gaussian", "kind: airy", "camera.psf.kind: 'airy' is none of gaussian, disc"),
         ("  kind: dome", "  kind: domes", "light.kind: 'domes' is none of dome, stars"),
         (
             "kind: ellipsoid",
@@ -199,13 +212,13 @@ def test_a_bad_override_is_one_line_and_blamed_on_the_option(key: str, value: st
         ('time: "10 ms"', 'time: "1e400 ms"', "exposure.time: inf is not a finite number"),
         ("f_number: 8", "f_number: .nan", "camera.f_number: nan is not a finite number"),
         (
-            "width_px: 1600",
-            "width_px: 1600.5",
+            "preset: lu205c",
+            "width_px: 1600.5\n  preset: lu205c",
             "camera.width_px: 1600.5 is not allowed; it should be a valid integer",
         ),
         (
-            "bits: 12",
-            "bits: 17",
+            "preset: lu205c",
+            "detector: {bits: 17}\n  preset: lu205c",
             "camera.detector.bits: 17 is not allowed; it should be less than or equal to 16",
         ),
         ("lit: [3, 6]", "lit: [3, 12]", "allowed: 1 <= least <= most <= 9"),
@@ -283,6 +296,146 @@ def test_a_dome_cannot_start_at_a_place_in_the_sky(tmp_path: Path) -> None:
     assert message == f"motion.start: light of kind dome takes roll_deg, pitch_deg, yaw_deg {place}"
 
 
+# Unions: of each the allowed kinds, as a wrong one is answered
+
+UNIONS = [
+    ("kind: gaussian", "kind: gauss", "camera.psf.kind", "gaussian, moffat, airy, disc, measured"),
+    ("kind: global", "kind: shut", "camera.shutter.kind", "global, rolling, frame_transfer, interline"),
+    (
+        "transmission: 0.85",
+        "vignetting: {kind: cos4}\n  transmission: 0.85",
+        "camera.vignetting.kind",
+        "two_stops, table",
+    ),
+    ("kind: cosine", "kind: square", "light.led.lobe.kind", "cosine, table"),
+    (
+        "exposure: {",
+        "background: [{kind: uniform, e_s: 3}, {kind: aurora}]\nexposure: {",
+        "background.1.kind",
+        "uniform, sky, moon, stray",
+    ),
+    ("control: pid", "jitter: [{kind: white}]\n  control: pid", "motion.jitter.0.kind", "line, band"),
+    (
+        "preset: lu205c",
+        "preset: lu206c",
+        "camera.preset",
+        "aps, ec655, lu205c, wat902h2",
+    ),
+]
+
+
+@pytest.mark.parametrize(("right", "wrong", "key", "allowed"), UNIONS)
+def test_a_kind_that_is_none_is_answered_with_those_that_are(
+    tmp_path: Path, right: str, wrong: str, key: str, allowed: str
+) -> None:
+    message, place = spoilt(tmp_path, AFIT, right, wrong)
+    assert re.fullmatch(rf"{re.escape(key)}: '\w+' is none of {allowed} {re.escape(place)}", message)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "says"),
+    [
+        ("camera.psf", "{kind: moffat}", "camera.psf.fwhm_px: missing"),
+        ("camera.psf", "{kind: disc, radius_px: 0}", "camera.psf.radius_px: 0 is not allowed"),
+        ("camera.psf", "{sigma_px: 0.5, fwhm_px: 2}", "camera.psf: kind is missing"),
+        ("camera.psf", "{kind: airy, wavelength: 550}", "camera.psf.wavelength: 550 has no unit"),
+        ("camera.shutter", "{kind: frame_transfer}", "camera.shutter.row_time: missing"),
+        ("camera.shutter", "{kind: global, row_time: '3 us'}", "camera.shutter.row_time: unknown key"),
+        ("camera.vignetting", "{kind: two_stops, cutoff_deg: 90}", "camera.vignetting.cutoff_deg: 90 is not"),
+        (
+            "camera.vignetting",
+            "{kind: two_stops, cutof_deg: 9}",
+            "camera.vignetting.cutof_deg: unknown key; did you mean cutoff_deg?",
+        ),
+        (
+            "camera.vignetting",
+            "{kind: table, angle_deg: [0, 5, 5], transmission: [1, 1, 1]}",
+            "camera.vignetting: angle_deg does not ascend",
+        ),
+        (
+            "light.led.lobe",
+            "{kind: table, angle_deg: [0, 5, 9], intensity: [1, 1]}",
+            "light.led.lobe: angle_deg has 3 numbers, intensity 2",
+        ),
+        (
+            "motion.jitter",
+            "[{kind: band, from_hz: 9, to_hz: 3, rms_arcsec: [1, 1, 1]}]",
+            "is not below to_hz 3",
+        ),
+        (
+            "background",
+            "[{kind: sky, mag_arcsec: 20}]",
+            "background.0.mag_arcsec: unknown key; did you mean mag",
+        ),
+        (
+            "camera.detector.particles",
+            "[{per_cm2_s: -1}]",
+            "camera.detector.particles.0.per_cm2_s: -1 is not",
+        ),
+        ("camera.detector.quantum_efficiency", "ccd", "'ccd' is none of cmos, interline, thick_ccd"),
+        ("camera.detector.offset_dn", "1024", "offset_dn 1024 is beyond a converter of 10 bits"),
+    ],
+)
+def test_a_slip_within_a_kind_is_told_of_that_kind_alone(key: str, value: str, says: str) -> None:
+    message = complaint(AFIT, {key: value})
+    assert says in message
+    assert "tagged-union" not in message
+
+
+# The camera: preset and focus
+
+
+def test_what_the_scene_says_stands_above_its_camera_s_preset(tmp_path: Path) -> None:
+    """Keys of a section are merged; a section of another kind replaces the preset's."""
+    path = tmp_path / "mine.yaml"
+    path.write_text(
+        SHEFEX.read_text().replace(
+            "preset: ec655",
+            "preset: ec655\n  width_px: 640\n  detector: {read_noise_e: 9}\n  shutter: {kind: global}",
+        )
+    )
+    plain, mine = scene.load("shefex2").camera, scene.load(path).camera
+    assert (mine.width_px, mine.detector.read_noise_e, mine.shutter.kind) == (640, 9.0, "global")
+    assert (plain.width_px, plain.detector.read_noise_e, plain.shutter.kind) == (659, 14.7, "interline")
+    changed = {"width_px": 640, "shutter": mine.shutter, "detector": mine.detector}
+    assert mine == plain.model_copy(update=changed)
+    assert mine.detector == plain.detector.model_copy(update={"read_noise_e": 9.0})
+    assert scene.load_camera(path) == mine
+
+
+def test_an_override_stands_above_the_preset() -> None:
+    assert scene.load("shefex2", {"camera.detector.bits": "8"}).camera.detector.bits == 8
+    other = scene.load("shefex2", {"camera.preset": "aps"}).camera
+    assert (other.width_px, other.shutter.kind, other.focal_length_m) == (1024, "rolling", 0.025)
+
+
+def test_a_lens_is_focused_at_infinity_unless_told_otherwise() -> None:
+    lens = scene.load("shefex2").camera
+    assert lens.focus_m == math.inf
+    assert lens.image_distance_m == pytest.approx(0.025, rel=1e-15)
+
+
+@pytest.mark.parametrize("focus", ["70 mm", "35 mm", "1 um"])
+def test_a_focus_nearer_than_twice_the_focal_length_is_refused(tmp_path: Path, focus: str) -> None:
+    """There the image would be greater than the object; at the focal length there is none at all."""
+    message, _ = spoilt(tmp_path, AFIT, 'focus: "33 in"', f'focus: "{focus}"')
+    assert re.match(r"camera: focus \S+ m is nearer than twice the focal length 0.035 m \(", message)
+
+
+@pytest.mark.parametrize(
+    ("focus", "says"),
+    [
+        ("0 m", "camera.focus: '0 m' is not allowed; it should be greater than 0"),
+        ("-33 in", "camera.focus: '-33 in' is not allowed; it should be greater than 0"),
+        ("nan m", "camera.focus: 'nan m' is not allowed"),
+        ("far", "camera.focus: 'far' is not a length; allowed: a length such as \"33 in\", or infinity"),
+        ("33", 'camera.focus: 33 has no unit; allowed: a length such as "33 in", or infinity'),
+    ],
+)
+def test_a_focus_that_is_no_distance_is_refused(focus: str, says: str) -> None:
+    assert says in complaint(AFIT, {"camera.focus": focus})
+
+
 def test_a_missing_key_is_named_with_its_section_s_line(tmp_path: Path) -> None:
     message, _ = spoilt(tmp_path, AFIT, '    apex: "48 in"\n', "")
     line = line_number(AFIT.read_text(), "surface:")
@@ -345,11 +498,19 @@ def test_a_camera_file_without_a_camera_is_one_line(tmp_path: Path) -> None:
         scene.load_camera(path)
 
 
-def test_every_algorithm_that_the_schema_names_exists() -> None:
-    from skysim.dome import LAYOUTS, SURFACES
+def kinds(union: object) -> set[str]:
+    """The kinds of a discriminated union."""
+    return {get_args(part.model_fields["kind"].annotation)[0] for part in get_args(get_args(union)[0])}
 
+
+def test_every_algorithm_that_the_schema_names_exists() -> None:
     assert set(scene.Surface.model_fields["kind"].annotation.__args__) == set(SURFACES)
     assert set(scene.PatchBoards.model_fields["kind"].annotation.__args__) == set(LAYOUTS)
+    assert kinds(camera.Psf) == set(PSFS)
+    assert kinds(get_args(camera.Camera.model_fields["vignetting"].annotation)[0]) == set(VIGNETTING)
+    assert kinds(scene.Lobe) == set(LOBES)
+    assert kinds(scene.Glow) == set(BACKGROUNDS)
+    assert kinds(scene.Jitter) == set(SPECTRA)
 
 
 def test_a_key_that_stands_twice_is_refused(tmp_path):

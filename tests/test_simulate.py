@@ -7,12 +7,22 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from estimator.types import Attitude, Centroids
-from skysim import scene, simulate
+from skysim import metrics, scene, simulate
+from skysim.optics import Optics
 from skysim.simulate import Lab
 from skysim.types import BadInput, Truth
 
-QUIET_DOME = {
+# Without noise a frame is the expectation in float64; without fixed pattern and with one exposure for all rows, a
+# perfect chip's.
+PERFECT_CHIP = {
+    "camera.shutter": "{kind: global}",
     "camera.detector.noise": "false",
+    "camera.detector.prnu": "0",
+    "camera.detector.dsnu": "0",
+    "camera.detector.hot_pixels": "0",
+    "camera.detector.column_offset_e": "0",
+}
+QUIET_DOME = PERFECT_CHIP | {
     "motion.control": "none",
     "motion.manoeuvre": "[]",
     "vehicle.centre_of_mass": "['0 m', '0 m', '0 m']",  # balanced: it stays where it is put
@@ -20,8 +30,7 @@ QUIET_DOME = {
 }
 # Stars too faint for the catalogue are light in their neighbours' fitting windows (some 10 arcsec of bias), so the
 # bar of 1e-6 deg is for a sky of isolated stars that are all on board.
-QUIET_SKY = {
-    "camera.detector.noise": "false",
+QUIET_SKY = PERFECT_CHIP | {
     "motion.rate_deg_s": "[0, 0, 0]",
     "light.limit_mag": "5",
     "tracker.limit_mag": "5",
@@ -70,7 +79,7 @@ def true_centroids(truth: Truth) -> Centroids:
 def test_a_noise_free_image_gives_the_true_attitude(name: str, start: str) -> None:
     lab = quiet(name, start)
     frame, truth = simulate.shoot(lab, 0)
-    assert frame.image_dn.dtype == np.float64
+    assert frame.image_dn.dtype == np.float64  # neither rounded nor clipped
     assert error_deg(simulate.tracker(lab).solve(frame.image_dn).attitude, truth) < 1e-6
 
 
@@ -88,6 +97,19 @@ def test_true_centroids_under_the_dome_give_the_attitude_to_machine_precision() 
     lab = quiet("afit_simsat", ATTITUDES[1])
     _, truth = simulate.shoot(lab, 0)
     assert error_deg(simulate.tracker(lab).solve_centroids(true_centroids(truth)), truth) < 1e-12
+
+
+@pytest.mark.parametrize("start", POINTINGS)
+def test_uneven_pixels_cost_what_they_move_the_stars(start: str) -> None:
+    """PRNU moves a Gaussian star's centre by prnu / sqrt(8 pi) px, whatever its width, and N stars turn by that
+    over sqrt(sum r^2): from the integral of g^2 x^2, with g the star's profile. Four sigma."""
+    uneven = {"camera.detector.prnu": "0.01", "motion.start": start}
+    lab = simulate.prepare(scene.load("shefex2", QUIET_SKY | uneven))
+    frame, truth = simulate.shoot(lab, 0)
+    from_centre_px = truth.seen.xy_px - lab.scene.camera.centre_px
+    sigma_rad = 0.01 / np.sqrt(8 * np.pi) / np.sqrt(np.sum(from_centre_px**2))
+    error = error_deg(simulate.tracker(lab).solve(frame.image_dn).attitude, truth)
+    assert 1e-6 < error < 4 * np.degrees(sigma_rad)
 
 
 def test_a_distorted_lens_that_the_tracker_knows_costs_nothing() -> None:
@@ -167,8 +189,60 @@ def test_the_camera_rides_fifteen_inches_above_the_bearing() -> None:
 
 
 def test_shutters_open_on_time() -> None:
-    loaded = scene.load("shefex2")
-    assert [simulate.open_s(loaded, k) for k in (0, 1, 39)] == pytest.approx([0.1, 0.2, 4.0], abs=1e-12)
+    windows = [simulate.window(scene.load("shefex2"), k) for k in (0, 1, 39)]
+    assert [when.open_s for when in windows] == pytest.approx([0.1, 0.2, 4.0], abs=1e-12)
+    assert {when.exposure_s for when in windows} == {0.040}
+    assert [when.close_s(493) for when in windows] == pytest.approx([0.14, 0.24, 4.04], abs=1e-12)
+
+
+def test_a_rolling_shutter_s_truth_is_that_of_its_middle_row() -> None:
+    """493 rows, each 80 us after the one above: the last closes 39.36 ms late, the middle one 19.68 ms."""
+    lab = prepared(
+        "shefex2", exposure__frames="1", camera__shutter="{kind: rolling, row_time: '80 us'}", seed="3"
+    )
+    assert simulate.window(lab.scene, 0).close_s(493) == pytest.approx(0.1 + 0.040 + 0.03936, abs=1e-12)
+    frame, truth = simulate.shoot(lab, 0)
+    assert frame.t_mid_s == truth.t_s == pytest.approx(0.1 + 0.020 + 0.01968, abs=1e-12)
+    answer = simulate.tracker(lab).solve(frame.image_dn).attitude
+    assert answer.cam_from_ref is not None
+    cross, roll = np.degrees(metrics.cross_and_roll_rad(answer.cam_from_ref, truth.cam_from_lab)) * 3600
+    # At the first row's time the boresight was 35 arcsec from this.
+    assert cross < 10
+    # Rows shear along x by .4 deg/s x 39.4 ms = .70 px in 493; the best turn takes y^2 / (x^2 + y^2) of a shear, 104
+    # arcsec if stars were spread evenly over 659 x 493.
+    assert abs(roll) == pytest.approx(np.degrees(0.695 / 493 * 493**2 / (493**2 + 659**2)) * 3600, rel=0.3)
+
+
+def test_a_background_is_under_everything_else() -> None:
+    """1000 e-/s of glow for 40 ms at 10 e-/DN: 4 DN more in every pixel, and the same stars on top."""
+    dark, lit = (
+        simulate.shoot(simulate.prepare(scene.load("shefex2", QUIET_SKY | {"background": glow})), 0)
+        for glow in ("[]", "[{kind: uniform, e_s: 1000}]")
+    )
+    np.testing.assert_allclose(lit[0].image_dn - dark[0].image_dn, 4.0, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(lit[1].seen.electrons, dark[1].seen.electrons, rtol=1e-12, atol=0)
+    assert (lit[1].seen.snr < dark[1].seen.snr).all()
+
+
+def test_jitter_shakes_the_camera_by_what_the_scene_says() -> None:
+    """100 arcsec rms about the body's x, at 20 Hz: the path's turns away from the unshaken one have that rms."""
+    line = "[{kind: line, frequency_hz: 20, rms_arcsec: [100, 0, 0]}]"
+    still, shaken = (
+        prepared("shefex2", exposure__frames="11", motion__jitter=j).trajectory for j in ("[]", line)
+    )
+    t_s = np.linspace(0, 1, 2000, endpoint=False)  # twenty whole periods
+    turned = np.degrees((still.at(t_s).inv() * shaken.at(t_s)).as_rotvec()) * 3600
+    np.testing.assert_allclose(np.sqrt(np.mean(turned**2, axis=0)), [100, 0, 0], rtol=1e-3, atol=1e-3)
+
+
+def test_a_chip_s_fixed_pattern_is_its_own_and_not_the_seed_s() -> None:
+    one, same, other = (
+        prepared("shefex2", exposure__frames="1", seed=seed, camera__detector__hardware_seed=chip).chip
+        for seed, chip in (("1", "5"), ("2", "5"), ("1", "6"))
+    )
+    for name in ("sensitivity", "dark_e_s"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(same, name))
+        assert np.mean(getattr(one, name) != getattr(other, name)) > 0.9
 
 
 # Random streams
@@ -210,7 +284,7 @@ def test_a_run_answers_every_frame(shots: list[simulate.Shot]) -> None:
 
 
 def test_a_blinded_frame_is_a_status_and_no_attitude() -> None:
-    lab = prepared("shefex2", exposure__frames="1", camera__detector__sky_e_s="1e8")
+    lab = prepared("shefex2", exposure__frames="1", background="[{kind: uniform, e_s: 1e8}]")
     (shot,) = shots_of(lab)
     assert "saturated" in shot.report.attitude.status
     assert shot.report.attitude.cam_from_ref is None
@@ -244,8 +318,15 @@ def test_a_solver_for_the_other_sky_is_refused(name: str, solver: str) -> None:
 def test_the_believed_camera_is_the_true_one_unless_told_otherwise() -> None:
     loaded = scene.load("shefex2", {"camera.distortion": "[-0.2, 0.1, 0, 0, 0]"})
     believed = simulate.believed_camera(loaded)
-    lens = simulate.Optics.of(loaded.camera)
+    lens = Optics.of(loaded.camera)
     vectors = Rotation.from_rotvec([0.05, -0.08, 0]).apply([[0, 0, 1.0], [0.02, 0, 1.0]])
     np.testing.assert_allclose(believed.pixels(vectors), lens.project(vectors), rtol=0, atol=1e-10)
     longer = simulate.believed_camera(scene.load("shefex2", {"tracker.believed_focal_length": "25.25 mm"}))
-    assert longer.focal_px == pytest.approx(lens.focal_px * 1.01, rel=1e-12)
+    assert longer.focal_px == pytest.approx(believed.focal_px * 1.01, rel=1e-12)
+
+
+def test_a_calibrated_tracker_knows_how_far_the_chip_stands_from_a_focused_lens() -> None:
+    """Reference §1.2: 35 mm at 33 in is 36.53 mm, whose 1,600 pixels of 4 um see 10.01 deg."""
+    believed = simulate.believed_camera(scene.load("afit_simsat"))
+    assert believed.focal_px * 4e-3 == pytest.approx(36.53, abs=5e-3)
+    assert np.degrees(2 * np.arctan(800 / believed.focal_px)) == pytest.approx(10.01, abs=5e-3)

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from skysim import catalogue, sky
 from skysim.catalogue import Catalogue
+from skysim.photometry import Band, star_flux_e_s_m2
 
 MAS_RAD = np.pi / 180 / 3.6e6
 ARCSEC_RAD = 1000 * MAS_RAD
@@ -169,7 +170,7 @@ def test_roll_is_the_position_angle_of_up(roll_deg: float) -> None:
 
 def test_sources_are_lit_points_at_infinity_in_lab_axes(stars: Catalogue) -> None:
     lab_from_icrs = Rotation.from_euler("zyx", [0.3, -1.1, 2.0])
-    seen = sky.sources(stars, DATES[1], 2.0, lab_from_icrs)
+    seen = sky.sources(stars, DATES[1], 2.0, lab_from_icrs, Band.of(0.5))
     kept = stars.take(stars.v_mag <= 2.0)
     assert len(seen) == len(kept) > 40
     np.testing.assert_array_equal(seen.id, kept.hip)
@@ -179,11 +180,22 @@ def test_sources_are_lit_points_at_infinity_in_lab_axes(stars: Catalogue) -> Non
         lab_from_icrs.inv().apply(seen.place[:, :3]), sky.apparent(kept, DATES[1]), rtol=0, atol=1e-14
     )
     np.testing.assert_array_equal(seen.period_s, seen.on_s)
-    sirius = np.flatnonzero(seen.id == 32349)[0]
-    # V = -1.46: 5.62e10 * 10^0.584 by hand.
-    assert seen.strength[sirius] == pytest.approx(5.62e10 * 3.83707, rel=1e-5)
-    assert seen.magnitude[sirius] == -1.46
+    np.testing.assert_array_equal(seen.magnitude, kept.v_mag)
+    strength = star_flux_e_s_m2(kept.v_mag, kept.b_v, kept.v_i, Band.of(0.5))
+    np.testing.assert_array_equal(seen.strength, strength)
+
+
+def test_sources_are_as_bright_as_their_magnitude_and_colour(stars: Catalogue) -> None:
+    """In half of all photons of 400-1000 nm, against the reference's 5.62e10 photons/s/m² of a G2 star at V = 0."""
+    seen = sky.sources(stars, DATES[1], 2.0, Rotation.identity(), Band.of(0.5))
+    relative = {
+        int(hip): strength / (0.5 * 5.62e10 * 10 ** (-0.4 * v_mag))
+        for hip, strength, v_mag in zip(seen.id, seen.strength, seen.magnitude, strict=True)
+    }
+    assert relative[71683] == pytest.approx(1, abs=0.03)  # alpha Centauri A, G2
+    assert relative[32349] < 0.9  # Sirius: white, so fewer photons in the red beside the same V
+    assert relative[27989] > 1.5  # Betelgeuse
 
 
 def test_no_star_so_bright_gives_no_source(stars: Catalogue) -> None:
-    assert len(sky.sources(stars, DATES[0], -5.0, Rotation.identity())) == 0
+    assert len(sky.sources(stars, DATES[0], -5.0, Rotation.identity(), Band.of(0.5))) == 0

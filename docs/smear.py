@@ -1,0 +1,35 @@
+"""Make docs/smear.png: the SHEFEX-2 camera on the Pleiades at 0 to 8 deg/s. `make pictures` runs it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from skysim import io, report, scene, simulate
+
+RATES_DEG_S = (0, 1, 2, 4, 8)
+WINDOW = (slice(196, 296), slice(279, 379))  # the middle hundred pixels
+
+
+def frame(rate_deg_s: float):  # type: ignore[no-untyped-def]
+    """One 50 ms exposure whose middle looks at the Pleiades, turning about the image's vertical."""
+    overrides = {
+        "motion.start": "{ra_deg: 56.87, dec_deg: 24.1, roll_deg: 0}",
+        "motion.rate_deg_s": f"[0, {rate_deg_s}, 0]",
+        "exposure": "{time: 50 ms, rate_hz: 10, frames: 1, first: 0 s}",
+    }
+    loaded = scene.load("shefex2", overrides)
+    return simulate.shoot(simulate.prepare(loaded), 0)
+
+
+def main() -> None:
+    shots = [frame(rate) for rate in RATES_DEG_S]
+    captions = [
+        f"{rate} deg/s, {truth.seen.streak_px.max():.1f} px"
+        for rate, (_, truth) in zip(RATES_DEG_S, shots, strict=True)
+    ]
+    sheet = report.contact_sheet([shot.image_dn[WINDOW] for shot, _ in shots], captions, scale=3)
+    io.write_image(Path(__file__).with_name("smear.png"), sheet)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,285 @@
+"""The camera as the hardware is: lens, chip and electronics, read from YAML. A part of the scene's schema."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BeforeValidator, Field, field_validator, model_validator
+
+from skysim.quantity import (
+    DATA,
+    Ascending,
+    Length,
+    NotNegative,
+    Number,
+    Part,
+    Positive,
+    Share,
+    Time,
+    a_table,
+    quantity,
+)
+from skysim.types import BadInput
+
+PRESETS = DATA / "cameras"
+
+
+def focus_distance(value: Any) -> float:
+    """A length, or the word infinity."""
+    return math.inf if value == "infinity" else quantity("m", "length", '"33 in", or infinity')(value)
+
+
+class PsfPart(Part):
+    """What every point-spread function has: a Gaussian blur that grows towards the field's corner.
+
+    corner_sigma_px : standard deviation, added in quadrature, proportional to the field radius, reached at the
+                      farthest corner of the chip (field curvature and coma, to first order)
+    """
+
+    corner_sigma_px: Annotated[Number, Field(ge=0, le=20)] = 0.0
+
+
+class GaussianPsf(PsfPart):
+    """A Gaussian of standard deviation sigma_px."""
+
+    kind: Literal["gaussian"] = "gaussian"
+    sigma_px: Annotated[Number, Field(ge=0.2, le=20)] = 0.7
+
+
+class MoffatPsf(PsfPart):
+    """A Moffat profile: a core with power-law wings (Moffat 1969)."""
+
+    kind: Literal["moffat"]
+    fwhm_px: Annotated[Number, Field(ge=0.5, le=50)]
+    beta: Annotated[Number, Field(ge=1.5, le=20)] = 3.0
+
+
+class AiryPsf(PsfPart):
+    """Diffraction at the lens's working f-number and a blur of sigma_px on top."""
+
+    kind: Literal["airy"]
+    wavelength_m: Annotated[Length, Field(ge=200e-9, le=2e-6)] = 550e-9
+    sigma_px: Annotated[Number, Field(ge=0, le=20)] = 0.0
+
+
+class DiscPsf(PsfPart):
+    """A uniform disc, the geometric image of a lens out of focus, and a blur of sigma_px on its edge."""
+
+    kind: Literal["disc"]
+    radius_px: Annotated[Number, Field(gt=0, le=200)]
+    sigma_px: Annotated[Number, Field(ge=0.2, le=20)] = 0.7
+
+
+class MeasuredPsf(PsfPart):
+    """A point's image as it was measured: a square table of numbers, `oversampling` samples a pixel each way."""
+
+    kind: Literal["measured"]
+    file: str
+    oversampling: Annotated[int, Field(ge=1, le=32)] = 1
+
+
+Psf = Annotated[GaussianPsf | MoffatPsf | AiryPsf | DiscPsf | MeasuredPsf, Field(discriminator="kind")]
+
+
+class TwoStops(Part):
+    """Mechanical vignetting by two equal round stops, one behind the other; nothing passes at cutoff_deg."""
+
+    kind: Literal["two_stops"]
+    cutoff_deg: Annotated[Number, Field(gt=0, lt=90)]
+
+
+class VignettingTable(Part):
+    """Measured transmission against field angle, 1 on the axis."""
+
+    kind: Literal["table"]
+    angle_deg: Ascending
+    transmission: Annotated[tuple[Share, ...], Field(min_length=2)]
+
+    @model_validator(mode="after")
+    def a_table(self) -> VignettingTable:
+        a_table(self.angle_deg, self.transmission, "transmission")
+        return self
+
+
+class GlobalShutter(Part):
+    """Every row sees the same exposure."""
+
+    kind: Literal["global"] = "global"
+
+
+class RollingShutter(Part):
+    """Each row opens and closes row_time after the one above it."""
+
+    kind: Literal["rolling"]
+    row_time_s: Annotated[Time, Field(gt=0)]
+
+
+class FrameTransfer(Part):
+    """Charge is shifted under light into a store, row_time a row: every pixel gathers from its whole column."""
+
+    kind: Literal["frame_transfer"]
+    row_time_s: Annotated[Time, Field(gt=0)]
+
+
+class Interline(Part):
+    """The covered register leaks: it takes `leak` of the light of every row that it passes, row_time a row."""
+
+    kind: Literal["interline"]
+    row_time_s: Annotated[Time, Field(gt=0)]
+    leak: Share = 1e-4
+
+
+Shutter = Annotated[GlobalShutter | RollingShutter | FrameTransfer | Interline, Field(discriminator="kind")]
+
+
+class Particles(Part):
+    """Ionising particles that leave straight tracks: cosmic rays, trapped protons.
+
+    per_cm2_s     : isotropic flux through the chip
+    depth_m       : thickness of the sensitive layer
+    electrons_um  : most probable charge a micrometre of track (about 80 for a fast singly charged particle)
+    diffusion_px  : standard deviation of the charge cloud
+    """
+
+    per_cm2_s: NotNegative
+    depth_m: Annotated[Length, Field(gt=0)] = 10e-6
+    electrons_um: Positive = 80.0
+    diffusion_px: Annotated[Number, Field(ge=0, le=5)] = 0.3
+
+
+class Detector(Part):
+    """The chip and its electronics, in the charge's order. A step is switched off by its parameter.
+
+    quantum_efficiency : one number for 400-1000 nm, or the name of a curve in data/qe (or a file)
+    hardware_seed      : this chip's own fixed pattern: PRNU, DSNU, hot pixels, column offsets
+    prnu               : standard deviation of the pixels' relative sensitivity
+    dark_e_s           : mean dark current at dark_temperature_c; it doubles every dark_doubling_c
+    dsnu               : standard deviation of the pixels' relative dark current
+    hot_pixels         : share of the pixels that are hot, with an exponential spread of mean hot_e_s
+    blooming           : column: what a full well cannot hold flows along its column; anti_blooming of it drains
+    cti_parallel, cti_serial : share of the charge left behind in each transfer
+    read_noise_e, reset_noise_e : Gaussian, every pixel, every frame
+    column_offset_e    : standard deviation of the columns' fixed offsets
+    nonlinearity       : share of the signal missing at full well: e (1 - nonlinearity e / full_well)
+    noise              : false gives the expectation itself, unrounded
+    """
+
+    quantum_efficiency: Annotated[Number, Field(gt=0, le=1)] | str
+    hardware_seed: Annotated[int, Field(ge=0)] = 0
+    prnu: Annotated[Number, Field(ge=0, le=0.2)] = 0.0
+    dark_e_s: NotNegative = 0.0
+    dark_temperature_c: Annotated[Number, Field(ge=-150, le=150)] = 20.0
+    dark_doubling_c: Annotated[Number, Field(gt=0, le=50)] = 7.0
+    temperature_c: Annotated[Number, Field(ge=-150, le=150)] | None = None
+    dsnu: Annotated[Number, Field(ge=0, le=2)] = 0.0
+    hot_pixels: Share = 0.0
+    hot_e_s: NotNegative = 0.0
+    particles: tuple[Particles, ...] = ()
+    full_well_e: Positive
+    blooming: Literal["none", "column"] = "none"
+    anti_blooming: Share = 0.0
+    cti_parallel: Annotated[Number, Field(ge=0, le=1e-2)] = 0.0
+    cti_serial: Annotated[Number, Field(ge=0, le=1e-2)] = 0.0
+    read_noise_e: NotNegative = 0.0
+    reset_noise_e: NotNegative = 0.0
+    column_offset_e: NotNegative = 0.0
+    gain_e_dn: Positive
+    offset_dn: NotNegative = 0.0
+    nonlinearity: Annotated[Number, Field(ge=0, le=0.4)] = 0.0
+    bits: Annotated[int, Field(ge=1, le=16)]
+    noise: bool = True
+
+    @field_validator("quantum_efficiency")
+    @classmethod
+    def known_curve(cls, value: float | str) -> float | str:
+        if isinstance(value, str):
+            from skysim.photometry import curve_file
+
+            curve_file(value)
+        return value
+
+    @model_validator(mode="after")
+    def offset_within_the_converter(self) -> Detector:
+        if self.offset_dn >= 2**self.bits:
+            raise ValueError(f"offset_dn {self.offset_dn:g} is beyond a converter of {self.bits} bits")
+        return self
+
+
+class Camera(Part):
+    """Lens and chip as they are. What the tracker believes of them stands in `tracker`."""
+
+    width_px: Annotated[int, Field(ge=16, le=20000)]
+    height_px: Annotated[int, Field(ge=16, le=20000)]
+    pixel_m: Annotated[Length, Field(gt=0)]
+    focal_length_m: Annotated[Length, Field(gt=0)]
+    f_number: Positive
+    focus_m: Annotated[float, BeforeValidator(focus_distance), Field(gt=0)] = math.inf
+    transmission: Annotated[Number, Field(gt=0, le=1)] = 1.0
+    vignetting: Annotated[TwoStops | VignettingTable, Field(discriminator="kind")] | None = None
+    distortion: tuple[Number, Number, Number, Number, Number] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    principal_point_px: tuple[Number, Number] | None = None
+    psf: Psf = GaussianPsf()
+    shutter: Shutter = GlobalShutter()
+    detector: Detector
+
+    @model_validator(mode="after")
+    def focused_before_the_lens(self) -> Camera:
+        if self.focus_m <= 2 * self.focal_length_m:
+            raise ValueError(
+                f"focus {self.focus_m:g} m is nearer than twice the focal length {self.focal_length_m:g} m"
+            )
+        return self
+
+    @property
+    def pupil_m(self) -> float:
+        """Diameter of the entrance pupil."""
+        return self.focal_length_m / self.f_number
+
+    @property
+    def image_distance_m(self) -> float:
+        """From lens to chip, by the thin lens: 1/v = 1/f - 1/u. The focal length, if focused at infinity."""
+        return 1 / (1 / self.focal_length_m - 1 / self.focus_m)
+
+    @property
+    def focal_px(self) -> float:
+        """Pixels a unit of tangent: what a star tracker calls its focal length."""
+        return self.image_distance_m / self.pixel_m
+
+    @property
+    def centre_px(self) -> tuple[float, float]:
+        """The principal point: as given, or the chip's middle."""
+        return self.principal_point_px or ((self.width_px - 1) / 2, (self.height_px - 1) / 2)
+
+
+def preset(name: str, where: str) -> dict[str, Any]:
+    """The `camera` section of data/cameras/NAME.yaml. Raises BadInput for a name that is none."""
+    from skysim.yamlfile import read_yaml
+
+    known = sorted(path.stem for path in PRESETS.glob("*.yaml"))
+    if name not in known:
+        raise BadInput(f"{where}: {name!r} is none of {', '.join(known)}")
+    tree: dict[str, Any] = read_yaml(Path(PRESETS / f"{name}.yaml"))[0]["camera"]
+    return tree
+
+
+def with_preset(tree: dict[str, Any]) -> dict[str, Any]:
+    """The raw scene with its camera's preset beneath what the scene itself says of the camera."""
+    part = tree.get("camera")
+    if not isinstance(part, dict) or "preset" not in part:
+        return tree
+    own = {key: value for key, value in part.items() if key != "preset"}
+    return tree | {"camera": over(preset(str(part["preset"]), "camera.preset"), own)}
+
+
+def over(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
+    """Two mappings merged; where both have a section of one kind the sections are merged too."""
+    merged = below | above
+    for key, value in above.items():
+        ground = below.get(key)
+        if not isinstance(value, dict) or not isinstance(ground, dict):
+            continue
+        if value.get("kind") in (None, ground.get("kind")):
+            merged[key] = over(ground, value)
+    return merged

@@ -1,0 +1,92 @@
+"""Values with their units, read from YAML; the base of every section of a file.
+
+Two rules name every key. A key whose value carries its own unit has none in its name (`focal_length: "35 mm"`);
+a key whose value is a bare number ends in its unit (`tilt_stop_deg: 30`). In Python the former gains the SI
+suffix (`camera.focal_length_m`), so that a unit is always in sight.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+import re
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
+
+ROOT = Path(__file__).resolve().parents[1]
+DATA = ROOT / "data"
+
+# Only what a quantity parser fills: `dark_e_s` and `rate_deg_s` are bare numbers and keep their unit.
+SI_SUFFIX = re.compile(r"(?<!_deg)(?<!_e)(?<!^e)(?<!_cm2)_(m|s|kg|kg_m2|cd|nm)$")
+
+
+def quantity(si_unit: str, what: str, examples: str) -> Callable[[Any], float]:
+    """A validator that turns a quantity such as "48 in" into a float in `si_unit`."""
+
+    def parse(value: Any) -> float:
+        from astropy import units
+
+        if not isinstance(value, str):
+            raise ValueError(f"{value!r} has no unit; allowed: a {what} such as {examples}")
+        try:
+            # astropy spells it `inch`; the lab writes `in`.
+            inch = units.def_unit("in", units.imperial.inch)
+            with units.add_enabled_units([inch, units.imperial]):
+                number = units.Quantity(value).to_value(si_unit)
+        except (units.UnitsError, TypeError, ValueError) as error:
+            raise ValueError(f"{value!r} is not a {what}; allowed: a {what} such as {examples}") from error
+        return float(number)
+
+    return parse
+
+
+def finite(value: float) -> float:
+    if not math.isfinite(value):
+        raise ValueError(f"{value} is not a finite number")
+    return value
+
+
+Number = Annotated[float, AfterValidator(finite)]
+Length = Annotated[Number, BeforeValidator(quantity("m", "length", '"35 mm" or "48 in"'))]
+Time = Annotated[Number, BeforeValidator(quantity("s", "time", '"40 ms" or "1000 us"'))]
+Mass = Annotated[Number, BeforeValidator(quantity("kg", "mass", '"80 kg"'))]
+Inertia = Annotated[Number, BeforeValidator(quantity("kg m2", "moment of inertia", '"6.0 kg m2"'))]
+Intensity = Annotated[Number, BeforeValidator(quantity("cd", "luminous intensity", '"7.7 mcd"'))]
+Torque = Annotated[Number, BeforeValidator(quantity("N m", "torque", '"0.5 N m"'))]
+SemiAxis = Annotated[Length, Field(gt=0)]
+Spin = Annotated[Number, Field(ge=-360, le=360)]
+Triple = tuple[Number, Number, Number]
+Share = Annotated[Number, Field(ge=0, le=1)]
+Positive = Annotated[Number, Field(gt=0)]
+NotNegative = Annotated[Number, Field(ge=0)]
+Ascending = Annotated[tuple[Number, ...], Field(min_length=2)]
+
+
+class Part(BaseModel):
+    """Base of every section: frozen, no unknown keys, units out of the YAML names."""
+
+    model_config = ConfigDict(
+        extra="forbid",
+        frozen=True,
+        validate_by_alias=True,
+        validate_by_name=False,
+        alias_generator=lambda name: SI_SUFFIX.sub("", name),
+    )
+
+
+def one_of(value: str, allowed: Mapping[str, Any]) -> str:
+    """The value, if it is a key of `allowed`."""
+    if value not in allowed:
+        raise ValueError(f"{value!r} is none of {', '.join(allowed)}")
+    return value
+
+
+def a_table(angle_deg: Sequence[float], values: Sequence[float], name: str) -> None:
+    """Refuse two columns that are no function of an ascending angle."""
+    if len(angle_deg) != len(values):
+        raise ValueError(f"angle_deg has {len(angle_deg)} numbers, {name} {len(values)}")
+    if any(b <= a for a, b in itertools.pairwise(angle_deg)):
+        raise ValueError("angle_deg does not ascend")

@@ -1,0 +1,174 @@
+"""Vibration against its own analytic sum: rms, spectrum, rates, and what lies between the samples."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from skysim.jitter import SPECTRA, joined, own_rate, shake, swing
+from skysim.scene import JitterBand, JitterLine
+from skysim.types import BadInput, Trajectory
+
+ARCSEC = np.radians(1 / 3600)
+RMS = (5.0, 2.0, 0.5)
+
+
+def line(frequency_hz: float = 40.0, rms: tuple[float, float, float] = RMS) -> JitterLine:
+    return JitterLine.model_validate({"kind": "line", "frequency_hz": frequency_hz, "rms_arcsec": rms})
+
+
+def band(from_hz: float, to_hz: float, slope: float = 0.0) -> JitterBand:
+    return JitterBand.model_validate(
+        {"kind": "band", "from_hz": from_hz, "to_hz": to_hz, "rms_arcsec": RMS, "slope": slope}
+    )
+
+
+def turning(end_s: float, rate: tuple[float, float, float] = (0.0, 0.0, 0.0), samples: int = 2) -> Trajectory:
+    """A body that turns evenly about one axis."""
+    t, rate_rad_s = np.linspace(0, end_s, samples), np.array(rate)
+    start = Rotation.from_rotvec([0.3, -1.0, 2.0])
+    return Trajectory(
+        t, start * Rotation.from_rotvec(t[:, None] * rate_rad_s), np.tile(rate_rad_s, (samples, 1))
+    )
+
+
+def shaken_by(calm: Trajectory, shaken: Trajectory, t_s: np.ndarray) -> np.ndarray:
+    """(N, 3) rotation vectors from the calm body to the shaken one, in arcseconds."""
+    return (calm.at(t_s).inv() * shaken.at(t_s)).as_rotvec() / ARCSEC
+
+
+def test_nothing_that_shakes_is_the_same_history() -> None:
+    calm, rng = turning(1.0), np.random.default_rng(1)
+    assert shake(calm, (), rng) is calm
+    assert shake(calm, (line(rms=(0.0, 0.0, 0.0)),), rng) is calm
+
+
+def test_a_line_is_a_sine_of_its_rms_about_each_axis() -> None:
+    calm = turning(1.0)
+    t = np.arange(1000) / 1000  # forty whole periods
+    phi = shaken_by(calm, shake(calm, (line(),), np.random.default_rng(2)), t)
+    np.testing.assert_allclose(np.sqrt(np.mean(phi**2, axis=0)), RMS, rtol=1e-3)
+    power = np.abs(np.fft.rfft(phi, axis=0)) ** 2
+    np.testing.assert_allclose(power[40] / power.sum(axis=0), 1, rtol=1e-5)
+
+
+def test_phases_are_at_random() -> None:
+    """The mean of exp(i phase) over n draws is 0 within 1/sqrt(n)."""
+    rng = np.random.default_rng(3)
+    drawn = [SPECTRA["line"](line(), rng) for _ in range(400)]
+    phasor = np.array([one.cosine_rad[0] * 1j + one.sine_rad[0] for one in drawn]) / (
+        np.sqrt(2) * ARCSEC * np.array(RMS)
+    )
+    np.testing.assert_allclose(np.abs(phasor), 1, rtol=1e-12)
+    assert np.abs(phasor.mean(axis=0)).max() < 4 / np.sqrt(400)
+
+
+@pytest.mark.parametrize("slope", [-6.0, -2.0, -1.0, 0.0, 3.0])
+def test_a_band_has_its_rms_and_keeps_within_its_edges(slope: float) -> None:
+    sines = SPECTRA["band"](band(2.0, 50.0, slope), np.random.default_rng(4))
+    rms = np.sqrt(np.sum(sines.sine_rad**2 + sines.cosine_rad**2, axis=0) / 2)
+    np.testing.assert_allclose(rms, np.array(RMS) * ARCSEC, rtol=1e-12)
+    assert sines.omega_rad_s.min() / (2 * np.pi) >= 2.0
+    assert sines.omega_rad_s.max() / (2 * np.pi) <= 50.0
+
+
+@pytest.mark.parametrize("slope", [-2.0, -1.0, 0.0, 2.0])
+def test_periodogram_of_a_band_rises_with_its_slope(slope: float) -> None:
+    """Power by octave of many draws: its integral over f^slope, to 4 sigma of the draws' own scatter."""
+    rng, rate_hz, seconds = np.random.default_rng(5), 256.0, 8.0
+    t = np.arange(int(seconds * rate_hz)) / rate_hz
+    window = np.hanning(len(t))[:, None]
+    edges = np.array([4.0, 8.0, 16.0, 32.0, 64.0])
+    shares = []
+    for _ in range(40):
+        sines = SPECTRA["band"](band(4.0, 64.0, slope), rng)
+        phi = swing(t, sines.omega_rad_s, sines.sine_rad, sines.cosine_rad)[0] / ARCSEC / np.array(RMS)
+        power = (np.abs(np.fft.rfft(phi * window, axis=0)) ** 2).sum(axis=1)
+        frequency = np.fft.rfftfreq(len(t), 1 / rate_hz)
+        outside = (frequency < 4.0 - 0.5) | (frequency > 64.0 + 0.5)  # four bins: Hann leaks 1e-3 beyond
+        assert power[outside].sum() < 2e-3 * power.sum()
+        shares.append(np.histogram(frequency, edges, weights=power)[0] / power.sum())
+    octave = np.exp2(
+        (slope + 1) * np.arange(4)
+    )  # power of an octave over that of the one below is 2^(slope + 1)
+    scatter = np.std(shares, axis=0) / np.sqrt(len(shares))
+    # Within 4 sigma, and 1 % that the window carries over an octave's edge.
+    assert np.all(np.abs(np.mean(shares, axis=0) - octave / octave.sum()) < 4 * scatter + 0.01)
+
+
+def test_many_sines_look_like_noise() -> None:
+    """The sum of so many sines is nearly normal: kurtosis 3 less 1.5 over the number of equal sines."""
+    sines = SPECTRA["band"](band(1.0, 100.0), np.random.default_rng(6))
+    t = np.sort(np.random.default_rng(7).uniform(0, 5000, 40_000))
+    phi = swing(t, sines.omega_rad_s, sines.sine_rad, sines.cosine_rad)[0]
+    kurtosis = np.mean(phi**4, axis=0) / np.mean(phi**2, axis=0) ** 2
+    np.testing.assert_allclose(kurtosis, 3, rtol=0, atol=0.2)
+
+
+def test_between_the_samples_the_history_follows_the_sum() -> None:
+    parts = (line(37.0), band(1.0, 60.0, -1.0))
+    calm = turning(2.0, rate=(0.02, -0.01, 0.03))
+    shaken = shake(calm, parts, np.random.default_rng(8))
+    rng = np.random.default_rng(8)
+    sines = joined([SPECTRA[part.kind](part, rng) for part in parts])
+    t = np.random.default_rng(9).uniform(0, 2, 5000)
+    wanted = swing(t, sines.omega_rad_s, sines.sine_rad, sines.cosine_rad)[0] / ARCSEC
+    error = np.abs(shaken_by(calm, shaken, t) - wanted)
+    assert (error.max(axis=0) < 1e-3 * np.abs(wanted).max(axis=0)).all()
+    highest_hz = sines.omega_rad_s.max() / (2 * np.pi)
+    assert np.diff(shaken.t_s).max() <= 1 / (16 * highest_hz) * (1 + 1e-9)
+
+
+def test_the_samples_of_the_calm_history_stay() -> None:
+    calm = turning(1.0, rate=(0.1, 0.2, 0.3), samples=7)
+    shaken = shake(calm, (line(11.0),), np.random.default_rng(10))
+    assert np.isin(calm.t_s, shaken.t_s).all()
+    assert (np.diff(shaken.t_s) > 0).all()
+    slow = shake(calm, (line(0.01),), np.random.default_rng(10))
+    np.testing.assert_array_equal(slow.t_s, calm.t_s)  # fine enough as it is
+
+
+def test_rates_are_the_derivative_of_the_attitude() -> None:
+    """A strong vibration (1 degree) on a body that turns at 20 deg/s: central differences, error h^2 w^3 phi / 6."""
+    calm = turning(0.5, rate=(0.2, -0.1, 0.25))
+    shaken = shake(calm, (line(10.0, rms=(3600.0, 2000.0, 1000.0)),), np.random.default_rng(11))
+    at = shaken.t_s[1:-1]
+    sines = SPECTRA["line"](line(10.0, rms=(3600.0, 2000.0, 1000.0)), np.random.default_rng(11))
+
+    def attitude(t_s: np.ndarray) -> Rotation:
+        phi = swing(t_s, sines.omega_rad_s, sines.sine_rad, sines.cosine_rad)[0]
+        return calm.at(t_s) * Rotation.from_rotvec(phi)
+
+    h = 1e-6
+    turn = (attitude(at - h).inv() * attitude(at + h)).as_rotvec() / (2 * h)
+    # Rounding: 2e-16 / h = 2e-10 a rotation, some of them; what own_rate leaves out: 0.03^3 / 24 of 2 rad/s.
+    np.testing.assert_allclose(shaken.rate_body_rad_s[1:-1], turn, rtol=0, atol=3e-6)
+    size = np.abs(shaken.rate_body_rad_s - np.array([0.2, -0.1, 0.25])).max()
+    assert size > 1.0  # the vibration's own rate is not small beside this tolerance
+
+
+def test_cross_term_of_the_rate_is_needed() -> None:
+    """Coning: two axes a quarter period apart turn the body steadily at -(phi x dphi/dt) / 2 about the third."""
+    phi, phi_rate = np.array([[0.01, 0.0, 0.0]]), np.array([[0.0, 0.01, 0.0]])
+    np.testing.assert_allclose(own_rate(phi, phi_rate)[0, 2], -0.5e-4, rtol=1e-12)
+
+
+def test_the_mean_attitude_is_that_of_the_calm_body() -> None:
+    calm = turning(10.0, rate=(0.0, 0.05, 0.0))
+    shaken = shake(calm, (line(20.0), band(5.0, 50.0)), np.random.default_rng(12))
+    mean = shaken_by(calm, shaken, np.arange(10_000) / 1000).mean(axis=0)
+    # A sine's mean over T is below a / (pi f T); 128 of them in quadrature, and the line has whole periods.
+    assert (np.abs(mean) < 4 * np.array(RMS) / (np.pi * 5.0 * 10.0)).all()
+
+
+def test_the_same_stream_shakes_alike() -> None:
+    calm = turning(0.2)
+    first, again, other = (shake(calm, (band(1.0, 30.0),), np.random.default_rng(s)) for s in (1, 1, 2))
+    np.testing.assert_array_equal(first.rate_body_rad_s, again.rate_body_rad_s)
+    assert not np.array_equal(first.rate_body_rad_s, other.rate_body_rad_s)
+
+
+def test_too_many_samples_are_refused_in_one_line() -> None:
+    with pytest.raises(BadInput, match=r"^motion\.jitter: 1e\+06 Hz over 60 s needs 960,000,001 .*$"):
+        shake(turning(60.0), (line(1e6),), np.random.default_rng(1))
