@@ -10,7 +10,7 @@ $(READY): pyproject.toml
 	$(BIN)/pip install --quiet --disable-pip-version-check -e '.[dev,catalog]'
 	touch $@
 
-.PHONY: demo test test-long test-oracle lint setup clean
+.PHONY: demo test test-long test-oracle lint pictures setup clean
 setup: $(READY)
 
 demo: $(READY)
@@ -26,6 +26,9 @@ test-long: $(READY)
 test-oracle: $(READY)
 	$(BIN)/pip install --quiet --disable-pip-version-check -e '.[oracle]'
 	$(BIN)/pytest tests/test_oracle_*.py
+
+pictures: demo
+	$(BIN)/python docs/pictures.py
 
 lint: $(READY)
 	$(BIN)/ruff check .

@@ -100,6 +100,16 @@ def test_render_leaves_frames_with_their_truth_and_nothing_else(rendered: Path) 
     assert {p.name for p in rendered.iterdir()} == {"frame_0000.fits", "frame_0000.png", "frame_0000.ecsv"}
 
 
+def test_a_preview_is_a_picture_beside_the_frame(skysim: Skysim, tmp_path: Path) -> None:
+    ran = skysim("render", "shefex2", "--frames", "1", "--preview", "--out", str(tmp_path))
+    assert ran.code == 0
+    picture = cv2.imread(str(tmp_path / "frame_0000.preview.png"), cv2.IMREAD_UNCHANGED)
+    assert picture.dtype == np.uint8
+    assert picture.shape == (2 * 493, 2 * 659, 3)
+    skysim("render", "shefex2", "--frames", "1", "--out", str(tmp_path))
+    assert not (tmp_path / "frame_0000.preview.png").exists()  # it spoke of an earlier run
+
+
 @pytest.mark.filterwarnings("ignore:.*datfix")
 def test_render_then_solve_agrees_with_the_wcs_of_the_true_pointing(
     skysim: Skysim, rendered: Path, tmp_path: Path

@@ -1,11 +1,15 @@
-"""Make docs/smear.png: the SHEFEX-2 camera on the Pleiades at 0 to 8 deg/s. `make pictures` runs it."""
+"""The README's pictures, from what `make demo` left in out/ and from frames of its own. `make pictures` runs it."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
+import cv2
+
 from skysim import io, report, scene, simulate
 
+DOCS = Path(__file__).parent
+OUT = DOCS.parent / "out"
 RATES_DEG_S = (0, 1, 2, 4, 8)
 WINDOW = (slice(196, 296), slice(279, 379))  # the middle hundred pixels
 
@@ -22,13 +26,18 @@ def frame(rate_deg_s: float):  # type: ignore[no-untyped-def]
 
 
 def main() -> None:
+    for name, scene_name in (("dome", "afit_simsat"), ("sky", "shefex2")):
+        picture = cv2.imread(str(OUT / scene_name / "annotated.png"))
+        width = 1200
+        size = (width, round(width * picture.shape[0] / picture.shape[1]))
+        io.write_image(DOCS / f"{name}.jpg", cv2.resize(picture, size, interpolation=cv2.INTER_AREA))
     shots = [frame(rate) for rate in RATES_DEG_S]
     captions = [
         f"{rate} deg/s, {truth.seen.streak_px.max():.1f} px"
         for rate, (_, truth) in zip(RATES_DEG_S, shots, strict=True)
     ]
     sheet = report.contact_sheet([shot.image_dn[WINDOW] for shot, _ in shots], captions, scale=3)
-    io.write_image(Path(__file__).with_name("smear.png"), sheet)
+    io.write_image(DOCS / "smear.png", sheet)
 
 
 if __name__ == "__main__":
