@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from skysim.camera import Camera
+from skysim.light import Glow, MoonGlow, SkyGlow, StrayLight, UniformGlow
 from skysim.optics import Optics, radial
 from skysim.photometry import SUN, Band, sky_radiance_e_s_m2_sr, star_flux_e_s_m2
-from skysim.scene import Glow, MoonGlow, SkyGlow, StrayLight, UniformGlow
 from skysim.types import Floats
 
 NODE_PX = 32.0

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from skysim import scene
+from skysim import light
 from skysim.photometry import Band, led_strength_e_s_sr
 from skysim.types import BadInput, Floats, Sources
 
@@ -62,31 +62,31 @@ class Plane:
 Surface = Ellipsoid | Plane
 
 
-def sphere(part: scene.Surface) -> Surface:
+def sphere(part: light.Surface) -> Surface:
     """A sphere of part.radius_m whose top is part.apex_m above the bearing."""
     radius = float(part.radius_m or 0)
     return Ellipsoid(np.array([0, 0, part.apex_m - radius]) + part.offset_m, np.full(3, radius))
 
 
-def ellipsoid(part: scene.Surface) -> Surface:
+def ellipsoid(part: light.Surface) -> Surface:
     """An ellipsoid with its axes along the lab's, its top part.apex_m above the bearing."""
     axes = np.array(part.semi_axes_m)
     return Ellipsoid(np.array([0, 0, part.apex_m - axes[2]]) + part.offset_m, axes)
 
 
-def flat(part: scene.Surface) -> Surface:
+def flat(part: light.Surface) -> Surface:
     """A horizontal panel part.apex_m above the bearing."""
     return Plane(part.apex_m + part.offset_m[2])
 
 
-SURFACES: dict[str, Callable[[scene.Surface], Surface]] = {
+SURFACES: dict[str, Callable[[light.Surface], Surface]] = {
     "sphere": sphere,
     "ellipsoid": ellipsoid,
     "flat": flat,
 }
 
 
-def surface(part: scene.Surface) -> Surface:
+def surface(part: light.Surface) -> Surface:
     """The surface that a scene describes. Raises BadInput unless the bearing is inside of it."""
     made = SURFACES[part.kind](part)
     if isinstance(made, Ellipsoid) and np.sum((made.centre_m / made.semi_axes_m) ** 2) >= 1:
@@ -104,7 +104,7 @@ def cap(count: int, half_angle_rad: float) -> Floats:
     return np.column_stack([ring * np.cos(n * GOLDEN_ANGLE_RAD), ring * np.sin(n * GOLDEN_ANGLE_RAD), z])
 
 
-def patch_boards(part: scene.PatchBoards, inside: Surface, led: scene.Led, band: Band) -> Sources:
+def patch_boards(part: light.PatchBoards, inside: Surface, led: light.Led, band: Band) -> Sources:
     """3x3 boards glued flat to the surface, each turned at random, with its own choice of LEDs and levels.
 
     Boards are spread evenly over the cap as seen from the bearing. A board is a plane tangent at its middle, so
@@ -153,6 +153,6 @@ def patch_boards(part: scene.PatchBoards, inside: Surface, led: scene.Led, band:
 LAYOUTS = {"patch_boards": patch_boards}
 
 
-def sources(light: scene.Dome, band: Band) -> Sources:
+def sources(part: light.Dome, band: Band) -> Sources:
     """Every LED of the dome, as bright as the chip's band makes it: strength is photo-electrons s^-1 sr^-1."""
-    return LAYOUTS[light.layout.kind](light.layout, surface(light.surface), light.led, band)
+    return LAYOUTS[part.layout.kind](part.layout, surface(part.surface), part.led, band)

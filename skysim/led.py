@@ -1,4 +1,4 @@
-"""What an LED sends towards the camera: emission lobe, falloff with distance, and its pulses."""
+"""What an LED sends towards the camera: emission lobe and falloff with distance (its pulses are in pulse.py)."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from skysim.scene import CosineLobe, Led, Lobe, LobeTable
+from skysim.light import CosineLobe, Led, Lobe, LobeTable
 from skysim.types import Floats
 
 Falloff = Callable[[Floats], Floats]
@@ -73,17 +73,3 @@ def irradiance_e_s_m2(
     return np.where(
         lit, strength_e_s_sr * emitted * cos_incidence * FALLOFF[emitter.falloff](distance_m), 0.0
     )
-
-
-def lit_s(begin_s: Floats, end_s: Floats, period_s: Floats, start_s: Floats, on_s: Floats) -> Floats:
-    """Seconds of [begin, end] during which a pulse train shines: lit from start for on in every period.
-
-    The running total F(t) = floor(u) on + min(frac(u) period, on), u = (t - start) / period, makes the integral
-    exact for any interval. Arrays broadcast.
-    """
-
-    def total(t_s: Floats) -> Floats:
-        cycles = np.floor((t_s - start_s) / period_s)
-        return cycles * on_s + np.minimum(t_s - start_s - cycles * period_s, on_s)
-
-    return total(np.asarray(end_s)) - total(np.asarray(begin_s))

@@ -10,7 +10,7 @@ from pydantic import TypeAdapter
 from scipy.interpolate import RegularGridInterpolator
 from scipy.spatial.transform import Rotation
 
-from skysim import scene
+from skysim import light
 from skysim.background import (
     BACKGROUNDS,
     NANOLAMBERT_V0,
@@ -55,8 +55,8 @@ def optics(**camera: object) -> Optics:
     return Optics.of(Camera.model_validate(CAMERA | camera))
 
 
-def glow(**part: object) -> scene.Glow:
-    made: scene.Glow = TypeAdapter(scene.Glow).validate_python(part, by_alias=True, by_name=True)
+def glow(**part: object) -> light.Glow:
+    made: light.Glow = TypeAdapter(light.Glow).validate_python(part, by_alias=True, by_name=True)
     return made
 
 
@@ -67,7 +67,7 @@ def lab_place(right_deg: float) -> tuple[float, float]:
     return float(np.degrees(np.arctan2(y, x)) % 360), float(np.degrees(np.arcsin(z)))
 
 
-def whole_map(part: scene.Glow, lens: Optics) -> np.ndarray:
+def whole_map(part: light.Glow, lens: Optics) -> np.ndarray:
     """Worked out at every third pixel itself, for comparison."""
     camera = lens.camera
     x, y = np.meshgrid(np.arange(0, camera.width_px, 3), np.arange(0, camera.height_px, 3))
@@ -76,14 +76,14 @@ def whole_map(part: scene.Glow, lens: Optics) -> np.ndarray:
     return BACKGROUNDS[part.kind](part, view).reshape(x.shape)
 
 
-def drawn(part: scene.Glow, lens: Optics, exposure_s: float = 1.0) -> np.ndarray:
+def drawn(part: light.Glow, lens: Optics, exposure_s: float = 1.0) -> np.ndarray:
     image = np.full((lens.camera.height_px, lens.camera.width_px), np.nan, np.float32)
     fill(image, glow_map((part,), lens, POINTING, BAND), exposure_s)
     return image
 
 
 def test_every_kind_of_the_schema_is_known() -> None:
-    union = typing.get_args(typing.get_args(scene.Glow)[0])
+    union = typing.get_args(typing.get_args(light.Glow)[0])
     assert {typing.get_args(one.model_fields["kind"].annotation)[0] for one in union} == set(BACKGROUNDS)
 
 

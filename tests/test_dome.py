@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from skysim import dome, scene
+from skysim import dome, light, scene
 from skysim.dome import Ellipsoid, Plane
 from skysim.photometry import Band, led_strength_e_s_sr
 from skysim.types import BadInput, Sources
@@ -22,7 +22,7 @@ BAND = Band.of("cmos")
 
 
 def surface(part: dict[str, Any]) -> Any:
-    return dome.surface(scene.Surface.model_validate(part))
+    return dome.surface(light.Surface.model_validate(part))
 
 
 def lit_dome(surface: dict[str, Any] = MEASURED, led: dict[str, Any] = LED, **boards: Any) -> Sources:
@@ -82,7 +82,7 @@ def test_a_sphere_about_the_bearing_is_equally_far_everywhere() -> None:
 @pytest.mark.parametrize("part", [MEASURED, SPHERE, {"kind": "flat", "apex": "48 in"}])
 def test_the_apex_is_where_it_is_declared(part: dict) -> None:
     """Straight above the dome's own axis; the offset moves it along."""
-    made, offset = surface(part), scene.Surface.model_validate(part).offset_m
+    made, offset = surface(part), light.Surface.model_validate(part).offset_m
     above = np.array([offset[0], offset[1], 0.0])
     top = made.meet(above, np.array([[0.0, 0.0, 1.0]]))[0]
     np.testing.assert_allclose(top, [*offset[:2], 48 * INCH_M + offset[2]], rtol=0, atol=1e-14)
@@ -125,7 +125,7 @@ def test_a_dome_that_leaves_the_bearing_outside_is_refused(part: dict) -> None:
 
 
 def test_every_kind_of_surface_in_a_scene_can_be_made() -> None:
-    kinds = scene.Surface.model_fields["kind"].annotation.__args__
+    kinds = light.Surface.model_fields["kind"].annotation.__args__
     assert set(kinds) == set(dome.SURFACES)
     assert isinstance(surface({"kind": "flat", "apex": "1 m"}), Plane)
     assert isinstance(surface(SPHERE), Ellipsoid)

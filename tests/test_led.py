@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
-from skysim.led import FALLOFF, LOBES, Emitter, irradiance_e_s_m2, lit_s
+from skysim.led import FALLOFF, LOBES, Emitter, irradiance_e_s_m2
+from skysim.light import CosineLobe, Led, LobeTable
 from skysim.photometry import Band, led_strength_e_s_sr
-from skysim.scene import CosineLobe, Led, LobeTable
 
 ONE = np.ones(1)
 LAMBERT = Emitter()
@@ -128,57 +126,3 @@ def test_reference_electrons_of_a_bright_led() -> None:
     at_camera = irradiance_e_s_m2(strength, LAMBERT, ONE, ONE, 33 * 0.0254 * ONE)
     pupil_m2 = np.pi / 4 * (0.035 / 8) ** 2
     assert float(at_camera[0] * pupil_m2 * 0.85 * 1e-3) == pytest.approx(3.1e7, rel=0.02)  # two digits
-
-
-def sampled_lit_s(begin: float, end: float, period: float, start: float, on: float) -> float:
-    """The pulse train looked at in the middle of each of 20,000 equal slices."""
-    slices = 20_000
-    t = begin + (end - begin) * (np.arange(slices) + 0.5) / slices
-    return float(np.mean(np.mod(t - start, period) < on) * (end - begin))
-
-
-span = st.floats(0, 5)
-
-
-@settings(max_examples=200, derandomize=True, deadline=None)
-@given(span, span, st.floats(0.2, 3), st.floats(-2, 2), st.floats(0, 1))
-def test_lit_time_is_that_of_brute_force_sampling(
-    begin: float, length: float, period: float, start: float, duty: float
-) -> None:
-    exact = float(lit_s(begin, begin + length, period, start, duty * period))
-    # Each of the at most 2 (length / period + 2) edges falls within a slice, which is counted or not.
-    edges = 2 * (length / period + 2)
-    sampled = sampled_lit_s(begin, begin + length, period, start, duty * period)
-    assert exact == pytest.approx(sampled, abs=edges * length / 20_000 + 1e-12)
-
-
-@settings(max_examples=100, derandomize=True, deadline=None)
-@given(st.floats(0, 1000), st.integers(1, 40), st.floats(0, 1e-3), st.floats(0.01, 1))
-def test_whole_periods_shine_for_exactly_their_duty(
-    begin: float, periods: int, start: float, duty: float
-) -> None:
-    on = duty * 1e-3
-    lit = float(lit_s(begin, begin + periods * 1e-3, 1e-3, start, on))
-    assert lit == pytest.approx(periods * on, abs=1e-12)  # t of 1000 s is held to 1e-13 s
-
-
-@settings(max_examples=100, derandomize=True, deadline=None)
-@given(span, span, span, st.floats(0.1, 2), st.floats(0, 1))
-def test_lit_time_of_two_intervals_adds(a: float, b: float, c: float, start: float, duty: float) -> None:
-    first, middle, last = sorted((a, b, c))
-    whole = lit_s(first, last, 0.7, start, duty * 0.7)
-    parts = lit_s(first, middle, 0.7, start, duty * 0.7) + lit_s(middle, last, 0.7, start, duty * 0.7)
-    assert float(whole) == pytest.approx(float(parts), abs=1e-13)
-
-
-def test_a_star_always_shines() -> None:
-    edges = np.linspace(3.217, 3.931, 12)
-    shone = lit_s(edges[:-1], edges[1:], 1.0, 0.0, 1.0)
-    np.testing.assert_allclose(shone, np.diff(edges), rtol=0, atol=1e-14)  # rounding of the times
-
-
-def test_lit_time_broadcasts_edges_over_sources() -> None:
-    edges = np.linspace(0, 1e-3, 5)
-    lit = lit_s(edges[:-1, None], edges[1:, None], np.full(3, 1e-3), np.zeros(3), np.array([1e-3, 5e-4, 0]))
-    quarters = 2.5e-4 * np.array([[1, 1, 0], [1, 1, 0], [1, 0, 0], [1, 0, 0]])
-    np.testing.assert_allclose(lit, quarters, rtol=0, atol=1e-18)

@@ -6,6 +6,8 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from skysim.pulse import lit_moments_s
 
@@ -57,3 +59,49 @@ def test_a_million_pulses_cost_no_loop_and_lose_nothing() -> None:
     assert lit == pytest.approx(250.0, rel=1e-9)
     assert mean == pytest.approx(500 - 3.75e-4, abs=1e-7)
     assert spread == pytest.approx(1000 / np.sqrt(12), rel=1e-9)
+
+
+def lit_s(*interval_and_pulses: float) -> float:
+    """The lit time alone."""
+    return float(lit_moments_s(*interval_and_pulses)[0])
+
+
+def sampled_lit_s(begin: float, end: float, period: float, start: float, on: float) -> float:
+    """The pulse train looked at in the middle of each of 20,000 equal slices."""
+    slices = 20_000
+    t = begin + (end - begin) * (np.arange(slices) + 0.5) / slices
+    return float(np.mean(np.mod(t - start, period) < on) * (end - begin))
+
+
+span = st.floats(0, 5)
+
+
+@settings(max_examples=200, derandomize=True, deadline=None)
+@given(span, span, st.floats(0.2, 3), st.floats(-2, 2), st.floats(0, 1))
+def test_lit_time_is_that_of_brute_force_sampling(
+    begin: float, length: float, period: float, start: float, duty: float
+) -> None:
+    exact = float(lit_s(begin, begin + length, period, start, duty * period))
+    # Each of the at most 2 (length / period + 2) edges falls within a slice, which is counted or not.
+    edges = 2 * (length / period + 2)
+    sampled = sampled_lit_s(begin, begin + length, period, start, duty * period)
+    assert exact == pytest.approx(sampled, abs=edges * length / 20_000 + 1e-12)
+
+
+@settings(max_examples=100, derandomize=True, deadline=None)
+@given(st.floats(0, 1000), st.integers(1, 40), st.floats(0, 1e-3), st.floats(0.01, 1))
+def test_whole_periods_shine_for_exactly_their_duty(
+    begin: float, periods: int, start: float, duty: float
+) -> None:
+    on = duty * 1e-3
+    lit = float(lit_s(begin, begin + periods * 1e-3, 1e-3, start, on))
+    assert lit == pytest.approx(periods * on, abs=1e-12)  # t of 1000 s is held to 1e-13 s
+
+
+@settings(max_examples=100, derandomize=True, deadline=None)
+@given(span, span, span, st.floats(0.1, 2), st.floats(0, 1))
+def test_lit_time_of_two_intervals_adds(a: float, b: float, c: float, start: float, duty: float) -> None:
+    first, middle, last = sorted((a, b, c))
+    whole = lit_s(first, last, 0.7, start, duty * 0.7)
+    parts = lit_s(first, middle, 0.7, start, duty * 0.7) + lit_s(middle, last, 0.7, start, duty * 0.7)
+    assert float(whole) == pytest.approx(float(parts), abs=1e-13)

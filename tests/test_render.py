@@ -17,10 +17,10 @@ from skysim import render as rendering
 from skysim.camera import Camera
 from skysim.detector import Chip, expose
 from skysim.led import Emitter
+from skysim.light import CosineLobe
 from skysim.optics import Optics
 from skysim.photometry import SUN, Band, led_strength_e_s_sr, star_flux_e_s_m2
 from skysim.render import Window, render
-from skysim.scene import CosineLobe
 from skysim.types import Floats, Mount, Seen, Sources, Trajectory
 
 FLAT = Band.of(1.0)

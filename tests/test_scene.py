@@ -11,7 +11,7 @@ from typing import get_args
 import pytest
 from pydantic import ValidationError
 
-from skysim import camera, scene
+from skysim import camera, light, scene
 from skysim.background import BACKGROUNDS
 from skysim.dome import LAYOUTS, SURFACES
 from skysim.jitter import SPECTRA
@@ -504,12 +504,12 @@ def kinds(union: object) -> set[str]:
 
 
 def test_every_algorithm_that_the_schema_names_exists() -> None:
-    assert set(scene.Surface.model_fields["kind"].annotation.__args__) == set(SURFACES)
-    assert set(scene.PatchBoards.model_fields["kind"].annotation.__args__) == set(LAYOUTS)
+    assert set(light.Surface.model_fields["kind"].annotation.__args__) == set(SURFACES)
+    assert set(light.PatchBoards.model_fields["kind"].annotation.__args__) == set(LAYOUTS)
     assert kinds(camera.Psf) == set(PSFS)
     assert kinds(get_args(camera.Camera.model_fields["vignetting"].annotation)[0]) == set(VIGNETTING)
-    assert kinds(scene.Lobe) == set(LOBES)
-    assert kinds(scene.Glow) == set(BACKGROUNDS)
+    assert kinds(light.Lobe) == set(LOBES)
+    assert kinds(light.Glow) == set(BACKGROUNDS)
     assert kinds(scene.Jitter) == set(SPECTRA)
 
 
