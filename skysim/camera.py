@@ -15,7 +15,6 @@ from skysim.quantity import (
     NotNegative,
     Number,
     Part,
-    Positive,
     Share,
     Time,
     a_table,
@@ -24,6 +23,10 @@ from skysim.quantity import (
 from skysim.types import BadInput
 
 PRESETS = DATA / "cameras"
+
+Electrons = Annotated[Number, Field(ge=0, le=1e9)]
+Radial = Annotated[Number, Field(ge=-1e6, le=1e6)]
+Tangential = Annotated[Number, Field(ge=-0.1, le=0.1)]  # more would fold the image
 
 
 def focus_distance(value: Any) -> float:
@@ -137,15 +140,16 @@ Shutter = Annotated[GlobalShutter | RollingShutter | FrameTransfer | Interline, 
 class Particles(Part):
     """Ionising particles that leave straight tracks: cosmic rays, trapped protons.
 
-    per_cm2_s     : isotropic flux through the chip
+    per_cm2_s     : crossings of a square centimetre of the chip a second, from all sides: half of the omnidirectional
+                    flux
     depth_m       : thickness of the sensitive layer
     electrons_um  : most probable charge a micrometre of track (about 80 for a fast singly charged particle)
     diffusion_px  : standard deviation of the charge cloud
     """
 
-    per_cm2_s: NotNegative
-    depth_m: Annotated[Length, Field(gt=0)] = 10e-6
-    electrons_um: Positive = 80.0
+    per_cm2_s: Annotated[Number, Field(ge=0, le=1e12)]
+    depth_m: Annotated[Length, Field(gt=0, le=1e-3)] = 10e-6
+    electrons_um: Annotated[Number, Field(gt=0, le=1e6)] = 80.0
     diffusion_px: Annotated[Number, Field(ge=0, le=5)] = 0.3
 
 
@@ -163,29 +167,30 @@ class Detector(Part):
     read_noise_e, reset_noise_e : Gaussian, every pixel, every frame
     column_offset_e    : standard deviation of the columns' fixed offsets
     nonlinearity       : share of the signal missing at full well: e (1 - nonlinearity e / full_well)
-    noise              : false gives the expectation itself, unrounded
+    noise              : false gives the expectation itself, unrounded: fixed pattern and transfer loss in it, but no
+                         particles, and neither well, bend nor converter have an end
     """
 
     quantum_efficiency: Annotated[Number, Field(gt=0, le=1)] | str
     hardware_seed: Annotated[int, Field(ge=0)] = 0
     prnu: Annotated[Number, Field(ge=0, le=0.2)] = 0.0
-    dark_e_s: NotNegative = 0.0
+    dark_e_s: Electrons = 0.0
     dark_temperature_c: Annotated[Number, Field(ge=-150, le=150)] = 20.0
-    dark_doubling_c: Annotated[Number, Field(gt=0, le=50)] = 7.0
+    dark_doubling_c: Annotated[Number, Field(ge=1, le=50)] = 7.0
     temperature_c: Annotated[Number, Field(ge=-150, le=150)] | None = None
     dsnu: Annotated[Number, Field(ge=0, le=2)] = 0.0
     hot_pixels: Share = 0.0
-    hot_e_s: NotNegative = 0.0
+    hot_e_s: Electrons = 0.0
     particles: tuple[Particles, ...] = ()
-    full_well_e: Positive
+    full_well_e: Annotated[Number, Field(ge=1, le=1e9)]
     blooming: Literal["none", "column"] = "none"
     anti_blooming: Share = 0.0
     cti_parallel: Annotated[Number, Field(ge=0, le=1e-2)] = 0.0
     cti_serial: Annotated[Number, Field(ge=0, le=1e-2)] = 0.0
-    read_noise_e: NotNegative = 0.0
-    reset_noise_e: NotNegative = 0.0
-    column_offset_e: NotNegative = 0.0
-    gain_e_dn: Positive
+    read_noise_e: Electrons = 0.0
+    reset_noise_e: Electrons = 0.0
+    column_offset_e: Electrons = 0.0
+    gain_e_dn: Annotated[Number, Field(ge=1e-6, le=1e9)]
     offset_dn: NotNegative = 0.0
     nonlinearity: Annotated[Number, Field(ge=0, le=0.4)] = 0.0
     bits: Annotated[int, Field(ge=1, le=16)]
@@ -212,13 +217,13 @@ class Camera(Part):
 
     width_px: Annotated[int, Field(ge=16, le=20000)]
     height_px: Annotated[int, Field(ge=16, le=20000)]
-    pixel_m: Annotated[Length, Field(gt=0)]
-    focal_length_m: Annotated[Length, Field(gt=0)]
-    f_number: Positive
+    pixel_m: Annotated[Length, Field(ge=1e-7, le=1e-2)]
+    focal_length_m: Annotated[Length, Field(ge=1e-5, le=1e3)]
+    f_number: Annotated[Number, Field(ge=0.3, le=1e6)]
     focus_m: Annotated[float, BeforeValidator(focus_distance), Field(gt=0)] = math.inf
     transmission: Annotated[Number, Field(gt=0, le=1)] = 1.0
     vignetting: Annotated[TwoStops | VignettingTable, Field(discriminator="kind")] | None = None
-    distortion: tuple[Number, Number, Number, Number, Number] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    distortion: tuple[Radial, Radial, Tangential, Tangential, Radial] = (0.0, 0.0, 0.0, 0.0, 0.0)
     principal_point_px: tuple[Number, Number] | None = None
     psf: Psf = GaussianPsf()
     shutter: Shutter = GlobalShutter()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+import itertools
 import shlex
 import sys
 from collections.abc import Iterable, Iterator
@@ -45,6 +46,8 @@ def main() -> None:
         code = complain(str(error))
     except OSError as error:
         code = complain(f"{error.filename}: {error.strerror}" if error.filename else str(error))
+    except (MemoryError, OverflowError) as error:
+        code = complain(f"a value of the scene is too large for this machine: {' '.join(str(error).split())}")
     except (typer.Abort, KeyboardInterrupt):
         code = 130
     except Exception as error:
@@ -78,10 +81,11 @@ def run(
     loaded = load(scene, frames, seed, set_)
     lab = simulate.prepare(loaded)
     estimator = simulate.tracker(lab)
+    shots = begun(simulate.run(lab, estimator))
     folder = fresh(out or Path("out") / loaded.name)
     rows: list[Row] = []
     tally = score.Tally()
-    for shot in progress(simulate.run(lab, estimator), loaded.exposure.frames, loaded.title):
+    for shot in progress(shots, loaded.exposure.frames, loaded.title):
         io.write_frame(folder, shot.frame, shot.truth, loaded)
         rows.append(score.row(shot, loaded, lab.mount))
         tally.add(shot)
@@ -117,15 +121,15 @@ def render(
 
     loaded = load(scene, frames, seed, set_)
     lab = simulate.prepare(loaded)
+    shots = begun(simulate.shoot(lab, index) for index in range(loaded.exposure.frames))
     folder = fresh(out or Path("out") / loaded.name)
     written = []
-    for index in progress(range(loaded.exposure.frames), loaded.exposure.frames, loaded.title):
-        frame, truth = simulate.shoot(lab, index)
+    for frame, truth in progress(shots, loaded.exposure.frames, loaded.title):
         io.write_frame(folder, frame, truth, loaded)
         if preview:
             picture = report.preview(frame.image_dn, truth.seen)
-            io.write_image(folder / f"frame_{index:04d}.preview.png", picture)
-        written.append(str(folder / f"frame_{index:04d}.fits"))
+            io.write_image(folder / f"frame_{frame.index:04d}.preview.png", picture)
+        written.append(str(folder / f"frame_{frame.index:04d}.fits"))
     if json:
         print(io.to_json(written))
     else:
@@ -269,6 +273,12 @@ def load(name: str, frames: int | None, seed: int | None, sets: list[str] | None
     if seed is not None:
         overrides["seed"] = str(seed)
     return load_scene(name, overrides)
+
+
+def begun(items: Iterable[T]) -> Iterator[T]:
+    """The same items, the first of them made at once: what is wrong with it is told before old results are cleared."""
+    rest = iter(items)
+    return itertools.chain([next(rest)], rest)
 
 
 def fresh(folder: Path) -> Path:

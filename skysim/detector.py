@@ -91,12 +91,12 @@ def warmth(part: Detector) -> float:
 def expose(light_e: NDArray[Any], exposure_s: float, chip: Chip, rng: Generator) -> NDArray[Any]:
     """A frame from its light: charge, then electronics. Returns (H, W) uint16.
 
-    light_e : (H, W) float32 mean photo-electrons of a perfect pixel; it is used up, its array is worked in
+    light_e : (H, W) float32 mean photo-electrons of a perfect pixel, the shutter's `smear` in it; it is used up, its
+              array is worked in
     With noise off the frame is the expectation itself in digital numbers: of light_e's own type, neither rounded
     nor clipped, for tests of everything behind it.
     """
     part = chip.part
-    smear(light_e, exposure_s, chip.shutter)
     if not part.noise:
         return expectation(light_e, exposure_s, chip)
     counting, reading = noise.seeds(rng, len(light_e)), noise.seeds(rng, len(light_e))
@@ -115,9 +115,11 @@ def expose(light_e: NDArray[Any], exposure_s: float, chip: Chip, rng: Generator)
 
 
 def expectation(light_e: NDArray[Any], exposure_s: float, chip: Chip) -> NDArray[Any]:
-    """Mean digital numbers of a chip that neither fills nor bends."""
-    mean_e = light_e * chip.sensitivity + chip.dark_e_s * exposure_s + chip.column_offset_e
-    return mean_e / chip.part.gain_e_dn + chip.part.offset_dn
+    """Mean digital numbers of a chip that neither fills nor bends, and that no particle hits."""
+    part = chip.part
+    mean_e = light_e * chip.sensitivity + chip.dark_e_s * exposure_s
+    charge.transfer_loss(mean_e, part.cti_parallel, part.cti_serial)
+    return (mean_e + chip.column_offset_e) / part.gain_e_dn + part.offset_dn
 
 
 def smear(light_e: NDArray[Any], exposure_s: float, shutter: Shutter) -> None:
@@ -247,13 +249,14 @@ def saturation_dn(part: Detector) -> float:
     """
     well_e = part.full_well_e - 3 * hypot(part.read_noise_e, part.reset_noise_e)
     well_dn = well_e * (1 - part.nonlinearity * well_e / part.full_well_e) / part.gain_e_dn + part.offset_dn
-    return float(min(well_dn, 2**part.bits - 1))
+    return float(min(max(well_dn, 0.0), 2**part.bits - 1))
 
 
 def judge(seen: Seen, light_e: NDArray[Any], exposure_s: float, chip: Chip) -> Seen:
     """Which sources are expected to saturate, and how far each stands out of the noise.
 
-    light_e : (H, W) mean photo-electrons of the whole frame, before `expose` uses it up
+    light_e : (H, W) mean photo-electrons of the whole frame, smear included, before `expose` uses it up
+    Both are of the light that falls: what a full well or the amplifier's bend then hides is not taken off.
     Saturated is a source in whose brightest pixel the expectation reaches `saturation_dn`. The signal to noise is
     the CCD equation's over the noise-equivalent area of its image, with all else that falls on its brightest
     pixel as background, and the converter's rounding among the read noise.

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from skysim import light
-from skysim.photometry import Band, led_strength_e_s_sr
+from skysim.photometry import Band, led_strength_e_s_sr, radiant_strength_e_s_sr
 from skysim.types import BadInput, Floats, Sources
 
 HOLES = 9  # on a patch board; LED number = board * HOLES + hole
@@ -136,7 +136,10 @@ def patch_boards(part: light.PatchBoards, inside: Surface, led: light.Led, band:
     count = len(board)
     level = rng.choice(part.pwm_levels, count)
     scatter = np.exp(led.scatter * rng.standard_normal(count))
-    strength = led_strength_e_s_sr(led.intensity_cd, led.spectrum, band) * scatter
+    if led.intensity_cd is not None:
+        strength = led_strength_e_s_sr(led.intensity_cd, led.spectrum, band) * scatter
+    else:
+        strength = radiant_strength_e_s_sr(led.radiant_intensity_w_sr or 0.0, led.spectrum, band) * scatter
     return Sources(
         id=(board * HOLES + hole).astype(np.int64),
         place=np.column_stack([place, np.ones(count)]),

@@ -47,7 +47,7 @@ class Shelf(NamedTuple):
 
 
 SHELF_BYTES = 1 << 27
-MOST_BLUR_PX = 500.0  # larger discs of confusion are no images, and their tables are large
+MOST_PX = 500.0  # larger discs are no images, and their tables are large
 
 
 @lru_cache(maxsize=16)
@@ -76,10 +76,16 @@ def images(
     extra = field_sigma_px(camera.psf, camera, place)
     emitter = np.where(near, radius_m / distance_m, 0.0) * camera.focal_px
     blur = blur_radius_px(camera, np.where(near, distance_m * np.maximum(cos_field, 1e-6), np.inf))
-    if blur.size and blur.max() > MOST_BLUR_PX:
+    size = np.array([camera.width_px, camera.height_px])
+    aside = np.maximum(np.maximum(-place, place - size), 0).max(axis=1)
+    emitter, blur = (
+        np.where(aside < MOST_PX, disc, 0.0) for disc in (emitter, blur)
+    )  # no image of what is far out
+    largest = (emitter + blur).max(initial=0.0)
+    if largest > MOST_PX:
         raise BadInput(
-            f"camera.focus: a source is out of focus by a disc of radius {blur.max():.0f} px;"
-            f" allowed: up to {MOST_BLUR_PX:.0f} px"
+            f"camera.focus: a source's image, {blur.max():.0f} px out of focus, has a radius of {largest:.0f} px;"
+            f" allowed: up to {MOST_PX:.0f} px"
         )
     steps = np.rint(np.column_stack([extra, emitter, blur]) / QUANTUM_PX).astype(np.int64)
     gaussian = camera.psf.kind == "gaussian"
@@ -117,6 +123,11 @@ def stock(held: Shelf, camera: Camera, keys: list[tuple[int, ...]]) -> None:
         held.spans.append((begin, begin + table.size, *sizes))
         tables.append(table.ravel())
         begin += table.size
+        if 4 * begin > 2 * SHELF_BYTES:
+            raise BadInput(
+                f"camera.psf: images of different sizes take more than {2 * SHELF_BYTES >> 20} MB;"
+                " allowed: a smaller table, or corner_sigma_px: 0"
+            )
     if len(tables) > 1:
         held.tables[0] = np.concatenate(tables)
 

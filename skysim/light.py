@@ -13,6 +13,7 @@ from skysim.quantity import (
     NotNegative,
     Number,
     Part,
+    RadiantIntensity,
     SemiAxis,
     Share,
     Time,
@@ -84,6 +85,8 @@ class LobeTable(Part):
     @model_validator(mode="after")
     def a_table(self) -> LobeTable:
         a_table(self.angle_deg, self.intensity, "intensity")
+        if self.angle_deg[0] != 0 or abs(self.intensity[0] - 1) > 1e-6:
+            raise ValueError("the table does not begin with an intensity of 1 at 0 deg")
         return self
 
 
@@ -91,9 +94,10 @@ Lobe = Annotated[CosineLobe | LobeTable, Field(discriminator="kind")]
 
 
 class Led(Part):
-    """One kind of LED, for the whole dome."""
+    """One kind of LED, for the whole dome: so bright along its normal, in candela or in watts a steradian."""
 
-    intensity_cd: Annotated[Intensity, Field(gt=0)]
+    intensity_cd: Annotated[Intensity, Field(gt=0)] | None = None
+    radiant_intensity_w_sr: Annotated[RadiantIntensity, Field(gt=0)] | None = None
     disc_diameter_m: Annotated[Length, Field(gt=0)]
     falloff: str = "inverse_square"
     lobe: Lobe = CosineLobe()
@@ -107,6 +111,12 @@ class Led(Part):
         from skysim.led import FALLOFF
 
         return one_of(value, FALLOFF)
+
+    @model_validator(mode="after")
+    def one_brightness(self) -> Led:
+        if (self.intensity_cd is None) == (self.radiant_intensity_w_sr is None):
+            raise ValueError("an LED takes either intensity or radiant_intensity")
+        return self
 
 
 class Dome(Part):
@@ -130,7 +140,7 @@ class UniformGlow(Part):
     """The same everywhere: e_s electrons a second in every pixel (a light leak, a lit room)."""
 
     kind: Literal["uniform"]
-    e_s: NotNegative
+    e_s: Annotated[Number, Field(ge=0, le=1e12)]
 
 
 class SkyGlow(Part):

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from skysim.camera import Particles
-from skysim.types import Floats
+from skysim.types import BadInput, Floats
 
 STEP_PX = 0.25
 REACH_SIGMA = 6.5  # a Gaussian's share beyond is 1e-10
@@ -20,6 +20,7 @@ REACH_SIGMA = 6.5  # a Gaussian's share beyond is 1e-10
 # 80 most probable ones (`assumed`, for a fast singly charged particle). Layers of a few micrometres straggle more.
 WIDTH = 0.06
 MOST_ASLANT = 100.0  # tangent of the steepest angle from the normal; 1e-4 of an isotropic flux is beyond
+MOST_TRACKS = 1_000_000
 
 TRACK = np.dtype(
     [
@@ -64,12 +65,19 @@ def tracks_of(
     side; an isotropic flux of J through a sphere of 1 cm^2 section gives J / 2. They come from all directions alike,
     but a plate is seen foreshortened: p(theta) = 2 sin(theta) cos(theta) = sin(2 theta) from its normal, so
     cos^2(theta) is uniform. The way through is depth / cos(theta). Its charge is Moyal's law (1955, Phil. Mag. 46,
-    263) about the most probable electrons_um times the length, of scale WIDTH times that.
+    263) about the most probable electrons_um times the length, of scale WIDTH times that. More than MOST_TRACKS are
+    refused (BadInput).
     """
     height, width = shape
     margin = MOST_ASLANT * part.depth_m / pixel_m  # also those that go in beside the frame and come to it
     area_cm2 = (width + 2 * margin) * (height + 2 * margin) * pixel_m**2 * 1e4
-    count = rng.poisson(part.per_cm2_s * area_cm2 * exposure_s)
+    expected = part.per_cm2_s * area_cm2 * exposure_s
+    if expected > MOST_TRACKS:
+        raise BadInput(
+            f"camera.detector.particles: {expected:.3g} tracks come near the chip in an exposure;"
+            f" allowed: {MOST_TRACKS:,}"
+        )
+    count = rng.poisson(expected)
     made = np.zeros(count, TRACK)
     cosine = np.sqrt(rng.uniform(1 / (1 + MOST_ASLANT**2), 1, count))
     azimuth = rng.uniform(0, 2 * np.pi, count)

@@ -249,26 +249,40 @@ def sky_radiance_e_s_m2_sr(mag_arcsec2: float | Floats, band: Band) -> Floats:
 
 
 def led_strength_e_s_sr(intensity_cd: float | Floats, spectrum: Spectrum, band: Band) -> Floats:
-    """Candela to photo-electrons: lumens a steradian, over lumens a watt, over joules a photon, by efficiency.
+    """Candela to photo-electrons: lumens a steradian, over lumens a watt, by electrons a joule.
 
     intensity_cd : any shape, along the LED's normal
     spectrum     : "white" (data/led/white.csv, 304 lm/W), or the wavelength in m of a narrow line
-    Returns photo-electrons s^-1 sr^-1. With the radiant intensity's shape S: I_v ∫ S λ/(h c) QE dλ / (683 lm/W
-    ∫ S V dλ), V the eye's. Raises BadInput for a line that the eye does not see: it has no candelas.
+    Returns photo-electrons s^-1 sr^-1. Raises BadInput for a line that the eye does not see: it has no candelas.
     """
+    watts_sr = np.asarray(intensity_cd, dtype=float) / lumens_a_watt(spectrum)
+    return radiant_strength_e_s_sr(watts_sr, spectrum, band)
+
+
+def radiant_strength_e_s_sr(intensity_w_sr: float | Floats, spectrum: Spectrum, band: Band) -> Floats:
+    """Radiant intensity to photo-electrons s^-1 sr^-1: I_e ∫ S λ/(h c) QE dλ / ∫ S dλ, S the spectrum's shape."""
+    if isinstance(spectrum, str):
+        white = _read(DATA / "led" / "white.csv")
+        electrons = band.integral(lambda wavelength_m: white.at(wavelength_m) * wavelength_m / HC_J_M)
+        electrons_a_joule = electrons / white.integral(np.ones_like)
+    else:
+        electrons_a_joule = band.at(spectrum) * spectrum / HC_J_M
+    return np.asarray(np.asarray(intensity_w_sr, dtype=float) * electrons_a_joule)
+
+
+def lumens_a_watt(spectrum: Spectrum) -> float:
+    """Luminous efficacy of radiation: 683 lm/W ∫ S V dλ / ∫ S dλ, V the eye's. Raises BadInput where it is nothing."""
     eye = _read(DATA / "bands" / "photopic.csv")
     if isinstance(spectrum, str):
         white = _read(DATA / "led" / "white.csv")
-        lumens = LUMENS_A_WATT * eye.integral(white.at)
-        electrons = band.integral(lambda wavelength_m: white.at(wavelength_m) * wavelength_m / HC_J_M)
-    else:
-        lumens, electrons = LUMENS_A_WATT * eye.at(spectrum), band.at(spectrum) * spectrum / HC_J_M
-        if lumens == 0:
-            allowed = "{:g} to {:g} nm".format(*(eye.wavelength_m[[0, -1]] * 1e9))
-            raise BadInput(
-                f"light.led.spectrum: {spectrum * 1e9:g} nm has no intensity in candela; allowed: {allowed}"
-            )
-    return np.asarray(np.asarray(intensity_cd, dtype=float) * electrons / lumens)
+        return float(LUMENS_A_WATT * eye.integral(white.at) / white.integral(np.ones_like))
+    if not eye.at(spectrum):
+        allowed = "{:g} to {:g} nm".format(*(eye.wavelength_m[[0, -1]] * 1e9))
+        raise BadInput(
+            f"light.led.spectrum: {spectrum * 1e9:g} nm has no intensity in candela; allowed: {allowed},"
+            " or radiant_intensity"
+        )
+    return float(LUMENS_A_WATT * eye.at(spectrum))
 
 
 def share_within(side_px: float, sigma_px: float) -> float:

@@ -20,7 +20,7 @@ ROOT = Path(__file__).resolve().parents[1]
 DATA = ROOT / "data"
 
 # Only what a quantity parser fills: `dark_e_s` and `rate_deg_s` are bare numbers and keep their unit.
-SI_SUFFIX = re.compile(r"(?<!_deg)(?<!_e)(?<!^e)(?<!_cm2)_(m|s|kg|kg_m2|cd|nm)$")
+SI_SUFFIX = re.compile(r"(?<!_deg)(?<!_e)(?<!^e)(?<!_cm2)_(m|s|kg|kg_m2|cd|w_sr|nm)$")
 
 
 def quantity(si_unit: str, what: str, examples: str) -> Callable[[Any], float]:
@@ -55,6 +55,7 @@ Time = Annotated[Number, BeforeValidator(quantity("s", "time", '"40 ms" or "1000
 Mass = Annotated[Number, BeforeValidator(quantity("kg", "mass", '"80 kg"'))]
 Inertia = Annotated[Number, BeforeValidator(quantity("kg m2", "moment of inertia", '"6.0 kg m2"'))]
 Intensity = Annotated[Number, BeforeValidator(quantity("cd", "luminous intensity", '"7.7 mcd"'))]
+RadiantIntensity = Annotated[Number, BeforeValidator(quantity("W sr-1", "radiant intensity", '"3 mW/sr"'))]
 Torque = Annotated[Number, BeforeValidator(quantity("N m", "torque", '"0.5 N m"'))]
 SemiAxis = Annotated[Length, Field(gt=0)]
 Spin = Annotated[Number, Field(ge=-360, le=360)]

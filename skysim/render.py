@@ -13,11 +13,11 @@ from skysim.led import Emitter, irradiance_e_s_m2
 from skysim.optics import Optics
 from skysim.pulse import lit_moments_s
 from skysim.stamp import add_gaussian, add_grid, add_round
-from skysim.types import Floats, Mount, Seen, Sources, Trajectory
+from skysim.types import BadInput, Floats, Mount, Seen, Sources, Trajectory
 
 STEP = 1.3  # of the image's sharpest feature (its sigma): how far it may move in one piece of the exposure
 MAX_PIECES = 100_000
-KNOTS = (9, 1025)  # fewest and most poses of an exposure
+FEWEST, MOST = 9, 16_385  # poses of an exposure
 SHORT = 0.4  # strides up to which a path is one piece: 1e-4 of the peak
 STILL_PX = 1e-3  # an image that moves less stands still
 AT_ONCE = 1 << 20  # pixels of patches in one go, or as many as the frame has
@@ -108,10 +108,18 @@ def render(
 
 
 def moments(open_s: float, close_s: float, trajectory: Trajectory) -> Floats:
-    """Even moments, as dense as the attitude's own samples; an odd number, so that one is in the middle."""
-    sample_s = np.diff(trajectory.t_s[:2])[0] if len(trajectory.t_s) > 1 else np.inf
-    count = int(np.clip(np.ceil((close_s - open_s) / sample_s) + 1, *KNOTS))
-    return np.linspace(open_s, close_s, count | 1)
+    """Even moments, as dense as the attitude's own samples; an odd number, so that one is in the middle.
+
+    Raises BadInput for more samples than memory should hold: to leave some out could leave out the jitter.
+    """
+    first, last = np.searchsorted(trajectory.t_s, (open_s, close_s))
+    count = max(int(last - first) + 1, FEWEST) | 1
+    if count > MOST:
+        raise BadInput(
+            f"exposure.time: {close_s - open_s:g} s holds {count} samples of the attitude; allowed: {MOST},"
+            " a shorter exposure or slower jitter"
+        )
+    return np.linspace(open_s, close_s, count)
 
 
 def poses(trajectory: Trajectory, mount: Mount, t_s: Floats) -> Poses:
@@ -152,7 +160,7 @@ def look(sources: Sources, optics: Optics, poses: Poses) -> tuple[Floats, Floats
 
 def in_view(sources: Sources, optics: Optics, poses: Poses) -> NDArray[np.int64]:
     """Rows of the sources within the field's circle from any of these poses, with a quarter more for images that
-    reach in from outside."""
+    reach in from outside, and half of the largest turn between two poses for what passes between them."""
     sight, camera_m = poses.cam_from_lab[:, 2], poses.camera_m
     place, near = sources.place[:, :3], sources.place[:, 3:]  # near is 1 for an LED, 0 for a star
     along = place @ sight.T - near * np.sum(camera_m * sight, axis=1)
@@ -161,7 +169,8 @@ def in_view(sources: Sources, optics: Optics, poses: Poses) -> NDArray[np.int64]
         - 2 * near * (place @ camera_m.T)
         + near * np.sum(camera_m**2, axis=1)
     )
-    edge = np.cos(min(1.25 * optics.field_rad + 0.02, np.pi))
+    turn = np.arccos(np.clip(np.sum(sight[1:] * sight[:-1], axis=1), -1, 1)).max(initial=0.0)
+    edge = np.cos(min(1.25 * optics.field_rad + 0.02 + turn / 2, np.pi))
     return np.flatnonzero((along > edge * np.sqrt(square)).any(axis=1))
 
 

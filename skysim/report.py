@@ -52,7 +52,7 @@ def annotate(
 
 
 def preview(image: NDArray, seen: Seen) -> NDArray[np.uint8]:
-    """The stretched frame with every true source ticked at mid-exposure and the brightest forty named.
+    """The stretched frame with every true source ticked where its light lies and the brightest forty named.
 
     Blue for what the detector can measure, red for what is expected to saturate. A small frame is doubled.
     """
@@ -61,7 +61,7 @@ def preview(image: NDArray, seen: Seen) -> NDArray[np.uint8]:
     picture = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_NEAREST)
     size = max(8, min(picture.shape[:2]) // 70)
     named = set(np.argsort(-seen.electrons)[:40].tolist())
-    for n, (x, y) in enumerate(places(seen.xy_px, scale)):
+    for n, (x, y) in enumerate(places(seen.flux_xy_px, scale)):
         colour = FOUND_BGR if seen.saturated[n] else TRUTH_BGR
         ticks(picture, x, y, size, colour)
         if n in named:

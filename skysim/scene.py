@@ -161,7 +161,7 @@ class Motion(Part):
 class Exposure(Part):
     """When the shutter opens."""
 
-    time_s: Annotated[Time, Field(gt=0)]
+    time_s: Annotated[Time, Field(ge=1e-6)]
     rate_hz: Annotated[Number, Field(gt=0)]
     frames: Annotated[int, Field(ge=1)]
     first_s: Annotated[Time, Field(ge=0)] = 0.0
@@ -210,6 +210,12 @@ class Scene(Part):
         if sky != isinstance(self.motion.start, Pointing):
             wanted = "ra_deg, dec_deg, roll_deg" if sky else "roll_deg, pitch_deg, yaw_deg"
             raise ValueError(f"motion.start: light of kind {self.light.kind} takes {wanted}")
+        read_s = getattr(self.camera.shutter, "row_time_s", 0.0) * (self.camera.height_px - 1)
+        if read_s > 1 / self.exposure.rate_hz:
+            raise ValueError(
+                f"camera.shutter: reading takes {read_s:g} s, longer than the frame period"
+                f" {1 / self.exposure.rate_hz:g} s"
+            )
         return self
 
 

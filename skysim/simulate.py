@@ -23,7 +23,7 @@ from estimator.types import Attitude, BadImage, Centroids
 from skysim import background, catalogue, control, dome, jitter, sky, world
 from skysim.camera import Camera as CameraPart
 from skysim.camera import RollingShutter
-from skysim.detector import Chip, expose, judge, saturation_dn
+from skysim.detector import Chip, expose, judge, saturation_dn, smear
 from skysim.led import Emitter
 from skysim.optics import Optics
 from skysim.photometry import Band
@@ -140,6 +140,7 @@ def shoot(lab: Lab, index: int, clock: Clock | None = None) -> tuple[Frame, Trut
     glow = background.glow_map(scene.background, lab.optics, cam_from_lab, lab.band)
     background.fill(light_e, glow, when.exposure_s)
     seen = render(light_e, lab.sources, lab.optics, lab.trajectory, lab.mount, when, lab.emitter)
+    smear(light_e, when.exposure_s, lab.chip.shutter)
     seen = judge(seen, light_e, when.exposure_s, lab.chip)
     clock.lap("render")
     image = expose(light_e, when.exposure_s, lab.chip, rng(scene.seed, "detector", index))

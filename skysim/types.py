@@ -110,15 +110,15 @@ class Seen:
     """The truth of every source that put light on the frame.
 
     id           : (N,)
-    xy_px        : (N, 2) pixel at mid-exposure
+    xy_px        : (N, 2) pixel at mid-exposure, in a rolling shutter the middle row's
     flux_xy_px   : (N, 2) flux-weighted mean pixel over the exposure
     electrons    : (N,) mean photo-electrons that fell on the chip
     peak_e       : (N,) mean electrons in the source's brightest pixel
-    streak_px    : (N,) path length over the exposure
+    streak_px    : (N,) path length over the exposure, in a rolling shutter the first row's
     area_px      : (N,) noise-equivalent area (sum s)^2 / sum s^2 of its image
     peak_xy      : (N, 2) the brightest pixel
     saturated    : (N,) whether that pixel is expected full
-    snr          : (N,) signal to noise of its electrons over that area
+    snr          : (N,) signal to noise of its electrons over that area, as if no well were full
     """
 
     id: NDArray[np.int64]

@@ -100,6 +100,19 @@ def test_render_leaves_frames_with_their_truth_and_nothing_else(rendered: Path) 
     assert {p.name for p in rendered.iterdir()} == {"frame_0000.fits", "frame_0000.png", "frame_0000.ecsv"}
 
 
+def test_what_only_the_first_frame_shows_to_be_wrong_costs_no_earlier_results(
+    skysim: Skysim, tmp_path: Path
+) -> None:
+    words = ["render", "afit_simsat", "--frames", "1", "--out", str(tmp_path)]
+    assert skysim(*words).code == 0
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    refused = skysim(*words, "--set", "camera.focus=infinity", "--set", "camera.f_number=0.3")
+    assert refused.code == 2
+    assert refused.err.startswith("skysim: camera.focus: ")
+    assert refused.err.count("\n") == 1
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
 def test_a_preview_is_a_picture_beside_the_frame(skysim: Skysim, tmp_path: Path) -> None:
     ran = skysim("render", "shefex2", "--frames", "1", "--preview", "--out", str(tmp_path))
     assert ran.code == 0
@@ -189,7 +202,7 @@ def test_an_option_overrides_the_scene(skysim: Skysim, tmp_path: Path) -> None:
         ),
         (
             ["shefex2", "--set", "exposure.time=-40 ms"],
-            "'-40 ms' is not allowed; it should be greater than 0",
+            "'-40 ms' is not allowed; it should be greater than or equal to 0.000001",
         ),
         (["shefex2", "--set", "exposure.time=nan s"], "nan is not a finite number"),
         (

@@ -252,6 +252,8 @@ def test_transfers_leave_charge_behind_the_star() -> None:
     assert made[31, 10] == pytest.approx(1e4 * lost, abs=4 * error * lost + 0.3)
     assert made[30, 10] == pytest.approx(1e4 * (1 - 1e-3) ** 31, abs=4 * error)
     assert made.sum() == pytest.approx(1e4, abs=4 * error + 5)
+    quiet = expose(spot(1e4), chip((64, 32), cti_parallel=1e-3, noise=False)) - 1000
+    assert quiet[31, 10] == pytest.approx(1e4 * lost, rel=1e-9)  # the expectation knows of it
 
 
 def test_particles_add_their_tracks() -> None:
@@ -278,7 +280,9 @@ def test_particles_add_their_tracks() -> None:
 )
 def test_a_shifted_frame_smears_its_columns(shutter: dict[str, Any], share: float) -> None:
     quiet = chip((64, 32), shutter=shutter, noise=False, offset_dn=0)
-    made = expose(spot(1e6), quiet)
+    light_e = spot(1e6)
+    detector.smear(light_e, 0.05, quiet.shutter)
+    made = expose(light_e, quiet)
     others = np.delete(made[:, 10], 30)
     np.testing.assert_allclose(others, 1e6 * share, rtol=1e-6, atol=0)
     assert not np.delete(made, 10, axis=1).any()

@@ -75,7 +75,7 @@ def test_a_measured_image_is_a_grid(tmp_path: Any) -> None:
 def test_a_full_shelf_is_cleared_and_gives_the_same_images(monkeypatch: pytest.MonkeyPatch) -> None:
     first = shapes(camera(), [1e-3], [True], [1.0])
     table = first.tables[slice(*first.table[0, :2])].copy()
-    monkeypatch.setattr("skysim.images.SHELF_BYTES", 1)
+    monkeypatch.setattr("skysim.images.SHELF_BYTES", first.tables.nbytes - 1)
     again = shapes(camera(), [1e-3], [True], [1.0])
     np.testing.assert_array_equal(again.tables[slice(*again.table[0, :2])], table)
 

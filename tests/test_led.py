@@ -74,7 +74,8 @@ def test_a_table_of_cosines_is_lambert_s_lobe() -> None:
 @pytest.mark.parametrize("seed", range(5))
 def test_a_measured_lobe_that_falls_falls_in_between(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    angle_deg, intensity = np.sort(rng.uniform(0, 90, 7)), np.sort(rng.uniform(0, 1, 7))[::-1]
+    angle_deg = np.append(0, np.sort(rng.uniform(1, 90, 6)))
+    intensity = np.append(1, np.sort(rng.uniform(0, 1, 6))[::-1])
     emitter = measured(angle_deg.tolist(), intensity.tolist())
     made = LOBES["table"](emitter.lobe, np.cos(np.radians(np.linspace(0, 89, 400))))
     assert np.all(np.diff(made) <= 1e-15)

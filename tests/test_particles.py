@@ -8,6 +8,7 @@ from scipy import stats
 
 from skysim.camera import Particles
 from skysim.particles import MOST_ASLANT, STEP_PX, TRACK, deposit, hit, tracks_of
+from skysim.types import BadInput
 
 PIXEL_M = 10e-6
 SHAPE = (200, 300)
@@ -156,3 +157,9 @@ def test_the_same_stream_draws_the_same_tracks() -> None:
         hit(image, 0.1, PIXEL_M, (protons(),), np.random.default_rng(seed))
     np.testing.assert_array_equal(first, again)
     assert not np.array_equal(first, other)
+
+
+def test_more_tracks_than_memory_should_hold_are_refused() -> None:
+    image = np.zeros((64, 64), np.float32)
+    with pytest.raises(BadInput, match=r"camera\.detector\.particles: .* tracks .*; allowed: 1,000,000"):
+        hit(image, 1e6, PIXEL_M, (protons(per_cm2_s=1e6),), np.random.default_rng(1))

@@ -18,6 +18,8 @@ from skysim.photometry import (
     instrumental_mag,
     known_colours,
     led_strength_e_s_sr,
+    lumens_a_watt,
+    radiant_strength_e_s_sr,
     share_within,
     sky_radiance_e_s_m2_sr,
     snr,
@@ -299,8 +301,24 @@ def read_columns(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize("wavelength_m", [340e-9, 900e-9])
 def test_light_that_nobody_sees_has_no_candelas(wavelength_m: float) -> None:
-    with pytest.raises(BadInput, match=r"^light\.led\.spectrum: .* candela; allowed: 360 to 830 nm$"):
+    with pytest.raises(
+        BadInput, match=r"^light\.led\.spectrum: .* candela; allowed: 360 to 830 nm, or radiant_intensity$"
+    ):
         led_strength_e_s_sr(0.1, wavelength_m, ALL)
+
+
+def test_a_watt_is_a_watt_by_whichever_name() -> None:
+    """A lamp of so many candela is one of so many watts a steradian by its own luminous efficacy."""
+    for spectrum in ("white", 555e-9, 630e-9):
+        watts = 0.2 / lumens_a_watt(spectrum)
+        by_eye = led_strength_e_s_sr(0.2, spectrum, Band.of("cmos"))
+        assert radiant_strength_e_s_sr(watts, spectrum, Band.of("cmos")) == pytest.approx(by_eye, rel=1e-12)
+    assert lumens_a_watt(555e-9) == pytest.approx(683, rel=1e-5)
+
+
+def test_an_infrared_lamp_gives_one_electron_a_photon_of_a_perfect_chip() -> None:
+    photon_j = 6.62607015e-34 * 299792458 / 850e-9
+    assert radiant_strength_e_s_sr(3e-3, 850e-9, Band.of(1.0)) == pytest.approx(3e-3 / photon_j, rel=1e-9)
 
 
 def test_ec655_collects_the_reference_s_electrons() -> None:

@@ -49,7 +49,7 @@ def test_the_commands_leave_what_the_readme_says(folder):
     assert ran == frames | {"solutions.ecsv", "annotated.png", "report.html"}
     # `render` came after `run` and cleared what the latter said of other frames.
     rendered = {path.name for path in (folder / "out" / "shefex2").iterdir()}
-    assert rendered == {"frame_0000.fits", "frame_0000.png", "frame_0000.ecsv"}
+    assert rendered == {f"frame_0000.{suffix}" for suffix in ("fits", "png", "ecsv", "preview.png")}
 
 
 def test_the_camera_block_is_a_camera_that_sees(folder):

@@ -21,7 +21,7 @@ from skysim.light import CosineLobe
 from skysim.optics import Optics
 from skysim.photometry import SUN, Band, led_strength_e_s_sr, star_flux_e_s_m2
 from skysim.render import Window, render
-from skysim.types import Floats, Mount, Seen, Sources, Trajectory
+from skysim.types import BadInput, Floats, Mount, Seen, Sources, Trajectory
 
 FLAT = Band.of(1.0)
 
@@ -375,6 +375,21 @@ def test_a_star_that_sweeps_through_from_outside_the_field_is_not_missed() -> No
     assert len(seen.id) == 1
 
 
+def test_stars_that_cross_the_field_between_two_looks_are_not_missed() -> None:
+    """A whole turn in a second, looked at nine times: every star of the equator gives the same."""
+    around = np.radians(np.arange(0, 360, 7.5))
+    stars = [light(place=[[np.sin(a), 0, np.cos(a), 0]]) for a in around]
+    ring = Sources(*(np.concatenate([getattr(s, f) for s in stars]) for f in Sources.__slots__))
+    t = np.linspace(0, 3, 3001)
+    spin = Trajectory(
+        t, Rotation.from_rotvec(np.outer(t, [0, 2 * np.pi, 0])), np.tile([0, 2 * np.pi, 0], (len(t), 1))
+    )
+    lens = lens_of(pixel="250 um", psf={"kind": "gaussian", "sigma_px": 0.7})
+    _, seen = draw(ring, Window(1.0, 1.0), spin, lens)
+    assert len(seen.id) == len(around)
+    np.testing.assert_allclose(seen.electrons, np.median(seen.electrons), rtol=0.02, atol=0)
+
+
 # LEDs
 
 
@@ -520,6 +535,15 @@ def test_a_step_of_the_attitude_draws_two_stars() -> None:
     image, _ = shot(star_at(41.5, 23.5), leap)
     assert image[:, 37:47].sum() == pytest.approx(0.5, abs=2e-3)
     assert image[:, 17:27].sum() == pytest.approx(0.5, abs=2e-3)
+
+
+def test_an_exposure_of_too_many_attitude_samples_is_refused() -> None:
+    t = np.linspace(0, 3, 30_000)
+    fine = Trajectory(t, Rotation.identity(len(t)), np.zeros((len(t), 3)))
+    with pytest.raises(
+        BadInput, match=r"exposure\.time: 2 s holds \d+ samples of the attitude; allowed: 16385"
+    ):
+        draw(light(), Window(0.1, 2.0), fine)
 
 
 # Lens

@@ -134,7 +134,7 @@ def test_an_override_may_add_a_section() -> None:
         (
             "exposure.time",
             "-1 ms",
-            "exposure.time: '-1 ms' is not allowed; it should be greater than 0 (--set)",
+            "exposure.time: '-1 ms' is not allowed; it should be greater than or equal to 0.000001 (--set)",
         ),
         (
             "exposure.frames",
@@ -206,7 +206,7 @@ def test_a_bad_override_is_one_line_and_blamed_on_the_option(key: str, value: st
         (
             'time: "10 ms"',
             'time: "-10 ms"',
-            "exposure.time: '-10 ms' is not allowed; it should be greater than 0",
+            "exposure.time: '-10 ms' is not allowed; it should be greater than or equal to 0.000001",
         ),
         ('time: "10 ms"', 'time: "nan ms"', "exposure.time: nan is not a finite number"),
         ('time: "10 ms"', 'time: "1e400 ms"', "exposure.time: inf is not a finite number"),
@@ -340,6 +340,18 @@ def test_a_kind_that_is_none_is_answered_with_those_that_are(
         ("camera.psf", "{sigma_px: 0.5, fwhm_px: 2}", "camera.psf: kind is missing"),
         ("camera.psf", "{kind: airy, wavelength: 550}", "camera.psf.wavelength: 550 has no unit"),
         ("camera.shutter", "{kind: frame_transfer}", "camera.shutter.row_time: missing"),
+        (
+            "camera.shutter",
+            "{kind: rolling, row_time: 1 ms}",
+            "camera.shutter: reading takes 1.199 s, longer than the frame period 0.5 s",
+        ),
+        ("light.led.intensity", "null", "light.led: an LED takes either intensity or radiant_intensity"),
+        ("light.led.radiant_intensity", "3 mW/sr", "light.led: an LED takes either intensity or radiant_"),
+        (
+            "light.led.lobe",
+            "{kind: table, angle_deg: [0, 60], intensity: [20, 1]}",
+            "light.led.lobe: the table does not begin with an intensity of 1 at 0 deg",
+        ),
         ("camera.shutter", "{kind: global, row_time: '3 us'}", "camera.shutter.row_time: unknown key"),
         ("camera.vignetting", "{kind: two_stops, cutoff_deg: 90}", "camera.vignetting.cutoff_deg: 90 is not"),
         (

@@ -15,6 +15,8 @@ from skysim.types import BadInput, Truth
 # Without noise a frame is the expectation in float64; without fixed pattern and with one exposure for all rows, a
 # perfect chip's.
 PERFECT_CHIP = {
+    "camera.detector.cti_parallel": "0",
+    "camera.detector.cti_serial": "0",
     "camera.shutter": "{kind: global}",
     "camera.detector.noise": "false",
     "camera.detector.prnu": "0",
@@ -330,3 +332,24 @@ def test_a_calibrated_tracker_knows_how_far_the_chip_stands_from_a_focused_lens(
     believed = simulate.believed_camera(scene.load("afit_simsat"))
     assert believed.focal_px * 4e-3 == pytest.approx(36.53, abs=5e-3)
     assert np.degrees(2 * np.arctan(800 / believed.focal_px)) == pytest.approx(10.01, abs=5e-3)
+
+
+def test_the_shutter_s_smear_counts_for_saturation_and_noise() -> None:
+    """A sky of 24,000 e- smears to half as much again in 493 rows of 40 us: stars that fit a well no longer do."""
+    bright = QUIET_SKY | {
+        "background": "[{kind: uniform, e_s: 600000}]",
+        "light.limit_mag": "4",
+        "motion.rate_deg_s": "[0, 0, 0]",
+        "camera.detector.noise": "true",
+    }
+    plain, shifted = (
+        simulate.shoot(simulate.prepare(scene.load("shefex2", bright | {"camera.shutter": shutter})), 0)[
+            1
+        ].seen
+        for shutter in ("{kind: global}", '{kind: frame_transfer, row_time: "40 us"}')
+    )
+    assert not plain.saturated.all()
+    assert shifted.saturated.sum() > plain.saturated.sum()
+    smeared = (24_000 * (1 + 492 * 40e-6 / 0.04) + 0.8) / 24_000.8
+    faint = np.argmin(plain.electrons)
+    assert (plain.snr[faint] / shifted.snr[faint]) ** 2 == pytest.approx(smeared, rel=0.02)
