@@ -206,6 +206,20 @@ class Detector(Part):
         return value
 
     @model_validator(mode="after")
+    def no_furnace(self) -> Detector:
+        if self.temperature_c is not None and self.doublings > 40:
+            raise ValueError(
+                f"temperature_c {self.temperature_c:g} doubles the dark current {self.doublings:.0f} times"
+            )
+        return self
+
+    @property
+    def doublings(self) -> float:
+        """How often the dark current doubles from the temperature it is quoted for to the chip's own."""
+        warm_c = 0.0 if self.temperature_c is None else self.temperature_c - self.dark_temperature_c
+        return warm_c / self.dark_doubling_c
+
+    @model_validator(mode="after")
     def offset_within_the_converter(self) -> Detector:
         if self.offset_dn >= 2**self.bits:
             raise ValueError(f"offset_dn {self.offset_dn:g} is beyond a converter of {self.bits} bits")

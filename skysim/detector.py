@@ -78,14 +78,8 @@ def dark_current_e_s(part: Detector, shape: tuple[int, int], rng: Generator) -> 
         dark *= np.exp(np.float32(np.sqrt(s2)) * spread - np.float32(s2 / 2))
     hot = rng.choice(dark.size, rng.binomial(dark.size, part.hot_pixels), replace=False)
     dark.reshape(-1)[hot] += rng.exponential(part.hot_e_s, len(hot)).astype(np.float32)
-    dark *= warmth(part)
+    dark *= np.float32(2.0**part.doublings)
     return dark
-
-
-def warmth(part: Detector) -> float:
-    """How much more dark current than at the temperature that it is quoted for."""
-    warm_c = 0.0 if part.temperature_c is None else part.temperature_c - part.dark_temperature_c
-    return float(2 ** (warm_c / part.dark_doubling_c))
 
 
 def expose(light_e: NDArray[Any], exposure_s: float, chip: Chip, rng: Generator) -> NDArray[Any]:

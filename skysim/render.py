@@ -17,7 +17,7 @@ from skysim.types import BadInput, Floats, Mount, Seen, Sources, Trajectory
 
 STEP = 1.3  # of the image's sharpest feature (its sigma): how far it may move in one piece of the exposure
 MAX_PIECES = 100_000
-FEWEST, MOST = 9, 16_385  # poses of an exposure
+FEWEST, MOST = 9, 32_769  # poses of an exposure
 SHORT = 0.4  # strides up to which a path is one piece: 1e-4 of the peak
 STILL_PX = 1e-3  # an image that moves less stands still
 AT_ONCE = 1 << 20  # pixels of patches in one go, or as many as the frame has
