@@ -92,13 +92,15 @@ def images(
     if gaussian:
         steps[(steps[:, 1:] == 0).all(axis=1), 0] = 0  # drawn by formula, each with its own width
     held = shelf(camera)
-    _, first, which = np.unique(steps @ PACKED, return_index=True, return_inverse=True)
+    packed = steps @ PACKED
+    alike = packed.size > 0 and not packed.any()  # stars in focus: no need to sort them
+    first, which = ([0], np.zeros(len(packed), int)) if alike else np.unique(packed, True, True)[1:]
     keys = [tuple(key) for key in steps[first].tolist()]
     stock(held, camera, keys)
     rows = np.array([held.places[key] for key in keys], dtype=np.int64)[which]
     kind, sigma, reach, sharp = np.array(held.kernels).reshape(-1, 4)[rows].T
     spans = np.array(held.spans, dtype=np.int64).reshape(-1, 4)[rows]
-    if gaussian:
+    if gaussian and camera.psf.corner_sigma_px:
         point = kind == GAUSS
         wider = np.hypot(sigma, extra) / np.where(point, sigma, 1)
         sigma, sharp = (np.where(point, a * wider, a) for a in (sigma, sharp))

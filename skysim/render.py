@@ -368,8 +368,9 @@ def _deposit(image: Any, buffer: Any, starts: Any, boxes: Any) -> None:
     """Add all patches to the image."""
     for i in range(len(boxes)):
         x0, x1, y0, y1 = boxes[i]
-        k = starts[i]
+        k, width = starts[i], x1 - x0
         for j in range(y0, y1):
-            for x in range(x0, x1):
-                image[j, x] += buffer[k]
-                k += 1
+            row, part = image[j, x0:x1], buffer[k : k + width]
+            for x in range(width):
+                row[x] += part[x]
+            k += width
