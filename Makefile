@@ -10,7 +10,7 @@ $(READY): pyproject.toml
 	$(BIN)/pip install --quiet --disable-pip-version-check -e '.[dev,catalog]'
 	touch $@
 
-.PHONY: demo test test-long test-oracle lint pictures setup clean
+.PHONY: demo test test-long test-oracle lint pictures recompile setup clean
 setup: $(READY)
 
 demo: $(READY)
@@ -35,6 +35,9 @@ lint: $(READY)
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+
+recompile:
+	find skysim estimator tests -name '*.nb[ic]' -delete
 
 clean:
 	rm -rf out .venv
