@@ -222,15 +222,15 @@ def packed(t: Floats) -> Singles:
 def grid_kernel(psf: Psf, camera: Camera, *steps: int) -> Kernel:
     """A kernel of tables at S x S sub-pixel places, by a fast Fourier transform of the product.
 
-    S is a power of two from 4 to 64, more than seven times the highest frequency but less for a large image.
+    S is a power of two from 4 to 128, more than seven times the highest frequency but less for a large image.
     """
     blend = Blend.of(psf, camera, *steps)
     half = int(np.ceil(blend.reach_px()))
     wanted, size = cutoff(psf, camera, blend.sigma_px, 1e-3), 2 * half + 1
-    places = 64
-    while places > 4 and (places >= 14 * wanted or places * size > 2048):
+    places = 128
+    while places > 4 and (places >= 14 * wanted or places * size > 3072):
         places //= 2
-    room = min(size + 2 * int(np.ceil(blend.beyond_px())), 2048 // places)
+    room = min(size + 2 * int(np.ceil(blend.beyond_px())), 3072 // places)
     box = fft.next_fast_len(max(size, room), real=True)
     fx = fft.rfftfreq(places * box, 1 / places)[None, :]
     fy = fft.fftfreq(places * box, 1 / places)[:, None]

@@ -69,8 +69,10 @@ LENSES = {
     "disc 0.2": disc(3.0, 0.2),
     "disc 0.7": disc(6.5, 0.7),
 }
-# What is as sharp as 0.08 px: cubics between 64 places a pixel, and a disc's edge without the twelfth harmonic.
-TOLERANCE = {"airy f/1.4": 2e-3}
+
+
+# A wide disc's edge 0.08 px sharp has a twelfth harmonic, which the radial tables leave out.
+TOLERANCE = {("airy f/1.4", 4.3): 2e-3}
 
 
 def theirs_px(parts: list[Any], x: float, y: float, size: int) -> Floats:
@@ -108,7 +110,7 @@ def test_every_kind_of_lens_and_an_emitting_disc_behind_it(name: str, radius_px:
     psf, camera, parts = LENSES[name]
     emitter = [galsim.TopHat(radius_px, gsparams=ACCURATE)] if radius_px else []
     error = worst(kernel(psf, camera, 0, radius_px), [*parts, *emitter], seed=round(10 * radius_px))
-    assert error < TOLERANCE.get(name, 5e-4)
+    assert error < TOLERANCE.get((name, radius_px), 5e-4)
 
 
 def test_emitter_and_defocus_together() -> None:
