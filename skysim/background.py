@@ -19,16 +19,12 @@ from scipy.spatial.transform import Rotation
 
 from skysim.camera import Camera
 from skysim.light import Glow, MoonGlow, SkyGlow, StrayLight, UniformGlow
-from skysim.optics import Optics, radial
+from skysim.optics import Optics, radial, tangential
 from skysim.photometry import SUN, Band, sky_radiance_e_s_m2_sr, star_flux_e_s_m2
 from skysim.types import Floats
 
 NODE_PX = 32.0
 NODE_RAD = 1 / 40  # a node's spacing as an angle: cos^4 bends by less than 1e-3 between two of them
-SUN_B_V, SUN_V_I = (
-    0.653,
-    0.702,
-)  # Ramírez et al. 2012, ApJ 752, 5; the Moon's and the day's light is sunlight too
 NANOLAMBERT_V0 = 34.08 * math.exp(20.7233)  # brightness of V = 0 mag arcsec^-2 (KS91 eq. 1)
 MOON_RADIUS_DEG = 0.26
 LEAST_PST = 1e-30  # what a transmittance of 0 is for the logarithm: no electron comes of it
@@ -145,7 +141,7 @@ def transmittance(angle_deg: float, table_deg: Sequence[float], pst: Sequence[fl
     return float(np.exp(np.interp(angle_deg, table_deg, np.log(np.maximum(pst, LEAST_PST)))))
 
 
-# What shines. A third kind is a class in scene.py and a function here.
+# What shines. A third kind is a class in light.py and a function here.
 BACKGROUNDS: dict[str, Callable[[Any, View], Floats]] = {
     "uniform": uniform,
     "sky": sky,
@@ -234,17 +230,12 @@ def unproject(xy_px: Floats, optics: Optics) -> Floats:
     if any(camera.distortion):
         r = np.linspace(0, min(optics.fold_r, 1.1 * math.tan(optics.field_rad) + 1e-3), 4001)
         image_r = r * radial(camera.distortion, r**2)
-        wanted, (p1, p2) = plane, camera.distortion[2:4]
-        aslant = np.zeros_like(plane)
-        for _ in range(10 if p1 or p2 else 1):
+        wanted, aslant = plane, np.zeros_like(plane)
+        for _ in range(10 if any(camera.distortion[2:4]) else 1):
             straight = wanted - aslant
             length = np.hypot(*straight.T)
             plane = straight * (np.interp(length, image_r, r) / np.maximum(length, 1e-300))[:, None]
-            x, y = plane.T
-            r2 = x**2 + y**2
-            aslant = np.column_stack(
-                [2 * p1 * x * y + p2 * (r2 + 2 * x**2), p1 * (r2 + 2 * y**2) + 2 * p2 * x * y]
-            )
+            aslant = np.column_stack(tangential(camera.distortion, *plane.T))
     toward = np.column_stack([plane, np.ones(len(plane))])
     return np.asarray(toward / np.linalg.norm(toward, axis=1, keepdims=True))
 

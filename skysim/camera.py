@@ -271,6 +271,12 @@ class Camera(Part):
         """The principal point: as given, or the chip's middle."""
         return self.principal_point_px or ((self.width_px - 1) / 2, (self.height_px - 1) / 2)
 
+    @property
+    def corner_px(self) -> float:
+        """From the principal point to the farthest corner of the chip."""
+        x, y = self.centre_px
+        return math.hypot(max(x + 0.5, self.width_px - 0.5 - x), max(y + 0.5, self.height_px - 0.5 - y))
+
 
 def preset(name: str, where: str) -> dict[str, Any]:
     """The `camera` section of data/cameras/NAME.yaml. Raises BadInput for a name that is none."""

@@ -64,12 +64,10 @@ class Optics:
         return np.stack([x * focal + centre[0], y * focal + centre[1]], axis=-1)
 
     def _distort(self, x: Floats, y: Floats) -> tuple[Floats, Floats]:
-        p1, p2 = self.camera.distortion[2:4]
         r2 = x**2 + y**2
         stretch = np.where(r2 < self.fold_r**2, radial(self.camera.distortion, r2), np.nan)
-        u = x * stretch + 2 * p1 * x * y + p2 * (r2 + 2 * x**2)
-        v = y * stretch + p1 * (r2 + 2 * y**2) + 2 * p2 * x * y
-        return u, v
+        across, down = tangential(self.camera.distortion, x, y)
+        return x * stretch + across, y * stretch + down
 
     def passed(self, cos_field: Floats) -> Floats:
         """Share of a point's light that the pupil takes in at an angle from the boresight: its foreshortening,
@@ -87,10 +85,16 @@ def radial(distortion: tuple[float, ...], r2: Floats) -> Floats:
     return 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
 
 
+def tangential(distortion: tuple[float, ...], x: Floats, y: Floats) -> tuple[Floats, Floats]:
+    """2 p1 x y + p2 (r^2 + 2 x^2) and p1 (r^2 + 2 y^2) + 2 p2 x y: what a lens element set askew adds to x and y."""
+    p1, p2 = distortion[2:4]
+    r2 = x**2 + y**2
+    return 2 * p1 * x * y + p2 * (r2 + 2 * x**2), p1 * (r2 + 2 * y**2) + 2 * p2 * x * y
+
+
 def field_rad(camera: Camera, fold_r: float) -> float:
     """Angle from the boresight of the chip's farthest corner, distortion undone."""
-    centre, size = np.array(camera.centre_px), np.array([camera.width_px, camera.height_px])
-    corner = np.hypot(*np.maximum(centre + 0.5, size - 0.5 - centre)) / camera.focal_px
+    corner = camera.corner_px / camera.focal_px
     r = np.linspace(0, min(fold_r, 20 * corner), 4001)
     return float(np.arctan(np.interp(corner, r * radial(camera.distortion, r**2), r)))
 

@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from skysim.camera import Particles
+from skysim.stamp import add_gaussian
 from skysim.types import BadInput, Floats
 
 STEP_PX = 0.25
-REACH_SIGMA = 6.5  # a Gaussian's share beyond is 1e-10
 # Landau's scale 0.1535 MeV cm^2/g x Z/A 0.498 x 2.33 g/cm^3 = 17.8 eV a micrometre, 4.9 electrons of 3.65 eV, over
 # 80 most probable ones (`assumed`, for a fast singly charged particle). Layers of a few micrometres straggle more.
 WIDTH = 0.06
@@ -98,30 +98,21 @@ def deposit(image: NDArray[Any], ends_px: Floats, electrons: Floats, sigma_px: f
 
     ends_px (N, 4): x, y in and x, y out. Returns (N,) charge that fell on the frame.
     """
+    height, width = image.shape
     kept = np.zeros(len(electrons))
     for n in range(len(electrons)):
         x, y, end_x, end_y = ends_px[n]
         steps = int(np.ceil(sqrt((end_x - x) ** 2 + (end_y - y) ** 2) / STEP_PX)) + 1
         for k in range(steps):
-            way = (k + 0.5) / steps
-            kept[n] += _cloud(
-                image, x + way * (end_x - x), y + way * (end_y - y), electrons[n] / steps, sigma_px
-            )
+            way, part = (k + 0.5) / steps, electrons[n] / steps
+            at_x, at_y = x + way * (end_x - x), y + way * (end_y - y)
+            add_gaussian(image, 0, height, at_x, at_y, part, sigma_px)
+            kept[n] += part * _share(at_x, width, sigma_px) * _share(at_y, height, sigma_px)
     return kept
 
 
 @numba.njit(cache=True)
-def _cloud(image: NDArray[Any], x: float, y: float, electrons: float, sigma_px: float) -> float:
-    """Add a Gaussian's share of each pixel; returns what fell on the frame."""
-    height, width = image.shape
-    reach, scale = REACH_SIGMA * sigma_px, 1 / (sigma_px * sqrt(2.0))
-    left, right = max(int(np.floor(x - reach + 0.5)), 0), min(int(np.floor(x + reach + 0.5)), width - 1)
-    top, bottom = max(int(np.floor(y - reach + 0.5)), 0), min(int(np.floor(y + reach + 0.5)), height - 1)
-    kept = 0.0
-    for j in range(top, bottom + 1):
-        row = electrons * (erf((j + 0.5 - y) * scale) - erf((j - 0.5 - y) * scale)) / 2
-        for i in range(left, right + 1):
-            part = row * (erf((i + 0.5 - x) * scale) - erf((i - 0.5 - x) * scale)) / 2
-            image[j, i] += part
-            kept += part
-    return kept
+def _share(place: float, size: int, sigma_px: float) -> float:
+    """Of a Gaussian at a place, what lies between the two ends of an axis of so many pixels."""
+    scale = 1 / (sigma_px * sqrt(2.0))
+    return (erf((size - 0.5 - place) * scale) - erf((-0.5 - place) * scale)) / 2

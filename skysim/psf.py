@@ -38,10 +38,8 @@ def blur_radius_px(camera: Camera, distance_m: Any) -> Any:
 
 def field_sigma_px(psf: Psf, camera: Camera, xy_px: Floats) -> Floats:
     """(...,) extra blur at pixels (..., 2): proportional to the field radius, corner_sigma_px at the far corner."""
-    centre = np.array(camera.centre_px)
-    size = np.array([camera.width_px, camera.height_px])
-    corner = np.hypot(*np.maximum(centre + 0.5, size - 0.5 - centre))
-    return np.asarray(psf.corner_sigma_px * np.linalg.norm(xy_px - centre, axis=-1) / corner)
+    radius_px = np.linalg.norm(xy_px - np.array(camera.centre_px), axis=-1)
+    return np.asarray(psf.corner_sigma_px * radius_px / camera.corner_px)
 
 
 def blur(sigma_px: float, fx: Floats, fy: Floats) -> Floats:
