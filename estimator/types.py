@@ -122,3 +122,28 @@ class Attitude:
     @property
     def solved(self) -> bool:
         return self.cam_from_ref is not None
+
+
+@dataclass(frozen=True, slots=True)
+class FilterState:
+    """What the attitude filter believes at a time.
+
+    body_from_ref : reference (ICRS, or lab under the dome) to body
+    bias_rad_s    : (3,) of the gyro, in body axes
+    covariance    : (6, 6) of the small turn in body axes (rad^2), then of the bias (rad^2/s^2)
+    """
+
+    t_s: float
+    body_from_ref: Rotation
+    bias_rad_s: Floats
+    covariance: Floats
+
+    @property
+    def sigma_attitude_rad(self) -> Floats:
+        """(3,) about the body axes."""
+        return np.sqrt(np.diag(self.covariance)[:3])
+
+    @property
+    def sigma_bias_rad_s(self) -> Floats:
+        """(3,) in body axes."""
+        return np.sqrt(np.diag(self.covariance)[3:])
