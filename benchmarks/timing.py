@@ -48,8 +48,8 @@ def versus(
     }
 
 
-def verdict(name: str, value: float, unit: str, what: str, most: float) -> dict[str, Any]:
-    """One result without a peer: a figure and the most that it may be."""
+def verdict(name: str, value: float, unit: str, what: str, bar: float, least: bool = False) -> dict[str, Any]:
+    """One result without a peer: a figure and the most that it may be, or the least."""
     return {
         "name": name,
         "value": value,
@@ -57,6 +57,6 @@ def verdict(name: str, value: float, unit: str, what: str, most: float) -> dict[
         "peer": what,
         "peer_value": None,
         "ratio": None,
-        "bar": most,
-        "met": value <= most,
+        "bar": bar,
+        "met": value >= bar if least else value <= bar,
     }

@@ -3,20 +3,31 @@
 from __future__ import annotations
 
 import datetime
-import itertools
 import shlex
 import sys
-from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TypeVar
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from estimator import BadImage
 from skysim import BadInput
+from skysim.terminal import (
+    begun,
+    number,
+    print_answers,
+    print_catalogue,
+    print_rows,
+    print_summary,
+    print_table,
+    progress,
+    watched,
+    yes,
+)
 
 if TYPE_CHECKING:
     from skysim.scene import Scene
+    from skysim.simulate import Lab
     from skysim.types import Row
 
 app = typer.Typer(
@@ -25,6 +36,10 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     help="A star tracker's laboratory in software: fly, light, photograph, solve, score.",
 )
+scenes_app = typer.Typer(
+    invoke_without_command=True, help="List the scenes that come with skysim; export one."
+)
+app.add_typer(scenes_app, name="scenes")
 catalog_app = typer.Typer(no_args_is_help=True, help="Make and look at star catalogues.")
 app.add_typer(catalog_app, name="catalog")
 
@@ -33,9 +48,8 @@ Frames = Annotated[int | None, typer.Option(help="How many frames; the scene's o
 Seed = Annotated[int | None, typer.Option(help="Seed of all random streams; the scene's own if left out.")]
 Out = Annotated[Path | None, typer.Option(help="Folder for what is written; out/NAME if left out.")]
 Sets = Annotated[list[str] | None, typer.Option("--set", help="Override a key: camera.detector.bits=8.")]
+FILM_FRAMES = 60
 Json = Annotated[bool, typer.Option("--json", help="Print JSON for machines instead of a table.")]
-
-T = TypeVar("T")
 
 
 def main() -> None:
@@ -73,13 +87,17 @@ def run(
     seed: Seed = None,
     out: Out = None,
     set_: Sets = None,
+    picture: Annotated[
+        bool, typer.Option("--picture", help="Also the lab in 3-D: lab.png and lab.gif, the vehicle moving.")
+    ] = False,
     json: Json = False,
 ) -> None:
     """Fly a scene, photograph it, solve every frame and score the answers."""
-    from skysim import io, report, score, simulate
+    from skysim import flightlog, io, report, score, simulate
 
     loaded = load(scene, frames, seed, set_)
-    lab = simulate.prepare(loaded)
+    with watched("flying") as watch:
+        lab = simulate.prepare(loaded, watch)
     estimator = simulate.tracker(lab)
     shots = begun(simulate.run(lab, estimator))
     folder = fresh(out or Path("out") / loaded.name)
@@ -87,16 +105,19 @@ def run(
     tally = score.Tally()
     for shot in progress(shots, loaded.exposure.frames, loaded.title):
         io.write_frame(folder, shot.frame, shot.truth, loaded)
-        rows.append(score.row(shot, loaded, lab.mount))
+        rows.append(score.row(shot, loaded, lab.mount, lab.verdicts.get(shot.frame.index, "")))
         tally.add(shot)
-    names = score.angle_names(loaded)
+    names, log = score.angle_names(loaded), lab.log
     io.write_table(folder / "solutions.ecsv", score.table(rows, names))
-    picture = tally.picture()
-    io.write_image(folder / "annotated.png", picture)
-    page = folder / "report.html"
+    io.write_table(folder / "telemetry.ecsv", flightlog.table(log))
+    annotated, page = tally.picture(), folder / "report.html"
+    io.write_image(folder / "annotated.png", annotated)
+    drawn = draw(lab, folder) if picture else []
     command = shlex.join(["skysim", *sys.argv[1:]])
-    report.write_page(page, loaded.title, command, names, rows, tally.median_ms(), picture)
+    images = report.Images(annotated, flightlog.figure(log), drawn)
+    report.write_page(page, loaded.title, command, names, rows, tally.median_ms(), images)
     figures = report.summary(rows) | {"stages_ms": tally.median_ms(), "report": str(page)}
+    figures |= {"flight": flightlog.summary(log), "pictures": [str(path) for path in drawn]}
     if json:
         print(io.to_json({"scene": loaded.name, **figures, "rows": report.as_dicts(rows)}))
     else:
@@ -120,7 +141,8 @@ def render(
     from skysim import io, report, simulate
 
     loaded = load(scene, frames, seed, set_)
-    lab = simulate.prepare(loaded)
+    with watched("flying") as watch:
+        lab = simulate.prepare(loaded, watch)
     shots = begun(simulate.shoot(lab, index) for index in range(loaded.exposure.frames))
     folder = fresh(out or Path("out") / loaded.name)
     written = []
@@ -169,9 +191,11 @@ def solve(
         raise typer.Exit(2)
 
 
-@app.command()
-def scenes(json: Json = False) -> None:
+@scenes_app.callback()
+def scenes(context: typer.Context, json: Json = False) -> None:
     """List the scenes that come with skysim."""
+    if context.invoked_subcommand:
+        return
     from skysim import io
     from skysim.scene import SCENES
     from skysim.scene import load as load_scene
@@ -187,10 +211,29 @@ def scenes(json: Json = False) -> None:
             print(f"{entry['name']:20s} {entry['title']}")
 
 
+@scenes_app.command("export")
+def scenes_export(
+    scene: SceneArg,
+    out: Annotated[Path | None, typer.Option(help="File; out/SCENE.xml if left out.")] = None,
+    seed: Seed = None,
+    set_: Sets = None,
+) -> None:
+    """Write a scene as one MJCF file with dome, LEDs and camera, for MuJoCo's own viewer."""
+    from skysim import io, simulate
+
+    loaded = load(scene, None, seed, set_)
+    path = out or Path("out") / f"{loaded.name}.xml"
+    text = simulate.staged(simulate.furnish(loaded))
+    io.make_folder(path.parent)
+    io.write_text(path, text)
+    print(f"{path}: python -m mujoco.viewer --mjcf={path}")
+
+
 @app.command()
 def bench(
     areas: Annotated[
-        list[str] | None, typer.Argument(help="render, detect, identify, attitude; all if left out.")
+        list[str] | None,
+        typer.Argument(help="instrument, detect, identify, attitude, dynamics; all if left out."),
     ] = None,
     json: Json = False,
 ) -> None:
@@ -275,10 +318,23 @@ def load(name: str, frames: int | None, seed: int | None, sets: list[str] | None
     return load_scene(name, overrides)
 
 
-def begun(items: Iterable[T]) -> Iterator[T]:
-    """The same items, the first of them made at once: what is wrong with it is told before old results are cleared."""
-    rest = iter(items)
-    return itertools.chain([next(rest)], rest)
+def draw(lab: Lab, folder: Path) -> list[Path]:
+    """The laboratory as a picture and as a film; without OpenGL a word about it, and the run goes on."""
+    from skysim import io, simulate
+    from skysim.world import picture
+
+    mjcf, joints = simulate.staged(lab), lab.log.joints
+    still, film = folder / "lab.png", folder / "lab.gif"
+    steps = max(len(joints) // FILM_FRAMES, 1)
+    moments = joints[::steps]
+    try:
+        io.write_image(still, picture.picture(mjcf, joints[len(joints) // 2])[:, :, ::-1])
+        shown = progress(picture.film(mjcf, moments), len(moments), "filming")
+        picture.write_film(shown, film, len(moments) / float(lab.log.t_s[-1] + 1e-9))
+    except picture.NoPicture as error:
+        complain(str(error))
+        return []
+    return [still, film]
 
 
 def fresh(folder: Path) -> Path:
@@ -296,118 +352,3 @@ def moment(text: str | None) -> datetime.datetime | None:
         return datetime.datetime.fromisoformat(text)
     except ValueError:
         raise BadInput(f"--time {text}: allowed: ISO 8601, e.g. 2012-06-22T21:00:00") from None
-
-
-def progress(items: Iterable[T], total: int, what: str, quiet: bool = False) -> Iterator[T]:
-    """The items, with a bar on stderr that goes away when it is done."""
-    from rich.console import Console
-    from rich.progress import track
-
-    console = Console(stderr=True)
-    yield from track(
-        items,
-        total=total,
-        description=what,
-        console=console,
-        transient=True,
-        disable=quiet or not console.is_terminal,
-    )
-
-
-def print_table(title: str, heads: list[str], lines: list[list[str]]) -> None:
-    from rich.console import Console
-    from rich.table import Table
-
-    table = Table(title=title, title_justify="left", box=None, header_style="bold", pad_edge=False)
-    for head in heads:
-        table.add_column(
-            head, justify="left" if head in ("what", "file", "status", "peer") else "right", no_wrap=True
-        )
-    for line in lines:
-        table.add_row(*line)
-    console = Console()
-    Console(width=max(console.width, 160) if not console.is_terminal else None).print(table)
-
-
-def print_rows(rows: list[Row], names: tuple[str, str, str]) -> None:
-    triple = "/".join(names)
-    heads = [
-        "frame",
-        "t s",
-        "deg/s",
-        f"true {triple}",
-        f"estimate {triple}",
-        "cross ″",
-        "roll ″",
-        "used",
-        "ms",
-        "status",
-    ]
-    lines = [
-        [
-            str(row.frame),
-            f"{row.t_s:.2f}",
-            f"{row.rate_deg_s:.2f}",
-            degrees(row.truth_deg),
-            degrees(row.estimate_deg),
-            f"{row.cross_arcsec:.3f}" if row.estimate_deg else "",
-            f"{row.roll_arcsec:+.3f}" if row.estimate_deg else "",
-            f"{row.matched}/{row.detected}",
-            f"{row.time_ms:.1f}",
-            "[red]WRONG[/]" if row.wrong else row.status,
-        ]
-        for row in rows
-    ]
-    print_table("", heads, lines)
-
-
-def degrees(angles_deg: tuple[float, float, float] | None) -> str:
-    return " ".join(f"{angle:9.4f}" for angle in angles_deg) if angles_deg else ""
-
-
-def print_summary(figures: dict[str, Any]) -> None:
-    print(
-        f"\n{figures['solved']} of {figures['frames']} frames solved, {figures['wrong']} wrong; "
-        f"cross-boresight median {figures['cross_arcsec_median']:.3g}″ worst {figures['cross_arcsec_worst']:.3g}″, "
-        f"roll median {figures['roll_arcsec_median']:.3g}″ worst {figures['roll_arcsec_worst']:.3g}″"
-    )
-    stages = ", ".join(f"{name} {ms:.2f}" for name, ms in figures["stages_ms"].items())
-    print(f"median ms a frame: {stages}")
-    print(f"report: {figures['report']}")
-
-
-def print_answers(answers: list[dict[str, Any]], out: Path) -> None:
-    heads = ["file", "status", "RA °", "Dec °", "roll °", "fov °", "stars", "rms ″", "ms"]
-    lines = [
-        [
-            a["file"],
-            a["status"] if a["time_ms"] is not None else "bad input",
-            *(number(a[key], 4) for key in ("ra_deg", "dec_deg", "roll_deg", "fov_deg")),
-            str(a["matches"]),
-            number(a["rms_arcsec"], 1),
-            number(a["time_ms"], 0),
-        ]
-        for a in answers
-    ]
-    print_table("", heads, lines)
-    print(f"annotated pictures and solutions.json in {out}")
-
-
-def print_catalogue(figures: dict[str, Any], json: bool, to_json: Any) -> None:
-    if json:
-        print(to_json(figures))
-        return
-    print(f"{figures['path']}: {figures['stars']} stars, {figures['supplied']} of them supplied")
-    print("  ".join(f"V<{limit}: {count}" for limit, count in figures["brighter_than"].items()))
-    for key, value in figures["meta"].items():
-        print(f"  {key}: {value}")
-
-
-def number(value: float | None, digits: int | None = None) -> str:
-    if value is None:
-        return ""
-    return f"{value:.3g}" if digits is None else f"{value:.{digits}f}"
-
-
-def yes(met: bool | None) -> str:
-    return "" if met is None else "yes" if met else "NO"

@@ -49,7 +49,7 @@ def clear(folder: Path) -> None:
     for suffix in ("fits", "png", "ecsv"):
         for path in folder.glob(f"frame_[0-9][0-9][0-9][0-9]*.{suffix}"):
             path.unlink()
-    for name in ("solutions.ecsv", "annotated.png", "report.html"):
+    for name in ("solutions.ecsv", "telemetry.ecsv", "annotated.png", "lab.png", "lab.gif", "report.html"):
         (folder / name).unlink(missing_ok=True)
 
 

@@ -1,4 +1,4 @@
-"""Vibration: small turns in the body's own axes, laid over the attitude history."""
+"""Vibration: small turns in the body's own axes, laid over the attitude history, always or for a while."""
 
 from __future__ import annotations
 
@@ -9,9 +9,11 @@ from typing import Any
 
 import numba
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from skysim.scene import Jitter, JitterBand, JitterLine
+from skysim.manoeuvre import envelope, shakes
+from skysim.motion import JitterBand, JitterLine, JitterPart, Motion
 from skysim.types import BadInput, Floats, Trajectory
 
 SINES = 128  # a band is a sum of so many; an uneven spectrum still has tens of equal ones
@@ -19,6 +21,8 @@ PER_PERIOD = (
     16  # samples of the shortest period: cubic Hermite is then off by (2 pi / 16)^4 / 384 = 6e-5 of it
 )
 MOST_SAMPLES = 5_000_000
+RISE = 0.1  # of a while of vibration is its rise, and so its fall ...
+LONGEST_RISE_S = 1.0  # ... but no longer
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,27 +71,130 @@ def with_phases(
     return Sines(2 * np.pi * frequency_hz, amplitude * np.cos(phase), amplitude * np.sin(phase))
 
 
-# How a vibration sounds. A third kind is a class in scene.py and a function here.
+# How a vibration sounds. A third kind is a class in motion.py and a function here.
 SPECTRA: dict[str, Callable[[Any, np.random.Generator], Sines]] = {"line": line, "band": band}
 
 
-def shake(trajectory: Trajectory, parts: Sequence[Jitter], rng: np.random.Generator) -> Trajectory:
-    """The attitude history with its vibration: lab_from_body exp(phi(t)), phi in body axes.
+@dataclass(frozen=True, slots=True)
+class Voice:
+    """Sines and when they sound: phi(t) = envelope(t) sines(t), from begin_s to end_s.
 
-    Resampled so finely that `Trajectory.at` between two samples keeps phi to 1e-4 of its amplitude. The body then
-    turns at exp(-phi) omega + J(phi) dphi/dt, in its own shaken axes. The rates of the history are taken as
-    straight between its samples. The same object comes back if nothing shakes. Raises BadInput (one line) where
-    more than five million samples would be needed.
+    The envelope is 1 but for a rise and a fall of a tenth of the while each, a second at most, in which it goes along
+    10x^3 - 15x^4 + 6x^5: phi, its rate and its acceleration are continuous. For a voice that sounds always it is 1.
+
+    name : where in the scene it is declared
     """
+
+    sines: Sines
+    name: str
+    begin_s: float = -math.inf
+    end_s: float = math.inf
+
+    @property
+    def rise_s(self) -> float:
+        return min(RISE * (self.end_s - self.begin_s), LONGEST_RISE_S)
+
+    @property
+    def highest_hz(self) -> float:
+        """The frequency to be sampled for: the sines' highest and one period a rise.
+
+        The envelope is smoother than a sine of that: cubic Hermite is off by what its fourth derivative, at most
+        360 / rise^4, and the jumps of its third, 60 / rise^3, make of it; the sine's are 1559 and 248.
+        """
+        edge_hz = 1 / self.rise_s if math.isfinite(self.begin_s) else 0.0
+        return float(self.sines.omega_rad_s.max()) / (2 * np.pi) + edge_hz
+
+    def sounds(self, t_s: Floats) -> NDArray[np.bool_]:
+        """(N - 1,) whether it is heard between each of (N,) times and the next."""
+        return np.asarray((t_s[:-1] < self.end_s) & (self.begin_s < t_s[1:]))
+
+    def swing(self, t_s: Floats) -> tuple[Floats, Floats]:
+        """(N, 3) phi and (N, 3) its derivative at (N,) times within."""
+        phi, rate = swing(t_s, self.sines.omega_rad_s, self.sines.sine_rad, self.sines.cosine_rad)
+        if not math.isfinite(self.begin_s):
+            return phi, rate
+        gain, slope = gains(t_s - self.begin_s, self.end_s - self.begin_s, self.rise_s)
+        return gain * phi, gain * rate + slope * phi
+
+
+@dataclass(frozen=True, slots=True)
+class Vibration:
+    """All that shakes a vehicle in one run, its phases drawn once: alike over a whole flight and piece by piece."""
+
+    voices: tuple[Voice, ...]
+
+    @classmethod
+    def of(cls, motion: Motion, rng: np.random.Generator) -> Vibration:
+        """What `motion.jitter` declares for always and each jitter of the manoeuvre for its while."""
+        drawn = [voice(motion.jitter, rng, "motion.jitter")]
+        for begin_s, end_s, parts in shakes(motion):
+            drawn.append(voice(parts, rng, f"motion.manoeuvre jitter at {begin_s:g} s", begin_s, end_s))
+        return cls(tuple(one for one in drawn if one))
+
+    def swing(self, t_s: Floats) -> tuple[Floats, Floats]:
+        """(N, 3) rotation vector phi and (N, 3) its derivative (rad/s), body axes, at (N,) ascending times."""
+        phi, rate = np.zeros((len(t_s), 3)), np.zeros((len(t_s), 3))
+        for one in self.voices:
+            now = slice(*np.searchsorted(t_s, [one.begin_s, one.end_s]))
+            more, faster = one.swing(t_s[now])
+            phi[now] += more
+            rate[now] += faster
+        return phi, rate
+
+    def lay_over(self, trajectory: Trajectory) -> Trajectory:
+        """The attitude history, or a piece of one, with its vibration: lab_from_body exp(phi(t)), phi in body axes.
+
+        Resampled so finely, where something sounds, that `Trajectory.at` between two samples keeps phi to 1e-4 of its
+        amplitude. The body then turns at exp(-phi) omega + J(phi) dphi/dt, in its own shaken axes. The rates of the
+        history are taken as straight between its samples, all of which stay. The same object comes back if nothing
+        sounds. Raises BadInput (one line) where more than five million samples would be needed.
+        """
+        if not any(one.sounds(trajectory.t_s).any() for one in self.voices):
+            return trajectory
+        t_s = finer(trajectory.t_s, self.pieces(trajectory.t_s))
+        phi, phi_rate = self.swing(t_s)
+        turn = Rotation.from_rotvec(phi)
+        rate = np.column_stack(
+            [np.interp(t_s, trajectory.t_s, axis) for axis in trajectory.rate_body_rad_s.T]
+        )
+        return Trajectory(t_s, trajectory.at(t_s) * turn, turn.inv().apply(rate) + own_rate(phi, phi_rate))
+
+    def pieces(self, t_s: Floats) -> NDArray[np.int64]:
+        """(N - 1,) into how many pieces each step is cut, so that every period has PER_PERIOD samples.
+
+        Raises BadInput if those are too many. A flight that is laid over piece by piece asks first, with all its times.
+        """
+        highest_hz = np.zeros(len(t_s) - 1)
+        for one in self.voices:
+            np.maximum(highest_hz, one.highest_hz, out=highest_hz, where=one.sounds(t_s))
+        pieces = np.ceil(np.maximum(np.diff(t_s) * highest_hz * PER_PERIOD * (1 - 1e-12), 1))
+        needed = int(pieces.sum()) + 1
+        if self.voices and needed > MOST_SAMPLES:
+            worst = max(self.voices, key=lambda one: one.highest_hz * np.diff(t_s)[one.sounds(t_s)].sum())
+            raise BadInput(
+                f"{worst.name}: {worst.highest_hz:g} Hz over {np.diff(t_s)[worst.sounds(t_s)].sum():g} s needs "
+                f"{needed:,} attitude samples; allowed: {MOST_SAMPLES:,}, {PER_PERIOD} a period"
+            )
+        return pieces.astype(np.int64)
+
+
+def voice(
+    parts: Sequence[JitterPart],
+    rng: np.random.Generator,
+    name: str,
+    begin_s: float = -math.inf,
+    end_s: float = math.inf,
+) -> Voice | None:
+    """The parts drawn, or None where none shakes."""
     loud = [part for part in parts if any(part.rms_arcsec)]
     if not loud:
-        return trajectory
-    sines = joined([SPECTRA[part.kind](part, rng) for part in loud])
-    t_s = finer(trajectory.t_s, float(sines.omega_rad_s.max()) / (2 * np.pi))
-    phi, phi_rate = swing(t_s, sines.omega_rad_s, sines.sine_rad, sines.cosine_rad)
-    turn = Rotation.from_rotvec(phi)
-    rate = np.column_stack([np.interp(t_s, trajectory.t_s, axis) for axis in trajectory.rate_body_rad_s.T])
-    return Trajectory(t_s, trajectory.at(t_s) * turn, turn.inv().apply(rate) + own_rate(phi, phi_rate))
+        return None
+    return Voice(joined([SPECTRA[part.kind](part, rng) for part in loud]), name, begin_s, end_s)
+
+
+def shake(trajectory: Trajectory, parts: Sequence[JitterPart], rng: np.random.Generator) -> Trajectory:
+    """The whole attitude history with a vibration that sounds always, see `Vibration.lay_over`."""
+    return Vibration.of(Motion(jitter=tuple(parts)), rng).lay_over(trajectory)
 
 
 def joined(many: Sequence[Sines]) -> Sines:
@@ -99,30 +206,35 @@ def joined(many: Sequence[Sines]) -> Sines:
     )
 
 
-def finer(t_s: Floats, highest_hz: float) -> Floats:
-    """The samples' times, and between them so many more that each period has PER_PERIOD."""
-    step = np.diff(t_s)
-    pieces = np.ceil(np.maximum(step * highest_hz * PER_PERIOD * (1 - 1e-12), 1))
-    needed = int(pieces.sum()) + 1
-    if needed > MOST_SAMPLES:
-        raise BadInput(
-            f"motion.jitter: {highest_hz:g} Hz over {t_s[-1] - t_s[0]:g} s needs {needed:,} attitude samples; "
-            f"allowed: {MOST_SAMPLES:,}, {PER_PERIOD} a period"
-        )
-    count = pieces.astype(np.int64)
-    begin = np.repeat(np.cumsum(count) - count, count)  # the first sample of each one's own step
-    within = (np.arange(len(begin)) - begin) / np.repeat(count, count)
-    return np.append(np.repeat(t_s[:-1], count) + within * np.repeat(step, count), t_s[-1])
+def finer(t_s: Floats, pieces: NDArray[np.int64]) -> Floats:
+    """The samples' times, and between them so many more that each step is cut evenly into its pieces."""
+    begin = np.repeat(np.cumsum(pieces) - pieces, pieces)  # the first sample of each one's own step
+    within = (np.arange(len(begin)) - begin) / np.repeat(pieces, pieces)
+    return np.append(np.repeat(t_s[:-1], pieces) + within * np.repeat(np.diff(t_s), pieces), t_s[-1])
 
 
 def own_rate(phi: Floats, phi_rate: Floats) -> Floats:
-    """(N, 3) angular velocity of exp(phi) in its own axes: dphi/dt - phi x dphi/dt / 2 + phi x (phi x dphi/dt) / 6.
+    """(N, 3) angular velocity of exp(phi) in its own axes, by the rotations' right Jacobian:
 
-    The right Jacobian of the rotations to second order (Bullo & Murray 1995; `assumed`): what is left out is
-    |phi|^3 / 24 of the rate, 1e-12 for an arc-minute, 2e-7 for a degree.
+        dphi/dt - (1 - cos a) / a^2 phi x dphi/dt + (a - sin a) / a^3 phi x (phi x dphi/dt),  a = |phi|
+
+    (Bullo & Murray 1995; `assumed`).
     """
+    angle = np.linalg.norm(phi, axis=1, keepdims=True)
+    first = np.sinc(angle / (2 * np.pi)) ** 2 / 2
+    # The quotient of two small numbers is 1/6 to a^2 / 120, and rounding in it counts for a^2 of the rate only.
+    second = np.where(angle > 1e-4, (1 - np.sinc(angle / np.pi)) / np.maximum(angle, 1e-4) ** 2, 1 / 6)
     cross = np.cross(phi, phi_rate)
-    return np.asarray(phi_rate - cross / 2 + np.cross(phi, cross) / 6)
+    return np.asarray(phi_rate - first * cross + second * np.cross(phi, cross))
+
+
+@numba.njit(cache=True)
+def gains(t_s: Floats, duration_s: float, rise_s: float) -> tuple[Floats, Floats]:
+    """(N, 1) envelope and (N, 1) its derivative."""
+    gain, slope = np.empty((len(t_s), 1)), np.empty((len(t_s), 1))
+    for n in range(len(t_s)):
+        gain[n, 0], slope[n, 0], _ = envelope(t_s[n], duration_s, rise_s)
+    return gain, slope
 
 
 @numba.njit(cache=True, parallel=True)

@@ -20,7 +20,9 @@ ROOT = Path(__file__).resolve().parents[1]
 DATA = ROOT / "data"
 
 # Only what a quantity parser fills: `dark_e_s` and `rate_deg_s` are bare numbers and keep their unit.
-SI_SUFFIX = re.compile(r"(?<!_deg)(?<!_e)(?<!^e)(?<!_cm2)_(m|s|kg|kg_m2|cd|w_sr|nm)$")
+SI_SUFFIX = re.compile(
+    r"(?<!_deg)(?<!_rad)(?<!_e)(?<!^e)(?<!_cm2)(?<!_um)_(m|s|n|kg|kg_m|kg_m2|cd|w_sr|nm|nm_rad|nms|nms2)$"
+)
 
 
 def quantity(si_unit: str, what: str, examples: str) -> Callable[[Any], float]:
@@ -57,9 +59,18 @@ Inertia = Annotated[Number, BeforeValidator(quantity("kg m2", "moment of inertia
 Intensity = Annotated[Number, BeforeValidator(quantity("cd", "luminous intensity", '"7.7 mcd"'))]
 RadiantIntensity = Annotated[Number, BeforeValidator(quantity("W sr-1", "radiant intensity", '"3 mW/sr"'))]
 Torque = Annotated[Number, BeforeValidator(quantity("N m", "torque", '"0.5 N m"'))]
+Force = Annotated[Number, BeforeValidator(quantity("N", "force", '"0.5 N"'))]
+Momentum = Annotated[Number, BeforeValidator(quantity("N m s", "angular momentum", '"2 N m s"'))]
+Damping = Annotated[Number, BeforeValidator(quantity("N m s", "torque per rate", '"1e-4 N m s"'))]
+QuadraticDrag = Annotated[
+    Number, BeforeValidator(quantity("N m s2", "torque per squared rate", '"0.01 N m s2"'))
+]
+Stiffness = Annotated[Number, BeforeValidator(quantity("N m rad-1", "torque per angle", '"1e-3 N m / rad"'))]
+Imbalance = Annotated[Number, BeforeValidator(quantity("kg m", "mass times offset", '"1 g cm"'))]
 SemiAxis = Annotated[Length, Field(gt=0)]
 Spin = Annotated[Number, Field(ge=-360, le=360)]
 Triple = tuple[Number, Number, Number]
+Angles = tuple[Number, Number, Number]
 Share = Annotated[Number, Field(ge=0, le=1)]
 Positive = Annotated[Number, Field(gt=0)]
 NotNegative = Annotated[Number, Field(ge=0)]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import io as std_io
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -122,6 +122,15 @@ def as_dicts(rows: list[Row]) -> list[dict[str, Any]]:
     return [asdict(row) for row in rows]
 
 
+@dataclass(frozen=True, slots=True)
+class Images:
+    """What a page shows: the annotated frame, the plot of the flight (PNG), pictures of the lab (files), if any."""
+
+    annotated: NDArray[np.uint8]
+    flight: bytes
+    lab: list[Path]
+
+
 def write_page(
     path: Path,
     title: str,
@@ -129,7 +138,7 @@ def write_page(
     angles: tuple[str, str, str],
     rows: list[Row],
     stages_ms: dict[str, float],
-    picture: NDArray[np.uint8],
+    images: Images,
 ) -> None:
     """One HTML file with everything inside: figures, the picture of a frame, the table, the command.
 
@@ -145,14 +154,16 @@ def write_page(
         rows=rows,
         summary=summary(rows),
         stages_ms=stages_ms,
-        picture=embed(cv2.imencode(".png", picture)[1].tobytes()),
+        picture=embed(cv2.imencode(".png", images.annotated)[1].tobytes()),
+        flight=embed(images.flight),
+        lab=[embed(path.read_bytes(), path.suffix[1:]) for path in images.lab],
         figure=embed(figure(rows)),
     )
     write_text(path, text)
 
 
-def embed(png: bytes) -> str:
-    return "data:image/png;base64," + base64.b64encode(png).decode()
+def embed(image: bytes, kind: str = "png") -> str:
+    return f"data:image/{kind};base64," + base64.b64encode(image).decode()
 
 
 def figure(rows: list[Row]) -> bytes:
@@ -214,6 +225,9 @@ PAGE = """<!doctype html>
  <div><b>{{ '%.1f'|format(summary.time_ms_median) }} ms</b>median, image to attitude</div>
 </div>
 <h2>The run</h2><img alt="errors, lights and rate against time" src="{{ figure }}">
+<h2>The flight</h2><img alt="attitude, beliefs and actuators against time" src="{{ flight }}">
+{% if lab %}<h2>The laboratory</h2>
+{% for image in lab %}<img class="lab" alt="the laboratory in 3-D" src="{{ image }}">{% endfor %}{% endif %}
 <h2>The last solved frame</h2>
 <p class="key"><span>blue ticks: truth</span><span>red squares: detected</span>
 <span>green circles: identified</span></p>

@@ -1,4 +1,8 @@
-"""A scene file (YAML) becomes a validated, frozen `Scene`. With `camera` and `quantity` the only schema."""
+"""A scene file (YAML) becomes a validated, frozen `Scene`.
+
+Its sections stand in `vehicle`, `motion`, `light` and `camera`, what a value with a unit is in `quantity`; there is no
+other schema.
+"""
 
 from __future__ import annotations
 
@@ -7,35 +11,15 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import (
-    AfterValidator,
-    Discriminator,
-    Field,
-    Tag,
-    ValidationError,
-    field_validator,
-    model_validator,
-)
+from pydantic import AfterValidator, Field, ValidationError, model_validator
 
-from skysim.camera import Camera, with_preset
+from skysim.camera import Camera, over, with_preset
 from skysim.light import Dome, Glow, Stars
-from skysim.quantity import (
-    DATA,
-    ROOT,
-    Inertia,
-    Length,
-    Mass,
-    NotNegative,
-    Number,
-    Part,
-    Positive,
-    Spin,
-    Time,
-    Torque,
-    Triple,
-)
+from skysim.motion import Motion, Pointing
+from skysim.quantity import DATA, ROOT, Length, NotNegative, Number, Part, Positive, Time
 from skysim.types import BadInput
-from skysim.yamlfile import explain, place_of, put, read_yaml
+from skysim.vehicle import Site, Vehicle
+from skysim.yamlfile import Files, explain, place_of, put, read_yaml
 
 SCENES = ROOT / "scenes"
 STEM = "(the file's name)"  # no key that a file could have
@@ -47,115 +31,6 @@ def in_our_time(value: datetime.datetime) -> datetime.datetime:
     if not 1900 <= value.year <= 2100:
         raise ValueError(f"{value.isoformat()} is outside of 1900 to 2100")
     return value
-
-
-class Vehicle(Part):
-    """What moves: an MJCF file and the mass properties that the scene declares over it."""
-
-    model: str
-    mount: Literal["air_bearing", "free"] = "air_bearing"
-    mass_kg: Annotated[Mass, Field(gt=0)] | None = None
-    inertia_kg_m2: tuple[Inertia, Inertia, Inertia] | None = None
-    centre_of_mass_m: tuple[Length, Length, Length] = (0.0, 0.0, 0.0)
-    tilt_stop_deg: Annotated[Number, Field(gt=0, lt=90)] = 30.0
-    torque_limit_nm: Annotated[Torque, Field(gt=0)] = 1.0
-
-    @field_validator("inertia_kg_m2")
-    @classmethod
-    def principal_moments(cls, value: Triple | None) -> Triple | None:
-        if value and (min(value) <= 0 or 2 * max(value) > sum(value)):
-            raise ValueError(f"{value} is no rigid body's: each positive, none above the sum of the others")
-        return value
-
-
-class Hold(Part):
-    """Keep the attitude for a while."""
-
-    kind: Literal["hold"]
-    duration_s: Annotated[Time, Field(gt=0)]
-
-
-class Slew(Part):
-    """Rest-to-rest eigen-axis turn to a 3-2-1 attitude, no faster than rate_deg_s."""
-
-    kind: Literal["slew"]
-    roll_deg: Number = 0.0
-    pitch_deg: Number = 0.0
-    yaw_deg: Number = 0.0
-    rate_deg_s: Annotated[Number, Field(gt=0)] = 2.0
-    acceleration_deg_s2: Annotated[Number, Field(gt=0)] = 0.5
-
-
-class Attitude(Part):
-    """3-2-1 Euler angles of the body in the lab."""
-
-    roll_deg: Number = 0.0
-    pitch_deg: Number = 0.0
-    yaw_deg: Number = 0.0
-
-
-class Pointing(Part):
-    """Where the camera looks in the ICRS: its boresight, and the position angle of the image's up direction."""
-
-    ra_deg: Annotated[Number, Field(ge=0, lt=360)]
-    dec_deg: Annotated[Number, Field(ge=-90, le=90)]
-    roll_deg: Number = 0.0
-
-
-def where_it_starts(value: Any) -> str:
-    """Which of the two starts is meant, so that a slip in one is not answered with the other's keys."""
-    keys = value if isinstance(value, dict) else ()
-    sky = isinstance(value, Pointing) or any(key in keys for key in ("ra_deg", "dec_deg"))
-    return "Pointing" if sky else "Attitude"
-
-
-Start = Annotated[
-    Annotated[Attitude, Tag("Attitude")] | Annotated[Pointing, Tag("Pointing")],
-    Discriminator(where_it_starts),
-]
-
-
-class JitterLine(Part):
-    """A vibration of one frequency: rms_arcsec about each of the body's axes, phases at random."""
-
-    kind: Literal["line"]
-    frequency_hz: Positive
-    rms_arcsec: tuple[NotNegative, NotNegative, NotNegative]
-
-
-class JitterBand(Part):
-    """Random vibration between two frequencies, power spectral density proportional to f^slope."""
-
-    kind: Literal["band"]
-    from_hz: Positive
-    to_hz: Positive
-    rms_arcsec: tuple[NotNegative, NotNegative, NotNegative]
-    slope: Annotated[Number, Field(ge=-6, le=6)] = 0.0
-
-    @model_validator(mode="after")
-    def a_band(self) -> JitterBand:
-        if self.from_hz >= self.to_hz:
-            raise ValueError(f"from_hz {self.from_hz:g} is not below to_hz {self.to_hz:g}")
-        return self
-
-
-Jitter = Annotated[JitterLine | JitterBand, Field(discriminator="kind")]
-
-
-class Motion(Part):
-    """How it starts and what it is told to do."""
-
-    start: Start = Attitude()
-    rate_deg_s: tuple[Spin, Spin, Spin] = (0.0, 0.0, 0.0)
-    control: Literal["none", "pid"] = "none"
-    manoeuvre: tuple[Annotated[Hold | Slew, Field(discriminator="kind")], ...] = ()
-    jitter: tuple[Jitter, ...] = ()
-
-    @model_validator(mode="after")
-    def somebody_flies_it(self) -> Motion:
-        if self.manoeuvre and self.control == "none":
-            raise ValueError("a manoeuvre needs a controller; allowed: control: pid")
-        return self
 
 
 class Exposure(Part):
@@ -188,6 +63,26 @@ class Tracker(Part):
     believed_camera_body_m: tuple[Length, Length, Length] | None = None
 
 
+class Filter(Part):
+    """What the attitude filter believes of the gyro and of the star tracker (MEKF: attitude and gyro bias).
+
+    arw_deg_sqrt_h, bias_deg_h, bias_time : of the gyro; the bias a Gauss-Markov process
+    start_deg, start_bias_deg_h           : standard deviation of attitude and bias about each axis at the start
+    floor_arcsec : of a star tracker's solution, added to its own covariance: what is the same in every frame
+    gate_sigma   : a solution farther off than this is refused
+    latency      : from the end of an exposure to its solution
+    """
+
+    arw_deg_sqrt_h: NotNegative = 0.07
+    bias_deg_h: NotNegative = 1.0
+    bias_time_s: Annotated[Time, Field(gt=0)] = 300.0
+    start_deg: Positive = 1.0
+    start_bias_deg_h: Positive = 10.0
+    floor_arcsec: NotNegative = 1.0
+    gate_sigma: Positive = 5.0
+    latency_s: Annotated[Time, Field(ge=0)] = 0.0
+
+
 class Scene(Part):
     """The whole story, before it happens."""
 
@@ -195,6 +90,7 @@ class Scene(Part):
     title: str
     seed: Annotated[int, Field(ge=0)]
     start_time: Annotated[datetime.datetime, AfterValidator(in_our_time)]
+    lab: Site = Site()
     vehicle: Vehicle
     motion: Motion
     light: Annotated[Dome | Stars, Field(discriminator="kind")]
@@ -202,6 +98,7 @@ class Scene(Part):
     camera: Camera
     exposure: Exposure
     tracker: Tracker = Tracker()
+    filter: Filter | None = None
     name: Annotated[str, Field(exclude=True, alias=STEM)] = ""
 
     @model_validator(mode="after")
@@ -217,6 +114,42 @@ class Scene(Part):
                 f" {1 / self.exposure.rate_hz:g} s"
             )
         return self
+
+    @model_validator(mode="after")
+    def who_flies(self) -> Scene:
+        told = self.motion.control
+        imu = self.vehicle.imu
+        if self.filter and not imu:
+            raise ValueError("filter: takes a gyro; allowed beside vehicle.imu")
+        if told is None:
+            return self
+        has = {"ideal": True} | {kind: getattr(self.vehicle, kind) for kind in ("wheels", "fans", "cmgs")}
+        if not has[told.actuators]:
+            raise ValueError(f"motion.control.actuators: vehicle.{told.actuators} is not switched on")
+        if told.desaturation and (not self.vehicle.fans or told.actuators not in ("wheels", "cmgs")):
+            raise ValueError("motion.control.desaturation: takes vehicle.fans, and actuators: wheels or cmgs")
+        if {"truth": False, "imu": not imu, "filter": not self.filter}[told.feedback]:
+            section = "vehicle.imu" if told.feedback == "imu" else "filter"
+            raise ValueError(f"motion.control.feedback: {told.feedback} takes the section {section}")
+        return self
+
+    @model_validator(mode="after")
+    def clocks(self) -> Scene:
+        """Steps in a control period, and IMU samples in one, come out whole."""
+        rate_hz = self.control_rate_hz
+        if abs(1000 / rate_hz - round(1000 / rate_hz)) > 1e-9:
+            raise ValueError(f"motion.control.rate_hz: {rate_hz:g} Hz is no whole number of milliseconds")
+        imu = self.vehicle.imu
+        if imu and abs(imu.rate_hz / rate_hz - round(imu.rate_hz / rate_hz)) > 1e-9:
+            raise ValueError(
+                f"vehicle.imu.rate_hz: {imu.rate_hz:g} Hz is no multiple of motion.control.rate_hz {rate_hz:g} Hz"
+            )
+        return self
+
+    @property
+    def control_rate_hz(self) -> float:
+        """The vehicle's computer ticks at this rate, whether it steers or listens only."""
+        return self.motion.control.rate_hz if self.motion.control else 100.0
 
 
 class CameraFile(Part):
@@ -243,22 +176,40 @@ def load(name: str | Path, overrides: Mapping[str, str] | None = None) -> Scene:
     Raises BadInput with one line: the key, what is wrong with it, what is allowed, the file and line.
     """
     path = find(str(name))
-    tree, text = read_yaml(path)
+    tree, files = read(path)
     for key, value in (overrides or {}).items():
         put(tree, key, value)
     try:
-        raw = beneath(beside(path, tree), text, path, overrides or {})
+        raw = beneath(tree, files, overrides or {})
         return Scene.model_validate(raw | {STEM: path.stem})
     except ValidationError as error:
-        raise BadInput(explain(error, Scene, tree, text, path, overrides or {})) from None
+        raise BadInput(explain(error, Scene, tree, files, overrides or {})) from None
 
 
-def beneath(tree: dict[str, Any], text: str, path: Path, overrides: Mapping[str, str]) -> dict[str, Any]:
+def read(path: Path, above: tuple[Path, ...] = ()) -> tuple[dict[str, Any], Files]:
+    """A scene's keys over those of its `base`, another scene by name or path; and the files, this one first."""
+    tree, text = read_yaml(path)
+    tree = beside(path, tree)
+    if "base" not in tree:
+        return tree, [(path, text)]
+    base = tree.pop("base")
+    place = place_of(["base"], [(path, text)], {})
+    try:
+        below = find(str(path.parent / base) if (path.parent / str(base)).is_file() else str(base))
+    except BadInput as error:
+        raise BadInput(f"base: {error} {place}") from None
+    if below.resolve() in above or below.resolve() == path.resolve():
+        raise BadInput(f"base: {base} is this scene itself, or has it for its base {place}")
+    beneath_it, files = read(below, (*above, path.resolve()))
+    return over(beneath_it, tree), [(path, text), *files]
+
+
+def beneath(tree: dict[str, Any], files: Files, overrides: Mapping[str, str]) -> dict[str, Any]:
     """`with_preset`, which knows neither file nor line."""
     try:
         return with_preset(tree)
     except BadInput as error:
-        raise BadInput(f"{error} {place_of(['camera', 'preset'], text, path, overrides)}") from None
+        raise BadInput(f"{error} {place_of(['camera', 'preset'], files, overrides)}") from None
 
 
 def beside(path: Path, tree: dict[str, Any]) -> dict[str, Any]:
@@ -280,9 +231,9 @@ def anchored(folder: Path, tree: dict[str, Any], key: str, *inner: str) -> dict[
 
 def load_camera(path: Path) -> Camera:
     """The `camera` section of a scene, or of a file that has nothing else. Raises BadInput with one line."""
-    tree, text = read_yaml(path)
+    tree, files = read(path)
     try:
         own = beside(path, {key: tree[key] for key in tree if key == "camera"})
-        return CameraFile.model_validate(beneath(own, text, path, {})).camera
+        return CameraFile.model_validate(beneath(own, files, {})).camera
     except ValidationError as error:
-        raise BadInput(explain(error, CameraFile, tree, text, path, {})) from None
+        raise BadInput(explain(error, CameraFile, tree, files, {})) from None

@@ -33,8 +33,8 @@ def angles_deg(cam_from_lab: Rotation, scene: Scene, mount: Mount) -> tuple[floa
     return float(roll), float(pitch), float(yaw)
 
 
-def row(shot: Shot, scene: Scene, mount: Mount) -> Row:
-    """One frame of a run as people read it."""
+def row(shot: Shot, scene: Scene, mount: Mount, verdict: str = "") -> Row:
+    """One frame of a run as people read it; verdict is what the attitude filter made of it."""
     truth, answer = shot.truth, shot.report.attitude
     cross = roll = float("nan")
     estimate, wrong = None, False
@@ -56,6 +56,7 @@ def row(shot: Shot, scene: Scene, mount: Mount) -> Row:
         rms_px=answer.rms_px,
         time_ms=1e3 * sum(shot.report.seconds.values()),
         wrong=wrong,
+        filter=verdict,
     )
 
 
@@ -70,7 +71,16 @@ def table(rows: list[Row], names: tuple[str, str, str]) -> Any:
     for n, name in enumerate(names):
         columns[f"true_{name.lower()}_deg"] = [row.truth_deg[n] for row in rows]
         columns[f"{name.lower()}_deg"] = [(row.estimate_deg or nothing)[n] for row in rows]
-    for name in ("cross_arcsec", "roll_arcsec", "detected", "matched", "rms_px", "time_ms", "wrong"):
+    for name in (
+        "cross_arcsec",
+        "roll_arcsec",
+        "detected",
+        "matched",
+        "rms_px",
+        "time_ms",
+        "wrong",
+        "filter",
+    ):
         columns[name] = [getattr(row, name) for row in rows]
     return Table(columns)
 

@@ -1,41 +1,36 @@
-"""The whole story: a scene is flown, lit, photographed and solved. Owns the random streams."""
+"""The whole story: a scene is flown, lit, photographed and solved. Owns the random streams and the closed loop."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from estimator import catalog
-from estimator.attitude import SOLVERS
-from estimator.camera import Camera
-from estimator.centroid import CENTROIDERS
-from estimator.detect import DETECTORS
-from estimator.identify import IDENTIFIERS
-from estimator.nearfield import SOLVERS as NEAR_SOLVERS
-from estimator.nearfield import LedMap, Lever
-from estimator.tracker import Clock, DomeTracker, Report, Settings, StarTracker
-from estimator.types import Attitude, BadImage, Centroids
-from skysim import background, catalogue, control, dome, jitter, sky, world
-from skysim.camera import Camera as CameraPart
+from estimator.tracker import Clock, Report
+from skysim import background, catalogue, dome, imu, manoeuvre, onboard, sky, world
 from skysim.camera import RollingShutter
 from skysim.detector import Chip, expose, judge, saturation_dn, smear
+from skysim.disturbance import Room
+from skysim.jitter import Vibration
 from skysim.led import Emitter
 from skysim.optics import Optics
 from skysim.photometry import Band
+from skysim.pilot import Now, Pilot
 from skysim.psf import EXTENT
-from skysim.quantity import one_of
 from skysim.render import Window, render
 from skysim.scene import CATALOGUES, Dome, Pointing, Scene
-from skysim.types import BadInput, Frame, Mount, Sources, Trajectory, Truth
+from skysim.telemetry import Diary
+from skysim.types import BadInput, Floats, Frame, Mount, Sources, Telemetry, Trajectory, Truth
+from skysim.world import stage
 
-STAGE_ID = {"detector": 1, "jitter": 2}
+STAGE_ID = {"detector": 1, "jitter": 2, "imu": 3, "draught": 4}
+SPARE_S = 2e-3  # flown beyond the last exposure
 
-Estimator = StarTracker | DomeTracker
+Watch = Callable[[float, float], None]
 
 
 def rng(seed: int, stage: str, frame: int) -> np.random.Generator:
@@ -45,21 +40,34 @@ def rng(seed: int, stage: str, frame: int) -> np.random.Generator:
 
 @dataclass(frozen=True, slots=True)
 class Lab:
-    """What a scene becomes before the first frame: hardware, lights and the flight.
+    """What a scene becomes before the first frame is kept: hardware, lights and the flight.
 
-    canvas : (H, W) where the light of one frame after another is drawn; float64 where noise is off, for such a frame
-             is the truth to many digits, and float32 otherwise
+    canvas    : (H, W) where the light of one frame after another is drawn; float64 where noise is off, for such a
+                frame is the truth to many digits, and float32 otherwise
+    trajectory: the flight, jitter and all; telemetry: what the vehicle's computers did in it
+    reports   : the star tracker's answers to the frames that were taken and solved in flight, for the filter
+    verdicts  : what the filter made of each
     """
 
     scene: Scene
+    ship: world.World
     mount: Mount
-    trajectory: Trajectory
     sources: Sources
     emitter: Emitter
     optics: Optics
     chip: Chip
     band: Band
     canvas: NDArray[Any]
+    trajectory: Trajectory
+    telemetry: Telemetry | None = None
+    reports: dict[int, Report] = field(default_factory=dict)
+    verdicts: dict[int, str] = field(default_factory=dict)
+
+    @property
+    def log(self) -> Telemetry:
+        """The telemetry of a lab that has flown."""
+        assert self.telemetry is not None, "not flown yet"
+        return self.telemetry
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,31 +80,154 @@ class Shot:
     seconds: dict[str, float]
 
 
-def prepare(scene: Scene) -> Lab:
-    """Build the vehicle, fly it to the last exposure, and light the sky or the dome."""
-    believed_settings(scene)  # a wrong name is told before the flight
+def prepare(scene: Scene, watch: Watch | None = None) -> Lab:
+    """Build the vehicle, light the sky or the dome, and fly to the last exposure.
+
+    watch(t_s, duration_s) is called at every tick on the way.
+    """
+    return fly(furnish(scene), watch)
+
+
+def furnish(scene: Scene) -> Lab:
+    """The lab on the ground: all but the flight, of which there is the start alone."""
+    onboard.believed_settings(scene)  # a wrong name is told before the flight
     EXTENT[scene.camera.psf.kind](scene.camera.psf, scene.camera)  # and so is a measured PSF's bad file
-    vehicle = world.build(scene.vehicle)
-    mount = world.mount(vehicle)
-    last_s = window(scene, scene.exposure.frames - 1).close_s(scene.camera.height_px)
-    pilot = None
-    if scene.motion.control == "pid":
-        plan = control.plan(scene.motion, lab_from_body_start(scene, mount))
-        pilot = control.pid(plan, vehicle.inertia_kg_m2, scene.vehicle.torque_limit_nm)
-    trajectory = world.fly(
-        vehicle,
-        lab_from_body_start(scene, mount),
-        np.radians(scene.motion.rate_deg_s),
-        last_s + 2e-3,
-        pilot,
-    )
-    trajectory = jitter.shake(trajectory, scene.motion.jitter, rng(scene.seed, "jitter", 0))
+    ship = world.build(scene.vehicle)
     band = Band.of(scene.camera.detector.quantum_efficiency)
-    emitter = Emitter.of(scene.light.led) if isinstance(scene.light, Dome) else Emitter()
-    optics, chip = Optics.of(scene.camera), Chip.of(scene.camera)
     kind = np.float32 if scene.camera.detector.noise else np.float64
-    canvas = np.empty((scene.camera.height_px, scene.camera.width_px), kind)
-    return Lab(scene, mount, trajectory, lights(scene, band), emitter, optics, chip, band, canvas)
+    mount = world.mount(ship)
+    start = lab_from_body_start(scene, mount)
+    return Lab(
+        scene,
+        ship,
+        mount,
+        lights(scene, band),
+        Emitter.of(scene.light.led) if isinstance(scene.light, Dome) else Emitter(),
+        Optics.of(scene.camera),
+        Chip.of(scene.camera),
+        band,
+        np.empty((scene.camera.height_px, scene.camera.width_px), kind),
+        Trajectory(np.array([0.0, 1.0]), Rotation.concatenate([start, start]), np.zeros((2, 3))),
+    )
+
+
+def staged(lab: Lab) -> str:
+    """The lab as one MJCF text, for MuJoCo's own viewer and for pictures."""
+    return stage.mjcf(lab.ship, lab.scene, lab.sources, lab.trajectory.lab_from_body[0])
+
+
+def fly(lab: Lab, watch: Watch | None = None) -> Lab:
+    """The lab after the flight: tick by tick the vehicle's computer steers, MuJoCo moves, the sensors feel.
+
+    A tick is a control period. With `filter` the frames are taken and solved as their exposures end, and what the
+    star tracker says is in the filter, and with feedback: filter in the controls, after the latency declared.
+    """
+    scene, ship = lab.scene, lab.ship
+    start = lab.trajectory.lab_from_body[0]
+    last_s = window(scene, scene.exposure.frames - 1).close_s(scene.camera.height_px)
+    flight = world.Flight(ship, start, np.radians(scene.motion.rate_deg_s), last_s + SPARE_S)
+    vibration = Vibration.of(scene.motion, rng(scene.seed, "jitter", 0))
+    vibration.pieces(flight.times_s(0, len(flight.states)))  # too much is told before the flight
+    reference = manoeuvre.plan(scene.motion, start)
+    pilot, navigation = Pilot(scene, ship, reference), navigator(lab, start)
+    room = Room.of(
+        scene.vehicle.disturbances,
+        imu.earth_rate_lab_rad_s(scene.lab),
+        manoeuvre.knocks(scene.motion),
+        ship.inertia_kg_m2,
+        pilot.period_s,
+        rng(scene.seed, "draught", 0),
+    )
+    eyes = Eyes(lab, vibration, navigation) if scene.filter and navigation else None
+    diary = Diary(flight, pilot, navigation)
+    steps = round(pilot.period_s / flight.step_s)
+    if not (scene.motion.control or navigation) and room.quiet:
+        steps = flight.steps_left  # nobody has anything to say before the end
+    while flight.steps_left:
+        tick(flight, pilot, room, navigation, diary, min(steps, flight.steps_left))
+        if navigation:
+            navigation.feel(flight.now_s, *felt(flight, vibration, steps))
+        if eyes:
+            eyes.look(flight)
+        if watch:
+            watch(flight.now_s, flight.now_s + flight.steps_left * flight.step_s)
+    told = reference if scene.motion.control else None
+    return replace(
+        lab,
+        trajectory=vibration.lay_over(flight.trajectory()),
+        telemetry=diary.telemetry(told),
+        reports=eyes.reports if eyes else {},
+        verdicts=eyes.verdicts if eyes else {},
+    )
+
+
+def tick(
+    flight: world.Flight,
+    pilot: Pilot,
+    room: Room,
+    navigation: onboard.Navigation | None,
+    diary: Diary,
+    steps: int,
+) -> None:
+    """One control period: believe, steer, be disturbed, move."""
+    t_s, angles, speeds = flight.now_s, flight.angles_rad, flight.speeds_rad_s
+    attitude, rate = flight.lab_from_body_wxyz, flight.rate_body_rad_s
+    stored = pilot.momentum_nms(angles, speeds)
+    seen, turning = attitude, rate
+    if pilot.told and pilot.told.feedback != "truth" and navigation:
+        seen, turning = navigation.attitude_wxyz(pilot.told.feedback), navigation.rate(pilot.told.feedback)
+    control = np.empty((steps, flight.model.nu))
+    control[:] = pilot.steer(Now(t_s, pilot.period_s, turning, angles, speeds), seen, stored)
+    if not room.quiet:
+        times_s = flight.times_s(flight.step, flight.step + steps + 1)
+        disturbance = room.torque_nm(times_s, attitude, rate, stored)
+        control[:, flight.world.torques] += disturbance
+        diary.disturbed(disturbance.mean(axis=0))
+    diary.note(stored)
+    flight.advance(control)
+
+
+def felt(flight: world.Flight, vibration: Vibration, steps: int) -> tuple[Floats, Floats, Floats]:
+    """Times (K,), attitudes (K, 4) as wxyz and rates (K, 3) of the last steps, with what shakes them."""
+    begin = max(flight.step - steps, 0)
+    if not vibration.voices:
+        return flight.knots(begin)
+    shaken = vibration.lay_over(flight.trajectory(begin))
+    return shaken.t_s, shaken.lab_from_body.as_quat(scalar_first=True), shaken.rate_body_rad_s
+
+
+def navigator(lab: Lab, start: Rotation) -> onboard.Navigation | None:
+    """The computer that listens to the gyros, where there are any."""
+    if lab.scene.vehicle.imu is None:
+        return None
+    place_m = world.imu_place_m(lab.ship)
+    stream = rng(lab.scene.seed, "imu", 0)
+    return onboard.Navigation(lab.scene, lab.mount, start, place_m, lab.ship.gravity_m_s2, stream)
+
+
+class Eyes:
+    """The star tracker in flight: every frame is taken and solved when its time has come, and told the filter."""
+
+    def __init__(self, lab: Lab, vibration: Vibration, navigation: onboard.Navigation) -> None:
+        self.lab, self.vibration, self.navigation = lab, vibration, navigation
+        self.tracker = tracker(lab)
+        self.reports: dict[int, Report] = {}
+        self.verdicts: dict[int, str] = {}
+
+    def look(self, flight: world.Flight) -> None:
+        """All frames whose exposure ended the filter's latency ago, and which were not solved yet."""
+        scene = self.lab.scene
+        assert scene.filter is not None
+        while len(self.reports) < scene.exposure.frames:
+            index = len(self.reports)
+            when = window(scene, index)
+            if when.close_s(scene.camera.height_px) + scene.filter.latency_s > flight.now_s:
+                return
+            since = flight.trajectory(max(int(when.open_s / flight.step_s) - 1, 0))
+            frame, _ = shoot(replace(self.lab, trajectory=self.vibration.lay_over(since)), index)
+            report = onboard.answer(self.tracker, frame)
+            self.reports[index] = report
+            self.verdicts[index] = self.navigation.see(frame.t_mid_s, report.attitude)
 
 
 def lab_from_body_start(scene: Scene, mount: Mount) -> Rotation:
@@ -104,7 +235,7 @@ def lab_from_body_start(scene: Scene, mount: Mount) -> Rotation:
     start = scene.motion.start
     if isinstance(start, Pointing):
         return sky.cam_from_icrs(start.ra_deg, start.dec_deg, start.roll_deg).inv() * mount.cam_from_body
-    return control.attitude(start)
+    return manoeuvre.attitude(start)
 
 
 def lights(scene: Scene, band: Band) -> Sources:
@@ -150,69 +281,16 @@ def shoot(lab: Lab, index: int, clock: Clock | None = None) -> tuple[Frame, Trut
     return Frame(index, image, middle_s, when.exposure_s, saturation_dn(camera.detector)), truth
 
 
-def tracker(lab: Lab) -> Estimator:
-    """The star tracker with what it believes of the hardware: the scene's `tracker` section, else the truth."""
-    scene, believed = lab.scene, lab.scene.tracker
-    camera, settings = believed_camera(scene), believed_settings(scene)
-    if isinstance(scene.light, Dome):
-        centre_m, semi_axes_m = dome.surface(scene.light.surface).as_ellipsoid()
-        board = lab.sources.id // dome.HOLES
-        leds = LedMap(lab.sources.id, lab.sources.place[:, :3], centre_m, semi_axes_m, board)
-        arm = believed.believed_camera_body_m or lab.mount.camera_body_m
-        return DomeTracker(camera, leds, Lever(np.array(arm), lab.mount.cam_from_body), settings)
-    stars = catalog.read(CATALOGUES / f"{scene.light.catalogue}.ecsv")
-    stars = catalog.brighter(stars, believed.limit_mag)
-    return StarTracker(camera, stars, catalog.apparent(stars, catalog.on_earth(scene.start_time)), settings)
+def tracker(lab: Lab) -> onboard.Estimator:
+    """The star tracker with what it believes of the hardware."""
+    return onboard.tracker(lab.scene, lab.mount, lab.sources)
 
 
-def believed_camera(scene: Scene) -> Camera:
-    """The calibration in the tracker's head."""
-    believed_m = scene.tracker.believed_focal_length_m
-    return calibration(scene.camera).zoomed(believed_m / scene.camera.focal_length_m if believed_m else 1.0)
-
-
-def calibration(camera: CameraPart) -> Camera:
-    """A perfect calibration of a camera, in the tracker's own terms."""
-    return Camera(camera.width_px, camera.height_px, camera.focal_px, camera.centre_px, camera.distortion)
-
-
-def believed_settings(scene: Scene) -> Settings:
-    """The tracker's algorithms and thresholds as the scene names them. Raises BadInput for a wrong name."""
-    part = scene.tracker
-    near = isinstance(scene.light, Dome)
-    return Settings(
-        detector=known("detector", part.detector, DETECTORS),
-        centroider=known("centroider", part.centroider, CENTROIDERS),
-        identifier=known("identifier", part.identifier, IDENTIFIERS),
-        solver=known("solver", part.solver, NEAR_SOLVERS if near else SOLVERS),
-        threshold_sigma=part.threshold_sigma,
-        min_area_px=part.min_area_px,
-        gain_e_dn=scene.camera.detector.gain_e_dn,
-        saturation=saturation_dn(scene.camera.detector),
-        centroid_sigma_px=part.centroid_sigma_px,
-    )
-
-
-def known(key: str, name: str, algorithms: Mapping[str, object]) -> str:
-    """The name, if there is such an algorithm: only the estimator knows, and scene.py may not ask it."""
-    try:
-        return one_of(name, algorithms)
-    except ValueError as error:
-        raise BadInput(f"tracker.{key}: {error}") from None
-
-
-def run(lab: Lab, estimator: Estimator) -> Iterator[Shot]:
-    """Photograph and solve frame after frame."""
-    answer(estimator, shoot(lab, 0)[0])  # a frame for the compiler, whose seconds are nobody's
+def run(lab: Lab, estimator: onboard.Estimator) -> Iterator[Shot]:
+    """Photograph and solve frame after frame; what was solved in flight is not solved again."""
+    onboard.answer(estimator, shoot(lab, 0)[0])  # a frame for the compiler, whose seconds are nobody's
     for index in range(lab.scene.exposure.frames):
         clock = Clock()
         frame, truth = shoot(lab, index, clock)
-        yield Shot(frame, truth, answer(estimator, frame), clock.seconds)
-
-
-def answer(estimator: Estimator, frame: Frame) -> Report:
-    """The tracker's report; a frame that it will not look at (empty, saturated) is a status too."""
-    try:
-        return estimator.solve(frame.image_dn)
-    except BadImage as error:
-        return Report(Attitude(str(error)), Centroids.none())
+        report = lab.reports.get(index) or onboard.answer(estimator, frame)
+        yield Shot(frame, truth, report, clock.seconds)

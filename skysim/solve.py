@@ -20,8 +20,8 @@ from estimator.types import BadImage
 from skysim import io, report, scene
 from skysim.camera import Camera as CameraPart
 from skysim.detector import saturation_dn
+from skysim.onboard import calibration
 from skysim.scene import CATALOGUES
-from skysim.simulate import calibration
 from skysim.types import BadInput
 
 FOV_UNCERTAINTY = 0.055  # "to 5 %", with half a per cent for how people measure it

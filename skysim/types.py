@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from skysim import BadInput as BadInput
+from skysim.quaternion import along
 
 Floats = NDArray[np.float64]
 
@@ -38,15 +39,19 @@ class Trajectory:
     t_s: Floats
     lab_from_body: Rotation
     rate_body_rad_s: Floats
-    hermite_rad: Floats = field(init=False, repr=False)  # (N - 1, 3, 3) see `at`, worked out once
+    _between: list[tuple[Floats, Floats]] = field(init=False, repr=False, default_factory=list)
 
-    def __post_init__(self) -> None:
-        turn = (self.lab_from_body[:-1].inv() * self.lab_from_body[1:]).as_rotvec()
-        step = np.diff(self.t_s)[:, None]
-        begin, end = self.rate_body_rad_s[:-1] * step, self.rate_body_rad_s[1:] * step
-        # d(rotvec)/dt = omega + rotvec x omega / 2 + ...: the body rate seen from the sample before.
-        end = end + np.cross(turn, end) / 2
-        object.__setattr__(self, "hermite_rad", np.stack([turn, begin, end], axis=1))
+    def between(self) -> tuple[Floats, Floats]:
+        """Attitudes (N, 4) as wxyz and (N - 1, 3, 3) what `quaternion.along` takes; worked out once, when asked."""
+        if not self._between:
+            step = np.diff(self.t_s)[:, None]
+            turn = (self.lab_from_body[:-1].inv() * self.lab_from_body[1:]).as_rotvec()
+            begin, end = self.rate_body_rad_s[:-1] * step, self.rate_body_rad_s[1:] * step
+            # d(rotvec)/dt = omega + rotvec x omega / 2 + ...: the body rate seen from the sample before.
+            end = end + np.cross(turn, end) / 2
+            wxyz = self.lab_from_body.as_quat(scalar_first=True)
+            self._between.append((wxyz, np.stack([turn, begin, end], axis=1)))
+        return self._between[0]
 
     def at(self, t_s: float | Floats) -> Rotation:
         """lab_from_body at any time inside the history.
@@ -60,16 +65,53 @@ class Trajectory:
                 f"time {t.min():.6f}..{t.max():.6f} s is outside {self.t_s[0]}..{self.t_s[-1]} s"
             )
         k = np.minimum(np.maximum(np.searchsorted(self.t_s, t, side="right") - 1, 0), len(self.t_s) - 2)
-        s = (t - self.t_s[k]) / (self.t_s[k + 1] - self.t_s[k])
-        basis = np.stack([s**2 * (3 - 2 * s), s * (1 - s) ** 2, -(s**2) * (1 - s)], axis=1)
-        here = self.lab_from_body[k] * Rotation.from_rotvec(
-            np.einsum("ni,nij->nj", basis, self.hermite_rad[k])
-        )
+        share = (t - self.t_s[k]) / (self.t_s[k + 1] - self.t_s[k])
+        here = Rotation.from_quat(along(*self.between(), k, share), scalar_first=True)
         return here if np.ndim(t_s) else here[0]
 
     def rate_at(self, t_s: float) -> Floats:
         """(3,) angular velocity in body axes, linear between the samples."""
         return np.array([np.interp(t_s, self.t_s, rate) for rate in self.rate_body_rad_s.T])
+
+
+@dataclass(frozen=True, slots=True)
+class Telemetry:
+    """What the vehicle did and believed at K ticks of its computer; None where it has no such thing.
+
+    t_s             : (K,)
+    lab_from_body   : K, the truth, without what jitter lays over it; rate_body_rad_s (K, 3) likewise
+    lab_from_ref    : K, what it was told
+    torque_nm       : (K, 3) what the controller asked for, in body axes
+    disturbance_nm  : (K, 3) what disturbed it, gravity, drag, spring and actuators apart
+    momentum_nms    : (K, 3) stored in wheels and CMGs, in body axes
+    wheel_rad_s, gimbal_rad : (K, n)
+    joints          : (K, nq) all joints as MuJoCo has them, for pictures
+    manipulability  : (K,) of the CMGs: 1 far from a singularity, 0 at one
+    lab_from_imu    : K, the navigator's attitude
+    saturated       : (K,) whether the gyros were at their limit in the tick before
+    bias_rad_s      : (K, 3) what the gyros show too much: their bias, and the Earth's turning if nobody allows for it
+    lab_from_filter : K, the filter's attitude, its standard deviation (K, 3) about the body's axes, the bias that it
+                      believes (K, 3) and that one's
+    """
+
+    t_s: Floats
+    lab_from_body: Rotation
+    rate_body_rad_s: Floats
+    torque_nm: Floats
+    disturbance_nm: Floats
+    momentum_nms: Floats
+    wheel_rad_s: Floats
+    gimbal_rad: Floats
+    joints: Floats
+    manipulability: Floats | None = None
+    lab_from_ref: Rotation | None = None
+    lab_from_imu: Rotation | None = None
+    saturated: NDArray[np.bool_] | None = None
+    bias_rad_s: Floats | None = None
+    lab_from_filter: Rotation | None = None
+    sigma_attitude_rad: Floats | None = None
+    believed_bias_rad_s: Floats | None = None
+    sigma_bias_rad_s: Floats | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,6 +211,7 @@ class Row:
     truth_deg, estimate_deg : (RA, Dec, roll) of the camera under the stars, (roll, pitch, yaw) of the vehicle
         under the dome
     wrong : solved, and more than ten arc-minutes off
+    filter : what the attitude filter made of it in flight; empty where there is none
     """
 
     frame: int
@@ -184,3 +227,4 @@ class Row:
     rms_px: float
     time_ms: float
     wrong: bool
+    filter: str = ""

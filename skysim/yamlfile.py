@@ -13,6 +13,8 @@ from pydantic import BaseModel, ValidationError
 
 from skysim import BadInput
 
+Files = list[tuple[Path, str]]  # paths and texts
+
 
 def read_yaml(path: Path) -> tuple[dict[str, Any], str]:
     """A YAML mapping and its text."""
@@ -67,11 +69,13 @@ def explain(
     error: ValidationError,
     model: type[BaseModel],
     tree: dict[str, Any],
-    text: str,
-    path: Path,
+    files: Files,
     overrides: Mapping[str, str],
 ) -> str:
-    """One line for the first fault: `led.falloff: 'cubic' is none of … (scenes/x.yaml, line 31)`."""
+    """One line for the first fault: `led.falloff: 'cubic' is none of … (scenes/x.yaml, line 31)`.
+
+    tree is what the files came to, files they themselves with what stands above first.
+    """
     # A key that is unknown explains one that is missing, so what is missing waits.
     first = min(error.errors(), key=lambda fault: fault["type"] == "missing")
     keys = [str(key) for key in in_tree(first["loc"], tree, first["type"] == "missing")]
@@ -93,15 +97,19 @@ def explain(
     elif not first["type"].startswith("value_error"):
         message = f"{first['input']!r} is not allowed; it should {message}"
     dotted = ".".join(keys)
-    return f"{dotted + ': ' if dotted else ''}{message} {place_of(keys, text, path, overrides)}"
+    # What is missing is in no file; but a file may have it in a section or list that another one replaces.
+    given = keys[:-1] if first["type"] == "missing" else keys
+    return f"{dotted + ': ' if dotted else ''}{message} {place_of(given, files, overrides)}"
 
 
-def place_of(keys: list[str], text: str, path: Path, overrides: Mapping[str, str]) -> str:
-    """Where a key was given: `(scenes/x.yaml, line 31)` or `(--set)`."""
+def place_of(keys: list[str], files: Files, overrides: Mapping[str, str]) -> str:
+    """Where a key was given: `(scenes/x.yaml, line 31)` or `(--set)`; in the file that has most of it."""
     dotted = ".".join(keys)
     if any(k == dotted or dotted.startswith(k + ".") for k in overrides):
         return "(--set)"
-    line = line_of(text, keys)
+    found = [(*line_of(text, keys), path) for path, text in files]
+    depth = max(found, key=lambda one: one[0])[0]
+    line, path = next((line, path) for deep, line, path in found if deep == depth)
     return f"({path}{f', line {line}' if line else ''})"
 
 
@@ -138,6 +146,10 @@ def allowed_keys(model: type[BaseModel], loc: tuple[int | str, ...]) -> list[str
 
 
 def resolve(node: dict[str, Any], schema: dict[str, Any]) -> dict[str, Any]:
+    """What a reference points to; of a section that may be left out, the section."""
+    options = [option for option in node.get("anyOf", []) if option.get("type") != "null"]
+    if len(options) == 1:
+        node = options[0]
     return schema["$defs"][node["$ref"].rsplit("/", 1)[1]] if "$ref" in node else node
 
 
@@ -151,10 +163,10 @@ def hint(word: str, allowed: list[str]) -> str:
     return f"{meant}; allowed: {', '.join(k for k in allowed if k.isidentifier())}" if allowed else meant
 
 
-def line_of(text: str, keys: list[str]) -> int | None:
-    """The line on which a dotted key stands, or its nearest parent that does."""
+def line_of(text: str, keys: list[str]) -> tuple[int, int | None]:
+    """How many of a dotted key's parts stand in the text, and the line of the last that does."""
     node = yaml.compose(text, yaml.SafeLoader)
-    line = None
+    depth, line = 0, None
     for key in keys:
         found = None
         if isinstance(node, yaml.MappingNode):
@@ -163,5 +175,5 @@ def line_of(text: str, keys: list[str]) -> int | None:
             found = (node.value[int(key)],) * 2
         if not found:
             break
-        line, node = found[0].start_mark.line + 1, found[1]
-    return line
+        depth, line, node = depth + 1, found[0].start_mark.line + 1, found[1]
+    return depth, line

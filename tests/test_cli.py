@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import cv2
+import mujoco
 import numpy as np
 import pytest
 from astropy.io import fits
@@ -94,6 +95,30 @@ def test_scenes_are_listed_with_their_titles(skysim: Skysim) -> None:
     for entry in listed:
         assert scene.load(entry["file"]).title == entry["title"]
     assert "AFIT SimSat" in skysim("scenes").out
+
+
+def test_export_writes_a_scene_that_mujoco_s_own_loader_takes(skysim: Skysim, tmp_path: Path) -> None:
+    path = tmp_path / "made" / "lab.xml"
+    done = skysim("scenes", "export", "simsat_cmg", "--out", path)
+    assert (done.code, done.err) == (0, "")
+    assert str(path) in done.out
+    model = mujoco.MjModel.from_xml_path(str(path))
+    assert model.joint("gimbal_1").id >= 0
+    assert "nothing: no such scene" in skysim("scenes", "export", "nothing").one_line()
+
+
+def test_a_picture_without_opengl_is_a_word_and_the_run_goes_on(
+    skysim: Skysim, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("MUJOCO_GL", "nonsense")
+    done = skysim("run", "shefex2", "--frames", "1", "--picture", "--json", "--out", tmp_path)
+    assert done.code == 0
+    assert done.err.count("\n") == 1
+    assert done.err.startswith("skysim: no picture of the lab: ")
+    assert "apt-get install" in done.err
+    assert json.loads(done.out)["pictures"] == []
+    assert (tmp_path / "report.html").is_file()
+    assert not (tmp_path / "lab.png").exists()
 
 
 def test_render_leaves_frames_with_their_truth_and_nothing_else(rendered: Path) -> None:

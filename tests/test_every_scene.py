@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import mujoco
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from estimator.nearfield import project
-from skysim import control, scene, simulate
+from skysim import manoeuvre, scene, simulate, world
 from skysim.simulate import Lab
+from skysim.vehicle import Vehicle
 
 NAMES = sorted(path.stem for path in scene.SCENES.glob("*.yaml"))
+MODELS = sorted(path.name for path in (scene.SCENES / "vehicles").glob("*.xml"))
 
 
 def prepared(name: str, frames: int, **overrides: str) -> Lab:
@@ -22,7 +26,7 @@ def lab(request: pytest.FixtureRequest) -> Lab:
 
 
 def test_there_are_scenes() -> None:
-    assert {"afit_simsat", "shefex2"} <= set(NAMES)
+    assert {"afit_simsat", "shefex2", "simsat_slew", "simsat_cmg", "simsat_bump", "tas2_vscmg"} <= set(NAMES)
 
 
 def test_it_says_what_it_is(lab: Lab) -> None:
@@ -88,17 +92,97 @@ def test_its_first_frames_are_solved_and_right(lab: Lab) -> None:
         assert np.degrees(error) < 10 / 60  # more is what the project calls wrong
 
 
-def test_the_afit_camera_sees_five_leds_all_along_its_manoeuvre():
-    """Two frames a second for the whole manoeuvre, at geometry alone: what is on the chip, by the tracker's map."""
-    loaded = scene.load("afit_simsat")
-    manoeuvre_s = control.plan(loaded.motion).duration_s
-    frames = int((manoeuvre_s - loaded.exposure.first_s) * loaded.exposure.rate_hz)
-    lab = simulate.prepare(scene.load("afit_simsat", {"exposure.frames": str(frames)}))
-    eyes = simulate.tracker(lab)
-    counts = []
-    for index in range(frames):
-        body_from_lab = lab.trajectory.at(simulate.window(lab.scene, index).open_s).inv()
+STEERED = [name for name in NAMES if scene.load(name).motion.control]
+NO_EYES = {
+    "simsat_bump": {"filter": "null", "motion.control.feedback": "truth"}
+}  # which would render and solve
+
+
+@pytest.fixture(scope="module", params=STEERED)
+def whole(request: pytest.FixtureRequest) -> Lab:
+    """A scene flown to its last frame, none of which is rendered."""
+    return simulate.prepare(scene.load(request.param, NO_EYES.get(request.param)))
+
+
+def test_the_camera_sees_five_leds_all_along_the_manoeuvre(whole: Lab) -> None:
+    """In every frame, at geometry alone: what is on the chip, by the tracker's map."""
+    eyes, counts = simulate.tracker(whole), []
+    for index in range(whole.scene.exposure.frames):
+        body_from_lab = whole.trajectory.at(simulate.window(whole.scene, index).open_s).inv()
         pixels = project(body_from_lab, eyes.leds.position_m, eyes.lever, eyes.camera)
         counts.append(int(eyes.camera.contains(np.nan_to_num(pixels, nan=-1e9), 12).sum()))
-    assert frames > 50
+    assert len(counts) >= 20
     assert min(counts) >= 5
+
+
+def test_its_last_frame_is_taken_when_the_manoeuvre_is_over_or_nearly(whole: Lab) -> None:
+    told_s = manoeuvre.plan(whole.scene.motion).duration_s
+    assert told_s - 3 < simulate.window(whole.scene, whole.scene.exposure.frames - 1).open_s < told_s + 3
+
+
+def test_it_is_steered_to_where_it_is_told_and_off_its_stop(whole: Lab) -> None:
+    telemetry = whole.telemetry
+    assert telemetry is not None
+    assert telemetry.lab_from_ref is not None
+    error_deg = np.degrees((telemetry.lab_from_ref.inv() * telemetry.lab_from_body).magnitude())
+    assert error_deg[-1] < 0.02
+    assert np.median(error_deg) < 0.05
+    up = telemetry.lab_from_body.as_matrix()[:, 2, 2]
+    assert np.degrees(np.arccos(np.clip(up, -1, 1))).max() < 29
+
+
+# --- the vehicles, at the hands of chance -------------------------------------------------------------------
+
+
+def at_random(vehicle: Vehicle, rate_body_rad_s: np.ndarray) -> world.Flight:
+    """A second of flight, every motor told something else each 10 ms, all over the range that it has.
+
+    A vehicle's own motors have the range of their file. `Flight.check` raises where MuJoCo warned.
+    """
+    ship, rng = world.build(vehicle), np.random.default_rng(7)
+    most = np.where(ship.model.actuator_ctrllimited, ship.model.actuator_ctrlrange[:, 1], 1.0)
+    most[ship.torques] = vehicle.torque_limit_nm
+    most[ship.gimbals.motor] = np.radians(vehicle.cmgs.gimbal_rate_limit_deg_s) if vehicle.cmgs else 0.0
+    flight = world.Flight(ship, Rotation.identity(), rate_body_rad_s, 1.0)
+    flight.advance(np.repeat(most * rng.uniform(-1, 1, (100, ship.model.nu)), 10, axis=0))
+    flight.check()
+    return flight
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_second_of_random_control_makes_no_warning(name: str) -> None:
+    flight = at_random(scene.load(name).vehicle, np.zeros(3))
+    assert flight.steps_left == 0
+    assert np.isfinite(flight.states).all()
+    assert np.linalg.norm(flight.rate_body_rad_s) > 1e-4  # it was moved
+
+
+@pytest.mark.parametrize("mount", ["free", "air_bearing"])
+@pytest.mark.parametrize("model", MODELS)
+def test_a_second_of_random_control_of_all_that_a_vehicle_has_makes_no_warning(
+    model: str, mount: str
+) -> None:
+    """At 1.1 rad/s and, on the bearing, against its stop; wheels at 3000 rpm and out of balance."""
+    spec = mujoco.MjSpec.from_file(str(scene.SCENES / "vehicles" / model))
+    named = [element.name for element in [*spec.joints, *spec.sites]]
+    wheels = sum(name.startswith("wheel_") for name in named)
+    parts = {
+        "wheel_": {
+            "wheels": {"start_rpm": [3000] * wheels, "coulomb": "2 mN m", "static_imbalance": "1 g cm"}
+        },
+        "gimbal_": {"cmgs": {"rotor_torque_limit": "0.1 N m"}},
+        "fan_": {"fans": {}},
+    }
+    given = {"model": f"vehicles/{model}", "mount": mount}
+    for prefix, part in parts.items():
+        given |= part if any(name.startswith(prefix) for name in named) else {}
+    flight = at_random(Vehicle.model_validate(given), np.array([0.6, 0.5, 0.8]))
+    assert flight.steps_left == 0
+    assert np.isfinite(flight.states).all()
+    assert flight.model.nu == 3 + sum(
+        name.startswith(("wheel_", "gimbal_", "rotor_", "fan_")) for name in named
+    )
+    up = Rotation.from_quat(flight.states[:, 1:5], scalar_first=True).as_matrix()[:, 2, 2]
+    tilt_deg = np.degrees(np.arccos(np.clip(up, -1, 1))).max()
+    lowest, highest = {"free": (30.0, 180.0), "air_bearing": (29.9, 30.1)}[mount]
+    assert lowest < tilt_deg <= highest

@@ -1,13 +1,15 @@
-"""Vibration against its own analytic sum: rms, spectrum, rates, and what lies between the samples."""
+"""Vibration against its own analytic sum: rms, spectrum, rates, what lies between the samples, and when it sounds."""
 
 from __future__ import annotations
+
+import itertools
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from skysim.jitter import SPECTRA, joined, own_rate, shake, swing
-from skysim.scene import JitterBand, JitterLine
+from skysim.jitter import SPECTRA, Vibration, joined, own_rate, shake, swing
+from skysim.motion import JitterBand, JitterLine, Motion
 from skysim.types import BadInput, Trajectory
 
 ARCSEC = np.radians(1 / 3600)
@@ -142,16 +144,25 @@ def test_rates_are_the_derivative_of_the_attitude() -> None:
 
     h = 1e-6
     turn = (attitude(at - h).inv() * attitude(at + h)).as_rotvec() / (2 * h)
-    # Rounding: 2e-16 / h = 2e-10 a rotation, some of them; what own_rate leaves out: 0.03^3 / 24 of 2 rad/s.
-    np.testing.assert_allclose(shaken.rate_body_rad_s[1:-1], turn, rtol=0, atol=3e-6)
+    # Rounding: 2e-16 / h = 2e-10 a rotation, some of them; the differences: 1e-12 * 63^3 * 0.025 / 6 = 1e-9.
+    np.testing.assert_allclose(shaken.rate_body_rad_s[1:-1], turn, rtol=0, atol=4e-9)
     size = np.abs(shaken.rate_body_rad_s - np.array([0.2, -0.1, 0.25])).max()
     assert size > 1.0  # the vibration's own rate is not small beside this tolerance
 
 
+@pytest.mark.parametrize("angle_rad", [0.0, 1e-9, 0.9e-4, 1.1e-4, 1e-2, 1.0, 3.0])
+def test_own_rate_is_that_of_the_rotation_at_any_angle(angle_rad: float) -> None:
+    """Rotations by complex numbers about one axis cannot see the cross terms: central differences of scipy's can."""
+    phi, phi_rate, h = angle_rad * np.array([[0.6, 0.0, 0.8]]), np.array([[0.3, -1.0, 0.2]]), 1e-5
+    before, after = (Rotation.from_rotvec(phi + side * h * phi_rate) for side in (-1, 1))
+    turned = (before.inv() * after).as_rotvec() / (2 * h)
+    np.testing.assert_allclose(own_rate(phi, phi_rate), turned, rtol=0, atol=1e-9)
+
+
 def test_cross_term_of_the_rate_is_needed() -> None:
-    """Coning: two axes a quarter period apart turn the body steadily at -(phi x dphi/dt) / 2 about the third."""
+    """Coning: two axes a quarter period apart turn the body steadily at (1 - cos a) dphi/dt / a about the third."""
     phi, phi_rate = np.array([[0.01, 0.0, 0.0]]), np.array([[0.0, 0.01, 0.0]])
-    np.testing.assert_allclose(own_rate(phi, phi_rate)[0, 2], -0.5e-4, rtol=1e-12)
+    np.testing.assert_allclose(own_rate(phi, phi_rate)[0, 2], -(1 - np.cos(0.01)), rtol=1e-11)
 
 
 def test_the_mean_attitude_is_that_of_the_calm_body() -> None:
@@ -172,3 +183,144 @@ def test_the_same_stream_shakes_alike() -> None:
 def test_too_many_samples_are_refused_in_one_line() -> None:
     with pytest.raises(BadInput, match=r"^motion\.jitter: 1e\+06 Hz over 60 s needs 960,000,001 .*$"):
         shake(turning(60.0), (line(1e6),), np.random.default_rng(1))
+
+
+# For a while only
+
+
+def shaking(*while_s: float, parts: object = None, always: object = ()) -> Motion:
+    """Holds of a second, and between them the vibration for each of the given whiles."""
+    hold = {"kind": "hold", "duration": "1 s"}
+    parts = parts or [{"kind": "line", "frequency_hz": 40, "rms_arcsec": RMS}]
+    told: list[object] = [hold]
+    for one_s in while_s:
+        told += [{"kind": "jitter", "duration": f"{one_s} s", "parts": parts}, hold]
+    return Motion.model_validate({"manoeuvre": told, "jitter": always})
+
+
+LOUD = [{"kind": "line", "frequency_hz": 7, "rms_arcsec": [3600, 1800, 900]}]
+NOISE = [{"kind": "band", "from_hz": 5, "to_hz": 60, "rms_arcsec": RMS}]
+
+
+def test_a_while_of_vibration_has_its_rms_between_rise_and_fall() -> None:
+    """Four seconds from 1 s: a rise of 0.4 s, then 128 whole periods of 40 Hz."""
+    calm = turning(6.0, samples=601)
+    shaken = Vibration.of(shaking(4.0), np.random.default_rng(13)).lay_over(calm)
+    phi = shaken_by(calm, shaken, 1.4 + np.arange(6400) / 2000)
+    np.testing.assert_allclose(np.sqrt(np.mean(phi**2, axis=0)), RMS, rtol=1e-3)
+    for begin, end in ((1.0, 1.4), (4.6, 5.0)):
+        # The mean square of 10x^3 - 15x^4 + 6x^5 is 181/462, and what the sine's square leaves of its own swing over
+        # a rise of T is at most 1 / (2 omega T), 0.005.
+        edge = shaken_by(calm, shaken, np.linspace(begin, end, 2000, endpoint=False))
+        np.testing.assert_allclose(np.mean(edge**2, axis=0), np.square(RMS) * 181 / 462, rtol=1.3e-2)
+
+
+def test_a_long_while_rises_within_a_second() -> None:
+    calm = turning(32.0, samples=3201)
+    shaken = Vibration.of(shaking(30.0), np.random.default_rng(14)).lay_over(calm)
+    for begin in (2.0, 29.0):
+        phi = shaken_by(calm, shaken, begin + np.arange(2000) / 2000)
+        np.testing.assert_allclose(np.sqrt(np.mean(phi**2, axis=0)), RMS, rtol=1e-3)
+
+
+def test_nothing_shakes_outside_of_its_while() -> None:
+    calm, rng = turning(8.0, rate=(0.1, 0.2, -0.1), samples=801), np.random.default_rng(15)
+    vibration = Vibration.of(shaking(2.0, 3.0), rng)
+    shaken = vibration.lay_over(calm)
+    t = np.random.default_rng(16).uniform(0, 8, 4000)
+    outside = (t < 1) | ((t > 3) & (t < 4)) | (t > 7)
+    phi, rate = vibration.swing(np.sort(t[outside]))
+    np.testing.assert_array_equal([phi, rate], np.zeros((2, outside.sum(), 3)))
+    assert np.abs(shaken_by(calm, shaken, t[outside])).max() < 1e-9  # rounding: 1e-15 rad is 2e-10 arcsec
+    assert (np.abs(shaken_by(calm, shaken, t[~outside])).max(axis=0) > RMS).all()
+    silent = (shaken.t_s <= 1) | ((shaken.t_s >= 3) & (shaken.t_s <= 4)) | (shaken.t_s >= 7)
+    np.testing.assert_allclose(shaken.rate_body_rad_s[silent], [[0.1, 0.2, -0.1]] * silent.sum(), rtol=1e-14)
+    np.testing.assert_allclose(
+        np.diff(shaken.t_s[shaken.t_s <= 1]), 0.01, rtol=1e-9
+    )  # no finer where it is calm
+
+
+def test_two_whiles_of_the_same_vibration_have_their_own_phases() -> None:
+    vibration = Vibration.of(shaking(2.0, 2.0), np.random.default_rng(17))
+    t = np.linspace(1.5, 2.5, 1000, endpoint=False)
+    first, second = vibration.swing(t)[0], vibration.swing(t + 3.0)[0]  # 120 periods later
+    assert (np.sqrt(np.mean((first - second) ** 2, axis=0)) > 0.05 * ARCSEC * np.array(RMS)).any()
+
+
+@pytest.mark.parametrize("always", [(), LOUD])
+def test_swing_within_a_while_has_the_derivative_it_says(always: list[object]) -> None:
+    """The envelope's own slope included: central differences of phi over the rise, the middle and the fall."""
+    vibration, h = Vibration.of(shaking(2.0, parts=LOUD, always=always), np.random.default_rng(18)), 1e-6
+    t = np.sort(np.random.default_rng(19).uniform(0.9, 3.1, 3000))
+    before, after = vibration.swing(t - h)[0], vibration.swing(t + h)[0]
+    rate = vibration.swing(t)[1]
+    # h^2 / 6 times a third derivative of some (2 pi 7 + 4 / 0.2)^3 * 0.05 rad = 1e4 rad/s3 at the most
+    np.testing.assert_allclose((after - before) / (2 * h), rate, rtol=0, atol=4e-9)
+    assert np.abs(rate).max() > 0.5
+
+
+def test_the_shaken_rate_is_the_derivative_of_the_attitude_through_a_while() -> None:
+    """At its samples by central differences of lab_from_body exp(phi); between them it follows that too."""
+    calm = turning(4.0, rate=(0.2, -0.1, 0.25), samples=4001)
+    vibration = Vibration.of(shaking(2.0, parts=LOUD), np.random.default_rng(20))
+    shaken, h = vibration.lay_over(calm), 1e-6
+    at = shaken.t_s[(shaken.t_s > 0.9) & (shaken.t_s < 3.1)][::7]
+
+    def body(t_s: np.ndarray) -> Rotation:
+        return calm.at(t_s) * Rotation.from_rotvec(vibration.swing(t_s)[0])
+
+    turned = (body(at - h).inv() * body(at + h)).as_rotvec() / (2 * h)
+    rate = np.array([shaken.rate_at(t) for t in at])
+    np.testing.assert_allclose(rate, turned, rtol=0, atol=4e-9)
+    between = np.sort(np.random.default_rng(21).uniform(0.9, 3.1, 3000))
+    error = np.linalg.norm((shaken.at(between).inv() * body(between)).as_rotvec(), axis=1)
+    assert error.max() < 1e-4 * np.radians(1.0) * np.sqrt(2)
+
+
+def test_a_short_while_is_sampled_for_its_envelope_too() -> None:
+    """A tenth of a period of 0.5 Hz: only the rise and fall, 10 ms each, set the samples."""
+    calm = turning(2.2, samples=3)
+    slow = [{"kind": "line", "frequency_hz": 0.5, "rms_arcsec": RMS}]
+    vibration = Vibration.of(shaking(0.1, parts=slow), np.random.default_rng(22))
+    shaken, t = vibration.lay_over(calm), np.linspace(0.95, 1.15, 4000)
+    wanted = vibration.swing(t)[0] / ARCSEC
+    assert (np.abs(shaken_by(calm, shaken, t) - wanted) < 1e-4 * np.sqrt(2) * np.array(RMS)).all()
+    assert (np.abs(wanted).max(axis=0) > 0).all()
+
+
+def test_a_flight_in_pieces_shakes_like_the_whole() -> None:
+    """A history that turns and speeds up, cut at samples into uneven pieces, inside and outside of the while."""
+    t = np.arange(0, 3.0 + 5e-4, 1e-3)
+    rate = np.outer(1 + t, [0.1, 0.0, 0.2])
+    angle = np.outer(t + t**2 / 2, [0.1, 0.0, 0.2])
+    vibration = Vibration.of(shaking(1.0, parts=NOISE + LOUD, always=NOISE), np.random.default_rng(23))
+    whole = vibration.lay_over(Trajectory(t, Rotation.from_rotvec(angle), rate))
+    cuts = [0, 10, 700, 1003, 1995, len(t) - 1]
+    for first, last in itertools.pairwise(cuts):
+        now = slice(first, last + 1)
+        piece = vibration.lay_over(Trajectory(t[now], Rotation.from_rotvec(angle[now]), rate[now]))
+        same = (whole.t_s >= t[first]) & (whole.t_s <= t[last])
+        np.testing.assert_array_equal(piece.t_s, whole.t_s[same])
+        np.testing.assert_allclose(piece.rate_body_rad_s, whole.rate_body_rad_s[same], rtol=0, atol=1e-12)
+        at = np.random.default_rng(24).uniform(t[first], t[last], 300)
+        assert np.abs((whole.at(at).inv() * piece.at(at)).as_rotvec()).max() < 1e-12
+
+
+def test_a_piece_in_which_nothing_sounds_is_the_same_history() -> None:
+    vibration = Vibration.of(shaking(1.0), np.random.default_rng(25))
+    piece = turning(0.9)
+    assert vibration.lay_over(piece) is piece
+    assert Vibration.of(Motion(), np.random.default_rng(25)).voices == ()
+
+
+def test_too_many_samples_of_a_while_are_refused_with_its_time() -> None:
+    fast = [{"kind": "line", "frequency_hz": 1e6, "rms_arcsec": RMS}]
+    vibration = Vibration.of(shaking(1.0, parts=fast, always=NOISE), np.random.default_rng(26))
+    flight = turning(3.0, samples=3001)
+    with pytest.raises(
+        BadInput, match=r"^motion\.manoeuvre jitter at 1 s: 1.*e\+06 Hz over 1 s needs 16,0.*$"
+    ):
+        vibration.lay_over(flight)
+    with pytest.raises(BadInput, match=r"; allowed: 5,000,000, 16 a period$"):
+        vibration.pieces(flight.t_s)
+    vibration.lay_over(turning(0.5))  # before its time

@@ -8,10 +8,11 @@ import sys
 from pathlib import Path
 from typing import get_args
 
+import mujoco
 import pytest
 import yaml
 
-from skysim import BadInput, camera
+from skysim import BadInput, camera, motion, vehicle
 from skysim.optics import VIGNETTING
 from skysim.psf import PSFS
 from skysim.scene import ROOT, load
@@ -22,6 +23,12 @@ SKYSIM = [sys.executable, "-m", "skysim"]
 
 def blocks(language: str) -> list[str]:
     return re.findall(rf"```{language}\n(.*?)```", README, re.DOTALL)
+
+
+def yaml_block(key: str) -> str:
+    """The one block of YAML that has this key at its top."""
+    (block,) = [block for block in blocks("yaml") if re.search(rf"^{key}:", block, re.MULTILINE)]
+    return block
 
 
 def commands() -> list[list[str]]:
@@ -46,7 +53,7 @@ def folder(tmp_path_factory) -> Path:
 def test_the_commands_leave_what_the_readme_says(folder):
     ran = {path.name for path in (folder / "out" / "short").iterdir()}
     frames = {f"frame_000{n}.{suffix}" for n in (0, 1) for suffix in ("fits", "png", "ecsv")}
-    assert ran == frames | {"solutions.ecsv", "annotated.png", "report.html"}
+    assert ran == frames | {"solutions.ecsv", "telemetry.ecsv", "annotated.png", "report.html"}
     # `render` came after `run` and cleared what the latter said of other frames.
     rendered = {path.name for path in (folder / "out" / "shefex2").iterdir()}
     assert rendered == {f"frame_0000.{suffix}" for suffix in ("fits", "png", "ecsv", "preview.png")}
@@ -54,7 +61,7 @@ def test_the_commands_leave_what_the_readme_says(folder):
 
 def test_the_camera_block_is_a_camera_that_sees(folder):
     """The block's lines in a copy of the scene that the text names, flown for two frames by the real command."""
-    (block,) = blocks("yaml")
+    block = yaml_block("camera")
     tree = yaml.safe_load((ROOT / "scenes/afit_simsat.yaml").read_text(encoding="utf-8"))
     mine = yaml.safe_load(block)
     assert set(mine) == {"camera", "background", "motion"}
@@ -72,7 +79,7 @@ def test_the_camera_block_is_a_camera_that_sees(folder):
 
 def test_every_kind_that_the_camera_block_names_is_one():
     """`# or ...` beside a kind lists the others, all of them."""
-    (block,) = blocks("yaml")
+    block = yaml_block("camera")
     rest = re.findall(r"(\w+): \{kind: (\w+)[^#]*# or ([\w, ]+)", block)
     told = {section: {kind, *others.split(", ")} for section, kind, others in rest}
     shutters = get_args(get_args(camera.Shutter)[0])
@@ -81,6 +88,55 @@ def test_every_kind_that_the_camera_block_names_is_one():
         "psf": set(PSFS),
         "shutter": {get_args(part.model_fields["kind"].annotation)[0] for part in shutters},
     }
+
+
+def test_the_vehicle_block_flies_and_is_told_where_it_is(folder):
+    """The block as a scene, two seconds of it by the real command: wheels, fans, gyros, filter, all disturbances."""
+    path = folder / "flown.yaml"
+    path.write_text(yaml_block("base"))
+    command = [*SKYSIM, "run", str(path), "--frames", "3", "--json"]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    told = json.loads(done.stdout)
+    assert (told["frames"], told["solved"], told["wrong"]) == (3, 3, 0)
+    assert told["flight"]["filter_arcsec_end"] < 30
+    assert [row["filter"] for row in told["rows"]] == ["used"] * 3
+
+
+def test_every_choice_that_the_vehicle_block_names_is_one():
+    """`# or ...` beside a choice lists the others, all of them; and every kind of manoeuvre is shown."""
+    block = yaml_block("base")
+    told = {
+        key: {one, *others.split(", ")}
+        for key, one, others in re.findall(r"(\w+): (\w+) +# or ([\w, ]+)", block)
+    }
+    choices = {
+        key: set(get_args(part.model_fields[key].annotation))
+        for part, keys in ((motion.Control, ("law", "actuators", "feedback")), (vehicle.Imu, ("earth_rate",)))
+        for key in keys
+    }
+    assert told == choices
+    shown = {element["kind"] for element in yaml.safe_load(block)["motion"]["manoeuvre"]}
+    kinds = {
+        get_args(part.model_fields["kind"].annotation)[0] for part in get_args(get_args(motion.Manoeuvre)[0])
+    }
+    assert shown == kinds
+
+
+def test_the_picture_of_the_lab_is_there_or_the_reason_is_told(folder):
+    """`--picture` in the README's own run: with OpenGL both files, without it the run's report all the same."""
+    left = {path.name for path in (folder / "out" / "simsat_slew").iterdir()}
+    assert "report.html" in left
+    assert ("lab.png" in left) == ("lab.gif" in left)
+
+
+def test_the_exported_scene_steps_in_mujoco(folder):
+    model = mujoco.MjModel.from_xml_path(str(folder / "out" / "simsat_cmg.xml"))
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, model.key("start").id)
+    mujoco.mj_step(model, data, nstep=200)
+    assert not data.warning.number.any()
+    assert data.time == pytest.approx(0.2)
 
 
 def test_the_python_block_solves_the_frame(folder):

@@ -18,6 +18,7 @@ from skysim.camera import Camera
 from skysim.detector import Chip, expose
 from skysim.led import Emitter
 from skysim.light import CosineLobe
+from skysim.motion import JitterLine
 from skysim.optics import Optics
 from skysim.photometry import SUN, Band, led_strength_e_s_sr, star_flux_e_s_m2
 from skysim.render import Window, render
@@ -518,7 +519,7 @@ def test_a_rolling_shutter_bands_a_pulsed_led() -> None:
 
 
 def test_jitter_widens_a_star_by_its_own_variance() -> None:
-    shake = scene.JitterLine(kind="line", frequency_hz=40.0, rms_arcsec=(60.0, 120.0, 0.0))
+    shake = JitterLine(kind="line", frequency_hz=40.0, rms_arcsec=(60.0, 120.0, 0.0))
     shaken = jitter.shake(STILL, [shake], np.random.default_rng(4))
     image, seen = shot(star_at(31.5, 23.5), shaken)  # forty whole periods
     wide = (np.radians([120 / 3600, 60 / 3600]) * 2500) ** 2  # about y it swings along x

@@ -5,20 +5,23 @@ from __future__ import annotations
 import datetime
 import math
 import re
+from collections.abc import Iterable
 from pathlib import Path
 from typing import get_args
 
 import pytest
-from pydantic import ValidationError
+from pydantic import BeforeValidator, ValidationError
 
-from skysim import camera, light, scene
+from skysim import camera, light, motion, scene, vehicle
+from skysim.actuators import STEERING
 from skysim.background import BACKGROUNDS
 from skysim.dome import LAYOUTS, SURFACES
 from skysim.jitter import SPECTRA
 from skysim.led import LOBES
+from skysim.manoeuvre import LEGS
 from skysim.optics import VIGNETTING
 from skysim.psf import PSFS
-from skysim.quantity import SI_SUFFIX
+from skysim.quantity import SI_SUFFIX, Part
 from skysim.types import BadInput
 
 AFIT, SHEFEX = scene.SCENES / "afit_simsat.yaml", scene.SCENES / "shefex2.yaml"
@@ -68,6 +71,21 @@ def spoilt(tmp_path: Path, whole: Path, right: str, wrong: str) -> tuple[str, st
         ("vehicle.mass", "176.37 lb", 80.0),
         ("vehicle.torque_limit", "1 N m", 1.0),
         ("light.led.intensity", "16 mcd", 0.016),
+        ("vehicle.wheels.torque_limit", "500 mN m", 0.5),
+        ("vehicle.wheels.coulomb", "2 mN m", 2e-3),
+        ("vehicle.wheels.viscous", "1e-4 N m s", 1e-4),
+        ("vehicle.wheels.static_imbalance", "1 g cm", 1e-5),
+        ("vehicle.wheels.dynamic_imbalance", "10 g cm2", 1e-6),
+        ("vehicle.fans.thrust_limit", "0.1 lbf", 0.444822),
+        ("vehicle.fans.time_constant", "200 ms", 0.2),
+        ("vehicle.cmgs.gimbal_time_constant", "20 ms", 0.02),
+        ("vehicle.cmgs.rotor_torque_limit", "0.1 N m", 0.1),
+        ("vehicle.drag.viscous", "2 mN m s", 2e-3),
+        ("vehicle.drag.quadratic", "3 mN m s2", 3e-3),
+        ("vehicle.disturbances.cable.stiffness", "1e-3 N m / rad", 1e-3),
+        ("vehicle.disturbances.cable.stiffness", "1 N m / deg", 180 / math.pi),
+        ("vehicle.imu.gyro.bias_time", "5 min", 300.0),
+        ("vehicle.imu.accelerometer.bias_time", "1 h", 3600.0),
     ],
 )
 def test_a_quantity_becomes_si(key: str, quantity: str, value: float) -> None:
@@ -76,6 +94,72 @@ def test_a_quantity_becomes_si(key: str, quantity: str, value: float) -> None:
         (name,) = [n for n in type(node).model_fields if SI_SUFFIX.sub("", n) == part]
         node = getattr(node, name)
     assert node == pytest.approx(value, rel=1e-5)  # a pound is 0.45359 kg
+
+
+@pytest.mark.parametrize(
+    ("part", "given", "name", "value"),
+    [
+        (vehicle.Draught, {"rms": ["1 mN m", "2 uN m", "0 N m"]}, "rms_nm", (1e-3, 2e-6, 0.0)),
+        (
+            vehicle.Draught,
+            {"rms": ["0 N m"] * 3, "correlation": "1500 ms"},
+            "correlation_s",
+            1.5,
+        ),
+        (
+            vehicle.Disturbances,
+            {"turbine": ["1 mN m", "-1 mN m", "0 N m"]},
+            "turbine_nm",
+            (1e-3, -1e-3, 0.0),
+        ),
+        (motion.Desaturation, {"start": "2 N m s", "stop": "800 mN m s"}, "stop_nms", 0.8),
+        (motion.Desaturation, {"start": "2 kg m2 / s", "stop": "1 N m s"}, "start_nms", 2.0),
+        (motion.Desaturation, {"start": "2 N m s", "stop": "1 N m s", "time": "1 min"}, "time_s", 60.0),
+        (
+            motion.Bump,
+            {"kind": "bump", "rate_deg_s": [1, 2, 3], "duration": "40 ms", "caught_after": "200 ms"},
+            "caught_after_s",
+            0.2,
+        ),
+        (scene.Filter, {"latency": "200 ms"}, "latency_s", 0.2),
+        (scene.Filter, {"bias_time": "5 min"}, "bias_time_s", 300.0),
+    ],
+)
+def test_a_section_s_quantities_become_si(
+    part: type[Part], given: dict[str, object], name: str, value: object
+) -> None:
+    assert getattr(part.model_validate(given), name) == pytest.approx(value, rel=1e-12)
+
+
+def parts_of(annotation: object) -> set[type[Part]]:
+    """Every section that an annotation names, and theirs."""
+    if isinstance(annotation, type) and issubclass(annotation, Part):
+        fields = annotation.model_fields.values()
+        return {annotation}.union(*(parts_of(field.annotation) for field in fields))
+    return set().union(*(parts_of(one) for one in get_args(annotation)))
+
+
+def is_quantity(annotation: object, metadata: Iterable[object]) -> bool:
+    """Whether it, or each of it, is filled by a value such as "48 in"."""
+    parsers = [one.func for one in metadata if isinstance(one, BeforeValidator)]
+    own = any(
+        parser is camera.focus_distance or parser.__qualname__.startswith("quantity") for parser in parsers
+    )
+    return own or any(is_quantity(one, getattr(one, "__metadata__", ())) for one in get_args(annotation))
+
+
+SUFFIXES = ("_w_sr", "_nm_rad", "_kg_m2", "_kg_m", "_nms2", "_nms", "_nm", "_kg", "_cd", "_n", "_m", "_s")
+FIELDS = [(part, name) for part in sorted(parts_of(scene.Scene), key=str) for name in part.model_fields]
+
+
+@pytest.mark.parametrize(("part", "name"), FIELDS, ids=[f"{part.__name__}.{name}" for part, name in FIELDS])
+def test_a_key_has_a_unit_in_its_name_unless_its_value_has_one(part: type[Part], name: str) -> None:
+    """A quantity's key is its Python name less the SI suffix; every other key is the name itself."""
+    field = part.model_fields[name]
+    suffix = next((one for one in SUFFIXES if name.endswith(one)), "")
+    bare = name.removesuffix(suffix if is_quantity(field.annotation, field.metadata) else "")
+    own = {"schema_version": "schema", "name": scene.STEM} if part is scene.Scene else {}
+    assert field.alias == own.get(name, bare)
 
 
 def test_afit_says_what_the_thesis_says() -> None:
@@ -115,7 +199,7 @@ def test_the_camera_of_a_scene_can_be_read_alone(tmp_path: Path) -> None:
 def test_an_override_takes_the_place_of_the_file_s_value() -> None:
     changed = scene.load("afit_simsat", {"camera.detector.bits": "8", "motion.start": "{yaw_deg: 40}"})
     assert changed.camera.detector.bits == 8
-    assert changed.motion.start == scene.Attitude(yaw_deg=40)
+    assert changed.motion.start == motion.Attitude(yaw_deg=40)
 
 
 def test_an_override_may_add_a_section() -> None:
@@ -171,7 +255,7 @@ def test_a_bad_override_is_one_line_and_blamed_on_the_option(key: str, value: st
         (
             "control: pid",
             "control: lqr",
-            "motion.control: 'lqr' is not allowed; it should be 'none' or 'pid'",
+            "motion.control: 'lqr' is not allowed; it should be 'pid' or 'pd'",
         ),
         (
             'apex: "48 in"',
@@ -239,7 +323,11 @@ def test_a_bad_override_is_one_line_and_blamed_on_the_option(key: str, value: st
             'durations: "1 s"',
             "unknown key; did you mean duration?; allowed: kind, duration",
         ),
-        ('{kind: hold, duration: "1 s"}', '{kind: wait, duration: "1 s"}', "'wait' is none of hold, slew"),
+        (
+            '{kind: hold, duration: "1 s"}',
+            '{kind: wait, duration: "1 s"}',
+            "motion.manoeuvre.0.kind: 'wait' is none of hold, step, slew, rate, spin_up, sine, jitter, bump",
+        ),
         (
             "pitch_deg: 0",
             "pich_deg: 0",
@@ -394,6 +482,269 @@ def test_a_slip_within_a_kind_is_told_of_that_kind_alone(key: str, value: str, s
     assert "tagged-union" not in message
 
 
+# Rules between sections: who flies, with what, at which rate
+
+
+UNLOAD = "{start: 2 N m s, stop: 1 N m s}"
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"filter": "{}"}, "filter: takes a gyro; allowed beside vehicle.imu"),
+        *(
+            (
+                {"motion.control": f"{{actuators: {kind}}}"},
+                f"motion.control.actuators: vehicle.{kind} is not switched on",
+            )
+            for kind in ("wheels", "cmgs", "fans")
+        ),
+        *(
+            (
+                {"motion.control": f"{{actuators: {kind}, desaturation: {UNLOAD}}}"} | more,
+                "motion.control.desaturation: takes vehicle.fans, and actuators: wheels or cmgs",
+            )
+            for kind, more in (
+                ("ideal", {"vehicle.fans": "{}"}),
+                ("wheels", {"vehicle.wheels": "{}"}),
+                ("fans", {"vehicle.fans": "{}"}),
+            )
+        ),
+        (
+            {"motion.control": "{feedback: imu}"},
+            "motion.control.feedback: imu takes the section vehicle.imu",
+        ),
+        (
+            {"motion.control": "{feedback: filter}", "vehicle.imu": "{}"},
+            "motion.control.feedback: filter takes the section filter",
+        ),
+        (
+            {"motion.control": "{rate_hz: 300}"},
+            "motion.control.rate_hz: 300 Hz is no whole number of milliseconds",
+        ),
+        (
+            {"vehicle.imu": "{rate_hz: 250}"},
+            "vehicle.imu.rate_hz: 250 Hz is no multiple of motion.control.rate_hz 100 Hz",
+        ),
+        (
+            {"motion.control": f"{{desaturation: {UNLOAD.replace('2', '0.5')}}}"},
+            "motion.control.desaturation: stop 1 N m s is not below start 0.5 N m s",
+        ),
+        (
+            {
+                "motion.manoeuvre": "[{kind: bump, rate_deg_s: [1, 2, 3], duration: 40 ms, caught_after: 30 ms}]"
+            },
+            "motion.manoeuvre.0: caught_after 0.03 s is before the knock is over",
+        ),
+    ],
+)
+def test_what_does_not_go_together_is_one_line(changes: dict[str, str], says: str) -> None:
+    assert complaint(AFIT, changes) == f"{says} (--set)"
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "says"),
+    [
+        *(
+            ("vehicle.disturbances", value, "vehicle: disturbances: a free vehicle has none; allowed: mount:")
+            for value in (
+                "{earth_rotation: true}",
+                "{turbine: [0 N m, 0 N m, 1 mN m]}",
+                "{cable: {stiffness: 1 N m / rad}}",
+                "{draught: {rms: [1 mN m, 1 mN m, 1 mN m]}}",
+            )
+        ),
+        *(
+            (
+                "vehicle.imu",
+                f"{{earth_rate: {rate}}}",
+                "vehicle: imu.earth_rate: a free vehicle is not on the Earth; allowed: none",
+            )
+            for rate in ("compensated", "uncompensated")
+        ),
+    ],
+)
+def test_a_free_vehicle_is_in_no_room(key: str, value: str, says: str) -> None:
+    free = {"vehicle.mount": "free", "vehicle.centre_of_mass": "[0 m, 0 m, 0 m]"}
+    assert says in complaint(AFIT, free | {key: value})
+    assert scene.load(AFIT, {key: value}).vehicle.mount == "air_bearing"  # where it may have it
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "says"),
+    [
+        ("vehicle.wheels", "{coulomb: 1 mN}", "coulomb: '1 mN' is not a torque; allowed: a torque such as"),
+        (
+            "vehicle.wheels",
+            "{coulomb: -1 mN m}",
+            "vehicle.wheels.coulomb: '-1 mN m' is not allowed; it should be gr",
+        ),
+        (
+            "vehicle.wheels",
+            "{torque: 1 N m}",
+            "vehicle.wheels.torque: unknown key; did you mean torque_limit?; allo",
+        ),
+        ("vehicle.wheels", "{static_imbalance: 1 g}", "'1 g' is not a mass times offset; allowed: a mass ti"),
+        ("vehicle.fans", "{thrust_limit: 1 N m}", "'1 N m' is not a force; allowed: a force such as"),
+        ("vehicle.drag", "{viscous: 1 N m}", "vehicle.drag.viscous: '1 N m' is not a torque per rate; allow"),
+        ("vehicle.drag", "{quadratic: 1 N m s}", "'1 N m s' is not a torque per squared rate; allowed: a t"),
+        ("vehicle.cmgs", "{steering: magic}", "it should be 'pseudo_inverse' or 'singularity_robust'"),
+        ("vehicle.cmgs", "{gimbal_time_constant: 1 ms}", "should be greater than or equal to 0.005"),
+        ("vehicle.disturbances", "{cable: {}}", "vehicle.disturbances.cable.stiffness: missing"),
+        (
+            "vehicle.disturbances",
+            "{cable: {stiffness: 1 N m}}",
+            "'1 N m' is not a torque per angle; allowed: ",
+        ),
+        (
+            "vehicle.disturbances",
+            "{draught: {rms: [1 N m]}}",
+            "vehicle.disturbances.draught.rms.1: missing",
+        ),
+        ("vehicle.imu", "{earth_rate: maybe}", "it should be 'none', 'uncompensated' or 'compensated'"),
+        ("vehicle.imu", "{gyro: {arw: 3}}", "vehicle.imu.gyro.arw: unknown key; allowed: arw_deg_sqrt_h, "),
+        ("motion.control", "{law: lqr}", "motion.control.law: 'lqr' is not allowed; it should be 'pid' or"),
+        ("motion.control", "{rate_hz: 0.5}", "motion.control.rate_hz: 0.5 is not allowed; it should be gr"),
+        ("motion.control", "true", "motion.control: True is not allowed; it should be a mapping of keys to"),
+        ("lab", "{latitude_deg: 91}", "lab.latitude_deg: 91 is not allowed; it should be less than or equal"),
+        ("filter", "{latency: -1 s}", "filter.latency: '-1 s' is not allowed; it should be greater than or"),
+    ],
+)
+def test_a_slip_in_what_flies_is_told_with_its_key(key: str, value: str, says: str) -> None:
+    message = complaint(AFIT, {key: value})
+    assert says in message
+    assert message.endswith("(--set)")
+
+
+@pytest.mark.parametrize("kind", ["hold", "jitter", "bump"])
+def test_nobody_need_fly_a_vehicle_that_is_told_nothing(kind: str) -> None:
+    more = {
+        "hold": "",
+        "jitter": ", parts: [{kind: line, frequency_hz: 9, rms_arcsec: [1, 1, 1]}]",
+        "bump": ", rate_deg_s: [1, 1, 1]",
+    }[kind]
+    told = {"motion.manoeuvre": f"[{{kind: {kind}, duration: 1 s{more}}}]", "motion.control": "none"}
+    assert scene.load(AFIT, told).motion.control is None
+
+
+def test_a_controller_s_name_is_short_for_its_section() -> None:
+    loaded = [scene.load(AFIT, {"motion.control": value}).motion.control for value in ("pd", "{law: pd}")]
+    assert loaded[0] == loaded[1] == motion.Control(law="pd")
+
+
+# A scene on top of another
+
+
+def written(folder: Path, name: str, text: str) -> Path:
+    path = folder / name
+    path.parent.mkdir(exist_ok=True)
+    path.write_text(text)
+    return path
+
+
+def test_a_scene_says_what_is_different_from_its_base(tmp_path: Path) -> None:
+    """Keys of a section are merged at every depth; a list is taken whole; the name is the file's own."""
+    mine = written(
+        tmp_path,
+        "mine.yaml",
+        "base: afit_simsat\ntitle: Mine\nexposure: {frames: 3}\nlight: {led: {scatter: 0.01}}\n"
+        'motion:\n  manoeuvre: [{kind: hold, duration: "2 s"}]\n',
+    )
+    base, loaded = scene.load("afit_simsat"), scene.load(mine)
+    assert (loaded.name, loaded.title) == ("mine", "Mine")
+    assert loaded.exposure == base.exposure.model_copy(update={"frames": 3})
+    led = base.light.led.model_copy(update={"scatter": 0.01})
+    assert loaded.light == base.light.model_copy(update={"led": led})
+    assert [one.kind for one in loaded.motion.manoeuvre] == ["hold"]
+    same = ("vehicle", "camera", "tracker", "seed", "start_time")
+    assert all(getattr(loaded, key) == getattr(base, key) for key in same)
+
+
+def test_a_section_of_another_kind_takes_the_place_of_the_base_s(tmp_path: Path) -> None:
+    surface = "light: {surface: {kind: sphere, apex: 1 m, radius: 90 cm}}"
+    loaded = scene.load(written(tmp_path, "mine.yaml", f"base: afit_simsat\n{surface}\n"))
+    assert loaded.light.surface == light.Surface.model_validate(
+        {"kind": "sphere", "apex": "1 m", "radius": "90 cm"}
+    )
+
+
+def test_null_switches_a_section_of_the_base_off(tmp_path: Path) -> None:
+    assert scene.load("simsat_slew").vehicle.wheels
+    mine = "base: simsat_slew\nvehicle: {wheels: null, fans: null}\nmotion: {control: null, manoeuvre: []}\n"
+    loaded = scene.load(written(tmp_path, "mine.yaml", mine))
+    assert (loaded.vehicle.wheels, loaded.vehicle.fans, loaded.motion.control) == (None, None, None)
+    assert loaded.vehicle.drag == scene.load("simsat_slew").vehicle.drag
+
+
+def test_a_base_is_found_beside_the_scene_and_may_have_one_too(tmp_path: Path) -> None:
+    """And the files that it names are those beside itself, not beside the scene on top of it."""
+    model = (scene.SCENES / "vehicles" / "simsat.xml").read_text()
+    written(tmp_path, "below/own.xml", model)
+    written(tmp_path, "below/lower.yaml", "base: simsat_slew\nvehicle: {model: own.xml}\nseed: 77\n")
+    mine = written(tmp_path, "mine.yaml", "base: below/lower.yaml\ntitle: Mine on top\n")
+    loaded = scene.load(mine)
+    assert loaded.vehicle.model == str(tmp_path / "below" / "own.xml")
+    assert (loaded.seed, loaded.title) == (77, "Mine on top")
+    assert loaded.exposure == scene.load("simsat_slew").exposure
+    assert loaded.camera == scene.load("afit_simsat").camera == scene.load_camera(mine)
+
+
+def test_an_override_stands_above_scene_and_base(tmp_path: Path) -> None:
+    mine = written(tmp_path, "mine.yaml", "base: afit_simsat\nseed: 2\n")
+    loaded = scene.load(mine, {"seed": "3", "exposure.frames": "7"})
+    assert (loaded.seed, loaded.exposure.frames) == (3, 7)
+
+
+@pytest.mark.parametrize(
+    ("base", "says"),
+    [
+        ("nosuch", "base: nosuch: no such scene; allowed: a .yaml file or one of afit_simsat, "),
+        ("nosuch.yaml", "base: nosuch.yaml: no such scene; allowed: a .yaml file or one of "),
+        ("3", "base: 3: no such scene; allowed: "),
+        ("", "base: None: no such scene; allowed: "),
+        ("[a, b]", "base: ['a', 'b']: no such scene; allowed: "),
+        ("mine.yaml", "base: mine.yaml is this scene itself, or has it for its base"),
+        ("../mine/mine.yaml", "base: ../mine/mine.yaml is this scene itself, or has it for its base"),
+    ],
+)
+def test_a_base_that_is_none_is_one_line(tmp_path: Path, base: str, says: str) -> None:
+    path = written(tmp_path / "mine", "mine.yaml", f"title: Mine\nbase: {base}\n")
+    message = complaint(path)
+    assert message.startswith(says)
+    assert message.endswith(f"({path}, line 2)")
+
+
+def test_scenes_that_stand_on_each_other_are_refused(tmp_path: Path) -> None:
+    one = written(tmp_path, "one.yaml", "base: two.yaml\n")
+    written(tmp_path, "two.yaml", "base: three.yaml\n")
+    three = written(tmp_path, "three.yaml", "title: Three\nbase: one.yaml\n")
+    says = "base: one.yaml is this scene itself, or has it for its base"
+    assert complaint(one) == f"{says} ({three}, line 2)"
+
+
+def test_a_slip_is_told_with_the_file_in_which_it_stands(tmp_path: Path) -> None:
+    """Its own where it is above, the base's where it is there; a section between is in both."""
+    lower = written(tmp_path, "lower.yaml", "base: afit_simsat\nexposure:\n  frames: 0\n  rate_hz: 2\n")
+    mine = written(tmp_path, "mine.yaml", "base: lower.yaml\nseed: 3\nexposure:\n  rate_hz: 1\n")
+    says = "exposure.frames: 0 is not allowed; it should be greater than or equal to 1"
+    assert complaint(mine) == f"{says} ({lower}, line 3)"
+    mine.write_text("base: lower.yaml\nseed: 3\n\nexposure:\n  rate_hz: 1\n  frames: -1\n")
+    assert complaint(mine) == f"{says.replace('0 is', '-1 is')} ({mine}, line 6)"
+    assert complaint(mine, {"exposure.frames": "0"}) == f"{says} (--set)"
+
+
+def test_what_is_missing_in_a_list_is_not_looked_for_in_the_base_s(tmp_path: Path) -> None:
+    """The base has a first element with a duration; but this list has taken its place."""
+    mine = written(tmp_path, "mine.yaml", "base: afit_simsat\nmotion:\n  manoeuvre:\n    - {kind: hold}\n")
+    assert complaint(mine) == f"motion.manoeuvre.0.duration: missing ({mine}, line 4)"
+
+
+def test_a_base_that_is_no_yaml_is_one_line(tmp_path: Path) -> None:
+    lower = written(tmp_path, "lower.yaml", "title: [")
+    mine = written(tmp_path, "mine.yaml", "base: lower.yaml\n")
+    assert complaint(mine).startswith(f"{lower}, line 1: not YAML: ")
+
+
 # The camera: preset and focus
 
 
@@ -518,11 +869,13 @@ def kinds(union: object) -> set[str]:
 def test_every_algorithm_that_the_schema_names_exists() -> None:
     assert set(light.Surface.model_fields["kind"].annotation.__args__) == set(SURFACES)
     assert set(light.PatchBoards.model_fields["kind"].annotation.__args__) == set(LAYOUTS)
+    assert set(vehicle.Cmgs.model_fields["steering"].annotation.__args__) == set(STEERING)
     assert kinds(camera.Psf) == set(PSFS)
     assert kinds(get_args(camera.Camera.model_fields["vignetting"].annotation)[0]) == set(VIGNETTING)
     assert kinds(light.Lobe) == set(LOBES)
     assert kinds(light.Glow) == set(BACKGROUNDS)
-    assert kinds(scene.Jitter) == set(SPECTRA)
+    assert kinds(motion.JitterPart) == set(SPECTRA)
+    assert kinds(motion.Manoeuvre) == set(LEGS)
 
 
 def test_a_key_that_stands_twice_is_refused(tmp_path):

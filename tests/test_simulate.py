@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from estimator.types import Attitude, Centroids
-from skysim import metrics, scene, simulate
+from skysim import metrics, onboard, scene, simulate
 from skysim.optics import Optics
 from skysim.simulate import Lab
 from skysim.types import BadInput, Truth
@@ -319,17 +319,17 @@ def test_a_solver_for_the_other_sky_is_refused(name: str, solver: str) -> None:
 
 def test_the_believed_camera_is_the_true_one_unless_told_otherwise() -> None:
     loaded = scene.load("shefex2", {"camera.distortion": "[-0.2, 0.1, 0, 0, 0]"})
-    believed = simulate.believed_camera(loaded)
+    believed = onboard.believed_camera(loaded)
     lens = Optics.of(loaded.camera)
     vectors = Rotation.from_rotvec([0.05, -0.08, 0]).apply([[0, 0, 1.0], [0.02, 0, 1.0]])
     np.testing.assert_allclose(believed.pixels(vectors), lens.project(vectors), rtol=0, atol=1e-10)
-    longer = simulate.believed_camera(scene.load("shefex2", {"tracker.believed_focal_length": "25.25 mm"}))
+    longer = onboard.believed_camera(scene.load("shefex2", {"tracker.believed_focal_length": "25.25 mm"}))
     assert longer.focal_px == pytest.approx(believed.focal_px * 1.01, rel=1e-12)
 
 
 def test_a_calibrated_tracker_knows_how_far_the_chip_stands_from_a_focused_lens() -> None:
     """Reference §1.2: 35 mm at 33 in is 36.53 mm, whose 1,600 pixels of 4 um see 10.01 deg."""
-    believed = simulate.believed_camera(scene.load("afit_simsat"))
+    believed = onboard.believed_camera(scene.load("afit_simsat"))
     assert believed.focal_px * 4e-3 == pytest.approx(36.53, abs=5e-3)
     assert np.degrees(2 * np.arctan(800 / believed.focal_px)) == pytest.approx(10.01, abs=5e-3)
 

@@ -1,0 +1,203 @@
+"""The computers on board, as the scene sets them up: the star tracker's, and the one that listens to the gyros."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from estimator import catalog
+from estimator.attitude import SOLVERS
+from estimator.camera import Camera
+from estimator.centroid import CENTROIDERS
+from estimator.detect import DETECTORS
+from estimator.filter import GyroModel, Mekf
+from estimator.identify import IDENTIFIERS
+from estimator.nearfield import SOLVERS as NEAR_SOLVERS
+from estimator.nearfield import LedMap, Lever
+from estimator.tracker import DomeTracker, Report, Settings, StarTracker
+from estimator.types import Attitude, BadImage, Centroids
+from skysim import dome, imu, quaternion
+from skysim.camera import Camera as CameraPart
+from skysim.detector import saturation_dn
+from skysim.quantity import one_of
+from skysim.scene import CATALOGUES, Dome, Filter, Scene
+from skysim.types import BadInput, Floats, Frame, Mount, Sources
+
+Estimator = StarTracker | DomeTracker
+ARCSEC_RAD = math.pi / 180 / 3600
+
+
+def tracker(scene: Scene, mount: Mount, sources: Sources) -> Estimator:
+    """The star tracker with what it believes of the hardware: the scene's `tracker` section, else the truth."""
+    believed = scene.tracker
+    camera, settings = believed_camera(scene), believed_settings(scene)
+    if isinstance(scene.light, Dome):
+        centre_m, semi_axes_m = dome.surface(scene.light.surface).as_ellipsoid()
+        board = sources.id // dome.HOLES
+        leds = LedMap(sources.id, sources.place[:, :3], centre_m, semi_axes_m, board)
+        arm = believed.believed_camera_body_m or mount.camera_body_m
+        return DomeTracker(camera, leds, Lever(np.array(arm), mount.cam_from_body), settings)
+    stars = catalog.read(CATALOGUES / f"{scene.light.catalogue}.ecsv")
+    stars = catalog.brighter(stars, believed.limit_mag)
+    return StarTracker(camera, stars, catalog.apparent(stars, catalog.on_earth(scene.start_time)), settings)
+
+
+def believed_camera(scene: Scene) -> Camera:
+    """The calibration in the tracker's head."""
+    believed_m = scene.tracker.believed_focal_length_m
+    return calibration(scene.camera).zoomed(believed_m / scene.camera.focal_length_m if believed_m else 1.0)
+
+
+def calibration(camera: CameraPart) -> Camera:
+    """A perfect calibration of a camera, in the tracker's own terms."""
+    return Camera(camera.width_px, camera.height_px, camera.focal_px, camera.centre_px, camera.distortion)
+
+
+def believed_settings(scene: Scene) -> Settings:
+    """The tracker's algorithms and thresholds as the scene names them. Raises BadInput for a wrong name."""
+    part = scene.tracker
+    near = isinstance(scene.light, Dome)
+    return Settings(
+        detector=known("detector", part.detector, DETECTORS),
+        centroider=known("centroider", part.centroider, CENTROIDERS),
+        identifier=known("identifier", part.identifier, IDENTIFIERS),
+        solver=known("solver", part.solver, NEAR_SOLVERS if near else SOLVERS),
+        threshold_sigma=part.threshold_sigma,
+        min_area_px=part.min_area_px,
+        gain_e_dn=scene.camera.detector.gain_e_dn,
+        saturation=saturation_dn(scene.camera.detector),
+        centroid_sigma_px=part.centroid_sigma_px,
+    )
+
+
+def known(key: str, name: str, algorithms: Mapping[str, object]) -> str:
+    """The name, if there is such an algorithm: only the estimator knows, and scene.py may not ask it."""
+    try:
+        return one_of(name, algorithms)
+    except ValueError as error:
+        raise BadInput(f"tracker.{key}: {error}") from None
+
+
+def answer(estimator: Estimator, frame: Frame) -> Report:
+    """The tracker's report; a frame that it will not look at (empty, saturated) is a status too."""
+    try:
+        return estimator.solve(frame.image_dn)
+    except BadImage as error:
+        return Report(Attitude(str(error)), Centroids.none())
+
+
+class Navigation:
+    """What the vehicle believes of its attitude: gyros added up, and corrected by the star tracker.
+
+    scene : with `vehicle.imu`, and `filter` where there is one
+    lab_from_body_wxyz : (4,) the true attitude at the start, when the navigator is zeroed
+    place_body_m, gravity_m_s2 : of the accelerometers
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        mount: Mount,
+        lab_from_body: Rotation,
+        place_body_m: Floats,
+        gravity_m_s2: float,
+        rng: np.random.Generator,
+    ) -> None:
+        part = scene.vehicle.imu
+        assert part is not None
+        self.unit = imu.Unit.of(part, rng)
+        self.place_body_m, self.gravity_m_s2 = place_body_m, gravity_m_s2
+        self.body_from_cam = mount.cam_from_body.inv()
+        self.step_s = 1 / part.rate_hz
+        self.samples = 0
+        earth = imu.earth_rate_lab_rad_s(scene.lab)
+        self.earth_felt_rad_s = earth * (part.earth_rate != "none")
+        self.earth_known_rad_s = earth * (part.earth_rate == "compensated")
+        believed = at_home(lab_from_body, part.home_error_deg)
+        self.navigator = imu.Navigator(believed.as_quat(scalar_first=True), self.earth_known_rad_s)
+        self.filter = mekf(scene.filter, believed) if scene.filter else None
+        self.rate_rad_s = np.zeros(3)
+        self.saturated = False
+
+    def feel(self, now_s: float, t_s: Floats, lab_from_body_wxyz: Floats, rate_body_rad_s: Floats) -> None:
+        """The unit's samples up to now, from the knots (K,), (K, 4), (K, 3) of the flight since the last call."""
+        due = int(now_s / self.step_s + 1e-6) - self.samples
+        if due < 1:
+            return
+        ends_s = (self.samples + 1 + np.arange(due)) * np.float64(self.step_s)
+        self.samples += due
+        ideal = imu.felt(
+            t_s,
+            lab_from_body_wxyz,
+            rate_body_rad_s,
+            ends_s,
+            self.step_s,
+            self.place_body_m,
+            self.gravity_m_s2,
+            self.earth_felt_rad_s,
+        )
+        measured = self.unit.measure(ideal)
+        self.navigator.add(measured)
+        self.saturated = bool(measured.saturated.any())
+        known = self.earth_body_rad_s(self.navigator.lab_from_body_wxyz)
+        self.rate_rad_s = measured.angle_rad.mean(axis=0) / self.step_s - known
+        if self.filter:
+            known = self.earth_body_rad_s(self.attitude_wxyz("filter"))
+            self.filter.propagate(ends_s, measured.angle_rad - known * self.step_s, measured.saturated)
+
+    def apparent_bias_rad_s(self, lab_from_body_wxyz: Floats) -> Floats:
+        """(3,) what the gyros show too much at that true attitude: their bias, and the Earth that nobody takes away."""
+        unknown = self.earth_felt_rad_s - self.earth_known_rad_s
+        earth = quaternion.apply(quaternion.inverse(lab_from_body_wxyz), unknown)
+        return self.unit.gyro_bias_rad_s + earth
+
+    def earth_body_rad_s(self, lab_from_body_wxyz: Floats) -> Floats:
+        """(3,) what is taken away for the Earth's turning, in body axes."""
+        return quaternion.apply(quaternion.inverse(lab_from_body_wxyz), self.earth_known_rad_s)
+
+    def see(self, t_s: float, answer: Attitude) -> str:
+        """A star tracker's solution for mid-exposure t_s; what the filter made of it."""
+        if self.filter is None or answer.cam_from_ref is None or answer.covariance_rad2 is None:
+            return answer.status
+        body_from_cam = self.body_from_cam.as_matrix()
+        covariance = body_from_cam @ answer.covariance_rad2 @ body_from_cam.T
+        return self.filter.update(t_s, self.body_from_cam * answer.cam_from_ref, covariance).status
+
+    def attitude_wxyz(self, feedback: str) -> Floats:
+        """(4,) lab_from_body as the navigator or the filter has it."""
+        if feedback == "imu" or self.filter is None:
+            return self.navigator.lab_from_body_wxyz
+        return self.filter.ref_from_body_wxyz
+
+    def rate(self, feedback: str) -> Floats:
+        """(3,) the body's rate in the lab as either has it, the mean over the last tick."""
+        return self.rate_rad_s if feedback == "imu" or self.filter is None else self.filter.rate_rad_s
+
+
+def at_home(lab_from_body: Rotation, error_deg: tuple[float, float, float]) -> Rotation:
+    """What the navigator takes the attitude for when it is zeroed: the true one less the error in roll, pitch, yaw."""
+    yaw, pitch, roll = lab_from_body.as_euler("ZYX", degrees=True)
+    wrong = [yaw - error_deg[2], pitch - error_deg[1], roll - error_deg[0]]
+    return Rotation.from_euler("ZYX", wrong, degrees=True)
+
+
+def mekf(part: Filter, lab_from_body: Rotation) -> Mekf:
+    """The attitude filter at the start, its reference the lab."""
+    hour_s = 3600.0
+    gyro = GyroModel(
+        math.radians(part.arw_deg_sqrt_h) / math.sqrt(hour_s),
+        math.radians(part.bias_deg_h) / hour_s,
+        part.bias_time_s,
+    )
+    return Mekf(
+        gyro,
+        0.0,
+        lab_from_body.inv(),
+        math.radians(part.start_deg),
+        math.radians(part.start_bias_deg_h) / hour_s,
+        part.floor_arcsec * ARCSEC_RAD,
+        part.gate_sigma,
+    )

@@ -1,0 +1,183 @@
+"""The vehicle's computer at every tick: the controller's torque, allotted to the actuators that it flies with."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from skysim.actuators import CmgSet, Desaturator, FanSet, WheelSet
+from skysim.control import controller
+from skysim.manoeuvre import Reference
+from skysim.scene import Scene
+from skysim.types import Floats
+from skysim.vehicle import Cmgs, Fans, Wheels
+from skysim.world import World
+
+RAD_S_RPM = math.pi / 30
+
+
+class Now(NamedTuple):
+    """A tick's beginning: the body's believed rate (3,), and all of qpos and qvel.
+
+    Only wheels' and gimbals' own encoders read the latter, which have no errors.
+    """
+
+    t_s: float
+    period_s: float
+    rate_body_rad_s: Floats
+    angles_rad: Floats
+    speeds_rad_s: Floats
+
+
+class Actuators(Protocol):
+    """One set: it takes a torque (3,) wanted on the body and writes into the controls (nu,)."""
+
+    def allot(self, control: Floats, wanted_nm: Floats, now: Now) -> Floats:
+        """(3,) the torque that the commands will give."""
+        ...
+
+    def momentum_nms(self, angles_rad: Floats, speeds_rad_s: Floats) -> Floats:
+        """(3,) stored, in body axes."""
+        ...
+
+
+class Torques:
+    """Torques from nowhere about the body's axes, each within its limit."""
+
+    def __init__(self, ship: World) -> None:
+        self.motor, self.limit_nm = ship.torques, ship.vehicle.torque_limit_nm
+
+    def allot(self, control: Floats, wanted_nm: Floats, now: Now) -> Floats:
+        control[self.motor] = given = np.clip(wanted_nm, -self.limit_nm, self.limit_nm)
+        return given
+
+    def momentum_nms(self, angles_rad: Floats, speeds_rad_s: Floats) -> Floats:
+        return np.zeros(3)
+
+
+class OnWheels:
+    """Reaction wheels; see `actuators.WheelSet`."""
+
+    def __init__(self, ship: World, part: Wheels) -> None:
+        self.at = at = ship.wheels
+        limit_rad_s = part.speed_limit_rpm * RAD_S_RPM
+        self.set = WheelSet(at.axes, at.inertia_kg_m2, part.torque_limit_nm, limit_rad_s)
+
+    def allot(self, control: Floats, wanted_nm: Floats, now: Now) -> Floats:
+        motor = self.set.drive(wanted_nm, now.speeds_rad_s[self.at.dof], now.period_s)
+        control[self.at.motor] = motor
+        return -self.set.axes @ motor
+
+    def momentum_nms(self, angles_rad: Floats, speeds_rad_s: Floats) -> Floats:
+        return self.set.momentum(speeds_rad_s[self.at.dof])
+
+
+class OnCmgs:
+    """Control moment gyroscopes; see `actuators.CmgSet`."""
+
+    def __init__(self, ship: World, part: Cmgs) -> None:
+        self.gimbals, self.rotors = ship.gimbals, ship.rotors
+        self.set = CmgSet(
+            self.gimbals.axes,
+            self.rotors.axes,
+            self.rotors.inertia_kg_m2,
+            math.radians(part.gimbal_rate_limit_deg_s),
+            part.rotor_torque_limit_nm,
+            part.steering,
+        )
+
+    def allot(self, control: Floats, wanted_nm: Floats, now: Now) -> Floats:
+        angle, spin = now.angles_rad[self.gimbals.qpos], now.speeds_rad_s[self.rotors.dof]
+        rate, torque = self.set.drive(wanted_nm, now.rate_body_rad_s, angle, spin, now.t_s)
+        control[self.gimbals.motor] = rate
+        if self.set.rotor_torque_limit_nm is not None:
+            control[self.rotors.motor] = torque
+        by_rotors = self.set.momentum(angle, torque / self.set.rotor_inertia_kg_m2)
+        return -self.set.jacobian(angle, spin) @ rate - by_rotors
+
+    def momentum_nms(self, angles_rad: Floats, speeds_rad_s: Floats) -> Floats:
+        return self.set.momentum(angles_rad[self.gimbals.qpos], speeds_rad_s[self.rotors.dof])
+
+
+class OnFans:
+    """Fans, as if they gave at once what they give after their lag; see `actuators.FanSet`."""
+
+    def __init__(self, ship: World, part: Fans) -> None:
+        self.motor, self.lag_s = ship.fans.motor, part.time_constant_s
+        self.set = FanSet(ship.fans.axes, ship.fans.places_m, part.thrust_limit_n)
+
+    def allot(self, control: Floats, wanted_nm: Floats, now: Now) -> Floats:
+        thrust = self.set.drive(wanted_nm)
+        control[self.motor] = thrust
+        return self.set.torque(thrust)
+
+    def momentum_nms(self, angles_rad: Floats, speeds_rad_s: Floats) -> Floats:
+        return np.zeros(3)
+
+
+# How each key of `vehicle` that switches actuators on is flown with.
+ACTUATORS: dict[str, Callable[..., Actuators]] = {"wheels": OnWheels, "cmgs": OnCmgs, "fans": OnFans}
+
+
+class Unloading:
+    """Fans that take momentum out of the other actuators, and what they give in the meantime."""
+
+    def __init__(self, fans: Actuators, desaturator: Desaturator) -> None:
+        assert isinstance(fans, OnFans)
+        self.fans, self.desaturator = fans, desaturator
+        self.blown_nm = np.zeros(3)
+
+    def allot(self, control: Floats, momentum_nms: Floats, now: Now) -> Floats:
+        """(3,) torque that the fans give now, as their lag is believed to be."""
+        before = self.blown_nm
+        asked = self.fans.allot(control, self.desaturator.torque(momentum_nms), now)
+        self.blown_nm = before + (asked - before) * -math.expm1(-now.period_s / self.fans.lag_s)
+        return before
+
+
+class Pilot:
+    """Steers with one set of actuators, and takes momentum out of it with the fans. Stateful: one flight each.
+
+    sets      : all actuators that are switched on, by their key in `vehicle`
+    wanted_nm : (3,) what the controller asked for at the last tick, zeros where nobody flies
+    """
+
+    def __init__(self, scene: Scene, ship: World, reference: Reference) -> None:
+        self.told, self.period_s = scene.motion.control, 1 / scene.control_rate_hz
+        self.sets = {
+            key: kind(ship, part)
+            for key, kind in ACTUATORS.items()
+            if (part := getattr(scene.vehicle, key)) is not None
+        }
+        self.nu = ship.model.nu
+        self.wanted_nm = np.zeros(3)
+        self.unloading: Unloading | None = None
+        if self.told is None:
+            return
+        self.law = controller(reference, ship.inertia_kg_m2, self.told)
+        self.hands = Torques(ship) if self.told.actuators == "ideal" else self.sets[self.told.actuators]
+        if self.told.desaturation:
+            self.unloading = Unloading(self.sets["fans"], Desaturator(self.told.desaturation))
+
+    def momentum_nms(self, angles_rad: Floats, speeds_rad_s: Floats) -> Floats:
+        """(3,) stored in wheels and CMGs, in body axes; the arguments are all of qpos and qvel."""
+        stored = np.zeros(3)
+        for one in self.sets.values():
+            stored += one.momentum_nms(angles_rad, speeds_rad_s)
+        return stored
+
+    def steer(self, now: Now, lab_from_body_wxyz: Floats, momentum_nms: Floats) -> Floats:
+        """(nu,) controls for the tick that begins, from the believed attitude (4,) and the stored momentum (3,)."""
+        control = np.zeros(self.nu)
+        if self.told is None:
+            return control
+        self.wanted_nm = self.law.torque_nm(now.t_s, lab_from_body_wxyz, now.rate_body_rad_s, momentum_nms)
+        rest_nm = self.wanted_nm
+        if self.unloading:
+            rest_nm = rest_nm - self.unloading.allot(control, momentum_nms, now)
+        given_nm = self.hands.allot(control, rest_nm, now)
+        self.law.learn(rest_nm, given_nm, self.period_s)
+        return control

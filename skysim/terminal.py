@@ -1,0 +1,166 @@
+"""What the command line shows: progress bars, tables, summaries. Heavy imports wait for their use."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+if TYPE_CHECKING:
+    from skysim.types import Row
+
+T = TypeVar("T")
+
+
+def begun(items: Iterable[T]) -> Iterator[T]:
+    """The same items, the first of them made at once: what is wrong with it is told before old results are cleared."""
+    rest = iter(items)
+    return itertools.chain([next(rest)], rest)
+
+
+def progress(items: Iterable[T], total: int, what: str, quiet: bool = False) -> Iterator[T]:
+    """The items, with a bar on stderr that goes away when it is done."""
+    from rich.console import Console
+    from rich.progress import track
+
+    console = Console(stderr=True)
+    yield from track(
+        items,
+        total=total,
+        description=what,
+        console=console,
+        transient=True,
+        disable=quiet or not console.is_terminal,
+    )
+
+
+def print_table(title: str, heads: list[str], lines: list[list[str]]) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(title=title, title_justify="left", box=None, header_style="bold", pad_edge=False)
+    for head in heads:
+        table.add_column(
+            head, justify="left" if head in ("what", "file", "status", "peer") else "right", no_wrap=True
+        )
+    for line in lines:
+        table.add_row(*line)
+    console = Console()
+    Console(width=max(console.width, 160) if not console.is_terminal else None).print(table)
+
+
+def print_rows(rows: list[Row], names: tuple[str, str, str]) -> None:
+    triple = "/".join(names)
+    heads = [
+        "frame",
+        "t s",
+        "deg/s",
+        f"true {triple}",
+        f"estimate {triple}",
+        "cross ″",
+        "roll ″",
+        "used",
+        "ms",
+        "status",
+    ]
+    lines = [
+        [
+            str(row.frame),
+            f"{row.t_s:.2f}",
+            f"{row.rate_deg_s:.2f}",
+            degrees(row.truth_deg),
+            degrees(row.estimate_deg),
+            f"{row.cross_arcsec:.3f}" if row.estimate_deg else "",
+            f"{row.roll_arcsec:+.3f}" if row.estimate_deg else "",
+            f"{row.matched}/{row.detected}",
+            f"{row.time_ms:.1f}",
+            "[red]WRONG[/]" if row.wrong else row.status,
+        ]
+        for row in rows
+    ]
+    print_table("", heads, lines)
+
+
+def degrees(angles_deg: tuple[float, float, float] | None) -> str:
+    return " ".join(f"{angle:9.4f}" for angle in angles_deg) if angles_deg else ""
+
+
+@contextmanager
+def watched(what: str, quiet: bool = False) -> Iterator[Callable[[float, float], None]]:
+    """A bar on stderr for work that tells how far it is: done(now, all)."""
+    from rich.console import Console
+    from rich.progress import Progress
+
+    console = Console(stderr=True)
+    with Progress(console=console, transient=True, disable=quiet or not console.is_terminal) as bar:
+        task = bar.add_task(what)
+        yield lambda now, everything: bar.update(task, completed=now, total=everything)
+
+
+def print_flight(figures: dict[str, float]) -> None:
+    """What is not there is not printed."""
+    lines = {
+        "pointing_deg_worst": "pointing: worst {pointing_deg_worst:.3g}°, at the end {pointing_deg_end:.2g}°; "
+        "torque asked for up to {torque_nm_worst:.3g} N m",
+        "momentum_nms_worst": "stored momentum up to {momentum_nms_worst:.3g} N m s",
+        "wheel_rpm_worst": "wheels up to {wheel_rpm_worst:.0f} rpm",
+        "manipulability_least": "CMGs' manipulability down to {manipulability_least:.2g}",
+        "imu_deg_worst": "IMU alone: off by {imu_deg_end:.3g}° at the end; "
+        "gyros saturated for {gyro_saturated_s:.2g} s",
+        "filter_deg_worst": "filter: worst {filter_deg_worst:.3g}°, at the end {filter_arcsec_end:.3g}″, "
+        "its bias off by {filter_bias_deg_h_end:.2g}°/h",
+    }
+    told = [text.format(**figures) for key, text in lines.items() if key in figures]
+    if told:
+        print("flight: " + "\n        ".join(told))
+
+
+def print_summary(figures: dict[str, Any]) -> None:
+    print(
+        f"\n{figures['solved']} of {figures['frames']} frames solved, {figures['wrong']} wrong; "
+        f"cross-boresight median {figures['cross_arcsec_median']:.3g}″ worst {figures['cross_arcsec_worst']:.3g}″, "
+        f"roll median {figures['roll_arcsec_median']:.3g}″ worst {figures['roll_arcsec_worst']:.3g}″"
+    )
+    stages = ", ".join(f"{name} {ms:.2f}" for name, ms in figures["stages_ms"].items())
+    print(f"median ms a frame: {stages}")
+    print_flight(figures["flight"])
+    print(f"report: {figures['report']}")
+
+
+def print_answers(answers: list[dict[str, Any]], out: Path) -> None:
+    heads = ["file", "status", "RA °", "Dec °", "roll °", "fov °", "stars", "rms ″", "ms"]
+    lines = [
+        [
+            a["file"],
+            a["status"] if a["time_ms"] is not None else "bad input",
+            *(number(a[key], 4) for key in ("ra_deg", "dec_deg", "roll_deg", "fov_deg")),
+            str(a["matches"]),
+            number(a["rms_arcsec"], 1),
+            number(a["time_ms"], 0),
+        ]
+        for a in answers
+    ]
+    print_table("", heads, lines)
+    print(f"annotated pictures and solutions.json in {out}")
+
+
+def print_catalogue(figures: dict[str, Any], json: bool, to_json: Any) -> None:
+    if json:
+        print(to_json(figures))
+        return
+    print(f"{figures['path']}: {figures['stars']} stars, {figures['supplied']} of them supplied")
+    print("  ".join(f"V<{limit}: {count}" for limit, count in figures["brighter_than"].items()))
+    for key, value in figures["meta"].items():
+        print(f"  {key}: {value}")
+
+
+def number(value: float | None, digits: int | None = None) -> str:
+    if value is None:
+        return ""
+    return f"{value:.3g}" if digits is None else f"{value:.{digits}f}"
+
+
+def yes(met: bool | None) -> str:
+    return "" if met is None else "yes" if met else "NO"
