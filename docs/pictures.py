@@ -6,7 +6,8 @@ from pathlib import Path
 
 import cv2
 
-from skysim import io, report, scene, simulate
+from skysim import flightlog, io, report, scene, simulate
+from skysim.world.picture import picture
 
 DOCS = Path(__file__).parent
 OUT = DOCS.parent / "out"
@@ -27,10 +28,14 @@ def frame(rate_deg_s: float):  # type: ignore[no-untyped-def]
 
 def main() -> None:
     for name, scene_name in (("dome", "afit_simsat"), ("sky", "shefex2")):
-        picture = cv2.imread(str(OUT / scene_name / "annotated.png"))
+        annotated = cv2.imread(str(OUT / scene_name / "annotated.png"))
         width = 1200
-        size = (width, round(width * picture.shape[0] / picture.shape[1]))
-        io.write_image(DOCS / f"{name}.jpg", cv2.resize(picture, size, interpolation=cv2.INTER_AREA))
+        size = (width, round(width * annotated.shape[0] / annotated.shape[1]))
+        io.write_image(DOCS / f"{name}.jpg", cv2.resize(annotated, size, interpolation=cv2.INTER_AREA))
+    lab = simulate.prepare(scene.load("simsat_slew"))
+    drawn = picture(simulate.staged(lab), lab.log.joints[700])
+    io.write_image(DOCS / "lab.jpg", drawn[:, :, ::-1])
+    (DOCS / "bump.png").write_bytes(flightlog.figure(simulate.prepare(scene.load("simsat_bump")).log))
     shots = [frame(rate) for rate in RATES_DEG_S]
     captions = [
         f"{rate} deg/s, {truth.seen.streak_px.max():.1f} px"
