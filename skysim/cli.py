@@ -110,6 +110,8 @@ def run(
     names, log = score.angle_names(loaded), lab.log
     io.write_table(folder / "solutions.ecsv", score.table(rows, names))
     io.write_table(folder / "telemetry.ecsv", flightlog.table(log))
+    if lab.record:
+        io.write_table(folder / "imu.ecsv", flightlog.imu_table(lab.record))
     annotated, page = tally.picture(), folder / "report.html"
     io.write_image(folder / "annotated.png", annotated)
     drawn = draw(lab, folder) if picture else []

@@ -9,12 +9,13 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from skysim.imu import Increments, tilt_rad
+from skysim.quantity import RPM_RAD_S
 from skysim.types import Floats, Telemetry
 
 AXES = ("x", "y", "z")
 EULER = ("roll", "pitch", "yaw")
 ARCSEC_DEG = 1 / 3600
-RPM_RAD_S = 30 / np.pi
 
 
 def euler_deg(lab_from_body: Rotation) -> Floats:
@@ -43,12 +44,12 @@ def summary(log: Telemetry) -> dict[str, float]:
     if log.wheel_rad_s.size or log.gimbal_rad.size:
         figures["momentum_nms_worst"] = np.linalg.norm(log.momentum_nms, axis=1).max()
     if log.wheel_rad_s.size:
-        figures["wheel_rpm_worst"] = np.abs(log.wheel_rad_s).max() * RPM_RAD_S
+        figures["wheel_rpm_worst"] = np.abs(log.wheel_rad_s).max() / RPM_RAD_S
     if log.manipulability is not None:
         figures["manipulability_least"] = log.manipulability.min()
     if imu is not None and log.saturated is not None:
         figures |= {"imu_deg_worst": imu.max(), "imu_deg_end": imu[-1]}
-        figures["gyro_saturated_s"] = log.saturated.sum() * (log.t_s[1] - log.t_s[0])
+        figures["gyro_saturated_s"] = log.saturated.sum() * log.period_s
     if by_filter is not None and log.believed_bias_rad_s is not None and log.bias_rad_s is not None:
         wrong = per_hour(log.believed_bias_rad_s - log.bias_rad_s)[-1]
         figures |= {"filter_deg_worst": by_filter.max(), "filter_arcsec_end": by_filter[-1] / ARCSEC_DEG}
@@ -78,7 +79,7 @@ def table(log: Telemetry) -> Any:
     add("disturbance", log.disturbance_nm, AXES, "nm")
     add("momentum", log.momentum_nms, AXES, "nms")
     numbers = tuple(str(n + 1) for n in range(max(log.wheel_rad_s.shape[1], log.gimbal_rad.shape[1])))
-    add("wheel", log.wheel_rad_s * RPM_RAD_S, numbers[: log.wheel_rad_s.shape[1]], "rpm")
+    add("wheel", log.wheel_rad_s / RPM_RAD_S, numbers[: log.wheel_rad_s.shape[1]], "rpm")
     add("gimbal", np.degrees(log.gimbal_rad), numbers[: log.gimbal_rad.shape[1]], "deg")
     if log.manipulability is not None:
         columns["manipulability"] = log.manipulability
@@ -93,6 +94,19 @@ def table(log: Telemetry) -> Any:
             add(name, per_hour(rates), AXES, "deg_h")
     if log.sigma_attitude_rad is not None:
         add("sigma_attitude", np.degrees(log.sigma_attitude_rad) / ARCSEC_DEG, AXES, "arcsec")
+    return Table(columns)
+
+
+def imu_table(record: Increments) -> Any:
+    """Every sample of the IMU, for a filter of one's own; the tilt that the accelerometers alone would give."""
+    from astropy.table import Table
+
+    columns: dict[str, Any] = {"t_s": record.t_s}
+    columns |= {f"angle_{end}_rad": record.angle_rad[:, n] for n, end in enumerate(AXES)}
+    columns |= {f"velocity_{end}_m_s": record.velocity_m_s[:, n] for n, end in enumerate(AXES)}
+    level = np.degrees([tilt_rad(velocity[None]) for velocity in record.velocity_m_s])
+    columns |= {"level_roll_deg": level[:, 0], "level_pitch_deg": level[:, 1]}
+    columns |= {"gyro_saturated": record.saturated, "accelerometer_overloaded": record.overloaded}
     return Table(columns)
 
 
@@ -147,7 +161,7 @@ def torque_panel(log: Telemetry, axes: Any) -> None:
 
 def wheels_panel(log: Telemetry, axes: Any) -> None:
     for n, speed in enumerate(log.wheel_rad_s.T):
-        axes.plot(log.t_s, speed * RPM_RAD_S, label=f"wheel {n + 1}")
+        axes.plot(log.t_s, speed / RPM_RAD_S, label=f"wheel {n + 1}")
     axes.set_ylabel("wheels [rpm]")
 
 

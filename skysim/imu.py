@@ -33,7 +33,8 @@ class Increments:
     step_s       : length of each
     angle_rad    : (N, 3) integral of the rate about each body axis: no rotation vector, unless the axis stands still
     velocity_m_s : (N, 3) integral of the specific force, which is +g along the vertical for a unit at rest
-    saturated    : (N,) one of the six stood at its limit; False where ideal
+    saturated    : (N,) a gyro stood at its limit; False where ideal
+    overloaded   : (N,) an accelerometer did; likewise
     """
 
     t_s: Floats
@@ -41,6 +42,7 @@ class Increments:
     angle_rad: Floats
     velocity_m_s: Floats
     saturated: NDArray[np.bool_]
+    overloaded: NDArray[np.bool_]
 
 
 def earth_rate_lab_rad_s(site: Site) -> Floats:
@@ -105,7 +107,8 @@ def felt(
         earth_rate_lab_rad_s,
     )
     angle, velocity = integrals(np.ascontiguousarray(t_s), knots, np.ascontiguousarray(ends_s), step_s, place)
-    return Increments(ends_s, step_s, angle, velocity, np.zeros(len(ends_s), dtype=bool))
+    fine = np.zeros(len(ends_s), dtype=bool)
+    return Increments(ends_s, step_s, angle, velocity, fine, fine)
 
 
 @numba.njit(cache=True)
@@ -316,7 +319,7 @@ class Unit:
         normal = self.rng.standard_normal((len(ideal.t_s), 2, 6))
         angle, fast = self.gyro.measure(ideal.angle_rad, ideal.step_s, normal[:, 0])
         velocity, hard = self.accelerometer.measure(ideal.velocity_m_s, ideal.step_s, normal[:, 1])
-        return Increments(ideal.t_s, ideal.step_s, angle, velocity, fast | hard)
+        return Increments(ideal.t_s, ideal.step_s, angle, velocity, fast, hard)
 
     @property
     def gyro_bias_rad_s(self) -> Floats:

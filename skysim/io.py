@@ -44,12 +44,18 @@ def make_folder(path: Path) -> Path:
     return path
 
 
+RESULTS = (
+    *("solutions.ecsv", "telemetry.ecsv", "imu.ecsv"),
+    *("annotated.png", "lab.png", "lab.gif", "report.html"),
+)
+
+
 def clear(folder: Path) -> None:
     """Remove what an earlier run left: its frames and what was said of them."""
     for suffix in ("fits", "png", "ecsv"):
         for path in folder.glob(f"frame_[0-9][0-9][0-9][0-9]*.{suffix}"):
             path.unlink()
-    for name in ("solutions.ecsv", "telemetry.ecsv", "annotated.png", "lab.png", "lab.gif", "report.html"):
+    for name in RESULTS:
         (folder / name).unlink(missing_ok=True)
 
 

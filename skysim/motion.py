@@ -170,7 +170,8 @@ class Control(Part):
     law       : pid, or pd, which leaves what a constant torque does
     actuators : ideal torques about the body's axes, or one of the sets that `vehicle` switches on
     feedback  : what it knows of the attitude: truth, imu (the navigator), filter (star tracker and gyro)
-    bandwidth_rad_s, damping : of the attitude loop; integral_rad_s : the pole of the integral
+    bandwidth_rad_s, damping : of the attitude loop; integral_rad_s : the pole of the integral. Keep the bandwidth times
+        the delay (a period of rate_hz, and the fans' time constant with fans) well below 1: 0.3 is fine
     """
 
     law: Literal["pid", "pd"] = "pid"

@@ -119,6 +119,7 @@ class Navigation:
         believed = at_home(lab_from_body, part.home_error_deg)
         self.navigator = imu.Navigator(believed.as_quat(scalar_first=True), self.earth_known_rad_s)
         self.filter = mekf(scene.filter, believed) if scene.filter else None
+        self.measured: list[imu.Increments] = []
         self.rate_rad_s = np.zeros(3)
         self.saturated = False
 
@@ -140,6 +141,7 @@ class Navigation:
             self.earth_felt_rad_s,
         )
         measured = self.unit.measure(ideal)
+        self.measured.append(measured)
         self.navigator.add(measured)
         self.saturated = bool(measured.saturated.any())
         known = self.earth_body_rad_s(self.navigator.lab_from_body_wxyz)
@@ -148,11 +150,23 @@ class Navigation:
             known = self.earth_body_rad_s(self.attitude_wxyz("filter"))
             self.filter.propagate(ends_s, measured.angle_rad - known * self.step_s, measured.saturated)
 
-    def apparent_bias_rad_s(self, lab_from_body_wxyz: Floats) -> Floats:
-        """(3,) what the gyros show too much at that true attitude: their bias, and the Earth that nobody takes away."""
+    def record(self) -> imu.Increments:
+        """All that the unit put out so far."""
+        columns = zip(
+            *((m.t_s, m.angle_rad, m.velocity_m_s, m.saturated, m.overloaded) for m in self.measured),
+            strict=True,
+        )
+        t_s, angle, velocity, saturated, overloaded = (np.concatenate(column) for column in columns)
+        return imu.Increments(t_s, self.step_s, angle, velocity, saturated, overloaded)
+
+    def apparent_bias_rad_s(self, lab_from_body_wxyz: Floats, rate_body_rad_s: Floats) -> Floats:
+        """(3,) what the gyros show too much at that true attitude and rate (3,), noise apart.
+
+        Their bias, what scale factors and misalignments make of the rate, and the Earth where nobody takes it away.
+        """
         unknown = self.earth_felt_rad_s - self.earth_known_rad_s
         earth = quaternion.apply(quaternion.inverse(lab_from_body_wxyz), unknown)
-        return self.unit.gyro_bias_rad_s + earth
+        return self.unit.gyro_bias_rad_s + self.unit.gyro.matrix @ rate_body_rad_s - rate_body_rad_s + earth
 
     def earth_body_rad_s(self, lab_from_body_wxyz: Floats) -> Floats:
         """(3,) what is taken away for the Earth's turning, in body axes."""

@@ -11,12 +11,13 @@ import numpy as np
 from skysim.actuators import CmgSet, Desaturator, FanSet, WheelSet
 from skysim.control import controller
 from skysim.manoeuvre import Reference
+from skysim.quantity import RPM_RAD_S
 from skysim.scene import Scene
 from skysim.types import Floats
 from skysim.vehicle import Cmgs, Fans, Wheels
 from skysim.world import World
 
-RAD_S_RPM = math.pi / 30
+WITHIN_GYROS = 0.7  # `assumed`
 
 
 class Now(NamedTuple):
@@ -43,6 +44,11 @@ class Actuators(Protocol):
         """(3,) stored, in body axes."""
         ...
 
+    @property
+    def authority_nm(self) -> float:
+        """The torque that it can give in every direction, while nothing is at its limit."""
+        ...
+
 
 class Torques:
     """Torques from nowhere about the body's axes, each within its limit."""
@@ -54,6 +60,10 @@ class Torques:
         control[self.motor] = given = np.clip(wanted_nm, -self.limit_nm, self.limit_nm)
         return given
 
+    @property
+    def authority_nm(self) -> float:
+        return self.limit_nm
+
     def momentum_nms(self, angles_rad: Floats, speeds_rad_s: Floats) -> Floats:
         return np.zeros(3)
 
@@ -63,13 +73,17 @@ class OnWheels:
 
     def __init__(self, ship: World, part: Wheels) -> None:
         self.at = at = ship.wheels
-        limit_rad_s = part.speed_limit_rpm * RAD_S_RPM
+        limit_rad_s = part.speed_limit_rpm * RPM_RAD_S
         self.set = WheelSet(at.axes, at.inertia_kg_m2, part.torque_limit_nm, limit_rad_s)
 
     def allot(self, control: Floats, wanted_nm: Floats, now: Now) -> Floats:
         motor = self.set.drive(wanted_nm, now.speeds_rad_s[self.at.dof], now.period_s)
         control[self.at.motor] = motor
         return -self.set.axes @ motor
+
+    @property
+    def authority_nm(self) -> float:
+        return weakest(self.set.motor_from_torque, self.set.torque_limit_nm)
 
     def momentum_nms(self, angles_rad: Floats, speeds_rad_s: Floats) -> Floats:
         return self.set.momentum(speeds_rad_s[self.at.dof])
@@ -80,6 +94,7 @@ class OnCmgs:
 
     def __init__(self, ship: World, part: Cmgs) -> None:
         self.gimbals, self.rotors = ship.gimbals, ship.rotors
+        self.rotor_rad_s = part.rotor_rpm * RPM_RAD_S
         self.set = CmgSet(
             self.gimbals.axes,
             self.rotors.axes,
@@ -98,6 +113,14 @@ class OnCmgs:
         by_rotors = self.set.momentum(angle, torque / self.set.rotor_inertia_kg_m2)
         return -self.set.jacobian(angle, spin) @ rate - by_rotors
 
+    @property
+    def authority_nm(self) -> float:
+        """With every gimbal at zero."""
+        jacobian = self.set.jacobian(np.zeros(len(self.gimbals)), np.full(len(self.rotors), self.rotor_rad_s))
+        return weakest(
+            np.asarray(np.linalg.pinv(jacobian), dtype=np.float64), self.set.gimbal_rate_limit_rad_s
+        )
+
     def momentum_nms(self, angles_rad: Floats, speeds_rad_s: Floats) -> Floats:
         return self.set.momentum(angles_rad[self.gimbals.qpos], speeds_rad_s[self.rotors.dof])
 
@@ -114,8 +137,17 @@ class OnFans:
         control[self.motor] = thrust
         return self.set.torque(thrust)
 
+    @property
+    def authority_nm(self) -> float:
+        return weakest(self.set.thrust_from_torque, self.set.thrust_limit_n)
+
     def momentum_nms(self, angles_rad: Floats, speeds_rad_s: Floats) -> Floats:
         return np.zeros(3)
+
+
+def weakest(command_from_torque: Floats, limit: float) -> float:
+    """The torque in every direction that keeps each of n commands (n, 3) within its limit."""
+    return float(limit / np.linalg.norm(command_from_torque, axis=1).max())
 
 
 # How each key of `vehicle` that switches actuators on is flown with.
@@ -157,8 +189,9 @@ class Pilot:
         self.unloading: Unloading | None = None
         if self.told is None:
             return
-        self.law = controller(reference, ship.inertia_kg_m2, self.told)
         self.hands = Torques(ship) if self.told.actuators == "ideal" else self.sets[self.told.actuators]
+        authority_nm, fastest_rad_s = self.hands.authority_nm, believable_rad_s(scene)
+        self.law = controller(reference, ship.inertia_kg_m2, self.told, authority_nm, fastest_rad_s)
         if self.told.desaturation:
             self.unloading = Unloading(self.sets["fans"], Desaturator(self.told.desaturation))
 
@@ -181,3 +214,14 @@ class Pilot:
         given_nm = self.hands.allot(control, rest_nm, now)
         self.law.learn(rest_nm, given_nm, self.period_s)
         return control
+
+
+def believable_rad_s(scene: Scene) -> float:
+    """How fast the controller may let the vehicle turn back: below what its gyros can follow, if it steers by them.
+
+    A gyro at its limit shows less than the true rate. A rate of return below that limit still brakes.
+    """
+    told, imu = scene.motion.control, scene.vehicle.imu
+    if told is None or told.feedback == "truth" or imu is None:
+        return math.inf
+    return WITHIN_GYROS * math.radians(imu.gyro.rate_limit_deg_s)

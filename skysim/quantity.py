@@ -51,6 +51,7 @@ def finite(value: float) -> float:
     return value
 
 
+RPM_RAD_S = math.pi / 30  # rad/s of one revolution a minute
 Number = Annotated[float, AfterValidator(finite)]
 Length = Annotated[Number, BeforeValidator(quantity("m", "length", '"35 mm" or "48 in"'))]
 Time = Annotated[Number, BeforeValidator(quantity("s", "time", '"40 ms" or "1000 us"'))]

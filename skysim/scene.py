@@ -66,6 +66,10 @@ class Tracker(Part):
 class Filter(Part):
     """What the attitude filter believes of the gyro and of the star tracker (MEKF: attitude and gyro bias).
 
+    The bias is believed to wander about zero in body axes. The Earth's turning where imu.earth_rate is uncompensated is
+    learnt as bias while the attitude stays; a vehicle that turns takes it for another one, unless bias_deg_h has room
+    for it (15) and bias_time is that of the turning. So with the gyro's scale and misalignment.
+
     arw_deg_sqrt_h, bias_deg_h, bias_time : of the gyro; the bias a Gauss-Markov process
     start_deg, start_bias_deg_h           : standard deviation of attitude and bias about each axis at the start
     floor_arcsec : of a star tracker's solution, added to its own covariance: what is the same in every frame
@@ -140,6 +144,15 @@ class Scene(Part):
         if abs(1000 / rate_hz - round(1000 / rate_hz)) > 1e-9:
             raise ValueError(f"motion.control.rate_hz: {rate_hz:g} Hz is no whole number of milliseconds")
         imu = self.vehicle.imu
+        if imu and self.filter and self.filter.bias_time_s < 10 / imu.rate_hz:
+            raise ValueError(f"filter.bias_time: shorter than ten samples of the IMU, {10 / imu.rate_hz:g} s")
+        fastest_hz = max(
+            (part.frequency_hz for part in self.motion.manoeuvre if part.kind == "sine"), default=0
+        )
+        if 2 * fastest_hz >= rate_hz:
+            raise ValueError(
+                f"motion.manoeuvre: a sine of {fastest_hz:g} Hz takes a motion.control.rate_hz of more than twice that"
+            )
         if imu and abs(imu.rate_hz / rate_hz - round(imu.rate_hz / rate_hz)) > 1e-9:
             raise ValueError(
                 f"vehicle.imu.rate_hz: {imu.rate_hz:g} Hz is no multiple of motion.control.rate_hz {rate_hz:g} Hz"

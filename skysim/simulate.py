@@ -29,6 +29,7 @@ from skysim.world import stage
 
 STAGE_ID = {"detector": 1, "jitter": 2, "imu": 3, "draught": 4}
 SPARE_S = 2e-3  # flown beyond the last exposure
+LOOK_S = 0.05  # between two looks at what a manoeuvre asks for
 
 Watch = Callable[[float, float], None]
 
@@ -45,6 +46,7 @@ class Lab:
     canvas    : (H, W) where the light of one frame after another is drawn; float64 where noise is off, for such a
                 frame is the truth to many digits, and float32 otherwise
     trajectory: the flight, jitter and all; telemetry: what the vehicle's computers did in it
+    record    : what the IMU put out, every sample of it; None where there is none
     reports   : the star tracker's answers to the frames that were taken and solved in flight, for the filter
     verdicts  : what the filter made of each
     """
@@ -60,8 +62,16 @@ class Lab:
     canvas: NDArray[Any]
     trajectory: Trajectory
     telemetry: Telemetry | None = None
+    record: imu.Increments | None = None
     reports: dict[int, Report] = field(default_factory=dict)
     verdicts: dict[int, str] = field(default_factory=dict)
+
+    @property
+    def flown_s(self) -> float:
+        """How long the flight has to be."""
+        return (
+            window(self.scene, self.scene.exposure.frames - 1).close_s(self.scene.camera.height_px) + SPARE_S
+        )
 
     @property
     def log(self) -> Telemetry:
@@ -124,8 +134,7 @@ def fly(lab: Lab, watch: Watch | None = None) -> Lab:
     """
     scene, ship = lab.scene, lab.ship
     start = lab.trajectory.lab_from_body[0]
-    last_s = window(scene, scene.exposure.frames - 1).close_s(scene.camera.height_px)
-    flight = world.Flight(ship, start, np.radians(scene.motion.rate_deg_s), last_s + SPARE_S)
+    flight = world.Flight(ship, start, np.radians(scene.motion.rate_deg_s), lab.flown_s)
     vibration = Vibration.of(scene.motion, rng(scene.seed, "jitter", 0))
     vibration.pieces(flight.times_s(0, len(flight.states)))  # too much is told before the flight
     reference = manoeuvre.plan(scene.motion, start)
@@ -143,22 +152,41 @@ def fly(lab: Lab, watch: Watch | None = None) -> Lab:
     steps = round(pilot.period_s / flight.step_s)
     if not (scene.motion.control or navigation) and room.quiet:
         steps = flight.steps_left  # nobody has anything to say before the end
-    while flight.steps_left:
-        tick(flight, pilot, room, navigation, diary, min(steps, flight.steps_left))
-        if navigation:
-            navigation.feel(flight.now_s, *felt(flight, vibration, steps))
-        if eyes:
-            eyes.look(flight)
-        if watch:
-            watch(flight.now_s, flight.now_s + flight.steps_left * flight.step_s)
+    check_reference(reference, lab)
+    with world.mujoco_warnings():
+        while flight.steps_left:
+            tick(flight, pilot, room, navigation, diary, min(steps, flight.steps_left))
+            if navigation:
+                navigation.feel(flight.now_s, *felt(flight, vibration, steps))
+            if eyes:
+                eyes.look(flight)
+            if watch:
+                watch(flight.now_s, flight.now_s + flight.steps_left * flight.step_s)
     told = reference if scene.motion.control else None
     return replace(
         lab,
         trajectory=vibration.lay_over(flight.trajectory()),
         telemetry=diary.telemetry(told),
+        record=navigation.record() if navigation else None,
         reports=eyes.reports if eyes else {},
         verdicts=eyes.verdicts if eyes else {},
     )
+
+
+def check_reference(reference: manoeuvre.Reference, lab: Lab) -> None:
+    """Refuse a manoeuvre that asks for a tilt beyond the stop, which the controller would push against."""
+    vehicle = lab.scene.vehicle
+    if vehicle.mount != "air_bearing" or lab.scene.motion.control is None:
+        return
+    t_s = np.arange(0, min(reference.duration_s, lab.flown_s) + LOOK_S, LOOK_S)
+    up = reference.attitudes(t_s).as_matrix()[:, 2, 2]
+    tilt_deg = np.degrees(np.arccos(np.clip(up, -1, 1)))
+    beyond = np.flatnonzero(tilt_deg > vehicle.tilt_stop_deg)
+    if len(beyond):
+        raise BadInput(
+            f"motion.manoeuvre: asks for a tilt of {tilt_deg[beyond[0]]:.3g} deg at {t_s[beyond[0]]:.3g} s, beyond"
+            f" vehicle.tilt_stop_deg {vehicle.tilt_stop_deg:g}"
+        )
 
 
 def tick(

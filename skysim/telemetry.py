@@ -47,7 +47,9 @@ class Diary:
         """What the navigator and the filter have of the present."""
         self.imu_wxyz[k] = navigation.attitude_wxyz("imu")
         self.saturated[k] = navigation.saturated
-        self.bias_rad_s[k] = navigation.apparent_bias_rad_s(self.flight.lab_from_body_wxyz)
+        self.bias_rad_s[k] = navigation.apparent_bias_rad_s(
+            self.flight.lab_from_body_wxyz, self.flight.rate_body_rad_s
+        )
         if navigation.filter:
             state = navigation.filter.state
             self.filter_wxyz[k] = navigation.attitude_wxyz("filter")
@@ -72,6 +74,7 @@ class Diary:
         filters = navigation is not None and navigation.filter is not None
         return Telemetry(
             t_s,
+            self.pilot.period_s,
             Rotation.from_quat(states[:, 1:5], scalar_first=True),
             states[:, 1 + nq : 4 + nq].copy(),
             self.torque_nm,

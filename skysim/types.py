@@ -78,7 +78,7 @@ class Trajectory:
 class Telemetry:
     """What the vehicle did and believed at K ticks of its computer; None where it has no such thing.
 
-    t_s             : (K,)
+    t_s             : (K,); period_s between them
     lab_from_body   : K, the truth, without what jitter lays over it; rate_body_rad_s (K, 3) likewise
     lab_from_ref    : K, what it was told
     torque_nm       : (K, 3) what the controller asked for, in body axes
@@ -89,12 +89,13 @@ class Telemetry:
     manipulability  : (K,) of the CMGs: 1 far from a singularity, 0 at one
     lab_from_imu    : K, the navigator's attitude
     saturated       : (K,) whether the gyros were at their limit in the tick before
-    bias_rad_s      : (K, 3) what the gyros show too much: their bias, and the Earth's turning if nobody allows for it
+    bias_rad_s      : (K, 3) what the gyros show too much: bias, scale, misalignment, the Earth if nobody allows for it
     lab_from_filter : K, the filter's attitude, its standard deviation (K, 3) about the body's axes, the bias that it
                       believes (K, 3) and that one's
     """
 
     t_s: Floats
+    period_s: float
     lab_from_body: Rotation
     rate_body_rad_s: Floats
     torque_nm: Floats

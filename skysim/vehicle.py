@@ -46,6 +46,12 @@ class Wheels(Part):
     dynamic_imbalance_kg_m2: Annotated[Inertia, Field(ge=0)] = 0.0
     start_rpm: tuple[Number, ...] = ()
 
+    @model_validator(mode="after")
+    def within_limits(self) -> Wheels:
+        if any(abs(rpm) > self.speed_limit_rpm for rpm in self.start_rpm):
+            raise ValueError(f"start_rpm: beyond speed_limit_rpm {self.speed_limit_rpm:g}")
+        return self
+
 
 class Fans(Part):
     """Fans: every site `fan_*` of the model pushes the vehicle along its own z, forwards and backwards.
@@ -54,7 +60,7 @@ class Fans(Part):
     """
 
     thrust_limit_n: Annotated[Force, Field(gt=0)] = 0.5
-    time_constant_s: Annotated[Time, Field(gt=0)] = 0.2
+    time_constant_s: Annotated[Time, Field(ge=5e-3)] = 0.2
 
 
 class Cmgs(Part):
@@ -74,7 +80,7 @@ class Cmgs(Part):
 
 
 class Drag(Part):
-    """What the air takes from a turn about each body axis: T = -(viscous + quadratic |rate|) rate."""
+    """What the air takes from a turn, about each body axis for itself: T = -(viscous + quadratic |rate|) rate."""
 
     viscous_nms: Annotated[Damping, Field(ge=0)] = 0.0
     quadratic_nms2: Annotated[QuadraticDrag, Field(ge=0)] = 0.0

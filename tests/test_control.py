@@ -181,6 +181,43 @@ def test_integral_lets_go_of_a_limit() -> None:
     assert law.error_sum_rad_s[0] == pytest.approx(-5.0 + 1e-3, abs=1e-12)
 
 
+# --- far from its reference ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("fastest", "expected"), [(math.inf, math.sqrt(0.9 / 9.0)), (0.2, 0.2)])
+def test_a_far_error_asks_for_no_more_than_a_rate_that_can_be_braked(fastest: float, expected: float) -> None:
+    """A radian off and at rest, kd J w_most; at that rate towards the reference, nothing: w = min(limit, sqrt(a e))."""
+    part = Control.model_validate(PLACED)
+    law = controller(told(), INERTIA, part, authority_nm=0.9, rate_limit_rad_s=fastest)
+    here = manoeuvre.wxyz(Rotation.from_rotvec([0, 0, 1.0]))
+    torque = law.torque_nm(0.0, here, NONE, NONE)
+    np.testing.assert_allclose(torque, [0, 0, -9.0 * law.kd * expected], rtol=1e-12, atol=1e-15)
+    coasting = law.torque_nm(0.0, here, np.array([0, 0, -expected]), NONE)
+    np.testing.assert_allclose(coasting, NONE, rtol=0, atol=1e-12)
+    law.learn(torque, torque, 0.01)
+    np.testing.assert_array_equal(law.error_sum_rad_s, NONE)
+
+
+def test_a_great_step_is_taken_without_swinging() -> None:
+    """60 deg of yaw all at once with 1 N m on 9 kg m2: there in little more than the quickest, 2 sqrt(e J / T) = 6.1 s.
+
+    It overshoots by less than half a degree, and comes to rest.
+    """
+    step = {
+        "motion.manoeuvre": '[{kind: step, yaw_deg: 60, duration: "40 s"}]',
+        "vehicle.centre_of_mass": "[0 m, 0 m, 0 m]",
+        "exposure": "{time: 10 ms, rate_hz: 1, frames: 1, first: 25 s}",
+    }
+    flown = simulate.prepare(scene.load("afit_simsat", step)).telemetry
+    assert flown is not None
+    yaw_deg = np.degrees(flown.lab_from_body.as_rotvec()[:, 2])
+    quickest_s = 2 * math.sqrt(math.radians(60) * 9.0 / 1.0)
+    arrived_s = flown.t_s[np.argmax(yaw_deg > 59.9)]
+    assert quickest_s < arrived_s < 1.3 * quickest_s
+    assert yaw_deg.max() < 60.5
+    assert abs(yaw_deg[-1] - 60) < 1e-3
+
+
 # --- flown --------------------------------------------------------------------------------------------------
 
 OFFSET_M, WEIGHT_N = 0.05e-3, 80 * 9.80665

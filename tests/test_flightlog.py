@@ -10,6 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from skysim import flightlog
+from skysim.imu import Increments
 from skysim.types import Telemetry
 
 T_S = np.arange(50) * 0.01
@@ -25,6 +26,7 @@ def bare() -> Telemetry:
     nothing = np.zeros((len(T_S), 3))
     return Telemetry(
         T_S,
+        0.01,
         turned("z", 10 * T_S),
         nothing + np.array([0, 0, 10 * DEG]),
         nothing,
@@ -89,6 +91,22 @@ def test_the_table_has_what_the_flight_has_in_degrees() -> None:
     np.testing.assert_allclose(table["gimbal_1_deg"], T_S / DEG, rtol=1e-12)
     np.testing.assert_allclose(table["believed_bias_z_deg_h"] - table["bias_z_deg_h"], 1, rtol=1e-9)
     assert {"told_roll_deg", "imu_roll_deg", "wheel_1_rpm"}.isdisjoint(flightlog.table(bare()).colnames)
+
+
+def test_every_sample_of_the_imu_is_in_its_table() -> None:
+    """At rest, rolled by 30 deg: the force of 1 g points up, which is (0, sin 30, cos 30) in body axes."""
+    ends = np.arange(1, 9) * 2.5e-3
+    force = 9.80665 * 2.5e-3 * np.array([0, 0.5, np.sqrt(0.75)])
+    record = Increments(
+        ends, 2.5e-3, np.full((8, 3), 1e-6), np.tile(force, (8, 1)), ends > 0.01, ends < 0.004
+    )
+    table = flightlog.imu_table(record)
+    assert len(table) == 8
+    np.testing.assert_allclose(table["level_roll_deg"], 30, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(table["level_pitch_deg"], 0, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(table["velocity_y_m_s"], force[1], rtol=1e-15)
+    assert table["gyro_saturated"].tolist() == [False] * 4 + [True] * 4
+    assert table["accelerometer_overloaded"].tolist() == [True] + [False] * 7
 
 
 def test_the_plot_shows_a_panel_for_everything_there_is() -> None:

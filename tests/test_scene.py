@@ -527,6 +527,14 @@ UNLOAD = "{start: 2 N m s, stop: 1 N m s}"
             "vehicle.imu.rate_hz: 250 Hz is no multiple of motion.control.rate_hz 100 Hz",
         ),
         (
+            {"vehicle.imu": "{rate_hz: 100}", "filter": "{bias_time: 90 ms}"},
+            "filter.bias_time: shorter than ten samples of the IMU, 0.1 s",
+        ),
+        (
+            {"motion.manoeuvre": "[{kind: sine, amplitude_deg: [1, 0, 0], frequency_hz: 50, duration: 1 s}]"},
+            "motion.manoeuvre: a sine of 50 Hz takes a motion.control.rate_hz of more than twice that",
+        ),
+        (
             {"motion.control": f"{{desaturation: {UNLOAD.replace('2', '0.5')}}}"},
             "motion.control.desaturation: stop 1 N m s is not below start 0.5 N m s",
         ),

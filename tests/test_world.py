@@ -6,6 +6,7 @@ The laws of mechanics are in test_physics_vehicle and test_physics_actuators.
 from __future__ import annotations
 
 import math
+import re
 from pathlib import Path
 
 import mujoco
@@ -296,7 +297,7 @@ def test_mujocos_warning_is_an_error_and_leaves_no_file(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     flown = world.build(vehicle())
-    with pytest.raises(RuntimeError, match=r"MuJoCo warned in flight, before 0\.100 s: mjWARN_BADCTRL"):
+    with pytest.raises(BadInput, match=r"MuJoCo warned before 0\.010 s \(mjWARN_BADCTRL\)"):
         world.fly(flown, LEVEL, STILL, 0.1, lambda *_: np.full(3, np.nan))
     assert not list(tmp_path.iterdir())
 
@@ -474,3 +475,69 @@ def test_users_own_vehicle_loses_its_joints_place_and_keyframes(tmp_path: Path) 
 def test_free_vehicle_turns_about_its_centre_of_mass() -> None:
     with pytest.raises(BadInput, match=r"vehicle.centre_of_mass: a free vehicle turns about it"):
         world.build(vehicle(mount="free", centre_of_mass=["1 mm", "0 m", "0 m"]))
+
+
+# --- what a file must not say, or says in another way -------------------------------------------------------
+
+
+def spoilt(folder: Path, right: str, wrong: str, **changes: object) -> world.World:
+    """simsat.xml with one thing changed."""
+    text = (scene.SCENES / "vehicles" / "simsat.xml").read_text(encoding="utf-8")
+    assert right in text
+    file = folder / "mine.xml"
+    file.write_text(text.replace(right, wrong, 1), encoding="utf-8")
+    return world.build(vehicle(model=str(file), **changes))
+
+
+@pytest.mark.parametrize(
+    ("right", "wrong", "says"),
+    [
+        ('name="wheel_x" axis', 'name="wheelx" axis', "wheelx: allowed: wheel_x, or another word"),
+        ('name="fan_x_1"', 'name="fanx"', "fanx: allowed: fan_x, or another word"),
+        (
+            'name="wheel_x" axis',
+            'range="0 90" name="wheel_x" axis',
+            "joint wheel_x: range is not the file's to say",
+        ),
+        ('name="wheel_y" axis', 'armature="1" name="wheel_y" axis', "joint wheel_y: armature is not"),
+        (
+            '<site name="imu"',
+            '<joint name="wheel_0"/><site name="imu"',
+            "joint wheel_0 must stand on a body of its",
+        ),
+    ],
+)
+def test_what_the_scene_declares_is_not_the_file_s_to_say(
+    tmp_path: Path, right: str, wrong: str, says: str
+) -> None:
+    with pytest.raises(BadInput, match=re.escape(says)):
+        spoilt(tmp_path, right, wrong, wheels={}, fans={})
+
+
+def test_a_reference_to_a_locked_joint_is_told_why(tmp_path: Path) -> None:
+    sensor = '<sensor><jointvel joint="wheel_x"/></sensor></mujoco>'
+    with pytest.raises(BadInput, match=r"vehicle\.wheels is off, which locks joint wheel_x"):
+        spoilt(tmp_path, "</mujoco>", sensor)
+    assert len(spoilt(tmp_path, "</mujoco>", sensor, wheels={}).wheels) == 3
+
+
+@pytest.mark.parametrize(
+    "inertial",
+    [
+        'diaginertia="0.006 0.0101 0.006" euler="0 0 90"',  # turned: the axle, the body's x, has the 0.0101
+        'fullinertia="0.0101 0.006 0.006 0 0 0"',
+    ],
+)
+def test_a_wheel_s_inertia_is_the_file_s_however_it_is_written(tmp_path: Path, inertial: str) -> None:
+    given = f'<inertial pos="0 0 0" mass="2.5" {inertial}/><joint name="wheel_x" axis'
+    made = spoilt(tmp_path, '<joint name="wheel_x" axis', given, wheels={"dynamic_imbalance": "1 g cm2"})
+    assert made.wheels.inertia_kg_m2[0] == pytest.approx(0.0101, rel=1e-6)
+
+
+def test_an_unstable_flight_is_an_error_though_it_calms_down() -> None:
+    """MuJoCo puts the vehicle back to its start and forgets its warning with the next call."""
+    flight = world.Flight(world.build(vehicle()), LEVEL, STILL, 0.1)
+    bad, good = np.full((10, 3), np.nan), np.zeros((10, 3))
+    flight.advance(good)
+    with pytest.raises(BadInput, match=r"MuJoCo warned before 0\.020 s"):
+        flight.advance(bad)

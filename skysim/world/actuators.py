@@ -99,8 +99,13 @@ def joints(spec: Any, prefix: str) -> list[Any]:
     return sorted((j for j in spec.joints if j.name.startswith(prefix)), key=lambda joint: joint.name)
 
 
-def lock_unused(spec: Any, vehicle: Vehicle, path: Path) -> None:
-    """Take away the joints of actuators that are not switched on; refuse a vehicle that lacks one that is."""
+def lock_unused(spec: Any, vehicle: Vehicle, path: Path) -> dict[str, str]:
+    """Take away the joints of actuators that are not switched on; refuse a vehicle that lacks one that is.
+
+    Returns the names of the joints that it took, and the key of the scene that would have kept each.
+    """
+    locked: dict[str, str] = {}
+    check_names(spec, path)
     for part, key, prefixes in (
         (vehicle.wheels, "wheels", (WHEEL,)),
         (vehicle.cmgs, "cmgs", (GIMBAL, ROTOR)),
@@ -108,12 +113,15 @@ def lock_unused(spec: Any, vehicle: Vehicle, path: Path) -> None:
         for prefix in prefixes:
             found = joints(spec, prefix)
             if part is None:
+                locked |= dict.fromkeys((joint.name for joint in found), f"vehicle.{key}")
                 for joint in found:
                     spec.delete(joint)
             elif not found:
                 raise BadInput(f"{path}: has no joint {prefix}*, which vehicle.{key} switches on")
             elif any(joint.type != mujoco.mjtJoint.mjJNT_HINGE for joint in found):
                 raise BadInput(f"{path}: joints {prefix}* must be hinges")
+            for joint in found if part else ():
+                check_bare(joint, path)
     if vehicle.cmgs:
         pair_up(spec, path)
     if vehicle.fans and not fans(spec):
@@ -123,6 +131,38 @@ def lock_unused(spec: Any, vehicle: Vehicle, path: Path) -> None:
             raise BadInput(
                 f"{path}: actuator {actuator.name}: skysim makes its own of this name; leave it out"
             )
+    return locked
+
+
+def why_locked(complaint: str, locked: dict[str, str]) -> str:
+    """What MuJoCo cannot know of a joint that it does not find."""
+    named = [name for name in locked if f"'{name}'" in complaint]
+    return f"; {locked[named[0]]} is off, which locks joint {named[0]}" if named else ""
+
+
+def check_names(spec: Any, path: Path) -> None:
+    """Refuse a joint or site that is nearly an actuator's, and would fly as something else without a word."""
+    for element in (*spec.joints, *spec.sites):
+        word = next((p for p in (WHEEL, GIMBAL, ROTOR, FAN) if element.name.startswith(p[:-1])), None)
+        if word and not element.name.startswith(word):
+            raise BadInput(
+                f"{path}: {element.name}: allowed: {word}{element.name[len(word) - 1 :]}, or another word"
+            )
+
+
+def check_bare(joint: Any, path: Path) -> None:
+    """Refuse what would stop, drive or load an actuator's joint beside what the scene declares."""
+    given = {
+        "range": joint.range,
+        "stiffness": joint.stiffness,
+        "damping": joint.damping,
+        "frictionloss": joint.frictionloss,
+        "armature": joint.armature,
+        "actuatorfrcrange": joint.actfrcrange,
+    }
+    for name, value in given.items():
+        if np.any(value):
+            raise BadInput(f"{path}: joint {joint.name}: {name} is not the file's to say; leave it out")
 
 
 def pair_up(spec: Any, path: Path) -> None:

@@ -9,6 +9,7 @@ import numpy as np
 from mujoco.rollout import Rollout
 from scipy.spatial.transform import Rotation
 
+from skysim.quantity import RPM_RAD_S
 from skysim.types import BadInput, Floats, Trajectory
 from skysim.world.spec import mujoco_warnings
 from skysim.world.vehicle import World
@@ -50,12 +51,12 @@ class Flight:
         data.qvel[:3] = rate_body_rad_s
         if vehicle.wheels:
             rpm = as_many(vehicle.wheels.start_rpm, len(world.wheels), "vehicle.wheels.start_rpm")
-            data.qvel[world.wheels.dof] = rpm * np.pi / 30
+            data.qvel[world.wheels.dof] = rpm * RPM_RAD_S
         if vehicle.cmgs:
             angles = np.radians(as_many(vehicle.cmgs.start_deg, len(world.gimbals), "vehicle.cmgs.start_deg"))
             data.qpos[world.gimbals.qpos] = angles
             data.act[self.model.actuator_actadr[world.gimbals.motor]] = angles  # where the servos aim
-            data.qvel[world.rotors.dof] = vehicle.cmgs.rotor_rpm * np.pi / 30
+            data.qvel[world.rotors.dof] = vehicle.cmgs.rotor_rpm * RPM_RAD_S
         mujoco.mj_getState(self.model, data, self.states[0], int(STATE))
         mujoco.mj_forward(self.model, data)
 
@@ -88,7 +89,10 @@ class Flight:
         return self.states[self.step, 1 + self.model.nq :][: self.model.nv]
 
     def advance(self, control: Floats) -> None:
-        """Fly one step for each row of control (K, nu)."""
+        """Fly one step for each row of control (K, nu). Raises BadInput where MuJoCo warned.
+
+        MuJoCo puts an unstable model back to its start and goes on, and forgets its warnings with the next call.
+        """
         end = self.step + len(control)
         self.rollout.rollout(
             [self.model],
@@ -102,11 +106,14 @@ class Flight:
             state=self.states[None, self.step + 1 : end + 1],
         )
         self.step = end
+        self.check()
 
     def check(self) -> None:
-        """Raise RuntimeError where MuJoCo warned: it puts an unstable model back to its start and goes on."""
         if self.data.warning.number.any():
-            raise RuntimeError(f"MuJoCo warned in flight, before {self.now_s:.3f} s: {self.warned()}")
+            raise BadInput(
+                f"the flight cannot be stepped at {1e3 * self.step_s:g} ms: MuJoCo warned before {self.now_s:.3f} s"
+                f" ({self.warned()}); something in vehicle or motion.control is too stiff, too fast or not a number"
+            )
 
     def warned(self) -> str:
         """Which of MuJoCo's warnings it was."""
@@ -125,8 +132,7 @@ class Flight:
         return self.times_s(begin, self.step + 1), flown[:, 1:5], flown[:, 1 + nq : 4 + nq]
 
     def trajectory(self, begin: int = 0) -> Trajectory:
-        """What was flown from a step on, as a history of its own. Raises RuntimeError where MuJoCo warned."""
-        self.check()
+        """What was flown from a step on, as a history of its own."""
         t_s, lab_from_body_wxyz, rate = self.knots(begin)
         return Trajectory(t_s, Rotation.from_quat(lab_from_body_wxyz, scalar_first=True), rate.copy())
 
@@ -150,8 +156,7 @@ def fly(
 
     controller(t_s, lab_from_body, rate_body_rad_s) -> (3,) torque in N m about the body axes. It is asked at
     the start and every control period (whole steps); its torque, clipped to the limit, is held in between.
-    rate_body_rad_s : (3,) at the start. Raises BadInput for a start beyond the tilt stop, RuntimeError where
-    MuJoCo warned.
+    rate_body_rad_s : (3,) at the start. Raises BadInput for a start beyond the tilt stop, and where MuJoCo warned.
     """
     flight = Flight(world, lab_from_body_start, rate_body_rad_s, duration_s)
     every = max(1, round(control_period_s / flight.step_s)) if controller else flight.steps_left

@@ -73,9 +73,11 @@ def unbalance(model: Any, joints: list[Any], wheels: Wheels, path: Path) -> None
     it; the axle feels the torque U_d speed^2, at a quarter of a turn from the former. Changes the joints' bodies;
     model is what they compiled to while they were balanced.
     """
+    if not (wheels.static_imbalance_kg_m or wheels.dynamic_imbalance_kg_m2):
+        return
     for joint in joints:
         rotor, own = joint.parent, model.body(joint.parent.name)
-        axle = np.array(joint.axis) / np.linalg.norm(joint.axis)
+        axle = model.joint(joint.name).axis  # in the rotor's axes, whatever frame the file gave it in
         across = np.cross(axle, np.eye(3)[np.argmin(np.abs(axle))])
         across /= np.linalg.norm(across)
         product = np.outer(axle, np.cross(axle, across))
@@ -104,3 +106,6 @@ def give_inertial(body: Any, mass_kg: float, place_m: Floats, inertia_kg_m2: Flo
     # MuJoCo takes a NaN ipos for the body's pos without a word: always set it.
     body.mass, body.ipos, body.inertia = mass_kg, place_m, moments
     body.iquat = Rotation.from_matrix(axes * np.linalg.det(axes)).as_quat(scalar_first=True)
+    # An orientation or a full inertia that the file gave in another way would win over these.
+    body.ialt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
+    body.fullinertia = np.full(6, np.nan)

@@ -28,6 +28,7 @@ from skysim.world.actuators import (
     add_actuators,
     joints,
     lock_unused,
+    why_locked,
 )
 from skysim.world.mass import MassProperties, declare_mass, tree_mass, unbalance
 from skysim.world.spec import compiled, load, mujoco_warnings, one_line
@@ -109,9 +110,14 @@ def compose(vehicle: Vehicle, path: Path) -> tuple[Any, MassProperties]:
             "vehicle.centre_of_mass: a free vehicle turns about it, so it is the body's origin; leave it out"
         )
     spec = load(path)
+    spec.compiler.fusestatic = False  # bodies keep their names until the bearing is there
     bus = put_at_origin(spec, path)
-    lock_unused(spec, vehicle, path)
-    mass = declare_mass(bus, compiled(spec, path), vehicle, path)
+    locked = lock_unused(spec, vehicle, path)
+    try:
+        bare = compiled(spec, path)
+    except BadInput as error:
+        raise BadInput(f"{error}{why_locked(str(error), locked)}") from None
+    mass = declare_mass(bus, bare, vehicle, path)
     try:
         add_bearing(spec, bus, vehicle)
     except ValueError as error:  # a name is taken
@@ -134,6 +140,8 @@ def put_at_origin(spec: Any, path: Path) -> Any:
     if bus.parent.name != "world" or bus.frame is not None:
         raise BadInput(f"{path}: body bus must stand directly in the worldbody, in no other body or frame")
     for joint in list(bus.joints):
+        if joint.name.startswith((WHEEL, GIMBAL, ROTOR)):
+            raise BadInput(f"{path}: joint {joint.name} must stand on a body of its own beneath bus")
         spec.delete(joint)
     for key in list(spec.keys):  # keyframes are lists of joint positions, which no longer fit
         spec.delete(key)

@@ -1,0 +1,97 @@
+"""Flights far from what was planned: blows beyond all limits, stops, what cannot be stepped, flights of one tick."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from skysim import flightlog, scene, simulate
+from skysim.types import BadInput, Telemetry
+
+QUIET = "{time: 1 ms, rate_hz: 10, frames: 1, first: %s s}"
+
+
+def off_deg(believed: Rotation | None, log: Telemetry) -> np.ndarray:
+    assert believed is not None
+    return np.degrees((believed.inv() * log.lab_from_body).magnitude())
+
+
+@pytest.mark.parametrize(
+    ("actuators", "more"),
+    [("ideal", {}), ("wheels", {"vehicle.wheels": "{torque_limit: 1 N m, speed_limit_rpm: 20000}"})],
+)
+def test_a_blow_far_beyond_the_torque_s_reach_is_braked_and_the_vehicle_comes_back(
+    actuators: str, more: dict[str, str]
+) -> None:
+    """80 deg/s about z: J w / T = 12.6 s at the least to stop, more than once round; home within four times that."""
+    blow = "[{kind: hold, duration: 1 s}, {kind: bump, rate_deg_s: [0, 0, 80], duration: 40 ms}]"
+    overrides = {
+        "motion.manoeuvre": blow,
+        "motion.control": f"{{actuators: {actuators}}}",
+        "exposure": QUIET % 50,
+        **more,
+    }
+    log = simulate.prepare(scene.load("afit_simsat", overrides)).log
+    rate = np.degrees(np.linalg.norm(log.rate_body_rad_s, axis=1))
+    assert rate.max() > 75
+    assert off_deg(log.lab_from_ref, log)[-1] < 0.01
+    assert rate[-1] < 0.01
+
+
+def test_steered_by_gyros_at_their_limit_the_vehicle_still_brakes() -> None:
+    """Blown to six times what the gyros show, with no star tracker to help: it comes to rest somewhere."""
+    overrides = {
+        "vehicle.imu": "{gyro: {rate_limit_deg_s: 10}}",
+        "motion.control": "{feedback: imu}",
+        "motion.manoeuvre": "[{kind: bump, rate_deg_s: [0, 0, 60], duration: 40 ms}]",
+        "exposure": QUIET % 40,
+    }
+    log = simulate.prepare(scene.load("afit_simsat", overrides)).log
+    assert np.degrees(np.linalg.norm(log.rate_body_rad_s[-1])) < 0.05
+
+
+def test_a_manoeuvre_beyond_the_stop_is_refused_before_the_flight() -> None:
+    overrides = {"motion.manoeuvre": "[{kind: slew, roll_deg: 45, rate_deg_s: 10}]", "exposure": QUIET % 20}
+    with pytest.raises(
+        BadInput, match=r"motion.manoeuvre: asks for a tilt of 30\.\d deg at \d+\.\d+ s, beyond"
+    ):
+        simulate.prepare(scene.load("afit_simsat", overrides))
+
+
+def test_what_cannot_be_stepped_is_told_in_one_line_and_leaves_no_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    overrides = {"vehicle.disturbances": "{cable: {stiffness: 1e8 N m / rad}}", "exposure": QUIET % 0.3}
+    with pytest.raises(BadInput, match="the flight cannot be stepped at 1 ms: MuJoCo warned before"):
+        simulate.prepare(scene.load("afit_simsat", overrides))
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_gyros_apparent_bias_is_what_the_navigator_drifts_by() -> None:
+    """Turning at a constant rate with scale errors, misalignments and a bias, and no noise: the integral of it."""
+    overrides = {
+        "vehicle.imu": "{gyro: {arw_deg_sqrt_h: 0, bias_deg_h: 0, turn_on_bias_deg_h: 20, scale_ppm: 500,"
+        " misalignment_arcsec: 60, quantum_arcsec: 0}}",
+        "motion.rate_deg_s": "[0, 0, 5]",
+        "motion.control": "none",
+        "motion.manoeuvre": "[]",
+        "vehicle.centre_of_mass": "[0 m, 0 m, 0 m]",
+        "exposure": QUIET % 20,
+    }
+    log = simulate.prepare(scene.load("afit_simsat", overrides)).log
+    assert log.lab_from_imu is not None
+    assert log.bias_rad_s is not None
+    off = (log.lab_from_imu * log.lab_from_body.inv()).as_rotvec()[-1]
+    drift = log.lab_from_body.apply(log.bias_rad_s)[:-1].sum(axis=0) * log.period_s
+    assert np.linalg.norm(drift) > 1e-3
+    np.testing.assert_allclose(off, drift, rtol=0, atol=2e-3 * np.linalg.norm(drift))
+
+
+def test_a_vehicle_of_one_tick_is_reported_too() -> None:
+    overrides = {"vehicle.imu": "{}", "exposure": "{time: 1 ms, rate_hz: 10, frames: 1, first: 0 s}"}
+    lab = simulate.prepare(scene.load("afit_simsat", overrides))
+    assert flightlog.summary(lab.log)["gyro_saturated_s"] == 0
