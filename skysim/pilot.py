@@ -108,10 +108,11 @@ class OnCmgs:
         angle, spin = now.angles_rad[self.gimbals.qpos], now.speeds_rad_s[self.rotors.dof]
         rate, torque = self.set.drive(wanted_nm, now.rate_body_rad_s, angle, spin, now.t_s)
         control[self.gimbals.motor] = rate
+        given = -self.set.jacobian(angle, spin) @ rate
         if self.set.rotor_torque_limit_nm is not None:
             control[self.rotors.motor] = torque
-        by_rotors = self.set.momentum(angle, torque / self.set.rotor_inertia_kg_m2)
-        return -self.set.jacobian(angle, spin) @ rate - by_rotors
+            given -= self.set.momentum(angle, torque / self.set.rotor_inertia_kg_m2)
+        return given
 
     @property
     def authority_nm(self) -> float:

@@ -210,7 +210,7 @@ def tick(
         times_s = flight.times_s(flight.step, flight.step + steps + 1)
         disturbance = room.torque_nm(times_s, attitude, rate, stored)
         control[:, flight.world.torques] += disturbance
-        diary.disturbed(disturbance.mean(axis=0))
+        diary.disturbed(disturbance.sum(axis=0) / steps)
     diary.note(stored)
     flight.advance(control)
 
