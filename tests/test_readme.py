@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import get_args
 
 import mujoco
+import numpy as np
 import pytest
 import yaml
 
@@ -139,8 +140,21 @@ def test_the_exported_scene_steps_in_mujoco(folder):
     assert data.time == pytest.approx(0.2)
 
 
+def test_the_controller_of_the_readme_damps(folder):
+    """Each rate dies as exp(-5 t / J), the angle is its integral; gravity on tens of micrometres adds 0.1 deg or so."""
+    (block,) = [block for block in blocks("python") if "world.fly" in block]
+    done = subprocess.run([sys.executable, "-c", block], cwd=folder, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    numbers = [float(word) for word in re.findall(r"[-\d.]+(?:e[-+]\d+)?", done.stdout)]
+    turned, rate = np.array(numbers[:3]), np.array(numbers[3:])
+    inertia = np.array([6.0, 6.5, 9.0])
+    expected = np.array([2, 0, 5]) * inertia / 5 * (1 - np.exp(-5 * 1.25 / inertia))
+    np.testing.assert_allclose(turned, expected, rtol=0, atol=0.2)
+    assert np.abs(rate).max() < 0.2
+
+
 def test_the_python_block_solves_the_frame(folder):
-    (block,) = blocks("python")
+    (block,) = [block for block in blocks("python") if "StarTracker" in block]
     done = subprocess.run([sys.executable, "-c", block], cwd=folder, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     status, ra, dec, roll = done.stdout.replace("[", " ").replace("]", " ").split()
