@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
 
 import pytest
@@ -21,5 +22,6 @@ def pytest_configure(config: pytest.Config) -> None:
     for package in (ROOT / "skysim", ROOT / "estimator"):
         changed_s = max(path.stat().st_mtime for path in package.rglob("*.py"))
         for path in package.rglob("__pycache__/*.nb[ic]"):
-            if path.stat().st_mtime < changed_s:
-                path.unlink(missing_ok=True)
+            with contextlib.suppress(FileNotFoundError):  # another run of the tests was quicker
+                if path.stat().st_mtime < changed_s:
+                    path.unlink()

@@ -1,0 +1,135 @@
+"""Attitude error of six methods under five surfaces: `python -m benchmarks.nearfield_table` prints the docs' table.
+
+The lights are where random rays meet the true surface; the methods are told the lights' true places and a centred
+sphere for the surface, as a lab believes of its dome.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from estimator.camera import Camera
+from estimator.nearfield import SOLVERS, LedMap, Lever, on_surface, project
+
+INCH_M = 0.0254
+LIGHTS = 5
+NOISE_PX = 0.1
+START_OFF_RAD = np.radians(2)  # what Tappe's iterated trial began with
+
+
+@dataclass(frozen=True, slots=True)
+class Bench:
+    """Where the lights really are, under which camera, and the radius of the centred sphere they are believed on."""
+
+    surface: LedMap
+    camera: Camera
+    lever_m: float
+    radius_m: float
+    tilts_deg: tuple[float, ...] = (0, 10, 20, 30)
+
+    @property
+    def lever(self) -> Lever:
+        return Lever(np.array([0.0, 0.0, self.lever_m]), Rotation.identity())
+
+
+def _dome(centre_in: tuple[float, float, float], semi_axes_in: tuple[float, float, float]) -> LedMap:
+    """A surface without lights; infinite semi-axes make it flat."""
+    nowhere = np.empty(0, dtype=np.int64), np.empty((0, 3))
+    return LedMap(*nowhere, np.array(centre_in) * INCH_M, np.array(semi_axes_in) * INCH_M)
+
+
+# AFIT: 10.45 x 7.85 deg on 1600 x 1200 pixels, camera 15 in up, apex at 48 in (reference, 1.1 and 1.2 item 12).
+AFIT_CAMERA = Camera(1600, 1200, float(800 / np.tan(np.radians(10.45 / 2))), (799.5, 599.5))
+# NPS: 8.5 mm lens on a 1/2-inch chip, 41 x 32 deg; its pixel, 10 um, and the lever, 0.30 m, are assumed.
+NPS_CAMERA = Camera(640, 480, 850.0, (319.5, 239.5))
+AFIT = AFIT_CAMERA, 15 * INCH_M, 48 * INCH_M
+BENCHES = {
+    "sphere": Bench(_dome((0, 0, 0), (48, 48, 48)), *AFIT),
+    "sphere 0.125 in off": Bench(_dome((0.125, 0, 0), (48, 48, 48)), *AFIT),
+    "measured ellipsoid": Bench(_dome((0, 0, 48 - 28.60), (38.88, 38.88, 28.60)), *AFIT),
+    "flat at 48 in": Bench(_dome((0, 0, 0), (np.inf, np.inf, 48)), *AFIT),
+    "NPS flat at 1 m": Bench(
+        _dome((0, 0, 0), (np.inf, np.inf, 1 / INCH_M)), NPS_CAMERA, 0.30, 1.0, (0, 5, 10, 15)
+    ),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Trial:
+    """One attitude and what the camera sees at it."""
+
+    truth: Rotation
+    start: Rotation
+    leds: LedMap
+    pixels: NDArray[np.float64]
+
+
+def trial(bench: Bench, tilt_deg: float, rng: np.random.Generator, noise_px: float = 0.0) -> Trial:
+    """Random yaw and azimuth of the tilt; lights where random pixels look; a start START_OFF_RAD from the truth."""
+    azimuth, yaw = rng.uniform(0, 2 * np.pi, 2)
+    lean = np.radians(tilt_deg) * np.array([np.cos(azimuth), np.sin(azimuth), 0])
+    truth = Rotation.from_rotvec(lean) * Rotation.from_rotvec([0, 0, yaw])
+    camera, lever = bench.camera, bench.lever
+    pixels = rng.uniform(-0.5, [camera.width_px - 0.5, camera.height_px - 0.5], (LIGHTS, 2))
+    rays_lab = (lever.cam_from_body * truth).inv().apply(camera.rays(pixels))
+    place = on_surface(rays_lab, truth.inv().apply(lever.camera_body_m), bench.surface)
+    leds = LedMap(np.arange(LIGHTS), place, np.zeros(3), np.full(3, bench.radius_m))
+    axis = rng.standard_normal(3)
+    start = Rotation.from_rotvec(START_OFF_RAD * axis / np.linalg.norm(axis)) * truth
+    seen = project(truth, place, lever, camera) + noise_px * rng.standard_normal((LIGHTS, 2))
+    return Trial(truth, start, leds, seen)
+
+
+def solved(method: str, bench: Bench, one: Trial) -> tuple[Rotation, NDArray[np.float64]]:
+    """What a method makes of a trial: body_from_lab and its covariance."""
+    sigma_rad = np.full(LIGHTS, NOISE_PX / bench.camera.focal_px)
+    rays = bench.camera.rays(one.pixels)
+    return SOLVERS[method](rays, sigma_rad, one.leds.position_m, one.leds, bench.lever, one.start)
+
+
+def errors_deg(
+    method: str, bench: Bench, tilt_deg: float, trials: int, seed: int, noise_px: float = 0.0
+) -> NDArray[np.float64]:
+    """(trials, 3) errors about the body's axes, degrees; the same trials for every method."""
+    rng = np.random.default_rng(seed)
+    errors = np.empty((trials, 3))
+    for n in range(trials):
+        one = trial(bench, tilt_deg, rng, noise_px)
+        errors[n] = (solved(method, bench, one)[0] * one.truth.inv()).as_rotvec(degrees=True)
+    return errors
+
+
+def cross_and_roll(errors: NDArray[np.float64]) -> tuple[float, float]:
+    """rms of the error across the boresight, sqrt(mean(x^2 + y^2)), and about it."""
+    square = np.mean(errors**2, axis=0)
+    return float(np.sqrt(square[0] + square[1])), float(np.sqrt(square[2]))
+
+
+def table(trials: int, seed: int) -> None:
+    """Print rms cross (roll), degrees: methods and tilts down, surfaces across, without noise and with NOISE_PX."""
+    for noise_px in (0.0, NOISE_PX):
+        print(
+            f"\n{LIGHTS} lights, {noise_px} px of noise, {trials} trials a cell: rms cross (roll), degrees\n"
+        )
+        print("| method, tilt | " + " | ".join(BENCHES) + " |")
+        print("|---" * (len(BENCHES) + 1) + "|")
+        for method in SOLVERS:
+            for n in range(4):
+                tilts = sorted({bench.tilts_deg[n] for bench in BENCHES.values()})
+                cells = [
+                    cross_and_roll(errors_deg(method, bench, bench.tilts_deg[n], trials, seed, noise_px))
+                    for bench in BENCHES.values()
+                ]
+                name = f"{method}, {' / NPS '.join(f'{tilt:g}' for tilt in reversed(tilts))}"
+                print(
+                    f"| {name} | " + " | ".join(f"{cross:.2g} ({roll:.2g})" for cross, roll in cells) + " |"
+                )
+
+
+if __name__ == "__main__":
+    table(*(int(argument) for argument in sys.argv[1:3] or ("500", "1")))
