@@ -18,10 +18,10 @@ demo: $(READY)
 	$(BIN)/skysim run shefex2 --out out/shefex2
 
 test: $(READY)
-	NUMBA_NUM_THREADS=1 $(BIN)/pytest -n 2 -m "not long"
+	NUMBA_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n 2 -m "not long"
 
 test-long: $(READY)
-	NUMBA_NUM_THREADS=1 $(BIN)/pytest -n 2 -m long
+	NUMBA_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n 2 -m long
 
 test-oracle: $(READY)
 	$(BIN)/pip install --quiet --disable-pip-version-check -e '.[oracle]'
