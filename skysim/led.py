@@ -1,14 +1,18 @@
-"""What an LED sends towards the camera: emission lobe and falloff with distance (its pulses are in pulse.py)."""
+"""What an LED sends towards the camera: emission lobe, falloff with distance, and the drive that makes its level.
+
+When a pulse train shines within an exposure is in pulse.py.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from skysim.light import CosineLobe, Led, Lobe, LobeTable
+from skysim.lamp import CosineLobe, Led, Lobe, LobeTable, Sequential
 from skysim.types import Floats
 
 Falloff = Callable[[Floats], Floats]
@@ -73,3 +77,63 @@ def irradiance_e_s_m2(
     return np.where(
         lit, strength_e_s_sr * emitted * cos_incidence * FALLOFF[emitter.falloff](distance_m), 0.0
     )
+
+
+class Lamps(NamedTuple):
+    """What a drive has to make: level (N,), share of full brightness; board (N,), which board each LED sits on."""
+
+    level: Floats
+    board: NDArray[np.int64]
+
+
+class Pulses(NamedTuple):
+    """What it makes of it, (N,) each: lit from start_s for on_s in every period_s, so strong while it is lit."""
+
+    period_s: Floats
+    start_s: Floats
+    on_s: Floats
+    strength: Floats
+
+
+def direct(_led: Led, lamps: Lamps, _rng: np.random.Generator) -> Pulses:
+    """Direct current: the LED never goes out, and its level is in its strength."""
+    one = np.ones(len(lamps.level))
+    return Pulses(one, 0 * one, one, lamps.level)
+
+
+def pwm(led: Led, lamps: Lamps, rng: np.random.Generator) -> Pulses:
+    """Hardware PWM: V_avg = D V_max, D = t_on / T (thesis, eqs 35 and 36); phases are random, T is led.pwm_period_s."""
+    count = len(lamps.level)
+    start_s = rng.uniform(0, led.pwm_period_s, count)
+    return Pulses(np.full(count, led.pwm_period_s), start_s, lamps.level * led.pwm_period_s, np.ones(count))
+
+
+def sequential(led: Led, lamps: Lamps, rng: np.random.Generator) -> Pulses:
+    """An Arduino switches one LED after another, so that each waits for all: D_i = t_on,i / sum T (thesis, eq. 37).
+
+    Each LED of a controller has a slot T, t_on is its level of it, and the controller's cycle is the sum of its
+    slots. The controllers' phases are random. The microcontroller's own delays are left out, as in the thesis.
+    """
+    part, count = led.drive, len(lamps.level)
+    assert isinstance(part, Sequential)
+    if part.controller == "board":
+        group = lamps.board
+    elif part.controller == "dome":
+        group = np.zeros(count, dtype=np.int64)
+    else:
+        group = np.arange(count) // part.controller
+    _, controller, sharing = np.unique(group, return_inverse=True, return_counts=True)
+    order = np.argsort(controller, kind="stable")
+    turn = np.empty(count)  # whose turn it is on its controller: 0, 1, ...
+    turn[order] = np.arange(count) - np.repeat(np.cumsum(sharing) - sharing, sharing)
+    cycle_s = sharing * np.float64(part.slot_s)
+    start_s = rng.uniform(0, cycle_s)[controller] + turn * part.slot_s
+    return Pulses(cycle_s[controller], start_s, lamps.level * part.slot_s, np.ones(count))
+
+
+# Each of (the LEDs' kind, what each LED has to be, the hardware's random stream) -> when it is lit and how strong.
+DRIVES: dict[str, Callable[[Led, Lamps, np.random.Generator], Pulses]] = {
+    "direct": direct,
+    "pwm": pwm,
+    "sequential": sequential,
+}

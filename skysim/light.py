@@ -2,130 +2,197 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+import math
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import BeforeValidator, Field, ModelWrapValidatorHandler, field_validator, model_validator
 
+from skysim.lamp import CosineLobe as CosineLobe
+from skysim.lamp import Layout as Layout
+from skysim.lamp import Led as Led
+from skysim.lamp import Lobe as Lobe
+from skysim.lamp import LobeTable as LobeTable
+from skysim.lamp import PatchBoards as PatchBoards
 from skysim.quantity import (
     Ascending,
-    Intensity,
     Length,
-    NotNegative,
     Number,
     Part,
-    RadiantIntensity,
     SemiAxis,
     Share,
-    Time,
     a_table,
-    one_of,
 )
+
+Tilt = Annotated[Number, Field(ge=-45, le=45)]
 
 
 class Surface(Part):
-    """The inside of the dome, in the lab frame (metres, bearing centre at the origin)."""
+    """The inside of the dome, in the lab frame (metres, bearing centre at the origin): what every kind has.
 
-    kind: Literal["sphere", "ellipsoid", "flat"]
-    apex_m: Annotated[Length, Field(gt=0)]
-    radius_m: Annotated[Length, Field(gt=0)] | None = None
-    semi_axes_m: tuple[SemiAxis, SemiAxis, SemiAxis] | None = None
+    Sizes, apex and rim are the dome's before it is displaced, its axis upright through the bearing's centre.
+
+    offset   : the whole dome's displacement
+    tilt_deg : about the lab's x, then about its y, through the surface's own centre (the origin of surveyed points)
+    error    : standard deviation of the lab's survey of it, along the normal
+    """
+
+    kind: Literal["sphere", "ellipsoid", "flat", "cylinder", "surveyed"]
     offset_m: tuple[Length, Length, Length] = (0.0, 0.0, 0.0)
+    tilt_deg: tuple[Tilt, Tilt] = (0.0, 0.0)
+    error_m: Annotated[Length, Field(ge=0)] = 0.0
 
-    @model_validator(mode="after")
-    def its_own_sizes(self) -> Surface:
-        needs = {"sphere": {"radius"}, "ellipsoid": {"semi_axes"}, "flat": set()}[self.kind]
-        has = {name for name in ("radius", "semi_axes") if getattr(self, f"{name}_m") is not None}
-        if needs != has:
-            wanted = ", ".join(sorted(needs)) or "neither radius nor semi_axes"
-            raise ValueError(f"a {self.kind} takes {wanted}")
-        return self
-
-
-class PatchBoards(Part):
-    """3x3 LED boards spread evenly over a cap of the surface, each with a pattern of its own."""
-
-    kind: Literal["patch_boards"]
-    cap_deg: Annotated[Number, Field(gt=0, le=90)]
-    spacing_m: Annotated[Length, Field(gt=0)]
-    pitch_m: Annotated[Length, Field(gt=0)]
-    lit: tuple[int, int] = (4, 6)
-    pwm_levels: Annotated[tuple[Annotated[Number, Field(gt=0, le=1)], ...], Field(min_length=1)] = (1.0,)
-    hardware_seed: Annotated[int, Field(ge=0)] = 0
-
-    @field_validator("lit")
+    @model_validator(mode="wrap")
     @classmethod
-    def within_board(cls, value: tuple[int, int]) -> tuple[int, int]:
-        if not 1 <= value[0] <= value[1] <= 9:
-            raise ValueError(f"{value} is no range of LEDs on a 3x3 board; allowed: 1 <= least <= most <= 9")
-        return value
+    def of_its_kind(cls, value: Any, handler: ModelWrapValidatorHandler[Surface]) -> Surface:
+        """`Surface.model_validate` makes the part of the kind that is told."""
+        kind = value.get("kind") if cls is Surface and isinstance(value, dict) else None
+        return PARTS[kind].model_validate(value) if kind in list(PARTS) else handler(value)
+
+
+class Rimmed(Surface):
+    """A surface that ends: at a height above the bearing, or at an angle from its axis seen from the bearing."""
+
+    rim_height_m: Length | None = None
+    rim_deg: Annotated[Number, Field(gt=0, lt=180)] | None = None
 
     @model_validator(mode="after")
-    def boards_fit_beside_each_other(self) -> PatchBoards:
-        if self.spacing_m < 3 * self.pitch_m:
+    def one_rim(self) -> Self:
+        if self.rim_height_m is not None and self.rim_deg is not None:
+            raise ValueError("a rim is told once; allowed: rim_height or rim_deg")
+        if self.rim_height_m is not None and self.rim_height_m >= getattr(self, "apex_m", math.inf):
             raise ValueError(
-                f"spacing {self.spacing_m:g} m: boards of three LEDs at {self.pitch_m:g} m would overlap"
+                f"rim_height {self.rim_height_m:g} m is not below the apex; allowed: less than apex"
             )
         return self
 
 
-class CosineLobe(Part):
-    """Radiant intensity as cos^exponent of the angle from the normal; 1 is Lambert's law."""
+class Wall(Part):
+    """A formed sheet, which is thinnest at the apex: its thickness is linear in the angle about the sphere's centre.
 
-    kind: Literal["cosine"] = "cosine"
-    exponent: NotNegative = 1.0
+    base_deg  : the angle of thickness_base, beyond which it stays
+    radius_of : the face that is a sphere: the outside, or the middle of the wall
+    """
+
+    thickness_apex_m: Annotated[Length, Field(gt=0)]
+    thickness_base_m: Annotated[Length, Field(gt=0)]
+    base_deg: Annotated[Number, Field(gt=0, le=90)]
+    radius_of: Literal["outside", "mid_wall"] = "outside"
 
 
-class LobeTable(Part):
-    """Relative intensity against angle as it was measured, 1 on the axis, nothing beyond the last angle."""
+class SphereSurface(Rimmed):
+    """A sphere; with a wall, what is inside of a formed shell whose outside or middle is a sphere."""
 
-    kind: Literal["table"]
-    angle_deg: Ascending
-    intensity: Annotated[tuple[NotNegative, ...], Field(min_length=2)]
+    kind: Literal["sphere"]
+    apex_m: Annotated[Length, Field(gt=0)]
+    radius_m: Annotated[Length, Field(gt=0)]
+    wall: Wall | None = None
 
     @model_validator(mode="after")
-    def a_table(self) -> LobeTable:
-        a_table(self.angle_deg, self.intensity, "intensity")
-        if self.angle_deg[0] != 0 or abs(self.intensity[0] - 1) > 1e-6:
-            raise ValueError("the table does not begin with an intensity of 1 at 0 deg")
+    def thin(self) -> Self:
+        thickest = max(self.wall.thickness_apex_m, self.wall.thickness_base_m) if self.wall else 0.0
+        if thickest > 0.1 * self.radius_m:
+            raise ValueError(f"a wall of {thickest:g} m is no shell's; allowed: to a tenth of the radius")
         return self
 
 
-Lobe = Annotated[CosineLobe | LobeTable, Field(discriminator="kind")]
+class EllipsoidSurface(Rimmed):
+    """An ellipsoid: oblate, prolate or with three axes of its own."""
+
+    kind: Literal["ellipsoid"]
+    apex_m: Annotated[Length, Field(gt=0)]
+    semi_axes_m: tuple[SemiAxis, SemiAxis, SemiAxis]
 
 
-class Led(Part):
-    """One kind of LED, for the whole dome: so bright along its normal, in candela or in watts a steradian."""
+class FlatSurface(Surface):
+    """A level panel; of a width along x and a height along y, or without an end."""
 
-    intensity_cd: Annotated[Intensity, Field(gt=0)] | None = None
-    radiant_intensity_w_sr: Annotated[RadiantIntensity, Field(gt=0)] | None = None
-    disc_diameter_m: Annotated[Length, Field(gt=0)]
-    falloff: str = "inverse_square"
-    lobe: Lobe = CosineLobe()
-    spectrum: Literal["white"] | Annotated[Length, Field(ge=300e-9, le=1100e-9)] = "white"
-    scatter: Annotated[Number, Field(ge=0, lt=0.5)] = 0.0
-    pwm_period_s: Annotated[Time, Field(gt=0)] = 1e-3
+    kind: Literal["flat"]
+    apex_m: Annotated[Length, Field(gt=0)]
+    width_m: Annotated[Length, Field(gt=0)] | None = None
+    height_m: Annotated[Length, Field(gt=0)] | None = None
 
-    @field_validator("falloff")
+
+class CylinderSurface(Surface):
+    """A vault along the lab's x or y, or a drum about z; its highest place is at apex, its ends half a length off."""
+
+    kind: Literal["cylinder"]
+    axis: Literal["x", "y", "z"]
+    apex_m: Annotated[Length, Field(gt=0)]
+    radius_m: Annotated[Length, Field(gt=0)]
+    length_m: Annotated[Length, Field(gt=0)] | None = None
+    rim_height_m: Length | None = None
+
+    @model_validator(mode="after")
+    def ends(self) -> Self:
+        if self.axis == "z" and self.length_m is None:
+            raise ValueError("a cylinder about z takes its length, from apex down")
+        if self.rim_height_m is not None and self.rim_height_m >= self.apex_m:
+            raise ValueError(
+                f"rim_height {self.rim_height_m:g} m is not below the apex; allowed: less than apex"
+            )
+        return self
+
+
+class SurveyedSurface(Rimmed):
+    """Points that a measuring arm took on the inside, made smooth: Zernike polynomials up to a degree.
+
+    file      : comments (#), a line of names, then lines of x, y, z in `unit`, z up
+    rms_limit : of the points' distances from the smooth surface
+    """
+
+    kind: Literal["surveyed"]
+    file: str
+    unit: Literal["m", "cm", "mm", "in"]
+    degree: Annotated[int, Field(ge=0, le=12)] = 6
+    rms_limit_m: Annotated[Length, Field(gt=0)] = 1e-3
+
+    @field_validator("file")
     @classmethod
-    def known_falloff(cls, value: str) -> str:
-        from skysim.led import FALLOFF
+    def is_there(cls, value: str) -> str:
+        if not value.endswith(".csv") or not Path(value).is_file():
+            raise ValueError(f"{value!r} is no file; allowed: a .csv file of x, y, z")
+        return value
 
-        return one_of(value, FALLOFF)
 
-    @model_validator(mode="after")
-    def one_brightness(self) -> Led:
-        if (self.intensity_cd is None) == (self.radiant_intensity_w_sr is None):
-            raise ValueError("an LED takes either intensity or radiant_intensity")
-        return self
+PARTS: dict[Any, type[Surface]] = {
+    "sphere": SphereSurface,
+    "ellipsoid": EllipsoidSurface,
+    "flat": FlatSurface,
+    "cylinder": CylinderSurface,
+    "surveyed": SurveyedSurface,
+}
+
+
+def of_a_known_kind(value: Any) -> Any:
+    """The value; an unknown kind is answered by the key `kind` itself, with those that there are."""
+    if isinstance(value, dict) and "kind" in value and value["kind"] not in list(PARTS):
+        Surface.model_validate({"kind": value["kind"]})
+    return value
+
+
+AnySurface = Annotated[
+    SphereSurface | EllipsoidSurface | FlatSurface | CylinderSurface | SurveyedSurface,
+    Field(discriminator="kind"),
+    BeforeValidator(of_a_known_kind),
+]
 
 
 class Dome(Part):
     """An LED dome as the light."""
 
     kind: Literal["dome"]
-    surface: Surface
-    layout: PatchBoards
+    surface: AnySurface
+    layout: Layout
     led: Led
+
+    @model_validator(mode="after")
+    def boards_have_controllers(self) -> Dome:
+        if getattr(self.led.drive, "controller", None) == "board" and self.layout.kind != "patch_boards":
+            raise ValueError(
+                f"led.drive.controller: {self.layout.kind} has no boards; allowed: dome, or a number of LEDs"
+            )
+        return self
 
 
 class Stars(Part):

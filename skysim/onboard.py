@@ -36,7 +36,7 @@ def tracker(scene: Scene, mount: Mount, sources: Sources) -> Estimator:
     camera, settings = believed_camera(scene), believed_settings(scene)
     if isinstance(scene.light, Dome):
         centre_m, semi_axes_m = dome.surface(scene.light.surface).as_ellipsoid()
-        board = sources.id // dome.HOLES
+        board = dome.board_of(scene.light.layout, sources.id)
         leds = LedMap(sources.id, sources.place[:, :3], centre_m, semi_axes_m, board)
         arm = believed.believed_camera_body_m or mount.camera_body_m
         return DomeTracker(camera, leds, Lever(np.array(arm), mount.cam_from_body), settings)

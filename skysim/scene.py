@@ -225,9 +225,18 @@ def beneath(tree: dict[str, Any], files: Files, overrides: Mapping[str, str]) ->
         raise BadInput(f"{error} {place_of(['camera', 'preset'], files, overrides)}") from None
 
 
+# Keys that name a file of the scene's own.
+FILES = (
+    ("vehicle", "model"),
+    ("camera", "psf", "file"),
+    ("light", "surface", "file"),
+    ("light", "layout", "file"),
+)
+
+
 def beside(path: Path, tree: dict[str, Any]) -> dict[str, Any]:
     """The scene with the files that it names taken from its own folder, where there are any of that name."""
-    for keys in (("vehicle", "model"), ("camera", "psf", "file")):
+    for keys in FILES:
         tree = anchored(path.resolve().parent, tree, *keys)
     return tree
 

@@ -12,12 +12,12 @@ from typing import get_args
 import pytest
 from pydantic import BeforeValidator, ValidationError
 
-from skysim import camera, light, motion, scene, vehicle
+from skysim import camera, lamp, light, motion, scene, vehicle
 from skysim.actuators import STEERING
 from skysim.background import BACKGROUNDS
 from skysim.dome import LAYOUTS, SURFACES
 from skysim.jitter import SPECTRA
-from skysim.led import LOBES
+from skysim.led import DRIVES, LOBES
 from skysim.manoeuvre import LEGS
 from skysim.optics import VIGNETTING
 from skysim.psf import PSFS
@@ -876,7 +876,8 @@ def kinds(union: object) -> set[str]:
 
 def test_every_algorithm_that_the_schema_names_exists() -> None:
     assert set(light.Surface.model_fields["kind"].annotation.__args__) == set(SURFACES)
-    assert set(light.PatchBoards.model_fields["kind"].annotation.__args__) == set(LAYOUTS)
+    assert kinds(light.Layout) == set(LAYOUTS)
+    assert kinds(lamp.Drive) == set(DRIVES)
     assert set(vehicle.Cmgs.model_fields["steering"].annotation.__args__) == set(STEERING)
     assert kinds(camera.Psf) == set(PSFS)
     assert kinds(get_args(camera.Camera.model_fields["vignetting"].annotation)[0]) == set(VIGNETTING)

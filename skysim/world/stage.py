@@ -178,18 +178,45 @@ def add_dome(spec: Any, rings_m: Floats) -> None:
 def shell_m(inside: dome.Surface, cap_rad: float) -> Floats:
     """(RINGS, SECTORS, 3) points of the dome, ring under ring from its top down, each against the clock's hands.
 
-    An ellipsoid ends where it is widest, or above the vehicle if that is higher; a panel a little beyond its LEDs.
+    A panel ends a little beyond its LEDs, an upright ellipsoid without a rim where it is widest or above the vehicle
+    if that is higher; every other surface as the bearing sees it end.
     """
     azimuth = np.arange(SECTORS) * (2 * np.pi / SECTORS)
     around = np.stack([np.cos(azimuth), np.sin(azimuth), np.zeros(SECTORS)], axis=1)
     up = np.array([0.0, 0.0, 1.0])
     if isinstance(inside, dome.Plane):
         radius = np.linspace(1e-3, inside.height_m * np.tan(min(cap_rad + 0.1, 1.3)), RINGS)[:, None, None]
-        return np.asarray(radius * around + inside.height_m * up)
+        half_m = np.append(inside.half_m, np.inf)
+        return np.asarray(
+            inside.centre_m + np.clip(radius * around, -half_m, half_m) @ inside.lab_from_own.as_matrix().T
+        )
+    upright = inside.lab_from_own.magnitude() == 0
+    if not (isinstance(inside, dome.Ellipsoid) and upright and inside.rim.nowhere):
+        return seen_shell_m(inside, around)
     middle, half = inside.centre_m[2], inside.semi_axes_m[2]
     lowest = max(middle, 0.35 * (middle + half))
     polar = np.linspace(1e-3, np.arccos((lowest - middle) / half), RINGS)[:, None, None]
     return np.asarray(inside.centre_m + inside.semi_axes_m * (np.sin(polar) * around + np.cos(polar) * up))
+
+
+def seen_shell_m(inside: dome.Surface, around: Floats) -> Floats:
+    """(RINGS, SECTORS, 3) points where rays from the bearing meet a surface, from its upper edge to its rim.
+
+    around : (SECTORS, 3) level unit vectors. Edge and rim are found to a fifth of a degree, between 0 and 80 deg from
+             the zenith and above a third of the surface's height
+    """
+    up = np.array([0.0, 0.0, 1.0])
+
+    def at(polar: Floats) -> Floats:
+        rays = np.sin(polar)[..., None] * around + np.cos(polar)[..., None] * up
+        return inside.meet(np.zeros(3), rays.reshape(-1, 3)).reshape(rays.shape)
+
+    polar = np.broadcast_to(np.linspace(1e-3, np.radians(80), 400)[:, None], (400, len(around)))
+    height_m = np.nan_to_num(at(polar)[..., 2], nan=-np.inf)
+    there = height_m > 0.35 * height_m.max()
+    first, last = there.argmax(axis=0), 399 - there[::-1].argmax(axis=0)
+    share = np.linspace(0, 1, RINGS)[:, None]
+    return at(polar[first, 0] * (1 - share) + polar[last, 0] * share)
 
 
 def add_sheet(

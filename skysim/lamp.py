@@ -1,0 +1,285 @@
+"""A dome's LEDs as a scene says it: how they are laid out, how each is driven and shines. Schema only."""
+
+from __future__ import annotations
+
+import datetime
+from collections.abc import Sequence
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, field_validator, model_validator
+
+from skysim.quantity import (
+    Ascending,
+    Intensity,
+    Length,
+    NotNegative,
+    Number,
+    Part,
+    RadiantIntensity,
+    Time,
+    a_table,
+    one_of,
+)
+
+HOLES = 9  # on a patch board: 3x3
+Level = Annotated[Number, Field(gt=0, le=1)]
+Levels = Annotated[tuple[Level, ...], Field(min_length=1)]
+Magnitudes = Annotated[tuple[Annotated[Number, Field(ge=-30, le=30)], ...], Field(min_length=1)]
+Cap = Annotated[Number, Field(gt=0, le=90)]
+Count = Annotated[int, Field(ge=1, le=100_000)]
+Seed = Annotated[int, Field(ge=0)]
+
+
+def levels_of(magnitudes: Sequence[float]) -> tuple[float, ...]:
+    """Pogson's law: 10^(-0.4 m), the brightest of the list at full level."""
+    return tuple(10.0 ** (-0.4 * (float(one) - float(min(magnitudes)))) for one in magnitudes)
+
+
+class Board(Part):
+    """One patch board, glued where the bearing's centre sees its middle.
+
+    azimuth_deg, tilt_deg : from the lab's +x towards +y, and from the zenith
+    turn_deg : of its columns about its normal
+    leds     : the holes that are soldered, 0 to 8, row by row; levels: of each, full if left out
+    """
+
+    azimuth_deg: Number
+    tilt_deg: Annotated[Number, Field(ge=0, le=90)]
+    turn_deg: Number = 0.0
+    leds: Annotated[tuple[Annotated[int, Field(ge=0, lt=HOLES)], ...], Field(min_length=1)]
+    levels: Levels | None = None
+
+    @model_validator(mode="after")
+    def one_led_a_hole(self) -> Board:
+        if len(set(self.leds)) < len(self.leds):
+            raise ValueError(f"leds: {list(self.leds)} has a hole twice")
+        if self.levels is not None and len(self.levels) != len(self.leds):
+            raise ValueError(f"leds has {len(self.leds)} holes, levels {len(self.levels)}")
+        return self
+
+
+class PatchBoards(Part):
+    """3x3 LED boards on a cap of the surface: spread evenly, each with a pattern of its own, or by list.
+
+    cap_deg : as far from the zenith as the dome carries LEDs, seen from the bearing; so for every layout
+    spacing, lit, pwm_levels : of boards spread evenly; `boards` takes their place
+    glue_scatter  : standard deviation of an LED's place along each axis of its board
+    glue_tilt_deg : a board's normal is off the surface's by up to this, evenly over that cap
+    """
+
+    kind: Literal["patch_boards"]
+    cap_deg: Cap
+    spacing_m: Annotated[Length, Field(gt=0)] | None = None
+    pitch_m: Annotated[Length, Field(gt=0)]
+    lit: tuple[int, int] = (4, 6)
+    pwm_levels: Levels = (1.0,)
+    boards: tuple[Board, ...] = ()
+    glue_scatter_m: Annotated[Length, Field(ge=0)] = 0.0
+    glue_tilt_deg: Annotated[Number, Field(ge=0, le=30)] = 0.0
+    hardware_seed: Seed = 0
+
+    @field_validator("lit")
+    @classmethod
+    def within_board(cls, value: tuple[int, int]) -> tuple[int, int]:
+        if not 1 <= value[0] <= value[1] <= HOLES:
+            raise ValueError(f"{value} is no range of LEDs on a 3x3 board; allowed: 1 <= least <= most <= 9")
+        return value
+
+    @model_validator(mode="after")
+    def boards_fit_beside_each_other(self) -> PatchBoards:
+        if self.spacing_m is None and not self.boards:
+            raise ValueError("patch_boards takes spacing, or boards by list")
+        if self.spacing_m is not None and self.spacing_m < 3 * self.pitch_m:
+            raise ValueError(
+                f"spacing {self.spacing_m:g} m: boards of three LEDs at {self.pitch_m:g} m would overlap"
+            )
+        return self
+
+
+class Dimmed(Part):
+    """Base of the layouts of single LEDs: how bright each is made, by shares of full brightness or by magnitudes.
+
+    Brightness is drawn from the list for each LED (in `listed`, the list is theirs, one by one); the least of the
+    magnitudes is full brightness.
+    """
+
+    cap_deg: Cap
+    levels: Levels | None = None
+    magnitudes: Magnitudes | None = None
+    hardware_seed: Seed = 0
+
+    @property
+    def dimming(self) -> tuple[float, ...]:
+        """The levels, whichever way they are given."""
+        return levels_of(self.magnitudes) if self.magnitudes else self.levels or (1.0,)
+
+    @model_validator(mode="after")
+    def one_way_to_say_it(self) -> Self:
+        if self.levels is not None and self.magnitudes is not None:
+            raise ValueError("a layout takes either levels or magnitudes")
+        return self
+
+
+class Fibonacci(Dimmed):
+    """So many LEDs on Fibonacci's spiral: as evenly as can be."""
+
+    kind: Literal["fibonacci"]
+    count: Count
+
+
+class PoissonDisc(Dimmed):
+    """LEDs at random, none nearer to another than the spacing, as many as find room."""
+
+    kind: Literal["poisson_disc"]
+    spacing_m: Annotated[Length, Field(gt=0)]
+
+
+class RandomPlaces(Dimmed):
+    """So many LEDs, each anywhere."""
+
+    kind: Literal["random"]
+    count: Count
+
+
+class Celestial(Part):
+    """The real sky: an LED for each of the brightest stars, where the camera at its nominal place sees it.
+
+    count or limit_mag : so many stars on the dome, or all to this V
+    camera : the entrance pupil in the lab when the vehicle stands level
+    zenith_ra_deg, zenith_dec_deg, roll_deg : what is overhead, and the position angle there of the lab's -y (a level
+        camera's up), as `ra_deg`, `dec_deg`, `roll_deg` of a camera that looks up
+    epoch  : whose apparent places they are, UTC
+    brightest_mag : no star is shown brighter than this, which is full brightness; the brightest star's if left out
+    """
+
+    kind: Literal["celestial"]
+    cap_deg: Cap
+    catalogue: str = "hipparcos_hp6.5"
+    count: Count | None = None
+    limit_mag: Annotated[Number, Field(ge=-2, le=15)] | None = None
+    brightest_mag: Number | None = None
+    camera_m: tuple[Length, Length, Length]
+    zenith_ra_deg: Annotated[Number, Field(ge=0, lt=360)]
+    zenith_dec_deg: Annotated[Number, Field(ge=-90, le=90)]
+    roll_deg: Number = 0.0
+    epoch: datetime.datetime = datetime.datetime(2000, 1, 1, 12)
+    hardware_seed: Seed = 0
+
+    @model_validator(mode="after")
+    def one_choice_of_stars(self) -> Celestial:
+        if (self.count is None) == (self.limit_mag is None):
+            raise ValueError("celestial takes either count or limit_mag")
+        if not 1900 <= self.epoch.year <= 2100:
+            raise ValueError(f"epoch: {self.epoch.isoformat()} is outside of 1900 to 2100")
+        return self
+
+
+class Listed(Dimmed):
+    """LEDs by list: places in the lab, or directions from the bearing onto the surface, or a CSV file of either.
+
+    directions_deg : azimuth from +x towards +y, and tilt from the zenith
+    file : columns x_m, y_m, z_m or azimuth_deg, tilt_deg, and level or magnitude
+    """
+
+    kind: Literal["listed"]
+    positions_m: Annotated[tuple[tuple[Length, Length, Length], ...], Field(min_length=1)] | None = None
+    directions_deg: Annotated[tuple[tuple[Number, Number], ...], Field(min_length=1)] | None = None
+    file: str | None = None
+
+    @model_validator(mode="after")
+    def one_list(self) -> Listed:
+        given = [one for one in (self.positions_m, self.directions_deg, self.file) if one is not None]
+        if len(given) != 1:
+            raise ValueError("listed takes one of positions, directions_deg, file")
+        dimmed = len(self.levels or self.magnitudes or ())
+        if dimmed and self.file is not None:
+            raise ValueError("levels and magnitudes of a file are its own columns")
+        if dimmed and dimmed != len(given[0]):
+            raise ValueError(f"{len(given[0])} LEDs, but {dimmed} levels or magnitudes")
+        return self
+
+
+Layout = Annotated[
+    PatchBoards | Fibonacci | PoissonDisc | RandomPlaces | Celestial | Listed, Field(discriminator="kind")
+]
+
+
+class CosineLobe(Part):
+    """Radiant intensity as cos^exponent of the angle from the normal; 1 is Lambert's law."""
+
+    kind: Literal["cosine"] = "cosine"
+    exponent: NotNegative = 1.0
+
+
+class LobeTable(Part):
+    """Relative intensity against angle as it was measured, 1 on the axis, nothing beyond the last angle."""
+
+    kind: Literal["table"]
+    angle_deg: Ascending
+    intensity: Annotated[tuple[NotNegative, ...], Field(min_length=2)]
+
+    @model_validator(mode="after")
+    def a_table(self) -> LobeTable:
+        a_table(self.angle_deg, self.intensity, "intensity")
+        if self.angle_deg[0] != 0 or abs(self.intensity[0] - 1) > 1e-6:
+            raise ValueError("the table does not begin with an intensity of 1 at 0 deg")
+        return self
+
+
+Lobe = Annotated[CosineLobe | LobeTable, Field(discriminator="kind")]
+
+
+class Direct(Part):
+    """Direct current: always lit, the level in its strength."""
+
+    kind: Literal["direct"]
+
+
+class Pwm(Part):
+    """Hardware PWM: lit for its level of every led.pwm_period, each LED with a phase of its own."""
+
+    kind: Literal["pwm"] = "pwm"
+
+
+class Sequential(Part):
+    """An Arduino's software PWM: its LEDs one after another, each lit for its level of its slot.
+
+    controller : `board`, one to each patch board; `dome`, one for all; or how many LEDs, by number, share one
+    """
+
+    kind: Literal["sequential"]
+    slot_s: Annotated[Time, Field(gt=0)] = 1e-3
+    controller: Literal["board", "dome"] | Annotated[int, Field(ge=1)] = "board"
+
+
+Drive = Annotated[Direct | Pwm | Sequential, Field(discriminator="kind")]
+
+
+class Led(Part):
+    """One kind of LED, for the whole dome: so bright along its normal, in candela or in watts a steradian.
+
+    drive : what makes its level; pwm_period belongs to the kind pwm
+    """
+
+    intensity_cd: Annotated[Intensity, Field(gt=0)] | None = None
+    radiant_intensity_w_sr: Annotated[RadiantIntensity, Field(gt=0)] | None = None
+    disc_diameter_m: Annotated[Length, Field(gt=0)]
+    falloff: str = "inverse_square"
+    lobe: Lobe = CosineLobe()
+    spectrum: Literal["white"] | Annotated[Length, Field(ge=300e-9, le=1100e-9)] = "white"
+    scatter: Annotated[Number, Field(ge=0, lt=0.5)] = 0.0
+    drive: Drive = Pwm()
+    pwm_period_s: Annotated[Time, Field(gt=0)] = 1e-3
+
+    @field_validator("falloff")
+    @classmethod
+    def known_falloff(cls, value: str) -> str:
+        from skysim.led import FALLOFF
+
+        return one_of(value, FALLOFF)
+
+    @model_validator(mode="after")
+    def one_brightness(self) -> Led:
+        if (self.intensity_cd is None) == (self.radiant_intensity_w_sr is None):
+            raise ValueError("an LED takes either intensity or radiant_intensity")
+        return self
