@@ -48,8 +48,9 @@ Frames = Annotated[int | None, typer.Option(help="How many frames; the scene's o
 Seed = Annotated[int | None, typer.Option(help="Seed of all random streams; the scene's own if left out.")]
 Out = Annotated[Path | None, typer.Option(help="Folder for what is written; out/NAME if left out.")]
 Sets = Annotated[list[str] | None, typer.Option("--set", help="Override a key: camera.detector.bits=8.")]
-FILM_FRAMES = 60
 Json = Annotated[bool, typer.Option("--json", help="Print JSON for machines instead of a table.")]
+
+FILM_FRAMES = 60
 
 
 def main() -> None:

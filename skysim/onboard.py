@@ -22,12 +22,11 @@ from estimator.types import Attitude, BadImage, Centroids
 from skysim import dome, imu, quaternion
 from skysim.camera import Camera as CameraPart
 from skysim.detector import saturation_dn
-from skysim.quantity import one_of
+from skysim.quantity import ARCSEC_RAD, one_of
 from skysim.scene import CATALOGUES, Dome, Filter, Scene
 from skysim.types import BadInput, Floats, Frame, Mount, Sources
 
 Estimator = StarTracker | DomeTracker
-ARCSEC_RAD = math.pi / 180 / 3600
 
 
 def tracker(scene: Scene, mount: Mount, sources: Sources) -> Estimator:

@@ -51,6 +51,7 @@ def finite(value: float) -> float:
     return value
 
 
+ARCSEC_RAD = math.pi / 180 / 3600
 RPM_RAD_S = math.pi / 30  # rad/s of one revolution a minute
 Number = Annotated[float, AfterValidator(finite)]
 Length = Annotated[Number, BeforeValidator(quantity("m", "length", '"35 mm" or "48 in"'))]

@@ -10,12 +10,11 @@ from scipy.spatial.transform import Rotation
 
 from estimator.attitude import radecroll_rad
 from skysim import metrics
+from skysim.quantity import ARCSEC_RAD
 from skysim.report import annotate
 from skysim.scene import Scene, Stars
 from skysim.simulate import Shot
 from skysim.types import Mount, Row
-
-ARCSEC_RAD = np.pi / 180 / 3600
 
 
 def angle_names(scene: Scene) -> tuple[str, str, str]:

@@ -153,15 +153,14 @@ def fly(lab: Lab, watch: Watch | None = None) -> Lab:
     if not (scene.motion.control or navigation) and room.quiet:
         steps = flight.steps_left  # nobody has anything to say before the end
     check_reference(reference, lab)
-    with world.mujoco_warnings():
-        while flight.steps_left:
-            tick(flight, pilot, room, navigation, diary, min(steps, flight.steps_left))
-            if navigation:
-                navigation.feel(flight.now_s, *felt(flight, vibration, steps))
-            if eyes:
-                eyes.look(flight)
-            if watch:
-                watch(flight.now_s, flight.now_s + flight.steps_left * flight.step_s)
+    while flight.steps_left:
+        tick(flight, pilot, room, navigation, diary, min(steps, flight.steps_left))
+        if navigation:
+            navigation.feel(flight.now_s, *felt(flight, vibration, steps))
+        if eyes:
+            eyes.look(flight)
+        if watch:
+            watch(flight.now_s, flight.now_s + flight.steps_left * flight.step_s)
     told = reference if scene.motion.control else None
     return replace(
         lab,
@@ -179,8 +178,7 @@ def check_reference(reference: manoeuvre.Reference, lab: Lab) -> None:
     if vehicle.mount != "air_bearing" or lab.scene.motion.control is None:
         return
     t_s = np.arange(0, min(reference.duration_s, lab.flown_s) + LOOK_S, LOOK_S)
-    up = reference.attitudes(t_s).as_matrix()[:, 2, 2]
-    tilt_deg = np.degrees(np.arccos(np.clip(up, -1, 1)))
+    tilt_deg = world.tilt_deg(reference.attitudes(t_s))
     beyond = np.flatnonzero(tilt_deg > vehicle.tilt_stop_deg)
     if len(beyond):
         raise BadInput(

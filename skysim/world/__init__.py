@@ -2,7 +2,7 @@
 
 from skysim.world.flight import Flight as Flight
 from skysim.world.flight import fly as fly
-from skysim.world.spec import mujoco_warnings as mujoco_warnings
+from skysim.world.flight import tilt_deg as tilt_deg
 from skysim.world.vehicle import CAM_FROM_MJCAM as CAM_FROM_MJCAM
 from skysim.world.vehicle import World as World
 from skysim.world.vehicle import build as build

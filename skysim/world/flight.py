@@ -94,17 +94,18 @@ class Flight:
         MuJoCo puts an unstable model back to its start and goes on, and forgets its warnings with the next call.
         """
         end = self.step + len(control)
-        self.rollout.rollout(
-            [self.model],
-            [self.data],
-            self.states[None, self.step],
-            control[None],
-            control_spec=int(CONTROL),
-            skip_checks=True,
-            nstep=len(control),
-            initial_warmstart=self.data.qacc_warmstart[None].copy(),
-            state=self.states[None, self.step + 1 : end + 1],
-        )
+        with mujoco_warnings():
+            self.rollout.rollout(
+                [self.model],
+                [self.data],
+                self.states[None, self.step],
+                control[None],
+                control_spec=int(CONTROL),
+                skip_checks=True,
+                nstep=len(control),
+                initial_warmstart=self.data.qacc_warmstart[None].copy(),
+                state=self.states[None, self.step + 1 : end + 1],
+            )
         self.step = end
         self.check()
 
@@ -161,23 +162,26 @@ def fly(
     flight = Flight(world, lab_from_body_start, rate_body_rad_s, duration_s)
     every = max(1, round(control_period_s / flight.step_s)) if controller else flight.steps_left
     limit = world.vehicle.torque_limit_nm
-    with mujoco_warnings():
-        while flight.steps_left:
-            control = np.zeros((min(every, flight.steps_left), world.model.nu))
-            if controller:
-                here = Rotation.from_quat(flight.lab_from_body_wxyz, scalar_first=True)
-                torque = controller(flight.now_s, here, flight.rate_body_rad_s.copy())
-                control[:, world.torques] = np.clip(torque, -limit, limit)
-            flight.advance(control)
+    while flight.steps_left:
+        control = np.zeros((min(every, flight.steps_left), world.model.nu))
+        if controller:
+            here = Rotation.from_quat(flight.lab_from_body_wxyz, scalar_first=True)
+            torque = controller(flight.now_s, here, flight.rate_body_rad_s.copy())
+            control[:, world.torques] = np.clip(torque, -limit, limit)
+        flight.advance(control)
     return flight.trajectory()
+
+
+def tilt_deg(lab_from_body: Rotation) -> Floats:
+    """Angle between the body's z and the lab's, of one attitude or of many."""
+    return np.degrees(np.arccos(np.clip(lab_from_body.as_matrix()[..., 2, 2], -1, 1)))
 
 
 def check_tilt(world: World, lab_from_body: Rotation) -> None:
     """Refuse a start that the bearing does not allow."""
-    up_body = lab_from_body.as_matrix()[:, 2]
-    tilt_deg = float(np.degrees(np.arccos(np.clip(up_body[2], -1, 1))))
-    if world.vehicle.mount == "air_bearing" and tilt_deg > world.vehicle.tilt_stop_deg:
+    tilt = float(tilt_deg(lab_from_body))
+    if world.vehicle.mount == "air_bearing" and tilt > world.vehicle.tilt_stop_deg:
         raise BadInput(
-            f"motion.start: tilted by {tilt_deg:.1f} deg, beyond vehicle.tilt_stop_deg"
+            f"motion.start: tilted by {tilt:.1f} deg, beyond vehicle.tilt_stop_deg"
             f" {world.vehicle.tilt_stop_deg:g}"
         )
