@@ -17,20 +17,20 @@ from estimator.camera import Camera
 from estimator.nearfield import SOLVERS, LedMap, Lever, on_surface, project
 
 INCH_M = 0.0254
-LIGHTS = 5
 NOISE_PX = 0.1
 START_OFF_RAD = np.radians(2)  # what Tappe's iterated trial began with
 
 
 @dataclass(frozen=True, slots=True)
 class Bench:
-    """Where the lights really are, under which camera, and the radius of the centred sphere they are believed on."""
+    """Where so many lights really are, under which camera, and the radius of the sphere they are believed on."""
 
     surface: LedMap
     camera: Camera
     lever_m: float
     radius_m: float
     tilts_deg: tuple[float, ...] = (0, 10, 20, 30)
+    lights: int = 5
 
     @property
     def lever(self) -> Lever:
@@ -45,7 +45,7 @@ def _dome(centre_in: tuple[float, float, float], semi_axes_in: tuple[float, floa
 
 # AFIT: 10.45 x 7.85 deg on 1600 x 1200 pixels, camera 15 in up, apex at 48 in (reference, 1.1 and 1.2 item 12).
 AFIT_CAMERA = Camera(1600, 1200, float(800 / np.tan(np.radians(10.45 / 2))), (799.5, 599.5))
-# NPS: 8.5 mm lens on a 1/2-inch chip, 41 x 32 deg; its pixel, 10 um, and the lever, 0.30 m, are assumed.
+# NPS: nine lights; 8.5 mm lens on a 1/2-inch chip, 41 x 32 deg; its pixel, 10 um, and the lever, 0.30 m, are assumed.
 NPS_CAMERA = Camera(640, 480, 850.0, (319.5, 239.5))
 AFIT = AFIT_CAMERA, 15 * INCH_M, 48 * INCH_M
 BENCHES = {
@@ -54,7 +54,7 @@ BENCHES = {
     "measured ellipsoid": Bench(_dome((0, 0, 48 - 28.60), (38.88, 38.88, 28.60)), *AFIT),
     "flat at 48 in": Bench(_dome((0, 0, 0), (np.inf, np.inf, 48)), *AFIT),
     "NPS flat at 1 m": Bench(
-        _dome((0, 0, 0), (np.inf, np.inf, 1 / INCH_M)), NPS_CAMERA, 0.30, 1.0, (0, 5, 10, 15)
+        _dome((0, 0, 0), (np.inf, np.inf, 1 / INCH_M)), NPS_CAMERA, 0.30, 1.0, (0, 5, 10, 15), 9
     ),
 }
 
@@ -75,19 +75,19 @@ def trial(bench: Bench, tilt_deg: float, rng: np.random.Generator, noise_px: flo
     lean = np.radians(tilt_deg) * np.array([np.cos(azimuth), np.sin(azimuth), 0])
     truth = Rotation.from_rotvec(lean) * Rotation.from_rotvec([0, 0, yaw])
     camera, lever = bench.camera, bench.lever
-    pixels = rng.uniform(-0.5, [camera.width_px - 0.5, camera.height_px - 0.5], (LIGHTS, 2))
+    pixels = rng.uniform(-0.5, [camera.width_px - 0.5, camera.height_px - 0.5], (bench.lights, 2))
     rays_lab = (lever.cam_from_body * truth).inv().apply(camera.rays(pixels))
     place = on_surface(rays_lab, truth.inv().apply(lever.camera_body_m), bench.surface)
-    leds = LedMap(np.arange(LIGHTS), place, np.zeros(3), np.full(3, bench.radius_m))
+    leds = LedMap(np.arange(bench.lights), place, np.zeros(3), np.full(3, bench.radius_m))
     axis = rng.standard_normal(3)
     start = Rotation.from_rotvec(START_OFF_RAD * axis / np.linalg.norm(axis)) * truth
-    seen = project(truth, place, lever, camera) + noise_px * rng.standard_normal((LIGHTS, 2))
+    seen = project(truth, place, lever, camera) + noise_px * rng.standard_normal((bench.lights, 2))
     return Trial(truth, start, leds, seen)
 
 
 def solved(method: str, bench: Bench, one: Trial) -> tuple[Rotation, NDArray[np.float64]]:
     """What a method makes of a trial: body_from_lab and its covariance."""
-    sigma_rad = np.full(LIGHTS, NOISE_PX / bench.camera.focal_px)
+    sigma_rad = np.full(bench.lights, NOISE_PX / bench.camera.focal_px)
     rays = bench.camera.rays(one.pixels)
     return SOLVERS[method](rays, sigma_rad, one.leds.position_m, one.leds, bench.lever, one.start)
 
@@ -113,9 +113,7 @@ def cross_and_roll(errors: NDArray[np.float64]) -> tuple[float, float]:
 def table(trials: int, seed: int) -> None:
     """Print rms cross (roll), degrees: methods and tilts down, surfaces across, without noise and with NOISE_PX."""
     for noise_px in (0.0, NOISE_PX):
-        print(
-            f"\n{LIGHTS} lights, {noise_px} px of noise, {trials} trials a cell: rms cross (roll), degrees\n"
-        )
+        print(f"\n{noise_px} px of noise, {trials} trials a cell: rms cross (roll), degrees\n")
         print("| method, tilt | " + " | ".join(BENCHES) + " |")
         print("|---" * (len(BENCHES) + 1) + "|")
         for method in SOLVERS:

@@ -71,6 +71,9 @@ def _cog(image: NDArray, boxes: NDArray, level: Floats, noise: Floats, gain_e_dn
                 flux += light
                 sx += light * x
                 sy += light * y
+        if flux == 0:  # as much darkness as light: it is nowhere
+            out[n] = np.nan, np.nan, np.nan, 0.0
+            continue
         cx, cy = sx / flux, sy / flux
         # The noise grid is that of the filtered image; one pixel's is 1 / 0.375 of it for white noise.
         sigma2 = (at(noise, height, width, cy, cx) / 0.375) ** 2

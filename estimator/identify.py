@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from math import lgamma, log, pi, sqrt
+from math import pi, sqrt
 from typing import NamedTuple
 
 import numba
@@ -11,13 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from estimator.chance import ACCEPT_LOG10_CHANCE, MIN_MATCHES, log10_tail
 from estimator.index import PairIndex, around, between
+from estimator.saa import saa
 from estimator.types import Floats, StarMatch
 
 Identifier = Callable[..., StarMatch | None]
-
-ACCEPT_LOG10_CHANCE = -5.0
-MIN_MATCHES = 4
 
 
 class Rules(NamedTuple):
@@ -79,7 +78,8 @@ def pyramid(
     return StarMatch(observed, star, Rotation.from_matrix(matrix), chance)
 
 
-IDENTIFIERS: dict[str, Identifier] = {"pyramid": pyramid}
+# `default` is the pyramid where the focal length is uncertain; a known camera's stars are found by evidence (ledpairs).
+IDENTIFIERS: dict[str, Identifier] = {"default": pyramid, "pyramid": pyramid, "saa": saa}
 
 Found = tuple[NDArray[np.int64], NDArray[np.int64], Floats, float]
 
@@ -312,15 +312,3 @@ def _log10_chance(groups: NDArray, seen: int, p: float) -> float:
         further += before > 1
     tail = log10_tail(max(seen - 3 - second - further, 0), independent - 3, p)
     return tail - second - 0.3 * further
-
-
-@numba.njit(cache=True)
-def log10_tail(trials: int, hits: int, p: float) -> float:
-    """log10 of the probability of `hits` or more in `trials` at probability p each."""
-    if hits <= 0 or p >= 1:
-        return 0.0
-    total = 0.0
-    for k in range(hits, trials + 1):
-        ways = lgamma(trials + 1.0) - lgamma(k + 1.0) - lgamma(trials - k + 1.0)
-        total += np.exp(ways + k * log(p) + (trials - k) * log(1 - p))
-    return np.log10(max(total, 1e-300))

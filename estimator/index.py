@@ -60,7 +60,8 @@ def build(vectors: Floats, max_angle_rad: float, group: NDArray[np.int64] | None
     pair, angle = pair[apart], angle[apart]
     if len(pair) < 3:
         raise BadImage(
-            f"{len(pair)} pairs of stars within {np.degrees(max_angle_rad):.2f} deg: no pattern to find"
+            f"{len(pair)} pairs within {np.degrees(max_angle_rad):.2f} deg, not counting those of one patch board,"
+            " are no pattern; allowed: 3 or more"
         )
     kvector, slope, offset = line(angle)
     return PairIndex(

@@ -23,6 +23,7 @@ class LedMap:
     position_m : (N, 3)
     centre_m, semi_axes_m : (3,) the ellipsoid x'A x' = 1 that the LEDs sit on
     board      : (N,) which LEDs share a patch board, whose lattice is every board's; None where each is by itself
+    sigma_m    : standard deviation of a place along each axis
     """
 
     id: Ints
@@ -30,6 +31,7 @@ class LedMap:
     centre_m: Floats
     semi_axes_m: Floats
     board: Ints | None = None
+    sigma_m: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,10 +39,12 @@ class Lever:
     """The believed place of the camera on the vehicle.
 
     camera_body_m : (3,) entrance pupil in the body frame;  cam_from_body : rotation
+    sigma_m       : standard deviation of the pupil's place along each axis
     """
 
     camera_body_m: Floats
     cam_from_body: Rotation
+    sigma_m: float = 0.0
 
 
 def on_sphere(rays_body: Floats, camera_body_m: Floats, radius_m: float) -> Floats:

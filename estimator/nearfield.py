@@ -151,6 +151,25 @@ def infinity(
     )
 
 
+def thesis_points(rays_cam: Floats, leds: LedMap, lever: Lever, sine: bool = False) -> tuple[Floats, float]:
+    """AFIT's vectors to the lights (Padro 2012, eqs 43-44): (N, 3) points in camera axes, m, and R - M, m.
+
+    R is the believed surface's height over the bearing, M the camera's distance from the bearing along the boresight.
+    sine : put the slip right, (x, y) = (R - M) sin a: then the point lies on its ray, R - M from the camera
+    Raises ValueError where eq. 44 has no root.
+    """
+    boresight_body = lever.cam_from_body.inv().apply([0.0, 0.0, 1.0])
+    height_m = on_surface(np.array([[0.0, 0.0, 1.0]]), np.zeros(3), leds)[0, 2]
+    reach_m = float(height_m - lever.camera_body_m @ boresight_body)
+    across_m = reach_m * (rays_cam[:, :2] if sine else rays_cam[:, :2] / rays_cam[:, 2:])
+    along2_m2 = reach_m**2 - np.sum(across_m**2, axis=1)
+    if not (reach_m > 0 and np.all(along2_m2 > 0)):
+        raise ValueError(
+            f"eq. 44 has no root: a ray is 45 deg off the boresight, or R - M is {reach_m:.3f} m"
+        )
+    return np.column_stack([across_m, np.sqrt(along2_m2)]), reach_m
+
+
 def thesis(
     rays_cam: Floats,
     sigma_rad: Floats,
@@ -165,18 +184,9 @@ def thesis(
     calibrated; along it z = sqrt((R - M)^2 - x^2 - y^2); the camera's place is added, and angles are taken about
     the bearing (Padro 2012, eqs 43-45, with his x, y, z for z, x, y here). The slip of tan for sin is his
     (reference 1.2, item 11) and gives the bias: .0036 degree cross on AFIT's dome, .07 under a flat at 30 degrees.
-    R is the believed surface's height over the bearing, M the camera's distance from the bearing along the boresight.
     """
-    boresight_body = lever.cam_from_body.inv().apply([0.0, 0.0, 1.0])
-    height_m = on_surface(np.array([[0.0, 0.0, 1.0]]), np.zeros(3), leds)[0, 2]
-    reach_m = height_m - lever.camera_body_m @ boresight_body
-    across_m = reach_m * rays_cam[:, :2] / rays_cam[:, 2:]
-    along2_m2 = reach_m**2 - np.sum(across_m**2, axis=1)
-    if not (reach_m > 0 and np.all(along2_m2 > 0)):
-        raise ValueError(
-            f"eq. 44 has no root: a ray is 45 deg off the boresight, or R - M is {reach_m:.3f} m"
-        )
-    point_cam = np.column_stack([across_m, np.sqrt(along2_m2)])
+    point_cam, reach_m = thesis_points(rays_cam, leds, lever)
+    across_m = point_cam[:, :2]
     # dp by the tangents, then the tangents by the ray.
     by_tangent = np.zeros((len(rays_cam), 3, 2))
     by_tangent[:, [0, 1], [0, 1]] = reach_m

@@ -1,4 +1,4 @@
-"""The sequence of stages, from a frame to an attitude: for stars at infinity and for lights on a dome."""
+"""The sequence of stages, from a frame to an attitude, for stars at infinity; `dometracker` has that for a dome."""
 
 from __future__ import annotations
 
@@ -12,19 +12,20 @@ from scipy.optimize import least_squares
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from estimator import catalog, index
+from estimator import catalog, index, ledpairs
 from estimator.attitude import SOLVERS, covariance
 from estimator.camera import Camera, check_shape
 from estimator.centroid import CENTROIDERS
+from estimator.chance import ACCEPT_LOG10_CHANCE, MIN_MATCHES, log10_tail
 from estimator.detect import DETECTORS
-from estimator.identify import ACCEPT_LOG10_CHANCE, IDENTIFIERS, MIN_MATCHES, log10_tail
-from estimator.nearfield import SOLVERS as NEAR_SOLVERS
-from estimator.nearfield import LedMap, Lever, check_lever, on_sphere, project
+from estimator.identify import IDENTIFIERS
+from estimator.ledsight import sky_of
 from estimator.types import Attitude, BadImage, Centroids, Floats, StarMatch
 
 NO_STARS = "too few stars detected"
 NO_MATCH = "no identification beyond chance"
 SATURATED = "the frame is saturated"
+LEAST_ERROR_PX = 0.1  # of a star, for what no calibration knows of
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,7 +39,7 @@ class Settings:
 
     detector: str = "local"
     centroider: str = "cog"
-    identifier: str = "pyramid"
+    identifier: str = "default"
     solver: str = "quest"
     threshold_sigma: float = 5.0
     min_area_px: int = 3
@@ -139,9 +140,10 @@ class StarTracker:
         field_sr = camera.width_px * camera.height_px / camera.focal_px**2
         limit = catalog.limit_for_density(stars, field_sr, settings.field_stars)
         bright = catalog.brighter(self.stars, limit)
-        self.index = index.build(
-            catalog.merge_doubles(bright, 3 / camera.focal_px).vectors, widest.diagonal_rad * 1.02
-        )
+        patterns = catalog.merge_doubles(bright, 3 / camera.focal_px).vectors
+        by_evidence = settings.identifier == "default" and focal_uncertainty == 0
+        self.sight = sky_of(patterns, camera) if by_evidence else None
+        self.index = self.sight.pairs if self.sight else index.build(patterns, widest.diagonal_rad * 1.02)
         self.stars = catalog.merge_doubles(self.stars, 2 / camera.focal_px)
         self.tree = cKDTree(self.stars.vectors)
 
@@ -164,7 +166,19 @@ class StarTracker:
         return Attitude(NO_MATCH)
 
     def _lost_in_space(self, centroids: Centroids) -> Iterator[tuple[Camera, Rotation]]:
-        """Pyramid at each focal length that is possible; a little effort at all before much at any."""
+        """Attitudes worth refining: by evidence for a camera that is known, else by triangles at each focal length.
+
+        Of those that are possible: a little effort at all before much at any.
+        """
+        if self.sight:
+            few = centroids.take(np.arange(min(len(centroids), self.settings.base_stars)))
+            sigma_rad = np.hypot(
+                direction_sigma_rad(few, self.camera, self.settings), LEAST_ERROR_PX / self.camera.focal_px
+            )
+            found = ledpairs.identify(self.camera.rays(few.xy_px), sigma_rad, self.sight)
+            if isinstance(found, StarMatch):
+                yield self.camera, found.cam_from_ref
+            return
         identify = IDENTIFIERS[self.settings.identifier]
         step, stretch = 0.02, 0.011 if self.focal_uncertainty else 5e-4
         reach = int(np.ceil(self.focal_uncertainty / step - 0.5))
@@ -291,105 +305,3 @@ def fit_camera(
 
     scale = np.array([1e-3, 1e-3, 1e-3, 1e-2, 0.3])[: len(start)]
     return model(least_squares(residual, start, loss="soft_l1", x_scale=scale, max_nfev=40).x)
-
-
-class DomeTracker:
-    """Lost under an LED dome, with a camera on a lever arm about the bearing centre.
-
-    cam_from_ref of the answer is cam_from_lab; `lever` turns it into the vehicle's attitude.
-    """
-
-    def __init__(
-        self,
-        camera: Camera,
-        leds: LedMap,
-        lever: Lever,
-        settings: Settings = Settings(solver="rotation_only"),
-    ) -> None:
-        check_lever(leds, lever)
-        self.camera, self.leds, self.lever, self.settings = camera, leds, lever, settings
-        radius = np.linalg.norm(leds.position_m, axis=1)
-        self.radius_m = float(np.median(radius))
-        corners = np.array(
-            [[0, 0], [camera.width_px, 0], [0, camera.height_px], [camera.width_px, camera.height_px]]
-        )
-        points = self._on_sphere(camera.rays(corners - 0.5))
-        tangent = points[:, :2] / points[:, 2:]
-        # Only the well-inside is held against a hypothesis: lights cut off by the border are not detected.
-        middle, half = (tangent.max(axis=0) + tangent.min(axis=0)) / 2, np.ptp(tangent, axis=0) / 2 * 0.95
-        low, high = middle - half, middle + half
-        self.field_tan = float(low[0]), float(high[0]), float(low[1]), float(high[1])
-        reach_rad = np.arccos(np.clip((points @ points.T).min(), -1, 1))
-        self.index = index.build(leds.position_m / radius[:, None], reach_rad * 1.05, leds.board)
-        # A dome that is no sphere stretches the angles as the lever stretches an error of range.
-        self.stretch = (
-            2 * float(np.std(radius)) / (self.radius_m - float(np.linalg.norm(lever.camera_body_m))) + 5e-4
-        )
-
-    def _on_sphere(self, rays_cam: Floats) -> Floats:
-        """Unit vectors from the bearing centre to where rays meet the mean sphere, in camera axes."""
-        camera_m = self.lever.cam_from_body.apply(self.lever.camera_body_m)
-        return on_sphere(rays_cam, camera_m, self.radius_m) / self.radius_m
-
-    def solve(self, image: NDArray) -> Report:
-        """One frame to an attitude. Raises BadImage for bad input; anything else that fails is a status."""
-        return look(image, self.camera, self.settings, self.solve_centroids)
-
-    def solve_centroids(self, centroids: Centroids, clock: Clock | None = None) -> Attitude:
-        """The stages after centroiding, for centroids from anywhere (the truth included)."""
-        clock = clock or Clock()
-        if len(centroids) < MIN_MATCHES:
-            return Attitude(NO_STARS)
-        few = brightest(centroids, self.settings)
-        match = IDENTIFIERS[self.settings.identifier](
-            self._on_sphere(self.camera.rays(few.xy_px)),
-            self.index,
-            max(1.0, 4 * self.settings.centroid_sigma_px) / self.camera.focal_px,
-            stretch=self.stretch,
-            base_stars=self.settings.base_stars,
-            missed_dex=self.settings.missed_dex,
-            field_tan=self.field_tan,
-        )
-        clock.lap("identify")
-        if match is None:
-            return Attitude(NO_MATCH)
-        attitude = self._refined(centroids, match)
-        clock.lap("solve")
-        return attitude
-
-    def _refined(self, centroids: Centroids, match: StarMatch) -> Attitude:
-        """Solve exactly, match every centroid to the LEDs in view, tighten; the search has weighed the chance."""
-        camera, lever = self.camera, self.lever
-        body_from_lab = lever.cam_from_body.inv() * match.cam_from_ref
-        observed, star = match.observed, match.star
-        for radius_px in (12.0, 4.0, 4.0):
-            rays = camera.rays(centroids.xy_px[observed])
-            sigma_rad = direction_sigma_rad(centroids.take(observed), camera, self.settings)
-            try:
-                body_from_lab, spread = NEAR_SOLVERS[self.settings.solver](
-                    rays, sigma_rad, self.leds.position_m[star], self.leds, lever, body_from_lab
-                )
-            except (ValueError, np.linalg.LinAlgError) as error:
-                return Attitude(f"no attitude: {error}")
-            xy = project(body_from_lab, self.leds.position_m, lever, camera)
-            # An LED whose middle is just off the chip still shines onto it.
-            inside = np.flatnonzero(camera.contains(np.nan_to_num(xy, nan=-1e9), -30.0))
-            kept = observed, star
-            observed, star = mutual(centroids.xy_px, xy[inside], radius_px, inside)
-            if len(observed) < MIN_MATCHES:
-                return Attitude(NO_MATCH)
-        observed, star = kept
-        # The exact geometry must confirm all that the approximate one found.
-        if len(observed) < len(match.observed):
-            return Attitude(NO_MATCH)
-        cam_from_lab = lever.cam_from_body * body_from_lab
-        R_cam_from_body = lever.cam_from_body.as_matrix()
-        residual = xy[star] - centroids.xy_px[observed]
-        return Attitude(
-            "solved",
-            cam_from_lab,
-            R_cam_from_body @ spread @ R_cam_from_body.T,
-            StarMatch(observed, star, cam_from_lab, match.log10_chance),
-            float(np.sqrt(np.mean(residual**2))),
-            camera,
-        )

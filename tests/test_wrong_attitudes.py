@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from estimator.dometracker import DomeTracker
 from estimator.nearfield import project
-from estimator.tracker import DomeTracker
 from estimator.types import Centroids
 from skysim import metrics, scene, simulate
 

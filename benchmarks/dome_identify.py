@@ -1,0 +1,129 @@
+"""Lost under a dome: how often LEDs are identified, wrongly identified and refused, and how long it takes.
+
+`python benchmarks/dome_identify.py [TRIALS] [SEED]` takes AFIT's SimSat under its measured dome with 1,400 equal LEDs,
+random attitudes to 30 degrees of tilt and no prior.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from estimator import ledpairs
+from estimator.camera import Camera
+from estimator.ledmap import LedMap, Lever, project
+from estimator.ledsight import Sight, sight_of
+from skysim import layout, scene, simulate
+from skysim.onboard import calibration
+from skysim.surface import surface
+from skysim.types import Floats
+
+COUNT, CAP_DEG, TILT_DEG = 1400, 40.0, 30.0
+
+
+@dataclass(frozen=True)
+class Case:
+    """What is done to the frames: noise of a centroid, error of a believed place, share of LEDs dead, false lights."""
+
+    name: str
+    places: str = "poisson_disc"
+    noise_px: float = 0.2
+    believed_m: float = 0.2e-3
+    dead: float = 0.0
+    false: int = 0
+
+
+CASES = (
+    Case("poisson disc"),
+    Case("random", "random"),
+    Case("fibonacci", "fibonacci"),
+    Case("half dead, 5 reflections", dead=0.5, false=5),
+    Case("the same, LEDs known", dead=0.5, false=5, believed_m=0.0),
+    Case("5 reflections", false=5),
+    Case("fibonacci, LEDs known", "fibonacci", believed_m=0.0),
+    Case("reflections only", dead=1.0, false=16),
+)
+
+
+def leds_m(places: str, count: int, inside: layout.Inside, rng: np.random.Generator) -> Floats:
+    """(count, 3) LEDs on the dome."""
+    half = np.radians(CAP_DEG)
+    if places == "fibonacci":
+        return layout.from_bearing(inside, layout.cap(count, half))
+    darts_m = layout.from_bearing(inside, layout.scattered_cap(100 * count, half, rng))
+    if places == "random":
+        return darts_m[:count]
+    area_m2 = 2 * np.pi * 1.22**2 * (1 - np.cos(half))
+    kept = darts_m[layout.apart(darts_m, np.sqrt(0.6 * area_m2 / count))]
+    return kept[:count] if len(kept) < count else kept[rng.permutation(len(kept))[:count]]
+
+
+def attitude(rng: np.random.Generator) -> Rotation:
+    """body_from_lab with the boresight anywhere within TILT_DEG of the zenith, and any yaw."""
+    tilt = np.arccos(1 - rng.random() * (1 - np.cos(np.radians(TILT_DEG))))
+    towards, yaw = rng.uniform(0, 2 * np.pi, 2)
+    tilted = Rotation.from_rotvec(tilt * np.array([np.cos(towards), np.sin(towards), 0]))
+    return Rotation.from_euler("z", yaw) * tilted
+
+
+def trial(
+    case: Case,
+    truth_m: Floats,
+    lever: Lever,
+    camera: Camera,
+    sight: Sight,
+    rng: np.random.Generator,
+) -> tuple[str, float, int]:
+    """What came of one frame, its time, and how many LEDs were in it."""
+    body_from_lab = attitude(rng)
+    xy = project(body_from_lab, truth_m, lever, camera)
+    seen = np.flatnonzero(camera.contains(np.nan_to_num(xy, nan=-1e9), 12))
+    seen = seen[rng.random(len(seen)) >= case.dead]
+    false = rng.random((case.false, 2)) * [camera.width_px, camera.height_px]
+    lights_px = np.concatenate([xy[seen] + case.noise_px * rng.standard_normal((len(seen), 2)), false])
+    order = rng.permutation(len(lights_px))
+    lights_px, name = lights_px[order], np.concatenate([seen, np.full(case.false, -1)])[order]
+    sigma = np.full(len(lights_px), case.noise_px / camera.focal_px)
+    begin = time.perf_counter()
+    found = ledpairs.identify(camera.rays(lights_px), sigma, sight)
+    spent = time.perf_counter() - begin
+    if isinstance(found, str):
+        return found, spent, len(seen)
+    # A reflection near a dead LED is no error; a light called by another's name is.
+    named = name[found.observed]
+    wrong = np.any((named != found.star) & (named >= 0)) or np.all(named < 0)
+    return ("WRONG" if wrong else "identified"), spent, len(seen)
+
+
+def measure(case: Case, trials: int, seed: int) -> str:
+    """One line of the table."""
+    rng = np.random.default_rng(seed)
+    lab = simulate.furnish(scene.load("afit_simsat"))
+    inside = surface(lab.scene.light.surface)
+    truth_m = leds_m(case.places, COUNT, inside, rng)
+    camera = calibration(lab.scene.camera)
+    lever = Lever(np.array(lab.mount.camera_body_m), lab.mount.cam_from_body)
+    believed_m = truth_m + case.believed_m * rng.standard_normal(truth_m.shape)
+    leds = LedMap(np.arange(len(truth_m)), believed_m, np.zeros(3), np.ones(3), sigma_m=case.believed_m)
+    sight = sight_of(leds, lever, camera)
+    trial(case, truth_m, lever, camera, sight, rng)
+    came = [trial(case, truth_m, lever, camera, sight, rng) for _ in range(trials)]
+    verdicts = np.array([verdict.split(":")[0] for verdict, _, _ in came])
+    ms = 1e3 * np.array([spent for _, spent, _ in came])
+    share = {name: 100 * np.mean(verdicts == name) for name in ("identified", "WRONG", "ambiguous")}
+    return (
+        f"{case.name:26s} {len(truth_m):5d} {np.mean([n for _, _, n in came]):6.1f} {min(n for _, _, n in came):4d}"
+        f" {share['identified']:9.2f} {int(np.sum(verdicts == 'WRONG')):6d} {share['ambiguous']:9.2f}"
+        f" {np.median(ms):8.2f} {np.percentile(ms, 99):8.2f}"
+    )
+
+
+if __name__ == "__main__":
+    trials, seed = (int(one) for one in (sys.argv[1:] + ["2000", "1"][len(sys.argv) - 1 :]))
+    print(f"{'case':26s}  LEDs   seen  min   found %  wrong  ambig. %       ms   p99 ms")
+    for case in CASES:
+        print(measure(case, trials, seed), flush=True)

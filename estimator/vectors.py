@@ -1,0 +1,70 @@
+"""Vectors and small rotations for compiled code that makes no arrays of them."""
+
+from __future__ import annotations
+
+from math import sqrt
+
+import numba
+
+from estimator.types import Floats
+
+Vector = tuple[float, float, float]
+
+
+@numba.njit(cache=True)
+def row(array: Floats, n: int) -> Vector:
+    return array[n, 0], array[n, 1], array[n, 2]
+
+
+@numba.njit(cache=True)
+def chord(u: Vector, v: Vector) -> float:
+    """Distance between the ends of unit vectors; it changes by no more than their angle."""
+    return sqrt((u[0] - v[0]) ** 2 + (u[1] - v[1]) ** 2 + (u[2] - v[2]) ** 2)
+
+
+@numba.njit(cache=True)
+def axes(u: Vector, v: Vector, out: Floats) -> None:
+    """Right-handed axes as the columns of out (3, 3): the middle of two unit vectors, their normal, and the third."""
+    out[0, 0], out[1, 0], out[2, 0] = u[0] + v[0], u[1] + v[1], u[2] + v[2]
+    out[0, 1] = u[1] * v[2] - u[2] * v[1]
+    out[1, 1] = u[2] * v[0] - u[0] * v[2]
+    out[2, 1] = u[0] * v[1] - u[1] * v[0]
+    for c in range(2):
+        inverse = 1 / sqrt(out[0, c] ** 2 + out[1, c] ** 2 + out[2, c] ** 2)
+        for k in range(3):
+            out[k, c] *= inverse
+    out[0, 2] = out[1, 0] * out[2, 1] - out[2, 0] * out[1, 1]
+    out[1, 2] = out[2, 0] * out[0, 1] - out[0, 0] * out[2, 1]
+    out[2, 2] = out[0, 0] * out[1, 1] - out[1, 0] * out[0, 1]
+
+
+@numba.njit(cache=True)
+def times_transposed(one: Floats, other: Floats, out: Floats) -> None:
+    """out = one other', (3, 3) each."""
+    for i in range(3):
+        for j in range(3):
+            out[i, j] = one[i, 0] * other[j, 0] + one[i, 1] * other[j, 1] + one[i, 2] * other[j, 2]
+
+
+@numba.njit(cache=True)
+def turn(w: Floats, matrix: Floats) -> None:
+    """A small turn w of a rotation matrix, in place: exp([w]) to second order, then made orthonormal."""
+    for c in range(3):
+        x, y, z = matrix[0, c], matrix[1, c], matrix[2, c]
+        cx, cy, cz = w[1] * z - w[2] * y, w[2] * x - w[0] * z, w[0] * y - w[1] * x
+        matrix[0, c] = x + cx + (w[1] * cz - w[2] * cy) / 2
+        matrix[1, c] = y + cy + (w[2] * cx - w[0] * cz) / 2
+        matrix[2, c] = z + cz + (w[0] * cy - w[1] * cx) / 2
+    u = row(matrix, 0)
+    inverse = 1 / sqrt(u[0] ** 2 + u[1] ** 2 + u[2] ** 2)
+    for c in range(3):
+        matrix[0, c] *= inverse
+    along = matrix[0, 0] * matrix[1, 0] + matrix[0, 1] * matrix[1, 1] + matrix[0, 2] * matrix[1, 2]
+    for c in range(3):
+        matrix[1, c] -= along * matrix[0, c]
+    inverse = 1 / sqrt(matrix[1, 0] ** 2 + matrix[1, 1] ** 2 + matrix[1, 2] ** 2)
+    for c in range(3):
+        matrix[1, c] *= inverse
+    for c in range(3):
+        n, m = (c + 1) % 3, (c + 2) % 3
+        matrix[2, c] = matrix[0, n] * matrix[1, m] - matrix[0, m] * matrix[1, n]
