@@ -28,6 +28,7 @@ Magnitudes = Annotated[tuple[Annotated[Number, Field(ge=-30, le=30)], ...], Fiel
 Cap = Annotated[Number, Field(gt=0, le=90)]
 Count = Annotated[int, Field(ge=1, le=100_000)]
 Seed = Annotated[int, Field(ge=0)]
+FieldOfView = Annotated[Number, Field(ge=1, le=90)]
 
 
 def levels_of(magnitudes: Sequence[float]) -> tuple[float, ...]:
@@ -59,10 +60,12 @@ class Board(Part):
 
 
 class PatchBoards(Part):
-    """3x3 LED boards on a cap of the surface: spread evenly, each with a pattern of its own, or by list.
+    """3x3 LED boards on a cap of the surface: spread evenly or on a grid, each with a pattern of its own, or by list.
 
     cap_deg : as far from the zenith as the dome carries LEDs, seen from the bearing; so for every layout
-    spacing, lit, pwm_levels : of boards spread evenly; `boards` takes their place
+    spacing, lit, pwm_levels : of boards that are spread; `boards` takes their place
+    spread  : along a spiral, as evenly as can be, or in rows and columns of the lab's x and y, seen from above;
+        on a dome of the apex's height all about, which sets how many a spiral has
     glue_scatter  : standard deviation of an LED's place along each axis of its board
     glue_tilt_deg : a board's normal is off the surface's by up to this, evenly over that cap
     """
@@ -71,6 +74,7 @@ class PatchBoards(Part):
     cap_deg: Cap
     spacing_m: Annotated[Length, Field(gt=0)] | None = None
     pitch_m: Annotated[Length, Field(gt=0)]
+    spread: Literal["spiral", "grid"] = "spiral"
     lit: tuple[int, int] = (4, 6)
     pwm_levels: Levels = (1.0,)
     boards: tuple[Board, ...] = ()
@@ -141,6 +145,28 @@ class RandomPlaces(Dimmed):
     count: Count
 
 
+class Optimised(Dimmed):
+    """So many LEDs where they make the worst attitude best: of all tilts to tilt_deg and any yaw, by one camera.
+
+    field_deg : the camera's field of view along body x and y
+    camera    : its entrance pupil on the body; it looks along body z
+    spacing   : no two LEDs are nearer to each other
+    alike     : LEDs of two fields coincide that are nearer when one is laid on the other: a few of the survey's errors
+    wanted    : LEDs that every field should hold; a field that has fewer counts as a worse one
+    rounds    : how often each LED is offered another place
+    """
+
+    kind: Literal["optimised"]
+    count: Annotated[int, Field(ge=3, le=2000)]
+    tilt_deg: Annotated[Number, Field(ge=0, le=60)]
+    field_deg: tuple[FieldOfView, FieldOfView]
+    camera_m: tuple[Length, Length, Length]
+    spacing_m: Annotated[Length, Field(gt=0)]
+    alike_m: Annotated[Length, Field(gt=0)] = 1e-3
+    wanted: Annotated[int, Field(ge=2, le=50)] = 5
+    rounds: Annotated[int, Field(ge=1, le=5000)] = 100
+
+
 class Celestial(Part):
     """The real sky: an LED for each of the brightest stars, where the camera at its nominal place sees it.
 
@@ -149,6 +175,7 @@ class Celestial(Part):
     zenith_ra_deg, zenith_dec_deg, roll_deg : what is overhead, and the position angle there of the lab's -y (a level
         camera's up), as `ra_deg`, `dec_deg`, `roll_deg` of a camera that looks up
     epoch  : whose apparent places they are, UTC
+    brightness : band, each LED is as bright as the chip finds its star, whose colour the LED lacks; v, as its V
     brightest_mag : no star is shown brighter than this, which is full brightness; the brightest star's if left out
     """
 
@@ -157,6 +184,7 @@ class Celestial(Part):
     catalogue: str = "hipparcos_hp6.5"
     count: Count | None = None
     limit_mag: Annotated[Number, Field(ge=-2, le=15)] | None = None
+    brightness: Literal["v", "band"] = "band"
     brightest_mag: Number | None = None
     camera_m: tuple[Length, Length, Length]
     zenith_ra_deg: Annotated[Number, Field(ge=0, lt=360)]
@@ -199,8 +227,73 @@ class Listed(Dimmed):
         return self
 
 
+Points = Annotated[
+    Fibonacci | PoissonDisc | RandomPlaces | Optimised | Celestial | Listed, Field(discriminator="kind")
+]
+
+
+class Fibres(Part):
+    """Ends of optical fibres through the shell (JHU/APL's dome), where any layout of single LEDs has its points.
+
+    radius_variation : the dome's radius is another at every fibre, by up to this share of the distance from the
+        bearing, evenly: the end stands off the surface along its normal, inwards or outwards
+    """
+
+    kind: Literal["fibres"]
+    points: Points
+    radius_variation: Annotated[Number, Field(ge=0, le=0.1)] = 0.0
+
+    @property
+    def cap_deg(self) -> float:
+        """As far from the zenith as there are points."""
+        return self.points.cap_deg
+
+
+class Pixels(Part):
+    """A display's grid and its greys: what a panel on the ceiling and a micro-display on a bench have alike.
+
+    pixels : columns and rows;  pitch : from a pixel to the next, along both
+    block  : a star is drawn as so many by so many pixels, all of one grey
+    grey_levels, gamma : grey g = 0, 1, ... lets (g / (grey_levels - 1))^gamma of white through
+    contrast : white over black, which glows all over the display; none: black is dark
+    """
+
+    pixels: tuple[Annotated[int, Field(ge=1, le=20_000)], Annotated[int, Field(ge=1, le=20_000)]]
+    pitch_m: Annotated[Length, Field(gt=0)]
+    block: Annotated[int, Field(ge=1)] = 1
+    grey_levels: Annotated[int, Field(ge=2, le=65536)] = 256
+    gamma: Annotated[Number, Field(gt=0, le=10)] = 2.2
+    contrast: Annotated[Number, Field(ge=2)] | None = None
+
+    @model_validator(mode="after")
+    def block_fits(self) -> Self:
+        if self.block > min(self.pixels):
+            raise ValueError(
+                f"block {self.block} is wider than the display; allowed: to {min(self.pixels)} pixels"
+            )
+        return self
+
+
+class Lcd(Pixels):
+    """A flat LCD panel (the Naval Postgraduate School's screen): any layout of single LEDs, drawn on its pixels.
+
+    It lies in the middle of the flat surface and ends where its pixels end, columns along the surface's own x, rows
+    along its y, which a level camera sees as right and down. `led` is one white pixel while its backlight is lit, its
+    disc_diameter that of a disc of its area.
+    """
+
+    kind: Literal["lcd"]
+    points: Points
+
+    @property
+    def cap_deg(self) -> float:
+        """As far from the zenith as there are points."""
+        return self.points.cap_deg
+
+
 Layout = Annotated[
-    PatchBoards | Fibonacci | PoissonDisc | RandomPlaces | Celestial | Listed, Field(discriminator="kind")
+    PatchBoards | Fibonacci | PoissonDisc | RandomPlaces | Optimised | Celestial | Listed | Fibres | Lcd,
+    Field(discriminator="kind"),
 ]
 
 
@@ -252,7 +345,15 @@ class Sequential(Part):
     controller: Literal["board", "dome"] | Annotated[int, Field(ge=1)] = "board"
 
 
-Drive = Annotated[Direct | Pwm | Sequential, Field(discriminator="kind")]
+class Refresh(Part):
+    """A panel's backlight, lit for `duty` of every frame: row after row from the top, in the course of a frame."""
+
+    kind: Literal["refresh"]
+    rate_hz: Annotated[Number, Field(gt=0)]
+    duty: Annotated[Number, Field(gt=0, le=1)] = 1.0
+
+
+Drive = Annotated[Direct | Pwm | Sequential | Refresh, Field(discriminator="kind")]
 
 
 class Led(Part):
@@ -263,7 +364,7 @@ class Led(Part):
 
     intensity_cd: Annotated[Intensity, Field(gt=0)] | None = None
     radiant_intensity_w_sr: Annotated[RadiantIntensity, Field(gt=0)] | None = None
-    disc_diameter_m: Annotated[Length, Field(gt=0)]
+    disc_diameter_m: Annotated[Length, Field(gt=0, le=0.1)]
     falloff: str = "inverse_square"
     lobe: Lobe = CosineLobe()
     spectrum: Literal["white"] | Annotated[Length, Field(ge=300e-9, le=1100e-9)] = "white"

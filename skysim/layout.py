@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from skysim import lamp, planetarium
-from skysim.led import DRIVES, Lamps
-from skysim.photometry import Band, led_strength_e_s_sr, radiant_strength_e_s_sr
+from skysim import display, lamp, optimise, planetarium
+from skysim.led import DRIVES, Lamps, full_e_s_sr
+from skysim.photometry import Band
 from skysim.planetarium import Inside
 from skysim.types import BadInput, Floats, Sources
 
@@ -63,10 +63,7 @@ def lit(spots: Spots, led: lamp.Led, band: Band, rng: np.random.Generator) -> So
     """
     count = len(spots.id)
     scatter = np.exp(led.scatter * rng.standard_normal(count))
-    if led.intensity_cd is not None:
-        strength = led_strength_e_s_sr(led.intensity_cd, led.spectrum, band) * scatter
-    else:
-        strength = radiant_strength_e_s_sr(led.radiant_intensity_w_sr or 0.0, led.spectrum, band) * scatter
+    strength = full_e_s_sr(led, band) * scatter
     pulses = DRIVES[led.drive.kind](led, Lamps(spots.level, spots.id // HOLES), rng)
     return Sources(
         id=spots.id,
@@ -125,7 +122,7 @@ def from_bearing(inside: Inside, directions: Floats) -> Floats:
     place_m = inside.meet(np.zeros(3), directions)
     if np.isnan(place_m).any():
         raise BadInput(
-            "light.layout: the surface ends within it; allowed: a smaller cap_deg (or list), or a rim farther out"
+            "light.layout: the surface ends within it; allowed: a smaller cap_deg, a rim farther out, or kind listed"
         )
     return place_m
 
@@ -159,14 +156,36 @@ def patch_boards(part: lamp.PatchBoards, inside: Inside, led: lamp.Led, band: Ba
 def spread_boards(
     part: lamp.PatchBoards, inside: Inside, rng: np.random.Generator
 ) -> tuple[Boards, list[Ints], None]:
-    """Boards evenly over the cap as seen from the bearing, each turned at random, and the holes that each uses."""
-    half = np.radians(part.cap_deg)
-    apex = from_bearing(inside, np.array([[0.0, 0.0, 1.0]]))[0, 2]
-    area_m2 = 2 * np.pi * apex**2 * (1 - np.cos(half))
-    count = max(1, round(area_m2 / (part.spacing_m or part.pitch_m) ** 2))
-    boards = tangent(inside, from_bearing(inside, cap(count, half)), rng.uniform(0, 2 * np.pi, count))
-    holes = [rng.permutation(HOLES)[: rng.integers(part.lit[0], part.lit[1] + 1)] for _ in range(count)]
+    """Boards all over the cap as seen from the bearing, and the holes that each uses.
+
+    Along a spiral each is turned at random; on a grid all lie along its rows.
+    """
+    half, spacing_m = np.radians(part.cap_deg), part.spacing_m or part.pitch_m
+    apex_m = from_bearing(inside, np.array([[0.0, 0.0, 1.0]]))[0, 2]
+    if part.spread == "grid":
+        directions = grid(spacing_m / apex_m, half)
+        turn = np.zeros(len(directions))
+    else:
+        area_m2 = 2 * np.pi * apex_m**2 * (1 - np.cos(half))
+        directions = cap(max(1, round(area_m2 / spacing_m**2)), half)
+        turn = rng.uniform(0, 2 * np.pi, len(directions))
+    boards = tangent(inside, from_bearing(inside, directions), turn)
+    holes = [rng.permutation(HOLES)[: rng.integers(part.lit[0], part.lit[1] + 1)] for _ in range(len(turn))]
     return boards, holes, None
+
+
+def grid(spacing_rad: float, half_angle_rad: float) -> Floats:
+    """(N, 3) unit vectors in rows and columns over a cap about +z, one of them there.
+
+    Equal steps on Lambert's equal-area map, on which a direction at t from the middle is 2 sin(t / 2) out.
+    """
+    steps = int(2 * np.sin(half_angle_rad / 2) / spacing_rad)
+    x, y = (one.ravel() * spacing_rad for one in np.meshgrid(*2 * [np.arange(-steps, steps + 1)]))
+    out2 = x**2 + y**2
+    within = out2 <= (2 * np.sin(half_angle_rad / 2)) ** 2
+    x, y, out2 = x[within], y[within], out2[within]
+    stretch = np.sqrt(1 - out2 / 4)
+    return np.column_stack([x * stretch, y * stretch, 1 - out2 / 2])
 
 
 def listed_boards(part: lamp.PatchBoards, inside: Inside) -> tuple[Boards, list[Ints], Floats]:
@@ -263,12 +282,25 @@ def apart(points_m: Floats, spacing_m: float) -> Ints:
     return np.array(taken, dtype=np.int64)
 
 
+def optimised(part: lamp.Optimised, inside: Inside, led: lamp.Led, band: Band) -> Sources:
+    """LEDs where a camera learns most of its worst attitude: see `optimise.places`.
+
+    No LED goes where no attitude looks. By the worst attitudes' mean it is not worse than Fibonacci's spiral is.
+    """
+    rng = np.random.default_rng(part.hardware_seed)
+    reach = optimise.reach_rad(part, inside)
+    sites = from_bearing(inside, scattered_cap(optimise.SITES_AN_LED * part.count, reach, rng))
+    spirals = [from_bearing(inside, cap(part.count, half)) for half in (np.radians(part.cap_deg), reach)]
+    place_m = optimise.places(part, sites, spirals, rng)
+    return lit(on_surface(inside, place_m, rng.choice(part.dimming, part.count)), led, band, rng)
+
+
 def celestial(part: lamp.Celestial, inside: Inside, led: lamp.Led, band: Band) -> Sources:
     """The real sky (JHU/APL's idea): an LED where the camera at its nominal place sees each of the brightest stars.
 
     Numbers are Hipparcos'. Where and how bright: `planetarium.projected`, `planetarium.levels`.
     """
-    stars = planetarium.projected(part, inside)
+    stars = planetarium.projected(part, inside, led, band)
     normal = inside.inward(stars.place_m)
     level = planetarium.levels(part, stars, normal, led)
     spots = Spots(stars.hip, stars.place_m, normal, level, stars.v_mag)
@@ -347,17 +379,33 @@ def numbers(path: Path, number: int, line: str, count: int, bright: str) -> list
     return row
 
 
+def fibres(part: lamp.Fibres, inside: Inside, led: lamp.Led, band: Band) -> Sources:
+    """Ends of fibres where another layout has its LEDs, but for the shell's radius: `display.standing_off`."""
+    return display.standing_off(part, LAYOUTS[part.points.kind](part.points, inside, led, band))
+
+
+def lcd(part: lamp.Lcd, inside: Inside, led: lamp.Led, band: Band) -> Sources:
+    """What another layout would light, drawn on the nearest pixels of a panel: `display.on_panel`."""
+    glass = display.glass(part, inside)
+    wanted = LAYOUTS[part.points.kind](part.points, glass, display.steady(led), band)
+    return display.on_panel(part, glass, led, band, wanted)
+
+
 # Each of (its part of the scene, the surface, the LEDs' kind, the chip's band) -> every LED.
 LAYOUTS: dict[str, Callable[[Any, Inside, lamp.Led, Band], Sources]] = {
     "patch_boards": patch_boards,
     "fibonacci": fibonacci,
     "poisson_disc": poisson_disc,
     "random": at_random,
+    "optimised": optimised,
     "celestial": celestial,
     "listed": listed,
+    "fibres": fibres,
+    "lcd": lcd,
 }
 
 
 def board_of(part: lamp.Layout, numbers: Ints) -> Ints | None:
-    """Which board each LED of these numbers sits on; None where the layout has no boards."""
-    return numbers // HOLES if isinstance(part, lamp.PatchBoards) else None
+    """Which board each LED of these numbers sits on; None where no two share a lattice: no boards, or one."""
+    board = numbers // HOLES
+    return board if isinstance(part, lamp.PatchBoards) and len(np.unique(board)) > 1 else None

@@ -12,7 +12,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from skysim.lamp import CosineLobe, Led, Lobe, LobeTable, Sequential
+from skysim.lamp import CosineLobe, Led, Lobe, LobeTable, Refresh, Sequential
+from skysim.photometry import Band, led_strength_e_s_sr, radiant_strength_e_s_sr
 from skysim.types import Floats
 
 Falloff = Callable[[Floats], Floats]
@@ -79,11 +80,24 @@ def irradiance_e_s_m2(
     )
 
 
+def full_e_s_sr(led: Led, band: Band) -> float:
+    """An LED at full brightness as the chip counts it: photo-electrons s^-1 sr^-1 along its normal."""
+    if led.intensity_cd is not None:
+        return float(led_strength_e_s_sr(led.intensity_cd, led.spectrum, band))
+    return float(radiant_strength_e_s_sr(led.radiant_intensity_w_sr or 0.0, led.spectrum, band))
+
+
 class Lamps(NamedTuple):
-    """What a drive has to make: level (N,), share of full brightness; board (N,), which board each LED sits on."""
+    """What a drive has to make, (N,) each.
+
+    level : share of full brightness
+    board : which board each LED sits on
+    row   : where each pixel's row is on its panel, from 0 at the top to below 1; 0 for LEDs
+    """
 
     level: Floats
     board: NDArray[np.int64]
+    row: Floats | float = 0.0
 
 
 class Pulses(NamedTuple):
@@ -131,9 +145,25 @@ def sequential(led: Led, lamps: Lamps, rng: np.random.Generator) -> Pulses:
     return Pulses(cycle_s[controller], start_s, lamps.level * part.slot_s, np.ones(count))
 
 
+def refresh(led: Led, lamps: Lamps, rng: np.random.Generator) -> Pulses:
+    """A panel's rows are lit one after another, once a frame: on for duty / rate, a row later by its share of 1 / rate.
+
+    A grey is in the strength, for the liquid crystal stays as it is. All pixels of a row shine together; the panel's
+    phase is random. Mean light is level * duty; over an exposure of (n + f) frames, n whole, it flickers by
+    sqrt(f (1 - f) - duty / 3) / (n + f) where duty <= f <= 1 - duty, and not at all where f = 0 (reference 1.3).
+    """
+    part, one = led.drive, np.ones(len(lamps.level))
+    assert isinstance(part, Refresh)
+    period_s = 1 / part.rate_hz
+    return Pulses(
+        one * period_s, one * (rng.random() + lamps.row) * period_s, one * part.duty * period_s, lamps.level
+    )
+
+
 # Each of (the LEDs' kind, what each LED has to be, the hardware's random stream) -> when it is lit and how strong.
 DRIVES: dict[str, Callable[[Led, Lamps, np.random.Generator], Pulses]] = {
     "direct": direct,
     "pwm": pwm,
     "sequential": sequential,
+    "refresh": refresh,
 }

@@ -14,6 +14,7 @@ from skysim.lamp import Led as Led
 from skysim.lamp import Lobe as Lobe
 from skysim.lamp import LobeTable as LobeTable
 from skysim.lamp import PatchBoards as PatchBoards
+from skysim.lamp import Pixels
 from skysim.quantity import (
     Ascending,
     Length,
@@ -34,7 +35,8 @@ class Surface(Part):
 
     offset   : the whole dome's displacement
     tilt_deg : about the lab's x, then about its y, through the surface's own centre (the origin of surveyed points)
-    error    : standard deviation of the lab's survey of it, along the normal
+    error    : standard deviation of the lab's survey of it, along the normal: one draw for all of it, for what its
+               points err each by itself averages out; `tracker.survey.seed` draws it
     """
 
     kind: Literal["sphere", "ellipsoid", "flat", "cylinder", "surveyed"]
@@ -179,12 +181,16 @@ AnySurface = Annotated[
 
 
 class Dome(Part):
-    """An LED dome as the light."""
+    """An LED dome as the light.
+
+    occlusion : whether the vehicle's parts and the dome's own wall hide LEDs
+    """
 
     kind: Literal["dome"]
     surface: AnySurface
     layout: Layout
     led: Led
+    occlusion: bool = True
 
     @model_validator(mode="after")
     def boards_have_controllers(self) -> Dome:
@@ -194,13 +200,53 @@ class Dome(Part):
             )
         return self
 
+    @model_validator(mode="after")
+    def panels_have_pixels(self) -> Dome:
+        panel, drive = self.layout.kind == "lcd", self.led.drive.kind
+        if panel and self.surface.kind != "flat":
+            raise ValueError(f"layout: an lcd is no {self.surface.kind}; allowed: surface of kind flat")
+        if panel and drive not in ("direct", "refresh"):
+            raise ValueError(f"led.drive: {drive} dims no pixel; allowed for an lcd: direct, refresh")
+        if not panel and drive == "refresh":
+            raise ValueError(f"led.drive: {self.layout.kind} has no rows; allowed: refresh for an lcd")
+        return self
+
 
 class Stars(Part):
-    """The real sky as the light."""
+    """The real sky as the light.
+
+    occlusion : whether the vehicle's parts hide stars
+    """
 
     kind: Literal["stars"]
     catalogue: str = "hipparcos_hp6.5"
     limit_mag: Annotated[Number, Field(ge=0, le=15)] = 6.5
+    occlusion: bool = True
+
+
+class Bench(Pixels):
+    """A star simulator: a micro-display in the focus of a collimator, which stands above the level camera.
+
+    Its axis is the lab's zenith, the display's columns run along the lab's x and its rows along y. Its exit covers
+    the lens wherever that moves to; what it does to colours and to the image is left out, and so is its refresh.
+
+    focal_length : of the collimator
+    catalogue, limit_mag : the stars shown, to this V, as they stand at the scene's start_time
+    axis_ra_deg, axis_dec_deg, roll_deg : what is in the display's middle, and the position angle there of the lab's
+        -y (a level camera's up), as `ra_deg`, `dec_deg`, `roll_deg` of a camera that looks up
+    brightest_mag : V that a white block has for the camera, in the Sun's colour; brighter stars are shown so
+    conjugate : as far from the bearing's centre the stars stand, by an error of collimation; none: at infinity
+    """
+
+    kind: Literal["bench"]
+    focal_length_m: Annotated[Length, Field(gt=0)]
+    catalogue: str = "hipparcos_hp6.5"
+    limit_mag: Annotated[Number, Field(ge=-2, le=15)] = 6.5
+    axis_ra_deg: Annotated[Number, Field(ge=0, lt=360)]
+    axis_dec_deg: Annotated[Number, Field(ge=-90, le=90)]
+    roll_deg: Number = 0.0
+    brightest_mag: Annotated[Number, Field(ge=-30, le=30)]
+    conjugate_m: Annotated[Length, Field(ge=10)] | None = None
 
 
 class UniformGlow(Part):

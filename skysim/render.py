@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numba
@@ -21,6 +22,8 @@ FEWEST, MOST = 9, 32_769  # poses of an exposure
 SHORT = 0.4  # strides up to which a path is one piece: 1e-4 of the peak
 STILL_PX = 1e-3  # an image that moves less stands still
 AT_ONCE = 1 << 20  # pixels of patches in one go, or as many as the frame has
+
+Hides = Callable[[Sources], NDArray[np.bool_]]  # which of N sources something stands before, (N,)
 
 
 class Window(NamedTuple):
@@ -74,6 +77,7 @@ def render(
     mount: Mount,
     window: Window,
     emitter: Emitter | None = None,
+    hides: Hides | None = None,
 ) -> Seen:
     """Add the mean photo-electrons of every source to the (H, W) image, in place; the truth of those that gave any.
 
@@ -86,6 +90,8 @@ def render(
     t_s = moments(window.open_s, window.close_s(rows), trajectory)
     during = poses(trajectory, mount, t_s)
     near = sources.take(in_view(sources, optics, Poses(*(part[:: len(t_s) // 8] for part in during))))
+    if hides:
+        near = near.take(~hides(near))
     paths, distance_m, cos_in = follow(near, optics, during, t_s, emitter or Emitter())
     middle_px = paths.xy_px[len(t_s) // 2]
     shapes = images(optics.camera, middle_px, near.radius_m, near.place[:, 3] > 0, distance_m, cos_in)

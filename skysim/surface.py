@@ -362,7 +362,7 @@ def surveyed(part: light.SurveyedSurface) -> Surface:
     if found.rms_m > part.rms_limit_m:
         raise BadInput(
             f"light.surface.file: {part.file}: the points lie {found.rms_m:.3g} m rms off a smooth surface"
-            f" (worst {found.worst_m:.3g} m); allowed: rms_limit {part.rms_limit_m:g} m, or a greater degree"
+            f" (worst {found.worst_m:.3g} m); allowed: rms_limit {part.rms_limit_m:g} m, a greater degree, another unit"
         )
     where = placed(part, 0.0)
     where["centre_m"] = part.offset_m + where["lab_from_own"].apply(found.centre_m)

@@ -185,6 +185,7 @@ class Truth:
     cam_from_lab  : the camera's attitude at mid-exposure
     rate_cam_rad_s: (3,) angular velocity in camera axes
     seen          : the sources on the frame
+    hidden        : (M,) ids of those that would be on it at mid-exposure, had something not stood in the way
     """
 
     t_s: float
@@ -192,6 +193,7 @@ class Truth:
     cam_from_lab: Rotation
     rate_cam_rad_s: Floats
     seen: Seen
+    hidden: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
 
 
 @dataclass(frozen=True, slots=True)
@@ -212,6 +214,7 @@ class Row:
     truth_deg, estimate_deg : (RA, Dec, roll) of the camera under the stars, (roll, pitch, yaw) of the vehicle
         under the dome
     wrong : solved, and more than ten arc-minutes off
+    cross_sigma_arcsec, roll_sigma_arcsec : what the tracker claims of its errors; log10_chance : of its matches
     filter : what the attitude filter made of it in flight; empty where there is none
     """
 
@@ -229,3 +232,6 @@ class Row:
     time_ms: float
     wrong: bool
     filter: str = ""
+    cross_sigma_arcsec: float = float("nan")
+    roll_sigma_arcsec: float = float("nan")
+    log10_chance: float = float("nan")

@@ -31,6 +31,7 @@ SKY = {
     "zenith_dec_deg": 5,
     "roll_deg": 25,
     "epoch": "2012-03-01T12:00:00",
+    "brightness": "v",
 }
 BAND = Band.of("cmos")
 SPREADS = [
@@ -38,6 +39,16 @@ SPREADS = [
     {"kind": "random", "count": 1400},
     {"kind": "poisson_disc", "spacing": "1.3 in"},
 ]
+
+
+GRID_BOARDS = {
+    "kind": "patch_boards",
+    "spread": "grid",
+    "spacing": "3 in",
+    "pitch": "8 mm",
+    "lit": [9, 9],
+    "cap_deg": 25,
+}
 
 
 def lit(layout: dict[str, Any], surface: dict[str, Any] = SPHERE, **led: Any) -> Sources:
@@ -172,6 +183,31 @@ def test_levels_are_drawn_from_the_list_and_magnitudes_by_pogson() -> None:
 def listed_boards(*boards: dict[str, Any], **more: Any) -> Sources:
     layout = {"kind": "patch_boards", "cap_deg": 40, "pitch": "8 mm", "boards": list(boards)}
     return lit(layout | more, MEASURED)
+
+
+def test_boards_on_a_grid_have_equal_areas_and_straight_rows() -> None:
+    """On a sphere about the bearing: as many as spacings squared go into the cap, and a row's middles in one plane."""
+    made = layout.grid(0.04, np.radians(40))
+    area_sr = 2 * np.pi * (1 - np.cos(np.radians(40)))
+    # Gauss's circle: the count is wrong by its boundary's lattice points at the most, 2 sqrt(2) pi (radius + 1).
+    radius = 2 * np.sin(np.radians(20)) / 0.04
+    assert abs(len(made) - area_sr / 0.04**2) < 2 * np.sqrt(2) * np.pi * (radius + 1)
+    row = made[np.abs(made[:, 1]) < 1e-12]
+    # Equal steps of 2 sin(t / 2) along the row through the zenith.
+    out = np.sort(np.sign(row[:, 0]) * 2 * np.sin(np.arccos(np.clip(row[:, 2], -1, 1)) / 2))
+    np.testing.assert_allclose(
+        np.diff(out), 0.04, rtol=0, atol=1e-9
+    )  # the arc cosine's rounding at the zenith
+    np.testing.assert_allclose(np.linalg.norm(made, axis=1), 1, rtol=0, atol=1e-15)
+
+
+def test_grid_boards_lie_along_their_rows() -> None:
+    leds = lit(GRID_BOARDS)
+    place = leds.place[np.argsort(leds.id), :3].reshape(-1, layout.HOLES, 3)
+    step_m = place[:, 1] - place[:, 0]
+    # Holes 0 and 1 are neighbours along the board's first axis, which has no part along the lab's x.
+    np.testing.assert_allclose(np.linalg.norm(step_m, axis=1), 0.008, rtol=0, atol=1e-15)
+    np.testing.assert_allclose(step_m[:, 0], 0, rtol=0, atol=1e-15)
 
 
 def test_boards_stand_where_the_list_says_with_their_leds_and_levels() -> None:
