@@ -14,11 +14,14 @@ from estimator import BadImage
 from skysim import BadInput
 from skysim.terminal import (
     begun,
+    complain,
+    draw,
     number,
     print_answers,
     print_catalogue,
     print_rows,
     print_summary,
+    print_survey,
     print_table,
     progress,
     watched,
@@ -27,8 +30,11 @@ from skysim.terminal import (
 
 if TYPE_CHECKING:
     from skysim.scene import Scene
-    from skysim.simulate import Lab
     from skysim.types import Row
+
+LOADED: list[
+    tuple[str, dict[str, str]]
+] = []  # the scene at hand: its name, and what the command line overrides
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -50,15 +56,13 @@ Out = Annotated[Path | None, typer.Option(help="Folder for what is written; out/
 Sets = Annotated[list[str] | None, typer.Option("--set", help="Override a key: camera.detector.bits=8.")]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON for machines instead of a table.")]
 
-FILM_FRAMES = 60
-
 
 def main() -> None:
     """Run the command; whatever the user got wrong ends as one line and exit code 2."""
     try:
         code = app(standalone_mode=False)
     except (BadInput, BadImage) as error:
-        code = complain(str(error))
+        code = complain(located(str(error)))
     except OSError as error:
         code = complain(f"{error.filename}: {error.strerror}" if error.filename else str(error))
     except (MemoryError, OverflowError) as error:
@@ -75,10 +79,13 @@ def main() -> None:
     sys.exit(code if isinstance(code, int) else 0)
 
 
-def complain(message: str, code: int = 2) -> int:
-    """One line to stderr and the exit code that goes with it."""
-    print(f"skysim: {message}", file=sys.stderr)
-    return code
+def located(message: str) -> str:
+    """A complaint of a key that only made sense too late, with the file and line of the scene where it stands."""
+    if not LOADED:
+        return message
+    from skysim.scene import where
+
+    return where(message, *LOADED[-1])
 
 
 @app.command()
@@ -94,11 +101,14 @@ def run(
     json: Json = False,
 ) -> None:
     """Fly a scene, photograph it, solve every frame and score the answers."""
-    from skysim import flightlog, io, report, score, simulate
+    from skysim import doubts, flightlog, io, report, score, simulate
 
     loaded = load(scene, frames, seed, set_)
+    lab = simulate.furnish(loaded)
+    for doubt in doubts.doubts(loaded, lab.sources, lab.mount):
+        complain(doubt)
     with watched("flying") as watch:
-        lab = simulate.prepare(loaded, watch)
+        lab = simulate.fly(lab, watch)
     estimator = simulate.tracker(lab)
     shots = begun(simulate.run(lab, estimator))
     folder = fresh(out or Path("out") / loaded.name)
@@ -192,6 +202,44 @@ def solve(
         complain(fault)
     if faults:
         raise typer.Exit(2)
+
+
+@app.command()
+def survey(
+    scene: SceneArg,
+    frames: Annotated[int, typer.Option(min=2, help="How many stops; a frame at each.")] = 300,
+    seed: Seed = None,
+    out: Out = None,
+    set_: Sets = None,
+    tilt: Annotated[float, typer.Option(help="Stops lean up to so many degrees, to any side.")] = 25.0,
+    imu_sigma: Annotated[str, typer.Option(help="Error of the IMU's attitude about each axis.")] = "0.5 deg",
+    led_sigma: Annotated[str, typer.Option(help="Of an LED's believed place along each axis.")] = "2 mm",
+    lever_sigma: Annotated[str, typer.Option(help="Error of the camera's believed place.")] = "5 mm",
+    focal_error: Annotated[str, typer.Option(help="Of the believed focal length.")] = "1%",
+    distortion: Annotated[bool, typer.Option("--distortion", help="Fit k1, k2, p1, p2 too.")] = False,
+    checks: Annotated[int, typer.Option(min=1, help="New stops where the attitude is compared.")] = 40,
+    json: Json = False,
+) -> None:
+    """Measure a dome from frames at many attitudes: LEDs, lever and lens, in a file for `tracker.map`."""
+    from skysim import io, measure, measured, onboard, simulate
+
+    doubt = measure.doubt(imu_sigma, led_sigma, lever_sigma, focal_error)
+    lab = simulate.furnish(measure.doubted(load(scene, None, seed, set_), doubt))
+    belief = measure.belief_of(lab)
+    before = simulate.tracker(lab)
+    looks = list(progress(measure.looks(lab, belief, doubt, frames, tilt), frames, "photographing"))
+    with watched("adjusting") as watch:
+        found = measure.surveyed(looks, belief, doubt, distortion, watch)
+    folder = io.make_folder(out or Path("out") / lab.scene.name)
+    path, picture = folder / "leds.ecsv", folder / "survey.png"
+    io.write_dome_map(path, measure.dome_map(found, doubt))
+    io.write_image(picture, measured.figure(measured.misplaced(found, belief, lab)))
+    after = onboard.tracker(measure.with_map(lab.scene, str(path)), lab.mount, lab.sources)
+    stops = measure.frames(lab, measure.attitudes(lab.scene, "checks", checks, tilt), frames)
+    errors = measured.checked({"before": before, "after": after}, progress(stops, checks, "comparing"))
+    figures = measured.figures(found, belief, lab, doubt) | errors
+    figures |= {"scene": lab.scene.name, "frames": frames, "map": str(path), "picture": str(picture)}
+    print(io.to_json(figures)) if json else print_survey(figures)
 
 
 @scenes_app.callback()
@@ -318,26 +366,8 @@ def load(name: str, frames: int | None, seed: int | None, sets: list[str] | None
         overrides["exposure.frames"] = str(frames)
     if seed is not None:
         overrides["seed"] = str(seed)
+    LOADED.append((name, overrides))
     return load_scene(name, overrides)
-
-
-def draw(lab: Lab, folder: Path) -> list[Path]:
-    """The laboratory as a picture and as a film; without OpenGL a word about it, and the run goes on."""
-    from skysim import io, simulate
-    from skysim.world import picture
-
-    mjcf, joints = simulate.staged(lab), lab.log.joints
-    still, film = folder / "lab.png", folder / "lab.gif"
-    steps = max(len(joints) // FILM_FRAMES, 1)
-    moments = joints[::steps]
-    try:
-        io.write_image(still, picture.picture(mjcf, joints[len(joints) // 2])[:, :, ::-1])
-        shown = progress(picture.film(mjcf, moments), len(moments), "filming")
-        picture.write_film(shown, film, len(moments) / float(lab.log.t_s[-1] + 1e-9))
-    except picture.NoPicture as error:
-        complain(str(error))
-        return []
-    return [still, film]
 
 
 def fresh(folder: Path) -> Path:

@@ -4,44 +4,105 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from estimator import catalog
+from estimator import calibrate, catalog
 from estimator.attitude import SOLVERS
+from estimator.calibrate import DomeFrame, Survey
 from estimator.camera import Camera
 from estimator.centroid import CENTROIDERS
 from estimator.detect import DETECTORS
+from estimator.dometracker import IDENTIFIERS as NEAR_IDENTIFIERS
+from estimator.dometracker import DomeTracker
 from estimator.filter import GyroModel, Mekf
 from estimator.identify import IDENTIFIERS
 from estimator.nearfield import SOLVERS as NEAR_SOLVERS
 from estimator.nearfield import LedMap, Lever
-from estimator.tracker import DomeTracker, Report, Settings, StarTracker
+from estimator.tracker import Clock, Report, Settings, StarTracker, see
 from estimator.types import Attitude, BadImage, Centroids
-from skysim import dome, imu, quaternion
+from skysim import display, dome, imu, io, quaternion, survey
 from skysim.camera import Camera as CameraPart
 from skysim.detector import saturation_dn
 from skysim.quantity import ARCSEC_RAD, one_of
-from skysim.scene import CATALOGUES, Dome, Filter, Scene
+from skysim.scene import CATALOGUES, Bench, Dome, Filter, Scene
 from skysim.types import BadInput, Floats, Frame, Mount, Sources
 
 Estimator = StarTracker | DomeTracker
 
 
 def tracker(scene: Scene, mount: Mount, sources: Sources) -> Estimator:
-    """The star tracker with what it believes of the hardware: the scene's `tracker` section, else the truth."""
-    believed = scene.tracker
+    """The star tracker with what it believes of the hardware: the scene's `tracker` section, else the truth.
+
+    Raises BadInput for a dome that no tracker can work under.
+    """
     camera, settings = believed_camera(scene), believed_settings(scene)
     if isinstance(scene.light, Dome):
-        centre_m, semi_axes_m = dome.surface(scene.light.surface).as_ellipsoid()
-        board = dome.board_of(scene.light.layout, sources.id)
-        leds = LedMap(sources.id, sources.place[:, :3], centre_m, semi_axes_m, board)
-        arm = believed.believed_camera_body_m or mount.camera_body_m
-        return DomeTracker(camera, leds, Lever(np.array(arm), mount.cam_from_body), settings)
+        leds, lever = believed_dome(scene, scene.light, sources), believed_lever(scene, mount)
+        if scene.tracker.map:
+            camera, leds, lever = surveyed_dome(scene, scene.tracker.map, leds, lever)
+        try:
+            return DomeTracker(camera, leds, lever, settings)
+        except BadImage as error:
+            raise BadInput(f"light: the star tracker cannot work under this dome: {error}") from None
     stars = catalog.read(CATALOGUES / f"{scene.light.catalogue}.ecsv")
-    stars = catalog.brighter(stars, believed.limit_mag)
-    return StarTracker(camera, stars, catalog.apparent(stars, catalog.on_earth(scene.start_time)), settings)
+    stars = catalog.brighter(stars, scene.tracker.limit_mag)
+    directions = catalog.apparent(stars, catalog.on_earth(scene.start_time))
+    if isinstance(scene.light, Bench):
+        # Where the bench has its display decides where the stars are in the lab.
+        directions = display.lab_from_icrs(scene.light).apply(directions)
+    return StarTracker(camera, stars, directions, settings)
+
+
+def believed_dome(scene: Scene, light: Dome, sources: Sources) -> LedMap:
+    """The dome on the tracker's map: the true one, and the errors of its survey."""
+    inside, told = dome.surface(light.surface), scene.tracker.survey
+    place_m = survey.believed_leds_m(inside, sources.place[:, :3], told.led_sigma_m, told.seed)
+    board = dome.board_of(light.layout, sources.id)
+    ellipsoid = survey.believed_ellipsoid(inside, told.seed)
+    return LedMap(sources.id, place_m, *ellipsoid, board, told.led_sigma_m)
+
+
+def believed_lever(scene: Scene, mount: Mount) -> Lever:
+    """The camera's place on the vehicle as it was told, else as it was surveyed; its attitude is known."""
+    told = scene.tracker.survey
+    arm_m = scene.tracker.believed_camera_body_m or survey.believed_m(
+        mount.camera_body_m, told.lever_sigma_m, told.seed, "lever"
+    )
+    return Lever(np.array(arm_m), mount.cam_from_body, told.lever_sigma_m)
+
+
+def surveyed_dome(scene: Scene, path: str, leds: LedMap, lever: Lever) -> tuple[Camera, LedMap, Lever]:
+    """Camera, LEDs and lever from the file of a survey; surface and boards as they are believed without it.
+
+    One sigma stands for all LEDs, the median of the file's. Raises BadInput for a file that is of another dome.
+    """
+    told = io.read_dome_map(Path(path))
+    size_px = (scene.camera.width_px, scene.camera.height_px)
+    if told.size_px != size_px:
+        raise BadInput(
+            f"tracker.map: {path}: is of a camera of {told.size_px} px; allowed: this one's, {size_px} px"
+        )
+    order = np.argsort(leds.id)
+    row = order[np.minimum(np.searchsorted(leds.id, told.id, sorter=order), len(order) - 1)]
+    strange = told.id[leds.id[row] != told.id]
+    if len(strange):
+        raise BadInput(f"tracker.map: {path}: LED {strange[0]} is none of this dome's {len(order)}")
+    board = None if leds.board is None else leds.board[row]
+    placed = replace(
+        leds, id=told.id, position_m=told.position_m, board=board, sigma_m=float(np.median(told.sigma_m))
+    )
+    camera = replace(
+        calibration(scene.camera),
+        focal_px=told.focal_px,
+        centre_px=told.centre_px,
+        distortion=told.distortion,
+    )
+    return camera, placed, Lever(told.camera_body_m, lever.cam_from_body, told.lever_sigma_m)
 
 
 def believed_camera(scene: Scene) -> Camera:
@@ -62,8 +123,16 @@ def believed_settings(scene: Scene) -> Settings:
     return Settings(
         detector=known("detector", part.detector, DETECTORS),
         centroider=known("centroider", part.centroider, CENTROIDERS),
-        identifier=known("identifier", part.identifier, IDENTIFIERS),
-        solver=known("solver", part.solver, NEAR_SOLVERS if near else SOLVERS),
+        identifier=known(
+            "identifier",
+            part.identifier or ("led_pairs" if near else "default"),
+            NEAR_IDENTIFIERS if near else IDENTIFIERS,
+        ),
+        solver=known(
+            "solver",
+            part.solver or ("rotation_only" if near else "quest"),
+            NEAR_SOLVERS if near else SOLVERS,
+        ),
         threshold_sigma=part.threshold_sigma,
         min_area_px=part.min_area_px,
         gain_e_dn=scene.camera.detector.gain_e_dn,
@@ -86,6 +155,43 @@ def answer(estimator: Estimator, frame: Frame) -> Report:
         return estimator.solve(frame.image_dn)
     except BadImage as error:
         return Report(Attitude(str(error)), Centroids.none())
+
+
+def lights(settings: Settings, camera: Camera, frame: Frame) -> Centroids:
+    """The lights of a frame, unnamed; none of a frame that the tracker would not look at."""
+    try:
+        return see(frame.image_dn, camera, settings, Clock())
+    except BadImage:
+        return Centroids.none()
+
+
+def sighting(
+    seen: Centroids,
+    light: NDArray[np.int64],
+    led: NDArray[np.int64],
+    body_from_lab: Rotation,
+    floor_px: float,
+) -> DomeFrame:
+    """A frame of a survey: the rows of its lights that have a name, and the rows of the LEDs that they are."""
+    sigma_px = np.hypot(seen.sigma_px[light], floor_px)
+    return DomeFrame(led, seen.xy_px[light], sigma_px, body_from_lab)
+
+
+def surveyed(
+    frames: list[DomeFrame],
+    leds: LedMap,
+    lever: Lever,
+    camera: Camera,
+    led_sigma_m: float,
+    fit_distortion: bool,
+) -> Survey:
+    """`calibrate.survey`, robust against wrong names, with the map before it as a measurement. Raises BadInput."""
+    try:
+        return calibrate.survey(
+            frames, leds, lever, camera, None, fit_distortion, loss="cauchy", leds_sigma_m=led_sigma_m
+        )
+    except ValueError as error:
+        raise BadInput(str(error)) from None
 
 
 class Navigation:

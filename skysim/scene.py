@@ -7,6 +7,7 @@ other schema.
 from __future__ import annotations
 
 import datetime
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -14,7 +15,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, Field, ValidationError, model_validator
 
 from skysim.camera import Camera, over, with_preset
-from skysim.light import Dome, Glow, Stars
+from skysim.light import Bench, Dome, Glow, Stars
 from skysim.motion import Motion, Pointing
 from skysim.quantity import DATA, ROOT, Length, NotNegative, Number, Part, Positive, Time
 from skysim.types import BadInput
@@ -33,6 +34,13 @@ def in_our_time(value: datetime.datetime) -> datetime.datetime:
     return value
 
 
+def a_file(value: str) -> str:
+    """A path that is there."""
+    if not Path(value).is_file():
+        raise ValueError(f"{value!r} is no file; allowed: one beside the scene, or a path")
+    return value
+
+
 class Exposure(Part):
     """When the shutter opens."""
 
@@ -48,19 +56,59 @@ class Exposure(Part):
         return self
 
 
+class Survey(Part):
+    """How well the lab knows what it built. Drawn once, from a seed of its own; `light.surface.error` from it too.
+
+    led_sigma   : standard deviation of every LED's believed place, about each axis of the lab
+    lever_sigma : of the camera's believed place, about each axis of the body
+    """
+
+    led_sigma_m: Annotated[Length, Field(ge=0, le=0.1)] = 0.0
+    lever_sigma_m: Annotated[Length, Field(ge=0, le=0.1)] = 0.0
+    seed: Annotated[int, Field(ge=0)] = 0
+
+
 class Tracker(Part):
-    """What the star tracker's computer does and believes. `null` believes what the hardware is."""
+    """What the star tracker's computer does and believes. `null` believes what the hardware is.
+
+    map : a file that `skysim survey` wrote: LEDs, lever, focal length and distortion as measured
+    identifier, solver : the best for the light if left out: led_pairs and rotation_only under a dome, else default
+        and quest
+    """
 
     detector: str = "local"
     centroider: str = "cog"
-    identifier: str = "pyramid"
-    solver: str = "quest"
+    identifier: str | None = None
+    solver: str | None = None
     threshold_sigma: Annotated[Number, Field(gt=0)] = 5.0
     min_area_px: Annotated[int, Field(ge=1)] = 3
     limit_mag: Number = 6.0
     centroid_sigma_px: Annotated[Number, Field(gt=0)] = 0.2
     believed_focal_length_m: Annotated[Length, Field(gt=0)] | None = None
     believed_camera_body_m: tuple[Length, Length, Length] | None = None
+    survey: Survey = Survey()
+    map: Annotated[str, AfterValidator(a_file)] | None = None
+
+    @model_validator(mode="after")
+    def one_lever(self) -> Tracker:
+        if self.believed_camera_body_m is not None and self.survey.lever_sigma_m:
+            raise ValueError(
+                "survey.lever_sigma: believed_camera_body tells the place; allowed: one of the two"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def one_map(self) -> Tracker:
+        told = {
+            "believed_focal_length": self.believed_focal_length_m,
+            "believed_camera_body": self.believed_camera_body_m,
+            "survey.led_sigma": self.survey.led_sigma_m,
+            "survey.lever_sigma": self.survey.lever_sigma_m,
+        }
+        beside = [key for key, value in told.items() if value]
+        if self.map and beside:
+            raise ValueError(f"{beside[0]}: the file of tracker.map tells it; allowed: one of the two")
+        return self
 
 
 class Filter(Part):
@@ -97,7 +145,7 @@ class Scene(Part):
     lab: Site = Site()
     vehicle: Vehicle
     motion: Motion
-    light: Annotated[Dome | Stars, Field(discriminator="kind")]
+    light: Annotated[Dome | Stars | Bench, Field(discriminator="kind")]
     background: tuple[Glow, ...] = ()
     camera: Camera
     exposure: Exposure
@@ -108,6 +156,12 @@ class Scene(Part):
     @model_validator(mode="after")
     def one_world(self) -> Scene:
         sky = self.light.kind == "stars"
+        told = self.tracker
+        if not isinstance(self.light, Dome) and (told.survey != Survey() or told.map):
+            key = "map" if told.map else "survey"
+            raise ValueError(
+                f"tracker.{key}: light of kind {self.light.kind} has nothing to survey; allowed: dome"
+            )
         if sky != isinstance(self.motion.start, Pointing):
             wanted = "ra_deg, dec_deg, roll_deg" if sky else "roll_deg, pitch_deg, yaw_deg"
             raise ValueError(f"motion.start: light of kind {self.light.kind} takes {wanted}")
@@ -199,6 +253,19 @@ def load(name: str | Path, overrides: Mapping[str, str] | None = None) -> Scene:
         raise BadInput(explain(error, Scene, tree, files, overrides or {})) from None
 
 
+def where(message: str, name: str, overrides: Mapping[str, str]) -> str:
+    """A complaint that begins with a key of a scene, and where that stands; any other as it is."""
+    key = message.partition(":")[0]
+    told = re.fullmatch(r"[a-z_]+(\.\w+)*", key)
+    if (
+        not told
+        or key.partition(".")[0] not in Scene.model_fields
+        or re.search(r"\((--set|.*, line \d+)\)$", message)
+    ):
+        return message
+    return f"{message} {place_of(key.split('.'), read(find(name))[1], overrides)}"
+
+
 def read(path: Path, above: tuple[Path, ...] = ()) -> tuple[dict[str, Any], Files]:
     """A scene's keys over those of its `base`, another scene by name or path; and the files, this one first."""
     tree, text = read_yaml(path)
@@ -231,6 +298,8 @@ FILES = (
     ("camera", "psf", "file"),
     ("light", "surface", "file"),
     ("light", "layout", "file"),
+    ("light", "layout", "points", "file"),
+    ("tracker", "map"),
 )
 
 

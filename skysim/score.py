@@ -35,12 +35,17 @@ def angles_deg(cam_from_lab: Rotation, scene: Scene, mount: Mount) -> tuple[floa
 def row(shot: Shot, scene: Scene, mount: Mount, verdict: str = "") -> Row:
     """One frame of a run as people read it; verdict is what the attitude filter made of it."""
     truth, answer = shot.truth, shot.report.attitude
-    cross = roll = float("nan")
+    cross = roll = cross_sigma = roll_sigma = chance = float("nan")
     estimate, wrong = None, False
     if answer.cam_from_ref is not None:
         cross, roll = metrics.cross_and_roll_rad(answer.cam_from_ref, truth.cam_from_lab)
         estimate = angles_deg(answer.cam_from_ref, scene, mount)
         wrong = metrics.is_wrong(answer.cam_from_ref, truth.cam_from_lab)
+        variance = (
+            np.diag(answer.covariance_rad2) if answer.covariance_rad2 is not None else np.full(3, np.nan)
+        )
+        cross_sigma, roll_sigma = float(np.sqrt(variance[:2].sum())), float(np.sqrt(variance[2]))
+        chance = answer.match.log10_chance if answer.match else chance
     return Row(
         frame=shot.frame.index,
         t_s=truth.t_s,
@@ -50,6 +55,9 @@ def row(shot: Shot, scene: Scene, mount: Mount, verdict: str = "") -> Row:
         estimate_deg=estimate,
         cross_arcsec=cross / ARCSEC_RAD,
         roll_arcsec=roll / ARCSEC_RAD,
+        cross_sigma_arcsec=cross_sigma / ARCSEC_RAD,
+        roll_sigma_arcsec=roll_sigma / ARCSEC_RAD,
+        log10_chance=chance,
         detected=len(shot.report.centroids),
         matched=len(answer.match.observed) if answer.match else 0,
         rms_px=answer.rms_px,
@@ -73,6 +81,9 @@ def table(rows: list[Row], names: tuple[str, str, str]) -> Any:
     for name in (
         "cross_arcsec",
         "roll_arcsec",
+        "cross_sigma_arcsec",
+        "roll_sigma_arcsec",
+        "log10_chance",
         "detected",
         "matched",
         "rms_px",

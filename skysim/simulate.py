@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from estimator.tracker import Clock, Report
-from skysim import background, catalogue, dome, imu, manoeuvre, onboard, sky, world
+from skysim import background, catalogue, display, dome, imu, manoeuvre, onboard, sky, world
 from skysim.camera import RollingShutter
 from skysim.detector import Chip, expose, judge, saturation_dn, smear
 from skysim.disturbance import Room
@@ -20,9 +21,10 @@ from skysim.led import Emitter
 from skysim.optics import Optics
 from skysim.photometry import Band
 from skysim.pilot import Now, Pilot
+from skysim.planetarium import known_catalogue
 from skysim.psf import EXTENT
-from skysim.render import Window, render
-from skysim.scene import CATALOGUES, Dome, Pointing, Scene
+from skysim.render import Poses, Window, in_view, look, render
+from skysim.scene import Bench, Dome, Pointing, Scene
 from skysim.telemetry import Diary
 from skysim.types import BadInput, Floats, Frame, Mount, Sources, Telemetry, Trajectory, Truth
 from skysim.world import stage
@@ -46,6 +48,7 @@ class Lab:
     canvas    : (H, W) where the light of one frame after another is drawn; float64 where noise is off, for such a
                 frame is the truth to many digits, and float32 otherwise
     trajectory: the flight, jitter and all; telemetry: what the vehicle's computers did in it
+    obstacles : what can hide a light; None where the scene has light.occlusion off
     record    : what the IMU put out, every sample of it; None where there is none
     reports   : the star tracker's answers to the frames that were taken and solved in flight, for the filter
     verdicts  : what the filter made of each
@@ -61,6 +64,7 @@ class Lab:
     band: Band
     canvas: NDArray[Any]
     trajectory: Trajectory
+    obstacles: world.Obstacles | None = None
     telemetry: Telemetry | None = None
     record: imu.Increments | None = None
     reports: dict[int, Report] = field(default_factory=dict)
@@ -118,7 +122,15 @@ def furnish(scene: Scene) -> Lab:
         band,
         np.empty((scene.camera.height_px, scene.camera.width_px), kind),
         Trajectory(np.array([0.0, 1.0]), Rotation.concatenate([start, start]), np.zeros((2, 3))),
+        obstacles(scene, ship),
     )
+
+
+def obstacles(scene: Scene, ship: world.World) -> world.Obstacles | None:
+    """What can hide a light from the camera, if the scene would have it so; a bench has nothing in its beam."""
+    if not getattr(scene.light, "occlusion", False):
+        return None
+    return world.obstacles(ship, dome.surface(scene.light.surface) if isinstance(scene.light, Dome) else None)
 
 
 def staged(lab: Lab) -> str:
@@ -268,12 +280,9 @@ def lights(scene: Scene, band: Band) -> Sources:
     """Everything that shines, as the band sees it."""
     if isinstance(scene.light, Dome):
         return dome.sources(scene.light, band)
-    if not (CATALOGUES / f"{scene.light.catalogue}.ecsv").is_file():
-        known = ", ".join(sorted(path.stem for path in CATALOGUES.glob("hipparcos*.ecsv")))
-        raise BadInput(
-            f"light.catalogue: {scene.light.catalogue!r} is none of {known}; see skysim catalog build"
-        )
-    stars = catalogue.read(scene.light.catalogue)
+    stars = catalogue.read(known_catalogue("light.catalogue", scene.light.catalogue))
+    if isinstance(scene.light, Bench):
+        return display.bench(scene.light, stars, scene.start_time, band)
     return sky.sources(stars, scene.start_time, scene.light.limit_mag, Rotation.identity(), band)
 
 
@@ -296,15 +305,33 @@ def shoot(lab: Lab, index: int, clock: Clock | None = None) -> tuple[Frame, Trut
     light_e = lab.canvas
     glow = background.glow_map(scene.background, lab.optics, cam_from_lab, lab.band)
     background.fill(light_e, glow, when.exposure_s)
-    seen = render(light_e, lab.sources, lab.optics, lab.trajectory, lab.mount, when, lab.emitter)
+    camera_m = lab_from_body.apply(lab.mount.camera_body_m)
+    black = display.black_glow(scene.light, lab.optics, cam_from_lab, camera_m, lab.band)
+    if black is not None:
+        light_e += black * when.exposure_s
+    hides = partial(world.hidden, lab.obstacles, lab_from_body) if lab.obstacles else None
+    seen = render(light_e, lab.sources, lab.optics, lab.trajectory, lab.mount, when, lab.emitter, hides)
     smear(light_e, when.exposure_s, lab.chip.shutter)
     seen = judge(seen, light_e, when.exposure_s, lab.chip)
     clock.lap("render")
     image = expose(light_e, when.exposure_s, lab.chip, rng(scene.seed, "detector", index))
     clock.lap("detector")
     rate_cam = lab.mount.cam_from_body.apply(lab.trajectory.rate_at(middle_s))
-    truth = Truth(middle_s, lab_from_body, cam_from_lab, rate_cam, seen)
+    truth = Truth(middle_s, lab_from_body, cam_from_lab, rate_cam, seen, behind_things(lab, lab_from_body))
     return Frame(index, image, middle_s, when.exposure_s, saturation_dn(camera.detector)), truth
+
+
+def behind_things(lab: Lab, lab_from_body: Rotation) -> NDArray[np.int64]:
+    """(M,) ids of the sources that would be on the chip at that attitude, had something not stood in the way."""
+    if lab.obstacles is None:
+        return np.zeros(0, np.int64)
+    cam_from_lab = (lab.mount.cam_from_body * lab_from_body.inv()).as_matrix()
+    here = Poses(cam_from_lab[None], lab_from_body.apply(lab.mount.camera_body_m)[None])
+    near = lab.sources.take(in_view(lab.sources, lab.optics, here))
+    xy_px = look(near, lab.optics, here)[0][0]
+    size_px = np.array([lab.scene.camera.width_px, lab.scene.camera.height_px])
+    on_chip = ((xy_px > -0.5) & (xy_px < size_px - 0.5)).all(axis=1)
+    return near.id[on_chip & world.hidden(lab.obstacles, lab_from_body, near)]
 
 
 def tracker(lab: Lab) -> onboard.Estimator:

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import itertools
+import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 if TYPE_CHECKING:
+    from skysim.simulate import Lab
     from skysim.types import Row
 
 T = TypeVar("T")
+FILM_FRAMES = 60
+SURVEY = ("believed", "found", "sigma", "truth")
 
 
 def begun(items: Iterable[T]) -> Iterator[T]:
@@ -129,6 +133,31 @@ def print_summary(figures: dict[str, Any]) -> None:
     print(f"report: {figures['report']}")
 
 
+def print_survey(figures: dict[str, Any]) -> None:
+    lines = [
+        [row["what"], *(f"{row[key]:.5g}" if row["what"][0] in "kp" else f"{row[key]:.3f}" for key in SURVEY)]
+        for row in figures["values"]
+        if row["sigma"]
+    ]
+    print_table("", ["what", *SURVEY], lines)
+    print(
+        f"\n{figures['surveyed']} of {figures['leds']} LEDs surveyed in {figures['tied']} of {figures['frames']} "
+        f"frames, {figures['renamed']} under a neighbour's name; {figures['status']}, {figures['outliers']} outliers, "
+        f"{figures['rms_px']:.2g} px rms, misfit {figures['misfit']:.2g}\n"
+        f"LEDs: sigma median {figures['led_sigma_mm_median']:.2g} mm worst {figures['led_sigma_mm_worst']:.2g} mm; "
+        f"off the truth by {figures['led_mm_before']:.2g} mm rms before, {figures['led_mm_after']:.2g} mm after"
+    )
+    for when in ("before", "after"):
+        told = figures[when]
+        errors = [
+            f"{name} median {told[f'{name}_deg_median']:.2g}° worst {told[f'{name}_deg_worst']:.2g}°"
+            for name in ("cross", "roll")
+            if told["solved"]
+        ]
+        print(f"{when}: " + ", ".join([f"{told['solved']} of {told['stops']} new stops solved", *errors]))
+    print(f"{figures['map']}: for tracker.map; errors drawn in {figures['picture']}")
+
+
 def print_answers(answers: list[dict[str, Any]], out: Path) -> None:
     heads = ["file", "status", "RA °", "Dec °", "roll °", "fov °", "stars", "rms ″", "ms"]
     lines = [
@@ -164,3 +193,28 @@ def number(value: float | None, digits: int | None = None) -> str:
 
 def yes(met: bool | None) -> str:
     return "" if met is None else "yes" if met else "NO"
+
+
+def complain(message: str, code: int = 2) -> int:
+    """One line to stderr and the exit code that goes with it."""
+    print(f"skysim: {message}", file=sys.stderr)
+    return code
+
+
+def draw(lab: Lab, folder: Path) -> list[Path]:
+    """The laboratory as a picture and as a film; without OpenGL a word about it, and the run goes on."""
+    from skysim import io, simulate
+    from skysim.world import picture
+
+    mjcf, joints = simulate.staged(lab), lab.log.joints
+    still, film = folder / "lab.png", folder / "lab.gif"
+    steps = max(len(joints) // FILM_FRAMES, 1)
+    moments = joints[::steps]
+    try:
+        io.write_image(still, picture.picture(mjcf, joints[len(joints) // 2])[:, :, ::-1])
+        shown = progress(picture.film(mjcf, moments), len(moments), "filming")
+        picture.write_film(shown, film, len(moments) / float(lab.log.t_s[-1] + 1e-9))
+    except picture.NoPicture as error:
+        complain(str(error))
+        return []
+    return [still, film]

@@ -240,7 +240,10 @@ def test_an_option_overrides_the_scene(skysim: Skysim, tmp_path: Path) -> None:
         ),
         (["afit_simsat", "--set", "motion.start={roll_deg: 40}"], "beyond vehicle.tilt_stop_deg 30"),
         (["afit_simsat", "--set", "light.surface.apex=90 in"], "the bearing's centre is outside of the dome"),
-        (["shefex2", "--set", "tracker.identifier=magic"], "tracker.identifier: 'magic' is none of pyramid"),
+        (
+            ["shefex2", "--set", "tracker.identifier=magic"],
+            "tracker.identifier: 'magic' is none of default, pyramid",
+        ),
         (["shefex2", "--set", "tracker.solver=rotation_only"], "tracker.solver: 'rotation_only' is none of "),
         (
             ["shefex2", "--set", "light.catalogue=nosuch"],

@@ -13,6 +13,11 @@ from skysim.simulate import Lab
 from skysim.vehicle import Vehicle
 
 NAMES = sorted(path.stem for path in scene.SCENES.glob("*.yaml"))
+# What a published experiment shows instead of five sources and an attitude.
+PAIR, GRID = "afit_test2", "afit_test1"
+SHOWN = {PAIR: 2, GRID: 9}  # LEDs in its first frame
+# On its way from one pair to the next it sees none; Position 4 of Test 3 is beyond this field's short side.
+NOT_ALL_ALONG = {PAIR, "afit_test3"}
 MODELS = sorted(path.name for path in (scene.SCENES / "vehicles").glob("*.xml"))
 
 
@@ -26,7 +31,17 @@ def lab(request: pytest.FixtureRequest) -> Lab:
 
 
 def test_there_are_scenes() -> None:
-    assert {"afit_simsat", "shefex2", "simsat_slew", "simsat_cmg", "simsat_bump", "tas2_vscmg"} <= set(NAMES)
+    flown = {"afit_simsat", "shefex2", "simsat_slew", "simsat_cmg", "simsat_bump", "tas2_vscmg"}
+    lit = {
+        "afit_test1",
+        "afit_test2",
+        "afit_test3",
+        "nps_tas2",
+        "apl_dome",
+        "celestial_dome",
+        "bench_collimated",
+    }
+    assert flown | lit <= set(NAMES)
 
 
 def test_it_says_what_it_is(lab: Lab) -> None:
@@ -34,12 +49,12 @@ def test_it_says_what_it_is(lab: Lab) -> None:
     assert 10 < len(lab.scene.title) < 80
 
 
-def test_its_first_frame_shows_at_least_five_sources(lab: Lab) -> None:
+def test_its_first_frame_shows_at_least_five_sources_or_what_was_published(lab: Lab) -> None:
     frame, truth = simulate.shoot(lab, 0)
     camera, chip = lab.scene.camera, lab.scene.camera.detector
     assert frame.image_dn.shape == (camera.height_px, camera.width_px)
     above_noise = truth.seen.peak_e > 5 * np.hypot(chip.read_noise_e, np.sqrt(truth.seen.peak_e))
-    assert above_noise.sum() >= 5
+    assert above_noise.sum() >= 5 or above_noise.sum() == SHOWN[lab.scene.name]
     # And none of them blinds the chip.
     assert np.mean(frame.image_dn >= frame.saturation_dn) < 1e-3
 
@@ -52,8 +67,13 @@ def test_its_light_is_on_the_frame(lab: Lab) -> None:
     Sensitivity is the one part of the pattern that goes with the light: a source of E electrons over A pixels has
     it as prnu E / sqrt(A).
     """
-    well_e = lab.scene.camera.detector.full_well_e
-    fine = {"camera.detector.bits": "16", "camera.detector.gain_e_dn": str(well_e / 60000)}
+    told = lab.scene.camera.detector
+    step_e = told.full_well_e / 60000
+    offset_dn = (
+        told.offset_dn * told.gain_e_dn / step_e
+    )  # the same in electrons, or noise would be cut off at 0
+    fine = {"bits": "16", "gain_e_dn": str(step_e), "offset_dn": str(offset_dn)}
+    fine = {f"camera.detector.{key}": value for key, value in fine.items()}
     lab = prepared(lab.scene.name, 1, **fine)
     frame, truth = simulate.shoot(lab, 0)
     part, chip, pixels = lab.scene.camera.detector, lab.chip, frame.image_dn.size
@@ -87,9 +107,25 @@ def test_a_frame_alone_is_the_frame_of_a_sequence(lab: Lab) -> None:
 def test_its_first_frames_are_solved_and_right(lab: Lab) -> None:
     for shot in simulate.run(lab, simulate.tracker(lab)):
         answer = shot.report.attitude
+        if lab.scene.name in SHOWN:  # seen, each where it is, to half a pixel; two are no attitude
+            found_px, seen_px = shot.report.centroids.xy_px, shot.truth.seen.xy_px
+            apart_px = np.linalg.norm(found_px[:, None] - seen_px, axis=2)
+            assert len(found_px) == len(seen_px) == SHOWN[lab.scene.name]
+            assert apart_px.min(axis=1).max() < 0.5
+            assert lab.scene.name != PAIR or answer.status == "too few stars detected"
+            continue
         assert answer.status == "solved"
         error = (answer.cam_from_ref * shot.truth.cam_from_lab.inv()).magnitude()
         assert np.degrees(error) < 10 / 60  # more is what the project calls wrong
+
+
+def test_a_square_of_equal_leds_is_never_solved_wrong() -> None:
+    """AFIT's nine LEDs are their own picture after a quarter turn, but for 0.12 mm of glue: 1.3 px."""
+    lab = prepared(GRID, 4)
+    for shot in simulate.run(lab, simulate.tracker(lab)):
+        answer = shot.report.attitude
+        if answer.solved:
+            assert np.degrees((answer.cam_from_ref * shot.truth.cam_from_lab.inv()).magnitude()) < 10 / 60
 
 
 STEERED = [name for name in NAMES if scene.load(name).motion.control]
@@ -112,7 +148,7 @@ def test_the_camera_sees_five_leds_all_along_the_manoeuvre(whole: Lab) -> None:
         pixels = project(body_from_lab, eyes.leds.position_m, eyes.lever, eyes.camera)
         counts.append(int(eyes.camera.contains(np.nan_to_num(pixels, nan=-1e9), 12).sum()))
     assert len(counts) >= 20
-    assert min(counts) >= 5
+    assert min(counts) >= 5 or whole.scene.name in NOT_ALL_ALONG
 
 
 def test_it_is_steered_to_where_it_is_told_and_off_its_stop(whole: Lab) -> None:

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from estimator.types import Attitude
-from skysim import imu, onboard, scene, simulate, world
-from skysim.types import Floats, Telemetry
+from skysim import cli, doubts, imu, onboard, scene, simulate, world
+from skysim.types import BadInput, Floats, Telemetry
 
 PERFECT = (
     "gyro: {arw_deg_sqrt_h: 0, bias_deg_h: 0, turn_on_bias_deg_h: 0, scale_ppm: 0, misalignment_arcsec: 0,"
@@ -232,3 +234,82 @@ def test_the_filter_is_told_a_solution_in_its_own_axes() -> None:
     along = int(np.argmax(np.abs(boresight_body)))
     np.testing.assert_allclose(sigma[along], 200, rtol=0.01)
     np.testing.assert_allclose(np.delete(sigma, along), 20, rtol=0.01)
+
+
+# --- what the star tracker will not work under, and what its beliefs are worth ------------------------------
+
+
+@pytest.mark.parametrize(
+    ("changes", "why"),
+    [
+        ({"light.layout": "{kind: fibonacci, count: 1, cap_deg: 20}"}, "0 pairs within"),
+        ({"light.layout": "{kind: fibonacci, count: 6, cap_deg: 25}"}, "0 pairs within"),
+        (
+            {"tracker.believed_camera_body": "[0 m, 0 m, 2 m]"},
+            r"the camera is believed 2\.000 m from the bearing",
+        ),
+    ],
+)
+def test_a_dome_that_no_tracker_can_work_under_is_told_in_one_line(changes: dict[str, str], why: str) -> None:
+    """And it is rendered all the same: a lab may light one LED."""
+    lab = simulate.furnish(scene.load("afit_simsat", changes))
+    with pytest.raises(BadInput, match=f"light: the star tracker cannot work .*: {why}") as refused:
+        simulate.tracker(lab)
+    assert "\n" not in str(refused.value)
+    assert len(lab.sources) >= 1
+
+
+def doubted_of(name: str, changes: dict[str, str]) -> list[str]:
+    lab = simulate.furnish(scene.load(name, changes))
+    return doubts.doubts(lab.scene, lab.sources, lab.mount)
+
+
+@pytest.mark.parametrize(
+    ("surface", "doubted"),
+    [
+        ("{kind: ellipsoid, apex: 1.2 m, semi_axes: [1 m, 1 m, 0.7 m]}", False),
+        ("{kind: ellipsoid, apex: 1.2 m, semi_axes: [1 m, 1 m, 0.7 m], tilt_deg: [3, 0]}", True),
+        ("{kind: sphere, apex: 1.2 m, radius: 1 m, tilt_deg: [3, 0]}", False),
+        ("{kind: flat, apex: 1.2 m, tilt_deg: [3, 0]}", False),
+    ],
+)
+def test_a_surface_that_is_no_upright_ellipsoid_is_doubted(surface: str, doubted: bool) -> None:
+    """Of a tilted ellipsoid by how much it misses: turned by e it moves (a - b) e at the most, along its normal."""
+    told = doubted_of("afit_simsat", {"light.surface": surface})
+    assert len(told) == doubted
+    for line in told:
+        missed_mm = float(re.search(r"misses it by (\S+) mm rms", line)[1])  # type: ignore[index]
+        assert 1 < missed_mm < 300 * np.radians(3)
+
+
+def test_under_the_stars_there_is_no_surface_to_doubt() -> None:
+    assert doubted_of("shefex2", {}) == []
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({"light.led.disc_diameter": "8 mm"}, "tracker.detector: an LED's image is 87 px wide"),
+        ({"camera.focus": "20 in"}, "tracker.detector: an LED's image is 54 px wide"),
+        (
+            {"light.led.drive": "{kind: sequential, controller: dome}"},
+            "exposure.time: 0.01 s of a drive's cycle",
+        ),
+    ],
+)
+def test_what_no_tracker_copes_with_is_doubted(changes: dict[str, str], told: str) -> None:
+    """By hand: 8 mm at 33 in, 36.5 mm before pixels of 4 um, is 87 px; focused at 20 in 4.4 mm of pupil blur by 32."""
+    lines = doubted_of("afit_simsat", changes)
+    assert len(lines) == 1
+    assert lines[0].startswith(told)
+
+
+def test_a_doubt_is_one_line_before_the_run_which_goes_on(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    changes = ["light.surface.tilt_deg=[8, 0]", "exposure.first=0 s"]
+    cli.run("afit_simsat", frames=1, seed=None, out=tmp_path, set_=changes, picture=False, json=True)
+    said = capsys.readouterr()
+    assert said.err.startswith("skysim: light.surface: the tracker believes an ellipsoid")
+    assert said.err.count("\n") == 1
+    assert '"frames": 1' in said.out

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import yaml
 
-from skysim import BadInput, camera, motion, vehicle
+from skysim import BadInput, camera, dome, led, motion, vehicle
 from skysim.optics import VIGNETTING
 from skysim.psf import PSFS
 from skysim.scene import ROOT, load
@@ -89,6 +89,23 @@ def test_every_kind_that_the_camera_block_names_is_one():
         "psf": set(PSFS),
         "shutter": {get_args(part.model_fields["kind"].annotation)[0] for part in shutters},
     }
+
+
+def test_the_dome_block_is_a_dome_under_which_the_tracker_finds_itself(folder):
+    path = folder / "dome.yaml"
+    path.write_text("base: afit_simsat\n" + yaml_block("light"))
+    command = [*SKYSIM, "run", str(path), "--frames", "3", "--json"]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    told = json.loads(done.stdout)
+    assert (told["frames"], told["solved"], told["wrong"]) == (3, 3, 0)
+
+
+def test_every_kind_of_dome_is_in_the_readme():
+    """Surfaces, layouts and drives, each by its name in the section on the dome."""
+    section = README.partition("### The dome\n")[2].partition("\n### ")[0]
+    kinds = [*dome.SURFACES, *dome.LAYOUTS, *led.DRIVES]
+    assert [kind for kind in kinds if f"`{kind}`" not in section] == []
 
 
 def test_the_vehicle_block_flies_and_is_told_where_it_is(folder):

@@ -246,7 +246,7 @@ def test_a_bad_override_is_one_line_and_blamed_on_the_option(key: str, value: st
     ("right", "wrong", "says"),
     [
         ("falloff: inverse_square", "falloff: cubic", "light.led.falloff: 'cubic' is none of inverse_square"),
-        ("  kind: dome", "  kind: domes", "light.kind: 'domes' is none of dome, stars"),
+        ("  kind: dome", "  kind: domes", "light.kind: 'domes' is none of dome, stars, bench"),
         (
             "kind: ellipsoid",
             "kind: torus",

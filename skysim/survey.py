@@ -1,0 +1,61 @@
+"""What the lab believes of its dome and of its camera's place: the truth and a survey's errors.
+
+They are drawn once, from a seed of their own (`tracker.survey.seed`): a survey is hardware, no noise of a frame. Each
+kind has a stream of its own, so that one error more leaves the others as they were.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from skysim.surface import Surface
+from skysim.types import BadInput, Floats
+
+STREAM = {"leds": 1, "lever": 2, "surface": 3}
+
+
+def normals(seed: int, what: str, shape: tuple[int, ...]) -> Floats:
+    """Standard normal numbers of that shape, the same for a seed whatever else is drawn."""
+    stream = np.random.SeedSequence(seed, spawn_key=(STREAM[what],))
+    return np.random.default_rng(stream).standard_normal(shape)
+
+
+def believed_m(place_m: Floats, sigma_m: float, seed: int, what: str) -> Floats:
+    """Places in space as a survey has them: true ones (..., 3) and an error of sigma about each axis, Gaussian.
+
+    Without an error the places themselves.
+    """
+    return place_m + sigma_m * normals(seed, what, place_m.shape) if sigma_m else place_m
+
+
+def raised_m(inside: Surface, seed: int) -> float:
+    """How far outside of the true surface, along its normal, the survey has it: N(0, light.surface.error).
+
+    One draw for all of the surface (the arm's zero, its probe's radius): what a thousand points err each by itself, an
+    ellipsoid fitted to them does not.
+    """
+    return float(inside.survey_sigma_m * normals(seed, "surface", (1,))[0])
+
+
+def believed_leds_m(inside: Surface, place_m: Floats, led_sigma_m: float, seed: int) -> Floats:
+    """(N, 3) LEDs as the lab has them on its map: each errs by itself, and all go with the surface that bears them."""
+    raised = raised_m(inside, seed)
+    on_it = place_m - raised * inside.inward(place_m) if raised else place_m
+    return believed_m(on_it, led_sigma_m, seed, "leds")
+
+
+def believed_ellipsoid(inside: Surface, seed: int) -> tuple[Floats, Floats]:
+    """Centre and semi-axes, (3,) each, m: those nearest to the surface, the axes greater by as much as it is raised.
+
+    That raises an ellipsoid by sum(a_i n_i^2) / sqrt(sum(a_i^2 n_i^2)) of it where the normal is n: all of it on the
+    axes and on a sphere, and never less than 2 sqrt(a b) / (a + b), a and b its longest and shortest.
+    Raises BadInput if nothing is left of it.
+    """
+    centre_m, semi_axes_m = inside.as_ellipsoid()
+    believed = semi_axes_m + raised_m(inside, seed)
+    if believed.min() <= 0:
+        raise BadInput(
+            f"light.surface.error: {inside.survey_sigma_m:g} m makes an ellipsoid of {believed.min():.3g} m; allowed:"
+            " far less than the dome"
+        )
+    return centre_m, believed

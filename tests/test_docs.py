@@ -1,0 +1,57 @@
+"""The commands of docs/*.md are commands that run, and what they print is what the page shows in kind."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from skysim.scene import ROOT
+
+DOME = (ROOT / "docs/dome.md").read_text(encoding="utf-8")
+
+
+def commands() -> list[list[str]]:
+    blocks = re.findall(r"```sh\n(.*?)```", DOME, re.DOTALL)
+    return [shlex.split(line, comments=True) for block in blocks for line in block.splitlines() if line]
+
+
+def test_the_page_s_commands_are_of_this_project() -> None:
+    starts = [" ".join(words[:3]) for words in commands()]
+    assert len(starts) >= 4
+    for words in commands():
+        if words[:2] == ["python", "-m"]:
+            assert (ROOT / (words[2].replace(".", "/") + ".py")).is_file()
+        elif words[0] == "pytest":
+            assert (ROOT / words[3]).is_file()
+        else:
+            assert words[0] == "skysim"
+
+
+@pytest.mark.parametrize("words", [words for words in commands() if words[0] == "python"], ids=" ".join)
+def test_the_page_s_tables_can_be_printed(words: list[str], tmp_path: Path) -> None:
+    """With two trials a row in place of the page's; numbers are the business of the modules' own tests."""
+    few = [*words[1:3], "2", *words[4:]]
+    done = subprocess.run([sys.executable, *few], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert len(done.stdout.splitlines()) >= 9
+
+
+@pytest.mark.parametrize("words", [words for words in commands() if words[0] == "skysim"], ids=" ".join)
+def test_the_page_s_skysim_commands_are_understood(words: list[str]) -> None:
+    """Their options are: the run itself is `test_measure.py`'s."""
+    done = subprocess.run(
+        [sys.executable, "-m", "skysim", words[1], "--help"], cwd=ROOT, capture_output=True, text=True
+    )
+    assert done.returncode == 0
+    assert [word for word in words if word.startswith("--") and word not in done.stdout] == []
+
+
+def test_the_page_s_surveys_are_tests() -> None:
+    for words in commands():
+        if words[0] == "pytest":
+            assert words[words.index("-k") + 1] in (ROOT / words[3]).read_text(encoding="utf-8")
