@@ -1,0 +1,173 @@
+"""Lost in space on six workloads, from centroids and magnitudes alone, beside an oracle that knows every name.
+
+`python -m benchmarks.lost_in_space [FIELDS] [SEED] [IDENTIFIER ...]` prints success, wrong answers and time. The sky is
+Hipparcos to the row's limit with the fainter of any two stars closer than 30" dropped; attitudes are uniform; a star's
+magnitude is wrong by 0.25 (1 sigma), a false one's drawn from the catalogue's. The oracle is what anybody could have
+done with three true stars. Wrong is an attitude more than 10' off where the oracle's is not.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from estimator import catalog
+from estimator.attitude import quest
+from estimator.camera import Camera
+from estimator.tracker import Settings, StarTracker
+from estimator.types import Centroids, Ints
+from skysim import catalogue
+from skysim.quantity import ARCSEC_RAD
+from skysim.scene import CATALOGUES
+
+WRONG_RAD = np.radians(10 / 60)
+DOUBLES_RAD = 30 * ARCSEC_RAD
+MAGNITUDE_SIGMA = 0.25
+DEEP = "hipparcos_hp7.5"
+
+
+@dataclass(frozen=True)
+class Workload:
+    """A camera, how deep it sees, and what is done to its fields.
+
+    fov_deg       : (2,) across the chip of width_px, which has square pixels
+    brightest     : no more centroids than that; false_share : so many of the centroids are false, after the cut
+    false, missing: so many false lights, and the share of stars that is not seen
+    """
+
+    name: str
+    fov_deg: tuple[float, float]
+    width_px: int
+    limit_mag: float
+    noise_px: float
+    brightest: int = 1000
+    false_share: float = 0.0
+    false: int = 0
+    missing: float = 0.0
+
+    @property
+    def camera(self) -> Camera:
+        """The pinhole camera of that field."""
+        width, height = np.tan(np.radians(self.fov_deg) / 2)
+        height_px = round(self.width_px * float(height / width))
+        return Camera.from_fov(self.width_px, height_px, float(np.radians(self.fov_deg[0])))
+
+
+PTASE_PX = 1024
+SHEFEX = (14.87, 11.15)
+WORKLOADS = (
+    Workload("PTASE", (20, 20), PTASE_PX, 6.0, 3 * ARCSEC_RAD * PTASE_PX / 2 / np.tan(np.radians(10))),
+    Workload("SHEFEX", SHEFEX, 659, 5.75, 0.1, brightest=15),
+    Workload("SHEFEX, half false", SHEFEX, 659, 5.75, 0.1, brightest=15, false_share=0.5),
+    Workload("SHEFEX, .5 px, a fifth false", SHEFEX, 659, 5.75, 0.5, brightest=15, false_share=0.2),
+    Workload("hard, V < 6.5", (10, 7.5), 1024, 6.5, 1.0, false=3, missing=0.2),
+    Workload("hard, V < 7", (10, 7.5), 1024, 7.0, 1.0, false=3, missing=0.2),
+)
+
+
+@dataclass(frozen=True)
+class Field:
+    """One frame: what is seen, brightest first, its truth, and each centroid's star (-1: none)."""
+
+    centroids: Centroids
+    cam_from_icrs: Rotation
+    star: Ints
+
+
+def sky(limit_mag: float) -> catalog.StarList:
+    """The stars of a row. Builds the deeper catalogue where the repository's does not reach."""
+    path = CATALOGUES / f"{DEEP}.ecsv"
+    if not path.is_file():
+        catalogue.build(7.5, path)
+    stars = catalog.brighter(catalog.read(path), limit_mag)
+    near = cKDTree(stars.vectors).query_pairs(2 * np.sin(DOUBLES_RAD / 2), output_type="ndarray")
+    fainter = near.max(axis=1)  # rows are by growing magnitude
+    return stars.take(np.setdiff1d(np.arange(len(stars)), fainter))
+
+
+def fields(work: Workload, stars: catalog.StarList, count: int, seed: int) -> Iterator[Field]:
+    """Random frames of a workload."""
+    for n in range(count):
+        yield field(work, stars, np.random.default_rng([seed, n]))
+
+
+def field(work: Workload, stars: catalog.StarList, rng: np.random.Generator) -> Field:
+    """One random frame."""
+    camera, truth = work.camera, Rotation.random(rng=rng)
+    xy = camera.pixels(truth.apply(stars.vectors))
+    row = np.flatnonzero(camera.contains(np.nan_to_num(xy, nan=-1e9)))
+    row = row[rng.random(len(row)) >= work.missing]
+    mag = stars.v_mag[row] + MAGNITUDE_SIGMA * rng.standard_normal(len(row))
+    true = round(work.brightest * (1 - work.false_share)) if work.brightest < 1000 else 1000
+    row, mag = row[np.argsort(mag)[:true]], np.sort(mag)[:true]
+    false = work.false + round(len(row) * work.false_share / (1 - work.false_share))
+    seen = xy[row] + work.noise_px * rng.standard_normal((len(row), 2))
+    strays = rng.uniform(-0.5, [camera.width_px - 0.5, camera.height_px - 0.5], (false, 2))
+    xy = np.concatenate([seen, strays])
+    mag = np.concatenate([mag, rng.choice(stars.v_mag, false)])
+    order = np.argsort(mag)
+    sigma = np.full(len(xy), work.noise_px)
+    names = np.concatenate([row, np.full(false, -1)])
+    return Field(Centroids(xy[order], sigma, 10 ** (-0.4 * mag[order])), truth, names[order])
+
+
+def oracle(work: Workload, stars: catalog.StarList, one: Field) -> Rotation | None:
+    """The attitude from true names, where there are three."""
+    known = one.star >= 0
+    if known.sum() < 3:
+        return None
+    rays = work.camera.rays(one.centroids.xy_px[known])
+    sigma = np.full(len(rays), work.noise_px / work.camera.focal_px)
+    return quest(rays, stars.vectors[one.star[known]], sigma)
+
+
+Solve = Callable[[Field], Rotation | None]
+
+
+def ours(work: Workload, stars: catalog.StarList, identifier: str) -> Solve:
+    """Our tracker with one of its identifiers."""
+    settings = Settings(identifier=identifier, centroid_sigma_px=0.0, field_stars=1e9)
+    tracker = StarTracker(work.camera, stars, stars.vectors, settings)
+    return lambda one: tracker.solve_centroids(one.centroids).cam_from_ref
+
+
+def compare(work: Workload, count: int, seed: int, identifier: str) -> str:
+    """One line of the table."""
+    stars = sky(work.limit_mag)
+    begin = time.perf_counter()
+    solve = ours(work, stars, identifier)
+    build_s = time.perf_counter() - begin
+    ms, found, wrong, possible = [], 0, 0, 0
+    for n, one in enumerate(fields(work, stars, count, seed)):
+        if n == 0:
+            solve(one)  # compiles
+        best = oracle(work, stars, one)
+        possible += best is not None
+        begin = time.perf_counter()
+        answer = solve(one)
+        ms.append(1e3 * (time.perf_counter() - begin))
+        if answer is None:
+            continue
+        right = (answer * one.cam_from_icrs.inv()).magnitude() < WRONG_RAD
+        reachable = best is not None and (best * one.cam_from_icrs.inv()).magnitude() < WRONG_RAD
+        found += right
+        wrong += not right and (reachable or best is None)
+    return (
+        f"{work.name:30s} {identifier:10s} {100 * found / count:8.2f} {100 * wrong / count:7.2f}"
+        f" {100 * possible / count:8.2f} {np.median(ms):8.3f} {np.percentile(ms, 99):8.2f} {build_s:7.2f}"
+    )
+
+
+if __name__ == "__main__":
+    arguments = sys.argv[1:]
+    count, seed = (int(one) for one in (arguments[:2] + ["1000", "1"][len(arguments[:2]) :]))
+    print(f"{'workload':30s} {'':10s}  found %  wrong % oracle %       ms   p99 ms build s")
+    for work in WORKLOADS:
+        for identifier in arguments[2:] or ["pyramid", "default"]:
+            print(compare(work, count, seed, identifier), flush=True)
