@@ -12,7 +12,8 @@ from scipy.spatial.transform import Rotation
 from benchmarks.timing import versus
 from estimator import catalog
 from estimator.camera import Camera
-from estimator.tracker import Settings, StarTracker
+from estimator.stages import Settings
+from estimator.tracker import StarTracker
 from estimator.types import Centroids
 from skysim.scene import CATALOGUES
 

@@ -20,7 +20,8 @@ from scipy.spatial.transform import Rotation
 from estimator import catalog
 from estimator.attitude import quest
 from estimator.camera import Camera
-from estimator.tracker import Settings, StarTracker
+from estimator.stages import Settings
+from estimator.tracker import StarTracker
 from estimator.types import Centroids, Ints
 from skysim import catalogue
 from skysim.quantity import ARCSEC_RAD

@@ -17,16 +17,8 @@ from estimator.ledpairs import NO_MATCH
 from estimator.ledproof import LEAST
 from estimator.ledsight import corner_rays, inner_field, sight_of
 from estimator.nearfield import SOLVERS
-from estimator.tracker import (
-    NO_STARS,
-    Clock,
-    Report,
-    Settings,
-    brightest,
-    direction_sigma_rad,
-    look,
-    mutual,
-)
+from estimator.stages import Clock, Report, Settings, brightest, direction_sigma_rad, look
+from estimator.tracker import NO_STARS, mutual
 from estimator.types import Attitude, Centroids, Floats, StarMatch
 
 LEAST_ERROR_PX = 0.3  # of a light, for what no survey and no calibration knows of

@@ -23,7 +23,8 @@ from estimator.filter import GyroModel, Mekf
 from estimator.identify import IDENTIFIERS
 from estimator.nearfield import SOLVERS as NEAR_SOLVERS
 from estimator.nearfield import LedMap, Lever
-from estimator.tracker import Clock, Report, Settings, StarTracker, see
+from estimator.stages import Clock, Report, Settings, see
+from estimator.tracker import StarTracker
 from estimator.types import Attitude, BadImage, Centroids
 from skysim import display, dome, imu, io, quaternion, survey
 from skysim.camera import Camera as CameraPart

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from estimator.tracker import Clock, Report
+from estimator.stages import Clock, Report
 from skysim import background, catalogue, display, dome, imu, manoeuvre, onboard, sky, world
 from skysim.camera import RollingShutter
 from skysim.detector import Chip, expose, judge, saturation_dn, smear

@@ -15,7 +15,8 @@ from estimator import catalog
 from estimator.attitude import radecroll_rad
 from estimator.camera import Camera
 from estimator.detect import check_size
-from estimator.tracker import Report, Settings, StarTracker
+from estimator.stages import Report, Settings
+from estimator.tracker import StarTracker
 from estimator.types import BadImage
 from skysim import io, report, scene
 from skysim.camera import Camera as CameraPart

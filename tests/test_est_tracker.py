@@ -12,16 +12,8 @@ from estimator import catalog, nearfield
 from estimator.camera import Camera
 from estimator.dometracker import SETTINGS, DomeTracker
 from estimator.nearfield import LedMap, Lever
-from estimator.tracker import (
-    NO_MATCH,
-    NO_STARS,
-    SATURATED,
-    Clock,
-    Settings,
-    StarTracker,
-    mutual,
-    see,
-)
+from estimator.stages import SATURATED, Clock, Settings, see
+from estimator.tracker import NO_MATCH, NO_STARS, StarTracker, mutual
 from estimator.types import Attitude, BadImage, Centroids, Floats
 
 FILE = Path(__file__).parents[1] / "data/catalogues/hipparcos_hp6.5.ecsv"
