@@ -23,6 +23,7 @@ from estimator.types import Attitude, Centroids, Floats, StarMatch
 NO_STARS = "too few stars detected"
 NO_MATCH = "no identification beyond chance"
 LEAST_ERROR_PX = 0.1  # of a star, for what no calibration knows of
+SETTINGS = Settings()
 
 
 class StarTracker:
@@ -40,7 +41,7 @@ class StarTracker:
         camera: Camera,
         stars: catalog.StarList,
         vectors: Floats,
-        settings: Settings = Settings(),
+        settings: Settings = SETTINGS,
         focal_uncertainty: float = 0.0,
     ) -> None:
         self.camera, self.settings = camera, settings
