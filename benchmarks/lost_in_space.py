@@ -133,7 +133,9 @@ Solve = Callable[[Field], Rotation | None]
 
 def ours(work: Workload, stars: catalog.StarList, identifier: str) -> Solve:
     """Our tracker with one of its identifiers."""
-    settings = Settings(identifier=identifier, centroid_sigma_px=0.0, field_stars=1e9)
+    settings = Settings(
+        identifier=identifier, centroid_sigma_px=0.0, field_stars=1e9, merge_px=0.0, zero_point_mag=0.0
+    )
     tracker = StarTracker(work.camera, stars, stars.vectors, settings)
     return lambda one: tracker.solve_centroids(one.centroids).cam_from_ref
 

@@ -1,4 +1,8 @@
-"""Wahba's problem: the rotation that best carries reference vectors into observed ones, with its covariance."""
+"""Wahba's problem: the rotation that best carries reference vectors into observed ones, with its covariance.
+
+Six classical methods, each as its author wrote it, on the compiled kernels of `wahba`. All but TRIAD minimise
+sum(w |cam - A ref|^2), w = 1 / sigma^2, over all stars, and the shared polish makes them agree to the last digits.
+"""
 
 from __future__ import annotations
 
@@ -7,99 +11,105 @@ from collections.abc import Callable
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from estimator import wahba as kernel
 from estimator.types import Floats
 
 Solver = Callable[..., Rotation]
 
 
-def quest(vectors_cam: Floats, vectors_ref: Floats, sigma_rad: Floats) -> Rotation:
-    """QUEST (Shuster & Oh 1981): cam_from_ref from (N, 3) unit vectors, N >= 2, weighted by 1 / sigma^2.
+def triad(vectors_cam: Floats, vectors_ref: Floats, sigma_rad: Floats) -> Rotation:
+    """TRIAD (Black 1964; optimal for its two stars by Markley 2002): cam_from_ref from the best pair alone.
 
-    The quartic for Davenport's greatest eigenvalue is solved by Newton from 1; the Gibbs vector's singularity
-    at half a turn is avoided by solving in the one of four frames, each turned by half a turn about an axis,
-    in which the quaternion's scalar part is the greatest. Directions close together make the two greatest
-    eigenvalues nearly equal, and the quartic loses digits as the fourth power of their spread: Gauss-Newton
-    on the directions themselves brings them back. Raises ValueError for fewer than two directions.
+    Of more than two stars it takes the two that leave the least variance about the worst axis: good ones far apart.
+    Its covariance is theirs: covariance(..., solver="triad"). Arguments, errors: those of `quest`.
     """
-    weight = 1 / np.asarray(sigma_rad) ** 2
-    weight = weight / weight.sum()
-    profile = (weight[:, None] * vectors_cam).T @ vectors_ref
-    if np.linalg.svd(profile, compute_uv=False)[1] < PARALLEL:
-        raise ValueError(
-            "all vectors are parallel: the roll about them is unknown; two directions are needed"
-        )
-    # The scalar parts are compared before the quaternions are normalised: in a frame where the turn is half a
-    # turn, all four numbers vanish, and their ratios are noise.
-    frames = [(_quest_once(profile * turn), turn) for turn in HALF_TURNS]
-    quaternion_xyzw, turn = max(frames, key=lambda frame: abs(frame[0][3]))
-    cam_from_ref = Rotation.from_quat(quaternion_xyzw) * Rotation.from_matrix(np.diag(turn))
-    return _polished(cam_from_ref, vectors_cam, vectors_ref, weight)
+    cam, ref, weight = _vectors(vectors_cam, vectors_ref, sigma_rad)
+    kernel.profile(cam, ref, weight)  # refuses what no method can solve
+    return rotation(kernel.raw_triad(cam, ref, weight))
 
 
-# Least second singular value of the profile matrix, about a quarter of the squared angle between two directions.
-PARALLEL = 1e-9
-# Half-turns of the reference frame about nothing, x, y and z: they flip two columns of the profile matrix.
-HALF_TURNS = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]], dtype=float)
+def davenport(vectors_cam: Floats, vectors_ref: Floats, sigma_rad: Floats) -> Rotation:
+    """Davenport's q-method: the eigenvector of the greatest eigenvalue, polished. As `quest`."""
+    return _solved(kernel.raw_davenport, vectors_cam, vectors_ref, sigma_rad)
 
 
-def _quest_once(profile: Floats) -> Floats:
-    """QUEST's quaternion (x, y, z, w), not normalised, for a profile matrix B = sum(w cam ref^T)."""
-    # Shuster's quaternion carries ref into cam as A(q), the transpose of the active matrix: hence B's order.
-    symmetric = profile + profile.T
-    trace = np.trace(profile)
-    z = np.array(
-        [profile[2, 1] - profile[1, 2], profile[0, 2] - profile[2, 0], profile[1, 0] - profile[0, 1]]
-    )
-    kappa = (np.trace(symmetric) ** 2 - np.sum(symmetric**2)) / 2  # the trace of its adjugate
-    delta = np.linalg.det(symmetric)
-    a, b = trace**2 - kappa, trace**2 + z @ z
-    c, d = delta + z @ symmetric @ z, z @ symmetric @ symmetric @ z
-    eigenvalue = _newton(a, b, c, d, trace)
-    alpha = eigenvalue**2 - trace**2 + kappa
-    gamma = (eigenvalue + trace) * alpha - delta
-    vector = (alpha * np.eye(3) + (eigenvalue - trace) * symmetric + symmetric @ symmetric) @ z
-    return np.array([*vector, gamma])
+def quest(vectors_cam: Floats, vectors_ref: Floats, sigma_rad: Floats) -> Rotation:
+    """QUEST (Shuster & Oh 1981): cam_from_ref from (N, 3) unit vectors, N >= 2, of errors (N,) sigma_rad.
+
+    Polished. Raises ValueError for fewer than two directions, or numbers that are not usable.
+    """
+    return _solved(kernel.raw_quest, vectors_cam, vectors_ref, sigma_rad)
 
 
-def _polished(cam_from_ref: Rotation, vectors_cam: Floats, vectors_ref: Floats, weight: Floats) -> Rotation:
-    """Gauss-Newton on sum(w |cam - A ref|^2): the turn w with sum(I - a a^T) w = sum(a x cam), a = A ref."""
-    for _ in range(20):
-        turned = cam_from_ref.apply(vectors_ref)
-        information = np.eye(3) - (weight[:, None] * turned).T @ turned
-        step = np.linalg.solve(information, weight @ np.cross(turned, vectors_cam))
-        cam_from_ref = Rotation.from_rotvec(step) * cam_from_ref
-        if step @ step < 1e-26:
-            break
-    return cam_from_ref
+def esoq2(vectors_cam: Floats, vectors_ref: Floats, sigma_rad: Floats) -> Rotation:
+    """ESOQ2 (Mortari 1997): the axis of the turn from a singular matrix, polished. As `quest`."""
+    return _solved(kernel.raw_esoq2, vectors_cam, vectors_ref, sigma_rad)
 
 
-def _newton(a: float, b: float, c: float, d: float, trace: float) -> float:
-    """Greatest root of the characteristic equation, from 1 downwards."""
-    x = 1.0
-    for _ in range(50):
-        value = x**4 - (a + b) * x**2 - c * x + (a * b + c * trace - d)
-        slope = 4 * x**3 - 2 * (a + b) * x - c
-        if slope == 0:
-            break
-        step = value / slope
-        x -= step
-        if abs(step) < 1e-16:
-            break
-    return x
+def svd(vectors_cam: Floats, vectors_ref: Floats, sigma_rad: Floats) -> Rotation:
+    """The singular value decomposition (Markley 1988), polished. As `quest`."""
+    return _solved(kernel.raw_svd, vectors_cam, vectors_ref, sigma_rad)
 
 
-SOLVERS: dict[str, Solver] = {"quest": quest}
+def least_squares(vectors_cam: Floats, vectors_ref: Floats, sigma_rad: Floats) -> Rotation:
+    """Least squares on the directions: Gauss-Newton from TRIAD's answer until it rests. As `quest`."""
+    cam, ref, weight = _vectors(vectors_cam, vectors_ref, sigma_rad)
+    kernel.profile(cam, ref, weight)
+    answer = kernel.raw_triad(cam, ref, weight)
+    kernel.polish(answer, cam, ref, weight)
+    return rotation(answer)
 
 
-def covariance(vectors_cam: Floats, sigma_rad: Floats) -> Floats:
+SOLVERS: dict[str, Solver] = {
+    "default": least_squares,
+    "quest": quest,
+    "triad": triad,
+    "davenport": davenport,
+    "esoq2": esoq2,
+    "svd": svd,
+    "least_squares": least_squares,
+}
+
+
+def _solved(
+    raw: Callable[[Floats], Floats], vectors_cam: Floats, vectors_ref: Floats, sigma_rad: Floats
+) -> Rotation:
+    """A method's own answer to the profile, polished on the directions."""
+    cam, ref, weight = _vectors(vectors_cam, vectors_ref, sigma_rad)
+    answer = raw(kernel.profile(cam, ref, weight))
+    kernel.polish(answer, cam, ref, weight)
+    return rotation(answer)
+
+
+def _vectors(vectors_cam: Floats, vectors_ref: Floats, sigma_rad: Floats) -> tuple[Floats, Floats, Floats]:
+    """What the kernels take: two (N, 3) arrays and (N,) weights in rad^-2. Raises ValueError for other shapes."""
+    cam, ref = np.ascontiguousarray(vectors_cam, dtype=float), np.ascontiguousarray(vectors_ref, dtype=float)
+    sigma = np.asarray(sigma_rad, dtype=float)
+    count = len(cam)
+    if cam.shape != (count, 3) or ref.shape != (count, 3) or sigma.shape != (count,):
+        raise ValueError(f"shapes {cam.shape}, {ref.shape}, {sigma.shape}; allowed: (N, 3), (N, 3), (N,)")
+    return cam, ref, kernel.weights(sigma)
+
+
+def rotation(R_a_from_b: Floats) -> Rotation:
+    """A matrix that is a rotation to rounding, as a Rotation.
+
+    Through the quaternion: from_matrix makes any matrix orthogonal first, and takes four times as long.
+    """
+    return Rotation.from_quat(kernel.xyzw_of(R_a_from_b))
+
+
+def covariance(vectors_cam: Floats, sigma_rad: Floats, solver: str = "quest") -> Floats:
     """(3, 3) covariance of the small rotation in camera axes: [sum((I - b b^T) / sigma^2)]^-1, rad^2.
 
-    QUEST's measurement model (Shuster & Oh 1981, eq. 97), confirmed by Monte Carlo in the tests.
+    QUEST's measurement model (Shuster & Oh 1981, eq. 97), of all methods that use all stars; of TRIAD, the sum is
+    over its pair. Confirmed by Monte Carlo in the tests. Raises ValueError where the roll is unknown.
     """
-    weight = 1 / np.asarray(sigma_rad) ** 2
-    outer = np.einsum("ni,nj->nij", vectors_cam, vectors_cam)
-    information = (weight[:, None, None] * (np.eye(3) - outer)).sum(axis=0)
-    return np.linalg.inv(information)
+    cam, _, weight = _vectors(vectors_cam, vectors_cam, sigma_rad)
+    if solver == "triad" and len(cam) > 2:
+        pair = list(kernel.best_pair(cam, weight))
+        cam, weight = cam[pair], weight[pair]
+    return kernel.spread(cam, weight)
 
 
 def radecroll_rad(cam_from_icrs: Rotation) -> tuple[float, float, float]:

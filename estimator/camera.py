@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import numba
 import numpy as np
 
 from estimator.types import BadImage, Floats
+
+Distortion = tuple[float, float, float, float, float]
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,7 +25,7 @@ class Camera:
     height_px: int
     focal_px: float
     centre_px: tuple[float, float]
-    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    distortion: Distortion = (0.0, 0.0, 0.0, 0.0, 0.0)
 
     @classmethod
     def from_fov(cls, width_px: int, height_px: int, fov_rad: float) -> Camera:
@@ -49,17 +52,20 @@ class Camera:
 
     def rays(self, xy_px: Floats) -> Floats:
         """(N, 2) pixels to (N, 3) unit vectors in camera axes."""
-        distorted = (np.asarray(xy_px, dtype=float) - self.centre_px) / self.focal_px
-        tangent = self._undistort(distorted)
+        tangent = self.tangents(xy_px)
         rays = np.column_stack([tangent, np.ones(len(tangent))])
         return rays / np.linalg.norm(rays, axis=1, keepdims=True)
+
+    def tangents(self, xy_px: Floats) -> Floats:
+        """(N, 2) pixels to (N, 2) x / z and y / z in camera axes."""
+        return undistorted(np.asarray(xy_px, dtype=float), self.focal_px, *self.centre_px, self.distortion)
 
     def pixels(self, vectors_cam: Floats) -> Floats:
         """(N, 3) vectors in camera axes to (N, 2) pixels; NaN behind the camera and beyond the distortion's fold."""
         z = np.where(vectors_cam[:, 2] > 0, vectors_cam[:, 2], np.nan)
         tangent = vectors_cam[:, :2] / z[:, None]
         tangent[np.sum(tangent**2, axis=1) >= self._fold()] = np.nan
-        return self._distort(tangent) * self.focal_px + self.centre_px
+        return distorted(tangent, self.distortion) * self.focal_px + self.centre_px
 
     def contains(self, xy_px: Floats, margin_px: float = 0.0) -> np.ndarray:
         """(N,) whether a pixel lies on the sensor, shrunk by the margin."""
@@ -82,29 +88,49 @@ class Camera:
         roots = np.roots([7 * k3, 5 * k2, 3 * k1, 1.0])
         return float(min(roots.real[(np.abs(roots.imag) < 1e-12) & (roots.real > 0)], default=np.inf))
 
-    def _distort(self, tangent: Floats) -> Floats:
-        k1, k2, p1, p2, k3 = self.distortion
-        x, y = tangent[:, 0], tangent[:, 1]
-        r2 = x * x + y * y
-        radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-        return np.column_stack(
-            [
-                x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
-                y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
-            ]
-        )
 
-    def _undistort(self, distorted: Floats) -> Floats:
-        """Fixed-point inverse of the distortion; a lens of some per cent converges to 1e-15 in a few tens."""
-        if not any(self.distortion):
-            return distorted
-        tangent = distorted.copy()
-        for _ in range(50):
-            step = distorted - self._distort(tangent)
-            tangent = tangent + step
-            if np.abs(step).max(initial=0.0) < 1e-15:
+@numba.njit(cache=True)
+def _bent(x: float, y: float, distortion: Distortion) -> tuple[float, float]:
+    """A tangent through the lens (Brown 1966, as OpenCV has it)."""
+    k1, k2, p1, p2, k3 = distortion
+    r2 = x * x + y * y
+    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    return (
+        x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+        y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
+    )
+
+
+@numba.njit(cache=True)
+def distorted(tangent: Floats, distortion: Distortion) -> Floats:
+    """(N, 2) tangents through the lens."""
+    out = np.empty_like(tangent)
+    for n in range(len(tangent)):
+        out[n, 0], out[n, 1] = _bent(tangent[n, 0], tangent[n, 1], distortion)
+    return out
+
+
+@numba.njit(cache=True)
+def undistorted(
+    xy_px: Floats, focal_px: float, centre_x_px: float, centre_y_px: float, distortion: Distortion
+) -> Floats:
+    """(N, 2) pixels to (N, 2) tangents.
+
+    Fixed-point inverse of the distortion; a lens of some per cent converges to 1e-15 in a few tens.
+    """
+    out = np.empty(xy_px.shape)
+    k1, k2, p1, p2, k3 = distortion
+    straight = k1 == 0 and k2 == 0 and p1 == 0 and p2 == 0 and k3 == 0
+    for n in range(len(out)):
+        seen_x, seen_y = (xy_px[n, 0] - centre_x_px) / focal_px, (xy_px[n, 1] - centre_y_px) / focal_px
+        x, y = seen_x, seen_y
+        for _ in range(0 if straight else 50):
+            bent_x, bent_y = _bent(x, y, distortion)
+            x, y = x + seen_x - bent_x, y + seen_y - bent_y
+            if max(abs(seen_x - bent_x), abs(seen_y - bent_y)) < 1e-15:
                 break
-        return tangent
+        out[n, 0], out[n, 1] = x, y
+    return out
 
 
 def check_shape(image_shape: tuple[int, ...], camera: Camera) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -67,26 +68,41 @@ def read(path: str | Path) -> StarList:
 
     Raises BadImage with one line if it cannot be read.
     """
-    names = ("hip", "ra_deg", "dec_deg", "pm_ra_mas_yr", "pm_dec_mas_yr", "parallax_mas", "v_mag")
+    hip, ra_deg, dec_deg, pm_ra, pm_dec, parallax, v_mag = columns(path, COLUMNS)
+    place = np.radians(ra_deg), np.radians(dec_deg)
+    stars = from_columns(hip.astype(np.int64), *place, pm_ra, pm_dec, parallax, v_mag)
+    return stars.take(np.argsort(v_mag, kind="stable"))
+
+
+COLUMNS = ("hip", "ra_deg", "dec_deg", "pm_ra_mas_yr", "pm_dec_mas_yr", "parallax_mas", "v_mag")
+
+
+def columns(path: str | Path, names: Sequence[str], blank: Sequence[str] = ()) -> Floats:
+    """(len(names) + len(blank), N) numbers of a catalogue file's columns, in the file's order.
+
+    blank : columns whose gaps and missing numbers are NaN. Raises BadImage with one line if it cannot be read.
+    """
     try:
         lines = Path(path).read_text(encoding="utf-8").splitlines()
         body = [line for line in lines if line and not line.startswith("#")]
         delimiter = "," if "," in body[0] else None
         header = body[0].replace('"', "").split(delimiter)
-        columns = [header.index(name) for name in names]
+        used = [header.index(name) for name in (*names, *blank)]
         if not body[1:]:
             raise ValueError("it has no rows")
-        table = np.loadtxt(body[1:], delimiter=delimiter, usecols=columns, ndmin=2)
-        if not np.isfinite(table).all():
+        gaps: dict[int | str, Callable[[str], Any]] = dict.fromkeys(used[len(names) :], _number_or_gap)
+        table = np.loadtxt(body[1:], delimiter=delimiter, usecols=used, ndmin=2, converters=gaps)
+        if not np.isfinite(table[:, : len(names)]).all():
             raise ValueError("some numbers are not finite")
     except (OSError, ValueError, IndexError) as error:
         raise BadImage(
-            f"{path}: not a star catalogue ({error}); allowed: ECSV with {', '.join(names)}"
+            f"{path}: not a star catalogue ({error}); allowed: ECSV with {', '.join((*names, *blank))}"
         ) from None
-    hip, ra_deg, dec_deg, pm_ra, pm_dec, parallax, v_mag = table.T
-    place = np.radians(ra_deg), np.radians(dec_deg)
-    stars = from_columns(hip.astype(np.int64), *place, pm_ra, pm_dec, parallax, v_mag)
-    return stars.take(np.argsort(v_mag, kind="stable"))
+    return table.T
+
+
+def _number_or_gap(text: str) -> float:
+    return float(text) if text.strip('" ') else np.nan
 
 
 def from_columns(
@@ -137,20 +153,24 @@ def unit(vectors: Floats) -> Floats:
 
 def merge_doubles(stars: StarList, closer_than_rad: float) -> StarList:
     """Replace stars too close to be told apart by one at their centre of light, as bright as all together."""
-    groups = _groups(stars.vectors, closer_than_rad)
-    light = 10 ** (-0.4 * stars.v_mag)
-    total = np.bincount(groups, light)
-    merged = [
-        np.column_stack([np.bincount(groups, light * column) / total for column in array.T])
-        for array in (stars.vectors, stars.drift_rad_yr, stars.parallax_rad[:, None])
-    ]
+    groups = close_groups(stars.vectors, closer_than_rad)
+    together = np.column_stack([stars.vectors, stars.drift_rad_yr, stars.parallax_rad])
+    middle, v_mag = light_centres(together, stars.v_mag, groups)
     # The brightest of each group comes first and gives the name.
     _, first = np.unique(groups, return_index=True)
-    result = StarList(stars.id[first], unit(merged[0]), merged[1], merged[2][:, 0], -2.5 * np.log10(total))
+    result = StarList(stars.id[first], unit(middle[:, :3]), middle[:, 3:6], middle[:, 6], v_mag)
     return result.take(np.argsort(result.v_mag, kind="stable"))
 
 
-def _groups(vectors: Floats, closer_than_rad: float) -> Ints:
+def light_centres(values: Floats, magnitude: Floats, group: Ints) -> tuple[Floats, Floats]:
+    """(G, K) means of (N, K) values weighted by light, and the (G,) magnitudes of all the light in each group."""
+    light = 10 ** (-0.4 * magnitude)
+    total = np.bincount(group, light)
+    middle = np.column_stack([np.bincount(group, light * column) / total for column in values.T])
+    return middle, -2.5 * np.log10(total)
+
+
+def close_groups(vectors: Floats, closer_than_rad: float) -> Ints:
     """Label of each star's group, where groups are joined through pairs closer than an angle."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components

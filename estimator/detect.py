@@ -1,47 +1,150 @@
-"""Which pixels are light: background, threshold, connected blobs."""
+"""Which pixels are light: background, threshold, connected blobs, and what of them is no star."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.types import Background, BadImage, Blobs, Floats
+from estimator import judge
+from estimator.hints import NO_HINTS, Hints
+from estimator.scan import AREA, FLUX, PEAK, STRONG, X, Y, labelled, runs_above, summed
+from estimator.shefex import maximum_scan, sequential_scan
+from estimator.skylevel import FILTERED_NOISE, median, sky
+from estimator.types import Background, BadImage, Blobs, Floats, Ints
 
-TILE_PX = 64
 MAX_BLOBS = 20_000
+GROW_SIGMA = 3.5
+FEWEST_GROWN = 8  # pixels of a blob that is significant as a whole, though nowhere by itself
+FEWEST_SMEARED = 5  # noise averaged along a line is above the threshold three pixels in a row, or not at all
+THESIS_INTENSITY, THESIS_AREA_PX = 0.04, 50
 
+# (image, threshold_sigma, min_area_px, max_blobs, hints): the image is (H, W) of any real dtype. Each raises BadImage
+# where there is nothing to look at.
 Detector = Callable[..., Blobs]
 
 
-def local(image: NDArray, threshold_sigma: float = 5.0, min_area_px: int = 3, max_blobs: int = 200) -> Blobs:
-    """Blobs that stand `threshold_sigma` above the local sky after a 3x3 binomial filter.
+def default(
+    image: NDArray,
+    threshold_sigma: float = 5.0,
+    min_area_px: int = 3,
+    max_blobs: int = 200,
+    hints: Hints = NO_HINTS,
+) -> Blobs:
+    """Matched filters for round and for smeared stars over the local sky, grown to where the light ends.
 
-    The filter [1 2 1] x [1 2 1] / 16 is close to the matched filter of a star of sigma 0.7 px, and its noise
-    is measured on the filtered image itself, so that correlated noise (JPEG, demosaicing) counts as it is.
-    image : (H, W), any real dtype. Raises BadImage where there is nothing to look at.
+    Round stars: the binomial filter [1 2 1] x [1 2 1] / 16 is close to the matched filter of sigma 0.7 px. A blob is
+    the connected pixels above 3 sigma of which `min_area_px` are above `threshold_sigma`, or whose light as a whole
+    is a sigma more significant than that: noise does not break a faint streak into pieces.
+    Smeared stars: the filtered image is averaged along the streak (dx, dy), which gains the square root of its
+    length. The streak is the hints' (from the gyro), else what the brightest blobs agree on.
     """
-    check(image)
-    image = native(image)
+    image = prepared(image)
+    background = sky(image)
+    if hints.streak_px is None or max(map(abs, hints.streak_px)) < 2:
+        blobs = gather(
+            image, background, threshold_sigma * background.noise, min_area_px, max_blobs, GROW_SIGMA
+        )
+        blobs = judge.judged(image, blobs, hints)
+        if blobs.streak_px is None:
+            return blobs
+        hints = Hints(blobs.streak_px, hints.saturation)
+    return judge.judged(image, smeared(image, background, threshold_sigma, max_blobs, hints), hints)
+
+
+def local(
+    image: NDArray,
+    threshold_sigma: float = 5.0,
+    min_area_px: int = 3,
+    max_blobs: int = 200,
+    hints: Hints = NO_HINTS,
+) -> Blobs:
+    """Blobs that stand `threshold_sigma` above the local sky after a 3x3 binomial filter."""
+    image = prepared(image)
     background = sky(image)
     return gather(image, background, threshold_sigma * background.noise, min_area_px, max_blobs)
 
 
-def threshold(
-    image: NDArray, threshold_sigma: float = 5.0, min_area_px: int = 3, max_blobs: int = 200
+def components(
+    image: NDArray,
+    threshold_sigma: float = 5.0,
+    min_area_px: int = 3,
+    max_blobs: int = 200,
+    hints: Hints = NO_HINTS,
 ) -> Blobs:
-    """Blobs above one level for the whole frame: its median plus `threshold_sigma` times its noise."""
-    check(image)
-    image = native(image)
-    background = sky(image)
-    level, noise = np.median(background.level), np.median(background.noise)
-    flat = Background(np.full((1, 1), level), np.full((1, 1), noise), max(image.shape))
+    """Blobs above one level for the whole frame: its median sky plus `threshold_sigma` times its noise."""
+    image = prepared(image)
+    flat = flattened(sky(image), image.shape)
     return gather(image, flat, threshold_sigma * flat.noise, min_area_px, max_blobs)
 
 
-DETECTORS: dict[str, Detector] = {"local": local, "threshold": threshold}
+def thesis(
+    image: NDArray,
+    threshold_sigma: float = 5.0,
+    min_area_px: int = 3,
+    max_blobs: int = 200,
+    hints: Hints = NO_HINTS,
+) -> Blobs:
+    """Blobs of at least 50 pixels above 4 % of full scale (Padro 2012, sections 3.4.1.3 and 3.5).
+
+    Full scale is the saturation in the hints, else what the integer type holds. Neither `threshold_sigma` nor
+    `min_area_px` plays a part: the thesis has two fixed thresholds. Raises BadImage for floats of unknown scale.
+    """
+    image = prepared(image)
+    full = hints.saturation
+    if not np.isfinite(full):
+        if image.dtype.kind != "u":
+            raise BadImage(
+                f"4 % of what? pixels of type {image.dtype} have no full scale; give the saturation"
+            )
+        full = float(np.iinfo(image.dtype).max)
+    flat = flattened(sky(image), image.shape)
+    # The threshold is on the raw pixel; a plateau of 50 pixels has the filtered image's contour within a pixel of it.
+    return gather(image, flat, THESIS_INTENSITY * full - flat.level, THESIS_AREA_PX, max_blobs)
+
+
+def sequential(
+    image: NDArray,
+    threshold_sigma: float = 5.0,
+    min_area_px: int = 3,
+    max_blobs: int = 200,
+    hints: Hints = NO_HINTS,
+) -> Blobs:
+    """SHEFEX-2's scan: once through the frame, each object summed as it is met and sorted into a table.
+
+    The table holds the `max_blobs` brightest so far. An object is the eight-connected pixels above one level for the
+    frame, sky + `threshold_sigma` times a raw pixel's noise (reference: the SHEFEX-2 paper, fig. 3 right).
+    """
+    return _scanned(sequential_scan, image, threshold_sigma, min_area_px, max_blobs)
+
+
+def maximum(
+    image: NDArray,
+    threshold_sigma: float = 5.0,
+    min_area_px: int = 3,
+    max_blobs: int = 200,
+    hints: Hints = NO_HINTS,
+) -> Blobs:
+    """SHEFEX-2's rival scan: the whole frame for its greatest pixel, again for every object (fig. 3 left)."""
+    return _scanned(maximum_scan, image, threshold_sigma, min_area_px, max_blobs)
+
+
+DETECTORS: dict[str, Detector] = {
+    "default": default,
+    "local": local,
+    "components": components,
+    "threshold": components,
+    "sequential": sequential,
+    "maximum": maximum,
+    "thesis": thesis,
+}
+
+
+def prepared(image: NDArray) -> NDArray:
+    """The image checked, in a type that compiled code takes."""
+    check(image)
+    return native(image)
 
 
 def check(image: NDArray) -> None:
@@ -51,6 +154,8 @@ def check(image: NDArray) -> None:
     if image.ndim != 2:
         raise BadImage(f"an image of shape {image.shape} is not monochrome; allowed: (height, width)")
     check_size(image)
+    if image.dtype.kind != "f" and image[0, 0] != image[-1, -1]:
+        return  # integers cannot be NaN, and these are uneven
     low, high = image.min(), image.max()
     if not (np.isfinite(low) and np.isfinite(high)):
         raise BadImage("the image holds NaN or infinite pixels; allowed: finite values")
@@ -72,188 +177,131 @@ def check_size(image: NDArray) -> None:
         raise BadImage(f"{image.shape[1]}x{image.shape[0]} pixels are too few; allowed: 16x16 and more")
 
 
-def sky(image: NDArray, tile_px: int = TILE_PX) -> Background:
-    """Median and scaled median absolute deviation of the filtered image, tile by tile.
+def mend(image: NDArray, bad_px: Ints) -> NDArray:
+    """A copy of the image whose bad pixels, (K, 2) x and y, hold the median of their good neighbours.
 
-    The noise has a floor of what quantisation leaves in a flat patch, lest a dark JPEG have none.
+    The map comes from dark frames on the ground. A bad pixel without a good neighbour within two takes the frame's
+    median: it then is no light.
     """
-    tile_px = min(tile_px, *image.shape)
-    level, noise = _tiles(image, tile_px)
-    step = 1.0 if np.issubdtype(image.dtype, np.integer) else 0.0
-    return Background(level, np.maximum(noise, 0.375 * step / np.sqrt(12)), tile_px)
+    mended = native(image).copy()
+    height, width = image.shape
+    x, y = np.asarray(bad_px).reshape(-1, 2).T
+    if len(x) and not (x.min() >= 0 and x.max() < width and y.min() >= 0 and y.max() < height):
+        raise BadImage(f"the bad-pixel map reaches beyond the frame of {width}x{height} pixels")
+    bad = set(zip(x.tolist(), y.tolist(), strict=True))
+    for column, row in bad:
+        for reach in (1, 2):
+            good = [
+                image[v, u]
+                for v in range(max(row - reach, 0), min(row + reach + 1, height))
+                for u in range(max(column - reach, 0), min(column + reach + 1, width))
+                if (u, v) not in bad
+            ]
+            if good:
+                break
+        mended[row, column] = np.median(good if good else image[::8, ::8])
+    return mended
 
 
-def gather(image: NDArray, background: Background, above: Floats, min_area_px: int, max_blobs: int) -> Blobs:
-    """Label what is more than `above` (on the background's grid) over the level, and keep the brightest."""
-    boxes, sums, count = _label(image, background.level, above, MAX_BLOBS)
-    if count < 0:
+def flattened(background: Background, shape: tuple[int, ...]) -> Background:
+    """One level and noise for the whole frame: the medians of the tiles'."""
+    level, noise = median(background.level), median(background.noise)
+    return Background(np.full((1, 1), level), np.full((1, 1), noise), max(shape))
+
+
+def gather(
+    image: NDArray,
+    background: Background,
+    above: Floats,
+    min_area_px: int,
+    max_blobs: int,
+    grow_sigma: float | None = None,
+) -> Blobs:
+    """Label what is more than `above` (on the background's grid) over the level, and keep the brightest.
+
+    With `grow_sigma` a blob reaches down to so many times the noise, and counts if enough of it is above `above` or
+    if its whole light is significant: flux / (pixel noise sqrt(area)) one more than the threshold's sigma.
+    """
+    strong = background.level + above
+    low = strong
+    if grow_sigma is not None:
+        low = background.level + np.minimum(above, grow_sigma * background.noise)
+    runs = runs_above(image, low)
+    boxes, sums = summed(image, background.level, strong, runs, *labelled(runs))
+    real = sums[:, STRONG] >= min_area_px
+    if grow_sigma is not None:
+        usual = median(background.noise)
+        pixel_noise, wanted = usual / FILTERED_NOISE, median(above) / usual + 1
+        real |= (sums[:, AREA] >= max(min_area_px, FEWEST_GROWN)) & (
+            sums[:, FLUX] >= wanted * pixel_noise * np.sqrt(sums[:, AREA])
+        )
+    return _kept(boxes, sums, np.flatnonzero(real & (sums[:, FLUX] > 0)), max_blobs, background)
+
+
+def smeared(
+    image: NDArray, background: Background, threshold_sigma: float, max_blobs: int, hints: Hints
+) -> Blobs:
+    """Streaks of the hints' (dx, dy), by the filtered image averaged along them.
+
+    The average's noise is that of white noise through both filters. A streak's response is symmetric about its
+    middle and twice as long as itself: its box is put about the middle, as large as the streak.
+    """
+    assert hints.streak_px is not None
+    taps = taps_of(hints.streak_px)
+    above = threshold_sigma * noise_kept(taps) / FILTERED_NOISE * background.noise
+    runs = runs_above(image, background.level + above, taps)
+    boxes, sums = summed(
+        image, background.level, np.full_like(background.level, -np.inf), runs, *labelled(runs)
+    )
+    kept = np.flatnonzero((sums[:, AREA] >= FEWEST_SMEARED) & (sums[:, FLUX] > 0))
+    blobs = _kept(boxes, sums, kept, max_blobs, background)
+    half = np.abs(hints.streak_px) / 2 + 1
+    middle = blobs.xy_px
+    edge = np.array(image.shape[::-1]) - 1
+    box = np.concatenate([np.clip(middle - half, 0, edge), np.clip(middle + half, 0, edge)], axis=1)
+    blobs.box_px[:] = np.rint(box)
+    return blobs
+
+
+def taps_of(streak_px: tuple[float, float]) -> Ints:
+    """(K, 2) pixels of a line of that length and direction, about 0: one a pixel of its longer side."""
+    count = max(round(max(map(abs, streak_px))), 1) | 1
+    along = (np.arange(count) - count // 2) / count
+    return np.rint(along[:, None] * np.array(streak_px)).astype(np.int64)
+
+
+def noise_kept(taps: Ints) -> float:
+    """What of white noise's deviation is left after the binomial filter and the mean over the taps."""
+    reach = int(np.abs(taps).max()) + 1
+    kernel = np.zeros((2 * reach + 1, 2 * reach + 1))
+    binomial = np.outer([1, 2, 1], [1, 2, 1]) / 16 / len(taps)
+    for x, y in taps + reach:
+        kernel[y - 1 : y + 2, x - 1 : x + 2] += binomial
+    return float(np.sqrt(np.sum(kernel**2)))
+
+
+def _scanned(
+    scan: Callable[..., tuple[Ints, Floats]],
+    image: NDArray,
+    threshold_sigma: float,
+    min_area_px: int,
+    max_blobs: int,
+) -> Blobs:
+    """The table of one of SHEFEX's scans as blobs."""
+    image = prepared(image)
+    flat = flattened(sky(image), image.shape)
+    level, noise = float(flat.level[0, 0]), float(flat.noise[0, 0]) / FILTERED_NOISE
+    boxes, sums = scan(image, level, level + threshold_sigma * noise, min_area_px, max_blobs)
+    return _kept(boxes, sums, np.arange(len(sums)), max_blobs, flat)
+
+
+def _kept(boxes: Ints, sums: Floats, kept: NDArray, max_blobs: int, background: Background) -> Blobs:
+    """The brightest of those rows as Blobs without any flag."""
+    if len(kept) > MAX_BLOBS:
         raise BadImage(f"over {MAX_BLOBS} blobs: the frame is noise or texture, not a star field")
-    boxes, sums = boxes[:count], sums[:count]
-    kept = np.flatnonzero((sums[:, 0] >= min_area_px) & (sums[:, 1] > 0))
-    kept = kept[np.argsort(-sums[kept, 1], kind="stable")][:max_blobs]
-    flux = sums[kept, 1]
-    xy = sums[kept, 2:4] / flux[:, None]
-    return Blobs(boxes[kept], xy, flux, sums[kept, 4], sums[kept, 0].astype(np.int64), background)
-
-
-@numba.njit(cache=True)
-def _filtered(image: NDArray, y: int, x: int) -> float:
-    """The 3x3 binomial filter at one pixel; edges repeat their last row or column."""
-    height, width = image.shape
-    up, down = max(y - 1, 0), min(y + 1, height - 1)
-    left, right = max(x - 1, 0), min(x + 1, width - 1)
-    total = 4.0 * image[y, x]
-    total += 2.0 * (float(image[up, x]) + image[down, x] + image[y, left] + image[y, right])
-    total += float(image[up, left]) + image[up, right] + image[down, left] + image[down, right]
-    return total / 16.0
-
-
-@numba.njit(cache=True)
-def _tiles(image: NDArray, tile_px: int) -> tuple[Floats, Floats]:
-    """Median and 1.4826 MAD of every tile, from a quarter of its pixels."""
-    height, width = image.shape
-    rows, columns = max(height // tile_px, 1), max(width // tile_px, 1)
-    level, noise = np.empty((rows, columns)), np.empty((rows, columns))
-    for row in range(rows):
-        y0 = row * height // rows
-        y1 = (row + 1) * height // rows
-        for column in range(columns):
-            x0 = column * width // columns
-            x1 = (column + 1) * width // columns
-            values = np.empty(((y1 - y0 + 1) // 2) * ((x1 - x0 + 1) // 2))
-            n = 0
-            for y in range(y0, y1, 2):
-                for x in range(x0, x1, 2):
-                    values[n] = _filtered(image, y, x)
-                    n += 1
-            middle = np.median(values[:n])
-            level[row, column] = middle
-            noise[row, column] = 1.4826 * np.median(np.abs(values[:n] - middle))
-    return level, noise
-
-
-@numba.njit(cache=True)
-def at(grid: Floats, height: int, width: int, y: float, x: float) -> float:
-    """Bilinear value of a tile grid at a pixel; constant beyond the outermost tile centres."""
-    rows, columns = grid.shape
-    v = min(max((y + 0.5) * rows / height - 0.5, 0.0), rows - 1.0)
-    u = min(max((x + 0.5) * columns / width - 0.5, 0.0), columns - 1.0)
-    row, column = min(int(v), max(rows - 2, 0)), min(int(u), max(columns - 2, 0))
-    below, beside = min(row + 1, rows - 1), min(column + 1, columns - 1)
-    fv, fu = v - row, u - column
-    top = grid[row, column] * (1 - fu) + grid[row, beside] * fu
-    bottom = grid[below, column] * (1 - fu) + grid[below, beside] * fu
-    return top * (1 - fv) + bottom * fv
-
-
-@numba.njit(cache=True)
-def _row(grid: Floats, height: int, width: int, y: int, out: Floats) -> None:
-    """`at` for every pixel of a row: the rows blended once, then one straight line from tile to tile."""
-    rows, columns = grid.shape
-    v = min(max((y + 0.5) * rows / height - 0.5, 0.0), rows - 1.0)
-    row = min(int(v), max(rows - 2, 0))
-    below = min(row + 1, rows - 1)
-    line = grid[row] * (1 - (v - row)) + grid[below] * (v - row)
-    for x in range(width):
-        u = min(max((x + 0.5) * columns / width - 0.5, 0.0), columns - 1.0)
-        column = min(int(u), max(columns - 2, 0))
-        out[x] = line[column] + (line[min(column + 1, columns - 1)] - line[column]) * (u - column)
-
-
-@numba.njit(cache=True)
-def _vertical(image: NDArray, y: int, out: Floats) -> None:
-    """Column sums 1 2 1 about a row, with one more at either end: the first half of `_filtered`."""
-    height, width = image.shape
-    up, down = max(y - 1, 0), min(y + 1, height - 1)
-    for x in range(width):
-        out[x + 1] = float(image[up, x]) + 2.0 * image[y, x] + image[down, x]
-    out[0], out[width + 1] = out[1], out[width]
-
-
-@numba.njit(cache=True)
-def _find(parent: NDArray, label: int) -> int:
-    while parent[label] != label:
-        parent[label] = parent[parent[label]]
-        label = parent[label]
-    return label
-
-
-@numba.njit(cache=True)
-def _label(image: NDArray, level: Floats, above: Floats, limit: int) -> tuple[NDArray, Floats, int]:
-    """Eight-connected blobs in one raster pass, with union-find over provisional labels.
-
-    Returns boxes (limit, 4), sums (limit, 5: area, flux, flux x, flux y, peak) and how many; -1 if too many.
-    """
-    height, width = image.shape
-    parent = np.empty(8 * limit, np.int64)
-    boxes = np.empty((8 * limit, 4), np.int64)
-    sums = np.zeros((8 * limit, 5))
-    previous, current = np.zeros(width + 2, np.int64), np.zeros(width + 2, np.int64)
-    labels = 1
-    column_sums = np.empty(width + 2)
-    sky_row, above_row = np.empty(width), np.empty(width)
-    for y in range(height):
-        current[:] = 0
-        _row(level, height, width, y, sky_row)
-        _row(above, height, width, y, above_row)
-        _vertical(image, y, column_sums)
-        for x in range(width):
-            smooth = (column_sums[x] + 2 * column_sums[x + 1] + column_sums[x + 2]) / 16.0
-            if smooth - sky_row[x] <= above_row[x]:
-                continue
-            mine = 0
-            for other in (current[x], previous[x], previous[x + 1], previous[x + 2]):
-                if other == 0:
-                    continue
-                root = _find(parent, other)
-                if mine == 0:
-                    mine = root
-                elif root != mine:
-                    parent[max(root, mine)] = min(root, mine)
-                    mine = min(root, mine)
-            if mine == 0:
-                if labels == 8 * limit:
-                    return boxes, sums, -1
-                mine = labels
-                parent[mine] = mine
-                boxes[mine] = (x, y, x, y)
-                sums[mine, 4] = image[y, x]
-                labels += 1
-            current[x + 1] = mine
-            excess = image[y, x] - sky_row[x]
-            sums[mine, 0] += 1
-            sums[mine, 1] += excess
-            sums[mine, 2] += excess * x
-            sums[mine, 3] += excess * y
-            sums[mine, 4] = max(sums[mine, 4], image[y, x])
-            boxes[mine, 0] = min(boxes[mine, 0], x)
-            boxes[mine, 2] = max(boxes[mine, 2], x)
-            boxes[mine, 3] = y
-        previous, current = current, previous
-    return _merge(parent, boxes, sums, labels, limit)
-
-
-@numba.njit(cache=True)
-def _merge(
-    parent: NDArray, boxes: NDArray, sums: Floats, labels: int, limit: int
-) -> tuple[NDArray, Floats, int]:
-    """Fold every provisional label into its root and close the ranks."""
-    for label in range(labels - 1, 0, -1):
-        root = _find(parent, label)
-        if root == label:
-            continue
-        sums[root, :4] += sums[label, :4]
-        sums[root, 4] = max(sums[root, 4], sums[label, 4])
-        boxes[root, 0] = min(boxes[root, 0], boxes[label, 0])
-        boxes[root, 1] = min(boxes[root, 1], boxes[label, 1])
-        boxes[root, 2] = max(boxes[root, 2], boxes[label, 2])
-        boxes[root, 3] = max(boxes[root, 3], boxes[label, 3])
-    count = 0
-    for label in range(1, labels):
-        if parent[label] == label:
-            if count == limit:
-                return boxes, sums, -1
-            boxes[count] = boxes[label]
-            sums[count] = sums[label]
-            count += 1
-    return boxes, sums, count
+    kept = kept[np.argsort(-sums[kept, FLUX], kind="stable")][:max_blobs]
+    rows = sums[kept]
+    flux = rows[:, FLUX]
+    xy = rows[:, X : Y + 1] / flux[:, None]
+    area = rows[:, AREA].astype(np.int64)
+    return Blobs(boxes[kept], xy, flux, rows[:, PEAK], area, background, np.zeros(len(kept), np.int64))

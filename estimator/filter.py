@@ -25,7 +25,7 @@ RESET = "reset"
 OUTSIDE = "refused: outside the gate"
 TOO_OLD = "refused: older than the filter remembers"
 
-# Samples are kept for so long at most, and for half of it at least, where no solution is used. `assumed`: some frames.
+# What was felt and seen is kept for so long at most, and for half of it at least. `assumed`: some frames.
 MEMORY_S = 10.0
 # Refused solutions in a row that must agree with one another before they are believed instead of the filter.
 AGREEING = 3
@@ -92,6 +92,17 @@ class _Solution(NamedTuple):
     covariance_rad2: Floats
 
 
+class _Leg(NamedTuple):
+    """From one used solution to the next: the moment after it was used, the gyro's samples since, the solution.
+
+    The first leg's is None: nothing before it is remembered.
+    """
+
+    moment: _Moment
+    samples: Floats
+    solution: _Solution | None
+
+
 class Mekf:
     """A star tracker's attitude filter: the attitude as a quaternion, its error e as a small turn in body axes.
 
@@ -115,6 +126,9 @@ class Mekf:
     spread grows in proportion to the time, to |measured rate| t, and a blow of six times the limit is still within the
     usual gate. All axes grow: a turn missed about one carries the turns about the others the wrong way. The growth
     is in the attitude alone: a large residual then is laid to the missed turn, not to the bias.
+
+    Order. Solutions may come at any rate, late, in any order, or not at all: each is used at its own time, and those
+    for later times that were used before it are used again after it, so that the result is that of the right order.
 
     Gate. A wrong solution is worse than none, so an improbable one is refused and changes nothing. But a filter that
     is wrong itself would then refuse the truth for ever. So when three solutions, refused one after another, agree
@@ -142,8 +156,7 @@ class Mekf:
         self._start_variance = (_not_negative("sigma_bias_rad_s", sigma_bias_rad_s) * np.ones(3)) ** 2
         covariance = np.diag(np.concatenate([sigma_attitude**2, self._start_variance]))
         self._now = _Moment(float(t_s), _ref_from_body_wxyz(body_from_ref), np.zeros(3), covariance, 0.0)
-        self._base = self._now  # the last time that a solution was used; all samples since are kept
-        self._since = np.empty((0, 5))  # rows of _checked_samples
+        self._legs = [_Leg(self._now, np.empty((0, 5)), None)]  # rows of _checked_samples
         self._refused: list[tuple[_Moment, _Solution]] = []  # in a row, each agreeing with the one before
         self._measured_rad_s = np.zeros(3)
 
@@ -186,11 +199,9 @@ class Mekf:
         samples = _checked_samples(start_s, t_s, angle_rad, saturated, 0.1 * self._gyro.bias_time_s)
         self._now = self._after(self._now, samples)
         self._measured_rad_s = samples[:, 1:4].sum(axis=0) / (samples[-1, 0] - start_s)
-        self._since = np.concatenate([self._since, samples])
-        if self._since[0, 0] < samples[-1, 0] - MEMORY_S:
-            half = len(self._since) // 2
-            self._base = self._after(self._base, self._since[:half])
-            self._since = self._since[half:]
+        last = self._legs[-1]
+        self._legs[-1] = last._replace(samples=np.concatenate([last.samples, samples]))
+        self._forget(float(samples[-1, 0]) - MEMORY_S)
 
     def update(self, t_s: float, body_from_ref_measured: Rotation, covariance_rad2: ArrayLike) -> Update:
         """Take a star tracker's solution for a time now or in the past, from which the gyro is followed again.
@@ -203,23 +214,46 @@ class Mekf:
         solution, now_s = _Solution(body_from_ref_measured, spread), self._now.t_s
         if not t_s <= now_s + ROUNDING_S:
             raise ValueError(f"update: a solution at {t_s} s; allowed: up to the last gyro sample, {now_s} s")
-        if t_s < self._base.t_s:
+        if t_s < self._legs[0].moment.t_s:
             return Update(TOO_OLD, np.full(3, np.nan), math.nan)
-        before, after = _split(self._since, self._base.t_s, min(float(t_s), now_s))
-        then = self._after(self._base, before)
-        residual = (then.body_from_ref * body_from_ref_measured.inv()).as_rotvec()
-        noise = _seen_from(residual, spread)
-        distance2 = float(residual @ np.linalg.solve(then.covariance[:3, :3] + noise, residual))
+        k = next(k for k in reversed(range(len(self._legs))) if self._legs[k].moment.t_s <= t_s)
+        leg = self._legs[k]
+        before, after = _split(leg.samples, leg.moment.t_s, min(float(t_s), now_s))
+        then = self._after(leg.moment, before)
+        residual, noise, distance2 = _innovation(then, solution)
         if distance2 <= self._gate:
             status, then = USED, _corrected(then, residual, noise)
+            self._legs[k : k + 1] = [leg._replace(samples=before), _Leg(then, after, solution)]
+            self._replay(k + 1)
         elif self._agrees(then, solution):
-            status, then = RESET, self._taken(then, solution)
+            status = RESET
+            # What was used after it, by a filter that was lost, is forgotten with it.
+            rest = np.concatenate([after, *(later.samples for later in self._legs[k + 1 :])])
+            self._legs = [_Leg(self._taken(then, solution), rest, None)]
         else:
             return Update(OUTSIDE, residual, math.sqrt(distance2))
         self._refused = []
-        self._base, self._since = then, after
-        self._now = self._after(then, after)
+        self._now = self._after(self._legs[-1].moment, self._legs[-1].samples)
         return Update(status, residual, math.sqrt(distance2))
+
+    def _replay(self, k: int) -> None:
+        """The solutions after leg k once more, from where leg k now leaves the filter; they have passed the gate."""
+        for j in range(k + 1, len(self._legs)):
+            earlier, leg = self._legs[j - 1], self._legs[j]
+            assert leg.solution is not None
+            then = self._after(earlier.moment, earlier.samples)
+            residual, noise, _ = _innovation(then, leg.solution)
+            self._legs[j] = leg._replace(moment=_corrected(then, residual, noise))
+
+    def _forget(self, before_s: float) -> None:
+        """Let go of whole legs, and of half of a long one."""
+        while len(self._legs) > 1 and self._legs[1].moment.t_s < before_s:
+            del self._legs[0]
+        first = self._legs[0]
+        if len(first.samples) and first.samples[0, 0] < before_s:
+            half = len(first.samples) // 2
+            moment = self._after(first.moment, first.samples[:half])
+            self._legs[0] = _Leg(moment, first.samples[half:], None)
 
     def _after(self, moment: _Moment, samples: Floats) -> _Moment:
         """A moment carried through samples by the gyro."""
@@ -251,6 +285,13 @@ class Mekf:
             ref_from_body_wxyz=_ref_from_body_wxyz(solution.body_from_ref),
             covariance=block_diag(solution.covariance_rad2, bias_covariance),
         )
+
+
+def _innovation(then: _Moment, solution: _Solution) -> tuple[Floats, Floats, float]:
+    """Residual (3,) in body axes, the solution's noise as it appears in it, the squared Mahalanobis distance."""
+    residual = (then.body_from_ref * solution.body_from_ref.inv()).as_rotvec()
+    noise = _seen_from(residual, solution.covariance_rad2)
+    return residual, noise, float(residual @ np.linalg.solve(then.covariance[:3, :3] + noise, residual))
 
 
 def _corrected(then: _Moment, residual: Floats, noise: Floats) -> _Moment:

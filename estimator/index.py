@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from estimator import cells
+from estimator.cells import Cells
 from estimator.types import BadImage, Floats
 
 
@@ -22,6 +24,8 @@ class PairIndex(NamedTuple):
     first     : (N + 1,) where each star's neighbours begin
     neighbour : their rows, by growing angle;  separation_rad : the angles
     group     : (N,) which stars were made as one; no pair is listed within a group, for its pattern repeats
+    magnitude : (N,) growing, in the camera's own scale; NaN where it is not known
+    cells     : the stars by direction
     """
 
     vectors: Floats
@@ -35,15 +39,28 @@ class PairIndex(NamedTuple):
     separation_rad: Floats
     group: NDArray[np.int64]
     max_angle_rad: float
+    magnitude: Floats
+    cells: Cells
 
 
-def build(vectors: Floats, max_angle_rad: float, group: NDArray[np.int64] | None = None) -> PairIndex:
-    """Index all pairs of (N, 3) unit vectors up to an angle. Raises BadImage where there are none.
+def build(
+    vectors: Floats,
+    max_angle_rad: float,
+    group: NDArray[np.int64] | None = None,
+    magnitude: Floats | None = None,
+) -> PairIndex:
+    """Index all pairs of (N, 3) unit vectors up to an angle, brightest first. Raises BadImage where there are none.
 
-    group : (N,) labels of what is not placed independently (LEDs of one patch board); each its own if left out
+    group     : (N,) labels of what is not placed independently (LEDs of one patch board); each its own if left out
+    magnitude : (N,) never falling; unknown if left out
     """
     group = np.arange(len(vectors)) if group is None else np.asarray(group, np.int64)
     vectors = np.ascontiguousarray(vectors, dtype=float)
+    light = np.full(len(vectors), np.nan) if magnitude is None else np.asarray(magnitude, float)
+    if light.shape != (len(vectors),) or (np.diff(light) < 0).any():
+        raise BadImage(
+            f"magnitudes {light.shape} of {len(vectors)} stars; allowed: one for each, the brightest first"
+        )
     chord = 2 * np.sin(min(max_angle_rad, np.pi) / 2)
     pair = cKDTree(vectors).query_pairs(chord, output_type="ndarray").astype(np.int32)
     # The half-chord keeps small angles exact where arccos of a dot product would lose half the digits.
@@ -76,6 +93,8 @@ def build(vectors: Floats, max_angle_rad: float, group: NDArray[np.int64] | None
         separation,
         group,
         max_angle_rad,
+        light,
+        cells.build(vectors),
     )
 
 
@@ -108,6 +127,15 @@ def between(index: PairIndex, low_rad: float, high_rad: float) -> tuple[int, int
     begin = index.kvector[k_low] if k_low >= 0 else 0
     end = index.kvector[k_high] if k_high <= last else len(index.angle_rad)
     return begin, end
+
+
+@numba.njit(cache=True)
+def alike(index: PairIndex, magnitude: float, gate: float) -> tuple[int, int]:
+    """Half-open range of rows whose magnitude is within a gate of one; all of them where one is not known."""
+    if not np.isfinite(gate) or np.isnan(magnitude) or np.isnan(index.magnitude[0]):
+        return 0, len(index.magnitude)
+    begin = int(np.searchsorted(index.magnitude, magnitude - gate))
+    return begin, int(np.searchsorted(index.magnitude, magnitude + gate, side="right"))
 
 
 @numba.njit(cache=True)

@@ -4,17 +4,23 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from estimator.camera import Camera, check_shape
 from estimator.centroid import CENTROIDERS
-from estimator.detect import DETECTORS
-from estimator.types import Attitude, BadImage, Centroids, Floats
+from estimator.detect import DETECTORS, mend
+from estimator.hints import Hints
+from estimator.judge import NO_STAR, Flag
+from estimator.types import Attitude, BadImage, Blobs, Centroids, Floats, Ints
 
 SATURATED = "the frame is saturated"
+SATURATED_SIGMA_PX = (
+    0.05  # a plateau's edge falls by whole pixels: .01 to .07 by Monte Carlo, as it is cut off deeper
+)
+MENDED_SIGMA_PX = 0.06  # of a star on a bad pixel, for the guess at what that would have held: Monte Carlo
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,12 +30,17 @@ class Settings:
     centroid_sigma_px : floor of a centroid's error, for what its own noise does not cover
     base_stars        : among how many of the brightest blobs patterns are sought
     field_stars       : how many catalogue stars a field should hold on average when patterns are sought
+    merge_px          : catalogue stars nearer to one another are one light
+    zero_point_mag    : magnitude of a light of flux 1; None where it is not known, and magnitudes tell nothing
+    magnitude_sigma   : error of a star's magnitude, what its colour does included
+    reject            : flags of `judge.Flag` with which a blob is taken for no star and dropped
+    bad_px            : (K, 2) x and y of the sensor's bad pixels; None where there is no map
     """
 
-    detector: str = "local"
+    detector: str = "default"
     centroider: str = "cog"
     identifier: str = "default"
-    solver: str = "quest"
+    solver: str = "default"
     threshold_sigma: float = 5.0
     min_area_px: int = 3
     max_blobs: int = 100
@@ -38,7 +49,12 @@ class Settings:
     centroid_sigma_px: float = 0.1
     base_stars: int = 20
     field_stars: float = 30.0
+    merge_px: float = 2.0
+    zero_point_mag: float | None = None
+    magnitude_sigma: float = 0.25
     missed_dex: float = 0.5
+    reject: int = int(NO_STAR)
+    bad_px: Ints | None = field(default=None, compare=False)
 
 
 @dataclass(slots=True)
@@ -63,28 +79,62 @@ class Clock:
         self._last = now
 
 
-def see(image: NDArray, camera: Camera, settings: Settings, clock: Clock) -> Centroids:
-    """Detect and centroid. Raises BadImage for a frame that cannot be one of this camera's."""
+def see(
+    image: NDArray,
+    camera: Camera,
+    settings: Settings,
+    clock: Clock,
+    streak_px: tuple[float, float] | None = None,
+) -> Centroids:
+    """Detect and centroid. Raises BadImage for a frame that cannot be one of this camera's.
+
+    streak_px : (dx, dy) that stars move during the exposure, from the gyro; None where there is none
+    """
     check_shape(image.shape, camera)
-    if np.isfinite(settings.saturation) and np.mean(image >= settings.saturation) > 0.5:
-        raise BadImage(f"{SATURATED}: over half of its pixels are at {settings.saturation:g}")
+    if np.isfinite(settings.saturation):
+        some = image[::8]  # enough to tell a half
+        if np.count_nonzero(some >= settings.saturation) > 0.5 * some.size:
+            raise BadImage(f"{SATURATED}: over half of its pixels are at {settings.saturation:g}")
+    if settings.bad_px is not None:
+        image = mend(image, settings.bad_px)
+    hints = Hints(streak_px, settings.saturation)
     blobs = DETECTORS[settings.detector](
-        image, settings.threshold_sigma, settings.min_area_px, settings.max_blobs
+        image, settings.threshold_sigma, settings.min_area_px, settings.max_blobs, hints
     )
-    blobs = blobs.take(whole(blobs.box_px, camera))
+    blobs = blobs.take(whole(blobs.box_px, camera) & (blobs.flag & settings.reject == 0))
     clock.lap("detect")
-    centroids = CENTROIDERS[settings.centroider](image, blobs, settings.gain_e_dn)
+    centroids = CENTROIDERS[settings.centroider](image, blobs, settings.gain_e_dn, hints)
+    centroids = doubted(centroids, blobs, settings)
     clock.lap("centroid")
     sound = camera.contains(centroids.xy_px) & np.isfinite(centroids.sigma_px) & (centroids.flux > 0)
-    return centroids.take(sound)
+    return centroids if sound.all() else centroids.take(sound)
+
+
+def doubted(centroids: Centroids, blobs: Blobs, settings: Settings) -> Centroids:
+    """The centroids with what their noise does not tell: of saturated blobs, and of those on bad pixels."""
+    extra = np.where(blobs.flag & Flag.SATURATED, SATURATED_SIGMA_PX, 0.0)
+    if settings.bad_px is not None and len(blobs):
+        bad = np.asarray(settings.bad_px)[:, None]
+        inside = np.all((bad >= blobs.box_px[:, :2] - 1) & (bad <= blobs.box_px[:, 2:] + 1), axis=2)
+        extra = np.where(inside.any(axis=0), np.hypot(extra, MENDED_SIGMA_PX), extra)
+    if not extra.any():
+        return centroids
+    spread = centroids.covariance_px2
+    if spread is not None:
+        spread = spread + (extra**2)[:, None, None] * np.eye(2)
+    return replace(centroids, sigma_px=np.hypot(centroids.sigma_px, extra), covariance_px2=spread)
 
 
 def look(
-    image: NDArray, camera: Camera, settings: Settings, solve: Callable[[Centroids, Clock], Attitude]
+    image: NDArray,
+    camera: Camera,
+    settings: Settings,
+    solve: Callable[[Centroids, Clock], Attitude],
+    streak_px: tuple[float, float] | None = None,
 ) -> Report:
     """A frame through all stages, timed."""
     clock = Clock()
-    centroids = see(image, camera, settings, clock)
+    centroids = see(image, camera, settings, clock, streak_px)
     return Report(solve(centroids, clock), centroids, clock.seconds)
 
 

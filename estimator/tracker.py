@@ -11,18 +11,23 @@ from scipy.optimize import least_squares
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from estimator import catalog, index, ledpairs
+from estimator import catalog, index, starfield, starsky
 from estimator.attitude import SOLVERS, covariance
 from estimator.camera import Camera
 from estimator.chance import ACCEPT_LOG10_CHANCE, MIN_MATCHES, log10_tail
 from estimator.identify import IDENTIFIERS
-from estimator.ledsight import sky_of
 from estimator.stages import Clock, Report, Settings, brightest, direction_sigma_rad, look
+from estimator.starproof import LEAST, Lights
 from estimator.types import Attitude, Centroids, Floats, StarMatch
 
 NO_STARS = "too few stars detected"
 NO_MATCH = "no identification beyond chance"
-LEAST_ERROR_PX = 0.1  # of a star, for what no calibration knows of
+LEAST_ERROR_PX = 0.02  # of a star, for what no calibration knows of
+# By how much lights may be off, in pixels and as a share of the distance from the middle, and how many are looked up
+# before a frame is given up: 200,000 take a hundredth of a second.
+KNOWN_LENS = ((LEAST_ERROR_PX, 0.0, 200_000),)
+UNKNOWN_LENS = ((0.5, 0.0, 200_000), (1.0, 0.005, 1_000_000), (2.0, 0.01, 3_000_000))
+CORNERS = np.array([[0, 0], [1, 0], [0, 1], [1, 1]])
 SETTINGS = Settings()
 
 
@@ -46,17 +51,27 @@ class StarTracker:
     ) -> None:
         self.camera, self.settings = camera, settings
         self.focal_uncertainty = focal_uncertainty
-        self.stars = replace(stars, vectors=vectors)
-        widest = camera.zoomed(1 - focal_uncertainty)
-        field_sr = camera.width_px * camera.height_px / camera.focal_px**2
-        limit = catalog.limit_for_density(stars, field_sr, settings.field_stars)
-        bright = catalog.brighter(self.stars, limit)
-        patterns = catalog.merge_doubles(bright, 3 / camera.focal_px).vectors
-        by_evidence = settings.identifier == "default" and focal_uncertainty == 0
-        self.sight = sky_of(patterns, camera) if by_evidence else None
-        self.index = self.sight.pairs if self.sight else index.build(patterns, widest.diagonal_rad * 1.02)
-        self.stars = catalog.merge_doubles(self.stars, 2 / camera.focal_px)
+        listed = replace(stars, vectors=vectors)
+        self.stars = catalog.merge_doubles(listed, settings.merge_px / camera.focal_px)
         self.tree = cKDTree(self.stars.vectors)
+        field_sr = camera.width_px * camera.height_px / camera.focal_px**2
+        bright = self.stars.take(
+            self.stars.v_mag <= catalog.limit_for_density(self.stars, field_sr, settings.field_stars)
+        )
+        widest_rad = camera.zoomed(1 - focal_uncertainty).diagonal_rad
+        self.sky = starsky.unpaired(self.stars.vectors, self.stars.v_mag)
+        self.patterns: starsky.Sky | None = None
+        self.index: index.PairIndex | None = None
+        if settings.identifier == "default":
+            self.patterns = starsky.sky_of(bright.vectors, bright.v_mag, widest_rad * 1.02)
+            self.pairs = len(self.patterns.pair)
+        else:
+            self.index = index.build(bright.vectors, widest_rad * 1.02)
+            self.pairs = len(self.index.pair)
+        corners = camera.tangents(CORNERS * [camera.width_px, camera.height_px] - 0.5)
+        self.field = np.array(
+            [corners[:, 0].min(), corners[:, 0].max(), corners[:, 1].min(), corners[:, 1].max()]
+        )
 
     def solve(self, image: NDArray) -> Report:
         """One frame to an attitude. Raises BadImage for bad input; anything else that fails is a status."""
@@ -65,8 +80,10 @@ class StarTracker:
     def solve_centroids(self, centroids: Centroids, clock: Clock | None = None) -> Attitude:
         """The stages after centroiding, for centroids from anywhere (the truth included)."""
         clock = clock or Clock()
-        if len(centroids) < MIN_MATCHES:
+        if len(centroids) < LEAST:
             return Attitude(NO_STARS)
+        if self.patterns is not None:
+            return self._by_evidence(centroids, self.patterns, clock)
         for camera, cam_from_ref in self._lost_in_space(centroids):
             clock.lap("identify")
             attitude = self._refined(centroids, camera, cam_from_ref)
@@ -76,20 +93,63 @@ class StarTracker:
         clock.lap("identify")
         return Attitude(NO_MATCH)
 
-    def _lost_in_space(self, centroids: Centroids) -> Iterator[tuple[Camera, Rotation]]:
-        """Attitudes worth refining: by evidence for a camera that is known, else by triangles at each focal length.
+    def lights(self, centroids: Centroids, sigma_px: Floats) -> Lights:
+        """Centroids laid out for the search."""
+        settings = self.settings
+        mag = np.full(len(centroids), np.nan)
+        if settings.zero_point_mag is not None:
+            mag = settings.zero_point_mag - 2.5 * np.log10(centroids.flux)
+        return Lights(
+            self.camera.tangents(centroids.xy_px),
+            sigma_px / self.camera.focal_px,
+            mag,
+            settings.magnitude_sigma,
+            self.field,
+            self.focal_uncertainty,
+        )
 
-        Of those that are possible: a little effort at all before much at any.
+    def _by_evidence(self, centroids: Centroids, patterns: starsky.Sky, clock: Clock) -> Attitude:
+        """Identity, attitude and covariance in one; where the lens is uncertain, it is fitted to all stars then."""
+        for loose_px, slack, checks in UNKNOWN_LENS if self.focal_uncertainty else KNOWN_LENS:
+            sigma_px = np.hypot(centroids.sigma_px, max(self.settings.centroid_sigma_px, loose_px))
+            if slack:
+                from_middle_px = np.linalg.norm(centroids.xy_px - self.camera.centre_px, axis=1)
+                sigma_px = np.hypot(sigma_px, slack * from_middle_px)
+            base = self.settings.base_stars
+            fix = starfield.lost_in_space(self.lights(centroids, sigma_px), patterns, self.sky, base, checks)
+            clock.lap("identify")
+            if not len(fix.star):
+                continue
+            found = self._attitude(centroids, fix, sigma_px)
+            if self.focal_uncertainty:
+                fitted = self._refined(
+                    centroids, self.camera.zoomed(fix.zoom), Rotation.from_quat(fix.cam_from_ref_xyzw)
+                )
+                found = found if not (fitted.solved or slack) else fitted
+            clock.lap("solve")
+            if found.solved:
+                return found
+        return Attitude(NO_MATCH)
+
+    def _attitude(self, centroids: Centroids, fix: starfield.Fix, sigma_px: Floats) -> Attitude:
+        """The answer that a fix is, solved again where another solver is named."""
+        camera = self.camera.zoomed(fix.zoom) if self.focal_uncertainty else self.camera
+        cam_from_ref, covariance_rad2 = Rotation.from_quat(fix.cam_from_ref_xyzw), fix.covariance_rad2
+        solver = self.settings.solver
+        if solver != "default":
+            rays, vectors = camera.rays(centroids.xy_px[fix.observed]), self.stars.vectors[fix.star]
+            sigma_rad = sigma_px[fix.observed] / camera.focal_px
+            cam_from_ref = SOLVERS[solver](rays, vectors, sigma_rad)
+            covariance_rad2 = covariance(rays, sigma_rad, solver)
+        match = StarMatch(fix.observed, fix.star, cam_from_ref, -fix.dex)
+        rms_px = fix.rms * self.camera.focal_px
+        return Attitude("solved", cam_from_ref, covariance_rad2, match, rms_px, camera)
+
+    def _lost_in_space(self, centroids: Centroids) -> Iterator[tuple[Camera, Rotation]]:
+        """Attitudes worth refining, by the identifier that is named.
+
+        Of the focal lengths that are possible: a little effort at all before much at any.
         """
-        if self.sight:
-            few = centroids.take(np.arange(min(len(centroids), self.settings.base_stars)))
-            sigma_rad = np.hypot(
-                direction_sigma_rad(few, self.camera, self.settings), LEAST_ERROR_PX / self.camera.focal_px
-            )
-            found = ledpairs.identify(self.camera.rays(few.xy_px), sigma_rad, self.sight)
-            if isinstance(found, StarMatch):
-                yield self.camera, found.cam_from_ref
-            return
         identify = IDENTIFIERS[self.settings.identifier]
         step, stretch = 0.02, 0.011 if self.focal_uncertainty else 5e-4
         reach = int(np.ceil(self.focal_uncertainty / step - 0.5))
@@ -133,7 +193,14 @@ class StarTracker:
             except ValueError as error:
                 return Attitude(f"no attitude: {error}")
         rows, _ = self._in_field(camera, cam_from_ref)
-        chance = log10_chance(observed, len(centroids), len(rows), radius_px, camera, len(self.index.pair))
+        chance = log10_chance(
+            observed,
+            len(centroids),
+            len(rows),
+            radius_px,
+            camera,
+            self.pairs,
+        )
         if chance > ACCEPT_LOG10_CHANCE:
             return Attitude(NO_MATCH)
         if abs(camera.fov_rad / self.camera.fov_rad - 1) > 1.2 * self.focal_uncertainty + 1e-9:
@@ -142,7 +209,7 @@ class StarTracker:
         return Attitude(
             "solved",
             cam_from_ref,
-            covariance(rays, sigma_rad),
+            covariance(rays, sigma_rad, self.settings.solver),
             StarMatch(observed, star, cam_from_ref, chance),
             float(np.sqrt(np.mean(residual**2))),
             camera,

@@ -41,6 +41,8 @@ class Blobs:
     peak      : (N,) greatest value of the image in the blob
     area_px   : (N,) how many pixels
     background: the level and noise they were found over
+    flag      : (N,) of `judge.Flag`, 0 for a plain star
+    streak_px : (dx, dy) that the frame's stars are smeared by, from either end; None if they are round or few
     """
 
     box_px: Ints
@@ -49,13 +51,15 @@ class Blobs:
     peak: Floats
     area_px: Ints
     background: Background
+    flag: Ints
+    streak_px: tuple[float, float] | None = None
 
     def __len__(self) -> int:
         return len(self.flux)
 
     def take(self, which: NDArray[Any]) -> Blobs:
         """The chosen blobs, by mask or index."""
-        names = ("box_px", "xy_px", "flux", "peak", "area_px")
+        names = ("box_px", "xy_px", "flux", "peak", "area_px", "flag")
         return replace(self, **{name: getattr(self, name)[which] for name in names})
 
 
@@ -64,13 +68,15 @@ class Centroids:
     """Where the light is, brightest first.
 
     xy_px    : (N, 2)
-    sigma_px : (N,) standard deviation of each coordinate
+    sigma_px : (N,) standard deviation of each coordinate; of an uneven one the root of the mean variance
     flux     : (N,) above the background
+    covariance_px2 : (N, 2, 2) where a centroider knows that x and y differ (streaks), else None
     """
 
     xy_px: Floats
     sigma_px: Floats
     flux: Floats
+    covariance_px2: Floats | None = None
 
     def __len__(self) -> int:
         return len(self.flux)
@@ -81,7 +87,8 @@ class Centroids:
 
     def take(self, which: NDArray[Any]) -> Centroids:
         """The chosen centroids, by mask or index."""
-        return Centroids(self.xy_px[which], self.sigma_px[which], self.flux[which])
+        spread = None if self.covariance_px2 is None else self.covariance_px2[which]
+        return Centroids(self.xy_px[which], self.sigma_px[which], self.flux[which], spread)
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from math import sqrt
 
 import numba
+import numpy as np
 
 from estimator.types import Floats
 
@@ -68,3 +69,22 @@ def turn(w: Floats, matrix: Floats) -> None:
     for c in range(3):
         n, m = (c + 1) % 3, (c + 2) % 3
         matrix[2, c] = matrix[0, n] * matrix[1, m] - matrix[0, m] * matrix[1, n]
+
+
+@numba.njit(cache=True)
+def quaternion_xyzw(R: Floats) -> Floats:
+    """(4,) of a rotation matrix, by the greatest of its four numbers (Shepperd 1978)."""
+    q = np.empty(4)
+    trace = R[0, 0] + R[1, 1] + R[2, 2]
+    k = 3
+    for n in range(3):
+        if R[n, n] > (trace if k == 3 else R[k, k]):
+            k = n
+    if k == 3:
+        q[0], q[1], q[2] = R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]
+        q[3] = 1 + trace
+    else:
+        i, j = (k + 1) % 3, (k + 2) % 3
+        q[k] = 1 + R[k, k] - R[i, i] - R[j, j]
+        q[i], q[j], q[3] = R[i, k] + R[k, i], R[j, k] + R[k, j], R[j, i] - R[i, j]
+    return q / sqrt(q[0] ** 2 + q[1] ** 2 + q[2] ** 2 + q[3] ** 2)

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
+from scipy.stats import chi2, kstest
 
-from estimator.filter import OUTSIDE, RESET, TOO_OLD, USED, GyroModel, Mekf, Update
+from estimator.filter import MEMORY_S, OUTSIDE, RESET, TOO_OLD, USED, GyroModel, Mekf, Update
 from estimator.types import FilterState
 
 ARCSEC_RAD = np.pi / 180 / 3600
@@ -208,6 +209,45 @@ def test_the_errors_are_what_the_covariance_says() -> None:
     assert abs(nees[:, 1].mean() - 6) < 4 * np.sqrt(2 * 6 / runs)
 
 
+def test_200_runs_are_within_their_bands_at_many_rates_with_frames_lost_and_out_of_order() -> None:
+    # Bar-Shalom's tests: NEES at the end, NIS of each solution, both within the 95 % band of their chi-squares.
+    # Gyro at 200 Hz, asked for in calls of 1 to 40 samples; solutions at 5 Hz of which a third never comes, and the
+    # others 0.05 to 0.5 s late, so that they overtake one another.
+    runs, seconds, rate_hz = 200, 4, 200
+    gyro, sigma_bias, sigma_attitude = GyroModel(1e-4, 3e-4, 20.0), 3e-4, 0.01
+    spread = np.diag([3e-5, 5e-5, 3e-4]) ** 2
+    t_s = np.arange(seconds * rate_hz + 1) / rate_hz
+    truth, seen_s = tumble_body_from_ref(t_s), np.arange(0.1, seconds - 0.5, 0.2) + 1 / 3000
+    seen = tumble_body_from_ref(np.append(seen_s, seconds))
+    rng = np.random.default_rng(69)
+    nees, nis, overtaken = np.empty(runs), [], 0
+    for run in range(runs):
+        world = drawn(gyro, sigma_bias, t_s, rng)
+        start = Rotation.from_rotvec(sigma_attitude * rng.normal(size=3)) * truth[0]
+        mekf = Mekf(gyro, 0.0, start, sigma_attitude, sigma_bias)
+        arrives_s = seen_s + rng.uniform(0.05, 0.5, len(seen_s))
+        arrives_s[rng.random(len(seen_s)) < 1 / 3] = np.inf
+        waiting = [int(k) for k in np.argsort(arrives_s) if arrives_s[k] < np.inf]
+        overtaken += int(np.sum(np.diff(seen_s[waiting]) < 0))
+        at = 0
+        while at < len(t_s) - 1:
+            rows = slice(at, min(at + int(rng.integers(1, 41)), len(t_s) - 1))
+            mekf.propagate(t_s[1:][rows], world.angle_rad[rows], np.zeros(rows.stop - at, bool))
+            at = rows.stop
+            while waiting and arrives_s[waiting[0]] <= t_s[at]:
+                k = waiting.pop(0)
+                nis.append(mekf.update(seen_s[k], measured(seen[k], spread, rng), spread).distance ** 2)
+        state = mekf.state
+        error = np.concatenate([error_rad(state, truth[-1]), world.bias_rad_s[-1] - state.bias_rad_s])
+        nees[run] = error @ np.linalg.solve(state.covariance, error)
+    assert overtaken > runs
+    for squared, freedom in ((nees, 6), (np.array(nis), 3)):
+        low, high = chi2.ppf([0.025, 0.975], freedom * len(squared)) / len(squared)
+        assert low < squared.mean() < high
+        # The distribution too, not its mean alone: Kolmogorov-Smirnov at 1 %.
+        assert kstest(squared, chi2(freedom).cdf).pvalue > 0.01
+
+
 def test_a_constant_bias_is_found_to_its_sigma() -> None:
     rng, runs, bias = np.random.default_rng(62), 12, 5 * DEG_H_RAD_S
     z, found, samples = np.empty((runs, 3)), np.empty((runs, 3)), np.arange(1, 11) / 10
@@ -298,7 +338,39 @@ def test_a_solution_from_before_the_memory_is_refused() -> None:
     assert np.isnan([*update.residual_rad, update.distance]).all()
     same(before, mekf.state)
     assert mekf.update(20.5, HOME, TRACKER_RAD2).status == USED
-    assert mekf.update(20.4, HOME, TRACKER_RAD2).status == TOO_OLD
+
+
+def test_memory_does_not_grow_and_reaches_half_of_its_span_at_least() -> None:
+    mekf = Mekf(QUIET, 0.0, HOME, 1e-3, 1e-5)
+    for k in range(60):
+        mekf.propagate(k + np.arange(1, 11) / 10, np.zeros((10, 3)), np.zeros(10, bool))
+        if k % 3:
+            assert mekf.update(k + 0.95, HOME, TRACKER_RAD2).status == USED
+        kept_s = 60 if k < 10 else MEMORY_S / 2
+        assert mekf.update(max(k + 1.0 - kept_s, 0.0) + 0.01, HOME, TRACKER_RAD2).status == USED
+    assert mekf.update(45.0, HOME, TRACKER_RAD2).status == TOO_OLD
+    assert sum(len(leg.samples) for leg in mekf._legs) < 10 * (MEMORY_S + 3) + 3 * len(mekf._legs)
+    assert len(mekf._legs) < 3 * MEMORY_S
+
+
+@pytest.mark.parametrize("order", [(1, 0, 2, 3), (3, 2, 1, 0), (2, 3, 0, 1)])
+def test_solutions_in_any_order_end_where_the_right_order_ends(order: tuple[int, ...]) -> None:
+    gyro, rng = GyroModel(1e-4, 3e-4, 20.0), np.random.default_rng(68)
+    t_s = np.arange(401) / 400
+    angle, seen_s = tumble_angle_rad(t_s), np.array([0.2, 0.45125, 0.4513, 0.9])
+    solutions = [measured(truth, TRACKER_RAD2, rng) for truth in tumble_body_from_ref(np.append(seen_s, 1.0))]
+    shuffled, ordered = (Mekf(gyro, 0.0, HOME, 0.01, 1e-3) for _ in range(2))
+    for mekf, rows in ((shuffled, order), (ordered, range(4))):
+        mekf.propagate(t_s[1:], angle, np.zeros(400, bool))
+        for k in rows:
+            assert mekf.update(seen_s[k], solutions[k], TRACKER_RAD2).status == USED
+    # Each is as informative as its own noise, so that leaving one out would show.
+    same(shuffled.state, ordered.state)
+    lacking = Mekf(gyro, 0.0, HOME, 0.01, 1e-3)
+    lacking.propagate(t_s[1:], angle, np.zeros(400, bool))
+    for k in order[1:]:
+        lacking.update(seen_s[k], solutions[k], TRACKER_RAD2)
+    assert np.abs(lacking.state.covariance / ordered.state.covariance - 1).max() > 0.01
 
 
 # ---- A blow beyond the gyro's limit ----

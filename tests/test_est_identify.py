@@ -9,7 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from estimator import catalog, index
 from estimator.camera import Camera
-from estimator.identify import ACCEPT_LOG10_CHANCE, MIN_MATCHES, log10_tail, pyramid
+from estimator.chance import ACCEPT_LOG10_CHANCE, MIN_MATCHES, log10_tail
+from estimator.identify import pyramid
 from estimator.types import Floats, StarMatch
 
 FILE = Path(__file__).parents[1] / "data/catalogues/hipparcos_hp6.5.ecsv"
@@ -66,7 +67,9 @@ class Field:
 def solved(
     xy: Floats, known: index.PairIndex, tolerance_px: float = 1.0, triangles: int = 3000
 ) -> StarMatch | None:
-    return pyramid(CAMERA.rays(xy), known, tolerance_px / CAMERA.focal_px, 5e-4, max_triangles=triangles)
+    return pyramid(
+        CAMERA.rays(xy), known, tolerance_px / CAMERA.focal_px, stretch=5e-4, max_triangles=triangles
+    )
 
 
 @pytest.mark.parametrize(

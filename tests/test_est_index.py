@@ -141,3 +141,26 @@ def test_small_angles_keep_their_digits() -> None:
 def test_a_sky_without_patterns_is_refused() -> None:
     with pytest.raises(ValueError, match=r"1 pairs .*within 1\.00 deg"):
         index.build(np.array([[1.0, 0, 0], [0, 1, 0], [0, 0, 1], [0, 0.001, 1]]), np.radians(1.0))
+
+
+def test_a_range_of_magnitudes_is_brute_force_s() -> None:
+    rng = np.random.default_rng(35)
+    magnitude = np.sort(np.round(rng.uniform(0, 6, 300), 1))  # many are equal
+    known = index.build(uniform_sky(300, seed=36), np.radians(20.0), magnitude=magnitude)
+    for middle, gate in zip(rng.uniform(-1, 7, 100), rng.uniform(0, 1, 100), strict=True):
+        inside = np.flatnonzero((magnitude >= middle - gate) & (magnitude <= middle + gate))
+        begin, end = index.alike(known, middle, gate)
+        assert list(range(begin, end)) == inside.tolist()
+
+
+def test_without_magnitudes_or_a_gate_all_stars_are_alike(sky: index.PairIndex) -> None:
+    known = index.build(uniform_sky(50, seed=37), np.radians(60.0), magnitude=np.linspace(0, 5, 50))
+    assert index.alike(sky, 3.0, 0.1) == (0, 600)
+    assert index.alike(known, np.nan, 0.1) == (0, 50)
+    assert index.alike(known, 3.0, np.inf) == (0, 50)
+
+
+@pytest.mark.parametrize("magnitude", [np.linspace(5, 0, 600), np.zeros(3)])
+def test_magnitudes_that_fall_or_are_too_few_are_refused(magnitude: np.ndarray) -> None:
+    with pytest.raises(ValueError, match=r"of 600 stars; allowed: one for each, the brightest first"):
+        index.build(uniform_sky(600, seed=30), np.radians(18.0), magnitude=magnitude)

@@ -7,12 +7,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from estimator import index
+from estimator.buckets import ARCSEC_RAD, PairCatalogue, bucket_of, bucketed, candidates
 from estimator.camera import Camera
 from estimator.catalog import unit
 from estimator.homecat import Sighting, calibrate
 from estimator.ledmap import LedMap, Lever, project
 from estimator.nearfield import thesis_points
-from estimator.saa import ARCSEC_RAD, PairCatalogue, bucket_of, bucketed, candidates, saa
+from estimator.saa import saa
 from estimator.types import BadImage, Floats, StarMatch
 
 RARE = 1e-4

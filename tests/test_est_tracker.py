@@ -118,7 +118,7 @@ def test_false_centroids_do_not_spoil_the_answer(tracker: StarTracker) -> None:
         assert apart_rad(answer, truth) < 2e-3
 
 
-@pytest.mark.parametrize("count", [0, 1, 3])
+@pytest.mark.parametrize("count", [0, 1, 2])
 def test_too_few_stars_are_a_status(tracker: StarTracker, count: int) -> None:
     answer = tracker.solve_centroids(centroids(np.random.default_rng(84).uniform(0, 400, (count, 2))))
     assert answer.status == NO_STARS

@@ -1,0 +1,48 @@
+"""Frames without a star: how often the tracker answers one. `python -m benchmarks.false_frames [FRAMES] [SEED]`.
+
+Three to thirty lights fall anywhere, with magnitudes of the catalogue's, before the cameras of `lost_in_space`; every
+answer is wrong. A hundred thousand frames take a quarter of an hour.
+"""
+
+from __future__ import annotations
+
+import sys
+from itertools import cycle
+
+import numpy as np
+
+from benchmarks.lost_in_space import WORKLOADS, Workload, sky
+from estimator.stages import Settings
+from estimator.tracker import StarTracker
+from estimator.types import Centroids
+
+LIGHTS = (3, 30)
+
+
+def false_frame(work: Workload, mag: np.ndarray, rng: np.random.Generator) -> Centroids:
+    """Lights that fell anywhere, brightest first."""
+    count = rng.integers(LIGHTS[0], LIGHTS[1] + 1)
+    camera = work.camera
+    xy = rng.uniform(-0.5, [camera.width_px - 0.5, camera.height_px - 0.5], (count, 2))
+    return Centroids(xy, np.full(count, work.noise_px), 10 ** (-0.4 * np.sort(rng.choice(mag, count))))
+
+
+def answered(count: int, seed: int) -> dict[str, tuple[int, int]]:
+    """Frames looked at and frames answered, by camera."""
+    settings = Settings(centroid_sigma_px=0.0, field_stars=1e9, merge_px=0.0, zero_point_mag=0.0)
+    trackers = []
+    for work in WORKLOADS:
+        stars = sky(work.limit_mag)
+        trackers.append((work, stars.v_mag, StarTracker(work.camera, stars, stars.vectors, settings)))
+    out = {work.name: (0, 0) for work in WORKLOADS}
+    for n, (work, mag, tracker) in zip(range(count), cycle(trackers), strict=False):
+        centroids = false_frame(work, mag, np.random.default_rng([seed, n]))
+        looked, wrong = out[work.name]
+        out[work.name] = looked + 1, wrong + tracker.solve_centroids(centroids).solved
+    return out
+
+
+if __name__ == "__main__":
+    count, seed = (int(one) for one in (sys.argv[1:3] + ["100000", "1"][len(sys.argv[1:3]) :]))
+    for name, (looked, wrong) in answered(count, seed).items():
+        print(f"{name:30s} {looked:7d} frames without a star, {wrong} answered")

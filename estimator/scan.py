@@ -1,0 +1,227 @@
+"""The pass over the frame: which pixels stand out, as runs, and the runs that touch, as blobs."""
+
+from __future__ import annotations
+
+from math import floor
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from estimator.skylevel import at, column_sums, filtered, summing
+from estimator.types import Floats, Ints
+
+FIRST_RUNS = 8192  # how many the first pass has room for
+# Columns of a blob's sums. STRONG counts the pixels above the higher threshold, TOP is the highest filtered light.
+AREA, STRONG, FLUX, X, Y, PEAK, TOP, TOP_X, TOP_Y = range(9)
+SUMS = 9
+
+
+def runs_above(image: NDArray, threshold: Floats, taps: Ints | None = None) -> Ints:
+    """(N, 3) y, first x and last x of the runs whose filtered light is above a grid's bilinear threshold.
+
+    Every row is filtered and compared in whole vectors with a bound that is nowhere above the threshold; only the
+    eights of pixels in which one exceeds the bound are looked at closely.
+    taps : (K, 2) x, y offsets over which the filtered image is averaged, for streaks; None for round stars
+    """
+    kind = summing(image.dtype)
+    room = FIRST_RUNS
+    while True:
+        runs = np.empty((room, 3), np.int64)
+        if taps is None:
+            count = _scan(image, threshold, np.empty(image.shape[1] + 2, kind), runs)
+        else:
+            wide = np.float64 if kind == np.float64 else np.int32
+            reach = int(np.abs(taps).max())
+            ring = np.empty((2 * reach + 1, image.shape[1] + 2 * reach), wide)
+            count = _scan_line(image, threshold, taps, np.empty(image.shape[1] + 2, kind), ring, runs)
+        if count <= room:
+            return runs[:count]
+        room = count
+
+
+@numba.njit(cache=True)
+def _scan(image: NDArray, threshold: Floats, sums: NDArray, runs: Ints) -> int:
+    """Fill `runs`; how many there are, which may be more than fit."""
+    height, width = image.shape
+    bound, smooth = np.empty(width, sums.dtype), np.empty(width, sums.dtype)
+    padded = (width + 7) // 8 * 8
+    mask = np.zeros(padded, np.uint8)
+    eights = mask.view(np.uint64)
+    count, cell = 0, -1
+    for y in range(height):
+        cell = _bounds(threshold, height, y, cell, 16.0, bound)
+        column_sums(image, y, sums)
+        left, middle, right = sums[:width], sums[1 : width + 1], sums[2:]
+        for x in range(width):
+            smooth[x] = left[x] + 2 * middle[x] + right[x]
+        for x in range(width):  # a loop of its own, lest the compiler widen the sums
+            mask[x] = smooth[x] > bound[x]
+        for k in range(len(eights)):
+            if eights[k] == 0:
+                continue
+            for x in range(8 * k, min(8 * k + 8, width)):
+                if mask[x] and smooth[x] / 16 > at(threshold, height, width, y, x):
+                    count = _extend(runs, count, y, x)
+    return count
+
+
+@numba.njit(cache=True)
+def _scan_line(
+    image: NDArray, threshold: Floats, taps: Ints, sums: NDArray, ring: NDArray, runs: Ints
+) -> int:
+    """As `_scan`, over the mean of the filtered image at the taps, from a ring of filtered rows."""
+    height, width = image.shape
+    reach = len(ring) // 2
+    bound, line = np.empty(width, ring.dtype), np.empty(width, ring.dtype)
+    count, cell, ready = 0, -1, 0
+    for y in range(height):
+        cell = _bounds(threshold, height, y, cell, 16.0 * len(taps), bound)
+        while ready < min(y + reach + 1, height):
+            _padded_row(image, ready, reach, sums, ring[ready % len(ring)])
+            ready += 1
+        line[:] = 0
+        for k in range(len(taps)):
+            source = ring[min(max(y + taps[k, 1], 0), height - 1) % len(ring)]
+            part = source[reach + taps[k, 0] : reach + taps[k, 0] + width]
+            for x in range(width):
+                line[x] += part[x]
+        for x in range(width):
+            if line[x] > bound[x] and line[x] / (16.0 * len(taps)) > at(threshold, height, width, y, x):
+                count = _extend(runs, count, y, x)
+    return count
+
+
+@numba.njit(cache=True)
+def _padded_row(image: NDArray, y: int, reach: int, sums: NDArray, out: NDArray) -> None:
+    """16 times the filtered row, its ends repeated."""
+    width = image.shape[1]
+    column_sums(image, y, sums)
+    left, middle, right = sums[:width], sums[1 : width + 1], sums[2:]
+    inner = out[reach : reach + width]
+    for x in range(width):
+        inner[x] = left[x] + 2 * middle[x] + right[x]
+    out[:reach], out[reach + width :] = inner[0], inner[width - 1]
+
+
+@numba.njit(cache=True)
+def _extend(runs: Ints, count: int, y: int, x: int) -> int:
+    """Lengthen the last run or begin another."""
+    if 0 < count <= len(runs) and runs[count - 1, 0] == y and runs[count - 1, 2] == x - 1:
+        runs[count - 1, 2] = x
+        return count
+    if count < len(runs):
+        runs[count, 0], runs[count, 1], runs[count, 2] = y, x, x
+    return count + 1
+
+
+@numba.njit(cache=True)
+def _bounds(threshold: Floats, height: int, y: int, cell: int, scale: float, bound: NDArray) -> int:
+    """`scale` times the least threshold of the bilinear cell about every pixel of a row; the row's cell.
+
+    Nothing is done while the row is in the cell of the row before.
+    """
+    rows, columns = threshold.shape
+    width = len(bound)
+    v = min(max((y + 0.5) * rows / height - 0.5, 0.0), rows - 1.0)
+    mine = min(int(v), max(rows - 2, 0))
+    if mine == cell:
+        return cell
+    below = min(mine + 1, rows - 1)
+    for column in range(max(columns - 1, 1)):
+        beside = min(column + 1, columns - 1)
+        upper = min(threshold[mine, column], threshold[mine, beside])
+        least = min(upper, min(threshold[below, column], threshold[below, beside]))
+        if bound.itemsize == 8:
+            value = scale * least
+        elif bound.itemsize == 4:
+            value = floor(min(max(scale * least, -2e9), 2e9))
+        else:  # integer sums are above a number if they are above its floor
+            value = floor(min(max(scale * least, 0.0), 65535.0))
+        # From one tile centre to the next; the outermost reach to the frame's edge.
+        first = 0 if column == 0 else int((column + 0.5) * width / columns)
+        last = width if column >= columns - 2 else int((column + 1.5) * width / columns)
+        bound[first:last] = value
+    return mine
+
+
+@numba.njit(cache=True)
+def labelled(runs: Ints) -> tuple[Ints, int]:
+    """Which blob each run belongs to, eight-connected, numbered from 0 in raster order; and how many blobs.
+
+    Runs of neighbouring rows are met pairwise from left to right; those that touch share a root (union-find).
+    """
+    count = len(runs)
+    parent = np.arange(count)
+    start = end = 0  # the runs of the row above
+    k = 0
+    while k < count:
+        y, first = runs[k, 0], k
+        while k < count and runs[k, 0] == y:
+            k += 1
+        if end > start and runs[start, 0] == y - 1:
+            i, j = start, first
+            while i < end and j < k:
+                if runs[i, 1] <= runs[j, 2] + 1 and runs[j, 1] <= runs[i, 2] + 1:
+                    _join(parent, i, j)
+                if runs[i, 2] < runs[j, 2]:
+                    i += 1
+                else:
+                    j += 1
+        start, end = first, k
+    blob = np.empty(count, np.int64)
+    blobs = 0
+    for n in range(count):  # a root comes before all that hang on it
+        root = _find(parent, n)
+        if root == n:
+            blob[n] = blobs
+            blobs += 1
+        else:
+            blob[n] = blob[root]
+    return blob, blobs
+
+
+@numba.njit(cache=True)
+def _find(parent: Ints, n: int) -> int:
+    while parent[n] != n:
+        parent[n] = parent[parent[n]]
+        n = parent[n]
+    return n
+
+
+@numba.njit(cache=True)
+def _join(parent: Ints, a: int, b: int) -> None:
+    a, b = _find(parent, a), _find(parent, b)
+    if a != b:
+        parent[max(a, b)] = min(a, b)
+
+
+@numba.njit(cache=True)
+def summed(
+    image: NDArray, level: Floats, strong: Floats, runs: Ints, blob: Ints, blobs: int
+) -> tuple[Ints, Floats]:
+    """(blobs, 4) boxes and (blobs, SUMS) sums over every blob's pixels; see the columns' names."""
+    height, width = image.shape
+    boxes = np.empty((blobs, 4), np.int64)
+    boxes[:, :2], boxes[:, 2:] = max(height, width), -1
+    sums = np.zeros((blobs, SUMS))
+    sums[:, PEAK], sums[:, TOP] = -np.inf, -np.inf
+    for n in range(len(runs)):
+        y, x0, x1 = runs[n]
+        box, mine = boxes[blob[n]], sums[blob[n]]
+        box[0], box[1] = min(box[0], x0), min(box[1], y)
+        box[2], box[3] = max(box[2], x1), max(box[3], y)
+        mine[AREA] += x1 - x0 + 1
+        for x in range(x0, x1 + 1):
+            sky = at(level, height, width, y, x)
+            smooth = filtered(image, y, x)
+            light = image[y, x] - sky
+            mine[FLUX] += light
+            mine[X] += light * x
+            mine[Y] += light * y
+            mine[PEAK] = max(mine[PEAK], float(image[y, x]))
+            if smooth - sky > mine[TOP]:
+                mine[TOP], mine[TOP_X], mine[TOP_Y] = smooth - sky, x, y
+            if smooth > at(strong, height, width, y, x):
+                mine[STRONG] += 1
+    return boxes, sums

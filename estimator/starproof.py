@@ -1,0 +1,287 @@
+"""What an attitude under the stars is worth: the stars that it puts where lights are, as evidence."""
+
+from __future__ import annotations
+
+from math import lgamma, log, log10, pi, sqrt
+from typing import NamedTuple
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from estimator import vectors
+from estimator.starsky import MAG_BLUR, MAG_STEP, Sky, nearest
+from estimator.types import Floats
+
+GATE = 3.5  # standard deviations within which a light is a star's: one in 450 is lost
+LEAST = 3  # matches
+MAG_ODD = (
+    0.05  # of the stars have another magnitude than the catalogue's: variables, doubles, what a filter does
+)
+INNER = 0.97  # of the field: a star nearer to its border may be cut off, which is no reason to miss it
+
+
+class Lights(NamedTuple):
+    """What is seen. A plain tuple, so that compiled code can take it.
+
+    tangent : (N, 2) x / z and y / z in camera axes, brightest first;  sigma : (N,) of each
+    mag     : (N,) magnitudes on the catalogue's scale, mag_sigma their error; NaN where they are not known
+    field   : (4,) tangents left, right, top, bottom of the sensor's edges
+    zoom    : the share by which the focal length may differ; 0 for a camera that is known
+    """
+
+    tangent: Floats
+    sigma: Floats
+    mag: Floats
+    mag_sigma: float
+    field: Floats
+    zoom: float
+
+
+class Guess(NamedTuple):
+    """An attitude with what speaks for it.
+
+    observed, star : (K,) rows of lights and stars;  R_cam_from_ref : (3, 3)
+    zoom : the true focal length over the believed;  info : (4, 4) of the small turn in camera axes and of log zoom
+    dex  : evidence in powers of ten
+    """
+
+    observed: NDArray[np.int64]
+    star: NDArray[np.int64]
+    R_cam_from_ref: Floats
+    zoom: float
+    info: Floats
+    dex: float
+
+
+@numba.njit(cache=True, error_model="numpy")
+def nothing() -> Guess:
+    """No attitude."""
+    return Guess(np.empty(0, np.int64), np.empty(0, np.int64), np.eye(3), 1.0, np.eye(4), -np.inf)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def share_at(sky: Sky, mag: float) -> float:
+    """Density of the catalogue's magnitudes at one."""
+    place = int(max(mag - sky.mag[0], 0.0) / MAG_STEP)
+    return sky.share[min(place, len(sky.share) - 1)]
+
+
+@numba.njit(cache=True, error_model="numpy")
+def ray(tangent: Floats, n: int, zoom: float) -> vectors.Vector:
+    """Unit vector of a light for a focal length `zoom` times the believed one."""
+    x, y = tangent[n, 0] / zoom, tangent[n, 1] / zoom
+    inverse = 1 / sqrt(x * x + y * y + 1)
+    return x * inverse, y * inverse, inverse
+
+
+@numba.njit(cache=True, error_model="numpy")
+def volume_dex(lights: Lights) -> float:
+    """log10 of the volume of all attitudes, 8 pi^2, and of all zooms."""
+    return log10(8 * pi * pi) + (log10(2 * lights.zoom) if lights.zoom > 0 else 0.0)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def area(lights: Lights) -> float:
+    return (lights.field[1] - lights.field[0]) * (lights.field[3] - lights.field[2])
+
+
+@numba.njit(cache=True, error_model="numpy")
+def turned(matrix: Floats, u: vectors.Vector) -> vectors.Vector:
+    return (
+        matrix[0, 0] * u[0] + matrix[0, 1] * u[1] + matrix[0, 2] * u[2],
+        matrix[1, 0] * u[0] + matrix[1, 1] * u[1] + matrix[1, 2] * u[2],
+        matrix[2, 0] * u[0] + matrix[2, 1] * u[1] + matrix[2, 2] * u[2],
+    )
+
+
+@numba.njit(cache=True, error_model="numpy")
+def weigh(lights: Lights, sky: Sky, R_cam_from_ref: Floats, zoom: float, gates: Floats) -> Guess:
+    """Match the field at an attitude (turned in place), fit it to the matches, twice, and weigh what they match."""
+    R, info = R_cam_from_ref, np.zeros((4, 4))
+    own = GATE * lights.sigma
+    for turn in range(3):
+        observed, star = _match(lights, sky, R, zoom, gates if turn == 0 else own)
+        if len(observed) < LEAST:
+            return nothing()
+        if turn < 2:
+            zoom = _fit(lights, sky, R, zoom, observed, star, info)
+            if abs(zoom - 1) > 1.2 * lights.zoom + 1e-12:
+                return nothing()
+    missed = _missed(lights, sky, R, zoom, observed, star)
+    dex = _evidence(lights, sky, R, zoom, observed, star, missed, info)
+    return Guess(observed, star, R, zoom, info, dex)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _match(
+    lights: Lights, sky: Sky, R_cam_from_ref: Floats, zoom: float, gates: Floats
+) -> tuple[NDArray, NDArray]:
+    """Each light's nearest star within its gate; of two lights at one star the nearer."""
+    total, count = len(lights.sigma), 0
+    observed, star, gap = np.empty(total, np.int64), np.empty(total, np.int64), np.empty(total)
+    R_ref_from_cam, tangent, vectors_ref = R_cam_from_ref.T.copy(), lights.tangent, sky.vectors
+    cell_first, cell_star, side = sky.cell_first, sky.cell_star, sky.side
+    for n in range(total):
+        x, y, z = turned(R_ref_from_cam, ray(tangent, n, zoom))
+        s, off2 = nearest(vectors_ref, cell_first, cell_star, side, x, y, z, gates[n])
+        if s < 0:
+            continue
+        place = 0
+        while place < count and star[place] != s:
+            place += 1
+        if place == count:
+            count += 1
+        elif off2 >= gap[place]:
+            continue
+        observed[place], star[place], gap[place] = n, s, off2
+    return observed[:count], star[:count]
+
+
+@numba.njit(cache=True, error_model="numpy")
+def predicted(vectors_ref: Floats, R: Floats, star: int) -> vectors.Vector:
+    """A star in camera axes: tangents of x and y, and z."""
+    x, y, z = turned(R, vectors.row(vectors_ref, star))
+    return x / z, y / z, z
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _fit(
+    lights: Lights,
+    sky: Sky,
+    R_cam_from_ref: Floats,
+    zoom: float,
+    observed: NDArray,
+    star: NDArray,
+    info: Floats,
+) -> float:
+    """One Gauss-Newton step of the attitude (in place) and of the zoom (returned), weighted by the lights' errors.
+
+    With t = zoom (x, y) / z and q <- q + w x q the slopes of t_x by w are zoom (-x y / z^2, 1 + x^2 / z^2, -y / z), of
+    t_y zoom (-1 - y^2 / z^2, x y / z^2, x / z), and both by log zoom t itself. Leaves the information in `info`.
+    """
+    count = 4 if lights.zoom > 0 else 3
+    info[:] = 0.0
+    pull, row = np.zeros(4), np.zeros(4)
+    tangent, sigma, vectors_ref = lights.tangent, lights.sigma, sky.vectors
+    for k in range(len(observed)):
+        x, y, _ = predicted(vectors_ref, R_cam_from_ref, star[k])
+        weight = 1 / sigma[observed[k]] ** 2
+        for axis in range(2):
+            if axis == 0:
+                row[0], row[1], row[2], row[3] = -zoom * x * y, zoom * (1 + x * x), -zoom * y, zoom * x
+            else:
+                row[0], row[1], row[2], row[3] = -zoom * (1 + y * y), zoom * x * y, zoom * x, zoom * y
+            residual = tangent[observed[k], axis] - zoom * (y if axis else x)
+            for i in range(count):
+                pull[i] += weight * row[i] * residual
+                for j in range(i + 1):
+                    info[i, j] += weight * row[i] * row[j]
+    factor = info[:count, :count].copy()
+    step = solved(factor, pull[:count])
+    for i in range(4):
+        for j in range(i):
+            info[j, i] = info[i, j]
+    vectors.turn(step[:3], R_cam_from_ref)
+    return zoom * np.exp(step[3]) if count == 4 else zoom
+
+
+@numba.njit(cache=True, error_model="numpy")
+def solved(a: Floats, b: Floats) -> Floats:
+    """x of a x = b by Cholesky; `a` (its lower half) becomes the factor."""
+    n = len(b)
+    x = b.copy()
+    for i in range(n):
+        for j in range(i + 1):
+            for k in range(j):
+                a[i, j] -= a[i, k] * a[j, k]
+            a[i, j] = sqrt(max(a[i, i], 1e-300)) if i == j else a[i, j] / a[j, j]
+        for k in range(i):
+            x[i] -= a[i, k] * x[k]
+        x[i] /= a[i, i]
+    for i in range(n - 1, -1, -1):
+        for k in range(i + 1, n):
+            x[i] -= a[k, i] * x[k]
+        x[i] /= a[i, i]
+    return x
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _missed(lights: Lights, sky: Sky, R: Floats, zoom: float, observed: NDArray, star: NDArray) -> int:
+    """How many stars that are brighter than the faintest match, and well within the field, no light is matched to."""
+    left, right, top, bottom = lights.field * (INNER / zoom)
+    vectors_ref, inside = sky.vectors, 0
+    corner = 1 / sqrt(1 + max(left * left, right * right) + max(top * top, bottom * bottom))
+    for s in range(star.max() + 1):
+        x, y, z = vectors.row(vectors_ref, s)
+        if R[2, 0] * x + R[2, 1] * y + R[2, 2] * z > corner:
+            x, y, z = turned(R, (x, y, z))
+            inside += left * z < x < right * z and top * z < y < bottom * z
+    matched = 0
+    for s in star:
+        x, y, _ = predicted(vectors_ref, R, s)
+        matched += left < x < right and top < y < bottom
+    return inside - matched
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _evidence(
+    lights: Lights,
+    sky: Sky,
+    R: Floats,
+    zoom: float,
+    observed: NDArray,
+    star: NDArray,
+    missed: int,
+    info: Floats,
+) -> float:
+    """How many powers of ten more probable the lights are at this attitude than fallen anywhere (Bayes' factor).
+
+    Each match is worth N(residual) / rho, rho the lights on the sensor's area, and as much for the magnitude; that so
+    many of the stars are seen and so many are not is B(m + 1, k + 1), every share being as probable before; and the
+    attitude is one among all: sqrt(2 pi)^n / sqrt(det info) of their volume (Laplace's integral over it). Among lights
+    that fell anywhere evidence beyond 10^x for any attitude is met once in 10^x frames at most (Markov's inequality).
+    """
+    count = 4 if lights.zoom > 0 else 3
+    factor = info[:count, :count].copy()
+    solved(factor, np.zeros(count))
+    total = 0.5 * count * log10(2 * pi) - volume_dex(lights)
+    for i in range(count):
+        total -= log10(factor[i, i])
+    tangent, sigma, vectors_ref = lights.tangent, lights.sigma, sky.vectors
+    as_bright = _share_to(sky, lights.mag)
+    for k in range(len(observed)):
+        # Any number of false lights being as probable, n of them are n! / (n - m)! times as many as n - m.
+        density = (len(sigma) - k) / area(lights)
+        x, y, _ = predicted(vectors_ref, R, star[k])
+        variance = sigma[observed[k]] ** 2
+        off2 = (tangent[observed[k], 0] - zoom * x) ** 2 + (tangent[observed[k], 1] - zoom * y) ** 2
+        total -= off2 / variance / 2 / log(10.0) + log10(2 * pi * variance * density)
+        total += _mag_dex(lights, sky, observed[k], star[k], as_bright)
+    seen = float(len(observed))
+    return total + (lgamma(seen + 1) + lgamma(missed + 1.0) - lgamma(seen + missed + 2)) / log(10.0)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _share_to(sky: Sky, mag: Floats) -> float:
+    """Share of the stars that are as bright as the faintest of the lights."""
+    faintest = mag[0]
+    for one in mag:
+        faintest = max(faintest, one)
+    if not np.isfinite(faintest):
+        return 1.0
+    return max(np.searchsorted(sky.mag, faintest + MAG_BLUR), 1) / len(sky.mag)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _mag_dex(lights: Lights, sky: Sky, light: int, star: int, as_bright: float) -> float:
+    """What a light's magnitude says for a star, dex: N(difference) over its density among stars as bright as these.
+
+    MAG_ODD of the stars have any magnitude.
+    """
+    off = lights.mag[light] - sky.mag[star]
+    if not np.isfinite(off):
+        return 0.0
+    share = share_at(sky, lights.mag[light]) / as_bright
+    likely = np.exp(-0.5 * (off / lights.mag_sigma) ** 2) / lights.mag_sigma / sqrt(2 * pi)
+    return log10(MAG_ODD + (1 - MAG_ODD) * likely / share)
