@@ -8,7 +8,6 @@ length is only known within a share, the pair's own angle tells it, and the rest
 from __future__ import annotations
 
 from math import log10, pi, sqrt
-from typing import NamedTuple
 
 import numba
 import numpy as np
@@ -18,14 +17,14 @@ from estimator import vectors
 from estimator.starproof import (
     GATE,
     LEAST,
+    Fix,
     Guess,
     Lights,
     area,
+    fixed,
     nothing,
-    predicted,
     ray,
     share_at,
-    solved,
     turned,
     volume_dex,
     weigh,
@@ -49,23 +48,6 @@ MAG_GATE = (
 PATIENCE = 4  # lights without a star, before an attitude is given up in the first round
 
 
-class Fix(NamedTuple):
-    """An attitude from all lights and stars.
-
-    observed, star : (K,) rows; none where there is no attitude
-    cam_from_ref_xyzw : (4,);  covariance_rad2 : (3, 3) of the small turn in camera axes
-    zoom : the true focal length over the believed;  rms : of the residuals, tangents;  dex : evidence in powers of ten
-    """
-
-    observed: NDArray[np.int64]
-    star: NDArray[np.int64]
-    cam_from_ref_xyzw: Floats
-    covariance_rad2: Floats
-    zoom: float
-    rms: float
-    dex: float
-
-
 @numba.njit(cache=True, error_model="numpy")
 def lost_in_space(lights: Lights, patterns: Sky, stars: Sky, base_lights: int, max_checks: int) -> Fix:
     """Which of the stars all the lights are: sought among the brightest lights and the patterns, told by all.
@@ -83,31 +65,14 @@ def lost_in_space(lights: Lights, patterns: Sky, stars: Sky, base_lights: int, m
     )
     found = search(head, patterns, max_checks)
     if found.dex < ACCEPT_DEX:
-        return _fixed(lights, stars, nothing())
+        return fixed(lights, stars, nothing())
     whole = weigh(lights, stars, found.R_cam_from_ref.copy(), found.zoom, 1.5 * GATE * lights.sigma)
     if 2 * len(whole.observed) <= len(found.observed):
-        return _fixed(lights, stars, nothing())
+        return fixed(lights, stars, nothing())
     best = Guess(
         whole.observed, whole.star, whole.R_cam_from_ref, whole.zoom, whole.info, max(whole.dex, found.dex)
     )
-    return _fixed(lights, stars, best)
-
-
-@numba.njit(cache=True, error_model="numpy")
-def _fixed(lights: Lights, stars: Sky, guess: Guess) -> Fix:
-    """A guess with its errors. The covariance is of the attitude with the zoom unknown, where it is."""
-    covariance, total, count = np.zeros((3, 3)), 0.0, 4 if lights.zoom > 0 else 3
-    for axis in range(3):
-        unit = np.zeros(count)
-        unit[axis] = 1.0
-        covariance[axis] = solved(guess.info[:count, :count].copy(), unit)[:3]
-    for k in range(len(guess.star)):
-        x, y, _ = predicted(stars.vectors, guess.R_cam_from_ref, guess.star[k])
-        tx, ty = lights.tangent[guess.observed[k], 0], lights.tangent[guess.observed[k], 1]
-        total += (tx - guess.zoom * x) ** 2 + (ty - guess.zoom * y) ** 2
-    rms = sqrt(total / max(2 * len(guess.star), 1))
-    xyzw = vectors.quaternion_xyzw(guess.R_cam_from_ref)
-    return Fix(guess.observed, guess.star, xyzw, covariance, guess.zoom, rms, guess.dex)
+    return fixed(lights, stars, best)
 
 
 @numba.njit(cache=True, error_model="numpy")

@@ -54,6 +54,23 @@ class Guess(NamedTuple):
     dex: float
 
 
+class Fix(NamedTuple):
+    """An attitude from all lights and stars.
+
+    observed, star : (K,) rows; none where there is no attitude
+    cam_from_ref_xyzw : (4,);  covariance_rad2 : (3, 3) of the small turn in camera axes
+    zoom : the true focal length over the believed;  rms : of the residuals, tangents;  dex : evidence in powers of ten
+    """
+
+    observed: NDArray[np.int64]
+    star: NDArray[np.int64]
+    cam_from_ref_xyzw: Floats
+    covariance_rad2: Floats
+    zoom: float
+    rms: float
+    dex: float
+
+
 @numba.njit(cache=True, error_model="numpy")
 def nothing() -> Guess:
     """No attitude."""
@@ -285,3 +302,20 @@ def _mag_dex(lights: Lights, sky: Sky, light: int, star: int, as_bright: float) 
     share = share_at(sky, lights.mag[light]) / as_bright
     likely = np.exp(-0.5 * (off / lights.mag_sigma) ** 2) / lights.mag_sigma / sqrt(2 * pi)
     return log10(MAG_ODD + (1 - MAG_ODD) * likely / share)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def fixed(lights: Lights, stars: Sky, guess: Guess) -> Fix:
+    """A guess with its errors. The covariance is of the attitude with the zoom unknown, where it is."""
+    covariance, total, count = np.zeros((3, 3)), 0.0, 4 if lights.zoom > 0 else 3
+    for axis in range(3):
+        unit = np.zeros(count)
+        unit[axis] = 1.0
+        covariance[axis] = solved(guess.info[:count, :count].copy(), unit)[:3]
+    for k in range(len(guess.star)):
+        x, y, _ = predicted(stars.vectors, guess.R_cam_from_ref, guess.star[k])
+        tx, ty = lights.tangent[guess.observed[k], 0], lights.tangent[guess.observed[k], 1]
+        total += (tx - guess.zoom * x) ** 2 + (ty - guess.zoom * y) ** 2
+    rms = sqrt(total / max(2 * len(guess.star), 1))
+    xyzw = vectors.quaternion_xyzw(guess.R_cam_from_ref)
+    return Fix(guess.observed, guess.star, xyzw, covariance, guess.zoom, rms, guess.dex)

@@ -17,7 +17,7 @@ from estimator.camera import Camera
 from estimator.chance import ACCEPT_LOG10_CHANCE, MIN_MATCHES, log10_tail
 from estimator.identify import IDENTIFIERS
 from estimator.stages import Clock, Report, Settings, brightest, direction_sigma_rad, look
-from estimator.starproof import LEAST, Lights
+from estimator.starproof import LEAST, Fix, Lights
 from estimator.types import Attitude, Centroids, Floats, StarMatch
 
 NO_STARS = "too few stars detected"
@@ -93,6 +93,14 @@ class StarTracker:
         clock.lap("identify")
         return Attitude(NO_MATCH)
 
+    def sigma_px(self, centroids: Centroids, loose_px: float = LEAST_ERROR_PX, slack: float = 0.0) -> Floats:
+        """(N,) a centroid's error all told: its own, the floor, and a share of the distance from the middle."""
+        sigma_px = np.hypot(centroids.sigma_px, max(self.settings.centroid_sigma_px, loose_px))
+        if slack == 0:
+            return sigma_px
+        from_middle_px = np.linalg.norm(centroids.xy_px - self.camera.centre_px, axis=1)
+        return np.hypot(sigma_px, slack * from_middle_px)
+
     def lights(self, centroids: Centroids, sigma_px: Floats) -> Lights:
         """Centroids laid out for the search."""
         settings = self.settings
@@ -111,16 +119,13 @@ class StarTracker:
     def _by_evidence(self, centroids: Centroids, patterns: starsky.Sky, clock: Clock) -> Attitude:
         """Identity, attitude and covariance in one; where the lens is uncertain, it is fitted to all stars then."""
         for loose_px, slack, checks in UNKNOWN_LENS if self.focal_uncertainty else KNOWN_LENS:
-            sigma_px = np.hypot(centroids.sigma_px, max(self.settings.centroid_sigma_px, loose_px))
-            if slack:
-                from_middle_px = np.linalg.norm(centroids.xy_px - self.camera.centre_px, axis=1)
-                sigma_px = np.hypot(sigma_px, slack * from_middle_px)
+            sigma_px = self.sigma_px(centroids, loose_px, slack)
             base = self.settings.base_stars
             fix = starfield.lost_in_space(self.lights(centroids, sigma_px), patterns, self.sky, base, checks)
             clock.lap("identify")
             if not len(fix.star):
                 continue
-            found = self._attitude(centroids, fix, sigma_px)
+            found = self.attitude_of(centroids, fix, sigma_px)
             if self.focal_uncertainty:
                 fitted = self._refined(
                     centroids, self.camera.zoomed(fix.zoom), Rotation.from_quat(fix.cam_from_ref_xyzw)
@@ -131,7 +136,7 @@ class StarTracker:
                 return found
         return Attitude(NO_MATCH)
 
-    def _attitude(self, centroids: Centroids, fix: starfield.Fix, sigma_px: Floats) -> Attitude:
+    def attitude_of(self, centroids: Centroids, fix: Fix, sigma_px: Floats) -> Attitude:
         """The answer that a fix is, solved again where another solver is named."""
         camera = self.camera.zoomed(fix.zoom) if self.focal_uncertainty else self.camera
         cam_from_ref, covariance_rad2 = Rotation.from_quat(fix.cam_from_ref_xyzw), fix.covariance_rad2
@@ -192,7 +197,7 @@ class StarTracker:
                 cam_from_ref = SOLVERS[self.settings.solver](rays, vectors, sigma_rad)
             except ValueError as error:
                 return Attitude(f"no attitude: {error}")
-        rows, _ = self._in_field(camera, cam_from_ref)
+        rows, _ = self.in_field(camera, cam_from_ref)
         chance = log10_chance(
             observed,
             len(centroids),
@@ -215,7 +220,7 @@ class StarTracker:
             camera,
         )
 
-    def _in_field(self, camera: Camera, cam_from_ref: Rotation) -> tuple[NDArray, Floats]:
+    def in_field(self, camera: Camera, cam_from_ref: Rotation) -> tuple[NDArray, Floats]:
         """Rows and pixels of the catalogue stars on the sensor."""
         boresight = cam_from_ref.inv().apply([0.0, 0.0, 1.0])
         rows = np.array(
@@ -230,7 +235,7 @@ class StarTracker:
         self, centroids: Centroids, camera: Camera, cam_from_ref: Rotation, radius_px: float
     ) -> tuple[NDArray, NDArray]:
         """Pairs of centroid and catalogue star that are each other's nearest within a radius."""
-        rows, xy = self._in_field(camera, cam_from_ref)
+        rows, xy = self.in_field(camera, cam_from_ref)
         return mutual(centroids.xy_px, xy, radius_px, rows)
 
 
