@@ -124,6 +124,7 @@ def disc(image: NDArray, blobs: Blobs, gain_e_dn: float = 1.0, hints: Hints = NO
 
 
 CENTROIDERS: dict[str, Centroider] = {
+    "default": streak,
     "cog": cog,
     "weighted": weighted,
     "gaussian_window": gaussian_window,

@@ -154,8 +154,9 @@ def check(image: NDArray) -> None:
     if image.ndim != 2:
         raise BadImage(f"an image of shape {image.shape} is not monochrome; allowed: (height, width)")
     check_size(image)
-    if image.dtype.kind != "f" and image[0, 0] != image[-1, -1]:
-        return  # integers cannot be NaN, and these are uneven
+    some = image[::97, ::89]
+    if image.dtype.kind != "f" and some.min() != some.max():
+        return  # integers cannot be NaN, and some of these are uneven
     low, high = image.min(), image.max()
     if not (np.isfinite(low) and np.isfinite(high)):
         raise BadImage("the image holds NaN or infinite pixels; allowed: finite values")

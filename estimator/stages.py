@@ -17,9 +17,8 @@ from estimator.judge import NO_STAR, Flag
 from estimator.types import Attitude, BadImage, Blobs, Centroids, Floats, Ints
 
 SATURATED = "the frame is saturated"
-SATURATED_SIGMA_PX = (
-    0.05  # a plateau's edge falls by whole pixels: .01 to .07 by Monte Carlo, as it is cut off deeper
-)
+# A plateau's edge falls by whole pixels: 0.01 to 0.07 by Monte Carlo, as it is cut off deeper.
+SATURATED_SIGMA_PX = 0.05
 MENDED_SIGMA_PX = 0.06  # of a star on a bad pixel, for the guess at what that would have held: Monte Carlo
 
 
@@ -38,7 +37,7 @@ class Settings:
     """
 
     detector: str = "default"
-    centroider: str = "cog"
+    centroider: str = "default"
     identifier: str = "default"
     solver: str = "default"
     threshold_sigma: float = 5.0
@@ -92,7 +91,7 @@ def see(
     """
     check_shape(image.shape, camera)
     if np.isfinite(settings.saturation):
-        some = image[::8]  # enough to tell a half
+        some = image[::13, ::7]  # enough to tell a half
         if np.count_nonzero(some >= settings.saturation) > 0.5 * some.size:
             raise BadImage(f"{SATURATED}: over half of its pixels are at {settings.saturation:g}")
     if settings.bad_px is not None:

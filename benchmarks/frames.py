@@ -1,0 +1,161 @@
+"""From image to attitude, lost in space, beside tetra3rs. `python -m benchmarks.frames [FRAMES] [SEED]`.
+
+Frames are painted here: Gaussian stars of the Hipparcos catalogue along a streak, photon and read noise. Both solve
+one by one on one core; the errors are those of the boresight's place, in arcsec, over the frames that were solved.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from estimator import catalog
+from estimator.camera import Camera
+from estimator.stages import Settings
+from estimator.tracker import StarTracker
+from skysim.quantity import ARCSEC_RAD
+from skysim.scene import CATALOGUES
+
+WRONG_RAD = np.radians(10 / 60)
+STEP_PX = 0.1  # of a streak
+
+
+@dataclass(frozen=True)
+class Sight:
+    """A camera and what it sees.
+
+    zero_e : electrons of a star of magnitude 0; deepest : magnitude of the faintest that is painted
+    gain_e : electrons a count; depth : its greatest count
+    """
+
+    name: str
+    camera: Camera
+    zero_e: float
+    deepest: float
+    sky_e: float
+    read_e: float
+    gain_e: float
+    depth: int
+    psf_px: float = 0.7
+    streak_px: float = 0.0
+
+
+EC655 = Camera.from_fov(659, 493, float(np.radians(14.87)))
+SQUARE = Camera.from_fov(1024, 1024, float(np.radians(13.5)))  # holds 22 stars brighter than 6
+LIEBE_E = 6008 * 10 ** (0.4 * 4)  # EC655, f/1.4, 50 ms: a star of magnitude 4 gives 6008 e
+SIGHTS = (
+    Sight("EC655, 50 ms", EC655, LIEBE_E, 7.0, 60, 15, 16, 4095),
+    Sight("1024 x 1024", SQUARE, LIEBE_E, 7.0, 60, 15, 16, 4095, psf_px=0.9),
+    Sight("1024 x 1024, smear of 12 px", SQUARE, LIEBE_E, 7.0, 60, 15, 16, 4095, psf_px=0.9, streak_px=12),
+)
+
+
+@numba.njit(cache=True)
+def paint(light: NDArray, xy: NDArray, flux: NDArray, ends: NDArray, psf_px: float) -> None:
+    """Gaussians of each flux, spread evenly along streaks of (dx, dy) about xy."""
+    reach, height, width = int(5 * psf_px) + 2, *light.shape
+    for n in range(len(xy)):
+        steps = int(np.hypot(ends[n, 0], ends[n, 1]) / STEP_PX) + 1
+        for k in range(steps):
+            along = (k + 0.5) / steps - 0.5
+            x, y = xy[n, 0] + along * ends[n, 0], xy[n, 1] + along * ends[n, 1]
+            for row in range(max(round(y) - reach, 0), min(round(y) + reach + 1, height)):
+                down = np.exp(-((row - y) ** 2) / 2 / psf_px**2)
+                for column in range(max(round(x) - reach, 0), min(round(x) + reach + 1, width)):
+                    across = np.exp(-((column - x) ** 2) / 2 / psf_px**2)
+                    light[row, column] += flux[n] / steps * down * across / (2 * np.pi * psf_px**2)
+
+
+def photograph(sight: Sight, stars: catalog.StarList, rng: np.random.Generator) -> tuple[NDArray, Rotation]:
+    """One frame and the attitude at mid-exposure."""
+    camera, truth = sight.camera, Rotation.random(rng=rng)
+    xy = camera.pixels(truth.apply(stars.vectors))
+    inside = camera.contains(np.nan_to_num(xy, nan=-1e9), -10.0)
+    angle = rng.uniform(0, 2 * np.pi)
+    ends = np.tile(sight.streak_px * np.array([np.cos(angle), np.sin(angle)]), (inside.sum(), 1))
+    light = np.full((camera.height_px, camera.width_px), sight.sky_e)
+    paint(light, xy[inside], sight.zero_e * 10 ** (-0.4 * stars.v_mag[inside]), ends, sight.psf_px)
+    noisy = rng.poisson(light) + rng.normal(0, sight.read_e, light.shape)
+    return np.clip(noisy / sight.gain_e + 16, 0, sight.depth).astype(np.uint16), truth
+
+
+Solve = Callable[[NDArray], Rotation | None]
+
+
+def ours(sight: Sight, stars: catalog.StarList) -> Solve:
+    """Our tracker as it comes, told the camera and its gain."""
+    settings = Settings(gain_e_dn=sight.gain_e, saturation=sight.depth, centroid_sigma_px=0.03)
+    tracker = StarTracker(sight.camera, stars, stars.vectors, settings)
+    return lambda image: tracker.solve(image).attitude.cam_from_ref
+
+
+def tetra3rs(sight: Sight, stars: catalog.StarList, fast: bool) -> Solve | None:
+    """tetra3rs with its own catalogue, where it is installed (extra `oracle`), on one thread."""
+    if importlib.util.find_spec("tetra3rs") is None:
+        return None
+    import tetra3rs as peer
+
+    fov_deg = float(np.degrees(sight.camera.fov_rad))
+    database = peer.SolverDatabase.generate_from_gaia(
+        max_fov_deg=fov_deg * 1.1, epoch_proper_motion_year=1991.25
+    )
+    shape = (sight.camera.height_px, sight.camera.width_px)
+    model = peer.CameraModel(sight.camera.focal_px, shape[1], shape[0])
+    extract = peer.extract_centroids_fast if fast else peer.extract_centroids
+
+    def solve(image: NDArray) -> Rotation | None:
+        found = extract(image, max_centroids=40, threads=1)
+        answer = database.solve_from_centroids(found.centroids, camera_model=model)
+        matrix = getattr(answer, "rotation_matrix_icrs_to_camera", None)
+        return None if matrix is None else Rotation.from_matrix(np.asarray(matrix))
+
+    return solve
+
+
+def compare(sight: Sight, solvers: dict[str, Solve | None], frames: list[tuple[NDArray, Rotation]]) -> None:
+    """A line a solver, frame by frame side by side."""
+    known = {name: solve for name, solve in solvers.items() if solve is not None}
+    ms: dict[str, list[float]] = {name: [] for name in known}
+    off: dict[str, list[NDArray]] = {name: [] for name in known}
+    for solve in known.values():
+        solve(frames[0][0])  # compiles
+    for image, truth in frames:
+        for name, solve in known.items():
+            begin = time.perf_counter()
+            answer = solve(image)
+            ms[name].append(1e3 * (time.perf_counter() - begin))
+            if answer is not None:
+                off[name].append((answer * truth.inv()).as_rotvec())
+    for name in known:
+        turn = np.array(off[name]).reshape(-1, 3)
+        right = np.linalg.norm(turn, axis=1) < WRONG_RAD
+        cross = np.hypot(turn[right, 0], turn[right, 1]) / ARCSEC_RAD
+        print(
+            f"{sight.name:28s} {name:14s} {100 * right.sum() / len(frames):8.2f} {100 * (~right).sum() / len(frames):7.2f}"
+            f" {np.median(ms[name]):8.3f} {np.percentile(ms[name], 99):8.2f}"
+            f" {np.median(cross):8.2f} {np.sqrt(np.mean(cross**2)):8.2f}",
+            flush=True,
+        )
+
+
+if __name__ == "__main__":
+    count, seed = (int(one) for one in (sys.argv[1:3] + ["300", "1"][len(sys.argv[1:3]) :]))
+    print(f'{"":28s} {"":14s} solved %  wrong %       ms   p99 ms   cross"    rms"')
+    stars = catalog.read(CATALOGUES / "hipparcos_hp6.5.ecsv")
+    for sight in SIGHTS:
+        deep = catalog.brighter(stars, sight.deepest)
+        shots = [photograph(sight, deep, np.random.default_rng([seed, n])) for n in range(count)]
+        solvers = {
+            "ours": ours(sight, deep),
+            "tetra3rs fast": tetra3rs(sight, deep, True),
+            "tetra3rs": tetra3rs(sight, deep, False),
+        }
+        compare(sight, solvers, shots)
