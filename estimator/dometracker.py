@@ -89,9 +89,12 @@ class DomeTracker:
         reach_m = np.linalg.norm(leds.position_m, axis=1).min() - np.linalg.norm(lever.camera_body_m)
         self.led_sigma_rad = float(leds.sigma_m / reach_m)
 
-    def solve(self, image: NDArray) -> Report:
-        """One frame to an attitude. Raises BadImage for bad input; anything else that fails is a status."""
-        return look(image, self.camera, self.settings, self.solve_centroids)
+    def solve(self, image: NDArray, streak_px: tuple[float, float] | None = None) -> Report:
+        """One frame to an attitude. Raises BadImage for bad input; anything else that fails is a status.
+
+        streak_px : (dx, dy) that stars move in the exposure, from the gyro; None where there is none
+        """
+        return look(image, self.camera, self.settings, self.solve_centroids, streak_px)
 
     def solve_centroids(self, centroids: Centroids, clock: Clock | None = None) -> Attitude:
         """The stages after centroiding, for centroids from anywhere (the truth included)."""

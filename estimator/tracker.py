@@ -18,7 +18,7 @@ from estimator.chance import ACCEPT_LOG10_CHANCE, MIN_MATCHES, log10_tail
 from estimator.identify import IDENTIFIERS
 from estimator.stages import Clock, Report, Settings, brightest, direction_sigma_rad, look
 from estimator.starproof import LEAST, Fix, Lights
-from estimator.types import Attitude, Centroids, Floats, StarMatch
+from estimator.types import Attitude, Centroids, Floats, Ints, StarMatch
 
 NO_STARS = "too few stars detected"
 NO_MATCH = "no identification beyond chance"
@@ -73,9 +73,12 @@ class StarTracker:
             [corners[:, 0].min(), corners[:, 0].max(), corners[:, 1].min(), corners[:, 1].max()]
         )
 
-    def solve(self, image: NDArray) -> Report:
-        """One frame to an attitude. Raises BadImage for bad input; anything else that fails is a status."""
-        return look(image, self.camera, self.settings, self.solve_centroids)
+    def solve(self, image: NDArray, streak_px: tuple[float, float] | None = None) -> Report:
+        """One frame to an attitude. Raises BadImage for bad input; anything else that fails is a status.
+
+        streak_px : (dx, dy) that stars move in the exposure, from the gyro; None where there is none
+        """
+        return look(image, self.camera, self.settings, self.solve_centroids, streak_px)
 
     def solve_centroids(self, centroids: Centroids, clock: Clock | None = None) -> Attitude:
         """The stages after centroiding, for centroids from anywhere (the truth included)."""
@@ -92,6 +95,28 @@ class StarTracker:
                 return attitude
         clock.lap("identify")
         return Attitude(NO_MATCH)
+
+    def solve_named(self, centroids: Centroids, observed: Ints, star: Ints) -> Attitude:
+        """The attitude alone, for names from anywhere (the truth included): centroids `observed` are the stars `star`.
+
+        Both (K,), K >= 2; `star` are rows of `self.stars`. Nothing is held against chance: its log10 is NaN.
+        """
+        sigma_px = self.sigma_px(centroids)[observed]
+        rays, vectors = self.camera.rays(centroids.xy_px[observed]), self.stars.vectors[star]
+        sigma_rad = sigma_px / self.camera.focal_px
+        try:
+            cam_from_ref = SOLVERS[self.settings.solver](rays, vectors, sigma_rad)
+        except ValueError as error:
+            return Attitude(f"no attitude: {error}")
+        residual = self.camera.pixels(cam_from_ref.apply(vectors)) - centroids.xy_px[observed]
+        return Attitude(
+            "solved",
+            cam_from_ref,
+            covariance(rays, sigma_rad, self.settings.solver),
+            StarMatch(observed, star, cam_from_ref, float("nan")),
+            float(np.sqrt(np.mean(residual**2))),
+            self.camera,
+        )
 
     def sigma_px(self, centroids: Centroids, loose_px: float = LEAST_ERROR_PX, slack: float = 0.0) -> Floats:
         """(N,) a centroid's error all told: its own, the floor, and a share of the distance from the middle."""

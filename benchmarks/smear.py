@@ -1,0 +1,122 @@
+"""How fast SHEFEX-2 may turn before its stars are lost: the paper's own chain and the default one, on the same frames.
+
+`python -m benchmarks.smear [FRAMES] [SEED]`: scene shefex2's camera at 50 ms, turning across the boresight at random
+attitudes that look south, for which their catalogue was made. Samaan & Theil (2011) found stars mostly identified to
+2 deg/s and rarely above 4. Their chain: one scan of the frame, no more than 15 centroids, centres of gravity, triangles
+and pyramids over their 2,023 stars, QUEST. The default one is told the streak by a gyro, or finds it itself.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from estimator import catalog, shefexcat
+from estimator.stages import Settings
+from estimator.tracker import StarTracker
+from estimator.types import BadImage
+from skysim import simulate
+from skysim.onboard import calibration
+from skysim.scene import CATALOGUES, load
+from skysim.types import Frame, Trajectory
+
+RATES_DEG_S = (0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0)
+WRONG_RAD = np.radians(10 / 60)
+FRAME_S = 0.1
+KNOT_S = 0.5e-3
+
+Streak = tuple[float, float] | None
+
+
+def frames(
+    lab: simulate.Lab, rate_deg_s: float, count: int, seed: int
+) -> Iterator[tuple[Frame, Rotation, Streak]]:
+    """Frames at random attitudes, each turning about a random axis across the boresight; cam_from_icrs, streak."""
+    for n in range(count):
+        rng = np.random.default_rng([seed, n])
+        middle, angle = southern(rng), rng.uniform(0, 2 * np.pi)
+        rate_cam = np.radians(rate_deg_s) * np.array([np.cos(angle), np.sin(angle), 0.0])
+        t_s = n * FRAME_S + np.arange(-10, 200) * KNOT_S
+        cam_from_icrs = Rotation.from_rotvec(np.outer(t_s - n * FRAME_S - 0.025, rate_cam)) * middle
+        lab_from_body = cam_from_icrs.inv() * lab.mount.cam_from_body
+        rate_body = lab.mount.cam_from_body.inv().apply(rate_cam)
+        trajectory = Trajectory(t_s, lab_from_body, np.tile(rate_body, (len(t_s), 1)))
+        frame, truth = simulate.shoot(replace(lab, trajectory=trajectory), n)
+        yield frame, truth.cam_from_lab, streak_of(rate_cam, lab)
+
+
+def southern(rng: np.random.Generator) -> Rotation:
+    """A random attitude whose boresight is south of the equator."""
+    while True:
+        cam_from_icrs = Rotation.random(rng=rng)
+        if cam_from_icrs.as_matrix()[2, 2] < 0:
+            return cam_from_icrs
+
+
+def streak_of(rate_cam_rad_s: np.ndarray, lab: simulate.Lab) -> tuple[float, float]:
+    """How far stars in the middle move: d(x / z)/dt = -w_y, d(y / z)/dt = w_x."""
+    reach_px = lab.scene.exposure.time_s * lab.scene.camera.focal_px
+    return -rate_cam_rad_s[1] * reach_px, rate_cam_rad_s[0] * reach_px
+
+
+def solved(tracker: StarTracker, frame: Frame, truth: Rotation, streak_px: Streak) -> tuple[bool, bool]:
+    """Whether a frame is solved rightly, and wrongly."""
+    try:
+        answer = tracker.solve(frame.image_dn, streak_px).attitude.cam_from_ref
+    except BadImage:
+        return False, False
+    right = answer is not None and (answer * truth.inv()).magnitude() < WRONG_RAD
+    return right, answer is not None and not right
+
+
+def chains(lab: simulate.Lab) -> dict[str, StarTracker]:
+    """The paper's chain with its chosen catalogue, and the default one with the paper's limit of magnitude."""
+    camera, scene = calibration(lab.scene.camera), lab.scene
+    stars = catalog.read(CATALOGUES / "hipparcos_hp6.5.ecsv")
+    observer = catalog.on_earth(scene.start_time)
+    theirs = shefexcat.chosen(stars)
+    ours = catalog.brighter(stars, scene.tracker.limit_mag)
+    gain = scene.camera.detector.gain_e_dn
+    paper = Settings(
+        detector="sequential",
+        centroider="cog",
+        identifier="shefex",
+        solver="quest",
+        max_blobs=15,
+        base_stars=15,
+        gain_e_dn=gain,
+    )
+    default = Settings(gain_e_dn=gain, centroid_sigma_px=scene.tracker.centroid_sigma_px)
+    return {
+        "paper": StarTracker(camera, theirs, catalog.apparent(theirs, observer), paper),
+        "default": StarTracker(camera, ours, catalog.apparent(ours, observer), default),
+        "with gyro": StarTracker(camera, ours, catalog.apparent(ours, observer), default),
+    }
+
+
+def measure(count: int, seed: int) -> Iterator[str]:
+    """A line a rate."""
+    told = {"exposure.time": "50 ms", "exposure.first": "0 s", "exposure.frames": str(count)}
+    lab = simulate.furnish(load("shefex2", told))
+    trackers = chains(lab)
+    for rate in RATES_DEG_S:
+        score = {name: np.zeros(2, int) for name in trackers}
+        for frame, truth, streak_px in frames(lab, rate, count, seed):
+            for name, tracker in trackers.items():
+                score[name] += solved(tracker, frame, truth, streak_px if name == "with gyro" else None)
+        told = [
+            f"{100 * score[name][0] / count:10.1f} {100 * score[name][1] / count:7.1f}" for name in trackers
+        ]
+        pixels = np.radians(rate) * 0.05 * lab.scene.camera.focal_px
+        yield f"{rate:5.1f} {pixels:6.1f}  " + "  ".join(told)
+
+
+if __name__ == "__main__":
+    count, seed = (int(one) for one in (sys.argv[1:3] + ["100", "1"][len(sys.argv[1:3]) :]))
+    print("deg/s     px    paper % wrong %   default % wrong %  with gyro % wrong %")
+    for line in measure(count, seed):
+        print(line, flush=True)
