@@ -25,8 +25,9 @@ NO_MATCH = "no identification beyond chance"
 LEAST_ERROR_PX = 0.02  # of a star, for what no calibration knows of
 # By how much lights may be off, in pixels and as a share of the distance from the middle, and how many are looked up
 # before a frame is given up: 200,000 take a hundredth of a second.
-KNOWN_LENS = ((LEAST_ERROR_PX, 0.0, 200_000),)
-UNKNOWN_LENS = ((0.5, 0.0, 200_000), (1.0, 0.005, 1_000_000), (2.0, 0.01, 3_000_000))
+Lens = tuple[float, float, int]
+KNOWN_LENS: tuple[Lens, ...] = ((LEAST_ERROR_PX, 0.0, 200_000),)
+UNKNOWN_LENS: tuple[Lens, ...] = ((0.5, 0.0, 200_000), (1.0, 0.005, 1_000_000), (2.0, 0.01, 3_000_000))
 CORNERS = np.array([[0, 0], [1, 0], [0, 1], [1, 1]])
 SETTINGS = Settings()
 
@@ -51,6 +52,7 @@ class StarTracker:
     ) -> None:
         self.camera, self.settings = camera, settings
         self.focal_uncertainty = focal_uncertainty
+        self.lenses = UNKNOWN_LENS if focal_uncertainty else KNOWN_LENS
         listed = replace(stars, vectors=vectors)
         self.stars = catalog.merge_doubles(listed, settings.merge_px / camera.focal_px)
         self.tree = cKDTree(self.stars.vectors)
@@ -80,13 +82,24 @@ class StarTracker:
         """
         return look(image, self.camera, self.settings, self.solve_centroids, streak_px)
 
-    def solve_centroids(self, centroids: Centroids, clock: Clock | None = None) -> Attitude:
-        """The stages after centroiding, for centroids from anywhere (the truth included)."""
+    @property
+    def efforts(self) -> int:
+        """How many searches, each of more effort than the one before, are made before a frame is given up."""
+        return len(self.lenses) if self.patterns is not None else 1
+
+    def solve_centroids(
+        self, centroids: Centroids, clock: Clock | None = None, effort: int | None = None
+    ) -> Attitude:
+        """The stages after centroiding, for centroids from anywhere (the truth included).
+
+        effort : this one of `efforts` alone, from 0; all of them in turn if left out
+        """
         clock = clock or Clock()
         if len(centroids) < LEAST:
             return Attitude(NO_STARS)
         if self.patterns is not None:
-            return self._by_evidence(centroids, self.patterns, clock)
+            lenses = self.lenses if effort is None else self.lenses[effort : effort + 1]
+            return self._by_evidence(centroids, self.patterns, lenses, clock)
         for camera, cam_from_ref in self._lost_in_space(centroids):
             clock.lap("identify")
             attitude = self._refined(centroids, camera, cam_from_ref)
@@ -141,9 +154,11 @@ class StarTracker:
             self.focal_uncertainty,
         )
 
-    def _by_evidence(self, centroids: Centroids, patterns: starsky.Sky, clock: Clock) -> Attitude:
+    def _by_evidence(
+        self, centroids: Centroids, patterns: starsky.Sky, lenses: tuple[Lens, ...], clock: Clock
+    ) -> Attitude:
         """Identity, attitude and covariance in one; where the lens is uncertain, it is fitted to all stars then."""
-        for loose_px, slack, checks in UNKNOWN_LENS if self.focal_uncertainty else KNOWN_LENS:
+        for loose_px, slack, checks in lenses:
             sigma_px = self.sigma_px(centroids, loose_px, slack)
             base = self.settings.base_stars
             fix = starfield.lost_in_space(self.lights(centroids, sigma_px), patterns, self.sky, base, checks)

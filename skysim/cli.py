@@ -54,6 +54,10 @@ Frames = Annotated[int | None, typer.Option(help="How many frames; the scene's o
 Seed = Annotated[int | None, typer.Option(help="Seed of all random streams; the scene's own if left out.")]
 Out = Annotated[Path | None, typer.Option(help="Folder for what is written; out/NAME if left out.")]
 Sets = Annotated[list[str] | None, typer.Option("--set", help="Override a key: camera.detector.bits=8.")]
+Detector = Annotated[str | None, typer.Option(help="How lights are found, e.g. local.")]
+Centroider = Annotated[str | None, typer.Option(help="How they are centred, e.g. gaussian_fit.")]
+Identifier = Annotated[str | None, typer.Option(help="How they are named, e.g. pyramid.")]
+SolverName = Annotated[str | None, typer.Option("--solver", help="How the attitude follows, e.g. quest.")]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON for machines instead of a table.")]
 
 
@@ -95,6 +99,10 @@ def run(
     seed: Seed = None,
     out: Out = None,
     set_: Sets = None,
+    detector: Detector = None,
+    centroider: Centroider = None,
+    identifier: Identifier = None,
+    solver: SolverName = None,
     picture: Annotated[
         bool, typer.Option("--picture", help="Also the lab in 3-D: lab.png and lab.gif, the vehicle moving.")
     ] = False,
@@ -103,7 +111,9 @@ def run(
     """Fly a scene, photograph it, solve every frame and score the answers."""
     from skysim import doubts, flightlog, io, report, score, simulate
 
-    loaded = load(scene, frames, seed, set_)
+    stages = named(detector=detector, centroider=centroider, identifier=identifier, solver=solver)
+    more = [f"tracker.{stage}={name}" for stage, name in stages.items()]
+    loaded = load(scene, frames, seed, [*(set_ or []), *more])
     lab = simulate.furnish(loaded)
     for doubt in doubts.doubts(loaded, lab.sources, lab.mount):
         complain(doubt)
@@ -113,10 +123,12 @@ def run(
     shots = begun(simulate.run(lab, estimator))
     folder = fresh(out or Path("out") / loaded.name)
     rows: list[Row] = []
+    exposures_ms: list[float] = []
     tally = score.Tally()
     for shot in progress(shots, loaded.exposure.frames, loaded.title):
         io.write_frame(folder, shot.frame, shot.truth, loaded)
         rows.append(score.row(shot, loaded, lab.mount, lab.verdicts.get(shot.frame.index, "")))
+        exposures_ms.append(1e3 * shot.frame.exposure_s)
         tally.add(shot)
     names, log = score.angle_names(loaded), lab.log
     io.write_table(folder / "solutions.ecsv", score.table(rows, names))
@@ -131,10 +143,11 @@ def run(
     report.write_page(page, loaded.title, command, names, rows, tally.median_ms(), images)
     figures = report.summary(rows) | {"stages_ms": tally.median_ms(), "report": str(page)}
     figures |= {"flight": flightlog.summary(log), "pictures": [str(path) for path in drawn]}
+    figures |= {"exposures_ms": exposures_ms}
     if json:
         print(io.to_json({"scene": loaded.name, **figures, "rows": report.as_dicts(rows)}))
     else:
-        print_rows(rows, names)
+        print_rows(rows, names, exposures_ms)
         print_summary(figures)
 
 
@@ -156,10 +169,10 @@ def render(
     loaded = load(scene, frames, seed, set_)
     with watched("flying") as watch:
         lab = simulate.prepare(loaded, watch)
-    shots = begun(simulate.shoot(lab, index) for index in range(loaded.exposure.frames))
+    shots = begun(simulate.photographs(lab))
     folder = fresh(out or Path("out") / loaded.name)
     written = []
-    for frame, truth in progress(shots, loaded.exposure.frames, loaded.title):
+    for frame, truth, _ in progress(shots, loaded.exposure.frames, loaded.title):
         io.write_frame(folder, frame, truth, loaded)
         if preview:
             picture = report.preview(frame.image_dn, truth.seen)
@@ -174,9 +187,16 @@ def render(
 @app.command()
 def solve(
     images: Annotated[list[Path], typer.Argument(help="FITS, PNG, TIFF, JPEG or BMP files.")],
-    fov: Annotated[float | None, typer.Option(help="Horizontal field of view in degrees, to 5 %.")] = None,
+    fov: Annotated[
+        float | None,
+        typer.Option(help="Horizontal field of view in degrees, to 5 %; 5 to 40 are tried if left out."),
+    ] = None,
     camera: Annotated[Path | None, typer.Option(help="A scene or camera file (YAML) that made them.")] = None,
     time: Annotated[str | None, typer.Option(help="UTC of the pictures, e.g. 2012-06-22T21:00:00.")] = None,
+    detector: Detector = None,
+    centroider: Centroider = None,
+    identifier: Identifier = None,
+    solver: SolverName = None,
     out: Annotated[Path, typer.Option(help="Folder for the annotated pictures.")] = Path("out/solve"),
     json: Json = False,
 ) -> None:
@@ -187,11 +207,12 @@ def solve(
     from skysim import io
     from skysim import solve as solving
 
-    solver = solving.make_solver(fov, camera, time_utc=moment(time))
+    stages = named(detector=detector, centroider=centroider, identifier=identifier, solver=solver)
+    how = solving.make_solver(fov, camera, time_utc=moment(time), stages=stages)
     io.make_folder(out)
     pictures = io.unlike([out / f"{path.name}.solved.png" for path in images])
     jobs = progress(list(zip(images, pictures, strict=True)), len(images), "solving", quiet=json)
-    answers = [solving.solve(path, solver, picture) for path, picture in jobs]
+    answers = [solving.solve(path, how, picture) for path, picture in jobs]
     faults = [answer["status"] for answer in answers if answer.pop("bad_input")]
     io.write_text(out / "solutions.json", io.to_json(answers))
     if json:
@@ -368,6 +389,11 @@ def load(name: str, frames: int | None, seed: int | None, sets: list[str] | None
         overrides["seed"] = str(seed)
     LOADED.append((name, overrides))
     return load_scene(name, overrides)
+
+
+def named(**stages: str | None) -> dict[str, str]:
+    """The tracker's stages that the command line names."""
+    return {stage: name for stage, name in stages.items() if name is not None}
 
 
 def fresh(folder: Path) -> Path:

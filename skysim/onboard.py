@@ -19,7 +19,9 @@ from estimator.centroid import CENTROIDERS
 from estimator.detect import DETECTORS
 from estimator.dometracker import IDENTIFIERS as NEAR_IDENTIFIERS
 from estimator.dometracker import DomeTracker
+from estimator.exposure import Control, Exposure, Observation, observe, step
 from estimator.filter import GyroModel, Mekf
+from estimator.hints import Hints
 from estimator.identify import IDENTIFIERS
 from estimator.nearfield import SOLVERS as NEAR_SOLVERS
 from estimator.nearfield import LedMap, Lever
@@ -131,7 +133,7 @@ def believed_settings(scene: Scene) -> Settings:
         ),
         solver=known(
             "solver",
-            part.solver or ("rotation_only" if near else "quest"),
+            part.solver or ("rotation_only" if near else "default"),
             NEAR_SOLVERS if near else SOLVERS,
         ),
         threshold_sigma=part.threshold_sigma,
@@ -156,6 +158,45 @@ def answer(estimator: Estimator, frame: Frame) -> Report:
         return estimator.solve(frame.image_dn)
     except BadImage as error:
         return Report(Attitude(str(error)), Centroids.none())
+
+
+class Meter:
+    """The camera's control: how long to expose the next frame, told by the one before.
+
+    exposure_s : of the next frame; always the scene's `exposure.time` without `tracker.exposure_control`
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        self.control, self.settings = exposure_control(scene), believed_settings(scene)
+        self.exposure_s = scene.exposure.time_s
+
+    def see(self, frame: Frame) -> None:
+        """Take note of the frame that was exposed for `exposure_s`."""
+        if self.control:
+            state = Exposure(frame.exposure_s)
+            self.exposure_s = step(state, observed(self.settings, self.control, frame), self.control).time_s
+
+
+def exposure_control(scene: Scene) -> Control | None:
+    """The constants of the chart, as the scene has them; None where exposures are fixed."""
+    part = scene.tracker.exposure_control
+    return Control(**dict(part)) if part else None
+
+
+def observed(settings: Settings, control: Control, frame: Frame) -> Observation:
+    """What the image processing says of a frame: objects that are no stars (defects, tracks, the Moon) do not count.
+
+    A full pixel is one near the value at which this camera's are cut off.
+    """
+    blobs = DETECTORS[settings.detector](
+        frame.image_dn,
+        settings.threshold_sigma,
+        settings.min_area_px,
+        settings.max_blobs,
+        Hints(None, settings.saturation),
+    )
+    box_px = blobs.box_px[blobs.flag & settings.reject == 0]
+    return observe(frame.image_dn, box_px, settings.saturation, control)
 
 
 def lights(settings: Settings, camera: Camera, frame: Frame) -> Centroids:

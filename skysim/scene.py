@@ -68,12 +68,38 @@ class Survey(Part):
     seed: Annotated[int, Field(ge=0)] = 0
 
 
+class ExposureControl(Part):
+    """How long to expose, decided on the frame before: SHEFEX-2's chart, `estimator.exposure` (Samaan & Theil 2011).
+
+    `exposure.time` is the first frame's. Too bright is a step shorter, else too few stars a step longer. What the
+    exposure of a frame is hangs on all frames before it, so frame 57 does not render alone with this section.
+
+    mean_dn             : of a frame, above which it is no picture of stars: twice its bias and sky, say
+    least_stars         : fewer cannot be identified
+    overexposed_objects : so many with more than saturated_px full pixels each are too many
+    """
+
+    mean_dn: Positive
+    shortest_s: Annotated[Time, Field(ge=10e-6)] = 10e-6
+    longest_s: Annotated[Time, Field(le=10.0)] = 50e-3
+    step_s: Annotated[Time, Field(ge=1e-6)] = 2e-3
+    least_stars: Annotated[int, Field(ge=1)] = 4
+    overexposed_objects: Annotated[int, Field(ge=1)] = 4
+    saturated_px: Annotated[int, Field(ge=0)] = 1
+
+    @model_validator(mode="after")
+    def in_order(self) -> ExposureControl:
+        if self.shortest_s > self.longest_s:
+            raise ValueError(f"shortest {self.shortest_s:g} s is above longest {self.longest_s:g} s")
+        return self
+
+
 class Tracker(Part):
     """What the star tracker's computer does and believes. `null` believes what the hardware is.
 
     map : a file that `skysim survey` wrote: LEDs, lever, focal length and distortion as measured
-    identifier, solver : the best for the light if left out: led_pairs and rotation_only under a dome, else default
-        and quest
+    identifier, solver : if left out, led_pairs and rotation_only under a dome, and both `default` under the stars
+    exposure_control : every frame is exposed for `exposure.time` if left out
     """
 
     detector: str = "local"
@@ -87,6 +113,7 @@ class Tracker(Part):
     believed_focal_length_m: Annotated[Length, Field(gt=0)] | None = None
     believed_camera_body_m: tuple[Length, Length, Length] | None = None
     survey: Survey = Survey()
+    exposure_control: ExposureControl | None = None
     map: Annotated[str, AfterValidator(a_file)] | None = None
 
     @model_validator(mode="after")
@@ -170,6 +197,23 @@ class Scene(Part):
             raise ValueError(
                 f"camera.shutter: reading takes {read_s:g} s, longer than the frame period"
                 f" {1 / self.exposure.rate_hz:g} s"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def exposures(self) -> Scene:
+        """Any exposure that the tracker may ask for ends before the next begins."""
+        told, period_s = self.tracker.exposure_control, 1 / self.exposure.rate_hz
+        if told is None:
+            return self
+        if told.longest_s > period_s:
+            raise ValueError(
+                f"tracker.exposure_control.longest: {told.longest_s:g} s is longer than the frame period {period_s:g} s"
+            )
+        if not told.shortest_s <= self.exposure.time_s <= told.longest_s:
+            raise ValueError(
+                f"tracker.exposure_control: exposure.time {self.exposure.time_s:g} s, the first, is outside of"
+                f" {told.shortest_s:g} s to {told.longest_s:g} s"
             )
         return self
 

@@ -64,6 +64,7 @@ def row(shot: Shot, scene: Scene, mount: Mount, verdict: str = "") -> Row:
         time_ms=1e3 * sum(shot.report.seconds.values()),
         wrong=wrong,
         filter=verdict,
+        exposure_s=shot.frame.exposure_s,
     )
 
 
@@ -88,6 +89,7 @@ def table(rows: list[Row], names: tuple[str, str, str]) -> Any:
         "matched",
         "rms_px",
         "time_ms",
+        "exposure_s",
         "wrong",
         "filter",
     ):

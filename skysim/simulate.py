@@ -52,6 +52,7 @@ class Lab:
     record    : what the IMU put out, every sample of it; None where there is none
     reports   : the star tracker's answers to the frames that were taken and solved in flight, for the filter
     verdicts  : what the filter made of each
+    exposures_s: of each
     """
 
     scene: Scene
@@ -69,13 +70,14 @@ class Lab:
     record: imu.Increments | None = None
     reports: dict[int, Report] = field(default_factory=dict)
     verdicts: dict[int, str] = field(default_factory=dict)
+    exposures_s: dict[int, float] = field(default_factory=dict)
 
     @property
     def flown_s(self) -> float:
-        """How long the flight has to be."""
-        return (
-            window(self.scene, self.scene.exposure.frames - 1).close_s(self.scene.camera.height_px) + SPARE_S
-        )
+        """How long the flight has to be, for the longest exposure of the last frame."""
+        part = self.scene.tracker.exposure_control
+        last = window(self.scene, self.scene.exposure.frames - 1, part.longest_s if part else None)
+        return last.close_s(self.scene.camera.height_px) + SPARE_S
 
     @property
     def log(self) -> Telemetry:
@@ -181,6 +183,7 @@ def fly(lab: Lab, watch: Watch | None = None) -> Lab:
         record=navigation.record() if navigation else None,
         reports=eyes.reports if eyes else {},
         verdicts=eyes.verdicts if eyes else {},
+        exposures_s=eyes.exposures_s if eyes else {},
     )
 
 
@@ -248,9 +251,10 @@ class Eyes:
 
     def __init__(self, lab: Lab, vibration: Vibration, navigation: onboard.Navigation) -> None:
         self.lab, self.vibration, self.navigation = lab, vibration, navigation
-        self.tracker = tracker(lab)
+        self.tracker, self.meter = tracker(lab), onboard.Meter(lab.scene)
         self.reports: dict[int, Report] = {}
         self.verdicts: dict[int, str] = {}
+        self.exposures_s: dict[int, float] = {}
 
     def look(self, flight: world.Flight) -> None:
         """All frames whose exposure ended the filter's latency ago, and which were not solved yet."""
@@ -258,13 +262,15 @@ class Eyes:
         assert scene.filter is not None
         while len(self.reports) < scene.exposure.frames:
             index = len(self.reports)
-            when = window(scene, index)
+            when = window(scene, index, self.meter.exposure_s)
             if when.close_s(scene.camera.height_px) + scene.filter.latency_s > flight.now_s:
                 return
             since = flight.trajectory(max(int(when.open_s / flight.step_s) - 1, 0))
-            frame, _ = shoot(replace(self.lab, trajectory=self.vibration.lay_over(since)), index)
+            here = replace(self.lab, trajectory=self.vibration.lay_over(since))
+            frame, _ = shoot(here, index, exposure_s=when.exposure_s)
+            self.meter.see(frame)
             report = onboard.answer(self.tracker, frame)
-            self.reports[index] = report
+            self.reports[index], self.exposures_s[index] = report, when.exposure_s
             self.verdicts[index] = self.navigation.see(frame.t_mid_s, report.attitude)
 
 
@@ -286,19 +292,21 @@ def lights(scene: Scene, band: Band) -> Sources:
     return sky.sources(stars, scene.start_time, scene.light.limit_mag, Rotation.identity(), band)
 
 
-def window(scene: Scene, index: int) -> Window:
-    """When the chip gathers the light of a frame."""
+def window(scene: Scene, index: int, exposure_s: float | None = None) -> Window:
+    """When the chip gathers the light of a frame; for the scene's own exposure if none is given."""
     shutter = scene.camera.shutter
     row_time_s = shutter.row_time_s if isinstance(shutter, RollingShutter) else 0.0
     begin_s = scene.exposure.first_s + index / scene.exposure.rate_hz
-    return Window(begin_s, scene.exposure.time_s, row_time_s)
+    return Window(begin_s, scene.exposure.time_s if exposure_s is None else exposure_s, row_time_s)
 
 
-def shoot(lab: Lab, index: int, clock: Clock | None = None) -> tuple[Frame, Truth]:
-    """One frame with its truth. Depends on the scene and the index alone."""
+def shoot(
+    lab: Lab, index: int, clock: Clock | None = None, exposure_s: float | None = None
+) -> tuple[Frame, Truth]:
+    """One frame with its truth. Depends on the scene, the index and the exposure (the scene's if left out) alone."""
     clock = clock or Clock()
     scene, camera = lab.scene, lab.scene.camera
-    when = window(scene, index)
+    when = window(scene, index, exposure_s)
     middle_s = when.middle_s(camera.height_px)
     lab_from_body = lab.trajectory.at(middle_s)
     cam_from_lab = lab.mount.cam_from_body * lab_from_body.inv()
@@ -339,11 +347,22 @@ def tracker(lab: Lab) -> onboard.Estimator:
     return onboard.tracker(lab.scene, lab.mount, lab.sources)
 
 
+def photographs(lab: Lab) -> Iterator[tuple[Frame, Truth, dict[str, float]]]:
+    """Frame after frame with its truth and the seconds it took, each exposed as the one before asks for.
+
+    A frame that was taken in flight is taken again as it was then.
+    """
+    meter = onboard.Meter(lab.scene)
+    for index in range(lab.scene.exposure.frames):
+        clock = Clock()
+        frame, truth = shoot(lab, index, clock, lab.exposures_s.get(index, meter.exposure_s))
+        meter.see(frame)
+        yield frame, truth, clock.seconds
+
+
 def run(lab: Lab, estimator: onboard.Estimator) -> Iterator[Shot]:
     """Photograph and solve frame after frame; what was solved in flight is not solved again."""
     onboard.answer(estimator, shoot(lab, 0)[0])  # a frame for the compiler, whose seconds are nobody's
-    for index in range(lab.scene.exposure.frames):
-        clock = Clock()
-        frame, truth = shoot(lab, index, clock)
-        report = lab.reports.get(index) or onboard.answer(estimator, frame)
-        yield Shot(frame, truth, report, clock.seconds)
+    for frame, truth, seconds in photographs(lab):
+        report = lab.reports.get(frame.index) or onboard.answer(estimator, frame)
+        yield Shot(frame, truth, report, seconds)

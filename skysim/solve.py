@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import datetime
+import math
 import time
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,29 +14,50 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator import catalog
-from estimator.attitude import radecroll_rad
+from estimator.attitude import SOLVERS, radecroll_rad
 from estimator.camera import Camera
-from estimator.detect import check_size
-from estimator.stages import Report, Settings
-from estimator.tracker import StarTracker
-from estimator.types import BadImage
+from estimator.centroid import CENTROIDERS
+from estimator.chance import ACCEPT_LOG10_CHANCE
+from estimator.detect import DETECTORS, check_size
+from estimator.identify import IDENTIFIERS
+from estimator.stages import Clock, Report, Settings, see
+from estimator.tracker import NO_MATCH, StarTracker
+from estimator.types import Attitude, BadImage, Centroids
 from skysim import io, report, scene
 from skysim.camera import Camera as CameraPart
 from skysim.detector import saturation_dn
 from skysim.onboard import calibration
+from skysim.quantity import one_of
 from skysim.scene import CATALOGUES
 from skysim.types import BadInput
 
 FOV_UNCERTAINTY = 0.055  # "to 5 %", with half a per cent for how people measure it
 PHOTO_EPOCH = datetime.datetime(2020, 1, 1, 12)
 
+# Where nobody tells the field of view: horizontal, and how many trackers share it, each a range of focal lengths. Wide
+# ranges, as the index of a field serves another 1.5 times as wide, and a search takes its time however wide.
+WIDEST_DEG, NARROWEST_DEG = 40.0, 5.0
+TRACKERS = 5
+OVERLAP = 0.01  # of the focal length
+DECISIVE_LOG10_CHANCE = -10.0  # beyond which no other field of view is looked at
+MARGIN_DEX = 3.0  # by which an answer must beat one elsewhere
+SAME_RAD = math.radians(0.2)
+
+STAGES: dict[str, Mapping[str, object]] = {
+    "detector": DETECTORS,
+    "centroider": CENTROIDERS,
+    "identifier": IDENTIFIERS,
+    "solver": SOLVERS,
+}
+
 
 @dataclass(frozen=True, slots=True)
 class Solver:
-    """How to look at images: a field of view known to 5 %, or a camera known exactly.
+    """How to look at images: a field of view known to 5 %, a camera known exactly, or neither: 5 to 40 degrees.
 
     time_utc : when the pictures were taken; None takes each FITS file's own, or 2020, when aberration (20") is
         left out because it turns with the season.
+    built    : the trackers for images of the last one's size and time
     """
 
     fov_deg: float | None
@@ -42,20 +65,42 @@ class Solver:
     stars: catalog.StarList
     settings: Settings
     time_utc: datetime.datetime | None = None
+    built: dict[Any, dict[Camera, StarTracker]] = field(default_factory=dict, compare=False, repr=False)
 
-    def tracker(self, image: NDArray, taken: datetime.datetime | None) -> StarTracker:
-        """The star tracker for an image of this size, taken then."""
-        height, width = image.shape
+    def beliefs(self, width_px: int, height_px: int) -> list[tuple[Camera, float]]:
+        """Cameras to try on images of this size, and how uncertain the focal length of each is; the likeliest first."""
+        if self.camera:
+            return [(calibration(self.camera), 0.0)]
+        if self.fov_deg:
+            return [(Camera.from_fov(width_px, height_px, math.radians(self.fov_deg)), FOV_UNCERTAINTY)]
+        widest, narrowest = (math.tan(math.radians(deg) / 2) for deg in (WIDEST_DEG, NARROWEST_DEG))
+        ratio = (widest / narrowest) ** (1 / TRACKERS)
+        from_middle_out = sorted(range(TRACKERS), key=lambda n: abs(n - (TRACKERS - 1) / 2))
+        # A tracker of focal length f finds those from f (1 - u) to f (1 + u), ratio times as long.
+        uncertainty = (ratio - 1) / (ratio + 1)
+        tangents = [widest / ratio**n * (1 - uncertainty) for n in from_middle_out]
+        return [
+            (Camera.from_fov(width_px, height_px, 2 * math.atan(tangent)), uncertainty + OVERLAP)
+            for tangent in tangents
+        ]
+
+    def trackers(
+        self, width_px: int, height_px: int, taken: datetime.datetime | None
+    ) -> Iterator[StarTracker]:
+        """The star trackers for an image of this size, taken then: one, or those that share the fields of view."""
         taken = self.time_utc or taken
-        vectors = (
-            catalog.apparent(self.stars, catalog.on_earth(taken))
-            if taken
-            else catalog.at_epoch(self.stars, PHOTO_EPOCH.year)
-        )
-        if self.camera is None:
-            believed = Camera.from_fov(width, height, float(np.radians(self.fov_deg or 0)))
-            return StarTracker(believed, self.stars, vectors, self.settings, FOV_UNCERTAINTY)
-        return StarTracker(calibration(self.camera), self.stars, vectors, self.settings)
+        if (width_px, height_px, taken) not in self.built:
+            self.built.clear()
+        ready = self.built.setdefault((width_px, height_px, taken), {})
+        for believed, uncertainty in self.beliefs(width_px, height_px):
+            if believed not in ready:
+                vectors = (
+                    catalog.apparent(self.stars, catalog.on_earth(taken))
+                    if taken
+                    else catalog.at_epoch(self.stars, PHOTO_EPOCH.year)
+                )
+                ready[believed] = StarTracker(believed, self.stars, vectors, self.settings, uncertainty)
+            yield ready[believed]
 
 
 def make_solver(
@@ -63,12 +108,14 @@ def make_solver(
     camera_file: Path | None,
     catalogue: str = "hipparcos_hp6.5",
     time_utc: datetime.datetime | None = None,
+    stages: Mapping[str, str] | None = None,
 ) -> Solver:
-    """Check what the user gave. Raises BadInput with one line."""
-    if (fov_deg is None) == (camera_file is None):
+    """Check what the user gave; stages: names of algorithms by STAGES. Raises BadInput with one line."""
+    if fov_deg is not None and camera_file is not None:
         raise BadInput("give either --fov DEG or --camera FILE")
     if fov_deg is not None and not 1 <= fov_deg <= 120:
         raise BadInput(f"--fov {fov_deg:g}: allowed: the horizontal field of view, 1 to 120 degrees")
+    named = {stage: known(stage, name) for stage, name in (stages or {}).items()}
     camera = scene.load_camera(camera_file) if camera_file else None
     settings = Settings()
     if camera:
@@ -77,11 +124,20 @@ def make_solver(
             gain_e_dn=camera.detector.gain_e_dn,
             saturation=saturation_dn(camera.detector),
         )
+    settings = replace(settings, **named)  # type: ignore[arg-type]
     try:
         stars = catalog.read(CATALOGUES / f"{catalogue}.ecsv")
     except BadImage as error:
         raise BadInput(f"{error}; make it with: skysim catalog build") from None
     return Solver(fov_deg, camera, stars, settings, time_utc)
+
+
+def known(stage: str, name: str) -> str:
+    """The name, if there is such an algorithm."""
+    try:
+        return one_of(name, STAGES[stage])
+    except ValueError as error:
+        raise BadInput(f"--{stage}: {error}") from None
 
 
 def solve(path: Path, solver: Solver, annotated: Path | None) -> dict[str, Any]:
@@ -107,8 +163,7 @@ def solve(path: Path, solver: Solver, annotated: Path | None) -> dict[str, Any]:
         check(path, image, solver.camera)
         image = io.monochrome(image)
         check_size(image)
-        tracker = solver.tracker(image, io.date_of(path))
-        found = tracker.solve(image)
+        found, tracker = look(image, solver, io.date_of(path))
     except (BadInput, BadImage) as error:
         message = str(error)
         answer["status"] = message if message.startswith(str(path)) else f"{path}: {message}"
@@ -120,6 +175,56 @@ def solve(path: Path, solver: Solver, annotated: Path | None) -> dict[str, Any]:
     if annotated:
         io.write_image(annotated, picture(image, found, tracker))
     return answer
+
+
+def look(image: NDArray, solver: Solver, taken: datetime.datetime | None) -> tuple[Report, StarTracker]:
+    """An image's answer, and the tracker whose it is."""
+    height_px, width_px = image.shape
+    first = next(solver.trackers(width_px, height_px, taken))
+    if solver.camera or solver.fov_deg:
+        return first.solve(image), first
+    clock = Clock()
+    centroids = see(image, first.camera, solver.settings, clock)  # of which only the camera's size counts
+    for effort in range(first.efforts):  # a little at all fields of view before much at any
+        attitude, tracker = sought(centroids, solver.trackers(width_px, height_px, taken), clock, effort)
+        if attitude.solved:
+            break
+    return Report(attitude, centroids, clock.seconds), tracker
+
+
+def sought(
+    centroids: Centroids, trackers: Iterator[StarTracker], clock: Clock, effort: int
+) -> tuple[Attitude, StarTracker]:
+    """Of the attitudes that trackers of different fields of view find, the one beyond chance and beyond its rivals.
+
+    Each field of view is one more occasion for a wrong answer, so each is allowed its share of the chance.
+    """
+    found: list[tuple[Attitude, StarTracker]] = []
+    for tracker in trackers:
+        attitude = tracker.solve_centroids(centroids, clock, effort)
+        if log10_chance(attitude) <= DECISIVE_LOG10_CHANCE:
+            return attitude, tracker
+        if attitude.solved:
+            found.append((attitude, tracker))
+    if not found:
+        return attitude, tracker
+    best, its = min(found, key=lambda one: log10_chance(one[0]))
+    rivals = [log10_chance(one) for one, _ in found if not alike(one, best)]
+    share = ACCEPT_LOG10_CHANCE - math.log10(TRACKERS)
+    beyond = log10_chance(best) <= min(share, min(rivals, default=0.0) - MARGIN_DEX)
+    return (best if beyond else Attitude(NO_MATCH)), its
+
+
+def log10_chance(attitude: Attitude) -> float:
+    """Of the answer being due to chance; 0 where there is none."""
+    return attitude.match.log10_chance if attitude.match else 0.0
+
+
+def alike(one: Attitude, other: Attitude) -> bool:
+    """Whether two answers are one."""
+    assert one.cam_from_ref is not None
+    assert other.cam_from_ref is not None
+    return bool((one.cam_from_ref * other.cam_from_ref.inv()).magnitude() < SAME_RAD)
 
 
 def check(path: Path, image: NDArray, camera: CameraPart | None) -> None:

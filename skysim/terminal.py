@@ -55,11 +55,13 @@ def print_table(title: str, heads: list[str], lines: list[list[str]]) -> None:
     Console(width=max(console.width, 160) if not console.is_terminal else None).print(table)
 
 
-def print_rows(rows: list[Row], names: tuple[str, str, str]) -> None:
+def print_rows(rows: list[Row], names: tuple[str, str, str], exposures_ms: list[float]) -> None:
+    """The rows of a run, and the exposure of each frame."""
     triple = "/".join(names)
     heads = [
         "frame",
         "t s",
+        "exp ms",
         "deg/s",
         f"true {triple}",
         f"estimate {triple}",
@@ -73,6 +75,7 @@ def print_rows(rows: list[Row], names: tuple[str, str, str]) -> None:
         [
             str(row.frame),
             f"{row.t_s:.2f}",
+            f"{exposure_ms:.5g}",
             f"{row.rate_deg_s:.2f}",
             degrees(row.truth_deg),
             degrees(row.estimate_deg),
@@ -82,7 +85,7 @@ def print_rows(rows: list[Row], names: tuple[str, str, str]) -> None:
             f"{row.time_ms:.1f}",
             "[red]WRONG[/]" if row.wrong else row.status,
         ]
-        for row in rows
+        for row, exposure_ms in zip(rows, exposures_ms, strict=True)
     ]
     print_table("", heads, lines)
 

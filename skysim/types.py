@@ -235,3 +235,4 @@ class Row:
     cross_sigma_arcsec: float = float("nan")
     roll_sigma_arcsec: float = float("nan")
     log10_chance: float = float("nan")
+    exposure_s: float = float("nan")

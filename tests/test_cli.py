@@ -171,6 +171,18 @@ def test_render_then_solve_agrees_with_the_wcs_of_the_true_pointing(
     assert answer["fov_deg"] == pytest.approx(2 * np.degrees(np.arctan(329 * 9.9e-3 / 25)), abs=1e-6)
 
 
+def test_solve_takes_a_picture_of_which_nothing_is_told(
+    skysim: Skysim, rendered: Path, tmp_path: Path
+) -> None:
+    """2 atan(658 x 9.9 um / 50 mm) between the middles of the edge columns, where the scene points."""
+    ran = skysim("solve", rendered / "frame_0000.fits", "--json", "--out", tmp_path)
+    (answer,) = json.loads(ran.out)
+    assert answer["status"] == "solved"
+    assert answer["fov_deg"] == pytest.approx(14.84, abs=0.05)
+    assert answer["ra_deg"] == pytest.approx(83.0, abs=0.1)
+    assert answer["dec_deg"] == pytest.approx(2.0, abs=0.1)
+
+
 def test_solve_writes_what_it_prints_and_a_picture(skysim: Skysim, rendered: Path, tmp_path: Path) -> None:
     ran = skysim("solve", rendered / "frame_0000.png", "--fov", "14.8", "--json", "--out", tmp_path)
     assert json.loads((tmp_path / "solutions.json").read_text()) == json.loads(ran.out)
@@ -207,6 +219,39 @@ def test_a_shorter_run_leaves_no_frames_of_a_longer_one(skysim: Skysim, tmp_path
 def test_an_option_overrides_the_scene(skysim: Skysim, tmp_path: Path) -> None:
     skysim("render", "shefex2", "--frames", "1", "--seed", "9", "--out", tmp_path, "--set", "title=Nine")
     assert fits.getheader(tmp_path / "frame_0000.fits")["SEED"] == 9
+
+
+@pytest.mark.parametrize("stage", ["detector", "centroider", "identifier", "solver"])
+def test_a_stage_of_a_run_is_named_by_its_option(skysim: Skysim, tmp_path: Path, stage: str) -> None:
+    ran = skysim("run", "shefex2", f"--{stage}", "magic", "--out", tmp_path / "out")
+    assert f"tracker.{stage}: 'magic' is none of " in ran.one_line()
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_stages_of_a_run_are_those_named(skysim: Skysim, tmp_path: Path) -> None:
+    """Above the scene's own and above --set; TRIAD takes two stars where the scene's QUEST takes all."""
+    words = ["run", "shefex2", "--frames", "1", "--json", "--out", tmp_path, "--set", "tracker.solver=magic"]
+    named = ["--detector", "default", "--centroider", "cog", "--identifier", "pyramid", "--solver"]
+    (triad,), (quest,) = (
+        json.loads(skysim(*words, *named, solver).out)["rows"] for solver in ("triad", "quest")
+    )
+    assert (triad["status"], quest["status"]) == ("solved", "solved")
+    assert triad["matched"] == quest["matched"]
+    assert triad["cross_sigma_arcsec"] > 1.1 * quest["cross_sigma_arcsec"]
+
+
+def test_exposures_are_told_frame_by_frame(skysim: Skysim, tmp_path: Path) -> None:
+    """By a run and by a rendering, which are of the same frames."""
+    growing = "tracker.exposure_control={mean_dn: 500, least_stars: 1000}"
+    words = ["shefex2", "--frames", "2", "--out", tmp_path, "--set", growing]
+    ran = json.loads(skysim("run", *words, "--json").out)
+    assert ran["exposures_ms"] == pytest.approx([40, 42], abs=1e-9)
+    solved = [io.read_image(tmp_path / f"frame_000{n}.fits") for n in (0, 1)]
+    assert skysim("render", *words).code == 0
+    told = [fits.getheader(tmp_path / f"frame_000{n}.fits")["EXPTIME"] for n in (0, 1)]
+    assert told == pytest.approx([0.040, 0.042], abs=1e-12)
+    for n in (0, 1):
+        np.testing.assert_array_equal(io.read_image(tmp_path / f"frame_000{n}.fits"), solved[n])
 
 
 # Scenes that are wrong
@@ -278,6 +323,10 @@ def test_an_option_overrides_the_scene(skysim: Skysim, tmp_path: Path) -> None:
         (["shefex2", "--frames", "many"], "--frames"),
         (["shefex2", "--nosuch"], "--nosuch"),
         ([], ""),
+        (
+            ["shefex2", "--set", "tracker.exposure_control={mean_dn: 150, longest: 101 ms}"],
+            "tracker.exposure_control.longest: 0.101 s is longer than the frame period 0.1 s (--set)",
+        ),
     ],
 )
 @pytest.mark.parametrize("command", ["run", "render"])
@@ -414,13 +463,16 @@ def test_noise_is_looked_at_and_refused_an_attitude(skysim: Skysim, tmp_path: Pa
 @pytest.mark.parametrize(
     ("words", "says"),
     [
-        ([], "give either --fov DEG or --camera FILE"),
         (["--fov", "15", "--camera", SHEFEX], "give either --fov DEG or --camera FILE"),
         (["--fov", "0"], "--fov 0: allowed: the horizontal field of view, 1 to 120 degrees"),
         (["--fov", "nan"], "--fov nan: allowed"),
         (["--fov", "wide"], "--fov"),
         (["--camera", "nosuch.yaml"], "nosuch.yaml: cannot be read: No such file"),
         (["--camera", SHEFEX, "--time", "yesterday"], "--time yesterday: allowed: ISO 8601"),
+        (["--detector", "magic"], "--detector: 'magic' is none of default, "),
+        (["--centroider", "magic"], "--centroider: 'magic' is none of "),
+        (["--identifier", "magic"], "--identifier: 'magic' is none of default, "),
+        (["--solver", "magic"], "--solver: 'magic' is none of default, quest, "),
     ],
 )
 def test_a_wrong_option_of_solve_is_one_line(

@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from estimator.exposure import Control
 from estimator.types import Attitude
 from skysim import cli, doubts, imu, onboard, scene, simulate, world
-from skysim.types import BadInput, Floats, Telemetry
+from skysim.types import BadInput, Floats, Frame, Telemetry
 
 PERFECT = (
     "gyro: {arw_deg_sqrt_h: 0, bias_deg_h: 0, turn_on_bias_deg_h: 0, scale_ppm: 0, misalignment_arcsec: 0,"
@@ -20,6 +21,7 @@ PERFECT = (
 )
 ARCSEC = math.pi / 180 / 3600
 TUMBLE = "[3, -2, 20]"
+SINGLE = {"tracker.detector": "default", "tracker.min_area_px": "1"}
 NOBODY = {"motion.control": "none", "motion.manoeuvre": "[]", "vehicle.centre_of_mass": "[0 m, 0 m, 0 m]"}
 
 
@@ -313,3 +315,40 @@ def test_a_doubt_is_one_line_before_the_run_which_goes_on(
     assert said.err.startswith("skysim: light.surface: the tracker believes an ellipsoid")
     assert said.err.count("\n") == 1
     assert '"frames": 1' in said.out
+
+
+# --- how long to expose ---------------------------------------------------------------------------------------
+
+
+def test_the_exposure_control_is_the_chart_s_unless_the_scene_says_otherwise() -> None:
+    """The schema repeats the estimator's constants, as it may not ask it for them."""
+    plain = onboard.exposure_control(scene.load("shefex2", {"tracker.exposure_control": "{mean_dn: 150}"}))
+    assert plain == Control(mean_dn=150.0)
+    part = "{mean_dn: 99, shortest: 1 ms, longest: 90 ms, step: 3 ms, least_stars: 5, overexposed_objects: 6,"
+    told = onboard.exposure_control(
+        scene.load("shefex2", {"tracker.exposure_control": part + " saturated_px: 7}"})
+    )
+    assert told == Control(99.0, 1e-3, 90e-3, 3e-3, 5, 6, 7)
+    assert onboard.exposure_control(scene.load("shefex2")) is None
+
+
+def test_without_control_every_frame_is_exposed_for_as_long() -> None:
+    meter = onboard.Meter(scene.load("shefex2"))
+    meter.see(Frame(0, np.full((493, 659), 4000, np.uint16), 0.0, 0.04, 4080.0))
+    assert meter.exposure_s == 0.04
+
+
+def test_a_defect_is_no_star_and_lengthens_the_exposure() -> None:
+    """Five stars are enough; five bright pixels, sharper than any optics, are none."""
+    meter = onboard.Meter(scene.load("shefex2", {"tracker.exposure_control": "{mean_dn: 500}"} | SINGLE))
+    rng = np.random.default_rng(5)
+    y, x = np.mgrid[:493, :659]
+    places = [(100, 100), (200, 400), (300, 150), (400, 500), (250, 600)]
+    spots = np.sum([600 * np.exp(-((x - a) ** 2 + (y - b) ** 2) / 2 / 0.8**2) for b, a in places], axis=0)
+    spikes = np.zeros((493, 659))
+    for place in places:
+        spikes[place] = 600
+    for light, expected_s in ((spots, 0.04), (spikes, 0.042)):
+        image = np.rint(100 + light + rng.normal(0, 2, light.shape)).astype(np.uint16)
+        meter.see(Frame(0, image, 0.0, 0.04, 4080.0))
+        assert meter.exposure_s == pytest.approx(expected_s, abs=1e-12)

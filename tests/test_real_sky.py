@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from skysim import solve
+from skysim import io, solve
 from skysim.scene import ROOT
 from skysim.sky import cam_from_icrs
 
@@ -32,6 +32,12 @@ def answer(row, fov_error: float) -> dict:
     """What `skysim solve` says of a photograph when told a field of view wrong by so much."""
     fov_deg = float(row["fov_deg_horizontal"] or 10.0) * (1 + fov_error)
     return solve.solve(FOLDER / row["file"], solve.make_solver(fov_deg, None), None)
+
+
+@pytest.fixture(scope="module")
+def blind() -> solve.Solver:
+    """Told nothing; it keeps its trackers for photographs of one size."""
+    return solve.make_solver(None, None)
 
 
 def errors_deg(found: dict, row) -> tuple[float, float]:
@@ -65,6 +71,40 @@ def test_a_picture_without_stars_is_refused(row):
     assert found["status"] != "solved"
     assert found["ra_deg"] is None
     assert not found["bad_input"]
+
+
+@needs_photographs
+@by_file(TO_SOLVE[4:5])
+def test_a_photograph_is_solved_with_its_field_unknown(row, blind):
+    check_right(solve.solve(FOLDER / row["file"], blind, None), row)
+
+
+@pytest.mark.long
+@needs_photographs
+@by_file(TO_SOLVE)
+def test_every_photograph_is_solved_with_its_field_unknown(row, blind):
+    check_right(solve.solve(FOLDER / row["file"], blind, None), row)
+
+
+@pytest.mark.long
+@needs_photographs
+@by_file(NOT_TO_SOLVE + ANY)
+def test_no_photograph_is_answered_wrongly_with_its_field_unknown(row, blind):
+    found = solve.solve(FOLDER / row["file"], blind, None)
+    right = bool(row["ra_deg"]) and found["status"] == "solved" and errors_deg(found, row)[0] < 0.05
+    assert right or found["status"] != "solved"
+    assert not found["bad_input"]
+
+
+@pytest.mark.long
+@needs_photographs
+@by_file(TO_SOLVE)
+def test_a_photograph_in_a_mirror_is_refused(row, blind):
+    """No turn of the sky is its mirror image, so whatever were answered would be wrong."""
+    image = io.monochrome(io.read_image(FOLDER / row["file"]))
+    found, _ = solve.look(np.ascontiguousarray(image[:, ::-1]), blind, None)
+    assert not found.attitude.solved
+    assert len(found.centroids) >= 10
 
 
 @pytest.mark.long

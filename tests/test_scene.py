@@ -511,6 +511,27 @@ UNLOAD = "{start: 2 N m s, stop: 1 N m s}"
             )
         ),
         (
+            {"tracker.exposure_control": "{mean_dn: 150, longest: 600 ms}"},
+            "tracker.exposure_control.longest: 0.6 s is longer than the frame period 0.5 s",
+        ),
+        (
+            {"tracker.exposure_control": "{mean_dn: 150, longest: 8 ms}"},
+            "tracker.exposure_control: exposure.time 0.01 s, the first, is outside of 1e-05 s to 0.008 s",
+        ),
+        (
+            {"tracker.exposure_control": "{mean_dn: 150, shortest: 60 ms}"},
+            "tracker.exposure_control: shortest 0.06 s is above longest 0.05 s",
+        ),
+        (
+            {"tracker.exposure_control": "{mean_dn: 150, longest: 11 s}"},
+            "tracker.exposure_control.longest: '11 s' is not allowed; it should be less than or equal to 10",
+        ),
+        (
+            {"tracker.exposure_control": "{mean_dn: 150, step: 0.1 us}"},
+            "tracker.exposure_control.step: '0.1 us' is not allowed; it should be greater than or equal to 0.000001",
+        ),
+        ({"tracker.exposure_control": "{step: 2 ms}"}, "tracker.exposure_control.mean_dn: missing"),
+        (
             {"motion.control": "{feedback: imu}"},
             "motion.control.feedback: imu takes the section vehicle.imu",
         ),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -199,9 +201,9 @@ def test_shutters_open_on_time() -> None:
 
 def test_a_rolling_shutter_s_truth_is_that_of_its_middle_row() -> None:
     """493 rows, each 80 us after the one above: the last closes 39.36 ms late, the middle one 19.68 ms."""
-    lab = prepared(
-        "shefex2", exposure__frames="1", camera__shutter="{kind: rolling, row_time: '80 us'}", seed="3"
-    )
+    # The first and last rows are .35 px off the middle's: a tracker that trusts to .03 px would leave them out.
+    loose = {"tracker__centroid_sigma_px": "0.2", "exposure__frames": "1"}
+    lab = prepared("shefex2", camera__shutter="{kind: rolling, row_time: '80 us'}", seed="3", **loose)
     assert simulate.window(lab.scene, 0).close_s(493) == pytest.approx(0.1 + 0.040 + 0.03936, abs=1e-12)
     frame, truth = simulate.shoot(lab, 0)
     assert frame.t_mid_s == truth.t_s == pytest.approx(0.1 + 0.020 + 0.01968, abs=1e-12)
@@ -353,3 +355,82 @@ def test_the_shutter_s_smear_counts_for_saturation_and_noise() -> None:
     smeared = (24_000 * (1 + 492 * 40e-6 / 0.04) + 0.8) / 24_000.8
     faint = np.argmin(plain.electrons)
     assert (plain.snr[faint] / shifted.snr[faint]) ** 2 == pytest.approx(smeared, rel=0.02)
+
+
+# Exposure control
+
+COMA = {"motion.start": "{ra_deg: 190, dec_deg: 25}", "motion.rate_deg_s": "[0, 0, 0]"}  # no bright stars
+
+
+def controlled(frames: int, start: str, control: str, **more: str) -> Lab:
+    given = {"exposure.frames": str(frames), "exposure.time": start, "tracker.exposure_control": control}
+    return prepared("shefex2", **(COMA | given | more))
+
+
+def exposures_ms(shots: list[simulate.Shot]) -> list[float]:
+    return [1e3 * shot.frame.exposure_s for shot in shots]
+
+
+def test_an_exposure_too_short_for_stars_grows_until_there_are_four() -> None:
+    shots = shots_of(controlled(10, "1 ms", "{mean_dn: 150}"))
+    enough = next(n for n, shot in enumerate(shots) if len(shot.report.centroids) >= 4)
+    assert 1 <= enough < 9
+    grown = 1.0 + 2.0 * np.minimum(np.arange(10), enough)
+    assert exposures_ms(shots) == pytest.approx(list(grown), abs=1e-9)
+    assert all(len(shot.report.centroids) >= 4 for shot in shots[enough:])
+    assert error_deg(shots[-1].report.attitude, shots[-1].truth) < 10 / 60
+
+
+def test_a_frame_is_exposed_for_as_long_as_it_was_told() -> None:
+    """It opens on time, its truth is that of its own middle, and its glare is its own: 1e5 e-/s."""
+    glare = "[{kind: uniform, e_s: 1e5}]"
+    lab = controlled(3, "4 ms", "{mean_dn: 1000, least_stars: 1000}", background=glare)
+    shots = shots_of(lab)
+    assert exposures_ms(shots) == pytest.approx([4, 6, 8], abs=1e-9)
+    for n, shot in enumerate(shots):
+        assert (
+            shot.frame.t_mid_s == shot.truth.t_s == pytest.approx(0.1 + n * 0.1 + (2 + n) * 1e-3, abs=1e-12)
+        )
+        gathered_dn = 1e5 * shot.frame.exposure_s / lab.scene.camera.detector.gain_e_dn
+        offset_dn = lab.scene.camera.detector.offset_dn
+        assert np.median(shot.frame.image_dn) == pytest.approx(offset_dn + gathered_dn, abs=1.0)
+
+
+def test_a_bright_body_shortens_the_exposure_and_turning_away_restores_the_stars() -> None:
+    """A body at the baffle's edge while the camera turns by 6.4 degrees away from it, its light gone after four."""
+    body = "[{kind: stray, ra_deg: 190, dec_deg: 5, angle_deg: [0, 23.9, 24, 180], pst: [4e-6, 4e-6, 0, 0]}]"
+    away = {"motion__rate_deg_s": "[2, 0, 0]", "background": body}
+    shots = shots_of(controlled(33, "24 ms", "{mean_dn: 150}", **away))
+    told, mean_dn = exposures_ms(shots), np.array([shot.frame.image_dn.mean() for shot in shots])
+    gone = int(np.argmax(mean_dn < 70))
+    assert 15 < gone < 25  # four degrees at 2 deg/s, ten frames a second
+    # In its light every frame above the reference is followed by one a step shorter, down to the least.
+    assert told[1] == pytest.approx(22)
+    assert min(told[:gone]) < 5
+    for n in range(gone):
+        assert (mean_dn[n] > 150) == (told[n + 1] < told[n])
+    # After that it grows to what four stars take, and stays.
+    assert told[-1] == told[-5] > min(told)
+    assert [shot.report.attitude.status for shot in shots[-5:]] == ["solved"] * 5
+    assert not any(shot.report.attitude.solved for shot in shots[5:gone])
+
+
+def test_frames_taken_in_flight_are_taken_again_with_the_same_exposures() -> None:
+    """For the filter frames are taken in flight; the run shows the very same, and one that flies anew agrees."""
+    flight = {"vehicle__imu": "{}", "filter": "{start_deg: 0.1}", "motion__control": "none"}
+    growing = "{mean_dn: 4000, least_stars: 100000, step: 1 ms, longest: 7 ms, overexposed_objects: 100000}"
+    exposure = '{time: "4 ms", rate_hz: 5, frames: 5}'
+    flight |= {"motion__manoeuvre": "[]", "exposure": exposure, "tracker__exposure_control": growing}
+    lab = prepared("afit_simsat", **flight)
+    assert list(lab.exposures_s.values()) == pytest.approx([4e-3, 5e-3, 6e-3, 7e-3, 7e-3], abs=1e-12)
+    assert sorted(lab.reports) == list(
+        range(5)
+    )  # the flight lasts until the longest exposure of the last frame
+    shots = shots_of(lab)
+    assert [shot.frame.exposure_s for shot in shots] == list(lab.exposures_s.values())
+    anew = shots_of(replace(lab, reports={}, exposures_s={}))
+    assert exposures_ms(anew) == exposures_ms(shots)
+    for shot, other in zip(shots, anew, strict=True):
+        np.testing.assert_array_equal(shot.frame.image_dn, other.frame.image_dn)
+        gap_px = shot.report.centroids.xy_px - other.report.centroids.xy_px
+        assert np.abs(gap_px).max() < 1e-6
