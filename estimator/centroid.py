@@ -60,17 +60,7 @@ def gaussian_fit(image: NDArray, blobs: Blobs, gain_e_dn: float = 1.0, hints: Hi
     4/3 times worse than the photons allow. Saturated pixels are left out: the wings tell where the star is. A blob
     that the model does not fit (no convergence, larger than the window) keeps its centre of gravity.
     """
-    rows = starfit.fit_all(
-        native(image),
-        blobs.xy_px,
-        blobs.flux,
-        blobs.box_px,
-        blobs.peak,
-        blobs.background.noise,
-        gain_e_dn,
-        hints.saturation,
-    )
-    return _measured(_or_gravity(rows, image, blobs, gain_e_dn))
+    return _measured(_or_gravity(_gaussians(image, blobs, gain_e_dn, hints), image, blobs, gain_e_dn))
 
 
 def streak(image: NDArray, blobs: Blobs, gain_e_dn: float = 1.0, hints: Hints = NO_HINTS) -> Centroids:
@@ -80,17 +70,18 @@ def streak(image: NDArray, blobs: Blobs, gain_e_dn: float = 1.0, hints: Hints = 
     blobs share. The ends are `streak_ends`. The covariance is Cramer and Rao's: of a streak of length L it is worse
     along than across. Frames that are not smeared get `gaussian_fit`, and so do blobs that are no streak.
     """
-    round_ones = gaussian_fit(image, blobs, gain_e_dn, hints)
-    rows = _streaks(image, blobs, gain_e_dn, hints)
-    covariance = round_ones.sigma_px[:, None, None] ** 2 * np.eye(2)
-    good = np.isfinite(rows[:, 0])
-    covariance[good] = rows[good][:, [5, 7, 7, 6]].reshape(-1, 2, 2)
-    return Centroids(
-        np.where(good[:, None], rows[:, :2], round_ones.xy_px),
-        np.sqrt(np.trace(covariance, axis1=1, axis2=2) / 2),
-        np.where(good, rows[:, 2], round_ones.flux),
-        covariance,
-    )
+    lines = _streaks(image, blobs, gain_e_dn, hints)
+    lost = np.isnan(lines[:, 0])
+    if lost.all():
+        return gaussian_fit(image, blobs, gain_e_dn, hints)
+    covariance = lines[:, [5, 7, 7, 6]].reshape(-1, 2, 2)
+    rows = lines[:, [0, 1, 5, 2]]
+    rows[:, 2] = np.sqrt((lines[:, 5] + lines[:, 6]) / 2)
+    if lost.any():
+        rows[lost] = _gaussians(image, blobs.take(lost), gain_e_dn, hints)
+        rows = _or_gravity(rows, image, blobs, gain_e_dn)
+        covariance[lost] = rows[lost, 2, None, None] ** 2 * np.eye(2)
+    return Centroids(rows[:, :2], rows[:, 2], rows[:, 3], covariance)
 
 
 def streak_ends(
@@ -132,6 +123,22 @@ CENTROIDERS: dict[str, Centroider] = {
     "streak": streak,
     "disc": disc,
 }
+
+
+def _gaussians(image: NDArray, blobs: Blobs, gain_e_dn: float, hints: Hints) -> Floats:
+    """The rows of `starfit.fit_all`."""
+    sky = blobs.background
+    return starfit.fit_all(
+        native(image),
+        blobs.xy_px,
+        blobs.flux,
+        blobs.box_px,
+        blobs.peak,
+        sky.level,
+        sky.noise,
+        gain_e_dn,
+        hints.saturation,
+    )
 
 
 def _streaks(image: NDArray, blobs: Blobs, gain_e_dn: float, hints: Hints) -> Floats:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from estimator import judge
 from estimator.hints import NO_HINTS, Hints
-from estimator.scan import AREA, FLUX, PEAK, STRONG, X, Y, labelled, runs_above, summed
+from estimator.scan import labelled, ranked, runs_above, summed
 from estimator.shefex import maximum_scan, sequential_scan
 from estimator.skylevel import FILTERED_NOISE, median, sky
 from estimator.types import Background, BadImage, Blobs, Floats, Ints
@@ -17,6 +17,7 @@ from estimator.types import Background, BadImage, Blobs, Floats, Ints
 MAX_BLOBS = 20_000
 GROW_SIGMA = 3.5
 FEWEST_GROWN = 8  # pixels of a blob that is significant as a whole, though nowhere by itself
+FEW_STARS, DIRECTIONS, SOUGHT_PX = 8, 8, 10.0  # fewer may be streaks too faint to be seen; what is tried then
 FEWEST_SMEARED = 5  # noise averaged along a line is above the threshold three pixels in a row, or not at all
 THESIS_INTENSITY, THESIS_AREA_PX = 0.04, 50
 
@@ -38,7 +39,8 @@ def default(
     the connected pixels above 3 sigma of which `min_area_px` are above `threshold_sigma`, or whose light as a whole
     is a sigma more significant than that: noise does not break a faint streak into pieces.
     Smeared stars: the filtered image is averaged along the streak (dx, dy), which gains the square root of its
-    length. The streak is the hints' (from the gyro), else what the brightest blobs agree on.
+    length. The streak is the hints' (from the gyro), else what the brightest blobs agree on, else, where there are
+    but few, the direction in which most are found.
     """
     image = prepared(image)
     background = sky(image)
@@ -48,7 +50,10 @@ def default(
         )
         blobs = judge.judged(image, blobs, hints)
         if blobs.streak_px is None:
-            return blobs
+            stars = int(np.count_nonzero(blobs.flag & judge.NO_STAR == 0))
+            wanting = hints.streak_px is None and stars < FEW_STARS
+            unseen = faint_streaks(image, background, threshold_sigma, max_blobs, hints) if wanting else blobs
+            return judge.judged(image, unseen, hints) if len(unseen) > stars + 1 else blobs
         hints = Hints(blobs.streak_px, hints.saturation)
     return judge.judged(image, smeared(image, background, threshold_sigma, max_blobs, hints), hints)
 
@@ -166,6 +171,8 @@ def check(image: NDArray) -> None:
 
 def native(image: NDArray) -> NDArray:
     """The image in a type that compiled code takes: FITS files are big-endian, masks are boolean."""
+    if image.dtype == np.uint16 and image.dtype.isnative:
+        return image
     kind = {"b": "uint8", "f": "float32" if image.itemsize == 2 else "float64"}.get(image.dtype.kind)
     if kind and image.itemsize not in (4, 8):
         return image.astype(kind)
@@ -229,14 +236,10 @@ def gather(
         low = background.level + np.minimum(above, grow_sigma * background.noise)
     runs = runs_above(image, low)
     boxes, sums = summed(image, background.level, strong, runs, *labelled(runs))
-    real = sums[:, STRONG] >= min_area_px
-    if grow_sigma is not None:
-        usual = median(background.noise)
-        pixel_noise, wanted = usual / FILTERED_NOISE, median(above) / usual + 1
-        real |= (sums[:, AREA] >= max(min_area_px, FEWEST_GROWN)) & (
-            sums[:, FLUX] >= wanted * pixel_noise * np.sqrt(sums[:, AREA])
-        )
-    return _kept(boxes, sums, np.flatnonzero(real & (sums[:, FLUX] > 0)), max_blobs, background)
+    if grow_sigma is None:
+        return _kept(boxes, sums, min_area_px, max_blobs, background)
+    light = (median(above) + median(background.noise)) / FILTERED_NOISE
+    return _kept(boxes, sums, min_area_px, max_blobs, background, max(min_area_px, FEWEST_GROWN), light)
 
 
 def smeared(
@@ -251,17 +254,30 @@ def smeared(
     taps = taps_of(hints.streak_px)
     above = threshold_sigma * noise_kept(taps) / FILTERED_NOISE * background.noise
     runs = runs_above(image, background.level + above, taps)
-    boxes, sums = summed(
-        image, background.level, np.full_like(background.level, -np.inf), runs, *labelled(runs)
-    )
-    kept = np.flatnonzero((sums[:, AREA] >= FEWEST_SMEARED) & (sums[:, FLUX] > 0))
-    blobs = _kept(boxes, sums, kept, max_blobs, background)
+    boxes, sums = summed(image, background.level, background.level + above, runs, *labelled(runs))
+    blobs = _kept(boxes, sums, FEWEST_SMEARED, max_blobs, background, FEWEST_SMEARED, 0.0)
     half = np.abs(hints.streak_px) / 2 + 1
     middle = blobs.xy_px
     edge = np.array(image.shape[::-1]) - 1
     box = np.concatenate([np.clip(middle - half, 0, edge), np.clip(middle + half, 0, edge)], axis=1)
     blobs.box_px[:] = np.rint(box)
     return blobs
+
+
+def faint_streaks(
+    image: NDArray, background: Background, threshold_sigma: float, max_blobs: int, hints: Hints
+) -> Blobs:
+    """Streaks that nobody told of: those of the direction, of a few, in which a line filter finds the most.
+
+    The best of several directions is a better one by chance too, which half a sigma makes good.
+    """
+    turns = np.pi * np.arange(DIRECTIONS) / DIRECTIONS
+    found = []
+    for turn in turns:
+        along = (SOUGHT_PX * float(np.cos(turn)), SOUGHT_PX * float(np.sin(turn)))
+        told = Hints(along, hints.saturation)
+        found.append(smeared(image, background, threshold_sigma + 0.5, max_blobs, told))
+    return max(found, key=len)
 
 
 def taps_of(streak_px: tuple[float, float]) -> Ints:
@@ -293,16 +309,20 @@ def _scanned(
     flat = flattened(sky(image), image.shape)
     level, noise = float(flat.level[0, 0]), float(flat.noise[0, 0]) / FILTERED_NOISE
     boxes, sums = scan(image, level, level + threshold_sigma * noise, min_area_px, max_blobs)
-    return _kept(boxes, sums, np.arange(len(sums)), max_blobs, flat)
+    return _kept(boxes, sums, 0, max_blobs, flat)
 
 
-def _kept(boxes: Ints, sums: Floats, kept: NDArray, max_blobs: int, background: Background) -> Blobs:
-    """The brightest of those rows as Blobs without any flag."""
-    if len(kept) > MAX_BLOBS:
+def _kept(
+    boxes: Ints,
+    sums: Floats,
+    min_area_px: int,
+    max_blobs: int,
+    background: Background,
+    grown_area: int = 0,
+    grown_light: float = np.inf,
+) -> Blobs:
+    """The brightest of what counts, see `ranked`, as Blobs without any flag."""
+    box, xy, flux, peak, area, count = ranked(boxes, sums, min_area_px, grown_area, grown_light, max_blobs)
+    if count > MAX_BLOBS:
         raise BadImage(f"over {MAX_BLOBS} blobs: the frame is noise or texture, not a star field")
-    kept = kept[np.argsort(-sums[kept, FLUX], kind="stable")][:max_blobs]
-    rows = sums[kept]
-    flux = rows[:, FLUX]
-    xy = rows[:, X : Y + 1] / flux[:, None]
-    area = rows[:, AREA].astype(np.int64)
-    return Blobs(boxes[kept], xy, flux, rows[:, PEAK], area, background, np.zeros(len(kept), np.int64))
+    return Blobs(box, xy, flux, peak, area, background, np.zeros(len(flux), np.int64))

@@ -15,7 +15,7 @@ from estimator.types import Floats, Ints
 
 MARGIN_PX = 4
 SMALLEST_PX = 2.0  # radius of a disc that its edge's blur leaves flat in the middle
-SETTLED_PX = 1e-6
+ROUNDS = 40
 MODEL_PX = 0.004  # what a square pixel at a curved edge differs from the model: without noise, at 5 and 10 px
 # Parameters: middle, radius, the edge's width, brightness, sky.
 X, Y, RADIUS, EDGE, BRIGHT, SKY = range(6)
@@ -36,8 +36,10 @@ def fit_all(
     """(N, 5) x, y, sigma of the place, flux, radius; NaN for what is no disc."""
     height, width = image.shape
     out = np.full((len(xy), 5), np.nan)
-    near = np.empty(len(xy), np.int64)
-    p = np.empty(6)
+    near, p = np.empty(len(xy), np.int64), np.empty(6)
+    room = _largest_window(boxes)
+    pixels, rows, weight = np.empty((3, room)), np.empty((7, room)), np.empty(room)
+    rows[SKY] = 1.0
     for n in range(len(xy)):
         p[X], p[Y] = xy[n]
         p[RADIUS] = sqrt(area[n] / pi)
@@ -51,80 +53,75 @@ def fit_all(
         sky = at(level, height, width, xy[n, 1], xy[n, 0])
         sigma = at(noise, height, width, xy[n, 1], xy[n, 0]) / FILTERED_NOISE
         p[EDGE], p[BRIGHT], p[SKY] = 1.0, flux[n] / area[n], sky
-        window = (x0, y0, x1, y1)
-        _fit(image, window, boxes, others, n, sigma, gain_e_dn, saturation, p, out[n])
+        count = 0
+        for y in range(y0, y1 + 1):
+            for x in range(x0, x1 + 1):
+                if image[y, x] < saturation and not foreign(boxes, others, n, x, y):
+                    pixels[0, count], pixels[1, count], pixels[2, count] = x, y, image[y, x]
+                    count += 1
+        if count >= 12:
+            _fit(pixels[:, :count], sigma, gain_e_dn, rows, weight, p, out[n])
     return out
 
 
 @numba.njit(cache=True)
-def _fit(
-    image: NDArray,
-    window: tuple[int, int, int, int],
-    boxes: Ints,
-    others: Ints,
-    n: int,
-    noise: float,
-    gain_e_dn: float,
-    saturation: float,
-    p: Floats,
-    out: Floats,
-) -> None:
-    """Gauss-Newton from `p`; leaves `out` NaN where it does not settle inside its window.
+def _largest_window(boxes: Ints) -> int:
+    """Pixels of the largest blob's window."""
+    most = 0
+    for x0, y0, x1, y1 in boxes:
+        most = max(most, (x1 - x0 + 1 + 2 * MARGIN_PX) * (y1 - y0 + 1 + 2 * MARGIN_PX))
+    return most
 
+
+@numba.njit(cache=True, error_model="numpy")
+def _fit(
+    pixels: Floats, noise: float, gain_e_dn: float, rows: Floats, weight: Floats, p: Floats, out: Floats
+) -> None:
+    """Gauss-Newton from `p`; leaves `out` NaN where it does not settle near its start.
+
+    pixels : (3, K) x, y and value of those that count
     A lamp is no perfect disc: where the residuals are larger than the noise, the covariance grows with them.
     """
-    x0, y0, x1, y1 = window
+    count = pixels.shape[1]
     start_x, start_y, start_radius = p[X], p[Y], p[RADIUS]
-    normal, gradient, slope = np.empty((6, 6)), np.empty(6), np.empty(6)
-    moved, misfit, pixels = np.inf, 0.0, 0
-    for _ in range(40):
-        normal[:], gradient[:] = 0.0, 0.0
-        misfit, pixels = 0.0, 0
-        for y in range(y0, y1 + 1):
-            for x in range(x0, x1 + 1):
-                if image[y, x] >= saturation or foreign(boxes, others, n, x, y):
-                    continue
-                model = _model(p, float(x), float(y), slope)
-                weight = 1 / (noise * noise + max(model, 0.0) / gain_e_dn + 1e-9)
-                rest = image[y, x] - p[SKY] - model
-                leastsquares.add(normal, gradient, slope, rest, weight)
-                misfit += weight * rest * rest
-                pixels += 1
-        if pixels < 12 or not leastsquares.factorise(normal):
+    normal, move = np.empty((7, 7)), np.empty(6)
+    for _ in range(ROUNDS):
+        _rows(pixels, noise, gain_e_dn, p, rows, weight)
+        leastsquares.normal_equations(rows, weight, count, normal)
+        fall = leastsquares.step(normal, move)
+        if not fall >= 0:
             return
-        leastsquares.solve(normal, gradient)
-        moved = max(abs(gradient[X]), abs(gradient[Y]))
-        scale = min(1.0, 1 / max(moved, abs(gradient[RADIUS]), 4 * abs(gradient[EDGE]), 1e-300))
-        p += scale * gradient
+        moved = max(abs(move[X]), abs(move[Y]), abs(move[RADIUS]))
+        p += min(1.0, 1 / max(moved, 4 * abs(move[EDGE]), 1e-300)) * move
         p[EDGE] = min(max(p[EDGE], 0.25), 0.6 * p[RADIUS])
         if hypot(p[X] - start_x, p[Y] - start_y) > start_radius / 2 or p[BRIGHT] <= 0:
             return
         if not start_radius / 2 < p[RADIUS] < 2 * start_radius:
             return
-        if max(moved, abs(gradient[RADIUS])) < SETTLED_PX:
-            break
-    if moved > 1e-3:
-        return
-    xx, yy, _ = leastsquares.place_covariance(normal, slope)
-    out[0], out[1], out[4] = p[X], p[Y], p[RADIUS]
-    grown = (xx + yy) / 2 * leastsquares.misfit_factor(misfit, pixels - 6)
-    out[2] = sqrt(grown + MODEL_PX**2)
-    # The whole light of a blurred disc: pi (R^2 + w^2), the edge being symmetric about R.
-    out[3] = p[BRIGHT] * pi * (p[RADIUS] ** 2 + p[EDGE] ** 2)
+        if moved < leastsquares.SETTLED_PX or fall < leastsquares.SETTLED_CHI2:
+            xx, yy, _ = leastsquares.place_covariance(normal, move)
+            grown = (xx + yy) / 2 * leastsquares.misfit_factor(normal[6, 6], count - 6)
+            out[0], out[1], out[2], out[4] = p[X], p[Y], sqrt(grown + MODEL_PX**2), p[RADIUS]
+            # The whole light of a blurred disc: pi (R^2 + w^2), the edge being symmetric about R.
+            out[3] = p[BRIGHT] * pi * (p[RADIUS] ** 2 + p[EDGE] ** 2)
+            return
 
 
-@numba.njit(cache=True)
-def _model(p: Floats, x: float, y: float, slope: Floats) -> float:
-    """Light of the disc at a pixel, A erfc((r - R) / (w sqrt 2)) / 2, and its slopes by the six parameters.
+@numba.njit(cache=True, error_model="numpy")
+def _rows(pixels: Floats, noise: float, gain_e_dn: float, p: Floats, rows: Floats, weight: Floats) -> None:
+    """The model's slopes by the six parameters at every pixel, what it leaves over, and the weights.
 
-    Exact for a straight edge blurred by a Gaussian; w^2 is the optics' sigma^2 and the pixel's 1/12.
+    The light is A erfc((r - R) / (w sqrt 2)) / 2: exact for a straight edge blurred by a Gaussian; w^2 is the
+    optics' sigma^2 and the pixel's 1/12.
     """
-    dx, dy = x - p[X], y - p[Y]
-    r = max(hypot(dx, dy), 1e-9)
-    off, w = r - p[RADIUS], p[EDGE]
-    shape = erfc(off / (w * sqrt(2.0))) / 2
-    bell = p[BRIGHT] * exp(-off * off / (2 * w * w)) / (w * sqrt(2 * pi))
-    slope[X], slope[Y] = bell * dx / r, bell * dy / r
-    slope[RADIUS], slope[EDGE] = bell, bell * off / w
-    slope[BRIGHT], slope[SKY] = shape, 1.0
-    return p[BRIGHT] * shape
+    bright, w = p[BRIGHT], p[EDGE]
+    for k in range(pixels.shape[1]):
+        dx, dy = pixels[0, k] - p[X], pixels[1, k] - p[Y]
+        r = max(hypot(dx, dy), 1e-9)
+        off = r - p[RADIUS]
+        shape = erfc(off / (w * sqrt(2.0))) / 2
+        bell = bright * exp(-off * off / (2 * w * w)) / (w * sqrt(2 * pi))
+        rows[X, k], rows[Y, k] = bell * dx / r, bell * dy / r
+        rows[RADIUS, k], rows[EDGE, k], rows[BRIGHT, k] = bell, bell * off / w, shape
+        rows[6, k] = pixels[2, k] - p[SKY] - bright * shape
+        weight[k] = 1 / (noise * noise + max(bright * shape, 0.0) / gain_e_dn + 1e-9)

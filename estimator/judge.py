@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from enum import IntFlag
+from math import atan2, cos, hypot, sin, sqrt
 
 import numba
 import numpy as np
@@ -40,6 +41,7 @@ class Flag(IntFlag):
 
 
 NO_STAR = Flag.HOT | Flag.TRACK | Flag.HUGE | Flag.TEXTURE
+SATURATED, HOT, TRACK, HUGE, TEXTURE = (int(flag) for flag in Flag)  # as compiled code takes them
 
 
 def judged(image: NDArray, blobs: Blobs, hints: Hints) -> Blobs:
@@ -52,54 +54,86 @@ def judged(image: NDArray, blobs: Blobs, hints: Hints) -> Blobs:
         return replace(blobs, streak_px=hints.streak_px)
     background = blobs.background
     shape = _shapes(image, blobs.box_px, background.level, background.noise)
-    middle, sides, width2, lines = shape[:, 0], shape[:, 1], shape[:, 2], shape[:, 3:5]
     streak_px = hints.streak_px
-    shared = _shared(lines) if streak_px is None else _doubled(streak_px)
-    if streak_px is None and np.hypot(*shared) > STREAK_PX**2 and len(blobs) >= 3:
-        streak_px = _halved(shared)
-    long2 = np.hypot(lines[:, 0] - shared[0], lines[:, 1] - shared[1])
-    noise = at_all(background.noise, image.shape, blobs.xy_px)
-    step = FILTERED_NOISE * (image.dtype.kind in "iu")
-    ordinary = max(median(background.noise), step)
-    side = np.max(blobs.box_px[:, 2:] - blobs.box_px[:, :2], axis=1) + 1
-    allowed = max(LARGEST_SHARE * min(image.shape) + np.sqrt(np.hypot(*shared)), 16)
-    sharp = sides + 6 * noise / FILTERED_NOISE < SHARPEST * middle
-    track = (long2 > TRACK_PX**2) & (width2 < 4 * median(width2)) & (long2 > 12 * 4 * width2)
-    if streak_px is not None:  # no star is a spike there, and a faint streak has the shape of its noise
-        sharp[:] = False
-        track &= middle > CLEAR_SIGMA * noise / FILTERED_NOISE
-    flag = Flag.SATURATED * (blobs.peak >= hints.saturation)
-    flag |= Flag.HOT * sharp | Flag.TRACK * track | Flag.HUGE * ((side > allowed) & ~track)
-    flag |= Flag.TEXTURE * (noise > ROUGHEST * ordinary)
-    return replace(blobs, flag=flag.astype(np.int64), streak_px=streak_px)
-
-
-def _shared(lines: Floats) -> Floats:
-    """(2,) the line, as L^2 (cos 2a, sin 2a), that most of the brightest blobs share; 0 where they do not agree."""
-    voters = lines[:VOTERS]
-    shared = np.array([median(voters[:, 0]), median(voters[:, 1])])
-    apart = np.hypot(voters[:, 0] - shared[0], voters[:, 1] - shared[1])
-    agree = np.mean(apart < 0.5 * np.hypot(*shared)) > 0.6
-    return shared if agree else np.zeros(2)
-
-
-def _doubled(streak_px: tuple[float, float]) -> Floats:
-    x, y = streak_px
-    return np.array([x * x - y * y, 2 * x * y])
-
-
-def _halved(line: Floats) -> tuple[float, float]:
-    length, angle = np.sqrt(np.hypot(*line)), np.arctan2(line[1], line[0]) / 2
-    return float(length * np.cos(angle)), float(length * np.sin(angle))
+    if streak_px is None:
+        shared = _shared(shape[:, 3:])
+        if shared[0] ** 2 + shared[1] ** 2 > STREAK_PX**4 and len(blobs) >= 3:
+            streak_px = _halved(shared)
+    else:
+        shared = _doubled(streak_px)
+    flag = _flags(
+        shape,
+        blobs.box_px,
+        blobs.xy_px,
+        blobs.peak,
+        background.noise,
+        image.shape,
+        shared,
+        streak_px is not None,
+        hints.saturation,
+        FILTERED_NOISE * (image.dtype.kind in "iu"),
+    )
+    return Blobs(
+        blobs.box_px, blobs.xy_px, blobs.flux, blobs.peak, blobs.area_px, background, flag, streak_px
+    )
 
 
 @numba.njit(cache=True)
-def at_all(grid: Floats, shape: tuple[int, int], xy: Floats) -> Floats:
-    """(N,) a grid's values at pixels."""
-    out = np.empty(len(xy))
-    for n in range(len(xy)):
-        out[n] = at(grid, shape[0], shape[1], xy[n, 1], xy[n, 0])
-    return out
+def _flags(
+    shape: Floats,
+    boxes: Ints,
+    xy: Floats,
+    peak: Floats,
+    noise: Floats,
+    size: tuple[int, int],
+    shared: tuple[float, float],
+    smeared: bool,
+    saturation: float,
+    step: float,
+) -> Ints:
+    """(N,) what each blob's row of `_shapes` tells, beside the line that they share; `step` is quantisation's noise."""
+    height, width = size
+    ordinary, narrow = max(median(noise), step), median(shape[:, 2])
+    allowed = max(LARGEST_SHARE * min(height, width) + sqrt(hypot(shared[0], shared[1])), 16.0)
+    flag = np.zeros(len(shape), np.int64)
+    for n in range(len(shape)):
+        middle, sides, width2, line_x, line_y = shape[n]
+        here = at(noise, height, width, xy[n, 1], xy[n, 0])
+        pixel_noise = here / FILTERED_NOISE
+        long2 = hypot(line_x - shared[0], line_y - shared[1])
+        sharp = sides + 6 * pixel_noise < SHARPEST * middle
+        track = long2 > TRACK_PX**2 and width2 < 4 * narrow and long2 > 12 * 4 * width2
+        if smeared:  # no star is a spike there, and a faint streak has the shape of its noise
+            sharp = False
+            track = track and middle > CLEAR_SIGMA * pixel_noise
+        side = max(boxes[n, 2] - boxes[n, 0], boxes[n, 3] - boxes[n, 1]) + 1
+        flag[n] |= SATURATED if peak[n] >= saturation else 0
+        flag[n] |= HOT if sharp else 0
+        flag[n] |= TRACK if track else 0
+        flag[n] |= HUGE if side > allowed and not track else 0
+        flag[n] |= TEXTURE if here > ROUGHEST * ordinary else 0
+    return flag
+
+
+@numba.njit(cache=True)
+def _shared(lines: Floats) -> tuple[float, float]:
+    """The line, as L^2 (cos 2a, sin 2a), that most of the brightest blobs share; 0 where they do not agree."""
+    voters = lines[:VOTERS]
+    x, y = median(voters[:, 0]), median(voters[:, 1])
+    agree = 0
+    for n in range(len(voters)):
+        agree += hypot(voters[n, 0] - x, voters[n, 1] - y) < 0.5 * hypot(x, y)
+    return (x, y) if agree > 0.6 * len(voters) else (0.0, 0.0)
+
+
+def _doubled(streak_px: tuple[float, float]) -> tuple[float, float]:
+    x, y = streak_px
+    return float(x * x - y * y), float(2 * x * y)
+
+
+def _halved(line: tuple[float, float]) -> tuple[float, float]:
+    length, angle = sqrt(hypot(*line)), atan2(line[1], line[0]) / 2
+    return length * cos(angle), length * sin(angle)
 
 
 @numba.njit(cache=True)

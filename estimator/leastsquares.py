@@ -5,21 +5,48 @@ from __future__ import annotations
 from math import sqrt
 
 import numba
+import numpy as np
 
 from estimator.types import Floats
 
+# A fit has settled once a step is a hundredth of the standard deviation of what is fitted, or a thousandth of a
+# pixel: where the model fits, Newton's next step is its square.
+SETTLED_CHI2, SETTLED_PX = 1e-4, 1e-3
 
-@numba.njit(cache=True)
-def add(normal: Floats, gradient: Floats, slope: Floats, rest: float, weight: float) -> None:
-    """One pixel into the normal equations: sum(w s s^T), the lower half, and sum(w s rest)."""
-    for i in range(len(slope)):
-        part = weight * slope[i]
-        gradient[i] += part * rest
+
+@numba.njit(cache=True, error_model="numpy", fastmath={"reassoc", "contract"})
+def normal_equations(rows: Floats, weight: Floats, count: int, normal: Floats) -> None:
+    """sum(w r_i r_j) over `count` pixels, the lower half.
+
+    rows : (P + 1, K) a model's slopes by its P parameters, and last what it leaves over. So the last row of `normal`
+        is the gradient, and its corner the chi-square. The pixels are innermost: so they pass through a vector unit
+    """
+    for i in range(len(rows)):
         for j in range(i + 1):
-            normal[i, j] += part * slope[j]
+            total = 0.0
+            for k in range(count):
+                total += weight[k] * rows[i, k] * rows[j, k]
+            normal[i, j] = total
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
+def step(normal: Floats, out: Floats) -> float:
+    """Gauss-Newton's step from the matrix of `normal_equations`, which keeps Cholesky's factor; NaN if singular.
+
+    What it returns is by how much chi-square falls, g^T N^-1 g: the step's square in standard deviations.
+    """
+    count = len(out)
+    if not factorise(normal[:count, :count]):
+        return np.nan
+    out[:] = normal[count, :count]
+    solve(normal, out)
+    fall = 0.0
+    for i in range(count):
+        fall += normal[count, i] * out[i]
+    return fall
+
+
+@numba.njit(cache=True, error_model="numpy")
 def factorise(normal: Floats) -> bool:
     """Cholesky's L in place of the lower half of N = L L^T; False where N has no inverse worth the name."""
     for i in range(len(normal)):
@@ -37,7 +64,7 @@ def factorise(normal: Floats) -> bool:
     return True
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def solve(factor: Floats, vector: Floats) -> None:
     """Replace v by N^-1 v, for Cholesky's factor of N."""
     count = len(vector)
@@ -51,7 +78,7 @@ def solve(factor: Floats, vector: Floats) -> None:
         vector[i] /= factor[i, i]
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def place_covariance(factor: Floats, column: Floats) -> tuple[float, float, float]:
     """xx, yy and xy of N^-1 for the first two parameters: where the weights are inverse variances, Cramer and Rao's."""
     column[:] = 0.0
@@ -64,7 +91,7 @@ def place_covariance(factor: Floats, column: Floats) -> tuple[float, float, floa
     return xx, column[1], xy
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def misfit_factor(chi2: float, freedom: int) -> float:
     """By how much a covariance grows where the model is not the light: chi-square a degree, if that is no accident.
 

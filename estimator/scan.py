@@ -2,106 +2,131 @@
 
 from __future__ import annotations
 
-from math import floor
+from math import floor, sqrt
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.skylevel import at, column_sums, filtered, summing
+from estimator.skylevel import at, filtered, filtered_row, summing
 from estimator.types import Floats, Ints
 
-FIRST_RUNS = 8192  # how many the first pass has room for
+FIRST_RUNS = 2048  # how many the first pass has room for
 # Columns of a blob's sums. STRONG counts the pixels above the higher threshold, TOP is the highest filtered light.
 AREA, STRONG, FLUX, X, Y, PEAK, TOP, TOP_X, TOP_Y = range(9)
 SUMS = 9
+STRETCH = 64  # pixels that are looked at closely if one of them is bright
+ONE_TAP = np.zeros((1, 2), np.int64)
 
 
 def runs_above(image: NDArray, threshold: Floats, taps: Ints | None = None) -> Ints:
     """(N, 3) y, first x and last x of the runs whose filtered light is above a grid's bilinear threshold.
 
     Every row is filtered and compared in whole vectors with a bound that is nowhere above the threshold; only the
-    eights of pixels in which one exceeds the bound are looked at closely.
+    stretches of pixels in which one exceeds the bound are looked at closely.
     taps : (K, 2) x, y offsets over which the filtered image is averaged, for streaks; None for round stars
     """
-    kind = summing(image.dtype)
+    kind = summing(image.dtype, image.max() if image.dtype == np.uint16 else np.inf)
+    if taps is None:
+        taps, wide = ONE_TAP, kind
+    else:
+        wide = np.float64 if kind == np.float64 else np.int32
+    reach, width = int(np.abs(taps).max()), image.shape[1]
+    sums, ring = np.empty(width + 2, kind), np.empty((2 * reach + 1, width + 2 * reach), wide)
     room = FIRST_RUNS
     while True:
         runs = np.empty((room, 3), np.int64)
-        if taps is None:
-            count = _scan(image, threshold, np.empty(image.shape[1] + 2, kind), runs)
-        else:
-            wide = np.float64 if kind == np.float64 else np.int32
-            reach = int(np.abs(taps).max())
-            ring = np.empty((2 * reach + 1, image.shape[1] + 2 * reach), wide)
-            count = _scan_line(image, threshold, taps, np.empty(image.shape[1] + 2, kind), ring, runs)
+        count = _scan(image, threshold, taps, sums, ring, runs)
         if count <= room:
             return runs[:count]
         room = count
 
 
 @numba.njit(cache=True)
-def _scan(image: NDArray, threshold: Floats, sums: NDArray, runs: Ints) -> int:
-    """Fill `runs`; how many there are, which may be more than fit."""
+def _scan(image: NDArray, threshold: Floats, taps: Ints, sums: NDArray, ring: NDArray, runs: Ints) -> int:
+    """Fill `runs`; how many there are, which may be more than fit. `ring` has room for the rows that taps reach."""
     height, width = image.shape
-    bound, smooth = np.empty(width, sums.dtype), np.empty(width, sums.dtype)
-    padded = (width + 7) // 8 * 8
-    mask = np.zeros(padded, np.uint8)
+    reach, scale = len(ring) // 2, 16.0 * len(taps)
+    room = max(width, STRETCH)  # a narrow frame fills no stretch: the rest is dark
+    bounds, lights = np.zeros(room, ring.dtype), np.zeros(room, ring.dtype)
+    bound, line = bounds[:width], lights[:width]
+    mask = np.zeros(STRETCH, np.uint8)
     eights = mask.view(np.uint64)
-    count, cell = 0, -1
+    count, cell, ready = 0, -1, 0
     for y in range(height):
-        cell = _bounds(threshold, height, y, cell, 16.0, bound)
-        column_sums(image, y, sums)
-        left, middle, right = sums[:width], sums[1 : width + 1], sums[2:]
-        for x in range(width):
-            smooth[x] = left[x] + 2 * middle[x] + right[x]
-        for x in range(width):  # a loop of its own, lest the compiler widen the sums
-            mask[x] = smooth[x] > bound[x]
-        for k in range(len(eights)):
-            if eights[k] == 0:
+        cell = _bounds(threshold, height, y, cell, scale, bound)
+        if reach == 0:
+            filtered_row(image, y, sums, line)
+        else:
+            while ready < min(y + reach + 1, height):
+                _padded_row(image, ready, reach, sums, ring[ready % len(ring)])
+                ready += 1
+            _line(ring, taps, y, height, line)
+        for first in range(0, width, STRETCH):
+            start = max(min(first, width - STRETCH), 0)  # the last one begins where it is whole
+            part, least = lights[start : start + STRETCH], bounds[start : start + STRETCH]
+            hit = False
+            for i in range(STRETCH):  # a number known to the compiler: a handful of vectors
+                hit |= part[i] > least[i]
+            if not hit:
                 continue
-            for x in range(8 * k, min(8 * k + 8, width)):
-                if mask[x] and smooth[x] / 16 > at(threshold, height, width, y, x):
-                    count = _extend(runs, count, y, x)
+            for i in range(STRETCH):
+                mask[i] = part[i] > least[i]
+            for k in range(len(eights)):
+                if eights[k] == 0:
+                    continue
+                for i in range(8 * k, 8 * k + 8):
+                    x = start + i
+                    if mask[i] and x >= first and line[x] > scale * at(threshold, height, width, y, x):
+                        count = _extend(runs, count, y, x)
     return count
 
 
 @numba.njit(cache=True)
-def _scan_line(
-    image: NDArray, threshold: Floats, taps: Ints, sums: NDArray, ring: NDArray, runs: Ints
+def _runs_of(
+    line: NDArray,
+    bound: NDArray,
+    threshold: Floats,
+    height: int,
+    y: int,
+    scale: float,
+    first: int,
+    mask: NDArray[np.uint8],
+    runs: Ints,
+    count: int,
 ) -> int:
-    """As `_scan`, over the mean of the filtered image at the taps, from a ring of filtered rows."""
-    height, width = image.shape
-    reach = len(ring) // 2
-    bound, line = np.empty(width, ring.dtype), np.empty(width, ring.dtype)
-    count, cell, ready = 0, -1, 0
-    for y in range(height):
-        cell = _bounds(threshold, height, y, cell, 16.0 * len(taps), bound)
-        while ready < min(y + reach + 1, height):
-            _padded_row(image, ready, reach, sums, ring[ready % len(ring)])
-            ready += 1
-        line[:] = 0
-        for k in range(len(taps)):
-            source = ring[min(max(y + taps[k, 1], 0), height - 1) % len(ring)]
-            part = source[reach + taps[k, 0] : reach + taps[k, 0] + width]
-            for x in range(width):
-                line[x] += part[x]
-        for x in range(width):
-            if line[x] > bound[x] and line[x] / (16.0 * len(taps)) > at(threshold, height, width, y, x):
-                count = _extend(runs, count, y, x)
+    """Add the runs of a row's stretch from `first` on to the `count` that there are; how many then."""
+    part, least, eights = line[first : first + STRETCH], bound[first : first + STRETCH], mask.view(np.uint64)
+    mask[:] = 0
+    for i in range(len(part)):
+        mask[i] = part[i] > least[i]
+    for k in range(len(eights)):
+        if eights[k] == 0:
+            continue
+        for i in range(8 * k, 8 * k + 8):
+            if mask[i] and part[i] > scale * at(threshold, height, len(line), y, first + i):
+                count = _extend(runs, count, y, first + i)
     return count
+
+
+@numba.njit(cache=True)
+def _line(ring: NDArray, taps: Ints, y: int, height: int, out: NDArray) -> None:
+    """Sum of the filtered rows at the taps about a row."""
+    reach, width = len(ring) // 2, len(out)
+    out[:] = 0
+    for k in range(len(taps)):
+        source = ring[min(max(y + taps[k, 1], 0), height - 1) % len(ring)]
+        part = source[reach + taps[k, 0] : reach + taps[k, 0] + width]
+        for x in range(width):
+            out[x] += part[x]
 
 
 @numba.njit(cache=True)
 def _padded_row(image: NDArray, y: int, reach: int, sums: NDArray, out: NDArray) -> None:
     """16 times the filtered row, its ends repeated."""
-    width = image.shape[1]
-    column_sums(image, y, sums)
-    left, middle, right = sums[:width], sums[1 : width + 1], sums[2:]
-    inner = out[reach : reach + width]
-    for x in range(width):
-        inner[x] = left[x] + 2 * middle[x] + right[x]
-    out[:reach], out[reach + width :] = inner[0], inner[width - 1]
+    inner = out[reach : len(out) - reach]
+    filtered_row(image, y, sums, inner)
+    out[:reach], out[len(out) - reach :] = inner[0], inner[-1]
 
 
 @numba.njit(cache=True)
@@ -225,3 +250,27 @@ def summed(
             if smooth > at(strong, height, width, y, x):
                 mine[STRONG] += 1
     return boxes, sums
+
+
+@numba.njit(cache=True)
+def ranked(
+    boxes: Ints, sums: Floats, least_area: float, grown_area: float, grown_light: float, most: int
+) -> tuple[Ints, Floats, Floats, Floats, Ints, int]:
+    """Boxes, (x, y), flux, peak and area of the `most` brightest that count, and how many count.
+
+    Those count that have `least_area` pixels above the higher threshold, or `grown_area` pixels in all whose light
+    is `grown_light` times the root of their number.
+    """
+    rows, count = np.empty(len(sums), np.int64), 0
+    for n in range(len(sums)):
+        area, light = sums[n, AREA], sums[n, FLUX]
+        whole = area >= grown_area and light >= grown_light * sqrt(area)
+        if light > 0 and (sums[n, STRONG] >= least_area or whole):
+            rows[count] = n
+            count += 1
+    rows = rows[:count]
+    rows = rows[np.argsort(-sums[rows, FLUX], kind="mergesort")][:most]
+    xy = np.empty((len(rows), 2))
+    for k in range(len(rows)):
+        xy[k, 0], xy[k, 1] = sums[rows[k], X] / sums[rows[k], FLUX], sums[rows[k], Y] / sums[rows[k], FLUX]
+    return boxes[rows], xy, sums[rows, FLUX], sums[rows, PEAK], sums[rows, AREA].astype(np.int64), count

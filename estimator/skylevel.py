@@ -24,16 +24,23 @@ def sky(image: NDArray, tile_px: int = TILE_PX) -> Background:
     it is. It has a floor of what quantisation leaves in a flat patch, lest a dark JPEG have none.
     """
     tile_px = min(tile_px, *image.shape)
-    level, noise = _tiles(image, tile_px, np.empty(image.shape[1] + 2, summing(image.dtype)))
+    kind = summing(image.dtype)
+    exact = (
+        np.float64 if kind == np.float64 else np.float32
+    )  # which holds 16 pixels of two bytes to the last digit
+    level, noise = _tiles(image, tile_px, np.empty(image.shape[1], kind), np.empty(STARTERS, exact))
     step = 1.0 if image.dtype.kind in "iu" else 0.0
     return Background(level, np.maximum(noise, FILTERED_NOISE * step / np.sqrt(12)), tile_px)
 
 
-def summing(pixel: np.dtype) -> type:
-    """The narrowest type that holds 16 times a pixel: narrow ones pass more pixels through a vector unit."""
+def summing(pixel: np.dtype, greatest: float = np.inf) -> type:
+    """The narrowest type that holds 16 times a pixel: narrow ones pass more pixels through a vector unit.
+
+    greatest : of the pixels, where it is known: those of 12 bits fit a narrower type than their own tells
+    """
     if pixel.kind not in "iu" or pixel.itemsize > 2:
         return np.float64
-    return np.uint16 if pixel == np.uint8 else np.int32
+    return np.uint16 if pixel == np.uint8 or (pixel.kind == "u" and greatest < 4096) else np.int32
 
 
 @numba.njit(cache=True)
@@ -49,13 +56,16 @@ def filtered(image: NDArray, y: int, x: int) -> float:
 
 
 @numba.njit(cache=True)
-def column_sums(image: NDArray, y: int, out: NDArray) -> None:
-    """Column sums 1 2 1 about a row, with one more at either end: the first half of `filtered`, times 4."""
+def filtered_row(image: NDArray, y: int, sums: NDArray, out: NDArray) -> None:
+    """16 times a row of `filtered`, by way of column sums 1 2 1, one more at either end, in a buffer of theirs."""
     height, width = image.shape
     above, row, below = image[max(y - 1, 0)], image[y], image[min(y + 1, height - 1)]
+    left, middle, right = sums[:width], sums[1 : width + 1], sums[2:]
     for x in range(width):
-        out[x + 1] = above[x] + 2 * row[x] + below[x]
-    out[0], out[width + 1] = out[1], out[width]
+        middle[x] = above[x] + 2 * row[x] + below[x]
+    sums[0], sums[width + 1] = sums[1], sums[width]
+    for x in range(width):
+        out[x] = left[x] + 2 * middle[x] + right[x]
 
 
 @numba.njit(cache=True)
@@ -73,24 +83,23 @@ def at(grid: Floats, height: int, width: int, y: float, x: float) -> float:
 
 
 @numba.njit(cache=True)
-def _tiles(image: NDArray, tile_px: int, sums: NDArray) -> tuple[Floats, Floats]:
-    """Level and noise of every tile from some of its rows."""
+def _tiles(image: NDArray, tile_px: int, smooth: NDArray, starters: NDArray) -> tuple[Floats, Floats]:
+    """Level and noise of every tile from some of its rows; the last two are room, and tell the types to work in."""
     height, width = image.shape
     rows, columns = max(height // tile_px, 1), max(width // tile_px, 1)
     level, noise = np.empty((rows, columns)), np.empty((rows, columns))
     longest = width // columns + 1
-    values = np.empty((columns, SAMPLE_ROWS * longest))
-    starters = np.empty(STARTERS)
+    values, sums = (
+        np.empty((columns, SAMPLE_ROWS * longest), starters.dtype),
+        np.empty(width + 2, smooth.dtype),
+    )
     for row in range(rows):
         y0, y1 = row * height // rows, (row + 1) * height // rows
         for k in range(SAMPLE_ROWS):
-            column_sums(image, y0 + (2 * k + 1) * (y1 - y0) // (2 * SAMPLE_ROWS), sums)
+            filtered_row(image, y0 + (2 * k + 1) * (y1 - y0) // (2 * SAMPLE_ROWS), sums, smooth)
             for column in range(columns):
                 x0, x1 = column * width // columns, (column + 1) * width // columns
-                part = values[column, k * (x1 - x0) : (k + 1) * (x1 - x0)]
-                left, middle, right = sums[x0 : x1 + 2], sums[x0 + 1 : x1 + 2], sums[x0 + 2 : x1 + 2]
-                for i in range(x1 - x0):
-                    part[i] = left[i] + 2 * middle[i] + right[i]
+                values[column, k * (x1 - x0) : (k + 1) * (x1 - x0)] = smooth[x0:x1]
         for column in range(columns):
             size = (column + 1) * width // columns - column * width // columns
             some = values[column, : SAMPLE_ROWS * size]
@@ -108,43 +117,44 @@ def median(values: Floats) -> float:
 
 
 @numba.njit(cache=True)
-def _robust(values: Floats, starters: Floats) -> tuple[float, float]:
+def _robust(values: NDArray, starters: NDArray) -> tuple[float, float]:
     """Median and 1.4826 MAD of a few values spread evenly over all."""
     count = len(starters)
     for k in range(count):
         starters[k] = values[(2 * k + 1) * len(values) // (2 * count)]
-    _sort(starters)
-    middle = starters[count // 2]
+    middle = _middle(starters)
     for k in range(count):
         starters[k] = abs(starters[k] - middle)
-    _sort(starters)
-    return middle, 1.4826 * starters[count // 2]
+    return middle, 1.4826 * _middle(starters)
 
 
 @numba.njit(cache=True)
-def _sort(values: Floats) -> None:
-    """By insertion: the quickest for a few tens."""
-    for i in range(1, len(values)):
-        value = values[i]
-        k = i
-        while k > 0 and values[k - 1] > value:
-            values[k] = values[k - 1]
-            k -= 1
-        values[k] = value
+def _middle(values: NDArray) -> float:
+    """Median of an odd number of values, by counting those below each: a few tens of them, without a branch."""
+    half = len(values) // 2
+    for value in values:
+        below, up_to = np.int32(0), np.int32(0)
+        for k in range(len(values)):
+            below += np.int32(values[k] < value)
+            up_to += np.int32(values[k] <= value)
+        if below <= half < up_to:
+            return value
+    return values[0]
 
 
 @numba.njit(cache=True, fastmath={"reassoc", "contract"})
-def _clipped(values: Floats, middle: float, spread: float) -> tuple[float, float]:
+def _clipped(values: NDArray, middle: float, spread: float) -> tuple[float, float]:
     """Mean and standard deviation of what lies within 3 sigma, the latter made good for the tails cut off."""
-    reach = CLIP_SIGMA * spread
-    count = total = squares = 0.0
+    number = values.dtype.type
+    centre, reach, one = number(middle), number(CLIP_SIGMA * spread), number(1)
+    count = total = squares = number(0)
     for i in range(len(values)):
-        off = values[i] - middle
-        kept = 1.0 if abs(off) <= reach else 0.0
+        off = values[i] - centre
+        kept = one if abs(off) <= reach else number(0)
         count += kept
         total += kept * off
         squares += kept * off * off
     if count < 1:
         return middle, spread
-    mean = total / count
-    return middle + mean, np.sqrt(max(squares / count - mean * mean, 0.0) / CLIPPED_VARIANCE)
+    mean = float(total) / count
+    return float(centre) + mean, np.sqrt(max(float(squares) / count - mean * mean, 0.0) / CLIPPED_VARIANCE)

@@ -14,128 +14,140 @@ from estimator.types import Floats, Ints
 
 HALF_PX, WIDEST_HALF_PX = 3, 10  # of the window: of a star, and of one that fills its pixels
 NARROWEST_PX, WIDEST_PX = 0.2, 3.0  # sigma that a window of 7x7 can tell
-SETTLED_PX = 1e-5  # the next step of Newton's would be its square
+USUAL_PX = 0.8  # sigma that the first star starts from
+ROUNDS = 40
+# Parameters: middle, flux, width, sky.
+X, Y, FLUX, WIDTH, SKY = range(5)
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def fit_all(
     image: NDArray,
     xy: Floats,
     flux: Floats,
     boxes: Ints,
     peak: Floats,
+    level: Floats,
     noise: Floats,
     gain_e_dn: float,
     saturation: float,
 ) -> Floats:
-    """(N, 4) x, y, sigma of the place, flux; NaN for what is no single Gaussian."""
-    out = np.full((len(xy), 4), np.nan)
+    """(N, 4) x, y, sigma of the place, flux; NaN for what is no single Gaussian.
+
+    Each star starts from the width of the one before: the optics are the same.
+    """
     height, width = image.shape
-    room = 2 * WIDEST_HALF_PX + 1
-    cells = np.empty((6, room))
-    normal, gradient, slope, p = np.empty((5, 5)), np.empty(5), np.empty(5), np.empty(5)
+    out = np.full((len(xy), 4), np.nan)
+    side = 2 * WIDEST_HALF_PX + 1
+    rows, weight, edges = np.empty((6, side * side)), np.empty(side * side), np.empty((6, side + 1))
+    rows[SKY] = 1.0
+    p, usual_px = np.empty(5), USUAL_PX
     for n in range(len(xy)):
-        pixel_noise = at(noise, height, width, xy[n, 1], xy[n, 0]) / FILTERED_NOISE
         half = HALF_PX
         if peak[n] >= saturation:  # only its wings tell where it is
-            side = max(boxes[n, 2] - boxes[n, 0], boxes[n, 3] - boxes[n, 1])
-            half = min(max(side // 2 + 2, HALF_PX), WIDEST_HALF_PX)
-        _fit(
-            image,
-            xy[n, 0],
-            xy[n, 1],
-            half,
-            pixel_noise,
-            gain_e_dn,
-            saturation,
-            cells,
-            normal,
-            gradient,
-            slope,
-            p,
-            out[n],
-        )
+            longer = max(boxes[n, 2] - boxes[n, 0], boxes[n, 3] - boxes[n, 1])
+            half = min(max(longer // 2 + 2, HALF_PX), WIDEST_HALF_PX)
+        left, top = round(xy[n, 0]) - half, round(xy[n, 1]) - half
+        side = 2 * half + 1
+        if left < 0 or top < 0 or left + side > width or top + side > height:
+            continue
+        window = image[top : top + side, left : left + side]
+        sigma = at(noise, height, width, xy[n, 1], xy[n, 0]) / FILTERED_NOISE
+        p[X], p[Y] = xy[n, 0] - left, xy[n, 1] - top
+        p[WIDTH], p[SKY] = usual_px, at(level, height, width, xy[n, 1], xy[n, 0])
+        if _fit(window, sigma, gain_e_dn, saturation, rows, weight, edges, p, out[n]):
+            usual_px = p[WIDTH]
+            out[n, 0] += left
+            out[n, 1] += top
         if not out[n, 3] > flux[n] / 2:
             out[n] = np.nan  # a window on the plateau of a disc sees a little light on a bright sky
     return out
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def _fit(
-    image: NDArray,
-    x0: float,
-    y0: float,
-    half: int,
+    window: NDArray,
     noise: float,
     gain_e_dn: float,
     saturation: float,
-    cells: Floats,
-    normal: Floats,
-    gradient: Floats,
-    slope: Floats,
+    rows: Floats,
+    weight: Floats,
+    edges: Floats,
     p: Floats,
     out: Floats,
-) -> None:
-    """One Gaussian by Gauss-Newton; leaves `out` NaN where it does not settle inside its window.
+) -> bool:
+    """One Gaussian by Gauss-Newton from `p`; False where it does not settle inside its window.
 
     Two stars in one window are no star: the covariance grows with what the model leaves over.
     """
-    height, width = image.shape
-    side = 2 * half + 1
-    left, top = round(x0) - half, round(y0) - half
-    if left < 0 or top < 0 or left + side > width or top + side > height:
-        return
-    low, total = np.inf, 0.0
-    for y in range(top, top + side):
-        for x in range(left, left + side):
-            low = min(low, float(image[y, x]))
-            total += image[y, x]
-    p[0], p[1], p[2], p[3], p[4] = x0, y0, max(total - side * side * low, 1e-9), 0.8, low
-    gx, dgx, sgx, gy, dgy, sgy = cells
-    moved, misfit, pixels = np.inf, 0.0, 0
-    for _ in range(60):
-        for k in range(side):
-            gx[k], dgx[k], sgx[k] = _cell(left + k - p[0], p[3])
-            gy[k], dgy[k], sgy[k] = _cell(top + k - p[1], p[3])
-        normal[:], gradient[:] = 0.0, 0.0
-        misfit, pixels = 0.0, 0
-        for j in range(side):
-            for i in range(side):
-                value = float(image[top + j, left + i])
-                if value >= saturation:
-                    continue
-                shape = gx[i] * gy[j]
-                slope[0], slope[1] = p[2] * dgx[i] * gy[j], p[2] * gx[i] * dgy[j]
-                slope[2], slope[3] = shape, p[2] * (sgx[i] * gy[j] + gx[i] * sgy[j])
-                slope[4] = 1.0
-                # The 1e-9 keeps a noise-free image's sky from weighing infinitely much.
-                weight = 1 / (noise * noise + (shape + 1e-9) * p[2] / gain_e_dn)
-                rest = value - p[4] - p[2] * shape
-                leastsquares.add(normal, gradient, slope, rest, weight)
-                misfit += weight * rest * rest
-                pixels += 1
-        if not leastsquares.factorise(normal):
-            return
-        leastsquares.solve(normal, gradient)
-        moved = max(abs(gradient[0]), abs(gradient[1]))
-        scale = min(1.0, 0.5 / max(moved, abs(gradient[3]), 1e-300))
-        p += scale * gradient
-        p[3] = min(max(p[3], NARROWEST_PX), WIDEST_PX)
-        if abs(p[0] - x0) > 2 or abs(p[1] - y0) > 2 or p[2] <= 0:
-            return
-        if max(moved, abs(gradient[3])) < SETTLED_PX:
-            break
-    if moved > SETTLED_PX or p[3] <= NARROWEST_PX or p[3] >= WIDEST_PX:
-        return
-    xx, yy, _ = leastsquares.place_covariance(normal, slope)
-    grown = leastsquares.misfit_factor(misfit, pixels - 5)
-    out[0], out[1], out[2], out[3] = p[0], p[1], sqrt((xx + yy) / 2 * grown), p[2]
+    start_x, start_y = p[X], p[Y]
+    normal, move = np.empty((6, 6)), np.empty(5)
+    p[FLUX] = max(window.sum() - window.size * p[SKY], 1e-9)
+    for _ in range(ROUNDS):
+        pixels = _rows(window, noise, gain_e_dn, saturation, p, rows, weight, edges)
+        leastsquares.normal_equations(rows, weight, window.size, normal)
+        fall = leastsquares.step(normal, move)
+        if not fall >= 0:
+            return False
+        moved = max(abs(move[X]), abs(move[Y]), abs(move[WIDTH]))
+        p += min(1.0, 0.5 / max(moved, 1e-300)) * move
+        if abs(p[X] - start_x) > 2 or abs(p[Y] - start_y) > 2 or p[FLUX] <= 0:
+            return False
+        p[WIDTH] = min(max(p[WIDTH], NARROWEST_PX), WIDEST_PX)
+        if moved < leastsquares.SETTLED_PX or fall < leastsquares.SETTLED_CHI2:
+            if not NARROWEST_PX < p[WIDTH] < WIDEST_PX:
+                return False
+            xx, yy, _ = leastsquares.place_covariance(normal, move)
+            grown = leastsquares.misfit_factor(normal[5, 5], pixels - 5)
+            out[0], out[1], out[2], out[3] = p[X], p[Y], sqrt((xx + yy) / 2 * grown), p[FLUX]
+            return True
+    return False
 
 
-@numba.njit(cache=True)
-def _cell(offset: float, sigma: float) -> tuple[float, float, float]:
-    """Share of a 1-D Gaussian in a pixel `offset` from its middle; its slopes by centre and by sigma."""
-    high, low = (offset + 0.5) / sigma, (offset - 0.5) / sigma
-    share = (erf(high / sqrt(2.0)) - erf(low / sqrt(2.0))) / 2
-    bell_high, bell_low = exp(-high * high / 2) / sqrt(2 * pi), exp(-low * low / 2) / sqrt(2 * pi)
-    return share, (bell_low - bell_high) / sigma, (low * bell_low - high * bell_high) / sigma
+@numba.njit(cache=True, error_model="numpy")
+def _rows(
+    window: NDArray,
+    noise: float,
+    gain_e_dn: float,
+    saturation: float,
+    p: Floats,
+    rows: Floats,
+    weight: Floats,
+    edges: Floats,
+) -> int:
+    """The model's slopes at every pixel of the window, what it leaves over, and the weights; how many count."""
+    side, flux, pixels = len(window), p[FLUX], window.size
+    gx, dgx, sgx, gy, dgy, sgy = edges
+    _cells(side, p[X], p[WIDTH], gx, dgx, sgx)
+    _cells(side, p[Y], p[WIDTH], gy, dgy, sgy)
+    for j in range(side):
+        part = rows[:, j * side : (j + 1) * side]
+        heavy, line = weight[j * side : (j + 1) * side], window[j]
+        share, slope, widening = flux * gy[j], flux * dgy[j], flux * sgy[j]
+        for i in range(side):
+            light = share * gx[i]
+            part[X, i], part[Y, i], part[FLUX, i] = share * dgx[i], slope * gx[i], gy[j] * gx[i]
+            part[WIDTH, i] = share * sgx[i] + widening * gx[i]
+            part[5, i] = line[i] - p[SKY] - light
+            # The 1e-9 keeps a noise-free image's sky from weighing infinitely much.
+            heavy[i] = 1 / (noise * noise + (light + 1e-9 * flux) / gain_e_dn)
+        for i in range(side):
+            if line[i] >= saturation:
+                heavy[i] = 0.0
+                pixels -= 1
+    return pixels
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _cells(count: int, middle: float, sigma: float, share: Floats, slope: Floats, widening: Floats) -> None:
+    """Share of a 1-D Gaussian in each pixel; its slopes by the middle and by sigma. From edge to edge."""
+    scale = 1 / sigma
+    low = (-0.5 - middle) * scale
+    low_sum, low_bell = erf(low * sqrt(0.5)) / 2, exp(-low * low / 2) / sqrt(2 * pi)
+    for k in range(count):
+        high = low + scale
+        high_sum, high_bell = erf(high * sqrt(0.5)) / 2, exp(-high * high / 2) / sqrt(2 * pi)
+        share[k] = high_sum - low_sum
+        slope[k] = (low_bell - high_bell) * scale
+        widening[k] = (low * low_bell - high * high_bell) * scale
+        low, low_sum, low_bell = high, high_sum, high_bell

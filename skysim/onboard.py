@@ -124,8 +124,8 @@ def believed_settings(scene: Scene) -> Settings:
     part = scene.tracker
     near = isinstance(scene.light, Dome)
     return Settings(
-        detector=known("detector", part.detector, DETECTORS),
-        centroider=known("centroider", part.centroider, CENTROIDERS),
+        detector=known("detector", part.detector or ("local" if near else "default"), DETECTORS),
+        centroider=known("centroider", part.centroider or ("cog" if near else "default"), CENTROIDERS),
         identifier=known(
             "identifier",
             part.identifier or ("led_pairs" if near else "default"),

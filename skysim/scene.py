@@ -98,12 +98,13 @@ class Tracker(Part):
     """What the star tracker's computer does and believes. `null` believes what the hardware is.
 
     map : a file that `skysim survey` wrote: LEDs, lever, focal length and distortion as measured
-    identifier, solver : if left out, led_pairs and rotation_only under a dome, and both `default` under the stars
+    detector, centroider, identifier, solver : if left out, under a dome local, cog, led_pairs and rotation_only, and
+        under the stars all of them `default`
     exposure_control : every frame is exposed for `exposure.time` if left out
     """
 
-    detector: str = "local"
-    centroider: str = "cog"
+    detector: str | None = None
+    centroider: str | None = None
     identifier: str | None = None
     solver: str | None = None
     threshold_sigma: Annotated[Number, Field(gt=0)] = 5.0
