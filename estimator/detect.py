@@ -18,6 +18,7 @@ MAX_BLOBS = 20_000
 GROW_SIGMA = 3.5
 FEWEST_GROWN = 8  # pixels of a blob that is significant as a whole, though nowhere by itself
 FEW_STARS, DIRECTIONS, SOUGHT_PX = 8, 8, 10.0  # fewer may be streaks too faint to be seen; what is tried then
+LARGE_PX = 150  # a blob of so many pixels is no faint streak, and a line filter makes many of its noise
 FEWEST_SMEARED = 5  # noise averaged along a line is above the threshold three pixels in a row, or not at all
 THESIS_INTENSITY, THESIS_AREA_PX = 0.04, 50
 
@@ -51,7 +52,7 @@ def default(
         blobs = judge.judged(image, blobs, hints)
         if blobs.streak_px is None:
             stars = int(np.count_nonzero(blobs.flag & judge.NO_STAR == 0))
-            wanting = hints.streak_px is None and stars < FEW_STARS
+            wanting = hints.streak_px is None and stars < FEW_STARS and np.all(blobs.area_px < LARGE_PX)
             unseen = faint_streaks(image, background, threshold_sigma, max_blobs, hints) if wanting else blobs
             return judge.judged(image, unseen, hints) if len(unseen) > stars + 1 else blobs
         hints = Hints(blobs.streak_px, hints.saturation)

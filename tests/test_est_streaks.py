@@ -231,7 +231,7 @@ def test_streaks_too_faint_to_be_seen_are_found_by_their_direction() -> None:
         for step in np.linspace(-0.5, 0.5, 60):
             x, y = middle + step * along
             light += (
-                800 / 60 / (2 * np.pi * 0.64) * np.exp(-((columns - x) ** 2 + (rows - y) ** 2) / 2 / 0.64)
+                500 / 60 / (2 * np.pi * 0.64) * np.exp(-((columns - x) ** 2 + (rows - y) ** 2) / 2 / 0.64)
             )
     image = 100 + light + rng.normal(0, 10, light.shape)
     told = detect.default(image, hints=Hints(tuple(along)))
