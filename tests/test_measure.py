@@ -141,7 +141,7 @@ def test_a_scene_beside_the_file_believes_it(told: dict[str, Any], folder: Path)
 
 @pytest.mark.long
 def test_afit_s_dome_is_measured_to_a_hundredth_of_a_degree(tmp_path: Path) -> None:
-    """Issue 5 asks for 0.01 deg across and 0.03 about the boresight after 600 frames: the same after 200."""
+    """A lab wants 0.01 deg across and 0.03 about the boresight after 600 frames: the same after 200."""
     words = ("survey", "afit_simsat", "--frames", 200, "--checks", 30, "--json", "--out", tmp_path)
     code, out, err = command(*words)
     assert (code, err) == (0, "")
