@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from estimator import wahba as kernel
 from estimator.types import Floats
+from estimator.vectors import xyzw_of
 
 Solver = Callable[..., Rotation]
 
@@ -96,7 +97,7 @@ def rotation(R_a_from_b: Floats) -> Rotation:
 
     Through the quaternion: from_matrix makes any matrix orthogonal first, and takes four times as long.
     """
-    return Rotation.from_quat(kernel.xyzw_of(R_a_from_b))
+    return Rotation.from_quat(xyzw_of(R_a_from_b))
 
 
 def covariance(vectors_cam: Floats, sigma_rad: Floats, solver: str = "quest") -> Floats:

@@ -9,7 +9,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator import vectors
+from estimator import leastsquares, vectors
 from estimator.starsky import MAG_BLUR, MAG_STEP, Sky, nearest
 from estimator.types import Floats
 
@@ -205,21 +205,14 @@ def _fit(
 
 @numba.njit(cache=True, error_model="numpy")
 def solved(a: Floats, b: Floats) -> Floats:
-    """x of a x = b by Cholesky; `a` (its lower half) becomes the factor."""
-    n = len(b)
+    """x of a x = b by Cholesky; `a` (its lower half) becomes the factor, be it as good as singular."""
     x = b.copy()
-    for i in range(n):
+    for i in range(len(b)):
         for j in range(i + 1):
             for k in range(j):
                 a[i, j] -= a[i, k] * a[j, k]
             a[i, j] = sqrt(max(a[i, i], 1e-300)) if i == j else a[i, j] / a[j, j]
-        for k in range(i):
-            x[i] -= a[i, k] * x[k]
-        x[i] /= a[i, i]
-    for i in range(n - 1, -1, -1):
-        for k in range(i + 1, n):
-            x[i] -= a[k, i] * x[k]
-        x[i] /= a[i, i]
+    leastsquares.solve(a, x)
     return x
 
 
@@ -317,5 +310,5 @@ def fixed(lights: Lights, stars: Sky, guess: Guess) -> Fix:
         tx, ty = lights.tangent[guess.observed[k], 0], lights.tangent[guess.observed[k], 1]
         total += (tx - guess.zoom * x) ** 2 + (ty - guess.zoom * y) ** 2
     rms = sqrt(total / max(2 * len(guess.star), 1))
-    xyzw = vectors.quaternion_xyzw(guess.R_cam_from_ref)
+    xyzw = vectors.xyzw_of(guess.R_cam_from_ref)
     return Fix(guess.observed, guess.star, xyzw, covariance, guess.zoom, rms, guess.dex)

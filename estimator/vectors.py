@@ -72,19 +72,17 @@ def turn(w: Floats, matrix: Floats) -> None:
 
 
 @numba.njit(cache=True)
-def quaternion_xyzw(R: Floats) -> Floats:
-    """(4,) of a rotation matrix, by the greatest of its four numbers (Shepperd 1978)."""
-    q = np.empty(4)
+def xyzw_of(R: Floats) -> Floats:
+    """(4,) quaternion (x, y, z, w) of a rotation matrix, by its greatest part (Shepperd 1978, J. Guidance 1, 223)."""
     trace = R[0, 0] + R[1, 1] + R[2, 2]
-    k = 3
-    for n in range(3):
-        if R[n, n] > (trace if k == 3 else R[k, k]):
-            k = n
-    if k == 3:
-        q[0], q[1], q[2] = R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]
+    q = np.empty(4)
+    i = 0 if R[0, 0] >= R[1, 1] else 1
+    i = i if R[i, i] >= R[2, 2] else 2
+    if trace >= R[i, i]:
         q[3] = 1 + trace
+        q[0], q[1], q[2] = R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]
     else:
-        i, j = (k + 1) % 3, (k + 2) % 3
-        q[k] = 1 + R[k, k] - R[i, i] - R[j, j]
-        q[i], q[j], q[3] = R[i, k] + R[k, i], R[j, k] + R[k, j], R[j, i] - R[i, j]
+        j, k = (i + 1) % 3, (i + 2) % 3
+        q[i] = 1 + 2 * R[i, i] - trace
+        q[j], q[k], q[3] = R[j, i] + R[i, j], R[k, i] + R[i, k], R[k, j] - R[j, k]
     return q / sqrt(q[0] ** 2 + q[1] ** 2 + q[2] ** 2 + q[3] ** 2)

@@ -394,20 +394,3 @@ def matrix_of(q: Quaternion) -> Floats:
     R[1, 0], R[1, 1], R[1, 2] = s * (x * y + z * w), 1 - s * (x * x + z * z), s * (y * z - x * w)
     R[2, 0], R[2, 1], R[2, 2] = s * (x * z - y * w), s * (y * z + x * w), 1 - s * (x * x + y * y)
     return R
-
-
-@numba.njit(cache=True)
-def xyzw_of(R: Floats) -> Floats:
-    """(4,) quaternion (x, y, z, w) of a rotation matrix, by its greatest part (Shepperd 1978, J. Guidance 1, 223)."""
-    trace = R[0, 0] + R[1, 1] + R[2, 2]
-    q = np.empty(4)
-    i = 0 if R[0, 0] >= R[1, 1] else 1
-    i = i if R[i, i] >= R[2, 2] else 2
-    if trace >= R[i, i]:
-        q[3] = 1 + trace
-        q[0], q[1], q[2] = R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]
-    else:
-        j, k = (i + 1) % 3, (i + 2) % 3
-        q[i] = 1 + 2 * R[i, i] - trace
-        q[j], q[k], q[3] = R[j, i] + R[i, j], R[k, i] + R[i, k], R[k, j] - R[j, k]
-    return q / sqrt(q[0] ** 2 + q[1] ** 2 + q[2] ** 2 + q[3] ** 2)

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from estimator import starfield, starproof, starsky
 from estimator.types import BadImage
-from estimator.vectors import quaternion_xyzw
+from estimator.vectors import xyzw_of
 
 WIDE_RAD = np.radians(12.0)
 FIELD = np.tan(np.radians([-5.0, 5.0, -4.0, 4.0]))
@@ -214,5 +214,5 @@ def test_the_normal_equations_are_solved(seed: int) -> None:
 def test_a_matrix_is_its_quaternion(seed: int, axis) -> None:
     """Half turns, where the scalar part vanishes, as well."""
     rotation = Rotation.random(rng=seed) if axis is None else Rotation.from_rotvec(np.pi * np.array(axis))
-    again = Rotation.from_quat(quaternion_xyzw(rotation.as_matrix()))
+    again = Rotation.from_quat(xyzw_of(rotation.as_matrix()))
     assert (again * rotation.inv()).magnitude() < 1e-14 * 10
