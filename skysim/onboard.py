@@ -152,10 +152,13 @@ def known(key: str, name: str, algorithms: Mapping[str, object]) -> str:
         raise BadInput(f"tracker.{key}: {error}") from None
 
 
-def answer(estimator: Estimator, frame: Frame) -> Report:
-    """The tracker's report; a frame that it will not look at (empty, saturated) is a status too."""
+def answer(estimator: Estimator, frame: Frame, streak_px: tuple[float, float] | None = None) -> Report:
+    """The tracker's report; a frame that it will not look at (empty, saturated) is a status too.
+
+    streak_px : (dx, dy) that lights move in the exposure, where a gyro tells the tracker
+    """
     try:
-        return estimator.solve(frame.image_dn)
+        return estimator.solve(frame.image_dn, streak_px)
     except BadImage as error:
         return Report(Attitude(str(error)), Centroids.none())
 

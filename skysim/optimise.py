@@ -25,15 +25,18 @@ from skysim.types import BadInput, Floats
 
 Ints = NDArray[np.int64]
 
-SITES_AN_LED = 10  # places to choose from: a third of the LEDs' own spacing apart
-BESIDE = 30  # nearest sites, to which every other offer goes
+SITES_AN_LED = 300  # places to choose from: a seventeenth of the LEDs' own spacing apart
+EVEN = 10  # of them are enough to be spread evenly
+FAR = 0.1  # of the offers are anywhere
+STEPS = (0.02, 0.6)  # of the LEDs' own spacing: how far the others are, from the least to the greatest
 SEERS = 400  # attitudes that see a site: a field's border passes it in steps of a twentieth of the field
-FEWEST, MOST = 2000, 20_000  # attitudes judged
+FEWEST, MOST = 2000, 10_000  # attitudes judged
 GOLDEN = 1.2207440846057596  # g^4 = g + 1: by its powers points fill a cube evenly (Roberts 2018; assumed)
 EXAMINED = 3  # times as many attitudes are those by which layouts are compared
 TAILS = (0.0005, 0.01)  # of them, the worst: what is asked of a dome
-GENERATIONS = 6  # of attitudes: after each the hardest of fresh ones join those that are judged
-DRAWN, HARDEST = 20_000, 600
+GENERATIONS = 25  # of attitudes: after each the hardest of fresh ones join those that are judged
+DRAWN, HARDEST = 20_000, 400
+SHAKES, SHAKE = 6, 0.1
 EDGE = 0.98  # of the field is what a search believes in
 HALF = 0.5  # of a field's LEDs may coincide with another field's
 NUDGES = 100  # tries to make a field differ
@@ -78,7 +81,7 @@ def places(
     Raises BadInput where so many do not find room at the spacing.
     """
     beginnings = [one for one in begin_m if cKDTree(one).query(one, k=2)[0][:, 1].min() >= part.spacing_m]
-    chosen = evenly(sites_m, part)
+    chosen = evenly(sites_m[: EVEN * part.count], part)
     if len(chosen) == part.count:
         beginnings.append(sites_m[chosen])
     if not beginnings:
@@ -90,29 +93,37 @@ def places(
     exam = Exam(part, attitudes(part, EXAMINED * judged, rng), np.ones(2))
     exam = exam._replace(limit=np.min([exam.marks(one) for one in beginnings], axis=0))
     best_m = min(beginnings, key=exam.mark)
-    sites_m = np.concatenate([best_m, sites_m])
-    best_m = min([best_m, *searched(part, sites_m, attitudes(part, judged, rng), rng)], key=exam.mark)
+    found = searched(part, best_m, sites_m, attitudes(part, judged, rng), rng)
+    best_m = min([best_m, *found], key=exam.mark)
     return set_apart(exam, best_m, sites_m, rng)
 
 
 def searched(
-    part: lamp.Optimised, sites_m: Floats, R_body_from_lab: Floats, rng: np.random.Generator
+    part: lamp.Optimised, place_m: Floats, sites_m: Floats, R_body_from_lab: Floats, rng: np.random.Generator
 ) -> list[Floats]:
-    """(N, 3) of the sites each, what the generations came to; they begin with the first of the sites."""
-    chosen, found = np.arange(part.count), []
-    beside = cKDTree(sites_m).query(sites_m, k=min(BESIDE, len(sites_m)))[1]
-    seen = seen_from(part, sites_m, R_body_from_lab)
+    """(N, 3) each, what the generations came to from these places."""
+    tree, found = cKDTree(sites_m), []
     ends = np.linspace(0, part.rounds, GENERATIONS + 1).round().astype(int)[1:-1]
     for n in range(part.rounds):
         if n in ends:
-            found.append(sites_m[chosen])
-            R_body_from_lab = np.concatenate([R_body_from_lab, hardest(part, found[-1], rng)])
-            seen = seen_from(part, sites_m, R_body_from_lab)
+            found.append(place_m)
+            R_body_from_lab = np.concatenate([R_body_from_lab, hardest(part, place_m, rng)])
+        both_m = np.concatenate([place_m, offers(place_m, sites_m, tree, rng)])
+        chosen = np.arange(part.count)
+        seen = seen_from(part, both_m, R_body_from_lab)
         who = rng.permutation(part.count)
-        local = beside[chosen[who], rng.integers(beside.shape[1], size=part.count)]
-        where = np.where(rng.random(part.count) < 0.5, local, rng.integers(len(sites_m), size=part.count))
-        exchange(chosen, sites_m, seen, len(R_body_from_lab), part.wanted, part.spacing_m, who, where)
-    return [*found, sites_m[chosen]]
+        exchange(chosen, both_m, seen, len(R_body_from_lab), part.wanted, part.spacing_m, who, who + part.count)
+        place_m = both_m[chosen]
+    return [*found, place_m]
+
+
+def offers(place_m: Floats, sites_m: Floats, tree: cKDTree, rng: np.random.Generator) -> Floats:
+    """(N, 3) of the sites, one an LED: most a step beside it, some anywhere."""
+    usual_m = np.median(cKDTree(place_m).query(place_m, k=2)[0][:, 1])
+    step_m = usual_m * np.exp(rng.uniform(*np.log(STEPS), (len(place_m), 1)))
+    beside = tree.query(place_m + step_m * rng.standard_normal(place_m.shape))[1]
+    anywhere = rng.integers(len(sites_m), size=len(place_m))
+    return sites_m[np.where(rng.random(len(place_m)) < FAR, anywhere, beside)]
 
 
 def seen_from(part: lamp.Optimised, sites_m: Floats, R_body_from_lab: Floats) -> Seen:
@@ -122,16 +133,30 @@ def seen_from(part: lamp.Optimised, sites_m: Floats, R_body_from_lab: Floats) ->
 
 def attitude_count(part: lamp.Optimised, sites_m: Floats, rng: np.random.Generator) -> int:
     """How many attitudes it takes for SEERS of them to see a site, from how many sites a few see."""
-    few = attitudes(part, 200, rng)
-    share = len(seen_from(part, sites_m, few).attitude) / (len(few) * len(sites_m))
+    few, some_m = attitudes(part, 200, rng), sites_m[: EVEN * part.count]
+    share = len(seen_from(part, some_m, few).attitude) / (len(few) * len(some_m))
     return int(np.clip(SEERS / max(share, 1e-9), FEWEST, MOST))
 
 
 def hardest(part: lamp.Optimised, place_m: Floats, rng: np.random.Generator) -> Floats:
-    """(H, 3, 3) R_body_from_lab: of fresh attitudes those that these LEDs serve worst."""
+    """(H, 3, 3) R_body_from_lab: of fresh attitudes those that these LEDs serve worst, and then the worst about them."""
     drawn = attitudes(part, DRAWN, rng)
-    total = told(place_m, drawn, *camera(part))
-    return drawn[np.argsort(costs(total, part.wanted))[-HARDEST:]]
+    each = served(part, place_m, drawn)
+    kept = np.argsort(each)[-HARDEST:]
+    worst, each = drawn[kept], each[kept]
+    step_rad = float(tan_half(part).min()) * SHAKE
+    for _ in range(SHAKES):
+        shaken = Rotation.from_rotvec(step_rad * rng.standard_normal((HARDEST, 3)) * [1, 1, 8]).as_matrix() @ worst
+        fresh = served(part, place_m, shaken)
+        harder = (fresh > each) & (shaken[:, 2, 2] >= math.cos(math.radians(part.tilt_deg)))
+        worst[harder], each[harder] = shaken[harder], fresh[harder]
+    return worst
+
+
+def served(part: lamp.Optimised, place_m: Floats, R_body_from_lab: Floats) -> Floats:
+    """(A,) how badly, by the search's cost."""
+    where_m, field = camera(part)
+    return costs(told(place_m, R_body_from_lab, where_m, EDGE * field), part.wanted)
 
 
 def attitudes(part: lamp.Optimised, count: int, rng: np.random.Generator) -> Floats:
@@ -259,7 +284,7 @@ def set_apart(exam: Exam, place_m: Floats, sites_m: Floats, rng: np.random.Gener
         middle_m = place_m[like.led[rng.choice(bad)]]
         who = rng.choice(cKDTree(place_m).query(middle_m, k=min(ABOUT, part.count))[1])
         tried_m = place_m.copy()
-        tried_m[who] = sites_m[rng.choice(tree.query(place_m[who], k=min(BESIDE, len(sites_m)))[1])]
+        tried_m[who] = sites_m[rng.choice(tree.query(place_m[who], k=min(100, len(sites_m)))[1])]
         if np.delete(np.linalg.norm(place_m - tried_m[who], axis=1), who).min() < part.spacing_m:
             continue
         nudged = alike(part, tried_m)

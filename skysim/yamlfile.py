@@ -51,18 +51,26 @@ def once(node: yaml.Node | None, path: Path) -> None:
 
 
 def put(tree: dict[str, Any], key: str, value: str) -> None:
-    """Set one dotted key of the raw scene; the value is YAML."""
+    """Set one dotted key of the raw scene; the value is YAML. A number is a place in a list: `camera_body.2`."""
     *parents, last = key.split(".")
     if not all((*parents, last)):
         raise BadInput(f"--set {key}={value}: allowed: path.to.key=value")
+    node: Any = tree
     for depth, parent in enumerate(parents):
-        tree = tree.setdefault(parent, {})
-        if not isinstance(tree, dict):
+        node = node.setdefault(parent, {}) if isinstance(node, dict) else node[item(node, parent, key)]
+        if not isinstance(node, dict | list):
             raise BadInput(f"--set {key}: {'.'.join(parents[: depth + 1])} holds a value, not keys")
     try:
-        tree[last] = yaml.safe_load(value)
+        node[last if isinstance(node, dict) else item(node, last, key)] = yaml.safe_load(value)
     except yaml.YAMLError as error:
         raise BadInput(f"--set {key}: {value!r} is not YAML") from error
+
+
+def item(values: list[Any], place: str, key: str) -> int:
+    """The place in a list that a part of a dotted key names."""
+    if not place.isdigit() or int(place) >= len(values):
+        raise BadInput(f"--set {key}: {place} is no place in a list; allowed: 0 to {len(values) - 1}")
+    return int(place)
 
 
 def explain(

@@ -1,0 +1,187 @@
+"""Where to put so many LEDs: patch boards, a spiral, Poisson's discs and the optimiser, at attitudes none was made for.
+
+`python -m benchmarks.placement [SEED]` prints docs/dome.md's table: AFIT's SimSat under its measured dome, the scene's
+own camera and lever, 400 and 1,400 equal LEDs over the same cap, which is as far as any field within 30 degrees of
+tilt reaches. `compare` returns its rows.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.dome_identify import TILT_DEG, Case, trial
+from estimator.camera import Camera
+from estimator.ledmap import LedMap, Lever
+from estimator.ledsight import sight_of
+from skysim import lamp, layout, optimise, scene, simulate, turninfo
+from skysim.likeness import likeness
+from skysim.onboard import calibration
+from skysim.photometry import Band
+from skysim.quantity import ARCSEC_RAD
+from skysim.surface import surface
+from skysim.types import Floats
+
+Ints = NDArray[np.int64]
+
+SIZES = (400, 1400)
+FRESH, FRAMES = 100_000, 5000  # attitudes; frames that the tracker is given
+NOISE_PX = 0.1  # of the sigmas
+TAIL = 0.01  # of the attitudes, the worst
+HALF = 0.5  # of a neighbourhood that another one repeats
+SEEN_BY_CHANCE = 0xD03E  # the attitudes' own seed: no layout is drawn from it
+KINDS = ("patch boards", "Fibonacci", "Poisson disc", "optimised")
+
+
+@dataclass(frozen=True)
+class Bench:
+    """The dome's inside, what looks at it, and how far from the zenith it sees LEDs: from the scene."""
+
+    inside: layout.Inside
+    camera: Camera
+    lever: Lever
+    boards: lamp.PatchBoards
+    led: lamp.Led
+    band: Band
+    cap_deg: float
+
+
+@dataclass(frozen=True)
+class Row:
+    """One layout.
+
+    seen       : LEDs in a field: mean, fewest
+    blind      : share of attitudes that see fewer than the two LEDs that an attitude takes
+    roll_arcsec, cross_arcsec : sigma for NOISE_PX; median, mean of the worst TAIL, worst; infinite where blind
+    alike      : share of neighbourhoods that match another in more than HALF of their LEDs
+    found, ambiguous, wrong : shares of the frames, and how many, by what the tracker made of them
+    made_s     : what it took to lay out
+    """
+
+    layout: str
+    count: int
+    seen: tuple[float, int]
+    blind: float
+    roll_arcsec: tuple[float, float, float]
+    cross_arcsec: tuple[float, float, float]
+    alike: float
+    found: float
+    ambiguous: float
+    wrong: int
+    made_s: float
+
+
+def bench() -> Bench:
+    """AFIT's SimSat as its scene has it."""
+    lab = simulate.furnish(scene.load("afit_simsat"))
+    light, camera = lab.scene.light, calibration(lab.scene.camera)
+    lever = Lever(np.array(lab.mount.camera_body_m), lab.mount.cam_from_body)
+    inside = surface(light.surface)
+    known = Bench(inside, camera, lever, light.layout, light.led, lab.band, 40.0)
+    reach_deg = float(np.degrees(optimise.reach_rad(wish(known, 3, 0), inside)))
+    return Bench(inside, camera, lever, light.layout, light.led, lab.band, reach_deg)
+
+
+def wish(of: Bench, count: int, seed: int) -> lamp.Optimised:
+    """The optimiser's part of a scene; everything it may leave out is left out."""
+    half = np.array([of.camera.width_px, of.camera.height_px]) / 2 / of.camera.focal_px
+    return lamp.Optimised.model_validate(
+        {
+            "kind": "optimised",
+            "cap_deg": of.cap_deg,
+            "count": count,
+            "tilt_deg": TILT_DEG,
+            "field_deg": np.degrees(2 * np.arctan(half)).tolist(),
+            "camera": [f"{one} m" for one in of.lever.camera_body_m],
+            "spacing": "8 mm",
+            "hardware_seed": seed,
+        }
+    )
+
+
+def leds(of: Bench, kind: str, count: int, seed: int) -> tuple[Floats, Ints | None]:
+    """(count, 3) LEDs, m, and which board each sits on. Boards and discs are a few too many, and some are left out."""
+    cap = {"cap_deg": of.cap_deg, "hardware_seed": seed}
+    parts: list[lamp.Layout] = []
+    if kind == "optimised":
+        parts = [wish(of, count, seed)]
+    elif kind == "Fibonacci":
+        parts = [lamp.Fibonacci.model_validate({"kind": "fibonacci", "count": count} | cap)]
+    area_m2 = 2 * np.pi * np.square(of.inside.meet(np.zeros(3), np.eye(3)[2:])[0, 2])
+    each_m2 = area_m2 * (1 - np.cos(np.radians(of.cap_deg))) / count
+    for more in np.linspace(1.0, 1.5, 51) if not parts else ():
+        if kind == "patch boards":
+            spacing_m = np.sqrt(each_m2 * np.mean(of.boards.lit) / more)
+            parts.append(of.boards.model_copy(update=cap | {"spacing_m": spacing_m}))
+        else:
+            disc = {"kind": "poisson_disc", "spacing": f"{np.sqrt(0.66 * each_m2 / more)} m"}
+            parts.append(lamp.PoissonDisc.model_validate(disc | cap))
+    lit = (layout.LAYOUTS[part.kind](part, of.inside, of.led, of.band) for part in parts)
+    sources = next(some for some in lit if len(some) >= count)
+    kept = np.sort(np.random.default_rng(seed).permutation(len(sources))[:count])
+    return sources.place[kept, :3], layout.board_of(parts[0], sources.id[kept])
+
+
+def sigmas_arcsec(of: Bench, place_m: Floats) -> tuple[Floats, Floats, Floats]:
+    """(A,) of roll and across the boresight, and of LEDs in the field, at attitudes that no layout was made for.
+
+    The covariance of the rotation-only solve at the truth, (sum_i J_i'J_i)^-1 sigma^2; body z is the boresight.
+    """
+    part = wish(of, len(place_m), 0)
+    fresh = optimise.attitudes(part, FRESH, np.random.default_rng(SEEN_BY_CHANCE))
+    total = turninfo.told(place_m, fresh, *optimise.camera(part))
+    solved, variance = total[:, 6] >= 2, np.full((FRESH, 3), np.inf)
+    matrix = total[solved][:, [0, 3, 4, 3, 1, 5, 4, 5, 2]].reshape(-1, 3, 3)
+    variance[solved] = np.linalg.inv(matrix).diagonal(axis1=1, axis2=2)
+    unit = NOISE_PX / of.camera.focal_px / ARCSEC_RAD
+    return unit * np.sqrt(variance[:, 2]), unit * np.sqrt(variance[:, :2].sum(axis=1)), total[:, 6]
+
+
+def summed(each: Floats) -> tuple[float, float, float]:
+    """Median, mean of the worst TAIL, worst."""
+    worst = np.sort(each)[-round(TAIL * len(each)) :]
+    return float(np.median(each)), float(worst.mean()), float(worst[-1])
+
+
+def verdicts(of: Bench, place_m: Floats, board: Ints | None, frames: int, seed: int) -> NDArray[np.str_]:
+    """(frames,) what the tracker says of each, of equal LEDs, noise and a survey's errors as `Case` has them."""
+    case, rng = Case("placement"), np.random.default_rng(seed)
+    believed_m = place_m + case.believed_m * rng.standard_normal(place_m.shape)
+    known = LedMap(
+        np.arange(len(place_m)), believed_m, np.zeros(3), np.ones(3), board, sigma_m=case.believed_m
+    )
+    sight = sight_of(known, of.lever, of.camera)
+    came = [trial(case, place_m, of.lever, of.camera, sight, rng)[0] for _ in range(frames)]
+    return np.array([one.split(":")[0] for one in came])
+
+
+def row(of: Bench, kind: str, count: int, seed: int, frames: int) -> Row:
+    """One layout, made and judged."""
+    begin = time.perf_counter()
+    place_m, board = leds(of, kind, count, seed)
+    made_s = time.perf_counter() - begin
+    roll, cross, seen = sigmas_arcsec(of, place_m)
+    like, came = optimise.alike(wish(of, count, seed), place_m), verdicts(of, place_m, board, frames, seed)
+    return Row(
+        kind,
+        count,
+        (float(seen.mean()), int(seen.min())),
+        float(np.mean(seen < 2)),
+        summed(roll),
+        summed(cross),
+        float(np.mean(like.share > HALF)),
+        float(np.mean(came == "identified")),
+        float(np.mean(came == "ambiguous")),
+        int(np.sum(came == "WRONG")),
+        made_s,
+    )
+
+
+def compare(sizes: tuple[int, ...] = SIZES, seed: int = 1, frames: int = FRAMES) -> list[Row]:
+    """Every layout at every size."""
+    of = bench()
+    return [row(of, kind, count, seed, frames) for count in sizes for kind in KINDS]

@@ -1,0 +1,207 @@
+"""Who does the trials: this process, a pool of processes, or a Dask cluster. What they make is the same, row for row."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import threading
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Iterator
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from typing import Protocol
+
+from skysim.study.plan import Recipe
+from skysim.study.trials import FAILED, Row, Segment, code_version, seed_of, work
+
+AHEAD = 1  # chunks that wait for each worker beside the one at hand
+TRIES = 3  # of a trial whose worker dies
+ONE_THREAD = ("NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
+
+Chunk = tuple[Segment, ...]
+
+
+class Chunks(Protocol):
+    """Work to be handed out: the next chunk, or none; and how long one took, by which the next are sized."""
+
+    def next(self) -> Chunk: ...
+    def took(self, chunk: Chunk, seconds: float) -> None: ...
+
+
+class Engine(Protocol):
+    """Does chunks of trials; rows come in any order, each chunk's at once."""
+
+    name: str
+    workers: int
+
+    def run(self, recipe: Recipe, chunks: Chunks) -> Iterator[list[Row]]: ...
+
+
+class Serial:
+    """One trial after another in this process."""
+
+    name, workers = "serial", 1
+
+    def run(self, recipe: Recipe, chunks: Chunks) -> Iterator[list[Row]]:
+        """See `Engine`."""
+        while chunk := chunks.next():
+            rows, seconds = timed(recipe, chunk)
+            chunks.took(chunk, seconds)
+            yield rows
+
+
+class Pool:
+    """Processes of this machine. Each builds a scene and its index once and keeps them.
+
+    Where one dies, the pool is begun anew and the trials at hand are tried one by one; one that was alone when its
+    worker died, TRIES times, is put down as failed.
+    """
+
+    name = "pool"
+
+    def __init__(self, workers: int | None = None) -> None:
+        self.workers = workers or len(os.sched_getaffinity(0))
+
+    def run(self, recipe: Recipe, chunks: Chunks) -> Iterator[list[Row]]:
+        """See `Engine`."""
+        suspects: deque[Chunk] = deque()
+        deaths: Counter[Chunk] = Counter()
+        while True:
+            flying: dict[Future[tuple[list[Row], float]], Chunk] = {}
+            pool = started(self.workers, recipe)
+            try:
+                yield from self._until_one_dies(pool, chunks, suspects, flying)
+                return
+            except BrokenProcessPool:
+                deaths.update(flying.values() if len(flying) == 1 else ())
+                for chunk in flying.values():
+                    if deaths[chunk] == TRIES:
+                        yield [dead(recipe, chunk[0])]
+                    else:
+                        suspects.extend(singly(chunk))
+            finally:
+                stop(pool)
+
+    def _until_one_dies(
+        self,
+        pool: ProcessPoolExecutor,
+        chunks: Chunks,
+        suspects: deque[Chunk],
+        flying: dict[Future[tuple[list[Row], float]], Chunk],
+    ) -> Iterator[list[Row]]:
+        """Rows as they come, suspects first and each of them alone. `flying` has what is at hand."""
+        while True:
+            room = self.workers * (1 + AHEAD) if not suspects else 1
+            while len(flying) < room and (chunk := suspects.popleft() if suspects else chunks.next()):
+                flying[pool.submit(remembered, chunk)] = chunk
+                room = room if not suspects else 1
+            if not flying:
+                return
+            for future in wait(flying, return_when=FIRST_COMPLETED).done:
+                rows, seconds = future.result()
+                chunks.took(flying.pop(future), seconds)
+                yield rows
+
+
+class Dask:
+    """An existing Dask cluster. A task that loses its worker is done by another.
+
+    scheduler : its address, such as tcp://10.0.0.1:8786. Raises BadInput where nobody answers, or with other code.
+    """
+
+    name = "dask"
+
+    def __init__(self, scheduler: str) -> None:
+        from skysim.study import cluster
+
+        self.client = cluster.connect(scheduler)
+        self.workers = cluster.threads(self.client)
+
+    def run(self, recipe: Recipe, chunks: Chunks) -> Iterator[list[Row]]:
+        """See `Engine`."""
+        from skysim.study import cluster
+
+        yield from cluster.run(self.client, recipe, chunks)
+
+
+ENGINES: dict[str, Callable[[int | None, str], Engine]] = {
+    "pool": lambda workers, scheduler: Pool(workers),
+    "serial": lambda workers, scheduler: Serial(),
+    "dask": lambda workers, scheduler: Dask(scheduler),
+}
+
+
+def timed(recipe: Recipe, chunk: Chunk) -> tuple[list[Row], float]:
+    """A chunk's rows, and the seconds that it took where it was done."""
+    begin_s = time.perf_counter()
+    return work(recipe, chunk), time.perf_counter() - begin_s
+
+
+def singly(chunk: Chunk) -> Iterator[Chunk]:
+    """A chunk's trials, each a chunk."""
+    for segment in chunk:
+        for n, replicate in enumerate(segment.replicates):
+            alone = range(replicate, replicate + 1)
+            yield (segment._replace(first=segment.first + n, replicates=alone),)
+
+
+def dead(recipe: Recipe, segment: Segment) -> Row:
+    """The row of a trial that kills its workers."""
+    replicate = segment.replicates[0]
+    seed, why = seed_of(recipe, segment.point, replicate), f"its worker process died, {TRIES} times"
+    return Row(segment.first, segment.point, replicate, seed, "", code_version(), FAILED, why, 0.0)
+
+
+# Worker processes.
+
+RECIPE: list[Recipe] = []  # a worker's
+
+
+def started(workers: int, recipe: Recipe) -> ProcessPoolExecutor:
+    """A pool whose processes have imported all that a trial takes and have one thread each."""
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(["skysim.study.trials"])
+    before = {name: os.environ.get(name) for name in ONE_THREAD}
+    os.environ.update(dict.fromkeys(ONE_THREAD, "1"))
+    try:
+        pool = ProcessPoolExecutor(workers, context, begin, (recipe,))
+        for one in [pool.submit(code_version) for _ in range(workers)]:
+            one.result()
+        return pool
+    finally:
+        os.environ.update({name: value for name, value in before.items() if value is not None})
+        for name in [name for name, value in before.items() if value is None]:
+            del os.environ[name]
+
+
+def begin(recipe: Recipe) -> None:
+    """A worker's first act. Ctrl-C is its parent's affair, and it ends when that does, even by -9."""
+    import cv2
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    cv2.setNumThreads(1)
+    RECIPE[:] = [recipe]
+    threading.Thread(target=end_with_parent, daemon=True).start()
+
+
+def end_with_parent() -> None:
+    """Wait for the parent's end."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
+
+
+def remembered(chunk: Chunk) -> tuple[list[Row], float]:
+    """`timed`, by the recipe that this worker was begun with."""
+    return timed(RECIPE[0], chunk)
+
+
+def stop(pool: ProcessPoolExecutor) -> None:
+    """End a pool at once: what is not in the store is done again."""
+    processes = list((pool._processes or {}).values())
+    pool.shutdown(wait=False, cancel_futures=True)
+    for process in processes:
+        process.kill()

@@ -1,0 +1,211 @@
+"""Where a study keeps its trials: one SQLite file, one row a trial, written by one run at a time.
+
+`trials` and `points` depend on the study alone; who did a trial, when and how quickly is in `timings` and `runs`.
+Every batch of rows is one transaction of a write-ahead log, so a run that is killed leaves whole batches.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import sqlite3
+import time
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import astuple
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skysim.study.designs import Point
+from skysim.study.trials import FIELDS, Row
+from skysim.types import BadInput
+
+FORMAT = 1
+TEXT = {"status"}
+WHOLE = {"frames", "solved", "wrong"}
+TABLES = f"""
+CREATE TABLE IF NOT EXISTS meta (key TEXT PRIMARY KEY, value TEXT NOT NULL);
+CREATE TABLE IF NOT EXISTS points (point INTEGER PRIMARY KEY, levels TEXT NOT NULL, settings TEXT NOT NULL);
+CREATE TABLE IF NOT EXISTS trials (
+  trial INTEGER PRIMARY KEY, point INTEGER NOT NULL, replicate INTEGER NOT NULL, seed INTEGER NOT NULL,
+  scene TEXT NOT NULL, code TEXT NOT NULL,
+  {", ".join(f"{name} {'TEXT' if name in TEXT else 'INTEGER' if name in WHOLE else 'REAL'}" for name in FIELDS)},
+  error TEXT);
+CREATE INDEX IF NOT EXISTS trials_of_point ON trials (point);
+CREATE TABLE IF NOT EXISTS timings (trial INTEGER PRIMARY KEY, time_ms REAL NOT NULL);
+CREATE TABLE IF NOT EXISTS runs (
+  run INTEGER PRIMARY KEY, began REAL NOT NULL, engine TEXT NOT NULL, workers INTEGER NOT NULL,
+  trials INTEGER NOT NULL, seconds REAL NOT NULL);
+"""
+INSERT = f"INSERT OR REPLACE INTO trials VALUES ({', '.join('?' * (7 + len(FIELDS)))})"
+
+
+class Store:
+    """One study's file. `open_store` makes or opens one; without `lock` it is for reading."""
+
+    def __init__(self, path: Path, connection: sqlite3.Connection) -> None:
+        self.path, self.db = path, connection
+
+    def meta(self, key: str) -> str:
+        """What is noted under a key; empty where nothing is."""
+        found = self.db.execute("SELECT value FROM meta WHERE key = ?", (key,)).fetchone()
+        return found[0] if found else ""
+
+    def note(self, **values: str) -> None:
+        """Note values under keys."""
+        with self.db:
+            self.db.executemany("INSERT OR REPLACE INTO meta VALUES (?, ?)", values.items())
+
+    def set_points(self, points: Iterable[Point], first: int = 0) -> None:
+        """Points by their numbers, from `first`."""
+        rows = ((first + n, json.dumps(point.levels), json.dumps(point.settings)) for n, point in enumerate(points))
+        with self.db:
+            self.db.executemany("INSERT OR REPLACE INTO points VALUES (?, ?, ?)", rows)
+
+    def points(self) -> list[Point]:
+        """All points, in order."""
+        rows = self.db.execute("SELECT levels, settings FROM points ORDER BY point")
+        return [Point(json.loads(levels), json.loads(settings)) for levels, settings in rows]
+
+    def add(self, rows: list[Row]) -> None:
+        """Keep rows, all or none of them."""
+        values = [(*row[:6], *map(plain, astuple(row.outcome)), row.error) for row in rows]
+        with self.db:
+            self.db.executemany(INSERT, values)
+            times = [(row.trial, 1e3 * row.seconds) for row in rows]
+            self.db.executemany("INSERT OR REPLACE INTO timings VALUES (?, ?)", times)
+
+    def ran(self, engine: str, workers: int, trials: int, seconds: float) -> None:
+        """Note that a run ended."""
+        with self.db:
+            row = (None, time.time() - seconds, engine, workers, trials, seconds)
+            self.db.execute("INSERT INTO runs VALUES (?, ?, ?, ?, ?, ?)", row)
+
+    def runs(self) -> list[dict[str, Any]]:
+        """Every run that ended by itself: engine, workers, trials, seconds."""
+        rows = self.db.execute("SELECT engine, workers, trials, seconds FROM runs ORDER BY run")
+        return [dict(zip(("engine", "workers", "trials", "seconds"), row, strict=True)) for row in rows]
+
+    def done(self, count: int) -> NDArray[np.bool_]:
+        """(count,) which trials are in; those that failed too."""
+        mask = np.zeros(count, bool)
+        for (trial,) in self.db.execute("SELECT trial FROM trials WHERE trial < ?", (count,)):
+            mask[trial] = True
+        return mask
+
+    def counts(self) -> dict[str, int]:
+        """How many trials are in, failed, were answered wrongly."""
+        told = "SELECT COUNT(*), COALESCE(SUM(error IS NOT NULL), 0), COALESCE(SUM(wrong), 0) FROM trials"
+        return dict(zip(("done", "failed", "wrong"), self.db.execute(told).fetchone(), strict=True))
+
+    def failures(self) -> list[tuple[int, str]]:
+        """Trials that raised, and the last line of what."""
+        rows = self.db.execute("SELECT trial, error FROM trials WHERE error IS NOT NULL ORDER BY trial")
+        return [(trial, error.strip().splitlines()[-1]) for trial, error in rows]
+
+    def trial(self, number: int) -> dict[str, Any]:
+        """One row with its names. Raises BadInput where it is not in."""
+        found = self.db.execute("SELECT * FROM trials WHERE trial = ?", (number,))
+        row = found.fetchone()
+        if row is None:
+            raise BadInput(f"trial {number}: is not in {self.path}; allowed: {self.span()}")
+        return dict(zip((column[0] for column in found.description), row, strict=True))
+
+    def span(self) -> str:
+        """The numbers of the trials that are in."""
+        low, high = self.db.execute("SELECT MIN(trial), MAX(trial) FROM trials").fetchone()
+        return "none yet" if low is None else f"{low} to {high}"
+
+    def columns(self, where: str = "1", values: tuple[Any, ...] = ()) -> dict[str, NDArray[Any]]:
+        """Every column of `trials` and `timings.time_ms` as an array, in the trials' order; NaN for what is not there."""
+        told = f"SELECT trials.*, time_ms FROM trials LEFT JOIN timings USING (trial) WHERE {where} ORDER BY trial"
+        found = self.db.execute(told, values)
+        names = [column[0] for column in found.description]
+        lists: list[list[Any]] = [[] for _ in names]
+        while batch := found.fetchmany(10_000):
+            for column, more in zip(lists, zip(*batch, strict=True), strict=True):
+                column.extend(more)
+        return {name: as_array(name, column) for name, column in zip(names, lists, strict=True)}
+
+    def of_point(self, point: int) -> dict[str, NDArray[Any]]:
+        """The columns of one point's trials."""
+        return self.columns("point = ?", (point,))
+
+    def check(self) -> bool:
+        """Whether SQLite finds the file whole."""
+        return bool(self.db.execute("PRAGMA integrity_check").fetchone()[0] == "ok")
+
+
+def plain(value: Any) -> Any:
+    """A value as SQLite has it: no NaN, no numpy."""
+    if isinstance(value, float):
+        return None if math.isnan(value) else float(value)
+    return value
+
+
+def as_array(name: str, column: list[Any]) -> NDArray[Any]:
+    """A column: text as objects, whole numbers as such, else floats."""
+    if name in TEXT or name in ("scene", "code", "error"):
+        return np.array(column, dtype=object)
+    if name in WHOLE or name in ("trial", "point", "replicate", "seed"):
+        return np.array(column, dtype=np.int64)
+    return np.array([math.nan if value is None else value for value in column], dtype=float)
+
+
+@contextmanager
+def open_store(path: Path) -> Iterator[Store]:
+    """A store to be read while a run may write it. Raises BadInput where there is none."""
+    if not path.is_file():
+        raise BadInput(f"{path}: no store; allowed: one that skysim study run made")
+    with connected(path) as db:
+        store = Store(path, db)
+        try:
+            if store.meta("format") != str(FORMAT):
+                raise BadInput(f"{path}: format {store.meta('format')!r}; allowed: {FORMAT}")
+        except sqlite3.DatabaseError as error:
+            raise BadInput(f"{path}: no store of a study: {error}") from None
+        yield store
+
+
+@contextmanager
+def writing(path: Path) -> Iterator[Store]:
+    """The store of a path for the one run that may write it; made where it is not there.
+
+    A lock beside it, itself SQLite's, goes when its holder ends in whatever way. Raises BadInput where another holds it.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    lock = sqlite3.connect(path.with_suffix(".lock"), timeout=0, isolation_level=None)
+    try:
+        try:
+            lock.execute("BEGIN EXCLUSIVE")
+        except sqlite3.OperationalError:
+            raise BadInput(f"{path}: another run is writing it; allowed: one at a time, or another --out") from None
+        with connected(path) as db:
+            db.execute("PRAGMA journal_mode = WAL")
+            db.execute("PRAGMA synchronous = NORMAL")
+            store = Store(path, db)
+            with db:
+                for statement in TABLES.split(";"):
+                    db.execute(statement)
+                db.execute("INSERT OR IGNORE INTO meta VALUES ('format', ?)", (str(FORMAT),))
+            if store.meta("format") != str(FORMAT):
+                raise BadInput(f"{path}: format {store.meta('format')!r}; allowed: {FORMAT}")
+            yield store
+    except sqlite3.DatabaseError as error:
+        raise BadInput(f"{path}: {error}") from error
+    finally:
+        lock.close()
+
+
+@contextmanager
+def connected(path: Path) -> Iterator[sqlite3.Connection]:
+    """A connection that is closed at the end."""
+    db = sqlite3.connect(os.fspath(path), timeout=30)
+    try:
+        yield db
+    finally:
+        db.close()

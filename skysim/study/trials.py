@@ -1,0 +1,387 @@
+"""One trial: a random attitude, what the camera makes of it, what the tracker makes of that, and how wrong it is.
+
+A trial hangs on its recipe, its point and its seed alone: not on what was tried before, nor on who tries it.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+import traceback
+from collections import OrderedDict
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, fields, replace
+from functools import cache
+from hashlib import sha256
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from estimator.types import Attitude, Centroids
+from skysim import metrics, onboard, simulate, world
+from skysim.quantity import ARCSEC_RAD, ROOT
+from skysim.render import Poses, follow, in_view
+from skysim.scene import FILES, Dome, Scene
+from skysim.study.factors import Settings
+from skysim.study.plan import CentroidTrial, FlightTrial, FrameTrial, Recipe, digest, resolved
+from skysim.types import Floats, Frame, Sources, Trajectory, Truth
+
+KEPT = 4  # benches a worker keeps ready
+KNOTS = 9  # of a frame trial's flight
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What came of a trial. Of a flight errors are rms over its solved frames, counts sums or what is told.
+
+    status   : "solved", why there is no attitude, or of a trial that raised "failed"
+    frames, solved, wrong : how many were photographed, answered, answered more than ten arc-minutes off
+    x_arcsec, y_arcsec, roll_arcsec : error in camera axes, signed (of a flight rms); NaN where nothing was answered
+    nees     : e' P^-1 e of three degrees of freedom, what the tracker claims of its errors for P; a flight's mean
+    stars    : true lights on the chip; a flight's least.  detected, matched : centroids and names; a flight's means
+    availability : share of a flight's time at which its filter, or without one its last frame, is within ten arc-minutes
+    filter_arcsec, filter_worst_arcsec : angle by which a flight's filter is off, rms and worst
+    drift_arcsec : filter_arcsec of the flight's last quarter less the first's
+    """
+
+    status: str
+    frames: int = 0
+    solved: int = 0
+    wrong: int = 0
+    x_arcsec: float = math.nan
+    y_arcsec: float = math.nan
+    roll_arcsec: float = math.nan
+    nees: float = math.nan
+    stars: float = math.nan
+    detected: float = math.nan
+    matched: float = math.nan
+    availability: float = math.nan
+    filter_arcsec: float = math.nan
+    filter_worst_arcsec: float = math.nan
+    drift_arcsec: float = math.nan
+
+
+FIELDS = tuple(field.name for field in fields(Outcome))
+FAILED = Outcome("failed")
+
+
+class Bench(NamedTuple):
+    """A scene set up for trials: hardware, the tracker with its index, what a trial is, a hash of the scene.
+
+    lab : flown nowhere yet;  sight : its lights' places times the camera's reach, kept for every attitude
+    """
+
+    lab: simulate.Lab
+    estimator: onboard.Estimator
+    trial: CentroidTrial | FrameTrial | FlightTrial
+    scene_hash: str
+
+
+class Row(NamedTuple):
+    """One trial as it is stored."""
+
+    trial: int
+    point: int
+    replicate: int
+    seed: int
+    scene: str
+    code: str
+    outcome: Outcome
+    error: str | None
+    seconds: float
+
+
+class Segment(NamedTuple):
+    """Successive replicates of one point, the unit that travels to a worker."""
+
+    point: int
+    settings: Settings
+    first: int
+    replicates: range
+
+
+# Setting up.
+
+
+class Shelf(threading.local):
+    """The benches that a thread of a worker has ready, the last used last; a lab's canvas is for one at a time."""
+
+    def __init__(self) -> None:
+        self.benches: OrderedDict[str, Bench] = OrderedDict()
+
+
+SHELF = Shelf()
+
+
+def bench(recipe: Recipe, settings: Settings) -> Bench:
+    """The bench of a point, from the shelf where it is there. Raises BadInput."""
+    key = digest([recipe.scene, recipe.folder, recipe.base, recipe.trial, settings])
+    shelf = SHELF.benches
+    if key not in shelf:
+        shelf[key] = set_up(recipe, settings)
+        while len(shelf) > KEPT:
+            shelf.popitem(last=False)
+    shelf.move_to_end(key)
+    return shelf[key]
+
+
+def set_up(recipe: Recipe, settings: Settings) -> Bench:
+    """Hardware and tracker of a point; of the bench before where the two differ in the trial alone."""
+    scene, trial = resolved(recipe, settings)
+    told = scene_hash(scene)
+    for ready in SHELF.benches.values():
+        if ready.scene_hash == told:
+            return ready._replace(trial=trial)
+    lab = simulate.furnish(scene)
+    return Bench(lab, simulate.tracker(lab), trial, told)
+
+
+def scene_hash(scene: Scene) -> str:
+    """Of a scene and of the files that it names."""
+    tree = scene.model_dump(mode="json", by_alias=True)
+    named = [sha256(Path(path).read_bytes()).hexdigest() for path in files_of(tree)]
+    return digest([tree, named])
+
+
+def files_of(tree: dict[str, Any]) -> list[str]:
+    """The files of its own that a scene names, where they are there."""
+    found = []
+    for keys in FILES:
+        node: Any = tree
+        for key in keys:
+            node = node.get(key) if isinstance(node, dict) else None
+        if isinstance(node, str) and Path(node).is_file():
+            found.append(node)
+    return found
+
+
+@cache
+def code_version() -> str:
+    """A hash of the sources of skysim and estimator: what a stored trial was made with."""
+    told = sha256()
+    for package in ("skysim", "estimator"):
+        for path in sorted((ROOT / package).rglob("*.py")):
+            told.update(path.relative_to(ROOT).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
+    return told.hexdigest()[:16]
+
+
+def seed_of(recipe: Recipe, point: int, replicate: int) -> int:
+    """A trial's own seed, 63 bits, from the study's; with `paired` the same at every point."""
+    key = (replicate,) if recipe.paired else (replicate, point)
+    return int(np.random.SeedSequence(recipe.seed, spawn_key=key).generate_state(1, np.uint64)[0] >> 1)
+
+
+# Doing them.
+
+
+def work(recipe: Recipe, segments: tuple[Segment, ...]) -> list[Row]:
+    """All trials of some segments, in their order."""
+    return [
+        one(recipe, segment, segment.first + n, replicate)
+        for segment in segments
+        for n, replicate in enumerate(segment.replicates)
+    ]
+
+
+def one(recipe: Recipe, segment: Segment, trial: int, replicate: int) -> Row:
+    """One trial; what it raises is in its row."""
+    seed = seed_of(recipe, segment.point, replicate)
+    scene, outcome, error, begin = "", FAILED, None, time.perf_counter()
+    try:
+        ready = bench(recipe, segment.settings)
+        scene, begin = ready.scene_hash, time.perf_counter()
+        outcome = TRIALS[ready.trial.kind](ready, seed)
+    except Exception:
+        error = traceback.format_exc()
+    spent = time.perf_counter() - begin
+    return Row(trial, segment.point, replicate, seed, scene, code_version(), outcome, error, spent)
+
+
+def centroids(ready: Bench, seed: int) -> Outcome:
+    """Random attitude, true lights with noise, false ones; identified and solved."""
+    trial, rng = ready.trial, np.random.default_rng(seed)
+    assert isinstance(trial, CentroidTrial)
+    lab_from_body = attitude(ready, rng)
+    xy_px, electrons = lights(ready.lab, lab_from_body)
+    seen = spoilt(trial, xy_px, electrons, ready.lab.scene, rng)
+    answer = ready.estimator.solve_centroids(seen)
+    cam_from_lab = ready.lab.mount.cam_from_body * lab_from_body.inv()
+    return scored(answer, cam_from_lab, len(xy_px), len(seen))
+
+
+def frames(ready: Bench, seed: int) -> Outcome:
+    """Random attitude, one whole frame, solved."""
+    frame, truth, streak_px = shot(ready, seed)
+    return answered(ready, frame, truth, streak_px)
+
+
+def answered(ready: Bench, frame: Frame, truth: Truth, streak_px: tuple[float, float] | None) -> Outcome:
+    """What the tracker makes of a frame."""
+    report = onboard.answer(ready.estimator, frame, streak_px)
+    return scored(report.attitude, truth.cam_from_lab, len(truth.seen.id), len(report.centroids))
+
+
+def flight(ready: Bench, seed: int) -> Outcome:
+    """The whole scene by another seed."""
+    trial = ready.trial
+    assert isinstance(trial, FlightTrial)
+    lab = simulate.fly(reseeded(ready.lab, seed))
+    came = [one for t_s, one in scores(lab, ready.estimator) if t_s >= trial.settle_s]
+    return summed(lab, came, trial.settle_s)
+
+
+def scores(lab: simulate.Lab, estimator: onboard.Estimator) -> Iterator[tuple[float, Outcome]]:
+    """Mid-exposure and outcome of every frame; those that were solved in flight are not taken again."""
+    if not lab.reports:
+        for shot in simulate.run(lab, estimator):
+            answer, truth = shot.report, shot.truth
+            yield truth.t_s, scored(answer.attitude, truth.cam_from_lab, len(truth.seen.id), len(answer.centroids))
+    for index, answer in lab.reports.items():
+        when = simulate.window(lab.scene, index, lab.exposures_s[index])
+        t_s = when.middle_s(lab.scene.camera.height_px)
+        lab_from_body = lab.trajectory.at(t_s)
+        cam_from_lab, stars = lab.mount.cam_from_body * lab_from_body.inv(), len(lights(lab, lab_from_body)[0])
+        yield t_s, scored(answer.attitude, cam_from_lab, stars, len(answer.centroids))
+
+
+TRIALS: dict[str, Callable[[Bench, int], Outcome]] = {"centroids": centroids, "frames": frames, "flight": flight}
+
+
+# What they are made of.
+
+
+def attitude(ready: Bench, rng: np.random.Generator) -> Rotation:
+    """lab_from_body: under a dome leaning to any side, else with the boresight anywhere; any turn about it."""
+    trial = ready.trial
+    assert isinstance(trial, CentroidTrial | FrameTrial)
+    if isinstance(ready.lab.scene.light, Dome):
+        low, high = trial.tilt_deg if isinstance(trial.tilt_deg, tuple) else (trial.tilt_deg,) * 2
+        cosine = rng.uniform(math.cos(math.radians(high)), math.cos(math.radians(low)))
+        towards, yaw = rng.uniform(0, 2 * math.pi, 2)
+        return Rotation.from_euler("ZYZ", [towards, math.acos(min(cosine, 1.0)), yaw - towards])
+    sine = rng.uniform(*np.sin(np.radians(trial.dec_deg)))
+    ra, roll = rng.uniform(0, 2 * math.pi, 2)
+    # z to (RA, Dec), then any turn about it.
+    lab_from_cam = Rotation.from_euler("ZYZ", [ra, math.acos(np.clip(sine, -1, 1)), roll])
+    return lab_from_cam * ready.lab.mount.cam_from_body
+
+
+def lights(lab: simulate.Lab, lab_from_body: Rotation) -> tuple[Floats, Floats]:
+    """(N, 2) pixels and (N,) photo-electrons of the lights whose middle is on the chip, as the hardware has them."""
+    cam_from_lab = (lab.mount.cam_from_body * lab_from_body.inv()).as_matrix()
+    here = Poses(cam_from_lab[None], lab_from_body.apply(lab.mount.camera_body_m)[None])
+    near = lab.sources.take(in_view(lab.sources, lab.optics, here))
+    if lab.obstacles is not None:
+        near = near.take(~world.hidden(lab.obstacles, lab_from_body, near))
+    paths, _, _ = follow(near, lab.optics, here, np.array([0.0, 1.0]), lab.emitter)
+    xy_px = paths.xy_px[0]
+    size_px = np.array([lab.scene.camera.width_px, lab.scene.camera.height_px])
+    on_chip = ((xy_px > -0.5) & (xy_px < size_px - 0.5)).all(axis=1)
+    electrons = paths.rate_e_s[0] * lit_share(near) * lab.scene.exposure.time_s
+    return xy_px[on_chip], electrons[on_chip]
+
+
+def lit_share(sources: Sources) -> Floats:
+    """(N,) of the time that a light is on, at most 1."""
+    return np.minimum(sources.on_s / sources.period_s, 1.0)
+
+
+def spoilt(
+    trial: CentroidTrial, xy_px: Floats, electrons: Floats, scene: Scene, rng: np.random.Generator
+) -> Centroids:
+    """What a camera would tell of true lights: some missed, all noisy, some false; brightest first."""
+    kept = np.flatnonzero(rng.random(len(xy_px)) >= trial.missing)
+    flux = electrons * 10 ** (0.4 * trial.magnitude_sigma * rng.standard_normal(len(xy_px)))
+    xy_px = xy_px + trial.noise_px * rng.standard_normal(xy_px.shape)
+    kept = kept[np.argsort(-flux[kept], kind="stable")][: trial.lights]
+    false = trial.false_lights + round(len(kept) * trial.false_share / (1 - trial.false_share))
+    strays_px = rng.uniform(-0.5, [scene.camera.width_px - 0.5, scene.camera.height_px - 0.5], (false, 2))
+    bright = rng.choice(flux, false) if len(flux) else rng.random(false) + 1.0
+    everything = np.concatenate([flux[kept], bright])
+    order = np.argsort(-everything, kind="stable")
+    sigma_px = np.full(len(order), trial.noise_px)
+    return Centroids(np.concatenate([xy_px[kept], strays_px])[order], sigma_px, everything[order])
+
+
+def shot(ready: Bench, seed: int) -> tuple[Frame, Truth, tuple[float, float] | None]:
+    """A frame trial's frame, its truth and, with a gyro, how far (dx, dy) px stars in the middle move in it."""
+    trial, rng, lab = ready.trial, np.random.default_rng(seed), reseeded(ready.lab, seed)
+    assert isinstance(trial, FrameTrial)
+    middle, towards = attitude(ready, rng), rng.uniform(0, 2 * math.pi)
+    rate_cam = math.radians(trial.rate_deg_s) * np.array([math.cos(towards), math.sin(towards), 0.0])
+    rate_body = lab.mount.cam_from_body.inv().apply(rate_cam)
+    when, rows = simulate.window(lab.scene, 0), lab.scene.camera.height_px
+    t_s = np.linspace(when.open_s - simulate.SPARE_S, when.close_s(rows) + simulate.SPARE_S, KNOTS)
+    turned = Rotation.from_rotvec(np.outer(t_s - when.middle_s(rows), rate_body))
+    path = Trajectory(t_s, middle * turned, np.tile(rate_body, (KNOTS, 1)))
+    frame, truth = simulate.shoot(replace(lab, trajectory=path), 0)
+    reach_px = when.exposure_s * lab.scene.camera.focal_px
+    # A star at the middle: d(x / z)/dt = -w_y, d(y / z)/dt = w_x.
+    return frame, truth, (-rate_cam[1] * reach_px, rate_cam[0] * reach_px) if trial.gyro else None
+
+
+def reseeded(lab: simulate.Lab, seed: int) -> simulate.Lab:
+    """The same hardware; noise, jitter and IMU of another seed."""
+    return replace(lab, scene=lab.scene.model_copy(update={"seed": seed}))
+
+
+def scored(answer: Attitude, cam_from_lab: Rotation, stars: int, detected: int) -> Outcome:
+    """An answer beside the truth."""
+    matched = len(answer.match.observed) if answer.match else 0
+    if answer.cam_from_ref is None:
+        return Outcome(answer.status, 1, stars=stars, detected=detected, matched=matched)
+    error = (answer.cam_from_ref * cam_from_lab.inv()).as_rotvec()
+    nees = math.nan
+    if answer.covariance_rad2 is not None:
+        nees = metrics.normalised_error_squared(answer.cam_from_ref, cam_from_lab, answer.covariance_rad2)
+    wrong = int(metrics.is_wrong(answer.cam_from_ref, cam_from_lab))
+    x, y, roll = (float(part) / ARCSEC_RAD for part in error)
+    return Outcome("solved", 1, 1, wrong, x, y, roll, nees, stars, detected, matched)
+
+
+def summed(lab: simulate.Lab, came: list[Outcome], settle_s: float) -> Outcome:
+    """A flight's outcome of its frames' and, where it has a filter, of its filter's errors at every tick."""
+    solved = [outcome for outcome in came if outcome.solved]
+    x, y, roll = (_rms([getattr(one, name) for one in solved]) for name in ("x_arcsec", "y_arcsec", "roll_arcsec"))
+    good = [bool(one.solved and not one.wrong) for one in came]
+    off = filter_off_arcsec(lab, settle_s)
+    quarter = len(off) // 4
+    limit = metrics.WRONG_RAD / ARCSEC_RAD
+    return Outcome(
+        "solved" if solved else came[-1].status if came else "no frame after it settled",
+        len(came),
+        len(solved),
+        sum(one.wrong for one in came),
+        x,
+        y,
+        roll,
+        _mean([one.nees for one in solved]),
+        min((one.stars for one in came), default=math.nan),
+        _mean([one.detected for one in came]),
+        _mean([one.matched for one in came]),
+        _mean(off < limit) if len(off) else _mean(good),
+        _rms(off),
+        float(off.max(initial=-np.inf)) if len(off) else math.nan,
+        _rms(off[-quarter:]) - _rms(off[:quarter]) if quarter else math.nan,
+    )
+
+
+def filter_off_arcsec(lab: simulate.Lab, settle_s: float) -> Floats:
+    """(K,) angle by which the filter is off at the ticks after it settled; none where there is no filter."""
+    log = lab.log
+    if log.lab_from_filter is None:
+        return np.empty(0)
+    off = (log.lab_from_filter * log.lab_from_body.inv()).magnitude() / ARCSEC_RAD
+    return np.asarray(off[log.t_s >= settle_s])
+
+
+def _rms(values: list[float] | NDArray[Any]) -> float:
+    return float(metrics.rms(np.asarray(values))) if len(values) else math.nan
+
+
+def _mean(values: list[Any] | NDArray[Any]) -> float:
+    return float(np.mean(values)) if len(values) else math.nan
