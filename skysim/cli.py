@@ -12,6 +12,7 @@ import typer
 
 from estimator import BadImage
 from skysim import BadInput
+from skysim.study.commands import app as studies
 from skysim.terminal import (
     begun,
     complain,
@@ -48,6 +49,7 @@ scenes_app = typer.Typer(
 app.add_typer(scenes_app, name="scenes")
 catalog_app = typer.Typer(no_args_is_help=True, help="Make and look at star catalogues.")
 app.add_typer(catalog_app, name="catalog")
+app.add_typer(studies, name="study")
 
 SceneArg = Annotated[str, typer.Argument(help="A scene file (.yaml) or the name of one in scenes/.")]
 Frames = Annotated[int | None, typer.Option(help="How many frames; the scene's own number if left out.")]

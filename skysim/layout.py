@@ -23,6 +23,8 @@ GOLDEN_ANGLE_RAD = np.pi * (3 - np.sqrt(5))
 GLUE = 1  # the spawn key of the glue's own random stream: a board keeps its pattern when its place scatters
 TRIES = 100  # darts on every square of the least spacing: room of .03 of it is found 95 times of a hundred
 MOST_TRIES = 3_000_000
+DARTS = 30  # for each LED of a count
+HALVINGS = 14  # of the dome's width: to some tenths of a millimetre
 STANDS_OFF_M = 0.05  # of a listed LED from the surface; more is a slip in a unit or an axis
 
 Ints = NDArray[np.int64]
@@ -249,11 +251,16 @@ def poisson_disc(part: lamp.PoissonDisc, inside: Inside, led: lamp.Led, band: Ba
 
     Darts uniform over the cap are kept in the order thrown where none kept lies within the spacing. Discs of that
     diameter would jam at a cover of .547 (Feder 1980, J. theor. Biol. 87, 237; assumed); TRIES darts come to .52, .66
-    LEDs on every square of the spacing, and denser along the rim.
+    LEDs on every square of the spacing, and denser along the rim. For a count it is the first so many of those at the
+    widest spacing that finds them room.
     Raises BadInput for a spacing that makes more LEDs than fit into memory.
     """
     rng = np.random.default_rng(part.hardware_seed)
     half = np.radians(part.cap_deg)
+    if part.spacing_m is None:
+        count = part.count or 1
+        place_m = widely(from_bearing(inside, scattered_cap(DARTS * count, half, rng)), count)
+        return lit(on_surface(inside, place_m, rng.choice(part.dimming, count)), led, band, rng)
     directions = cap(1000, half)
     points = from_bearing(inside, directions)
     # Square metres in a steradian as the bearing sees it: where they are most the darts are fewest.
@@ -268,6 +275,19 @@ def poisson_disc(part: lamp.PoissonDisc, inside: Inside, led: lamp.Led, band: Ba
     darts_m = from_bearing(inside, scattered_cap(max(int(tries), 1), half, rng))
     place_m = darts_m[apart(darts_m, part.spacing_m)]
     return lit(on_surface(inside, place_m, rng.choice(part.dimming, len(place_m))), led, band, rng)
+
+
+def widely(darts_m: Floats, count: int) -> Floats:
+    """(count, 3) of the darts, in their order, at the widest spacing that leaves so many; found by halving."""
+    near_m, far_m, best_m = 0.0, float(np.ptp(darts_m, axis=0).max()), darts_m[:count]
+    for _ in range(HALVINGS):
+        middle_m = (near_m + far_m) / 2
+        kept = apart(darts_m, middle_m)
+        if len(kept) < count:
+            far_m = middle_m
+        else:
+            near_m, best_m = middle_m, darts_m[kept[:count]]
+    return best_m
 
 
 def apart(points_m: Floats, spacing_m: float) -> Ints:

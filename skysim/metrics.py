@@ -53,26 +53,28 @@ class Summary(NamedTuple):
     value: float
     low: float
     high: float
-    count: int
+    trials: int
 
 
 NOTHING = Summary(float("nan"), float("nan"), float("nan"), 0)
 Response = Callable[[Columns], Summary]
 
 
-def share(hits: float, of: float) -> Summary:
+def share(hits: Any, of: Any) -> Summary:
     """hits / of with Wilson's interval (Wilson 1927), which holds at no hits and at none missed too."""
     if of < 1:
         return NOTHING
     found = stats.binomtest(int(hits), int(of)).proportion_ci(CONFIDENCE, "wilson")
-    return Summary(hits / of, float(found.low), float(found.high), int(of))
+    return Summary(float(hits / of), float(found.low), float(found.high), int(of))
 
 
 def resampled(values: Floats, statistic: Callable[..., Any]) -> Summary:
     """A mean or the like, with the bootstrap's percentile interval (Efron 1979); always the same resamples."""
     value = float(statistic(values))
     if len(values) < 2 or np.ptp(values) == 0:
-        return Summary(value, value if len(values) > 1 else np.nan, value if len(values) > 1 else np.nan, len(values))
+        return Summary(
+            value, value if len(values) > 1 else np.nan, value if len(values) > 1 else np.nan, len(values)
+        )
     batch = max(1, 2_000_000 // len(values))
     found = stats.bootstrap(
         (values,),
@@ -83,7 +85,8 @@ def resampled(values: Floats, statistic: Callable[..., Any]) -> Summary:
         method="percentile",
         rng=np.random.default_rng(1),
     )
-    return Summary(value, *map(float, found.confidence_interval), len(values))
+    low, high = map(float, found.confidence_interval)
+    return Summary(value, low, high, len(values))
 
 
 def quantile(values: Floats, part: float) -> Summary:

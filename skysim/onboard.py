@@ -64,9 +64,9 @@ def tracker(scene: Scene, mount: Mount, sources: Sources) -> Estimator:
 def believed_dome(scene: Scene, light: Dome, sources: Sources) -> LedMap:
     """The dome on the tracker's map: the true one, and the errors of its survey."""
     inside, told = dome.surface(light.surface), scene.tracker.survey
-    place_m = survey.believed_leds_m(inside, sources.place[:, :3], told.led_sigma_m, told.seed)
+    place_m = survey.believed_leds_m(inside, sources.place[:, :3], told)
     board = dome.board_of(light.layout, sources.id)
-    ellipsoid = survey.believed_ellipsoid(inside, told.seed)
+    ellipsoid = survey.believed_ellipsoid(inside, told)
     return LedMap(sources.id, place_m, *ellipsoid, board, told.led_sigma_m)
 
 
@@ -110,8 +110,11 @@ def surveyed_dome(scene: Scene, path: str, leds: LedMap, lever: Lever) -> tuple[
 
 def believed_camera(scene: Scene) -> Camera:
     """The calibration in the tracker's head."""
-    believed_m = scene.tracker.believed_focal_length_m
-    return calibration(scene.camera).zoomed(believed_m / scene.camera.focal_length_m if believed_m else 1.0)
+    told, true = scene.tracker, calibration(scene.camera)
+    if told.believed_distortion is not None:
+        true = replace(true, distortion=told.believed_distortion)
+    believed_m = told.believed_focal_length_m
+    return true.zoomed(believed_m / scene.camera.focal_length_m if believed_m else 1.0)
 
 
 def calibration(camera: CameraPart) -> Camera:
@@ -121,9 +124,11 @@ def calibration(camera: CameraPart) -> Camera:
 
 def believed_settings(scene: Scene) -> Settings:
     """The tracker's algorithms and thresholds as the scene names them. Raises BadInput for a wrong name."""
-    part = scene.tracker
+    part, usual = scene.tracker, Settings()
     near = isinstance(scene.light, Dome)
     return Settings(
+        max_blobs=part.brightest or usual.max_blobs,
+        base_stars=min(part.brightest or usual.base_stars, usual.base_stars),
         detector=known("detector", part.detector or ("local" if near else "default"), DETECTORS),
         centroider=known("centroider", part.centroider or ("cog" if near else "default"), CENTROIDERS),
         identifier=known(

@@ -17,7 +17,7 @@ from pydantic import AfterValidator, Field, ValidationError, model_validator
 from skysim.camera import Camera, over, with_preset
 from skysim.light import Bench, Dome, Glow, Stars
 from skysim.motion import Motion, Pointing
-from skysim.quantity import DATA, ROOT, Length, NotNegative, Number, Part, Positive, Time
+from skysim.quantity import DATA, ROOT, Length, NotNegative, Number, Part, Positive, Spin, Time
 from skysim.types import BadInput
 from skysim.vehicle import Site, Vehicle
 from skysim.yamlfile import Files, explain, place_of, put, read_yaml
@@ -59,10 +59,15 @@ class Exposure(Part):
 class Survey(Part):
     """How well the lab knows what it built. Drawn once, from a seed of its own; `light.surface.error` from it too.
 
-    led_sigma   : standard deviation of every LED's believed place, about each axis of the lab
-    lever_sigma : of the camera's believed place, about each axis of the body
+    led_sigma    : standard deviation of every LED's believed place, about each axis of the lab
+    lever_sigma  : of the camera's believed place, about each axis of the body
+    turn_deg     : rotation vector by which the survey's axes stand turned in the lab's: what level or IMU it was
+        referred to erred by. All believed LEDs are turned with it
+    surface_seed : draws `light.surface.error`; `seed` if left out
     """
 
+    turn_deg: tuple[Spin, Spin, Spin] = (0.0, 0.0, 0.0)
+    surface_seed: Annotated[int, Field(ge=0)] | None = None
     led_sigma_m: Annotated[Length, Field(ge=0, le=0.1)] = 0.0
     lever_sigma_m: Annotated[Length, Field(ge=0, le=0.1)] = 0.0
     seed: Annotated[int, Field(ge=0)] = 0
@@ -100,6 +105,8 @@ class Tracker(Part):
     map : a file that `skysim survey` wrote: LEDs, lever, focal length and distortion as measured
     detector, centroider, identifier, solver : if left out, under a dome local, cog, led_pairs and rotation_only, and
         under the stars all of them `default`
+    believed_distortion : k1, k2, p1, p2, k3 of the lens; as it is if left out
+    brightest : no more lights of a frame than that are looked at
     exposure_control : every frame is exposed for `exposure.time` if left out
     """
 
@@ -112,6 +119,8 @@ class Tracker(Part):
     limit_mag: Number = 6.0
     centroid_sigma_px: Annotated[Number, Field(gt=0)] = 0.2
     believed_focal_length_m: Annotated[Length, Field(gt=0)] | None = None
+    believed_distortion: tuple[Number, Number, Number, Number, Number] | None = None
+    brightest: Annotated[int, Field(ge=3, le=1000)] | None = None
     believed_camera_body_m: tuple[Length, Length, Length] | None = None
     survey: Survey = Survey()
     exposure_control: ExposureControl | None = None
@@ -130,6 +139,7 @@ class Tracker(Part):
         told = {
             "believed_focal_length": self.believed_focal_length_m,
             "believed_camera_body": self.believed_camera_body_m,
+            "believed_distortion": self.believed_distortion,
             "survey.led_sigma": self.survey.led_sigma_m,
             "survey.lever_sigma": self.survey.lever_sigma_m,
         }

@@ -7,7 +7,9 @@ kind has a stream of its own, so that one error more leaves the others as they w
 from __future__ import annotations
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
+from skysim.scene import Survey
 from skysim.surface import Surface
 from skysim.types import BadInput, Floats
 
@@ -28,6 +30,16 @@ def believed_m(place_m: Floats, sigma_m: float, seed: int, what: str) -> Floats:
     return place_m + sigma_m * normals(seed, what, place_m.shape) if sigma_m else place_m
 
 
+def surface_seed(told: Survey) -> int:
+    """What draws the surface's error."""
+    return told.seed if told.surface_seed is None else told.surface_seed
+
+
+def turned(places_m: Floats, told: Survey) -> Floats:
+    """Believed places (..., 3) as a survey has them whose axes stand turned in the lab's."""
+    return Rotation.from_rotvec(told.turn_deg, degrees=True).apply(places_m) if any(told.turn_deg) else places_m
+
+
 def raised_m(inside: Surface, seed: int) -> float:
     """How far outside of the true surface, along its normal, the survey has it: N(0, light.surface.error).
 
@@ -37,14 +49,14 @@ def raised_m(inside: Surface, seed: int) -> float:
     return float(inside.survey_sigma_m * normals(seed, "surface", (1,))[0])
 
 
-def believed_leds_m(inside: Surface, place_m: Floats, led_sigma_m: float, seed: int) -> Floats:
-    """(N, 3) LEDs as the lab has them on its map: each errs by itself, and all go with the surface that bears them."""
-    raised = raised_m(inside, seed)
+def believed_leds_m(inside: Surface, place_m: Floats, told: Survey) -> Floats:
+    """(N, 3) LEDs as the lab has them on its map: each errs by itself, all go with the surface and the survey's axes."""
+    raised = raised_m(inside, surface_seed(told))
     on_it = place_m - raised * inside.inward(place_m) if raised else place_m
-    return believed_m(on_it, led_sigma_m, seed, "leds")
+    return turned(believed_m(on_it, told.led_sigma_m, told.seed, "leds"), told)
 
 
-def believed_ellipsoid(inside: Surface, seed: int) -> tuple[Floats, Floats]:
+def believed_ellipsoid(inside: Surface, told: Survey) -> tuple[Floats, Floats]:
     """Centre and semi-axes, (3,) each, m: those nearest to the surface, the axes greater by as much as it is raised.
 
     That raises an ellipsoid by sum(a_i n_i^2) / sqrt(sum(a_i^2 n_i^2)) of it where the normal is n: all of it on the
@@ -52,10 +64,10 @@ def believed_ellipsoid(inside: Surface, seed: int) -> tuple[Floats, Floats]:
     Raises BadInput if nothing is left of it.
     """
     centre_m, semi_axes_m = inside.as_ellipsoid()
-    believed = semi_axes_m + raised_m(inside, seed)
+    believed = semi_axes_m + raised_m(inside, surface_seed(told))
     if believed.min() <= 0:
         raise BadInput(
             f"light.surface.error: {inside.survey_sigma_m:g} m makes an ellipsoid of {believed.min():.3g} m; allowed:"
             " far less than the dome"
         )
-    return centre_m, believed
+    return turned(centre_m, told), believed

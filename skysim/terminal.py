@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 if TYPE_CHECKING:
     from skysim.simulate import Lab
+    from skysim.study.runner import Progress
     from skysim.types import Row
 
 T = TypeVar("T")
@@ -104,6 +105,41 @@ def watched(what: str, quiet: bool = False) -> Iterator[Callable[[float, float],
     with Progress(console=console, transient=True, disable=quiet or not console.is_terminal) as bar:
         task = bar.add_task(what)
         yield lambda now, everything: bar.update(task, completed=now, total=everything)
+
+
+@contextmanager
+def counted(what: str, total: int) -> Iterator[Callable[[Progress], None]]:
+    """A bar on stderr for trials: how many, how many a second, how long still, how many failed.
+
+    Where stderr is no terminal, a line at every tenth.
+    """
+    from rich.console import Console
+    from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
+    from rich.progress import Progress as Bar
+
+    console = Console(stderr=True)
+    text = "{task.completed:.0f}/{task.total:.0f}  {task.fields[rate]:.0f}/s  {task.fields[faults]}"
+    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn(text), TimeRemainingColumn())
+    tenth = [0]
+
+    def line(done: Progress, told: str) -> None:
+        if not console.is_terminal and 10 * done.done // total > tenth[0]:
+            tenth[0] = 10 * done.done // total
+            print(
+                f"{what}: {done.done} of {total}, {done.rate:.0f} a second, {told}",
+                file=sys.stderr,
+                flush=True,
+            )
+
+    with Bar(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+        task = bar.add_task(what, total=total, rate=0.0, faults="")
+
+        def update(done: Progress) -> None:
+            told = f"{done.failed} failed" + (f", {done.wrong} wrong" if done.wrong else "")
+            bar.update(task, completed=done.done, rate=done.rate, faults=told)
+            line(done, told)
+
+        yield update
 
 
 def print_flight(figures: dict[str, float]) -> None:

@@ -166,6 +166,7 @@ class Imu(Part):
 class Vehicle(Part):
     """What moves: an MJCF file and what the scene declares over it.
 
+    camera       : where its entrance pupil is on the body, its housing with it; where the MJCF has it if left out
     torque_limit : of each of the ideal torques about body x, y, z
     wheels, fans, cmgs : the actuators that are switched on; joints of the others are locked
     """
@@ -175,6 +176,7 @@ class Vehicle(Part):
     mass_kg: Annotated[Mass, Field(gt=0)] | None = None
     inertia_kg_m2: tuple[Inertia, Inertia, Inertia] | None = None
     centre_of_mass_m: tuple[Length, Length, Length] = (0.0, 0.0, 0.0)
+    camera_m: tuple[Length, Length, Length] | None = None
     tilt_stop_deg: Annotated[Number, Field(gt=0, lt=90)] = 30.0
     torque_limit_nm: TorqueLimit = 1.0
     wheels: Wheels | None = None

@@ -10,7 +10,7 @@ from scipy.stats import chi2
 
 from estimator.dometracker import DomeTracker
 from skysim import dome, light, onboard, scene, simulate, survey
-from skysim.scene import Scene
+from skysim.scene import Scene, Survey
 from skysim.types import BadInput, Floats
 
 RARE = 1e-6  # of a sum of squares that is outside: the seeds are fixed, so it fails for a wrong law alone
@@ -81,8 +81,8 @@ def test_a_raised_sphere_is_a_greater_sphere_with_its_leds_on_it() -> None:
     inside = inside_of(error="2 mm", offset=["1 cm", "0 m", "0 m"])
     directions = np.random.default_rng(1).normal(size=(50, 3)) * [0.3, 0.3, 0.0] + [0, 0, 1]
     place_m = inside.meet(np.zeros(3), directions)
-    believed_m = survey.believed_leds_m(inside, place_m, 0.0, 9)
-    centre_m, semi_axes_m = survey.believed_ellipsoid(inside, 9)
+    believed_m = survey.believed_leds_m(inside, place_m, Survey(seed=9))
+    centre_m, semi_axes_m = survey.believed_ellipsoid(inside, Survey(seed=9))
     raised_m = survey.raised_m(inside, 9)
     assert 1e-4 < abs(raised_m) < 1e-2
     np.testing.assert_allclose(semi_axes_m, 1 + raised_m, rtol=0, atol=1e-15)
@@ -226,4 +226,4 @@ def test_a_survey_that_leaves_no_dome_is_refused() -> None:
     with pytest.raises(
         BadInput, match=r"light\.surface\.error: 1 m makes an ellipsoid of -.* m; allowed: far less"
     ):
-        survey.believed_ellipsoid(inside, seed)
+        survey.believed_ellipsoid(inside, Survey(seed=seed))

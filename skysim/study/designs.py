@@ -1,4 +1,4 @@
-"""Which combinations of the factors are tried: full factorial, one at a time, or spread over the cube of their shares."""
+"""Which combinations of the factors are tried: full factorial, one at a time, or spread over their shares' cube."""
 
 from __future__ import annotations
 
@@ -44,11 +44,17 @@ def points(design: Design, factors: Factors, seed: int) -> list[Point]:
     if drawn != (design.points is not None):
         wanted = "takes how many" if drawn else "has as many as its levels make"
         raise BadInput(f"design.points: {design.kind} {wanted}")
-    if design.kind in ("sobol", "saltelli") and design.points is not None and design.points & (design.points - 1):
+    if (
+        design.kind in ("sobol", "saltelli")
+        and design.points is not None
+        and design.points & (design.points - 1)
+    ):
         raise BadInput(f"design.points: {design.points} is no power of two, as {design.kind} wants")
     for name, factor in factors.items():
         if not drawn and not factor.options():
-            raise BadInput(f"factors.{name}: a distribution has no levels; allowed: design of kind lhs, sobol, saltelli")
+            raise BadInput(
+                f"factors.{name}: a distribution has no levels; allowed: design of kind lhs, sobol, saltelli"
+            )
     return list(DESIGNS[design.kind](design, factors, seed))
 
 
@@ -78,7 +84,9 @@ def one_at_a_time(design: Design, factors: Factors, seed: int) -> Iterator[Point
 def at_shares(factors: Factors, shares: Floats) -> Iterator[Point]:
     """The points at (P, D) shares of 1."""
     for row in shares:
-        yield merged({name: factor.at(float(u)) for (name, factor), u in zip(factors.items(), row, strict=True)})
+        yield merged(
+            {name: factor.at(float(u)) for (name, factor), u in zip(factors.items(), row, strict=True)}
+        )
 
 
 def lhs(design: Design, factors: Factors, seed: int) -> Iterator[Point]:

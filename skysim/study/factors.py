@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from pydantic import Discriminator, Field, Tag, model_validator
@@ -49,28 +49,43 @@ class Levels(Part):
         return pick(self.options(), share)
 
 
-class Values(Part):
-    """One key, the values it takes."""
+class Keyed(Part):
+    """Base of the factors of one value: it goes to one key, or to several that must be alike (apex and radius)."""
 
-    key: Name
+    key: Name | None = None
+    keys: tuple[Name, ...] = ()
+
+    @model_validator(mode="after")
+    def one_way_to_say_it(self) -> Self:
+        if (self.key is None) == (not self.keys):
+            raise ValueError("a factor takes either key or keys")
+        return self
+
+    def sets(self, value: Value) -> Settings:
+        """The value at every key."""
+        return dict.fromkeys(self.keys or (self.key or "",), value)
+
+
+class Values(Keyed):
+    """The values of a key."""
+
     values: Annotated[tuple[Value, ...], Field(min_length=1)]
 
     def options(self) -> list[tuple[Value, Settings]]:
         """Every value."""
-        return [(value, {self.key: value}) for value in self.values]
+        return [(value, self.sets(value)) for value in self.values]
 
     def at(self, share: float) -> tuple[Value, Settings]:
         """Of equally likely values, the one at a share of 1."""
         return pick(self.options(), share)
 
 
-class Range(Part):
-    """One key between two ends: `steps` values where levels are wanted, evenly likely in between where draws are.
+class Range(Keyed):
+    """A key between two ends: `steps` values where levels are wanted, evenly likely in between where draws are.
 
     scale : of equal steps (linear) or of equal ratios (log); whole : rounded to whole numbers
     """
 
-    key: Name
     from_: Annotated[Value, Field(alias="from")]
     to: Value
     steps: Annotated[int, Field(ge=2, le=10_000)] = 5
@@ -97,17 +112,16 @@ class Range(Part):
         (low, unit), (high, _) = split(self.from_), split(self.to)
         between = low * (high / low) ** share if self.scale == "log" else low + (high - low) * share
         value = joined(round(between) if self.whole else between, unit)
-        return value, {self.key: value}
+        return value, self.sets(value)
 
 
-class Distribution(Part):
-    """One key, drawn: normal (mean, sigma), lognormal (median, sigma of the logarithm), triangular (low, mode, high),
+class Distribution(Keyed):
+    """A key, drawn: normal (mean, sigma), lognormal (median, sigma of the logarithm), triangular (low, mode, high),
     integers (low to high, both ends). Uniform and log-uniform are `from` and `to`.
 
     With a unit all numbers but a lognormal's sigma have it.
     """
 
-    key: Name
     distribution: Literal["normal", "lognormal", "triangular", "integers"]
     mean: Value = None
     median: Value = None
@@ -121,7 +135,9 @@ class Distribution(Part):
         wanted = PARAMETERS[self.distribution]
         given = [name for name in ALL if getattr(self, name) is not None]
         if sorted(given) != sorted(wanted):
-            raise ValueError(f"{self.distribution} takes {', '.join(wanted)}, not {', '.join(given) or 'nothing'}")
+            raise ValueError(
+                f"{self.distribution} takes {', '.join(wanted)}, not {', '.join(given) or 'nothing'}"
+            )
         self.numbers()
         return self
 
@@ -146,7 +162,7 @@ class Distribution(Part):
         """The quantile at a share of 1."""
         numbers, unit = self.numbers()
         value = joined(float(QUANTILES[self.distribution](share, *numbers)), unit)
-        return value, {self.key: value}
+        return value, self.sets(value)
 
 
 ALL = ("mean", "median", "sigma", "low", "mode", "high")
@@ -187,4 +203,3 @@ Factor = Annotated[
     | Annotated[Range, Tag("range")],
     Discriminator(kind_of),
 ]
-

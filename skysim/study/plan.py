@@ -33,8 +33,10 @@ class Anywhere(Part):
 
     tilt_deg : under a dome the body's lean from upright, one angle or uniform over the cap's ring between two
     dec_deg  : under the stars the boresight is uniform over the sphere between two declinations
+    noise_seed : other noise at the same attitudes; a factor of it makes noise an input, as Sobol indices want
     """
 
+    noise_seed: Annotated[int, Field(ge=0)] = 0
     tilt_deg: Tilt | tuple[Tilt, Tilt] = (0.0, 30.0)
     dec_deg: tuple[Declination, Declination] = (-90.0, 90.0)
 
@@ -95,7 +97,7 @@ class Curve(Part):
     x: str
     y: str
     by: str | None = None
-    where: dict[str, Value] = {}
+    where: dict[str, Value] = Field(default_factory=dict)
     log: bool = False
 
 
@@ -106,7 +108,7 @@ class Heat(Part):
     x: str
     y: str
     value: str
-    where: dict[str, Value] = {}
+    where: dict[str, Value] = Field(default_factory=dict)
     log: bool = False
 
 
@@ -117,8 +119,8 @@ class Cost(Part):
     """What a point costs: base + sum of `per` times a factor's value + the named level's price."""
 
     base: Number = 0.0
-    per: dict[str, Number] = {}
-    levels: dict[str, dict[str, Number]] = {}
+    per: dict[str, Number] = Field(default_factory=dict)
+    levels: dict[str, dict[str, Number]] = Field(default_factory=dict)
 
 
 class Objective(Part):
@@ -160,7 +162,7 @@ class Study(Part):
     title: str
     scene: str
     seed: Annotated[int, Field(ge=0)]
-    set: Settings = {}
+    set: Settings = Field(default_factory=dict)
     trial: Trial
     factors: Annotated[dict[Annotated[str, Field(pattern=r"^[a-z]\w*$")], Factor], Field(min_length=1)]
     design: Design = Design()
@@ -232,6 +234,11 @@ def find(name: str) -> Path:
     raise BadInput(f"{name}: no such study; allowed: a .yaml file or one of {', '.join(known)}")
 
 
+def title_of(path: Path) -> str:
+    """A study file's title, the rest of it unread."""
+    return str(read_yaml(path)[0].get("title", ""))
+
+
 def load(name: str | Path, overrides: Mapping[str, str] | None = None) -> Plan:
     """Read, override (`path.to.key` -> YAML value) and validate a study and every level of its factors.
 
@@ -246,17 +253,16 @@ def load(name: str | Path, overrides: Mapping[str, str] | None = None) -> Plan:
     except ValidationError as error:
         raise BadInput(explain(error, Study, tree, [(path, text)], overrides or {})) from None
     try:
-        plan = planned(path, study)
+        plan = planned(path, study, tree["trial"])
         check(plan)
     except BadInput as error:
         raise BadInput(located(str(error), path, text)) from None
     return plan
 
 
-def planned(path: Path, study: Study) -> Plan:
-    """The study's points and what a worker has to know."""
+def planned(path: Path, study: Study, trial: dict[str, Any]) -> Plan:
+    """The study's points and what a worker has to know; `trial` as the file has it, units and all."""
     chosen = [] if study.optimise else points(study.design, study.factors, study.seed)
-    trial = study.trial.model_dump(by_alias=True)
     told = Recipe(study.scene, str(path.resolve().parent), study.seed, study.set, trial, study.paired)
     return Plan(path, study, told, chosen)
 
@@ -289,10 +295,14 @@ def check(plan: Plan) -> None:
 def resolved(recipe: Recipe, settings: Settings) -> tuple[Scene, CentroidTrial | FrameTrial | FlightTrial]:
     """The scene and the trial at a point. Raises BadInput with one line."""
     told = recipe.base | settings
-    name, tree = str(told.get("scene", recipe.scene)), {"trial": dict(recipe.trial)}
+    name = str(told.get("scene", recipe.scene))
+    tree: dict[str, Any] = {"trial": dict(recipe.trial)}
+    scene_keys = {}
     for key, value in told.items():
         if key.startswith(TRIAL):
             put(tree, key, as_yaml(value))
+        elif key != "scene":
+            scene_keys[key] = as_yaml(value)
     try:
         trial = Asked.model_validate(tree).trial
     except ValidationError as error:
@@ -301,8 +311,7 @@ def resolved(recipe: Recipe, settings: Settings) -> tuple[Scene, CentroidTrial |
         raise BadInput(f"{keys}: {fault['input']!r}: {fault['msg'].removeprefix('Value error, ')}") from None
     beside = Path(recipe.folder) / name
     path = beside if beside.suffix in {".yaml", ".yml"} and beside.is_file() else find_scene(name)
-    keys = {key: as_yaml(value) for key, value in told.items() if key != "scene" and not key.startswith(TRIAL)}
-    return load_scene(path, keys), trial
+    return load_scene(path, scene_keys), trial
 
 
 class Asked(Part):

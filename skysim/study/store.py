@@ -12,7 +12,7 @@ import os
 import sqlite3
 import time
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import astuple
 from pathlib import Path
 from typing import Any
@@ -62,7 +62,10 @@ class Store:
 
     def set_points(self, points: Iterable[Point], first: int = 0) -> None:
         """Points by their numbers, from `first`."""
-        rows = ((first + n, json.dumps(point.levels), json.dumps(point.settings)) for n, point in enumerate(points))
+        rows = (
+            (first + n, json.dumps(point.levels), json.dumps(point.settings))
+            for n, point in enumerate(points)
+        )
         with self.db:
             self.db.executemany("INSERT OR REPLACE INTO points VALUES (?, ?, ?)", rows)
 
@@ -121,7 +124,7 @@ class Store:
         return "none yet" if low is None else f"{low} to {high}"
 
     def columns(self, where: str = "1", values: tuple[Any, ...] = ()) -> dict[str, NDArray[Any]]:
-        """Every column of `trials` and `timings.time_ms` as an array, in the trials' order; NaN for what is not there."""
+        """Every column of `trials` and `timings.time_ms` as an array, in the trials' order; NaN for what is missing."""
         told = f"SELECT trials.*, time_ms FROM trials LEFT JOIN timings USING (trial) WHERE {where} ORDER BY trial"
         found = self.db.execute(told, values)
         names = [column[0] for column in found.description]
@@ -175,30 +178,36 @@ def open_store(path: Path) -> Iterator[Store]:
 def writing(path: Path) -> Iterator[Store]:
     """The store of a path for the one run that may write it; made where it is not there.
 
-    A lock beside it, itself SQLite's, goes when its holder ends in whatever way. Raises BadInput where another holds it.
+    A lock beside it, itself SQLite's, goes when its holder ends in whatever way. Raises BadInput where another has it.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    lock = sqlite3.connect(path.with_suffix(".lock"), timeout=0, isolation_level=None)
     try:
-        try:
-            lock.execute("BEGIN EXCLUSIVE")
-        except sqlite3.OperationalError:
-            raise BadInput(f"{path}: another run is writing it; allowed: one at a time, or another --out") from None
-        with connected(path) as db:
-            db.execute("PRAGMA journal_mode = WAL")
-            db.execute("PRAGMA synchronous = NORMAL")
-            store = Store(path, db)
-            with db:
-                for statement in TABLES.split(";"):
-                    db.execute(statement)
-                db.execute("INSERT OR IGNORE INTO meta VALUES ('format', ?)", (str(FORMAT),))
-            if store.meta("format") != str(FORMAT):
-                raise BadInput(f"{path}: format {store.meta('format')!r}; allowed: {FORMAT}")
-            yield store
+        with closing(sqlite3.connect(path.with_suffix(".lock"), timeout=0, isolation_level=None)) as lock:
+            hold(lock, path)
+            with connected(path) as db:
+                db.execute("PRAGMA journal_mode = WAL")
+                db.execute("PRAGMA synchronous = NORMAL")
+                store = Store(path, db)
+                with db:
+                    for statement in TABLES.split(";"):
+                        db.execute(statement)
+                    db.execute("INSERT OR IGNORE INTO meta VALUES ('format', ?)", (str(FORMAT),))
+                if store.meta("format") != str(FORMAT):
+                    raise BadInput(f"{path}: format {store.meta('format')!r}; allowed: {FORMAT}")
+                yield store
     except sqlite3.DatabaseError as error:
         raise BadInput(f"{path}: {error}") from error
-    finally:
-        lock.close()
+
+
+def hold(lock: sqlite3.Connection, path: Path) -> None:
+    """Take the lock until its connection is closed. Raises BadInput where another has it."""
+    try:
+        lock.execute("BEGIN EXCLUSIVE")
+    except sqlite3.OperationalError as error:
+        if error.sqlite_errorcode != sqlite3.SQLITE_BUSY:
+            raise
+        told = f"{path}: another run is writing it; allowed: one at a time, or another --out"
+        raise BadInput(told) from None
 
 
 @contextmanager

@@ -20,7 +20,7 @@ from skysim.types import Floats, Sources
 from skysim.world.actuators import lock_unused
 from skysim.world.flight import as_many
 from skysim.world.spec import compiled, load, mujoco_warnings
-from skysim.world.vehicle import CAMERA, World, mount, put_at_origin
+from skysim.world.vehicle import CAMERA, World, mount, place_camera, put_at_origin
 
 BLOCKS, PASSES = 0, 5  # groups of geoms: those that are in the way of light, and the camera's own housing
 GROUPS = np.array([1, 0, 0, 0, 0, 0], dtype=np.uint8)  # of which rays heed the first alone
@@ -54,6 +54,7 @@ def obstacles(world: World, wall: dome.Surface | None) -> Obstacles:
         spec = load(path)
         spec.compiler.fusestatic = False
         bus = put_at_origin(spec, path)
+        place_camera(spec, world.vehicle)
         bus.mocap = True  # a body that stands where it is put
         lock_unused(spec, world.vehicle, path)
         model = compiled(spec, path)

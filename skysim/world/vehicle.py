@@ -112,6 +112,7 @@ def compose(vehicle: Vehicle, path: Path) -> tuple[Any, MassProperties]:
     spec = load(path)
     spec.compiler.fusestatic = False  # bodies keep their names until the bearing is there
     bus = put_at_origin(spec, path)
+    place_camera(spec, vehicle)
     locked = lock_unused(spec, vehicle, path)
     try:
         bare = compiled(spec, path)
@@ -148,6 +149,21 @@ def put_at_origin(spec: Any, path: Path) -> Any:
     bus.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT  # an euler or axisangle would win over the quat
     bus.pos, bus.quat = [0.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0]
     return bus
+
+
+def place_camera(spec: Any, vehicle: Vehicle) -> None:
+    """The camera's pupil where the scene has it: the body that carries the camera is moved, or on bus the camera."""
+    if vehicle.camera_m is None:
+        return
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    camera = spec.camera(CAMERA)
+    carrier = camera if camera.parent.name == "bus" else camera.parent
+    R_lab_from_parent = data.body(carrier.parent.name).xmat.reshape(3, 3)
+    mujoco.mj_camlight(model, data)
+    off_m = np.array(vehicle.camera_m) - data.camera(CAMERA).xpos
+    carrier.pos = carrier.pos + R_lab_from_parent.T @ off_m
 
 
 def add_bearing(spec: Any, bus: Any, vehicle: Vehicle) -> None:

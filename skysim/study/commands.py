@@ -1,0 +1,391 @@
+"""`skysim study`: run, look at, resume, export and replay studies. Thin, like `cli`."""
+
+from __future__ import annotations
+
+import shlex
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from skysim import BadInput
+from skysim.terminal import complain, counted, print_table
+
+if TYPE_CHECKING:
+    from skysim.study.engines import Engine
+    from skysim.study.plan import Plan
+    from skysim.study.runner import Progress
+    from skysim.study.store import Store
+
+app = typer.Typer(
+    invoke_without_command=True, help="Many trials of a scene whose fields vary, answered with error bars."
+)
+
+StudyArg = Annotated[str, typer.Argument(help="A study file (.yaml) or the name of one in scenes/studies/.")]
+Out = Annotated[Path | None, typer.Option(help="Folder of the store and the report; out/NAME if left out.")]
+Workers = Annotated[
+    int | None, typer.Option(min=1, help="Processes; as many as there are cores if left out.")
+]
+EngineName = Annotated[str, typer.Option("--engine", help="pool, serial or dask.")]
+Scheduler = Annotated[str, typer.Option(help="Address of a Dask scheduler, tcp://HOST:PORT.")]
+Sets = Annotated[list[str] | None, typer.Option("--set", help="Override a key: replicates=100.")]
+Json = Annotated[bool, typer.Option("--json", help="Print JSON for machines instead of a table.")]
+
+
+@app.callback()
+def studies(context: typer.Context, json: Json = False) -> None:
+    """List the studies that come with skysim."""
+    if context.invoked_subcommand:
+        return
+    from skysim import io
+    from skysim.study import plan
+
+    listed = [
+        {"name": path.stem, "title": plan.title_of(path), "file": str(path)}
+        for path in sorted(plan.STUDIES.glob("*.yaml"))
+    ]
+    if json:
+        print(io.to_json(listed))
+    else:
+        for entry in listed:
+            print(f"{entry['name']:20s} {entry['title']}")
+
+
+@app.command()
+def run(
+    study: StudyArg,
+    out: Out = None,
+    workers: Workers = None,
+    engine: EngineName = "pool",
+    scheduler: Scheduler = "",
+    set_: Sets = None,
+    json: Json = False,
+) -> None:
+    """Do all trials of a study and report them. Ctrl-C leaves a store that `resume` goes on with."""
+    from skysim.study import plan
+
+    overrides = parsed(set_)
+    told = plan.load(study, overrides)
+    done(
+        told,
+        study,
+        folder_of(told, out),
+        engine_of(engine, workers, scheduler),
+        overrides,
+        resume=False,
+        json=json,
+    )
+
+
+@app.command()
+def resume(
+    study: StudyArg,
+    out: Out = None,
+    workers: Workers = None,
+    engine: EngineName = "pool",
+    scheduler: Scheduler = "",
+    json: Json = False,
+) -> None:
+    """Go on with a study that was stopped, killed or ran out of its budget."""
+    folder = out or Path("out") / name_of(study)
+    told, overrides = planned(study, folder)
+    done(told, study, folder, engine_of(engine, workers, scheduler), overrides, resume=True, json=json)
+
+
+@app.command()
+def status(study: StudyArg, out: Out = None, json: Json = False) -> None:
+    """How far a study is, while it runs or after."""
+    from skysim import io
+    from skysim.study import store
+
+    folder = out or Path("out") / name_of(study)
+    told, _ = planned(study, folder)
+    with store.open_store(folder / STORE) as kept:
+        figures = facts(told, kept)
+        failures = [{"trial": trial, "error": error} for trial, error in kept.failures()[:10]]
+    if json:
+        print(io.to_json(figures | {"failures": failures}))
+        return
+    print_facts(figures)
+    for failure in failures:
+        print(f"  trial {failure['trial']}: {failure['error']}")
+
+
+@app.command()
+def report(study: StudyArg, out: Out = None, json: Json = False) -> None:
+    """Write the report of a study, finished or not, and print its table."""
+    folder = out or Path("out") / name_of(study)
+    told, overrides = planned(study, folder)
+    reported(told, folder, command(study, out, overrides), json)
+
+
+@app.command()
+def export(
+    study: StudyArg,
+    to: Annotated[
+        list[Path], typer.Argument(help="Files: .csv, .parquet (a row a trial), .zarr (the responses).")
+    ],
+    out: Out = None,
+) -> None:
+    """Write a study's results for other tools."""
+    from skysim.study import export as exporting
+    from skysim.study import store
+
+    folder = out or Path("out") / name_of(study)
+    told, _ = planned(study, folder)
+    with store.open_store(folder / STORE) as kept:
+        for path in to:
+            exporting.export(kept, told.study.responses, path)
+            print(path)
+
+
+@app.command()
+def replay(
+    study: StudyArg,
+    trial: Annotated[int, typer.Argument(help="The trial's number, as report and status give it.")],
+    out: Out = None,
+    show: Annotated[bool, typer.Option("--open/--no-open", help="Open the first picture.")] = False,
+    json: Json = False,
+) -> None:
+    """Do one trial again, alone, and write its frames."""
+    from skysim import io
+    from skysim.study import replay as replaying
+    from skysim.study import store
+
+    folder = out or Path("out") / name_of(study)
+    told, _ = planned(study, folder)
+    with store.open_store(folder / STORE) as kept:
+        again = replaying.replay(told, kept, trial, folder / f"trial_{trial}")
+    row = again.row
+    figures: dict[str, Any] = {
+        "trial": trial,
+        "point": row.point,
+        "replicate": row.replicate,
+        "seed": row.seed,
+    }
+    figures |= {name: getattr(row.outcome, name) for name in row.outcome.__slots__}
+    figures |= {"changed": again.changed, "error": row.error}
+    figures |= {"files": list(map(str, again.files)), "pictures": list(map(str, again.pictures))}
+    if json:
+        print(io.to_json(figures))
+    else:
+        print_replay(figures)
+    if show and again.pictures:
+        typer.launch(str(again.pictures[0]))
+
+
+@app.command()
+def optimise(
+    study: StudyArg,
+    out: Out = None,
+    workers: Workers = None,
+    engine: EngineName = "pool",
+    scheduler: Scheduler = "",
+    set_: Sets = None,
+    json: Json = False,
+) -> None:
+    """Search a study's factors for the best point, or for the Pareto front of two objectives. Goes on where it was."""
+    from skysim.study import plan, runner, search, store
+
+    overrides = parsed(set_)
+    told = plan.load(study, overrides)
+    if told.study.optimise is None:
+        raise BadInput(
+            f"{told.path}: optimise: missing; allowed: skysim study run, for a study with a design"
+        )
+    folder, doer = folder_of(told, out), engine_of(engine, workers, scheduler)
+    with store.writing(folder / STORE) as kept, stoppable(study, kept):
+        runner.begin(told, kept, resume=bool(kept.meta("digest")))
+        noted(kept, overrides)
+        with counted(told.study.title, told.study.replicates * told.study.optimise.candidates) as watch:
+            search.search(told, kept, doer, watch)
+    reported(told, folder, command(study, out, overrides, "optimise"), json)
+
+
+# What they share.
+
+STORE = "study.sqlite"
+
+
+def done(
+    told: Plan, study: str, folder: Path, engine: Engine, overrides: dict[str, str], resume: bool, json: bool
+) -> None:
+    """Do what is missing, with a bar, and report."""
+    from skysim.study import runner, store
+
+    if told.study.optimise is not None:
+        raise BadInput(f"{told.path}: optimise: has no design to run; allowed: skysim study optimise")
+    with store.writing(folder / STORE) as kept, stoppable(study, kept):
+        runner.begin(told, kept, resume)
+        noted(kept, overrides)
+        with counted(told.study.title, told.trials) as watch:
+            progress = runner.run(told, kept, engine, watch)
+    told_so_far(progress, study)
+    out = None if folder == Path("out") / told.name else folder
+    reported(told, folder, command(study, out, overrides), json)
+
+
+def told_so_far(progress: Progress, study: str) -> None:
+    """Why a run ended early, if it did."""
+    if progress.done < progress.trials:
+        complain(
+            f"{progress.done} of {progress.trials} trials done within the budget; skysim study resume {study} goes on"
+        )
+    if progress.failed:
+        complain(f"{progress.failed} trials failed; skysim study status {study} names them")
+
+
+@contextmanager
+def stoppable(study: str, kept: Store) -> Iterator[None]:
+    """Ctrl-C and SIGTERM end a run with a word on how it goes on."""
+
+    def stop(*_: Any) -> None:
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGTERM, stop)
+    try:
+        yield
+    except KeyboardInterrupt:
+        complain(f"{kept.counts()['done']} trials are in; skysim study resume {study} goes on")
+        raise
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def reported(told: Plan, folder: Path, repeat: str, json: bool) -> None:
+    """The page, and the table on the terminal."""
+    from skysim import io
+    from skysim.study import page, store, table
+
+    path = folder / "report.html"
+    with store.open_store(folder / STORE) as kept:
+        page.write_page(path, kept, told.study, repeat)
+        lines = table.table(kept, told.study.responses)
+        figures = facts(told, kept)
+    if json:
+        print(io.to_json(figures | {"report": str(path), "points": table.flat(lines)}))
+        return
+    heads, cells = table.cells(lines)
+    print_table("", heads, cells[:MOST_LINES])
+    if len(cells) > MOST_LINES:
+        print(f"and {len(cells) - MOST_LINES} points more, in the report")
+    print_facts(figures)
+    print(f"report: {path}")
+
+
+MOST_LINES = 60  # of a table on the terminal
+
+
+def facts(told: Plan, kept: Store) -> dict[str, Any]:
+    """How far a study is and what it rests on."""
+    counts = kept.counts()
+    trials = told.study.replicates * (
+        told.study.optimise.candidates if told.study.optimise else len(told.points)
+    )
+    return {
+        "study": told.name,
+        "title": told.study.title,
+        "trials": trials,
+        **counts,
+        "code": kept.meta("code"),
+        "seconds": sum(run["seconds"] for run in kept.runs()),
+        "store": str(kept.path),
+    }
+
+
+def print_facts(figures: dict[str, Any]) -> None:
+    rate = figures["done"] / figures["seconds"] if figures["seconds"] else 0.0
+    print(
+        f"{figures['title']}: {figures['done']} of {figures['trials']} trials, {figures['failed']} failed,"
+        f" {figures['wrong']} wrong attitudes; {figures['seconds']:.1f} s, {rate:.0f} a second\n"
+        f"store: {figures['store']} (code {figures['code']})"
+    )
+
+
+def print_replay(figures: dict[str, Any]) -> None:
+    for name in (
+        "trial",
+        "point",
+        "replicate",
+        "seed",
+        "status",
+        "x_arcsec",
+        "y_arcsec",
+        "roll_arcsec",
+        "stars",
+        "matched",
+    ):
+        print(f"{name:12s} {figures[name]}")
+    if figures["changed"]:
+        complain(f"differs from the store in {', '.join(figures['changed'])}: made with other code")
+    if figures["error"]:
+        print(figures["error"])
+    for path in figures["pictures"][:10]:
+        print(path)
+
+
+def planned(study: str, folder: Path) -> tuple[Plan, dict[str, str]]:
+    """The plan of a study's store, with what its command line overrode. Raises BadInput where they do not match."""
+    import json
+
+    from skysim.study import plan, store
+
+    with store.open_store(folder / STORE) as kept:
+        overrides = json.loads(kept.meta("overrides") or "{}")
+        held = kept.meta("digest")
+    told = plan.load(study, overrides)
+    if told.digest != held:
+        raise BadInput(
+            f"{folder / STORE}: holds another study, or this one before it was changed; allowed: another --out"
+        )
+    return told, overrides
+
+
+def noted(kept: Store, overrides: dict[str, str]) -> None:
+    """Keep what the command line overrides with the store."""
+    import json
+
+    kept.note(overrides=json.dumps(overrides))
+
+
+def parsed(sets: list[str] | None) -> dict[str, str]:
+    """--set's keys and values."""
+    overrides = {}
+    for item in sets or []:
+        key, equals, value = item.partition("=")
+        if not equals or not key:
+            raise BadInput(f"--set {item}: allowed: path.to.key=value")
+        overrides[key] = value
+    return overrides
+
+
+def engine_of(name: str, workers: int | None, scheduler: str) -> Engine:
+    """Who does the trials. Raises BadInput for a wrong name."""
+    from skysim.study.engines import ENGINES
+
+    if name not in ENGINES:
+        raise BadInput(f"--engine: {name!r} is none of {', '.join(ENGINES)}")
+    if (name == "dask") != bool(scheduler):
+        raise BadInput("--scheduler: goes with --engine dask, and takes tcp://HOST:PORT")
+    return ENGINES[name](workers, scheduler)
+
+
+def name_of(study: str) -> str:
+    """A study's name, of its file or as it is."""
+    return Path(study).stem
+
+
+def folder_of(told: Plan, out: Path | None) -> Path:
+    """Where a study's store is."""
+    from skysim import io
+
+    return io.make_folder(out or Path("out") / told.name)
+
+
+def command(study: str, out: Path | None, overrides: dict[str, str], verb: str = "run") -> str:
+    """What repeats a study."""
+    words = ["skysim", "study", verb, study, *(["--out", str(out)] if out else [])]
+    return shlex.join([*words, *(f"--set={key}={value}" for key, value in overrides.items())])

@@ -1,0 +1,78 @@
+"""One trial of a study again, alone, with its frames to look at."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from estimator.stages import Report
+from skysim import io, onboard, simulate
+from skysim.report import annotate
+from skysim.study.plan import CentroidTrial, FlightTrial, FrameTrial, Plan
+from skysim.study.store import Store, plain
+from skysim.study.trials import Bench, Row, Segment, bench, one, reseeded, seed_of, shot, sight
+from skysim.types import BadInput, Frame, Truth
+
+
+class Replay(NamedTuple):
+    """A trial done again: its row, the names of stored figures that differ now, its frames' files, its pictures."""
+
+    row: Row
+    changed: list[str]
+    files: list[Path]
+    pictures: list[Path]
+
+
+def segment_of(plan: Plan, store: Store, trial: int) -> Segment:
+    """What a worker was given for a trial. Raises BadInput for one that the study has not."""
+    points, each = store.points(), plan.study.replicates
+    if not 0 <= trial < len(points) * each:
+        raise BadInput(f"trial {trial}: is none of the study's; allowed: 0 to {len(points) * each - 1}")
+    point, replicate = divmod(trial, each)
+    return Segment(point, points[point].settings, trial, range(replicate, replicate + 1))
+
+
+def replay(plan: Plan, store: Store, trial: int, folder: Path) -> Replay:
+    """Do a trial again by its seed, and write what the camera saw in it, each frame with an annotated picture."""
+    segment = segment_of(plan, store, trial)
+    row = one(plan.recipe, segment, trial, segment.replicates[0])
+    kept = store.trial(trial) if store.done(trial + 1)[trial] else {}
+    now = {name: plain(getattr(row.outcome, name)) for name in row.outcome.__slots__}
+    changed = [name for name, value in now.items() if kept and kept[name] != value]
+    files, pictures = [], []
+    if row.scene:  # else there is no lab to photograph
+        ready = bench(plan.recipe, segment.settings)
+        io.clear(io.make_folder(folder))
+        for frame, truth, report in seen(ready, seed_of(plan.recipe, segment.point, row.replicate)):
+            io.write_frame(folder, frame, truth, ready.lab.scene)
+            files.append(folder / f"frame_{frame.index:04d}.fits")
+            pictures.append(folder / f"frame_{frame.index:04d}.annotated.png")
+            io.write_image(pictures[-1], picture(frame, truth, report))
+    return Replay(row, changed, files, pictures)
+
+
+def picture(frame: Frame, truth: Truth, report: Report) -> Any:
+    """The frame with truth, centroids and names."""
+    match, xy_px = report.attitude.match, report.centroids.xy_px
+    matched_px = xy_px[match.observed] if match else np.empty((0, 2))
+    return annotate(frame.image_dn, xy_px, matched_px, truth_px=truth.seen.xy_px)
+
+
+def seen(ready: Bench, seed: int) -> Iterator[tuple[Frame, Truth, Report]]:
+    """A trial's frames. A centroid trial has none, so its attitude is photographed and its own centroids are shown."""
+    trial = ready.trial
+    if isinstance(trial, CentroidTrial):
+        _, _, centroids = sight(ready, seed)
+        still = FrameTrial(kind="frames", **{name: getattr(trial, name) for name in ("tilt_deg", "dec_deg")})
+        frame, truth, _ = shot(ready._replace(trial=still), seed)
+        yield frame, truth, Report(ready.estimator.solve_centroids(centroids), centroids)
+    elif isinstance(trial, FlightTrial):
+        lab = simulate.fly(reseeded(ready.lab, seed))
+        for taken in simulate.run(lab, ready.estimator):
+            yield taken.frame, taken.truth, taken.report
+    else:
+        frame, truth, streak_px = shot(ready, seed)
+        yield frame, truth, onboard.answer(ready.estimator, frame, streak_px)
