@@ -19,7 +19,6 @@ from estimator.camera import Camera
 from estimator.ledmap import LedMap, Lever
 from estimator.ledsight import sight_of
 from skysim import lamp, layout, optimise, scene, simulate, turninfo
-from skysim.likeness import likeness
 from skysim.onboard import calibration
 from skysim.photometry import Band
 from skysim.quantity import ARCSEC_RAD
@@ -59,7 +58,7 @@ class Row:
     roll_arcsec, cross_arcsec : sigma for NOISE_PX; median, mean of the worst TAIL, worst; infinite where blind
     alike      : share of neighbourhoods that match another in more than HALF of their LEDs
     found, ambiguous, wrong : shares of the frames, and how many, by what the tracker made of them
-    made_s     : what it took to lay out
+    made_s     : processor time that it took to lay out
     """
 
     layout: str
@@ -80,6 +79,8 @@ def bench() -> Bench:
     lab = simulate.furnish(scene.load("afit_simsat"))
     light, camera = lab.scene.light, calibration(lab.scene.camera)
     lever = Lever(np.array(lab.mount.camera_body_m), lab.mount.cam_from_body)
+    assert isinstance(light, scene.Dome)
+    assert isinstance(light.layout, lamp.PatchBoards)
     inside = surface(light.surface)
     known = Bench(inside, camera, lever, light.layout, light.led, lab.band, 40.0)
     reach_deg = float(np.degrees(optimise.reach_rad(wish(known, 3, 0), inside)))
@@ -161,9 +162,9 @@ def verdicts(of: Bench, place_m: Floats, board: Ints | None, frames: int, seed: 
 
 def row(of: Bench, kind: str, count: int, seed: int, frames: int) -> Row:
     """One layout, made and judged."""
-    begin = time.perf_counter()
+    begin = time.process_time()
     place_m, board = leds(of, kind, count, seed)
-    made_s = time.perf_counter() - begin
+    made_s = time.process_time() - begin
     roll, cross, seen = sigmas_arcsec(of, place_m)
     like, came = optimise.alike(wish(of, count, seed), place_m), verdicts(of, place_m, board, frames, seed)
     return Row(
@@ -185,3 +186,29 @@ def compare(sizes: tuple[int, ...] = SIZES, seed: int = 1, frames: int = FRAMES)
     """Every layout at every size."""
     of = bench()
     return [row(of, kind, count, seed, frames) for count in sizes for kind in KINDS]
+
+
+def printed(one: Row) -> str:
+    """A row of the docs' table."""
+    arcsec = ["—" if np.isinf(value) else f"{value:.3g}" for value in one.roll_arcsec + one.cross_arcsec]
+    cells = [
+        f"{one.count:,} {one.layout}",
+        f"{one.seen[0]:.1f} ({one.seen[1]})",
+        ", ".join(arcsec[:3]),
+        ", ".join(arcsec[3:]),
+        f"{100 * one.alike:.1f} %",
+        f"{100 * one.ambiguous:.1f} %",
+        f"{100 * one.found:.1f} %",
+        f"{one.wrong}",
+        f"{one.made_s:.1f} s",
+    ]
+    return f"| {' | '.join(cells)} |"
+
+
+if __name__ == "__main__":
+    print(
+        "| LEDs | seen (min) | roll: median, worst 1 %, worst | cross | alike | ambiguous | found | wrong | made |"
+    )
+    print("|---" * 9 + "|")
+    for one in compare(seed=int((sys.argv[1:] or ["1"])[0])):
+        print(printed(one), flush=True)

@@ -132,10 +132,19 @@ class Fibonacci(Dimmed):
 
 
 class PoissonDisc(Dimmed):
-    """LEDs at random, none nearer to another than the spacing, as many as find room."""
+    """LEDs at random, none nearer to another than the spacing, as many as find room; or so many, as far apart as they
+    find it.
+    """
 
     kind: Literal["poisson_disc"]
-    spacing_m: Annotated[Length, Field(gt=0)]
+    spacing_m: Annotated[Length, Field(gt=0)] | None = None
+    count: Annotated[int, Field(ge=1, le=20_000)] | None = None
+
+    @model_validator(mode="after")
+    def one_measure(self) -> Self:
+        if (self.spacing_m is None) == (self.count is None):
+            raise ValueError("poisson_disc takes either spacing or count")
+        return self
 
 
 class RandomPlaces(Dimmed):

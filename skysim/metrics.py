@@ -44,6 +44,7 @@ def normalised_error_squared(
 Columns = Mapping[str, NDArray[Any]]
 CONFIDENCE = 0.95
 RESAMPLES = 999
+BEYOND = 1e-8  # of answers may be so far off by chance
 FEWEST_STARS = 5  # "5 stars everywhere" (Padro 2012)
 
 
@@ -131,7 +132,16 @@ FIGURES: dict[str, Callable[[Columns], NDArray[Any]]] = {
         )
     },
 }
+
+
+def overconfident(c: Columns) -> Summary:
+    """Answers farther off than their covariance allows once in 10^8: wrong names, or errors not known of."""
+    answered = np.isfinite(c["nees"])
+    return share(np.sum(c["nees"][answered] > stats.chi2.isf(BEYOND, 3)), np.sum(answered))
+
+
 SHARES: dict[str, Response] = {
+    "overconfident": overconfident,
     "identified": lambda c: share(np.sum(c["solved"] - c["wrong"]), np.sum(c["frames"])),
     "wrong": lambda c: share(np.sum(c["wrong"]), np.sum(c["frames"])),
     "refused": lambda c: share(np.sum(c["frames"] - c["solved"]), np.sum(c["frames"])),
@@ -143,6 +153,7 @@ COVERAGE = re.compile(r"coverage(?:_(\d+))?$")
 def response(name: str, where: str = "response") -> Response:
     """What makes a figure of trials' columns, by its name. Raises BadInput for a name that is none.
 
+    overconfident : share of the answers farther off than they claim
     identified, wrong, refused : shares of the frames: right within ten arc-minutes, wrong, neither
     failed     : share of the trials that raised
     coverage_N : share of the trials with at least N lights in the field, 5 if left out

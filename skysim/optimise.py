@@ -25,46 +25,51 @@ from skysim.types import BadInput, Floats
 
 Ints = NDArray[np.int64]
 
-SITES_AN_LED = 300  # places to choose from: a seventeenth of the LEDs' own spacing apart
+SITES_AN_LED = 500  # places to choose from: a twentieth of the LEDs' own spacing apart
 EVEN = 10  # of them are enough to be spread evenly
-FAR = 0.1  # of the offers are anywhere
-STEPS = (0.02, 0.6)  # of the LEDs' own spacing: how far the others are, from the least to the greatest
+# Steps, of the LEDs' own spacing, from the least to the greatest; and how much of the field a search believes in, for
+# none is judged at every attitude. Evenness is all where few LEDs are seen; where many are, there is more to gain.
+FEW = 8.0  # LEDs in a field, on average
+CAREFUL, BOLD = ((0.02, 0.06), 0.93), ((0.01, 0.3), 0.97)
 SEERS = 400  # attitudes that see a site: a field's border passes it in steps of a twentieth of the field
-FEWEST, MOST = 2000, 10_000  # attitudes judged
+FEWEST, MOST = 2000, 20_000  # attitudes judged
 GOLDEN = 1.2207440846057596  # g^4 = g + 1: by its powers points fill a cube evenly (Roberts 2018; assumed)
-EXAMINED = 3  # times as many attitudes are those by which layouts are compared
-TAILS = (0.0005, 0.01)  # of them, the worst: what is asked of a dome
-GENERATIONS = 25  # of attitudes: after each the hardest of fresh ones join those that are judged
-DRAWN, HARDEST = 20_000, 400
-SHAKES, SHAKE = 6, 0.1
-EDGE = 0.98  # of the field is what a search believes in
+EXAMINED = 40_000  # attitudes by which layouts are compared
+TAIL = 0.01  # of them, the worst: what is asked of a dome
+DRAWN_IN = (0.98, 0.96, 0.94, 0.92, 0.9, 0.88, 0.86, 0.84)  # of the solid angle, what spreads are drawn in to
+GENERATIONS = 15  # of attitudes: after each the hardest of fresh ones join those that are judged
+KEPT = 3  # from that many generations to the next what it came to is kept
+DRAWN, HARDEST = 20_000, 600
+SHAKES, SHAKE = 6, 0.1  # the hardest are turned that often, by that much of half a field, to find harder ones
 HALF = 0.5  # of a field's LEDs may coincide with another field's
 NUDGES = 100  # tries to make a field differ
+BESIDE = 60  # nearest sites, to which it is tried: a fifth of the LEDs' own spacing
 ABOUT = 4  # LEDs in the middle of a field, one of which is nudged
 SLACK = 0.02  # by which the worst variance may rise for it
+BLIND = 0.95  # of the field, where no more attitudes than before may hold fewer than two LEDs for it
 
 
 class Exam(NamedTuple):
     """What layouts are compared by: (A, 3, 3) attitudes that no search looks at, and what is to be beaten in them.
 
-    limit : (2,) the least marks that layouts to begin with have
+    limit : the least worst variance that layouts to begin with have
     """
 
     part: lamp.Optimised
     R_body_from_lab: Floats
-    limit: Floats
+    limit: float
 
-    def marks(self, place_m: Floats) -> Floats:
-        """(2,) variances, rad^2 per rad^2 of a ray: the means of the worst attitudes, by the parts of TAILS.
+    def mark(self, place_m: Floats) -> float:
+        """Mean variance of the worst TAIL of attitudes over the limit: 1 or less is as good as any to begin with.
 
         The very worst one is a matter of a hair's breadth, by which an LED leaves the field, and of luck to find.
         """
         each = np.sort(variances(told(place_m, self.R_body_from_lab, *camera(self.part))))
-        return np.array([each[-math.ceil(part * len(each)) :].mean() for part in TAILS])
+        return float(each[-math.ceil(TAIL * len(each)) :].mean()) / self.limit
 
-    def mark(self, place_m: Floats) -> float:
-        """The worse of both over its limit: what has 1 or less is at least as good as any layout to begin with."""
-        return float(np.max(self.marks(place_m) / self.limit))
+    def blind(self, place_m: Floats) -> int:
+        """How many of them have fewer than the two LEDs that an attitude takes in the BLIND part of their field."""
+        return int(np.sum(told(place_m, self.R_body_from_lab, *camera(self.part, BLIND))[:, 6] < 2))
 
 
 def places(
@@ -74,13 +79,14 @@ def places(
 
     sites_m : (K, 3) allowed places in the lab, on the surface within its rim and cap; SITES_AN_LED times the count do
     begin_m : (N, 3) each, layouts to begin with, beside one of the sites that is as even as chance makes it
-    Descent of sum_a c_a^6, c_a = SHORT^missing tr((sum_i J_i'J_i)^-1), over attitudes a to the tilt, with what LED i
-    tells of a turn in J_i: one LED after another is offered another site. Heat only lost the evenness it began with.
-    Of what each generation came to the best by `Exam` is kept, so none of the layouts to begin with is better in the
-    worst attitudes. Then fields that look alike are made to differ: `set_apart`.
+    The best of them, drawn in from the rim as far as the worst attitudes gain by it, begins a descent of sum_a
+    c_a^HARDNESS, c_a = SHORT^missing tr((sum_i J_i'J_i)^-1), over attitudes a to the tilt, with what LED i tells of a
+    turn in J_i: one LED after another is offered a site beside it. Steps are small, for evenness once lost is not
+    found again; they are enough to make one field unlike the others. Of what it came to the best by `worth` is kept,
+    so none of the layouts to begin with is better in the worst attitudes. Then `set_apart`, where that is of worth.
     Raises BadInput where so many do not find room at the spacing.
     """
-    beginnings = [one for one in begin_m if cKDTree(one).query(one, k=2)[0][:, 1].min() >= part.spacing_m]
+    beginnings = [one for one in begin_m if roomy(one, part.spacing_m)]
     chosen = evenly(sites_m[: EVEN * part.count], part)
     if len(chosen) == part.count:
         beginnings.append(sites_m[chosen])
@@ -89,74 +95,115 @@ def places(
             f"light.layout.spacing: {len(chosen)} of {part.count} LEDs find room {part.spacing_m:.3g} m apart where a"
             f" tilt of {part.tilt_deg:g} deg looks; allowed: fewer, nearer to each other, or a greater cap_deg"
         )
-    judged = attitude_count(part, sites_m, rng)
-    exam = Exam(part, attitudes(part, EXAMINED * judged, rng), np.ones(2))
-    exam = exam._replace(limit=np.min([exam.marks(one) for one in beginnings], axis=0))
-    best_m = min(beginnings, key=exam.mark)
-    found = searched(part, best_m, sites_m, attitudes(part, judged, rng), rng)
-    best_m = min([best_m, *found], key=exam.mark)
-    return set_apart(exam, best_m, sites_m, rng)
+    share = seen_share(part, sites_m[: EVEN * part.count], rng)
+    exam = Exam(part, attitudes(part, EXAMINED, rng), 1.0)
+    even_m = min(beginnings, key=exam.mark)
+    exam = exam._replace(limit=exam.mark(even_m))
+    drawn = [drawn_in(even_m, sites_m, share) for share in DRAWN_IN]
+    begun_m = min([even_m, *(one for one in drawn if roomy(one, part.spacing_m))], key=exam.mark)
+    best_m = min([even_m, begun_m], key=lambda one: worth(exam, one, rng))
+    steps, edge = CAREFUL if share * part.count < FEW else BOLD
+    judged = int(np.clip(SEERS / max(share, 1e-9), FEWEST, MOST))
+    found = searched(Search(part, sites_m, cKDTree(sites_m), steps, edge), begun_m, judged, rng)
+    best_m = min([best_m, *found], key=lambda one: worth(exam, one, rng))
+    return min([set_apart(exam, best_m, sites_m, rng), best_m], key=lambda one: worth(exam, one, rng))
 
 
-def searched(
-    part: lamp.Optimised, place_m: Floats, sites_m: Floats, R_body_from_lab: Floats, rng: np.random.Generator
-) -> list[Floats]:
-    """(N, 3) each, what the generations came to from these places."""
-    tree, found = cKDTree(sites_m), []
+def worth(exam: Exam, place_m: Floats, rng: np.random.Generator) -> tuple[bool, bool, float]:
+    """Less is better: whether a layout to begin with is better in the worst attitudes; whether an attitude was found
+    that has fewer than two LEDs; then worst variances times 1 to 2, as none or all fields are more than HALF another's.
+    """
+    mark, like = exam.mark(place_m), alike(exam.part, place_m)
+    whole = Search(exam.part, place_m, cKDTree(place_m), CAREFUL[0], 1.0)
+    fewest = told(place_m, hardest(whole, place_m, rng), *whole.camera())[:, 6].min()
+    return mark > 1, bool(fewest < 2), mark * (1 + float(np.mean(like.share > HALF)))
+
+
+def roomy(place_m: Floats, spacing_m: float) -> bool:
+    """Whether no two are nearer to each other than the spacing."""
+    return bool(cKDTree(place_m).query(place_m, k=2)[0][:, 1].min() >= spacing_m)
+
+
+def drawn_in(place_m: Floats, sites_m: Floats, share: float) -> Floats:
+    """(N, 3) of the sites, nearest to places drawn in on that share of their solid angle about the zenith.
+
+    Few attitudes look at the rim, and all of them gain by LEDs that are moved from there to where the others are.
+    """
+    up = place_m / np.linalg.norm(place_m, axis=1, keepdims=True)
+    z = 1 - share * (1 - up[:, 2])
+    aside = up[:, :2] * np.sqrt((1 - z**2) / np.maximum(1 - up[:, 2] ** 2, 1e-12))[:, None]
+    site_up = sites_m / np.linalg.norm(sites_m, axis=1, keepdims=True)
+    return sites_m[cKDTree(site_up).query(np.column_stack([aside, z]))[1]]
+
+
+class Search(NamedTuple):
+    """In what manner places are sought: among (K, 3) sites, m, and a tree of them; steps and edge as in CAREFUL."""
+
+    part: lamp.Optimised
+    sites_m: Floats
+    tree: cKDTree
+    steps: tuple[float, float]
+    edge: float
+
+    def offers(self, place_m: Floats, rng: np.random.Generator) -> Floats:
+        """(N, 3) of the sites, one an LED, a step beside it; the steps' logarithms are even."""
+        usual_m = np.median(cKDTree(place_m).query(place_m, k=2)[0][:, 1])
+        least, most = np.log(self.steps)
+        step_m = usual_m * np.exp(rng.uniform(least, most, (len(place_m), 1)))
+        return self.sites_m[self.tree.query(place_m + step_m * rng.standard_normal(place_m.shape))[1]]
+
+    def camera(self) -> tuple[Floats, Floats]:
+        """As `camera`, of the field that is believed in."""
+        return camera(self.part, self.edge)
+
+
+def searched(search: Search, place_m: Floats, judged: int, rng: np.random.Generator) -> list[Floats]:
+    """(N, 3) of the sites each, what the generations came to from these places; judged: attitudes at first."""
+    part, found, R_body_from_lab = search.part, [], attitudes(search.part, judged, rng)
     ends = np.linspace(0, part.rounds, GENERATIONS + 1).round().astype(int)[1:-1]
     for n in range(part.rounds):
-        if n in ends:
+        if n in ends[KEPT - 1 :: KEPT]:
             found.append(place_m)
-            R_body_from_lab = np.concatenate([R_body_from_lab, hardest(part, place_m, rng)])
-        both_m = np.concatenate([place_m, offers(place_m, sites_m, tree, rng)])
-        chosen = np.arange(part.count)
-        seen = seen_from(part, both_m, R_body_from_lab)
-        who = rng.permutation(part.count)
-        exchange(chosen, both_m, seen, len(R_body_from_lab), part.wanted, part.spacing_m, who, who + part.count)
+        if n in ends:
+            R_body_from_lab = np.concatenate([R_body_from_lab, hardest(search, place_m, rng)])
+        both_m = np.concatenate([place_m, search.offers(place_m, rng)])
+        seen = Seen(*look(both_m, R_body_from_lab, *search.camera()))
+        chosen, who = np.arange(part.count), rng.permutation(part.count)
+        exchange(
+            chosen, both_m, seen, len(R_body_from_lab), part.wanted, part.spacing_m, who, who + part.count
+        )
         place_m = both_m[chosen]
     return [*found, place_m]
 
 
-def offers(place_m: Floats, sites_m: Floats, tree: cKDTree, rng: np.random.Generator) -> Floats:
-    """(N, 3) of the sites, one an LED: most a step beside it, some anywhere."""
-    usual_m = np.median(cKDTree(place_m).query(place_m, k=2)[0][:, 1])
-    step_m = usual_m * np.exp(rng.uniform(*np.log(STEPS), (len(place_m), 1)))
-    beside = tree.query(place_m + step_m * rng.standard_normal(place_m.shape))[1]
-    anywhere = rng.integers(len(sites_m), size=len(place_m))
-    return sites_m[np.where(rng.random(len(place_m)) < FAR, anywhere, beside)]
+def seen_share(part: lamp.Optimised, sites_m: Floats, rng: np.random.Generator) -> float:
+    """Of the sites, how many a few attitudes see on average: times the LEDs, how many a field holds."""
+    return float(told(sites_m, attitudes(part, 200, rng), *camera(part))[:, 6].mean()) / len(sites_m)
 
 
-def seen_from(part: lamp.Optimised, sites_m: Floats, R_body_from_lab: Floats) -> Seen:
-    """Who sees which site."""
-    return Seen(*look(sites_m, R_body_from_lab, np.array(part.camera_m), EDGE * tan_half(part)))
+def hardest(search: Search, place_m: Floats, rng: np.random.Generator) -> Floats:
+    """(H, 3, 3) R_body_from_lab: of fresh attitudes those that these LEDs serve worst, or still worse ones beside.
 
-
-def attitude_count(part: lamp.Optimised, sites_m: Floats, rng: np.random.Generator) -> int:
-    """How many attitudes it takes for SEERS of them to see a site, from how many sites a few see."""
-    few, some_m = attitudes(part, 200, rng), sites_m[: EVEN * part.count]
-    share = len(seen_from(part, some_m, few).attitude) / (len(few) * len(some_m))
-    return int(np.clip(SEERS / max(share, 1e-9), FEWEST, MOST))
-
-
-def hardest(part: lamp.Optimised, place_m: Floats, rng: np.random.Generator) -> Floats:
-    """(H, 3, 3) R_body_from_lab: of fresh attitudes those that these LEDs serve worst, and then the worst about them."""
-    drawn = attitudes(part, DRAWN, rng)
-    each = served(part, place_m, drawn)
+    About the boresight they are turned by more, since what is in the field's corner moves less.
+    """
+    drawn = attitudes(search.part, DRAWN, rng)
+    each = served(search, place_m, drawn)
     kept = np.argsort(each)[-HARDEST:]
     worst, each = drawn[kept], each[kept]
-    step_rad = float(tan_half(part).min()) * SHAKE
+    half = tan_half(search.part)
+    step_rad = SHAKE * half.min() * np.array([1, 1, 1 / math.hypot(*half)])
     for _ in range(SHAKES):
-        shaken = Rotation.from_rotvec(step_rad * rng.standard_normal((HARDEST, 3)) * [1, 1, 8]).as_matrix() @ worst
-        fresh = served(part, place_m, shaken)
-        harder = (fresh > each) & (shaken[:, 2, 2] >= math.cos(math.radians(part.tilt_deg)))
-        worst[harder], each[harder] = shaken[harder], fresh[harder]
+        turn = Rotation.from_rotvec(step_rad * rng.standard_normal((len(worst), 3)))
+        beside = turn.as_matrix() @ worst
+        fresh = served(search, place_m, beside)
+        harder = (fresh > each) & (beside[:, 2, 2] >= math.cos(math.radians(search.part.tilt_deg)))
+        worst[harder], each[harder] = beside[harder], fresh[harder]
     return worst
 
 
-def served(part: lamp.Optimised, place_m: Floats, R_body_from_lab: Floats) -> Floats:
+def served(search: Search, place_m: Floats, R_body_from_lab: Floats) -> Floats:
     """(A,) how badly, by the search's cost."""
-    where_m, field = camera(part)
-    return costs(told(place_m, R_body_from_lab, where_m, EDGE * field), part.wanted)
+    return costs(told(place_m, R_body_from_lab, *search.camera()), search.part.wanted)
 
 
 def attitudes(part: lamp.Optimised, count: int, rng: np.random.Generator) -> Floats:
@@ -167,9 +214,9 @@ def attitudes(part: lamp.Optimised, count: int, rng: np.random.Generator) -> Flo
     return Rotation.from_euler("ZYZ", angles).inv().as_matrix()
 
 
-def camera(part: lamp.Optimised) -> tuple[Floats, Floats]:
-    """Where its pupil is on the body, m, and the tangents of half its field."""
-    return np.array(part.camera_m), tan_half(part)
+def camera(part: lamp.Optimised, edge: float = 1.0) -> tuple[Floats, Floats]:
+    """Where its pupil is on the body, m, and the tangents of half its field, or of that part of it."""
+    return np.array(part.camera_m), edge * tan_half(part)
 
 
 def tan_half(part: lamp.Optimised) -> Floats:
@@ -275,7 +322,7 @@ def set_apart(exam: Exam, place_m: Floats, sites_m: Floats, rng: np.random.Gener
     begin with have. What NUDGES tries do not part stays: of three LEDs in a field two have their like almost anywhere.
     """
     part, tree = exam.part, cKDTree(sites_m)
-    like, mark = alike(part, place_m), exam.mark(place_m)
+    like, mark, blind = alike(part, place_m), exam.mark(place_m), exam.blind(place_m)
     most = max(mark, min(1.0, mark * (1 + SLACK)))
     for _ in range(NUDGES):
         bad = np.flatnonzero(like.share > HALF)
@@ -284,11 +331,13 @@ def set_apart(exam: Exam, place_m: Floats, sites_m: Floats, rng: np.random.Gener
         middle_m = place_m[like.led[rng.choice(bad)]]
         who = rng.choice(cKDTree(place_m).query(middle_m, k=min(ABOUT, part.count))[1])
         tried_m = place_m.copy()
-        tried_m[who] = sites_m[rng.choice(tree.query(place_m[who], k=min(100, len(sites_m)))[1])]
+        tried_m[who] = sites_m[rng.choice(tree.query(place_m[who], k=min(BESIDE, len(sites_m)))[1])]
         if np.delete(np.linalg.norm(place_m - tried_m[who], axis=1), who).min() < part.spacing_m:
             continue
         nudged = alike(part, tried_m)
-        if excess(nudged) < excess(like) and exam.mark(tried_m) <= most:
+        if excess(nudged) >= excess(like) or exam.blind(tried_m) > blind:
+            continue
+        if exam.mark(tried_m) <= most:
             place_m, like = tried_m, nudged
     return place_m
 

@@ -37,7 +37,9 @@ def surface_seed(told: Survey) -> int:
 
 def turned(places_m: Floats, told: Survey) -> Floats:
     """Believed places (..., 3) as a survey has them whose axes stand turned in the lab's."""
-    return Rotation.from_rotvec(told.turn_deg, degrees=True).apply(places_m) if any(told.turn_deg) else places_m
+    return (
+        Rotation.from_rotvec(told.turn_deg, degrees=True).apply(places_m) if any(told.turn_deg) else places_m
+    )
 
 
 def raised_m(inside: Surface, seed: int) -> float:
@@ -50,7 +52,7 @@ def raised_m(inside: Surface, seed: int) -> float:
 
 
 def believed_leds_m(inside: Surface, place_m: Floats, told: Survey) -> Floats:
-    """(N, 3) LEDs as the lab has them on its map: each errs by itself, all go with the surface and the survey's axes."""
+    """(N, 3) LEDs as the lab has them on its map: each errs, all go with the surface and the survey's axes."""
     raised = raised_m(inside, surface_seed(told))
     on_it = place_m - raised * inside.inward(place_m) if raised else place_m
     return turned(believed_m(on_it, told.led_sigma_m, told.seed, "leds"), told)

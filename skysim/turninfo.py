@@ -17,7 +17,8 @@ from skysim.types import Floats
 Ints = NDArray[np.int64]
 
 UNKNOWN = 1e-6  # information, rad^-2, of a turn that no LED tells: a variance of a million
-HARDNESS = 6  # the soft maximum's power of the variance: 1 is the mean, infinity the worst
+HARDNESS = 10  # the soft maximum's power of the variance: 1 is the mean, infinity the worst
+COLUMNS = 4  # to a field's reach, by which attitudes are sorted
 SHORT = 1.5  # an LED too few in a field counts as this factor of its variance
 
 
@@ -79,29 +80,37 @@ def look(
 ) -> tuple[Ints, Ints, Floats]:
     """Seen of every site: its attitudes, and what an LED there would tell them.
 
-    Attitudes are taken in the order of their boresights' x, so that only those near a site are asked.
+    Attitudes are taken by columns of their boresights' x, in each in the order of y: only those near a site are asked.
     """
     b, wide = np.empty(3), widest(sites_m, camera_m, tan_half)
-    order = np.argsort(R_body_from_lab[:, 2, 0])
-    R = R_body_from_lab[order]
-    x, y = R[:, 2, 0].copy(), R[:, 2, 1].copy()
+    columns = max(int(2 * COLUMNS / wide), 1)
+    column = np.minimum(((R_body_from_lab[:, 2, 0] + 1) / 2 * columns).astype(np.int64), columns - 1)
+    order = np.argsort(4.0 * column + R_body_from_lab[:, 2, 1])
+    R, y = R_body_from_lab[order], R_body_from_lab[order, 2, 1]
+    first = np.searchsorted(column[order], np.arange(columns + 1))
     start = np.zeros(len(sites_m) + 1, dtype=np.int64)
-    attitude, information = np.empty(0, dtype=np.int64), np.empty((0, 7))
-    for fill in range(2):
-        m = 0
-        for k in range(len(sites_m)):
-            up = sites_m[k] / math.sqrt(np.sum(sites_m[k] ** 2))
-            for q in range(np.searchsorted(x, up[0] - wide), np.searchsorted(x, up[0] + wide)):
-                if abs(y[q] - up[1]) > wide or not in_field(R[q], sites_m[k], camera_m, tan_half, b):
+    attitude, information = np.empty(1024, dtype=np.int64), np.empty((1024, 7))
+    m = 0
+    for k in range(len(sites_m)):
+        up = sites_m[k] / math.sqrt(np.sum(sites_m[k] ** 2))
+        left = max(int((up[0] - wide + 1) / 2 * columns), 0)
+        right = min(int((up[0] + wide + 1) / 2 * columns), columns - 1)
+        for c in range(left, right + 1):
+            those = y[first[c] : first[c + 1]]
+            for q in range(
+                first[c] + np.searchsorted(those, up[1] - wide),
+                first[c] + np.searchsorted(those, up[1] + wide),
+            ):
+                if not in_field(R[q], sites_m[k], camera_m, tan_half, b):
                     continue
-                if fill:
-                    tell(b, camera_m, information[m])
-                    attitude[m] = order[q]
+                if m == len(attitude):
+                    attitude = np.concatenate((attitude, np.empty_like(attitude)))
+                    information = np.concatenate((information, np.empty_like(information)))
+                tell(b, camera_m, information[m])
+                attitude[m] = order[q]
                 m += 1
-            start[k + 1] = m
-        if not fill:
-            attitude, information = np.empty(m, dtype=np.int64), np.empty((m, 7))
-    return start, attitude, information
+        start[k + 1] = m
+    return start, attitude[:m], information[:m]
 
 
 def told(place_m: Floats, R_body_from_lab: Floats, camera_m: Floats, tan_half: Floats) -> Floats:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 import signal
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -200,7 +200,10 @@ def optimise(
     with store.writing(folder / STORE) as kept, stoppable(study, kept):
         runner.begin(told, kept, resume=bool(kept.meta("digest")))
         noted(kept, overrides)
-        with counted(told.study.title, told.study.replicates * told.study.optimise.candidates) as watch:
+        with (
+            counted(told.study.title, told.study.replicates * told.study.optimise.candidates) as watch,
+            closing(doer),
+        ):
             search.search(told, kept, doer, watch)
     reported(told, folder, command(study, out, overrides, "optimise"), json)
 
@@ -221,7 +224,7 @@ def done(
     with store.writing(folder / STORE) as kept, stoppable(study, kept):
         runner.begin(told, kept, resume)
         noted(kept, overrides)
-        with counted(told.study.title, told.trials) as watch:
+        with counted(told.study.title, told.trials) as watch, closing(engine):
             progress = runner.run(told, kept, engine, watch)
     told_so_far(progress, study)
     out = None if folder == Path("out") / told.name else folder
@@ -262,7 +265,7 @@ def reported(told: Plan, folder: Path, repeat: str, json: bool) -> None:
 
     path = folder / "report.html"
     with store.open_store(folder / STORE) as kept:
-        page.write_page(path, kept, told.study, repeat)
+        page.write_page(path, kept, told.study, repeat, **findings(told, kept))
         lines = table.table(kept, told.study.responses)
         figures = facts(told, kept)
     if json:
@@ -274,6 +277,17 @@ def reported(told: Plan, folder: Path, repeat: str, json: bool) -> None:
         print(f"and {len(cells) - MOST_LINES} points more, in the report")
     print_facts(figures)
     print(f"report: {path}")
+
+
+def findings(told: Plan, kept: Store) -> dict[str, Any]:
+    """What a study's kind adds to its page: Sobol indices, or the front of a search and what its candidates cost."""
+    from skysim.study import search, sensitivity
+
+    if told.study.optimise is not None:
+        found = search.found(told, kept)
+        costs = {one.number: one.cost for one in found.candidates}
+        return {"front": [one.number for one in found.front], "costs": costs}
+    return {"indices": sensitivity.indices(told, kept)} if told.study.design.kind == "saltelli" else {}
 
 
 MOST_LINES = 60  # of a table on the terminal

@@ -1,4 +1,4 @@
-"""Who does the trials: this process, a pool of processes, or a Dask cluster. What they make is the same, row for row."""
+"""Who does the trials: this process, a pool of processes, or a Dask cluster. All make the same, row for row."""
 
 from __future__ import annotations
 
@@ -13,8 +13,9 @@ from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wai
 from concurrent.futures.process import BrokenProcessPool
 from typing import Protocol
 
+from skysim.study.benches import code_version, seed_of
 from skysim.study.plan import Recipe
-from skysim.study.trials import FAILED, Row, Segment, code_version, seed_of, work
+from skysim.study.trials import FAILED, Row, Segment, work
 
 AHEAD = 1  # chunks that wait for each worker beside the one at hand
 TRIES = 3  # of a trial whose worker dies
@@ -38,6 +39,9 @@ class Engine(Protocol):
 
     def run(self, recipe: Recipe, chunks: Chunks) -> Iterator[list[Row]]: ...
 
+    def close(self) -> None:
+        """Let go of what is kept from one run to the next."""
+
 
 class Serial:
     """One trial after another in this process."""
@@ -51,9 +55,12 @@ class Serial:
             chunks.took(chunk, seconds)
             yield rows
 
+    def close(self) -> None:
+        """See `Engine`."""
+
 
 class Pool:
-    """Processes of this machine. Each builds a scene and its index once and keeps them.
+    """Processes of this machine. Each builds a scene and its index once and keeps them, from one run to the next.
 
     Where one dies, the pool is begun anew and the trials at hand are tried one by one; one that was alone when its
     worker died, TRIES times, is put down as failed.
@@ -63,26 +70,52 @@ class Pool:
 
     def __init__(self, workers: int | None = None) -> None:
         self.workers = workers or len(os.sched_getaffinity(0))
+        self._pool: ProcessPoolExecutor | None = None
+        self._recipe: Recipe | None = None
 
     def run(self, recipe: Recipe, chunks: Chunks) -> Iterator[list[Row]]:
         """See `Engine`."""
         suspects: deque[Chunk] = deque()
-        deaths: Counter[Chunk] = Counter()
-        while True:
+        deaths: Counter[int] = Counter()  # by trial
+        done = False
+        while not done:
             flying: dict[Future[tuple[list[Row], float]], Chunk] = {}
-            pool = started(self.workers, recipe)
             try:
-                yield from self._until_one_dies(pool, chunks, suspects, flying)
-                return
+                yield from self._until_one_dies(self._ready(recipe), chunks, suspects, flying)
+                done = True
             except BrokenProcessPool:
-                deaths.update(flying.values() if len(flying) == 1 else ())
-                for chunk in flying.values():
-                    if deaths[chunk] == TRIES:
-                        yield [dead(recipe, chunk[0])]
+                at_hand = [one for chunk in flying.values() for one in singly(chunk)]
+                deaths.update(one[0].first for one in at_hand if len(at_hand) == 1)
+                for one in at_hand:
+                    if deaths[one[0].first] == TRIES:
+                        yield [dead(recipe, one[0])]
                     else:
-                        suspects.extend(singly(chunk))
+                        suspects.append(one)
             finally:
-                stop(pool)
+                if not done:
+                    self._kill()
+
+    def close(self) -> None:
+        """See `Engine`."""
+        if self._pool is not None:
+            self._pool.shutdown()
+        self._pool = None
+
+    def _ready(self, recipe: Recipe) -> ProcessPoolExecutor:
+        """The pool of the run before, if it was begun with this recipe; else a new one."""
+        if recipe != self._recipe:
+            self.close()
+        if self._pool is None:
+            self._pool, self._recipe = started(self.workers, recipe), recipe
+        return self._pool
+
+    def _kill(self) -> None:
+        """End the pool at once: what is not in the store is done again."""
+        if self._pool is not None:
+            for process in list((self._pool._processes or {}).values()):
+                process.kill()
+            self._pool.shutdown(cancel_futures=True)
+        self._pool = None
 
     def _until_one_dies(
         self,
@@ -116,14 +149,20 @@ class Dask:
     def __init__(self, scheduler: str) -> None:
         from skysim.study import cluster
 
-        self.client = cluster.connect(scheduler)
+        self.scheduler, self.client = scheduler, cluster.connect(scheduler)
         self.workers = cluster.threads(self.client)
 
     def run(self, recipe: Recipe, chunks: Chunks) -> Iterator[list[Row]]:
         """See `Engine`."""
         from skysim.study import cluster
 
+        if self.client.status != "running":  # a run before has closed it
+            self.client = cluster.connect(self.scheduler)
         yield from cluster.run(self.client, recipe, chunks)
+
+    def close(self) -> None:
+        """See `Engine`."""
+        self.client.close()
 
 
 ENGINES: dict[str, Callable[[int | None, str], Engine]] = {
@@ -197,11 +236,3 @@ def end_with_parent() -> None:
 def remembered(chunk: Chunk) -> tuple[list[Row], float]:
     """`timed`, by the recipe that this worker was begun with."""
     return timed(RECIPE[0], chunk)
-
-
-def stop(pool: ProcessPoolExecutor) -> None:
-    """End a pool at once: what is not in the store is done again."""
-    processes = list((pool._processes or {}).values())
-    pool.shutdown(wait=False, cancel_futures=True)
-    for process in processes:
-        process.kill()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -269,6 +269,9 @@ def planned(path: Path, study: Study, trial: dict[str, Any]) -> Plan:
 
 def check(plan: Plan) -> None:
     """Refuse, before the first trial, what cannot be asked: responses, figures, budget, and levels one by one."""
+    from skysim.study import arrange, search
+    from skysim.study.table import Line
+
     study = plan.study
     for n, name in enumerate(study.responses):
         metrics.response(name, f"responses.{n}")
@@ -278,18 +281,32 @@ def check(plan: Plan) -> None:
             if axis is not None and axis not in study.factors:
                 raise BadInput(f"figures.{n}.{key}: {axis!r} is none of {', '.join(study.factors)}")
         metrics.response(figure.y if isinstance(figure, Curve) else figure.value, f"figures.{n}")
+        if plan.points:
+            arrange.held(figure, study, [Line(k, point.levels, {}) for k, point in enumerate(plan.points)])
+    if study.optimise:
+        search.check(study)
     if study.budget.trials is not None and plan.trials > study.budget.trials:
         raise BadInput(f"budget.trials: {study.budget.trials} are fewer than the study's {plan.trials}")
-    first = {name: factor.at(0.5) for name, factor in study.factors.items()}
-    for name, factor in study.factors.items():
+    for name, level, settings in one_by_one(study.factors):
+        try:
+            resolved(plan.recipe, settings)
+        except BadInput as error:
+            key = str(error).partition(":")[0]
+            owners = [other for other, factor in study.factors.items() if key in dict(factor.at(0.5)[1])]
+            owner = name if name in owners or not owners else owners[0]
+            told = level if owner == name else study.factors[owner].at(0.5)[0]
+            raise BadInput(f"factors.{owner}: {told!r}: {error}") from None
+
+
+def one_by_one(factors: Mapping[str, Factor]) -> Iterator[tuple[str, Value, Settings]]:
+    """Every level of every factor, the others at their middle: which factor, the level, all that is set."""
+    middle = {name: factor.at(0.5)[1] for name, factor in factors.items()}
+    for name, factor in factors.items():
         for level, settings in factor.options() or [factor.at(0.5)]:
             others: Settings = {}
-            for other, (_, sets) in first.items():
+            for other, sets in middle.items():
                 others |= sets if other != name else {}
-            try:
-                resolved(plan.recipe, others | settings)
-            except BadInput as error:
-                raise BadInput(f"factors.{name}: {level!r}: {error}") from None
+            yield name, level, others | settings
 
 
 def resolved(recipe: Recipe, settings: Settings) -> tuple[Scene, CentroidTrial | FrameTrial | FlightTrial]:

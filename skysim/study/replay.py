@@ -11,9 +11,10 @@ import numpy as np
 from estimator.stages import Report
 from skysim import io, onboard, simulate
 from skysim.report import annotate
+from skysim.study.benches import Bench, bench, seed_of
 from skysim.study.plan import CentroidTrial, FlightTrial, FrameTrial, Plan
 from skysim.study.store import Store, plain
-from skysim.study.trials import Bench, Row, Segment, bench, one, reseeded, seed_of, shot, sight
+from skysim.study.trials import Row, Segment, one, reseeded, shot, sight
 from skysim.types import BadInput, Frame, Truth
 
 

@@ -10,14 +10,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from skysim.study.benches import code_version
 from skysim.study.designs import Point
 from skysim.study.engines import Chunk, Engine
 from skysim.study.plan import Plan
 from skysim.study.store import Store
-from skysim.study.trials import Row, Segment, code_version
+from skysim.study.trials import Row, Segment
 from skysim.types import BadInput
 
-CHUNK_S = 0.25  # of work in a chunk: a worker that dies loses no more, and handing it over costs nothing beside
+CHUNK_S = 0.25  # of work in a chunk: a worker that dies loses no more, and handing it over costs nothing
 MOST = 5000  # trials in a chunk
 
 
@@ -54,7 +55,9 @@ class Todo:
     missing : (M,) numbers of trials, ascending
     """
 
-    def __init__(self, points: Sequence[Point], replicates: int, missing: NDArray[np.int64], first: int = 0) -> None:
+    def __init__(
+        self, points: Sequence[Point], replicates: int, missing: NDArray[np.int64], first: int = 0
+    ) -> None:
         self.points, self.replicates, self.missing, self.first = points, replicates, missing, first
         self.at, self.size = 0, 1
 
@@ -88,7 +91,9 @@ def begin(plan: Plan, store: Store, resume: bool) -> None:
     """
     held, done = store.meta("digest"), store.counts()["done"]
     if held and held != plan.digest:
-        raise BadInput(f"{store.path}: holds another study, or this one before it was changed; allowed: another --out")
+        raise BadInput(
+            f"{store.path}: holds another study, or this one before it was changed; allowed: another --out"
+        )
     if resume and not held:
         raise BadInput(f"{store.path}: holds nothing to resume; allowed: skysim study run")
     if done and not resume:

@@ -1,0 +1,130 @@
+"""Studies on two cores: trials a second with the store, what a second worker brings, what a trial costs beside itself.
+
+`python -m benchmarks.studies` (OPENBLAS_NUM_THREADS=1, an idle machine). Peerless: each figure stands beside its bar.
+"""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.timing import verdict
+from skysim.study import engines, plan, runner, store
+from skysim.study.engines import Chunks, Pool
+from skysim.study.plan import Recipe
+from skysim.study.trials import Row
+
+STUDY = """
+schema: 1
+title: how fast studies are
+scene: shefex2
+seed: 1
+trial: {trial}
+factors: {{{factor}}}
+replicates: {replicates}
+responses: [identified]
+"""
+CENTROIDS = {
+    "trial": "{kind: centroids, noise_px: 0.1, lights: 15}",
+    "factor": "strays: {key: trial.false_lights, values: [0, 5]}",
+    "replicates": 5000,
+}
+FRAMES = {
+    "trial": "{kind: frames}",
+    "factor": "rate: {key: trial.rate_deg_s, values: [0, 0.1]}",
+    "replicates": 500,
+}
+SETTLED = 0.2  # of the trials, after which every worker has its scene and full chunks
+
+
+class Clocked:
+    """A pool with a clock. came : (when, how many trials, seconds that they took) of every batch."""
+
+    def __init__(self, pool: Pool) -> None:
+        self.pool, self.name, self.workers = pool, pool.name, pool.workers
+        self.came: list[tuple[float, int, float]] = []
+
+    def run(self, recipe: Recipe, chunks: Chunks) -> Iterator[list[Row]]:
+        """See `engines.Engine`."""
+        for rows in self.pool.run(recipe, chunks):
+            self.came.append((time.perf_counter(), len(rows), sum(row.seconds for row in rows)))
+            yield rows
+
+
+@dataclass(frozen=True)
+class Spent:
+    """What a study took.
+
+    total_s     : from its file to its closed store, processes begun and ended
+    rate        : trials a second once it has settled
+    overhead_ms : a trial's share of its worker's time that was not the trial
+    """
+
+    total_s: float
+    rate: float
+    overhead_ms: float
+
+
+def spent(asked: dict[str, Any], workers: int) -> Spent:
+    """Do a study with a pool, in a folder that goes away."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "study.yaml"
+        path.write_text(STUDY.format(**asked))
+        clocked, begin = Clocked(engines.Pool(workers)), time.perf_counter()
+        told = plan.load(path)
+        with store.writing(path.with_suffix(".sqlite")) as kept:
+            runner.begin(told, kept, False)
+            progress = runner.run(told, kept, clocked)
+        total_s = time.perf_counter() - begin
+    if (progress.done, progress.failed) != (told.trials, 0):
+        raise RuntimeError(
+            f"{progress.done} of {told.trials} trials are in, {progress.failed} of them failed"
+        )
+    when_s, count, worked_s = np.array(clocked.came).T
+    late = np.cumsum(count) > SETTLED * told.trials
+    first = int(np.argmax(late))  # its end is where the clock starts
+    window_s, trials = when_s[-1] - when_s[first], count[first + 1 :].sum()
+    beside_s = workers * window_s - worked_s[first + 1 :].sum()
+    return Spent(total_s, trials / window_s, 1e3 * beside_s / trials)
+
+
+def measure() -> list[dict[str, Any]]:
+    """The bars of studies; the first pool is begun cold, as a user's is."""
+    points, frames = spent(CENTROIDS, 2), spent(FRAMES, 2)
+    alone = {"centroids": spent(CENTROIDS, 1), "frames": spent(FRAMES, 1)}
+    both = {"centroids": points, "frames": frames}
+    ratios = [
+        verdict(
+            f"{name}: two workers over one",
+            both[name].rate / one.rate,
+            "x",
+            f"{one.rate:.0f}/s of one",
+            1.8,
+            True,
+        )
+        for name, one in alone.items()
+    ]
+    return [
+        verdict(
+            "10,000 centroid trials with the store", points.total_s, "s", f"then {points.rate:.0f}/s", 5.0
+        ),
+        verdict(
+            "1,000 EC655 frame trials with the store", frames.total_s, "s", f"then {frames.rate:.0f}/s", 20.0
+        ),
+        *ratios,
+        verdict("overhead a trial of a pool of two", points.overhead_ms, "ms", "centroid trials", 1.0),
+    ]
+
+
+if __name__ == "__main__":
+    for one in measure():
+        kept = "met" if one["met"] else "MISSED"
+        print(
+            f"{one['name']:40s} {one['value']:8.3g} {one['unit']:3s} bar {one['bar']:4.3g} {kept:7s} {one['peer']}"
+        )
