@@ -11,8 +11,21 @@ import math
 import numba
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 Floats = NDArray[np.float64]
+
+
+def of(a_from_b: Rotation) -> Floats:
+    """(4,) wxyz of one Rotation; SciPy's own scalar_first takes 30 us for its roll."""
+    x, y, z, w = a_from_b.as_quat()
+    return np.array([w, x, y, z])
+
+
+def rotation(a_from_b: Floats) -> Rotation:
+    """One Rotation of (4,) wxyz."""
+    w, x, y, z = a_from_b.tolist()
+    return Rotation.from_quat([x, y, z, w])
 
 
 @numba.njit(cache=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -167,17 +168,27 @@ def look(sources: Sources, optics: Optics, poses: Poses) -> tuple[Floats, Floats
 def in_view(sources: Sources, optics: Optics, poses: Poses) -> NDArray[np.int64]:
     """Rows of the sources within the field's circle from any of these poses, with a quarter more for images that
     reach in from outside, and half of the largest turn between two poses for what passes between them."""
-    sight, camera_m = poses.cam_from_lab[:, 2], poses.camera_m
-    place, near = sources.place[:, :3], sources.place[:, 3:]  # near is 1 for an LED, 0 for a star
-    along = place @ sight.T - near * np.sum(camera_m * sight, axis=1)
-    square = (
-        np.sum(place**2, axis=1)[:, None]
-        - 2 * near * (place @ camera_m.T)
-        + near * np.sum(camera_m**2, axis=1)
-    )
+    sight = np.ascontiguousarray(poses.cam_from_lab[:, 2])
     turn = np.arccos(np.clip(np.sum(sight[1:] * sight[:-1], axis=1), -1, 1)).max(initial=0.0)
-    edge = np.cos(min(1.25 * optics.field_rad + 0.02 + turn / 2, np.pi))
-    return np.flatnonzero((along > edge * np.sqrt(square)).any(axis=1))
+    edge = math.cos(min(1.25 * optics.field_rad + 0.02 + turn / 2, math.pi))
+    return np.flatnonzero(_in_cone(sources.place, sight, np.ascontiguousarray(poses.camera_m), edge))
+
+
+@numba.njit(cache=True)
+def _in_cone(place: Floats, sight: Floats, camera_m: Floats, edge: float) -> Any:
+    """(N,) whether a place's direction from any of K cameras has a cosine above `edge` with that one's sight."""
+    out = np.zeros(len(place), np.bool_)
+    for n in range(len(place)):
+        for k in range(len(sight)):
+            along, square = 0.0, 0.0
+            for i in range(3):
+                offset = place[n, i] - place[n, 3] * camera_m[k, i]
+                along += offset * sight[k, i]
+                square += offset * offset
+            if along > edge * math.sqrt(square):
+                out[n] = True
+                break
+    return out
 
 
 def draw(image: NDArray[Any], paths: Paths, shapes: Images, window: Window) -> Floats:

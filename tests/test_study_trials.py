@@ -73,7 +73,9 @@ def test_any_turn_about_the_boresight_is_as_likely_as_another():
 
 @pytest.mark.parametrize("angles", [(0.3, 1.1, -2.0), (3.0, 0.0, 1.0), (-1.0, math.pi, 0.2)])
 def test_three_turns_are_scipys(angles):
-    off = trials.zyz(*angles) * Rotation.from_euler("ZYZ", angles).inv()
+    off = (
+        Rotation.from_quat(trials.zyz(*angles), scalar_first=True) * Rotation.from_euler("ZYZ", angles).inv()
+    )
     assert off.magnitude() < 1e-14
 
 

@@ -65,6 +65,7 @@ def run(
     json: Json = False,
 ) -> None:
     """Do all trials of a study and report them. Ctrl-C leaves a store that `resume` goes on with."""
+    warmed(engine)
     from skysim.study import plan
 
     overrides = parsed(set_)
@@ -90,6 +91,7 @@ def resume(
     json: Json = False,
 ) -> None:
     """Go on with a study that was stopped, killed or ran out of its budget."""
+    warmed(engine)
     folder = out or Path("out") / name_of(study)
     told, overrides = planned(study, folder)
     done(told, study, folder, engine_of(engine, workers, scheduler), overrides, resume=True, json=json)
@@ -188,6 +190,7 @@ def optimise(
     json: Json = False,
 ) -> None:
     """Search a study's factors for the best point, or for the Pareto front of two objectives. Goes on where it was."""
+    warmed(engine)
     from skysim.study import plan, runner, search, store
 
     overrides = parsed(set_)
@@ -374,6 +377,14 @@ def parsed(sets: list[str] | None) -> dict[str, str]:
             raise BadInput(f"--set {item}: allowed: path.to.key=value")
         overrides[key] = value
     return overrides
+
+
+def warmed(engine: str) -> None:
+    """Begin the workers' imports before our own, which take as long."""
+    if engine == "pool":
+        from skysim.study import workers
+
+        workers.warm()
 
 
 def engine_of(name: str, workers: int | None, scheduler: str) -> Engine:

@@ -13,13 +13,13 @@ from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wai
 from concurrent.futures.process import BrokenProcessPool
 from typing import Protocol
 
+from skysim.study import workers
 from skysim.study.benches import code_version, seed_of
 from skysim.study.plan import Recipe
 from skysim.study.trials import FAILED, Row, Segment, work
 
 AHEAD = 1  # chunks that wait for each worker beside the one at hand
 TRIES = 3  # of a trial whose worker dies
-ONE_THREAD = ("NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 
 Chunk = tuple[Segment, ...]
 
@@ -68,8 +68,8 @@ class Pool:
 
     name = "pool"
 
-    def __init__(self, workers: int | None = None) -> None:
-        self.workers = workers or len(os.sched_getaffinity(0))
+    def __init__(self, count: int | None = None) -> None:
+        self.workers = count or len(os.sched_getaffinity(0))
         self._pool: ProcessPoolExecutor | None = None
         self._recipe: Recipe | None = None
 
@@ -166,9 +166,9 @@ class Dask:
 
 
 ENGINES: dict[str, Callable[[int | None, str], Engine]] = {
-    "pool": lambda workers, scheduler: Pool(workers),
-    "serial": lambda workers, scheduler: Serial(),
-    "dask": lambda workers, scheduler: Dask(scheduler),
+    "pool": lambda count, scheduler: Pool(count),
+    "serial": lambda count, scheduler: Serial(),
+    "dask": lambda count, scheduler: Dask(scheduler),
 }
 
 
@@ -198,21 +198,12 @@ def dead(recipe: Recipe, segment: Segment) -> Row:
 RECIPE: list[Recipe] = []  # a worker's
 
 
-def started(workers: int, recipe: Recipe) -> ProcessPoolExecutor:
+def started(count: int, recipe: Recipe) -> ProcessPoolExecutor:
     """A pool whose processes have imported all that a trial takes and have one thread each."""
-    context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["skysim.study.trials"])
-    before = {name: os.environ.get(name) for name in ONE_THREAD}
-    os.environ.update(dict.fromkeys(ONE_THREAD, "1"))
-    try:
-        pool = ProcessPoolExecutor(workers, context, begin, (recipe,))
-        for one in [pool.submit(code_version) for _ in range(workers)]:
-            one.result()
-        return pool
-    finally:
-        os.environ.update({name: value for name, value in before.items() if value is not None})
-        for name in [name for name, value in before.items() if value is None]:
-            del os.environ[name]
+    pool = ProcessPoolExecutor(count, workers.warm(), begin, (recipe,))
+    for one in [pool.submit(code_version) for _ in range(count)]:
+        one.result()
+    return pool
 
 
 def begin(recipe: Recipe) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from skysim import dome
+from skysim import dome, quaternion
 from skysim.scene import SCENES
 from skysim.types import Floats, Sources
 from skysim.world.actuators import lock_unused
@@ -82,11 +82,12 @@ def housing(model: Any, data: Any, camera_body_m: Floats) -> NDArray[np.bool_]:
 
 def hidden(things: Obstacles, lab_from_body: Rotation, sources: Sources) -> NDArray[np.bool_]:
     """(N,) whether something stands on the line from the pupil to each source, LED or star, at that attitude."""
-    camera_m = lab_from_body.apply(things.camera_body_m)
+    turn = quaternion.of(lab_from_body)
+    camera_m = quaternion.apply(turn, things.camera_body_m)
     place_m, near = sources.place[:, :3], sources.place[:, 3] > 0
     rays = place_m - sources.place[:, 3:] * camera_m
     far_m = np.linalg.norm(rays, axis=1)
-    things.data.mocap_quat[things.model.body("bus").mocapid[0]] = lab_from_body.as_quat(scalar_first=True)
+    things.data.mocap_quat[things.model.body("bus").mocapid[0]] = turn
     mujoco.mj_kinematics(things.model, things.data)
     clear = clear_m(things.model, things.data, camera_m, rays / far_m[:, None])
     out = clear < np.where(near, far_m, np.inf)
