@@ -67,7 +67,7 @@ def to_zarr(store: Store, responses: tuple[str, ...], path: Path) -> None:
     made = dataset(store, responses, path)
     temporary = path.with_name(f".{path.name}.new")
     shutil.rmtree(temporary, ignore_errors=True)
-    made.to_zarr(temporary, mode="w")
+    made.to_zarr(temporary, mode="w", consolidated=False)
     shutil.rmtree(path, ignore_errors=True)
     temporary.rename(path)
 

@@ -47,13 +47,9 @@ def cells(lines: Sequence[Line]) -> tuple[list[str], list[list[str]]]:
 
 def level(value: Any) -> str:
     """A factor's level in a table."""
-    return (
-        f"{value:.4g}"
-        if isinstance(value, float)
-        else ", ".join(map(str, value))
-        if isinstance(value, list)
-        else str(value)
-    )
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    return ", ".join(map(str, value)) if isinstance(value, list) else str(value)
 
 
 def figure(summary: Summary) -> str:
