@@ -10,7 +10,7 @@ $(READY): pyproject.toml
 	$(BIN)/pip install --quiet --disable-pip-version-check -e '.[dev,catalog]'
 	touch $@
 
-.PHONY: demo test test-long test-oracle lint pictures recompile setup clean
+.PHONY: demo test test-long test-oracle lint pictures studies recompile setup clean
 setup: $(READY)
 
 demo: $(READY)
@@ -29,6 +29,12 @@ test-oracle: $(READY)
 
 pictures: demo
 	$(BIN)/python docs/pictures.py
+
+STUDIES := dome_shape dome_size led_count rate_smear false_stars error_budget end_to_end
+studies: $(READY)
+	for name in $(STUDIES); do $(BIN)/skysim study run $$name || $(BIN)/skysim study resume $$name || exit 1; done
+	$(BIN)/skysim study optimise dome_for_the_money
+	$(BIN)/python docs/studies.py
 
 lint: $(READY)
 	$(BIN)/ruff check .

@@ -101,6 +101,17 @@ def test_the_dome_block_is_a_dome_under_which_the_tracker_finds_itself(folder):
     assert (told["frames"], told["solved"], told["wrong"]) == (3, 3, 0)
 
 
+def test_the_study_block_is_a_study(folder):
+    path = folder / "lens.yaml"
+    path.write_text(yaml_block("trial"))
+    command = [*SKYSIM, "study", "run", str(path), "--engine", "serial", "--set", "replicates=2", "--json"]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    told = json.loads(done.stdout)
+    assert (told["done"], told["failed"], told["wrong"]) == (4 * 2 * 2 * 2, 0, 0)
+    assert (folder / "out" / "lens" / "report.html").is_file()
+
+
 def test_every_kind_of_dome_is_in_the_readme():
     """Surfaces, layouts and drives, each by its name in the section on the dome."""
     section = README.partition("### The dome\n")[2].partition("\n### ")[0]
