@@ -29,8 +29,9 @@ def main(folder: Path) -> None:
             print(f"{where}: not there; left as it was")
             continue
         with store.open_store(where) as kept:
-            if kept.meta("digest") != told.digest:
-                print(f"{where}: of another version of the study; left as it was")
+            unfinished = not told.study.optimise and kept.counts()["done"] < told.trials
+            if kept.meta("digest") != told.digest or unfinished:
+                print(f"{where}: not finished, or of another version of the study; left as it was")
                 continue
             (PAGES / f"{told.name}.md").write_text("\n".join(page(told, kept)) + "\n", encoding="utf-8")
         print(PAGES / f"{told.name}.md")

@@ -11,8 +11,8 @@ from typing import Any
 
 import numba
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import stats
 
 from skysim.types import Floats
 
@@ -110,10 +110,10 @@ def late_shares(transfers: int, cti: float) -> Floats:
 
     Ends where less than 1e-6 of the longest way's charge is later still, and counts that as K places late.
     """
-    last = int(stats.nbinom.ppf(1 - TAIL, transfers, 1 - cti))
+    last = int(scipy.stats.nbinom.ppf(1 - TAIL, transfers, 1 - cti))
     late, n = np.arange(last + 1)[:, None], np.arange(1, transfers + 1)
-    share = stats.nbinom.pmf(late, n, 1 - cti)
-    share[-1] = stats.nbinom.sf(last - 1, n, 1 - cti)
+    share = scipy.stats.nbinom.pmf(late, n, 1 - cti)
+    share[-1] = scipy.stats.nbinom.sf(last - 1, n, 1 - cti)
     share.flags.writeable = False
     return np.asarray(share)
 

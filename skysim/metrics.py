@@ -7,8 +7,8 @@ from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from skysim.types import BadInput, Floats
@@ -65,7 +65,7 @@ def share(hits: Any, of: Any) -> Summary:
     """hits / of with Wilson's interval (Wilson 1927), which holds at no hits and at none missed too."""
     if of < 1:
         return NOTHING
-    found = stats.binomtest(int(hits), int(of)).proportion_ci(CONFIDENCE, "wilson")
+    found = scipy.stats.binomtest(int(hits), int(of)).proportion_ci(CONFIDENCE, "wilson")
     return Summary(float(hits / of), float(found.low), float(found.high), int(of))
 
 
@@ -77,7 +77,7 @@ def resampled(values: Floats, statistic: Callable[..., Any]) -> Summary:
             value, value if len(values) > 1 else np.nan, value if len(values) > 1 else np.nan, len(values)
         )
     batch = max(1, 2_000_000 // len(values))
-    found = stats.bootstrap(
+    found = scipy.stats.bootstrap(
         (values,),
         statistic,
         n_resamples=RESAMPLES,
@@ -93,7 +93,7 @@ def resampled(values: Floats, statistic: Callable[..., Any]) -> Summary:
 def quantile(values: Floats, part: float) -> Summary:
     """A quantile with the interval between two of the ordered values that the binomial distribution gives (Conover
     1999, section 3.2): of no assumption; an end is infinite where there are too few values for it."""
-    low, high = stats.quantile_test(values, p=part).confidence_interval(CONFIDENCE)
+    low, high = scipy.stats.quantile_test(values, p=part).confidence_interval(CONFIDENCE)
     ends = (float(low) if np.isfinite(low) else -np.inf, float(high) if np.isfinite(high) else np.inf)
     return Summary(float(np.quantile(values, part)), *ends, len(values))
 
@@ -137,7 +137,7 @@ FIGURES: dict[str, Callable[[Columns], NDArray[Any]]] = {
 def overconfident(c: Columns) -> Summary:
     """Answers farther off than their covariance allows once in 10^8: wrong names, or errors not known of."""
     answered = np.isfinite(c["nees"])
-    return share(np.sum(c["nees"][answered] > stats.chi2.isf(BEYOND, 3)), np.sum(answered))
+    return share(np.sum(c["nees"][answered] > scipy.stats.chi2.isf(BEYOND, 3)), np.sum(answered))
 
 
 SHARES: dict[str, Response] = {

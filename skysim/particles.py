@@ -8,8 +8,8 @@ from typing import Any
 
 import numba
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import stats
 
 from skysim.camera import Particles
 from skysim.stamp import add_gaussian
@@ -88,7 +88,9 @@ def tracks_of(
     made["end_y_px"] = made["y_px"] + reach_px * np.sin(azimuth)
     made["length_m"] = part.depth_m / cosine
     probable = part.electrons_um * 1e6 * made["length_m"]
-    made["electrons"] = probable * np.maximum(1 + WIDTH * stats.moyal.rvs(size=count, random_state=rng), 0)
+    made["electrons"] = probable * np.maximum(
+        1 + WIDTH * scipy.stats.moyal.rvs(size=count, random_state=rng), 0
+    )
     return made
 
 

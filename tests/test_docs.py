@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from skysim.scene import ROOT
+from skysim.study import plan
 
 DOME = (ROOT / "docs/dome.md").read_text(encoding="utf-8")
 
@@ -55,3 +56,31 @@ def test_the_page_s_surveys_are_tests() -> None:
     for words in commands():
         if words[0] == "pytest":
             assert words[words.index("-k") + 1] in (ROOT / words[3]).read_text(encoding="utf-8")
+
+
+# The pages of the studies.
+
+STUDIES = (ROOT / "docs/studies.md").read_text(encoding="utf-8")
+
+
+def test_every_study_that_comes_along_has_its_page_and_its_command() -> None:
+    shipped = {path.stem for path in plan.STUDIES.glob("*.yaml")}
+    told = re.findall(r"\[(\w+)\]\(studies/(\w+)\.md\) \| `skysim study (run|optimise) (\w+)`", STUDIES)
+    assert {name for name, page, _, command in told if name == page == command} == shipped
+    for name, _, verb, _ in told:
+        assert (verb == "optimise") == (plan.load(name).study.optimise is not None)
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "docs/studies").glob("*.md")), ids=lambda path: path.stem)
+def test_a_study_s_page_is_of_its_study_and_shows_what_is_there(path: Path) -> None:
+    text, told = path.read_text(encoding="utf-8"), plan.load(path.stem)
+    assert text.startswith(f"# {told.study.title}\n")
+    assert f"seed {told.study.seed}." in text
+    counted = re.search(r"(\d+) trials, (\d+) failed", text)
+    assert counted is not None
+    assert int(counted[2]) == 0
+    if told.study.optimise is None:
+        assert int(counted[1]) == told.trials
+    pictures = re.findall(r"!\[[^]]*\]\((\w+\.png)\)", text)
+    assert len(pictures) >= len(told.study.figures)
+    assert all((path.parent / name).is_file() for name in pictures)

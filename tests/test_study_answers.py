@@ -156,6 +156,17 @@ def test_the_error_budget_blames_whom_it_should(tmp_path):
     assert found["cross_arcsec", "lever_x"].rms_arcsec == pytest.approx(drawn, rel=0.6)
 
 
+def test_a_budget_that_is_not_known_yet_is_no_fault(tmp_path):
+    path = tmp_path / "question.yaml"
+    path.write_text(ERRORS)
+    told = plan.load(path)
+    with store.writing(tmp_path / "study.sqlite") as rows:
+        runner.begin(told, rows, resume=False)
+        found = sensitivity.indices(told, rows)
+    assert len(found) == 6
+    assert all(math.isnan(one.total.value) for one in found)
+
+
 def done(folder, text):
     """A study's plan, and its finished store to be opened."""
     path = folder / "question.yaml"

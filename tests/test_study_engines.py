@@ -19,7 +19,7 @@ import psutil  # type: ignore[import-untyped]
 import pytest
 
 import skysim.study
-from skysim.study import benches, engines, plan, runner, store, trials
+from skysim.study import benches, engines, plan, runner, store, trials, workers
 from skysim.study.engines import Engine
 from skysim.types import BadInput
 
@@ -47,7 +47,7 @@ with store.writing(Path(sys.argv[2])) as kept:
     runner.begin(told, kept, kept.counts()["done"] > 0)
     runner.run(told, kept, engines.Pool(int(sys.argv[3])), lambda progress: print(progress.done, flush=True))
 """
-ONE_THREAD = dict.fromkeys(engines.ONE_THREAD, "1")
+ONE_THREAD = dict.fromkeys(workers.ONE_THREAD, "1")
 HERE = os.environ | ONE_THREAD | {"PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "tests")])}
 
 

@@ -7,8 +7,8 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
+import scipy
 from pydantic import Field
-from scipy.stats import qmc
 
 from skysim.quantity import Part
 from skysim.study.factors import Factor, Settings, Value
@@ -91,18 +91,20 @@ def at_shares(factors: Factors, shares: Floats) -> Iterator[Point]:
 
 def lhs(design: Design, factors: Factors, seed: int) -> Iterator[Point]:
     """A Latin hypercube: each factor's range is cut in as many strips as there are points, one in each."""
-    yield from at_shares(factors, qmc.LatinHypercube(len(factors), rng=seed).random(design.points or 0))
+    yield from at_shares(
+        factors, scipy.stats.qmc.LatinHypercube(len(factors), rng=seed).random(design.points or 0)
+    )
 
 
 def sobol(design: Design, factors: Factors, seed: int) -> Iterator[Point]:
     """Sobol's sequence, scrambled by the seed."""
-    yield from at_shares(factors, qmc.Sobol(len(factors), rng=seed).random(design.points or 0))
+    yield from at_shares(factors, scipy.stats.qmc.Sobol(len(factors), rng=seed).random(design.points or 0))
 
 
 def saltelli(design: Design, factors: Factors, seed: int) -> Iterator[Point]:
     """A, B, then for each factor A with that column of B: `sensitivity.indices` knows this order."""
     count, width = design.points or 0, len(factors)
-    both = qmc.Sobol(2 * width, rng=seed).random(count)
+    both = scipy.stats.qmc.Sobol(2 * width, rng=seed).random(count)
     a, b = both[:, :width], both[:, width:]
     yield from at_shares(factors, a)
     yield from at_shares(factors, b)

@@ -7,8 +7,8 @@ from collections.abc import Callable
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
+import scipy
 from pydantic import Discriminator, Field, Tag, model_validator
-from scipy import stats
 
 from skysim.quantity import Part
 
@@ -173,9 +173,9 @@ PARAMETERS = {
     "integers": ("low", "high"),
 }
 QUANTILES: dict[str, Callable[..., Any]] = {
-    "normal": lambda share, mean, sigma: stats.norm.ppf(share, mean, sigma),
-    "lognormal": lambda share, median, sigma: median * np.exp(sigma * stats.norm.ppf(share)),
-    "triangular": lambda share, low, mode, high: stats.triang.ppf(
+    "normal": lambda share, mean, sigma: scipy.stats.norm.ppf(share, mean, sigma),
+    "lognormal": lambda share, median, sigma: median * np.exp(sigma * scipy.stats.norm.ppf(share)),
+    "triangular": lambda share, low, mode, high: scipy.stats.triang.ppf(
         share, (mode - low) / (high - low), low, high - low
     ),
     "integers": lambda share, low, high: min(np.floor(low + share * (high - low + 1)), high),

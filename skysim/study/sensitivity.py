@@ -10,8 +10,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import stats
 
 from skysim.metrics import CONFIDENCE, Summary
 from skysim.study.plan import Plan
@@ -78,13 +78,13 @@ def outputs(plan: Plan, store: Store, axes: tuple[str, ...]) -> tuple[Floats, Fl
     values[:, columns["trial"]] = [columns[name] for name in axes]
     grid = values.reshape(len(axes), -1, each).transpose(0, 2, 1).reshape(len(axes) * each, -1)
     whole = np.isfinite(grid).all(axis=1)
-    blocks = grid[whole].reshape(int(whole.sum()), width + 2, -1)
+    blocks = grid[whole].reshape(int(whole.sum()), width + 2, len(plan.points) // (width + 2))
     return blocks[:, 0], blocks[:, 1], blocks[:, 2:].transpose(1, 0, 2)
 
 
 def generalised(a: Floats, b: Floats, ab: Floats) -> NDArray[np.float64]:
     """(2, D) first-order and total indices over all outputs (Saltelli et al. 2010's estimators, by SciPy)."""
-    found = stats.sobol_indices(func={"f_A": a, "f_B": b, "f_AB": ab}, n=a.shape[1])
+    found = scipy.stats.sobol_indices(func={"f_A": a, "f_B": b, "f_AB": ab}, n=a.shape[1])
     weight = np.var(np.concatenate([a, b], axis=1), axis=1)
     if weight.sum() == 0:
         return np.zeros((2, len(ab)))
