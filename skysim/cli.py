@@ -378,13 +378,9 @@ def catalog_info(
 def load(name: str, frames: int | None, seed: int | None, sets: list[str] | None) -> Scene:
     """The scene with what the command line overrides."""
     from skysim.scene import load as load_scene
+    from skysim.yamlfile import overridden
 
-    overrides = {}
-    for item in sets or []:
-        key, equals, value = item.partition("=")
-        if not equals or not key:
-            raise BadInput(f"--set {item}: allowed: path.to.key=value")
-        overrides[key] = value
+    overrides = overridden(sets)
     if frames is not None:
         overrides["exposure.frames"] = str(frames)
     if seed is not None:

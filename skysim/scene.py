@@ -14,6 +14,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, ValidationError, model_validator
 
+from skysim import yamlfile
 from skysim.camera import Camera, over, with_preset
 from skysim.light import Bench, Dome, Glow, Stars
 from skysim.motion import Motion, Pointing
@@ -282,14 +283,7 @@ class CameraFile(Part):
 
 def find(name: str) -> Path:
     """The path of a scene given by path or by its name in scenes/."""
-    path = Path(name)
-    if path.suffix in {".yaml", ".yml"} and path.is_file():
-        return path
-    shipped = SCENES / f"{name}.yaml"
-    if not path.suffix and shipped.is_file():
-        return shipped
-    known = sorted(p.stem for p in SCENES.glob("*.yaml"))
-    raise BadInput(f"{name}: no such scene; allowed: a .yaml file or one of {', '.join(known)}")
+    return yamlfile.find(name, SCENES, "scene")
 
 
 def load(name: str | Path, overrides: Mapping[str, str] | None = None) -> Scene:

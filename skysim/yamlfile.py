@@ -16,6 +16,28 @@ from skysim import BadInput
 Files = list[tuple[Path, str]]  # paths and texts
 
 
+def find(name: str, folder: Path, what: str) -> Path:
+    """The path of a file given by path, or by its name in a folder."""
+    path, shipped = Path(name), folder / f"{name}.yaml"
+    if path.suffix in {".yaml", ".yml"} and path.is_file():
+        return path
+    if not path.suffix and shipped.is_file():
+        return shipped
+    known = sorted(one.stem for one in folder.glob("*.yaml"))
+    raise BadInput(f"{name}: no such {what}; allowed: a .yaml file or one of {', '.join(known)}")
+
+
+def overridden(sets: list[str] | None) -> dict[str, str]:
+    """The keys and values of `--set path.to.key=value`."""
+    overrides = {}
+    for item in sets or []:
+        key, equals, value = item.partition("=")
+        if not equals or not key:
+            raise BadInput(f"--set {item}: allowed: path.to.key=value")
+        overrides[key] = value
+    return overrides
+
+
 def read_yaml(path: Path) -> tuple[dict[str, Any], str]:
     """A YAML mapping and its text."""
     try:
@@ -57,16 +79,16 @@ def put(tree: dict[str, Any], key: str, value: str) -> None:
         raise BadInput(f"--set {key}={value}: allowed: path.to.key=value")
     node: Any = tree
     for depth, parent in enumerate(parents):
-        node = node.setdefault(parent, {}) if isinstance(node, dict) else node[item(node, parent, key)]
+        node = node.setdefault(parent, {}) if isinstance(node, dict) else node[place_in(node, parent, key)]
         if not isinstance(node, dict | list):
             raise BadInput(f"--set {key}: {'.'.join(parents[: depth + 1])} holds a value, not keys")
     try:
-        node[last if isinstance(node, dict) else item(node, last, key)] = yaml.safe_load(value)
+        node[last if isinstance(node, dict) else place_in(node, last, key)] = yaml.safe_load(value)
     except yaml.YAMLError as error:
         raise BadInput(f"--set {key}: {value!r} is not YAML") from error
 
 
-def item(values: list[Any], place: str, key: str) -> int:
+def place_in(values: list[Any], place: str, key: str) -> int:
     """The place in a list that a part of a dotted key names."""
     if not place.isdigit() or int(place) >= len(values):
         raise BadInput(f"--set {key}: {place} is no place in a list; allowed: 0 to {len(values) - 1}")

@@ -67,8 +67,9 @@ def run(
     """Do all trials of a study and report them. Ctrl-C leaves a store that `resume` goes on with."""
     warmed(engine)
     from skysim.study import plan
+    from skysim.yamlfile import overridden
 
-    overrides = parsed(set_)
+    overrides = overridden(set_)
     told = plan.load(study, overrides)
     done(
         told,
@@ -192,8 +193,9 @@ def optimise(
     """Search a study's factors for the best point, or for the Pareto front of two objectives. Goes on where it was."""
     warmed(engine)
     from skysim.study import plan, runner, search, store
+    from skysim.yamlfile import overridden
 
-    overrides = parsed(set_)
+    overrides = overridden(set_)
     told = plan.load(study, overrides)
     if told.study.optimise is None:
         raise BadInput(
@@ -366,17 +368,6 @@ def noted(kept: Store, overrides: dict[str, str]) -> None:
     import json
 
     kept.note(overrides=json.dumps(overrides))
-
-
-def parsed(sets: list[str] | None) -> dict[str, str]:
-    """--set's keys and values."""
-    overrides = {}
-    for item in sets or []:
-        key, equals, value = item.partition("=")
-        if not equals or not key:
-            raise BadInput(f"--set {item}: allowed: path.to.key=value")
-        overrides[key] = value
-    return overrides
 
 
 def warmed(engine: str) -> None:

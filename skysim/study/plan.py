@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 import yaml
 from pydantic import Field, ValidationError
 
-from skysim import metrics
+from skysim import metrics, yamlfile
 from skysim.quantity import NotNegative, Number, Part, Share, Time
 from skysim.scene import SCENES, Scene
 from skysim.scene import find as find_scene
@@ -224,14 +224,7 @@ def digest(told: Any) -> str:
 
 def find(name: str) -> Path:
     """The path of a study given by path or by its name in scenes/studies/."""
-    path = Path(name)
-    if path.suffix in {".yaml", ".yml"} and path.is_file():
-        return path
-    shipped = STUDIES / f"{name}.yaml"
-    if not path.suffix and shipped.is_file():
-        return shipped
-    known = sorted(p.stem for p in STUDIES.glob("*.yaml"))
-    raise BadInput(f"{name}: no such study; allowed: a .yaml file or one of {', '.join(known)}")
+    return yamlfile.find(name, STUDIES, "study")
 
 
 def title_of(path: Path) -> str:
