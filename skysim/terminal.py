@@ -53,7 +53,7 @@ def print_table(title: str, heads: list[str], lines: list[list[str]]) -> None:
     for line in lines:
         table.add_row(*line)
     console = Console()
-    Console(width=max(console.width, 160) if not console.is_terminal else None).print(table)
+    Console(width=max(console.width, 240) if not console.is_terminal else None).print(table)
 
 
 def print_rows(rows: list[Row], names: tuple[str, str, str], exposures_ms: list[float]) -> None:

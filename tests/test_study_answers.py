@@ -234,6 +234,20 @@ def test_a_trial_is_replayed_with_its_frames(tmp_path):
             replay.replay(told, rows, 16, tmp_path)
 
 
+@pytest.mark.parametrize(
+    ("value", "told"),
+    [
+        ("1.59728308212 m", "1.597 m"),
+        ("48 in", "48 in"),
+        ("0.25 mm", "0.25 mm"),
+        (0.123456, "0.1235"),
+        ([0, 30], "0, 30"),
+    ],
+)
+def test_a_level_is_told_shortly(value, told):
+    assert table.level(value) == told
+
+
 def test_a_table_is_of_every_point(tmp_path):
     told, kept = done(tmp_path, STUDY)
     with kept as rows:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -12,6 +13,8 @@ from skysim import metrics
 from skysim.metrics import Columns, Summary
 from skysim.study.designs import Point
 from skysim.study.store import Store
+
+LONG = re.compile(r"(-?\d*\.\d{4,}(?:e[-+]?\d+)?)(\s\S.*)$")
 
 
 class Line(NamedTuple):
@@ -49,6 +52,8 @@ def level(value: Any) -> str:
     """A factor's level in a table."""
     if isinstance(value, float):
         return f"{value:.4g}"
+    if isinstance(value, str) and (told := LONG.match(value)):  # a quantity that was drawn
+        return f"{float(told[1]):.4g}{told[2]}"
     return ", ".join(map(str, value)) if isinstance(value, list) else str(value)
 
 
