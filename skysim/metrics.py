@@ -136,15 +136,25 @@ FIGURES: dict[str, Callable[[Columns], NDArray[Any]]] = {
 
 def overconfident(c: Columns) -> Summary:
     """Answers farther off than their covariance allows once in 10^8: wrong names, or errors not known of."""
-    answered = np.isfinite(c["nees"])
+    answered = np.isfinite(c["nees"]) & (c["frames"] == 1)  # a flight's NEES is a mean
     return share(np.sum(c["nees"][answered] > scipy.stats.chi2.isf(BEYOND, 3)), np.sum(answered))
+
+
+def of_frames(hits: NDArray[Any], frames: NDArray[Any]) -> Summary:
+    """A share of all frames. Those of a flight are like one another, so there the interval is of so many flights."""
+    told = share(np.sum(hits), np.sum(frames))
+    if not len(frames) or np.max(frames) <= 1:
+        return told
+    flights = int(np.sum(frames > 0))
+    alike = share(round(told.value * flights), flights)
+    return told._replace(low=min(alike.low, told.value), high=max(alike.high, told.value), trials=flights)
 
 
 SHARES: dict[str, Response] = {
     "overconfident": overconfident,
-    "identified": lambda c: share(np.sum(c["solved"] - c["wrong"]), np.sum(c["frames"])),
-    "wrong": lambda c: share(np.sum(c["wrong"]), np.sum(c["frames"])),
-    "refused": lambda c: share(np.sum(c["frames"] - c["solved"]), np.sum(c["frames"])),
+    "identified": lambda c: of_frames(c["solved"] - c["wrong"], c["frames"]),
+    "wrong": lambda c: of_frames(c["wrong"], c["frames"]),
+    "refused": lambda c: of_frames(c["frames"] - c["solved"], c["frames"]),
     "failed": lambda c: share(np.sum(c["frames"] == 0), len(c["frames"])),
 }
 COVERAGE = re.compile(r"coverage(?:_(\d+))?$")

@@ -8,6 +8,7 @@ import pytest
 from scipy import stats
 from scipy.stats import qmc
 
+from estimator.tracker import StarTracker
 from skysim import metrics
 from skysim.study import engines, export, plan, replay, runner, sensitivity, store, table
 from skysim.study.trials import FIELDS
@@ -95,7 +96,7 @@ def test_responses_are_of_what_their_names_say():
 
 def test_honest_answers_are_not_called_overconfident():
     nees = stats.chi2.rvs(3, size=100_000, random_state=4)
-    told = metrics.response("overconfident")(columns(nees=nees))
+    told = metrics.response("overconfident")(columns(nees=nees, frames=np.ones(len(nees))))
     assert told.value == 0
     assert stats.chi2.sf(stats.chi2.isf(metrics.BEYOND, 3), 3) == pytest.approx(1e-8, rel=1e-6)
 
@@ -246,6 +247,55 @@ def test_a_trial_is_replayed_with_its_frames(tmp_path):
 )
 def test_a_level_is_told_shortly(value, told):
     assert table.level(value) == told
+
+
+def test_a_trial_that_raises_in_its_tracker_is_replayed_with_its_frame(tmp_path, monkeypatch):
+    told, kept = done(tmp_path, STUDY)
+
+    def broken(self, centroids, *_):
+        raise ZeroDivisionError("in the tracker")
+
+    monkeypatch.setattr(StarTracker, "solve_centroids", broken)
+    with kept as rows:
+        again = replay.replay(told, rows, 9, tmp_path / "trial_9")
+    assert "in the tracker" in again.row.error
+    assert str(plan.SCENES.parent) not in again.row.error
+    assert [path.name for path in again.files] == ["frame_0000.fits"]
+    assert again.pictures[0].is_file()
+
+
+def test_a_store_of_a_scene_that_was_changed_is_not_gone_on_with(tmp_path):
+    (tmp_path / "mine.yaml").write_text("base: shefex2\n")
+    told, _ = done(
+        tmp_path, STUDY.replace("scene: shefex2", "scene: mine.yaml").replace('"-1 mm"', '"30 mm"')
+    )
+    with store.writing(tmp_path / "study.sqlite") as kept:
+        runner.begin(told, kept, resume=True)
+    (tmp_path / "mine.yaml").write_text("base: shefex2\ncamera: {f_number: 2.0}\n")
+    with (
+        store.writing(tmp_path / "study.sqlite") as kept,
+        pytest.raises(BadInput, match="the scene of point 0 was changed since"),
+    ):
+        runner.begin(told, kept, resume=True)
+
+
+def test_failed_trials_can_be_forgotten(tmp_path):
+    told, _ = done(tmp_path, STUDY)
+    with store.writing(tmp_path / "study.sqlite") as kept:
+        assert kept.counts() == {"done": 16, "failed": 8, "wrong": 0}
+        kept.forget_failed()
+        assert kept.done(16).sum() == 8
+        runner.run(told, kept, engines.Serial())
+        assert kept.counts()["done"] == 16
+
+
+def test_frames_of_a_flight_are_counted_as_one_another_s_like():
+    """Two flights of a hundred frames each, all identified: the interval is of two, not of two hundred."""
+    c = columns(frames=[100, 100], solved=[100, 100], wrong=[0, 0], nees=[500, 500])
+    told = metrics.response("identified")(c)
+    assert (told.value, told.trials) == (1.0, 2)
+    assert told.low == pytest.approx(metrics.share(2, 2).low)
+    assert metrics.response("overconfident")(c).trials == 0  # a flight's NEES is a mean
 
 
 def test_a_table_is_of_every_point(tmp_path):

@@ -68,6 +68,11 @@ def test_an_override_changes_the_study(tmp_path):
         (('"20 mm"', '"0 mm"'), r"factors.focal: '0 mm': camera.focal_length: '0 mm' is not allowed"),
         (("noise_px: 0.1", "noise_px: -1"), r"trial.*noise_px.*line 6\)"),
         (("kind: centroids", "kind: guesses"), r"trial.kind: 'guesses' is none of"),
+        (
+            ("  strays:", "  stars:"),
+            r"factors.stars: is a column of every trial; allowed: another name.*line 8\)",
+        ),
+        (("scene: shefex2", "scene: bench_collimated"), r"trial.kind: a bench has no sky around it"),
         (("scene: shefex2", "scene: shefex3"), r"shefex3: no such scene; allowed:"),
         (
             ("replicates: 4", "replicates: 4\nbudget: {trials: 23}"),

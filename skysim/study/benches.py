@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
+from dataclasses import replace
 from functools import cache
 from hashlib import sha256
 from pathlib import Path
@@ -12,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from skysim import onboard, simulate
-from skysim.quantity import ROOT
+from skysim.quantity import DATA, ROOT
 from skysim.scene import FILES, Scene
 from skysim.study.factors import Settings
 from skysim.study.plan import CentroidTrial, FlightTrial, FrameTrial, Recipe, digest, resolved
@@ -61,8 +62,17 @@ def set_up(recipe: Recipe, settings: Settings) -> Bench:
     for ready in SHELF.benches.values():
         if ready.scene_hash == told:
             return ready._replace(trial=trial)
-    lab = simulate.furnish(scene)
+    lab = like_before(scene) or simulate.furnish(scene)
     return Bench(lab, simulate.tracker(lab), trial, told)
+
+
+def like_before(scene: Scene) -> simulate.Lab | None:
+    """The lab of a bench whose scene differs in what its tracker believes alone: its hardware is the same."""
+    for ready in SHELF.benches.values():
+        if ready.lab.scene.model_copy(update={"tracker": scene.tracker}) == scene:
+            onboard.believed_settings(scene)
+            return replace(ready.lab, scene=scene)
+    return None
 
 
 def scene_hash(scene: Scene) -> str:
@@ -86,11 +96,17 @@ def files_of(tree: dict[str, Any]) -> list[str]:
 
 @cache
 def code_version() -> str:
-    """A hash of the sources of skysim and estimator: what a stored trial was made with."""
+    """A hash of the sources of skysim and estimator and of their data: what a stored trial was made with."""
     told = sha256()
-    for package in ("skysim", "estimator"):
-        for path in sorted((ROOT / package).rglob("*.py")):
-            told.update(path.relative_to(ROOT).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
+    sources = [path for package in ("skysim", "estimator") for path in (ROOT / package).rglob("*.py")]
+    data = [
+        path
+        for part in ("qe", "led", "bands", "cameras")
+        for path in (DATA / part).rglob("*")
+        if path.is_file()
+    ]
+    for path in sorted(sources + data):
+        told.update(path.relative_to(ROOT).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
     return told.hexdigest()[:16]
 
 

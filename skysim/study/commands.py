@@ -17,7 +17,6 @@ from skysim.terminal import complain, counted, print_table
 if TYPE_CHECKING:
     from skysim.study.engines import Engine
     from skysim.study.plan import Plan
-    from skysim.study.runner import Progress
     from skysim.study.store import Store
 
 app = typer.Typer(
@@ -71,15 +70,9 @@ def run(
 
     overrides = overridden(set_)
     told = plan.load(study, overrides)
-    done(
-        told,
-        study,
-        folder_of(told, out),
-        engine_of(engine, workers, scheduler),
-        overrides,
-        resume=False,
-        json=json,
-    )
+    if told.study.optimise is not None:
+        raise BadInput(f"{told.path}: optimise: has no design to run; allowed: skysim study optimise")
+    done(told, study, out, engine_of(engine, workers, scheduler), overrides, json)
 
 
 @app.command()
@@ -89,13 +82,13 @@ def resume(
     workers: Workers = None,
     engine: EngineName = "pool",
     scheduler: Scheduler = "",
+    failed: Annotated[bool, typer.Option("--failed", help="Also do again the trials that failed.")] = False,
     json: Json = False,
 ) -> None:
-    """Go on with a study that was stopped, killed or ran out of its budget."""
+    """Go on with a study or a search that was stopped, killed or ran out of its budget."""
     warmed(engine)
-    folder = out or Path("out") / name_of(study)
-    told, overrides = planned(study, folder)
-    done(told, study, folder, engine_of(engine, workers, scheduler), overrides, resume=True, json=json)
+    told, overrides = planned(study, out)
+    done(told, study, out, engine_of(engine, workers, scheduler), overrides, json, again=True, failed=failed)
 
 
 @app.command()
@@ -104,8 +97,7 @@ def status(study: StudyArg, out: Out = None, json: Json = False) -> None:
     from skysim import io
     from skysim.study import store
 
-    folder = out or Path("out") / name_of(study)
-    told, _ = planned(study, folder)
+    (told, _), folder = planned(study, out), folder_of(study, out)
     with store.open_store(folder / STORE) as kept:
         figures = facts(told, kept)
         failures = [{"trial": trial, "error": error} for trial, error in kept.failures()[:10]]
@@ -120,9 +112,8 @@ def status(study: StudyArg, out: Out = None, json: Json = False) -> None:
 @app.command()
 def report(study: StudyArg, out: Out = None, json: Json = False) -> None:
     """Write the report of a study, finished or not, and print its table."""
-    folder = out or Path("out") / name_of(study)
-    told, overrides = planned(study, folder)
-    reported(told, folder, command(study, out, overrides), json)
+    told, overrides = planned(study, out)
+    reported(told, study, out, overrides, json)
 
 
 @app.command()
@@ -137,8 +128,7 @@ def export(
     from skysim.study import export as exporting
     from skysim.study import store
 
-    folder = out or Path("out") / name_of(study)
-    told, _ = planned(study, folder)
+    (told, _), folder = planned(study, out), folder_of(study, out)
     with store.open_store(folder / STORE) as kept:
         for path in to:
             exporting.export(kept, told.study.responses, path)
@@ -158,8 +148,7 @@ def replay(
     from skysim.study import replay as replaying
     from skysim.study import store
 
-    folder = out or Path("out") / name_of(study)
-    told, _ = planned(study, folder)
+    (told, _), folder = planned(study, out), folder_of(study, out)
     with store.open_store(folder / STORE) as kept:
         again = replaying.replay(told, kept, trial, folder / f"trial_{trial}")
     row = again.row
@@ -190,9 +179,9 @@ def optimise(
     set_: Sets = None,
     json: Json = False,
 ) -> None:
-    """Search a study's factors for the best point, or for the Pareto front of two objectives. Goes on where it was."""
+    """Search a study's factors for the best point, or the Pareto front of two objectives. `resume` goes on with it."""
     warmed(engine)
-    from skysim.study import plan, runner, search, store
+    from skysim.study import plan
     from skysim.yamlfile import overridden
 
     overrides = overridden(set_)
@@ -201,16 +190,7 @@ def optimise(
         raise BadInput(
             f"{told.path}: optimise: missing; allowed: skysim study run, for a study with a design"
         )
-    folder, doer = folder_of(told, out), engine_of(engine, workers, scheduler)
-    with store.writing(folder / STORE) as kept, stoppable(study, kept):
-        runner.begin(told, kept, resume=bool(kept.meta("digest")))
-        noted(kept, overrides)
-        with (
-            counted(told.study.title, told.study.replicates * told.study.optimise.candidates) as watch,
-            closing(doer),
-        ):
-            search.search(told, kept, doer, watch)
-    reported(told, folder, command(study, out, overrides, "optimise"), json)
+    done(told, study, out, engine_of(engine, workers, scheduler), overrides, json)
 
 
 # What they share.
@@ -219,36 +199,47 @@ STORE = "study.sqlite"
 
 
 def done(
-    told: Plan, study: str, folder: Path, engine: Engine, overrides: dict[str, str], resume: bool, json: bool
+    told: Plan,
+    study: str,
+    out: Path | None,
+    engine: Engine,
+    overrides: dict[str, str],
+    json: bool,
+    again: bool = False,
+    failed: bool = False,
 ) -> None:
-    """Do what is missing, with a bar, and report."""
-    from skysim.study import runner, store
+    """Do what is missing of a study or a search, with a bar, and report. again : trials may be in already."""
+    from skysim.study import runner, search, store
 
-    if told.study.optimise is not None:
-        raise BadInput(f"{told.path}: optimise: has no design to run; allowed: skysim study optimise")
-    with store.writing(folder / STORE) as kept, stoppable(study, kept):
-        runner.begin(told, kept, resume)
-        noted(kept, overrides)
-        with counted(told.study.title, told.trials) as watch, closing(engine):
-            progress = runner.run(told, kept, engine, watch)
-    told_so_far(progress, study)
-    out = None if folder == Path("out") / told.name else folder
-    reported(told, folder, command(study, out, overrides), json)
+    folder, on = io_folder(folder_of(study, out)), command(study, out, "resume")
+    with store.writing(folder / STORE) as kept, stoppable(on, kept), closing(engine):
+        runner.begin(told, kept, again, overrides)
+        if failed:
+            kept.forget_failed()
+        with counted(told.study.title, total(told)) as watch:
+            if told.study.optimise is not None:
+                whole = search.search(told, kept, engine, watch).finished
+            else:
+                progress = runner.run(told, kept, engine, watch)
+                whole = progress.done == progress.trials
+        counts = kept.counts()
+    if not whole:
+        complain(f"{counts['done']} of {total(told)} trials done within the budget; {on} goes on")
+    if counts["failed"]:
+        complain(f"{counts['failed']} trials failed; {command(study, out, 'status')} names them")
+    reported(told, study, out, overrides, json)
 
 
-def told_so_far(progress: Progress, study: str) -> None:
-    """Why a run ended early, if it did."""
-    if progress.done < progress.trials:
-        complain(
-            f"{progress.done} of {progress.trials} trials done within the budget; skysim study resume {study} goes on"
-        )
-    if progress.failed:
-        complain(f"{progress.failed} trials failed; skysim study status {study} names them")
+def total(told: Plan) -> int:
+    """How many trials a study or a search has in all."""
+    return told.study.replicates * (
+        told.study.optimise.candidates if told.study.optimise else len(told.points)
+    )
 
 
 @contextmanager
-def stoppable(study: str, kept: Store) -> Iterator[None]:
-    """Ctrl-C and SIGTERM end a run with a word on how it goes on."""
+def stoppable(on: str, kept: Store) -> Iterator[None]:
+    """Ctrl-C and SIGTERM end a run with a word on the command `on` by which it goes on."""
 
     def stop(*_: Any) -> None:
         raise KeyboardInterrupt
@@ -257,19 +248,21 @@ def stoppable(study: str, kept: Store) -> Iterator[None]:
     try:
         yield
     except KeyboardInterrupt:
-        complain(f"{kept.counts()['done']} trials are in; skysim study resume {study} goes on")
+        complain(f"{kept.counts()['done']} trials are in; {on} goes on")
         raise
     finally:
         signal.signal(signal.SIGTERM, before)
 
 
-def reported(told: Plan, folder: Path, repeat: str, json: bool) -> None:
+def reported(told: Plan, study: str, out: Path | None, overrides: dict[str, str], json: bool) -> None:
     """The page, and the table on the terminal."""
     from skysim import io
     from skysim.study import page, store, table
 
-    path = folder / "report.html"
+    folder = folder_of(study, out)
+    path, verb = folder / "report.html", "optimise" if told.study.optimise else "run"
     with store.open_store(folder / STORE) as kept:
+        repeat = command(study, out, verb, overrides)
         page.write_page(path, kept, told.study, repeat, **findings(told, kept))
         lines = table.table(kept, told.study.responses)
         figures = facts(told, kept)
@@ -300,10 +293,7 @@ MOST_LINES = 60  # of a table on the terminal
 
 def facts(told: Plan, kept: Store) -> dict[str, Any]:
     """How far a study is and what it rests on."""
-    counts = kept.counts()
-    trials = told.study.replicates * (
-        told.study.optimise.candidates if told.study.optimise else len(told.points)
-    )
+    counts, trials = kept.counts(), total(told)
     return {
         "study": told.name,
         "title": told.study.title,
@@ -346,28 +336,22 @@ def print_replay(figures: dict[str, Any]) -> None:
         print(path)
 
 
-def planned(study: str, folder: Path) -> tuple[Plan, dict[str, str]]:
+def planned(study: str, out: Path | None) -> tuple[Plan, dict[str, str]]:
     """The plan of a study's store, with what its command line overrode. Raises BadInput where they do not match."""
     import json
 
     from skysim.study import plan, store
 
-    with store.open_store(folder / STORE) as kept:
+    path = folder_of(study, out) / STORE
+    with store.open_store(path) as kept:
         overrides = json.loads(kept.meta("overrides") or "{}")
         held = kept.meta("digest")
     told = plan.load(study, overrides)
     if told.digest != held:
         raise BadInput(
-            f"{folder / STORE}: holds another study, or this one before it was changed; allowed: another --out"
+            f"{path}: holds another study, or this one before it was changed; allowed: another --out"
         )
     return told, overrides
-
-
-def noted(kept: Store, overrides: dict[str, str]) -> None:
-    """Keep what the command line overrides with the store."""
-    import json
-
-    kept.note(overrides=json.dumps(overrides))
 
 
 def warmed(engine: str) -> None:
@@ -389,19 +373,19 @@ def engine_of(name: str, workers: int | None, scheduler: str) -> Engine:
     return ENGINES[name](workers, scheduler)
 
 
-def name_of(study: str) -> str:
-    """A study's name, of its file or as it is."""
-    return Path(study).stem
+def folder_of(study: str, out: Path | None) -> Path:
+    """Where a study's store is: by its name, of its file or as it is."""
+    return out or Path("out") / Path(study).stem
 
 
-def folder_of(told: Plan, out: Path | None) -> Path:
-    """Where a study's store is."""
+def io_folder(path: Path) -> Path:
+    """The folder, made if it is not there."""
     from skysim import io
 
-    return io.make_folder(out or Path("out") / told.name)
+    return io.make_folder(path)
 
 
-def command(study: str, out: Path | None, overrides: dict[str, str], verb: str = "run") -> str:
-    """What repeats a study."""
+def command(study: str, out: Path | None, verb: str, overrides: dict[str, str] | None = None) -> str:
+    """A command for a study as it is typed."""
     words = ["skysim", "study", verb, study, *(["--out", str(out)] if out else [])]
-    return shlex.join([*words, *(f"--set={key}={value}" for key, value in overrides.items())])
+    return shlex.join([*words, *(f"--set={key}={value}" for key, value in (overrides or {}).items())])

@@ -17,6 +17,7 @@ from skysim.study import workers
 from skysim.study.benches import code_version, seed_of
 from skysim.study.plan import Recipe
 from skysim.study.trials import FAILED, Row, Segment, work
+from skysim.types import BadInput
 
 AHEAD = 1  # chunks that wait for each worker beside the one at hand
 TRIES = 3  # of a trial whose worker dies
@@ -69,7 +70,7 @@ class Pool:
     name = "pool"
 
     def __init__(self, count: int | None = None) -> None:
-        self.workers = count or len(os.sched_getaffinity(0))
+        self.workers = count or cores()
         self._pool: ProcessPoolExecutor | None = None
         self._recipe: Recipe | None = None
 
@@ -128,7 +129,11 @@ class Pool:
         while True:
             room = self.workers * (1 + AHEAD) if not suspects else 1
             while len(flying) < room and (chunk := suspects.popleft() if suspects else chunks.next()):
-                flying[pool.submit(remembered, chunk)] = chunk
+                try:
+                    flying[pool.submit(remembered, chunk)] = chunk
+                except BrokenProcessPool:  # a worker died while rows were kept
+                    suspects.appendleft(chunk)
+                    raise
                 room = room if not suspects else 1
             if not flying:
                 return
@@ -193,6 +198,11 @@ def dead(recipe: Recipe, segment: Segment) -> Row:
     return Row(segment.first, segment.point, replicate, seed, "", code_version(), FAILED, why, 0.0)
 
 
+def cores() -> int:
+    """How many this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 # Worker processes.
 
 RECIPE: list[Recipe] = []  # a worker's
@@ -201,8 +211,13 @@ RECIPE: list[Recipe] = []  # a worker's
 def started(count: int, recipe: Recipe) -> ProcessPoolExecutor:
     """A pool whose processes have imported all that a trial takes and have one thread each."""
     pool = ProcessPoolExecutor(count, workers.warm(), begin, (recipe,))
-    for one in [pool.submit(code_version) for _ in range(count)]:
-        one.result()
+    try:
+        for one in [pool.submit(code_version) for _ in range(count)]:
+            one.result()
+    except BrokenProcessPool:
+        raise BadInput(
+            f"--workers: {count} processes cannot start; allowed: fewer, or --engine serial"
+        ) from None
     return pool
 
 

@@ -150,7 +150,7 @@ class Distribution(Keyed):
         numbers = [number for number, _ in parts]
         if self.sigma is not None and numbers[1] <= 0:
             raise ValueError(f"sigma {self.sigma!r} is not positive")
-        if self.low is not None and not numbers == sorted(numbers):
+        if self.low is not None and not (numbers == sorted(numbers) and numbers[0] < numbers[-1]):
             raise ValueError(f"{', '.join(PARAMETERS[self.distribution])} do not ascend")
         return numbers, units.pop()
 

@@ -14,7 +14,7 @@ from pydantic import Field, ValidationError
 
 from skysim import metrics, yamlfile
 from skysim.quantity import NotNegative, Number, Part, Share, Time
-from skysim.scene import SCENES, Scene
+from skysim.scene import SCENES, Bench, Scene
 from skysim.scene import find as find_scene
 from skysim.scene import load as load_scene
 from skysim.study.designs import Design, Point, points
@@ -24,6 +24,25 @@ from skysim.yamlfile import explain, line_of, put, read_yaml
 
 STUDIES = SCENES / "studies"
 TRIAL = "trial."
+# Columns of a store, which no factor may be called.
+TAKEN = {
+    *(
+        "trial",
+        "point",
+        "replicate",
+        "seed",
+        "scene",
+        "code",
+        "error",
+        "time_ms",
+        "status",
+        "frames",
+        "solved",
+        "wrong",
+    ),
+    *("x_arcsec", "y_arcsec", "roll_arcsec", "nees", "stars", "detected", "matched", "availability"),
+    *("filter_arcsec", "filter_worst_arcsec", "drift_arcsec"),
+}
 Declination = Annotated[Number, Field(ge=-90, le=90)]
 Tilt = Annotated[Number, Field(ge=0, le=90)]
 
@@ -83,11 +102,11 @@ Trial = Annotated[CentroidTrial | FrameTrial | FlightTrial, Field(discriminator=
 
 
 class Budget(Part):
-    """What a study may cost: trials in all, wall-clock time (it stops and can be resumed), failed trials."""
+    """What a study may cost: trials in all, wall-clock time, failed trials; after the latter two it can be resumed."""
 
     trials: Annotated[int, Field(ge=1)] | None = None
     time_s: Annotated[Time, Field(gt=0)] | None = None
-    failures: Annotated[int, Field(ge=1)] = 100
+    failures: Annotated[int, Field(ge=1)] | None = None
 
 
 class Curve(Part):
@@ -280,9 +299,14 @@ def check(plan: Plan) -> None:
         search.check(study)
     if study.budget.trials is not None and plan.trials > study.budget.trials:
         raise BadInput(f"budget.trials: {study.budget.trials} are fewer than the study's {plan.trials}")
+    for name in study.factors:
+        if name in TAKEN or name in study.responses:
+            raise BadInput(f"factors.{name}: is a column of every trial; allowed: another name")
     for name, level, settings in one_by_one(study.factors):
         try:
-            resolved(plan.recipe, settings)
+            scene, trial = resolved(plan.recipe, settings)
+            if isinstance(scene.light, Bench) and not isinstance(trial, FlightTrial):
+                raise BadInput("trial.kind: a bench has no sky around it; allowed: flight")
         except BadInput as error:
             key = str(error).partition(":")[0]
             owners = [other for other, factor in study.factors.items() if key in dict(factor.at(0.5)[1])]

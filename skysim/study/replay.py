@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from estimator.stages import Report
+from estimator.types import Attitude, Centroids
 from skysim import io, onboard, simulate
 from skysim.report import annotate
-from skysim.study.benches import Bench, bench, seed_of
+from skysim.study.benches import Bench, bench
 from skysim.study.plan import CentroidTrial, FlightTrial, FrameTrial, Plan
 from skysim.study.store import Store, plain
 from skysim.study.trials import Row, Segment, one, reseeded, shot, sight
 from skysim.types import BadInput, Frame, Truth
+
+MOST = 100  # frames of a flight that are written
 
 
 class Replay(NamedTuple):
@@ -37,7 +41,11 @@ def segment_of(plan: Plan, store: Store, trial: int) -> Segment:
 
 
 def replay(plan: Plan, store: Store, trial: int, folder: Path) -> Replay:
-    """Do a trial again by its seed, and write what the camera saw in it, each frame with an annotated picture."""
+    """Do a trial again by its seed, and write what the camera saw in it, each frame with an annotated picture.
+
+    Of a flight the first MOST frames. What a trial raised is in its row, and its frame is written all the same where
+    it was taken.
+    """
     segment = segment_of(plan, store, trial)
     row = one(plan.recipe, segment, trial, segment.replicates[0])
     kept = store.trial(trial) if store.done(trial + 1)[trial] else {}
@@ -47,11 +55,15 @@ def replay(plan: Plan, store: Store, trial: int, folder: Path) -> Replay:
     if row.scene:  # else there is no lab to photograph
         ready = bench(plan.recipe, segment.settings)
         io.clear(io.make_folder(folder))
-        for frame, truth, report in seen(ready, seed_of(plan.recipe, segment.point, row.replicate)):
-            io.write_frame(folder, frame, truth, ready.lab.scene)
-            files.append(folder / f"frame_{frame.index:04d}.fits")
-            pictures.append(folder / f"frame_{frame.index:04d}.annotated.png")
-            io.write_image(pictures[-1], picture(frame, truth, report))
+        try:
+            for frame, truth, report in islice(seen(ready, row.seed), MOST):
+                io.write_frame(folder, frame, truth, ready.lab.scene)
+                files.append(folder / f"frame_{frame.index:04d}.fits")
+                pictures.append(folder / f"frame_{frame.index:04d}.annotated.png")
+                io.write_image(pictures[-1], picture(frame, truth, report))
+        except Exception:
+            if row.error is None:
+                raise
     return Replay(row, changed, files, pictures)
 
 
@@ -69,11 +81,19 @@ def seen(ready: Bench, seed: int) -> Iterator[tuple[Frame, Truth, Report]]:
         _, _, centroids = sight(ready, seed)
         still = FrameTrial(kind="frames", **{name: getattr(trial, name) for name in ("tilt_deg", "dec_deg")})
         frame, truth, _ = shot(ready._replace(trial=still), seed)
-        yield frame, truth, Report(ready.estimator.solve_centroids(centroids), centroids)
+        yield frame, truth, tried(lambda: Report(ready.estimator.solve_centroids(centroids), centroids))
     elif isinstance(trial, FlightTrial):
         lab = simulate.fly(reseeded(ready.lab, seed))
         for taken in simulate.run(lab, ready.estimator):
             yield taken.frame, taken.truth, taken.report
     else:
         frame, truth, streak_px = shot(ready, seed)
-        yield frame, truth, onboard.answer(ready.estimator, frame, streak_px)
+        yield frame, truth, tried(lambda: onboard.answer(ready.estimator, frame, streak_px))
+
+
+def tried(solve: Callable[[], Report]) -> Report:
+    """A tracker's report; an empty one where it raises, which the trial's row tells of."""
+    try:
+        return solve()
+    except Exception as error:
+        return Report(Attitude(f"failed: {error}"), Centroids.none())

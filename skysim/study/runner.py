@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
+import json
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from skysim.study.benches import code_version
+from skysim.study.benches import code_version, scene_hash
 from skysim.study.designs import Point
 from skysim.study.engines import Chunk, Engine
-from skysim.study.plan import Plan
+from skysim.study.plan import Plan, resolved
 from skysim.study.store import Store
 from skysim.study.trials import Row, Segment
 from skysim.types import BadInput
@@ -84,10 +85,10 @@ class Todo:
         self.size = int(np.clip(wanted, 1, min(2 * max(count, self.size), MOST)))
 
 
-def begin(plan: Plan, store: Store, resume: bool) -> None:
+def begin(plan: Plan, store: Store, resume: bool, overrides: Mapping[str, str] | None = None) -> None:
     """Make a store the plan's, or see that it is. Raises BadInput where it holds another study, or other code's rows.
 
-    resume : whether trials that are in already are wanted there
+    resume : whether trials that are in already are wanted there;  overrides : the command line's, kept with the store
     """
     held, done = store.meta("digest"), store.counts()["done"]
     if held and held != plan.digest:
@@ -103,10 +104,24 @@ def begin(plan: Plan, store: Store, resume: bool) -> None:
             f"{store.path}: its {done} trials were made by skysim {store.meta('code')}, this is {code_version()};"
             " allowed: the same code, or another --out"
         )
-    if not held:
-        store.set_points(plan.points)
+    if done:
+        check_scene(plan, store)
+    else:
         text = plan.path.read_text(encoding="utf-8")
-        store.note(study=text, title=plan.study.title, code=code_version(), digest=plan.digest)
+        told = {"study": text, "title": plan.study.title, "code": code_version(), "digest": plan.digest}
+        store.begin(plan.points, overrides=json.dumps(dict(overrides or {})), **told)
+
+
+def check_scene(plan: Plan, store: Store) -> None:
+    """See that the first and the last point that are in were of scenes that are still the same, files and all."""
+    points = store.points()
+    for point, told in store.scenes():
+        now = scene_hash(resolved(plan.recipe, points[point].settings)[0])
+        if now != told:
+            raise BadInput(
+                f"{store.path}: the scene of point {point} was changed since (then {told}, now {now}); allowed: another"
+                " --out, or the scene as it was"
+            )
 
 
 def run(plan: Plan, store: Store, engine: Engine, watch: Watch | None = None) -> Progress:
@@ -121,7 +136,8 @@ def run_points(
     replicates = plan.study.replicates
     span = np.arange(first * replicates, (first + len(points)) * replicates)
     missing = span[~store.done(int(span[-1]) + 1)[span]]
-    progress = Progress(len(span), len(span) - len(missing), store.counts()["failed"])
+    before = store.counts()["failed"]
+    progress = Progress(len(span), len(span) - len(missing), before)
     budget = plan.study.budget
     rows = engine.run(plan.recipe, Todo(points, replicates, missing, first)) if len(missing) else iter(())
     try:
@@ -131,7 +147,7 @@ def run_points(
             if watch:
                 watch(progress)
             over = budget.time_s is not None and time.perf_counter() - progress.began > budget.time_s
-            if over or progress.failed >= budget.failures:
+            if over or (budget.failures is not None and progress.failed - before >= budget.failures):
                 break
     finally:
         if hasattr(rows, "close"):

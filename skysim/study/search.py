@@ -343,7 +343,9 @@ def answered(
     left_s = None if budget.time_s is None else budget.time_s - (time.perf_counter() - whole.began)
     if left_s is not None and left_s <= 0:
         return False
-    budget = budget.model_copy(update={"time_s": left_s, "failures": budget.failures + refused})
+    budget = budget.model_copy(
+        update={"time_s": left_s, "failures": budget.failures and budget.failures + refused - before.failed}
+    )
     limited = replace(plan, study=plan.study.model_copy(update={"budget": budget}))
 
     def look(progress: Progress) -> None:

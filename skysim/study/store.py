@@ -60,10 +60,31 @@ class Store:
         with self.db:
             self.db.executemany("INSERT OR REPLACE INTO meta VALUES (?, ?)", values.items())
 
+    def begin(self, points: Iterable[Point], **values: str) -> None:
+        """Make the store a study's: its points and what is noted of it, all or nothing."""
+        rows = (
+            (n, json.dumps(one.levels, default=str), json.dumps(one.settings, default=str))
+            for n, one in enumerate(points)
+        )
+        with self.db:
+            self.db.execute("DELETE FROM points")
+            self.db.executemany("INSERT INTO points VALUES (?, ?, ?)", rows)
+            self.db.executemany("INSERT OR REPLACE INTO meta VALUES (?, ?)", values.items())
+
+    def scenes(self) -> list[tuple[int, str]]:
+        """The first and the last point of trials that did not fail, with their scenes' hashes."""
+        told = "SELECT point, scene FROM trials WHERE scene != '' AND error IS NULL ORDER BY trial {} LIMIT 1"
+        return [row for order in ("ASC", "DESC") for row in self.db.execute(told.format(order))]
+
+    def forget_failed(self) -> None:
+        """Drop the trials that raised, so that they are done again."""
+        with self.db:
+            self.db.execute("DELETE FROM trials WHERE error IS NOT NULL")
+
     def set_points(self, points: Iterable[Point], first: int = 0) -> None:
         """Points by their numbers, from `first`."""
         rows = (
-            (first + n, json.dumps(point.levels), json.dumps(point.settings))
+            (first + n, json.dumps(point.levels, default=str), json.dumps(point.settings, default=str))
             for n, point in enumerate(points)
         )
         with self.db:

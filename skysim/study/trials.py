@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from estimator.types import Attitude, Centroids
 from skysim import metrics, onboard, quaternion, simulate, world
-from skysim.quantity import ARCSEC_RAD
+from skysim.quantity import ARCSEC_RAD, ROOT
 from skysim.render import Poses, follow, in_view
 from skysim.scene import Dome, Scene
 from skysim.study.benches import Bench, bench, code_version, seed_of
@@ -109,7 +109,7 @@ def one(recipe: Recipe, segment: Segment, trial: int, replicate: int) -> Row:
         scene, begin = ready.scene_hash, time.perf_counter()
         outcome = TRIALS[ready.trial.kind](ready, seed)
     except Exception:
-        error = traceback.format_exc()
+        error = traceback.format_exc().replace(f"{ROOT}/", "")  # the same wherever skysim is installed
     spent = time.perf_counter() - begin
     return Row(trial, segment.point, replicate, seed, scene, code_version(), outcome, error, spent)
 
@@ -248,7 +248,7 @@ def spoilt(
     if not false:
         return Centroids(xy_px[kept], np.full(len(kept), trial.noise_px), flux[kept])
     strays_px = rng.random((false, 2)) * [scene.camera.width_px, scene.camera.height_px] - 0.5
-    bright = flux[rng.integers(len(flux), size=false)] if len(flux) else rng.random(false) + 1.0
+    bright = flux[kept][rng.integers(len(kept), size=false)] if len(kept) else rng.random(false) + 1.0
     everything = np.concatenate([flux[kept], bright])
     order = np.argsort(-everything, kind="stable")
     sigma_px = np.full(len(order), trial.noise_px)
