@@ -10,13 +10,13 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from skysim.study import arrange, pictures, search, sensitivity, store, table
-from skysim.study.commands import STORE
+from skysim.study.commands import STORE, total
 from skysim.study.plan import STUDIES, Curve, Figure, Plan, load
 from skysim.study.store import Store
 from skysim.study.table import Line
 
 PAGES = Path(__file__).parent / "studies"
-MOST = 70  # lines of a table that is printed whole
+MOST = 72  # lines of a table that is printed whole
 
 
 def main(folder: Path) -> None:
@@ -29,7 +29,7 @@ def main(folder: Path) -> None:
             print(f"{where}: not there; left as it was")
             continue
         with store.open_store(where) as kept:
-            unfinished = not told.study.optimise and kept.counts()["done"] < told.trials
+            unfinished = kept.counts()["done"] < total(told)
             if kept.meta("digest") != told.digest or unfinished:
                 print(f"{where}: not finished, or of another version of the study; left as it was")
                 continue
@@ -44,10 +44,10 @@ def page(told: Plan, kept: Store) -> Iterator[str]:
     question = [line[2:] for line in told.path.read_text("utf-8").splitlines() if line.startswith("# ")]
     yield f"# {study.title}\n\n" + " ".join(question)
     yield f"\n```sh\nskysim study {verb} {name}\n```\n"
-    seconds = sum(run["seconds"] for run in kept.runs())
+    seconds, cores = sum(run["seconds"] for run in kept.runs()), max(run["workers"] for run in kept.runs())
     yield (
-        f"{counts['done']} trials, {counts['failed']} failed, in {seconds:.0f} s on two cores; scene `{study.scene}`,"
-        f" seed {study.seed}. What is varied: [`{told.path.name}`](../../scenes/studies/{told.path.name}). Intervals"
+        f"{counts['done']} trials, {counts['failed']} failed, in {seconds:.0f} s on {cores} cores; scene"
+        f" `{study.scene}`, seed {study.seed}. What is varied: [`{told.path.name}`](../../scenes/studies/{told.path.name}). Intervals"
         " are of 95 %.\n"
     )
     lines = table.table(kept, study.responses)
@@ -60,7 +60,7 @@ def page(told: Plan, kept: Store) -> Iterator[str]:
         (PAGES / picture).write_bytes(pictures.figure_png(lines, figure, study))
         yield f"![{figure.kind}]({picture})\n\n*{arrange.caption(figure, study, lines)}*\n"
         yield from pivot(figure, lines, told)
-    if not study.figures and study.design.kind != "saltelli" and not study.optimise:
+    if len(lines) <= MOST and study.design.kind != "saltelli" and not study.optimise:
         yield from whole(lines)
 
 

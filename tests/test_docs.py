@@ -33,7 +33,12 @@ def test_the_page_s_commands_are_of_this_project() -> None:
             assert words[0] == "skysim"
 
 
-@pytest.mark.parametrize("words", [words for words in commands() if words[0] == "python"], ids=" ".join)
+QUICK = [
+    words for words in commands() if words[0] == "python" and len(words) > 3
+]  # that take how many trials
+
+
+@pytest.mark.parametrize("words", QUICK, ids=" ".join)
 def test_the_page_s_tables_can_be_printed(words: list[str], tmp_path: Path) -> None:
     """With two trials a row in place of the page's; numbers are the business of the modules' own tests."""
     few = [*words[1:3], "2", *words[4:]]

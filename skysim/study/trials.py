@@ -239,7 +239,10 @@ def lit_share(sources: Sources) -> Floats:
 def spoilt(
     trial: CentroidTrial, xy_px: Floats, electrons: Floats, scene: Scene, rng: np.random.Generator
 ) -> Centroids:
-    """What a camera would tell of true lights: some missed, all noisy, some false; brightest first."""
+    """What a camera would tell of true lights: some missed, all noisy, some false; brightest first.
+
+    A false light is as bright as any of the field's, those too that `lights` leaves out.
+    """
     kept = np.flatnonzero(rng.random(len(xy_px)) >= trial.missing)
     flux = electrons * 10 ** (0.4 * trial.magnitude_sigma * rng.standard_normal(len(xy_px)))
     xy_px = xy_px + trial.noise_px * rng.standard_normal(xy_px.shape)
@@ -248,7 +251,7 @@ def spoilt(
     if not false:
         return Centroids(xy_px[kept], np.full(len(kept), trial.noise_px), flux[kept])
     strays_px = rng.random((false, 2)) * [scene.camera.width_px, scene.camera.height_px] - 0.5
-    bright = flux[kept][rng.integers(len(kept), size=false)] if len(kept) else rng.random(false) + 1.0
+    bright = flux[rng.integers(len(flux), size=false)] if len(flux) else rng.random(false) + 1.0
     everything = np.concatenate([flux[kept], bright])
     order = np.argsort(-everything, kind="stable")
     sigma_px = np.full(len(order), trial.noise_px)
