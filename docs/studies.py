@@ -47,8 +47,8 @@ def page(told: Plan, kept: Store) -> Iterator[str]:
     seconds, cores = sum(run["seconds"] for run in kept.runs()), max(run["workers"] for run in kept.runs())
     yield (
         f"{counts['done']} trials, {counts['failed']} failed, in {seconds:.0f} s on {cores} cores; scene"
-        f" `{study.scene}`, seed {study.seed}. What is varied: [`{told.path.name}`](../../scenes/studies/{told.path.name}). Intervals"
-        " are of 95 %.\n"
+        f" `{study.scene}`, seed {study.seed}. What is varied:"
+        f" [`{told.path.name}`](../../scenes/studies/{told.path.name}). Intervals are of 95 %.\n"
     )
     lines = table.table(kept, study.responses)
     if study.optimise:

@@ -80,6 +80,12 @@ def bowl(settings: Settings) -> Outcome:
     return angle(1 + (x - 0.7) ** 2 + (y - 0.2) ** 2)
 
 
+@pytest.fixture(autouse=True)
+def any_scene(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A law has no scene, whose hash a run that goes on would compare."""
+    monkeypatch.setattr(runner, "check_scene", lambda *_: None)
+
+
 def loaded(folder: Path, told: dict[str, Any]) -> plan.Plan:
     path = folder / "study.yaml"
     path.write_text(yaml.safe_dump(told))
