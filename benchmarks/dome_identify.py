@@ -17,7 +17,7 @@ from estimator import ledpairs
 from estimator.camera import Camera
 from estimator.ledmap import LedMap, Lever, project
 from estimator.ledsight import Sight, sight_of
-from skysim import layout, scene, simulate
+from skysim import layout, optimise, scene, simulate
 from skysim.onboard import calibration
 from skysim.surface import surface
 from skysim.types import Floats
@@ -58,7 +58,7 @@ def leds_m(places: str, count: int, inside: layout.Inside, rng: np.random.Genera
     if places == "random":
         return darts_m[:count]
     area_m2 = 2 * np.pi * 1.22**2 * (1 - np.cos(half))
-    kept = darts_m[layout.apart(darts_m, np.sqrt(0.6 * area_m2 / count))]
+    kept = darts_m[optimise.apart(darts_m, np.sqrt(0.6 * area_m2 / count))]
     return kept[:count] if len(kept) < count else kept[rng.permutation(len(kept))[:count]]
 
 

@@ -24,6 +24,7 @@ from skysim.terminal import (
     print_summary,
     print_survey,
     print_table,
+    print_titles,
     progress,
     watched,
     yes,
@@ -274,15 +275,7 @@ def scenes(context: typer.Context, json: Json = False) -> None:
     from skysim.scene import SCENES
     from skysim.scene import load as load_scene
 
-    listed = [
-        {"name": path.stem, "title": load_scene(path).title, "file": str(path)}
-        for path in sorted(SCENES.glob("*.yaml"))
-    ]
-    if json:
-        print(io.to_json(listed))
-    else:
-        for entry in listed:
-            print(f"{entry['name']:20s} {entry['title']}")
+    print_titles(SCENES, lambda path: load_scene(path).title, json, io.to_json)
 
 
 @scenes_app.command("export")

@@ -259,7 +259,8 @@ def poisson_disc(part: lamp.PoissonDisc, inside: Inside, led: lamp.Led, band: Ba
     half = np.radians(part.cap_deg)
     if part.spacing_m is None:
         count = part.count or 1
-        place_m = widely(from_bearing(inside, scattered_cap(DARTS * count, half, rng)), count)
+        darts_m = from_bearing(inside, scattered_cap(DARTS * count, half, rng))
+        place_m = darts_m[optimise.evenly(darts_m, 0.0, count, HALVINGS)]
         return lit(on_surface(inside, place_m, rng.choice(part.dimming, count)), led, band, rng)
     directions = cap(1000, half)
     points = from_bearing(inside, directions)
@@ -273,33 +274,8 @@ def poisson_disc(part: lamp.PoissonDisc, inside: Inside, led: lamp.Led, band: Ba
             f"light.layout.spacing: {part.spacing_m:g} m makes too many LEDs; allowed: {least_m:.3g} m or more"
         )
     darts_m = from_bearing(inside, scattered_cap(max(int(tries), 1), half, rng))
-    place_m = darts_m[apart(darts_m, part.spacing_m)]
+    place_m = darts_m[optimise.apart(darts_m, part.spacing_m)]
     return lit(on_surface(inside, place_m, rng.choice(part.dimming, len(place_m))), led, band, rng)
-
-
-def widely(darts_m: Floats, count: int) -> Floats:
-    """(count, 3) of the darts, in their order, at the widest spacing that leaves so many; found by halving."""
-    near_m, far_m, best_m = 0.0, float(np.ptp(darts_m, axis=0).max()), darts_m[:count]
-    for _ in range(HALVINGS):
-        middle_m = (near_m + far_m) / 2
-        kept = apart(darts_m, middle_m)
-        if len(kept) < count:
-            far_m = middle_m
-        else:
-            near_m, best_m = middle_m, darts_m[kept[:count]]
-    return best_m
-
-
-def apart(points_m: Floats, spacing_m: float) -> Ints:
-    """Indices of the points, taken in their order, that have none taken before within the spacing."""
-    tree = cKDTree(points_m)
-    free = np.ones(len(points_m), dtype=bool)
-    taken = []
-    for n, point in enumerate(points_m):
-        if free[n]:
-            taken.append(n)
-            free[tree.query_ball_point(point, spacing_m)] = False
-    return np.array(taken, dtype=np.int64)
 
 
 def optimised(part: lamp.Optimised, inside: Inside, led: lamp.Led, band: Band) -> Sources:

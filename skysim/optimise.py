@@ -27,6 +27,7 @@ Ints = NDArray[np.int64]
 
 SITES_AN_LED = 500  # places to choose from: a twentieth of the LEDs' own spacing apart
 EVEN = 10  # of them are enough to be spread evenly
+HALVINGS = 12  # of the sites' width, until they are
 # Steps, of the LEDs' own spacing, from the least to the greatest; and how much of the field a search believes in, for
 # none is judged at every attitude. Evenness is all where few LEDs are seen; where many are, there is more to gain.
 FEW = 8.0  # LEDs in a field, on average
@@ -87,7 +88,7 @@ def places(
     Raises BadInput where so many do not find room at the spacing.
     """
     beginnings = [one for one in begin_m if roomy(one, part.spacing_m)]
-    chosen = evenly(sites_m[: EVEN * part.count], part)
+    chosen = evenly(sites_m[: EVEN * part.count], part.spacing_m, part.count)
     if len(chosen) == part.count:
         beginnings.append(sites_m[chosen])
     if not beginnings:
@@ -281,26 +282,26 @@ def exchange(
             renew(new, seen, total, each, wanted)
 
 
-def evenly(sites_m: Floats, part: lamp.Optimised) -> Ints:
-    """The sites, in their order, that are as far apart as finds part.count of them room; or fewer at the spacing."""
-    chosen = apart(sites_m, part.spacing_m, part.count)
-    near_m, far_m = part.spacing_m, float(np.ptp(sites_m, axis=0).max())
-    for _ in range(12):
+def evenly(sites_m: Floats, spacing_m: float, count: int, halvings: int = HALVINGS) -> Ints:
+    """The sites, in their order, that are as far apart as finds `count` of them room; or fewer at the spacing."""
+    chosen = apart(sites_m, spacing_m, count)
+    near_m, far_m = spacing_m, float(np.ptp(sites_m, axis=0).max())
+    for _ in range(halvings):
         middle_m = (near_m + far_m) / 2
-        wider = apart(sites_m, middle_m, part.count)
-        if len(wider) < part.count:
+        wider = apart(sites_m, middle_m, count)
+        if len(wider) < count:
             far_m = middle_m
         else:
             near_m, chosen = middle_m, wider
     return chosen
 
 
-def apart(sites_m: Floats, spacing_m: float, count: int) -> Ints:
-    """The first `count` of the sites, taken in their order, that have none taken before within the spacing."""
+def apart(sites_m: Floats, spacing_m: float, count: int | None = None) -> Ints:
+    """The first `count` of the sites, or all, taken in their order, that have none taken before within the spacing."""
     tree, free = cKDTree(sites_m), np.ones(len(sites_m), dtype=bool)
     taken: list[int] = []
     for site in range(len(sites_m)):
-        if free[site] and len(taken) < count:
+        if free[site] and (count is None or len(taken) < count):
             taken.append(site)
             free[tree.query_ball_point(sites_m[site], spacing_m)] = False
     return np.array(taken, dtype=np.int64)

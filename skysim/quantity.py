@@ -29,20 +29,25 @@ def quantity(si_unit: str, what: str, examples: str) -> Callable[[Any], float]:
     """A validator that turns a quantity such as "48 in" into a float in `si_unit`."""
 
     def parse(value: Any) -> float:
-        from astropy import units
-
         if not isinstance(value, str):
             raise ValueError(f"{value!r} has no unit; allowed: a {what} such as {examples}")
         try:
-            # astropy spells it `inch`; the lab writes `in`.
-            inch = units.def_unit("in", units.imperial.inch)
-            with units.add_enabled_units([inch, units.imperial]):
-                number = units.Quantity(value).to_value(si_unit)
-        except (units.UnitsError, TypeError, ValueError) as error:
+            return in_si(value, si_unit)
+        except (TypeError, ValueError) as error:  # astropy's UnitsError is a ValueError
             raise ValueError(f"{value!r} is not a {what}; allowed: a {what} such as {examples}") from error
-        return float(number)
 
     return parse
+
+
+def in_si(value: str, si_unit: str | None = None) -> float:
+    """A quantity such as "48 in" in that unit, or in its own of the SI. Raises ValueError or TypeError."""
+    from astropy import units
+
+    # astropy spells it `inch`; the lab writes `in`.
+    inch = units.def_unit("in", units.imperial.inch)
+    with units.add_enabled_units([inch, units.imperial]):
+        told = units.Quantity(value)
+        return float(told.to_value(si_unit) if si_unit else told.si.value)
 
 
 def finite(value: float) -> float:

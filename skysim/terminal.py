@@ -224,6 +224,18 @@ def print_catalogue(figures: dict[str, Any], json: bool, to_json: Any) -> None:
         print(f"  {key}: {value}")
 
 
+def print_titles(folder: Path, title: Callable[[Path], str], json: bool, to_json: Any) -> None:
+    """The files of a folder by name, with their titles."""
+    listed = [
+        {"name": path.stem, "title": title(path), "file": str(path)} for path in sorted(folder.glob("*.yaml"))
+    ]
+    if json:
+        print(to_json(listed))
+        return
+    for entry in listed:
+        print(f"{entry['name']:20s} {entry['title']}")
+
+
 def number(value: float | None, digits: int | None = None) -> str:
     if value is None:
         return ""

@@ -6,17 +6,17 @@ import importlib
 import os
 import signal
 import socket
-import sqlite3
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Generator, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import psutil  # type: ignore[import-untyped]
 import pytest
+from study_stores import contents, done
 
 import skysim.study
 from skysim.study import benches, engines, plan, runner, store, trials, workers
@@ -68,26 +68,6 @@ def whole(told: plan.Plan) -> str:
     path = told.path.with_name("whole.sqlite")
     assert done(told, path, engines.Serial()).failed == 0
     return contents(path)
-
-
-def contents(path: Path) -> str:
-    """Points and trials, row for row, to the last bit and with their types."""
-    db = sqlite3.connect(path)
-    tables = [db.execute(f"SELECT * FROM {name} ORDER BY 1").fetchall() for name in ("points", "trials")]
-    db.close()
-    return repr(tables)
-
-
-def done(
-    told: plan.Plan,
-    path: Path,
-    engine: Engine,
-    resume: bool = False,
-    watch: Callable[[runner.Progress], object] | None = None,
-) -> runner.Progress:
-    with store.writing(path) as kept:
-        runner.begin(told, kept, resume)
-        return runner.run(told, kept, engine, watch)
 
 
 # A pool.

@@ -124,7 +124,8 @@ class Html(HTMLParser):
 
 def written(path: Path, asked: Study, **more: Any) -> tuple[str, Html]:
     with store.open_store(path) as kept:
-        page.write_page(path.with_suffix(".html"), kept, asked, COMMAND, **more)
+        lines = table(kept, page.responses(asked))
+        page.write_page(path.with_suffix(".html"), kept, asked, COMMAND, lines, **more)
     text = path.with_suffix(".html").read_text(encoding="utf-8")
     return text, Html(text)
 

@@ -15,8 +15,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from study_stores import contents, done
 
-from skysim.study import engines, plan, runner, store, trials
+from skysim.study import plan, runner, store, trials
 from skysim.study.designs import Point
 from skysim.study.trials import Outcome, Row
 from skysim.types import BadInput
@@ -51,22 +52,6 @@ def whole(told: plan.Plan) -> str:
 
 def other(told: plan.Plan, **overrides: str) -> plan.Plan:
     return plan.load(told.path, overrides)
-
-
-def contents(path: Path) -> str:
-    """Points and trials, row for row, to the last bit and with their types."""
-    db = sqlite3.connect(path)
-    tables = [db.execute(f"SELECT * FROM {name} ORDER BY 1").fetchall() for name in ("points", "trials")]
-    db.close()
-    return repr(tables)
-
-
-def done(
-    told: plan.Plan, path: Path, resume: bool = False, watch: Callable[..., object] | None = None
-) -> runner.Progress:
-    with store.writing(path) as kept:
-        runner.begin(told, kept, resume)
-        return runner.run(told, kept, engines.Serial(), watch)
 
 
 def child(does: Callable[[], object]) -> int:

@@ -22,10 +22,7 @@ KEPT = 4  # benches a worker keeps ready
 
 
 class Bench(NamedTuple):
-    """A scene set up for trials: hardware, the tracker with its index, what a trial is, a hash of the scene.
-
-    lab : flown nowhere yet;  sight : its lights' places times the camera's reach, kept for every attitude
-    """
+    """A scene set up for trials: hardware, flown nowhere; the tracker with its index; what a trial is; a hash of it."""
 
     lab: simulate.Lab
     estimator: onboard.Estimator
@@ -70,7 +67,6 @@ def like_before(scene: Scene) -> simulate.Lab | None:
     """The lab of a bench whose scene differs in what its tracker believes alone: its hardware is the same."""
     for ready in SHELF.benches.values():
         if ready.lab.scene.model_copy(update={"tracker": scene.tracker}) == scene:
-            onboard.believed_settings(scene)
             return replace(ready.lab, scene=scene)
     return None
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from skysim import BadInput
-from skysim.terminal import complain, counted, print_table
+from skysim.terminal import complain, counted, print_table, print_titles
 
 if TYPE_CHECKING:
     from skysim.study.engines import Engine
@@ -42,15 +42,7 @@ def studies(context: typer.Context, json: Json = False) -> None:
     from skysim import io
     from skysim.study import plan
 
-    listed = [
-        {"name": path.stem, "title": plan.title_of(path), "file": str(path)}
-        for path in sorted(plan.STUDIES.glob("*.yaml"))
-    ]
-    if json:
-        print(io.to_json(listed))
-    else:
-        for entry in listed:
-            print(f"{entry['name']:20s} {entry['title']}")
+    print_titles(plan.STUDIES, plan.title_of, json, io.to_json)
 
 
 @app.command()
@@ -211,8 +203,8 @@ def done(
     """Do what is missing of a study or a search, with a bar, and report. again : trials may be in already."""
     from skysim.study import runner, search, store
 
-    folder, on = io_folder(folder_of(study, out)), command(study, out, "resume")
-    with store.writing(folder / STORE) as kept, stoppable(on, kept), closing(engine):
+    on = command(study, out, "resume")
+    with store.writing(folder_of(study, out) / STORE) as kept, stoppable(on, kept), closing(engine):
         runner.begin(told, kept, again, overrides)
         if failed:
             kept.forget_failed()
@@ -263,8 +255,9 @@ def reported(told: Plan, study: str, out: Path | None, overrides: dict[str, str]
     path, verb = folder / "report.html", "optimise" if told.study.optimise else "run"
     with store.open_store(folder / STORE) as kept:
         repeat = command(study, out, verb, overrides)
-        page.write_page(path, kept, told.study, repeat, **findings(told, kept))
-        lines = table.table(kept, told.study.responses)
+        lines = table.table(kept, page.responses(told.study))
+        page.write_page(path, kept, told.study, repeat, lines, **findings(told, kept))
+        lines = table.asked(lines, told.study.responses)
         figures = facts(told, kept)
     if json:
         print(io.to_json(figures | {"report": str(path), "points": table.flat(lines)}))
@@ -376,13 +369,6 @@ def engine_of(name: str, workers: int | None, scheduler: str) -> Engine:
 def folder_of(study: str, out: Path | None) -> Path:
     """Where a study's store is: by its name, of its file or as it is."""
     return out or Path("out") / Path(study).stem
-
-
-def io_folder(path: Path) -> Path:
-    """The folder, made if it is not there."""
-    from skysim import io
-
-    return io.make_folder(path)
 
 
 def command(study: str, out: Path | None, verb: str, overrides: dict[str, str] | None = None) -> str:

@@ -12,7 +12,7 @@ from skysim.report import embed
 from skysim.study import arrange, pictures
 from skysim.study.plan import Curve, Study
 from skysim.study.store import Store
-from skysim.study.table import Line, cells, figure, table
+from skysim.study.table import Line, cells, figure
 
 if TYPE_CHECKING:
     from skysim.study.sensitivity import Index
@@ -41,19 +41,20 @@ def write_page(
     store: Store,
     study: Study,
     command: str,
+    lines: Sequence[Line],
     indices: Sequence[Index] | None = None,
     front: Sequence[int] | None = None,
     costs: Mapping[int, float] | None = None,
 ) -> None:
     """One HTML file with everything inside.
 
-    command : what repeats the study;  indices : of a study of design saltelli
+    command : what repeats the study;  lines : its table, of all that `responses` names
+    indices : of a study of design saltelli
     front   : the points of an optimised study that none beats;  costs : by point, where it has any
     Raises BadInput where a figure's `where` names what is not there.
     """
     from jinja2 import Environment
 
-    lines = table(store, responses(study))
     heads, rows = sortable(lines, study, costs)
     page = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True).from_string(PAGE)
     text = page.render(

@@ -24,25 +24,6 @@ from skysim.yamlfile import explain, line_of, put, read_yaml
 
 STUDIES = SCENES / "studies"
 TRIAL = "trial."
-# Columns of a store, which no factor may be called.
-TAKEN = {
-    *(
-        "trial",
-        "point",
-        "replicate",
-        "seed",
-        "scene",
-        "code",
-        "error",
-        "time_ms",
-        "status",
-        "frames",
-        "solved",
-        "wrong",
-    ),
-    *("x_arcsec", "y_arcsec", "roll_arcsec", "nees", "stars", "detected", "matched", "availability"),
-    *("filter_arcsec", "filter_worst_arcsec", "drift_arcsec"),
-}
 Declination = Annotated[Number, Field(ge=-90, le=90)]
 Tilt = Annotated[Number, Field(ge=0, le=90)]
 
@@ -282,6 +263,7 @@ def planned(path: Path, study: Study, trial: dict[str, Any]) -> Plan:
 def check(plan: Plan) -> None:
     """Refuse, before the first trial, what cannot be asked: responses, figures, budget, and levels one by one."""
     from skysim.study import arrange, search
+    from skysim.study.store import COLUMNS
     from skysim.study.table import Line
 
     study = plan.study
@@ -300,7 +282,7 @@ def check(plan: Plan) -> None:
     if study.budget.trials is not None and plan.trials > study.budget.trials:
         raise BadInput(f"budget.trials: {study.budget.trials} are fewer than the study's {plan.trials}")
     for name in study.factors:
-        if name in TAKEN or name in study.responses:
+        if name in COLUMNS or name in study.responses:
             raise BadInput(f"factors.{name}: is a column of every trial; allowed: another name")
     for name, level, settings in one_by_one(study.factors):
         try:

@@ -17,6 +17,7 @@ import numpy as np
 
 from skysim import metrics
 from skysim.metrics import Columns, Summary
+from skysim.quantity import in_si
 from skysim.study.benches import code_version, seed_of
 from skysim.study.designs import Point, merged
 from skysim.study.engines import Engine
@@ -146,13 +147,7 @@ def one_of(name: str, factors: dict[str, Factor], where: str) -> Factor:
 def si(value: Value) -> float:
     """A number as it is, a quantity in SI units: "48 in" is 1.2192. Raises ValueError."""
     number, unit = split(value)
-    if not unit:
-        return number
-    from astropy import units
-
-    inch = units.def_unit("in", units.imperial.inch)  # astropy spells it `inch`; the lab writes `in`
-    with units.add_enabled_units([inch, units.imperial]):
-        return float(units.Quantity(number, unit).si.value)
+    return in_si(value) if unit else number
 
 
 def cost(wanted: Search, levels: dict[str, Value]) -> float:

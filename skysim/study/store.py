@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from skysim.io import make_folder
 from skysim.study.designs import Point
 from skysim.study.trials import FIELDS, Row
 from skysim.types import BadInput
@@ -27,6 +28,17 @@ from skysim.types import BadInput
 FORMAT = 1
 TEXT = {"status"}
 WHOLE = {"frames", "solved", "wrong"}
+COLUMNS = (
+    "trial",
+    "point",
+    "replicate",
+    "seed",
+    "scene",
+    "code",
+    *FIELDS,
+    "error",
+    "time_ms",
+)  # of `columns`
 TABLES = f"""
 CREATE TABLE IF NOT EXISTS meta (key TEXT PRIMARY KEY, value TEXT NOT NULL);
 CREATE TABLE IF NOT EXISTS points (point INTEGER PRIMARY KEY, levels TEXT NOT NULL, settings TEXT NOT NULL);
@@ -201,7 +213,7 @@ def writing(path: Path) -> Iterator[Store]:
 
     A lock beside it, itself SQLite's, goes when its holder ends in whatever way. Raises BadInput where another has it.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(path.parent)
     try:
         with closing(sqlite3.connect(path.with_suffix(".lock"), timeout=0, isolation_level=None)) as lock:
             hold(lock, path)

@@ -31,6 +31,11 @@ def table(store: Store, responses: Sequence[str]) -> list[Line]:
     return [line(number, point, store.of_point(number), asked) for number, point in enumerate(store.points())]
 
 
+def asked(lines: Sequence[Line], responses: Sequence[str]) -> list[Line]:
+    """The lines with these of their responses alone."""
+    return [one._replace(responses={name: one.responses[name] for name in responses}) for one in lines]
+
+
 def line(number: int, point: Point, columns: Columns, asked: dict[str, metrics.Response]) -> Line:
     """One point's line."""
     return Line(number, point.levels, {name: response(columns) for name, response in asked.items()})

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from estimator.stages import Report
 from estimator.types import Attitude, Centroids
 from skysim import metrics, onboard, quaternion, simulate, world
 from skysim.quantity import ARCSEC_RAD, ROOT
@@ -140,12 +141,11 @@ def streams(ready: Bench, seed: int) -> tuple[np.random.Generator, np.random.Gen
 def frames(ready: Bench, seed: int) -> Outcome:
     """Random attitude, one whole frame, solved."""
     frame, truth, streak_px = shot(ready, seed)
-    return answered(ready, frame, truth, streak_px)
+    return answered(onboard.answer(ready.estimator, frame, streak_px), truth)
 
 
-def answered(ready: Bench, frame: Frame, truth: Truth, streak_px: tuple[float, float] | None) -> Outcome:
-    """What the tracker makes of a frame."""
-    report = onboard.answer(ready.estimator, frame, streak_px)
+def answered(report: Report, truth: Truth) -> Outcome:
+    """What the tracker made of a frame, beside the frame's truth."""
     truly = quaternion.of(truth.cam_from_lab)
     return scored(report.attitude, truly, len(truth.seen.id), len(report.centroids))
 
@@ -163,9 +163,7 @@ def scores(lab: simulate.Lab, estimator: onboard.Estimator) -> Iterator[tuple[fl
     """Mid-exposure and outcome of every frame; those that were solved in flight are not taken again."""
     if not lab.reports:
         for shot in simulate.run(lab, estimator):
-            answer, truth = shot.report, shot.truth
-            truly = quaternion.of(truth.cam_from_lab)
-            yield truth.t_s, scored(answer.attitude, truly, len(truth.seen.id), len(answer.centroids))
+            yield shot.truth.t_s, answered(shot.report, shot.truth)
     for index, answer in lab.reports.items():
         when = simulate.window(lab.scene, index, lab.exposures_s[index])
         t_s = when.middle_s(lab.scene.camera.height_px)
