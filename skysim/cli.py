@@ -12,6 +12,7 @@ import typer
 
 from estimator import BadImage
 from skysim import BadInput
+from skysim.papers.commands import reproduce
 from skysim.study.commands import app as studies
 from skysim.terminal import (
     begun,
@@ -264,6 +265,9 @@ def survey(
     figures = measured.figures(found, belief, lab, doubt) | errors
     figures |= {"scene": lab.scene.name, "frames": frames, "map": str(path), "picture": str(picture)}
     print(io.to_json(figures)) if json else print_survey(figures)
+
+
+app.command()(reproduce)
 
 
 @scenes_app.callback()

@@ -275,6 +275,11 @@ def write_text(path: Path, text: str) -> None:
         temporary.write_text(text, encoding="utf-8")
 
 
+def write_bytes(path: Path, data: bytes) -> None:
+    with whole(path) as temporary:
+        temporary.write_bytes(data)
+
+
 def to_json(data: Any) -> str:
     """JSON with null for what is not a number."""
 

@@ -61,6 +61,11 @@ NOTHING = Summary(float("nan"), float("nan"), float("nan"), 0)
 Response = Callable[[Columns], Summary]
 
 
+def exact(value: float) -> Summary:
+    """A figure that no chance had a part in."""
+    return Summary(float(value), float(value), float(value), 1)
+
+
 def share(hits: Any, of: Any) -> Summary:
     """hits / of with Wilson's interval (Wilson 1927), which holds at no hits and at none missed too."""
     if of < 1:

@@ -56,6 +56,7 @@ def finite(value: float) -> float:
     return value
 
 
+INCH_M = 0.0254
 ARCSEC_RAD = math.pi / 180 / 3600
 RPM_RAD_S = math.pi / 30  # rad/s of one revolution a minute
 Number = Annotated[float, AfterValidator(finite)]

@@ -48,7 +48,9 @@ def print_table(title: str, heads: list[str], lines: list[list[str]]) -> None:
     table = Table(title=title, title_justify="left", box=None, header_style="bold", pad_edge=False)
     for head in heads:
         table.add_column(
-            head, justify="left" if head in ("what", "file", "status", "peer") else "right", no_wrap=True
+            head,
+            justify="left" if head in ("what", "file", "status", "peer", "verdict") else "right",
+            no_wrap=True,
         )
     for line in lines:
         table.add_row(*line)

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import io as std_io
 import math
 import textwrap
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from skysim.plots import INK, MARKS, png
 from skysim.study import arrange
 from skysim.study.arrange import CROWD, Axis, Grid, Panel, Series, is_drawn, label
 from skysim.study.plan import Curve, Figure, Heat, Study
@@ -19,22 +19,12 @@ from skysim.types import Floats
 if TYPE_CHECKING:
     from skysim.study.sensitivity import Index
 
-DPI = 120
 TICKS = 16  # levels up to which each has its tick
 UPRIGHT = 8  # names below an axis up to which they are broken into lines, then turned
 WIDE = 88  # letters that fit below an axis
 WRITTEN = 12  # rows and columns of a heat map up to which its cells tell their value
 NAMED = 12  # points of a front up to which each is named
-# For all kinds of sight (Okabe & Ito 2008), and two more.
-INK = ["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#555555", "#882255"]
-MARKS = "osD^vP<X"
 QUIET, FRONT = "#8fa1b3", "#d55e00"
-LOOK: Any = {
-    **{"font.size": 9, "axes.spines.top": False, "axes.spines.right": False, "axes.edgecolor": "#888888"},
-    **{"axes.grid": True, "grid.color": "#e8e8e8", "grid.linewidth": 0.6, "axes.axisbelow": True},
-    **{"xtick.color": "#444444", "ytick.color": "#444444", "legend.frameon": False, "lines.linewidth": 1.2},
-    **{"text.parse_math": False, "lines.markersize": 4.5, "hatch.color": "#b8b8b8", "hatch.linewidth": 0.7},
-}
 
 
 def figure_png(lines: Sequence[Line], figure: Figure, study: Study) -> bytes:
@@ -47,19 +37,6 @@ def figure_png(lines: Sequence[Line], figure: Figure, study: Study) -> bytes:
     rows, columns = cells.value.shape
     size = float(np.clip(2.6 + 0.6 * columns, 4.6, 9.6)), float(np.clip(1.2 + 0.42 * rows, 2.6, 7.0))
     return png(lambda fig: draw_heat(fig, cells, figure), size)
-
-
-def png(draw: Callable[[Any], None], size_in: tuple[float, float]) -> bytes:
-    """What is drawn into an empty figure."""
-    import matplotlib
-    from matplotlib.figure import Figure as Canvas
-
-    buffer = std_io.BytesIO()
-    with matplotlib.rc_context(LOOK):
-        fig = Canvas(figsize=size_in, layout="constrained")
-        draw(fig)
-        fig.savefig(buffer, format="png", dpi=DPI, metadata={"Software": None})
-    return buffer.getvalue()
 
 
 # Curves.

@@ -1,0 +1,101 @@
+"""`skysim reproduce`: thin, like `cli`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from skysim.terminal import print_table, watched
+
+if TYPE_CHECKING:
+    from skysim.papers.compare import Reproduction
+
+INK = {"agrees": "green", "explained": "yellow", "disagrees": "bold red"}
+
+
+def reproduce(
+    ids: Annotated[
+        list[str] | None, typer.Argument(metavar="[ID ...|all]", help="Experiments; lists them if left out.")
+    ] = None,
+    quick: Annotated[bool, typer.Option("--quick", help="Fewer trials, wider intervals.")] = False,
+    seed: Annotated[int, typer.Option(help="Of all random streams: the same seed, the same numbers.")] = 1,
+    report: Annotated[
+        bool, typer.Option("--report", help="Also one HTML page with the papers' figures.")
+    ] = False,
+    out: Annotated[Path, typer.Option(help="Folder for the report.")] = Path("out/reproduce"),
+    markdown: Annotated[
+        Path | None,
+        typer.Option(help="Also a page of Markdown with its pictures beside it, as docs/papers.md."),
+    ] = None,
+    json: Annotated[bool, typer.Option("--json", help="Print JSON for machines instead of tables.")] = False,
+) -> None:
+    """Do the papers' experiments again and set the published numbers beside ours."""
+    from skysim import io
+    from skysim.papers.published import experiments
+
+    if not ids:
+        listed = [{"id": id, "title": one.title, "source": one.source} for id, one in experiments().items()]
+        print(io.to_json(listed)) if json else listing(listed)
+        return
+    from skysim.papers import page
+    from skysim.papers.compare import Ask
+    from skysim.papers.experiments import named
+    from skysim.papers.experiments import reproduce as do
+
+    done = []
+    for id in named(ids):
+        with watched(id, quiet=json) as watch:
+            done.append(do(id, Ask(quick, seed, watch)))
+        if not json:
+            show(done[-1])
+    told = page.Told(tuple(ids), quick, seed)
+    if report:
+        page.write_html(io.make_folder(out) / "report.html", done, told)
+    if markdown:
+        io.make_folder(markdown.parent)
+        page.write_markdown(markdown, done, told)
+    if json:
+        print(io.to_json([line.as_dict() for one in done for line in one.lines]))
+        return
+    summed(done)
+    for path in [out / "report.html"] * report + [markdown] * bool(markdown):
+        print(path)
+
+
+def listing(listed: list[dict[str, str]]) -> None:
+    """What there is."""
+    for entry in listed:
+        print(f"{entry['id']:20s} {entry['title']}")
+
+
+def show(one: Reproduction) -> None:
+    """An experiment's table, and the notes on it."""
+    from skysim.papers.compare import number, stated
+
+    heads = ["what", "published", "ours", "verdict"]
+    lines = [
+        [
+            line.row.quantity,
+            stated(line.row),
+            number(line.answer.ours),
+            f"[{INK[line.verdict]}]{line.verdict}[/]",
+        ]
+        for line in one.lines
+    ]
+    print_table(
+        f"{one.id}: {one.published.title} ({one.published.source}), {one.seconds:.1f} s", heads, lines
+    )
+    for line in one.lines:
+        if line.verdict != "agrees" or line.weakness:
+            print(f"  {line.row.quantity}: {line.note or 'no cause found'}")
+    print()
+
+
+def summed(done: list[Reproduction]) -> None:
+    """How many of each verdict."""
+    from skysim.papers.compare import VERDICTS
+
+    counts = {verdict: sum(one.counts[verdict] for one in done) for verdict in VERDICTS}
+    print(", ".join(f"{count} {verdict}" for verdict, count in counts.items()))

@@ -1,0 +1,31 @@
+"""How our pictures look, whoever draws them: colours, lines, and an empty figure that becomes a PNG."""
+
+from __future__ import annotations
+
+import io as std_io
+from collections.abc import Callable
+from typing import Any
+
+DPI = 120
+# For all kinds of sight (Okabe & Ito 2008), and two more.
+INK = ["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#555555", "#882255"]
+MARKS = "osD^vP<X"
+LOOK: Any = {
+    **{"font.size": 9, "axes.spines.top": False, "axes.spines.right": False, "axes.edgecolor": "#888888"},
+    **{"axes.grid": True, "grid.color": "#e8e8e8", "grid.linewidth": 0.6, "axes.axisbelow": True},
+    **{"xtick.color": "#444444", "ytick.color": "#444444", "legend.frameon": False, "lines.linewidth": 1.2},
+    **{"text.parse_math": False, "lines.markersize": 4.5, "hatch.color": "#b8b8b8", "hatch.linewidth": 0.7},
+}
+
+
+def png(draw: Callable[[Any], None], size_in: tuple[float, float]) -> bytes:
+    """What is drawn into an empty figure."""
+    import matplotlib
+    from matplotlib.figure import Figure as Canvas
+
+    buffer = std_io.BytesIO()
+    with matplotlib.rc_context(LOOK):
+        fig = Canvas(figsize=size_in, layout="constrained")
+        draw(fig)
+        fig.savefig(buffer, format="png", dpi=DPI, metadata={"Software": None})
+    return buffer.getvalue()

@@ -1,0 +1,206 @@
+"""`skysim reproduce`: the verdict's law, the published data, the command, the pages; and every experiment, quickly."""
+
+from __future__ import annotations
+
+import json
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+from pydantic import ValidationError
+from typer.testing import CliRunner
+
+from skysim import BadInput
+from skysim.cli import app
+from skysim.metrics import Summary, exact, share
+from skysim.papers import compare, page, published
+from skysim.papers.compare import Answer, Ask, Cause, Drawing, Found
+from skysim.papers.experiments import EXPERIMENTS, named, reproduce
+from skysim.papers.published import Experiment, Row
+
+# The law of the verdict.
+
+TEN = Row(quantity="ten", published=10.0, tolerance=0.5)
+
+
+def interval(low: float, high: float) -> Summary:
+    return Summary((low + high) / 2, low, high, 10)
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "agrees"),
+    [
+        (9.6, 10.2, True),
+        (10.4, 11.0, True),
+        (8.0, 9.5, True),
+        (10.51, 12.0, False),
+        (8.0, 9.49, False),
+        (1, 20, True),
+    ],
+)
+def test_ours_agrees_where_its_interval_and_the_tolerance_meet(low: float, high: float, agrees: bool) -> None:
+    assert compare.verdict(TEN, Answer(interval(low, high))) == ("agrees" if agrees else "disagrees")
+
+
+def test_a_number_without_an_interval_is_held_by_itself() -> None:
+    nan = float("nan")
+    assert compare.verdict(TEN, Answer(Summary(10.4, nan, nan, 5))) == "agrees"
+    assert compare.verdict(TEN, Answer(Summary(10.6, nan, nan, 5))) == "disagrees"
+
+
+def test_a_cause_explains_only_what_disagrees_and_only_where_it_brings_ours_there() -> None:
+    off, near = exact(12.0), exact(10.1)
+    assert compare.verdict(TEN, Answer(off, cause=Cause("tilt", near))) == "explained"
+    assert compare.verdict(TEN, Answer(off, cause=Cause("tilt", exact(11.0)))) == "disagrees"
+    assert compare.verdict(TEN, Answer(near, cause=Cause("tilt", off))) == "agrees"
+
+
+@pytest.mark.parametrize(
+    ("row", "ours", "agrees"),
+    [
+        (Row(quantity="x", at_least=0.9), 0.95, True),
+        (Row(quantity="x", at_least=0.9), 0.85, False),
+        (Row(quantity="x", at_least=0.9, tolerance=0.1), 0.85, True),
+        (Row(quantity="x", at_most=0.5), 0.2, True),
+        (Row(quantity="x", at_most=0.5), 0.6, False),
+        (Row(quantity="x", at_least=0.9, at_most=0.97), 0.99, False),
+    ],
+)
+def test_a_bound_is_held_on_its_side(row: Row, ours: float, agrees: bool) -> None:
+    assert (compare.verdict(row, Answer(exact(ours))) == "agrees") == agrees
+
+
+def test_an_interval_wider_than_the_tolerance_is_told() -> None:
+    line = compare.Comparison("x", TEN, Answer(interval(8, 12), note="few"), "agrees")
+    assert line.note == "interval wider than the tolerance; few"
+    assert line._replace(answer=Answer(interval(9.8, 10))).note == ""
+
+
+def test_machines_get_the_keys_that_were_promised() -> None:
+    bound = Row(quantity="share", at_least=0.9, note="of frames")
+    line = compare.Comparison("x", bound, Answer(share(95, 100)), "agrees")
+    told = line.as_dict()
+    assert list(told) == ["id", "quantity", "published", "ours", "interval", "tolerance", "verdict", "note"]
+    assert told["published"] == [0.9, None]
+    assert told["ours"] == 0.95
+    assert told["interval"][0] < 0.95 < told["interval"][1]
+
+
+def test_an_answer_to_every_row_and_no_other() -> None:
+    one = Experiment(title="t", source="s", rows={"ten": TEN})
+    with pytest.raises(ValueError, match="eleven, ten"):
+        compare.compare("x", one, Found({"eleven": Answer(exact(1))}), 0.0)
+
+
+# What was published.
+
+
+def test_a_row_says_a_number_or_bounds() -> None:
+    for wrong in ({"quantity": "x"}, {"quantity": "x", "published": 1, "at_most": 2}, {"published": 1}):
+        with pytest.raises(ValidationError):
+            Row.model_validate(wrong)
+
+
+def test_a_wrong_file_is_told_in_one_line(tmp_path: Path) -> None:
+    path = tmp_path / "x.yaml"
+    path.write_text(
+        "paper: P\nexperiments:\n  a:\n    title: T\n    source: S\n    rows:\n      r: {published: 1}\n"
+    )
+    with pytest.raises(BadInput, match=r"experiments\.a\.rows\.r\.quantity: missing .*line 7"):
+        published.read(path)
+
+
+def test_every_published_experiment_is_run_and_none_else() -> None:
+    assert set(published.experiments()) == set(EXPERIMENTS)
+    assert all(one.title and one.source and one.paper for one in published.experiments().values())
+
+
+# The command.
+
+
+def asked(*words: str) -> str:
+    done = CliRunner().invoke(app, ["reproduce", *words])
+    assert done.exit_code == 0, done.output
+    return done.output
+
+
+def test_without_an_id_it_lists_them() -> None:
+    assert [line.split()[0] for line in asked().splitlines()] == list(published.experiments())
+    assert json.loads(asked("--json"))[0].keys() == {"id", "title", "source"}
+
+
+def test_an_unknown_id_is_told_with_the_allowed_ones() -> None:
+    with pytest.raises(
+        BadInput, match=r"afit-table-99: no such experiment; allowed: all, or any of .*afit-table-1"
+    ):
+        named(["afit-table-99"])
+    assert named(["all"]) == list(published.experiments())
+    assert named(["afit-table-1", "afit-table-1"]) == ["afit-table-1"]
+
+
+def test_its_report_and_its_page_show_what_its_json_says(tmp_path: Path) -> None:
+    markdown = tmp_path / "papers.md"
+    words = ["afit-table-1", "--report", "--out", str(tmp_path), "--markdown", str(markdown)]
+    shown, rows = asked(*words), json.loads(asked("afit-table-1", "--json"))
+    html, text = (tmp_path / "report.html").read_text("utf-8"), markdown.read_text("utf-8")
+    for row in rows:
+        assert row["quantity"] in shown
+        assert row["quantity"] in html
+        assert re.search(rf"\| {re.escape(row['quantity'])} \| .* \| \**{row['verdict']}\** \|", text)
+    assert (tmp_path / "papers/afit-table-1_1.png").stat().st_size > 1000
+    assert html.count("data:image/png") == 1
+
+
+class Verdicts(HTMLParser):
+    """The class and the verdict of every line of the report."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.lines: list[tuple[str, str]] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        told = dict(attrs).get("class") or ""
+        if tag == "tr":
+            self.line = told
+        if tag == "td" and told.startswith("v "):
+            self.lines.append((self.line, told[2:]))
+
+
+def test_what_disagrees_is_red_in_the_report_and_bold_in_the_page(tmp_path: Path) -> None:
+    one = Experiment(title="t", source="s", rows={"ten": TEN, "a | b": TEN})
+    found = Found(
+        {"ten": Answer(exact(12)), "a | b": Answer(exact(10))}, (Drawing("<empty>", lambda fig: None),)
+    )
+    done = [compare.compare("x", one, found, 0.0)]
+    page.write_html(tmp_path / "x.html", done, page.Told(("x",), True, 3))
+    page.write_markdown(tmp_path / "x.md", done, page.Told(("x",), True, 3))
+    html = (tmp_path / "x.html").read_text("utf-8")
+    parsed = Verdicts()
+    parsed.feed(html)
+    assert parsed.lines == [("disagrees", "disagrees"), ("", "agrees")]
+    assert "skysim reproduce x --quick --seed 3" in html
+    assert "&lt;empty&gt;" in html
+    assert "| **disagrees** |" in (tmp_path / "x.md").read_text("utf-8")
+
+
+# Every experiment, quickly.
+
+
+@pytest.mark.parametrize("id", list(published.experiments()))
+def test_an_experiment_done_quickly_has_honest_numbers(id: str) -> None:
+    """Finite numbers inside their intervals, and a picture that can be drawn."""
+    done = reproduce(id, Ask(quick=True))
+    for line in done.lines:
+        ours = line.answer.ours
+        assert ours.value == ours.value, line.row.quantity
+        assert not ours.low > ours.value + 1e-12, line.row.quantity
+        assert not ours.high < ours.value - 1e-12, line.row.quantity
+        assert ours.trials > 0, line.row.quantity
+    page.png(done.drawings[0].draw, done.drawings[0].size_in) if done.drawings else None
+
+
+@pytest.mark.parametrize("id", ["afit-table-1"])
+def test_the_same_seed_gives_the_same_numbers(id: str) -> None:
+    first, again = (reproduce(id, Ask(quick=True, seed=5)) for _ in range(2))
+    assert [line.as_dict() for line in first.lines] == [line.as_dict() for line in again.lines]
