@@ -10,7 +10,7 @@ $(READY): pyproject.toml
 	$(BIN)/pip install --quiet --disable-pip-version-check -e '.[dev,catalog]'
 	touch $@
 
-.PHONY: demo test test-long test-oracle lint pictures studies recompile setup clean
+.PHONY: demo test test-long test-oracle lint pictures studies papers recompile setup clean
 setup: $(READY)
 
 demo: $(READY)
@@ -35,6 +35,9 @@ studies: $(READY)
 	for name in $(STUDIES); do $(BIN)/skysim study run $$name || $(BIN)/skysim study resume $$name || exit 1; done
 	$(BIN)/skysim study optimise dome_for_the_money
 	$(BIN)/python docs/studies.py
+
+papers: $(READY)
+	$(BIN)/skysim reproduce all --report --markdown docs/papers.md
 
 lint: $(READY)
 	$(BIN)/ruff check .

@@ -18,17 +18,22 @@ from estimator.index import PairIndex, around, between
 from estimator.options import Options
 from estimator.types import BadImage, Floats, StarMatch
 
+FOURTH_STAR = 1e300  # the paper's own rule: "it is already certain that a success will occur"
 APART = 6.0  # tolerances between base stars, and from them: closer, an angle says little
 
 
 class Rules(NamedTuple):
-    """How a search is done: cosError, a direction's tolerance, and when to give up (see `Options`)."""
+    """How a search is done: cosError, a direction's tolerance, and when to give up (see `Options`).
+
+    accept : log10 of the chance at which a match is the answer; FOURTH_STAR takes whatever has a fourth star
+    """
 
     cos_error: float
     tolerance_rad: float
     triangles: int
     checks: int
     base: int
+    accept: float = ACCEPT_LOG10_CHANCE
 
 
 def cos_error(fov_rad: float, centroid_error_rad: float, factor: float = 1.0) -> float:
@@ -74,16 +79,21 @@ def shefex(vectors_cam: Floats, index: PairIndex, tolerance_rad: float, **option
 @numba.njit(cache=True)
 def search(seen: Floats, index: PairIndex, by: Rules) -> Found:
     """The compiled identifier: rows of the observed and the catalogue's stars, R_cam_from_ref, log10 of the chance."""
-    tried, count = np.zeros(2, np.int64), 0  # base triangles found, angles compared
+    return sought(seen, index, by, np.zeros(3, np.int64))
+
+
+@numba.njit(cache=True)
+def sought(seen: Floats, index: PairIndex, by: Rules, tried: NDArray) -> Found:
+    """As `search`, and what it took is added to (3,) tried: base triangles found, angles compared, triangles seen."""
     for i in range(by.base - 2):
         for j in range(i + 1, by.base - 1):
             for k in range(j + 1, by.base):
-                if count >= by.triangles or tried[1] >= by.checks:
+                if tried[2] >= by.triangles or tried[1] >= by.checks:
                     return nothing()
+                tried[2] += 1
                 found = _triangle(seen, index, np.array([i, j, k]), by, tried)
-                if found[3] <= ACCEPT_LOG10_CHANCE:
+                if len(found[0]) and found[3] <= by.accept:
                     return found
-                count += 1
     return nothing()
 
 
@@ -118,7 +128,7 @@ def _triangle(seen: Floats, index: PairIndex, corners: NDArray, by: Rules, tried
                     continue
                 tried[0] += 1
                 found = _rest(seen, index, corners, np.array([a, b, c], np.int64), rings, by, tried)
-                if found[3] <= ACCEPT_LOG10_CHANCE:
+                if len(found[0]) and found[3] <= by.accept:
                     return found
     return nothing()
 

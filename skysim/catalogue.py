@@ -265,7 +265,7 @@ def info(name_or_path: str | Path) -> dict[str, Any]:
     stars = read(path)
     faintest = int(np.ceil(stars.v_mag.max())) if len(stars) else 0
     return {
-        "path": path,
+        "path": str(path),
         "stars": len(stars),
         "supplied": sum(line.endswith(",supplement") for line in lines),
         "brighter_than": {v: int(np.sum(stars.v_mag < v)) for v in range(faintest + 1)},

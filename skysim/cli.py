@@ -32,6 +32,10 @@ from skysim.terminal import (
 )
 
 if TYPE_CHECKING:
+    from typing import Any
+
+    from numpy.typing import NDArray
+
     from skysim.scene import Scene
     from skysim.types import Row
 
@@ -190,12 +194,16 @@ def render(
 
 @app.command()
 def solve(
-    images: Annotated[list[Path], typer.Argument(help="FITS, PNG, TIFF, JPEG or BMP files.")],
+    images: Annotated[list[Path] | None, typer.Argument(help="FITS, PNG, TIFF, JPEG or BMP files.")] = None,
     fov: Annotated[
         float | None,
         typer.Option(help="Horizontal field of view in degrees, to 5 %; 5 to 40 are tried if left out."),
     ] = None,
     camera: Annotated[Path | None, typer.Option(help="A scene or camera file (YAML) that made them.")] = None,
+    live: Annotated[
+        str | None,
+        typer.Option(help="Also a frame of a live camera: its index, a video file or an address."),
+    ] = None,
     time: Annotated[str | None, typer.Option(help="UTC of the pictures, e.g. 2012-06-22T21:00:00.")] = None,
     detector: Detector = None,
     centroider: Centroider = None,
@@ -214,8 +222,11 @@ def solve(
     stages = named(detector=detector, centroider=centroider, identifier=identifier, solver=solver)
     how = solving.make_solver(fov, camera, time_utc=moment(time), stages=stages)
     io.make_folder(out)
-    pictures = io.unlike([out / f"{path.name}.solved.png" for path in images])
-    jobs = progress(list(zip(images, pictures, strict=True)), len(images), "solving", quiet=json)
+    paths = [*(images or ()), *([kept(io.grab(live), out / "live.png")] if live is not None else ())]
+    if not paths:
+        raise BadInput("give images, or --live CAMERA")
+    pictures = io.unlike([out / f"{path.name}.solved.png" for path in paths])
+    jobs = progress(list(zip(paths, pictures, strict=True)), len(paths), "solving", quiet=json)
     answers = [solving.solve(path, how, picture) for path, picture in jobs]
     faults = [answer["status"] for answer in answers if answer.pop("bad_input")]
     io.write_text(out / "solutions.json", io.to_json(answers))
@@ -227,6 +238,14 @@ def solve(
         complain(fault)
     if faults:
         raise typer.Exit(2)
+
+
+def kept(image: NDArray[Any], path: Path) -> Path:
+    """The file of a camera's frame."""
+    from skysim import io
+
+    io.write_image(path, image)
+    return path
 
 
 @app.command()

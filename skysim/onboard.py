@@ -196,13 +196,16 @@ def observed(settings: Settings, control: Control, frame: Frame) -> Observation:
 
     A full pixel is one near the value at which this camera's are cut off.
     """
-    blobs = DETECTORS[settings.detector](
-        frame.image_dn,
-        settings.threshold_sigma,
-        settings.min_area_px,
-        settings.max_blobs,
-        Hints(None, settings.saturation),
-    )
+    try:
+        blobs = DETECTORS[settings.detector](
+            frame.image_dn,
+            settings.threshold_sigma,
+            settings.min_area_px,
+            settings.max_blobs,
+            Hints(None, settings.saturation),
+        )
+    except BadImage:  # a coarse converter's frame may hold one value alone: there is nothing in it
+        return observe(frame.image_dn, np.empty((0, 4), np.int64), settings.saturation, control)
     box_px = blobs.box_px[blobs.flag & settings.reject == 0]
     return observe(frame.image_dn, box_px, settings.saturation, control)
 

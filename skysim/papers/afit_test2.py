@@ -1,0 +1,326 @@
+"""AFIT's Test 2: one pair of LEDs at three places of the dome (Padro 2012, sections 3.5.3, 3.7.2 and 4.3)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from estimator.ledmap import project
+from skysim import onboard
+from skysim.camera import MoffatPsf
+from skysim.light import SphereSurface
+from skysim.metrics import Summary, exact, resampled
+from skysim.papers.afit_bench import (
+    GREY_E,
+    changed,
+    furnished,
+    grey,
+    measured,
+    separations_arcsec,
+    shot,
+)
+from skysim.papers.compare import Answer, Ask, Cause, Drawing, Found
+from skysim.papers.intervals import mean_of
+from skysim.papers.published import experiments
+from skysim.plots import INK, MARKS
+from skysim.pointcloud import fit_sphere
+from skysim.quantity import INCH_M
+from skysim.scene import Dome, Scene, load
+from skysim.simulate import Lab
+from skysim.surface import Surface, surface
+from skysim.types import Floats
+
+PLACES_DEG = (0.0, 14.0, 28.0)  # of the scene: the apex, half way, the edge within the stop
+HALF_WAY_DEG, LEAN_DEG, LEAN_TOO_DEG, DECENTRE_IN = 23.6, 5.0, 3.5, 0.125
+PAIR_M = 16.119e-3  # gives Table 5's 2727" at the apex; 16 mm gives 2706.9"
+EXPOSURE_S, INTENSITY_CD, ON_SHARE, NOISE_E = 0.1, 2.85e-3, 0.0594, 700.0
+SEEN_SHARE = 0.3  # of a dim LED that is far above the threshold: for angles without its noise
+BRIGHT, DIM = 0, 1
+WALL = {"thickness_apex": "0.2036 in", "thickness_base": "0.25 in", "base_deg": 40, "radius_of": "mid_wall"}
+DESIGN = SphereSurface.model_validate(
+    {"kind": "sphere", "apex": "48 in", "radius": "48.135 in", "wall": WALL}
+)
+
+
+class Place(NamedTuple):
+    """Where the board is: its tilt seen from the bearing, how far it leans, how far the dome is displaced to it."""
+
+    tilt_deg: float
+    lean_deg: float = 0.0
+    decentre_in: float = 0.0
+
+
+class Series(NamedTuple):
+    """What n images of a place gave: (n, 2) magnitudes of the bright and the dim LED, (n,) their angle."""
+
+    magnitude: Floats
+    angle_arcsec: Floats
+
+
+def scene(dim_share: float) -> Scene:
+    """The scene at the light that Table 3's bright LED asks for; the dim LED is lit for a share of its slot."""
+    told = changed(load("afit_test2"), "exposure", time_s=EXPOSURE_S)
+    told = changed(told, "light.layout", levels=(1.0, dim_share) * len(PLACES_DEG))
+    return changed(told, "light.led", intensity_cd=INTENSITY_CD, scatter=0.0)
+
+
+def noisy() -> Scene:
+    """The dim LED hardly above the threshold, in the noise that Table 5's deviations ask for."""
+    return changed(scene(ON_SHARE), "camera.detector", read_noise_e=NOISE_E)
+
+
+def dome_of(told: Scene, decentre_in: float = 0.0) -> Surface:
+    """The measured dome, displaced along x."""
+    assert isinstance(told.light, Dome)
+    return surface(told.light.surface.model_copy(update={"offset_m": (decentre_in * INCH_M, 0.0, 0.0)}))
+
+
+def glued(lab: Lab, place: Place) -> Lab:
+    """The pair on a board that is flat to the dome, or leans off it, its LEDs along the meridian."""
+    inside, tilt = dome_of(lab.scene, place.decentre_in), np.radians(place.tilt_deg)
+    middle_m = inside.meet(np.zeros(3), np.array([[np.sin(tilt), 0.0, np.cos(tilt)]]))[0]
+    lean = Rotation.from_euler("y", place.lean_deg, degrees=True)
+    normal = lean.apply(inside.inward(middle_m[None])[0])
+    along = np.cross(normal, [0.0, 1.0, 0.0])
+    spots_m = middle_m + np.outer([-PAIR_M / 2, PAIR_M / 2], along / np.linalg.norm(along))
+    pair = lab.sources.take(np.arange(2))
+    return replace(
+        lab,
+        sources=replace(pair, place=np.column_stack([spots_m, np.ones(2)]), normal=np.tile(normal, (2, 1))),
+    )
+
+
+def towards(place: Place) -> Rotation:
+    """lab_from_body with the boresight on the board."""
+    return Rotation.from_euler("y", place.tilt_deg, degrees=True)
+
+
+def series(lab: Lab, place: Place, count: int, rng: np.random.Generator) -> Series:
+    """Images of a place; those that do not show two lights are left out."""
+    board, attitude = glued(lab, place), towards(place)
+    magnitudes, angles = [], []
+    for _ in range(count):
+        lights = measured(grey(shot(board, attitude, rng)[0], board))
+        if len(lights.magnitude) == 2:
+            magnitudes.append(lights.magnitude)
+            angles.append(separations_arcsec(lights.xy_px, board)[0])
+    return Series(np.array(magnitudes), np.array(angles))
+
+
+def dome(ask: Ask) -> Found:
+    """Tables 3 to 5 and the dome's contour."""
+    count, clear, faint = ask.trials(50, 6), furnished(scene(SEEN_SHARE)), furnished(noisy())
+    rng = [np.random.default_rng([ask.seed, stage]) for stage in range(3)]
+    calm, wild = [], []
+    for n, tilt_deg in enumerate(PLACES_DEG):
+        ask.watch(n, 4)
+        calm.append(series(clear, Place(tilt_deg), count, rng[0]))
+        wild.append(series(faint, Place(tilt_deg), count, rng[1]))
+    answers = magnitudes(wild) | spreads(calm, wild)
+    ask.watch(3, 4)
+    answers |= angles(clear, calm, wild, ask.trials(12, 2), rng[2]) | contour()
+    return Found(answers, drawings(clear, calm, wild))
+
+
+def magnitudes(wild: Sequence[Series]) -> dict[str, Answer]:
+    """Table 3."""
+    answers: dict[str, Answer] = {}
+    for led, name in enumerate(("bright", "dim")):
+        means = [mean_of(one.magnitude[:, led]) for one in wild]
+        answers |= {f"{name}_{n}": Answer(one) for n, one in enumerate(means, 1)}
+        answers[f"{name}_avg"] = Answer(averaged(means))
+    return answers
+
+
+def averaged(places: Sequence[Summary]) -> Summary:
+    """Mean of the places' means; their errors are independent."""
+    value = float(np.mean([one.value for one in places]))
+    half = float(np.sqrt(sum((one.high - one.value) ** 2 for one in places)) / len(places))
+    return Summary(value, value - half, value + half, sum(one.trials for one in places))
+
+
+def spreads(calm: Sequence[Series], wild: Sequence[Series]) -> dict[str, Answer]:
+    """Table 4, and the standard deviations of Table 5."""
+    answers: dict[str, Answer] = {}
+    for led, name in enumerate(("bright", "dim")):
+        columns = [[one.magnitude[:, led] for one in runs] for runs in (calm, wild)]
+        answers |= {f"sd_{name}_{n}": spread(*pair) for n, pair in enumerate(zip(*columns, strict=True), 1)}
+        answers[f"sd_{name}_all"] = spread(*(np.concatenate(column) for column in columns))
+    pairs = enumerate(zip(calm, wild, strict=True), 1)
+    return answers | {f"sd_angle_{n}": spread(one.angle_arcsec, two.angle_arcsec) for n, (one, two) in pairs}
+
+
+def spread(calm: Floats, wild: Floats) -> Answer:
+    """A deviation of the camera's own noise, and what a dim LED at the threshold in more noise makes of it."""
+    name = f"a dim LED at the threshold in noise of {NOISE_E / GREY_E:.1f} grey levels"
+    return Answer(deviation(calm), cause=Cause(name, deviation(wild)))
+
+
+def deviation(values: Floats) -> Summary:
+    """Standard deviation, n - 1, with the bootstrap's interval."""
+    return resampled(values, lambda x, axis=-1: np.std(x, ddof=1, axis=axis))
+
+
+def angles(
+    lab: Lab, calm: Sequence[Series], wild: Sequence[Series], count: int, rng: np.random.Generator
+) -> dict[str, Answer]:
+    """Table 5's means, and what each declared cause makes of the last two."""
+    edge = PLACES_DEG[2]
+    half_way, decentred, leaning, both, more = (
+        mean_of(series(lab, place, count, rng).angle_arcsec)
+        for place in (
+            Place(HALF_WAY_DEG),
+            Place(edge, 0.0, DECENTRE_IN),
+            Place(edge, LEAN_DEG),
+            Place(edge, LEAN_TOO_DEG, DECENTRE_IN),
+            Place(edge, LEAN_DEG, DECENTRE_IN),
+        )
+    )
+    glaring = glare(lab, count, rng)
+    faint = [
+        float(two.angle_arcsec.mean() - one.angle_arcsec.mean()) for one, two in zip(calm, wild, strict=True)
+    ]
+    means = [mean_of(one.angle_arcsec) for one in calm]
+    others = (
+        f'the dome {DECENTRE_IN} in off centre alone: {decentred.value:.1f}"; with that, leaning {LEAN_TOO_DEG:g} deg:'
+        f' {both.value:.1f}", leaning {LEAN_DEG:g} deg: {more.value:.1f}"; centroid bias of the dim LED, in the noise:'
+        f' {faint[2] - faint[0]:+.1f}" from apex to edge, by glare of a lens with wide wings: {glaring:+.1f}"'
+    )
+    leans = f"a board that leans {LEAN_DEG:g} deg"
+    fall = [exact(100 * (1 - one.value / means[0].value)) for one in (means[2], leaning)]
+    least = min(geometric(lab, Place(float(tilt_deg))) for tilt_deg in np.linspace(20, 34, 29))
+    return {
+        "angle_1": Answer(means[0]),
+        "angle_2": Answer(means[1], cause=Cause(f"the board at {HALF_WAY_DEG} deg", half_way)),
+        "angle_3": Answer(means[2], others, Cause(leans, leaning)),
+        "fall": Answer(fall[0], cause=Cause(leans, fall[1])),
+        "least": Answer(exact(least)),
+    }
+
+
+def glare(lab: Lab, count: int, rng: np.random.Generator) -> float:
+    """By how much more the angle falls to the edge where a lens's wide wings lay light of one LED under the other."""
+    wide = furnished(
+        changed(scene(2 * ON_SHARE), "camera", psf=MoffatPsf(kind="moffat", fwhm_px=2.5, beta=1.5))
+    )
+    edge, apex = Place(PLACES_DEG[2]), Place(0.0)
+    there, here = (series(wide, place, count, rng).angle_arcsec.mean() for place in (edge, apex))
+    return float(there - here - geometric(lab, edge) + geometric(lab, apex))
+
+
+def geometric(lab: Lab, place: Place) -> float:
+    """The pair's angle by eqs 43-45 from where its LEDs are, without any image."""
+    lever, camera = onboard.believed_lever(lab.scene, lab.mount), onboard.believed_camera(lab.scene)
+    xy_px = project(towards(place).inv(), glued(lab, place).sources.place[:, :3], lever, camera)
+    return float(separations_arcsec(xy_px, lab)[0])
+
+
+def contour() -> dict[str, Answer]:
+    """The design's inside and the measured one (section 3.5.3), from our surfaces; inches."""
+    design, inside = surface(DESIGN), dome_of(load("afit_test2"))
+    edge = np.radians(40)
+    rays = np.array([[0.0, 0.0, 1.0], [np.sin(edge), 0.0, np.cos(edge)]])
+    radii = np.linalg.norm(design.meet(design.centre_m, rays) - design.centre_m, axis=1) / INCH_M
+    # A spheroid through both: 1 / r^2 = cos^2 / a^2 + sin^2 / b^2.
+    across = np.sin(edge) / np.sqrt(radii[1] ** -2 - np.cos(edge) ** 2 / radii[0] ** 2)
+    _, axes_m = inside.as_ellipsoid()
+    wide, tall = axes_m[0] / INCH_M, axes_m[2] / INCH_M
+    points_m = inside.samples_m()
+    rim_m = inside.centre_m[2] + inside.rim.lowest_m
+    return {
+        "design_apex": Answer(exact(radii[0])),
+        "design_edge": Answer(exact(radii[1])),
+        "design_across": Answer(exact(across)),
+        "differs_v": Answer(exact(per_cent(radii[0], tall))),
+        "differs_h": Answer(exact(per_cent(across, wide))),
+        "height": Answer(exact((inside.meet(np.zeros(3), rays[:1])[0, 2] - rim_m) / INCH_M)),
+        "best_sphere": Answer(exact(fit_sphere(points_m).radius_m / INCH_M)),
+    }
+
+
+def per_cent(one: float, other: float) -> float:
+    """By how many per cent of their mean two lengths differ, as the thesis takes its differences."""
+    return float(200 * abs(one - other) / (one + other))
+
+
+def drawings(lab: Lab, calm: Sequence[Series], wild: Sequence[Series]) -> tuple[Drawing, ...]:
+    return (
+        Drawing(
+            "Figs 69 and 70: magnitudes of the two LEDs at three places; published as mean and standard deviation.",
+            lambda fig: draw_magnitudes(fig, wild),
+        ),
+        Drawing(
+            "Fig. 71 and Table 5: the pair's angle over the tilt of its board; the published bars are standard"
+            " deviations, their tilts 0 deg, as fitted and as assumed.",
+            lambda fig: draw_angles(fig, lab, calm),
+        ),
+    )
+
+
+def draw_magnitudes(fig: Any, wild: Sequence[Series]) -> None:
+    """Histograms of ours, with the published means."""
+    rows = experiments()["afit-table-3-5"].rows
+    both = fig.subplots(1, 2)
+    for column, name, axes in zip((DIM, BRIGHT), ("dim", "bright"), both, strict=True):
+        everything = np.concatenate([one.magnitude[:, column] for one in wild])
+        bins = np.linspace(everything.min(), everything.max(), 25)
+        top = 1.0
+        for n, one in enumerate(wild):
+            counts, _, _ = axes.hist(
+                one.magnitude[:, column],
+                bins,
+                histtype="step",
+                color=INK[(0, 2, 4)[n]],
+                label=f"ours, place {n + 1}",
+            )
+            top = max(top, counts.max())
+        for n in range(3):
+            mean, sd = rows[f"{name}_{n + 1}"].published, rows[f"sd_{name}_{n + 1}"].published
+            axes.errorbar(
+                mean,
+                top * (1.1 + 0.1 * n),
+                xerr=sd,
+                color=INK[1],
+                marker=MARKS[n],
+                label=f"published, {n + 1}",
+            )
+        axes.set(xlabel=f"magnitude of the {name} LED", ylabel="images", ylim=(0, top * 1.4))
+    fig.legend(*both[0].get_legend_handles_labels(), loc="outside lower center", ncols=6, fontsize=8)
+
+
+def draw_angles(fig: Any, lab: Lab, calm: Sequence[Series]) -> None:
+    """Curves of the geometry, ours from images, and the published ones."""
+    rows, axes = experiments()["afit-table-3-5"].rows, fig.subplots()
+    tilt_deg = np.linspace(0, 32, 33)
+    curves = (
+        ("measured dome", Place(0)),
+        (f"{DECENTRE_IN} in off centre", Place(0, 0, DECENTRE_IN)),
+        (f"leaning {LEAN_DEG:g} deg", Place(0, LEAN_DEG)),
+    )
+    for ink, style, (name, place) in zip((INK[0], INK[2], INK[4]), ("-", "--", "-."), curves, strict=True):
+        axes.plot(
+            tilt_deg,
+            [geometric(lab, place._replace(tilt_deg=float(tilt))) for tilt in tilt_deg],
+            style,
+            color=ink,
+            label=name,
+        )
+    axes.plot(
+        PLACES_DEG, [one.angle_arcsec.mean() for one in calm], "s", color=INK[0], label="ours, from images"
+    )
+    told = [(rows[f"angle_{n}"].published, rows[f"sd_angle_{n}"].published) for n in (1, 2, 3)]
+    axes.errorbar(
+        (0, HALF_WAY_DEG, PLACES_DEG[2]),
+        [mean for mean, _ in told],
+        [sd for _, sd in told],
+        fmt="o",
+        capsize=3,
+        color=INK[1],
+        label="published",
+    )
+    axes.set(xlabel="tilt of the board (deg)", ylabel="angle of the pair (arcsec)")
+    axes.legend()
