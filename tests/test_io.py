@@ -318,3 +318,18 @@ def test_a_shape_that_is_no_picture_is_refused(shape: tuple[int, ...]) -> None:
 def test_json_has_null_for_what_is_no_number() -> None:
     data = {"a": float("nan"), "b": [np.float64("inf"), np.int64(3)], "c": (np.bool_(True), "x", None)}
     assert json.loads(io.to_json(data)) == {"a": None, "b": [None, 3], "c": [True, "x", None]}
+
+
+def test_a_camera_s_frame_is_taken_as_opencv_opens_it_and_none_is_told(tmp_path: Path) -> None:
+    """A video file stands for the camera: its first frame, to what JPEG leaves of it."""
+    frame = np.zeros((48, 64, 3), np.uint8)
+    frame[20:30, 30:40] = 200
+    video = cv2.VideoWriter(str(tmp_path / "camera.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 10, (64, 48))
+    video.write(frame)
+    video.release()
+    grabbed = io.grab(str(tmp_path / "camera.avi"))
+    assert grabbed.shape == frame.shape
+    assert np.abs(grabbed.astype(int) - frame).max() < 30
+    for nowhere in (str(tmp_path / "none.avi"), "99"):
+        with pytest.raises(BadInput, match="no camera answers there; allowed: an index such as 0"):
+            io.grab(nowhere)

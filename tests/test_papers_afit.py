@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from skysim.papers import afit_leds, afit_test1, afit_test2
+from skysim.papers import afit_leds, afit_surface, afit_test1, afit_test2
 from skysim.papers.afit_bench import furnished, grey, measured, separations_arcsec, shot
 from skysim.papers.afit_test2 import PAIR_M, Place, geometric
 from skysim.quantity import INCH_M
+from skysim.scene import load
 from skysim.simulate import Lab
 
 R_M, M_M = 48 * INCH_M, 15 * INCH_M
@@ -56,6 +57,20 @@ def test_images_have_the_angle_of_the_geometry(pair: Lab) -> None:
     lights = measured(grey(frame, board))
     assert separations_arcsec(lights.xy_px, board)[0] == pytest.approx(geometric(pair, Place(28.0)), abs=1.0)
     assert len(truth.seen.id) == 2
+
+
+def test_the_rim_of_the_measured_dome_is_its_ellipse_where_it_is_62_in_wide() -> None:
+    found = afit_surface.contour(afit_test2.dome_of(load("afit_test2")))
+    rim = 48 - 28.60 + 28.60 * np.sqrt(1 - (31 / 38.88) ** 2)
+    assert found["rim_z"].ours.value == pytest.approx(rim, abs=1e-9)
+    assert found["rim_rho"].ours.value == pytest.approx(np.hypot(31, rim), abs=1e-9)
+    assert found["height_by_axes"].ours.value == pytest.approx(48 - rim, abs=1e-9)
+
+
+def test_an_led_that_is_not_seen_is_in_no_order() -> None:
+    """Of three images one has all LEDs, falling; one lacks the last; one has two in the wrong order."""
+    told = afit_leds.ordered(np.array([[3.0, 2.0, 1.0], [3.0, 2.0, 0.0], [2.0, 3.0, 1.0]]))
+    assert told.value == pytest.approx(1 / 3)
 
 
 def test_a_magnitude_is_light_over_the_median_area() -> None:

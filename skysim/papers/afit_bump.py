@@ -11,6 +11,7 @@ from skysim import scene, simulate
 from skysim.papers.afit_still import angles_deg
 from skysim.papers.compare import Answer, Ask, Cause, Drawing, Found
 from skysim.papers.intervals import another
+from skysim.papers.published import experiments
 from skysim.plots import INK
 from skysim.simulate import Lab
 from skysim.types import Floats
@@ -24,7 +25,6 @@ FITTED: Knock = (
 ASSUMED: Knock = (3.0, -2.0, 14.0)  # the scene's own
 BEGIN_S, OVER_S, SEEN_S = 1.5, 2.0, 2.5
 CAUSE = f"a knock of {FITTED} deg/s, gyros that stop at 10"
-TABLE_14_DEG = (0.0555, 0.239, 0.7892)
 
 
 class Flight(NamedTuple):
@@ -134,14 +134,14 @@ def tracker_deg(lab: Lab) -> float:
 
 def draw(fig: Any, one: Flight) -> None:
     """Errors by time."""
-    axes = fig.subplots()
+    axes, rows = fig.subplots(), experiments()["afit-bump"].rows
     for axis in range(3):
         axes.plot(
             one.t_s, np.abs(one.imu_deg[:, axis]), color=INK[(0, 2, 5)[axis]], label=f"IMU, theta_{axis + 1}"
         )
         axes.plot(
             one.t_s[-1] + 0.15,
-            TABLE_14_DEG[axis],
+            rows[f"theta_{axis + 1}"].published,
             "os^"[axis],
             color=INK[1],
             label=f"published, theta_{axis + 1}",

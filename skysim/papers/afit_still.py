@@ -17,24 +17,13 @@ from estimator.types import Ints
 from skysim import manoeuvre, onboard, scene, simulate
 from skysim.motion import Attitude
 from skysim.papers.afit_bench import pair_angles_arcsec, vectors_m
+from skysim.papers.published import experiments
 from skysim.simulate import Lab
 from skysim.types import Floats, Mount, Trajectory
 
 # Roll, pitch, yaw in degrees, Tables 10-14: by the IMU, and by the thesis's algorithm.
-IMU_DEG = (
-    (0.0, 0.0, 0.0),
-    (-0.009, 2.313, 0.007),
-    (0.249, -2.076, 0.004),
-    (3.337, -0.137, -0.028),
-    (-1.882, 0.28, 0.191),
-)
-ALGORITHM_DEG = (
-    (-0.0335, 0.0335, 0.0005),
-    (0.1732, 2.3273, -0.0389),
-    (-0.4672, -2.0595, 0.2312),
-    (3.2338, -0.1171, 0.0848),
-    (-1.9375, 0.041, -0.5982),
-)
+IMU_DEG = experiments()["afit-table-10-15"].data["imu_deg"]
+ALGORITHM_DEG = experiments()["afit-table-10-15"].data["algorithm_deg"]
 LEDS, HOME = 5, 0
 
 TURN_DEG = 55.0  # of the camera about its boresight: assumed, for square on the vehicle it loses position 4

@@ -1,18 +1,22 @@
-"""AFIT's flat surface against a spherical one (Padro 2012, sections 3.5.1 and 3.5.2, Table 1)."""
+"""AFIT's surfaces: flat against spherical, the dome as designed and as measured (Padro 2012, section 3.5, Table 1)."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from scipy.optimize import brentq
+from scipy.spatial.transform import Rotation
 
 from skysim.light import FlatSurface, SphereSurface
 from skysim.metrics import Summary, exact
 from skysim.papers.compare import Answer, Ask, Cause, Drawing, Found
 from skysim.papers.published import experiments
 from skysim.plots import INK
+from skysim.pointcloud import fit_sphere
 from skysim.quantity import INCH_M
-from skysim.surface import Surface, surface
+from skysim.surface import Rim, Surface, surface
 from skysim.types import Floats
 
 FIELD_RAD = np.radians(10.45)
@@ -20,6 +24,16 @@ STATED_MOUNT_IN, FITTED_MOUNT_IN = 14.0, 15.5
 ANGLES_DEG = (0, 10, 15, 20, 25, 30)
 FLAT = FlatSurface.model_validate({"kind": "flat", "apex": "48 in"})
 SPHERE = SphereSurface.model_validate({"kind": "sphere", "apex": "48 in", "radius": "48 in"})
+WALL = {"thickness_apex": "0.2036 in", "thickness_base": "0.25 in", "base_deg": 40, "radius_of": "mid_wall"}
+DESIGN = SphereSurface.model_validate(
+    {"kind": "sphere", "apex": "48 in", "radius": "48.135 in", "wall": WALL}
+)
+EDGE_RAD, WIDE_IN, OUTSIDE_IN = (
+    np.radians(40.0),
+    62.0,
+    48.135,
+)  # it covers 80 deg, is 62 in wide; the design's sphere
+RINGS, SECTORS = 400, 12
 
 
 def width_in(shape: Surface, mount_in: float, angle_deg: float) -> float:
@@ -93,3 +107,71 @@ def draw(fig: Any, panel: Surface) -> None:
     axes.plot(ANGLES_DEG, told, "o", color=INK[1], label="published")
     axes.set(xlabel="angle (deg)", ylabel="width (in)")
     axes.legend()
+
+
+def contour(inside: Surface) -> dict[str, Answer]:
+    """The design's inside and the measured one (section 3.5.3), from our surfaces; inches."""
+    design = surface(DESIGN)
+    ends = along(0.0), along(EDGE_RAD)
+    radii = np.linalg.norm(design.meet(design.centre_m, np.array(ends)) - design.centre_m, axis=1) / INCH_M
+    # A spheroid through both: 1 / r^2 = cos^2 / a^2 + sin^2 / b^2.
+    across = np.sin(EDGE_RAD) / np.sqrt(radii[1] ** -2 - np.cos(EDGE_RAD) ** 2 / radii[0] ** 2)
+    _, axes_m = inside.as_ellipsoid()
+    wide, tall = axes_m[0] / INCH_M, axes_m[2] / INCH_M
+    return {
+        "design_apex": Answer(exact(radii[0])),
+        "design_edge": Answer(exact(radii[1])),
+        "design_change": Answer(exact(100 * (radii[0] / radii[1] - 1))),
+        "design_across": Answer(exact(across)),
+        "differs_v": Answer(exact(per_cent(radii[0], tall))),
+        "differs_h": Answer(exact(per_cent(across, wide))),
+        **rim_and_radii(inside),
+        **best_sphere(inside),
+    }
+
+
+def per_cent(one: float, other: float) -> float:
+    """By how many per cent of their mean two lengths differ, as the thesis takes its differences."""
+    return float(200 * abs(one - other) / (one + other))
+
+
+def met_in(inside: Surface, lean_rad: Any) -> Floats:
+    """(N, 3) where rays from the bearing that lean so far meet a surface, its rim left out of account; inches."""
+    rays = np.array([along(one) for one in np.atleast_1d(lean_rad)])
+    return np.asarray(replace(inside, rim=Rim(inside.rim.eye_m)).meet(np.zeros(3), rays) / INCH_M)
+
+
+def rim_and_radii(inside: Surface) -> dict[str, Answer]:
+    """Where the measured inside is as wide as the dome, and its distances from the bearing."""
+    rim_rad = brentq(lambda lean: met_in(inside, lean)[0, 0] - WIDE_IN / 2, 0.5, 0.9)
+    rim = met_in(inside, rim_rad)[0]
+    height = Answer(exact(met_in(inside, 0.0)[0, 2] - rim[2]))
+    lean_rad = np.linspace(0, rim_rad, 4001)
+    rho = np.linalg.norm(met_in(inside, lean_rad), axis=1)
+    return {
+        "height": height,
+        "height_by_axes": height,
+        "rim_z": Answer(exact(rim[2])),
+        "rim_rho": Answer(exact(float(np.linalg.norm(rim)))),
+        "rho_max": Answer(exact(rho.max())),
+        "rho_max_at": Answer(exact(np.degrees(lean_rad[rho.argmax()]))),
+    }
+
+
+def best_sphere(inside: Surface) -> dict[str, Answer]:
+    """The sphere nearest to the measured inside over equal areas of the design's cap, and the contour's rms off it.
+
+    The contour's points are even in polar angle, as those of a measuring arm that goes along a meridian.
+    """
+    cap_rad = np.arcsin(WIDE_IN / 2 / OUTSIDE_IN)
+    part = (np.arange(RINGS) + 0.5) / RINGS
+    profile_in = met_in(inside, np.arccos(1 - part * (1 - np.cos(cap_rad))))
+    around = Rotation.from_euler("z", np.arange(SECTORS)[:, None] * (2 * np.pi / SECTORS))
+    ball = fit_sphere(np.concatenate([one.apply(profile_in) for one in around]))
+    contour_in = met_in(inside, part * cap_rad)
+    off_in = np.linalg.norm(contour_in - ball.centre_m, axis=1) - ball.radius_m
+    return {
+        "best_sphere": Answer(exact(ball.radius_m)),
+        "best_centre": Answer(exact(float(ball.centre_m[2]))),
+        "best_rms": Answer(exact(float(np.sqrt(np.mean(off_in**2)))), f"over equal areas {ball.rms_m:.3f}"),
+    }

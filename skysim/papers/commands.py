@@ -33,11 +33,9 @@ def reproduce(
 ) -> None:
     """Do the papers' experiments again and set the published numbers beside ours."""
     from skysim import io
-    from skysim.papers.published import experiments
 
     if not ids:
-        listed = [{"id": id, "title": one.title, "source": one.source} for id, one in experiments().items()]
-        print(io.to_json(listed)) if json else listing(listed)
+        listing(json)
         return
     from skysim.papers import page
     from skysim.papers.compare import Ask
@@ -64,8 +62,15 @@ def reproduce(
         print(path)
 
 
-def listing(listed: list[dict[str, str]]) -> None:
+def listing(json: bool) -> None:
     """What there is."""
+    from skysim import io
+    from skysim.papers.published import experiments
+
+    listed = [{"id": id, "title": one.title, "source": one.source} for id, one in experiments().items()]
+    if json:
+        print(io.to_json(listed))
+        return
     for entry in listed:
         print(f"{entry['id']:20s} {entry['title']}")
 
@@ -95,7 +100,6 @@ def show(one: Reproduction) -> None:
 
 def summed(done: list[Reproduction]) -> None:
     """How many of each verdict."""
-    from skysim.papers.compare import VERDICTS
+    from skysim.papers.page import counts
 
-    counts = {verdict: sum(one.counts[verdict] for one in done) for verdict in VERDICTS}
-    print(", ".join(f"{count} {verdict}" for verdict, count in counts.items()))
+    print(", ".join(f"{count} {kind}" for kind, count in counts(done).items()))

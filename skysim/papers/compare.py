@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal, NamedTuple
@@ -77,13 +78,15 @@ class Comparison(NamedTuple):
 
     @property
     def weakness(self) -> str:
-        """Said where the interval is wider than the band that it is to meet."""
-        low, high = self.row.band
-        return (
-            "interval wider than the tolerance"
-            if self.answer.ours.high - self.answer.ours.low > high - low
-            else ""
-        )
+        """Said where a verdict other than disagrees rests on an interval that leaves it open."""
+        cause, (low, high) = self.answer.cause, self.row.band
+        if self.verdict == "disagrees":
+            return ""
+        ours = cause.ours if cause and self.verdict == "explained" else self.answer.ours
+        if low > -math.inf and high < math.inf:
+            return "interval wider than the tolerance" if ours.high - ours.low > high - low else ""
+        bound = low if low > -math.inf else high
+        return "the bound lies within the interval" if ours.low < bound < ours.high else ""
 
     def as_dict(self) -> dict[str, Any]:
         """For machines. A bound is published as [least, most], an open end as null."""
@@ -112,8 +115,14 @@ class Reproduction:
     seconds: float = field(compare=False)
 
     @property
-    def counts(self) -> dict[Verdict, int]:
-        return {verdict: sum(line.verdict == verdict for line in self.lines) for verdict in VERDICTS}
+    def counts(self) -> dict[str, int]:
+        """Lines of each verdict; of them those whose number is derived, and whose verdict an interval leaves open."""
+        told: dict[str, int] = {
+            verdict: sum(line.verdict == verdict for line in self.lines) for verdict in VERDICTS
+        }
+        told["derived"] = sum(line.row.derived for line in self.lines)
+        told["open"] = sum(bool(line.weakness) for line in self.lines)
+        return told
 
 
 def compare(id: str, published: Experiment, found: Found, seconds: float) -> Reproduction:
@@ -143,6 +152,12 @@ def meets(row: Row, ours: Summary) -> bool:
     ends = (ours.value if end != end else end for end in (ours.low, ours.high))
     least, most = ends
     return least <= high and most >= low
+
+
+def printed(row: Row) -> str:
+    """The published number and where it stands; `derived` where it is not printed."""
+    where = "; ".join(part for part in ("derived" if row.derived else "", row.source) if part)
+    return f"{stated(row)} ({where})" if where else stated(row)
 
 
 def number(told: Summary) -> str:

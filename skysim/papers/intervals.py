@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.special import stdtrit
 
+from skysim import metrics
 from skysim.metrics import CONFIDENCE, RESAMPLES, Summary
 from skysim.types import Floats
 
@@ -17,17 +18,34 @@ def mean_of(values: Sequence[float] | Floats) -> Summary:
     return about_mean(values, 0.0)
 
 
-def another(values: Sequence[float] | Floats) -> Summary:
-    """The mean and where one more draw is: mean +- t s sqrt(1 + 1 / n). For a published number that is itself one."""
-    return about_mean(values, 1.0)
+def another(values: Sequence[float] | Floats, count: int = 0) -> Summary:
+    """The mean and where one more draw is: mean +- t s sqrt(1 + 1 / n). For a published number that is itself one.
+
+    count : of draws that are independent, where they are fewer than the values
+    """
+    return about_mean(values, 1.0, count)
 
 
-def about_mean(values: Sequence[float] | Floats, own: float) -> Summary:
+def about_mean(values: Sequence[float] | Floats, own: float, count: int = 0) -> Summary:
     """mean +- t s sqrt(own + 1 / n) with t of n - 1 degrees of freedom."""
     drawn = np.asarray(values, float)
-    count, middle = len(drawn), float(np.mean(drawn))
+    count, middle = count or len(drawn), float(np.mean(drawn))
     reach = float(stdtrit(count - 1, 0.975) * np.std(drawn, ddof=1) * np.sqrt(own + 1 / count))
     return Summary(middle, middle - reach, middle + reach, count)
+
+
+def resampled(values: Floats, statistic: Callable[..., Any]) -> Summary:
+    """A mean or the like with the bootstrap's interval, made as much wider as a few values ask for."""
+    return widened(metrics.resampled(values, statistic))
+
+
+def widened(told: Summary) -> Summary:
+    """The bootstrap of n values leaves out a factor sqrt(n / (n - 1)), and that t is longer than the normal's 1.96."""
+    if told.trials < 2:
+        return told
+    factor = stdtrit(told.trials - 1, 0.975) / 1.96 * np.sqrt(told.trials / (told.trials - 1))
+    low, high = (told.value + factor * (end - told.value) for end in (told.low, told.high))
+    return told._replace(low=float(low), high=float(high))
 
 
 def of_means(columns: Floats, statistic: Callable[[Floats], Any]) -> Summary:
@@ -44,4 +62,4 @@ def of_means(columns: Floats, statistic: Callable[[Floats], Any]) -> Summary:
     value = float(statistic(filled.sum(axis=0) / there.sum(axis=0)))
     tail = 50 * (1 - CONFIDENCE)
     low, high = np.nanpercentile(found, [tail, 100 - tail])
-    return Summary(value, min(float(low), value), max(float(high), value), rows)
+    return widened(Summary(value, min(float(low), value), max(float(high), value), rows))

@@ -16,8 +16,9 @@ from estimator.masterstar import master_star
 from estimator.nearfield import LedMap, on_surface
 from skysim import onboard, scene, simulate
 from skysim.light import FlatSurface
-from skysim.metrics import Summary, resampled, share
+from skysim.metrics import Summary, share
 from skysim.papers.compare import Answer, Ask, Cause, Drawing, Found
+from skysim.papers.intervals import resampled
 from skysim.plots import INK, MARKS
 from skysim.quantity import ARCSEC_RAD
 from skysim.scene import Dome

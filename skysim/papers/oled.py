@@ -9,8 +9,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from skysim import scene, simulate
-from skysim.metrics import Summary, resampled, rms
+from skysim.metrics import Summary, rms
 from skysim.papers.compare import Answer, Ask, Cause, Drawing, Found
+from skysim.papers.intervals import resampled
 from skysim.papers.published import experiments
 from skysim.plots import INK, MARKS
 from skysim.study.benches import Bench

@@ -8,9 +8,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 from skysim.io import make_folder, write_bytes, write_text
-from skysim.papers.compare import VERDICTS, Comparison, Reproduction, number, stated
+from skysim.papers.compare import VERDICTS, Comparison, Reproduction, number, printed
 from skysim.plots import png
 from skysim.report import embed
+
+KINDS = (*VERDICTS, "derived", "open")
 
 
 class Told(NamedTuple):
@@ -36,8 +38,8 @@ def papers(done: Sequence[Reproduction]) -> dict[str, list[Reproduction]]:
 
 
 def counts(done: Sequence[Reproduction]) -> dict[str, int]:
-    """How many lines of each verdict."""
-    return {verdict: sum(one.counts[verdict] for one in done) for verdict in VERDICTS}
+    """How many lines of each kind."""
+    return {kind: sum(one.counts[kind] for one in done) for kind in KINDS}
 
 
 def write_html(path: Path, done: Sequence[Reproduction], told: Told) -> None:
@@ -53,7 +55,7 @@ def write_html(path: Path, done: Sequence[Reproduction], told: Told) -> None:
         told=told,
         drawn=drawn,
         number=number,
-        stated=stated,
+        printed=printed,
     )
     write_text(path, text)
 
@@ -61,16 +63,16 @@ def write_html(path: Path, done: Sequence[Reproduction], told: Told) -> None:
 def write_markdown(path: Path, done: Sequence[Reproduction], told: Told) -> None:
     """A page of Markdown; its pictures in a folder of its name beside it."""
     lines = [HEAD.format(command=told.command, seed=told.seed)]
-    lines += ["| experiment | agrees | explained | disagrees | seconds |", "|---|---|---|---|---|"]
+    lines += [f"| experiment | {' | '.join(KINDS)} | seconds |", "|---" * (len(KINDS) + 2) + "|"]
     for one in done:
         cells = [
             f"[{one.id}](#{one.id})",
-            *(str(one.counts[verdict]) for verdict in VERDICTS),
+            *(str(one.counts[kind]) for kind in KINDS),
             f"{one.seconds:.0f}",
         ]
         lines.append(f"| {' | '.join(cells)} |")
     total = counts(done)
-    lines.append(f"| all | {' | '.join(str(total[verdict]) for verdict in VERDICTS)} | |")
+    lines.append(f"| all | {' | '.join(str(total[kind]) for kind in KINDS)} | |")
     folder = make_folder(path.with_suffix(""))
     for paper, ones in papers(done).items():
         lines += [f"\n## {paper}"]
@@ -108,14 +110,14 @@ def remarks(one: Reproduction) -> list[tuple[str, str]]:
 def cells(line: Comparison) -> list[str]:
     """A comparison's cells, safe in a table of Markdown."""
     verdict = f"**{line.verdict}**" if line.verdict == "disagrees" else line.verdict
-    told = [line.row.quantity, stated(line.row), number(line.answer.ours), verdict, line.note]
+    told = [line.row.quantity, printed(line.row), number(line.answer.ours), verdict, line.note]
     return [text.replace("|", "\\|") for text in told]
 
 
 HEAD = """# The papers, reproduced
 
-Every experiment of which the three papers publish numbers, done again by our own simulator and estimator: the
-published number, ours with its interval of 95 %, and a verdict. This page is written by
+Every experiment of which the papers publish numbers, done again by our own simulator and estimator: the published
+number, ours with its interval of 95 %, and a verdict. This page is written by
 
 ```sh
 {command} --markdown docs/papers.md
@@ -125,10 +127,13 @@ and by nobody else; seed {seed}. The published numbers, each with its table or p
 [`data/published`](../data/published).
 
 * **agrees**: our interval meets the published number's tolerance.
-* **explained**: it does not, but does with a cause that the row names and that was simulated too.
+* **explained**: it does not, but does with causes that the row names and that were simulated too. A cause may have been
+  fitted: then it stands under *Fitted*, and explains no more than that the number can come about so.
 * **disagrees**: neither.
 
-Nothing is tuned to hit a number unless it stands under *Fitted*.
+A number is *derived* where it is not printed but follows from what is, and a verdict *open* where its interval is
+wider than the tolerance, or holds the bound: more trials might turn it. Nothing is tuned to hit a number unless it
+stands under *Fitted*.
 """
 
 PAGE = """<!doctype html>
@@ -152,18 +157,18 @@ PAGE = """<!doctype html>
 <h1>The papers, reproduced</h1>
 <p><code id="command">{{ told.command }} --report</code></p>
 <div class="figures">
-{% for verdict, count in counts.items() %}
- <div><b id="{{ verdict }}" class="{{ verdict if count }}">{{ count }}</b>{{ verdict }}</div>
+{% for kind, count in counts.items() %}
+ <div><b id="{{ kind }}" class="{{ kind if count }}">{{ count }}</b>{{ kind }}</div>
 {% endfor %}
  <div><b>{{ told.seed }}</b>seed{{ ', quick: wider intervals' if told.quick }}</div>
 </div>
 <p>agrees: our interval of 95 % meets the published number's tolerance. explained: it does with a cause that the row
 names and that was simulated too. disagrees: neither.</p>
 <table id="contents"><tr><th>experiment</th><th></th>
-{% for verdict in counts %}<th class="n">{{ verdict }}</th>{% endfor %}<th class="n">seconds</th></tr>
+{% for kind in counts %}<th class="n">{{ kind }}</th>{% endfor %}<th class="n">seconds</th></tr>
 {% for ones in papers.values() %}{% for one in ones %}
 <tr><td><a href="#{{ one.id }}">{{ one.id }}</a></td><td>{{ one.published.title }}</td>
-{% for verdict, count in one.counts.items() %}<td class="n {{ verdict if count }}">{{ count or '' }}</td>{% endfor %}
+{% for kind, count in one.counts.items() %}<td class="n {{ kind if count }}">{{ count or '' }}</td>{% endfor %}
 <td class="n">{{ '%.1f'|format(one.seconds) }}</td></tr>
 {% endfor %}{% endfor %}</table>
 {% for paper, ones in papers.items() %}
@@ -175,7 +180,7 @@ names and that was simulated too. disagrees: neither.</p>
 <table><tr><th>what</th><th class="n">published</th><th class="n">ours (95 %)</th><th>verdict</th><th>note</th></tr>
 {% for line in one.lines %}
 <tr class="{{ line.verdict if line.verdict == 'disagrees' }}"><td>{{ line.row.quantity }}</td>
-<td class="n">{{ stated(line.row) }}</td><td class="n">{{ number(line.answer.ours) }}</td>
+<td class="n">{{ printed(line.row) }}</td><td class="n">{{ number(line.answer.ours) }}</td>
 <td class="v {{ line.verdict }}">{{ line.verdict }}</td><td>{{ line.note }}</td></tr>
 {% endfor %}</table>
 {% for source, caption in drawn[one.id] %}

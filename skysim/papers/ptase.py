@@ -13,8 +13,9 @@ from estimator.fialho import SHARE_BASIC, SHARE_FALSE_STARS, VERSIONS, Rules, ru
 from estimator.index import PairIndex
 from estimator.options import Options
 from estimator.types import Ints
-from skysim.metrics import WRONG_RAD, Summary, resampled, share
+from skysim.metrics import WRONG_RAD, Summary, share
 from skysim.papers.compare import Answer, Ask, Cause, Drawing, Found
+from skysim.papers.intervals import resampled
 from skysim.papers.published import experiments
 from skysim.plots import INK, MARKS
 from skysim.quantity import ARCSEC_RAD
@@ -29,15 +30,7 @@ DOUBLES_RAD = 30 * ARCSEC_RAD
 FITTED_LIMIT_MAG, FITTED_GATE_SIGMAS = 5.1, 3.2
 SIMULATION_RUNS = 1000
 # Table 1: success (%), mean attitude, roll and axis error (arcsec) of its five simulations.
-TABLE_1 = np.array(
-    [
-        [99.4, 6.48, 4.48, 0.95],
-        [98.8, 7.02, 4.88, 0.96],
-        [99.3, 6.70, 4.64, 0.97],
-        [99.0, 6.82, 4.72, 0.97],
-        [99.1, 6.83, 4.73, 0.96],
-    ]
-)
+TABLE_1 = np.array(experiments()["ptase-table-1"].data["simulations"])
 
 
 def catalogue(limit_mag: float) -> PairIndex:

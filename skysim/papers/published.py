@@ -22,6 +22,7 @@ class Row(Part):
     published: the number; in its place at_least and at_most, one or both, where a bound is all that was stated
     tolerance: how far ours may be off, in the same unit
     source   : the table, figure or page, where it is another than its experiment's
+    derived  : not printed, but what follows from what is: by arithmetic, or by theory that is not ours alone
     note     : what the reader should know: a misprint, how the tolerance was come by
     """
 
@@ -31,6 +32,7 @@ class Row(Part):
     at_most: Number | None = None
     tolerance: NotNegative = 0.0
     source: str = ""
+    derived: bool = False
     note: str = ""
 
     @model_validator(mode="after")
@@ -55,6 +57,7 @@ class Experiment(Part):
     source : table, figure or section;  wrong: what the paper gets wrong, and the value corrected
     assumed: what the paper does not tell, and what was put in its place
     fitted : parameters that were chosen so that a number comes out: never without being told here
+    data   : published tables that an experiment is set up by, row by row
     """
 
     title: str
@@ -62,6 +65,7 @@ class Experiment(Part):
     wrong: str = ""
     assumed: tuple[str, ...] = ()
     fitted: tuple[str, ...] = ()
+    data: dict[str, tuple[tuple[Number, ...], ...]] = Field(default_factory=dict)
     rows: Annotated[dict[str, Row], Field(min_length=1)]
     paper: str = ""
 

@@ -16,9 +16,9 @@ from estimator.detect import DETECTORS
 from estimator.shefex import maximum_scan, sequential_scan
 from skysim import onboard, simulate
 from skysim.light import UniformGlow
-from skysim.metrics import Summary, exact, quantile, resampled
+from skysim.metrics import Summary, exact, quantile
 from skysim.papers.compare import Answer, Ask, Cause, Drawing, Found
-from skysim.papers.intervals import of_means
+from skysim.papers.intervals import of_means, resampled
 from skysim.papers.shefex_nights import FULL_MOON, at, shots
 from skysim.papers.shefex_set import MOST, PUBLISHED
 from skysim.plots import INK, MARKS
@@ -79,7 +79,7 @@ def draw_scans(times_s: Floats, fig: Any) -> None:
         axes.axhline(told * scale, color=PUBLISHED, ls="--")
         axes.text(0, told * scale, f"published, {told:g} ms there", color=PUBLISHED, va="bottom", fontsize=8)
     axes.set(xlabel="frame", ylabel="time of a scan (ms)", ylim=(0, None))
-    axes.legend(loc="center left")
+    fig.legend(loc="outside upper center", ncols=2)
 
 
 # The exposure control.

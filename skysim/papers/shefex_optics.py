@@ -12,8 +12,9 @@ from estimator.stages import Clock, Settings, see
 from estimator.starcal import self_calibrated
 from estimator.tracker import StarTracker
 from skysim import onboard, simulate
-from skysim.metrics import Summary, exact, resampled
+from skysim.metrics import Summary, exact
 from skysim.papers.compare import Answer, Ask, number
+from skysim.papers.intervals import resampled
 from skysim.papers.shefex_set import apparent, lab, stars
 from skysim.render import Window, render
 from skysim.scene import load
