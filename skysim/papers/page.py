@@ -140,7 +140,7 @@ PAGE = """<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width">
 <title>The papers, reproduced</title>
 <style>
- body { font: 15px/1.5 system-ui, sans-serif; color: #222; max-width: 1100px; margin: 2rem auto; padding: 0 1rem }
+ body { font: 15px/1.5 system-ui, sans-serif; color: #222; max-width: 1240px; margin: 2rem auto; padding: 0 1rem }
  h1 { font-size: 1.5rem; margin-bottom: .2rem } h2 { font-size: 1.2rem; margin-top: 2.5rem } h3 { margin: 2rem 0 .2rem }
  code { background: #f2f2f2; padding: .15rem .4rem; border-radius: 3px }
  figure { margin: 1.2rem 0 } figcaption { color: #555; font-size: 13px; max-width: 760px } img { max-width: 100% }
@@ -149,7 +149,8 @@ PAGE = """<!doctype html>
  .figures b { display: block; font-size: 1.25rem }
  table { border-collapse: collapse; font-variant-numeric: tabular-nums; font-size: 13px; margin: .6rem 0 }
  th, td { text-align: left; padding: .2rem .7rem; border-bottom: 1px solid #eee; vertical-align: top }
- .n { text-align: right; white-space: nowrap } .remark { font-size: 14px; margin: .3rem 0; max-width: 860px }
+ td:first-child { min-width: 190px } .n { text-align: right }
+ #contents td { white-space: nowrap } .remark { font-size: 14px; margin: .3rem 0; max-width: 860px }
  .agrees { color: #00713f } .explained { color: #9a5b00 } .disagrees { color: #b00020; font-weight: 600 }
  tr.disagrees td { background: #fdf3f4; color: #222; font-weight: 400 }
  tr.disagrees td.v { color: #b00020; font-weight: 600 }
@@ -162,8 +163,9 @@ PAGE = """<!doctype html>
 {% endfor %}
  <div><b>{{ told.seed }}</b>seed{{ ', quick: wider intervals' if told.quick }}</div>
 </div>
-<p>agrees: our interval of 95 % meets the published number's tolerance. explained: it does with a cause that the row
-names and that was simulated too. disagrees: neither.</p>
+<p>agrees: our interval of 95 % meets the published number's tolerance. explained: it does with causes that the row
+names and that were simulated too; a fitted one explains no more than that the number can come about so. disagrees:
+neither. derived: the number is not printed, but follows from what is. open: our interval leaves the verdict open.</p>
 <table id="contents"><tr><th>experiment</th><th></th>
 {% for kind in counts %}<th class="n">{{ kind }}</th>{% endfor %}<th class="n">seconds</th></tr>
 {% for ones in papers.values() %}{% for one in ones %}

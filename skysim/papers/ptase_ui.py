@@ -48,6 +48,7 @@ STOPPED = """
 import signal, sys
 from skysim import simulate
 from skysim.cli import main
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job ignores it
 fly = simulate.fly
 simulate.fly = lambda *told: (signal.raise_signal(signal.SIGINT), fly(*told))[1]
 sys.argv = ["skysim", "run", "shefex2", "--out", sys.argv[1]]
