@@ -10,7 +10,7 @@ $(READY): pyproject.toml
 	$(BIN)/pip install --quiet --disable-pip-version-check -e '.[dev,catalog]'
 	touch $@
 
-.PHONY: demo test test-long test-oracle lint pictures studies papers recompile setup clean
+.PHONY: demo test test-long test-oracle test-browser lint pictures studies papers lab recompile setup clean
 setup: $(READY)
 
 demo: $(READY)
@@ -27,6 +27,9 @@ test-oracle: $(READY)
 	$(BIN)/pip install --quiet --disable-pip-version-check -e '.[oracle]'
 	$(BIN)/pytest tests/test_oracle_*.py
 
+lab: $(READY)
+	$(BIN)/skysim lab
+
 pictures: demo
 	$(BIN)/python docs/pictures.py
 
@@ -38,6 +41,11 @@ studies: $(READY)
 
 papers: $(READY)
 	$(BIN)/skysim reproduce all --report --markdown docs/papers.md
+
+# The lab's page in Chromium, which has to be there.
+test-browser: $(READY)
+	$(BIN)/pip install --quiet --disable-pip-version-check -e '.[browser]'
+	$(BIN)/pytest tests/test_lab_page.py -m long
 
 lint: $(READY)
 	$(BIN)/ruff check .

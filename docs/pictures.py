@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import cv2
@@ -43,6 +44,33 @@ def main() -> None:
     ]
     sheet = report.contact_sheet([shot.image_dn[WINDOW] for shot, _ in shots], captions, scale=3)
     io.write_image(DOCS / "smear.png", sheet)
+    pages()
+
+
+def pages() -> None:
+    """The lab's page under the sky, and a slew under the dome as it is played."""
+    from playwright.sync_api import sync_playwright
+
+    from benchmarks.lab import chromium, served
+
+    with served("shefex2") as url, sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=chromium(), args=["--no-sandbox"])
+        page = browser.new_page(viewport={"width": 1440, "height": 860})
+        page.goto(url)
+        page.locator(".lab-card .good").wait_for(timeout=90_000)
+        page.wait_for_timeout(3000)  # the first look clears what was clicked before
+        box = page.locator(".lab-frame img").bounding_box()
+        page.mouse.click(box["x"] + 0.71 * box["width"], box["y"] + 0.186 * box["height"])  # Bellatrix
+        page.wait_for_timeout(3000)
+        page.screenshot(path=DOCS / "lab_page.jpg", quality=85)
+        page.get_by_role("combobox", name="Scene").click()
+        page.get_by_role("option", name="simsat_slew").click()
+        page.get_by_text("SimSat slews on its reaction wheels").wait_for(timeout=90_000)
+        page.get_by_role("tab", name="Run").click()
+        page.get_by_role("button", name="Fly").click()
+        page.get_by_text(re.compile(r"^2\d\.\d\d s$")).wait_for(timeout=180_000)
+        page.screenshot(path=DOCS / "lab_run.jpg", quality=85)
+        browser.close()
 
 
 if __name__ == "__main__":

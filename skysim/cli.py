@@ -12,6 +12,7 @@ import typer
 
 from estimator import BadImage
 from skysim import BadInput
+from skysim.lab.commands import lab as open_lab
 from skysim.papers.commands import reproduce
 from skysim.study.commands import app as studies
 from skysim.terminal import (
@@ -287,6 +288,7 @@ def survey(
 
 
 app.command()(reproduce)
+app.command("lab")(open_lab)
 
 
 @scenes_app.callback()

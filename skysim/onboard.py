@@ -149,6 +149,17 @@ def believed_settings(scene: Scene) -> Settings:
     )
 
 
+def choices(scene: Scene) -> dict[str, tuple[str, ...]]:
+    """Every algorithm that a scene's tracker may name, by stage."""
+    near = isinstance(scene.light, Dome)
+    return {
+        "detector": tuple(DETECTORS),
+        "centroider": tuple(CENTROIDERS),
+        "identifier": tuple(NEAR_IDENTIFIERS if near else IDENTIFIERS),
+        "solver": tuple(NEAR_SOLVERS if near else SOLVERS),
+    }
+
+
 def known(key: str, name: str, algorithms: Mapping[str, object]) -> str:
     """The name, if there is such an algorithm: only the estimator knows, and scene.py may not ask it."""
     try:

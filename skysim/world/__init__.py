@@ -6,6 +6,8 @@ from skysim.world.flight import tilt_deg as tilt_deg
 from skysim.world.occlusion import Obstacles as Obstacles
 from skysim.world.occlusion import hidden as hidden
 from skysim.world.occlusion import obstacles as obstacles
+from skysim.world.shapes import Shape as Shape
+from skysim.world.shapes import shapes as shapes
 from skysim.world.vehicle import CAM_FROM_MJCAM as CAM_FROM_MJCAM
 from skysim.world.vehicle import World as World
 from skysim.world.vehicle import build as build

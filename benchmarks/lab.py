@@ -1,0 +1,122 @@
+"""The lab's page in Chromium: frames a second while a key is held, and from a key to the picture on the screen.
+
+`python -m benchmarks.lab [SECONDS]` serves shefex2 with a chip of 1024 x 1024, every frame identified, and prints both
+for a screen of 1280 x 800 and one of 1920 x 1080. A browser without a graphics card draws on the cores that make the
+frames.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+import urllib.request
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+SCENE = """base: shefex2
+title: SHEFEX-2 with a square megapixel
+camera: {width_px: 1024, height_px: 1024}
+"""
+SIZES = ((1280, 800), (1920, 1080))
+PRESSES = 30
+BROWSERS = ("chromium", "chromium-browser", "google-chrome")
+LOADS = """() => { window.came = [];
+ document.querySelector('.lab-frame img').addEventListener('load', () => window.came.push(performance.now())); }"""
+
+
+@contextmanager
+def served(name: str) -> Iterator[str]:
+    """A server of a scene, and its address."""
+    with tempfile.TemporaryDirectory() as folder, socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+        free.close()
+        command = [sys.executable, "-m", "skysim", "lab", name, "--no-open", "--port", str(port)]
+        server = subprocess.Popen([*command, "--out", folder], start_new_session=True)
+        try:
+            yield reached(f"http://127.0.0.1:{port}/")
+        finally:
+            os.killpg(server.pid, signal.SIGTERM)
+            server.wait(10)
+
+
+def reached(url: str) -> str:
+    """The address, once somebody answers there."""
+    for _ in range(600):
+        try:
+            urllib.request.urlopen(url, timeout=2).read()
+            return url
+        except OSError:
+            time.sleep(0.1)
+    raise TimeoutError(url)
+
+
+def held(page: Any, seconds: float) -> float:
+    """Frames a second while an arrow is held."""
+    page.evaluate("() => { window.came = [] }")
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        page.keyboard.down("ArrowLeft")
+        time.sleep(0.03)  # as keyboards repeat
+    page.keyboard.up("ArrowLeft")
+    return float(page.evaluate("window.came.length")) / seconds
+
+
+def delays_ms(page: Any) -> np.ndarray:
+    """From each of some presses to the next picture."""
+    found = []
+    for _ in range(PRESSES):
+        before = page.evaluate("window.came.length")
+        begin = page.evaluate("performance.now()")
+        page.keyboard.press("ArrowRight")
+        page.wait_for_function(f"window.came.length > {before}", polling=5)
+        found.append(page.evaluate(f"window.came[{before}]") - begin)
+        page.wait_for_timeout(150)
+    return np.array(found)
+
+
+def main(seconds: float) -> None:
+    """Print both figures at each size."""
+    from playwright.sync_api import sync_playwright
+
+    print(f"{'screen':12s} frames/s   key to picture: median, 90 %, ms   (bars: 15; 100)")
+    with tempfile.TemporaryDirectory() as folder:
+        scene = Path(folder) / "square.yaml"
+        scene.write_text(SCENE)
+        with served(str(scene)) as url, sync_playwright() as driver:
+            measured(driver, url, seconds)
+
+
+def measured(driver: Any, url: str, seconds: float) -> None:
+    """A line a size of screen."""
+    browser = driver.chromium.launch(executable_path=chromium(), args=["--no-sandbox"])
+    for width, height in SIZES:
+        page = browser.new_page(viewport={"width": width, "height": height})
+        page.goto(url)
+        page.locator(".lab-card .good").wait_for(timeout=90_000)
+        page.wait_for_timeout(8000)  # the server begins the next tab's worker
+        page.evaluate(LOADS)
+        rate, late = held(page, seconds), delays_ms(page)
+        middle, most = np.quantile(late, [0.5, 0.9])
+        print(f"{width} x {height:<6d} {rate:8.1f}   {middle:15.0f} {most:8.0f}", flush=True)
+        page.close()
+    browser.close()
+
+
+def chromium() -> str:
+    """The browser. Raises StopIteration where there is none."""
+    return next(path for name in BROWSERS if (path := shutil.which(name)))
+
+
+if __name__ == "__main__":
+    main(float((sys.argv[1:] or ["6"])[0]))

@@ -1,0 +1,203 @@
+"""What a tab's worker has before it: one scene's lab and tracker, and the attitude that it is looked at from."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from estimator.dometracker import DomeTracker
+from estimator.nearfield import project
+from estimator.stages import Clock, Report
+from estimator.types import Attitude
+from skysim import metrics, onboard, quaternion, score, simulate
+from skysim.lab import picture, pose, stage
+from skysim.lab.views import Answer, Light, Setting, Spot, Triple, View, Zoom
+from skysim.quantity import ARCSEC_RAD
+from skysim.scene import Scene, Stars, load
+from skysim.types import Floats, Frame, Trajectory, Truth
+
+STAGES = ("detector", "centroider", "identifier", "solver")
+
+
+@dataclass
+class Desk:
+    """A scene set up.
+
+    stretch, bright : how frames are shown;  shots : how many were taken, each with noise of its own
+    """
+
+    scene: Scene
+    lab: simulate.Lab
+    estimator: onboard.Estimator
+    lab_from_body: Rotation
+    stretch: str = "square root"
+    bright: float = 1.0
+    shots: int = 0
+    frame: Frame | None = None
+    truth: Truth | None = None
+    report: Report | None = None
+    magnitude: dict[int, float] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, name: str, overrides: Mapping[str, str], before: Desk | None = None) -> Desk:
+        """Raises BadInput. Where the desk before differs in the tracker alone, its hardware and attitude stay."""
+        scene = load(name, overrides)
+        if before and before.scene.model_copy(update={"tracker": scene.tracker}) == scene:
+            lab = replace(before.lab, scene=scene)
+            return replace(before, scene=scene, lab=lab, estimator=simulate.tracker(lab))
+        lab = simulate.furnish(scene)
+        magnitude = dict(zip(lab.sources.id.tolist(), lab.sources.magnitude.tolist(), strict=True))
+        here = lab.trajectory.lab_from_body[0]
+        desk = cls(scene, lab, simulate.tracker(lab), here, magnitude=magnitude)
+        return replace(desk, stretch=before.stretch, bright=before.bright) if before else desk
+
+    @property
+    def setting(self) -> Setting:
+        """What the page has to know of the scene."""
+        scene, settings = self.scene, onboard.believed_settings(self.scene)
+        camera = scene.camera
+        return Setting(
+            scene.name,
+            scene.title,
+            isinstance(scene.light, Stars),
+            score.angle_names(scene),
+            "HIP" if not np.isnan(self.lab.sources.magnitude).all() else "LED",
+            2 * math.degrees(math.atan(camera.width_px / 2 / camera.focal_px)),
+            {name: getattr(settings, name) for name in STAGES},
+            onboard.choices(scene),
+            bool(scene.motion.manoeuvre or any(scene.motion.rate_deg_s)),
+            self.lab.flown_s,
+            stage.of(self.lab),
+        )
+
+    def point(self, angles_deg: Triple) -> None:
+        """Look there."""
+        self.lab_from_body = pose.from_angles(self.scene, self.lab.mount, angles_deg)
+
+    def move(self, right: float, up: float, roll_deg: float) -> None:
+        """Look a little aside."""
+        self.lab_from_body = pose.moved(self.scene, self.lab.mount, self.lab_from_body, right, up, roll_deg)
+
+    def look(self, solve: bool = False) -> View:
+        """A frame from here, every one with noise of its own."""
+        self.shots += 1
+        scene = self.scene.model_copy(update={"seed": self.scene.seed + self.shots})
+        when = simulate.window(scene, 0)
+        end_s = when.close_s(scene.camera.height_px) + simulate.SPARE_S
+        here = Rotation.concatenate([self.lab_from_body, self.lab_from_body])
+        still = Trajectory(np.array([0.0, end_s]), here, np.zeros((2, 3)))
+        return self.shown(replace(self.lab, scene=scene, trajectory=still), solve)
+
+    def shown(self, lab: simulate.Lab, solve: bool) -> View:
+        """Frame 0 of a lab, solved if that is asked for, as the page shows it."""
+        clock = Clock()
+        self.frame, self.truth = simulate.shoot(lab, 0)
+        self.report = onboard.answer(self.estimator, self.frame) if solve else None
+        grey = picture.stretched(self.frame.image_dn, self.stretch, self.bright)
+        packed = picture.jpeg(grey)
+        clock.lap("all")
+        return View(
+            packed,
+            (grey.shape[1], grey.shape[0]),
+            score.angles_deg(self.truth.cam_from_lab, self.scene, self.lab.mount),
+            tuple(quaternion.of(self.truth.lab_from_body).tolist()),
+            self.frame.exposure_s,
+            self.lights(),
+            self.answered(self.report, self.truth) if self.report else None,
+            1e3 * clock.seconds["all"],
+        )
+
+    def again(self) -> bytes:
+        """The same frame, shown otherwise."""
+        return (
+            picture.jpeg(picture.stretched(self.frame.image_dn, self.stretch, self.bright))
+            if self.frame
+            else b""
+        )
+
+    def lights(self) -> tuple[Light, ...]:
+        """The true lights of the frame, the brightest first."""
+        assert self.truth is not None
+        seen = self.truth.seen
+        rows = np.argsort(-seen.electrons)
+        told = zip(
+            seen.id[rows].tolist(), seen.flux_xy_px[rows].tolist(), seen.electrons[rows].tolist(), strict=True
+        )
+        return tuple(Light(id, x, y, e, self.magnitude.get(id, math.nan)) for id, (x, y), e in told)
+
+    def answered(self, report: Report, truth: Truth) -> Answer:
+        """The tracker's report beside the truth."""
+        told, ms = report.attitude, 1e3 * sum(report.seconds.values())
+        spots = spots_of(report, named(self.estimator, told, report.centroids.xy_px))
+        if told.cam_from_ref is None:
+            return Answer(told.status, spots, ms)
+        cross, roll = metrics.cross_and_roll_rad(told.cam_from_ref, truth.cam_from_lab)
+        return Answer(
+            told.status,
+            spots,
+            ms,
+            score.angles_deg(told.cam_from_ref, self.scene, self.lab.mount),
+            cross / ARCSEC_RAD,
+            roll / ARCSEC_RAD,
+            claimed_arcsec(told),
+            metrics.is_wrong(told.cam_from_ref, truth.cam_from_lab),
+            windows(self.estimator, told.cam_from_ref),
+        )
+
+    def zoom(self, x: float, y: float, half: int = 6) -> Zoom:
+        """The pixels around one of the newest frame."""
+        assert self.frame is not None
+        image = self.frame.image_dn
+        height, width = image.shape
+        x0 = min(max(round(x) - half, 0), max(width - 2 * half - 1, 0))
+        y0 = min(max(round(y) - half, 0), max(height - 2 * half - 1, 0))
+        part = np.rint(image[y0 : y0 + 2 * half + 1, x0 : x0 + 2 * half + 1]).astype(int)
+        return Zoom(x0, y0, tuple(map(tuple, part.tolist())))
+
+
+def spots_of(report: Report, names: Mapping[int, tuple[int, float]]) -> tuple[Spot, ...]:
+    """What was seen, with the names that were given."""
+    seen = report.centroids
+    rows = zip(seen.xy_px.tolist(), seen.sigma_px.tolist(), seen.flux.tolist(), strict=True)
+    return tuple(
+        Spot(x, y, sigma, flux, *names.get(n, (-1, math.nan))) for n, ((x, y), sigma, flux) in enumerate(rows)
+    )
+
+
+def claimed_arcsec(told: Attitude) -> tuple[float, float]:
+    """What the tracker claims of its error, across the boresight and about it."""
+    if told.covariance_rad2 is None:
+        return math.nan, math.nan
+    variance = np.diag(told.covariance_rad2)
+    return float(np.sqrt(variance[:2].sum())) / ARCSEC_RAD, float(np.sqrt(variance[2])) / ARCSEC_RAD
+
+
+def predicted(estimator: onboard.Estimator, cam_from_ref: Rotation) -> tuple[NDArray[np.int64], Floats]:
+    """(N,) ids and (N, 2) pixels of all lights on the tracker's map, as the camera would see them from there."""
+    if isinstance(estimator, DomeTracker):
+        body_from_lab = estimator.lever.cam_from_body.inv() * cam_from_ref
+        places = estimator.leds.position_m
+        return estimator.leds.id, project(body_from_lab, places, estimator.lever, estimator.camera)
+    return estimator.stars.id, estimator.camera.pixels(cam_from_ref.apply(estimator.stars.vectors))
+
+
+def named(estimator: onboard.Estimator, told: Attitude, xy_px: Floats) -> dict[int, tuple[int, float]]:
+    """By a centroid's row the light that it is, and how far from where the answer would have it, in pixels."""
+    if told.match is None or told.cam_from_ref is None:
+        return {}
+    ids, where = predicted(estimator, told.cam_from_ref)
+    rows, star = told.match.observed, told.match.star
+    off = np.hypot(*(where[star] - xy_px[rows]).T)
+    return dict(zip(rows.tolist(), zip(ids[star].tolist(), off.tolist(), strict=True), strict=True))
+
+
+def windows(estimator: onboard.Estimator, cam_from_ref: Rotation) -> tuple[tuple[float, float], ...]:
+    """Where a tracker that follows would look for its lights in the next frame."""
+    _, xy_px = predicted(estimator, cam_from_ref)
+    inside = estimator.camera.contains(np.nan_to_num(xy_px, nan=-1e9))
+    return tuple((float(x), float(y)) for x, y in xy_px[inside][:200])

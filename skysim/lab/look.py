@@ -1,0 +1,69 @@
+"""How the page looks: dark, quiet, aligned. Sizes that would make it jump are fixed here."""
+
+from __future__ import annotations
+
+INK = {
+    **{"ground": "#0d1015", "panel": "#141922", "line": "#252c38", "text": "#d7dce4", "quiet": "#8b95a5"},
+    **{"accent": "#5aa9ff", "good": "#63c174", "warn": "#f0b429", "bad": "#ff6b6b"},
+}
+CURVES = ["#5aa9ff", "#f0b429", "#63c174", "#ff6b6b", "#b48ead", "#88c0d0", "#b48ead", "#88c0d0"]
+
+CSS = f"""
+:root {{ --nicegui-default-padding: 0; --nicegui-default-gap: 0 }}
+body {{ background: {INK["ground"]} !important; color: {INK["text"]}; font: 13px/1.45 Inter, system-ui, sans-serif }}
+.nicegui-content {{ padding: 0; gap: 0; height: 100vh; overflow: hidden }}
+.lab {{ display: grid; width: 100vw; height: 100vh; grid-template-rows: 44px minmax(0, 1fr) 30px;
+  grid-template-columns: minmax(0, 1fr) clamp(430px, 36vw, 660px);
+  grid-template-areas: "head head" "sensor side" "keys keys" }}
+.lab-head {{ grid-area: head }} .lab-sensor {{ grid-area: sensor }} .lab-side {{ grid-area: side }}
+.lab-keys {{ grid-area: keys }}
+.lab-head, .lab-keys {{ display: flex; align-items: center; gap: 14px; padding: 0 14px; background: {INK["panel"]};
+  border: 0 solid {INK["line"]} }}
+.lab-head {{ border-bottom-width: 1px }} .lab-keys {{ border-top-width: 1px; gap: 18px; overflow: hidden;
+  white-space: nowrap; color: {INK["quiet"]}; font-size: 12px }}
+.lab-keys kbd {{ background: {INK["line"]}; color: {INK["text"]}; border-radius: 3px; padding: 1px 5px;
+  font: 11px ui-monospace, monospace; margin-right: 5px }}
+.lab-sensor {{ display: grid; grid-template-rows: 40px minmax(0, 1fr) 176px; min-width: 0; min-height: 0 }}
+.lab-bar {{ display: flex; align-items: center; gap: 14px; padding: 0 14px; min-width: 0; overflow: hidden }}
+.lab-frame {{ display: flex; align-items: center; justify-content: center; min-height: 0; min-width: 0; padding: 0 14px;
+  container-type: size }}
+.lab-frame > * {{ background: #000; outline: 1px solid {INK["line"]}; image-rendering: pixelated }}
+.lab-under {{ display: grid; grid-template-columns: 176px minmax(0, 1fr); gap: 14px; padding: 8px 14px; min-height: 0 }}
+.lab-side {{ display: grid; grid-template-rows: auto auto minmax(0, 1fr); border-left: 1px solid {INK["line"]};
+  min-height: 0; min-width: 0; background: {INK["panel"]} }}
+.lab-card {{ padding: 10px 14px; border-bottom: 1px solid {INK["line"]}; width: 100% }}
+.lab-panels {{ min-height: 0; overflow: hidden; background: transparent !important }}
+.lab-panels .q-tab-panel {{ padding: 10px 14px; height: 100%; overflow: auto }}
+.mono {{ font: 12.5px/1.6 ui-monospace, SFMono-Regular, Menlo, monospace; font-variant-numeric: tabular-nums;
+  white-space: pre }}
+.quiet {{ color: {INK["quiet"]} }} .good {{ color: {INK["good"]} }} .bad {{ color: {INK["bad"]} }}
+.warn {{ color: {INK["warn"]} }}
+.lab-grid {{ display: grid; grid-template-columns: 84px repeat(3, minmax(0, 1fr)); gap: 2px 10px; align-items: center }}
+.lab-grid .num {{ text-align: right }}
+.q-field--dense .q-field__control, .q-field--dense .q-field__marginal {{ height: 32px; min-height: 32px }}
+.q-field--dense .q-field__native, .q-field--dense .q-field__input {{ min-height: 32px; padding: 2px 0;
+  font-size: 12.5px }}
+.q-field--labeled.q-field--dense .q-field__control, .q-field--labeled.q-field--dense .q-field__marginal {{
+  height: 42px; min-height: 42px }}
+.q-field--labeled.q-field--dense .q-field__native, .q-field--labeled.q-field--dense .q-field__input {{
+  min-height: 42px; padding: 16px 0 2px }}
+.q-select.q-field--dense.q-field--labeled .q-field__native {{ padding: 16px 0 0; min-height: 0 }}
+.q-select.q-field--dense .q-field__native {{ flex-wrap: nowrap; overflow: hidden }}
+.q-select.q-field--dense .q-field__native > span {{ overflow: hidden; text-overflow: ellipsis; white-space: nowrap }}
+.q-select .q-select__focus-target {{ min-height: 0 !important; height: 1px; padding: 0 !important }}
+.q-field__suffix {{ font-size: 12px; opacity: .7 }} .q-field__messages {{ font-size: 12px; line-height: 1.35 }}
+.q-field--dense .q-field__native > span {{ font-size: 12.5px; line-height: 20px }}
+.q-field--dense .q-field__label {{ font-size: 12px; top: 11px }}
+.q-field--dense.q-field--float .q-field__label {{ transform: translateY(-38%) scale(.85) }}
+.lab-stages {{ display: grid; grid-template-columns: repeat(4, minmax(0, 1fr)); gap: 8px }}
+.lab-stages .q-field__control {{ padding: 0 2px 0 8px }} .lab-stages .q-field__append {{ padding: 0 }}
+.q-select.q-field--dense.q-field--labeled .q-field__native > span {{ margin-top: -12px }}
+.lab-trial .q-field__control {{ padding: 0 4px 0 8px }} .lab-panels .q-btn {{ padding: 2px 8px }}
+.lab-panels .q-uploader__header {{ background: {INK["line"]} }}
+.q-field--dense .q-field__suffix {{ align-self: center; padding: 0 }}
+.lab-trial {{ display: grid; grid-template-columns: 1fr 1.5fr 1fr .8fr 1.2fr; gap: 8px; margin: 8px 0 }}
+.q-tab {{ min-height: 34px; padding: 0 12px; text-transform: none }} .q-tabs {{ min-height: 34px }}
+.q-btn {{ text-transform: none }}
+:focus-visible {{ outline: 2px solid {INK["accent"]}; outline-offset: 1px }}
+.empty {{ color: {INK["quiet"]}; padding: 28px 8px; text-align: center; line-height: 1.6 }}
+"""

@@ -1,0 +1,91 @@
+"""A picture of the user's own: dropped, or from a live camera; solved, annotated, or refused with the reason."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from nicegui import ui
+
+from skysim.lab.photo import SUFFIXES, Photo
+
+if TYPE_CHECKING:
+    from skysim.lab.page import Tab
+
+LIMIT_BYTES = 64 * 2**20
+
+
+class PhotoPanel:
+    """Drop, look, read."""
+
+    def __init__(self, tab: Tab) -> None:
+        self.tab, self.live = tab, False
+        self.fov = ui.number("field of view, deg (empty: 5 to 40 are tried)", min=1, max=120)
+        self.fov.props("dense outlined clearable").classes("w-full").mark("fov")
+        self.upload = ui.upload(
+            label="Drop a FITS, PNG, JPEG, TIFF or BMP here",
+            auto_upload=True,
+            max_file_size=LIMIT_BYTES,
+            on_upload=self.dropped,
+            on_rejected=lambda: tab.say(f"not taken: allowed: {', '.join(SUFFIXES)}, at most 64 MB"),
+        )
+        self.upload.props(f'flat bordered accept="{",".join(SUFFIXES)}"').classes("w-full").style(
+            "margin: 10px 0"
+        )
+        self.upload.mark("upload")
+        with ui.row().classes("w-full no-wrap items-center gap-2"):
+            self.source = (
+                ui.input("live camera: index, file or address").props("dense outlined").classes("flex-grow")
+            )
+            self.button = ui.button("Look", on_click=self.watch).props("dense outline size=sm").mark("camera")
+        self.facts = (
+            ui.label(
+                "No picture yet. It is solved without being told where it looks; a wrong answer is worse "
+                "than none, so it may be refused."
+            )
+            .classes("quiet")
+            .style("margin-top: 10px; white-space: pre-wrap")
+        )
+        self.facts.mark("facts")
+
+    async def dropped(self, event: Any) -> None:
+        """A file has come."""
+        data = await event.file.read()
+        name = str(event.file.name)
+        self.upload.reset()
+        if len(data) > LIMIT_BYTES:
+            self.tab.say(f"{name}: larger than 64 MB")
+            return
+        self.facts.set_text(f"solving {name} …")
+        self.show(name, await self.tab.ask("solve_file", name, data, self.fov.value, {}))
+
+    async def watch(self) -> None:
+        """Frame after frame of a live camera, until pressed again."""
+        if self.live:
+            self.live = False
+            return
+        self.live = True
+        self.button.set_text("Stop")
+        while self.live and self.tab.open_still:
+            photo = await self.tab.ask("solve_camera", (self.source.value or "0").strip(), self.fov.value, {})
+            self.show("camera", photo)
+            self.live = self.live and photo is not None
+        self.button.set_text("Look")
+
+    def show(self, name: str, photo: Photo | None) -> None:
+        """The picture with its marks, and the numbers."""
+        if photo is None:
+            self.facts.set_text(f"{name}: {self.tab.said}")
+            return
+        self.tab.sensor.show_photo(photo.jpeg, photo.size_px, photo.answer)
+        self.tab.attitude.tell(photo.answer)
+        self.tab.log(f"{name}: {photo.answer.status}")
+        facts = photo.facts
+        lines = [f"{name}: {photo.answer.status}"]
+        if facts:
+            lines += [
+                f"RA {facts['ra_deg']:.4f}°  Dec {facts['dec_deg']:+.4f}°  roll {facts['roll_deg']:.3f}°"
+            ]
+            lines += [
+                f"field {facts['fov_deg']:.3f}°  {facts['matches']} stars  rms {facts['rms_arcsec']:.1f}″"
+            ]
+        self.facts.set_text("\n".join(lines))

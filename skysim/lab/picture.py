@@ -1,0 +1,36 @@
+"""A frame for the eye: stretched by a table, packed as JPEG."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Stretch = Literal["square root", "linear", "logarithm"]
+CURVES: dict[str, Any] = {
+    "square root": np.sqrt,
+    "linear": lambda share: share,
+    "logarithm": lambda share: np.log1p(200 * share) / np.log1p(200),
+}
+SAMPLED = 8  # every so many rows and columns tell the sky
+
+
+def stretched(image: NDArray, curve: str, bright: float = 1.0) -> NDArray[np.uint8]:
+    """(H, W) of 8 bits, from the sky to near the brightest pixel.
+
+    bright : how much brighter than usual faint light is shown
+    """
+    low, high = np.percentile(image[::SAMPLED, ::SAMPLED], (30, 99.9))
+    top = max(float(high), float(image.max()) * 0.25) / bright
+    top = max(top, low + 1.0)
+    if image.dtype != np.uint16:
+        return (255 * CURVES[curve](np.clip((image - low) / (top - low), 0, 1))).astype(np.uint8)
+    levels = np.arange(int(image.max()) + 1)
+    return (255 * CURVES[curve](np.clip((levels - low) / (top - low), 0, 1))).astype(np.uint8)[image]
+
+
+def jpeg(grey: NDArray[np.uint8]) -> bytes:
+    """Packed for the way to the browser."""
+    return bytes(cv2.imencode(".jpg", grey, [cv2.IMWRITE_JPEG_QUALITY, 88])[1])

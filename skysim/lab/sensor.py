@@ -1,0 +1,159 @@
+"""The sensor view: the newest frame with its marks, a star's pixels enlarged, what the mouse is over."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from typing import TYPE_CHECKING, Any
+
+from nicegui import ui
+
+from skysim.lab import overlay
+from skysim.lab.look import INK
+from skysim.lab.starnames import NAMES
+from skysim.lab.views import Answer, Light, Spot, View
+
+if TYPE_CHECKING:
+    from skysim.lab.page import Tab
+
+ZOOM_PX = 160  # side of the enlarged pixels on the screen
+STRETCHES = ["square root", "linear", "logarithm"]
+NUMBER = itertools.count(1)  # of frames, so that each has an address of its own
+FRAMES: dict[str, bytes] = {}  # by tab, the newest
+
+
+class Sensor:
+    """The view and its controls. What is shown is a look of the scene or a picture of the user's."""
+
+    def __init__(self, tab: Tab) -> None:
+        self.tab = tab
+        self.shown = {"truth", "identified", "false"}
+        self.lights: tuple[Light, ...] = ()
+        self.answer: Answer | None = None
+        self.size_px = (4, 3)
+        self.sent = self.came = 0
+        with ui.element("div").classes("lab-sensor"):
+            self.bar()
+            with ui.element("div").classes("lab-frame"):
+                self.image = ui.interactive_image(sanitize=False).mark("sensor")
+                self.image.props('alt="Sensor view"').props["events"] = ["click", "mousemove"]
+                self.image.on("mouse", self.mouse, throttle=0.06)
+                self.image.on("loaded", self.loaded, args=["source"])
+            with ui.element("div").classes("lab-under"):
+                self.magnified = ui.html(sanitize=False).classes("quiet").mark("zoom")
+                self.hover = ui.label().classes("mono").mark("hover")
+        self.rest()
+
+    def bar(self) -> None:
+        """Overlays, stretch, brightness."""
+        with ui.element("div").classes("lab-bar"):
+            for kind in overlay.KINDS:
+                box = ui.checkbox(kind, value=kind in self.shown).props("dense size=xs")
+                box.style(f"color: {overlay.INK[kind]}").mark(f"overlay-{kind}")
+                box.on_value_change(lambda event, kind=kind: self.toggle(kind, event.value))
+            ui.space()
+            self.stretch = ui.select(STRETCHES, value=STRETCHES[0], on_change=self.restretch)
+            self.stretch.props('dense borderless options-dense aria-label="Stretch"').classes("w-28")
+            self.bright = ui.slider(min=-2, max=4, step=0.25, value=0).props('dense aria-label="Brightness"')
+            self.bright.classes("w-24").on("change", self.restretch)
+
+    def rest(self) -> None:
+        """Nothing enlarged, nothing under the mouse."""
+        side = f"width:{ZOOM_PX}px;height:{ZOOM_PX}px"
+        look = (
+            f"{side};border:1px dashed {INK['line']};display:flex;align-items:center;justify-content:center"
+        )
+        self.magnified.set_content(f'<div style="{look}"><span>click a star</span></div>')
+        self.hover.set_text("")
+
+    def toggle(self, kind: str, on: bool) -> None:
+        self.shown = self.shown | {kind} if on else self.shown - {kind}
+        self.mark()
+
+    async def restretch(self) -> None:
+        """Show the same frame otherwise."""
+        data = await self.tab.ask("show", self.stretch.value, 2.0 ** float(self.bright.value))
+        if data:
+            self.picture(data, self.size_px)
+
+    def picture(self, data: bytes, size_px: tuple[int, int]) -> None:
+        """Put an image on the screen, as large as there is room for it."""
+        if size_px != self.size_px:
+            share = size_px[0] / size_px[1]
+            self.image.style(f"width: min(100cqw, calc(100cqh * {share:.5f})); height: auto")
+        self.size_px = size_px
+        FRAMES[self.tab.id] = data
+        self.sent = next(NUMBER)
+        self.image.set_source(f"/frame/{self.tab.id}/{self.sent}")
+
+    def loaded(self, event: Any) -> None:
+        """The browser has drawn a frame: now its marks, which would else stand over the frame before."""
+        self.came = int(event.args["source"].rpartition("/")[2])
+        self.mark()
+
+    @property
+    def waiting(self) -> bool:
+        """Whether the newest frame is still on its way."""
+        return self.came < self.sent
+
+    def show(self, view: View) -> None:
+        """A look at the scene."""
+        self.lights, self.answer = view.lights, view.answer
+        self.picture(view.jpeg, view.size_px)
+
+    def show_photo(self, data: bytes, size_px: tuple[int, int], answer: Answer) -> None:
+        """A picture of the user's: no truth is known of it."""
+        self.lights, self.answer = (), answer
+        self.picture(data, size_px)
+
+    def mark(self) -> None:
+        """Draw the marks anew. A picture may come smaller than it is; marks are in the pixels that came."""
+        marks = overlay.svg(self.lights, self.answer, self.size_px[0], self.shown, self.name)
+        self.image.set_content(marks)
+
+    def name(self, id: int) -> str:
+        """A light by its name."""
+        prefix = self.tab.setting.prefix if self.tab.setting else "HIP"
+        return NAMES.get(id, f"HIP {id}") if prefix == "HIP" else f"{prefix} {id}"
+
+    async def mouse(self, event: Any) -> None:
+        """Tell what is under the mouse; a click enlarges it."""
+        x, y = event.args.get("image_x", 0.0) - 0.5, event.args.get("image_y", 0.0) - 0.5
+        spot, light = self.nearest(x, y)
+        self.hover.set_text(self.told(x, y, spot, light))
+        if event.args.get("mouse_event_type") != "click" or not self.tab.setting:
+            return
+        middle = spot or light
+        zoom = await self.tab.ask("zoom", middle.x if middle else x, middle.y if middle else y)
+        if zoom:
+            spots = self.answer.spots if self.answer else ()
+            self.magnified.set_content(overlay.magnified(zoom.dn, spots, zoom.x, zoom.y, ZOOM_PX))
+
+    def nearest(self, x: float, y: float) -> tuple[Spot | None, Light | None]:
+        """What was seen there and what truly is, within a few marks' width."""
+        reach = max(8.0, self.size_px[0] / 60)
+
+        def off(one: Spot | Light) -> float:
+            return math.hypot(one.x - x, one.y - y)
+
+        spots = [spot for spot in (self.answer.spots if self.answer else ()) if off(spot) < reach]
+        lights = [light for light in self.lights if off(light) < reach]
+        return min(spots, key=off, default=None), min(lights, key=off, default=None)
+
+    def told(self, x: float, y: float, spot: Spot | None, light: Light | None) -> str:
+        """Pixel, true light, what the tracker made of it."""
+        lines = [f"pixel      {x:8.1f} {y:8.1f}"]
+        if light:
+            bright = "" if math.isnan(light.magnitude) else f"V {light.magnitude:.2f}  "
+            lines += [f"truth      {light.x:8.2f} {light.y:8.2f}   {self.name(light.id)}"]
+            lines += [f"           {bright}{light.electrons:.4g} e-"]
+        if spot:
+            who = self.name(spot.id) if spot.id >= 0 else "no name"
+            lines += [f"centroid   {spot.x:8.2f} {spot.y:8.2f} ± {spot.sigma_px:.3f} px   {who}"]
+            residual = "" if math.isnan(spot.residual_px) else f"   residual {spot.residual_px:.3f} px"
+            lines += [f"           flux {spot.flux:.4g}{residual}"]
+            if light:
+                lines += [
+                    f"           off the truth by {math.hypot(spot.x - light.x, spot.y - light.y):.3f} px"
+                ]
+        return "\n".join(lines)

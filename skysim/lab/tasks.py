@@ -1,0 +1,126 @@
+"""What a worker can be asked, by name. Each is given what the worker keeps between tasks, and how to tell progress."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from skysim.lab import export, photo
+from skysim.lab.desk import Desk
+from skysim.lab.flight import Flown
+from skysim.lab.views import FlightLog, Setting, Triple, View, Zoom
+from skysim.types import BadInput
+
+Watch = Callable[[float, float], None]
+
+
+@dataclass
+class Kept:
+    """Between tasks: the desk, and the flight that was flown on it.
+
+    watch : tells how far a long task is; raises Stopped where it is to end
+    """
+
+    watch: Watch
+    desk: Desk | None = None
+    flown: Flown | None = None
+    scene: str = ""
+    overrides: Mapping[str, str] | None = None
+
+    def ready(self) -> Desk:
+        """The desk, once a scene is set up."""
+        if self.desk is None:
+            raise BadInput("no scene is set up")
+        return self.desk
+
+
+class Stopped(Exception):
+    """The user has stopped a task."""
+
+
+def warm(_: Kept, scene: str) -> None:
+    """Do once what a tab will do, for nobody."""
+    Desk.of(scene, {}).look(solve=True)
+
+
+def open_scene(kept: Kept, scene: str, overrides: Mapping[str, str], solve: bool) -> tuple[Setting, View]:
+    """Set a scene up and look."""
+    kept.desk = Desk.of(scene, overrides, kept.desk)
+    kept.scene, kept.overrides, kept.flown = scene, dict(overrides), None
+    return kept.desk.setting, kept.desk.look(solve)
+
+
+def look(kept: Kept, solve: bool) -> View:
+    return kept.ready().look(solve)
+
+
+def point(kept: Kept, angles_deg: Triple, solve: bool) -> View:
+    kept.ready().point(angles_deg)
+    return look(kept, solve)
+
+
+def move(kept: Kept, right: float, up: float, roll_deg: float, solve: bool) -> View:
+    kept.ready().move(right, up, roll_deg)
+    return look(kept, solve)
+
+
+def show(kept: Kept, stretch: str, bright: float) -> bytes:
+    """The newest frame as JPEG, stretched otherwise."""
+    desk = kept.ready()
+    desk.stretch, desk.bright = stretch, bright
+    return desk.again()
+
+
+def zoom(kept: Kept, x: float, y: float) -> Zoom:
+    return kept.ready().zoom(x, y)
+
+
+def fly(kept: Kept) -> FlightLog:
+    """The whole flight, to be played."""
+    kept.flown = Flown.of(kept.ready(), kept.watch)
+    return kept.flown.curves
+
+
+def play(kept: Kept, t_s: float, solve: bool) -> View:
+    """A moment of the flight."""
+    if kept.flown is None:
+        raise BadInput("nothing was flown yet")
+    return kept.flown.at(kept.ready(), t_s, solve)
+
+
+def replay(kept: Kept, study: str, folder: str, trial: int) -> photo.Photo:
+    """A trial of a study again, as the page shows a picture."""
+    return photo.of_trial(study, Path(folder), trial)
+
+
+def export_files(kept: Kept) -> dict[str, bytes]:
+    return export.files(kept.ready(), kept.scene, dict(kept.overrides or {}))
+
+
+def solve_file(
+    kept: Kept, name: str, data: bytes, fov_deg: float | None, stages: dict[str, str]
+) -> photo.Photo:
+    return photo.of_file(name, data, fov_deg, stages)
+
+
+def solve_camera(kept: Kept, source: str, fov_deg: float | None, stages: dict[str, str]) -> photo.Photo:
+    return photo.of_camera(source, fov_deg, stages)
+
+
+TASKS: dict[str, Callable[..., Any]] = {
+    "warm": warm,
+    "open": open_scene,
+    "look": look,
+    "point": point,
+    "move": move,
+    "show": show,
+    "zoom": zoom,
+    "fly": fly,
+    "play": play,
+    "replay": replay,
+    "export": export_files,
+    "solve_file": solve_file,
+    "solve_camera": solve_camera,
+}
