@@ -147,11 +147,12 @@ def test_each_kind_of_mark_can_be_switched_off_and_stands_where_it_should() -> N
     answer = Answer("solved", SPOTS, 1.0, (0.0, 0.0, 0.0), windows_px=((50.0, 60.0),))
     drawn = {kind: overlay.svg(LIGHTS, answer, 130, {kind}, lambda id: f"<{id}>") for kind in overlay.KINDS}
     assert all(f'class="{kind}"' in text for kind, text in drawn.items())
-    assert drawn["truth"].count("<path") == 2
-    assert drawn["identified"].count("<circle") == 1
-    assert 'cx="10.6" cy="20.5"' in drawn["identified"]  # an integer is a pixel's centre
+    assert drawn["truth"].count("M") == 2 * 4
+    assert (
+        'd="M4.2 20.5a6.4' in drawn["identified"]
+    )  # an integer is a pixel's centre: 10.1 + 0.5 less 1.6 x 4
     assert "&lt;1&gt;" in drawn["identified"]
-    assert drawn["false"].count("<path") == 1
+    assert drawn["false"].count("M") == 2
     assert overlay.svg(LIGHTS, answer, 130, (), str) == ""
 
 

@@ -24,7 +24,10 @@ def svg(
     shown: Collection[str],
     name: Callable[[int], str],
 ) -> str:
-    """The marks of a look: truth ticked, detections squared, identified circled and named, false crossed, windows."""
+    """The marks of a look: truth ticked, detections squared, identified circled and named, false crossed, windows.
+
+    All marks of a kind are one path: a browser draws that several times as fast as an element a mark.
+    """
     size = max(4.0, width_px / 130)
     spots = answer.spots if answer else ()
     known = [spot for spot in spots if spot.id >= 0]
@@ -32,16 +35,25 @@ def svg(
         "windows": [box(x, y, 2.2 * size) for x, y in answer.windows_px] if answer else [],
         "truth": [ticks(light.x, light.y, size) for light in list(lights)[:MARKED]],
         "detected": [box(spot.x, spot.y, size) for spot in spots],
-        "identified": [circle(one, size, name(one.id) if n < NAMED else "") for n, one in enumerate(known)],
+        "identified": [circle(one.x, one.y, 1.6 * size) for one in known],
         "false": [cross(one.x, one.y, size) for one in false(spots, lights)],
     }
-    return "".join(group(kind, drawn[kind], size) for kind in KINDS if kind in shown and drawn[kind])
+    named = "".join(label(one, size, name(one.id)) for one in known[:NAMED])
+    return "".join(
+        group(kind, drawn[kind], size, named if kind == "identified" else "")
+        for kind in KINDS
+        if kind in shown and drawn[kind]
+    )
 
 
-def group(kind: str, marks: list[str], size: float) -> str:
+def group(kind: str, marks: list[str], size: float, named: str) -> str:
+    """The marks of a kind, and their names."""
     dashes = f' stroke-dasharray="{size / 2:.1f}"' if kind == "windows" else ""
     look = f'stroke="{INK[kind]}" fill="none" stroke-width="{size / 6:.2f}"{dashes}'
-    return f'<g class="{kind}" {look}>{"".join(marks)}</g>'
+    if not named:
+        return f'<path class="{kind}" {look} d="{"".join(marks)}"/>'
+    text = f'font-size="{1.8 * size:.1f}" fill="{INK[kind]}" font-family="monospace"'
+    return f'<g class="{kind}"><path {look} d="{"".join(marks)}"/><g {text}>{named}</g></g>'
 
 
 def false(spots: Collection[Spot], lights: Collection[Light]) -> list[Spot]:
@@ -60,28 +72,32 @@ def ticks(x: float, y: float, size: float) -> str:
     x, y, near, long = x + 0.5, y + 0.5, 0.6 * size, 0.6 * size
     far = near + long
     return (
-        f'<path d="M{x - far:.1f} {y:.1f}h{long:.1f}M{x + near:.1f} {y:.1f}h{long:.1f}'
-        f'M{x:.1f} {y - far:.1f}v{long:.1f}M{x:.1f} {y + near:.1f}v{long:.1f}"/>'
+        f"M{x - far:.1f} {y:.1f}h{long:.1f}M{x + near:.1f} {y:.1f}h{long:.1f}"
+        f"M{x:.1f} {y - far:.1f}v{long:.1f}M{x:.1f} {y + near:.1f}v{long:.1f}"
     )
 
 
 def box(x: float, y: float, half: float) -> str:
-    side = f"{2 * half:.1f}"
-    return f'<rect x="{x + 0.5 - half:.1f}" y="{y + 0.5 - half:.1f}" width="{side}" height="{side}"/>'
+    side = 2 * half
+    return f"M{x + 0.5 - half:.1f} {y + 0.5 - half:.1f}h{side:.1f}v{side:.1f}h{-side:.1f}z"
 
 
-def circle(spot: Spot, size: float, text: str) -> str:
-    x, y = spot.x + 0.5, spot.y + 0.5
-    drawn = f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{1.6 * size:.1f}"/>'
-    if not text:
-        return drawn
-    look = f'font-size="{1.8 * size:.1f}" stroke="none" fill="{INK["identified"]}" font-family="monospace"'
-    return f'{drawn}<text x="{x + 2 * size:.1f}" y="{y + 0.6 * size:.1f}" {look}>{escape(text)}</text>'
+def circle(x: float, y: float, radius: float) -> str:
+    """Two half circles."""
+    half = f"a{radius:.1f} {radius:.1f} 0 1 0"
+    return f"M{x + 0.5 - radius:.1f} {y + 0.5:.1f}{half} {2 * radius:.1f} 0{half} {-2 * radius:.1f} 0"
 
 
 def cross(x: float, y: float, size: float) -> str:
     x, y, side = x + 0.5 - size, y + 0.5 - size, 2 * size
-    return f'<path d="M{x:.1f} {y:.1f}l{side:.1f} {side:.1f}M{x:.1f} {y + side:.1f}l{side:.1f} {-side:.1f}"/>'
+    return f"M{x:.1f} {y:.1f}l{side:.1f} {side:.1f}M{x:.1f} {y + side:.1f}l{side:.1f} {-side:.1f}"
+
+
+def label(spot: Spot, size: float, text: str) -> str:
+    """A name beside its circle."""
+    return (
+        f'<text x="{spot.x + 0.5 + 2 * size:.1f}" y="{spot.y + 0.5 + 0.6 * size:.1f}">{escape(text)}</text>'
+    )
 
 
 def magnified(dn: tuple[tuple[int, ...], ...], spots: Collection[Spot], x0: int, y0: int, side: int) -> str:
