@@ -123,7 +123,7 @@ def furnish(scene: Scene) -> Lab:
         Chip.of(scene.camera),
         band,
         np.empty((scene.camera.height_px, scene.camera.width_px), kind),
-        Trajectory(np.array([0.0, 1.0]), Rotation.concatenate([start, start]), np.zeros((2, 3))),
+        Trajectory.at_rest(start, 1.0),
         obstacles(scene, ship),
     )
 

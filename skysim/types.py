@@ -41,6 +41,12 @@ class Trajectory:
     rate_body_rad_s: Floats
     _between: list[tuple[Floats, Floats]] = field(init=False, repr=False, default_factory=list)
 
+    @classmethod
+    def at_rest(cls, lab_from_body: Rotation, end_s: float) -> Trajectory:
+        """One attitude from 0 to end_s."""
+        both = Rotation.concatenate([lab_from_body, lab_from_body])
+        return cls(np.array([0.0, end_s]), both, np.zeros((2, 3)))
+
     def between(self) -> tuple[Floats, Floats]:
         """Attitudes (N, 4) as wxyz and (N - 1, 3, 3) what `quaternion.along` takes; worked out once, when asked."""
         if not self._between:

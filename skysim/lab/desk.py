@@ -89,8 +89,7 @@ class Desk:
         scene = self.scene.model_copy(update={"seed": self.scene.seed + self.shots})
         when = simulate.window(scene, 0)
         end_s = when.close_s(scene.camera.height_px) + simulate.SPARE_S
-        here = Rotation.concatenate([self.lab_from_body, self.lab_from_body])
-        still = Trajectory(np.array([0.0, end_s]), here, np.zeros((2, 3)))
+        still = Trajectory.at_rest(self.lab_from_body, end_s)
         return self.shown(replace(self.lab, scene=scene, trajectory=still), solve)
 
     def shown(self, lab: simulate.Lab, solve: bool) -> View:

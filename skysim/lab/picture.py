@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-Stretch = Literal["square root", "linear", "logarithm"]
 CURVES: dict[str, Any] = {
     "square root": np.sqrt,
     "linear": lambda share: share,

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from nicegui import ui
 
-from skysim.lab import overlay
+from skysim.lab import overlay, picture
 from skysim.lab.look import INK
 from skysim.lab.starnames import NAMES
 from skysim.lab.views import Answer, Light, Spot, View
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from skysim.lab.page import Tab
 
 ZOOM_PX = 160  # side of the enlarged pixels on the screen
-STRETCHES = ["square root", "linear", "logarithm"]
+STRETCHES = list(picture.CURVES)
 NUMBER = itertools.count(1)  # of frames, so that each has an address of its own
 FRAMES: dict[str, bytes] = {}  # by tab, the newest
 

@@ -4,19 +4,16 @@ from __future__ import annotations
 
 import asyncio
 import multiprocessing
-import os
 import signal
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from multiprocessing.connection import Connection
 from typing import Any
 
 from estimator.types import BadImage
 from skysim import BadInput
-from skysim.study.workers import one_thread
+from skysim.study.workers import environment, one_thread
 
-MOST_PX = 2**27  # of a picture that is unpacked
+CAREFUL = {"OPENCV_IO_MAX_IMAGE_PIXELS": str(2**27)}  # of a picture that is unpacked
 
 
 class Gone(Exception):
@@ -56,20 +53,6 @@ def serve(pipe: Connection, progress: Any, stop: Any) -> None:
             pipe.send(("bad", f"{type(error).__name__}: {error}"))
 
 
-@contextmanager
-def careful() -> Iterator[None]:
-    """An environment in which OpenCV takes no picture that unpacks to more than MOST_PX."""
-    name = "OPENCV_IO_MAX_IMAGE_PIXELS"
-    before = os.environ.get(name)
-    os.environ[name] = str(MOST_PX)
-    try:
-        yield
-    finally:
-        os.environ.pop(name)
-        if before is not None:
-            os.environ[name] = before
-
-
 class Session:
     """One tab's process. Calls stand in line; a `newest` call that waits is dropped for the one after it."""
 
@@ -78,7 +61,7 @@ class Session:
         self.pipe, theirs = context.Pipe()
         self.progress, self.stop = context.RawArray("d", 2), context.RawValue("b")
         self.process = context.Process(target=serve, args=(theirs, self.progress, self.stop), daemon=True)
-        with one_thread(), careful():
+        with one_thread(), environment(CAREFUL):
             self.process.start()
         theirs.close()
         self.thread = ThreadPoolExecutor(1, "lab")

@@ -73,8 +73,7 @@ def shot(lab: Lab, lab_from_body: Rotation, rng: np.random.Generator) -> tuple[F
     """A frame at an attitude that stands still, begun at a random moment of the LEDs' cycle."""
     scene = changed(lab.scene, "exposure", first_s=rng.uniform(0, MOST_PHASE_S))
     scene = scene.model_copy(update={"seed": int(rng.integers(2**62))})
-    rest = Rotation.concatenate([lab_from_body, lab_from_body])
-    path = Trajectory(np.array([0.0, MOST_PHASE_S + scene.exposure.time_s + 1]), rest, np.zeros((2, 3)))
+    path = Trajectory.at_rest(lab_from_body, MOST_PHASE_S + scene.exposure.time_s + 1)
     return simulate.shoot(replace(lab, scene=scene, trajectory=path), 0)
 
 

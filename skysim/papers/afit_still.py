@@ -69,8 +69,7 @@ def angles_deg(lab_from_body: Rotation) -> Floats:
 
 def held(lab: Lab, where: Rotation) -> Lab:
     """The lab whose vehicle stands still there for ever."""
-    ends_s = np.array([0.0, FOREVER_S])
-    return replace(lab, trajectory=Trajectory(ends_s, Rotation.concatenate([where, where]), np.zeros((2, 3))))
+    return replace(lab, trajectory=Trajectory.at_rest(where, FOREVER_S))
 
 
 def photographed(

@@ -11,6 +11,7 @@ from skysim.terminal import print_table, watched
 
 if TYPE_CHECKING:
     from skysim.papers.compare import Reproduction
+    from skysim.papers.page import Told
 
 INK = {"agrees": "green", "explained": "yellow", "disagrees": "bold red"}
 
@@ -49,17 +50,29 @@ def reproduce(
         if not json:
             show(done[-1])
     told = page.Told(tuple(ids), quick, seed)
-    if report:
-        page.write_html(io.make_folder(out) / "report.html", done, told)
-    if markdown:
-        io.make_folder(markdown.parent)
-        page.write_markdown(markdown, done, told)
+    written = pages(done, told, out if report else None, markdown)
     if json:
         print(io.to_json([line.as_dict() for one in done for line in one.lines]))
         return
     summed(done)
-    for path in [out / "report.html"] * report + [markdown] * bool(markdown):
+    for path in written:
         print(path)
+
+
+def pages(done: list[Reproduction], told: Told, out: Path | None, markdown: Path | None) -> list[Path]:
+    """The pages that were asked for, written: HTML in a folder, Markdown as a file."""
+    from skysim import io
+    from skysim.papers import page
+
+    written = []
+    if out:
+        written.append(io.make_folder(out) / "report.html")
+        page.write_html(written[-1], done, told)
+    if markdown:
+        io.make_folder(markdown.parent)
+        written.append(markdown)
+        page.write_markdown(markdown, done, told)
+    return written
 
 
 def listing(json: bool) -> None:

@@ -118,9 +118,7 @@ class Loop:
     def __init__(self, told: dict[str, str], lab_from_body: Rotation, start_ms: int = 10) -> None:
         control = {"tracker.exposure_control": f"{{mean_dn: {MEAN_DN}}}", "tracker.detector": "sequential"}
         scene = load("shefex2", control | told | at(start_ms) | {"tracker.brightest": str(MOST)})
-        still = Rotation.concatenate([lab_from_body, lab_from_body])
-        path = Trajectory(np.array([0.0, 100.0]), still, np.zeros((2, 3)))
-        self.lab = replace(simulate.furnish(scene), trajectory=path)
+        self.lab = replace(simulate.furnish(scene), trajectory=Trajectory.at_rest(lab_from_body, 100.0))
         self.meter, self.frames = onboard.Meter(scene), 0
 
     def take(self, glare_e_s: float = 0.0, planets: int = 0) -> float:
