@@ -31,7 +31,8 @@ SIZES = ((1280, 800), (1920, 1080))
 PRESSES = 30
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 LOADS = """() => { window.came = [];
- document.querySelector('.lab-frame img').addEventListener('load', () => window.came.push(performance.now())); }"""
+ new MutationObserver(() => window.came.push(performance.now())).observe(
+ document.querySelector('.lab-frame canvas'), {attributeFilter: ['data-frame']}); }"""
 
 
 @contextmanager

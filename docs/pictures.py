@@ -59,7 +59,7 @@ def pages() -> None:
         page.goto(url)
         page.locator(".lab-card .good").wait_for(timeout=90_000)
         page.wait_for_timeout(3000)  # the first look clears what was clicked before
-        box = page.locator(".lab-frame img").bounding_box()
+        box = page.locator(".lab-frame canvas").bounding_box()
         page.mouse.click(box["x"] + 0.71 * box["width"], box["y"] + 0.186 * box["height"])  # Bellatrix
         page.wait_for_timeout(3000)
         page.screenshot(path=DOCS / "lab_page.jpg", quality=85)

@@ -27,8 +27,7 @@ body {{ background: {INK["ground"]} !important; color: {INK["text"]}; font: 13px
 .lab-bar {{ display: flex; align-items: center; gap: 14px; padding: 0 14px; min-width: 0; overflow: hidden }}
 .lab-frame {{ display: flex; align-items: center; justify-content: center; min-height: 0; min-width: 0; padding: 0 14px;
   container-type: size }}
-.lab-frame > * {{ background: #000; outline: 1px solid {INK["line"]}; image-rendering: pixelated }}
-.lab-frame svg, .lab-frame img {{ will-change: transform }}
+.lab-frame > * {{ background: #000; outline: 1px solid {INK["line"]} }}
 .lab-under {{ display: grid; grid-template-columns: 176px minmax(0, 1fr); gap: 14px; padding: 8px 14px; min-height: 0 }}
 .lab-side {{ display: grid; grid-template-rows: auto auto minmax(0, 1fr); border-left: 1px solid {INK["line"]};
   min-height: 0; min-width: 0; background: {INK["panel"]} }}

@@ -1,9 +1,9 @@
-"""What is drawn over a frame, as SVG in the frame's pixels; every kind can be switched off."""
+"""What is drawn over a frame, as paths in the frame's pixels; every kind can be switched off."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping
-from html import escape
+from typing import Any
 
 from skysim.lab.views import Answer, Light, Spot
 
@@ -17,16 +17,16 @@ MARKED = 400  # true lights at most
 NEAR_PX = 4.0  # within which a spot is a true light's
 
 
-def svg(
+def marks(
     lights: Collection[Light],
     answer: Answer | None,
     width_px: int,
     shown: Collection[str],
     name: Callable[[int], str],
-) -> str:
+) -> list[dict[str, Any]]:
     """The marks of a look: truth ticked, detections squared, identified circled and named, false crossed, windows.
 
-    All marks of a kind are one path: a browser draws that several times as fast as an element a mark.
+    A kind is one path as SVG writes it, with what frame.js draws it by: ink, width, dash, font, names (x, y, text).
     """
     size = max(4.0, width_px / 130)
     spots = answer.spots if answer else ()
@@ -38,22 +38,16 @@ def svg(
         "identified": [circle(one.x, one.y, 1.6 * size) for one in known],
         "false": [cross(one.x, one.y, size) for one in false(spots, lights)],
     }
-    named = "".join(label(one, size, name(one.id)) for one in known[:NAMED])
-    return "".join(
-        group(kind, drawn[kind], size, named if kind == "identified" else "")
+    names = [label(one, size, name(one.id)) for one in known[:NAMED]]
+    return [
+        {
+            **{"kind": kind, "path": "".join(drawn[kind]), "names": names if kind == "identified" else []},
+            **{"ink": INK[kind], "width": round(size / 6, 2), "font": round(1.8 * size, 1)},
+            "dash": [round(size / 2, 1)] if kind == "windows" else [],
+        }
         for kind in KINDS
         if kind in shown and drawn[kind]
-    )
-
-
-def group(kind: str, marks: list[str], size: float, named: str) -> str:
-    """The marks of a kind, and their names."""
-    dashes = f' stroke-dasharray="{size / 2:.1f}"' if kind == "windows" else ""
-    look = f'stroke="{INK[kind]}" fill="none" stroke-width="{size / 6:.2f}"{dashes}'
-    if not named:
-        return f'<path class="{kind}" {look} d="{"".join(marks)}"/>'
-    text = f'font-size="{1.8 * size:.1f}" fill="{INK[kind]}" font-family="monospace"'
-    return f'<g class="{kind}"><path {look} d="{"".join(marks)}"/><g {text}>{named}</g></g>'
+    ]
 
 
 def false(spots: Collection[Spot], lights: Collection[Light]) -> list[Spot]:
@@ -93,11 +87,9 @@ def cross(x: float, y: float, size: float) -> str:
     return f"M{x:.1f} {y:.1f}l{side:.1f} {side:.1f}M{x:.1f} {y + side:.1f}l{side:.1f} {-side:.1f}"
 
 
-def label(spot: Spot, size: float, text: str) -> str:
+def label(spot: Spot, size: float, text: str) -> tuple[float, float, str]:
     """A name beside its circle."""
-    return (
-        f'<text x="{spot.x + 0.5 + 2 * size:.1f}" y="{spot.y + 0.5 + 0.6 * size:.1f}">{escape(text)}</text>'
-    )
+    return round(spot.x + 0.5 + 2 * size, 1), round(spot.y + 0.5 + 0.6 * size, 1), text
 
 
 def magnified(dn: tuple[tuple[int, ...], ...], spots: Collection[Spot], x0: int, y0: int, side: int) -> str:

@@ -9,6 +9,7 @@ from collections.abc import Awaitable, Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from nicegui import ui
 from nicegui.events import KeyEventArguments
 
@@ -36,6 +37,7 @@ class Tab:
     folder : where scenes are saved;  out : where studies are
     overrides : keys of the scene that differ from its file
     solving : whether every look is identified
+    steps : (3,) right, up, roll that keys have asked for and no frame shows yet
     """
 
     session: Session
@@ -48,6 +50,7 @@ class Tab:
         self.view: View | None = None
         self.feedback: str | None = None
         self.solving, self.open_still = True, True
+        self.steps, self.moving = np.zeros(3), False
         self.said = ""
         self.lines: list[str] = []
 
@@ -265,11 +268,25 @@ class Tab:
             right, up, turn = keys.MOVES[name]
             step = pose.COARSE if event.modifiers.shift else pose.FINE
             roll = pose.ROLL_COARSE_DEG if event.modifiers.shift else pose.ROLL_FINE_DEG
-            self.flight.playing = False
-            self.say("")
-            await self.show(self.session.newest("move", right * step, up * step, turn * roll, self.solving))
+            await self.move(right * step, up * step, turn * roll)
         elif not event.action.repeat:
             await self.act(action)
+
+    async def move(self, right: float, up: float, roll_deg: float) -> None:
+        """Move by this; what keys ask for while a frame is made is added up for the next."""
+        self.flight.playing = False
+        self.say("")
+        self.steps += (right, up, roll_deg)
+        if self.moving:
+            return
+        self.moving = True
+        try:
+            while self.steps.any():
+                steps, self.steps = self.steps.tolist(), np.zeros(3)
+                await self.show(self.session.ask("move", *steps, self.solving))
+                await self.sensor.ready()
+        finally:
+            self.moving = False
 
     async def act(self, action: str) -> None:
         """What the other keys do."""

@@ -129,7 +129,7 @@ class RunPanel:
         """The next moment, if the one before is on the screen."""
         if self.flying:
             self.bar.set_value(self.tab.session.share)
-        if self.playing and not self.busy and not self.tab.sensor.waiting:
+        if self.playing and not self.busy:
             await self.moment()
             if self.log.t_s and self.now_s >= self.log.t_s[-1]:
                 self.from_s, self.playing = self.log.t_s[-1], False
@@ -140,11 +140,12 @@ class RunPanel:
         self.busy = True
         try:
             now_s = self.now_s
-            view = await self.tab.show(self.tab.session.newest("play", now_s, self.tab.solving))
+            view = await self.tab.show(self.tab.session.ask("play", now_s, self.tab.solving))
             if view is not None:
                 self.seek.set_value(round(now_s, 2))
                 self.clock.set_text(f"{view.t_s:.2f} s")
                 self.gather(view)
+            await self.tab.sensor.ready()
         finally:
             self.busy = False
 

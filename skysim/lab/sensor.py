@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import itertools
 import math
 from typing import TYPE_CHECKING, Any
@@ -19,7 +20,13 @@ if TYPE_CHECKING:
 ZOOM_PX = 160  # side of the enlarged pixels on the screen
 STRETCHES = list(picture.CURVES)
 NUMBER = itertools.count(1)  # of frames, so that each has an address of its own
-FRAMES: dict[str, bytes] = {}  # by tab, the newest
+FRAMES: dict[str, dict[int, bytes]] = {}  # by tab and number, the newest few
+KEPT = 3
+PATIENCE_S = 1.0  # with a browser that does not tell what it has drawn
+
+
+class Canvas(ui.element, component="frame.js"):  # type: ignore[call-arg]
+    """A frame with its marks: frame.js."""
 
 
 class Sensor:
@@ -32,13 +39,13 @@ class Sensor:
         self.answer: Answer | None = None
         self.size_px = (4, 3)
         self.sent = self.came = 0
+        self.arrived = asyncio.Event()
         with ui.element("div").classes("lab-sensor"):
             self.bar()
             with ui.element("div").classes("lab-frame"):
-                self.image = ui.interactive_image(sanitize=False).mark("sensor")
-                self.image.props('alt="Sensor view"').props["events"] = ["click", "mousemove"]
-                self.image.on("mouse", self.mouse, throttle=0.06)
-                self.image.on("loaded", self.loaded, args=["source"])
+                self.canvas = Canvas().mark("sensor")
+                self.canvas.on("mouse", self.mouse, throttle=0.06)
+                self.canvas.on("drawn", self.drawn)
             with ui.element("div").classes("lab-under"):
                 self.magnified = ui.html(sanitize=False).classes("quiet").mark("zoom")
                 self.hover = ui.label().classes("mono").mark("hover")
@@ -80,21 +87,27 @@ class Sensor:
         """Put an image on the screen, as large as there is room for it."""
         if size_px != self.size_px:
             share = size_px[0] / size_px[1]
-            self.image.style(f"width: min(100cqw, calc(100cqh * {share:.5f})); height: auto")
+            self.canvas.style(f"width: min(100cqw, calc(100cqh * {share:.5f})); aspect-ratio: {share:.5f}")
         self.size_px = size_px
-        FRAMES[self.tab.id] = data
         self.sent = next(NUMBER)
-        self.image.set_source(f"/frame/{self.tab.id}/{self.sent}")
-
-    def loaded(self, event: Any) -> None:
-        """The browser has drawn a frame: now its marks, which would else stand over the frame before."""
-        self.came = int(event.args["source"].rpartition("/")[2])
+        kept = FRAMES.setdefault(self.tab.id, {})
+        kept[self.sent] = data
+        kept.pop(min(kept) if len(kept) > KEPT else -1, None)
         self.mark()
 
-    @property
-    def waiting(self) -> bool:
-        """Whether the newest frame is still on its way."""
-        return self.came < self.sent
+    def drawn(self, event: Any) -> None:
+        """The browser has drawn a frame."""
+        self.came = int(event.args["src"].rpartition("/")[2])
+        self.arrived.set()
+
+    async def ready(self) -> None:
+        """Wait until no more than one frame is on its way to the screen: more would but take the browser's time."""
+        while self.sent > self.came + 1:
+            self.arrived.clear()
+            try:
+                await asyncio.wait_for(self.arrived.wait(), PATIENCE_S)
+            except TimeoutError:
+                return
 
     def show(self, view: View) -> None:
         """A look at the scene."""
@@ -107,9 +120,19 @@ class Sensor:
         self.picture(data, size_px)
 
     def mark(self) -> None:
-        """Draw the marks anew. A picture may come smaller than it is; marks are in the pixels that came."""
-        marks = overlay.svg(self.lights, self.answer, self.size_px[0], self.shown, self.name)
-        self.image.set_content(marks)
+        """Draw the marks anew."""
+        self.canvas.props["look"] = {
+            "src": f"/frame/{self.tab.id}/{self.sent}",
+            "size": self.size_px,
+            "marks": overlay.marks(self.lights, self.answer, self.size_px[0], self.shown, self.name),
+            "label": self.words(),
+        }
+        self.canvas.update()
+
+    def words(self) -> str:
+        """The view for who does not see it."""
+        known = [self.name(spot.id) for spot in self.answer.spots if spot.id >= 0] if self.answer else []
+        return f"Sensor view: {len(self.lights)} true lights; named: {', '.join(known) or 'none'}"
 
     def name(self, id: int) -> str:
         """A light by its name."""
@@ -118,10 +141,10 @@ class Sensor:
 
     async def mouse(self, event: Any) -> None:
         """Tell what is under the mouse; a click enlarges it."""
-        x, y = event.args.get("image_x", 0.0) - 0.5, event.args.get("image_y", 0.0) - 0.5
+        x, y = event.args["x"] - 0.5, event.args["y"] - 0.5
         spot, light = self.nearest(x, y)
         self.hover.set_text(self.told(x, y, spot, light))
-        if event.args.get("mouse_event_type") != "click" or not self.tab.setting:
+        if event.args["kind"] != "click" or not self.tab.setting:
             return
         middle = spot or light
         zoom = await self.tab.ask("zoom", middle.x if middle else x, middle.y if middle else y)

@@ -98,10 +98,11 @@ def routes(scene: str, folder: Path, out: Path) -> None:
 
     @app.get("/frame/{tab}/{number}")
     def frame(tab: str, number: int) -> Response:
-        """The newest frame of a tab; the number makes each another address."""
-        if tab not in FRAMES:
+        """A frame of a tab, while it is among its newest."""
+        data = FRAMES.get(tab, {}).get(number)
+        if data is None:
             return Response(status_code=404)
-        return Response(FRAMES[tab], media_type="image/jpeg", headers={"Cache-Control": "no-store"})
+        return Response(data, media_type="image/jpeg", headers={"Cache-Control": "no-store"})
 
     @app.get("/report/{name}")
     def report(name: str) -> Response:

@@ -54,7 +54,7 @@ def serve(pipe: Connection, progress: Any, stop: Any) -> None:
 
 
 class Session:
-    """One tab's process. Calls stand in line; a `newest` call that waits is dropped for the one after it."""
+    """One tab's process. Calls stand in line."""
 
     def __init__(self) -> None:
         context = multiprocessing.get_context("spawn")
@@ -65,19 +65,10 @@ class Session:
             self.process.start()
         theirs.close()
         self.thread = ThreadPoolExecutor(1, "lab")
-        self.turn = 0
 
     async def ask(self, task: str, *arguments: Any) -> Any:
         """What a task answers. Raises BadInput for what the user got wrong, Gone where the worker is no more."""
         return await asyncio.get_running_loop().run_in_executor(self.thread, self.call, task, arguments)
-
-    async def newest(self, task: str, *arguments: Any) -> Any | None:
-        """The same, but None where another such call came while this one stood in line."""
-        self.turn += 1
-        mine = self.turn
-        return await asyncio.get_running_loop().run_in_executor(
-            self.thread, lambda: self.call(task, arguments) if mine == self.turn else None
-        )
 
     def call(self, task: str, arguments: tuple[Any, ...]) -> Any:
         """In the session's own thread: send, wait, receive."""

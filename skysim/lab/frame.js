@@ -1,0 +1,82 @@
+// A frame and its marks on one canvas: unpacked off the page's thread, drawn together, so that a mark never stands
+// over another frame than its own. An <img> beneath an <svg> took the browser twice as long.
+export default {
+  template: `<canvas role="img" @click="told" @mousemove="told"></canvas>`,
+  props: { look: Object }, // src: the frame's address; size: of the frame; marks: see overlay.py; label: in words
+  mounted() {
+    this.drawn = null; // a look and its picture
+    this.fetching = false;
+    this.pen = this.$el.getContext("2d", { alpha: false });
+    this.watcher = new ResizeObserver(() => this.paint());
+    this.watcher.observe(this.$el);
+    this.renew();
+  },
+  beforeUnmount() {
+    this.watcher.disconnect();
+  },
+  watch: {
+    look() {
+      this.renew();
+    },
+  },
+  methods: {
+    // Draw the newest look; one that is overtaken while its frame is fetched is drawn all the same, then the newest.
+    async renew() {
+      if (this.fetching) return;
+      this.fetching = true;
+      try {
+        while (this.look && this.look !== this.drawn?.look) {
+          const look = this.look;
+          const bitmap = look.src === this.drawn?.look.src ? this.drawn.bitmap : await this.fetched(look.src);
+          if (!bitmap && look === this.look) break;
+          if (!bitmap) continue;
+          if (this.drawn && this.drawn.bitmap !== bitmap) this.drawn.bitmap.close();
+          this.drawn = { look, bitmap };
+          this.paint();
+          this.$emit("drawn", { src: look.src });
+        }
+      } finally {
+        this.fetching = false;
+      }
+    },
+    // A frame, unpacked; null where the server is gone or has newer ones only, and tells of them in a moment.
+    async fetched(src) {
+      try {
+        const answer = await fetch((window.path_prefix || "") + src);
+        return answer.ok ? await createImageBitmap(await answer.blob()) : null;
+      } catch {
+        return null;
+      }
+    },
+    // The canvas has as many pixels as the screen gives it: a frame is scaled once.
+    paint() {
+      const canvas = this.$el, pen = this.pen;
+      const wide = Math.round(canvas.clientWidth * devicePixelRatio);
+      const high = Math.round(canvas.clientHeight * devicePixelRatio);
+      if (!this.drawn || !wide || !high) return;
+      const { look, bitmap } = this.drawn;
+      if (canvas.width !== wide || canvas.height !== high) [canvas.width, canvas.height] = [wide, high];
+      pen.resetTransform();
+      pen.imageSmoothingEnabled = wide < bitmap.width; // enlarged, pixels are to be seen
+      pen.drawImage(bitmap, 0, 0, wide, high);
+      pen.scale(wide / look.size[0], high / look.size[1]);
+      for (const mark of look.marks) {
+        pen.strokeStyle = pen.fillStyle = mark.ink;
+        pen.lineWidth = mark.width;
+        pen.setLineDash(mark.dash);
+        pen.stroke(new Path2D(mark.path));
+        pen.font = `${mark.font}px ui-monospace, monospace`;
+        for (const [x, y, name] of mark.names) pen.fillText(name, x, y);
+      }
+      canvas.dataset.frame = look.src;
+      canvas.ariaLabel = look.label;
+    },
+    // Where the mouse is, in the frame's pixels from its corner.
+    told(event) {
+      if (!this.drawn) return;
+      const { clientWidth, clientHeight } = this.$el, [wide, high] = this.drawn.look.size;
+      const x = (event.offsetX * wide) / clientWidth, y = (event.offsetY * high) / clientHeight;
+      this.$emit("mouse", { kind: event.type, x, y });
+    },
+  },
+};
