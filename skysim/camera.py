@@ -234,7 +234,9 @@ class Camera(Part):
     pixel_m: Annotated[Length, Field(ge=1e-7, le=1e-2)]
     focal_length_m: Annotated[Length, Field(ge=1e-5, le=1e3)]
     f_number: Annotated[Number, Field(ge=0.3, le=1e6)]
-    focus_m: Annotated[float, BeforeValidator(focus_distance), Field(gt=0)] = math.inf
+    focus_m: Annotated[float, BeforeValidator(focus_distance, json_schema_input_type=str), Field(gt=0)] = (
+        math.inf
+    )
     transmission: Annotated[Number, Field(gt=0, le=1)] = 1.0
     vignetting: Annotated[TwoStops | VignettingTable, Field(discriminator="kind")] | None = None
     distortion: tuple[Radial, Radial, Tangential, Tangential, Radial] = (0.0, 0.0, 0.0, 0.0, 0.0)

@@ -31,6 +31,7 @@ from skysim.terminal import (
     watched,
     yes,
 )
+from skysim.validate import validate
 
 if TYPE_CHECKING:
     from typing import Any
@@ -289,6 +290,7 @@ def survey(
 
 app.command()(reproduce)
 app.command("lab")(open_lab)
+app.command()(validate)
 
 
 @scenes_app.callback()

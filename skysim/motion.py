@@ -11,6 +11,7 @@ from skysim.quantity import Momentum, NotNegative, Number, Part, Positive, Spin,
 Duration = Annotated[Time, Field(gt=0)]
 Acceleration = Positive
 RatesDegS = tuple[Spin, Spin, Spin]
+Law = Literal["pid", "pd"]
 
 
 class Attitude(Part):
@@ -174,7 +175,7 @@ class Control(Part):
         the delay (a period of rate_hz, and the fans' time constant with fans) well below 1: 0.3 is fine
     """
 
-    law: Literal["pid", "pd"] = "pid"
+    law: Law = "pid"
     actuators: Literal["ideal", "wheels", "fans", "cmgs"] = "ideal"
     feedback: Literal["truth", "imu", "filter"] = "truth"
     rate_hz: Annotated[Number, Field(ge=1, le=1000)] = 100.0
@@ -196,7 +197,10 @@ class Motion(Part):
 
     start: Start = Attitude()
     rate_deg_s: RatesDegS = (0.0, 0.0, 0.0)
-    control: Annotated[Control | None, BeforeValidator(spelt_out)] = None
+    control: Annotated[
+        Control | None,
+        BeforeValidator(spelt_out, json_schema_input_type=Control | Law | Literal["none"] | None),
+    ] = None
     manoeuvre: tuple[Manoeuvre, ...] = ()
     jitter: tuple[JitterPart, ...] = ()
 

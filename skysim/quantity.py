@@ -18,6 +18,7 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Fie
 
 ROOT = Path(__file__).resolve().parents[1]
 DATA = ROOT / "data"
+UNIT_FOLLOWS = r"^\s*[-+.]?\d.*[a-zA-Z]"  # what editors can tell of a quantity
 
 # Only what a quantity parser fills: `dark_e_s` and `rate_deg_s` are bare numbers and keep their unit.
 SI_SUFFIX = re.compile(
@@ -37,6 +38,12 @@ def quantity(si_unit: str, what: str, examples: str) -> Callable[[Any], float]:
             raise ValueError(f"{value!r} is not a {what}; allowed: a {what} such as {examples}") from error
 
     return parse
+
+
+def with_unit(si_unit: str, what: str, examples: str) -> BeforeValidator:
+    """`quantity` for a key of a section; editors are told that it is a text."""
+    told = Field(description=f"a {what} such as {examples}", pattern=UNIT_FOLLOWS)
+    return BeforeValidator(quantity(si_unit, what, examples), json_schema_input_type=Annotated[str, told])
 
 
 def in_si(value: str, si_unit: str | None = None) -> float:
@@ -60,21 +67,19 @@ INCH_M = 0.0254
 ARCSEC_RAD = math.pi / 180 / 3600
 RPM_RAD_S = math.pi / 30  # rad/s of one revolution a minute
 Number = Annotated[float, AfterValidator(finite)]
-Length = Annotated[Number, BeforeValidator(quantity("m", "length", '"35 mm" or "48 in"'))]
-Time = Annotated[Number, BeforeValidator(quantity("s", "time", '"40 ms" or "1000 us"'))]
-Mass = Annotated[Number, BeforeValidator(quantity("kg", "mass", '"80 kg"'))]
-Inertia = Annotated[Number, BeforeValidator(quantity("kg m2", "moment of inertia", '"6.0 kg m2"'))]
-Intensity = Annotated[Number, BeforeValidator(quantity("cd", "luminous intensity", '"7.7 mcd"'))]
-RadiantIntensity = Annotated[Number, BeforeValidator(quantity("W sr-1", "radiant intensity", '"3 mW/sr"'))]
-Torque = Annotated[Number, BeforeValidator(quantity("N m", "torque", '"0.5 N m"'))]
-Force = Annotated[Number, BeforeValidator(quantity("N", "force", '"0.5 N"'))]
-Momentum = Annotated[Number, BeforeValidator(quantity("N m s", "angular momentum", '"2 N m s"'))]
-Damping = Annotated[Number, BeforeValidator(quantity("N m s", "torque per rate", '"1e-4 N m s"'))]
-QuadraticDrag = Annotated[
-    Number, BeforeValidator(quantity("N m s2", "torque per squared rate", '"0.01 N m s2"'))
-]
-Stiffness = Annotated[Number, BeforeValidator(quantity("N m rad-1", "torque per angle", '"1e-3 N m / rad"'))]
-Imbalance = Annotated[Number, BeforeValidator(quantity("kg m", "mass times offset", '"1 g cm"'))]
+Length = Annotated[Number, with_unit("m", "length", '"35 mm" or "48 in"')]
+Time = Annotated[Number, with_unit("s", "time", '"40 ms" or "1000 us"')]
+Mass = Annotated[Number, with_unit("kg", "mass", '"80 kg"')]
+Inertia = Annotated[Number, with_unit("kg m2", "moment of inertia", '"6.0 kg m2"')]
+Intensity = Annotated[Number, with_unit("cd", "luminous intensity", '"7.7 mcd"')]
+RadiantIntensity = Annotated[Number, with_unit("W sr-1", "radiant intensity", '"3 mW/sr"')]
+Torque = Annotated[Number, with_unit("N m", "torque", '"0.5 N m"')]
+Force = Annotated[Number, with_unit("N", "force", '"0.5 N"')]
+Momentum = Annotated[Number, with_unit("N m s", "angular momentum", '"2 N m s"')]
+Damping = Annotated[Number, with_unit("N m s", "torque per rate", '"1e-4 N m s"')]
+QuadraticDrag = Annotated[Number, with_unit("N m s2", "torque per squared rate", '"0.01 N m s2"')]
+Stiffness = Annotated[Number, with_unit("N m rad-1", "torque per angle", '"1e-3 N m / rad"')]
+Imbalance = Annotated[Number, with_unit("kg m", "mass times offset", '"1 g cm"')]
 SemiAxis = Annotated[Length, Field(gt=0)]
 Spin = Annotated[Number, Field(ge=-360, le=360)]
 Triple = tuple[Number, Number, Number]

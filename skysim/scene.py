@@ -21,7 +21,7 @@ from skysim.motion import Motion, Pointing
 from skysim.quantity import DATA, ROOT, Length, NotNegative, Number, Part, Positive, Spin, Time
 from skysim.types import BadInput
 from skysim.vehicle import Site, Vehicle
-from skysim.yamlfile import Files, explain, place_of, put, read_yaml
+from skysim.yamlfile import Files, explain, of_our_version, place_of, put, read_yaml
 
 SCENES = ROOT / "scenes"
 STEM = "(the file's name)"  # no key that a file could have
@@ -318,6 +318,7 @@ def where(message: str, name: str, overrides: Mapping[str, str]) -> str:
 def read(path: Path, above: tuple[Path, ...] = ()) -> tuple[dict[str, Any], Files]:
     """A scene's keys over those of its `base`, another scene by name or path; and the files, this one first."""
     tree, text = read_yaml(path)
+    of_our_version(tree, path, text)
     tree = beside(path, tree)
     if "base" not in tree:
         return tree, [(path, text)]
@@ -369,9 +370,14 @@ def anchored(folder: Path, tree: dict[str, Any], key: str, *inner: str) -> dict[
     return tree
 
 
-def load_camera(path: Path) -> Camera:
-    """The `camera` section of a scene, or of a file that has nothing else. Raises BadInput with one line."""
+def load_camera(path: Path, lens: Mapping[str, Any] | None = None) -> Camera:
+    """The `camera` section of a scene, or of a file that has nothing else. Raises BadInput with one line.
+
+    lens : keys that stand in for those which a preset leaves to its scene
+    """
     tree, files = read(path)
+    if isinstance(tree.get("camera"), dict):
+        tree = tree | {"camera": {**(lens or {}), **tree["camera"]}}
     try:
         own = beside(path, {key: tree[key] for key in tree if key == "camera"})
         return CameraFile.model_validate(beneath(own, files, {})).camera

@@ -11,9 +11,10 @@ from typing import Any
 import yaml
 from pydantic import BaseModel, ValidationError
 
-from skysim import BadInput
+from skysim import BadInput, __version__
 
 Files = list[tuple[Path, str]]  # paths and texts
+VERSION = 1  # of scene and study files. A change that old files don't survive raises it and brings them up to date here
 
 
 def find(name: str, folder: Path, what: str) -> Path:
@@ -70,6 +71,16 @@ def once(node: yaml.Node | None, path: Path) -> None:
                 )
             seen.add(key.value)
             once(value, path)
+
+
+def of_our_version(tree: Mapping[str, Any], path: Path, text: str) -> None:
+    """Refuse a file whose `schema` is another than ours, before keys that we don't know are taken for mistakes."""
+    told = tree.get("schema", VERSION)
+    if type(told) is int and told == VERSION:
+        return
+    newer = type(told) is int and told > VERSION
+    what = f"{told!r} is {f'of a newer skysim than {__version__}' if newer else 'not known'}"
+    raise BadInput(f"schema: {what}; allowed: {VERSION} {place_of(['schema'], [(path, text)], {})}")
 
 
 def put(tree: dict[str, Any], key: str, value: str) -> None:

@@ -316,4 +316,6 @@ def test_a_histogram_counts_every_trial_once() -> None:
 
 def test_a_saved_scene_names_its_base_first() -> None:
     text = export.scene_yaml("shefex2", {"camera.f_number": "2", "tracker.limit_mag": "5"}, "T")
-    assert re.match(r"base: shefex2\ntitle: T\ncamera:\n  f_number: 2\ntracker:\n  limit_mag: 5\n", text)
+    assert re.match(
+        r"schema: 1\nbase: shefex2\ntitle: T\ncamera:\n  f_number: 2\ntracker:\n  limit_mag: 5\n", text
+    )

@@ -310,7 +310,9 @@ def test_a_bad_override_is_one_line_and_blamed_on_the_option(key: str, value: st
         ("pwm_levels: [1.0, 0.7, 0.5, 0.35]", "pwm_levels: []", "light.layout.pwm_levels: [] is not allowed"),
         ("hardware_seed: 2012", "hardware_seed: -1", "light.layout.hardware_seed: -1 is not allowed"),
         ('"9.0 kg m2"', '"90 kg m2"', "is no rigid body's: each positive, none above the sum of the others"),
-        ("schema: 1", "schema: 2", "schema: 2 is not allowed; it should be 1"),
+        ("schema: 1", "schema: 2", "schema: 2 is of a newer skysim than "),
+        ("schema: 1", "schema: 0", "schema: 0 is not known; allowed: 1"),
+        ("schema: 1", "schema: yes", "schema: True is not known; allowed: 1"),
         ("seed: 1\n", "seed: one\n", "seed: 'one' is not allowed; it should be a valid integer"),
         (
             "2012-03-01T12:00:00",

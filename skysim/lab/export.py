@@ -15,7 +15,7 @@ from skysim import io
 from skysim.lab.desk import Desk
 from skysim.report import annotate
 from skysim.types import BadInput
-from skysim.yamlfile import put
+from skysim.yamlfile import VERSION, put
 
 KINDS = {  # what the menu offers, and the file that it is
     "frame, FITS": "frame.fits",
@@ -64,7 +64,7 @@ def figure(desk: Desk) -> bytes:
 
 def scene_yaml(base: str, overrides: dict[str, str], title: str = "") -> str:
     """A scene that is another with some keys of its own."""
-    tree: dict[str, object] = {"base": base}
+    tree: dict[str, object] = {"schema": VERSION, "base": base}
     if title:
         tree["title"] = title
     for key, value in overrides.items():

@@ -20,7 +20,7 @@ from skysim.scene import load as load_scene
 from skysim.study.designs import Design, Point, points
 from skysim.study.factors import Factor, Settings, Value
 from skysim.types import BadInput
-from skysim.yamlfile import explain, line_of, put, read_yaml
+from skysim.yamlfile import explain, line_of, of_our_version, put, read_yaml
 
 STUDIES = SCENES / "studies"
 TRIAL = "trial."
@@ -239,6 +239,7 @@ def load(name: str | Path, overrides: Mapping[str, str] | None = None) -> Plan:
     """
     path = find(str(name))
     tree, text = read_yaml(path)
+    of_our_version(tree, path, text)
     for key, value in (overrides or {}).items():
         put(tree, key, value)
     try:

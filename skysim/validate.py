@@ -1,0 +1,115 @@
+"""`skysim validate`: what is wrong with a file, before anything is flown; and its schema for an editor."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, NamedTuple
+
+import typer
+
+from skysim import BadInput
+from skysim.terminal import complain
+
+KINDS = ("scene", "study")
+LENS = {"focal_length": "1 m", "f_number": 1.0}  # of no meaning: a preset has none
+
+
+class Verdict(NamedTuple):
+    """A file, what it is in words, what one might doubt of it; or what is wrong with it, in one line."""
+
+    file: str
+    what: str = ""
+    doubts: tuple[str, ...] = ()
+    fault: str = ""
+
+
+def validate(
+    files: Annotated[
+        list[Path] | None,
+        typer.Argument(help="Scenes, studies, cameras (YAML); catalogues and LED maps (ECSV)."),
+    ] = None,
+    schema: Annotated[
+        str | None, typer.Option(help="Print the JSON Schema of a kind of file instead: scene or study.")
+    ] = None,
+    json: Annotated[bool, typer.Option("--json", help="Print JSON for machines.")] = False,
+) -> None:
+    """Check files: keys, units, what goes together, whether a scene can be set up. Exit code 2 if one is refused."""
+    from skysim import io, schemas
+
+    if schema is not None:
+        if schema not in KINDS:
+            raise BadInput(f"--schema {schema}: allowed: {', '.join(KINDS)}")
+        print(io.to_json(schemas.json_schema(schema)))
+        return
+    if not files:
+        raise BadInput("give files, or --schema scene")
+    told = [checked(path) for path in files]
+    if json:
+        print(io.to_json([one._asdict() for one in told]))
+    for one in told if not json else []:
+        if one.fault:
+            complain(one.fault)
+        else:
+            print(f"{one.file}: {one.what}", *one.doubts, sep="\n  ")
+    if any(one.fault for one in told):
+        raise typer.Exit(2)
+
+
+def checked(path: Path) -> Verdict:
+    """One file."""
+    try:
+        return Verdict(str(path), *looked_at(path))
+    except (BadInput, OSError) as error:
+        return Verdict(str(path), fault=str(error))
+
+
+def looked_at(path: Path) -> tuple[str, tuple[str, ...]]:
+    """What a file is, in words, and doubts. Raises BadInput with one line."""
+    if path.suffix == ".ecsv":
+        return table(path), ()
+    if path.suffix not in (".yaml", ".yml"):
+        raise BadInput(f"{path}: allowed: .yaml or .ecsv")
+    from skysim.yamlfile import read_yaml
+
+    keys = read_yaml(path)[0].keys()
+    if keys & {"factors", "trial", "responses"}:
+        from skysim.study import plan
+
+        told = plan.load(path)
+        return f"a study of {told.trials} trials" if told.trials else "a search", ()
+    if "camera" in keys and keys <= {"camera", "schema"}:
+        from skysim.scene import load_camera
+
+        camera = load_camera(path, LENS)
+        return f"a camera of {camera.width_px} x {camera.height_px} pixels", ()
+    return scene(path)
+
+
+def scene(path: Path) -> tuple[str, tuple[str, ...]]:
+    """A scene, set up as far as it goes without flying: vehicle, lights, tracker."""
+    from skysim import doubts, simulate
+    from skysim.scene import load, where
+
+    told = load(path)
+    try:
+        lab = simulate.furnish(told)
+        simulate.tracker(lab)
+    except BadInput as error:
+        raise BadInput(where(str(error), str(path), {})) from None
+    count, frames = len(lab.sources.id), told.exposure.frames
+    return f"a scene of {count} lights and {frames} frames", tuple(
+        doubts.doubts(told, lab.sources, lab.mount)
+    )
+
+
+def table(path: Path) -> str:
+    """A star catalogue, else a map of LEDs."""
+    from skysim import catalogue, io
+
+    try:
+        first = path.read_text(encoding="utf-8", errors="replace")[:4000]
+    except OSError as error:
+        raise BadInput(f"{path}: cannot be read: {error.strerror}") from error
+    if "{name: hip," in first:
+        return f"a catalogue of {len(catalogue.read(path).hip)} stars"
+    return f"a map of {len(io.read_dome_map(path).id)} LEDs"
