@@ -289,6 +289,18 @@ def on_dask(lab: Lab, workers: int) -> engines.Dask:
     return engine
 
 
+def test_a_chunk_travels_as_text_and_comes_back_bit_for_bit() -> None:
+    from skysim.study import cluster
+
+    settings = {
+        "trial.noise_px": 0.1 + 0.2,
+        "light.layout": {"kind": "boards", "lit": [3, 6]},
+        "camera.focus": None,
+    }
+    chunk = (trials.Segment(3, settings, 41, range(7, 12)), trials.Segment(4, {}, 46, range(0, 1)))
+    assert cluster.unpacked(cluster.packed(chunk)) == chunk
+
+
 def test_a_run_that_is_stopped_leaves_nothing_on_the_cluster(lab: Lab, told: plan.Plan) -> None:
     engine = on_dask(lab, 2)
     rows = engine.run(told.recipe, runner.Todo(told.points, 150, np.arange(told.trials)))

@@ -6,8 +6,8 @@ Scheduler and workers need this same skysim. A worker is best a process of one t
 
 from __future__ import annotations
 
+import json
 import logging
-import pickle
 import time
 from collections import deque
 from collections.abc import Iterator
@@ -21,7 +21,7 @@ import cv2
 from skysim.study.benches import code_version
 from skysim.study.engines import AHEAD, Chunk, Chunks, dead, singly, timed
 from skysim.study.plan import Recipe
-from skysim.study.trials import Row
+from skysim.study.trials import Row, Segment
 from skysim.types import BadInput
 
 try:
@@ -122,8 +122,7 @@ def coming(
         while len(flying) < (1 if alone else room) and (
             chunk := suspects.popleft() if alone else chunks.next()
         ):
-            # Packed, or Dask would look for its own keys in it.
-            future = client.submit(remembered, name, pickle.dumps(chunk), pure=False)
+            future = client.submit(remembered, name, packed(chunk), pure=False)
             flying[future] = Flight(chunk, alone)
             landed.add(future)
         if not flying:
@@ -140,6 +139,18 @@ def coming(
         else:
             chunks.took(flight.chunk, seconds)
             yield rows
+
+
+def packed(chunk: Chunk) -> str:
+    """A chunk as text: in anything else Dask would look for its own keys. Floats come back bit for bit."""
+    rows = [(one.point, one.settings, one.first, one.replicates.start, one.replicates.stop) for one in chunk]
+    return json.dumps(rows, default=str)  # a moment of YAML's as its text, which scenes take too
+
+
+def unpacked(text: str) -> Chunk:
+    """What was `packed`."""
+    rows = json.loads(text)
+    return tuple(Segment(point, settings, first, range(*which)) for point, settings, first, *which in rows)
 
 
 # On the workers.
@@ -165,8 +176,8 @@ class Told(WorkerPlugin):
         RECIPES.pop(self.name, None)
 
 
-def remembered(name: str, packed: bytes) -> tuple[list[Row], float]:
+def remembered(name: str, text: str) -> tuple[list[Row], float]:
     """`timed`, by the recipe that this worker was told. Raises BadInput where it refused that."""
     if name not in RECIPES:
         raise BadInput(f"scheduler: a worker that came later has skysim {code_version()}; allowed: one code")
-    return timed(RECIPES[name], pickle.loads(packed))
+    return timed(RECIPES[name], unpacked(text))
