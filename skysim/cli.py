@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from estimator import BadImage
-from skysim import BadInput
+from skysim import BadInput, __version__
 from skysim.lab.commands import lab as open_lab
 from skysim.papers.commands import reproduce
 from skysim.study.commands import app as studies
@@ -49,7 +49,6 @@ app = typer.Typer(
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
-    help="A star tracker's laboratory in software: fly, light, photograph, solve, score.",
 )
 scenes_app = typer.Typer(
     invoke_without_command=True, help="List the scenes that come with skysim; export one."
@@ -69,6 +68,27 @@ Centroider = Annotated[str | None, typer.Option(help="How they are centred, e.g.
 Identifier = Annotated[str | None, typer.Option(help="How they are named, e.g. pyramid.")]
 SolverName = Annotated[str | None, typer.Option("--solver", help="How the attitude follows, e.g. quest.")]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON for machines instead of a table.")]
+
+
+def version(asked: bool) -> None:
+    """Print what a report of a defect should name."""
+    if asked:
+        import platform
+        from importlib.metadata import version as of
+
+        print(
+            f"skysim {__version__}, MuJoCo {of('mujoco')}, numpy {of('numpy')}, Python {platform.python_version()}"
+        )
+        raise typer.Exit
+
+
+@app.callback()
+def options(
+    version: Annotated[
+        bool, typer.Option("--version", callback=version, is_eager=True, help="Print versions.")
+    ] = False,
+) -> None:
+    """A star tracker's laboratory in software: fly, light, photograph, solve, score."""
 
 
 def main() -> None:
@@ -335,7 +355,10 @@ def bench(
     from skysim import io
 
     sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-    from benchmarks import AREAS, measure
+    try:
+        from benchmarks import AREAS, measure
+    except ImportError:
+        raise BadInput("bench: the benchmarks are in the project's checkout only; run it there") from None
 
     unknown = [area for area in areas or () if area not in AREAS]
     if unknown:

@@ -17,7 +17,9 @@ from typing import Annotated, Any
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
 
 ROOT = Path(__file__).resolve().parents[1]
-DATA = ROOT / "data"
+# An installed package carries within it what stands beside it in a checkout.
+SHIPPED = ROOT if (ROOT / "pyproject.toml").is_file() else ROOT / "skysim"
+DATA = SHIPPED / "data"
 UNIT_FOLLOWS = r"^\s*[-+.]?\d.*[a-zA-Z]"  # what editors can tell of a quantity
 
 # Only what a quantity parser fills: `dark_e_s` and `rate_deg_s` are bare numbers and keep their unit.

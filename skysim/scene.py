@@ -18,12 +18,12 @@ from skysim import yamlfile
 from skysim.camera import Camera, over, with_preset
 from skysim.light import Bench, Dome, Glow, Stars
 from skysim.motion import Motion, Pointing
-from skysim.quantity import DATA, ROOT, Length, NotNegative, Number, Part, Positive, Spin, Time
+from skysim.quantity import DATA, SHIPPED, Length, NotNegative, Number, Part, Positive, Spin, Time
 from skysim.types import BadInput
 from skysim.vehicle import Site, Vehicle
 from skysim.yamlfile import Files, explain, of_our_version, place_of, put, read_yaml
 
-SCENES = ROOT / "scenes"
+SCENES = SHIPPED / "scenes"
 STEM = "(the file's name)"  # no key that a file could have
 CATALOGUES = DATA / "catalogues"
 

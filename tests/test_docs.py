@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from skysim.scene import ROOT
+from skysim.quantity import ROOT
 from skysim.study import plan
 
 DOME = (ROOT / "docs/dome.md").read_text(encoding="utf-8")

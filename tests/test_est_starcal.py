@@ -26,7 +26,7 @@ from estimator.starcal import (
 from estimator.tracker import StarTracker
 from estimator.types import Attitude, Centroids, StarMatch
 from skysim import io
-from skysim.scene import ROOT
+from skysim.quantity import ROOT
 
 # SHEFEX-2's chip behind a 25 mm lens that nobody has measured, and what its data sheet says: 1.5 % off, no distortion.
 TRUE = Camera(659, 493, 2520.0, (336.5, 241.0), (-0.11, 0.35, 8e-4, -6e-4, -1.5))

@@ -16,7 +16,8 @@ import yaml
 from skysim import BadInput, camera, dome, led, motion, vehicle
 from skysim.optics import VIGNETTING
 from skysim.psf import PSFS
-from skysim.scene import ROOT, load
+from skysim.quantity import ROOT
+from skysim.scene import load
 
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 SKYSIM = [sys.executable, "-m", "skysim"]

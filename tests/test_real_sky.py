@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from skysim import io, solve
-from skysim.scene import ROOT
+from skysim.quantity import ROOT
 from skysim.sky import cam_from_icrs
 
 FOLDER = Path(os.environ.get("SKYSIM_REAL_SKY", ROOT.parent / "shared" / "real_sky"))

@@ -1,0 +1,22 @@
+"""A built package carries scenes and data within `skysim`; everything else is said in pyproject.toml."""
+
+import shutil
+from pathlib import Path
+
+from setuptools import setup
+from setuptools.command.build_py import build_py
+
+CARRIED = ("scenes", "data")
+LEFT = shutil.ignore_patterns("__pycache__", "*.py", "hipparcos_hp[7-9]*")  # catalogues that a user has built
+
+
+class BuildWithData(build_py):
+    """Of a checkout that is only linked to, nothing is copied."""
+
+    def run(self) -> None:
+        super().run()
+        for name in CARRIED if not self.editable_mode else ():
+            shutil.copytree(name, Path(self.build_lib) / "skysim" / name, ignore=LEFT, dirs_exist_ok=True)
+
+
+setup(cmdclass={"build_py": BuildWithData})

@@ -1,0 +1,45 @@
+"""An installed package does without the checkout: scenes and data travel within it."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from skysim import cli
+from skysim.quantity import ROOT
+
+
+def test_versions_are_told_for_a_report() -> None:
+    told = CliRunner().invoke(cli.app, ["--version"])
+    assert re.match(
+        r"skysim \d+\.\d+\.\d+, MuJoCo \d+\.\d+\.\d+, numpy \d+\.\d+\.\d+, Python 3\.\d+\.\d+$", told.stdout
+    )
+
+
+@pytest.mark.long
+def test_a_wheel_runs_a_scene_outside_of_the_checkout(tmp_path: Path) -> None:
+    wheels, there, here = tmp_path / "wheels", tmp_path / "installed", tmp_path / "here"
+    here.mkdir()
+    pip = [sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check"]
+    subprocess.run([*pip, "wheel", "--no-deps", "-w", wheels, ROOT], check=True)
+    wheel = next(wheels.glob("skysim-*.whl"))
+    subprocess.run([*pip, "install", "--no-deps", "--target", there, wheel], check=True)
+    environment = os.environ | {"PYTHONPATH": str(there)}
+
+    def python(*words: str) -> str:
+        done = subprocess.run(
+            [sys.executable, *words], cwd=here, env=environment, check=True, capture_output=True, text=True
+        )
+        return done.stdout
+
+    assert python("-c", "import skysim; print(skysim.__file__)").startswith(str(there))
+    ran = python("-m", "skysim", "run", "afit_simsat", "--frames", "2")
+    assert "2 of 2 frames solved, 0 wrong" in ran
+    assert (here / "out/afit_simsat/report.html").is_file()
+    assert "led_count" in python("-m", "skysim", "study")
