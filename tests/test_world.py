@@ -454,6 +454,34 @@ def test_vehicle_may_carry_wheels_that_turn(tmp_path: Path) -> None:
     assert flight.rate_body_rad_s[-1, 2] == pytest.approx(expected, abs=1e-12)
 
 
+@pytest.mark.parametrize(
+    "names",
+    [
+        '<include file="../secret.xml"/>',
+        '<include file="part.xml"/>',
+        '<include file="linked.xml"/>',
+        '<asset><mesh name="m" file="/etc/hostname.obj"/></asset>',
+        '<compiler meshdir="/etc"/>',
+        '<asset><texture name="t" type="cube" fileright="../../t.png"/></asset>',
+    ],
+)
+def test_a_stranger_s_vehicle_reads_no_file_outside_of_its_folder(tmp_path: Path, names: str) -> None:
+    folder = tmp_path / "theirs"
+    (folder / "deep").mkdir(parents=True)
+    (tmp_path / "secret.xml").write_text(f"<mujoco><worldbody>{BUS}</worldbody></mujoco>")
+    (folder / "part.xml").write_text('<mujoco><include file="deep/part.xml"/></mujoco>')
+    (folder / "deep" / "part.xml").write_text('<mujoco><include file="../secret.xml"/></mujoco>')
+    (folder / "linked.xml").symlink_to(tmp_path / "secret.xml")
+    with pytest.raises(BadInput, match=r"leaves .*theirs; allowed: files in it$"):
+        built(folder, BUS, names)
+
+
+def test_a_vehicle_in_parts_is_put_together(tmp_path: Path) -> None:
+    (tmp_path / "deep").mkdir()
+    (tmp_path / "deep" / "bus.xml").write_text(f"<mujoco><worldbody>{BUS}</worldbody></mujoco>")
+    assert built(tmp_path, "", '<include file="deep/bus.xml"/>').spec.body("bus") is not None
+
+
 def test_missing_file_is_named() -> None:
     with pytest.raises(
         BadInput, match=r"scenes/vehicles/no_such\.xml: no such file; .* beside the scene or in scenes/"
