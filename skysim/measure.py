@@ -28,7 +28,7 @@ from skysim.types import BadInput, Floats, Frame, Trajectory, Truth
 
 Ints = NDArray[np.int64]
 
-STREAM = {"attitudes": 101, "imu": 102, "checks": 103}  # apart from simulate.STAGE_ID
+STREAM = {"attitudes": 101, "imu": 102, "checks": 103}  # apart from shutter.STAGE_ID
 GATE = 3.5  # sigmas of a two-dimensional error; Gaussian noise goes beyond once in 450
 ANCHORS = 10  # lights whose every possible name is tried for the common shift
 LINKS = (3, 8)  # lights that hang a frame on others: two tie its turn; a patch board all misnamed has six

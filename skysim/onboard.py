@@ -264,6 +264,7 @@ class Navigation:
     scene : with `vehicle.imu`, and `filter` where there is one
     lab_from_body_wxyz : (4,) the true attitude at the start, when the navigator is zeroed
     place_body_m, gravity_m_s2 : of the accelerometers
+    records : whether all that the unit put out is kept, for `record`
     """
 
     def __init__(
@@ -274,6 +275,7 @@ class Navigation:
         place_body_m: Floats,
         gravity_m_s2: float,
         rng: np.random.Generator,
+        records: bool = True,
     ) -> None:
         part = scene.vehicle.imu
         assert part is not None
@@ -288,7 +290,7 @@ class Navigation:
         believed = at_home(lab_from_body, part.home_error_deg)
         self.navigator = imu.Navigator(believed.as_quat(scalar_first=True), self.earth_known_rad_s)
         self.filter = mekf(scene.filter, believed) if scene.filter else None
-        self.measured: list[imu.Increments] = []
+        self.records, self.measured = records, list[imu.Increments]()
         self.rate_rad_s = np.zeros(3)
         self.saturated = False
 
@@ -310,7 +312,8 @@ class Navigation:
             self.earth_felt_rad_s,
         )
         measured = self.unit.measure(ideal)
-        self.measured.append(measured)
+        if self.records:
+            self.measured.append(measured)
         self.navigator.add(measured)
         self.saturated = bool(measured.saturated.any())
         known = self.earth_body_rad_s(self.navigator.lab_from_body_wxyz)

@@ -21,7 +21,7 @@ class Diary:
     def __init__(self, flight: Flight, pilot: Pilot, navigation: Navigation | None) -> None:
         self.flight, self.pilot, self.navigation = flight, pilot, navigation
         steps = round(pilot.period_s / flight.step_s)
-        self.at_step = np.arange(0, len(flight.states) - 1, steps)
+        self.at_step = np.arange(0, flight.last, steps)
         self.row = 0
         rows = len(self.at_step)
         self.torque_nm, self.disturbance_nm = np.zeros((rows, 3)), np.zeros((rows, 3))

@@ -9,7 +9,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from estimator.types import Attitude, Centroids
-from skysim import metrics, onboard, scene, simulate
+from skysim import metrics, onboard, scene, shutter, simulate
+from skysim.aloft import Aloft
 from skysim.optics import Optics
 from skysim.simulate import Lab
 from skysim.types import BadInput, Truth
@@ -261,7 +262,7 @@ def test_frames_do_not_depend_on_those_before() -> None:
 
 
 def test_noise_differs_from_frame_to_frame_and_seed_to_seed() -> None:
-    draws = [simulate.rng(seed, "detector", k).standard_normal(1000) for seed, k in ((1, 0), (1, 1), (2, 0))]
+    draws = [shutter.rng(seed, "detector", k).standard_normal(1000) for seed, k in ((1, 0), (1, 1), (2, 0))]
     correlation = np.corrcoef(draws)
     assert np.abs(correlation[np.triu_indices(3, 1)]).max() < 4 / np.sqrt(1000)
 
@@ -434,3 +435,35 @@ def test_frames_taken_in_flight_are_taken_again_with_the_same_exposures() -> Non
         np.testing.assert_array_equal(shot.frame.image_dn, other.frame.image_dn)
         gap_px = shot.report.centroids.xy_px - other.report.centroids.xy_px
         assert np.abs(gap_px).max() < 1e-6
+
+
+# As it happens.
+
+
+@pytest.mark.parametrize("name", ["simsat_bump", "shefex2"])
+def test_frames_as_they_happen_are_those_of_the_whole_flight(name: str) -> None:
+    """To the last bit, though the flight before them is forgotten: with the filter in the loop, and flown alone."""
+    loaded = scene.load(name, {"exposure.frames": "6"})
+    whole = simulate.run(simulate.prepare(loaded), simulate.tracker(simulate.furnish(loaded)))
+    lab = simulate.furnish(loaded)
+    as_it_happens = simulate.live(lab, simulate.tracker(lab))
+    for shot, look in zip(whole, as_it_happens, strict=True):
+        np.testing.assert_array_equal(look.frame.image_dn, shot.frame.image_dn)
+        assert look.frame.t_mid_s == shot.frame.t_mid_s
+        assert (look.truth.cam_from_lab * shot.truth.cam_from_lab.inv()).magnitude() == 0
+        assert look.report is not None
+        assert look.report.attitude.status == shot.report.attitude.status
+
+
+def test_a_flight_that_forgets_is_the_same_flight() -> None:
+    """Nothing of it depends on how much is kept; what is older is gone."""
+    loaded = scene.load("simsat_slew", {"exposure.frames": "3"})
+    lab = simulate.furnish(loaded)
+    long, short = Aloft(lab), Aloft(lab, forgets=True)
+    while long.flight.steps_left:
+        long.tick(10)
+        short.tick(10)
+    assert len(short.flight.states) < len(long.flight.states) / 4
+    kept = short.flight.knots(short.flight.first)
+    for one, other in zip(kept, long.flight.knots(short.flight.first), strict=True):
+        np.testing.assert_array_equal(one, other)

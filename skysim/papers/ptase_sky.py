@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from estimator.attitude import radecroll_rad
-from skysim import onboard, scene, simulate, sky
+from skysim import onboard, scene, shutter, simulate, sky
 from skysim.jitter import Vibration
 from skysim.metrics import WRONG_RAD, Summary, extreme, rms, share
 from skysim.papers.compare import Answer, Ask, Cause, Drawing, Found
@@ -119,7 +119,7 @@ def standing(lab: simulate.Lab, cam_from_icrs: Rotation) -> simulate.Lab:
     rate_body = earth_rad_s * middle.inv().apply([0.0, 0.0, 1.0])
     turned = Rotation.from_rotvec(np.outer(t_s - when.middle_s(rows), rate_body))
     path = Trajectory(t_s, middle * turned, np.tile(rate_body, (KNOTS, 1)))
-    shaken = Vibration.of(lab.scene.motion, simulate.rng(lab.scene.seed, "jitter", 0))
+    shaken = Vibration.of(lab.scene.motion, shutter.rng(lab.scene.seed, "jitter", 0))
     return replace(lab, trajectory=shaken.lay_over(path))
 
 

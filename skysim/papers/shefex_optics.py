@@ -12,6 +12,7 @@ from estimator.stages import Clock, Settings, see
 from estimator.starcal import self_calibrated
 from estimator.tracker import StarTracker
 from skysim import onboard, simulate
+from skysim.detector import saturation_dn
 from skysim.metrics import Summary, exact
 from skysim.papers.compare import Answer, Ask, number
 from skysim.papers.intervals import resampled
@@ -141,7 +142,7 @@ def focal_mm(ask: Ask) -> tuple[Summary, str]:
     ready = Bench(where, simulate.tracker(where), FrameTrial(kind="frames"), "")
     sheet = onboard.calibration(lab().scene.camera)
     detector = where.scene.camera.detector
-    settings = Settings(gain_e_dn=detector.gain_e_dn, saturation=simulate.saturation_dn(detector))
+    settings = Settings(gain_e_dn=detector.gain_e_dn, saturation=saturation_dn(detector))
     first = 1_000_000 * ask.seed
     frames = [
         see(trials.shot(ready, first + n)[0].image_dn, sheet, settings, Clock())

@@ -28,17 +28,25 @@ class Flight:
 
     lab_from_body : at the start; rate_body_rad_s : (3,) likewise
     duration_s    : the longest that this flight can last; room is made for so many steps
+    kept_s        : room is made for twice so many only, and what is older than that is forgotten
     """
 
     def __init__(
-        self, world: World, lab_from_body: Rotation, rate_body_rad_s: Floats, duration_s: float
+        self,
+        world: World,
+        lab_from_body: Rotation,
+        rate_body_rad_s: Floats,
+        duration_s: float,
+        kept_s: float | None = None,
     ) -> None:
         check_tilt(world, lab_from_body)
         self.world, self.model = world, world.model
         self.step_s = float(self.model.opt.timestep)
-        most = max(1, int(np.ceil(duration_s / self.step_s - 1e-6)))
-        self.states = np.empty((most + 1, mujoco.mj_stateSize(self.model, int(STATE))))
-        self.step = 0
+        self.last = max(1, int(np.ceil(duration_s / self.step_s - 1e-6)))
+        self.kept = self.last if kept_s is None else int(np.ceil(kept_s / self.step_s))
+        rows = min(self.last, 2 * self.kept) + 1
+        self.states = np.empty((rows, mujoco.mj_stateSize(self.model, int(STATE))))
+        self.step = self.first = 0  # the present; which step the first of `states` is
         self.data = mujoco.MjData(self.model)
         self.rollout = Rollout(nthread=0)
         self.start(lab_from_body, rate_body_rad_s)
@@ -62,7 +70,7 @@ class Flight:
 
     @property
     def steps_left(self) -> int:
-        return len(self.states) - 1 - self.step
+        return self.last - self.step
 
     @property
     def now_s(self) -> float:
@@ -71,42 +79,56 @@ class Flight:
     @property
     def lab_from_body_wxyz(self) -> Floats:
         """(4,) scalar first."""
-        return self.states[self.step, 1:5]
+        return self.states[self.row, 1:5]
 
     @property
     def rate_body_rad_s(self) -> Floats:
         """(3,)"""
-        return self.states[self.step, 1 + self.model.nq :][:3]
+        return self.states[self.row, 1 + self.model.nq :][:3]
 
     @property
     def angles_rad(self) -> Floats:
         """All of qpos; `Hinges.qpos` tells which is whose."""
-        return self.states[self.step, 1 : 1 + self.model.nq]
+        return self.states[self.row, 1 : 1 + self.model.nq]
 
     @property
     def speeds_rad_s(self) -> Floats:
         """All of qvel; `Hinges.dof` tells which is whose."""
-        return self.states[self.step, 1 + self.model.nq :][: self.model.nv]
+        return self.states[self.row, 1 + self.model.nq :][: self.model.nv]
+
+    @property
+    def row(self) -> int:
+        """Where in `states` the present is."""
+        return self.step - self.first
+
+    def forget(self, steps: int) -> None:
+        """Make room for so many steps, if there is none, by what is older than `kept`."""
+        if self.row + steps < len(self.states):
+            return
+        old = max(self.row - self.kept, 0)
+        self.states[: self.row - old + 1] = self.states[old : self.row + 1]
+        self.first += old
 
     def advance(self, control: Floats) -> None:
         """Fly one step for each row of control (K, nu). Raises BadInput where MuJoCo warned.
 
         MuJoCo puts an unstable model back to its start and goes on, and forgets its warnings with the next call.
         """
-        end = self.step + len(control)
+        self.forget(len(control))
+        row, end = self.row, self.row + len(control)
         with mujoco_warnings():
             self.rollout.rollout(
                 [self.model],
                 [self.data],
-                self.states[None, self.step],
+                self.states[None, row],
                 control[None],
                 control_spec=int(CONTROL),
                 skip_checks=True,
                 nstep=len(control),
                 initial_warmstart=self.data.qacc_warmstart[None].copy(),
-                state=self.states[None, self.step + 1 : end + 1],
+                state=self.states[None, row + 1 : end + 1],
             )
-        self.step = end
+        self.step += len(control)
         self.check()
 
     def check(self) -> None:
@@ -129,7 +151,7 @@ class Flight:
 
     def knots(self, begin: int = 0) -> tuple[Floats, Floats, Floats]:
         """Times (K,), lab_from_body (K, 4) as wxyz and rates (K, 3) from a step on."""
-        flown, nq = self.states[begin : self.step + 1], self.model.nq
+        flown, nq = self.states[begin - self.first : self.row + 1], self.model.nq
         return self.times_s(begin, self.step + 1), flown[:, 1:5], flown[:, 1 + nq : 4 + nq]
 
     def trajectory(self, begin: int = 0) -> Trajectory:

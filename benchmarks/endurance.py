@@ -1,0 +1,68 @@
+"""An hour of closed loop: does memory grow, do time stamps drift, does the tracker stay right?
+
+`python -m benchmarks.endurance [SECONDS] [HERTZ]` flies SimSat on its wheels under a slow sine, steered by the filter,
+which is fed by every frame, and says every minute of flight how much memory is in use. An hour at 10 Hz takes half an
+hour.
+"""
+
+from __future__ import annotations
+
+import gc
+import sys
+import time
+
+import psutil
+
+from skysim import metrics, simulate
+from skysim.quantity import ARCSEC_RAD
+from skysim.scene import load
+
+WARM_S = 60.0  # of flight: by then everything was called once
+SCENE = {
+    "seed": "11",
+    "motion.start": "{roll_deg: 0, pitch_deg: 0, yaw_deg: 0}",
+    "motion.manoeuvre": "[{kind: sine, amplitude_deg: [4, 3, 10], frequency_hz: 0.01, duration: 1e6 s}]",
+    "motion.control.feedback": "filter",
+    "exposure.first": "0.1 s",
+}
+
+
+def main(duration_s: float, rate_hz: float) -> None:
+    """Fly, and print a line a minute of flight and what came of it."""
+    frames = round(duration_s * rate_hz)
+    told = SCENE | {"exposure.rate_hz": str(rate_hz), "exposure.frames": str(frames)}
+    lab = simulate.furnish(load("simsat_bump", told))
+    us, begin = psutil.Process(), time.monotonic()
+    memory_mb: list[float] = []
+    solved = wrong = 0
+    first_s = late_s = 0.0
+    print(f"{'flight':>8s} {'wall':>8s} {'memory':>10s}  solved  wrong")
+    for n, look in enumerate(simulate.live(lab, simulate.tracker(lab)), 1):
+        first_s = first_s or look.frame.t_mid_s
+        late_s = max(late_s, abs(look.frame.t_mid_s - first_s - (n - 1) / rate_hz))
+        answer = look.report.attitude.cam_from_ref if look.report else None
+        solved += answer is not None
+        wrong += answer is not None and metrics.is_wrong(answer, look.truth.cam_from_lab)
+        if n % round(60 * rate_hz) == 0 or n == frames:
+            gc.collect()
+            memory_mb.append(us.memory_info().rss / 1e6)
+            wall_s = time.monotonic() - begin
+            print(
+                f"{n / rate_hz:6.0f} s {wall_s:6.0f} s {memory_mb[-1]:7.1f} MB {solved:7d} {wrong:6d}",
+                flush=True,
+            )
+    after = memory_mb[round(WARM_S // 60) - 1 :]
+    grown = max(after) / after[0] - 1
+    off = (
+        metrics.cross_and_roll_rad(answer, look.truth.cam_from_lab)[0] / ARCSEC_RAD
+        if answer
+        else float("nan")
+    )
+    print(f"memory grew by {100 * grown:.2f} % after the first minute (bar 1 %)")
+    print(f"time stamps drifted by {late_s:.2g} s")
+    print(f"{solved} of {n} solved, {wrong} wrong, the last off by {off:.2g} arcsec")
+
+
+if __name__ == "__main__":
+    given = [float(one) for one in sys.argv[1:]]
+    main(*(given + [3600.0, 10.0][len(given) :]))

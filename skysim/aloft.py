@@ -1,0 +1,165 @@
+"""A lab in flight: tick by tick its computer steers, MuJoCo moves, the sensors feel, the star tracker looks."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from estimator.stages import Clock, Report
+from skysim import imu, manoeuvre, onboard, world
+from skysim.disturbance import Room
+from skysim.jitter import Vibration
+from skysim.pilot import Now, Pilot
+from skysim.scene import Scene
+from skysim.shutter import rng, shoot, window
+from skysim.telemetry import Diary
+from skysim.types import BadInput, Floats, Frame, Truth
+
+if TYPE_CHECKING:
+    from skysim.simulate import Lab
+
+LOOK_S = 0.05  # between two looks at what a manoeuvre asks for
+MARGIN_S = 0.05  # kept of the past beyond what is needed
+
+
+class Look(NamedTuple):
+    """A frame that was taken in flight, what was true of it, what the star tracker and the filter made of it."""
+
+    frame: Frame
+    truth: Truth
+    report: Report | None
+    verdict: str
+
+
+class Aloft:
+    """A lab in flight. Stateful: one flight each.
+
+    forgets : keep no more of the past than the next frame needs; else all of it
+    """
+
+    def __init__(self, lab: Lab, forgets: bool = False) -> None:
+        scene, ship = lab.scene, lab.ship
+        start = lab.trajectory.lab_from_body[0]
+        self.lab, self.forgets = lab, forgets
+        kept_s = memory_s(scene) if forgets else None
+        self.flight = world.Flight(ship, start, np.radians(scene.motion.rate_deg_s), lab.flown_s, kept_s)
+        self.vibration = Vibration.of(scene.motion, rng(scene.seed, "jitter", 0))
+        self.reference = manoeuvre.plan(scene.motion, start)
+        self.pilot, self.navigation = Pilot(scene, ship, self.reference), navigator(lab, start, not forgets)
+        self.room = Room.of(
+            scene.vehicle.disturbances,
+            imu.earth_rate_lab_rad_s(scene.lab),
+            manoeuvre.knocks(scene.motion),
+            ship.inertia_kg_m2,
+            self.pilot.period_s,
+            rng(scene.seed, "draught", 0),
+        )
+        check_reference(self.reference, lab)
+
+    @property
+    def nobody_speaks(self) -> bool:
+        """Whether all of the flight is settled at its start."""
+        return self.room.quiet and not (self.lab.scene.motion.control or self.navigation)
+
+    def tick(self, steps: int, diary: Diary | None = None) -> None:
+        """One control period or what is left of the flight: believe, steer, be disturbed, move, feel."""
+        flight, pilot, navigation = self.flight, self.pilot, self.navigation
+        t_s, angles, speeds = flight.now_s, flight.angles_rad, flight.speeds_rad_s
+        attitude, rate = flight.lab_from_body_wxyz, flight.rate_body_rad_s
+        stored = pilot.momentum_nms(angles, speeds)
+        seen, turning = attitude, rate
+        if pilot.told and pilot.told.feedback != "truth" and navigation:
+            seen, turning = (
+                navigation.attitude_wxyz(pilot.told.feedback),
+                navigation.rate(pilot.told.feedback),
+            )
+        control = np.empty((min(steps, flight.steps_left), flight.model.nu))
+        control[:] = pilot.steer(Now(t_s, pilot.period_s, turning, angles, speeds), seen, stored)
+        if not self.room.quiet:
+            times_s = flight.times_s(flight.step, flight.step + len(control) + 1)
+            disturbance = self.room.torque_nm(times_s, attitude, rate, stored)
+            control[:, flight.world.torques] += disturbance
+            if diary:
+                diary.disturbed(disturbance.sum(axis=0) / len(control))
+        if diary:
+            diary.note(stored)
+        flight.advance(control)
+        if navigation:
+            navigation.feel(flight.now_s, *felt(flight, self.vibration, len(control)))
+
+    def here(self, open_s: float) -> Lab:
+        """The lab with the flight from shortly before a moment until now."""
+        since = self.flight.trajectory(max(int(open_s / self.flight.step_s) - 1, 0))
+        return replace(self.lab, trajectory=self.vibration.lay_over(since))
+
+
+class Eyes:
+    """The camera in flight, and the star tracker: every frame is taken when its time has come, solved, and told the
+    filter, if there is one."""
+
+    def __init__(self, aloft: Aloft, tracker: onboard.Estimator | None) -> None:
+        self.aloft, self.tracker = aloft, tracker
+        self.scene, self.meter = aloft.lab.scene, onboard.Meter(aloft.lab.scene)
+        self.latency_s = self.scene.filter.latency_s if self.scene.filter else 0.0
+        self.index = 0
+
+    def looks(self, clock: Clock | None = None) -> Iterator[Look]:
+        """All frames whose exposure ended the filter's latency ago, and which were not taken yet."""
+        scene, aloft = self.scene, self.aloft
+        while self.index < scene.exposure.frames:
+            when = window(scene, self.index, self.meter.exposure_s)
+            if when.close_s(scene.camera.height_px) + self.latency_s > aloft.flight.now_s:
+                return
+            frame, truth = shoot(aloft.here(when.open_s), self.index, clock, when.exposure_s)
+            self.meter.see(frame)
+            report = onboard.answer(self.tracker, frame) if self.tracker else None
+            told = aloft.navigation if scene.filter and report else None
+            verdict = told.see(frame.t_mid_s, report.attitude) if told and report else ""
+            self.index += 1
+            yield Look(frame, truth, report, verdict)
+
+
+def memory_s(scene: Scene) -> float:
+    """How much of the flight a frame is made from, once its time has come."""
+    control, latency_s = scene.tracker.exposure_control, scene.filter.latency_s if scene.filter else 0.0
+    when = window(scene, 0, control.longest_s if control else None)
+    return (
+        when.close_s(scene.camera.height_px) - when.open_s + latency_s + 2 / scene.control_rate_hz + MARGIN_S
+    )
+
+
+def check_reference(reference: manoeuvre.Reference, lab: Lab) -> None:
+    """Refuse a manoeuvre that asks for a tilt beyond the stop, which the controller would push against."""
+    vehicle = lab.scene.vehicle
+    if vehicle.mount != "air_bearing" or lab.scene.motion.control is None:
+        return
+    t_s = np.arange(0, min(reference.duration_s, lab.flown_s) + LOOK_S, LOOK_S)
+    tilt_deg = world.tilt_deg(reference.attitudes(t_s))
+    beyond = np.flatnonzero(tilt_deg > vehicle.tilt_stop_deg)
+    if len(beyond):
+        raise BadInput(
+            f"motion.manoeuvre: asks for a tilt of {tilt_deg[beyond[0]]:.3g} deg at {t_s[beyond[0]]:.3g} s, beyond"
+            f" vehicle.tilt_stop_deg {vehicle.tilt_stop_deg:g}"
+        )
+
+
+def felt(flight: world.Flight, vibration: Vibration, steps: int) -> tuple[Floats, Floats, Floats]:
+    """Times (K,), attitudes (K, 4) as wxyz and rates (K, 3) of the last steps, with what shakes them."""
+    begin = max(flight.step - steps, 0)
+    if not vibration.voices:
+        return flight.knots(begin)
+    shaken = vibration.lay_over(flight.trajectory(begin))
+    return shaken.t_s, shaken.lab_from_body.as_quat(scalar_first=True), shaken.rate_body_rad_s
+
+
+def navigator(lab: Lab, start: Rotation, records: bool) -> onboard.Navigation | None:
+    """The computer that listens to the gyros, where there are any; records: whether it keeps all that they said."""
+    if lab.scene.vehicle.imu is None:
+        return None
+    place_m = world.imu_place_m(lab.ship)
+    stream = rng(lab.scene.seed, "imu", 0)
+    return onboard.Navigation(lab.scene, lab.mount, start, place_m, lab.ship.gravity_m_s2, stream, records)
