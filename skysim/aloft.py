@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
 LOOK_S = 0.05  # between two looks at what a manoeuvre asks for
 MARGIN_S = 0.05  # kept of the past beyond what is needed
+
+Wanted = Callable[[int, float], bool]
 
 
 class Look(NamedTuple):
@@ -99,10 +101,13 @@ class Aloft:
 
 class Eyes:
     """The camera in flight, and the star tracker: every frame is taken when its time has come, solved, and told the
-    filter, if there is one."""
+    filter, if there is one.
 
-    def __init__(self, aloft: Aloft, tracker: onboard.Estimator | None) -> None:
-        self.aloft, self.tracker = aloft, tracker
+    tracker : who solves them, if anybody does;  wanted(index, close_s) : whether a frame is taken at all
+    """
+
+    def __init__(self, aloft: Aloft, tracker: onboard.Estimator | None, wanted: Wanted | None = None) -> None:
+        self.aloft, self.tracker, self.wanted = aloft, tracker, wanted
         self.scene, self.meter = aloft.lab.scene, onboard.Meter(aloft.lab.scene)
         self.latency_s = self.scene.filter.latency_s if self.scene.filter else 0.0
         self.index = 0
@@ -112,8 +117,12 @@ class Eyes:
         scene, aloft = self.scene, self.aloft
         while self.index < scene.exposure.frames:
             when = window(scene, self.index, self.meter.exposure_s)
-            if when.close_s(scene.camera.height_px) + self.latency_s > aloft.flight.now_s:
+            close_s = when.close_s(scene.camera.height_px)
+            if close_s + self.latency_s > aloft.flight.now_s:
                 return
+            if self.wanted and not self.wanted(self.index, close_s):
+                self.index += 1
+                continue
             frame, truth = shoot(aloft.here(when.open_s), self.index, clock, when.exposure_s)
             self.meter.see(frame)
             report = onboard.answer(self.tracker, frame) if self.tracker else None

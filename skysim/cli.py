@@ -14,6 +14,7 @@ from estimator import BadImage
 from skysim import BadInput, __version__
 from skysim.lab.commands import lab as open_lab
 from skysim.papers.commands import reproduce
+from skysim.stream.commands import stream
 from skysim.study.commands import app as studies
 from skysim.terminal import (
     begun,
@@ -310,6 +311,7 @@ def survey(
 
 app.command()(reproduce)
 app.command("lab")(open_lab)
+app.command()(stream)
 app.command()(validate)
 
 

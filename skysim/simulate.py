@@ -163,14 +163,18 @@ def fly(lab: Lab, watch: Watch | None = None) -> Lab:
     )
 
 
-def live(lab: Lab, estimator: onboard.Estimator | None) -> Iterator[Look]:
+def live(
+    lab: Lab, estimator: onboard.Estimator | None, wanted: Callable[[int, float], bool] | None = None
+) -> Iterator[Look]:
     """Frame after frame of a lab on the ground as it happens; memory holds the last moments alone, however long it
     lasts. They are the frames that `run` makes of it.
 
-    estimator : solves each; a scene with a filter needs one, others may leave that to who is given the frames
+    estimator : solves each; without one they are not solved, but where a filter needs it
+    wanted(index, close_s) : whether a frame is made at all; the others are as they would have been
     """
     aloft = Aloft(lab, forgets=True)
-    eyes, flight = Eyes(aloft, estimator or (tracker(lab) if lab.scene.filter else None)), aloft.flight
+    flight = aloft.flight
+    eyes = Eyes(aloft, estimator or (tracker(lab) if lab.scene.filter else None), wanted)
     steps = round(aloft.pilot.period_s / flight.step_s)
     while flight.steps_left:
         aloft.tick(steps)

@@ -14,8 +14,8 @@ from estimator.dometracker import DomeTracker
 from estimator.nearfield import project
 from estimator.stages import Clock, Report
 from estimator.types import Attitude
-from skysim import metrics, onboard, quaternion, score, simulate
-from skysim.lab import picture, pose, stage
+from skysim import greys, metrics, onboard, quaternion, score, simulate
+from skysim.lab import pose, stage
 from skysim.lab.views import Answer, Light, Setting, Spot, Triple, View, Zoom
 from skysim.quantity import ARCSEC_RAD
 from skysim.scene import Scene, Stars, load
@@ -97,8 +97,8 @@ class Desk:
         clock = Clock()
         self.frame, self.truth = simulate.shoot(lab, 0)
         self.report = onboard.answer(self.estimator, self.frame) if solve else None
-        grey = picture.stretched(self.frame.image_dn, self.stretch, self.bright)
-        packed = picture.jpeg(grey)
+        grey = greys.stretched(self.frame.image_dn, self.stretch, self.bright)
+        packed = greys.jpeg(grey)
         clock.lap("all")
         return View(
             packed,
@@ -114,9 +114,7 @@ class Desk:
     def again(self) -> bytes:
         """The same frame, shown otherwise."""
         return (
-            picture.jpeg(picture.stretched(self.frame.image_dn, self.stretch, self.bright))
-            if self.frame
-            else b""
+            greys.jpeg(greys.stretched(self.frame.image_dn, self.stretch, self.bright)) if self.frame else b""
         )
 
     def lights(self) -> tuple[Light, ...]:

@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.detect import check_size
-from skysim import io, solve
-from skysim.lab import picture
+from skysim import greys, io, solve
 from skysim.lab.desk import named, spots_of
 from skysim.lab.views import Answer, Triple
 from skysim.study import plan, replay, store
@@ -66,8 +65,8 @@ def of_trial(study: str, folder: Path, trial: int) -> Photo:
     frame, _, report = next(replay.seen(ready, row.seed))
     spots = spots_of(report, named(ready.estimator, report.attitude, report.centroids.xy_px))
     answer = Answer(row.error.strip().splitlines()[-1] if row.error else report.attitude.status, spots, 0.0)
-    grey = picture.stretched(frame.image_dn, "square root")
-    return Photo(picture.jpeg(grey), (grey.shape[1], grey.shape[0]), answer, {})
+    grey = greys.stretched(frame.image_dn, "square root")
+    return Photo(greys.jpeg(grey), (grey.shape[1], grey.shape[0]), answer, {})
 
 
 def solved(image: NDArray, fov_deg: float | None, stages: dict[str, str], taken: Any) -> Photo:
@@ -80,8 +79,8 @@ def solved(image: NDArray, fov_deg: float | None, stages: dict[str, str], taken:
     facts = solve.solution(found) if told.solved else {}
     angles: Triple | None = (facts["ra_deg"], facts["dec_deg"], facts["roll_deg"]) if facts else None
     answer = Answer(told.status, spots, 1e3 * sum(found.seconds.values()), angles)
-    grey = picture.stretched(image, "square root")
+    grey = greys.stretched(image, "square root")
     height, width = grey.shape
     if width > WIDEST_PX:
         grey = cv2.resize(grey, (WIDEST_PX, round(height * WIDEST_PX / width)), interpolation=cv2.INTER_AREA)
-    return Photo(picture.jpeg(np.asarray(grey, np.uint8)), (width, height), answer, facts)
+    return Photo(greys.jpeg(np.asarray(grey, np.uint8)), (width, height), answer, facts)

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 from nicegui import ui
 
-from skysim.lab import overlay, picture
+from skysim import greys
+from skysim.lab import overlay
 from skysim.lab.look import INK
 from skysim.lab.starnames import NAMES
 from skysim.lab.views import Answer, Light, Spot, View
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
     from skysim.lab.page import Tab
 
 ZOOM_PX = 160  # side of the enlarged pixels on the screen
-STRETCHES = list(picture.CURVES)
+STRETCHES = list(greys.CURVES)
 NUMBER = itertools.count(1)  # of frames, so that each has an address of its own
 FRAMES: dict[str, dict[int, bytes]] = {}  # by tab and number, the newest few
 KEPT = 3

@@ -16,14 +16,22 @@ CURVES: dict[str, Any] = {
 SAMPLED = 8  # every so many rows and columns tell the sky
 
 
-def stretched(image: NDArray, curve: str, bright: float = 1.0) -> NDArray[np.uint8]:
+def span(image: NDArray) -> tuple[float, float]:
+    """What is black in a frame and what is white: the sky, and near the brightest pixel."""
+    low, high = np.percentile(image[::SAMPLED, ::SAMPLED], (30, 99.9))
+    return float(low), max(float(high), float(image.max()) * 0.25)
+
+
+def stretched(
+    image: NDArray, curve: str, bright: float = 1.0, between: tuple[float, float] | None = None
+) -> NDArray[np.uint8]:
     """(H, W) of 8 bits, from the sky to near the brightest pixel.
 
-    bright : how much brighter than usual faint light is shown
+    bright  : how much brighter than usual faint light is shown
+    between : black and white, where they are another frame's; the frame's own if left out
     """
-    low, high = np.percentile(image[::SAMPLED, ::SAMPLED], (30, 99.9))
-    top = max(float(high), float(image.max()) * 0.25) / bright
-    top = max(top, low + 1.0)
+    low, high = between or span(image)
+    top = max(high / bright, low + 1.0)
     if image.dtype != np.uint16:
         return (255 * CURVES[curve](np.clip((image - low) / (top - low), 0, 1))).astype(np.uint8)
     levels = np.arange(int(image.max()) + 1)

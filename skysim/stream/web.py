@@ -1,0 +1,132 @@
+"""Frames over HTTP: MJPEG for the eye, packets for a tracker, the newest frame, truth and tallies for who asks."""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections.abc import Callable
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from typing import Any
+
+from skysim import io
+from skysim.greys import jpeg, stretched
+from skysim.stream.packet import Packet
+from skysim.stream.sinks import png
+from skysim.types import BadInput
+
+BOUNDARY = "frame"
+PATIENCE_S = 10.0  # with a client that takes nothing
+INDEX = b"""<!doctype html><meta charset="utf-8"><title>skysim stream</title>
+<body style="margin:0;background:#0d1015;color:#8b95a5;font:13px system-ui"><img src="/stream.mjpg" style="width:100%">
+<p style="padding:0 12px">/stream.mjpg, /stream.raw, /frame.png, /frame.raw, /truth.json, /status.json</p>"""
+
+
+class Board:
+    """The newest packet, and who waits for the next."""
+
+    def __init__(self, status: Callable[[], dict[str, Any]]) -> None:
+        self.status = status
+        self.newest: Packet | None = None
+        self.ended = False
+        self.changed = threading.Condition()
+        self.clients: list[list[int]] = []  # of each: frames sent, frames that it was too slow for
+
+    def post(self, packet: Packet) -> None:
+        with self.changed:
+            self.newest = packet
+            self.changed.notify_all()
+
+    def end(self) -> None:
+        with self.changed:
+            self.ended = True
+            self.changed.notify_all()
+
+    def after(self, number: int) -> Packet | None:
+        """The next packet that is newer; None at the end."""
+        with self.changed:
+            self.changed.wait_for(lambda: self.ended or (self.newest and self.newest.number > number))
+            return None if self.ended else self.newest
+
+
+class Handler(BaseHTTPRequestHandler):
+    """One client. What it is too slow for it does not get; it is told by `dropped` how much that was."""
+
+    board: Board
+    timeout = PATIENCE_S
+
+    def do_GET(self) -> None:
+        path = self.path.partition("?")[0]
+        newest = self.board.newest
+        if path == "/":
+            self.answer(INDEX, "text/html")
+        elif path == "/status.json":
+            self.answer(io.to_json(self.board.status()).encode(), "application/json")
+        elif path in ("/stream.mjpg", "/stream.raw"):
+            self.stream(path.endswith("raw"))
+        elif path not in ("/frame.png", "/frame.raw", "/truth.json"):
+            self.send_error(
+                404,
+                "allowed: /, /stream.mjpg, /stream.raw, /frame.png, /frame.raw, /truth.json, /status.json",
+            )
+        elif newest is None:
+            self.send_error(503, "no frame yet")
+        elif path == "/frame.png":
+            self.answer(png(newest), "image/png", newest.header)
+        elif path == "/frame.raw":
+            self.answer(newest.pack(), "application/octet-stream", newest.header)
+        else:
+            self.answer(io.to_json({**newest.header, "truth": newest.truth}).encode(), "application/json")
+
+    def answer(self, data: bytes, kind: str, header: dict[str, Any] | None = None) -> None:
+        """One thing, whole."""
+        self.send_response(200)
+        self.send_header("Content-Type", kind)
+        self.send_header("Content-Length", str(len(data)))
+        self.send_header("Cache-Control", "no-store")
+        if header:
+            self.send_header("X-Skysim-Header", json.dumps(header))
+        self.end_headers()
+        self.wfile.write(data)
+
+    def stream(self, raw: bool) -> None:
+        """Frame after frame: packets one after another, or parts of JPEG with their header's numbers."""
+        self.send_response(200)
+        kind = "application/octet-stream" if raw else f"multipart/x-mixed-replace; boundary={BOUNDARY}"
+        self.send_header("Content-Type", kind)
+        self.send_header("Cache-Control", "no-store")
+        self.end_headers()
+        mine, number = [0, 0], -1
+        self.board.clients.append(mine)
+        try:
+            while packet := self.board.after(number):
+                mine[1] += packet.number - number - 1 if mine[0] else 0
+                number = packet.number
+                self.wfile.write(packet.after(mine[1]).pack() if raw else part(packet.after(mine[1])))
+                mine[0] += 1
+        except OSError:  # it has gone
+            self.close_connection = True
+
+    def log_message(self, *_: Any) -> None:
+        """Nobody reads it."""
+
+
+def part(packet: Packet) -> bytes:
+    """A part of a multipart answer."""
+    data = jpeg(stretched(packet.pixels, "square root"))
+    head = f"--{BOUNDARY}\r\nContent-Type: image/jpeg\r\nContent-Length: {len(data)}\r\n"
+    head += "".join(
+        f"X-{name}: {packet.header[name]}\r\n" for name in ("index", "t_s", "due_unix_s", "dropped")
+    )
+    return head.encode() + b"\r\n" + data + b"\r\n"
+
+
+def served(board: Board, host: str, port: int) -> ThreadingHTTPServer:
+    """A server in threads of its own. Raises BadInput where the address is taken."""
+    handler = type("Here", (Handler,), {"board": board})
+    try:
+        server = ThreadingHTTPServer((host, port), handler)
+    except OSError as error:
+        raise BadInput(f"--http {port}: {host}:{port} cannot be served: {error.strerror}") from None
+    server.daemon_threads = True
+    threading.Thread(target=server.serve_forever, name="http", daemon=True).start()
+    return server

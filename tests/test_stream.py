@@ -1,0 +1,237 @@
+"""A scene sent out as it happens: the frames are those of a run, in time or counted, whoever takes them."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from skysim import cli, scene, simulate
+from skysim.stream import send, sinks, web
+from skysim.stream.pace import Pace
+from skysim.stream.packet import Packet, unpack
+from skysim.types import BadInput
+
+FRAMES = 4
+OVERRIDES = {"exposure.frames": str(FRAMES), "light.limit_mag": "5"}
+
+
+@pytest.fixture(scope="module")
+def frames() -> list[np.ndarray]:
+    """What a run makes of the scene."""
+    lab = simulate.prepare(scene.load("shefex2", OVERRIDES))
+    return [frame.image_dn for frame, _, _ in simulate.photographs(lab)]
+
+
+def on_the_ground() -> simulate.Lab:
+    return simulate.furnish(scene.load("shefex2", OVERRIDES))
+
+
+def packet(index: int, dropped: int = 0, pixels: Any = None) -> Packet:
+    pixels = np.arange(12, dtype="<u2").reshape(3, 4) if pixels is None else pixels
+    shape = {"width": pixels.shape[1], "height": pixels.shape[0], "dtype": pixels.dtype.str}
+    return Packet({"index": index, "dropped": dropped, "t_s": 0.5, "due_unix_s": 1.0, **shape}, pixels, {})
+
+
+@pytest.mark.parametrize("dtype", ["<u2", "<f8"])
+def test_a_packet_comes_back_as_it_was_and_one_cut_short_is_told(dtype: str) -> None:
+    pixels = np.random.default_rng(1).integers(0, 65535, (5, 7)).astype(dtype)
+    data = packet(3, 1, pixels).pack()
+    stream = io.BytesIO(data + data)
+    for _ in range(2):
+        found = unpack(stream)
+        assert found is not None
+        assert found[0]["index"] == 3
+        np.testing.assert_array_equal(found[1], pixels)
+    assert unpack(stream) is None
+    with pytest.raises(BadInput, match="ended within frame 3"):
+        unpack(io.BytesIO(data[:-1]))
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        b"\n",
+        b"no JSON\n",
+        b"[1]\n",
+        b'{"width": 100000, "height": 100000, "dtype": "<u2"}\n',
+        b'{"width": -1, "height": 1, "dtype": "<u2"}\n',
+        b'{"width": 1, "height": 1, "dtype": "O"}\n',
+        b'{"width": 1, "height": 1, "dtype": "nonsense"}\n',
+    ],
+)
+def test_what_is_no_packet_is_refused_before_anything_is_read(line: bytes) -> None:
+    with pytest.raises(BadInput, match="no packet of skysim stream"):
+        unpack(io.BytesIO(line + b"x" * 64))
+
+
+class Wall:
+    """A clock on the wall that only sleep moves."""
+
+    def __init__(self) -> None:
+        self.now_s = 100.0
+
+    def monotonic(self) -> float:
+        return self.now_s
+
+    def time(self) -> float:
+        return 1e9 + self.now_s
+
+    def sleep(self, seconds: float) -> None:
+        self.now_s += seconds
+
+
+def test_a_frame_waits_for_its_time_and_is_left_out_a_period_after_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    wall = Wall()
+    monkeypatch.setattr("skysim.stream.pace.time", wall)
+    pace = Pace(2.0, 10.0)  # a period is 50 ms on the wall
+    assert pace.in_time(0, 123.0)  # what is before the first frame is nobody's delay
+    pace.start(0.3)
+    pace.wait(0.5)
+    assert wall.now_s == pytest.approx(100.1, abs=1e-12)
+    wall.now_s += 0.05 - 1e-6
+    assert pace.in_time(1, 0.5)
+    wall.now_s += 2e-6
+    assert not pace.in_time(1, 0.5)
+    assert pace.due_s(0.5) + pace.offset_s == pytest.approx(1e9 + 100.1, abs=1e-6)
+
+
+def test_frames_that_are_late_are_left_out_and_all_are_accounted_for(frames: list[np.ndarray]) -> None:
+    """With time for every other frame, those that come are the run's; the header says how many did not."""
+    came: list[Packet] = []
+
+    class Slow(Pace):
+        def in_time(self, index: int, t_s: float) -> bool:
+            return index % 2 == 0
+
+    tally = send.Tally()
+    send.send(on_the_ground(), Slow(0.0, 10.0), [], tally, came.append)
+    assert [one.header["index"] for one in came] == list(range(0, FRAMES, 2))
+    assert [one.header["dropped"] for one in came] == list(range(FRAMES // 2))
+    assert tally.made + tally.dropped == came[-1].header["index"] + 1
+    for one in came:
+        np.testing.assert_array_equal(one.pixels, frames[one.header["index"]])
+
+
+def test_a_slow_sink_holds_nobody_up_and_its_losses_are_counted() -> None:
+    free, got = threading.Event(), list[int]()
+
+    def take(one: Packet) -> None:
+        free.wait(10)
+        got.append(one.header["dropped"])
+
+    sink = sinks.Sink("slow", take)
+    for index in range(20):
+        sink.offer(packet(index), patient=False)
+    free.set()
+    sink.close()
+    assert sink.sent == len(got)
+    assert sink.sent + sink.dropped == 20
+    assert sink.dropped >= 16  # one at hand, two waiting, one that came between
+    sink = sinks.Sink("gone", lambda _: (_ for _ in ()).throw(BrokenPipeError))
+    sink.offer(packet(0), patient=True)
+    sink.close()
+    assert (sink.sent, sink.dropped, sink.fault) == (0, 1, "its reader is gone")
+
+
+def test_a_folder_gets_every_frame_whole_with_its_truth(tmp_path: Path, frames: list[np.ndarray]) -> None:
+    sets = [word for key, value in OVERRIDES.items() for word in ("--set", f"{key}={value}")]
+    command = ["stream", "shefex2", "--folder", str(tmp_path), "--speed", "0", "--json", *sets]
+    done = CliRunner().invoke(cli.app, command)
+    assert json.loads(done.stdout)["sinks"]["folder"] == {"sent": FRAMES, "dropped": 0, "fault": ""}
+    for n, image in enumerate(frames):
+        told = json.loads((tmp_path / f"frame_{n:06d}.json").read_text())
+        np.testing.assert_array_equal(cv2.imread(str(tmp_path / f"frame_{n:06d}.png"), -1), image)
+        assert np.linalg.norm(told["truth"]["cam_from_ref_xyzw"]) == pytest.approx(1, abs=1e-12)
+        assert len(told["truth"]["ids"]) == len(told["truth"]["x_px"]) > 5
+    with pytest.raises(BadInput, match="frames of an earlier stream are there"):
+        sinks.folder(tmp_path)
+    with pytest.raises(BadInput, match="no named pipe"):
+        sinks.pipe(str(tmp_path / "none"))
+
+
+@pytest.fixture
+def board() -> Iterator[tuple[web.Board, str]]:
+    """A server with one packet posted."""
+    board = web.Board(lambda: {"made": 1})
+    server = web.served(board, "127.0.0.1", 0)
+    board.post(packet(0))
+    yield board, f"http://127.0.0.1:{server.server_port}"
+    board.end()
+    server.shutdown()
+
+
+def test_the_newest_frame_and_the_tallies_are_served(board: tuple[web.Board, str]) -> None:
+    def got(path: str) -> bytes:
+        return bytes(urllib.request.urlopen(board[1] + path, timeout=10).read())
+
+    found = unpack(io.BytesIO(got("/frame.raw")))
+    assert found is not None
+    np.testing.assert_array_equal(found[1], packet(0).pixels)
+    image = cv2.imdecode(np.frombuffer(got("/frame.png"), np.uint8), -1)
+    np.testing.assert_array_equal(image, packet(0).pixels)
+    assert json.loads(got("/truth.json"))["index"] == 0
+    assert json.loads(got("/status.json")) == {"made": 1}
+    assert b"/stream.mjpg" in got("/")
+    with pytest.raises(urllib.error.HTTPError, match="404"):
+        got("/etc/passwd")
+
+
+def test_streams_bring_every_next_frame(board: tuple[web.Board, str]) -> None:
+    raw = urllib.request.urlopen(board[1] + "/stream.raw", timeout=10)
+    movie = urllib.request.urlopen(board[1] + "/stream.mjpg", timeout=10)
+    for index in range(3):
+        found = unpack(raw)
+        assert found is not None
+        assert (found[0]["index"], found[0]["dropped"]) == (index, 0)
+        assert movie.readline() == b"--frame\r\n"
+        head = dict(line.decode().split(": ") for line in iter(movie.readline, b"\r\n"))
+        assert int(head["X-index"]) == index
+        data = movie.read(int(head["Content-Length"]))
+        assert cv2.imdecode(np.frombuffer(data, np.uint8), -1).shape == (3, 4)
+        movie.readline()
+        board[0].post(packet(index + 1))
+    assert {tuple(one) for one in board[0].clients} <= {(3, 0), (4, 0)}
+
+
+def test_a_pipe_ends_with_its_reader_and_sigterm_ends_a_stream_with_its_tallies(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "skysim", "stream", "shefex2", "--set", "light.limit_mag=5", "--endless"]
+    piped = subprocess.Popen([*command, "--pipe", "-", "--speed", "0"], stdout=-1, stderr=-1)
+    assert piped.stdout is not None
+    assert piped.stderr is not None
+    assert unpack(piped.stdout) is not None
+    piped.stdout.close()
+    assert piped.wait(60) == 0
+    told = piped.stderr.read().decode()
+    assert "its reader is gone" in told
+    assert "Exception" not in told
+    fifo = tmp_path / "frames"
+    os.mkfifo(fifo)
+    named = subprocess.Popen([*command, "--pipe", str(fifo), "--json"], stdout=-1)
+    with fifo.open("rb") as reader:
+        began = [unpack(reader) for _ in range(2)]
+        assert all(began)
+        time.sleep(0.1)
+        named.send_signal(signal.SIGTERM)
+        while unpack(reader):
+            pass
+    told = json.loads(named.communicate(timeout=60)[0])
+    assert named.returncode == 0
+    assert told["made"] >= told["sinks"]["pipe"]["sent"] >= 2
