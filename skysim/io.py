@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+import errno
 import json
 import os
 import sys
@@ -56,6 +57,12 @@ def whole(path: Path) -> Iterator[Path]:
     try:
         yield temporary
         os.replace(temporary, path)
+    except OSError as error:  # some libraries tell neither which file nor, of a full disk, what is wrong in a line
+        full = error.errno in (None, errno.ENOSPC, errno.EDQUOT) and "space" in str(error).lower()
+        number = errno.ENOSPC if full else error.errno
+        if number is None:
+            raise
+        raise OSError(number, os.strerror(number), str(path)) from error
     finally:
         temporary.unlink(missing_ok=True)
 

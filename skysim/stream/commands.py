@@ -54,6 +54,7 @@ def stream(
     from skysim.scene import load
     from skysim.stream import send, sinks, web
     from skysim.stream.pace import Pace
+    from skysim.stream.sinks import GONE
     from skysim.yamlfile import overridden
 
     if folder is None and http is None and pipe is None:
@@ -92,6 +93,9 @@ def stream(
     figures = tally.figures(takers) | ({"clients": clients(board)} if board else {})
     where = sys.stderr if pipe == "-" else sys.stdout
     print(io.to_json(figures) if json else summary(figures), file=where)
+    for taker in takers:
+        if taker.fault not in ("", GONE):
+            raise BadInput(f"--{taker.name}: {taker.fault}")
 
 
 def clients(board: Any) -> list[dict[str, int]]:

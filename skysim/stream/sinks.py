@@ -22,6 +22,7 @@ from skysim.types import BadInput
 
 WAITING = 2  # packets that may wait for a sink
 GRACE_S = 5.0  # for what still waits at the end
+GONE = "its reader is gone"
 
 
 class Sink:
@@ -44,7 +45,7 @@ class Sink:
             try:
                 self.take(packet)
             except BrokenPipeError:
-                self.fault = "its reader is gone"
+                self.fault = GONE
             except OSError as error:
                 self.fault = error.strerror or str(error)
             if self.fault:
