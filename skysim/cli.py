@@ -24,6 +24,7 @@ from skysim.terminal import (
     print_answers,
     print_catalogue,
     print_rows,
+    print_scores,
     print_summary,
     print_survey,
     print_table,
@@ -68,6 +69,10 @@ Detector = Annotated[str | None, typer.Option(help="How lights are found, e.g. l
 Centroider = Annotated[str | None, typer.Option(help="How they are centred, e.g. gaussian_fit.")]
 Identifier = Annotated[str | None, typer.Option(help="How they are named, e.g. pyramid.")]
 SolverName = Annotated[str | None, typer.Option("--solver", help="How the attitude follows, e.g. quest.")]
+Programs = Annotated[
+    list[str] | None,
+    typer.Option("--program", help="NAME=COMMAND: a tracker of your own, a program that is told frames."),
+]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON for machines instead of a table.")]
 
 
@@ -134,18 +139,23 @@ def run(
     centroider: Centroider = None,
     identifier: Identifier = None,
     solver: SolverName = None,
+    tracker: Annotated[
+        str | None, typer.Option(help="Who solves: own, or a name of `skysim trackers` or --program.")
+    ] = None,
+    program: Programs = None,
     picture: Annotated[
         bool, typer.Option("--picture", help="Also the lab in 3-D: lab.png and lab.gif, the vehicle moving.")
     ] = False,
     json: Json = False,
 ) -> None:
     """Fly a scene, photograph it, solve every frame and score the answers."""
-    from skysim import doubts, flightlog, io, report, score, simulate
+    from skysim import doubts, flightlog, io, programs, report, score, simulate
 
     stages = named(detector=detector, centroider=centroider, identifier=identifier, solver=solver)
     more = [f"tracker.{stage}={name}" for stage, name in stages.items()]
+    more += [] if tracker is None else [f"tracker.name={tracker}"]
     loaded = load(scene, frames, seed, [*(set_ or []), *more])
-    lab = simulate.furnish(loaded)
+    lab = simulate.furnish(loaded, programs.named(program))
     for doubt in doubts.doubts(loaded, lab.sources, lab.mount):
         complain(doubt)
     with watched("flying") as watch:
@@ -180,6 +190,56 @@ def run(
     else:
         print_rows(rows, names, exposures_ms)
         print_summary(figures)
+
+
+@app.command()
+def compare(
+    scene: SceneArg,
+    tracker: Annotated[
+        list[str], typer.Option(help="Who solves: own, or a name of `skysim trackers` or --program.")
+    ],
+    program: Programs = None,
+    frames: Frames = None,
+    seed: Seed = None,
+    out: Out = None,
+    set_: Sets = None,
+    json: Json = False,
+) -> None:
+    """Let trackers solve the same frames, and score them side by side. Where there is a filter the first one flies."""
+    from skysim import io, programs, scoreboard, simulate
+
+    loaded = load(scene, frames, seed, [*(set_ or []), f"tracker.name={tracker[0]}"])
+    lab = simulate.furnish(loaded, programs.named(program))
+    entrants = scoreboard.entrants(lab, tracker)
+    with watched("flying", quiet=json) as watch:
+        lab = simulate.fly(lab, watch)
+    shots = begun(scoreboard.shots(lab, entrants))
+    folder = fresh(out or Path("out") / loaded.name)
+    rows: dict[str, list[Row]] = {name: [] for name in entrants}
+    for frame, truth, answers in progress(shots, loaded.exposure.frames, loaded.title, quiet=json):
+        io.write_frame(folder, frame, truth, loaded)
+        for name, row in answers.items():
+            rows[name].append(row)
+    lines = scoreboard.write(folder, rows, loaded)
+    if json:
+        print(io.to_json({"scene": loaded.name, "scoreboard": scoreboard.as_dicts(lines)}))
+    else:
+        print_scores(lines, folder)
+
+
+@app.command()
+def trackers(json: Json = False) -> None:
+    """List the trackers that are installed."""
+    from skysim import io
+    from skysim import trackers as known
+
+    listed = [{"name": known.OWN, "from": "skysim"}]
+    listed += [{"name": name, "from": point.value} for name, point in known.entry_points().items()]
+    if json:
+        print(io.to_json(listed))
+        return
+    for entry in listed:
+        print(f"{entry['name']:20s} {entry['from']}")
 
 
 @app.command()

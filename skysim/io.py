@@ -78,7 +78,7 @@ def make_folder(path: Path) -> Path:
 
 RESULTS = (
     *("solutions.ecsv", "telemetry.ecsv", "imu.ecsv"),
-    *("annotated.png", "lab.png", "lab.gif", "report.html"),
+    *("annotated.png", "lab.png", "lab.gif", "report.html", "scoreboard.ecsv"),
 )
 
 
@@ -87,6 +87,8 @@ def clear(folder: Path) -> None:
     for suffix in ("fits", "png", "ecsv"):
         for path in folder.glob(f"frame_[0-9][0-9][0-9][0-9]*.{suffix}"):
             path.unlink()
+    for path in folder.glob("solutions.*.ecsv"):
+        path.unlink()
     for name in RESULTS:
         (folder / name).unlink(missing_ok=True)
 

@@ -28,19 +28,25 @@ from estimator.nearfield import LedMap, Lever
 from estimator.stages import Clock, Report, Settings, see
 from estimator.tracker import StarTracker
 from estimator.types import Attitude, BadImage, Centroids
-from skysim import display, dome, imu, io, quaternion, survey
+from skysim import display, dome, guest, imu, io, quaternion, survey
 from skysim.camera import Camera as CameraPart
 from skysim.detector import saturation_dn
+from skysim.guest import Guest
 from skysim.quantity import ARCSEC_RAD, one_of
 from skysim.scene import CATALOGUES, Bench, Dome, Filter, Scene
+from skysim.trackers import OWN
 from skysim.types import BadInput, Floats, Frame, Mount, Sources
 
-Estimator = StarTracker | DomeTracker
+Estimator = StarTracker | DomeTracker | Guest
+NO_PROGRAMS: Mapping[str, str] = {}
 
 
-def tracker(scene: Scene, mount: Mount, sources: Sources) -> Estimator:
+def tracker(
+    scene: Scene, mount: Mount, sources: Sources, programs: Mapping[str, str] = NO_PROGRAMS
+) -> Estimator:
     """The star tracker with what it believes of the hardware: the scene's `tracker` section, else the truth.
 
+    programs : commands by name, any of which `tracker.name` may be
     Raises BadInput for a dome that no tracker can work under.
     """
     camera, settings = believed_camera(scene), believed_settings(scene)
@@ -48,6 +54,8 @@ def tracker(scene: Scene, mount: Mount, sources: Sources) -> Estimator:
         leds, lever = believed_dome(scene, scene.light, sources), believed_lever(scene, mount)
         if scene.tracker.map:
             camera, leds, lever = surveyed_dome(scene, scene.tracker.map, leds, lever)
+        if scene.tracker.name != OWN:
+            return Guest.of(scene, camera, settings, guest.leds(leds, lever), programs)
         try:
             return DomeTracker(camera, leds, lever, settings)
         except BadImage as error:
@@ -58,6 +66,8 @@ def tracker(scene: Scene, mount: Mount, sources: Sources) -> Estimator:
     if isinstance(scene.light, Bench):
         # Where the bench has its display decides where the stars are in the lab.
         directions = display.lab_from_icrs(scene.light).apply(directions)
+    if scene.tracker.name != OWN:
+        return Guest.of(scene, camera, settings, guest.stars(stars, directions), programs)
     return StarTracker(camera, stars, directions, settings)
 
 
@@ -173,6 +183,8 @@ def answer(estimator: Estimator, frame: Frame, streak_px: tuple[float, float] | 
 
     streak_px : (dx, dy) that lights move in the exposure, where a gyro tells the tracker
     """
+    if isinstance(estimator, Guest):
+        return estimator.look(frame, streak_px)
     try:
         return estimator.solve(frame.image_dn, streak_px)
     except BadImage as error:

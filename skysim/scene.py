@@ -103,6 +103,8 @@ class ExposureControl(Part):
 class Tracker(Part):
     """What the star tracker's computer does and believes. `null` believes what the hardware is.
 
+    name : own, or a tracker of somebody else's: an entry point, or a program that the command line names (`--program`)
+    options, time_limit : what such a tracker is told, and for how long it may look at a frame
     map : a file that `skysim survey` wrote: LEDs, lever, focal length and distortion as measured
     detector, centroider, identifier, solver : if left out, under a dome local, cog, led_pairs and rotation_only, and
         under the stars all of them `default`
@@ -111,6 +113,9 @@ class Tracker(Part):
     exposure_control : every frame is exposed for `exposure.time` if left out
     """
 
+    name: Annotated[str, Field(pattern=r"^\w[\w.-]*$")] = "own"
+    options: dict[str, bool | int | Number | str] = Field(default_factory=dict)
+    time_limit_s: Annotated[Time, Field(ge=1e-3, le=3600)] = 10.0
     detector: str | None = None
     centroider: str | None = None
     identifier: str | None = None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from estimator.stages import Clock, Report
-from skysim import catalogue, display, dome, imu, manoeuvre, onboard, sky, world
+from skysim import catalogue, display, dome, imu, manoeuvre, onboard, sky, trackers, world
 from skysim.aloft import Aloft, Eyes, Look
 from skysim.detector import Chip
 from skysim.led import Emitter
@@ -42,6 +42,7 @@ class Lab:
     reports   : the star tracker's answers to the frames that were taken and solved in flight, for the filter
     verdicts  : what the filter made of each
     exposures_s: of each
+    programs  : commands by name, which the scene's tracker may be: the user's, who alone may say what is run
     """
 
     scene: Scene
@@ -60,6 +61,7 @@ class Lab:
     reports: dict[int, Report] = field(default_factory=dict)
     verdicts: dict[int, str] = field(default_factory=dict)
     exposures_s: dict[int, float] = field(default_factory=dict)
+    programs: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def flown_s(self) -> float:
@@ -93,9 +95,10 @@ def prepare(scene: Scene, watch: Watch | None = None) -> Lab:
     return fly(furnish(scene), watch)
 
 
-def furnish(scene: Scene) -> Lab:
+def furnish(scene: Scene, programs: Mapping[str, str] = onboard.NO_PROGRAMS) -> Lab:
     """The lab on the ground: all but the flight, of which there is the start alone."""
     onboard.believed_settings(scene)  # a wrong name is told before the flight
+    trackers.known(scene.tracker.name, programs)  # this one too
     EXTENT[scene.camera.psf.kind](scene.camera.psf, scene.camera)  # and so is a measured PSF's bad file
     ship = world.build(scene.vehicle)
     band = Band.of(scene.camera.detector.quantum_efficiency)
@@ -114,6 +117,7 @@ def furnish(scene: Scene) -> Lab:
         np.empty((scene.camera.height_px, scene.camera.width_px), kind),
         Trajectory.at_rest(start, 1.0),
         obstacles(scene, ship),
+        programs=programs,
     )
 
 
@@ -201,7 +205,7 @@ def lights(scene: Scene, band: Band) -> Sources:
 
 def tracker(lab: Lab) -> onboard.Estimator:
     """The star tracker with what it believes of the hardware."""
-    return onboard.tracker(lab.scene, lab.mount, lab.sources)
+    return onboard.tracker(lab.scene, lab.mount, lab.sources, lab.programs)
 
 
 def photographs(lab: Lab) -> Iterator[tuple[Frame, Truth, dict[str, float]]]:

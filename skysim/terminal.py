@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 if TYPE_CHECKING:
+    from skysim.scoreboard import Line
     from skysim.simulate import Lab
     from skysim.study.runner import Progress
     from skysim.types import Row
@@ -172,6 +173,32 @@ def print_summary(figures: dict[str, Any]) -> None:
     print(f"median ms a frame: {stages}")
     print_flight(figures["flight"])
     print(f"report: {figures['report']}")
+
+
+def print_scores(lines: list[Line], folder: Path) -> None:
+    """The scoreboard, and why frames had no answer."""
+    heads = ["what", "frames", "right %", "(95 %)", "wrong", "refused", "failed"]
+    heads += ["cross ″", "worst ″", "roll ″", "worst ″", "ms", "95 % ms"]
+    rows = [
+        [
+            line.tracker,
+            str(line.frames),
+            f"{100 * line.right.value:.1f}",
+            f"{100 * line.right.low:.1f} to {100 * line.right.high:.1f}",
+            f"[red]{line.wrong}[/]" if line.wrong else "0",
+            str(line.refused),
+            str(line.failed),
+            *(f"{value:.3g}" for value in (line.cross_arcsec_median, line.cross_arcsec_worst)),
+            *(f"{value:.3g}" for value in (line.roll_arcsec_median, line.roll_arcsec_worst)),
+            *(f"{value:.3g}" for value in (line.time_ms_median, line.time_ms_p95)),
+        ]
+        for line in lines
+    ]
+    print_table("", heads, rows)
+    for line in lines:
+        for status, count in line.refusals.items():
+            print(f"{line.tracker}: {count} × {status}")
+    print(f"scoreboard.ecsv, solutions.NAME.ecsv and the frames are in {folder}")
 
 
 def print_survey(figures: dict[str, Any]) -> None:

@@ -13,8 +13,10 @@ from scipy.spatial.transform import Rotation
 from estimator.dometracker import DomeTracker
 from estimator.nearfield import project
 from estimator.stages import Clock, Report
+from estimator.tracker import StarTracker
 from estimator.types import Attitude
 from skysim import greys, metrics, onboard, quaternion, score, simulate
+from skysim.guest import Guest
 from skysim.lab import pose, stage
 from skysim.lab.views import Answer, Light, Setting, Spot, Triple, View, Zoom
 from skysim.quantity import ARCSEC_RAD
@@ -174,7 +176,9 @@ def claimed_arcsec(told: Attitude) -> tuple[float, float]:
     return float(np.sqrt(variance[:2].sum())) / ARCSEC_RAD, float(np.sqrt(variance[2])) / ARCSEC_RAD
 
 
-def predicted(estimator: onboard.Estimator, cam_from_ref: Rotation) -> tuple[NDArray[np.int64], Floats]:
+def predicted(
+    estimator: DomeTracker | StarTracker, cam_from_ref: Rotation
+) -> tuple[NDArray[np.int64], Floats]:
     """(N,) ids and (N, 2) pixels of all lights on the tracker's map, as the camera would see them from there."""
     if isinstance(estimator, DomeTracker):
         body_from_lab = estimator.lever.cam_from_body.inv() * cam_from_ref
@@ -185,7 +189,7 @@ def predicted(estimator: onboard.Estimator, cam_from_ref: Rotation) -> tuple[NDA
 
 def named(estimator: onboard.Estimator, told: Attitude, xy_px: Floats) -> dict[int, tuple[int, float]]:
     """By a centroid's row the light that it is, and how far from where the answer would have it, in pixels."""
-    if told.match is None or told.cam_from_ref is None:
+    if told.match is None or told.cam_from_ref is None or isinstance(estimator, Guest):
         return {}
     ids, where = predicted(estimator, told.cam_from_ref)
     rows, star = told.match.observed, told.match.star
@@ -195,6 +199,8 @@ def named(estimator: onboard.Estimator, told: Attitude, xy_px: Floats) -> dict[i
 
 def windows(estimator: onboard.Estimator, cam_from_ref: Rotation) -> tuple[tuple[float, float], ...]:
     """Where a tracker that follows would look for its lights in the next frame."""
+    if isinstance(estimator, Guest):
+        return ()
     _, xy_px = predicted(estimator, cam_from_ref)
     inside = estimator.camera.contains(np.nan_to_num(xy_px, nan=-1e9))
     return tuple((float(x), float(y)) for x, y in xy_px[inside][:200])

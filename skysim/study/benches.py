@@ -42,7 +42,7 @@ SHELF = Shelf()
 
 def bench(recipe: Recipe, settings: Settings) -> Bench:
     """The bench of a point, from the shelf where it is there. Raises BadInput."""
-    key = digest([recipe.scene, recipe.folder, recipe.base, recipe.trial, settings])
+    key = digest([recipe.scene, recipe.folder, recipe.base, recipe.trial, recipe.programs, settings])
     shelf = SHELF.benches
     if key not in shelf:
         shelf[key] = set_up(recipe, settings)
@@ -57,9 +57,10 @@ def set_up(recipe: Recipe, settings: Settings) -> Bench:
     scene, trial = resolved(recipe, settings)
     told = scene_hash(scene)
     for ready in SHELF.benches.values():
-        if ready.scene_hash == told:
+        if ready.scene_hash == told and ready.lab.programs == recipe.programs:
             return ready._replace(trial=trial)
-    lab = like_before(scene) or simulate.furnish(scene)
+    lab = like_before(scene) or simulate.furnish(scene, recipe.programs)
+    lab = replace(lab, programs=recipe.programs)
     return Bench(lab, simulate.tracker(lab), trial, told)
 
 

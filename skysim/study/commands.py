@@ -31,6 +31,9 @@ Workers = Annotated[
 EngineName = Annotated[str, typer.Option("--engine", help="pool, serial or dask.")]
 Scheduler = Annotated[str, typer.Option(help="Address of a Dask scheduler, tcp://HOST:PORT.")]
 Sets = Annotated[list[str] | None, typer.Option("--set", help="Override a key: replicates=100.")]
+Programs = Annotated[
+    list[str] | None, typer.Option("--program", help="NAME=COMMAND: a tracker that the study may name.")
+]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON for machines instead of a table.")]
 
 
@@ -53,15 +56,17 @@ def run(
     engine: EngineName = "pool",
     scheduler: Scheduler = "",
     set_: Sets = None,
+    program: Programs = None,
     json: Json = False,
 ) -> None:
     """Do all trials of a study and report them. Ctrl-C leaves a store that `resume` goes on with."""
     warmed(engine)
+    from skysim import programs
     from skysim.study import plan
     from skysim.yamlfile import overridden
 
     overrides = overridden(set_)
-    told = plan.load(study, overrides)
+    told = plan.load(study, overrides, programs.named(program))
     if told.study.optimise is not None:
         raise BadInput(f"{told.path}: optimise: has no design to run; allowed: skysim study optimise")
     done(told, study, out, engine_of(engine, workers, scheduler), overrides, json)
@@ -75,11 +80,12 @@ def resume(
     engine: EngineName = "pool",
     scheduler: Scheduler = "",
     failed: Annotated[bool, typer.Option("--failed", help="Also do again the trials that failed.")] = False,
+    program: Programs = None,
     json: Json = False,
 ) -> None:
     """Go on with a study or a search that was stopped, killed or ran out of its budget."""
     warmed(engine)
-    told, overrides = planned(study, out)
+    told, overrides = planned(study, out, program or [])
     done(told, study, out, engine_of(engine, workers, scheduler), overrides, json, again=True, failed=failed)
 
 
@@ -133,6 +139,7 @@ def replay(
     trial: Annotated[int, typer.Argument(help="The trial's number, as report and status give it.")],
     out: Out = None,
     show: Annotated[bool, typer.Option("--open/--no-open", help="Open the first picture.")] = False,
+    program: Programs = None,
     json: Json = False,
 ) -> None:
     """Do one trial again, alone, and write its frames."""
@@ -140,7 +147,7 @@ def replay(
     from skysim.study import replay as replaying
     from skysim.study import store
 
-    (told, _), folder = planned(study, out), folder_of(study, out)
+    (told, _), folder = planned(study, out, program or []), folder_of(study, out)
     with store.open_store(folder / STORE) as kept:
         again = replaying.replay(told, kept, trial, folder / f"trial_{trial}")
     row = again.row
@@ -169,15 +176,17 @@ def optimise(
     engine: EngineName = "pool",
     scheduler: Scheduler = "",
     set_: Sets = None,
+    program: Programs = None,
     json: Json = False,
 ) -> None:
     """Search a study's factors for the best point, or the Pareto front of two objectives. `resume` goes on with it."""
     warmed(engine)
+    from skysim import programs
     from skysim.study import plan
     from skysim.yamlfile import overridden
 
     overrides = overridden(set_)
-    told = plan.load(study, overrides)
+    told = plan.load(study, overrides, programs.named(program))
     if told.study.optimise is None:
         raise BadInput(
             f"{told.path}: optimise: missing; allowed: skysim study run, for a study with a design"
@@ -329,17 +338,21 @@ def print_replay(figures: dict[str, Any]) -> None:
         print(path)
 
 
-def planned(study: str, out: Path | None) -> tuple[Plan, dict[str, str]]:
-    """The plan of a study's store, with what its command line overrode. Raises BadInput where they do not match."""
+def planned(study: str, out: Path | None, program: list[str] | None = None) -> tuple[Plan, dict[str, str]]:
+    """The plan of a study's store, with what its command line overrode. Raises BadInput where they do not match.
+
+    program : of the command line; None where no trial shall be done
+    """
     import json
 
+    from skysim import programs
     from skysim.study import plan, store
 
     path = folder_of(study, out) / STORE
     with store.open_store(path) as kept:
         overrides = json.loads(kept.meta("overrides") or "{}")
         held = kept.meta("digest")
-    told = plan.load(study, overrides)
+    told = plan.load(study, overrides, None if program is None else programs.named(program))
     if told.digest != held:
         raise BadInput(
             f"{path}: holds another study, or this one before it was changed; allowed: another --out"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -19,6 +19,7 @@ from skysim.scene import find as find_scene
 from skysim.scene import load as load_scene
 from skysim.study.designs import Design, Point, points
 from skysim.study.factors import Factor, Settings, Value
+from skysim.trackers import OWN, known
 from skysim.types import BadInput
 from skysim.yamlfile import explain, line_of, of_our_version, put, read_yaml
 
@@ -179,6 +180,7 @@ class Recipe:
     """What a worker has to know of a study to do any trial of it.
 
     folder : of the study file, against which scenes are named
+    programs : commands by name, which `tracker.name` may be: of the command line, and no part of a study's digest
     """
 
     scene: str
@@ -187,6 +189,7 @@ class Recipe:
     base: Settings
     trial: dict[str, Any]
     paired: bool
+    programs: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -232,9 +235,12 @@ def title_of(path: Path) -> str:
     return str(read_yaml(path)[0].get("title", ""))
 
 
-def load(name: str | Path, overrides: Mapping[str, str] | None = None) -> Plan:
+def load(
+    name: str | Path, overrides: Mapping[str, str] | None = None, programs: Mapping[str, str] | None = None
+) -> Plan:
     """Read, override (`path.to.key` -> YAML value) and validate a study and every level of its factors.
 
+    programs : commands by name for `tracker.name`; None where the study shall not be run, and they need not be there
     Raises BadInput with one line: the key, what is wrong with it, what is allowed, the file and line.
     """
     path = find(str(name))
@@ -247,22 +253,26 @@ def load(name: str | Path, overrides: Mapping[str, str] | None = None) -> Plan:
     except ValidationError as error:
         raise BadInput(explain(error, Study, tree, [(path, text)], overrides or {})) from None
     try:
-        plan = planned(path, study, tree["trial"])
-        check(plan)
+        plan = planned(path, study, tree["trial"], programs or {})
+        check(plan, to_run=programs is not None)
     except BadInput as error:
         raise BadInput(located(str(error), path, text)) from None
     return plan
 
 
-def planned(path: Path, study: Study, trial: dict[str, Any]) -> Plan:
+def planned(path: Path, study: Study, trial: dict[str, Any], programs: Mapping[str, str]) -> Plan:
     """The study's points and what a worker has to know; `trial` as the file has it, units and all."""
     chosen = [] if study.optimise else points(study.design, study.factors, study.seed)
-    told = Recipe(study.scene, str(path.resolve().parent), study.seed, study.set, trial, study.paired)
+    folder = str(path.resolve().parent)
+    told = Recipe(study.scene, folder, study.seed, study.set, trial, study.paired, dict(programs))
     return Plan(path, study, told, chosen)
 
 
-def check(plan: Plan) -> None:
-    """Refuse, before the first trial, what cannot be asked: responses, figures, budget, and levels one by one."""
+def check(plan: Plan, to_run: bool) -> None:
+    """Refuse, before the first trial, what cannot be asked: responses, figures, budget, and levels one by one.
+
+    to_run : whether the trackers have to be there
+    """
     from skysim.study import arrange, search
     from skysim.study.store import COLUMNS
     from skysim.study.table import Line
@@ -290,12 +300,22 @@ def check(plan: Plan) -> None:
             scene, trial = resolved(plan.recipe, settings)
             if isinstance(scene.light, Bench) and not isinstance(trial, FlightTrial):
                 raise BadInput("trial.kind: a bench has no sky around it; allowed: flight")
+            if to_run:
+                check_tracker(plan, scene, trial)
         except BadInput as error:
             key = str(error).partition(":")[0]
             owners = [other for other, factor in study.factors.items() if key in dict(factor.at(0.5)[1])]
             owner = name if name in owners or not owners else owners[0]
             told = level if owner == name else study.factors[owner].at(0.5)[0]
             raise BadInput(f"factors.{owner}: {told!r}: {error}") from None
+
+
+def check_tracker(plan: Plan, scene: Scene, trial: CentroidTrial | FrameTrial | FlightTrial) -> None:
+    """Refuse a tracker that no worker would find, or that a trial of centroids has nothing to show. Raises BadInput."""
+    name = scene.tracker.name
+    known(name, plan.recipe.programs)
+    if name != OWN and isinstance(trial, CentroidTrial):
+        raise BadInput(f"tracker.name: {name} takes frames; allowed: {OWN}, or another trial.kind")
 
 
 def one_by_one(factors: Mapping[str, Factor]) -> Iterator[tuple[str, Value, Settings]]:

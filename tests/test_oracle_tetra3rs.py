@@ -1,0 +1,53 @@
+"""tetra3rs as a tracker (extra `oracle`): told our camera, it finds our skies where they are."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+
+from estimator.camera import Camera
+from skysim import BadInput, scene, score, simulate, tetratracker, trackers
+from skysim.trackers import Setup
+
+tetra3rs = pytest.importorskip("tetra3rs")
+
+
+def test_its_camera_is_ours() -> None:
+    """Distorted, off-centre: both turn pixels to the same tangents, by two pieces of code."""
+    f, centre, bent = 2500.0, (331.0, 244.0), (-0.1, 0.05, 1e-3, -2e-3, 0.01)
+    setup = Setup("icrs", "2012-06-22T21:00:00", 659, 493, f, centre, bent, 1.0, 4095.0, 1)
+    theirs, middle = tetratracker.camera(tetra3rs, setup), tetratracker.middle_px(setup)
+    xy_px = np.array([[20.0, 30.0], [600.0, 400.0], [330.0, 10.0]])
+    told = [theirs.pixel_to_tanplane(*(xy - middle)) for xy in xy_px]
+    ours = Camera(659, 493, f, centre, bent).tangents(xy_px)
+    np.testing.assert_allclose(told, ours, rtol=0, atol=1e-8)
+
+
+@pytest.mark.parametrize("options", ["{}", "{fast: true}"])
+def test_it_solves_our_frames_without_a_bias(options: str) -> None:
+    """Twelve fields; proper motion and aberration (20 arcsec) are both its own, so what is left is noise."""
+    keys = {"tracker.name": "tetra3rs", "tracker.options": options, "exposure.frames": "12"}
+    told = scene.load("scoreboard", keys | {"motion.rate_deg_s": "[0.6, 0.8, 0]"})
+    lab = simulate.prepare(told)
+    shots = list(simulate.run(lab, simulate.tracker(lab)))
+    rows = [score.row(shot, told, lab.mount) for shot in shots]
+    assert sum(row.status == "solved" for row in rows) >= 11
+    assert not any(row.wrong for row in rows)
+    turns = [
+        (s.report.attitude.cam_from_ref * s.truth.cam_from_lab.inv()).as_rotvec()
+        for s in shots
+        if s.report.attitude.solved
+    ]
+    assert np.degrees(np.median(np.hypot(*np.array(turns).T[:2]))) * 3600 < 10
+
+
+@pytest.mark.parametrize("name", ["afit_simsat", "bench_collimated"])
+def test_it_refuses_what_is_no_sky(name: str) -> None:
+    with pytest.raises(BadInput, match=re.escape("tetra3rs knows the stars alone")):
+        simulate.tracker(simulate.furnish(scene.load(name, {"tracker.name": "tetra3rs"})))
+
+
+def test_it_is_an_entry_point_of_skysim() -> None:
+    assert trackers.entry_points()["tetra3rs"].load() is tetratracker.Tetra3rs
