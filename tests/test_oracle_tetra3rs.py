@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import json
 import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from estimator.camera import Camera
 from skysim import BadInput, scene, score, simulate, tetratracker, trackers
+from skysim.scene import ROOT
 from skysim.trackers import Setup
 
 tetra3rs = pytest.importorskip("tetra3rs")
@@ -47,6 +53,22 @@ def test_it_solves_our_frames_without_a_bias(options: str) -> None:
 def test_it_refuses_what_is_no_sky(name: str) -> None:
     with pytest.raises(BadInput, match=re.escape("tetra3rs knows the stars alone")):
         simulate.tracker(simulate.furnish(scene.load(name, {"tracker.name": "tetra3rs"})))
+
+
+PAGE = (ROOT / "docs/trackers.md").read_text(encoding="utf-8")
+COMMANDS = re.findall(r"^skysim (.*--tracker tetra3rs.*)$", PAGE, re.MULTILINE)
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_the_page_s_commands_do_what_it_says(command: str, tmp_path: Path) -> None:
+    """Every frame has its line or its share, and none is wrong."""
+    words = [sys.executable, "-m", "skysim", *shlex.split(command), "--json", "--out", str(tmp_path)]
+    done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    told = json.loads(done.stdout)
+    lines = told.get("scoreboard", [told | {"right": told.get("solved", 0) / told.get("frames", 1)}])
+    assert [line["wrong"] for line in lines] == [0] * len(lines)
+    assert min(line["right"] for line in lines) > 0.9
 
 
 def test_it_is_an_entry_point_of_skysim() -> None:
