@@ -244,9 +244,11 @@ def test_monte_carlo_of_200_by_2(page: Any) -> None:
 
 
 def test_a_dropped_picture_is_solved_and_one_without_stars_refused(page: Any, tmp_path: Path) -> None:
+    before = angles(page)
     page.get_by_role("tab", name="Image").click()
     page.set_input_files("input[type=file]", ROOT / "docs" / "sky.jpg")
     page.get_by_text("sky.jpg: solved").wait_for()
+    assert page.get_by_label("angle 1").input_value() == ""  # nobody knows where it was taken
     noise = tmp_path / "noise.png"
     cv2.imwrite(str(noise), np.random.default_rng(1).integers(90, 110, (480, 640), dtype=np.uint8))
     page.set_input_files("input[type=file]", noise)
@@ -255,10 +257,13 @@ def test_a_dropped_picture_is_solved_and_one_without_stars_refused(page: Any, tm
     broken.write_bytes(b"\x89PNG\r\n\x1a\n" + bytes(100))
     page.set_input_files("input[type=file]", broken)
     page.get_by_text("cannot be decoded").first.wait_for()
+    frame = source(page)
+    page.keyboard.press("1")
+    changed(page, frame)
+    np.testing.assert_array_equal(angles(page), before)
 
 
 def test_bad_input_is_refused_where_it_stands(page: Any) -> None:
-    before = angles(page)
     page.get_by_label("angle 2").fill("95")
     page.get_by_label("angle 2").press("Enter")
     page.get_by_text("Dec: 95 deg is not allowed").first.wait_for()
@@ -274,7 +279,6 @@ def test_bad_input_is_refused_where_it_stands(page: Any) -> None:
     page.get_by_placeholder("new-name").fill("../out")
     page.get_by_role("button", name="Save as").click()
     page.get_by_text("allowed: letters, digits").first.wait_for()
-    assert before.shape == (3,)
 
 
 def test_a_dome_is_flown_and_played(page: Any) -> None:

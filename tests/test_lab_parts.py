@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 pytest.importorskip("nicegui", reason="the extra `lab` is not installed")
 
-from skysim import BadInput, catalogue, scene, sky, world
+from skysim import BadInput, catalogue, greys, scene, sky, world
 from skysim.lab import export, forms, keys, overlay, pose, trials
 from skysim.lab.server import Guard, host_of
 from skysim.lab.session import Gone, Session
@@ -145,16 +145,35 @@ SPOTS = (Spot(10.1, 20.0, 0.01, 5.0, 1, 0.1), Spot(80.0, 80.0, 0.1, 1.0))
 
 def test_each_kind_of_mark_can_be_switched_off_and_stands_where_it_should() -> None:
     answer = Answer("solved", SPOTS, 1.0, (0.0, 0.0, 0.0), windows_px=((50.0, 60.0),))
-    drawn = {kind: overlay.marks(LIGHTS, answer, 130, {kind}, str) for kind in overlay.KINDS}
+    drawn = {kind: overlay.marks(LIGHTS, answer, (130, 100), {kind}, str) for kind in overlay.KINDS}
     assert all([one["kind"] for one in of_kind] == [kind] for kind, of_kind in drawn.items())
     path = {kind: of_kind[0]["path"] for kind, of_kind in drawn.items()}
     assert path["truth"].count("M") == 2 * 4
-    assert path["identified"].startswith(
-        "M4.2 20.5a6.4"
-    )  # a whole number is a pixel's middle: 10.1 + .5 - 1.6 x 4
-    assert drawn["identified"][0]["names"] == [(18.6, 22.9, "1")]
+    left, y, radius = map(float, re.match(r"M([\d.]+) ([\d.]+)a([\d.]+)", path["identified"]).groups())
+    np.testing.assert_allclose(
+        (left + radius, y), (10.6, 20.5), rtol=0, atol=0.11
+    )  # a whole number is a middle
     assert path["false"].count("M") == 2
-    assert overlay.marks(LIGHTS, answer, 130, (), str) == []
+    assert overlay.marks(LIGHTS, answer, (130, 100), (), str) == []
+
+
+@pytest.mark.parametrize("size_px", [(659, 493), (1024, 1024), (3000, 1000)])
+def test_names_are_beside_their_stars_within_the_frame_and_cover_no_other(size_px: tuple[int, int]) -> None:
+    random = np.random.default_rng(4)
+    places = np.vstack([random.uniform(0, size_px, (20, 2)), [[size_px[0] - 1, 5], [3, size_px[1] - 2]]])
+    spots = tuple(Spot(x, y, 0.1, 1.0, n) for n, (x, y) in enumerate(places.tolist()))
+    (marked,) = overlay.marks((), Answer("solved", spots, 1.0), size_px, {"identified"}, "HIP {}".format)
+    font, names = marked["font"], marked["names"]
+    assert 15 <= len(names) <= len(spots)
+    assert any(name == "HIP 20" for *_, name in names)  # in a corner
+    boxes = np.array([(x, y - 0.7 * font, x + 0.6 * font * len(name), y) for x, y, name in names])
+    assert (boxes[:, :2] >= 0).all()
+    assert (boxes[:, 2:] <= size_px).all()
+    apart = (boxes[:, None, :2] >= boxes[None, :, 2:]).any(axis=2)
+    np.testing.assert_array_equal(apart | apart.T, ~np.eye(len(names), dtype=bool))
+    own = places[[int(name.split()[1]) for *_, name in names]]
+    gap = np.maximum(np.maximum(boxes[:, :2] - own, own - boxes[:, 2:]), 0).max(axis=1)
+    assert (gap < 2 * font).all()
 
 
 def test_names_of_stars_are_those_of_bright_stars() -> None:
@@ -319,3 +338,24 @@ def test_a_saved_scene_names_its_base_first() -> None:
     assert re.match(
         r"schema: 1\nbase: shefex2\ntitle: T\ncamera:\n  f_number: 2\ntracker:\n  limit_mag: 5\n", text
     )
+
+
+def test_a_frame_s_numbers_are_its_sky_s_for_all_its_stars() -> None:
+    """The scatter of whole numbers has the rounding's 1/12 on top; 2 % of the pixels are stars."""
+    random = np.random.default_rng(7)
+    for sigma_dn in (0.6, 3.0, 20.0):
+        image = np.rint(random.normal(200, sigma_dn, (800, 800)))
+        image[random.random(image.shape) < 0.02] += 40 * sigma_dn + 100
+        image[:2, :3] = 4095
+        told = greys.facts(image.astype(np.uint16), 4095.0)
+        np.testing.assert_allclose(told.sky_dn, 200, rtol=0, atol=0.06 * sigma_dn + 0.01)
+        np.testing.assert_allclose(told.scatter_dn, np.hypot(sigma_dn, 12**-0.5), rtol=0.06, atol=0)
+        assert (told.peak_dn, told.saturated) == (4095, 6)
+
+
+def test_trials_that_were_wrong_or_refused_are_told_apart_from_solved_ones() -> None:
+    columns = {
+        **{"trial": np.array([3, 5, 8]), "frames": np.array([1, 2, 1]), "solved": np.array([1, 1, 1])},
+        **{"wrong": np.array([0, 0, 1]), "status": np.array(["solved", "no match", "solved"], dtype=object)},
+    }
+    assert trials.unsolved(columns) == [(5, "no match"), (8, "wrong")]

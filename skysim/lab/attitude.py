@@ -8,10 +8,12 @@ from typing import TYPE_CHECKING
 
 from nicegui import ui
 
+from skysim.lab.look import LEFT
 from skysim.lab.views import Answer, Setting, View
 
 if TYPE_CHECKING:
     from skysim.lab.page import Tab
+    from skysim.lab.photo import Photo
 
 ASIDE = {"detector": "F6", "identifier": "F7"}
 
@@ -20,7 +22,7 @@ class AttitudeCard:
     """Three angles, the answer beside them, the error; four stages of the tracker."""
 
     def __init__(self, tab: Tab) -> None:
-        self.tab = tab
+        self.tab, self.foreign = tab, False
         with ui.element("div").classes("lab-card"):
             with ui.element("div").classes("lab-grid"):
                 ui.label("attitude").classes("quiet")
@@ -49,14 +51,20 @@ class AttitudeCard:
         """One stage's algorithm."""
         label = f"{name} {ASIDE[name]}" if name in ASIDE else name
         field = ui.select([], label=label, on_change=partial(self.choose, name))
+        field.on("popup-hide", js_handler=LEFT)
         return field.props("dense outlined options-dense").mark(name)
 
     def set(self, setting: Setting) -> None:
         """A scene was set up."""
-        for head, name in zip(self.heads, setting.names, strict=True):
-            head.set_text(f"{name}, deg")
+        self.head(setting.names)
         for name, field in self.stages.items():
+            field.props["title"] = f"{name}: {setting.stages[name]}"  # the whole of a long name
             field.set_options(list(setting.choices[name]), value=setting.stages[name])
+
+    def head(self, names: tuple[str, str, str]) -> None:
+        """What the three angles are."""
+        for head, name in zip(self.heads, names, strict=True):
+            head.set_text(f"{name}, deg")
 
     async def choose(self, stage: str) -> None:
         """Another algorithm: the tracker is built anew, the lab stays."""
@@ -72,13 +80,35 @@ class AttitudeCard:
         except (TypeError, ValueError):
             self.tab.say("an angle is not a number; allowed: degrees such as 83.6")
             return
-        await self.tab.show(self.tab.session.ask("point", angles, self.tab.solving))
+        if await self.tab.show(self.tab.session.ask("point", angles, self.tab.solving)):
+            for field in self.inputs:
+                field.run_method("blur")  # the arrow keys go on from there
 
     def show(self, view: View) -> None:
         """The newest look."""
+        if self.foreign and self.tab.setting:
+            self.foreign = False
+            self.head(self.tab.setting.names)
+            self.hint("")
         for field, angle in zip(self.inputs, view.angles_deg, strict=True):
             field.set_value(degrees(angle))
         self.tell(view.answer)
+
+    def show_photo(self, photo: Photo) -> None:
+        """A picture that is not the scene's at hand: of the user's nobody knows where it was taken."""
+        self.foreign = True
+        self.head(photo.names)
+        self.hint("unknown")
+        told = [degrees(angle) for angle in photo.true_deg] if photo.true_deg else ["", "", ""]
+        for field, text in zip(self.inputs, told, strict=True):
+            field.set_value(text)
+        self.tell(photo.answer)
+
+    def hint(self, text: str) -> None:
+        """What stands in fields that are empty."""
+        for field in self.inputs:
+            field.props["placeholder"] = text
+            field.update()
 
     def tell(self, answer: Answer | None) -> None:
         """The tracker's answer, or that it was not asked."""
@@ -90,12 +120,12 @@ class AttitudeCard:
                 label.set_text(degrees(angle))
             cross, roll = answer.sigma_arcsec
             self.errors[0].set_text(
-                "" if math.isnan(answer.cross_arcsec) else f"cross {answer.cross_arcsec:.2f}″"
+                "–" if math.isnan(answer.cross_arcsec) else f"cross {answer.cross_arcsec:.2f}″"
             )
             self.errors[1].set_text(
-                "" if math.isnan(answer.roll_arcsec) else f"roll {answer.roll_arcsec:+.1f}″"
+                "–" if math.isnan(answer.roll_arcsec) else f"roll {answer.roll_arcsec:+.1f}″"
             )
-            self.errors[2].set_text("" if math.isnan(cross) else f"σ {cross:.2f}″ {roll:.1f}″")
+            self.errors[2].set_text("–" if math.isnan(cross) else f"σ {cross:.3g}″ {roll:.3g}″")
         ink, text = verdict(answer)
         self.status.set_text(text)
         self.status.classes(remove="good bad warn quiet", add=ink)
@@ -110,7 +140,8 @@ def verdict(answer: Answer | None) -> tuple[str, str]:
     """A colour and a line: solved, refused, wrong, or not asked."""
     if answer is None:
         return "quiet", "not asked: press 1 to identify"
-    counts = f"{answer.identified} of {len(answer.spots)} lights named, {answer.ms:.1f} ms"
-    if answer.wrong:
-        return "bad", f"WRONG by more than ten arc-minutes; {counts}"
-    return ("good", f"solved; {counts}") if answer.solved else ("warn", f"{answer.status}; {counts}")
+    if not answer.solved:
+        return "warn", f"{answer.status}; {len(answer.spots)} lights seen"
+    took = f", {answer.ms:.1f} ms" if answer.ms else ""  # of a trial done again nobody took the time
+    counts = f"{answer.identified} of {len(answer.spots)} lights named{took}"
+    return ("bad", f"WRONG by more than 10′; {counts}") if answer.wrong else ("good", f"solved; {counts}")

@@ -23,6 +23,7 @@ from skysim.quantity import ARCSEC_RAD
 from skysim.scene import Scene, Stars, load
 from skysim.types import Floats, Frame, Trajectory, Truth
 
+ZOOMED = (11, 7)  # pixels across and down: as many as can be read
 STAGES = ("detector", "centroider", "identifier", "solver")
 
 
@@ -53,9 +54,8 @@ class Desk:
             lab = replace(before.lab, scene=scene)
             return replace(before, scene=scene, lab=lab, estimator=simulate.tracker(lab))
         lab = simulate.furnish(scene)
-        magnitude = dict(zip(lab.sources.id.tolist(), lab.sources.magnitude.tolist(), strict=True))
         here = lab.trajectory.lab_from_body[0]
-        desk = cls(scene, lab, simulate.tracker(lab), here, magnitude=magnitude)
+        desk = cls(scene, lab, simulate.tracker(lab), here, magnitude=magnitudes(lab))
         return replace(desk, stretch=before.stretch, bright=before.bright) if before else desk
 
     @property
@@ -108,55 +108,46 @@ class Desk:
             score.angles_deg(self.truth.cam_from_lab, self.scene, self.lab.mount),
             tuple(quaternion.of(self.truth.lab_from_body).tolist()),
             self.frame.exposure_s,
-            self.lights(),
-            self.answered(self.report, self.truth) if self.report else None,
+            greys.facts(self.frame.image_dn, self.frame.saturation_dn),
+            lights_of(self.truth, self.magnitude),
+            answered(self.lab, self.estimator, self.report, self.truth) if self.report else None,
             1e3 * clock.seconds["all"],
         )
 
-    def again(self) -> bytes:
-        """The same frame, shown otherwise."""
-        return (
-            greys.jpeg(greys.stretched(self.frame.image_dn, self.stretch, self.bright)) if self.frame else b""
-        )
 
-    def lights(self) -> tuple[Light, ...]:
-        """The true lights of the frame, the brightest first."""
-        assert self.truth is not None
-        seen = self.truth.seen
-        rows = np.argsort(-seen.electrons)
-        told = zip(
-            seen.id[rows].tolist(), seen.flux_xy_px[rows].tolist(), seen.electrons[rows].tolist(), strict=True
-        )
-        return tuple(Light(id, x, y, e, self.magnitude.get(id, math.nan)) for id, (x, y), e in told)
+def lights_of(truth: Truth, magnitude: Mapping[int, float]) -> tuple[Light, ...]:
+    """The true lights of a frame, the brightest first."""
+    seen = truth.seen
+    rows = np.argsort(-seen.electrons)
+    told = zip(
+        seen.id[rows].tolist(), seen.flux_xy_px[rows].tolist(), seen.electrons[rows].tolist(), strict=True
+    )
+    return tuple(Light(id, x, y, e, magnitude.get(id, math.nan)) for id, (x, y), e in told)
 
-    def answered(self, report: Report, truth: Truth) -> Answer:
-        """The tracker's report beside the truth."""
-        told, ms = report.attitude, 1e3 * sum(report.seconds.values())
-        spots = spots_of(report, named(self.estimator, told, report.centroids.xy_px))
-        if told.cam_from_ref is None:
-            return Answer(told.status, spots, ms)
-        cross, roll = metrics.cross_and_roll_rad(told.cam_from_ref, truth.cam_from_lab)
-        return Answer(
-            told.status,
-            spots,
-            ms,
-            score.angles_deg(told.cam_from_ref, self.scene, self.lab.mount),
-            cross / ARCSEC_RAD,
-            roll / ARCSEC_RAD,
-            claimed_arcsec(told),
-            metrics.is_wrong(told.cam_from_ref, truth.cam_from_lab),
-            windows(self.estimator, told.cam_from_ref),
-        )
 
-    def zoom(self, x: float, y: float, half: int = 6) -> Zoom:
-        """The pixels around one of the newest frame."""
-        assert self.frame is not None
-        image = self.frame.image_dn
-        height, width = image.shape
-        x0 = min(max(round(x) - half, 0), max(width - 2 * half - 1, 0))
-        y0 = min(max(round(y) - half, 0), max(height - 2 * half - 1, 0))
-        part = np.rint(image[y0 : y0 + 2 * half + 1, x0 : x0 + 2 * half + 1]).astype(int)
-        return Zoom(x0, y0, tuple(map(tuple, part.tolist())))
+def magnitudes(lab: simulate.Lab) -> dict[int, float]:
+    """Of a lab's lights, by their numbers."""
+    return dict(zip(lab.sources.id.tolist(), lab.sources.magnitude.tolist(), strict=True))
+
+
+def answered(lab: simulate.Lab, estimator: onboard.Estimator, report: Report, truth: Truth) -> Answer:
+    """The tracker's report beside the truth."""
+    told, ms = report.attitude, 1e3 * sum(report.seconds.values())
+    spots = spots_of(report, named(estimator, told, report.centroids.xy_px))
+    if told.cam_from_ref is None:
+        return Answer(told.status, spots, ms)
+    cross, roll = metrics.cross_and_roll_rad(told.cam_from_ref, truth.cam_from_lab)
+    return Answer(
+        told.status,
+        spots,
+        ms,
+        score.angles_deg(told.cam_from_ref, lab.scene, lab.mount),
+        cross / ARCSEC_RAD,
+        roll / ARCSEC_RAD,
+        claimed_arcsec(told),
+        metrics.is_wrong(told.cam_from_ref, truth.cam_from_lab),
+        windows(estimator, told),
+    )
 
 
 def spots_of(report: Report, names: Mapping[int, tuple[int, float]]) -> tuple[Spot, ...]:
@@ -168,6 +159,15 @@ def spots_of(report: Report, names: Mapping[int, tuple[int, float]]) -> tuple[Sp
     )
 
 
+def zoomed(image: NDArray, x: float, y: float) -> Zoom:
+    """The pixels around one."""
+    (height, width), (across, down) = image.shape, ZOOMED
+    x0 = min(max(round(x) - across // 2, 0), max(width - across, 0))
+    y0 = min(max(round(y) - down // 2, 0), max(height - down, 0))
+    part = np.rint(image[y0 : y0 + down, x0 : x0 + across]).astype(int)
+    return Zoom(x0, y0, tuple(map(tuple, part.tolist())))
+
+
 def claimed_arcsec(told: Attitude) -> tuple[float, float]:
     """What the tracker claims of its error, across the boresight and about it."""
     if told.covariance_rad2 is None:
@@ -176,31 +176,34 @@ def claimed_arcsec(told: Attitude) -> tuple[float, float]:
     return float(np.sqrt(variance[:2].sum())) / ARCSEC_RAD, float(np.sqrt(variance[2])) / ARCSEC_RAD
 
 
-def predicted(
-    estimator: DomeTracker | StarTracker, cam_from_ref: Rotation
-) -> tuple[NDArray[np.int64], Floats]:
-    """(N,) ids and (N, 2) pixels of all lights on the tracker's map, as the camera would see them from there."""
+def predicted(estimator: DomeTracker | StarTracker, told: Attitude) -> tuple[NDArray[np.int64], Floats]:
+    """(N,) ids and (N, 2) pixels of all lights on the tracker's map, as its camera would see them from where it says.
+
+    Of a picture whose field was not known the camera is the answer's: it was found with it.
+    """
+    assert told.cam_from_ref is not None
     if isinstance(estimator, DomeTracker):
-        body_from_lab = estimator.lever.cam_from_body.inv() * cam_from_ref
+        body_from_lab = estimator.lever.cam_from_body.inv() * told.cam_from_ref
         places = estimator.leds.position_m
         return estimator.leds.id, project(body_from_lab, places, estimator.lever, estimator.camera)
-    return estimator.stars.id, estimator.camera.pixels(cam_from_ref.apply(estimator.stars.vectors))
+    camera = told.camera or estimator.camera
+    return estimator.stars.id, camera.pixels(told.cam_from_ref.apply(estimator.stars.vectors))
 
 
 def named(estimator: onboard.Estimator, told: Attitude, xy_px: Floats) -> dict[int, tuple[int, float]]:
     """By a centroid's row the light that it is, and how far from where the answer would have it, in pixels."""
     if told.match is None or told.cam_from_ref is None or isinstance(estimator, Guest):
         return {}
-    ids, where = predicted(estimator, told.cam_from_ref)
+    ids, where = predicted(estimator, told)
     rows, star = told.match.observed, told.match.star
     off = np.hypot(*(where[star] - xy_px[rows]).T)
     return dict(zip(rows.tolist(), zip(ids[star].tolist(), off.tolist(), strict=True), strict=True))
 
 
-def windows(estimator: onboard.Estimator, cam_from_ref: Rotation) -> tuple[tuple[float, float], ...]:
+def windows(estimator: onboard.Estimator, told: Attitude) -> tuple[tuple[float, float], ...]:
     """Where a tracker that follows would look for its lights in the next frame."""
     if isinstance(estimator, Guest):
         return ()
-    _, xy_px = predicted(estimator, cam_from_ref)
+    _, xy_px = predicted(estimator, told)
     inside = estimator.camera.contains(np.nan_to_num(xy_px, nan=-1e9))
     return tuple((float(x), float(y)) for x, y in xy_px[inside][:200])

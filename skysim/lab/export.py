@@ -12,7 +12,7 @@ import numpy as np
 import yaml
 
 from skysim import io
-from skysim.lab.desk import Desk
+from skysim.lab.desk import Desk, answered
 from skysim.report import annotate
 from skysim.types import BadInput
 from skysim.yamlfile import VERSION, put
@@ -40,7 +40,7 @@ def files(desk: Desk, base: str, overrides: dict[str, str]) -> dict[str, bytes]:
         }
     found["figure.png"] = figure(desk)
     if desk.report:
-        answer = desk.answered(desk.report, desk.truth)
+        answer = answered(desk.lab, desk.estimator, desk.report, desk.truth)
         told = {
             name: getattr(answer, name) for name in answer.__slots__ if name not in ("spots", "windows_px")
         }

@@ -1,7 +1,7 @@
 // A frame and its marks on one canvas: unpacked off the page's thread, drawn together, so that a mark never stands
 // over another frame than its own. An <img> beneath an <svg> took the browser twice as long.
 export default {
-  template: `<canvas role="img" @click="told" @mousemove="told"></canvas>`,
+  template: `<canvas role="img" @click="told" @mousemove="told" @mouseleave="told"></canvas>`,
   props: { look: Object }, // src: the frame's address; size: of the frame; marks: see overlay.py; label: in words
   mounted() {
     this.drawn = null; // a look and its picture
@@ -66,7 +66,12 @@ export default {
         pen.setLineDash(mark.dash);
         pen.stroke(new Path2D(mark.path));
         pen.font = `${mark.font}px ui-monospace, monospace`;
-        for (const [x, y, name] of mark.names) pen.fillText(name, x, y);
+        for (const [x, y, name] of mark.names) { // on a ground of its own, to be read over a bright sky too
+          pen.fillStyle = "rgb(13 16 21 / 65%)";
+          pen.fillRect(x, y - 0.8 * mark.font, 0.61 * mark.font * name.length, mark.font);
+          pen.fillStyle = mark.ink;
+          pen.fillText(name, x, y);
+        }
       }
       canvas.dataset.frame = look.src;
       canvas.ariaLabel = look.label;

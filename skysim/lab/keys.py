@@ -38,11 +38,13 @@ KEYS = (
 )
 ACTION = {key: one.action for one in KEYS for key in one.keys}
 
-# The browser has uses of its own for these; while no field is being typed in, the page has them.
+# The browser has uses of its own for these; while no field is being typed in, the page has them. F keys and Esc leave a
+# field first (before the page's own listener, which hears nothing from a field).
 TAKEN = """
 document.addEventListener("keydown", event => {
   const typing = event.target.closest && event.target.closest("input, textarea, [contenteditable], .q-menu, .q-tab");
-  const ours = %s;
-  if (ours.includes(event.key) && (event.key.startsWith("F") || !typing)) event.preventDefault();
-});
+  const ours = %s, named = /^F\\d/.test(event.key);
+  if (typing && ((named && ours.includes(event.key)) || event.key === "Escape")) document.activeElement.blur();
+  if (ours.includes(event.key) && (named || !typing)) event.preventDefault();
+}, true);
 """ % [key for one in KEYS for key in one.keys if key.startswith(("F", "Arrow"))]

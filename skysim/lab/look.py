@@ -7,6 +7,12 @@ INK = {
     **{"accent": "#5aa9ff", "good": "#63c174", "warn": "#f0b429", "bad": "#ff6b6b"},
 }
 CURVES = ["#5aa9ff", "#f0b429", "#63c174", "#ff6b6b", "#b48ead", "#88c0d0", "#b48ead", "#88c0d0"]
+TOOLTIP = {
+    **{"trigger": "axis", "confine": True, "backgroundColor": INK["line"], "borderWidth": 0},
+    "textStyle": {"color": INK["text"], "fontSize": 11},
+}
+
+LEFT = "() => document.activeElement.blur()"  # the arrow keys are the page's again
 
 CSS = f"""
 :root {{ --nicegui-default-padding: 0; --nicegui-default-gap: 0 }}
@@ -19,6 +25,12 @@ body {{ background: {INK["ground"]} !important; color: {INK["text"]}; font: 13px
 .lab-keys {{ grid-area: keys }}
 .lab-head, .lab-keys {{ display: flex; align-items: center; gap: 14px; padding: 0 14px; background: {INK["panel"]};
   border: 0 solid {INK["line"]} }}
+.lab-name {{ font-weight: 600; letter-spacing: .02em; white-space: nowrap }}
+.lab-title {{ flex: 0 1 auto; min-width: 0; max-width: 32% }} .lab-rate {{ width: 56px; text-align: right }}
+.lab-said {{ flex: 1 1 0; min-width: 0; text-align: right; line-height: 1.3; max-height: 2.6em; overflow: hidden;
+  display: -webkit-box; -webkit-box-orient: vertical; -webkit-line-clamp: 2; overflow-wrap: anywhere }}
+.lab-busy, .lab-rate, .lab-head .q-btn, .lab-head .q-toggle {{ flex: none }}
+.lab-busy.hidden {{ display: inline-flex; visibility: hidden }}
 .lab-head {{ border-bottom-width: 1px }} .lab-keys {{ border-top-width: 1px; gap: 18px; overflow: hidden;
   white-space: nowrap; color: {INK["quiet"]}; font-size: 12px }}
 .lab-keys kbd {{ background: {INK["line"]}; color: {INK["text"]}; border-radius: 3px; padding: 1px 5px;
@@ -27,10 +39,20 @@ body {{ background: {INK["ground"]} !important; color: {INK["text"]}; font: 13px
 .lab-bar {{ display: flex; align-items: center; gap: 14px; padding: 0 14px; min-width: 0; overflow: hidden }}
 .lab-frame {{ display: flex; align-items: center; justify-content: center; min-height: 0; min-width: 0; padding: 0 14px;
   container-type: size }}
-.lab-frame > * {{ background: #000; outline: 1px solid {INK["line"]} }}
-.lab-under {{ display: grid; grid-template-columns: 176px minmax(0, 1fr); gap: 14px; padding: 8px 14px; min-height: 0 }}
-.lab-side {{ display: grid; grid-template-rows: auto auto minmax(0, 1fr); border-left: 1px solid {INK["line"]};
-  min-height: 0; min-width: 0; background: {INK["panel"]} }}
+.lab-frame > canvas {{ background: #000; outline: 1px solid {INK["line"]} }}
+.lab-wait {{ display: flex; flex-direction: column; align-items: center; gap: 16px; white-space: pre-line;
+  text-align: center; line-height: 1.8; color: {INK["quiet"]} }}
+.lab-under {{ display: grid; grid-template-columns: 252px minmax(0, 1fr); gap: 14px; padding: 8px 14px; min-height: 0 }}
+.lab-zoom {{ width: 252px; height: 160px; border: 1px dashed {INK["line"]}; display: flex; align-items: center;
+  justify-content: center }}
+.lab-run {{ display: flex; flex-direction: column; gap: 2px }}
+.lab-run .lab-strips {{ flex: 1 1 0; margin-top: 8px; min-height: 380px }}
+.lab-log {{ white-space: pre-wrap; overflow-wrap: anywhere }}
+.q-uploader__subtitle {{ display: none }} .q-uploader__title {{ font-size: 13px; font-weight: 500 }}
+.lab-turn {{ position: absolute; left: 24px; bottom: 16px; font-size: 11px; pointer-events: none }}
+.stale {{ opacity: .45 }}
+.lab-side {{ display: grid; grid-template: auto auto minmax(0, 1fr) / minmax(0, 1fr);
+  border-left: 1px solid {INK["line"]}; min-height: 0; min-width: 0; background: {INK["panel"]} }}
 .lab-card {{ padding: 10px 14px; border-bottom: 1px solid {INK["line"]}; width: 100% }}
 .lab-panels {{ min-height: 0; overflow: hidden; background: transparent !important }}
 .lab-panels .q-tab-panel {{ padding: 10px 14px; height: 100%; overflow: auto }}
@@ -39,7 +61,7 @@ body {{ background: {INK["ground"]} !important; color: {INK["text"]}; font: 13px
 .quiet {{ color: {INK["quiet"]} }} .good {{ color: {INK["good"]} }} .bad {{ color: {INK["bad"]} }}
 .warn {{ color: {INK["warn"]} }}
 .lab-grid {{ display: grid; grid-template-columns: 84px repeat(3, minmax(0, 1fr)); gap: 2px 10px; align-items: center }}
-.lab-grid .num {{ text-align: right }}
+.lab-grid .num {{ text-align: right; min-height: 20px }}
 .q-field--dense .q-field__control, .q-field--dense .q-field__marginal {{ height: 32px; min-height: 32px }}
 .q-field--dense .q-field__native, .q-field--dense .q-field__input {{ min-height: 32px; padding: 2px 0;
   font-size: 12.5px }}
@@ -61,9 +83,10 @@ body {{ background: {INK["ground"]} !important; color: {INK["text"]}; font: 13px
 .lab-trial .q-field__control {{ padding: 0 4px 0 8px }} .lab-panels .q-btn {{ padding: 2px 8px }}
 .lab-panels .q-uploader__header {{ background: {INK["line"]} }}
 .q-field--dense .q-field__suffix {{ align-self: center; padding: 0 }}
-.lab-trial {{ display: grid; grid-template-columns: 1fr 1.5fr 1fr .8fr 1.2fr; gap: 8px; margin: 8px 0 }}
+.lab-trial {{ display: grid; width: 100%; grid-template-columns: 1fr 1.5fr 1fr .8fr 1.2fr; gap: 8px; margin: 8px 0 }}
 .q-tab {{ min-height: 34px; padding: 0 12px; text-transform: none }} .q-tabs {{ min-height: 34px }}
-.q-btn {{ text-transform: none }}
+.q-btn {{ text-transform: none }} .q-btn .q-btn__content {{ font-size: 12px; line-height: 1.5 }}
+.lab-sections .q-item {{ padding: 2px 0 }}
 :focus-visible {{ outline: 2px solid {INK["accent"]}; outline-offset: 1px }}
 .empty {{ color: {INK["quiet"]}; padding: 28px 8px; text-align: center; line-height: 1.6 }}
 """

@@ -15,12 +15,16 @@ KINDS = tuple(INK)
 NAMED = 40  # labels at most: the brightest
 MARKED = 400  # true lights at most
 NEAR_PX = 4.0  # within which a spot is a true light's
+# Room for the frame in the smallest window, in pixels of the screen: marks and names are readable there.
+SCREEN_PX = (806.0, 511.0)
+MARK_PX, FONT_PX = 5.2, 10.0
+LETTER = 0.61  # width of a letter, of its font's size
 
 
 def marks(
     lights: Collection[Light],
     answer: Answer | None,
-    width_px: int,
+    size_px: tuple[int, int],
     shown: Collection[str],
     name: Callable[[int], str],
 ) -> list[dict[str, Any]]:
@@ -28,7 +32,8 @@ def marks(
 
     A kind is one path as SVG writes it, with what frame.js draws it by: ink, width, dash, font, names (x, y, text).
     """
-    size = max(4.0, width_px / 130)
+    share = max(size_px[0] / SCREEN_PX[0], size_px[1] / SCREEN_PX[1])
+    size, font = MARK_PX * share, FONT_PX * share
     spots = answer.spots if answer else ()
     known = [spot for spot in spots if spot.id >= 0]
     drawn: Mapping[str, list[str]] = {
@@ -38,11 +43,11 @@ def marks(
         "identified": [circle(one.x, one.y, 1.6 * size) for one in known],
         "false": [cross(one.x, one.y, size) for one in false(spots, lights)],
     }
-    names = [label(one, size, name(one.id)) for one in known[:NAMED]]
+    names = labels(known[:NAMED], size, font, size_px, name) if "identified" in shown else []
     return [
         {
             **{"kind": kind, "path": "".join(drawn[kind]), "names": names if kind == "identified" else []},
-            **{"ink": INK[kind], "width": round(size / 6, 2), "font": round(1.8 * size, 1)},
+            **{"ink": INK[kind], "width": round(size / 6, 2), "font": round(font, 1)},
             "dash": [round(size / 2, 1)] if kind == "windows" else [],
         }
         for kind in KINDS
@@ -87,34 +92,80 @@ def cross(x: float, y: float, size: float) -> str:
     return f"M{x:.1f} {y:.1f}l{side:.1f} {side:.1f}M{x:.1f} {y + side:.1f}l{side:.1f} {-side:.1f}"
 
 
-def label(spot: Spot, size: float, text: str) -> tuple[float, float, str]:
-    """A name beside its circle."""
-    return round(spot.x + 0.5 + 2 * size, 1), round(spot.y + 0.5 + 0.6 * size, 1), text
+def labels(
+    spots: Collection[Spot],
+    size: float,
+    font: float,
+    size_px: tuple[int, int],
+    name: Callable[[int], str],
+) -> list[tuple[float, float, str]]:
+    """(x, y, name) beside each spot, where it is free and within the frame: right, left, above, below, else none.
+
+    Earlier spots choose first. What is taken: by rows of half a letter's height a bit for each column of that width.
+    """
+    side, taken = font / 2, dict[int, int]()
+    for one in spots:
+        x, y, half = one.x + 0.5, one.y + 0.5, 0.9 * size
+        take(taken, max(x - half, 0.0), max(y - half, 0.0), x + half, y + half, side)
+    found = []
+    for one in spots:
+        text, x, y = name(one.id), one.x + 0.5, one.y + 0.5
+        wide, gap = LETTER * font * len(text), 2 * size
+        level, above, below = y + 0.35 * font, y - gap, y + gap + 0.7 * font
+        for left, base in (
+            *((x + gap, level), (x - gap - wide, level)),
+            *((x - wide / 2, above), (x - wide / 2, below)),
+        ):
+            left = max(min(left, size_px[0] - wide), 0.0)
+            base = max(min(base, size_px[1] - 0.25 * font), 0.75 * font)
+            if take(taken, left, base - 0.75 * font, left + wide, base, side):
+                found.append((round(left, 1), round(base, 1), text))
+                break
+    return found
 
 
-def magnified(dn: tuple[tuple[int, ...], ...], spots: Collection[Spot], x0: int, y0: int, side: int) -> str:
-    """Pixels as squares with their numbers, and crosses at the centroids among them."""
+def take(taken: dict[int, int], left: float, top: float, right: float, bottom: float, side: float) -> bool:
+    """Take a box, if nobody has any of it."""
+    first = max(int(left / side), 0)
+    bits = (2 << (int(right / side) - first)) - 1 << first
+    rows = range(int(top / side), int(bottom / side) + 1)
+    if any(taken.get(row, 0) & bits for row in rows):
+        return False
+    for row in rows:
+        taken[row] = taken.get(row, 0) | bits
+    return True
+
+
+def magnified(dn: tuple[tuple[int, ...], ...], spots: Collection[Spot], x0: int, y0: int, high: int) -> str:
+    """Pixels as squares with their numbers, and crosses at the centroids among them; `high` pixels of the screen."""
     rows, columns = len(dn), len(dn[0])
-    cell = side / max(rows, columns)
-    low, high = min(map(min, dn)), max(map(max, dn))
-    reach = max(high - low, 1)
-    parts = []
-    for y, row in enumerate(dn):
-        for x, value in enumerate(row):
-            grey = round(255 * ((value - low) / reach) ** 0.5)
-            at = f'x="{x * cell:.1f}" y="{y * cell:.1f}"'
-            parts.append(
-                f'<rect {at} width="{cell:.1f}" height="{cell:.1f}" fill="rgb({grey},{grey},{grey})"/>'
-            )
-            ink = "#000" if grey > 140 else "#99a3b3"
-            place = f'x="{(x + 0.5) * cell:.1f}" y="{(y + 0.62) * cell:.1f}"'
-            parts.append(
-                f'<text {place} font-size="{cell / 2.9:.1f}" text-anchor="middle" fill="{ink}">{value}</text>'
-            )
+    cell, wide = high / rows, columns * high / rows
+    low, most = min(map(min, dn)), max(map(max, dn))
+    letters = len(str(most))
+    font = min(0.46 * cell, 0.94 * cell / (LETTER * letters))
+    parts = [
+        pixel(x, y, value, ((value - low) / max(most - low, 1)) ** 0.5, cell, (x0, y0))
+        for y, row in enumerate(dn)
+        for x, value in enumerate(row)
+    ]
     for spot in spots:
         along, down = (spot.x - x0 + 0.5) * cell, (spot.y - y0 + 0.5) * cell
-        if 0 < along < side and 0 < down < side:
-            look = f'stroke="{INK["detected"]}" stroke-width="1.2"'
-            parts.append(f'<path d="M{along - 6:.1f} {down:.1f}h12M{along:.1f} {down - 6:.1f}v12" {look}/>')
-    box_px = f'viewBox="0 0 {side} {side}" width="{side}" height="{side}"'
-    return f'<svg {box_px} font-family="monospace">{"".join(parts)}</svg>'
+        if 0 < along < wide and 0 < down < high:
+            look = f'stroke="{INK["detected"]}" stroke-width="1.5"'
+            parts.append(f'<path d="M{along - 8:.1f} {down:.1f}h16M{along:.1f} {down - 8:.1f}v16" {look}/>')
+    box_px = f'viewBox="0 0 {wide:.1f} {high}" width="{wide:.1f}" height="{high}"'
+    letter = f'font-family="ui-monospace, monospace" font-size="{font:.1f}" text-anchor="middle"'
+    return f"<svg {box_px} {letter}>{''.join(parts)}</svg>"
+
+
+def pixel(x: int, y: int, dn: int, bright: float, cell: float, first: tuple[int, int]) -> str:
+    """A pixel's square, its number, and where it is for who rests the mouse on it."""
+    grey = round(255 * bright)
+    square = f'x="{x * cell:.1f}" y="{y * cell:.1f}" width="{cell:.1f}" height="{cell:.1f}"'
+    middle = (
+        f'x="{(x + 0.5) * cell:.1f}" y="{(y + 0.64) * cell:.1f}" fill="{"#000" if grey > 120 else "#b6bfcd"}"'
+    )
+    return (
+        f"<g><title>x {first[0] + x}, y {first[1] + y}: {dn} DN</title>"
+        f'<rect {square} fill="rgb({grey},{grey},{grey})"/><text {middle}>{dn}</text></g>'
+    )

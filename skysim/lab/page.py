@@ -88,7 +88,7 @@ class Tab:
     def head(self) -> None:
         """Title, scene, what is going on, export."""
         with ui.element("div").classes("lab-head"):
-            ui.label("skysim lab").style("font-weight: 600; letter-spacing: .02em")
+            ui.label("skysim lab").classes("lab-name")
             names = {path.stem: path.stem for path in sorted(SCENES.glob("*.yaml"))} | {
                 self.scene: self.scene
             }
@@ -96,37 +96,42 @@ class Tab:
             self.picker.props('dense borderless options-dense aria-label="Scene"').classes("w-44").mark(
                 "scene"
             )
-            self.title = ui.label().classes("quiet ellipsis")
-            ui.space()
-            self.message = ui.label().classes("ellipsis").props('role="status"').mark("message")
-            self.busy = ui.spinner(size="16px").mark("busy")
-            self.rate = ui.label().classes("mono quiet").style("width: 130px; text-align: right").mark("rate")
+            self.picker.on("popup-hide", js_handler=look.LEFT)
+            self.title = ui.label().classes("lab-title quiet ellipsis")
+            self.message = ui.label().classes("lab-said").props('role="status"').mark("message")
+            self.busy = ui.spinner(size="16px").classes("lab-busy").mark("busy")
+            self.rate = ui.label().classes("lab-rate mono quiet").mark("rate")
+            self.rate.props('title="from asking for the newest frame to having it here"')
             self.every = ui.switch("identify", value=True, on_change=self.solve_every).props("dense size=xs")
             with ui.button("Export").props("dense flat size=sm").mark("export"), ui.menu():
                 for name in export.KINDS:
-                    ui.menu_item(name, on_click=lambda name=name: self.export(name))
+                    item = ui.menu_item(name, on_click=lambda name=name: self.export(name))
+                    item.props("dense").style("white-space: nowrap")
 
     def side(self) -> None:
         """The panels beneath the attitude."""
-        with ui.element("div").style("display: grid; grid-template-rows: 34px minmax(0,1fr); min-height: 0"):
+        with ui.element("div").style(
+            "display: grid; grid-template: 34px minmax(0, 1fr) / minmax(0, 1fr); min-height: 0"
+        ):
             with ui.tabs().props("dense align=left no-caps indicator-color=primary") as self.tabs:
                 # Else the arrow keys would go on to choose tabs.
-                self.tabs.on("click", js_handler="() => document.activeElement.blur()")
+                self.tabs.on("click", js_handler=look.LEFT)
                 for name in PANELS:
                     ui.tab(name).mark(f"tab-{name}")
             with ui.tab_panels(self.tabs, value="Lab", animated=False, keep_alive=True).classes("lab-panels"):
-                with ui.tab_panel("Lab"):
+                with ui.tab_panel("Lab").classes("relative-position"):
                     self.space = Space()
+                    ui.label("drag turns · right drag shifts · wheel nears").classes("lab-turn quiet")
                 with ui.tab_panel("Scene"):
                     self.form = ScenePanel(self)
-                with ui.tab_panel("Run"):
+                with ui.tab_panel("Run").classes("lab-run"):
                     self.flight = RunPanel(self)
                 with ui.tab_panel("Monte Carlo"):
                     self.trials = TrialPanel(self)
                 with ui.tab_panel("Image"):
                     self.photo = PhotoPanel(self)
                 with ui.tab_panel("Log"):
-                    self.told = ui.label("Nothing yet.").classes("mono").mark("log")
+                    self.told = ui.label("Nothing yet.").classes("mono lab-log").mark("log")
 
     def dialog(self) -> ui.dialog:
         """Help: what the page is and its keys."""
@@ -151,12 +156,16 @@ class Tab:
         """Set a scene up and look."""
         before = self.scene, self.overrides
         self.scene, self.overrides = scene, dict(overrides or {})
-        answer = await self.ask("open", self.scene_path, self.overrides, self.solving)
+        doing = f"setting up {scene} …" if self.view else ""  # the first says so in the frame's place
+        answer = await self.ask("open", self.scene_path, self.overrides, self.solving, doing=doing)
         if answer is None:
             self.scene, self.overrides = before
+            if self.view is None:
+                self.sensor.waiting(f"{scene} could not be set up:", self.said)
             return
         self.setting, view = answer
         self.feedback = await self.fed_back()
+        self.title.props["title"] = self.setting.title  # the whole of a long one
         self.title.set_text(self.setting.title)
         self.attitude.set(self.setting)
         self.space.set(self.setting)
@@ -206,14 +215,16 @@ class Tab:
         self.attitude.show(view)
         self.space.show(view)
 
-    async def ask(self, task: str, *arguments: Any) -> Any:
-        """What the session answers; None where it went wrong, which is said."""
-        self.say("")
+    async def ask(self, task: str, *arguments: Any, doing: str = "") -> Any:
+        """What the session answers; None where it went wrong, which is said. Until then: what is being done."""
+        self.say(doing, "quiet")
         self.busy.set_visibility(True)
         try:
             return await self.wait(self.session.ask(task, *arguments))
         finally:
             self.busy.set_visibility(False)
+            if doing and self.said == doing:
+                self.say("")
 
     async def wait(self, asked: Awaitable[Any]) -> Any:
         """An answer; what is wrong is said in one line."""
@@ -224,14 +235,15 @@ class Tab:
             return None
         return answer
 
-    def say(self, text: str, good: bool = False) -> None:
-        """One line at the top, until the next action."""
+    def say(self, text: str, ink: str = "warn") -> None:
+        """A message at the top, until the next action: what is wrong, what went well or what is being done."""
         if text == self.said:
             return
         self.said = text
+        self.message.props["title"] = text  # the whole of a long one
         self.message.set_text(text)
-        self.message.classes(remove="good warn", add="good" if good else "warn")
-        if text and not good:
+        self.message.classes(remove="good warn quiet", add=ink)
+        if text and ink == "warn":
             self.log(text)
 
     def log(self, text: str) -> None:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import tempfile
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.detect import check_size
-from skysim import greys, io, solve
-from skysim.lab.desk import named, spots_of
-from skysim.lab.views import Answer, Triple
+from skysim import greys, io, score, solve
+from skysim.lab.desk import answered, lights_of, magnitudes, named, spots_of
+from skysim.lab.views import Answer, Light, Triple
 from skysim.study import plan, replay, store
 from skysim.study.benches import bench
 from skysim.study.commands import STORE
@@ -27,15 +28,25 @@ WIDEST_PX = 1400  # as the browser gets it
 
 @dataclass(frozen=True, slots=True)
 class Photo:
-    """A picture of the user's, as the page shows it; size_px is the picture's own."""
+    """A picture that is not the scene's at hand, and its answer; size_px is its own, jpeg what the page shows.
 
-    jpeg: bytes
+    names, true_deg : of its three angles, and what they truly are;  lights : what truly shone: of a study's trial
+    """
+
     size_px: tuple[int, int]
     answer: Answer
-    facts: dict[str, Any]
+    solution: dict[str, Any]
+    facts: greys.Facts
+    jpeg: bytes = b""
+    names: tuple[str, str, str] = ("RA", "Dec", "roll")
+    true_deg: Triple | None = None
+    lights: tuple[Light, ...] = ()
 
 
-def of_file(name: str, data: bytes, fov_deg: float | None, stages: dict[str, str]) -> Photo:
+Seen = tuple[Photo, NDArray]  # with the picture's pixels
+
+
+def of_file(name: str, data: bytes, fov_deg: float | None, stages: dict[str, str]) -> Seen:
     """An uploaded file, solved. Raises BadInput for what cannot be an image."""
     suffix = Path(name).suffix.lower()
     if suffix not in SUFFIXES:
@@ -50,37 +61,56 @@ def of_file(name: str, data: bytes, fov_deg: float | None, stages: dict[str, str
     return solved(image, fov_deg, stages, taken)
 
 
-def of_camera(source: str, fov_deg: float | None, stages: dict[str, str]) -> Photo:
+def of_camera(source: str, fov_deg: float | None, stages: dict[str, str]) -> Seen:
     """One frame of a live camera. Raises BadInput."""
     return solved(io.monochrome(io.grab(source)), fov_deg, stages, None)
 
 
-def of_trial(study: str, folder: Path, trial: int) -> Photo:
+def of_trial(study: str, folder: Path, trial: int) -> Seen:
     """The frame of a study's trial, done again, with what the tracker made of it."""
-    told = plan.load(study)
+    planned = plan.load(study)
     with store.open_store(folder / STORE) as kept:
-        segment = replay.segment_of(told, kept, trial)
-    row = one(told.recipe, segment, trial, segment.replicates[0])
-    ready = bench(told.recipe, segment.settings)
-    frame, _, report = next(replay.seen(ready, row.seed))
-    spots = spots_of(report, named(ready.estimator, report.attitude, report.centroids.xy_px))
-    answer = Answer(row.error.strip().splitlines()[-1] if row.error else report.attitude.status, spots, 0.0)
-    grey = greys.stretched(frame.image_dn, "square root")
-    return Photo(greys.jpeg(grey), (grey.shape[1], grey.shape[0]), answer, {})
+        segment = replay.segment_of(planned, kept, trial)
+    row = one(planned.recipe, segment, trial, segment.replicates[0])
+    ready = bench(planned.recipe, segment.settings)
+    frame, truth, report = next(replay.seen(ready, row.seed))
+    answer = answered(ready.lab, ready.estimator, report, truth)
+    if row.error:
+        answer = replace(answer, status=row.error.strip().splitlines()[-1])
+    scene, (height, width) = ready.lab.scene, frame.image_dn.shape
+    told = Photo(
+        (width, height),
+        answer,
+        {},
+        greys.facts(frame.image_dn, frame.saturation_dn),
+        names=score.angle_names(scene),
+        true_deg=score.angles_deg(truth.cam_from_lab, scene, ready.lab.mount),
+        lights=lights_of(truth, magnitudes(ready.lab)),
+    )
+    return told, frame.image_dn
 
 
-def solved(image: NDArray, fov_deg: float | None, stages: dict[str, str], taken: Any) -> Photo:
+def solved(image: NDArray, fov_deg: float | None, stages: dict[str, str], taken: Any) -> Seen:
     """The answer to a picture, or why there is none."""
     check_size(image)
     how = solve.make_solver(fov_deg, None, stages=stages)
     found, tracker = solve.look(image, how, taken)
     told = found.attitude
     spots = spots_of(found, named(tracker, told, found.centroids.xy_px))
-    facts = solve.solution(found) if told.solved else {}
-    angles: Triple | None = (facts["ra_deg"], facts["dec_deg"], facts["roll_deg"]) if facts else None
+    solution = solve.solution(found) if told.solved else {}
+    angles: Triple | None = (
+        (solution["ra_deg"], solution["dec_deg"], solution["roll_deg"]) if solution else None
+    )
     answer = Answer(told.status, spots, 1e3 * sum(found.seconds.values()), angles)
-    grey = greys.stretched(image, "square root")
+    height, width = image.shape
+    full = float(np.iinfo(image.dtype).max) if image.dtype.kind == "u" else math.inf
+    return Photo((width, height), answer, solution, greys.facts(image, full)), image
+
+
+def packed(image: NDArray, curve: str, bright: float) -> bytes:
+    """As the page shows it: no wider than a screen."""
+    grey = greys.stretched(image, curve, bright)
     height, width = grey.shape
     if width > WIDEST_PX:
         grey = cv2.resize(grey, (WIDEST_PX, round(height * WIDEST_PX / width)), interpolation=cv2.INTER_AREA)
-    return Photo(greys.jpeg(np.asarray(grey, np.uint8)), (width, height), answer, facts)
+    return greys.jpeg(np.asarray(grey, np.uint8))

@@ -18,7 +18,7 @@ class PhotoPanel:
     """Drop, look, read."""
 
     def __init__(self, tab: Tab) -> None:
-        self.tab, self.live = tab, False
+        self.tab, self.live, self.logged = tab, False, ""
         self.fov = ui.number("field of view, deg (empty: 5 to 40 are tried)", min=1, max=120)
         self.fov.props("dense outlined clearable").classes("w-full").mark("fov")
         self.upload = ui.upload(
@@ -42,7 +42,7 @@ class PhotoPanel:
                 "No picture yet. It is solved without being told where it looks; a wrong answer is worse "
                 "than none, so it may be refused."
             )
-            .classes("quiet")
+            .classes("mono quiet")
             .style("margin-top: 10px; white-space: pre-wrap")
         )
         self.facts.mark("facts")
@@ -55,8 +55,10 @@ class PhotoPanel:
         if len(data) > LIMIT_BYTES:
             self.tab.say(f"{name}: larger than 64 MB")
             return
-        self.facts.set_text(f"solving {name} …")
-        self.show(name, await self.tab.ask("solve_file", name, data, self.fov.value, {}))
+        self.say(f"solving {name} …", "quiet")
+        self.show(
+            name, await self.tab.ask("solve_file", name, data, self.fov.value, {}, doing=f"solving {name} …")
+        )
 
     async def watch(self) -> None:
         """Frame after frame of a live camera, until pressed again."""
@@ -74,18 +76,23 @@ class PhotoPanel:
     def show(self, name: str, photo: Photo | None) -> None:
         """The picture with its marks, and the numbers."""
         if photo is None:
-            self.facts.set_text(f"{name}: {self.tab.said}")
+            self.say(self.tab.said if self.tab.said.startswith(name) else f"{name}: {self.tab.said}", "warn")
             return
-        self.tab.sensor.show_photo(photo.jpeg, photo.size_px, photo.answer)
-        self.tab.attitude.tell(photo.answer)
-        self.tab.log(f"{name}: {photo.answer.status}")
-        facts = photo.facts
-        lines = [f"{name}: {photo.answer.status}"]
-        if facts:
-            lines += [
-                f"RA {facts['ra_deg']:.4f}°  Dec {facts['dec_deg']:+.4f}°  roll {facts['roll_deg']:.3f}°"
-            ]
-            lines += [
-                f"field {facts['fov_deg']:.3f}°  {facts['matches']} stars  rms {facts['rms_arcsec']:.1f}″"
-            ]
-        self.facts.set_text("\n".join(lines))
+        self.tab.sensor.show_photo(photo)
+        self.tab.attitude.show_photo(photo)
+        told = f"{name}: {photo.answer.status}"
+        if told != self.logged:  # a live camera's say the same again and again
+            self.logged = told
+            self.tab.log(told)
+        found = photo.solution
+        if not found:
+            self.say(f"{told}\nRefused: a wrong attitude is worse than none.", "warn")
+            return
+        where = f"RA {found['ra_deg']:.4f}°  Dec {found['dec_deg']:+.4f}°  roll {found['roll_deg']:.3f}°"
+        how = f"field {found['fov_deg']:.3f}°  {found['matches']} stars  rms {found['rms_arcsec']:.1f}″"
+        self.say(f"{told}\n{where}\n{how}", "good")
+
+    def say(self, text: str, ink: str) -> None:
+        """What came of the picture."""
+        self.facts.set_text(text)
+        self.facts.classes(remove="quiet good warn", add=ink)

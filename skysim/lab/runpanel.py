@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from nicegui import ui
 
 from skysim.lab.forms import LOOPS, looped
-from skysim.lab.look import CURVES, INK
+from skysim.lab.look import CURVES, INK, TOOLTIP
 from skysim.lab.views import FlightLog, View
 from skysim.scene import load
 
@@ -47,14 +47,17 @@ class RunPanel:
         self.bar = ui.linear_progress(0, show_value=False, size="3px").props("instant-feedback")
         self.seek = ui.slider(min=0, max=1, step=0.01, value=0).props('dense aria-label="Time"')
         self.seek.on("change", self.sought)
-        self.chart = ui.echart(options()).classes("w-full").style("height: 440px").mark("strips")
+        self.seek.disable()
+        self.chart = ui.echart(options()).classes("lab-strips w-full").mark("strips")
         ui.timer(1 / 30, self.tick)
 
     def set(self) -> None:
         """Another scene: nothing is flown yet."""
         self.playing = False
-        self.log, self.came = FlightLog(()), {}
+        self.log, self.came, self.from_s = FlightLog(()), {}, 0.0
         self.play.disable()
+        self.seek.disable()
+        self.seek.set_value(0)
         self.clock.set_text("0.00 s")
         told = self.tab.feedback
         self.loop.set_options(LOOPS if told else {"": LOOPS[""]}, value=told or "")
@@ -73,7 +76,7 @@ class RunPanel:
             return
         self.flying, self.playing = True, False
         self.fly.set_text("Stop")
-        log = await self.tab.ask("fly")
+        log = await self.tab.ask("fly", doing="flying …")
         self.flying = False
         self.fly.set_text("Fly")
         self.bar.set_value(0)
@@ -82,6 +85,7 @@ class RunPanel:
         self.log, self.came = log, {}
         self.seek.props(f"max={log.t_s[-1]:.2f}")
         self.play.enable()
+        self.seek.enable()
         self.draw()
         self.tab.log(f"flew {log.t_s[-1]:.2f} s")
         self.from_s = 0.0
@@ -179,10 +183,24 @@ class RunPanel:
         ] + [moment(strip, now_s) for strip in range(len(STRIPS))]
         for strip, axis in enumerate(shown["xAxis"]):
             axis["max"] = round(end_s, 2)
+            here = {name: points for name, at, points in curves if at == strip and points}
             if strip in LOGARITHMIC:
-                values = [y for _, at, points in curves if at == strip for _, y in points]
-                shown["yAxis"][strip] |= decades(values)
+                shown["yAxis"][strip] |= decades([y for points in here.values() for _, y in points])
+            shown["legend"][strip]["data"] = list(here)
+            shown["title"][len(STRIPS) + strip]["text"] = "" if here else self.empty(strip)
         self.chart.update()
+
+    def empty(self, strip: int) -> str:
+        """Why there is nothing in a strip."""
+        if not self.log.t_s:
+            told = self.tab.setting
+            return f"not flown yet: Fly flies {told.duration_s:.4g} s" if told and strip == 0 else ""
+        if STRIPS[strip].startswith("innovation"):
+            if "filter" not in self.log.curves:
+                return "no filter in this scene (Scene, filter)"
+            if not self.tab.solving:
+                return "identify is off: no star tracker's answer to hold against the filter"
+        return "comes while it plays"
 
 
 def decades(values: list[float]) -> dict[str, float]:
@@ -215,16 +233,27 @@ def moment(strip: int, now_s: float) -> dict[str, Any]:
 
 
 def options() -> dict[str, Any]:
-    """Four strips above one another, one time."""
+    """Four strips above one another, one time; each with its title, its legend, and why it is empty."""
     text, rule = {"color": INK["quiet"], "fontSize": 10}, {"lineStyle": {"color": INK["line"]}}
-    top, high, gap, last = 44, 72, 24, len(STRIPS) - 1
+    plain = text | {"fontWeight": "normal", "fontSize": 11}
+    last, slot = len(STRIPS) - 1, 24.2  # per cent of the chart's height
+    tops = [1 + n * slot for n in range(last + 1)]
+    legend = {"textStyle": text, "itemWidth": 12, "itemHeight": 6, "itemGap": 8, "right": 10, "padding": 0}
     return {
         "animation": False,
-        "legend": {"textStyle": text, "itemWidth": 12, "itemHeight": 6, "top": 0, "left": 0, "itemGap": 12},
-        "tooltip": {"trigger": "axis", "confine": True},
-        "grid": [
-            {"left": 58, "right": 14, "top": top + n * (high + gap), "height": high} for n in range(last + 1)
+        "title": [
+            *(
+                {"text": name, "left": 0, "top": f"{top}%", "padding": 0, "textStyle": plain}
+                for name, top in zip(STRIPS, tops, strict=True)
+            ),
+            *(
+                {"text": "", "left": "center", "top": f"{top + 11}%", "padding": 0, "textStyle": plain}
+                for top in tops
+            ),
         ],
+        "legend": [legend | {"top": f"{top}%", "data": []} for top in tops],
+        "tooltip": TOOLTIP,
+        "grid": [{"left": 50, "right": 12, "top": f"{top + 5.4}%", "height": "16.4%"} for top in tops],
         "xAxis": [
             {
                 **{"type": "value", "gridIndex": n, "min": 0, "splitLine": {"show": False}},
@@ -234,11 +263,10 @@ def options() -> dict[str, Any]:
         ],
         "yAxis": [
             {
-                **{"type": "log" if n in LOGARITHMIC else "value", "gridIndex": n, "name": name},
-                **{"nameTextStyle": {**text, "align": "left"}, "nameGap": 6, "splitNumber": 3},
+                **{"type": "log" if n in LOGARITHMIC else "value", "gridIndex": n, "splitNumber": 3},
                 **{"axisLabel": text, "splitLine": rule},
             }
-            for n, name in enumerate(STRIPS)
+            for n in range(last + 1)
         ],
         "series": [],
     }

@@ -37,7 +37,9 @@ class ScenePanel:
             self.undo = (
                 ui.button("Undo all", on_click=self.revert).props("dense flat no-wrap size=sm").mark("revert")
             )
-        self.sections = ui.column().classes("w-full gap-0")
+        self.none = ui.label("No key has these letters.").classes("w-full empty")
+        self.none.set_visibility(False)
+        self.sections = ui.column().classes("lab-sections w-full gap-0")
         self.boxes: dict[str, ui.element] = {}
         self.opened: dict[str, ui.expansion] = {}
         self.entries: dict[str, ui.input | ui.select] = {}
@@ -77,7 +79,7 @@ class ScenePanel:
         """One key."""
         own = field.key.removeprefix(f"{field.section}.")
         with ui.row().classes("w-full no-wrap items-start gap-2") as box:
-            head = ui.label(own).classes("mono w-52 flex-none ellipsis").style("padding-top: 6px")
+            head = ui.label(own).classes("mono w-48 flex-none ellipsis").style("padding-top: 6px")
             head.tooltip(field.key).classes(self.ink(field))
             if field.choices:
                 known = field.text if field.text in field.choices else None
@@ -141,6 +143,7 @@ class ScenePanel:
         found = {one.section for key, one in self.shown.items() if letters in key.lower()}
         for section, opened in self.opened.items():
             opened.set_visibility(section in found)
+        self.none.set_visibility(not found)
 
     def search(self) -> None:
         """Filter, and open the first section that has such a key."""
@@ -162,7 +165,7 @@ class ScenePanel:
             return
         self.tab.log(f"saved {path}")
         self.name.set_value("")
-        self.tab.say(f"saved as {path.name}", good=True)
+        self.tab.say(f"saved as {path.name}", "good")
 
     async def revert(self) -> None:
         """The scene as its file has it."""

@@ -11,14 +11,15 @@ from nicegui import ui
 
 from skysim import greys
 from skysim.lab import overlay
-from skysim.lab.look import INK
 from skysim.lab.starnames import NAMES
-from skysim.lab.views import Answer, Light, Spot, View
+from skysim.lab.views import Answer, Light, Setting, Spot, View
 
 if TYPE_CHECKING:
     from skysim.lab.page import Tab
+    from skysim.lab.photo import Photo
 
-ZOOM_PX = 160  # side of the enlarged pixels on the screen
+ZOOM_PX = 160  # height of the enlarged pixels on the screen
+FIRST = "The first look on a machine takes up to a minute: the code is loaded and compiled, once."
 STRETCHES = list(greys.CURVES)
 NUMBER = itertools.count(1)  # of frames, so that each has an address of its own
 FRAMES: dict[str, dict[int, bytes]] = {}  # by tab and number, the newest few
@@ -39,6 +40,9 @@ class Sensor:
         self.lights: tuple[Light, ...] = ()
         self.answer: Answer | None = None
         self.size_px = (4, 3)
+        self.facts = ""  # of the frame, told where the mouse is nowhere
+        self.at: tuple[float, float] | None = None
+        self.fresh = False  # what is enlarged is of the frame that is shown
         self.sent = self.came = 0
         self.arrived = asyncio.Event()
         with ui.element("div").classes("lab-sensor"):
@@ -47,10 +51,19 @@ class Sensor:
                 self.canvas = Canvas().mark("sensor")
                 self.canvas.on("mouse", self.mouse, throttle=0.06)
                 self.canvas.on("drawn", self.drawn)
+                with ui.element("div").classes("lab-wait") as self.wait:
+                    ui.spinner(size="28px")
+                    self.why = ui.label().mark("wait")
             with ui.element("div").classes("lab-under"):
                 self.magnified = ui.html(sanitize=False).classes("quiet").mark("zoom")
                 self.hover = ui.label().classes("mono").mark("hover")
+        self.canvas.set_visibility(False)
+        self.waiting(f"Setting up {tab.scene} …", FIRST)
         self.rest()
+
+    def waiting(self, *lines: str) -> None:
+        """What the first frame is waiting for, or why there is none."""
+        self.why.set_text("\n".join(lines))
 
     def bar(self) -> None:
         """Overlays, stretch, brightness."""
@@ -67,12 +80,9 @@ class Sensor:
 
     def rest(self) -> None:
         """Nothing enlarged, nothing under the mouse."""
-        side = f"width:{ZOOM_PX}px;height:{ZOOM_PX}px"
-        look = (
-            f"{side};border:1px dashed {INK['line']};display:flex;align-items:center;justify-content:center"
-        )
-        self.magnified.set_content(f'<div style="{look}"><span>click a star</span></div>')
-        self.hover.set_text("")
+        self.at, self.fresh = None, False
+        self.magnified.set_content('<div class="lab-zoom">click a star: its pixels</div>')
+        self.magnified.classes(remove="stale")
 
     def toggle(self, kind: str, on: bool) -> None:
         self.shown = self.shown | {kind} if on else self.shown - {kind}
@@ -89,6 +99,9 @@ class Sensor:
         if size_px != self.size_px:
             share = size_px[0] / size_px[1]
             self.canvas.style(f"width: min(100cqw, calc(100cqh * {share:.5f})); aspect-ratio: {share:.5f}")
+        if not self.sent:
+            self.wait.set_visibility(False)
+            self.canvas.set_visibility(True)
         self.size_px = size_px
         self.sent = next(NUMBER)
         kept = FRAMES.setdefault(self.tab.id, {})
@@ -113,19 +126,37 @@ class Sensor:
     def show(self, view: View) -> None:
         """A look at the scene."""
         self.lights, self.answer = view.lights, view.answer
+        self.facts = facts(view.size_px, view.facts, view.answer, view, self.tab.setting)
+        self.renewed()
         self.picture(view.jpeg, view.size_px)
 
-    def show_photo(self, data: bytes, size_px: tuple[int, int], answer: Answer) -> None:
-        """A picture of the user's: no truth is known of it."""
-        self.lights, self.answer = (), answer
-        self.picture(data, size_px)
+    def show_photo(self, photo: Photo) -> None:
+        """A picture of the user's, or a study's trial."""
+        self.lights, self.answer = photo.lights, photo.answer
+        self.facts = facts(photo.size_px, photo.facts, photo.answer)
+        self.renewed()
+        self.picture(photo.jpeg, photo.size_px)
+
+    def renewed(self) -> None:
+        """What stands beneath the frame is told of the new one; what is enlarged is of an older one."""
+        self.tell()
+        if self.fresh:
+            self.fresh = False
+            self.magnified.classes("stale")
+
+    def tell(self) -> None:
+        """What is under the mouse, else the frame's own numbers."""
+        if self.at is None:
+            self.hover.set_text(self.facts)
+            return
+        self.hover.set_text(self.told(*self.at, *self.nearest(*self.at)))
 
     def mark(self) -> None:
         """Draw the marks anew."""
         self.canvas.props["look"] = {
             "src": f"/frame/{self.tab.id}/{self.sent}",
             "size": self.size_px,
-            "marks": overlay.marks(self.lights, self.answer, self.size_px[0], self.shown, self.name),
+            "marks": overlay.marks(self.lights, self.answer, self.size_px, self.shown, self.name),
             "label": self.words(),
         }
         self.canvas.update()
@@ -143,15 +174,18 @@ class Sensor:
     async def mouse(self, event: Any) -> None:
         """Tell what is under the mouse; a click enlarges it."""
         x, y = event.args["x"] - 0.5, event.args["y"] - 0.5
-        spot, light = self.nearest(x, y)
-        self.hover.set_text(self.told(x, y, spot, light))
+        self.at = None if event.args["kind"] == "mouseleave" else (x, y)
+        self.tell()
         if event.args["kind"] != "click" or not self.tab.setting:
             return
+        spot, light = self.nearest(x, y)
         middle = spot or light
         zoom = await self.tab.ask("zoom", middle.x if middle else x, middle.y if middle else y)
         if zoom:
             spots = self.answer.spots if self.answer else ()
             self.magnified.set_content(overlay.magnified(zoom.dn, spots, zoom.x, zoom.y, ZOOM_PX))
+            self.magnified.classes(remove="stale")
+            self.fresh = True
 
     def nearest(self, x: float, y: float) -> tuple[Spot | None, Light | None]:
         """What was seen there and what truly is, within a few marks' width."""
@@ -181,3 +215,30 @@ class Sensor:
                     f"           off the truth by {math.hypot(spot.x - light.x, spot.y - light.y):.3f} px"
                 ]
         return "\n".join(lines)
+
+
+def facts(
+    size_px: tuple[int, int],
+    told: greys.Facts,
+    answer: Answer | None,
+    view: View | None = None,
+    setting: Setting | None = None,
+) -> str:
+    """A frame's numbers in two columns; of a picture of the user's fewer are known."""
+    rows = [
+        (
+            "frame",
+            f"{size_px[0]} × {size_px[1]} px",
+            *(("field", f"{setting.field_deg:.4g}°") if setting else ("", "")),
+        )
+    ]
+    if view:
+        rows += [("exposure", f"{1e3 * view.exposure_s:.4g} ms", "made in", f"{view.ms:.0f} ms")]
+    rows += [
+        ("sky", f"{told.sky_dn:.5g} DN", "scatter", f"{told.scatter_dn:.3g} DN"),
+        ("brightest", f"{told.peak_dn:.5g} DN", "saturated", f"{told.saturated} px"),
+    ]
+    lights = ("lights", f"{len(view.lights)} in the field") if view else ()
+    seen = ("named", f"{answer.identified} of {len(answer.spots)} seen") if answer else ()
+    rows += [(*lights, *seen, "", "", "", "")[:4]]
+    return "\n".join(f"{a:<11s}{b:<20s}{c:<11s}{d}".rstrip() for a, b, c, d in rows)

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from numpy.typing import NDArray
+
+from skysim import greys
 from skysim.lab import export, photo
-from skysim.lab.desk import Desk
+from skysim.lab.desk import Desk, zoomed
 from skysim.lab.flight import Flown
 from skysim.lab.views import FlightLog, Setting, Triple, View, Zoom
 from skysim.types import BadInput
@@ -18,7 +21,7 @@ Watch = Callable[[float, float], None]
 
 @dataclass
 class Kept:
-    """Between tasks: the desk, and the flight that was flown on it.
+    """Between tasks: the desk, the flight that was flown on it, and the user's picture while the page shows one.
 
     watch : tells how far a long task is; raises Stopped where it is to end
     """
@@ -26,6 +29,7 @@ class Kept:
     watch: Watch
     desk: Desk | None = None
     flown: Flown | None = None
+    image: NDArray | None = None
     scene: str = ""
     overrides: Mapping[str, str] | None = None
 
@@ -34,6 +38,24 @@ class Kept:
         if self.desk is None:
             raise BadInput("no scene is set up")
         return self.desk
+
+    def look(self, solve: bool) -> View:
+        """A look at the scene: the user's picture is put away."""
+        self.image = None
+        return self.ready().look(solve)
+
+    def shown(self, seen: photo.Seen) -> photo.Photo:
+        """A picture of the user's, packed for the page."""
+        told, self.image = seen
+        return replace(told, jpeg=self.packed())
+
+    def packed(self) -> bytes:
+        """What the page shows, as the desk has it stretched."""
+        desk = self.ready()
+        if self.image is not None:
+            return photo.packed(self.image, desk.stretch, desk.bright)
+        assert desk.frame is not None
+        return greys.jpeg(greys.stretched(desk.frame.image_dn, desk.stretch, desk.bright))
 
 
 class Stopped(Exception):
@@ -49,11 +71,11 @@ def open_scene(kept: Kept, scene: str, overrides: Mapping[str, str], solve: bool
     """Set a scene up and look."""
     kept.desk = Desk.of(scene, overrides, kept.desk)
     kept.scene, kept.overrides, kept.flown = scene, dict(overrides), None
-    return kept.desk.setting, kept.desk.look(solve)
+    return kept.desk.setting, kept.look(solve)
 
 
 def look(kept: Kept, solve: bool) -> View:
-    return kept.ready().look(solve)
+    return kept.look(solve)
 
 
 def point(kept: Kept, angles_deg: Triple, solve: bool) -> View:
@@ -67,14 +89,17 @@ def move(kept: Kept, right: float, up: float, roll_deg: float, solve: bool) -> V
 
 
 def show(kept: Kept, stretch: str, bright: float) -> bytes:
-    """The newest frame as JPEG, stretched otherwise."""
+    """What is shown as JPEG, stretched otherwise."""
     desk = kept.ready()
     desk.stretch, desk.bright = stretch, bright
-    return desk.again()
+    return kept.packed()
 
 
 def zoom(kept: Kept, x: float, y: float) -> Zoom:
-    return kept.ready().zoom(x, y)
+    """The pixels around one of what is shown."""
+    frame = kept.ready().frame
+    assert frame is not None
+    return zoomed(frame.image_dn if kept.image is None else kept.image, x, y)
 
 
 def fly(kept: Kept) -> FlightLog:
@@ -87,12 +112,13 @@ def play(kept: Kept, t_s: float, solve: bool) -> View:
     """A moment of the flight."""
     if kept.flown is None:
         raise BadInput("nothing was flown yet")
+    kept.image = None
     return kept.flown.at(kept.ready(), t_s, solve)
 
 
 def replay(kept: Kept, study: str, folder: str, trial: int) -> photo.Photo:
     """A trial of a study again, as the page shows a picture."""
-    return photo.of_trial(study, Path(folder), trial)
+    return kept.shown(photo.of_trial(study, Path(folder), trial))
 
 
 def export_files(kept: Kept) -> dict[str, bytes]:
@@ -102,11 +128,11 @@ def export_files(kept: Kept) -> dict[str, bytes]:
 def solve_file(
     kept: Kept, name: str, data: bytes, fov_deg: float | None, stages: dict[str, str]
 ) -> photo.Photo:
-    return photo.of_file(name, data, fov_deg, stages)
+    return kept.shown(photo.of_file(name, data, fov_deg, stages))
 
 
 def solve_camera(kept: Kept, source: str, fov_deg: float | None, stages: dict[str, str]) -> photo.Photo:
-    return photo.of_camera(source, fov_deg, stages)
+    return kept.shown(photo.of_camera(source, fov_deg, stages))
 
 
 TASKS: dict[str, Callable[..., Any]] = {

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
@@ -10,7 +11,7 @@ from urllib.parse import quote
 from nicegui import run, ui
 
 from skysim import io
-from skysim.lab.look import INK
+from skysim.lab.look import INK, TOOLTIP
 from skysim.lab.trials import Tally, Trials, finished, monte_carlo
 from skysim.study import plan
 from skysim.study.plan import STUDIES
@@ -41,6 +42,7 @@ class TrialPanel:
 
     def __init__(self, tab: Tab) -> None:
         self.tab, self.trials, self.runs = tab, Trials(Path()), 0
+        self.failed: tuple[tuple[int, str], ...] = ()
         with ui.row().classes("w-full no-wrap items-center gap-2"):
             self.what = ui.select({}, value=None).props('dense outlined options-dense aria-label="Study"')
             self.what.classes("flex-grow").mark("study").on_value_change(self.chosen)
@@ -61,7 +63,8 @@ class TrialPanel:
             self.field = ui.number("field, °", min=1, max=90).props("dense outlined").mark("field")
             self.field.on("keydown.enter", self.refield)
         self.bar = ui.linear_progress(0, show_value=False, size="3px").props("instant-feedback")
-        self.note = ui.label("Nothing run yet: press 2.").classes("quiet").mark("trials-note")
+        self.note = ui.label("Nothing run yet: press 2.").classes("quiet").style("margin-top: 6px")
+        self.note.mark("trials-note")
         self.chart = ui.echart(options()).classes("w-full").style("height: 190px").mark("histogram")
         self.table = ui.element("div").classes("mono w-full").mark("figures")
         self.failures = ui.column().classes("w-full gap-1")
@@ -103,6 +106,7 @@ class TrialPanel:
         """Begin the study that is chosen."""
         if self.trials.running:
             return
+        self.tab.say("")
         try:
             path = await run.io_bound(self.file)
             told = await run.io_bound(plan.load, path)
@@ -113,6 +117,7 @@ class TrialPanel:
             return
         self.trials = Trials(path.parent if not self.what.value else self.tab.out / path.stem)
         self.trials.total = told.trials
+        self.bar.set_value(0)
         self.button.set_text("Stop")
         self.note.set_text("starting …")
         self.tab.log(f"study {path.stem}: {told.trials} trials")
@@ -163,18 +168,27 @@ class TrialPanel:
     def show(self, told: Tally) -> None:
         """Figures and histogram."""
         self.bar.set_value(told.done / max(self.trials.total, 1))
-        self.chart.options["xAxis"]["data"] = [f"{one:.3g}" for one in told.bins]
+        self.chart.options["xAxis"]["data"] = [
+            f"{one:.0f}" if one >= 100 else f"{one:.3g}" for one in told.bins
+        ]
         self.chart.options["series"][0]["data"] = list(told.counts)
+        self.chart.options["title"]["text"] = "" if told.counts else "none solved: no error to count"
         self.chart.update()
         self.table.clear()
         with self.table:
+            ui.label(f"{'':16s}{'value':>8s}   95 % interval").classes("mono quiet")
             lines = [f"{NAMED[name]:16s}{figure(*value)}" for name, value in told.figures.items()]
             ui.label("\n".join(lines)).classes("mono")
+        if told.failed == self.failed:
+            return
+        self.failed = told.failed
         self.failures.clear()
         with self.failures:
+            if told.failed:
+                ui.label("Failed trials, the first of them").classes("quiet").style("margin-top: 8px")
             for number, why in told.failed:
                 with ui.row().classes("items-center gap-2 no-wrap"):
-                    ui.label(f"trial {number}: {why}").classes("bad ellipsis")
+                    ui.label(f"trial {number}: {why}").classes("mono warn ellipsis")
                     ui.button("replay", on_click=lambda number=number: self.replay(number)).props(
                         "dense flat size=sm"
                     )
@@ -182,9 +196,12 @@ class TrialPanel:
     async def replay(self, number: int) -> None:
         """A failed trial's frame, in the sensor view."""
         study = next(iter(self.trials.folder.glob("*.yaml")), STUDIES / f"{self.what.value}.yaml")
-        photo = await self.tab.ask("replay", str(study), str(self.trials.folder), number)
+        photo = await self.tab.ask(
+            "replay", str(study), str(self.trials.folder), number, doing=f"replaying trial {number} …"
+        )
         if photo:
-            self.tab.sensor.show_photo(photo.jpeg, photo.size_px, photo.answer)
+            self.tab.sensor.show_photo(photo)
+            self.tab.attitude.show_photo(photo)
             self.tab.log(f"replayed trial {number}: {photo.answer.status}")
 
     def list(self) -> None:
@@ -193,9 +210,19 @@ class TrialPanel:
         with self.reports:
             found = finished(self.tab.out)
             for folder in found[:12]:
-                ui.link(folder.name, f"/report/{quote(folder.name)}", new_tab=True).classes("mono")
+                done = time.strftime("%d %b %H:%M", time.localtime((folder / "report.html").stat().st_mtime))
+                with ui.row().classes("w-full no-wrap gap-3"):
+                    ui.label(done).classes("mono quiet flex-none")
+                    link = ui.link(named(folder), f"/report/{quote(folder.name)}", new_tab=True)
+                    link.classes("ellipsis").props["title"] = folder.name
             if not found:
                 ui.label("none yet").classes("quiet")
+
+
+def named(folder: Path) -> str:
+    """A study's title where its file is beside its report, else its folder's name."""
+    file = next(iter(sorted(folder.glob("*.yaml"))), None)
+    return (plan.title_of(file) if file else "") or folder.name
 
 
 def figure(value: float, low: float, high: float) -> str:
@@ -211,6 +238,10 @@ def options() -> dict[str, Any]:
     text = {"color": INK["quiet"], "fontSize": 10}
     return {
         "animation": False,
+        "title": {
+            **{"text": "the errors of trials come here", "left": "center", "top": "middle"},
+            "textStyle": text | {"fontWeight": "normal", "fontSize": 11},
+        },
         "grid": {"left": 42, "right": 10, "top": 22, "bottom": 36},
         "xAxis": {
             "type": "category",
@@ -228,7 +259,7 @@ def options() -> dict[str, Any]:
             "name": "trials",
             "nameTextStyle": text,
         },
-        "tooltip": {"trigger": "axis", "confine": True},
+        "tooltip": TOOLTIP,
         "series": [
             {"type": "bar", "data": [], "barCategoryGap": "8%", "itemStyle": {"color": INK["accent"]}}
         ],

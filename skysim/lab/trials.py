@@ -28,13 +28,14 @@ RESPONSES = (
     "time_ms_median",
 )
 BINS = 28
+SHOWN = 20  # failed trials at most
 
 
 class Tally(NamedTuple):
     """A study's trials so far.
 
     figures : by response its value and interval;  bins, counts : a histogram of the angle of error, arcsec
-    failed  : trials that raised, by number
+    failed  : trials that raised, were wrong or refused, by number, the first few
     """
 
     done: int
@@ -51,7 +52,7 @@ def monte_carlo(
     """The study file of `count` random attitudes of a scene."""
     tree = {
         "schema": 1,
-        "title": f"Monte Carlo of {scene}",
+        "title": f"Monte Carlo of {Path(scene).stem}, {count} trials of {trial['kind']}",
         "scene": scene,
         "seed": seed,
         "set": {key: yaml.safe_load(value) for key, value in overrides.items()},
@@ -114,7 +115,7 @@ class Trials:
             return None
         try:
             with store.open_store(path) as kept:
-                counts, columns, failed = kept.counts(), kept.columns("error IS NULL"), kept.failures()[:20]
+                counts, columns, failed = kept.counts(), kept.columns("error IS NULL"), kept.failures()
         except BadInput:
             return None
         if not counts["done"]:
@@ -125,7 +126,17 @@ class Trials:
             figures[name] = (told.value, told.low, told.high)
         off = metrics.FIGURES["angle_arcsec"](columns)
         bins, heights = histogram(off[np.isfinite(off)])
+        failed = sorted([*failed, *unsolved(columns)])[:SHOWN]
         return Tally(counts["done"], counts["wrong"], figures, bins, heights, tuple(failed))
+
+
+def unsolved(columns: Mapping[str, Any]) -> list[tuple[int, str]]:
+    """Trials with a frame that was answered wrongly, or not at all, and what became of it."""
+    rows = np.flatnonzero((columns["wrong"] > 0) | (columns["solved"] < columns["frames"]))
+    return [
+        (int(columns["trial"][n]), "wrong" if columns["wrong"][n] > 0 else str(columns["status"][n]))
+        for n in rows
+    ]
 
 
 def histogram(off_arcsec: Any) -> tuple[tuple[float, ...], tuple[int, ...]]:

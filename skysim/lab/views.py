@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from skysim import greys
+
 Triple = tuple[float, float, float]
 NAN = float("nan")
 
@@ -71,6 +73,7 @@ class View:
     angles_deg: Triple
     body_wxyz: tuple[float, ...]
     exposure_s: float
+    facts: greys.Facts
     lights: tuple[Light, ...]
     answer: Answer | None
     ms: float
