@@ -8,6 +8,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, field_validator, model_validator
 
+from skysim.calibration import Calibration
+from skysim.calibration import read as read_calibration
 from skysim.quantity import (
     DATA,
     Ascending,
@@ -273,6 +275,10 @@ class Camera(Part):
         """The principal point: as given, or the chip's middle."""
         return self.principal_point_px or ((self.width_px - 1) / 2, (self.height_px - 1) / 2)
 
+    def calibration(self) -> Calibration:
+        """What a perfect calibration would find."""
+        return Calibration(self.width_px, self.height_px, self.focal_px, self.centre_px, self.distortion)
+
     @property
     def corner_px(self) -> float:
         """From the principal point to the farthest corner of the chip."""
@@ -292,12 +298,52 @@ def preset(name: str, where: str) -> dict[str, Any]:
 
 
 def with_preset(tree: dict[str, Any]) -> dict[str, Any]:
-    """The raw scene with its camera's preset beneath what the scene itself says of the camera."""
+    """The raw scene with its camera's preset beneath what the scene itself says of the camera, and its calibration
+    in its place. Raises BadInput beginning with the key."""
     part = tree.get("camera")
-    if not isinstance(part, dict) or "preset" not in part:
+    if not isinstance(part, dict) or not {"preset", "calibration"} & set(part):
         return tree
-    own = {key: value for key, value in part.items() if key != "preset"}
-    return tree | {"camera": over(preset(str(part["preset"]), "camera.preset"), own)}
+    own = {key: value for key, value in part.items() if key not in ("preset", "calibration")}
+    below = preset(str(part["preset"]), "camera.preset") if "preset" in part else {}
+    if part.get("calibration") is None:
+        return tree | {"camera": over(below, own)}
+    for key in CALIBRATED:
+        if own.pop(key, None) is not None:
+            raise BadInput(
+                f"camera.{key}: the file of camera.calibration tells it; allowed: one of the two (null for a base's)"
+            )
+    whole = over(below, own)
+    return tree | {"camera": whole | calibrated(Path(str(part["calibration"])), whole)}
+
+
+CALIBRATED = ("width_px", "height_px", "focal_length", "principal_point_px", "distortion")
+
+
+def calibrated(path: Path, part: dict[str, Any]) -> dict[str, Any]:
+    """What a calibration of OpenCV says of a camera whose pixel and focus are told: size, focal length, distortion."""
+    try:
+        told = read_calibration(path)
+        pixel_m = quantity("m", "length", '"5.5 um"')(part.get("pixel"))
+        focus_m = focus_distance(part.get("focus", "infinity"))
+    except BadInput as error:
+        raise BadInput(f"camera.calibration: {error}") from None
+    except ValueError as error:
+        raise BadInput(f"camera.pixel: {error}; camera.calibration takes it, and focus") from None
+    size = (part.get("width_px", told.width_px), part.get("height_px", told.height_px))
+    if size != (told.width_px, told.height_px):
+        raise BadInput(
+            f"camera.calibration: {path}: of frames of {told.width_px}x{told.height_px}; the preset's are"
+            f" {size[0]}x{size[1]}"
+        )
+    # By the thin lens, as Camera.image_distance_m.
+    focal_m = 1 / (1 / (told.focal_px * pixel_m) + 1 / focus_m)
+    return {
+        "width_px": told.width_px,
+        "height_px": told.height_px,
+        "focal_length": f"{focal_m!r} m",
+        "principal_point_px": list(told.centre_px),
+        "distortion": list(told.distortion),
+    }
 
 
 def over(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:

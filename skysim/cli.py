@@ -12,6 +12,7 @@ import typer
 
 from estimator import BadImage
 from skysim import BadInput, __version__
+from skysim.commands import camera, export
 from skysim.lab.commands import lab as open_lab
 from skysim.papers.commands import reproduce
 from skysim.stream.commands import stream
@@ -282,7 +283,10 @@ def solve(
         float | None,
         typer.Option(help="Horizontal field of view in degrees, to 5 %; 5 to 40 are tried if left out."),
     ] = None,
-    camera: Annotated[Path | None, typer.Option(help="A scene or camera file (YAML) that made them.")] = None,
+    camera: Annotated[
+        Path | None,
+        typer.Option(help="A scene or camera file (YAML) that made them, or OpenCV's calibration."),
+    ] = None,
     live: Annotated[
         str | None,
         typer.Option(help="Also a frame of a live camera: its index, a video file or an address."),
@@ -369,6 +373,8 @@ def survey(
     print(io.to_json(figures)) if json else print_survey(figures)
 
 
+app.command()(export)
+app.command()(camera)
 app.command()(reproduce)
 app.command("lab")(open_lab)
 app.command()(stream)

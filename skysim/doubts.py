@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from skysim import dome
+from skysim import dome, wcs
 from skysim.light import SurveyedSurface
-from skysim.scene import Dome, Scene
+from skysim.scene import Dome, Scene, Stars
 from skysim.surface import Radial
 from skysim.types import Mount, Sources
 
@@ -18,7 +18,9 @@ LOCAL_PX = 32.0
 
 
 def doubts(scene: Scene, sources: Sources, mount: Mount) -> list[str]:
-    """A line each; none under the stars or in front of a bench."""
+    """A line each; none in front of a bench."""
+    if isinstance(scene.light, Stars):
+        return [line for line in [wcs.doubt(scene.camera)] if line]
     if not isinstance(scene.light, Dome):
         return []
     inside = dome.surface(scene.light.surface)

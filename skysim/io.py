@@ -6,6 +6,7 @@ import datetime
 import errno
 import json
 import os
+import shutil
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -16,9 +17,8 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
-from skysim.camera import Camera
+from skysim import wcs
 from skysim.scene import Scene, Stars
 from skysim.types import BadInput, Floats, Frame, Truth
 
@@ -69,6 +69,18 @@ def whole(path: Path) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
+@contextmanager
+def whole_folder(path: Path) -> Iterator[Path]:
+    """`whole` of a folder: a temporary one beside `path` that takes its place, whatever was there."""
+    temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        yield temporary
+        shutil.rmtree(path, ignore_errors=True)
+        temporary.rename(path)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
 def make_folder(path: Path) -> Path:
     """The folder, made if it is not there. Raises BadInput where that cannot be."""
     try:
@@ -84,15 +96,24 @@ RESULTS = (
 )
 
 
+EXPORTED = (
+    *("truth.aem", "solutions.aem", "truth.ecsv"),
+    *(f"{name}.parquet" for name in ("truth", "sources", "solutions", "telemetry", "imu")),
+    "frames.mp4",
+)
+ZARR = "frames.zarr"
+
+
 def clear(folder: Path) -> None:
-    """Remove what an earlier run left: its frames and what was said of them."""
-    for suffix in ("fits", "png", "ecsv"):
+    """Remove what an earlier run left: its frames, what was said of them and what `skysim export` made of it."""
+    for suffix in ("fits", "png", "ecsv", "tif"):
         for path in folder.glob(f"frame_[0-9][0-9][0-9][0-9]*.{suffix}"):
             path.unlink()
     for path in folder.glob("solutions.*.ecsv"):
         path.unlink()
-    for name in RESULTS:
+    for name in RESULTS + EXPORTED:
         (folder / name).unlink(missing_ok=True)
+    shutil.rmtree(folder / ZARR, ignore_errors=True)
 
 
 def unlike(paths: list[Path]) -> list[Path]:
@@ -127,7 +148,10 @@ def write_fits(path: Path, frame: Frame, truth: Truth, scene: Scene) -> None:
     header["FRAME"] = (frame.index, "index of the frame")
     header["SATURATE"] = (frame.saturation_dn, "saturation [DN]")
     if isinstance(scene.light, Stars):
-        header.update(wcs(scene.camera, truth.cam_from_lab))
+        header.update(wcs.header(scene.camera, truth.cam_from_lab))
+        header["COMMENT"] = "WCS: of the true attitude at mid-exposure; apparent directions in ICRS axes"
+    else:
+        header["COMMENT"] = "no WCS: the lights are in the laboratory"
     with whole(path) as temporary:
         fits.PrimaryHDU(frame.image_dn, header).writeto(temporary, overwrite=True)
 
@@ -136,44 +160,19 @@ def mid_time(scene: Scene, frame: Frame) -> datetime.datetime:
     return scene.start_time + datetime.timedelta(seconds=frame.t_mid_s)
 
 
-def wcs(camera: Camera, cam_from_icrs: Rotation) -> dict[str, Any]:
-    """Gnomonic WCS of the true pointing (Calabretta & Greisen 2002), without the lens's distortion.
-
-    CD carries pixel offsets to degrees east (xi) and north (eta) of the tangent point; rows of the attitude
-    matrix are the camera's axes in the ICRS, so its products with the local east and north are the CD's columns.
-    """
-    right, down, sight = cam_from_icrs.as_matrix()
-    ra, dec = np.arctan2(sight[1], sight[0]), np.arcsin(np.clip(sight[2], -1, 1))
-    east = np.array([-np.sin(ra), np.cos(ra), 0.0])
-    north = np.array([-np.sin(dec) * np.cos(ra), -np.sin(dec) * np.sin(ra), np.cos(dec)])
-    scale = np.degrees(1 / camera.focal_px)
-    return {
-        "CTYPE1": "RA---TAN",
-        "CTYPE2": "DEC--TAN",
-        "CUNIT1": "deg",
-        "CUNIT2": "deg",
-        "RADESYS": "ICRS",
-        "CRVAL1": np.degrees(ra) % 360,
-        "CRVAL2": np.degrees(dec),
-        "CRPIX1": camera.centre_px[0] + 1,  # FITS counts pixels from 1
-        "CRPIX2": camera.centre_px[1] + 1,
-        "CD1_1": scale * (right @ east),
-        "CD1_2": scale * (down @ east),
-        "CD2_1": scale * (right @ north),
-        "CD2_2": scale * (down @ north),
-    }
-
-
 def write_png16(path: Path, image_dn: NDArray) -> None:
     """16-bit PNG of the digital numbers themselves; a noise-free frame is rounded."""
     numbers = np.clip(np.rint(image_dn), 0, 65535).astype(np.uint16)
     write_image(path, numbers)
 
 
+PLAIN = (cv2.IMWRITE_TIFF_COMPRESSION, cv2.IMWRITE_TIFF_COMPRESSION_NONE)  # some readers know no other
+
+
 def write_image(path: Path, image: NDArray) -> None:
     """An image by the name's ending. Raises BadInput if it cannot be written."""
     with whole(path) as temporary:
-        if not cv2.imwrite(str(temporary), image):
+        if not cv2.imwrite(str(temporary), image, PLAIN if path.suffix == ".tif" else ()):
             raise BadInput(f"{path}: cannot be written as an image")
 
 
@@ -204,6 +203,7 @@ def write_truth(path: Path, frame: Frame, truth: Truth, scene: Scene) -> None:
         "seed": scene.seed,
         "frame": frame.index,
         "t_mid_s": frame.t_mid_s,
+        "mid_utc": mid_time(scene, frame).isoformat(timespec="microseconds"),
         "exposure_s": frame.exposure_s,
         "lab_from_body_xyzw": truth.lab_from_body.as_quat().tolist(),
         "cam_from_lab_xyzw": truth.cam_from_lab.as_quat().tolist(),

@@ -344,13 +344,15 @@ def beneath(tree: dict[str, Any], files: Files, overrides: Mapping[str, str]) ->
     try:
         return with_preset(tree)
     except BadInput as error:
-        raise BadInput(f"{error} {place_of(['camera', 'preset'], files, overrides)}") from None
+        key = str(error).partition(":")[0]
+        raise BadInput(f"{error} {place_of(key.split('.'), files, overrides)}") from None
 
 
 # Keys that name a file of the scene's own.
 FILES = (
     ("vehicle", "model"),
     ("camera", "psf", "file"),
+    ("camera", "calibration"),
     ("light", "surface", "file"),
     ("light", "layout", "file"),
     ("light", "layout", "points", "file"),

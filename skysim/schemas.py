@@ -18,7 +18,11 @@ KINDS: Mapping[str, type[BaseModel]] = {"scene": Scene, "study": Study}
 BESIDE: Mapping[str, dict[str, Any]] = {  # keys that are taken out before a file is checked
     "Scene": {"base": {"type": "string", "description": "another scene, by name or beside this one"}},
     "Camera": {
-        "preset": {"type": "string", "description": "a file of data/cameras: what is left out is from there"}
+        "preset": {"type": "string", "description": "a file of data/cameras: what is left out is from there"},
+        "calibration": {
+            "type": "string",
+            "description": "a file of OpenCV's: focal length, centre, distortion",
+        },
     },
 }
 STANDARD = "https://json-schema.org/draft/2020-12/schema"

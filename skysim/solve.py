@@ -23,6 +23,7 @@ from estimator.identify import IDENTIFIERS
 from estimator.stages import Clock, Report, Settings, see
 from estimator.tracker import NO_MATCH, StarTracker
 from estimator.types import Attitude, BadImage, Centroids
+from skysim import calibration as opencv
 from skysim import io, report, scene
 from skysim.camera import Camera as CameraPart
 from skysim.detector import saturation_dn
@@ -31,6 +32,9 @@ from skysim.quantity import one_of
 from skysim.scene import CATALOGUES
 from skysim.types import BadInput
 
+CALIBRATED_UNCERTAINTY = (
+    0.003  # of a focal length by OpenCV: a chessboard's is good to a part in a thousand or so
+)
 FOV_UNCERTAINTY = 0.055  # "to 5 %", with half a per cent for how people measure it
 PHOTO_EPOCH = datetime.datetime(2020, 1, 1, 12)
 
@@ -53,7 +57,8 @@ STAGES: dict[str, Mapping[str, object]] = {
 
 @dataclass(frozen=True, slots=True)
 class Solver:
-    """How to look at images: a field of view known to 5 %, a camera known exactly, or neither: 5 to 40 degrees.
+    """How to look at images: a field of view known to 5 %, a camera known exactly or by calibration, or neither: 5 to
+    40 degrees.
 
     time_utc : when the pictures were taken; None takes each FITS file's own, or 2020, when aberration (20") is
         left out because it turns with the season.
@@ -65,12 +70,17 @@ class Solver:
     stars: catalog.StarList
     settings: Settings
     time_utc: datetime.datetime | None = None
+    calibrated: opencv.Calibration | None = None
     built: dict[Any, dict[Camera, StarTracker]] = field(default_factory=dict, compare=False, repr=False)
 
     def beliefs(self, width_px: int, height_px: int) -> list[tuple[Camera, float]]:
         """Cameras to try on images of this size, and how uncertain the focal length of each is; the likeliest first."""
         if self.camera:
             return [(calibration(self.camera), 0.0)]
+        if self.calibrated:
+            told = self.calibrated
+            camera = Camera(told.width_px, told.height_px, told.focal_px, told.centre_px, told.distortion)
+            return [(camera, CALIBRATED_UNCERTAINTY)]
         if self.fov_deg:
             return [(Camera.from_fov(width_px, height_px, math.radians(self.fov_deg)), FOV_UNCERTAINTY)]
         widest, narrowest = (math.tan(math.radians(deg) / 2) for deg in (WIDEST_DEG, NARROWEST_DEG))
@@ -116,7 +126,8 @@ def make_solver(
     if fov_deg is not None and not 1 <= fov_deg <= 120:
         raise BadInput(f"--fov {fov_deg:g}: allowed: the horizontal field of view, 1 to 120 degrees")
     named = {stage: known(stage, name) for stage, name in (stages or {}).items()}
-    camera = scene.load_camera(camera_file) if camera_file else None
+    calibrated = opencv.read(camera_file) if camera_file and opencv.is_one(camera_file) else None
+    camera = scene.load_camera(camera_file) if camera_file and not calibrated else None
     settings = Settings()
     if camera:
         settings = Settings(
@@ -129,7 +140,7 @@ def make_solver(
         stars = catalog.read(CATALOGUES / f"{catalogue}.ecsv")
     except BadImage as error:
         raise BadInput(f"{error}; make it with: skysim catalog build") from None
-    return Solver(fov_deg, camera, stars, settings, time_utc)
+    return Solver(fov_deg, camera, stars, settings, time_utc, calibrated)
 
 
 def known(stage: str, name: str) -> str:
@@ -160,7 +171,7 @@ def solve(path: Path, solver: Solver, annotated: Path | None) -> dict[str, Any]:
     begin = time.perf_counter()
     try:
         image = io.read_image(path)
-        check(path, image, solver.camera)
+        check(path, image, solver)
         image = io.monochrome(image)
         check_size(image)
         found, tracker = look(image, solver, io.date_of(path))
@@ -181,7 +192,7 @@ def look(image: NDArray, solver: Solver, taken: datetime.datetime | None) -> tup
     """An image's answer, and the tracker whose it is."""
     height_px, width_px = image.shape
     first = next(solver.trackers(width_px, height_px, taken))
-    if solver.camera or solver.fov_deg:
+    if solver.camera or solver.calibrated or solver.fov_deg:
         return first.solve(image), first
     clock = Clock()
     centroids = see(image, first.camera, solver.settings, clock)  # of which only the camera's size counts
@@ -227,18 +238,20 @@ def alike(one: Attitude, other: Attitude) -> bool:
     return bool((one.cam_from_ref * other.cam_from_ref.inv()).magnitude() < SAME_RAD)
 
 
-def check(path: Path, image: NDArray, camera: CameraPart | None) -> None:
-    """A known camera makes frames of one size, one channel and one depth; anything else is another's."""
-    if camera is None:
-        return
-    bits = camera.detector.bits
-    if image.ndim != 2:
+def check(path: Path, image: NDArray, solver: Solver) -> None:
+    """A known camera makes frames of one size, a scene's of one channel and one depth; anything else is another's."""
+    camera = solver.camera
+    if camera and image.ndim != 2:
         raise BadInput(f"{path}: a colour image of shape {image.shape}; this camera's are monochrome")
-    if image.dtype == np.uint8 and bits > 8:
+    if camera and image.dtype == np.uint8 and camera.detector.bits > 8:
+        bits = camera.detector.bits
         raise BadInput(f"{path}: an 8-bit image; this camera's have {bits} bits, in 16-bit FITS, PNG or TIFF")
-    if image.shape != (camera.height_px, camera.width_px):
+    known_size = camera or solver.calibrated
+    if known_size and image.shape[:2] != (known_size.height_px, known_size.width_px):
         size = f"{image.shape[1]}x{image.shape[0]}"
-        raise BadInput(f"{path}: {size} pixels; this camera's are {camera.width_px}x{camera.height_px}")
+        raise BadInput(
+            f"{path}: {size} pixels; this camera's are {known_size.width_px}x{known_size.height_px}"
+        )
 
 
 def solution(found: Report) -> dict[str, Any]:

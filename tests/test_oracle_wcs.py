@@ -9,7 +9,7 @@ from astropy.coordinates import SkyCoord
 from astropy.io.fits import Header
 from astropy.wcs import WCS
 
-from skysim import io, sky
+from skysim import sky, wcs
 from skysim.camera import Camera
 from skysim.optics import Optics
 
@@ -34,7 +34,7 @@ def both_ways(pointing: tuple[float, float, float], stars: SkyCoord) -> tuple[np
     """(N, 2) pixels by our optics, and by astropy from the header."""
     cam_from_icrs = sky.cam_from_icrs(*pointing)
     ours = Optics.of(CAMERA).project(cam_from_icrs.apply(stars.cartesian.xyz.value.T))
-    header = WCS(Header(io.wcs(CAMERA, cam_from_icrs)))
+    header = WCS(Header(wcs.header(CAMERA, cam_from_icrs)))
     return ours, np.column_stack(header.world_to_pixel(stars))
 
 
@@ -62,7 +62,7 @@ def test_north_is_up_and_east_is_left_without_roll() -> None:
 
 def test_astropy_s_pixels_are_the_frame_s_own_indices() -> None:
     """FITS counts from 1, arrays from 0: the pointing lands on the principal point in both counts."""
-    header = WCS(Header(io.wcs(CAMERA, sky.cam_from_icrs(40.0, 30.0, 10.0))))
+    header = WCS(Header(wcs.header(CAMERA, sky.cam_from_icrs(40.0, 30.0, 10.0))))
     centre = SkyCoord(40.0, 30.0, unit="deg")
     np.testing.assert_allclose(header.world_to_pixel(centre), CAMERA.centre_px, rtol=0, atol=1e-6)
     counted_from_1 = header.all_world2pix([[40.0, 30.0]], 1)[0]

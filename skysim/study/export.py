@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,11 +10,10 @@ from typing import Any
 import numpy as np
 
 from skysim import io
+from skysim.export import EXTRA
 from skysim.study.store import Store
 from skysim.study.table import everything, flat, table
 from skysim.types import BadInput
-
-EXTRA = "takes more packages; install them: pip install 'skysim[export]'"
 
 
 def to_csv(store: Store, responses: tuple[str, ...], path: Path) -> None:
@@ -65,11 +63,8 @@ def dataset(store: Store, responses: tuple[str, ...], path: Path) -> Any:
 def to_zarr(store: Store, responses: tuple[str, ...], path: Path) -> None:
     """`dataset` as a Zarr folder."""
     made = dataset(store, responses, path)
-    temporary = path.with_name(f".{path.name}.new")
-    shutil.rmtree(temporary, ignore_errors=True)
-    made.to_zarr(temporary, mode="w", consolidated=False)
-    shutil.rmtree(path, ignore_errors=True)
-    temporary.rename(path)
+    with io.whole_folder(path) as temporary:
+        made.to_zarr(temporary, mode="w", consolidated=False)
 
 
 EXPORTS: dict[str, Callable[[Store, tuple[str, ...], Path], None]] = {

@@ -1,0 +1,73 @@
+"""`skysim export` and `skysim camera`: thin, like `cli`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from skysim.terminal import progress
+
+
+def export(
+    folder: Annotated[Path, typer.Argument(help="A folder that skysim run or skysim render wrote.")],
+    to: Annotated[
+        list[str], typer.Option("--to", help="aem, ecsv, parquet, tiff, zarr or video; may be given again.")
+    ],
+    out: Annotated[
+        Path | None, typer.Option(help="Folder for what is written; the run's own if left out.")
+    ] = None,
+    json: Annotated[bool, typer.Option("--json", help="Print JSON for machines.")] = False,
+) -> None:
+    """Write a finished run for other tools: attitudes as CCSDS AEM, tables as Parquet, frames as TIFF, Zarr, video."""
+    from skysim import export as exporting
+    from skysim import io, recording
+
+    run = recording.recording(folder)
+    written = exporting.export(run, to, out or folder, progress)
+    if json:
+        print(io.to_json([str(path) for path in written]))
+        return
+    for path in written[:10]:
+        print(path)
+    if len(written) > 10:
+        print(f"and {len(written) - 10} files more in {out or folder}")
+
+
+def camera(
+    file: Annotated[
+        Path,
+        typer.Argument(help="A scene or camera file, a scene's name, or a calibration by OpenCV (YAML)."),
+    ],
+    out: Annotated[Path | None, typer.Option(help="Also write it as OpenCV's YAML, to this file.")] = None,
+    set_: Annotated[
+        list[str] | None, typer.Option("--set", help='Override a scene\'s key: camera.focus="2 m".')
+    ] = None,
+    json: Annotated[bool, typer.Option("--json", help="Print JSON for machines.")] = False,
+) -> None:
+    """Show a camera's calibration: focal length, principal point, distortion; and write it for OpenCV."""
+    import dataclasses
+
+    from skysim import calibration, io, scene
+    from skysim.yamlfile import overridden
+
+    if calibration.is_one(file):
+        told = calibration.read(file)
+    elif set_:
+        told = scene.load(file, overridden(set_)).camera.calibration()
+    else:
+        told = scene.load_camera(scene.find(str(file))).calibration()
+    if out:
+        io.make_folder(out.parent)
+        io.write_text(out, calibration.text(told))
+    if json:
+        print(io.to_json(dataclasses.asdict(told)))
+        return
+    (x, y), named = told.centre_px, zip(calibration.FIVE, told.distortion, strict=True)
+    print(f"size             {told.width_px} x {told.height_px} px")
+    print(f"focal length     {told.focal_px:.6g} px")
+    print(f"principal point  {x:.6g}, {y:.6g} px (the first pixel's middle is 0, 0)")
+    print("distortion       " + ", ".join(f"{name} {value:g}" for name, value in named))
+    if out:
+        print(f"{out}: for OpenCV, for skysim solve --camera, and for a scene's camera.calibration")
