@@ -13,7 +13,7 @@ import pytest
 
 from skysim import cli, io
 from skysim.export import EXPORTS
-from skysim.scene import ROOT
+from skysim.quantity import ROOT
 
 PAGE = (ROOT / "docs/formats.md").read_text(encoding="utf-8")
 COMMANDS = [line for block in re.findall(r"```sh\n(.*?)```", PAGE, re.DOTALL) for line in block.splitlines()]

@@ -14,7 +14,7 @@ import pytest
 
 from estimator.camera import Camera
 from skysim import BadInput, scene, score, simulate, tetratracker, trackers
-from skysim.scene import ROOT
+from skysim.quantity import ROOT
 from skysim.trackers import Setup
 
 tetra3rs = pytest.importorskip("tetra3rs")
