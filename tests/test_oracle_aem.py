@@ -11,7 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from skysim import aem, io
-from skysim.scene import ROOT
+from skysim.quantity import ROOT
 from skysim.types import BadInput
 
 ndm = pytest.importorskip("ccsds_ndm", reason="the package ccsds-ndm-py is not installed")
