@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime
 import shlex
+import signal
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -100,6 +101,7 @@ def options(
 
 def main() -> None:
     """Run the command; whatever the user got wrong ends as one line and exit code 2."""
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # whoever ends us, nothing stays half-written
     try:
         code = app(standalone_mode=False)
     except (BadInput, BadImage) as error:

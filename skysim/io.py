@@ -107,8 +107,12 @@ ZARR = "frames.zarr"
 def clear(folder: Path) -> None:
     """Remove what an earlier run left: its frames, what was said of them and what `skysim export` made of it."""
     for suffix in ("fits", "png", "ecsv", "tif"):
-        for path in folder.glob(f"frame_[0-9][0-9][0-9][0-9]*.{suffix}"):
-            path.unlink()
+        for name in (
+            "frame_[0-9][0-9][0-9][0-9]*",
+            ".frame_[0-9][0-9][0-9][0-9].*",
+        ):  # the latter: of a killed run
+            for path in folder.glob(f"{name}.{suffix}"):
+                path.unlink()
     for path in folder.glob("solutions.*.ecsv"):
         path.unlink()
     for name in RESULTS + EXPORTED:

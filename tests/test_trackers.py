@@ -20,8 +20,7 @@ from astropy.io import fits
 
 from skysim import BadInput, metrics, programs, scene, scoreboard, simulate
 from skysim.programs import Fault, Program
-from skysim.quantity import ARCSEC_RAD
-from skysim.quantity import ROOT
+from skysim.quantity import ARCSEC_RAD, ROOT
 from skysim.study import plan, runner, store
 from skysim.study.engines import Serial
 from skysim.trackers import Answer, Leds, Picture, Setup, Stars, checked

@@ -1,0 +1,52 @@
+"""Same seed and version, same bytes: of frames, truth and answers, whoever computes them and whatever was compiled."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from astropy.table import Table
+
+SCENES = ("afit_simsat", "shefex2", "simsat_bump")
+# Seconds of wall clock stand in these, and in no other file.
+TIMED = ("report.html", "solutions.ecsv")
+
+
+def digests(folder: Path) -> dict[str, str]:
+    return {
+        path.name: hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in sorted(folder.iterdir())
+        if path.name not in TIMED
+    }
+
+
+def answers(folder: Path) -> list[str]:
+    """The rows of the solutions, every digit, without the time that each took."""
+    table = Table.read(folder / "solutions.ecsv", format="ascii.ecsv")
+    table.remove_column("time_ms")
+    return [str(tuple(row)) for row in table]
+
+
+def made(scene: str, out: Path, **environment: str) -> Path:
+    """What a run leaves, in a process of its own."""
+    folder = out / scene
+    command = [sys.executable, "-m", "skysim", "run", scene, "--frames", "3", "--out", str(folder)]
+    subprocess.run(command, check=True, capture_output=True, env=os.environ | environment)
+    return folder
+
+
+@pytest.mark.long
+def test_bytes_do_not_depend_on_threads_or_on_what_was_compiled_before(tmp_path: Path) -> None:
+    cache = {"NUMBA_CACHE_DIR": str(tmp_path / "numba")}
+    for scene in SCENES:
+        cold = made(scene, tmp_path / "cold", **cache, NUMBA_NUM_THREADS="1")
+        warm = made(scene, tmp_path / "warm", **cache, NUMBA_NUM_THREADS="1")
+        two = made(scene, tmp_path / "two", **cache, NUMBA_NUM_THREADS="2", OPENBLAS_NUM_THREADS="2")
+        assert len(digests(cold)) > 9
+        for other in (warm, two):
+            assert digests(other) == digests(cold)
+            assert answers(other) == answers(cold)
