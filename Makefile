@@ -2,15 +2,19 @@
 PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
+# `make LOCK=requirements.lock`: the versions that CI takes, which were last seen to work together.
+LOCK ?=
+PIP = $(BIN)/pip install --quiet --disable-pip-version-check $(if $(LOCK),-c $(LOCK))
+LOWEST := out/lowest
 
 $(READY): pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "skysim needs Python 3.11 or newer")'
 	$(PYTHON) -m venv .venv
 	$(BIN)/pip install --quiet --disable-pip-version-check --upgrade pip
-	$(BIN)/pip install --quiet --disable-pip-version-check -e '.[dev,catalog]'
+	$(PIP) -e '.[dev,catalog]'
 	touch $@
 
-.PHONY: demo test test-long test-oracle test-browser lint pictures studies papers lab recompile setup clean
+.PHONY: demo test test-long test-oracle test-browser test-lowest lock lint pictures studies papers lab recompile setup clean
 setup: $(READY)
 
 demo: $(READY)
@@ -24,7 +28,7 @@ test-long: $(READY)
 	NUMBA_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n 2 -m long
 
 test-oracle: $(READY)
-	$(BIN)/pip install --quiet --disable-pip-version-check -e '.[oracle]'
+	$(PIP) -e '.[oracle]'
 	$(BIN)/pytest tests/test_oracle_*.py
 
 lab: $(READY)
@@ -44,8 +48,19 @@ papers: $(READY)
 
 # The lab's page in Chromium. Where that is missing the tests say so and are skipped.
 test-browser: $(READY)
-	$(BIN)/pip install --quiet --disable-pip-version-check -e '.[browser]'
+	$(PIP) -e '.[browser]'
 	$(BIN)/pytest tests/test_lab_page.py -rs
+
+# Versions that resolve today, for CI; and the tests on the lowest that pyproject.toml allows.
+lock: $(READY)
+	$(BIN)/pip install --quiet --upgrade --upgrade-strategy eager -e '.[dev,catalog,browser]'
+	$(BIN)/pip freeze --exclude-editable > requirements.lock
+
+test-lowest:
+	$(PYTHON) -m venv $(LOWEST)
+	$(LOWEST)/bin/pip install --quiet --disable-pip-version-check uv
+	$(LOWEST)/bin/uv pip install --quiet --python $(LOWEST)/bin/python --resolution lowest-direct -e '.[dev,catalog]'
+	NUMBA_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(LOWEST)/bin/python -m pytest -n 2 -m "not long and not browser"
 
 lint: $(READY)
 	$(BIN)/ruff check .
