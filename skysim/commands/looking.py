@@ -1,0 +1,171 @@
+"""`skysim solve`, `survey`, `bench`."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from skysim import BadInput
+from skysim.commands.options import (
+    Centroider,
+    Detector,
+    Identifier,
+    Json,
+    Out,
+    SceneArg,
+    Seed,
+    Sets,
+    SolverName,
+    load,
+    moment,
+    named,
+)
+from skysim.terminal import complain, number, print_answers, print_survey, print_table, progress, watched, yes
+
+if TYPE_CHECKING:
+    from typing import Any
+
+    from numpy.typing import NDArray
+
+
+def solve(
+    images: Annotated[list[Path] | None, typer.Argument(help="FITS, PNG, TIFF, JPEG or BMP files.")] = None,
+    fov: Annotated[
+        float | None,
+        typer.Option(help="Horizontal field of view in degrees, to 5 %; 5 to 40 are tried if left out."),
+    ] = None,
+    camera: Annotated[
+        Path | None,
+        typer.Option(help="A scene or camera file (YAML) that made them, or OpenCV's calibration."),
+    ] = None,
+    live: Annotated[
+        str | None,
+        typer.Option(help="Also a frame of a live camera: its index, a video file or an address."),
+    ] = None,
+    time: Annotated[str | None, typer.Option(help="UTC of the pictures, e.g. 2012-06-22T21:00:00.")] = None,
+    detector: Detector = None,
+    centroider: Centroider = None,
+    identifier: Identifier = None,
+    solver: SolverName = None,
+    out: Annotated[Path, typer.Option(help="Folder for the annotated pictures.")] = Path("out/solve"),
+    json: Json = False,
+) -> None:
+    """Find where pictures of the sky look, lost in space; refuse rather than guess.
+
+    Exit code 0 when every image was looked at, solved or not; 2 when one could not be.
+    """
+    from skysim import io
+    from skysim import solve as solving
+
+    stages = named(detector=detector, centroider=centroider, identifier=identifier, solver=solver)
+    how = solving.make_solver(fov, camera, time_utc=moment(time), stages=stages)
+    io.make_folder(out)
+    paths = [*(images or ()), *([kept(io.grab(live), out / "live.png")] if live is not None else ())]
+    if not paths:
+        raise BadInput("give images, or --live CAMERA")
+    pictures = io.unlike([out / f"{path.name}.solved.png" for path in paths])
+    jobs = progress(list(zip(paths, pictures, strict=True)), len(paths), "solving", quiet=json)
+    answers = [solving.solve(path, how, picture) for path, picture in jobs]
+    faults = [answer["status"] for answer in answers if answer.pop("bad_input")]
+    io.write_text(out / "solutions.json", io.to_json(answers))
+    if json:
+        print(io.to_json(answers))
+    else:
+        print_answers(answers, out)
+    for fault in faults:
+        complain(fault)
+    if faults:
+        raise typer.Exit(2)
+
+
+def kept(image: NDArray[Any], path: Path) -> Path:
+    """The file of a camera's frame."""
+    from skysim import io
+
+    io.write_image(path, image)
+    return path
+
+
+def survey(
+    scene: SceneArg,
+    frames: Annotated[int, typer.Option(min=2, help="How many stops; a frame at each.")] = 300,
+    seed: Seed = None,
+    out: Out = None,
+    set_: Sets = None,
+    tilt: Annotated[float, typer.Option(help="Stops lean up to so many degrees, to any side.")] = 25.0,
+    imu_sigma: Annotated[str, typer.Option(help="Error of the IMU's attitude about each axis.")] = "0.5 deg",
+    led_sigma: Annotated[str, typer.Option(help="Of an LED's believed place along each axis.")] = "2 mm",
+    lever_sigma: Annotated[str, typer.Option(help="Error of the camera's believed place.")] = "5 mm",
+    focal_error: Annotated[str, typer.Option(help="Of the believed focal length.")] = "1%",
+    distortion: Annotated[bool, typer.Option("--distortion", help="Fit k1, k2, p1, p2 too.")] = False,
+    checks: Annotated[int, typer.Option(min=1, help="New stops where the attitude is compared.")] = 40,
+    json: Json = False,
+) -> None:
+    """Measure a dome from frames at many attitudes: LEDs, lever and lens, in a file for `tracker.map`."""
+    from skysim import io, measure, measured, onboard, simulate
+
+    doubt = measure.doubt(imu_sigma, led_sigma, lever_sigma, focal_error)
+    lab = simulate.furnish(measure.doubted(load(scene, None, seed, set_), doubt))
+    belief = measure.belief_of(lab)
+    before = simulate.tracker(lab)
+    looks = list(progress(measure.looks(lab, belief, doubt, frames, tilt), frames, "photographing"))
+    with watched("adjusting") as watch:
+        found = measure.surveyed(looks, belief, doubt, distortion, watch)
+    folder = io.make_folder(out or Path("out") / lab.scene.name)
+    path, picture = folder / "leds.ecsv", folder / "survey.png"
+    io.write_dome_map(path, measure.dome_map(found, doubt))
+    io.write_image(picture, measured.figure(measured.misplaced(found, belief, lab)))
+    after = onboard.tracker(measure.with_map(lab.scene, str(path)), lab.mount, lab.sources)
+    stops = measure.frames(lab, measure.attitudes(lab.scene, "checks", checks, tilt), frames)
+    errors = measured.checked({"before": before, "after": after}, progress(stops, checks, "comparing"))
+    figures = measured.figures(found, belief, lab, doubt) | errors
+    figures |= {"scene": lab.scene.name, "frames": frames, "map": str(path), "picture": str(picture)}
+    print(io.to_json(figures)) if json else print_survey(figures)
+
+
+def bench(
+    areas: Annotated[
+        list[str] | None,
+        typer.Argument(help="instrument, detect, identify, attitude, dynamics; all if left out."),
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Time ourselves beside the best peer, in the same run."""
+    from skysim import io
+
+    sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+    try:
+        from benchmarks import AREAS, measure
+    except ImportError:
+        raise BadInput("bench: the benchmarks are in the project's checkout only; run it there") from None
+
+    unknown = [area for area in areas or () if area not in AREAS]
+    if unknown:
+        raise BadInput(f"bench: {unknown[0]!r} is none of {', '.join(AREAS)}")
+    results = [
+        result
+        for area in progress(areas or list(AREAS), len(areas or AREAS), "bench")
+        for result in measure(area)
+    ]
+    if json:
+        print(io.to_json(results))
+    else:
+        print_table(
+            "bench",
+            ["what", "ours", "peer", "peer's", "ratio", "bar", "met"],
+            [
+                [
+                    r["name"],
+                    f"{r['value']:.3g} {r['unit']}",
+                    r["peer"],
+                    number(r["peer_value"]),
+                    number(r["ratio"]),
+                    number(r["bar"]),
+                    yes(r["met"]),
+                ]
+                for r in results
+            ],
+        )
