@@ -49,7 +49,7 @@ papers: $(READY)
 # The lab's page in Chromium. Where that is missing the tests say so and are skipped.
 test-browser: $(READY)
 	$(PIP) -e '.[browser]'
-	$(BIN)/pytest tests/test_lab_page.py -rs
+	$(BIN)/pytest -m browser tests/test_lab_*.py -rs
 
 # Versions that resolve today, for CI; and the tests on the lowest that pyproject.toml allows.
 lock: $(READY)

@@ -42,7 +42,7 @@ def stretched(
     between : black and white, where they are another frame's; the frame's own if left out
     """
     low, high = between or span(image)
-    top = max(high / bright, low + 1.0)
+    top = low + max((high - low) / bright, 1.0)
     if image.dtype != np.uint16:
         return (255 * CURVES[curve](np.clip((image - low) / (top - low), 0, 1))).astype(np.uint8)
     levels = np.arange(int(image.max()) + 1)

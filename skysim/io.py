@@ -343,26 +343,6 @@ def read_fits(path: Path) -> NDArray:
     raise BadInput(f"{path}: a FITS file without an image")
 
 
-def grab(source: str) -> NDArray:
-    """One frame of a live camera, (H, W) or (H, W, 3): an index, a video file or an address, as OpenCV opens it.
-
-    Raises BadInput where there is none.
-    """
-    before = cv2.utils.logging.getLogLevel()
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
-    try:
-        capture = cv2.VideoCapture(int(source) if source.isdigit() else source)
-        there, frame = capture.read() if capture.isOpened() else (False, None)
-        capture.release()
-    finally:
-        cv2.utils.logging.setLogLevel(before)
-    if not there or frame is None:
-        raise BadInput(
-            f"{source}: no camera answers there; allowed: an index such as 0, a video file, an address"
-        )
-    return np.asarray(frame)
-
-
 def date_of(path: Path) -> datetime.datetime | None:
     """DATE-OBS of a FITS file; None for other files and other headers."""
     if path.suffix.lower() not in FITS_SUFFIXES:

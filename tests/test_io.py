@@ -16,7 +16,7 @@ from astropy.table import Table
 from astropy.wcs import WCS
 from scipy.spatial.transform import Rotation
 
-from skysim import io, scene, simulate
+from skysim import io, livecamera, scene, simulate
 from skysim.types import BadInput, Frame, Truth
 
 Shot = tuple[scene.Scene, Frame, Truth]
@@ -327,9 +327,9 @@ def test_a_camera_s_frame_is_taken_as_opencv_opens_it_and_none_is_told(tmp_path:
     video = cv2.VideoWriter(str(tmp_path / "camera.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 10, (64, 48))
     video.write(frame)
     video.release()
-    grabbed = io.grab(str(tmp_path / "camera.avi"))
+    grabbed = livecamera.grab(str(tmp_path / "camera.avi"))
     assert grabbed.shape == frame.shape
     assert np.abs(grabbed.astype(int) - frame).max() < 30
     for nowhere in (str(tmp_path / "none.avi"), "99"):
         with pytest.raises(BadInput, match="no camera answers there; allowed: an index such as 0"):
-            io.grab(nowhere)
+            livecamera.grab(nowhere)

@@ -2,147 +2,53 @@
 
 from __future__ import annotations
 
-import os
+import json
 import re
-import shutil
-import signal
-import socket
-import subprocess
-import sys
-import time
-import urllib.request
-from collections.abc import Iterator
+import zipfile
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+from astropy.io import fits
+from astropy.table import Table
+from labpage import (
+    CHROMIUM,
+    NARROW,
+    WIDE,
+    Server,
+    angles,
+    brightness,
+    changed,
+    chosen,
+    come,
+    differs,
+    exported,
+    onto_the_page,
+    panel,
+    picture,
+    pictured,
+    pixels,
+    screen,
+    set_to,
+    source,
+    status,
+)
 
+from skysim import scene
 from skysim.quantity import ROOT
 
-CHROMIUM = next(
-    (found for name in ("chromium", "chromium-browser", "google-chrome") if (found := shutil.which(name))), ""
-)
+FOCUSED = """() => {
+  const at = document.activeElement, whole = at.closest(".q-field, .q-slider") || at;
+  const box = whole.getBoundingClientRect(), named = whole.querySelector("[aria-label]");
+  return [at.ariaLabel || at.innerText || whole.ariaLabel || named?.ariaLabel, Math.max(Math.floor(box.left) - 4, 0),
+          Math.max(Math.floor(box.top) - 4, 0), Math.min(Math.ceil(box.right) + 4, innerWidth),
+          Math.ceil(box.bottom) + 4];
+}"""  # what has the focus, and where it is
+pytest_plugins = ["labpage"]
 pytestmark = [pytest.mark.browser, pytest.mark.skipif(not CHROMIUM, reason="Chromium is not installed")]
-
-SERVER: list[int] = []  # its process
-PICTURES = ROOT / "out" / "screenshots"
-SLOW_MS = 150_000  # a first compilation on a busy machine
-WIDE, NARROW = {"width": 1920, "height": 1080}, {"width": 1280, "height": 800}
-
-
-@pytest.fixture(scope="module")
-def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    """A server with a folder of its own."""
-    pytest.importorskip("nicegui", reason="the extra `lab` is not installed")
-    folder = tmp_path_factory.mktemp("lab")
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    command = [sys.executable, "-m", "skysim", "lab", "shefex2", "--no-open", "--port", str(port)]
-    told = ["--folder", str(folder), "--out", str(folder / "out")]
-    # With pytest's own variable NiceGUI takes the server for a test of itself.
-    environment = {name: value for name, value in os.environ.items() if name != "PYTEST_CURRENT_TEST"}
-    server = subprocess.Popen([*command, *told], cwd=ROOT, env=environment, start_new_session=True)
-    url = f"http://127.0.0.1:{port}/"
-    try:
-        for _ in range(300):
-            try:
-                urllib.request.urlopen(url, timeout=2).read()
-                break
-            except OSError:
-                assert server.poll() is None, "the server ended"
-                time.sleep(0.1)
-        SERVER.append(server.pid)
-        yield url
-    finally:
-        os.killpg(server.pid, signal.SIGTERM)
-        server.wait(10)
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    """Chromium without a screen."""
-    playwright = pytest.importorskip("playwright.sync_api", reason="the extra `browser` is not installed")
-    with playwright.sync_playwright() as driver:
-        found = driver.chromium.launch(
-            executable_path=CHROMIUM, args=["--no-sandbox", "--enable-unsafe-swiftshader"]
-        )
-        yield found
-        found.close()
-
-
-@pytest.fixture(scope="module")
-def tab(browser: Any, address: str) -> Iterator[Any]:
-    """A tab for most tests, one after the other, as a person has it open."""
-    with opened(browser, address, NARROW) as found:
-        yield found
-
-
-@pytest.fixture
-def page(tab: Any, request: pytest.FixtureRequest) -> Iterator[Any]:
-    """The tab, with its first panel before it; a picture of how the test left it."""
-    tab.get_by_role("tab", name="Lab").click()
-    yield tab
-    pictured(tab, request.node.name)
-
-
-@pytest.fixture(scope="module")
-def second(browser: Any, address: str) -> Iterator[Any]:
-    """Another tab."""
-    with opened(browser, address, NARROW) as found:
-        yield found
-
-
-def pictured(page: Any, name: str) -> None:
-    PICTURES.mkdir(parents=True, exist_ok=True)
-    page.screenshot(path=PICTURES / f"{name}.png")
-
-
-class opened:
-    """A tab, closed in the end."""
-
-    def __init__(self, browser: Any, address: str, size: dict[str, int]) -> None:
-        self.page = browser.new_page(viewport=size)
-        self.page.set_default_timeout(SLOW_MS)
-        self.faults: list[str] = []
-        self.page.on("pageerror", lambda error: self.faults.append(str(error)))
-        self.page.goto(address)
-        status(self.page, "solved")
-        self.page.locator(".lab-frame canvas[data-frame]").wait_for()
-        self.page.wait_for_timeout(300)  # no person types in the moment in which fields are filled in
-
-    def __enter__(self) -> Any:
-        return self.page
-
-    def __exit__(self, *_: object) -> None:
-        self.page.close()
-        assert self.faults == []
-
-
-def status(page: Any, starts: str) -> str:
-    """The tracker's status, once it begins so."""
-    found = page.locator(".lab-card .mono", has_text=re.compile(f"^{starts}"))
-    found.first.wait_for()
-    return str(found.first.inner_text())
-
-
-def angles(page: Any) -> np.ndarray:
-    """The three typed angles."""
-    return np.array([float(page.get_by_label(f"angle {n}").input_value()) for n in (1, 2, 3)])
-
-
-def source(page: Any) -> str:
-    """Which frame is drawn."""
-    return str(page.locator(".lab-frame canvas").get_attribute("data-frame"))
-
-
-def changed(page: Any, before: str) -> None:
-    """Wait for another frame."""
-    page.wait_for_function(
-        "before => document.querySelector('.lab-frame canvas').dataset.frame !== before", arg=before
-    )
 
 
 def test_it_shows_a_solved_frame_with_names_and_a_map_of_keys(page: Any) -> None:
@@ -186,13 +92,13 @@ def test_a_key_that_repeats_loses_no_step(page: Any) -> None:
         page.keyboard.down("e")  # faster than frames are made
     page.keyboard.up("e")
     page.wait_for_timeout(300)
-    after = before
-    for _ in range(100):
-        if abs(after - before) > 19.9:
-            break
-        page.wait_for_timeout(50)
-        after = angles(page)[2]
-    np.testing.assert_allclose((after - before + 180) % 360 - 180, 20, rtol=0, atol=1e-3)
+
+    def turned() -> float:
+        return (angles(page)[2] - before + 180) % 360 - 180
+
+    assert come(lambda: turned() > 19.9)
+    page.wait_for_timeout(300)
+    np.testing.assert_allclose(turned(), 20, rtol=0, atol=1e-3)
     assert status(page, "solved")
 
 
@@ -224,12 +130,128 @@ def test_an_attitude_is_typed_and_1_identifies_it(page: Any) -> None:
     assert status(page, "solved")
 
 
-def test_another_identifier_by_f7(page: Any) -> None:
+def test_every_export_reads_back(page: Any, tmp_path: Path) -> None:
+    kept = {name: exported(page, name, tmp_path) for name in ("truth", "solution", "figure", "scene")}
+    frame = fits.getdata(exported(page, "frame, FITS", tmp_path))
+    grey = cv2.imread(str(exported(page, "frame, PNG", tmp_path)), cv2.IMREAD_UNCHANGED)
+    np.testing.assert_array_equal(grey, frame)
+    truth, told = Table.read(kept["truth"]), json.loads(kept["solution"].read_text())
+    assert f"{len(truth)} true lights" in page.locator(".lab-frame canvas").get_attribute("aria-label")
+    np.testing.assert_allclose(told["angles_deg"], angles(page), rtol=0, atol=0.01)
+    assert cv2.imread(str(kept["figure"])).shape[2] == 3
+    assert scene.load(kept["scene"]).model_dump() | {"stem": ""} == scene.load("shefex2").model_dump() | {
+        "stem": ""
+    }
+    with zipfile.ZipFile(exported(page, "all of them", tmp_path)) as archive:
+        assert set(archive.namelist()) == {path.name for path in tmp_path.iterdir() if path.suffix != ".zip"}
+        assert archive.read("frame.png") == (tmp_path / "frame.png").read_bytes()
+
+
+def test_the_mouse_tells_of_a_star_and_a_click_enlarges_it(page: Any, tmp_path: Path) -> None:
+    spots = json.loads(exported(page, "solution", tmp_path).read_text())["spots"]
+    frame = fits.getdata(exported(page, "frame, FITS", tmp_path))
+    spot = max((one for one in spots if one["id"] >= 0), key=lambda one: one["flux"])
+    page.mouse.click(*screen(page, frame.shape[::-1], spot["x"], spot["y"]))
+    enlarged = pixels(page)
+    assert [dn for *_, dn in enlarged] == [int(frame[y, x]) for x, y, _ in enlarged]
+    assert len(enlarged) == 7 * 11
+    assert (round(spot["x"]), round(spot["y"])) == enlarged[3 * 11 + 5][:2]
+    shown = page.locator(".lab-under svg text").all_text_contents()
+    assert shown == [str(dn) for *_, dn in enlarged]
+    told = page.locator(".lab-under .mono").inner_text()
+    assert float(re.search(r"residual ([\d.]+) px", told)[1]) == pytest.approx(spot["residual_px"], abs=6e-4)
+    assert re.search(rf"centroid +{spot['x']:.2f} +{spot['y']:.2f} ", told)
+    assert float(re.search(r"V (-?[\d.]+)", told)[1]) < 5
+
+
+def test_stretch_and_brightness_make_faint_light_brighter_and_arrows_stay_the_slider_s(page: Any) -> None:
+    dark, before = brightness(page), angles(page)
+    frame = source(page)
+    page.get_by_label("Brightness").locator("[tabindex]").focus()
+    page.keyboard.press("ArrowRight")
+    changed(page, frame)
+    brighter = brightness(page)
+    assert brighter > 1.05 * dark
+    chosen(page, "Stretch", "logarithm")
+    assert come(lambda: brightness(page) > 1.05 * brighter)
+    chosen(page, "Stretch", "square root")
+    page.get_by_label("Brightness").locator("[tabindex]").focus()
+    page.keyboard.press("ArrowLeft")
+    assert come(lambda: abs(brightness(page) - dark) < 0.02 * dark)
+    np.testing.assert_array_equal(angles(page), before)
+
+
+def test_tab_reaches_every_control_and_shows_where_it_is(page: Any) -> None:
+    onto_the_page(page)
+    unseen, reached = picture(page), []
+    for _ in range(18):
+        page.keyboard.press("Tab")
+        name, *box = page.evaluate(FOCUSED)
+        assert come(partial(differs, page, unseen, box)), name
+        reached.append(name)
+    wanted = [
+        "Scene",
+        "identify",
+        "Export",
+        "truth",
+        "Stretch",
+        "Brightness",
+        "angle 1",
+        "detector F6",
+        "solver",
+    ]
+    assert [name for name in reached if name in wanted] == wanted
+    onto_the_page(page)
+
+
+def test_typing_and_help_hold_the_camera_still(page: Any) -> None:
+    frame, field = source(page), page.get_by_label("angle 1")
+    before = field.input_value()
+    field.fill("")
+    page.keyboard.type("e1r2")
+    page.keyboard.press("ArrowUp")
+    assert field.input_value() == "e1r2"
+    page.keyboard.press("Enter")
+    page.get_by_text("an angle is not a number").first.wait_for()
+    field.fill(before)
+    onto_the_page(page)
+    page.keyboard.press("F1")
+    page.get_by_role("dialog").wait_for()
+    page.keyboard.press("ArrowUp")
+    page.keyboard.press("Escape")
+    page.get_by_role("dialog").wait_for(state="detached")
+    assert source(page) == frame
+    page.keyboard.press("1")
+    changed(page, frame)
+
+
+def test_another_identifier_by_f7_and_the_keys_are_the_camera_s_again(page: Any) -> None:
     page.keyboard.press("F7")
-    page.get_by_role("option", name="pyramid").click()
-    page.get_by_role("tab", name="Log").click()
+    page.get_by_role("option", name="pyramid").wait_for()
+    page.keyboard.press("ArrowDown")
+    page.keyboard.press("Enter")
+    page.get_by_role("listbox").wait_for(state="detached")
+    assert page.get_by_role("combobox", name="identifier F7").input_value() == "pyramid"
+    status(page, "solved")
+    frame = source(page)
+    page.keyboard.press("1")
+    changed(page, frame)
+    panel(page, "Log")
     page.get_by_text("opened shefex2 with tracker.identifier").wait_for()
-    assert status(page, "solved")
+
+
+def test_f8_sets_the_field_and_an_arrow_goes_a_fiftieth_of_it(page: Any) -> None:
+    page.keyboard.press("F8")
+    page.locator("input[aria-label='runs, F8']:focus").wait_for()
+    set_to(page, "field, °", "8")
+    onto_the_page(page)
+    before, frame = angles(page), source(page)
+    page.keyboard.press("ArrowUp")
+    changed(page, frame)
+    (ra, dec, _), (ra_before, dec_before, _) = np.radians(angles(page)), np.radians(before)
+    cosine = np.sin(dec) * np.sin(dec_before) + np.cos(dec) * np.cos(dec_before) * np.cos(ra - ra_before)
+    np.testing.assert_allclose(np.degrees(np.arccos(cosine)), 8 / 50, rtol=2e-3, atol=0)
+    set_to(page, "field, °", "14.868")
 
 
 def test_monte_carlo_of_200_by_2(page: Any) -> None:
@@ -239,28 +261,76 @@ def test_monte_carlo_of_200_by_2(page: Any) -> None:
     assert float(re.search(r"identified\s+([\d.]+)", told)[1]) > 0.9
     with page.expect_popup() as opens:
         page.locator("a[href^='/report/']").first.click()
-    assert "Monte Carlo of" in opens.value.title()
+    opens.value.wait_for_function("() => document.title.startsWith('Monte Carlo of')")
     opens.value.close()
 
 
-def test_a_dropped_picture_is_solved_and_one_without_stars_refused(page: Any, tmp_path: Path) -> None:
+def test_a_dropped_picture_is_solved_shown_or_refused(page: Any, tmp_path: Path) -> None:
     before = angles(page)
-    page.get_by_role("tab", name="Image").click()
+    panel(page, "Image")
+    photo = cv2.imread(str(ROOT / "docs" / "sky.jpg"), cv2.IMREAD_GRAYSCALE)
     page.set_input_files("input[type=file]", ROOT / "docs" / "sky.jpg")
     page.get_by_text("sky.jpg: solved").wait_for()
     assert page.get_by_label("angle 1").input_value() == ""  # nobody knows where it was taken
-    noise = tmp_path / "noise.png"
+    page.mouse.click(*screen(page, photo.shape[::-1], 600, 400))
+    for x, y, dn in pixels(page):  # the picture's, not the scene's
+        assert abs(dn - int(photo[y, x])) <= 2
+    noise, broken, program, large = (
+        tmp_path / f"{name}" for name in ("noise.png", "broken.png", "a.exe", "large.png")
+    )
     cv2.imwrite(str(noise), np.random.default_rng(1).integers(90, 110, (480, 640), dtype=np.uint8))
     page.set_input_files("input[type=file]", noise)
     page.get_by_text(re.compile(r"noise\.png: (?!solved|solving)")).wait_for()
-    broken = tmp_path / "broken.png"
     broken.write_bytes(b"\x89PNG\r\n\x1a\n" + bytes(100))
-    page.set_input_files("input[type=file]", broken)
-    page.get_by_text("cannot be decoded").first.wait_for()
+    program.write_bytes(b"MZ")
+    with large.open("wb") as file:
+        file.truncate(65 * 2**20)
+    for path, why in (
+        (broken, "cannot be decoded"),
+        (program, "not taken"),
+        (broken, "cannot be decoded"),
+        (large, "not taken"),
+    ):
+        page.set_input_files("input[type=file]", path)
+        page.get_by_role("status").filter(has_text=why).wait_for()
+    identified(page)
+    np.testing.assert_array_equal(angles(page), before)
+
+
+def identified(page: Any) -> None:
+    """The scene is shown again."""
+    onto_the_page(page)
     frame = source(page)
     page.keyboard.press("1")
     changed(page, frame)
-    np.testing.assert_array_equal(angles(page), before)
+
+
+def rolled(page: Any, name: str) -> float:
+    """The roll that a picture was solved to."""
+    facts = page.locator(".lab-panels .mono", has_text=re.compile(rf"^{name}: solved")).last.inner_text()
+    return float(re.search(r"roll ([\d.]+)", facts)[1])
+
+
+def test_a_live_camera_is_followed_to_its_end(page: Any, tmp_path: Path) -> None:
+    photo = cv2.imread(str(ROOT / "docs" / "sky.jpg"))
+    high, wide = photo.shape[:2]
+    video = cv2.VideoWriter(str(tmp_path / "clip.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 5, (wide, high))
+    for turn_deg in (0, 10):
+        turn = cv2.getRotationMatrix2D((wide / 2, high / 2), turn_deg, 1)
+        video.write(cv2.warpAffine(photo, turn, (wide, high)))
+    video.release()
+    panel(page, "Image")
+    page.set_input_files("input[type=file]", ROOT / "docs" / "sky.jpg")
+    still = rolled(page, "sky.jpg")
+    page.get_by_label("live camera").fill(str(tmp_path / "clip.avi"))
+    page.get_by_role("button", name="Look").click()
+    page.get_by_role("status").filter(has_text="ends after 2 frames").wait_for()
+    turned = rolled(page, "camera")
+    np.testing.assert_allclose(
+        still - turned, 10, rtol=0, atol=0.05
+    )  # the last frame's; the sky turns the other way
+    page.get_by_role("button", name="Look").wait_for()
+    identified(page)
 
 
 def test_bad_input_is_refused_where_it_stands(page: Any) -> None:
@@ -272,49 +342,23 @@ def test_bad_input_is_refused_where_it_stands(page: Any) -> None:
     page.get_by_label("camera.focal_length", exact=True).fill("35 mmm")
     page.get_by_label("camera.focal_length", exact=True).press("Enter")
     page.get_by_text("'35 mmm' is not a length; allowed").wait_for()
-    page.get_by_label("camera.focal_length", exact=True).fill("50 mm")
-    frame = source(page)
-    page.get_by_label("camera.focal_length", exact=True).press("Enter")
-    changed(page, frame)
+    set_to(page, "camera.focal_length", "50 mm")
     page.get_by_placeholder("new-name").fill("../out")
     page.get_by_role("button", name="Save as").click()
     page.get_by_text("allowed: letters, digits").first.wait_for()
 
 
-def test_a_dome_is_flown_and_played(page: Any) -> None:
-    page.get_by_role("combobox", name="Scene").click()
-    page.get_by_role("option", name="simsat_slew").click()
-    page.get_by_text("SimSat slews on its reaction wheels").wait_for()
+def test_a_scene_is_saved_opened_again_and_not_overwritten(page: Any, server: Server) -> None:
+    panel(page, "Scene")
+    page.get_by_placeholder("find a key").fill("focal_length")
+    set_to(page, "camera.focal_length", "45 mm")
+    for told in ("saved as mine.yaml", "mine.yaml: is there already"):
+        page.get_by_placeholder("new-name").fill("mine")
+        page.get_by_role("button", name="Save as").click()
+        page.get_by_role("status").filter(has_text=told).wait_for()
+    assert scene.load(server.folder / "mine.yaml").camera.focal_length_m == 0.045
+    frame = source(page)
+    chosen(page, "Scene", "mine.yaml")
+    changed(page, frame)
+    assert page.get_by_label("camera.focal_length", exact=True).input_value() == "45 mm"
     status(page, "solved")
-    page.get_by_role("tab", name="Run").click()
-    page.get_by_role("button", name="Fly").click()
-    page.get_by_text(re.compile(r"^[1-9]\.\d\d s$")).wait_for()  # plays by itself
-    assert status(page, "solved")
-    page.get_by_role("button", name="Play").click()
-
-
-def test_two_tabs_do_not_disturb_one_another(page: Any, second: Any) -> None:
-    still = angles(page)
-    frame = source(second)
-    second.keyboard.press("Shift+ArrowDown")
-    changed(second, frame)
-    assert not np.allclose(angles(second), still, rtol=0, atol=0.1)
-    np.testing.assert_array_equal(angles(page), still)
-
-
-def test_closing_a_tab_ends_its_worker(page: Any, second: Any) -> None:
-    psutil = pytest.importorskip("psutil")
-
-    def come_to(count: int) -> int:
-        """How many workers the server has, once they are so many, else after a while."""
-        for _ in range(150):
-            children = psutil.Process(SERVER[0]).children(recursive=True)
-            found = sum("spawn_main" in " ".join(one.cmdline()) for one in children)
-            if found == count:
-                break
-            time.sleep(0.1)
-        return found
-
-    assert come_to(3) == 3  # two tabs, and one worker that waits for the next
-    second.close()
-    assert come_to(2) == 2

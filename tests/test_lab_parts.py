@@ -112,11 +112,11 @@ def test_fields_know_their_unit_and_their_choices() -> None:
 
 
 def test_the_loop_is_closed_by_something_else_whether_the_scene_has_a_word_or_a_section() -> None:
-    for name in ("afit_simsat", "simsat_bump"):
-        told = forms.looped(scene.load(name), "truth")
+    for name in ("afit_simsat", "simsat_bump", "simsat_slew"):
+        told = forms.looped(name, {}, "truth")
         assert scene.load(name, told).motion.control.feedback == "truth"
         assert scene.load(name, told).motion.control.law == scene.load(name).motion.control.law
-        assert scene.load(name, forms.looped(scene.load(name), "")).motion.control is None
+        assert scene.load(name, forms.looped(name, {}, "")).motion.control is None
 
 
 def test_a_scene_s_file_outside_its_folder_is_refused(tmp_path: Path) -> None:
@@ -358,4 +358,12 @@ def test_trials_that_were_wrong_or_refused_are_told_apart_from_solved_ones() -> 
         **{"trial": np.array([3, 5, 8]), "frames": np.array([1, 2, 1]), "solved": np.array([1, 1, 1])},
         **{"wrong": np.array([0, 0, 1]), "status": np.array(["solved", "no match", "solved"], dtype=object)},
     }
-    assert trials.unsolved(columns) == [(5, "no match"), (8, "wrong")]
+    assert trials.unsolved(columns) == [(8, "wrong"), (5, "no match")]
+
+
+@pytest.mark.parametrize("pedestal_dn", [0, 1000])
+def test_brighter_is_brighter_by_as_much_on_any_pedestal(pedestal_dn: int) -> None:
+    image = (pedestal_dn + np.arange(401)[None, :]).astype(np.uint16)
+    between = (pedestal_dn, pedestal_dn + 400.0)
+    grey, brighter = (greys.stretched(image, "linear", by, between) for by in (1.0, 2.0))
+    np.testing.assert_allclose(brighter, np.minimum(2.0 * grey, 255), rtol=0, atol=1)

@@ -59,11 +59,12 @@ def solve(
     """
     from skysim import io
     from skysim import solve as solving
+    from skysim.livecamera import grab
 
     stages = named(detector=detector, centroider=centroider, identifier=identifier, solver=solver)
     how = solving.make_solver(fov, camera, time_utc=moment(time), stages=stages)
     io.make_folder(out)
-    paths = [*(images or ()), *([kept(io.grab(live), out / "live.png")] if live is not None else ())]
+    paths = [*(images or ()), *([kept(grab(live), out / "live.png")] if live is not None else ())]
     if not paths:
         raise BadInput("give images, or --live CAMERA")
     pictures = io.unlike([out / f"{path.name}.solved.png" for path in paths])

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 
 from nicegui import ui
 
-from skysim.lab.look import LEFT
+from skysim.lab import keys
+from skysim.lab.look import digits
 from skysim.lab.views import Answer, Setting, View
 
 if TYPE_CHECKING:
@@ -51,7 +52,7 @@ class AttitudeCard:
         """One stage's algorithm."""
         label = f"{name} {ASIDE[name]}" if name in ASIDE else name
         field = ui.select([], label=label, on_change=partial(self.choose, name))
-        field.on("popup-hide", js_handler=LEFT)
+        field.on("popup-hide", js_handler=keys.LEAVE)
         return field.props("dense outlined options-dense").mark(name)
 
     def set(self, setting: Setting) -> None:
@@ -74,6 +75,7 @@ class AttitudeCard:
 
     async def point(self) -> None:
         """Look where the three fields say."""
+        self.tab.rest()
         self.tab.say("")
         try:
             angles = tuple(float(field.value) for field in self.inputs)
@@ -125,7 +127,7 @@ class AttitudeCard:
             self.errors[1].set_text(
                 "–" if math.isnan(answer.roll_arcsec) else f"roll {answer.roll_arcsec:+.1f}″"
             )
-            self.errors[2].set_text("–" if math.isnan(cross) else f"σ {cross:.3g}″ {roll:.3g}″")
+            self.errors[2].set_text("–" if math.isnan(cross) else f"σ {digits(cross)}″ {digits(roll)}″")
         ink, text = verdict(answer)
         self.status.set_text(text)
         self.status.classes(remove="good bad warn quiet", add=ink)

@@ -68,7 +68,7 @@ class Desk:
             scene.title,
             isinstance(scene.light, Stars),
             score.angle_names(scene),
-            "HIP" if not np.isnan(self.lab.sources.magnitude).all() else "LED",
+            prefix_of(self.lab),
             2 * math.degrees(math.atan(camera.width_px / 2 / camera.focal_px)),
             {name: getattr(settings, name) for name in STAGES},
             onboard.choices(scene),
@@ -94,6 +94,13 @@ class Desk:
         still = Trajectory.at_rest(self.lab_from_body, end_s)
         return self.shown(replace(self.lab, scene=scene, trajectory=still), solve)
 
+    @property
+    def answer(self) -> Answer | None:
+        """What the tracker made of the newest frame."""
+        if self.report is None or self.truth is None:
+            return None
+        return answered(self.lab, self.estimator, self.report, self.truth)
+
     def shown(self, lab: simulate.Lab, solve: bool) -> View:
         """Frame 0 of a lab, solved if that is asked for, as the page shows it."""
         clock = Clock()
@@ -110,9 +117,14 @@ class Desk:
             self.frame.exposure_s,
             greys.facts(self.frame.image_dn, self.frame.saturation_dn),
             lights_of(self.truth, self.magnitude),
-            answered(self.lab, self.estimator, self.report, self.truth) if self.report else None,
+            self.answer,
             1e3 * clock.seconds["all"],
         )
+
+
+def prefix_of(lab: simulate.Lab) -> str:
+    """What its lights' numbers are numbers of."""
+    return "LED" if np.isnan(lab.sources.magnitude).all() else "HIP"
 
 
 def lights_of(truth: Truth, magnitude: Mapping[int, float]) -> tuple[Light, ...]:
@@ -126,7 +138,7 @@ def lights_of(truth: Truth, magnitude: Mapping[int, float]) -> tuple[Light, ...]
 
 
 def magnitudes(lab: simulate.Lab) -> dict[int, float]:
-    """Of a lab's lights, by their numbers."""
+    """By a light's number its V magnitude, NaN of an LED."""
     return dict(zip(lab.sources.id.tolist(), lab.sources.magnitude.tolist(), strict=True))
 
 

@@ -12,8 +12,9 @@ import numpy as np
 import yaml
 
 from skysim import io
-from skysim.lab.desk import Desk, answered
+from skysim.lab.desk import Desk
 from skysim.report import annotate
+from skysim.scene import SCENES, find
 from skysim.types import BadInput
 from skysim.yamlfile import VERSION, put
 
@@ -39,14 +40,13 @@ def files(desk: Desk, base: str, overrides: dict[str, str]) -> dict[str, bytes]:
             for path in sorted(Path(folder).iterdir())
         }
     found["figure.png"] = figure(desk)
-    if desk.report:
-        answer = answered(desk.lab, desk.estimator, desk.report, desk.truth)
+    if answer := desk.answer:
         told = {
             name: getattr(answer, name) for name in answer.__slots__ if name not in ("spots", "windows_px")
         }
         told["spots"] = [{name: getattr(spot, name) for name in spot.__slots__} for spot in answer.spots]
         found["solution.json"] = io.to_json(told).encode()
-    found["scene.yaml"] = scene_yaml(base, overrides).encode()
+    found["scene.yaml"] = scene_yaml(base_of(base), overrides).encode()
     return found
 
 
@@ -60,6 +60,14 @@ def figure(desk: Desk) -> bytes:
     matched_px = xy_px[match.observed] if match else empty
     drawn = annotate(desk.frame.image_dn, xy_px, matched_px, truth_px=desk.truth.seen.xy_px)
     return bytes(cv2.imencode(".png", drawn)[1])
+
+
+def base_of(scene: str, folder: Path | None = None) -> str:
+    """A scene as a file in a folder names it for its base: one that skysim has by its name, else by its path."""
+    path = find(scene).resolve()
+    if path.parent == SCENES.resolve():
+        return path.stem
+    return path.name if path.parent == folder else str(path)
 
 
 def scene_yaml(base: str, overrides: dict[str, str], title: str = "") -> str:

@@ -10,9 +10,11 @@ from typing import Any, Literal, NamedTuple, get_args, get_origin
 import yaml
 from pydantic import BaseModel
 
+from skysim.motion import spelt_out
 from skysim.quantity import SI_SUFFIX
 from skysim.scene import FILES, SCENES, STEM, Scene, find, load, read
 from skysim.types import BadInput
+from skysim.yamlfile import put, read_yaml
 
 UNITS = {
     **{
@@ -166,6 +168,15 @@ def checked(name: str, overrides: Mapping[str, str]) -> Scene:
     return scene
 
 
+def is_scene(path: Path) -> bool:
+    """Whether a YAML file looks like a scene of its own or one that changes another."""
+    try:
+        tree, _ = read_yaml(path)
+    except BadInput:
+        return False
+    return "factors" not in tree and not {"base", "camera"}.isdisjoint(tree)
+
+
 LOOPS = {
     "truth": "closed by the truth",
     "imu": "closed by the IMU",
@@ -174,18 +185,21 @@ LOOPS = {
 }
 
 
-def looped(scene: Scene, feedback: str) -> dict[str, str]:
+def looped(name: str, overrides: Mapping[str, str], feedback: str) -> dict[str, str]:
     """What closes the loop of a scene that has a controller by something else; `` opens it: nobody steers."""
-    if not feedback or scene.motion.control is None:
+    tree = read(find(name))[0]
+    for key, value in overrides.items():
+        put(tree, key, value)
+    control = spelt_out(tree.get("motion", {}).get("control"))
+    if not feedback or control is None:
         return {"motion.control": "null", "motion.manoeuvre": "[]"}
-    told = scene.motion.control.model_dump(mode="json", by_alias=True, exclude_defaults=True)
-    return {"motion.control": in_yaml(told | {"feedback": feedback})}
+    return {"motion.control": in_yaml(control | {"feedback": feedback})}
 
 
 def save(folder: Path, name: str, base: str, overrides: Mapping[str, str], title: str) -> Path:
     """A new scene file in a folder: the base's keys but for those changed. Raises BadInput; overwrites nothing."""
     from skysim import io
-    from skysim.lab.export import scene_yaml
+    from skysim.lab.export import base_of, scene_yaml
 
     if not re.fullmatch(r"[A-Za-z0-9][\w-]{0,60}", name):
         raise BadInput(f"{name!r}: allowed: letters, digits, _ and -")
@@ -193,5 +207,5 @@ def save(folder: Path, name: str, base: str, overrides: Mapping[str, str], title
     if path.exists():
         raise BadInput(f"{path.name}: is there already; allowed: another name")
     checked(base, overrides)
-    io.write_text(path, scene_yaml(base, dict(overrides), title))
+    io.write_text(path, scene_yaml(base_of(base, folder), dict(overrides), title))
     return path

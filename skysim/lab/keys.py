@@ -38,6 +38,11 @@ KEYS = (
 )
 ACTION = {key: one.action for one in KEYS for key in one.keys}
 
+# What was chosen from, a list or a tab, would else go on to take the keys.
+LEAVE = (
+    "() => document.activeElement.closest('.q-select__focus-target, .q-tab') && document.activeElement.blur()"
+)
+
 # The browser has uses of its own for these; while no field is being typed in, the page has them. F keys and Esc leave a
 # field first (before the page's own listener, which hears nothing from a field).
 TAKEN = """

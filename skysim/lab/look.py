@@ -12,7 +12,11 @@ TOOLTIP = {
     "textStyle": {"color": INK["text"], "fontSize": 11},
 }
 
-LEFT = "() => document.activeElement.blur()"  # the arrow keys are the page's again
+
+def digits(value: float) -> str:
+    """Three of them, and never an exponent."""
+    return f"{value:.0f}" if value >= 100 else f"{value:.3g}"
+
 
 CSS = f"""
 :root {{ --nicegui-default-padding: 0; --nicegui-default-gap: 0 }}
@@ -47,7 +51,7 @@ body {{ background: {INK["ground"]} !important; color: {INK["text"]}; font: 13px
   justify-content: center }}
 .lab-run {{ display: flex; flex-direction: column; gap: 2px }}
 .lab-run .lab-strips {{ flex: 1 1 0; margin-top: 8px; min-height: 380px }}
-.lab-log {{ white-space: pre-wrap; overflow-wrap: anywhere }}
+.mono.lab-log {{ white-space: pre-wrap; overflow-wrap: anywhere }}
 .q-uploader__subtitle {{ display: none }} .q-uploader__title {{ font-size: 13px; font-weight: 500 }}
 .lab-turn {{ position: absolute; left: 24px; bottom: 16px; font-size: 11px; pointer-events: none }}
 .stale {{ opacity: .45 }}
@@ -87,6 +91,6 @@ body {{ background: {INK["ground"]} !important; color: {INK["text"]}; font: 13px
 .q-tab {{ min-height: 34px; padding: 0 12px; text-transform: none }} .q-tabs {{ min-height: 34px }}
 .q-btn {{ text-transform: none }} .q-btn .q-btn__content {{ font-size: 12px; line-height: 1.5 }}
 .lab-sections .q-item {{ padding: 2px 0 }}
-:focus-visible {{ outline: 2px solid {INK["accent"]}; outline-offset: 1px }}
+.q-field--borderless.q-field--focused, :focus-visible {{ outline: 2px solid {INK["accent"]}; outline-offset: 1px }}
 .empty {{ color: {INK["quiet"]}; padding: 28px 8px; text-align: center; line-height: 1.6 }}
 """

@@ -14,7 +14,7 @@ from nicegui import ui
 from nicegui.events import KeyEventArguments
 
 from skysim import BadInput
-from skysim.lab import export, keys, look, pose
+from skysim.lab import export, forms, keys, look, pose
 from skysim.lab.attitude import AttitudeCard
 from skysim.lab.photopanel import PhotoPanel
 from skysim.lab.runpanel import RunPanel
@@ -89,14 +89,11 @@ class Tab:
         """Title, scene, what is going on, export."""
         with ui.element("div").classes("lab-head"):
             ui.label("skysim lab").classes("lab-name")
-            names = {path.stem: path.stem for path in sorted(SCENES.glob("*.yaml"))} | {
-                self.scene: self.scene
-            }
-            self.picker = ui.select(names, value=self.scene, on_change=lambda event: self.open(event.value))
+            self.picker = ui.select(self.scenes(), value=self.scene, on_change=self.pick)
             self.picker.props('dense borderless options-dense aria-label="Scene"').classes("w-44").mark(
                 "scene"
             )
-            self.picker.on("popup-hide", js_handler=look.LEFT)
+            self.picker.on("popup-hide", js_handler=keys.LEAVE)
             self.title = ui.label().classes("lab-title quiet ellipsis")
             self.message = ui.label().classes("lab-said").props('role="status"').mark("message")
             self.busy = ui.spinner(size="16px").classes("lab-busy").mark("busy")
@@ -108,6 +105,15 @@ class Tab:
                     item = ui.menu_item(name, on_click=lambda name=name: self.export(name))
                     item.props("dense").style("white-space: nowrap")
 
+    def scenes(self) -> dict[str, str]:
+        """What can be opened, and how it is shown: scenes that skysim has, those saved here, the one at hand."""
+        own = [path for path in sorted(self.folder.glob("*.yaml")) if forms.is_scene(path)]
+        return (
+            {path.stem: path.stem for path in sorted(SCENES.glob("*.yaml"))}
+            | {str(path): path.name for path in own}
+            | {self.scene: Path(self.scene).name}
+        )
+
     def side(self) -> None:
         """The panels beneath the attitude."""
         with ui.element("div").style(
@@ -115,7 +121,7 @@ class Tab:
         ):
             with ui.tabs().props("dense align=left no-caps indicator-color=primary") as self.tabs:
                 # Else the arrow keys would go on to choose tabs.
-                self.tabs.on("click", js_handler=look.LEFT)
+                self.tabs.on("click", js_handler=keys.LEAVE)
                 for name in PANELS:
                     ui.tab(name).mark(f"tab-{name}")
             with ui.tab_panels(self.tabs, value="Lab", animated=False, keep_alive=True).classes("lab-panels"):
@@ -152,16 +158,25 @@ class Tab:
 
     # What happens.
 
+    async def pick(self) -> None:
+        """Another scene, from the list."""
+        if self.picker.value != self.scene:
+            await self.open(str(self.picker.value))
+
     async def open(self, scene: str, overrides: Mapping[str, str] | None = None) -> None:
         """Set a scene up and look."""
+        self.rest()
         before = self.scene, self.overrides
         self.scene, self.overrides = scene, dict(overrides or {})
-        doing = f"setting up {scene} …" if self.view else ""  # the first says so in the frame's place
+        doing = (
+            f"setting up {Path(scene).name} …" if self.view else ""
+        )  # the first says so in the frame's place
         answer = await self.ask("open", self.scene_path, self.overrides, self.solving, doing=doing)
         if answer is None:
             self.scene, self.overrides = before
+            self.picker.set_value(self.scene)
             if self.view is None:
-                self.sensor.waiting(f"{scene} could not be set up:", self.said)
+                self.sensor.waiting(f"{Path(scene).name} could not be set up:", self.said)
             return
         self.setting, view = answer
         self.feedback = await self.fed_back()
@@ -174,7 +189,9 @@ class Tab:
         self.trials.set()
         self.display(view)
         await self.form.set()
-        self.log(f"opened {scene}" + (f" with {', '.join(self.overrides)}" if self.overrides else ""))
+        self.log(
+            f"opened {Path(scene).name}" + (f" with {', '.join(self.overrides)}" if self.overrides else "")
+        )
 
     async def change(self, keys_: Mapping[str, str]) -> None:
         """Other values for some keys of the scene."""
@@ -215,6 +232,11 @@ class Tab:
         self.attitude.show(view)
         self.space.show(view)
 
+    def rest(self) -> None:
+        """What plays or looks by itself ends: the picture is wanted for something else."""
+        self.flight.pause()
+        self.photo.stop()
+
     async def ask(self, task: str, *arguments: Any, doing: str = "") -> Any:
         """What the session answers; None where it went wrong, which is said. Until then: what is being done."""
         self.say(doing, "quiet")
@@ -222,18 +244,20 @@ class Tab:
         try:
             return await self.wait(self.session.ask(task, *arguments))
         finally:
-            self.busy.set_visibility(False)
-            if doing and self.said == doing:
-                self.say("")
+            if self.open_still:
+                self.busy.set_visibility(False)
+                if doing and self.said == doing:
+                    self.say("")
 
     async def wait(self, asked: Awaitable[Any]) -> Any:
         """An answer; what is wrong is said in one line."""
         try:
             answer = await asked
         except (BadInput, Gone) as error:
-            self.say(str(error))
+            if self.open_still:
+                self.say(str(error))
             return None
-        return answer
+        return answer if self.open_still else None
 
     def say(self, text: str, ink: str = "warn") -> None:
         """A message at the top, until the next action: what is wrong, what went well or what is being done."""
@@ -262,7 +286,7 @@ class Tab:
             return
         name = export.KINDS[kind]
         if not name:
-            ui.download(export.packed(found), f"{self.scene}.zip")
+            ui.download(export.packed(found), f"{Path(self.scene).stem}.zip")
         elif name in found:
             ui.download(found[name], name)
         else:
@@ -276,6 +300,8 @@ class Tab:
         action = keys.ACTION.get(name)
         if not event.action.keydown or action is None or event.modifiers.ctrl or event.modifiers.meta:
             return
+        if self.help.value and action not in ("help", "close"):
+            return
         if action == "move":
             right, up, turn = keys.MOVES[name]
             step = pose.COARSE if event.modifiers.shift else pose.FINE
@@ -286,7 +312,7 @@ class Tab:
 
     async def move(self, right: float, up: float, roll_deg: float) -> None:
         """Move by this; what keys ask for while a frame is made is added up for the next."""
-        self.flight.playing = False
+        self.rest()
         self.say("")
         self.steps += (right, up, roll_deg)
         if self.moving:
@@ -304,6 +330,7 @@ class Tab:
         """What the other keys do."""
         self.say("")
         if action == "identify":
+            self.rest()
             await self.show(self.session.ask("look", True))
             self.log(
                 f"identify: {self.view.answer.status if self.view and self.view.answer else 'no answer'}"

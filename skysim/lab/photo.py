@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import tempfile
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 
 from estimator.detect import check_size
 from skysim import greys, io, score, solve
-from skysim.lab.desk import answered, lights_of, magnitudes, named, spots_of
+from skysim.lab.desk import answered, lights_of, magnitudes, named, prefix_of, spots_of
 from skysim.lab.views import Answer, Light, Triple
+from skysim.livecamera import LiveCamera
 from skysim.study import plan, replay, store
 from skysim.study.benches import bench
 from skysim.study.commands import STORE
@@ -30,7 +31,8 @@ WIDEST_PX = 1400  # as the browser gets it
 class Photo:
     """A picture that is not the scene's at hand, and its answer; size_px is its own, jpeg what the page shows.
 
-    names, true_deg : of its three angles, and what they truly are;  lights : what truly shone: of a study's trial
+    names, true_deg : of its three angles, and what they truly are
+    lights, prefix : what truly shone, of a study's trial, and what lights' numbers are numbers of
     """
 
     size_px: tuple[int, int]
@@ -41,6 +43,7 @@ class Photo:
     names: tuple[str, str, str] = ("RA", "Dec", "roll")
     true_deg: Triple | None = None
     lights: tuple[Light, ...] = ()
+    prefix: str = "HIP"
 
 
 Seen = tuple[Photo, NDArray]  # with the picture's pixels
@@ -61,9 +64,9 @@ def of_file(name: str, data: bytes, fov_deg: float | None, stages: dict[str, str
     return solved(image, fov_deg, stages, taken)
 
 
-def of_camera(source: str, fov_deg: float | None, stages: dict[str, str]) -> Seen:
-    """One frame of a live camera. Raises BadInput."""
-    return solved(io.monochrome(io.grab(source)), fov_deg, stages, None)
+def of_camera(camera: LiveCamera, fov_deg: float | None, stages: dict[str, str]) -> Seen:
+    """The next frame of a live camera. Raises BadInput."""
+    return solved(io.monochrome(camera.frame()), fov_deg, stages, None)
 
 
 def of_trial(study: str, folder: Path, trial: int) -> Seen:
@@ -76,7 +79,7 @@ def of_trial(study: str, folder: Path, trial: int) -> Seen:
     frame, truth, report = next(replay.seen(ready, row.seed))
     answer = answered(ready.lab, ready.estimator, report, truth)
     if row.error:
-        answer = replace(answer, status=row.error.strip().splitlines()[-1])
+        answer = Answer(row.error.strip().splitlines()[-1], answer.spots, answer.ms)
     scene, (height, width) = ready.lab.scene, frame.image_dn.shape
     told = Photo(
         (width, height),
@@ -86,6 +89,7 @@ def of_trial(study: str, folder: Path, trial: int) -> Seen:
         names=score.angle_names(scene),
         true_deg=score.angles_deg(truth.cam_from_lab, scene, ready.lab.mount),
         lights=lights_of(truth, magnitudes(ready.lab)),
+        prefix=prefix_of(ready.lab),
     )
     return told, frame.image_dn
 

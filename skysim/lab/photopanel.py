@@ -6,10 +6,11 @@ from typing import TYPE_CHECKING, Any
 
 from nicegui import ui
 
-from skysim.lab.photo import SUFFIXES, Photo
+from skysim.lab.photo import SUFFIXES
 
 if TYPE_CHECKING:
     from skysim.lab.page import Tab
+    from skysim.lab.photo import Photo
 
 LIMIT_BYTES = 64 * 2**20
 
@@ -55,23 +56,38 @@ class PhotoPanel:
         if len(data) > LIMIT_BYTES:
             self.tab.say(f"{name}: larger than 64 MB")
             return
+        self.tab.rest()
         self.say(f"solving {name} …", "quiet")
         self.show(
             name, await self.tab.ask("solve_file", name, data, self.fov.value, {}, doing=f"solving {name} …")
         )
 
+    def stop(self) -> None:
+        """No more of a live camera, once the frame at hand is done."""
+        if self.live:
+            self.live = False
+            self.button.disable()
+
     async def watch(self) -> None:
         """Frame after frame of a live camera, until pressed again."""
         if self.live:
-            self.live = False
+            self.stop()
             return
-        self.live = True
+        self.tab.rest()
+        self.live, seen, source = True, 0, (self.source.value or "0").strip()
         self.button.set_text("Stop")
-        while self.live and self.tab.open_still:
-            photo = await self.tab.ask("solve_camera", (self.source.value or "0").strip(), self.fov.value, {})
-            self.show("camera", photo)
+        while self.live:
+            photo = await self.tab.ask("solve_camera", source, self.fov.value, {})
+            if not self.tab.open_still:
+                return
+            if photo or not seen:  # what ends keeps its last answer
+                self.show("camera", photo)
+            seen += 1
             self.live = self.live and photo is not None
+        self.button.disable()
+        await self.tab.wait(self.tab.session.ask("release"))
         self.button.set_text("Look")
+        self.button.enable()
 
     def show(self, name: str, photo: Photo | None) -> None:
         """The picture with its marks, and the numbers."""

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 from nicegui import ui
 
+from skysim.lab import keys
 from skysim.lab.forms import LOOPS, looped
 from skysim.lab.look import CURVES, INK, TOOLTIP
 from skysim.lab.views import FlightLog, View
-from skysim.scene import load
 
 if TYPE_CHECKING:
     from skysim.lab.page import Tab
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 SPEEDS = {"real time": 1.0, "½": 0.5, "¼": 0.25, "1/10": 0.1, "2×": 2.0, "5×": 5.0}
 STRIPS = ("error, arcsec", "lights", "innovation, arcsec", "momentum, N m s")
 LOGARITHMIC = (0, 2)
+STEERED = ("motion.control", "motion.manoeuvre")
 OFF = ("off what was asked", "IMU alone", "filter", "star tracker")
 
 
@@ -29,7 +30,9 @@ class RunPanel:
         self.tab, self.log = tab, FlightLog(())
         self.playing, self.flying, self.busy = False, False, False
         self.begun_s = self.from_s = 0.0
+        self.factor = 1.0
         self.came: dict[str, list[list[float]]] = {}
+        self.held, self.of, self.closed = False, "", dict[str, str]()
         with ui.row().classes("w-full no-wrap items-center gap-2"):
             self.fly = ui.button("Fly", on_click=self.begin).props("dense outline size=sm").mark("fly")
             self.play = ui.button(icon="play_arrow", on_click=self.toggle).props(
@@ -39,42 +42,54 @@ class RunPanel:
             self.speed = ui.select(list(SPEEDS), value="real time").props(
                 'dense borderless aria-label="Speed"'
             )
-            self.speed.classes("w-24").on_value_change(self.resync)
+            self.speed.classes("w-24").on("popup-hide", js_handler=keys.LEAVE).on_value_change(self.resync)
             self.loop = ui.select({}, on_change=self.close_loop).props("dense borderless options-dense")
-            self.loop.props('aria-label="Feedback"').mark("feedback")
+            self.loop.props('aria-label="Feedback"').mark("feedback").on("popup-hide", js_handler=keys.LEAVE)
             ui.space()
             self.clock = ui.label("0.00 s").classes("mono")
         self.bar = ui.linear_progress(0, show_value=False, size="3px").props("instant-feedback")
         self.seek = ui.slider(min=0, max=1, step=0.01, value=0).props('dense aria-label="Time"')
-        self.seek.on("change", self.sought)
+        self.seek.on("change", self.sought).on("pan", self.hold)
         self.seek.disable()
         self.chart = ui.echart(options()).classes("lab-strips w-full").mark("strips")
         ui.timer(1 / 30, self.tick)
 
     def set(self) -> None:
         """Another scene: nothing is flown yet."""
-        self.playing = False
+        self.pause()
         self.log, self.came, self.from_s = FlightLog(()), {}, 0.0
         self.play.disable()
         self.seek.disable()
         self.seek.set_value(0)
         self.clock.set_text("0.00 s")
         told = self.tab.feedback
-        self.loop.set_options(LOOPS if told else {"": LOOPS[""]}, value=told or "")
+        if told:
+            self.of, self.closed = self.tab.scene, dict(self.tab.overrides)
+        self.loop.set_options(LOOPS if self.of == self.tab.scene else {"": LOOPS[""]}, value=told or "")
         self.draw()
 
     async def close_loop(self) -> None:
-        """Another feedback is another scene."""
-        if self.tab.feedback and self.loop.value != self.tab.feedback:
-            scene = load(self.tab.scene_path, self.tab.overrides)
-            await self.tab.change(looped(scene, self.loop.value))
+        """Another feedback is another scene. Who opens the loop can close it again, as it was steered before."""
+        now, wanted = self.tab.feedback or "", str(self.loop.value or "")
+        if self.of != self.tab.scene or wanted == now:
+            return
+        kept = {key: told for key, told in self.tab.overrides.items() if not key.startswith(STEERED)}
+        steered = {key: told for key, told in self.closed.items() if key.startswith(STEERED)}
+        control = looped(self.tab.scene_path, {**kept, **steered}, wanted)
+        flown = {key: told for key, told in steered.items() if key.startswith(STEERED[1]) and wanted}
+        self.loop.disable()  # one after the other
+        await self.tab.open(self.tab.scene, {**kept, **flown, **control})
+        if self.tab.open_still:
+            self.loop.set_value(self.tab.feedback or "")  # where that was refused
+            self.loop.enable()
 
     async def begin(self) -> None:
         """Fly from the start, or stop flying."""
         if self.flying:
             self.tab.session.halt()
             return
-        self.flying, self.playing = True, False
+        self.pause()
+        self.flying = True
         self.fly.set_text("Stop")
         log = await self.tab.ask("fly", doing="flying …")
         self.flying = False
@@ -93,18 +108,23 @@ class RunPanel:
 
     def start(self) -> None:
         """Play on."""
+        self.tab.photo.stop()
         self.playing, self.begun_s = True, time.monotonic()
         self.play.props("icon=pause")
 
     def toggle(self) -> None:
         """Play or pause."""
         if self.playing:
-            self.from_s, self.playing = self.now_s, False
-            self.play.props("icon=play_arrow")
+            self.pause()
             return
         if self.log.t_s and self.from_s >= self.log.t_s[-1] - 0.05:
             self.from_s, self.came = 0.0, {}
         self.start()
+
+    def pause(self) -> None:
+        """Stay at this moment."""
+        self.from_s, self.playing = self.now_s, False
+        self.play.props("icon=play_arrow")
 
     @property
     def now_s(self) -> float:
@@ -112,22 +132,22 @@ class RunPanel:
         since = (time.monotonic() - self.begun_s) * self.factor if self.playing else 0.0
         return min(self.from_s + since, self.log.t_s[-1] if self.log.t_s else 0.0)
 
-    @property
-    def factor(self) -> float:
-        return SPEEDS[str(self.speed.value)]
-
-    def resync(self, event: Any) -> None:
+    def resync(self) -> None:
         """Another speed from here on."""
         if self.playing:
-            since = (time.monotonic() - self.begun_s) * SPEEDS[str(event.previous_value)]
-            self.from_s, self.begun_s = self.from_s + since, time.monotonic()
+            self.from_s, self.begun_s = self.now_s, time.monotonic()
+        self.factor = SPEEDS[str(self.speed.value)]
 
     async def sought(self, event: Any) -> None:
         """Jump there."""
         if not self.log.t_s:
             return
-        self.from_s, self.begun_s = float(self.seek.value), time.monotonic()
+        self.from_s, self.begun_s = float(event.args), time.monotonic()
         await self.moment()
+
+    def hold(self, event: Any) -> None:
+        """While the slider is in somebody's hand the play does not move it."""
+        self.held = event.args == "start"
 
     async def tick(self) -> None:
         """The next moment, if the one before is on the screen."""
@@ -136,8 +156,7 @@ class RunPanel:
         if self.playing and not self.busy:
             await self.moment()
             if self.log.t_s and self.now_s >= self.log.t_s[-1]:
-                self.from_s, self.playing = self.log.t_s[-1], False
-                self.play.props("icon=play_arrow")
+                self.pause()
 
     async def moment(self) -> None:
         """Show the flight as it is now."""
@@ -146,7 +165,8 @@ class RunPanel:
             now_s = self.now_s
             view = await self.tab.show(self.tab.session.ask("play", now_s, self.tab.solving))
             if view is not None:
-                self.seek.set_value(round(now_s, 2))
+                if not self.held:
+                    self.seek.set_value(round(now_s, 2))
                 self.clock.set_text(f"{view.t_s:.2f} s")
                 self.gather(view)
             await self.tab.sensor.ready()

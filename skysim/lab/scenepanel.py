@@ -155,7 +155,8 @@ class ScenePanel:
     async def save(self) -> None:
         """A new file beside where the server was begun."""
         name = (self.name.value or "").strip()
-        title = f"{self.tab.setting.title}, changed" if self.tab.setting else name
+        known = self.tab.setting.title.removesuffix(", changed") if self.tab.setting else ""
+        title = f"{known}, changed" if known else name
         try:
             path = await run.io_bound(
                 forms.save, self.tab.folder, name, self.tab.scene, dict(self.tab.overrides), title
@@ -164,6 +165,7 @@ class ScenePanel:
             self.tab.say(str(error))
             return
         self.tab.log(f"saved {path}")
+        self.tab.picker.set_options(self.tab.scenes())
         self.name.set_value("")
         self.tab.say(f"saved as {path.name}", "good")
 

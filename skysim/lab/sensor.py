@@ -5,12 +5,13 @@ from __future__ import annotations
 import asyncio
 import itertools
 import math
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from nicegui import ui
 
 from skysim import greys
-from skysim.lab import overlay
+from skysim.lab import keys, overlay
 from skysim.lab.starnames import NAMES
 from skysim.lab.views import Answer, Light, Setting, Spot, View
 
@@ -39,7 +40,7 @@ class Sensor:
         self.shown = {"truth", "identified", "false"}
         self.lights: tuple[Light, ...] = ()
         self.answer: Answer | None = None
-        self.size_px = (4, 3)
+        self.size_px, self.prefix = (4, 3), "HIP"
         self.facts = ""  # of the frame, told where the mouse is nowhere
         self.at: tuple[float, float] | None = None
         self.fresh = False  # what is enlarged is of the frame that is shown
@@ -58,7 +59,7 @@ class Sensor:
                 self.magnified = ui.html(sanitize=False).classes("quiet").mark("zoom")
                 self.hover = ui.label().classes("mono").mark("hover")
         self.canvas.set_visibility(False)
-        self.waiting(f"Setting up {tab.scene} …", FIRST)
+        self.waiting(f"Setting up {Path(tab.scene).name} …", FIRST)
         self.rest()
 
     def waiting(self, *lines: str) -> None:
@@ -75,6 +76,7 @@ class Sensor:
             ui.space()
             self.stretch = ui.select(STRETCHES, value=STRETCHES[0], on_change=self.restretch)
             self.stretch.props('dense borderless options-dense aria-label="Stretch"').classes("w-28")
+            self.stretch.on("popup-hide", js_handler=keys.LEAVE)
             self.bright = ui.slider(min=-2, max=4, step=0.25, value=0).props('dense aria-label="Brightness"')
             self.bright.classes("w-24").on("change", self.restretch)
 
@@ -126,13 +128,14 @@ class Sensor:
     def show(self, view: View) -> None:
         """A look at the scene."""
         self.lights, self.answer = view.lights, view.answer
+        self.prefix = self.tab.setting.prefix if self.tab.setting else "HIP"
         self.facts = facts(view.size_px, view.facts, view.answer, view, self.tab.setting)
         self.renewed()
         self.picture(view.jpeg, view.size_px)
 
     def show_photo(self, photo: Photo) -> None:
         """A picture of the user's, or a study's trial."""
-        self.lights, self.answer = photo.lights, photo.answer
+        self.lights, self.answer, self.prefix = photo.lights, photo.answer, photo.prefix
         self.facts = facts(photo.size_px, photo.facts, photo.answer)
         self.renewed()
         self.picture(photo.jpeg, photo.size_px)
@@ -168,8 +171,7 @@ class Sensor:
 
     def name(self, id: int) -> str:
         """A light by its name."""
-        prefix = self.tab.setting.prefix if self.tab.setting else "HIP"
-        return NAMES.get(id, f"HIP {id}") if prefix == "HIP" else f"{prefix} {id}"
+        return NAMES.get(id, f"HIP {id}") if self.prefix == "HIP" else f"{self.prefix} {id}"
 
     async def mouse(self, event: Any) -> None:
         """Tell what is under the mouse; a click enlarges it."""

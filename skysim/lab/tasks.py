@@ -14,6 +14,7 @@ from skysim.lab import export, photo
 from skysim.lab.desk import Desk, zoomed
 from skysim.lab.flight import Flown
 from skysim.lab.views import FlightLog, Setting, Triple, View, Zoom
+from skysim.livecamera import LiveCamera
 from skysim.types import BadInput
 
 Watch = Callable[[float, float], None]
@@ -24,6 +25,7 @@ class Kept:
     """Between tasks: the desk, the flight that was flown on it, and the user's picture while the page shows one.
 
     watch : tells how far a long task is; raises Stopped where it is to end
+    image : (H, W) of that picture;  camera : a live one that is open
     """
 
     watch: Watch
@@ -32,6 +34,7 @@ class Kept:
     image: NDArray | None = None
     scene: str = ""
     overrides: Mapping[str, str] | None = None
+    camera: LiveCamera | None = None
 
     def ready(self) -> Desk:
         """The desk, once a scene is set up."""
@@ -39,12 +42,12 @@ class Kept:
             raise BadInput("no scene is set up")
         return self.desk
 
-    def look(self, solve: bool) -> View:
-        """A look at the scene: the user's picture is put away."""
+    def seen(self, view: View) -> View:
+        """The page shows the scene: the user's picture is put away."""
         self.image = None
-        return self.ready().look(solve)
+        return view
 
-    def shown(self, seen: photo.Seen) -> photo.Photo:
+    def pictured(self, seen: photo.Seen) -> photo.Photo:
         """A picture of the user's, packed for the page."""
         told, self.image = seen
         return replace(told, jpeg=self.packed())
@@ -71,11 +74,11 @@ def open_scene(kept: Kept, scene: str, overrides: Mapping[str, str], solve: bool
     """Set a scene up and look."""
     kept.desk = Desk.of(scene, overrides, kept.desk)
     kept.scene, kept.overrides, kept.flown = scene, dict(overrides), None
-    return kept.desk.setting, kept.look(solve)
+    return kept.desk.setting, look(kept, solve)
 
 
 def look(kept: Kept, solve: bool) -> View:
-    return kept.look(solve)
+    return kept.seen(kept.ready().look(solve))
 
 
 def point(kept: Kept, angles_deg: Triple, solve: bool) -> View:
@@ -112,13 +115,12 @@ def play(kept: Kept, t_s: float, solve: bool) -> View:
     """A moment of the flight."""
     if kept.flown is None:
         raise BadInput("nothing was flown yet")
-    kept.image = None
-    return kept.flown.at(kept.ready(), t_s, solve)
+    return kept.seen(kept.flown.at(kept.ready(), t_s, solve))
 
 
 def replay(kept: Kept, study: str, folder: str, trial: int) -> photo.Photo:
     """A trial of a study again, as the page shows a picture."""
-    return kept.shown(photo.of_trial(study, Path(folder), trial))
+    return kept.pictured(photo.of_trial(study, Path(folder), trial))
 
 
 def export_files(kept: Kept) -> dict[str, bytes]:
@@ -128,11 +130,21 @@ def export_files(kept: Kept) -> dict[str, bytes]:
 def solve_file(
     kept: Kept, name: str, data: bytes, fov_deg: float | None, stages: dict[str, str]
 ) -> photo.Photo:
-    return kept.shown(photo.of_file(name, data, fov_deg, stages))
+    return kept.pictured(photo.of_file(name, data, fov_deg, stages))
 
 
 def solve_camera(kept: Kept, source: str, fov_deg: float | None, stages: dict[str, str]) -> photo.Photo:
-    return kept.shown(photo.of_camera(source, fov_deg, stages))
+    """The next frame of a camera, which stays open."""
+    if kept.camera is None:
+        kept.camera = LiveCamera(source)
+    return kept.pictured(photo.of_camera(kept.camera, fov_deg, stages))
+
+
+def release(kept: Kept) -> None:
+    """The camera is no longer wanted."""
+    if kept.camera:
+        kept.camera.close()
+    kept.camera = None
 
 
 TASKS: dict[str, Callable[..., Any]] = {
@@ -149,4 +161,5 @@ TASKS: dict[str, Callable[..., Any]] = {
     "export": export_files,
     "solve_file": solve_file,
     "solve_camera": solve_camera,
+    "release": release,
 }

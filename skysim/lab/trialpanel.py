@@ -11,7 +11,8 @@ from urllib.parse import quote
 from nicegui import run, ui
 
 from skysim import io
-from skysim.lab.look import INK, TOOLTIP
+from skysim.lab import keys
+from skysim.lab.look import INK, TOOLTIP, digits
 from skysim.lab.trials import Tally, Trials, finished, monte_carlo
 from skysim.study import plan
 from skysim.study.plan import STUDIES
@@ -43,9 +44,11 @@ class TrialPanel:
     def __init__(self, tab: Tab) -> None:
         self.tab, self.trials, self.runs = tab, Trials(Path()), 0
         self.failed: tuple[tuple[int, str], ...] = ()
+        self.stopped = False
         with ui.row().classes("w-full no-wrap items-center gap-2"):
             self.what = ui.select({}, value=None).props('dense outlined options-dense aria-label="Study"')
             self.what.classes("flex-grow").mark("study").on_value_change(self.chosen)
+            self.what.on("popup-hide", js_handler=keys.LEAVE)
             self.button = (
                 ui.button("Start", on_click=self.start_or_stop)
                 .props("dense outline size=sm")
@@ -58,6 +61,7 @@ class TrialPanel:
                 .mark("runs")
             )
             self.kind = ui.select(KINDS, value="centroids", label="of").props("dense outlined options-dense")
+            self.kind.on("popup-hide", js_handler=keys.LEAVE)
             self.noise = ui.number("noise, px", value=0.1, min=0, max=10, step=0.05).props("dense outlined")
             self.false = ui.number("false", value=0, min=0, max=100, precision=0).props("dense outlined")
             self.field = ui.number("field, °", min=1, max=90).props("dense outlined").mark("field")
@@ -76,7 +80,7 @@ class TrialPanel:
 
     def set(self) -> None:
         """Another scene."""
-        options = {"": f"Monte Carlo of {self.tab.scene}"}
+        options = {"": f"Monte Carlo of {Path(self.tab.scene).stem}"}
         options |= {
             path.stem: f"{path.stem}: {plan.title_of(path)}" for path in sorted(STUDIES.glob("*.yaml"))
         }
@@ -98,6 +102,7 @@ class TrialPanel:
         """The button."""
         if self.trials.running:
             self.trials.stop()
+            self.stopped = True
             self.note.set_text("stopping …")
             return
         await self.start()
@@ -119,24 +124,30 @@ class TrialPanel:
         self.trials.total = told.trials
         self.bar.set_value(0)
         self.button.set_text("Stop")
+        self.stopped = False
         self.note.set_text("starting …")
         self.tab.log(f"study {path.stem}: {told.trials} trials")
         there = (self.trials.folder / "study.sqlite").is_file()
         await self.trials.begin(path, "resume" if there else "run")
         fault = await self.trials.end()
-        self.ended(fault)
+        if self.tab.open_still:
+            self.ended("" if self.stopped else fault)
 
     def file(self) -> Path:
-        """The study file: one that is there, or Monte Carlo's, written."""
+        """The study file: one that is there, or Monte Carlo's, written; what was stopped goes on."""
         if self.what.value:
             return STUDIES / f"{self.what.value}.yaml"
-        self.runs += 1
         trial: dict[str, Any] = {"kind": self.kind.value}
         if self.kind.value == "centroids":
             trial |= {"noise_px": float(self.noise.value or 0), "false_lights": int(self.false.value or 0)}
         if not (self.count.value and 1 <= self.count.value <= 100_000):
             raise BadInput("runs: allowed: 1 to 100000")
-        text = monte_carlo(self.tab.scene_path, self.tab.overrides, trial, int(self.count.value), self.runs)
+        told = self.tab.scene_path, self.tab.overrides, trial, int(self.count.value)
+        before = self.trials.folder / "monte_carlo.yaml"
+        if self.stopped and before.is_file() and before.read_text() == monte_carlo(*told, self.runs):
+            return before
+        self.runs += 1
+        text = monte_carlo(*told, self.runs)
         folder = io.make_folder(self.tab.out / f"monte_carlo_{self.tab.id}_{self.runs}")
         io.write_text(folder / "monte_carlo.yaml", text)
         return folder / "monte_carlo.yaml"
@@ -168,9 +179,7 @@ class TrialPanel:
     def show(self, told: Tally) -> None:
         """Figures and histogram."""
         self.bar.set_value(told.done / max(self.trials.total, 1))
-        self.chart.options["xAxis"]["data"] = [
-            f"{one:.0f}" if one >= 100 else f"{one:.3g}" for one in told.bins
-        ]
+        self.chart.options["xAxis"]["data"] = [digits(one) for one in told.bins]
         self.chart.options["series"][0]["data"] = list(told.counts)
         self.chart.options["title"]["text"] = "" if told.counts else "none solved: no error to count"
         self.chart.update()
@@ -196,6 +205,7 @@ class TrialPanel:
     async def replay(self, number: int) -> None:
         """A failed trial's frame, in the sensor view."""
         study = next(iter(self.trials.folder.glob("*.yaml")), STUDIES / f"{self.what.value}.yaml")
+        self.tab.rest()
         photo = await self.tab.ask(
             "replay", str(study), str(self.trials.folder), number, doing=f"replaying trial {number} …"
         )

@@ -35,7 +35,7 @@ class Tally(NamedTuple):
     """A study's trials so far.
 
     figures : by response its value and interval;  bins, counts : a histogram of the angle of error, arcsec
-    failed  : trials that raised, were wrong or refused, by number, the first few
+    failed  : by number trials that raised, then those wrong, then those refused; the first few
     """
 
     done: int
@@ -115,7 +115,7 @@ class Trials:
             return None
         try:
             with store.open_store(path) as kept:
-                counts, columns, failed = kept.counts(), kept.columns("error IS NULL"), kept.failures()
+                counts, columns, raised = kept.counts(), kept.columns("error IS NULL"), kept.failures()
         except BadInput:
             return None
         if not counts["done"]:
@@ -126,17 +126,16 @@ class Trials:
             figures[name] = (told.value, told.low, told.high)
         off = metrics.FIGURES["angle_arcsec"](columns)
         bins, heights = histogram(off[np.isfinite(off)])
-        failed = sorted([*failed, *unsolved(columns)])[:SHOWN]
-        return Tally(counts["done"], counts["wrong"], figures, bins, heights, tuple(failed))
+        failed = (*raised, *unsolved(columns))[:SHOWN]
+        return Tally(counts["done"], counts["wrong"], figures, bins, heights, failed)
 
 
 def unsolved(columns: Mapping[str, Any]) -> list[tuple[int, str]]:
-    """Trials with a frame that was answered wrongly, or not at all, and what became of it."""
-    rows = np.flatnonzero((columns["wrong"] > 0) | (columns["solved"] < columns["frames"]))
-    return [
-        (int(columns["trial"][n]), "wrong" if columns["wrong"][n] > 0 else str(columns["status"][n]))
-        for n in rows
-    ]
+    """Trials with a frame that was answered wrongly, then those with one that was not answered, and why."""
+    wrong = columns["wrong"] > 0
+    refused = (columns["solved"] < columns["frames"]) & ~wrong
+    told = zip(columns["trial"][refused].tolist(), columns["status"][refused].tolist(), strict=True)
+    return [*((trial, "wrong") for trial in columns["trial"][wrong].tolist()), *told]
 
 
 def histogram(off_arcsec: Any) -> tuple[tuple[float, ...], tuple[int, ...]]:
