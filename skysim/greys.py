@@ -28,9 +28,9 @@ class Facts:
 
 
 def span(image: NDArray) -> tuple[float, float]:
-    """What is black in a frame and what is white: the sky, and near the brightest pixel."""
+    """What is black in a frame and what is white: the sky, and a quarter of the way to the brightest pixel."""
     low, high = np.percentile(image[::SAMPLED, ::SAMPLED], (30, 99.9))
-    return float(low), max(float(high), float(image.max()) * 0.25)
+    return float(low), max(float(high), float(low + 0.25 * (image.max() - low)))
 
 
 def stretched(

@@ -57,9 +57,8 @@ def whole(path: Path) -> Iterator[Path]:
     try:
         yield temporary
         os.replace(temporary, path)
-    except (
-        OSError
-    ) as error:  # some libraries tell neither which file nor, of a full disk, what is wrong in a line
+    except OSError as error:
+        # Some libraries tell neither which file nor, of a full disk, what is wrong in a line.
         full = error.errno in (None, errno.ENOSPC, errno.EDQUOT) and "space" in str(error).lower()
         number = errno.ENOSPC if full else error.errno
         if number is None:

@@ -367,3 +367,11 @@ def test_brighter_is_brighter_by_as_much_on_any_pedestal(pedestal_dn: int) -> No
     between = (pedestal_dn, pedestal_dn + 400.0)
     grey, brighter = (greys.stretched(image, "linear", by, between) for by in (1.0, 2.0))
     np.testing.assert_allclose(brighter, np.minimum(2.0 * grey, 255), rtol=0, atol=1)
+
+
+def test_a_pedestal_under_a_frame_changes_nothing_for_the_eye() -> None:
+    """Black and white are measured from the sky."""
+    image = np.random.default_rng(2).poisson(20, (200, 200)).astype(np.uint16)
+    image[50, 60] = 900
+    shown = [greys.stretched((image + up).astype(np.uint16), "square root") for up in (0, 1000)]
+    np.testing.assert_array_equal(*shown)
