@@ -105,7 +105,7 @@ def measured(driver: Any, url: str, seconds: float) -> None:
         page = browser.new_page(viewport={"width": width, "height": height})
         page.goto(url)
         page.locator(".lab-card .good").wait_for(timeout=90_000)
-        page.wait_for_timeout(8000)  # the server begins the next tab's worker
+        page.wait_for_timeout(20_000)  # the server begins the next tab's worker
         page.evaluate(LOADS)
         rate, late = held(page, seconds), delays_ms(page)
         middle, most = np.quantile(late, [0.5, 0.9])

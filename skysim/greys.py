@@ -63,6 +63,15 @@ def facts(image: NDArray, saturation_dn: float) -> Facts:
     return Facts(sky, float(near.std()), peak, full)
 
 
+def fitted(grey: NDArray[np.uint8], widest_px: int) -> NDArray[np.uint8]:
+    """No wider than that: each pixel the mean of those that it stands for, so that no star is left out."""
+    height, width = grey.shape
+    if width <= widest_px:
+        return grey
+    size = widest_px, max(round(height * widest_px / width), 1)
+    return np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), np.uint8)
+
+
 def jpeg(grey: NDArray[np.uint8]) -> bytes:
     """Packed for the way to the browser."""
     return bytes(cv2.imencode(".jpg", grey, [cv2.IMWRITE_JPEG_QUALITY, 88])[1])

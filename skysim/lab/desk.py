@@ -31,7 +31,7 @@ STAGES = ("detector", "centroider", "identifier", "solver")
 class Desk:
     """A scene set up.
 
-    stretch, bright : how frames are shown;  shots : how many were taken, each with noise of its own
+    stretch, bright, widest_px : how frames are shown;  shots : how many were taken, each with noise of its own
     """
 
     scene: Scene
@@ -40,6 +40,7 @@ class Desk:
     lab_from_body: Rotation
     stretch: str = "square root"
     bright: float = 1.0
+    widest_px: int = 1400
     shots: int = 0
     frame: Frame | None = None
     truth: Truth | None = None
@@ -56,7 +57,13 @@ class Desk:
         lab = simulate.furnish(scene)
         here = lab.trajectory.lab_from_body[0]
         desk = cls(scene, lab, simulate.tracker(lab), here, magnitude=magnitudes(lab))
-        return replace(desk, stretch=before.stretch, bright=before.bright) if before else desk
+        if before:
+            return replace(desk, stretch=before.stretch, bright=before.bright, widest_px=before.widest_px)
+        return desk
+
+    def packed(self, image: NDArray) -> bytes:
+        """A picture as the page shows it."""
+        return greys.jpeg(greys.fitted(greys.stretched(image, self.stretch, self.bright), self.widest_px))
 
     @property
     def setting(self) -> Setting:
@@ -106,12 +113,11 @@ class Desk:
         clock = Clock()
         self.frame, self.truth = simulate.shoot(lab, 0)
         self.report = onboard.answer(self.estimator, self.frame) if solve else None
-        grey = greys.stretched(self.frame.image_dn, self.stretch, self.bright)
-        packed = greys.jpeg(grey)
+        packed, (height, width) = self.packed(self.frame.image_dn), self.frame.image_dn.shape
         clock.lap("all")
         return View(
             packed,
-            (grey.shape[1], grey.shape[0]),
+            (width, height),
             score.angles_deg(self.truth.cam_from_lab, self.scene, self.lab.mount),
             tuple(quaternion.of(self.truth.lab_from_body).tolist()),
             self.frame.exposure_s,

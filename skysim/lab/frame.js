@@ -55,7 +55,10 @@ export default {
       const high = Math.round(canvas.clientHeight * devicePixelRatio);
       if (!this.drawn || !wide || !high) return;
       const { look, bitmap } = this.drawn;
-      if (canvas.width !== wide || canvas.height !== high) [canvas.width, canvas.height] = [wide, high];
+      if (canvas.width !== wide || canvas.height !== high) {
+        [canvas.width, canvas.height] = [wide, high];
+        this.$emit("sized", { wide }); // what is wider need not travel
+      }
       pen.resetTransform();
       pen.imageSmoothingEnabled = wide < bitmap.width; // enlarged, pixels are to be seen
       pen.drawImage(bitmap, 0, 0, wide, high);

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -24,7 +23,6 @@ from skysim.study.trials import one
 from skysim.types import BadInput
 
 SUFFIXES = (".fits", ".fit", ".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
-WIDEST_PX = 1400  # as the browser gets it
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,12 +107,3 @@ def solved(image: NDArray, fov_deg: float | None, stages: dict[str, str], taken:
     height, width = image.shape
     full = float(np.iinfo(image.dtype).max) if image.dtype.kind == "u" else math.inf
     return Photo((width, height), answer, solution, greys.facts(image, full)), image
-
-
-def packed(image: NDArray, curve: str, bright: float) -> bytes:
-    """As the page shows it: no wider than a screen."""
-    grey = greys.stretched(image, curve, bright)
-    height, width = grey.shape
-    if width > WIDEST_PX:
-        grey = cv2.resize(grey, (WIDEST_PX, round(height * WIDEST_PX / width)), interpolation=cv2.INTER_AREA)
-    return greys.jpeg(np.asarray(grey, np.uint8))

@@ -52,6 +52,7 @@ class Sensor:
                 self.canvas = Canvas().mark("sensor")
                 self.canvas.on("mouse", self.mouse, throttle=0.06)
                 self.canvas.on("drawn", self.drawn)
+                self.canvas.on("sized", self.sized, throttle=0.5)
                 with ui.element("div").classes("lab-wait") as self.wait:
                     ui.spinner(size="28px")
                     self.why = ui.label().mark("wait")
@@ -115,6 +116,12 @@ class Sensor:
         """The browser has drawn a frame."""
         self.came = int(event.args["src"].rpartition("/")[2])
         self.arrived.set()
+
+    async def sized(self, event: Any) -> None:
+        """The screen has so many pixels for the picture."""
+        data = await self.tab.wait(self.tab.session.ask("fit", max(int(event.args["wide"]), 1)))
+        if data:
+            self.picture(data, self.size_px)
 
     async def ready(self) -> None:
         """Wait until no more than one frame is on its way to the screen: more would but take the browser's time."""

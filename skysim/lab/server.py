@@ -129,6 +129,7 @@ def routes(scene: str, folder: Path, out: Path) -> None:
         tab.session = spare.take()
         client.on_delete(tab.close)
         await tab.open(scene)
+        await tab.space.suit()
         spare.begin()
 
 

@@ -16,9 +16,11 @@ CLASSES = 3  # of brightness, each drawn in a size of its own
 POINT_M = (0.008, 0.013, 0.02)
 DIM, LIT = (0.75, 0.72, 0.62), (1.0, 0.85, 0.25)
 SHELL = (0.25, 0.30, 0.38)
-# Without a graphics card the browser draws this on the cores that make the frames: often only under the mouse.
-FPS, FPS_MOUSE = 4, 30
-MOVED_S = 0.25  # between two moves
+# Without a graphics card the browser draws this on the cores that make the frames: seldom then, but under the mouse.
+FPS, FPS_SLOW, MOVED_S, MOVED_SLOW_S = 30, 2, 0.1, 0.5
+CARD = """(() => { const gl = document.createElement("canvas").getContext("webgl");
+  const told = gl && gl.getExtension("WEBGL_debug_renderer_info");
+  return Boolean(told) && !/swiftshader|llvmpipe|software/i.test(gl.getParameter(told.UNMASKED_RENDERER_WEBGL)); })()"""
 
 
 class Space:
@@ -26,16 +28,23 @@ class Space:
 
     def __init__(self) -> None:
         self.scene = ui.scene(
-            width=400, height=300, grid=False, background_color=INK["ground"], fps=FPS, click_events=[]
+            width=400, height=300, grid=False, background_color=INK["ground"], fps=FPS_SLOW, click_events=[]
         )
         self.scene.classes("w-full h-full").mark("space")
-        self.scene.on("pointerenter", lambda: self.scene.props(f"fps={FPS_MOUSE}"), args=[])
-        self.scene.on("pointerleave", lambda: self.scene.props(f"fps={FPS}"), args=[])
+        self.fps = FPS_SLOW
+        self.scene.on("pointerenter", lambda: self.scene.props(f"fps={FPS}"), args=[])
+        self.scene.on("pointerleave", lambda: self.scene.props(f"fps={self.fps}"), args=[])
         self.vehicle: Any = None
         self.lit: Any = None
         self.stage: Stage | None = None
         self.newest: View | None = None
-        ui.timer(MOVED_S, self.move)
+        self.moves = ui.timer(MOVED_SLOW_S, self.move)
+
+    async def suit(self) -> None:
+        """Draw as often as the browser can without taking the cores' time."""
+        if await ui.run_javascript(CARD, timeout=10):
+            self.fps, self.moves.interval = FPS, MOVED_S
+            self.scene.props(f"fps={self.fps}")
 
     def set(self, setting: Setting) -> None:
         """Another scene."""

@@ -9,7 +9,6 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from skysim import greys
 from skysim.lab import export, photo
 from skysim.lab.desk import Desk, zoomed
 from skysim.lab.flight import Flown
@@ -56,9 +55,9 @@ class Kept:
         """What the page shows, as the desk has it stretched."""
         desk = self.ready()
         if self.image is not None:
-            return photo.packed(self.image, desk.stretch, desk.bright)
+            return desk.packed(self.image)
         assert desk.frame is not None
-        return greys.jpeg(greys.stretched(desk.frame.image_dn, desk.stretch, desk.bright))
+        return desk.packed(desk.frame.image_dn)
 
 
 class Stopped(Exception):
@@ -95,6 +94,12 @@ def show(kept: Kept, stretch: str, bright: float) -> bytes:
     """What is shown as JPEG, stretched otherwise."""
     desk = kept.ready()
     desk.stretch, desk.bright = stretch, bright
+    return kept.packed()
+
+
+def fit(kept: Kept, widest_px: int) -> bytes:
+    """What is shown, for a screen that has so many pixels for it."""
+    kept.ready().widest_px = widest_px
     return kept.packed()
 
 
@@ -154,6 +159,7 @@ TASKS: dict[str, Callable[..., Any]] = {
     "point": point,
     "move": move,
     "show": show,
+    "fit": fit,
     "zoom": zoom,
     "fly": fly,
     "play": play,
