@@ -304,7 +304,7 @@ def with_preset(tree: dict[str, Any]) -> dict[str, Any]:
     if not isinstance(part, dict) or not {"preset", "calibration"} & set(part):
         return tree
     own = {key: value for key, value in part.items() if key not in ("preset", "calibration")}
-    below = preset(str(part["preset"]), "camera.preset") if "preset" in part else {}
+    below = preset(str(part["preset"]), "camera.preset") if part.get("preset") is not None else {}
     if part.get("calibration") is None:
         return tree | {"camera": over(below, own)}
     for key in CALIBRATED:

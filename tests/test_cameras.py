@@ -107,6 +107,11 @@ def test_an_unknown_preset_is_answered_with_the_known_ones_in_one_line() -> None
     assert str(caught.value) == f"camera.preset: 'lu250c' is none of {', '.join(NAMES)}"
 
 
+def test_a_preset_of_the_base_is_switched_off_by_null() -> None:
+    own = {"pixel": "5 um", "width_px": 640}
+    assert with_preset({"camera": {"preset": None} | own}) == {"camera": own}
+
+
 def test_a_camera_without_a_preset_is_left_alone() -> None:
     raw = {"camera": {"width_px": 640}, "title": "x"}
     assert with_preset(raw) is raw
