@@ -14,7 +14,7 @@ $(READY): pyproject.toml
 	$(PIP) -e '.[dev,catalog]'
 	touch $@
 
-.PHONY: demo test test-long test-oracle test-browser test-lowest lock lint pictures studies papers lab recompile setup clean
+.PHONY: demo test test-long test-oracle test-browser test-lowest lock lint pictures studies papers docs figures lab recompile setup clean
 setup: $(READY)
 
 demo: $(READY)
@@ -45,6 +45,14 @@ studies: $(READY)
 
 papers: $(READY)
 	$(BIN)/skysim reproduce all --report --markdown docs/papers.md
+
+# The site, in out/site. Nothing in it is fetched from elsewhere.
+docs: $(READY)
+	$(PIP) -e '.[docs]'
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+
+figures: $(READY)
+	$(BIN)/python docs/figures.py
 
 # The lab's page in Chromium. Where that is missing the tests say so and are skipped.
 test-browser: $(READY)

@@ -1,0 +1,252 @@
+"""The figures of the pages on conventions and near stars, drawn from the code's own laws. `make figures` runs it."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import matplotlib as mpl
+
+mpl.use("svg")
+import matplotlib.pyplot as plt
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from skysim import scene, sky, surface, world
+from skysim.catalogue import read
+from skysim.optics import Optics
+from skysim.render import Window, render
+from skysim.types import Floats, Mount, Sources, Trajectory
+
+mpl.rcParams.update(
+    {"svg.fonttype": "none", "svg.hashsalt": "skysim", "font.family": "sans-serif", "font.size": 11}
+)
+INK, LAB, BODY, CAM, LIGHT = "#333333", "#666666", "#1f6fb2", "#c0392b", "#d68910"
+ORION = {
+    "Betelgeuse": 27989, "Rigel": 24436, "Bellatrix": 25336, "Saiph": 27366,
+    "Mintaka": 25930, "Alnilam": 26311, "Alnitak": 26727,
+}  # fmt: skip
+
+
+def axes(path: Path) -> None:
+    """Lab, body and camera axes of SimSat, yawed by 30 and rolled by 20 degrees."""
+    mount = world.mount(world.build(scene.load("afit_simsat").vehicle))
+    lab_from_body = Rotation.from_euler("ZYX", [30, 0, 20], degrees=True)
+    lab_from_cam = lab_from_body * mount.cam_from_body.inv()
+    camera_m = lab_from_body.apply(mount.camera_body_m)
+    azimuth, height = np.radians([-38, 24])  # from where it is looked at
+    toward = np.array([np.cos(height) * np.cos(azimuth), np.cos(height) * np.sin(azimuth), np.sin(height)])
+    right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
+    flat = np.column_stack([right, np.cross(toward, right)])  # (3, 2) from the lab to the paper
+    frames = (
+        ("lab", Rotation.identity(), np.zeros(3), LAB, 0.3),
+        ("body", lab_from_body, np.zeros(3), BODY, 0.24),
+        ("cam", lab_from_cam, camera_m, CAM, 0.2),
+    )
+    fig, ax = plt.subplots(figsize=(6.4, 5.6))
+    ax.plot(*np.transpose([np.zeros(2), camera_m @ flat]), color=INK, linestyle=":", linewidth=1.4)
+    for name, lab_from_own, origin_m, colour, length_m in frames:
+        begin = origin_m @ flat
+        for letter, axis in zip("xyz", lab_from_own.apply(np.eye(3)), strict=True):
+            end = begin + length_m * axis @ flat
+            ax.annotate(
+                "",
+                end,
+                begin,
+                arrowprops={"arrowstyle": "-|>", "color": colour, "lw": 2, "shrinkA": 0, "shrinkB": 0},
+            )
+            ax.text(
+                *(begin + 1.16 * (end - begin)), f"{name} {letter}", color=colour, ha="center", va="center"
+            )
+    ax.plot(0, 0, "o", color=INK)
+    ax.text(-0.012, -0.012, "bearing's centre", color=INK, ha="right", va="top")
+    ax.text(
+        *(0.35 * camera_m @ flat - [0.015, 0.0]),
+        f"lever {np.linalg.norm(camera_m):.3f} m",
+        color=INK,
+        ha="right",
+    )
+    ax.set(xlim=(-0.26, 0.32), ylim=(-0.2, 0.56), aspect="equal")
+    ax.set_axis_off()
+    save(fig, path)
+
+
+def chip() -> Optics:
+    """A small chip behind a lens whose arithmetic is easy: f = 1000 px, principal point (3, 2)."""
+    detector = {"quantum_efficiency": 0.5, "full_well_e": 40000, "gain_e_dn": 10, "bits": 12}
+    part = {
+        "width_px": 16,
+        "height_px": 16,
+        "principal_point_px": [3, 2],
+        "pixel": "10 um",
+        "focal_length": "10 mm",
+        "f_number": 2,
+    }
+    return Optics.of(scene.Camera.model_validate(part | {"detector": detector}))
+
+
+def pixels(path: Path) -> None:
+    """A star drawn by the renderer, in a corner of seven by five pixels."""
+    optics = chip()
+    toward = np.array([[1.3e-3, -0.6e-3, 1.0]])  # 1.3 px right of the boresight, 0.6 px above it
+    toward /= np.linalg.norm(toward)
+    one, image = np.ones(1), np.zeros((16, 16))
+    still = Trajectory(np.array([0.0, 1.0]), Rotation.identity(2), np.zeros((2, 3)))
+    star = Sources(
+        np.array([1]),
+        np.column_stack([toward, [0.0]]),
+        np.zeros((1, 3)),
+        0 * one,
+        1e9 * one,
+        one,
+        0 * one,
+        one,
+        0 * one,
+    )
+    seen = render(image, star, optics, still, Mount(np.zeros(3), Rotation.identity()), Window(0.0, 1.0))
+    (x, y), (column, row) = seen.xy_px[0], seen.peak_xy[0]
+    fig, ax = plt.subplots(figsize=(6.4, 4.6))
+    ax.imshow(image[:5, :7], cmap="gray_r", vmax=1.6 * image.max())
+    ax.set_xticks(np.arange(7))
+    ax.set_yticks(np.arange(5))
+    ax.set_xticks(np.arange(8) - 0.5, minor=True)
+    ax.set_yticks(np.arange(6) - 0.5, minor=True)
+    ax.grid(which="minor", color="#999999", linewidth=0.8)
+    ax.tick_params(which="minor", length=0)
+    ax.xaxis.tick_top()
+    ax.plot(*np.mgrid[:7, :5].reshape(2, -1), ".", color=BODY, markersize=4)
+    ax.plot(x, y, "+", color=CAM, markersize=13, markeredgewidth=2)
+    ax.annotate(
+        f"star at (x, y) = ({x:.1f}, {y:.1f})",
+        (x, y),
+        (x - 3.9, y + 1.5),
+        color=CAM,
+        arrowprops={"arrowstyle": "-", "color": CAM},
+    )
+    ax.annotate(
+        f"brightest: image[{row}, {column}]",
+        (column, row),
+        (column - 1.4, row + 3.0),
+        color=INK,
+        arrowprops={"arrowstyle": "-", "color": INK},
+    )
+    ax.annotate(
+        "corner (-0.5, -0.5)",
+        (-0.5, -0.5),
+        (-0.2, 0.3),
+        color=INK,
+        arrowprops={"arrowstyle": "-", "color": INK},
+    )
+    ax.plot(*optics.project(np.array([0.0, 0.0, 1.0])), "x", color=BODY, markersize=9)
+    ax.text(3.1, 2.35, "boresight (3, 2)", color=BODY)
+    ax.set_xlabel("x, right: columns", loc="left")
+    ax.xaxis.set_label_position("top")
+    ax.set_ylabel("y, down: rows", loc="top")
+    save(fig, path)
+
+
+def roll(path: Path) -> None:
+    """Orion at roll 0 and at roll 30, in the image, with north, east and the image's up."""
+    stars = read("hipparcos_hp6.5")
+    camera = scene.load("shefex2", {"camera.focal_length": "14 mm"}).camera
+    optics = Optics.of(camera)
+    rows = [int(np.flatnonzero(stars.hip == number)[0]) for number in ORION.values()]
+    toward = unit(stars.ra_rad, stars.dec_rad)
+    fig, both = plt.subplots(1, 2, figsize=(9.2, 3.9), layout="constrained")
+    for ax, roll_deg in zip(both, (0, 30), strict=True):
+        look = sky.cam_from_icrs(84.0, 0.0, roll_deg)
+        xy = optics.project(look.apply(toward))
+        shown = (stars.v_mag < 5) & (np.abs(xy - camera.centre_px) < camera.centre_px).all(axis=1)
+        ax.scatter(*xy[shown].T, s=2 + 6 * (5 - stars.v_mag[shown]) ** 1.3, color=INK, linewidths=0)
+        for name, place in zip(ORION, optics.project(look.apply(toward[rows])), strict=True):
+            if name not in ("Alnilam", "Mintaka"):
+                ax.annotate(name, place, (9, 3), textcoords="offset points", fontsize=9, color=INK)
+        middle = np.array(camera.centre_px)
+        for name, ra_deg, dec_deg in (("N", 84.0, 8.5), ("E", 91.0, 0.0)):
+            end = optics.project(look.apply(unit(*np.radians([[ra_deg], [dec_deg]]))))[0]
+            ax.annotate("", end, middle, arrowprops={"arrowstyle": "->", "color": BODY, "lw": 1.8})
+            ax.text(*(middle + 1.15 * (end - middle)), name, color=BODY, ha="center", va="center")
+        ax.annotate("", middle - [0, 120], middle, arrowprops={"arrowstyle": "->", "color": CAM, "lw": 1.8})
+        ax.text(middle[0] - 8, middle[1] - 104, "up (-y)", color=CAM, ha="right", va="center")
+        if roll_deg:
+            angles = np.radians(np.linspace(0, roll_deg, 30))
+            north = np.arctan2(*(optics.project(look.apply(unit(*np.radians([[84.0], [7.0]]))))[0] - middle))
+            arc = middle + 95 * np.column_stack([np.sin(north + angles), np.cos(north + angles)])
+            ax.plot(*arc.T, color=LIGHT, linewidth=2)
+            ax.text(*(arc[15] + [0, -16]), f"roll {roll_deg}°", color=LIGHT, ha="center")
+        ax.set(
+            xlim=(-0.5, camera.width_px - 0.5),
+            ylim=(camera.height_px - 0.5, -0.5),
+            title=f"roll {roll_deg}°",
+            aspect="equal",
+        )
+        ax.set_xticks([])
+        ax.set_yticks([])
+    save(fig, path)
+
+
+def unit(ra_rad: Floats, dec_rad: Floats) -> Floats:
+    """(N, 3) unit vectors of right ascensions and declinations."""
+    return np.column_stack(
+        [np.cos(dec_rad) * np.cos(ra_rad), np.cos(dec_rad) * np.sin(ra_rad), np.sin(dec_rad)]
+    )
+
+
+def lever(path: Path) -> None:
+    """AFIT's measured dome from the side, the vehicle level and rolled by 20 degrees: why LEDs are no stars."""
+    afit = scene.load("afit_simsat")
+    dome = surface.surface(afit.light.surface)
+    mount = world.mount(world.build(afit.vehicle))
+    fig, ax = plt.subplots(figsize=(9.0, 4.6))
+    tilts = np.radians(np.linspace(-60, 60, 241))
+    along = np.column_stack([0 * tilts, np.sin(tilts), np.cos(tilts)])
+    wall = dome.meet(np.zeros(3), along)  # NaN beneath the rim
+    ax.plot(wall[:, 1], wall[:, 2], color=LAB, linewidth=2)
+    led = wall[np.argmin(np.abs(tilts - np.radians(8)))]
+    ax.plot(*led[1:], "o", color=LIGHT, markersize=8)
+    ax.annotate("LED P", led[1:], (6, 8), textcoords="offset points", color=LIGHT)
+    for roll_deg, colour, at_pt, side in ((0.0, BODY, 14, "left"), (20.0, CAM, -14, "right")):
+        lab_from_body = Rotation.from_euler("x", roll_deg, degrees=True)
+        camera = lab_from_body.apply(mount.camera_body_m)
+        bore = lab_from_body.apply([0.0, 0.0, 1.0])
+        ax.plot(
+            *np.transpose([np.zeros(3), camera])[1:],
+            color=colour,
+            linewidth=5,
+            alpha=0.5,
+            solid_capstyle="round",
+        )
+        ax.plot(
+            *np.transpose([camera, dome.meet(camera, bore[None])[0]])[1:],
+            color=colour,
+            linestyle="--",
+            linewidth=1,
+        )
+        ax.plot(*np.transpose([camera, led])[1:], color=colour, linewidth=1.6)
+        seen = np.degrees(np.arccos((led - camera) @ bore / np.linalg.norm(led - camera)))
+        told = f"roll {roll_deg:.0f}°: the LED {seen:.2f}° off the boresight"
+        ax.annotate(told, camera[1:], (at_pt, -12), textcoords="offset points", color=colour, ha=side)
+    far = np.degrees(np.arctan2(led[1], led[2]))
+    ax.plot(*np.transpose([np.zeros(3), led])[1:], color=LAB, linestyle=":", linewidth=1.2)
+    ax.text(0.05, -0.11, f"bearing's centre O: from here it stands at {far:.2f}°", color=LAB)
+    ax.plot(0, 0, "o", color=INK)
+    ax.set(aspect="equal", xlabel="lab y (m)", ylabel="lab z (m)", ylim=(-0.2, 1.32), xlim=(-1.35, 1.7))
+    save(fig, path)
+
+
+def save(fig: plt.Figure, path: Path) -> None:
+    """The same figure, the same bytes."""
+    fig.savefig(path, metadata={"Date": None}, bbox_inches="tight")
+    plt.close(fig)
+
+
+FIGURES = {"axes": axes, "pixels": pixels, "roll": roll, "lever": lever}
+
+
+def main(folder: Path) -> None:
+    for name, draw in FIGURES.items():
+        draw(folder / f"{name}.svg")
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).parent / "pictures")

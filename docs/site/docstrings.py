@@ -1,0 +1,55 @@
+"""Docstrings as they are written here, for Markdown: equations are indented, and `name : meaning` stands on a line."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import griffe
+
+TERM = re.compile(r"^([a-zA-Z]\w*(?:, \w+)* +|[a-z]\w*(?:, \w+)*): +(?=\S)")
+MARKS = re.compile(r"([*_\[\]])")
+CODE = re.compile(r"(`[^`]*`)")
+
+
+class Docstrings(griffe.Extension):
+    """Rewrite every docstring before it is shown."""
+
+    def on_object(self, *, obj: Any, **_: Any) -> None:
+        """Called once an object has been read."""
+        if obj.docstring is not None:
+            obj.docstring.value = markdown(obj.docstring.value)
+
+
+def markdown(text: str) -> str:
+    """Lists of terms become lists, marks become letters; indented blocks stay the code that they are."""
+    return "\n\n".join(shown(part) for part in re.split(r"\n\s*\n", text))
+
+
+def shown(part: str) -> str:
+    """One paragraph."""
+    lines = part.split("\n")
+    if all(line.startswith("    ") for line in lines):
+        return part
+    out: list[str] = []
+    listed = False
+    for line in lines:
+        term = TERM.match(line)
+        if term:
+            gap = [""] if out and not listed else []
+            out += [*gap, f"- `{term[1].strip()}`: {plain(line[term.end() :])}"]
+            listed = True
+        elif listed and line.startswith(" "):
+            out.append(f"    {plain(line.strip())}")
+        else:
+            out += ["", plain(line.strip())] if listed else [plain(line.strip())]
+            listed = False
+    return "\n".join(out)
+
+
+def plain(text: str) -> str:
+    """Markdown's and HTML's marks outside of code as the letters that they are."""
+    pieces = CODE.split(text)
+    return "".join(
+        piece if piece[:1] == "`" else MARKS.sub(r"\\\1", piece.replace("<", "&lt;")) for piece in pieces
+    )
