@@ -14,7 +14,7 @@ $(READY): pyproject.toml
 	$(PIP) -e '.[dev,catalog]'
 	touch $@
 
-.PHONY: demo test test-long test-oracle test-browser test-lowest lock lint pictures studies papers docs figures lab recompile setup clean
+.PHONY: demo test test-long oracle test-browser test-lowest lock lint pictures studies papers docs figures lab recompile setup clean
 setup: $(READY)
 
 demo: $(READY)
@@ -27,9 +27,10 @@ test: $(READY)
 test-long: $(READY)
 	NUMBA_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n 2 -m long
 
-test-oracle: $(READY)
+# Other people's instruments. astrometry.net is no Python package: docs/oracles.md tells how to get it.
+oracle: $(READY)
 	$(PIP) -e '.[oracle]'
-	$(BIN)/pytest tests/test_oracle_*.py
+	$(BIN)/python -m pytest -rs -m "not long" tests/test_oracle_*.py
 
 lab: $(READY)
 	$(BIN)/skysim lab

