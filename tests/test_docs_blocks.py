@@ -42,6 +42,7 @@ LONG = {
     "howto/photo.md",
     "howto/tracker.md",
     "explanation/budget.md",
+    "stream.md",
 }
 LANGUAGES = {
     "sh",
