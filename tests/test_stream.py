@@ -208,9 +208,10 @@ def test_streams_bring_every_next_frame(board: tuple[web.Board, str]) -> None:
         assert cv2.imdecode(np.frombuffer(data, np.uint8), -1).shape == (3, 4)
         movie.readline()
         board[0].post(packet(index + 1))
-    assert {tuple(one) for one in board[0].clients} <= {(3, 0), (4, 0)}
+    assert [dropped for _, dropped in board[0].clients] == [0, 0]
 
 
+@pytest.mark.long
 def test_a_pipe_ends_with_its_reader_and_sigterm_ends_a_stream_with_its_tallies(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "skysim", "stream", "shefex2", "--set", "light.limit_mag=5", "--endless"]
     piped = subprocess.Popen([*command, "--pipe", "-", "--speed", "0"], stdout=-1, stderr=-1)

@@ -60,6 +60,7 @@ def test_a_full_disk_is_named_and_what_was_written_is_whole(mounted: Path) -> No
     assert whole_frames(mounted / "run") >= 1
 
 
+@pytest.mark.long
 def test_a_folder_that_cannot_be_written_is_told_in_a_line(mounted: Path) -> None:
     subprocess.run(["mount", "-o", "remount,ro", mounted], check=True)
     for words in (("run", "shefex2", "--frames", "1"), ("study", "run", "led_count")):
@@ -71,7 +72,7 @@ def test_a_folder_that_cannot_be_written_is_told_in_a_line(mounted: Path) -> Non
         )
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [pytest.param(signal.SIGINT, marks=pytest.mark.long), signal.SIGTERM])
 def test_a_run_that_is_stopped_leaves_whole_frames(tmp_path: Path, number: signal.Signals) -> None:
     command = [*SKYSIM, "run", "shefex2", "--frames", "400", "--out", str(tmp_path), *SMALL]
     run = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, preexec_fn=ready)
