@@ -14,7 +14,7 @@ $(READY): pyproject.toml
 	$(PIP) -e '.[dev,catalog]'
 	touch $@
 
-.PHONY: demo test test-long oracle test-browser test-lowest lock lint pictures studies papers docs figures lab recompile setup clean
+.PHONY: demo test test-long oracle test-browser test-lowest lock fuzz lint pictures studies papers docs figures lab recompile setup clean
 setup: $(READY)
 
 demo: $(READY)
@@ -70,6 +70,12 @@ test-lowest:
 	$(LOWEST)/bin/pip install --quiet --disable-pip-version-check uv
 	$(LOWEST)/bin/uv pip install --quiet --python $(LOWEST)/bin/python --resolution lowest-direct -e '.[dev,catalog]'
 	NUMBA_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(LOWEST)/bin/python -m pytest -n 2 -m "not long and not browser"
+
+# Files that nobody wrote by hand, for every parser; findings are kept in out/fuzz.
+FUZZ_S ?= 60
+fuzz: $(READY)
+	-$(BIN)/pip install --quiet --disable-pip-version-check -e '.[fuzz]'
+	$(BIN)/python -m fuzz $(FUZZ_S)
 
 lint: $(READY)
 	$(BIN)/ruff check .

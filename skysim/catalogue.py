@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from skysim.scene import CATALOGUES
 from skysim.types import BadInput, Floats
+from skysim.yamlfile import composed
 
 EPOCH_JYEAR = 1991.25
 MAS_RAD = np.pi / 180 / 3.6e6
@@ -241,7 +242,7 @@ def split(path: Path) -> tuple[dict[str, Any], list[str]]:
         raise bad(path, f"it cannot be read ({error})") from error
     size = next((n for n, line in enumerate(lines) if not line.startswith("#")), len(lines))
     try:
-        meta = yaml.safe_load("\n".join(line[2:] for line in lines[1:size]))["meta"]
+        meta = composed("\n".join(line[2:] for line in lines[1:size]))[1]["meta"]
         whole = lines[size].split(",")[: len(NAMES)] == NAMES and {"rows", "epoch_jyear"} <= set(meta)
     except (yaml.YAMLError, TypeError, KeyError, IndexError) as error:
         raise bad(path, "its header is not a skysim catalogue's") from error

@@ -7,10 +7,10 @@ import errno
 import json
 import os
 import shutil
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -19,11 +19,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skysim import wcs
+from skysim.picturefile import check_bytes, check_pixels, read_picture
 from skysim.scene import Scene, Stars
 from skysim.types import BadInput, Floats, Frame, Truth
 
 IMAGE_SUFFIXES = (".fits", ".fit", ".fts", ".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp")
 FITS_SUFFIXES = (".fits", ".fit", ".fts")
+MOST_HDUS = 1000  # in which an image is looked for
 
 
 @dataclass(frozen=True, slots=True)
@@ -242,10 +244,14 @@ def write_dome_map(path: Path, dome: DomeMap) -> None:
 
 def read_dome_map(path: Path) -> DomeMap:
     """What `write_dome_map` wrote. Raises BadInput with one line for a file that is none."""
+    import warnings
+
     from astropy.table import Table
 
     try:
-        table = Table.read(path, format="ascii.ecsv")
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            table = Table.read(path, format="ascii.ecsv")
     except Exception as error:  # of a file that is no ECSV astropy says whatever its parsers stumble over
         raise BadInput(f"{path}: no ECSV table: {' '.join(str(error).split())[:120]}") from None
     missing = [name for name in MAP_COLUMNS if name not in table.colnames]
@@ -312,12 +318,14 @@ def to_json(data: Any) -> str:
 def read_image(path: Path) -> NDArray:
     """The pixels of a FITS, PNG, TIFF, JPEG or BMP file as they are: (H, W) or (H, W, channels).
 
-    Raises BadInput with one line for a file that is missing, truncated, or no image.
+    Raises BadInput with one line for a file that is missing, truncated, no image, or of more pixels than are
+    allowed.
     """
     if not path.is_file():
         raise BadInput(f"{path}: no such file")
     if path.suffix.lower() not in IMAGE_SUFFIXES:
         raise BadInput(f"{path}: not an image by its name; allowed: {', '.join(IMAGE_SUFFIXES)}")
+    check_bytes(path)
     image = read_fits(path) if path.suffix.lower() in FITS_SUFFIXES else read_picture(path)
     if image.dtype.kind not in "uif":
         raise BadInput(f"{path}: pixels of type {image.dtype}; allowed: integers and floats")
@@ -334,9 +342,14 @@ def read_fits(path: Path) -> NDArray:
         with warnings.catch_warnings():
             warnings.simplefilter("error", AstropyWarning)  # "file may have been truncated" is one
             with path.open("rb") as file, fits.open(file, memmap=False) as hdus:
-                for hdu in hdus:
+                for hdu in islice(hdus, MOST_HDUS):
+                    # By the header, before the data is read, or skipped in a stream that is decompressed.
+                    check_pixels(path, *map(int, getattr(hdu, "shape", ()) or ()))
+                    check_pixels(path, int(hdu.size) // 8)
                     if getattr(hdu, "is_image", False) and hdu.header.get("NAXIS", 0) > 0:
                         return np.ascontiguousarray(hdu.data.astype(hdu.data.dtype.newbyteorder("=")))
+    except BadInput:
+        raise
     except Exception as error:  # astropy meets a damaged header with whatever it stumbles over, KeyError too
         raise BadInput(f"{path}: not a whole FITS file: {' '.join(str(error).split())}") from None
     raise BadInput(f"{path}: a FITS file without an image")
@@ -346,38 +359,16 @@ def date_of(path: Path) -> datetime.datetime | None:
     """DATE-OBS of a FITS file; None for other files and other headers."""
     if path.suffix.lower() not in FITS_SUFFIXES:
         return None
+    import warnings
+
     from astropy.io import fits
 
     try:
-        return datetime.datetime.fromisoformat(str(fits.getheader(path).get("DATE-OBS")))
-    except (ValueError, fits.VerifyError):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            return datetime.datetime.fromisoformat(str(fits.getheader(path).get("DATE-OBS")))
+    except Exception:  # as in `read_fits`, which tells what is wrong
         return None
-
-
-def read_picture(path: Path) -> NDArray:
-    data = np.fromfile(path, np.uint8)
-    try:
-        with silent_stderr():
-            image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if len(data) else None
-    except cv2.error as error:
-        raise BadInput(f"{path}: cannot be decoded: {' '.join(str(error).split())}") from None
-    if image is None:
-        raise BadInput(f"{path}: cannot be decoded; it may be truncated or not an image")
-    return image
-
-
-@contextmanager
-def silent_stderr() -> Iterator[None]:
-    """Keep C libraries quiet: libpng and OpenCV print their complaints on file descriptor 2 themselves."""
-    sys.stderr.flush()
-    kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
-    try:
-        os.dup2(nowhere, 2)
-        yield
-    finally:
-        os.dup2(kept, 2)
-        os.close(kept)
-        os.close(nowhere)
 
 
 def monochrome(image: NDArray) -> NDArray:

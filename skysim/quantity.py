@@ -20,6 +20,7 @@ ROOT = Path(__file__).resolve().parents[1]
 # An installed package carries within it what stands beside it in a checkout.
 SHIPPED = ROOT if (ROOT / "pyproject.toml").is_file() else ROOT / "skysim"
 DATA = SHIPPED / "data"
+LONGEST = 80  # a quantity
 UNIT_FOLLOWS = r"^\s*[-+.]?\d.*[a-zA-Z]"  # what editors can tell of a quantity
 
 # Only what a quantity parser fills: `dark_e_s` and `rate_deg_s` are bare numbers and keep their unit.
@@ -54,9 +55,14 @@ def in_si(value: str, si_unit: str | None = None) -> float:
 
     # astropy spells it `inch`; the lab writes `in`.
     inch = units.def_unit("in", units.imperial.inch)
+    if len(value) > LONGEST:
+        raise ValueError(f"{len(value)} characters are no quantity")
     with units.add_enabled_units([inch, units.imperial]):
-        told = units.Quantity(value)
-        return float(told.to_value(si_unit) if si_unit else told.si.value)
+        try:
+            told = units.Quantity(value)
+            return float(told.to_value(si_unit) if si_unit else told.si.value)
+        except ArithmeticError as error:  # "3 m(1/0)", "3 m(9e9)"
+            raise ValueError(str(error)) from None
 
 
 def finite(value: float) -> float:

@@ -21,10 +21,11 @@ from skysim.motion import Motion, Pointing
 from skysim.quantity import DATA, SHIPPED, Length, NotNegative, Number, Part, Positive, Spin, Time
 from skysim.types import BadInput
 from skysim.vehicle import Site, Vehicle
-from skysim.yamlfile import Files, explain, of_our_version, place_of, put, read_yaml
+from skysim.yamlfile import Files, explain, is_file, of_our_version, place_of, put, read_yaml
 
 SCENES = SHIPPED / "scenes"
 STEM = "(the file's name)"  # no key that a file could have
+MOST_FRAMES, MOST_S = 1_000_000, 86_400.0  # of a flight, which memory holds
 CATALOGUES = DATA / "catalogues"
 
 
@@ -37,7 +38,7 @@ def in_our_time(value: datetime.datetime) -> datetime.datetime:
 
 def a_file(value: str) -> str:
     """A path that is there."""
-    if not Path(value).is_file():
+    if not is_file(Path(value)):
         raise ValueError(f"{value!r} is no file; allowed: one beside the scene, or a path")
     return value
 
@@ -54,6 +55,11 @@ class Exposure(Part):
     def fits_its_period(self) -> Exposure:
         if self.time_s > 1 / self.rate_hz:
             raise ValueError(f"time {self.time_s} s is longer than the frame period {1 / self.rate_hz} s")
+        lasts_s = self.first_s + self.frames / self.rate_hz
+        if self.frames > MOST_FRAMES or lasts_s > MOST_S:
+            raise ValueError(
+                f"{self.frames} frames over {lasts_s:g} s; allowed: up to {MOST_FRAMES}, over a day ({MOST_S:g} s)"
+            )
         return self
 
 
@@ -330,7 +336,7 @@ def read(path: Path, above: tuple[Path, ...] = ()) -> tuple[dict[str, Any], File
     base = tree.pop("base")
     place = place_of(["base"], [(path, text)], {})
     try:
-        below = find(str(path.parent / base) if (path.parent / str(base)).is_file() else str(base))
+        below = find(str(path.parent / base) if is_file(path.parent / str(base)) else str(base))
     except BadInput as error:
         raise BadInput(f"base: {error} {place}") from None
     if below.resolve() in above or below.resolve() == path.resolve():
@@ -372,7 +378,7 @@ def anchored(folder: Path, tree: dict[str, Any], key: str, *inner: str) -> dict[
     value = tree.get(key)
     if inner and isinstance(value, dict):
         return tree | {key: anchored(folder, value, *inner)}
-    if not inner and isinstance(value, str) and (folder / value).is_file():
+    if not inner and isinstance(value, str) and is_file(folder / value):
         return tree | {key: str(folder / value)}
     return tree
 

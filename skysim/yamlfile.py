@@ -17,15 +17,78 @@ Files = list[tuple[Path, str]]  # paths and texts
 VERSION = 1  # of scene and study files. A change that old files don't survive raises it and brings them up to date here
 
 
+MOST_BYTES = 1 << 20  # of a file: a minute of reading
+MOST_NODES = 100_000  # of a document, what stands behind its aliases counted every time
+LONGEST = 200  # what is shown of a value
+DEEPEST = 40  # sections within sections
+
+
+class Careful(yaml.SafeLoader):
+    """Plain YAML without what makes a small file a great one: aliases of aliases, depth, a section within itself."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__(text)
+        self.depth = self.nodes = 0
+        self.size: dict[int, int] = {}  # of nodes that are whole, by id
+
+    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
+        before, mark = self.nodes, self.peek_event().start_mark
+        aliased = self.check_event(yaml.AliasEvent)
+        self.depth += 1
+        if self.depth > DEEPEST:
+            raise yaml.composer.ComposerError(None, None, f"more than {DEEPEST} sections deep", mark)
+        node = super().compose_node(parent, index)
+        self.depth -= 1
+        if aliased and id(node) not in self.size:
+            raise yaml.composer.ComposerError(None, None, "an alias of what it stands in", mark)
+        self.nodes += self.size[id(node)] if aliased else 1
+        self.size[id(node)] = self.nodes - before
+        if self.nodes > MOST_NODES:
+            raise yaml.composer.ComposerError(None, None, f"more than {MOST_NODES} values", mark)
+        return node
+
+    def construct_object(self, node: yaml.Node, deep: bool = False) -> Any:
+        """As ever; what Python has against a number or a date is told as what is wrong with the YAML."""
+        try:
+            return super().construct_object(node, deep)
+        except (ValueError, TypeError, LookupError, OverflowError, AttributeError) as error:
+            problem = f"{str(node.value)[:40]!r} is no {node.tag.rpartition(':')[2]} ({error})"
+            raise yaml.constructor.ConstructorError(None, None, problem, node.start_mark) from None
+
+
+def composed(text: str) -> tuple[yaml.Node | None, Any]:
+    """The nodes of a YAML document, and its values. Raises YAMLError."""
+    loader = Careful(text)
+    try:
+        node = loader.get_single_node()
+        return node, None if node is None else loader.construct_document(node)
+    finally:
+        loader.dispose()
+
+
+def is_file(path: Path) -> bool:
+    """Whether there is such a file; of a name that no file can have, no."""
+    try:
+        return path.is_file()
+    except OSError:
+        return False
+
+
 def find(name: str, folder: Path, what: str) -> Path:
     """The path of a file given by path, or by its name in a folder."""
     path, shipped = Path(name), folder / f"{name}.yaml"
-    if path.suffix in {".yaml", ".yml"} and path.is_file():
+    if path.suffix in {".yaml", ".yml"} and is_file(path):
         return path
-    if not path.suffix and shipped.is_file():
+    if not path.suffix and is_file(shipped):
         return shipped
     known = sorted(one.stem for one in folder.glob("*.yaml"))
-    raise BadInput(f"{name}: no such {what}; allowed: a .yaml file or one of {', '.join(known)}")
+    raise BadInput(f"{shown(name)}: no such {what}; allowed: a .yaml file or one of {', '.join(known)}")
+
+
+def shown(value: object) -> str:
+    """A value as it stands in a complaint: on one line, and not without end."""
+    text = "".join(one if one.isprintable() else "?" for one in " ".join(str(value).split()))
+    return text if len(text) <= LONGEST else f"{text[:LONGEST]}…"
 
 
 def overridden(sets: list[str] | None) -> dict[str, str]:
@@ -34,7 +97,7 @@ def overridden(sets: list[str] | None) -> dict[str, str]:
     for item in sets or []:
         key, equals, value = item.partition("=")
         if not equals or not key:
-            raise BadInput(f"--set {item}: allowed: path.to.key=value")
+            raise BadInput(f"--set {shown(item)}: allowed: path.to.key=value")
         overrides[key] = value
     return overrides
 
@@ -42,8 +105,10 @@ def overridden(sets: list[str] | None) -> dict[str, str]:
 def read_yaml(path: Path) -> tuple[dict[str, Any], str]:
     """A YAML mapping and its text."""
     try:
+        if path.stat().st_size > MOST_BYTES:
+            raise BadInput(f"{path}: {path.stat().st_size} bytes; allowed: up to {MOST_BYTES}")
         text = path.read_text(encoding="utf-8")
-        tree = yaml.safe_load(text)
+        node, tree = composed(text)
     except (OSError, UnicodeDecodeError) as error:
         raise BadInput(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from error
     except yaml.YAMLError as error:
@@ -53,7 +118,7 @@ def read_yaml(path: Path) -> tuple[dict[str, Any], str]:
         raise BadInput(f"{path}{where}: not YAML: {problem}") from error
     if not isinstance(tree, dict):
         raise BadInput(f"{path}: allowed: a mapping of keys to values")
-    once(yaml.compose(text, yaml.SafeLoader), path)
+    once(node, path)
     return tree, text
 
 
@@ -65,11 +130,11 @@ def once(node: yaml.Node | None, path: Path) -> None:
     if isinstance(node, yaml.MappingNode):
         seen: set[str] = set()
         for key, value in node.value:
-            if key.value in seen:
+            if str(key.value) in seen:
                 raise BadInput(
-                    f"{key.value}: stands twice in one section ({path}, line {key.start_mark.line + 1})"
+                    f"{shown(key.value)}: stands twice in one section ({path}, line {key.start_mark.line + 1})"
                 )
-            seen.add(key.value)
+            seen.add(str(key.value))
             once(value, path)
 
 
@@ -87,22 +152,26 @@ def put(tree: dict[str, Any], key: str, value: str) -> None:
     """Set one dotted key of the raw scene; the value is YAML. A number is a place in a list: `camera_body.2`."""
     *parents, last = key.split(".")
     if not all((*parents, last)):
-        raise BadInput(f"--set {key}={value}: allowed: path.to.key=value")
+        raise BadInput(f"--set {shown(key)}={shown(value)}: allowed: path.to.key=value")
     node: Any = tree
     for depth, parent in enumerate(parents):
         node = node.setdefault(parent, {}) if isinstance(node, dict) else node[place_in(node, parent, key)]
         if not isinstance(node, dict | list):
-            raise BadInput(f"--set {key}: {'.'.join(parents[: depth + 1])} holds a value, not keys")
+            raise BadInput(
+                f"--set {shown(key)}: {shown('.'.join(parents[: depth + 1]))} holds a value, not keys"
+            )
     try:
-        node[last if isinstance(node, dict) else place_in(node, last, key)] = yaml.safe_load(value)
+        node[last if isinstance(node, dict) else place_in(node, last, key)] = composed(value)[1]
     except yaml.YAMLError as error:
-        raise BadInput(f"--set {key}: {value!r} is not YAML") from error
+        raise BadInput(f"--set {shown(key)}: {shown(repr(value))} is not YAML") from error
 
 
 def place_in(values: list[Any], place: str, key: str) -> int:
     """The place in a list that a part of a dotted key names."""
-    if not place.isdigit() or int(place) >= len(values):
-        raise BadInput(f"--set {key}: {place} is no place in a list; allowed: 0 to {len(values) - 1}")
+    if not (place.isascii() and place.isdigit() and len(place) < 10) or int(place) >= len(values):
+        raise BadInput(
+            f"--set {shown(key)}: {shown(place)} is no place in a list; allowed: 0 to {len(values) - 1}"
+        )
     return int(place)
 
 
@@ -131,16 +200,16 @@ def explain(
     elif first["type"] == "union_tag_not_found":
         message = "kind is missing"
     elif first["type"] in ("model_type", "model_attributes_type"):
-        message = f"{first['input']!r} is not allowed; it should be a mapping of keys to values"
+        message = f"{shown(repr(first['input']))} is not allowed; it should be a mapping of keys to values"
     elif first["type"] == "value_error" and not keys:  # of the whole scene: the message begins with the key
         dotted, _, message = message.partition(": ")
         keys = dotted.split(".")
     elif not first["type"].startswith("value_error"):
-        message = f"{first['input']!r} is not allowed; it should {message}"
+        message = f"{shown(repr(first['input']))} is not allowed; it should {message}"
     dotted = ".".join(keys)
     # What is missing is in no file; but a file may have it in a section or list that another one replaces.
     given = keys[:-1] if first["type"] == "missing" else keys
-    return f"{dotted + ': ' if dotted else ''}{message} {place_of(given, files, overrides)}"
+    return f"{shown(dotted) + ': ' if dotted else ''}{message} {place_of(given, files, overrides)}"
 
 
 def place_of(keys: list[str], files: Files, overrides: Mapping[str, str]) -> str:
@@ -212,7 +281,12 @@ def line_of(text: str, keys: list[str]) -> tuple[int, int | None]:
         found = None
         if isinstance(node, yaml.MappingNode):
             found = next(((k, v) for k, v in node.value if k.value == key), None)
-        elif isinstance(node, yaml.SequenceNode) and key.isdigit() and int(key) < len(node.value):
+        elif (
+            isinstance(node, yaml.SequenceNode)
+            and key.isascii()
+            and key.isdigit()
+            and int(key) < len(node.value)
+        ):
             found = (node.value[int(key)],) * 2
         if not found:
             break

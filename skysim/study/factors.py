@@ -189,7 +189,7 @@ def pick(options: list[tuple[Any, Settings]], share: float) -> tuple[Value, Sett
 
 def kind_of(value: Any) -> str:
     """Which sort of factor is meant, so that a slip in one is not answered with another's keys."""
-    keys = value if isinstance(value, dict) else vars(value)
+    keys = value if isinstance(value, dict) else getattr(value, "__dict__", {})
     for name in ("levels", "values", "distribution"):
         if name in keys:
             return name

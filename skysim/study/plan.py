@@ -21,7 +21,7 @@ from skysim.study.designs import Design, Point, points
 from skysim.study.factors import Factor, Settings, Value
 from skysim.trackers import OWN, known
 from skysim.types import BadInput
-from skysim.yamlfile import explain, line_of, of_our_version, put, read_yaml
+from skysim.yamlfile import explain, is_file, line_of, of_our_version, put, read_yaml
 
 STUDIES = SCENES / "studies"
 TRIAL = "trial."
@@ -347,7 +347,7 @@ def resolved(recipe: Recipe, settings: Settings) -> tuple[Scene, CentroidTrial |
         keys = ".".join(str(key) for key in fault["loc"] if key not in ("centroids", "frames", "flight"))
         raise BadInput(f"{keys}: {fault['input']!r}: {fault['msg'].removeprefix('Value error, ')}") from None
     beside = Path(recipe.folder) / name
-    path = beside if beside.suffix in {".yaml", ".yml"} and beside.is_file() else find_scene(name)
+    path = beside if beside.suffix in {".yaml", ".yml"} and is_file(beside) else find_scene(name)
     return load_scene(path, scene_keys), trial
 
 

@@ -1,0 +1,162 @@
+"""Every parser against files that nobody wrote by hand: read, or refused in one line."""
+
+from __future__ import annotations
+
+import gzip
+import io as streams
+from collections.abc import Callable
+from pathlib import Path
+from random import Random
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as some
+
+from benchmarks.hostilefiles import promise
+from fuzz.__main__ import NAMES, mutated, seeds
+from fuzz.targets import TARGETS, refused
+from skysim import io, layout, photometry, picturefile, pointcloud, scene, yamlfile
+from skysim.psf import cells_of
+from skysim.types import BadInput
+
+AS_IT_IS = settings(
+    max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+
+
+def test_every_target_has_a_corpus() -> None:
+    assert list(TARGETS) == list(NAMES)
+    assert all(seeds(name) for name in NAMES)
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("files", [15, pytest.param(3000, marks=pytest.mark.long)])
+def test_what_grew_from_the_corpus_is_read_or_refused_in_one_line(name: str, files: int) -> None:
+    rng, corpus = Random(2026), seeds(name)
+    for data in corpus:
+        TARGETS[name](data)
+    for _ in range(files):
+        TARGETS[name](mutated(rng.choice(corpus), corpus, rng))
+
+
+# YAML
+
+
+@pytest.mark.parametrize(
+    ("text", "what"),
+    [
+        (
+            "\n".join(f"a{n}: &a{n} [{', '.join([f'*a{n - 1}' if n else 'x'] * 9)}]" for n in range(9)),
+            "values",
+        ),
+        ("a: " + "[" * 60 + "]" * 60, "sections deep"),
+        ("a: &a [*a]", "an alias of what it stands in"),
+        ("a: 2001-99-99", "is no timestamp"),
+        ("a: " + "9" * 5000, "is no int"),
+        ("a: !!python/name:os.system", "tag"),
+    ],
+    ids=["laughs", "deep", "itself", "date", "digits", "code"],
+)
+def test_yaml_that_is_more_than_it_seems_is_refused(tmp_path: Path, text: str, what: str) -> None:
+    (tmp_path / "x.yaml").write_text(text)
+    with pytest.raises(BadInput, match=rf"x\.yaml, line \d: not YAML: .*{what}"):
+        yamlfile.read_yaml(tmp_path / "x.yaml")
+
+
+def test_yaml_keeps_aliases_and_merges(tmp_path: Path) -> None:
+    text = "a: &a {b: 1, c: [2, 3]}\nd: {<<: *a, b: 4}\ne: *a\n"
+    _, values = yamlfile.composed(text)
+    assert values == {"a": {"b": 1, "c": [2, 3]}, "d": {"b": 4, "c": [2, 3]}, "e": {"b": 1, "c": [2, 3]}}
+
+
+def test_a_yaml_file_of_megabytes_is_refused_unread(tmp_path: Path) -> None:
+    (tmp_path / "x.yaml").write_bytes(b"#" * (yamlfile.MOST_BYTES + 1))
+    with pytest.raises(BadInput, match=f"{yamlfile.MOST_BYTES + 1} bytes; allowed: up to"):
+        yamlfile.read_yaml(tmp_path / "x.yaml")
+
+
+@pytest.mark.parametrize(
+    "told", [{"exposure.frames": "1000000000"}, {"exposure.frames": "5000", "exposure.rate_hz": "0.01"}]
+)
+def test_a_flight_that_no_memory_holds_is_refused(told: dict[str, str]) -> None:
+    with pytest.raises(BadInput, match="allowed: up to 1000000, over a day"):
+        scene.load("shefex2", told)
+
+
+@settings(max_examples=8, deadline=None)
+@given(some.dictionaries(some.text(min_size=1, max_size=30), some.text(max_size=30), max_size=3))
+def test_any_override_is_taken_or_refused(told: dict[str, str]) -> None:
+    refused(lambda: scene.load("shefex2", told), BadInput)
+
+
+# Tables
+
+
+TABLES: dict[str, Callable[[Path], object]] = {
+    "a, b, c": lambda path: pointcloud.read(str(path), "m"),
+    "x_m,y_m,z_m,magnitude": layout.read_csv,
+    "azimuth_deg,tilt_deg,level": layout.read_csv,
+    "wavelength_nm,response": photometry._read,
+    "1,2,3": lambda path: cells_of(str(path)),
+}
+
+
+@pytest.mark.filterwarnings("ignore:loadtxt")
+@pytest.mark.parametrize("head", TABLES)
+@AS_IT_IS
+@given(some.lists(some.lists(some.floats() | some.text(max_size=6), max_size=5), max_size=3))
+def test_any_table_is_read_or_refused(
+    tmp_path_factory: pytest.TempPathFactory, head: str, rows: list[list[object]]
+) -> None:
+    """Points of a dome, LEDs, a quantum efficiency, a point-spread function."""
+    path = tmp_path_factory.mktemp("table") / "x.csv"
+    path.write_text("\n".join([head, *(",".join(map(str, row)) for row in rows)]), encoding="utf-8")
+    refused(lambda: TABLES[head](path), BadInput)
+
+
+# Pictures that promise too much
+
+
+@pytest.mark.parametrize("side", [20_000, 60_000])
+@pytest.mark.parametrize("suffix", [".png", ".bmp", ".tiff", ".jpg", ".fits"])
+def test_a_header_of_gigapixels_is_refused_by_itself(tmp_path: Path, suffix: str, side: int) -> None:
+    path = tmp_path / f"x{suffix}"
+    path.write_bytes(promise(suffix, side, side) + b"\0" * 999)
+    with pytest.raises(BadInput, match=r"\d+x\d+ pixels by its header; allowed: up to 268435456|truncated"):
+        io.read_image(path)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".bmp", ".tiff", ".jpg"])
+def test_sizes_are_read_as_opencv_writes_them(suffix: str, tmp_path: Path) -> None:
+    import cv2
+
+    data = cv2.imencode(suffix, np.zeros((30, 41), np.uint8))[1].tobytes()
+    read = next(told for magic, told in picturefile.FORMATS.items() if data.startswith(magic))
+    assert list(read(data)) == [(41, 30)]
+
+
+@pytest.mark.parametrize("kind", ["stream", "tiles"])
+def test_fits_that_unpacks_to_gigapixels_is_refused(tmp_path: Path, kind: str) -> None:
+    """Two gigapixels of zeros in some kilobytes: gzipped, or with a table of tiles that claims them."""
+    path = tmp_path / "x.fits"
+    if kind == "stream":
+        path.write_bytes(gzip.compress(promise(".fits", 40_000, 50_000) + b"\0" * 2880))
+    else:
+        told = streams.BytesIO()
+        fits.HDUList([fits.PrimaryHDU(), fits.CompImageHDU(np.zeros((20, 20), np.int16))]).writeto(told)
+        data = told.getvalue()
+        for key, of in (("ZNAXIS1", 40_000), ("ZNAXIS2", 50_000)):
+            at = data.index(key.encode())
+            data = data[: at + 10] + f"{of:20d}".encode() + data[at + 30 :]
+        path.write_bytes(data)
+    with pytest.raises(BadInput, match=r"50000x40000 pixels by its header|not a whole FITS"):
+        io.read_image(path)
+
+
+def test_a_format_that_opencv_knows_and_nobody_asked_for_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "x.png").write_bytes(b"P5 2 2 255\n" + bytes(4))  # portable graymap
+    with pytest.raises(BadInput, match="cannot be decoded"):
+        io.read_image(tmp_path / "x.png")
