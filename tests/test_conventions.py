@@ -229,7 +229,8 @@ def test_a_tilt_moves_an_apex_led_the_way_worked_out_by_hand():
 
 def test_no_code_comes_out_of_data():
     """YAML by the safe loader, arrays and results without pickle, and nothing that runs a text."""
-    banned = r"\b(yaml\.(unsafe_|full_)?load\((?!.*, Loader\))|pickle\b|marshal\b|shelve\b|allow_pickle=True|(?<![.\w])(eval|exec)\()"
+    loads = r"yaml\.(unsafe_|full_)?load\((?!.*, Loader\))|pickle\b|marshal\b|shelve\b|allow_pickle=True"
+    banned = rf"\b({loads}|(?<![.\w])(eval|exec)\()"
     found = [
         f"{path.relative_to(ROOT)}:{number}: {line.strip()}"
         for room in ("skysim", "estimator")
