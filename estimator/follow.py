@@ -135,7 +135,7 @@ class Follower:
         lights = tracker.lights(centroids, sigma_px)
         reach_rad = self.reach_px / tracker.camera.focal_px
         gates = np.full(len(centroids), 1.5 * reach_rad)  # a window's corner
-        guess = starproof.weigh(lights, tracker.sky, predicted.as_matrix(), 1.0, gates)
+        guess = starproof.weigh(lights, tracker.sky, predicted.as_matrix(), 1.0, gates, -np.inf)
         # The prediction has spared the search all attitudes but those within its reach.
         half = float(np.min(tracker.field[1::2] - tracker.field[::2])) / 2
         spared = log10(8 * pi**2 / ((2 * reach_rad) ** 2 * min(2 * reach_rad / half, 2 * pi)))

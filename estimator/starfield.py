@@ -37,6 +37,7 @@ from estimator.types import Floats
 ACCEPT_DEX = 4.0
 DECISIVE_DEX = 10.0  # evidence beyond which no rival is looked for
 MARGIN_DEX = 3.0  # by which the answer must beat every other attitude
+NO_RIVAL_DEX = ACCEPT_DEX - MARGIN_DEX  # of less evidence an attitude is neither the answer nor in its way
 AGAIN, AGAIN_LEAST = (
     2,
     2000,
@@ -44,6 +45,9 @@ AGAIN, AGAIN_LEAST = (
 LONG = 0.2  # of the field: pairs as long as that say where the other stars are
 MAG_GATE = (
     4.0  # standard deviations by which a light's magnitude may differ from its star's, in the first round
+)
+WEIGH_CHECKS = (
+    6  # what weighing an attitude counts for beside looking up a light: a frame with no answer must end
 )
 PATIENCE = 4  # lights without a star, before an attitude is given up in the first round
 
@@ -66,7 +70,8 @@ def lost_in_space(lights: Lights, patterns: Sky, stars: Sky, base_lights: int, m
     found = search(head, patterns, max_checks)
     if found.dex < ACCEPT_DEX:
         return fixed(lights, stars, nothing())
-    whole = weigh(lights, stars, found.R_cam_from_ref.copy(), found.zoom, 1.5 * GATE * lights.sigma)
+    gates = 1.5 * GATE * lights.sigma
+    whole = weigh(lights, stars, found.R_cam_from_ref.copy(), found.zoom, gates, -np.inf)
     if 2 * len(whole.observed) <= len(found.observed):
         return fixed(lights, stars, nothing())
     best = Guess(
@@ -83,7 +88,7 @@ def search(lights: Lights, sky: Sky, max_checks: int) -> Guess:
     light that has been tried goes back. A first round gives an attitude up after PATIENCE lights without a star, so
     that false pairs cost little, and passes over stars of another magnitude; a second one looks at all. An attitude
     that is beyond chance and not decisive is held against what other pairs find, AGAIN times the effort so far.
-    max_checks bounds the lights looked up.
+    max_checks bounds the lights looked up, and WEIGH_CHECKS for each attitude weighed.
     """
     total = len(lights.sigma)
     length, rare = _lengths(lights), _rarity(lights, sky)
@@ -218,7 +223,8 @@ def _attempt(lights: Lights, sky: Sky, a: int, b: int, patience: int, known: Gue
                 )
                 checks[0] += 1 + looked
                 if fits:
-                    guess = weigh(lights, sky, R_ref_from_cam.T.copy(), zoom, gates)
+                    checks[0] += WEIGH_CHECKS
+                    guess = weigh(lights, sky, R_ref_from_cam.T.copy(), zoom, gates, NO_RIVAL_DEX)
                     if guess.dex >= ACCEPT_DEX and not _alike(guess, known):
                         return guess
                     if guess.dex > best.dex:

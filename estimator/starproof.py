@@ -113,20 +113,30 @@ def turned(matrix: Floats, u: vectors.Vector) -> vectors.Vector:
 
 
 @numba.njit(cache=True, error_model="numpy")
-def weigh(lights: Lights, sky: Sky, R_cam_from_ref: Floats, zoom: float, gates: Floats) -> Guess:
-    """Match the field at an attitude (turned in place), fit it to the matches, twice, and weigh what they match."""
+def weigh(
+    lights: Lights, sky: Sky, R_cam_from_ref: Floats, zoom: float, gates: Floats, floor_dex: float
+) -> Guess:
+    """Match the field at an attitude (turned in place), fit it to the matches, twice, and weigh what they match.
+
+    Nothing where the evidence is below floor_dex, or would be though every match were exact and no star missed: that
+    is seen before most of the work.
+    """
     R, info = R_cam_from_ref, np.zeros((4, 4))
     own = GATE * lights.sigma
     for turn in range(3):
         observed, star = _match(lights, sky, R, zoom, gates if turn == 0 else own)
         if len(observed) < LEAST:
             return nothing()
+        if turn == 1 and _evidence(lights, sky, R, zoom, observed, star, 0, info, False) < floor_dex:
+            return nothing()
         if turn < 2:
             zoom = _fit(lights, sky, R, zoom, observed, star, info)
             if abs(zoom - 1) > 1.2 * lights.zoom + 1e-12:
                 return nothing()
+    if _evidence(lights, sky, R, zoom, observed, star, 0, info, True) < floor_dex:
+        return nothing()
     missed = _missed(lights, sky, R, zoom, observed, star)
-    dex = _evidence(lights, sky, R, zoom, observed, star, missed, info)
+    dex = _evidence(lights, sky, R, zoom, observed, star, missed, info, True)
     return Guess(observed, star, R, zoom, info, dex)
 
 
@@ -244,6 +254,7 @@ def _evidence(
     star: NDArray,
     missed: int,
     info: Floats,
+    misfit: bool,
 ) -> float:
     """How many powers of ten more probable the lights are at this attitude than fallen anywhere (Bayes' factor).
 
@@ -251,6 +262,7 @@ def _evidence(
     many of the stars are seen and so many are not is B(m + 1, k + 1), every share being as probable before; and the
     attitude is one among all: sqrt(2 pi)^n / sqrt(det info) of their volume (Laplace's integral over it). Among lights
     that fell anywhere evidence beyond 10^x for any attitude is met once in 10^x frames at most (Markov's inequality).
+    misfit : whether the residuals count; without them it is the most that these matches could be worth
     """
     count = 4 if lights.zoom > 0 else 3
     factor = info[:count, :count].copy()
@@ -266,7 +278,7 @@ def _evidence(
         x, y, _ = predicted(vectors_ref, R, star[k])
         variance = sigma[observed[k]] ** 2
         off2 = (tangent[observed[k], 0] - zoom * x) ** 2 + (tangent[observed[k], 1] - zoom * y) ** 2
-        total -= off2 / variance / 2 / log(10.0) + log10(2 * pi * variance * density)
+        total -= misfit * off2 / variance / 2 / log(10.0) + log10(2 * pi * variance * density)
         total += _mag_dex(lights, sky, observed[k], star[k], as_bright)
     seen = float(len(observed))
     return total + (lgamma(seen + 1) + lgamma(missed + 1.0) - lgamma(seen + missed + 2)) / log(10.0)
