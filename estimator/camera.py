@@ -136,7 +136,5 @@ def undistorted(
 def check_shape(image_shape: tuple[int, ...], camera: Camera) -> None:
     """Raise BadImage unless the image is the camera's."""
     if image_shape != (camera.height_px, camera.width_px):
-        height, width = image_shape[:2]
-        raise BadImage(
-            f"the image is {width}x{height} pixels; this camera's are {camera.width_px}x{camera.height_px}"
-        )
+        size = "x".join(map(str, image_shape[1::-1])) if len(image_shape) >= 2 else image_shape
+        raise BadImage(f"the image is {size} pixels; this camera's are {camera.width_px}x{camera.height_px}")

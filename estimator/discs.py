@@ -21,7 +21,7 @@ MODEL_PX = 0.004  # what a square pixel at a curved edge differs from the model:
 X, Y, RADIUS, EDGE, BRIGHT, SKY = range(6)
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def fit_all(
     image: NDArray,
     xy: Floats,
@@ -64,7 +64,7 @@ def fit_all(
     return out
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def _largest_window(boxes: Ints) -> int:
     """Pixels of the largest blob's window."""
     most = 0

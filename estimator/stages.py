@@ -19,6 +19,7 @@ from estimator.types import Attitude, BadImage, Blobs, Centroids, Floats, Ints
 SATURATED = "the frame is saturated"
 # A plateau's edge falls by whole pixels: 0.01 to 0.07 by Monte Carlo, as it is cut off deeper.
 SATURATED_SIGMA_PX = 0.05
+VAGUE_PX = 5.0  # a light of so great an error may be any star, and costs the search more than it can tell
 MENDED_SIGMA_PX = 0.06  # of a star on a bad pixel, for the guess at what that would have held: Monte Carlo
 
 
@@ -107,7 +108,7 @@ def see(
     centroids = CENTROIDERS[settings.centroider](image, blobs, settings.gain_e_dn, hints)
     centroids = doubted(centroids, blobs, settings)
     clock.lap("centroid")
-    sound = camera.contains(centroids.xy_px) & np.isfinite(centroids.sigma_px) & (centroids.flux > 0)
+    sound = camera.contains(centroids.xy_px) & (centroids.sigma_px < VAGUE_PX) & (centroids.flux > 0)
     return centroids if sound.all() else centroids.take(sound)
 
 

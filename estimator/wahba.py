@@ -18,6 +18,7 @@ Quaternion = tuple[float, float, float, float]
 
 # Least squared sine of the angle between the first direction and any other: 13 arcsec.
 PARALLEL = 4e-9
+UNIT = 1e-2  # a squared length farther from 1 is no direction's
 POLISHES = 30
 RESTING = 1e-26  # squared radians: a step that changes no digit
 
@@ -38,7 +39,7 @@ def weights(sigma_rad: Floats) -> Floats:
     """(N,) 1 / sigma^2. Raises ValueError for a sigma that is not finite and above 0."""
     out = np.empty(len(sigma_rad))
     for n in range(len(out)):
-        if not (sigma_rad[n] > 0 and isfinite(sigma_rad[n])):
+        if not 1e-150 < sigma_rad[n] < 1e150:  # whose square is a number too
             raise ValueError("a sigma_rad is not usable; allowed: finite, above 0")
         out[n] = 1 / sigma_rad[n] ** 2
     return out
@@ -50,9 +51,11 @@ def profile(cam: Floats, ref: Floats, weight: Floats) -> Floats:
     if len(cam) < 2:
         raise ValueError("all vectors are parallel: fewer than two directions leave the roll unknown")
     B = np.zeros((3, 3))
-    apart, total = 0.0, 0.0
+    apart, total, off = 0.0, 0.0, 0.0
     for n in range(len(cam)):
         total += weight[n]
+        off = max(off, abs(cam[n, 0] ** 2 + cam[n, 1] ** 2 + cam[n, 2] ** 2 - 1))
+        off = max(off, abs(ref[n, 0] ** 2 + ref[n, 1] ** 2 + ref[n, 2] ** 2 - 1))
         apart = max(apart, min(_sine2(cam, 0, n), _sine2(ref, 0, n)))
         for i in range(3):
             for j in range(3):
@@ -64,6 +67,8 @@ def profile(cam: Floats, ref: Floats, weight: Floats) -> Floats:
             entries += B[i, j]
     if not isfinite(entries):
         raise ValueError("a direction is NaN or infinite; allowed: unit vectors")
+    if off > UNIT:
+        raise ValueError("a direction is not of unit length; allowed: unit vectors")
     if apart < PARALLEL:
         raise ValueError(
             "all vectors are parallel: the roll about them is unknown; two directions are needed"

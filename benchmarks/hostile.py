@@ -1,0 +1,392 @@
+"""Pictures that are no sky of ours: how `skysim solve` takes them. `python -m benchmarks.hostile [COUNT] [SEED]`.
+
+Each is a file: noise, stripes, text, lights that repeat, skies in a mirror, headers that lie, bytes that are no
+picture. None may be answered, but for a frame of two skies at once, which may be answered by either. Nothing may raise,
+take more than 2 s of a processor a megapixel (a megapixel at least) or more memory than ten of the decoded frames and
+64 MiB. Most are told the camera or the field of view; one in 400 is searched at all focal lengths.
+"""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from benchmarks.frames import LIEBE_E, Sight, paint, photograph
+from benchmarks.hostilefiles import encoded, promise
+from estimator import catalog
+from estimator.camera import Camera
+from skysim import io, scene, sky, solve
+from skysim.scene import CATALOGUES
+from skysim.terminal import progress
+
+LIMIT_S_PER_MPX, MEMORY_FRAMES, MEMORY_FLOOR = 2.0, 10, 64 << 20
+WRONG_RAD = np.radians(10 / 60)
+CAMERA_FILE, FOV_DEG, WIDTH, HEIGHT = scene.SCENES / "shefex2.yaml", 14.87, 659, 493
+SMALL, LARGE = (240, 320), (4096, 4096)
+USUAL = ((HEIGHT, WIDTH), SMALL, LARGE)
+DEPTH = 4095
+SEARCHED = 1 / 400  # told neither camera nor field of view
+Rng = np.random.Generator
+Skies = tuple[Rotation, ...]  # the attitudes that a picture shows
+
+
+@dataclass(frozen=True)
+class Shot:
+    """A picture, or a file's bytes; its ending; the attitudes with which it may be answered."""
+
+    picture: NDArray | None
+    suffix: str = ".png"
+    data: bytes = b""
+    skies: Skies = ()
+
+
+@dataclass
+class Tally:
+    """What became of the pictures of a family."""
+
+    looked: int = 0
+    right: int = 0
+    defects: list[str] = field(default_factory=list)
+    worst_s: float = 0.0
+    most_frames: float = 0.0
+
+
+# The families, each a picture from a random stream
+
+
+def size(rng: Rng) -> tuple[int, int]:
+    """That of the camera, or a small one."""
+    return (HEIGHT, WIDTH) if rng.uniform() < 0.5 else SMALL
+
+
+def noise(rng: Rng) -> Shot:
+    shape, kind = size(rng), rng.integers(5)
+    if kind == 0:
+        return Shot(rng.poisson(rng.uniform(1, 400), shape).astype(np.uint16))
+    if kind == 1:
+        return Shot(np.clip(rng.normal(300, 60, shape), 0, DEPTH).astype(np.uint16))
+    if kind == 2:
+        return Shot(rng.integers(0, DEPTH + 1, shape, dtype=np.uint16))
+    if kind == 3:  # salt and pepper
+        share = 10 ** rng.uniform(-5, -1)
+        return Shot(np.where(rng.uniform(size=shape) < share, DEPTH, 100).astype(np.uint16))
+    clouds = cv2.GaussianBlur(rng.normal(size=shape), (0, 0), rng.uniform(1, 20))
+    return Shot(np.clip(500 + 2000 * clouds, 0, DEPTH).astype(np.uint16))
+
+
+def stripes(rng: Rng) -> Shot:
+    y, x = np.indices(size(rng))
+    along = x * np.cos(turn := rng.uniform(0, np.pi)) + y * np.sin(turn)
+    wave = np.sin(2 * np.pi * along / rng.uniform(2, 80))
+    if rng.uniform() < 0.3:
+        wave = wave * np.sin(2 * np.pi * (x - y) / rng.uniform(2, 80))
+    if rng.uniform() < 0.4:
+        wave = np.sign(wave)
+    return Shot(speckled(1000 + rng.uniform(10, 900) * wave, rng))
+
+
+def gradients(rng: Rng) -> Shot:
+    y, x = np.indices(size(rng)) / WIDTH
+    lamp = np.hypot(x - rng.uniform(), y - rng.uniform())
+    slope = rng.uniform(-2000, 2000) * x + rng.uniform(-2000, 2000) * y
+    return Shot(speckled(2000 + slope + 1500 * np.exp(-lamp / rng.uniform(0.01, 1)), rng))
+
+
+def text(rng: Rng) -> Shot:
+    page = np.zeros(size(rng), np.uint8)
+    for _ in range(rng.integers(1, 30)):
+        word = "".join(map(chr, rng.integers(33, 127, rng.integers(1, 40))))
+        at = tuple(int(one) for one in rng.integers(0, page.shape[::-1]))
+        cv2.putText(page, word, at, int(rng.integers(8)), rng.uniform(0.2, 1.5), int(rng.integers(1, 256)), 1)
+    return Shot(speckled(100 + 15.0 * page, rng))
+
+
+def scattered(rng: Rng) -> Shot:
+    """Lights that fell anywhere, as bright as stars are, few and many."""
+    count = int(rng.choice([3, 6, 12, 25, 60, 200]))
+    return Shot(lit(rng.uniform(0, [WIDTH, HEIGHT], (count, 2)), star_light(count, rng), rng))
+
+
+def repeated(rng: Rng) -> Shot:
+    """A few lights again and again on a lattice, as panels of LEDs and ghosts of windows are."""
+    across, down = rng.uniform(30, 200, 2)
+    cell = rng.uniform(0, [across, down], (rng.integers(1, 8), 2))
+    steps = np.stack(np.meshgrid(np.arange(-1, 25), np.arange(-1, 20)), axis=-1).reshape(-1, 2)
+    turn = rng.uniform(0, np.pi / 2)
+    lean = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    xy = (steps[:, None] * [across, down] + cell).reshape(-1, 2) @ (
+        np.eye(2) if rng.uniform() < 0.5 else lean
+    )
+    light = np.tile(star_light(len(cell), rng), len(steps))
+    return Shot(lit(xy, light, rng))
+
+
+def duplicated(rng: Rng) -> Shot:
+    """Two skies at once: a lens that was bumped, or one sky over another. Either may be the answer."""
+    one, there = starry(rng)
+    if rng.uniform() < 0.5:
+        shift = rng.integers(-40, 41, 2)
+        moved = np.roll(one, shift, (0, 1))
+        ground = np.median(one)
+        turned = Rotation.from_rotvec(np.array([-shift[0], shift[1], 0]) / camera().focal_px) * there
+        return Shot(np.clip(one + (moved - ground), 0, DEPTH).astype(np.uint16), skies=(there, turned))
+    other, elsewhere = starry(rng)
+    return Shot(np.clip(one + other - np.median(one), 0, DEPTH).astype(np.uint16), skies=(there, elsewhere))
+
+
+def mirrored(rng: Rng) -> Shot:
+    """No turn of the sky is its mirror image."""
+    picture = starry(rng)[0]
+    return Shot(np.ascontiguousarray(picture[:, ::-1] if rng.uniform() < 0.5 else picture[::-1]))
+
+
+def kaleidoscope(rng: Rng) -> Shot:
+    """Half a mirrored sky and its mirror image; the true half may be recognised."""
+    picture, there = starry(rng)
+    half = picture[:, : WIDTH // 2]
+    return Shot(np.hstack([half, picture[:, WIDTH // 2 : WIDTH // 2 + 1], half[:, ::-1]]), skies=(there,))
+
+
+def shuffled(rng: Rng) -> Shot:
+    """A true sky cut into squares that are dealt out anew."""
+    picture, _ = starry(rng)
+    side = 82
+    cells = [(r, c) for r in range(0, 6 * side, side) for c in range(0, 8 * side, side)]
+    out = picture.copy()
+    for (r, c), n in zip(cells, rng.permutation(len(cells)), strict=True):
+        v, u = cells[n]
+        out[r : r + side, c : c + side] = picture[v : v + side, u : u + side]
+    return Shot(out)
+
+
+def flat(rng: Rng) -> Shot:
+    level = int(rng.choice([0, 1, 2000, DEPTH, 65535]))
+    picture = np.full(size(rng), level, np.uint16)
+    if rng.uniform() < 0.5:  # but for a few
+        at = rng.integers(0, picture.shape, (rng.integers(1, 40), 2))
+        picture[at[:, 0], at[:, 1]] = rng.integers(0, DEPTH)
+    return Shot(picture)
+
+
+def tiny(rng: Rng) -> Shot:
+    shape = tuple(rng.choice([1, 2, 3, 15, 16, 17, 40, 400], 2))
+    return Shot(rng.integers(0, DEPTH, shape, dtype=np.uint16), str(rng.choice([".png", ".tiff"])))
+
+
+def no_numbers(rng: Rng) -> Shot:
+    """Floats that are not finite, or beyond all measure."""
+    picture = rng.normal(100, 10, size(rng)).astype(rng.choice(["f4", "f8"]))
+    at = rng.integers(0, picture.size, rng.integers(1, 50))
+    picture.ravel()[at] = rng.choice([np.nan, np.inf, -np.inf, 3e38, -3e38, 1e-40], len(at))
+    return Shot(picture, ".fits")
+
+
+def broken(rng: Rng) -> Shot:
+    """A whole file with some of its bytes changed, or cut off."""
+    suffix = str(rng.choice([".png", ".tiff", ".jpg", ".bmp", ".fits"]))
+    data = bytearray(encoded(rng.integers(0, 255, (64, 80), dtype=np.uint8), suffix))
+    for _ in range(rng.integers(1, 20)):
+        data[int(rng.integers(0, min(len(data), 3000)))] = int(rng.integers(256))
+    cut = int(rng.integers(0, len(data))) if rng.uniform() < 0.3 else len(data)
+    return Shot(None, suffix, bytes(data[:cut]))
+
+
+def rubbish(rng: Rng) -> Shot:
+    suffix = str(rng.choice(io.IMAGE_SUFFIXES))
+    heads = (b"", b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff", b"BM", b"II*\0", b"MM\0*", b"SIMPLE  = ")
+    return Shot(None, suffix, heads[rng.integers(len(heads))] + rng.bytes(int(rng.integers(0, 5000))))
+
+
+def promises(rng: Rng) -> Shot:
+    """A header of a great picture and a body that ends."""
+    side = int(rng.choice([20_000, 60_000, 2**30]))
+    suffix = str(rng.choice([".png", ".bmp", ".tiff", ".jpg", ".fits"]))
+    return Shot(None, suffix, promise(suffix, side, side) + rng.bytes(int(rng.integers(0, 3000))))
+
+
+def large(rng: Rng) -> Shot:
+    """Sixteen megapixels of noise, or of lights."""
+    picture = rng.integers(90, 110, LARGE, dtype=np.uint16)
+    at = rng.integers(8, 4088, (rng.integers(0, 500), 2))
+    for dy, dx, share in [(0, 0, 1.0), (0, 1, 0.6), (1, 0, 0.6), (1, 1, 0.4)]:
+        picture[at[:, 0] + dy, at[:, 1] + dx] = int(2000 * share)
+    return Shot(picture, ".tiff")
+
+
+Family = Callable[[Rng], Shot]
+# How often each comes up.
+FAMILIES: dict[Family, float] = {
+    **dict.fromkeys((noise, stripes, gradients, text, scattered, repeated), 10),
+    **dict.fromkeys((duplicated, kaleidoscope, shuffled), 4),
+    mirrored: 12,
+    **dict.fromkeys((flat, tiny, no_numbers, broken, rubbish, promises), 4),
+    large: 0.05,
+}
+
+
+# What they are made of
+
+
+@lru_cache
+def camera() -> Camera:
+    return solve.make_solver(None, CAMERA_FILE).beliefs(WIDTH, HEIGHT)[0][0]
+
+
+@lru_cache
+def stars() -> catalog.StarList:
+    """As the solvers see them, who leave aberration out of pictures without a date."""
+    return catalog.brighter(catalog.read(CATALOGUES / "hipparcos_hp6.5.ecsv"), 7.0)
+
+
+def starry(rng: Rng) -> tuple[NDArray, Rotation]:
+    """A true sky, and its attitude."""
+    return photograph(Sight("", camera(), LIEBE_E, 7.0, 60, 15, 16, DEPTH), stars(), rng)
+
+
+def star_light(count: int, rng: Rng) -> NDArray:
+    """Digital numbers of lights as bright as the catalogue's stars."""
+    return LIEBE_E / 16 * 10 ** (-0.4 * rng.choice(stars().v_mag[:4000], count))
+
+
+def lit(xy_px: NDArray, light_dn: NDArray, rng: Rng) -> NDArray:
+    """Gaussian lights over a sky."""
+    picture = np.full((HEIGHT, WIDTH), 20.0)
+    inside = np.all((xy_px > 0) & (xy_px < [WIDTH, HEIGHT]), axis=1)
+    paint(picture, xy_px[inside], light_dn[inside], np.zeros((int(inside.sum()), 2)), 0.7)
+    return speckled(picture, rng)
+
+
+def speckled(picture: NDArray, rng: Rng) -> NDArray:
+    return np.clip(picture + rng.normal(0, 1.5, picture.shape), 0, DEPTH).astype(np.uint16)
+
+
+# How they are taken
+
+
+@dataclass
+class Judge:
+    """The solvers, and a folder for the files."""
+
+    folder: Path
+    solvers: dict[str, dict[tuple[int, ...], solve.Solver]] = field(default_factory=dict)
+
+    def solver(self, told: str, shape: tuple[int, ...]) -> solve.Solver:
+        """One for each usual size, whose trackers take seconds to build, and one for all others."""
+        shape = shape if shape in USUAL else ()
+        how = {"camera": (None, CAMERA_FILE), "field": (FOV_DEG, None), "nothing": (None, None)}[told]
+        kept = self.solvers.setdefault(told, {})
+        if shape not in kept:
+            kept[shape] = solve.make_solver(*how)
+            if shape:
+                list(kept[shape].trackers(*shape[::-1], None))
+        return kept[shape]
+
+    def take(self, n: int, seed: int) -> tuple[str, Shot, dict, float, float]:
+        """Picture number n: its family, the answer, the seconds, and the memory in frames."""
+        rng = np.random.default_rng([seed, n])
+        weight = np.array(list(FAMILIES.values()))
+        family = list(FAMILIES)[rng.choice(len(FAMILIES), p=weight / weight.sum())]
+        shot = family(rng)
+        fits_camera = shot.picture is not None and shot.picture.shape == (HEIGHT, WIDTH)
+        told = "camera" if fits_camera and rng.uniform() < 0.8 else "field"
+        told = "nothing" if rng.uniform() < SEARCHED else told
+        path = self.folder / f"{family.__name__}{shot.suffix}"
+        path.write_bytes(shot.data if shot.picture is None else encoded(shot.picture, shot.suffix))
+        solver = self.solver(told, shot.picture.shape if shot.picture is not None else ())
+        answer, seconds, taken = timed(path, solver)
+        if any(
+            defects(shot, answer | {"told": told}, seconds, taken)
+        ):  # it may have been compiling: once more
+            answer, seconds, taken = timed(path, solver)
+        return family.__name__, shot, answer | {"told": told}, seconds, taken
+
+
+def timed(path: Path, solver: solve.Solver) -> tuple[dict, float, float]:
+    """The answer to a file, seconds of the processor, and bytes beyond the floor."""
+    before = memory("VmRSS", reset=True)
+    begin = time.process_time()
+    try:
+        answer = solve.solve(path, solver, None)
+    except Exception as error:  # which is the defect that is looked for
+        answer = {"status": f"raised {error!r}", "raised": True}
+    seconds = time.process_time() - begin
+    return answer, seconds, max(memory("VmHWM") - before - MEMORY_FLOOR, 0)
+
+
+def memory(key: str, reset: bool = False) -> int:
+    """Bytes of memory held now (VmRSS), or the most since the last reset (VmHWM); Linux only, else 0."""
+    try:
+        if reset:
+            Path("/proc/self/clear_refs").write_text("5")
+        lines = Path("/proc/self/status").read_text().splitlines()
+    except OSError:
+        return 0
+    return next(1024 * int(line.split()[1]) for line in lines if line.startswith(key))
+
+
+def wrong(answer: dict, skies: Skies) -> bool:
+    """An attitude that the picture does not show."""
+    if answer.get("ra_deg") is None:
+        return False
+    told = sky.cam_from_icrs(answer["ra_deg"], answer["dec_deg"], answer["roll_deg"])
+    return all((told * one.inv()).magnitude() > WRONG_RAD for one in skies)
+
+
+def judged(count: int, seed: int, quiet: bool = True) -> dict[str, Tally]:
+    """What became of so many pictures, by family."""
+    tallies: dict[str, Tally] = {}
+    with tempfile.TemporaryDirectory() as folder:
+        judge = Judge(Path(folder))
+        for n in progress(range(count), count, "hostile pictures", quiet):
+            try:
+                name, shot, answer, seconds, taken = judge.take(n, seed)
+            except KeyboardInterrupt:  # what was seen so far is told
+                break
+            tally = tallies.setdefault(name, Tally())
+            tally.looked += 1
+            tally.defects += (f"{n}: {one}" for one in defects(shot, answer, seconds, taken))
+            tally.right += answer.get("ra_deg") is not None
+            tally.worst_s = max(tally.worst_s, seconds)
+            if shot.picture is not None:
+                tally.most_frames = max(tally.most_frames, taken / shot.picture.nbytes)
+    return tallies
+
+
+def defects(shot: Shot, answer: dict, seconds: float, taken: float) -> Iterator[str]:
+    """What is wrong with how a picture was taken."""
+    pixels, held = (shot.picture.size, shot.picture.nbytes) if shot.picture is not None else (0, 0)
+    if answer.get("raised"):
+        yield answer["status"]
+    if "\n" in answer["status"]:
+        yield f"more than a line: {answer['status']!r}"
+    if wrong(answer, shot.skies):
+        yield f"WRONG ATTITUDE {answer}"
+    if seconds > LIMIT_S_PER_MPX * max(pixels / 1e6, 1):
+        yield f"SLOW {seconds:.1f} s, told {answer['told']}"
+    if taken > MEMORY_FRAMES * held:
+        yield f"MEMORY {taken / 2**20:.0f} MiB beyond the first {MEMORY_FLOOR >> 20}"
+
+
+if __name__ == "__main__":
+    count, seed = (int(one) for one in (sys.argv[1:3] + ["10000", "1"][len(sys.argv[1:3]) :]))
+    begin = time.perf_counter()
+    told = judged(count, seed, quiet=False)
+    print(f"{'':14s} {'pictures':>8s} {'a true sky':>10s} {'defects':>8s} {'worst s':>8s} {'frames':>7s}")
+    for name, one in told.items():
+        print(
+            f"{name:14s} {one.looked:8d} {one.right:10d} {len(one.defects):8d}"
+            f" {one.worst_s:8.2f} {one.most_frames:7.1f}"
+        )
+        print(*(f"    {line}" for line in one.defects[:20]), sep="\n", end="\n" if one.defects else "")
+    looked = sum(one.looked for one in told.values())
+    print(f"{looked} pictures, {(time.perf_counter() - begin) / looked:.3f} s each")
