@@ -18,6 +18,7 @@ LEAST = 3  # matches
 MAG_ODD = (
     0.05  # of the stars have another magnitude than the catalogue's: variables, doubles, what a filter does
 )
+TOLL_DEX = 0.5  # for each light of no star, as bright as those matched, by which these outnumber the matches
 INNER = 0.97  # of the field: a star nearer to its border may be cut off, which is no reason to miss it
 
 
@@ -262,6 +263,7 @@ def _evidence(
     many of the stars are seen and so many are not is B(m + 1, k + 1), every share being as probable before; and the
     attitude is one among all: sqrt(2 pi)^n / sqrt(det info) of their volume (Laplace's integral over it). Among lights
     that fell anywhere evidence beyond 10^x for any attitude is met once in 10^x frames at most (Markov's inequality).
+    So much for strangers up to half of the lights; more of them are less and less likely (TOLL_DEX).
     misfit : whether the residuals count; without them it is the most that these matches could be worth
     """
     count = 4 if lights.zoom > 0 else 3
@@ -281,6 +283,7 @@ def _evidence(
         total -= misfit * off2 / variance / 2 / log(10.0) + log10(2 * pi * variance * density)
         total += _mag_dex(lights, sky, observed[k], star[k], as_bright)
     seen = float(len(observed))
+    total -= TOLL_DEX * max(observed.max() + 1 - 2 * seen, 0.0)
     return total + (lgamma(seen + 1) + lgamma(missed + 1.0) - lgamma(seen + missed + 2)) / log(10.0)
 
 

@@ -24,7 +24,7 @@ NO_STARS = "too few stars detected"
 NO_MATCH = "no identification beyond chance"
 LEAST_ERROR_PX = 0.02  # of a star, for what no calibration knows of
 # By how much lights may be off, in pixels and as a share of the distance from the middle, and how many are looked up
-# before a frame is given up: 200,000 take a hundredth of a second.
+# before a frame is given up: 400,000 take two hundredths of a second.
 Lens = tuple[float, float, int]
 KNOWN_LENS: tuple[Lens, ...] = ((LEAST_ERROR_PX, 0.0, 400_000),)
 UNKNOWN_LENS: tuple[Lens, ...] = ((0.5, 0.0, 200_000), (1.0, 0.005, 1_000_000), (2.0, 0.01, 3_000_000))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -135,3 +137,10 @@ def test_a_mirrored_sky_is_refused(stars: catalog.StarList, frames: int) -> None
         told = eye.solve(picture).attitude.cam_from_ref or Rotation.identity()
         right += (told * there.inv()).magnitude() < hostile.WRONG_RAD
     assert right >= 0.9 * frames
+
+
+def test_four_stars_among_twice_as_many_strangers_are_no_sky(tmp_path: Path) -> None:
+    """A mirrored sky that once had an answer: 4 of 12 lights on stars, a chance of one in ten thousand by itself."""
+    name, shot, answer, _, _ = hostile.Judge(tmp_path).take(68, 14)
+    assert (name, shot.skies) == ("mirrored", ())
+    assert answer["status"] == "no identification beyond chance"
