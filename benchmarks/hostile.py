@@ -158,15 +158,25 @@ def kaleidoscope(rng: Rng) -> Shot:
 
 
 def shuffled(rng: Rng) -> Shot:
-    """A true sky cut into squares that are dealt out anew."""
-    picture, _ = starry(rng)
+    """A true sky cut into squares that are dealt out anew; the sky of a square or two may be recognised."""
+    picture, there = starry(rng)
     side = 82
     cells = [(r, c) for r in range(0, 6 * side, side) for c in range(0, 8 * side, side)]
-    out = picture.copy()
+    out, skies = picture.copy(), []
     for (r, c), n in zip(cells, rng.permutation(len(cells)), strict=True):
         v, u = cells[n]
         out[r : r + side, c : c + side] = picture[v : v + side, u : u + side]
-    return Shot(out)
+        skies.append(carried(np.array([(u, v), (c, r)]) + side / 2) * there)
+    return Shot(out, skies=tuple(skies))
+
+
+def carried(xy_px: NDArray) -> Rotation:
+    """The turn of the camera's frame that takes a small piece at xy_px[0] to xy_px[1], upright as it was."""
+    frames = []
+    for ray in camera().rays(xy_px):
+        x = np.array([ray[2], 0, -ray[0]]) / np.hypot(ray[0], ray[2])
+        frames.append(np.stack([x, np.cross(ray, x), ray], axis=1))
+    return Rotation.from_matrix(frames[1] @ frames[0].T)
 
 
 def flat(rng: Rng) -> Shot:

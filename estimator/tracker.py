@@ -27,7 +27,7 @@ LEAST_ERROR_PX = 0.02  # of a star, for what no calibration knows of
 # before a frame is given up: 400,000 take two hundredths of a second.
 Lens = tuple[float, float, int]
 KNOWN_LENS: tuple[Lens, ...] = ((LEAST_ERROR_PX, 0.0, 400_000),)
-UNKNOWN_LENS: tuple[Lens, ...] = ((0.5, 0.0, 200_000), (1.0, 0.005, 1_000_000), (2.0, 0.01, 3_000_000))
+UNKNOWN_LENS: tuple[Lens, ...] = ((0.5, 0.0, 200_000), (1.0, 0.005, 600_000), (2.0, 0.01, 600_000))
 CORNERS = np.array([[0, 0], [1, 0], [0, 1], [1, 1]])
 SETTINGS = Settings()
 
