@@ -66,9 +66,10 @@ def gaussian_fit(image: NDArray, blobs: Blobs, gain_e_dn: float = 1.0, hints: Hi
 def streak(image: NDArray, blobs: Blobs, gain_e_dn: float = 1.0, hints: Hints = NO_HINTS) -> Centroids:
     """Least-squares fit of a line segment blurred by a Gaussian: its middle is the star at mid-exposure.
 
-    Middle, flux, length, direction, width and sky are free; the start is the hints' streak, else what the frame's
-    blobs share. The ends are `streak_ends`. The covariance is Cramer and Rao's: of a streak of length L it is worse
-    along than across. Frames that are not smeared get `gaussian_fit`, and so do blobs that are no streak.
+    Middle, flux and sky are free; length, direction and width nearly so, about the hints' streak, else what the
+    frame's blobs share. The ends are `streak_ends`. The covariance is Cramer and Rao's, worse along than across, and
+    what noise makes of the ends of a faint one. Frames that are not smeared get `gaussian_fit`; in the others blobs
+    that are no streak get it too, or their centre of gravity where a streak is longer than a round star's window.
     """
     lines = _streaks(image, blobs, gain_e_dn, hints)
     lost = np.isnan(lines[:, 0])
@@ -78,7 +79,9 @@ def streak(image: NDArray, blobs: Blobs, gain_e_dn: float = 1.0, hints: Hints = 
     rows = lines[:, [0, 1, 5, 2]]
     rows[:, 2] = np.sqrt((lines[:, 5] + lines[:, 6]) / 2)
     if lost.any():
-        rows[lost] = _gaussians(image, blobs.take(lost), gain_e_dn, hints)
+        rows[lost] = np.nan
+        if _smear_px(blobs, hints) <= starfit.HALF_PX:  # a longer one does not fit the window of a round star
+            rows[lost] = _gaussians(image, blobs.take(lost), gain_e_dn, hints)
         rows = _or_gravity(rows, image, blobs, gain_e_dn)
         covariance[lost] = rows[lost, 2, None, None] ** 2 * np.eye(2)
     return Centroids(rows[:, :2], rows[:, 2], rows[:, 3], covariance)
@@ -144,12 +147,17 @@ def _gaussians(image: NDArray, blobs: Blobs, gain_e_dn: float, hints: Hints) -> 
 def _streaks(image: NDArray, blobs: Blobs, gain_e_dn: float, hints: Hints) -> Floats:
     """The rows of `streaks.fit_all`; all NaN for a frame that is not smeared."""
     line = hints.streak_px or blobs.streak_px
-    if line is None or np.hypot(*line) < streaks.SHORTEST_PX:
+    if line is None or _smear_px(blobs, hints) < streaks.SHORTEST_PX:
         return np.full((len(blobs), 8), np.nan)
     sky = blobs.background
     return streaks.fit_all(
         native(image), blobs.xy_px, blobs.box_px, sky.level, sky.noise, line, gain_e_dn, hints.saturation
     )
+
+
+def _smear_px(blobs: Blobs, hints: Hints) -> float:
+    """Length of the frame's streaks."""
+    return float(np.hypot(*(hints.streak_px or blobs.streak_px or (0.0, 0.0))))
 
 
 def _or_gravity(rows: Floats, image: NDArray, blobs: Blobs, gain_e_dn: float) -> Floats:

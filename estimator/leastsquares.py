@@ -30,6 +30,15 @@ def normal_equations(rows: Floats, weight: Floats, count: int, normal: Floats) -
 
 
 @numba.njit(cache=True, error_model="numpy")
+def expect(normal: Floats, n: int, off: float, sigma: float) -> None:
+    """Add what is known of parameter n beforehand: that it lies `off` from here, give or take sigma."""
+    last, weight = len(normal) - 1, 1 / sigma**2
+    normal[n, n] += weight
+    normal[last, n] += weight * off
+    normal[last, last] += weight * off**2
+
+
+@numba.njit(cache=True, error_model="numpy")
 def step(normal: Floats, out: Floats) -> float:
     """Gauss-Newton's step from the matrix of `normal_equations`, which keeps Cholesky's factor; NaN if singular.
 

@@ -62,6 +62,7 @@ def lost_in_space(lights: Lights, patterns: Sky, stars: Sky, base_lights: int, m
     head = Lights(
         lights.tangent[:few],
         lights.sigma[:few],
+        lights.weight[:few],
         lights.mag[:few],
         lights.mag_sigma,
         lights.field,

@@ -25,7 +25,8 @@ INNER = 0.97  # of the field: a star nearer to its border may be cut off, which 
 class Lights(NamedTuple):
     """What is seen. A plain tuple, so that compiled code can take it.
 
-    tangent : (N, 2) x / z and y / z in camera axes, brightest first;  sigma : (N,) of each
+    tangent : (N, 2) x / z and y / z in camera axes, brightest first
+    sigma   : (N,) in the direction of the greatest error;  weight : (N, 3) the inverse covariance: xx, yy, xy
     mag     : (N,) magnitudes on the catalogue's scale, mag_sigma their error; NaN where they are not known
     field   : (4,) tangents left, right, top, bottom of the sensor's edges
     zoom    : the share by which the focal length may differ; 0 for a camera that is known
@@ -33,6 +34,7 @@ class Lights(NamedTuple):
 
     tangent: Floats
     sigma: Floats
+    weight: Floats
     mag: Floats
     mag_sigma: float
     field: Floats
@@ -125,7 +127,7 @@ def weigh(
     R, info = R_cam_from_ref, np.zeros((4, 4))
     own = GATE * lights.sigma
     for turn in range(3):
-        observed, star = _match(lights, sky, R, zoom, gates if turn == 0 else own)
+        observed, star = _match(lights, sky, R, zoom, own if turn else gates, GATE if turn else np.inf)
         if len(observed) < LEAST:
             return nothing()
         if turn == 1 and _evidence(lights, sky, R, zoom, observed, star, 0, info, False) < floor_dex:
@@ -143,17 +145,20 @@ def weigh(
 
 @numba.njit(cache=True, error_model="numpy")
 def _match(
-    lights: Lights, sky: Sky, R_cam_from_ref: Floats, zoom: float, gates: Floats
+    lights: Lights, sky: Sky, R_cam_from_ref: Floats, zoom: float, gates: Floats, most_sigma: float
 ) -> tuple[NDArray, NDArray]:
-    """Each light's nearest star within its gate; of two lights at one star the nearer."""
+    """Each light's nearest star within its gate and so many of its errors; of two lights at one star the nearer."""
     total, count = len(lights.sigma), 0
     observed, star, gap = np.empty(total, np.int64), np.empty(total, np.int64), np.empty(total)
     R_ref_from_cam, tangent, vectors_ref = R_cam_from_ref.T.copy(), lights.tangent, sky.vectors
     cell_first, cell_star, side = sky.cell_first, sky.cell_star, sky.side
     for n in range(total):
         x, y, z = turned(R_ref_from_cam, ray(tangent, n, zoom))
-        s, off2 = nearest(vectors_ref, cell_first, cell_star, side, x, y, z, gates[n])
+        s, _ = nearest(vectors_ref, cell_first, cell_star, side, x, y, z, gates[n])
         if s < 0:
+            continue
+        off2 = misfit2(lights, sky, R_cam_from_ref, zoom, n, s)
+        if off2 > most_sigma**2:
             continue
         place = 0
         while place < count and star[place] != s:
@@ -174,6 +179,15 @@ def predicted(vectors_ref: Floats, R: Floats, star: int) -> vectors.Vector:
 
 
 @numba.njit(cache=True, error_model="numpy")
+def misfit2(lights: Lights, sky: Sky, R_cam_from_ref: Floats, zoom: float, light: int, star: int) -> float:
+    """Square of a light's distance from a star in its own standard deviations (Mahalanobis)."""
+    x, y, _ = predicted(sky.vectors, R_cam_from_ref, star)
+    off_x, off_y = lights.tangent[light, 0] - zoom * x, lights.tangent[light, 1] - zoom * y
+    xx, yy, xy = vectors.row(lights.weight, light)
+    return xx * off_x * off_x + 2 * xy * off_x * off_y + yy * off_y * off_y
+
+
+@numba.njit(cache=True, error_model="numpy")
 def _fit(
     lights: Lights,
     sky: Sky,
@@ -190,21 +204,19 @@ def _fit(
     """
     count = 4 if lights.zoom > 0 else 3
     info[:] = 0.0
-    pull, row = np.zeros(4), np.zeros(4)
-    tangent, sigma, vectors_ref = lights.tangent, lights.sigma, sky.vectors
+    pull, by_x, by_y = np.zeros(4), np.zeros(4), np.zeros(4)
+    tangent, weight, vectors_ref = lights.tangent, lights.weight, sky.vectors
     for k in range(len(observed)):
         x, y, _ = predicted(vectors_ref, R_cam_from_ref, star[k])
-        weight = 1 / sigma[observed[k]] ** 2
-        for axis in range(2):
-            if axis == 0:
-                row[0], row[1], row[2], row[3] = -zoom * x * y, zoom * (1 + x * x), -zoom * y, zoom * x
-            else:
-                row[0], row[1], row[2], row[3] = -zoom * (1 + y * y), zoom * x * y, zoom * x, zoom * y
-            residual = tangent[observed[k], axis] - zoom * (y if axis else x)
-            for i in range(count):
-                pull[i] += weight * row[i] * residual
-                for j in range(i + 1):
-                    info[i, j] += weight * row[i] * row[j]
+        by_x[0], by_x[1], by_x[2], by_x[3] = -zoom * x * y, zoom * (1 + x * x), -zoom * y, zoom * x
+        by_y[0], by_y[1], by_y[2], by_y[3] = -zoom * (1 + y * y), zoom * x * y, zoom * x, zoom * y
+        xx, yy, xy = vectors.row(weight, observed[k])
+        off_x, off_y = tangent[observed[k], 0] - zoom * x, tangent[observed[k], 1] - zoom * y
+        for i in range(count):
+            heavy_x, heavy_y = by_x[i] * xx + by_y[i] * xy, by_x[i] * xy + by_y[i] * yy
+            pull[i] += heavy_x * off_x + heavy_y * off_y
+            for j in range(i + 1):
+                info[i, j] += heavy_x * by_x[j] + heavy_y * by_y[j]
     factor = info[:count, :count].copy()
     step = solved(factor, pull[:count])
     for i in range(4):
@@ -272,15 +284,14 @@ def _evidence(
     total = 0.5 * count * log10(2 * pi) - volume_dex(lights)
     for i in range(count):
         total -= log10(factor[i, i])
-    tangent, sigma, vectors_ref = lights.tangent, lights.sigma, sky.vectors
     as_bright = _share_to(sky, lights.mag)
     for k in range(len(observed)):
         # Any number of false lights being as probable, n of them are n! / (n - m)! times as many as n - m.
-        density = (len(sigma) - k) / area(lights)
-        x, y, _ = predicted(vectors_ref, R, star[k])
-        variance = sigma[observed[k]] ** 2
-        off2 = (tangent[observed[k], 0] - zoom * x) ** 2 + (tangent[observed[k], 1] - zoom * y) ** 2
-        total -= misfit * off2 / variance / 2 / log(10.0) + log10(2 * pi * variance * density)
+        density = (len(lights.sigma) - k) / area(lights)
+        xx, yy, xy = vectors.row(lights.weight, observed[k])
+        total -= log10(2 * pi * density / sqrt(xx * yy - xy * xy))
+        if misfit:
+            total -= misfit2(lights, sky, R, zoom, observed[k], star[k]) / 2 / log(10.0)
         total += _mag_dex(lights, sky, observed[k], star[k], as_bright)
     seen = float(len(observed))
     total -= TOLL_DEX * max(observed.max() + 1 - 2 * seen, 0.0)

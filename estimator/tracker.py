@@ -145,9 +145,12 @@ class StarTracker:
         mag = np.full(len(centroids), np.nan)
         if settings.zero_point_mag is not None:
             mag = settings.zero_point_mag - 2.5 * np.log10(centroids.flux)
+        weight = centroids.weights_per_px2(sigma_px) * self.camera.focal_px**2
+        xx, yy, xy = weight.T
         return Lights(
             self.camera.tangents(centroids.xy_px),
-            sigma_px / self.camera.focal_px,
+            1 / np.sqrt((xx + yy) / 2 - np.hypot((xx - yy) / 2, xy)),
+            weight,
             mag,
             settings.magnitude_sigma,
             self.field,

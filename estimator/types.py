@@ -90,6 +90,15 @@ class Centroids:
         spread = None if self.covariance_px2 is None else self.covariance_px2[which]
         return Centroids(self.xy_px[which], self.sigma_px[which], self.flux[which], spread)
 
+    def weights_per_px2(self, sigma_px: Floats) -> Floats:
+        """(N, 3) xx, yy, xy of the inverse covariances, for errors sigma_px all told (N,), which add to their own."""
+        even = 1 / sigma_px**2
+        if self.covariance_px2 is None:
+            return np.stack([even, even, 0 * even], axis=1)
+        more = sigma_px**2 - self.sigma_px**2
+        xx, yy, xy = (self.covariance_px2[:, i, j] + more * (i == j) for i, j in ((0, 0), (1, 1), (0, 1)))
+        return np.stack([yy, xx, -xy], axis=1) / (xx * yy - xy**2)[:, None]
+
 
 @dataclass(frozen=True, slots=True)
 class StarMatch:

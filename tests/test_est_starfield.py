@@ -43,9 +43,9 @@ def seen(truth: Rotation, rng, sigma=SIGMA, zoom=1.0, vectors=VECTORS, mag=MAG):
 
 
 def lights_of(tangent, mag, sigma=SIGMA, zoom=0.0) -> starproof.Lights:
-    return starproof.Lights(
-        np.ascontiguousarray(tangent), np.full(len(tangent), sigma), np.array(mag), 0.25, FIELD, zoom
-    )
+    sigmas = np.full(len(tangent), sigma)
+    weight = np.stack([sigmas**-2, sigmas**-2, 0 * sigmas], axis=1)
+    return starproof.Lights(np.ascontiguousarray(tangent), sigmas, weight, np.array(mag), 0.25, FIELD, zoom)
 
 
 def solve(lights: starproof.Lights, sky: starsky.Sky = SKY) -> starfield.Fix:
@@ -92,6 +92,23 @@ def test_a_sky_without_a_pattern_is_refused() -> None:
         BadImage, match=r"2 pairs of stars within 12\.00 deg are no pattern; allowed: 3 or more"
     ):
         starsky.sky_of(in_a_row, MAG[:3], WIDE_RAD)
+
+
+def test_lights_that_are_worse_along_than_across_count_as_they_are() -> None:
+    """Smeared stars: about y, which errors along x turn, the attitude errs as it says, and about x too."""
+    rng, scaled = np.random.default_rng(12), []
+    along, across = 4 * SIGMA, SIGMA / 4
+    for _ in range(150):
+        truth = Rotation.random(rng=rng)
+        tangent, mag, _ = seen(truth, rng, sigma=0.0)
+        tangent = tangent + rng.standard_normal(tangent.shape) * [along, across]
+        lights = lights_of(tangent, mag, along)
+        fix = solve(lights._replace(weight=np.tile([along**-2, across**-2, 0], (len(mag), 1))))
+        if len(fix.star):
+            scaled.append(turn(fix, truth) / np.sqrt(np.diag(fix.covariance_rad2)))
+    assert len(scaled) > 140
+    # A mean square of 140 numbers is 1 to 12 %; that of equal weights would be 2 and 1/8.
+    np.testing.assert_allclose(np.mean(np.square(scaled), axis=0), 1, rtol=0, atol=0.4)
 
 
 def test_true_lights_give_the_true_attitude_and_names() -> None:

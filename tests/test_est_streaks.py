@@ -188,6 +188,23 @@ def test_the_fit_reaches_the_bound_along_and_across() -> None:
     assert rms[1] / across == pytest.approx(1, abs=0.12)
 
 
+def test_a_faint_streak_does_not_call_a_piece_of_itself_the_whole() -> None:
+    rng = np.random.default_rng(71)
+    hints, scaled = Hints((14.0, 10.0)), []
+    for _ in range(8):
+        image, xy = field(rng, 14.0, 10.0, np.full(36, 1000.0))  # signal to noise of 7
+        found = streak(image, detect.default(image, hints=hints), 1.0, hints)
+        off = found.xy_px[:, None] - xy
+        row = np.linalg.norm(off, axis=2).argmin(axis=1)
+        error = off[np.arange(len(found)), row]
+        near = np.linalg.norm(error, axis=1) < 9  # of the light of that streak
+        inverse = np.linalg.inv(found.covariance_px2[near])
+        scaled.append(np.einsum("ni,nij,nj->n", error[near], inverse, error[near]))
+    chi2 = np.concatenate(scaled)
+    assert len(chi2) > 200
+    assert np.mean(chi2 > 16) < 0.01  # of two numbers: beyond four standard deviations, 3e-4
+
+
 def test_the_line_fit_beats_the_centre_of_gravity() -> None:
     rng = np.random.default_rng(66)
     image, xy = field(rng, 9.0, 7.0, np.full(36, 4000.0))
