@@ -236,6 +236,12 @@ def entry_points() -> dict[str, metadata.EntryPoint]:
     return {point.name: point for point in metadata.entry_points(group=GROUP) if point.name != OWN}
 
 
+def release(name: str) -> str:
+    """The package that offers a tracker, with its version; empty for skysim's own and for programs."""
+    point = entry_points().get(name) if name != OWN else None
+    return f"{point.dist.name} {point.dist.version}" if point and point.dist else ""
+
+
 def known(name: str, commands: Mapping[str, str]) -> None:
     """Refuse a tracker that is not there. Raises BadInput."""
     allowed = [OWN, *entry_points(), *commands]

@@ -18,10 +18,10 @@ import numpy as np
 import pytest
 from astropy.io import fits
 
-from skysim import BadInput, metrics, programs, scene, scoreboard, simulate
+from skysim import BadInput, metrics, programs, scene, scoreboard, simulate, trackers
 from skysim.programs import Fault, Program
 from skysim.quantity import ARCSEC_RAD, ROOT
-from skysim.study import plan, runner, store
+from skysim.study import benches, plan, runner, store
 from skysim.study.engines import Serial
 from skysim.trackers import Answer, Leds, Picture, Setup, Stars, checked
 
@@ -246,6 +246,17 @@ def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (about / "METADATA").write_text("Metadata-Version: 2.1\nName: offset\nVersion: 1.0\n")
     (about / "entry_points.txt").write_text("[skysim.trackers]\noffset = offset:Offset\n")
     monkeypatch.syspath_prepend(str(tmp_path))
+
+
+def test_a_trial_of_another_release_of_a_tracker_is_another(installed: None, tmp_path: Path) -> None:
+    told = scene.load("shefex2", {"tracker.name": "offset"})
+    before = benches.scene_hash(told)
+    assert trackers.release("offset") == "offset 1.0"
+    (tmp_path / "offset-1.0.dist-info" / "METADATA").write_text(
+        "Metadata-Version: 2.1\nName: offset\nVersion: 1.1\n"
+    )
+    assert trackers.release("offset") == "offset 1.1"
+    assert benches.scene_hash(told) != before
 
 
 def test_a_package_s_tracker_is_scored_by_the_error_that_it_makes(installed: None) -> None:

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from skysim import onboard, simulate
+from skysim import onboard, simulate, trackers
 from skysim.quantity import DATA, ROOT
 from skysim.scene import FILES, Scene
 from skysim.study.factors import Settings
@@ -73,10 +73,10 @@ def like_before(scene: Scene) -> simulate.Lab | None:
 
 
 def scene_hash(scene: Scene) -> str:
-    """Of a scene and of the files that it names."""
+    """Of a scene, of the files that it names and of the tracker that another package offers."""
     tree = scene.model_dump(mode="json", by_alias=True)
     named = [sha256(Path(path).read_bytes()).hexdigest() for path in files_of(tree)]
-    return digest([tree, named])
+    return digest([tree, named, trackers.release(scene.tracker.name)])
 
 
 def files_of(tree: dict[str, Any]) -> list[str]:
