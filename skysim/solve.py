@@ -130,11 +130,7 @@ def make_solver(
     camera = scene.load_camera(camera_file) if camera_file and not calibrated else None
     settings = Settings()
     if camera:
-        settings = Settings(
-            centroider="gaussian_fit",
-            gain_e_dn=camera.detector.gain_e_dn,
-            saturation=saturation_dn(camera.detector),
-        )
+        settings = Settings(gain_e_dn=camera.detector.gain_e_dn, saturation=saturation_dn(camera.detector))
     settings = replace(settings, **named)  # type: ignore[arg-type]
     try:
         stars = catalog.read(CATALOGUES / f"{catalogue}.ecsv")
