@@ -85,8 +85,10 @@ class Camera:
         k1, k2, _, _, k3 = self.distortion
         if not (k1 or k2 or k3):
             return np.inf
-        roots = np.roots([7 * k3, 5 * k2, 3 * k1, 1.0])
-        return float(min(roots.real[(np.abs(roots.imag) < 1e-12) & (roots.real > 0)], default=np.inf))
+        # Of 1 / r^2, so that a coefficient of next to nothing is never divided by.
+        roots = np.roots([1.0, 3 * k1, 5 * k2, 7 * k3])
+        greatest = float(max(roots.real[(np.abs(roots.imag) < 1e-12) & (roots.real > 0)], default=0.0))
+        return 1 / greatest if greatest else np.inf
 
 
 @numba.njit(cache=True)

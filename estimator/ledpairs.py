@@ -26,6 +26,7 @@ from estimator.vectors import Vector
 ACCEPT_DEX = 5.0  # evidence for an attitude, against lights that fell anywhere, in powers of ten
 MARGIN_DEX = 5.0  # by which the best attitude must beat every other one
 TWIN_DEX = 2.0  # two attitudes of as much evidence are worth to be called ambiguous
+SAME = 1e-9  # as tangents: two lights so near to one another have no direction between them
 LONG = 0.2  # of the field: pairs as long as that say where the other LEDs are
 AMBIGUOUS = "ambiguous: another attitude fits the lights as well"
 NO_MATCH = "no identification beyond chance"
@@ -97,7 +98,7 @@ def _search(lights: Lights, sight: Sight, max_checks: int) -> tuple[Guess, float
 
 @numba.njit(cache=True)
 def _pairs(lights: Lights, sight: Sight) -> NDArray[np.int64]:
-    """(P, 2) pairs of lights, those that the fewest LEDs may be first; short ones last.
+    """(P, 2) pairs of lights, those that the fewest LEDs may be first; short ones last, two in one place not at all.
 
     A short pair may be few LEDs too, but says little of the turn about the boresight.
     """
@@ -107,11 +108,13 @@ def _pairs(lights: Lights, sight: Sight) -> NDArray[np.int64]:
     for a in range(total):
         for b in range(a + 1, total):
             length = apart(lights.tangent, a, b)
+            if not length > SAME:
+                continue
             begin, end, _ = _window(lights, sight, a, b)
             pair[place, 0], pair[place, 1] = a, b
             cost[place] = end - begin if length >= long else 1e9 - length
             place += 1
-    return pair[np.argsort(cost)]
+    return pair[:place][np.argsort(cost[:place])]
 
 
 @numba.njit(cache=True)

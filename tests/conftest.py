@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-pytest.register_assert_rewrite("labpage")
+pytest.register_assert_rewrite("labpage", "laws")
 ROOT = Path(__file__).resolve().parents[1]
 
 
