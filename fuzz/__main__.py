@@ -1,24 +1,51 @@
 """`python -m fuzz SECONDS [TARGET ...] [--plain]`: every target for its share of the time; exit code 1 for a finding.
 
 Guided by coverage (atheris, libFuzzer) where that is installed; else, or with --plain, by nothing but mutation of the
-corpus. What is found is kept in out/fuzz/; once it is mended it goes into fuzz/corpus/, which the tests read too.
+corpus. It begins with fuzz/corpus/, with what earlier runs grew in out/fuzz/, and with files that skysim ships. What is
+found is kept in out/fuzz/; once it is mended it goes into fuzz/corpus/, which the tests read too.
 """
 
 from __future__ import annotations
 
 import importlib.util
-import subprocess
+import os
+import re
 import sys
 import time
 import traceback
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from functools import partial
 from hashlib import sha256
 from pathlib import Path
 from random import Random
+from types import FunctionType, ModuleType
 
 HERE = Path(__file__).parent
 CORPUS, OUT = HERE / "corpus", HERE.parent / "out" / "fuzz"
 SLOWEST_S, MOST_MB = 10, 3000
-NAMES = ("scenes", "studies", "overrides", "fits", "pictures", "catalogues", "maps", "quantities")
+# Of each target: shipped files that it begins with too.
+TARGETS = {
+    "scenes": ("scenes/*.yaml", "data/cameras/*.yaml"),
+    "studies": (),
+    "overrides": (),
+    "fits": (),
+    "pictures": (),
+    "catalogues": (),
+    "maps": (),
+    "truths": (),
+    "calibrations": (),
+    "tables": ("data/qe/*.csv",),
+    "vehicles": ("scenes/vehicles/*.xml",),
+    "stores": (),
+    "answers": (),
+    "packets": (),
+    "quantities": (),
+}
+NAMES = tuple(TARGETS)
+# What guides: whole packages; and of a great one, all of which would take half a minute, the parts that read files.
+GUIDES = ["skysim", "estimator", "yaml", "json"]
+PARTS = ("astropy.io.ascii.", "astropy.io.fits.", "astropy.table.")
 TOKENS = (
     b"[",
     b"{",
@@ -37,9 +64,25 @@ TOKENS = (
 )
 
 
+def shipped(name: str) -> list[Path]:
+    """Files of a target that are in the tree for another reason."""
+    return [path for glob in TARGETS[name] for path in sorted(HERE.parent.glob(glob))]
+
+
 def seeds(name: str) -> list[bytes]:
-    """The corpus of a target."""
-    return [path.read_bytes() for path in sorted((CORPUS / name).iterdir())]
+    """What a target begins with."""
+    return [path.read_bytes() for path in (*sorted((CORPUS / name).iterdir()), *shipped(name))]
+
+
+def dictionary(name: str) -> Path:
+    """A dictionary for libFuzzer: the words of a target's seeds, of its schema, and TOKENS."""
+    schemas = {"scenes": ("scene",), "overrides": ("scene",), "studies": ("scene", "study")}.get(name, ())
+    texts = [*seeds(name), *((HERE.parent / f"data/schema/{one}.json").read_bytes() for one in schemas)]
+    found = {word for text in texts for word in re.findall(rb"[A-Za-z_][\w-]{2,40}", text)}
+    path = OUT / f"{name}.dict"
+    told = ["".join(f"\\x{byte:02x}" for byte in word) for word in sorted(found.union(TOKENS))]
+    path.write_text("".join(f'"{word}"\n' for word in told))
+    return path
 
 
 def mutated(seed: bytes, others: list[bytes], rng: Random) -> bytes:
@@ -66,6 +109,14 @@ def mutated(seed: bytes, others: list[bytes], rng: Random) -> bytes:
     return bytes(data)
 
 
+def timed(target: Callable[[bytes], None], data: bytes) -> None:
+    """A target; a finding too where it takes long by the processor's clock, which no other work stretches."""
+    begin = time.process_time()
+    target(data)
+    if (took_s := time.process_time() - begin) > SLOWEST_S:
+        raise AssertionError(f"{took_s:.1f} s")
+
+
 def plainly(name: str, seconds: float, seed: int = 1) -> int:
     """Mutation alone: how many findings."""
     from fuzz.targets import TARGETS
@@ -74,11 +125,8 @@ def plainly(name: str, seconds: float, seed: int = 1) -> int:
     while time.monotonic() < end:
         data = corpus[tries] if tries < len(corpus) else mutated(rng.choice(corpus), corpus, rng)
         tries += 1
-        begin = time.process_time()
         try:
-            TARGETS[name](data)
-            if (took_s := time.process_time() - begin) > SLOWEST_S:
-                raise AssertionError(f"{took_s:.1f} s")
+            timed(TARGETS[name], data)
         except Exception:
             findings += 1
             kept = OUT / f"{name}-{sha256(data).hexdigest()[:12]}"
@@ -88,43 +136,77 @@ def plainly(name: str, seconds: float, seed: int = 1) -> int:
     return findings
 
 
-def guided(name: str) -> None:
-    """libFuzzer with the rest of the command line; it ends the process itself."""
+def guided(names: list[str], share_s: float) -> int:
+    """libFuzzer: how many targets were found out. It ends its process by itself, so each has one of its own."""
     import atheris
 
-    with atheris.instrument_imports(include=["skysim", "estimator", "yaml"]):
+    with atheris.instrument_imports(include=GUIDES):
         from fuzz.targets import TARGETS
 
-    atheris.Setup(sys.argv, TARGETS[name])
-    atheris.Fuzz()
-
-
-def main() -> int:
-    """Each target in a process of its own, so that one that dies is one finding."""
-    words = [word for word in sys.argv[1:] if not word.startswith("-")]
-    if words and words[0] in NAMES:
-        sys.argv = sys.argv[1:]  # called by ourselves: TARGET libFuzzer's words
-        guided(words[0])
-    seconds, names = float(words[0]) if words else 60.0, words[1:] or list(NAMES)
-    OUT.mkdir(parents=True, exist_ok=True)
-    share = seconds / len(names)
-    if "--plain" in sys.argv or importlib.util.find_spec("atheris") is None:
-        return int(sum([plainly(name, share) for name in names]) > 0)
-    worst = 0
+        for name in names:
+            for path in (CORPUS / name).iterdir():  # what is imported only now is a guide too
+                with suppress(Exception):
+                    TARGETS[name](path.read_bytes())
+    for name, module in sorted(sys.modules.items()):
+        if name.startswith(PARTS):
+            for one in functions(module):
+                atheris.instrument_func(one)
+    found = 0
     for name in names:
         grown = OUT / f"{name}-grown"
         grown.mkdir(exist_ok=True)
+        for path in shipped(name):
+            (grown / f"shipped-{path.name}").write_bytes(path.read_bytes())
         limits = [
-            f"-max_total_time={max(round(share), 1)}",
-            f"-timeout={SLOWEST_S}",
+            f"-max_total_time={max(round(share_s), 1)}",
+            f"-timeout={12 * SLOWEST_S}",
             f"-rss_limit_mb={MOST_MB}",
         ]
-        quiet = ["-verbosity=0", "-print_final_stats=1", f"-artifact_prefix={OUT / name}-"]
-        call = [sys.executable, "-m", "fuzz", name, *limits, *quiet, str(grown), str(CORPUS / name)]
-        code = subprocess.run(call, check=False).returncode
+        told = [f"-dict={dictionary(name)}", f"-artifact_prefix={OUT / name}-"]
+        quiet = ["-verbosity=0", "-print_final_stats=1"]
+        code = alone(
+            partial(fuzzed, TARGETS[name], [name, *limits, *told, *quiet, str(grown), str(CORPUS / name)])
+        )
         print(f"{name}: {'nothing found' if code == 0 else f'FOUND, exit code {code}'}", flush=True)
-        worst = max(worst, abs(code))
-    return int(worst > 0)
+        found += code != 0
+    return found
+
+
+def functions(module: ModuleType) -> Iterator[FunctionType]:
+    """Those of a module and the methods of its classes."""
+    for one in vars(module).values():
+        for inner in vars(one).values() if isinstance(one, type) else [one]:
+            if isinstance(inner, FunctionType) and inner.__module__ == module.__name__:
+                yield inner
+
+
+def fuzzed(target: Callable[[bytes], None], words: list[str]) -> None:
+    """libFuzzer on a target; there is no way back."""
+    import atheris
+
+    atheris.Setup(words, partial(timed, target))
+    atheris.Fuzz()
+
+
+def alone(work: Callable[[], None]) -> int:
+    """Work in a process of its own: its exit code."""
+    sys.stdout.flush()
+    if (child := os.fork()) == 0:
+        work()  # libFuzzer writes down what it has found as the interpreter ends
+        sys.exit()
+    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+
+
+def main() -> int:
+    """The targets that are asked for, one after another."""
+    words = [word for word in sys.argv[1:] if not word.startswith("-")]
+    seconds, names = float(words[0]) if words else 60.0, words[1:] or list(NAMES)
+    OUT.mkdir(parents=True, exist_ok=True)
+    share_s = seconds / len(names)
+    if "--plain" in sys.argv or importlib.util.find_spec("atheris") is None:
+        print("By mutation alone; the extra `fuzz` (atheris) has it guided by coverage.", flush=True)
+        return int(sum([plainly(name, share_s) for name in names]) > 0)
+    return int(guided(names, share_s) > 0)
 
 
 if __name__ == "__main__":

@@ -2,25 +2,47 @@
 
 from __future__ import annotations
 
-import os
+import json
 import tempfile
 from collections.abc import Callable
+from functools import cache
+from io import BytesIO
 from pathlib import Path
 
-from estimator import catalog
+from estimator import catalog, ptasecat
 from estimator.types import BadImage
-from skysim import catalogue, io, quantity, scene, yamlfile
-from skysim.study import plan
+from skysim import (
+    calibration,
+    catalogue,
+    io,
+    layout,
+    photometry,
+    pointcloud,
+    psf,
+    quantity,
+    recording,
+    scene,
+    trackers,
+    yamlfile,
+)
+from skysim.stream import packet
+from skysim.study import plan, store
 from skysim.types import BadInput
+from skysim.world import spec
 
-FOLDER = Path(tempfile.gettempdir()) / f"skysim-fuzz-{os.getuid()}"
+COLOUR = ptasecat.Colour(0.1, 0.2, 0.0)
+
+
+@cache
+def folder() -> tempfile.TemporaryDirectory[str]:
+    """Of this process alone; it goes with it."""
+    return tempfile.TemporaryDirectory(prefix="skysim-fuzz-")
 
 
 def written(data: bytes, name: str) -> Path:
-    """The bytes as a file of a folder of this process's own."""
-    folder = FOLDER / str(os.getpid())
-    folder.mkdir(parents=True, exist_ok=True)
-    path = folder / name
+    """The bytes as a file."""
+    path = Path(folder().name) / name
+    path.parent.mkdir(exist_ok=True)
     path.write_bytes(data)
     return path
 
@@ -67,11 +89,61 @@ def catalogues(data: bytes) -> None:
     path = written(data, "stars.ecsv")
     refused(lambda: catalogue.read(path), BadInput)
     refused(lambda: catalog.read(path), BadImage)
+    refused(lambda: ptasecat.read_cat(path, 5.0, 2010.0, COLOUR), BadImage)
 
 
 def maps(data: bytes) -> None:
     path = written(data, "map.ecsv")
     refused(lambda: io.read_dome_map(path), BadInput)
+
+
+def truths(data: bytes) -> None:
+    path = written(data, "frame_0000.ecsv")
+    refused(lambda: recording.truth(path), BadInput)
+
+
+def calibrations(data: bytes) -> None:
+    path = written(data, "camera.yml")
+    calibration.is_one(path)
+    refused(lambda: calibration.read(path), BadInput)
+
+
+def tables(data: bytes) -> None:
+    """LEDs, points of a dome, a curve over the wavelength, a point-spread function."""
+    path = written(data, "table.csv")
+    refused(lambda: layout.read_csv(path), BadInput)
+    refused(lambda: pointcloud.fit(pointcloud.read(str(path), "m"), 2, str(path)), BadInput)
+    refused(lambda: photometry._read.__wrapped__(path), BadInput)  # what is cached goes by the file's name
+    refused(lambda: psf.cells_of.__wrapped__(str(path)), BadInput)
+
+
+def vehicles(data: bytes) -> None:
+    path = written(data, "vehicle.xml")
+    refused(lambda: spec.compiled(spec.load(path), path), BadInput)
+
+
+def stores(data: bytes) -> None:
+    """The file of a study, as its reports read it."""
+    path = written(data, "trials.sqlite")
+
+    def read() -> None:
+        with store.open_store(path) as kept:
+            kept.points(), kept.columns(), kept.counts(), kept.failures(), kept.runs(), kept.span()
+
+    refused(read, BadInput)
+
+
+def answers(data: bytes) -> None:
+    """What a tracker says, which may be anybody's program."""
+    try:
+        told = json.loads(data)
+    except (ValueError, RecursionError):  # as `programs` has it
+        return
+    refused(lambda: trackers.checked(trackers.Answer.of_tree(told)), ValueError)
+
+
+def packets(data: bytes) -> None:
+    refused(lambda: packet.unpack(BytesIO(data)), BadInput)
 
 
 def quantities(data: bytes) -> None:
@@ -80,5 +152,9 @@ def quantities(data: bytes) -> None:
 
 
 TARGETS: dict[str, Callable[[bytes], None]] = {
-    one.__name__: one for one in (scenes, studies, overrides, fits, pictures, catalogues, maps, quantities)
+    one.__name__: one
+    for one in (
+        *(scenes, studies, overrides, fits, pictures, catalogues, maps, truths, calibrations),
+        *(tables, vehicles, stores, answers, packets, quantities),
+    )
 }

@@ -10,6 +10,7 @@ from typing import Any
 import yaml
 
 from skysim.types import BadInput
+from skysim.yamlfile import Careful, composed, shown
 
 MOST_BYTES = 1 << 20  # a calibration with all its views' points; beyond that it is something else
 SQUARE = 1e-3  # by which fx and fy may differ: a calibration's own error, for the pixels of a chip are square
@@ -33,8 +34,8 @@ class Calibration:
     distortion: tuple[float, float, float, float, float]
 
 
-class Loader(yaml.SafeLoader):
-    """YAML's safe types, and OpenCV's matrices as the mappings that they are."""
+class Loader(Careful):
+    """Plain YAML, and OpenCV's matrices as the mappings that they are."""
 
 
 def matrix_node(loader: yaml.SafeLoader, node: yaml.Node) -> Any:
@@ -65,7 +66,9 @@ def read(path: Path) -> Calibration:
     tree = parsed(path)
     for key, allowed in (("fisheye_model", (0, False)), ("distortion_model", ("plumb_bob",))):
         if key in tree and tree[key] not in allowed:
-            raise BadInput(f"{path}: {key}: {tree[key]!r} is none of {', '.join(map(str, allowed))}")
+            raise BadInput(
+                f"{path}: {key}: {shown(repr(tree[key]))} is none of {', '.join(map(str, allowed))}"
+            )
     width, height = (side(path, tree, key) for key in ("image_width", "image_height"))
     fx, skew, cx, zero, fy, cy, *last = matrix(path, tree, "camera_matrix", ((3, 3),))
     if min(fx, fy) <= 0 or skew or zero or last != [0, 0, 1]:
@@ -94,7 +97,7 @@ def parsed(path: Path) -> dict[str, Any]:
             raise BadInput(f"{path}: more than {MOST_BYTES >> 20} MiB; allowed: a calibration of OpenCV")
         text = data.decode("utf-8")
         first, _, rest = text.partition("\n")
-        tree = yaml.load(rest if first.startswith("%YAML") else text, Loader)  # safe: see Loader
+        _, tree = composed(rest if first.startswith("%YAML") else text, Loader)
     except OSError as error:
         raise BadInput(f"{path}: cannot be read: {error.strerror}") from None
     except (yaml.YAMLError, ValueError, RecursionError, TypeError, OverflowError) as error:
@@ -110,7 +113,7 @@ def side(path: Path, tree: dict[str, Any], key: str) -> int:
     value = tree.get(key)
     if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= MOST_PX:
         raise BadInput(
-            f"{path}: {key}: {value!r} is not allowed; it should be a whole number from 1 to {MOST_PX}"
+            f"{path}: {key}: {shown(repr(value))} is not allowed; it should be a whole number from 1 to {MOST_PX}"
         )
     return value
 
@@ -123,7 +126,7 @@ def matrix(path: Path, tree: dict[str, Any], key: str, shapes: tuple[tuple[int, 
     shape, data = (node.get("rows"), node.get("cols")), node.get("data")
     if shape not in shapes:
         raise BadInput(
-            f"{path}: {key}: {shape[0]} rows and {shape[1]} cols; allowed:"
+            f"{path}: {key}: {shown(shape[0])} rows and {shown(shape[1])} cols; allowed:"
             f" {', '.join(f'{rows}x{cols}' for rows, cols in shapes)}"
         )
     count = shape[0] * shape[1]

@@ -75,7 +75,7 @@ def check_picture(path: Path, data: bytes) -> None:
     read = next((told for magic, told in FORMATS.items() if data.startswith(magic)), None)
     try:
         sizes = list(read(data)) if read else []
-    except struct.error:  # it ends within its header
+    except (struct.error, OverflowError):  # it ends within its header, or is told to go on beyond memory
         sizes = []
     if not sizes:
         raise BadInput(f"{path}: cannot be decoded; it may be truncated or not an image")

@@ -193,7 +193,7 @@ def numbers(value: Any, name: str, shape: tuple[int, ...]) -> Floats:
     """Finite numbers of a shape. Raises ValueError."""
     try:
         array = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise ValueError(f"{name} has other things than numbers") from None
     if array.shape != shape:
         raise ValueError(f"{name} has shape {array.shape}; allowed: {shape}")

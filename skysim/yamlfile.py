@@ -56,9 +56,9 @@ class Careful(yaml.SafeLoader):
             raise yaml.constructor.ConstructorError(None, None, problem, node.start_mark) from None
 
 
-def composed(text: str) -> tuple[yaml.Node | None, Any]:
+def composed(text: str, kind: type[Careful] = Careful) -> tuple[yaml.Node | None, Any]:
     """The nodes of a YAML document, and its values. Raises YAMLError."""
-    loader = Careful(text)
+    loader = kind(text)
     try:
         node = loader.get_single_node()
         return node, None if node is None else loader.construct_document(node)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
@@ -71,11 +72,13 @@ def unpack(stream: BinaryIO) -> tuple[dict[str, Any], NDArray[Any]] | None:
         return None
     try:
         header = json.loads(line)
-        shape, dtype = (int(header["height"]), int(header["width"])), np.dtype(header["dtype"])
-    except (ValueError, KeyError, TypeError) as error:
+        shape, kind = (int(header["height"]), int(header["width"])), header["dtype"]
+        if not re.fullmatch(r"[<>|]?(u[1248]|f[248])", kind):
+            raise ValueError(kind)
+    except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
         raise BadInput(f"no packet of skysim stream: {line[:40]!r}") from error
-    count = shape[0] * shape[1]
-    if min(shape) < 1 or count > MOST_PIXELS or dtype.kind not in "uf":
+    count, dtype = shape[0] * shape[1], np.dtype(kind)
+    if min(shape) < 1 or count > MOST_PIXELS:
         raise BadInput(f"no packet of skysim stream: {shape[1]} x {shape[0]} pixels of {dtype}")
     pixels = stream.read(count * dtype.itemsize)
     if len(pixels) < count * dtype.itemsize:

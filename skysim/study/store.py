@@ -105,7 +105,8 @@ class Store:
     def points(self) -> list[Point]:
         """All points, in order."""
         rows = self.db.execute("SELECT levels, settings FROM points ORDER BY point")
-        return [Point(json.loads(levels), json.loads(settings)) for levels, settings in rows]
+        with self.sound():
+            return [Point(json.loads(levels), json.loads(settings)) for levels, settings in rows]
 
     def add(self, rows: list[Row]) -> None:
         """Keep rows, all or none of them."""
@@ -141,7 +142,8 @@ class Store:
     def failures(self) -> list[tuple[int, str]]:
         """Trials that raised, and the last line of what."""
         rows = self.db.execute("SELECT trial, error FROM trials WHERE error IS NOT NULL ORDER BY trial")
-        return [(trial, error.strip().splitlines()[-1]) for trial, error in rows]
+        with self.sound():
+            return [(trial, error.strip().splitlines()[-1]) for trial, error in rows]
 
     def trial(self, number: int) -> dict[str, Any]:
         """One row with its names. Raises BadInput where it is not in."""
@@ -165,11 +167,22 @@ class Store:
         while batch := found.fetchmany(10_000):
             for column, more in zip(lists, zip(*batch, strict=True), strict=True):
                 column.extend(more)
-        return {name: as_array(name, column) for name, column in zip(names, lists, strict=True)}
+        with self.sound():
+            return {name: as_array(name, column) for name, column in zip(names, lists, strict=True)}
 
     def of_point(self, point: int) -> dict[str, NDArray[Any]]:
         """The columns of one point's trials."""
         return self.columns("point = ?", (point,))
+
+    @contextmanager
+    def sound(self) -> Iterator[None]:
+        """Values that SQLite holds and we never wrote are told as such. Raises BadInput."""
+        try:
+            yield
+        except (ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError) as error:
+            raise BadInput(
+                f"{self.path}: no store of a study: {' '.join(str(error).split())[:120]}"
+            ) from None
 
     def check(self) -> bool:
         """Whether SQLite finds the file whole."""
@@ -194,7 +207,7 @@ def as_array(name: str, column: list[Any]) -> NDArray[Any]:
 
 @contextmanager
 def open_store(path: Path) -> Iterator[Store]:
-    """A store to be read while a run may write it. Raises BadInput where there is none."""
+    """A store to be read while a run may write it. Raises BadInput where there is none, or none that is whole."""
     if not path.is_file():
         raise BadInput(f"{path}: no store; allowed: one that skysim study run made")
     with connected(path) as db:
@@ -202,9 +215,14 @@ def open_store(path: Path) -> Iterator[Store]:
         try:
             if store.meta("format") != str(FORMAT):
                 raise BadInput(f"{path}: format {store.meta('format')!r}; allowed: {FORMAT}")
-        except sqlite3.DatabaseError as error:
-            raise BadInput(f"{path}: no store of a study: {error}") from None
-        yield store
+            yield store
+        except (
+            sqlite3.DatabaseError,
+            UnicodeDecodeError,
+            MemoryError,
+        ) as error:  # by a size that nothing has
+            said = " ".join(str(error).split()) or "it asks for more memory than there is"
+            raise BadInput(f"{path}: no store of a study: {said}") from None
 
 
 @contextmanager
