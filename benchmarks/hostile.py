@@ -25,6 +25,7 @@ from benchmarks.frames import LIEBE_E, Sight, paint, photograph
 from benchmarks.hostilefiles import encoded, promise
 from estimator import catalog
 from estimator.camera import Camera
+from estimator.tracker import CORNERS
 from skysim import io, scene, sky, solve
 from skysim.scene import CATALOGUES
 from skysim.terminal import progress
@@ -345,11 +346,13 @@ def memory(key: str, reset: bool = False) -> int:
 
 
 def wrong(answer: dict, skies: Skies) -> bool:
-    """An attitude that the picture does not show."""
+    """An attitude that puts the sky elsewhere in the picture than where it is."""
     if answer.get("ra_deg") is None:
         return False
     told = sky.cam_from_icrs(answer["ra_deg"], answer["dec_deg"], answer["roll_deg"])
-    return all((told * one.inv()).magnitude() > WRONG_RAD for one in skies)
+    corners = camera().rays(CORNERS * [WIDTH, HEIGHT])
+    off = (np.linalg.norm((told * one.inv()).apply(corners) - corners, axis=1).max() for one in skies)
+    return all(one > WRONG_RAD for one in off)
 
 
 def judged(count: int, seed: int, quiet: bool = True) -> dict[str, Tally]:

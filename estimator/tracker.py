@@ -27,7 +27,8 @@ LEAST_ERROR_PX = 0.02  # of a star, for what no calibration knows of
 # before a frame is given up: 400,000 take two hundredths of a second.
 Lens = tuple[float, float, int]
 KNOWN_LENS: tuple[Lens, ...] = ((LEAST_ERROR_PX, 0.0, 400_000),)
-UNKNOWN_LENS: tuple[Lens, ...] = ((0.5, 0.0, 200_000), (1.0, 0.005, 600_000), (2.0, 0.01, 600_000))
+UNKNOWN_LENS: tuple[Lens, ...] = ((0.5, 0.0, 200_000), (1.0, 0.005, 600_000), (2.0, 0.01, 300_000))
+TOO_BRIGHT_MAG = 2.0
 CORNERS = np.array([[0, 0], [1, 0], [0, 1], [1, 1]])
 SETTINGS = Settings()
 
@@ -279,7 +280,15 @@ class StarTracker:
     ) -> tuple[NDArray, NDArray]:
         """Pairs of centroid and catalogue star that are each other's nearest within a radius."""
         rows, xy = self.in_field(camera, cam_from_ref)
-        return mutual(centroids.xy_px, xy, radius_px, rows)
+        observed, star = mutual(centroids.xy_px, xy, radius_px, rows)
+        if len(star) < MIN_MATCHES:
+            return observed, star
+        # The catalogue's magnitude of a light of one count is about the same for all, and less only where not all of a
+        # light is seen (saturation). A light far above the others' is a planet, a lamp, a mirror image.
+        zero_mag = self.stars.v_mag[star] + 2.5 * np.log10(centroids.flux[observed])
+        off = zero_mag - np.median(zero_mag)
+        own = off < max(TOO_BRIGHT_MAG, 4 * float(np.median(np.abs(off))))
+        return observed[own], star[own]
 
 
 def log10_chance(

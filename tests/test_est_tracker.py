@@ -203,6 +203,22 @@ def test_a_focal_length_three_per_cent_off_is_found(uncertain: StarTracker) -> N
         assert apart_rad(answer, truth) < 1e-3
 
 
+def test_a_lamp_beside_a_faint_star_does_not_turn_the_field(uncertain: StarTracker) -> None:
+    """Where the lens may be off by as much as the lamp is from the star, its brightness alone tells them apart."""
+    rng = np.random.default_rng(96)
+    for _ in range(5):
+        truth, pixels, light = starfield(uncertain, rng, CAMERA)
+        alone = np.array([np.partition(np.linalg.norm(pixels - one, axis=1), 1)[1] > 12 for one in pixels])
+        outer = np.linalg.norm(pixels - CAMERA.centre_px, axis=1) * alone * (light < np.median(light))
+        pixels[outer.argmax()] += 1.5
+        light[outer.argmax()] = 10 * light.max()
+        order = np.argsort(-light)
+        lights = Centroids(pixels[order], np.full(len(order), NOISE_PX), light[order])
+        answer = uncertain.solve_centroids(lights)
+        assert 0 not in answer.match.observed
+        assert apart_rad(answer, truth) < 2e-4
+
+
 def test_a_radial_distortion_is_found_with_the_focal_length(uncertain: StarTracker) -> None:
     lens = replace(CAMERA, distortion=(-0.15, 0.0, 0.0, 0.0, 0.0))
     rng = np.random.default_rng(92)
