@@ -1,14 +1,15 @@
 """Where to put so many LEDs: patch boards, a spiral, Poisson's discs and the optimiser, at attitudes none was made for.
 
-`python -m benchmarks.placement [SEED]` prints docs/dome.md's table: AFIT's SimSat under its measured dome, the scene's
-own camera and lever, 400 and 1,400 equal LEDs over the same cap, which is as far as any field within 30 degrees of
-tilt reaches. `compare` returns its rows.
+`python -m benchmarks.placement [LEDS [FRAMES [SEED]]]` prints docs/dome.md's table: AFIT's SimSat under its measured
+dome, the scene's own camera and lever, so many equal LEDs over the same cap, which is as far as any field within 30
+degrees of tilt reaches, and so many frames for the tracker. `compare` returns its rows.
 """
 
 from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,8 +28,8 @@ from skysim.types import Floats
 
 Ints = NDArray[np.int64]
 
-SIZES = (400, 1400)
-FRESH, FRAMES = 100_000, 5000  # attitudes; frames that the tracker is given
+FRESH = 100_000  # attitudes
+ASKED = (400, 1000, 1)  # LEDs, frames that the tracker is given, seed
 NOISE_PX = 0.1  # of the sigmas
 TAIL = 0.01  # of the attitudes, the worst
 HALF = 0.5  # of a neighbourhood that another one repeats
@@ -182,10 +183,10 @@ def row(of: Bench, kind: str, count: int, seed: int, frames: int) -> Row:
     )
 
 
-def compare(sizes: tuple[int, ...] = SIZES, seed: int = 1, frames: int = FRAMES) -> list[Row]:
-    """Every layout at every size."""
+def compare(count: int, frames: int, seed: int) -> Iterator[Row]:
+    """Every layout of so many LEDs."""
     of = bench()
-    return [row(of, kind, count, seed, frames) for count in sizes for kind in KINDS]
+    yield from (row(of, kind, count, seed, frames) for kind in KINDS)
 
 
 def printed(one: Row) -> str:
@@ -210,5 +211,6 @@ if __name__ == "__main__":
         "| LEDs | seen (min) | roll: median, worst 1 %, worst | cross | alike | ambiguous | found | wrong | made |"
     )
     print("|---" * 9 + "|")
-    for one in compare(seed=int((sys.argv[1:] or ["1"])[0])):
+    told = [int(word) for word in sys.argv[1:]]
+    for one in compare(*told, *ASKED[len(told) :]):
         print(printed(one), flush=True)

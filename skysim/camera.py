@@ -25,6 +25,9 @@ from skysim.quantity import (
 from skysim.types import BadInput
 
 PRESETS = DATA / "cameras"
+FOCUS = Annotated[
+    str, Field(description='a length such as "33 in", or infinity')
+]  # what editors are told of it
 
 Electrons = Annotated[Number, Field(ge=0, le=1e9)]
 Radial = Annotated[Number, Field(ge=-1e6, le=1e6)]
@@ -236,7 +239,7 @@ class Camera(Part):
     pixel_m: Annotated[Length, Field(ge=1e-7, le=1e-2)]
     focal_length_m: Annotated[Length, Field(ge=1e-5, le=1e3)]
     f_number: Annotated[Number, Field(ge=0.3, le=1e6)]
-    focus_m: Annotated[float, BeforeValidator(focus_distance, json_schema_input_type=str), Field(gt=0)] = (
+    focus_m: Annotated[float, BeforeValidator(focus_distance, json_schema_input_type=FOCUS), Field(gt=0)] = (
         math.inf
     )
     transmission: Annotated[Number, Field(gt=0, le=1)] = 1.0

@@ -26,7 +26,9 @@ class Verdict(NamedTuple):
 def validate(
     files: Annotated[
         list[Path] | None,
-        typer.Argument(help="Scenes, studies, cameras (YAML); catalogues and LED maps (ECSV)."),
+        typer.Argument(
+            metavar="FILES", help="Scenes, studies, cameras (YAML); catalogues and LED maps (ECSV)."
+        ),
     ] = None,
     schema: Annotated[
         str | None, typer.Option(help="Print the JSON Schema of a kind of file instead: scene or study.")

@@ -1,7 +1,8 @@
-"""The commands of docs/*.md are commands that run, and what they print is what the page shows in kind."""
+"""The commands of docs/dome.md and of the estimator's README run, and print what the page shows in kind."""
 
 from __future__ import annotations
 
+import os
 import re
 import shlex
 import subprocess
@@ -14,10 +15,13 @@ from skysim.quantity import ROOT
 from skysim.study import plan
 
 DOME = (ROOT / "docs/dome.md").read_text(encoding="utf-8")
+ESTIMATOR = (ROOT / "estimator/README.md").read_text(encoding="utf-8")
+TRIALS_AT = {"benchmarks.placement": 4}  # the word that says how many trials; else the fourth
+MINUTES = {"benchmarks.placement", "benchmarks.lost_in_space"}  # even with two trials
 
 
-def commands() -> list[list[str]]:
-    blocks = re.findall(r"```sh\n(.*?)```", DOME, re.DOTALL)
+def commands(page: str = DOME) -> list[list[str]]:
+    blocks = re.findall(r"```sh\n(.*?)```", page, re.DOTALL)
     return [shlex.split(line, comments=True) for block in blocks for line in block.splitlines() if line]
 
 
@@ -33,18 +37,53 @@ def test_the_page_s_commands_are_of_this_project() -> None:
             assert words[0] == "skysim"
 
 
-QUICK = [
-    words for words in commands() if words[0] == "python" and len(words) > 3
-]  # that take how many trials
+TABLES = [words for words in commands(DOME) + commands(ESTIMATOR) if words[0] == "python"]
 
 
-@pytest.mark.parametrize("words", QUICK, ids=" ".join)
-def test_the_page_s_tables_can_be_printed(words: list[str], tmp_path: Path) -> None:
-    """With two trials a row in place of the page's; numbers are the business of the modules' own tests."""
-    few = [*words[1:3], "2", *words[4:]]
+@pytest.mark.parametrize(
+    "words",
+    [
+        pytest.param(words, id=" ".join(words), marks=[pytest.mark.long] if words[2] in MINUTES else [])
+        for words in TABLES
+    ],
+)
+def test_the_page_s_tables_can_be_printed(words: list[str]) -> None:
+    """With two trials a row in place of the page's."""
+    assert len(printed_with(words, 2)) >= 5
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("words", TABLES, ids=" ".join)
+def test_a_tenth_of_the_page_s_trials_prints_as_many_rows(words: list[str]) -> None:
+    """Numbers are the business of the modules' own tests."""
+    trials = int(words[TRIALS_AT.get(words[2], 3)]) // 10
+    assert len(printed_with(words, trials)) == len(printed_with(words, 2))
+
+
+def printed_with(words: list[str], trials: int) -> list[str]:
+    """The lines of a table's command with so many trials a row."""
+    at = TRIALS_AT.get(words[2], 3)
+    few = [*words[1:at], str(trials), *words[at + 1 :]]
     done = subprocess.run([sys.executable, *few], cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    assert len(done.stdout.splitlines()) >= 9
+    return done.stdout.splitlines()
+
+
+@pytest.mark.long
+def test_the_page_s_survey_prints_what_the_page_shows(tmp_path: Path) -> None:
+    """As it is typed there: solved stops and errors after it, to a tenth of what the table says."""
+    (words,) = [words for words in commands() if words[0] == "skysim"]
+    command = [sys.executable, "-m", *words]
+    done = subprocess.run(
+        command, cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(ROOT)}, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    (after,) = re.findall(
+        r"^after: (\d+) of \d+.*?cross median ([\d.]+)°.*?roll median ([\d.]+)°", done.stdout, re.M
+    )
+    rows = dict(re.findall(r"^\| (new attitudes|cross|roll).*\| ([\d.]+)[^|]*\|$", DOME, re.M))
+    shown = [float(rows[name]) for name in ("new attitudes", "cross", "roll")]
+    assert [float(one) for one in after] == pytest.approx(shown, rel=0.1)
 
 
 @pytest.mark.parametrize("words", [words for words in commands() if words[0] == "skysim"], ids=" ".join)

@@ -1,11 +1,21 @@
-"""Docstrings as they are written here, for Markdown: equations are indented, and `name : meaning` stands on a line."""
+"""Docstrings as they are written here, for Markdown: equations are indented, and `name : meaning` stands on a line.
+
+A section of a scene or study file gains the table of its keys.
+"""
 
 from __future__ import annotations
 
 import re
+import sys
+from pathlib import Path
 from typing import Any
 
 import griffe
+
+sys.path.insert(0, str(Path(__file__).parent))
+import keys
+
+SECTIONS = keys.sections()
 
 TERM = re.compile(r"^([a-zA-Z]\w*(?:, \w+)* +|[a-z]\w*(?:, \w+)*): +(?=\S)")
 MARKS = re.compile(r"([*_\[\]])")
@@ -17,8 +27,11 @@ class Docstrings(griffe.Extension):
 
     def on_object(self, *, obj: Any, **_: Any) -> None:
         """Called once an object has been read."""
-        if obj.docstring is not None:
-            obj.docstring.value = markdown(obj.docstring.value)
+        told = [] if obj.docstring is None else [markdown(obj.docstring.value)]
+        if obj.path in SECTIONS:
+            told.append(keys.table(SECTIONS[obj.path]))
+        if told:
+            obj.docstring = griffe.Docstring("\n\n".join(told), parent=obj)
 
 
 def markdown(text: str) -> str:

@@ -66,7 +66,9 @@ def catalog_build(
 
 @catalog_app.command("info")
 def catalog_info(
-    name: Annotated[str, typer.Argument(help="A catalogue's name or file.")] = "hipparcos_hp6.5",
+    name: Annotated[
+        str, typer.Argument(metavar="NAME", help="A catalogue's name or file.")
+    ] = "hipparcos_hp6.5",
     json: Json = False,
 ) -> None:
     """Count the stars of a catalogue and tell where they come from."""
@@ -76,9 +78,14 @@ def catalog_info(
 
 
 def export(
-    folder: Annotated[Path, typer.Argument(help="A folder that skysim run or skysim render wrote.")],
+    folder: Annotated[
+        Path, typer.Argument(metavar="FOLDER", help="A folder that skysim run or skysim render wrote.")
+    ],
     to: Annotated[
-        list[str], typer.Option("--to", help="aem, ecsv, parquet, tiff, zarr or video; may be given again.")
+        list[str],
+        typer.Option(
+            "--to", metavar="FORMAT", help="aem, ecsv, parquet, tiff, zarr or video; may be given again."
+        ),
     ],
     out: Annotated[
         Path | None, typer.Option(help="Folder for what is written; the run's own if left out.")
@@ -103,11 +110,14 @@ def export(
 def camera(
     file: Annotated[
         Path,
-        typer.Argument(help="A scene or camera file, a scene's name, or a calibration by OpenCV (YAML)."),
+        typer.Argument(
+            metavar="FILE", help="A scene or camera file, a scene's name, or a calibration by OpenCV (YAML)."
+        ),
     ],
     out: Annotated[Path | None, typer.Option(help="Also write it as OpenCV's YAML, to this file.")] = None,
     set_: Annotated[
-        list[str] | None, typer.Option("--set", help='Override a scene\'s key: camera.focus="2 m".')
+        list[str] | None,
+        typer.Option("--set", metavar="KEY=VALUE", help='Override a scene\'s key: camera.focus="2 m".'),
     ] = None,
     json: Annotated[bool, typer.Option("--json", help="Print JSON for machines.")] = False,
 ) -> None:

@@ -42,7 +42,8 @@ def run(
     identifier: Identifier = None,
     solver: SolverName = None,
     tracker: Annotated[
-        str | None, typer.Option(help="Who solves: own, or a name of `skysim trackers` or --program.")
+        str | None,
+        typer.Option(metavar="NAME", help="Who solves: own, or a name of `skysim trackers` or --program."),
     ] = None,
     program: Programs = None,
     picture: Annotated[
@@ -97,7 +98,8 @@ def run(
 def compare(
     scene: SceneArg,
     tracker: Annotated[
-        list[str], typer.Option(help="Who solves: own, or a name of `skysim trackers` or --program.")
+        list[str],
+        typer.Option(metavar="NAME", help="Who solves: own, or a name of `skysim trackers` or --program."),
     ],
     program: Programs = None,
     frames: Frames = None,

@@ -32,7 +32,9 @@ if TYPE_CHECKING:
 
 
 def solve(
-    images: Annotated[list[Path] | None, typer.Argument(help="FITS, PNG, TIFF, JPEG or BMP files.")] = None,
+    images: Annotated[
+        list[Path] | None, typer.Argument(metavar="IMAGES", help="FITS, PNG, TIFF, JPEG or BMP files.")
+    ] = None,
     fov: Annotated[
         float | None,
         typer.Option(help="Horizontal field of view in degrees, to 5 %; 5 to 40 are tried if left out."),
@@ -130,7 +132,9 @@ def survey(
 def bench(
     areas: Annotated[
         list[str] | None,
-        typer.Argument(help="instrument, detect, identify, attitude, dynamics; all if left out."),
+        typer.Argument(
+            metavar="AREAS", help="instrument, detect, identify, attitude, dynamics; all if left out."
+        ),
     ] = None,
     json: Json = False,
 ) -> None:

@@ -17,18 +17,27 @@ LOADED: list[
     tuple[str, dict[str, str]]
 ] = []  # the scene at hand: its name, and what the command line overrides
 
-SceneArg = Annotated[str, typer.Argument(help="A scene file (.yaml) or the name of one in scenes/.")]
+SceneArg = Annotated[
+    str, typer.Argument(metavar="SCENE", help="A scene file (.yaml) or the name of one in scenes/.")
+]
 Frames = Annotated[int | None, typer.Option(help="How many frames; the scene's own number if left out.")]
 Seed = Annotated[int | None, typer.Option(help="Seed of all random streams; the scene's own if left out.")]
 Out = Annotated[Path | None, typer.Option(help="Folder for what is written; out/NAME if left out.")]
-Sets = Annotated[list[str] | None, typer.Option("--set", help="Override a key: camera.detector.bits=8.")]
+Sets = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set", metavar="KEY=VALUE", help="Override a key: camera.detector.bits=8; may be given again."
+    ),
+]
 Detector = Annotated[str | None, typer.Option(help="How lights are found, e.g. local.")]
 Centroider = Annotated[str | None, typer.Option(help="How they are centred, e.g. gaussian_fit.")]
 Identifier = Annotated[str | None, typer.Option(help="How they are named, e.g. pyramid.")]
 SolverName = Annotated[str | None, typer.Option("--solver", help="How the attitude follows, e.g. quest.")]
 Programs = Annotated[
     list[str] | None,
-    typer.Option("--program", help="NAME=COMMAND: a tracker of your own, a program that is told frames."),
+    typer.Option(
+        "--program", metavar="NAME=COMMAND", help="A tracker of your own: a program that is told frames."
+    ),
 ]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON for machines instead of a table.")]
 

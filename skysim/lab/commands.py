@@ -14,12 +14,12 @@ LOOPBACK = ("127.0.0.1", "localhost", "::1")
 
 def lab(
     scene: Annotated[
-        str, typer.Argument(help="A scene file (.yaml) or the name of one in scenes/.")
+        str, typer.Argument(metavar="SCENE", help="A scene file (.yaml) or the name of one in scenes/.")
     ] = "shefex2",
     host: Annotated[
         str, typer.Option(help="Address to serve on; another than this machine's own takes a token.")
     ] = "127.0.0.1",
-    port: Annotated[int, typer.Option(min=1, max=65535)] = 8080,
+    port: Annotated[int, typer.Option(min=1, max=65535, help="Port to serve on.")] = 8080,
     token: Annotated[
         str, typer.Option(help="Asked of every browser; one is made where --host needs it.")
     ] = "",

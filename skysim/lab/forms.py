@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping
+from math import isfinite
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args, get_origin
 
@@ -140,7 +141,7 @@ def plain(value: Any, unit: str) -> Any:
     if isinstance(value, tuple | list):
         return [plain(one, unit) for one in value]
     if unit and isinstance(value, float):
-        return f"{value:.6g} {unit}"
+        return f"{value:.6g} {unit}" if isfinite(value) else "infinity"
     return value
 
 

@@ -18,7 +18,7 @@ INK = {"agrees": "green", "explained": "yellow", "disagrees": "bold red"}
 
 def reproduce(
     ids: Annotated[
-        list[str] | None, typer.Argument(metavar="[ID ...|all]", help="Experiments; lists them if left out.")
+        list[str] | None, typer.Argument(metavar="ID|all", help="Experiments; lists them if left out.")
     ] = None,
     quick: Annotated[bool, typer.Option("--quick", help="Fewer trials, wider intervals.")] = False,
     seed: Annotated[int, typer.Option(help="Of all random streams: the same seed, the same numbers.")] = 1,

@@ -18,7 +18,9 @@ FOREVER = 1_000_000_000  # frames
 
 
 def stream(
-    scene: Annotated[str, typer.Argument(help="A scene file (.yaml) or the name of one in scenes/.")],
+    scene: Annotated[
+        str, typer.Argument(metavar="SCENE", help="A scene file (.yaml) or the name of one in scenes/.")
+    ],
     folder: Annotated[
         Path | None, typer.Option(help="Into a folder: PNG of 16 bits and JSON a frame.")
     ] = None,
@@ -45,7 +47,8 @@ def stream(
         int | None, typer.Option(help="Of all random streams; the scene's own if left out.")
     ] = None,
     set_: Annotated[
-        list[str] | None, typer.Option("--set", help="Override a key: exposure.rate_hz=10.")
+        list[str] | None,
+        typer.Option("--set", metavar="KEY=VALUE", help="Override a key: exposure.rate_hz=10."),
     ] = None,
     json: Annotated[bool, typer.Option("--json", help="Print the tallies as JSON.")] = False,
 ) -> None:

@@ -23,16 +23,21 @@ app = typer.Typer(
     invoke_without_command=True, help="Many trials of a scene whose fields vary, answered with error bars."
 )
 
-StudyArg = Annotated[str, typer.Argument(help="A study file (.yaml) or the name of one in scenes/studies/.")]
+StudyArg = Annotated[
+    str, typer.Argument(metavar="STUDY", help="A study file (.yaml) or the name of one in scenes/studies/.")
+]
 Out = Annotated[Path | None, typer.Option(help="Folder of the store and the report; out/NAME if left out.")]
 Workers = Annotated[
     int | None, typer.Option(min=1, help="Processes; as many as there are cores if left out.")
 ]
 EngineName = Annotated[str, typer.Option("--engine", help="pool, serial or dask.")]
 Scheduler = Annotated[str, typer.Option(help="Address of a Dask scheduler, tcp://HOST:PORT.")]
-Sets = Annotated[list[str] | None, typer.Option("--set", help="Override a key: replicates=100.")]
+Sets = Annotated[
+    list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override a key: replicates=100.")
+]
 Programs = Annotated[
-    list[str] | None, typer.Option("--program", help="NAME=COMMAND: a tracker that the study may name.")
+    list[str] | None,
+    typer.Option("--program", metavar="NAME=COMMAND", help="A tracker that the study may name."),
 ]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON for machines instead of a table.")]
 
@@ -118,7 +123,8 @@ def report(study: StudyArg, out: Out = None, json: Json = False) -> None:
 def export(
     study: StudyArg,
     to: Annotated[
-        list[Path], typer.Argument(help="Files: .csv, .parquet (a row a trial), .zarr (the responses).")
+        list[Path],
+        typer.Argument(metavar="FILES", help="Files: .csv, .parquet (a row a trial), .zarr (the responses)."),
     ],
     out: Out = None,
 ) -> None:
@@ -136,7 +142,9 @@ def export(
 @app.command()
 def replay(
     study: StudyArg,
-    trial: Annotated[int, typer.Argument(help="The trial's number, as report and status give it.")],
+    trial: Annotated[
+        int, typer.Argument(metavar="TRIAL", help="The trial's number, as report and status give it.")
+    ],
     out: Out = None,
     show: Annotated[bool, typer.Option("--open/--no-open", help="Open the first picture.")] = False,
     program: Programs = None,

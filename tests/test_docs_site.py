@@ -1,0 +1,76 @@
+"""What the site writes by itself: the page of the commands, the tables of a file's keys."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+from types import ModuleType
+
+import pytest
+from typer.testing import CliRunner
+
+from skysim import cli
+from skysim.quantity import ROOT
+from skysim.scene import Exposure, Scene, Survey
+
+
+def of_the_site(name: str) -> ModuleType:
+    """A module beside the site's settings, which no package holds."""
+    spec = importlib.util.spec_from_file_location(name, ROOT / "docs" / "site" / f"{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+commands, keys = of_the_site("commands"), of_the_site("keys")
+TOLD = commands.told()
+SECTIONS = dict(re.findall(r"^##+ `skysim ?([^`]*)`\n(.*?)(?=^##|\Z)", TOLD, re.DOTALL | re.MULTILINE))
+
+
+def helped(*words: str) -> str:
+    """What --help prints, on a terminal wide enough."""
+    told = CliRunner().invoke(cli.app, [*words, "--help"], env={"COLUMNS": "300", "TERMINAL_WIDTH": "300"})
+    assert told.exit_code == 0, told.output
+    return re.sub(r"\x1b\[[0-9;]*m", "", told.output)
+
+
+def test_every_command_that_help_names_has_its_section() -> None:
+    shown = {name: re.findall(r"^│ ([a-z]+)  ", helped(*name.split()), re.MULTILINE) for name in SECTIONS}
+    assert len(shown[""]) >= 16
+    told = {f"{name} {below}".strip() for name, all_below in shown.items() for below in all_below}
+    assert told | {""} == set(SECTIONS)
+
+
+@pytest.mark.parametrize("name", SECTIONS)
+def test_a_section_has_the_options_that_help_shows(name: str) -> None:
+    """And each of them, and every argument, with a word on what it is for."""
+    starts = re.findall(r"^│[ *]+((?:--[a-z-]+ +)+)", helped(*name.split()), re.MULTILINE)
+    shown = {option for start in starts for option in start.split()}
+    rows = dict(re.findall(r"^\| `([^`]+)` \| (.*) \|$", SECTIONS[name], re.MULTILINE))
+    listed = {option for what in rows for option in re.findall(r"--[a-z-]+", what)}
+    assert listed | {"--help"} == shown
+    assert [what for what, meaning in rows.items() if not re.match(r"\w", meaning)] == []
+
+
+def test_a_key_s_row_says_what_it_takes_and_what_stands_for_it() -> None:
+    exposure, survey = keys.table(Exposure), keys.table(Survey)
+    assert '| `time` | a time such as "40 ms" or "1000 us", ≥ 1e-06 s | needed |' in exposure
+    assert "| `rate_hz` | number, > 0 | needed |" in exposure
+    assert '| `led_sigma` | a length such as "35 mm" or "48 in", ≥ 0 m, ≤ 0.1 m | `0 m` |' in survey
+    assert "| `surface_seed` | whole number, ≥ 0 or null | `null` |" in survey
+    assert "| `exposure` | [Exposure][skysim.scene.Exposure] | needed |" in keys.table(Scene)
+
+
+def test_every_section_of_a_file_has_a_page_to_stand_on() -> None:
+    """A table links to the sections beneath: the reference holds all their modules."""
+    pages = "".join(path.read_text(encoding="utf-8") for path in (ROOT / "docs/reference").glob("*.md"))
+    held = set(re.findall(r"^::: (\S+)$", pages, re.MULTILINE))
+    linked = {
+        target
+        for model in keys.sections().values()
+        for target in re.findall(r"\]\[([\w.]+)\]", keys.table(model))
+    }
+    assert len(linked) > 60
+    assert {target.rpartition(".")[0] for target in linked} <= held
