@@ -21,6 +21,11 @@ from skysim.types import Floats, Mount, Sources, Trajectory
 mpl.rcParams.update(
     {"svg.fonttype": "none", "svg.hashsalt": "skysim", "font.family": "sans-serif", "font.size": 11}
 )
+BARE = {
+    "facecolor": "white",
+    "edgecolor": "none",
+    "pad": 1.0,
+}  # what stands under a label is not seen through it
 INK, LAB, BODY, CAM, LIGHT = "#333333", "#666666", "#1f6fb2", "#c0392b", "#d68910"
 ORION = {
     "Betelgeuse": 27989, "Rigel": 24436, "Bellatrix": 25336, "Saiph": 27366,
@@ -39,7 +44,7 @@ def axes(path: Path) -> None:
     right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
     flat = np.column_stack([right, np.cross(toward, right)])  # (3, 2) from the lab to the paper
     frames = (
-        ("lab", Rotation.identity(), np.zeros(3), LAB, 0.3),
+        ("lab", Rotation.identity(), np.zeros(3), LAB, 0.26),
         ("body", lab_from_body, np.zeros(3), BODY, 0.24),
         ("cam", lab_from_cam, camera_m, CAM, 0.2),
     )
@@ -55,8 +60,14 @@ def axes(path: Path) -> None:
                 begin,
                 arrowprops={"arrowstyle": "-|>", "color": colour, "lw": 2, "shrinkA": 0, "shrinkB": 0},
             )
-            ax.text(
-                *(begin + 1.16 * (end - begin)), f"{name} {letter}", color=colour, ha="center", va="center"
+            ax.annotate(
+                f"{name} {letter}",
+                end,
+                (5 if end[0] >= begin[0] - 1e-9 else -5, 3 if end[1] >= begin[1] else -3),
+                textcoords="offset points",
+                color=colour,
+                ha="left" if end[0] >= begin[0] - 1e-9 else "right",
+                va="center",
             )
     ax.plot(0, 0, "o", color=INK)
     ax.text(-0.012, -0.012, "bearing's centre", color=INK, ha="right", va="top")
@@ -121,6 +132,7 @@ def pixels(path: Path) -> None:
         (x, y),
         (x - 3.9, y + 1.5),
         color=CAM,
+        bbox=BARE,
         arrowprops={"arrowstyle": "-", "color": CAM},
     )
     ax.annotate(
@@ -128,6 +140,7 @@ def pixels(path: Path) -> None:
         (column, row),
         (column - 1.4, row + 3.0),
         color=INK,
+        bbox=BARE,
         arrowprops={"arrowstyle": "-", "color": INK},
     )
     ax.annotate(
@@ -135,10 +148,11 @@ def pixels(path: Path) -> None:
         (-0.5, -0.5),
         (-0.2, 0.3),
         color=INK,
+        bbox=BARE,
         arrowprops={"arrowstyle": "-", "color": INK},
     )
     ax.plot(*optics.project(np.array([0.0, 0.0, 1.0])), "x", color=BODY, markersize=9)
-    ax.text(3.1, 2.35, "boresight (3, 2)", color=BODY)
+    ax.text(2.8, 2.0, "boresight (3, 2)", color=BODY, ha="right", va="center", bbox=BARE)
     ax.set_xlabel("x, right: columns", loc="left")
     ax.xaxis.set_label_position("top")
     ax.set_ylabel("y, down: rows", loc="top")
@@ -160,26 +174,34 @@ def roll(path: Path) -> None:
         ax.scatter(*xy[shown].T, s=2 + 6 * (5 - stars.v_mag[shown]) ** 1.3, color=INK, linewidths=0)
         for name, place in zip(ORION, optics.project(look.apply(toward[rows])), strict=True):
             if name not in ("Alnilam", "Mintaka"):
-                ax.annotate(name, place, (9, 3), textcoords="offset points", fontsize=9, color=INK)
+                side = -1 if name in ("Betelgeuse", "Alnitak") else 1  # where no arrow and no star stands
+                ax.annotate(
+                    name,
+                    place,
+                    (9 * side, 3),
+                    textcoords="offset points",
+                    fontsize=9,
+                    color=INK,
+                    ha="left" if side > 0 else "right",
+                )
         middle = np.array(camera.centre_px)
-        for name, ra_deg, dec_deg in (("N", 84.0, 8.5), ("E", 91.0, 0.0)):
+        for name, ra_deg, dec_deg in (("N", 84.0, 7.6), ("E", 91.0, 0.0)):
             end = optics.project(look.apply(unit(*np.radians([[ra_deg], [dec_deg]]))))[0]
             ax.annotate("", end, middle, arrowprops={"arrowstyle": "->", "color": BODY, "lw": 1.8})
             ax.text(*(middle + 1.15 * (end - middle)), name, color=BODY, ha="center", va="center")
         ax.annotate("", middle - [0, 120], middle, arrowprops={"arrowstyle": "->", "color": CAM, "lw": 1.8})
-        ax.text(middle[0] - 8, middle[1] - 104, "up (-y)", color=CAM, ha="right", va="center")
+        ax.text(middle[0] - 12, middle[1] - 100, "up (-y)", color=CAM, ha="right", va="center")
         if roll_deg:
             angles = np.radians(np.linspace(0, roll_deg, 30))
             north = np.arctan2(*(optics.project(look.apply(unit(*np.radians([[84.0], [7.0]]))))[0] - middle))
             arc = middle + 95 * np.column_stack([np.sin(north + angles), np.cos(north + angles)])
             ax.plot(*arc.T, color=LIGHT, linewidth=2)
-            ax.text(*(arc[15] + [0, -16]), f"roll {roll_deg}°", color=LIGHT, ha="center")
         ax.set(
             xlim=(-0.5, camera.width_px - 0.5),
             ylim=(camera.height_px - 0.5, -0.5),
-            title=f"roll {roll_deg}°",
             aspect="equal",
         )
+        ax.set_title(f"roll {roll_deg}°", color=LIGHT)
         ax.set_xticks([])
         ax.set_yticks([])
     save(fig, path)
