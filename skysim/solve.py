@@ -113,6 +113,12 @@ class Solver:
             yield ready[believed]
 
 
+def named_scene(path: Path) -> Path:
+    """A file, or the scene that comes along by that name."""
+    shipped = (scene.SCENES / path).with_suffix(".yaml")
+    return shipped if not path.suffix and not path.exists() and shipped.is_file() else path
+
+
 def make_solver(
     fov_deg: float | None,
     camera_file: Path | None,
@@ -127,7 +133,7 @@ def make_solver(
         raise BadInput(f"--fov {fov_deg:g}: allowed: the horizontal field of view, 1 to 120 degrees")
     named = {stage: known(stage, name) for stage, name in (stages or {}).items()}
     calibrated = opencv.read(camera_file) if camera_file and opencv.is_one(camera_file) else None
-    camera = scene.load_camera(camera_file) if camera_file and not calibrated else None
+    camera = scene.load_camera(named_scene(camera_file)) if camera_file and not calibrated else None
     settings = Settings()
     if camera:
         settings = Settings(gain_e_dn=camera.detector.gain_e_dn, saturation=saturation_dn(camera.detector))

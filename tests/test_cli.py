@@ -153,7 +153,7 @@ def test_render_then_solve_agrees_with_the_wcs_of_the_true_pointing(
     skysim: Skysim, rendered: Path, tmp_path: Path
 ) -> None:
     path = rendered / "frame_0000.fits"
-    ran = skysim("solve", path, "--camera", SHEFEX, "--json", "--out", tmp_path)
+    ran = skysim("solve", path, "--camera", "shefex2", "--json", "--out", tmp_path)  # by name
     assert (ran.code, ran.err) == (0, "")
     (answer,) = json.loads(ran.out)
     assert set(answer) == ANSWER

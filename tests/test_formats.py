@@ -358,8 +358,8 @@ def test_a_damaged_frame_leaves_no_half_of_a_sequence(stars: Flown, tmp_path: Pa
 @pytest.mark.parametrize(
     ("old", "new", "complaint"),
     [
-        ("- {mid_utc: ", "- {mid_uct: ", "mid_utc in the header is None"),
-        ("- {exposure_s: 0.04}", "- {exposure_s: soon}", "exposure_s in the header is 'soon'"),
+        ("mid_utc: ", "mid_uct: ", "mid_utc in the header is None"),
+        ("exposure_s: 0.04", "exposure_s: soon", "exposure_s in the header is 'soon'"),
         ("# %ECSV 1.0", "# ECSV", "no ECSV table"),
     ],
 )

@@ -78,6 +78,7 @@ def send(
         tally.note(1e3 * (now_s - due_s), left_out)
         if sinks and not post and all(sink.fault for sink in sinks):
             return
+    tally.dropped = lab.scene.exposure.frames - tally.made  # with those after the last that was made
 
 
 def closes_s(lab: simulate.Lab, look: Look) -> float:
