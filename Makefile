@@ -62,7 +62,7 @@ test-browser: $(READY)
 
 # Versions that resolve today, for CI; and the tests on the lowest that pyproject.toml allows.
 lock: $(READY)
-	$(BIN)/pip install --quiet --upgrade --upgrade-strategy eager -e '.[dev,catalog,browser]'
+	$(BIN)/pip install --quiet --upgrade --upgrade-strategy eager -e '.[dev,catalog,browser,docs]'
 	$(BIN)/pip freeze --exclude-editable > requirements.lock
 
 test-lowest:
