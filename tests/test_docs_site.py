@@ -1,4 +1,4 @@
-"""What the site writes by itself: the page of the commands, the tables of a file's keys."""
+"""What the site writes by itself: the page of the commands, the tables of keys; and what pages tell to make."""
 
 from __future__ import annotations
 
@@ -74,3 +74,16 @@ def test_every_section_of_a_file_has_a_page_to_stand_on() -> None:
     }
     assert len(linked) > 60
     assert {target.rpartition(".")[0] for target in linked} <= held
+
+
+def test_what_a_page_tells_to_make_is_a_target() -> None:
+    pages = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").rglob("*.md")]
+    pages += (ROOT / ".github").rglob("*.md")
+    told = {
+        name
+        for path in pages
+        for name in re.findall(r"(?:^|`)make ([a-z-]+)", path.read_text(encoding="utf-8"), re.MULTILINE)
+    }
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    assert len(told) >= 10
+    assert told <= set(re.findall(r"^([a-z-]+):", makefile, re.MULTILINE))

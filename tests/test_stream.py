@@ -125,7 +125,10 @@ def test_frames_that_are_late_are_left_out_and_all_are_accounted_for(frames: lis
     send.send(on_the_ground(), Slow(0.0, 10.0), [], tally, came.append)
     assert [one.header["index"] for one in came] == list(range(0, FRAMES, 2))
     assert [one.header["dropped"] for one in came] == list(range(FRAMES // 2))
-    assert (tally.made, tally.dropped) == (FRAMES // 2, FRAMES - FRAMES // 2)  # with the last, after which none came
+    assert (tally.made, tally.dropped) == (
+        FRAMES // 2,
+        FRAMES - FRAMES // 2,
+    )  # with the last, after which none came
     for one in came:
         np.testing.assert_array_equal(one.pixels, frames[one.header["index"]])
 

@@ -41,7 +41,9 @@ def solve(
     ] = None,
     camera: Annotated[
         Path | None,
-        typer.Option(help="The scene (a file or a name in scenes/) or camera file that made them, or OpenCV's calibration."),
+        typer.Option(
+            help="The scene (a file or a name in scenes/) or camera file that made them, or OpenCV's calibration."
+        ),
     ] = None,
     live: Annotated[
         str | None,
