@@ -114,9 +114,8 @@ class Solver:
 
 
 def named_scene(path: Path) -> Path:
-    """A file, or the scene that comes along by that name."""
-    shipped = (scene.SCENES / path).with_suffix(".yaml")
-    return shipped if not path.suffix and not path.exists() and shipped.is_file() else path
+    """A file as it is, else the scene that comes along by that name. Raises BadInput with the names that there are."""
+    return path if path.suffix or path.exists() else scene.find(str(path))
 
 
 def make_solver(

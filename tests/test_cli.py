@@ -468,6 +468,7 @@ def test_noise_is_looked_at_and_refused_an_attitude(skysim: Skysim, tmp_path: Pa
         (["--fov", "nan"], "--fov nan: allowed"),
         (["--fov", "wide"], "--fov"),
         (["--camera", "nosuch.yaml"], "nosuch.yaml: cannot be read: No such file"),
+        (["--camera", "nosuch"], "nosuch: no such scene; allowed: a .yaml file or one of afit_simsat, "),
         (["--camera", SHEFEX, "--time", "yesterday"], "--time yesterday: allowed: ISO 8601"),
         (["--detector", "magic"], "--detector: 'magic' is none of default, "),
         (["--centroider", "magic"], "--centroider: 'magic' is none of "),
