@@ -248,6 +248,22 @@ def test_lights_are_chosen_and_doubted_as_told(
     np.testing.assert_array_equal(stages.whole(blobs.box_px, CAMERA), off_border.all(axis=1))
 
 
+@law(Centroids.weights_per_px2)
+@given(rng=SEEDS, count=some.integers(0, 9), more_px=some.floats(0, 5), even=some.booleans())
+def test_weights_are_the_inverse_of_all_the_errors(
+    rng: np.random.Generator, count: int, more_px: float, even: bool
+) -> None:
+    roots = rng.normal(size=(count, 2, 2)) + 2 * np.eye(2)
+    spread = roots @ roots.transpose(0, 2, 1) + 0.01 * np.eye(2)
+    sigma = np.sqrt(np.trace(spread, axis1=1, axis2=2) / 2)
+    lights = Centroids(np.zeros((count, 2)), sigma, np.ones(count), None if even else spread)
+    xx, yy, xy = lights.weights_per_px2(np.hypot(sigma, more_px)).T
+    weight = np.stack([np.stack([xx, xy], -1), np.stack([xy, yy], -1)], -1)
+    alone = sigma[:, None, None] ** 2 * np.eye(2) if even else spread
+    whole = weight @ (alone + more_px**2 * np.eye(2))
+    np.testing.assert_allclose(whole, np.broadcast_to(np.eye(2), whole.shape), rtol=0, atol=1e-9)
+
+
 @law(stages.see, stages.look, Clock.lap, camera.check_shape)
 @given(
     rng=SEEDS,
