@@ -311,9 +311,12 @@ def test_the_page_is_what_the_command_writes(tmp_path: Path) -> None:
 # Every experiment, quickly.
 
 TIMED = {"shefex-fig-3"}  # whose ratio another machine may double
+SLOW = {"ptase-ui", "shefex-fig-2"}
 
 
-@pytest.mark.parametrize("id", list(published.experiments()))
+@pytest.mark.parametrize(
+    "id", [pytest.param(id, marks=pytest.mark.long if id in SLOW else ()) for id in published.experiments()]
+)
 def test_an_experiment_done_quickly_has_honest_numbers(id: str) -> None:
     """Each inside its interval; the whole experiment's, on the page, within the two intervals' widths of it; and what
     agrees on the page does not disagree."""
