@@ -22,6 +22,7 @@ from skysim.types import BadInput
 
 MOST_PX = 1 << 28
 MOST_BYTES = 8 * MOST_PX  # of a file: each pixel a double
+DEFLATE = 1032  # times as many bytes come out of it at most (zlib's technical details)
 SEGMENTS = 1000  # of a JPEG before its picture
 # TIFF: types of a whole number, 8, 16, 32 and 64 bits; tags of width and height.
 WHOLE = {1: "B", 3: "H", 4: "I", 16: "Q"}
@@ -87,9 +88,19 @@ Sizes = Iterator[tuple[int, int]]
 
 
 def png(data: bytes) -> Sizes:
-    """The first chunk is IHDR (PNG, section 11.2.2)."""
-    width, height = struct.unpack_from(">II", data, 16)
-    yield width, height
+    """The first chunk is IHDR (PNG, section 11.2.2). None where more rows or a longer chunk are told than there can be.
+
+    OpenCV takes the memory for a chunk before it reads it.
+    """
+    width, height, bits = struct.unpack_from(">IIB", data, 16)
+    if width * height <= MOST_PX and height * (1 + width * bits // 8) > DEFLATE * len(data):
+        return
+    at, kind = 8, b""
+    while kind != b"IEND" and at < len(data):
+        length, kind = struct.unpack_from(">I4s", data, at)
+        at += 12 + length
+    if at <= len(data) or width * height > MOST_PX:
+        yield width, height
 
 
 def bmp(data: bytes) -> Sizes:
