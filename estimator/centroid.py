@@ -80,7 +80,8 @@ def streak(image: NDArray, blobs: Blobs, gain_e_dn: float = 1.0, hints: Hints = 
     rows[:, 2] = np.sqrt((lines[:, 5] + lines[:, 6]) / 2)
     if lost.any():
         rows[lost] = np.nan
-        if _smear_px(blobs, hints) <= starfit.HALF_PX:  # a longer one does not fit the window of a round star
+        # A longer one does not fit the window of a round star.
+        if np.hypot(*_smear(blobs, hints)) <= starfit.HALF_PX:
             rows[lost] = _gaussians(image, blobs.take(lost), gain_e_dn, hints)
         rows = _or_gravity(rows, image, blobs, gain_e_dn)
         covariance[lost] = rows[lost, 2, None, None] ** 2 * np.eye(2)
@@ -146,8 +147,8 @@ def _gaussians(image: NDArray, blobs: Blobs, gain_e_dn: float, hints: Hints) -> 
 
 def _streaks(image: NDArray, blobs: Blobs, gain_e_dn: float, hints: Hints) -> Floats:
     """The rows of `streaks.fit_all`; all NaN for a frame that is not smeared."""
-    line = hints.streak_px or blobs.streak_px
-    if line is None or _smear_px(blobs, hints) < streaks.SHORTEST_PX:
+    line = _smear(blobs, hints)
+    if np.hypot(*line) < streaks.SHORTEST_PX:
         return np.full((len(blobs), 8), np.nan)
     sky = blobs.background
     return streaks.fit_all(
@@ -155,9 +156,9 @@ def _streaks(image: NDArray, blobs: Blobs, gain_e_dn: float, hints: Hints) -> Fl
     )
 
 
-def _smear_px(blobs: Blobs, hints: Hints) -> float:
-    """Length of the frame's streaks."""
-    return float(np.hypot(*(hints.streak_px or blobs.streak_px or (0.0, 0.0))))
+def _smear(blobs: Blobs, hints: Hints) -> tuple[float, float]:
+    """(dx, dy) of the frame's streaks, px: as told, else as its blobs share; 0 where there are none."""
+    return hints.streak_px or blobs.streak_px or (0.0, 0.0)
 
 
 def _or_gravity(rows: Floats, image: NDArray, blobs: Blobs, gain_e_dn: float) -> Floats:

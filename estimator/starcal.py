@@ -214,7 +214,7 @@ def _gathered(frames: Sequence[StarFrame]) -> Sightings:
     if not frames:
         raise ValueError("calibrate: no frames; a lens needs some tens")
     for k, frame in enumerate(frames):
-        count = sum(frame.xy_px.shape[:1])
+        count = frame.xy_px.shape[0] if frame.xy_px.ndim else 0
         shapes = [frame.xy_px.shape, frame.sigma_px.shape, frame.vectors_ref.shape]
         if shapes != [(count, 2), (count,), (count, 3)]:
             raise ValueError(f"calibrate: frame {k} has shapes {shapes}; allowed: (K, 2), (K,), (K, 3)")

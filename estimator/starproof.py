@@ -130,16 +130,18 @@ def weigh(
         observed, star = _match(lights, sky, R, zoom, own if turn else gates, GATE if turn else np.inf)
         if len(observed) < LEAST:
             return nothing()
-        if turn == 1 and _evidence(lights, sky, R, zoom, observed, star, 0, info, False) < floor_dex:
-            return nothing()
+        if turn == 1:
+            most_dex = _evidence(lights, sky, R, zoom, observed, star, info, False)
+            if most_dex + _seen_dex(len(observed), 0) < floor_dex:
+                return nothing()
         if turn < 2:
             zoom = _fit(lights, sky, R, zoom, observed, star, info)
             if abs(zoom - 1) > 1.2 * lights.zoom + 1e-12:
                 return nothing()
-    if _evidence(lights, sky, R, zoom, observed, star, 0, info, True) < floor_dex:
+    dex, seen = _evidence(lights, sky, R, zoom, observed, star, info, True), len(observed)
+    if dex + _seen_dex(seen, 0) < floor_dex:
         return nothing()
-    missed = _missed(lights, sky, R, zoom, observed, star)
-    dex = _evidence(lights, sky, R, zoom, observed, star, missed, info, True)
+    dex += _seen_dex(seen, _missed(lights, sky, R, zoom, observed, star))
     return Guess(observed, star, R, zoom, info, dex)
 
 
@@ -265,17 +267,16 @@ def _evidence(
     zoom: float,
     observed: NDArray,
     star: NDArray,
-    missed: int,
     info: Floats,
     misfit: bool,
 ) -> float:
     """How many powers of ten more probable the lights are at this attitude than fallen anywhere (Bayes' factor).
 
-    Each match is worth N(residual) / rho, rho the lights on the sensor's area, and as much for the magnitude; that so
-    many of the stars are seen and so many are not is B(m + 1, k + 1), every share being as probable before; and the
-    attitude is one among all: sqrt(2 pi)^n / sqrt(det info) of their volume (Laplace's integral over it). Among lights
-    that fell anywhere evidence beyond 10^x for any attitude is met once in 10^x frames at most (Markov's inequality).
-    So much for strangers up to half of the lights; more of them are less and less likely (TOLL_DEX).
+    But for `_seen_dex`. Each match is worth N(residual) / rho, rho the lights on the sensor's area, and as much for the
+    magnitude; the attitude is one among all: sqrt(2 pi)^n / sqrt(det info) of their volume (Laplace's integral over
+    it). Among lights that fell anywhere evidence beyond 10^x for any attitude is met once in 10^x frames at most
+    (Markov's inequality). So much for strangers up to half of the lights; more of them are less and less likely
+    (TOLL_DEX).
     misfit : whether the residuals count; without them it is the most that these matches could be worth
     """
     count = 4 if lights.zoom > 0 else 3
@@ -293,9 +294,13 @@ def _evidence(
         if misfit:
             total -= misfit2(lights, sky, R, zoom, observed[k], star[k]) / 2 / log(10.0)
         total += _mag_dex(lights, sky, observed[k], star[k], as_bright)
-    seen = float(len(observed))
-    total -= TOLL_DEX * max(observed.max() + 1 - 2 * seen, 0.0)
-    return total + (lgamma(seen + 1) + lgamma(missed + 1.0) - lgamma(seen + missed + 2)) / log(10.0)
+    return total - TOLL_DEX * max(observed.max() + 1 - 2.0 * len(observed), 0.0)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _seen_dex(seen: int, missed: int) -> float:
+    """That so many of the stars are seen and so many are not: B(m + 1, k + 1), every share being as probable before."""
+    return (lgamma(seen + 1.0) + lgamma(missed + 1.0) - lgamma(seen + missed + 2.0)) / log(10.0)
 
 
 @numba.njit(cache=True, error_model="numpy")

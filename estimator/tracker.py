@@ -28,6 +28,7 @@ LEAST_ERROR_PX = 0.02  # of a star, for what no calibration knows of
 Lens = tuple[float, float, int]
 KNOWN_LENS: tuple[Lens, ...] = ((LEAST_ERROR_PX, 0.0, 400_000),)
 UNKNOWN_LENS: tuple[Lens, ...] = ((0.5, 0.0, 200_000), (1.0, 0.005, 600_000), (2.0, 0.01, 300_000))
+# By which a light outshines what its star should give: beyond colours, variables and doubles.
 TOO_BRIGHT_MAG = 2.0
 CORNERS = np.array([[0, 0], [1, 0], [0, 1], [1, 1]])
 SETTINGS = Settings()

@@ -93,13 +93,12 @@ def png(data: bytes) -> Sizes:
     OpenCV takes the memory for a chunk before it reads it.
     """
     width, height, bits = struct.unpack_from(">IIB", data, 16)
-    if width * height <= MOST_PX and height * (1 + width * bits // 8) > DEFLATE * len(data):
-        return
     at, kind = 8, b""
     while kind != b"IEND" and at < len(data):
         length, kind = struct.unpack_from(">I4s", data, at)
         at += 12 + length
-    if at <= len(data) or width * height > MOST_PX:
+    held = at <= len(data) and height * (1 + width * bits // 8) <= DEFLATE * len(data)
+    if held or width * height > MOST_PX:  # of so many the caller tells
         yield width, height
 
 
