@@ -49,7 +49,7 @@ class Options:
         """(N,) magnitudes of the observed stars, NaN where they are not known."""
         if self.magnitude is None:
             return np.full(count, np.nan)
-        light = np.ascontiguousarray(self.magnitude, dtype=float)
-        if light.shape != (count,):
-            raise BadImage(f"magnitudes {light.shape} of {count} observed stars; allowed: one for each")
-        return light
+        if np.shape(self.magnitude) != (count,):
+            told = np.shape(self.magnitude)
+            raise BadImage(f"magnitudes {told} of {count} observed stars; allowed: one for each")
+        return np.ascontiguousarray(self.magnitude, dtype=float)

@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as some
 from hypothesis.extra.numpy import arrays
 from laws import ANY, NUMBERS, SEEDS, answered, assert_covariance, drawn, law, turn, units
@@ -108,6 +108,7 @@ def test_directions_of_nothing_are_no_stars(
 
 @law(Options.light, Options.fixed_focal)
 @given(mag=NUMBERS, count=some.integers(0, 6))
+@example(mag=np.array(3.0), count=1)
 def test_magnitudes_are_one_a_star_or_unknown(mag: NDArray, count: int) -> None:
     told = answered(lambda: Options(magnitude=mag).light(count), BadImage)
     assert (told is not None) == (mag.shape == (count,))
