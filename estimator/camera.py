@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import numba
 import numpy as np
 
+from estimator.compiled import kernel
 from estimator.types import BadImage, Floats
 
 Distortion = tuple[float, float, float, float, float]
@@ -91,7 +91,7 @@ class Camera:
         return 1 / greatest if greatest else np.inf
 
 
-@numba.njit(cache=True)
+@kernel
 def _bent(x: float, y: float, distortion: Distortion) -> tuple[float, float]:
     """A tangent through the lens (Brown 1966, as OpenCV has it)."""
     k1, k2, p1, p2, k3 = distortion
@@ -103,7 +103,7 @@ def _bent(x: float, y: float, distortion: Distortion) -> tuple[float, float]:
     )
 
 
-@numba.njit(cache=True)
+@kernel
 def distorted(tangent: Floats, distortion: Distortion) -> Floats:
     """(N, 2) tangents through the lens."""
     out = np.empty_like(tangent)
@@ -112,7 +112,7 @@ def distorted(tangent: Floats, distortion: Distortion) -> Floats:
     return out
 
 
-@numba.njit(cache=True)
+@kernel
 def undistorted(
     xy_px: Floats, focal_px: float, centre_x_px: float, centre_y_px: float, distortion: Distortion
 ) -> Floats:

@@ -16,10 +16,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from estimator.compiled import kernel
 from estimator.types import BadImage, Ints
 
 # The camera's own range and increment (table 1).
@@ -109,7 +109,7 @@ def observe(image: NDArray, box_px: Ints, saturation_dn: float, control: Control
     return Observation(mean, len(boxes), overexposed)
 
 
-@numba.njit(cache=True)
+@kernel
 def _counted(image: NDArray, box_px: Ints, saturation_dn: float, allowed: int) -> tuple[float, int]:
     """Mean of the frame, and how many boxes hold more saturated pixels than allowed."""
     total = 0.0

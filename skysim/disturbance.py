@@ -6,17 +6,17 @@ import itertools
 import math
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from skysim.compiled import kernel
 from skysim.manoeuvre import Knock
 from skysim.quaternion import apply, cross, inverse, times
 from skysim.types import Floats
 from skysim.vehicle import Disturbances, Draught
 
 
-@numba.njit(cache=True)
+@kernel
 def earth_torque_nm(
     inertia_kg_m2: Floats, momentum_nms: Floats, rate_body_rad_s: Floats, earth_body_rad_s: Floats
 ) -> Floats:
@@ -39,7 +39,7 @@ def earth_torque_nm(
     )
 
 
-@numba.njit(cache=True)
+@kernel
 def steady(
     torque_lab_nm: Floats,
     earth_lab_rad_s: Floats,

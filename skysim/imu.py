@@ -9,11 +9,11 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
-import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from skysim import quaternion
+from skysim.compiled import kernel
 from skysim.types import BadInput, Floats
 from skysim.vehicle import Accelerometer, Gyro, Imu, Site
 
@@ -111,7 +111,7 @@ def felt(
     return Increments(ends_s, step_s, angle, velocity, fine, fine)
 
 
-@numba.njit(cache=True)
+@kernel
 def sensed(
     lab_from_body_wxyz: Floats,
     rate_body_rad_s: Floats,
@@ -131,7 +131,7 @@ def sensed(
     return knots
 
 
-@numba.njit(cache=True)
+@kernel
 def integrals(
     t_s: Floats, knots: Floats, ends_s: Floats, step_s: float, place_m: Floats
 ) -> tuple[Floats, Floats]:
@@ -160,7 +160,7 @@ def integrals(
     return angle, velocity
 
 
-@numba.njit(cache=True)
+@kernel
 def add_cubic(t_s: Floats, knots: Floats, k: int, at_s: float, factor: float, out: Floats) -> None:
     """Add to out (C,) factor times the value at at_s, of the cubic (Lagrange) through the knots about t_s[k]..t_s[k+1].
 
@@ -218,7 +218,7 @@ class Triad:
         return counted, limited
 
 
-@numba.njit(cache=True)
+@kernel
 def corrupt(
     ideal: Floats,
     matrix: Floats,
@@ -363,7 +363,7 @@ class Navigator:
         return math.degrees(roll), math.degrees(pitch), math.degrees(yaw)
 
 
-@numba.njit(cache=True)
+@kernel
 def turned(lab_from_body_wxyz: Floats, angle_rad: Floats, earth_rate: Floats, step_s: float) -> Floats:
     """The attitude after (N, 3) increments: lab_from_body <- exp(-earth_rate step) lab_from_body exp(angle).
 

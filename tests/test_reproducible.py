@@ -7,9 +7,15 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
+import numba
+import numpy as np
 import pytest
 from astropy.table import Table
+
+import estimator.compiled
+import skysim.compiled
 
 SCENES = ("afit_simsat", "shefex2", "simsat_bump")
 # Seconds of wall clock stand in these, and in no other file.
@@ -37,6 +43,23 @@ def made(scene: str, out: Path, **environment: str) -> Path:
     command = [sys.executable, "-m", "skysim", "run", scene, "--frames", "3", "--out", str(folder)]
     subprocess.run(command, check=True, capture_output=True, env=os.environ | environment)
     return folder
+
+
+@pytest.mark.parametrize("package", [estimator, skysim])
+def test_a_loop_is_compiled_alike_whoever_calls_it_first(package: Any) -> None:
+    """A caller that raises for a division by zero and adds in any order has no say in what it calls."""
+
+    @package.compiled.kernel(cache=False)
+    def lost(small: float) -> tuple[float, float]:
+        return (1 + small) - 1, 1 / (small - small)
+
+    @numba.njit(error_model="python", fastmath={"reassoc", "nsz"})
+    def caller(small: float) -> tuple[float, float]:
+        return lost(small)
+
+    assert caller(1e-30) == (0, np.inf)
+    told = [path for path in Path(*package.__path__).rglob("*.py") if "njit" in path.read_text()]
+    assert told == [Path(package.compiled.__file__)]
 
 
 @pytest.mark.long
