@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 
 from estimator import cells
 from estimator.cells import Cells
-from estimator.compiled import kernel
+from estimator.compiled import jit
 from estimator.types import BadImage, Floats, Ints
 
 ARCSEC_RAD = np.pi / 648_000
@@ -77,7 +77,7 @@ def bucketed(
     return PairCatalogue(vectors, light, pair, table, float(high), width_rad, cells.build(vectors))
 
 
-@kernel
+@jit
 def bucket_of(angle_rad: Floats, max_rad: float, width_rad: float, buckets: int) -> Ints:
     """Which bucket, 0 .. buckets - 1, each angle belongs to; what lies outside goes to the first or the last.
 
@@ -88,7 +88,7 @@ def bucket_of(angle_rad: Floats, max_rad: float, width_rad: float, buckets: int)
     return np.clip(number, 0, buckets - 1).astype(np.int64)
 
 
-@kernel
+@jit
 def candidates(catalogue: PairCatalogue, low_rad: float, high_rad: float) -> tuple[int, int]:
     """Half-open range of pairs that holds every angle in [low, high], and a bucket's rest at either end.
 

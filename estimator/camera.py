@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from estimator.compiled import kernel
+from estimator.compiled import jit
 from estimator.types import BadImage, Floats
 
 Distortion = tuple[float, float, float, float, float]
@@ -91,7 +91,7 @@ class Camera:
         return 1 / greatest if greatest else np.inf
 
 
-@kernel
+@jit
 def _bent(x: float, y: float, distortion: Distortion) -> tuple[float, float]:
     """A tangent through the lens (Brown 1966, as OpenCV has it)."""
     k1, k2, p1, p2, k3 = distortion
@@ -103,7 +103,7 @@ def _bent(x: float, y: float, distortion: Distortion) -> tuple[float, float]:
     )
 
 
-@kernel
+@jit
 def distorted(tangent: Floats, distortion: Distortion) -> Floats:
     """(N, 2) tangents through the lens."""
     out = np.empty_like(tangent)
@@ -112,7 +112,7 @@ def distorted(tangent: Floats, distortion: Distortion) -> Floats:
     return out
 
 
-@kernel
+@jit
 def undistorted(
     xy_px: Floats, focal_px: float, centre_x_px: float, centre_y_px: float, distortion: Distortion
 ) -> Floats:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.compiled import kernel
+from estimator.compiled import jit
 from estimator.types import Floats
 
 MOST_A_SIDE = 64  # a table of a megabyte
@@ -35,7 +35,7 @@ def build(vectors: Floats) -> Cells:
     return Cells(side, *_sorted(vectors, side))
 
 
-@kernel
+@jit
 def _sorted(vectors: Floats, side: int) -> tuple[NDArray, NDArray]:
     """Counting sort of the stars by cell."""
     first = np.zeros(side**3 + 1, np.int32)
@@ -53,13 +53,13 @@ def _sorted(vectors: Floats, side: int) -> tuple[NDArray, NDArray]:
     return first, row
 
 
-@kernel
+@jit
 def _spot(x: float, side: int) -> int:
     """Which cell along an edge a coordinate is in."""
     return min(max(int((x + 1) / 2 * side), 0), side - 1)
 
 
-@kernel
+@jit
 def within(cells: Cells, vectors: Floats, x: float, y: float, z: float, chord: float, out: NDArray) -> int:
     """How many stars are within a straight-line distance `chord` of (x, y, z); the rows of the first len(out)."""
     count, side = 0, cells.side
@@ -78,7 +78,7 @@ def within(cells: Cells, vectors: Floats, x: float, y: float, z: float, chord: f
     return count
 
 
-@kernel
+@jit
 def nearest(cells: Cells, vectors: Floats, x: float, y: float, z: float, chord: float) -> int:
     """Row of the star nearest to (x, y, z) within a straight-line distance; -1 where there is none."""
     best, least, side = -1, chord * chord, cells.side

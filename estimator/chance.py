@@ -6,13 +6,13 @@ from math import lgamma, log
 
 import numpy as np
 
-from estimator.compiled import kernel
+from estimator.compiled import jit
 
 ACCEPT_LOG10_CHANCE = -5.0  # matches as good as that are expected less often over all that was tried
 MIN_MATCHES = 4
 
 
-@kernel
+@jit
 def log10_tail(trials: int, hits: int, p: float) -> float:
     """log10 of the probability of `hits` or more in `trials` at probability p each."""
     if hits <= 0 or p >= 1:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator import leastsquares
-from estimator.compiled import kernel
+from estimator.compiled import jit
 from estimator.moments import foreign, neighbours
 from estimator.skylevel import FILTERED_NOISE, at
 from estimator.types import Floats, Ints
@@ -21,7 +21,7 @@ MODEL_PX = 0.004  # what a square pixel at a curved edge differs from the model:
 X, Y, RADIUS, EDGE, BRIGHT, SKY = range(6)
 
 
-@kernel
+@jit
 def fit_all(
     image: NDArray,
     xy: Floats,
@@ -64,7 +64,7 @@ def fit_all(
     return out
 
 
-@kernel
+@jit
 def _largest_window(boxes: Ints) -> int:
     """Pixels of the largest blob's window."""
     most = 0
@@ -73,7 +73,7 @@ def _largest_window(boxes: Ints) -> int:
     return most
 
 
-@kernel
+@jit
 def _fit(
     pixels: Floats, noise: float, gain_e_dn: float, rows: Floats, weight: Floats, p: Floats, out: Floats
 ) -> None:
@@ -107,7 +107,7 @@ def _fit(
             return
 
 
-@kernel
+@jit
 def _rows(pixels: Floats, noise: float, gain_e_dn: float, p: Floats, rows: Floats, weight: Floats) -> None:
     """The model's slopes by the six parameters at every pixel, what it leaves over, and the weights.
 

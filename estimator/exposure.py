@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.compiled import kernel
+from estimator.compiled import jit
 from estimator.types import BadImage, Ints
 
 # The camera's own range and increment (table 1).
@@ -109,7 +109,7 @@ def observe(image: NDArray, box_px: Ints, saturation_dn: float, control: Control
     return Observation(mean, len(boxes), overexposed)
 
 
-@kernel
+@jit
 def _counted(image: NDArray, box_px: Ints, saturation_dn: float, allowed: int) -> tuple[float, int]:
     """Mean of the frame, and how many boxes hold more saturated pixels than allowed."""
     total = 0.0

@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.chance import ACCEPT_LOG10_CHANCE, MIN_MATCHES
-from estimator.compiled import kernel
+from estimator.compiled import jit
 from estimator.fieldmatch import Found, angle, answer, nothing, settled, triple
 from estimator.index import PairIndex, alike, around
 from estimator.options import Options
@@ -178,7 +178,7 @@ def _found(vectors_cam: Floats, index: PairIndex, asked: Options, by: Rules) -> 
     return search(np.ascontiguousarray(vectors_cam), asked.light(len(vectors_cam)), index, by)
 
 
-@kernel
+@jit
 def search(seen: Floats, light: Floats, index: PairIndex, by: Rules) -> Found:
     """The compiled identifier: (N, 3) unit vectors brightest first and their (N,) magnitudes, NaN if unknown.
 
@@ -209,14 +209,14 @@ def search(seen: Floats, light: Floats, index: PairIndex, by: Rules) -> Found:
     return nothing()
 
 
-@kernel
+@jit
 def _closest(seen: Floats, corners: NDArray) -> float:
     """The least angle between three stars."""
     i, j, k = corners
     return min(angle(seen[i], seen[j]), angle(seen[i], seen[k]), angle(seen[j], seen[k]))
 
 
-@kernel
+@jit
 def _brightest(seen: Floats, base: int, least_rad: float) -> NDArray:
     """Rows of the three brightest stars with a least distance between them; -1 where there are none."""
     for i in range(base):
@@ -230,7 +230,7 @@ def _brightest(seen: Floats, base: int, least_rad: float) -> NDArray:
     return np.full(3, -1)
 
 
-@kernel
+@jit
 def triplets(
     seen: Floats, light: Floats, index: PairIndex, corners: NDArray, by: Rules, tried: NDArray
 ) -> Found:
@@ -250,7 +250,7 @@ def triplets(
     return _by_lists(seen, light, index, corners, sides, slack, by, tried)
 
 
-@kernel
+@jit
 def _accepted(
     seen: Floats, index: PairIndex, corners: NDArray, stars: NDArray, by: Rules, tried: int
 ) -> Found:
@@ -261,7 +261,7 @@ def _accepted(
     return found
 
 
-@kernel
+@jit
 def _candidate(index: PairIndex, star: int, magnitude: float, by: Rules) -> bool:
     """Whether a star is bright enough, faint enough, and near enough to the believed boresight."""
     if abs(index.magnitude[star] - magnitude) > by.gate_mag:  # NaN is not
@@ -270,7 +270,7 @@ def _candidate(index: PairIndex, star: int, magnitude: float, by: Rules) -> bool
     return (x - by.x) ** 2 + (y - by.y) ** 2 + (z - by.z) ** 2 <= by.chord
 
 
-@kernel
+@jit
 def _by_neighbours(
     seen: Floats,
     light: Floats,
@@ -320,7 +320,7 @@ def _by_neighbours(
     return nothing()
 
 
-@kernel
+@jit
 def _list(index: PairIndex, magnitude: float, by: Rules) -> NDArray:
     """Candidates for one star, from the whole catalogue."""
     out, count = np.empty(len(index.vectors), np.int64), 0
@@ -331,7 +331,7 @@ def _list(index: PairIndex, magnitude: float, by: Rules) -> NDArray:
     return out[:count]
 
 
-@kernel
+@jit
 def _by_lists(
     seen: Floats,
     light: Floats,

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from estimator.cells import nearest
 from estimator.chance import ACCEPT_LOG10_CHANCE, MIN_MATCHES, log10_tail
-from estimator.compiled import kernel
+from estimator.compiled import jit
 from estimator.index import PairIndex
 from estimator.types import Floats, StarMatch
 from estimator.wahba import wahba
@@ -27,7 +27,7 @@ def answer(found: Found) -> StarMatch | None:
     return StarMatch(observed, star, Rotation.from_matrix(matrix), chance)
 
 
-@kernel
+@jit
 def settled(
     seen: Floats,
     index: PairIndex,
@@ -55,20 +55,20 @@ def settled(
     return observed, star, turned(seen[observed], index.vectors[star]), chance
 
 
-@kernel
+@jit
 def nothing() -> Found:
     """No match: a chance of 1."""
     return np.empty(0, np.int64), np.empty(0, np.int64), np.eye(3), 0.0
 
 
-@kernel
+@jit
 def angle(u: Floats, v: Floats) -> float:
     """Angle between unit vectors by the half-chord, exact when small."""
     half = sqrt((u[0] - v[0]) ** 2 + (u[1] - v[1]) ** 2 + (u[2] - v[2]) ** 2) / 2
     return 2 * np.arcsin(min(half, 1.0))
 
 
-@kernel
+@jit
 def triple(u: Floats, v: Floats, w: Floats) -> float:
     """u . (v x w): whose sign is the handedness of a triangle of directions."""
     return (
@@ -78,13 +78,13 @@ def triple(u: Floats, v: Floats, w: Floats) -> float:
     )
 
 
-@kernel
+@jit
 def turned(cam: Floats, ref: Floats) -> Floats:
     """R_cam_from_ref of directions that weigh alike."""
     return wahba(cam, ref, np.ones(len(cam)))[0]
 
 
-@kernel
+@jit
 def match(
     seen: Floats, index: PairIndex, centre: int, matrix: Floats, tolerance: float, stretch: float
 ) -> tuple[NDArray, NDArray, float]:
@@ -114,7 +114,7 @@ def match(
     return observed[:count], star[:count], 1 - np.exp(-covered / len(seen))
 
 
-@kernel
+@jit
 def log10_chance(groups: NDArray, seen: int, p: float) -> float:
     """log10 of the probability that a false attitude matches this much, three independent matches being spent.
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.chance import ACCEPT_LOG10_CHANCE, MIN_MATCHES
-from estimator.compiled import kernel
+from estimator.compiled import jit
 from estimator.fialho import fialho_1, fialho_2, fialho_3, fialho_4
 from estimator.fieldmatch import Found, angle, answer, nothing, settled, triple
 from estimator.index import PairIndex, around, between
@@ -85,7 +85,7 @@ IDENTIFIERS: dict[str, Identifier] = {
 }
 
 
-@kernel
+@jit
 def _search(seen: Floats, index: PairIndex, rules: Rules) -> Found:
     """Walk the triangles (i, i + dj, i + dj + dk) and stop at the first attitude beyond chance."""
     tried = np.zeros(3, np.int64)  # observed triangles, hypotheses, checks
@@ -102,7 +102,7 @@ def _search(seen: Floats, index: PairIndex, rules: Rules) -> Found:
     return nothing()
 
 
-@kernel
+@jit
 def _triangle(seen: Floats, index: PairIndex, corners: NDArray, rules: Rules, tried: NDArray) -> Found:
     """Every catalogue triangle like an observed one, of the same handedness, that a fourth star confirms."""
     i, j, k = corners
@@ -150,7 +150,7 @@ def _triangle(seen: Floats, index: PairIndex, corners: NDArray, rules: Rules, tr
     return nothing()
 
 
-@kernel
+@jit
 def _pyramid(
     seen: Floats,
     index: PairIndex,
@@ -182,7 +182,7 @@ def _pyramid(
     return nothing()
 
 
-@kernel
+@jit
 def _zoomed(seen: Floats, zoom: float) -> Floats:
     """The directions with all angles from the boresight stretched, as a shorter focal length would see them."""
     out = np.empty_like(seen)
@@ -193,7 +193,7 @@ def _zoomed(seen: Floats, zoom: float) -> Floats:
     return out
 
 
-@kernel
+@jit
 def _prove(
     seen: Floats,
     index: PairIndex,
@@ -213,7 +213,7 @@ def _prove(
     return observed, star, matrix, chance
 
 
-@kernel
+@jit
 def _expected(index: PairIndex, centre: int, matrix: Floats, rules: Rules) -> int:
     """How many catalogue stars should be in the field at an attitude."""
     count = 0

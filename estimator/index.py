@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from estimator import cells
 from estimator.cells import Cells
-from estimator.compiled import kernel
+from estimator.compiled import jit
 from estimator.types import BadImage, Floats
 
 
@@ -111,7 +111,7 @@ def line(angle_rad: Floats) -> tuple[NDArray[np.int64], float, float]:
     return np.searchsorted(angle_rad, z, side="right"), float(slope), float(low)
 
 
-@kernel
+@jit
 def between(index: PairIndex, low_rad: float, high_rad: float) -> tuple[int, int]:
     """Half-open range of pairs that holds every angle in [low, high].
 
@@ -129,7 +129,7 @@ def between(index: PairIndex, low_rad: float, high_rad: float) -> tuple[int, int
     return begin, end
 
 
-@kernel
+@jit
 def alike(index: PairIndex, magnitude: float, gate: float) -> tuple[int, int]:
     """Half-open range of rows whose magnitude is within a gate of one; all of them where one is not known."""
     if not np.isfinite(gate) or np.isnan(magnitude) or np.isnan(index.magnitude[0]):
@@ -138,7 +138,7 @@ def alike(index: PairIndex, magnitude: float, gate: float) -> tuple[int, int]:
     return begin, int(np.searchsorted(index.magnitude, magnitude + gate, side="right"))
 
 
-@kernel
+@jit
 def around(index: PairIndex, star: int, low_rad: float) -> int:
     """Place of a star's first neighbour at `low_rad` or farther, by bisection."""
     begin, end = index.first[star], index.first[star + 1]

@@ -9,7 +9,7 @@ from math import atan2, cos, hypot, sin, sqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.compiled import kernel
+from estimator.compiled import jit
 from estimator.hints import Hints
 from estimator.skylevel import FILTERED_NOISE, at, filtered, median
 from estimator.types import Blobs, Floats, Ints
@@ -78,7 +78,7 @@ def judged(image: NDArray, blobs: Blobs, hints: Hints) -> Blobs:
     )
 
 
-@kernel
+@jit
 def _flags(
     shape: Floats,
     boxes: Ints,
@@ -115,7 +115,7 @@ def _flags(
     return flag
 
 
-@kernel
+@jit
 def _shared(lines: Floats) -> tuple[float, float]:
     """The line, as L^2 (cos 2a, sin 2a), that most of the brightest blobs share; 0 where they do not agree."""
     voters = lines[:VOTERS]
@@ -136,7 +136,7 @@ def _halved(line: tuple[float, float]) -> tuple[float, float]:
     return length * cos(angle), length * sin(angle)
 
 
-@kernel
+@jit
 def _shapes(image: NDArray, boxes: Ints, level: Floats, noise: Floats) -> Floats:
     """(N, 5) a blob's greatest pixel above the sky, the sum of its four neighbours, the variance across its longer
     axis, and 12 (xx - yy, 2 xy) of the pixels whose filtered light is above 3 sigma: L^2 (cos 2a, sin 2a).

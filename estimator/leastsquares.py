@@ -6,7 +6,7 @@ from math import sqrt
 
 import numpy as np
 
-from estimator.compiled import kernel
+from estimator.compiled import jit
 from estimator.types import Floats
 
 # A fit has settled once a step is a hundredth of the standard deviation of what is fitted, or a thousandth of a
@@ -14,7 +14,7 @@ from estimator.types import Floats
 SETTLED_CHI2, SETTLED_PX = 1e-4, 1e-3
 
 
-@kernel(fastmath={"reassoc", "contract"})
+@jit(fastmath={"reassoc", "contract"})
 def normal_equations(rows: Floats, weight: Floats, count: int, normal: Floats) -> None:
     """sum(w r_i r_j) over `count` pixels, the lower half.
 
@@ -29,7 +29,7 @@ def normal_equations(rows: Floats, weight: Floats, count: int, normal: Floats) -
             normal[i, j] = total
 
 
-@kernel
+@jit
 def expect(normal: Floats, n: int, off: float, sigma: float) -> None:
     """Add what is known of parameter n beforehand: that it lies `off` from here, give or take sigma."""
     last, weight = len(normal) - 1, 1 / sigma**2
@@ -38,7 +38,7 @@ def expect(normal: Floats, n: int, off: float, sigma: float) -> None:
     normal[last, last] += weight * off**2
 
 
-@kernel
+@jit
 def step(normal: Floats, out: Floats) -> float:
     """Gauss-Newton's step from the matrix of `normal_equations`, which keeps Cholesky's factor; NaN if singular.
 
@@ -55,7 +55,7 @@ def step(normal: Floats, out: Floats) -> float:
     return fall
 
 
-@kernel
+@jit
 def factorise(normal: Floats) -> bool:
     """Cholesky's L in place of the lower half of N = L L^T; False where N has no inverse worth the name."""
     for i in range(len(normal)):
@@ -73,7 +73,7 @@ def factorise(normal: Floats) -> bool:
     return True
 
 
-@kernel
+@jit
 def solve(factor: Floats, vector: Floats) -> None:
     """Replace v by N^-1 v, for Cholesky's factor of N."""
     count = len(vector)
@@ -87,7 +87,7 @@ def solve(factor: Floats, vector: Floats) -> None:
         vector[i] /= factor[i, i]
 
 
-@kernel
+@jit
 def place_covariance(factor: Floats, column: Floats) -> tuple[float, float, float]:
     """xx, yy and xy of N^-1 for the first two parameters: where the weights are inverse variances, Cramer and Rao's."""
     column[:] = 0.0
@@ -100,7 +100,7 @@ def place_covariance(factor: Floats, column: Floats) -> tuple[float, float, floa
     return xx, column[1], xy
 
 
-@kernel
+@jit
 def misfit_factor(chi2: float, freedom: int) -> float:
     """By how much a covariance grows where the model is not the light: chi-square a degree, if that is no accident.
 

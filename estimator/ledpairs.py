@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from estimator import vectors
-from estimator.compiled import kernel
+from estimator.compiled import jit
 from estimator.index import between
 from estimator.ledmap import on_sphere
 from estimator.ledproof import GATE, LEAST, Guess, Lights, alike, apart, prove
@@ -76,7 +76,7 @@ def lights_of(rays_cam: Floats, sigma_rad: Floats, sight: Sight) -> Lights:
     )
 
 
-@kernel
+@jit
 def _search(lights: Lights, sight: Sight, max_checks: int) -> tuple[Guess, float]:
     """The best attitude, and how much speaks for the best that is another."""
     best = Guess(np.empty(0, np.int64), np.empty(0, np.int64), np.eye(3), -np.inf)
@@ -96,7 +96,7 @@ def _search(lights: Lights, sight: Sight, max_checks: int) -> tuple[Guess, float
     return best, rival_dex
 
 
-@kernel
+@jit
 def _pairs(lights: Lights, sight: Sight) -> NDArray[np.int64]:
     """(P, 2) pairs of lights, those that the fewest LEDs may be first; short ones last, two in one place not at all.
 
@@ -117,7 +117,7 @@ def _pairs(lights: Lights, sight: Sight) -> NDArray[np.int64]:
     return pair[:place][np.argsort(cost[:place])]
 
 
-@kernel
+@jit
 def _window(lights: Lights, sight: Sight, a: int, b: int) -> tuple[int, int, float]:
     """Which pairs of the index two lights may be, half-open, and the gate for the angle about the bearing."""
     gate = GATE * sqrt(lights.sigma[a] ** 2 + lights.sigma[b] ** 2) * _to_bearing(sight)
@@ -127,13 +127,13 @@ def _window(lights: Lights, sight: Sight, a: int, b: int) -> tuple[int, int, flo
     return begin, end, gate
 
 
-@kernel
+@jit
 def _to_bearing(sight: Sight) -> float:
     """An angle about the bearing for one at the camera: (R - M) / R."""
     return 1 - sqrt(sight.pupil_m[0] ** 2 + sight.pupil_m[1] ** 2 + sight.pupil_m[2] ** 2) / sight.usual_m
 
 
-@kernel
+@jit
 def _second(pairs: NDArray, rank: int, best: Guess) -> int:
     """The first of the pairs of matched lights that has none of that pair's, or as few as can be."""
     kept, cost = rank, 9
@@ -150,7 +150,7 @@ def _second(pairs: NDArray, rank: int, best: Guess) -> int:
     return kept
 
 
-@kernel
+@jit
 def _attempt(
     lights: Lights,
     sight: Sight,
@@ -195,7 +195,7 @@ def _attempt(
     return best, rival_dex
 
 
-@kernel
+@jit
 def _carried(ray: Floats, sight: Sight, radius_m: float) -> Vector:
     """Unit vector from the bearing to where a ray from the camera meets the sphere of a radius, in camera axes."""
     px, py, pz = sight.pupil_m
@@ -205,7 +205,7 @@ def _carried(ray: Floats, sight: Sight, radius_m: float) -> Vector:
     return (px + reach * ray[0]) * inverse, (py + reach * ray[1]) * inverse, (pz + reach * ray[2]) * inverse
 
 
-@kernel
+@jit
 def _wanted(lights: Lights, sight: Sight, a: int, b: int, floor_dex: float) -> int:
     """How many matches it takes for that evidence.
 
@@ -222,7 +222,7 @@ def _wanted(lights: Lights, sight: Sight, a: int, b: int, floor_dex: float) -> i
     return len(lights.ray)
 
 
-@kernel
+@jit
 def _first_gates(lights: Lights, sight: Sight, a: int, b: int) -> Floats:
     """(N,) angles about the bearing within which an LED is to be where a pair's attitude puts a light.
 
@@ -237,7 +237,7 @@ def _first_gates(lights: Lights, sight: Sight, a: int, b: int) -> Floats:
     return out
 
 
-@kernel
+@jit
 def _glance(
     lights: Lights,
     sight: Sight,
@@ -267,7 +267,7 @@ def _glance(
     return count
 
 
-@kernel
+@jit
 def _anything(grid: Grid, where: Vector, gate: float) -> bool:
     """Whether an LED is within an angle of a direction in the grid's axes."""
     inverse, half, reach = 1 / grid.cell, grid.side / 2, gate / grid.cell

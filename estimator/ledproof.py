@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator import vectors
-from estimator.compiled import kernel
+from estimator.compiled import jit
 from estimator.ledsight import Sight
 from estimator.types import Floats
 from estimator.vectors import Vector
@@ -41,13 +41,13 @@ class Guess(NamedTuple):
     dex: float
 
 
-@kernel
+@jit
 def apart(tangent: Floats, a: int, b: int) -> float:
     """Distance of two lights in the image, in tangents."""
     return sqrt((tangent[a, 0] - tangent[b, 0]) ** 2 + (tangent[a, 1] - tangent[b, 1]) ** 2)
 
 
-@kernel
+@jit
 def alike(one: Guess, other: Guess) -> bool:
     """Whether two guesses are the same attitude: more than half of the smaller one's lights are the same LEDs."""
     common = 0
@@ -57,7 +57,7 @@ def alike(one: Guess, other: Guess) -> bool:
     return 2 * common > min(len(one.observed), len(other.observed))
 
 
-@kernel
+@jit
 def prove(lights: Lights, sight: Sight, matrix: Floats, centre: int, a: int, b: int) -> Guess:
     """Match the field at a pair's attitude, fit the attitude to the matches, match again, and weigh them."""
     middle = (lights.tangent[a] + lights.tangent[b]) / 2
@@ -73,7 +73,7 @@ def prove(lights: Lights, sight: Sight, matrix: Floats, centre: int, a: int, b: 
     return Guess(observed, star, matrix, dex if len(observed) >= LEAST else -np.inf)
 
 
-@kernel
+@jit
 def _seen_from_pupil(sight: Sight, matrix: Floats, star: int) -> Vector:
     """An LED from the camera's pupil at R_cam_from_lab, in camera axes."""
     x, y, z = vectors.row(sight.position_m, star)
@@ -84,7 +84,7 @@ def _seen_from_pupil(sight: Sight, matrix: Floats, star: int) -> Vector:
     )
 
 
-@kernel
+@jit
 def _match(
     lights: Lights, sight: Sight, matrix: Floats, centre: int, middle: Floats, own: float, turning: float
 ) -> tuple[NDArray, NDArray, int]:
@@ -132,7 +132,7 @@ def _match(
     return observed[:count], star[:count], missed
 
 
-@kernel
+@jit
 def _fit(lights: Lights, sight: Sight, matrix: Floats, observed: NDArray, star: NDArray) -> Floats:
     """One Gauss-Newton step of the exact rotation-only solve, in place; its (3, 3) information, in camera axes.
 
@@ -157,7 +157,7 @@ def _fit(lights: Lights, sight: Sight, matrix: Floats, observed: NDArray, star: 
     return info
 
 
-@kernel
+@jit
 def _evidence(
     lights: Lights,
     sight: Sight,

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.chance import ACCEPT_LOG10_CHANCE, MIN_MATCHES
-from estimator.compiled import kernel
+from estimator.compiled import jit
 from estimator.fieldmatch import Found, angle, answer, nothing, settled
 from estimator.index import PairIndex, alike, around
 from estimator.options import Options
@@ -58,7 +58,7 @@ def master_star(
     return answer(search(np.ascontiguousarray(vectors_cam), asked.light(count), index, by))
 
 
-@kernel
+@jit
 def search(seen: Floats, light: Floats, index: PairIndex, by: Rules) -> Found:
     """The compiled identifier: rows of the observed and the catalogue's stars, R_cam_from_ref, log10 of the chance."""
     tried = np.zeros(2, np.int64)  # assumed pairs, angles compared
@@ -80,7 +80,7 @@ def search(seen: Floats, light: Floats, index: PairIndex, by: Rules) -> Found:
     return nothing()
 
 
-@kernel
+@jit
 def _contradict(one: Found, other: Found) -> bool:
     """Whether two matches give an observed star different names."""
     for n in range(len(one[0])):
@@ -90,7 +90,7 @@ def _contradict(one: Found, other: Found) -> bool:
     return False
 
 
-@kernel
+@jit
 def _repeated(seen: Floats, index: PairIndex, master: int, candidate: int, by: Rules, tried: NDArray) -> int:
     """How many of the master's angles the candidate has to stars of its own."""
     count = 0
@@ -105,7 +105,7 @@ def _repeated(seen: Floats, index: PairIndex, master: int, candidate: int, by: R
     return count
 
 
-@kernel
+@jit
 def _proved(
     seen: Floats,
     index: PairIndex,

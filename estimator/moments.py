@@ -7,7 +7,7 @@ from math import exp, pi, sqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.compiled import kernel
+from estimator.compiled import jit
 from estimator.skylevel import FILTERED_NOISE, at
 from estimator.types import Floats, Ints
 
@@ -19,7 +19,7 @@ WINDOW_SHARE = (
 SIZING, ROUNDS = 4, 60  # rounds in which the window takes the star's width, and at most
 
 
-@kernel
+@jit
 def gravity(image: NDArray, boxes: Ints, level: Floats, noise: Floats, gain_e_dn: float) -> Floats:
     """(N, 4) x, y, sigma of the place, flux, of the light in the box and a margin around it."""
     height, width = image.shape
@@ -68,7 +68,7 @@ def gravity(image: NDArray, boxes: Ints, level: Floats, noise: Floats, gain_e_dn
     return out
 
 
-@kernel
+@jit
 def squared(image: NDArray, boxes: Ints, level: Floats, noise: Floats, gain_e_dn: float) -> Floats:
     """(N, 4) x, y, sigma of the place, flux; each pixel weighs as its light squared."""
     height, width = image.shape
@@ -110,7 +110,7 @@ def squared(image: NDArray, boxes: Ints, level: Floats, noise: Floats, gain_e_dn
     return out
 
 
-@kernel
+@jit
 def windowed(
     image: NDArray, xy: Floats, boxes: Ints, level: Floats, noise: Floats, gain_e_dn: float
 ) -> Floats:
@@ -168,7 +168,7 @@ def windowed(
     return out
 
 
-@kernel
+@jit
 def sampling_variance(variance_px2: float) -> float:
     """Mean square of the S-curve of a Gaussian v seen at points only: its amplitude is 4 pi v exp(-2 pi^2 v).
 
@@ -177,7 +177,7 @@ def sampling_variance(variance_px2: float) -> float:
     return (4 * pi * variance_px2 * exp(-2 * pi * pi * variance_px2)) ** 2 / 2
 
 
-@kernel
+@jit
 def neighbours(boxes: Ints, n: int, x0: int, y0: int, x1: int, y1: int, near: Ints) -> int:
     """Fill `near` with the other blobs whose boxes reach into a window; how many."""
     count = 0
@@ -189,7 +189,7 @@ def neighbours(boxes: Ints, n: int, x0: int, y0: int, x1: int, y1: int, near: In
     return count
 
 
-@kernel
+@jit
 def foreign(boxes: Ints, near: Ints, n: int, x: int, y: int) -> bool:
     """Whether a pixel lies nearer to another blob's box."""
     if len(near) == 0:
@@ -201,7 +201,7 @@ def foreign(boxes: Ints, near: Ints, n: int, x: int, y: int) -> bool:
     return nearest < mine
 
 
-@kernel
+@jit
 def _apart(box: Ints, x: int, y: int) -> float:
     """Squared distance of a pixel from a box; 0 inside."""
     dx = max(box[0] - x, 0, x - box[2])

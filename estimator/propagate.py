@@ -6,11 +6,11 @@ import math
 
 import numpy as np
 
-from estimator.compiled import kernel
+from estimator.compiled import jit
 from estimator.types import Floats
 
 
-@kernel
+@jit
 def advance(
     moment: tuple[float, Floats, Floats, Floats, float],
     samples: Floats,
@@ -55,7 +55,7 @@ def advance(
     return wxyz, bias, covariance, missed_rad
 
 
-@kernel
+@jit
 def congruent(matrix: Floats, covariance: Floats, passed: Floats) -> None:
     """covariance <- matrix covariance matrix^T, exactly symmetric; `passed` is room for the product between."""
     size = len(matrix)
@@ -72,7 +72,7 @@ def congruent(matrix: Floats, covariance: Floats, passed: Floats) -> None:
             covariance[i, j] = covariance[j, i] = total
 
 
-@kernel
+@jit
 def transition(p: Floats, acting_s: float, out: Floats) -> None:
     """The attitude's rows of the transition: out[:3] = exp(-[p]), -acting_s J(p); [p] v = p x v."""
     square = p[0] * p[0] + p[1] * p[1] + p[2] * p[2]
@@ -92,7 +92,7 @@ def transition(p: Floats, acting_s: float, out: Floats) -> None:
             out[i, j + 3] = -acting_s * (one - cosine * crossed + cubic * twice)
 
 
-@kernel
+@jit
 def turn_on(ref_from_body_wxyz: Floats, turn_rad: Floats) -> None:
     """The unit quaternion times that of a rotation vector in body axes (Hamilton's product), in place."""
     q, (x, y, z) = ref_from_body_wxyz, turn_rad

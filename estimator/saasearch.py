@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.cells import Cells, within
-from estimator.compiled import kernel
+from estimator.compiled import jit
 from estimator.fieldmatch import angle
 from estimator.types import Floats, Ints
 
@@ -65,13 +65,13 @@ class Primary(NamedTuple):
     reach_rad: float
 
 
-@kernel
+@jit
 def gate_rad(gates: Gates, angle_rad: float) -> float:
     """How far an angle may be off."""
     return 3 * gates.separation_rad + gates.stretch * angle_rad
 
 
-@kernel
+@jit
 def triad(a: Floats, b: Floats) -> Floats:
     """Rows: unit vectors along a + b, a - b and their cross product.
 
@@ -86,7 +86,7 @@ def triad(a: Floats, b: Floats) -> Floats:
     return rows
 
 
-@kernel
+@jit
 def primary_of(sky: Sky, row_a: int, row_b: int) -> Primary:
     """What the direct match needs of the pair, whatever it is assumed to be.
 
@@ -123,7 +123,7 @@ def primary_of(sky: Sky, row_a: int, row_b: int) -> Primary:
     return Primary(rows, triad(a, b), middle, others, corner, gate, sigma, radius, area, reach_rad)
 
 
-@kernel
+@jit
 def magnitude_cost(sky: Sky, observed: int, star: int) -> float:
     """Squared deviation of a magnitude, infinite beyond three; 0 where none is known."""
     off = (sky.light[observed] - sky.magnitude[star]) / sky.gates.magnitude
@@ -132,7 +132,7 @@ def magnitude_cost(sky: Sky, observed: int, star: int) -> float:
     return off * off if abs(off) <= 3 else np.inf
 
 
-@kernel
+@jit
 def matched(sky: Sky, primary: Primary, pairs: NDArray) -> tuple[NDArray, Floats, Ints]:
     """Steps 3 to 7: every assumption that one of the catalogue's (K, 2) pairs makes, either way round.
 
@@ -168,7 +168,7 @@ def matched(sky: Sky, primary: Primary, pairs: NDArray) -> tuple[NDArray, Floats
     return star[:count], cost[:count], hits[:count]
 
 
-@kernel
+@jit
 def _partners(
     sky: Sky, primary: Primary, first: int, second: int, near: NDArray, partner: NDArray, spent: Floats
 ) -> None:
@@ -209,7 +209,7 @@ def _partners(
                 least, partner[k], spent[k] = cost + place, s, cost
 
 
-@kernel
+@jit
 def _each_once(partner: NDArray, spent: Floats) -> int:
     """A star that two observed ones want goes to the cheaper; how many have one."""
     count = 0
@@ -226,7 +226,7 @@ def _each_once(partner: NDArray, spent: Floats) -> int:
     return count
 
 
-@kernel
+@jit
 def contradicting(star: NDArray, cost: Floats, hits: NDArray, best: NDArray, doubts: Floats) -> None:
     """Add up those that give an observed star another name than the best does: how many, their matches, least cost."""
     for n in range(len(cost)):

@@ -7,7 +7,7 @@ from math import floor, sqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.compiled import kernel
+from estimator.compiled import jit
 from estimator.skylevel import at, filtered, filtered_row, summing
 from estimator.types import Floats, Ints
 
@@ -42,7 +42,7 @@ def runs_above(image: NDArray, threshold: Floats, taps: Ints | None = None) -> I
         room = count
 
 
-@kernel
+@jit
 def _scan(image: NDArray, threshold: Floats, taps: Ints, sums: NDArray, ring: NDArray, runs: Ints) -> int:
     """Fill `runs`; how many there are, which may be more than fit. `ring` has room for the rows that taps reach."""
     height, width = image.shape
@@ -82,7 +82,7 @@ def _scan(image: NDArray, threshold: Floats, taps: Ints, sums: NDArray, ring: ND
     return count
 
 
-@kernel
+@jit
 def _runs_of(
     line: NDArray,
     bound: NDArray,
@@ -109,7 +109,7 @@ def _runs_of(
     return count
 
 
-@kernel
+@jit
 def _line(ring: NDArray, taps: Ints, y: int, height: int, out: NDArray) -> None:
     """Sum of the filtered rows at the taps about a row."""
     reach, width = len(ring) // 2, len(out)
@@ -121,7 +121,7 @@ def _line(ring: NDArray, taps: Ints, y: int, height: int, out: NDArray) -> None:
             out[x] += part[x]
 
 
-@kernel
+@jit
 def _padded_row(image: NDArray, y: int, reach: int, sums: NDArray, out: NDArray) -> None:
     """16 times the filtered row, its ends repeated."""
     inner = out[reach : len(out) - reach]
@@ -129,7 +129,7 @@ def _padded_row(image: NDArray, y: int, reach: int, sums: NDArray, out: NDArray)
     out[:reach], out[len(out) - reach :] = inner[0], inner[-1]
 
 
-@kernel
+@jit
 def _extend(runs: Ints, count: int, y: int, x: int) -> int:
     """Lengthen the last run or begin another."""
     if 0 < count <= len(runs) and runs[count - 1, 0] == y and runs[count - 1, 2] == x - 1:
@@ -140,7 +140,7 @@ def _extend(runs: Ints, count: int, y: int, x: int) -> int:
     return count + 1
 
 
-@kernel
+@jit
 def _bounds(threshold: Floats, height: int, y: int, cell: int, scale: float, bound: NDArray) -> int:
     """`scale` times the least threshold of the bilinear cell about every pixel of a row; the row's cell.
 
@@ -170,7 +170,7 @@ def _bounds(threshold: Floats, height: int, y: int, cell: int, scale: float, bou
     return mine
 
 
-@kernel
+@jit
 def labelled(runs: Ints) -> tuple[Ints, int]:
     """Which blob each run belongs to, eight-connected, numbered from 0 in raster order; and how many blobs.
 
@@ -206,7 +206,7 @@ def labelled(runs: Ints) -> tuple[Ints, int]:
     return blob, blobs
 
 
-@kernel
+@jit
 def _find(parent: Ints, n: int) -> int:
     while parent[n] != n:
         parent[n] = parent[parent[n]]
@@ -214,14 +214,14 @@ def _find(parent: Ints, n: int) -> int:
     return n
 
 
-@kernel
+@jit
 def _join(parent: Ints, a: int, b: int) -> None:
     a, b = _find(parent, a), _find(parent, b)
     if a != b:
         parent[max(a, b)] = min(a, b)
 
 
-@kernel
+@jit
 def summed(
     image: NDArray, level: Floats, strong: Floats, runs: Ints, blob: Ints, blobs: int
 ) -> tuple[Ints, Floats]:
@@ -252,7 +252,7 @@ def summed(
     return boxes, sums
 
 
-@kernel
+@jit
 def ranked(
     boxes: Ints, sums: Floats, least_area: float, grown_area: float, grown_light: float, most: int
 ) -> tuple[Ints, Floats, Floats, Floats, Ints, int]:

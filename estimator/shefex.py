@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.compiled import kernel
+from estimator.compiled import jit
 from estimator.scan import AREA, FLUX, PEAK, SUMS, X, Y
 from estimator.types import Floats, Ints
 
 
-@kernel
+@jit
 def sequential_scan(
     image: NDArray, level: float, threshold: float, min_area_px: int, table_size: int
 ) -> tuple[Ints, Floats]:
@@ -36,7 +36,7 @@ def sequential_scan(
     return boxes[:count], sums[:count]
 
 
-@kernel
+@jit
 def maximum_scan(
     image: NDArray, level: float, threshold: float, min_area_px: int, table_size: int
 ) -> tuple[Ints, Floats]:
@@ -65,7 +65,7 @@ def maximum_scan(
     return boxes[:count], sums[:count]
 
 
-@kernel
+@jit
 def _object(
     image: NDArray,
     level: float,
@@ -107,7 +107,7 @@ def _object(
                     depth += 1
 
 
-@kernel
+@jit
 def _insert(boxes: Ints, sums: Floats, count: int, box: Ints, mine: Floats) -> int:
     """Put an object into the table by its intensity; how many it then holds."""
     k = min(count, len(sums) - 1)

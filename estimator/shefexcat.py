@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from estimator import cells
 from estimator.catalog import StarList
 from estimator.cells import Cells, within
-from estimator.compiled import kernel
+from estimator.compiled import jit
 from estimator.types import BadImage, Floats
 
 NORTH_MAG, SOUTH_MAG = 5.2, 5.4
@@ -41,7 +41,7 @@ def spread(stars: StarList, apart_rad: float, kept_mag: float = -np.inf) -> Star
     return stars.take(order[_spread(vectors, cells.build(vectors), kept, 2 * np.sin(apart_rad / 2))])
 
 
-@kernel
+@jit
 def _spread(vectors: Floats, known: Cells, kept: int, chord: float) -> NDArray:
     """(N,) whether each star is taken, the brightest deciding first."""
     taken = np.zeros(len(vectors), np.bool_)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.chance import ACCEPT_LOG10_CHANCE, MIN_MATCHES, log10_tail
-from estimator.compiled import kernel
+from estimator.compiled import jit
 from estimator.fieldmatch import Found, angle, answer, nothing, triple, turned
 from estimator.index import PairIndex, around, between
 from estimator.options import Options
@@ -41,7 +41,7 @@ def cos_error(fov_rad: float, centroid_error_rad: float, factor: float = 1.0) ->
     return factor * abs(float(np.cos(fov_rad) - np.cos(fov_rad - centroid_error_rad)))
 
 
-@kernel
+@jit
 def gate(angle_rad: float, cos_error: float) -> tuple[float, float]:
     """The angles whose cosine differs from that of one by cosError at most: eqs 4 and 5 with their signs mended.
 
@@ -76,13 +76,13 @@ def shefex(vectors_cam: Floats, index: PairIndex, tolerance_rad: float, **option
     return answer(search(np.ascontiguousarray(vectors_cam), index, by))
 
 
-@kernel
+@jit
 def search(seen: Floats, index: PairIndex, by: Rules) -> Found:
     """The compiled identifier: rows of the observed and the catalogue's stars, R_cam_from_ref, log10 of the chance."""
     return sought(seen, index, by, np.zeros(3, np.int64))
 
 
-@kernel
+@jit
 def sought(seen: Floats, index: PairIndex, by: Rules, tried: NDArray) -> Found:
     """As `search`, and what it took is added to (3,) tried: base triangles found, angles compared, triangles seen."""
     for i in range(by.base - 2):
@@ -97,7 +97,7 @@ def sought(seen: Floats, index: PairIndex, by: Rules, tried: NDArray) -> Found:
     return nothing()
 
 
-@kernel
+@jit
 def _triangle(seen: Floats, index: PairIndex, corners: NDArray, by: Rules, tried: NDArray) -> Found:
     """Every catalogue triangle like an observed one, with the other stars named by their angles to its corners."""
     i, j, k = corners
@@ -133,7 +133,7 @@ def _triangle(seen: Floats, index: PairIndex, corners: NDArray, by: Rules, tried
     return nothing()
 
 
-@kernel
+@jit
 def _rings(seen: Floats, corners: NDArray, by: Rules) -> Floats:
     """(N, 10) where a star must be about the base: lower ends of its angles' gates, upper ends, cosines of the angles.
 
@@ -150,7 +150,7 @@ def _rings(seen: Floats, corners: NDArray, by: Rules) -> Floats:
     return rings
 
 
-@kernel
+@jit
 def _rest(
     seen: Floats,
     index: PairIndex,
@@ -189,7 +189,7 @@ def _rest(
     return observed, star, turned(seen[observed], index.vectors[star]), chance
 
 
-@kernel
+@jit
 def _partner(
     seen: Floats, index: PairIndex, corners: NDArray, stars: NDArray, n: int, ring: Floats, tried: NDArray
 ) -> int:
@@ -217,7 +217,7 @@ def _partner(
     return best
 
 
-@kernel
+@jit
 def _same_side(seen: Floats, index: PairIndex, corners: NDArray, stars: NDArray, n: int, d: int) -> bool:
     """Whether a star is on the same side of the base's line that it is farthest from, observed and catalogued."""
     best, product = 0.0, 1.0
@@ -230,7 +230,7 @@ def _same_side(seen: Floats, index: PairIndex, corners: NDArray, stars: NDArray,
     return product > 0
 
 
-@kernel
+@jit
 def _crossing(seen: Floats, corners: NDArray, n: int, side: Floats, width: Floats) -> float:
     """The least of the three rhombi in which two rings about base stars cross at a star, in steradians.
 

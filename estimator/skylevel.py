@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.compiled import kernel
+from estimator.compiled import jit
 from estimator.types import Background, Floats
 
 TILE_PX = 64
@@ -43,7 +43,7 @@ def summing(pixel: np.dtype, greatest: float = np.inf) -> type:
     return np.uint16 if pixel == np.uint8 or (pixel.kind == "u" and greatest < 4096) else np.int32
 
 
-@kernel
+@jit
 def filtered(image: NDArray, y: int, x: int) -> float:
     """The 3x3 binomial filter [1 2 1] x [1 2 1] / 16 at one pixel; edges repeat their last row or column."""
     height, width = image.shape
@@ -55,7 +55,7 @@ def filtered(image: NDArray, y: int, x: int) -> float:
     return total / 16.0
 
 
-@kernel
+@jit
 def filtered_row(image: NDArray, y: int, sums: NDArray, out: NDArray) -> None:
     """16 times a row of `filtered`, by way of column sums 1 2 1, one more at either end, in a buffer of theirs."""
     height, width = image.shape
@@ -68,7 +68,7 @@ def filtered_row(image: NDArray, y: int, sums: NDArray, out: NDArray) -> None:
         out[x] = left[x] + 2 * middle[x] + right[x]
 
 
-@kernel
+@jit
 def at(grid: Floats, height: int, width: int, y: float, x: float) -> float:
     """Bilinear value of a tile grid at a pixel; constant beyond the outermost tile centres."""
     rows, columns = grid.shape
@@ -82,7 +82,7 @@ def at(grid: Floats, height: int, width: int, y: float, x: float) -> float:
     return top * (1 - fv) + bottom * fv
 
 
-@kernel
+@jit
 def _tiles(image: NDArray, tile_px: int, smooth: NDArray, starters: NDArray) -> tuple[Floats, Floats]:
     """Level and noise of every tile from some of its rows; the last two are room, and tell the types to work in."""
     height, width = image.shape
@@ -110,13 +110,13 @@ def _tiles(image: NDArray, tile_px: int, smooth: NDArray, starters: NDArray) -> 
     return level, noise
 
 
-@kernel
+@jit
 def median(values: Floats) -> float:
     """As numpy's, without its checks, which cost more than a short list."""
     return np.median(values)
 
 
-@kernel
+@jit
 def _robust(values: NDArray, starters: NDArray) -> tuple[float, float]:
     """Median and 1.4826 MAD of a few values spread evenly over all."""
     count = len(starters)
@@ -128,7 +128,7 @@ def _robust(values: NDArray, starters: NDArray) -> tuple[float, float]:
     return middle, 1.4826 * _middle(starters)
 
 
-@kernel
+@jit
 def _middle(values: NDArray) -> float:
     """Median of an odd number of values, by counting those below each: a few tens of them, without a branch."""
     half = len(values) // 2
@@ -142,7 +142,7 @@ def _middle(values: NDArray) -> float:
     return values[0]
 
 
-@kernel(fastmath={"reassoc", "contract"})
+@jit(fastmath={"reassoc", "contract"})
 def _clipped(values: NDArray, middle: float, spread: float) -> tuple[float, float]:
     """Mean and standard deviation of what lies within 3 sigma, the latter made good for the tails cut off."""
     number = values.dtype.type

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator import vectors
-from estimator.compiled import kernel
+from estimator.compiled import jit
 from estimator.starproof import (
     GATE,
     LEAST,
@@ -52,7 +52,7 @@ WEIGH_CHECKS = (
 PATIENCE = 4  # lights without a star, before an attitude is given up in the first round
 
 
-@kernel
+@jit
 def lost_in_space(lights: Lights, patterns: Sky, stars: Sky, base_lights: int, max_checks: int) -> Fix:
     """Which of the stars all the lights are: sought among the brightest lights and the patterns, told by all.
 
@@ -81,7 +81,7 @@ def lost_in_space(lights: Lights, patterns: Sky, stars: Sky, base_lights: int, m
     return fixed(lights, stars, best)
 
 
-@kernel
+@jit
 def search(lights: Lights, sky: Sky, max_checks: int) -> Guess:
     """The first attitude with DECISIVE_DEX of evidence; else the best one met, if it is beyond chance and every rival.
 
@@ -120,13 +120,13 @@ def search(lights: Lights, sky: Sky, max_checks: int) -> Guess:
     return best if best.dex >= ACCEPT_DEX and best.dex - rival_dex >= MARGIN_DEX else nothing()
 
 
-@kernel
+@jit
 def _alike(one: Guess, other: Guess) -> bool:
     """Whether two guesses are one attitude, to some degrees; nothing is like nothing."""
     return other.dex > -np.inf and bool(np.sum(one.R_cam_from_ref * other.R_cam_from_ref) > 2.99)
 
 
-@kernel
+@jit
 def _lengths(lights: Lights) -> Floats:
     """(N, N) of every pair a < b; those too short to tell the turn about the boresight count as very long."""
     total, field = len(lights.sigma), lights.field
@@ -139,7 +139,7 @@ def _lengths(lights: Lights) -> Floats:
     return out
 
 
-@kernel
+@jit
 def _rarity(lights: Lights, sky: Sky) -> Floats:
     """(N,) share of the stars that are as bright as a light."""
     out = np.ones(len(lights.sigma))
@@ -149,12 +149,12 @@ def _rarity(lights: Lights, sky: Sky) -> Floats:
     return out
 
 
-@kernel
+@jit
 def _apart2(tangent: Floats, a: int, b: int) -> float:
     return (tangent[a, 0] - tangent[b, 0]) ** 2 + (tangent[a, 1] - tangent[b, 1]) ** 2
 
 
-@kernel
+@jit
 def _next(length: Floats, tried: NDArray, vain: Floats) -> tuple[int, int]:
     """The most promising pair that is left."""
     best, at_a, at_b = np.inf, 0, 1
@@ -166,7 +166,7 @@ def _next(length: Floats, tried: NDArray, vain: Floats) -> tuple[int, int]:
     return at_a, at_b
 
 
-@kernel
+@jit
 def _attempt(lights: Lights, sky: Sky, a: int, b: int, patience: int, known: Guess, checks: NDArray) -> Guess:
     """Two lights as every pair of stars that they may be: the first attitude beyond chance, else the best.
 
@@ -235,7 +235,7 @@ def _attempt(lights: Lights, sky: Sky, a: int, b: int, patience: int, known: Gue
     return best
 
 
-@kernel
+@jit
 def _others(total: int, a: int, b: int) -> NDArray[np.int64]:
     out, count = np.empty(total, np.int64), 0
     for n in range(total):
@@ -245,7 +245,7 @@ def _others(total: int, a: int, b: int) -> NDArray[np.int64]:
     return out[:count]
 
 
-@kernel
+@jit
 def _zoom(tangent: Floats, a: int, b: int, chord: float, wanted: float) -> float:
     """The zoom at which two lights are a chord apart."""
     zoom = chord / wanted
@@ -254,7 +254,7 @@ def _zoom(tangent: Floats, a: int, b: int, chord: float, wanted: float) -> float
     return zoom
 
 
-@kernel
+@jit
 def _gates(lights: Lights, a: int, b: int) -> Floats:
     """(N,) angles within which a star is to be where a pair's attitude puts a light: its own error and the pair's.
 
@@ -271,7 +271,7 @@ def _gates(lights: Lights, a: int, b: int) -> Floats:
     return out
 
 
-@kernel
+@jit
 def _wanted(lights: Lights, a: int, b: int) -> int:
     """How many matches it takes for ACCEPT_DEX, at best: an upper bound of `_evidence`.
 
@@ -290,7 +290,7 @@ def _wanted(lights: Lights, a: int, b: int) -> int:
     return total
 
 
-@kernel
+@jit
 def _glance(
     tangent: Floats,
     vectors_ref: Floats,

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator import leastsquares
-from estimator.compiled import kernel
+from estimator.compiled import jit
 from estimator.skylevel import FILTERED_NOISE, at
 from estimator.types import Floats, Ints
 
@@ -20,7 +20,7 @@ ROUNDS = 40
 X, Y, FLUX, WIDTH, SKY = range(5)
 
 
-@kernel
+@jit
 def fit_all(
     image: NDArray,
     xy: Floats,
@@ -64,7 +64,7 @@ def fit_all(
     return out
 
 
-@kernel
+@jit
 def _fit(
     window: NDArray,
     noise: float,
@@ -104,7 +104,7 @@ def _fit(
     return False
 
 
-@kernel
+@jit
 def _rows(
     window: NDArray,
     noise: float,
@@ -138,7 +138,7 @@ def _rows(
     return pixels
 
 
-@kernel
+@jit
 def _cells(count: int, middle: float, sigma: float, share: Floats, slope: Floats, widening: Floats) -> None:
     """Share of a 1-D Gaussian in each pixel; its slopes by the middle and by sigma. From edge to edge."""
     scale = 1 / sigma

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator import leastsquares, vectors
-from estimator.compiled import kernel
+from estimator.compiled import jit
 from estimator.starsky import MAG_BLUR, MAG_STEP, Sky, nearest
 from estimator.types import Floats
 
@@ -74,20 +74,20 @@ class Fix(NamedTuple):
     dex: float
 
 
-@kernel
+@jit
 def nothing() -> Guess:
     """No attitude."""
     return Guess(np.empty(0, np.int64), np.empty(0, np.int64), np.eye(3), 1.0, np.eye(4), -np.inf)
 
 
-@kernel
+@jit
 def share_at(sky: Sky, mag: float) -> float:
     """Density of the catalogue's magnitudes at one."""
     place = int(max(mag - sky.mag[0], 0.0) / MAG_STEP)
     return sky.share[min(place, len(sky.share) - 1)]
 
 
-@kernel
+@jit
 def ray(tangent: Floats, n: int, zoom: float) -> vectors.Vector:
     """Unit vector of a light for a focal length `zoom` times the believed one."""
     x, y = tangent[n, 0] / zoom, tangent[n, 1] / zoom
@@ -95,18 +95,18 @@ def ray(tangent: Floats, n: int, zoom: float) -> vectors.Vector:
     return x * inverse, y * inverse, inverse
 
 
-@kernel
+@jit
 def volume_dex(lights: Lights) -> float:
     """log10 of the volume of all attitudes, 8 pi^2, and of all zooms."""
     return log10(8 * pi * pi) + (log10(2 * lights.zoom) if lights.zoom > 0 else 0.0)
 
 
-@kernel
+@jit
 def area(lights: Lights) -> float:
     return (lights.field[1] - lights.field[0]) * (lights.field[3] - lights.field[2])
 
 
-@kernel
+@jit
 def turned(matrix: Floats, u: vectors.Vector) -> vectors.Vector:
     return (
         matrix[0, 0] * u[0] + matrix[0, 1] * u[1] + matrix[0, 2] * u[2],
@@ -115,7 +115,7 @@ def turned(matrix: Floats, u: vectors.Vector) -> vectors.Vector:
     )
 
 
-@kernel
+@jit
 def weigh(
     lights: Lights, sky: Sky, R_cam_from_ref: Floats, zoom: float, gates: Floats, floor_dex: float
 ) -> Guess:
@@ -145,7 +145,7 @@ def weigh(
     return Guess(observed, star, R, zoom, info, dex)
 
 
-@kernel
+@jit
 def _match(
     lights: Lights, sky: Sky, R_cam_from_ref: Floats, zoom: float, gates: Floats, most_sigma: float
 ) -> tuple[NDArray, NDArray]:
@@ -173,14 +173,14 @@ def _match(
     return observed[:count], star[:count]
 
 
-@kernel
+@jit
 def predicted(vectors_ref: Floats, R: Floats, star: int) -> vectors.Vector:
     """A star in camera axes: tangents of x and y, and z."""
     x, y, z = turned(R, vectors.row(vectors_ref, star))
     return x / z, y / z, z
 
 
-@kernel
+@jit
 def misfit2(lights: Lights, sky: Sky, R_cam_from_ref: Floats, zoom: float, light: int, star: int) -> float:
     """Square of a light's distance from a star in its own standard deviations (Mahalanobis)."""
     x, y, _ = predicted(sky.vectors, R_cam_from_ref, star)
@@ -189,7 +189,7 @@ def misfit2(lights: Lights, sky: Sky, R_cam_from_ref: Floats, zoom: float, light
     return xx * off_x * off_x + 2 * xy * off_x * off_y + yy * off_y * off_y
 
 
-@kernel
+@jit
 def _fit(
     lights: Lights,
     sky: Sky,
@@ -228,7 +228,7 @@ def _fit(
     return zoom * np.exp(step[3]) if count == 4 else zoom
 
 
-@kernel
+@jit
 def solved(a: Floats, b: Floats) -> Floats:
     """x of a x = b by Cholesky; `a` (its lower half) becomes the factor, be it as good as singular."""
     x = b.copy()
@@ -241,7 +241,7 @@ def solved(a: Floats, b: Floats) -> Floats:
     return x
 
 
-@kernel
+@jit
 def _missed(lights: Lights, sky: Sky, R: Floats, zoom: float, observed: NDArray, star: NDArray) -> int:
     """How many stars that are brighter than the faintest match, and well within the field, no light is matched to."""
     left, right, top, bottom = lights.field * (INNER / zoom)
@@ -259,7 +259,7 @@ def _missed(lights: Lights, sky: Sky, R: Floats, zoom: float, observed: NDArray,
     return inside - matched
 
 
-@kernel
+@jit
 def _evidence(
     lights: Lights,
     sky: Sky,
@@ -297,13 +297,13 @@ def _evidence(
     return total - TOLL_DEX * max(observed.max() + 1 - 2.0 * len(observed), 0.0)
 
 
-@kernel
+@jit
 def _seen_dex(seen: int, missed: int) -> float:
     """That so many of the stars are seen and so many are not: B(m + 1, k + 1), every share being as probable before."""
     return (lgamma(seen + 1.0) + lgamma(missed + 1.0) - lgamma(seen + missed + 2.0)) / log(10.0)
 
 
-@kernel
+@jit
 def _share_to(sky: Sky, mag: Floats) -> float:
     """Share of the stars that are as bright as the faintest of the lights."""
     faintest = mag[0]
@@ -314,7 +314,7 @@ def _share_to(sky: Sky, mag: Floats) -> float:
     return max(np.searchsorted(sky.mag, faintest + MAG_BLUR), 1) / len(sky.mag)
 
 
-@kernel
+@jit
 def _mag_dex(lights: Lights, sky: Sky, light: int, star: int, as_bright: float) -> float:
     """What a light's magnitude says for a star, dex: N(difference) over its density among stars as bright as these.
 
@@ -328,7 +328,7 @@ def _mag_dex(lights: Lights, sky: Sky, light: int, star: int, as_bright: float) 
     return log10(MAG_ODD + (1 - MAG_ODD) * likely / share)
 
 
-@kernel
+@jit
 def fixed(lights: Lights, stars: Sky, guess: Guess) -> Fix:
     """A guess with its errors. The covariance is of the attitude with the zoom unknown, where it is."""
     covariance, total, count = np.zeros((3, 3)), 0.0, 4 if lights.zoom > 0 else 3

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.compiled import kernel
+from estimator.compiled import jit
 from estimator.types import BadImage, Floats
 
 PAIRS_A_BIN = 8
@@ -86,7 +86,7 @@ def _share(mag: Floats) -> Floats:
     return np.maximum(smooth[round(reach / MAG_STEP) :], 1e-4)
 
 
-@kernel
+@jit
 def _pairs(
     vectors: Floats,
     order: NDArray,
@@ -132,7 +132,7 @@ def _cells(vectors: Floats, side: int) -> tuple[NDArray[np.int32], NDArray[np.in
     return first.astype(np.int32), np.concatenate(star)[order].astype(np.int32)
 
 
-@kernel
+@jit
 def nearest(
     vectors: Floats,
     cell_first: NDArray,

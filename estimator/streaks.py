@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator import leastsquares
-from estimator.compiled import kernel
+from estimator.compiled import jit
 from estimator.moments import foreign, neighbours
 from estimator.skylevel import FILTERED_NOISE, at
 from estimator.types import Floats, Ints
@@ -26,7 +26,7 @@ FAR_SIGMA = 5.0  # from an end of the line: 3e-7 of the light is farther out
 X, Y, FLUX, LENGTH, ANGLE, WIDTH, SKY = range(7)
 
 
-@kernel
+@jit
 def fit_all(
     image: NDArray,
     xy: Floats,
@@ -72,7 +72,7 @@ def fit_all(
     return out
 
 
-@kernel
+@jit
 def _off_line(p: Floats, x: float, y: float) -> float:
     """Distance of a pixel from the line segment."""
     along_x, along_y = cos(p[ANGLE]), sin(p[ANGLE])
@@ -81,7 +81,7 @@ def _off_line(p: Floats, x: float, y: float) -> float:
     return hypot(max(abs(u) - p[LENGTH] / 2, 0.0), v)
 
 
-@kernel
+@jit
 def _fit(
     pixels: Floats, noise: float, gain_e_dn: float, rows: Floats, weight: Floats, p: Floats, out: Floats
 ) -> bool:
@@ -126,7 +126,7 @@ def _fit(
     return False
 
 
-@kernel
+@jit
 def _slip_px2(p: Floats, noise: float, gain_e_dn: float) -> float:
     """Variance along the streak that Cramer and Rao do not see: in noise an end may be taken for where it is not.
 
@@ -139,7 +139,7 @@ def _slip_px2(p: Floats, noise: float, gain_e_dn: float) -> float:
     return 6.5 * (variance * across * (p[LENGTH] / p[FLUX]) ** 2) ** 2
 
 
-@kernel
+@jit
 def _rows(pixels: Floats, noise: float, gain_e_dn: float, p: Floats, rows: Floats, weight: Floats) -> None:
     """The model's slopes by the seven parameters at every pixel, what it leaves over, and the weights.
 
@@ -168,7 +168,7 @@ def _rows(pixels: Floats, noise: float, gain_e_dn: float, p: Floats, rows: Float
         weight[k] = 1 / (noise * noise + max(flux * unit, 0.0) / gain_e_dn + 1e-9)
 
 
-@kernel
+@jit
 def _step(t: float) -> tuple[float, float]:
     """A Gaussian's integral from its middle, and its density, at t of its sigmas; far off without much ado."""
     if abs(t) > FAR_SIGMA:

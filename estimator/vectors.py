@@ -6,24 +6,24 @@ from math import sqrt
 
 import numpy as np
 
-from estimator.compiled import kernel
+from estimator.compiled import jit
 from estimator.types import Floats
 
 Vector = tuple[float, float, float]
 
 
-@kernel
+@jit
 def row(array: Floats, n: int) -> Vector:
     return array[n, 0], array[n, 1], array[n, 2]
 
 
-@kernel
+@jit
 def chord(u: Vector, v: Vector) -> float:
     """Distance between the ends of unit vectors; it changes by no more than their angle."""
     return sqrt((u[0] - v[0]) ** 2 + (u[1] - v[1]) ** 2 + (u[2] - v[2]) ** 2)
 
 
-@kernel
+@jit
 def axes(u: Vector, v: Vector, out: Floats) -> None:
     """Right-handed axes as the columns of out (3, 3): the middle of two unit vectors, their normal, and the third."""
     out[0, 0], out[1, 0], out[2, 0] = u[0] + v[0], u[1] + v[1], u[2] + v[2]
@@ -39,7 +39,7 @@ def axes(u: Vector, v: Vector, out: Floats) -> None:
     out[2, 2] = out[0, 0] * out[1, 1] - out[1, 0] * out[0, 1]
 
 
-@kernel
+@jit
 def times_transposed(one: Floats, other: Floats, out: Floats) -> None:
     """out = one other', (3, 3) each."""
     for i in range(3):
@@ -47,7 +47,7 @@ def times_transposed(one: Floats, other: Floats, out: Floats) -> None:
             out[i, j] = one[i, 0] * other[j, 0] + one[i, 1] * other[j, 1] + one[i, 2] * other[j, 2]
 
 
-@kernel
+@jit
 def turn(w: Floats, matrix: Floats) -> None:
     """A small turn w of a rotation matrix, in place: exp([w]) to second order, then made orthonormal."""
     for c in range(3):
@@ -71,7 +71,7 @@ def turn(w: Floats, matrix: Floats) -> None:
         matrix[2, c] = matrix[0, n] * matrix[1, m] - matrix[0, m] * matrix[1, n]
 
 
-@kernel
+@jit
 def xyzw_of(R: Floats) -> Floats:
     """(4,) quaternion (x, y, z, w) of a rotation matrix, by its greatest part (Shepperd 1978, J. Guidance 1, 223)."""
     trace = R[0, 0] + R[1, 1] + R[2, 2]

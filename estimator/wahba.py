@@ -10,7 +10,7 @@ from math import isfinite, sqrt
 
 import numpy as np
 
-from estimator.compiled import kernel
+from estimator.compiled import jit
 from estimator.types import Floats
 from estimator.vectors import turn
 
@@ -23,7 +23,7 @@ POLISHES = 30
 RESTING = 1e-26  # squared radians: a step that changes no digit
 
 
-@kernel
+@jit
 def wahba(cam: Floats, ref: Floats, weight: Floats) -> tuple[Floats, Floats]:
     """R_cam_from_ref (3, 3) that minimises sum(w |cam - A ref|^2), and its covariance (3, 3) in camera axes, rad^2.
 
@@ -34,7 +34,7 @@ def wahba(cam: Floats, ref: Floats, weight: Floats) -> tuple[Floats, Floats]:
     return answer, spread(cam, weight)
 
 
-@kernel
+@jit
 def weights(sigma_rad: Floats) -> Floats:
     """(N,) 1 / sigma^2. Raises ValueError for a sigma that is not finite and above 0."""
     out = np.empty(len(sigma_rad))
@@ -45,7 +45,7 @@ def weights(sigma_rad: Floats) -> Floats:
     return out
 
 
-@kernel
+@jit
 def profile(cam: Floats, ref: Floats, weight: Floats) -> Floats:
     """(3, 3) B with the weights' sum at 1. Raises ValueError for directions that do not determine a rotation."""
     if len(cam) < 2:
@@ -76,7 +76,7 @@ def profile(cam: Floats, ref: Floats, weight: Floats) -> Floats:
     return B
 
 
-@kernel
+@jit
 def _sine2(vectors: Floats, m: int, n: int) -> float:
     """Squared sine of the angle between two of the unit vectors."""
     x = vectors[m, 1] * vectors[n, 2] - vectors[m, 2] * vectors[n, 1]
@@ -85,7 +85,7 @@ def _sine2(vectors: Floats, m: int, n: int) -> float:
     return x * x + y * y + z * z
 
 
-@kernel
+@jit
 def greatest(B: Floats) -> float:
     """Greatest eigenvalue of Davenport's matrix, by Newton from 1 downwards.
 
@@ -113,13 +113,13 @@ def greatest(B: Floats) -> float:
     return x
 
 
-@kernel
+@jit
 def _cofactor(matrix: Floats, i: int, j: int) -> float:
     a, b, c, d = (i + 1) % 3, (i + 2) % 3, (j + 1) % 3, (j + 2) % 3
     return matrix[a, c] * matrix[b, d] - matrix[a, d] * matrix[b, c]
 
 
-@kernel
+@jit
 def _turned(B: Floats, axis: int) -> Floats:
     """The profile for a reference frame turned by half a turn about an axis 0, 1, 2; not at all for 3."""
     out = B.copy()
@@ -131,7 +131,7 @@ def _turned(B: Floats, axis: int) -> Floats:
     return out
 
 
-@kernel
+@jit
 def _turned_back(q: Quaternion, axis: int) -> Quaternion:
     """Hamilton's product of a quaternion (x, y, z, w) and a half-turn about an axis: back to the true reference."""
     x, y, z, w = q
@@ -144,7 +144,7 @@ def _turned_back(q: Quaternion, axis: int) -> Quaternion:
     return q
 
 
-@kernel
+@jit
 def _symmetric(B: Floats) -> tuple[Floats, Floats, float]:
     """S = B + B^T, z (3,) and the trace: the parts of Davenport's matrix [[S - tr, z], [z^T, tr]].
 
@@ -154,7 +154,7 @@ def _symmetric(B: Floats) -> tuple[Floats, Floats, float]:
     return B + B.T, z, B[0, 0] + B[1, 1] + B[2, 2]
 
 
-@kernel
+@jit
 def raw_quest(B: Floats) -> Floats:
     """QUEST (Shuster & Oh 1981, J. Guidance & Control 4, 70): the Gibbs vector from the greatest eigenvalue.
 
@@ -172,7 +172,7 @@ def raw_quest(B: Floats) -> Floats:
     return matrix_of(_turned_back(best, frame))
 
 
-@kernel
+@jit
 def _quest_once(B: Floats, x: float) -> Quaternion:
     """QUEST's quaternion (x, y, z, w), not normalised, for the eigenvalue x."""
     S, z, trace = _symmetric(B)
@@ -188,7 +188,7 @@ def _quest_once(B: Floats, x: float) -> Quaternion:
     return v[0], v[1], v[2], gamma
 
 
-@kernel
+@jit
 def _times(matrix: Floats, v: Floats) -> Floats:
     out = np.zeros(3)
     for i in range(3):
@@ -197,7 +197,7 @@ def _times(matrix: Floats, v: Floats) -> Floats:
     return out
 
 
-@kernel
+@jit
 def raw_esoq2(B: Floats) -> Floats:
     """ESOQ2 (Mortari 1997; Markley & Mortari 2000, J. Astronautical Sciences 48, 359): the axis e and angle.
 
@@ -227,7 +227,7 @@ def raw_esoq2(B: Floats) -> Floats:
     return matrix_of(_turned_back(q, frame))
 
 
-@kernel
+@jit
 def raw_davenport(B: Floats) -> Floats:
     """Davenport's q-method (Keat 1977, CSC/TM-77/6034): the eigenvector of K's greatest eigenvalue."""
     S, z, trace = _symmetric(B)
@@ -240,7 +240,7 @@ def raw_davenport(B: Floats) -> Floats:
     return matrix_of((vectors[0, 3], vectors[1, 3], vectors[2, 3], vectors[3, 3]))
 
 
-@kernel
+@jit
 def raw_svd(B: Floats) -> Floats:
     """Markley 1988 (J. Astronautical Sciences 36, 245): with B = U S V^T, A = U diag(1, 1, det U det V) V^T."""
     U, _, Vt = np.linalg.svd(B)
@@ -252,7 +252,7 @@ def raw_svd(B: Floats) -> Floats:
     return answer
 
 
-@kernel
+@jit
 def best_pair(cam: Floats, weight: Floats) -> tuple[int, int]:
     """The two stars that leave the least variance about the worst axis.
 
@@ -270,7 +270,7 @@ def best_pair(cam: Floats, weight: Floats) -> tuple[int, int]:
     return first, second
 
 
-@kernel
+@jit
 def raw_triad(cam: Floats, ref: Floats, weight: Floats) -> Floats:
     """TRIAD for two stars, in its optimal form (Markley 2002, J. Guidance 25, 411).
 
@@ -298,13 +298,13 @@ def raw_triad(cam: Floats, ref: Floats, weight: Floats) -> Floats:
     return along
 
 
-@kernel
+@jit
 def _normal(u: Floats, v: Floats) -> Floats:
     w = np.cross(u, v)
     return w / sqrt(w[0] ** 2 + w[1] ** 2 + w[2] ** 2)
 
 
-@kernel
+@jit
 def polish(answer: Floats, cam: Floats, ref: Floats, weight: Floats) -> None:
     """Gauss-Newton on sum(w |cam - A ref|^2), in place: sum(w (1 - a a^T)) turn = sum(w a x cam), a = A ref.
 
@@ -331,7 +331,7 @@ def polish(answer: Floats, cam: Floats, ref: Floats, weight: Floats) -> None:
             break
 
 
-@kernel
+@jit
 def _add_information(matrix: Floats, v: Floats, w: float) -> None:
     """Lower triangle of matrix += w (|v|^2 - v v^T), without the difference of near equals on the diagonal."""
     matrix[0, 0] += w * (v[1] * v[1] + v[2] * v[2])
@@ -342,7 +342,7 @@ def _add_information(matrix: Floats, v: Floats, w: float) -> None:
     matrix[2, 1] -= w * v[2] * v[1]
 
 
-@kernel
+@jit
 def spread(cam: Floats, weight: Floats) -> Floats:
     """(3, 3) inverse of the information sum(w (1 - b b^T)). Raises ValueError where it is singular."""
     factor, out, unit = np.zeros((3, 3)), np.empty((3, 3)), np.empty(3)
@@ -359,7 +359,7 @@ def spread(cam: Floats, weight: Floats) -> Floats:
     return out
 
 
-@kernel
+@jit
 def cholesky(matrix: Floats) -> None:
     """The lower triangle of a positive definite (3, 3) matrix becomes its factor L, L L^T = matrix. ValueError."""
     for j in range(3):
@@ -375,7 +375,7 @@ def cholesky(matrix: Floats) -> None:
                 matrix[i, j] = total / matrix[j, j]
 
 
-@kernel
+@jit
 def solve(factor: Floats, right: Floats, out: Floats) -> None:
     """out = (L L^T)^-1 right."""
     for i in range(3):
@@ -389,7 +389,7 @@ def solve(factor: Floats, right: Floats, out: Floats) -> None:
         out[i] /= factor[i, i]
 
 
-@kernel
+@jit
 def matrix_of(q: Quaternion) -> Floats:
     """(3, 3) rotation of a quaternion (x, y, z, w) of any length."""
     x, y, z, w = q

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.compiled import kernel
+from estimator.compiled import jit
 from estimator.detect import prepared
 from estimator.hints import NO_HINTS, Hints
 from estimator.judge import judged
@@ -45,7 +45,7 @@ def in_windows(
     return judged(image, blobs, hints)
 
 
-@kernel
+@jit
 def _brightest(
     image: NDArray, centre_px: Floats, half_px: float, level: Floats, noise: Floats, threshold_sigma: float
 ) -> tuple[Ints, Floats, int]:
@@ -72,7 +72,7 @@ def _brightest(
     return boxes, sums, count
 
 
-@kernel
+@jit
 def _grow(image: NDArray, x: int, y: int, level: Floats, noise: Floats, box: NDArray, total: NDArray) -> None:
     """Collect the pixels connected to a peak; at most 4096 of them."""
     height, width = image.shape

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from skysim.compiled import kernel
+from skysim.compiled import jit
 from skysim.motion import Desaturation
 from skysim.types import BadInput, Floats
 
@@ -28,7 +28,7 @@ FADING = 10.0  # how fast either dies away from a singularity: exp(-FADING det A
 DROPPED = 1e-6  # a direction in which a set is weaker than this part of its strongest one is given up
 
 
-@kernel
+@jit
 def within(command: Floats, limit: float) -> Floats:
     """The command scaled as a whole, so that its direction is kept and no part of it exceeds the limit."""
     peak = np.abs(command).max()
@@ -133,7 +133,7 @@ class FanSet:
         return within(self.thrust_from_torque @ torque_nm, self.thrust_limit_n)
 
 
-@kernel
+@jit
 def solve(gram: Floats, wanted: Floats) -> Floats:
     """x of gram x = wanted for a symmetric (3, 3) without negative eigenvalues; singular directions are given up."""
     value, vector = np.linalg.eigh(gram)
@@ -144,7 +144,7 @@ def solve(gram: Floats, wanted: Floats) -> Floats:
     return x
 
 
-@kernel
+@jit
 def determinant(m: Floats) -> float:
     """Of A A^T (3, 3), which rounding alone makes negative; np.linalg.det takes several times as long."""
     by_a = m[1, 1] * m[2, 2] - m[1, 2] * m[2, 1]
@@ -153,7 +153,7 @@ def determinant(m: Floats) -> float:
     return max(m[0, 0] * by_a - m[0, 1] * by_b + m[0, 2] * by_c, 0.0)
 
 
-@kernel
+@jit
 def pseudo_inverse(jacobian_unit: Floats, wanted: Floats, t_s: float) -> Floats:
     """The smallest gimbal rates that change the momentum as wanted, A^T (A A^T)^-1 dh/dt: blind to singularities.
 
@@ -162,7 +162,7 @@ def pseudo_inverse(jacobian_unit: Floats, wanted: Floats, t_s: float) -> Floats:
     return jacobian_unit.T @ solve(jacobian_unit @ jacobian_unit.T, wanted)
 
 
-@kernel
+@jit
 def singularity_robust(jacobian_unit: Floats, wanted: Floats, t_s: float) -> Floats:
     """Gimbal rates by the generalised singularity-robust inverse: A^T (A A^T + lambda E)^-1 dh/dt.
 
@@ -189,14 +189,14 @@ STEERING: dict[str, Callable[[Floats, Floats, float], Floats]] = {
 }
 
 
-@kernel
+@jit
 def turned(spin_axes: Floats, cross_axes: Floats, angle_rad: Floats) -> tuple[Floats, Floats]:
     """Where the axles (3, n) of the rotors point, s cos + t sin, and the derivative (3, n) by the gimbal angles."""
     cosine, sine = np.cos(angle_rad), np.sin(angle_rad)
     return spin_axes * cosine + cross_axes * sine, cross_axes * cosine - spin_axes * sine
 
 
-@kernel
+@jit
 def shared(
     axle: Floats, jacobian: Floats, unit_nms: float, wanted_nm: Floats, rate_limit: float, torque_limit: float
 ) -> tuple[Floats, Floats]:

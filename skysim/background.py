@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from skysim.camera import Camera
-from skysim.compiled import kernel
+from skysim.compiled import jit
 from skysim.light import Glow, MoonGlow, SkyGlow, StrayLight, UniformGlow
 from skysim.optics import Optics, radial, tangential
 from skysim.photometry import SUN, Band, sky_radiance_e_s_m2_sr, star_flux_e_s_m2
@@ -253,13 +253,13 @@ def fill(image: NDArray[Any], coarse: Floats, factor: float) -> None:
         _fill_between(image, coarse * factor)
 
 
-@kernel(parallel=True)
+@jit(parallel=True)
 def _fill_flat(image: NDArray[Any], value: float) -> None:
     for y in numba.prange(image.shape[0]):
         image[y, :] = value
 
 
-@kernel(parallel=True)
+@jit(parallel=True)
 def _fill_between(image: NDArray[Any], coarse: Floats) -> None:
     """A row of nodes is drawn up for every row of pixels, and a straight line from node to node."""
     (height, width), (h, w) = image.shape, coarse.shape

@@ -14,7 +14,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from skysim.compiled import kernel
+from skysim.compiled import jit
 from skysim.types import Floats
 
 BLOCK = 64  # columns worked at together: a few cache lines of every row
@@ -36,7 +36,7 @@ def bloom(electrons: NDArray[Any], full_well_e: float, anti_blooming: float = 0.
         _bloom(electrons, over, float(full_well_e), float(anti_blooming))
 
 
-@kernel(parallel=True)
+@jit(parallel=True)
 def _bloom(
     electrons: NDArray[Any], over: NDArray[np.int64], full_well_e: float, anti_blooming: float
 ) -> None:
@@ -58,7 +58,7 @@ def _bloom(
             electrons[y, x] = full_well_e - room[y]
 
 
-@kernel
+@jit
 def _settle(room: Floats, y: int) -> tuple[int, int]:
     """Spread the excess of pixel y until it and all it reaches are full; returns the two ends, full in part.
 
@@ -119,7 +119,7 @@ def late_shares(transfers: int, cti: float) -> Floats:
     return np.asarray(share)
 
 
-@kernel(parallel=True)
+@jit(parallel=True)
 def _late_rows(electrons: NDArray[Any], share: Floats) -> None:
     """From the last row to the first, each gathers what the rows before it left: those are still as they were."""
     height, width = electrons.shape
@@ -136,7 +136,7 @@ def _late_rows(electrons: NDArray[Any], share: Floats) -> None:
                 electrons[y, x] = gathered[x - x0]
 
 
-@kernel(parallel=True)
+@jit(parallel=True)
 def _late_columns(electrons: NDArray[Any], share: Floats) -> None:
     height, width = electrons.shape
     for y in numba.prange(height):
@@ -168,7 +168,7 @@ def interline_smear(light_e: NDArray[Any], exposure_s: float, row_time_s: float,
     _smear(light_e, leak * row_time_s / exposure_s)
 
 
-@kernel(parallel=True)
+@jit(parallel=True)
 def _smear(light_e: NDArray[Any], share: float) -> None:
     """Add a share of the rest of its column to every pixel."""
     height, width = light_e.shape

@@ -11,4 +11,4 @@ from functools import partial
 import numba
 
 # Division by zero gives inf or nan, as arrays do; sums are added as written unless a function allows otherwise.
-kernel = partial(numba.njit, cache=True, error_model="numpy", fastmath=False)
+jit = partial(numba.njit, cache=True, error_model="numpy", fastmath=False)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike
 
-from skysim.compiled import kernel
+from skysim.compiled import jit
 from skysim.manoeuvre import Reference
 from skysim.motion import Control
 from skysim.quaternion import apply, cross, inverse, multiply, times, to_rotvec
@@ -72,7 +72,7 @@ class Pid:
             add_unless_short(self.error_sum_rad_s, self.error_rad, wanted_nm, given_nm, period_s)
 
 
-@kernel
+@jit
 def law(
     reference: tuple[Floats, Floats, Floats],
     present: tuple[Floats, Floats],
@@ -100,7 +100,7 @@ def law(
     return error, times(inertia, wanted) + cross(rate, times(inertia, rate) + momentum), limited
 
 
-@kernel
+@jit
 def add_unless_short(total: Floats, error: Floats, wanted: Floats, given: Floats, period_s: float) -> None:
     """`Pid.learn`, in place."""
     for i in range(3):

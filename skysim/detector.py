@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from skysim import charge, noise, particles
 from skysim.camera import Camera, Detector, FrameTransfer, Interline, Shutter
-from skysim.compiled import kernel
+from skysim.compiled import jit
 from skysim.photometry import snr
 from skysim.types import Seen
 
@@ -152,7 +152,7 @@ def rules(part: Detector, exposure_s: float) -> Rules:
     return Rules(*map(np.float32, numbers))
 
 
-@kernel
+@jit
 def _gather(row: Any, sensitivity: Any, dark_e_s: Any, rules: Rules, seed: Any, tables: noise.Tables) -> None:
     """Electrons are counted, light and dark together: Poisson, variance equal to the mean. One row, in place.
 
@@ -164,7 +164,7 @@ def _gather(row: Any, sensitivity: Any, dark_e_s: Any, rules: Rules, seed: Any, 
     noise.count(row, seed, tables)
 
 
-@kernel
+@jit
 def _convert(row: Any, offset_e: Any, rules: Rules, seed: Any, tables: noise.Tables, numbers: Any) -> None:
     """Charge to numbers: full well, column offset and Gaussian noise, the amplifier's bend, gain, rounding, the ends.
 
@@ -184,7 +184,7 @@ def count(light_e: NDArray[Any], exposure_s: float, chip: Chip, seeds: NDArray[n
     _count(light_e, chip.sensitivity, chip.dark_e_s, rules(chip.part, exposure_s), seeds, noise.tables())
 
 
-@kernel(parallel=True)
+@jit(parallel=True)
 def _count(
     light_e: Any, sensitivity: Any, dark_e_s: Any, rules: Rules, seeds: Any, tables: noise.Tables
 ) -> None:
@@ -199,7 +199,7 @@ def read_out(electrons: NDArray[Any], chip: Chip, seeds: NDArray[np.uint64]) -> 
     return frame
 
 
-@kernel(parallel=True)
+@jit(parallel=True)
 def _read_out(
     electrons: Any, offset_e: Any, rules: Rules, seeds: Any, tables: noise.Tables, frame: Any
 ) -> None:
@@ -221,7 +221,7 @@ def count_and_read(
     return frame
 
 
-@kernel(parallel=True)
+@jit(parallel=True)
 def _count_and_read(
     light_e: Any,
     sensitivity: Any,

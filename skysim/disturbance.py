@@ -9,14 +9,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from skysim.compiled import kernel
+from skysim.compiled import jit
 from skysim.manoeuvre import Knock
 from skysim.quaternion import apply, cross, inverse, times
 from skysim.types import Floats
 from skysim.vehicle import Disturbances, Draught
 
 
-@kernel
+@jit
 def earth_torque_nm(
     inertia_kg_m2: Floats, momentum_nms: Floats, rate_body_rad_s: Floats, earth_body_rad_s: Floats
 ) -> Floats:
@@ -39,7 +39,7 @@ def earth_torque_nm(
     )
 
 
-@kernel
+@jit
 def steady(
     torque_lab_nm: Floats,
     earth_lab_rad_s: Floats,

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from skysim import quaternion
-from skysim.compiled import kernel
+from skysim.compiled import jit
 from skysim.types import BadInput, Floats
 from skysim.vehicle import Accelerometer, Gyro, Imu, Site
 
@@ -111,7 +111,7 @@ def felt(
     return Increments(ends_s, step_s, angle, velocity, fine, fine)
 
 
-@kernel
+@jit
 def sensed(
     lab_from_body_wxyz: Floats,
     rate_body_rad_s: Floats,
@@ -131,7 +131,7 @@ def sensed(
     return knots
 
 
-@kernel
+@jit
 def integrals(
     t_s: Floats, knots: Floats, ends_s: Floats, step_s: float, place_m: Floats
 ) -> tuple[Floats, Floats]:
@@ -160,7 +160,7 @@ def integrals(
     return angle, velocity
 
 
-@kernel
+@jit
 def add_cubic(t_s: Floats, knots: Floats, k: int, at_s: float, factor: float, out: Floats) -> None:
     """Add to out (C,) factor times the value at at_s, of the cubic (Lagrange) through the knots about t_s[k]..t_s[k+1].
 
@@ -218,7 +218,7 @@ class Triad:
         return counted, limited
 
 
-@kernel
+@jit
 def corrupt(
     ideal: Floats,
     matrix: Floats,
@@ -363,7 +363,7 @@ class Navigator:
         return math.degrees(roll), math.degrees(pitch), math.degrees(yaw)
 
 
-@kernel
+@jit
 def turned(lab_from_body_wxyz: Floats, angle_rad: Floats, earth_rate: Floats, step_s: float) -> Floats:
     """The attitude after (N, 3) increments: lab_from_body <- exp(-earth_rate step) lab_from_body exp(angle).
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from skysim.compiled import kernel
+from skysim.compiled import jit
 from skysim.manoeuvre import envelope, shakes
 from skysim.motion import JitterBand, JitterLine, JitterPart, Motion
 from skysim.types import BadInput, Floats, Trajectory
@@ -229,7 +229,7 @@ def own_rate(phi: Floats, phi_rate: Floats) -> Floats:
     return np.asarray(phi_rate - first * cross + second * np.cross(phi, cross))
 
 
-@kernel
+@jit
 def gains(t_s: Floats, duration_s: float, rise_s: float) -> tuple[Floats, Floats]:
     """(N, 1) envelope and (N, 1) its derivative."""
     gain, slope = np.empty((len(t_s), 1)), np.empty((len(t_s), 1))
@@ -238,7 +238,7 @@ def gains(t_s: Floats, duration_s: float, rise_s: float) -> tuple[Floats, Floats
     return gain, slope
 
 
-@kernel(parallel=True)
+@jit(parallel=True)
 def swing(t_s: Floats, omega_rad_s: Floats, sine_rad: Floats, cosine_rad: Floats) -> tuple[Floats, Floats]:
     """(N, 3) phi and (N, 3) its derivative at every time."""
     phi, rate = np.empty((len(t_s), 3)), np.empty((len(t_s), 3))

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from skysim.compiled import kernel
+from skysim.compiled import jit
 from skysim.types import Floats
 
 Ints = NDArray[np.int64]
@@ -83,7 +83,7 @@ def fields_about(
     return Fields(centre, first, radius[order], angle_rad[order], alike)
 
 
-@kernel
+@jit
 def likest(fields: Fields) -> tuple[Floats, Ints]:
     """(C,) greatest share of each field that another one has, and which one that is."""
     count = len(fields.centre)
@@ -101,7 +101,7 @@ def likest(fields: Fields) -> tuple[Floats, Ints]:
     return share, other
 
 
-@kernel
+@jit
 def coincide(fields: Fields, i: int, j: int, enough: float) -> int:
     """The most LEDs about i that meet ones about j at one turn; 0 if they cannot be more than `enough`."""
     first, radius, angle, alike = fields.first, fields.radius, fields.angle_rad, fields.alike[i]
@@ -119,7 +119,7 @@ def coincide(fields: Fields, i: int, j: int, enough: float) -> int:
     return most
 
 
-@kernel
+@jit
 def reach(fields: Fields, i: int, j: int) -> int:
     """How many LEDs about i have one about j as far from the middle: no turn makes more of them meet."""
     first, radius, alike = fields.first, fields.radius, fields.alike[i]
@@ -131,7 +131,7 @@ def reach(fields: Fields, i: int, j: int) -> int:
     return total
 
 
-@kernel
+@jit
 def met(fields: Fields, i: int, j: int, turn_rad: float) -> int:
     """How many LEDs about i, turned, meet one about j."""
     first, radius, angle, alike = fields.first, fields.radius, fields.angle_rad, fields.alike[i]

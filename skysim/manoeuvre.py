@@ -19,7 +19,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from skysim import quaternion
-from skysim.compiled import kernel
+from skysim.compiled import jit
 from skysim.motion import Attitude, Bump, JitterPart, Motion, Rate, Sine, Slew, SpinUp, Step
 from skysim.types import BadInput, Floats
 
@@ -59,7 +59,7 @@ def steady(rate_rad_s: float, t_s: float) -> tuple[float, float, float]:
     return rate_rad_s * t_s, rate_rad_s, 0.0
 
 
-@kernel
+@jit
 def rest_to_rest(
     angle_rad: float, rate_rad_s: float, ramp_s: float, duration_s: float, t_s: float
 ) -> tuple[float, float, float]:
@@ -75,7 +75,7 @@ def rest_to_rest(
     return (angle_rad - angle, rate, -acceleration) if braking else (angle, rate, acceleration)
 
 
-@kernel
+@jit
 def envelope(t_s: float, duration_s: float, growth_s: float) -> tuple[float, float, float]:
     """1 in the middle, 0 at and beyond both ends, and its two derivatives (1/s, 1/s2), all three continuous.
 
@@ -88,7 +88,7 @@ def envelope(t_s: float, duration_s: float, growth_s: float) -> tuple[float, flo
     return x**3 * (10 - 15 * x + 6 * x**2), -slope if dying else slope, bend
 
 
-@kernel
+@jit
 def sway(
     amplitude_rad: float, omega_rad_s: float, duration_s: float, growth_s: float, t_s: float
 ) -> tuple[float, float, float]:
@@ -100,7 +100,7 @@ def sway(
     return amplitude_rad * e * s, amplitude_rad * rate, amplitude_rad * acceleration
 
 
-@kernel
+@jit
 def turned(
     lab_from_start_wxyz: Floats, axis: Floats, angle_rad: float, rate_rad_s: float, acceleration_rad_s2: float
 ) -> tuple[Floats, Floats, Floats]:
@@ -112,14 +112,14 @@ def turned(
 # A change of the rate, whose axis may move.
 
 
-@kernel
+@jit
 def rate_at(t_s: float, duration_s: float, rate_rad_s: Floats, change_rad_s: Floats) -> Floats:
     """(3,) rate + change (3x^2 - 2x^3), x = t / duration."""
     x = t_s / duration_s
     return rate_rad_s + x**2 * (3 - 2 * x) * change_rad_s
 
 
-@kernel
+@jit
 def turn_between(
     begin_s: float, step_s: float, duration_s: float, rate_rad_s: Floats, change_rad_s: Floats
 ) -> Floats:
@@ -136,7 +136,7 @@ def turn_between(
     return step_s / 2 * (early + late) + math.sqrt(3.0) / 12 * step_s**2 * quaternion.cross(early, late)
 
 
-@kernel
+@jit
 def knots(
     lab_from_start_wxyz: Floats, count: int, duration_s: float, rate_rad_s: Floats, change_rad_s: Floats
 ) -> Floats:
@@ -151,7 +151,7 @@ def knots(
     return lab_from_knot_wxyz
 
 
-@kernel
+@jit
 def changing(
     lab_from_knot_wxyz: Floats, duration_s: float, rate_rad_s: Floats, change_rad_s: Floats, t_s: float
 ) -> tuple[Floats, Floats, Floats]:

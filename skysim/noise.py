@@ -16,7 +16,7 @@ from numba import float32, float64, int32, int64, uint32, uint64
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-from skysim.compiled import kernel
+from skysim.compiled import jit
 
 BUCKETS = 1024  # ten bits, six times in a draw: the tables of a dark frame then fit the fastest cache
 PER_E = 128  # guide tables an electron
@@ -86,7 +86,7 @@ def ziggurat() -> NDArray[np.float64]:
     return x
 
 
-@kernel
+@jit
 def _guide() -> Any:
     """A count is sure where the whole bucket lies above F(n - 1) of the smallest mean and below F(n) of the
     greatest: F falls with the mean. Unsure is 1/PER_E of the numbers, and a bucket at every step of F."""
@@ -106,7 +106,7 @@ def _guide() -> Any:
     return guide
 
 
-@kernel(inline="always")
+@jit(inline="always")
 def draw(state: Any) -> Any:
     """64 random bits and the stream's next state."""
     state += uint64(GAMMA)
@@ -115,14 +115,14 @@ def draw(state: Any) -> Any:
     return z ^ (z >> uint64(31)), state
 
 
-@kernel(inline="always")
+@jit(inline="always")
 def _uniform(state: Any) -> Any:
     """A number within (0, 1), 52 bits of it, and the next state."""
     bits, state = draw(state)
     return (float64(int64(bits >> uint64(12))) + 0.5) * 2.0**-52, state
 
 
-@kernel
+@jit
 def count(row: Any, state: Any, tables: Tables) -> Any:
     """Turn a row of means >= 0 into Poisson counts, exactly, in place. Returns the stream's next state.
 
@@ -151,7 +151,7 @@ def count(row: Any, state: Any, tables: Tables) -> Any:
     return state
 
 
-@kernel
+@jit
 def _invert(mean: Any, u: Any) -> Any:
     """The least n with F(n) > u."""
     n, p = 0.0, exp(-mean)
@@ -163,7 +163,7 @@ def _invert(mean: Any, u: Any) -> Any:
     return n
 
 
-@kernel
+@jit
 def _count_many(row: Any, which: Any, state: Any, edge: Any, height: Any, width: Any, sure: Any) -> Any:
     """The same for the chosen pixels of a row, whose means are ten or more.
 
@@ -187,7 +187,7 @@ def _count_many(row: Any, which: Any, state: Any, edge: Any, height: Any, width:
     return state
 
 
-@kernel
+@jit
 def _mend(mean: float, sigma: float, k: float, u: float, state: Any) -> Any:
     """PD's steps P to H: quotient acceptance, then rejection from a double exponential."""
     if k >= 0:
@@ -208,7 +208,7 @@ def _mend(mean: float, sigma: float, k: float, u: float, state: Any) -> Any:
             return k, state
 
 
-@kernel
+@jit
 def _densities(mean: float, sigma: float, k: float) -> Any:
     """PD's procedure F: the Poisson probability of k is py exp(px), the discrete normal's near fy exp(fx).
 
@@ -234,7 +234,7 @@ def _densities(mean: float, sigma: float, k: float) -> Any:
     return px, py, -x2 / 2, fy
 
 
-@kernel
+@jit
 def normal(row: Any, state: Any, tables: Tables) -> Any:
     """Fill a row with standard normal numbers by the ziggurat. Returns the stream's next state.
 
@@ -253,7 +253,7 @@ def normal(row: Any, state: Any, tables: Tables) -> Any:
     return state
 
 
-@kernel
+@jit
 def _edge(across: Any, layer: Any, state: Any, edge: Any, height: Any) -> Any:
     """The ziggurat's corners by comparison with the density, its tail by Marsaglia's exponential."""
     while True:
@@ -270,7 +270,7 @@ def _edge(across: Any, layer: Any, state: Any, edge: Any, height: Any) -> Any:
         layer, across = int64(bits & uint64(LAYERS - 1)), int64(int32(bits) >> int32(9))
 
 
-@kernel
+@jit
 def _tail(sign: Any, state: Any, begin: float) -> Any:
     """A normal number beyond `begin`, with the given sign (Marsaglia 1964)."""
     while True:

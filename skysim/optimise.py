@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from skysim import lamp
-from skysim.compiled import kernel
+from skysim.compiled import jit
 from skysim.likeness import Likeness, likeness
 from skysim.planetarium import Inside
 from skysim.turninfo import Seen, add, costs, look, renew, tally, told, variances
@@ -241,7 +241,7 @@ def reach_rad(part: lamp.Optimised, inside: Inside) -> float:
     return min(most, math.radians(part.cap_deg)) or math.radians(part.cap_deg)
 
 
-@kernel
+@jit
 def room_at(site: int, without: int, chosen: Ints, sites_m: Floats, spacing_m: float) -> bool:
     """Whether a site is as far as the spacing from every LED but that one."""
     for n in range(len(chosen)):
@@ -253,7 +253,7 @@ def room_at(site: int, without: int, chosen: Ints, sites_m: Floats, spacing_m: f
     return True
 
 
-@kernel
+@jit
 def exchange(
     chosen: Ints,
     sites_m: Floats,

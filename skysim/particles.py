@@ -11,7 +11,7 @@ import scipy
 from numpy.typing import NDArray
 
 from skysim.camera import Particles
-from skysim.compiled import kernel
+from skysim.compiled import jit
 from skysim.stamp import add_gaussian
 from skysim.types import BadInput, Floats
 
@@ -94,7 +94,7 @@ def tracks_of(
     return made
 
 
-@kernel
+@jit
 def deposit(image: NDArray[Any], ends_px: Floats, electrons: Floats, sigma_px: float) -> Floats:
     """Lay each charge evenly along its track, in steps under a quarter pixel, each a Gaussian integrated by pixels.
 
@@ -113,7 +113,7 @@ def deposit(image: NDArray[Any], ends_px: Floats, electrons: Floats, sigma_px: f
     return kept
 
 
-@kernel
+@jit
 def _share(place: float, size: int, sigma_px: float) -> float:
     """Of a Gaussian at a place, what lies between the two ends of an axis of so many pixels."""
     scale = 1 / (sigma_px * sqrt(2.0))

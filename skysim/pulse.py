@@ -5,10 +5,10 @@ from __future__ import annotations
 from math import ceil, floor, sqrt
 from typing import Any
 
-from skysim.compiled import kernel
+from skysim.compiled import jit
 
 
-@kernel
+@jit
 def lit_moments_s(begin_s: float, end_s: float, period_s: float, start_s: float, on_s: float) -> Any:
     """Seconds of [begin, end] during which a pulse train shines, their mean time and its standard deviation.
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from skysim.compiled import kernel
+from skysim.compiled import jit
 
 Floats = NDArray[np.float64]
 
@@ -29,7 +29,7 @@ def rotation(a_from_b: Floats) -> Rotation:
     return Rotation.from_quat([x, y, z, w])
 
 
-@kernel
+@jit
 def multiply(a_from_b: Floats, b_from_c: Floats) -> Floats:
     """a_from_c = a_from_b * b_from_c."""
     aw, ax, ay, az = a_from_b[0], a_from_b[1], a_from_b[2], a_from_b[3]
@@ -44,13 +44,13 @@ def multiply(a_from_b: Floats, b_from_c: Floats) -> Floats:
     )
 
 
-@kernel
+@jit
 def inverse(a_from_b: Floats) -> Floats:
     """b_from_a, the conjugate."""
     return np.array([a_from_b[0], -a_from_b[1], -a_from_b[2], -a_from_b[3]])
 
 
-@kernel
+@jit
 def apply(a_from_b: Floats, v_b: Floats) -> Floats:
     """v_a (3,) of v_b (3,): v + 2 w (u x v) + 2 u x (u x v) with u the vector part."""
     w, x, y, z = a_from_b[0], a_from_b[1], a_from_b[2], a_from_b[3]
@@ -59,7 +59,7 @@ def apply(a_from_b: Floats, v_b: Floats) -> Floats:
     return np.array([p + w * a + y * c - z * b, q + w * b + z * a - x * c, r + w * c + x * b - y * a])
 
 
-@kernel
+@jit
 def from_rotvec(turn_rad: Floats) -> Floats:
     """The rotation by |turn_rad| about turn_rad (3,): cos(a / 2), sin(a / 2) axis."""
     angle = math.sqrt(turn_rad[0] ** 2 + turn_rad[1] ** 2 + turn_rad[2] ** 2)
@@ -67,7 +67,7 @@ def from_rotvec(turn_rad: Floats) -> Floats:
     return np.array([math.cos(angle / 2), scale * turn_rad[0], scale * turn_rad[1], scale * turn_rad[2]])
 
 
-@kernel
+@jit
 def to_rotvec(a_from_b: Floats) -> Floats:
     """(3,) axis times angle, the angle at most pi."""
     sign = 1.0 if a_from_b[0] >= 0 else -1.0
@@ -77,13 +77,13 @@ def to_rotvec(a_from_b: Floats) -> Floats:
     return np.array([scale * x, scale * y, scale * z])
 
 
-@kernel
+@jit
 def cross(a: Floats, b: Floats) -> Floats:
     """a x b; np.cross takes ten times as long over a single pair."""
     return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
 
 
-@kernel
+@jit
 def times(matrix: Floats, v: Floats) -> Floats:
     """matrix (3, 3) times v (3,)."""
     p, q, r = v[0], v[1], v[2]
@@ -96,7 +96,7 @@ def times(matrix: Floats, v: Floats) -> Floats:
     )
 
 
-@kernel
+@jit
 def along(knots_wxyz: Floats, hermite_rad: Floats, knot: NDArray[np.int64], share: Floats) -> Floats:
     """(M, 4) attitudes between knots (N, 4): cubic Hermite in the rotation vector from the knot before.
 

@@ -10,7 +10,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from skysim.compiled import kernel
+from skysim.compiled import jit
 from skysim.images import GAUSS, ROUND, Images, images
 from skysim.led import Emitter, irradiance_e_s_m2
 from skysim.optics import Optics
@@ -175,7 +175,7 @@ def in_view(sources: Sources, optics: Optics, poses: Poses) -> NDArray[np.int64]
     return np.flatnonzero(_in_cone(sources.place, sight, np.ascontiguousarray(poses.camera_m), edge))
 
 
-@kernel
+@jit
 def _in_cone(place: Floats, sight: Floats, camera_m: Floats, edge: float) -> Any:
     """(N,) whether a place's direction from any of K cameras has a cosine above `edge` with that one's sight."""
     out = np.zeros(len(place), np.bool_)
@@ -230,7 +230,7 @@ def patches(xy_px: Floats, reach_px: Floats, shape: tuple[int, ...]) -> NDArray[
     return np.column_stack([begin[:, 0], end[:, 0], begin[:, 1], end[:, 1]]).astype(np.int64)
 
 
-@kernel(parallel=True)
+@jit(parallel=True)
 def _draw(
     buffer: Any, starts: Any, boxes: Any, first: int, paths: Paths, shapes: Images, window: Window, out: Any
 ) -> None:
@@ -242,7 +242,7 @@ def _draw(
             _measure(patch, x0, y0, out[first + i])
 
 
-@kernel
+@jit
 def _expose(
     patch: Any, x0: int, y0: int, n: int, paths: Paths, shapes: Images, window: Window, row: Any
 ) -> None:
@@ -260,7 +260,7 @@ def _expose(
     row[2], row[3] = _mean_place(patch, x0, y0)
 
 
-@kernel
+@jit
 def _integrate(
     patch: Any,
     row0: int,
@@ -299,7 +299,7 @@ def _integrate(
     return total, total_x, total_y
 
 
-@kernel
+@jit
 def _stamp(
     patch: Any, row0: int, row1: int, x: float, y: float, electrons: float, n: int, shapes: Images
 ) -> None:
@@ -313,7 +313,7 @@ def _stamp(
         add_grid(patch, row0, row1, x, y, electrons, shapes.tables[begin:end].reshape(p, p, q, q))
 
 
-@kernel
+@jit
 def _at(paths: Paths, n: int, t_s: float) -> Any:
     """Pixel and rate of a source at any time: cubic through the four moments around it (Lagrange)."""
     last = paths.xy_px.shape[0] - 4
@@ -331,7 +331,7 @@ def _at(paths: Paths, n: int, t_s: float) -> Any:
     return x, y, (e if np.isfinite(x + y) else 0.0)
 
 
-@kernel
+@jit
 def _speed(paths: Paths, n: int, begin_s: float, end_s: float) -> float:
     """The fastest that a source's image moves between two times, pixels a second."""
     first = max(int((begin_s - paths.first_s) / paths.step_s), 0)
@@ -344,7 +344,7 @@ def _speed(paths: Paths, n: int, begin_s: float, end_s: float) -> float:
     return fastest
 
 
-@kernel
+@jit
 def _length(paths: Paths, n: int, begin_s: float, end_s: float) -> float:
     """Length of a source's path between two times, pixels, in as many chords as there are moments."""
     chords = max(int(np.ceil((end_s - begin_s) / paths.step_s)), 8)
@@ -358,7 +358,7 @@ def _length(paths: Paths, n: int, begin_s: float, end_s: float) -> float:
     return total
 
 
-@kernel
+@jit
 def _measure(patch: Any, x0: int, y0: int, row: Any) -> None:
     """Sum, peak, sum of squares and the peak's pixel of a finished patch."""
     for j in range(patch.shape[0]):
@@ -370,7 +370,7 @@ def _measure(patch: Any, x0: int, y0: int, row: Any) -> None:
                 row[1], row[6], row[7] = e, x0 + i, y0 + j
 
 
-@kernel
+@jit
 def _mean_place(patch: Any, x0: int, y0: int) -> Any:
     """Centre of gravity of a patch; its corner if it is empty."""
     total, x, y = 0.0, 0.0, 0.0
@@ -381,7 +381,7 @@ def _mean_place(patch: Any, x0: int, y0: int) -> Any:
     return (x0 + x / total, y0 + y / total) if total > 0 else (float(x0), float(y0))
 
 
-@kernel
+@jit
 def _deposit(image: Any, buffer: Any, starts: Any, boxes: Any) -> None:
     """Add all patches to the image."""
     for i in range(len(boxes)):

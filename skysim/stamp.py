@@ -12,7 +12,7 @@ from math import ceil, erf, floor, sqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from skysim.compiled import kernel
+from skysim.compiled import jit
 from skysim.types import Floats
 
 Singles = NDArray[np.float32]
@@ -22,7 +22,7 @@ REACH_SIGMA = 6.5  # a Gaussian's share beyond is 7e-10
 LANES = 32  # what the compiler takes at a time (four registers of eight); a remainder would run one by one
 
 
-@kernel
+@jit
 def add(
     patch: Floats,
     row0: int,
@@ -43,7 +43,7 @@ def add(
         add_gaussian(patch, row0, row1, x, y, electrons, sigma_px)
 
 
-@kernel
+@jit
 def add_gaussian(
     patch: Floats, row0: int, row1: int, x: float, y: float, electrons: float, sigma_px: float
 ) -> None:
@@ -71,7 +71,7 @@ def add_gaussian(
             row[i] += share * columns[i]
 
 
-@kernel(fastmath=True)
+@jit(fastmath=True)
 def add_round(
     patch: Floats, row0: int, row1: int, x: float, y: float, electrons: float, radial: Singles
 ) -> None:
@@ -119,7 +119,7 @@ def add_round(
                 row[i] += electrons * (along(radial, entry[i], f[i]) + c4[i] * t4 + c8[i] * t8)
 
 
-@kernel(fastmath=True)
+@jit(fastmath=True)
 def radii(u: Singles, v: float, entry: NDArray[np.int32], fraction: Singles) -> None:
     """Which entry of a radial table each pixel of a row falls on, and how far past it."""
     for i in range(u.size):
@@ -128,7 +128,7 @@ def radii(u: Singles, v: float, entry: NDArray[np.int32], fraction: Singles) -> 
         fraction[i] = r - np.float32(entry[i])
 
 
-@kernel(fastmath=True)
+@jit(fastmath=True)
 def cosines(u: Singles, v: float, c4: Singles, c8: Singles) -> None:
     """r^4 cos 4 theta and r^8 cos 8 theta of each pixel of a row."""
     for i in range(u.size):
@@ -137,21 +137,21 @@ def cosines(u: Singles, v: float, c4: Singles, c8: Singles) -> None:
         c8[i] = np.float32(2) * c4[i] * c4[i] - r4 * r4
 
 
-@kernel(fastmath=True)
+@jit(fastmath=True)
 def along(radial: Singles, entry: int, f: float) -> float:
     """T0 at a fraction f past an entry."""
     k = np.uint64(entry)
     return radial[k, 0] + f * (radial[k, 1] + (f - np.float32(1)) * radial[k, 2])
 
 
-@kernel
+@jit
 def cubic(t: float) -> tuple[float, float, float, float]:
     """Lagrange's weights of the samples at -1, 0, 1, 2 for a place 0 <= t < 1 between the middle two."""
     a, b, c, d = t + 1, t, t - 1, t - 2
     return -b * c * d / 6, a * c * d / 2, -a * b * d / 2, a * b * c / 6
 
 
-@kernel(fastmath=True)
+@jit(fastmath=True)
 def add_grid(
     patch: Floats, row0: int, row1: int, x: float, y: float, electrons: float, grid: Singles
 ) -> None:

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from skysim.compiled import kernel
+from skysim.compiled import jit
 from skysim.types import Floats
 
 Ints = NDArray[np.int64]
@@ -33,7 +33,7 @@ class Seen(NamedTuple):
     told: Floats
 
 
-@kernel
+@jit
 def in_field(R: Floats, point_m: Floats, camera_m: Floats, tan_half: Floats, b: Floats) -> bool:
     """Whether the attitude R_body_from_lab has a point in its field; b becomes the point in body axes."""
     b[2] = R[2, 0] * point_m[0] + R[2, 1] * point_m[1] + R[2, 2] * point_m[2]
@@ -45,7 +45,7 @@ def in_field(R: Floats, point_m: Floats, camera_m: Floats, tan_half: Floats, b: 
     return abs(b[1] - camera_m[1]) <= tan_half[1] * ahead_m
 
 
-@kernel
+@jit
 def tell(b: Floats, camera_m: Floats, out: Floats) -> None:
     """(7,) J'J of one LED, and 1: q = b - r, dq = w x b, so a tangent q_x / q_z turns by w . (b x d), d its slope."""
     ahead_m = b[2] - camera_m[2]
@@ -61,7 +61,7 @@ def tell(b: Floats, camera_m: Floats, out: Floats) -> None:
     out[6] = 1
 
 
-@kernel
+@jit
 def widest(sites_m: Floats, camera_m: Floats, tan_half: Floats) -> float:
     """Chord of unit vectors, between a boresight and what is in its field, both seen from the bearing; or more."""
     aside_m = math.hypot(camera_m[0], camera_m[1])
@@ -74,7 +74,7 @@ def widest(sites_m: Floats, camera_m: Floats, tan_half: Floats) -> float:
     return chord
 
 
-@kernel
+@jit
 def look(
     sites_m: Floats, R_body_from_lab: Floats, camera_m: Floats, tan_half: Floats
 ) -> tuple[Ints, Ints, Floats]:
@@ -119,7 +119,7 @@ def told(place_m: Floats, R_body_from_lab: Floats, camera_m: Floats, tan_half: F
     return tally(np.arange(len(place_m)), seen, len(R_body_from_lab))
 
 
-@kernel
+@jit
 def variance(m: Floats) -> float:
     """tr(M^-1) of a symmetric (3, 3) matrix as (6,), by its minors: the turn's variance for rays of 1 rad^2."""
     a, b, c, d, e, f = m[0] + UNKNOWN, m[1] + UNKNOWN, m[2] + UNKNOWN, m[3], m[4], m[5]
@@ -128,7 +128,7 @@ def variance(m: Floats) -> float:
     return minors / max(whole, 1e-30)
 
 
-@kernel
+@jit
 def variances(total: Floats) -> Floats:
     """(A,) of every attitude."""
     out = np.empty(len(total))
@@ -137,7 +137,7 @@ def variances(total: Floats) -> Floats:
     return out
 
 
-@kernel
+@jit
 def cost(m: Floats, wanted: int) -> float:
     """One attitude's share of the soft maximum: (SHORT^missing tr(M^-1))^HARDNESS."""
     each = variance(m)
@@ -146,7 +146,7 @@ def cost(m: Floats, wanted: int) -> float:
     return each**HARDNESS
 
 
-@kernel
+@jit
 def costs(total: Floats, wanted: int) -> Floats:
     """(A,) of every attitude."""
     out = np.empty(len(total))
@@ -155,7 +155,7 @@ def costs(total: Floats, wanted: int) -> Floats:
     return out
 
 
-@kernel
+@jit
 def tally(chosen: Ints, seen: Seen, attitude_count: int) -> Floats:
     """(A, 7) of every attitude, as `told`, from what the sites are known to tell."""
     total = np.zeros((attitude_count, 7))
@@ -164,7 +164,7 @@ def tally(chosen: Ints, seen: Seen, attitude_count: int) -> Floats:
     return total
 
 
-@kernel
+@jit
 def add(site: int, sign: int, seen: Seen, total: Floats) -> None:
     """Light an LED (sign 1) or put it out (-1) in the sums of those who see it."""
     for m in range(seen.start[site], seen.start[site + 1]):
@@ -173,7 +173,7 @@ def add(site: int, sign: int, seen: Seen, total: Floats) -> None:
             total[a, i] += sign * seen.told[m, i]
 
 
-@kernel
+@jit
 def renew(site: int, seen: Seen, total: Floats, each: Floats, wanted: int) -> float:
     """By how much the cost of those who see a site changes; `each` becomes the new one."""
     change = 0.0

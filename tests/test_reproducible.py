@@ -49,7 +49,7 @@ def made(scene: str, out: Path, **environment: str) -> Path:
 def test_a_loop_is_compiled_alike_whoever_calls_it_first(package: Any) -> None:
     """A caller that raises for a division by zero and adds in any order has no say in what it calls."""
 
-    @package.compiled.kernel(cache=False)
+    @package.compiled.jit(cache=False)
     def lost(small: float) -> tuple[float, float]:
         return (1 + small) - 1, 1 / (small - small)
 

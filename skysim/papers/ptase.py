@@ -12,7 +12,7 @@ from estimator.fialho import SHARE_BASIC, SHARE_FALSE_STARS, VERSIONS, Rules, ru
 from estimator.index import PairIndex
 from estimator.options import Options
 from estimator.types import Ints
-from skysim.compiled import kernel
+from skysim.compiled import jit
 from skysim.metrics import WRONG_RAD, Summary, share
 from skysim.papers.compare import Answer, Ask, Cause, Drawing, Found
 from skysim.papers.intervals import resampled
@@ -47,7 +47,7 @@ def version(name: str) -> Rules:
     return rules(TOLERANCE_RAD, asked, part, name != "fialho_1", falls_back)
 
 
-@kernel
+@jit
 def simulate(known: PairIndex, by: Rules, runs: int, seed: int) -> tuple[Floats, Floats, Ints]:
     """R_cam_from_icrs (runs, 3, 3) that was and that was found, NaN where refused; (runs,) stars seen.
 
@@ -68,7 +68,7 @@ def simulate(known: PairIndex, by: Rules, runs: int, seed: int) -> tuple[Floats,
     return truly, told, stars
 
 
-@kernel
+@jit
 def _attitude() -> Floats:
     """A rotation matrix uniform over all rotations."""
     a, b, c, d = np.random.standard_normal(4)  # noqa: NPY002
@@ -81,7 +81,7 @@ def _attitude() -> Floats:
     return R
 
 
-@kernel
+@jit
 def _field(R: Floats, known: PairIndex) -> tuple[Floats, Floats]:
     """PTASE's gen_sia_input2: the stars in the field with noise on their directions and magnitudes, brightest first."""
     seen, light = np.empty((len(known.vectors), 3)), np.empty(len(known.vectors))
