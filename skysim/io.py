@@ -362,12 +362,14 @@ def date_of(path: Path) -> datetime.datetime | None:
     import warnings
 
     from astropy.io import fits
+    from astropy.utils.exceptions import AstropyWarning
 
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
+            # As in `read_fits`: past what it only warns of, astropy may walk a compressed file for ever.
+            warnings.simplefilter("error", AstropyWarning)
             return datetime.datetime.fromisoformat(str(fits.getheader(path).get("DATE-OBS")))
-    except Exception:  # as in `read_fits`, which tells what is wrong
+    except Exception:  # as there, where it is told
         return None
 
 
