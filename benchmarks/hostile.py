@@ -12,7 +12,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -36,6 +36,7 @@ CAMERA_FILE, FOV_DEG, WIDTH, HEIGHT = scene.SCENES / "shefex2.yaml", 14.87, 659,
 SMALL, LARGE = (240, 320), (4096, 4096)
 USUAL = ((HEIGHT, WIDTH), SMALL, LARGE)
 DEPTH = 4095
+EIGHT_BIT = 0.2  # of the pictures of sixteen bits
 SEARCHED = 1 / 400  # told neither camera nor field of view
 Rng = np.random.Generator
 Skies = tuple[Rotation, ...]  # the attitudes that a picture shows
@@ -146,8 +147,9 @@ def duplicated(rng: Rng) -> Shot:
 
 
 def mirrored(rng: Rng) -> Shot:
-    """No turn of the sky is its mirror image."""
-    picture = starry(rng)[0]
+    """No turn of the sky is its mirror image, through whatever lens."""
+    lens = camera() if rng.uniform() < 0.7 else Camera.from_fov(WIDTH, HEIGHT, np.radians(rng.uniform(6, 60)))
+    picture = starry(rng, lens)[0]
     return Shot(np.ascontiguousarray(picture[:, ::-1] if rng.uniform() < 0.5 else picture[::-1]))
 
 
@@ -226,7 +228,11 @@ def promises(rng: Rng) -> Shot:
 
 
 def large(rng: Rng) -> Shot:
-    """Sixteen megapixels of noise, or of lights."""
+    """Sixteen megapixels of noise, of lights, or of a lattice of a million lights in eight bits."""
+    if rng.uniform() < 0.4:
+        picture = np.full(LARGE, 10, np.uint8)
+        picture[:: rng.integers(2, 9), :: rng.integers(2, 9)] = rng.integers(60, 256)
+        return Shot(picture, ".tiff")
     picture = rng.integers(90, 110, LARGE, dtype=np.uint16)
     at = rng.integers(8, 4088, (rng.integers(0, 500), 2))
     for dy, dx, share in [(0, 0, 1.0), (0, 1, 0.6), (1, 0, 0.6), (1, 1, 0.4)]:
@@ -259,9 +265,9 @@ def stars() -> catalog.StarList:
     return catalog.brighter(catalog.read(CATALOGUES / "hipparcos_hp6.5.ecsv"), 7.0)
 
 
-def starry(rng: Rng) -> tuple[NDArray, Rotation]:
+def starry(rng: Rng, lens: Camera | None = None) -> tuple[NDArray, Rotation]:
     """A true sky, and its attitude."""
-    return photograph(Sight("", camera(), LIEBE_E, 7.0, 60, 15, 16, DEPTH), stars(), rng)
+    return photograph(Sight("", lens or camera(), LIEBE_E, 7.0, 60, 15, 16, DEPTH), stars(), rng)
 
 
 def star_light(count: int, rng: Rng) -> NDArray:
@@ -308,6 +314,8 @@ class Judge:
         weight = np.array(list(FAMILIES.values()))
         family = list(FAMILIES)[rng.choice(len(FAMILIES), p=weight / weight.sum())]
         shot = family(rng)
+        if shot.picture is not None and shot.picture.dtype == np.uint16 and rng.uniform() < EIGHT_BIT:
+            shot = replace(shot, picture=(shot.picture >> 4).clip(0, 255).astype(np.uint8))
         fits_camera = shot.picture is not None and shot.picture.shape == (HEIGHT, WIDTH)
         told = "camera" if fits_camera and rng.uniform() < 0.8 else "field"
         told = "nothing" if rng.uniform() < SEARCHED else told

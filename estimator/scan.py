@@ -35,7 +35,7 @@ def runs_above(image: NDArray, threshold: Floats, taps: Ints | None = None) -> I
     sums, ring = np.empty(width + 2, kind), np.empty((2 * reach + 1, width + 2 * reach), wide)
     room = FIRST_RUNS
     while True:
-        runs = np.empty((room, 3), np.int64)
+        runs = np.empty((room, 3), np.int32)
         count = _scan(image, threshold, taps, sums, ring, runs)
         if count <= room:
             return runs[:count]
@@ -79,33 +79,6 @@ def _scan(image: NDArray, threshold: Floats, taps: Ints, sums: NDArray, ring: ND
                     x = start + i
                     if mask[i] and x >= first and line[x] > scale * at(threshold, height, width, y, x):
                         count = _extend(runs, count, y, x)
-    return count
-
-
-@jit
-def _runs_of(
-    line: NDArray,
-    bound: NDArray,
-    threshold: Floats,
-    height: int,
-    y: int,
-    scale: float,
-    first: int,
-    mask: NDArray[np.uint8],
-    runs: Ints,
-    count: int,
-) -> int:
-    """Add the runs of a row's stretch from `first` on to the `count` that there are; how many then."""
-    part, least, eights = line[first : first + STRETCH], bound[first : first + STRETCH], mask.view(np.uint64)
-    mask[:] = 0
-    for i in range(len(part)):
-        mask[i] = part[i] > least[i]
-    for k in range(len(eights)):
-        if eights[k] == 0:
-            continue
-        for i in range(8 * k, 8 * k + 8):
-            if mask[i] and part[i] > scale * at(threshold, height, len(line), y, first + i):
-                count = _extend(runs, count, y, first + i)
     return count
 
 
@@ -177,7 +150,7 @@ def labelled(runs: Ints) -> tuple[Ints, int]:
     Runs of neighbouring rows are met pairwise from left to right; those that touch share a root (union-find).
     """
     count = len(runs)
-    parent = np.arange(count)
+    parent = np.arange(count).astype(np.int32)
     start = end = 0  # the runs of the row above
     k = 0
     while k < count:
@@ -194,7 +167,7 @@ def labelled(runs: Ints) -> tuple[Ints, int]:
                 else:
                     j += 1
         start, end = first, k
-    blob = np.empty(count, np.int64)
+    blob = np.empty(count, np.int32)
     blobs = 0
     for n in range(count):  # a root comes before all that hang on it
         root = _find(parent, n)
@@ -227,7 +200,7 @@ def summed(
 ) -> tuple[Ints, Floats]:
     """(blobs, 4) boxes and (blobs, SUMS) sums over every blob's pixels; see the columns' names."""
     height, width = image.shape
-    boxes = np.empty((blobs, 4), np.int64)
+    boxes = np.empty((blobs, 4), np.int32)
     boxes[:, :2], boxes[:, 2:] = max(height, width), -1
     sums = np.zeros((blobs, SUMS))
     sums[:, PEAK], sums[:, TOP] = -np.inf, -np.inf
@@ -273,4 +246,5 @@ def ranked(
     xy = np.empty((len(rows), 2))
     for k in range(len(rows)):
         xy[k, 0], xy[k, 1] = sums[rows[k], X] / sums[rows[k], FLUX], sums[rows[k], Y] / sums[rows[k], FLUX]
-    return boxes[rows], xy, sums[rows, FLUX], sums[rows, PEAK], sums[rows, AREA].astype(np.int64), count
+    box = boxes[rows].astype(np.int64)
+    return box, xy, sums[rows, FLUX], sums[rows, PEAK], sums[rows, AREA].astype(np.int64), count
