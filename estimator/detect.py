@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from estimator import judge
 from estimator.hints import NO_HINTS, Hints
-from estimator.scan import labelled, ranked, runs_above, summed
+from estimator.scan import Ints32, labelled, ranked, runs_above, summed
 from estimator.shefex import maximum_scan, sequential_scan
 from estimator.skylevel import FILTERED_NOISE, median, sky
 from estimator.types import Background, BadImage, Blobs, Floats, Ints
@@ -314,7 +314,7 @@ def _scanned(
 
 
 def _kept(
-    boxes: Ints,
+    boxes: Ints | Ints32,
     sums: Floats,
     min_area_px: int,
     max_blobs: int,

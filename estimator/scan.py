@@ -11,6 +11,7 @@ from estimator.compiled import jit
 from estimator.skylevel import at, filtered, filtered_row, summing
 from estimator.types import Floats, Ints
 
+Ints32 = NDArray[np.int32]  # half the memory where there are millions of runs
 FIRST_RUNS = 2048  # how many the first pass has room for
 # Columns of a blob's sums. STRONG counts the pixels above the higher threshold, TOP is the highest filtered light.
 AREA, STRONG, FLUX, X, Y, PEAK, TOP, TOP_X, TOP_Y = range(9)
@@ -19,7 +20,7 @@ STRETCH = 64  # pixels that are looked at closely if one of them is bright
 ONE_TAP = np.zeros((1, 2), np.int64)
 
 
-def runs_above(image: NDArray, threshold: Floats, taps: Ints | None = None) -> Ints:
+def runs_above(image: NDArray, threshold: Floats, taps: Ints | None = None) -> Ints32:
     """(N, 3) y, first x and last x of the runs whose filtered light is above a grid's bilinear threshold.
 
     Every row is filtered and compared in whole vectors with a bound that is nowhere above the threshold; only the
@@ -43,7 +44,7 @@ def runs_above(image: NDArray, threshold: Floats, taps: Ints | None = None) -> I
 
 
 @jit
-def _scan(image: NDArray, threshold: Floats, taps: Ints, sums: NDArray, ring: NDArray, runs: Ints) -> int:
+def _scan(image: NDArray, threshold: Floats, taps: Ints, sums: NDArray, ring: NDArray, runs: Ints32) -> int:
     """Fill `runs`; how many there are, which may be more than fit. `ring` has room for the rows that taps reach."""
     height, width = image.shape
     reach, scale = len(ring) // 2, 16.0 * len(taps)
@@ -103,7 +104,7 @@ def _padded_row(image: NDArray, y: int, reach: int, sums: NDArray, out: NDArray)
 
 
 @jit
-def _extend(runs: Ints, count: int, y: int, x: int) -> int:
+def _extend(runs: Ints32, count: int, y: int, x: int) -> int:
     """Lengthen the last run or begin another."""
     if 0 < count <= len(runs) and runs[count - 1, 0] == y and runs[count - 1, 2] == x - 1:
         runs[count - 1, 2] = x
@@ -144,7 +145,7 @@ def _bounds(threshold: Floats, height: int, y: int, cell: int, scale: float, bou
 
 
 @jit
-def labelled(runs: Ints) -> tuple[Ints, int]:
+def labelled(runs: Ints32) -> tuple[Ints32, int]:
     """Which blob each run belongs to, eight-connected, numbered from 0 in raster order; and how many blobs.
 
     Runs of neighbouring rows are met pairwise from left to right; those that touch share a root (union-find).
@@ -180,7 +181,7 @@ def labelled(runs: Ints) -> tuple[Ints, int]:
 
 
 @jit
-def _find(parent: Ints, n: int) -> int:
+def _find(parent: Ints32, n: int) -> int:
     while parent[n] != n:
         parent[n] = parent[parent[n]]
         n = parent[n]
@@ -188,7 +189,7 @@ def _find(parent: Ints, n: int) -> int:
 
 
 @jit
-def _join(parent: Ints, a: int, b: int) -> None:
+def _join(parent: Ints32, a: int, b: int) -> None:
     a, b = _find(parent, a), _find(parent, b)
     if a != b:
         parent[max(a, b)] = min(a, b)
@@ -196,8 +197,8 @@ def _join(parent: Ints, a: int, b: int) -> None:
 
 @jit
 def summed(
-    image: NDArray, level: Floats, strong: Floats, runs: Ints, blob: Ints, blobs: int
-) -> tuple[Ints, Floats]:
+    image: NDArray, level: Floats, strong: Floats, runs: Ints32, blob: Ints32, blobs: int
+) -> tuple[Ints32, Floats]:
     """(blobs, 4) boxes and (blobs, SUMS) sums over every blob's pixels; see the columns' names."""
     height, width = image.shape
     boxes = np.empty((blobs, 4), np.int32)
@@ -227,7 +228,7 @@ def summed(
 
 @jit
 def ranked(
-    boxes: Ints, sums: Floats, least_area: float, grown_area: float, grown_light: float, most: int
+    boxes: Ints | Ints32, sums: Floats, least_area: float, grown_area: float, grown_light: float, most: int
 ) -> tuple[Ints, Floats, Floats, Floats, Ints, int]:
     """Boxes, (x, y), flux, peak and area of the `most` brightest that count, and how many count.
 

@@ -24,9 +24,9 @@ MOST_PX = 1 << 28
 MOST_BYTES = 8 * MOST_PX  # of a file: each pixel a double
 DEFLATE = 1032  # times as many bytes come out of it at most (zlib's technical details)
 SEGMENTS = 1000  # of a JPEG before its picture
-# TIFF: types of a whole number, 8, 16, 32 and 64 bits; tags of width and height.
+# TIFF: types of a whole number, 8, 16, 32 and 64 bits; tags of width, height and samples of a pixel.
 WHOLE = {1: "B", 3: "H", 4: "I", 16: "Q"}
-WIDTH_TAG, HEIGHT_TAG = 256, 257
+WIDTH_TAG, HEIGHT_TAG, SAMPLES_TAG = 256, 257, 277
 
 
 def read_picture(path: Path) -> NDArray:
@@ -80,11 +80,11 @@ def check_picture(path: Path, data: bytes) -> None:
         sizes = []
     if not sizes:
         raise BadInput(f"{path}: cannot be decoded; it may be truncated or not an image")
-    for width, height in sizes:
-        check_pixels(path, width, height)
+    for sides in sizes:
+        check_pixels(path, *sides)
 
 
-Sizes = Iterator[tuple[int, int]]
+Sizes = Iterator[tuple[int, ...]]
 
 
 def png(data: bytes) -> Sizes:
@@ -125,13 +125,16 @@ def jpeg(data: bytes) -> Sizes:
 
 
 def tiff(data: bytes) -> Sizes:
-    """The first directory (TIFF 6.0, section 2), or BigTIFF's. The greatest of a tag that is there twice."""
+    """The first directory (TIFF 6.0, section 2), or BigTIFF's. The greatest of a tag that is there twice.
+
+    Here alone a sample may have eight bytes, as a pixel of the other formats has at most.
+    """
     order = "<" if data.startswith(b"II") else ">"
     big = struct.unpack_from(order + "H", data, 2)[0] == 43
     (at,) = struct.unpack_from(order + ("Q" if big else "I"), data, 8 if big else 4)
     (count,) = struct.unpack_from(order + ("Q" if big else "H"), data, at)
     entry, head, value = (20, 8, 12) if big else (12, 2, 8)
-    sides = {WIDTH_TAG: 0, HEIGHT_TAG: 0}
+    sides = {WIDTH_TAG: 0, HEIGHT_TAG: 0, SAMPLES_TAG: 1}
     for n in range(min(count, 1 << 16)):
         begin = at + head + n * entry
         tag, kind = struct.unpack_from(order + "HH", data, begin)
@@ -139,7 +142,8 @@ def tiff(data: bytes) -> Sizes:
             told = struct.unpack_from(order + WHOLE[kind], data, begin + value)[0]
             sides[tag] = max(sides[tag], told)
     if all(sides.values()):
-        yield sides[WIDTH_TAG], sides[HEIGHT_TAG]
+        width, height, samples = sides.values()
+        yield (width, height, samples) if samples > 1 else (width, height)
 
 
 FORMATS: dict[bytes, Callable[[bytes], Sizes]] = {

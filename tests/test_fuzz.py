@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from random import Random
 
+import cv2
 import numpy as np
 import pytest
 from astropy.io import fits
@@ -131,11 +132,20 @@ def test_a_header_of_gigapixels_is_refused_by_itself(tmp_path: Path, suffix: str
 
 @pytest.mark.parametrize("suffix", [".png", ".bmp", ".tiff", ".jpg"])
 def test_sizes_are_read_as_opencv_writes_them(suffix: str, tmp_path: Path) -> None:
-    import cv2
-
     data = cv2.imencode(suffix, np.zeros((30, 41), np.uint8))[1].tobytes()
     read = next(told for magic, told in picturefile.FORMATS.items() if data.startswith(magic))
     assert list(read(data)) == [(41, 30)]
+
+
+def test_every_sample_of_a_tiff_s_pixels_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Four doubles a pixel are sixteen times what two bytes are."""
+    monkeypatch.setattr(picturefile, "MOST_PX", 30 * 41)
+    path, grey = tmp_path / "x.tiff", np.arange(30 * 41.0).reshape(30, 41)
+    cv2.imwrite(str(path), grey)
+    assert np.array_equal(io.read_image(path), grey)
+    cv2.imwrite(str(path), np.dstack([grey] * 4))
+    with pytest.raises(BadInput, match="41x30x4 pixels by its header"):
+        io.read_image(path)
 
 
 @pytest.mark.parametrize("kind", ["stream", "tiles"])
