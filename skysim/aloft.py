@@ -115,7 +115,7 @@ class Eyes:
     def looks(self, clock: Clock | None = None) -> Iterator[Look]:
         """All frames whose exposure ended the filter's latency ago, and which were not taken yet."""
         scene, aloft = self.scene, self.aloft
-        while self.index < scene.exposure.frames:
+        while self.index < aloft.lab.frames:
             when = window(scene, self.index, self.meter.exposure_s)
             close_s = when.close_s(scene.camera.height_px)
             if close_s + self.latency_s > aloft.flight.now_s:

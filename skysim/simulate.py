@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -43,6 +44,7 @@ class Lab:
     verdicts  : what the filter made of each
     exposures_s: of each
     programs  : commands by name, which the scene's tracker may be: the user's, who alone may say what is run
+    endless   : frame follows frame for ever, whatever number the scene has; for `live` alone, which forgets
     """
 
     scene: Scene
@@ -62,10 +64,18 @@ class Lab:
     verdicts: dict[int, str] = field(default_factory=dict)
     exposures_s: dict[int, float] = field(default_factory=dict)
     programs: Mapping[str, str] = field(default_factory=dict)
+    endless: bool = False
+
+    @property
+    def frames(self) -> float:
+        """How many there are."""
+        return math.inf if self.endless else self.scene.exposure.frames
 
     @property
     def flown_s(self) -> float:
         """How long the flight has to be, for the longest exposure of the last frame."""
+        if self.endless:
+            return math.inf
         part = self.scene.tracker.exposure_control
         last = window(self.scene, self.scene.exposure.frames - 1, part.longest_s if part else None)
         return last.close_s(self.scene.camera.height_px) + SPARE_S

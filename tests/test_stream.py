@@ -13,6 +13,7 @@ import time
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ import pytest
 from typer.testing import CliRunner
 
 from skysim import cli, scene, simulate
+from skysim.aloft import Aloft, Eyes, Look
 from skysim.stream import send, sinks, web
 from skysim.stream.pace import Pace
 from skysim.stream.packet import Packet, unpack
@@ -212,6 +214,49 @@ def test_streams_bring_every_next_frame(board: tuple[web.Board, str]) -> None:
         movie.readline()
         board[0].post(packet(index + 1))
     assert [dropped for _, dropped in board[0].clients] == [0, 0]
+
+
+def test_an_endless_flight_goes_on_beyond_the_scene_s_frames_and_beyond_a_day() -> None:
+    """The clock is put forward by ten days, which a body that turns freely does not feel."""
+    lab = replace(on_the_ground(), endless=True)
+    aloft = Aloft(lab, forgets=True)
+    room = aloft.flight.states.nbytes
+    eyes, later = Eyes(aloft, None), 10 * 86_400
+    aloft.flight.step = aloft.flight.first = round(later / aloft.flight.step_s)
+    eyes.index = round(later * lab.scene.exposure.rate_hz)
+    came: list[Look] = []
+    while len(came) < FRAMES + 1:
+        aloft.tick(10)
+        came += eyes.looks()
+    mids_s = [look.frame.t_mid_s - later for look in came]
+    first_s = lab.scene.exposure.first_s + lab.scene.exposure.time_s / 2
+    np.testing.assert_allclose(
+        mids_s, first_s + np.arange(len(came)) / lab.scene.exposure.rate_hz, rtol=0, atol=1e-8
+    )
+    assert aloft.flight.states.nbytes == room
+    turned = came[-1].truth.cam_from_lab * came[0].truth.cam_from_lab.inv()
+    rate_rad_s = np.radians(np.linalg.norm(lab.scene.motion.rate_deg_s))
+    assert turned.magnitude() == pytest.approx(rate_rad_s * (mids_s[-1] - mids_s[0]), rel=1e-6)
+
+
+def test_an_endless_stream_ends_by_sigterm_with_whole_frames_and_its_tallies(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "skysim", "stream", "shefex2", "--set", "light.limit_mag=5", "--endless"]
+    stream = subprocess.Popen([*command, "--folder", str(tmp_path), "--json"], stdout=-1)
+    until = time.monotonic() + 100
+    while not (tmp_path / "frame_000002.json").exists():
+        assert stream.poll() is None
+        assert time.monotonic() < until
+        time.sleep(0.02)
+    stream.send_signal(signal.SIGTERM)
+    told = json.loads(stream.communicate(timeout=60)[0])
+    assert stream.returncode == 0
+    stems = {path.stem for path in tmp_path.iterdir()}
+    assert {path.name for path in tmp_path.iterdir()} == {
+        f"{stem}.{end}" for stem in stems for end in ("png", "json")
+    }
+    assert len(stems) == told["sinks"]["folder"]["sent"] >= 3
+    with pytest.raises(BadInput, match="either --frames N or --endless"):
+        CliRunner().invoke(cli.app, [*command[3:], "--frames", "3", "--pipe", "-"], catch_exceptions=False)
 
 
 @pytest.mark.long

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -13,8 +14,6 @@ from skysim import BadInput
 
 if TYPE_CHECKING:
     from skysim.stream.sinks import Sink
-
-FOREVER = 1_000_000_000  # frames
 
 
 def stream(
@@ -38,7 +37,10 @@ def stream(
     frames: Annotated[
         int | None, typer.Option(min=1, help="How many; the scene's own number if left out.")
     ] = None,
-    endless: Annotated[bool, typer.Option("--endless", help="Until Ctrl-C.")] = False,
+    endless: Annotated[
+        bool,
+        typer.Option("--endless", help="Until Ctrl-C, however long; without it a day at most."),
+    ] = False,
     speed: Annotated[
         float,
         typer.Option(min=0, max=1000, help="So many times real time; 0: as fast as frames can be made."),
@@ -62,9 +64,11 @@ def stream(
 
     if folder is None and http is None and pipe is None:
         raise BadInput("skysim stream: give where to: --folder DIR, --http PORT or --pipe PATH")
+    if endless and frames is not None:
+        raise BadInput("skysim stream: give either --frames N or --endless")
     told = overridden(set_) | ({"seed": str(seed)} if seed is not None else {})
-    count = FOREVER if endless else frames
-    lab = simulate.furnish(load(scene, told | ({"exposure.frames": str(count)} if count else {})))
+    told |= {"exposure.frames": str(frames)} if frames is not None else {}
+    lab = replace(simulate.furnish(load(scene, told)), endless=endless)
     takers: list[Sink] = []
     if folder is not None:
         takers.append(sinks.Sink("folder", sinks.folder(folder)))

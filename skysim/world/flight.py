@@ -16,6 +16,7 @@ from skysim.world.vehicle import World
 
 STATE = mujoco.mjtState.mjSTATE_FULLPHYSICS
 CONTROL = mujoco.mjtState.mjSTATE_CTRL
+FOREVER = 2**62  # steps
 
 Controller = Callable[[float, Rotation, Floats], Floats]
 
@@ -27,7 +28,7 @@ class Flight:
     The present is the last state flown: angles, rates and speeds are read from it without a copy.
 
     lab_from_body : at the start; rate_body_rad_s : (3,) likewise
-    duration_s    : the longest that this flight can last; room is made for so many steps
+    duration_s    : the longest that this flight can last; room is made for so many steps. With kept_s it may be inf
     kept_s        : room is made for twice so many only, and what is older than that is forgotten
     """
 
@@ -42,7 +43,7 @@ class Flight:
         check_tilt(world, lab_from_body)
         self.world, self.model = world, world.model
         self.step_s = float(self.model.opt.timestep)
-        self.last = max(1, int(np.ceil(duration_s / self.step_s - 1e-6)))
+        self.last = max(1, int(np.ceil(min(duration_s / self.step_s, FOREVER) - 1e-6)))
         self.kept = self.last if kept_s is None else int(np.ceil(kept_s / self.step_s))
         rows = min(self.last, 2 * self.kept) + 1
         self.states = np.empty((rows, mujoco.mj_stateSize(self.model, int(STATE))))
