@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import datetime
+import os
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,7 +14,8 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from skysim import aem, greys, io
+from skysim import aem, greys, io, livecamera
+from skysim.picturefile import silent_stderr
 from skysim.recording import Recording, Told
 from skysim.types import BadInput
 
@@ -20,6 +23,7 @@ EXTRA = "takes more packages; install them: pip install 'skysim[export]'"
 BATCH_ROWS = 1 << 16  # of Parquet that are kept before they are written
 SAMPLED_FRAMES = 9  # of a video that tell its black and white
 FOURCC = "mp4v"  # MPEG-4 part 2, which every wheel of OpenCV can write
+MORE_BYTES = 1 << 20
 
 Bar = Callable[[Iterable[Any], int, str], Iterator[Any]]  # items, how many, what is being done
 
@@ -250,16 +254,35 @@ def to_video(run: Recording, out: Path, bar: Bar) -> list[Path]:
         )
         try:
             if not film.isOpened():
+                more_room(temporary)
                 raise BadInput(
                     f"{path}: this OpenCV cannot write {FOURCC} video of {width}x{height} at {pace_hz:g} Hz"
                 )
             for stem in bar(run.stems, len(run.stems), "video"):
                 image = like(run.image(stem), first, stem)
                 grey = greys.stretched(image, "square root", between=(float(low), float(high)))
-                film.write(np.ascontiguousarray(grey[:height, :width]))
+                with silent_stderr():
+                    film.write(np.ascontiguousarray(grey[:height, :width]))
         finally:
             film.release()
+        there, count = frames_of(temporary), len(run.stems)
+        if there != count:  # OpenCV does not tell of what it could not write
+            more_room(temporary)
+            raise BadInput(f"{path}: OpenCV wrote {there} of {count} frames and does not tell why")
     return [path]
+
+
+def frames_of(film: Path) -> int:
+    """How many frames can be read of a video file."""
+    with silent_stderr(), closing(livecamera.LiveCamera(str(film))) as reader:
+        return sum(1 for _ in iter(reader.capture.grab, False))
+
+
+def more_room(path: Path) -> None:
+    """Make a file longer by more than a film's index takes: raises the OSError of who did not tell of one."""
+    with path.open("ab") as file:
+        file.write(bytes(MORE_BYTES))
+        os.fsync(file.fileno())
 
 
 EXPORTS: dict[str, Callable[[Recording, Path, Bar], list[Path]]] = {
