@@ -53,19 +53,29 @@ class DomeMap:
 
 
 @contextmanager
-def whole(path: Path) -> Iterator[Path]:
-    """A temporary name beside `path` that becomes it once everything is written, or vanishes."""
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
+def naming(path: Path) -> Iterator[None]:
+    """Whatever cannot be written is told of `path`, in the system's own words for why.
+
+    Some libraries tell neither which file nor, of a full disk, what is wrong in a line.
+    """
     try:
-        yield temporary
-        os.replace(temporary, path)
+        yield
     except OSError as error:
-        # Some libraries tell neither which file nor, of a full disk, what is wrong in a line.
         full = error.errno in (None, errno.ENOSPC, errno.EDQUOT) and "space" in str(error).lower()
         number = errno.ENOSPC if full else error.errno
         if number is None:
             raise
         raise OSError(number, os.strerror(number), str(path)) from error
+
+
+@contextmanager
+def whole(path: Path) -> Iterator[Path]:
+    """A temporary name beside `path` that becomes it once everything is written, or vanishes."""
+    temporary = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
+    try:
+        with naming(path):
+            yield temporary
+            os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
 
@@ -75,9 +85,10 @@ def whole_folder(path: Path) -> Iterator[Path]:
     """`whole` of a folder: a temporary one beside `path` that takes its place, whatever was there."""
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
     try:
-        yield temporary
-        shutil.rmtree(path, ignore_errors=True)
-        temporary.rename(path)
+        with naming(path):
+            yield temporary
+            shutil.rmtree(path, ignore_errors=True)
+            temporary.rename(path)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
 
@@ -175,10 +186,18 @@ PLAIN = (cv2.IMWRITE_TIFF_COMPRESSION, cv2.IMWRITE_TIFF_COMPRESSION_NONE)  # som
 
 
 def write_image(path: Path, image: NDArray) -> None:
-    """An image by the name's ending. Raises BadInput if it cannot be written."""
+    """An image by the name's ending. Raises BadInput if it cannot be encoded, OSError if it cannot be written.
+
+    OpenCV encodes in memory: of a file that it cannot write it would not tell why.
+    """
+    try:
+        done, coded = cv2.imencode(path.suffix, image, PLAIN if path.suffix == ".tif" else ())
+    except cv2.error:
+        done = False
+    if not done:
+        raise BadInput(f"{path}: an image of {image.dtype} and shape {image.shape} cannot be encoded so")
     with whole(path) as temporary:
-        if not cv2.imwrite(str(temporary), image, PLAIN if path.suffix == ".tif" else ()):
-            raise BadInput(f"{path}: cannot be written as an image")
+        temporary.write_bytes(coded.data)
 
 
 def write_truth(path: Path, frame: Frame, truth: Truth, scene: Scene) -> None:

@@ -2,16 +2,26 @@
 
 from __future__ import annotations
 
+import contextlib
+import json
 import os
+import resource
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
+from typing import Any
 
+import cv2
+import numpy as np
 import pytest
 from astropy.io import fits
+from typer.testing import CliRunner
+
+from skysim import cli, export, io, recording, scene, simulate
+from skysim.types import BadInput
 
 SKYSIM = [sys.executable, "-m", "skysim"]
 SMALL = ["--set", "light.limit_mag=5"]
@@ -58,6 +68,95 @@ def test_a_full_disk_is_named_and_what_was_written_is_whole(mounted: Path) -> No
     assert last.endswith(": No space left on device")
     assert "Traceback" not in done.stderr
     assert whole_frames(mounted / "run") >= 1
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory: pytest.TempPathFactory) -> recording.Recording:
+    """Three frames with their truth."""
+    folder = tmp_path_factory.mktemp("flown")
+    lab = simulate.prepare(scene.load("shefex2", {"exposure.frames": "3", "light.limit_mag": "5"}))
+    for frame, truth, _ in simulate.photographs(lab):
+        io.write_frame(folder, frame, truth, lab.scene)
+    return recording.recording(folder)
+
+
+@contextlib.contextmanager
+def no_room(file_bytes: int) -> Iterator[None]:
+    """No file may grow larger: what a write gets then is an error of the system, as on a full disk."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (file_bytes, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+@pytest.mark.parametrize(
+    ("name", "file"),
+    [
+        ("tiff", "frame_0000.tif"),
+        ("zarr", "frames.zarr"),
+        ("video", "frames.mp4"),
+        ("ecsv", "truth.ecsv"),
+        ("parquet", "truth.parquet"),
+        ("aem", "truth.aem"),
+    ],
+)
+def test_an_export_without_room_names_file_and_reason_and_leaves_nothing(
+    flown: recording.Recording, tmp_path: Path, capfd: pytest.CaptureFixture[str], name: str, file: str
+) -> None:
+    def quiet(items: Iterable[Any], total: int, what: str) -> Iterator[Any]:
+        yield from items
+
+    with no_room(500), pytest.raises(OSError, match="File too large") as told:
+        export.export(flown, [name], tmp_path, quiet)
+    assert told.value.filename == str(tmp_path / file)
+    assert list(tmp_path.iterdir()) == []
+    assert capfd.readouterr().err == ""
+
+
+def test_a_film_that_lost_frames_is_refused(
+    flown: recording.Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """There is room again when it is asked for: nobody can tell why, but that frames are missing."""
+    film = cv2.VideoWriter
+
+    class Forgetful:
+        def __init__(self, *told: Any) -> None:
+            self.film, self.frames = film(*told), 0
+            self.isOpened, self.release = self.film.isOpened, self.film.release
+
+        def write(self, image: Any) -> None:
+            self.frames += 1
+            if self.frames < 3:
+                self.film.write(image)
+
+    monkeypatch.setattr("skysim.export.cv2.VideoWriter", type("F", (Forgetful,), {"fourcc": film.fourcc}))
+    with pytest.raises(BadInput, match=r"frames\.mp4: OpenCV wrote 2 of 3 frames"):
+        export.export(flown, ["video"], tmp_path, lambda items, *_: iter(items))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_stream_without_room_names_the_file_and_counts_what_was_lost(tmp_path: Path) -> None:
+    command = ["stream", "shefex2", "--folder", str(tmp_path), "--speed", "0", "--frames", "5", *SMALL]
+    with no_room(100_000):
+        done = CliRunner().invoke(cli.app, [*command, "--json"])
+    assert str(done.exception) == f"--folder: {tmp_path / 'frame_000000.png'}: File too large"
+    told = json.loads(done.stdout)
+    assert told["sinks"]["folder"]["dropped"] == told["made"] >= 1
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("suffix", ["png", "tif", "jpg"])
+def test_a_picture_without_room_names_file_and_reason(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], suffix: str
+) -> None:
+    image = np.random.default_rng(1).integers(0, 255, (64, 64), np.uint8)
+    with no_room(500), pytest.raises(OSError, match="File too large") as told:
+        io.write_image(tmp_path / f"a.{suffix}", image)
+    assert told.value.filename == str(tmp_path / f"a.{suffix}")
+    assert list(tmp_path.iterdir()) == []
+    assert capfd.readouterr().err == ""
 
 
 @pytest.mark.long

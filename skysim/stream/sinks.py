@@ -47,7 +47,8 @@ class Sink:
             except BrokenPipeError:
                 self.fault = GONE
             except OSError as error:
-                self.fault = error.strerror or str(error)
+                file = f"{error.filename}: " if error.filename else ""
+                self.fault = file + (error.strerror or str(error))
             if self.fault:
                 self.dropped += 1
                 return
@@ -73,6 +74,9 @@ class Sink:
                 self.waiting.put(None, timeout=0.1)
                 break
         self.thread.join(max(until - time.monotonic(), 0.0))
+        with contextlib.suppress(queue.Empty):  # nobody takes what still waits
+            while True:
+                self.dropped += self.waiting.get_nowait() is not None
 
 
 def folder(path: Path) -> Callable[[Packet], None]:
