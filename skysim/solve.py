@@ -130,6 +130,9 @@ def make_solver(
         raise BadInput("give either --fov DEG or --camera FILE")
     if fov_deg is not None and not 1 <= fov_deg <= 120:
         raise BadInput(f"--fov {fov_deg:g}: allowed: the horizontal field of view, 1 to 120 degrees")
+    time_utc, doubt = believable(time_utc)
+    if doubt:
+        raise BadInput(f"--time: {doubt}")
     named = {stage: known(stage, name) for stage, name in (stages or {}).items()}
     calibrated = opencv.read(camera_file) if camera_file and opencv.is_one(camera_file) else None
     camera = scene.load_camera(named_scene(camera_file)) if camera_file and not calibrated else None
@@ -144,6 +147,14 @@ def make_solver(
     return Solver(fov_deg, camera, stars, settings, time_utc, calibrated)
 
 
+def believable(taken: datetime.datetime | None) -> tuple[datetime.datetime | None, str]:
+    """A picture's date, if there is one for which we know the Earth's and the stars' motion, and else why not."""
+    try:
+        return (scene.in_our_time(taken) if taken else None), ""
+    except ValueError as error:
+        return None, str(error)
+
+
 def known(stage: str, name: str) -> str:
     """The name, if there is such an algorithm."""
     try:
@@ -156,7 +167,7 @@ def solve(path: Path, solver: Solver, annotated: Path | None) -> dict[str, Any]:
     """One file to one answer: the fields of `skysim solve --json`. Writes the annotated PNG.
 
     Bad input does not raise here, for other files wait behind it: its line becomes the status, with
-    `bad_input` true for the exit code.
+    `bad_input` true for the exit code. `doubt` is what of the header was not believed.
     """
     answer: dict[str, Any] = {
         "file": str(path),
@@ -168,6 +179,7 @@ def solve(path: Path, solver: Solver, annotated: Path | None) -> dict[str, Any]:
         "matches": 0,
         "rms_arcsec": None,
         "time_ms": None,
+        "doubt": "",
     }
     begin = time.perf_counter()
     try:
@@ -175,7 +187,10 @@ def solve(path: Path, solver: Solver, annotated: Path | None) -> dict[str, Any]:
         check(path, image, solver)
         image = io.monochrome(image)
         check_size(image)
-        found, tracker = look(image, solver, io.date_of(path))
+        taken, doubt = believable(io.date_of(path))
+        if doubt and not solver.time_utc:
+            answer["doubt"] = f"{path}: DATE-OBS {doubt}: left out"
+        found, tracker = look(image, solver, taken)
     except (BadInput, BadImage) as error:
         message = str(error)
         answer["status"] = message if message.startswith(str(path)) else f"{path}: {message}"

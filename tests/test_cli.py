@@ -183,6 +183,31 @@ def test_solve_takes_a_picture_of_which_nothing_is_told(
     assert answer["dec_deg"] == pytest.approx(2.0, abs=0.1)
 
 
+def test_solve_leaves_out_a_header_s_date_that_cannot_be_and_says_so(
+    skysim: Skysim, rendered: Path, tmp_path: Path
+) -> None:
+    """As if there were none, when aberration is left out."""
+    frames = {}
+    for name, date in (("none", None), ("late", "9012-06-22T21:00:00"), ("good", "2012-06-22T21:00:00")):
+        frames[name] = tmp_path / f"{name}.fits"
+        with fits.open(rendered / "frame_0000.fits") as hdus:
+            hdus[0].header["DATE-OBS"] = date
+            hdus.writeto(frames[name])
+    ran = skysim("solve", *frames.values(), "--camera", SHEFEX, "--json", "--out", tmp_path / "out")
+    none, late, good = json.loads(ran.out)
+    assert ran.code == 0
+    assert ran.err == (
+        f"skysim: {frames['late']}: DATE-OBS 9012-06-22T21:00:00 is outside of 1900 to 2100: left out\n"
+    )
+    for key in ("ra_deg", "dec_deg", "roll_deg"):
+        assert late[key] == none[key]
+        assert late[key] != good[key]
+    told = ["--time", "2012-06-22T21:00:00", "--json", "--out", tmp_path / "out"]
+    ran = skysim("solve", frames["late"], "--camera", SHEFEX, *told)
+    assert ran.err == ""
+    assert json.loads(ran.out)[0]["ra_deg"] == good["ra_deg"]
+
+
 def test_solve_writes_what_it_prints_and_a_picture(skysim: Skysim, rendered: Path, tmp_path: Path) -> None:
     ran = skysim("solve", rendered / "frame_0000.png", "--fov", "14.8", "--json", "--out", tmp_path)
     assert json.loads((tmp_path / "solutions.json").read_text()) == json.loads(ran.out)
@@ -470,6 +495,8 @@ def test_noise_is_looked_at_and_refused_an_attitude(skysim: Skysim, tmp_path: Pa
         (["--camera", "nosuch.yaml"], "nosuch.yaml: cannot be read: No such file"),
         (["--camera", "nosuch"], "nosuch: no such scene; allowed: a .yaml file or one of afit_simsat, "),
         (["--camera", SHEFEX, "--time", "yesterday"], "--time yesterday: allowed: ISO 8601"),
+        (["--time", "9999-12-31T23:59:59"], "--time: 9999-12-31T23:59:59 is outside of 1900 to 2100"),
+        (["--time", "1899-12-31T23:59:59+00:00"], "is outside of 1900 to 2100"),
         (["--detector", "magic"], "--detector: 'magic' is none of default, "),
         (["--centroider", "magic"], "--centroider: 'magic' is none of "),
         (["--identifier", "magic"], "--identifier: 'magic' is none of default, "),

@@ -49,7 +49,9 @@ def solve(
         str | None,
         typer.Option(help="Also a frame of a live camera: its index, a video file or an address."),
     ] = None,
-    time: Annotated[str | None, typer.Option(help="UTC of the pictures, e.g. 2012-06-22T21:00:00.")] = None,
+    time: Annotated[
+        str | None, typer.Option(help="UTC of the pictures, 1900 to 2100, e.g. 2012-06-22T21:00:00.")
+    ] = None,
     detector: Detector = None,
     centroider: Centroider = None,
     identifier: Identifier = None,
@@ -75,12 +77,13 @@ def solve(
     jobs = progress(list(zip(paths, pictures, strict=True)), len(paths), "solving", quiet=json)
     answers = [solving.solve(path, how, picture) for path, picture in jobs]
     faults = [answer["status"] for answer in answers if answer.pop("bad_input")]
+    doubts = [doubt for answer in answers if (doubt := answer.pop("doubt"))]
     io.write_text(out / "solutions.json", io.to_json(answers))
     if json:
         print(io.to_json(answers))
     else:
         print_answers(answers, out)
-    for fault in faults:
+    for fault in doubts + faults:
         complain(fault)
     if faults:
         raise typer.Exit(2)

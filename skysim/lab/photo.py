@@ -56,7 +56,7 @@ def of_file(name: str, data: bytes, fov_deg: float | None, stages: dict[str, str
         path = Path(folder) / f"upload{suffix}"
         path.write_bytes(data)
         try:
-            image, taken = io.monochrome(io.read_image(path)), io.date_of(path)
+            image, (taken, _) = io.monochrome(io.read_image(path)), solve.believable(io.date_of(path))
         except BadInput as error:
             raise BadInput(str(error).replace(str(path), Path(name).name)) from None
     return solved(image, fov_deg, stages, taken)
