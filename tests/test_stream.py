@@ -193,7 +193,7 @@ def test_the_newest_frame_and_the_tallies_are_served(board: tuple[web.Board, str
     image = cv2.imdecode(np.frombuffer(got("/frame.png"), np.uint8), -1)
     np.testing.assert_array_equal(image, packet(0).pixels)
     assert json.loads(got("/truth.json"))["index"] == 0
-    assert json.loads(got("/status.json")) == {"made": 1}
+    assert json.loads(got("/status.json")) == {"made": 1} | board[0].tallies()
     assert b"/stream.mjpg" in got("/")
     with pytest.raises(urllib.error.HTTPError, match="404"):
         got("/etc/passwd")
@@ -213,7 +213,42 @@ def test_streams_bring_every_next_frame(board: tuple[web.Board, str]) -> None:
         assert cv2.imdecode(np.frombuffer(data, np.uint8), -1).shape == (3, 4)
         movie.readline()
         board[0].post(packet(index + 1))
-    assert [dropped for _, dropped in board[0].clients] == [0, 0]
+    assert [client.dropped for client in board[0].clients] == [0, 0]
+
+
+def test_clients_that_left_cost_no_memory_but_count(board: tuple[web.Board, str]) -> None:
+    """A hundred come, each for a frame; what the newest were sent is told one by one, of the others the sum."""
+    stays = urllib.request.urlopen(board[1] + "/stream.raw", timeout=10)
+    assert unpack(stays) is not None
+    for _ in range(100):
+        with urllib.request.urlopen(board[1] + "/stream.raw", timeout=10) as raw:
+            assert unpack(raw) is not None
+    until = time.monotonic() + 60
+    index = 0
+    while len(board[0].left) + board[0].earlier["clients"] < 100:  # who left is found out by sending
+        assert time.monotonic() < until
+        index += 1
+        board[0].post(packet(index))
+        while (found := unpack(stays)) and found[0]["index"] < index:
+            pass
+    told = board[0].tallies()
+    assert len(told["clients"]) == 1 + web.REMEMBERED == len(board[0].clients)
+    assert told["earlier_clients"]["clients"] == 100 - web.REMEMBERED
+    assert told["earlier_clients"]["sent"] >= 100 - web.REMEMBERED
+    assert told["clients"][0]["sent"] in (index, index + 1)
+
+
+@pytest.mark.parametrize(
+    "path", ["/", "/frame.png", "/frame.raw", "/truth.json", "/stream.raw", "/stream.mjpg"]
+)
+def test_head_is_told_what_get_is_without_the_body(board: tuple[web.Board, str], path: str) -> None:
+    with urllib.request.urlopen(urllib.request.Request(board[1] + path, method="HEAD"), timeout=10) as told:
+        assert told.status == 200
+        assert told.read() == b""
+    assert board[0].clients == []
+    with urllib.request.urlopen(board[1] + path, timeout=10) as got:
+        same = ("Content-Type", "Content-Length", "X-Skysim-Header")
+        assert [told.headers[name] for name in same] == [got.headers[name] for name in same]
 
 
 def test_an_endless_flight_goes_on_beyond_the_scene_s_frames_and_beyond_a_day() -> None:
@@ -242,7 +277,7 @@ def test_an_endless_flight_goes_on_beyond_the_scene_s_frames_and_beyond_a_day() 
 def test_an_endless_stream_ends_by_sigterm_with_whole_frames_and_its_tallies(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "skysim", "stream", "shefex2", "--set", "light.limit_mag=5", "--endless"]
     stream = subprocess.Popen([*command, "--folder", str(tmp_path), "--json"], stdout=-1)
-    until = time.monotonic() + 100
+    until = time.monotonic() + 300
     while not (tmp_path / "frame_000002.json").exists():
         assert stream.poll() is None
         assert time.monotonic() < until

@@ -75,9 +75,7 @@ def stream(
     if pipe is not None:
         takers.append(sinks.Sink("pipe", sinks.pipe(pipe)))
     tally, pace = send.Tally(), Pace(speed, lab.scene.exposure.rate_hz)
-    board = (
-        web.Board(lambda: tally.figures(takers) | {"clients": clients(board)}) if http is not None else None
-    )
+    board = web.Board(lambda: tally.figures(takers)) if http is not None else None
     server = web.served(board, host, http) if board and http is not None else None
     if server:
         print(
@@ -97,17 +95,12 @@ def stream(
         if board and server:
             board.end()
             server.shutdown()
-    figures = tally.figures(takers) | ({"clients": clients(board)} if board else {})
+    figures = tally.figures(takers) | (board.tallies() if board else {})
     where = sys.stderr if pipe == "-" else sys.stdout
     print(io.to_json(figures) if json else summary(figures), file=where)
     for taker in takers:
         if taker.fault not in ("", GONE):
             raise BadInput(f"--{taker.name}: {taker.fault}")
-
-
-def clients(board: Any) -> list[dict[str, int]]:
-    """What each client of a stream was sent, and what it was too slow for."""
-    return [{"sent": sent, "dropped": dropped} for sent, dropped in list(board.clients)]
 
 
 def summary(figures: dict[str, Any]) -> str:
@@ -121,6 +114,11 @@ def summary(figures: dict[str, Any]) -> str:
             f"{name}: {one['sent']} sent, {one['dropped']} left out"
             + (f"; {one['fault']}" if one["fault"] else "")
         )
+    before = figures.get("earlier_clients", {"clients": 0})
+    if before["clients"]:
+        lines.append(
+            f"{before['clients']} earlier clients: {before['sent']} sent, {before['dropped']} left out"
+        )
     for n, one in enumerate(figures.get("clients", [])):
-        lines.append(f"client {n + 1}: {one['sent']} sent, {one['dropped']} left out")
+        lines.append(f"client {before['clients'] + n + 1}: {one['sent']} sent, {one['dropped']} left out")
     return "\n".join(lines)

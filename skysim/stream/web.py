@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import threading
+from collections import deque
 from collections.abc import Callable
+from dataclasses import dataclass
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 
@@ -16,20 +18,56 @@ from skysim.types import BadInput
 
 BOUNDARY = "frame"
 PATIENCE_S = 10.0  # with a client that takes nothing
+REMEMBERED = 20  # clients that left
 INDEX = b"""<!doctype html><meta charset="utf-8"><title>skysim stream</title>
 <body style="margin:0;background:#0d1015;color:#8b95a5;font:13px system-ui"><img src="/stream.mjpg" style="width:100%">
 <p style="padding:0 12px">/stream.mjpg, /stream.raw, /frame.png, /frame.raw, /truth.json, /status.json</p>"""
 
 
+@dataclass(eq=False)
+class Client:
+    """Of one: frames sent, frames that it was too slow for."""
+
+    sent: int = 0
+    dropped: int = 0
+
+
 class Board:
-    """The newest packet, and who waits for the next."""
+    """The newest packet, and who waits for the next.
+
+    clients : who is there, and the REMEMBERED that left last;  earlier : how many left before them, and their frames
+    """
 
     def __init__(self, status: Callable[[], dict[str, Any]]) -> None:
         self.status = status
         self.newest: Packet | None = None
         self.ended = False
         self.changed = threading.Condition()
-        self.clients: list[list[int]] = []  # of each: frames sent, frames that it was too slow for
+        self.clients: list[Client] = []
+        self.left: deque[Client] = deque()
+        self.earlier = {"clients": 0, "sent": 0, "dropped": 0}
+
+    def come(self) -> Client:
+        """Somebody begins to watch."""
+        with self.changed:
+            self.clients.append(Client())
+            return self.clients[-1]
+
+    def leave(self, client: Client) -> None:
+        """And ends it. Of who left long ago the sums are kept, so that memory is constant."""
+        with self.changed:
+            self.left.append(client)
+            if len(self.left) > REMEMBERED:
+                old = self.left.popleft()
+                self.clients.remove(old)
+                for name, more in (("clients", 1), ("sent", old.sent), ("dropped", old.dropped)):
+                    self.earlier[name] += more
+
+    def tallies(self) -> dict[str, Any]:
+        """What each client was sent, and what it was too slow for."""
+        with self.changed:
+            told = [{"sent": one.sent, "dropped": one.dropped} for one in self.clients]
+            return {"clients": told, "earlier_clients": dict(self.earlier)}
 
     def post(self, packet: Packet) -> None:
         with self.changed:
@@ -60,7 +98,7 @@ class Handler(BaseHTTPRequestHandler):
         if path == "/":
             self.answer(INDEX, "text/html")
         elif path == "/status.json":
-            self.answer(io.to_json(self.board.status()).encode(), "application/json")
+            self.answer(io.to_json(self.board.status() | self.board.tallies()).encode(), "application/json")
         elif path in ("/stream.mjpg", "/stream.raw"):
             self.stream(path.endswith("raw"))
         elif path not in ("/frame.png", "/frame.raw", "/truth.json"):
@@ -77,6 +115,8 @@ class Handler(BaseHTTPRequestHandler):
         else:
             self.answer(io.to_json({**newest.header, "truth": newest.truth}).encode(), "application/json")
 
+    do_HEAD = do_GET  # the same without a body
+
     def answer(self, data: bytes, kind: str, header: dict[str, Any] | None = None) -> None:
         """One thing, whole."""
         self.send_response(200)
@@ -86,7 +126,8 @@ class Handler(BaseHTTPRequestHandler):
         if header:
             self.send_header("X-Skysim-Header", json.dumps(header))
         self.end_headers()
-        self.wfile.write(data)
+        if self.command != "HEAD":
+            self.wfile.write(data)
 
     def stream(self, raw: bool) -> None:
         """Frame after frame: packets one after another, or parts of JPEG with their header's numbers."""
@@ -95,16 +136,20 @@ class Handler(BaseHTTPRequestHandler):
         self.send_header("Content-Type", kind)
         self.send_header("Cache-Control", "no-store")
         self.end_headers()
-        mine, number = [0, 0], -1
-        self.board.clients.append(mine)
+        if self.command == "HEAD":
+            return
+        mine, number = self.board.come(), -1
         try:
             while packet := self.board.after(number):
-                mine[1] += packet.number - number - 1 if mine[0] else 0
+                mine.dropped += packet.number - number - 1 if mine.sent else 0
                 number = packet.number
-                self.wfile.write(packet.after(mine[1]).pack() if raw else part(packet.after(mine[1])))
-                mine[0] += 1
+                told = packet.after(mine.dropped)
+                self.wfile.write(told.pack() if raw else part(told))
+                mine.sent += 1
         except OSError:  # it has gone
             self.close_connection = True
+        finally:
+            self.board.leave(mine)
 
     def log_message(self, *_: Any) -> None:
         """Nobody reads it."""
