@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skysim import wcs
+from skysim.leftovers import being_written, sweep
 from skysim.picturefile import check_bytes, check_pixels, read_picture
 from skysim.scene import Scene, Stars
 from skysim.types import BadInput, Floats, Frame, Truth
@@ -71,34 +72,30 @@ def naming(path: Path) -> Iterator[None]:
 @contextmanager
 def whole(path: Path) -> Iterator[Path]:
     """A temporary name beside `path` that becomes it once everything is written, or vanishes."""
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
-    try:
-        with naming(path):
-            yield temporary
-            os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    with being_written(path) as temporary, naming(path):
+        yield temporary
+        os.replace(temporary, path)
 
 
 @contextmanager
 def whole_folder(path: Path) -> Iterator[Path]:
     """`whole` of a folder: a temporary one beside `path` that takes its place, whatever was there."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        with naming(path):
-            yield temporary
-            shutil.rmtree(path, ignore_errors=True)
-            temporary.rename(path)
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
+    with being_written(path) as temporary, naming(path):
+        yield temporary
+        shutil.rmtree(path, ignore_errors=True)
+        temporary.rename(path)
 
 
 def make_folder(path: Path) -> Path:
-    """The folder, made if it is not there. Raises BadInput where that cannot be."""
+    """The folder, made if it is not there, without what a killed process of ours left half-written.
+
+    Raises BadInput where that cannot be.
+    """
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise BadInput(f"{path}: cannot be made a folder: {error.strerror}") from error
+    sweep(path)
     return path
 
 
@@ -119,12 +116,8 @@ ZARR = "frames.zarr"
 def clear(folder: Path) -> None:
     """Remove what an earlier run left: its frames, what was said of them and what `skysim export` made of it."""
     for suffix in ("fits", "png", "ecsv", "tif"):
-        for name in (
-            "frame_[0-9][0-9][0-9][0-9]*",
-            ".frame_[0-9][0-9][0-9][0-9].*",
-        ):  # the latter: of a killed run
-            for path in folder.glob(f"{name}.{suffix}"):
-                path.unlink()
+        for path in folder.glob(f"frame_[0-9][0-9][0-9][0-9]*.{suffix}"):
+            path.unlink()
     for path in folder.glob("solutions.*.ecsv"):
         path.unlink()
     for name in RESULTS + EXPORTED:

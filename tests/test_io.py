@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import datetime
 import json
+import os
+import subprocess
+import sys
 import warnings
 from dataclasses import replace
 from pathlib import Path
@@ -17,6 +20,7 @@ from astropy.wcs import WCS
 from scipy.spatial.transform import Rotation
 
 from skysim import io, livecamera, scene, simulate
+from skysim.leftovers import HOST, NAME
 from skysim.types import BadInput, Frame, Truth
 
 Shot = tuple[scene.Scene, Frame, Truth]
@@ -219,6 +223,45 @@ def test_a_picture_that_cannot_be_encoded_leaves_nothing(tmp_path: Path) -> None
     ):
         io.write_image(tmp_path / "x.png", np.zeros((4, 4, 2), np.uint8))
     assert not list(tmp_path.iterdir())
+
+
+KILLED = """
+import os, sys
+from pathlib import Path
+from skysim import io
+out = Path(sys.argv[1])
+with io.whole(out / "solutions.ecsv") as file, io.whole_folder(out / "frames.zarr") as folder:
+    file.write_text("half")
+    folder.mkdir()
+    (folder / "zarr.json").write_text("half")
+    os.kill(os.getpid(), 9)
+"""
+
+
+def test_what_a_killed_process_left_is_swept_and_nothing_else(tmp_path: Path) -> None:
+    """Not what a live process writes, ours or another, nor another machine's, nor hidden files of the user's."""
+    subprocess.run([sys.executable, "-c", KILLED, tmp_path], check=False)
+    left = {path.name for path in tmp_path.iterdir()}
+    assert len(left) == 2
+    (name,) = (name for name in left if name.endswith(".ecsv"))
+    pid = NAME.fullmatch(name)[1]  # type: ignore[index]
+    others = {
+        name.replace(f"-{pid}.", f"-{os.getppid()}."),
+        name.replace(HOST, "0badcafe"),
+        f".solutions.{pid}.ecsv",
+        ".hidden",
+        "frame_0000.fits",
+    }
+    for other in others:
+        (tmp_path / other).write_text("mine")
+    ours_before = tmp_path / name.replace(
+        f"-{pid}.", f"-{os.getpid()}."
+    )  # of an earlier process by our number
+    ours_before.write_text("half")
+    with io.whole(tmp_path / "truth.ecsv") as temporary:
+        temporary.write_text("whole")
+        io.make_folder(tmp_path)
+    assert {path.name for path in tmp_path.iterdir()} == others | {"truth.ecsv"}
 
 
 def test_a_folder_under_a_file_is_refused(tmp_path: Path) -> None:
