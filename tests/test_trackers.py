@@ -17,8 +17,9 @@ import cv2
 import numpy as np
 import pytest
 from astropy.io import fits
+from scipy.spatial.transform import Rotation
 
-from skysim import BadInput, metrics, programs, scene, scoreboard, simulate, trackers
+from skysim import BadInput, metrics, programs, scene, scoreboard, simulate, sky, trackers
 from skysim.programs import Fault, Program
 from skysim.quantity import ARCSEC_RAD, ROOT
 from skysim.study import benches, plan, runner, store
@@ -379,6 +380,72 @@ def test_the_page_s_json_is_of_the_protocol() -> None:
     assert header["bytes"] == header["width_px"] * header["height_px"] * 2
     for answer in answers:
         checked(Answer.of_tree({key: value for key, value in answer.items() if key != "frame"}))
+
+
+# What stands where the page has LOST: of the frame it sees one pixel, which says what it is to print.
+LOST = """#!{python}
+import shutil, sys, cv2
+told = dict(zip(sys.argv[2::2], sys.argv[3::2]))
+image = cv2.imread(told["--png"], cv2.IMREAD_UNCHANGED)
+assert sys.argv[1] == "pipeline" and image.dtype == "uint8" and image.shape == (6, 8)
+assert float(told["--focal-length"]) * 1000 / float(told["--pixel-size"]) == 100  # FocalLengthFromOptions
+print("PNG Read status: no error has occurred")
+shutil.copy(str(image[0, 0]), told["--print-attitude"])
+"""
+# RA, Dec, roll in degrees; LOST's own example of a solved picture is the first.
+POINTED = [(225.102, 28.9928, 81.3329), (0, 0, 0), (10, -70, 200), (359, 89, 300), (83, 2, 20)]
+
+
+def multiplied(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """LOST's Quaternion::operator*: real, i, j, k."""
+    real = a[0] * b[0] - a[1:] @ b[1:]
+    return np.array([real, *(a[0] * b[1:] + b[0] * a[1:] + np.cross(a[1:], b[1:]))])
+
+
+def of_lost(ra_deg: float, dec_deg: float, roll_deg: float) -> np.ndarray:
+    """LOST's SphericalToQuaternion: the conjugate of turns by ra about z, by -dec about y, by -roll about x."""
+    a, b, c = np.radians([ra_deg, -dec_deg, -roll_deg]) / 2
+    about_z = np.array([np.cos(a), 0, 0, np.sin(a)])
+    about_y = np.array([np.cos(b), 0, np.sin(b), 0])
+    about_x = np.array([np.cos(c), np.sin(c), 0, 0])
+    return multiplied(multiplied(about_z, about_y), about_x) * [1, -1, -1, -1]
+
+
+def pixel_of_lost(quaternion: np.ndarray, star: np.ndarray) -> list[float]:
+    """Its Attitude::Rotate and Camera::SpatialToCamera: where a star falls, from the upper left corner."""
+    _, x, y, z = multiplied(multiplied(quaternion, np.array([0, *star])), quaternion * [1, -1, -1, -1])
+    assert x > 0
+    return [-y / x * 100 + 8 / 2, -z / x * 100 + 6 / 2]
+
+
+def test_the_page_s_adapter_reads_lost_s_axes_and_quaternion(tmp_path: Path) -> None:
+    """By LOST's own formulas: its stars and ours fall on the same pixels, whose corner is (-0.5, -0.5) for us."""
+    lost, adapter = tmp_path / "lost", tmp_path / "lost.py"
+    adapter.write_text(next(block for block in blocks("python") if block.startswith("# lost.py")))
+    lost.mkdir()
+    (lost / "lost").write_text(LOST.format(python=sys.executable))
+    (lost / "lost").chmod(0o755)
+    for n, pointed in enumerate(POINTED):
+        values = [1, *pointed, *of_lost(*pointed)[[1, 2, 3, 0]]]
+        keys = ("known", "ra", "de", "roll", "i", "j", "k", "real")
+        rows = [f"attitude_{key} {value:.6g}\n" for key, value in zip(keys, values, strict=True)]
+        (lost / str(n)).write_text("".join(rows))
+    (lost / str(len(POINTED))).write_text("attitude_known 0\n")
+    words = [sys.executable, str(adapter), str(lost), "{folder}"]
+    runs = Program("lost", words, "png", replace(SETUP, saturation_dn=255.0), 20.0)
+    answers = [
+        checked(runs.solve(replace(PICTURE, frame=n, image_dn=np.full((6, 8), n, np.uint16))))
+        for n in range(len(POINTED) + 1)
+    ]
+    runs.close()
+    assert [answer.status for answer in answers] == ["solved"] * len(POINTED) + ["no attitude"]
+    for pointed, answer in zip(POINTED, answers, strict=False):
+        turn = Rotation.from_quat(answer.cam_from_ref_xyzw)
+        assert (turn * sky.cam_from_icrs(*pointed).inv()).magnitude() < 5e-6  # six digits
+        for ray in ([0, 0, 1], [0.03, 0, 1], [-0.02, 0.025, 1]):
+            star = turn.inv().apply(ray / np.linalg.norm(ray))
+            seen = 100 * np.array(ray[:2]) + SETUP.centre_px + 0.5
+            np.testing.assert_allclose(pixel_of_lost(of_lost(*pointed), star), seen, rtol=0, atol=1e-3)
 
 
 def test_every_key_of_the_protocol_is_on_the_page() -> None:
