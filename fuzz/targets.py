@@ -23,6 +23,7 @@ from skysim import (
     recording,
     scene,
     trackers,
+    validate,
     yamlfile,
 )
 from skysim.stream import packet
@@ -90,6 +91,7 @@ def catalogues(data: bytes) -> None:
     refused(lambda: catalogue.read(path), BadInput)
     refused(lambda: catalog.read(path), BadImage)
     refused(lambda: ptasecat.read_cat(path, 5.0, 2010.0, COLOUR), BadImage)
+    refused(lambda: validate.looked_at(path), BadInput)
 
 
 def maps(data: bytes) -> None:
@@ -123,14 +125,22 @@ def vehicles(data: bytes) -> None:
 
 
 def stores(data: bytes) -> None:
-    """The file of a study, as its reports read it."""
+    """The file of a study, as its reports read it, and as a run that goes on does."""
     path = written(data, "trials.sqlite")
 
     def read() -> None:
         with store.open_store(path) as kept:
             kept.points(), kept.columns(), kept.counts(), kept.failures(), kept.runs(), kept.span()
+            kept.overrides()
 
+    def resume() -> None:
+        with store.writing(path) as kept:
+            kept.meta("digest"), kept.meta("code"), kept.counts(), kept.points(), kept.scenes()
+
+    for beside in path.parent.glob(f"{path.name}-*"):  # a log of the file before
+        beside.unlink()
     refused(read, BadInput)
+    refused(resume, BadInput)
 
 
 def answers(data: bytes) -> None:

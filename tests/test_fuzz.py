@@ -16,7 +16,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as some
 
 from benchmarks.hostilefiles import promise
-from fuzz.__main__ import NAMES, mutated, seeds
+from fuzz.__main__ import NAMES, TOKENS, mutated, seeds
 from fuzz.targets import TARGETS, refused
 from skysim import io, layout, photometry, picturefile, pointcloud, scene, yamlfile
 from skysim.psf import cells_of
@@ -41,6 +41,53 @@ def test_what_grew_from_the_corpus_is_read_or_refused_in_one_line(name: str, fil
         TARGETS[name](data)
     for _ in range(files):
         TARGETS[name](mutated(rng.choice(corpus), corpus, rng))
+
+
+EDITS = ("insert", "delete", "replace", "splice")
+PLACE = some.floats(0, 1, allow_nan=False)  # of a file
+
+
+def edited(data: bytes, edit: tuple[str, float, int, bytes], other: bytes) -> bytes:
+    """A file with bytes put in, left out or put over, or with the rest of another one."""
+    how, place, length, new = edit
+    at = round(place * len(data))
+    if how == "splice":
+        return data[:at] + other[round(place * len(other)) :]
+    return data[:at] + (b"" if how == "delete" else new) + data[at + (0 if how == "insert" else length) :]
+
+
+@some.composite
+def files_of(draw: some.DrawFn, name: str) -> bytes:
+    """Any bytes; or a file of the corpus, or one that is shipped, edited up to six times."""
+    corpus = some.sampled_from(seeds(name))
+    new = some.binary(max_size=16) | some.sampled_from(TOKENS)
+    edit = some.tuples(some.sampled_from(EDITS), PLACE, some.integers(1, 60), new)
+    if draw(some.integers(0, 5)) == 0:
+        return draw(some.binary(max_size=400))
+    data = draw(corpus)
+    for one in draw(some.lists(edit, min_size=1, max_size=6)):
+        data = edited(data, one, draw(corpus))
+    return data
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("examples", [6, pytest.param(300, marks=pytest.mark.long)])
+def test_any_file_is_read_or_refused_in_one_line(name: str, examples: int) -> None:
+    """Drawn by hypothesis, which looks for the smallest file that is not."""
+
+    @settings(
+        max_examples=examples,
+        deadline=None,
+        derandomize=examples < 100,
+        database=None,
+        suppress_health_check=list(HealthCheck),
+    )
+    @given(files_of(name))
+    def holds(data: bytes) -> None:
+        TARGETS[name](data)
+
+    holds()
 
 
 # YAML

@@ -351,14 +351,12 @@ def planned(study: str, out: Path | None, program: list[str] | None = None) -> t
 
     program : of the command line; None where no trial shall be done
     """
-    import json
-
     from skysim import programs
     from skysim.study import plan, store
 
     path = folder_of(study, out) / STORE
     with store.open_store(path) as kept:
-        overrides = json.loads(kept.meta("overrides") or "{}")
+        overrides = kept.overrides()
         held = kept.meta("digest")
     told = plan.load(study, overrides, None if program is None else programs.named(program))
     if told.digest != held:

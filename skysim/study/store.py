@@ -72,6 +72,14 @@ class Store:
         with self.db:
             self.db.executemany("INSERT OR REPLACE INTO meta VALUES (?, ?)", values.items())
 
+    def overrides(self) -> dict[str, str]:
+        """What the run's command line had put over the study: texts by key."""
+        with self.sound():
+            told = json.loads(self.meta("overrides") or "{}")
+            if not isinstance(told, dict) or not all(isinstance(value, str) for value in told.values()):
+                raise ValueError("overrides that are no texts by key")
+            return told
+
     def begin(self, points: Iterable[Point], **values: str) -> None:
         """Make the store a study's: its points and what is noted of it, all or nothing."""
         rows = (
@@ -210,19 +218,22 @@ def open_store(path: Path) -> Iterator[Store]:
     """A store to be read while a run may write it. Raises BadInput where there is none, or none that is whole."""
     if not path.is_file():
         raise BadInput(f"{path}: no store; allowed: one that skysim study run made")
-    with connected(path) as db:
+    with whole(path, "no store of a study: "), connected(path) as db:
         store = Store(path, db)
-        try:
-            if store.meta("format") != str(FORMAT):
-                raise BadInput(f"{path}: format {store.meta('format')!r}; allowed: {FORMAT}")
-            yield store
-        except (
-            sqlite3.DatabaseError,
-            UnicodeDecodeError,
-            MemoryError,
-        ) as error:  # by a size that nothing has
-            said = " ".join(str(error).split()) or "it asks for more memory than there is"
-            raise BadInput(f"{path}: no store of a study: {said}") from None
+        if store.meta("format") != str(FORMAT):
+            raise BadInput(f"{path}: format {store.meta('format')!r}; allowed: {FORMAT}")
+        yield store
+
+
+@contextmanager
+def whole(path: Path, what: str = "") -> Iterator[None]:
+    """What SQLite and its adapter say of a file that is none of theirs, of bytes that are no text, and of a size that
+    no memory holds is told as such. Raises BadInput."""
+    try:
+        yield
+    except (sqlite3.DatabaseError, UnicodeDecodeError, MemoryError) as error:
+        said = " ".join(str(error).split()) or "it asks for more memory than there is"
+        raise BadInput(f"{path}: {what}{said}") from None
 
 
 @contextmanager
@@ -232,22 +243,20 @@ def writing(path: Path) -> Iterator[Store]:
     A lock beside it, itself SQLite's, goes when its holder ends in whatever way. Raises BadInput where another has it.
     """
     make_folder(path.parent)
-    try:
-        with closing(sqlite3.connect(path.with_suffix(".lock"), timeout=0, isolation_level=None)) as lock:
-            hold(lock, path)
-            with connected(path) as db:
-                db.execute("PRAGMA journal_mode = WAL")
-                db.execute("PRAGMA synchronous = NORMAL")
-                store = Store(path, db)
-                with db:
-                    for statement in TABLES.split(";"):
-                        db.execute(statement)
-                    db.execute("INSERT OR IGNORE INTO meta VALUES ('format', ?)", (str(FORMAT),))
-                if store.meta("format") != str(FORMAT):
-                    raise BadInput(f"{path}: format {store.meta('format')!r}; allowed: {FORMAT}")
-                yield store
-    except sqlite3.DatabaseError as error:
-        raise BadInput(f"{path}: {error}") from error
+    lock_file = path.with_suffix(".lock")
+    with whole(path), closing(sqlite3.connect(lock_file, timeout=0, isolation_level=None)) as lock:
+        hold(lock, path)
+        with connected(path) as db:
+            db.execute("PRAGMA journal_mode = WAL")
+            db.execute("PRAGMA synchronous = NORMAL")
+            store = Store(path, db)
+            with db:
+                for statement in TABLES.split(";"):
+                    db.execute(statement)
+                db.execute("INSERT OR IGNORE INTO meta VALUES ('format', ?)", (str(FORMAT),))
+            if store.meta("format") != str(FORMAT):
+                raise BadInput(f"{path}: format {store.meta('format')!r}; allowed: {FORMAT}")
+            yield store
 
 
 def hold(lock: sqlite3.Connection, path: Path) -> None:

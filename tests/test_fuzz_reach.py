@@ -1,0 +1,106 @@
+"""No reader of anybody's bytes without a fuzz target that reaches it, or a reason why none has to."""
+
+from __future__ import annotations
+
+import ast
+import re
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from types import CodeType, FrameType
+from typing import Any
+
+import pytest
+
+from fuzz.__main__ import NAMES, seeds
+from fuzz.targets import TARGETS
+from skysim.quantity import ROOT
+
+SEEDS = 6  # of each target: its readers are reached by any
+READER = re.compile(r"((read|load|unpack|parse)(e?d)?(_\w+)?|of_tree)$")  # by its name, if it is public
+PARSERS = {  # by what it calls, whatever its name
+    *("json.loads", "np.loadtxt", "np.frombuffer", "np.load", "Table.read", "fits.open", "fits.getheader"),
+    *("cv2.imdecode", "cv2.VideoCapture", "yaml.safe_load", "yaml.compose", "sqlite3.connect"),
+    *("mujoco.MjSpec.from_file", "mujoco.MjModel.from_xml_string"),
+}
+BYTES = ("read_text", "read_bytes")  # of any path
+OURS = "what skysim itself has written, for its own process or folder"
+SHIPPED = "a file that comes along, each of which a test reads"
+SOURCES = "reads bytes for their digest alone"
+OUT_OF_REACH = {
+    "skysim.commands.options.load": "hands a scene's name on to `scene.load`",
+    "skysim.detector.read_out": "a chip's electrons, no file",
+    "skysim.lab.export.files": "copies a run's files",
+    "skysim.lab.trialpanel.TrialPanel.file": OURS,
+    "skysim.lab.trials.monte_carlo": "values of the page's form, which `scene.load` has taken before",
+    "skysim.livecamera.LiveCamera.__init__": "a device, decoded by OpenCV; tests/test_solve.py",
+    "skysim.papers.ptase_ui.asked": OURS,
+    "skysim.papers.ptase_ui.drawn_at": OURS,
+    "skysim.papers.published.read": SHIPPED,
+    "skysim.photometry.stellar_sequence": SHIPPED,
+    "skysim.programs.Program.exchange": "needs a process; a line of it is target `answers`; tests/test_trackers.py",
+    "skysim.programs.Program.read": "the same line",
+    "skysim.report.write_page": "takes a picture of ours into a page",
+    "skysim.study.benches.code_version": SOURCES,
+    "skysim.study.benches.scene_hash": SOURCES,
+    "skysim.study.cluster.unpacked": OURS,
+    "skysim.study.runner.begin": "copies the study's text, which `plan.load` has read",
+    "skysim.trackerhost.main": OURS,
+    "skysim.trackerhost.picture": OURS,
+    "skysim.trackers.Setup.of_tree": OURS,
+    "skysim.world.picture.film": OURS,
+    "skysim.world.picture.paint": OURS,
+}
+
+
+def readers() -> Iterator[str]:
+    """Every function that opens or takes apart what comes from outside: `module.function`."""
+    for package in ("skysim", "estimator"):
+        for path in sorted((ROOT / package).rglob("*.py")):
+            module = path.relative_to(ROOT).with_suffix("").as_posix().replace("/", ".")
+            for name, function in functions(ast.parse(path.read_text(encoding="utf-8")), ""):
+                calls = {ast.unparse(one.func) for one in ast.walk(function) if isinstance(one, ast.Call)}
+                opens = calls & PARSERS or any(call.endswith(BYTES) for call in calls)
+                if opens or READER.match(function.name):
+                    yield f"{module}.{name}"
+
+
+def functions(tree: ast.AST, above: str) -> Iterator[tuple[str, Any]]:
+    """A module's functions and its classes' methods, by name; what stands in a function is part of it."""
+    for node in ast.iter_child_nodes(tree):
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            yield above + node.name, node
+        elif isinstance(node, ast.ClassDef):
+            yield from functions(node, f"{above}{node.name}.")
+
+
+def called() -> set[str]:
+    """What runs while every target takes some of its corpus."""
+    codes: set[CodeType] = set()
+
+    def watch(frame: FrameType, event: str, _: Any) -> None:
+        if event == "call":
+            codes.add(frame.f_code)
+
+    for name in NAMES:
+        data = seeds(name)[:SEEDS]
+        sys.setprofile(watch)
+        try:
+            for one in data:
+                TARGETS[name](one)
+        finally:
+            sys.setprofile(None)
+    own = [code for code in codes if Path(code.co_filename).is_relative_to(ROOT)]
+    return {
+        f"{Path(code.co_filename).relative_to(ROOT).with_suffix('').as_posix().replace('/', '.')}"
+        f".{code.co_qualname}"
+        for code in own
+    }
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_every_reader_is_fuzzed_or_has_a_reason() -> None:
+    every = set(readers())
+    assert len(every) > 50
+    assert sorted(every - called()) == sorted(OUT_OF_REACH)
+    assert all(OUT_OF_REACH.values())
