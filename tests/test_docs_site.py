@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import importlib.util
+import os
 import re
+import shutil
+import subprocess
+from pathlib import Path
 from types import ModuleType
 
 import pytest
@@ -87,3 +91,39 @@ def test_what_a_page_tells_to_make_is_a_target() -> None:
     makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
     assert len(told) >= 10
     assert told <= set(re.findall(r"^([a-z-]+):", makefile, re.MULTILINE))
+
+
+@pytest.mark.parametrize("name", ["run", "weekly"])
+def test_what_ci_makes_is_a_target(name: str) -> None:
+    """Scripts that bash can read and anybody can start; CONTRIBUTING names them, and the parts of the weekly one."""
+    script = ROOT / ".ci" / name
+    subprocess.run(["bash", "-n", script], check=True)
+    assert os.access(script, os.X_OK)
+    text = script.read_text(encoding="utf-8")
+    told, parts = (re.findall(rf"^{head}make ([a-z-]+)", text, re.MULTILINE) for head in ("", r"part \w+ "))
+    assert len(told) + len(parts) >= 4
+    assert {*told, *parts} <= set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
+    pages = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    assert [one for one in (f".ci/{name}", *(f"make {one}" for one in parts)) if f"`{one}" not in pages] == []
+
+
+def test_the_weekly_script_runs_every_part_and_tells_of_those_that_failed(tmp_path: Path) -> None:
+    """With a `make` that fails at the oracles."""
+    (tmp_path / ".ci").mkdir()
+    weekly = shutil.copy(ROOT / ".ci/weekly", tmp_path / ".ci/weekly")
+    (tmp_path / "make").write_text('#!/bin/sh\necho "did $*"\n[ "$1" != oracle ]\n')
+    (tmp_path / "make").chmod(0o755)
+    path = f"{tmp_path}:{os.environ['PATH']}"
+    done = subprocess.run([weekly], env={"PATH": path, "FUZZ_S": "5"}, capture_output=True, text=True)
+    assert done.returncode == 1
+    lines = done.stdout.splitlines()
+    assert [line.split(" ")[0] for line in lines] == [
+        "long:",
+        "oracle:",
+        "did",
+        "lowest:",
+        "fuzz:",
+        "failed:",
+    ]
+    assert lines[-2].endswith("did fuzz FUZZ_S=5")
+    assert lines[-1] == "failed: oracle"
