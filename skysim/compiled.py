@@ -9,6 +9,24 @@ from __future__ import annotations
 from functools import partial
 
 import numba
+from numba.core import event
+
+from skysim import terminal
 
 # Division by zero gives inf or nan, as arrays do; sums are added as written unless a function allows otherwise.
 jit = partial(numba.njit, cache=True, error_model="numpy", fastmath=False)
+
+
+class Listener(event.Listener):
+    """Says at the first compilation that one is under way; what is read from numba's cache makes none."""
+
+    def on_start(self, _: event.Event) -> None:
+        event.unregister("numba:compile", self)
+        terminal.note("compiling its loops, once after an installation or a change: a minute or so")
+
+    def on_end(self, _: event.Event) -> None:
+        """Nothing is said of it."""
+
+
+if terminal.attended:
+    event.register("numba:compile", Listener())

@@ -17,6 +17,9 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 FILM_FRAMES = 60
+attended = (
+    False  # whether we are a command, whose user may wonder why it takes so long; a package says nothing
+)
 SURVEY = ("believed", "found", "sigma", "truth")
 
 
@@ -279,6 +282,12 @@ def complain(message: str, code: int = 2) -> int:
     """One line to stderr and the exit code that goes with it."""
     print(f"skysim: {message}", file=sys.stderr)
     return code
+
+
+def note(message: str) -> None:
+    """One line to stderr, of what is no fault: for whoever sits before a terminal."""
+    if sys.stderr.isatty():
+        print(f"skysim: {message}", file=sys.stderr, flush=True)
 
 
 def draw(lab: Lab, folder: Path) -> list[Path]:

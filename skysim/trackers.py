@@ -232,7 +232,7 @@ def places(centroids: Any) -> Floats:
 
 
 def entry_points() -> dict[str, metadata.EntryPoint]:
-    """The trackers that installed packages offer, by name; none is loaded. `own` is skysim's own whoever offers it."""
+    """The trackers that installed packages offer, by name; none is loaded. The name `own` is kept for skysim's."""
     return {point.name: point for point in metadata.entry_points(group=GROUP) if point.name != OWN}
 
 

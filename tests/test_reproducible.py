@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -16,6 +17,7 @@ from astropy.table import Table
 
 import estimator.compiled
 import skysim.compiled
+from skysim.quantity import ROOT
 
 SCENES = ("afit_simsat", "shefex2", "simsat_bump")
 # Seconds of wall clock stand in these, and in no other file.
@@ -60,6 +62,41 @@ def test_a_loop_is_compiled_alike_whoever_calls_it_first(package: Any) -> None:
     assert caller(1e-30) == (0, np.inf)
     told = [path for path in Path(*package.__path__).rglob("*.py") if "njit" in path.read_text()]
     assert told == [Path(package.compiled.__file__)]
+
+
+LOOPS = """
+from skysim import terminal
+terminal.attended = {attended}
+from skysim.compiled import kernel
+@kernel
+def one(x): return x + 1
+@kernel
+def two(x): return one(x) + 1
+assert two(1) == 3 and two(1.0) == 3.0
+"""
+
+
+def test_a_command_says_once_that_it_compiles_and_nothing_once_it_has(tmp_path: Path) -> None:
+    """Before a terminal: cold, warm, and as a package; into a file never."""
+    said = []
+    for name, attended, seen in (
+        ("a", True, True),
+        ("a", True, True),
+        ("b", False, True),
+        ("c", True, False),
+    ):
+        script = tmp_path / f"{name}.py"
+        if not script.exists():
+            script.write_text(LOOPS.format(attended=attended))
+        ours, theirs = os.openpty()
+        stderr = theirs if seen else subprocess.PIPE
+        environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path), "PYTHONPATH": str(ROOT)}
+        done = subprocess.run([sys.executable, script], stderr=stderr, env=environment, check=True)
+        os.write(theirs, b"end\n")
+        said.append((done.stderr or b"").decode() + os.read(ours, 10_000).decode().replace("\r", ""))
+        os.close(ours), os.close(theirs)
+    assert re.fullmatch(r"skysim: compiling its loops.*\nend\n", said[0])
+    assert said[1:] == ["end\n"] * 3
 
 
 @pytest.mark.long
