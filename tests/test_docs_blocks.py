@@ -207,6 +207,17 @@ def test_what_the_reference_names_is_a_module() -> None:
     ] == []
 
 
+def test_the_reference_holds_every_module_that_a_page_names() -> None:
+    """What a reader imports or is sent to; the browser's lab and the papers apart, which are no library."""
+    text = "".join(path.read_text(encoding="utf-8") for path in all_pages())
+    named = {name.replace("/", ".") for name in re.findall(r"\b((?:skysim|estimator)/[\w/]+)\.py", text)}
+    named |= set(re.findall(r"^from ((?:skysim|estimator)\.[\w.]+) import", text, re.M))
+    named = {name for name in named if not name.startswith(("skysim.lab.", "skysim.papers."))}
+    reference = "".join(path.read_text(encoding="utf-8") for path in (DOCS / "reference").glob("*.md"))
+    assert len(named) > 90
+    assert sorted(named - set(re.findall(r"^::: (\S+)$", reference, re.M))) == []
+
+
 def test_every_link_of_a_page_leads_somewhere() -> None:
     for path in DOCS.rglob("*.md"):
         links = re.findall(r"\]\(([^)#\s:]+)(?:#[^)]*)?\)", path.read_text(encoding="utf-8"))
