@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from estimator import BadImage
-from skysim import BadInput, __version__, terminal
+from skysim import BadInput, __version__, notice
 from skysim.commands.files import camera, catalog_app, export, scenes_app
 from skysim.commands.flying import compare, render, run, trackers
 from skysim.commands.looking import bench, solve, survey
@@ -66,7 +66,7 @@ def options(
 
 def main() -> None:
     """Run the command; whatever the user got wrong ends as one line and exit code 2."""
-    terminal.attended = True
+    notice.attended = True
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # whoever ends us, nothing stays half-written
     try:
         code = app(standalone_mode=False)

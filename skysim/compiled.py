@@ -11,7 +11,7 @@ from functools import partial
 import numba
 from numba.core import event
 
-from skysim import terminal
+from skysim import notice
 
 # Division by zero gives inf or nan, as arrays do; sums are added as written unless a function allows otherwise.
 jit = partial(numba.njit, cache=True, error_model="numpy", fastmath=False)
@@ -22,11 +22,11 @@ class Listener(event.Listener):
 
     def on_start(self, _: event.Event) -> None:
         event.unregister("numba:compile", self)
-        terminal.note("compiling its loops, once after an installation or a change: a minute or so")
+        notice.note("compiling its loops, once after an installation or a change: a minute or so")
 
     def on_end(self, _: event.Event) -> None:
         """Nothing is said of it."""
 
 
-if terminal.attended:
+if notice.attended:
     event.register("numba:compile", Listener())

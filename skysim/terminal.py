@@ -284,12 +284,6 @@ def complain(message: str, code: int = 2) -> int:
     return code
 
 
-def note(message: str) -> None:
-    """One line to stderr, of what is no fault: for whoever sits before a terminal."""
-    if sys.stderr.isatty():
-        print(f"skysim: {message}", file=sys.stderr, flush=True)
-
-
 def draw(lab: Lab, folder: Path) -> list[Path]:
     """The laboratory as a picture and as a film; without OpenGL a word about it, and the run goes on."""
     from skysim import io, simulate

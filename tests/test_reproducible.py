@@ -65,8 +65,8 @@ def test_a_loop_is_compiled_alike_whoever_calls_it_first(package: Any) -> None:
 
 
 LOOPS = """
-from skysim import terminal
-terminal.attended = {attended}
+from skysim import notice
+notice.attended = {attended}
 from skysim.compiled import kernel
 @kernel
 def one(x): return x + 1
@@ -93,7 +93,10 @@ def test_a_command_says_once_that_it_compiles_and_nothing_once_it_has(tmp_path: 
         environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path), "PYTHONPATH": str(ROOT)}
         done = subprocess.run([sys.executable, script], stderr=stderr, env=environment, check=True)
         os.write(theirs, b"end\n")
-        said.append((done.stderr or b"").decode() + os.read(ours, 10_000).decode().replace("\r", ""))
+        told = done.stderr or b""
+        while not told.endswith(b"end\r\n"):
+            told += os.read(ours, 10_000)
+        said.append(told.decode().replace("\r", ""))
         os.close(ours), os.close(theirs)
     assert re.fullmatch(r"skysim: compiling its loops.*\nend\n", said[0])
     assert said[1:] == ["end\n"] * 3
