@@ -17,9 +17,6 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 FILM_FRAMES = 60
-attended = (
-    False  # whether we are a command, whose user may wonder why it takes so long; a package says nothing
-)
 SURVEY = ("believed", "found", "sigma", "truth")
 
 

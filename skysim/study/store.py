@@ -218,7 +218,7 @@ def open_store(path: Path) -> Iterator[Store]:
     """A store to be read while a run may write it. Raises BadInput where there is none, or none that is whole."""
     if not path.is_file():
         raise BadInput(f"{path}: no store; allowed: one that skysim study run made")
-    with whole(path, "no store of a study: "), connected(path) as db:
+    with legible(path, "no store of a study: "), connected(path) as db:
         store = Store(path, db)
         if store.meta("format") != str(FORMAT):
             raise BadInput(f"{path}: format {store.meta('format')!r}; allowed: {FORMAT}")
@@ -226,7 +226,7 @@ def open_store(path: Path) -> Iterator[Store]:
 
 
 @contextmanager
-def whole(path: Path, what: str = "") -> Iterator[None]:
+def legible(path: Path, what: str = "") -> Iterator[None]:
     """What SQLite and its adapter say of a file that is none of theirs, of bytes that are no text, and of a size that
     no memory holds is told as such. Raises BadInput."""
     try:
@@ -244,7 +244,7 @@ def writing(path: Path) -> Iterator[Store]:
     """
     make_folder(path.parent)
     lock_file = path.with_suffix(".lock")
-    with whole(path), closing(sqlite3.connect(lock_file, timeout=0, isolation_level=None)) as lock:
+    with legible(path), closing(sqlite3.connect(lock_file, timeout=0, isolation_level=None)) as lock:
         hold(lock, path)
         with connected(path) as db:
             db.execute("PRAGMA journal_mode = WAL")
