@@ -1,0 +1,124 @@
+"""A vehicle's model may be a stranger's: it names no file outside of its own folder, by itself or in what it includes.
+
+MuJoCo would read any. It and we have to see the same names, so XML that two parsers could take differently is refused:
+another encoding than UTF-8, a DOCTYPE, namespaces. And of the places where MuJoCo may look for a name all are checked.
+"""
+
+from __future__ import annotations
+
+import os.path
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NamedTuple
+from xml.etree import ElementTree
+
+from skysim.types import BadInput
+from skysim.yamlfile import is_file, shown
+
+# In lower case: MuJoCo finds <INCLUDE> too.
+READ_AS_XML = {"include", "model"}
+SIDES = ("right", "left", "up", "down", "front", "back")
+FOLDERS = {"meshdir", "texturedir", "assetdir"}
+FILES = {"file", *(f"file{side}" for side in SIDES)}
+MOST_BYTES = 1 << 24  # of an XML file
+MOST_PLACES = 100_000  # where a model's files might lie
+
+
+class Named(NamedTuple):
+    """A file or folder as a model names it."""
+
+    value: str
+    told: str  # by whom, in words
+    xml: bool
+
+
+@dataclass
+class Names:
+    """What has been found so far: a setting in one file moves the files of another, so all are taken together.
+
+    bases : folders that a name may start from;  folders : what meshdir and its like put between
+    """
+
+    folder: Path
+    bases: set[str]
+    folders: set[Named] = field(default_factory=set)
+    files: set[Named] = field(default_factory=set)
+
+    def add(self, path: Path) -> None:
+        """What an XML file names."""
+        self.bases |= {str(path.parent), str(path.resolve().parent)}
+        for element in parsed(path).iter():
+            tag = element.tag.lower()
+            for key, value in element.attrib.items():
+                if key.lower() in FOLDERS | FILES:
+                    into = self.files if key.lower() in FILES else self.folders
+                    into.add(
+                        Named(value, f"{path}: {element.tag} {key}={shown(repr(value))}", tag in READ_AS_XML)
+                    )
+
+    def places(self) -> Iterator[tuple[Named, Path]]:
+        """Wherever MuJoCo may look for a name; it takes `..` away before links are followed, and others after."""
+        between = {"", *(one.value for one in self.folders)}
+        if len(self.bases) * len(between) * len(self.files) > MOST_PLACES:
+            raise BadInput(
+                f"{self.folder}: the model names too many files; allowed: {MOST_PLACES} places of them"
+            )
+        for base in self.bases:
+            for one in self.folders:
+                yield from ((one, place) for place in both(base, one.value))
+            for one in self.files:
+                for name in {one.value, os.path.basename(one.value)}:  # strippath
+                    for folder in between:
+                        yield from ((one, place) for place in both(base, folder, name))
+
+
+def both(*parts: str) -> tuple[Path, Path]:
+    """A joined path as it is, and with each `..` and what stands before it left out."""
+    path = os.path.join(*parts)
+    return Path(path), Path(os.path.normpath(path))
+
+
+def confined(path: Path) -> None:
+    """Refuse a model that leaves the folder it is in. Raises BadInput with one line."""
+    names = Names(path.resolve().parent, set())
+    waiting, seen = [path], {path}
+    while waiting:
+        names.add(waiting.pop())
+        for name, place in names.places():
+            if "\\" in name.value or not resolved(place).is_relative_to(names.folder):
+                raise BadInput(f"{name.told} leaves {names.folder}; allowed: files in it")
+            if os.path.exists(place) and not (os.path.isfile(place) or os.path.isdir(place)):
+                raise BadInput(f"{name.told} is no plain file; allowed: files in {names.folder}")
+            if name.xml and place not in seen and is_file(place):
+                waiting.append(place)
+                seen.add(place)
+
+
+def resolved(place: Path) -> Path:
+    """The place with all links followed; of links in a circle the root, which is in no folder."""
+    try:
+        return place.resolve()
+    except (OSError, RuntimeError):
+        return Path("/")
+
+
+def parsed(path: Path) -> ElementTree.Element:
+    """The XML, if MuJoCo's parser and Python's read the same in it. Raises BadInput with one line."""
+    try:
+        with path.open("rb") as file:
+            data = file.read(MOST_BYTES + 1)
+        text = data.decode("utf-8")  # whatever its first line says: so MuJoCo does
+        root = ElementTree.fromstring(text)
+    except (ElementTree.ParseError, OSError, ValueError) as error:
+        raise BadInput(f"{path}: not a MuJoCo model: {' '.join(str(error).split())}") from None
+    named = [name for element in root.iter() for name in (element.tag, *element.attrib)]
+    for wrong, allowed in (
+        (len(data) > MOST_BYTES, f"up to {MOST_BYTES} bytes"),
+        ("<!DOCTYPE" in text, "XML without DOCTYPE"),
+        (any("{" in name for name in named), "XML without namespaces"),
+        (root.tag.lower() == "robot", "MJCF, no URDF"),
+    ):
+        if wrong:
+            raise BadInput(f"{path}: not a MuJoCo model that skysim reads; allowed: {allowed}")
+    return root
