@@ -5,8 +5,9 @@ from __future__ import annotations
 import json
 import tempfile
 from collections.abc import Callable
+from contextlib import redirect_stdout
 from functools import cache
-from io import BytesIO
+from io import BytesIO, TextIOWrapper
 from pathlib import Path
 
 from estimator import catalog, ptasecat
@@ -22,6 +23,7 @@ from skysim import (
     quantity,
     recording,
     scene,
+    terminal,
     trackers,
     validate,
     yamlfile,
@@ -149,7 +151,15 @@ def answers(data: bytes) -> None:
         told = json.loads(data)
     except (ValueError, RecursionError):  # as `programs` has it
         return
-    refused(lambda: trackers.checked(trackers.Answer.of_tree(told)), ValueError)
+    statuses: list[str] = []
+    if refused(lambda: statuses.append(trackers.checked(trackers.Answer.of_tree(told)).status), ValueError):
+        return
+    with redirect_stdout(TextIOWrapper(BytesIO(), "utf-8")) as screen:
+        terminal.print_table("", ["status"], [statuses])
+        screen.seek(0)
+        shown = screen.read()
+    if statuses[0][:80] not in shown or not shown.removesuffix("\n").partition("\n")[2].isprintable():
+        raise AssertionError(f"not shown as it is: {statuses[0]!r}")
 
 
 def packets(data: bytes) -> None:

@@ -9,5 +9,10 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 __version__ = "0.1.0"
 
 
+def printable(text: object) -> str:
+    """On one line, and with ? for what a terminal obeys or cannot show: text from outside goes through here."""
+    return "".join(one if one.isprintable() else "?" for one in " ".join(str(text).split()))
+
+
 class BadInput(ValueError):
     """The user's input is wrong. The message is one line: what, where, what is allowed."""

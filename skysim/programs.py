@@ -27,7 +27,7 @@ from typing import IO, Any
 
 import numpy as np
 
-from skysim import BadInput, trackers
+from skysim import BadInput, printable, trackers
 from skysim.trackers import Answer, Picture, Setup
 
 START_LIMIT_S = 120.0  # to be ready
@@ -106,7 +106,7 @@ class Running:
         """Keep the last lines; a program that says much must not wait for us."""
         with errors:
             for line in iter(lambda: errors.readline(4096), b""):
-                text = " ".join(line.decode(errors="replace").split())
+                text = printable(line.decode(errors="replace"))
                 if text:
                     self.last.append(text[: trackers.MOST_TEXT // 2])
 
@@ -200,7 +200,7 @@ class Program:
         told = self.exchange([self.hello], START_LIMIT_S)
         if not isinstance(told, dict) or told.get("ready") is not True:
             said = told.get("status") if isinstance(told, dict) else told
-            raise self.ended(" ".join(str(said if said else told).split())[: trackers.MOST_TEXT])
+            raise self.ended(printable(said if said else told)[: trackers.MOST_TEXT])
 
     def solve(self, picture: Picture) -> Answer:
         """Its answer to a frame, with the seconds it took. Raises Fault."""

@@ -4,12 +4,18 @@ from __future__ import annotations
 
 import itertools
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
+from skysim import printable
+
 if TYPE_CHECKING:
+    from rich.progress import Progress as Bar
+    from rich.progress import ProgressColumn
+    from rich.text import Text
+
     from skysim.scoreboard import Line
     from skysim.simulate import Lab
     from skysim.study.runner import Progress
@@ -28,33 +34,45 @@ def begun(items: Iterable[T]) -> Iterator[T]:
 
 def progress(items: Iterable[T], total: int, what: str, quiet: bool = False) -> Iterator[T]:
     """The items, with a bar on stderr that goes away when it is done."""
+    from rich.progress import BarColumn, TaskProgressColumn, TimeRemainingColumn
+
+    with bar(BarColumn(), TaskProgressColumn(), TimeRemainingColumn(), quiet=quiet) as shown:
+        yield from shown.track(items, total=total, description=printable(what))
+
+
+def bar(*columns: ProgressColumn, quiet: bool = False) -> Bar:
+    """A bar on stderr that goes away when it is done, what is done before its columns, and none where nobody looks."""
     from rich.console import Console
-    from rich.progress import track
+    from rich.progress import Progress, TextColumn
 
     console = Console(stderr=True)
-    yield from track(
-        items,
-        total=total,
-        description=what,
-        console=console,
-        transient=True,
-        disable=quiet or not console.is_terminal,
-    )
+    what = TextColumn("{task.description}", markup=False)  # a title, and who knows what is in it
+    return Progress(what, *columns, console=console, transient=True, disable=quiet or not console.is_terminal)
 
 
-def print_table(title: str, heads: list[str], lines: list[list[str]]) -> None:
+def inked(text: str, ink: str) -> Text:
+    """A text of a table in a colour."""
+    from rich.text import Text
+
+    return Text(text, ink)
+
+
+def print_table(title: str, heads: Sequence[str], lines: Sequence[Sequence[str | Text]]) -> None:
+    """The cells as they are: what looks like rich's markup is none."""
     from rich.console import Console
     from rich.table import Table
+    from rich.text import Text
 
-    table = Table(title=title, title_justify="left", box=None, header_style="bold", pad_edge=False)
+    table = Table(box=None, header_style="bold", pad_edge=False)
+    table.title = Text(printable(title), "table.title", justify="left")
     for head in heads:
         table.add_column(
-            head,
+            Text(printable(head)),
             justify="left" if head in ("what", "file", "status", "peer", "verdict") else "right",
             no_wrap=True,
         )
     for line in lines:
-        table.add_row(*line)
+        table.add_row(*(Text(printable(cell)) if isinstance(cell, str) else cell for cell in line))
     console = Console()
     Console(width=max(console.width, 240) if not console.is_terminal else None).print(table)
 
@@ -87,7 +105,7 @@ def print_rows(rows: list[Row], names: tuple[str, str, str], exposures_ms: list[
             f"{row.roll_arcsec:+.3f}" if row.estimate_deg else "",
             f"{row.matched}/{row.detected}",
             f"{row.time_ms:.1f}",
-            "[red]WRONG[/]" if row.wrong else row.status,
+            inked("WRONG", "red") if row.wrong else row.status,
         ]
         for row, exposure_ms in zip(rows, exposures_ms, strict=True)
     ]
@@ -101,13 +119,11 @@ def degrees(angles_deg: tuple[float, float, float] | None) -> str:
 @contextmanager
 def watched(what: str, quiet: bool = False) -> Iterator[Callable[[float, float], None]]:
     """A bar on stderr for work that tells how far it is: done(now, all)."""
-    from rich.console import Console
-    from rich.progress import Progress
+    from rich.progress import BarColumn, TaskProgressColumn, TimeRemainingColumn
 
-    console = Console(stderr=True)
-    with Progress(console=console, transient=True, disable=quiet or not console.is_terminal) as bar:
-        task = bar.add_task(what)
-        yield lambda now, everything: bar.update(task, completed=now, total=everything)
+    with bar(BarColumn(), TaskProgressColumn(), TimeRemainingColumn(), quiet=quiet) as shown:
+        task = shown.add_task(printable(what))
+        yield lambda now, everything: shown.update(task, completed=now, total=everything)
 
 
 @contextmanager
@@ -118,11 +134,9 @@ def counted(what: str, total: int) -> Iterator[Callable[[Progress], None]]:
     """
     from rich.console import Console
     from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
-    from rich.progress import Progress as Bar
 
-    console = Console(stderr=True)
+    console, what = Console(stderr=True), printable(what)
     text = "{task.completed:.0f}/{task.total:.0f}  {task.fields[rate]:.0f}/s  {task.fields[faults]}"
-    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn(text), TimeRemainingColumn())
     tenth = [0]
 
     def line(done: Progress, told: str) -> None:
@@ -134,12 +148,12 @@ def counted(what: str, total: int) -> Iterator[Callable[[Progress], None]]:
                 flush=True,
             )
 
-    with Bar(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
-        task = bar.add_task(what, total=total, rate=0.0, faults="")
+    with bar(BarColumn(), TextColumn(text), TimeRemainingColumn()) as shown:
+        task = shown.add_task(what, total=total, rate=0.0, faults="")
 
         def update(done: Progress) -> None:
             told = f"{done.failed} failed" + (f", {done.wrong} wrong" if done.wrong else "")
-            bar.update(task, completed=done.done, rate=done.rate, faults=told)
+            shown.update(task, completed=done.done, rate=done.rate, faults=told)
             line(done, told)
 
         yield update
@@ -185,7 +199,7 @@ def print_scores(lines: list[Line], folder: Path) -> None:
             str(line.frames),
             f"{100 * line.right.value:.1f}",
             f"{100 * line.right.low:.1f} to {100 * line.right.high:.1f}",
-            f"[red]{line.wrong}[/]" if line.wrong else "0",
+            inked(str(line.wrong), "red") if line.wrong else "0",
             str(line.refused),
             str(line.failed),
             *(f"{value:.3g}" for value in (line.cross_arcsec_median, line.cross_arcsec_worst)),
@@ -250,7 +264,7 @@ def print_catalogue(figures: dict[str, Any], json: bool, to_json: Any) -> None:
     print(f"{figures['path']}: {figures['stars']} stars, {figures['supplied']} of them supplied")
     print("  ".join(f"V<{limit}: {count}" for limit, count in figures["brighter_than"].items()))
     for key, value in figures["meta"].items():
-        print(f"  {key}: {value}")
+        print(f"  {key}: {printable(value)}")
 
 
 def print_titles(folder: Path, title: Callable[[Path], str], json: bool, to_json: Any) -> None:
@@ -262,7 +276,7 @@ def print_titles(folder: Path, title: Callable[[Path], str], json: bool, to_json
         print(to_json(listed))
         return
     for entry in listed:
-        print(f"{entry['name']:20s} {entry['title']}")
+        print(f"{entry['name']:20s} {printable(entry['title'])}")
 
 
 def number(value: float | None, digits: int | None = None) -> str:
@@ -277,7 +291,7 @@ def yes(met: bool | None) -> str:
 
 def complain(message: str, code: int = 2) -> int:
     """One line to stderr and the exit code that goes with it."""
-    print(f"skysim: {message}", file=sys.stderr)
+    print(f"skysim: {printable(message)}", file=sys.stderr)
     return code
 
 

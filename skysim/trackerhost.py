@@ -14,6 +14,7 @@ from typing import IO, Any
 
 import numpy as np
 
+from skysim import printable
 from skysim.trackers import FAILED, Answer, Picture, Setup, Tracker, checked, entry_points
 
 
@@ -30,7 +31,7 @@ def picture(header: dict[str, Any], frames: IO[bytes]) -> Picture:
 
 def why(error: Exception) -> str:
     """An exception in one line."""
-    return " ".join(f"{type(error).__name__}: {error}".split())
+    return printable(f"{type(error).__name__}: {error}")
 
 
 def solved(tracker: Tracker, sight: Picture) -> Answer:

@@ -14,7 +14,7 @@ from typing import Any, Literal, Protocol, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from skysim import BadInput
+from skysim import BadInput, printable
 
 GROUP = "skysim.trackers"
 OWN = "own"  # the name of skysim's own estimator
@@ -172,7 +172,7 @@ def checked(answer: Any) -> Answer:
     """An answer that can be scored: arrays of the right shape, a unit quaternion. Raises ValueError for any other."""
     if not isinstance(answer, Answer):
         raise ValueError(f"a {type(answer).__name__} is no Answer")
-    status = " ".join(answer.status.split())[:MOST_TEXT] if isinstance(answer.status, str) else ""
+    status = printable(answer.status)[:MOST_TEXT] if isinstance(answer.status, str) else ""
     if not status:
         raise ValueError(f"status {answer.status!r} is no text")
     quaternion = None

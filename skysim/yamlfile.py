@@ -11,7 +11,7 @@ from typing import Any
 import yaml
 from pydantic import BaseModel, ValidationError
 
-from skysim import BadInput, __version__
+from skysim import BadInput, __version__, printable
 
 Files = list[tuple[Path, str]]  # paths and texts
 VERSION = 1  # of scene and study files. A change that old files don't survive raises it and brings them up to date here
@@ -87,7 +87,7 @@ def find(name: str, folder: Path, what: str) -> Path:
 
 def shown(value: object) -> str:
     """A value as it stands in a complaint: on one line, and not without end."""
-    text = "".join(one if one.isprintable() else "?" for one in " ".join(str(value).split()))
+    text = printable(value)
     return text if len(text) <= LONGEST else f"{text[:LONGEST]}…"
 
 

@@ -7,9 +7,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from skysim.terminal import print_table, watched
+from skysim.terminal import inked, print_table, watched
 
 if TYPE_CHECKING:
+    from rich.text import Text
+
     from skysim.papers.compare import Reproduction
     from skysim.papers.page import Told
 
@@ -93,12 +95,12 @@ def show(one: Reproduction) -> None:
     from skysim.papers.compare import number, stated
 
     heads = ["what", "published", "ours", "verdict"]
-    lines = [
+    lines: list[list[str | Text]] = [
         [
             line.row.quantity,
             stated(line.row),
             number(line.answer.ours),
-            f"[{INK[line.verdict]}]{line.verdict}[/]",
+            inked(line.verdict, INK[line.verdict]),
         ]
         for line in one.lines
     ]

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from skysim import BadInput
+from skysim import BadInput, printable
 from skysim.terminal import complain, counted, print_table, print_titles
 
 if TYPE_CHECKING:
@@ -109,7 +109,7 @@ def status(study: StudyArg, out: Out = None, json: Json = False) -> None:
         return
     print_facts(figures)
     for failure in failures:
-        print(f"  trial {failure['trial']}: {failure['error']}")
+        print(f"  trial {failure['trial']}: {printable(failure['error'])}")
 
 
 @app.command()
@@ -318,7 +318,7 @@ def facts(told: Plan, kept: Store) -> dict[str, Any]:
 def print_facts(figures: dict[str, Any]) -> None:
     rate = figures["done"] / figures["seconds"] if figures["seconds"] else 0.0
     print(
-        f"{figures['title']}: {figures['done']} of {figures['trials']} trials, {figures['failed']} failed,"
+        f"{printable(figures['title'])}: {figures['done']} of {figures['trials']} trials, {figures['failed']} failed,"
         f" {figures['wrong']} wrong attitudes; {figures['seconds']:.1f} s, {rate:.0f} a second\n"
         f"store: {figures['store']} (code {figures['code']})"
     )
