@@ -329,7 +329,8 @@ def where(message: str, name: str, overrides: Mapping[str, str]) -> str:
 def read(path: Path, above: tuple[Path, ...] = ()) -> tuple[dict[str, Any], Files]:
     """A scene's keys over those of its `base`, another scene by name or path; and the files, this one first."""
     tree, text = read_yaml(path)
-    of_our_version(tree, path, text)
+    if above or tree.keys() != {"camera"}:  # a camera's file, which is no scene
+        of_our_version(tree, path, text)
     tree = beside(path, tree)
     if "base" not in tree:
         return tree, [(path, text)]

@@ -1,7 +1,7 @@
 """JSON Schema of scene and study files, for editors; and which versions of such a file this skysim reads.
 
 An editor is told what a key may hold before anything is run. It cannot know what a `base` or a preset has, so that it
-takes nothing for missing; `skysim validate` does.
+takes nothing but the version for missing; `skysim validate` does.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def json_schema(kind: str) -> dict[str, Any]:
     """The JSON Schema (draft 2020-12) of a kind of file."""
     model = KINDS[kind]
     told = loosened(model.model_json_schema(by_alias=True), model.__name__)
-    return {"$schema": STANDARD, "title": f"A {kind} of skysim"} | {
+    return {"$schema": STANDARD, "title": f"A {kind} of skysim", "required": ["schema"]} | {
         k: v for k, v in told.items() if k != "title"
     }
 

@@ -140,11 +140,16 @@ def once(node: yaml.Node | None, path: Path) -> None:
 
 def of_our_version(tree: Mapping[str, Any], path: Path, text: str) -> None:
     """Refuse a file whose `schema` is another than ours, before keys that we don't know are taken for mistakes."""
-    told = tree.get("schema", VERSION)
+    if "schema" not in tree:
+        raise BadInput(f"schema: missing; add the line schema: {VERSION} ({path})")
+    told = tree["schema"]
     if type(told) is int and told == VERSION:
         return
-    newer = type(told) is int and told > VERSION
-    what = f"{told!r} is {f'of a newer skysim than {__version__}' if newer else 'not known'}"
+    what = f"{shown(repr(told))} is not known"
+    if type(told) is int:
+        what = f"{told} is " + (
+            f"of a newer skysim than {__version__}" if told > VERSION else "older than this skysim reads"
+        )
     raise BadInput(f"schema: {what}; allowed: {VERSION} {place_of(['schema'], [(path, text)], {})}")
 
 

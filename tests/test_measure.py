@@ -22,6 +22,7 @@ from skysim.types import BadInput
 
 RARE = 1e-6  # the seeds are fixed: it fails for a wrong law alone
 SMALL = """
+schema: 1
 base: afit_simsat
 title: a small dome seen by a wide lens
 light:
@@ -120,7 +121,7 @@ def test_the_leds_are_off_by_what_their_sigmas_say(told: dict[str, Any], folder:
 
 def test_a_scene_beside_the_file_believes_it(told: dict[str, Any], folder: Path) -> None:
     """Places, sigma, lever and lens as measured; LEDs not surveyed are left out; frames of the scene are solved."""
-    (folder / "mapped.yaml").write_text("base: small.yaml\ntracker: {map: leds.ecsv}\n")
+    (folder / "mapped.yaml").write_text("schema: 1\nbase: small.yaml\ntracker: {map: leds.ecsv}\n")
     lab = simulate.furnish(scene.load(folder / "mapped.yaml"))
     eyes = simulate.tracker(lab)
     assert isinstance(eyes, DomeTracker)

@@ -94,7 +94,7 @@ def test_every_kind_that_the_camera_block_names_is_one():
 
 def test_the_dome_block_is_a_dome_under_which_the_tracker_finds_itself(folder):
     path = folder / "dome.yaml"
-    path.write_text("base: afit_simsat\n" + yaml_block("light"))
+    path.write_text("schema: 1\nbase: afit_simsat\n" + yaml_block("light"))
     command = [*SKYSIM, "run", str(path), "--frames", "3", "--json"]
     done = subprocess.run(command, cwd=folder, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
@@ -123,7 +123,7 @@ def test_every_kind_of_dome_is_in_the_readme():
 def test_the_vehicle_block_flies_and_is_told_where_it_is(folder):
     """The block as a scene, two seconds of it by the real command: wheels, fans, gyros, filter, all disturbances."""
     path = folder / "flown.yaml"
-    path.write_text(yaml_block("base"))
+    path.write_text("schema: 1\n" + yaml_block("base"))
     command = [*SKYSIM, "run", str(path), "--frames", "3", "--json"]
     done = subprocess.run(command, cwd=folder, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

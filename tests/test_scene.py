@@ -311,7 +311,7 @@ def test_a_bad_override_is_one_line_and_blamed_on_the_option(key: str, value: st
         ("hardware_seed: 2012", "hardware_seed: -1", "light.layout.hardware_seed: -1 is not allowed"),
         ('"9.0 kg m2"', '"90 kg m2"', "is no rigid body's: each positive, none above the sum of the others"),
         ("schema: 1", "schema: 2", "schema: 2 is of a newer skysim than "),
-        ("schema: 1", "schema: 0", "schema: 0 is not known; allowed: 1"),
+        ("schema: 1", "schema: 0", "schema: 0 is older than this skysim reads; allowed: 1"),
         ("schema: 1", "schema: yes", "schema: True is not known; allowed: 1"),
         ("seed: 1\n", "seed: one\n", "seed: 'one' is not allowed; it should be a valid integer"),
         (
@@ -678,7 +678,7 @@ def test_a_scene_says_what_is_different_from_its_base(tmp_path: Path) -> None:
     mine = written(
         tmp_path,
         "mine.yaml",
-        "base: afit_simsat\ntitle: Mine\nexposure: {frames: 3}\nlight: {led: {scatter: 0.01}}\n"
+        "schema: 1\nbase: afit_simsat\ntitle: Mine\nexposure: {frames: 3}\nlight: {led: {scatter: 0.01}}\n"
         'motion:\n  manoeuvre: [{kind: hold, duration: "2 s"}]\n',
     )
     base, loaded = scene.load("afit_simsat"), scene.load(mine)
@@ -693,7 +693,7 @@ def test_a_scene_says_what_is_different_from_its_base(tmp_path: Path) -> None:
 
 def test_a_section_of_another_kind_takes_the_place_of_the_base_s(tmp_path: Path) -> None:
     surface = "light: {surface: {kind: sphere, apex: 1 m, radius: 90 cm}}"
-    loaded = scene.load(written(tmp_path, "mine.yaml", f"base: afit_simsat\n{surface}\n"))
+    loaded = scene.load(written(tmp_path, "mine.yaml", f"schema: 1\nbase: afit_simsat\n{surface}\n"))
     assert loaded.light.surface == light.Surface.model_validate(
         {"kind": "sphere", "apex": "1 m", "radius": "90 cm"}
     )
@@ -701,7 +701,7 @@ def test_a_section_of_another_kind_takes_the_place_of_the_base_s(tmp_path: Path)
 
 def test_null_switches_a_section_of_the_base_off(tmp_path: Path) -> None:
     assert scene.load("simsat_slew").vehicle.wheels
-    mine = "base: simsat_slew\nvehicle: {wheels: null, fans: null}\nmotion: {control: null, manoeuvre: []}\n"
+    mine = "schema: 1\nbase: simsat_slew\nvehicle: {wheels: null, fans: null}\nmotion: {control: null, manoeuvre: []}\n"
     loaded = scene.load(written(tmp_path, "mine.yaml", mine))
     assert (loaded.vehicle.wheels, loaded.vehicle.fans, loaded.motion.control) == (None, None, None)
     assert loaded.vehicle.drag == scene.load("simsat_slew").vehicle.drag
@@ -711,8 +711,10 @@ def test_a_base_is_found_beside_the_scene_and_may_have_one_too(tmp_path: Path) -
     """And the files that it names are those beside itself, not beside the scene on top of it."""
     model = (scene.SCENES / "vehicles" / "simsat.xml").read_text()
     written(tmp_path, "below/own.xml", model)
-    written(tmp_path, "below/lower.yaml", "base: simsat_slew\nvehicle: {model: own.xml}\nseed: 77\n")
-    mine = written(tmp_path, "mine.yaml", "base: below/lower.yaml\ntitle: Mine on top\n")
+    written(
+        tmp_path, "below/lower.yaml", "schema: 1\nbase: simsat_slew\nvehicle: {model: own.xml}\nseed: 77\n"
+    )
+    mine = written(tmp_path, "mine.yaml", "schema: 1\nbase: below/lower.yaml\ntitle: Mine on top\n")
     loaded = scene.load(mine)
     assert loaded.vehicle.model == str(tmp_path / "below" / "own.xml")
     assert (loaded.seed, loaded.title) == (77, "Mine on top")
@@ -721,7 +723,7 @@ def test_a_base_is_found_beside_the_scene_and_may_have_one_too(tmp_path: Path) -
 
 
 def test_an_override_stands_above_scene_and_base(tmp_path: Path) -> None:
-    mine = written(tmp_path, "mine.yaml", "base: afit_simsat\nseed: 2\n")
+    mine = written(tmp_path, "mine.yaml", "schema: 1\nbase: afit_simsat\nseed: 2\n")
     loaded = scene.load(mine, {"seed": "3", "exposure.frames": "7"})
     assert (loaded.seed, loaded.exposure.frames) == (3, 7)
 
@@ -739,40 +741,44 @@ def test_an_override_stands_above_scene_and_base(tmp_path: Path) -> None:
     ],
 )
 def test_a_base_that_is_none_is_one_line(tmp_path: Path, base: str, says: str) -> None:
-    path = written(tmp_path / "mine", "mine.yaml", f"title: Mine\nbase: {base}\n")
+    path = written(tmp_path / "mine", "mine.yaml", f"schema: 1\ntitle: Mine\nbase: {base}\n")
     message = complaint(path)
     assert message.startswith(says)
-    assert message.endswith(f"({path}, line 2)")
+    assert message.endswith(f"({path}, line 3)")
 
 
 def test_scenes_that_stand_on_each_other_are_refused(tmp_path: Path) -> None:
-    one = written(tmp_path, "one.yaml", "base: two.yaml\n")
-    written(tmp_path, "two.yaml", "base: three.yaml\n")
-    three = written(tmp_path, "three.yaml", "title: Three\nbase: one.yaml\n")
+    one = written(tmp_path, "one.yaml", "schema: 1\nbase: two.yaml\n")
+    written(tmp_path, "two.yaml", "schema: 1\nbase: three.yaml\n")
+    three = written(tmp_path, "three.yaml", "schema: 1\ntitle: Three\nbase: one.yaml\n")
     says = "base: one.yaml is this scene itself, or has it for its base"
-    assert complaint(one) == f"{says} ({three}, line 2)"
+    assert complaint(one) == f"{says} ({three}, line 3)"
 
 
 def test_a_slip_is_told_with_the_file_in_which_it_stands(tmp_path: Path) -> None:
     """Its own where it is above, the base's where it is there; a section between is in both."""
-    lower = written(tmp_path, "lower.yaml", "base: afit_simsat\nexposure:\n  frames: 0\n  rate_hz: 2\n")
-    mine = written(tmp_path, "mine.yaml", "base: lower.yaml\nseed: 3\nexposure:\n  rate_hz: 1\n")
+    lower = written(
+        tmp_path, "lower.yaml", "schema: 1\nbase: afit_simsat\nexposure:\n  frames: 0\n  rate_hz: 2\n"
+    )
+    mine = written(tmp_path, "mine.yaml", "schema: 1\nbase: lower.yaml\nseed: 3\nexposure:\n  rate_hz: 1\n")
     says = "exposure.frames: 0 is not allowed; it should be greater than or equal to 1"
-    assert complaint(mine) == f"{says} ({lower}, line 3)"
-    mine.write_text("base: lower.yaml\nseed: 3\n\nexposure:\n  rate_hz: 1\n  frames: -1\n")
-    assert complaint(mine) == f"{says.replace('0 is', '-1 is')} ({mine}, line 6)"
+    assert complaint(mine) == f"{says} ({lower}, line 4)"
+    mine.write_text("schema: 1\nbase: lower.yaml\nseed: 3\n\nexposure:\n  rate_hz: 1\n  frames: -1\n")
+    assert complaint(mine) == f"{says.replace('0 is', '-1 is')} ({mine}, line 7)"
     assert complaint(mine, {"exposure.frames": "0"}) == f"{says} (--set)"
 
 
 def test_what_is_missing_in_a_list_is_not_looked_for_in_the_base_s(tmp_path: Path) -> None:
     """The base has a first element with a duration; but this list has taken its place."""
-    mine = written(tmp_path, "mine.yaml", "base: afit_simsat\nmotion:\n  manoeuvre:\n    - {kind: hold}\n")
-    assert complaint(mine) == f"motion.manoeuvre.0.duration: missing ({mine}, line 4)"
+    mine = written(
+        tmp_path, "mine.yaml", "schema: 1\nbase: afit_simsat\nmotion:\n  manoeuvre:\n    - {kind: hold}\n"
+    )
+    assert complaint(mine) == f"motion.manoeuvre.0.duration: missing ({mine}, line 5)"
 
 
 def test_a_base_that_is_no_yaml_is_one_line(tmp_path: Path) -> None:
     lower = written(tmp_path, "lower.yaml", "title: [")
-    mine = written(tmp_path, "mine.yaml", "base: lower.yaml\n")
+    mine = written(tmp_path, "mine.yaml", "schema: 1\nbase: lower.yaml\n")
     assert complaint(mine).startswith(f"{lower}, line 1: not YAML: ")
 
 
@@ -887,7 +893,7 @@ def test_an_unknown_scene_is_answered_with_the_known_ones(name: str) -> None:
 
 def test_a_camera_file_without_a_camera_is_one_line(tmp_path: Path) -> None:
     path = tmp_path / "camera.yaml"
-    path.write_text("title: no camera\n")
+    path.write_text("schema: 1\ntitle: no camera\n")
     with pytest.raises(BadInput, match=r"^camera: missing \(.*camera\.yaml\)$"):
         scene.load_camera(path)
 

@@ -145,7 +145,7 @@ def test_a_vehicle_that_nobody_flies_may_be_knocked() -> None:
 
 def written(folder: Path, name: str, **tree: object) -> Path:
     path = folder / f"{name}.yaml"
-    path.write_text(yaml.safe_dump(tree, sort_keys=False), encoding="utf-8")
+    path.write_text(yaml.safe_dump({"schema": 1} | tree, sort_keys=False), encoding="utf-8")
     return path
 
 
@@ -191,7 +191,7 @@ def test_a_base_stands_beside_the_scene_and_brings_its_own_files(tmp_path: Path)
 def test_a_base_that_is_none_is_told_with_its_place(tmp_path: Path) -> None:
     path = written(tmp_path, "mine", title="mine", base="nothing")
     with pytest.raises(
-        BadInput, match=r"^base: nothing: no such scene; allowed: .* \(.*mine.yaml, line 2\)$"
+        BadInput, match=r"^base: nothing: no such scene; allowed: .* \(.*mine.yaml, line 3\)$"
     ):
         scene.load(path)
 
@@ -207,9 +207,9 @@ def test_a_slip_is_found_in_the_file_where_it_stands(tmp_path: Path) -> None:
     written(tmp_path, "below", base="afit_simsat", exposure={"time": "3 kg"})
     above = written(tmp_path, "above", base="below.yaml", vehicle={"wheels": {"coulomb": "1 m"}})
     with pytest.raises(
-        BadInput, match=r"vehicle.wheels.coulomb: '1 m' is not a torque.*above.yaml, line 4\)"
+        BadInput, match=r"vehicle.wheels.coulomb: '1 m' is not a torque.*above.yaml, line 5\)"
     ):
         scene.load(above)
     above = written(tmp_path, "above", base="below.yaml", vehicle={"wheels": {}})
-    with pytest.raises(BadInput, match=r"exposure.time: '3 kg' is not a time.*below.yaml, line 3\)"):
+    with pytest.raises(BadInput, match=r"exposure.time: '3 kg' is not a time.*below.yaml, line 4\)"):
         scene.load(above)

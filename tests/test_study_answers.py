@@ -265,13 +265,13 @@ def test_a_trial_that_raises_in_its_tracker_is_replayed_with_its_frame(tmp_path,
 
 
 def test_a_store_of_a_scene_that_was_changed_is_not_gone_on_with(tmp_path):
-    (tmp_path / "mine.yaml").write_text("base: shefex2\n")
+    (tmp_path / "mine.yaml").write_text("schema: 1\nbase: shefex2\n")
     told, _ = done(
         tmp_path, STUDY.replace("scene: shefex2", "scene: mine.yaml").replace('"-1 mm"', '"30 mm"')
     )
     with store.writing(tmp_path / "study.sqlite") as kept:
         runner.begin(told, kept, resume=True)
-    (tmp_path / "mine.yaml").write_text("base: shefex2\ncamera: {f_number: 2.0}\n")
+    (tmp_path / "mine.yaml").write_text("schema: 1\nbase: shefex2\ncamera: {f_number: 2.0}\n")
     with (
         store.writing(tmp_path / "study.sqlite") as kept,
         pytest.raises(BadInput, match="the scene of point 0 was changed since"),

@@ -96,7 +96,7 @@ def test_a_slip_is_told_in_one_line_with_its_place(tmp_path, change, complaint):
 
 
 def test_a_scene_beside_the_study_is_found_from_anywhere(tmp_path):
-    (tmp_path / "mine.yaml").write_text("base: shefex2\ntitle: mine\n")
+    (tmp_path / "mine.yaml").write_text("schema: 1\nbase: shefex2\ntitle: mine\n")
     told = plan.load(written(tmp_path, STUDY.replace("scene: shefex2", "scene: mine.yaml")))
     assert plan.resolved(told.recipe, {})[0].title == "mine"
 

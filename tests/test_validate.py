@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from typer.testing import CliRunner
 
 from skysim import BadInput, cli, schemas, yamlfile
 from skysim.quantity import DATA, ROOT
-from skysim.scene import SCENES, load
+from skysim.scene import SCENES, load, load_camera
 from skysim.study import plan
 from skysim.validate import checked
 
@@ -67,9 +68,9 @@ def test_the_published_schema_is_the_newest_and_takes_every_file_that_ships(kind
     ],
 )
 def test_an_editor_marks_what_skysim_refuses(wrong: dict[str, Any], tmp_path: Path) -> None:
-    assert faults("scene", wrong)
+    assert faults("scene", {"schema": 1} | wrong)
     path = tmp_path / "mine.yaml"
-    path.write_text(yaml.safe_dump({"base": "shefex2"} | wrong))
+    path.write_text(yaml.safe_dump({"schema": 1, "base": "shefex2"} | wrong))
     with pytest.raises(BadInput):
         load(path)
 
@@ -82,8 +83,27 @@ def test_another_version_is_refused_by_name_wherever_it_stands(tmp_path: Path) -
         with pytest.raises(BadInput, match=r"^schema: 3 is of a newer skysim than .*newer\.yaml, line 1\)$"):
             load(path)
     study.write_text("title: T\nschema: 0\n")
-    with pytest.raises(BadInput, match=r"^schema: 0 is not known; allowed: 1 \(.*study\.yaml, line 2\)$"):
+    with pytest.raises(
+        BadInput, match=r"^schema: 0 is older than this skysim reads; allowed: 1 \(.*study\.yaml, line 2\)$"
+    ):
         plan.load(study)
+
+
+def test_a_scene_or_study_without_a_version_is_told_the_line_to_add(tmp_path: Path) -> None:
+    path, above = tmp_path / "mine.yaml", tmp_path / "above.yaml"
+    path.write_text("base: shefex2\n")
+    above.write_text("schema: 1\nbase: mine.yaml\n")
+    says = f"schema: missing; add the line schema: 1 ({path})"
+    for read in (lambda: load(path), lambda: load(above), lambda: load(path, {"schema": "1"})):
+        with pytest.raises(BadInput, match=f"^{re.escape(says)}$"):
+            read()
+    path.write_text("title: T\nscene: shefex2\n")
+    with pytest.raises(BadInput, match=f"^{re.escape(says)}$"):
+        plan.load(path)
+    for kind in SHIPPED:
+        assert faults(kind, {"title": "T"}) == ["'schema' is a required property"]
+    path.write_text("camera: {preset: ec655, focal_length: 16 mm, f_number: 1.4}\n")  # no scene
+    assert load_camera(path).f_number == 1.4
 
 
 def test_each_kind_of_file_is_told_and_each_fault_is_a_line(tmp_path: Path) -> None:
