@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
 from importlib import metadata
+from importlib.util import find_spec
 from typing import Any, Literal, Protocol, Self
 
 import numpy as np
@@ -23,6 +24,9 @@ FAILED = "failed: "  # what the status of a tracker begins with that raised, hun
 PROTOCOL = 1  # its version, first in the set-up
 UNIT_TOLERANCE = 1e-3  # of a quaternion's norm: single precision is let pass, and made a unit again
 LARGEST_RAD2 = (2 * np.pi) ** 2  # an axis of a covariance: nothing at all is known
+EXTRAS = {
+    "skysim.tetratracker:Tetra3rs": ("tetra3rs", "oracle")
+}  # module and extra of the trackers in our own package
 LEAST_RAD2 = 1e-24  # 0.2 micro-arcseconds
 MOST_CENTROIDS = 100_000
 MOST_TEXT = 300  # characters of a status
@@ -240,6 +244,12 @@ def release(name: str) -> str:
     """The package that offers a tracker, with its version; empty for skysim's own and for programs."""
     point = entry_points().get(name) if name != OWN else None
     return f"{point.dist.name} {point.dist.version}" if point and point.dist else ""
+
+
+def needs(point: metadata.EntryPoint) -> str:
+    """What has to be installed for a tracker of skysim's own package, else nothing. Nothing is imported."""
+    package = EXTRAS.get(point.value)
+    return f"skysim[{package[1]}]" if package and find_spec(package[0]) is None else ""
 
 
 def known(name: str, commands: Mapping[str, str]) -> None:

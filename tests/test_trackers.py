@@ -18,8 +18,9 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from scipy.spatial.transform import Rotation
+from typer.testing import CliRunner
 
-from skysim import BadInput, metrics, programs, scene, scoreboard, simulate, sky, trackers
+from skysim import BadInput, cli, metrics, programs, scene, scoreboard, simulate, sky, trackers
 from skysim.programs import Fault, Program
 from skysim.quantity import ARCSEC_RAD, ROOT
 from skysim.study import benches, plan, runner, store
@@ -283,6 +284,14 @@ def test_a_package_s_tracker_is_scored_by_the_error_that_it_makes(installed: Non
     assert (summed.frames, summed.wrong, summed.refused, summed.failed) == (3, 1, 0, 1)
     assert summed.right == metrics.share(1, 3)
     assert summed.cross_arcsec_worst == pytest.approx(36, abs=1e-6)  # of the right ones
+
+
+def test_the_list_tells_what_an_entry_needs(monkeypatch: pytest.MonkeyPatch) -> None:
+    for there, needs in ((None, "skysim[oracle]"), (object(), "")):
+        monkeypatch.setattr(trackers, "find_spec", lambda name, there=there: there)
+        listed = json.loads(CliRunner().invoke(cli.app, ["trackers", "--json"]).stdout)
+        assert {one["name"]: one["needs"] for one in listed}["tetra3rs"] == needs
+        assert {one["name"]: one["needs"] for one in listed}["own"] == ""
 
 
 def test_a_scene_names_a_tracker_and_never_a_command() -> None:

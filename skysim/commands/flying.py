@@ -131,17 +131,22 @@ def compare(
 
 
 def trackers(json: Json = False) -> None:
-    """List the trackers that are installed."""
+    """List the trackers that are there, and what they still need."""
     from skysim import io
     from skysim import trackers as known
 
-    listed = [{"name": known.OWN, "from": "skysim"}]
-    listed += [{"name": name, "from": point.value} for name, point in known.entry_points().items()]
+    listed = [{"name": known.OWN, "from": "skysim", "needs": ""}]
+    listed += [
+        {"name": name, "from": point.value, "needs": known.needs(point)}
+        for name, point in known.entry_points().items()
+    ]
     if json:
         print(io.to_json(listed))
         return
     for entry in listed:
-        print(f"{entry['name']:20s} {entry['from']}")
+        print(
+            f"{entry['name']:20s} {entry['from']}" + (f"  needs {entry['needs']}" if entry["needs"] else "")
+        )
 
 
 def render(
