@@ -27,7 +27,9 @@ def validate(
     files: Annotated[
         list[Path] | None,
         typer.Argument(
-            metavar="FILES", help="Scenes, studies, cameras (YAML); catalogues and LED maps (ECSV)."
+            metavar="FILES",
+            help="Scenes and studies (YAML, or by name), cameras (YAML, OpenCV's too), vehicles (MJCF),"
+            " catalogues and LED maps (ECSV).",
         ),
     ] = None,
     schema: Annotated[
@@ -67,12 +69,21 @@ def checked(path: Path) -> Verdict:
 
 def looked_at(path: Path) -> tuple[str, tuple[str, ...]]:
     """What a file is, in words, and doubts. Raises BadInput with one line."""
+    from skysim import calibration
+    from skysim.yamlfile import is_file, read_yaml
+
+    path = path if path.suffix else named(path)
+    if path.suffix not in (".yaml", ".yml", ".ecsv", ".xml"):
+        raise BadInput(f"{path}: allowed: .yaml, .ecsv, .xml or the name of a scene or a study")
+    if not is_file(path):  # a pipe would be waited for
+        raise BadInput(f"{path}: is no plain file")
     if path.suffix == ".ecsv":
         return table(path), ()
-    if path.suffix not in (".yaml", ".yml"):
-        raise BadInput(f"{path}: allowed: .yaml or .ecsv")
-    from skysim.yamlfile import read_yaml
-
+    if path.suffix == ".xml":
+        return vehicle(path), ()
+    if calibration.is_one(path):
+        lens = calibration.read(path)
+        return f"a calibration of {lens.width_px} x {lens.height_px} pixels", ()
     keys = read_yaml(path)[0].keys()
     if keys & {"factors", "trial", "responses"}:
         from skysim.study import plan
@@ -85,6 +96,26 @@ def looked_at(path: Path) -> tuple[str, tuple[str, ...]]:
         camera = load_camera(path, LENS)
         return f"a camera of {camera.width_px} x {camera.height_px} pixels", ()
     return scene(path)
+
+
+def named(path: Path) -> Path:
+    """The scene or the study that comes with skysim by this name. Raises BadInput with the names that there are."""
+    from skysim import scene
+    from skysim.study import plan
+
+    try:
+        return plan.find(str(path))
+    except BadInput:
+        return scene.find(str(path))
+
+
+def vehicle(path: Path) -> str:
+    """A vehicle's model, on its bearing."""
+    from skysim import world
+    from skysim.vehicle import Vehicle
+
+    built = world.build(Vehicle.model_validate({"model": str(path.resolve())}))
+    return f"a vehicle of {built.mass.mass_kg:g} kg"
 
 
 def scene(path: Path) -> tuple[str, tuple[str, ...]]:
@@ -109,7 +140,8 @@ def table(path: Path) -> str:
     from skysim import catalogue, io
 
     try:
-        first = path.read_text(encoding="utf-8", errors="replace")[:4000]
+        with path.open(encoding="utf-8", errors="replace") as file:
+            first = file.read(4000)
     except OSError as error:
         raise BadInput(f"{path}: cannot be read: {error.strerror}") from error
     if "{name: hip," in first:

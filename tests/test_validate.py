@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ import pytest
 import yaml
 from typer.testing import CliRunner
 
-from skysim import BadInput, cli, schemas, yamlfile
+from skysim import BadInput, calibration, cli, schemas, yamlfile
 from skysim.quantity import DATA, ROOT
 from skysim.scene import SCENES, load, load_camera
 from skysim.study import plan
@@ -121,6 +122,35 @@ def test_each_kind_of_file_is_told_and_each_fault_is_a_line(tmp_path: Path) -> N
         fault = checked(path).fault
         assert fault
         assert "\n" not in fault
+
+
+def test_whatever_skysim_reads_is_taken(tmp_path: Path) -> None:
+    lens = tmp_path / "lens.yml"
+    lens.write_text(calibration.text(load("shefex2").camera.calibration()))
+    for path, what in (
+        (lens, "a calibration of 659 x 493 pixels"),
+        (Path("shefex2"), "a scene of 7955 lights"),
+        (Path("end_to_end"), "a study of 6 trials"),
+        (SCENES / "vehicles/simsat.xml", "a vehicle of 73.35 kg"),
+    ):
+        told = checked(path)
+        assert (told.fault, told.what[: len(what)]) == ("", what)
+    assert "allowed: a .yaml file or one of afit_simsat" in checked(Path("nosuch")).fault
+
+
+def test_what_has_no_end_is_not_waited_for(tmp_path: Path) -> None:
+    for suffix in ("yaml", "ecsv", "xml"):
+        os.mkfifo(tmp_path / f"pipe.{suffix}")
+        (tmp_path / f"zero.{suffix}").symlink_to("/dev/zero")
+        for name in ("pipe", "zero"):
+            assert checked(tmp_path / f"{name}.{suffix}").fault.endswith("is no plain file")
+
+
+def test_a_wrong_key_of_a_trial_is_told_with_those_that_are_allowed(tmp_path: Path) -> None:
+    path, text = tmp_path / "mine.yaml", (SCENES / "studies/false_stars.yaml").read_text()
+    path.write_text(text.replace("trial.false_lights", "trial.false_light"))
+    says = r"trial\.false_light: unknown key; did you mean false_lights\?; allowed: .*noise_px.*"
+    assert re.fullmatch(rf"factors\.strays: 0: {says} \(.*mine\.yaml, line 9\)", checked(path).fault)
 
 
 def test_what_only_the_setup_finds_has_its_line(tmp_path: Path) -> None:

@@ -343,12 +343,15 @@ def resolved(recipe: Recipe, settings: Settings) -> tuple[Scene, CentroidTrial |
     try:
         trial = Asked.model_validate(tree).trial
     except ValidationError as error:
-        fault = error.errors()[0]
-        keys = ".".join(str(key) for key in fault["loc"] if key not in ("centroids", "frames", "flight"))
-        raise BadInput(f"{keys}: {fault['input']!r}: {fault['msg'].removeprefix('Value error, ')}") from None
+        raise BadInput(told_of(error, tree)) from None
     beside = Path(recipe.folder) / name
     path = beside if beside.suffix in {".yaml", ".yml"} and is_file(beside) else find_scene(name)
     return load_scene(path, scene_keys), trial
+
+
+def told_of(error: ValidationError, tree: dict[str, Any]) -> str:
+    """A fault of a trial as of any file, without a place: the factor that made it is told by who asked."""
+    return explain(error, Asked, tree, [(Path(), "")], {}).removesuffix(f" ({Path()})")
 
 
 class Asked(Part):
