@@ -54,9 +54,20 @@ def _sorted(vectors: Floats, side: int) -> tuple[NDArray, NDArray]:
 
 
 @jit
+def cell_of(place: float, last: int) -> int:
+    """The cell, 0 to last, of a place counted in cells: the nearest one where it is outside, 0 where it is NaN.
+
+    A cast of NaN, or of more than an integer holds, is whatever the processor makes of it.
+    """
+    if not place > 0:
+        return 0
+    return int(place) if place < last else last
+
+
+@jit
 def _spot(x: float, side: int) -> int:
     """Which cell along an edge a coordinate is in."""
-    return min(max(int((x + 1) / 2 * side), 0), side - 1)
+    return cell_of((x + 1) / 2 * side, side - 1)
 
 
 @jit

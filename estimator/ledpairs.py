@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from estimator import vectors
+from estimator.cells import cell_of
 from estimator.compiled import jit
 from estimator.index import between
 from estimator.ledmap import on_sphere
@@ -272,9 +273,9 @@ def _anything(grid: Grid, where: Vector, gate: float) -> bool:
     """Whether an LED is within an angle of a direction in the grid's axes."""
     inverse, half, reach = 1 / grid.cell, grid.side / 2, gate / grid.cell
     x, y = where[0] * inverse + half, where[1] * inverse + half
-    for line in range(max(int(y - reach), 0), min(int(y + reach), grid.side - 1) + 1):
-        left = line * grid.side + max(int(x - reach), 0)
-        right = line * grid.side + min(int(x + reach), grid.side - 1)
+    for line in range(cell_of(y - reach, grid.side), cell_of(y + reach, grid.side - 1) + 1):
+        left = line * grid.side + cell_of(x - reach, grid.side)
+        right = line * grid.side + cell_of(x + reach, grid.side - 1)
         if left > right:
             continue
         for place in range(grid.first[left], grid.first[right + 1]):

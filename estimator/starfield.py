@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator import vectors
+from estimator.cells import cell_of
 from estimator.compiled import jit
 from estimator.starproof import (
     GATE,
@@ -182,8 +183,8 @@ def _attempt(lights: Lights, sky: Sky, a: int, b: int, patience: int, known: Gue
     gate = GATE * sqrt(lights.sigma[a] ** 2 + lights.sigma[b] ** 2)
     angle = 2 * np.arcsin(min(chord / 2, 1.0))
     last = len(sky.first) - 2
-    low = min(int(max(angle / (1 + lights.zoom) - gate, 0.0) / sky.bin_rad), last + 1)
-    high = min(int((angle / (1 - lights.zoom) + gate) / sky.bin_rad), last)
+    low = cell_of((angle / (1 + lights.zoom) - gate) / sky.bin_rad, last + 1)
+    high = cell_of((angle / (1 - lights.zoom) + gate) / sky.bin_rad, last)
     # Members of tuples are taken out here: in the loop each would cost two counts of its references.
     tangent, first, pair, star, mag = lights.tangent, sky.first, sky.pair, sky.vectors, sky.mag
     cell_first, cell_star, side, zooms = sky.cell_first, sky.cell_star, sky.side, lights.zoom

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator import leastsquares, vectors
+from estimator.cells import cell_of
 from estimator.compiled import jit
 from estimator.starsky import MAG_BLUR, MAG_STEP, Sky, nearest
 from estimator.types import Floats
@@ -83,8 +84,7 @@ def nothing() -> Guess:
 @jit
 def share_at(sky: Sky, mag: float) -> float:
     """Density of the catalogue's magnitudes at one."""
-    place = int(max(mag - sky.mag[0], 0.0) / MAG_STEP)
-    return sky.share[min(place, len(sky.share) - 1)]
+    return sky.share[cell_of((mag - sky.mag[0]) / MAG_STEP, len(sky.share) - 1)]
 
 
 @jit

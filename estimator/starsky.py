@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from estimator.cells import cell_of
 from estimator.compiled import jit
 from estimator.types import BadImage, Floats
 
@@ -160,8 +161,8 @@ def nearest(
     scale = side / (2 * EDGE)
     # A tangent grows by no more than 1 + u^2 + v^2 times the angle, and a little for the angle's own size.
     reach = gate * (1 + u * u + v * v) * (1 + 4 * gate)
-    left, right = max(int((u - reach + EDGE) * scale), 0), min(int((u + reach + EDGE) * scale), side - 1)
-    top, bottom = max(int((v - reach + EDGE) * scale), 0), min(int((v + reach + EDGE) * scale), side - 1)
+    left, right = cell_of((u - reach + EDGE) * scale, side), cell_of((u + reach + EDGE) * scale, side - 1)
+    top, bottom = cell_of((v - reach + EDGE) * scale, side), cell_of((v + reach + EDGE) * scale, side - 1)
     best, closest = -1, gate * gate
     for row in range(top, bottom + 1):
         line = (face * side + row) * side

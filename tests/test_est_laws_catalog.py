@@ -189,3 +189,10 @@ def test_any_array_is_indexed_or_refused(vectors: NDArray, mag: NDArray, most_ra
 def test_the_shipped_catalogue_is_brightest_first() -> None:
     stars = catalog.read(Path(__file__).parents[1] / "data/catalogues/hipparcos_hp6.5.ecsv")
     assert (np.diff(stars.v_mag) >= 0).all()
+
+
+@given(place=ANY, last=some.integers(0, 1000))
+def test_a_place_s_cell_is_the_nearest_there_is(place: float, last: int) -> None:
+    """Whatever the number: casts of NaN and of 1e300 once led beyond a table's end."""
+    expected = 0 if np.isnan(place) else min(max(place, 0), last)
+    assert cells.cell_of(float(place), last) == int(expected)

@@ -172,7 +172,7 @@ def test_every_covariance_is_that_of_the_noise(method: str, surface: str) -> Non
 @pytest.mark.parametrize("method", ["infinity", "thesis", "tappe", "ray_on_surface"])
 def test_every_covariance_holds_within_ten_per_cent(method: str, surface: str) -> None:
     errors, claimed = noise_alone(method, surface, 15, 2000, seed=77)
-    # The ten per cent; sampling takes 1.8 of them. NPS's wide field comes out 8 % below what is claimed.
+    # The ten per cent; sampling takes 1.8 of them.
     assert nees(errors, claimed).mean() == pytest.approx(3, rel=0.1)
 
 
