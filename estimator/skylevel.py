@@ -72,8 +72,9 @@ def filtered_row(image: NDArray, y: int, sums: NDArray, out: NDArray) -> None:
 def at(grid: Floats, height: int, width: int, y: float, x: float) -> float:
     """Bilinear value of a tile grid at a pixel; constant beyond the outermost tile centres."""
     rows, columns = grid.shape
-    v = min(max((y + 0.5) * rows / height - 0.5, 0.0), rows - 1.0)
-    u = min(max((x + 0.5) * columns / width - 0.5, 0.0), columns - 1.0)
+    v, u = (y + 0.5) * rows / height - 0.5, (x + 0.5) * columns / width - 0.5
+    # Not max(): of NaN, a place that is none, it makes NaN, and that a row beyond the grid.
+    v, u = min(v if v > 0 else 0.0, rows - 1.0), min(u if u > 0 else 0.0, columns - 1.0)
     row, column = min(int(v), max(rows - 2, 0)), min(int(u), max(columns - 2, 0))
     below, beside = min(row + 1, rows - 1), min(column + 1, columns - 1)
     fv, fu = v - row, u - column
