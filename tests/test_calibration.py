@@ -148,7 +148,9 @@ def lens(tmp_path: Path) -> Path:
 def test_a_scene_s_camera_is_what_opencv_says_it_is(lens: Path, focus: str) -> None:
     """A file beside the scene; directions go through `cv2.projectPoints` and our lens to the same pixels."""
     own = lens.parent / "mine.yaml"
-    own.write_text(f"base: shefex2\ncamera: {{calibration: lens.yml, focal_length: null, focus: {focus}}}\n")
+    own.write_text(
+        f"schema: 1\nbase: shefex2\ncamera: {{calibration: lens.yml, focal_length: null, focus: {focus}}}\n"
+    )
     camera = scene.load(own).camera
     file = cv2.FileStorage(str(lens), cv2.FILE_STORAGE_READ)
     matrix, bent = file.getNode("camera_matrix").mat(), file.getNode("distortion_coefficients").mat()
@@ -175,7 +177,7 @@ def test_a_scene_s_camera_is_what_opencv_says_it_is(lens: Path, focus: str) -> N
 )
 def test_a_contradiction_is_told_with_its_line(lens: Path, said: str, complaint: str) -> None:
     own = lens.parent / "mine.yaml"
-    own.write_text(f"base: shefex2\ncamera: {{{said}}}\n")
+    own.write_text(f"schema: 1\nbase: shefex2\ncamera: {{{said}}}\n")
     with pytest.raises(BadInput) as raised:
         scene.load(own)
     assert complaint in str(raised.value)
@@ -187,7 +189,7 @@ def test_a_frame_is_solved_by_its_camera_s_calibration(lens: Path) -> None:
     """A focal length wrong by a part in a thousand, as chessboards have it, is found again."""
     own = lens.parent / "mine.yaml"
     own.write_text(
-        "base: shefex2\ncamera: {calibration: lens.yml, focal_length: null}\nexposure: {frames: 1}\n"
+        "schema: 1\nbase: shefex2\ncamera: {calibration: lens.yml, focal_length: null}\nexposure: {frames: 1}\n"
     )
     loaded = scene.load(own)
     frame, truth = simulate.shoot(simulate.prepare(loaded), 0)

@@ -67,10 +67,10 @@ def test_a_loop_is_compiled_alike_whoever_calls_it_first(package: Any) -> None:
 LOOPS = """
 from skysim import notice
 notice.attended = {attended}
-from skysim.compiled import kernel
-@kernel
+from skysim.compiled import jit
+@jit
 def one(x): return x + 1
-@kernel
+@jit
 def two(x): return one(x) + 1
 assert two(1) == 3 and two(1.0) == 3.0
 """

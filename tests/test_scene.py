@@ -866,7 +866,7 @@ def test_a_manoeuvre_without_a_controller_is_refused(tmp_path: Path) -> None:
         ("", "allowed: a mapping of keys to values"),
         ("- 1\n- 2\n", "allowed: a mapping of keys to values"),
         ("just words", "allowed: a mapping of keys to values"),
-        ("1: 2\n", "1: 1 is not allowed"),
+        ("schema: 1\n1: 2\n", "1: 1 is not allowed"),
     ],
 )
 def test_what_is_no_scene_at_all_is_one_line(tmp_path: Path, text: str, says: str) -> None:
