@@ -151,7 +151,7 @@ def labelled(runs: Ints32) -> tuple[Ints32, int]:
     Runs of neighbouring rows are met pairwise from left to right; those that touch share a root (union-find).
     """
     count = len(runs)
-    parent = np.arange(count).astype(np.int32)
+    parent = np.arange(count, dtype=np.int32)
     start = end = 0  # the runs of the row above
     k = 0
     while k < count:
