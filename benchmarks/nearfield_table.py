@@ -14,10 +14,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from estimator.camera import Camera
-from estimator.nearfield import SOLVERS, LedMap, Lever, on_surface, project
+from estimator.nearfield import OF_TANGENTS, SOLVERS, LedMap, Lever, on_surface, project
 
 INCH_M = 0.0254
-WEIGH_TANGENTS = ("rotation_only", "pnp")
 NOISE_PX = 0.1
 START_OFF_RAD = np.radians(2)  # what Tappe's iterated trial began with
 
@@ -90,10 +89,10 @@ def solved(method: str, bench: Bench, one: Trial) -> tuple[Rotation, NDArray[np.
     """What a method makes of a trial: body_from_lab and its covariance.
 
     Off the axis by an angle a, a pixel spans cos^2 a along the radius and cos a across it: the rms of both is a ray's
-    error. The methods that fit tangents, WEIGH_TANGENTS, want the tangents'.
+    error. The methods that fit tangents, OF_TANGENTS, want the tangents'.
     """
     rays = bench.camera.rays(one.pixels)
-    cosine = np.ones(bench.lights) if method in WEIGH_TANGENTS else rays[:, 2]
+    cosine = np.ones(bench.lights) if method in OF_TANGENTS else rays[:, 2]
     sigma_rad = NOISE_PX / bench.camera.focal_px * np.sqrt((cosine**2 + cosine**4) / 2)
     return SOLVERS[method](rays, sigma_rad, one.leds.position_m, one.leds, bench.lever, one.start)
 

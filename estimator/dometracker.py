@@ -16,7 +16,7 @@ from estimator.ledmap import LedMap, Lever, check_lever, on_sphere, project
 from estimator.ledpairs import NO_MATCH
 from estimator.ledproof import LEAST
 from estimator.ledsight import corner_rays, inner_field, sight_of
-from estimator.nearfield import SOLVERS
+from estimator.nearfield import OF_TANGENTS, SOLVERS
 from estimator.stages import Clock, Report, Settings, brightest, direction_sigma_rad, look
 from estimator.tracker import NO_STARS, mutual
 from estimator.types import Attitude, Centroids, Floats, StarMatch
@@ -119,8 +119,8 @@ class DomeTracker:
         """
         observed, star = match.observed, match.star
         body_from_lab = self.lever.cam_from_body.inv() * match.cam_from_ref
-        sigma_rad = np.hypot(direction_sigma_rad(centroids, self.camera, self.settings), self.led_sigma_rad)
         rays = self.camera.rays(centroids.xy_px)
+        sigma_rad = self._sigma_rad(centroids, rays, "rotation_only")
         radius_px = max(4.0, 4 * float(np.median(sigma_rad)) * self.camera.focal_px)
         try:
             for widened in (3.0, 1.0):
@@ -132,9 +132,9 @@ class DomeTracker:
                 if len(observed) < len(match.observed):
                     return Attitude(NO_MATCH)
             observed, star, misfit = self._without_blends(centroids, sigma_rad, observed, star, body_from_lab)
-            body_from_lab, spread = self._solve(
-                self.settings.solver, rays, sigma_rad, observed, star, body_from_lab
-            )
+            solver = self.settings.solver
+            sigma_rad = self._sigma_rad(centroids, rays, solver)
+            body_from_lab, spread = self._solve(solver, rays, sigma_rad, observed, star, body_from_lab)
         except (ValueError, np.linalg.LinAlgError) as error:
             return Attitude(f"no attitude: {error}")
         cam_from_lab = self.lever.cam_from_body * body_from_lab
@@ -149,6 +149,18 @@ class DomeTracker:
             float(np.sqrt(np.mean(residual**2))),
             self.camera,
         )
+
+    def _sigma_rad(self, centroids: Centroids, rays: Floats, solver: str) -> Floats:
+        """(N,) error of what a method fits, by the pixels and by the LEDs' places.
+
+        A pixel is as wide in tangents everywhere. At an angle a off the boresight a ray turns by cos^2 a of it along
+        the radius and by cos a across: the rms of both is its error per axis.
+        """
+        pixels_rad = direction_sigma_rad(centroids, self.camera, self.settings)
+        if solver not in OF_TANGENTS:
+            cosine = rays[:, 2]
+            pixels_rad = pixels_rad * np.sqrt((cosine**2 + cosine**4) / 2)
+        return np.hypot(pixels_rad, self.led_sigma_rad)
 
     def _residual_px(
         self, centroids: Centroids, observed: NDArray, star: NDArray, body_from_lab: Rotation

@@ -3,7 +3,8 @@
 Six methods of one signature, from the one that takes the lights for stars to the exact one, which knows that the
 camera can only turn about the bearing centre. Each takes
 
-rays_cam      : (N, 3) unit vectors in camera axes;  sigma_rad : (N,) their standard deviation per axis
+rays_cam      : (N, 3) unit vectors in camera axes
+sigma_rad     : (N,) their standard deviation per axis; for the methods of OF_TANGENTS, that of their tangents
 position_m    : (N, 3) where the lights of these rays are, in the lab frame
 leds, lever   : the believed surface and the believed place of the camera
 body_from_lab : the attitude to start from; infinity and thesis need none
@@ -25,7 +26,7 @@ from estimator.attitude import quest
 from estimator.ledmap import LedMap, Lever, check_lever, on_sphere, on_surface, project
 from estimator.types import Floats
 
-__all__ = ["SOLVERS", "LedMap", "Lever", "check_lever", "on_sphere", "on_surface", "project"]
+__all__ = ["OF_TANGENTS", "SOLVERS", "LedMap", "Lever", "check_lever", "on_sphere", "on_surface", "project"]
 
 
 def rotation_only(
@@ -360,3 +361,4 @@ SOLVERS: dict[str, NearSolver] = {
     "tappe": tappe,
     "pnp": pnp,
 }
+OF_TANGENTS = ("rotation_only", "pnp")  # they fit a ray's (x/z, y/z), in which a pixel is as wide everywhere

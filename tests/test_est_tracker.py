@@ -253,6 +253,7 @@ def test_pairs_are_each_other_s_nearest_within_the_radius() -> None:
 
 # AFIT's SimSat under its dome (reference 1.1): 35 mm, 4 um, 38.88 in across and 28.60 in up.
 DOME_CAMERA = Camera(1600, 1200, 8750.0, (799.5, 599.5))
+WIDE_CAMERA = replace(DOME_CAMERA, focal_px=1000.0)  # 90 degrees from corner to corner
 LEVERS = {
     "axial": Lever(np.array([0.0, 0.0, 0.381]), Rotation.identity()),
     "askew": Lever(np.array([0.01, -0.02, 0.37]), Rotation.from_euler("xyz", [0.02, -0.03, 0.9])),
@@ -279,14 +280,14 @@ def dome(shape: str, count: int = 2500) -> LedMap:
 
 
 def under_the_dome(
-    rng: np.random.Generator, leds: LedMap, lever: Lever, noise_px: float
+    rng: np.random.Generator, leds: LedMap, lever: Lever, noise_px: float, camera: Camera = DOME_CAMERA
 ) -> tuple[Rotation, Floats]:
     """A vehicle tilted by up to 15 degrees: cam_from_lab and the pixels of the LEDs on the sensor."""
     heading, about = rng.uniform(0, 2 * np.pi, 2)
     tilt = np.radians(rng.uniform(0, 15)) * np.array([np.cos(about), np.sin(about), 0])
     body_from_lab = Rotation.from_rotvec(tilt) * Rotation.from_rotvec([0, 0, heading])
-    pixels = nearfield.project(body_from_lab, leds.position_m, lever, DOME_CAMERA)
-    pixels = pixels[DOME_CAMERA.contains(np.nan_to_num(pixels, nan=-1e9))]
+    pixels = nearfield.project(body_from_lab, leds.position_m, lever, camera)
+    pixels = pixels[camera.contains(np.nan_to_num(pixels, nan=-1e9))]
     pixels = rng.permutation(pixels) + rng.normal(0, noise_px, pixels.shape)
     return lever.cam_from_body * body_from_lab, pixels
 
@@ -306,13 +307,17 @@ def test_true_centroids_under_a_dome_give_the_true_attitude(lever: str, shape: s
         assert len(answer.match.star) == len(pixels)
 
 
-def test_the_dome_tracker_s_covariance_is_true() -> None:
-    leds, lever = dome("ellipsoid"), LEVERS["askew"]
-    tracker = DomeTracker(DOME_CAMERA, leds, lever, replace(SETTINGS, centroid_sigma_px=0.0))
+@pytest.mark.parametrize(
+    ("camera", "count", "solver"),
+    [(DOME_CAMERA, 2500, "rotation_only"), (WIDE_CAMERA, 60, "rotation_only"), (WIDE_CAMERA, 60, "tappe")],
+)
+def test_the_dome_tracker_s_covariance_is_true(camera: Camera, count: int, solver: str) -> None:
+    leds, lever = dome("ellipsoid", count), LEVERS["askew"]
+    tracker = DomeTracker(camera, leds, lever, replace(SETTINGS, solver=solver, centroid_sigma_px=0.0))
     rng = np.random.default_rng(96)
     nees = []
     for _ in range(150):
-        truth, pixels = under_the_dome(rng, leds, lever, NOISE_PX)
+        truth, pixels = under_the_dome(rng, leds, lever, NOISE_PX, camera)
         answer = tracker.solve_centroids(centroids(pixels))
         error = (answer.cam_from_ref * truth.inv()).as_rotvec()
         nees.append(error @ np.linalg.inv(answer.covariance_rad2) @ error)
