@@ -45,8 +45,9 @@ def page(told: Plan, kept: Store) -> Iterator[str]:
     yield f"# {study.title}\n\n" + " ".join(question)
     yield f"\n```sh\nskysim study {verb} {name}\n```\n"
     seconds, cores = sum(run["seconds"] for run in kept.runs()), max(run["workers"] for run in kept.runs())
+    effort = f"{seconds:.0f} s on {cores} {'core' if cores == 1 else 'cores'}"
     yield (
-        f"{counts['done']} trials, {counts['failed']} failed, in {seconds:.0f} s on {cores} cores; scene"
+        f"{counts['done']} trials, {counts['failed']} failed, in {effort}; scene"
         f" `{study.scene}`, seed {study.seed}. What is varied:"
         f" [`{told.path.name}`](../../scenes/studies/{told.path.name}). Intervals are of 95 %.\n"
     )

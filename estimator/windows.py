@@ -53,8 +53,8 @@ def _brightest(
     height, width = image.shape
     boxes, sums, count = np.empty((len(centre_px), 4), np.int64), np.zeros((len(centre_px), 5)), 0
     for n in range(len(centre_px)):
-        x0, x1 = max(int(centre_px[n, 0] - half_px), 0), min(int(centre_px[n, 0] + half_px), width - 1)
-        y0, y1 = max(int(centre_px[n, 1] - half_px), 0), min(int(centre_px[n, 1] + half_px), height - 1)
+        x0, x1 = _span(centre_px[n, 0], half_px, width)
+        y0, y1 = _span(centre_px[n, 1], half_px, height)
         best, at_x, at_y = threshold_sigma, -1, -1
         for y in range(y0, y1 + 1):
             for x in range(x0, x1 + 1):
@@ -70,6 +70,15 @@ def _brightest(
             _grow(image, at_x, at_y, level, noise, boxes[count], sums[count])
             count += sums[count, 1] > 0
     return boxes, sums, count
+
+
+@jit
+def _span(middle_px: float, half_px: float, size: int) -> tuple[int, int]:
+    """First and last pixel of a window along an axis; none where its middle is NaN."""
+    low, high = middle_px - half_px, middle_px + half_px
+    if not (high > -1 and low < size):
+        return 0, -1
+    return int(max(low, 0.0)), int(min(high, size - 1.0))
 
 
 @jit

@@ -7,7 +7,6 @@ star, sorted by number. Positions and motions are those of the epoch J1991.25, i
 from __future__ import annotations
 
 import csv
-import os
 from collections.abc import Iterable
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -17,6 +16,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
+from skysim import io
 from skysim.scene import CATALOGUES
 from skysim.types import BadInput, Floats
 from skysim.yamlfile import composed
@@ -184,17 +184,12 @@ def write(path: Path, rows: list[dict[str, Any]], meta: dict[str, Any], extra: t
     head = {"delimiter": ",", "datatype": datatype}
     comment = yaml.safe_dump(head, sort_keys=False, default_flow_style=None)
     comment += yaml.safe_dump({"meta": meta | {"rows": len(rows)}}, sort_keys=False, width=105)
-    partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
-    try:
-        with open(partial, "w", encoding="utf-8", newline="") as out:
-            out.writelines(f"# {line}\n" for line in ["%ECSV 1.0", "---", *comment.splitlines(), SCHEMA])
-            table = csv.writer(out, lineterminator="\n")
-            table.writerow([*NAMES, *texts])
-            for row in rows:
-                table.writerow([format(row[c.name], c.format) for c in COLUMNS] + [row[t] for t in texts])
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
+    with io.whole(path) as temporary, open(temporary, "w", encoding="utf-8", newline="") as out:
+        out.writelines(f"# {line}\n" for line in ["%ECSV 1.0", "---", *comment.splitlines(), SCHEMA])
+        table = csv.writer(out, lineterminator="\n")
+        table.writerow([*NAMES, *texts])
+        for row in rows:
+            table.writerow([format(row[c.name], c.format) for c in COLUMNS] + [row[t] for t in texts])
 
 
 def find(name_or_path: str | Path) -> Path:

@@ -108,17 +108,27 @@ def parsed(path: Path) -> ElementTree.Element:
     try:
         with path.open("rb") as file:
             data = file.read(MOST_BYTES + 1)
-        text = data.decode("utf-8")  # whatever its first line says: so MuJoCo does
-        root = ElementTree.fromstring(text)
-    except (ElementTree.ParseError, OSError, ValueError) as error:
-        raise BadInput(f"{path}: not a MuJoCo model: {' '.join(str(error).split())}") from None
+    except (OSError, ValueError) as error:
+        raise unread(path, error) from None
+    check(path, len(data) <= MOST_BYTES, f"up to {MOST_BYTES} bytes")
+    check(path, b"<!DOCTYPE" not in data, "XML without DOCTYPE")
+    try:
+        # UTF-8 whatever its first line says: so MuJoCo does.
+        root = ElementTree.fromstring(data.decode("utf-8"))
+    except (ElementTree.ParseError, ValueError) as error:
+        raise unread(path, error) from None
     named = [name for element in root.iter() for name in (element.tag, *element.attrib)]
-    for wrong, allowed in (
-        (len(data) > MOST_BYTES, f"up to {MOST_BYTES} bytes"),
-        ("<!DOCTYPE" in text, "XML without DOCTYPE"),
-        (any("{" in name for name in named), "XML without namespaces"),
-        (root.tag.lower() == "robot", "MJCF, no URDF"),
-    ):
-        if wrong:
-            raise BadInput(f"{path}: not a MuJoCo model that skysim reads; allowed: {allowed}")
+    check(path, not any("{" in name for name in named), "XML without namespaces")
+    check(path, root.tag.lower() != "robot", "MJCF, no URDF")
     return root
+
+
+def unread(path: Path, error: Exception) -> BadInput:
+    """What to say of a file that cannot be read, is no UTF-8 or no XML."""
+    return BadInput(f"{path}: not a MuJoCo model: {' '.join(str(error).split())}")
+
+
+def check(path: Path, holds: bool, allowed: str) -> None:
+    """BadInput with one line where a rule for a model's file does not hold."""
+    if not holds:
+        raise BadInput(f"{path}: not a MuJoCo model that skysim reads; allowed: {allowed}")
