@@ -19,6 +19,7 @@ GROW_SIGMA = 3.5
 FEWEST_GROWN = 8  # pixels of a blob that is significant as a whole, though nowhere by itself
 FEW_STARS, DIRECTIONS, SOUGHT_PX = 8, 8, 10.0  # fewer may be streaks too faint to be seen; what is tried then
 LARGE_PX = 150  # a blob of so many pixels is no faint streak, and a line filter makes many of its noise
+LONGEST_PX = 1024  # of a streak that is filtered for: along such a line no pixel holds much of a star
 FEWEST_SMEARED = 5  # noise averaged along a line is above the threshold three pixels in a row, or not at all
 THESIS_INTENSITY, THESIS_AREA_PX = 0.04, 50
 
@@ -41,11 +42,11 @@ def default(
     is a sigma more significant than that: noise does not break a faint streak into pieces.
     Smeared stars: the filtered image is averaged along the streak (dx, dy), which gains the square root of its
     length. The streak is the hints' (from the gyro), else what the brightest blobs agree on, else, where there are
-    but few, the direction in which most are found.
+    but few, the direction in which most are found. Beyond LONGEST_PX it stays with the filter for round stars.
     """
     image = prepared(image)
     background = sky(image)
-    if hints.streak_px is None or max(map(abs, hints.streak_px)) < 2:
+    if hints.streak_px is None or not 2 <= max(map(abs, hints.streak_px)) <= LONGEST_PX:
         blobs = gather(
             image, background, threshold_sigma * background.noise, min_area_px, max_blobs, GROW_SIGMA
         )
@@ -55,6 +56,8 @@ def default(
             wanting = hints.streak_px is None and stars < FEW_STARS and np.all(blobs.area_px < LARGE_PX)
             unseen = faint_streaks(image, background, threshold_sigma, max_blobs, hints) if wanting else blobs
             return judge.judged(image, unseen, hints) if len(unseen) > stars + 1 else blobs
+        if max(map(abs, blobs.streak_px)) > LONGEST_PX:
+            return blobs
         hints = Hints(blobs.streak_px, hints.saturation)
     return judge.judged(image, smeared(image, background, threshold_sigma, max_blobs, hints), hints)
 

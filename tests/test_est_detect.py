@@ -6,6 +6,7 @@ from scipy import ndimage, stats
 from scipy.special import erf
 
 from estimator import detect, skylevel
+from estimator.hints import Hints
 from estimator.judge import NO_STAR
 from estimator.types import Background, BadImage
 
@@ -209,3 +210,21 @@ def test_a_texture_is_refused() -> None:
     image[place[0], place[1].transpose(1, 0)] = 1.0
     with pytest.raises(BadImage, match="over 20000 blobs"):
         detect.local(image)
+
+
+def test_no_line_is_filtered_for_that_is_longer_than_any_star_s(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A lattice that closes to lines over the whole frame: filters of their length took a minute."""
+    taps: list[int] = []
+    kept = detect.taps_of
+    monkeypatch.setattr(detect, "taps_of", lambda streak: taps.append(1) or kept(streak))
+    lattice = np.full((3000, 240), 10, np.uint8)
+    lattice[::3, ::6] = 231
+    blobs = detect.default(lattice)
+    assert max(map(abs, blobs.streak_px)) > detect.LONGEST_PX
+    assert not taps
+    short = detect.default(lattice[:600])
+    assert max(map(abs, short.streak_px)) < detect.LONGEST_PX
+    assert taps
+    stars, xy = field_of_stars(3)
+    told = detect.default(stars, hints=Hints((0.0, 5000.0)))
+    assert nearest_px(told.xy_px, xy).max() < 1
