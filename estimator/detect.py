@@ -38,7 +38,7 @@ def default(
     """Matched filters for round and for smeared stars over the local sky, grown to where the light ends.
 
     Round stars: the binomial filter [1 2 1] x [1 2 1] / 16 is close to the matched filter of sigma 0.7 px. A blob is
-    the connected pixels above 3 sigma of which `min_area_px` are above `threshold_sigma`, or whose light as a whole
+    the connected pixels above 3.5 sigma of which `min_area_px` are above `threshold_sigma`, or whose light as a whole
     is a sigma more significant than that: noise does not break a faint streak into pieces.
     Smeared stars: the filtered image is averaged along the streak (dx, dy), which gains the square root of its
     length. The streak is the hints' (from the gyro), else what the brightest blobs agree on, else, where there are
