@@ -6,6 +6,8 @@ import io
 import json
 import os
 import signal
+import socket
+import struct
 import subprocess
 import sys
 import threading
@@ -214,6 +216,33 @@ def test_streams_bring_every_next_frame(board: tuple[web.Board, str]) -> None:
         movie.readline()
         board[0].post(packet(index + 1))
     assert [client.dropped for client in board[0].clients] == [0, 0]
+
+
+def test_the_last_frame_reaches_who_watches_though_the_stream_ends_with_it() -> None:
+    board = web.Board(dict)
+    server = web.served(board, "127.0.0.1", 0)
+    raw = urllib.request.urlopen(f"http://127.0.0.1:{server.server_port}/stream.raw", timeout=10)
+    board.post(packet(0))
+    assert unpack(raw) is not None
+    late = threading.Timer(0.1, lambda: unpack(raw))
+    late.start()
+    board.post(packet(1, pixels=np.zeros((3000, 3000), "<u2")))  # more than a socket holds
+    board.end()
+    late.join()
+    assert board.tallies()["clients"] == [{"sent": 2, "dropped": 0}]
+    server.shutdown()
+
+
+def test_a_client_that_goes_within_an_answer_is_nothing_to_tell(
+    board: tuple[web.Board, str], capfd: pytest.CaptureFixture[str]
+) -> None:
+    board[0].post(packet(1, pixels=np.zeros((3000, 3000), "<u2")))
+    with socket.create_connection(("127.0.0.1", int(board[1].rpartition(":")[2])), 10) as client:
+        client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))  # reset by closing
+        client.sendall(b"GET /frame.raw HTTP/1.0\r\n\r\n")
+        assert client.recv(100)
+    time.sleep(0.3)
+    assert capfd.readouterr().err == ""
 
 
 def test_clients_that_left_cost_no_memory_but_count(board: tuple[web.Board, str]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import threading
 from collections import deque
@@ -18,6 +19,7 @@ from skysim.types import BadInput
 
 BOUNDARY = "frame"
 PATIENCE_S = 10.0  # with a client that takes nothing
+GRACE_S = 5.0  # for who still takes the last frame at the end
 REMEMBERED = 20  # clients that left
 INDEX = b"""<!doctype html><meta charset="utf-8"><title>skysim stream</title>
 <body style="margin:0;background:#0d1015;color:#8b95a5;font:13px system-ui"><img src="/stream.mjpg" style="width:100%">
@@ -44,18 +46,22 @@ class Board:
         self.ended = False
         self.changed = threading.Condition()
         self.clients: list[Client] = []
+        self.watching = 0
         self.left: deque[Client] = deque()
         self.earlier = {"clients": 0, "sent": 0, "dropped": 0}
 
     def come(self) -> Client:
         """Somebody begins to watch."""
         with self.changed:
+            self.watching += 1
             self.clients.append(Client())
             return self.clients[-1]
 
     def leave(self, client: Client) -> None:
         """And ends it. Of who left long ago the sums are kept, so that memory is constant."""
         with self.changed:
+            self.watching -= 1
+            self.changed.notify_all()
             self.left.append(client)
             if len(self.left) > REMEMBERED:
                 old = self.left.popleft()
@@ -75,15 +81,20 @@ class Board:
             self.changed.notify_all()
 
     def end(self) -> None:
+        """No more packets come; who watches is given some time to take the last."""
         with self.changed:
             self.ended = True
             self.changed.notify_all()
+            self.changed.wait_for(lambda: self.watching == 0, GRACE_S)
 
     def after(self, number: int) -> Packet | None:
-        """The next packet that is newer; None at the end."""
+        """The next packet that is newer; None once it has ended and the last was given."""
         with self.changed:
-            self.changed.wait_for(lambda: self.ended or (self.newest and self.newest.number > number))
-            return None if self.ended else self.newest
+            self.changed.wait_for(lambda: self.ended or self.newer(number))
+            return self.newest if self.newer(number) else None
+
+    def newer(self, number: int) -> bool:
+        return self.newest is not None and self.newest.number > number
 
 
 class Handler(BaseHTTPRequestHandler):
@@ -150,6 +161,11 @@ class Handler(BaseHTTPRequestHandler):
             self.close_connection = True
         finally:
             self.board.leave(mine)
+
+    def handle(self) -> None:
+        """A client that goes in the middle of an answer is no fault of ours."""
+        with contextlib.suppress(ConnectionError):
+            super().handle()
 
     def log_message(self, *_: Any) -> None:
         """Nobody reads it."""
