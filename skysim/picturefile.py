@@ -24,8 +24,10 @@ MOST_PX = 1 << 28
 MOST_BYTES = 8 * MOST_PX  # of a file: each pixel a double
 DEFLATE = 1032  # times as many bytes come out of it at most (zlib's technical details)
 SEGMENTS = 1000  # of a JPEG before its picture
-# TIFF: types of a whole number, 8, 16, 32 and 64 bits; tags of width, height and samples of a pixel.
-WHOLE = {1: "B", 3: "H", 4: "I", 16: "Q"}
+ALONE = (0x01, *range(0xD0, 0xD8))  # TEM and RST: marks without a length
+# TIFF: types of a whole number, 8, 16, 32 and 64 bits, and signed ones, which libtiff takes for a size as well (below 0
+# it does not, and we see more than is allowed); tags of width, height and samples of a pixel.
+WHOLE = {1: "B", 3: "H", 4: "I", 16: "Q", 6: "B", 8: "H", 9: "I", 17: "Q"}
 WIDTH_TAG, HEIGHT_TAG, SAMPLES_TAG = 256, 257, 277
 
 
@@ -110,14 +112,20 @@ def bmp(data: bytes) -> Sizes:
 
 
 def jpeg(data: bytes) -> Sizes:
-    """Every start of a frame (SOF, ITU-T T.81, B.2.2) before the first scan."""
+    """Every start of a frame (SOF, ITU-T T.81, B.2.2) before the first scan.
+
+    Between segments libjpeg passes over what is none; we read no further.
+    """
     at = 2
     for _ in range(SEGMENTS):
         while data[at : at + 2] == b"\xff\xff":  # fill bytes
             at += 1
         mark, kind, length = struct.unpack_from(">BBH", data, at)
-        if mark != 0xFF or kind == 0xDA:
+        if mark != 0xFF or kind in (0x00, 0xDA):
             return
+        if kind in ALONE:
+            at += 2
+            continue
         if 0xC0 <= kind <= 0xCF and kind not in (0xC4, 0xC8, 0xCC):
             height, width = struct.unpack_from(">HH", data, at + 5)
             yield width, height

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import io as streams
+import struct
 from collections.abc import Callable
 from pathlib import Path
 from random import Random
@@ -192,6 +193,31 @@ def test_every_sample_of_a_tiff_s_pixels_counts(tmp_path: Path, monkeypatch: pyt
     assert np.array_equal(io.read_image(path), grey)
     cv2.imwrite(str(path), np.dstack([grey] * 4))
     with pytest.raises(BadInput, match="41x30x4 pixels by its header"):
+        io.read_image(path)
+
+
+@pytest.mark.parametrize("kind", [6, 8, 9, 17])
+def test_a_tiff_s_sides_count_as_libtiff_reads_them(tmp_path: Path, kind: int) -> None:
+    """Signed, and the first of two; here a BigTIFF, whose entries hold any type."""
+    side = 100 if kind == 6 else 30_000
+
+    def entry(tag: int, of: int, value: int) -> bytes:
+        return struct.pack("<HHQQ", tag, of, 1, value)
+
+    sides = b"".join(entry(tag, of, value) for tag in (256, 257) for of, value in ((kind, side), (4, 2)))
+    data = b"II" + struct.pack("<HHHQQ", 43, 8, 0, 16, 4) + sides
+    assert list(picturefile.tiff(data)) == [(side, side)]
+
+
+@pytest.mark.parametrize("between", [b"\xff\xd0", b"\xff\x01", b"\xff\x00"])
+def test_no_mark_hides_a_jpeg_s_size(tmp_path: Path, between: bytes) -> None:
+    """To libjpeg these are a mark without a length, or nothing: what they seem to skip, it reads."""
+    path, small = tmp_path / "x.jpg", cv2.imencode(".jpg", np.zeros((8, 8), np.uint8))[1].tobytes()
+    at = small.index(b"\xff\xc0")
+    great = small[2 : at + 5] + struct.pack(">HH", 17_000, 17_000) + small[at + 9 :]
+    skipped = 4 + struct.unpack(">H", great[:2])[0]
+    path.write_bytes((small[:2] + between + great).ljust(skipped, b"\0") + small[at:] + bytes(9))
+    with pytest.raises(BadInput, match=r"17000x17000 pixels by its header|cannot be decoded"):
         io.read_image(path)
 
 
