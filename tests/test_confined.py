@@ -9,7 +9,8 @@ import mujoco
 import pytest
 
 from skysim import BadInput
-from skysim.world import spec
+from skysim.world import confined, spec
+from skysim.world.confined import parsed
 
 BUS = '<body name="bus"><camera name="star_camera"/><geom size=".1"/></body>'
 SECRET = '<body name="secret"><geom size=".1"/></body>'
@@ -128,6 +129,21 @@ def test_any_name_that_leaves_the_folder_is_refused(tmp_path: Path, names: str) 
     (tmp_path / "round.xml").symlink_to(tmp_path / "round.xml")
     with pytest.raises(BadInput, match=r"leaves .*; allowed: files in it$"):
         spec.load(tmp_path / "v.xml")
+
+
+def test_a_file_that_includes_itself_in_many_ways_is_read_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each way would be a folder of its own, to which each way leads again: for hours."""
+    read = list[Path]()
+    monkeypatch.setattr(confined, "parsed", lambda path: read.append(path) or parsed(path))
+    (tmp_path / "sub").mkdir()
+    (tmp_path / "v.xml").write_text(
+        whole("".join(f'<include file="{"sub/../" * n}v.xml"/>' for n in (1, 2, 3)))
+    )
+    with pytest.raises(BadInput, match="not a MuJoCo model"):
+        spec.load(tmp_path / "v.xml")
+    assert read == [tmp_path / "v.xml"]
 
 
 def test_other_encodings_archives_and_pipes_are_refused(tmp_path: Path) -> None:

@@ -47,7 +47,9 @@ class Names:
 
     def add(self, path: Path) -> None:
         """What an XML file names."""
-        self.bases |= {str(path.parent), str(path.resolve().parent)}
+        # Without `..`, or a file that includes itself by way of one would lie in ever new folders. What the system
+        # makes of a `..` after a link is in the others.
+        self.bases |= {os.path.normpath(path.parent), str(path.parent.resolve()), str(path.resolve().parent)}
         for element in parsed(path).iter():
             tag = element.tag.lower()
             for key, value in element.attrib.items():
@@ -81,18 +83,33 @@ def both(*parts: str) -> tuple[Path, Path]:
 
 def confined(path: Path) -> None:
     """Refuse a model that leaves the folder it is in. Raises BadInput with one line."""
-    names = Names(path.resolve().parent, set())
-    waiting, seen = [path], {path}
+    names, looked = Names(path.resolve().parent, set()), set[tuple[Named, Path]]()
+    waiting, seen = [path], {same(path)}
     while waiting:
-        names.add(waiting.pop())
+        for one in waiting:
+            names.add(one)
+        waiting = []
         for name, place in names.places():
-            if "\\" in name.value or not resolved(place).is_relative_to(names.folder):
-                raise BadInput(f"{name.told} leaves {names.folder}; allowed: files in it")
-            if os.path.exists(place) and not (os.path.isfile(place) or os.path.isdir(place)):
-                raise BadInput(f"{name.told} is no plain file; allowed: files in {names.folder}")
-            if name.xml and place not in seen and is_file(place):
+            if (name, place) in looked:
+                continue
+            looked.add((name, place))
+            check_place(name, place, names.folder)
+            if name.xml and same(place) not in seen and is_file(place):
                 waiting.append(place)
-                seen.add(place)
+                seen.add(same(place))
+
+
+def check_place(name: Named, place: Path, folder: Path) -> None:
+    """Refuse a place outside of the folder, and what is there and no plain file. Raises BadInput with one line."""
+    if "\\" in name.value or not resolved(place).is_relative_to(folder):
+        raise BadInput(f"{name.told} leaves {folder}; allowed: files in it")
+    if os.path.exists(place) and not (os.path.isfile(place) or os.path.isdir(place)):
+        raise BadInput(f"{name.told} is no plain file; allowed: files in {folder}")
+
+
+def same(place: Path) -> tuple[str, Path, Path]:
+    """What two places share that are one file, and from which the same names lead to the same places."""
+    return os.path.normpath(place), resolved(place.parent), resolved(place)
 
 
 def resolved(place: Path) -> Path:
