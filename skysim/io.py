@@ -27,6 +27,7 @@ from skysim.types import BadInput, Floats, Frame, Truth
 IMAGE_SUFFIXES = (".fits", ".fit", ".fts", ".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp")
 FITS_SUFFIXES = (".fits", ".fit", ".fts")
 MOST_HDUS = 1000  # in which an image is looked for
+FITS_BEGINS = b"SIMPLE  ="  # what is packed (gzip, zip and others) does not: astropy would unpack it
 
 
 @dataclass(frozen=True, slots=True)
@@ -351,11 +352,12 @@ def read_fits(path: Path) -> NDArray:
     from astropy.utils.exceptions import AstropyWarning
 
     try:
+        check_begin(path)
         with warnings.catch_warnings():
             warnings.simplefilter("error", AstropyWarning)  # "file may have been truncated" is one
             with path.open("rb") as file, fits.open(file, memmap=False) as hdus:
                 for hdu in islice(hdus, MOST_HDUS):
-                    # By the header, before the data is read, or skipped in a stream that is decompressed.
+                    # By the header, before the data is read or skipped.
                     check_pixels(path, *map(int, getattr(hdu, "shape", ()) or ()))
                     check_pixels(path, int(hdu.size) // 8)
                     if getattr(hdu, "is_image", False) and hdu.header.get("NAXIS", 0) > 0:
@@ -365,6 +367,13 @@ def read_fits(path: Path) -> NDArray:
     except Exception as error:  # astropy meets a damaged header with whatever it stumbles over, KeyError too
         raise BadInput(f"{path}: not a whole FITS file: {' '.join(str(error).split())}") from None
     raise BadInput(f"{path}: a FITS file without an image")
+
+
+def check_begin(path: Path) -> None:
+    """Raise BadInput for what does not begin as a FITS file."""
+    with path.open("rb") as file:
+        if file.read(len(FITS_BEGINS)) != FITS_BEGINS:
+            raise BadInput(f"{path}: not a whole FITS file: allowed: one that begins with SIMPLE, not packed")
 
 
 def date_of(path: Path) -> datetime.datetime | None:
@@ -377,8 +386,9 @@ def date_of(path: Path) -> datetime.datetime | None:
     from astropy.utils.exceptions import AstropyWarning
 
     try:
+        check_begin(path)
         with warnings.catch_warnings():
-            # As in `read_fits`: past what it only warns of, astropy may walk a compressed file for ever.
+            # As in `read_fits`: past what it only warns of, astropy may walk a damaged file for ever.
             warnings.simplefilter("error", AstropyWarning)
             return datetime.datetime.fromisoformat(str(fits.getheader(path).get("DATE-OBS")))
     except Exception:  # as there, where it is told

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import bz2
 import gzip
 import io as streams
+import lzma
 import struct
 from collections.abc import Callable
 from pathlib import Path
 from random import Random
+from typing import Any
 
 import cv2
 import numpy as np
@@ -237,6 +240,16 @@ def test_fits_that_unpacks_to_gigapixels_is_refused(tmp_path: Path, kind: str) -
         path.write_bytes(data)
     with pytest.raises(BadInput, match=r"50000x40000 pixels by its header|not a whole FITS"):
         io.read_image(path)
+
+
+@pytest.mark.parametrize("packer", [gzip, bz2, lzma])
+def test_packed_fits_is_refused_before_it_is_unpacked(tmp_path: Path, packer: Any) -> None:
+    """A header of blanks has no end: two gigabytes of them in some kilobytes took minutes, and all memory."""
+    path = tmp_path / "x.fits"
+    path.write_bytes(packer.compress(b"SIMPLE  =".ljust(1 << 20)))
+    with pytest.raises(BadInput, match="begins with SIMPLE, not packed"):
+        io.read_image(path)
+    assert io.date_of(path) is None
 
 
 def test_a_format_that_opencv_knows_and_nobody_asked_for_is_refused(tmp_path: Path) -> None:
