@@ -158,6 +158,30 @@ def test_a_slow_sink_holds_nobody_up_and_its_losses_are_counted() -> None:
     assert (sink.sent, sink.dropped, sink.fault) == (0, 1, "its reader is gone")
 
 
+def test_a_packet_in_the_hands_of_a_sink_that_never_ends_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As of a pipe that nobody opens."""
+    monkeypatch.setattr(sinks, "GRACE_S", 0.3)
+    free = threading.Event()
+    sink = sinks.Sink("stuck", lambda _: free.wait(30) and None)
+    for index in range(10):
+        sink.offer(packet(index), patient=False)
+    sink.close()
+    assert (sink.sent, sink.dropped) == (0, 10)
+    free.set()
+
+
+def test_a_sink_that_fails_in_whatever_way_is_told_and_waited_for_no_longer() -> None:
+    sink = sinks.Sink("odd", lambda _: (_ for _ in ()).throw(ValueError("no such\nthing")))
+    sending = threading.Thread(
+        target=lambda: [sink.offer(packet(index), patient=True) for index in range(5)], daemon=True
+    )
+    sending.start()
+    sending.join(10)
+    assert not sending.is_alive()
+    sink.close()
+    assert (sink.sent, sink.dropped, sink.fault) == (0, 5, "ValueError: no such thing")
+
+
 def test_a_folder_gets_every_frame_whole_with_its_truth(tmp_path: Path, frames: list[np.ndarray]) -> None:
     sets = [word for key, value in OVERRIDES.items() for word in ("--set", f"{key}={value}")]
     command = ["stream", "shefex2", "--folder", str(tmp_path), "--speed", "0", "--json", *sets]

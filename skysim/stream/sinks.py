@@ -16,7 +16,7 @@ from typing import BinaryIO
 import cv2
 import numpy as np
 
-from skysim import io
+from skysim import io, printable
 from skysim.stream.packet import Packet
 from skysim.types import BadInput
 
@@ -34,6 +34,7 @@ class Sink:
     def __init__(self, name: str, take: Callable[[Packet], None]) -> None:
         self.name, self.take = name, take
         self.sent = self.dropped = 0
+        self.busy = False  # with a packet that is neither sent nor left out as yet
         self.fault = ""
         self.waiting: queue.Queue[Packet | None] = queue.Queue(WAITING)
         self.thread = threading.Thread(target=self.work, name=f"sink {name}", daemon=True)
@@ -42,6 +43,7 @@ class Sink:
     def work(self) -> None:
         """Until None comes, or what takes the packets is gone."""
         while (packet := self.waiting.get()) is not None:
+            self.busy = True
             try:
                 self.take(packet)
             except BrokenPipeError:
@@ -49,10 +51,15 @@ class Sink:
             except OSError as error:
                 file = f"{error.filename}: " if error.filename else ""
                 self.fault = file + (error.strerror or str(error))
+            except Exception as error:  # whatever it is, who offers packets must not wait for us for ever
+                self.fault = printable(f"{type(error).__name__}: {error}")
             if self.fault:
                 self.dropped += 1
+            else:
+                self.sent += 1
+            self.busy = False
+            if self.fault:
                 return
-            self.sent += 1
 
     def offer(self, packet: Packet, patient: bool) -> None:
         """Take a packet, or leave it out if too many wait; patient: wait instead."""
@@ -77,6 +84,7 @@ class Sink:
         with contextlib.suppress(queue.Empty):  # nobody takes what still waits
             while True:
                 self.dropped += self.waiting.get_nowait() is not None
+        self.dropped += self.busy  # of one that still holds a packet we wait no longer
 
 
 def folder(path: Path) -> Callable[[Packet], None]:
