@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from xml.etree import ElementTree
 
 import mujoco
 import pytest
@@ -136,7 +137,12 @@ def test_a_file_that_includes_itself_in_many_ways_is_read_once(
 ) -> None:
     """Each way would be a folder of its own, to which each way leads again: for hours."""
     read = list[Path]()
-    monkeypatch.setattr(confined, "parsed", lambda path: read.append(path) or parsed(path))
+
+    def noted(path: Path) -> ElementTree.Element:
+        read.append(path)
+        return parsed(path)
+
+    monkeypatch.setattr(confined, "parsed", noted)
     (tmp_path / "sub").mkdir()
     (tmp_path / "v.xml").write_text(
         whole("".join(f'<include file="{"sub/../" * n}v.xml"/>' for n in (1, 2, 3)))

@@ -162,7 +162,11 @@ def test_a_packet_in_the_hands_of_a_sink_that_never_ends_is_left_out(monkeypatch
     """As of a pipe that nobody opens."""
     monkeypatch.setattr(sinks, "GRACE_S", 0.3)
     free = threading.Event()
-    sink = sinks.Sink("stuck", lambda _: free.wait(30) and None)
+
+    def take(_: Packet) -> None:
+        free.wait(30)
+
+    sink = sinks.Sink("stuck", take)
     for index in range(10):
         sink.offer(packet(index), patient=False)
     sink.close()
@@ -172,9 +176,12 @@ def test_a_packet_in_the_hands_of_a_sink_that_never_ends_is_left_out(monkeypatch
 
 def test_a_sink_that_fails_in_whatever_way_is_told_and_waited_for_no_longer() -> None:
     sink = sinks.Sink("odd", lambda _: (_ for _ in ()).throw(ValueError("no such\nthing")))
-    sending = threading.Thread(
-        target=lambda: [sink.offer(packet(index), patient=True) for index in range(5)], daemon=True
-    )
+
+    def send() -> None:
+        for index in range(5):
+            sink.offer(packet(index), patient=True)
+
+    sending = threading.Thread(target=send, daemon=True)
     sending.start()
     sending.join(10)
     assert not sending.is_alive()
