@@ -82,7 +82,8 @@ def unbroken(xyzw: Floats) -> Floats:
 
 def epoch(utc: datetime.datetime) -> str:
     """Of 6.8.9 in the standard: 2012-06-22T21:00:00.120000."""
-    return utc.replace(tzinfo=None).isoformat(timespec="microseconds")
+    bare = utc if utc.tzinfo is None else utc.astimezone(datetime.UTC).replace(tzinfo=None)
+    return bare.isoformat(timespec="microseconds")
 
 
 def plain(line: str) -> str:

@@ -30,10 +30,10 @@ CATALOGUES = DATA / "catalogues"
 
 
 def in_our_time(value: datetime.datetime) -> datetime.datetime:
-    """The Earth's ephemeris and straight proper motion hold for a century or so."""
+    """UTC without a zone. The Earth's ephemeris and straight proper motion hold for a century or so."""
     if not 1900 <= value.year <= 2100:
         raise ValueError(f"{value.isoformat()} is outside of 1900 to 2100")
-    return value
+    return value if value.tzinfo is None else value.astimezone(datetime.UTC).replace(tzinfo=None)
 
 
 def a_file(value: str) -> str:

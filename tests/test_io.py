@@ -19,7 +19,7 @@ from astropy.table import Table
 from astropy.wcs import WCS
 from scipy.spatial.transform import Rotation
 
-from skysim import io, livecamera, scene, simulate
+from skysim import aem, io, livecamera, scene, simulate
 from skysim.leftovers import HOST, NAME
 from skysim.types import BadInput, Frame, Truth
 
@@ -102,6 +102,16 @@ def test_the_header_tells_when_how_long_and_from_what(sky: Shot, written: Path) 
         0,
         pytest.approx((40000 - 3 * 14.7) / 10 + 64),
     )
+
+
+@pytest.mark.parametrize("start", ["2012-06-22T23:00:00+02:00", "2012-06-22T21:00:00Z"])
+def test_a_scene_s_time_with_a_zone_is_told_as_utc(sky: Shot, start: str) -> None:
+    """DATE-OBS takes no zone, and an attitude message would have been two hours off."""
+    loaded, frame, _ = sky
+    zoned = scene.load("shefex2", {"start_time": start})
+    assert io.mid_time(zoned, frame) == io.mid_time(loaded, frame)
+    local = datetime.datetime.fromisoformat(start)
+    assert aem.epoch(local) == "2012-06-22T21:00:00.000000"
 
 
 def test_a_png_has_no_date(written: Path) -> None:
