@@ -10,7 +10,6 @@ import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -19,15 +18,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skysim import wcs
+from skysim.fitsfile import FITS_SUFFIXES, read_fits
+from skysim.fitsfile import date_of as date_of
 from skysim.leftovers import being_written, sweep
-from skysim.picturefile import check_bytes, check_pixels, read_picture
+from skysim.picturefile import check_bytes, read_picture
 from skysim.scene import Scene, Stars
 from skysim.types import BadInput, Floats, Frame, Truth
 
-IMAGE_SUFFIXES = (".fits", ".fit", ".fts", ".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp")
-FITS_SUFFIXES = (".fits", ".fit", ".fts")
-MOST_HDUS = 1000  # in which an image is looked for
-FITS_BEGINS = b"SIMPLE  ="  # what is packed (gzip, zip and others) does not: astropy would unpack it
+IMAGE_SUFFIXES = (*FITS_SUFFIXES, ".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp")
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,9 +79,12 @@ def whole(path: Path) -> Iterator[Path]:
 @contextmanager
 def whole_folder(path: Path) -> Iterator[Path]:
     """`whole` of a folder: a temporary one beside `path` that takes its place, whatever was there."""
-    with being_written(path) as temporary, naming(path):
+    aside = path.with_name(f"{path.stem}.old{path.suffix}")
+    with being_written(path) as temporary, being_written(aside) as old, naming(path):
         yield temporary
-        shutil.rmtree(path, ignore_errors=True)
+        # Put aside at once and removed at leisure: an interrupt finds the one or the other.
+        if path.exists():
+            path.rename(old)
         temporary.rename(path)
 
 
@@ -343,56 +344,6 @@ def read_image(path: Path) -> NDArray:
     if image.dtype.kind not in "uif":
         raise BadInput(f"{path}: pixels of type {image.dtype}; allowed: integers and floats")
     return image
-
-
-def read_fits(path: Path) -> NDArray:
-    import warnings
-
-    from astropy.io import fits
-    from astropy.utils.exceptions import AstropyWarning
-
-    try:
-        check_begin(path)
-        with warnings.catch_warnings():
-            warnings.simplefilter("error", AstropyWarning)  # "file may have been truncated" is one
-            with path.open("rb") as file, fits.open(file, memmap=False) as hdus:
-                for hdu in islice(hdus, MOST_HDUS):
-                    # By the header, before the data is read or skipped.
-                    check_pixels(path, *map(int, getattr(hdu, "shape", ()) or ()))
-                    check_pixels(path, int(hdu.size) // 8)
-                    if getattr(hdu, "is_image", False) and hdu.header.get("NAXIS", 0) > 0:
-                        return np.ascontiguousarray(hdu.data.astype(hdu.data.dtype.newbyteorder("=")))
-    except BadInput:
-        raise
-    except Exception as error:  # astropy meets a damaged header with whatever it stumbles over, KeyError too
-        raise BadInput(f"{path}: not a whole FITS file: {' '.join(str(error).split())}") from None
-    raise BadInput(f"{path}: a FITS file without an image")
-
-
-def check_begin(path: Path) -> None:
-    """Raise BadInput for what does not begin as a FITS file."""
-    with path.open("rb") as file:
-        if file.read(len(FITS_BEGINS)) != FITS_BEGINS:
-            raise BadInput(f"{path}: not a whole FITS file: allowed: one that begins with SIMPLE, not packed")
-
-
-def date_of(path: Path) -> datetime.datetime | None:
-    """DATE-OBS of a FITS file; None for other files and other headers."""
-    if path.suffix.lower() not in FITS_SUFFIXES:
-        return None
-    import warnings
-
-    from astropy.io import fits
-    from astropy.utils.exceptions import AstropyWarning
-
-    try:
-        check_begin(path)
-        with warnings.catch_warnings():
-            # As in `read_fits`: past what it only warns of, astropy may walk a damaged file for ever.
-            warnings.simplefilter("error", AstropyWarning)
-            return datetime.datetime.fromisoformat(str(fits.getheader(path).get("DATE-OBS")))
-    except Exception:  # as there, where it is told
-        return None
 
 
 def monochrome(image: NDArray) -> NDArray:

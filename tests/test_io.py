@@ -5,6 +5,7 @@ from __future__ import annotations
 import datetime
 import json
 import os
+import shutil
 import subprocess
 import sys
 import warnings
@@ -233,6 +234,26 @@ def test_a_picture_that_cannot_be_encoded_leaves_nothing(tmp_path: Path) -> None
     ):
         io.write_image(tmp_path / "x.png", np.zeros((4, 4, 2), np.uint8))
     assert not list(tmp_path.iterdir())
+
+
+def test_an_interrupt_leaves_the_old_folder_or_the_new(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(folder: Path, **_: object) -> None:
+        next(Path(folder).iterdir()).unlink()
+        raise KeyboardInterrupt
+
+    def shoot(text: str) -> None:
+        with io.whole_folder(film) as folder:
+            folder.mkdir()
+            (folder / "zarr.json").write_text(text)
+
+    film = tmp_path / "frames.zarr"
+    shoot("old")
+    monkeypatch.setattr(shutil, "rmtree", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        shoot("new")
+    assert (film / "zarr.json").read_text() == "new"
 
 
 KILLED = """
