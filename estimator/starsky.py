@@ -16,7 +16,8 @@ PAIRS_A_BIN = 8
 STARS_A_CELL = 0.5
 MAG_STEP = 0.1
 MAG_BLUR = 0.25  # by which the histogram of magnitudes is smoothed
-EDGE = 1.1  # a face of the cube reaches so far beyond its 45 degrees that no gate at its border needs another face
+# A face of the cube reaches so far beyond its 45 degrees that no gate to .05 rad needs another face.
+EDGE = 1.2
 
 
 class Sky(NamedTuple):
@@ -144,7 +145,7 @@ def nearest(
     z: float,
     gate: float,
 ) -> tuple[int, float]:
-    """The star nearest to a unit vector within a small angle, rad, and the square of its distance; -1 if there is none.
+    """The star nearest to a unit vector within .05 rad or less, and the square of its distance; -1 if there is none.
 
     The first four are a Sky's: passing it whole would cost more than the search.
     """
