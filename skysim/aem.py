@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from skysim.quantity import in_utc
 from skysim.types import BadInput, Floats
 
 MOST_CHARACTERS = 254  # of a line, 6.3 of the standard
@@ -82,8 +83,7 @@ def unbroken(xyzw: Floats) -> Floats:
 
 def epoch(utc: datetime.datetime) -> str:
     """Of 6.8.9 in the standard: 2012-06-22T21:00:00.120000."""
-    bare = utc if utc.tzinfo is None else utc.astimezone(datetime.UTC).replace(tzinfo=None)
-    return bare.isoformat(timespec="microseconds")
+    return in_utc(utc).isoformat(timespec="microseconds")
 
 
 def plain(line: str) -> str:

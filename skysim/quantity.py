@@ -7,6 +7,7 @@ suffix (`camera.focal_length_m`), so that a unit is always in sight.
 
 from __future__ import annotations
 
+import datetime
 import itertools
 import math
 import re
@@ -27,6 +28,11 @@ UNIT_FOLLOWS = r"^\s*[-+.]?\d.*[a-zA-Z]"  # what editors can tell of a quantity
 SI_SUFFIX = re.compile(
     r"(?<!_deg)(?<!_rad)(?<!_e)(?<!^e)(?<!_cm2)(?<!_um)_(m|s|n|kg|kg_m|kg_m2|cd|w_sr|nm|nm_rad|nms|nms2)$"
 )
+
+
+def in_utc(moment: datetime.datetime) -> datetime.datetime:
+    """The moment in UTC, without a zone; one that has no zone is in UTC."""
+    return moment if moment.tzinfo is None else moment.astimezone(datetime.UTC).replace(tzinfo=None)
 
 
 def quantity(si_unit: str, what: str, examples: str) -> Callable[[Any], float]:

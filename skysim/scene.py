@@ -18,7 +18,7 @@ from skysim import yamlfile
 from skysim.camera import Camera, over, with_preset
 from skysim.light import Bench, Dome, Glow, Stars
 from skysim.motion import Motion, Pointing
-from skysim.quantity import DATA, SHIPPED, Length, NotNegative, Number, Part, Positive, Spin, Time
+from skysim.quantity import DATA, SHIPPED, Length, NotNegative, Number, Part, Positive, Spin, Time, in_utc
 from skysim.types import BadInput
 from skysim.vehicle import Site, Vehicle
 from skysim.yamlfile import Files, explain, is_file, of_our_version, place_of, put, read_yaml
@@ -33,7 +33,7 @@ def in_our_time(value: datetime.datetime) -> datetime.datetime:
     """UTC without a zone. The Earth's ephemeris and straight proper motion hold for a century or so."""
     if not 1900 <= value.year <= 2100:
         raise ValueError(f"{value.isoformat()} is outside of 1900 to 2100")
-    return value if value.tzinfo is None else value.astimezone(datetime.UTC).replace(tzinfo=None)
+    return in_utc(value)
 
 
 def a_file(value: str) -> str:

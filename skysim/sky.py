@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from skysim.catalogue import Catalogue
 from skysim.photometry import Band, star_flux_e_s_m2
+from skysim.quantity import in_utc
 from skysim.types import Floats, Sources
 
 J2000_TT = datetime.datetime(2000, 1, 1, 12)
@@ -61,9 +62,7 @@ def apparent(
 
 def days_since_j2000_tt(time: datetime.datetime) -> float:
     """Terrestrial Time as days from J2000.0 (JD 2451545.0)."""
-    if time.tzinfo is not None:
-        time = time.astimezone(datetime.UTC).replace(tzinfo=None)
-    return (time + TT_MINUS_UTC - J2000_TT) / DAY
+    return (in_utc(time) + TT_MINUS_UTC - J2000_TT) / DAY
 
 
 def sources(

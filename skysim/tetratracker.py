@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from skysim.quantity import in_utc
 from skysim.trackers import SOLVED, Answer, Picture, Setup
 
 WIDER = 1.1  # than the field: for what patterns are made
@@ -37,9 +38,7 @@ class Tetra3rs:
         self.extract = tetra3rs.extract_centroids_fast if fast else tetra3rs.extract_centroids
         self.camera = camera(tetra3rs, setup)
         self.middle_px = middle_px(setup)
-        moment = datetime.datetime.fromisoformat(setup.time_utc)
-        if moment.tzinfo is not None:
-            moment = moment.astimezone(datetime.UTC).replace(tzinfo=None)
+        moment = in_utc(datetime.datetime.fromisoformat(setup.time_utc))
         self.velocity_km_s = tetra3rs.earth_barycentric_velocity(moment)
         self.database: Any = tetra3rs.SolverDatabase.generate_from_gaia(
             max_fov_deg=self.camera.fov_deg * WIDER,

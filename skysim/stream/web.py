@@ -46,23 +46,20 @@ class Board:
         self.ended = False
         self.changed = threading.Condition()
         self.clients: list[Client] = []
-        self.watching = 0
         self.left: deque[Client] = deque()
         self.earlier = {"clients": 0, "sent": 0, "dropped": 0}
 
     def come(self) -> Client:
         """Somebody begins to watch."""
         with self.changed:
-            self.watching += 1
             self.clients.append(Client())
             return self.clients[-1]
 
     def leave(self, client: Client) -> None:
         """And ends it. Of who left long ago the sums are kept, so that memory is constant."""
         with self.changed:
-            self.watching -= 1
-            self.changed.notify_all()
             self.left.append(client)
+            self.changed.notify_all()
             if len(self.left) > REMEMBERED:
                 old = self.left.popleft()
                 self.clients.remove(old)
@@ -85,7 +82,7 @@ class Board:
         with self.changed:
             self.ended = True
             self.changed.notify_all()
-            self.changed.wait_for(lambda: self.watching == 0, GRACE_S)
+            self.changed.wait_for(lambda: len(self.clients) == len(self.left), GRACE_S)
 
     def after(self, number: int) -> Packet | None:
         """The next packet that is newer; None once it has ended and the last was given."""
