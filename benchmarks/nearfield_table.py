@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from estimator.camera import Camera
-from estimator.nearfield import OF_TANGENTS, SOLVERS, LedMap, Lever, on_surface, project
+from estimator.nearfield import SOLVERS, LedMap, Lever, fitted_sigma_rad, on_surface, project
 
 INCH_M = 0.0254
 NOISE_PX = 0.1
@@ -86,14 +86,9 @@ def trial(bench: Bench, tilt_deg: float, rng: np.random.Generator, noise_px: flo
 
 
 def solved(method: str, bench: Bench, one: Trial) -> tuple[Rotation, NDArray[np.float64]]:
-    """What a method makes of a trial: body_from_lab and its covariance.
-
-    Off the axis by an angle a, a pixel spans cos^2 a along the radius and cos a across it: the rms of both is a ray's
-    error. The methods that fit tangents, OF_TANGENTS, want the tangents'.
-    """
+    """What a method makes of a trial: body_from_lab and its covariance."""
     rays = bench.camera.rays(one.pixels)
-    cosine = np.ones(bench.lights) if method in OF_TANGENTS else rays[:, 2]
-    sigma_rad = NOISE_PX / bench.camera.focal_px * np.sqrt((cosine**2 + cosine**4) / 2)
+    sigma_rad = fitted_sigma_rad(method, rays, np.full(bench.lights, NOISE_PX / bench.camera.focal_px))
     return SOLVERS[method](rays, sigma_rad, one.leds.position_m, one.leds, bench.lever, one.start)
 
 

@@ -16,7 +16,7 @@ from estimator.ledmap import LedMap, Lever, check_lever, on_sphere, project
 from estimator.ledpairs import NO_MATCH
 from estimator.ledproof import LEAST
 from estimator.ledsight import corner_rays, inner_field, sight_of
-from estimator.nearfield import OF_TANGENTS, SOLVERS
+from estimator.nearfield import SOLVERS, fitted_sigma_rad
 from estimator.stages import Clock, Report, Settings, brightest, direction_sigma_rad, look
 from estimator.tracker import NO_STARS, mutual
 from estimator.types import Attitude, Centroids, Floats, StarMatch
@@ -151,16 +151,9 @@ class DomeTracker:
         )
 
     def _sigma_rad(self, centroids: Centroids, rays: Floats, solver: str) -> Floats:
-        """(N,) error of what a method fits, by the pixels and by the LEDs' places.
-
-        A pixel is as wide in tangents everywhere. At an angle a off the boresight a ray turns by cos^2 a of it along
-        the radius and by cos a across: the rms of both is its error per axis.
-        """
-        pixels_rad = direction_sigma_rad(centroids, self.camera, self.settings)
-        if solver not in OF_TANGENTS:
-            cosine = rays[:, 2]
-            pixels_rad = pixels_rad * np.sqrt((cosine**2 + cosine**4) / 2)
-        return np.hypot(pixels_rad, self.led_sigma_rad)
+        """(N,) error of what a method fits, by the pixels and by the LEDs' places."""
+        pixel_rad = direction_sigma_rad(centroids, self.camera, self.settings)
+        return np.hypot(fitted_sigma_rad(solver, rays, pixel_rad), self.led_sigma_rad)
 
     def _residual_px(
         self, centroids: Centroids, observed: NDArray, star: NDArray, body_from_lab: Rotation

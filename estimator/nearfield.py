@@ -26,7 +26,16 @@ from estimator.attitude import quest
 from estimator.ledmap import LedMap, Lever, check_lever, on_sphere, on_surface, project
 from estimator.types import Floats
 
-__all__ = ["OF_TANGENTS", "SOLVERS", "LedMap", "Lever", "check_lever", "on_sphere", "on_surface", "project"]
+__all__ = [
+    "SOLVERS",
+    "LedMap",
+    "Lever",
+    "check_lever",
+    "fitted_sigma_rad",
+    "on_sphere",
+    "on_surface",
+    "project",
+]
 
 
 def rotation_only(
@@ -362,3 +371,15 @@ SOLVERS: dict[str, NearSolver] = {
     "pnp": pnp,
 }
 OF_TANGENTS = ("rotation_only", "pnp")  # they fit a ray's (x/z, y/z), in which a pixel is as wide everywhere
+
+
+def fitted_sigma_rad(solver: str, rays_cam: Floats, pixel_rad: Floats) -> Floats:
+    """(N,) error per axis of what a method fits, from that of the pixels over the focal length.
+
+    At an angle a off the boresight a ray turns by cos^2 a of a tangent's change along the radius and by cos a across:
+    its error is the rms of both.
+    """
+    if solver in OF_TANGENTS:
+        return pixel_rad
+    cosine = rays_cam[:, 2]
+    return pixel_rad * np.sqrt((cosine**2 + cosine**4) / 2)

@@ -103,6 +103,18 @@ def test_exact_solves_find_the_truth(rng: np.random.Generator, count: int, off_r
     assert_covariance(covariance)
 
 
+@law(nearfield.fitted_sigma_rad)
+@given(rng=SEEDS, name=some.sampled_from(sorted(SOLVERS)))
+def test_the_error_of_what_is_fitted_is_that_of_a_shifted_pixel(rng: np.random.Generator, name: str) -> None:
+    """By differences: of a pixel shifted along x and along y, the turn of its ray and the change of its tangents."""
+    pixel, step = rng.uniform([0, 0], [640, 480], (9, 2)), 1e-3
+    moved = np.array([CAMERA.rays(pixel + step * axis) - CAMERA.rays(pixel) for axis in np.eye(2)])
+    turned_rad = np.sqrt(np.sum(moved**2, axis=(0, 2)) / 2)
+    expected = np.full(9, step / 900) if name in ("rotation_only", "pnp") else turned_rad
+    found = nearfield.fitted_sigma_rad(name, CAMERA.rays(pixel), np.full(9, step / 900))
+    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=0)
+
+
 @law(nearfield.infinity, nearfield.thesis, nearfield.thesis_points)
 @given(rng=SEEDS, name=some.sampled_from(["infinity", "thesis"]))
 def test_the_thesis_s_ways_are_near_the_truth(rng: np.random.Generator, name: str) -> None:
