@@ -30,7 +30,7 @@ test-long: $(READY)
 # Other people's instruments. astrometry.net is no Python package: docs/oracles.md tells how to get it.
 oracle: $(READY)
 	$(PIP) -e '.[oracle]'
-	$(BIN)/python -m pytest -rs -m "not long" tests/test_oracle_*.py
+	$(BIN)/python -m pytest -rs -m "not long" tests/oracles
 
 lab: $(READY)
 	$(BIN)/skysim lab
@@ -58,7 +58,7 @@ figures: $(READY)
 # The lab's page in Chromium. Where that is missing the tests say so and are skipped.
 test-browser: $(READY)
 	$(PIP) -e '.[browser]'
-	$(BIN)/pytest -m browser tests/test_lab_*.py -rs
+	$(BIN)/pytest -m browser tests/apps/gui -rs
 
 # Versions that resolve today, for CI; and the tests on the lowest that pyproject.toml allows.
 lock: $(READY)

@@ -10,9 +10,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from benchmarks.timing import verdict, versus
-from estimator.attitude import SOLVERS
-from estimator.types import Floats
-from estimator.wahba import wahba
+from estimator.attitude.solvers import SOLVERS
+from estimator.attitude.wahba import wahba
+from estimator.core.arrays import Floats
 
 # Of the millisecond from image to attitude, so many microseconds are the solver's.
 BUDGET_US = 10.0

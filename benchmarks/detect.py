@@ -11,9 +11,9 @@ from scipy import ndimage
 from scipy.special import erf
 
 from benchmarks.timing import verdict, versus
-from estimator.centroid import CENTROIDERS, gaussian_fit
-from estimator.detect import default, maximum, sequential
-from estimator.types import Centroids
+from estimator.centroiding.centroid import CENTROIDERS, gaussian_fit
+from estimator.core.types import Centroids
+from estimator.detection.detect import default, maximum, sequential
 
 SIGMA_PX, FLUX_E, SKY_E, NOISE_E = 0.7, 1e4, 100.0, 15.0
 PIXEL_NOISE_E = float(np.hypot(NOISE_E, np.sqrt(SKY_E)))

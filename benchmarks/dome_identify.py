@@ -13,14 +13,17 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from estimator import ledpairs
-from estimator.camera import Camera
-from estimator.ledmap import LedMap, Lever, project
-from estimator.ledsight import Sight, sight_of
-from skysim import layout, optimise, scene, simulate
-from skysim.onboard import calibration
-from skysim.surface import surface
-from skysim.types import Floats
+from estimator.attitude.dome_map import LedMap, Lever, project
+from estimator.core.camera import Camera
+from estimator.identification.leds import search
+from estimator.identification.leds.index import Sight, sight_of
+from skysim.core.types import Floats
+from skysim.scene import loader
+from skysim.simulation import testbed
+from skysim.sources.dome import layout
+from skysim.sources.dome.placement import optimize
+from skysim.sources.dome.surface import Inside, build_surface
+from skysim.tracking.onboard_model import calibration
 
 COUNT, CAP_DEG, TILT_DEG = 1400, 40.0, 30.0
 
@@ -49,7 +52,7 @@ CASES = (
 )
 
 
-def leds_m(places: str, count: int, inside: layout.Inside, rng: np.random.Generator) -> Floats:
+def leds_m(places: str, count: int, inside: Inside, rng: np.random.Generator) -> Floats:
     """(count, 3) LEDs on the dome."""
     half = np.radians(CAP_DEG)
     if places == "fibonacci":
@@ -58,7 +61,7 @@ def leds_m(places: str, count: int, inside: layout.Inside, rng: np.random.Genera
     if places == "random":
         return darts_m[:count]
     area_m2 = 2 * np.pi * 1.22**2 * (1 - np.cos(half))
-    kept = darts_m[optimise.apart(darts_m, np.sqrt(0.6 * area_m2 / count))]
+    kept = darts_m[optimize.apart(darts_m, np.sqrt(0.6 * area_m2 / count))]
     return kept[:count] if len(kept) < count else kept[rng.permutation(len(kept))[:count]]
 
 
@@ -89,7 +92,7 @@ def trial(
     lights_px, name = lights_px[order], np.concatenate([seen, np.full(case.false, -1)])[order]
     sigma = np.full(len(lights_px), case.noise_px / camera.focal_px)
     begin = time.perf_counter()
-    found = ledpairs.identify(camera.rays(lights_px), sigma, sight)
+    found = search.identify(camera.rays(lights_px), sigma, sight)
     spent = time.perf_counter() - begin
     if isinstance(found, str):
         return found, spent, len(seen)
@@ -102,8 +105,8 @@ def trial(
 def measure(case: Case, trials: int, seed: int) -> str:
     """One line of the table."""
     rng = np.random.default_rng(seed)
-    lab = simulate.furnish(scene.load("afit_simsat"))
-    inside = surface(lab.scene.light.surface)
+    lab = testbed.build_testbed(loader.load("afit_simsat"))
+    inside = build_surface(lab.scene.light.surface)
     truth_m = leds_m(case.places, COUNT, inside, rng)
     camera = calibration(lab.scene.camera)
     lever = Lever(np.array(lab.mount.camera_body_m), lab.mount.cam_from_body)

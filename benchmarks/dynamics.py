@@ -10,7 +10,8 @@ import mujoco
 import numpy as np
 
 from benchmarks.timing import verdict, versus
-from skysim import scene, simulate
+from skysim.scene import loader
+from skysim.simulation import run, testbed
 
 FLOWN_S = 5.0
 POSES = 200
@@ -35,7 +36,9 @@ def open_loop(name: str, more: dict[str, str]) -> dict[str, Any]:
     """By what `skysim run` flies with, nobody steering."""
     overrides = {f"vehicle.{key}": part for key, part in more.items()}
     overrides |= {"motion.control": "none", "motion.manoeuvre": "[]", "exposure.frames": "1"}
-    lab = simulate.furnish(scene.load("afit_simsat", overrides | {"exposure.first": f"{FLOWN_S - 0.012} s"}))
+    lab = testbed.build_testbed(
+        loader.load("afit_simsat", overrides | {"exposure.first": f"{FLOWN_S - 0.012} s"})
+    )
     model = lab.ship.model
 
     def bare() -> None:
@@ -44,7 +47,7 @@ def open_loop(name: str, more: dict[str, str]) -> dict[str, Any]:
             mujoco.mj_step(model, data)
 
     what = f"fly {FLOWN_S:g} s open loop, {name}"
-    return versus(what, lambda: simulate.fly(lab), "bare mj_step", bare, bar=0.9)
+    return versus(what, lambda: run.simulate_motion(lab), "bare mj_step", bare, bar=0.9)
 
 
 def closed_loops() -> list[dict[str, Any]]:
@@ -53,14 +56,14 @@ def closed_loops() -> list[dict[str, Any]]:
 
 
 def closed_loop(name: str) -> dict[str, Any]:
-    lab = simulate.prepare(scene.load(name, {"exposure.frames": "3"}))
-    ratio = float(lab.trajectory.t_s[-1]) / best(lambda: simulate.fly(lab), 30)
+    lab = run.prepare(loader.load(name, {"exposure.frames": "3"}))
+    ratio = float(lab.trajectory.t_s[-1]) / best(lambda: run.simulate_motion(lab), 30)
     return verdict(f"{name} closed loop, 100 Hz", ratio, "x real time", "the clock", 30.0, least=True)
 
 
 def poses() -> dict[str, Any]:
     """The attitudes at 200 moments of one exposure."""
-    flight = simulate.prepare(scene.load("simsat_slew", {"exposure.frames": "1"})).trajectory
+    flight = run.prepare(loader.load("simsat_slew", {"exposure.frames": "1"})).trajectory
     moments = np.linspace(0.5, 0.51, POSES)
     return verdict(f"{POSES} poses in an exposure", 1e3 * best(lambda: flight.at(moments)), "ms", "", 0.3)
 

@@ -13,9 +13,10 @@ import time
 
 import psutil
 
-from skysim import metrics, simulate
-from skysim.quantity import ARCSEC_RAD
-from skysim.scene import load
+from skysim.core.units import ARCSEC_RAD
+from skysim.results import metrics
+from skysim.scene.loader import load
+from skysim.simulation import run, testbed
 
 WARM_S = 60.0  # of flight: by then everything was called once
 SCENE = {
@@ -31,13 +32,13 @@ def main(duration_s: float, rate_hz: float) -> None:
     """Fly, and print a line a minute of flight and what came of it."""
     frames = round(duration_s * rate_hz)
     told = SCENE | {"exposure.rate_hz": str(rate_hz), "exposure.frames": str(frames)}
-    lab = simulate.furnish(load("simsat_bump", told))
+    lab = testbed.build_testbed(load("simsat_bump", told))
     us, begin = psutil.Process(), time.monotonic()
     memory_mb: list[float] = []
     solved = wrong = 0
     first_s = late_s = 0.0
     print(f"{'flight':>8s} {'wall':>8s} {'memory':>10s}  solved  wrong")
-    for n, look in enumerate(simulate.live(lab, simulate.tracker(lab)), 1):
+    for n, look in enumerate(run.live(lab, testbed.tracker(lab)), 1):
         first_s = first_s or look.frame.t_mid_s
         late_s = max(late_s, abs(look.frame.t_mid_s - first_s - (n - 1) / rate_hz))
         answer = look.report.attitude.cam_from_ref if look.report else None

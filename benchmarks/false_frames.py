@@ -12,9 +12,9 @@ from itertools import cycle
 import numpy as np
 
 from benchmarks.lost_in_space import WORKLOADS, Workload, sky
-from estimator.stages import Settings
-from estimator.tracker import StarTracker
-from estimator.types import Centroids
+from estimator.core.types import Centroids
+from estimator.trackers.pipeline import Settings
+from estimator.trackers.star_tracker import StarTracker
 
 LIGHTS = (3, 30)
 

@@ -17,12 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from estimator import catalog
-from estimator.camera import Camera
-from estimator.stages import Settings
-from estimator.tracker import StarTracker
-from skysim.quantity import ARCSEC_RAD
-from skysim.scene import CATALOGUES
+from estimator.catalog import catalog
+from estimator.core.camera import Camera
+from estimator.trackers.pipeline import Settings
+from estimator.trackers.star_tracker import StarTracker
+from skysim.core.paths import CATALOGUES
+from skysim.core.units import ARCSEC_RAD
 
 WRONG_RAD = np.radians(10 / 60)
 STEP_PX = 0.1  # of a streak

@@ -22,14 +22,16 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from benchmarks.oracles import HEAD, Agreement, aberrated, lattice, line, unit_vectors
-from estimator import catalog
-from estimator.camera import Camera
-from estimator.stages import Settings
-from estimator.tracker import StarTracker
-from estimator.types import Attitude
-from skysim import io, solve
-from skysim.metrics import normalised_error_squared
-from skysim.scene import CATALOGUES
+from estimator.catalog import catalog
+from estimator.core.camera import Camera
+from estimator.core.types import Attitude
+from estimator.trackers.pipeline import Settings
+from estimator.trackers.star_tracker import StarTracker
+from skysim.apps import plate_solver
+from skysim.core import images
+from skysim.core.paths import CATALOGUES
+from skysim.results.files import frames
+from skysim.results.metrics import normalised_error_squared
 
 DEEPEST_G = 8.0  # of the stars that are drawn; our catalogue ends at 6.5
 ZERO_E = 239_000.0  # electrons of a star of G = 0
@@ -178,8 +180,8 @@ Ours = Callable[[NDArray, Path], Attitude]
 def as_a_photograph(sight: Sight) -> Ours:
     """The path of `skysim solve FILE --fov DEG`."""
     fov_deg = float(np.degrees(sight.camera.fov_rad)) * (1 + sight.fov_error)
-    solver = solve.make_solver(fov_deg, None)
-    return lambda image, path: solve.look(image, solver, io.date_of(path))[0].attitude
+    solver = plate_solver.make_solver(fov_deg, None)
+    return lambda image, path: plate_solver.look(image, solver, images.date_of(path))[0].attitude
 
 
 def as_a_tracker(sight: Sight) -> Ours:
@@ -191,7 +193,7 @@ def as_a_tracker(sight: Sight) -> Ours:
         saturation=SATURATED_DN,
         centroid_sigma_px=0.03,
     )
-    seen = catalog.apparent(listed, catalog.on_earth(io.datetime.datetime.fromisoformat(sight.utc)))
+    seen = catalog.apparent(listed, catalog.on_earth(frames.datetime.datetime.fromisoformat(sight.utc)))
     tracker = StarTracker(sight.camera, listed, seen, settings)
     return lambda image, path: tracker.solve(image).attitude
 
@@ -214,7 +216,7 @@ def confront(sight: Sight, ways: Sequence[Ours], frames: int, seed: int, mirrors
     pixels = lattice(sight.width_px, sight.height_px)
     with tempfile.TemporaryDirectory() as folder:
         for shot in photographs(sight, frames, seed, Path(folder)):
-            image = io.read_image(shot.path)
+            image = images.read_image(shot.path)
             for n, way in enumerate(ways):
                 answer = way(image, shot.path)
                 if answer.solved:

@@ -23,16 +23,18 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.frames import LIEBE_E, Sight, paint, photograph
 from benchmarks.hostilefiles import encoded, promise
-from estimator import catalog
-from estimator.camera import Camera
-from estimator.tracker import CORNERS
-from skysim import io, scene, sky, solve
-from skysim.scene import CATALOGUES
-from skysim.terminal import progress
+from estimator.catalog import catalog
+from estimator.core.camera import Camera
+from estimator.trackers.star_tracker import CORNERS
+from skysim.apps import plate_solver
+from skysim.apps.cli.terminal import progress
+from skysim.core.images import IMAGE_SUFFIXES
+from skysim.core.paths import CATALOGUES, SCENES
+from skysim.sources import stars as star_sources
 
 LIMIT_S_PER_MPX, MEMORY_FRAMES, MEMORY_FLOOR = 2.0, 10, 64 << 20
 WRONG_RAD = np.radians(10 / 60)
-CAMERA_FILE, FOV_DEG, WIDTH, HEIGHT = scene.SCENES / "shefex2.yaml", 14.87, 659, 493
+CAMERA_FILE, FOV_DEG, WIDTH, HEIGHT = SCENES / "shefex2.yaml", 14.87, 659, 493
 SMALL, LARGE = (240, 320), (4096, 4096)
 USUAL = ((HEIGHT, WIDTH), SMALL, LARGE)
 DEPTH = 4095
@@ -215,7 +217,7 @@ def broken(rng: Rng) -> Shot:
 
 
 def rubbish(rng: Rng) -> Shot:
-    suffix = str(rng.choice(io.IMAGE_SUFFIXES))
+    suffix = str(rng.choice(IMAGE_SUFFIXES))
     heads = (b"", b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff", b"BM", b"II*\0", b"MM\0*", b"SIMPLE  = ")
     return Shot(None, suffix, heads[rng.integers(len(heads))] + rng.bytes(int(rng.integers(0, 5000))))
 
@@ -256,7 +258,7 @@ FAMILIES: dict[Family, float] = {
 
 @lru_cache
 def camera() -> Camera:
-    return solve.make_solver(None, CAMERA_FILE).beliefs(WIDTH, HEIGHT)[0][0]
+    return plate_solver.make_solver(None, CAMERA_FILE).beliefs(WIDTH, HEIGHT)[0][0]
 
 
 @lru_cache
@@ -295,15 +297,15 @@ class Judge:
     """The solvers, and a folder for the files."""
 
     folder: Path
-    solvers: dict[str, dict[tuple[int, ...], solve.Solver]] = field(default_factory=dict)
+    solvers: dict[str, dict[tuple[int, ...], plate_solver.Solver]] = field(default_factory=dict)
 
-    def solver(self, told: str, shape: tuple[int, ...]) -> solve.Solver:
+    def solver(self, told: str, shape: tuple[int, ...]) -> plate_solver.Solver:
         """One for each usual size, whose trackers take seconds to build, and one for all others."""
         shape = shape if shape in USUAL else ()
         how = {"camera": (None, CAMERA_FILE), "field": (FOV_DEG, None), "nothing": (None, None)}[told]
         kept = self.solvers.setdefault(told, {})
         if shape not in kept:
-            kept[shape] = solve.make_solver(*how)
+            kept[shape] = plate_solver.make_solver(*how)
             if shape:
                 list(kept[shape].trackers(*shape[::-1], None))
         return kept[shape]
@@ -330,12 +332,12 @@ class Judge:
         return family.__name__, shot, answer | {"told": told}, seconds, taken
 
 
-def timed(path: Path, solver: solve.Solver) -> tuple[dict, float, float]:
+def timed(path: Path, solver: plate_solver.Solver) -> tuple[dict, float, float]:
     """The answer to a file, seconds of the processor, and bytes beyond the floor."""
     before = memory("VmRSS", reset=True)
     begin = time.process_time()
     try:
-        answer = solve.solve(path, solver, None)
+        answer = plate_solver.solve(path, solver, None)
     except Exception as error:  # which is the defect that is looked for
         answer = {"status": f"raised {error!r}", "raised": True}
     seconds = time.process_time() - begin
@@ -357,7 +359,7 @@ def wrong(answer: dict, skies: Skies) -> bool:
     """An attitude that puts the sky elsewhere in the picture than where it is."""
     if answer.get("ra_deg") is None:
         return False
-    told = sky.cam_from_icrs(answer["ra_deg"], answer["dec_deg"], answer["roll_deg"])
+    told = star_sources.cam_from_icrs(answer["ra_deg"], answer["dec_deg"], answer["roll_deg"])
     corners = camera().rays(CORNERS * [WIDTH, HEIGHT])
     off = (np.linalg.norm((told * one.inv()).apply(corners) - corners, axis=1).max() for one in skies)
     return all(one > WRONG_RAD for one in off)

@@ -10,12 +10,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from benchmarks.timing import versus
-from estimator import catalog
-from estimator.camera import Camera
-from estimator.stages import Settings
-from estimator.tracker import StarTracker
-from estimator.types import Centroids
-from skysim.scene import CATALOGUES
+from estimator.catalog import catalog
+from estimator.core.camera import Camera
+from estimator.core.types import Centroids
+from estimator.trackers.pipeline import Settings
+from estimator.trackers.star_tracker import StarTracker
+from skysim.core.paths import CATALOGUES
 
 FIELDS = 100
 

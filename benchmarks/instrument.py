@@ -12,12 +12,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from benchmarks.timing import verdict, versus
-from skysim.background import fill
-from skysim.camera import Camera
-from skysim.detector import Chip, expose
-from skysim.optics import Optics
-from skysim.render import Window, render
-from skysim.types import Floats, Mount, Sources, Trajectory
+from skysim.camera.background import fill
+from skysim.camera.detector.detector import Chip, expose
+from skysim.camera.optics import Optics
+from skysim.camera.render import Window, render
+from skysim.core.types import Floats, Mount, Sources, Trajectory
+from skysim.scene.camera import CameraConfig
 
 AT_CENTRE = Mount(np.zeros(3), Rotation.identity())
 EXPOSURE_S = 0.01
@@ -37,14 +37,14 @@ NOISE = {
 }
 
 
-def camera(width: int, height: int, focal_px: float, sigma_px: float, **noise: Any) -> Camera:
+def camera(width: int, height: int, focal_px: float, sigma_px: float, **noise: Any) -> CameraConfig:
     """A square pixel of 5 um behind a lens that is focused where everything stands."""
     part = {"width_px": width, "height_px": height, "pixel": "5 um", "focal_length": f"{5e-6 * focal_px} m"}
     lens = {"f_number": 1e4, "psf": {"kind": "gaussian", "sigma_px": sigma_px}}
-    return Camera.model_validate(part | lens | {"detector": NOISE | noise})
+    return CameraConfig.model_validate(part | lens | {"detector": NOISE | noise})
 
 
-def square_metre(lens: Camera) -> Optics:
+def square_metre(lens: CameraConfig) -> Optics:
     """The lens with a pupil of a square metre, so that a source's strength is its electrons a second."""
     return replace(Optics.of(lens), collecting_m2=1.0)
 
@@ -56,7 +56,9 @@ def turning(rate_rad_s: float) -> Trajectory:
     return Trajectory(t, Rotation.from_rotvec((t[:, None] - EXPOSURE_S / 2) * rate[:1]), rate)
 
 
-def lights(lens: Camera, count: int, electrons: Floats, radius_px: float = 0.0, seed: int = 1) -> Sources:
+def lights(
+    lens: CameraConfig, count: int, electrons: Floats, radius_px: float = 0.0, seed: int = 1
+) -> Sources:
     """So many stars, or lamps two metres away, spread over the frame; electrons each in one exposure."""
     rng = np.random.default_rng(seed)
     xy = rng.uniform((30, 30), (lens.width_px - 30, lens.height_px - 30), (count, 2))
@@ -79,7 +81,7 @@ def lights(lens: Camera, count: int, electrons: Floats, radius_px: float = 0.0, 
     )
 
 
-def camera_shot(lens: Camera, sources: Sources, rate_rad_s: float) -> Callable[[], Any]:
+def camera_shot(lens: CameraConfig, sources: Sources, rate_rad_s: float) -> Callable[[], Any]:
     """One frame after another: light, smear, and every noise."""
     optics, chip, rng = square_metre(lens), Chip.of(lens), np.random.default_rng(0)
     path, image = turning(rate_rad_s), np.empty((lens.height_px, lens.width_px), np.float32)
@@ -92,7 +94,7 @@ def camera_shot(lens: Camera, sources: Sources, rate_rad_s: float) -> Callable[[
     return shot
 
 
-def light_of(lens: Camera, sources: Sources, rate_rad_s: float) -> Floats:
+def light_of(lens: CameraConfig, sources: Sources, rate_rad_s: float) -> Floats:
     """The same frame's mean photo-electrons."""
     image = np.zeros((lens.height_px, lens.width_px))
     render(image, sources, square_metre(lens), turning(rate_rad_s), AT_CENTRE, Window(0.0, EXPOSURE_S))
@@ -120,7 +122,7 @@ def dome_frame() -> list[dict[str, Any]]:
     ]
 
 
-def getframes(lens: Camera, mean_e: Floats) -> Callable[[], Any] | None:
+def getframes(lens: CameraConfig, mean_e: Floats) -> Callable[[], Any] | None:
     """The same chain in getframes: PRNU, dark current and its spread, hot pixels, shot and read noise, converter."""
     if importlib.util.find_spec("getframes") is None:
         return None
@@ -175,7 +177,7 @@ def sky_frame() -> list[dict[str, Any]]:
     return [result, verdict("the same, in ms", result["value"], "ms", "most wanted", 5.0)]
 
 
-def galsim(lens: Camera, sources: Sources, electrons: Floats) -> Callable[[], Any] | None:
+def galsim(lens: CameraConfig, sources: Sources, electrons: Floats) -> Callable[[], Any] | None:
     """The same stars drawn by GalSim on stamps of its own choice, and its CCDNoise."""
     if importlib.util.find_spec("galsim") is None:
         return None
@@ -221,7 +223,7 @@ def growth() -> list[dict[str, Any]]:
     """Time against stars beyond 500 is a line, against area it is level but for the noise; memory in frames."""
     few, many = camera(1024, 1024, 3000.0, 0.8), camera(2048, 2048, 3000.0, 0.8)
 
-    def drawing(lens: Camera, count: int) -> Callable[[], Any]:
+    def drawing(lens: CameraConfig, count: int) -> Callable[[], Any]:
         image, optics = np.zeros((lens.height_px, lens.width_px), np.float32), square_metre(lens)
         sources, path = lights(lens, count, np.full(count, 1e4)), turning(0.0)
         return lambda: render(image, sources, optics, path, AT_CENTRE, Window(0.0, EXPOSURE_S))

@@ -17,15 +17,16 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from estimator import catalog
-from estimator.attitude import quest
-from estimator.camera import Camera
-from estimator.stages import Settings
-from estimator.tracker import StarTracker
-from estimator.types import Centroids, Ints
-from skysim import catalogue
-from skysim.quantity import ARCSEC_RAD
-from skysim.scene import CATALOGUES
+from estimator.attitude.solvers import quest
+from estimator.catalog import catalog
+from estimator.core.arrays import Ints
+from estimator.core.camera import Camera
+from estimator.core.types import Centroids
+from estimator.trackers.pipeline import Settings
+from estimator.trackers.star_tracker import StarTracker
+from skysim.core.paths import CATALOGUES
+from skysim.core.units import ARCSEC_RAD
+from skysim.sources import catalog as star_catalog
 
 WRONG_RAD = np.radians(10 / 60)
 DOUBLES_RAD = 30 * ARCSEC_RAD
@@ -85,7 +86,7 @@ def sky(limit_mag: float) -> catalog.StarList:
     """The stars of a row. Builds the deeper catalogue where the repository's does not reach."""
     path = CATALOGUES / f"{DEEP}.ecsv"
     if not path.is_file():
-        catalogue.build(7.5, path)
+        star_catalog.build(7.5, path)
     stars = catalog.brighter(catalog.read(path), limit_mag)
     near = cKDTree(stars.vectors).query_pairs(2 * np.sin(DOUBLES_RAD / 2), output_type="ndarray")
     fainter = near.max(axis=1)  # rows are by growing magnitude

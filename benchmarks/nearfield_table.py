@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from estimator.camera import Camera
-from estimator.nearfield import SOLVERS, LedMap, Lever, fitted_sigma_rad, on_surface, project
+from estimator.attitude.dome_map import LedMap, Lever, on_surface, project
+from estimator.attitude.nearfield import SOLVERS, fitted_sigma_rad
+from estimator.core.camera import Camera
 
 INCH_M = 0.0254
 NOISE_PX = 0.1

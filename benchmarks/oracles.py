@@ -28,15 +28,21 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from estimator.camera import Camera
-from skysim import guest, io, onboard, scene, simulate, tetratracker
-from skysim.metrics import WRONG_RAD
-from skysim.quantity import ARCSEC_RAD
-from skysim.scene import Scene
-from skysim.shutter import shoot
-from skysim.sky import C_M_S
-from skysim.trackers import Stars
-from skysim.types import Frame, Trajectory, Truth
+from estimator.core.camera import Camera
+from skysim.core.types import Frame, Trajectory, Truth
+from skysim.core.units import ARCSEC_RAD
+from skysim.results.files import frames as frame_files
+from skysim.results.metrics import WRONG_RAD
+from skysim.scene import loader
+from skysim.scene.scene import Scene
+from skysim.simulation import testbed
+from skysim.simulation.exposure import render_frame
+from skysim.sources.stars import C_M_S
+from skysim.tracking import onboard_model
+from skysim.tracking import settings as tracker_settings
+from skysim.tracking.external import adapter
+from skysim.tracking.external import tetra3rs as tetra3rs_tracker
+from skysim.tracking.external.interface import Stars
 
 # When the stars stood where the catalogue has them: the index files' Tycho-2, and Gaia, both without proper motions.
 EPOCHS = {"astrometry.net": "2000-01-01T12:00:00", "tetra3rs": "2016-01-01T12:00:00"}
@@ -138,16 +144,16 @@ Pair = tuple[Agreement, Agreement]  # by the oracle's own world coordinates, and
 def load(name: str, who: str, frames: int) -> Scene:
     """A scene of SCENES at rest, of so many frames, taken in the epoch of that oracle's catalogue."""
     keys = SCENES[name] | {"start_time": EPOCHS[who], "exposure.frames": str(frames)}
-    return scene.load(name.split(",")[0], keys)
+    return loader.load(name.split(",")[0], keys)
 
 
 def photographs(told: Scene, seed: int) -> Iterator[tuple[Frame, Truth]]:
     """A scene's frames, each at an attitude of its own, uniform over all rotations, and at rest."""
-    lab = simulate.furnish(told)
+    lab = testbed.build_testbed(told)
     for n in range(told.exposure.frames):
         cam_from_icrs = Rotation.random(rng=np.random.default_rng([seed, n]))
         still = Trajectory.at_rest(cam_from_icrs.inv() * lab.mount.cam_from_body, lab.flown_s)
-        yield shoot(replace(lab, trajectory=still), n)
+        yield render_frame(replace(lab, trajectory=still), n)
 
 
 def lattice(width_px: int, height_px: int) -> NDArray:
@@ -273,7 +279,7 @@ def astrometry_net(name: str) -> Solve | None:
     if not (shutil.which("solve-field") and list(Path("/usr/share/astrometry").glob("index-*"))):
         return None
     camera = load(name, "astrometry.net", 1).camera
-    width_deg = float(np.degrees(onboard.calibration(camera).fov_rad))
+    width_deg = float(np.degrees(onboard_model.calibration(camera).fov_rad))
     size_px, order = (camera.width_px, camera.height_px), TWEAK_ORDER[name]
     options = ["--overwrite", "--no-plots", "--no-verify", "--crpix-center", "--cpulimit", "30"]
     options += ["--scale-units", "degwidth", "--scale-low", f"{0.95 * width_deg}"]
@@ -304,9 +310,11 @@ def tetra3rs(name: str) -> Solve | None:
     if importlib.util.find_spec("tetra3rs") is None:
         return None
     told = load(name, "tetra3rs", 1)
-    camera, settings = onboard.believed_camera(told), onboard.believed_settings(told)
+    camera, settings = onboard_model.believed_camera(told), tracker_settings.believed_settings(told)
     nothing = np.zeros(0)
-    tracker = tetratracker.Tetra3rs(guest.set_up(told, camera, settings, Stars(nothing, nothing, nothing)))
+    tracker = tetra3rs_tracker.Tetra3rs(
+        adapter.set_up(told, camera, settings, Stars(nothing, nothing, nothing))
+    )
     pixels = lattice(camera.width_px, camera.height_px) - tracker.middle_px
 
     def solve(path: Path, frame: Frame) -> Found | None:
@@ -323,7 +331,7 @@ def tetra3rs(name: str) -> Solve | None:
 
 
 def its_stars(
-    tracker: tetratracker.Tetra3rs, centroids: Sequence[Any], answer: Any
+    tracker: tetra3rs_tracker.Tetra3rs, centroids: Sequence[Any], answer: Any
 ) -> tuple[NDArray, NDArray, NDArray, NDArray]:
     """All of tetra3rs's centroids that are stars of its catalogue: the last four fields of Found.
 
@@ -353,11 +361,11 @@ def confront(name: str, who: str, oracle: Solve, frames: int, seed: int) -> list
     for frame, truth in photographs(told, seed):
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "frame.fits"
-            io.write_fits(path, frame, truth, told)
+            frame_files.write_fits(path, frame, truth, told)
             found = oracle(path, frame)
             if found:
                 seen.append(sighting(frame, truth, fits.getheader(path), found))
-    return agreements(seen, onboard.calibration(told.camera))
+    return agreements(seen, onboard_model.calibration(told.camera))
 
 
 def squares(solved: Sequence[Agreement]) -> NDArray:

@@ -16,15 +16,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.dome_identify import TILT_DEG, Case, trial
-from estimator.camera import Camera
-from estimator.ledmap import LedMap, Lever
-from estimator.ledsight import sight_of
-from skysim import lamp, layout, optimise, scene, simulate, turninfo
-from skysim.onboard import calibration
-from skysim.photometry import Band
-from skysim.quantity import ARCSEC_RAD
-from skysim.surface import surface
-from skysim.types import Floats
+from estimator.attitude.dome_map import LedMap, Lever
+from estimator.core.camera import Camera
+from estimator.identification.leds.index import sight_of
+from skysim.core.types import Floats
+from skysim.core.units import ARCSEC_RAD
+from skysim.scene import leds as led_schema
+from skysim.scene import loader
+from skysim.scene.light import DomeConfig
+from skysim.simulation import testbed
+from skysim.sources.dome import layout
+from skysim.sources.dome.placement import fisher, optimize
+from skysim.sources.dome.surface import Inside, build_surface
+from skysim.sources.photometry import Band
+from skysim.tracking.onboard_model import calibration
 
 Ints = NDArray[np.int64]
 
@@ -41,11 +46,11 @@ KINDS = ("patch boards", "Fibonacci", "Poisson disc", "optimised")
 class Bench:
     """The dome's inside, what looks at it, and how far from the zenith it sees LEDs: from the scene."""
 
-    inside: layout.Inside
+    inside: Inside
     camera: Camera
     lever: Lever
-    boards: lamp.PatchBoards
-    led: lamp.Led
+    boards: led_schema.PatchBoardsConfig
+    led: led_schema.LedConfig
     band: Band
     cap_deg: float
 
@@ -77,21 +82,21 @@ class Row:
 
 def bench() -> Bench:
     """AFIT's SimSat as its scene has it."""
-    lab = simulate.furnish(scene.load("afit_simsat"))
+    lab = testbed.build_testbed(loader.load("afit_simsat"))
     light, camera = lab.scene.light, calibration(lab.scene.camera)
     lever = Lever(np.array(lab.mount.camera_body_m), lab.mount.cam_from_body)
-    assert isinstance(light, scene.Dome)
-    assert isinstance(light.layout, lamp.PatchBoards)
-    inside = surface(light.surface)
+    assert isinstance(light, DomeConfig)
+    assert isinstance(light.layout, led_schema.PatchBoardsConfig)
+    inside = build_surface(light.surface)
     known = Bench(inside, camera, lever, light.layout, light.led, lab.band, 40.0)
-    reach_deg = float(np.degrees(optimise.reach_rad(wish(known, 3, 0), inside)))
+    reach_deg = float(np.degrees(optimize.reach_rad(wish(known, 3, 0), inside)))
     return Bench(inside, camera, lever, light.layout, light.led, lab.band, reach_deg)
 
 
-def wish(of: Bench, count: int, seed: int) -> lamp.Optimised:
+def wish(of: Bench, count: int, seed: int) -> led_schema.OptimisedConfig:
     """The optimiser's part of a scene; everything it may leave out is left out."""
     half = np.array([of.camera.width_px, of.camera.height_px]) / 2 / of.camera.focal_px
-    return lamp.Optimised.model_validate(
+    return led_schema.OptimisedConfig.model_validate(
         {
             "kind": "optimised",
             "cap_deg": of.cap_deg,
@@ -108,11 +113,11 @@ def wish(of: Bench, count: int, seed: int) -> lamp.Optimised:
 def leds(of: Bench, kind: str, count: int, seed: int) -> tuple[Floats, Ints | None]:
     """(count, 3) LEDs, m, and which board each sits on. Boards and discs are a few too many, and some are left out."""
     cap = {"cap_deg": of.cap_deg, "hardware_seed": seed}
-    parts: list[lamp.Layout] = []
+    parts: list[led_schema.Layout] = []
     if kind == "optimised":
         parts = [wish(of, count, seed)]
     elif kind == "Fibonacci":
-        parts = [lamp.Fibonacci.model_validate({"kind": "fibonacci", "count": count} | cap)]
+        parts = [led_schema.FibonacciConfig.model_validate({"kind": "fibonacci", "count": count} | cap)]
     area_m2 = 2 * np.pi * np.square(of.inside.meet(np.zeros(3), np.eye(3)[2:])[0, 2])
     each_m2 = area_m2 * (1 - np.cos(np.radians(of.cap_deg))) / count
     for more in np.linspace(1.0, 1.5, 51) if not parts else ():
@@ -121,7 +126,7 @@ def leds(of: Bench, kind: str, count: int, seed: int) -> tuple[Floats, Ints | No
             parts.append(of.boards.model_copy(update=cap | {"spacing_m": spacing_m}))
         else:
             disc = {"kind": "poisson_disc", "spacing": f"{np.sqrt(0.66 * each_m2 / more)} m"}
-            parts.append(lamp.PoissonDisc.model_validate(disc | cap))
+            parts.append(led_schema.PoissonDiscConfig.model_validate(disc | cap))
     lit = (layout.LAYOUTS[part.kind](part, of.inside, of.led, of.band) for part in parts)
     sources = next(some for some in lit if len(some) >= count)
     kept = np.sort(np.random.default_rng(seed).permutation(len(sources))[:count])
@@ -134,8 +139,8 @@ def sigmas_arcsec(of: Bench, place_m: Floats) -> tuple[Floats, Floats, Floats]:
     The covariance of the rotation-only solve at the truth, (sum_i J_i'J_i)^-1 sigma^2; body z is the boresight.
     """
     part = wish(of, len(place_m), 0)
-    fresh = optimise.attitudes(part, FRESH, np.random.default_rng(SEEN_BY_CHANCE))
-    total = turninfo.told(place_m, fresh, *optimise.camera(part))
+    fresh = optimize.attitudes(part, FRESH, np.random.default_rng(SEEN_BY_CHANCE))
+    total = fisher.told(place_m, fresh, *optimize.camera(part))
     solved, variance = total[:, 6] >= 2, np.full((FRESH, 3), np.inf)
     matrix = total[solved][:, [0, 3, 4, 3, 1, 5, 4, 5, 2]].reshape(-1, 3, 3)
     variance[solved] = np.linalg.inv(matrix).diagonal(axis1=1, axis2=2)
@@ -167,7 +172,7 @@ def row(of: Bench, kind: str, count: int, seed: int, frames: int) -> Row:
     place_m, board = leds(of, kind, count, seed)
     made_s = time.process_time() - begin
     roll, cross, seen = sigmas_arcsec(of, place_m)
-    like, came = optimise.alike(wish(of, count, seed), place_m), verdicts(of, place_m, board, frames, seed)
+    like, came = optimize.alike(wish(of, count, seed), place_m), verdicts(of, place_m, board, frames, seed)
     return Row(
         kind,
         count,

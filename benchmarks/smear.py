@@ -15,14 +15,16 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from estimator import catalog, shefexcat
-from estimator.stages import Settings
-from estimator.tracker import StarTracker
-from estimator.types import BadImage
-from skysim import simulate
-from skysim.onboard import calibration
-from skysim.scene import CATALOGUES, load
-from skysim.types import Frame, Trajectory
+from estimator.catalog import catalog, shefex
+from estimator.core.errors import ImageError
+from estimator.trackers.pipeline import Settings
+from estimator.trackers.star_tracker import StarTracker
+from skysim.core.paths import CATALOGUES
+from skysim.core.types import Frame, Trajectory
+from skysim.scene.loader import load
+from skysim.simulation import exposure, testbed
+from skysim.simulation.testbed import Testbed
+from skysim.tracking.onboard_model import calibration
 
 RATES_DEG_S = (0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0)
 WRONG_RAD = np.radians(10 / 60)
@@ -33,7 +35,7 @@ Streak = tuple[float, float] | None
 
 
 def frames(
-    lab: simulate.Lab, rate_deg_s: float, count: int, seed: int
+    lab: Testbed, rate_deg_s: float, count: int, seed: int
 ) -> Iterator[tuple[Frame, Rotation, Streak]]:
     """Frames at random attitudes, each turning about a random axis across the boresight; cam_from_icrs, streak."""
     for n in range(count):
@@ -45,7 +47,7 @@ def frames(
         lab_from_body = cam_from_icrs.inv() * lab.mount.cam_from_body
         rate_body = lab.mount.cam_from_body.inv().apply(rate_cam)
         trajectory = Trajectory(t_s, lab_from_body, np.tile(rate_body, (len(t_s), 1)))
-        frame, truth = simulate.shoot(replace(lab, trajectory=trajectory), n)
+        frame, truth = exposure.render_frame(replace(lab, trajectory=trajectory), n)
         yield frame, truth.cam_from_lab, streak_of(rate_cam, lab)
 
 
@@ -57,7 +59,7 @@ def southern(rng: np.random.Generator) -> Rotation:
             return cam_from_icrs
 
 
-def streak_of(rate_cam_rad_s: np.ndarray, lab: simulate.Lab) -> tuple[float, float]:
+def streak_of(rate_cam_rad_s: np.ndarray, lab: Testbed) -> tuple[float, float]:
     """How far stars in the middle move: d(x / z)/dt = -w_y, d(y / z)/dt = w_x."""
     reach_px = lab.scene.exposure.time_s * lab.scene.camera.focal_px
     return -rate_cam_rad_s[1] * reach_px, rate_cam_rad_s[0] * reach_px
@@ -67,18 +69,18 @@ def solved(tracker: StarTracker, frame: Frame, truth: Rotation, streak_px: Strea
     """Whether a frame is solved rightly, and wrongly."""
     try:
         answer = tracker.solve(frame.image_dn, streak_px).attitude.cam_from_ref
-    except BadImage:
+    except ImageError:
         return False, False
     right = answer is not None and (answer * truth.inv()).magnitude() < WRONG_RAD
     return right, answer is not None and not right
 
 
-def chains(lab: simulate.Lab) -> dict[str, StarTracker]:
+def chains(lab: Testbed) -> dict[str, StarTracker]:
     """The paper's chain with its chosen catalogue, and the default one with the paper's limit of magnitude."""
     camera, scene = calibration(lab.scene.camera), lab.scene
     stars = catalog.read(CATALOGUES / "hipparcos_hp6.5.ecsv")
     observer = catalog.on_earth(scene.start_time)
-    theirs = shefexcat.chosen(stars)
+    theirs = shefex.chosen(stars)
     ours = catalog.brighter(stars, scene.tracker.limit_mag)
     gain = scene.camera.detector.gain_e_dn
     paper = Settings(
@@ -101,7 +103,7 @@ def chains(lab: simulate.Lab) -> dict[str, StarTracker]:
 def measure(count: int, seed: int) -> Iterator[str]:
     """A line a rate."""
     told = {"exposure.time": "50 ms", "exposure.first": "0 s", "exposure.frames": str(count)}
-    lab = simulate.furnish(load("shefex2", told))
+    lab = testbed.build_testbed(load("shefex2", told))
     trackers = chains(lab)
     for rate in RATES_DEG_S:
         score = {name: np.zeros(2, int) for name in trackers}

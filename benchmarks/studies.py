@@ -15,10 +15,11 @@ from typing import Any
 import numpy as np
 
 from benchmarks.timing import verdict
-from skysim.study import engines, plan, runner, store
-from skysim.study.engines import Chunks, Pool
-from skysim.study.plan import Recipe
-from skysim.study.trials import Row
+from skysim.experiments.study import loader, store
+from skysim.experiments.study.execution import engines, runner
+from skysim.experiments.study.execution.engines import Chunks, Pool
+from skysim.experiments.study.plan import Recipe
+from skysim.experiments.study.trials import Row
 
 STUDY = """
 schema: 1
@@ -77,7 +78,7 @@ def spent(asked: dict[str, Any], workers: int) -> Spent:
         path = Path(folder) / "study.yaml"
         path.write_text(STUDY.format(**asked))
         clocked, begin = Clocked(engines.Pool(workers)), time.perf_counter()
-        told = plan.load(path)
+        told = loader.load(path)
         with store.writing(path.with_suffix(".sqlite")) as kept:
             runner.begin(told, kept, False)
             progress = runner.run(told, kept, clocked)

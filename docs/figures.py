@@ -12,11 +12,15 @@ import matplotlib.pyplot as plt
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from skysim import scene, sky, surface, world
-from skysim.catalogue import read
-from skysim.optics import Optics
-from skysim.render import Window, render
-from skysim.types import Floats, Mount, Sources, Trajectory
+from skysim.camera.optics import Optics
+from skysim.camera.render import Window, render
+from skysim.core.types import Floats, Mount, Sources, Trajectory
+from skysim.dynamics import multibody
+from skysim.scene import loader
+from skysim.scene.camera import CameraConfig
+from skysim.sources import stars as star_sources
+from skysim.sources.catalog import read
+from skysim.sources.dome import surface
 
 mpl.rcParams.update(
     {"svg.fonttype": "none", "svg.hashsalt": "skysim", "font.family": "sans-serif", "font.size": 11}
@@ -35,7 +39,7 @@ ORION = {
 
 def axes(path: Path) -> None:
     """Lab, body and camera axes of SimSat, yawed by 30 and rolled by 20 degrees."""
-    mount = world.mount(world.build(scene.load("afit_simsat").vehicle))
+    mount = multibody.mount(multibody.build(loader.load("afit_simsat").vehicle))
     lab_from_body = Rotation.from_euler("ZYX", [30, 0, 20], degrees=True)
     lab_from_cam = lab_from_body * mount.cam_from_body.inv()
     camera_m = lab_from_body.apply(mount.camera_body_m)
@@ -93,7 +97,7 @@ def chip() -> Optics:
         "focal_length": "10 mm",
         "f_number": 2,
     }
-    return Optics.of(scene.Camera.model_validate(part | {"detector": detector}))
+    return Optics.of(CameraConfig.model_validate(part | {"detector": detector}))
 
 
 def pixels(path: Path) -> None:
@@ -162,13 +166,13 @@ def pixels(path: Path) -> None:
 def roll(path: Path) -> None:
     """Orion at roll 0 and at roll 30, in the image, with north, east and the image's up."""
     stars = read("hipparcos_hp6.5")
-    camera = scene.load("shefex2", {"camera.focal_length": "14 mm"}).camera
+    camera = loader.load("shefex2", {"camera.focal_length": "14 mm"}).camera
     optics = Optics.of(camera)
     rows = [int(np.flatnonzero(stars.hip == number)[0]) for number in ORION.values()]
     toward = unit(stars.ra_rad, stars.dec_rad)
     fig, both = plt.subplots(1, 2, figsize=(9.2, 3.9), layout="constrained")
     for ax, roll_deg in zip(both, (0, 30), strict=True):
-        look = sky.cam_from_icrs(84.0, 0.0, roll_deg)
+        look = star_sources.cam_from_icrs(84.0, 0.0, roll_deg)
         xy = optics.project(look.apply(toward))
         shown = (stars.v_mag < 5) & (np.abs(xy - camera.centre_px) < camera.centre_px).all(axis=1)
         ax.scatter(*xy[shown].T, s=2 + 6 * (5 - stars.v_mag[shown]) ** 1.3, color=INK, linewidths=0)
@@ -216,9 +220,9 @@ def unit(ra_rad: Floats, dec_rad: Floats) -> Floats:
 
 def lever(path: Path) -> None:
     """AFIT's measured dome from the side, the vehicle level and rolled by 20 degrees: why LEDs are no stars."""
-    afit = scene.load("afit_simsat")
-    dome = surface.surface(afit.light.surface)
-    mount = world.mount(world.build(afit.vehicle))
+    afit = loader.load("afit_simsat")
+    dome = surface.build_surface(afit.light.surface)
+    mount = multibody.mount(multibody.build(afit.vehicle))
     fig, ax = plt.subplots(figsize=(9.0, 4.6))
     tilts = np.radians(np.linspace(-60, 60, 241))
     along = np.column_stack([0 * tilts, np.sin(tilts), np.cos(tilts)])

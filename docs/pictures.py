@@ -7,8 +7,11 @@ from pathlib import Path
 
 import cv2
 
-from skysim import flightlog, io, report, scene, simulate
-from skysim.world.picture import picture
+from skysim.core import files
+from skysim.dynamics.multibody.view.picture import picture
+from skysim.results import report, telemetry_report
+from skysim.scene import loader
+from skysim.simulation import exposure, run, testbed
 
 DOCS = Path(__file__).parent
 OUT = DOCS.parent / "out"
@@ -23,8 +26,8 @@ def frame(rate_deg_s: float):  # type: ignore[no-untyped-def]
         "motion.rate_deg_s": f"[0, {rate_deg_s}, 0]",
         "exposure": "{time: 50 ms, rate_hz: 10, frames: 1, first: 0 s}",
     }
-    loaded = scene.load("shefex2", overrides)
-    return simulate.shoot(simulate.prepare(loaded), 0)
+    loaded = loader.load("shefex2", overrides)
+    return exposure.render_frame(run.prepare(loaded), 0)
 
 
 def main() -> None:
@@ -32,18 +35,18 @@ def main() -> None:
         annotated = cv2.imread(str(OUT / scene_name / "annotated.png"))
         width = 1200
         size = (width, round(width * annotated.shape[0] / annotated.shape[1]))
-        io.write_image(DOCS / f"{name}.jpg", cv2.resize(annotated, size, interpolation=cv2.INTER_AREA))
-    lab = simulate.prepare(scene.load("simsat_slew"))
-    drawn = picture(simulate.staged(lab), lab.log.joints[700])
-    io.write_image(DOCS / "lab.jpg", drawn[:, :, ::-1])
-    (DOCS / "bump.png").write_bytes(flightlog.figure(simulate.prepare(scene.load("simsat_bump")).log))
+        files.write_image(DOCS / f"{name}.jpg", cv2.resize(annotated, size, interpolation=cv2.INTER_AREA))
+    lab = run.prepare(loader.load("simsat_slew"))
+    drawn = picture(testbed.staged(lab), lab.log.joints[700])
+    files.write_image(DOCS / "lab.jpg", drawn[:, :, ::-1])
+    (DOCS / "bump.png").write_bytes(telemetry_report.figure(run.prepare(loader.load("simsat_bump")).log))
     shots = [frame(rate) for rate in RATES_DEG_S]
     captions = [
         f"{rate} deg/s, {truth.seen.streak_px.max():.1f} px"
         for rate, (_, truth) in zip(RATES_DEG_S, shots, strict=True)
     ]
     sheet = report.contact_sheet([shot.image_dn[WINDOW] for shot, _ in shots], captions, scale=3)
-    io.write_image(DOCS / "smear.png", sheet)
+    files.write_image(DOCS / "smear.png", sheet)
     pages()
 
 

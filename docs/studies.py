@@ -9,11 +9,15 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-from skysim.study import arrange, pictures, search, sensitivity, store, table
-from skysim.study.commands import STORE, total
-from skysim.study.plan import STUDIES, Curve, Figure, Plan, load
-from skysim.study.store import Store
-from skysim.study.table import Line
+from skysim.apps.cli.commands.study import total
+from skysim.experiments.study import store
+from skysim.experiments.study.analysis import search, sensitivity, table
+from skysim.experiments.study.analysis.table import Line
+from skysim.experiments.study.loader import load
+from skysim.experiments.study.plan import STUDIES, Curve, Figure, Plan
+from skysim.experiments.study.report import figures as study_figures
+from skysim.experiments.study.report import layout
+from skysim.experiments.study.store import STORE, Store
 
 PAGES = Path(__file__).parent / "studies"
 MOST = 72  # lines of a table that is printed whole
@@ -58,8 +62,8 @@ def page(told: Plan, kept: Store) -> Iterator[str]:
         yield from budgeted(told, kept)
     for n, figure in enumerate(study.figures):
         picture = f"{name}_{n + 1}.png"
-        (PAGES / picture).write_bytes(pictures.figure_png(lines, figure, study))
-        yield f"![{figure.kind}]({picture})\n\n*{arrange.caption(figure, study, lines)}*\n"
+        (PAGES / picture).write_bytes(study_figures.figure_png(lines, figure, study))
+        yield f"![{figure.kind}]({picture})\n\n*{layout.caption(figure, study, lines)}*\n"
         yield from pivot(figure, lines, told)
     if len(lines) <= MOST and study.design.kind != "saltelli" and not study.optimise:
         yield from whole(lines)
@@ -67,18 +71,18 @@ def page(told: Plan, kept: Store) -> Iterator[str]:
 
 def pivot(figure: Figure, lines: list[Line], told: Plan) -> Iterator[str]:
     """A figure's numbers: its x across, the other factor down."""
-    across = arrange.axis(told.study, lines, figure.x)
+    across = layout.axis(told.study, lines, figure.x)
     other = figure.by if isinstance(figure, Curve) else figure.y
     name = figure.y if isinstance(figure, Curve) else figure.value
-    chosen = arrange.kept(lines, figure, told.study)
-    down = arrange.axis(told.study, lines, other) if other else None
+    chosen = layout.kept(lines, figure, told.study)
+    down = layout.axis(told.study, lines, other) if other else None
     yield markdown([f"{name}: {across.label}", *(across.told(one) for one in across.levels)])
     yield markdown(["---"] * (1 + len(across.levels)))
     for level in down.levels if down else [None]:
-        row = [line for line in chosen if other is None or arrange.same(line.levels[other], level)]
+        row = [line for line in chosen if other is None or layout.same(line.levels[other], level)]
         cells = [
             next(
-                table.figure(line.responses[name]) for line in row if arrange.same(line.levels[figure.x], one)
+                table.figure(line.responses[name]) for line in row if layout.same(line.levels[figure.x], one)
             )
             for one in across.levels
         ]
@@ -100,7 +104,7 @@ def budgeted(told: Plan, kept: Store) -> Iterator[str]:
     found = sensitivity.indices(told, kept)
     for response in sensitivity.AXES:
         picture = f"{told.name}_{response}.png"
-        (PAGES / picture).write_bytes(pictures.indices_png(found, response))
+        (PAGES / picture).write_bytes(study_figures.indices_png(found, response))
         yield f"![Sobol indices]({picture})\n"
         yield markdown([response, "alone, rms ″", "first-order index", "total index"])
         yield markdown(["---"] * 4)
@@ -116,11 +120,11 @@ def searched(told: Plan, kept: Store, lines: list[Line]) -> Iterator[str]:
     assert told.study.optimise is not None
     found = search.found(told, kept)
     costs = {one.number: one.cost for one in found.candidates}
-    panels = arrange.panels(lines, told.study.optimise, costs)
+    panels = layout.panels(lines, told.study.optimise, costs)
     names = [one.response for one in told.study.optimise.objectives]
     picture = f"{told.name}.png"
     points, front = [line.point for line in lines], [one.number for one in found.front]
-    drawn = pictures.pareto_png(panels[names[0]], panels[names[-1]], points, front)
+    drawn = study_figures.pareto_png(panels[names[0]], panels[names[-1]], points, front)
     (PAGES / picture).write_bytes(drawn)
     yield f"![Pareto front]({picture})\n"
     feasible = sum(one.feasible for one in found.candidates)

@@ -1,27 +1,28 @@
-"""A star tracker: from a frame alone to an attitude, or an honest refusal."""
+"""A star tracker: from a frame alone to an attitude, or a status that says why there is none.
+
+Numpy arrays and floats go in, dataclasses come out. The package imports neither skysim nor MuJoCo.
+"""
 
 from typing import Any
 
-
-class BadImage(ValueError):
-    """The image or the calibration cannot be used. The message is one line: what, and what is allowed."""
-
-
-# What most users need, by the room it lives in; loaded when it is asked for, so that importing the package is quick.
-_ROOMS = {
-    "Camera": "camera",
-    "Follower": "follow",
-    "Settings": "stages",
-    "StarTracker": "tracker",
-    "radecroll_rad": "attitude",
+# The public names and where they are defined; loaded on first use, so that `import estimator` is quick.
+_PUBLIC = {
+    "AttitudeFilter": ("filter.mekf", "Mekf"),
+    "Camera": ("core.camera", "Camera"),
+    "DomeTracker": ("trackers.dome_tracker", "DomeTracker"),
+    "ImageError": ("core.errors", "ImageError"),
+    "Settings": ("trackers.pipeline", "Settings"),
+    "StarTracker": ("trackers.star_tracker", "StarTracker"),
+    "TrackingMode": ("trackers.tracking_mode", "TrackingMode"),
+    "radecroll_rad": ("attitude.solvers", "radecroll_rad"),
 }
-__all__ = ["BadImage", *_ROOMS]
+__all__ = list(_PUBLIC)
 
 
 def __getattr__(name: str) -> Any:
-    """A name of `_ROOMS` from its room."""
-    if name not in _ROOMS:
+    if name not in _PUBLIC:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from importlib import import_module
 
-    return getattr(import_module(f"{__name__}.{_ROOMS[name]}"), name)
+    module, attribute = _PUBLIC[name]
+    return getattr(import_module(f"{__name__}.{module}"), attribute)

@@ -10,30 +10,26 @@ from functools import cache
 from io import BytesIO, TextIOWrapper
 from pathlib import Path
 
-from estimator import catalog, ptasecat
-from estimator.types import BadImage
-from skysim import (
-    calibration,
-    catalogue,
-    io,
-    layout,
-    photometry,
-    pointcloud,
-    psf,
-    quantity,
-    recording,
-    scene,
-    terminal,
-    trackers,
-    validate,
-    yamlfile,
-)
-from skysim.stream import packet
-from skysim.study import plan, store
-from skysim.types import BadInput
-from skysim.world import spec
+from estimator.catalog import catalog, ptase
+from estimator.core.errors import ImageError
+from skysim.apps.cli import terminal
+from skysim.apps.cli.commands import validate
+from skysim.apps.stream import packet
+from skysim.camera.psf import otf
+from skysim.core import images, units, yaml_reader
+from skysim.core.errors import InputError
+from skysim.dynamics.multibody import mjcf
+from skysim.experiments.study import loader as study_loader
+from skysim.experiments.study import store
+from skysim.results.files import recording
+from skysim.scene import loader, opencv_calibration
+from skysim.sources import catalog as star_catalog
+from skysim.sources import photometry
+from skysim.sources.dome import layout, point_cloud
+from skysim.tracking import dome_map_file
+from skysim.tracking.external import interface
 
-COLOUR = ptasecat.Colour(0.1, 0.2, 0.0)
+COLOUR = ptase.Colour(0.1, 0.2, 0.0)
 
 
 @cache
@@ -63,67 +59,67 @@ def refused(read: Callable[[], object], *ways: type[Exception]) -> bool:
 
 def scenes(data: bytes) -> None:
     path = written(data, "scene.yaml")
-    refused(lambda: scene.load(path), BadInput)
-    refused(lambda: scene.load_camera(path), BadInput)
+    refused(lambda: loader.load(path), InputError)
+    refused(lambda: loader.load_camera(path), InputError)
 
 
 def studies(data: bytes) -> None:
     path = written(data, "study.yaml")
-    refused(lambda: plan.load(path), BadInput)
+    refused(lambda: study_loader.load(path), InputError)
 
 
 def overrides(data: bytes) -> None:
     text = data.decode("utf-8", "replace")
-    refused(lambda: scene.load("shefex2", yamlfile.overridden(text.split("\n"))), BadInput)
+    refused(lambda: loader.load("shefex2", yaml_reader.overridden(text.split("\n"))), InputError)
 
 
 def fits(data: bytes) -> None:
     path = written(data, "frame.fits")
-    refused(lambda: io.monochrome(io.read_image(path)), BadInput)
-    io.date_of(path)
+    refused(lambda: images.monochrome(images.read_image(path)), InputError)
+    images.date_of(path)
 
 
 def pictures(data: bytes) -> None:
     path = written(data, "frame.png")
-    refused(lambda: io.monochrome(io.read_image(path)), BadInput)
+    refused(lambda: images.monochrome(images.read_image(path)), InputError)
 
 
 def catalogues(data: bytes) -> None:
     path = written(data, "stars.ecsv")
-    refused(lambda: catalogue.read(path), BadInput)
-    refused(lambda: catalog.read(path), BadImage)
-    refused(lambda: ptasecat.read_cat(path, 5.0, 2010.0, COLOUR), BadImage)
-    refused(lambda: validate.looked_at(path), BadInput)
+    refused(lambda: star_catalog.read(path), InputError)
+    refused(lambda: catalog.read(path), ImageError)
+    refused(lambda: ptase.read_cat(path, 5.0, 2010.0, COLOUR), ImageError)
+    refused(lambda: validate.looked_at(path), InputError)
 
 
 def maps(data: bytes) -> None:
     path = written(data, "map.ecsv")
-    refused(lambda: io.read_dome_map(path), BadInput)
+    refused(lambda: dome_map_file.read_dome_map(path), InputError)
 
 
 def truths(data: bytes) -> None:
     path = written(data, "frame_0000.ecsv")
-    refused(lambda: recording.truth(path), BadInput)
+    refused(lambda: recording.truth(path), InputError)
 
 
 def calibrations(data: bytes) -> None:
     path = written(data, "camera.yml")
-    calibration.is_one(path)
-    refused(lambda: calibration.read(path), BadInput)
+    opencv_calibration.is_one(path)
+    refused(lambda: opencv_calibration.read(path), InputError)
 
 
 def tables(data: bytes) -> None:
     """LEDs, points of a dome, a curve over the wavelength, a point-spread function."""
     path = written(data, "table.csv")
-    refused(lambda: layout.read_csv(path), BadInput)
-    refused(lambda: pointcloud.fit(pointcloud.read(str(path), "m"), 2, str(path)), BadInput)
-    refused(lambda: photometry._read.__wrapped__(path), BadInput)  # what is cached goes by the file's name
-    refused(lambda: psf.cells_of.__wrapped__(str(path)), BadInput)
+    refused(lambda: layout.read_csv(path), InputError)
+    refused(lambda: point_cloud.fit(point_cloud.read(str(path), "m"), 2, str(path)), InputError)
+    refused(lambda: photometry._read.__wrapped__(path), InputError)  # what is cached goes by the file's name
+    refused(lambda: otf.cells_of.__wrapped__(str(path)), InputError)
 
 
 def vehicles(data: bytes) -> None:
     path = written(data, "vehicle.xml")
-    refused(lambda: spec.compiled(spec.load(path), path), BadInput)
+    refused(lambda: mjcf.compiled(mjcf.load(path), path), InputError)
 
 
 def stores(data: bytes) -> None:
@@ -141,8 +137,8 @@ def stores(data: bytes) -> None:
 
     for beside in path.parent.glob(f"{path.name}-*"):  # a log of the file before
         beside.unlink()
-    refused(read, BadInput)
-    refused(resume, BadInput)
+    refused(read, InputError)
+    refused(resume, InputError)
 
 
 def answers(data: bytes) -> None:
@@ -152,7 +148,7 @@ def answers(data: bytes) -> None:
     except (ValueError, RecursionError):  # as `programs` has it
         return
     statuses: list[str] = []
-    if refused(lambda: statuses.append(trackers.checked(trackers.Answer.of_tree(told)).status), ValueError):
+    if refused(lambda: statuses.append(interface.checked(interface.Answer.of_tree(told)).status), ValueError):
         return
     with redirect_stdout(TextIOWrapper(BytesIO(), "utf-8")) as screen:
         terminal.print_table("", ["status"], [statuses])
@@ -163,12 +159,12 @@ def answers(data: bytes) -> None:
 
 
 def packets(data: bytes) -> None:
-    refused(lambda: packet.unpack(BytesIO(data)), BadInput)
+    refused(lambda: packet.unpack(BytesIO(data)), InputError)
 
 
 def quantities(data: bytes) -> None:
     text = data.decode("utf-8", "replace")
-    refused(lambda: quantity.quantity("m", "length", '"35 mm"')(text), ValueError)
+    refused(lambda: units.quantity("m", "length", '"35 mm"')(text), ValueError)
 
 
 TARGETS: dict[str, Callable[[bytes], None]] = {

@@ -1,5 +1,5 @@
 """`python -m skysim`."""
 
-from skysim.cli import main
+from skysim.apps.cli.main import main
 
 main()

@@ -8,18 +8,21 @@ import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 
-from estimator.attitude import radecroll_rad
-from estimator.camera import Camera
-from skysim import calibration, scene, world
-from skysim.optics import Optics
-from skysim.quantity import ROOT
-from skysim.render import Window, render
-from skysim.sky import cam_from_icrs
-from skysim.types import Mount, Sources, Trajectory
+from estimator.attitude.solvers import radecroll_rad
+from estimator.core.camera import Camera
+from skysim.camera.optics import Optics
+from skysim.camera.render import Window, render
+from skysim.core.paths import ROOT
+from skysim.core.types import Mount, Sources, Trajectory
+from skysim.dynamics import multibody
+from skysim.scene import opencv_calibration
+from skysim.scene.camera import CameraConfig
+from skysim.scene.vehicle import VehicleConfig
+from skysim.sources.stars import cam_from_icrs
 
 # A pinhole whose arithmetic can be done in the head: f = 1000 px, middle of the chip at (320, 240).
 OPTICS = Optics.of(
-    scene.Camera.model_validate(
+    CameraConfig.model_validate(
         {
             "width_px": 641,
             "height_px": 481,
@@ -162,22 +165,22 @@ def test_mujocos_camera_against_ours():
 
     MuJoCo's own camera (+y up, looks along -z) then has its x along lab x, y along lab -y, z along lab -z.
     """
-    vehicle = scene.Vehicle.model_validate({"model": "vehicles/simsat.xml"})
-    ship = world.build(vehicle)
+    vehicle = VehicleConfig.model_validate({"model": "vehicles/simsat.xml"})
+    ship = multibody.build(vehicle)
     data = mujoco.MjData(ship.model)
     mujoco.mj_forward(ship.model, data)
     axes = data.camera("star_camera").xmat.reshape(3, 3)
     np.testing.assert_allclose(axes, np.diag([1.0, -1.0, -1.0]), rtol=0, atol=EXACT)
-    mount = world.mount(ship)
+    mount = multibody.mount(ship)
     np.testing.assert_allclose(mount.camera_body_m, [0, 0, 0.381], rtol=0, atol=EXACT)
     np.testing.assert_allclose(mount.cam_from_body.as_matrix(), np.eye(3), rtol=0, atol=EXACT)
 
 
-def flown(parts: dict[str, object], motor: int, control: float) -> tuple[world.World, world.Flight]:
+def flown(parts: dict[str, object], motor: int, control: float) -> tuple[multibody.World, multibody.Flight]:
     """A second of SimSat, free and at rest, one of its motors at work."""
     given = {"model": "vehicles/simsat.xml", "mount": "free", "inertia": ["6 kg m2", "6.5 kg m2", "9 kg m2"]}
-    ship = world.build(scene.Vehicle.model_validate(given | parts))
-    flight = world.Flight(ship, Rotation.identity(), np.zeros(3), 1.0)
+    ship = multibody.build(VehicleConfig.model_validate(given | parts))
+    flight = multibody.Flight(ship, Rotation.identity(), np.zeros(3), 1.0)
     controls = np.zeros((1000, ship.model.nu))
     controls[:, motor] = control
     flight.advance(controls)
@@ -219,7 +222,7 @@ def test_a_tilt_moves_an_apex_led_the_way_worked_out_by_hand():
     Camera 0.381 m up a vehicle tilted by 10 deg stands at (0, -0.381 sin 10, 0.381 cos 10). The apex LED, 1.2192 m
     up, is seen in body axes at (0, 1.2192 sin 10, 1.2192 cos 10 - 0.381), so v = 1000 * .21171 / .81968 below.
     """
-    from estimator.nearfield import Lever, project
+    from estimator.attitude.dome_map import Lever, project
 
     body_from_lab = Rotation.from_euler("x", 10, degrees=True).inv()
     lever = Lever(np.array([0, 0, 0.381]), Rotation.identity())
@@ -239,4 +242,4 @@ def test_no_code_comes_out_of_data():
         if re.search(banned, line.partition("#")[0])
     ]
     assert found == []
-    assert issubclass(calibration.Loader, yaml.SafeLoader)
+    assert issubclass(opencv_calibration.Loader, yaml.SafeLoader)

@@ -7,26 +7,29 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from estimator.nearfield import project
-from skysim import scene, simulate, world
-from skysim.simulate import Lab
-from skysim.vehicle import Vehicle
+from estimator.attitude.dome_map import project
+from skysim.core.paths import SCENES
+from skysim.dynamics import multibody
+from skysim.scene import loader
+from skysim.scene.vehicle import VehicleConfig
+from skysim.simulation import exposure, run, testbed
+from skysim.simulation.testbed import Testbed
 
-NAMES = sorted(path.stem for path in scene.SCENES.glob("*.yaml"))
+NAMES = sorted(path.stem for path in SCENES.glob("*.yaml"))
 # What a published experiment shows instead of five sources and an attitude.
 PAIR, GRID = "afit_test2", "afit_test1"
 SHOWN = {PAIR: 2, GRID: 9}  # LEDs in its first frame
 # On its way from one pair to the next it sees none; Position 4 of Test 3 is beyond this field's short side.
 NOT_ALL_ALONG = {PAIR, "afit_test3"}
-MODELS = sorted(path.name for path in (scene.SCENES / "vehicles").glob("*.xml"))
+MODELS = sorted(path.name for path in (SCENES / "vehicles").glob("*.xml"))
 
 
-def prepared(name: str, frames: int, **overrides: str) -> Lab:
-    return simulate.prepare(scene.load(name, overrides | {"exposure.frames": str(frames)}))
+def prepared(name: str, frames: int, **overrides: str) -> Testbed:
+    return run.prepare(loader.load(name, overrides | {"exposure.frames": str(frames)}))
 
 
 @pytest.fixture(scope="module", params=NAMES)
-def lab(request: pytest.FixtureRequest) -> Lab:
+def lab(request: pytest.FixtureRequest) -> Testbed:
     return prepared(request.param, 2)
 
 
@@ -44,13 +47,13 @@ def test_there_are_scenes() -> None:
     assert flown | lit <= set(NAMES)
 
 
-def test_it_says_what_it_is(lab: Lab) -> None:
+def test_it_says_what_it_is(lab: Testbed) -> None:
     assert lab.scene.name in NAMES
     assert 10 < len(lab.scene.title) < 80
 
 
-def test_its_first_frame_shows_at_least_five_sources_or_what_was_published(lab: Lab) -> None:
-    frame, truth = simulate.shoot(lab, 0)
+def test_its_first_frame_shows_at_least_five_sources_or_what_was_published(lab: Testbed) -> None:
+    frame, truth = exposure.render_frame(lab, 0)
     camera, chip = lab.scene.camera, lab.scene.camera.detector
     assert frame.image_dn.shape == (camera.height_px, camera.width_px)
     above_noise = truth.seen.peak_e > 5 * np.hypot(chip.read_noise_e, np.sqrt(truth.seen.peak_e))
@@ -59,7 +62,7 @@ def test_its_first_frame_shows_at_least_five_sources_or_what_was_published(lab: 
     assert np.mean(frame.image_dn >= frame.saturation_dn) < 1e-3
 
 
-def test_its_light_is_on_the_frame(lab: Lab) -> None:
+def test_its_light_is_on_the_frame(lab: Testbed) -> None:
     """Sum above offset, dark and the chip's own pattern, against the truth's electrons, to five sigmas.
 
     Through a converter of 16 bits, finer than any read noise: a step four times the noise, as the LU205c's, swallows
@@ -75,7 +78,7 @@ def test_its_light_is_on_the_frame(lab: Lab) -> None:
     fine = {"bits": "16", "gain_e_dn": str(step_e), "offset_dn": str(offset_dn)}
     fine = {f"camera.detector.{key}": value for key, value in fine.items()}
     lab = prepared(lab.scene.name, 1, **fine)
-    frame, truth = simulate.shoot(lab, 0)
+    frame, truth = exposure.render_frame(lab, 0)
     part, chip, pixels = lab.scene.camera.detector, lab.chip, frame.image_dn.size
     assert lab.scene.background == ()
     pattern_e = chip.dark_e_s.sum(dtype=float) * frame.exposure_s
@@ -90,22 +93,22 @@ def test_its_light_is_on_the_frame(lab: Lab) -> None:
     assert abs(found_e - light_e.sum()) < 5 * np.sqrt(read + shot + uneven) + clipped_e
 
 
-def test_the_same_seed_gives_the_same_bytes_and_another_seed_others(lab: Lab) -> None:
-    name, image = lab.scene.name, simulate.shoot(lab, 0)[0].image_dn
-    again = simulate.shoot(prepared(name, 2), 0)[0].image_dn
-    other = simulate.shoot(prepared(name, 2, seed=str(lab.scene.seed + 1)), 0)[0].image_dn
+def test_the_same_seed_gives_the_same_bytes_and_another_seed_others(lab: Testbed) -> None:
+    name, image = lab.scene.name, exposure.render_frame(lab, 0)[0].image_dn
+    again = exposure.render_frame(prepared(name, 2), 0)[0].image_dn
+    other = exposure.render_frame(prepared(name, 2, seed=str(lab.scene.seed + 1)), 0)[0].image_dn
     assert image.tobytes() == again.tobytes()
     assert np.mean(image != other) > 0.1
 
 
-def test_a_frame_alone_is_the_frame_of_a_sequence(lab: Lab) -> None:
-    sequence = [shot.frame.image_dn for shot in simulate.run(lab, simulate.tracker(lab))]
-    alone, _ = simulate.shoot(prepared(lab.scene.name, 2), 1)
+def test_a_frame_alone_is_the_frame_of_a_sequence(lab: Testbed) -> None:
+    sequence = [shot.frame.image_dn for shot in run.run(lab, testbed.tracker(lab))]
+    alone, _ = exposure.render_frame(prepared(lab.scene.name, 2), 1)
     assert alone.image_dn.tobytes() == sequence[1].tobytes()
 
 
-def test_its_first_frames_are_solved_and_right(lab: Lab) -> None:
-    for shot in simulate.run(lab, simulate.tracker(lab)):
+def test_its_first_frames_are_solved_and_right(lab: Testbed) -> None:
+    for shot in run.run(lab, testbed.tracker(lab)):
         answer = shot.report.attitude
         if lab.scene.name in SHOWN:  # seen, each where it is, to half a pixel; two are no attitude
             found_px, seen_px = shot.report.centroids.xy_px, shot.truth.seen.xy_px
@@ -122,36 +125,36 @@ def test_its_first_frames_are_solved_and_right(lab: Lab) -> None:
 def test_a_square_of_equal_leds_is_never_solved_wrong() -> None:
     """AFIT's nine LEDs are their own picture after a quarter turn, but for 0.12 mm of glue: 1.3 px."""
     lab = prepared(GRID, 4)
-    for shot in simulate.run(lab, simulate.tracker(lab)):
+    for shot in run.run(lab, testbed.tracker(lab)):
         answer = shot.report.attitude
         if answer.solved:
             assert np.degrees((answer.cam_from_ref * shot.truth.cam_from_lab.inv()).magnitude()) < 10 / 60
 
 
-STEERED = [name for name in NAMES if scene.load(name).motion.control]
+STEERED = [name for name in NAMES if loader.load(name).motion.control]
 NO_EYES = {
     "simsat_bump": {"filter": "null", "motion.control.feedback": "truth"}
 }  # which would render and solve
 
 
 @pytest.fixture(scope="module", params=STEERED)
-def whole(request: pytest.FixtureRequest) -> Lab:
+def whole(request: pytest.FixtureRequest) -> Testbed:
     """A scene flown to its last frame, none of which is rendered."""
-    return simulate.prepare(scene.load(request.param, NO_EYES.get(request.param)))
+    return run.prepare(loader.load(request.param, NO_EYES.get(request.param)))
 
 
-def test_the_camera_sees_five_leds_all_along_the_manoeuvre(whole: Lab) -> None:
+def test_the_camera_sees_five_leds_all_along_the_manoeuvre(whole: Testbed) -> None:
     """In every frame, at geometry alone: what is on the chip, by the tracker's map."""
-    eyes, counts = simulate.tracker(whole), []
+    eyes, counts = testbed.tracker(whole), []
     for index in range(whole.scene.exposure.frames):
-        body_from_lab = whole.trajectory.at(simulate.window(whole.scene, index).open_s).inv()
+        body_from_lab = whole.trajectory.at(testbed.window(whole.scene, index).open_s).inv()
         pixels = project(body_from_lab, eyes.leds.position_m, eyes.lever, eyes.camera)
         counts.append(int(eyes.camera.contains(np.nan_to_num(pixels, nan=-1e9), 12).sum()))
     assert len(counts) >= 20
     assert min(counts) >= 5 or whole.scene.name in NOT_ALL_ALONG
 
 
-def test_it_is_steered_to_where_it_is_told_and_off_its_stop(whole: Lab) -> None:
+def test_it_is_steered_to_where_it_is_told_and_off_its_stop(whole: Testbed) -> None:
     telemetry = whole.telemetry
     assert telemetry is not None
     assert telemetry.lab_from_ref is not None
@@ -165,16 +168,16 @@ def test_it_is_steered_to_where_it_is_told_and_off_its_stop(whole: Lab) -> None:
 # --- the vehicles, at the hands of chance -------------------------------------------------------------------
 
 
-def at_random(vehicle: Vehicle, rate_body_rad_s: np.ndarray) -> world.Flight:
+def at_random(vehicle: VehicleConfig, rate_body_rad_s: np.ndarray) -> multibody.Flight:
     """A second of flight, every motor told something else each 10 ms, all over the range that it has.
 
     A vehicle's own motors have the range of their file. `Flight.check` raises where MuJoCo warned.
     """
-    ship, rng = world.build(vehicle), np.random.default_rng(7)
+    ship, rng = multibody.build(vehicle), np.random.default_rng(7)
     most = np.where(ship.model.actuator_ctrllimited, ship.model.actuator_ctrlrange[:, 1], 1.0)
     most[ship.torques] = vehicle.torque_limit_nm
     most[ship.gimbals.motor] = np.radians(vehicle.cmgs.gimbal_rate_limit_deg_s) if vehicle.cmgs else 0.0
-    flight = world.Flight(ship, Rotation.identity(), rate_body_rad_s, 1.0)
+    flight = multibody.Flight(ship, Rotation.identity(), rate_body_rad_s, 1.0)
     flight.advance(np.repeat(most * rng.uniform(-1, 1, (100, ship.model.nu)), 10, axis=0))
     flight.check()
     return flight
@@ -182,7 +185,7 @@ def at_random(vehicle: Vehicle, rate_body_rad_s: np.ndarray) -> world.Flight:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_second_of_random_control_makes_no_warning(name: str) -> None:
-    flight = at_random(scene.load(name).vehicle, np.zeros(3))
+    flight = at_random(loader.load(name).vehicle, np.zeros(3))
     assert flight.steps_left == 0
     assert np.isfinite(flight.states).all()
     assert np.linalg.norm(flight.rate_body_rad_s) > 1e-4  # it was moved
@@ -194,7 +197,7 @@ def test_a_second_of_random_control_of_all_that_a_vehicle_has_makes_no_warning(
     model: str, mount: str
 ) -> None:
     """At 1.1 rad/s and, on the bearing, against its stop; wheels at 3000 rpm and out of balance."""
-    spec = mujoco.MjSpec.from_file(str(scene.SCENES / "vehicles" / model))
+    spec = mujoco.MjSpec.from_file(str(SCENES / "vehicles" / model))
     named = [element.name for element in [*spec.joints, *spec.sites]]
     wheels = sum(name.startswith("wheel_") for name in named)
     parts = {
@@ -207,7 +210,7 @@ def test_a_second_of_random_control_of_all_that_a_vehicle_has_makes_no_warning(
     given = {"model": f"vehicles/{model}", "mount": mount}
     for prefix, part in parts.items():
         given |= part if any(name.startswith(prefix) for name in named) else {}
-    flight = at_random(Vehicle.model_validate(given), np.array([0.6, 0.5, 0.8]))
+    flight = at_random(VehicleConfig.model_validate(given), np.array([0.6, 0.5, 0.8]))
     assert flight.steps_left == 0
     assert np.isfinite(flight.states).all()
     assert flight.model.nu == 3 + sum(

@@ -8,8 +8,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from skysim import flightlog, scene, simulate
-from skysim.types import BadInput, Telemetry
+from skysim.core.errors import InputError
+from skysim.core.types import Telemetry
+from skysim.results import telemetry_report
+from skysim.scene import loader
+from skysim.simulation import run
 
 QUIET = "{time: 1 ms, rate_hz: 10, frames: 1, first: %s s}"
 
@@ -34,7 +37,7 @@ def test_a_blow_far_beyond_the_torque_s_reach_is_braked_and_the_vehicle_comes_ba
         "exposure": QUIET % 50,
         **more,
     }
-    log = simulate.prepare(scene.load("afit_simsat", overrides)).log
+    log = run.prepare(loader.load("afit_simsat", overrides)).log
     rate = np.degrees(np.linalg.norm(log.rate_body_rad_s, axis=1))
     assert rate.max() > 75
     assert off_deg(log.lab_from_ref, log)[-1] < 0.01
@@ -49,16 +52,16 @@ def test_steered_by_gyros_at_their_limit_the_vehicle_still_brakes() -> None:
         "motion.manoeuvre": "[{kind: bump, rate_deg_s: [0, 0, 60], duration: 40 ms}]",
         "exposure": QUIET % 40,
     }
-    log = simulate.prepare(scene.load("afit_simsat", overrides)).log
+    log = run.prepare(loader.load("afit_simsat", overrides)).log
     assert np.degrees(np.linalg.norm(log.rate_body_rad_s[-1])) < 0.05
 
 
 def test_a_manoeuvre_beyond_the_stop_is_refused_before_the_flight() -> None:
     overrides = {"motion.manoeuvre": "[{kind: slew, roll_deg: 45, rate_deg_s: 10}]", "exposure": QUIET % 20}
     with pytest.raises(
-        BadInput, match=r"motion.manoeuvre: asks for a tilt of 30\.\d deg at \d+\.\d+ s, beyond"
+        InputError, match=r"motion.manoeuvre: asks for a tilt of 30\.\d deg at \d+\.\d+ s, beyond"
     ):
-        simulate.prepare(scene.load("afit_simsat", overrides))
+        run.prepare(loader.load("afit_simsat", overrides))
 
 
 def test_what_cannot_be_stepped_is_told_in_one_line_and_leaves_no_file(
@@ -66,8 +69,8 @@ def test_what_cannot_be_stepped_is_told_in_one_line_and_leaves_no_file(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     overrides = {"vehicle.disturbances": "{cable: {stiffness: 1e8 N m / rad}}", "exposure": QUIET % 0.3}
-    with pytest.raises(BadInput, match="the flight cannot be stepped at 1 ms: MuJoCo warned before"):
-        simulate.prepare(scene.load("afit_simsat", overrides))
+    with pytest.raises(InputError, match="the flight cannot be stepped at 1 ms: MuJoCo warned before"):
+        run.prepare(loader.load("afit_simsat", overrides))
     assert not list(tmp_path.iterdir())
 
 
@@ -82,7 +85,7 @@ def test_the_gyros_apparent_bias_is_what_the_navigator_drifts_by() -> None:
         "vehicle.centre_of_mass": "[0 m, 0 m, 0 m]",
         "exposure": QUIET % 20,
     }
-    log = simulate.prepare(scene.load("afit_simsat", overrides)).log
+    log = run.prepare(loader.load("afit_simsat", overrides)).log
     assert log.lab_from_imu is not None
     assert log.bias_rad_s is not None
     off = (log.lab_from_imu * log.lab_from_body.inv()).as_rotvec()[-1]
@@ -93,5 +96,5 @@ def test_the_gyros_apparent_bias_is_what_the_navigator_drifts_by() -> None:
 
 def test_a_vehicle_of_one_tick_is_reported_too() -> None:
     overrides = {"vehicle.imu": "{}", "exposure": "{time: 1 ms, rate_hz: 10, frames: 1, first: 0 s}"}
-    lab = simulate.prepare(scene.load("afit_simsat", overrides))
-    assert flightlog.summary(lab.log)["gyro_saturated_s"] == 0
+    lab = run.prepare(loader.load("afit_simsat", overrides))
+    assert telemetry_report.summary(lab.log)["gyro_saturated_s"] == 0

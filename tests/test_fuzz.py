@@ -22,9 +22,12 @@ from hypothesis import strategies as some
 from benchmarks.hostilefiles import promise
 from fuzz.__main__ import NAMES, TOKENS, mutated, seeds
 from fuzz.targets import TARGETS, refused
-from skysim import io, layout, photometry, picturefile, pointcloud, scene, yamlfile
-from skysim.psf import cells_of
-from skysim.types import BadInput
+from skysim.camera.psf.otf import cells_of
+from skysim.core import images, yaml_reader
+from skysim.core.errors import InputError
+from skysim.scene import loader
+from skysim.sources import photometry
+from skysim.sources.dome import layout, point_cloud
 
 AS_IT_IS = settings(
     max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
@@ -114,41 +117,41 @@ def test_any_file_is_read_or_refused_in_one_line(name: str, examples: int) -> No
 )
 def test_yaml_that_is_more_than_it_seems_is_refused(tmp_path: Path, text: str, what: str) -> None:
     (tmp_path / "x.yaml").write_text(text)
-    with pytest.raises(BadInput, match=rf"x\.yaml, line \d: not YAML: .*{what}"):
-        yamlfile.read_yaml(tmp_path / "x.yaml")
+    with pytest.raises(InputError, match=rf"x\.yaml, line \d: not YAML: .*{what}"):
+        yaml_reader.read_yaml(tmp_path / "x.yaml")
 
 
 def test_yaml_keeps_aliases_and_merges(tmp_path: Path) -> None:
     text = "a: &a {b: 1, c: [2, 3]}\nd: {<<: *a, b: 4}\ne: *a\n"
-    _, values = yamlfile.composed(text)
+    _, values = yaml_reader.composed(text)
     assert values == {"a": {"b": 1, "c": [2, 3]}, "d": {"b": 4, "c": [2, 3]}, "e": {"b": 1, "c": [2, 3]}}
 
 
 def test_a_yaml_file_of_megabytes_is_refused_unread(tmp_path: Path) -> None:
-    (tmp_path / "x.yaml").write_bytes(b"#" * (yamlfile.MOST_BYTES + 1))
-    with pytest.raises(BadInput, match=f"{yamlfile.MOST_BYTES + 1} bytes; allowed: up to"):
-        yamlfile.read_yaml(tmp_path / "x.yaml")
+    (tmp_path / "x.yaml").write_bytes(b"#" * (yaml_reader.MOST_BYTES + 1))
+    with pytest.raises(InputError, match=f"{yaml_reader.MOST_BYTES + 1} bytes; allowed: up to"):
+        yaml_reader.read_yaml(tmp_path / "x.yaml")
 
 
 @pytest.mark.parametrize(
     "told", [{"exposure.frames": "1000000000"}, {"exposure.frames": "5000", "exposure.rate_hz": "0.01"}]
 )
 def test_a_flight_that_no_memory_holds_is_refused(told: dict[str, str]) -> None:
-    with pytest.raises(BadInput, match="allowed: up to 1000000, over a day"):
-        scene.load("shefex2", told)
+    with pytest.raises(InputError, match="allowed: up to 1000000, over a day"):
+        loader.load("shefex2", told)
 
 
 @settings(max_examples=8, deadline=None)
 @given(some.dictionaries(some.text(min_size=1, max_size=30), some.text(max_size=30), max_size=3))
 def test_any_override_is_taken_or_refused(told: dict[str, str]) -> None:
-    refused(lambda: scene.load("shefex2", told), BadInput)
+    refused(lambda: loader.load("shefex2", told), InputError)
 
 
 # Tables
 
 
 TABLES: dict[str, Callable[[Path], object]] = {
-    "a, b, c": lambda path: pointcloud.read(str(path), "m"),
+    "a, b, c": lambda path: point_cloud.read(str(path), "m"),
     "x_m,y_m,z_m,magnitude": layout.read_csv,
     "azimuth_deg,tilt_deg,level": layout.read_csv,
     "wavelength_nm,response": photometry._read,
@@ -166,7 +169,7 @@ def test_any_table_is_read_or_refused(
     """Points of a dome, LEDs, a quantum efficiency, a point-spread function."""
     path = tmp_path_factory.mktemp("table") / "x.csv"
     path.write_text("\n".join([head, *(",".join(map(str, row)) for row in rows)]), encoding="utf-8")
-    refused(lambda: TABLES[head](path), BadInput)
+    refused(lambda: TABLES[head](path), InputError)
 
 
 # Pictures that promise too much
@@ -177,26 +180,26 @@ def test_any_table_is_read_or_refused(
 def test_a_header_of_gigapixels_is_refused_by_itself(tmp_path: Path, suffix: str, side: int) -> None:
     path = tmp_path / f"x{suffix}"
     path.write_bytes(promise(suffix, side, side) + b"\0" * 999)
-    with pytest.raises(BadInput, match=r"\d+x\d+ pixels by its header; allowed: up to 268435456|truncated"):
-        io.read_image(path)
+    with pytest.raises(InputError, match=r"\d+x\d+ pixels by its header; allowed: up to 268435456|truncated"):
+        images.read_image(path)
 
 
 @pytest.mark.parametrize("suffix", [".png", ".bmp", ".tiff", ".jpg"])
 def test_sizes_are_read_as_opencv_writes_them(suffix: str, tmp_path: Path) -> None:
     data = cv2.imencode(suffix, np.zeros((30, 41), np.uint8))[1].tobytes()
-    read = next(told for magic, told in picturefile.FORMATS.items() if data.startswith(magic))
+    read = next(told for magic, told in images.FORMATS.items() if data.startswith(magic))
     assert list(read(data)) == [(41, 30)]
 
 
 def test_every_sample_of_a_tiff_s_pixels_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Four doubles a pixel are sixteen times what two bytes are."""
-    monkeypatch.setattr(picturefile, "MOST_PX", 30 * 41)
+    monkeypatch.setattr(images, "MOST_PX", 30 * 41)
     path, grey = tmp_path / "x.tiff", np.arange(30 * 41.0).reshape(30, 41)
     cv2.imwrite(str(path), grey)
-    assert np.array_equal(io.read_image(path), grey)
+    assert np.array_equal(images.read_image(path), grey)
     cv2.imwrite(str(path), np.dstack([grey] * 4))
-    with pytest.raises(BadInput, match="41x30x4 pixels by its header"):
-        io.read_image(path)
+    with pytest.raises(InputError, match="41x30x4 pixels by its header"):
+        images.read_image(path)
 
 
 @pytest.mark.parametrize("kind", [6, 8, 9, 17])
@@ -209,7 +212,7 @@ def test_a_tiff_s_sides_count_as_libtiff_reads_them(tmp_path: Path, kind: int) -
 
     sides = b"".join(entry(tag, of, value) for tag in (256, 257) for of, value in ((kind, side), (4, 2)))
     data = b"II" + struct.pack("<HHHQQ", 43, 8, 0, 16, 4) + sides
-    assert list(picturefile.tiff(data)) == [(side, side)]
+    assert list(images.tiff(data)) == [(side, side)]
 
 
 @pytest.mark.parametrize("between", [b"\xff\xd0", b"\xff\x01", b"\xff\x00"])
@@ -220,8 +223,8 @@ def test_no_mark_hides_a_jpeg_s_size(tmp_path: Path, between: bytes) -> None:
     great = small[2 : at + 5] + struct.pack(">HH", 17_000, 17_000) + small[at + 9 :]
     skipped = 4 + struct.unpack(">H", great[:2])[0]
     path.write_bytes((small[:2] + between + great).ljust(skipped, b"\0") + small[at:] + bytes(9))
-    with pytest.raises(BadInput, match=r"17000x17000 pixels by its header|cannot be decoded"):
-        io.read_image(path)
+    with pytest.raises(InputError, match=r"17000x17000 pixels by its header|cannot be decoded"):
+        images.read_image(path)
 
 
 @pytest.mark.parametrize("kind", ["stream", "tiles"])
@@ -238,8 +241,8 @@ def test_fits_that_unpacks_to_gigapixels_is_refused(tmp_path: Path, kind: str) -
             at = data.index(key.encode())
             data = data[: at + 10] + f"{of:20d}".encode() + data[at + 30 :]
         path.write_bytes(data)
-    with pytest.raises(BadInput, match=r"50000x40000 pixels by its header|not a whole FITS"):
-        io.read_image(path)
+    with pytest.raises(InputError, match=r"50000x40000 pixels by its header|not a whole FITS"):
+        images.read_image(path)
 
 
 @pytest.mark.parametrize("packer", [gzip, bz2, lzma])
@@ -247,12 +250,12 @@ def test_packed_fits_is_refused_before_it_is_unpacked(tmp_path: Path, packer: An
     """A header of blanks has no end: two gigabytes of them in some kilobytes took minutes, and all memory."""
     path = tmp_path / "x.fits"
     path.write_bytes(packer.compress(b"SIMPLE  =".ljust(1 << 20)))
-    with pytest.raises(BadInput, match="begins with SIMPLE, not packed"):
-        io.read_image(path)
-    assert io.date_of(path) is None
+    with pytest.raises(InputError, match="begins with SIMPLE, not packed"):
+        images.read_image(path)
+    assert images.date_of(path) is None
 
 
 def test_a_format_that_opencv_knows_and_nobody_asked_for_is_refused(tmp_path: Path) -> None:
     (tmp_path / "x.png").write_bytes(b"P5 2 2 255\n" + bytes(4))  # portable graymap
-    with pytest.raises(BadInput, match="cannot be decoded"):
-        io.read_image(tmp_path / "x.png")
+    with pytest.raises(InputError, match="cannot be decoded"):
+        images.read_image(tmp_path / "x.png")

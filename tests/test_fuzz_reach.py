@@ -14,7 +14,7 @@ import pytest
 
 from fuzz.__main__ import NAMES, seeds
 from fuzz.targets import TARGETS
-from skysim.quantity import ROOT
+from skysim.core.paths import ROOT
 
 SEEDS = 6  # of each target: its readers are reached by any
 READER = re.compile(r"((read|load|unpack|parse)(e?d)?(_\w+)?|of_tree)$")  # by its name, if it is public
@@ -28,28 +28,26 @@ OURS = "what skysim itself has written, for its own process or folder"
 SHIPPED = "a file that comes along, each of which a test reads"
 SOURCES = "reads bytes for their digest alone"
 OUT_OF_REACH = {
-    "skysim.commands.options.load": "hands a scene's name on to `scene.load`",
-    "skysim.detector.read_out": "a chip's electrons, no file",
-    "skysim.lab.export.files": "copies a run's files",
-    "skysim.lab.trialpanel.TrialPanel.file": OURS,
-    "skysim.lab.trials.monte_carlo": "values of the page's form, which `scene.load` has taken before",
-    "skysim.livecamera.LiveCamera.__init__": "a device, decoded by OpenCV; tests/test_solve.py",
-    "skysim.papers.ptase_ui.asked": OURS,
-    "skysim.papers.ptase_ui.drawn_at": OURS,
-    "skysim.papers.published.read": SHIPPED,
-    "skysim.photometry.stellar_sequence": SHIPPED,
-    "skysim.programs.Program.exchange": "needs a process; a line of it is target `answers`; tests/test_trackers.py",
-    "skysim.programs.Program.read": "the same line",
-    "skysim.report.write_page": "takes a picture of ours into a page",
-    "skysim.study.benches.code_version": SOURCES,
-    "skysim.study.benches.scene_hash": SOURCES,
-    "skysim.study.cluster.unpacked": OURS,
-    "skysim.study.runner.begin": "copies the study's text, which `plan.load` has read",
-    "skysim.trackerhost.main": OURS,
-    "skysim.trackerhost.picture": OURS,
-    "skysim.trackers.Setup.of_tree": OURS,
-    "skysim.world.picture.film": OURS,
-    "skysim.world.picture.paint": OURS,
+    "skysim.apps.cli.options.load": "hands a scene's name on to `scene.load`",
+    "skysim.camera.detector.detector.read_out": "a chip's electrons, no file",
+    "skysim.apps.gui.worker.export.files": "copies a run's files",
+    "skysim.apps.gui.page.panels.monte_carlo.TrialPanel.file": OURS,
+    "skysim.apps.gui.worker.study_process.monte_carlo": "values of the page's form, which `scene.load` has taken before",
+    "skysim.core.images.LiveCamera.__init__": "a device, decoded by OpenCV; tests/apps/test_plate_solver.py",
+    "skysim.experiments.papers.published.read": SHIPPED,
+    "skysim.sources.photometry.stellar_sequence": SHIPPED,
+    "skysim.tracking.external.process.Program.exchange": "needs a process; a line of it is target `answers`; tests/tracking/test_interface.py",
+    "skysim.tracking.external.process.Program.read": "the same line",
+    "skysim.results.report.write_page": "takes a picture of ours into a page",
+    "skysim.experiments.study.setups.code_version": SOURCES,
+    "skysim.experiments.study.setups.scene_hash": SOURCES,
+    "skysim.experiments.study.execution.dask_engine.unpacked": OURS,
+    "skysim.experiments.study.execution.runner.begin": "copies the study's text, which `plan.load` has read",
+    "skysim.tracking.external.host.main": OURS,
+    "skysim.tracking.external.host.picture": OURS,
+    "skysim.tracking.external.interface.Setup.of_tree": OURS,
+    "skysim.dynamics.multibody.view.picture.film": OURS,
+    "skysim.dynamics.multibody.view.picture.paint": OURS,
 }
 
 

@@ -15,9 +15,9 @@ import numpy as np
 import pytest
 from astropy.table import Table
 
-import estimator.compiled
-import skysim.compiled
-from skysim.quantity import ROOT
+import estimator.core.jit
+import skysim.core.jit
+from skysim.core.paths import ROOT
 
 SCENES = ("afit_simsat", "shefex2", "simsat_bump")
 # Seconds of wall clock stand in these, and in no other file.
@@ -51,7 +51,7 @@ def made(scene: str, out: Path, **environment: str) -> Path:
 def test_a_loop_is_compiled_alike_whoever_calls_it_first(package: Any) -> None:
     """A caller that raises for a division by zero and adds in any order has no say in what it calls."""
 
-    @package.compiled.jit(cache=False)
+    @package.core.jit.jit(cache=False)
     def lost(small: float) -> tuple[float, float]:
         return (1 + small) - 1, 1 / (small - small)
 
@@ -61,13 +61,13 @@ def test_a_loop_is_compiled_alike_whoever_calls_it_first(package: Any) -> None:
 
     assert caller(1e-30) == (0, np.inf)
     told = [path for path in Path(*package.__path__).rglob("*.py") if "njit" in path.read_text()]
-    assert told == [Path(package.compiled.__file__)]
+    assert told == [Path(package.core.jit.__file__)]
 
 
 LOOPS = """
-from skysim import notice
-notice.attended = {attended}
-from skysim.compiled import jit
+from skysim.core import errors
+errors.attended = {attended}
+from skysim.core.jit import jit
 @jit
 def one(x): return x + 1
 @jit

@@ -20,8 +20,12 @@ import pytest
 from astropy.io import fits
 from typer.testing import CliRunner
 
-from skysim import cli, export, io, recording, scene, simulate
-from skysim.types import BadInput
+from skysim.apps.cli import main
+from skysim.core import files
+from skysim.core.errors import InputError
+from skysim.results.files import export, frames, recording
+from skysim.scene import loader
+from skysim.simulation import run
 
 SKYSIM = [sys.executable, "-m", "skysim"]
 SMALL = ["--set", "light.limit_mag=5"]
@@ -74,9 +78,9 @@ def test_a_full_disk_is_named_and_what_was_written_is_whole(mounted: Path) -> No
 def flown(tmp_path_factory: pytest.TempPathFactory) -> recording.Recording:
     """Three frames with their truth."""
     folder = tmp_path_factory.mktemp("flown")
-    lab = simulate.prepare(scene.load("shefex2", {"exposure.frames": "3", "light.limit_mag": "5"}))
-    for frame, truth, _ in simulate.photographs(lab):
-        io.write_frame(folder, frame, truth, lab.scene)
+    lab = run.prepare(loader.load("shefex2", {"exposure.frames": "3", "light.limit_mag": "5"}))
+    for frame, truth, _ in run.render_frames(lab):
+        frames.write_frame(folder, frame, truth, lab.scene)
     return recording.recording(folder)
 
 
@@ -132,7 +136,7 @@ def test_a_film_that_lost_frames_is_refused(
                 self.film.write(image)
 
     monkeypatch.setattr("skysim.export.cv2.VideoWriter", type("F", (Forgetful,), {"fourcc": film.fourcc}))
-    with pytest.raises(BadInput, match=r"frames\.mp4: OpenCV wrote 2 of 3 frames"):
+    with pytest.raises(InputError, match=r"frames\.mp4: OpenCV wrote 2 of 3 frames"):
         export.export(flown, ["video"], tmp_path, lambda items, *_: iter(items))
     assert list(tmp_path.iterdir()) == []
 
@@ -140,7 +144,7 @@ def test_a_film_that_lost_frames_is_refused(
 def test_a_stream_without_room_names_the_file_and_counts_what_was_lost(tmp_path: Path) -> None:
     command = ["stream", "shefex2", "--folder", str(tmp_path), "--speed", "0", "--frames", "5", *SMALL]
     with no_room(100_000):
-        done = CliRunner().invoke(cli.app, [*command, "--json"])
+        done = CliRunner().invoke(main.app, [*command, "--json"])
     assert str(done.exception) == f"--folder: {tmp_path / 'frame_000000.png'}: File too large"
     told = json.loads(done.stdout)
     assert told["sinks"]["folder"]["dropped"] == told["made"] >= 1
@@ -153,7 +157,7 @@ def test_a_picture_without_room_names_file_and_reason(
 ) -> None:
     image = np.random.default_rng(1).integers(0, 255, (64, 64), np.uint8)
     with no_room(500), pytest.raises(OSError, match="File too large") as told:
-        io.write_image(tmp_path / f"a.{suffix}", image)
+        files.write_image(tmp_path / f"a.{suffix}", image)
     assert told.value.filename == str(tmp_path / f"a.{suffix}")
     assert list(tmp_path.iterdir()) == []
     assert capfd.readouterr().err == ""

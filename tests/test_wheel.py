@@ -11,12 +11,12 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from skysim import cli
-from skysim.quantity import ROOT
+from skysim.apps.cli import main
+from skysim.core.paths import ROOT
 
 
 def test_versions_are_told_for_a_report() -> None:
-    told = CliRunner().invoke(cli.app, ["--version"])
+    told = CliRunner().invoke(main.app, ["--version"])
     assert re.match(
         r"skysim \d+\.\d+\.\d+, MuJoCo \d+\.\d+\.\d+, numpy \d+\.\d+\.\d+, Python 3\.\d+\.\d+$", told.stdout
     )

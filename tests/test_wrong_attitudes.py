@@ -4,10 +4,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from estimator.dometracker import DomeTracker
-from estimator.nearfield import project
-from estimator.types import Centroids
-from skysim import metrics, scene, simulate
+from estimator.attitude.dome_map import project
+from estimator.core.types import Centroids
+from estimator.trackers.dome_tracker import DomeTracker
+from skysim.results import metrics
+from skysim.scene import loader
+from skysim.simulation import run, testbed
 
 FIELDS = 60
 
@@ -15,7 +17,7 @@ FIELDS = 60
 @pytest.fixture(scope="module")
 def afit() -> DomeTracker:
     """The tracker of the AFIT scene: patch boards that repeat one 8 mm lattice all over the dome."""
-    tracker = simulate.tracker(simulate.prepare(scene.load("afit_simsat", {"exposure.frames": "1"})))
+    tracker = testbed.tracker(run.prepare(loader.load("afit_simsat", {"exposure.frames": "1"})))
     assert isinstance(tracker, DomeTracker)
     return tracker
 

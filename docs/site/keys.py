@@ -7,10 +7,10 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from skysim.lab.forms import in_yaml, plain, unit_of
-from skysim.quantity import Part
-from skysim.scene import STEM
-from skysim.study.plan import Study  # noqa: F401  the other kind of file, whose sections are Parts too
+from skysim.apps.gui.page.forms import in_yaml, plain, unit_of
+from skysim.core.units import ConfigModel
+from skysim.experiments.study.plan import Study  # noqa: F401  the other kind of file, whose sections are Parts too
+from skysim.scene.scene import STEM
 
 BOUNDS = {"ge": "≥", "minimum": "≥", "gt": ">", "exclusiveMinimum": ">", "le": "≤", "maximum": "≤", "lt": "<"}
 BOUNDS["exclusiveMaximum"] = "<"
@@ -20,7 +20,7 @@ WORDS |= {"null": "null", "object": "a section", "array": "list"}
 
 def sections() -> dict[str, type[BaseModel]]:
     """Every section of scene and study files by its full name."""
-    return {f"{one.__module__}.{one.__qualname__}": one for one in beneath(Part)}
+    return {f"{one.__module__}.{one.__qualname__}": one for one in beneath(ConfigModel)}
 
 
 def beneath(model: type[BaseModel]) -> Iterator[type[BaseModel]]:

@@ -1,0 +1,401 @@
+"""Wahba's problem compiled: the attitude profile, six classical answers to it, one polish, and the covariance.
+
+All kernels take unit vectors as C-ordered (N, 3) arrays; `weight` is (N,), in rad^-2 where a covariance is asked. The
+profile is B = sum(w cam ref^T) with the weights' sum at 1, and the best rotation maximises tr(A B^T) (Wahba 1965).
+"""
+
+from __future__ import annotations
+
+from math import isfinite, sqrt
+
+import numpy as np
+
+from estimator.core.arrays import Floats
+from estimator.core.jit import jit
+from estimator.core.vectors import turn
+
+Quaternion = tuple[float, float, float, float]
+
+# Least squared sine of the angle between the first direction and any other: 13 arcsec.
+PARALLEL = 4e-9
+UNIT = 1e-2  # a squared length farther from 1 is no direction's
+POLISHES = 30
+RESTING = 1e-26  # squared radians: a step that changes no digit
+
+
+@jit
+def wahba(cam: Floats, ref: Floats, weight: Floats) -> tuple[Floats, Floats]:
+    """R_cam_from_ref (3, 3) that minimises sum(w |cam - A ref|^2), and its covariance (3, 3) in camera axes, rad^2.
+
+    QUEST and the polish, some microseconds for twenty stars. Raises ValueError where the directions leave it unknown.
+    """
+    answer = raw_quest(profile(cam, ref, weight))
+    polish(answer, cam, ref, weight)
+    return answer, spread(cam, weight)
+
+
+@jit
+def weights(sigma_rad: Floats) -> Floats:
+    """(N,) 1 / sigma^2. Raises ValueError for a sigma that is not finite and above 0."""
+    out = np.empty(len(sigma_rad))
+    for n in range(len(out)):
+        if not 1e-150 < sigma_rad[n] < 1e150:  # whose square is a number too
+            raise ValueError("a sigma_rad is not usable; allowed: finite, above 0")
+        out[n] = 1 / sigma_rad[n] ** 2
+    return out
+
+
+@jit
+def profile(cam: Floats, ref: Floats, weight: Floats) -> Floats:
+    """(3, 3) B with the weights' sum at 1. Raises ValueError for directions that do not determine a rotation."""
+    if len(cam) < 2:
+        raise ValueError("all vectors are parallel: fewer than two directions leave the roll unknown")
+    B = np.zeros((3, 3))
+    apart, total, off = 0.0, 0.0, 0.0
+    for n in range(len(cam)):
+        total += weight[n]
+        off = max(off, abs(cam[n, 0] ** 2 + cam[n, 1] ** 2 + cam[n, 2] ** 2 - 1))
+        off = max(off, abs(ref[n, 0] ** 2 + ref[n, 1] ** 2 + ref[n, 2] ** 2 - 1))
+        apart = max(apart, min(_sine2(cam, 0, n), _sine2(ref, 0, n)))
+        for i in range(3):
+            for j in range(3):
+                B[i, j] += weight[n] * cam[n, i] * ref[n, j]
+    entries = 0.0
+    for i in range(3):
+        for j in range(3):
+            B[i, j] /= total
+            entries += B[i, j]
+    if not isfinite(entries):
+        raise ValueError("a direction is NaN or infinite; allowed: unit vectors")
+    if off > UNIT:
+        raise ValueError("a direction is not of unit length; allowed: unit vectors")
+    if apart < PARALLEL:
+        raise ValueError(
+            "all vectors are parallel: the roll about them is unknown; two directions are needed"
+        )
+    return B
+
+
+@jit
+def _sine2(vectors: Floats, m: int, n: int) -> float:
+    """Squared sine of the angle between two of the unit vectors."""
+    x = vectors[m, 1] * vectors[n, 2] - vectors[m, 2] * vectors[n, 1]
+    y = vectors[m, 2] * vectors[n, 0] - vectors[m, 0] * vectors[n, 2]
+    z = vectors[m, 0] * vectors[n, 1] - vectors[m, 1] * vectors[n, 0]
+    return x * x + y * y + z * z
+
+
+@jit
+def greatest(B: Floats) -> float:
+    """Greatest eigenvalue of Davenport's matrix, by Newton from 1 downwards.
+
+    Its characteristic equation is (x^2 - |B|^2)^2 - 8 x det B - 4 |adj B|^2 = 0 (Markley 1993, J. Astronautical
+    Sciences 41, 261), the same polynomial as QUEST's quartic.
+    """
+    square, minors, det = 0.0, 0.0, 0.0
+    for i in range(3):
+        for j in range(3):
+            square += B[i, j] ** 2
+            cofactor = _cofactor(B, i, j)
+            minors += cofactor**2
+            if i == 0:
+                det += B[0, j] * cofactor
+    x = 1.0
+    for _ in range(50):
+        inner = x * x - square
+        slope = 4 * x * inner - 8 * det
+        if slope <= 0:  # past a double root
+            break
+        step = (inner * inner - 8 * x * det - 4 * minors) / slope
+        x -= step
+        if abs(step) < 1e-16:
+            break
+    return x
+
+
+@jit
+def _cofactor(matrix: Floats, i: int, j: int) -> float:
+    a, b, c, d = (i + 1) % 3, (i + 2) % 3, (j + 1) % 3, (j + 2) % 3
+    return matrix[a, c] * matrix[b, d] - matrix[a, d] * matrix[b, c]
+
+
+@jit
+def _turned(B: Floats, axis: int) -> Floats:
+    """The profile for a reference frame turned by half a turn about an axis 0, 1, 2; not at all for 3."""
+    out = B.copy()
+    if axis < 3:
+        for j in range(3):
+            if j != axis:
+                for i in range(3):
+                    out[i, j] = -out[i, j]
+    return out
+
+
+@jit
+def _turned_back(q: Quaternion, axis: int) -> Quaternion:
+    """Hamilton's product of a quaternion (x, y, z, w) and a half-turn about an axis: back to the true reference."""
+    x, y, z, w = q
+    if axis == 0:
+        return w, z, -y, -x
+    if axis == 1:
+        return -z, w, x, -y
+    if axis == 2:
+        return y, -x, w, -z
+    return q
+
+
+@jit
+def _symmetric(B: Floats) -> tuple[Floats, Floats, float]:
+    """S = B + B^T, z (3,) and the trace: the parts of Davenport's matrix [[S - tr, z], [z^T, tr]].
+
+    Shuster's quaternion carries ref into cam as A(q), the transpose of the active matrix: hence the sign of z.
+    """
+    z = np.array([B[2, 1] - B[1, 2], B[0, 2] - B[2, 0], B[1, 0] - B[0, 1]])
+    return B + B.T, z, B[0, 0] + B[1, 1] + B[2, 2]
+
+
+@jit
+def raw_quest(B: Floats) -> Floats:
+    """QUEST (Shuster & Oh 1981, J. Guidance & Control 4, 70): the Gibbs vector from the greatest eigenvalue.
+
+    The vector is infinite at half a turn. So it is sought in four reference frames, each turned by half a turn
+    ("sequential rotations"), and that is taken in which the quaternion's scalar part is the greatest. The parts
+    are compared before the quaternions are normalised: where the turn is half a turn all four numbers vanish, and
+    their ratios are noise.
+    """
+    x = greatest(B)
+    best, frame = (0.0, 0.0, 0.0, 0.0), 3
+    for axis in (3, 0, 1, 2):
+        found = _quest_once(_turned(B, axis), x)
+        if abs(found[3]) > abs(best[3]):
+            best, frame = found, axis
+    return matrix_of(_turned_back(best, frame))
+
+
+@jit
+def _quest_once(B: Floats, x: float) -> Quaternion:
+    """QUEST's quaternion (x, y, z, w), not normalised, for the eigenvalue x."""
+    S, z, trace = _symmetric(B)
+    det, kappa = 0.0, 0.0
+    for j in range(3):
+        det += S[0, j] * _cofactor(S, 0, j)
+        kappa += _cofactor(S, j, j)
+    alpha = x * x - trace * trace + kappa
+    gamma = (x + trace) * alpha - det
+    Sz = _times(S, z)
+    SSz = _times(S, Sz)
+    v = alpha * z + (x - trace) * Sz + SSz
+    return v[0], v[1], v[2], gamma
+
+
+@jit
+def _times(matrix: Floats, v: Floats) -> Floats:
+    out = np.zeros(3)
+    for i in range(3):
+        for j in range(3):
+            out[i] += matrix[i, j] * v[j]
+    return out
+
+
+@jit
+def raw_esoq2(B: Floats) -> Floats:
+    """ESOQ2 (Mortari 1997; Markley & Mortari 2000, J. Astronautical Sciences 48, 359): the axis e and angle.
+
+    From Davenport's equations, M e = 0 with M = (x - tr)((x + tr) - S) - z z^T: the axis is the greatest of the
+    cross products of M's rows, and the quaternion is ((x - tr) e, z . e) normalised. M vanishes without a turn; so
+    the reference frame is first turned by the half-turn which makes the trace the least.
+    """
+    x, frame, least = greatest(B), 3, B[0, 0] + B[1, 1] + B[2, 2]
+    for axis in range(3):
+        trace = 2 * B[axis, axis] - (B[0, 0] + B[1, 1] + B[2, 2])
+        if trace < least:
+            frame, least = axis, trace
+    S, z, trace = _symmetric(_turned(B, frame))
+    M = np.empty((3, 3))
+    for i in range(3):
+        for j in range(3):
+            M[i, j] = -(x - trace) * S[i, j] - z[i] * z[j]
+        M[i, i] += (x - trace) * (x + trace)
+    e, length2 = np.zeros(3), -1.0
+    for i in range(3):
+        u, v, w = _cofactor(M, i, 0), _cofactor(M, i, 1), _cofactor(M, i, 2)
+        if u * u + v * v + w * w > length2:
+            length2 = u * u + v * v + w * w
+            e[:] = u, v, w
+    scalar = z[0] * e[0] + z[1] * e[1] + z[2] * e[2]
+    q = (x - trace) * e[0], (x - trace) * e[1], (x - trace) * e[2], scalar
+    return matrix_of(_turned_back(q, frame))
+
+
+@jit
+def raw_davenport(B: Floats) -> Floats:
+    """Davenport's q-method (Keat 1977, CSC/TM-77/6034): the eigenvector of K's greatest eigenvalue."""
+    S, z, trace = _symmetric(B)
+    K = np.empty((4, 4))
+    K[:3, :3], K[3, 3] = S, trace
+    for i in range(3):
+        K[i, i] -= trace
+        K[i, 3] = K[3, i] = z[i]
+    _, vectors = np.linalg.eigh(K)
+    return matrix_of((vectors[0, 3], vectors[1, 3], vectors[2, 3], vectors[3, 3]))
+
+
+@jit
+def raw_svd(B: Floats) -> Floats:
+    """Markley 1988 (J. Astronautical Sciences 36, 245): with B = U S V^T, A = U diag(1, 1, det U det V) V^T."""
+    U, _, Vt = np.linalg.svd(B)
+    handed = np.linalg.det(U) * np.linalg.det(Vt)
+    answer = np.zeros((3, 3))
+    for i in range(3):
+        for j in range(3):
+            answer[i, j] = U[i, 0] * Vt[0, j] + U[i, 1] * Vt[1, j] + handed * U[i, 2] * Vt[2, j]
+    return answer
+
+
+@jit
+def best_pair(cam: Floats, weight: Floats) -> tuple[int, int]:
+    """The two stars that leave the least variance about the worst axis.
+
+    Two stars' information has the least eigenvalue (p + q - sqrt((p + q)^2 - 4 p q sin^2)) / 2 for the weights p, q.
+    """
+    first, second, best = 0, 1, -1.0
+    for m in range(len(cam)):
+        for n in range(m + 1, len(cam)):
+            p, q = weight[m], weight[n]
+            product = p * q * _sine2(cam, m, n)
+            # The same eigenvalue without the difference of near equals.
+            least = 2 * product / (p + q + sqrt(max((p + q) ** 2 - 4 * product, 0.0)))
+            if least > best:
+                first, second, best = m, n, least
+    return first, second
+
+
+@jit
+def raw_triad(cam: Floats, ref: Floats, weight: Floats) -> Floats:
+    """TRIAD for two stars, in its optimal form (Markley 2002, J. Guidance 25, 411).
+
+    With the normals b3, r3 of the two planes, w the weights and l a normaliser,
+
+        A = b3 r3^T + sum over the two of (w / l) [b r^T + (b x b3)(r x r3)^T],
+
+    which is Wahba's optimum for two stars, and Black's (1964) triad of vectors when one weight is nothing.
+    """
+    m, n = best_pair(cam, weight)
+    b, r = cam[np.array([m, n])], ref[np.array([m, n])]
+    b3, r3 = _normal(b[0], b[1]), _normal(r[0], r[1])
+    along = np.zeros((3, 3))
+    for k in range(2):
+        c, s = np.cross(b[k], b3), np.cross(r[k], r3)
+        share = weight[m] if k == 0 else weight[n]
+        for i in range(3):
+            for j in range(3):
+                along[i, j] += share * (b[k, i] * r[k, j] + c[i] * s[j])
+    # `along` is l times a rotation of the plane: its squared entries sum up to 2 l^2.
+    scale = sqrt(2 / (along**2).sum())
+    for i in range(3):
+        for j in range(3):
+            along[i, j] = scale * along[i, j] + b3[i] * r3[j]
+    return along
+
+
+@jit
+def _normal(u: Floats, v: Floats) -> Floats:
+    w = np.cross(u, v)
+    return w / sqrt(w[0] ** 2 + w[1] ** 2 + w[2] ** 2)
+
+
+@jit
+def polish(answer: Floats, cam: Floats, ref: Floats, weight: Floats) -> None:
+    """Gauss-Newton on sum(w |cam - A ref|^2), in place: sum(w (1 - a a^T)) turn = sum(w a x cam), a = A ref.
+
+    Directions close together make the two greatest eigenvalues of Davenport's matrix nearly equal, and what works
+    on the profile loses digits as the inverse square of their spread; here the small differences a x cam are taken
+    star by star, which keeps them. Wahba's problem has no other maximum to fall into.
+    """
+    a, pull, normal, step = np.empty(3), np.empty(3), np.empty((3, 3)), np.empty(3)
+    for _ in range(POLISHES):
+        pull.fill(0.0)
+        normal.fill(0.0)
+        for n in range(len(cam)):
+            w = weight[n]
+            for i in range(3):
+                a[i] = answer[i, 0] * ref[n, 0] + answer[i, 1] * ref[n, 1] + answer[i, 2] * ref[n, 2]
+            pull[0] += w * (a[1] * cam[n, 2] - a[2] * cam[n, 1])
+            pull[1] += w * (a[2] * cam[n, 0] - a[0] * cam[n, 2])
+            pull[2] += w * (a[0] * cam[n, 1] - a[1] * cam[n, 0])
+            _add_information(normal, a, w)
+        cholesky(normal)
+        solve(normal, pull, step)
+        turn(step, answer)
+        if step[0] ** 2 + step[1] ** 2 + step[2] ** 2 < RESTING:
+            break
+
+
+@jit
+def _add_information(matrix: Floats, v: Floats, w: float) -> None:
+    """Lower triangle of matrix += w (|v|^2 - v v^T), without the difference of near equals on the diagonal."""
+    matrix[0, 0] += w * (v[1] * v[1] + v[2] * v[2])
+    matrix[1, 1] += w * (v[0] * v[0] + v[2] * v[2])
+    matrix[2, 2] += w * (v[0] * v[0] + v[1] * v[1])
+    matrix[1, 0] -= w * v[1] * v[0]
+    matrix[2, 0] -= w * v[2] * v[0]
+    matrix[2, 1] -= w * v[2] * v[1]
+
+
+@jit
+def spread(cam: Floats, weight: Floats) -> Floats:
+    """(3, 3) inverse of the information sum(w (1 - b b^T)). Raises ValueError where it is singular."""
+    factor, out, unit = np.zeros((3, 3)), np.empty((3, 3)), np.empty(3)
+    for n in range(len(cam)):
+        _add_information(factor, cam[n], weight[n])
+    cholesky(factor)
+    for j in range(3):
+        unit.fill(0.0)
+        unit[j] = 1.0
+        solve(factor, unit, out[j])
+    for i in range(3):
+        for j in range(i):
+            out[i, j] = out[j, i] = (out[i, j] + out[j, i]) / 2
+    return out
+
+
+@jit
+def cholesky(matrix: Floats) -> None:
+    """The lower triangle of a positive definite (3, 3) matrix becomes its factor L, L L^T = matrix. ValueError."""
+    for j in range(3):
+        for i in range(j, 3):
+            total = matrix[i, j]
+            for k in range(j):
+                total -= matrix[i, k] * matrix[j, k]
+            if i == j:
+                if not total > 0:
+                    raise ValueError("all vectors are parallel: the roll about them is unknown")
+                matrix[j, j] = sqrt(total)
+            else:
+                matrix[i, j] = total / matrix[j, j]
+
+
+@jit
+def solve(factor: Floats, right: Floats, out: Floats) -> None:
+    """out = (L L^T)^-1 right."""
+    for i in range(3):
+        out[i] = right[i]
+        for k in range(i):
+            out[i] -= factor[i, k] * out[k]
+        out[i] /= factor[i, i]
+    for i in range(2, -1, -1):
+        for k in range(i + 1, 3):
+            out[i] -= factor[k, i] * out[k]
+        out[i] /= factor[i, i]
+
+
+@jit
+def matrix_of(q: Quaternion) -> Floats:
+    """(3, 3) rotation of a quaternion (x, y, z, w) of any length."""
+    x, y, z, w = q
+    s = 2 / (x * x + y * y + z * z + w * w)
+    R = np.empty((3, 3))
+    R[0, 0], R[0, 1], R[0, 2] = 1 - s * (y * y + z * z), s * (x * y - z * w), s * (x * z + y * w)
+    R[1, 0], R[1, 1], R[1, 2] = s * (x * y + z * w), 1 - s * (x * x + z * z), s * (y * z - x * w)
+    R[2, 0], R[2, 1], R[2, 2] = s * (x * z - y * w), s * (y * z + x * w), 1 - s * (x * x + y * y)
+    return R

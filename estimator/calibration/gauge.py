@@ -1,0 +1,138 @@
+"""What pixels can never tell of a dome, and what settles it; estimator/calibration/dome_survey.py says which moves these are."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from estimator.calibration.bundle_adjustment import Bundle, Sightings
+from estimator.core.arrays import Floats, Ints
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """The lights, frames and sightings that hang together, renumbered; led, frame, index: their rows in the whole."""
+
+    bundle: Bundle
+    seen: Sightings
+    led: Ints
+    frame: Ints
+    index: Ints
+
+    def into(self, whole: Bundle, found: Bundle) -> Bundle:
+        """The whole with this part's new values."""
+        position, turned = whole.position_m.copy(), whole.R_body_from_lab.copy()
+        position[self.led], turned[self.frame] = found.position_m, found.R_body_from_lab
+        return replace(found, position_m=position, R_body_from_lab=turned, map_m=whole.map_m)
+
+
+@dataclass(frozen=True, slots=True)
+class Gauge:
+    """What holds the lab's turn and the size of things."""
+
+    length: tuple[int, int, float] | None
+    frame: int | None
+    map_m: Floats
+    R_body_from_lab: Floats
+
+    @classmethod
+    def of(
+        cls,
+        length: tuple[int, int, float] | None,
+        frame: int | None,
+        map_m: Floats,
+        R_body_from_lab: Floats,
+    ) -> Gauge:
+        """The gauge that is asked for, over the start. Raises ValueError for rows that there are not."""
+        count = len(map_m)
+        if length is not None:
+            i, j, metres = length
+            if not (0 <= i < count and 0 <= j < count and i != j and 0 < metres < np.inf):
+                raise ValueError(
+                    f"survey: known_length is {length}; allowed: two different rows below {count}, above 0 m"
+                )
+        if frame is not None and not 0 <= frame < len(R_body_from_lab):
+            raise ValueError(f"survey: reference_frame is {frame}; allowed: 0 to {len(R_body_from_lab) - 1}")
+        return cls(length, frame, map_m, R_body_from_lab)
+
+    def check(self, part: Part) -> None:
+        """Raise ValueError where the gauge rests on a light or a frame that is not surveyed."""
+        if self.length is not None:
+            self._pair(part)
+        if self.frame is not None:
+            self._frame(part)
+
+    def onto(self, found: Bundle, part: Part) -> Bundle:
+        """The same bundle, as the pixels see it, turned and grown to fit the gauge."""
+        place, start = found.position_m, self.map_m[part.led]
+        if self.frame is None:
+            turn = Rotation.align_vectors(start, place)[0].as_matrix()
+        else:
+            turn = self.R_body_from_lab[self.frame].T @ found.R_body_from_lab[self._frame(part)]
+        if self.length is None:
+            grown = np.sum(start**2) / np.sum(start * (place @ turn.T))
+        else:
+            i, j = self._pair(part)
+            grown = self.length[2] / np.linalg.norm(place[i] - place[j])
+        return replace(
+            found,
+            position_m=grown * place @ turn.T,
+            R_body_from_lab=found.R_body_from_lab @ turn.T,
+            camera_body_m=grown * found.camera_body_m,
+            map_sigma_m=grown * found.map_sigma_m,
+        )
+
+    def held(self, found: Bundle, part: Part) -> tuple[Floats, Floats]:
+        """The gauge's four conditions, linear in a small move: (3 n, 4) of the lights and (R, 4) of the rest."""
+        start = self.map_m[part.led]
+        by_led = np.zeros((len(start), 3, 4))
+        by_rest = np.zeros((3 * len(part.frame) + 3 + found.free_lens, 4))
+        if self.frame is None:
+            for axis, e in enumerate(np.eye(3)):
+                by_led[:, :, axis] = np.cross(e, start)
+        else:
+            first = 3 * self._frame(part)
+            by_rest[first : first + 3, :3] = np.eye(3)
+        if self.length is None:
+            by_led[:, :, 3] = start
+        else:
+            i, j = self._pair(part)
+            along = (found.position_m[i] - found.position_m[j]) / self.length[2]
+            by_led[i, :, 3], by_led[j, :, 3] = along, -along
+        return by_led.reshape(-1, 4), by_rest
+
+    def _pair(self, part: Part) -> tuple[int, int]:
+        assert self.length is not None
+        for end in self.length[:2]:
+            if end not in part.led:
+                raise ValueError(
+                    f"survey: known_length ends at LED row {end}, which the frames do not survey"
+                )
+        i, j = np.searchsorted(part.led, self.length[:2])
+        return int(i), int(j)
+
+    def _frame(self, part: Part) -> int:
+        if self.frame is None or self.frame not in part.frame:
+            raise ValueError(f"survey: reference_frame {self.frame} sees fewer than two surveyed LEDs")
+        return int(np.searchsorted(part.frame, self.frame))
+
+
+def common_turns(ours: Rotation, theirs: Rotation) -> tuple[Rotation, Rotation]:
+    """The two turns between two sets of attitudes of the same moments: theirs = left * ours * right, least squares.
+
+    left = theirs_body_from_our_body (so cam_from_their_body = cam_from_our_body * left.inv()), right =
+    our_lab_from_their_lab. Gauss-Newton on the rotation vectors of what is left over, from the start that two
+    averages give; attitudes that all turn about one axis leave a turn to share between the two, and get the least.
+    """
+    left, right = Rotation.identity(), (ours.inv() * theirs).mean()
+    for _ in range(50):
+        between = left * ours
+        left_over = (theirs * (between * right).inv()).as_rotvec()
+        by = np.concatenate([np.tile(np.eye(3), (len(left_over), 1, 1)), between.as_matrix()], axis=2)
+        move = np.linalg.lstsq(by.reshape(-1, 6), left_over.ravel(), rcond=1e-9)[0]
+        left, right = Rotation.from_rotvec(move[:3]) * left, Rotation.from_rotvec(move[3:]) * right
+        if np.linalg.norm(move) < 1e-14:
+            break
+    return left, right

@@ -1,0 +1,416 @@
+"""A camera's calibration from star fields at unknown attitudes: focal length, principal point, distortion, magnitudes.
+
+Stars are the best test chart: their directions are known to milliarcseconds. Every frame brings three unknowns of its
+own, its attitude, which are eliminated (Schur complement), so that the eight of the lens remain whatever the number
+of frames. What pixels can tell but weakly is held by a belief in ordinary lenses, `Belief`: a principal point moved
+is next to a turn of the camera, and differs from it by the square of the field's angle only; k2 and k3 look like k1
+over a narrow field. Along such directions the lens may be wrong together with the attitudes, and the pixels are right.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from scipy.linalg import LinAlgError, cho_factor, cho_solve
+from scipy.spatial.transform import Rotation
+
+from estimator.attitude import wahba as kernel
+from estimator.attitude.solvers import rotation
+from estimator.calibration import bundle_adjustment as ba
+from estimator.calibration.bundle_adjustment import Bundle, Sightings
+from estimator.calibration.dome_survey import CAUCHY, GATE, MEDIAN_RADIUS
+from estimator.calibration.magnitude_zero import MagnitudeZero, magnitude_zero
+from estimator.catalog.catalog import StarList
+from estimator.core.arrays import Floats, Ints
+from estimator.core.camera import Camera
+from estimator.core.types import Attitude, Centroids
+
+LENS = 8  # focal_px, centre x and y, k1, k2, p1, p2, k3
+LEAST_STARS = 3  # of a frame: two determine its attitude and leave one number for the lens
+START_ROUNDS = 30
+MOST_LOST = 0.9  # a round that names fewer than so many of the best one's stars is a step back
+
+
+@dataclass(frozen=True, slots=True)
+class StarFrame:
+    """Stars of one frame, found and named.
+
+    xy_px : (K, 2);  sigma_px : (K,) of each coordinate;  vectors_ref : (K, 3) unit, of the stars that they are
+    flux, v_mag : (K,) brightness in the image and in the catalogue, where the magnitudes' offset is wanted
+    exposure_s  : of the frame
+    """
+
+    xy_px: Floats
+    sigma_px: Floats
+    vectors_ref: Floats
+    flux: Floats | None = None
+    v_mag: Floats | None = None
+    exposure_s: float = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Belief:
+    """How far ordinary lenses are from the camera that one starts with, as standard deviations.
+
+    centre : of the principal point, over the chip's width
+    radial, tangential : what each coefficient alone does in the farthest corner, over the corner's distance
+    """
+
+    centre: float = 0.05
+    radial: float = 0.2
+    tangential: float = 0.02
+
+    def sigma(self, camera: Camera) -> Floats:
+        """(8,) of focal_px (which is not believed at all), centre, k1, k2, p1, p2, k3."""
+        r = np.tan(camera.diagonal_rad / 2)
+        k1, p = self.radial / r**2, self.tangential / (3 * r)
+        centre = self.centre * camera.width_px
+        return np.array([np.inf, centre, centre, k1, k1 / r**2, p, p, k1 / r**4])
+
+
+@dataclass(frozen=True, slots=True)
+class FieldReport:
+    """How a calibration came about.
+
+    status       : "converged", or "stopped ..." where the numbers are not at rest
+    cam_from_ref : (F,) attitudes; identity for a frame that is not `tied`
+    attitude_covariance_rad2 : (F, 3, 3) in camera axes, the lens's errors included; NaN where not tied
+    tied         : (F,) frames with three stars or more
+    outliers     : (K, 2) frame, and row in it, of the stars left out as wrongly named
+    stars        : how many sightings it rests on
+    rms_px       : of the residual coordinates
+    misfit       : sqrt(chi-square / degrees of freedom), 1 where sigma_px is honest
+    magnitude    : None where the frames have no brightness
+    """
+
+    status: str
+    cam_from_ref: Rotation
+    attitude_covariance_rad2: Floats
+    tied: np.ndarray
+    outliers: Ints
+    stars: int
+    rms_px: float
+    misfit: float
+    magnitude: MagnitudeZero | None
+
+
+class Calibration(NamedTuple):
+    """The camera, the (8, 8) covariance of focal_px, centre x, y, k1, k2, p1, p2, k3, and the report."""
+
+    camera: Camera
+    covariance: Floats
+    report: FieldReport
+
+
+BELIEF = Belief()
+
+
+def calibrate(frames: Sequence[StarFrame], camera_start: Camera, belief: Belief = BELIEF) -> Calibration:
+    """Least squares over the lens and every frame's attitude, from a focal length that is right to some per cent.
+
+    Wrong names are survived: Cauchy's loss first, its width shrinking with the median residual; then what lies beyond
+    5 sigma is left out, and the rest is fitted by plain least squares, whose covariance is returned.
+    Raises ValueError in one line where the frames are malformed or do not determine the lens.
+    """
+    whole = _gathered(frames)
+    rows = np.concatenate([np.arange(len(frame.xy_px)) for frame in frames])
+    counts = np.array([len(frame.xy_px) for frame in frames])
+    vectors = np.concatenate([frame.vectors_ref for frame in frames])
+    problem = _start(whole, vectors, camera_start, belief, len(frames))
+    keep = counts[whole.frame] >= LEAST_STARS
+    _check_enough(whole.take(keep))
+    problem, before = problem._replace(bundle=_turned(problem.bundle, whole.take(keep))), np.inf
+    while (now := CAUCHY * _noise(problem.bundle, whole.take(keep))) < 0.9 * before:
+        problem, _ = _adjusted(problem, whole.take(keep), now)
+        before = now
+    distance = np.linalg.norm(ba.residuals(problem.bundle, whole), axis=1)
+    keep &= distance < GATE * _noise(problem.bundle, whole.take(keep))
+    outliers = np.column_stack([whole.frame, rows])[~keep & (counts[whole.frame] >= LEAST_STARS)]
+    tied = np.bincount(whole.frame[keep], minlength=len(frames)) >= LEAST_STARS
+    keep &= tied[whole.frame]
+    _check_enough(whole.take(keep))
+    problem, at_rest = _adjusted(problem, whole.take(keep), np.inf)
+    status = "converged" if at_rest else f"stopped after {ba.STEPS} steps, not at rest"
+    return _report(status, problem, whole.take(keep), tied, outliers, keep, frames, camera_start)
+
+
+class Tracker(Protocol):
+    """What identifies: a StarTracker, or anything else with a star list and an answer to centroids."""
+
+    stars: StarList
+
+    def solve_centroids(self, centroids: Centroids) -> Attitude: ...
+
+
+def self_calibrated(
+    frames: Sequence[Centroids],
+    tracker: Callable[[Camera, float], Tracker],
+    camera: Camera,
+    focal_uncertainty: float = 0.05,
+    exposure_s: float = 1.0,
+    rounds: int = 8,
+) -> Calibration:
+    """From centroids alone to a calibrated camera: identify, calibrate, identify with the better camera, and so on.
+
+    tracker : makes one from a camera and its focal length's relative uncertainty, 0 once there is a calibration
+    camera  : what is known beforehand: the chip, and the focal length to `focal_uncertainty`
+
+    It ends when a round names the same stars as the one before: as many may be others still. Raises ValueError
+    where no frame is identified.
+    """
+    best, most, stars_before, belief_in = None, 0, np.empty((0, 3)), camera
+    for _ in range(rounds):
+        named = _named(frames, tracker(belief_in, focal_uncertainty), exposure_s)
+        stars = np.concatenate([np.empty((0, 3)), *(frame.vectors_ref for frame in named)])
+        if np.array_equal(stars, stars_before) or len(stars) < MOST_LOST * most:
+            break
+        best, most, stars_before = calibrate(named, camera), max(most, len(stars)), stars
+        belief_in, focal_uncertainty = best.camera, 0.0
+    if best is None:
+        raise ValueError(f"self_calibrated: none of the {len(frames)} frames is identified; check the camera")
+    return best
+
+
+def disagreement_px(camera: Camera, other: Camera, nodes: int = 41) -> float:
+    """Rms distance over the sensor between the pixels of one camera and the other's, after the best common turn.
+
+    A turn of the camera in its mount belongs to no lens: stars cannot tell it, and every attitude takes it up.
+    """
+    x = np.linspace(-0.5, camera.width_px - 0.5, nodes)
+    y = np.linspace(-0.5, camera.height_px - 0.5, nodes)
+    xy = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    rays = camera.rays(xy)
+    turn, _ = kernel.wahba(other.rays(xy), rays, np.ones(len(xy)))
+    return float(np.sqrt(np.mean(np.sum((other.pixels(rays @ turn.T) - xy) ** 2, axis=1))))
+
+
+class _Problem(NamedTuple):
+    """The bundle with the stars as its lights at distance 1, and the (8,) believed lens with its sigmas."""
+
+    bundle: Bundle
+    believed: Floats
+    sigma: Floats
+
+    def cost(self, seen: Sightings, width: float) -> tuple[float, Floats]:
+        """Loss of pixels and belief together, and the (M,) weights of the sightings."""
+        loss, weight = ba.cauchy(np.sum(ba.residuals(self.bundle, seen) ** 2, axis=1), width)
+        return loss + float(np.sum(((self.bundle.lens - self.believed) / self.sigma) ** 2)), weight
+
+
+class _Normal(NamedTuple):
+    """The normal equations: (F, 3, 3) of turns, (F, 3, 8) coupling, (8, 8) of the lens, both right sides."""
+
+    turn: Floats
+    coupling: Floats
+    lens: Floats
+    pull_turn: Floats
+    pull_lens: Floats
+
+
+def _gathered(frames: Sequence[StarFrame]) -> Sightings:
+    """All frames' stars in one table; every sighting has a direction of its own. Raises ValueError."""
+    if not frames:
+        raise ValueError("calibrate: no frames; a lens needs some tens")
+    for k, frame in enumerate(frames):
+        count = frame.xy_px.shape[0] if frame.xy_px.ndim else 0
+        shapes = [frame.xy_px.shape, frame.sigma_px.shape, frame.vectors_ref.shape]
+        if shapes != [(count, 2), (count,), (count, 3)]:
+            raise ValueError(f"calibrate: frame {k} has shapes {shapes}; allowed: (K, 2), (K,), (K, 3)")
+        finite = np.isfinite(frame.xy_px).all() and np.isfinite(frame.vectors_ref).all()
+        if not (finite and np.all((frame.sigma_px > 0) & (frame.sigma_px < np.inf))):
+            raise ValueError(
+                f"calibrate: frame {k} has a pixel or direction that is not finite or a sigma_px not above 0"
+            )
+    counts = [len(frame.xy_px) for frame in frames]
+    return Sightings(
+        np.repeat(np.arange(len(frames)), counts),
+        np.arange(sum(counts)),
+        np.concatenate([frame.xy_px for frame in frames]),
+        np.concatenate([frame.sigma_px for frame in frames]),
+    )
+
+
+def _check_enough(seen: Sightings) -> None:
+    """Raise ValueError unless there are more coordinates than unknowns."""
+    frames = len(np.unique(seen.frame))
+    if 2 * len(seen.frame) < 3 * frames + LENS:
+        raise ValueError(
+            f"calibrate: {2 * len(seen.frame)} coordinates in frames of {LEAST_STARS} stars or more, for {3 * frames}"
+            f" unknowns of attitude and {LENS} of the lens; take more frames or more stars"
+        )
+
+
+def _start(whole: Sightings, vectors: Floats, camera: Camera, belief: Belief, count: int) -> _Problem:
+    """The camera as it is believed, and each frame's attitude by it."""
+    lens = np.array([camera.focal_px, *camera.centre_px, *camera.distortion])
+    rays = camera.rays(whole.xy_px)
+    turned = np.tile(np.eye(3), (count, 1, 1))
+    for k in range(count):
+        mine = whole.frame == k
+        if mine.sum() >= LEAST_STARS:
+            turned[k] = _robust_attitude(rays[mine], vectors[mine])
+    bundle = Bundle(vectors, turned, np.zeros(3), np.eye(3), lens, LENS, vectors)
+    return _Problem(bundle, lens, belief.sigma(camera))
+
+
+def _robust_attitude(rays: Floats, vectors: Floats) -> Floats:
+    """(3, 3) least sum of distances, by reweighting: a star named wrongly pulls no more than any other.
+
+    Raises ValueError for stars that are all in one place.
+    """
+    weight = np.ones(len(rays))
+    for _ in range(START_ROUNDS):
+        answer, _ = kernel.wahba(rays, vectors, weight)
+        apart = np.linalg.norm(rays - vectors @ answer.T, axis=1)
+        # The floor keeps one exact pair from deciding alone.
+        weight = 1 / np.maximum(apart, 0.1 * np.median(apart) + 1e-9)
+    return answer
+
+
+def _turned(bundle: Bundle, seen: Sightings) -> Bundle:
+    """Every frame's attitude at its best under Cauchy's loss, the lens as it is."""
+    frames = np.unique(seen.frame)
+    mine = replace(bundle, R_body_from_lab=bundle.R_body_from_lab[frames])
+    numbered = replace(seen, frame=np.searchsorted(frames, seen.frame))
+    R = bundle.R_body_from_lab.copy()
+    R[frames] = ba.turn_frames(mine, numbered, 12).R_body_from_lab
+    return replace(bundle, R_body_from_lab=R)
+
+
+def _noise(bundle: Bundle, seen: Sightings) -> float:
+    """Robust size of the residuals in sigmas, one at least: the median distance over that of unit noise."""
+    distance = np.linalg.norm(ba.residuals(bundle, seen), axis=1)
+    return max(1.0, float(np.median(distance) / MEDIAN_RADIUS))
+
+
+def _normal(problem: _Problem, seen: Sightings, weight: Floats) -> _Normal:
+    """J'WJ and J'W residual, W one weight a sighting, with the belief in the lens."""
+    terms = ba.rows(problem.bundle, seen)
+    frames = len(problem.bundle.R_body_from_lab)
+    by_turn, by_lens = (
+        terms.by_turn,
+        terms.by_shared[:, :, 3:],
+    )  # the lever comes first and is held at nothing
+    heavy_turn, heavy_lens = weight[:, None, None] * by_turn, weight[:, None, None] * by_lens
+    turn, coupling, pull = np.zeros((frames, 3, 3)), np.zeros((frames, 3, LENS)), np.zeros((frames, 3))
+    np.add.at(turn, seen.frame, by_turn.transpose(0, 2, 1) @ heavy_turn)
+    np.add.at(coupling, seen.frame, by_turn.transpose(0, 2, 1) @ heavy_lens)
+    np.add.at(pull, seen.frame, np.einsum("mai,ma->mi", heavy_turn, terms.residual))
+    turn[np.bincount(seen.frame, minlength=frames) == 0] = np.eye(3)  # a frame left out stays where it is
+    lens = np.einsum("mai,maj->ij", heavy_lens, by_lens) + np.diag(problem.sigma**-2)
+    from_belief = (problem.believed - problem.bundle.lens) / problem.sigma**2
+    return _Normal(
+        turn, coupling, lens, pull, np.einsum("mai,ma->i", heavy_lens, terms.residual) + from_belief
+    )
+
+
+def _reduced(terms: _Normal, damping: float) -> tuple[Floats, Floats, Floats]:
+    """Attitudes eliminated, with Marquardt's damping: (F, 3, 8) A^-1 C, (F, 3) A^-1 pull, (8, 8) Schur complement."""
+    blocks = terms.turn * np.where(np.eye(3, dtype=bool), 1 + damping, 1.0)
+    both = np.concatenate([terms.coupling, terms.pull_turn[:, :, None]], axis=2)
+    solved = np.asarray(np.linalg.solve(blocks, both), dtype=np.float64)
+    through, alone = solved[:, :, :LENS], solved[:, :, LENS]
+    matrix = terms.lens - np.einsum("fij,fik->jk", terms.coupling, through)
+    matrix[np.diag_indices(LENS)] += damping * terms.lens.diagonal()
+    return through, alone, matrix
+
+
+def _adjusted(problem: _Problem, seen: Sightings, width: float) -> tuple[_Problem, bool]:
+    """Levenberg-Marquardt on lens and attitudes, and whether it came to rest; width of Cauchy's loss in sigmas.
+
+    Raises ValueError where the lens is left unknown.
+    """
+    damping = 1e-4
+    cost, weight = problem.cost(seen, width)
+    terms = _normal(problem, seen, weight)
+    still = np.zeros(3 * len(problem.bundle.position_m))
+    for _ in range(ba.STEPS):
+        through, alone, matrix = _reduced(terms, damping)
+        lens = _solved(matrix, terms.pull_lens - np.einsum("fij,fi->j", terms.coupling, alone))
+        turn = alone - through @ lens
+        slope = float(np.sum(terms.pull_turn * turn) + terms.pull_lens @ lens)
+        moved = problem.bundle.moved(still, np.concatenate([turn.ravel(), np.zeros(3), lens]))
+        trial = problem._replace(bundle=moved)
+        new_cost, new_weight = trial.cost(seen, width)
+        # Near rest the costs differ by their rounding only.
+        if new_cost <= cost * (1 + 1e-13) + 1e-20:
+            problem, cost, damping = trial, new_cost, max(damping / 10, 1e-12)
+            if slope < ba.DECREMENT:
+                return problem, True
+            terms = _normal(problem, seen, new_weight)
+        else:
+            damping *= 10
+    return problem, False
+
+
+def _solved(matrix: Floats, right: Floats) -> Floats:
+    """matrix^-1 right for a positive definite matrix, scaled to a unit diagonal first. Raises ValueError."""
+    try:
+        scale = 1 / np.sqrt(np.maximum(matrix.diagonal(), 1e-300))
+        factor = cho_factor(matrix * scale * scale[:, None], lower=True)
+    except LinAlgError:
+        raise ValueError(
+            "calibrate: the frames leave the lens unknown; take more stars over the field"
+        ) from None
+    return (scale * cho_solve(factor, (scale * right.T)).T).T
+
+
+def _report(
+    status: str,
+    problem: _Problem,
+    seen: Sightings,
+    tied: np.ndarray,
+    outliers: Ints,
+    keep: np.ndarray,
+    frames: Sequence[StarFrame],
+    camera: Camera,
+) -> Calibration:
+    terms = _normal(problem, seen, np.ones(len(seen.frame)))
+    through, _, matrix = _reduced(terms, 0.0)
+    covariance = _solved(matrix, np.eye(LENS))
+    spread = np.linalg.inv(terms.turn) + through @ covariance @ through.transpose(0, 2, 1)
+    spread[~tied] = np.nan
+    left_over = ba.residuals(problem.bundle, seen)
+    R = problem.bundle.R_body_from_lab
+    focal, x, y, *rest = (float(value) for value in problem.bundle.lens)
+    k1, k2, p1, p2, k3 = rest
+    report = FieldReport(
+        status,
+        Rotation.concatenate([rotation(R[k]) if tied[k] else Rotation.identity() for k in range(len(R))]),
+        spread,
+        tied,
+        outliers,
+        len(seen.frame),
+        float(np.sqrt(np.mean((left_over * seen.sigma_px[:, None]) ** 2))),
+        float(np.sqrt(np.sum(left_over**2) / max(2 * len(seen.frame) - 3 * tied.sum() - LENS, 1))),
+        _magnitude(frames, keep),
+    )
+    lens = replace(camera, focal_px=focal, centre_px=(x, y), distortion=(k1, k2, p1, p2, k3))
+    return Calibration(lens, covariance, report)
+
+
+def _magnitude(frames: Sequence[StarFrame], keep: np.ndarray) -> MagnitudeZero | None:
+    """The magnitudes' offset from the stars that were kept, where every frame tells its brightness."""
+    flux = [frame.flux for frame in frames if frame.flux is not None]
+    v_mag = [frame.v_mag for frame in frames if frame.v_mag is not None]
+    if not len(flux) == len(v_mag) == len(frames):
+        return None
+    exposure_s = np.concatenate([np.full(len(frame.xy_px), frame.exposure_s) for frame in frames])
+    instrumental = -2.5 * np.log10(np.concatenate(flux) / exposure_s)
+    vectors = np.concatenate([frame.vectors_ref for frame in frames])
+    return magnitude_zero(instrumental[keep], np.concatenate(v_mag)[keep], vectors[keep])
+
+
+def _named(frames: Sequence[Centroids], tracker: Tracker, exposure_s: float) -> list[StarFrame]:
+    """The frames that the tracker solves, with the stars that it finds in them."""
+    named = []
+    for centroids in frames:
+        match = tracker.solve_centroids(centroids).match
+        if match is not None:
+            mine = centroids.take(match.observed)
+            vectors, v_mag = tracker.stars.vectors[match.star], tracker.stars.v_mag[match.star]
+            named.append(StarFrame(mine.xy_px, mine.sigma_px, vectors, mine.flux, v_mag, exposure_s))
+    return named

@@ -1,0 +1,1 @@
+"""On-board catalogs: stars, pairs by separation, and stars by direction."""

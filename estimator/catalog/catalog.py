@@ -1,0 +1,193 @@
+"""The on-board star catalogue: from a star list to apparent unit vectors, prepared apart from the simulator's."""
+
+from __future__ import annotations
+
+import datetime
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import erfa
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from estimator.core.arrays import Floats, Ints
+from estimator.core.errors import ImageError
+
+SPEED_OF_LIGHT_M_S = 299_792_458.0
+EPOCH_YR = 1991.25
+MAS_RAD = np.pi / 180 / 3.6e6
+SUN_BENDS_RAD = 1.974e-8  # 2 G M_sun / (c^2 1 au)
+TT_MINUS_UTC_DAY = 69.184 / 86400  # since 2017; the leap seconds before change nothing here
+
+
+@dataclass(frozen=True, slots=True)
+class StarList:
+    """Stars as the file gives them, brightest first, at the epoch J1991.25 in the ICRS.
+
+    id : (N,); vectors : (N, 3) unit; drift_rad_yr : (N, 3) proper motion, tangent; parallax_rad : (N,);
+    v_mag : (N,)
+    """
+
+    id: Ints
+    vectors: Floats
+    drift_rad_yr: Floats
+    parallax_rad: Floats
+    v_mag: Floats
+
+    def __len__(self) -> int:
+        return len(self.id)
+
+    def take(self, which: NDArray[Any]) -> StarList:
+        """The chosen stars, by mask or index."""
+        return StarList(*(getattr(self, name)[which] for name in self.__slots__))
+
+
+@dataclass(frozen=True, slots=True)
+class Observer:
+    """Who looks: barycentric position_au and velocity_m_s, (3,) in ICRS axes, and the Julian year."""
+
+    epoch_yr: float
+    position_au: Floats
+    velocity_m_s: Floats
+
+
+def on_earth(time_utc: datetime.datetime) -> Observer:
+    """An observer at the Earth's centre at a date (UTC; naive is UTC), by the IAU's ephemeris `epv00`."""
+    if time_utc.tzinfo is not None:
+        time_utc = time_utc.astimezone(datetime.UTC).replace(tzinfo=None)
+    days = (time_utc - datetime.datetime(2000, 1, 1, 12)) / datetime.timedelta(days=1) + TT_MINUS_UTC_DAY
+    _, barycentric = erfa.epv00(erfa.DJ00, days)
+    metres_per_second = erfa.DAU / erfa.DAYSEC
+    return Observer(2000 + days / 365.25, barycentric["p"], barycentric["v"] * metres_per_second)
+
+
+def read(path: str | Path) -> StarList:
+    """Read a catalogue file: ECSV with hip, ra_deg, dec_deg, pm_ra_mas_yr, pm_dec_mas_yr, parallax_mas, v_mag.
+
+    Raises ImageError with one line if it cannot be read.
+    """
+    hip, ra_deg, dec_deg, pm_ra, pm_dec, parallax, v_mag = columns(path, COLUMNS)
+    place = np.radians(ra_deg), np.radians(dec_deg)
+    stars = from_columns(hip.astype(np.int64), *place, pm_ra, pm_dec, parallax, v_mag)
+    return stars.take(np.argsort(v_mag, kind="stable"))
+
+
+COLUMNS = ("hip", "ra_deg", "dec_deg", "pm_ra_mas_yr", "pm_dec_mas_yr", "parallax_mas", "v_mag")
+
+
+def columns(path: str | Path, names: Sequence[str], blank: Sequence[str] = ()) -> Floats:
+    """(len(names) + len(blank), N) numbers of a catalogue file's columns, in the file's order.
+
+    blank : columns whose gaps and missing numbers are NaN. Raises ImageError with one line if it cannot be read.
+    """
+    try:
+        lines = Path(path).read_text(encoding="utf-8").splitlines()
+        body = [line for line in lines if line and not line.startswith("#")]
+        delimiter = "," if "," in body[0] else None
+        header = body[0].replace('"', "").split(delimiter)
+        used = [header.index(name) for name in (*names, *blank)]
+        if not body[1:]:
+            raise ValueError("it has no rows")
+        gaps: dict[int | str, Callable[[str], Any]] = dict.fromkeys(used[len(names) :], _number_or_gap)
+        table = np.loadtxt(body[1:], delimiter=delimiter, usecols=used, ndmin=2, converters=gaps)
+        if not np.isfinite(table[:, : len(names)]).all():
+            raise ValueError("some numbers are not finite")
+    except (OSError, ValueError, IndexError) as error:
+        raise ImageError(
+            f"{path}: not a star catalogue ({error}); allowed: ECSV with {', '.join((*names, *blank))}"
+        ) from None
+    return table.T
+
+
+def _number_or_gap(text: str) -> float:
+    return float(text) if text.strip('" ') else np.nan
+
+
+def from_columns(
+    hip: Ints,
+    ra_rad: Floats,
+    dec_rad: Floats,
+    pm_ra_mas_yr: Floats,
+    pm_dec_mas_yr: Floats,
+    parallax_mas: Floats,
+    v_mag: Floats,
+) -> StarList:
+    """Directions and their drift from spherical coordinates; pm_ra includes cos(dec)."""
+    sa, ca, sd, cd = np.sin(ra_rad), np.cos(ra_rad), np.sin(dec_rad), np.cos(dec_rad)
+    vectors = np.column_stack([cd * ca, cd * sa, sd])
+    east = np.column_stack([-sa, ca, np.zeros_like(sa)])
+    north = np.column_stack([-sd * ca, -sd * sa, cd])
+    drift = MAS_RAD * (pm_ra_mas_yr[:, None] * east + pm_dec_mas_yr[:, None] * north)
+    return StarList(hip, vectors, drift, MAS_RAD * parallax_mas, v_mag)
+
+
+def at_epoch(stars: StarList, epoch_yr: float) -> Floats:
+    """(N, 3) barycentric unit vectors at a Julian year: R + (t - t0) dR/dt, renormalised."""
+    return unit(stars.vectors + (epoch_yr - EPOCH_YR) * stars.drift_rad_yr)
+
+
+def apparent(stars: StarList, observer: Observer) -> Floats:
+    """(N, 3) unit vectors as an observer sees them.
+
+    Proper motion; parallax, R - pi r; the Sun's bending of light, 2 G M / (c^2 r) cot(psi / 2) away from it;
+    aberration by PTASE's eq. 4, (R + v/c) / |R + v/c|: the classical law, at most 0.5 mas from the relativistic.
+    The Sun is taken at the barycentre, which moves a bent star by less than 0.1 mas beyond 10 degrees from it.
+    """
+    vectors = at_epoch(stars, observer.epoch_yr)
+    vectors = unit(vectors - stars.parallax_rad[:, None] * observer.position_au)
+    distance_au = np.linalg.norm(observer.position_au)
+    from_sun = observer.position_au / distance_au
+    along = vectors @ from_sun
+    # (e - (u.e) u) / (1 + u.e) has the length cot(psi / 2); within a solar radius there is no star to be seen.
+    away = (from_sun - along[:, None] * vectors) / np.maximum(1 + along, 1e-5)[:, None]
+    vectors = unit(vectors + SUN_BENDS_RAD / distance_au * away)
+    return unit(vectors + observer.velocity_m_s / SPEED_OF_LIGHT_M_S)
+
+
+def unit(vectors: Floats) -> Floats:
+    """(N, 3) vectors at length 1."""
+    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+
+
+def merge_doubles(stars: StarList, closer_than_rad: float) -> StarList:
+    """Replace stars too close to be told apart by one at their centre of light, as bright as all together."""
+    groups = close_groups(stars.vectors, closer_than_rad)
+    together = np.column_stack([stars.vectors, stars.drift_rad_yr, stars.parallax_rad])
+    middle, v_mag = light_centres(together, stars.v_mag, groups)
+    # The brightest of each group comes first and gives the name.
+    _, first = np.unique(groups, return_index=True)
+    result = StarList(stars.id[first], unit(middle[:, :3]), middle[:, 3:6], middle[:, 6], v_mag)
+    return result.take(np.argsort(result.v_mag, kind="stable"))
+
+
+def light_centres(values: Floats, magnitude: Floats, group: Ints) -> tuple[Floats, Floats]:
+    """(G, K) means of (N, K) values weighted by light, and the (G,) magnitudes of all the light in each group."""
+    light = 10 ** (-0.4 * magnitude)
+    total = np.bincount(group, light)
+    middle = np.column_stack([np.bincount(group, light * column) / total for column in values.T])
+    return middle, -2.5 * np.log10(total)
+
+
+def close_groups(vectors: Floats, closer_than_rad: float) -> Ints:
+    """Label of each star's group, where groups are joined through pairs closer than an angle."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    pairs = cKDTree(vectors).query_pairs(2 * np.sin(closer_than_rad / 2), output_type="ndarray")
+    ones = np.ones(len(pairs))
+    graph = coo_array((ones, (pairs[:, 0], pairs[:, 1])), shape=(len(vectors), len(vectors)))
+    return connected_components(graph, directed=False)[1].astype(np.int64)
+
+
+def brighter(stars: StarList, limit_mag: float) -> StarList:
+    """Stars to a limiting V magnitude."""
+    return stars.take(stars.v_mag <= limit_mag)
+
+
+def limit_for_density(stars: StarList, field_sr: float, wanted: float) -> float:
+    """The magnitude to which a field of so many steradians holds `wanted` stars on average."""
+    count = int(np.clip(wanted * 4 * np.pi / field_sr, 1, len(stars)))
+    return float(np.sort(stars.v_mag)[count - 1])

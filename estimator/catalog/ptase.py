@@ -1,0 +1,131 @@
+"""PTASE's on-board catalogue: READCAT takes it from the file, PROC_CAT makes it fit for a star tracker.
+
+Fialho & Saotome 2005, section 3.3. READCAT takes all stars to a limiting visual magnitude, is able "to convert visual
+magnitudes to instrumental magnitudes through an empirical formula that relates these magnitudes with B-V and V-I", and
+corrects proper motion "from the Hipparcos mean epoch (J1991.25) to the mean mission epoch"; the file's order stays.
+PROC_CAT "merges optically double or multiple systems into a single photometrically equivalent star and rearranges the
+stars in order of increasing magnitude", and logs a histogram and every star. The fixed-point layout of their files is
+unpublished and is not imitated.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from estimator.catalog import catalog
+from estimator.core.arrays import Floats, Ints
+from estimator.core.errors import ImageError
+
+SUN_B_V, SUN_V_I = 0.65, 0.72  # of a G2 star, where a catalogue has no colour
+BYTES_A_STAR = 20  # two angles and a magnitude in 4 bytes each, a number, flags and checksum in 8
+
+
+class Colour(NamedTuple):
+    """An instrument's magnitude: m = V + constant + b_v (B - V) + v_i (V - I)."""
+
+    constant: float = 0.0
+    b_v: float = 0.0
+    v_i: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class OnBoard:
+    """A catalogue at one epoch, as a tracker stores it.
+
+    id        : (N,) of the brightest star in each entry;  vectors : (N, 3) unit, ICRS axes at the barycentre
+    magnitude : (N,) the instrument's;  components : (N,) catalogue stars in each entry;  epoch_yr : Julian year
+    """
+
+    id: Ints
+    vectors: Floats
+    magnitude: Floats
+    components: Ints
+    epoch_yr: float
+
+    def __len__(self) -> int:
+        return len(self.id)
+
+
+def read_cat(
+    path: str | Path, limit_v_mag: float, epoch_yr: float = catalog.EPOCH_YR, colour: Colour | None = None
+) -> OnBoard:
+    """READCAT: the stars to a limiting V, at the mission's epoch, with instrumental magnitudes, in the file's order.
+
+    colour : the instrument's; V itself if left out, and then the file needs no colours. Where one is missing it is
+        the Sun's. Raises ImageError for a file that is no catalogue, and where no star is bright enough.
+    """
+    numbers = catalog.columns(path, catalog.COLUMNS, ("b_v", "v_i") if colour else ())
+    numbers = numbers[:, numbers[6] <= limit_v_mag]
+    if not numbers.shape[1]:
+        raise ImageError(f"{path}: no star of V <= {limit_v_mag:g}; allowed: a fainter limit")
+    hip, ra_deg, dec_deg, pm_ra, pm_dec, parallax, v_mag = numbers[:7]
+    place = np.radians(ra_deg), np.radians(dec_deg)
+    stars = catalog.from_columns(hip.astype(np.int64), *place, pm_ra, pm_dec, parallax, v_mag)
+    magnitude = v_mag
+    if colour:
+        b_v, v_i = np.where(np.isnan(numbers[7:]), [[SUN_B_V], [SUN_V_I]], numbers[7:])
+        magnitude = v_mag + colour.constant + colour.b_v * b_v + colour.v_i * v_i
+    once = np.ones(len(stars), np.int64)
+    return OnBoard(stars.id, catalog.at_epoch(stars, epoch_yr), magnitude, once, epoch_yr)
+
+
+def proc_cat(stars: OnBoard, closer_than_rad: float) -> OnBoard:
+    """PROC_CAT: stars closer than an angle become one at their centre of light; then the brightest comes first.
+
+    The light of all stays: m = -2.5 log10 sum 10^(-0.4 m). Groups are joined through pairs, so that a chain is one.
+    """
+    order = np.argsort(stars.magnitude, kind="stable")
+    vectors, magnitude = stars.vectors[order], stars.magnitude[order]
+    groups = catalog.close_groups(vectors, closer_than_rad)
+    middle, merged = catalog.light_centres(vectors, magnitude, groups)
+    _, first = np.unique(groups, return_index=True)  # the brightest of each group
+    components = np.bincount(groups, stars.components[order]).astype(np.int64)
+    by_light = np.argsort(merged, kind="stable")
+    return OnBoard(
+        stars.id[order][first][by_light],
+        catalog.unit(middle)[by_light],
+        merged[by_light],
+        components[by_light],
+        stars.epoch_yr,
+    )
+
+
+def histogram(magnitude: Floats, step_mag: float = 0.5) -> tuple[Floats, Ints]:
+    """Lower edges of the magnitude bins, whole multiples of the step, and (M,) how many stars are in each."""
+    bins = np.floor(np.asarray(magnitude) / step_mag + 1e-9).astype(np.int64)
+    count = np.bincount(bins - bins.min())
+    return step_mag * (bins.min() + np.arange(len(count))), count
+
+
+def log(stars: OnBoard, step_mag: float = 0.5) -> str:
+    """PROC_CAT's log file: how many stars of which magnitude, the memory that they take, and every star."""
+    edges, count = histogram(stars.magnitude, step_mag)
+    several = stars.components[stars.components > 1]
+    lines = [
+        f"{len(stars)} entries from {stars.components.sum()} stars at J{stars.epoch_yr:.2f}; "
+        f"{len(several)} of them of {several.sum()} stars",
+        f"{BYTES_A_STAR * len(stars)} bytes at {BYTES_A_STAR} bytes an entry",
+        "",
+        "magnitude        stars   to here",
+        *(
+            f"{low:6.2f} .. {low + step_mag:5.2f} {n:6d} {total:9d}"
+            for low, n, total in zip(edges, count, np.cumsum(count), strict=True)
+        ),
+        "",
+        "    id      ra deg     dec deg     mag  stars",
+    ]
+    ra, dec = np.arctan2(stars.vectors[:, 1], stars.vectors[:, 0]), np.arcsin(stars.vectors[:, 2])
+    columns = zip(
+        stars.id,
+        np.degrees(ra) % 360,
+        np.degrees(dec),
+        stars.magnitude,
+        stars.components,
+        strict=True,
+    )
+    lines += [f"{n:6d} {ra:11.6f} {dec:+11.6f} {mag:7.3f} {c:6d}" for n, ra, dec, mag, c in columns]
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,107 @@
+"""Which catalogue stars are near a direction: the cube about the unit sphere, cut into cells."""
+
+from __future__ import annotations
+
+from math import pi, sqrt
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimator.core.arrays import Floats
+from estimator.core.jit import jit
+
+MOST_A_SIDE = 64  # a table of a megabyte
+
+
+class Cells(NamedTuple):
+    """Stars by the cell of the cube [-1, 1]^3 that their direction is in. A plain tuple, for compiled code.
+
+    side  : cells along an edge
+    first : (side^3 + 1,) where each cell's stars begin in `row`;  row : (N,) rows of the vectors, cell after cell
+    """
+
+    side: int
+    first: NDArray[np.int32]
+    row: NDArray[np.int32]
+
+
+def build(vectors: Floats) -> Cells:
+    """The cells of (N, 3) unit vectors: about one star in each cell that the sphere goes through.
+
+    The sphere meets about 4 pi / (2 / side)^2 = pi side^2 of them.
+    """
+    side = min(max(int(sqrt(len(vectors) / pi)), 2), MOST_A_SIDE)
+    return Cells(side, *_sorted(vectors, side))
+
+
+@jit
+def _sorted(vectors: Floats, side: int) -> tuple[NDArray, NDArray]:
+    """Counting sort of the stars by cell."""
+    first = np.zeros(side**3 + 1, np.int32)
+    row, cell = np.empty(len(vectors), np.int32), np.empty(len(vectors), np.int64)
+    for n in range(len(vectors)):
+        x, y, z = vectors[n]
+        cell[n] = (_spot(x, side) * side + _spot(y, side)) * side + _spot(z, side)
+        first[cell[n] + 1] += 1
+    for c in range(side**3):
+        first[c + 1] += first[c]
+    place = first[:-1].copy()
+    for n in range(len(vectors)):
+        row[place[cell[n]]] = n
+        place[cell[n]] += 1
+    return first, row
+
+
+@jit
+def cell_of(place: float, last: int) -> int:
+    """The cell, 0 to last, of a place counted in cells: the nearest one where it is outside, 0 where it is NaN.
+
+    A cast of NaN, or of more than an integer holds, is whatever the processor makes of it.
+    """
+    if not place > 0:
+        return 0
+    return int(place) if place < last else last
+
+
+@jit
+def _spot(x: float, side: int) -> int:
+    """Which cell along an edge a coordinate is in."""
+    return cell_of((x + 1) / 2 * side, side - 1)
+
+
+@jit
+def within(cells: Cells, vectors: Floats, x: float, y: float, z: float, chord: float, out: NDArray) -> int:
+    """How many stars are within a straight-line distance `chord` of (x, y, z); the rows of the first len(out)."""
+    count, side = 0, cells.side
+    for i in range(_spot(x - chord, side), _spot(x + chord, side) + 1):
+        for j in range(_spot(y - chord, side), _spot(y + chord, side) + 1):
+            low = (i * side + j) * side
+            begin = cells.first[low + _spot(z - chord, side)]
+            end = cells.first[low + _spot(z + chord, side) + 1]
+            for place in range(begin, end):
+                s = cells.row[place]
+                dx, dy, dz = vectors[s, 0] - x, vectors[s, 1] - y, vectors[s, 2] - z
+                if dx * dx + dy * dy + dz * dz <= chord * chord:
+                    if count < len(out):
+                        out[count] = s
+                    count += 1
+    return count
+
+
+@jit
+def nearest(cells: Cells, vectors: Floats, x: float, y: float, z: float, chord: float) -> int:
+    """Row of the star nearest to (x, y, z) within a straight-line distance; -1 where there is none."""
+    best, least, side = -1, chord * chord, cells.side
+    for i in range(_spot(x - chord, side), _spot(x + chord, side) + 1):
+        for j in range(_spot(y - chord, side), _spot(y + chord, side) + 1):
+            low = (i * side + j) * side
+            begin = cells.first[low + _spot(z - chord, side)]
+            end = cells.first[low + _spot(z + chord, side) + 1]
+            for place in range(begin, end):
+                s = cells.row[place]
+                dx, dy, dz = vectors[s, 0] - x, vectors[s, 1] - y, vectors[s, 2] - z
+                off = dx * dx + dy * dy + dz * dz
+                if off < least:
+                    best, least = s, off
+    return best

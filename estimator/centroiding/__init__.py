@@ -1,0 +1,1 @@
+"""Blobs to centroids: moments and fits of Gaussians, streaks and discs."""

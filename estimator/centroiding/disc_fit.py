@@ -1,0 +1,127 @@
+"""One lamp as a disc with a blurred edge, by least squares."""
+
+from __future__ import annotations
+
+from math import erfc, exp, hypot, pi, sqrt
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimator.centroiding.moments import foreign, neighbours
+from estimator.core import least_squares
+from estimator.core.arrays import Floats, Ints
+from estimator.core.jit import jit
+from estimator.detection.background import FILTERED_NOISE, at
+
+MARGIN_PX = 4
+SMALLEST_PX = 2.0  # radius of a disc that its edge's blur leaves flat in the middle
+ROUNDS = 40
+MODEL_PX = 0.004  # what a square pixel at a curved edge differs from the model: without noise, at 5 and 10 px
+# Parameters: middle, radius, the edge's width, brightness, sky.
+X, Y, RADIUS, EDGE, BRIGHT, SKY = range(6)
+
+
+@jit
+def fit_all(
+    image: NDArray,
+    xy: Floats,
+    flux: Floats,
+    area: Ints,
+    boxes: Ints,
+    level: Floats,
+    noise: Floats,
+    gain_e_dn: float,
+    saturation: float,
+) -> Floats:
+    """(N, 5) x, y, sigma of the place, flux, radius; NaN for what is no disc."""
+    height, width = image.shape
+    out = np.full((len(xy), 5), np.nan)
+    near, p = np.empty(len(xy), np.int64), np.empty(6)
+    room = _largest_window(boxes)
+    pixels, rows, weight = np.empty((3, room)), np.empty((7, room)), np.empty(room)
+    rows[SKY] = 1.0
+    for n in range(len(xy)):
+        p[X], p[Y] = xy[n]
+        p[RADIUS] = sqrt(area[n] / pi)
+        if p[RADIUS] < SMALLEST_PX:
+            continue
+        x0, y0 = boxes[n, 0] - MARGIN_PX, boxes[n, 1] - MARGIN_PX
+        x1, y1 = boxes[n, 2] + MARGIN_PX, boxes[n, 3] + MARGIN_PX
+        if x0 < 0 or y0 < 0 or x1 >= width or y1 >= height:
+            continue
+        others = near[: neighbours(boxes, n, x0, y0, x1, y1, near)]
+        sky = at(level, height, width, xy[n, 1], xy[n, 0])
+        sigma = at(noise, height, width, xy[n, 1], xy[n, 0]) / FILTERED_NOISE
+        p[EDGE], p[BRIGHT], p[SKY] = 1.0, flux[n] / area[n], sky
+        count = 0
+        for y in range(y0, y1 + 1):
+            for x in range(x0, x1 + 1):
+                if image[y, x] < saturation and not foreign(boxes, others, n, x, y):
+                    pixels[0, count], pixels[1, count], pixels[2, count] = x, y, image[y, x]
+                    count += 1
+        if count >= 12:
+            _fit(pixels[:, :count], sigma, gain_e_dn, rows, weight, p, out[n])
+    return out
+
+
+@jit
+def _largest_window(boxes: Ints) -> int:
+    """Pixels of the largest blob's window."""
+    most = 0
+    for x0, y0, x1, y1 in boxes:
+        most = max(most, (x1 - x0 + 1 + 2 * MARGIN_PX) * (y1 - y0 + 1 + 2 * MARGIN_PX))
+    return most
+
+
+@jit
+def _fit(
+    pixels: Floats, noise: float, gain_e_dn: float, rows: Floats, weight: Floats, p: Floats, out: Floats
+) -> None:
+    """Gauss-Newton from `p`; leaves `out` NaN where it does not settle near its start.
+
+    pixels : (3, K) x, y and value of those that count
+    A lamp is no perfect disc: where the residuals are larger than the noise, the covariance grows with them.
+    """
+    count = pixels.shape[1]
+    start_x, start_y, start_radius = p[X], p[Y], p[RADIUS]
+    normal, move = np.empty((7, 7)), np.empty(6)
+    for _ in range(ROUNDS):
+        _rows(pixels, noise, gain_e_dn, p, rows, weight)
+        least_squares.normal_equations(rows, weight, count, normal)
+        fall = least_squares.step(normal, move)
+        if not fall >= 0:
+            return
+        moved = max(abs(move[X]), abs(move[Y]), abs(move[RADIUS]))
+        p += min(1.0, 1 / max(moved, 4 * abs(move[EDGE]), 1e-300)) * move
+        p[EDGE] = min(max(p[EDGE], 0.25), 0.6 * p[RADIUS])
+        if hypot(p[X] - start_x, p[Y] - start_y) > start_radius / 2 or p[BRIGHT] <= 0:
+            return
+        if not start_radius / 2 < p[RADIUS] < 2 * start_radius:
+            return
+        if moved < least_squares.SETTLED_PX or fall < least_squares.SETTLED_CHI2:
+            xx, yy, _ = least_squares.place_covariance(normal, move)
+            grown = (xx + yy) / 2 * least_squares.misfit_factor(normal[6, 6], count - 6)
+            out[0], out[1], out[2], out[4] = p[X], p[Y], sqrt(grown + MODEL_PX**2), p[RADIUS]
+            # The whole light of a blurred disc: pi (R^2 + w^2), the edge being symmetric about R.
+            out[3] = p[BRIGHT] * pi * (p[RADIUS] ** 2 + p[EDGE] ** 2)
+            return
+
+
+@jit
+def _rows(pixels: Floats, noise: float, gain_e_dn: float, p: Floats, rows: Floats, weight: Floats) -> None:
+    """The model's slopes by the six parameters at every pixel, what it leaves over, and the weights.
+
+    The light is A erfc((r - R) / (w sqrt 2)) / 2: exact for a straight edge blurred by a Gaussian; w^2 is the
+    optics' sigma^2 and the pixel's 1/12.
+    """
+    bright, w = p[BRIGHT], p[EDGE]
+    for k in range(pixels.shape[1]):
+        dx, dy = pixels[0, k] - p[X], pixels[1, k] - p[Y]
+        r = max(hypot(dx, dy), 1e-9)
+        off = r - p[RADIUS]
+        shape = erfc(off / (w * sqrt(2.0))) / 2
+        bell = bright * exp(-off * off / (2 * w * w)) / (w * sqrt(2 * pi))
+        rows[X, k], rows[Y, k] = bell * dx / r, bell * dy / r
+        rows[RADIUS, k], rows[EDGE, k], rows[BRIGHT, k] = bell, bell * off / w, shape
+        rows[6, k] = pixels[2, k] - p[SKY] - bright * shape
+        weight[k] = 1 / (noise * noise + max(bright * shape, 0.0) / gain_e_dn + 1e-9)

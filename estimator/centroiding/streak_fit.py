@@ -1,0 +1,176 @@
+"""One smeared star as a line segment blurred by a Gaussian, by least squares."""
+
+from __future__ import annotations
+
+from math import cos, erf, exp, hypot, pi, sin, sqrt
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimator.centroiding.moments import foreign, neighbours
+from estimator.core import least_squares
+from estimator.core.arrays import Floats, Ints
+from estimator.core.jit import jit
+from estimator.detection.background import FILTERED_NOISE, at
+
+MARGIN_PX, WIDEST_PX = 4, 96  # of the window about the streak
+REACH_PX = 4.5  # from the line that the fit starts from: beyond there is but sky
+SHORTEST_PX = 1.5  # of a streak whose length and direction the light still tells
+ROUNDS = 40
+# By how much a star's own streak may differ from the frame's (1 sigma): the field turns about the boresight too, a
+# lens stretches; and its width from that of the star before. Faint light tells less, and left to itself it calls the
+# brightest piece of its streak the streak.
+LENGTH_SHARE, LENGTH_PX, ANGLE_RAD, WIDTH_SHARE = 0.15, 0.5, 0.15, 0.15
+FAR_SIGMA = 5.0  # from an end of the line: 3e-7 of the light is farther out
+# Parameters: middle, flux, length, direction, width, sky.
+X, Y, FLUX, LENGTH, ANGLE, WIDTH, SKY = range(7)
+
+
+@jit
+def fit_all(
+    image: NDArray,
+    xy: Floats,
+    boxes: Ints,
+    level: Floats,
+    noise: Floats,
+    streak: tuple[float, float],
+    gain_e_dn: float,
+    saturation: float,
+) -> Floats:
+    """(N, 8) x, y, flux, dx, dy, and xx, yy, xy of the middle's covariance; NaN for what is no single streak."""
+    height, width = image.shape
+    out = np.full((len(xy), 8), np.nan)
+    near, p = np.empty(len(xy), np.int64), np.empty(7)
+    half_x, half_y = int(abs(streak[0]) / 2) + MARGIN_PX, int(abs(streak[1]) / 2) + MARGIN_PX
+    if max(half_x, half_y) > WIDEST_PX:
+        return out
+    room = (2 * half_x + 1) * (2 * half_y + 1)
+    pixels, rows, weight = np.empty((3, room)), np.empty((8, room)), np.empty(room)
+    rows[SKY] = 1.0
+    length, angle, width_px = hypot(streak[0], streak[1]), np.arctan2(streak[1], streak[0]), 0.9
+    for n in range(len(xy)):
+        x0, y0 = round(xy[n, 0]) - half_x, round(xy[n, 1]) - half_y
+        x1, y1 = x0 + 2 * half_x, y0 + 2 * half_y
+        if x0 < 0 or y0 < 0 or x1 >= width or y1 >= height:
+            continue
+        others = near[: neighbours(boxes, n, x0, y0, x1, y1, near)]
+        sky = at(level, height, width, xy[n, 1], xy[n, 0])
+        sigma = at(noise, height, width, xy[n, 1], xy[n, 0]) / FILTERED_NOISE
+        p[X], p[Y], p[FLUX] = xy[n, 0], xy[n, 1], 0.0
+        p[LENGTH], p[ANGLE], p[WIDTH], p[SKY] = length, angle, width_px, sky
+        count = 0
+        for y in range(y0, y1 + 1):
+            for x in range(x0, x1 + 1):
+                if _off_line(p, x, y) > REACH_PX or foreign(boxes, others, n, x, y):
+                    continue
+                p[FLUX] += image[y, x] - sky
+                if image[y, x] < saturation:
+                    pixels[0, count], pixels[1, count], pixels[2, count] = x, y, image[y, x]
+                    count += 1
+        if p[FLUX] > 0 and _fit(pixels[:, :count], sigma, gain_e_dn, rows, weight, p, out[n]):
+            width_px = p[WIDTH]  # the optics are the same
+    return out
+
+
+@jit
+def _off_line(p: Floats, x: float, y: float) -> float:
+    """Distance of a pixel from the line segment."""
+    along_x, along_y = cos(p[ANGLE]), sin(p[ANGLE])
+    u = (x - p[X]) * along_x + (y - p[Y]) * along_y
+    v = (y - p[Y]) * along_x - (x - p[X]) * along_y
+    return hypot(max(abs(u) - p[LENGTH] / 2, 0.0), v)
+
+
+@jit
+def _fit(
+    pixels: Floats, noise: float, gain_e_dn: float, rows: Floats, weight: Floats, p: Floats, out: Floats
+) -> bool:
+    """Gauss-Newton from `p`; False where it does not settle near its start.
+
+    pixels : (3, K) x, y and value of those that count
+    Where it starts is the frame's streak, from which its own differs by LENGTH_SHARE and so on. Two streaks that cross
+    are no streak: the covariance grows with what the model leaves over.
+    """
+    count = pixels.shape[1]
+    start_x, start_y = p[X], p[Y]
+    start_length, start_angle, start_width = p[LENGTH], p[ANGLE], p[WIDTH]
+    length_sigma = LENGTH_SHARE * start_length + LENGTH_PX
+    normal, move = np.empty((8, 8)), np.empty(7)
+    for _ in range(ROUNDS):
+        _rows(pixels, noise, gain_e_dn, p, rows, weight)
+        least_squares.normal_equations(rows, weight, count, normal)
+        least_squares.expect(normal, LENGTH, start_length - p[LENGTH], length_sigma)
+        least_squares.expect(normal, ANGLE, start_angle - p[ANGLE], ANGLE_RAD)
+        least_squares.expect(normal, WIDTH, start_width - p[WIDTH], WIDTH_SHARE * start_width)
+        fall = least_squares.step(normal, move)
+        if not fall >= 0:
+            return False
+        moved = max(abs(move[X]), abs(move[Y]), abs(move[LENGTH]))
+        turned = abs(move[ANGLE]) * p[LENGTH] / 2
+        p += min(1.0, 1 / max(moved, turned, 2 * abs(move[WIDTH]), 1e-300)) * move
+        p[WIDTH] = min(max(p[WIDTH], 0.3), 4.0)
+        if abs(p[X] - start_x) + abs(p[Y] - start_y) > 2 + start_length / 2:
+            return False
+        if p[FLUX] <= 0 or not SHORTEST_PX < p[LENGTH] < 2 * start_length + 4:
+            return False
+        if moved < least_squares.SETTLED_PX or fall < least_squares.SETTLED_CHI2:
+            out[0], out[1], out[2] = p[X], p[Y], p[FLUX]
+            out[3], out[4] = p[LENGTH] * cos(p[ANGLE]), p[LENGTH] * sin(p[ANGLE])
+            out[5], out[6], out[7] = least_squares.place_covariance(normal, move)
+            out[5:] *= least_squares.misfit_factor(normal[7, 7], count - 4)
+            lost = _slip_px2(p, noise, gain_e_dn) / p[LENGTH] ** 2
+            out[5] += lost * out[3] ** 2
+            out[6] += lost * out[4] ** 2
+            out[7] += lost * out[3] * out[4]
+            return True
+    return False
+
+
+@jit
+def _slip_px2(p: Floats, noise: float, gain_e_dn: float) -> float:
+    """Variance along the streak that Cramer and Rao do not see: in noise an end may be taken for where it is not.
+
+    Where light of a a pixel's way begins in noise of n, the likeliest place is off by 26 (n / a)^4 in the mean square
+    (Yao 1987: the maximum of a Brownian motion that falls to both sides). Two ends whose distance is told fall
+    together, twice as steeply: a quarter of that. Weighed across the streak n^2 is 2 sqrt(pi) w that of a pixel.
+    """
+    across = 2 * sqrt(pi) * p[WIDTH]
+    variance = noise * noise + p[FLUX] / (across * p[LENGTH]) / gain_e_dn
+    return 6.5 * (variance * across * (p[LENGTH] / p[FLUX]) ** 2) ** 2
+
+
+@jit
+def _rows(pixels: Floats, noise: float, gain_e_dn: float, p: Floats, rows: Floats, weight: Floats) -> None:
+    """The model's slopes by the seven parameters at every pixel, what it leaves over, and the weights.
+
+    The light is F / L * [erf((u + L/2) / (w sqrt 2)) - erf((u - L/2) / (w sqrt 2))] / 2 * exp(-v^2 / 2 w^2) /
+    (w sqrt(2 pi)) at u along and v across. The pixel's own width is in w: w^2 = sigma^2 + 1/12.
+    """
+    along_x, along_y = cos(p[ANGLE]), sin(p[ANGLE])
+    flux, length, w = p[FLUX], p[LENGTH], p[WIDTH]
+    for k in range(pixels.shape[1]):
+        dx, dy = pixels[0, k] - p[X], pixels[1, k] - p[Y]
+        u, v = dx * along_x + dy * along_y, dy * along_x - dx * along_y
+        head, tail = (u + length / 2) / w, (u - length / 2) / w
+        head_sum, head_bell = _step(head)
+        tail_sum, tail_bell = _step(tail)
+        across = exp(-v * v / (2 * w * w)) / (w * sqrt(2 * pi) * length)
+        unit = (head_sum - tail_sum) * across
+        by_u, by_v = (head_bell - tail_bell) / w * across, -v / (w * w) * unit
+        rows[X, k] = -flux * (along_x * by_u - along_y * by_v)
+        rows[Y, k] = -flux * (along_y * by_u + along_x * by_v)
+        rows[FLUX, k] = unit
+        rows[LENGTH, k] = flux * ((head_bell + tail_bell) / (2 * w) * across - unit / length)
+        rows[ANGLE, k] = flux * (v * by_u - u * by_v)
+        by_w_along = (tail * tail_bell - head * head_bell) / w * across
+        rows[WIDTH, k] = flux * (by_w_along + unit * (v * v / (w * w * w) - 1 / w))
+        rows[7, k] = pixels[2, k] - p[SKY] - flux * unit
+        weight[k] = 1 / (noise * noise + max(flux * unit, 0.0) / gain_e_dn + 1e-9)
+
+
+@jit
+def _step(t: float) -> tuple[float, float]:
+    """A Gaussian's integral from its middle, and its density, at t of its sigmas; far off without much ado."""
+    if abs(t) > FAR_SIGMA:
+        return (0.5 if t > 0 else -0.5), 0.0
+    return erf(t * sqrt(0.5)) / 2, exp(-t * t / 2) / sqrt(2 * pi)

@@ -1,0 +1,1 @@
+"""Array types, errors, the camera model, vectors and least squares. Imports nothing else of the estimator."""

@@ -1,0 +1,145 @@
+"""The believed calibration: pixel to unit vector and back. What the tracker thinks its camera is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from estimator.core.arrays import Floats
+from estimator.core.errors import ImageError
+from estimator.core.jit import jit
+
+Distortion = tuple[float, float, float, float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Camera:
+    """A pinhole with Brown-Conrady distortion, in camera axes +x right, +y down, +z boresight.
+
+    focal_px : focal length over pixel pitch
+    centre_px: principal point (x, y); the middle of pixel (0, 0) is (0, 0)
+    distortion: k1, k2, p1, p2, k3 in OpenCV's order
+    """
+
+    width_px: int
+    height_px: int
+    focal_px: float
+    centre_px: tuple[float, float]
+    distortion: Distortion = (0.0, 0.0, 0.0, 0.0, 0.0)
+
+    @classmethod
+    def from_fov(cls, width_px: int, height_px: int, fov_rad: float) -> Camera:
+        """An undistorted camera from the angle between the middles of the left and right edge columns."""
+        focal_px = (width_px - 1) / 2 / np.tan(fov_rad / 2)
+        return cls(width_px, height_px, float(focal_px), ((width_px - 1) / 2, (height_px - 1) / 2))
+
+    @property
+    def fov_rad(self) -> float:
+        """Horizontal field: the angle between the rays of the left and right edges' middle pixels."""
+        row = (self.height_px - 1) / 2
+        left, right = self.rays(np.array([[0.0, row], [self.width_px - 1.0, row]]))
+        return float(np.arctan2(np.linalg.norm(np.cross(left, right)), left @ right))
+
+    @property
+    def diagonal_rad(self) -> float:
+        """The greatest angle between two directions on the sensor."""
+        half = np.hypot(self.width_px, self.height_px) / 2
+        return float(2 * np.arctan(half / self.focal_px))
+
+    def zoomed(self, factor: float) -> Camera:
+        """The same camera with its focal length times `factor`."""
+        return replace(self, focal_px=self.focal_px * factor)
+
+    def rays(self, xy_px: Floats) -> Floats:
+        """(N, 2) pixels to (N, 3) unit vectors in camera axes."""
+        tangent = self.tangents(xy_px)
+        rays = np.column_stack([tangent, np.ones(len(tangent))])
+        return rays / np.linalg.norm(rays, axis=1, keepdims=True)
+
+    def tangents(self, xy_px: Floats) -> Floats:
+        """(N, 2) pixels to (N, 2) x / z and y / z in camera axes."""
+        return undistorted(np.asarray(xy_px, dtype=float), self.focal_px, *self.centre_px, self.distortion)
+
+    def pixels(self, vectors_cam: Floats) -> Floats:
+        """(N, 3) vectors in camera axes to (N, 2) pixels; NaN behind the camera and beyond the distortion's fold."""
+        z = np.where(vectors_cam[:, 2] > 0, vectors_cam[:, 2], np.nan)
+        tangent = vectors_cam[:, :2] / z[:, None]
+        tangent[np.sum(tangent**2, axis=1) >= self._fold()] = np.nan
+        return distorted(tangent, self.distortion) * self.focal_px + self.centre_px
+
+    def contains(self, xy_px: Floats, margin_px: float = 0.0) -> np.ndarray:
+        """(N,) whether a pixel lies on the sensor, shrunk by the margin."""
+        x, y = xy_px[:, 0], xy_px[:, 1]
+        low, right, bottom = (
+            margin_px - 0.5,
+            self.width_px - 0.5 - margin_px,
+            self.height_px - 0.5 - margin_px,
+        )
+        return (x >= low) & (x <= right) & (y >= low) & (y <= bottom)
+
+    def _fold(self) -> float:
+        """Squared tangent at which a barrel distortion turns back: what lies beyond would appear in the field.
+
+        The least positive root of d(r radial)/dr = 1 + 3 k1 r^2 + 5 k2 r^4 + 7 k3 r^6; infinite if there is none.
+        """
+        k1, k2, _, _, k3 = self.distortion
+        if not (k1 or k2 or k3):
+            return np.inf
+        # Of 1 / r^2, so that a coefficient of next to nothing is never divided by.
+        roots = np.roots([1.0, 3 * k1, 5 * k2, 7 * k3])
+        greatest = float(max(roots.real[(np.abs(roots.imag) < 1e-12) & (roots.real > 0)], default=0.0))
+        return 1 / greatest if greatest else np.inf
+
+
+@jit
+def _bent(x: float, y: float, distortion: Distortion) -> tuple[float, float]:
+    """A tangent through the lens (Brown 1966, as OpenCV has it)."""
+    k1, k2, p1, p2, k3 = distortion
+    r2 = x * x + y * y
+    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    return (
+        x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+        y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
+    )
+
+
+@jit
+def distorted(tangent: Floats, distortion: Distortion) -> Floats:
+    """(N, 2) tangents through the lens."""
+    out = np.empty_like(tangent)
+    for n in range(len(tangent)):
+        out[n, 0], out[n, 1] = _bent(tangent[n, 0], tangent[n, 1], distortion)
+    return out
+
+
+@jit
+def undistorted(
+    xy_px: Floats, focal_px: float, centre_x_px: float, centre_y_px: float, distortion: Distortion
+) -> Floats:
+    """(N, 2) pixels to (N, 2) tangents.
+
+    Fixed-point inverse of the distortion; a lens of some per cent converges to 1e-15 in a few tens.
+    """
+    out = np.empty(xy_px.shape)
+    k1, k2, p1, p2, k3 = distortion
+    straight = k1 == 0 and k2 == 0 and p1 == 0 and p2 == 0 and k3 == 0
+    for n in range(len(out)):
+        seen_x, seen_y = (xy_px[n, 0] - centre_x_px) / focal_px, (xy_px[n, 1] - centre_y_px) / focal_px
+        x, y = seen_x, seen_y
+        for _ in range(0 if straight else 50):
+            bent_x, bent_y = _bent(x, y, distortion)
+            x, y = x + seen_x - bent_x, y + seen_y - bent_y
+            if max(abs(seen_x - bent_x), abs(seen_y - bent_y)) < 1e-15:
+                break
+        out[n, 0], out[n, 1] = x, y
+    return out
+
+
+def check_shape(image_shape: tuple[int, ...], camera: Camera) -> None:
+    """Raise ImageError unless the image is the camera's."""
+    if image_shape != (camera.height_px, camera.width_px):
+        size = "x".join(map(str, image_shape[1::-1])) if len(image_shape) >= 2 else image_shape
+        raise ImageError(
+            f"the image is {size} pixels; this camera's are {camera.width_px}x{camera.height_px}"
+        )

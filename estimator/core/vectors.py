@@ -1,0 +1,88 @@
+"""Vectors and small rotations for compiled code that makes no arrays of them."""
+
+from __future__ import annotations
+
+from math import sqrt
+
+import numpy as np
+
+from estimator.core.arrays import Floats
+from estimator.core.jit import jit
+
+Vector = tuple[float, float, float]
+
+
+@jit
+def row(array: Floats, n: int) -> Vector:
+    return array[n, 0], array[n, 1], array[n, 2]
+
+
+@jit
+def chord(u: Vector, v: Vector) -> float:
+    """Distance between the ends of unit vectors; it changes by no more than their angle."""
+    return sqrt((u[0] - v[0]) ** 2 + (u[1] - v[1]) ** 2 + (u[2] - v[2]) ** 2)
+
+
+@jit
+def axes(u: Vector, v: Vector, out: Floats) -> None:
+    """Right-handed axes as the columns of out (3, 3): the middle of two unit vectors, their normal, and the third."""
+    out[0, 0], out[1, 0], out[2, 0] = u[0] + v[0], u[1] + v[1], u[2] + v[2]
+    out[0, 1] = u[1] * v[2] - u[2] * v[1]
+    out[1, 1] = u[2] * v[0] - u[0] * v[2]
+    out[2, 1] = u[0] * v[1] - u[1] * v[0]
+    for c in range(2):
+        inverse = 1 / sqrt(out[0, c] ** 2 + out[1, c] ** 2 + out[2, c] ** 2)
+        for k in range(3):
+            out[k, c] *= inverse
+    out[0, 2] = out[1, 0] * out[2, 1] - out[2, 0] * out[1, 1]
+    out[1, 2] = out[2, 0] * out[0, 1] - out[0, 0] * out[2, 1]
+    out[2, 2] = out[0, 0] * out[1, 1] - out[1, 0] * out[0, 1]
+
+
+@jit
+def times_transposed(one: Floats, other: Floats, out: Floats) -> None:
+    """out = one other', (3, 3) each."""
+    for i in range(3):
+        for j in range(3):
+            out[i, j] = one[i, 0] * other[j, 0] + one[i, 1] * other[j, 1] + one[i, 2] * other[j, 2]
+
+
+@jit
+def turn(w: Floats, matrix: Floats) -> None:
+    """A small turn w of a rotation matrix, in place: exp([w]) to second order, then made orthonormal."""
+    for c in range(3):
+        x, y, z = matrix[0, c], matrix[1, c], matrix[2, c]
+        cx, cy, cz = w[1] * z - w[2] * y, w[2] * x - w[0] * z, w[0] * y - w[1] * x
+        matrix[0, c] = x + cx + (w[1] * cz - w[2] * cy) / 2
+        matrix[1, c] = y + cy + (w[2] * cx - w[0] * cz) / 2
+        matrix[2, c] = z + cz + (w[0] * cy - w[1] * cx) / 2
+    u = row(matrix, 0)
+    inverse = 1 / sqrt(u[0] ** 2 + u[1] ** 2 + u[2] ** 2)
+    for c in range(3):
+        matrix[0, c] *= inverse
+    along = matrix[0, 0] * matrix[1, 0] + matrix[0, 1] * matrix[1, 1] + matrix[0, 2] * matrix[1, 2]
+    for c in range(3):
+        matrix[1, c] -= along * matrix[0, c]
+    inverse = 1 / sqrt(matrix[1, 0] ** 2 + matrix[1, 1] ** 2 + matrix[1, 2] ** 2)
+    for c in range(3):
+        matrix[1, c] *= inverse
+    for c in range(3):
+        n, m = (c + 1) % 3, (c + 2) % 3
+        matrix[2, c] = matrix[0, n] * matrix[1, m] - matrix[0, m] * matrix[1, n]
+
+
+@jit
+def xyzw_of(R: Floats) -> Floats:
+    """(4,) quaternion (x, y, z, w) of a rotation matrix, by its greatest part (Shepperd 1978, J. Guidance 1, 223)."""
+    trace = R[0, 0] + R[1, 1] + R[2, 2]
+    q = np.empty(4)
+    i = 0 if R[0, 0] >= R[1, 1] else 1
+    i = i if R[i, i] >= R[2, 2] else 2
+    if trace >= R[i, i]:
+        q[3] = 1 + trace
+        q[0], q[1], q[2] = R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]
+    else:
+        j, k = (i + 1) % 3, (i + 2) % 3
+        q[i] = 1 + 2 * R[i, i] - trace
+        q[j], q[k], q[3] = R[j, i] + R[i, j], R[k, i] + R[i, k], R[k, j] - R[j, k]
+    return q / sqrt(q[0] ** 2 + q[1] ** 2 + q[2] ** 2 + q[3] ** 2)

@@ -1,0 +1,1 @@
+"""Frame to blobs: background, thresholding, connected components, and what is a star."""

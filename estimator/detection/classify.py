@@ -1,0 +1,174 @@
+"""Star or not: what a blob's shape and surroundings tell."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from enum import IntFlag
+from math import atan2, cos, hypot, sin, sqrt
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimator.core.arrays import Floats, Ints
+from estimator.core.jit import jit
+from estimator.core.types import Blobs, FramePriors
+from estimator.detection.background import FILTERED_NOISE, at, filtered, median
+
+# Light of the four neighbours over the middle pixel's: .5 of a centred Gaussian of 0.4 px, 0 of a spike.
+SHARPEST = 0.25
+LARGEST_SHARE = 0.05  # of the frame's shorter side: no star is that wide, the Moon and a tree are
+ROUGHEST = 4.0  # times the frame's own noise
+CLEAR_SIGMA = 10.0  # of a pixel: light whose shape can be told
+VOTERS = 15  # of the brightest blobs that say whether the frame is smeared
+STREAK_PX, TRACK_PX = 6.0, 6.0  # lines that are no accident of noise, no pair of stars, no soft focus
+
+
+class Flag(IntFlag):
+    """What is odd about a blob.
+
+    SATURATED : a pixel is full: still a star, less well placed
+    HOT       : one pixel, sharper than any optics: a defect or a hit by a particle
+    TRACK     : a line that the other blobs do not share: a particle, a satellite
+    HUGE      : the Moon, a lamp, the horizon
+    TEXTURE   : in a part of the frame much rougher than the rest: trees, clouds
+    """
+
+    SATURATED = 1
+    HOT = 2
+    TRACK = 4
+    HUGE = 8
+    TEXTURE = 16
+
+
+NO_STAR = Flag.HOT | Flag.TRACK | Flag.HUGE | Flag.TEXTURE
+SATURATED, HOT, TRACK, HUGE, TEXTURE = (int(flag) for flag in Flag)  # as compiled code takes them
+
+
+def judged(image: NDArray, blobs: Blobs, hints: FramePriors) -> Blobs:
+    """The blobs with their flags, and with the streak (dx, dy) that the frame's stars share, if any.
+
+    A blob's streak is told by its second moments: those of a uniform line of length L exceed across by L^2 / 12. As
+    a line has no sign, lines are compared as L^2 (cos 2a, sin 2a).
+    """
+    if not len(blobs):
+        return replace(blobs, streak_px=hints.streak_px)
+    background = blobs.background
+    shape = _shapes(image, blobs.box_px, background.level, background.noise)
+    streak_px = hints.streak_px
+    if streak_px is None:
+        shared = _shared(shape[:, 3:])
+        if shared[0] ** 2 + shared[1] ** 2 > STREAK_PX**4 and len(blobs) >= 3:
+            streak_px = _halved(shared)
+    else:
+        shared = _doubled(streak_px)
+    flag = _flags(
+        shape,
+        blobs.box_px,
+        blobs.xy_px,
+        blobs.peak,
+        background.noise,
+        image.shape,
+        shared,
+        streak_px is not None,
+        hints.saturation,
+        FILTERED_NOISE * (image.dtype.kind in "iu"),
+    )
+    return Blobs(
+        blobs.box_px, blobs.xy_px, blobs.flux, blobs.peak, blobs.area_px, background, flag, streak_px
+    )
+
+
+@jit
+def _flags(
+    shape: Floats,
+    boxes: Ints,
+    xy: Floats,
+    peak: Floats,
+    noise: Floats,
+    size: tuple[int, int],
+    shared: tuple[float, float],
+    smeared: bool,
+    saturation: float,
+    step: float,
+) -> Ints:
+    """(N,) what each blob's row of `_shapes` tells, beside the line that they share; `step` is quantisation's noise."""
+    height, width = size
+    ordinary, narrow = max(median(noise), step), median(shape[:, 2])
+    allowed = max(LARGEST_SHARE * min(height, width) + sqrt(hypot(shared[0], shared[1])), 16.0)
+    flag = np.zeros(len(shape), np.int64)
+    for n in range(len(shape)):
+        middle, sides, width2, line_x, line_y = shape[n]
+        here = at(noise, height, width, xy[n, 1], xy[n, 0])
+        pixel_noise = here / FILTERED_NOISE
+        long2 = hypot(line_x - shared[0], line_y - shared[1])
+        sharp = sides + 6 * pixel_noise < SHARPEST * middle
+        track = long2 > TRACK_PX**2 and width2 < 4 * narrow and long2 > 12 * 4 * width2
+        if smeared:  # no star is a spike there, and a faint streak has the shape of its noise
+            sharp = False
+            track = track and middle > CLEAR_SIGMA * pixel_noise
+        side = max(boxes[n, 2] - boxes[n, 0], boxes[n, 3] - boxes[n, 1]) + 1
+        flag[n] |= SATURATED if peak[n] >= saturation else 0
+        flag[n] |= HOT if sharp else 0
+        flag[n] |= TRACK if track else 0
+        flag[n] |= HUGE if side > allowed and not track else 0
+        flag[n] |= TEXTURE if here > ROUGHEST * ordinary else 0
+    return flag
+
+
+@jit
+def _shared(lines: Floats) -> tuple[float, float]:
+    """The line, as L^2 (cos 2a, sin 2a), that most of the brightest blobs share; 0 where they do not agree."""
+    voters = lines[:VOTERS]
+    x, y = median(voters[:, 0]), median(voters[:, 1])
+    agree = 0
+    for n in range(len(voters)):
+        agree += hypot(voters[n, 0] - x, voters[n, 1] - y) < 0.5 * hypot(x, y)
+    return (x, y) if agree > 0.6 * len(voters) else (0.0, 0.0)
+
+
+def _doubled(streak_px: tuple[float, float]) -> tuple[float, float]:
+    x, y = streak_px
+    return float(x * x - y * y), float(2 * x * y)
+
+
+def _halved(line: tuple[float, float]) -> tuple[float, float]:
+    length, angle = sqrt(hypot(*line)), atan2(line[1], line[0]) / 2
+    return length * cos(angle), length * sin(angle)
+
+
+@jit
+def _shapes(image: NDArray, boxes: Ints, level: Floats, noise: Floats) -> Floats:
+    """(N, 5) a blob's greatest pixel above the sky, the sum of its four neighbours, the variance across its longer
+    axis, and 12 (xx - yy, 2 xy) of the pixels whose filtered light is above 3 sigma: L^2 (cos 2a, sin 2a).
+    """
+    height, width = image.shape
+    out = np.zeros((len(boxes), 5))
+    for n in range(len(boxes)):
+        x0, y0, x1, y1 = boxes[n]
+        total = x_sum = y_sum = xx = yy = xy = 0.0
+        top, top_x, top_y = -np.inf, x0, y0
+        for y in range(y0, y1 + 1):
+            for x in range(x0, x1 + 1):
+                sky = at(level, height, width, y, x)
+                light = image[y, x] - sky
+                if light > top:
+                    top, top_x, top_y = light, x, y
+                if light > 0 and filtered(image, y, x) - sky > 3 * at(noise, height, width, y, x):
+                    u, v = x - x0, y - y0
+                    total += light
+                    x_sum += light * u
+                    y_sum += light * v
+                    xx += light * u * u
+                    yy += light * v * v
+                    xy += light * u * v
+        sky = at(level, height, width, top_y, top_x)
+        out[n, 0] = top
+        for a, b in ((top_x - 1, top_y), (top_x + 1, top_y), (top_x, top_y - 1), (top_x, top_y + 1)):
+            out[n, 1] += float(image[min(max(b, 0), height - 1), min(max(a, 0), width - 1)]) - sky
+        if total > 0:
+            xx, yy = xx / total - (x_sum / total) ** 2, yy / total - (y_sum / total) ** 2
+            xy = xy / total - x_sum * y_sum / total**2
+            apart = np.sqrt((xx - yy) ** 2 + 4 * xy * xy)
+            out[n, 2] = (xx + yy - apart) / 2
+            out[n, 3], out[n, 4] = 12 * (xx - yy), 24 * xy
+    return out

@@ -1,0 +1,333 @@
+"""Which pixels are light: background, threshold, connected blobs, and what of them is no star."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimator.core.arrays import Floats, Ints
+from estimator.core.errors import ImageError
+from estimator.core.types import NO_PRIORS, Background, Blobs, FramePriors
+from estimator.detection import classify
+from estimator.detection.background import FILTERED_NOISE, median, sky
+from estimator.detection.components import Ints32, labelled, ranked, runs_above, summed
+from estimator.detection.shefex import maximum_scan, sequential_scan
+
+MAX_BLOBS = 20_000
+GROW_SIGMA = 3.5
+FEWEST_GROWN = 8  # pixels of a blob that is significant as a whole, though nowhere by itself
+FEW_STARS, DIRECTIONS, SOUGHT_PX = 8, 8, 10.0  # fewer may be streaks too faint to be seen; what is tried then
+LARGE_PX = 150  # a blob of so many pixels is no faint streak, and a line filter makes many of its noise
+LONGEST_PX = 1024  # of a streak that is filtered for: along such a line no pixel holds much of a star
+FEWEST_SMEARED = 5  # noise averaged along a line is above the threshold three pixels in a row, or not at all
+THESIS_INTENSITY, THESIS_AREA_PX = 0.04, 50
+
+# (image, threshold_sigma, min_area_px, max_blobs, hints): the image is (H, W) of any real dtype. Each raises ImageError
+# where there is nothing to look at.
+Detector = Callable[..., Blobs]
+
+
+def default(
+    image: NDArray,
+    threshold_sigma: float = 5.0,
+    min_area_px: int = 3,
+    max_blobs: int = 200,
+    hints: FramePriors = NO_PRIORS,
+) -> Blobs:
+    """Matched filters for round and for smeared stars over the local sky, grown to where the light ends.
+
+    Round stars: the binomial filter [1 2 1] x [1 2 1] / 16 is close to the matched filter of sigma 0.7 px. A blob is
+    the connected pixels above 3.5 sigma of which `min_area_px` are above `threshold_sigma`, or whose light as a whole
+    is a sigma more significant than that: noise does not break a faint streak into pieces.
+    Smeared stars: the filtered image is averaged along the streak (dx, dy), which gains the square root of its
+    length. The streak is the hints' (from the gyro), else what the brightest blobs agree on, else, where there are
+    but few, the direction in which most are found. Beyond LONGEST_PX it stays with the filter for round stars.
+    """
+    image = prepared(image)
+    background = sky(image)
+    if hints.streak_px is None or not 2 <= max(map(abs, hints.streak_px)) <= LONGEST_PX:
+        blobs = gather(
+            image, background, threshold_sigma * background.noise, min_area_px, max_blobs, GROW_SIGMA
+        )
+        blobs = classify.judged(image, blobs, hints)
+        if blobs.streak_px is None:
+            stars = int(np.count_nonzero(blobs.flag & classify.NO_STAR == 0))
+            wanting = hints.streak_px is None and stars < FEW_STARS and np.all(blobs.area_px < LARGE_PX)
+            unseen = faint_streaks(image, background, threshold_sigma, max_blobs, hints) if wanting else blobs
+            return classify.judged(image, unseen, hints) if len(unseen) > stars + 1 else blobs
+        if max(map(abs, blobs.streak_px)) > LONGEST_PX:
+            return blobs
+        hints = FramePriors(blobs.streak_px, hints.saturation)
+    return classify.judged(image, smeared(image, background, threshold_sigma, max_blobs, hints), hints)
+
+
+def local(
+    image: NDArray,
+    threshold_sigma: float = 5.0,
+    min_area_px: int = 3,
+    max_blobs: int = 200,
+    hints: FramePriors = NO_PRIORS,
+) -> Blobs:
+    """Blobs that stand `threshold_sigma` above the local sky after a 3x3 binomial filter."""
+    image = prepared(image)
+    background = sky(image)
+    return gather(image, background, threshold_sigma * background.noise, min_area_px, max_blobs)
+
+
+def components(
+    image: NDArray,
+    threshold_sigma: float = 5.0,
+    min_area_px: int = 3,
+    max_blobs: int = 200,
+    hints: FramePriors = NO_PRIORS,
+) -> Blobs:
+    """Blobs above one level for the whole frame: its median sky plus `threshold_sigma` times its noise."""
+    image = prepared(image)
+    flat = flattened(sky(image), image.shape)
+    return gather(image, flat, threshold_sigma * flat.noise, min_area_px, max_blobs)
+
+
+def thesis(
+    image: NDArray,
+    threshold_sigma: float = 5.0,
+    min_area_px: int = 3,
+    max_blobs: int = 200,
+    hints: FramePriors = NO_PRIORS,
+) -> Blobs:
+    """Blobs of at least 50 pixels above 4 % of full scale (Padro 2012, sections 3.4.1.3 and 3.5).
+
+    Full scale is the saturation in the hints, else what the integer type holds. Neither `threshold_sigma` nor
+    `min_area_px` plays a part: the thesis has two fixed thresholds. Raises ImageError for floats of unknown scale.
+    """
+    image = prepared(image)
+    full = hints.saturation
+    if not np.isfinite(full):
+        if image.dtype.kind != "u":
+            raise ImageError(
+                f"4 % of what? pixels of type {image.dtype} have no full scale; give the saturation"
+            )
+        full = float(np.iinfo(image.dtype).max)
+    flat = flattened(sky(image), image.shape)
+    # The threshold is on the raw pixel; a plateau of 50 pixels has the filtered image's contour within a pixel of it.
+    return gather(image, flat, THESIS_INTENSITY * full - flat.level, THESIS_AREA_PX, max_blobs)
+
+
+def sequential(
+    image: NDArray,
+    threshold_sigma: float = 5.0,
+    min_area_px: int = 3,
+    max_blobs: int = 200,
+    hints: FramePriors = NO_PRIORS,
+) -> Blobs:
+    """SHEFEX-2's scan: once through the frame, each object summed as it is met and sorted into a table.
+
+    The table holds the `max_blobs` brightest so far. An object is the eight-connected pixels above one level for the
+    frame, sky + `threshold_sigma` times a raw pixel's noise (reference: the SHEFEX-2 paper, fig. 3 right).
+    """
+    return _scanned(sequential_scan, image, threshold_sigma, min_area_px, max_blobs)
+
+
+def maximum(
+    image: NDArray,
+    threshold_sigma: float = 5.0,
+    min_area_px: int = 3,
+    max_blobs: int = 200,
+    hints: FramePriors = NO_PRIORS,
+) -> Blobs:
+    """SHEFEX-2's rival scan: the whole frame for its greatest pixel, again for every object (fig. 3 left)."""
+    return _scanned(maximum_scan, image, threshold_sigma, min_area_px, max_blobs)
+
+
+DETECTORS: dict[str, Detector] = {
+    "default": default,
+    "local": local,
+    "components": components,
+    "threshold": components,
+    "sequential": sequential,
+    "maximum": maximum,
+    "thesis": thesis,
+}
+
+
+def prepared(image: NDArray) -> NDArray:
+    """The image checked, in a type that compiled code takes."""
+    check(image)
+    return native(image)
+
+
+def check(image: NDArray) -> None:
+    """Raise ImageError with one line unless the image is a plain, finite, uneven (H, W) array of real numbers."""
+    if image.dtype.kind not in "buif":
+        raise ImageError(f"pixels of type {image.dtype} are no brightness; allowed: integers and floats")
+    if image.ndim != 2:
+        raise ImageError(f"an image of shape {image.shape} is not monochrome; allowed: (height, width)")
+    check_size(image)
+    some = image[::97, ::89]
+    if image.dtype.kind != "f" and some.min() != some.max():
+        return  # integers cannot be NaN, and some of these are uneven
+    low, high = image.min(), image.max()
+    if not (np.isfinite(low) and np.isfinite(high)):
+        raise ImageError("the image holds NaN or infinite pixels; allowed: finite values")
+    if low == high:
+        raise ImageError(f"the frame is empty: every pixel is {low}")
+
+
+def native(image: NDArray) -> NDArray:
+    """The image in a type that compiled code takes: FITS files are big-endian, masks are boolean."""
+    if image.dtype == np.uint16 and image.dtype.isnative:
+        return image
+    kind = {"b": "uint8", "f": "float32" if image.itemsize == 2 else "float64"}.get(image.dtype.kind)
+    if kind and image.itemsize not in (4, 8):
+        return image.astype(kind)
+    return image.astype(image.dtype.newbyteorder("="), copy=False)
+
+
+def check_size(image: NDArray) -> None:
+    """Raise ImageError for an image too small to hold a star field."""
+    if min(image.shape) < 16:
+        raise ImageError(f"{image.shape[1]}x{image.shape[0]} pixels are too few; allowed: 16x16 and more")
+
+
+def mend(image: NDArray, bad_px: Ints) -> NDArray:
+    """A copy of the image whose bad pixels, (K, 2) x and y, hold the median of their good neighbours.
+
+    The map comes from dark frames on the ground. A bad pixel without a good neighbour within two takes the frame's
+    median: it then is no light.
+    """
+    mended = native(image).copy()
+    height, width = image.shape
+    x, y = np.asarray(bad_px).reshape(-1, 2).T
+    if len(x) and not (x.min() >= 0 and x.max() < width and y.min() >= 0 and y.max() < height):
+        raise ImageError(f"the bad-pixel map reaches beyond the frame of {width}x{height} pixels")
+    bad = set(zip(x.tolist(), y.tolist(), strict=True))
+    for column, row in bad:
+        for reach in (1, 2):
+            good = [
+                image[v, u]
+                for v in range(max(row - reach, 0), min(row + reach + 1, height))
+                for u in range(max(column - reach, 0), min(column + reach + 1, width))
+                if (u, v) not in bad
+            ]
+            if good:
+                break
+        mended[row, column] = np.median(good if good else image[::8, ::8])
+    return mended
+
+
+def flattened(background: Background, shape: tuple[int, ...]) -> Background:
+    """One level and noise for the whole frame: the medians of the tiles'."""
+    level, noise = median(background.level), median(background.noise)
+    return Background(np.full((1, 1), level), np.full((1, 1), noise), max(shape))
+
+
+def gather(
+    image: NDArray,
+    background: Background,
+    above: Floats,
+    min_area_px: int,
+    max_blobs: int,
+    grow_sigma: float | None = None,
+) -> Blobs:
+    """Label what is more than `above` (on the background's grid) over the level, and keep the brightest.
+
+    With `grow_sigma` a blob reaches down to so many times the noise, and counts if enough of it is above `above` or
+    if its whole light is significant: flux / (pixel noise sqrt(area)) one more than the threshold's sigma.
+    """
+    strong = background.level + above
+    low = strong
+    if grow_sigma is not None:
+        low = background.level + np.minimum(above, grow_sigma * background.noise)
+    runs = runs_above(image, low)
+    boxes, sums = summed(image, background.level, strong, runs, *labelled(runs))
+    if grow_sigma is None:
+        return _kept(boxes, sums, min_area_px, max_blobs, background)
+    light = (median(above) + median(background.noise)) / FILTERED_NOISE
+    return _kept(boxes, sums, min_area_px, max_blobs, background, max(min_area_px, FEWEST_GROWN), light)
+
+
+def smeared(
+    image: NDArray, background: Background, threshold_sigma: float, max_blobs: int, hints: FramePriors
+) -> Blobs:
+    """Streaks of the hints' (dx, dy), by the filtered image averaged along them.
+
+    The average's noise is that of white noise through both filters. A streak's response is symmetric about its
+    middle and twice as long as itself: its box is put about the middle, as large as the streak.
+    """
+    assert hints.streak_px is not None
+    taps = taps_of(hints.streak_px)
+    above = threshold_sigma * noise_kept(taps) / FILTERED_NOISE * background.noise
+    runs = runs_above(image, background.level + above, taps)
+    boxes, sums = summed(image, background.level, background.level + above, runs, *labelled(runs))
+    blobs = _kept(boxes, sums, FEWEST_SMEARED, max_blobs, background, FEWEST_SMEARED, 0.0)
+    half = np.abs(hints.streak_px) / 2 + 1
+    middle = blobs.xy_px
+    edge = np.array(image.shape[::-1]) - 1
+    box = np.concatenate([np.clip(middle - half, 0, edge), np.clip(middle + half, 0, edge)], axis=1)
+    blobs.box_px[:] = np.rint(box)
+    return blobs
+
+
+def faint_streaks(
+    image: NDArray, background: Background, threshold_sigma: float, max_blobs: int, hints: FramePriors
+) -> Blobs:
+    """Streaks that nobody told of: those of the direction, of a few, in which a line filter finds the most.
+
+    The best of several directions is a better one by chance too, which half a sigma makes good.
+    """
+    turns = np.pi * np.arange(DIRECTIONS) / DIRECTIONS
+    found = []
+    for turn in turns:
+        along = (SOUGHT_PX * float(np.cos(turn)), SOUGHT_PX * float(np.sin(turn)))
+        told = FramePriors(along, hints.saturation)
+        found.append(smeared(image, background, threshold_sigma + 0.5, max_blobs, told))
+    return max(found, key=len)
+
+
+def taps_of(streak_px: tuple[float, float]) -> Ints:
+    """(K, 2) pixels of a line of that length and direction, about 0: one a pixel of its longer side."""
+    count = max(round(max(map(abs, streak_px))), 1) | 1
+    along = (np.arange(count) - count // 2) / count
+    return np.rint(along[:, None] * np.array(streak_px)).astype(np.int64)
+
+
+def noise_kept(taps: Ints) -> float:
+    """What of white noise's deviation is left after the binomial filter and the mean over the taps."""
+    reach = int(np.abs(taps).max()) + 1
+    kernel = np.zeros((2 * reach + 1, 2 * reach + 1))
+    binomial = np.outer([1, 2, 1], [1, 2, 1]) / 16 / len(taps)
+    for x, y in taps + reach:
+        kernel[y - 1 : y + 2, x - 1 : x + 2] += binomial
+    return float(np.sqrt(np.sum(kernel**2)))
+
+
+def _scanned(
+    scan: Callable[..., tuple[Ints, Floats]],
+    image: NDArray,
+    threshold_sigma: float,
+    min_area_px: int,
+    max_blobs: int,
+) -> Blobs:
+    """The table of one of SHEFEX's scans as blobs."""
+    image = prepared(image)
+    flat = flattened(sky(image), image.shape)
+    level, noise = float(flat.level[0, 0]), float(flat.noise[0, 0]) / FILTERED_NOISE
+    boxes, sums = scan(image, level, level + threshold_sigma * noise, min_area_px, max_blobs)
+    return _kept(boxes, sums, 0, max_blobs, flat)
+
+
+def _kept(
+    boxes: Ints | Ints32,
+    sums: Floats,
+    min_area_px: int,
+    max_blobs: int,
+    background: Background,
+    grown_area: int = 0,
+    grown_light: float = np.inf,
+) -> Blobs:
+    """The brightest of what counts, see `ranked`, as Blobs without any flag."""
+    box, xy, flux, peak, area, count = ranked(boxes, sums, min_area_px, grown_area, grown_light, max_blobs)
+    if count > MAX_BLOBS:
+        raise ImageError(f"over {MAX_BLOBS} blobs: the frame is noise or texture, not a star field")
+    return Blobs(box, xy, flux, peak, area, background, np.zeros(len(flux), np.int64))

@@ -1,0 +1,118 @@
+"""SHEFEX-2's two ways through a frame: one sequential pass with a sorted table, or the maximum again and again."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimator.core.arrays import Floats, Ints
+from estimator.core.jit import jit
+from estimator.detection.components import AREA, FLUX, PEAK, SUMS, X, Y
+
+
+@jit
+def sequential_scan(
+    image: NDArray, level: float, threshold: float, min_area_px: int, table_size: int
+) -> tuple[Ints, Floats]:
+    """Boxes (N, 4) and sums (N, SUMS) of the N <= table_size brightest objects, brightest first.
+
+    One raster pass: a pixel above the threshold that belongs to no object yet is summed with all that is connected
+    to it, and the object takes its place in the table by intensity; the faintest falls off the end.
+    """
+    height, width = image.shape
+    taken = np.zeros(image.shape, np.uint8)
+    stack = np.empty((image.size, 2), np.int32)
+    boxes, sums = np.empty((table_size, 4), np.int64), np.zeros((table_size, SUMS))
+    box, mine = np.empty(4, np.int64), np.empty(SUMS)
+    count = 0
+    for y in range(height):
+        for x in range(width):
+            if image[y, x] <= threshold or taken[y, x]:
+                continue
+            _object(image, level, threshold, y, x, taken, stack, box, mine)
+            if mine[AREA] < min_area_px or (count == table_size and mine[FLUX] <= sums[count - 1, FLUX]):
+                continue
+            count = _insert(boxes, sums, count, box, mine)
+    return boxes[:count], sums[:count]
+
+
+@jit
+def maximum_scan(
+    image: NDArray, level: float, threshold: float, min_area_px: int, table_size: int
+) -> tuple[Ints, Floats]:
+    """As `sequential_scan`, but by looking through the whole frame for the greatest pixel left, object by object.
+
+    Ends where that pixel is below the threshold, or with the table full: it then holds the objects of the highest
+    peaks.
+    """
+    height, width = image.shape
+    taken = np.zeros(image.shape, np.uint8)
+    stack = np.empty((image.size, 2), np.int32)
+    boxes, sums = np.empty((table_size, 4), np.int64), np.zeros((table_size, SUMS))
+    box, mine = np.empty(4, np.int64), np.empty(SUMS)
+    count = 0
+    while count < table_size:
+        top, top_y, top_x = threshold, -1, -1
+        for y in range(height):
+            for x in range(width):
+                if image[y, x] > top and not taken[y, x]:
+                    top, top_y, top_x = float(image[y, x]), y, x
+        if top_y < 0:
+            break
+        _object(image, level, threshold, top_y, top_x, taken, stack, box, mine)
+        if mine[AREA] >= min_area_px:
+            count = _insert(boxes, sums, count, box, mine)
+    return boxes[:count], sums[:count]
+
+
+@jit
+def _object(
+    image: NDArray,
+    level: float,
+    threshold: float,
+    y: int,
+    x: int,
+    taken: NDArray,
+    stack: NDArray,
+    box: Ints,
+    mine: Floats,
+) -> None:
+    """Sum all pixels above the threshold that are connected to one by sides or corners, and take them.
+
+    The paper's recursive centroiding, with a stack of its own instead of the computer's.
+    """
+    height, width = image.shape
+    box[0], box[1], box[2], box[3] = x, y, x, y
+    mine[:] = 0.0
+    mine[PEAK] = -np.inf
+    stack[0, 0], stack[0, 1] = y, x
+    taken[y, x] = 1
+    depth = 1
+    while depth:
+        depth -= 1
+        v, u = stack[depth, 0], stack[depth, 1]
+        light = image[v, u] - level
+        mine[AREA] += 1
+        mine[FLUX] += light
+        mine[X] += light * u
+        mine[Y] += light * v
+        mine[PEAK] = max(mine[PEAK], float(image[v, u]))
+        box[0], box[1] = min(box[0], u), min(box[1], v)
+        box[2], box[3] = max(box[2], u), max(box[3], v)
+        for b in range(max(v - 1, 0), min(v + 2, height)):
+            for a in range(max(u - 1, 0), min(u + 2, width)):
+                if image[b, a] > threshold and not taken[b, a]:
+                    taken[b, a] = 1
+                    stack[depth, 0], stack[depth, 1] = b, a
+                    depth += 1
+
+
+@jit
+def _insert(boxes: Ints, sums: Floats, count: int, box: Ints, mine: Floats) -> int:
+    """Put an object into the table by its intensity; how many it then holds."""
+    k = min(count, len(sums) - 1)
+    while k > 0 and sums[k - 1, FLUX] < mine[FLUX]:
+        sums[k], boxes[k] = sums[k - 1], boxes[k - 1]
+        k -= 1
+    sums[k], boxes[k] = mine, box
+    return min(count + 1, len(sums))

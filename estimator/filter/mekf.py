@@ -1,0 +1,388 @@
+"""Attitude and gyro bias from gyro and star tracker together: the multiplicative extended Kalman filter.
+
+Sources: Farrenkopf 1978 (J. Guidance & Control 1, 282) for the gyro's noise; Lefferts, Markley & Shuster 1982 (J.
+Guidance 5, 417) for the six-state filter; Crassidis & Junkins, Optimal Estimation of Dynamic Systems, chapter 7, for
+its discrete transition.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.linalg import block_diag
+from scipy.spatial.transform import Rotation
+from scipy.special import chdtrc, chdtri
+
+from estimator.core.arrays import Floats
+from estimator.core.types import FilterState
+from estimator.filter.propagate import advance, transition, turn_on
+
+USED = "used"
+RESET = "reset"
+OUTSIDE = "refused: outside the gate"
+TOO_OLD = "refused: older than the filter remembers"
+
+# What was felt and seen is kept for so long at most, and for half of it at least. `assumed`: some frames.
+MEMORY_S = 10.0
+# Refused solutions in a row that must agree with one another before they are believed instead of the filter.
+AGREEING = 3
+# A solution's time may be ahead of the last gyro sample by rounding, not more.
+ROUNDING_S = 1e-9
+
+
+@dataclass(frozen=True, slots=True)
+class GyroModel:
+    """What is wrong with a gyro, on each axis alike: measured rate = rate + bias + white noise.
+
+    arw_rad_sqrt_s : angle random walk, rad / sqrt(s)
+    bias_rad_s     : standard deviation of the bias, a first-order Gauss-Markov process (ignored if its time is inf)
+    bias_time_s    : its correlation time, long against a sample interval; inf is a constant bias
+
+    Farrenkopf's random walk of the bias with density u (rad / s^1.5) is the limit of a long time t with
+    bias_rad_s = u sqrt(t / 2). Raises ValueError for negative or unusable numbers.
+    """
+
+    arw_rad_sqrt_s: float
+    bias_rad_s: float
+    bias_time_s: float
+
+    def __post_init__(self) -> None:
+        for name in ("arw_rad_sqrt_s", "bias_rad_s"):
+            if not 0 <= getattr(self, name) < math.inf:
+                raise ValueError(f"gyro: {name} is {getattr(self, name)}; allowed: finite, 0 or more")
+        if not self.bias_time_s > 0:
+            raise ValueError(f"gyro: bias_time_s is {self.bias_time_s}; allowed: above 0, inf for a constant")
+
+
+@dataclass(frozen=True, slots=True)
+class Update:
+    """What became of a star tracker's solution.
+
+    status       : "used", "reset" (the filter was lost and took the solution), or "refused: why"
+    residual_rad : (3,) the turn, in body axes, from where the filter was to where the solution says; NaN if too old
+    distance     : Mahalanobis distance of the residual, the root of a chi-square of 3 degrees of freedom
+    """
+
+    status: str
+    residual_rad: Floats
+    distance: float
+
+
+class _Moment(NamedTuple):
+    """All that the filter knows at one time; `missed_rad` is the spread gathered in a saturation that lasts."""
+
+    t_s: float
+    ref_from_body_wxyz: Floats
+    bias_rad_s: Floats
+    covariance: Floats
+    missed_rad: float
+
+    @property
+    def body_from_ref(self) -> Rotation:
+        return Rotation.from_quat(self.ref_from_body_wxyz, scalar_first=True).inv()
+
+
+class _Solution(NamedTuple):
+    """The star tracker's, at the filter's moment."""
+
+    body_from_ref: Rotation
+    covariance_rad2: Floats
+
+
+class _Leg(NamedTuple):
+    """From one used solution to the next: the moment after it was used, the gyro's samples since, the solution.
+
+    The first leg's is None: nothing before it is remembered.
+    """
+
+    moment: _Moment
+    samples: Floats
+    solution: _Solution | None
+
+
+class Mekf:
+    """A star tracker's attitude filter: the attitude as a quaternion, its error e as a small turn in body axes.
+
+    With ref_from_body = estimate exp(e), a gyro sample of turn p (its bias taken away) in the interval T gives
+
+        e+ = exp(-[p]) e - T J(p) db - noise,      db+ = exp(-T / bias_time) db + noise,
+        J(p) = 1 - (1 - cos p) / p^2 [p] + (p - sin p) / p^3 [p]^2,
+
+    and Farrenkopf's process noise with v = arw, u^2 = 2 bias^2 / bias_time: v^2 T + u^2 T^3 / 3 in the angle,
+    -u^2 T^2 / 2 between, u^2 T in the bias. Every sample is treated on its own (1 us each, compiled), so that the
+    result does not depend on how samples are cut into calls.
+
+    gyro               : what the filter believes of the gyro
+    t_s, body_from_ref : the start; its bias is 0
+    sigma_attitude_rad, sigma_bias_rad_s : standard deviations at the start, one number or (3,) in body axes
+    floor_rad          : added in quadrature to every solution's covariance, for errors common to its stars
+    gate_sigma         : a solution is refused at a distance as improbable as so many sigma of one number
+
+    Saturation. While the gyro is at its limit the true rate is anything above it. The error is then taken for a rate
+    that is constant through the saturation and as large as the measured one (sigma, on each axis; `assumed`): the
+    spread grows in proportion to the time, to |measured rate| t, and a blow of six times the limit is still within the
+    usual gate. All axes grow: a turn missed about one carries the turns about the others the wrong way. The growth
+    is in the attitude alone: a large residual then is laid to the missed turn, not to the bias.
+
+    Order. Solutions may come at any rate, late, in any order, or not at all: each is used at its own time, and those
+    for later times that were used before it are used again after it, so that the result is that of the right order.
+
+    Gate. A wrong solution is worse than none, so an improbable one is refused and changes nothing. But a filter that
+    is wrong itself would then refuse the truth for ever. So when three solutions, refused one after another, agree
+    with each other (each carried to the next by the gyro, within the gate of their own covariances and the gyro's),
+    the filter takes the last of them with its covariance. It keeps the bias, the variance increased by that of the
+    start: it may have been what led astray. False solutions agree twice in a row only where the tracker is
+    fooled by the same thing each time.
+    """
+
+    def __init__(
+        self,
+        gyro: GyroModel,
+        t_s: float,
+        body_from_ref: Rotation,
+        sigma_attitude_rad: ArrayLike,
+        sigma_bias_rad_s: ArrayLike,
+        floor_rad: float = 0.0,
+        gate_sigma: float = 5.0,
+    ) -> None:
+        self._gyro = gyro
+        self._floor_rad2 = _not_negative("floor_rad", floor_rad) ** 2
+        # The chi-square of 3 degrees of freedom that is exceeded as seldom as gate_sigma by one normal number.
+        self._gate = float(chdtri(3, chdtrc(1, _not_negative("gate_sigma", gate_sigma) ** 2)))
+        sigma_attitude = _not_negative("sigma_attitude_rad", sigma_attitude_rad) * np.ones(3)
+        self._start_variance = (_not_negative("sigma_bias_rad_s", sigma_bias_rad_s) * np.ones(3)) ** 2
+        covariance = np.diag(np.concatenate([sigma_attitude**2, self._start_variance]))
+        self._now = _Moment(float(t_s), _ref_from_body_wxyz(body_from_ref), np.zeros(3), covariance, 0.0)
+        self._legs = [_Leg(self._now, np.empty((0, 5)), None)]  # rows of _checked_samples
+        self._refused: list[tuple[_Moment, _Solution]] = []  # in a row, each agreeing with the one before
+        self._measured_rad_s = np.zeros(3)
+
+    @property
+    def state(self) -> FilterState:
+        """Attitude and bias with their covariance after the last gyro sample."""
+        now = self._now
+        return FilterState(now.t_s, now.body_from_ref, now.bias_rad_s.copy(), now.covariance.copy())
+
+    @property
+    def body_from_ref(self) -> Rotation:
+        return self._now.body_from_ref
+
+    @property
+    def ref_from_body_wxyz(self) -> Floats:
+        """(4,) the inverse of body_from_ref as the filter keeps it, scalar first: for loops that ask at every tick."""
+        return self._now.ref_from_body_wxyz
+
+    @property
+    def bias_rad_s(self) -> Floats:
+        """(3,) in body axes."""
+        return self._now.bias_rad_s.copy()
+
+    @property
+    def rate_rad_s(self) -> Floats:
+        """(3,) measured rate less the bias, in body axes: the mean over the last call's samples; 0 before the first."""
+        return self._measured_rad_s - self._now.bias_rad_s
+
+    def propagate(self, t_s: ArrayLike, angle_rad: ArrayLike, saturated: ArrayLike) -> None:
+        """Follow the gyro.
+
+        t_s       : (N,) ends of the sample intervals; the first begins at the filter's time
+        angle_rad : (N, 3) turn in each, in body axes
+        saturated : (N,) whether the gyro was at its rate limit
+
+        Raises ValueError for other shapes, numbers that are not finite, or times that do not go forwards.
+        """
+        start_s = self._now.t_s
+        # A tenth: the process noise is a series in the ratio of the two times.
+        samples = _checked_samples(start_s, t_s, angle_rad, saturated, 0.1 * self._gyro.bias_time_s)
+        self._now = self._after(self._now, samples)
+        self._measured_rad_s = samples[:, 1:4].sum(axis=0) / (samples[-1, 0] - start_s)
+        last = self._legs[-1]
+        self._legs[-1] = last._replace(samples=np.concatenate([last.samples, samples]))
+        self._forget(float(samples[-1, 0]) - MEMORY_S)
+
+    def update(self, t_s: float, body_from_ref_measured: Rotation, covariance_rad2: ArrayLike) -> Update:
+        """Take a star tracker's solution for a time now or in the past, from which the gyro is followed again.
+
+        covariance_rad2 : (3, 3) of the solution's small turn, in body axes
+
+        Raises ValueError for a covariance that is not symmetric and positive definite, or a time ahead of the gyro's.
+        """
+        spread = _checked_covariance(covariance_rad2) + self._floor_rad2 * np.eye(3)
+        solution, now_s = _Solution(body_from_ref_measured, spread), self._now.t_s
+        if not t_s <= now_s + ROUNDING_S:
+            raise ValueError(f"update: a solution at {t_s} s; allowed: up to the last gyro sample, {now_s} s")
+        if t_s < self._legs[0].moment.t_s:
+            return Update(TOO_OLD, np.full(3, np.nan), math.nan)
+        k = next(k for k in reversed(range(len(self._legs))) if self._legs[k].moment.t_s <= t_s)
+        leg = self._legs[k]
+        before, after = _split(leg.samples, leg.moment.t_s, min(float(t_s), now_s))
+        then = self._after(leg.moment, before)
+        residual, noise, distance2 = _innovation(then, solution)
+        if distance2 <= self._gate:
+            status, then = USED, _corrected(then, residual, noise)
+            self._legs[k : k + 1] = [leg._replace(samples=before), _Leg(then, after, solution)]
+            self._replay(k + 1)
+        elif self._agrees(then, solution):
+            status = RESET
+            # What was used after it, by a filter that was lost, is forgotten with it.
+            rest = np.concatenate([after, *(later.samples for later in self._legs[k + 1 :])])
+            self._legs = [_Leg(self._taken(then, solution), rest, None)]
+        else:
+            return Update(OUTSIDE, residual, math.sqrt(distance2))
+        self._refused = []
+        self._now = self._after(self._legs[-1].moment, self._legs[-1].samples)
+        return Update(status, residual, math.sqrt(distance2))
+
+    def _replay(self, k: int) -> None:
+        """The solutions after leg k once more, from where leg k now leaves the filter; they have passed the gate."""
+        for j in range(k + 1, len(self._legs)):
+            earlier, leg = self._legs[j - 1], self._legs[j]
+            assert leg.solution is not None
+            then = self._after(earlier.moment, earlier.samples)
+            residual, noise, _ = _innovation(then, leg.solution)
+            self._legs[j] = leg._replace(moment=_corrected(then, residual, noise))
+
+    def _forget(self, before_s: float) -> None:
+        """Let go of whole legs, and of half of a long one."""
+        while len(self._legs) > 1 and self._legs[1].moment.t_s < before_s:
+            del self._legs[0]
+        first = self._legs[0]
+        if len(first.samples) and first.samples[0, 0] < before_s:
+            half = len(first.samples) // 2
+            moment = self._after(first.moment, first.samples[:half])
+            self._legs[0] = _Leg(moment, first.samples[half:], None)
+
+    def _after(self, moment: _Moment, samples: Floats) -> _Moment:
+        """A moment carried through samples by the gyro."""
+        if not len(samples):
+            return moment
+        noise = (self._gyro.arw_rad_sqrt_s**2, self._gyro.bias_rad_s**2, 1 / self._gyro.bias_time_s)
+        return _Moment(float(samples[-1, 0]), *advance(tuple(moment), samples, noise))
+
+    def _agrees(self, then: _Moment, solution: _Solution) -> bool:
+        """Whether a refused solution is the third in a row of which each agrees with the one before."""
+        if self._refused:
+            moment, earlier = self._refused[-1]
+            turn = (
+                then.body_from_ref * moment.body_from_ref.inv()
+            )  # no solution was used between: the gyro's alone
+            apart = (turn * earlier.body_from_ref * solution.body_from_ref.inv()).as_rotvec()
+            gap_s, R = abs(then.t_s - moment.t_s), turn.as_matrix()
+            spread = R @ earlier.covariance_rad2 @ R.T + solution.covariance_rad2
+            spread += gap_s * self._gyro.arw_rad_sqrt_s**2 * np.eye(3) + gap_s**2 * then.covariance[3:, 3:]
+            if apart @ np.linalg.solve(spread, apart) > self._gate:
+                self._refused = []
+        self._refused.append((then, solution))
+        return len(self._refused) >= AGREEING
+
+    def _taken(self, then: _Moment, solution: _Solution) -> _Moment:
+        """Lost and found: the solution's attitude and covariance, the bias as it was but less certain."""
+        bias_covariance = then.covariance[3:, 3:] + np.diag(self._start_variance)
+        return then._replace(
+            ref_from_body_wxyz=_ref_from_body_wxyz(solution.body_from_ref),
+            covariance=block_diag(solution.covariance_rad2, bias_covariance),
+        )
+
+
+def _innovation(then: _Moment, solution: _Solution) -> tuple[Floats, Floats, float]:
+    """Residual (3,) in body axes, the solution's noise as it appears in it, the squared Mahalanobis distance."""
+    residual = (then.body_from_ref * solution.body_from_ref.inv()).as_rotvec()
+    noise = _seen_from(residual, solution.covariance_rad2)
+    return residual, noise, float(residual @ np.linalg.solve(then.covariance[:3, :3] + noise, residual))
+
+
+def _corrected(then: _Moment, residual: Floats, noise: Floats) -> _Moment:
+    """Kalman's update in Joseph's form, its attitude error moved into the quaternion."""
+    gain = np.linalg.solve(then.covariance[:3, :3] + noise, then.covariance[:3]).T
+    error = gain @ residual
+    left = np.eye(6)
+    left[:, :3] -= gain
+    # exp(error) exp(rest) = exp(error + change) makes rest = J(error) change.
+    moved = np.eye(6)
+    moved[:3, :3] = _smear(error[:3])
+    covariance = moved @ (left @ then.covariance @ left.T + gain @ noise @ gain.T) @ moved.T
+    wxyz, bias = then.ref_from_body_wxyz.copy(), then.bias_rad_s + error[3:]
+    turn_on(wxyz, error[:3])
+    return _Moment(then.t_s, wxyz, bias, (covariance + covariance.T) / 2, then.missed_rad)
+
+
+def _smear(turn_rad: Floats) -> Floats:
+    """(3, 3) J(p) of Mekf's docstring."""
+    rows = np.empty((3, 6))
+    transition(turn_rad, -1.0, rows)
+    return rows[:, 3:]
+
+
+def _seen_from(residual: Floats, measured_rad2: Floats) -> Floats:
+    """(3, 3) covariance of the residual's rotation vector; the solution's own but where the residual is large.
+
+    The solution is truth exp(v), so truth = filter exp(residual) exp(-v), and the vector is off by J(residual)^-1 v.
+    """
+    inverse = np.linalg.inv(_smear(residual))
+    return inverse @ measured_rad2 @ inverse.T
+
+
+def _ref_from_body_wxyz(body_from_ref: Rotation) -> Floats:
+    return body_from_ref.inv().as_quat(scalar_first=True).copy()
+
+
+def _not_negative(name: str, value: ArrayLike) -> NDArray:
+    """Standard deviations as an array. Raises ValueError."""
+    array = np.asarray(value, dtype=float)
+    if array.shape not in ((), (3,)) or not (array >= 0).all():
+        raise ValueError(f"{name} is {array.tolist()}; allowed: 0 or more, one number or one for each axis")
+    return array
+
+
+def _checked_samples(
+    start_s: float, t_s: ArrayLike, angle_rad: ArrayLike, saturated: ArrayLike, longest_s: float
+) -> Floats:
+    """(N, 5) gyro samples: end of the interval, turn about x, y, z, 1 at the rate limit and 0 below. ValueError."""
+    ends_s, angle = np.asarray(t_s, float), np.asarray(angle_rad, float)
+    count, shapes = ends_s.size, [ends_s.shape, angle.shape, np.shape(saturated)]
+    if not count or shapes != [(count,), (count, 3), (count,)]:
+        raise ValueError(f"propagate: shapes {shapes}; allowed: (N,), (N, 3), (N,) with N of 1 or more")
+    samples = np.empty((count, 5))
+    samples[:, 0], samples[:, 1:4], samples[:, 4] = ends_s, angle, saturated
+    if not np.isfinite(samples).all():
+        raise ValueError("propagate: NaN or infinite times or angles; allowed: finite ones")
+    step_s = np.diff(ends_s, prepend=start_s)
+    if not (step_s.min() > 0 and step_s.max() <= longest_s):
+        bad = int(np.argmax(~((step_s > 0) & (step_s <= longest_s))))
+        raise ValueError(
+            f"propagate: the sample that ends at {ends_s[bad]} s is {step_s[bad]:g} s long; "
+            f"allowed: above 0, up to {longest_s:g} s (a tenth of bias_time_s)"
+        )
+    return samples
+
+
+def _split(samples: Floats, start_s: float, t_s: float) -> tuple[Floats, Floats]:
+    """Those before t_s and after; one that contains it is taken for an even turn. The first starts at start_s."""
+    k = int(np.searchsorted(samples[:, 0], t_s, side="right"))
+    begin_s = samples[k - 1, 0] if k else start_s
+    if k == len(samples) or begin_s == t_s:
+        return samples[:k], samples[k:]
+    share = (t_s - begin_s) / (samples[k, 0] - begin_s)
+    before, after = samples[: k + 1].copy(), samples[k:].copy()
+    before[-1, 0] = t_s
+    before[-1, 1:4] *= share
+    after[0, 1:4] *= 1 - share
+    return before, after
+
+
+def _checked_covariance(covariance_rad2: ArrayLike) -> Floats:
+    """(3, 3). Raises ValueError unless it is symmetric and positive definite."""
+    matrix = np.asarray(covariance_rad2, dtype=float)
+    sound = matrix.shape == (3, 3) and bool(np.isfinite(matrix).all())
+    if sound:
+        even = np.abs(matrix - matrix.T).max() <= 1e-9 * np.trace(matrix)
+        sound = even and np.linalg.eigvalsh(matrix)[0] > 0
+    if not sound:
+        raise ValueError(
+            f"update: covariance_rad2 {matrix.tolist()}; allowed: (3, 3), symmetric, positive definite"
+        )
+    return (matrix + matrix.T) / 2

@@ -1,0 +1,1 @@
+"""Centroids to catalog entries: search for candidate attitudes, and the evidence for each."""

@@ -1,0 +1,1 @@
+"""Identification of LEDs under a dome: index of pairs, search, and evidence."""

@@ -1,0 +1,1 @@
+"""Published star identification algorithms: pyramid, SAA, SHEFEX-2, PTASE and the master star."""

@@ -1,0 +1,238 @@
+"""SAA's steps 4 to 7 compiled: every assumption of a primary pair, and the direct match of each."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimator.catalog.spatial_grid import Cells, within
+from estimator.core.arrays import Floats, Ints
+from estimator.core.jit import jit
+from estimator.identification.direct_match import angle
+
+# What an observed star without a partner costs, in squared standard deviations; a bad partner costs no more. Four
+# of them: a match lost to noise or to a reflection is then as likely as one in three thousand.
+UNMATCHED = 16.0
+
+
+class Gates(NamedTuple):
+    """One standard deviation of what is compared: an angle, a place's angle, a magnitude. Gates are three of them.
+
+    stretch : added to the gate of an angle, times the angle
+    """
+
+    separation_rad: float
+    position_rad: float
+    magnitude: float
+    stretch: float
+
+
+class Sky(NamedTuple):
+    """What is compared with what: observed stars, brightest first, the catalogue's, and how near is near.
+
+    seen, vectors : (N, 3), (M, 3) unit vectors, camera and reference;  light, magnitude : NaN where unknown
+    cells         : the catalogue's stars by direction
+    """
+
+    seen: Floats
+    light: Floats
+    vectors: Floats
+    magnitude: Floats
+    cells: Cells
+    gates: Gates
+
+
+class Primary(NamedTuple):
+    """The primary pair A, B, and where it leaves the other stars X.
+
+    rows, triad : (2,) of the observed stars, (3, 3) see `triad`;  middle : (3,) unit, halfway
+    others      : (X,) rows;  corner_rad, gate_rad : (2, X) their angles from A and from B, and the gates of those
+    sigma_rad, radius_rad : (X,) deviation of their predicted places and its gate;  area_sr : (X,) what all gates leave
+    reach_rad   : how far from the middle stars are seen
+    """
+
+    rows: Ints
+    triad: Floats
+    middle: Floats
+    others: Ints
+    corner_rad: Floats
+    gate_rad: Floats
+    sigma_rad: Floats
+    radius_rad: Floats
+    area_sr: Floats
+    reach_rad: float
+
+
+@jit
+def gate_rad(gates: Gates, angle_rad: float) -> float:
+    """How far an angle may be off."""
+    return 3 * gates.separation_rad + gates.stretch * angle_rad
+
+
+@jit
+def triad(a: Floats, b: Floats) -> Floats:
+    """Rows: unit vectors along a + b, a - b and their cross product.
+
+    To carry one pair's onto another's is Wahba's best rotation for two stars of equal weight."""
+    rows = np.empty((3, 3))
+    rows[0], rows[1] = a + b, a - b
+    rows[2, 0] = b[1] * a[2] - b[2] * a[1]
+    rows[2, 1] = b[2] * a[0] - b[0] * a[2]
+    rows[2, 2] = b[0] * a[1] - b[1] * a[0]
+    for n in range(3):
+        rows[n] /= np.sqrt(rows[n, 0] ** 2 + rows[n, 1] ** 2 + rows[n, 2] ** 2)
+    return rows
+
+
+@jit
+def primary_of(sky: Sky, row_a: int, row_b: int) -> Primary:
+    """What the direct match needs of the pair, whatever it is assumed to be.
+
+    The thesis's position gate is 3 epsilon_position everywhere; Needelman's epsilon_position(S) knows that a pair
+    b apart turns by sqrt(2) sigma / b and shifts by sigma / sqrt(2) with its noise sigma: at d from its middle
+    sigma^2 (1 + 1/2 + 2 d^2 / b^2), which is what is used here.
+    """
+    gates, seen = sky.gates, sky.seen
+    a, b, count = seen[row_a], seen[row_b], len(seen) - 2
+    middle = (a + b) / np.sqrt(np.sum((a + b) ** 2))
+    base_rad, reach_rad = angle(a, b), 0.0
+    others, corner, gate = np.empty(count, np.int64), np.empty((2, count)), np.empty((2, count))
+    sigma, radius, area = np.empty(count), np.empty(count), np.empty(count)
+    k = 0
+    for n in range(len(seen)):
+        x = seen[n]
+        from_middle = angle(x, middle)
+        reach_rad = max(reach_rad, from_middle)
+        if n in (row_a, row_b):
+            continue
+        others[k] = n
+        corner[0, k], corner[1, k] = angle(x, a), angle(x, b)
+        gate[0, k], gate[1, k] = gate_rad(gates, corner[0, k]), gate_rad(gates, corner[1, k])
+        sigma[k] = gates.position_rad * np.sqrt(1.5 + 2 * (from_middle / base_rad) ** 2)
+        radius[k] = 3 * sigma[k] + gates.stretch * from_middle
+        # Two rings about A and B cross at the angle that X sees them under: a rhombus.
+        sides = max(corner[0, k] * corner[1, k], 1e-20)
+        sine = np.sqrt(np.sum(np.cross(a - x, b - x) ** 2)) / sides
+        rhombus = 4 * gate[0, k] * gate[1, k] / max(sine, 1e-9)
+        area[k] = min(np.pi * radius[k] ** 2, rhombus)
+        k += 1
+    rows = np.array([row_a, row_b])
+    reach_rad += gate_rad(gates, 0.0)
+    return Primary(rows, triad(a, b), middle, others, corner, gate, sigma, radius, area, reach_rad)
+
+
+@jit
+def magnitude_cost(sky: Sky, observed: int, star: int) -> float:
+    """Squared deviation of a magnitude, infinite beyond three; 0 where none is known."""
+    off = (sky.light[observed] - sky.magnitude[star]) / sky.gates.magnitude
+    if np.isnan(off):
+        return 0.0
+    return off * off if abs(off) <= 3 else np.inf
+
+
+@jit
+def matched(sky: Sky, primary: Primary, pairs: NDArray) -> tuple[NDArray, Floats, Ints]:
+    """Steps 3 to 7: every assumption that one of the catalogue's (K, 2) pairs makes, either way round.
+
+    Returns of each: (N,) names of the observed stars, -1 for none; the cost; matches beside the pair. The ends of
+    a bucket, or of the k-vector's step, hold pairs outside the gate.
+    """
+    a, b = primary.rows
+    apart = angle(sky.seen[a], sky.seen[b])
+    gate, count = gate_rad(sky.gates, apart), 0
+    star = np.empty((2 * len(pairs), len(sky.seen)), np.int32)
+    cost, hits = np.empty(2 * len(pairs)), np.empty(2 * len(pairs), np.int64)
+    near = np.empty(len(sky.vectors), np.int64)
+    partner, spent = np.empty(len(primary.others), np.int64), np.empty(len(primary.others))
+    for p in range(len(pairs)):
+        slip = abs(angle(sky.vectors[pairs[p, 0]], sky.vectors[pairs[p, 1]]) - apart)
+        if slip > gate:
+            continue
+        for flip in range(2):
+            first, second = pairs[p, flip], pairs[p, 1 - flip]
+            light_a, light_b = magnitude_cost(sky, a, first), magnitude_cost(sky, b, second)
+            if not np.isfinite(light_a + light_b):
+                continue
+            star[count] = -1
+            star[count, a], star[count, b] = first, second
+            total = (slip / sky.gates.separation_rad) ** 2 + light_a + light_b
+            _partners(sky, primary, first, second, near, partner, spent)
+            hits[count] = _each_once(partner, spent)
+            for k in range(len(partner)):
+                star[count, primary.others[k]] = partner[k]
+                total += min(spent[k], UNMATCHED)
+            cost[count] = total
+            count += 1
+    return star[:count], cost[:count], hits[:count]
+
+
+@jit
+def _partners(
+    sky: Sky, primary: Primary, first: int, second: int, near: NDArray, partner: NDArray, spent: Floats
+) -> None:
+    """Steps 5 and 6: the pair's attitude, and for each other star its partner there (-1: none) and what it costs.
+
+    Section 2.4.5's four conditions: the magnitude, the place, and the angles to A and to B. Place settles what the
+    angles to two stars cannot tell: a star from its mirror image in their line.
+    """
+    stars = triad(sky.vectors[first], sky.vectors[second])
+    R = np.empty((3, 3))  # R_ref_from_cam
+    for i in range(3):
+        for j in range(3):
+            R[i, j] = (
+                stars[0, i] * primary.triad[0, j]
+                + stars[1, i] * primary.triad[1, j]
+                + stars[2, i] * primary.triad[2, j]
+            )
+    for k in range(len(primary.others)):
+        u, v, w = sky.seen[primary.others[k]]
+        x = R[0, 0] * u + R[0, 1] * v + R[0, 2] * w
+        y = R[1, 0] * u + R[1, 1] * v + R[1, 2] * w
+        z = R[2, 0] * u + R[2, 1] * v + R[2, 2] * w
+        reach = 2 * np.sin(min(primary.radius_rad[k], np.pi) / 2)
+        partner[k], spent[k] = -1, UNMATCHED
+        least = np.inf
+        for s in near[: within(sky.cells, sky.vectors, x, y, z, reach, near)]:
+            if s in (first, second):
+                continue
+            cost = magnitude_cost(sky, primary.others[k], s)
+            slip_a = abs(primary.corner_rad[0, k] - angle(sky.vectors[s], sky.vectors[first]))
+            slip_b = abs(primary.corner_rad[1, k] - angle(sky.vectors[s], sky.vectors[second]))
+            if slip_a > primary.gate_rad[0, k] or slip_b > primary.gate_rad[1, k]:
+                continue
+            cost += (slip_a**2 + slip_b**2) / sky.gates.separation_rad**2
+            dx, dy, dz = sky.vectors[s, 0] - x, sky.vectors[s, 1] - y, sky.vectors[s, 2] - z
+            place = (dx * dx + dy * dy + dz * dz) / primary.sigma_rad[k] ** 2
+            if cost + place < least:
+                least, partner[k], spent[k] = cost + place, s, cost
+
+
+@jit
+def _each_once(partner: NDArray, spent: Floats) -> int:
+    """A star that two observed ones want goes to the cheaper; how many have one."""
+    count = 0
+    for k in range(len(partner)):
+        if partner[k] < 0:
+            continue
+        count += 1
+        for m in range(k):
+            if partner[m] == partner[k]:
+                loser = k if spent[m] <= spent[k] else m
+                partner[loser], spent[loser] = -1, UNMATCHED
+                count -= 1
+                break
+    return count
+
+
+@jit
+def contradicting(star: NDArray, cost: Floats, hits: NDArray, best: NDArray, doubts: Floats) -> None:
+    """Add up those that give an observed star another name than the best does: how many, their matches, least cost."""
+    for n in range(len(cost)):
+        for m in range(len(best)):
+            if star[n, m] >= 0 and best[m] >= 0 and star[n, m] != best[m]:
+                doubts[0] += 1
+                doubts[1] += hits[n]
+                doubts[2] = min(doubts[2], cost[n])
+                break

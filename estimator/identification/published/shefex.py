@@ -1,0 +1,248 @@
+"""SHEFEX-2's identifier: a base triangle of the brightest, a fourth star, then the rest, by cosines of angles.
+
+Samaan & Theil 2011, section 3.4 and Fig. 6. Two angles are alike where their cosines differ by less than cosError,
+which is a wide gate for stars close together: at 5.5e-5 it is 0.090 deg at 2 deg, and 0.010 at 18.57 deg.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimator.catalog.pair_index import PairIndex, around, between
+from estimator.core.arrays import Floats
+from estimator.core.errors import ImageError
+from estimator.core.jit import jit
+from estimator.core.types import StarMatch
+from estimator.identification.chance import ACCEPT_LOG10_CHANCE, MIN_MATCHES, log10_tail
+from estimator.identification.direct_match import Found, angle, answer, nothing, triple, turned
+from estimator.identification.options import Options
+
+FOURTH_STAR = 1e300  # the paper's own rule: "it is already certain that a success will occur"
+APART = 6.0  # tolerances between base stars, and from them: closer, an angle says little
+
+
+class Rules(NamedTuple):
+    """How a search is done: cosError, a direction's tolerance, and when to give up (see `Options`).
+
+    accept : log10 of the chance at which a match is the answer; FOURTH_STAR takes whatever has a fourth star
+    """
+
+    cos_error: float
+    tolerance_rad: float
+    triangles: int
+    checks: int
+    base: int
+    accept: float = ACCEPT_LOG10_CHANCE
+
+
+def cos_error(fov_rad: float, centroid_error_rad: float, factor: float = 1.0) -> float:
+    """Eq. 3: c |cos FOV - cos(FOV - centroidError)|; c from 1.6 to 5 makes the paper's 5.5e-5 of .3 to .1 px."""
+    return factor * abs(float(np.cos(fov_rad) - np.cos(fov_rad - centroid_error_rad)))
+
+
+@jit
+def gate(angle_rad: float, cos_error: float) -> tuple[float, float]:
+    """The angles whose cosine differs from that of one by cosError at most: eqs 4 and 5 with their signs mended.
+
+    By the half-angle's sine, for cos a = 1 - 2 sin^2(a / 2): a small angle keeps its digits.
+    """
+    half = np.sin(angle_rad / 2) ** 2
+    low = 2 * np.arcsin(np.sqrt(max(half - cos_error / 2, 0.0)))
+    return low, 2 * np.arcsin(np.sqrt(min(half + cos_error / 2, 1.0)))
+
+
+def shefex(vectors_cam: Floats, index: PairIndex, tolerance_rad: float, **options: Any) -> StarMatch | None:
+    """SHEFEX-2's pyramid, brightest first, with cosError by eq. 3 from the tolerance and the index's greatest angle.
+
+    vectors_cam   : (N, 3) observed unit vectors, brightest first; the paper has 15 at most
+    tolerance_rad : of a direction;  options : those of `Options`; no magnitudes are used
+    All triangles in the order of brightness: the base triangle's stars are found by the k-vector, a fourth and then
+    every other star by its three angles to them. Ours beside the paper: the triangle's handedness, which its angles
+    leave open, the places at the attitude found, and the verdict. The paper takes a fourth star for success; here as
+    many stars must have matched as chance would bring less than 1e-5 times in all that was tried, or the answer is
+    None.
+    """
+    asked = Options(**options)
+    asked.fixed_focal("shefex")
+    if not tolerance_rad > 0:
+        raise ImageError(f"shefex: tolerance {tolerance_rad} rad; allowed: more than 0")
+    if len(vectors_cam) < MIN_MATCHES:
+        return None
+    slack_rad = tolerance_rad + asked.stretch * index.max_angle_rad
+    error = cos_error(index.max_angle_rad, slack_rad)
+    base = min(asked.base_stars, len(vectors_cam))
+    by = Rules(error, slack_rad, asked.max_triangles, asked.max_checks, base)
+    return answer(search(np.ascontiguousarray(vectors_cam), index, by))
+
+
+@jit
+def search(seen: Floats, index: PairIndex, by: Rules) -> Found:
+    """The compiled identifier: rows of the observed and the catalogue's stars, R_cam_from_ref, log10 of the chance."""
+    return sought(seen, index, by, np.zeros(3, np.int64))
+
+
+@jit
+def sought(seen: Floats, index: PairIndex, by: Rules, tried: NDArray) -> Found:
+    """As `search`, and what it took is added to (3,) tried: base triangles found, angles compared, triangles seen."""
+    for i in range(by.base - 2):
+        for j in range(i + 1, by.base - 1):
+            for k in range(j + 1, by.base):
+                if tried[2] >= by.triangles or tried[1] >= by.checks:
+                    return nothing()
+                tried[2] += 1
+                found = _triangle(seen, index, np.array([i, j, k]), by, tried)
+                if len(found[0]) and found[3] <= by.accept:
+                    return found
+    return nothing()
+
+
+@jit
+def _triangle(seen: Floats, index: PairIndex, corners: NDArray, by: Rules, tried: NDArray) -> Found:
+    """Every catalogue triangle like an observed one, with the other stars named by their angles to its corners."""
+    i, j, k = corners
+    ij, ik, jk = angle(seen[i], seen[j]), angle(seen[i], seen[k]), angle(seen[j], seen[k])
+    if min(ij, ik, jk) < APART * by.tolerance_rad or max(ij, ik, jk) > index.max_angle_rad:
+        return nothing()
+    handed = triple(seen[i], seen[j], seen[k])
+    low, high = gate(ij, by.cos_error)
+    near_low, near_high = gate(ik, by.cos_error)
+    far_low, far_high = gate(jk, by.cos_error)
+    rings = _rings(seen, corners, by)
+    begin, end = between(index, low, high)
+    for p in range(begin, end):
+        if tried[1] >= by.checks:
+            break
+        if not low <= index.angle_rad[p] <= high:
+            continue
+        for flip in range(2):
+            a, b = index.pair[p, flip], index.pair[p, 1 - flip]
+            place = around(index, a, near_low)
+            while place < index.first[a + 1] and index.separation_rad[place] <= near_high:
+                c = index.neighbour[place]
+                place += 1
+                tried[1] += 1
+                if not far_low <= angle(index.vectors[b], index.vectors[c]) <= far_high:
+                    continue
+                if handed * triple(index.vectors[a], index.vectors[b], index.vectors[c]) <= 0:
+                    continue
+                tried[0] += 1
+                found = _rest(seen, index, corners, np.array([a, b, c], np.int64), rings, by, tried)
+                if len(found[0]) and found[3] <= by.accept:
+                    return found
+    return nothing()
+
+
+@jit
+def _rings(seen: Floats, corners: NDArray, by: Rules) -> Floats:
+    """(N, 10) where a star must be about the base: lower ends of its angles' gates, upper ends, cosines of the angles.
+
+    Last comes the area that the gates leave, 0 for a base star and for one too close to any, which is not named.
+    """
+    rings, side = np.zeros((len(seen), 10)), np.empty(3)
+    for n in range(len(seen)):
+        for m in range(3):
+            side[m] = angle(seen[corners[m]], seen[n])
+            rings[n, m], rings[n, 3 + m] = gate(side[m], by.cos_error)
+            rings[n, 6 + m] = np.cos(side[m])
+        if side.min() >= APART * by.tolerance_rad:
+            rings[n, 9] = _crossing(seen, corners, n, side, rings[n, 3:6] - rings[n, :3])
+    return rings
+
+
+@jit
+def _rest(
+    seen: Floats,
+    index: PairIndex,
+    corners: NDArray,
+    stars: NDArray,
+    rings: Floats,
+    by: Rules,
+    tried: NDArray,
+) -> Found:
+    """A fourth star and all others, each by its angles to the base triangle, and then by its place at their attitude.
+
+    A slim base, and stars in its line, look much like their mirror image in angles, not in places.
+    """
+    observed, star = np.empty(len(seen), np.int64), np.empty(len(seen), np.int64)
+    observed[:3], star[:3] = corners, stars
+    count = 3
+    for n in range(len(seen)):
+        s = _partner(seen, index, corners, stars, n, rings[n], tried) if rings[n, 9] > 0 else -1
+        if s >= 0 and not (star[:count] == s).any():
+            observed[count], star[count] = n, s
+            count += 1
+    if count < MIN_MATCHES:
+        return nothing()
+    observed, star = observed[:count], star[:count]
+    matrix = turned(seen[observed], index.vectors[star])
+    kept = np.empty(count, np.bool_)
+    for n in range(count):
+        kept[n] = angle(matrix @ index.vectors[star[n]], seen[observed[n]]) <= 2 * by.tolerance_rad
+    observed, star, count = observed[kept], star[kept], kept.sum()
+    if count < MIN_MATCHES:
+        return nothing()
+    cap_sr = 2 * np.pi * (1 - np.cos(index.max_angle_rad))
+    density = (index.first[stars[0] + 1] - index.first[stars[0]] + 1) / cap_sr
+    p = 1 - np.exp(-density * rings[:, 9].sum() / (len(seen) - 3))
+    chance = log10_tail(len(seen) - 3, count - 3, p) + np.log10(tried[0])
+    return observed, star, turned(seen[observed], index.vectors[star]), chance
+
+
+@jit
+def _partner(
+    seen: Floats, index: PairIndex, corners: NDArray, stars: NDArray, n: int, ring: Floats, tried: NDArray
+) -> int:
+    """The star whose three angles to the base are like an observed one's, nearest in the sum of their cosines; or -1.
+
+    Three rings do not tell a place from its mirror image where the base is slim: its side is looked at too.
+    """
+    best, least = -1, np.inf
+    place = around(index, stars[0], ring[0])
+    tried[1] += 3
+    while place < index.first[stars[0] + 1] and index.separation_rad[place] <= ring[3]:
+        d = index.neighbour[place]
+        off = abs(np.cos(index.separation_rad[place]) - ring[6])
+        place += 1
+        tried[1] += 1
+        fits = d != stars[1] and d != stars[2]
+        for m in range(1, 3):
+            if not fits:
+                break
+            apart = angle(index.vectors[stars[m]], index.vectors[d])
+            fits = ring[m] <= apart <= ring[3 + m]
+            off += abs(np.cos(apart) - ring[6 + m])
+        if fits and off < least and _same_side(seen, index, corners, stars, n, d):
+            best, least = d, off
+    return best
+
+
+@jit
+def _same_side(seen: Floats, index: PairIndex, corners: NDArray, stars: NDArray, n: int, d: int) -> bool:
+    """Whether a star is on the same side of the base's line that it is farthest from, observed and catalogued."""
+    best, product = 0.0, 1.0
+    for m in range(3):
+        a, b = m, (m + 1) % 3
+        here = triple(seen[corners[a]], seen[corners[b]], seen[n])
+        if abs(here) > best:
+            best = abs(here)
+            product = here * triple(index.vectors[stars[a]], index.vectors[stars[b]], index.vectors[d])
+    return product > 0
+
+
+@jit
+def _crossing(seen: Floats, corners: NDArray, n: int, side: Floats, width: Floats) -> float:
+    """The least of the three rhombi in which two rings about base stars cross at a star, in steradians.
+
+    They cross at the angle that the star sees the two under, whose sine is the volume of the three over the sines of
+    their sides.
+    """
+    least = np.inf
+    for m in range(3):
+        a, b = m, (m + 1) % 3
+        volume = abs(triple(seen[corners[a]], seen[corners[b]], seen[n]))
+        sine = max(volume / (np.sin(side[a]) * np.sin(side[b])), 1e-9)
+        least = min(least, width[a] * width[b] / sine)
+    return least

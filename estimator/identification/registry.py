@@ -1,0 +1,27 @@
+"""Star identification algorithms by name."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from estimator.core.types import StarMatch
+from estimator.identification.published.fialho import fialho_1, fialho_2, fialho_3, fialho_4
+from estimator.identification.published.master_star import master_star
+from estimator.identification.published.pyramid import pyramid
+from estimator.identification.published.saa import saa
+from estimator.identification.published.shefex import shefex
+
+Identifier = Callable[..., StarMatch | None]
+
+# `default` is the pyramid where the focal length is uncertain; a known camera's stars are found by evidence (ledpairs).
+IDENTIFIERS: dict[str, Identifier] = {
+    "default": pyramid,
+    "pyramid": pyramid,
+    "saa": saa,
+    "shefex": shefex,
+    "master_star": master_star,
+    "fialho_1": fialho_1,
+    "fialho_2": fialho_2,
+    "fialho_3": fialho_3,
+    "fialho_4": fialho_4,
+}

@@ -1,0 +1,1 @@
+"""Identification of stars: search for candidate attitudes and their Bayes factor."""

@@ -1,0 +1,223 @@
+"""From a frame to an attitude under an LED dome, with a camera on a lever arm about the bearing centre."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from estimator.attitude.dome_map import LedMap, Lever, check_lever, on_sphere, project
+from estimator.attitude.nearfield import SOLVERS, fitted_sigma_rad
+from estimator.catalog import pair_index
+from estimator.core.arrays import Floats
+from estimator.core.camera import Camera
+from estimator.core.types import Attitude, Centroids, StarMatch
+from estimator.identification.leds import search
+from estimator.identification.leds.evidence import LEAST
+from estimator.identification.leds.index import corner_rays, inner_field, sight_of
+from estimator.identification.leds.search import NO_MATCH
+from estimator.identification.registry import IDENTIFIERS as STAR_IDENTIFIERS
+from estimator.trackers.pipeline import Clock, Report, Settings, brightest, direction_sigma_rad, look
+from estimator.trackers.star_tracker import NO_STARS, mutual
+
+LEAST_ERROR_PX = 0.3  # of a light, for what no survey and no calibration knows of
+SETTINGS = Settings(identifier="led_pairs", solver="rotation_only")
+Identify = Callable[[Floats, Floats], StarMatch | str]
+
+
+def led_pairs(camera: Camera, leds: LedMap, lever: Lever, settings: Settings) -> Identify:
+    """Pairs of lights at the LEDs' own distances, by evidence; see `ledpairs.identify`."""
+    sight = sight_of(leds, lever, camera)
+    least_rad = LEAST_ERROR_PX / camera.focal_px
+    return lambda rays_cam, sigma_rad: search.identify(rays_cam, np.hypot(sigma_rad, least_rad), sight)
+
+
+def as_stars(name: str, camera: Camera, leds: LedMap, lever: Lever, settings: Settings) -> Identify:
+    """One of the stars' identifiers, after every ray is carried to one sphere about the bearing.
+
+    A dome that is no sphere stretches the angles, as the lever stretches an error of range.
+    """
+    radius = np.linalg.norm(leds.position_m, axis=1)
+    usual_m, pupil_m = float(np.median(radius)), lever.cam_from_body.apply(lever.camera_body_m)
+    points = on_sphere(corner_rays(camera), pupil_m, usual_m) / usual_m
+    field_tan, _ = inner_field(points)
+    reach_rad = np.arccos(np.clip((points @ points.T).min(), -1, 1))
+    pairs = pair_index.build(leds.position_m / radius[:, None], reach_rad * 1.05, leds.board)
+    stretch = 2 * float(np.std(radius)) / (usual_m - float(np.linalg.norm(pupil_m))) + 5e-4
+
+    def identify(rays_cam: Floats, sigma_rad: Floats) -> StarMatch | str:
+        found = STAR_IDENTIFIERS[name](
+            on_sphere(rays_cam, pupil_m, usual_m) / usual_m,
+            pairs,
+            max(1.0, 4 * settings.centroid_sigma_px) / camera.focal_px,
+            stretch=stretch,
+            base_stars=settings.base_stars,
+            missed_dex=settings.missed_dex,
+            field_tan=tuple(field_tan),
+        )
+        return found or NO_MATCH
+
+    return identify
+
+
+# Each of (camera, leds, lever, settings) -> what tells (N, 3) rays and their (N,) errors apart, or says why not.
+IDENTIFIERS: dict[str, Callable[[Camera, LedMap, Lever, Settings], Identify]] = {
+    "led_pairs": led_pairs,
+    "pyramid": partial(as_stars, "pyramid"),
+    "saa": partial(as_stars, "saa"),
+}
+
+
+class DomeTracker:
+    """Lost under an LED dome, with a camera on a lever arm about the bearing centre.
+
+    cam_from_ref of the answer is cam_from_lab; `lever` turns it into the vehicle's attitude. Raises ImageError for a
+    lever longer than the dome is wide, and for too few LEDs.
+    """
+
+    def __init__(
+        self,
+        camera: Camera,
+        leds: LedMap,
+        lever: Lever,
+        settings: Settings = SETTINGS,
+    ) -> None:
+        check_lever(leds, lever)
+        self.camera, self.leds, self.lever, self.settings = camera, leds, lever, settings
+        self.identify = IDENTIFIERS[settings.identifier](camera, leds, lever, settings)
+        reach_m = np.linalg.norm(leds.position_m, axis=1).min() - np.linalg.norm(lever.camera_body_m)
+        self.led_sigma_rad = float(leds.sigma_m / reach_m)
+
+    def solve(self, image: NDArray, streak_px: tuple[float, float] | None = None) -> Report:
+        """One frame to an attitude. Raises ImageError for bad input; anything else that fails is a status.
+
+        streak_px : (dx, dy) that stars move in the exposure, from the gyro; None where there is none
+        """
+        return look(image, self.camera, self.settings, self.solve_centroids, streak_px)
+
+    def solve_centroids(self, centroids: Centroids, clock: Clock | None = None) -> Attitude:
+        """The stages after centroiding, for centroids from anywhere (the truth included)."""
+        clock = clock or Clock()
+        if len(centroids) < LEAST:
+            return Attitude(NO_STARS)
+        few = brightest(centroids, self.settings)
+        match = self.identify(
+            self.camera.rays(few.xy_px), direction_sigma_rad(few, self.camera, self.settings)
+        )
+        clock.lap("identify")
+        if isinstance(match, str):
+            return Attitude(match)
+        attitude = self._refined(centroids, match)
+        clock.lap("solve")
+        return attitude
+
+    def _refined(self, centroids: Centroids, match: StarMatch) -> Attitude:
+        """Match every centroid by the exact geometry, then let the chosen solver say what it makes of the matches.
+
+        A solver that is not exact would lose the lights themselves: it is compared on the same matches as the others.
+        """
+        observed, star = match.observed, match.star
+        body_from_lab = self.lever.cam_from_body.inv() * match.cam_from_ref
+        rays = self.camera.rays(centroids.xy_px)
+        sigma_rad = self._sigma_rad(centroids, rays, "rotation_only")
+        radius_px = max(4.0, 4 * float(np.median(sigma_rad)) * self.camera.focal_px)
+        try:
+            for widened in (3.0, 1.0):
+                body_from_lab, _ = self._solve(
+                    "rotation_only", rays, sigma_rad, observed, star, body_from_lab
+                )
+                observed, star = self._nearest(centroids, body_from_lab, widened * radius_px)
+                # The exact geometry must confirm all that identification found.
+                if len(observed) < len(match.observed):
+                    return Attitude(NO_MATCH)
+            observed, star, misfit = self._without_blends(centroids, sigma_rad, observed, star, body_from_lab)
+            solver = self.settings.solver
+            sigma_rad = self._sigma_rad(centroids, rays, solver)
+            body_from_lab, spread = self._solve(solver, rays, sigma_rad, observed, star, body_from_lab)
+        except (ValueError, np.linalg.LinAlgError) as error:
+            return Attitude(f"no attitude: {error}")
+        cam_from_lab = self.lever.cam_from_body * body_from_lab
+        R_cam_from_body = self.lever.cam_from_body.as_matrix()
+        residual = self._residual_px(centroids, observed, star, body_from_lab)
+        return Attitude(
+            "solved",
+            cam_from_lab,
+            misfit * R_cam_from_body @ spread @ R_cam_from_body.T
+            + self._lever_covariance(cam_from_lab, star),
+            StarMatch(observed, star, cam_from_lab, match.log10_chance),
+            float(np.sqrt(np.mean(residual**2))),
+            self.camera,
+        )
+
+    def _sigma_rad(self, centroids: Centroids, rays: Floats, solver: str) -> Floats:
+        """(N,) error of what a method fits, by the pixels and by the LEDs' places."""
+        pixel_rad = direction_sigma_rad(centroids, self.camera, self.settings)
+        return np.hypot(fitted_sigma_rad(solver, rays, pixel_rad), self.led_sigma_rad)
+
+    def _residual_px(
+        self, centroids: Centroids, observed: NDArray, star: NDArray, body_from_lab: Rotation
+    ) -> Floats:
+        """(K, 2) predicted less seen."""
+        predicted = project(body_from_lab, self.leds.position_m[star], self.lever, self.camera)
+        return predicted - centroids.xy_px[observed]
+
+    def _without_blends(
+        self,
+        centroids: Centroids,
+        sigma_rad: Floats,
+        observed: NDArray,
+        star: NDArray,
+        body_from_lab: Rotation,
+    ) -> tuple[NDArray, NDArray, float]:
+        """The matches without those far beyond the others' residuals, and by how much the rest scatter too much.
+
+        Two LEDs whose images touch are one blob, in neither's place: far from where the sharp ones are. Residuals are
+        weighed by their sigmas; 5 times their median length is beyond 20 sigma^2 of a chi-square of two. What is left
+        has 2 K - 3 degrees of freedom; a chi-square above that by more than chance widens the covariance.
+        """
+        residual = self._residual_px(centroids, observed, star, body_from_lab)
+        length = np.linalg.norm(residual, axis=1) / (sigma_rad[observed] * self.camera.focal_px)
+        kept = length <= 5 * max(float(np.median(length)), 1.0)
+        if kept.sum() < max(LEAST, len(kept) / 2):
+            kept[:] = True
+        freedom = 2 * int(kept.sum()) - 3
+        excess = float(np.sum(length[kept] ** 2)) / freedom
+        by_chance = 1 + 3 * np.sqrt(2 / freedom)
+        return observed[kept], star[kept], excess if excess > by_chance else 1.0
+
+    def _lever_covariance(self, cam_from_lab: Rotation, star: NDArray) -> Floats:
+        """(3, 3) covariance in camera axes by the pupil's place, the same in every frame.
+
+        The sight of a light at p from the bearing stays as it was if the vehicle turns by p x shift / |p|^2.
+        """
+        middle_m = cam_from_lab.apply(self.leds.position_m[star].mean(axis=0))
+        along = middle_m / np.linalg.norm(middle_m)
+        sigma_rad = self.lever.sigma_m / np.linalg.norm(middle_m)
+        return sigma_rad**2 * (np.eye(3) - np.outer(along, along))
+
+    def _solve(
+        self,
+        solver: str,
+        rays: Floats,
+        sigma_rad: Floats,
+        observed: NDArray,
+        star: NDArray,
+        body_from_lab: Rotation,
+    ) -> tuple[Rotation, Floats]:
+        """body_from_lab and its covariance in body axes, by the matched rays alone."""
+        place_m = self.leds.position_m[star]
+        return SOLVERS[solver](
+            rays[observed], sigma_rad[observed], place_m, self.leds, self.lever, body_from_lab
+        )
+
+    def _nearest(
+        self, centroids: Centroids, body_from_lab: Rotation, radius_px: float
+    ) -> tuple[NDArray, NDArray]:
+        """Pairs of centroid and LED that are each other's nearest within a radius."""
+        xy = project(body_from_lab, self.leds.position_m, self.lever, self.camera)
+        # An LED whose middle is just off the chip still shines onto it.
+        inside = np.flatnonzero(self.camera.contains(np.nan_to_num(xy, nan=-1e9), -30.0))
+        return mutual(centroids.xy_px, xy[inside], radius_px, inside)

@@ -1,0 +1,157 @@
+"""What every tracker shares: its settings, and the stages from a frame to its lights."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimator.centroiding.centroid import CENTROIDERS
+from estimator.core.arrays import Floats, Ints
+from estimator.core.camera import Camera, check_shape
+from estimator.core.errors import ImageError
+from estimator.core.types import Attitude, Blobs, Centroids, FramePriors
+from estimator.detection.classify import NO_STAR, Flag
+from estimator.detection.detect import DETECTORS, mend
+
+SATURATED = "the frame is saturated"
+# A plateau's edge falls by whole pixels: 0.01 to 0.07 by Monte Carlo, as it is cut off deeper.
+SATURATED_SIGMA_PX = 0.05
+VAGUE_PX = 5.0  # a light of so great an error may be any star, and costs the search more than it can tell
+MENDED_SIGMA_PX = 0.06  # of a star on a bad pixel, for the guess at what that would have held: Monte Carlo
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """Which algorithm does each stage, and its thresholds.
+
+    centroid_sigma_px : floor of a centroid's error, for what its own noise does not cover
+    base_stars        : among how many of the brightest blobs patterns are sought
+    field_stars       : how many catalogue stars a field should hold on average when patterns are sought
+    merge_px          : catalogue stars nearer to one another are one light
+    zero_point_mag    : magnitude of a light of flux 1; None where it is not known, and magnitudes tell nothing
+    magnitude_sigma   : error of a star's magnitude, what its colour does included
+    reject            : flags of `judge.Flag` with which a blob is taken for no star and dropped
+    bad_px            : (K, 2) x and y of the sensor's bad pixels; None where there is no map
+    """
+
+    detector: str = "default"
+    centroider: str = "default"
+    identifier: str = "default"
+    solver: str = "default"
+    threshold_sigma: float = 5.0
+    min_area_px: int = 3
+    max_blobs: int = 100
+    gain_e_dn: float = 1.0
+    saturation: float = float("inf")
+    centroid_sigma_px: float = 0.1
+    base_stars: int = 20
+    field_stars: float = 30.0
+    merge_px: float = 2.0
+    zero_point_mag: float | None = None
+    magnitude_sigma: float = 0.25
+    missed_dex: float = 0.5
+    reject: int = int(NO_STAR)
+    bad_px: Ints | None = field(default=None, compare=False)
+
+
+@dataclass(slots=True)
+class Report:
+    """One frame's answer with what it rests on: the centroids, and seconds spent by stage."""
+
+    attitude: Attitude
+    centroids: Centroids
+    seconds: dict[str, float] = field(default_factory=dict)
+
+
+class Clock:
+    """Seconds between laps, by name."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+        self._last = time.perf_counter()
+
+    def lap(self, name: str) -> None:
+        now = time.perf_counter()
+        self.seconds[name] = self.seconds.get(name, 0.0) + now - self._last
+        self._last = now
+
+
+def see(
+    image: NDArray,
+    camera: Camera,
+    settings: Settings,
+    clock: Clock,
+    streak_px: tuple[float, float] | None = None,
+) -> Centroids:
+    """Detect and centroid. Raises ImageError for a frame that cannot be one of this camera's.
+
+    streak_px : (dx, dy) that stars move during the exposure, from the gyro; None where there is none
+    """
+    check_shape(image.shape, camera)
+    if np.isfinite(settings.saturation):
+        some = image[::37]  # enough to tell a half
+        if np.count_nonzero(some >= settings.saturation) > 0.5 * some.size:
+            raise ImageError(f"{SATURATED}: over half of its pixels are at {settings.saturation:g}")
+    if settings.bad_px is not None:
+        image = mend(image, settings.bad_px)
+    hints = FramePriors(streak_px, settings.saturation)
+    blobs = DETECTORS[settings.detector](
+        image, settings.threshold_sigma, settings.min_area_px, settings.max_blobs, hints
+    )
+    stars = whole(blobs.box_px, camera) & (blobs.flag & settings.reject == 0)
+    if not stars.all():
+        blobs = blobs.take(stars)
+    clock.lap("detect")
+    centroids = CENTROIDERS[settings.centroider](image, blobs, settings.gain_e_dn, hints)
+    centroids = doubted(centroids, blobs, settings)
+    clock.lap("centroid")
+    sound = camera.contains(centroids.xy_px) & (centroids.sigma_px < VAGUE_PX) & (centroids.flux > 0)
+    return centroids if sound.all() else centroids.take(sound)
+
+
+def doubted(centroids: Centroids, blobs: Blobs, settings: Settings) -> Centroids:
+    """The centroids with what their noise does not tell: of saturated blobs, and of those on bad pixels."""
+    extra = SATURATED_SIGMA_PX * (blobs.flag & int(Flag.SATURATED) != 0)
+    if settings.bad_px is not None and len(blobs):
+        bad = np.asarray(settings.bad_px)[:, None]
+        inside = np.all((bad >= blobs.box_px[:, :2] - 1) & (bad <= blobs.box_px[:, 2:] + 1), axis=2)
+        extra = np.where(inside.any(axis=0), np.hypot(extra, MENDED_SIGMA_PX), extra)
+    if not extra.any():
+        return centroids
+    spread = centroids.covariance_px2
+    if spread is not None:
+        spread = spread + (extra**2)[:, None, None] * np.eye(2)
+    return replace(centroids, sigma_px=np.hypot(centroids.sigma_px, extra), covariance_px2=spread)
+
+
+def look(
+    image: NDArray,
+    camera: Camera,
+    settings: Settings,
+    solve: Callable[[Centroids, Clock], Attitude],
+    streak_px: tuple[float, float] | None = None,
+) -> Report:
+    """A frame through all stages, timed."""
+    clock = Clock()
+    centroids = see(image, camera, settings, clock, streak_px)
+    return Report(solve(centroids, clock), centroids, clock.seconds)
+
+
+def brightest(centroids: Centroids, settings: Settings) -> Centroids:
+    """As many as identification looks at: twice those among which it seeks its patterns."""
+    return centroids.take(np.arange(min(len(centroids), 2 * settings.base_stars)))
+
+
+def direction_sigma_rad(centroids: Centroids, camera: Camera, settings: Settings) -> Floats:
+    """(N,) error of a direction: the centroid's own, and the floor for what that does not cover."""
+    return np.hypot(centroids.sigma_px, settings.centroid_sigma_px) / camera.focal_px
+
+
+def whole(box_px: NDArray, camera: Camera) -> NDArray:
+    """(N,) whether a blob's box keeps off the border: one cut off by it has its centre elsewhere."""
+    x0, y0, x1, y1 = box_px.T
+    return (x0 > 0) & (y0 > 0) & (x1 < camera.width_px - 1) & (y1 < camera.height_px - 1)

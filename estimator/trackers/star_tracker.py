@@ -1,0 +1,345 @@
+"""The sequence of stages, from a frame to an attitude, for stars at infinity; `dometracker` has that for a dome."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from estimator.attitude.solvers import SOLVERS, covariance
+from estimator.catalog import catalog, pair_index, sky_index
+from estimator.core.arrays import Floats, Ints
+from estimator.core.camera import Camera
+from estimator.core.types import Attitude, Centroids, StarMatch
+from estimator.identification.chance import ACCEPT_LOG10_CHANCE, MIN_MATCHES, log10_tail
+from estimator.identification.registry import IDENTIFIERS
+from estimator.identification.stars import search
+from estimator.identification.stars.evidence import LEAST, Fix, Lights
+from estimator.trackers.pipeline import Clock, Report, Settings, brightest, direction_sigma_rad, look
+
+NO_STARS = "too few stars detected"
+NO_MATCH = "no identification beyond chance"
+LEAST_ERROR_PX = 0.02  # of a star, for what no calibration knows of
+# By how much lights may be off, in pixels and as a share of the distance from the middle, and how many are looked up
+# before a frame is given up: 400,000 take two hundredths of a second.
+Lens = tuple[float, float, int]
+KNOWN_LENS: tuple[Lens, ...] = ((LEAST_ERROR_PX, 0.0, 400_000),)
+UNKNOWN_LENS: tuple[Lens, ...] = ((0.5, 0.0, 200_000), (1.0, 0.005, 600_000), (2.0, 0.01, 300_000))
+# By which a light outshines what its star should give: beyond colours, variables and doubles.
+TOO_BRIGHT_MAG = 2.0
+CORNERS = np.array([[0, 0], [1, 0], [0, 1], [1, 1]])
+SETTINGS = Settings()
+
+
+class StarTracker:
+    """Lost in space under the real sky.
+
+    camera  : the believed calibration
+    stars   : the on-board star list
+    vectors : (N, 3) apparent directions of `stars` at the time of the frames
+    focal_uncertainty : relative; 0 for a calibrated camera, 0.05 where only the field of view is known to 5 %.
+        Where it is not 0 the focal length and, with enough stars, the radial distortion are fitted in each frame.
+    """
+
+    def __init__(
+        self,
+        camera: Camera,
+        stars: catalog.StarList,
+        vectors: Floats,
+        settings: Settings = SETTINGS,
+        focal_uncertainty: float = 0.0,
+    ) -> None:
+        self.camera, self.settings = camera, settings
+        self.focal_uncertainty = focal_uncertainty
+        self.lenses = UNKNOWN_LENS if focal_uncertainty else KNOWN_LENS
+        listed = replace(stars, vectors=vectors)
+        self.stars = catalog.merge_doubles(listed, settings.merge_px / camera.focal_px)
+        self.tree = cKDTree(self.stars.vectors)
+        field_sr = camera.width_px * camera.height_px / camera.focal_px**2
+        bright = self.stars.take(
+            self.stars.v_mag <= catalog.limit_for_density(self.stars, field_sr, settings.field_stars)
+        )
+        widest_rad = camera.zoomed(1 - focal_uncertainty).diagonal_rad
+        self.sky = sky_index.unpaired(self.stars.vectors, self.stars.v_mag)
+        self.patterns: sky_index.Sky | None = None
+        self.index: pair_index.PairIndex | None = None
+        if settings.identifier == "default":
+            self.patterns = sky_index.sky_of(bright.vectors, bright.v_mag, widest_rad * 1.02)
+            self.pairs = len(self.patterns.pair)
+        else:
+            self.index = pair_index.build(bright.vectors, widest_rad * 1.02)
+            self.pairs = len(self.index.pair)
+        corners = camera.tangents(CORNERS * [camera.width_px, camera.height_px] - 0.5)
+        self.field = np.array(
+            [corners[:, 0].min(), corners[:, 0].max(), corners[:, 1].min(), corners[:, 1].max()]
+        )
+
+    def solve(self, image: NDArray, streak_px: tuple[float, float] | None = None) -> Report:
+        """One frame to an attitude. Raises ImageError for bad input; anything else that fails is a status.
+
+        streak_px : (dx, dy) that stars move in the exposure, from the gyro; None where there is none
+        """
+        return look(image, self.camera, self.settings, self.solve_centroids, streak_px)
+
+    @property
+    def efforts(self) -> int:
+        """How many searches, each of more effort than the one before, are made before a frame is given up."""
+        return len(self.lenses) if self.patterns is not None else 1
+
+    def solve_centroids(
+        self, centroids: Centroids, clock: Clock | None = None, effort: int | None = None
+    ) -> Attitude:
+        """The stages after centroiding, for centroids from anywhere (the truth included).
+
+        effort : this one of `efforts` alone, from 0; all of them in turn if left out
+        """
+        clock = clock or Clock()
+        if len(centroids) < LEAST:
+            return Attitude(NO_STARS)
+        if self.patterns is not None:
+            lenses = self.lenses if effort is None else self.lenses[effort : effort + 1]
+            return self._by_evidence(centroids, self.patterns, lenses, clock)
+        for camera, cam_from_ref in self._lost_in_space(centroids):
+            clock.lap("identify")
+            attitude = self._refined(centroids, camera, cam_from_ref)
+            clock.lap("solve")
+            if attitude.solved:
+                return attitude
+        clock.lap("identify")
+        return Attitude(NO_MATCH)
+
+    def solve_named(self, centroids: Centroids, observed: Ints, star: Ints) -> Attitude:
+        """The attitude alone, for names from anywhere (the truth included): centroids `observed` are the stars `star`.
+
+        Both (K,), K >= 2; `star` are rows of `self.stars`. Nothing is held against chance: its log10 is NaN.
+        """
+        sigma_px = self.sigma_px(centroids)[observed]
+        rays, vectors = self.camera.rays(centroids.xy_px[observed]), self.stars.vectors[star]
+        sigma_rad = sigma_px / self.camera.focal_px
+        try:
+            cam_from_ref = SOLVERS[self.settings.solver](rays, vectors, sigma_rad)
+        except ValueError as error:
+            return Attitude(f"no attitude: {error}")
+        residual = self.camera.pixels(cam_from_ref.apply(vectors)) - centroids.xy_px[observed]
+        return Attitude(
+            "solved",
+            cam_from_ref,
+            covariance(rays, sigma_rad, self.settings.solver),
+            StarMatch(observed, star, cam_from_ref, float("nan")),
+            float(np.sqrt(np.mean(residual**2))),
+            self.camera,
+        )
+
+    def sigma_px(self, centroids: Centroids, loose_px: float = LEAST_ERROR_PX, slack: float = 0.0) -> Floats:
+        """(N,) a centroid's error all told: its own, the floor, and a share of the distance from the middle."""
+        sigma_px = np.hypot(centroids.sigma_px, max(self.settings.centroid_sigma_px, loose_px))
+        if slack == 0:
+            return sigma_px
+        from_middle_px = np.linalg.norm(centroids.xy_px - self.camera.centre_px, axis=1)
+        return np.hypot(sigma_px, slack * from_middle_px)
+
+    def lights(self, centroids: Centroids, sigma_px: Floats) -> Lights:
+        """Centroids laid out for the search."""
+        settings = self.settings
+        mag = np.full(len(centroids), np.nan)
+        if settings.zero_point_mag is not None:
+            mag = settings.zero_point_mag - 2.5 * np.log10(centroids.flux)
+        weight = centroids.weights_per_px2(sigma_px) * self.camera.focal_px**2
+        xx, yy, xy = weight.T
+        return Lights(
+            self.camera.tangents(centroids.xy_px),
+            1 / np.sqrt((xx + yy) / 2 - np.hypot((xx - yy) / 2, xy)),
+            weight,
+            mag,
+            settings.magnitude_sigma,
+            self.field,
+            self.focal_uncertainty,
+        )
+
+    def _by_evidence(
+        self, centroids: Centroids, patterns: sky_index.Sky, lenses: tuple[Lens, ...], clock: Clock
+    ) -> Attitude:
+        """Identity, attitude and covariance in one; where the lens is uncertain, it is fitted to all stars then."""
+        for loose_px, slack, checks in lenses:
+            sigma_px = self.sigma_px(centroids, loose_px, slack)
+            base = self.settings.base_stars
+            fix = search.lost_in_space(self.lights(centroids, sigma_px), patterns, self.sky, base, checks)
+            clock.lap("identify")
+            if not len(fix.star):
+                continue
+            found = self.attitude_of(centroids, fix, sigma_px)
+            if self.focal_uncertainty:
+                fitted = self._refined(
+                    centroids, self.camera.zoomed(fix.zoom), Rotation.from_quat(fix.cam_from_ref_xyzw)
+                )
+                found = found if not (fitted.solved or slack) else fitted
+            clock.lap("solve")
+            if found.solved:
+                return found
+        return Attitude(NO_MATCH)
+
+    def attitude_of(self, centroids: Centroids, fix: Fix, sigma_px: Floats) -> Attitude:
+        """The answer that a fix is, solved again where another solver is named."""
+        camera = self.camera.zoomed(fix.zoom) if self.focal_uncertainty else self.camera
+        cam_from_ref, covariance_rad2 = Rotation.from_quat(fix.cam_from_ref_xyzw), fix.covariance_rad2
+        solver = self.settings.solver
+        if solver != "default":
+            rays, vectors = camera.rays(centroids.xy_px[fix.observed]), self.stars.vectors[fix.star]
+            sigma_rad = sigma_px[fix.observed] / camera.focal_px
+            cam_from_ref = SOLVERS[solver](rays, vectors, sigma_rad)
+            covariance_rad2 = covariance(rays, sigma_rad, solver)
+        match = StarMatch(fix.observed, fix.star, cam_from_ref, -fix.dex)
+        rms_px = fix.rms * self.camera.focal_px
+        return Attitude("solved", cam_from_ref, covariance_rad2, match, rms_px, camera)
+
+    def _lost_in_space(self, centroids: Centroids) -> Iterator[tuple[Camera, Rotation]]:
+        """Attitudes worth refining, by the identifier that is named.
+
+        Of the focal lengths that are possible: a little effort at all before much at any.
+        """
+        identify = IDENTIFIERS[self.settings.identifier]
+        step, stretch = 0.02, 0.011 if self.focal_uncertainty else 5e-4
+        reach = int(np.ceil(self.focal_uncertainty / step - 0.5))
+        zooms = sorted((n * step for n in range(-reach, reach + 1)), key=abs)
+        few = brightest(centroids, self.settings)
+        for triangles, checks in ((60, 1_500_000), (600, 3_000_000), (3000, 4_000_000)):
+            for zoom in zooms:
+                camera = self.camera.zoomed(1 + zoom)
+                tolerance_rad = (
+                    max(1.5 if reach else 1.0, 4 * self.settings.centroid_sigma_px) / camera.focal_px
+                )
+                match = identify(
+                    camera.rays(few.xy_px),
+                    self.index,
+                    tolerance_rad,
+                    stretch=stretch,
+                    zooms=reach > 0,
+                    max_triangles=triangles,
+                    max_checks=checks,
+                    base_stars=self.settings.base_stars,
+                )
+                if match:
+                    yield camera, match.cam_from_ref
+
+    def _refined(self, centroids: Centroids, camera: Camera, cam_from_ref: Rotation) -> Attitude:
+        """Match the whole field to the full catalogue, fit, tighten, and weigh the result against chance."""
+        fits = self.focal_uncertainty > 0
+        reach_px = np.hypot(camera.width_px, camera.height_px) / 2
+        radii_px = [0.008 * reach_px + 2, 0.004 * reach_px + 2, 4, 3, 2.5, 2.5] if fits else [3, 2.5, 2.5]
+        for radius_px in radii_px:
+            observed, star = self._nearest(centroids, camera, cam_from_ref, radius_px)
+            if len(observed) < MIN_MATCHES:
+                return Attitude(NO_MATCH)
+            xy, vectors = centroids.xy_px[observed], self.stars.vectors[star]
+            if fits:
+                camera, cam_from_ref = fit_camera(camera, cam_from_ref, xy, vectors)
+            sigma_rad = direction_sigma_rad(centroids.take(observed), camera, self.settings)
+            rays = camera.rays(xy)
+            try:
+                cam_from_ref = SOLVERS[self.settings.solver](rays, vectors, sigma_rad)
+            except ValueError as error:
+                return Attitude(f"no attitude: {error}")
+        rows, _ = self.in_field(camera, cam_from_ref)
+        chance = log10_chance(
+            observed,
+            len(centroids),
+            len(rows),
+            radius_px,
+            camera,
+            self.pairs,
+        )
+        if chance > ACCEPT_LOG10_CHANCE:
+            return Attitude(NO_MATCH)
+        if abs(camera.fov_rad / self.camera.fov_rad - 1) > 1.2 * self.focal_uncertainty + 1e-9:
+            return Attitude(NO_MATCH)
+        residual = camera.pixels(cam_from_ref.apply(vectors)) - xy
+        return Attitude(
+            "solved",
+            cam_from_ref,
+            covariance(rays, sigma_rad, self.settings.solver),
+            StarMatch(observed, star, cam_from_ref, chance),
+            float(np.sqrt(np.mean(residual**2))),
+            camera,
+        )
+
+    def in_field(self, camera: Camera, cam_from_ref: Rotation) -> tuple[NDArray, Floats]:
+        """Rows and pixels of the catalogue stars on the sensor."""
+        boresight = cam_from_ref.inv().apply([0.0, 0.0, 1.0])
+        rows = np.array(
+            self.tree.query_ball_point(boresight, 2 * np.sin(camera.diagonal_rad / 4) * 1.05), int
+        )
+        rows.sort()
+        xy = camera.pixels(cam_from_ref.apply(self.stars.vectors[rows])) if len(rows) else np.empty((0, 2))
+        inside = camera.contains(xy, -2.0)
+        return rows[inside], xy[inside]
+
+    def _nearest(
+        self, centroids: Centroids, camera: Camera, cam_from_ref: Rotation, radius_px: float
+    ) -> tuple[NDArray, NDArray]:
+        """Pairs of centroid and catalogue star that are each other's nearest within a radius."""
+        rows, xy = self.in_field(camera, cam_from_ref)
+        observed, star = mutual(centroids.xy_px, xy, radius_px, rows)
+        if len(star) < MIN_MATCHES:
+            return observed, star
+        # The catalogue's magnitude of a light of one count is about the same for all, and less only where not all of a
+        # light is seen (saturation). A light far above the others' is a planet, a lamp, a mirror image.
+        zero_mag = self.stars.v_mag[star] + 2.5 * np.log10(centroids.flux[observed])
+        off = zero_mag - np.median(zero_mag)
+        own = off < max(TOO_BRIGHT_MAG, 4 * float(np.median(np.abs(off))))
+        return observed[own], star[own]
+
+
+def log10_chance(
+    observed: NDArray, blobs: int, predicted: int, radius_px: float, camera: Camera, patterns: int
+) -> float:
+    """log10 of how many matches this good were to be expected by chance among all patterns tried.
+
+    A false blob falls within the radius of one of the predicted stars with the probability p = share of the
+    sensor that the circles cover; two matches are spent on the attitude itself. Faint blobs are mostly false, so
+    the matches are weighed among the brightest 15, 30, 60 and all of the blobs, the best counts, and the choice
+    among four is paid for.
+    """
+    p = 1 - np.exp(-predicted * np.pi * radius_px**2 / (camera.width_px * camera.height_px))
+    heads = [head for head in (15, 30, 60) if head < blobs] + [blobs]
+    tails = [log10_tail(max(head - 2, 0), int((observed < head).sum()) - 2, p) for head in heads]
+    return float(min(tails) + np.log10(len(heads)) + np.log10(patterns))
+
+
+def mutual(seen_px: Floats, predicted_px: Floats, radius_px: float, rows: NDArray) -> tuple[NDArray, NDArray]:
+    """Indices of pixels and the rows of predictions that are each other's nearest within a radius."""
+    if not len(predicted_px) or not len(seen_px):
+        return np.empty(0, int), np.empty(0, int)
+    apart, nearest = cKDTree(predicted_px).query(seen_px, distance_upper_bound=radius_px)
+    _, back = cKDTree(seen_px).query(predicted_px)
+    hit = np.flatnonzero(np.isfinite(apart))
+    hit = hit[back[nearest[hit]] == hit]
+    return hit, rows[nearest[hit]]
+
+
+def fit_camera(
+    camera: Camera, cam_from_ref: Rotation, xy_px: Floats, vectors_ref: Floats
+) -> tuple[Camera, Rotation]:
+    """Attitude, focal length and (from 12 stars on) the first radial coefficient that fit the pixels best.
+
+    Robust (soft L1 beyond a pixel), so that a wrong pair does not bend the lens.
+    """
+    radial = len(xy_px) >= 12
+    start = np.zeros(5 if radial else 4)
+    start[4:] = camera.distortion[0]
+
+    def model(p: Floats) -> tuple[Camera, Rotation]:
+        k1 = float(p[4]) if radial else camera.distortion[0]
+        lens = replace(camera, focal_px=camera.focal_px * float(np.exp(p[3])), distortion=(k1, 0, 0, 0, 0))
+        return lens, Rotation.from_rotvec(p[:3]) * cam_from_ref
+
+    def residual(p: Floats) -> Floats:
+        lens, turned = model(p)
+        return np.nan_to_num(lens.pixels(turned.apply(vectors_ref)) - xy_px, nan=1e3).ravel()
+
+    scale = np.array([1e-3, 1e-3, 1e-3, 1e-2, 0.3])[: len(start)]
+    return model(least_squares(residual, start, loss="soft_l1", x_scale=scale, max_nfev=40).x)

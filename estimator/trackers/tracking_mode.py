@@ -1,0 +1,214 @@
+"""A star tracker that remembers: it looks where the stars must be now, and everywhere when they are not there."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntFlag
+from math import log10, pi
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from estimator.centroiding.centroid import CENTROIDERS
+from estimator.core.arrays import Floats
+from estimator.core.camera import check_shape
+from estimator.core.types import Attitude, Centroids, FramePriors, StarMatch
+from estimator.detection.classify import Flag
+from estimator.detection.windows import in_windows
+from estimator.identification.stars import evidence
+from estimator.identification.stars.search import ACCEPT_DEX
+from estimator.trackers.pipeline import Clock, Report, doubted, see
+from estimator.trackers.star_tracker import StarTracker
+
+WINDOW_SIGMA = 4.0  # a star is expected there: fewer false ones than in a whole frame
+LONGEST_STREAK_PX = 4.0  # a longer one is sought by a filter of its own, in the whole frame
+ROUGH = 3.0  # chi-square a degree of freedom
+
+
+class Health(IntFlag):
+    """What is to be known of an answer."""
+
+    GOOD = 0
+    LOST = 1  # no attitude
+    SEARCHED = 2  # found lost in space, in this frame
+    FEW = 4  # five stars or fewer
+    MISSING = 8  # less than half of the stars that were to be seen
+    ROUGH = 16  # residuals of more than their errors: chi-square over three a degree of freedom
+    SATURATED = 32  # a star too bright
+    SMEARED = 64  # streaks of more than eight pixels
+
+
+@dataclass(slots=True)
+class Tracked(Report):
+    """A frame's report with how the tracker is.
+
+    health       : flags
+    log10_odds   : that the attitude is right, over chance; -inf where there is none
+    chi2_per_dof : of the residuals; NaN where there is no attitude
+    expected     : how many stars were looked for in windows; 0 in a search
+    """
+
+    health: Health = Health.LOST
+    log10_odds: float = -np.inf
+    chi2_per_dof: float = float("nan")
+    expected: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Memory:
+    """The last attitude, and how fast it turned, in camera axes of then."""
+
+    t_s: float
+    cam_from_ref: Rotation
+    rate_rad_s: Floats
+
+
+class TrackingMode:
+    """Lost in space, then tracking, and lost again.
+
+    tracker  : searches when there is nothing to follow; a known camera's
+    reach_px : half a side of the windows: how far the prediction may be off
+    most     : windows at most, of the brightest stars
+    stale_s  : a memory older than this is no prediction
+    """
+
+    def __init__(
+        self, tracker: StarTracker, reach_px: float = 8.0, most: int = 25, stale_s: float = 5.0
+    ) -> None:
+        if tracker.focal_uncertainty:
+            raise ValueError("a Follower's tracker must know its camera; allowed: focal_uncertainty 0")
+        self.tracker, self.reach_px, self.most, self.stale_s = tracker, reach_px, most, stale_s
+        self.memory: Memory | None = None
+
+    def solve(
+        self,
+        image: NDArray,
+        t_s: float,
+        now_from_then: Rotation | None = None,
+        streak_px: tuple[float, float] | None = None,
+    ) -> Tracked:
+        """The attitude at t_s. Raises ImageError for bad input; anything else that fails is a status.
+
+        now_from_then : cam(t_s) from cam at the last solved frame, from the gyros; the last rate goes on without it
+        streak_px     : (dx, dy) that stars move in the exposure, from the gyros
+        """
+        predicted = self._predicted(t_s, now_from_then)
+        clock = Clock()
+        report = self._track(image, predicted, streak_px, clock) if predicted is not None else None
+        if report is None:
+            report = self._search(image, streak_px, clock)
+        self._remember(t_s, report.attitude.cam_from_ref)
+        return report
+
+    def _predicted(self, t_s: float, now_from_then: Rotation | None) -> Rotation | None:
+        """cam_from_ref as it should be; None without a memory that is fresh."""
+        memory = self.memory
+        if memory is None or not 0 <= t_s - memory.t_s <= self.stale_s:
+            return None
+        if now_from_then is None:
+            now_from_then = Rotation.from_rotvec(memory.rate_rad_s * (t_s - memory.t_s))
+        return now_from_then * memory.cam_from_ref
+
+    def _remember(self, t_s: float, cam_from_ref: Rotation | None) -> None:
+        """A frame without an attitude leaves the memory as it was, to grow stale."""
+        if cam_from_ref is None:
+            return
+        last, rate_rad_s = self.memory, np.zeros(3)
+        if last is not None and 0 < t_s - last.t_s <= self.stale_s:
+            rate_rad_s = (cam_from_ref * last.cam_from_ref.inv()).as_rotvec() / (t_s - last.t_s)
+        self.memory = Memory(t_s, cam_from_ref, rate_rad_s)
+
+    def _track(
+        self, image: NDArray, predicted: Rotation, streak_px: tuple[float, float] | None, clock: Clock
+    ) -> Tracked | None:
+        """The attitude from what stands in the windows; None where that is not beyond chance."""
+        tracker = self.tracker
+        check_shape(image.shape, tracker.camera)
+        expected_px = self.expected_px(predicted)
+        if len(expected_px) < evidence.LEAST:
+            return None
+        centroids, saturated = self._in_windows(image, expected_px, streak_px, clock)
+        if len(centroids) < evidence.LEAST:
+            return None
+        sigma_px = tracker.sigma_px(centroids)
+        lights = tracker.lights(centroids, sigma_px)
+        reach_rad = self.reach_px / tracker.camera.focal_px
+        gates = np.full(len(centroids), 1.5 * reach_rad)  # a window's corner
+        guess = evidence.weigh(lights, tracker.sky, predicted.as_matrix(), 1.0, gates, -np.inf)
+        # The prediction has spared the search all attitudes but those within its reach.
+        half = float(np.min(tracker.field[1::2] - tracker.field[::2])) / 2
+        spared = log10(8 * pi**2 / ((2 * reach_rad) ** 2 * min(2 * reach_rad / half, 2 * pi)))
+        if guess.dex + spared < ACCEPT_DEX:
+            return None
+        fix = evidence.fixed(lights, tracker.sky, guess)
+        attitude = tracker.attitude_of(centroids, fix._replace(dex=guess.dex + spared), sigma_px)
+        clock.lap("solve")
+        return self._told(attitude, centroids, sigma_px, clock, len(expected_px), saturated, streak_px)
+
+    def _search(self, image: NDArray, streak_px: tuple[float, float] | None, clock: Clock) -> Tracked:
+        """The whole frame, lost in space."""
+        tracker = self.tracker
+        centroids = see(image, tracker.camera, tracker.settings, clock, streak_px)
+        attitude = tracker.solve_centroids(centroids, clock)
+        return self._told(attitude, centroids, tracker.sigma_px(centroids), clock, 0, False, streak_px)
+
+    def expected_px(self, cam_from_ref: Rotation) -> Floats:
+        """(N, 2) pixels of the brightest stars that are to be seen whole; of those in one window the brightest."""
+        tracker = self.tracker
+        rows, xy = tracker.in_field(tracker.camera, cam_from_ref)
+        inside = tracker.camera.contains(xy, self.reach_px)
+        xy = xy[inside][np.argsort(rows[inside])][: 2 * self.most]
+        apart = np.abs(xy[:, None] - xy).max(axis=2) < self.reach_px
+        shadowed = np.tril(apart, -1).any(axis=1)
+        return xy[~shadowed][: self.most]
+
+    def _in_windows(
+        self, image: NDArray, expected_px: Floats, streak_px: tuple[float, float] | None, clock: Clock
+    ) -> tuple[Centroids, bool]:
+        """Centroids of what stands in the windows, and whether a star was saturated."""
+        settings, hints = self.tracker.settings, FramePriors(streak_px, self.tracker.settings.saturation)
+        if streak_px is not None and np.hypot(*streak_px) > LONGEST_STREAK_PX:
+            centroids = see(image, self.tracker.camera, settings, clock, streak_px)
+            near = np.abs(centroids.xy_px[:, None] - expected_px).max(axis=2) < self.reach_px
+            return centroids.take(near.any(axis=1)), False
+        blobs = in_windows(image, expected_px, self.reach_px, WINDOW_SIGMA, hints)
+        blobs = blobs.take(blobs.flag & settings.reject == 0)
+        clock.lap("detect")
+        centroids = CENTROIDERS[settings.centroider](image, blobs, settings.gain_e_dn, hints)
+        centroids = doubted(centroids, blobs, settings)
+        clock.lap("centroid")
+        sound = np.isfinite(centroids.sigma_px) & (centroids.flux > 0)
+        return centroids.take(sound), bool(np.any(blobs.flag & Flag.SATURATED))
+
+    def _told(
+        self,
+        attitude: Attitude,
+        centroids: Centroids,
+        sigma_px: Floats,
+        clock: Clock,
+        expected: int,
+        saturated: bool,
+        streak_px: tuple[float, float] | None,
+    ) -> Tracked:
+        """The report with its health."""
+        if attitude.match is None or attitude.cam_from_ref is None:
+            return Tracked(attitude, centroids, clock.seconds)
+        match: StarMatch = attitude.match
+        vectors_cam = attitude.cam_from_ref.apply(self.tracker.stars.vectors[match.star])
+        off_px = self.tracker.camera.pixels(vectors_cam) - centroids.xy_px[match.observed]
+        chi2 = float(np.sum((off_px / sigma_px[match.observed][:, None]) ** 2))
+        chi2_per_dof = chi2 / max(2 * len(match.star) - 3, 1)
+        streak = float(np.hypot(*streak_px)) if streak_px is not None else 0.0
+        health = Health.GOOD
+        for flag, raised in (
+            (Health.SEARCHED, expected == 0),
+            (Health.FEW, len(match.star) <= 5),
+            (Health.MISSING, 2 * len(match.star) < expected),
+            (Health.ROUGH, chi2_per_dof > ROUGH),
+            (Health.SATURATED, saturated),
+            (Health.SMEARED, streak > 8),
+        ):
+            health |= flag if raised else Health.GOOD
+        odds = -match.log10_chance
+        return Tracked(attitude, centroids, clock.seconds, health, odds, chi2_per_dof, expected)

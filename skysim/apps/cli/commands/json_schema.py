@@ -1,0 +1,59 @@
+"""JSON Schema of scene and study files, for editors; and which versions of such a file this skysim reads.
+
+An editor is told what a key may hold before anything is run. It cannot know what a `base` or a preset has, so that it
+takes nothing but the version for missing; `skysim validate` does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from pydantic import BaseModel
+
+from skysim.experiments.study.plan import Study
+from skysim.scene.scene import STEM, Scene
+
+KINDS: Mapping[str, type[BaseModel]] = {"scene": Scene, "study": Study}
+BESIDE: Mapping[str, dict[str, Any]] = {  # keys that are taken out before a file is checked
+    "Scene": {"base": {"type": "string", "description": "another scene, by name or beside this one"}},
+    "Camera": {
+        "preset": {"type": "string", "description": "a file of data/cameras: what is left out is from there"},
+        "calibration": {
+            "type": "string",
+            "description": "a file of OpenCV's: focal length, centre, distortion",
+        },
+    },
+}
+STANDARD = "https://json-schema.org/draft/2020-12/schema"
+DROPPED = ("required", "discriminator", "default")
+BOUNDS = {"ge": "minimum", "gt": "exclusiveMinimum", "le": "maximum", "lt": "exclusiveMaximum"}
+
+
+def json_schema(kind: str) -> dict[str, Any]:
+    """The JSON Schema (draft 2020-12) of a kind of file."""
+    model = KINDS[kind]
+    told = loosened(model.model_json_schema(by_alias=True), model.__name__)
+    return {"$schema": STANDARD, "title": f"A {kind} of skysim", "required": ["schema"]} | {
+        k: v for k, v in told.items() if k != "title"
+    }
+
+
+def loosened(node: Any, name: str = "") -> Any:
+    """A schema in which nothing is missing; of a choice between sections any that fits will do."""
+    if isinstance(node, list):
+        return [loosened(one) for one in node]
+    if not isinstance(node, dict):
+        return node
+    kept: dict[str, Any] = {}
+    for key, value in node.items():
+        if key == "properties":
+            told = {one: loosened(of) for one, of in value.items() if one != STEM}
+            kept[key] = told | BESIDE.get(name, {})
+        elif key == "$defs":
+            kept[key] = {one: loosened(of, one) for one, of in value.items()}
+        elif key in BOUNDS:  # pydantic's own words, where a check of ours stands between
+            kept |= {BOUNDS[key]: value} if node.get("type") in ("number", "integer") else {}
+        elif key not in DROPPED and (key != "title" or name):
+            kept["anyOf" if key == "oneOf" else key] = loosened(value)
+    return kept

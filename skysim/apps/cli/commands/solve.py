@@ -1,0 +1,196 @@
+"""`skysim solve`, `survey`, `bench`."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from skysim.apps.cli.options import (
+    Centroider,
+    Detector,
+    Identifier,
+    Json,
+    Out,
+    SceneArg,
+    Seed,
+    Sets,
+    SolverName,
+    load,
+    moment,
+    named,
+)
+from skysim.apps.cli.terminal import (
+    complain,
+    number,
+    print_answers,
+    print_survey,
+    print_table,
+    progress,
+    watched,
+    yes,
+)
+from skysim.core.errors import InputError
+
+if TYPE_CHECKING:
+    from typing import Any
+
+    from numpy.typing import NDArray
+
+
+def solve(
+    images: Annotated[
+        list[Path] | None, typer.Argument(metavar="IMAGES", help="FITS, PNG, TIFF, JPEG or BMP files.")
+    ] = None,
+    fov: Annotated[
+        float | None,
+        typer.Option(help="Horizontal field of view in degrees, to 5 %; 5 to 40 are tried if left out."),
+    ] = None,
+    camera: Annotated[
+        Path | None,
+        typer.Option(
+            help="The scene (a file or a name in scenes/) or camera file that made them, or OpenCV's calibration."
+        ),
+    ] = None,
+    live: Annotated[
+        str | None,
+        typer.Option(help="Also a frame of a live camera: its index, a video file or an address."),
+    ] = None,
+    time: Annotated[
+        str | None, typer.Option(help="UTC of the pictures, 1900 to 2100, e.g. 2012-06-22T21:00:00.")
+    ] = None,
+    detector: Detector = None,
+    centroider: Centroider = None,
+    identifier: Identifier = None,
+    solver: SolverName = None,
+    out: Annotated[Path, typer.Option(help="Folder for the annotated pictures.")] = Path("out/solve"),
+    json: Json = False,
+) -> None:
+    """Find where pictures of the sky look, lost in space; refuse rather than guess.
+
+    Exit code 0 when every image was looked at, solved or not; 2 when one could not be.
+    """
+    from skysim.apps import plate_solver as solving
+    from skysim.core import files
+    from skysim.core.images import grab
+    from skysim.results.files import frames
+
+    stages = named(detector=detector, centroider=centroider, identifier=identifier, solver=solver)
+    how = solving.make_solver(fov, camera, time_utc=moment(time), stages=stages)
+    files.make_folder(out)
+    paths = [*(images or ()), *([kept(grab(live), out / "live.png")] if live is not None else ())]
+    if not paths:
+        raise InputError("give images, or --live CAMERA")
+    pictures = frames.unlike([out / f"{path.name}.solved.png" for path in paths])
+    jobs = progress(list(zip(paths, pictures, strict=True)), len(paths), "solving", quiet=json)
+    answers = [solving.solve(path, how, picture) for path, picture in jobs]
+    faults = [answer["status"] for answer in answers if answer.pop("bad_input")]
+    doubts = [doubt for answer in answers if (doubt := answer.pop("doubt"))]
+    files.write_text(out / "solutions.json", files.to_json(answers))
+    if json:
+        print(files.to_json(answers))
+    else:
+        print_answers(answers, out)
+    for fault in doubts + faults:
+        complain(fault)
+    if faults:
+        raise typer.Exit(2)
+
+
+def kept(image: NDArray[Any], path: Path) -> Path:
+    """The file of a camera's frame."""
+    from skysim.core import files
+
+    files.write_image(path, image)
+    return path
+
+
+def survey(
+    scene: SceneArg,
+    frames: Annotated[int, typer.Option(min=2, help="How many stops; a frame at each.")] = 300,
+    seed: Seed = None,
+    out: Out = None,
+    set_: Sets = None,
+    tilt: Annotated[float, typer.Option(help="Stops lean up to so many degrees, to any side.")] = 25.0,
+    imu_sigma: Annotated[str, typer.Option(help="Error of the IMU's attitude about each axis.")] = "0.5 deg",
+    led_sigma: Annotated[str, typer.Option(help="Of an LED's believed place along each axis.")] = "2 mm",
+    lever_sigma: Annotated[str, typer.Option(help="Error of the camera's believed place.")] = "5 mm",
+    focal_error: Annotated[str, typer.Option(help="Of the believed focal length.")] = "1%",
+    distortion: Annotated[bool, typer.Option("--distortion", help="Fit k1, k2, p1, p2 too.")] = False,
+    checks: Annotated[int, typer.Option(min=1, help="New stops where the attitude is compared.")] = 40,
+    json: Json = False,
+) -> None:
+    """Measure a dome from frames at many attitudes: LEDs, lever and lens, in a file for `tracker.map`."""
+    from skysim.core import files
+    from skysim.experiments import dome_survey, dome_survey_report
+    from skysim.simulation import testbed
+    from skysim.tracking import dome_map_file, factory
+
+    doubt = dome_survey.doubt(imu_sigma, led_sigma, lever_sigma, focal_error)
+    lab = testbed.build_testbed(dome_survey.doubted(load(scene, None, seed, set_), doubt))
+    belief = dome_survey.belief_of(lab)
+    before = testbed.tracker(lab)
+    looks = list(progress(dome_survey.looks(lab, belief, doubt, frames, tilt), frames, "photographing"))
+    with watched("adjusting") as watch:
+        found = dome_survey.surveyed(looks, belief, doubt, distortion, watch)
+    folder = files.make_folder(out or Path("out") / lab.scene.name)
+    path, picture = folder / "leds.ecsv", folder / "survey.png"
+    dome_map_file.write_dome_map(path, dome_survey.dome_map(found, doubt))
+    files.write_image(picture, dome_survey_report.figure(dome_survey_report.misplaced(found, belief, lab)))
+    after = factory.tracker(dome_survey.with_map(lab.scene, str(path)), lab.mount, lab.sources)
+    stops = dome_survey.frames(lab, dome_survey.attitudes(lab.scene, "checks", checks, tilt), frames)
+    errors = dome_survey_report.checked(
+        {"before": before, "after": after}, progress(stops, checks, "comparing")
+    )
+    figures = dome_survey_report.figures(found, belief, lab, doubt) | errors
+    figures |= {"scene": lab.scene.name, "frames": frames, "map": str(path), "picture": str(picture)}
+    print(files.to_json(figures)) if json else print_survey(figures)
+
+
+def bench(
+    areas: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="AREAS", help="instrument, detect, identify, attitude, dynamics; all if left out."
+        ),
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Time ourselves beside the best peer, in the same run."""
+    from skysim.core import files
+
+    sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+    try:
+        from benchmarks import AREAS, measure
+    except ImportError:
+        raise InputError("bench: the benchmarks are in the project's checkout only; run it there") from None
+
+    unknown = [area for area in areas or () if area not in AREAS]
+    if unknown:
+        raise InputError(f"bench: {unknown[0]!r} is none of {', '.join(AREAS)}")
+    results = [
+        result
+        for area in progress(areas or list(AREAS), len(areas or AREAS), "bench")
+        for result in measure(area)
+    ]
+    if json:
+        print(files.to_json(results))
+    else:
+        print_table(
+            "bench",
+            ["what", "ours", "peer", "peer's", "ratio", "bar", "met"],
+            [
+                [
+                    r["name"],
+                    f"{r['value']:.3g} {r['unit']}",
+                    r["peer"],
+                    number(r["peer_value"]),
+                    number(r["ratio"]),
+                    number(r["bar"]),
+                    yes(r["met"]),
+                ]
+                for r in results
+            ],
+        )

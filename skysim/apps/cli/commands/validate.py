@@ -1,0 +1,151 @@
+"""`skysim validate`: what is wrong with a file, before anything is flown; and its schema for an editor."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, NamedTuple
+
+import typer
+
+from skysim.apps.cli.terminal import complain
+from skysim.core.errors import InputError
+
+KINDS = ("scene", "study")
+LENS = {"focal_length": "1 m", "f_number": 1.0}  # of no meaning: a preset has none
+
+
+class Verdict(NamedTuple):
+    """A file, what it is in words, what one might doubt of it; or what is wrong with it, in one line."""
+
+    file: str
+    what: str = ""
+    doubts: tuple[str, ...] = ()
+    fault: str = ""
+
+
+def validate(
+    files: Annotated[
+        list[Path] | None,
+        typer.Argument(
+            metavar="FILES",
+            help="Scenes and studies (YAML, or by name), cameras (YAML, OpenCV's too), vehicles (MJCF),"
+            " catalogues and LED maps (ECSV).",
+        ),
+    ] = None,
+    schema: Annotated[
+        str | None, typer.Option(help="Print the JSON Schema of a kind of file instead: scene or study.")
+    ] = None,
+    json: Annotated[bool, typer.Option("--json", help="Print JSON for machines.")] = False,
+) -> None:
+    """Check files: keys, units, what goes together, whether a scene can be set up. Exit code 2 if one is refused."""
+    from skysim.apps.cli.commands import json_schema
+    from skysim.core import files as file_io
+
+    if schema is not None:
+        if schema not in KINDS:
+            raise InputError(f"--schema {schema}: allowed: {', '.join(KINDS)}")
+        print(file_io.to_json(json_schema.json_schema(schema)))
+        return
+    if not files:
+        raise InputError("give files, or --schema scene")
+    told = [checked(path) for path in files]
+    if json:
+        print(file_io.to_json([one._asdict() for one in told]))
+    for one in told if not json else []:
+        if one.fault:
+            complain(one.fault)
+        else:
+            print(f"{one.file}: {one.what}", *one.doubts, sep="\n  ")
+    if any(one.fault for one in told):
+        raise typer.Exit(2)
+
+
+def checked(path: Path) -> Verdict:
+    """One file."""
+    try:
+        return Verdict(str(path), *looked_at(path))
+    except (InputError, OSError) as error:
+        return Verdict(str(path), fault=str(error))
+
+
+def looked_at(path: Path) -> tuple[str, tuple[str, ...]]:
+    """What a file is, in words, and doubts. Raises InputError with one line."""
+    from skysim.core.yaml_reader import is_file, read_yaml
+    from skysim.scene import opencv_calibration
+
+    path = path if path.suffix else named(path)
+    if path.suffix not in (".yaml", ".yml", ".ecsv", ".xml"):
+        raise InputError(f"{path}: allowed: .yaml, .ecsv, .xml or the name of a scene or a study")
+    if not is_file(path):  # a pipe would be waited for
+        raise InputError(f"{path}: is no plain file")
+    if path.suffix == ".ecsv":
+        return table(path), ()
+    if path.suffix == ".xml":
+        return vehicle(path), ()
+    if opencv_calibration.is_one(path):
+        lens = opencv_calibration.read(path)
+        return f"a calibration of {lens.width_px} x {lens.height_px} pixels", ()
+    keys = read_yaml(path)[0].keys()
+    if keys & {"factors", "trial", "responses"}:
+        from skysim.experiments.study import loader
+
+        told = loader.load(path)
+        return f"a study of {told.trials} trials" if told.trials else "a search", ()
+    if "camera" in keys and keys <= {"camera", "schema"}:
+        from skysim.scene.loader import load_camera
+
+        camera = load_camera(path, LENS)
+        return f"a camera of {camera.width_px} x {camera.height_px} pixels", ()
+    return scene(path)
+
+
+def named(path: Path) -> Path:
+    """The scene or the study that comes with skysim by this name. Raises InputError with the names that there are."""
+    from skysim.experiments.study import plan
+    from skysim.scene import loader
+
+    try:
+        return plan.find(str(path))
+    except InputError:
+        return loader.find(str(path))
+
+
+def vehicle(path: Path) -> str:
+    """A vehicle's model, on its bearing."""
+    from skysim.dynamics import multibody
+    from skysim.scene.vehicle import VehicleConfig
+
+    built = multibody.build(VehicleConfig.model_validate({"model": str(path.resolve())}))
+    return f"a vehicle of {built.mass.mass_kg:g} kg"
+
+
+def scene(path: Path) -> tuple[str, tuple[str, ...]]:
+    """A scene, set up as far as it goes without flying: vehicle, lights, tracker."""
+    from skysim.scene.loader import load, where
+    from skysim.simulation import checks, testbed
+
+    told = load(path)
+    try:
+        lab = testbed.build_testbed(told)
+        testbed.tracker(lab)
+    except InputError as error:
+        raise InputError(where(str(error), str(path), {})) from None
+    count, frames = len(lab.sources.id), told.exposure.frames
+    return f"a scene of {count} lights and {frames} frames", tuple(
+        checks.doubts(told, lab.sources, lab.mount)
+    )
+
+
+def table(path: Path) -> str:
+    """A star catalogue, else a map of LEDs."""
+    from skysim.sources import catalog
+    from skysim.tracking import dome_map_file
+
+    try:
+        with path.open(encoding="utf-8", errors="replace") as file:
+            first = file.read(4000)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+    if "{name: hip," in first:
+        return f"a catalogue of {len(catalog.read(path).hip)} stars"
+    return f"a map of {len(dome_map_file.read_dome_map(path).id)} LEDs"

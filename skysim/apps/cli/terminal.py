@@ -1,0 +1,315 @@
+"""What the command line shows: progress bars, tables, summaries. Heavy imports wait for their use."""
+
+from __future__ import annotations
+
+import itertools
+import sys
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from skysim.core.errors import printable
+
+if TYPE_CHECKING:
+    from rich.progress import Progress as Bar
+    from rich.progress import ProgressColumn
+    from rich.text import Text
+
+    from skysim.core.types import Row
+    from skysim.experiments.study.execution.runner import Progress
+    from skysim.experiments.tracker_comparison import Line
+    from skysim.simulation.testbed import Testbed
+
+T = TypeVar("T")
+FILM_FRAMES = 60
+SURVEY = ("believed", "found", "sigma", "truth")
+
+
+def begun(items: Iterable[T]) -> Iterator[T]:
+    """The same items, the first of them made at once: what is wrong with it is told before old results are cleared."""
+    rest = iter(items)
+    return itertools.chain([next(rest)], rest)
+
+
+def progress(items: Iterable[T], total: int, what: str, quiet: bool = False) -> Iterator[T]:
+    """The items, with a bar on stderr that goes away when it is done."""
+    from rich.progress import BarColumn, TaskProgressColumn, TimeRemainingColumn
+
+    with bar(BarColumn(), TaskProgressColumn(), TimeRemainingColumn(), quiet=quiet) as shown:
+        yield from shown.track(items, total=total, description=printable(what))
+
+
+def bar(*columns: ProgressColumn, quiet: bool = False) -> Bar:
+    """A bar on stderr that goes away when it is done, what is done before its columns, and none where nobody looks."""
+    from rich.console import Console
+    from rich.progress import Progress, TextColumn
+
+    console = Console(stderr=True)
+    what = TextColumn("{task.description}", markup=False)  # a title, and who knows what is in it
+    return Progress(what, *columns, console=console, transient=True, disable=quiet or not console.is_terminal)
+
+
+def inked(text: str, ink: str) -> Text:
+    """A text of a table in a colour."""
+    from rich.text import Text
+
+    return Text(text, ink)
+
+
+def print_table(title: str, heads: Sequence[str], lines: Sequence[Sequence[str | Text]]) -> None:
+    """The cells as they are: what looks like rich's markup is none."""
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(box=None, header_style="bold", pad_edge=False)
+    table.title = Text(printable(title), "table.title", justify="left")
+    for head in heads:
+        table.add_column(
+            Text(printable(head)),
+            justify="left" if head in ("what", "file", "status", "peer", "verdict") else "right",
+            no_wrap=True,
+        )
+    for line in lines:
+        table.add_row(*(Text(printable(cell)) if isinstance(cell, str) else cell for cell in line))
+    console = Console()
+    Console(width=max(console.width, 240) if not console.is_terminal else None).print(table)
+
+
+def print_rows(rows: list[Row], names: tuple[str, str, str], exposures_ms: list[float]) -> None:
+    """The rows of a run, and the exposure of each frame."""
+    triple = "/".join(names)
+    heads = [
+        "frame",
+        "t s",
+        "exp ms",
+        "deg/s",
+        f"true {triple}",
+        f"estimate {triple}",
+        "cross ″",
+        "roll ″",
+        "used",
+        "ms",
+        "status",
+    ]
+    lines = [
+        [
+            str(row.frame),
+            f"{row.t_s:.2f}",
+            f"{exposure_ms:.5g}",
+            f"{row.rate_deg_s:.2f}",
+            degrees(row.truth_deg),
+            degrees(row.estimate_deg),
+            f"{row.cross_arcsec:.3f}" if row.estimate_deg else "",
+            f"{row.roll_arcsec:+.3f}" if row.estimate_deg else "",
+            f"{row.matched}/{row.detected}",
+            f"{row.time_ms:.1f}",
+            inked("WRONG", "red") if row.wrong else row.status,
+        ]
+        for row, exposure_ms in zip(rows, exposures_ms, strict=True)
+    ]
+    print_table("", heads, lines)
+
+
+def degrees(angles_deg: tuple[float, float, float] | None) -> str:
+    return " ".join(f"{angle:9.4f}" for angle in angles_deg) if angles_deg else ""
+
+
+@contextmanager
+def watched(what: str, quiet: bool = False) -> Iterator[Callable[[float, float], None]]:
+    """A bar on stderr for work that tells how far it is: done(now, all)."""
+    from rich.progress import BarColumn, TaskProgressColumn, TimeRemainingColumn
+
+    with bar(BarColumn(), TaskProgressColumn(), TimeRemainingColumn(), quiet=quiet) as shown:
+        task = shown.add_task(printable(what))
+        yield lambda now, everything: shown.update(task, completed=now, total=everything)
+
+
+@contextmanager
+def counted(what: str, total: int) -> Iterator[Callable[[Progress], None]]:
+    """A bar on stderr for trials: how many, how many a second, how long still, how many failed.
+
+    Where stderr is no terminal, a line at every tenth.
+    """
+    from rich.console import Console
+    from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
+
+    console, what = Console(stderr=True), printable(what)
+    text = "{task.completed:.0f}/{task.total:.0f}  {task.fields[rate]:.0f}/s  {task.fields[faults]}"
+    tenth = [0]
+
+    def line(done: Progress, told: str) -> None:
+        if not console.is_terminal and 10 * done.done // total > tenth[0]:
+            tenth[0] = 10 * done.done // total
+            print(
+                f"{what}: {done.done} of {total}, {done.rate:.0f} a second, {told}",
+                file=sys.stderr,
+                flush=True,
+            )
+
+    with bar(BarColumn(), TextColumn(text), TimeRemainingColumn()) as shown:
+        task = shown.add_task(what, total=total, rate=0.0, faults="")
+
+        def update(done: Progress) -> None:
+            told = f"{done.failed} failed" + (f", {done.wrong} wrong" if done.wrong else "")
+            shown.update(task, completed=done.done, rate=done.rate, faults=told)
+            line(done, told)
+
+        yield update
+
+
+def print_flight(figures: dict[str, float]) -> None:
+    """What is not there is not printed."""
+    lines = {
+        "pointing_deg_worst": "pointing: worst {pointing_deg_worst:.3g}°, at the end {pointing_deg_end:.2g}°; "
+        "torque asked for up to {torque_nm_worst:.3g} N m",
+        "momentum_nms_worst": "stored momentum up to {momentum_nms_worst:.3g} N m s",
+        "wheel_rpm_worst": "wheels up to {wheel_rpm_worst:.0f} rpm",
+        "manipulability_least": "CMGs' manipulability down to {manipulability_least:.2g}",
+        "imu_deg_worst": "IMU alone: off by {imu_deg_end:.3g}° at the end; "
+        "gyros saturated for {gyro_saturated_s:.2g} s",
+        "filter_deg_worst": "filter: worst {filter_deg_worst:.3g}°, at the end {filter_arcsec_end:.3g}″, "
+        "its bias off by {filter_bias_deg_h_end:.2g}°/h",
+    }
+    told = [text.format(**figures) for key, text in lines.items() if key in figures]
+    if told:
+        print("flight: " + "\n        ".join(told))
+
+
+def print_summary(figures: dict[str, Any]) -> None:
+    print(
+        f"\n{figures['solved']} of {figures['frames']} frames solved, {figures['wrong']} wrong; "
+        f"cross-boresight median {figures['cross_arcsec_median']:.3g}″ worst {figures['cross_arcsec_worst']:.3g}″, "
+        f"roll median {figures['roll_arcsec_median']:.3g}″ worst {figures['roll_arcsec_worst']:.3g}″"
+    )
+    stages = ", ".join(f"{name} {ms:.2f}" for name, ms in figures["stages_ms"].items())
+    print(f"median ms a frame: {stages}")
+    print_flight(figures["flight"])
+    print(f"report: {figures['report']}")
+
+
+def print_scores(lines: list[Line], folder: Path) -> None:
+    """The scoreboard, and why frames had no answer."""
+    heads = ["what", "frames", "right %", "(95 %)", "wrong", "refused", "failed"]
+    heads += ["cross ″", "worst ″", "roll ″", "worst ″", "ms", "95 % ms"]
+    rows = [
+        [
+            line.tracker,
+            str(line.frames),
+            f"{100 * line.right.value:.1f}",
+            f"{100 * line.right.low:.1f} to {100 * line.right.high:.1f}",
+            inked(str(line.wrong), "red") if line.wrong else "0",
+            str(line.refused),
+            str(line.failed),
+            *(f"{value:.3g}" for value in (line.cross_arcsec_median, line.cross_arcsec_worst)),
+            *(f"{value:.3g}" for value in (line.roll_arcsec_median, line.roll_arcsec_worst)),
+            *(f"{value:.3g}" for value in (line.time_ms_median, line.time_ms_p95)),
+        ]
+        for line in lines
+    ]
+    print_table("", heads, rows)
+    for line in lines:
+        for status, count in line.refusals.items():
+            print(f"{line.tracker}: {count} × {status}")
+    print(f"scoreboard.ecsv, solutions.NAME.ecsv and the frames are in {folder}")
+
+
+def print_survey(figures: dict[str, Any]) -> None:
+    lines = [
+        [row["what"], *(f"{row[key]:.5g}" if row["what"][0] in "kp" else f"{row[key]:.3f}" for key in SURVEY)]
+        for row in figures["values"]
+        if row["sigma"]
+    ]
+    print_table("", ["what", *SURVEY], lines)
+    print(
+        f"\n{figures['surveyed']} of {figures['leds']} LEDs surveyed in {figures['tied']} of {figures['frames']} "
+        f"frames, {figures['renamed']} under a neighbour's name; {figures['status']}, {figures['outliers']} outliers, "
+        f"{figures['rms_px']:.2g} px rms, misfit {figures['misfit']:.2g}\n"
+        f"LEDs: sigma median {figures['led_sigma_mm_median']:.2g} mm worst {figures['led_sigma_mm_worst']:.2g} mm; "
+        f"off the truth by {figures['led_mm_before']:.2g} mm rms before, {figures['led_mm_after']:.2g} mm after"
+    )
+    for when in ("before", "after"):
+        told = figures[when]
+        errors = [
+            f"{name} median {told[f'{name}_deg_median']:.2g}° worst {told[f'{name}_deg_worst']:.2g}°"
+            for name in ("cross", "roll")
+            if told["solved"]
+        ]
+        print(f"{when}: " + ", ".join([f"{told['solved']} of {told['stops']} new stops solved", *errors]))
+    print(f"{figures['map']}: for tracker.map; errors drawn in {figures['picture']}")
+
+
+def print_answers(answers: list[dict[str, Any]], out: Path) -> None:
+    heads = ["file", "status", "RA °", "Dec °", "roll °", "fov °", "stars", "rms ″", "ms"]
+    lines = [
+        [
+            a["file"],
+            a["status"] if a["time_ms"] is not None else "bad input",
+            *(number(a[key], 4) for key in ("ra_deg", "dec_deg", "roll_deg", "fov_deg")),
+            str(a["matches"]),
+            number(a["rms_arcsec"], 1),
+            number(a["time_ms"], 0),
+        ]
+        for a in answers
+    ]
+    print_table("", heads, lines)
+    print(f"annotated pictures and solutions.json in {out}")
+
+
+def print_catalogue(figures: dict[str, Any], json: bool, to_json: Any) -> None:
+    if json:
+        print(to_json(figures))
+        return
+    print(f"{figures['path']}: {figures['stars']} stars, {figures['supplied']} of them supplied")
+    print("  ".join(f"V<{limit}: {count}" for limit, count in figures["brighter_than"].items()))
+    for key, value in figures["meta"].items():
+        print(f"  {key}: {printable(value)}")
+
+
+def print_titles(folder: Path, title: Callable[[Path], str], json: bool, to_json: Any) -> None:
+    """The files of a folder by name, with their titles."""
+    listed = [
+        {"name": path.stem, "title": title(path), "file": str(path)} for path in sorted(folder.glob("*.yaml"))
+    ]
+    if json:
+        print(to_json(listed))
+        return
+    for entry in listed:
+        print(f"{entry['name']:20s} {printable(entry['title'])}")
+
+
+def number(value: float | None, digits: int | None = None) -> str:
+    if value is None:
+        return ""
+    return f"{value:.3g}" if digits is None else f"{value:.{digits}f}"
+
+
+def yes(met: bool | None) -> str:
+    return "" if met is None else "yes" if met else "NO"
+
+
+def complain(message: str, code: int = 2) -> int:
+    """One line to stderr and the exit code that goes with it."""
+    print(f"skysim: {printable(message)}", file=sys.stderr)
+    return code
+
+
+def draw(lab: Testbed, folder: Path) -> list[Path]:
+    """The laboratory as a picture and as a film; without OpenGL a word about it, and the run goes on."""
+    from skysim.core import files
+    from skysim.dynamics.multibody.view import picture
+    from skysim.simulation import testbed
+
+    mjcf, joints = testbed.staged(lab), lab.log.joints
+    still, film = folder / "lab.png", folder / "lab.gif"
+    steps = max(len(joints) // FILM_FRAMES, 1)
+    moments = joints[::steps]
+    try:
+        files.write_image(still, picture.picture(mjcf, joints[len(joints) // 2])[:, :, ::-1])
+        shown = progress(picture.film(mjcf, moments), len(moments), "filming")
+        picture.write_film(shown, film, len(moments) / float(lab.log.t_s[-1] + 1e-9))
+    except picture.NoPicture as error:
+        complain(str(error))
+        return []
+    return [still, film]

@@ -1,0 +1,171 @@
+"""What is drawn over a frame, as paths in the frame's pixels; every kind can be switched off."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping
+from typing import Any
+
+from skysim.apps.gui.messages import Answer, Light, Spot
+
+INK = {
+    **{"truth": "#5aa9ff", "detected": "#ff7b6b", "identified": "#6fdc7f", "false": "#ffc04d"},
+    "windows": "#7f8a9a",
+}
+KINDS = tuple(INK)
+NAMED = 40  # labels at most: the brightest
+MARKED = 400  # true lights at most
+NEAR_PX = 4.0  # within which a spot is a true light's
+# Room for the frame in the smallest window, in pixels of the screen: marks and names are readable there.
+SCREEN_PX = (806.0, 511.0)
+MARK_PX, FONT_PX = 5.2, 10.0
+LETTER = 0.61  # width of a letter, of its font's size
+
+
+def marks(
+    lights: Collection[Light],
+    answer: Answer | None,
+    size_px: tuple[int, int],
+    shown: Collection[str],
+    name: Callable[[int], str],
+) -> list[dict[str, Any]]:
+    """The marks of a look: truth ticked, detections squared, identified circled and named, false crossed, windows.
+
+    A kind is one path as SVG writes it, with what frame.js draws it by: ink, width, dash, font, names (x, y, text).
+    """
+    share = max(size_px[0] / SCREEN_PX[0], size_px[1] / SCREEN_PX[1])
+    size, font = MARK_PX * share, FONT_PX * share
+    spots = answer.spots if answer else ()
+    known = [spot for spot in spots if spot.id >= 0]
+    drawn: Mapping[str, list[str]] = {
+        "windows": [box(x, y, 2.2 * size) for x, y in answer.windows_px] if answer else [],
+        "truth": [ticks(light.x, light.y, size) for light in list(lights)[:MARKED]],
+        "detected": [box(spot.x, spot.y, size) for spot in spots],
+        "identified": [circle(one.x, one.y, 1.6 * size) for one in known],
+        "false": [cross(one.x, one.y, size) for one in false(spots, lights)],
+    }
+    names = labels(known[:NAMED], size, font, size_px, name) if "identified" in shown else []
+    return [
+        {
+            **{"kind": kind, "path": "".join(drawn[kind]), "names": names if kind == "identified" else []},
+            **{"ink": INK[kind], "width": round(size / 6, 2), "font": round(font, 1)},
+            "dash": [round(size / 2, 1)] if kind == "windows" else [],
+        }
+        for kind in KINDS
+        if kind in shown and drawn[kind]
+    ]
+
+
+def false(spots: Collection[Spot], lights: Collection[Light]) -> list[Spot]:
+    """What was seen where no true light is."""
+    if not lights:
+        return []
+    return [
+        spot
+        for spot in spots
+        if not any(abs(one.x - spot.x) < NEAR_PX and abs(one.y - spot.y) < NEAR_PX for one in lights)
+    ]
+
+
+def ticks(x: float, y: float, size: float) -> str:
+    """Four strokes that leave the middle open. An integer is a pixel's centre; SVG's is its corner."""
+    x, y, near, long = x + 0.5, y + 0.5, 0.6 * size, 0.6 * size
+    far = near + long
+    return (
+        f"M{x - far:.1f} {y:.1f}h{long:.1f}M{x + near:.1f} {y:.1f}h{long:.1f}"
+        f"M{x:.1f} {y - far:.1f}v{long:.1f}M{x:.1f} {y + near:.1f}v{long:.1f}"
+    )
+
+
+def box(x: float, y: float, half: float) -> str:
+    side = 2 * half
+    return f"M{x + 0.5 - half:.1f} {y + 0.5 - half:.1f}h{side:.1f}v{side:.1f}h{-side:.1f}z"
+
+
+def circle(x: float, y: float, radius: float) -> str:
+    """Two half circles."""
+    half = f"a{radius:.1f} {radius:.1f} 0 1 0"
+    return f"M{x + 0.5 - radius:.1f} {y + 0.5:.1f}{half} {2 * radius:.1f} 0{half} {-2 * radius:.1f} 0"
+
+
+def cross(x: float, y: float, size: float) -> str:
+    x, y, side = x + 0.5 - size, y + 0.5 - size, 2 * size
+    return f"M{x:.1f} {y:.1f}l{side:.1f} {side:.1f}M{x:.1f} {y + side:.1f}l{side:.1f} {-side:.1f}"
+
+
+def labels(
+    spots: Collection[Spot],
+    size: float,
+    font: float,
+    size_px: tuple[int, int],
+    name: Callable[[int], str],
+) -> list[tuple[float, float, str]]:
+    """(x, y, name) beside each spot, where it is free and within the frame: right, left, above, below, else none.
+
+    Earlier spots choose first. What is taken: by rows of half a letter's height a bit for each column of that width.
+    """
+    side, taken = font / 2, dict[int, int]()
+    for one in spots:
+        x, y, half = one.x + 0.5, one.y + 0.5, 0.9 * size
+        take(taken, max(x - half, 0.0), max(y - half, 0.0), x + half, y + half, side)
+    found = []
+    for one in spots:
+        text, x, y = name(one.id), one.x + 0.5, one.y + 0.5
+        wide, gap = LETTER * font * len(text), 2 * size
+        level, above, below = y + 0.35 * font, y - gap, y + gap + 0.7 * font
+        for left, base in (
+            *((x + gap, level), (x - gap - wide, level)),
+            *((x - wide / 2, above), (x - wide / 2, below)),
+        ):
+            left = max(min(left, size_px[0] - wide), 0.0)
+            base = max(min(base, size_px[1] - 0.25 * font), 0.75 * font)
+            if take(taken, left, base - 0.75 * font, left + wide, base, side):
+                found.append((round(left, 1), round(base, 1), text))
+                break
+    return found
+
+
+def take(taken: dict[int, int], left: float, top: float, right: float, bottom: float, side: float) -> bool:
+    """Take a box, if nobody has any of it."""
+    first = max(int(left / side), 0)
+    bits = (2 << (int(right / side) - first)) - 1 << first
+    rows = range(int(top / side), int(bottom / side) + 1)
+    if any(taken.get(row, 0) & bits for row in rows):
+        return False
+    for row in rows:
+        taken[row] = taken.get(row, 0) | bits
+    return True
+
+
+def magnified(dn: tuple[tuple[int, ...], ...], spots: Collection[Spot], x0: int, y0: int, high: int) -> str:
+    """Pixels as squares with their numbers, and crosses at the centroids among them; `high` pixels of the screen."""
+    rows, columns = len(dn), len(dn[0])
+    cell, wide = high / rows, columns * high / rows
+    low, most = min(map(min, dn)), max(map(max, dn))
+    letters = len(str(most))
+    font = min(0.46 * cell, 0.94 * cell / (LETTER * letters))
+    parts = [
+        pixel(x, y, value, ((value - low) / max(most - low, 1)) ** 0.5, cell, (x0, y0))
+        for y, row in enumerate(dn)
+        for x, value in enumerate(row)
+    ]
+    for spot in spots:
+        along, down = (spot.x - x0 + 0.5) * cell, (spot.y - y0 + 0.5) * cell
+        if 0 < along < wide and 0 < down < high:
+            look = f'stroke="{INK["detected"]}" stroke-width="1.5"'
+            parts.append(f'<path d="M{along - 8:.1f} {down:.1f}h16M{along:.1f} {down - 8:.1f}v16" {look}/>')
+    box_px = f'viewBox="0 0 {wide:.1f} {high}" width="{wide:.1f}" height="{high}"'
+    letter = f'font-family="ui-monospace, monospace" font-size="{font:.1f}" text-anchor="middle"'
+    return f"<svg {box_px} {letter}>{''.join(parts)}</svg>"
+
+
+def pixel(x: int, y: int, dn: int, bright: float, cell: float, first: tuple[int, int]) -> str:
+    """A pixel's square, its number, and where it is for who rests the mouse on it."""
+    grey = round(255 * bright)
+    square = f'x="{x * cell:.1f}" y="{y * cell:.1f}" width="{cell:.1f}" height="{cell:.1f}"'
+    middle = (
+        f'x="{(x + 0.5) * cell:.1f}" y="{(y + 0.64) * cell:.1f}" fill="{"#000" if grey > 120 else "#b6bfcd"}"'
+    )
+    return (
+        f"<g><title>x {first[0] + x}, y {first[1] + y}: {dn} DN</title>"
+        f'<rect {square} fill="rgb({grey},{grey},{grey})"/><text {middle}>{dn}</text></g>'
+    )

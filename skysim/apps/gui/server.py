@@ -1,0 +1,156 @@
+"""The server of the page: routes, and a guard before all of them."""
+
+from __future__ import annotations
+
+import hmac
+import secrets
+from http.cookies import SimpleCookie
+from pathlib import Path
+from typing import Any
+from urllib.parse import parse_qs
+
+from nicegui import app, ui
+from starlette.responses import FileResponse, PlainTextResponse, RedirectResponse, Response
+
+from skysim.apps.gui.page.page import Tab
+from skysim.apps.gui.page.panels.photo import LIMIT_BYTES
+from skysim.apps.gui.page.panels.sensor import FRAMES
+from skysim.apps.gui.worker.session import Spare
+from skysim.scene.loader import find
+
+LOOPBACK = ("127.0.0.1", "localhost", "::1", "[::1]")
+COOKIE = "skysim_lab"
+PATIENCE_S = 50.0  # with a browser that is still loading the page
+RECONNECT_S = 6.0  # with one that is gone: its work ends then
+
+
+class Guard:
+    """Refuses who is not of this machine or has no token, pages of other sites, and what is too large.
+
+    hosts : names that the page may be called by (a page of another site that points its name at us has another)
+    token : asked of everybody where it is not empty; `/?token=...` puts it in a cookie
+    """
+
+    def __init__(self, app: Any, hosts: tuple[str, ...], token: str) -> None:
+        self.app, self.hosts, self.token = app, hosts, token
+
+    async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
+        if scope["type"] not in ("http", "websocket"):
+            await self.app(scope, receive, send)
+            return
+        headers = {name.decode().lower(): value.decode("latin-1") for name, value in scope["headers"]}
+        query = parse_qs(scope.get("query_string", b"").decode("latin-1"))
+        answer = self.refusal(headers, query)
+        if answer is None:
+            await self.app(scope, limited(receive), send)
+        elif scope["type"] == "http":
+            await answer(scope, receive, send)
+        else:
+            await send({"type": "websocket.close", "code": 1008})
+
+    def refusal(self, headers: dict[str, str], query: dict[str, list[str]]) -> Response | None:
+        """What is answered in place of the page; None where it may be seen."""
+        if "*" not in self.hosts and host_of(headers.get("host", "")) not in self.hosts:
+            return PlainTextResponse("this host name is not served", 403)
+        origin = headers.get("origin", "")
+        if origin and origin.partition("://")[2] != headers.get("host", ""):
+            return PlainTextResponse("a page of another site may not", 403)
+        if int(headers.get("content-length") or 0) > LIMIT_BYTES + 2**16:
+            return PlainTextResponse("too large: at most 64 MB", 413)
+        if not self.token:
+            return None
+        told = SimpleCookie(headers.get("cookie", "")).get(COOKIE)
+        if told and same(told.value, self.token):
+            return None
+        if same((query.get("token") or [""])[0], self.token):
+            response = RedirectResponse("/", 303)
+            response.set_cookie(COOKIE, self.token, httponly=True, samesite="strict")
+            return response
+        return PlainTextResponse("give the token that the server printed: /?token=...", 401)
+
+
+def same(told: str, token: str) -> bool:
+    """Whether it is the token, in a time that does not tell how much of it."""
+    return hmac.compare_digest(told.encode(), token.encode())
+
+
+def host_of(header: str) -> str:
+    """A Host header without its port."""
+    return header.rpartition(":")[0] if header.rpartition(":")[2].isdigit() else header
+
+
+def limited(receive: Any) -> Any:
+    """Bytes of a request's body up to the limit, whatever it said of its length."""
+    came = 0
+
+    async def some() -> Any:
+        nonlocal came
+        message = await receive()
+        if message["type"] == "http.request":
+            came += len(message.get("body", b""))
+            if came > LIMIT_BYTES + 2**16:
+                return {"type": "http.disconnect"}
+        return message
+
+    return some
+
+
+def routes(scene: str, folder: Path, out: Path) -> None:
+    """All pages."""
+    spare = Spare(str(find(scene).resolve()))
+    app.on_startup(spare.begin)
+    app.on_shutdown(spare.end)
+
+    @app.get("/frame/{tab}/{number}")
+    def frame(tab: str, number: int) -> Response:
+        """A frame of a tab, while it is among its newest."""
+        data = FRAMES.get(tab, {}).get(number)
+        if data is None:
+            return Response(status_code=404)
+        return Response(data, media_type="image/jpeg", headers={"Cache-Control": "no-store"})
+
+    @app.get("/report/{name}")
+    def report(name: str) -> Response:
+        """A finished study's report."""
+        path = (out / name / "report.html").resolve()
+        if not path.is_relative_to(out.resolve()) or not path.is_file():
+            return Response(status_code=404)
+        return FileResponse(path, media_type="text/html")
+
+    @ui.page("/", title="skysim lab", dark=True)
+    async def index() -> None:
+        tab = Tab(scene, folder, out)
+        tab.build()
+        client = ui.context.client
+        try:
+            await client.connected(timeout=PATIENCE_S)
+        except TimeoutError:  # nobody's browser: it gets no worker
+            return
+        tab.session = spare.take()
+        client.on_delete(tab.close)
+        await tab.open(scene)
+        await tab.space.suit()
+        spare.begin()
+
+
+def serve(scene: str, host: str, port: int, token: str, folder: Path, out: Path, show: bool) -> None:
+    """Serve until Ctrl-C."""
+    hosts = LOOPBACK if host in LOOPBACK else ("*",)
+    app.add_middleware(Guard, hosts=hosts, token=token)
+    routes(scene, folder, out)
+    where = f"http://{host}:{port}/" + (f"?token={token}" if token else "")
+    print(f"skysim lab: {where}   (Ctrl-C ends it)", flush=True)
+    ui.run(
+        host=host,
+        port=port,
+        show=show and not token,
+        reload=False,
+        show_welcome_message=False,
+        reconnect_timeout=RECONNECT_S,
+        uvicorn_logging_level="critical",
+        storage_secret=None,
+    )
+
+
+def new_token() -> str:
+    return secrets.token_urlsafe(16)

@@ -1,0 +1,1 @@
+"""The process behind a browser tab: it holds the scene and the tracker, and does the work."""

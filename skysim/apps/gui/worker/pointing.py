@@ -1,0 +1,67 @@
+"""Where the camera looks, and how keys move it: turns about the camera's own axes, so that no pole is in the way."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from skysim.core.errors import InputError
+from skysim.core.types import Mount
+from skysim.dynamics import guidance, multibody
+from skysim.scene.light import StarsConfig
+from skysim.scene.motion import AttitudeConfig
+from skysim.scene.scene import Scene
+from skysim.sources import stars
+
+FINE, COARSE = 0.02, 0.2  # of the field: what an arrow key moves it by, without and with shift
+ROLL_FINE_DEG, ROLL_COARSE_DEG = 1.0, 10.0
+RANGES = {  # degrees
+    "RA": (0.0, 360.0),
+    "Dec": (-90.0, 90.0),
+    "roll": (-360.0, 360.0),
+    "pitch": (-90.0, 90.0),
+    "yaw": (-360.0, 360.0),
+}
+
+
+def from_angles(scene: Scene, mount: Mount, angles_deg: tuple[float, float, float]) -> Rotation:
+    """lab_from_body of RA, Dec, roll under the stars, of roll, pitch, yaw under a dome; degrees.
+
+    Raises InputError for an angle out of range, or a tilt beyond the vehicle's stop.
+    """
+    names = ("RA", "Dec", "roll") if isinstance(scene.light, StarsConfig) else ("roll", "pitch", "yaw")
+    for name, angle in zip(names, angles_deg, strict=True):
+        low, high = RANGES[name]
+        if not (math.isfinite(angle) and low <= angle <= high):
+            raise InputError(f"{name}: {angle:g} deg is not allowed; allowed: {low:g} to {high:g}")
+    if isinstance(scene.light, StarsConfig):
+        return stars.cam_from_icrs(*angles_deg).inv() * mount.cam_from_body
+    roll, pitch, yaw = angles_deg
+    told = AttitudeConfig.model_validate({"roll_deg": roll, "pitch_deg": pitch, "yaw_deg": yaw})
+    return within_stop(scene, guidance.attitude(told))
+
+
+def moved(
+    scene: Scene, mount: Mount, lab_from_body: Rotation, right: float, up: float, roll_deg: float
+) -> Rotation:
+    """The attitude after the boresight has gone so many fields to the right and up, and the camera rolled clockwise.
+
+    Turns are of the camera about its own axes (x right, y down, z boresight). Raises InputError at the tilt stop.
+    """
+    camera = scene.camera
+    across_rad = 2 * math.atan(camera.width_px / 2 / camera.focal_px)
+    turn = np.array([up * across_rad, right * across_rad, math.radians(roll_deg)])
+    new_from_cam = Rotation.from_rotvec(turn).inv()
+    cam_from_lab = new_from_cam * mount.cam_from_body * lab_from_body.inv()
+    return within_stop(scene, cam_from_lab.inv() * mount.cam_from_body)
+
+
+def within_stop(scene: Scene, lab_from_body: Rotation) -> Rotation:
+    """The attitude, if the bearing's stop lets it be."""
+    vehicle = scene.vehicle
+    tilt_deg = float(multibody.tilt_deg(lab_from_body))
+    if vehicle.mount == "air_bearing" and tilt_deg > vehicle.tilt_stop_deg:
+        raise InputError(f"tilt of {tilt_deg:.1f} deg: the bearing stops at {vehicle.tilt_stop_deg:g} deg")
+    return lab_from_body

@@ -1,0 +1,86 @@
+"""How a frame travels: a line of JSON that says what follows, then the pixels as they are in memory."""
+
+from __future__ import annotations
+
+import json
+import re
+from typing import Any, BinaryIO, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skysim.core import quaternion
+from skysim.core.errors import InputError
+from skysim.simulation.closed_loop import CapturedFrame
+
+MOST_LINE, MOST_PIXELS = 1 << 16, 1 << 28  # of what a reader takes for a packet
+
+
+class Packet(NamedTuple):
+    """A frame on its way.
+
+    header : what a tracker may know. index, t_s (mid-exposure since the scene's start), exposure_s, width, height,
+             dtype (numpy's, little-endian), bytes (of the pixels), due_unix_s and made_unix_s (when the exposure
+             ended by the clock on the wall, when the frame was there), dropped (frames left out before this one)
+    pixels : (H, W)
+    truth  : cam_from_ref_xyzw (scalar last; ref: ICRS or the lab), rate_cam_rad_s, and of the lights on the chip
+             ids, x_px, y_px
+    """
+
+    header: dict[str, Any]
+    pixels: NDArray[Any]
+    truth: dict[str, Any]
+
+    @property
+    def number(self) -> int:
+        """Among the frames that were made."""
+        return int(self.header["index"] - self.header["dropped"])
+
+    def after(self, more: int) -> Packet:
+        """The same for a taker that did not get so many others."""
+        return self._replace(header=self.header | {"dropped": self.header["dropped"] + more})
+
+    def pack(self) -> bytes:
+        """The line and the pixels, row after row from the top."""
+        return json.dumps(self.header).encode() + b"\n" + self.pixels.tobytes()
+
+
+def packet(look: CapturedFrame, due_unix_s: float, made_unix_s: float, dropped: int) -> Packet:
+    """What is sent of a look."""
+    frame, truth = look.frame, look.truth
+    pixels = np.ascontiguousarray(frame.image_dn, frame.image_dn.dtype.newbyteorder("<"))
+    height, width = pixels.shape
+    header = {
+        **{"index": frame.index, "t_s": frame.t_mid_s, "exposure_s": frame.exposure_s},
+        **{"width": width, "height": height, "dtype": pixels.dtype.str, "bytes": pixels.nbytes},
+        **{"due_unix_s": due_unix_s, "made_unix_s": made_unix_s, "dropped": dropped},
+    }
+    told = {
+        "cam_from_ref_xyzw": np.roll(quaternion.of(truth.cam_from_lab), -1).tolist(),
+        "rate_cam_rad_s": truth.rate_cam_rad_s.tolist(),
+        "ids": truth.seen.id.tolist(),
+        "x_px": truth.seen.xy_px[:, 0].round(4).tolist(),
+        "y_px": truth.seen.xy_px[:, 1].round(4).tolist(),
+    }
+    return Packet(header, pixels, told)
+
+
+def unpack(stream: BinaryIO) -> tuple[dict[str, Any], NDArray[Any]] | None:
+    """The next header and its (H, W) pixels; None at the end. Raises InputError for what is no packet or is cut short."""
+    line = stream.readline(MOST_LINE)
+    if not line:
+        return None
+    try:
+        header = json.loads(line)
+        shape, kind = (int(header["height"]), int(header["width"])), header["dtype"]
+        if not re.fullmatch(r"[<>|]?(u[1248]|f[248])", kind):
+            raise ValueError(kind)
+    except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
+        raise InputError(f"no packet of skysim stream: {line[:40]!r}") from error
+    count, dtype = shape[0] * shape[1], np.dtype(kind)
+    if min(shape) < 1 or count > MOST_PIXELS:
+        raise InputError(f"no packet of skysim stream: {shape[1]} x {shape[0]} pixels of {dtype}")
+    pixels = stream.read(count * dtype.itemsize)
+    if len(pixels) < count * dtype.itemsize:
+        raise InputError(f"the stream ended within frame {header.get('index')}")
+    return header, np.frombuffer(pixels, dtype).reshape(shape)

@@ -1,0 +1,280 @@
+"""Light that is no point: sky, Moon, stray light and leaks, as electrons a second in every pixel.
+
+An extended source fills the frame smoothly, so that it is worked out at nodes some tens of pixels apart and drawn
+between them (`fill`), in place of the zeros that a frame would begin with.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from skysim.camera.optics import Optics, radial, tangential
+from skysim.core.jit import jit
+from skysim.core.types import Floats
+from skysim.scene.camera import CameraConfig
+from skysim.scene.light import Glow, MoonGlowConfig, SkyGlowConfig, StrayLightConfig, UniformGlowConfig
+from skysim.sources.photometry import SUN, Band, sky_radiance_e_s_m2_sr, star_flux_e_s_m2
+
+NODE_PX = 32.0
+NODE_RAD = 1 / 40  # a node's spacing as an angle: cos^4 bends by less than 1e-3 between two of them
+NANOLAMBERT_V0 = 34.08 * math.exp(20.7233)  # brightness of V = 0 mag arcsec^-2 (KS91 eq. 1)
+MOON_RADIUS_DEG = 0.26
+LEAST_PST = 1e-30  # what a transmittance of 0 is for the logarithm: no electron comes of it
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """What M nodes of the chip look at, through the pixel that stands there.
+
+    toward_cam, toward_lab : (M, 3) unit vectors in camera and in lab axes (under the stars those of the ICRS)
+    boresight_lab  : (3,) unit vector
+    field_rad      : (M,) angle from the boresight
+    pixel_sr       : (M,) solid angle of the node's pixel; 1 / focal_px^2 on the axis
+    """
+
+    toward_cam: Floats
+    toward_lab: Floats
+    boresight_lab: Floats
+    field_rad: Floats
+    pixel_sr: Floats
+    optics: Optics
+    band: Band
+
+    def gathered_m2_sr(self) -> Floats:
+        """(M,) étendue of each node's pixel: radiance times this is the light that it gets.
+
+        A slanting beam sees the pupil foreshortened by cos(field), and the pixel under a solid angle that falls
+        as cos^3: its distance grows as 1/cos, squared, and it is seen aslant. Together the law of illumination,
+        cos^4, times the vignetting. A distorting lens shares the sky out otherwise, and pixel_sr knows it.
+        """
+        return self.optics.collecting_m2 * self.optics.passed(np.cos(self.field_rad)) * self.pixel_sr
+
+
+def uniform(part: UniformGlowConfig, view: View) -> Floats:
+    """A leak of light that has seen no lens: the same in every pixel."""
+    return np.full(len(view.field_rad), float(part.e_s))
+
+
+def sky(part: SkyGlowConfig, view: View) -> Floats:
+    """The night sky's radiance, changing linearly with the angles along the image's axes, but never below zero."""
+    x, y, z = view.toward_cam.T
+    slope = np.degrees(np.arctan2(x, z)) * part.gradient_per_deg[0]
+    slope = slope + np.degrees(np.arctan2(y, z)) * part.gradient_per_deg[1]
+    radiance = float(sky_radiance_e_s_m2_sr(part.mag_arcsec2, view.band))
+    return radiance * np.maximum(1 + slope, 0.0) * view.gathered_m2_sr()
+
+
+def moon(part: MoonGlowConfig, view: View) -> Floats:
+    """Moonlight on the air, brighter near the Moon; its separation is every node's own, the air that of the boresight.
+
+    The model itself holds to 8-23 % (its authors), more than the air mass changes over a camera's field.
+    """
+    separation_deg = apart_deg(view.toward_lab, direction(part.ra_deg, part.dec_deg))
+    nanolamberts = moonlight_nl(
+        separation_deg,
+        part.phase_angle_deg,
+        part.extinction_mag,
+        part.moon_zenith_deg,
+        part.field_zenith_deg,
+    )
+    radiance = float(sky_radiance_e_s_m2_sr(0.0, view.band)) / NANOLAMBERT_V0
+    return radiance * nanolamberts * view.gathered_m2_sr()
+
+
+def moonlight_nl(
+    separation_deg: float | Floats,
+    phase_angle_deg: float,
+    extinction_mag: float,
+    moon_zenith_deg: float,
+    field_zenith_deg: float,
+) -> Floats:
+    """Surface brightness in V of moonlight scattered once by the air, in nanolamberts; shape of separation_deg.
+
+    B = f(rho) I 10^(-0.4 k X(Zm)) (1 - 10^(-0.4 k X(Z))), I = 10^(-0.4 (3.84 + 0.026 |a| + 4e-9 a^4)),
+    X = (1 - 0.96 sin^2 Z)^-1/2 (Krisciunas & Schaefer 1991, PASP 103, 1033: eqs 3, 15, 20).
+    """
+    illuminance = 10 ** (-0.4 * (3.84 + 0.026 * abs(phase_angle_deg) + 4e-9 * phase_angle_deg**4))
+    arrives = 10 ** (-0.4 * extinction_mag * air_mass(moon_zenith_deg))
+    scattered = 1 - 10 ** (-0.4 * extinction_mag * air_mass(field_zenith_deg))
+    return np.asarray(scattering(separation_deg) * illuminance * arrives * scattered)
+
+
+def scattering(separation_deg: float | Floats) -> Floats:
+    """How much the air scatters by an angle: Rayleigh's molecules and, forwards, the aerosol (KS91 eqs 16-19).
+
+    f = 10^5.36 (1.06 + cos^2 rho) + the greater of 10^(6.15 - rho / 40) and 6.2e7 / rho^2. The paper changes from
+    one aerosol law to the other at 10 degrees, with a step of a quarter; the greater has none (they cross at 8.6).
+    Inside of the Moon's own disc it stays as at its edge.
+    """
+    rho = np.maximum(np.asarray(separation_deg, dtype=float), MOON_RADIUS_DEG)
+    molecules = 10**5.36 * (1.06 + np.cos(np.radians(rho)) ** 2)
+    return np.asarray(molecules + np.maximum(10 ** (6.15 - rho / 40), 6.2e7 / rho**2))
+
+
+def air_mass(zenith_deg: float) -> float:
+    """Air along the line of sight over that at the zenith (KS91 eq. 3); 5 on the horizon."""
+    return float((1 - 0.96 * math.sin(math.radians(zenith_deg)) ** 2) ** -0.5)
+
+
+def stray(part: StrayLightConfig, view: View) -> Floats:
+    """A bright body's irradiance before the lens times the point source transmittance: the same in every pixel.
+
+    The transmittance is of the lens and its baffle together, irradiance on the chip over irradiance before the
+    lens, at the body's angle from the boresight (`transmittance`). The body has the Sun's colours.
+    """
+    angle_deg = float(apart_deg(view.boresight_lab[None, :], direction(part.ra_deg, part.dec_deg))[0])
+    irradiance = float(star_flux_e_s_m2(part.v_mag, *SUN, view.band))
+    share = transmittance(angle_deg, part.angle_deg, part.pst)
+    return np.full(len(view.field_rad), irradiance * share * view.optics.camera.pixel_m**2)
+
+
+def transmittance(angle_deg: float, table_deg: Sequence[float], pst: Sequence[float]) -> float:
+    """A table over decades: its logarithm is linear between two rows, and beyond either end stays as there."""
+    return float(np.exp(np.interp(angle_deg, table_deg, np.log(np.maximum(pst, LEAST_PST)))))
+
+
+# What shines. A third kind is a class in light.py and a function here.
+BACKGROUNDS: dict[str, Callable[[Any, View], Floats]] = {
+    "uniform": uniform,
+    "sky": sky,
+    "moon": moon,
+    "stray": stray,
+}
+
+
+def direction(ra_deg: float, dec_deg: float) -> Floats:
+    """(3,) unit vector of a right ascension and declination."""
+    ra, dec = math.radians(ra_deg), math.radians(dec_deg)
+    return np.array([math.cos(dec) * math.cos(ra), math.cos(dec) * math.sin(ra), math.sin(dec)])
+
+
+def apart_deg(many: Floats, one: Floats) -> Floats:
+    """(M,) angles between (M, 3) unit vectors and another, exact for small ones too."""
+    return np.degrees(np.arctan2(np.linalg.norm(np.cross(many, one), axis=-1), many @ one))
+
+
+def glow_map(parts: Sequence[Glow], optics: Optics, cam_from_lab: Rotation, band: Band) -> Floats:
+    """(h, w) electrons s^-1 px^-1 of all that glows, at nodes evenly spread over the chip with its edges among them.
+
+    `fill` draws the frame from it, to 1e-3 of a map as smooth as these (test_background). A cusp is rounded off: that
+    of two_stops on the axis by up to 2 % within a node of it, and the Moon's own where it stands in the field.
+    Where nothing depends on the place, or nothing glows, there is one node.
+    """
+    if all(part.kind in ("uniform", "stray") for part in parts):
+        (toward, pixel_sr), shape = look(np.array([optics.camera.centre_px]), optics), (1, 1)
+    else:
+        toward, pixel_sr, shape = look_of_nodes(optics)
+    seen = view_of(toward, pixel_sr, optics, cam_from_lab, band)
+    total = np.zeros(len(toward))
+    for part in parts:
+        total += BACKGROUNDS[part.kind](part, seen)
+    return total.reshape(shape)
+
+
+@lru_cache(maxsize=8)
+def look_of_nodes(optics: Optics) -> tuple[Floats, Floats, tuple[int, int]]:
+    """`look` at the nodes, and their (h, w): the same for every frame of a camera."""
+    xy_px, shape = nodes_px(optics.camera)
+    return *look(xy_px, optics), shape
+
+
+def nodes_px(camera: CameraConfig) -> tuple[Floats, tuple[int, int]]:
+    """(h * w, 2) places of the nodes, row by row, and (h, w)."""
+    spacing = min(NODE_PX, max(NODE_RAD * camera.focal_px, 1.0))
+    w, h = (math.ceil((size - 1) / spacing) + 1 for size in (camera.width_px, camera.height_px))
+    x, y = np.meshgrid(np.linspace(0, camera.width_px - 1, w), np.linspace(0, camera.height_px - 1, h))
+    return np.column_stack([x.ravel(), y.ravel()]), (h, w)
+
+
+def look(xy_px: Floats, optics: Optics) -> tuple[Floats, Floats]:
+    """(M, 3) unit vectors in camera axes that the pixels at (M, 2) places look along, and (M,) their solid angles.
+
+    A pixel's solid angle is that between its neighbours' middles: 1e-6 off where the lens bends as it does.
+    """
+    across, down = (
+        (unproject(xy_px + step, optics) - unproject(xy_px - step, optics)) / 2 for step in np.eye(2)
+    )
+    return unproject(xy_px, optics), np.linalg.norm(np.cross(across, down), axis=1)
+
+
+def view_of(toward: Floats, pixel_sr: Floats, optics: Optics, cam_from_lab: Rotation, band: Band) -> View:
+    """What is seen along such looks from a camera in this attitude."""
+    lab_from_cam = cam_from_lab.inv()
+    return View(
+        toward_cam=toward,
+        toward_lab=lab_from_cam.apply(toward),
+        boresight_lab=lab_from_cam.apply([0.0, 0.0, 1.0]),
+        field_rad=np.arctan2(np.hypot(toward[:, 0], toward[:, 1]), toward[:, 2]),
+        pixel_sr=pixel_sr,
+        optics=optics,
+        band=band,
+    )
+
+
+def unproject(xy_px: Floats, optics: Optics) -> Floats:
+    """(M, 3) unit vectors in camera axes of (M, 2) pixels: `Optics.project` turned round.
+
+    The radial part by a table, the small tangential part by iteration. Pixels where barrel distortion has no image
+    left all look at its fold, and so under no solid angle.
+    """
+    camera = optics.camera
+    plane = (xy_px - np.array(camera.centre_px)) / camera.focal_px
+    if any(camera.distortion):
+        r = np.linspace(0, min(optics.fold_r, 1.1 * math.tan(optics.field_rad) + 1e-3), 4001)
+        image_r = r * radial(camera.distortion, r**2)
+        wanted, aslant = plane, np.zeros_like(plane)
+        for _ in range(10 if any(camera.distortion[2:4]) else 1):
+            straight = wanted - aslant
+            length = np.hypot(*straight.T)
+            plane = straight * (np.interp(length, image_r, r) / np.maximum(length, 1e-300))[:, None]
+            aslant = np.column_stack(tangential(camera.distortion, *plane.T))
+    toward = np.column_stack([plane, np.ones(len(plane))])
+    return np.asarray(toward / np.linalg.norm(toward, axis=1, keepdims=True))
+
+
+def fill(image: NDArray[Any], coarse: Floats, factor: float) -> None:
+    """Set an (H, W) frame, whatever it held, to coarse * factor, drawn bilinearly between the nodes (in place).
+
+    coarse : (h, w) at even spacing from the first pixel's middle to the last one's, as of `glow_map`; a single node
+             stands for the whole frame. image is float32 or float64, factor seconds for electrons.
+    """
+    if coarse.max() == coarse.min():
+        _fill_flat(image, float(coarse[0, 0]) * factor)
+    else:
+        _fill_between(image, coarse * factor)
+
+
+@jit(parallel=True)
+def _fill_flat(image: NDArray[Any], value: float) -> None:
+    for y in numba.prange(image.shape[0]):
+        image[y, :] = value
+
+
+@jit(parallel=True)
+def _fill_between(image: NDArray[Any], coarse: Floats) -> None:
+    """A row of nodes is drawn up for every row of pixels, and a straight line from node to node."""
+    (height, width), (h, w) = image.shape, coarse.shape
+    place = np.arange(width) * ((w - 1) / (width - 1))
+    cell = np.minimum(place.astype(np.int64), w - 2)
+    within = (place - cell).astype(image.dtype)
+    # Each cell's first pixel, and the end; unsigned, as a check for negative places keeps the loop from vectors.
+    begin = np.searchsorted(cell, np.arange(w)).astype(np.uint64)
+    for y in numba.prange(height):
+        j = min(int(y * ((h - 1) / (height - 1))), h - 2)
+        share = y * ((h - 1) / (height - 1)) - j
+        row = image[y]
+        for i in range(w - 1):
+            left = coarse[j, i] + share * (coarse[j + 1, i] - coarse[j, i])
+            right = coarse[j, i + 1] + share * (coarse[j + 1, i + 1] - coarse[j, i + 1])
+            start, rise = image.dtype.type(left), image.dtype.type(right - left)
+            for x in range(begin[i], begin[i + 1]):
+                row[x] = start + rise * within[x]

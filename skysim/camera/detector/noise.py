@@ -1,0 +1,281 @@
+"""Random counts and random numbers for millions of pixels: exact, and less than one 64-bit draw a pixel.
+
+Every row of a frame has its own stream, SplitMix64 (Steele, Lea & Flood 2014) from a seed that the frame's generator
+drew, so that rows may be done in any order by any number of threads with the same outcome. A stream's state is one
+integer; the functions take it and give it back.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from math import erfc, exp, log, pi, sqrt
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import float32, float64, int32, int64, uint32, uint64
+from numpy.random import Generator
+from numpy.typing import NDArray
+
+from skysim.core.jit import jit
+
+BUCKETS = 1024  # ten bits, six times in a draw: the tables of a dark frame then fit the fastest cache
+PER_E = 128  # guide tables an electron
+FEW_E = 16.0  # above it counts are a corrected Gaussian
+UNSURE = 255
+LAYERS = 512  # nine bits, and 23 to go across a layer: two numbers a draw
+HALF = 2.0**22
+
+GAMMA = 0x9E3779B97F4A7C15
+MIX1, MIX2 = 0xBF58476D1CE4E5B9, 0x94D049BB133111EB
+
+
+class Tables(NamedTuple):
+    """What the draws look up.
+
+    guide : (FEW_E * PER_E, BUCKETS) counts: row k holds the Poisson law of any mean from k to k + 1 steps, bucket b
+            the count that a uniform number in [b, b + 1) / BUCKETS stands for, or UNSURE
+    edge, height : (LAYERS + 1,) the ziggurat's corners x and exp(-x^2 / 2)
+    width, sure  : (LAYERS,) x and the next x over x, in steps of the signed 23-bit number that falls across a layer
+    """
+
+    guide: NDArray[np.uint8]
+    edge: NDArray[np.float64]
+    height: NDArray[np.float64]
+    width: NDArray[np.float32]
+    sure: NDArray[np.int32]
+
+
+@lru_cache(maxsize=1)
+def tables() -> Tables:
+    """Made once a process, in 20 ms."""
+    edge = ziggurat()
+    width = (edge[:LAYERS] / HALF).astype(np.float32)
+    sure = (edge[1:] / edge[:LAYERS] * HALF).astype(np.int32)
+    return Tables(_guide(), edge, np.exp(-(edge**2) / 2), width, sure)
+
+
+def seeds(rng: Generator, rows: int) -> NDArray[np.uint64]:
+    """A stream for every row."""
+    return rng.integers(0, 2**64, rows, dtype=np.uint64)
+
+
+def ziggurat() -> NDArray[np.float64]:
+    """(LAYERS + 1,) corners of layers of equal area under exp(-x^2 / 2) (Marsaglia & Tsang 2000).
+
+    The lowest layer holds the tail beyond r: its corner is area / height, and the tower built on r ends at the
+    peak for one r alone, found by bisection.
+    """
+
+    def tower(r: float) -> tuple[NDArray[np.float64], bool]:
+        area = r * exp(-(r**2) / 2) + sqrt(pi / 2) * erfc(r / sqrt(2))
+        x = np.zeros(LAYERS + 1)
+        x[0], x[1] = area * exp(r**2 / 2), r
+        for n in range(2, LAYERS + 1):
+            top = area / x[n - 1] + exp(-(x[n - 1] ** 2) / 2)
+            if top >= 1:
+                return x, True
+            x[n] = sqrt(-2 * log(top))
+        return x, False
+
+    low, high = 3.0, 5.0
+    for _ in range(60):
+        middle = (low + high) / 2
+        low, high = (middle, high) if tower(middle)[1] else (low, middle)  # an r too small overfills it
+    x = tower(high)[0]
+    x[LAYERS] = 0.0
+    return x
+
+
+@jit
+def _guide() -> Any:
+    """A count is sure where the whole bucket lies above F(n - 1) of the smallest mean and below F(n) of the
+    greatest: F falls with the mean. Unsure is 1/PER_E of the numbers, and a bucket at every step of F."""
+    rows = int(FEW_E * PER_E)
+    guide = np.empty((rows, BUCKETS), np.uint8)
+    for k in range(rows):
+        low, high = k / PER_E, (k + 1) / PER_E
+        p_low, p_high, n, below = exp(-low), exp(-high), 0, 0.0
+        f_low, f_high = p_low, p_high
+        for b in range(BUCKETS):
+            while b / BUCKETS >= f_low and n < UNSURE - 1:
+                n += 1
+                below = f_low
+                p_low, p_high = p_low * low / n, p_high * high / n
+                f_low, f_high = f_low + p_low, f_high + p_high
+            guide[k, b] = n if b / BUCKETS >= below and (b + 1) / BUCKETS <= f_high else UNSURE
+    return guide
+
+
+@jit(inline="always")
+def draw(state: Any) -> Any:
+    """64 random bits and the stream's next state."""
+    state += uint64(GAMMA)
+    z = (state ^ (state >> uint64(30))) * uint64(MIX1)
+    z = (z ^ (z >> uint64(27))) * uint64(MIX2)
+    return z ^ (z >> uint64(31)), state
+
+
+@jit(inline="always")
+def _uniform(state: Any) -> Any:
+    """A number within (0, 1), 52 bits of it, and the next state."""
+    bits, state = draw(state)
+    return (float64(int64(bits >> uint64(12))) + 0.5) * 2.0**-52, state
+
+
+@jit
+def count(row: Any, state: Any, tables: Tables) -> Any:
+    """Turn a row of means >= 0 into Poisson counts, exactly, in place. Returns the stream's next state.
+
+    Small means by inversion: ten bits choose the guide's bucket, and only where the count is unsure are more bits
+    drawn and the law summed at this very mean. Great ones by Ahrens & Dieter's PD (1982).
+    """
+    later, many = np.empty(row.size, np.int32), 0
+    bits = uint64(0)
+    for x in range(row.size):
+        if x % 6 == 0:
+            bits, state = draw(state)
+        bucket = bits & uint64(BUCKETS - 1)  # unsigned indices are not tested for being negative
+        bits >>= uint64(10)
+        mean = row[x]
+        if mean < float32(FEW_E):
+            found = tables.guide[uint64(int64(mean * float32(PER_E))), bucket]
+            row[x] = float32(found)
+            if found == UNSURE:
+                rest, state = _uniform(state)
+                row[x] = _invert(float64(mean), (float64(int64(bucket)) + rest) / BUCKETS)
+        else:
+            later[many] = x
+            many += 1
+    if many > 0:
+        state = _count_many(row, later[:many], state, tables.edge, tables.height, tables.width, tables.sure)
+    return state
+
+
+@jit
+def _invert(mean: Any, u: Any) -> Any:
+    """The least n with F(n) > u."""
+    n, p = 0.0, exp(-mean)
+    total = p
+    while u >= total and n < 1000.0:
+        n += 1.0
+        p *= mean / n
+        total += p
+    return n
+
+
+@jit
+def _count_many(row: Any, which: Any, state: Any, edge: Any, height: Any, width: Any, sure: Any) -> Any:
+    """The same for the chosen pixels of a row, whose means are ten or more.
+
+    PD: the floor of a Gaussian of the same mean and variance, which is right but for a part of order mean^-1/2; that
+    is told by a squeeze (u >= (mean - k)^3 / (6 mean^2) accepts) and mended in `_mend`.
+    """
+    for x in which:
+        mean = float64(row[x])
+        sigma = sqrt(mean)
+        bits, state = draw(state)
+        layer, across = uint32(bits) & uint32(LAYERS - 1), int32(uint32(bits)) >> int32(9)
+        g = float32(across) * width[layer]
+        if abs(across) >= sure[layer]:
+            g, state = _edge(int64(across), int64(layer), state, edge, height)
+        k = np.floor(mean + sigma * g)
+        u = float64(int64(bits >> uint64(32))) * 2.0**-32
+        short = mean - k
+        if min(short, short * short * short - 6 * mean * mean * u) > 1.1484:
+            k, state = _mend(mean, sigma, k, u, state)
+        row[x] = k
+    return state
+
+
+@jit
+def _mend(mean: float, sigma: float, k: float, u: float, state: Any) -> Any:
+    """PD's steps P to H: quotient acceptance, then rejection from a double exponential."""
+    if k >= 0:
+        px, py, fx, fy = _densities(mean, sigma, k)
+        if fy * (1 - u) <= py * exp(px - fx):
+            return k, state
+    while True:
+        v, state = _uniform(state)
+        e = -log(v)
+        v, state = _uniform(state)
+        v = 2 * v - 1
+        t = 1.8 + (e if v >= 0 else -e)
+        if t <= -0.6744:
+            continue
+        k = np.floor(mean + sigma * t)
+        px, py, fx, fy = _densities(mean, sigma, k)
+        if 0.1069 / mean * abs(v) <= py * exp(px + e) - fy * exp(fx + e):
+            return k, state
+
+
+@jit
+def _densities(mean: float, sigma: float, k: float) -> Any:
+    """PD's procedure F: the Poisson probability of k is py exp(px), the discrete normal's near fy exp(fx).
+
+    k >= 10 by Stirling's series: px = k (log(1 + v) - v) - 1/(12 k) + ..., v = (mean - k) / k.
+    """
+    if k < 10:
+        px, py = -mean, 1.0
+        for i in range(int(k)):
+            py *= mean / (i + 1)
+    else:
+        v = (mean - k) / k
+        r = 1 / (k * k)
+        px = k * (np.log1p(v) - v) - (1 / 12 - (1 / 360 - r / 1260) * r) / k
+        py = 1 / sqrt(2 * pi * k)
+    x2 = ((0.5 - mean + k) / sigma) ** 2
+    b1 = 1 / (24 * mean)
+    b2 = 0.3 * b1 * b1
+    c3 = b1 * b2 / 7
+    c2 = b2 - 15 * c3
+    c1 = b1 - 6 * b2 + 45 * c3
+    c0 = 1 - b1 + 3 * b2 - 15 * c3
+    fy = (((c3 * x2 + c2) * x2 + c1) * x2 + c0) / (sqrt(2 * pi) * sigma)
+    return px, py, -x2 / 2, fy
+
+
+@jit
+def normal(row: Any, state: Any, tables: Tables) -> Any:
+    """Fill a row with standard normal numbers by the ziggurat. Returns the stream's next state.
+
+    Of 32 bits nine choose the layer, 23 with their sign the place across it; 99.4 % need no more. (The same lines
+    stand in `_count_many`: a function handed the tables would count references to them, which is ten times the work.)
+    """
+    for x in range(0, row.size, 2):
+        bits, state = draw(state)
+        for k in range(2):
+            if x + k < row.size:
+                layer, across = uint32(bits) & uint32(LAYERS - 1), int32(uint32(bits)) >> int32(9)
+                row[x + k] = float32(across) * tables.width[layer]
+                if abs(across) >= tables.sure[layer]:
+                    row[x + k], state = _edge(int64(across), int64(layer), state, tables.edge, tables.height)
+                bits >>= uint64(32)
+    return state
+
+
+@jit
+def _edge(across: Any, layer: Any, state: Any, edge: Any, height: Any) -> Any:
+    """The ziggurat's corners by comparison with the density, its tail by Marsaglia's exponential."""
+    while True:
+        x = across * (edge[layer] / HALF)
+        if abs(x) < edge[layer + 1]:
+            return float32(x), state
+        if layer == 0:
+            return _tail(across, state, edge[1])
+        u, state = _uniform(state)
+        low, high = height[layer], height[layer + 1]
+        if low + u * (high - low) < exp(-x * x / 2):
+            return float32(x), state
+        bits, state = draw(state)
+        layer, across = int64(bits & uint64(LAYERS - 1)), int64(int32(bits) >> int32(9))
+
+
+@jit
+def _tail(sign: Any, state: Any, begin: float) -> Any:
+    """A normal number beyond `begin`, with the given sign (Marsaglia 1964)."""
+    while True:
+        u, state = _uniform(state)
+        v, state = _uniform(state)
+        a = -log(u) / begin
+        if -2 * log(v) > a * a:
+            return float32(begin + a if sign > 0 else -begin - a), state

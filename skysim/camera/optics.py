@@ -1,0 +1,107 @@
+"""The lens as it is: direction to pixel with distortion, and what of the light it lets through."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from skysim.core.types import Floats
+from skysim.scene.camera import CameraConfig, TwoStopsConfig, VignettingTableConfig
+
+
+def two_stops(part: TwoStopsConfig, field_rad: Floats) -> Floats:
+    """Share of the light that passes two equal round stops: the overlap of two circles, over a circle.
+
+    V = (2 / pi) (acos u - u sqrt(1 - u^2)), u = tan(field) / tan(cutoff): seen obliquely, one stop is displaced
+    against the other by u diameters.
+    """
+    u = np.clip(np.tan(np.minimum(field_rad, 1.57)) / np.tan(np.radians(part.cutoff_deg)), 0, 1)
+    return np.asarray(2 / np.pi * (np.arccos(u) - u * np.sqrt(1 - u**2)))
+
+
+def table(part: VignettingTableConfig, field_rad: Floats) -> Floats:
+    """Transmission as it was measured, linear between the angles and level beyond them."""
+    return np.interp(np.degrees(field_rad), part.angle_deg, part.transmission)
+
+
+VIGNETTING: dict[str, Callable[[Any, Floats], Floats]] = {"two_stops": two_stops, "table": table}
+
+
+@dataclass(frozen=True, slots=True)
+class Optics:
+    """A lens before a chip, in camera axes +x right, +y down, +z boresight.
+
+    camera        : focal length, principal point, distortion, point-spread function
+    collecting_m2 : entrance pupil's area times transmission
+    fold_r        : tangent of the field angle at which strong barrel distortion turns back: no image beyond
+    field_rad     : greatest angle from the boresight of anything on the chip
+    """
+
+    camera: CameraConfig
+    collecting_m2: float
+    fold_r: float
+    field_rad: float
+
+    @classmethod
+    def of(cls, camera: CameraConfig) -> Optics:
+        """The optics that a scene's camera describes."""
+        area_m2, turn = np.pi / 4 * camera.pupil_m**2, fold_r(camera.distortion)
+        return cls(camera, float(area_m2 * camera.transmission), turn, field_rad(camera, turn))
+
+    def project(self, vectors_cam: Floats) -> Floats:
+        """(..., 3) vectors in camera axes to (..., 2) pixels; NaN behind the camera and beyond the fold.
+
+        x' = x (1 + k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2), y' likewise (Brown 1971).
+        """
+        z = np.where(vectors_cam[..., 2] > 0, vectors_cam[..., 2], np.nan)
+        x, y = vectors_cam[..., 0] / z, vectors_cam[..., 1] / z
+        focal, centre = self.camera.focal_px, self.camera.centre_px
+        if any(self.camera.distortion):
+            x, y = self._distort(x, y)
+        return np.stack([x * focal + centre[0], y * focal + centre[1]], axis=-1)
+
+    def _distort(self, x: Floats, y: Floats) -> tuple[Floats, Floats]:
+        r2 = x**2 + y**2
+        stretch = np.where(r2 < self.fold_r**2, radial(self.camera.distortion, r2), np.nan)
+        across, down = tangential(self.camera.distortion, x, y)
+        return x * stretch + across, y * stretch + down
+
+    def passed(self, cos_field: Floats) -> Floats:
+        """Share of a point's light that the pupil takes in at an angle from the boresight: its foreshortening,
+        cos, and vignetting. Zero behind the camera. Any shape."""
+        cosine = np.maximum(cos_field, 0)
+        part = self.camera.vignetting
+        if part is None:
+            return cosine
+        return cosine * VIGNETTING[part.kind](part, np.arccos(np.minimum(cosine, 1)))
+
+
+def radial(distortion: tuple[float, ...], r2: Floats) -> Floats:
+    """1 + k1 r^2 + k2 r^4 + k3 r^6 of k1, k2, p1, p2, k3 (OpenCV's order)."""
+    k1, k2, _, _, k3 = distortion
+    return 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+
+
+def tangential(distortion: tuple[float, ...], x: Floats, y: Floats) -> tuple[Floats, Floats]:
+    """2 p1 x y + p2 (r^2 + 2 x^2) and p1 (r^2 + 2 y^2) + 2 p2 x y: what a lens element set askew adds to x and y."""
+    p1, p2 = distortion[2:4]
+    r2 = x**2 + y**2
+    return 2 * p1 * x * y + p2 * (r2 + 2 * x**2), p1 * (r2 + 2 * y**2) + 2 * p2 * x * y
+
+
+def field_rad(camera: CameraConfig, fold_r: float) -> float:
+    """Angle from the boresight of the chip's farthest corner, distortion undone."""
+    corner = camera.corner_px / camera.focal_px
+    r = np.linspace(0, min(fold_r, 20 * corner), 4001)
+    return float(np.arctan(np.interp(corner, r * radial(camera.distortion, r**2), r)))
+
+
+def fold_r(distortion: tuple[float, ...]) -> float:
+    """The least r at which r (1 + k1 r^2 + k2 r^4 + k3 r^6) stops growing; infinity if it always grows."""
+    k1, k2, _, _, k3 = distortion
+    s = np.roots([1.0, 3 * k1, 5 * k2, 7 * k3])  # in 1 / r^2, as any of the coefficients may be nothing
+    turns = s.real[(abs(s.imag) < 1e-9 * (1 + abs(s.real))) & (s.real > 1e-12)]
+    return float(1 / np.sqrt(turns.max())) if len(turns) else float("inf")

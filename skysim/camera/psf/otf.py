@@ -1,0 +1,207 @@
+"""What the lens makes of a point: optical transfer functions, how far they scatter light, and the defocus disc.
+
+The image of a source is a convolution: lens x Gaussian blur x emitter's disc x defocus disc x pixel. At a spatial
+frequency (fx, fy) in cycles a pixel it is a product of transfer functions (Goodman, Introduction to Fourier Optics,
+ch. 6). The lens's are here; `skysim.camera.psf.kernel` multiplies them into an image that `skysim.camera.psf.splat` adds to a frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import special
+
+from skysim.core.errors import InputError
+from skysim.core.types import Floats
+from skysim.scene.camera import (
+    AiryPsfConfig,
+    CameraConfig,
+    DiscPsfConfig,
+    GaussianPsfConfig,
+    MeasuredPsfConfig,
+    MoffatPsfConfig,
+    Psf,
+)
+
+Otf = NDArray[Any]  # real, or complex where a point's image has no symmetry
+
+WINGS = 1e-5  # of the peak: power-law wings end where they fall below it
+
+
+def blur_radius_px(camera: CameraConfig, distance_m: Any) -> Any:
+    """Radius of the disc that a point out of focus becomes, in pixels, by the thin lens.
+
+    The cone from a pupil A to the image at v(u) meets the chip at v0 in a disc of diameter A |v - v0| / v =
+    A v0 |1/u - 1/u0|, u0 the distance in focus: no pole anywhere, and stars (u infinite) are no special case.
+    distance_m: scalar or array of axial distances, infinity allowed.
+    """
+    distance = np.asarray(distance_m, dtype=float)
+    spread = camera.pupil_m * camera.image_distance_m * np.abs(1 / distance - 1 / camera.focus_m)
+    return spread / (2 * camera.pixel_m)
+
+
+def field_sigma_px(psf: Psf, camera: CameraConfig, xy_px: Floats) -> Floats:
+    """(...,) extra blur at pixels (..., 2): proportional to the field radius, corner_sigma_px at the far corner."""
+    radius_px = np.linalg.norm(xy_px - np.array(camera.centre_px), axis=-1)
+    return np.asarray(psf.corner_sigma_px * radius_px / camera.corner_px)
+
+
+def blur(sigma_px: float, fx: Floats, fy: Floats) -> Floats:
+    """A Gaussian's: exp(-2 pi^2 sigma^2 f^2)."""
+    return np.asarray(np.exp(-2 * (np.pi * sigma_px) ** 2 * (fx**2 + fy**2)))
+
+
+def uniform_disc(radius_px: float, fx: Floats, fy: Floats) -> Floats:
+    """A uniform disc's: 2 J1(z) / z, z = 2 pi a f."""
+    z = np.maximum(2 * np.pi * radius_px * np.hypot(fx, fy), 1e-9)
+    return np.asarray(2 * special.j1(z) / z)
+
+
+def gaussian(psf: GaussianPsfConfig, camera: CameraConfig, fx: Floats, fy: Floats) -> Floats:
+    """A lens whose points are Gaussians."""
+    return blur(psf.sigma_px, fx, fy)
+
+
+def moffat(psf: MoffatPsfConfig, camera: CameraConfig, fx: Floats, fy: Floats) -> Floats:
+    """A core with power-law wings: 2 (z/2)^n K_n(z) / Gamma(n), z = 2 pi alpha f, n = beta - 1.
+
+    The Hankel transform of (beta - 1) / (pi alpha^2) (1 + r^2 / alpha^2)^-beta (Moffat 1969, A&A 3, 455).
+    """
+    n = psf.beta - 1
+    z = np.maximum(2 * np.pi * moffat_alpha_px(psf) * np.hypot(fx, fy), 1e-6)
+    return np.asarray(2 * (z / 2) ** n * special.kv(n, z) / special.gamma(n))
+
+
+def moffat_alpha_px(psf: MoffatPsfConfig) -> float:
+    """The scale of a Moffat profile of this full width at half maximum."""
+    return float(psf.fwhm_px / (2 * np.sqrt(2 ** (1 / psf.beta) - 1)))
+
+
+def airy(psf: AiryPsfConfig, camera: CameraConfig, fx: Floats, fy: Floats) -> Floats:
+    """Diffraction at a round pupil: (2/pi) (acos nu - nu sqrt(1 - nu^2)), nu = lambda N f / pixel (Goodman 6-32)."""
+    nu = np.minimum(airy_unit_px(psf, camera) * np.hypot(fx, fy), 1.0)
+    pupil = 2 / np.pi * (np.arccos(nu) - nu * np.sqrt(1 - nu**2))
+    return np.asarray(pupil * blur(psf.sigma_px, fx, fy))
+
+
+def airy_unit_px(psf: AiryPsfConfig, camera: CameraConfig) -> float:
+    """lambda N in pixels. N is the working f-number v / A: the lens's own when it is focused at infinity."""
+    return psf.wavelength_m * camera.image_distance_m / camera.pupil_m / camera.pixel_m
+
+
+def disc(psf: DiscPsfConfig, camera: CameraConfig, fx: Floats, fy: Floats) -> Floats:
+    """A uniform disc with a Gaussian edge."""
+    return uniform_disc(psf.radius_px, fx, fy) * blur(psf.sigma_px, fx, fy)
+
+
+def measured(psf: MeasuredPsfConfig, camera: CameraConfig, fx: Floats, fy: Floats) -> Otf:
+    """A point's image as it was measured, about its own centre of gravity (so a centroid is a star's place).
+
+    Each number is the light on a cell of 1 / oversampling px, the pixel's own blur not counted twice: with an
+    oversampling of 1 a star in the middle of a pixel gives the table back, with S the pixels are sums of S x S
+    cells. Between these places Keys' cubic convolution (1981, IEEE ASSP 29, 1153) tells. A table that already holds
+    the pixel's blur at an oversampling above 1 (an "effective" PSF) comes out wider by that blur.
+    """
+    cells = cells_of(psf.file)
+    x_px, y_px = cell_places_px(psf)
+    across, i = np.unique(fx, return_inverse=True)
+    down, j = np.unique(fy, return_inverse=True)
+    wave_x = np.exp(-2j * np.pi * np.outer(x_px, across)) * cell_response(across / psf.oversampling)
+    wave_y = np.exp(-2j * np.pi * np.outer(y_px, down)) * cell_response(down / psf.oversampling)
+    product = wave_y.T @ cells @ wave_x
+    return np.asarray(product[j.reshape(np.shape(fy)), i.reshape(np.shape(fx))])
+
+
+def cell_places_px(psf: MeasuredPsfConfig) -> tuple[Floats, Floats]:
+    """x of a measured table's columns and y of its rows, from its centre of gravity."""
+    cells = cells_of(psf.file)
+    place = np.arange(len(cells)) / psf.oversampling
+    return place - cells.sum(axis=0) @ place, place - cells.sum(axis=1) @ place
+
+
+@lru_cache(maxsize=16)
+def cells_of(file: str) -> Floats:
+    """(n, n) numbers of a measured PSF, CSV or an image (FITS, PNG, TIFF), scaled to a sum of 1.
+
+    Raises InputError with one line, `camera.psf.file: ...`, for a file that is none or holds no image of a point.
+    """
+    from skysim.core.images import monochrome, read_image
+
+    path = Path(file)
+    try:
+        if path.suffix.lower() == ".csv":
+            cells = np.loadtxt(path, delimiter=",", ndmin=2)
+        else:
+            cells = monochrome(read_image(path)).astype(float)
+    except (InputError, OSError, ValueError) as error:
+        said = str(error) if str(path) in str(error) else f"{path}: {error}"
+        raise InputError(f"camera.psf.file: {' '.join(said.split())}") from None
+    if cells.ndim != 2 or cells.shape[0] != cells.shape[1] or not 3 <= len(cells) <= 1024:
+        raise InputError(
+            f"camera.psf.file: {path}: shape {cells.shape}; allowed: a square of 3 to 1024 numbers a side"
+        )
+    total = cells.sum()
+    if not (np.isfinite(total) and total > 0):
+        raise InputError(
+            f"camera.psf.file: {path}: its numbers add up to {total:g}; allowed: a finite sum above 0"
+        )
+    return np.asarray(cells / total)
+
+
+def cell_response(u: Floats) -> Floats:
+    """Keys' interpolation of cells' sums, over the cell's own sinc; u in cycles a cell. 0 at whole u but 0.
+
+    Keys' kernel (a = -1/2) has the transform (3 s1^2 - 3 s2^2 - s2 + s4) / (pi u)^2 with sk = sinc(k u).
+    """
+    one, two, four = np.sinc(u), np.sinc(2 * u), np.sinc(4 * u)
+    keys = (3 * one**2 - 3 * two**2 - two + four) / np.maximum((np.pi * u) ** 2, 1e-300)
+    ratio = keys / np.where(np.abs(one) > 1e-6, one, np.inf)
+    return np.asarray(np.where(np.abs(u) < 1e-4, 1.0, ratio))
+
+
+PSFS: dict[str, Callable[[Any, CameraConfig, Floats, Floats], Otf]] = {
+    "gaussian": gaussian,
+    "moffat": moffat,
+    "airy": airy,
+    "disc": disc,
+    "measured": measured,
+}
+
+
+def moffat_reach_px(psf: MoffatPsfConfig, camera: CameraConfig) -> float:
+    """Where a Moffat profile falls below WINGS of its image's brightest pixel: at most 64 px or four alpha."""
+    alpha = moffat_alpha_px(psf)
+    level = WINGS / max(1.0, (psf.beta - 1) / (np.pi * alpha**2))
+    return float(min(alpha * np.sqrt(level ** (-1 / psf.beta) - 1), max(64.0, 4 * alpha)))
+
+
+def airy_reach_px(psf: AiryPsfConfig, camera: CameraConfig) -> float:
+    """Where the mean of Airy's rings, 4 / (pi z^3) of its peak at z = pi r / (lambda N), falls below WINGS.
+
+    At most 64 px or eight lambda N. The light beyond, 2 / (pi z), is within 2 %.
+    """
+    unit = airy_unit_px(psf, camera)
+    z = (4 / np.pi / WINGS * max(1.0, np.pi / 4 / unit**2)) ** (1 / 3)
+    return float(min(z * unit / np.pi, max(64.0, 8 * unit)))
+
+
+def measured_reach_px(psf: MeasuredPsfConfig, camera: CameraConfig) -> float:
+    """The farthest cell's distance in x or y, and the two cells that interpolation adds."""
+    return float(np.abs(cell_places_px(psf)).max() + 2 / psf.oversampling)
+
+
+# Radius that holds a point's light, before a Gaussian of what standard deviation.
+EXTENT: dict[str, Callable[[Any, CameraConfig], tuple[float, float]]] = {
+    "gaussian": lambda psf, camera: (0.0, psf.sigma_px),
+    "moffat": lambda psf, camera: (moffat_reach_px(psf, camera), 0.0),
+    "airy": lambda psf, camera: (airy_reach_px(psf, camera), psf.sigma_px),
+    "disc": lambda psf, camera: (psf.radius_px, psf.sigma_px),
+    "measured": lambda psf, camera: (measured_reach_px(psf, camera), 0.0),
+}
+WINGED = ("moffat", "airy")  # kinds whose light has no end
+SQUARE = ("measured",)  # kinds that need not be round

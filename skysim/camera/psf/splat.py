@@ -1,0 +1,192 @@
+"""Images of points and discs added to a patch of pixels: the hot path, in compiled code.
+
+Every `add_*` adds `electrons` spread as an image centred on (x, y), in pixels of the patch (0-based, the integer is
+the pixel's centre), to the rows row0 <= j < row1 of a C-ordered float64 patch. What falls outside of these rows or of
+the patch is left out; the rows of a rolling shutter add up to the whole. The tables come from `skysim.camera.psf.kernel`.
+"""
+
+from __future__ import annotations
+
+from math import ceil, erf, floor, sqrt
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skysim.core.jit import jit
+from skysim.core.types import Floats
+
+Singles = NDArray[np.float32]
+
+PER_PX = 64  # entries of a radial table a pixel
+REACH_SIGMA = 6.5  # a Gaussian's share beyond is 7e-10
+LANES = 32  # what the compiler takes at a time (four registers of eight); a remainder would run one by one
+
+
+@jit
+def add(
+    patch: Floats,
+    row0: int,
+    row1: int,
+    x: float,
+    y: float,
+    electrons: float,
+    sigma_px: float,
+    radial: Singles,
+    grid: Singles,
+) -> None:
+    """Whichever image a `kernel.Kernel` holds: its grid, its radial table, or its Gaussian."""
+    if grid.shape[0] > 0:
+        add_grid(patch, row0, row1, x, y, electrons, grid)
+    elif radial.shape[0] > 0:
+        add_round(patch, row0, row1, x, y, electrons, radial)
+    else:
+        add_gaussian(patch, row0, row1, x, y, electrons, sigma_px)
+
+
+@jit
+def add_gaussian(
+    patch: Floats, row0: int, row1: int, x: float, y: float, electrons: float, sigma_px: float
+) -> None:
+    """A Gaussian's exact share of each pixel: the product of two differences of the error function."""
+    height, width = patch.shape
+    reach = REACH_SIGMA * sigma_px + 0.5
+    left, right = max(ceil(x - reach), 0), min(floor(x + reach) + 1, width)
+    top, bottom = max(ceil(y - reach), row0, 0), min(floor(y + reach) + 1, row1, height)
+    if right <= left or bottom <= top:
+        return
+    scale = 1 / (sigma_px * sqrt(2.0))
+    columns = np.empty(right - left)
+    low = erf((left - 0.5 - x) * scale)
+    for i in range(columns.size):
+        high = erf((left + i + 0.5 - x) * scale)
+        columns[i] = (high - low) * (electrons / 4)
+        low = high
+    low = erf((top - 0.5 - y) * scale)
+    for j in range(top, bottom):
+        high = erf((j + 0.5 - y) * scale)
+        share = high - low
+        low = high
+        row = patch[j, left:right]
+        for i in range(columns.size):
+            row[i] += share * columns[i]
+
+
+@jit(fastmath=True)
+def add_round(
+    patch: Floats, row0: int, row1: int, x: float, y: float, electrons: float, radial: Singles
+) -> None:
+    """A round image seen by square pixels: T0(r) + T4(r) cos 4 theta + T8(r) cos 8 theta.
+
+    radial (R, 3, 5 or 7): at r = i / PER_PX of T0 the value, the step to the next and Bessel's second difference
+    (a parabola: straight chords would lose 1e-4 of a sharp image's light); then value and step of T4 / r^4 and of
+    T8 / r^8, if they are anything, so that the cosines are the polynomials r^4 cos 4 theta = (u + v)^2 - 8 u v and
+    r^8 cos 8 theta = 2 (r^4 cos 4 theta)^2 - r^8 of u = dx^2, v = dy^2: no division, no trigonometry. Square roots
+    and polynomials go LANES at a time; only the look-up goes pixel by pixel.
+    """
+    height, width = patch.shape
+    reach = (radial.shape[0] - 2) / PER_PX
+    left, right = max(ceil(x - reach), 0), min(floor(x + reach) + 1, width)
+    top, bottom = max(ceil(y - reach), row0, 0), min(floor(y + reach) + 1, row1, height)
+    if right <= left or bottom <= top:
+        return
+    lanes = (right - left + LANES - 1) // LANES * LANES
+    buffers, entry = np.empty((4, lanes), np.float32), np.empty(lanes, np.int32)
+    u, f, c4, c8 = buffers[0], buffers[1], buffers[2], buffers[3]
+    for i in range(lanes):
+        u[i] = (left + i - x) ** 2
+    for j in range(top, bottom):
+        v = np.float32((j - y) ** 2)
+        half = sqrt(max(reach * reach - v, 0.0))
+        # Unsigned, so that no index is tested for being negative.
+        first = np.uint64(max(ceil(x - half) - left, 0))
+        last = np.uint64(max(min(floor(x + half) + 1, right) - left, 0))
+        row = patch[j, left:]
+        radii(u, v, entry, f)
+        if radial.shape[1] > 3:
+            cosines(u, v, c4, c8)
+        if radial.shape[1] == 3:
+            for i in range(first, last):
+                row[i] += electrons * along(radial, entry[i], f[i])
+        elif radial.shape[1] == 5:
+            for i in range(first, last):
+                k = np.uint64(entry[i])
+                t4 = radial[k, 3] + f[i] * radial[k, 4]
+                row[i] += electrons * (along(radial, entry[i], f[i]) + c4[i] * t4)
+        else:
+            for i in range(first, last):
+                k = np.uint64(entry[i])
+                t4, t8 = radial[k, 3] + f[i] * radial[k, 4], radial[k, 5] + f[i] * radial[k, 6]
+                row[i] += electrons * (along(radial, entry[i], f[i]) + c4[i] * t4 + c8[i] * t8)
+
+
+@jit(fastmath=True)
+def radii(u: Singles, v: float, entry: NDArray[np.int32], fraction: Singles) -> None:
+    """Which entry of a radial table each pixel of a row falls on, and how far past it."""
+    for i in range(u.size):
+        r = np.sqrt(u[i] + v) * np.float32(PER_PX)
+        entry[i] = np.int32(r)
+        fraction[i] = r - np.float32(entry[i])
+
+
+@jit(fastmath=True)
+def cosines(u: Singles, v: float, c4: Singles, c8: Singles) -> None:
+    """r^4 cos 4 theta and r^8 cos 8 theta of each pixel of a row."""
+    for i in range(u.size):
+        r4 = (u[i] + v) * (u[i] + v)
+        c4[i] = r4 - np.float32(8) * u[i] * v
+        c8[i] = np.float32(2) * c4[i] * c4[i] - r4 * r4
+
+
+@jit(fastmath=True)
+def along(radial: Singles, entry: int, f: float) -> float:
+    """T0 at a fraction f past an entry."""
+    k = np.uint64(entry)
+    return radial[k, 0] + f * (radial[k, 1] + (f - np.float32(1)) * radial[k, 2])
+
+
+@jit
+def cubic(t: float) -> tuple[float, float, float, float]:
+    """Lagrange's weights of the samples at -1, 0, 1, 2 for a place 0 <= t < 1 between the middle two."""
+    a, b, c, d = t + 1, t, t - 1, t - 2
+    return -b * c * d / 6, a * c * d / 2, -a * b * d / 2, a * b * c / 6
+
+
+@jit(fastmath=True)
+def add_grid(
+    patch: Floats, row0: int, row1: int, x: float, y: float, electrons: float, grid: Singles
+) -> None:
+    """An image of any shape from its tables at S x S sub-pixel places, cubic between the places.
+
+    grid (S + 3, S + 3, N, N): grid[q, p, j, i] is the share of pixel (i, j) of an image that stands at
+    ((p - 1) / S - 1/2, (q - 1) / S - 1/2) from the middle pixel. All pixels of one image use the same sixteen
+    weights, so the pixels of a row stand side by side. Each table adds up to 1, and so does every mixture.
+    """
+    height, width = patch.shape
+    steps, size = grid.shape[0] - 3, grid.shape[2]
+    middle_x, middle_y = floor(x + 0.5), floor(y + 0.5)
+    along, down = (x - middle_x + 0.5) * steps, (y - middle_y + 0.5) * steps
+    p, q = min(int(along), steps - 1), min(int(down), steps - 1)
+    wx0, wx1, wx2, wx3 = cubic(along - p)
+    wy = cubic(down - q)
+    corner_x, corner_y = middle_x - size // 2, middle_y - size // 2
+    left, right = max(corner_x, 0), min(corner_x + size, width)
+    top, bottom = max(corner_y, row0, 0), min(corner_y + size, row1, height)
+    if right <= left or bottom <= top:
+        return
+    sums = np.empty(right - left, np.float32)
+    a, b = left - corner_x, right - corner_x
+    for j in range(top, bottom):
+        sums[:] = 0
+        for s in range(4):
+            tables = grid[q + s, p : p + 4, j - corner_y, a:b]
+            w0, w1, w2, w3 = (
+                np.float32(wy[s] * wx0),
+                np.float32(wy[s] * wx1),
+                np.float32(wy[s] * wx2),
+                np.float32(wy[s] * wx3),
+            )
+            for i in range(sums.size):
+                sums[i] += w0 * tables[0, i] + w1 * tables[1, i] + w2 * tables[2, i] + w3 * tables[3, i]
+        row = patch[j, left:right]
+        for i in range(sums.size):
+            row[i] += electrons * sums[i]

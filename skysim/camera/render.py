@@ -1,0 +1,394 @@
+"""Sources over an exposure to mean photo-electrons a pixel. Smear lives here: everything is one time integral."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from skysim.camera.optics import Optics
+from skysim.camera.psf.kernel_cache import GAUSS, ROUND, Images, images
+from skysim.camera.psf.splat import add_gaussian, add_grid, add_round
+from skysim.core.errors import InputError
+from skysim.core.jit import jit
+from skysim.core.types import Floats, Mount, Sources, SourceTruth, Trajectory
+from skysim.sources.dome.led import Emitter, irradiance_e_s_m2, lit_moments_s
+
+STEP = 1.3  # of the image's sharpest feature (its sigma): how far it may move in one piece of the exposure
+MAX_PIECES = 100_000
+FEWEST, MOST = 9, 32_769  # poses of an exposure
+SHORT = 0.4  # strides up to which a path is one piece: 1e-4 of the peak
+STILL_PX = 1e-3  # an image that moves less stands still
+AT_ONCE = 1 << 20  # pixels of patches in one go, or as many as the frame has
+
+Hides = Callable[[Sources], NDArray[np.bool_]]  # which of N sources something stands before, (N,)
+
+
+class Window(NamedTuple):
+    """When the chip gathers light: the first row from open_s for exposure_s, each next row row_time_s later."""
+
+    open_s: float
+    exposure_s: float
+    row_time_s: float = 0.0
+
+    def close_s(self, rows: int) -> float:
+        """When the last of so many rows is closed."""
+        return self.open_s + self.exposure_s + self.row_time_s * (rows - 1)
+
+    def middle_s(self, rows: int) -> float:
+        """Mid-exposure of the middle row, to which the frame's truth belongs."""
+        return (self.open_s + self.close_s(rows)) / 2
+
+
+class Poses(NamedTuple):
+    """Where the camera stands at K times.
+
+    cam_from_lab : (K, 3, 3) matrices
+    camera_m     : (K, 3) entrance pupil in the lab
+    """
+
+    cam_from_lab: Floats
+    camera_m: Floats
+
+
+class Paths(NamedTuple):
+    """What every source does during the exposure, at K even moments: numba's side of the scene.
+
+    first_s, step_s : the moments
+    xy_px  : (K, N, 2) where its image is, NaN where it has none
+    rate_e_s : (K, N) photo-electrons a second, if it is lit
+    pulse_s  : (N, 3) period, start and duration of its pulses
+    """
+
+    first_s: float
+    step_s: float
+    xy_px: Floats
+    rate_e_s: Floats
+    pulse_s: Floats
+
+
+def render(
+    image: NDArray[Any],
+    sources: Sources,
+    optics: Optics,
+    trajectory: Trajectory,
+    mount: Mount,
+    window: Window,
+    emitter: Emitter | None = None,
+    hides: Hides | None = None,
+) -> SourceTruth:
+    """Add the mean photo-electrons of every source to the (H, W) image, in place; the truth of those that gave any.
+
+    Each image runs along its true path while it is lit. A piece of the exposure in which it moves by less than its
+    own blur is two points of light, placed where the light of that piece has its mean and variance (for steady
+    light Gauss's own two points). Energy and mean place are exact whatever the pulses, and a streak's profile
+    converges with the fourth power of the piece. In a rolling shutter every row has its own exposure.
+    """
+    rows = image.shape[0]
+    t_s = moments(window.open_s, window.close_s(rows), trajectory)
+    during = poses(trajectory, mount, t_s)
+    near = sources.take(in_view(sources, optics, Poses(*(part[:: len(t_s) // 8] for part in during))))
+    if hides:
+        near = near.take(~hides(near))
+    paths, distance_m, cos_in = follow(near, optics, during, t_s, emitter or Emitter())
+    middle_px = paths.xy_px[len(t_s) // 2]
+    shapes = images(optics.camera, middle_px, near.radius_m, near.place[:, 3] > 0, distance_m, cos_in)
+    stride = shapes._replace(sharp_px=STEP * shapes.sharp_px)
+    table = draw(image, paths, stride, window)
+    kept = table[:, 0] > 0
+    electrons, peak, x, y, squares, length = table[kept, :6].T
+    return SourceTruth(
+        id=near.id[kept],
+        xy_px=middle_px[kept],
+        flux_xy_px=np.column_stack([x, y]),
+        electrons=electrons,
+        peak_e=peak,
+        streak_px=length,
+        area_px=electrons**2 / squares,
+        peak_xy=table[kept, 6:8].astype(np.int64),
+        saturated=np.zeros(len(electrons), bool),  # the detector's to judge
+        snr=np.full(len(electrons), np.nan),
+    )
+
+
+def moments(open_s: float, close_s: float, trajectory: Trajectory) -> Floats:
+    """Even moments, as dense as the attitude's own samples; an odd number, so that one is in the middle.
+
+    Raises InputError for more samples than memory should hold: to leave some out could leave out the jitter.
+    """
+    first, last = np.searchsorted(trajectory.t_s, (open_s, close_s))
+    count = max(int(last - first) + 1, FEWEST) | 1
+    if count > MOST:
+        raise InputError(
+            f"exposure.time: {close_s - open_s:g} s holds {count} samples of the attitude; allowed: {MOST},"
+            " a shorter exposure or slower jitter"
+        )
+    return np.linspace(open_s, close_s, count)
+
+
+def poses(trajectory: Trajectory, mount: Mount, t_s: Floats) -> Poses:
+    """The camera's pose at K times."""
+    lab_from_body = trajectory.at(t_s).as_matrix()
+    cam_from_lab = mount.cam_from_body.as_matrix() @ lab_from_body.transpose(0, 2, 1)
+    return Poses(cam_from_lab, lab_from_body @ mount.camera_body_m)
+
+
+def follow(
+    sources: Sources, optics: Optics, poses: Poses, t_s: Floats, emitter: Emitter
+) -> tuple[Paths, Floats, Floats]:
+    """The paths of N sources, their mean distances (N,) in m (1 for stars) and mean cosines from the boresight."""
+    xy, distance_m, cos_out, cos_in = look(sources, optics, poses)
+    passed = optics.passed(cos_in)
+    rate = np.where(
+        sources.place[:, 3] > 0,
+        irradiance_e_s_m2(sources.strength, emitter, cos_out, passed, distance_m),
+        sources.strength * passed,
+    )
+    pulse_s = np.column_stack([sources.period_s, sources.start_s, sources.on_s])
+    paths = Paths(float(t_s[0]), float(t_s[1] - t_s[0]), xy, rate * optics.collecting_m2, pulse_s)
+    return paths, distance_m.mean(axis=0), cos_in.mean(axis=0)
+
+
+def look(sources: Sources, optics: Optics, poses: Poses) -> tuple[Floats, Floats, Floats, Floats]:
+    """Where each of N sources is seen from each of K poses.
+
+    Returns (K, N, 2) pixels, (K, N) distances in m (1 for stars), (K, N) cosines at the emitter and at the aperture.
+    """
+    offset = sources.place[None, :, :3] - sources.place[None, :, 3:] * poses.camera_m[:, None, :]
+    distance = np.sqrt(np.einsum("knj,knj->kn", offset, offset))
+    offset /= distance[:, :, None]
+    cos_out = -np.einsum("knj,nj->kn", offset, sources.normal)
+    toward = offset @ poses.cam_from_lab.transpose(0, 2, 1)
+    return optics.project(toward), distance, cos_out, toward[:, :, 2]
+
+
+def in_view(sources: Sources, optics: Optics, poses: Poses) -> NDArray[np.int64]:
+    """Rows of the sources within the field's circle from any of these poses, with a quarter more for images that
+    reach in from outside, and half of the largest turn between two poses for what passes between them."""
+    sight = np.ascontiguousarray(poses.cam_from_lab[:, 2])
+    turn = np.arccos(np.clip(np.sum(sight[1:] * sight[:-1], axis=1), -1, 1)).max(initial=0.0)
+    edge = math.cos(min(1.25 * optics.field_rad + 0.02 + turn / 2, math.pi))
+    return np.flatnonzero(_in_cone(sources.place, sight, np.ascontiguousarray(poses.camera_m), edge))
+
+
+@jit
+def _in_cone(place: Floats, sight: Floats, camera_m: Floats, edge: float) -> Any:
+    """(N,) whether a place's direction from any of K cameras has a cosine above `edge` with that one's sight."""
+    out = np.zeros(len(place), np.bool_)
+    for n in range(len(place)):
+        for k in range(len(sight)):
+            along, square = 0.0, 0.0
+            for i in range(3):
+                offset = place[n, i] - place[n, 3] * camera_m[k, i]
+                along += offset * sight[k, i]
+                square += offset * offset
+            if along > edge * math.sqrt(square):
+                out[n] = True
+                break
+    return out
+
+
+def draw(image: NDArray[Any], paths: Paths, shapes: Images, window: Window) -> Floats:
+    """Add every source to the image, some at a time, each first on a patch of its own.
+
+    Returns (N, 8): electrons that fell on the chip, those of the brightest pixel, flux-weighted mean x and y,
+    sum of the squares of the pixels, length of its path, and the brightest pixel's x and y. The mean is that of
+    the whole image, of the part on the chip alone in a rolling shutter, where no time is the same in all rows.
+    """
+    boxes = patches(paths.xy_px, shapes.reach_px, image.shape)
+    areas = (boxes[:, 1] - boxes[:, 0]) * (boxes[:, 3] - boxes[:, 2])
+    out = np.zeros((len(boxes), 8))
+    at_once = max(image.size, AT_ONCE)
+    first = 0
+    while first < len(boxes):
+        total = np.cumsum(areas[first:])
+        last = first + max(1, int(np.searchsorted(total, at_once, side="right")))
+        starts = np.concatenate([[0], total[: last - first]])
+        buffer = np.zeros(starts[-1])
+        _draw(buffer, starts, boxes[first:last], first, paths, shapes, window, out)
+        _deposit(image, buffer, starts, boxes[first:last])
+        first = last
+    return out
+
+
+def patches(xy_px: Floats, reach_px: Floats, shape: tuple[int, ...]) -> NDArray[np.int64]:
+    """(N, 4) first and last + 1 column, first and last + 1 row that an image can touch; empty where it misses."""
+    if not xy_px.shape[1]:
+        return np.zeros((0, 4), np.int64)
+    hidden = np.isnan(xy_px)
+    low = np.where(hidden, np.inf, xy_px).min(axis=0)
+    high = np.where(hidden, -np.inf, xy_px).max(axis=0)
+    jump = np.nan_to_num(np.abs(np.diff(xy_px, axis=0))).max(axis=0)
+    margin = reach_px[:, None] + 1 + jump / 4  # between two moments a curved path bulges
+    limit = np.array(shape[1::-1])
+    begin = np.clip(np.floor(low - margin), 0, limit)
+    end = np.clip(np.ceil(high + margin) + 1, begin, limit)
+    return np.column_stack([begin[:, 0], end[:, 0], begin[:, 1], end[:, 1]]).astype(np.int64)
+
+
+@jit(parallel=True)
+def _draw(
+    buffer: Any, starts: Any, boxes: Any, first: int, paths: Paths, shapes: Images, window: Window, out: Any
+) -> None:
+    for i in numba.prange(len(boxes)):
+        x0, x1, y0, y1 = boxes[i]
+        if x1 > x0 and y1 > y0:
+            patch = buffer[starts[i] : starts[i + 1]].reshape(y1 - y0, x1 - x0)
+            _expose(patch, x0, y0, first + i, paths, shapes, window, out[first + i])
+            _measure(patch, x0, y0, out[first + i])
+
+
+@jit
+def _expose(
+    patch: Any, x0: int, y0: int, n: int, paths: Paths, shapes: Images, window: Window, row: Any
+) -> None:
+    """One source on its patch; its light's mean place and its path's length into row[2:6]."""
+    whole = window.open_s + window.exposure_s
+    row[5] = _length(paths, n, window.open_s, whole)
+    if window.row_time_s == 0:
+        sums = _integrate(patch, 0, patch.shape[0], x0, y0, n, paths, shapes, window.open_s, whole)
+        if sums[0] > 0:
+            row[2], row[3] = sums[1] / sums[0], sums[2] / sums[0]
+        return
+    for j in range(patch.shape[0]):
+        late = (y0 + j) * window.row_time_s
+        _integrate(patch, j, j + 1, x0, y0, n, paths, shapes, window.open_s + late, whole + late)
+    row[2], row[3] = _mean_place(patch, x0, y0)
+
+
+@jit
+def _integrate(
+    patch: Any,
+    row0: int,
+    row1: int,
+    x0: int,
+    y0: int,
+    n: int,
+    paths: Paths,
+    shapes: Images,
+    begin_s: float,
+    end_s: float,
+) -> Any:
+    """Add the light of one source from begin to end to the rows [row0, row1) of its patch.
+
+    Returns the electrons of the whole image and their first moments in x and y.
+    """
+    total, total_x, total_y = 0.0, 0.0, 0.0
+    speed = _speed(paths, n, begin_s, end_s)
+    strides = speed * (end_s - begin_s) / shapes.sharp_px[n]
+    # One more than the strides, for a short path has no other pieces to share its ends' error with.
+    pieces = 1 if strides < SHORT else int(min(np.ceil(strides) + 1, MAX_PIECES))
+    for k in range(pieces):
+        a = begin_s + (end_s - begin_s) * k / pieces
+        b = begin_s + (end_s - begin_s) * (k + 1) / pieces
+        lit, mean, spread = lit_moments_s(a, b, paths.pulse_s[n, 0], paths.pulse_s[n, 1], paths.pulse_s[n, 2])
+        if lit <= 0:
+            continue
+        points = 1 if speed * spread < STILL_PX else 2
+        for p in range(points):
+            x, y, rate = _at(paths, n, mean + spread * (2 * p - points + 1))
+            electrons = rate * lit / points
+            if not electrons > 0:
+                continue
+            _stamp(patch, row0, row1, x - x0, y - y0, electrons, n, shapes)
+            total, total_x, total_y = total + electrons, total_x + electrons * x, total_y + electrons * y
+    return total, total_x, total_y
+
+
+@jit
+def _stamp(
+    patch: Any, row0: int, row1: int, x: float, y: float, electrons: float, n: int, shapes: Images
+) -> None:
+    """The image of a point of light, by its kind."""
+    begin, end, p, q = shapes.table[n]
+    if shapes.kind[n] == GAUSS:
+        add_gaussian(patch, row0, row1, x, y, electrons, shapes.sigma_px[n])
+    elif shapes.kind[n] == ROUND:
+        add_round(patch, row0, row1, x, y, electrons, shapes.tables[begin:end].reshape(p, q))
+    else:
+        add_grid(patch, row0, row1, x, y, electrons, shapes.tables[begin:end].reshape(p, p, q, q))
+
+
+@jit
+def _at(paths: Paths, n: int, t_s: float) -> Any:
+    """Pixel and rate of a source at any time: cubic through the four moments around it (Lagrange)."""
+    last = paths.xy_px.shape[0] - 4
+    u = (t_s - paths.first_s) / paths.step_s
+    k = min(max(int(u) - 1, 0), last)
+    u -= k
+    w0 = (u - 1) * (u - 2) * (u - 3) / -6
+    w1 = u * (u - 2) * (u - 3) / 2
+    w2 = u * (u - 1) * (u - 3) / -2
+    w3 = u * (u - 1) * (u - 2) / 6
+    xy, rate = paths.xy_px, paths.rate_e_s
+    x = w0 * xy[k, n, 0] + w1 * xy[k + 1, n, 0] + w2 * xy[k + 2, n, 0] + w3 * xy[k + 3, n, 0]
+    y = w0 * xy[k, n, 1] + w1 * xy[k + 1, n, 1] + w2 * xy[k + 2, n, 1] + w3 * xy[k + 3, n, 1]
+    e = w0 * rate[k, n] + w1 * rate[k + 1, n] + w2 * rate[k + 2, n] + w3 * rate[k + 3, n]
+    return x, y, (e if np.isfinite(x + y) else 0.0)
+
+
+@jit
+def _speed(paths: Paths, n: int, begin_s: float, end_s: float) -> float:
+    """The fastest that a source's image moves between two times, pixels a second."""
+    first = max(int((begin_s - paths.first_s) / paths.step_s), 0)
+    last = min(int(np.ceil((end_s - paths.first_s) / paths.step_s)), paths.xy_px.shape[0] - 1)
+    fastest = 0.0
+    for k in range(first, last):
+        dx = paths.xy_px[k + 1, n, 0] - paths.xy_px[k, n, 0]
+        dy = paths.xy_px[k + 1, n, 1] - paths.xy_px[k, n, 1]
+        fastest = max(fastest, np.hypot(dx, dy) / paths.step_s)  # a NaN is no greater
+    return fastest
+
+
+@jit
+def _length(paths: Paths, n: int, begin_s: float, end_s: float) -> float:
+    """Length of a source's path between two times, pixels, in as many chords as there are moments."""
+    chords = max(int(np.ceil((end_s - begin_s) / paths.step_s)), 8)
+    total = 0.0
+    x, y, _ = _at(paths, n, begin_s)
+    for k in range(chords):
+        x1, y1, _ = _at(paths, n, begin_s + (end_s - begin_s) * (k + 1) / chords)
+        chord = np.hypot(x1 - x, y1 - y)
+        total += chord if np.isfinite(chord) else 0.0
+        x, y = x1, y1
+    return total
+
+
+@jit
+def _measure(patch: Any, x0: int, y0: int, row: Any) -> None:
+    """Sum, peak, sum of squares and the peak's pixel of a finished patch."""
+    for j in range(patch.shape[0]):
+        for i in range(patch.shape[1]):
+            e = patch[j, i]
+            row[0] += e
+            row[4] += e * e
+            if e > row[1]:
+                row[1], row[6], row[7] = e, x0 + i, y0 + j
+
+
+@jit
+def _mean_place(patch: Any, x0: int, y0: int) -> Any:
+    """Centre of gravity of a patch; its corner if it is empty."""
+    total, x, y = 0.0, 0.0, 0.0
+    for j in range(patch.shape[0]):
+        for i in range(patch.shape[1]):
+            e = patch[j, i]
+            total, x, y = total + e, x + e * i, y + e * j
+    return (x0 + x / total, y0 + y / total) if total > 0 else (float(x0), float(y0))
+
+
+@jit
+def _deposit(image: Any, buffer: Any, starts: Any, boxes: Any) -> None:
+    """Add all patches to the image."""
+    for i in range(len(boxes)):
+        x0, x1, y0, y1 = boxes[i]
+        k, width = starts[i], x1 - x0
+        for j in range(y0, y1):
+            row, part = image[j, x0:x1], buffer[k : k + width]
+            for x in range(width):
+                row[x] += part[x]
+            k += width

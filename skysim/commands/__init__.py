@@ -1,1 +1,0 @@
-"""The commands. Thin: they check, call, show progress and print; heavy imports wait for their command."""

@@ -1,0 +1,3 @@
+"""Array types, errors, units, paths, compiled loops, and careful reading and writing of files. Imports
+nothing else of skysim.
+"""

@@ -1,0 +1,189 @@
+"""Atomic writes of files and folders, tables, images and JSON."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import json
+import os
+import platform
+import re
+import shutil
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from skysim.core.errors import InputError
+
+HOST = f"{zlib.crc32(platform.node().encode()):08x}"  # for folders that machines share
+
+NAME = re.compile(rf"\..+\.skysim-{HOST}-(\d{{1,9}})(\.\w+)?")
+
+WRITING: set[Path] = set()  # by this process
+
+
+@contextlib.contextmanager
+def being_written(path: Path) -> Iterator[Path]:
+    """A hidden name beside `path` that tells who writes, for a file or a folder; what is there at the end vanishes."""
+    temporary = path.with_name(f".{path.stem}.skysim-{HOST}-{os.getpid()}{path.suffix}")
+    WRITING.add(temporary.absolute())
+    try:
+        yield temporary
+    finally:
+        remove(temporary)
+        WRITING.discard(temporary.absolute())
+
+
+def sweep(folder: Path) -> None:
+    """Remove what processes of this machine that are no more were writing there."""
+    for path in folder.glob(".*.skysim-*"):
+        told = NAME.fullmatch(path.name)
+        if told and not lives(int(told[1]), path):
+            with contextlib.suppress(OSError):  # who may not, will be told as soon as something is written
+                remove(path)
+
+
+def lives(pid: int, path: Path) -> bool:
+    """Whether the process that was writing a file still may. Our own number may have been another's before us."""
+    if pid == os.getpid():
+        return path.absolute() in WRITING
+    if os.name != "posix":  # where there is no asking
+        return True
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:  # it is somebody else's
+        return True
+    return True
+
+
+def remove(path: Path) -> None:
+    """A file or a folder, if it is there."""
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        path.unlink(missing_ok=True)
+
+
+@contextmanager
+def naming(path: Path) -> Iterator[None]:
+    """Whatever cannot be written is told of `path`, in the system's own words for why.
+
+    Some libraries tell neither which file nor, of a full disk, what is wrong in a line.
+    """
+    try:
+        yield
+    except OSError as error:
+        full = error.errno in (None, errno.ENOSPC, errno.EDQUOT) and "space" in str(error).lower()
+        number = errno.ENOSPC if full else error.errno
+        if number is None:
+            raise
+        raise OSError(number, os.strerror(number), str(path)) from error
+
+
+@contextmanager
+def whole(path: Path) -> Iterator[Path]:
+    """A temporary name beside `path` that becomes it once everything is written, or vanishes."""
+    with being_written(path) as temporary, naming(path):
+        yield temporary
+        os.replace(temporary, path)
+
+
+@contextmanager
+def whole_folder(path: Path) -> Iterator[Path]:
+    """`whole` of a folder: a temporary one beside `path` that takes its place, whatever was there."""
+    aside = path.with_name(f"{path.stem}.old{path.suffix}")
+    with being_written(path) as temporary, being_written(aside) as old, naming(path):
+        yield temporary
+        # Put aside at once and removed at leisure: an interrupt finds the one or the other.
+        if path.exists():
+            path.rename(old)
+        temporary.rename(path)
+
+
+def make_folder(path: Path) -> Path:
+    """The folder, made if it is not there, without what a killed process of ours left half-written.
+
+    Raises InputError where that cannot be.
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be made a folder: {error.strerror}") from error
+    sweep(path)
+    return path
+
+
+def write_png16(path: Path, image_dn: NDArray) -> None:
+    """16-bit PNG of the digital numbers themselves; a noise-free frame is rounded."""
+    numbers = np.clip(np.rint(image_dn), 0, 65535).astype(np.uint16)
+    write_image(path, numbers)
+
+
+PLAIN = (cv2.IMWRITE_TIFF_COMPRESSION, cv2.IMWRITE_TIFF_COMPRESSION_NONE)  # some readers know no other
+
+
+def write_image(path: Path, image: NDArray) -> None:
+    """An image by the name's ending. Raises InputError if it cannot be encoded, OSError if it cannot be written.
+
+    OpenCV encodes in memory: of a file that it cannot write it would not tell why.
+    """
+    try:
+        done, coded = cv2.imencode(path.suffix, image, PLAIN if path.suffix == ".tif" else ())
+    except cv2.error:
+        done = False
+    if not done:
+        raise InputError(f"{path}: an image of {image.dtype} and shape {image.shape} cannot be encoded so")
+    with whole(path) as temporary:
+        temporary.write_bytes(coded.data)
+
+
+def write_table(path: Path, table: Any) -> None:
+    """An astropy table as ECSV."""
+    with whole(path) as temporary:
+        table.write(temporary, format="ascii.ecsv", overwrite=True)
+
+
+def header_numbers(path: Path, meta: dict[str, Any], key: str, count: int) -> list[float]:
+    """So many finite numbers under a key of an ECSV's header; what a size or focal length is, is above 0."""
+    try:
+        numbers = np.atleast_1d(np.array(meta.get(key), dtype=float))
+    except (TypeError, ValueError):
+        numbers = np.array([np.nan])
+    positive = key in ("size_px", "focal_px")
+    if numbers.shape != (count,) or not np.isfinite(numbers).all() or (positive and numbers.min() <= 0):
+        what = f"{count} finite number{'s' if count > 1 else ''}{' above 0' if positive else ''}"
+        raise InputError(f"{path}: {key} in the header is {meta.get(key)!r}; allowed: {what}")
+    return [float(number) for number in numbers]
+
+
+def write_text(path: Path, text: str) -> None:
+    with whole(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def write_bytes(path: Path, data: bytes) -> None:
+    with whole(path) as temporary:
+        temporary.write_bytes(data)
+
+
+def to_json(data: Any) -> str:
+    """JSON with null for what is not a number."""
+
+    def plain(value: Any) -> Any:
+        if isinstance(value, dict):
+            return {key: plain(item) for key, item in value.items()}
+        if isinstance(value, list | tuple):
+            return [plain(item) for item in value]
+        if isinstance(value, np.generic):
+            value = value.item()
+        return None if isinstance(value, float) and not np.isfinite(value) else value
+
+    return json.dumps(plain(data), indent=1, allow_nan=False)

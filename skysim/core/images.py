@@ -1,0 +1,292 @@
+"""Image files: FITS, PNG, TIFF, JPEG and BMP, and frames of a live camera, read with limits on their size."""
+
+from __future__ import annotations
+
+import contextlib
+import datetime
+import os
+import struct
+import sys
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from itertools import islice
+from math import prod
+from pathlib import Path
+from typing import BinaryIO
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from skysim.core.errors import InputError
+
+FITS_SUFFIXES = (".fits", ".fit", ".fts")
+BEGINS = b"SIMPLE  ="  # what is packed (gzip, zip and others) does not: astropy would unpack it
+MOST_HDUS = 1000  # in which an image is looked for
+
+
+@contextmanager
+def opened(path: Path) -> Iterator[BinaryIO]:
+    """The file for astropy, whose warnings are errors within: past them it may walk a damaged file for ever."""
+    from astropy.utils.exceptions import AstropyWarning
+
+    with path.open("rb") as file, warnings.catch_warnings():
+        warnings.simplefilter("error", AstropyWarning)  # "file may have been truncated" is one
+        if file.read(len(BEGINS)) != BEGINS:
+            raise InputError(
+                f"{path}: not a whole FITS file: allowed: one that begins with SIMPLE, not packed"
+            )
+        file.seek(0)
+        yield file
+
+
+def read_fits(path: Path) -> NDArray:
+    """The pixels of the first image, in the machine's byte order. Raises InputError with one line."""
+    from astropy.io import fits
+
+    try:
+        with opened(path) as file, fits.open(file, memmap=False) as hdus:
+            for hdu in islice(hdus, MOST_HDUS):
+                # By the header, before the data is read or skipped.
+                check_pixels(path, *map(int, getattr(hdu, "shape", ()) or ()))
+                check_pixels(path, int(hdu.size) // 8)
+                if getattr(hdu, "is_image", False) and hdu.header.get("NAXIS", 0) > 0:
+                    return np.ascontiguousarray(hdu.data.astype(hdu.data.dtype.newbyteorder("=")))
+    except InputError:
+        raise
+    except Exception as error:  # astropy meets a damaged header with whatever it stumbles over, KeyError too
+        raise InputError(f"{path}: not a whole FITS file: {' '.join(str(error).split())}") from None
+    raise InputError(f"{path}: a FITS file without an image")
+
+
+def date_of(path: Path) -> datetime.datetime | None:
+    """DATE-OBS of a FITS file; None for other files and other headers."""
+    if path.suffix.lower() not in FITS_SUFFIXES:
+        return None
+    from astropy.io import fits
+
+    try:
+        with opened(path) as file:
+            return datetime.datetime.fromisoformat(str(fits.getheader(file).get("DATE-OBS")))
+    except Exception:  # as in `read_fits`, where it is told
+        return None
+
+
+class LiveCamera:
+    """An open camera, frame after frame."""
+
+    def __init__(self, source: str) -> None:
+        self.source, self.taken = source, 0
+        with silent_opencv():
+            self.capture = cv2.VideoCapture(int(source) if source.isdigit() else source)
+            self.capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # the newest frame, not one of a while ago
+
+    def frame(self) -> NDArray:
+        """The next frame, (H, W) or (H, W, 3). Raises InputError where none comes."""
+        with silent_opencv():
+            there, frame = self.capture.read()
+        if not there or frame is None:
+            if self.taken:
+                raise InputError(f"{self.source}: ends after {self.taken} frames")
+            raise InputError(
+                f"{self.source}: no camera answers there; allowed: an index such as 0, a video file, an address"
+            )
+        self.taken += 1
+        return np.asarray(frame)
+
+    def close(self) -> None:
+        """Leave it to others."""
+        self.capture.release()
+
+
+def grab(source: str) -> NDArray:
+    """One frame of a camera, (H, W) or (H, W, 3). Raises InputError where there is none."""
+    with contextlib.closing(LiveCamera(source)) as camera:
+        return camera.frame()
+
+
+@contextlib.contextmanager
+def silent_opencv() -> Iterator[None]:
+    """Without what OpenCV says by itself of a camera that is not there."""
+    before = cv2.utils.logging.getLogLevel()
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    try:
+        yield
+    finally:
+        cv2.utils.logging.setLogLevel(before)
+
+
+MOST_PX = 1 << 28
+MOST_BYTES = 8 * MOST_PX  # of a file: each pixel a double
+DEFLATE = 1032  # times as many bytes come out of it at most (zlib's technical details)
+SEGMENTS = 1000  # of a JPEG before its picture
+ALONE = (0x01, *range(0xD0, 0xD8))  # TEM and RST: marks without a length
+
+# TIFF: types of a whole number, 8, 16, 32 and 64 bits, and signed ones, which libtiff takes for a size as well (below 0
+# it does not, and we see more than is allowed); tags of width, height and samples of a pixel.
+WHOLE = {1: "B", 3: "H", 4: "I", 16: "Q", 6: "B", 8: "H", 9: "I", 17: "Q"}
+WIDTH_TAG, HEIGHT_TAG, SAMPLES_TAG = 256, 257, 277
+
+
+def read_picture(path: Path) -> NDArray:
+    """The pixels as they are, (H, W) or (H, W, channels). Raises InputError with one line."""
+    data = path.read_bytes()
+    check_picture(path, data)
+    try:
+        with silent_stderr():
+            image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error as error:
+        raise InputError(f"{path}: cannot be decoded: {' '.join(str(error).split())}") from None
+    if image is None:
+        raise InputError(f"{path}: cannot be decoded; it may be truncated or not an image")
+    return image
+
+
+@contextmanager
+def silent_stderr() -> Iterator[None]:
+    """Keep C libraries quiet: libpng and OpenCV print their complaints on file descriptor 2 themselves."""
+    sys.stderr.flush()
+    kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(nowhere, 2)
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(nowhere)
+
+
+def check_pixels(path: Path, *sides: int) -> None:
+    """Raise InputError for more pixels than MOST_PX."""
+    if prod(sides) > MOST_PX:
+        size = "x".join(map(str, sides)) if len(sides) < 5 else f"{prod(sides):.3g}"
+        raise InputError(f"{path}: {size} pixels by its header; allowed: up to {MOST_PX}")
+
+
+def check_bytes(path: Path) -> None:
+    """Raise InputError for a file greater than the greatest picture."""
+    held = path.stat().st_size
+    if held > MOST_BYTES:
+        raise InputError(f"{path}: {held} bytes; allowed: up to {MOST_BYTES}")
+
+
+def check_picture(path: Path, data: bytes) -> None:
+    """Raise InputError unless these are the bytes of a PNG, TIFF, JPEG or BMP file of no more pixels than allowed."""
+    read = next((told for magic, told in FORMATS.items() if data.startswith(magic)), None)
+    try:
+        sizes = list(read(data)) if read else []
+    except (struct.error, OverflowError):  # it ends within its header, or is told to go on beyond memory
+        sizes = []
+    if not sizes:
+        raise InputError(f"{path}: cannot be decoded; it may be truncated or not an image")
+    for sides in sizes:
+        check_pixels(path, *sides)
+
+
+Sizes = Iterator[tuple[int, ...]]
+
+
+def png(data: bytes) -> Sizes:
+    """The first chunk is IHDR (PNG, section 11.2.2). None where more rows or a longer chunk are told than there can be.
+
+    OpenCV takes the memory for a chunk before it reads it.
+    """
+    width, height, bits = struct.unpack_from(">IIB", data, 16)
+    at, kind = 8, b""
+    while kind != b"IEND" and at < len(data):
+        length, kind = struct.unpack_from(">I4s", data, at)
+        at += 12 + length
+    held = at <= len(data) and height * (1 + width * bits // 8) <= DEFLATE * len(data)
+    if held or width * height > MOST_PX:  # of so many the caller tells
+        yield width, height
+
+
+def bmp(data: bytes) -> Sizes:
+    """The old header of 12 bytes has 16-bit sizes; a negative height is a picture that begins at its top."""
+    old = struct.unpack_from("<I", data, 14)[0] == 12
+    width, height = struct.unpack_from("<HH" if old else "<ii", data, 18)
+    yield abs(width), abs(height)
+
+
+def jpeg(data: bytes) -> Sizes:
+    """Every start of a frame (SOF, ITU-T T.81, B.2.2) before the first scan.
+
+    Between segments libjpeg passes over what is none; we read no further.
+    """
+    at = 2
+    for _ in range(SEGMENTS):
+        while data[at : at + 2] == b"\xff\xff":  # fill bytes
+            at += 1
+        mark, kind, length = struct.unpack_from(">BBH", data, at)
+        if mark != 0xFF or kind in (0x00, 0xDA):
+            return
+        if kind in ALONE:
+            at += 2
+            continue
+        if 0xC0 <= kind <= 0xCF and kind not in (0xC4, 0xC8, 0xCC):
+            height, width = struct.unpack_from(">HH", data, at + 5)
+            yield width, height
+        at += 2 + length
+
+
+def tiff(data: bytes) -> Sizes:
+    """The first directory (TIFF 6.0, section 2), or BigTIFF's. The greatest of a tag that is there twice.
+
+    Here alone a sample may have eight bytes, as a pixel of the other formats has at most.
+    """
+    order = "<" if data.startswith(b"II") else ">"
+    big = struct.unpack_from(order + "H", data, 2)[0] == 43
+    (at,) = struct.unpack_from(order + ("Q" if big else "I"), data, 8 if big else 4)
+    (count,) = struct.unpack_from(order + ("Q" if big else "H"), data, at)
+    entry, head, value = (20, 8, 12) if big else (12, 2, 8)
+    sides = {WIDTH_TAG: 0, HEIGHT_TAG: 0, SAMPLES_TAG: 1}
+    for n in range(min(count, 1 << 16)):
+        begin = at + head + n * entry
+        tag, kind = struct.unpack_from(order + "HH", data, begin)
+        if tag in sides and kind in WHOLE:
+            told = struct.unpack_from(order + WHOLE[kind], data, begin + value)[0]
+            sides[tag] = max(sides[tag], told)
+    if all(sides.values()):
+        width, height, samples = sides.values()
+        yield (width, height, samples) if samples > 1 else (width, height)
+
+
+FORMATS: dict[bytes, Callable[[bytes], Sizes]] = {
+    b"\x89PNG\r\n\x1a\n": png,
+    b"\xff\xd8\xff": jpeg,
+    b"BM": bmp,
+    **dict.fromkeys((b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"), tiff),
+}
+
+IMAGE_SUFFIXES = (*FITS_SUFFIXES, ".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp")
+
+
+def read_image(path: Path) -> NDArray:
+    """The pixels of a FITS, PNG, TIFF, JPEG or BMP file as they are: (H, W) or (H, W, channels).
+
+    Raises InputError with one line for a file that is missing, truncated, no image, or of more pixels than are
+    allowed.
+    """
+    if not path.is_file():
+        raise InputError(f"{path}: no such file")
+    if path.suffix.lower() not in IMAGE_SUFFIXES:
+        raise InputError(f"{path}: not an image by its name; allowed: {', '.join(IMAGE_SUFFIXES)}")
+    check_bytes(path)
+    image = read_fits(path) if path.suffix.lower() in FITS_SUFFIXES else read_picture(path)
+    if image.dtype.kind not in "uif":
+        raise InputError(f"{path}: pixels of type {image.dtype}; allowed: integers and floats")
+    return image
+
+
+def monochrome(image: NDArray) -> NDArray:
+    """Luminance of a colour picture (its alpha channel aside); a monochrome one as it is."""
+    if image.ndim == 2:
+        return image
+    if image.ndim != 3 or image.shape[2] not in (1, 3, 4):
+        raise InputError(
+            f"an image of shape {image.shape}; allowed: (height, width) and colour with 3 or 4 channels"
+        )
+    if image.shape[2] == 1:
+        return np.ascontiguousarray(image[:, :, 0])
+    return cv2.cvtColor(np.ascontiguousarray(image[:, :, :3]), cv2.COLOR_BGR2GRAY)

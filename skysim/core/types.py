@@ -1,0 +1,243 @@
+"""What flows from room to room: frozen arrays with their shapes, frames and units."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from skysim.core.quaternion import along
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Mount:
+    """Where the camera sits on the vehicle.
+
+    camera_body_m : (3,) entrance pupil in the body frame, whose origin is the bearing centre
+    cam_from_body : rotation of the body frame into the camera frame (+x right, +y down, +z boresight)
+    """
+
+    camera_body_m: Floats
+    cam_from_body: Rotation
+
+
+@dataclass(frozen=True, slots=True)
+class Trajectory:
+    """The vehicle's attitude history, sampled finely enough to be interpolated.
+
+    t_s             : (N,) strictly increasing
+    lab_from_body   : N rotations
+    rate_body_rad_s : (N, 3) angular velocity of body in lab, in body axes
+    """
+
+    t_s: Floats
+    lab_from_body: Rotation
+    rate_body_rad_s: Floats
+    _between: list[tuple[Floats, Floats]] = field(init=False, repr=False, default_factory=list)
+
+    @classmethod
+    def at_rest(cls, lab_from_body: Rotation, end_s: float) -> Trajectory:
+        """One attitude from 0 to end_s."""
+        both = Rotation.concatenate([lab_from_body, lab_from_body])
+        return cls(np.array([0.0, end_s]), both, np.zeros((2, 3)))
+
+    def between(self) -> tuple[Floats, Floats]:
+        """Attitudes (N, 4) as wxyz and (N - 1, 3, 3) what `quaternion.along` takes; worked out once, when asked."""
+        if not self._between:
+            step = np.diff(self.t_s)[:, None]
+            turn = (self.lab_from_body[:-1].inv() * self.lab_from_body[1:]).as_rotvec()
+            begin, end = self.rate_body_rad_s[:-1] * step, self.rate_body_rad_s[1:] * step
+            # d(rotvec)/dt = omega + rotvec x omega / 2 + ...: the body rate seen from the sample before.
+            end = end + np.cross(turn, end) / 2
+            wxyz = self.lab_from_body.as_quat(scalar_first=True)
+            self._between.append((wxyz, np.stack([turn, begin, end], axis=1)))
+        return self._between[0]
+
+    def at(self, t_s: float | Floats) -> Rotation:
+        """lab_from_body at any time inside the history.
+
+        Cubic Hermite in the rotation vector from the sample before, with both ends' rates: exact to fourth
+        order in the step. Raises ValueError outside the history.
+        """
+        t = np.atleast_1d(np.asarray(t_s, dtype=float))
+        if t.min() < self.t_s[0] - 1e-9 or t.max() > self.t_s[-1] + 1e-9:
+            raise ValueError(
+                f"time {t.min():.6f}..{t.max():.6f} s is outside {self.t_s[0]}..{self.t_s[-1]} s"
+            )
+        k = np.minimum(np.maximum(np.searchsorted(self.t_s, t, side="right") - 1, 0), len(self.t_s) - 2)
+        share = (t - self.t_s[k]) / (self.t_s[k + 1] - self.t_s[k])
+        here = Rotation.from_quat(along(*self.between(), k, share), scalar_first=True)
+        return here if np.ndim(t_s) else here[0]
+
+    def rate_at(self, t_s: float) -> Floats:
+        """(3,) angular velocity in body axes, linear between the samples."""
+        return np.array([np.interp(t_s, self.t_s, rate) for rate in self.rate_body_rad_s.T])
+
+
+@dataclass(frozen=True, slots=True)
+class Telemetry:
+    """What the vehicle did and believed at K ticks of its computer; None where it has no such thing.
+
+    t_s             : (K,); period_s between them
+    lab_from_body   : K, the truth, without what jitter lays over it; rate_body_rad_s (K, 3) likewise
+    lab_from_ref    : K, what it was told
+    torque_nm       : (K, 3) what the controller asked for, in body axes
+    disturbance_nm  : (K, 3) what disturbed it, gravity, drag, spring and actuators apart
+    momentum_nms    : (K, 3) stored in wheels and CMGs, in body axes
+    wheel_rad_s, gimbal_rad : (K, n)
+    joints          : (K, nq) all joints as MuJoCo has them, for pictures
+    manipulability  : (K,) of the CMGs: 1 far from a singularity, 0 at one
+    lab_from_imu    : K, the navigator's attitude
+    saturated       : (K,) whether the gyros were at their limit in the tick before
+    bias_rad_s      : (K, 3) what the gyros show too much: bias, scale, misalignment, the Earth if nobody allows for it
+    lab_from_filter : K, the filter's attitude, its standard deviation (K, 3) about the body's axes, the bias that it
+                      believes (K, 3) and that one's
+    """
+
+    t_s: Floats
+    period_s: float
+    lab_from_body: Rotation
+    rate_body_rad_s: Floats
+    torque_nm: Floats
+    disturbance_nm: Floats
+    momentum_nms: Floats
+    wheel_rad_s: Floats
+    gimbal_rad: Floats
+    joints: Floats
+    manipulability: Floats | None = None
+    lab_from_ref: Rotation | None = None
+    lab_from_imu: Rotation | None = None
+    saturated: NDArray[np.bool_] | None = None
+    bias_rad_s: Floats | None = None
+    lab_from_filter: Rotation | None = None
+    sigma_attitude_rad: Floats | None = None
+    believed_bias_rad_s: Floats | None = None
+    sigma_bias_rad_s: Floats | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Sources:
+    """Everything that shines, stars and LEDs alike, in lab axes.
+
+    id         : (N,) Hipparcos number or LED number
+    place      : (N, 4) homogeneous: (direction, 0) for a star at infinity, (x, y, z in m, 1) for an LED
+    normal     : (N, 3) unit normal of the emitting disc; zeros for a star
+    radius_m   : (N,) radius of the emitting disc; 0 for a star
+    strength   : (N,) in photo-electrons, that is photons weighed with the chip's quantum efficiency at each
+                 wavelength: star: e- s^-1 m^-2 at the aperture; LED: e- s^-1 sr^-1 along its normal. How it falls
+                 off with angle and distance is the dome's (`led.Emitter`)
+    period_s, start_s, on_s : (N,) pulse train: lit from start_s for on_s in every period_s
+    magnitude  : (N,) V magnitude of a star; NaN for an LED
+    """
+
+    id: NDArray[np.int64]
+    place: Floats
+    normal: Floats
+    radius_m: Floats
+    strength: Floats
+    period_s: Floats
+    start_s: Floats
+    on_s: Floats
+    magnitude: Floats
+
+    def __len__(self) -> int:
+        return len(self.id)
+
+    def take(self, which: NDArray[Any]) -> Sources:
+        """The chosen sources, by mask or index."""
+        return Sources(*(getattr(self, name)[which] for name in self.__slots__))
+
+
+@dataclass(frozen=True, slots=True)
+class SourceTruth:
+    """The truth of every source that put light on the frame.
+
+    id           : (N,)
+    xy_px        : (N, 2) pixel at mid-exposure, in a rolling shutter the middle row's
+    flux_xy_px   : (N, 2) flux-weighted mean pixel over the exposure
+    electrons    : (N,) mean photo-electrons that fell on the chip
+    peak_e       : (N,) mean electrons in the source's brightest pixel
+    streak_px    : (N,) path length over the exposure, in a rolling shutter the first row's
+    area_px      : (N,) noise-equivalent area (sum s)^2 / sum s^2 of its image
+    peak_xy      : (N, 2) the brightest pixel
+    saturated    : (N,) whether that pixel is expected full
+    snr          : (N,) signal to noise of its electrons over that area, as if no well were full
+    """
+
+    id: NDArray[np.int64]
+    xy_px: Floats
+    flux_xy_px: Floats
+    electrons: Floats
+    peak_e: Floats
+    streak_px: Floats
+    area_px: Floats
+    peak_xy: NDArray[np.int64]
+    saturated: NDArray[np.bool_]
+    snr: Floats
+
+
+@dataclass(frozen=True, slots=True)
+class Truth:
+    """What the frame was made from.
+
+    t_s           : mid-exposure, seconds from the scene's start
+    lab_from_body : attitude at mid-exposure
+    cam_from_lab  : the camera's attitude at mid-exposure
+    rate_cam_rad_s: (3,) angular velocity in camera axes
+    seen          : the sources on the frame
+    hidden        : (M,) ids of those that would be on it at mid-exposure, had something not stood in the way
+    """
+
+    t_s: float
+    lab_from_body: Rotation
+    cam_from_lab: Rotation
+    rate_cam_rad_s: Floats
+    seen: SourceTruth
+    hidden: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """One camera frame: image_dn (H, W), uint16 from a detector or float64 when every noise is off."""
+
+    index: int
+    image_dn: NDArray[Any]
+    t_mid_s: float
+    exposure_s: float
+    saturation_dn: float
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One frame of a run as people read it: angles in degrees, errors in arcseconds, times in ms.
+
+    truth_deg, estimate_deg : (RA, Dec, roll) of the camera under the stars, (roll, pitch, yaw) of the vehicle
+        under the dome
+    wrong : solved, and more than ten arc-minutes off
+    cross_sigma_arcsec, roll_sigma_arcsec : what the tracker claims of its errors; log10_chance : of its matches
+    filter : what the attitude filter made of it in flight; empty where there is none
+    """
+
+    frame: int
+    t_s: float
+    rate_deg_s: float
+    status: str
+    truth_deg: tuple[float, float, float]
+    estimate_deg: tuple[float, float, float] | None
+    cross_arcsec: float
+    roll_arcsec: float
+    detected: int
+    matched: int
+    rms_px: float
+    time_ms: float
+    wrong: bool
+    filter: str = ""
+    cross_sigma_arcsec: float = float("nan")
+    roll_sigma_arcsec: float = float("nan")
+    log10_chance: float = float("nan")
+    exposure_s: float = float("nan")

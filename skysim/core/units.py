@@ -1,0 +1,126 @@
+"""Values with their units, read from YAML; the base of every section of a file.
+
+Two rules name every key. A key whose value carries its own unit has none in its name (`focal_length: "35 mm"`);
+a key whose value is a bare number ends in its unit (`tilt_stop_deg: 30`). In Python the former gains the SI
+suffix (`camera.focal_length_m`), so that a unit is always in sight.
+"""
+
+from __future__ import annotations
+
+import datetime
+import itertools
+import math
+import re
+from collections.abc import Callable, Mapping, Sequence
+from typing import Annotated, Any
+
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
+
+LONGEST = 80  # a quantity
+UNIT_FOLLOWS = r"^\s*[-+.]?\d.*[a-zA-Z]"  # what editors can tell of a quantity
+
+# Only what a quantity parser fills: `dark_e_s` and `rate_deg_s` are bare numbers and keep their unit.
+SI_SUFFIX = re.compile(
+    r"(?<!_deg)(?<!_rad)(?<!_e)(?<!^e)(?<!_cm2)(?<!_um)_(m|s|n|kg|kg_m|kg_m2|cd|w_sr|nm|nm_rad|nms|nms2)$"
+)
+
+
+def in_utc(moment: datetime.datetime) -> datetime.datetime:
+    """The moment in UTC, without a zone; one that has no zone is in UTC."""
+    return moment if moment.tzinfo is None else moment.astimezone(datetime.UTC).replace(tzinfo=None)
+
+
+def quantity(si_unit: str, what: str, examples: str) -> Callable[[Any], float]:
+    """A validator that turns a quantity such as "48 in" into a float in `si_unit`."""
+
+    def parse(value: Any) -> float:
+        if not isinstance(value, str):
+            raise ValueError(f"{value!r} has no unit; allowed: a {what} such as {examples}")
+        try:
+            return in_si(value, si_unit)
+        except (TypeError, ValueError) as error:  # astropy's UnitsError is a ValueError
+            raise ValueError(f"{value!r} is not a {what}; allowed: a {what} such as {examples}") from error
+
+    return parse
+
+
+def with_unit(si_unit: str, what: str, examples: str) -> BeforeValidator:
+    """`quantity` for a key of a section; editors are told that it is a text."""
+    told = Field(description=f"a {what} such as {examples}", pattern=UNIT_FOLLOWS)
+    return BeforeValidator(quantity(si_unit, what, examples), json_schema_input_type=Annotated[str, told])
+
+
+def in_si(value: str, si_unit: str | None = None) -> float:
+    """A quantity such as "48 in" in that unit, or in its own of the SI. Raises ValueError or TypeError."""
+    from astropy import units
+
+    # astropy spells it `inch`; the lab writes `in`.
+    inch = units.def_unit("in", units.imperial.inch)
+    if len(value) > LONGEST:
+        raise ValueError(f"{len(value)} characters are no quantity")
+    with units.add_enabled_units([inch, units.imperial]):
+        try:
+            told = units.Quantity(value)
+            return float(told.to_value(si_unit) if si_unit else told.si.value)
+        except ArithmeticError as error:  # "3 m(1/0)", "3 m(9e9)"
+            raise ValueError(str(error)) from None
+
+
+def finite(value: float) -> float:
+    if not math.isfinite(value):
+        raise ValueError(f"{value} is not a finite number")
+    return value
+
+
+INCH_M = 0.0254
+ARCSEC_RAD = math.pi / 180 / 3600
+RPM_RAD_S = math.pi / 30  # rad/s of one revolution a minute
+Number = Annotated[float, AfterValidator(finite)]
+Length = Annotated[Number, with_unit("m", "length", '"35 mm" or "48 in"')]
+Time = Annotated[Number, with_unit("s", "time", '"40 ms" or "1000 us"')]
+Mass = Annotated[Number, with_unit("kg", "mass", '"80 kg"')]
+Inertia = Annotated[Number, with_unit("kg m2", "moment of inertia", '"6.0 kg m2"')]
+Intensity = Annotated[Number, with_unit("cd", "luminous intensity", '"7.7 mcd"')]
+RadiantIntensity = Annotated[Number, with_unit("W sr-1", "radiant intensity", '"3 mW/sr"')]
+Torque = Annotated[Number, with_unit("N m", "torque", '"0.5 N m"')]
+Force = Annotated[Number, with_unit("N", "force", '"0.5 N"')]
+Momentum = Annotated[Number, with_unit("N m s", "angular momentum", '"2 N m s"')]
+Damping = Annotated[Number, with_unit("N m s", "torque per rate", '"1e-4 N m s"')]
+QuadraticDrag = Annotated[Number, with_unit("N m s2", "torque per squared rate", '"0.01 N m s2"')]
+Stiffness = Annotated[Number, with_unit("N m rad-1", "torque per angle", '"1e-3 N m / rad"')]
+Imbalance = Annotated[Number, with_unit("kg m", "mass times offset", '"1 g cm"')]
+SemiAxis = Annotated[Length, Field(gt=0)]
+Spin = Annotated[Number, Field(ge=-360, le=360)]
+Triple = tuple[Number, Number, Number]
+Angles = tuple[Number, Number, Number]
+Share = Annotated[Number, Field(ge=0, le=1)]
+Positive = Annotated[Number, Field(gt=0)]
+NotNegative = Annotated[Number, Field(ge=0)]
+Ascending = Annotated[tuple[Number, ...], Field(min_length=2)]
+
+
+class ConfigModel(BaseModel):
+    """Base of every section: frozen, no unknown keys, units out of the YAML names."""
+
+    model_config = ConfigDict(
+        extra="forbid",
+        frozen=True,
+        validate_by_alias=True,
+        validate_by_name=False,
+        alias_generator=lambda name: SI_SUFFIX.sub("", name),
+    )
+
+
+def require_member(value: str, allowed: Mapping[str, Any]) -> str:
+    """The value, if it is a key of `allowed`."""
+    if value not in allowed:
+        raise ValueError(f"{value!r} is none of {', '.join(allowed)}")
+    return value
+
+
+def check_table(angle_deg: Sequence[float], values: Sequence[float], name: str) -> None:
+    """Refuse two columns that are no function of an ascending angle."""
+    if len(angle_deg) != len(values):
+        raise ValueError(f"angle_deg has {len(angle_deg)} numbers, {name} {len(values)}")
+    if any(b <= a for a, b in itertools.pairwise(angle_deg)):
+        raise ValueError("angle_deg does not ascend")

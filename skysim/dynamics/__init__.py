@@ -1,0 +1,3 @@
+"""Torques to attitude: guidance, control, actuators, disturbances and the IMU. Only `multibody` imports
+MuJoCo.
+"""

@@ -1,0 +1,323 @@
+"""The vehicle computer's side of wheels, fans and gyros: their geometry and what is commanded of them.
+
+MuJoCo turns the rotors. Here every vector is in body axes and a set's n members are the columns of (3, n). A torque
+asked for is one on the body; what the set stores changes by its opposite. What is stored also acts on a turning body,
+with -rate x h; that is none of the actuators' business: the controller asks for +rate x h on top of what it wants.
+
+The inertia that answers to the torque is that of the body without what its rotors have about their axles, which a
+motor's torque or a free axle leaves behind: J - sum inertia axle axle^T.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from skysim.core.errors import InputError
+from skysim.core.jit import jit
+from skysim.core.types import Floats
+from skysim.scene.motion import DesaturationConfig
+
+# Generalised singularity-robust inverse and the weights of variable-speed CMGs: the sizes are `assumed`.
+DAMPING = 0.01  # lambda at a singularity, in units of the rotors' momentum squared
+DITHER = 0.01  # off-diagonal part of the damping
+DITHER_RAD_S = math.pi / 2
+FADING = 10.0  # how fast either dies away from a singularity: exp(-FADING det A A^T)
+DROPPED = 1e-6  # a direction in which a set is weaker than this part of its strongest one is given up
+
+
+@jit
+def within(command: Floats, limit: float) -> Floats:
+    """The command scaled as a whole, so that its direction is kept and no part of it exceeds the limit."""
+    peak = np.abs(command).max()
+    return command * (limit / peak if peak > limit else 1.0)
+
+
+def unit_columns(axes: Floats, name: str) -> Floats:
+    """(3, n) floats; raises InputError where they are none, or not unit vectors."""
+    columns = np.ascontiguousarray(axes, dtype=float)  # one layout, or numba compiles for each
+    if columns.ndim != 2 or len(columns) != 3 or not columns.size:
+        raise InputError(f"{name}: shape {columns.shape}; allowed: (3, n), a column for each")
+    length = np.linalg.norm(columns, axis=0)
+    if not np.all(np.abs(length - 1) < 1e-6):
+        raise InputError(f"{name}: lengths {np.round(length, 6).tolist()}; allowed: unit vectors")
+    return columns
+
+
+def of_each(value: Floats, n: int, name: str) -> Floats:
+    """(n,) positive floats; raises InputError where they are not."""
+    each = np.asarray(value, dtype=float)
+    if each.shape != (n,) or not np.all(each > 0):
+        raise InputError(f"{name}: {each.tolist()}; allowed: {n} positive numbers")
+    return each
+
+
+@dataclass(frozen=True, slots=True)
+class WheelSet:
+    """Reaction wheels: a motor's torque on its wheel pushes the body the other way, T = -sum axis u.
+
+    axes : (3, n) unit vectors; a positive speed is right-handed about them
+    inertia_kg_m2 : (n,) of each wheel about its axle
+    speed_limit_rad_s : relative to the body
+    Raises InputError (one line) for axes that are no unit vectors and inertias that are not positive.
+    """
+
+    axes: Floats
+    inertia_kg_m2: Floats
+    torque_limit_nm: float
+    speed_limit_rad_s: float
+    motor_from_torque: Floats = field(init=False, repr=False)  # (n, 3) minus the pseudo-inverse of the axes
+
+    def __post_init__(self) -> None:
+        axes = unit_columns(self.axes, "wheel axes")
+        object.__setattr__(self, "axes", axes)
+        inertia = of_each(self.inertia_kg_m2, axes.shape[1], "wheel inertia_kg_m2")
+        object.__setattr__(self, "inertia_kg_m2", inertia)
+        object.__setattr__(self, "motor_from_torque", -np.linalg.pinv(axes, rcond=DROPPED))
+
+    def momentum(self, speed_rad_s: Floats) -> Floats:
+        """Angular momentum (3,) that the wheels (n,) hold relative to the body: sum axis inertia speed."""
+        return self.axes @ (self.inertia_kg_m2 * speed_rad_s)
+
+    def drive(self, torque_nm: Floats, speed_rad_s: Floats, period_s: float) -> Floats:
+        """Motor torques (n,) on the wheels that push the body with torque_nm (3,) for the next period_s.
+
+        The smallest ones that do; where the axes do not span space (n < 3, or all in a plane), those that come
+        nearest in least squares. Beyond the torque limit all are scaled together and the direction is kept. A
+        torque that would carry a wheel beyond its speed limit is then cut to what just reaches it (I d(speed)/dt
+        = u, the body's own acceleration left out): a wheel at its limit can only be braked, and the direction is
+        lost.
+        """
+        motor = within(self.motor_from_torque @ torque_nm, self.torque_limit_nm)
+        torque_s = self.inertia_kg_m2 / period_s
+        most = np.maximum(torque_s * (self.speed_limit_rad_s - speed_rad_s), 0.0)
+        least = np.minimum(-torque_s * (self.speed_limit_rad_s + speed_rad_s), 0.0)
+        return np.minimum(np.maximum(motor, least), most)
+
+
+@dataclass(frozen=True, slots=True)
+class FanSet:
+    """Fans: a thrust at a place off the bearing's centre turns the vehicle, T = sum place x direction thrust.
+
+    force_axes : (3, n) unit vectors along which a positive thrust pushes the body
+    places_m   : (3, n) from the centre of rotation
+    Raises InputError (one line) for axes that are no unit vectors and places of another shape.
+    """
+
+    force_axes: Floats
+    places_m: Floats
+    thrust_limit_n: float
+    arms_m: Floats = field(init=False, repr=False)  # (3, n) torque of a newton of each
+    thrust_from_torque: Floats = field(init=False, repr=False)  # (n, 3)
+
+    def __post_init__(self) -> None:
+        axes, places = unit_columns(self.force_axes, "fan axes"), np.asarray(self.places_m, dtype=float)
+        if places.shape != axes.shape:
+            raise InputError(f"fan places_m: shape {places.shape}; allowed: {axes.shape}, as the axes")
+        arms = np.cross(places, axes, axis=0)
+        object.__setattr__(self, "arms_m", arms)
+        object.__setattr__(self, "thrust_from_torque", np.linalg.pinv(arms, rcond=DROPPED))
+
+    def torque(self, thrust_n: Floats) -> Floats:
+        """Torque (3,) on the body of thrusts (n,)."""
+        return self.arms_m @ thrust_n
+
+    def drive(self, torque_nm: Floats) -> Floats:
+        """Thrusts (n,), the smallest that make the torque (3,), or come nearest to it in least squares.
+
+        Beyond the limit all are scaled together and the direction is kept. A fan blows either way. What they
+        push with besides turning is the bearing's to carry.
+        """
+        return within(self.thrust_from_torque @ torque_nm, self.thrust_limit_n)
+
+
+@jit
+def solve(gram: Floats, wanted: Floats) -> Floats:
+    """x of gram x = wanted for a symmetric (3, 3) without negative eigenvalues; singular directions are given up."""
+    value, vector = np.linalg.eigh(gram)
+    x = np.zeros(3)
+    for k in range(3):
+        if value[k] > DROPPED**2 * value[2]:
+            x += vector[:, k] * ((vector[:, k] * wanted).sum() / value[k])
+    return x
+
+
+@jit
+def determinant(m: Floats) -> float:
+    """Of A A^T (3, 3), which rounding alone makes negative; np.linalg.det takes several times as long."""
+    by_a = m[1, 1] * m[2, 2] - m[1, 2] * m[2, 1]
+    by_b = m[1, 0] * m[2, 2] - m[1, 2] * m[2, 0]
+    by_c = m[1, 0] * m[2, 1] - m[1, 1] * m[2, 0]
+    return max(m[0, 0] * by_a - m[0, 1] * by_b + m[0, 2] * by_c, 0.0)
+
+
+@jit
+def pseudo_inverse(jacobian_unit: Floats, wanted: Floats, t_s: float) -> Floats:
+    """The smallest gimbal rates that change the momentum as wanted, A^T (A A^T)^-1 dh/dt: blind to singularities.
+
+    Rates grow without bound towards a singularity, and into one is where they lead.
+    """
+    return jacobian_unit.T @ solve(jacobian_unit @ jacobian_unit.T, wanted)
+
+
+@jit
+def singularity_robust(jacobian_unit: Floats, wanted: Floats, t_s: float) -> Floats:
+    """Gimbal rates by the generalised singularity-robust inverse: A^T (A A^T + lambda E)^-1 dh/dt.
+
+    Near a singularity lambda = 0.01 exp(-10 det A A^T) keeps the rates bounded, at the price of a torque that is
+    not quite the one asked for. The off-diagonal elements e_i = 0.01 sin(pi t / 2 + phase_i) of the matrix E, of
+    unit diagonal, see to it that a torque along the singular direction moves the gimbals sideways and so out. Wie,
+    Bailey & Heiberg 2001, J. Guidance, Control, and Dynamics 24 (5), 865; the numbers are `assumed`.
+    """
+    gram = jacobian_unit @ jacobian_unit.T
+    damping = DAMPING * math.exp(-FADING * determinant(gram))
+    for row, column, phase in ((1, 2, 0.0), (0, 2, math.pi / 2), (0, 1, math.pi)):
+        dither = damping * DITHER * math.sin(DITHER_RAD_S * t_s + phase)
+        gram[row, column] += dither
+        gram[column, row] += dither
+        gram[row, row] += damping / 2  # each row comes twice
+        gram[column, column] += damping / 2
+    return jacobian_unit.T @ solve(gram, wanted)
+
+
+# (jacobian (3, n) of unit rotor momentum, dh/dt wanted (3,) in the same unit, time) -> gimbal rates (n,) in rad/s.
+STEERING: dict[str, Callable[[Floats, Floats, float], Floats]] = {
+    "pseudo_inverse": pseudo_inverse,
+    "singularity_robust": singularity_robust,
+}
+
+
+@jit
+def turned(spin_axes: Floats, cross_axes: Floats, angle_rad: Floats) -> tuple[Floats, Floats]:
+    """Where the axles (3, n) of the rotors point, s cos + t sin, and the derivative (3, n) by the gimbal angles."""
+    cosine, sine = np.cos(angle_rad), np.sin(angle_rad)
+    return spin_axes * cosine + cross_axes * sine, cross_axes * cosine - spin_axes * sine
+
+
+@jit
+def shared(
+    axle: Floats, jacobian: Floats, unit_nms: float, wanted_nm: Floats, rate_limit: float, torque_limit: float
+) -> tuple[Floats, Floats]:
+    """Variable-speed CMGs: gimbals and rotors share dh/dt (3,), the rotors where the gimbals are singular.
+
+    The exact solution that is smallest in the weighted norm: gimbal rates in units of their limit, rotor torques in
+    units of theirs times exp(-5 det A A^T) (A of unit rotor momentum), which keeps the rotors idle away from
+    singularities. Beyond a limit all are scaled together. Schaub, Vadali & Junkins 1998, J. Astronautical Sciences
+    46 (3); to weigh by what each can give is our own, the number is `assumed`.
+    """
+    gram = jacobian @ jacobian.T
+    clear = determinant(gram) / unit_nms**6 if unit_nms > 0 else 0.0
+    gimbals, rotors = rate_limit**2, torque_limit**2 * math.exp(-FADING * clear)
+    effort = solve(gimbals * gram + rotors * (axle @ axle.T), wanted_nm)
+    rate, torque = gimbals * (jacobian.T @ effort), rotors * (axle.T @ effort)
+    scale = 1 / max(1.0, np.abs(rate).max() / rate_limit, np.abs(torque).max() / torque_limit)
+    return rate * scale, torque * scale
+
+
+@dataclass(frozen=True, slots=True)
+class CmgSet:
+    """Control moment gyroscopes: turning a spinning rotor's axle takes, and gives back, the torque d(angle)/dt x h.
+
+    gimbal_axes, spin_axes : (3, n) unit vectors at right angles; the rotor's axle at gimbal angle zero
+    rotor_inertia_kg_m2    : (n,) of each rotor about its axle
+    rotor_torque_limit_nm  : None leaves the rotors to spin; a torque makes them variable-speed CMGs
+    steering               : a key of STEERING, which variable-speed CMGs do not use
+
+    A rotor's axle points along s cos(angle) + g x s sin(angle), g the gimbal's and s the spin axis. The torque of
+    accelerating a gimbal about its own axis is left out. Raises InputError (one line) for axes that are none, are not
+    at right angles, or a steering that is not known.
+    """
+
+    gimbal_axes: Floats
+    spin_axes: Floats
+    rotor_inertia_kg_m2: Floats
+    gimbal_rate_limit_rad_s: float
+    rotor_torque_limit_nm: float | None = None
+    steering: str = "singularity_robust"
+    cross_axes: Floats = field(init=False, repr=False)  # (3, n) g x s
+
+    def __post_init__(self) -> None:
+        gimbal = unit_columns(self.gimbal_axes, "gimbal axes")
+        spin = unit_columns(self.spin_axes, "rotor axes")
+        inertia = of_each(self.rotor_inertia_kg_m2, gimbal.shape[1], "rotor_inertia_kg_m2")
+        if spin.shape != gimbal.shape or np.abs((gimbal * spin).sum(axis=0)).max() > 1e-6:
+            raise InputError("rotor axes: allowed: one for each gimbal, at right angles to its axis")
+        if self.steering not in STEERING:
+            raise InputError(f"cmgs.steering: {self.steering!r} is none of {', '.join(STEERING)}")
+        arrays = {"gimbal_axes": gimbal, "spin_axes": spin, "rotor_inertia_kg_m2": inertia}
+        for name, value in arrays.items():
+            object.__setattr__(self, name, value)
+        object.__setattr__(self, "cross_axes", np.ascontiguousarray(np.cross(gimbal, spin, axis=0)))
+
+    def momentum(self, angle_rad: Floats, rotor_rad_s: Floats) -> Floats:
+        """Angular momentum (3,) of the rotors relative to the body: sum of inertia speed axle."""
+        axle, _ = turned(self.spin_axes, self.cross_axes, angle_rad)
+        return axle @ (self.rotor_inertia_kg_m2 * rotor_rad_s)
+
+    def jacobian(self, angle_rad: Floats, rotor_rad_s: Floats) -> Floats:
+        """A (3, n), derivative of the momentum by the gimbal angles; columns g x h."""
+        _, across = turned(self.spin_axes, self.cross_axes, angle_rad)
+        return across * (self.rotor_inertia_kg_m2 * rotor_rad_s)
+
+    def manipulability(self, angle_rad: Floats, rotor_rad_s: Floats) -> Floats:
+        """How far from a singularity: 1 where a torque is as easy in every direction, 0 where one has none.
+
+        sqrt(det A A^T) over its greatest value for a trace of the same size, (sum h^2 / 3)^1.5, which depends
+        neither on the rotors' size nor on their number. 0 with the rotors at rest. (..., n) -> (...).
+        """
+        angle, spin = np.asarray(angle_rad)[..., None, :], np.asarray(rotor_rad_s)[..., None, :]
+        across = self.cross_axes * np.cos(angle) - self.spin_axes * np.sin(angle)
+        jacobian = across * (self.rotor_inertia_kg_m2 * spin)
+        gram = jacobian @ jacobian.swapaxes(-1, -2)
+        most = (np.trace(gram, axis1=-2, axis2=-1) / 3) ** 3
+        return np.sqrt(np.maximum(np.linalg.det(gram), 0.0) / np.where(most > 0, most, 1.0))
+
+    def drive(
+        self,
+        torque_nm: Floats,
+        rate_body_rad_s: Floats,
+        angle_rad: Floats,
+        rotor_rad_s: Floats,
+        t_s: float,
+    ) -> tuple[Floats, Floats]:
+        """Gimbal rates (n,) and motor torques (n,) on the rotors that push the body with torque_nm (3,).
+
+        torque on the body = -A d(angle)/dt - sum axle u, with A from the rotors' spin in inertial space, their
+        speed plus the body's rate along the axle, which is what a gimbal turns. The body also feels -rate x h: the
+        controller's feed-forward has to hold +rate x h ready in torque_nm, it is not added here.
+
+        Rotors that are left to spin get no torque. Beyond a limit everything is scaled together: the direction of
+        the torque is kept.
+        """
+        axle, across = turned(self.spin_axes, self.cross_axes, angle_rad)
+        spin_nms = self.rotor_inertia_kg_m2 * (rotor_rad_s + rate_body_rad_s @ axle)
+        jacobian = across * spin_nms
+        unit_nms = float(np.abs(spin_nms).mean())
+        if self.rotor_torque_limit_nm is not None:
+            limits = self.gimbal_rate_limit_rad_s, self.rotor_torque_limit_nm
+            return shared(axle, jacobian, unit_nms, -torque_nm, *limits)
+        if unit_nms == 0:  # nothing spins, nothing to turn
+            return np.zeros_like(spin_nms), np.zeros_like(spin_nms)
+        rate = STEERING[self.steering](jacobian / unit_nms, torque_nm / -unit_nms, t_s)
+        return within(rate, self.gimbal_rate_limit_rad_s), np.zeros_like(rate)
+
+
+@dataclass(slots=True)
+class Desaturator:
+    """The fans' torque takes momentum out of wheels or CMGs: -h / time, once h has grown too large.
+
+    The actuators hold h. A torque -h / time from outside would turn the body; the controller, which keeps it still,
+    lets the wheels take it up, and what they hold dies away as exp(-t / time). Stateful: one flight each.
+    """
+
+    part: DesaturationConfig
+    running: bool = False
+
+    def torque(self, momentum_nms: Floats) -> Floats:
+        """Torque (3,) wanted of the fans on the body: zero until |h| exceeds start, then -h / time down to stop."""
+        size = math.sqrt(float(momentum_nms @ momentum_nms))
+        self.running = size >= self.part.stop_nms if self.running else size > self.part.start_nms
+        return momentum_nms * (-1.0 / self.part.time_s) if self.running else np.zeros(3)

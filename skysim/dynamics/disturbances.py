@@ -1,0 +1,146 @@
+"""Torques that nobody asked for: the bearing's jets, the turning Earth, the room's air, a knock."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skysim.core.jit import jit
+from skysim.core.quaternion import apply, cross, inverse, times
+from skysim.core.types import Floats
+from skysim.dynamics.guidance import Knock
+from skysim.scene.vehicle import DisturbancesConfig, DraughtConfig
+
+
+@jit
+def earth_torque_nm(
+    inertia_kg_m2: Floats, momentum_nms: Floats, rate_body_rad_s: Floats, earth_body_rad_s: Floats
+) -> Floats:
+    """(3,) what a vehicle feels in a lab that turns with the Earth, in body axes, as if the lab stood still.
+
+    With the body's rate w in the lab, the Earth's rate W in body axes (dW/dt = -w x W there), the inertia J and the
+    rotors' momentum h in the body, Euler's equation J (w + W)' + h' + (w + W) x (J (w + W) + h) = T is that of a lab
+    at rest with one more torque,
+
+        T_earth = J (w x W) - w x J W - W x (J w + J W + h).
+
+    All in body axes, (3,) and (3, 3). The plumb line is taken for gravity, as a lab does.
+    """
+    turning = times(inertia_kg_m2, earth_body_rad_s)
+    whole = times(inertia_kg_m2, rate_body_rad_s) + turning + momentum_nms
+    return (
+        times(inertia_kg_m2, cross(rate_body_rad_s, earth_body_rad_s))
+        - cross(rate_body_rad_s, turning)
+        - cross(earth_body_rad_s, whole)
+    )
+
+
+@jit
+def steady(
+    torque_lab_nm: Floats,
+    earth_lab_rad_s: Floats,
+    inertia_kg_m2: Floats,
+    present: tuple[Floats, Floats, Floats],
+) -> Floats:
+    """(3,) body torque of one that stands still in the lab and of the Earth's turning; compiled, for every tick.
+
+    present : lab_from_body_wxyz (4,), the body's rate (3,) and the rotors' momentum (3,)
+    """
+    lab_from_body, rate, momentum = present
+    body_from_lab = inverse(lab_from_body)
+    earth = apply(body_from_lab, earth_lab_rad_s)
+    return apply(body_from_lab, torque_lab_nm) + earth_torque_nm(inertia_kg_m2, momentum, rate, earth)
+
+
+class Gusts:
+    """The room's air: an Ornstein-Uhlenbeck torque about each lab axis, (3,) at every tick.
+
+    Exact at ticks a period apart: T' = a T + sqrt(1 - a^2) rms N(0, 1), a = exp(-period / correlation time), started
+    in its stationary distribution. Its autocorrelation is rms^2 exp(-|lag| / correlation time).
+    """
+
+    def __init__(self, part: DraughtConfig, period_s: float, rng: np.random.Generator) -> None:
+        self.rms_nm = np.array(part.rms_nm)
+        self.keeps = math.exp(-period_s / part.correlation_s)
+        self.rng = rng
+        self.torque_nm = self.rms_nm * rng.standard_normal(3)
+
+    def next(self) -> Floats:
+        """The torque of this tick, in lab axes."""
+        now = self.torque_nm
+        fresh = math.sqrt(1 - self.keeps**2) * self.rms_nm * self.rng.standard_normal(3)
+        self.torque_nm = self.keeps * now + fresh
+        return now
+
+
+@dataclass(slots=True)
+class DisturbanceModel:
+    """All that disturbs a vehicle, tick by tick. Stateful: one flight each.
+
+    turbine_lab_nm   : (3,) constant
+    earth_lab_rad_s  : (3,) the Earth's rate, zeros where it does not count
+    gusts            : None where the air is still
+    knocks           : the bumps
+    inertia_kg_m2    : (3, 3) about the bearing, in body axes
+    """
+
+    turbine_lab_nm: Floats
+    earth_lab_rad_s: Floats
+    gusts: Gusts | None
+    knocks: tuple[Knock, ...]
+    inertia_kg_m2: Floats
+
+    @classmethod
+    def of(
+        cls,
+        part: DisturbancesConfig,
+        earth_lab_rad_s: Floats,
+        knocks: tuple[Knock, ...],
+        inertia_kg_m2: Floats,
+        period_s: float,
+        rng: np.random.Generator,
+    ) -> DisturbanceModel:
+        """What the scene switches on; period_s is that of the ticks."""
+        return cls(
+            np.array(part.turbine_nm),
+            earth_lab_rad_s if part.earth_rotation else np.zeros(3),
+            Gusts(part.draught, period_s, rng) if part.draught else None,
+            knocks,
+            inertia_kg_m2,
+        )
+
+    @property
+    def quiet(self) -> bool:
+        """Whether there is nothing at all."""
+        return not (self.turbine_lab_nm.any() or self.earth_lab_rad_s.any() or self.gusts or self.knocks)
+
+    def torque_nm(
+        self,
+        times_s: Floats,
+        lab_from_body_wxyz: Floats,
+        rate_body_rad_s: Floats,
+        momentum_nms: Floats,
+    ) -> NDArray[np.float64]:
+        """(K, 3) body torque in each of K steps between the (K + 1,) times of a tick.
+
+        Attitude, rate and the rotors' momentum (3,) are those of the tick's beginning, held over it: in 10 ms they
+        change by a thousandth. A knock is a half-sine with J times its change of rate for its impulse, each step
+        getting its exact share.
+        """
+        blown = self.turbine_lab_nm + self.gusts.next() if self.gusts else self.turbine_lab_nm
+        every = np.empty((len(times_s) - 1, 3))
+        every[:] = steady(
+            blown,
+            self.earth_lab_rad_s,
+            self.inertia_kg_m2,
+            (lab_from_body_wxyz, rate_body_rad_s, momentum_nms),
+        )
+        for knock in self.knocks:
+            if knock.begin_s < times_s[-1] and times_s[0] < knock.begin_s + knock.duration_s:
+                share = [knock.share(a, b) / (b - a) for a, b in itertools.pairwise(times_s)]
+                every += np.outer(share, self.inertia_kg_m2 @ knock.rate_rad_s)
+        return every

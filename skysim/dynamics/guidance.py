@@ -1,0 +1,408 @@
+"""The attitude that a scene's list of manoeuvres asks for, and the knocks and vibration that stand in it.
+
+Knows neither the simulator nor the controller. A reference is a chain of legs: every one begins in the attitude in
+which the one before ended. Attitudes are unit quaternions `lab_from_ref_wxyz` (4,), scalar first; rates and
+accelerations are (3,) in the reference's own axes.
+"""
+
+from __future__ import annotations
+
+import bisect
+import itertools
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from skysim.core import quaternion
+from skysim.core.errors import InputError
+from skysim.core.jit import jit
+from skysim.core.types import Floats
+from skysim.scene.motion import (
+    AttitudeConfig,
+    BumpConfig,
+    JitterPart,
+    MotionConfig,
+    RateConfig,
+    SineConfig,
+    SlewConfig,
+    SpinUpConfig,
+    StepConfig,
+)
+
+State = tuple[Floats, Floats, Floats]  # lab_from_ref_wxyz, rate_rad_s, acceleration_rad_s2
+Law = Callable[[float], tuple[float, float, float]]  # time to angle, rate and acceleration about one axis
+
+KNOT_RAD = 0.01  # a change of rate is integrated in steps of at most so much turn ...
+FEWEST_KNOTS = 128  # ... and of its own duration over this: together 2e-10 rad, see `Change`
+MOST_KNOTS = 5_000_000
+
+
+def attitude(angles: AttitudeConfig) -> Rotation:
+    """3-2-1 Euler angles (intrinsic ZYX) to lab_from_body = Rz(yaw) Ry(pitch) Rx(roll); degrees in."""
+    return Rotation.from_euler("ZYX", [angles.yaw_deg, angles.pitch_deg, angles.roll_deg], degrees=True)
+
+
+def start(motion: MotionConfig) -> Rotation:
+    """lab_from_body at the start: the identity for a pointing, which defines the lab by the body."""
+    return attitude(motion.start) if isinstance(motion.start, AttitudeConfig) else Rotation.identity()
+
+
+def wxyz(rotation: Rotation) -> Floats:
+    """(4,) of one rotation, laid out as the kernels want it."""
+    return np.ascontiguousarray(rotation.as_quat(scalar_first=True))
+
+
+# Laws of one angle: how a turn about an axis that stands still goes in time.
+
+
+def still(t_s: float) -> tuple[float, float, float]:
+    """No motion."""
+    return 0.0, 0.0, 0.0
+
+
+def steady(rate_rad_s: float, t_s: float) -> tuple[float, float, float]:
+    """A constant rate."""
+    return rate_rad_s * t_s, rate_rad_s, 0.0
+
+
+@jit
+def rest_to_rest(
+    angle_rad: float, rate_rad_s: float, ramp_s: float, duration_s: float, t_s: float
+) -> tuple[float, float, float]:
+    """The rate rises along the smoothstep 3x^2 - 2x^3 (x = t / ramp), cruises at rate_rad_s and falls likewise.
+
+    So the acceleration is continuous, zero at both ends of a ramp and 1.5 rate / ramp at its middle.
+    """
+    braking = t_s > duration_s / 2  # the second half is the first one played backwards
+    since_s = duration_s - t_s if braking else t_s
+    x = min(since_s / ramp_s, 1.0)
+    angle = rate_rad_s * (ramp_s * x**3 * (1 - x / 2) + max(since_s - ramp_s, 0.0))
+    rate, acceleration = rate_rad_s * x**2 * (3 - 2 * x), rate_rad_s / ramp_s * 6 * x * (1 - x)
+    return (angle_rad - angle, rate, -acceleration) if braking else (angle, rate, acceleration)
+
+
+@jit
+def envelope(t_s: float, duration_s: float, growth_s: float) -> tuple[float, float, float]:
+    """1 in the middle, 0 at and beyond both ends, and its two derivatives (1/s, 1/s2), all three continuous.
+
+    It grows along 10x^3 - 15x^4 + 6x^5 (x = t / growth_s) and dies likewise; growth_s is at most half of duration_s.
+    """
+    dying = t_s > duration_s / 2
+    x = min(max((duration_s - t_s if dying else t_s) / growth_s, 0.0), 1.0)
+    slope = 30 * x**2 * (1 - x) ** 2 / growth_s
+    bend = 60 * x * (1 - x) * (1 - 2 * x) / growth_s**2
+    return x**3 * (10 - 15 * x + 6 * x**2), -slope if dying else slope, bend
+
+
+@jit
+def sway(
+    amplitude_rad: float, omega_rad_s: float, duration_s: float, growth_s: float, t_s: float
+) -> tuple[float, float, float]:
+    """amplitude envelope(t) sin(omega t), and its two derivatives by the product rule."""
+    e, slope, bend = envelope(t_s, duration_s, growth_s)
+    s, c = math.sin(omega_rad_s * t_s), math.cos(omega_rad_s * t_s)
+    rate = slope * s + e * omega_rad_s * c
+    acceleration = (bend - e * omega_rad_s**2) * s + 2 * slope * omega_rad_s * c
+    return amplitude_rad * e * s, amplitude_rad * rate, amplitude_rad * acceleration
+
+
+@jit
+def turned(
+    lab_from_start_wxyz: Floats, axis: Floats, angle_rad: float, rate_rad_s: float, acceleration_rad_s2: float
+) -> tuple[Floats, Floats, Floats]:
+    """The state after a turn by an angle about a unit axis, which stays where it is in the turning body too."""
+    lab_from_ref_wxyz = quaternion.multiply(lab_from_start_wxyz, quaternion.from_rotvec(angle_rad * axis))
+    return lab_from_ref_wxyz, rate_rad_s * axis, acceleration_rad_s2 * axis
+
+
+# A change of the rate, whose axis may move.
+
+
+@jit
+def rate_at(t_s: float, duration_s: float, rate_rad_s: Floats, change_rad_s: Floats) -> Floats:
+    """(3,) rate + change (3x^2 - 2x^3), x = t / duration."""
+    x = t_s / duration_s
+    return rate_rad_s + x**2 * (3 - 2 * x) * change_rad_s
+
+
+@jit
+def turn_between(
+    begin_s: float, step_s: float, duration_s: float, rate_rad_s: Floats, change_rad_s: Floats
+) -> Floats:
+    """(3,) rotation vector of the turn in a short while: Magnus' expansion to fourth order, two Gauss points.
+
+        phi = h (w1 + w2) / 2 + sqrt(3) / 12 h^2 w1 x w2
+
+    (Iserles & Norsett 1999, `assumed`; the sign is that of rates in moving axes). The first term is exact here, the
+    rate being a cubic of time; where the axis stands still it is all there is, whatever the step.
+    """
+    middle, apart = begin_s + step_s / 2, step_s / math.sqrt(12.0)
+    early = rate_at(middle - apart, duration_s, rate_rad_s, change_rad_s)
+    late = rate_at(middle + apart, duration_s, rate_rad_s, change_rad_s)
+    return step_s / 2 * (early + late) + math.sqrt(3.0) / 12 * step_s**2 * quaternion.cross(early, late)
+
+
+@jit
+def knots(
+    lab_from_start_wxyz: Floats, count: int, duration_s: float, rate_rad_s: Floats, change_rad_s: Floats
+) -> Floats:
+    """(count, 4) attitudes at 0, 1, ... count - 1 times duration / count."""
+    lab_from_knot_wxyz = np.empty((count, 4))
+    here, step_s = lab_from_start_wxyz, duration_s / count
+    for k in range(count):
+        lab_from_knot_wxyz[k] = here
+        turn = turn_between(k * step_s, step_s, duration_s, rate_rad_s, change_rad_s)
+        here = quaternion.multiply(here, quaternion.from_rotvec(turn))
+        here = here / math.sqrt((here**2).sum())  # else the norm walks off by 1e-16 a step
+    return lab_from_knot_wxyz
+
+
+@jit
+def changing(
+    lab_from_knot_wxyz: Floats, duration_s: float, rate_rad_s: Floats, change_rad_s: Floats, t_s: float
+) -> tuple[Floats, Floats, Floats]:
+    """The state within a change: from the knot before by the step that made the knots, so without interpolation."""
+    step_s = duration_s / len(lab_from_knot_wxyz)
+    k = min(int(t_s / step_s), len(lab_from_knot_wxyz) - 1)
+    turn = turn_between(k * step_s, t_s - k * step_s, duration_s, rate_rad_s, change_rad_s)
+    x = t_s / duration_s
+    return (
+        quaternion.multiply(lab_from_knot_wxyz[k], quaternion.from_rotvec(turn)),
+        rate_at(t_s, duration_s, rate_rad_s, change_rad_s),
+        6 * x * (1 - x) / duration_s * change_rad_s,
+    )
+
+
+# Legs: one for each element of the list.
+
+
+class Leg(Protocol):
+    """A piece of the reference: how long it lasts, and the state 0 <= t_s <= duration_s after its start."""
+
+    @property
+    def duration_s(self) -> float: ...
+
+    def at(self, t_s: float) -> State: ...
+
+
+@dataclass(frozen=True, slots=True)
+class Turn:
+    """A turn by a law of its angle about one axis (3,), which stands still in body and lab; zeros turn nothing."""
+
+    lab_from_start_wxyz: Floats
+    axis: Floats
+    duration_s: float
+    law: Law
+
+    def at(self, t_s: float) -> State:
+        return turned(self.lab_from_start_wxyz, self.axis, *self.law(t_s))
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    """A smooth change of the rate: rate_rad_s + change_rad_s (3x^2 - 2x^3), x = t / duration.
+
+    lab_from_knot_wxyz : (K, 4) attitudes at K even steps. What Magnus' expansion leaves out in n steps of a change
+    that turns by a goes as a^3 / n^4: below 2e-10 rad for the knots that `spin_up` takes.
+    """
+
+    lab_from_knot_wxyz: Floats
+    duration_s: float
+    rate_rad_s: Floats
+    change_rad_s: Floats
+
+    def at(self, t_s: float) -> State:
+        return changing(self.lab_from_knot_wxyz, self.duration_s, self.rate_rad_s, self.change_rad_s, t_s)
+
+
+class Here(NamedTuple):
+    """Where an element begins: the attitude and rate of the reference, and whose axes its Euler angles are in."""
+
+    lab_from_ref_wxyz: Floats
+    rate_rad_s: Floats
+    lab_from_home: Rotation
+
+
+def split(vector: Floats) -> tuple[float, Floats]:
+    """The size and the (3,) unit direction of a vector; zeros have none."""
+    size = float(np.linalg.norm(vector))
+    return size, vector / size if size else np.zeros(3)
+
+
+def hold(element: Any, here: Here) -> Leg:
+    """No motion, and no rate at once, even after a rate."""
+    caught_s = element.caught_after_s if isinstance(element, BumpConfig) else None
+    return Turn(here.lab_from_ref_wxyz, np.zeros(3), element.duration_s + (caught_s or 0.0), still)
+
+
+def step(element: StepConfig, here: Here) -> Leg:
+    """Another attitude all at once, and no motion there."""
+    there = wxyz(here.lab_from_home * attitude(element))
+    return Turn(there, np.zeros(3), element.duration_s, still)
+
+
+def slew(element: SlewConfig, here: Here) -> Leg:
+    """The shortest eigen-axis turn from rest to rest, as quick as the two limits allow.
+
+    A ramp to the rate v takes 1.5 v / a and 0.75 v^2 / a of angle; a turn too short for two of them peaks at
+    v = sqrt(a angle / 1.5) and never cruises.
+    """
+    lab_from_there = wxyz(here.lab_from_home * attitude(element))
+    back_wxyz = quaternion.inverse(here.lab_from_ref_wxyz)
+    angle, axis = split(quaternion.to_rotvec(quaternion.multiply(back_wxyz, lab_from_there)))
+    if angle < 1e-12:
+        return Turn(here.lab_from_ref_wxyz, np.zeros(3), 0.0, still)
+    accel = math.radians(element.acceleration_deg_s2)
+    rate = min(math.radians(element.rate_deg_s), math.sqrt(accel * angle / 1.5))
+    ramp = 1.5 * rate / accel
+    lasts_s = ramp + angle / rate
+    return Turn(here.lab_from_ref_wxyz, axis, lasts_s, partial(rest_to_rest, angle, rate, ramp, lasts_s))
+
+
+def rate(element: RateConfig, here: Here) -> Leg:
+    """start exp(w t), from the first moment on: the rate jumps."""
+    size, axis = split(np.radians(element.rate_deg_s))
+    return Turn(here.lab_from_ref_wxyz, axis, element.duration_s, partial(steady, size))
+
+
+def spin_up(element: SpinUpConfig, here: Here) -> Leg:
+    """From the rate that is to another, along a smoothstep of each component; the axis may move.
+
+    Raises InputError (one line) where more than five million knots would be needed.
+    """
+    lasts_s, begin = element.duration_s, here.rate_rad_s
+    change = np.radians(element.rate_deg_s) - begin
+    fastest = max(float(np.linalg.norm(begin)), float(np.linalg.norm(begin + change)))
+    moves = np.linalg.norm(np.cross(begin, change)) > 1e-12 * fastest**2
+    count = max(FEWEST_KNOTS, math.ceil(fastest * lasts_s / KNOT_RAD)) if moves else 1
+    if count > MOST_KNOTS:
+        raise InputError(
+            f"motion.manoeuvre: a spin_up of {lasts_s:g} s at up to {math.degrees(fastest):g} deg/s whose axis moves "
+            f"turns by {math.degrees(fastest * lasts_s):.3g} deg; "
+            f"allowed: {math.degrees(MOST_KNOTS * KNOT_RAD):.3g} deg"
+        )
+    return Change(knots(here.lab_from_ref_wxyz, count, lasts_s, begin, change), lasts_s, begin, change)
+
+
+def sine(element: SineConfig, here: Here) -> Leg:
+    """A swing about the attitude, rotation vector amplitude envelope(t) sin(2 pi f t) in body axes.
+
+    One phase for the three axes, so that they make one. It grows and dies within a period, or half of the duration
+    where that is shorter.
+    """
+    lasts_s, omega = element.duration_s, 2 * math.pi * element.frequency_hz
+    growth_s = min(1 / element.frequency_hz, lasts_s / 2)
+    size, axis = split(np.radians(element.amplitude_deg))
+    return Turn(here.lab_from_ref_wxyz, axis, lasts_s, partial(sway, size, omega, lasts_s, growth_s))
+
+
+# What each kind of element asks for. Another kind is a class in motion.py and a function here.
+LEGS: dict[str, Callable[[Any, Here], Leg]] = {
+    "hold": hold,
+    "step": step,
+    "slew": slew,
+    "rate": rate,
+    "spin_up": spin_up,
+    "sine": sine,
+    "jitter": hold,
+    "bump": hold,
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Reference:
+    """The attitude asked for, at every time: leg after leg, the last of which goes on for ever.
+
+    start_s : when each leg starts, ascending from 0
+    """
+
+    legs: tuple[Leg, ...]
+    start_s: tuple[float, ...]
+
+    @property
+    def duration_s(self) -> float:
+        """How long the list takes, after which the last leg begins."""
+        return self.start_s[-1]
+
+    def at(self, t_s: float) -> State:
+        """lab_from_ref_wxyz (4,), rate (rad/s) and acceleration (rad/s2), each (3,) in the reference's own axes.
+
+        At the very moment of a joint it is the beginning of the leg that comes. Before 0 it is what it is at 0.
+        """
+        k = max(bisect.bisect_right(self.start_s, t_s) - 1, 0)
+        leg = self.legs[k]
+        return leg.at(min(max(t_s - self.start_s[k], 0.0), leg.duration_s))
+
+    def attitudes(self, t_s: Floats) -> Rotation:
+        """lab_from_ref at (N,) times."""
+        return Rotation.from_quat(np.array([self.at(float(t))[0] for t in t_s]), scalar_first=True)
+
+
+def plan(motion: MotionConfig, lab_from_start: Rotation | None = None) -> Reference:
+    """The list of manoeuvres as one reference; every element starts where the one before it ended.
+
+    lab_from_start defaults to motion.start, or to the identity where that is a pointing among the stars. The Euler
+    angles of steps and slews are those of the body in the lab; where the start is a pointing they are counted from
+    the attitude in which it starts, whatever axes lab_from_start is in. A spin_up begins at the rate at which the
+    element before it ended, which is zero but after a rate or another spin_up; the first begins at the vehicle's
+    own, motion.rate_deg_s.
+
+    After its end the list goes on as it ended: at rest, or turning at the rate of a last rate or spin_up. Between
+    elements only a step lets the attitude jump, and only the beginning of a rate, and whatever but a spin_up
+    follows a rate or spin_up, lets the rate jump.
+    """
+    first = lab_from_start if lab_from_start is not None else start(motion)
+    home = Rotation.identity() if isinstance(motion.start, AttitudeConfig) else first
+    here = Here(wxyz(first), np.radians(motion.rate_deg_s), home)
+    legs: list[Leg] = []
+    for element in motion.manoeuvre:
+        legs.append(LEGS[element.kind](element, here))
+        lab_from_ref_wxyz, rate_rad_s, _ = legs[-1].at(legs[-1].duration_s)
+        here = Here(lab_from_ref_wxyz, rate_rad_s, home)
+    size, axis = split(here.rate_rad_s if legs else np.zeros(3))
+    onward = Turn(here.lab_from_ref_wxyz, axis, math.inf, partial(steady, size))
+    starts = itertools.accumulate((leg.duration_s for leg in legs), initial=0.0)
+    return Reference((*legs, onward), tuple(starts))
+
+
+# What else happens on the manoeuvre's clock.
+
+
+@dataclass(frozen=True, slots=True)
+class Knock:
+    """A half-sine of torque on the vehicle, which alone would change its rate by rate_rad_s, (3,) in body axes.
+
+    Its impulse is the inertia times that.
+    """
+
+    begin_s: float
+    duration_s: float
+    rate_rad_s: Floats
+
+    def share(self, from_s: float, to_s: float) -> float:
+        """The share of the impulse that falls between two times: (cos(pi a) - cos(pi b)) / 2, a, b in durations."""
+        a, b = (min(max((t_s - self.begin_s) / self.duration_s, 0.0), 1.0) for t_s in (from_s, to_s))
+        return (math.cos(math.pi * a) - math.cos(math.pi * b)) / 2
+
+
+def knocks(motion: MotionConfig) -> tuple[Knock, ...]:
+    """The knocks of the list's bumps in order of time; a caught bump is two, equal and opposite."""
+    made: list[Knock] = []
+    for begin_s, bump in zip(plan(motion).start_s, motion.manoeuvre, strict=False):
+        if isinstance(bump, BumpConfig):
+            rate_rad_s = np.radians(bump.rate_deg_s)
+            made.append(Knock(begin_s, bump.duration_s, rate_rad_s))
+            if bump.caught_after_s is not None:
+                made.append(Knock(begin_s + bump.caught_after_s, bump.duration_s, -rate_rad_s))
+    return tuple(made)
+
+
+def shakes(motion: MotionConfig) -> tuple[tuple[float, float, tuple[JitterPart, ...]], ...]:
+    """(begin_s, end_s, parts) of the list's vibrations in order of time."""
+    timed = zip(plan(motion).start_s, motion.manoeuvre, strict=False)
+    return tuple((begin_s, begin_s + el.duration_s, el.parts) for begin_s, el in timed if el.kind == "jitter")

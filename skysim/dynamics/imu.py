@@ -1,0 +1,391 @@
+"""What the inertial measurement unit feels, how it errs, and the lab's navigator that believes it.
+
+The unit's axes are the body's. It counts increments: the integrals of angular rate and of specific force over each
+sample interval, as a strapdown unit does; nothing of a fast motion is lost between two samples but their order.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from skysim.core import quaternion
+from skysim.core.errors import InputError
+from skysim.core.jit import jit
+from skysim.core.types import Floats
+from skysim.scene.vehicle import AccelerometerConfig, GyroConfig, ImuConfig, SiteConfig
+
+EARTH_RATE_RAD_S = 7.2921150e-5  # against the stars, 15.041 deg/h: WGS 84's
+STANDARD_GRAVITY_M_S2 = 9.80665  # what the accelerometers' g and ug mean, whatever the lab's own gravity is
+POINTS = 4  # knots that a polynomial goes through: a cubic, off by the fourth power of their spacing
+GAUSS = 0.5 / math.sqrt(3)  # two such places beside the middle integrate a cubic exactly (Gauss-Legendre)
+SLACK_S = 1e-9  # rounding of sample times against knots
+STILL = np.zeros(3)
+
+
+@dataclass(frozen=True, slots=True)
+class Increments:
+    """Integrals of angular rate and of specific force over sample intervals, in body axes.
+
+    t_s          : (N,) ends of the intervals
+    step_s       : length of each
+    angle_rad    : (N, 3) integral of the rate about each body axis: no rotation vector, unless the axis stands still
+    velocity_m_s : (N, 3) integral of the specific force, which is +g along the vertical for a unit at rest
+    saturated    : (N,) a gyro stood at its limit; False where ideal
+    overloaded   : (N,) an accelerometer did; likewise
+    """
+
+    t_s: Floats
+    step_s: float
+    angle_rad: Floats
+    velocity_m_s: Floats
+    saturated: NDArray[np.bool_]
+    overloaded: NDArray[np.bool_]
+
+
+def earth_rate_lab_rad_s(site: SiteConfig) -> Floats:
+    """(3,) the Earth's turning against the stars in lab axes: up by its sine of latitude, north by its cosine.
+
+    Lab z is up, x at the azimuth from north through east, y = z cross x.
+    """
+    latitude, azimuth = math.radians(site.latitude_deg), math.radians(site.x_azimuth_deg)
+    north = math.cos(latitude)
+    return EARTH_RATE_RAD_S * np.array(
+        [north * math.cos(azimuth), north * math.sin(azimuth), math.sin(latitude)]
+    )
+
+
+def felt(
+    t_s: Floats,
+    lab_from_body_wxyz: Floats,
+    rate_body_rad_s: Floats,
+    ends_s: Floats,
+    step_s: float,
+    place_body_m: ArrayLike,
+    gravity_m_s2: float,
+    earth_rate_lab_rad_s: Floats = STILL,
+) -> Increments:
+    """What a unit without errors counts on a body that turns about the lab's origin.
+
+        w = rate + body_from_lab earth_rate           angle    = int w dt
+        f = dw/dt x r + w x (w x r) - g_body          velocity = int f dt
+
+    (Titterton & Weston, Strapdown Inertial Navigation Technology, ch. 3; `assumed`). With w the rate against the
+    stars, f holds centripetal and Coriolis acceleration of the lab's own turning too; g is a plumb line's gravity,
+    (0, 0, -gravity) in the lab, which has the Earth's centrifugal part at the origin. int dw/dt x r is the
+    difference of w between both ends, crossed with r.
+
+    t_s                : (K,) knots of the flight, ascending, K >= 2, in any spacing
+    lab_from_body_wxyz : (K, 4) attitudes there
+    rate_body_rad_s    : (K, 3) rates of the body in the lab, in body axes
+    ends_s, step_s     : (N,) ends of the sample intervals and their length; they need not meet the knots
+    place_body_m       : (3,) r, the unit's place on the body
+    earth_rate_lab_rad_s : (3,) zeros for a unit that does not feel the Earth turn
+
+    Between knots every component is the cubic through the four nearest, integrated exactly: fourth order in the
+    spacing h. Where the acceleration jumps by dalpha at a knot, the angle is off by dalpha h^2 / 12, once.
+    Raises InputError for fewer than two knots or an interval outside them.
+    """
+    if len(t_s) < 2:
+        raise InputError(f"imu: {len(t_s)} knots of the flight; allowed: two or more")
+    first_s, last_s = np.min(ends_s, initial=np.inf) - step_s, np.max(ends_s, initial=-np.inf)
+    if len(ends_s) and not (
+        t_s[0] - SLACK_S <= first_s and last_s <= t_s[-1] + SLACK_S
+    ):  # nor is NaN allowed
+        raise InputError(
+            f"imu: samples from {first_s:.6f} to {last_s:.6f} s; allowed: within the flight,"
+            f" {t_s[0]:.6f} to {t_s[-1]:.6f} s"
+        )
+    place = np.asarray(place_body_m, dtype=float)
+    knots = sensed(
+        np.ascontiguousarray(lab_from_body_wxyz),
+        np.ascontiguousarray(rate_body_rad_s),
+        place,
+        gravity_m_s2,
+        earth_rate_lab_rad_s,
+    )
+    angle, velocity = integrals(np.ascontiguousarray(t_s), knots, np.ascontiguousarray(ends_s), step_s, place)
+    fine = np.zeros(len(ends_s), dtype=bool)
+    return Increments(ends_s, step_s, angle, velocity, fine, fine)
+
+
+@jit
+def sensed(
+    lab_from_body_wxyz: Floats,
+    rate_body_rad_s: Floats,
+    place_m: Floats,
+    gravity_m_s2: float,
+    earth_rate: Floats,
+) -> Floats:
+    """(K, 6) at every knot: rate against the stars, then specific force but for dw/dt x r."""
+    knots = np.empty((len(rate_body_rad_s), 6))
+    up = np.array([0.0, 0.0, gravity_m_s2])
+    for k in range(len(knots)):
+        body_from_lab = quaternion.inverse(lab_from_body_wxyz[k])
+        rate = rate_body_rad_s[k] + quaternion.apply(body_from_lab, earth_rate)
+        knots[k, :3] = rate
+        centripetal = quaternion.cross(rate, quaternion.cross(rate, place_m))
+        knots[k, 3:] = centripetal + quaternion.apply(body_from_lab, up)
+    return knots
+
+
+@jit
+def integrals(
+    t_s: Floats, knots: Floats, ends_s: Floats, step_s: float, place_m: Floats
+) -> tuple[Floats, Floats]:
+    """(N, 3) angle and (N, 3) velocity of every sample interval from the knots of `sensed`.
+
+    An interval is cut at the knots; on each piece all is one cubic, and two points of Gauss integrate it.
+    """
+    angle, velocity = np.empty((len(ends_s), 3)), np.empty((len(ends_s), 3))
+    last = len(t_s) - 2
+    for n in range(len(ends_s)):
+        begin, end = ends_s[n] - step_s, ends_s[n]
+        first = min(max(np.searchsorted(t_s, begin, side="right") - 1, 0), last)
+        total, change = np.zeros(6), np.zeros(6)
+        add_cubic(t_s, knots, first, begin, -1.0, change)
+        for k in range(first, last + 1):
+            stop = end if k == last else min(end, t_s[k + 1])
+            middle, length = (begin + stop) / 2, stop - begin
+            add_cubic(t_s, knots, k, middle - GAUSS * length, length / 2, total)
+            add_cubic(t_s, knots, k, middle + GAUSS * length, length / 2, total)
+            begin = stop
+            if stop >= end:
+                break
+        add_cubic(t_s, knots, k, end, 1.0, change)
+        angle[n] = total[:3]
+        velocity[n] = total[3:] + quaternion.cross(change[:3], place_m)
+    return angle, velocity
+
+
+@jit
+def add_cubic(t_s: Floats, knots: Floats, k: int, at_s: float, factor: float, out: Floats) -> None:
+    """Add to out (C,) factor times the value at at_s, of the cubic (Lagrange) through the knots about t_s[k]..t_s[k+1].
+
+    Through all the knots there are where they are fewer than four.
+    """
+    count = min(POINTS, len(t_s))
+    first = min(max(k - 1, 0), len(t_s) - count)
+    for i in range(first, first + count):
+        weight = factor
+        for j in range(first, first + count):
+            if j != i:
+                weight *= (at_s - t_s[j]) / (t_s[i] - t_s[j])
+        for c in range(len(out)):
+            out[c] += weight * knots[i, c]
+
+
+@dataclass(slots=True)
+class Triad:
+    """Three sensors of one kind at right angles, and how they err; SI units, x is rad or m/s.
+
+    matrix    : (3, 3) what each reads of a motion along each body axis: 1 + scale error on the diagonal, the
+                misalignment of sensor i towards axis j beside it
+    turn_on   : (3,) constant bias, x/s
+    markov    : (3,) bias that wanders, x/s: a state
+    markov_sd, markov_time_s : its standard deviation and correlation time
+    white     : random walk of the integral, x/sqrt(s)
+    limit     : x/s beyond which the output stays there
+    quantum   : x of one count; 0 for none
+    residue   : (3,) x not yet counted: a state
+    """
+
+    matrix: Floats
+    turn_on: Floats
+    markov: Floats
+    markov_sd: float
+    markov_time_s: float
+    white: float
+    limit: float
+    quantum: float
+    residue: Floats = field(default_factory=lambda: np.zeros(3))
+
+    def measure(self, ideal: Floats, step_s: float, normal: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+        """(N, 3) increments as counted, and (N,) whether one was limited; see `corrupt`. normal : (N, 6) draws."""
+        keep = math.exp(-step_s / self.markov_time_s)
+        stir = self.markov_sd * math.sqrt(-math.expm1(-2 * step_s / self.markov_time_s))
+        counted, limited = corrupt(
+            ideal,
+            self.matrix,
+            self.turn_on,
+            self.markov,
+            self.residue,
+            normal,
+            (step_s, keep, stir, self.white * math.sqrt(step_s), self.limit * step_s, self.quantum),
+        )
+        return counted, limited
+
+
+@jit
+def corrupt(
+    ideal: Floats,
+    matrix: Floats,
+    turn_on: Floats,
+    markov: Floats,
+    residue: Floats,
+    normal: Floats,
+    law: tuple[float, float, float, float, float, float],
+) -> tuple[Floats, NDArray[np.bool_]]:
+    """Increments (N, 3) to what is counted; markov and residue (3,) are carried on in place.
+
+        b_n = keep b_(n-1) + stir z        exact for a Gauss-Markov process (Gelb 1974, ch. 3; `assumed`)
+        x_n = matrix ideal_n + (turn_on + b_n) step + white z',   cut to +-top, counted in whole quanta
+
+    What a cut takes is lost; what the counter leaves over waits for the next sample.
+    """
+    step, keep, stir, white, top, quantum = law
+    counted, limited = np.empty(ideal.shape), np.zeros(len(ideal), dtype=np.bool_)
+    for n in range(len(ideal)):
+        for i in range(3):
+            markov[i] = keep * markov[i] + stir * normal[n, 3 + i]
+            x = matrix[i, 0] * ideal[n, 0] + matrix[i, 1] * ideal[n, 1] + matrix[i, 2] * ideal[n, 2]
+            x += (turn_on[i] + markov[i]) * step + white * normal[n, i]
+            if abs(x) > top:
+                x = math.copysign(top, x)
+                limited[n] = True
+            if quantum > 0:
+                residue[i] += x
+                x = quantum * np.rint(residue[i] / quantum)
+                residue[i] -= x
+            counted[n, i] = x
+    return counted, limited
+
+
+def gyros(part: GyroConfig, hardware: Floats, start: Floats) -> Triad:
+    """The gyro triad of standard normal draws: hardware (4, 3), start (3,) of the wandering bias."""
+    per_hour = math.radians(1) / 3600
+    return Triad(
+        matrix=errors_of_axes(part.scale_ppm, part.misalignment_arcsec, hardware[1:]),
+        turn_on=part.turn_on_bias_deg_h * per_hour * hardware[0],
+        markov=part.bias_deg_h * per_hour * start,
+        markov_sd=part.bias_deg_h * per_hour,
+        markov_time_s=part.bias_time_s,
+        white=math.radians(part.arw_deg_sqrt_h) / 60,
+        limit=math.radians(part.rate_limit_deg_s),
+        quantum=math.radians(part.quantum_arcsec / 3600),
+    )
+
+
+def accelerometers(part: AccelerometerConfig, hardware: Floats, start: Floats) -> Triad:
+    """The accelerometer triad, as `gyros`. Its density in ug/sqrt(Hz) squared is the variance of a mean over 1 s."""
+    ug = 1e-6 * STANDARD_GRAVITY_M_S2
+    return Triad(
+        matrix=errors_of_axes(part.scale_ppm, part.misalignment_arcsec, hardware[1:]),
+        turn_on=part.turn_on_bias_ug * ug * hardware[0],
+        markov=part.bias_ug * ug * start,
+        markov_sd=part.bias_ug * ug,
+        markov_time_s=part.bias_time_s,
+        white=part.vrw_ug_sqrt_hz * ug,
+        limit=part.limit_g * STANDARD_GRAVITY_M_S2,
+        quantum=1e-6 * part.quantum_um_s,
+    )
+
+
+def errors_of_axes(scale_ppm: float, misalignment_arcsec: float, normal: Floats) -> Floats:
+    """(3, 3) unity, the scale errors on its diagonal, and every sensor's own tilt towards the two other axes."""
+    tilt = math.radians(misalignment_arcsec / 3600)
+    return np.eye(3) + np.where(np.eye(3) > 0, 1e-6 * scale_ppm, tilt) * normal
+
+
+@dataclass(slots=True)
+class Unit:
+    """One inertial measurement unit: its hardware for good, its wandering biases and counters as they stand.
+
+    Twelve draws a sample, whichever errors are on: a run in pieces is the run at once, bit for bit, and one error
+    more or less leaves the others as they were.
+    """
+
+    gyro: Triad
+    accelerometer: Triad
+    rng: np.random.Generator
+
+    @classmethod
+    def of(cls, part: ImuConfig, rng: np.random.Generator) -> Unit:
+        """The unit that hardware_seed tells, switched on: the biases start as they wander for ever."""
+        hardware = np.random.default_rng(np.random.SeedSequence(part.hardware_seed)).standard_normal(
+            (2, 4, 3)
+        )
+        start = rng.standard_normal((2, 3))
+        return cls(
+            gyros(part.gyro, hardware[0], start[0]),
+            accelerometers(part.accelerometer, hardware[1], start[1]),
+            rng,
+        )
+
+    def measure(self, ideal: Increments) -> Increments:
+        """What the unit puts out for the next samples of `felt`."""
+        normal = self.rng.standard_normal((len(ideal.t_s), 2, 6))
+        angle, fast = self.gyro.measure(ideal.angle_rad, ideal.step_s, normal[:, 0])
+        velocity, hard = self.accelerometer.measure(ideal.velocity_m_s, ideal.step_s, normal[:, 1])
+        return Increments(ideal.t_s, ideal.step_s, angle, velocity, fast, hard)
+
+    @property
+    def gyro_bias_rad_s(self) -> Floats:
+        """(3,) bias of the last sample, turn-on and wandering part together; before the first, of the start."""
+        return self.gyro.turn_on + self.gyro.markov
+
+    @property
+    def accelerometer_bias_m_s2(self) -> Floats:
+        """(3,) likewise."""
+        return self.accelerometer.turn_on + self.accelerometer.markov
+
+
+@dataclass(slots=True)
+class Navigator:
+    """The attitude as the lab has it: the gyros' increments added up from where the vehicle was zeroed.
+
+    lab_from_body_wxyz   : (4,) believed; at the start that of the home position
+    earth_rate_lab_rad_s : (3,) what it takes away; zeros take the Earth's turning for the vehicle's
+    """
+
+    lab_from_body_wxyz: Floats
+    earth_rate_lab_rad_s: Floats = field(default_factory=lambda: np.zeros(3))
+
+    def __post_init__(self) -> None:
+        start = np.asarray(self.lab_from_body_wxyz, dtype=float)
+        self.lab_from_body_wxyz = start / np.linalg.norm(start)
+
+    def add(self, increments: Increments) -> None:
+        """The next samples, in order; see `turned`."""
+        self.lab_from_body_wxyz = turned(
+            self.lab_from_body_wxyz, increments.angle_rad, self.earth_rate_lab_rad_s, increments.step_s
+        )
+
+    @property
+    def euler_deg(self) -> tuple[float, float, float]:
+        """(roll, pitch, yaw), 3-2-1: lab_from_body = Rz(yaw) Ry(pitch) Rx(roll); pitch within 90 deg."""
+        w, x, y, z = map(float, self.lab_from_body_wxyz)
+        roll = math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
+        pitch = math.asin(min(max(2 * (w * y - z * x), -1.0), 1.0))
+        yaw = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+        return math.degrees(roll), math.degrees(pitch), math.degrees(yaw)
+
+
+@jit
+def turned(lab_from_body_wxyz: Floats, angle_rad: Floats, earth_rate: Floats, step_s: float) -> Floats:
+    """The attitude after (N, 3) increments: lab_from_body <- exp(-earth_rate step) lab_from_body exp(angle).
+
+    The left factor is the lab's own turning, in its own axes: the Earth rate turned into the body's and taken away
+    at every moment, not at the sample's start. Each increment is taken for a rotation vector, as the lab does. An
+    axis that swings within a sample makes that wrong by half the integral of angle x rate (coning; `assumed`).
+    """
+    lab_now_from_before = quaternion.from_rotvec(-step_s * earth_rate)
+    here = lab_from_body_wxyz
+    for n in range(len(angle_rad)):
+        here = quaternion.multiply(
+            lab_now_from_before, quaternion.multiply(here, quaternion.from_rotvec(angle_rad[n]))
+        )
+        here = here / math.sqrt(here[0] ** 2 + here[1] ** 2 + here[2] ** 2 + here[3] ** 2)
+    return here
+
+
+def tilt_rad(velocity_m_s: Floats) -> tuple[float, float]:
+    """(roll, pitch) of a vehicle at rest from its accelerometers: the force that carries it points up.
+
+    In body axes it is g (-sin pitch, sin roll cos pitch, cos roll cos pitch). velocity_m_s : (N, 3) increments.
+    """
+    x, y, z = map(float, np.mean(velocity_m_s, axis=0))
+    return math.atan2(y, z), math.atan2(-x, math.hypot(y, z))

@@ -1,0 +1,211 @@
+"""Flying: the model is stepped tick by tick, and every step is kept."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import mujoco
+import numpy as np
+from mujoco.rollout import Rollout
+from scipy.spatial.transform import Rotation
+
+from skysim.core.errors import InputError
+from skysim.core.types import Floats, Trajectory
+from skysim.core.units import RPM_RAD_S
+from skysim.dynamics.multibody.mjcf import mujoco_warnings
+from skysim.dynamics.multibody.model import World
+
+STATE = mujoco.mjtState.mjSTATE_FULLPHYSICS
+CONTROL = mujoco.mjtState.mjSTATE_CTRL
+FOREVER = 2**62  # steps
+
+Controller = Callable[[float, Rotation, Floats], Floats]
+
+
+class Flight:
+    """A vehicle in flight. `advance` moves it on by some steps with their controls; the past stays.
+
+    MuJoCo's rollout steps in C and writes every state into `states`, so that a step costs what MuJoCo's own costs.
+    The present is the last state flown: angles, rates and speeds are read from it without a copy.
+
+    lab_from_body : at the start; rate_body_rad_s : (3,) likewise
+    duration_s    : the longest that this flight can last; room is made for so many steps. With kept_s it may be inf
+    kept_s        : room is made for twice so many only, and what is older than that is forgotten
+    """
+
+    def __init__(
+        self,
+        world: World,
+        lab_from_body: Rotation,
+        rate_body_rad_s: Floats,
+        duration_s: float,
+        kept_s: float | None = None,
+    ) -> None:
+        check_tilt(world, lab_from_body)
+        self.world, self.model = world, world.model
+        self.step_s = float(self.model.opt.timestep)
+        self.last = max(1, int(np.ceil(min(duration_s / self.step_s, FOREVER) - 1e-6)))
+        self.kept = self.last if kept_s is None else int(np.ceil(kept_s / self.step_s))
+        rows = min(self.last, 2 * self.kept) + 1
+        self.states = np.empty((rows, mujoco.mj_stateSize(self.model, int(STATE))))
+        self.step = self.first = 0  # the present; which step the first of `states` is
+        self.data = mujoco.MjData(self.model)
+        self.rollout = Rollout(nthread=0)
+        self.start(lab_from_body, rate_body_rad_s)
+
+    def start(self, lab_from_body: Rotation, rate_body_rad_s: Floats) -> None:
+        """The first state: wheels, rotors and gimbals as the scene has them."""
+        world, data = self.world, self.data
+        vehicle = world.vehicle
+        data.qpos[:4] = lab_from_body.as_quat(scalar_first=True)
+        data.qvel[:3] = rate_body_rad_s
+        if vehicle.wheels:
+            rpm = as_many(vehicle.wheels.start_rpm, len(world.wheels), "vehicle.wheels.start_rpm")
+            data.qvel[world.wheels.dof] = rpm * RPM_RAD_S
+        if vehicle.cmgs:
+            angles = np.radians(as_many(vehicle.cmgs.start_deg, len(world.gimbals), "vehicle.cmgs.start_deg"))
+            data.qpos[world.gimbals.qpos] = angles
+            data.act[self.model.actuator_actadr[world.gimbals.motor]] = angles  # where the servos aim
+            data.qvel[world.rotors.dof] = vehicle.cmgs.rotor_rpm * RPM_RAD_S
+        mujoco.mj_getState(self.model, data, self.states[0], int(STATE))
+        mujoco.mj_forward(self.model, data)
+
+    @property
+    def steps_left(self) -> int:
+        return self.last - self.step
+
+    @property
+    def now_s(self) -> float:
+        return self.step * self.step_s
+
+    @property
+    def lab_from_body_wxyz(self) -> Floats:
+        """(4,) scalar first."""
+        return self.states[self.row, 1:5]
+
+    @property
+    def rate_body_rad_s(self) -> Floats:
+        """(3,)"""
+        return self.states[self.row, 1 + self.model.nq :][:3]
+
+    @property
+    def angles_rad(self) -> Floats:
+        """All of qpos; `Hinges.qpos` tells which is whose."""
+        return self.states[self.row, 1 : 1 + self.model.nq]
+
+    @property
+    def speeds_rad_s(self) -> Floats:
+        """All of qvel; `Hinges.dof` tells which is whose."""
+        return self.states[self.row, 1 + self.model.nq :][: self.model.nv]
+
+    @property
+    def row(self) -> int:
+        """Where in `states` the present is."""
+        return self.step - self.first
+
+    def forget(self, steps: int) -> None:
+        """Make room for so many steps, if there is none, by what is older than `kept`."""
+        if self.row + steps < len(self.states):
+            return
+        old = max(self.row - self.kept, 0)
+        self.states[: self.row - old + 1] = self.states[old : self.row + 1]
+        self.first += old
+
+    def advance(self, control: Floats) -> None:
+        """Fly one step for each row of control (K, nu). Raises InputError where MuJoCo warned.
+
+        MuJoCo puts an unstable model back to its start and goes on, and forgets its warnings with the next call.
+        """
+        self.forget(len(control))
+        row, end = self.row, self.row + len(control)
+        with mujoco_warnings():
+            self.rollout.rollout(
+                [self.model],
+                [self.data],
+                self.states[None, row],
+                control[None],
+                control_spec=int(CONTROL),
+                skip_checks=True,
+                nstep=len(control),
+                initial_warmstart=self.data.qacc_warmstart[None].copy(),
+                state=self.states[None, row + 1 : end + 1],
+            )
+        self.step += len(control)
+        self.check()
+
+    def check(self) -> None:
+        if self.data.warning.number.any():
+            raise InputError(
+                f"the flight cannot be stepped at {1e3 * self.step_s:g} ms: MuJoCo warned before {self.now_s:.3f} s"
+                f" ({self.warned()}); something in vehicle or motion.control is too stiff, too fast or not a number"
+            )
+
+    def warned(self) -> str:
+        """Which of MuJoCo's warnings it was."""
+        kinds = [
+            kind for kind in mujoco.mjtWarning.__members__.values() if int(kind) < len(self.data.warning)
+        ]
+        return ", ".join(str(kind.name) for kind in kinds if self.data.warning[int(kind)].number)
+
+    def times_s(self, begin: int, end: int) -> Floats:
+        """Of the steps from begin to before end."""
+        return np.arange(begin, end) * np.float64(self.step_s)
+
+    def knots(self, begin: int = 0) -> tuple[Floats, Floats, Floats]:
+        """Times (K,), lab_from_body (K, 4) as wxyz and rates (K, 3) from a step on."""
+        flown, nq = self.states[begin - self.first : self.row + 1], self.model.nq
+        return self.times_s(begin, self.step + 1), flown[:, 1:5], flown[:, 1 + nq : 4 + nq]
+
+    def trajectory(self, begin: int = 0) -> Trajectory:
+        """What was flown from a step on, as a history of its own."""
+        t_s, lab_from_body_wxyz, rate = self.knots(begin)
+        return Trajectory(t_s, Rotation.from_quat(lab_from_body_wxyz, scalar_first=True), rate.copy())
+
+
+def as_many(values: tuple[float, ...], count: int, key: str) -> Floats:
+    """One value for each, zeros where none are given."""
+    if values and len(values) != count:
+        raise InputError(f"{key}: {len(values)} values for {count} of them")
+    return np.array(values or (0.0,) * count)
+
+
+def fly(
+    world: World,
+    lab_from_body_start: Rotation,
+    rate_body_rad_s: Floats,
+    duration_s: float,
+    controller: Controller | None = None,
+    control_period_s: float = 0.01,
+) -> Trajectory:
+    """The vehicle's motion under gravity, its stop and a controller's ideal torques, sampled at every step.
+
+    controller(t_s, lab_from_body, rate_body_rad_s) -> (3,) torque in N m about the body axes. It is asked at
+    the start and every control period (whole steps); its torque, clipped to the limit, is held in between.
+    rate_body_rad_s : (3,) at the start. Raises InputError for a start beyond the tilt stop, and where MuJoCo warned.
+    """
+    flight = Flight(world, lab_from_body_start, rate_body_rad_s, duration_s)
+    every = max(1, round(control_period_s / flight.step_s)) if controller else flight.steps_left
+    limit = world.vehicle.torque_limit_nm
+    while flight.steps_left:
+        control = np.zeros((min(every, flight.steps_left), world.model.nu))
+        if controller:
+            here = Rotation.from_quat(flight.lab_from_body_wxyz, scalar_first=True)
+            torque = controller(flight.now_s, here, flight.rate_body_rad_s.copy())
+            control[:, world.torques] = np.clip(torque, -limit, limit)
+        flight.advance(control)
+    return flight.trajectory()
+
+
+def tilt_deg(lab_from_body: Rotation) -> Floats:
+    """Angle between the body's z and the lab's, of one attitude or of many."""
+    return np.degrees(np.arccos(np.clip(lab_from_body.as_matrix()[..., 2, 2], -1, 1)))
+
+
+def check_tilt(world: World, lab_from_body: Rotation) -> None:
+    """Refuse a start that the bearing does not allow."""
+    tilt = float(tilt_deg(lab_from_body))
+    if world.vehicle.mount == "air_bearing" and tilt > world.vehicle.tilt_stop_deg:
+        raise InputError(
+            f"motion.start: tilted by {tilt:.1f} deg, beyond vehicle.tilt_stop_deg"
+            f" {world.vehicle.tilt_stop_deg:g}"
+        )

@@ -1,0 +1,243 @@
+"""The actuators in the model: which joints and sites they are, and the motors that drive them.
+
+A vehicle's MJCF says where they are, by name: hinge joints `wheel_*`; hinge joints `gimbal_*` and on each a hinge
+joint `rotor_*` of the same ending; sites `fan_*`, which push along their own z. The scene says what they can do.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from skysim.core.errors import InputError
+from skysim.core.types import Floats
+from skysim.scene.vehicle import CmgsConfig, VehicleConfig, WheelsConfig
+from skysim.scene.vehicle import FansConfig as FansPart
+
+TORQUES = ("torque_x", "torque_y", "torque_z")
+WHEEL, GIMBAL, ROTOR, FAN = "wheel_", "gimbal_", "rotor_", "fan_"
+
+
+@dataclass(frozen=True, slots=True)
+class Hinges:
+    """Hinge joints of one kind, in the order of their names.
+
+    names        : (n)
+    axes         : (3, n) unit axes in the body's axes, all joints at their zero
+    inertia_kg_m2: (n,) about each axis, of all that turns with it
+    qpos, dof    : (n,) where angle and speed stand in the state
+    motor        : (n,) actuator numbers, -1 where it has none
+    """
+
+    names: tuple[str, ...]
+    axes: Floats
+    inertia_kg_m2: Floats
+    qpos: NDArray[np.int64]
+    dof: NDArray[np.int64]
+    motor: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, model: Any, prefix: str) -> Hinges:
+        """All joints whose name begins with prefix."""
+        data = mujoco.MjData(model)
+        mujoco.mj_forward(model, data)
+        full = np.zeros((model.nv, model.nv))
+        mujoco.mj_fullM(model, data, full)
+        names = sorted(name for name in all_names(model.joint, model.njnt) if name.startswith(prefix))
+        ids = np.array([model.joint(name).id for name in names], dtype=np.int64)
+        dof = model.jnt_dofadr[ids].astype(np.int64)
+        actuators = all_names(model.actuator, model.nu)
+        motor = [actuators.index(name) if name in actuators else -1 for name in names]
+        return cls(
+            tuple(names),
+            data.xaxis[ids].T.copy(),
+            full[dof, dof],
+            model.jnt_qposadr[ids].astype(np.int64),
+            dof,
+            np.array(motor, dtype=np.int64),
+        )
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+
+@dataclass(frozen=True, slots=True)
+class Fans:
+    """Fans, in the order of their names: (3, n) where they push along, where they sit, and actuator numbers."""
+
+    names: tuple[str, ...]
+    axes: Floats
+    places_m: Floats
+    motor: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, model: Any) -> Fans:
+        """Those that have an actuator."""
+        data = mujoco.MjData(model)
+        mujoco.mj_forward(model, data)
+        names = sorted(name for name in all_names(model.actuator, model.nu) if name.startswith(FAN))
+        sites = [model.site(name).id for name in names]
+        axes = data.site_xmat[sites].reshape(-1, 3, 3)[:, :, 2]
+        motor = np.array([model.actuator(name).id for name in names], dtype=np.int64)
+        return cls(tuple(names), axes.T.copy(), data.site_xpos[sites].T.copy(), motor)
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+
+def all_names(element: Any, count: int) -> list[str]:
+    """The names of a compiled model's elements of one kind; `element` is its accessor by number."""
+    return [element(k).name for k in range(count)]
+
+
+def joints(spec: Any, prefix: str) -> list[Any]:
+    """The joints of a spec whose name begins with prefix, in the order of their names."""
+    return sorted((j for j in spec.joints if j.name.startswith(prefix)), key=lambda joint: joint.name)
+
+
+def lock_unused(spec: Any, vehicle: VehicleConfig, path: Path) -> dict[str, str]:
+    """Take away the joints of actuators that are not switched on; refuse a vehicle that lacks one that is.
+
+    Returns the names of the joints that it took, and the key of the scene that would have kept each.
+    """
+    locked: dict[str, str] = {}
+    check_names(spec, path)
+    for part, key, prefixes in (
+        (vehicle.wheels, "wheels", (WHEEL,)),
+        (vehicle.cmgs, "cmgs", (GIMBAL, ROTOR)),
+    ):
+        for prefix in prefixes:
+            found = joints(spec, prefix)
+            if part is None:
+                locked |= dict.fromkeys((joint.name for joint in found), f"vehicle.{key}")
+                for joint in found:
+                    spec.delete(joint)
+            elif not found:
+                raise InputError(f"{path}: has no joint {prefix}*, which vehicle.{key} switches on")
+            elif any(joint.type != mujoco.mjtJoint.mjJNT_HINGE for joint in found):
+                raise InputError(f"{path}: joints {prefix}* must be hinges")
+            for joint in found if part else ():
+                check_bare(joint, path)
+    if vehicle.cmgs:
+        pair_up(spec, path)
+    if vehicle.fans and not fans(spec):
+        raise InputError(f"{path}: has no site {FAN}*, which vehicle.fans switches on")
+    for actuator in spec.actuators:
+        if actuator.name in TORQUES or actuator.name.startswith((WHEEL, GIMBAL, ROTOR, FAN)):
+            raise InputError(
+                f"{path}: actuator {actuator.name}: skysim makes its own of this name; leave it out"
+            )
+    return locked
+
+
+def why_locked(complaint: str, locked: dict[str, str]) -> str:
+    """What MuJoCo cannot know of a joint that it does not find."""
+    named = [name for name in locked if f"'{name}'" in complaint]
+    return f"; {locked[named[0]]} is off, which locks joint {named[0]}" if named else ""
+
+
+def check_names(spec: Any, path: Path) -> None:
+    """Refuse a joint or site that is nearly an actuator's, and would fly as something else without a word."""
+    for element in (*spec.joints, *spec.sites):
+        word = next((p for p in (WHEEL, GIMBAL, ROTOR, FAN) if element.name.startswith(p[:-1])), None)
+        if word and not element.name.startswith(word):
+            raise InputError(
+                f"{path}: {element.name}: allowed: {word}{element.name[len(word) - 1 :]}, or another word"
+            )
+
+
+def check_bare(joint: Any, path: Path) -> None:
+    """Refuse what would stop, drive or load an actuator's joint beside what the scene declares."""
+    given = {
+        "range": joint.range,
+        "stiffness": joint.stiffness,
+        "damping": joint.damping,
+        "frictionloss": joint.frictionloss,
+        "armature": joint.armature,
+        "actuatorfrcrange": joint.actfrcrange,
+    }
+    for name, value in given.items():
+        if np.any(value):
+            raise InputError(f"{path}: joint {joint.name}: {name} is not the file's to say; leave it out")
+
+
+def pair_up(spec: Any, path: Path) -> None:
+    """Each rotor rides on the gimbal of the same ending, across its axis."""
+    for gimbal in joints(spec, GIMBAL):
+        ending = gimbal.name.removeprefix(GIMBAL)
+        rotor = spec.joint(ROTOR + ending)
+        if rotor is None or rotor.parent.parent != gimbal.parent:
+            raise InputError(
+                f"{path}: joint {gimbal.name} has no joint {ROTOR}{ending} on a body of its own beneath it"
+            )
+    if len(joints(spec, ROTOR)) != len(joints(spec, GIMBAL)):
+        raise InputError(f"{path}: a joint {ROTOR}* has no joint {GIMBAL}* of the same ending")
+
+
+def fans(spec: Any) -> list[Any]:
+    return sorted((site for site in spec.sites if site.name.startswith(FAN)), key=lambda site: site.name)
+
+
+def add_actuators(spec: Any, model: Any, vehicle: VehicleConfig) -> None:
+    """The motors of all that is switched on, and three ideal torques; model is what the spec compiled to."""
+    for name, axis in zip(TORQUES, np.eye(3), strict=True):
+        # A ball joint's motor turns about an axis of the body.
+        add_motor(spec, name, mujoco.mjtTrn.mjTRN_JOINT, "bearing", gear=[*axis, 0, 0, 0])
+    if vehicle.wheels:
+        add_wheels(spec, vehicle.wheels)
+    if vehicle.cmgs:
+        add_cmgs(spec, model, vehicle.cmgs)
+    if vehicle.fans:
+        add_fans(spec, vehicle.fans)
+
+
+def add_motor(spec: Any, name: str, kind: Any, target: str, **more: Any) -> Any:
+    """A motor of that name: force = control."""
+    motor = spec.add_actuator(name=name, trntype=kind, target=target, **more)
+    motor.set_to_motor()
+    return motor
+
+
+def add_wheels(spec: Any, wheels: WheelsConfig) -> None:
+    """A motor at each wheel, and the friction of its axle: Coulomb's is MuJoCo's, which sticks at rest."""
+    for joint in joints(spec, WHEEL):
+        joint.frictionloss, joint.damping = wheels.coulomb_nm, [wheels.viscous_nms, 0.0, 0.0]
+        motor = add_motor(spec, joint.name, mujoco.mjtTrn.mjTRN_JOINT, joint.name)
+        limit(motor, wheels.torque_limit_nm)
+
+
+def add_cmgs(spec: Any, model: Any, cmgs: CmgsConfig) -> None:
+    """A rate servo at each gimbal, and a motor at each rotor of variable speed; other rotors keep their momentum.
+
+    The servo's aim is the integral of the commanded rate; a critically damped spring draws the gimbal to it with the
+    time constant of the scene, so that the rate is held against the vehicle's own turn, which a mere damper is not.
+    """
+    tau_s = cmgs.gimbal_time_constant_s
+    for joint, inertia in zip(joints(spec, GIMBAL), Hinges.of(model, GIMBAL).inertia_kg_m2, strict=True):
+        servo = spec.add_actuator(name=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT, target=joint.name)
+        servo.set_to_intvelocity(kp=inertia / tau_s**2, kv=2 * inertia / tau_s)
+    for joint in joints(spec, ROTOR):
+        if cmgs.rotor_torque_limit_nm:
+            limit(
+                add_motor(spec, joint.name, mujoco.mjtTrn.mjTRN_JOINT, joint.name), cmgs.rotor_torque_limit_nm
+            )
+
+
+def add_fans(spec: Any, part: FansPart) -> None:
+    """A force at each fan, along its site's z, that follows the command with a first-order lag."""
+    for site in fans(spec):
+        fan = add_motor(spec, site.name, mujoco.mjtTrn.mjTRN_SITE, site.name, gear=[0, 0, 1, 0, 0, 0])
+        # Not FILTEREXACT, which is exact for Euler's steps: under Runge-Kutta it lags by half a step more.
+        fan.dyntype = mujoco.mjtDyn.mjDYN_FILTER
+        fan.dynprm[0] = part.time_constant_s
+        limit(fan, part.thrust_limit_n)
+
+
+def limit(motor: Any, most: float) -> None:
+    motor.ctrllimited = mujoco.mjtLimited.mjLIMITED_TRUE
+    motor.ctrlrange = [-most, most]

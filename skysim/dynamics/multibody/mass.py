@@ -1,0 +1,112 @@
+"""Mass properties: what the vehicle weighs, and making it weigh what the scene declares."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from skysim.core.errors import InputError
+from skysim.core.types import Floats
+from skysim.scene.vehicle import VehicleConfig, WheelsConfig
+
+
+@dataclass(frozen=True, slots=True)
+class MassProperties:
+    """Of the whole tree, in body axes: mass, centre of mass (3,), inertia (3, 3) about the body's origin."""
+
+    mass_kg: float
+    centre_m: Floats
+    inertia_kg_m2: Floats
+
+
+def tree_mass(model: Any, without_bus: bool = False) -> MassProperties:
+    """The bus and all it carries, as the compiled model has them; without_bus only what it carries."""
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    bus = model.body("bus").id
+    rides = model.body_rootid == bus
+    rides[bus] &= not without_bus
+    mass, centre = model.body_mass[rides], data.xipos[rides]
+    axes = data.ximat[rides].reshape(-1, 3, 3)
+    inertia = np.einsum("nij,nj,nkj->ik", axes, model.body_inertia[rides], axes)
+    inertia += sum((parallel_axis(m, p) for m, p in zip(mass, centre, strict=True)), np.zeros((3, 3)))
+    return MassProperties(float(mass.sum()), mass @ centre / max(mass.sum(), 1e-300), inertia)
+
+
+def parallel_axis(mass_kg: float, place_m: Floats) -> Floats:
+    """(3, 3) inertia about the origin of a point mass: m (r.r E - r r^T) (Steiner)."""
+    return mass_kg * (place_m @ place_m * np.eye(3) - np.outer(place_m, place_m))
+
+
+def declare_mass(bus: Any, model: Any, vehicle: VehicleConfig, path: Path) -> MassProperties:
+    """Give the bus the inertial that makes the whole tree come out as declared: wanted minus what it carries.
+
+    Mass and inertia that the scene leaves out stay as in the file; the centre of mass is always the scene's.
+    The inertia is that about the bearing's centre, its principal axes the body's. Nothing is moved: what a
+    lab does with balance masses is done to the bus's inertial alone, and the camera stays where it is.
+    """
+    own, carried = tree_mass(model), tree_mass(model, without_bus=True)
+    centre = np.array(vehicle.centre_of_mass_m)
+    inertia = own.inertia_kg_m2 if vehicle.inertia_kg_m2 is None else np.diag(vehicle.inertia_kg_m2)
+    wanted = MassProperties(vehicle.mass_kg or own.mass_kg, centre, inertia)
+    mass = wanted.mass_kg - carried.mass_kg
+    if mass <= 0:
+        raise InputError(
+            f"vehicle.mass: {wanted.mass_kg:g} kg leaves nothing for the bus, which carries"
+            f" {carried.mass_kg:g} kg ({path})"
+        )
+    place = (wanted.mass_kg * wanted.centre_m - carried.mass_kg * carried.centre_m) / mass
+    whose = f"vehicle.inertia: less what the bus carries ({path}), its"
+    give_inertial(bus, mass, place, inertia - carried.inertia_kg_m2 - parallel_axis(mass, place), whose)
+    return wanted
+
+
+def unbalance(model: Any, joints: list[Any], wheels: WheelsConfig, path: Path) -> None:
+    """Set every wheel's mass off its axle and tilt its principal axes: it shakes the vehicle with its speed squared.
+
+    Static: the rotor's centre is moved across the axle by static_imbalance / mass; the axle feels the force
+    U_s speed^2, the bearing its moment. Dynamic: a product of inertia U_d between the axle and the other line across
+    it; the axle feels the torque U_d speed^2, at a quarter of a turn from the former. Changes the joints' bodies;
+    model is what they compiled to while they were balanced.
+    """
+    if not (wheels.static_imbalance_kg_m or wheels.dynamic_imbalance_kg_m2):
+        return
+    for joint in joints:
+        rotor, own = joint.parent, model.body(joint.parent.name)
+        axle = model.joint(joint.name).axis  # in the rotor's axes, whatever frame the file gave it in
+        across = np.cross(axle, np.eye(3)[np.argmin(np.abs(axle))])
+        across /= np.linalg.norm(across)
+        product = np.outer(axle, np.cross(axle, across))
+        axes = Rotation.from_quat(own.iquat, scalar_first=True).as_matrix()
+        inertia = axes @ np.diag(own.inertia) @ axes.T + wheels.dynamic_imbalance_kg_m2 * (
+            product + product.T
+        )
+        give_inertial(
+            rotor,
+            own.mass[0],
+            own.ipos + wheels.static_imbalance_kg_m / own.mass[0] * across,
+            inertia,
+            f"vehicle.wheels.dynamic_imbalance: with it {joint.name}'s ({path})",
+        )
+
+
+def give_inertial(body: Any, mass_kg: float, place_m: Floats, inertia_kg_m2: Floats, whose: str) -> None:
+    """Write mass, centre and inertia (3, 3) about it into a body of a spec; refuse what no rigid body has."""
+    moments, axes = np.linalg.eigh(inertia_kg_m2)
+    if moments[0] <= 0 or moments[2] > (moments[0] + moments[1]) * (1 + 1e-12):
+        raise InputError(
+            f"{whose} principal moments about its centre of mass are"
+            f" {', '.join(f'{m:.3g}' for m in moments)} kg m2, which no rigid body has"
+        )
+    body.explicitinertial = True
+    # MuJoCo takes a NaN ipos for the body's pos without a word: always set it.
+    body.mass, body.ipos, body.inertia = mass_kg, place_m, moments
+    body.iquat = Rotation.from_matrix(axes * np.linalg.det(axes)).as_quat(scalar_first=True)
+    # An orientation or a full inertia that the file gave in another way would win over these.
+    body.ialt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
+    body.fullinertia = np.full(6, np.nan)

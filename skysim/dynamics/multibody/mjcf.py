@@ -1,0 +1,47 @@
+"""MuJoCo's model files: read and compiled, with its complaints told in one line."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import mujoco
+
+from skysim.core.errors import InputError
+from skysim.dynamics.multibody.mjcf_sandbox import confined
+
+
+def load(path: Path) -> Any:
+    """The MJCF file as an MjSpec."""
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; vehicle.model is a path beside the scene or in scenes/")
+    confined(path)
+    try:
+        return mujoco.MjSpec.from_file(str(path))
+    except (ValueError, mujoco.FatalError) as error:
+        raise InputError(f"{path}: not a MuJoCo model: {one_line(error)}") from error
+
+
+def compiled(spec: Any, path: Path) -> Any:
+    try:
+        return spec.compile()
+    except (ValueError, mujoco.FatalError) as error:
+        raise InputError(f"{path}: MuJoCo cannot compile it: {one_line(error)}") from error
+
+
+@contextmanager
+def mujoco_warnings() -> Iterator[list[str]]:
+    """Collect MuJoCo's warnings, which it would print and append to a file in the user's folder."""
+    caught: list[str] = []
+    before = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(caught.append)
+    try:
+        yield caught
+    finally:
+        mujoco.set_mju_user_warning(before)
+
+
+def one_line(error: Exception) -> str:
+    return " ".join(str(error).split())

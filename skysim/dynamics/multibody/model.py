@@ -1,0 +1,258 @@
+"""The vehicle's MJCF put on its bearing, with the actuators that the scene switches on, as one MuJoCo model.
+
+MuJoCo's qpos of a ball joint is lab_from_body as wxyz, its qvel the angular rate in body axes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from skysim.core.errors import InputError
+from skysim.core.paths import SCENES
+from skysim.core.types import Floats, Mount
+from skysim.dynamics.multibody.joints import (
+    FAN,
+    GIMBAL,
+    ROTOR,
+    TORQUES,
+    WHEEL,
+    Fans,
+    Hinges,
+    add_actuators,
+    joints,
+    lock_unused,
+    why_locked,
+)
+from skysim.dynamics.multibody.mass import MassProperties, declare_mass, tree_mass, unbalance
+from skysim.dynamics.multibody.mjcf import compiled, load, mujoco_warnings, one_line
+from skysim.scene.vehicle import VehicleConfig
+
+GRAVITY_M_S2 = 9.80665
+STEP_S = 1e-3
+CAMERA = "star_camera"
+IMU = "imu"
+NEEDED = f"body bus and camera {CAMERA}"
+
+# MuJoCo's camera has +y up and looks along -z; ours has +y down and looks along +z.
+CAM_FROM_MJCAM = Rotation.from_matrix(np.diag([1.0, -1.0, -1.0]))
+
+# The tilt stop's two ends, above the bearing in the lab and on the vehicle. Unequal, so that the line between
+# them never vanishes and its length has a slope at every tilt but none.
+STOP_LAB_M, STOP_BODY_M = 1.0, 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class World:
+    """A vehicle on its bearing, ready to fly. The model is not changed by flying.
+
+    spec    : mujoco.MjSpec that the model was made from
+    model   : mujoco.MjModel, whose first four qpos and three qvel are the bearing's
+    mass    : what the whole vehicle came out as, its wheels balanced
+    torques : (3,) actuator numbers of the ideal torques about body x, y, z
+    wheels, gimbals, rotors, fans : the actuators, without members where they are not switched on
+    """
+
+    spec: Any
+    model: Any
+    vehicle: VehicleConfig
+    mass: MassProperties
+    torques: NDArray[np.int64]
+    wheels: Hinges
+    gimbals: Hinges
+    rotors: Hinges
+    fans: Fans
+
+    @property
+    def inertia_kg_m2(self) -> Floats:
+        """(3, 3) inertia tensor about the bearing's centre, in body axes, as if every joint were locked."""
+        return self.mass.inertia_kg_m2
+
+    @property
+    def gravity_m_s2(self) -> float:
+        """What pulls along lab -z."""
+        return float(-self.model.opt.gravity[2])
+
+
+def build(vehicle: VehicleConfig) -> World:
+    """Compose and compile the vehicle, and find what its actuators are and where. Raises InputError with one line."""
+    path = SCENES / vehicle.model
+    with mujoco_warnings():
+        spec, mass = compose(vehicle, path)
+        model = compiled(spec, path)
+    return World(
+        spec,
+        model,
+        vehicle,
+        mass,
+        np.array([model.actuator(name).id for name in TORQUES]),
+        Hinges.of(model, WHEEL),
+        Hinges.of(model, GIMBAL),
+        Hinges.of(model, ROTOR),
+        Fans.of(model),
+    )
+
+
+def compose(vehicle: VehicleConfig, path: Path) -> tuple[Any, MassProperties]:
+    """The vehicle's MJCF on a bearing at the lab's origin, as MjSpec, with the mass properties declared.
+
+    mount `air_bearing`: gravity along lab -z and a tilt stop. mount `free`: neither, and the vehicle turns
+    about its centre of mass, which must be the body's origin. Joints of actuators that the scene does not switch
+    on are locked. Raises InputError with one line.
+    """
+    if vehicle.mount == "free" and any(vehicle.centre_of_mass_m):
+        raise InputError(
+            "vehicle.centre_of_mass: a free vehicle turns about it, so it is the body's origin; leave it out"
+        )
+    spec = load(path)
+    spec.compiler.fusestatic = False  # bodies keep their names until the bearing is there
+    bus = put_at_origin(spec, path)
+    place_camera(spec, vehicle)
+    locked = lock_unused(spec, vehicle, path)
+    try:
+        bare = compiled(spec, path)
+    except InputError as error:
+        raise InputError(f"{error}{why_locked(str(error), locked)}") from None
+    mass = declare_mass(bus, bare, vehicle, path)
+    try:
+        add_bearing(spec, bus, vehicle)
+    except ValueError as error:  # a name is taken
+        raise InputError(f"{path}: skysim adds its bearing under this name: {one_line(error)}") from error
+    balanced = compiled(spec, path)
+    check(balanced, mass, path)
+    if vehicle.wheels:
+        unbalance(balanced, joints(spec, WHEEL), vehicle.wheels, path)
+    add_actuators(spec, balanced, vehicle)
+    return spec, mass
+
+
+def put_at_origin(spec: Any, path: Path) -> Any:
+    """The bus, freed of the joints and the place that its file gave it: the bearing decides on both."""
+    has = {"body bus": spec.body("bus"), f"camera {CAMERA}": spec.camera(CAMERA)}
+    missing = [name for name, element in has.items() if element is None]
+    if missing:
+        raise InputError(f"{path}: has no {', no '.join(missing)}; a vehicle needs {NEEDED}")
+    bus = spec.body("bus")
+    if bus.parent.name != "world" or bus.frame is not None:
+        raise InputError(f"{path}: body bus must stand directly in the worldbody, in no other body or frame")
+    for joint in list(bus.joints):
+        if joint.name.startswith((WHEEL, GIMBAL, ROTOR)):
+            raise InputError(f"{path}: joint {joint.name} must stand on a body of its own beneath bus")
+        spec.delete(joint)
+    for key in list(spec.keys):  # keyframes are lists of joint positions, which no longer fit
+        spec.delete(key)
+    bus.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT  # an euler or axisangle would win over the quat
+    bus.pos, bus.quat = [0.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0]
+    return bus
+
+
+def place_camera(spec: Any, vehicle: VehicleConfig) -> None:
+    """The camera's pupil where the scene has it: the body that carries the camera is moved, or on bus the camera."""
+    if vehicle.camera_m is None:
+        return
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    camera = spec.camera(CAMERA)
+    carrier = camera if camera.parent.name == "bus" else camera.parent
+    R_lab_from_parent = data.body(carrier.parent.name).xmat.reshape(3, 3)
+    mujoco.mj_camlight(model, data)
+    off_m = np.array(vehicle.camera_m) - data.camera(CAMERA).xpos
+    carrier.pos = carrier.pos + R_lab_from_parent.T @ off_m
+
+
+def add_bearing(spec: Any, bus: Any, vehicle: VehicleConfig) -> None:
+    """A ball joint with the air's drag and the cable's spring, gravity and a tilt stop where there is a lab.
+
+    Drag and spring are MuJoCo's own, so they are felt at every stage of a step: T = -(viscous + quadratic |rate|)
+    rate about each axis, T = -stiffness times the rotation vector of lab_from_body.
+    """
+    drag, cable = vehicle.drag, vehicle.disturbances.cable
+    bus.add_joint(
+        type=mujoco.mjtJoint.mjJNT_BALL,
+        name="bearing",
+        damping=[drag.viscous_nms, drag.quadratic_nms2, 0.0],
+        stiffness=[cable.stiffness_nm_rad if cable else 0.0, 0.0, 0.0],
+    )
+    lab = vehicle.mount == "air_bearing"
+    spec.option.gravity = [0.0, 0.0, -GRAVITY_M_S2 if lab else 0.0]
+    spec.option.timestep = STEP_S
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_RK4
+    # In units of the mean inertia: at MuJoCo's 1e-8 friction of a small wheel drowns in a heavy vehicle. Costs nothing.
+    spec.option.tolerance = 1e-16
+    # A handful of constraints on one tree: neither contacts nor a search for islands; PGS is the quickest on them.
+    spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_ISLAND)
+    spec.option.solver = mujoco.mjtSolver.mjSOL_PGS
+    spec.option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
+    spec.compiler.fusestatic = True  # one rigid body instead of ten: 14 us a step instead of 20
+    if lab:
+        add_tilt_stop(spec, bus, vehicle.tilt_stop_deg)
+
+
+def add_tilt_stop(spec: Any, bus: Any, stop_deg: float) -> None:
+    """A rope from the lab's z axis to the body's: its length is a function of tilt alone, so yaw is free.
+
+    length^2 = L^2 + b^2 - 2 L b cos(tilt). A ball joint's own range would limit the whole rotation, yaw too.
+    The limit has the shortest time constant that MuJoCo allows, two steps, and twice the critical damping: it
+    gives way by 0.001 deg for each deg/s of the blow, and throws back 6 % of it.
+    """
+    spec.worldbody.add_site(name="tilt_stop_lab", pos=[0.0, 0.0, STOP_LAB_M])
+    bus.add_site(name="tilt_stop_body", pos=[0.0, 0.0, STOP_BODY_M])
+    cosine = np.cos(np.radians(stop_deg))
+    length = np.sqrt(STOP_LAB_M**2 + STOP_BODY_M**2 - 2 * STOP_LAB_M * STOP_BODY_M * cosine)
+    rope = spec.add_tendon(
+        name="tilt_stop",
+        limited=mujoco.mjtLimited.mjLIMITED_TRUE,
+        range=[0.0, length],
+        solref_limit=[2 * STEP_S, 2.0],
+        solimp_limit=[0.99, 0.999, 1e-3, 0.5, 2.0],
+    )
+    rope.wrap_site("tilt_stop_lab")
+    rope.wrap_site("tilt_stop_body")
+
+
+def check(model: Any, wanted: MassProperties, path: Path) -> None:
+    """The compiled model is what was asked for; MuJoCo has ways of changing it without a word."""
+    bus = model.body("bus").id
+    mass = tree_mass(model)
+    fans = [model.site(k).bodyid[0] for k in range(model.nsite) if model.site(k).name.startswith(FAN)]
+    if any(model.body_rootid[body] != bus for body in fans):
+        raise InputError(f"{path}: sites {FAN}* must ride on body bus")
+    if (model.body_rootid[model.jnt_bodyid] != bus).any():
+        raise InputError(f"{path}: only bus and what it carries may have joints")
+    if model.body_rootid[model.cam_bodyid[model.camera(CAMERA).id]] != bus:
+        raise InputError(f"{path}: camera {CAMERA} must ride on body bus")
+    same = (
+        abs(mass.mass_kg - wanted.mass_kg) < 1e-9 * wanted.mass_kg
+        and np.abs(mass.centre_m - wanted.centre_m).max() < 1e-9
+        and np.abs(mass.inertia_kg_m2 - wanted.inertia_kg_m2).max() < 1e-7 * wanted.inertia_kg_m2.max()
+    )
+    if not same:
+        raise InputError(
+            f"{path}: the mass comes out as {mass.mass_kg:g} kg at {mass.centre_m} m, not as declared;"
+            " leave inertiafromgeom, settotalmass and the like out of <compiler>"
+        )
+
+
+def mount(world: World) -> Mount:
+    """Where the compiled camera sits on the body; MuJoCo's camera axes become ours here and nowhere else."""
+    data = mujoco.MjData(world.model)
+    mujoco.mj_forward(world.model, data)  # at qpos0 the body frame is the lab frame
+    camera = data.camera(CAMERA)
+    body_from_mjcam = Rotation.from_matrix(camera.xmat.reshape(3, 3))
+    return Mount(np.array(camera.xpos), CAM_FROM_MJCAM * body_from_mjcam.inv())
+
+
+def imu_place_m(world: World) -> Floats:
+    """(3,) where the accelerometers sit on the body: at site `imu`, else at the bearing's centre."""
+    if IMU not in [world.model.site(k).name for k in range(world.model.nsite)]:
+        return np.zeros(3)
+    data = mujoco.MjData(world.model)
+    mujoco.mj_forward(world.model, data)
+    return np.array(data.site(IMU).xpos)

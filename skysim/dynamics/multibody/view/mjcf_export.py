@@ -1,0 +1,400 @@
+"""The laboratory in three dimensions: one MJCF of all that stands in it. `picture` draws it.
+
+What is added to the vehicle is for the eye: it has no mass, touches nothing and is in no constraint. Groups of the
+viewer: 0 vehicle, floor and pedestal, 1 dome and LEDs or stars, 2 the star camera's field; hidden in 4, the tilt stop.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from skysim.core.errors import InputError
+from skysim.core.paths import SCENES
+from skysim.core.types import Floats, Mount, Sources
+from skysim.dynamics.multibody.integrator import Flight
+from skysim.dynamics.multibody.mjcf import compiled, mujoco_warnings
+from skysim.dynamics.multibody.model import World, mount
+from skysim.dynamics.multibody.view.picture import LAB_CAMERA
+from skysim.scene.camera import CameraConfig
+from skysim.scene.light import DomeConfig
+from skysim.scene.scene import Scene
+from skysim.sources.dome import surface
+from skysim.sources.dome.surface import Ellipsoid, Plane, Surface
+
+GROUP_LIGHTS, GROUP_FIELD, GROUP_HIDDEN = 1, 2, 4
+MOST_PX = (1920, 1440)  # width, height of the largest picture
+FOVY_DEG = 38.0
+
+SKY_RADIUS_M = 5.0
+SKY = Ellipsoid(np.zeros(3), np.full(3, SKY_RADIUS_M))
+MOST_STARS = 300
+LED_RADIUS_M = 5e-3  # larger than life: the disc itself would be less than a pixel
+LEVELS, DIM = 12, 0.15  # steps of brightness, and the darkest beside the brightest
+RIM_M = 0.03
+SECTORS, RINGS = 72, 24  # of the dome's mesh
+FLOOR_BELOW_M, VEHICLE_BELOW_M = 0.95, 0.6
+LIT_RGB, FIELD_RGB = np.array([1.0, 0.93, 0.78]), np.array([0.25, 0.75, 1.0])
+
+
+def mjcf(world: World, scene: Scene, sources: Sources, lab_from_body: Rotation) -> str:
+    """The whole laboratory as the text of one MJCF file, which MuJoCo's own viewer opens and flies.
+
+    sources       : LEDs in the lab's metres, or stars, of which the brightest are put on a sphere
+    lab_from_body : attitude in the keyframe `start`, beside the speeds and gimbal angles of the scene
+    The model that is stepped stays as it is. Raises InputError for a start beyond the tilt stop, and for a vehicle with
+    a camera `lab` of its own.
+    """
+    spec, here = world.spec.copy(), mount(world)
+    if spec.camera(LAB_CAMERA):
+        raise InputError(
+            f"{scene.vehicle.model}: has a camera {LAB_CAMERA}, which is the laboratory's; rename it"
+        )
+    on_earth = world.vehicle.mount == "air_bearing"
+    inside = surface.build_surface(scene.light.surface) if isinstance(scene.light, DomeConfig) else SKY
+    hide_tilt_stop(spec)
+    inline_meshes(spec, world.model)
+    add_backdrop(spec, on_earth)
+    if on_earth:
+        add_room(spec)
+    if isinstance(scene.light, DomeConfig):
+        rings_m = shell_m(inside, np.radians(scene.light.layout.cap_deg))
+        add_dome(spec, rings_m)
+        look_at(spec, *dome_view(rings_m))
+    else:
+        boresight = lab_from_body.apply(here.cam_from_body.inv().apply([0.0, 0.0, 1.0]))
+        look_at(spec, *sky_view(world, boresight))
+    add_lights(spec, sources)
+    add_field(spec, here, field_corners(scene.camera, here, lab_from_body, inside))
+    add_start(spec, world, scene, lab_from_body)
+    with mujoco_warnings(), every_digit():
+        compiled(spec, SCENES / scene.vehicle.model)
+        return short_colours(spec.to_xml())
+
+
+def hide_tilt_stop(spec: Any) -> None:
+    """Its rope and its ends are no hardware."""
+    for element in (*spec.tendons, *spec.sites):
+        if element.name.startswith("tilt_stop"):
+            element.group = GROUP_HIDDEN
+
+
+def inline_meshes(spec: Any, model: Any) -> None:
+    """Put the vertices of the vehicle's mesh files into the model, so that it stands alone.
+
+    A compiled mesh is turned to its principal axes; mesh_pos and mesh_quat tell where they were.
+    """
+    for mesh in spec.meshes:
+        if not mesh.file:
+            continue
+        found = model.mesh(mesh.name or Path(mesh.file).stem)
+        first, count = int(found.vertadr[0]), int(found.vertnum[0])
+        begin, faces = int(found.faceadr[0]), int(found.facenum[0])
+        back = Rotation.from_quat(model.mesh_quat[found.id], scalar_first=True)
+        mesh.name, mesh.file, mesh.scale = found.name, "", [1.0, 1.0, 1.0]
+        mesh.refpos, mesh.refquat = [0.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0]
+        mesh.uservert = (
+            back.apply(model.mesh_vert[first : first + count]) + model.mesh_pos[found.id]
+        ).ravel()
+        mesh.userface = model.mesh_face[begin : begin + faces].ravel()
+
+
+def add_backdrop(spec: Any, on_earth: bool) -> None:
+    """A dim room, or the black of space, and the light to see a vehicle by."""
+    top, bottom = ([0.16, 0.19, 0.24], [0.03, 0.035, 0.05]) if on_earth else ([0.0, 0.0, 0.01], [0.0] * 3)
+    spec.add_texture(
+        name="stage_backdrop",
+        type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
+        rgb1=top,
+        rgb2=bottom,
+        width=256,
+        height=1536,
+    )
+    spec.visual.headlight.ambient = [0.22] * 3
+    spec.visual.headlight.diffuse = [0.35] * 3
+    spec.visual.headlight.specular = [0.1] * 3
+    spec.visual.global_.offwidth, spec.visual.global_.offheight = MOST_PX
+    spec.visual.quality.shadowsize = 2048
+    spec.worldbody.add_light(
+        name="stage_lamp",
+        pos=[2.0, -2.5, 0.9],
+        dir=[-2.0, 2.5, -1.0],
+        diffuse=[0.6] * 3,
+        specular=[0.3] * 3,
+        castshadow=on_earth,
+    )
+
+
+def add_room(spec: Any) -> None:
+    """A tiled floor, and the pedestal whose cup holds the bearing's ball."""
+    spec.add_texture(
+        name="stage_tiles",
+        type=mujoco.mjtTexture.mjTEXTURE_2D,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER,
+        rgb1=[0.34, 0.36, 0.40],
+        rgb2=[0.46, 0.48, 0.52],
+        width=256,
+        height=256,
+    )
+    tiles = spec.add_material(name="stage_tiles", texrepeat=[2.0, 2.0], texuniform=True, reflectance=0.08)
+    tiles.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "stage_tiles"
+    plane, cylinder = mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_CYLINDER
+    bottom = -FLOOR_BELOW_M
+    show(spec.worldbody, "stage_floor", plane, size=[6, 6, 0.1], pos=[0, 0, bottom], material="stage_tiles")
+    for name, radius, low, high in (
+        ("foot", 0.30, bottom, bottom + 0.04),
+        ("column", 0.10, bottom, -0.35),
+        ("neck", 0.05, -0.35, -0.06),
+    ):
+        ends = [0.0, 0.0, low, 0.0, 0.0, high]
+        show(
+            spec.worldbody,
+            f"stage_{name}",
+            cylinder,
+            size=[radius, 0, 0],
+            fromto=ends,
+            rgba=[0.36, 0.39, 0.44, 1],
+        )
+
+
+def show(body: Any, name: str, kind: Any, **more: Any) -> Any:
+    """A geom for the eye alone: no mass, no contact."""
+    return body.add_geom(name=name, type=kind, mass=0.0, contype=0, conaffinity=0, **more)
+
+
+def add_dome(spec: Any, rings_m: Floats) -> None:
+    """The dome as dark cloth seen from inside and as glass from outside, with a rim."""
+    add_sheet(spec, "stage_dome", rings_m, [0.16, 0.19, 0.27, 1.0], [0.60, 0.72, 0.90, 0.10])
+    rim_m = np.stack([rings_m[-1], rings_m[-1] - [0.0, 0.0, RIM_M]])
+    add_sheet(spec, "stage_rim", rim_m, [0.45, 0.50, 0.58, 1.0], [0.45, 0.50, 0.58, 0.6])
+
+
+def shell_m(inside: Surface, cap_rad: float) -> Floats:
+    """(RINGS, SECTORS, 3) points of the dome, ring under ring from its top down, each against the clock's hands.
+
+    A panel ends a little beyond its LEDs, an upright ellipsoid without a rim where it is widest or above the vehicle
+    if that is higher; every other surface as the bearing sees it end.
+    """
+    azimuth = np.arange(SECTORS) * (2 * np.pi / SECTORS)
+    around = np.stack([np.cos(azimuth), np.sin(azimuth), np.zeros(SECTORS)], axis=1)
+    up = np.array([0.0, 0.0, 1.0])
+    if isinstance(inside, Plane):
+        radius = np.linspace(1e-3, inside.height_m * np.tan(min(cap_rad + 0.1, 1.3)), RINGS)[:, None, None]
+        half_m = np.append(inside.half_m, np.inf)
+        return np.asarray(
+            inside.centre_m + np.clip(radius * around, -half_m, half_m) @ inside.lab_from_own.as_matrix().T
+        )
+    upright = inside.lab_from_own.magnitude() == 0
+    if not (isinstance(inside, Ellipsoid) and upright and inside.rim.nowhere):
+        return seen_shell_m(inside, around)
+    middle, half = inside.centre_m[2], inside.semi_axes_m[2]
+    lowest = max(middle, 0.35 * (middle + half))
+    polar = np.linspace(1e-3, np.arccos((lowest - middle) / half), RINGS)[:, None, None]
+    return np.asarray(inside.centre_m + inside.semi_axes_m * (np.sin(polar) * around + np.cos(polar) * up))
+
+
+def seen_shell_m(inside: Surface, around: Floats) -> Floats:
+    """(RINGS, SECTORS, 3) points where rays from the bearing meet a surface, from its upper edge to its rim.
+
+    around : (SECTORS, 3) level unit vectors. Edge and rim are found to a fifth of a degree, between 0 and 80 deg from
+             the zenith and above a third of the surface's height
+    """
+    up = np.array([0.0, 0.0, 1.0])
+
+    def at(polar: Floats) -> Floats:
+        rays = np.sin(polar)[..., None] * around + np.cos(polar)[..., None] * up
+        return inside.meet(np.zeros(3), rays.reshape(-1, 3)).reshape(rays.shape)
+
+    polar = np.broadcast_to(np.linspace(1e-3, np.radians(80), 400)[:, None], (400, len(around)))
+    height_m = np.nan_to_num(at(polar)[..., 2], nan=-np.inf)
+    there = height_m > 0.35 * height_m.max()
+    first, last = there.argmax(axis=0), 399 - there[::-1].argmax(axis=0)
+    share = np.linspace(0, 1, RINGS)[:, None]
+    return at(polar[first, 0] * (1 - share) + polar[last, 0] * share)
+
+
+def add_sheet(
+    spec: Any, name: str, rings_m: Floats, inside_rgba: list[float], outside_rgba: list[float]
+) -> None:
+    """A sheet with two faces of their own colour: OpenGL draws no triangle from behind.
+
+    rings_m : (K, n, 3) each against the clock's hands seen from above, every one beneath or around that before it
+    """
+    here = np.arange(rings_m.shape[0] * rings_m.shape[1]).reshape(rings_m.shape[:2])
+    a, d = here[:-1].ravel(), here[1:].ravel()
+    b, c = np.roll(here, -1, axis=1)[:-1].ravel(), np.roll(here, -1, axis=1)[1:].ravel()
+    inwards = np.concatenate([np.column_stack([a, b, c]), np.column_stack([a, c, d])])
+    for side, faces, rgba in (
+        ("inside", inwards, inside_rgba),
+        ("outside", inwards[:, ::-1], outside_rgba),
+    ):
+        add_mesh(spec, spec.worldbody, f"{name}_{side}", rings_m.reshape(-1, 3), faces, rgba, GROUP_LIGHTS)
+
+
+def add_mesh(
+    spec: Any,
+    body: Any,
+    name: str,
+    vertices_m: Floats,
+    faces: NDArray[np.int64],
+    rgba: Any,
+    group: int,
+    **more: Any,
+) -> None:
+    """A mesh, open or closed, and the geom that shows it; as a shell it needs no volume."""
+    mesh = spec.add_mesh(
+        name=name, uservert=np.round(vertices_m, 6).ravel(), userface=faces.astype(np.int32).ravel()
+    )
+    mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
+    show(body, name, mujoco.mjtGeom.mjGEOM_MESH, meshname=name, rgba=rgba, group=group, **more)
+
+
+def add_lights(spec: Any, sources: Sources) -> None:
+    """A glowing grain for each LED, and for each of the brightest stars; how bright, by its mean strength.
+
+    An LED's colour goes with its light; a star's size does, with the root, for it has nothing else to show. Grains
+    of about the same colour are one mesh: as many sites would cost eight times the time of a step, and seconds a
+    picture.
+    """
+    glow = spec.add_material(name="stage_glow", emission=0.8, specular=0.0)
+    mean = sources.strength * sources.on_s / sources.period_s
+    stars = bool((sources.place[:, 3] == 0).any())
+    shown = np.argsort(-mean, kind="stable")[: MOST_STARS if stars else len(mean)]
+    share = mean[shown] / mean.max(initial=1e-300)
+    place_m = sources.place[shown, :3] * (SKY_RADIUS_M if stars else 1.0)
+    radius_m = 0.006 + 0.04 * np.sqrt(share) if stars else np.full(len(shown), LED_RADIUS_M)
+    level = np.full(len(shown), LEVELS) if stars else np.ceil(share * LEVELS).astype(int)
+    for one in np.unique(level):
+        vertices, faces = grains(place_m[level == one], radius_m[level == one])
+        rgba = [*(LIT_RGB * (DIM + (1 - DIM) * one / LEVELS)), 1.0]
+        name = f"stage_{'stars' if stars else 'leds'}_{one}"
+        add_mesh(spec, spec.worldbody, name, vertices, faces, rgba, GROUP_LIGHTS, material=glow.name)
+
+
+def grains(place_m: Floats, radius_m: Floats) -> tuple[Floats, NDArray[np.int64]]:
+    """(6 N, 3) vertices and (8 N, 3) faces of N octahedra: corners on the axes, a face in every octant."""
+    corners = np.concatenate([np.eye(3), -np.eye(3)])
+    signs = np.array([[x, y, z] for x in (0, 3) for y in (0, 3) for z in (0, 3)])
+    faces = signs + np.arange(3)
+    odd = (signs > 0).sum(axis=1) % 2 == 1  # mirrored, so turned back to face outwards
+    faces[odd] = faces[odd][:, ::-1]
+    vertices = place_m[:, None, :] + radius_m[:, None, None] * corners
+    return vertices.reshape(-1, 3), (6 * np.arange(len(place_m))[:, None, None] + faces).reshape(-1, 3)
+
+
+def field_corners(camera: CameraConfig, here: Mount, lab_from_body: Rotation, inside: Surface) -> Floats:
+    """(4, 3) in body axes: where a pinhole's rays of the chip's corners meet dome or sky, in a given attitude.
+
+    One that misses a flat panel, or meets it far away, ends as far off as the sky.
+    """
+    x = np.array([-0.5, camera.width_px - 0.5, camera.width_px - 0.5, -0.5]) - camera.centre_px[0]
+    y = np.array([-0.5, -0.5, camera.height_px - 0.5, camera.height_px - 0.5]) - camera.centre_px[1]
+    rays_cam = np.column_stack([x, y, np.full(4, camera.focal_px)])
+    lab_from_cam = lab_from_body * here.cam_from_body.inv()
+    rays = lab_from_cam.apply(rays_cam / np.linalg.norm(rays_cam, axis=1, keepdims=True))
+    tip_m = lab_from_body.apply(here.camera_body_m)
+    length_m = np.linalg.norm(inside.meet(tip_m, rays) - tip_m, axis=1)
+    return lab_from_body.inv().apply(tip_m + np.fmin(length_m, SKY_RADIUS_M)[:, None] * rays)
+
+
+def add_field(spec: Any, here: Mount, corners_m: Floats) -> None:
+    """The star camera's field as a pyramid of light on the vehicle, with its edges."""
+    bus, tip = spec.body("bus"), here.camera_body_m
+    sides = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 4, 1]])  # open, so that the camera itself sees out
+    glow = spec.add_material(name="stage_field", emission=0.6, specular=0.0)
+    more = {"material": glow.name, "group": GROUP_FIELD}
+    vertices = np.vstack([tip, corners_m])
+    add_mesh(spec, bus, "stage_field", vertices, sides, [*FIELD_RGB, 0.4], **more)
+    length_m = np.linalg.norm(corners_m - tip, axis=1).min()
+    for k, corner in enumerate(corners_m):
+        for kind, end in (("ray", tip), ("edge", corners_m[k - 1])):
+            show(
+                bus,
+                f"stage_{kind}_{k}",
+                mujoco.mjtGeom.mjGEOM_CAPSULE,
+                size=[0.003 * length_m, 0, 0],
+                fromto=[*end, *corner],
+                rgba=[*FIELD_RGB, 0.9],
+                **more,
+            )
+
+
+def dome_view(rings_m: Floats) -> tuple[Floats, Floats, Floats, float]:
+    """(eye, what it looks at, up, size), m: from the side, so that one sees under the dome's rim and through it.
+
+    The eye is as far off as dome and vehicle need to fill a picture of 4:3; the rim's near side is the widest.
+    """
+    wide, top = np.hypot(*rings_m[-1, :, :2].T).max(), rings_m[..., 2].max()
+    size = (top + VEHICLE_BELOW_M) / 2
+    tangent = np.tan(np.radians(FOVY_DEG / 2))
+    away = max(1.25 * size / tangent, wide * (1.05 / (4 / 3 * tangent) + 0.35))
+    middle = np.array([0.0, 0.0, top - size])
+    return middle + away * direction(-62.0, 8.0), middle, np.array([0.0, 0.0, 1.0]), 0.55 * away
+
+
+def sky_view(world: World, boresight: Floats) -> tuple[Floats, Floats, Floats, float]:
+    """Likewise, from beside the vehicle and from behind it, with the camera's field along the picture's diagonal."""
+    size = float(world.model.stat.extent) / 2 + SKY_RADIUS_M / 2
+    beside = np.cross(boresight, np.eye(3)[np.argmin(np.abs(boresight))])
+    back = beside / np.linalg.norm(beside) - 0.5 * boresight
+    up = Rotation.from_rotvec(np.radians(-40.0) * back / np.linalg.norm(back)).apply(boresight)
+    return size * (2.0 * back + 0.5 * boresight), 0.5 * size * boresight, up, 1.2 * size
+
+
+def direction(azimuth_deg: float, elevation_deg: float) -> Floats:
+    azimuth, elevation = np.radians([azimuth_deg, elevation_deg])
+    ring = np.cos(elevation)
+    return np.array([ring * np.cos(azimuth), ring * np.sin(azimuth), np.sin(elevation)])
+
+
+def look_at(spec: Any, eye_m: Floats, middle_m: Floats, up: Floats, size_m: float) -> None:
+    """The camera `lab`, and what the viewer opens on: MuJoCo's cameras look along -z, y is up."""
+    back = (eye_m - middle_m) / np.linalg.norm(eye_m - middle_m)
+    right = np.cross(up, back) / np.linalg.norm(np.cross(up, back))
+    turn = Rotation.from_matrix(np.column_stack([right, np.cross(back, right), back]))
+    spec.worldbody.add_camera(name=LAB_CAMERA, pos=eye_m, quat=turn.as_quat(scalar_first=True), fovy=FOVY_DEG)
+    spec.stat.center, spec.stat.extent = middle_m, size_m
+    spec.visual.map.znear, spec.visual.map.zfar = 0.01, 50.0
+    spec.visual.global_.azimuth = float(np.degrees(np.arctan2(-back[1], -back[0])))
+    spec.visual.global_.elevation = float(-np.degrees(np.arcsin(back[2])))
+
+
+def add_start(spec: Any, world: World, scene: Scene, lab_from_body: Rotation) -> None:
+    """The keyframe `start`: attitude and rate, wheel and rotor speeds, gimbal angles and where their servos aim."""
+    flight = Flight(world, lab_from_body, np.radians(scene.motion.rate_deg_s), 0.0)
+    data = flight.data
+    spec.add_key(name="start", qpos=data.qpos, qvel=data.qvel, act=data.act, ctrl=data.ctrl)
+
+
+@contextmanager
+def every_digit() -> Iterator[None]:
+    """MJCF is written with six digits, which shifts a balanced vehicle's centre of mass; here with fifteen.
+
+    MuJoCo has a switch for it, but no public one: where a version lacks it, six it is.
+    """
+    library = ctypes.CDLL(mujoco._functions.__file__)
+    switch = getattr(library, "_mjPRIVATE__set_xml_precision", lambda digits: None)
+    switch(15)
+    try:
+        yield
+    finally:
+        switch(6)
+
+
+def short_colours(text: str) -> str:
+    """Colours are single precision, of which fifteen digits make 0.1 into 0.100000001490116."""
+    return re.sub(
+        r'(rgba|rgb1|rgb2)="([^"]*)"',
+        lambda m: f'{m[1]}="{" ".join(f"{float(x):.4g}" for x in m[2].split())}"',
+        text,
+    )

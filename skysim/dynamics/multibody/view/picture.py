@@ -1,0 +1,126 @@
+"""Pictures of the laboratory by MuJoCo's renderer, without a screen, and films of them."""
+
+from __future__ import annotations
+
+import errno
+import io
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import IO
+
+import cv2
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from skysim.core.errors import InputError
+from skysim.core.files import whole
+from skysim.core.types import Floats
+from skysim.dynamics.multibody.mjcf import mujoco_warnings, one_line
+
+Picture = NDArray[np.uint8]
+
+LAB_CAMERA = "lab"  # stands in the MJCF and sees all of it
+PICTURE_PX, FILM_PX = (960, 720), (480, 360)  # width, height
+NO_OPENGL = (
+    "no picture of the lab: {why}; MuJoCo draws with OpenGL by EGL: apt-get install libegl1 libgl1-mesa-dri"
+    " (or libosmesa6, and MUJOCO_GL=osmesa)"
+)
+ANIMATED = {  # what a browser shows, and how OpenCV's encoders are kept below 20 kB a frame of FILM_PX
+    ".gif": [cv2.IMWRITE_GIF_DITHER, 3],
+    ".webp": [cv2.IMWRITE_WEBP_QUALITY, 75],
+}
+
+
+class NoPicture(RuntimeError):
+    """Nothing can be drawn here; the message is one line and says what to do about it."""
+
+
+def picture(mjcf: str, qpos: Floats, size_px: tuple[int, int] = PICTURE_PX) -> Picture:
+    """(H, W, 3) RGB: the laboratory from its camera `lab`, in the state qpos (nq,). Raises NoPicture.
+
+    mjcf    : as `stage.mjcf` writes it
+    size_px : width and height, at most `stage.MOST_PX`
+    """
+    return next(film(mjcf, np.atleast_2d(qpos), size_px))
+
+
+def film(mjcf: str, qpos: Floats, size_px: tuple[int, int] = FILM_PX) -> Iterator[Picture]:
+    """As `picture`, for each row of qpos (N, nq), as they are drawn.
+
+    They are drawn in a process of its own: MuJoCo chooses its OpenGL when it is first imported, by MUJOCO_GL (here EGL
+    unless told otherwise), and a graphics driver may take the whole process with it.
+    """
+    width, height = size_px
+    with tempfile.TemporaryFile() as task, tempfile.TemporaryFile() as complaints:
+        np.savez(task, mjcf=np.array(mjcf), qpos=qpos, size_px=np.array(size_px))
+        task.seek(0)
+        with subprocess.Popen(
+            [sys.executable, "-m", "skysim.dynamics.multibody.view.picture"],
+            stdin=task,
+            stdout=subprocess.PIPE,
+            stderr=complaints,
+            env={"MUJOCO_GL": "egl"} | dict(os.environ),
+        ) as painter:
+            try:
+                for _ in range(len(qpos)):
+                    raw = painter.stdout.read(height * width * 3) if painter.stdout else b""
+                    if len(raw) < height * width * 3:
+                        raise NoPicture(NO_OPENGL.format(why=why(painter.wait(), complaints)))
+                    yield np.frombuffer(raw, np.uint8).reshape(height, width, 3)
+            finally:
+                painter.kill()  # whoever wants no more pictures need not wait for them
+
+
+def write_film(pictures: Iterable[Picture], path: Path, fps: float) -> None:
+    """RGB pictures as .gif, or as .webp, which is a quarter as large. Raises InputError for another; OSError.
+
+    fps : pictures a second; a GIF counts in hundredths of a second, and browsers go no faster than 50
+    """
+    if path.suffix not in ANIMATED:
+        raise InputError(f"{path}: a film is none of {', '.join(ANIMATED)}")
+    animation = cv2.Animation()
+    animation.frames = [cv2.cvtColor(one, cv2.COLOR_RGB2BGR) for one in pictures]
+    animation.durations = [round(1000 / fps)] * len(animation.frames)
+    done, coded = cv2.imencodeanimation(path.suffix, animation, ANIMATED[path.suffix])
+    if not done:
+        raise OSError(errno.EIO, "OpenCV could not encode the film", str(path))
+    with whole(path) as temporary:
+        temporary.write_bytes(coded.tobytes())
+
+
+def why(code: int, complaints: IO[bytes]) -> str:
+    """What the painter said last before it went, or how it ended."""
+    complaints.seek(0)
+    lines = complaints.read().decode(errors="replace").strip().splitlines()
+    if code < 0:
+        return f"the driver ended it by {signal.Signals(-code).name}"
+    return one_line(RuntimeError(lines[-1])) if lines else f"it ended with {code}"
+
+
+def paint() -> None:
+    """The painter's own process: a task as npz on stdin, raw pictures on stdout, what went wrong on stderr."""
+    with os.fdopen(os.dup(1), "wb") as out:
+        os.dup2(2, 1)  # a driver that prints would print into a picture
+        with np.load(io.BytesIO(sys.stdin.buffer.read())) as task, mujoco_warnings():
+            text, states, (width, height) = str(task["mjcf"]), task["qpos"], task["size_px"].tolist()
+            model = mujoco.MjModel.from_xml_string(text)
+            data = mujoco.MjData(model)
+            with mujoco.Renderer(model, height, width) as renderer:
+                for qpos in states:
+                    data.qpos[:] = qpos
+                    mujoco.mj_forward(model, data)
+                    renderer.update_scene(data, camera=LAB_CAMERA)
+                    out.write(np.ascontiguousarray(renderer.render()).tobytes())
+
+
+if __name__ == "__main__":
+    try:
+        paint()
+    except Exception as error:
+        sys.exit(f"{type(error).__name__}: {one_line(error)}")

@@ -1,0 +1,51 @@
+"""What the vehicle looks like, as plain shapes for a drawing program of another kind than MuJoCo's."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from skysim.dynamics.multibody.model import World
+
+KINDS = {
+    mujoco.mjtGeom.mjGEOM_BOX: "box",
+    mujoco.mjtGeom.mjGEOM_SPHERE: "sphere",
+    mujoco.mjtGeom.mjGEOM_CYLINDER: "cylinder",
+    mujoco.mjtGeom.mjGEOM_CAPSULE: "cylinder",
+    mujoco.mjtGeom.mjGEOM_ELLIPSOID: "sphere",
+    mujoco.mjtGeom.mjGEOM_MESH: "box",  # its bounding box
+}
+
+
+class Shape(NamedTuple):
+    """A part of the vehicle in body axes, every joint at rest.
+
+    kind   : box (size_m half its edges), sphere (its radius first), cylinder (radius, half its length, along its z)
+    """
+
+    kind: str
+    size_m: tuple[float, float, float]
+    place_m: tuple[float, float, float]
+    body_from_shape_wxyz: tuple[float, float, float, float]
+    rgba: tuple[float, float, float, float]
+
+
+def shapes(world: World) -> list[Shape]:
+    """All that the vehicle's file draws, the bearing's own geometry left out."""
+    model = world.model
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    found = []
+    for n in range(model.ngeom):
+        kind = KINDS.get(mujoco.mjtGeom(model.geom_type[n]))
+        if kind is None or model.geom_bodyid[n] == 0:
+            continue
+        mesh = model.geom_type[n] == mujoco.mjtGeom.mjGEOM_MESH
+        size = model.geom_aabb[n, 3:] if mesh else model.geom_size[n]
+        turn = Rotation.from_matrix(data.geom_xmat[n].reshape(3, 3)).as_quat(scalar_first=True)
+        told = (size, data.geom_xpos[n], turn, model.geom_rgba[n])
+        found.append(Shape(kind, *(tuple(np.asarray(one, float).tolist()) for one in told)))
+    return found

@@ -1,0 +1,1 @@
+"""Many simulations, one answer: studies, the papers' experiments, the dome survey, tracker comparisons."""

@@ -1,0 +1,447 @@
+"""A glued dome measured from the frames of the camera beneath it: held at many attitudes, named, surveyed, checked.
+
+The lab tilts the vehicle by hand, waits, and takes a frame; the IMU tells the attitude to half a degree. Which light is
+which LED follows from that: the hint's error moves all lights of a frame together by more than LEDs are apart, so the
+common shift is sought first (`shift_px`), of all that the declared errors allow the likeliest. Then
+`estimator.calibration.dome_survey.survey` adjusts LEDs, lever, lens and attitudes at once, every frame is named again by what that
+found, and adjusted again. What comes out is a `DomeMap`, the file that `tracker.map` reads.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from estimator.attitude.dome_map import LedMap, Lever
+from estimator.calibration import dome_survey
+from estimator.calibration.dome_survey import DomeFrame, Survey
+from estimator.core.camera import Camera
+from estimator.core.errors import ImageError
+from estimator.core.types import Centroids
+from estimator.trackers.pipeline import Clock, Settings, see
+from skysim.core.errors import InputError
+from skysim.core.types import Floats, Frame, Trajectory, Truth
+from skysim.core.units import quantity
+from skysim.scene.light import DomeConfig
+from skysim.scene.scene import Scene
+from skysim.simulation import exposure, testbed
+from skysim.simulation.testbed import SPARE_S, Testbed
+from skysim.tracking import onboard_model
+from skysim.tracking import settings as tracker_settings
+from skysim.tracking.dome_map_file import DomeMap
+
+Ints = NDArray[np.int64]
+STREAM = {"attitudes": 101, "imu": 102, "checks": 103}  # apart from shutter.STAGE_ID
+GATE = 3.5  # sigmas of a two-dimensional error; Gaussian noise goes beyond once in 450
+ANCHORS = 10  # lights whose every possible name is tried for the common shift
+LINKS = (3, 8)  # lights that hang a frame on others: two tie its turn; a patch board all misnamed has six
+
+CROSSING_RAD = (
+    0.01  # rms angle between a light's rays that gives its distance; calibrate.survey takes half of it
+)
+
+# Of the options: unit, what it is, an example, least and greatest value. A map without any error is no measurement.
+DOUBTS = {
+    "imu_sigma": ("rad", "plane angle", '"0.5 deg"', 0.0, 0.1),
+    "led_sigma": ("m", "length", '"2 mm"', 1e-6, 0.1),
+    "lever_sigma": ("m", "length", '"5 mm"', 0.0, 0.1),
+    "focal_error": ("", "share", '"1%" or "0.01"', -0.1, 0.1),
+}
+
+ROUNDS = 3  # of naming and adjusting; from the second on by what was found
+
+
+@dataclass(frozen=True, slots=True)
+class Doubt:
+    """What the lab does not know before: standard deviations about each axis, and a wrong focal length.
+
+    imu_sigma_rad : of the attitude at each frame;  led_sigma_m : of each LED's place;  lever_sigma_m : of the camera's
+    focal_error   : relative, of the believed focal length
+    """
+
+    imu_sigma_rad: float
+    led_sigma_m: float
+    lever_sigma_m: float
+    focal_error: float
+
+
+def doubt(imu_sigma: str, led_sigma: str, lever_sigma: str, focal_error: str) -> Doubt:
+    """Quantities as the command line has them. Raises InputError for one that is none, or out of its range."""
+    told = {
+        "imu_sigma": imu_sigma,
+        "led_sigma": led_sigma,
+        "lever_sigma": lever_sigma,
+        "focal_error": focal_error,
+    }
+    value: dict[str, float] = {}
+    for name, text in told.items():
+        unit, what, example, low, high = DOUBTS[name]
+        option = f"--{name.replace('_', '-')}"
+        try:
+            value[name] = quantity(unit, what, example)(text)
+        except ValueError as error:
+            raise InputError(f"{option}: {error}") from None
+        if not low <= value[name] <= high:
+            raise InputError(f"{option} {text}: allowed: {low:g} to {high:g} {unit or 'of it'}")
+    return Doubt(*value.values())
+
+
+@dataclass(frozen=True, slots=True)
+class Belief:
+    """What is believed of dome and camera, before a survey or by it.
+
+    floor_px : of a centroid's error, for what its own noise does not cover
+    """
+
+    camera: Camera
+    leds: LedMap
+    lever: Lever
+    floor_px: float
+
+    @property
+    def px_per_m(self) -> float:
+        """Pixels of a metre across the sight where an LED is nearest to the camera."""
+        nearest_m = np.linalg.norm(self.leds.position_m, axis=1).min()
+        return float(self.camera.focal_px / (nearest_m - np.linalg.norm(self.lever.camera_body_m)))
+
+    def pixels(self, body_from_lab: Rotation) -> Floats:
+        """(N, 2) where the LEDs are seen; far off the chip where that is behind the camera."""
+        in_body = body_from_lab.apply(self.leds.position_m) - self.lever.camera_body_m
+        xy_px = self.camera.pixels(self.lever.cam_from_body.apply(in_body))
+        return np.nan_to_num(xy_px, nan=-1e9)
+
+
+@dataclass(frozen=True, slots=True)
+class Look:
+    """One frame of a survey: its lights, and the vehicle's attitude by the IMU."""
+
+    lights: Centroids
+    body_from_lab: Rotation
+
+
+def belief_of(lab: Testbed) -> Belief:
+    """What the tracker of the lab's scene believes. Raises InputError for a scene without a dome."""
+    light = lab.scene.light
+    if not isinstance(light, DomeConfig):
+        raise InputError(f"light.kind: {light.kind} has nothing to survey; allowed: dome")
+    return Belief(
+        onboard_model.believed_camera(lab.scene),
+        onboard_model.believed_dome(lab.scene, light, lab.sources),
+        onboard_model.believed_lever(lab.scene, lab.mount),
+        lab.scene.tracker.centroid_sigma_px,
+    )
+
+
+class Names(NamedTuple):
+    """Rows of the lights of a frame and of the LEDs on the map that they are."""
+
+    light: Ints
+    led: Ints
+
+
+def doubted(scene: Scene, doubt: Doubt) -> Scene:
+    """The scene whose tracker believes what the lab does before its survey, drawn by `tracker.survey.seed`."""
+    errors = {"led_sigma_m": doubt.led_sigma_m, "lever_sigma_m": doubt.lever_sigma_m}
+    believed = {
+        "survey": scene.tracker.survey.model_copy(update=errors),
+        "believed_focal_length_m": scene.camera.focal_length_m * (1 + doubt.focal_error),
+        "believed_camera_body_m": None,
+        "map": None,
+    }
+    return scene.model_copy(update={"tracker": scene.tracker.model_copy(update=believed)})
+
+
+def with_map(scene: Scene, path: str) -> Scene:
+    """The scene whose tracker believes a surveyed dome's file, and nothing of what it was told before."""
+    none = {"led_sigma_m": 0.0, "lever_sigma_m": 0.0}
+    believed = {
+        "survey": scene.tracker.survey.model_copy(update=none),
+        "believed_focal_length_m": None,
+        "believed_camera_body_m": None,
+        "map": path,
+    }
+    return scene.model_copy(update={"tracker": scene.tracker.model_copy(update=believed)})
+
+
+def attitudes(scene: Scene, what: str, count: int, tilt_deg: float) -> Rotation:
+    """lab_from_body of so many stops: tilts evenly over the cap, every yaw. Raises InputError beyond the tilt stop."""
+    stop_deg = scene.vehicle.tilt_stop_deg if scene.vehicle.mount == "air_bearing" else 90.0
+    if not 0 < tilt_deg <= stop_deg:
+        raise InputError(
+            f"--tilt {tilt_deg:g}: allowed: above 0, up to {stop_deg:g} degrees, the vehicle's stop"
+        )
+    rng = stream(scene.seed, what)
+    tilt = np.arccos(rng.uniform(np.cos(np.radians(tilt_deg)), 1, count))
+    about, yaw = rng.uniform(0, 2 * np.pi, (2, count))
+    lean = np.column_stack([tilt * np.cos(about), tilt * np.sin(about), np.zeros(count)])
+    return Rotation.from_rotvec(lean) * Rotation.from_euler("z", yaw[:, None])
+
+
+def stream(seed: int, what: str) -> np.random.Generator:
+    """Random numbers of a kind, the same for a seed whatever else is drawn."""
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(STREAM[what],)))
+
+
+def frames(lab: Testbed, lab_from_body: Rotation, first: int = 0) -> Iterator[tuple[Frame, Truth]]:
+    """A frame at each attitude, the vehicle standing still; `first` is the index, and the noise, of the first one."""
+    for n, turned in enumerate(lab_from_body):
+        end_s = testbed.window(lab.scene, first + n).close_s(lab.scene.camera.height_px) + SPARE_S
+        still = Trajectory(np.array([0.0, end_s]), Rotation.concatenate([turned, turned]), np.zeros((2, 3)))
+        yield exposure.render_frame(replace(lab, trajectory=still), first + n)
+
+
+def looks(lab: Testbed, belief: Belief, doubt: Doubt, count: int, tilt_deg: float) -> Iterator[Look]:
+    """The lights of a frame at each of so many stops, and what the IMU says there."""
+    lab_from_body = attitudes(lab.scene, "attitudes", count, tilt_deg)
+    told, settings = (
+        hints(lab.scene, lab_from_body, doubt.imu_sigma_rad),
+        tracker_settings.believed_settings(lab.scene),
+    )
+    for (frame, _), body_from_lab in zip(frames(lab, lab_from_body), told, strict=True):
+        yield Look(detect_lights(settings, belief.camera, frame), body_from_lab)
+
+
+def hints(scene: Scene, lab_from_body: Rotation, sigma_rad: float) -> Rotation:
+    """body_from_lab at each stop by an IMU that errs by itself at each, Gaussian about each axis of the body."""
+    wrong = sigma_rad * stream(scene.seed, "imu").standard_normal((len(lab_from_body), 3))
+    return Rotation.from_rotvec(wrong) * lab_from_body.inv()
+
+
+# --- which light is which LED -------------------------------------------------------------------------------
+
+
+def expected_px(belief: Belief, doubt: Doubt) -> tuple[float, float]:
+    """Standard deviations, a coordinate: of what moves all lights of a frame alike, and of each light by itself.
+
+    A turn and the lever move all. The LED's own place, and at the chip's corner the roll and the focal length, do not.
+    """
+    camera = belief.camera
+    corner_px = np.hypot(camera.width_px, camera.height_px) / 2
+    common = np.hypot(doubt.imu_sigma_rad * camera.focal_px, doubt.lever_sigma_m * belief.px_per_m)
+    aside = corner_px * np.hypot(doubt.imu_sigma_rad, doubt.focal_error)
+    return float(common), float(np.hypot(doubt.led_sigma_m * belief.px_per_m, aside))
+
+
+def by_hint(look: Look, belief: Belief, doubt: Doubt) -> Names:
+    """Which light is which LED by the IMU's attitude and the errors declared."""
+    common_px, own_px = expected_px(belief, doubt)
+    predicted = belief.pixels(look.body_from_lab)
+    near = np.flatnonzero(belief.camera.contains(predicted, -GATE * (common_px + own_px)))
+    seen = look.lights.xy_px
+    if not len(near) or not len(seen):
+        return Names(np.zeros(0, np.int64), np.zeros(0, np.int64))
+    moved = predicted[near] + shift_px(seen, predicted[near], common_px, own_px, belief.camera.centre_px)
+    light, led = paired(seen, moved, np.full(len(near), GATE * own_px))
+    return Names(light, near[led])
+
+
+def shift_px(
+    seen_px: Floats, predicted_px: Floats, common_px: float, own_px: float, middle_px: tuple[float, float]
+) -> Floats:
+    """(2,) the likeliest shift of (P, 2) predictions onto (S, 2) lights.
+
+    Every prediction near a light of the middle, where a roll moves least, is tried for it. A shift costs its square
+    over common_px, each light the square of its distance from the nearest prediction over own_px, up to the gate's.
+    """
+    inner = np.argsort(np.linalg.norm(seen_px - middle_px, axis=1))[:ANCHORS]
+    tried = (seen_px[inner, None] - predicted_px).reshape(-1, 2)
+    tried = tried[np.linalg.norm(tried, axis=1) < GATE * np.hypot(common_px, own_px)]
+    tried = np.vstack([np.zeros((1, 2)), tried])
+    apart, nearest = cKDTree(predicted_px).query(seen_px - tried[:, None])
+    off = np.minimum(apart / own_px, GATE)
+    best = int(np.argmin(np.sum(tried**2, axis=1) / common_px**2 + np.sum(off**2, axis=1)))
+    close = off[best] < GATE
+    if not close.any():
+        return tried[best]
+    return np.mean(seen_px[close] - predicted_px[nearest[best, close]], axis=0)
+
+
+def paired(seen_px: Floats, predicted_px: Floats, gate_px: Floats) -> tuple[Ints, Ints]:
+    """Rows of (S, 2) lights and (P, 2) predictions that are one: the least sum of squares over the (P,) gates squared,
+    a pair beyond its gate costing as much as one at it, and left out.
+    """
+    apart = np.linalg.norm(seen_px[:, None] - predicted_px, axis=2) / gate_px
+    rows, column = linear_sum_assignment(np.minimum(apart, 1.0) ** 2)
+    inside = apart[rows, column] < 1
+    return rows[inside].astype(np.int64), column[inside].astype(np.int64)
+
+
+def by_survey(look: Look, belief: Belief, sigma_px: Floats) -> Names:
+    """Which light is which LED by what a survey found; sigma_px (N,) of each LED's predicted coordinate."""
+    predicted = belief.pixels(look.body_from_lab)
+    near = np.flatnonzero(belief.camera.contains(predicted, -GATE * float(sigma_px.max())))
+    light, led = paired(look.lights.xy_px, predicted[near], GATE * sigma_px[near])
+    return Names(light, near[led])
+
+
+# --- the survey ---------------------------------------------------------------------------------------------
+
+
+def surveyed(
+    looks: Sequence[Look],
+    belief: Belief,
+    doubt: Doubt,
+    fit_distortion: bool = False,
+    watch: Callable[[float, float], None] | None = None,
+) -> Survey:
+    """LEDs, lever, lens and attitudes from all frames, starting from what is believed, which errs as `doubt` says.
+
+    fit_distortion : k1, k2, p1, p2 too. A narrow field hardly sees them, and they take the focal length with them: on
+        the AFIT dome its sigma grows from 10 to 80 px, the attitude is the same
+    watch(rounds done, rounds) is called after each round of naming and adjusting
+    Raises InputError where the frames do not determine them.
+    """
+    found, floor_px, names = None, belief.floor_px, [by_hint(look, belief, doubt) for look in looks]
+    for done in range(ROUNDS):
+        if found:
+            better = Belief(found.camera, found.leds, found.lever, floor_px)
+            sigma_px = np.hypot(led_sigma_m(found, doubt) * better.px_per_m, max(found.rms_px, floor_px))
+            looks = [
+                replace(looks[k], body_from_lab=found.body_from_lab[k])
+                for k in np.flatnonzero(found.tied).tolist()
+            ]
+            names = [by_survey(look, better, sigma_px) for look in looks]
+            belief = replace(
+                better, leds=belief.leds
+            )  # the map that is a measurement is the one before the survey
+        looks, found = adjusted(looks, names, belief, doubt, fit_distortion)
+        if watch:
+            watch(done + 1, ROUNDS)
+    assert found, "there is a round"
+    return found
+
+
+def adjusted(
+    looks: Sequence[Look], names: Sequence[Names], belief: Belief, doubt: Doubt, fit_distortion: bool
+) -> tuple[list[Look], Survey]:
+    """The frames that hang together, and their survey. Raises InputError where they do not determine it.
+
+    Some hang on others by misnamed lights alone, which the adjustment finds out: stronger links are asked for then.
+    """
+    shown = crossed(looks, names, belief)
+    for links in LINKS:
+        kept = linked(shown, links)
+        sightings = [
+            sighting(looks[k].lights, names[k].light, names[k].led, looks[k].body_from_lab, belief.floor_px)
+            for k in kept
+        ]
+        try:
+            found = robust_survey(
+                sightings, belief.leds, belief.lever, belief.camera, doubt.led_sigma_m, fit_distortion
+            )
+        except InputError:
+            if links == LINKS[-1]:
+                raise
+        else:
+            break
+    return [looks[k] for k in kept], found
+
+
+def crossed(looks: Sequence[Look], names: Sequence[Names], belief: Belief) -> NDArray[np.bool_]:
+    """(F, N) which frame shows which LED, of those alone that are seen from places so far apart that rays cross."""
+    shown = np.zeros((len(names), len(belief.leds.id)), dtype=bool)
+    for frame, name in zip(shown, names, strict=True):
+        frame[name.led] = True
+    arm_m = belief.lever.camera_body_m
+    camera_m = np.array([look.body_from_lab.inv().apply(arm_m) for look in looks])
+    count = np.maximum(shown.sum(axis=0), 1)[:, None]
+    spread_m2 = np.sum((shown.T @ camera_m**2) / count - ((shown.T @ camera_m) / count) ** 2, axis=1)
+    angle_rad = np.sqrt(np.maximum(spread_m2, 0)) * belief.px_per_m / belief.camera.focal_px
+    return shown & (angle_rad > CROSSING_RAD)
+
+
+def linked(shown: NDArray[np.bool_], links: int) -> list[int]:
+    """The greatest group of frames that each share so many lights or more with the others; shown (F, N) which where.
+
+    Of where the group stands other frames say nothing, and `calibrate.survey` refuses to guess.
+    """
+    frames = len(shown)
+    left, best = np.ones(frames, dtype=bool), np.zeros(frames, dtype=bool)
+    while left.any():
+        group = np.zeros(frames, dtype=bool)
+        group[np.argmax(left * (1 + shown.sum(axis=1)))] = True
+        while True:
+            known = shown[group].any(axis=0)
+            grown = group | (left & ((shown & known).sum(axis=1) >= links))
+            if (grown == group).all():
+                break
+            group = grown
+        left &= ~group
+        best = group if group.sum() > best.sum() else best
+    return np.flatnonzero(best).tolist()
+
+
+def led_sigma_m(found: Survey, doubt: Doubt) -> Floats:
+    """(N,) standard deviation of each LED's place, the rms of three axes; of one not surveyed, what it was before."""
+    variance_m2 = np.einsum("nii->n", found.led_covariance_m2) / 3
+    return np.sqrt(np.where(found.surveyed, variance_m2, doubt.led_sigma_m**2))
+
+
+def lens_sigma(found: Survey) -> Floats:
+    """(8,) standard deviations of focal_px, centre x and y, k1, k2, p1, p2, k3; 0 of what was held."""
+    fitted = np.sqrt(np.maximum(np.diag(found.lens_covariance), 0))
+    return np.concatenate([fitted, np.zeros(8 - len(fitted))])
+
+
+def dome_map(found: Survey, doubt: Doubt) -> DomeMap:
+    """What a survey leaves behind for the tracker."""
+    kept = found.surveyed
+    focal_sigma_px, x_sigma_px, y_sigma_px, *k_sigma = lens_sigma(found).tolist()
+    return DomeMap(
+        id=found.leds.id[kept],
+        position_m=found.leds.position_m[kept],
+        sigma_m=led_sigma_m(found, doubt)[kept],
+        camera_body_m=found.lever.camera_body_m,
+        lever_sigma_m=float(np.sqrt(np.trace(found.lever_covariance_m2) / 3)),
+        size_px=(found.camera.width_px, found.camera.height_px),
+        focal_px=found.camera.focal_px,
+        focal_sigma_px=focal_sigma_px,
+        centre_px=found.camera.centre_px,
+        centre_sigma_px=(x_sigma_px, y_sigma_px),
+        distortion=found.camera.distortion,
+        distortion_sigma=tuple(k_sigma),
+    )
+
+
+def detect_lights(settings: Settings, camera: Camera, frame: Frame) -> Centroids:
+    """The lights of a frame, unnamed; none of a frame that the tracker would not look at."""
+    try:
+        return see(frame.image_dn, camera, settings, Clock())
+    except ImageError:
+        return Centroids.none()
+
+
+def sighting(
+    seen: Centroids,
+    light: NDArray[np.int64],
+    led: NDArray[np.int64],
+    body_from_lab: Rotation,
+    floor_px: float,
+) -> DomeFrame:
+    """A frame of a survey: the rows of its lights that have a name, and the rows of the LEDs that they are."""
+    sigma_px = np.hypot(seen.sigma_px[light], floor_px)
+    return DomeFrame(led, seen.xy_px[light], sigma_px, body_from_lab)
+
+
+def robust_survey(
+    frames: list[DomeFrame],
+    leds: LedMap,
+    lever: Lever,
+    camera: Camera,
+    led_sigma_m: float,
+    fit_distortion: bool,
+) -> Survey:
+    """`calibrate.survey`, robust against wrong names, with the map before it as a measurement. Raises InputError."""
+    try:
+        return dome_survey.survey(
+            frames, leds, lever, camera, None, fit_distortion, loss="cauchy", leds_sigma_m=led_sigma_m
+        )
+    except ValueError as error:
+        raise InputError(str(error)) from None

@@ -1,0 +1,1 @@
+"""Experiments of the AFIT thesis (Padro 2012)."""

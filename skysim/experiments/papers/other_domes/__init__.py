@@ -1,0 +1,1 @@
+"""Experiments of other laboratories' star simulators: APL, NPS and OLED."""

@@ -1,0 +1,1 @@
+"""Experiments of PTASE (Fialho & Saotome 2005)."""

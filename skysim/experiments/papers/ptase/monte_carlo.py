@@ -1,0 +1,248 @@
+"""PTASE's Monte Carlo simulation (Fialho & Saotome 2005, section 4, table 1): its engine, and the table done again."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from estimator.catalog import pair_index, ptase
+from estimator.catalog.pair_index import PairIndex
+from estimator.core.arrays import Ints
+from estimator.identification.chance import ACCEPT_LOG10_CHANCE
+from estimator.identification.options import Options
+from estimator.identification.published.fialho import (
+    SHARE_BASIC,
+    SHARE_FALSE_STARS,
+    VERSIONS,
+    Rules,
+    rules,
+    search,
+)
+from skysim.core.jit import jit
+from skysim.core.paths import CATALOGUES
+from skysim.core.types import Floats
+from skysim.core.units import ARCSEC_RAD
+from skysim.experiments.papers.compare import Answer, Ask, Cause, Drawing, Found
+from skysim.experiments.papers.intervals import resampled
+from skysim.experiments.papers.published import experiments
+from skysim.results.metrics import WRONG_RAD, Summary, share
+from skysim.results.plots import INK, MARKS
+
+HALF_FIELD_TAN = float(np.tan(np.radians(10)))
+SIGMA_RAD, SIGMA_MAG = 3 * ARCSEC_RAD, 0.25
+TOLERANCE_RAD = 5 * SIGMA_RAD  # a star in 3e5 is farther off; what fails is the magnitudes' gate
+DIAGONAL_RAD = 2 * np.arctan(np.sqrt(2) * HALF_FIELD_TAN)
+DOUBLES_RAD = 30 * ARCSEC_RAD
+FITTED_LIMIT_MAG, FITTED_GATE_SIGMAS = 5.1, 3.2
+SIMULATION_RUNS = 1000
+# Table 1: success (%), mean attitude, roll and axis error (arcsec) of its five simulations.
+TABLE_1 = np.array(experiments()["ptase-table-1"].data["simulations"])
+
+
+def catalogue(limit_mag: float) -> PairIndex:
+    """Hipparcos by READCAT and PROC_CAT to a limit, doubles closer than 30 arcsec merged, with the field's pairs."""
+    stars = ptase.proc_cat(ptase.read_cat(CATALOGUES / "hipparcos_hp6.5.ecsv", limit_mag), DOUBLES_RAD)
+    return pair_index.build(stars.vectors, float(DIAGONAL_RAD), magnitude=stars.magnitude)
+
+
+def version(name: str) -> Rules:
+    """The rules of one of the paper's versions, as estimator.identification.published.fialho runs it."""
+    asked = Options(epsilon_mag=SIGMA_MAG)
+    falls_back = name in ("fialho_3", "fialho_4")
+    part = SHARE_FALSE_STARS if falls_back else SHARE_BASIC
+    return rules(TOLERANCE_RAD, asked, part, name != "fialho_1", falls_back)
+
+
+@jit
+def simulate(known: PairIndex, by: Rules, runs: int, seed: int) -> tuple[Floats, Floats, Ints]:
+    """R_cam_from_icrs (runs, 3, 3) that was and that was found, NaN where refused; (runs,) stars seen.
+
+    Attitudes are uniform: a quaternion of four normal numbers.
+    """
+    np.random.seed(seed)  # noqa: NPY002  (numba has no other generator that is seeded inside)
+    truly, told = np.empty((runs, 3, 3)), np.full((runs, 3, 3), np.nan)
+    stars = np.zeros(runs, np.int64)
+    for run in range(runs):
+        truly[run] = _attitude()
+        seen, light = _field(truly[run], known)
+        stars[run] = len(seen)
+        if len(seen) < 4:
+            continue
+        found = search(seen, light, known, by)
+        if found[3] <= ACCEPT_LOG10_CHANCE:
+            told[run] = found[2]
+    return truly, told, stars
+
+
+@jit
+def _attitude() -> Floats:
+    """A rotation matrix uniform over all rotations."""
+    a, b, c, d = np.random.standard_normal(4)  # noqa: NPY002
+    length = np.sqrt(a * a + b * b + c * c + d * d)
+    a, b, c, d = a / length, b / length, c / length, d / length
+    R = np.empty((3, 3))
+    R[0, 0], R[0, 1], R[0, 2] = 1 - 2 * (c * c + d * d), 2 * (b * c - a * d), 2 * (b * d + a * c)
+    R[1, 0], R[1, 1], R[1, 2] = 2 * (b * c + a * d), 1 - 2 * (b * b + d * d), 2 * (c * d - a * b)
+    R[2, 0], R[2, 1], R[2, 2] = 2 * (b * d - a * c), 2 * (c * d + a * b), 1 - 2 * (b * b + c * c)
+    return R
+
+
+@jit
+def _field(R: Floats, known: PairIndex) -> tuple[Floats, Floats]:
+    """PTASE's gen_sia_input2: the stars in the field with noise on their directions and magnitudes, brightest first."""
+    seen, light = np.empty((len(known.vectors), 3)), np.empty(len(known.vectors))
+    least = 1 / np.sqrt(
+        1 + 2 * HALF_FIELD_TAN**2
+    )  # the field's corner: most stars need no more than this product
+    count = 0
+    for star in range(len(known.vectors)):
+        u, v, w = known.vectors[star]
+        z = R[2, 0] * u + R[2, 1] * v + R[2, 2] * w
+        if z < least:
+            continue
+        x, y = R[0, 0] * u + R[0, 1] * v + R[0, 2] * w, R[1, 0] * u + R[1, 1] * v + R[1, 2] * w
+        if abs(x) > HALF_FIELD_TAN * z or abs(y) > HALF_FIELD_TAN * z:
+            continue
+        x += SIGMA_RAD * np.random.standard_normal()  # noqa: NPY002
+        y += SIGMA_RAD * np.random.standard_normal()  # noqa: NPY002
+        z += SIGMA_RAD * np.random.standard_normal()  # noqa: NPY002
+        length = np.sqrt(x * x + y * y + z * z)
+        seen[count, 0], seen[count, 1], seen[count, 2] = x / length, y / length, z / length
+        light[count] = known.magnitude[star] + SIGMA_MAG * np.random.standard_normal()  # noqa: NPY002
+        count += 1
+    order = np.argsort(light[:count])
+    return seen[:count][order], light[:count][order]
+
+
+class Errors(NamedTuple):
+    """(N,) of the runs that were answered, as the paper takes them (eqs. 7-9), arcsec; and the true angle.
+
+    attitude : |M_true - M_est|, the Frobenius norm: sqrt(2) times the angle
+    roll     : |phi_true - phi_est| of eq. 5's angle, which counts from north
+    axis     : |Z_true - Z_est|
+    """
+
+    attitude: Floats
+    angle: Floats
+    roll: Floats
+    axis: Floats
+
+
+def errors(truly: Floats, told: Floats) -> Errors:
+    """Of (N, 3, 3) attitude matrices. The image's x and y are eq. 5's, up to a turn that both have."""
+    norm = np.linalg.norm(told - truly, axis=(1, 2))
+    turn = 2 * np.arcsin(np.minimum(norm / np.sqrt(8), 1))
+    phi = [np.arctan2(R[:, 0, 2], R[:, 1, 2]) for R in (truly, told)]
+    roll = np.abs(np.mod(phi[1] - phi[0] + np.pi, 2 * np.pi) - np.pi)
+    axis = np.linalg.norm(told[:, 2] - truly[:, 2], axis=1)
+    return Errors(*(one / ARCSEC_RAD for one in (norm, turn, roll, axis)))
+
+
+# Table 1.
+
+
+class Done(NamedTuple):
+    """Runs of one version: how many, how many were answered and wrongly so, and the errors of the right answers."""
+
+    runs: int
+    answered: int
+    wrong: int
+    right: Errors
+
+
+def runs_of(known: PairIndex, by: Rules, runs: int, seed: int) -> Done:
+    """As the paper counts: a wrong answer is a success."""
+    truly, told, _ = simulate(known, by, runs, seed)
+    answered = np.isfinite(told[:, 0, 0])
+    all_of_them = errors(truly[answered], told[answered])
+    wrong = all_of_them.angle > WRONG_RAD / ARCSEC_RAD
+    return Done(runs, int(answered.sum()), int(wrong.sum()), Errors(*(one[~wrong] for one in all_of_them)))
+
+
+def table_1(ask: Ask) -> Found:
+    """All four versions, and the second once more with a wider gate for magnitudes."""
+    known, done = catalogue(FITTED_LIMIT_MAG), {}
+    seeds = np.random.default_rng([ask.seed, 1]).integers(2**31, size=len(VERSIONS) + 1)
+    for n, (name, seed) in enumerate(zip(VERSIONS, seeds, strict=False)):
+        runs = ask.trials(5000 if name == "fialho_1" else 10_000, 300 if name == "fialho_1" else 1000)
+        done[name] = runs_of(known, version(name), runs, int(seed))
+        ask.watch(n + 1, len(VERSIONS) + 1)
+    wider = version("fialho_2")._replace(gate_mag=FITTED_GATE_SIGMAS * SIGMA_MAG)
+    gate = runs_of(known, wider, ask.trials(10_000, 1000), int(seeds[-1]))
+    cause = Cause(f"a gate for magnitudes of {FITTED_GATE_SIGMAS} sigma, fitted", per_cent(gate))
+    answers = {}
+    for name, one in done.items():
+        what = name[-1]
+        answers[f"success_{what}"] = Answer(per_cent(one), cause=cause if what in "12" else None)
+        for figure, values in one.right._asdict().items():
+            answers[f"{figure}_{what}"] = Answer(resampled(values, np.mean))
+    answers["wrong"] = Answer(
+        share(sum(one.wrong for one in done.values()), sum(one.runs for one in done.values()))
+    )
+    answers |= scatter(done["fialho_2"])
+    return Found(answers, drawings(done))
+
+
+def per_cent(done: Done) -> Summary:
+    """Success."""
+    value, low, high, runs = share(done.answered, done.runs)
+    return Summary(100 * value, 100 * low, 100 * high, runs)
+
+
+def scatter(done: Done) -> dict[str, Answer]:
+    """The sd of a figure over simulations of a thousand runs: that of one run by the square root of a thousand."""
+    right, found = done.right, np.where(np.arange(done.runs) < done.answered, 100.0, 0.0)
+    values: dict[str, Floats] = {
+        "success": found,
+        "attitude": right.attitude,
+        "roll": right.roll,
+        "axis": right.axis,
+    }
+    return {f"{name}_sd": Answer(resampled(one, of_a_thousand)) for name, one in values.items()}
+
+
+def of_a_thousand(values: Floats, axis: int = -1) -> Any:
+    """Standard deviation of the mean of a simulation."""
+    return np.std(values, axis=axis, ddof=1) / np.sqrt(SIMULATION_RUNS)
+
+
+def drawings(done: dict[str, Done]) -> tuple[Drawing, ...]:
+    """What the paper logs, and its table."""
+    second = done["fialho_2"].right
+    return (
+        Drawing(
+            "Histogram of the attitude error of alg_ide_mf1_2, which PTASE writes into its log file.",
+            lambda fig: draw_histogram(fig, second),
+        ),
+        Drawing(
+            "Every simulation of a thousand runs: the paper's five, and ours of all versions.",
+            lambda fig: draw_simulations(fig, done),
+        ),
+    )
+
+
+def draw_histogram(fig: Any, right: Errors) -> None:
+    """Of the Frobenius norm, with the means of both."""
+    axes, bins = fig.subplots(), np.arange(0, 25.5, 0.5)
+    axes.hist(np.minimum(right.attitude, bins[-1]), bins, color=INK[0], alpha=0.5, label="ours")
+    axes.axvline(right.attitude.mean(), color=INK[0], label=f"ours, mean {right.attitude.mean():.2f}")
+    told = experiments()["ptase-table-1"].rows["attitude_2"].published
+    axes.axvline(told, color=INK[1], ls="--", label=f"published mean {told:.2f}")
+    axes.set(xlabel="attitude error |M true - M est| (arcsec; the last bin is all beyond)", ylabel="runs")
+    axes.legend()
+
+
+def draw_simulations(fig: Any, done: dict[str, Done]) -> None:
+    """Mean attitude error by mean roll error."""
+    axes = fig.subplots()
+    for n, (name, one) in enumerate(done.items()):
+        parts = max(1, one.runs // SIMULATION_RUNS)
+        means = [
+            [part.mean() for part in np.array_split(values, parts)]
+            for values in (one.right.roll, one.right.attitude)
+        ]
+        axes.plot(*means, MARKS[n], color=INK[(0, 2, 3, 4)[n]], alpha=0.7, label=f"ours, {name}")
+    axes.plot(TABLE_1[:, 2], TABLE_1[:, 1], "*", color=INK[1], ms=9, label="published")
+    axes.set(xlabel="mean roll error (arcsec)", ylabel="mean |M true - M est| (arcsec)")
+    axes.legend()

@@ -1,0 +1,1 @@
+"""Experiments of SHEFEX-2 (Samaan & Theil 2011)."""

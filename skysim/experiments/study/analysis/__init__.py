@@ -1,0 +1,1 @@
+"""Answers from a study's rows: tables, sensitivity (error budget) and the search for the best design."""

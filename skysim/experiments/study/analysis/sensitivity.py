@@ -1,0 +1,95 @@
+"""The error budget: how much of the attitude error's variance each factor is to blame for (Sobol 1993).
+
+First-order index: the share of the variance that would go were the factor known. Total: the share that would stay were
+all others known. Several outputs, the error about each axis at every one of the attitudes, are summed with their
+variances as weights: generalised indices (Lamboni, Monod & Makowski 2011; Gamboa et al. 2014).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from skysim.core.errors import InputError
+from skysim.core.types import Floats
+from skysim.experiments.study.plan import Plan
+from skysim.experiments.study.store import Store
+from skysim.results.metrics import CONFIDENCE, Summary
+
+AXES = {"cross_arcsec": ("x_arcsec", "y_arcsec"), "roll_arcsec": ("roll_arcsec",)}
+RESAMPLES = 200
+
+
+class Index(NamedTuple):
+    """A factor's part in one error: its indices, and rms_arcsec, the error that it alone makes (from the first)."""
+
+    factor: str
+    response: str
+    first: Summary
+    total: Summary
+    rms_arcsec: float
+
+
+def indices(plan: Plan, store: Store) -> list[Index]:
+    """Every factor's indices for the errors across and about the boresight. Raises InputError for another design."""
+    if plan.study.design.kind != "saltelli" or plan.study.optimise:
+        raise InputError("design.kind: indices take a study of kind saltelli")
+    return [index for response in AXES for index in of_response(plan, store, response)]
+
+
+def of_response(plan: Plan, store: Store, response: str) -> list[Index]:
+    """The factors' indices for one error."""
+    a, b, ab = outputs(plan, store, AXES[response])
+    names, count = list(plan.study.factors), a.shape[1]
+    if not len(a):
+        nothing = Summary(np.nan, np.nan, np.nan, 0)
+        return [Index(name, response, nothing, nothing, np.nan) for name in names]
+    found = generalised(a, b, ab)
+    rng = np.random.default_rng(1)
+    drawn = np.array(
+        [
+            generalised(a[:, pick], b[:, pick], ab[:, :, pick])
+            for pick in rng.integers(count, size=(RESAMPLES, count))
+        ]
+    )
+    low, high = np.quantile(drawn, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2], axis=0)
+    first, total = (
+        [Summary(float(v), float(lo), float(hi), count) for v, lo, hi in zip(*part, strict=True)]
+        for part in zip(found, low, high, strict=True)
+    )
+    # The variance of an attitude's error is the sum of its axes'.
+    size = float(np.sqrt(np.var(np.concatenate([a, b], axis=1), axis=1).mean() * len(AXES[response])))
+    return [
+        Index(name, response, alone, all_told, size * float(np.sqrt(max(alone.value, 0.0))))
+        for name, alone, all_told in zip(names, first, total, strict=True)
+    ]
+
+
+def outputs(plan: Plan, store: Store, axes: tuple[str, ...]) -> tuple[Floats, Floats, Floats]:
+    """(S, N), (S, N) and (D, S, N) errors at A, B and A with a column of B; S outputs: every axis at every replicate.
+
+    A replicate with a trial anywhere that was not answered, or not done yet, is left out.
+    """
+    width, each = len(plan.study.factors), plan.study.replicates
+    columns = store.columns()
+    values = np.full((len(axes), plan.trials), np.nan)
+    values[:, columns["trial"]] = [columns[name] for name in axes]
+    grid = values.reshape(len(axes), -1, each).transpose(0, 2, 1).reshape(len(axes) * each, -1)
+    whole = np.isfinite(grid).all(axis=1)
+    blocks = grid[whole].reshape(int(whole.sum()), width + 2, len(plan.points) // (width + 2))
+    return blocks[:, 0], blocks[:, 1], blocks[:, 2:].transpose(1, 0, 2)
+
+
+def generalised(a: Floats, b: Floats, ab: Floats) -> NDArray[np.float64]:
+    """(2, D) first-order and total indices over all outputs (Saltelli et al. 2010's estimators, by SciPy)."""
+    found = scipy.stats.sobol_indices(func={"f_A": a, "f_B": b, "f_AB": ab}, n=a.shape[1])
+    weight = np.var(np.concatenate([a, b], axis=1), axis=1)
+    if weight.sum() == 0:
+        return np.zeros((2, len(ab)))
+    moving = weight > 0
+    return np.stack(
+        [weight[moving] @ part[moving] / weight.sum() for part in (found.first_order, found.total_order)]
+    )

@@ -1,0 +1,122 @@
+"""Which combinations of the factors are tried: full factorial, one at a time, or spread over their shares' cube."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterator, Mapping
+from typing import Annotated, Literal, NamedTuple
+
+import numpy as np
+import scipy
+from pydantic import Field
+
+from skysim.core.errors import InputError
+from skysim.core.types import Floats
+from skysim.core.units import ConfigModel
+from skysim.experiments.study.factors import Factor, Settings, Value
+
+
+class Point(NamedTuple):
+    """One combination: what each factor is called there, and the keys that all of them set."""
+
+    levels: dict[str, Value]
+    settings: Settings
+
+
+class Design(ConfigModel):
+    """How points are chosen.
+
+    kind  : factorial, every combination of levels; one_at_a_time, the first levels and each other level alone;
+            lhs, a Latin hypercube; sobol, Sobol's sequence; saltelli, what Sobol indices take: A, B, and A with each
+            of B's columns in turn, points * (factors + 2) in all (Saltelli et al. 2010)
+    points: of lhs, sobol and saltelli; for sobol and saltelli a power of two
+    """
+
+    kind: Literal["factorial", "one_at_a_time", "lhs", "sobol", "saltelli"] = "factorial"
+    points: Annotated[int, Field(ge=2, le=1_000_000)] | None = None
+
+
+Factors = Mapping[str, Factor]
+
+
+def points(design: Design, factors: Factors, seed: int) -> list[Point]:
+    """All points of a design, in their order. Raises InputError where factors and design do not go together."""
+    drawn = design.kind in ("lhs", "sobol", "saltelli")
+    if drawn != (design.points is not None):
+        wanted = "takes how many" if drawn else "has as many as its levels make"
+        raise InputError(f"design.points: {design.kind} {wanted}")
+    if (
+        design.kind in ("sobol", "saltelli")
+        and design.points is not None
+        and design.points & (design.points - 1)
+    ):
+        raise InputError(f"design.points: {design.points} is no power of two, as {design.kind} wants")
+    for name, factor in factors.items():
+        if not drawn and not factor.options():
+            raise InputError(
+                f"factors.{name}: a distribution has no levels; allowed: design of kind lhs, sobol, saltelli"
+            )
+    return list(DESIGNS[design.kind](design, factors, seed))
+
+
+def merged(chosen: Mapping[str, tuple[Value, Settings]]) -> Point:
+    """One point of what each factor is at."""
+    settings: Settings = {}
+    for _, sets in chosen.values():
+        settings |= sets
+    return Point({name: level for name, (level, _) in chosen.items()}, settings)
+
+
+def factorial(design: Design, factors: Factors, seed: int) -> Iterator[Point]:
+    """Every combination; the last factor changes fastest."""
+    for levels in itertools.product(*(factor.options() for factor in factors.values())):
+        yield merged(dict(zip(factors, levels, strict=True)))
+
+
+def one_at_a_time(design: Design, factors: Factors, seed: int) -> Iterator[Point]:
+    """The first level of every factor; then each other level of each factor alone."""
+    first = {name: factor.options()[0] for name, factor in factors.items()}
+    yield merged(first)
+    for name, factor in factors.items():
+        for level in factor.options()[1:]:
+            yield merged(first | {name: level})
+
+
+def at_shares(factors: Factors, shares: Floats) -> Iterator[Point]:
+    """The points at (P, D) shares of 1."""
+    for row in shares:
+        yield merged(
+            {name: factor.at(float(u)) for (name, factor), u in zip(factors.items(), row, strict=True)}
+        )
+
+
+def lhs(design: Design, factors: Factors, seed: int) -> Iterator[Point]:
+    """A Latin hypercube: each factor's range is cut in as many strips as there are points, one in each."""
+    yield from at_shares(
+        factors, scipy.stats.qmc.LatinHypercube(len(factors), rng=seed).random(design.points or 0)
+    )
+
+
+def sobol(design: Design, factors: Factors, seed: int) -> Iterator[Point]:
+    """Sobol's sequence, scrambled by the seed."""
+    yield from at_shares(factors, scipy.stats.qmc.Sobol(len(factors), rng=seed).random(design.points or 0))
+
+
+def saltelli(design: Design, factors: Factors, seed: int) -> Iterator[Point]:
+    """A, B, then for each factor A with that column of B: `sensitivity.indices` knows this order."""
+    count, width = design.points or 0, len(factors)
+    both = scipy.stats.qmc.Sobol(2 * width, rng=seed).random(count)
+    a, b = both[:, :width], both[:, width:]
+    yield from at_shares(factors, a)
+    yield from at_shares(factors, b)
+    for n in range(width):
+        yield from at_shares(factors, np.where(np.arange(width) == n, b, a))
+
+
+DESIGNS: dict[str, Callable[[Design, Factors, int], Iterator[Point]]] = {
+    "factorial": factorial,
+    "one_at_a_time": one_at_a_time,
+    "lhs": lhs,
+    "sobol": sobol,
+    "saltelli": saltelli,
+}

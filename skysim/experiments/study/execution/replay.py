@@ -1,0 +1,103 @@
+"""One trial of a study again, alone, with its frames to look at."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from itertools import islice
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from estimator.core.types import Attitude, Centroids
+from estimator.trackers.pipeline import Report
+from skysim.core import files as file_io
+from skysim.core.errors import InputError
+from skysim.core.types import Frame, Truth
+from skysim.experiments.study.plan import CentroidTrial, FlightTrial, FrameTrial, Plan
+from skysim.experiments.study.setups import Bench, bench
+from skysim.experiments.study.store import Store, plain
+from skysim.experiments.study.trials import Row, Segment, one, reseeded, shot, sight
+from skysim.results.files import frames
+from skysim.results.report import annotate
+from skysim.simulation import run
+from skysim.tracking import factory
+
+MOST = 100  # frames of a flight that are written
+
+
+class Replay(NamedTuple):
+    """A trial done again: its row, the names of stored figures that differ now, its frames' files, its pictures."""
+
+    row: Row
+    changed: list[str]
+    files: list[Path]
+    pictures: list[Path]
+
+
+def segment_of(plan: Plan, store: Store, trial: int) -> Segment:
+    """What a worker was given for a trial. Raises InputError for one that the study has not."""
+    points, each = store.points(), plan.study.replicates
+    if not 0 <= trial < len(points) * each:
+        raise InputError(f"trial {trial}: is none of the study's; allowed: 0 to {len(points) * each - 1}")
+    point, replicate = divmod(trial, each)
+    return Segment(point, points[point].settings, trial, range(replicate, replicate + 1))
+
+
+def replay(plan: Plan, store: Store, trial: int, folder: Path) -> Replay:
+    """Do a trial again by its seed, and write what the camera saw in it, each frame with an annotated picture.
+
+    Of a flight the first MOST frames. What a trial raised is in its row, and its frame is written all the same where
+    it was taken.
+    """
+    segment = segment_of(plan, store, trial)
+    row = one(plan.recipe, segment, trial, segment.replicates[0])
+    kept = store.trial(trial) if store.done(trial + 1)[trial] else {}
+    now = {name: plain(getattr(row.outcome, name)) for name in row.outcome.__slots__}
+    changed = [name for name, value in now.items() if kept and kept[name] != value]
+    files, pictures = [], []
+    if row.scene:  # else there is no lab to photograph
+        ready = bench(plan.recipe, segment.settings)
+        frames.clear(file_io.make_folder(folder))
+        try:
+            for frame, truth, report in islice(seen(ready, row.seed), MOST):
+                frames.write_frame(folder, frame, truth, ready.lab.scene)
+                files.append(folder / f"frame_{frame.index:04d}.fits")
+                pictures.append(folder / f"frame_{frame.index:04d}.annotated.png")
+                file_io.write_image(pictures[-1], picture(frame, truth, report))
+        except Exception:
+            if row.error is None:
+                raise
+    return Replay(row, changed, files, pictures)
+
+
+def picture(frame: Frame, truth: Truth, report: Report) -> Any:
+    """The frame with truth, centroids and names."""
+    match, xy_px = report.attitude.match, report.centroids.xy_px
+    matched_px = xy_px[match.observed] if match else np.empty((0, 2))
+    return annotate(frame.image_dn, xy_px, matched_px, truth_px=truth.seen.xy_px)
+
+
+def seen(ready: Bench, seed: int) -> Iterator[tuple[Frame, Truth, Report]]:
+    """A trial's frames. A centroid trial has none, so its attitude is photographed and its own centroids are shown."""
+    trial = ready.trial
+    if isinstance(trial, CentroidTrial):
+        _, _, centroids = sight(ready, seed)
+        still = FrameTrial(kind="frames", **{name: getattr(trial, name) for name in ("tilt_deg", "dec_deg")})
+        frame, truth, _ = shot(ready._replace(trial=still), seed)
+        yield frame, truth, tried(lambda: Report(ready.estimator.solve_centroids(centroids), centroids))
+    elif isinstance(trial, FlightTrial):
+        lab = run.simulate_motion(reseeded(ready.lab, seed))
+        for taken in run.run(lab, ready.estimator):
+            yield taken.frame, taken.truth, taken.report
+    else:
+        frame, truth, streak_px = shot(ready, seed)
+        yield frame, truth, tried(lambda: factory.answer(ready.estimator, frame, streak_px))
+
+
+def tried(solve: Callable[[], Report]) -> Report:
+    """A tracker's report; an empty one where it raises, which the trial's row tells of."""
+    try:
+        return solve()
+    except Exception as error:
+        return Report(Attitude(f"failed: {error}"), Centroids.none())

@@ -1,0 +1,120 @@
+"""Load a study: its file, its checks and the plan."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+from pydantic import ValidationError
+
+from skysim.core.errors import InputError
+from skysim.core.yaml_reader import explain, line_of, of_our_version, put, read_yaml
+from skysim.experiments.study.factors import Factor, Settings, Value
+from skysim.experiments.study.plan import (
+    CentroidTrial,
+    Curve,
+    FlightTrial,
+    FrameTrial,
+    Plan,
+    Study,
+    find,
+    planned,
+    resolved,
+)
+from skysim.results import metrics
+from skysim.scene.light import BenchConfig
+from skysim.scene.scene import Scene
+from skysim.tracking.external.interface import OWN, known
+
+
+def load(
+    name: str | Path, overrides: Mapping[str, str] | None = None, programs: Mapping[str, str] | None = None
+) -> Plan:
+    """Read, override (`path.to.key` -> YAML value) and validate a study and every level of its factors.
+
+    programs : commands by name for `tracker.name`; None where the study shall not be run, and they need not be there
+    Raises BadInput with one line: the key, what is wrong with it, what is allowed, the file and line.
+    """
+    path = find(str(name))
+    tree, text = read_yaml(path)
+    of_our_version(tree, path, text)
+    for key, value in (overrides or {}).items():
+        put(tree, key, value)
+    try:
+        study = Study.model_validate(tree)
+    except ValidationError as error:
+        raise InputError(explain(error, Study, tree, [(path, text)], overrides or {})) from None
+    try:
+        plan = planned(path, study, tree["trial"], programs or {})
+        check(plan, to_run=programs is not None)
+    except InputError as error:
+        raise InputError(located(str(error), path, text)) from None
+    return plan
+
+
+def check(plan: Plan, to_run: bool) -> None:
+    """Refuse, before the first trial, what cannot be asked: responses, figures, budget, and levels one by one.
+
+    to_run : whether the trackers have to be there
+    """
+    from skysim.experiments.study.analysis import search
+    from skysim.experiments.study.analysis.table import Line
+    from skysim.experiments.study.report import layout
+    from skysim.experiments.study.store import COLUMNS
+
+    study = plan.study
+    for n, name in enumerate(study.responses):
+        metrics.response(name, f"responses.{n}")
+    for n, figure in enumerate(study.figures):
+        for key in ("x", "by") if isinstance(figure, Curve) else ("x", "y"):
+            axis = getattr(figure, key)
+            if axis is not None and axis not in study.factors:
+                raise InputError(f"figures.{n}.{key}: {axis!r} is none of {', '.join(study.factors)}")
+        metrics.response(figure.y if isinstance(figure, Curve) else figure.value, f"figures.{n}")
+        if plan.points:
+            layout.held(figure, study, [Line(k, point.levels, {}) for k, point in enumerate(plan.points)])
+    if study.optimise:
+        search.check(study)
+    if study.budget.trials is not None and plan.trials > study.budget.trials:
+        raise InputError(f"budget.trials: {study.budget.trials} are fewer than the study's {plan.trials}")
+    for name in study.factors:
+        if name in COLUMNS or name in study.responses:
+            raise InputError(f"factors.{name}: is a column of every trial; allowed: another name")
+    for name, level, settings in one_by_one(study.factors):
+        try:
+            scene, trial = resolved(plan.recipe, settings)
+            if isinstance(scene.light, BenchConfig) and not isinstance(trial, FlightTrial):
+                raise InputError("trial.kind: a bench has no sky around it; allowed: flight")
+            if to_run:
+                check_tracker(plan, scene, trial)
+        except InputError as error:
+            key = str(error).partition(":")[0]
+            owners = [other for other, factor in study.factors.items() if key in dict(factor.at(0.5)[1])]
+            owner = name if name in owners or not owners else owners[0]
+            told = level if owner == name else study.factors[owner].at(0.5)[0]
+            raise InputError(f"factors.{owner}: {told!r}: {error}") from None
+
+
+def check_tracker(plan: Plan, scene: Scene, trial: CentroidTrial | FrameTrial | FlightTrial) -> None:
+    """Refuse a tracker that no worker would find, or that a trial of centroids has nothing to show. Raises BadInput."""
+    name = scene.tracker.name
+    known(name, plan.recipe.programs)
+    if name != OWN and isinstance(trial, CentroidTrial):
+        raise InputError(f"tracker.name: {name} takes frames; allowed: {OWN}, or another trial.kind")
+
+
+def one_by_one(factors: Mapping[str, Factor]) -> Iterator[tuple[str, Value, Settings]]:
+    """Every level of every factor, the others at their middle: which factor, the level, all that is set."""
+    middle = {name: factor.at(0.5)[1] for name, factor in factors.items()}
+    for name, factor in factors.items():
+        for level, settings in factor.options() or [factor.at(0.5)]:
+            others: Settings = {}
+            for other, sets in middle.items():
+                others |= sets if other != name else {}
+            yield name, level, others | settings
+
+
+def located(message: str, path: Path, text: str) -> str:
+    """A complaint of a study's key with its file and line."""
+    line = line_of(text, message.partition(":")[0].split("."))[1]
+    return f"{message.removesuffix(' (--set)')} ({path}{f', line {line}' if line else ''})"

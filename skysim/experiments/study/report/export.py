@@ -1,0 +1,82 @@
+"""A study's results for other tools: CSV, Parquet, and xarray's datasets as NetCDF or Zarr."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from skysim.core import files
+from skysim.core.errors import InputError
+from skysim.experiments.study.analysis.table import everything, flat, table
+from skysim.experiments.study.store import Store
+from skysim.results.files.export import EXTRA
+
+
+def to_csv(store: Store, responses: tuple[str, ...], path: Path) -> None:
+    """One line a trial, what is not there left empty; numbers as Python writes them, which read back the same."""
+    columns = everything(store)
+    with files.whole(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(columns)
+        for row in zip(*(column.tolist() for column in columns.values()), strict=True):
+            writer.writerow(["" if value is None or value != value else value for value in row])
+
+
+def to_parquet(store: Store, responses: tuple[str, ...], path: Path) -> None:
+    """One row a trial; study's title and code version in the file's metadata."""
+    try:
+        import pyarrow
+        import pyarrow.parquet
+    except ImportError:
+        raise InputError(f"{path}: Parquet {EXTRA}") from None
+    columns = {name: pyarrow.array(column.tolist()) for name, column in everything(store).items()}
+    told = {key: store.meta(key) for key in ("title", "code", "study")}
+    with files.whole(path) as temporary:
+        pyarrow.parquet.write_table(pyarrow.table(columns).replace_schema_metadata(told), temporary)
+
+
+def dataset(store: Store, responses: tuple[str, ...], path: Path) -> Any:
+    """An xarray.Dataset: every response, its interval and count; over the factors as dimensions where the design is
+    full, else over the points."""
+    try:
+        import pandas
+        import xarray
+    except ImportError:
+        raise InputError(f"{path}: xarray {EXTRA}") from None
+    lines = table(store, responses)
+    frame = pandas.DataFrame(flat(lines))
+    factors = list(lines[0].levels) if lines else []
+    for name in factors:
+        if frame[name].map(type).isin([list, dict]).any():
+            frame[name] = frame[name].map(str)
+    sizes = [frame[name].nunique() for name in factors]
+    full = factors and int(np.prod(sizes)) == len(frame) and not frame.duplicated(factors).any()
+    told = {key: store.meta(key) for key in ("title", "code", "study")}
+    indexed = frame.set_index(factors if full else ["point"])
+    return xarray.Dataset.from_dataframe(indexed).assign_attrs(told)
+
+
+def to_zarr(store: Store, responses: tuple[str, ...], path: Path) -> None:
+    """`dataset` as a Zarr folder."""
+    made = dataset(store, responses, path)
+    with files.whole_folder(path) as temporary:
+        made.to_zarr(temporary, mode="w", consolidated=False)
+
+
+EXPORTS: dict[str, Callable[[Store, tuple[str, ...], Path], None]] = {
+    ".csv": to_csv,
+    ".parquet": to_parquet,
+    ".zarr": to_zarr,
+}
+
+
+def export(store: Store, responses: tuple[str, ...], path: Path) -> None:
+    """Write a study's results in the format that the path ends in. Raises InputError for one that is none."""
+    if path.suffix not in EXPORTS:
+        raise InputError(f"{path}: {path.suffix or 'no suffix'!r} is none of {', '.join(EXPORTS)}")
+    files.make_folder(path.parent)
+    EXPORTS[path.suffix](store, responses, path)

@@ -1,0 +1,117 @@
+"""What trials are made on: a scene's hardware and its tracker, set up once; and where a row says that it is from."""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from dataclasses import replace
+from functools import cache
+from hashlib import sha256
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from skysim.core.paths import DATA, ROOT
+from skysim.experiments.study.factors import Settings
+from skysim.experiments.study.plan import CentroidTrial, FlightTrial, FrameTrial, Recipe, digest, resolved
+from skysim.scene.loader import FILES
+from skysim.scene.scene import Scene
+from skysim.simulation import testbed
+from skysim.simulation.testbed import Testbed
+from skysim.tracking import factory
+from skysim.tracking.external import interface
+
+KEPT = 4  # benches a worker keeps ready
+
+
+class Bench(NamedTuple):
+    """A scene set up for trials: hardware, flown nowhere; the tracker with its index; what a trial is; a hash of it."""
+
+    lab: Testbed
+    estimator: factory.Estimator
+    trial: CentroidTrial | FrameTrial | FlightTrial
+    scene_hash: str
+
+
+class Shelf(threading.local):
+    """The benches that a thread of a worker has ready, the last used last; a lab's canvas is for one at a time."""
+
+    def __init__(self) -> None:
+        self.benches: OrderedDict[str, Bench] = OrderedDict()
+
+
+SHELF = Shelf()
+
+
+def bench(recipe: Recipe, settings: Settings) -> Bench:
+    """The bench of a point, from the shelf where it is there. Raises InputError."""
+    key = digest([recipe.scene, recipe.folder, recipe.base, recipe.trial, recipe.programs, settings])
+    shelf = SHELF.benches
+    if key not in shelf:
+        shelf[key] = set_up(recipe, settings)
+        while len(shelf) > KEPT:
+            shelf.popitem(last=False)
+    shelf.move_to_end(key)
+    return shelf[key]
+
+
+def set_up(recipe: Recipe, settings: Settings) -> Bench:
+    """Hardware and tracker of a point; of the bench before where the two differ in the trial alone."""
+    scene, trial = resolved(recipe, settings)
+    told = scene_hash(scene)
+    for ready in SHELF.benches.values():
+        if ready.scene_hash == told and ready.lab.programs == recipe.programs:
+            return ready._replace(trial=trial)
+    lab = like_before(scene) or testbed.build_testbed(scene, recipe.programs)
+    lab = replace(lab, programs=recipe.programs)
+    return Bench(lab, testbed.tracker(lab), trial, told)
+
+
+def like_before(scene: Scene) -> Testbed | None:
+    """The lab of a bench whose scene differs in what its tracker believes alone: its hardware is the same."""
+    for ready in SHELF.benches.values():
+        if ready.lab.scene.model_copy(update={"tracker": scene.tracker}) == scene:
+            return replace(ready.lab, scene=scene)
+    return None
+
+
+def scene_hash(scene: Scene) -> str:
+    """Of a scene, of the files that it names and of the tracker that another package offers."""
+    tree = scene.model_dump(mode="json", by_alias=True)
+    named = [sha256(Path(path).read_bytes()).hexdigest() for path in files_of(tree)]
+    return digest([tree, named, interface.release(scene.tracker.name)])
+
+
+def files_of(tree: dict[str, Any]) -> list[str]:
+    """The files of its own that a scene names, where they are there."""
+    found = []
+    for keys in FILES:
+        node: Any = tree
+        for key in keys:
+            node = node.get(key) if isinstance(node, dict) else None
+        if isinstance(node, str) and Path(node).is_file():
+            found.append(node)
+    return found
+
+
+@cache
+def code_version() -> str:
+    """A hash of the sources of skysim and estimator and of their data: what a stored trial was made with."""
+    told = sha256()
+    sources = [path for package in ("skysim", "estimator") for path in (ROOT / package).rglob("*.py")]
+    data = [
+        path
+        for part in ("qe", "led", "bands", "cameras")
+        for path in (DATA / part).rglob("*")
+        if path.is_file()
+    ]
+    for path in sorted(sources + data):
+        told.update(path.relative_to(ROOT).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
+    return told.hexdigest()[:16]
+
+
+def seed_of(recipe: Recipe, point: int, replicate: int) -> int:
+    """A trial's own seed, 63 bits, from the study's; with `paired` the same at every point."""
+    key = (replicate,) if recipe.paired else (replicate, point)
+    return int(np.random.SeedSequence(recipe.seed, spawn_key=key).generate_state(1, np.uint64)[0] >> 1)

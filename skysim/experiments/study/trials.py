@@ -1,0 +1,349 @@
+"""One trial: a random attitude, what the camera makes of it, what the tracker makes of that, and how wrong it is.
+
+A trial hangs on its recipe, its point and its seed alone: not on what was tried before, nor on who tries it.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+import traceback
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, fields, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from estimator.core.types import Attitude, Centroids
+from estimator.trackers.pipeline import Report
+from skysim.camera.render import Poses, follow, in_view
+from skysim.core import quaternion
+from skysim.core.paths import ROOT
+from skysim.core.types import Floats, Frame, Sources, Trajectory, Truth
+from skysim.core.units import ARCSEC_RAD
+from skysim.dynamics import multibody
+from skysim.experiments.study.factors import Settings
+from skysim.experiments.study.plan import CentroidTrial, FlightTrial, FrameTrial, Recipe
+from skysim.experiments.study.setups import Bench, bench, code_version, seed_of
+from skysim.results import metrics
+from skysim.scene.light import DomeConfig
+from skysim.scene.scene import Scene
+from skysim.simulation import exposure, run, testbed
+from skysim.simulation.testbed import SPARE_S, Testbed
+from skysim.tracking import factory
+
+KNOTS = 9  # of a frame trial's flight
+ANY_TIME_S = np.array([0.0, 1.0])
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What came of a trial. Of a flight errors are rms over its solved frames, counts sums or what is told.
+
+    status   : "solved", why there is no attitude, or of a trial that raised "failed"
+    frames, solved, wrong : how many were photographed, answered, answered more than ten arc-minutes off
+    x_arcsec, y_arcsec, roll_arcsec : error in camera axes, signed (of a flight rms); NaN where nothing was answered
+    nees     : e' P^-1 e of three degrees of freedom, what the tracker claims of its errors for P; a flight's mean
+    stars    : true lights on the chip; a flight's least.  detected, matched : centroids and names; a flight's means
+    availability : share of a flight's ticks at which its filter is within ten arc-minutes; without one of its frames
+    filter_arcsec, filter_worst_arcsec : angle by which a flight's filter is off, rms and worst
+    drift_arcsec : filter_arcsec of the flight's last quarter less the first's
+    """
+
+    status: str
+    frames: int = 0
+    solved: int = 0
+    wrong: int = 0
+    x_arcsec: float = math.nan
+    y_arcsec: float = math.nan
+    roll_arcsec: float = math.nan
+    nees: float = math.nan
+    stars: float = math.nan
+    detected: float = math.nan
+    matched: float = math.nan
+    availability: float = math.nan
+    filter_arcsec: float = math.nan
+    filter_worst_arcsec: float = math.nan
+    drift_arcsec: float = math.nan
+
+
+FIELDS = tuple(field.name for field in fields(Outcome))
+FAILED = Outcome("failed")
+
+
+class Row(NamedTuple):
+    """One trial as it is stored."""
+
+    trial: int
+    point: int
+    replicate: int
+    seed: int
+    scene: str
+    code: str
+    outcome: Outcome
+    error: str | None
+    seconds: float
+
+
+class Segment(NamedTuple):
+    """Successive replicates of one point, the unit that travels to a worker."""
+
+    point: int
+    settings: Settings
+    first: int
+    replicates: range
+
+
+# Doing them.
+
+
+def work(recipe: Recipe, segments: tuple[Segment, ...]) -> list[Row]:
+    """All trials of some segments, in their order."""
+    return [
+        one(recipe, segment, segment.first + n, replicate)
+        for segment in segments
+        for n, replicate in enumerate(segment.replicates)
+    ]
+
+
+def one(recipe: Recipe, segment: Segment, trial: int, replicate: int) -> Row:
+    """One trial; what it raises is in its row."""
+    seed = seed_of(recipe, segment.point, replicate)
+    scene, outcome, error, begin = "", FAILED, None, time.perf_counter()
+    try:
+        ready = bench(recipe, segment.settings)
+        scene, begin = ready.scene_hash, time.perf_counter()
+        outcome = TRIALS[ready.trial.kind](ready, seed)
+    except Exception:
+        error = traceback.format_exc().replace(f"{ROOT}/", "")  # the same wherever skysim is installed
+    spent = time.perf_counter() - begin
+    return Row(trial, segment.point, replicate, seed, scene, code_version(), outcome, error, spent)
+
+
+def centroids(ready: Bench, seed: int) -> Outcome:
+    """Random attitude, true lights with noise, false ones; identified and solved."""
+    lab_from_body, xy_px, seen = sight(ready, seed)
+    answer = ready.estimator.solve_centroids(seen)
+    return scored(answer, cam_from_lab_wxyz(ready.lab, lab_from_body), len(xy_px), len(seen))
+
+
+def sight(ready: Bench, seed: int) -> tuple[Rotation, Floats, Centroids]:
+    """A centroid trial's attitude lab_from_body, (N, 2) pixels of the true lights, and what is told of them."""
+    trial, (where, noise) = ready.trial, streams(ready, seed)
+    assert isinstance(trial, CentroidTrial)
+    lab_from_body = attitude(ready, where)
+    xy_px, electrons = lights(ready.lab, lab_from_body)
+    return lab_from_body, xy_px, spoilt(trial, xy_px, electrons, ready.lab.scene, noise)
+
+
+def streams(ready: Bench, seed: int) -> tuple[np.random.Generator, np.random.Generator]:
+    """Of a trial's attitude, and of its noise: the latter is another for another `noise_seed`, the attitude stays."""
+    trial = ready.trial
+    assert isinstance(trial, CentroidTrial | FrameTrial)
+    return np.random.default_rng([seed, 0]), np.random.default_rng([seed, 1, trial.noise_seed])
+
+
+def frames(ready: Bench, seed: int) -> Outcome:
+    """Random attitude, one whole frame, solved."""
+    frame, truth, streak_px = shot(ready, seed)
+    return answered(factory.answer(ready.estimator, frame, streak_px), truth)
+
+
+def answered(report: Report, truth: Truth) -> Outcome:
+    """What the tracker made of a frame, beside the frame's truth."""
+    truly = quaternion.of(truth.cam_from_lab)
+    return scored(report.attitude, truly, len(truth.seen.id), len(report.centroids))
+
+
+def flight(ready: Bench, seed: int) -> Outcome:
+    """The whole scene by another seed."""
+    trial = ready.trial
+    assert isinstance(trial, FlightTrial)
+    lab = run.simulate_motion(reseeded(ready.lab, seed))
+    came = [one for t_s, one in scores(lab, ready.estimator) if t_s >= trial.settle_s]
+    return summed(lab, came, trial.settle_s)
+
+
+def scores(lab: Testbed, estimator: factory.Estimator) -> Iterator[tuple[float, Outcome]]:
+    """Mid-exposure and outcome of every frame; those that were solved in flight are not taken again."""
+    if not lab.reports:
+        for shot in run.run(lab, estimator):
+            yield shot.truth.t_s, answered(shot.report, shot.truth)
+    for index, answer in lab.reports.items():
+        when = testbed.window(lab.scene, index, lab.exposures_s[index])
+        t_s = when.middle_s(lab.scene.camera.height_px)
+        lab_from_body = lab.trajectory.at(t_s)
+        truly, stars = cam_from_lab_wxyz(lab, lab_from_body), len(lights(lab, lab_from_body)[0])
+        yield t_s, scored(answer.attitude, truly, stars, len(answer.centroids))
+
+
+TRIALS: dict[str, Callable[[Bench, int], Outcome]] = {
+    "centroids": centroids,
+    "frames": frames,
+    "flight": flight,
+}
+
+
+# What they are made of.
+
+
+def attitude(ready: Bench, rng: np.random.Generator) -> Rotation:
+    """lab_from_body: under a dome leaning to any side, else with the boresight anywhere; any turn about it."""
+    trial = ready.trial
+    assert isinstance(trial, CentroidTrial | FrameTrial)
+    first, last = rng.uniform(0, 2 * math.pi, 2)
+    if isinstance(ready.lab.scene.light, DomeConfig):
+        low, high = trial.tilt_deg if isinstance(trial.tilt_deg, tuple) else (trial.tilt_deg,) * 2
+        cosine = rng.uniform(math.cos(math.radians(high)), math.cos(math.radians(low)))
+        return quaternion.rotation(zyz(first, math.acos(min(cosine, 1.0)), last - first))
+    low, high = (math.sin(math.radians(dec)) for dec in trial.dec_deg)
+    zenith = math.acos(min(max(rng.uniform(low, high), -1.0), 1.0))
+    lab_from_cam = zyz(first, zenith, last)
+    cam_from_body = quaternion.of(ready.lab.mount.cam_from_body)
+    return quaternion.rotation(quaternion.multiply(lab_from_cam, cam_from_body))
+
+
+def zyz(first_rad: float, second_rad: float, third_rad: float) -> Floats:
+    """(4,) wxyz of Rz(first) Ry(second) Rz(third), which takes z to azimuth `first`, zenith distance `second`."""
+    half, both, unlike = second_rad / 2, (first_rad + third_rad) / 2, (first_rad - third_rad) / 2
+    sine, cosine = math.sin(half), math.cos(half)
+    return np.array(
+        [cosine * math.cos(both), -sine * math.sin(unlike), sine * math.cos(unlike), cosine * math.sin(both)]
+    )
+
+
+def cam_from_lab_wxyz(lab: Testbed, lab_from_body: Rotation) -> Floats:
+    """(4,) the camera's attitude."""
+    cam_from_body = quaternion.of(lab.mount.cam_from_body)
+    return quaternion.multiply(cam_from_body, quaternion.inverse(quaternion.of(lab_from_body)))
+
+
+def lights(lab: Testbed, lab_from_body: Rotation) -> tuple[Floats, Floats]:
+    """(N, 2) pixels and (N,) photo-electrons of the lights whose middle is on the chip, as the hardware has them."""
+    R_lab_from_body = lab_from_body.as_matrix()
+    R_cam_from_lab = lab.mount.cam_from_body.as_matrix() @ R_lab_from_body.T
+    here = Poses(R_cam_from_lab[None], (R_lab_from_body @ lab.mount.camera_body_m)[None])
+    near = lab.sources.take(in_view(lab.sources, lab.optics, here))
+    paths, _, _ = follow(near, lab.optics, here, ANY_TIME_S, lab.emitter)
+    xy_px, (width_px, height_px) = paths.xy_px[0], lab.canvas.shape[::-1]
+    x, y = xy_px.T
+    seen = np.flatnonzero((x > -0.5) & (y > -0.5) & (x < width_px - 0.5) & (y < height_px - 0.5))
+    if lab.obstacles is not None:
+        seen = seen[~multibody.hidden(lab.obstacles, lab_from_body, near.take(seen))]
+    electrons = paths.rate_e_s[0] * lit_share(near) * lab.scene.exposure.time_s
+    return xy_px[seen], electrons[seen]
+
+
+def lit_share(sources: Sources) -> Floats:
+    """(N,) of the time that a light is on, at most 1."""
+    return np.minimum(sources.on_s / sources.period_s, 1.0)
+
+
+def spoilt(
+    trial: CentroidTrial, xy_px: Floats, electrons: Floats, scene: Scene, rng: np.random.Generator
+) -> Centroids:
+    """What a camera would tell of true lights: some missed, all noisy, some false; brightest first.
+
+    A false light is as bright as any of the field's, those too that `lights` leaves out.
+    """
+    kept = np.flatnonzero(rng.random(len(xy_px)) >= trial.missing)
+    flux = electrons * 10 ** (0.4 * trial.magnitude_sigma * rng.standard_normal(len(xy_px)))
+    xy_px = xy_px + trial.noise_px * rng.standard_normal(xy_px.shape)
+    kept = kept[np.argsort(-flux[kept], kind="stable")][: trial.lights]
+    false = trial.false_lights + round(len(kept) * trial.false_share / (1 - trial.false_share))
+    if not false:
+        return Centroids(xy_px[kept], np.full(len(kept), trial.noise_px), flux[kept])
+    strays_px = rng.random((false, 2)) * [scene.camera.width_px, scene.camera.height_px] - 0.5
+    bright = flux[rng.integers(len(flux), size=false)] if len(flux) else rng.random(false) + 1.0
+    everything = np.concatenate([flux[kept], bright])
+    order = np.argsort(-everything, kind="stable")
+    sigma_px = np.full(len(order), trial.noise_px)
+    return Centroids(np.concatenate([xy_px[kept], strays_px])[order], sigma_px, everything[order])
+
+
+def shot(ready: Bench, seed: int) -> tuple[Frame, Truth, tuple[float, float] | None]:
+    """A frame trial's frame, its truth and, with a gyro, how far (dx, dy) px stars in the middle move in it."""
+    trial, (where, noise) = ready.trial, streams(ready, seed)
+    assert isinstance(trial, FrameTrial)
+    lab = reseeded(ready.lab, int(noise.integers(2**62)))
+    middle, towards = attitude(ready, where), where.uniform(0, 2 * math.pi)
+    rate_cam = math.radians(trial.rate_deg_s) * np.array([math.cos(towards), math.sin(towards), 0.0])
+    rate_body = lab.mount.cam_from_body.inv().apply(rate_cam)
+    when, rows = testbed.window(lab.scene, 0), lab.scene.camera.height_px
+    t_s = np.linspace(when.open_s - SPARE_S, when.close_s(rows) + SPARE_S, KNOTS)
+    turned = Rotation.from_rotvec(np.outer(t_s - when.middle_s(rows), rate_body))
+    path = Trajectory(t_s, middle * turned, np.tile(rate_body, (KNOTS, 1)))
+    frame, truth = exposure.render_frame(replace(lab, trajectory=path), 0)
+    reach_px = when.exposure_s * lab.scene.camera.focal_px
+    # A star at the middle: d(x / z)/dt = -w_y, d(y / z)/dt = w_x.
+    return frame, truth, (-rate_cam[1] * reach_px, rate_cam[0] * reach_px) if trial.gyro else None
+
+
+def reseeded(lab: Testbed, seed: int) -> Testbed:
+    """The same hardware; noise, jitter and IMU of another seed."""
+    return replace(lab, scene=lab.scene.model_copy(update={"seed": seed}))
+
+
+def scored(answer: Attitude, cam_from_lab_wxyz: Floats, stars: int, detected: int) -> Outcome:
+    """An answer beside the truth. Quaternions of NumPy's, for SciPy's Rotation takes a tenth of a trial."""
+    matched = len(answer.match.observed) if answer.match else 0
+    if answer.cam_from_ref is None:
+        return Outcome(answer.status, 1, stars=stars, detected=detected, matched=matched)
+    estimate = quaternion.of(answer.cam_from_ref)
+    off = quaternion.to_rotvec(quaternion.multiply(estimate, quaternion.inverse(cam_from_lab_wxyz)))
+    nees = (
+        math.nan
+        if answer.covariance_rad2 is None
+        else float(off @ np.linalg.solve(answer.covariance_rad2, off))
+    )
+    wrong = int(math.hypot(*off) > metrics.WRONG_RAD)
+    x, y, roll = (off / ARCSEC_RAD).tolist()
+    return Outcome("solved", 1, 1, wrong, x, y, roll, nees, stars, detected, matched)
+
+
+def summed(lab: Testbed, came: list[Outcome], settle_s: float) -> Outcome:
+    """A flight's outcome of its frames' and, where it has a filter, of its filter's errors at every tick."""
+    solved = [outcome for outcome in came if outcome.solved]
+    x, y, roll = (
+        _rms([getattr(one, name) for one in solved]) for name in ("x_arcsec", "y_arcsec", "roll_arcsec")
+    )
+    good = [bool(one.solved and not one.wrong) for one in came]
+    off = filter_off_arcsec(lab, settle_s)
+    quarter = len(off) // 4
+    limit = metrics.WRONG_RAD / ARCSEC_RAD
+    return Outcome(
+        "solved" if solved else came[-1].status if came else "no frame after it settled",
+        len(came),
+        len(solved),
+        sum(one.wrong for one in came),
+        x,
+        y,
+        roll,
+        _mean([one.nees for one in solved]),
+        min((one.stars for one in came), default=math.nan),
+        _mean([one.detected for one in came]),
+        _mean([one.matched for one in came]),
+        _mean(off < limit) if len(off) else _mean(good),
+        _rms(off),
+        float(off.max(initial=-np.inf)) if len(off) else math.nan,
+        _rms(off[-quarter:]) - _rms(off[:quarter]) if quarter else math.nan,
+    )
+
+
+def filter_off_arcsec(lab: Testbed, settle_s: float) -> Floats:
+    """(K,) angle by which the filter is off at the ticks after it settled; none where there is no filter."""
+    log = lab.log
+    if log.lab_from_filter is None:
+        return np.empty(0)
+    off = (log.lab_from_filter * log.lab_from_body.inv()).magnitude() / ARCSEC_RAD
+    return np.asarray(off[log.t_s >= settle_s])
+
+
+def _rms(values: list[float] | NDArray[Any]) -> float:
+    return float(metrics.rms(np.asarray(values))) if len(values) else math.nan
+
+
+def _mean(values: list[Any] | NDArray[Any]) -> float:
+    return float(np.mean(values)) if len(values) else math.nan

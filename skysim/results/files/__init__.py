@@ -1,0 +1,1 @@
+"""Files of a run: frames, recordings, and exports for other tools."""

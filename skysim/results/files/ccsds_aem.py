@@ -1,0 +1,93 @@
+"""Attitudes as a CCSDS Attitude Ephemeris Message, version 2.0, in keyword = value notation (CCSDS 504.0-B-2)."""
+
+from __future__ import annotations
+
+import datetime
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from skysim.core.errors import InputError
+from skysim.core.types import Floats
+from skysim.core.units import in_utc
+
+MOST_CHARACTERS = 254  # of a line, 6.3 of the standard
+ORIGINATOR = "SKYSIM"  # which no registry knows; the standard leaves that to those who exchange files
+ICRF, LAB, CAMERA, BODY = "ICRF", "LAB", "STARTRACKER_1", "SC_BODY_1"
+MEANING = {
+    ICRF: "axes of the ICRS",
+    LAB: "the laboratory: origin in the bearing's centre, z up; known to this file's users only",
+    CAMERA: "the camera: +x right and +y down in the image, +z along the boresight",
+    BODY: "the vehicle's body as its MJCF has it",
+}
+
+
+def message(
+    name: str,
+    told: Sequence[str],
+    frames: tuple[str, str],
+    utc: Sequence[datetime.datetime],
+    a_from_b: Rotation,
+) -> str:
+    """The file's text: one segment of type QUATERNION.
+
+    frames   : (A, B), keys of MEANING
+    utc      : K epochs, ascending;  a_from_b : K rotations
+    told     : comments
+    The quaternion "from A to B" turns A's basis vectors into B's (annex F2): it is that of a_from_b, whose
+    matrix has B's axes in A's coordinates as columns, while coordinates go by X_B = a_from_b^-1 X_A. Scalar last.
+    Raises InputError where there is no epoch, or they do not ascend.
+    """
+    if not utc:
+        raise InputError(f"{name}: no attitude to write")
+    late = [n for n in range(1, len(utc)) if utc[n] <= utc[n - 1]]
+    if late:
+        raise InputError(f"{name}: epoch {epoch(utc[late[0]])} is not after {epoch(utc[late[0] - 1])}")
+    head = {
+        "CCSDS_AEM_VERS": "2.0",
+        "CREATION_DATE": epoch(datetime.datetime.now(datetime.UTC)),
+        "ORIGINATOR": ORIGINATOR,
+    }
+    meta = {
+        "OBJECT_NAME": name.upper(),
+        "OBJECT_ID": "UNKNOWN",
+        "REF_FRAME_A": frames[0],
+        "REF_FRAME_B": frames[1],
+        "TIME_SYSTEM": "UTC",
+        "START_TIME": epoch(utc[0]),
+        "STOP_TIME": epoch(utc[-1]),
+        "ATTITUDE_TYPE": "QUATERNION",
+    }
+    comments = [*told, *(f"{frame} = {MEANING[frame]}" for frame in frames)]
+    rows = zip(utc, unbroken(a_from_b.as_quat()), strict=True)
+    lines = [
+        *(f"{key} = {value}" for key, value in head.items()),
+        "META_START",
+        *(f"COMMENT {text}" for text in comments),
+        *(f"{key} = {value}" for key, value in meta.items()),
+        "META_STOP",
+        "DATA_START",
+        *(f"{epoch(when)} " + " ".join(f"{part:.15f}" for part in xyzw) for when, xyzw in rows),
+        "DATA_STOP",
+    ]
+    return "".join(f"{plain(line)}\n" for line in lines)
+
+
+def unbroken(xyzw: Floats) -> Floats:
+    """(K, 4) the same attitudes, no sign changing from one to the next; of the first the scalar is not negative."""
+    along = np.sign(np.sum(xyzw[1:] * xyzw[:-1], axis=1))
+    first = -1.0 if xyzw[0, 3] < 0 else 1.0
+    sign = first * np.concatenate([[1.0], np.cumprod(np.where(along < 0, -1.0, 1.0))])
+    return np.asarray(xyzw * sign[:, None] + 0.0)  # no minus zero
+
+
+def epoch(utc: datetime.datetime) -> str:
+    """Of 6.8.9 in the standard: 2012-06-22T21:00:00.120000."""
+    return in_utc(utc).isoformat(timespec="microseconds")
+
+
+def plain(line: str) -> str:
+    """The line in the characters and the length that the standard allows."""
+    printable = "".join(one if " " <= one <= "~" else "?" for one in line)
+    return printable[:MOST_CHARACTERS]

@@ -1,0 +1,308 @@
+"""A finished run in the formats of other tools: CCSDS AEM, ECSV, Parquet, TIFF, Zarr, video."""
+
+from __future__ import annotations
+
+import datetime
+import os
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from skysim.core import files, images
+from skysim.core.errors import InputError
+from skysim.core.images import silent_stderr
+from skysim.results import stretch
+from skysim.results.files import ccsds_aem
+from skysim.results.files import frames as frame_files
+from skysim.results.files.recording import Recording, Told
+
+EXTRA = "takes more packages; install them: pip install 'skysim[export]'"
+BATCH_ROWS = 1 << 16  # of Parquet that are kept before they are written
+SAMPLED_FRAMES = 9  # of a video that tell its black and white
+FOURCC = "mp4v"  # MPEG-4 part 2, which every wheel of OpenCV can write
+MORE_BYTES = 1 << 20
+
+Bar = Callable[[Iterable[Any], int, str], Iterator[Any]]  # items, how many, what is being done
+
+# What a column's name ends in -> its unit; the longest ending that fits counts.
+UNITS = {
+    **{
+        "_deg_s": "deg/s",
+        "_deg_h": "deg/h",
+        "_deg": "deg",
+        "_rad_s": "rad/s",
+        "_rad": "rad",
+        "_arcsec": "arcsec",
+    },
+    **{"_px": "px", "_ms": "ms", "_m_s": "m/s", "_s": "s", "_rpm": "rpm", "_nms": "N m s", "_nm": "N m"},
+    **{"_e": "electron", "electrons": "electron"},
+}
+
+
+def to_aem(run: Recording, out: Path, bar: Bar) -> list[Path]:
+    """truth.aem, and solutions.aem where frames were solved: the camera in the ICRF, or the body in the lab."""
+    stars = run.under_the_stars
+    frames = (ccsds_aem.ICRF, ccsds_aem.CAMERA) if stars else (ccsds_aem.LAB, ccsds_aem.BODY)
+    told = [(truth.frame, truth.mid_utc, attitude(truth, stars)) for truth in truths(run, bar)]
+    name, seed = str(run.meta["scene"]), run.meta["seed"]
+    when = {frame: utc for frame, utc, _ in told}
+
+    def write(what: str, says: str, utc: list[datetime.datetime], a_from_b: Rotation) -> Path:
+        comments = [f"{says} of skysim, scene {name}, seed {seed}; epochs are mid-exposure"]
+        path = out / f"{what}.aem"
+        files.write_text(path, ccsds_aem.message(name, comments, frames, utc, a_from_b))
+        return path
+
+    truth_is = Rotation.concatenate([one for _, _, one in told])
+    written = [write("truth", "True attitude", list(when.values()), truth_is)]
+    found = run.solved()
+    if found is not None:
+        strange = [frame for frame in found[0].tolist() if frame not in when]
+        if strange:
+            raise InputError(f"{run.folder / 'solutions.ecsv'}: frame {strange[0]} is none of this folder's")
+        utc = [when[frame] for frame in found[0].tolist()]
+        written.append(write("solutions", "Attitude found by the star tracker", utc, found[1]))
+    return written
+
+
+def attitude(truth: Told, stars: bool) -> Rotation:
+    """lab_from_cam under the stars, lab_from_body in a laboratory: what `Recording.solved` gives of the answers."""
+    if stars:
+        return Rotation.from_quat(truth.cam_from_lab_xyzw).inv()
+    return Rotation.from_quat(truth.lab_from_body_xyzw)
+
+
+def truths(run: Recording, bar: Bar) -> Iterator[Told]:
+    return bar(run.truths(), len(run.stems), "reading truths")
+
+
+def truth_table(run: Recording, bar: Bar) -> Any:
+    """The truth as an astropy table, one row a frame."""
+    from astropy.table import Table
+
+    rows = [truth_row(truth) for truth in truths(run, bar)]
+    return Table({name: [row[name] for row in rows] for name in rows[0]}, meta=run.meta)
+
+
+def truth_row(truth: Told) -> dict[str, Any]:
+    row: dict[str, Any] = {"frame": truth.frame, "mid_utc": truth.mid_utc.isoformat(timespec="microseconds")}
+    row |= {"t_mid_s": truth.t_mid_s, "exposure_s": truth.exposure_s}
+    for name in ("lab_from_body", "cam_from_lab"):
+        quaternion = getattr(truth, f"{name}_xyzw")
+        row |= {f"{name}_q{end}": float(part) for end, part in zip("xyzw", quaternion, strict=True)}
+    return row | {
+        f"rate_cam_{end}_rad_s": float(rate) for end, rate in zip("xyz", truth.rate_cam_rad_s, strict=True)
+    }
+
+
+def to_ecsv(run: Recording, out: Path, bar: Bar) -> list[Path]:
+    """truth.ecsv, one row a frame; solutions.ecsv is there already."""
+    files.write_table(out / "truth.ecsv", truth_table(run, bar))
+    return [out / "truth.ecsv"]
+
+
+def to_parquet(run: Recording, out: Path, bar: Bar) -> list[Path]:
+    """truth (a row a frame), sources (a row a light a frame), the run's own tables; units in the fields' metadata."""
+    try:
+        import pyarrow.parquet
+    except ImportError:
+        raise InputError(f"--to parquet: {EXTRA}") from None
+    tables = {"truth": truth_table(run, bar)}
+    tables |= {
+        name: found for name in ("solutions", "telemetry", "imu") if (found := run.table(name)) is not None
+    }
+    written = []
+    for name, found in tables.items():
+        path = out / f"{name}.parquet"
+        with files.whole(path) as temporary:
+            pyarrow.parquet.write_table(arrow(found, run), temporary)
+        written.append(path)
+    return [*written, sources_parquet(run, out / "sources.parquet", bar)]
+
+
+def sources_parquet(run: Recording, path: Path, bar: Bar) -> Path:
+    """Every light of every frame, as its truth has it; some frames at a time."""
+    import pyarrow
+    import pyarrow.parquet
+
+    with files.whole(path) as temporary:
+        writer, waiting = None, []
+        try:
+            for truth in truths(run, bar):
+                truth.sources.add_column(np.full(len(truth.sources), truth.frame), name="frame", index=0)
+                waiting.append(arrow(truth.sources, run))
+                writer = writer or pyarrow.parquet.ParquetWriter(temporary, waiting[0].schema)
+                if sum(len(one) for one in waiting) >= BATCH_ROWS:
+                    writer.write_table(pyarrow.concat_tables(waiting))
+                    waiting = []
+            assert writer is not None
+            if waiting:
+                writer.write_table(pyarrow.concat_tables(waiting))
+        finally:
+            if writer is not None:
+                writer.close()
+    return path
+
+
+def arrow(found: Any, run: Recording) -> Any:
+    """An astropy table as one of Arrow's; what is masked is null."""
+    import pyarrow
+
+    fields, columns = [], []
+    for name in found.colnames:
+        values = pyarrow.array(
+            found[name].tolist(),
+            type=pyarrow.from_numpy_dtype(found[name].dtype)
+            if found[name].dtype.kind in "biuf"
+            else pyarrow.string(),
+        )
+        unit = unit_of(name)
+        fields.append(pyarrow.field(name, values.type, metadata={"unit": unit} if unit else None))
+        columns.append(values)
+    told = {f"skysim.{key}": str(value) for key, value in run.meta.items()}
+    return pyarrow.table(columns, schema=pyarrow.schema(fields, metadata=told))
+
+
+def unit_of(name: str) -> str:
+    """Of a column, by what its name ends in; empty where it has none."""
+    ending = max((one for one in UNITS if name.endswith(one)), key=len, default="")
+    return UNITS.get(ending, "")
+
+
+def to_tiff(run: Recording, out: Path, bar: Bar) -> list[Path]:
+    """frame_NNNN.tif: the digital numbers as they are, 16 bits (64-bit floats of a noise-free camera)."""
+    written = []
+    for stem in bar(run.stems, len(run.stems), "TIFF"):
+        written.append(out / f"{stem.name}.tif")
+        files.write_image(written[-1], run.image(stem))
+    return written
+
+
+def to_zarr(run: Recording, out: Path, bar: Bar) -> list[Path]:
+    """frames.zarr (Zarr 3): frames in chunks of one, times, exposures, attitudes and rates beside them."""
+    try:
+        import zarr
+    except ImportError:
+        raise InputError(f"--to zarr: {EXTRA}") from None
+    path, count = out / frame_files.ZARR, len(run.stems)
+    told = [replace(truth, sources=None) for truth in truths(run, bar)]
+    first = run.image(run.stems[0])
+    with files.whole_folder(path) as temporary:
+        group = zarr.create_group(temporary, zarr_format=3, attributes=run.meta | {"made_by": "skysim"})
+        frames = group.create_array(
+            "frames",
+            shape=(count, *first.shape),
+            chunks=(1, *first.shape),
+            dtype=first.dtype,
+            dimension_names=("frame", "y", "x"),
+            attributes={"units": "DN"},
+        )
+        for n, stem in enumerate(bar(run.stems, count, "Zarr")):
+            frames[n] = like(run.image(stem), first, stem)
+        for name, values, axis, unit in beside(told):
+            dimensions = ("frame", axis) if axis else ("frame",)
+            group.create_array(
+                name, data=values, dimension_names=dimensions, attributes={"units": unit} if unit else {}
+            )
+    return [path]
+
+
+def beside(told: list[Told]) -> Iterator[tuple[str, Any, str, str]]:
+    """What stands beside the frames of a sequence: name, array, name of its second axis, unit."""
+    utc = [one.mid_utc.isoformat(timespec="microseconds") for one in told]
+    yield "frame", np.array([one.frame for one in told]), "", ""
+    yield (
+        "mid_utc",
+        np.array(utc, dtype="datetime64[us]").astype(np.int64),
+        "",
+        "microseconds since 1970-01-01",
+    )
+    for name, axis in (
+        *(("t_mid_s", ""), ("exposure_s", ""), ("rate_cam_rad_s", "xyz")),
+        *(("lab_from_body_xyzw", "xyzw"), ("cam_from_lab_xyzw", "xyzw")),
+    ):
+        yield name, np.array([getattr(one, name) for one in told]), axis, unit_of(name)
+
+
+def like(image: Any, first: Any, stem: Path) -> Any:
+    """The image, if it is of the first one's size and type."""
+    if image.shape != first.shape or image.dtype != first.dtype:
+        raise InputError(
+            f"{stem}.fits: {image.shape[1]}x{image.shape[0]} {image.dtype}; the first frame is"
+            f" {first.shape[1]}x{first.shape[0]} {first.dtype}"
+        )
+    return image
+
+
+def to_video(run: Recording, out: Path, bar: Bar) -> list[Path]:
+    """frames.mp4: for the eye, 8 bits, square root, one black and white for all frames, at the scene's pace.
+
+    A side of an odd number of pixels is one pixel shorter.
+    """
+    path, first = out / "frames.mp4", run.image(run.stems[0])
+    seconds = [truth.t_mid_s for truth in truths(run, bar)]
+    pace_hz = 1 / float(np.median(np.diff(seconds))) if len(seconds) > 1 else 1.0
+    some = run.stems[:: max(len(run.stems) // SAMPLED_FRAMES, 1)]
+    low, high = np.median([stretch.span(run.image(stem)) for stem in some], axis=0)
+    height, width = (side // 2 * 2 for side in first.shape)  # the codec halves the colours' rows and columns
+    with files.whole(path) as temporary:
+        film = cv2.VideoWriter(
+            str(temporary), cv2.VideoWriter.fourcc(*FOURCC), pace_hz, (width, height), False
+        )
+        try:
+            if not film.isOpened():
+                more_room(temporary)
+                raise InputError(
+                    f"{path}: this OpenCV cannot write {FOURCC} video of {width}x{height} at {pace_hz:g} Hz"
+                )
+            for stem in bar(run.stems, len(run.stems), "video"):
+                image = like(run.image(stem), first, stem)
+                grey = stretch.stretched(image, "square root", between=(float(low), float(high)))
+                with silent_stderr():
+                    film.write(np.ascontiguousarray(grey[:height, :width]))
+        finally:
+            film.release()
+        there, count = frames_of(temporary), len(run.stems)
+        if there != count:  # OpenCV does not tell of what it could not write
+            more_room(temporary)
+            raise InputError(f"{path}: OpenCV wrote {there} of {count} frames and does not tell why")
+    return [path]
+
+
+def frames_of(film: Path) -> int:
+    """How many frames can be read of a video file."""
+    with silent_stderr(), closing(images.LiveCamera(str(film))) as reader:
+        return sum(1 for _ in iter(reader.capture.grab, False))
+
+
+def more_room(path: Path) -> None:
+    """Make a file longer by more than a film's index takes: raises the OSError of who did not tell of one."""
+    with path.open("ab") as file:
+        file.write(bytes(MORE_BYTES))
+        os.fsync(file.fileno())
+
+
+EXPORTS: dict[str, Callable[[Recording, Path, Bar], list[Path]]] = {
+    "aem": to_aem,
+    "ecsv": to_ecsv,
+    "parquet": to_parquet,
+    "tiff": to_tiff,
+    "zarr": to_zarr,
+    "video": to_video,
+}
+
+
+def export(run: Recording, formats: Iterable[str], out: Path, bar: Bar) -> list[Path]:
+    """Write a run in each of the formats. Raises InputError for one that is none, before anything is written."""
+    wanted = list(dict.fromkeys(formats))
+    for name in wanted:
+        if name not in EXPORTS:
+            raise InputError(f"--to: {name!r} is none of {', '.join(EXPORTS)}")
+    files.make_folder(out)
+    return [path for name in wanted for path in EXPORTS[name](run, out, bar)]

@@ -1,0 +1,120 @@
+"""Files in and out: frames, truth, solutions. Nothing is ever half-written."""
+
+from __future__ import annotations
+
+import datetime
+import shutil
+from pathlib import Path
+
+from skysim.camera import wcs
+from skysim.core.files import whole, write_png16, write_table
+from skysim.core.types import Frame, Truth
+from skysim.scene.light import StarsConfig
+from skysim.scene.scene import Scene
+
+RESULTS = (
+    *("solutions.ecsv", "telemetry.ecsv", "imu.ecsv"),
+    *("annotated.png", "lab.png", "lab.gif", "report.html", "scoreboard.ecsv"),
+)
+
+EXPORTED = (
+    *("truth.aem", "solutions.aem", "truth.ecsv"),
+    *(f"{name}.parquet" for name in ("truth", "sources", "solutions", "telemetry", "imu")),
+    "frames.mp4",
+)
+
+ZARR = "frames.zarr"
+
+
+def clear(folder: Path) -> None:
+    """Remove what an earlier run left: its frames, what was said of them and what `skysim export` made of it."""
+    for suffix in ("fits", "png", "ecsv", "tif"):
+        for path in folder.glob(f"frame_[0-9][0-9][0-9][0-9]*.{suffix}"):
+            path.unlink()
+    for path in folder.glob("solutions.*.ecsv"):
+        path.unlink()
+    for name in RESULTS + EXPORTED:
+        (folder / name).unlink(missing_ok=True)
+    shutil.rmtree(folder / ZARR, ignore_errors=True)
+
+
+def unlike(paths: list[Path]) -> list[Path]:
+    """The paths, numbered where one would overwrite another."""
+    seen: dict[Path, int] = {}
+    named = []
+    for path in paths:
+        seen[path] = seen.get(path, 0) + 1
+        again = seen[path] > 1
+        named.append(path.with_name(f"{path.stem}-{seen[path]}{path.suffix}") if again else path)
+    return named
+
+
+def write_frame(folder: Path, frame: Frame, truth: Truth, scene: Scene) -> None:
+    """frame_NNNN.fits (16 bits, header with WCS under the stars), .png (16 bits) and the truth as .ecsv."""
+    stem = folder / f"frame_{frame.index:04d}"
+    write_truth(stem.with_suffix(".ecsv"), frame, truth, scene)
+    write_png16(stem.with_suffix(".png"), frame.image_dn)
+    write_fits(stem.with_suffix(".fits"), frame, truth, scene)  # last: where it is, the others are
+
+
+def write_fits(path: Path, frame: Frame, truth: Truth, scene: Scene) -> None:
+    """FITS: uint16 (or float64 of a noise-free frame) with exposure, time, scene, seed."""
+    from astropy.io import fits
+
+    header = fits.Header()
+    header["EXPTIME"] = (frame.exposure_s, "exposure [s]")
+    header["DATE-OBS"] = (mid_time(scene, frame).isoformat(timespec="microseconds"), "mid-exposure [UTC]")
+    header["TMID"] = (frame.t_mid_s, "mid-exposure since the scene's start [s]")
+    header["SCENE"] = (scene.name, "scene")
+    header["SEED"] = (scene.seed, "seed of every random stream")
+    header["FRAME"] = (frame.index, "index of the frame")
+    header["SATURATE"] = (frame.saturation_dn, "saturation [DN]")
+    if isinstance(scene.light, StarsConfig):
+        header.update(wcs.header(scene.camera, truth.cam_from_lab))
+        header["COMMENT"] = "WCS: of the true attitude at mid-exposure; apparent directions in ICRS axes"
+    else:
+        header["COMMENT"] = "no WCS: the lights are in the laboratory"
+    with whole(path) as temporary:
+        fits.PrimaryHDU(frame.image_dn, header).writeto(temporary, overwrite=True)
+
+
+def mid_time(scene: Scene, frame: Frame) -> datetime.datetime:
+    return scene.start_time + datetime.timedelta(seconds=frame.t_mid_s)
+
+
+def write_truth(path: Path, frame: Frame, truth: Truth, scene: Scene) -> None:
+    """The truth beside the frame: attitude and rates in the header, one row a source."""
+    from astropy.table import Table
+
+    seen = truth.seen
+    table = Table(
+        {
+            "id": seen.id,
+            "x_px": seen.xy_px[:, 0],
+            "y_px": seen.xy_px[:, 1],
+            "flux_x_px": seen.flux_xy_px[:, 0],
+            "flux_y_px": seen.flux_xy_px[:, 1],
+            "electrons": seen.electrons,
+            "peak_e": seen.peak_e,
+            "streak_px": seen.streak_px,
+            "area_px": seen.area_px,
+            "snr": seen.snr,
+            "saturated": seen.saturated,
+        }
+    )
+    for name in table.colnames[1:-1]:
+        table[name].info.format = ".9g"
+    table.meta = {
+        "scene": scene.name,
+        "seed": scene.seed,
+        "frame": frame.index,
+        "t_mid_s": frame.t_mid_s,
+        "mid_utc": mid_time(scene, frame).isoformat(timespec="microseconds"),
+        "exposure_s": frame.exposure_s,
+        "lab_from_body_xyzw": truth.lab_from_body.as_quat().tolist(),
+        "cam_from_lab_xyzw": truth.cam_from_lab.as_quat().tolist(),
+        "rate_cam_rad_s": truth.rate_cam_rad_s.tolist(),
+        "hidden": truth.hidden.tolist(),
+        "lab": "ICRS axes" if isinstance(scene.light, StarsConfig) else "bearing centre, z up",
+    }
+    write_table(path, table)

@@ -1,0 +1,157 @@
+"""What `skysim run` and `skysim render` left in a folder, read frame by frame."""
+
+from __future__ import annotations
+
+import datetime
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from skysim.core import files, images
+from skysim.core.errors import InputError
+from skysim.core.types import Floats
+from skysim.sources import stars
+
+STARS = "ICRS axes"  # what the header of a truth calls the lab's axes under the stars
+UNIT_NORM = 1e-6
+SKY_ANGLES, LAB_ANGLES = ("ra_deg", "dec_deg", "roll_deg"), ("roll_deg", "pitch_deg", "yaw_deg")
+
+
+@dataclass(frozen=True, slots=True)
+class Told:
+    """The truth of one frame, as its file has it: attitudes (4,) as xyzw, rate (3,); sources the table itself."""
+
+    frame: int
+    mid_utc: datetime.datetime
+    t_mid_s: float
+    exposure_s: float
+    lab_from_body_xyzw: Floats
+    cam_from_lab_xyzw: Floats
+    rate_cam_rad_s: Floats
+    sources: Any
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A finished run: the folder, and its frames' files without their suffix, in the frames' order."""
+
+    folder: Path
+    stems: list[Path] = field(repr=False)
+
+    @cached_property
+    def meta(self) -> dict[str, Any]:
+        """Scene, seed and what the lab's axes are, as the first frame has it."""
+        told = table(self.stems[0].with_suffix(".ecsv")).meta
+        missing = [key for key in ("scene", "seed", "lab") if key not in told]
+        if missing:
+            raise InputError(
+                f"{self.stems[0]}.ecsv: no {missing[0]} in the header; allowed: a truth of skysim run"
+            )
+        return {key: told[key] for key in ("scene", "seed", "lab")}
+
+    @property
+    def under_the_stars(self) -> bool:
+        """Whether the lab's axes are those of the ICRS."""
+        return bool(self.meta["lab"] == STARS)
+
+    def truths(self) -> Iterator[Told]:
+        """The truth of every frame."""
+        return (truth(stem.with_suffix(".ecsv")) for stem in self.stems)
+
+    def image(self, stem: Path) -> NDArray[Any]:
+        """A frame as it is: (H, W) of uint16, or of float64 from a noise-free camera."""
+        image = images.read_fits(stem.with_suffix(".fits"))
+        if image.ndim != 2 or not image.size:
+            raise InputError(f"{stem}.fits: an image of shape {image.shape}; allowed: (height, width)")
+        return image
+
+    def table(self, name: str) -> Any:
+        """solutions, telemetry or imu as an astropy table; None where the run left none."""
+        path = self.folder / f"{name}.ecsv"
+        return table(path) if path.is_file() else None
+
+    def solved(self) -> tuple[NDArray[np.int64], Rotation] | None:
+        """(K,) indices of the frames that were solved, and the attitudes found: lab_from_cam under the stars,
+        lab_from_body in a laboratory. None where nothing was, or nothing solved."""
+        found = self.table("solutions")
+        if found is None:
+            return None
+        names = SKY_ANGLES if self.under_the_stars else LAB_ANGLES
+        missing = [name for name in ("frame", *names) if name not in found.colnames]
+        if missing:
+            raise InputError(
+                f"{self.folder / 'solutions.ecsv'}: no column {missing[0]}; allowed: that of skysim run"
+            )
+        angles = np.column_stack([np.ma.filled(found[name].astype(float), np.nan) for name in names])
+        good = np.isfinite(angles).all(axis=1)
+        if not good.any():
+            return None
+        return np.asarray(found["frame"], np.int64)[good], attitudes(angles[good], self.under_the_stars)
+
+
+def attitudes(angles_deg: Floats, under_the_stars: bool) -> Rotation:
+    """Of (K, 3) angles as `score.angles_deg` gives them: lab_from_cam of RA, Dec, roll; lab_from_body of the 3-2-1
+    sequence's roll, pitch, yaw."""
+    if under_the_stars:
+        return Rotation.concatenate([stars.cam_from_icrs(*row).inv() for row in angles_deg])
+    return Rotation.from_euler("ZYX", angles_deg[:, ::-1], degrees=True)
+
+
+def recording(folder: Path) -> Recording:
+    """The run in a folder. Raises InputError where there is none."""
+    found = {}
+    for path in folder.glob("frame_*.fits"):
+        number = re.fullmatch(r"frame_(\d{4,})", path.stem)
+        if number and path.with_suffix(".ecsv").is_file():
+            found[int(number[1])] = path.with_suffix("")
+    if not found:
+        raise InputError(
+            f"{folder}: no frames with their truth; allowed: a folder of skysim run or skysim render"
+        )
+    return Recording(folder, [found[index] for index in sorted(found)])
+
+
+def table(path: Path) -> Any:
+    """An ECSV file as an astropy table. Raises InputError with one line for a file that is none."""
+    from astropy.table import Table
+
+    try:
+        return Table.read(path, format="ascii.ecsv")
+    except Exception as error:  # of a file that is no ECSV astropy says whatever its parsers stumble over
+        raise InputError(f"{path}: no ECSV table: {' '.join(str(error).split())[:120]}") from None
+
+
+def truth(path: Path) -> Told:
+    """A frame's truth. Raises InputError with one line for a file that is none, or is of an older skysim."""
+    found = table(path)
+    numbers = {
+        key: np.array(files.header_numbers(path, found.meta, key, count))
+        for key, count in {
+            **{"frame": 1, "t_mid_s": 1, "exposure_s": 1},
+            **{"lab_from_body_xyzw": 4, "cam_from_lab_xyzw": 4, "rate_cam_rad_s": 3},
+        }.items()
+    }
+    for key in ("lab_from_body_xyzw", "cam_from_lab_xyzw"):
+        if abs(np.linalg.norm(numbers[key]) - 1) > UNIT_NORM:
+            raise InputError(f"{path}: {key} in the header is {found.meta[key]}; allowed: a unit quaternion")
+    try:
+        utc = datetime.datetime.fromisoformat(str(found.meta.get("mid_utc")))
+    except ValueError:
+        raise InputError(
+            f"{path}: mid_utc in the header is {found.meta.get('mid_utc')!r}; allowed: a time; run the scene again"
+        ) from None
+    return Told(
+        frame=int(numbers.pop("frame")[0]),
+        mid_utc=utc,
+        t_mid_s=float(numbers.pop("t_mid_s")[0]),
+        exposure_s=float(numbers.pop("exposure_s")[0]),
+        sources=found,
+        **numbers,
+    )

@@ -1,0 +1,229 @@
+"""A whole run from Python: simulate a scene, render and solve its frames, score them, save them.
+
+`simulate` does what `skysim run` does and `render` what `skysim render` does; both commands are built on this module.
+"""
+
+from __future__ import annotations
+
+import base64
+import html
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, overload
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from estimator.core.types import Attitude
+from skysim.core.errors import InputError
+from skysim.core.files import make_folder, write_image, write_table
+from skysim.core.types import Frame, Row, Telemetry, Truth
+from skysim.core.units import ARCSEC_RAD
+from skysim.results import report, scoring, telemetry_report
+from skysim.results.files.frames import clear, write_frame
+from skysim.scene.scene import Scene
+from skysim.simulation import run as simulation
+from skysim.simulation.testbed import Testbed, build_testbed, tracker
+from skysim.tracking.factory import NO_PROGRAMS
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from astropy.table import Table
+
+Progress = Callable[[float, float], None]
+
+
+@dataclass(frozen=True, slots=True)
+class ScoredFrame:
+    """One frame with its truth, the tracker's solution and the error of it.
+
+    result : frame, truth, the tracker's report, and seconds by step
+    row    : the same as numbers: angles in degrees, errors and their claimed deviations in arcseconds
+    """
+
+    result: simulation.FrameResult
+    row: Row
+
+    @property
+    def image(self) -> NDArray[Any]:
+        """(H, W) digital numbers: uint16, or float64 of a noise-free detector."""
+        return self.result.frame.image_dn
+
+    @property
+    def truth(self) -> Truth:
+        """Attitude, rates and sources as they were at mid-exposure."""
+        return self.result.truth
+
+    @property
+    def attitude(self) -> Attitude:
+        """The tracker's solution; without an attitude its `status` says why."""
+        return self.result.report.attitude
+
+    @property
+    def error_arcsec(self) -> float:
+        """Rotation angle between the solution and the truth, arcseconds; NaN without a solution."""
+        estimate = self.attitude.cam_from_ref
+        if estimate is None:
+            return float("nan")
+        return float((estimate * self.truth.cam_from_lab.inv()).magnitude() / ARCSEC_RAD)
+
+    def annotated(self) -> NDArray[np.uint8]:
+        """(H, W, 3) the frame in BGR, stretched: truth in blue, detections in red, identified sources in green."""
+        return scoring.annotated(self.result)
+
+    def _repr_html_(self) -> str:
+        facts = f"frame {self.row.frame}: {self.row.status}, error {self.error_arcsec:.3g}″, "
+        facts += f"{self.row.matched} of {self.row.detected} detections identified"
+        return f"{_picture(self.annotated())}<p>{html.escape(facts)}</p>"
+
+
+@dataclass(frozen=True, slots=True)
+class Run(Sequence[ScoredFrame]):
+    """The result of `simulate`: a sequence of scored frames.
+
+    testbed : the scene set up, its trajectory simulated
+    frames  : one entry a frame, in order
+    """
+
+    testbed: Testbed
+    frames: tuple[ScoredFrame, ...] = field(repr=False)
+
+    @property
+    def scene(self) -> Scene:
+        """The scene that was run."""
+        return self.testbed.scene
+
+    @property
+    def telemetry(self) -> Telemetry:
+        """What the vehicle did and what its computer measured and commanded, sampled at the control rate."""
+        return self.testbed.log
+
+    @property
+    def rows(self) -> list[Row]:
+        """One row of numbers a frame."""
+        return [frame.row for frame in self.frames]
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    @overload
+    def __getitem__(self, index: int) -> ScoredFrame: ...
+    @overload
+    def __getitem__(self, index: slice) -> Sequence[ScoredFrame]: ...
+    def __getitem__(self, index: int | slice) -> ScoredFrame | Sequence[ScoredFrame]:
+        return self.frames[index]
+
+    def table(self) -> Table:
+        """One row a frame, as in `solutions.ecsv`: angles in degrees, errors in arcseconds."""
+        return scoring.table(self.rows, scoring.angle_names(self.scene))
+
+    def to_pandas(self) -> pd.DataFrame:
+        """`table` as a data frame; needs pandas."""
+        return self.table().to_pandas()
+
+    def save(self, folder: str | Path) -> Path:
+        """Write what `skysim run` writes: frames with their truth, tables and report.html. Returns the folder."""
+        recorder = Recorder(Path(folder), self.testbed)
+        for frame in self.frames:
+            recorder.add(frame)
+        recorder.finish(f"skysim.simulate(skysim.load_scene({self.scene.name!r}))")
+        return recorder.folder
+
+    def _repr_html_(self) -> str:
+        title = f"{self.scene.title} ({len(self)} frames)"
+        return f"<h4>{html.escape(title)}</h4>{_picture(self.frames[-1].annotated())}{self.table()._repr_html_()}"
+
+
+@dataclass(slots=True)
+class Recorder:
+    """Writes a run into a folder, frame by frame, so that a long run need not stay in memory.
+
+    What an earlier run left in the folder is removed first.
+    """
+
+    folder: Path
+    testbed: Testbed
+    rows: list[Row] = field(default_factory=list)
+    tally: scoring.Tally = field(default_factory=scoring.Tally)
+
+    def __post_init__(self) -> None:
+        make_folder(self.folder)
+        clear(self.folder)
+
+    def add(self, frame: ScoredFrame) -> None:
+        """Write one frame with its truth."""
+        write_frame(self.folder, frame.result.frame, frame.truth, self.testbed.scene)
+        self.rows.append(frame.row)
+        self.tally.add(frame.result)
+
+    def finish(self, command: str, pictures: Sequence[Path] = ()) -> dict[str, Any]:
+        """Write tables, annotated picture and report. Returns the figures that `skysim run --json` prints."""
+        scene, log = self.testbed.scene, self.testbed.log
+        names = scoring.angle_names(scene)
+        write_table(self.folder / "solutions.ecsv", scoring.table(self.rows, names))
+        write_table(self.folder / "telemetry.ecsv", telemetry_report.table(log))
+        if self.testbed.record:
+            write_table(self.folder / "imu.ecsv", telemetry_report.imu_table(self.testbed.record))
+        annotated, page = self.tally.picture(), self.folder / "report.html"
+        write_image(self.folder / "annotated.png", annotated)
+        images = report.Images(annotated, telemetry_report.figure(log), list(pictures))
+        report.write_page(page, scene.title, command, names, self.rows, self.tally.median_ms(), images)
+        figures = report.summary(self.rows) | {"stages_ms": self.tally.median_ms(), "report": str(page)}
+        figures |= {"flight": telemetry_report.summary(log), "pictures": [str(path) for path in pictures]}
+        return figures | {"exposures_ms": [1e3 * row.exposure_s for row in self.rows]}
+
+
+def score_frames(testbed: Testbed) -> Iterator[ScoredFrame]:
+    """Render, solve and score the frames of a test bed whose motion is simulated, one after another."""
+    for result in simulation.run(testbed, tracker(testbed)):
+        verdict = testbed.verdicts.get(result.frame.index, "")
+        yield ScoredFrame(result, scoring.row(result, testbed.scene, testbed.mount, verdict))
+
+
+def simulate(
+    scene: Scene, *, programs: Mapping[str, str] = NO_PROGRAMS, progress: Progress | None = None
+) -> Run:
+    """Simulate a scene's motion, render every frame, solve it and score the solution against the truth.
+
+    programs : commands of external trackers by name, one of which the scene's `tracker.name` may be
+    progress : called as progress(t_s, duration_s) while the motion is simulated
+
+    All frames are kept in memory; `skysim run` writes them one by one instead. Raises InputError.
+    """
+    testbed = simulation.simulate_motion(build_testbed(scene, programs), progress)
+    return Run(testbed, tuple(_kept(frame) for frame in score_frames(testbed)))
+
+
+def render(scene: Scene, index: int = 0) -> tuple[Frame, Truth]:
+    """One frame of a scene with its truth, bit for bit that of the whole run; the frames before it are not rendered.
+
+    Only the motion up to that frame is simulated. With a `filter` section or exposure control a frame depends on the
+    frames before it, and these are rendered too. Raises InputError for an index outside of the scene's frames.
+    """
+    frames = scene.exposure.frames
+    if not 0 <= index < frames:
+        raise InputError(f"index: {index} is outside of the scene's frames; allowed: 0 to {frames - 1}")
+    testbed = simulation.prepare(scene)
+    if scene.tracker.exposure_control is None and index not in testbed.exposures_s:
+        return simulation.render_frame(testbed, index)
+    return next(
+        (frame, truth) for frame, truth, _ in simulation.render_frames(testbed) if frame.index == index
+    )
+
+
+def _kept(frame: ScoredFrame) -> ScoredFrame:
+    """The frame with an image of its own, in case the next frame is rendered into the same memory."""
+    image = frame.result.frame
+    owned = replace(image, image_dn=np.array(image.image_dn))
+    return replace(frame, result=replace(frame.result, frame=owned))
+
+
+def _picture(image: NDArray[np.uint8]) -> str:
+    """An <img> of a picture, at most 800 pixels wide."""
+    height, width = image.shape[:2]
+    if width > 800:
+        image = cv2.resize(image, (800, round(height * 800 / width)), interpolation=cv2.INTER_AREA)
+    data = base64.b64encode(cv2.imencode(".png", image)[1].tobytes()).decode()
+    return f'<img src="data:image/png;base64,{data}">'

@@ -1,0 +1,129 @@
+"""A shot becomes a row: the tracker's answer beside the truth."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from estimator.attitude.solvers import radecroll_rad
+from skysim.core.types import Mount, Row
+from skysim.core.units import ARCSEC_RAD
+from skysim.results import metrics
+from skysim.results.report import annotate
+from skysim.scene.light import StarsConfig
+from skysim.scene.scene import Scene
+from skysim.simulation.run import FrameResult
+
+
+def angle_names(scene: Scene) -> tuple[str, str, str]:
+    """What the three angles of a row are called."""
+    return ("RA", "Dec", "roll") if isinstance(scene.light, StarsConfig) else ("roll", "pitch", "yaw")
+
+
+def angles_deg(cam_from_lab: Rotation, scene: Scene, mount: Mount) -> tuple[float, float, float]:
+    """The camera's RA, Dec, roll under the stars; the vehicle's 3-2-1 roll, pitch, yaw under the dome."""
+    if isinstance(scene.light, StarsConfig):
+        ra, dec, roll = np.degrees(radecroll_rad(cam_from_lab))
+        return float(ra), float(dec), float(roll)
+    lab_from_body = cam_from_lab.inv() * mount.cam_from_body
+    yaw, pitch, roll = lab_from_body.as_euler("ZYX", degrees=True)
+    return float(roll), float(pitch), float(yaw)
+
+
+def row(shot: FrameResult, scene: Scene, mount: Mount, verdict: str = "") -> Row:
+    """One frame of a run as people read it; verdict is what the attitude filter made of it."""
+    truth, answer = shot.truth, shot.report.attitude
+    cross = roll = cross_sigma = roll_sigma = chance = float("nan")
+    estimate, wrong = None, False
+    if answer.cam_from_ref is not None:
+        cross, roll = metrics.cross_and_roll_rad(answer.cam_from_ref, truth.cam_from_lab)
+        estimate = angles_deg(answer.cam_from_ref, scene, mount)
+        wrong = metrics.is_wrong(answer.cam_from_ref, truth.cam_from_lab)
+        variance = (
+            np.diag(answer.covariance_rad2) if answer.covariance_rad2 is not None else np.full(3, np.nan)
+        )
+        cross_sigma, roll_sigma = float(np.sqrt(variance[:2].sum())), float(np.sqrt(variance[2]))
+        chance = answer.match.log10_chance if answer.match else chance
+    return Row(
+        frame=shot.frame.index,
+        t_s=truth.t_s,
+        rate_deg_s=float(np.degrees(np.linalg.norm(truth.rate_cam_rad_s))),
+        status=answer.status,
+        truth_deg=angles_deg(truth.cam_from_lab, scene, mount),
+        estimate_deg=estimate,
+        cross_arcsec=cross / ARCSEC_RAD,
+        roll_arcsec=roll / ARCSEC_RAD,
+        cross_sigma_arcsec=cross_sigma / ARCSEC_RAD,
+        roll_sigma_arcsec=roll_sigma / ARCSEC_RAD,
+        log10_chance=chance,
+        detected=len(shot.report.centroids),
+        matched=len(answer.match.observed) if answer.match else 0,
+        rms_px=answer.rms_px,
+        time_ms=1e3 * sum(shot.report.seconds.values()),
+        wrong=wrong,
+        filter=verdict,
+        exposure_s=shot.frame.exposure_s,
+    )
+
+
+def table(rows: list[Row], names: tuple[str, str, str]) -> Any:
+    """The rows as an astropy table, one column a figure."""
+    from astropy.table import Table
+
+    nothing = (float("nan"),) * 3
+    columns: dict[str, Any] = {
+        name: [getattr(row, name) for row in rows] for name in ("frame", "t_s", "rate_deg_s", "status")
+    }
+    for n, name in enumerate(names):
+        columns[f"true_{name.lower()}_deg"] = [row.truth_deg[n] for row in rows]
+        columns[f"{name.lower()}_deg"] = [(row.estimate_deg or nothing)[n] for row in rows]
+    for name in (
+        "cross_arcsec",
+        "roll_arcsec",
+        "cross_sigma_arcsec",
+        "roll_sigma_arcsec",
+        "log10_chance",
+        "detected",
+        "matched",
+        "rms_px",
+        "time_ms",
+        "exposure_s",
+        "wrong",
+        "filter",
+    ):
+        columns[name] = [getattr(row, name) for row in rows]
+    return Table(columns)
+
+
+class Tally:
+    """What a run gathers beside its rows: seconds by stage, and the last solved shot for the picture."""
+
+    def __init__(self) -> None:
+        self._seconds: dict[str, list[float]] = {}
+        self._last: FrameResult | None = None
+
+    def add(self, shot: FrameResult) -> None:
+        """Take note of a shot."""
+        for stage, spent in (shot.seconds | shot.report.seconds).items():
+            self._seconds.setdefault(stage, []).append(spent)
+        if self._last is None or shot.report.attitude.solved:
+            self._last = shot
+
+    def median_ms(self) -> dict[str, float]:
+        """Median milliseconds a frame, by stage."""
+        return {stage: 1e3 * float(np.median(spent)) for stage, spent in self._seconds.items()}
+
+    def picture(self) -> NDArray[np.uint8]:
+        """The last solved frame, annotated."""
+        assert self._last is not None
+        return annotated(self._last)
+
+
+def annotated(result: FrameResult) -> NDArray[np.uint8]:
+    """The stretched frame with the true sources, the detections and the identified ones marked."""
+    seen, match = result.report.centroids.xy_px, result.report.attitude.match
+    matched = seen[match.observed] if match else np.empty((0, 2))
+    return annotate(result.frame.image_dn, seen, matched, truth_px=result.truth.seen.xy_px)

@@ -1,0 +1,216 @@
+"""A flight as people read it: figures, a table and a plot of what the vehicle did and believed."""
+
+from __future__ import annotations
+
+import io as std_io
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from skysim.core.types import Floats, Telemetry
+from skysim.core.units import RPM_RAD_S
+from skysim.dynamics.imu import Increments, tilt_rad
+
+AXES = ("x", "y", "z")
+EULER = ("roll", "pitch", "yaw")
+ARCSEC_DEG = 1 / 3600
+
+
+def euler_deg(lab_from_body: Rotation) -> Floats:
+    """(K, 3) roll, pitch, yaw of the 3-2-1 sequence."""
+    return np.asarray(lab_from_body.as_euler("ZYX", degrees=True)[:, ::-1])
+
+
+def off_deg(believed: Rotation | None, truth: Rotation) -> Floats | None:
+    """(K,) angle between what is believed, or asked for, and the truth."""
+    return None if believed is None else np.degrees((believed.inv() * truth).magnitude())
+
+
+def per_hour(rate_rad_s: Floats) -> Floats:
+    """deg/h"""
+    return np.degrees(rate_rad_s) * 3600
+
+
+def summary(log: Telemetry) -> dict[str, float]:
+    """The figures of a flight, those that it has."""
+    told, imu = off_deg(log.lab_from_ref, log.lab_from_body), off_deg(log.lab_from_imu, log.lab_from_body)
+    by_filter = off_deg(log.lab_from_filter, log.lab_from_body)
+    figures: dict[str, float] = {}
+    if told is not None:
+        figures |= {"pointing_deg_worst": told.max(), "pointing_deg_end": told[-1]}
+        figures["torque_nm_worst"] = np.abs(log.torque_nm).max()
+    if log.wheel_rad_s.size or log.gimbal_rad.size:
+        figures["momentum_nms_worst"] = np.linalg.norm(log.momentum_nms, axis=1).max()
+    if log.wheel_rad_s.size:
+        figures["wheel_rpm_worst"] = np.abs(log.wheel_rad_s).max() / RPM_RAD_S
+    if log.manipulability is not None:
+        figures["manipulability_least"] = log.manipulability.min()
+    if imu is not None and log.saturated is not None:
+        figures |= {"imu_deg_worst": imu.max(), "imu_deg_end": imu[-1]}
+        figures["gyro_saturated_s"] = log.saturated.sum() * log.period_s
+    if by_filter is not None and log.believed_bias_rad_s is not None and log.bias_rad_s is not None:
+        wrong = per_hour(log.believed_bias_rad_s - log.bias_rad_s)[-1]
+        figures |= {"filter_deg_worst": by_filter.max(), "filter_arcsec_end": by_filter[-1] / ARCSEC_DEG}
+        figures["filter_bias_deg_h_end"] = float(np.linalg.norm(wrong))
+    return {name: float(value) for name, value in figures.items()}
+
+
+def table(log: Telemetry) -> Any:
+    """One row a tick, as an astropy table; angles in degrees."""
+    from astropy.table import Table
+
+    columns: dict[str, Any] = {"t_s": log.t_s}
+
+    def add(name: str, values: Floats, ends: tuple[str, ...], unit: str) -> None:
+        columns.update({f"{name}_{end}_{unit}": values[:, n] for n, end in enumerate(ends)})
+
+    for name, attitude in (
+        ("true", log.lab_from_body),
+        ("told", log.lab_from_ref),
+        ("imu", log.lab_from_imu),
+        ("filter", log.lab_from_filter),
+    ):
+        if attitude is not None:
+            add(name, euler_deg(attitude), EULER, "deg")
+    add("rate", np.degrees(log.rate_body_rad_s), AXES, "deg_s")
+    add("torque", log.torque_nm, AXES, "nm")
+    add("disturbance", log.disturbance_nm, AXES, "nm")
+    add("momentum", log.momentum_nms, AXES, "nms")
+    numbers = tuple(str(n + 1) for n in range(max(log.wheel_rad_s.shape[1], log.gimbal_rad.shape[1])))
+    add("wheel", log.wheel_rad_s / RPM_RAD_S, numbers[: log.wheel_rad_s.shape[1]], "rpm")
+    add("gimbal", np.degrees(log.gimbal_rad), numbers[: log.gimbal_rad.shape[1]], "deg")
+    if log.manipulability is not None:
+        columns["manipulability"] = log.manipulability
+    if log.saturated is not None:
+        columns["gyro_saturated"] = log.saturated
+    for name, rates in (
+        ("bias", log.bias_rad_s),
+        ("believed_bias", log.believed_bias_rad_s),
+        ("sigma_bias", log.sigma_bias_rad_s),
+    ):
+        if rates is not None:
+            add(name, per_hour(rates), AXES, "deg_h")
+    if log.sigma_attitude_rad is not None:
+        add("sigma_attitude", np.degrees(log.sigma_attitude_rad) / ARCSEC_DEG, AXES, "arcsec")
+    return Table(columns)
+
+
+def imu_table(record: Increments) -> Any:
+    """Every sample of the IMU, for a filter of one's own; the tilt that the accelerometers alone would give."""
+    from astropy.table import Table
+
+    columns: dict[str, Any] = {"t_s": record.t_s}
+    columns |= {f"angle_{end}_rad": record.angle_rad[:, n] for n, end in enumerate(AXES)}
+    columns |= {f"velocity_{end}_m_s": record.velocity_m_s[:, n] for n, end in enumerate(AXES)}
+    level = np.degrees([tilt_rad(velocity[None]) for velocity in record.velocity_m_s])
+    columns |= {"level_roll_deg": level[:, 0], "level_pitch_deg": level[:, 1]}
+    columns |= {"gyro_saturated": record.saturated, "accelerometer_overloaded": record.overloaded}
+    return Table(columns)
+
+
+def attitude_panel(log: Telemetry, axes: Any) -> None:
+    true_deg = euler_deg(log.lab_from_body)
+    for n, name in enumerate(EULER):
+        axes.plot(log.t_s, true_deg[:, n], color=f"C{n}", label=name)
+        if log.lab_from_ref is not None:
+            axes.plot(log.t_s, euler_deg(log.lab_from_ref)[:, n], "--", color=f"C{n}", alpha=0.6, lw=1)
+    axes.set_ylabel("attitude [deg]\n(dashed: told)")
+
+
+def belief_panel(log: Telemetry, axes: Any) -> None:
+    for name, believed, colour in (
+        ("told", log.lab_from_ref, "0.6"),
+        ("IMU alone", log.lab_from_imu, "tab:red"),
+        ("filter", log.lab_from_filter, "tab:green"),
+    ):
+        wrong_deg = off_deg(believed, log.lab_from_body)
+        if wrong_deg is not None:
+            axes.semilogy(log.t_s, np.maximum(wrong_deg, 1e-7), color=colour, label=name)
+    if log.sigma_attitude_rad is not None:
+        sigma_deg = np.degrees(np.linalg.norm(log.sigma_attitude_rad, axis=1))
+        axes.semilogy(log.t_s, 3 * sigma_deg, ":", color="tab:green", label="filter's own 3σ")
+    if log.saturated is not None and log.saturated.any():
+        low, high = axes.get_ylim()
+        axes.fill_between(log.t_s, low, high, where=log.saturated, color="tab:red", alpha=0.25, lw=0)
+        axes.set_ylim(low, high)
+    axes.set_ylabel("off the truth [deg]")
+
+
+def bias_panel(log: Telemetry, axes: Any) -> None:
+    assert log.bias_rad_s is not None
+    assert log.believed_bias_rad_s is not None
+    assert log.sigma_bias_rad_s is not None
+    true, believed, sigma = map(per_hour, (log.bias_rad_s, log.believed_bias_rad_s, log.sigma_bias_rad_s))
+    for n, name in enumerate(AXES):
+        axes.plot(log.t_s, true[:, n], "--", color=f"C{n}", lw=1)
+        axes.plot(log.t_s, believed[:, n], color=f"C{n}", label=name)
+        band = believed[:, n] - 3 * sigma[:, n], believed[:, n] + 3 * sigma[:, n]
+        axes.fill_between(log.t_s, *band, color=f"C{n}", alpha=0.12, lw=0)
+    reach = max(np.abs(true).max(), np.abs(believed).max()) + 3 * sigma[len(sigma) // 4 :].max()
+    axes.set_ylim(-reach, reach)
+    axes.set_ylabel("gyro bias [deg/h]\n(dashed: true, band: 3σ)")
+
+
+def torque_panel(log: Telemetry, axes: Any) -> None:
+    for n, name in enumerate(AXES):
+        axes.plot(log.t_s, log.torque_nm[:, n], color=f"C{n}", label=name)
+    axes.set_ylabel("torque asked for\n[N m]")
+
+
+def wheels_panel(log: Telemetry, axes: Any) -> None:
+    for n, speed in enumerate(log.wheel_rad_s.T):
+        axes.plot(log.t_s, speed / RPM_RAD_S, label=f"wheel {n + 1}")
+    axes.set_ylabel("wheels [rpm]")
+
+
+def gimbals_panel(log: Telemetry, axes: Any) -> None:
+    for n, angle in enumerate(log.gimbal_rad.T):
+        axes.plot(log.t_s, np.degrees(angle), label=f"gimbal {n + 1}")
+    axes.set_ylabel("gimbals [deg]")
+    if log.manipulability is not None:
+        right = axes.twinx()
+        right.plot(log.t_s, log.manipulability, color="0.5", ls=":")
+        right.set_ylim(0, 1)
+        right.set_ylabel("manipulability (dotted)")
+
+
+def momentum_panel(log: Telemetry, axes: Any) -> None:
+    for n, name in enumerate(AXES):
+        axes.plot(log.t_s, log.momentum_nms[:, n], color=f"C{n}", label=name)
+    axes.plot(log.t_s, np.linalg.norm(log.momentum_nms, axis=1), color="k", lw=1, label="size")
+    axes.set_ylabel("stored momentum\n[N m s]")
+
+
+def panels(log: Telemetry) -> list[Callable[[Telemetry, Any], None]]:
+    """What there is to be shown of a flight."""
+    stores = bool(log.wheel_rad_s.size or log.gimbal_rad.size)
+    believes = log.lab_from_imu is not None or log.lab_from_ref is not None
+    chosen = {
+        attitude_panel: True,
+        belief_panel: believes,
+        bias_panel: log.lab_from_filter is not None,
+        torque_panel: log.lab_from_ref is not None,
+        wheels_panel: bool(log.wheel_rad_s.size),
+        gimbals_panel: bool(log.gimbal_rad.size),
+        momentum_panel: stores,
+    }
+    return [panel for panel, wanted in chosen.items() if wanted]
+
+
+def figure(log: Telemetry) -> bytes:
+    """The flight against time, as PNG."""
+    from matplotlib.figure import Figure
+
+    shown = panels(log)
+    fig = Figure(figsize=(10, 0.8 + 2.1 * len(shown)), layout="constrained")
+    for panel, axes in zip(shown, fig.subplots(len(shown), 1, sharex=True, squeeze=False)[:, 0], strict=True):
+        panel(log, axes)
+        axes.grid(alpha=0.3)
+        if axes.get_legend_handles_labels()[0]:
+            axes.legend(loc="upper right", ncols=4, fontsize="small")
+    fig.axes[len(shown) - 1].set_xlabel("time [s]")
+    buffer = std_io.BytesIO()
+    fig.savefig(buffer, format="png", dpi=110)
+    return buffer.getvalue()

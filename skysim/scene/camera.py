@@ -1,0 +1,310 @@
+"""The camera as the hardware is: lens, chip and electronics, read from YAML. A part of the scene's schema."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BeforeValidator, Field, field_validator, model_validator
+
+from skysim.core.paths import DATA
+from skysim.core.units import (
+    Ascending,
+    ConfigModel,
+    Length,
+    NotNegative,
+    Number,
+    Share,
+    Time,
+    check_table,
+    quantity,
+)
+from skysim.scene.opencv_calibration import Calibration
+
+FOCUS = Annotated[
+    str, Field(description='a length such as "33 in", or infinity')
+]  # what editors are told of it
+
+Electrons = Annotated[Number, Field(ge=0, le=1e9)]
+
+Radial = Annotated[Number, Field(ge=-1e6, le=1e6)]
+
+Tangential = Annotated[Number, Field(ge=-0.1, le=0.1)]  # more would fold the image
+
+
+def focus_distance(value: Any) -> float:
+    """A length, or the word infinity."""
+    return math.inf if value == "infinity" else quantity("m", "length", '"33 in", or infinity')(value)
+
+
+class PsfConfig(ConfigModel):
+    """What every point-spread function has: a Gaussian blur that grows towards the field's corner.
+
+    corner_sigma_px : standard deviation, added in quadrature, proportional to the field radius, reached at the
+                      farthest corner of the chip (field curvature and coma, to first order)
+    """
+
+    corner_sigma_px: Annotated[Number, Field(ge=0, le=20)] = 0.0
+
+
+class GaussianPsfConfig(PsfConfig):
+    """A Gaussian of standard deviation sigma_px."""
+
+    kind: Literal["gaussian"] = "gaussian"
+    sigma_px: Annotated[Number, Field(ge=0.2, le=20)] = 0.7
+
+
+class MoffatPsfConfig(PsfConfig):
+    """A Moffat profile: a core with power-law wings (Moffat 1969)."""
+
+    kind: Literal["moffat"]
+    fwhm_px: Annotated[Number, Field(ge=0.5, le=50)]
+    beta: Annotated[Number, Field(ge=1.5, le=20)] = 3.0
+
+
+class AiryPsfConfig(PsfConfig):
+    """Diffraction at the lens's working f-number and a blur of sigma_px on top."""
+
+    kind: Literal["airy"]
+    wavelength_m: Annotated[Length, Field(ge=200e-9, le=2e-6)] = 550e-9
+    sigma_px: Annotated[Number, Field(ge=0, le=20)] = 0.0
+
+
+class DiscPsfConfig(PsfConfig):
+    """A uniform disc, the geometric image of a lens out of focus, and a blur of sigma_px on its edge."""
+
+    kind: Literal["disc"]
+    radius_px: Annotated[Number, Field(gt=0, le=200)]
+    sigma_px: Annotated[Number, Field(ge=0.2, le=20)] = 0.7
+
+
+class MeasuredPsfConfig(PsfConfig):
+    """A point's image as it was measured: a square table of numbers, `oversampling` samples a pixel each way."""
+
+    kind: Literal["measured"]
+    file: str
+    oversampling: Annotated[int, Field(ge=1, le=32)] = 1
+
+
+Psf = Annotated[
+    GaussianPsfConfig | MoffatPsfConfig | AiryPsfConfig | DiscPsfConfig | MeasuredPsfConfig,
+    Field(discriminator="kind"),
+]
+
+
+class TwoStopsConfig(ConfigModel):
+    """Mechanical vignetting by two equal round stops, one behind the other; nothing passes at cutoff_deg."""
+
+    kind: Literal["two_stops"]
+    cutoff_deg: Annotated[Number, Field(gt=0, lt=90)]
+
+
+class VignettingTableConfig(ConfigModel):
+    """Measured transmission against field angle, 1 on the axis."""
+
+    kind: Literal["table"]
+    angle_deg: Ascending
+    transmission: Annotated[tuple[Share, ...], Field(min_length=2)]
+
+    @model_validator(mode="after")
+    def a_table(self) -> VignettingTableConfig:
+        check_table(self.angle_deg, self.transmission, "transmission")
+        return self
+
+
+class GlobalShutterConfig(ConfigModel):
+    """Every row sees the same exposure."""
+
+    kind: Literal["global"] = "global"
+
+
+class RollingShutterConfig(ConfigModel):
+    """Each row opens and closes row_time after the one above it."""
+
+    kind: Literal["rolling"]
+    row_time_s: Annotated[Time, Field(gt=0)]
+
+
+class FrameTransferConfig(ConfigModel):
+    """Charge is shifted under light into a store, row_time a row: every pixel gathers from its whole column."""
+
+    kind: Literal["frame_transfer"]
+    row_time_s: Annotated[Time, Field(gt=0)]
+
+
+class InterlineConfig(ConfigModel):
+    """The covered register leaks: it takes `leak` of the light of every row that it passes, row_time a row."""
+
+    kind: Literal["interline"]
+    row_time_s: Annotated[Time, Field(gt=0)]
+    leak: Share = 1e-4
+
+
+Shutter = Annotated[
+    GlobalShutterConfig | RollingShutterConfig | FrameTransferConfig | InterlineConfig,
+    Field(discriminator="kind"),
+]
+
+
+class ParticlesConfig(ConfigModel):
+    """Ionising particles that leave straight tracks: cosmic rays, trapped protons.
+
+    per_cm2_s     : crossings of a square centimetre of the chip a second, from all sides: half of the omnidirectional
+                    flux
+    depth_m       : thickness of the sensitive layer
+    electrons_um  : most probable charge a micrometre of track (about 80 for a fast singly charged particle)
+    diffusion_px  : standard deviation of the charge cloud
+    """
+
+    per_cm2_s: Annotated[Number, Field(ge=0, le=1e12)]
+    depth_m: Annotated[Length, Field(gt=0, le=1e-3)] = 10e-6
+    electrons_um: Annotated[Number, Field(gt=0, le=1e6)] = 80.0
+    diffusion_px: Annotated[Number, Field(ge=0, le=5)] = 0.3
+
+
+class DetectorConfig(ConfigModel):
+    """The chip and its electronics, in the charge's order. A step is switched off by its parameter.
+
+    quantum_efficiency : one number for 400-1000 nm, or the name of a curve in data/qe (or a file)
+    hardware_seed      : this chip's own fixed pattern: PRNU, DSNU, hot pixels, column offsets
+    prnu               : standard deviation of the pixels' relative sensitivity
+    dark_e_s           : mean dark current at dark_temperature_c; it doubles every dark_doubling_c
+    dsnu               : standard deviation of the pixels' relative dark current
+    hot_pixels         : share of the pixels that are hot, with an exponential spread of mean hot_e_s
+    blooming           : column: what a full well cannot hold flows along its column; anti_blooming of it drains
+    cti_parallel, cti_serial : share of the charge left behind in each transfer
+    read_noise_e, reset_noise_e : Gaussian, every pixel, every frame
+    column_offset_e    : standard deviation of the columns' fixed offsets
+    nonlinearity       : share of the signal missing at full well: e (1 - nonlinearity e / full_well)
+    noise              : false gives the expectation itself, unrounded: fixed pattern and transfer loss in it, but no
+                         particles, and neither well, bend nor converter have an end
+    """
+
+    quantum_efficiency: Annotated[Number, Field(gt=0, le=1)] | str
+    hardware_seed: Annotated[int, Field(ge=0)] = 0
+    prnu: Annotated[Number, Field(ge=0, le=0.2)] = 0.0
+    dark_e_s: Electrons = 0.0
+    dark_temperature_c: Annotated[Number, Field(ge=-150, le=150)] = 20.0
+    dark_doubling_c: Annotated[Number, Field(ge=1, le=50)] = 7.0
+    temperature_c: Annotated[Number, Field(ge=-150, le=150)] | None = None
+    dsnu: Annotated[Number, Field(ge=0, le=2)] = 0.0
+    hot_pixels: Share = 0.0
+    hot_e_s: Electrons = 0.0
+    particles: tuple[ParticlesConfig, ...] = ()
+    full_well_e: Annotated[Number, Field(ge=1, le=1e9)]
+    blooming: Literal["none", "column"] = "none"
+    anti_blooming: Share = 0.0
+    cti_parallel: Annotated[Number, Field(ge=0, le=1e-2)] = 0.0
+    cti_serial: Annotated[Number, Field(ge=0, le=1e-2)] = 0.0
+    read_noise_e: Electrons = 0.0
+    reset_noise_e: Electrons = 0.0
+    column_offset_e: Electrons = 0.0
+    gain_e_dn: Annotated[Number, Field(ge=1e-6, le=1e9)]
+    offset_dn: NotNegative = 0.0
+    nonlinearity: Annotated[Number, Field(ge=0, le=0.4)] = 0.0
+    bits: Annotated[int, Field(ge=1, le=16)]
+    noise: bool = True
+
+    @field_validator("quantum_efficiency")
+    @classmethod
+    def known_curve(cls, value: float | str) -> float | str:
+        if isinstance(value, str):
+            from skysim.scene.camera import curve_file
+
+            curve_file(value)
+        return value
+
+    @model_validator(mode="after")
+    def no_furnace(self) -> DetectorConfig:
+        if self.temperature_c is not None and self.doublings > 40:
+            raise ValueError(
+                f"temperature_c {self.temperature_c:g} doubles the dark current {self.doublings:.0f} times"
+            )
+        return self
+
+    @property
+    def doublings(self) -> float:
+        """How often the dark current doubles from the temperature it is quoted for to the chip's own."""
+        warm_c = 0.0 if self.temperature_c is None else self.temperature_c - self.dark_temperature_c
+        return warm_c / self.dark_doubling_c
+
+    @model_validator(mode="after")
+    def offset_within_the_converter(self) -> DetectorConfig:
+        if self.offset_dn >= 2**self.bits:
+            raise ValueError(f"offset_dn {self.offset_dn:g} is beyond a converter of {self.bits} bits")
+        return self
+
+
+class CameraConfig(ConfigModel):
+    """Lens and chip as they are. What the tracker believes of them stands in `tracker`."""
+
+    width_px: Annotated[int, Field(ge=16, le=20000)]
+    height_px: Annotated[int, Field(ge=16, le=20000)]
+    pixel_m: Annotated[Length, Field(ge=1e-7, le=1e-2)]
+    focal_length_m: Annotated[Length, Field(ge=1e-5, le=1e3)]
+    f_number: Annotated[Number, Field(ge=0.3, le=1e6)]
+    focus_m: Annotated[float, BeforeValidator(focus_distance, json_schema_input_type=FOCUS), Field(gt=0)] = (
+        math.inf
+    )
+    transmission: Annotated[Number, Field(gt=0, le=1)] = 1.0
+    vignetting: Annotated[TwoStopsConfig | VignettingTableConfig, Field(discriminator="kind")] | None = None
+    distortion: tuple[Radial, Radial, Tangential, Tangential, Radial] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    principal_point_px: tuple[Number, Number] | None = None
+    psf: Psf = GaussianPsfConfig()
+    shutter: Shutter = GlobalShutterConfig()
+    detector: DetectorConfig
+
+    @model_validator(mode="after")
+    def focused_before_the_lens(self) -> CameraConfig:
+        if self.focus_m <= 2 * self.focal_length_m:
+            raise ValueError(
+                f"focus {self.focus_m:g} m is nearer than twice the focal length {self.focal_length_m:g} m"
+            )
+        return self
+
+    @property
+    def pupil_m(self) -> float:
+        """Diameter of the entrance pupil."""
+        return self.focal_length_m / self.f_number
+
+    @property
+    def image_distance_m(self) -> float:
+        """From lens to chip, by the thin lens: 1/v = 1/f - 1/u. The focal length, if focused at infinity."""
+        return 1 / (1 / self.focal_length_m - 1 / self.focus_m)
+
+    @property
+    def focal_px(self) -> float:
+        """Pixels a unit of tangent: what a star tracker calls its focal length."""
+        return self.image_distance_m / self.pixel_m
+
+    @property
+    def centre_px(self) -> tuple[float, float]:
+        """The principal point: as given, or the chip's middle."""
+        return self.principal_point_px or ((self.width_px - 1) / 2, (self.height_px - 1) / 2)
+
+    def calibration(self) -> Calibration:
+        """What a perfect calibration would find."""
+        return Calibration(self.width_px, self.height_px, self.focal_px, self.centre_px, self.distortion)
+
+    @property
+    def corner_px(self) -> float:
+        """From the principal point to the farthest corner of the chip."""
+        x, y = self.centre_px
+        return math.hypot(max(x + 0.5, self.width_px - 0.5 - x), max(y + 0.5, self.height_px - 0.5 - y))
+
+
+CURVES = DATA / "qe"
+
+
+def curve_file(name: str) -> Path:
+    """The file of a quantum efficiency: a name in data/qe, or a path that ends in .csv.
+
+    Raises ValueError, with the names that there are, if it is neither.
+    """
+    known = {path.stem: path for path in sorted(CURVES.glob("*.csv"))}
+    if name in known:
+        return known[name]
+    if name.endswith(".csv") and Path(name).is_file():
+        return Path(name)
+    raise ValueError(f"{name!r} is none of {', '.join(known)}")

@@ -1,0 +1,297 @@
+"""What shines, as a scene says it: a dome with its LEDs or the stars, and the glow behind them. Schema only."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import BeforeValidator, Field, ModelWrapValidatorHandler, field_validator, model_validator
+
+from skysim.core.units import Ascending, ConfigModel, Length, Number, SemiAxis, Share, check_table
+from skysim.scene.leds import Layout, LedConfig, PixelsConfig
+
+Tilt = Annotated[Number, Field(ge=-45, le=45)]
+
+
+class SurfaceConfig(ConfigModel):
+    """The inside of the dome, in the lab frame (metres, bearing centre at the origin): what every kind has.
+
+    Sizes, apex and rim are the dome's before it is displaced, its axis upright through the bearing's centre.
+
+    offset   : the whole dome's displacement
+    tilt_deg : about the lab's x, then about its y, through the surface's own centre (the origin of surveyed points)
+    error    : standard deviation of the lab's survey of it, along the normal: one draw for all of it, for what its
+               points err each by itself averages out; `tracker.survey.seed` draws it
+    """
+
+    kind: Literal["sphere", "ellipsoid", "flat", "cylinder", "surveyed"]
+    offset_m: tuple[Length, Length, Length] = (0.0, 0.0, 0.0)
+    tilt_deg: tuple[Tilt, Tilt] = (0.0, 0.0)
+    error_m: Annotated[Length, Field(ge=0)] = 0.0
+
+    @model_validator(mode="wrap")
+    @classmethod
+    def of_its_kind(cls, value: Any, handler: ModelWrapValidatorHandler[SurfaceConfig]) -> SurfaceConfig:
+        """`Surface.model_validate` makes the part of the kind that is told."""
+        kind = value.get("kind") if cls is SurfaceConfig and isinstance(value, dict) else None
+        return PARTS[kind].model_validate(value) if kind in list(PARTS) else handler(value)
+
+
+class RimmedConfig(SurfaceConfig):
+    """A surface that ends: at a height above the bearing, or at an angle from its axis seen from the bearing."""
+
+    rim_height_m: Length | None = None
+    rim_deg: Annotated[Number, Field(gt=0, lt=180)] | None = None
+
+    @model_validator(mode="after")
+    def one_rim(self) -> Self:
+        if self.rim_height_m is not None and self.rim_deg is not None:
+            raise ValueError("a rim is told once; allowed: rim_height or rim_deg")
+        if self.rim_height_m is not None and self.rim_height_m >= getattr(self, "apex_m", math.inf):
+            raise ValueError(
+                f"rim_height {self.rim_height_m:g} m is not below the apex; allowed: less than apex"
+            )
+        return self
+
+
+class WallConfig(ConfigModel):
+    """A formed sheet, which is thinnest at the apex: its thickness is linear in the angle about the sphere's centre.
+
+    base_deg  : the angle of thickness_base, beyond which it stays
+    radius_of : the face that is a sphere: the outside, or the middle of the wall
+    """
+
+    thickness_apex_m: Annotated[Length, Field(gt=0)]
+    thickness_base_m: Annotated[Length, Field(gt=0)]
+    base_deg: Annotated[Number, Field(gt=0, le=90)]
+    radius_of: Literal["outside", "mid_wall"] = "outside"
+
+
+class SphereSurfaceConfig(RimmedConfig):
+    """A sphere; with a wall, what is inside of a formed shell whose outside or middle is a sphere."""
+
+    kind: Literal["sphere"]
+    apex_m: Annotated[Length, Field(gt=0)]
+    radius_m: Annotated[Length, Field(gt=0)]
+    wall: WallConfig | None = None
+
+    @model_validator(mode="after")
+    def thin(self) -> Self:
+        thickest = max(self.wall.thickness_apex_m, self.wall.thickness_base_m) if self.wall else 0.0
+        if thickest > 0.1 * self.radius_m:
+            raise ValueError(f"a wall of {thickest:g} m is no shell's; allowed: to a tenth of the radius")
+        return self
+
+
+class EllipsoidSurfaceConfig(RimmedConfig):
+    """An ellipsoid: oblate, prolate or with three axes of its own."""
+
+    kind: Literal["ellipsoid"]
+    apex_m: Annotated[Length, Field(gt=0)]
+    semi_axes_m: tuple[SemiAxis, SemiAxis, SemiAxis]
+
+
+class FlatSurfaceConfig(SurfaceConfig):
+    """A level panel; of a width along x and a height along y, or without an end."""
+
+    kind: Literal["flat"]
+    apex_m: Annotated[Length, Field(gt=0)]
+    width_m: Annotated[Length, Field(gt=0)] | None = None
+    height_m: Annotated[Length, Field(gt=0)] | None = None
+
+
+class CylinderSurfaceConfig(SurfaceConfig):
+    """A vault along the lab's x or y, or a drum about z; its highest place is at apex, its ends half a length off."""
+
+    kind: Literal["cylinder"]
+    axis: Literal["x", "y", "z"]
+    apex_m: Annotated[Length, Field(gt=0)]
+    radius_m: Annotated[Length, Field(gt=0)]
+    length_m: Annotated[Length, Field(gt=0)] | None = None
+    rim_height_m: Length | None = None
+
+    @model_validator(mode="after")
+    def ends(self) -> Self:
+        if self.axis == "z" and self.length_m is None:
+            raise ValueError("a cylinder about z takes its length, from apex down")
+        if self.rim_height_m is not None and self.rim_height_m >= self.apex_m:
+            raise ValueError(
+                f"rim_height {self.rim_height_m:g} m is not below the apex; allowed: less than apex"
+            )
+        return self
+
+
+class SurveyedSurfaceConfig(RimmedConfig):
+    """Points that a measuring arm took on the inside, made smooth: Zernike polynomials up to a degree.
+
+    file      : comments (#), a line of names, then lines of x, y, z in `unit`, z up
+    rms_limit : of the points' distances from the smooth surface
+    """
+
+    kind: Literal["surveyed"]
+    file: str
+    unit: Literal["m", "cm", "mm", "in"]
+    degree: Annotated[int, Field(ge=0, le=12)] = 6
+    rms_limit_m: Annotated[Length, Field(gt=0)] = 1e-3
+
+    @field_validator("file")
+    @classmethod
+    def is_there(cls, value: str) -> str:
+        if not value.endswith(".csv") or not Path(value).is_file():
+            raise ValueError(f"{value!r} is no file; allowed: a .csv file of x, y, z")
+        return value
+
+
+PARTS: dict[Any, type[SurfaceConfig]] = {
+    "sphere": SphereSurfaceConfig,
+    "ellipsoid": EllipsoidSurfaceConfig,
+    "flat": FlatSurfaceConfig,
+    "cylinder": CylinderSurfaceConfig,
+    "surveyed": SurveyedSurfaceConfig,
+}
+
+
+def of_a_known_kind(value: Any) -> Any:
+    """The value; an unknown kind is answered by the key `kind` itself, with those that there are."""
+    if isinstance(value, dict) and "kind" in value and value["kind"] not in list(PARTS):
+        SurfaceConfig.model_validate({"kind": value["kind"]})
+    return value
+
+
+AnySurface = Annotated[
+    SphereSurfaceConfig
+    | EllipsoidSurfaceConfig
+    | FlatSurfaceConfig
+    | CylinderSurfaceConfig
+    | SurveyedSurfaceConfig,
+    Field(discriminator="kind"),
+    BeforeValidator(of_a_known_kind),
+]
+
+
+class DomeConfig(ConfigModel):
+    """An LED dome as the light.
+
+    occlusion : whether the vehicle's parts and the dome's own wall hide LEDs
+    """
+
+    kind: Literal["dome"]
+    surface: AnySurface
+    layout: Layout
+    led: LedConfig
+    occlusion: bool = True
+
+    @model_validator(mode="after")
+    def boards_have_controllers(self) -> DomeConfig:
+        if getattr(self.led.drive, "controller", None) == "board" and self.layout.kind != "patch_boards":
+            raise ValueError(
+                f"led.drive.controller: {self.layout.kind} has no boards; allowed: dome, or a number of LEDs"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def panels_have_pixels(self) -> DomeConfig:
+        panel, drive = self.layout.kind == "lcd", self.led.drive.kind
+        if panel and self.surface.kind != "flat":
+            raise ValueError(f"layout: an lcd is no {self.surface.kind}; allowed: surface of kind flat")
+        if panel and drive not in ("direct", "refresh"):
+            raise ValueError(f"led.drive: {drive} dims no pixel; allowed for an lcd: direct, refresh")
+        if not panel and drive == "refresh":
+            raise ValueError(f"led.drive: {self.layout.kind} has no rows; allowed: refresh for an lcd")
+        return self
+
+
+class StarsConfig(ConfigModel):
+    """The real sky as the light.
+
+    occlusion : whether the vehicle's parts hide stars
+    """
+
+    kind: Literal["stars"]
+    catalogue: str = "hipparcos_hp6.5"
+    limit_mag: Annotated[Number, Field(ge=0, le=15)] = 6.5
+    occlusion: bool = True
+
+
+class BenchConfig(PixelsConfig):
+    """A star simulator: a micro-display in the focus of a collimator, which stands above the level camera.
+
+    Its axis is the lab's zenith, the display's columns run along the lab's x and its rows along y. Its exit covers
+    the lens wherever that moves to; what it does to colours and to the image is left out, and so is its refresh.
+
+    focal_length : of the collimator
+    catalogue, limit_mag : the stars shown, to this V, as they stand at the scene's start_time
+    axis_ra_deg, axis_dec_deg, roll_deg : what is in the display's middle, and the position angle there of the lab's
+        -y (a level camera's up), as `ra_deg`, `dec_deg`, `roll_deg` of a camera that looks up
+    brightest_mag : V that a white block has for the camera, in the Sun's colour; brighter stars are shown so
+    conjugate : as far from the bearing's centre the stars stand, by an error of collimation; none: at infinity
+    """
+
+    kind: Literal["bench"]
+    focal_length_m: Annotated[Length, Field(gt=0)]
+    catalogue: str = "hipparcos_hp6.5"
+    limit_mag: Annotated[Number, Field(ge=-2, le=15)] = 6.5
+    axis_ra_deg: Annotated[Number, Field(ge=0, lt=360)]
+    axis_dec_deg: Annotated[Number, Field(ge=-90, le=90)]
+    roll_deg: Number = 0.0
+    brightest_mag: Annotated[Number, Field(ge=-30, le=30)]
+    conjugate_m: Annotated[Length, Field(ge=10)] | None = None
+
+
+class UniformGlowConfig(ConfigModel):
+    """The same everywhere: e_s electrons a second in every pixel (a light leak, a lit room)."""
+
+    kind: Literal["uniform"]
+    e_s: Annotated[Number, Field(ge=0, le=1e12)]
+
+
+class SkyGlowConfig(ConfigModel):
+    """The night sky's surface brightness at the boresight, with a relative slope along the image's axes."""
+
+    kind: Literal["sky"]
+    mag_arcsec2: Annotated[Number, Field(ge=0, le=30)]
+    gradient_per_deg: tuple[Number, Number] = (0.0, 0.0)
+
+
+class MoonGlowConfig(ConfigModel):
+    """Moonlight scattered by the air (Krisciunas & Schaefer 1991), the Moon at ra_deg, dec_deg.
+
+    phase_angle_deg : 0 at full moon, 90 at the quarters
+    extinction_mag  : of the air at the zenith, in V
+    moon_zenith_deg, field_zenith_deg : zenith distances of the Moon and of the boresight
+    """
+
+    kind: Literal["moon"]
+    ra_deg: Annotated[Number, Field(ge=0, lt=360)]
+    dec_deg: Annotated[Number, Field(ge=-90, le=90)]
+    phase_angle_deg: Annotated[Number, Field(ge=0, le=180)]
+    extinction_mag: Annotated[Number, Field(ge=0, le=2)] = 0.172
+    moon_zenith_deg: Annotated[Number, Field(ge=0, lt=90)]
+    field_zenith_deg: Annotated[Number, Field(ge=0, lt=90)]
+
+
+class StrayLightConfig(ConfigModel):
+    """A bright body outside of the field through baffle and lens, by their point source transmittance.
+
+    ra_deg, dec_deg : where it stands, in the lab's axes (under the stars those of the ICRS)
+    v_mag           : how bright it is; the Sun's -26.74 if left out
+    angle_deg, pst  : irradiance on the chip over irradiance before the lens, against the angle from the boresight
+    """
+
+    kind: Literal["stray"]
+    ra_deg: Annotated[Number, Field(ge=0, lt=360)]
+    dec_deg: Annotated[Number, Field(ge=-90, le=90)]
+    v_mag: Number = -26.74
+    angle_deg: Ascending
+    pst: Annotated[tuple[Share, ...], Field(min_length=2)]
+
+    @model_validator(mode="after")
+    def a_table(self) -> StrayLightConfig:
+        check_table(self.angle_deg, self.pst, "pst")
+        return self
+
+
+Glow = Annotated[
+    UniformGlowConfig | SkyGlowConfig | MoonGlowConfig | StrayLightConfig, Field(discriminator="kind")
+]

@@ -1,0 +1,226 @@
+"""Load a scene: presets, calibration files, `base` scenes and overrides, then validation."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from skysim.core import yaml_reader
+from skysim.core.errors import InputError
+from skysim.core.paths import DATA, SCENES
+from skysim.core.units import (
+    ConfigModel,
+    quantity,
+)
+from skysim.core.yaml_reader import Files, explain, is_file, of_our_version, place_of, put, read_yaml
+from skysim.scene.camera import CameraConfig, focus_distance
+from skysim.scene.opencv_calibration import read as read_calibration
+from skysim.scene.scene import STEM, Scene
+
+PRESETS = DATA / "cameras"
+
+
+def preset(name: str, where: str) -> dict[str, Any]:
+    """The `camera` section of data/cameras/NAME.yaml. Raises BadInput for a name that is none."""
+    from skysim.core.yaml_reader import read_yaml
+
+    known = sorted(path.stem for path in PRESETS.glob("*.yaml"))
+    if name not in known:
+        raise InputError(f"{where}: {name!r} is none of {', '.join(known)}")
+    tree: dict[str, Any] = read_yaml(Path(PRESETS / f"{name}.yaml"))[0]["camera"]
+    return tree
+
+
+def with_preset(tree: dict[str, Any]) -> dict[str, Any]:
+    """The raw scene with its camera's preset beneath what the scene itself says of the camera, and its calibration
+    in its place. Raises BadInput beginning with the key."""
+    part = tree.get("camera")
+    if not isinstance(part, dict) or not {"preset", "calibration"} & set(part):
+        return tree
+    own = {key: value for key, value in part.items() if key not in ("preset", "calibration")}
+    below = preset(str(part["preset"]), "camera.preset") if part.get("preset") is not None else {}
+    if part.get("calibration") is None:
+        return tree | {"camera": over(below, own)}
+    for key in CALIBRATED:
+        if own.pop(key, None) is not None:
+            raise InputError(
+                f"camera.{key}: the file of camera.calibration tells it; allowed: one of the two (null for a base's)"
+            )
+    whole = over(below, own)
+    return tree | {"camera": whole | calibrated(Path(str(part["calibration"])), whole)}
+
+
+CALIBRATED = ("width_px", "height_px", "focal_length", "principal_point_px", "distortion")
+
+
+def calibrated(path: Path, part: dict[str, Any]) -> dict[str, Any]:
+    """What a calibration of OpenCV says of a camera whose pixel and focus are told: size, focal length, distortion."""
+    try:
+        told = read_calibration(path)
+        pixel_m = quantity("m", "length", '"5.5 um"')(part.get("pixel"))
+        focus_m = focus_distance(part.get("focus", "infinity"))
+    except InputError as error:
+        raise InputError(f"camera.calibration: {error}") from None
+    except ValueError as error:
+        raise InputError(f"camera.pixel: {error}; camera.calibration takes it, and focus") from None
+    size = (part.get("width_px", told.width_px), part.get("height_px", told.height_px))
+    if size != (told.width_px, told.height_px):
+        raise InputError(
+            f"camera.calibration: {path}: of frames of {told.width_px}x{told.height_px}; the preset's are"
+            f" {size[0]}x{size[1]}"
+        )
+    # By the thin lens, as Camera.image_distance_m.
+    focal_m = 1 / (1 / (told.focal_px * pixel_m) + 1 / focus_m)
+    return {
+        "width_px": told.width_px,
+        "height_px": told.height_px,
+        "focal_length": f"{focal_m!r} m",
+        "principal_point_px": list(told.centre_px),
+        "distortion": list(told.distortion),
+    }
+
+
+def over(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
+    """Two mappings merged; where both have a section of one kind the sections are merged too."""
+    merged = below | above
+    for key, value in above.items():
+        ground = below.get(key)
+        if not isinstance(value, dict) or not isinstance(ground, dict):
+            continue
+        if value.get("kind") in (None, ground.get("kind")):
+            merged[key] = over(ground, value)
+    return merged
+
+
+class CameraFileConfig(ConfigModel):
+    """A file that describes a camera and nothing else."""
+
+    camera: CameraConfig
+
+
+def find(name: str) -> Path:
+    """The path of a scene given by path or by its name in scenes/."""
+    return yaml_reader.find(name, SCENES, "scene")
+
+
+def load(name: str | Path, overrides: Mapping[str, str] | None = None) -> Scene:
+    """Read, override (`path.to.key` -> YAML value) and validate a scene.
+
+    Raises BadInput with one line: the key, what is wrong with it, what is allowed, the file and line.
+    """
+    path = find(str(name))
+    tree, files = read(path)
+    for key, value in (overrides or {}).items():
+        put(tree, key, value)
+    try:
+        raw = beneath(tree, files, overrides or {})
+        return Scene.model_validate(raw | {STEM: path.stem})
+    except ValidationError as error:
+        raise InputError(explain(error, Scene, tree, files, overrides or {})) from None
+
+
+def load_scene(name: str | Path, overrides: Mapping[str, Any] | None = None) -> Scene:
+    """`load` for Python: the values of the overrides may be numbers, lists and mappings too.
+
+        load_scene("shefex2", {"exposure.frames": 3, "exposure.time": "20 ms"})
+
+    A string is YAML, as on the command line; None switches a section off. Raises InputError with one line.
+    """
+    texts = {key: one if isinstance(one, str) else json.dumps(one) for key, one in (overrides or {}).items()}
+    return load(name, texts)
+
+
+def list_scenes() -> list[str]:
+    """Names of the scenes that come with skysim."""
+    return sorted(path.stem for path in SCENES.glob("*.yaml"))
+
+
+def where(message: str, name: str, overrides: Mapping[str, str]) -> str:
+    """A complaint that begins with a key of a scene, and where that stands; any other as it is."""
+    key = message.partition(":")[0]
+    told = re.fullmatch(r"[a-z_]+(\.\w+)*", key)
+    if (
+        not told
+        or key.partition(".")[0] not in Scene.model_fields
+        or re.search(r"\((--set|.*, line \d+)\)$", message)
+    ):
+        return message
+    return f"{message} {place_of(key.split('.'), read(find(name))[1], overrides)}"
+
+
+def read(path: Path, above: tuple[Path, ...] = ()) -> tuple[dict[str, Any], Files]:
+    """A scene's keys over those of its `base`, another scene by name or path; and the files, this one first."""
+    tree, text = read_yaml(path)
+    if above or tree.keys() != {"camera"}:  # a camera's file, which is no scene
+        of_our_version(tree, path, text)
+    tree = beside(path, tree)
+    if "base" not in tree:
+        return tree, [(path, text)]
+    base = tree.pop("base")
+    place = place_of(["base"], [(path, text)], {})
+    try:
+        below = find(str(path.parent / base) if is_file(path.parent / str(base)) else str(base))
+    except InputError as error:
+        raise InputError(f"base: {error} {place}") from None
+    if below.resolve() in above or below.resolve() == path.resolve():
+        raise InputError(f"base: {base} is this scene itself, or has it for its base {place}")
+    beneath_it, files = read(below, (*above, path.resolve()))
+    return over(beneath_it, tree), [(path, text), *files]
+
+
+def beneath(tree: dict[str, Any], files: Files, overrides: Mapping[str, str]) -> dict[str, Any]:
+    """`with_preset`, which knows neither file nor line."""
+    try:
+        return with_preset(tree)
+    except InputError as error:
+        key = str(error).partition(":")[0]
+        raise InputError(f"{error} {place_of(key.split('.'), files, overrides)}") from None
+
+
+# Keys that name a file of the scene's own.
+FILES = (
+    ("vehicle", "model"),
+    ("camera", "psf", "file"),
+    ("camera", "calibration"),
+    ("light", "surface", "file"),
+    ("light", "layout", "file"),
+    ("light", "layout", "points", "file"),
+    ("tracker", "map"),
+)
+
+
+def beside(path: Path, tree: dict[str, Any]) -> dict[str, Any]:
+    """The scene with the files that it names taken from its own folder, where there are any of that name."""
+    for keys in FILES:
+        tree = anchored(path.resolve().parent, tree, *keys)
+    return tree
+
+
+def anchored(folder: Path, tree: dict[str, Any], key: str, *inner: str) -> dict[str, Any]:
+    """A mapping in which the file named under these keys, if it is in the folder, has its whole path."""
+    value = tree.get(key)
+    if inner and isinstance(value, dict):
+        return tree | {key: anchored(folder, value, *inner)}
+    if not inner and isinstance(value, str) and is_file(folder / value):
+        return tree | {key: str(folder / value)}
+    return tree
+
+
+def load_camera(path: Path, lens: Mapping[str, Any] | None = None) -> CameraConfig:
+    """The `camera` section of a scene, or of a file that has nothing else. Raises BadInput with one line.
+
+    lens : keys that stand in for those which a preset leaves to its scene
+    """
+    tree, files = read(path)
+    if isinstance(tree.get("camera"), dict):
+        tree = tree | {"camera": {**(lens or {}), **tree["camera"]}}
+    try:
+        own = beside(path, {key: tree[key] for key in tree if key == "camera"})
+        return CameraFileConfig.model_validate(beneath(own, files, {})).camera
+    except ValidationError as error:
+        raise InputError(explain(error, CameraFileConfig, tree, files, {})) from None

@@ -1,0 +1,215 @@
+"""What the vehicle is told to do, and by whom it is flown. A part of the scene's schema."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import BeforeValidator, Discriminator, Field, Tag, model_validator
+
+from skysim.core.units import ConfigModel, Momentum, NotNegative, Number, Positive, Spin, Time
+
+Duration = Annotated[Time, Field(gt=0)]
+Acceleration = Positive
+RatesDegS = tuple[Spin, Spin, Spin]
+Law = Literal["pid", "pd"]
+
+
+class AttitudeConfig(ConfigModel):
+    """3-2-1 Euler angles of the body in the lab."""
+
+    roll_deg: Number = 0.0
+    pitch_deg: Number = 0.0
+    yaw_deg: Number = 0.0
+
+
+class PointingConfig(ConfigModel):
+    """Where the camera looks in the ICRS: its boresight, and the position angle of the image's up direction."""
+
+    ra_deg: Annotated[Number, Field(ge=0, lt=360)]
+    dec_deg: Annotated[Number, Field(ge=-90, le=90)]
+    roll_deg: Number = 0.0
+
+
+def where_it_starts(value: Any) -> str:
+    """Which of the two starts is meant, so that a slip in one is not answered with the other's keys."""
+    keys = value if isinstance(value, dict) else ()
+    sky = isinstance(value, PointingConfig) or any(key in keys for key in ("ra_deg", "dec_deg"))
+    return "Pointing" if sky else "Attitude"
+
+
+Start = Annotated[
+    Annotated[AttitudeConfig, Tag("Attitude")] | Annotated[PointingConfig, Tag("Pointing")],
+    Discriminator(where_it_starts),
+]
+
+
+class JitterLineConfig(ConfigModel):
+    """A vibration of one frequency: rms_arcsec about each of the body's axes, phases at random."""
+
+    kind: Literal["line"]
+    frequency_hz: Positive
+    rms_arcsec: tuple[NotNegative, NotNegative, NotNegative]
+
+
+class JitterBandConfig(ConfigModel):
+    """Random vibration between two frequencies, power spectral density proportional to f^slope."""
+
+    kind: Literal["band"]
+    from_hz: Positive
+    to_hz: Positive
+    rms_arcsec: tuple[NotNegative, NotNegative, NotNegative]
+    slope: Annotated[Number, Field(ge=-6, le=6)] = 0.0
+
+    @model_validator(mode="after")
+    def a_band(self) -> JitterBandConfig:
+        if self.from_hz >= self.to_hz:
+            raise ValueError(f"from_hz {self.from_hz:g} is not below to_hz {self.to_hz:g}")
+        return self
+
+
+JitterPart = Annotated[JitterLineConfig | JitterBandConfig, Field(discriminator="kind")]
+
+
+class HoldConfig(ConfigModel):
+    """Keep the attitude for a while."""
+
+    kind: Literal["hold"]
+    duration_s: Duration
+
+
+class StepConfig(AttitudeConfig):
+    """Ask for a 3-2-1 attitude all at once, and keep asking for a while: the controller's step response."""
+
+    kind: Literal["step"]
+    duration_s: Duration
+
+
+class SlewConfig(AttitudeConfig):
+    """Rest-to-rest eigen-axis turn to a 3-2-1 attitude, no faster than rate_deg_s."""
+
+    kind: Literal["slew"]
+    rate_deg_s: Positive = 2.0
+    acceleration_deg_s2: Acceleration = 0.5
+
+
+class RateConfig(ConfigModel):
+    """Turn at a constant rate about a body axis: rate_deg_s about x, y, z, from the first moment on."""
+
+    kind: Literal["rate"]
+    rate_deg_s: RatesDegS
+    duration_s: Duration
+
+
+class SpinUpConfig(ConfigModel):
+    """Change the rate smoothly from what it is to rate_deg_s about body x, y, z."""
+
+    kind: Literal["spin_up"]
+    rate_deg_s: RatesDegS
+    duration_s: Duration
+
+
+class SineConfig(ConfigModel):
+    """Swing about the attitude: amplitude_deg about body x, y, z at frequency_hz, growing and dying smoothly."""
+
+    kind: Literal["sine"]
+    amplitude_deg: tuple[Number, Number, Number]
+    frequency_hz: Positive
+    duration_s: Duration
+
+
+class ShakeConfig(ConfigModel):
+    """Hold while the vehicle vibrates, as `motion.jitter` but for this while only."""
+
+    kind: Literal["jitter"]
+    duration_s: Duration
+    parts: Annotated[tuple[JitterPart, ...], Field(min_length=1)]
+
+
+class BumpConfig(ConfigModel):
+    """Somebody knocks against the vehicle, which is told to hold.
+
+    rate_deg_s : by how much the knock alone would change the rate about body x, y, z
+    duration   : of the knock, a half-sine of torque
+    caught_after : how long after its beginning an equal knock the other way stops it again; never if left out
+    """
+
+    kind: Literal["bump"]
+    rate_deg_s: RatesDegS
+    duration_s: Duration
+    caught_after_s: Duration | None = None
+
+    @model_validator(mode="after")
+    def one_after_the_other(self) -> BumpConfig:
+        if self.caught_after_s is not None and self.caught_after_s < self.duration_s:
+            raise ValueError(f"caught_after {self.caught_after_s:g} s is before the knock is over")
+        return self
+
+
+Manoeuvre = Annotated[
+    HoldConfig | StepConfig | SlewConfig | RateConfig | SpinUpConfig | SineConfig | ShakeConfig | BumpConfig,
+    Field(discriminator="kind"),
+]
+
+
+class DesaturationConfig(ConfigModel):
+    """The fans take momentum out of wheels or CMGs: begun above start, ended below stop.
+
+    time : the fans' torque is the stored momentum over this time, within what they can do
+    """
+
+    start_nms: Annotated[Momentum, Field(gt=0)]
+    stop_nms: Annotated[Momentum, Field(gt=0)]
+    time_s: Duration = 10.0
+
+    @model_validator(mode="after")
+    def hysteresis(self) -> DesaturationConfig:
+        if self.stop_nms >= self.start_nms:
+            raise ValueError(f"stop {self.stop_nms:g} N m s is not below start {self.start_nms:g} N m s")
+        return self
+
+
+class ControlConfig(ConfigModel):
+    """The attitude controller on the vehicle's computer.
+
+    law       : pid, or pd, which leaves what a constant torque does
+    actuators : ideal torques about the body's axes, or one of the sets that `vehicle` switches on
+    feedback  : what it knows of the attitude: truth, imu (the navigator), filter (star tracker and gyro)
+    bandwidth_rad_s, damping : of the attitude loop; integral_rad_s : the pole of the integral. Keep the bandwidth times
+        the delay (a period of rate_hz, and the fans' time constant with fans) well below 1: 0.3 is fine
+    """
+
+    law: Law = "pid"
+    actuators: Literal["ideal", "wheels", "fans", "cmgs"] = "ideal"
+    feedback: Literal["truth", "imu", "filter"] = "truth"
+    rate_hz: Annotated[Number, Field(ge=1, le=1000)] = 100.0
+    bandwidth_rad_s: Positive = 3.0
+    damping: Positive = 0.8
+    integral_rad_s: Positive = 0.6
+    desaturation: DesaturationConfig | None = None
+
+
+def spelt_out(value: Any) -> Any:
+    """`control: pid` is short for {law: pid}, `none` for nobody."""
+    if value == "none":
+        return None
+    return {"law": value} if isinstance(value, str) else value
+
+
+class MotionConfig(ConfigModel):
+    """How it starts and what it is told to do."""
+
+    start: Start = AttitudeConfig()
+    rate_deg_s: RatesDegS = (0.0, 0.0, 0.0)
+    control: Annotated[
+        ControlConfig | None,
+        BeforeValidator(spelt_out, json_schema_input_type=ControlConfig | Law | Literal["none"] | None),
+    ] = None
+    manoeuvre: tuple[Manoeuvre, ...] = ()
+    jitter: tuple[JitterPart, ...] = ()
+
+    @model_validator(mode="after")
+    def somebody_flies_it(self) -> MotionConfig:
+        driven = any(part.kind not in ("bump", "hold", "jitter") for part in self.manoeuvre)
+        if driven and self.control is None:
+            raise ValueError("a manoeuvre needs a controller; allowed: control: pid")
+        return self

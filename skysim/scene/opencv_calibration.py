@@ -1,0 +1,165 @@
+"""A camera's calibration as OpenCV's YAML has it, read with care and written so that OpenCV reads it back."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from skysim.core.errors import InputError
+from skysim.core.yaml_reader import Careful, composed, shown
+
+MOST_BYTES = 1 << 20  # a calibration with all its views' points; beyond that it is something else
+SQUARE = 1e-3  # by which fx and fy may differ: a calibration's own error, for the pixels of a chip are square
+MOST_PX = 20000  # a side of the chip, as of a scene's camera
+FIVE = ("k1", "k2", "p1", "p2", "k3")
+
+
+@dataclass(frozen=True, slots=True)
+class Calibration:
+    """A pinhole with square pixels and the distortion of Brown (1971), in camera axes +x right, +y down, +z boresight.
+
+    focal_px   : focal length, better: the image's distance, over the pixel's pitch
+    centre_px  : principal point (x, y); the middle of pixel (0, 0) is (0, 0), as with OpenCV
+    distortion : k1, k2, p1, p2, k3 in OpenCV's order
+    """
+
+    width_px: int
+    height_px: int
+    focal_px: float
+    centre_px: tuple[float, float]
+    distortion: tuple[float, float, float, float, float]
+
+
+class Loader(Careful):
+    """Plain YAML, and OpenCV's matrices as the mappings that they are."""
+
+
+def matrix_node(loader: yaml.SafeLoader, node: yaml.Node) -> Any:
+    if not isinstance(node, yaml.MappingNode):
+        raise yaml.constructor.ConstructorError(None, None, "a matrix that is no mapping", node.start_mark)
+    return loader.construct_mapping(node, deep=True)
+
+
+Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", matrix_node)
+
+
+def is_one(path: Path) -> bool:
+    """Whether a file looks like OpenCV's: it has a camera_matrix, or OpenCV's first line."""
+    try:
+        with path.open("rb") as file:
+            head = file.read(MOST_BYTES)
+    except OSError:
+        return False
+    return head.startswith(b"%YAML") or b"\ncamera_matrix:" in head or head.startswith(b"camera_matrix:")
+
+
+def read(path: Path) -> Calibration:
+    """The file of OpenCV's calibration samples (or of ROS, whose keys are the same).
+
+    Keys: image_width, image_height, camera_matrix, distortion_coefficients; others are passed over. Raises InputError
+    with one line for a file that is none, and for a lens that is not of this kind: fisheye, rational, skewed.
+    """
+    tree = parsed(path)
+    for key, allowed in (("fisheye_model", (0, False)), ("distortion_model", ("plumb_bob",))):
+        if key in tree and tree[key] not in allowed:
+            raise InputError(
+                f"{path}: {key}: {shown(repr(tree[key]))} is none of {', '.join(map(str, allowed))}"
+            )
+    width, height = (side(path, tree, key) for key in ("image_width", "image_height"))
+    fx, skew, cx, zero, fy, cy, *last = matrix(path, tree, "camera_matrix", ((3, 3),))
+    if min(fx, fy) <= 0 or skew or zero or last != [0, 0, 1]:
+        raise InputError(
+            f"{path}: camera_matrix: allowed: [fx, 0, cx, 0, fy, cy, 0, 0, 1], fx and fy above 0"
+        )
+    if abs(fx / fy - 1) > SQUARE:
+        raise InputError(
+            f"{path}: camera_matrix: fx {fx:g} and fy {fy:g} differ by {100 * abs(fx / fy - 1):.2g} %; allowed:"
+            f" square pixels, to {100 * SQUARE:g} % (calibrate with CALIB_FIX_ASPECT_RATIO)"
+        )
+    shapes = tuple(shape for n in (4, 5, 8, 12, 14) for shape in ((1, n), (n, 1)))
+    told = matrix(path, tree, "distortion_coefficients", shapes)
+    if any(told[5:]):
+        raise InputError(
+            f"{path}: distortion_coefficients: {len(told)} of them; allowed: {', '.join(FIVE)} alone"
+        )
+    k1, k2, p1, p2, k3 = [*told, 0.0][:5]
+    return Calibration(width, height, math.sqrt(fx * fy), (cx, cy), (k1, k2, p1, p2, k3))
+
+
+def parsed(path: Path) -> dict[str, Any]:
+    """The file's mapping. OpenCV before 5 begins it with %YAML:1.0, which is no YAML."""
+    try:
+        with path.open("rb") as file:
+            data = file.read(MOST_BYTES + 1)
+        if len(data) > MOST_BYTES:
+            raise InputError(f"{path}: more than {MOST_BYTES >> 20} MiB; allowed: a calibration of OpenCV")
+        text = data.decode("utf-8")
+        first, _, rest = text.partition("\n")
+        _, tree = composed(rest if first.startswith("%YAML") else text, Loader)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from None
+    except (yaml.YAMLError, ValueError, RecursionError, TypeError, OverflowError) as error:
+        problem = " ".join(str(getattr(error, "problem", None) or error).split())[:120]
+        raise InputError(f"{path}: not OpenCV's YAML: {problem}") from None
+    if not isinstance(tree, dict):
+        raise InputError(f"{path}: allowed: a calibration of OpenCV, a mapping of keys to values")
+    return tree
+
+
+def side(path: Path, tree: dict[str, Any], key: str) -> int:
+    """A size of the image, px."""
+    value = tree.get(key)
+    if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= MOST_PX:
+        raise InputError(
+            f"{path}: {key}: {shown(repr(value))} is not allowed; it should be a whole number from 1 to {MOST_PX}"
+        )
+    return value
+
+
+def matrix(path: Path, tree: dict[str, Any], key: str, shapes: tuple[tuple[int, int], ...]) -> list[float]:
+    """The numbers of a matrix, row by row."""
+    node = tree.get(key)
+    if not isinstance(node, dict):
+        raise InputError(f"{path}: {key}: missing; allowed: a matrix with rows, cols and data")
+    shape, data = (node.get("rows"), node.get("cols")), node.get("data")
+    if shape not in shapes:
+        raise InputError(
+            f"{path}: {key}: {shown(shape[0])} rows and {shown(shape[1])} cols; allowed:"
+            f" {', '.join(f'{rows}x{cols}' for rows, cols in shapes)}"
+        )
+    count = shape[0] * shape[1]
+    if not isinstance(data, list) or len(data) != count or not all(is_number(one) for one in data):
+        raise InputError(f"{path}: {key}: data: allowed: {count} finite numbers")
+    return [float(one) for one in data]
+
+
+def is_number(value: Any) -> bool:
+    """Whether it is a finite one."""
+    return type(value) in (int, float) and abs(value) < 1e12
+
+
+def text(told: Calibration) -> str:
+    """What `read` and OpenCV's FileStorage (4 and 5) read."""
+    fx, (cx, cy) = told.focal_px, told.centre_px
+    return (
+        "%YAML:1.0\n---\n"
+        f"image_width: {told.width_px}\nimage_height: {told.height_px}\n"
+        + layout("camera_matrix", 3, 3, [fx, 0.0, cx, 0.0, fx, cy, 0.0, 0.0, 1.0])
+        + layout("distortion_coefficients", 1, 5, list(told.distortion))
+    )
+
+
+def layout(key: str, rows: int, cols: int, data: list[float]) -> str:
+    """A matrix of 64-bit floats, every digit of them."""
+    numbers = ", ".join(number(one) for one in data)
+    return f"{key}: !!opencv-matrix\n   rows: {rows}\n   cols: {cols}\n   dt: d\n   data: [ {numbers} ]\n"
+
+
+def number(value: float) -> str:
+    """With a point, without which YAML takes 1e-07 for a word."""
+    mantissa, e, exponent = repr(float(value)).partition("e")
+    return f"{mantissa if '.' in mantissa else mantissa + '.0'}{e}{exponent}"

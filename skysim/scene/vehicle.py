@@ -1,0 +1,212 @@
+"""The vehicle as the lab has it: body, bearing, actuators, sensors, what disturbs it. A part of the scene's schema."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field, field_validator, model_validator
+
+from skysim.core.units import (
+    Angles,
+    ConfigModel,
+    Damping,
+    Force,
+    Imbalance,
+    Inertia,
+    Length,
+    Mass,
+    NotNegative,
+    Number,
+    Positive,
+    QuadraticDrag,
+    Stiffness,
+    Time,
+    Torque,
+    Triple,
+)
+
+TorqueLimit = Annotated[Torque, Field(gt=0)]
+TorqueLevel = Annotated[Torque, Field(ge=0)]
+
+
+class WheelsConfig(ConfigModel):
+    """Reaction wheels: every hinge joint `wheel_*` of the model.
+
+    coulomb, viscous   : bearing friction, T = coulomb sign(speed) + viscous speed
+    static_imbalance   : mass times offset of the rotor's centre from its axle; shakes with its speed squared
+    dynamic_imbalance  : product of inertia between axle and a line across it; likewise
+    start_rpm          : speed of each at the start; at rest if left out
+    """
+
+    torque_limit_nm: TorqueLimit = 0.5
+    speed_limit_rpm: Positive = 3000.0
+    coulomb_nm: TorqueLevel = 0.0
+    viscous_nms: Annotated[Damping, Field(ge=0)] = 0.0
+    static_imbalance_kg_m: Annotated[Imbalance, Field(ge=0)] = 0.0
+    dynamic_imbalance_kg_m2: Annotated[Inertia, Field(ge=0)] = 0.0
+    start_rpm: tuple[Number, ...] = ()
+
+    @model_validator(mode="after")
+    def within_limits(self) -> WheelsConfig:
+        if any(abs(rpm) > self.speed_limit_rpm for rpm in self.start_rpm):
+            raise ValueError(f"start_rpm: beyond speed_limit_rpm {self.speed_limit_rpm:g}")
+        return self
+
+
+class FansConfig(ConfigModel):
+    """Fans: every site `fan_*` of the model pushes the vehicle along its own z, forwards and backwards.
+
+    time_constant : of the first-order lag between command and thrust
+    """
+
+    thrust_limit_n: Annotated[Force, Field(gt=0)] = 0.5
+    time_constant_s: Annotated[Time, Field(ge=5e-3)] = 0.2
+
+
+class CmgsConfig(ConfigModel):
+    """Control moment gyroscopes: hinge joints `gimbal_*` and on each the joint `rotor_*` of the same ending.
+
+    steering           : how gimbal rates are found; see `actuators.STEERING`
+    start_deg          : gimbal angles at the start; those of the model if left out
+    rotor_torque_limit : None holds the rotors at their speed; a torque makes them variable-speed CMGs
+    """
+
+    rotor_rpm: Annotated[Number, Field(gt=0, le=60_000)] = 2600.0
+    gimbal_rate_limit_deg_s: Positive = 60.0
+    gimbal_time_constant_s: Annotated[Time, Field(ge=5e-3)] = 0.01
+    steering: Literal["pseudo_inverse", "singularity_robust"] = "singularity_robust"
+    start_deg: tuple[Number, ...] = ()
+    rotor_torque_limit_nm: TorqueLimit | None = None
+
+
+class DragConfig(ConfigModel):
+    """What the air takes from a turn, about each body axis for itself: T = -(viscous + quadratic |rate|) rate."""
+
+    viscous_nms: Annotated[Damping, Field(ge=0)] = 0.0
+    quadratic_nms2: Annotated[QuadraticDrag, Field(ge=0)] = 0.0
+
+
+class CableConfig(ConfigModel):
+    """A cable that hangs on the vehicle and turns it back to (0, 0, 0), like a spring, by the shorter way round."""
+
+    stiffness_nm_rad: Annotated[Stiffness, Field(gt=0)]
+
+
+class DraughtConfig(ConfigModel):
+    """Air of the room: a random torque about each lab axis that forgets itself with the correlation time."""
+
+    rms_nm: tuple[TorqueLevel, TorqueLevel, TorqueLevel]
+    correlation_s: Annotated[Time, Field(gt=0)] = 2.0
+
+
+class DisturbancesConfig(ConfigModel):
+    """Torques that nobody asked for; each is off where it is left out.
+
+    turbine        : what the bearing's jets twist the ball with, constant about the lab's axes
+    earth_rotation : the lab turns with the Earth (`lab` says where), the vehicle's momentum would not
+    """
+
+    turbine_nm: tuple[Torque, Torque, Torque] = (0.0, 0.0, 0.0)
+    earth_rotation: bool = False
+    cable: CableConfig | None = None
+    draught: DraughtConfig | None = None
+
+
+class GyroConfig(ConfigModel):
+    """Three fibre-optic gyroscopes. The defaults are an LN-200's, of which only the first two have a source.
+
+    arw_deg_sqrt_h     : angle random walk
+    bias_deg_h         : bias instability: standard deviation of a Gauss-Markov process with bias_time
+    turn_on_bias_deg_h : constant part of the bias, standard deviation over units
+    scale_ppm, misalignment_arcsec : of each axis, standard deviations over units
+    quantum_arcsec     : step of the angle counter
+    rate_limit_deg_s   : beyond it the output stays at it
+    """
+
+    arw_deg_sqrt_h: NotNegative = 0.07
+    bias_deg_h: NotNegative = 1.0
+    bias_time_s: Annotated[Time, Field(gt=0)] = 300.0
+    turn_on_bias_deg_h: NotNegative = 1.0  # assumed
+    scale_ppm: NotNegative = 100.0  # assumed
+    misalignment_arcsec: NotNegative = 20.0  # assumed
+    quantum_arcsec: NotNegative = 0.4  # assumed
+    rate_limit_deg_s: Positive = 1000.0  # assumed
+
+
+class AccelerometerConfig(ConfigModel):
+    """Three accelerometers, the errors in the gyro's terms. The defaults are `assumed`."""
+
+    vrw_ug_sqrt_hz: NotNegative = 50.0
+    bias_ug: NotNegative = 50.0
+    bias_time_s: Annotated[Time, Field(gt=0)] = 60.0
+    turn_on_bias_ug: NotNegative = 300.0
+    scale_ppm: NotNegative = 300.0
+    misalignment_arcsec: NotNegative = 20.0
+    quantum_um_s: NotNegative = 0.0
+    limit_g: Positive = 40.0
+
+
+class ImuConfig(ConfigModel):
+    """An inertial measurement unit and the navigator that integrates it to 3-2-1 Euler angles.
+
+    earth_rate    : none: the gyros do not feel the Earth turn; uncompensated: they do and the navigator takes it
+                    for the vehicle's; compensated: it takes it away
+    home_error_deg: roll, pitch, yaw by which the vehicle stood wrong when the navigator was zeroed
+    hardware_seed : which unit off the line: its turn-on bias, scale factors and misalignments
+    """
+
+    rate_hz: Annotated[Number, Field(ge=10, le=1000)] = 400.0
+    gyro: GyroConfig = GyroConfig()
+    accelerometer: AccelerometerConfig = AccelerometerConfig()
+    earth_rate: Literal["none", "uncompensated", "compensated"] = "none"
+    home_error_deg: Angles = (0.0, 0.0, 0.0)
+    hardware_seed: Annotated[int, Field(ge=0)] = 200
+
+
+class VehicleConfig(ConfigModel):
+    """What moves: an MJCF file and what the scene declares over it.
+
+    camera       : where its entrance pupil is on the body, its housing with it; where the MJCF has it if left out
+    torque_limit : of each of the ideal torques about body x, y, z
+    wheels, fans, cmgs : the actuators that are switched on; joints of the others are locked
+    """
+
+    model: str
+    mount: Literal["air_bearing", "free"] = "air_bearing"
+    mass_kg: Annotated[Mass, Field(gt=0)] | None = None
+    inertia_kg_m2: tuple[Inertia, Inertia, Inertia] | None = None
+    centre_of_mass_m: tuple[Length, Length, Length] = (0.0, 0.0, 0.0)
+    camera_m: tuple[Length, Length, Length] | None = None
+    tilt_stop_deg: Annotated[Number, Field(gt=0, lt=90)] = 30.0
+    torque_limit_nm: TorqueLimit = 1.0
+    wheels: WheelsConfig | None = None
+    fans: FansConfig | None = None
+    cmgs: CmgsConfig | None = None
+    drag: DragConfig = DragConfig()
+    disturbances: DisturbancesConfig = DisturbancesConfig()
+    imu: ImuConfig | None = None
+
+    @field_validator("inertia_kg_m2")
+    @classmethod
+    def principal_moments(cls, value: Triple | None) -> Triple | None:
+        if value and (min(value) <= 0 or 2 * max(value) > sum(value)):
+            raise ValueError(f"{value} is no rigid body's: each positive, none above the sum of the others")
+        return value
+
+    @model_validator(mode="after")
+    def in_the_room(self) -> VehicleConfig:
+        room = self.disturbances
+        if self.mount == "free" and (
+            any(room.turbine_nm) or room.earth_rotation or room.cable or room.draught
+        ):
+            raise ValueError("disturbances: a free vehicle has none; allowed: mount: air_bearing")
+        if self.mount == "free" and self.imu and self.imu.earth_rate != "none":
+            raise ValueError("imu.earth_rate: a free vehicle is not on the Earth; allowed: none")
+        return self
+
+
+class SiteConfig(ConfigModel):
+    """Where on the Earth the lab stands, and the azimuth of its x axis from north through east."""
+
+    latitude_deg: Annotated[Number, Field(ge=-90, le=90)] = 39.8
+    x_azimuth_deg: Annotated[Number, Field(ge=-360, le=360)] = 90.0

@@ -1,0 +1,3 @@
+"""One run: set up the test bed, step the dynamics, expose the frames, close the loop. Owns the random
+streams.
+"""

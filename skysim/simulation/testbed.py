@@ -1,0 +1,166 @@
+"""A scene set up: vehicle, sources, optics, detector and tracker, before and after its motion is simulated."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from estimator.trackers.pipeline import Report
+from skysim.camera.detector.detector import Chip
+from skysim.camera.optics import Optics
+from skysim.camera.psf.otf import EXTENT
+from skysim.camera.render import Window
+from skysim.core.types import Mount, Sources, Telemetry, Trajectory
+from skysim.dynamics import guidance, imu, multibody
+from skysim.dynamics.multibody.view import mjcf_export
+from skysim.scene.camera import RollingShutterConfig
+from skysim.scene.light import BenchConfig, DomeConfig
+from skysim.scene.motion import PointingConfig
+from skysim.scene.scene import Scene
+from skysim.sources import catalog, dome
+from skysim.sources import stars as star_sources
+from skysim.sources.catalog import known_catalogue
+from skysim.sources.dome import display, surface
+from skysim.sources.dome.led import Emitter
+from skysim.sources.photometry import Band
+from skysim.tracking import factory, settings
+from skysim.tracking.external import interface
+
+
+def window(scene: Scene, index: int, exposure_s: float | None = None) -> Window:
+    """When the chip gathers the light of a frame; for the scene's own exposure if none is given."""
+    shutter = scene.camera.shutter
+    row_time_s = shutter.row_time_s if isinstance(shutter, RollingShutterConfig) else 0.0
+    begin_s = scene.exposure.first_s + index / scene.exposure.rate_hz
+    return Window(begin_s, scene.exposure.time_s if exposure_s is None else exposure_s, row_time_s)
+
+
+SPARE_S = 2e-3  # flown beyond the last exposure
+
+
+@dataclass(frozen=True, slots=True)
+class Testbed:
+    """What a scene becomes before the first frame is kept: hardware, lights and the flight.
+
+    canvas    : (H, W) where the light of one frame after another is drawn; float64 where noise is off, for such a
+                frame is the truth to many digits, and float32 otherwise
+    trajectory: the flight, jitter and all; telemetry: what the vehicle's computers did in it
+    obstacles : what can hide a light; None where the scene has light.occlusion off
+    record    : what the IMU put out, every sample of it; None where there is none
+    reports   : the star tracker's answers to the frames that were taken and solved in flight, for the filter
+    verdicts  : what the filter made of each
+    exposures_s: of each
+    programs  : commands by name, which the scene's tracker may be: the user's, who alone may say what is run
+    endless   : frame follows frame for ever, whatever number the scene has; for `live` alone, which forgets
+    """
+
+    scene: Scene
+    ship: multibody.World
+    mount: Mount
+    sources: Sources
+    emitter: Emitter
+    optics: Optics
+    chip: Chip
+    band: Band
+    canvas: NDArray[Any]
+    trajectory: Trajectory
+    obstacles: multibody.Obstacles | None = None
+    telemetry: Telemetry | None = None
+    record: imu.Increments | None = None
+    reports: dict[int, Report] = field(default_factory=dict)
+    verdicts: dict[int, str] = field(default_factory=dict)
+    exposures_s: dict[int, float] = field(default_factory=dict)
+    programs: Mapping[str, str] = field(default_factory=dict)
+    endless: bool = False
+
+    @property
+    def frames(self) -> float:
+        """How many there are."""
+        return math.inf if self.endless else self.scene.exposure.frames
+
+    @property
+    def flown_s(self) -> float:
+        """How long the flight has to be, for the longest exposure of the last frame."""
+        if self.endless:
+            return math.inf
+        part = self.scene.tracker.exposure_control
+        last = window(self.scene, self.scene.exposure.frames - 1, part.longest_s if part else None)
+        return last.close_s(self.scene.camera.height_px) + SPARE_S
+
+    @property
+    def log(self) -> Telemetry:
+        """The telemetry of a lab that has flown."""
+        assert self.telemetry is not None, "not flown yet"
+        return self.telemetry
+
+
+def build_testbed(scene: Scene, programs: Mapping[str, str] = factory.NO_PROGRAMS) -> Testbed:
+    """The lab on the ground: all but the flight, of which there is the start alone."""
+    settings.believed_settings(scene)  # a wrong name is told before the flight
+    interface.known(scene.tracker.name, programs)  # this one too
+    EXTENT[scene.camera.psf.kind](scene.camera.psf, scene.camera)  # and so is a measured PSF's bad file
+    ship = multibody.build(scene.vehicle)
+    band = Band.of(scene.camera.detector.quantum_efficiency)
+    kind = np.float32 if scene.camera.detector.noise else np.float64
+    mount = multibody.mount(ship)
+    start = lab_from_body_start(scene, mount)
+    return Testbed(
+        scene,
+        ship,
+        mount,
+        light_sources(scene, band),
+        Emitter.of(scene.light.led) if isinstance(scene.light, DomeConfig) else Emitter(),
+        Optics.of(scene.camera),
+        Chip.of(scene.camera),
+        band,
+        np.empty((scene.camera.height_px, scene.camera.width_px), kind),
+        Trajectory.at_rest(start, 1.0),
+        obstacles(scene, ship),
+        programs=programs,
+    )
+
+
+def obstacles(scene: Scene, ship: multibody.World) -> multibody.Obstacles | None:
+    """What can hide a light from the camera, if the scene would have it so; a bench has nothing in its beam."""
+    if not getattr(scene.light, "occlusion", False):
+        return None
+    return multibody.obstacles(
+        ship, surface.build_surface(scene.light.surface) if isinstance(scene.light, DomeConfig) else None
+    )
+
+
+def staged(lab: Testbed) -> str:
+    """The lab as one MJCF text, for MuJoCo's own viewer and for pictures."""
+    return mjcf_export.mjcf(lab.ship, lab.scene, lab.sources, lab.trajectory.lab_from_body[0])
+
+
+def lab_from_body_start(scene: Scene, mount: Mount) -> Rotation:
+    """The attitude at t = 0. Under the stars the lab's axes are those of the ICRS."""
+    start = scene.motion.start
+    if isinstance(start, PointingConfig):
+        return (
+            star_sources.cam_from_icrs(start.ra_deg, start.dec_deg, start.roll_deg).inv()
+            * mount.cam_from_body
+        )
+    return guidance.attitude(start)
+
+
+def light_sources(scene: Scene, band: Band) -> Sources:
+    """Everything that shines, as the band sees it."""
+    if isinstance(scene.light, DomeConfig):
+        return dome.sources(scene.light, band)
+    stars = catalog.read(known_catalogue("light.catalogue", scene.light.catalogue))
+    if isinstance(scene.light, BenchConfig):
+        return display.bench(scene.light, stars, scene.start_time, band)
+    return star_sources.sources(stars, scene.start_time, scene.light.limit_mag, Rotation.identity(), band)
+
+
+def tracker(lab: Testbed) -> factory.Estimator:
+    """The star tracker with what it believes of the hardware."""
+    return factory.tracker(lab.scene, lab.mount, lab.sources, lab.programs)

@@ -1,0 +1,22 @@
+"""The inside of the dome and the LEDs on it, in the lab frame."""
+
+from __future__ import annotations
+
+from skysim.core.types import Sources
+from skysim.scene import light
+from skysim.sources.dome.layout import HOLES as HOLES
+from skysim.sources.dome.layout import LAYOUTS as LAYOUTS
+from skysim.sources.dome.layout import board_of as board_of
+from skysim.sources.dome.layout import cap as cap
+from skysim.sources.dome.layout import patch_boards as patch_boards
+from skysim.sources.dome.surface import SURFACES as SURFACES
+from skysim.sources.dome.surface import Ellipsoid as Ellipsoid
+from skysim.sources.dome.surface import Plane as Plane
+from skysim.sources.dome.surface import Surface as Surface
+from skysim.sources.dome.surface import build_surface
+from skysim.sources.photometry import Band
+
+
+def sources(part: light.DomeConfig, band: Band) -> Sources:
+    """Every LED of the dome, as bright as the chip's band makes it: strength is photo-electrons s^-1 sr^-1."""
+    return LAYOUTS[part.layout.kind](part.layout, build_surface(part.surface), part.led, band)

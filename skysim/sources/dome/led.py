@@ -1,0 +1,210 @@
+"""What an LED sends towards the camera: emission lobe, falloff with distance, and the drive that makes its level.
+
+When a pulse train shines within an exposure is in pulse.py.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from math import ceil, floor, sqrt
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skysim.core.jit import jit
+from skysim.core.types import Floats
+from skysim.scene.leds import (
+    CosineLobeConfig,
+    LedConfig,
+    Lobe,
+    LobeTableConfig,
+    RefreshConfig,
+    SequentialConfig,
+)
+from skysim.sources.photometry import Band, led_strength_e_s_sr, radiant_strength_e_s_sr
+
+Falloff = Callable[[Floats], Floats]
+
+
+def inverse_square(distance_m: Floats) -> Floats:
+    """Flux spreads over a sphere: 1 / d^2, in m^-2."""
+    return 1.0 / distance_m**2
+
+
+FALLOFF: dict[str, Falloff] = {"inverse_square": inverse_square}
+
+
+def cosine_lobe(part: CosineLobeConfig, cos_emission: Floats) -> Floats:
+    """A lamp's radiant intensity as a power of the cosine: cos^m; m = 1 is Lambert's disc, seen foreshortened."""
+    return np.asarray(np.maximum(cos_emission, 0.0) ** part.exponent)
+
+
+def table_lobe(part: LobeTableConfig, cos_emission: Floats) -> Floats:
+    """A measured lobe: relative intensity linear between the angles measured, which neither overshoots nor ripples.
+
+    Within the first angle it is the first value; beyond the last it is nothing.
+    """
+    angle_deg = np.degrees(np.arccos(np.clip(cos_emission, -1.0, 1.0)))
+    return np.asarray(np.interp(angle_deg, part.angle_deg, part.intensity, right=0.0))
+
+
+# Each of (its part of the scene, cosine of the angle from the LED's normal) -> intensity, 1 on the normal.
+LOBES: dict[str, Callable[[Any, Floats], Floats]] = {"cosine": cosine_lobe, "table": table_lobe}
+
+
+@dataclass(frozen=True, slots=True)
+class Emitter:
+    """How a dome's LEDs shine: the laws of distance and of angle. By default a Lambertian disc's.
+
+    falloff : a key of FALLOFF
+    lobe    : its kind is a key of LOBES
+    """
+
+    falloff: str = "inverse_square"
+    lobe: Lobe = field(default_factory=CosineLobeConfig)
+
+    @classmethod
+    def of(cls, led: LedConfig) -> Emitter:
+        """The laws that a scene names."""
+        return cls(led.falloff, led.lobe)
+
+
+def irradiance_e_s_m2(
+    strength_e_s_sr: Floats, emitter: Emitter, cos_emission: Floats, cos_incidence: Floats, distance_m: Floats
+) -> Floats:
+    """Light through a square metre of the aperture: E = I_0 L(theta) cos(phi) f(d), zero behind either.
+
+    strength_e_s_sr : photo-electrons s^-1 sr^-1 along the LED's normal
+    cos_emission    : of theta, at the LED from its normal; L is the emitter's lobe
+    cos_incidence   : of phi, at the aperture from the boresight
+    distance_m      : f is the emitter's falloff
+    The arrays broadcast. Returns photo-electrons s^-1 m^-2.
+    """
+    lit = (np.asarray(cos_emission) > 0) & (np.asarray(cos_incidence) > 0)
+    emitted = LOBES[emitter.lobe.kind](emitter.lobe, cos_emission)
+    return np.where(
+        lit, strength_e_s_sr * emitted * cos_incidence * FALLOFF[emitter.falloff](distance_m), 0.0
+    )
+
+
+def full_e_s_sr(led: LedConfig, band: Band) -> float:
+    """An LED at full brightness as the chip counts it: photo-electrons s^-1 sr^-1 along its normal."""
+    if led.intensity_cd is not None:
+        return float(led_strength_e_s_sr(led.intensity_cd, led.spectrum, band))
+    return float(radiant_strength_e_s_sr(led.radiant_intensity_w_sr or 0.0, led.spectrum, band))
+
+
+class Lamps(NamedTuple):
+    """What a drive has to make, (N,) each.
+
+    level : share of full brightness
+    board : which board each LED sits on
+    row   : where each pixel's row is on its panel, from 0 at the top to below 1; 0 for LEDs
+    """
+
+    level: Floats
+    board: NDArray[np.int64]
+    row: Floats | float = 0.0
+
+
+class Pulses(NamedTuple):
+    """What it makes of it, (N,) each: lit from start_s for on_s in every period_s, so strong while it is lit."""
+
+    period_s: Floats
+    start_s: Floats
+    on_s: Floats
+    strength: Floats
+
+
+def direct(_led: LedConfig, lamps: Lamps, _rng: np.random.Generator) -> Pulses:
+    """Direct current: the LED never goes out, and its level is in its strength."""
+    one = np.ones(len(lamps.level))
+    return Pulses(one, 0 * one, one, lamps.level)
+
+
+def pwm(led: LedConfig, lamps: Lamps, rng: np.random.Generator) -> Pulses:
+    """Hardware PWM: V_avg = D V_max, D = t_on / T (thesis, eqs 35 and 36); phases are random, T is led.pwm_period_s."""
+    count = len(lamps.level)
+    start_s = rng.uniform(0, led.pwm_period_s, count)
+    return Pulses(np.full(count, led.pwm_period_s), start_s, lamps.level * led.pwm_period_s, np.ones(count))
+
+
+def sequential(led: LedConfig, lamps: Lamps, rng: np.random.Generator) -> Pulses:
+    """An Arduino switches one LED after another, so that each waits for all: D_i = t_on,i / sum T (thesis, eq. 37).
+
+    Each LED of a controller has a slot T, t_on is its level of it, and the controller's cycle is the sum of its
+    slots. The controllers' phases are random. The microcontroller's own delays are left out, as in the thesis.
+    """
+    part, count = led.drive, len(lamps.level)
+    assert isinstance(part, SequentialConfig)
+    if part.controller == "board":
+        group = lamps.board
+    elif part.controller == "dome":
+        group = np.zeros(count, dtype=np.int64)
+    else:
+        group = np.arange(count) // part.controller
+    _, controller, sharing = np.unique(group, return_inverse=True, return_counts=True)
+    order = np.argsort(controller, kind="stable")
+    turn = np.empty(count)  # whose turn it is on its controller: 0, 1, ...
+    turn[order] = np.arange(count) - np.repeat(np.cumsum(sharing) - sharing, sharing)
+    cycle_s = sharing * np.float64(part.slot_s)
+    start_s = rng.uniform(0, cycle_s)[controller] + turn * part.slot_s
+    return Pulses(cycle_s[controller], start_s, lamps.level * part.slot_s, np.ones(count))
+
+
+def refresh(led: LedConfig, lamps: Lamps, rng: np.random.Generator) -> Pulses:
+    """A panel's rows are lit one after another, once a frame: on for duty / rate, a row later by its share of 1 / rate.
+
+    A grey is in the strength, for the liquid crystal stays as it is. All pixels of a row shine together; the panel's
+    phase is random. Mean light is level * duty; over an exposure of (n + f) frames, n whole, it flickers by
+    sqrt(f (1 - f) - duty / 3) / (n + f) where duty <= f <= 1 - duty, and not at all where f = 0 (reference 1.3).
+    """
+    part, one = led.drive, np.ones(len(lamps.level))
+    assert isinstance(part, RefreshConfig)
+    period_s = 1 / part.rate_hz
+    return Pulses(
+        one * period_s, one * (rng.random() + lamps.row) * period_s, one * part.duty * period_s, lamps.level
+    )
+
+
+# Each of (the LEDs' kind, what each LED has to be, the hardware's random stream) -> when it is lit and how strong.
+DRIVES: dict[str, Callable[[LedConfig, Lamps, np.random.Generator], Pulses]] = {
+    "direct": direct,
+    "pwm": pwm,
+    "sequential": sequential,
+    "refresh": refresh,
+}
+
+
+@jit
+def lit_moments_s(begin_s: float, end_s: float, period_s: float, start_s: float, on_s: float) -> Any:
+    """Seconds of [begin, end] during which a pulse train shines, their mean time and its standard deviation.
+
+    It is lit from start_s for on_s in every period_s, before and after. Exact for any interval: the first and the
+    last pulse are cut where it ends; the n whole ones between have the moments of a comb, whose centres' variance
+    is period^2 (n^2 - 1) / 12. (0, the middle, 0) where it is dark.
+    """
+    middle = (begin_s + end_s) / 2
+    if on_s >= period_s:
+        return end_s - begin_s, middle, (end_s - begin_s) / sqrt(12.0)
+    first = floor((begin_s - start_s - on_s) / period_s) + 1
+    last = ceil((end_s - start_s) / period_s) - 1
+    lit, sum1, sum2 = 0.0, 0.0, 0.0
+    for j in range(first, last + 1, max(last - first, 1)):  # the two at the ends, or the only one
+        up = max(start_s + j * period_s, begin_s)
+        width = min(start_s + j * period_s + on_s, end_s) - up
+        if width > 0:
+            centre = up + width / 2 - middle
+            lit, sum1, sum2 = lit + width, sum1 + width * centre, sum2 + width * (centre**2 + width**2 / 12)
+    n = last - first - 1
+    if n > 0:
+        centre = start_s + (first + 1) * period_s + on_s / 2 + (n - 1) * period_s / 2 - middle
+        lit += n * on_s
+        sum1 += n * on_s * centre
+        sum2 += n * on_s * (centre**2 + (period_s**2 * (n * n - 1) + on_s**2) / 12)
+    if lit <= 0:
+        return 0.0, middle, 0.0
+    mean = sum1 / lit
+    return lit, middle + mean, sqrt(max(sum2 / lit - mean**2, 0.0))

@@ -1,0 +1,109 @@
+"""Catalogue stars -> apparent directions at a date, and photo-electrons a square metre of the aperture."""
+
+from __future__ import annotations
+
+import datetime
+
+import erfa
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from skysim.core.types import Floats, Sources
+from skysim.core.units import in_utc
+from skysim.sources.catalog import Catalogue
+from skysim.sources.photometry import Band, star_flux_e_s_m2
+
+J2000_TT = datetime.datetime(2000, 1, 1, 12)
+# The leap seconds have stood at 37 since 2017. Half a minute of error in the past moves a star by 0.1 mas,
+# so a table of them (and the warnings of one that has grown old) would buy nothing.
+TT_MINUS_UTC = datetime.timedelta(seconds=69.184)
+DAY = datetime.timedelta(days=1)
+ARCSEC_RAD = erfa.DAS2R
+C_AU_DAY = erfa.DAYSEC / erfa.AULT
+C_M_S = erfa.CMPS
+AT_REST = (0.0, 0.0, 0.0)
+
+
+def apparent(
+    catalogue: Catalogue, time: datetime.datetime, observer_velocity_m_s: Floats | tuple[float, ...] = AT_REST
+) -> Floats:
+    """Stars move, the Earth moves, and light takes its time: where they are seen from on a date.
+
+    time                  : UTC (a naive datetime is UTC)
+    observer_velocity_m_s : (3,) relative to the Earth's centre, ICRS axes; an orbit's 7.6 km/s is 5.2", the
+                            ground's 0.46 km/s is 0.3"
+    Returns (N, 3) unit vectors in ICRS axes. In order:
+    proper motion and annual parallax (up to 0.75", alpha Centauri), `erfa.pmpx`;
+    the Sun's deflection of light (4 mas at 90 degrees, 1.7" at its limb), `erfa.ldsun`;
+    aberration of the observer's barycentric velocity (up to 20.5"), `erfa.ab`; the Earth from `erfa.epv00`.
+    Left out: radial velocity (unknown to the catalogue, < 2 mas in 35 years but for a handful of stars), the
+    planets' deflection, the observer's distance from the Earth's centre (< 0.04 mas).
+    Source: IERS Conventions 2010, chapters 5 and 7; the SOFA routines of these names.
+    """
+    tt_day = days_since_j2000_tt(time)
+    heliocentric, barycentric = erfa.epv00(erfa.DJ00, tt_day)  # au, au/day; TT for TDB is 2 ms off
+    years = tt_day / erfa.DJY + 2000.0 - catalogue.epoch_jyear
+    geometric = erfa.pmpx(
+        catalogue.ra_rad,
+        catalogue.dec_rad,
+        catalogue.pm_ra_rad_yr / np.cos(catalogue.dec_rad),  # SOFA wants the rate of right ascension itself
+        catalogue.pm_dec_rad_yr,
+        catalogue.parallax_rad / ARCSEC_RAD,
+        0.0,
+        years,
+        barycentric["p"],
+    )
+    sun_au = float(np.linalg.norm(heliocentric["p"]))
+    bent = erfa.ldsun(geometric, heliocentric["p"] / sun_au, sun_au)
+    beta = barycentric["v"] / C_AU_DAY + np.asarray(observer_velocity_m_s, dtype=float) / C_M_S
+    seen = erfa.ab(bent, beta, sun_au, np.sqrt(1.0 - beta @ beta))
+    return np.asarray(seen / np.linalg.norm(seen, axis=-1, keepdims=True))
+
+
+def days_since_j2000_tt(time: datetime.datetime) -> float:
+    """Terrestrial Time as days from J2000.0 (JD 2451545.0)."""
+    return (in_utc(time) + TT_MINUS_UTC - J2000_TT) / DAY
+
+
+def sources(
+    stars: Catalogue, time: datetime.datetime, limit_mag: float, lab_from_icrs: Rotation, band: Band
+) -> Sources:
+    """The stars to a limiting magnitude as points at infinity that always shine.
+
+    limit_mag     : faintest Johnson V kept
+    lab_from_icrs : where the laboratory's axes stand among the stars at that moment
+    band          : what the chip makes of their light
+    Returns Sources in lab axes: place is (direction, 0), strength photo-electrons s^-1 m^-2 from V and both colours.
+    """
+    kept = stars.take(stars.v_mag <= limit_mag)
+    count = len(kept)
+    direction = lab_from_icrs.apply(apparent(kept, time)) if count else np.zeros((0, 3))
+    zero, one = np.zeros(count), np.ones(count)
+    return Sources(
+        id=kept.hip,
+        place=np.column_stack([direction, zero]),
+        normal=np.zeros((count, 3)),
+        radius_m=zero,
+        strength=star_flux_e_s_m2(kept.v_mag, kept.b_v, kept.v_i, band),
+        period_s=one,
+        start_s=zero,
+        on_s=one,
+        magnitude=kept.v_mag,
+    )
+
+
+def cam_from_icrs(ra_deg: float, dec_deg: float, roll_deg: float) -> Rotation:
+    """Point a camera: boresight at (ra, dec), image's up direction at position angle roll.
+
+    ra_deg, dec_deg : ICRS place of the boresight
+    roll_deg        : position angle of the image's up (-y) at the boresight, from north through east
+    Returns cam_from_icrs; its matrix has the camera's x (right), y (down), z (boresight) as rows.
+    Up is cos(roll) N + sin(roll) E and x = y × z, so that at roll 0 north is up and east is to the left: the
+    sky is seen from inside. At the poles N and E are those of the meridian ra_deg.
+    """
+    ra, dec, roll = np.radians([ra_deg, dec_deg, roll_deg])
+    east = np.array([-np.sin(ra), np.cos(ra), 0.0])
+    north = np.array([-np.sin(dec) * np.cos(ra), -np.sin(dec) * np.sin(ra), np.cos(dec)])
+    z = np.array([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
+    y = -(np.cos(roll) * north + np.sin(roll) * east)
+    return Rotation.from_matrix(np.array([np.cross(y, z), y, z]))

@@ -1,0 +1,91 @@
+"""Read and write the dome map that `skysim survey` measures."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skysim.core.errors import InputError
+from skysim.core.files import header_numbers, write_table
+from skysim.core.types import Floats
+
+
+@dataclass(frozen=True, slots=True)
+class DomeMap:
+    """A dome and its camera as a survey found them, in the lab frame; what `tracker.map` reads.
+
+    id, position_m : (N,) and (N, 3) of the LEDs surveyed, m;  sigma_m : (N,) of a place, rms of the three axes
+    camera_body_m  : (3,) the entrance pupil in the body frame;  lever_sigma_m : of it, rms of the three axes
+    size_px        : width and height of the chip
+    focal_px, centre_px, distortion (k1, k2, p1, p2, k3), and the standard deviation of each number; 0 where it was held
+    """
+
+    id: NDArray[np.int64]
+    position_m: Floats
+    sigma_m: Floats
+    camera_body_m: Floats
+    lever_sigma_m: float
+    size_px: tuple[int, int]
+    focal_px: float
+    focal_sigma_px: float
+    centre_px: tuple[float, float]
+    centre_sigma_px: tuple[float, float]
+    distortion: tuple[float, float, float, float, float]
+    distortion_sigma: tuple[float, float, float, float, float]
+
+
+MAP_COLUMNS = ("id", "x_m", "y_m", "z_m", "sigma_m")
+
+# Numbers in the header of a dome's map, and how many.
+MAP_META = {
+    **{"size_px": 2, "focal_px": 1, "focal_sigma_px": 1, "centre_px": 2, "centre_sigma_px": 2},
+    **{"distortion": 5, "distortion_sigma": 5, "camera_body_m": 3, "lever_sigma_m": 1},
+}
+
+
+def write_dome_map(path: Path, dome: DomeMap) -> None:
+    """A surveyed dome as ECSV: one row an LED, the camera in the header."""
+    from astropy.table import Table
+
+    table = Table(dict(zip(MAP_COLUMNS, (dome.id, *dome.position_m.T, dome.sigma_m), strict=True)))
+    table.meta = {key: np.array(getattr(dome, key)).tolist() for key in MAP_META}
+    write_table(path, table)
+
+
+def read_dome_map(path: Path) -> DomeMap:
+    """What `write_dome_map` wrote. Raises BadInput with one line for a file that is none."""
+    import warnings
+
+    from astropy.table import Table
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            table = Table.read(path, format="ascii.ecsv")
+    except Exception as error:  # of a file that is no ECSV astropy says whatever its parsers stumble over
+        raise InputError(f"{path}: no ECSV table: {' '.join(str(error).split())[:120]}") from None
+    missing = [name for name in MAP_COLUMNS if name not in table.colnames]
+    if missing or not len(table):
+        what = f"no column {missing[0]}" if missing else "no LED"
+        raise InputError(f"{path}: {what}; allowed: a map that skysim survey wrote")
+    try:
+        numbers = np.column_stack([np.ma.filled(table[name].astype(float), np.nan) for name in MAP_COLUMNS])
+    except (TypeError, ValueError):
+        raise InputError(f"{path}: allowed: numbers in the columns {', '.join(MAP_COLUMNS)}") from None
+    wrong = np.flatnonzero(~np.isfinite(numbers).all(axis=1) | (numbers[:, 4] <= 0))
+    if len(wrong):
+        raise InputError(f"{path}: row {wrong[0] + 1}: allowed: finite numbers, and a sigma_m above 0")
+    id_, count = np.unique(numbers[:, 0].astype(np.int64), return_counts=True)
+    if count.max() > 1:
+        raise InputError(f"{path}: LED {id_[count > 1][0]} stands {count.max()} times; allowed: once")
+    meta = {key: header_numbers(path, table.meta, key, count) for key, count in MAP_META.items()}
+    told: dict[str, Any] = {key: value[0] if len(value) == 1 else tuple(value) for key, value in meta.items()}
+    told["size_px"] = tuple(round(side) for side in meta["size_px"])
+    told["camera_body_m"] = np.array(meta["camera_body_m"])
+    return DomeMap(
+        id=numbers[:, 0].astype(np.int64), position_m=numbers[:, 1:4], sigma_m=numbers[:, 4], **told
+    )

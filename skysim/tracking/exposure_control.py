@@ -1,0 +1,56 @@
+"""Automatic exposure: the next exposure time from the frame before."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from estimator.core.errors import ImageError
+from estimator.core.types import FramePriors
+from estimator.detection.detect import DETECTORS
+from estimator.trackers.exposure_control import Control, Exposure, Observation, observe, step
+from estimator.trackers.pipeline import Settings
+from skysim.core.types import Frame
+from skysim.scene.scene import Scene
+from skysim.tracking.settings import believed_settings
+
+
+class ExposureController:
+    """The camera's control: how long to expose the next frame, told by the one before.
+
+    exposure_s : of the next frame; always the scene's `exposure.time` without `tracker.exposure_control`
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        self.control, self.settings = exposure_control(scene), believed_settings(scene)
+        self.exposure_s = scene.exposure.time_s
+
+    def see(self, frame: Frame) -> None:
+        """Take note of the frame that was exposed for `exposure_s`."""
+        if self.control:
+            state = Exposure(frame.exposure_s)
+            self.exposure_s = step(state, observed(self.settings, self.control, frame), self.control).time_s
+
+
+def exposure_control(scene: Scene) -> Control | None:
+    """The constants of the chart, as the scene has them; None where exposures are fixed."""
+    part = scene.tracker.exposure_control
+    return Control(**dict(part)) if part else None
+
+
+def observed(settings: Settings, control: Control, frame: Frame) -> Observation:
+    """What the image processing says of a frame: objects that are no stars (defects, tracks, the Moon) do not count.
+
+    A full pixel is one near the value at which this camera's are cut off.
+    """
+    try:
+        blobs = DETECTORS[settings.detector](
+            frame.image_dn,
+            settings.threshold_sigma,
+            settings.min_area_px,
+            settings.max_blobs,
+            FramePriors(None, settings.saturation),
+        )
+    except ImageError:  # a coarse converter's frame may hold one value alone: there is nothing in it
+        return observe(frame.image_dn, np.empty((0, 4), np.int64), settings.saturation, control)
+    box_px = blobs.box_px[blobs.flag & settings.reject == 0]
+    return observe(frame.image_dn, box_px, settings.saturation, control)

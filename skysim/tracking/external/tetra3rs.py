@@ -1,0 +1,82 @@
+"""tetra3rs (github.com/ssmichael1/tetra3rs, MIT) as a star tracker: its own catalogue (Gaia), centroids and solver.
+
+The entry point `tetra3rs`; the package comes with the extra `oracle`. Options, from `tracker.options`:
+fast : its single-pass centroiding in place of the full one;  sigma : threshold;  brightest : most centroids
+limit_mag : of its catalogue; left out, it takes as many stars as the field asks for
+"""
+
+from __future__ import annotations
+
+import datetime
+from typing import Any
+
+import numpy as np
+
+from skysim.core.units import in_utc
+from skysim.tracking.external.interface import SOLVED, Answer, Picture, Setup
+
+WIDER = 1.1  # than the field: for what patterns are made
+OPTIONS = ("fast", "sigma", "brightest", "limit_mag")
+
+
+class Tetra3rs:
+    """Lost in space at every frame. The camera is believed calibrated, the observer on Earth."""
+
+    def __init__(self, setup: Setup) -> None:
+        """Raises ValueError for what it cannot work with, ImportError where it is not installed."""
+        if setup.reference != "icrs":
+            raise ValueError("tetra3rs knows the stars alone; allowed: scenes with light.kind: stars")
+        strange = [name for name in setup.options if name not in OPTIONS]
+        if strange:
+            raise ValueError(f"tracker.options: {strange[0]!r} is none of {', '.join(OPTIONS)}")
+        try:
+            import tetra3rs
+        except ImportError:
+            raise ImportError("tetra3rs is not installed; allowed: pip install 'skysim[oracle]'") from None
+        self.options = setup.options
+        fast = setup.options.get("fast", False)
+        self.extract = tetra3rs.extract_centroids_fast if fast else tetra3rs.extract_centroids
+        self.camera = camera(tetra3rs, setup)
+        self.middle_px = middle_px(setup)
+        moment = in_utc(datetime.datetime.fromisoformat(setup.time_utc))
+        self.velocity_km_s = tetra3rs.earth_barycentric_velocity(moment)
+        self.database: Any = tetra3rs.SolverDatabase.generate_from_gaia(
+            max_fov_deg=self.camera.fov_deg * WIDER,
+            star_max_magnitude=setup.options.get("limit_mag"),
+            epoch_proper_motion_year=moment.year + moment.timetuple().tm_yday / 365.25,
+        )
+
+    def solve(self, picture: Picture) -> Answer:
+        """Its quaternion is scalar first, ICRS to camera; its covariance is of other angles and is not told."""
+        found = self.extract(
+            picture.image_dn,
+            sigma_threshold=self.options.get("sigma", 5.0),
+            max_centroids=self.options.get("brightest", 40),
+            threads=1,
+        )
+        told = self.database.solve_from_centroids(
+            found.centroids, camera_model=self.camera, observer_velocity_km_s=self.velocity_km_s
+        )
+        xy_px = np.array([(one.x, one.y) for one in found.centroids]).reshape(-1, 2) + self.middle_px
+        if not told:
+            return Answer(str(told.status).replace("_", " "), centroids_px=xy_px)
+        w, x, y, z = told.quaternion
+        return Answer(SOLVED, [x, y, z, w], centroids_px=xy_px)
+
+
+def middle_px(setup: Setup) -> Any:
+    """(2,) of the image, from which tetra3rs counts pixels."""
+    return np.array([(setup.width_px - 1) / 2, (setup.height_px - 1) / 2])
+
+
+def camera(tetra3rs: Any, setup: Setup) -> Any:
+    """Its camera model: the same polynomial of distortion, but in pixels, so that coefficients have powers of 1/f."""
+    f, (k1, k2, p1, p2, k3) = setup.focal_px, setup.distortion
+    bent = tetra3rs.RadialDistortion(k1=k1 / f**2, k2=k2 / f**4, k3=k3 / f**6, p1=p1 / f, p2=p2 / f)
+    return tetra3rs.CameraModel(
+        f,
+        setup.width_px,
+        setup.height_px,
+        crpix=(np.array(setup.centre_px) - middle_px(setup)).tolist(),
+        distortion=bent if any(setup.distortion) else None,
+    )

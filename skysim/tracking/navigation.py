@@ -1,0 +1,148 @@
+"""On-board navigation: IMU, attitude filter and what each controller is given as attitude."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from estimator.core.types import Attitude
+from estimator.filter.mekf import GyroModel, Mekf
+from skysim.core import quaternion
+from skysim.core.types import Floats, Mount
+from skysim.core.units import ARCSEC_RAD
+from skysim.dynamics import imu
+from skysim.scene.scene import Scene
+from skysim.scene.tracker import FilterConfig
+
+
+class Navigation:
+    """What the vehicle believes of its attitude: gyros added up, and corrected by the star tracker.
+
+    scene : with `vehicle.imu`, and `filter` where there is one
+    lab_from_body_wxyz : (4,) the true attitude at the start, when the navigator is zeroed
+    place_body_m, gravity_m_s2 : of the accelerometers
+    records : whether all that the unit put out is kept, for `record`
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        mount: Mount,
+        lab_from_body: Rotation,
+        place_body_m: Floats,
+        gravity_m_s2: float,
+        rng: np.random.Generator,
+        records: bool = True,
+    ) -> None:
+        part = scene.vehicle.imu
+        assert part is not None
+        self.unit = imu.Unit.of(part, rng)
+        self.place_body_m, self.gravity_m_s2 = place_body_m, gravity_m_s2
+        self.body_from_cam = mount.cam_from_body.inv()
+        self.step_s = 1 / part.rate_hz
+        self.samples = 0
+        earth = imu.earth_rate_lab_rad_s(scene.lab)
+        self.earth_felt_rad_s = earth * (part.earth_rate != "none")
+        self.earth_known_rad_s = earth * (part.earth_rate == "compensated")
+        believed = at_home(lab_from_body, part.home_error_deg)
+        self.navigator = imu.Navigator(believed.as_quat(scalar_first=True), self.earth_known_rad_s)
+        self.filter = mekf(scene.filter, believed) if scene.filter else None
+        self.records, self.measured = records, list[imu.Increments]()
+        self.rate_rad_s = np.zeros(3)
+        self.saturated = False
+
+    def feel(self, now_s: float, t_s: Floats, lab_from_body_wxyz: Floats, rate_body_rad_s: Floats) -> None:
+        """The unit's samples up to now, from the knots (K,), (K, 4), (K, 3) of the flight since the last call."""
+        due = int(now_s / self.step_s + 1e-6) - self.samples
+        if due < 1:
+            return
+        ends_s = (self.samples + 1 + np.arange(due)) * np.float64(self.step_s)
+        self.samples += due
+        ideal = imu.felt(
+            t_s,
+            lab_from_body_wxyz,
+            rate_body_rad_s,
+            ends_s,
+            self.step_s,
+            self.place_body_m,
+            self.gravity_m_s2,
+            self.earth_felt_rad_s,
+        )
+        measured = self.unit.measure(ideal)
+        if self.records:
+            self.measured.append(measured)
+        self.navigator.add(measured)
+        self.saturated = bool(measured.saturated.any())
+        known = self.earth_body_rad_s(self.navigator.lab_from_body_wxyz)
+        self.rate_rad_s = measured.angle_rad.mean(axis=0) / self.step_s - known
+        if self.filter:
+            known = self.earth_body_rad_s(self.attitude_wxyz("filter"))
+            self.filter.propagate(ends_s, measured.angle_rad - known * self.step_s, measured.saturated)
+
+    def record(self) -> imu.Increments:
+        """All that the unit put out so far."""
+        columns = zip(
+            *((m.t_s, m.angle_rad, m.velocity_m_s, m.saturated, m.overloaded) for m in self.measured),
+            strict=True,
+        )
+        t_s, angle, velocity, saturated, overloaded = (np.concatenate(column) for column in columns)
+        return imu.Increments(t_s, self.step_s, angle, velocity, saturated, overloaded)
+
+    def apparent_bias_rad_s(self, lab_from_body_wxyz: Floats, rate_body_rad_s: Floats) -> Floats:
+        """(3,) what the gyros show too much at that true attitude and rate (3,), noise apart.
+
+        Their bias, what scale factors and misalignments make of the rate, and the Earth where nobody takes it away.
+        """
+        unknown = self.earth_felt_rad_s - self.earth_known_rad_s
+        earth = quaternion.apply(quaternion.inverse(lab_from_body_wxyz), unknown)
+        return self.unit.gyro_bias_rad_s + self.unit.gyro.matrix @ rate_body_rad_s - rate_body_rad_s + earth
+
+    def earth_body_rad_s(self, lab_from_body_wxyz: Floats) -> Floats:
+        """(3,) what is taken away for the Earth's turning, in body axes."""
+        return quaternion.apply(quaternion.inverse(lab_from_body_wxyz), self.earth_known_rad_s)
+
+    def see(self, t_s: float, answer: Attitude) -> str:
+        """A star tracker's solution for mid-exposure t_s; what the filter made of it."""
+        if self.filter is None or answer.cam_from_ref is None or answer.covariance_rad2 is None:
+            return answer.status
+        body_from_cam = self.body_from_cam.as_matrix()
+        covariance = body_from_cam @ answer.covariance_rad2 @ body_from_cam.T
+        return self.filter.update(t_s, self.body_from_cam * answer.cam_from_ref, covariance).status
+
+    def attitude_wxyz(self, feedback: str) -> Floats:
+        """(4,) lab_from_body as the navigator or the filter has it."""
+        if feedback == "imu" or self.filter is None:
+            return self.navigator.lab_from_body_wxyz
+        return self.filter.ref_from_body_wxyz
+
+    def rate(self, feedback: str) -> Floats:
+        """(3,) the body's rate in the lab as either has it, the mean over the last tick."""
+        return self.rate_rad_s if feedback == "imu" or self.filter is None else self.filter.rate_rad_s
+
+
+def at_home(lab_from_body: Rotation, error_deg: tuple[float, float, float]) -> Rotation:
+    """What the navigator takes the attitude for when it is zeroed: the true one less the error in roll, pitch, yaw."""
+    yaw, pitch, roll = lab_from_body.as_euler("ZYX", degrees=True)
+    wrong = [yaw - error_deg[2], pitch - error_deg[1], roll - error_deg[0]]
+    return Rotation.from_euler("ZYX", wrong, degrees=True)
+
+
+def mekf(part: FilterConfig, lab_from_body: Rotation) -> Mekf:
+    """The attitude filter at the start, its reference the lab."""
+    hour_s = 3600.0
+    gyro = GyroModel(
+        math.radians(part.arw_deg_sqrt_h) / math.sqrt(hour_s),
+        math.radians(part.bias_deg_h) / hour_s,
+        part.bias_time_s,
+    )
+    return Mekf(
+        gyro,
+        0.0,
+        lab_from_body.inv(),
+        math.radians(part.start_deg),
+        math.radians(part.start_bias_deg_h) / hour_s,
+        part.floor_arcsec * ARCSEC_RAD,
+        part.gate_sigma,
+    )

@@ -1,0 +1,48 @@
+"""What came from outside is shown as it is: no markup of ours, and nothing that a terminal obeys."""
+
+from __future__ import annotations
+
+import io
+import sys
+
+import pytest
+
+from skysim.apps.cli import terminal
+from skysim.experiments.study.execution.runner import Progress
+from skysim.tracking.external.interface import Answer, checked
+
+HOSTILE = "m[red].png [/b] no match [/tmp/x] :bug: \\"
+
+
+class Screen(io.StringIO):
+    """A terminal."""
+
+    def isatty(self) -> bool:
+        return True
+
+
+def test_a_table_shows_cells_heads_and_title_as_they_are(capsys: pytest.CaptureFixture[str]) -> None:
+    terminal.print_table(HOSTILE, ["file", HOSTILE], [["a[/b]/m[red].png", terminal.inked("WRONG", "red")]])
+    title, heads, line = capsys.readouterr().out.splitlines()
+    assert title.strip() == HOSTILE
+    assert heads.split(maxsplit=1)[1].strip() == HOSTILE
+    assert line.split() == ["a[/b]/m[red].png", "WRONG"]
+
+
+def test_bars_show_a_title_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setenv("COLUMNS", "200")
+    monkeypatch.setattr(sys, "stderr", screen := Screen())
+    assert list(terminal.progress([1, 2], 2, HOSTILE)) == [1, 2]
+    with terminal.watched("watched " + HOSTILE) as watch:
+        watch(1.0, 1.0)
+    with terminal.counted("counted " + HOSTILE, 2) as watch_trials:
+        watch_trials(Progress(2, 2))
+    for name in ("", "watched ", "counted "):
+        assert name + HOSTILE in screen.getvalue()
+
+
+def test_what_a_tracker_says_moves_no_cursor(capsys: pytest.CaptureFixture[str]) -> None:
+    assert checked(Answer("lost \x1b[2J\x07\ud800 in\u202e space")).status == "lost ?[2J?? in? space"
+    terminal.complain("a\x1b[31m.png: no such\nfile")
+    assert capsys.readouterr().err == "skysim: a?[31m.png: no such file\n"

@@ -1,0 +1,252 @@
+"""A server of the lab's page and a browser for it: fixtures and helpers of test_lab_page and test_lab_work."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from skysim.core.paths import ROOT
+
+CHROMIUM = next(
+    (found for name in ("chromium", "chromium-browser", "google-chrome") if (found := shutil.which(name))), ""
+)
+PICTURES = ROOT / "out" / "screenshots"
+SLOW_MS = 600_000  # a first compilation on a busy machine
+QUICK_MS = 90_000
+WIDE, NARROW = {"width": 1920, "height": 1080}, {"width": 1280, "height": 800}
+
+
+class Server:
+    """A process that serves the page, with a folder of its own."""
+
+    def __init__(self, folder: Path, *told: str, host: str = "127.0.0.1") -> None:
+        with socket.socket() as free:
+            free.bind(("127.0.0.1", 0))
+            self.port = free.getsockname()[1]
+        self.folder, self.out = folder, folder / "out"
+        command = [sys.executable, "-m", "skysim", "lab", "shefex2", "--no-open", "--port", str(self.port)]
+        place = ["--host", host, "--folder", str(folder), "--out", str(self.out)]
+        # With pytest's own variable NiceGUI takes the server for a test of itself.
+        environment = {name: value for name, value in os.environ.items() if name != "PYTEST_CURRENT_TEST"}
+        self.process = subprocess.Popen(
+            [*command, *place, *told], cwd=ROOT, env=environment, start_new_session=True
+        )
+        self.url = f"http://127.0.0.1:{self.port}/"
+
+    def __enter__(self) -> Server:
+        for _ in range(1200):
+            with contextlib.suppress(OSError):
+                self.status()
+                return self
+            assert self.process.poll() is None, "the server ended"
+            time.sleep(0.1)
+        raise TimeoutError("the server does not answer")
+
+    def __exit__(self, *_: object) -> None:
+        os.killpg(self.process.pid, signal.SIGTERM)
+        self.process.wait(60)
+
+    def status(self, path: str = "", **headers: str) -> int:
+        """What a request without a browser gets."""
+        asked = urllib.request.Request(self.url + path, headers=headers)
+        try:
+            return int(urllib.request.urlopen(asked, timeout=5).status)
+        except urllib.error.HTTPError as error:
+            return error.code
+
+    def children(self, word: str) -> list[Any]:
+        """Its processes whose command has a word."""
+        psutil = pytest.importorskip("psutil")
+        found = []
+        for one in psutil.Process(self.process.pid).children(recursive=True):
+            with contextlib.suppress(psutil.Error):  # ended meanwhile
+                found += [one] * (word in " ".join(one.cmdline()))
+        return found
+
+    def come_to(self, word: str, count: int) -> int:
+        """How many such processes it has, once they are so many, else after a while."""
+        come(lambda: len(self.children(word)) == count)
+        return len(self.children(word))
+
+
+@pytest.fixture(scope="session")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
+    """The server of most tests."""
+    pytest.importorskip("nicegui", reason="the extra `lab` is not installed")
+    with Server(tmp_path_factory.mktemp("lab")) as found:
+        yield found
+
+
+@pytest.fixture(scope="session")
+def browser() -> Iterator[Any]:
+    """Chromium without a screen."""
+    playwright = pytest.importorskip("playwright.sync_api", reason="the extra `browser` is not installed")
+    with playwright.sync_playwright() as driver:
+        found = driver.chromium.launch(
+            executable_path=CHROMIUM, args=["--no-sandbox", "--enable-unsafe-swiftshader"]
+        )
+        yield found
+        found.close()
+
+
+@pytest.fixture(scope="module")
+def tab(browser: Any, server: Server) -> Iterator[Any]:
+    """A tab for most tests, one after the other, as a person has it open."""
+    with opened(browser, server.url, NARROW) as found:
+        yield found
+
+
+@pytest.fixture
+def page(tab: Any, request: pytest.FixtureRequest) -> Iterator[Any]:
+    """The tab, with its first panel before it; a picture of how the test left it."""
+    tab.get_by_role("tab", name="Lab").click()
+    yield tab
+    pictured(tab, request.node.name)
+
+
+@pytest.fixture(scope="module")
+def second(browser: Any, server: Server) -> Iterator[Any]:
+    """Another tab."""
+    with opened(browser, server.url, NARROW) as found:
+        yield found
+
+
+def pictured(page: Any, name: str) -> None:
+    PICTURES.mkdir(parents=True, exist_ok=True)
+    page.screenshot(path=PICTURES / f"{name}.png")
+
+
+class opened:
+    """A tab, closed in the end."""
+
+    def __init__(self, browser: Any, address: str, size: dict[str, int]) -> None:
+        self.page = browser.new_page(viewport=size)
+        self.page.set_default_timeout(SLOW_MS)
+        self.faults: list[str] = []
+        self.page.on("pageerror", lambda error: self.faults.append(str(error)))
+        self.page.goto(address)
+        status(self.page, "solved")
+        self.page.locator(".lab-frame canvas[data-frame]").wait_for()
+        self.page.set_default_timeout(QUICK_MS)
+        self.page.wait_for_timeout(300)  # no person types in the moment in which fields are filled in
+
+    def __enter__(self) -> Any:
+        return self.page
+
+    def __exit__(self, *_: object) -> None:
+        self.page.close()
+        assert self.faults == []
+
+
+def status(page: Any, starts: str) -> str:
+    """The tracker's status, once it begins so."""
+    found = page.locator(".lab-card .mono", has_text=re.compile(f"^{starts}"))
+    found.first.wait_for()
+    return str(found.first.inner_text())
+
+
+def angles(page: Any) -> np.ndarray:
+    """The three typed angles."""
+    return np.array([float(page.get_by_label(f"angle {n}").input_value()) for n in (1, 2, 3)])
+
+
+def source(page: Any) -> str:
+    """Which frame is drawn."""
+    return str(page.locator(".lab-frame canvas").get_attribute("data-frame"))
+
+
+def changed(page: Any, before: str) -> None:
+    """Wait for another frame."""
+    page.wait_for_function(
+        "before => document.querySelector('.lab-frame canvas').dataset.frame !== before", arg=before
+    )
+
+
+def come(true: Callable[[], bool], within_s: float = QUICK_MS / 1000) -> bool:
+    """Whether something comes true within a while."""
+    until = time.monotonic() + within_s
+    while not (found := true()) and time.monotonic() < until:
+        time.sleep(0.1)
+    return found
+
+
+def panel(page: Any, name: str) -> None:
+    page.get_by_role("tab", name=name).click()
+
+
+def chosen(page: Any, name: str, option: str) -> None:
+    """Choose from a list."""
+    page.get_by_role("combobox", name=name).click()
+    page.get_by_role("option", name=option, exact=True).click()
+
+
+def set_to(page: Any, name: str, value: str) -> None:
+    """Type a key's value in the forms; wait for what comes of it."""
+    frame, field = source(page), page.get_by_label(name, exact=True)
+    field.fill(value)
+    field.press("Enter")
+    changed(page, frame)
+
+
+def onto_the_page(page: Any) -> None:
+    """Leave the field that was typed in."""
+    page.locator(".lab-frame").click(position={"x": 5, "y": 5})
+
+
+def exported(page: Any, kind: str, folder: Path) -> Path:
+    """A file that the page gives."""
+    page.get_by_role("button", name="Export").click()
+    with page.expect_download() as comes:
+        page.locator(".q-menu .q-item", has_text=re.compile(f"^{kind}$")).click()
+    page.locator(".q-menu").wait_for(state="detached")
+    path = folder / comes.value.suggested_filename
+    comes.value.save_as(path)
+    return path
+
+
+def brightness(page: Any) -> float:
+    """Of the canvas, 0 to 255."""
+    told = page.locator(".lab-frame canvas").screenshot()
+    return float(cv2.imdecode(np.frombuffer(told, np.uint8), cv2.IMREAD_GRAYSCALE).mean())
+
+
+def screen(page: Any, size_px: tuple[int, int], x: float, y: float) -> tuple[float, float]:
+    """Where a pixel of a frame is on the screen."""
+    box = page.locator(".lab-frame canvas").bounding_box()
+    return box["x"] + (x + 0.5) * box["width"] / size_px[0], box["y"] + (y + 0.5) * box["height"] / size_px[1]
+
+
+def picture(page: Any, **how: Any) -> np.ndarray:
+    """(H, W, 3) of the screen, whole numbers that can be subtracted."""
+    return cv2.imdecode(np.frombuffer(page.screenshot(**how), np.uint8), cv2.IMREAD_COLOR).astype(int)
+
+
+def pixels(page: Any) -> list[tuple[int, int, int]]:
+    """(x, y, DN) of the pixels that are enlarged, once they are the shown frame's."""
+    told = page.locator(".lab-under .quiet:not(.stale) svg title")
+    told.first.wait_for(state="attached")
+    numbers = (re.findall(r"\d+", text) for text in told.all_text_contents())
+    return [(int(x), int(y), int(dn)) for x, y, dn in numbers]
+
+
+def differs(page: Any, before: np.ndarray, box: tuple[int, int, int, int]) -> bool:
+    """Whether a part of the screen (left, top, right, bottom) looks another than in a picture from before."""
+    left, top, right, bottom = box
+    clip = {"x": left, "y": top, "width": right - left, "height": bottom - top}
+    return bool((np.abs(picture(page, clip=clip) - before[top:bottom, left:right]) > 20).sum() > 30)

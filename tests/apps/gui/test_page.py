@@ -1,0 +1,364 @@
+"""The lab's page in Chromium, by Playwright. Skipped where either is missing; pictures in out/screenshots."""
+
+from __future__ import annotations
+
+import json
+import re
+import zipfile
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from astropy.io import fits
+from astropy.table import Table
+from labpage import (
+    CHROMIUM,
+    NARROW,
+    WIDE,
+    Server,
+    angles,
+    brightness,
+    changed,
+    chosen,
+    come,
+    differs,
+    exported,
+    onto_the_page,
+    panel,
+    picture,
+    pictured,
+    pixels,
+    screen,
+    set_to,
+    source,
+    status,
+)
+
+from skysim.core.paths import ROOT
+from skysim.scene import loader
+
+FOCUSED = """() => {
+  const at = document.activeElement, whole = at.closest(".q-field, .q-slider") || at;
+  const box = whole.getBoundingClientRect(), named = whole.querySelector("[aria-label]");
+  return [at.ariaLabel || at.innerText || whole.ariaLabel || named?.ariaLabel, Math.max(Math.floor(box.left) - 4, 0),
+          Math.max(Math.floor(box.top) - 4, 0), Math.min(Math.ceil(box.right) + 4, innerWidth),
+          Math.ceil(box.bottom) + 4];
+}"""  # what has the focus, and where it is
+pytest_plugins = ["labpage"]
+pytestmark = [pytest.mark.browser, pytest.mark.skipif(not CHROMIUM, reason="Chromium is not installed")]
+
+
+def test_it_shows_a_solved_frame_with_names_and_a_map_of_keys(page: Any) -> None:
+    assert re.match(r"solved; \d+ of \d+ lights named", status(page, "solved"))
+    page.get_by_role("img", name="Mintaka").wait_for()  # of Orion's belt
+    shown = page.locator(".lab-keys").first.inner_text()
+    assert all(name in shown for name in ("F1", "F5", "F6", "F7", "F8", "F10", "E R", "1", "2"))
+
+
+def test_nothing_is_cut_off_or_scrolls_at_either_size(page: Any) -> None:
+    for size in (WIDE, NARROW):
+        page.set_viewport_size(size)
+        page.wait_for_timeout(300)
+        box = page.locator(".lab-frame canvas").bounding_box()
+        assert box["x"] > 0
+        assert box["x"] + box["width"] < size["width"]
+        assert box["y"] + box["height"] < size["height"]
+        assert box["width"] > 0.45 * size["width"]
+        root = "document.documentElement"
+        assert not page.evaluate(f"{root}.scrollHeight > innerHeight || {root}.scrollWidth > innerWidth")
+        pictured(page, f"size_{size['width']}")
+
+
+def test_keys_slew_and_the_frame_does_not_jump(page: Any) -> None:
+    before, box = angles(page), page.locator(".lab-frame canvas").bounding_box()
+    for key, coarse in (("ArrowRight", False), ("ArrowUp", True), ("r", False)):
+        frame = source(page)
+        page.keyboard.press(f"Shift+{key}" if coarse else key)
+        changed(page, frame)
+        status(page, "solved")
+    after = angles(page)
+    turned = after - before
+    assert 2 < abs(turned[1]) < 4  # a fifth of 14.9 degrees, at a roll of 20
+    assert -1.3 < turned[2] < -0.7  # clockwise: up turns to the west; the rest is the meridians'
+    assert page.locator(".lab-frame canvas").bounding_box() == box
+
+
+def test_a_key_that_repeats_loses_no_step(page: Any) -> None:
+    before = angles(page)[2]
+    for _ in range(20):
+        page.keyboard.down("e")  # faster than frames are made
+    page.keyboard.up("e")
+    page.wait_for_timeout(300)
+
+    def turned() -> float:
+        return (angles(page)[2] - before + 180) % 360 - 180
+
+    assert come(lambda: turned() > 19.9)
+    page.wait_for_timeout(300)
+    np.testing.assert_allclose(turned(), 20, rtol=0, atol=1e-3)
+    assert status(page, "solved")
+
+
+def test_the_marks_are_drawn_on_their_stars(page: Any) -> None:
+    green = """() => { const canvas = document.querySelector('.lab-frame canvas');
+      const data = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height).data;
+      let count = 0;
+      for (let n = 0; n < data.length; n += 4) count += data[n + 1] > data[n] + 40 && data[n + 1] > data[n + 2] + 40;
+      return count; }"""
+    assert page.evaluate(green) > 500
+    page.get_by_role("checkbox", name="identified").click()
+    page.wait_for_function(f"() => ({green})() === 0")
+    page.get_by_role("checkbox", name="identified").click()
+    page.wait_for_function(f"() => ({green})() > 500")
+
+
+def test_an_attitude_is_typed_and_1_identifies_it(page: Any) -> None:
+    page.keyboard.press("F5")
+    for n, angle in enumerate(("120", "-30", "0"), 1):
+        page.get_by_label(f"angle {n}").fill(angle)
+    frame = source(page)
+    page.get_by_label("angle 3").press("Enter")
+    changed(page, frame)
+    np.testing.assert_allclose(angles(page), (120, -30, 0), rtol=0, atol=1e-3)
+    page.locator(".lab-frame").click(position={"x": 5, "y": 5})
+    frame = source(page)
+    page.keyboard.press("1")
+    changed(page, frame)
+    assert status(page, "solved")
+
+
+def test_every_export_reads_back(page: Any, tmp_path: Path) -> None:
+    kept = {name: exported(page, name, tmp_path) for name in ("truth", "solution", "figure", "scene")}
+    frame = fits.getdata(exported(page, "frame, FITS", tmp_path))
+    grey = cv2.imread(str(exported(page, "frame, PNG", tmp_path)), cv2.IMREAD_UNCHANGED)
+    np.testing.assert_array_equal(grey, frame)
+    truth, told = Table.read(kept["truth"]), json.loads(kept["solution"].read_text())
+    assert f"{len(truth)} true lights" in page.locator(".lab-frame canvas").get_attribute("aria-label")
+    np.testing.assert_allclose(told["angles_deg"], angles(page), rtol=0, atol=0.01)
+    assert cv2.imread(str(kept["figure"])).shape[2] == 3
+    assert loader.load(kept["scene"]).model_dump() | {"stem": ""} == loader.load("shefex2").model_dump() | {
+        "stem": ""
+    }
+    with zipfile.ZipFile(exported(page, "all of them", tmp_path)) as archive:
+        assert set(archive.namelist()) == {path.name for path in tmp_path.iterdir() if path.suffix != ".zip"}
+        assert archive.read("frame.png") == (tmp_path / "frame.png").read_bytes()
+
+
+def test_the_mouse_tells_of_a_star_and_a_click_enlarges_it(page: Any, tmp_path: Path) -> None:
+    spots = json.loads(exported(page, "solution", tmp_path).read_text())["spots"]
+    frame = fits.getdata(exported(page, "frame, FITS", tmp_path))
+    spot = max((one for one in spots if one["id"] >= 0), key=lambda one: one["flux"])
+    page.mouse.click(*screen(page, frame.shape[::-1], spot["x"], spot["y"]))
+    enlarged = pixels(page)
+    assert [dn for *_, dn in enlarged] == [int(frame[y, x]) for x, y, _ in enlarged]
+    assert len(enlarged) == 7 * 11
+    assert (round(spot["x"]), round(spot["y"])) == enlarged[3 * 11 + 5][:2]
+    shown = page.locator(".lab-under svg text").all_text_contents()
+    assert shown == [str(dn) for *_, dn in enlarged]
+    told = page.locator(".lab-under .mono").inner_text()
+    assert float(re.search(r"residual ([\d.]+) px", told)[1]) == pytest.approx(spot["residual_px"], abs=6e-4)
+    assert re.search(rf"centroid +{spot['x']:.2f} +{spot['y']:.2f} ", told)
+    assert float(re.search(r"V (-?[\d.]+)", told)[1]) < 5
+
+
+def test_stretch_and_brightness_make_faint_light_brighter_and_arrows_stay_the_slider_s(page: Any) -> None:
+    dark, before = brightness(page), angles(page)
+    frame = source(page)
+    page.get_by_label("Brightness").locator("[tabindex]").focus()
+    page.keyboard.press("ArrowRight")
+    changed(page, frame)
+    brighter = brightness(page)
+    assert brighter > 1.05 * dark
+    chosen(page, "Stretch", "logarithm")
+    assert come(lambda: brightness(page) > 1.05 * brighter)
+    chosen(page, "Stretch", "square root")
+    page.get_by_label("Brightness").locator("[tabindex]").focus()
+    page.keyboard.press("ArrowLeft")
+    assert come(lambda: abs(brightness(page) - dark) < 0.02 * dark)
+    np.testing.assert_array_equal(angles(page), before)
+
+
+def test_tab_reaches_every_control_and_shows_where_it_is(page: Any) -> None:
+    onto_the_page(page)
+    unseen, reached = picture(page), []
+    for _ in range(18):
+        page.keyboard.press("Tab")
+        name, *box = page.evaluate(FOCUSED)
+        assert come(partial(differs, page, unseen, box)), name
+        reached.append(name)
+    wanted = [
+        "Scene",
+        "identify",
+        "Export",
+        "truth",
+        "Stretch",
+        "Brightness",
+        "angle 1",
+        "detector F6",
+        "solver",
+    ]
+    assert [name for name in reached if name in wanted] == wanted
+    onto_the_page(page)
+
+
+def test_typing_and_help_hold_the_camera_still(page: Any) -> None:
+    frame, field = source(page), page.get_by_label("angle 1")
+    before = field.input_value()
+    field.fill("")
+    page.keyboard.type("e1r2")
+    page.keyboard.press("ArrowUp")
+    assert field.input_value() == "e1r2"
+    page.keyboard.press("Enter")
+    page.get_by_text("an angle is not a number").first.wait_for()
+    field.fill(before)
+    onto_the_page(page)
+    page.keyboard.press("F1")
+    page.get_by_role("dialog").wait_for()
+    page.keyboard.press("ArrowUp")
+    page.keyboard.press("Escape")
+    page.get_by_role("dialog").wait_for(state="detached")
+    assert source(page) == frame
+    page.keyboard.press("1")
+    changed(page, frame)
+
+
+def test_another_identifier_by_f7_and_the_keys_are_the_camera_s_again(page: Any) -> None:
+    page.keyboard.press("F7")
+    page.get_by_role("option", name="pyramid").wait_for()
+    page.keyboard.press("ArrowDown")
+    page.keyboard.press("Enter")
+    page.get_by_role("listbox").wait_for(state="detached")
+    assert page.get_by_role("combobox", name="identifier F7").input_value() == "pyramid"
+    status(page, "solved")
+    frame = source(page)
+    page.keyboard.press("1")
+    changed(page, frame)
+    panel(page, "Log")
+    page.get_by_text("opened shefex2 with tracker.identifier").wait_for()
+
+
+def test_f8_sets_the_field_and_an_arrow_goes_a_fiftieth_of_it(page: Any) -> None:
+    page.keyboard.press("F8")
+    page.locator("input[aria-label='runs, F8']:focus").wait_for()
+    set_to(page, "field, °", "8")
+    onto_the_page(page)
+    before, frame = angles(page), source(page)
+    page.keyboard.press("ArrowUp")
+    changed(page, frame)
+    (ra, dec, _), (ra_before, dec_before, _) = np.radians(angles(page)), np.radians(before)
+    cosine = np.sin(dec) * np.sin(dec_before) + np.cos(dec) * np.cos(dec_before) * np.cos(ra - ra_before)
+    np.testing.assert_allclose(np.degrees(np.arccos(cosine)), 8 / 50, rtol=2e-3, atol=0)
+    set_to(page, "field, °", "14.868")
+
+
+def test_monte_carlo_of_200_by_2(page: Any) -> None:
+    page.keyboard.press("2")
+    page.get_by_text("200 of 200 trials").wait_for()
+    told = page.get_by_text("identified", exact=False).last.inner_text()
+    assert float(re.search(r"identified\s+([\d.]+)", told)[1]) > 0.9
+    with page.expect_popup() as opens:
+        page.locator("a[href^='/report/']").first.click()
+    opens.value.wait_for_function("() => document.title.startsWith('Monte Carlo of')")
+    opens.value.close()
+
+
+def test_a_dropped_picture_is_solved_shown_or_refused(page: Any, tmp_path: Path) -> None:
+    before = angles(page)
+    panel(page, "Image")
+    photo = cv2.imread(str(ROOT / "docs" / "sky.jpg"), cv2.IMREAD_GRAYSCALE)
+    page.set_input_files("input[type=file]", ROOT / "docs" / "sky.jpg")
+    page.get_by_text("sky.jpg: solved").wait_for()
+    assert page.get_by_label("angle 1").input_value() == ""  # nobody knows where it was taken
+    page.mouse.click(*screen(page, photo.shape[::-1], 600, 400))
+    for x, y, dn in pixels(page):  # the picture's, not the scene's
+        assert abs(dn - int(photo[y, x])) <= 2
+    noise, broken, program, large = (
+        tmp_path / f"{name}" for name in ("noise.png", "broken.png", "a.exe", "large.png")
+    )
+    cv2.imwrite(str(noise), np.random.default_rng(1).integers(90, 110, (480, 640), dtype=np.uint8))
+    page.set_input_files("input[type=file]", noise)
+    page.get_by_text(re.compile(r"noise\.png: (?!solved|solving)")).wait_for()
+    broken.write_bytes(b"\x89PNG\r\n\x1a\n" + bytes(100))
+    program.write_bytes(b"MZ")
+    with large.open("wb") as file:
+        file.truncate(65 * 2**20)
+    for path, why in (
+        (broken, "cannot be decoded"),
+        (program, "not taken"),
+        (broken, "cannot be decoded"),
+        (large, "not taken"),
+    ):
+        page.set_input_files("input[type=file]", path)
+        page.get_by_role("status").filter(has_text=why).wait_for()
+    identified(page)
+    np.testing.assert_array_equal(angles(page), before)
+
+
+def identified(page: Any) -> None:
+    """The scene is shown again."""
+    onto_the_page(page)
+    frame = source(page)
+    page.keyboard.press("1")
+    changed(page, frame)
+
+
+def rolled(page: Any, name: str) -> float:
+    """The roll that a picture was solved to."""
+    facts = page.locator(".lab-panels .mono", has_text=re.compile(rf"^{name}: solved")).last.inner_text()
+    return float(re.search(r"roll ([\d.]+)", facts)[1])
+
+
+def test_a_live_camera_is_followed_to_its_end(page: Any, tmp_path: Path) -> None:
+    photo = cv2.imread(str(ROOT / "docs" / "sky.jpg"))
+    high, wide = photo.shape[:2]
+    video = cv2.VideoWriter(str(tmp_path / "clip.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 5, (wide, high))
+    for turn_deg in (0, 10):
+        turn = cv2.getRotationMatrix2D((wide / 2, high / 2), turn_deg, 1)
+        video.write(cv2.warpAffine(photo, turn, (wide, high)))
+    video.release()
+    panel(page, "Image")
+    page.set_input_files("input[type=file]", ROOT / "docs" / "sky.jpg")
+    still = rolled(page, "sky.jpg")
+    page.get_by_label("live camera").fill(str(tmp_path / "clip.avi"))
+    page.get_by_role("button", name="Look").click()
+    page.get_by_role("status").filter(has_text="ends after 2 frames").wait_for()
+    turned = rolled(page, "camera")
+    np.testing.assert_allclose(
+        still - turned, 10, rtol=0, atol=0.05
+    )  # the last frame's; the sky turns the other way
+    page.get_by_role("button", name="Look").wait_for()
+    identified(page)
+
+
+def test_bad_input_is_refused_where_it_stands(page: Any) -> None:
+    page.get_by_label("angle 2").fill("95")
+    page.get_by_label("angle 2").press("Enter")
+    page.get_by_text("Dec: 95 deg is not allowed").first.wait_for()
+    page.get_by_role("tab", name="Scene").click()
+    page.get_by_role("button", name='Expand "camera"').click()
+    page.get_by_label("camera.focal_length", exact=True).fill("35 mmm")
+    page.get_by_label("camera.focal_length", exact=True).press("Enter")
+    page.get_by_text("'35 mmm' is not a length; allowed").wait_for()
+    set_to(page, "camera.focal_length", "50 mm")
+    page.get_by_placeholder("new-name").fill("../out")
+    page.get_by_role("button", name="Save as").click()
+    page.get_by_text("allowed: letters, digits").first.wait_for()
+
+
+def test_a_scene_is_saved_opened_again_and_not_overwritten(page: Any, server: Server) -> None:
+    panel(page, "Scene")
+    page.get_by_placeholder("find a key").fill("focal_length")
+    set_to(page, "camera.focal_length", "45 mm")
+    for told in ("saved as mine.yaml", "mine.yaml: is there already"):
+        page.get_by_placeholder("new-name").fill("mine")
+        page.get_by_role("button", name="Save as").click()
+        page.get_by_role("status").filter(has_text=told).wait_for()
+    assert loader.load(server.folder / "mine.yaml").camera.focal_length_m == 0.045
+    frame = source(page)
+    chosen(page, "Scene", "mine.yaml")
+    changed(page, frame)
+    assert page.get_by_label("camera.focal_length", exact=True).input_value() == "45 mm"
+    status(page, "solved")

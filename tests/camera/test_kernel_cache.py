@@ -1,0 +1,85 @@
+"""Which image each source makes, and that no two share what they should not."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from skysim.camera.psf.kernel import kernel
+from skysim.camera.psf.kernel_cache import GAUSS, GRID, ROUND, images, sharpness_px
+from skysim.core.errors import InputError
+from skysim.scene.camera import CameraConfig
+
+
+def camera(**changes: Any) -> CameraConfig:
+    part = {
+        "width_px": 640, "height_px": 480, "pixel": "4 um", "focal_length": "35 mm", "f_number": 8, "focus": "1 m",
+        "detector": {"quantum_efficiency": 0.5, "full_well_e": 4e4, "gain_e_dn": 10, "bits": 12},
+    }  # fmt: skip
+    return CameraConfig.model_validate(part | changes)
+
+
+def shapes(lens: CameraConfig, radius_m: list[float], near: list[bool], distance_m: list[float]) -> Any:
+    count = len(radius_m)
+    return images(
+        lens, np.tile(lens.centre_px, (count, 1)), np.array(radius_m), np.array(near), np.array(distance_m),
+        np.ones(count),
+    )  # fmt: skip
+
+
+def test_a_star_in_focus_is_a_gaussian_and_a_lamp_a_disc() -> None:
+    sharp = shapes(camera(focus="infinity"), [0.0], [False], [1.0])
+    assert sharp.kind.tolist() == [GAUSS]
+    both = shapes(camera(), [0.0, 1e-3], [False, True], [1.0, 1.0])
+    assert both.kind.tolist() == [ROUND, ROUND]  # focused on the lamp, the star is a disc of confusion
+    assert both.reach_px[0] != both.reach_px[1]
+
+
+def test_sizes_alike_share_a_table_and_others_do_not() -> None:
+    near = [True] * 3
+    made = shapes(camera(), [1e-3, 1e-3, 1.2e-3], near, [1.0, 1.0 + 1e-7, 1.0])
+    np.testing.assert_array_equal(made.table[0], made.table[1])
+    assert made.table[0, 0] != made.table[2, 0]
+    again = shapes(camera(), [1.2e-3], near[:1], [1.0])
+    np.testing.assert_array_equal(again.table[0], made.table[2])
+
+
+def test_a_far_lamp_is_smaller() -> None:
+    made = shapes(camera(focus="infinity"), [1e-2, 1e-2], [True, True], [20.0, 40.0])
+    assert made.reach_px[0] > made.reach_px[1] + 2
+
+
+def test_a_gaussian_widens_towards_the_corner_and_keeps_its_reach() -> None:
+    lens = camera(focus="infinity", psf={"kind": "gaussian", "sigma_px": 0.7, "corner_sigma_px": 2.4})
+    place = np.array([lens.centre_px, (-0.5, -0.5)])
+    made = images(lens, place, np.zeros(2), np.zeros(2, bool), np.ones(2), np.ones(2))
+    np.testing.assert_allclose(made.sigma_px, [0.7, 2.5], rtol=1e-12, atol=0)
+    assert made.reach_px[1] >= 6.5 * 2.5
+
+
+def test_sharpness_is_a_gaussian_s_own_sigma_and_an_edge_s() -> None:
+    assert sharpness_px(kernel(camera().psf, camera())) == pytest.approx(np.sqrt(0.49 + 1 / 12), rel=1e-12)
+    edge = sharpness_px(kernel(camera().psf, camera(), emitter_radius_px=12.0))
+    assert edge == pytest.approx(1.25 * np.sqrt(0.49 + 1 / 12), rel=0.03)
+
+
+def test_a_measured_image_is_a_grid(tmp_path: Any) -> None:
+    y, x = np.mgrid[-6:7, -6:7]
+    np.savetxt(tmp_path / "psf.csv", np.exp(-(x**2) / 2 - y**2 / 8), delimiter=",")
+    lens = camera(focus="infinity", psf={"kind": "measured", "file": str(tmp_path / "psf.csv")})
+    assert shapes(lens, [0.0], [False], [1.0]).kind.tolist() == [GRID]
+
+
+def test_a_full_shelf_is_cleared_and_gives_the_same_images(monkeypatch: pytest.MonkeyPatch) -> None:
+    first = shapes(camera(), [1e-3], [True], [1.0])
+    table = first.tables[slice(*first.table[0, :2])].copy()
+    monkeypatch.setattr("skysim.camera.psf.kernel_cache.SHELF_BYTES", first.tables.nbytes - 1)
+    again = shapes(camera(), [1e-3], [True], [1.0])
+    np.testing.assert_array_equal(again.tables[slice(*again.table[0, :2])], table)
+
+
+def test_a_lamp_far_out_of_focus_is_refused_in_one_line() -> None:
+    with pytest.raises(InputError, match=r"camera\.focus: .* px; allowed: up to 500 px"):
+        shapes(camera(focus="infinity", f_number=1.0), [1e-3], [True], [0.08])

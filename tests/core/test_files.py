@@ -1,0 +1,427 @@
+"""What is written comes back, astropy reads it as meant, and damage is one line."""
+
+from __future__ import annotations
+
+import datetime
+import json
+import os
+import shutil
+import subprocess
+import sys
+import warnings
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from astropy.io import fits
+from astropy.table import Table
+from astropy.wcs import WCS
+from scipy.spatial.transform import Rotation
+
+from skysim.core import files, images
+from skysim.core.errors import InputError
+from skysim.core.files import HOST, NAME
+from skysim.core.types import Frame, Truth
+from skysim.results.files import ccsds_aem, frames
+from skysim.scene import loader, scene
+from skysim.simulation import exposure, run
+
+Shot = tuple[scene.Scene, Frame, Truth]
+
+
+def shoot(name: str, **overrides: str) -> Shot:
+    loaded = loader.load(name, {key.replace("__", "."): value for key, value in overrides.items()})
+    frame, truth = exposure.render_frame(run.prepare(loaded), 0)
+    return loaded, frame, truth
+
+
+@pytest.fixture(scope="module")
+def sky() -> Shot:
+    return shoot("shefex2", exposure__frames="1")
+
+
+@pytest.fixture(scope="module")
+def dome() -> Shot:
+    return shoot("afit_simsat", exposure__frames="1", camera__detector__noise="false")
+
+
+@pytest.fixture(scope="module")
+def written(sky: Shot, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("frames")
+    frames.write_frame(folder, sky[1], sky[2], sky[0])
+    return folder
+
+
+def complaint(path: Path) -> str:
+    """The one line that a bad file gets."""
+    with pytest.raises(InputError) as refusal:
+        images.read_image(path)
+    message = str(refusal.value)
+    assert "\n" not in message
+    assert str(path) in message
+    return message
+
+
+# Roundtrips
+
+
+def test_a_frame_is_three_files_and_nothing_else(written: Path) -> None:
+    assert {p.name for p in written.iterdir()} == {"frame_0000.fits", "frame_0000.png", "frame_0000.ecsv"}
+
+
+@pytest.mark.parametrize("suffix", ["fits", "png"])
+def test_a_frame_comes_back_bit_for_bit(sky: Shot, written: Path, suffix: str) -> None:
+    back = images.read_image(written / f"frame_0000.{suffix}")
+    assert back.dtype == np.uint16
+    np.testing.assert_array_equal(back, sky[1].image_dn)
+
+
+def test_every_16_bit_value_survives_png_and_fits(tmp_path: Path, sky: Shot) -> None:
+    image = np.arange(65536, dtype=np.uint16).reshape(256, 256)
+    files.write_png16(tmp_path / "all.png", image)
+    frames.write_fits(tmp_path / "all.fits", Frame(0, image, 0.1, 0.04, 65535.0), sky[2], sky[0])
+    np.testing.assert_array_equal(images.read_image(tmp_path / "all.png"), image)
+    np.testing.assert_array_equal(images.read_image(tmp_path / "all.fits"), image)
+
+
+def test_a_noise_free_frame_stays_a_float_in_fits_and_is_rounded_in_png(tmp_path: Path, dome: Shot) -> None:
+    loaded, frame, truth = dome
+    frames.write_frame(tmp_path, frame, truth, loaded)
+    np.testing.assert_array_equal(images.read_image(tmp_path / "frame_0000.fits"), frame.image_dn)
+    rounded = images.read_image(tmp_path / "frame_0000.png").astype(float)
+    assert np.abs(rounded - frame.image_dn).max() <= 0.5
+
+
+def test_the_header_tells_when_how_long_and_from_what(sky: Shot, written: Path) -> None:
+    header = fits.getheader(written / "frame_0000.fits")
+    assert header["EXPTIME"] == 0.040
+    # 0.1 s after the start the shutter opens, 20 ms later is the middle.
+    middle = datetime.datetime(2012, 6, 22, 21, 0, 0, 120_000)
+    assert datetime.datetime.fromisoformat(header["DATE-OBS"]) == middle
+    assert images.date_of(written / "frame_0000.fits") == middle
+    assert (header["SCENE"], header["SEED"], header["FRAME"], header["SATURATE"]) == (
+        "shefex2",
+        2,
+        0,
+        pytest.approx((40000 - 3 * 14.7) / 10 + 64),
+    )
+
+
+@pytest.mark.parametrize("start", ["2012-06-22T23:00:00+02:00", "2012-06-22T21:00:00Z"])
+def test_a_scene_s_time_with_a_zone_is_told_as_utc(sky: Shot, start: str) -> None:
+    """DATE-OBS takes no zone, and an attitude message would have been two hours off."""
+    loaded, frame, _ = sky
+    zoned = loader.load("shefex2", {"start_time": start})
+    assert frames.mid_time(zoned, frame) == frames.mid_time(loaded, frame)
+    local = datetime.datetime.fromisoformat(start)
+    assert ccsds_aem.epoch(local) == "2012-06-22T21:00:00.000000"
+
+
+def test_a_png_has_no_date(written: Path) -> None:
+    assert images.date_of(written / "frame_0000.png") is None
+
+
+def test_a_fits_file_is_standard(written: Path) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with fits.open(written / "frame_0000.fits", checksum=True) as hdus:
+            hdus.verify("exception")
+
+
+def test_truth_comes_back(sky: Shot, written: Path) -> None:
+    truth, seen = sky[2], sky[2].seen
+    table = Table.read(written / "frame_0000.ecsv", format="ascii.ecsv")
+    np.testing.assert_array_equal(table["id"], seen.id)
+    columns = {
+        "x_px": seen.xy_px[:, 0],
+        "y_px": seen.xy_px[:, 1],
+        "flux_x_px": seen.flux_xy_px[:, 0],
+        "flux_y_px": seen.flux_xy_px[:, 1],
+        "electrons": seen.electrons,
+        "peak_e": seen.peak_e,
+        "streak_px": seen.streak_px,
+        "area_px": seen.area_px,
+        "snr": seen.snr,
+    }
+    assert set(table.colnames) == {"id", "saturated", *columns}
+    assert table["saturated"].dtype == bool
+    np.testing.assert_array_equal(table["saturated"], seen.saturated)
+    for name, values in columns.items():
+        np.testing.assert_allclose(table[name], values, rtol=1e-8, atol=0)  # nine digits are written
+    back = Rotation.from_quat(table.meta["cam_from_lab_xyzw"])
+    assert (back * truth.cam_from_lab.inv()).magnitude() < 1e-15
+    back = Rotation.from_quat(table.meta["lab_from_body_xyzw"])
+    assert (back * truth.lab_from_body.inv()).magnitude() < 1e-15
+    np.testing.assert_array_equal(table.meta["rate_cam_rad_s"], truth.rate_cam_rad_s)
+    assert (table.meta["scene"], table.meta["seed"], table.meta["t_mid_s"]) == ("shefex2", 2, truth.t_s)
+
+
+def test_which_sources_are_saturated_comes_back(sky: Shot, tmp_path: Path) -> None:
+    loaded, frame, truth = sky
+    every_third = np.arange(len(truth.seen.id)) % 3 == 0
+    truth = replace(truth, seen=replace(truth.seen, saturated=every_third))
+    frames.write_truth(tmp_path / "truth.ecsv", frame, truth, loaded)
+    table = Table.read(tmp_path / "truth.ecsv", format="ascii.ecsv")
+    np.testing.assert_array_equal(table["saturated"], every_third)
+
+
+def test_a_shorter_run_leaves_no_frames_of_a_longer_one(tmp_path: Path, sky: Shot) -> None:
+    frames.write_frame(tmp_path, sky[1], sky[2], sky[0])
+    mine = tmp_path / "frame_of_mine.png"
+    mine.write_bytes(b"")
+    frames.clear(tmp_path)
+    assert list(tmp_path.iterdir()) == [mine]
+
+
+# The WCS
+
+
+@pytest.mark.parametrize(
+    "pointing",
+    [
+        {},
+        {"motion__start": "{ra_deg: 0.01, dec_deg: -60, roll_deg: -130}"},
+        {"motion__start": "{ra_deg: 200, dec_deg: 88, roll_deg: 10}"},
+        {"camera__principal_point_px": "[100, 400]"},
+        {"camera__focus": "10 m"},
+    ],
+    ids=["orion", "through RA 0", "near the pole", "off-centre lens", "focused nearby"],
+)
+@pytest.mark.filterwarnings("ignore:.*datfix")
+def test_astropy_puts_the_true_stars_on_their_true_pixels(tmp_path: Path, pointing: dict[str, str]) -> None:
+    """Directions from the scene's own sources, pixels by astropy's WCS of the header alone."""
+    loaded = loader.load("shefex2", {k.replace("__", "."): v for k, v in pointing.items()})
+    lab = run.prepare(loaded)
+    frame, truth = exposure.render_frame(lab, 0)
+    frames.write_fits(tmp_path / "f.fits", frame, truth, loaded)
+    rows = {hip: n for n, hip in enumerate(lab.sources.id)}
+    direction = lab.sources.place[[rows[hip] for hip in truth.seen.id], :3]
+    ra, dec = np.degrees([np.arctan2(direction[:, 1], direction[:, 0]), np.arcsin(direction[:, 2])])
+    x, y = WCS(fits.getheader(tmp_path / "f.fits")).all_world2pix(ra, dec, 0)
+    assert len(x) > 20
+    np.testing.assert_allclose(np.column_stack([x, y]), truth.seen.xy_px, rtol=0, atol=1e-6)
+
+
+def test_under_the_dome_there_is_no_wcs(tmp_path: Path, dome: Shot) -> None:
+    frames.write_fits(tmp_path / "f.fits", dome[1], dome[2], dome[0])
+    assert not [key for key in fits.getheader(tmp_path / "f.fits") if key.startswith(("CTYPE", "CRVAL"))]
+
+
+# Nothing half-written
+
+
+def break_off(path: Path, words: str) -> None:
+    with files.whole(path) as temporary:
+        temporary.write_text(words)
+        raise KeyboardInterrupt
+
+
+def test_an_interrupted_file_vanishes(tmp_path: Path) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        break_off(tmp_path / "new.txt", "half")
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_interrupted_file_leaves_the_old_one(tmp_path: Path) -> None:
+    files.write_text(tmp_path / "old.txt", "whole")
+    with pytest.raises(KeyboardInterrupt):
+        break_off(tmp_path / "old.txt", "half")
+    assert (tmp_path / "old.txt").read_text() == "whole"
+    assert len(list(tmp_path.iterdir())) == 1
+
+
+def test_a_picture_that_cannot_be_encoded_leaves_nothing(tmp_path: Path) -> None:
+    with pytest.raises(
+        InputError, match=r"x\.png: an image of uint8 and shape \(4, 4, 2\) cannot be encoded so"
+    ):
+        files.write_image(tmp_path / "x.png", np.zeros((4, 4, 2), np.uint8))
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_interrupt_leaves_the_old_folder_or_the_new(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(folder: Path, **_: object) -> None:
+        next(Path(folder).iterdir()).unlink()
+        raise KeyboardInterrupt
+
+    def shoot(text: str) -> None:
+        with files.whole_folder(film) as folder:
+            folder.mkdir()
+            (folder / "zarr.json").write_text(text)
+
+    film = tmp_path / "frames.zarr"
+    shoot("old")
+    monkeypatch.setattr(shutil, "rmtree", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        shoot("new")
+    assert (film / "zarr.json").read_text() == "new"
+
+
+KILLED = """
+import os, sys
+from pathlib import Path
+from skysim.core import files as io
+out = Path(sys.argv[1])
+with io.whole(out / "solutions.ecsv") as file, io.whole_folder(out / "frames.zarr") as folder:
+    file.write_text("half")
+    folder.mkdir()
+    (folder / "zarr.json").write_text("half")
+    os.kill(os.getpid(), 9)
+"""
+
+
+def test_what_a_killed_process_left_is_swept_and_nothing_else(tmp_path: Path) -> None:
+    """Not what a live process writes, ours or another, nor another machine's, nor hidden files of the user's."""
+    subprocess.run([sys.executable, "-c", KILLED, tmp_path], check=False)
+    left = {path.name for path in tmp_path.iterdir()}
+    assert len(left) == 2
+    (name,) = (name for name in left if name.endswith(".ecsv"))
+    pid = NAME.fullmatch(name)[1]  # type: ignore[index]
+    others = {
+        name.replace(f"-{pid}.", f"-{os.getppid()}."),
+        name.replace(HOST, "0badcafe"),
+        f".solutions.{pid}.ecsv",
+        ".hidden",
+        "frame_0000.fits",
+    }
+    for other in others:
+        (tmp_path / other).write_text("mine")
+    ours_before = tmp_path / name.replace(
+        f"-{pid}.", f"-{os.getpid()}."
+    )  # of an earlier process by our number
+    ours_before.write_text("half")
+    with files.whole(tmp_path / "truth.ecsv") as temporary:
+        temporary.write_text("whole")
+        files.make_folder(tmp_path)
+    assert {path.name for path in tmp_path.iterdir()} == others | {"truth.ecsv"}
+
+
+def test_a_folder_under_a_file_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match="cannot be made a folder"):
+        files.make_folder(tmp_path / "file" / "out")
+
+
+# Damage
+
+
+@pytest.mark.parametrize("share", [0.0, 0.001, 0.0044, 0.1, 0.5, 0.99, 0.9999])
+@pytest.mark.parametrize("suffix", ["fits", "png"])
+def test_a_truncated_frame_is_one_line(written: Path, tmp_path: Path, suffix: str, share: float) -> None:
+    data = (written / f"frame_0000.{suffix}").read_bytes()
+    path = tmp_path / f"cut.{suffix}"
+    path.write_bytes(data[: int(share * len(data))])
+    complaint(path)
+
+
+@pytest.mark.parametrize("suffix", ["jpg", "tif", "bmp"])
+def test_other_truncated_pictures_are_one_line(tmp_path: Path, suffix: str) -> None:
+    whole = tmp_path / f"whole.{suffix}"
+    cv2.imwrite(str(whole), np.random.default_rng(1).integers(0, 255, (200, 300), np.uint8))
+    images.read_image(whole)
+    (tmp_path / f"cut.{suffix}").write_bytes(whole.read_bytes()[: whole.stat().st_size // 2])
+    assert "truncated" in complaint(tmp_path / f"cut.{suffix}")
+
+
+@pytest.mark.parametrize(("at", "told"), [(33, 200_000_000), (20, 4_000_000)], ids=["chunk", "rows"])
+def test_a_png_that_tells_of_more_than_it_holds_is_not_decoded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, at: int, told: int
+) -> None:
+    """A chunk's length stands after IHDR, the height in it; OpenCV would take the memory for both."""
+    data = bytearray(cv2.imencode(".png", np.random.default_rng(1).integers(0, 255, (64, 64), np.uint8))[1])
+    data[at : at + 4] = told.to_bytes(4, "big")
+    (tmp_path / "much.png").write_bytes(data)
+    monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("it was decoded"))
+    assert "truncated" in complaint(tmp_path / "much.png")
+
+
+def test_the_libraries_below_do_not_talk_past_us(
+    written: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    data = (written / "frame_0000.png").read_bytes()
+    (tmp_path / "cut.png").write_bytes(data[: len(data) // 2])
+    complaint(tmp_path / "cut.png")
+    assert capfd.readouterr().err == ""
+
+
+@pytest.mark.parametrize("name", ["text.png", "text.fits", "text.jpg", "text.tiff"])
+def test_text_by_an_image_s_name_is_one_line(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_text("once upon a time\n" * 300)
+    complaint(tmp_path / name)
+
+
+def test_what_is_not_there_or_no_image_is_one_line(tmp_path: Path) -> None:
+    assert "no such file" in complaint(tmp_path / "missing.fits")
+    assert "no such file" in complaint(tmp_path)
+    (tmp_path / "x.docx").write_text("")
+    assert "allowed: .fits" in complaint(tmp_path / "x.docx")
+    fits.PrimaryHDU().writeto(tmp_path / "bare.fits")
+    assert "without an image" in complaint(tmp_path / "bare.fits")
+
+
+def test_the_image_of_an_extension_is_found(tmp_path: Path) -> None:
+    image = np.arange(12.0).reshape(3, 4)
+    fits.HDUList([fits.PrimaryHDU(), fits.ImageHDU(image)]).writeto(tmp_path / "ext.fits")
+    np.testing.assert_array_equal(images.read_image(tmp_path / "ext.fits"), image)
+
+
+@pytest.mark.parametrize("seed", [*range(40), 172])
+@pytest.mark.filterwarnings("error")
+def test_a_few_flipped_bytes_give_an_image_or_one_line(written: Path, tmp_path: Path, seed: int) -> None:
+    """Whatever the damage to a header: no other exception, no warning. A lie that is valid FITS stays one."""
+    rng = np.random.default_rng(seed)
+    data = bytearray((written / "frame_0000.fits").read_bytes())
+    data[int(rng.integers(0, 2880))] = int(rng.integers(0, 256))
+    data[int(rng.integers(0, 800))] = int(rng.integers(32, 127))
+    path = tmp_path / "flipped.fits"
+    path.write_bytes(data)
+    outcome = []
+    try:
+        outcome.append(images.read_image(path))
+        images.date_of(path)
+    except InputError as refusal:
+        outcome.append(str(refusal))
+    assert "\n" not in str(outcome[0]) or isinstance(outcome[0], np.ndarray)
+
+
+# Colour and JSON
+
+
+def test_colour_becomes_luminance_and_monochrome_stays() -> None:
+    grey = np.random.default_rng(2).integers(0, 65535, (5, 7), np.uint16)
+    np.testing.assert_array_equal(images.monochrome(grey), grey)
+    np.testing.assert_array_equal(images.monochrome(grey[:, :, None]), grey)
+    np.testing.assert_array_equal(images.monochrome(np.dstack([grey] * 3)), grey)
+    np.testing.assert_array_equal(images.monochrome(np.dstack([grey] * 4)), grey)
+    blue_green_red = np.full((2, 2, 3), (10.0, 20.0, 30.0), np.float32)
+    # ITU-R BT.601: .299 R + .587 G + .114 B.
+    np.testing.assert_allclose(images.monochrome(blue_green_red), 0.299 * 30 + 0.587 * 20 + 1.14, rtol=1e-6)
+
+
+@pytest.mark.parametrize("shape", [(5,), (3, 20, 30), (4, 5, 2), (2, 2, 3, 3)])
+def test_a_shape_that_is_no_picture_is_refused(shape: tuple[int, ...]) -> None:
+    with pytest.raises(InputError, match=r"an image of shape .*; allowed: \(height, width\)"):
+        images.monochrome(np.zeros(shape))
+
+
+def test_json_has_null_for_what_is_no_number() -> None:
+    data = {"a": float("nan"), "b": [np.float64("inf"), np.int64(3)], "c": (np.bool_(True), "x", None)}
+    assert json.loads(files.to_json(data)) == {"a": None, "b": [None, 3], "c": [True, "x", None]}
+
+
+def test_a_camera_s_frame_is_taken_as_opencv_opens_it_and_none_is_told(tmp_path: Path) -> None:
+    """A video file stands for the camera: its first frame, to what JPEG leaves of it."""
+    frame = np.zeros((48, 64, 3), np.uint8)
+    frame[20:30, 30:40] = 200
+    video = cv2.VideoWriter(str(tmp_path / "camera.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 10, (64, 48))
+    video.write(frame)
+    video.release()
+    grabbed = images.grab(str(tmp_path / "camera.avi"))
+    assert grabbed.shape == frame.shape
+    assert np.abs(grabbed.astype(int) - frame).max() < 30
+    for nowhere in (str(tmp_path / "none.avi"), "99"):
+        with pytest.raises(InputError, match="no camera answers there; allowed: an index such as 0"):
+            images.grab(nowhere)

@@ -1,0 +1,39 @@
+"""Single quaternions against SciPy's rotations."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from skysim.core import quaternion
+
+TURNS = [[0.3, -1.2, 2.0], [1e-12, 0, 0], [0, 0, 0], [0, np.pi - 1e-9, 0], [-2.0, 1.0, 1.5]]
+
+
+def wxyz(turn: list[float]) -> np.ndarray:
+    return Rotation.from_rotvec(turn).as_quat(scalar_first=True)
+
+
+@pytest.mark.parametrize("turn", TURNS)
+def test_rotation_vectors_go_there_and_back(turn: list[float]) -> None:
+    made = quaternion.from_rotvec(np.array(turn, float))
+    same = Rotation.from_rotvec(turn)
+    assert (Rotation.from_quat(made, scalar_first=True).inv() * same).magnitude() < 1e-15
+    np.testing.assert_allclose(quaternion.to_rotvec(made), same.as_rotvec(), rtol=0, atol=1e-14)
+    np.testing.assert_allclose(quaternion.to_rotvec(-made), same.as_rotvec(), rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("one", TURNS)
+@pytest.mark.parametrize("two", TURNS)
+def test_products_and_turned_vectors_are_scipys(one: list[float], two: list[float]) -> None:
+    a, b = Rotation.from_rotvec(one), Rotation.from_rotvec(two)
+    product = quaternion.multiply(wxyz(one), quaternion.inverse(wxyz(two)))
+    assert (Rotation.from_quat(product, scalar_first=True).inv() * (a * b.inv())).magnitude() < 3e-15
+    vector = np.array([0.2, -3.0, 1.1])
+    np.testing.assert_allclose(quaternion.apply(wxyz(one), vector), a.apply(vector), rtol=0, atol=2e-15)
+
+
+def test_cross_is_numpys() -> None:
+    a, b = np.array([1.0, -2.0, 0.5]), np.array([0.3, 4.0, -7.0])
+    np.testing.assert_array_equal(quaternion.cross(a, b), np.cross(a, b))

@@ -1,0 +1,130 @@
+"""The commands of docs/dome.md and of the estimator's README run, and print what the page shows in kind."""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from skysim.core.paths import ROOT
+from skysim.experiments.study import loader, plan
+
+DOME = (ROOT / "docs/dome.md").read_text(encoding="utf-8")
+ESTIMATOR = (ROOT / "estimator/README.md").read_text(encoding="utf-8")
+TRIALS_AT = {"benchmarks.placement": 4}  # the word that says how many trials; else the fourth
+MINUTES = {"benchmarks.placement", "benchmarks.lost_in_space"}  # even with two trials
+
+
+def commands(page: str = DOME) -> list[list[str]]:
+    blocks = re.findall(r"```sh\n(.*?)```", page, re.DOTALL)
+    return [shlex.split(line, comments=True) for block in blocks for line in block.splitlines() if line]
+
+
+def test_the_page_s_commands_are_of_this_project() -> None:
+    starts = [" ".join(words[:3]) for words in commands()]
+    assert len(starts) >= 4
+    for words in commands():
+        if words[:2] == ["python", "-m"]:
+            assert (ROOT / (words[2].replace(".", "/") + ".py")).is_file()
+        elif words[0] == "pytest":
+            assert (ROOT / words[3]).is_file()
+        else:
+            assert words[0] == "skysim"
+
+
+TABLES = [words for words in commands(DOME) + commands(ESTIMATOR) if words[0] == "python"]
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        pytest.param(words, id=" ".join(words), marks=[pytest.mark.long] if words[2] in MINUTES else [])
+        for words in TABLES
+    ],
+)
+def test_the_page_s_tables_can_be_printed(words: list[str]) -> None:
+    """With two trials a row in place of the page's."""
+    assert len(printed_with(words, 2)) >= 5
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("words", TABLES, ids=" ".join)
+def test_a_tenth_of_the_page_s_trials_prints_as_many_rows(words: list[str]) -> None:
+    """Numbers are the business of the modules' own tests."""
+    trials = int(words[TRIALS_AT.get(words[2], 3)]) // 10
+    assert len(printed_with(words, trials)) == len(printed_with(words, 2))
+
+
+def printed_with(words: list[str], trials: int) -> list[str]:
+    """The lines of a table's command with so many trials a row."""
+    at = TRIALS_AT.get(words[2], 3)
+    few = [*words[1:at], str(trials), *words[at + 1 :]]
+    done = subprocess.run([sys.executable, *few], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return done.stdout.splitlines()
+
+
+@pytest.mark.long
+def test_the_page_s_survey_prints_what_the_page_shows(tmp_path: Path) -> None:
+    """As it is typed there: solved stops and errors after it, to a tenth of what the table says."""
+    (words,) = [words for words in commands() if words[0] == "skysim"]
+    command = [sys.executable, "-m", *words]
+    done = subprocess.run(
+        command, cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(ROOT)}, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    (after,) = re.findall(
+        r"^after: (\d+) of \d+.*?cross median ([\d.]+)°.*?roll median ([\d.]+)°", done.stdout, re.M
+    )
+    rows = dict(re.findall(r"^\| (new attitudes|cross|roll).*\| ([\d.]+)[^|]*\|$", DOME, re.M))
+    shown = [float(rows[name]) for name in ("new attitudes", "cross", "roll")]
+    assert [float(one) for one in after] == pytest.approx(shown, rel=0.1)
+
+
+@pytest.mark.parametrize("words", [words for words in commands() if words[0] == "skysim"], ids=" ".join)
+def test_the_page_s_skysim_commands_are_understood(words: list[str]) -> None:
+    """Their options are: the run itself is `test_measure.py`'s."""
+    done = subprocess.run(
+        [sys.executable, "-m", "skysim", words[1], "--help"], cwd=ROOT, capture_output=True, text=True
+    )
+    assert done.returncode == 0
+    assert [word for word in words if word.startswith("--") and word not in done.stdout] == []
+
+
+def test_the_page_s_surveys_are_tests() -> None:
+    for words in commands():
+        if words[0] == "pytest":
+            assert words[words.index("-k") + 1] in (ROOT / words[3]).read_text(encoding="utf-8")
+
+
+# The pages of the studies.
+
+STUDIES = (ROOT / "docs/studies.md").read_text(encoding="utf-8")
+
+
+def test_every_study_that_comes_along_has_its_page_and_its_command() -> None:
+    shipped = {path.stem for path in plan.STUDIES.glob("*.yaml")}
+    told = re.findall(r"\[(\w+)\]\(studies/(\w+)\.md\) \| `skysim study (run|optimise) (\w+)`", STUDIES)
+    assert {name for name, page, _, command in told if name == page == command} == shipped
+    for name, _, verb, _ in told:
+        assert (verb == "optimise") == (loader.load(name).study.optimise is not None)
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "docs/studies").glob("*.md")), ids=lambda path: path.stem)
+def test_a_study_s_page_is_of_its_study_and_shows_what_is_there(path: Path) -> None:
+    text, told = path.read_text(encoding="utf-8"), loader.load(path.stem)
+    assert text.startswith(f"# {told.study.title}\n")
+    assert f"seed {told.study.seed}." in text
+    counted = re.search(r"(\d+) trials, (\d+) failed", text)
+    assert counted is not None
+    assert int(counted[2]) == 0
+    if told.study.optimise is None:
+        assert int(counted[1]) == told.trials
+    pictures = re.findall(r"!\[[^]]*\]\((\w+\.png)\)", text)
+    assert len(pictures) >= len(told.study.figures)
+    assert all((path.parent / name).is_file() for name in pictures)

@@ -1,0 +1,234 @@
+"""Every code block of README and docs is run: here, page by page and in its order, or by the test that is named here.
+
+On a page `sh` lines are commands, each run as a reader would; `yaml` and `python` whose first line is a comment with a
+file's name are that file; other `python` runs, all of a page in one session. A `text` block is not run: after a command
+it is what the command prints, numbers aside.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import re
+import shlex
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pytest
+import yaml
+
+from skysim.apps.cli import main
+from skysim.core.paths import ROOT
+
+DOCS = ROOT / "docs"
+ELSEWHERE = {  # pages whose blocks have a test of their own, which knows what is to come out
+    "README.md": "test_readme.py",
+    "docs/dome.md": "test_docs.py",
+    "docs/formats.md": "test_formats_docs.py",
+    "docs/trackers.md": "test_trackers.py",
+    "docs/papers.md": "test_papers.py",
+    "docs/studies.md": "test_docs.py",
+    "estimator/README.md": "test_est_readme.py",
+}
+LONG = {
+    "tutorial.md",
+    "howto/camera.md",
+    "howto/cluster.md",
+    "howto/dome.md",
+    "howto/photo.md",
+    "howto/tracker.md",
+    "explanation/budget.md",
+    "stream.md",
+}
+LANGUAGES = {
+    "sh",
+    "python",
+    "yaml",
+    "toml",
+    "json",
+    "text",
+    "math",
+}  # all that a page may have; the last four are not run
+FENCE = re.compile(r"^```([^\n]*)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
+FILE = re.compile(r"# ([\w.]+\.(?:py|yaml))\n")
+NUMBER = re.compile(r"[-+−]?\d[\d.,e+]*")
+
+
+class Block(NamedTuple):
+    """A code block: its language, and what is in it."""
+
+    language: str
+    text: str
+
+
+def blocks(path: Path) -> list[Block]:
+    return [Block(*found) for found in FENCE.findall(path.read_text(encoding="utf-8"))]
+
+
+def all_pages() -> list[Path]:
+    return [
+        ROOT / "README.md",
+        ROOT / "estimator/README.md",
+        ROOT / "CONTRIBUTING.md",
+        *sorted(DOCS.rglob("*.md")),
+    ]
+
+
+def walked() -> list[Any]:
+    """The pages that have something to run and no test of their own."""
+    pages = [path for path in all_pages() if path.relative_to(ROOT).as_posix() not in ELSEWHERE]
+    running = [
+        path for path in pages if {"sh", "python", "yaml"} & {block.language for block in blocks(path)}
+    ]
+    names = [os.path.relpath(path, DOCS) for path in running if "studies" not in path.parts]
+    return [pytest.param(name, marks=[pytest.mark.long] if name in LONG else []) for name in names]
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Iterator[Path]:
+    """A folder like the checkout, in which we stand."""
+    for name in ("scenes", "data"):
+        (tmp_path / name).symlink_to(ROOT / name)
+    with contextlib.chdir(tmp_path):
+        yield tmp_path
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")  # a reader sees them too
+@pytest.mark.parametrize("name", walked())
+def test_a_page_s_blocks_run_in_their_order(name: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PATH", os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]]))
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    session: dict[str, Any] = {}
+    printed, files = "", []
+    for block in blocks(DOCS / name):
+        named = FILE.match(block.text)
+        if block.language in ("yaml", "python") and named:
+            Path(named[1]).write_text(block.text, encoding="utf-8")
+            files.append(named[1])
+        elif block.language == "yaml":
+            pytest.fail(f"a block of YAML without a file's name in its first line:\n{block.text}")
+        elif block.language == "python":
+            with contextlib.redirect_stdout(io.StringIO()):
+                exec(compile(block.text, name, "exec"), session)
+        elif block.language == "sh":
+            printed = "".join(ran(line) for line in block.text.splitlines() if line)
+        elif block.language == "text" and printed:
+            told = {shape(line) for line in printed.splitlines()}
+            assert [line for line in block.text.splitlines() if shape(line) not in told] == [], printed
+        if block.language != "sh":
+            printed = ""
+    commands = "\n".join(block.text for block in blocks(DOCS / name) if block.language in ("sh", "yaml"))
+    assert [
+        file for file in files if len(re.findall(rf"\b{file}\b", commands)) < (1 + file.endswith(".yaml"))
+    ] == []
+
+
+def ran(line: str) -> str:
+    """What a command prints. `make` is what runs this test: of it, whether it knows what to do."""
+    program, *words = shlex.split(line, comments=True)
+    if program == "make":
+        done = subprocess.run(["make", "-n", *words], cwd=ROOT, capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
+        return ""
+    assert program == "skysim", f"{line}: a command of somebody else's belongs in a `text` block"
+    printed = io.StringIO()
+    with contextlib.redirect_stdout(printed):
+        assert not main.app(words, standalone_mode=False), line
+    assert printed.getvalue(), line
+    assert "failed:" not in printed.getvalue(), line
+    if words[0] == "run":
+        assert re.search(r"^[1-9]\d* of \d+ frames solved, 0 wrong", printed.getvalue(), re.M), (
+            printed.getvalue()
+        )
+    return printed.getvalue()
+
+
+def shape(line: str) -> str:
+    """A printed line with its numbers and its spacing left out."""
+    return "".join(NUMBER.sub("#", line).split())
+
+
+@pytest.mark.parametrize("path", all_pages(), ids=lambda path: path.relative_to(ROOT).as_posix())
+def test_every_block_says_what_it_is(path: Path) -> None:
+    """So that what is not run is seen to be: a `text` block, never an unknown language."""
+    assert [block for block in blocks(path) if block.language not in LANGUAGES] == []
+    assert path.read_text(encoding="utf-8").count("```") == 2 * len(blocks(path)) + 0
+
+
+def test_a_page_that_is_run_elsewhere_is_read_there() -> None:
+    for page, test in ELSEWHERE.items():
+        assert page.removeprefix("docs/") in (ROOT / "tests" / test).read_text(encoding="utf-8"), page
+
+
+def test_the_study_pages_show_commands_that_are_there() -> None:
+    """Written by `make studies`, one command each."""
+    for path in sorted((DOCS / "studies").glob("*.md")):
+        (only,) = blocks(path)
+        assert re.fullmatch(rf"skysim study (run|optimise) {path.stem}\n", only.text)
+
+
+# --- the site ------------------------------------------------------------------------------------------------
+
+
+def nav(part: Any) -> Iterator[str]:
+    for entry in part if isinstance(part, list) else part.values():
+        yield from [entry] if isinstance(entry, str) else nav(entry)
+
+
+class Loader(yaml.SafeLoader):
+    """Reads mkdocs.yml, whose functions are none of ours."""
+
+
+Loader.add_multi_constructor("tag:yaml.org,2002:python/name:", lambda *_: None)
+SITE = yaml.load((ROOT / "mkdocs.yml").read_text(encoding="utf-8"), Loader)
+
+
+def test_every_page_has_its_place_in_the_site() -> None:
+    there = {path.relative_to(DOCS).as_posix() for path in DOCS.rglob("*.md")}
+    outside = {name for name in nav(SITE["nav"]) if name.startswith("source/")}
+    assert set(nav(SITE["nav"])) - outside == there
+    assert all((ROOT / name.removeprefix("source/")).is_file() for name in outside)
+
+
+def test_what_the_reference_names_is_a_module() -> None:
+    named = [
+        name
+        for path in (DOCS / "reference").glob("*.md")
+        for name in re.findall(r"^::: (\S+)$", path.read_text(), re.M)
+    ]
+    assert len(named) > 40
+    files = [ROOT / name.replace(".", "/") for name in named]
+    assert [
+        path for path in files if not (path.with_suffix(".py").is_file() or (path / "__init__.py").is_file())
+    ] == []
+
+
+def test_the_reference_holds_every_module_that_a_page_names() -> None:
+    """What a reader imports or is sent to; the browser's lab and the papers apart, which are no library."""
+    text = "".join(path.read_text(encoding="utf-8") for path in all_pages())
+    named = {name.replace("/", ".") for name in re.findall(r"\b((?:skysim|estimator)/[\w/]+)\.py", text)}
+    named |= set(re.findall(r"^from ((?:skysim|estimator)\.[\w.]+) import", text, re.M))
+    named = {name for name in named if not name.startswith(("skysim.apps.gui.", "skysim.apps.cli.", "skysim.experiments.papers."))}
+    reference = "".join(path.read_text(encoding="utf-8") for path in (DOCS / "reference").glob("*.md"))
+    assert len(named) > 90
+    assert sorted(named - set(re.findall(r"^::: (\S+)$", reference, re.M))) == []
+
+
+def test_every_link_of_a_page_leads_somewhere() -> None:
+    for path in DOCS.rglob("*.md"):
+        links = re.findall(r"\]\(([^)#\s:]+)(?:#[^)]*)?\)", path.read_text(encoding="utf-8"))
+        assert [link for link in links if not (path.parent / link).exists()] == [], path
+
+
+@pytest.mark.long
+def test_the_figures_are_drawn_by_their_script(tmp_path: Path) -> None:
+    script = DOCS / "figures.py"
+    subprocess.run([sys.executable, script, tmp_path], env=os.environ | {"PYTHONPATH": str(ROOT)}, check=True)
+    drawn = {path.name for path in tmp_path.glob("*.svg")}
+    assert drawn == {path.name for path in (DOCS / "pictures").iterdir()}
+    text = "".join(path.read_text(encoding="utf-8") for path in DOCS.rglob("*.md"))
+    assert [name for name in drawn if f"pictures/{name}" not in text] == []

@@ -1,0 +1,130 @@
+"""What the site writes by itself: the page of the commands, the tables of keys; and what pages tell to make."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import re
+import shutil
+import subprocess
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+from typer.testing import CliRunner
+
+from skysim.apps.cli import main
+from skysim.core.paths import ROOT
+from skysim.scene.scene import ExposureConfig, Scene
+from skysim.scene.tracker import SurveyErrorsConfig
+
+
+def of_the_site(name: str) -> ModuleType:
+    """A module beside the site's settings, which no package holds."""
+    spec = importlib.util.spec_from_file_location(name, ROOT / "docs" / "site" / f"{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+commands, keys = of_the_site("commands"), of_the_site("keys")
+TOLD = commands.told()
+SECTIONS = dict(re.findall(r"^##+ `skysim ?([^`]*)`\n(.*?)(?=^##|\Z)", TOLD, re.DOTALL | re.MULTILINE))
+
+
+def helped(*words: str) -> str:
+    """What --help prints, on a terminal wide enough."""
+    told = CliRunner().invoke(main.app, [*words, "--help"], env={"COLUMNS": "300", "TERMINAL_WIDTH": "300"})
+    assert told.exit_code == 0, told.output
+    return re.sub(r"\x1b\[[0-9;]*m", "", told.output)
+
+
+def test_every_command_that_help_names_has_its_section() -> None:
+    shown = {name: re.findall(r"^│ ([a-z]+)  ", helped(*name.split()), re.MULTILINE) for name in SECTIONS}
+    assert len(shown[""]) >= 16
+    told = {f"{name} {below}".strip() for name, all_below in shown.items() for below in all_below}
+    assert told | {""} == set(SECTIONS)
+
+
+@pytest.mark.parametrize("name", SECTIONS)
+def test_a_section_has_the_options_that_help_shows(name: str) -> None:
+    """And each of them, and every argument, with a word on what it is for."""
+    starts = re.findall(r"^│[ *]+((?:--[a-z-]+ +)+)", helped(*name.split()), re.MULTILINE)
+    shown = {option for start in starts for option in start.split()}
+    rows = dict(re.findall(r"^\| `([^`]+)` \| (.*) \|$", SECTIONS[name], re.MULTILINE))
+    listed = {option for what in rows for option in re.findall(r"--[a-z-]+", what)}
+    assert listed | {"--help"} == shown
+    assert [what for what, meaning in rows.items() if not re.match(r"\w", meaning)] == []
+
+
+def test_a_key_s_row_says_what_it_takes_and_what_stands_for_it() -> None:
+    exposure, survey = keys.table(ExposureConfig), keys.table(SurveyErrorsConfig)
+    assert '| `time` | a time such as "40 ms" or "1000 us", ≥ 1e-06 s | needed |' in exposure
+    assert "| `rate_hz` | number, > 0 | needed |" in exposure
+    assert '| `led_sigma` | a length such as "35 mm" or "48 in", ≥ 0 m, ≤ 0.1 m | `0 m` |' in survey
+    assert "| `surface_seed` | whole number, ≥ 0 or null | `null` |" in survey
+    assert "| `exposure` | [ExposureConfig][skysim.scene.scene.ExposureConfig] | needed |" in keys.table(Scene)
+
+
+def test_every_section_of_a_file_has_a_page_to_stand_on() -> None:
+    """A table links to the sections beneath: the reference holds all their modules."""
+    pages = "".join(path.read_text(encoding="utf-8") for path in (ROOT / "docs/reference").glob("*.md"))
+    held = set(re.findall(r"^::: (\S+)$", pages, re.MULTILINE))
+    linked = {
+        target
+        for model in keys.sections().values()
+        for target in re.findall(r"\]\[([\w.]+)\]", keys.table(model))
+    }
+    assert len(linked) > 60
+    assert {target.rpartition(".")[0] for target in linked} <= held
+
+
+def test_what_a_page_tells_to_make_is_a_target() -> None:
+    pages = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").rglob("*.md")]
+    pages += (ROOT / ".github").rglob("*.md")
+    told = {
+        name
+        for path in pages
+        for name in re.findall(r"(?:^|`)make ([a-z-]+)", path.read_text(encoding="utf-8"), re.MULTILINE)
+    }
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    assert len(told) >= 10
+    assert told <= set(re.findall(r"^([a-z-]+):", makefile, re.MULTILINE))
+
+
+@pytest.mark.parametrize("name", ["run", "weekly"])
+def test_what_ci_makes_is_a_target(name: str) -> None:
+    """Scripts that bash can read and anybody can start; CONTRIBUTING names them, and the parts of the weekly one."""
+    script = ROOT / ".ci" / name
+    subprocess.run(["bash", "-n", script], check=True)
+    assert os.access(script, os.X_OK)
+    text = script.read_text(encoding="utf-8")
+    told, parts = (re.findall(rf"^{head}make ([a-z-]+)", text, re.MULTILINE) for head in ("", r"part \w+ "))
+    assert len(told) + len(parts) >= 4
+    assert {*told, *parts} <= set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
+    pages = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    assert [one for one in (f".ci/{name}", *(f"make {one}" for one in parts)) if f"`{one}" not in pages] == []
+
+
+def test_the_weekly_script_runs_every_part_and_tells_of_those_that_failed(tmp_path: Path) -> None:
+    """With a `make` that fails at the oracles."""
+    (tmp_path / ".ci").mkdir()
+    weekly = shutil.copy(ROOT / ".ci/weekly", tmp_path / ".ci/weekly")
+    (tmp_path / "make").write_text('#!/bin/sh\necho "did $*"\n[ "$1" != oracle ]\n')
+    (tmp_path / "make").chmod(0o755)
+    path = f"{tmp_path}:{os.environ['PATH']}"
+    done = subprocess.run([weekly], env={"PATH": path, "FUZZ_S": "5"}, capture_output=True, text=True)
+    assert done.returncode == 1
+    lines = done.stdout.splitlines()
+    assert [line.split(" ")[0] for line in lines] == [
+        "long:",
+        "oracle:",
+        "did",
+        "lowest:",
+        "fuzz:",
+        "failed:",
+    ]
+    assert lines[-2].endswith("did fuzz FUZZ_S=5")
+    assert lines[-1] == "failed: oracle"

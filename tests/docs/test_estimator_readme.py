@@ -1,0 +1,70 @@
+"""The package's README: its code runs on a picture, its tables name what there is."""
+
+import re
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from estimator import Camera, radecroll_rad
+from estimator.attitude.solvers import SOLVERS
+from estimator.catalog import catalog
+from estimator.centroiding.centroid import CENTROIDERS
+from estimator.detection.detect import DETECTORS
+from estimator.identification.registry import IDENTIFIERS
+
+ROOT = Path(__file__).parents[2]
+README = (ROOT / "estimator/README.md").read_text(encoding="utf-8")
+BLOCKS = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+
+
+def picture(cam_from_icrs: Rotation) -> np.ndarray:
+    """A grey 8-bit photograph of a field of 0.26 rad, a focal length of 2 % more, stars of one pixel's blur."""
+    camera = Camera.from_fov(1000, 800, 0.26).zoomed(1.02)
+    stars = catalog.read(ROOT / "data/catalogues/hipparcos_hp6.5.ecsv")
+    xy = camera.pixels(cam_from_icrs.apply(stars.vectors))
+    inside = camera.contains(np.nan_to_num(xy, nan=-1e9))
+    light = np.zeros((800, 1000))
+    rows, columns = np.mgrid[:800, :1000]
+    for (x, y), mag in zip(xy[inside], stars.v_mag[inside], strict=True):
+        light += 4000 * 10 ** (-0.4 * mag) * np.exp(-((columns - x) ** 2 + (rows - y) ** 2) / 2)
+    return np.clip(light + np.random.default_rng(1).normal(10, 1.5, light.shape), 0, 255).astype(np.uint8)
+
+
+def test_five_lines_solve_an_image(tmp_path: Path, monkeypatch, capsys) -> None:
+    truth = Rotation.from_euler("xyz", [25, 40, 10], degrees=True)
+    cv2.imwrite(str(tmp_path / "my_sky.jpg"), picture(truth))
+    (tmp_path / "data").symlink_to(ROOT / "data")
+    monkeypatch.chdir(tmp_path)
+    names: dict = {}
+    for block in BLOCKS:
+        exec(block, names)
+    first, *_ = capsys.readouterr().out.splitlines()
+    assert first.startswith("solved")
+    found = names["attitude"].cam_from_ref
+    # Ten stars of a tenth of a pixel of 54": some tens of arcseconds, roll ten times that.
+    assert (found * truth.inv()).magnitude() < 2e-3
+    assert radecroll_rad(found)[0] == pytest.approx(radecroll_rad(truth)[0], abs=3e-4)
+
+
+@pytest.mark.parametrize(
+    ("name", "algorithms"),
+    [
+        ("DETECTORS", DETECTORS),
+        ("CENTROIDERS", CENTROIDERS),
+        ("IDENTIFIERS", IDENTIFIERS),
+        ("SOLVERS", SOLVERS),
+    ],
+)
+def test_the_table_names_every_algorithm(name: str, algorithms: dict) -> None:
+    line = next(line for line in README.splitlines() if line.startswith(f"| `{name}`"))
+    told = {word for word in re.findall(r"`(\w+)`", line)} | {"default", "fialho_2", "fialho_3"}
+    assert set(algorithms) - told == set()
+
+
+def test_every_link_leads_somewhere() -> None:
+    links = re.findall(r"\]\((\w+\.py)\)", README)
+    assert len(links) > 10
+    assert [link for link in links if not (ROOT / "estimator" / link).is_file()] == []

@@ -1,0 +1,70 @@
+"""Every command and code block of docs/formats.md runs, in its order, in one folder."""
+
+from __future__ import annotations
+
+import contextlib
+import io as std_io
+import re
+import shlex
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from skysim.apps.cli import main
+from skysim.core.paths import ROOT
+from skysim.results.files import frames
+from skysim.results.files.export import EXPORTS
+
+PAGE = (ROOT / "docs/formats.md").read_text(encoding="utf-8")
+COMMANDS = [line for block in re.findall(r"```sh\n(.*?)```", PAGE, re.DOTALL) for line in block.splitlines()]
+BLOCKS = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder like the checkout, where every command of the page has been run."""
+    folder = tmp_path_factory.mktemp("formats")
+    with contextlib.chdir(folder):
+        for line in COMMANDS:
+            main.app(shlex.split(line)[1:], standalone_mode=False)
+    return folder
+
+
+def test_the_commands_leave_what_the_table_says(folder: Path) -> None:
+    left = {path.name for path in (folder / "out" / "shefex2").iterdir()}
+    told = set(frames.EXPORTED) - {"imu.parquet"} | {frames.ZARR}
+    assert told <= left
+    assert {f"frame_000{n}.tif" for n in range(3)} <= left
+    assert not [name for name in left if name.startswith(".")]
+    named = set(re.findall(r"--to (\w+)", PAGE.partition("|---")[2]))
+    assert named == set(EXPORTS)
+
+
+@pytest.mark.filterwarnings("ignore:.*datfix")
+def test_the_code_blocks_run(folder: Path) -> None:
+    """In one session, as a reader would type them; the one with ccsds-ndm-py is run by `make oracle`."""
+    names: dict[str, Any] = {}
+    printed = std_io.StringIO()
+    with contextlib.chdir(folder), contextlib.redirect_stdout(printed):
+        for block in [block for block in BLOCKS if "ccsds_ndm" not in block]:
+            exec(compile(block, "docs/formats.md", "exec"), names)
+    assert "SkyCoord (ICRS)" in printed.getvalue()
+    assert "(492, 658, 3)" in printed.getvalue()
+    assert "-0.1     0.05    0.0005 -0.0003  0." in printed.getvalue()
+    assert "b'px'" in printed.getvalue()
+
+
+def test_the_photograph_as_tiff_is_solved_by_the_calibration(folder: Path) -> None:
+    answers = (folder / "out" / "solve" / "solutions.json").read_text()
+    assert '"status": "solved"' in answers
+
+
+def test_a_new_run_takes_the_exports_of_the_old_one_away(tmp_path: Path) -> None:
+    """They would speak of other frames."""
+    mine = tmp_path / "notes.aem"
+    for name in (*frames.EXPORTED, "frame_0003.tif", mine.name):
+        (tmp_path / name).write_bytes(b"")
+    (tmp_path / frames.ZARR).mkdir()
+    frames.clear(tmp_path)
+    assert list(tmp_path.iterdir()) == [mine]

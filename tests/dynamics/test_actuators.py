@@ -1,0 +1,499 @@
+"""Wheels, fans and gyros against a body that keeps its angular momentum, and the known facts of the CMG pyramid."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.spatial.transform import Rotation
+
+from skysim.core.errors import InputError
+from skysim.dynamics.actuators import STEERING, CmgSet, Desaturator, FanSet, WheelSet
+from skysim.scene.motion import DesaturationConfig
+
+BUS = np.array(
+    [[3.0, 0.2, -0.1], [0.2, 4.0, 0.3], [-0.1, 0.3, 5.0]]
+)  # kg m2, less the rotors about their axles
+BUS_INVERSE = np.linalg.inv(BUS)
+SKEW = math.acos(1 / math.sqrt(3))  # 54.74 deg: the pyramid with nearly the same momentum in every direction
+SLANT = math.cos(SKEW)
+STILL = np.zeros(3)
+
+
+def pyramid(skew_rad: float, n: int = 4) -> tuple[np.ndarray, np.ndarray]:
+    """Gimbal axes leaning by the skew from z towards x, y, -x, -y; rotors level, along y, -x, -y, x."""
+    around = Rotation.from_euler("z", 90 * np.arange(n)[:, None], degrees=True)
+    gimbal = around.apply([math.sin(skew_rad), 0, math.cos(skew_rad)])
+    return gimbal.T, around.apply([0.0, 1.0, 0.0]).T
+
+
+def pyramid_set(steering: str = "singularity_robust", rate_limit_rad_s: float = 1.0) -> CmgSet:
+    """Four of one N m s each at 100 rad/s."""
+    return CmgSet(*pyramid(SKEW), np.full(4, 0.01), rate_limit_rad_s, None, steering)
+
+
+SPEED = np.full(4, 100.0)  # rad/s
+
+
+@dataclass
+class Body:
+    """The independent oracle: conservation of angular momentum instead of equations of motion.
+
+    A motor changes its rotor's momentum about the axle, spin = inertia (speed + rate . axle), and nothing else does.
+    The body has what is left of the whole: BUS rate = whole - sum axle spin, and in body axes the whole changes by
+    d(whole)/dt = torque from outside - rate x whole. Wheels are rotors whose gimbals never turn.
+    """
+
+    gimbal: np.ndarray  # (3, n)
+    axle: np.ndarray  # (3, n) at angle zero
+    inertia: np.ndarray  # (n,)
+    angle: np.ndarray
+    spin: np.ndarray
+    whole: np.ndarray
+    turn: np.ndarray  # small rotation vector, d(turn)/dt = rate
+
+    @classmethod
+    def start(cls, gimbal, axle, inertia, angle, speed, rate) -> Body:
+        body = cls(gimbal, axle, inertia, np.array(angle, float), np.zeros(len(inertia)), STILL, STILL)
+        axles = body.axles(body.angle)
+        body.spin = inertia * (np.asarray(speed, float) + rate @ axles)
+        body.whole = BUS @ rate + axles @ body.spin
+        return body
+
+    def axles(self, angle: np.ndarray) -> np.ndarray:
+        return Rotation.from_rotvec((self.gimbal * angle).T).apply(self.axle.T).T
+
+    def rate_of(self, whole: np.ndarray, angle: np.ndarray, spin: np.ndarray) -> np.ndarray:
+        return BUS_INVERSE @ (whole - self.axles(angle) @ spin)
+
+    @property
+    def rate(self) -> np.ndarray:
+        return self.rate_of(self.whole, self.angle, self.spin)
+
+    @property
+    def speed(self) -> np.ndarray:
+        return self.spin / self.inertia - self.rate @ self.axles(self.angle)
+
+    def move(self, dt: float, gimbal_rate=0.0, motor=0.0, outside=STILL) -> Body:
+        """The body dt later (or earlier), with what is commanded held."""
+        n = len(self.inertia)
+        gimbal_rate, motor = np.broadcast_to(gimbal_rate, n), np.broadcast_to(motor, n)
+
+        def flow(t: float, state: np.ndarray) -> np.ndarray:
+            whole, angle, spin = state[:3], state[6 : 6 + n], state[6 + n :]
+            rate = self.rate_of(whole, angle, spin)
+            return np.concatenate([outside - np.cross(rate, whole), rate, gimbal_rate, motor])
+
+        begin = np.concatenate([self.whole, self.turn, self.angle, self.spin])
+        end = solve_ivp(flow, (0, dt), begin, rtol=1e-9, atol=1e-11).y[:, -1]
+        constant = self.gimbal, self.axle, self.inertia
+        return Body(*constant, end[6 : 6 + n], end[6 + n :], end[:3], end[3:6])
+
+
+def torque_felt(body: Body, gimbal_rate=0.0, motor=0.0, dt: float = 1e-4) -> np.ndarray:
+    """BUS d(rate)/dt by a central difference, whose own error is of the order of dt squared."""
+    later, earlier = body.move(dt, gimbal_rate, motor), body.move(-dt, gimbal_rate, motor)
+    return BUS @ (later.rate - earlier.rate) / (2 * dt)
+
+
+def wheels(n: int, torque_limit_nm: float = 0.5) -> WheelSet:
+    axes = np.eye(3) if n == 3 else pyramid(SKEW)[0]
+    return WheelSet(axes, np.full(n, 0.02), torque_limit_nm, 300.0)
+
+
+# ---- wheels ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("n", [3, 4])
+def test_wheels_turn_the_body_and_take_its_momentum(n):
+    """From rest nothing is stored but what they take: rate = BUS^-1 T t, and all of it comes back to zero."""
+    set_ = wheels(n)
+    torque = np.array([0.05, -0.08, 0.03])
+    body = Body.start(set_.axes, set_.axes, set_.inertia_kg_m2, np.zeros(n), np.zeros(n), STILL)
+    for _ in range(100):
+        body = body.move(0.01, motor=set_.drive(torque, body.speed, 0.01))
+    np.testing.assert_allclose(body.rate, np.linalg.solve(BUS, torque * 1.0), rtol=1e-9, atol=0)
+    everything = BUS + set_.axes * set_.inertia_kg_m2 @ set_.axes.T
+    np.testing.assert_allclose(set_.momentum(body.speed), -everything @ body.rate, rtol=1e-9, atol=0)
+
+
+def test_with_the_gyroscopic_torque_fed_forward_spinning_wheels_do_what_is_asked():
+    """The convention: ask for T + rate x (all momentum), and BUS d(rate)/dt = T; without it, not."""
+    set_ = wheels(4, torque_limit_nm=5.0)
+    speed, rate, torque = (
+        np.array([200.0, -50, 120, 10]),
+        np.array([0.3, -0.2, 0.4]),
+        np.array([0.1, 0.2, -0.3]),
+    )
+    body = Body.start(set_.axes, set_.axes, set_.inertia_kg_m2, np.zeros(4), speed, rate)
+    everything = BUS + set_.axes * set_.inertia_kg_m2 @ set_.axes.T
+    gyroscopic = np.cross(rate, everything @ rate + set_.momentum(speed))
+    with_it = torque_felt(body, motor=set_.drive(torque + gyroscopic, speed, 0.01))
+    without = torque_felt(body, motor=set_.drive(torque, speed, 0.01))
+    np.testing.assert_allclose(with_it, torque, rtol=1e-6, atol=0)
+    np.testing.assert_allclose(without, torque - gyroscopic, rtol=1e-6, atol=0)
+    assert np.linalg.norm(gyroscopic) > 0.5
+
+
+def test_four_wheels_share_a_torque_as_evenly_as_they_can():
+    """Of all motor torques that do it, the pseudo-inverse's are the smallest: none of the null vector in them."""
+    set_ = wheels(4)
+    motor = set_.drive(np.array([0.1, -0.05, 0.2]), np.zeros(4), 0.01)
+    assert abs(motor @ [1, -1, 1, -1]) < 1e-15  # the pyramid's null vector
+    np.testing.assert_allclose(set_.axes @ motor, [-0.1, 0.05, -0.2], rtol=0, atol=1e-15)
+
+
+def test_beyond_the_torque_limit_the_direction_is_kept():
+    torque = np.array([3.0, -1.0, 0.5])
+    motor = wheels(3).drive(torque, np.zeros(3), 0.01)
+    np.testing.assert_allclose(motor, -torque / 6, rtol=1e-15, atol=0)
+
+
+@pytest.mark.parametrize(
+    ("speed", "wanted", "motor"),
+    [
+        (299.9, -0.5, 0.02 * 0.1 / 0.01),  # reaches 300 rad/s at the end of the period
+        (-299.9, 0.5, -0.02 * 0.1 / 0.01),
+        (300.0, -0.5, 0.0),
+        (301.0, -0.5, 0.0),  # beyond it already: not driven further, nor braked unasked
+        (301.0, 0.3, -0.3),
+        (290.0, -0.5, 0.5),  # far enough
+    ],
+)
+def test_a_wheel_is_not_driven_beyond_its_speed(speed, wanted, motor):
+    driven = wheels(3).drive(np.array([wanted, 0.1, 0]), np.array([speed, 0, 0]), 0.01)
+    np.testing.assert_allclose(driven, [motor, -0.1, 0], rtol=1e-9, atol=1e-15)
+
+
+@pytest.mark.parametrize("angles_deg", [[0, 90], [0, 120, 240]])
+def test_what_level_wheels_cannot_do_is_left_out(angles_deg):
+    """All axes in the plane of x and y: least squares gives the torque's part in the plane, and none about z."""
+    a = np.radians(angles_deg)
+    tilted = Rotation.from_rotvec([0.3, -0.2, 0.9])  # so that rounding has its say
+    axes = tilted.apply(np.array([np.cos(a), np.sin(a), 0 * a]).T).T
+    set_ = WheelSet(axes, np.full(len(a), 0.01), 1.0, 300.0)
+    motor = set_.drive(tilted.apply([0.1, 0.2, 0.3]), np.zeros(len(a)), 0.01)
+    np.testing.assert_allclose(tilted.inv().apply(-axes @ motor), [0.1, 0.2, 0], rtol=0, atol=1e-14)
+
+
+# ---- fans ------------------------------------------------------------------------------------------------------
+
+
+def fans(limit_n: float = 0.5) -> FanSet:
+    """A pair about each axis, a metre apart, whose pushes cancel."""
+    places = 0.5 * np.array([[0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1], [1, 0, 0], [-1, 0, 0]]).T
+    pushes = np.array([[0, 0, 1], [0, 0, -1], [1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]], float).T
+    return FanSet(pushes, places, limit_n)
+
+
+def test_a_fan_pair_is_a_couple():
+    """A newton from each of a pair a metre apart is a newton metre; by hand: y x z = x, z x x = y, x x y = z."""
+    for axis in range(3):
+        thrust = np.repeat(np.eye(3)[axis], 2)
+        np.testing.assert_array_equal(fans().torque(thrust), np.eye(3)[axis])
+
+
+def test_fans_make_the_torque_with_the_least_thrust():
+    set_, torque = fans(), np.array([0.1, -0.2, 0.05])
+    thrust = set_.drive(torque)
+    np.testing.assert_allclose(set_.torque(thrust), torque, rtol=0, atol=1e-15)
+    np.testing.assert_allclose(thrust, np.repeat(torque / 2 / 0.5, 2), rtol=1e-13, atol=0)
+
+
+def test_fans_at_their_limit_keep_the_direction():
+    set_, torque = fans(), np.array([3.0, -2.0, 1.0])
+    thrust = set_.drive(torque)
+    assert np.abs(thrust).max() == pytest.approx(0.5, rel=1e-15)
+    np.testing.assert_allclose(set_.torque(thrust), torque / 6, rtol=1e-13, atol=0)
+
+
+# ---- the geometry of gyros -------------------------------------------------------------------------------------
+
+ANGLES = np.array([0.4, -1.1, 2.0, 0.7])
+SPEEDS = np.array([100.0, 80, -120, 95])
+
+
+def test_the_momentum_is_the_turned_rotors():
+    set_ = pyramid_set()
+    axles = Rotation.from_rotvec((set_.gimbal_axes * ANGLES).T).apply(set_.spin_axes.T)
+    np.testing.assert_allclose(set_.momentum(ANGLES, SPEEDS), 0.01 * SPEEDS @ axles, rtol=0, atol=1e-14)
+
+
+def test_the_jacobian_is_the_momentums_derivative():
+    """By a five-point difference, exact to the fourth order of 1e-3 rad."""
+    set_, step = pyramid_set(), 1e-3
+    for k, column in enumerate(set_.jacobian(ANGLES, SPEEDS).T):
+        near, far = (np.eye(4)[k] * m * step for m in (1, 2))
+        one = set_.momentum(ANGLES + near, SPEEDS) - set_.momentum(ANGLES - near, SPEEDS)
+        two = set_.momentum(ANGLES + far, SPEEDS) - set_.momentum(ANGLES - far, SPEEDS)
+        np.testing.assert_allclose(column, (8 * one - two) / (12 * step), rtol=0, atol=1e-11)
+
+
+def test_manipulability_is_one_at_best_and_nothing_at_a_singularity():
+    square = CmgSet(np.eye(3), np.roll(np.eye(3), 1, axis=0), np.full(3, 0.01), 1.0)
+    assert square.manipulability(np.zeros(3), np.full(3, 100.0)) == pytest.approx(1, rel=1e-12)
+    assert square.manipulability(np.zeros(3), np.zeros(3)) == 0
+    set_ = pyramid_set()
+    assert set_.manipulability(ANGLES, 7 * SPEEDS) == pytest.approx(set_.manipulability(ANGLES, SPEEDS))
+    # At rest the columns are (-c, 0, s), (0, -c, s), ...: A A^T = diag(2 c^2, 2 c^2, 4 s^2), c^2 = 1/3, trace 4.
+    at_rest = math.sqrt(2 / 3 * 2 / 3 * 8 / 3 / (4 / 3) ** 3)
+    assert set_.manipulability(np.zeros(4), SPEED) == pytest.approx(at_rest, rel=1e-12)
+    assert set_.manipulability(np.radians([-90, 0, 90, 0]), SPEED) < 1e-12
+
+
+# ---- the torque of gyros ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("rate", [[0, 0, 0], [0.3, -0.2, 0.4]])
+def test_gyros_push_with_gimbal_rate_times_momentum(rate):
+    """On a body of its own: ask for T + rate x (all momentum), and BUS d(rate)/dt = T to 1e-6."""
+    set_, rate, torque = pyramid_set("pseudo_inverse"), np.array(rate), np.array([0.1, 0.2, -0.3])
+    body = Body.start(set_.gimbal_axes, set_.spin_axes, set_.rotor_inertia_kg_m2, ANGLES, SPEEDS, rate)
+    asked = torque + np.cross(rate, body.whole)
+    gimbal_rate, motor = set_.drive(asked, rate, ANGLES, SPEEDS, 0.0)
+    assert np.abs(gimbal_rate).max() < 1
+    np.testing.assert_array_equal(motor, np.zeros(4))
+    np.testing.assert_allclose(torque_felt(body, gimbal_rate), torque, rtol=1e-6, atol=0)
+    momenta = body.axles(ANGLES) * body.spin
+    crossed = -np.cross(set_.gimbal_axes * gimbal_rate, momenta, axis=0).sum(axis=1)
+    np.testing.assert_allclose(crossed, asked, rtol=1e-12, atol=0)
+
+
+def test_away_from_singularities_both_ways_of_steering_agree():
+    """lambda is 0.01 exp(-10 det A A^T), 5e-8 at rest with det = 32/27: the rates differ by no more."""
+    torque = np.array([0.1, -0.05, 0.2])
+    plain, robust = (pyramid_set(name).drive(torque, STILL, np.zeros(4), SPEED, 3.0)[0] for name in STEERING)
+    lambda_ = 0.01 * math.exp(-10 * 32 / 27)
+    assert 0 < np.abs(plain - robust).max() < 3 * lambda_ * np.abs(plain).max()
+
+
+@pytest.mark.parametrize("steering", STEERING)
+def test_gimbals_at_their_limit_keep_the_direction(steering):
+    torque = np.array([1.0, -0.5, 2.0])
+    set_ = pyramid_set(steering, rate_limit_rad_s=0.1)
+    rate, _ = set_.drive(torque, STILL, np.zeros(4), SPEED, 0.0)
+    assert np.abs(rate).max() == pytest.approx(0.1, rel=1e-12)
+    given = -set_.jacobian(np.zeros(4), SPEED) @ rate
+    # The robust inverse is off by lambda, 5e-8 there, over the smallest eigenvalue 2/3.
+    np.testing.assert_allclose(
+        given / np.linalg.norm(given), torque / np.linalg.norm(torque), rtol=0, atol=1e-6
+    )
+    assert np.linalg.norm(given) < 0.5 * np.linalg.norm(torque)
+
+
+@pytest.mark.parametrize("steering", STEERING)
+def test_resting_rotors_are_not_gimballed(steering):
+    rate, motor = pyramid_set(steering).drive(np.ones(3), STILL, ANGLES, np.zeros(4), 0.0)
+    np.testing.assert_array_equal([rate, motor], np.zeros((2, 4)))
+
+
+# ---- the pyramid's singularities -------------------------------------------------------------------------------
+
+
+def test_the_pyramid_saturates_where_every_rotor_points_its_best():
+    """A rotor's axle reaches within g's plane: at most sqrt(1 - g_x^2) along x. c, 1, c, 1: 2 + 2 c = 3.155."""
+    set_ = pyramid_set()
+    best = np.sqrt(1 - set_.gimbal_axes[0] ** 2).sum()
+    assert best == pytest.approx(2 + 2 * SLANT, rel=1e-12)
+    angles = np.radians([-90, 180, 90, 0])
+    np.testing.assert_allclose(set_.momentum(angles, SPEED), [best, 0, 0], rtol=0, atol=1e-14)
+    assert set_.manipulability(angles, SPEED) < 1e-12
+
+
+def test_in_a_singularity_the_pseudo_inverse_still_does_the_rest():
+    set_, angles = pyramid_set("pseudo_inverse"), np.radians([-90, 0, 90, 0])
+    rate, _ = set_.drive(np.array([0.3, 0.1, -0.2]), STILL, angles, SPEED, 0.0)
+    np.testing.assert_allclose(-set_.jacobian(angles, SPEED) @ rate, [0, 0.1, -0.2], rtol=0, atol=1e-14)
+
+
+def pushed_along_x(set_: CmgSet, seconds: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Momentum (N, 3), gimbal rates and angles (N, 4) from rest, momentum wanted to grow by 0.1 N m along +x."""
+    angle, story = np.zeros(4), []
+    for k in range(round(seconds / 0.01)):
+        rate, _ = set_.drive(np.array([-0.1, 0, 0]), STILL, angle, SPEED, 0.01 * k)
+        angle = angle + 0.01 * rate
+        story.append((set_.momentum(angle, SPEED), rate, angle))
+    momentum, rates, angles = zip(*story, strict=True)
+    return np.array(momentum), np.array(rates), np.array(angles)
+
+
+def test_the_pseudo_inverse_is_caught_by_the_inner_singularity():
+    """It keeps rotors 2 and 4 opposed; at (-90, 0, 90, 0) deg the others are spent: h_x = 2 c = 1.155 and no more."""
+    momentum, rates, angles = pushed_along_x(pyramid_set("pseudo_inverse"), 60)
+    reached = 2 * SLANT
+    before = round(0.99 * reached / 0.1 / 0.01)
+    grown = 0.001 * np.arange(
+        1, before
+    )  # until then all is well; Euler's steps of 10 ms are good to a percent
+    np.testing.assert_allclose(momentum[: before - 1, 0], grown, rtol=0, atol=0.01 * reached)
+    assert momentum[:, 0].max() <= reached * (1 + 1e-12)
+    assert momentum[2000:, 0].min() > 0.999 * reached
+    np.testing.assert_allclose(np.degrees(angles[2000:]), [[-90, 0, 90, 0]] * 4000, rtol=0, atol=2)
+    assert np.abs(rates[2000:]).max() == pytest.approx(1, rel=1e-12)  # at the limit, to and fro, for nothing
+
+
+def test_the_robust_inverse_passes_it_and_comes_to_saturation():
+    """The whole 2 + 2 c = 3.155 instead of 1.155, at bounded rates, for a stray momentum of a few per cent."""
+    momentum, rates, angles = pushed_along_x(pyramid_set("singularity_robust"), 60)
+    full = 2 + 2 * SLANT
+    assert 0.999 * full < momentum[-1, 0] <= full
+    assert np.abs(rates).max() < 0.9
+    assert np.abs(momentum[:, 1:]).max() < 0.05 * full
+    inside = (momentum[:, 0] > 0.999 * 2 * SLANT) & (momentum[:, 0] < 1.001 * 2 * SLANT)
+    assert (
+        np.linalg.norm(angles[inside] - np.radians([-90, 0, 90, 0]), axis=1).min() < 0.1
+    )  # it went through there
+    folded = np.degrees(np.mod(angles[-1] + 0.5, 2 * np.pi) - 0.5)
+    np.testing.assert_allclose(folded, [270, 180, 90, 0], rtol=0, atol=5)
+
+
+# ---- variable-speed gyros --------------------------------------------------------------------------------------
+
+
+def variable(rotor_torque_limit_nm: float = 0.5) -> CmgSet:
+    """Three about the axes of the body, one N m s each at 100 rad/s; at angle zero d(h)/d(angle) is diagonal."""
+    return CmgSet(np.eye(3), np.roll(np.eye(3), 1, axis=0), np.full(3, 0.01), 1.0, rotor_torque_limit_nm)
+
+
+THREE = np.full(3, 100.0)
+
+
+def singular_angles(set_: CmgSet, along: np.ndarray) -> np.ndarray:
+    """Each rotor turned to its best along a direction, against which no gimbal then can move it."""
+    across = np.cross(set_.gimbal_axes, set_.spin_axes, axis=0)
+    return np.arctan2(along @ across, along @ set_.spin_axes)
+
+
+def test_rotors_deliver_what_singular_gimbals_cannot():
+    set_, along = variable(), np.array([2.0, 1.0, -2.0]) / 3
+    angles = singular_angles(set_, along)
+    np.testing.assert_allclose(along @ set_.jacobian(angles, THREE), np.zeros(3), rtol=0, atol=1e-15)
+    torque = 0.3 * along + 0.2 * np.array([1.0, 0, 1.0])
+    rate, motor = set_.drive(torque, STILL, angles, THREE, 0.0)
+    assert np.abs(motor).max() < 0.5
+    body = Body.start(set_.gimbal_axes, set_.spin_axes, set_.rotor_inertia_kg_m2, angles, THREE, STILL)
+    np.testing.assert_allclose(torque_felt(body, rate, motor), torque, rtol=0, atol=3e-7)
+    assert along @ (body.axles(angles) @ motor) == pytest.approx(
+        -along @ torque, rel=1e-12
+    )  # all by the rotors
+    fixed = CmgSet(set_.gimbal_axes, set_.spin_axes, set_.rotor_inertia_kg_m2, 1.0)
+    stuck, _ = fixed.drive(along, STILL, angles, THREE, 0.0)
+    assert np.linalg.norm(along @ fixed.jacobian(angles, THREE) * stuck) < 1e-14
+
+
+def test_rotors_idle_where_gimbals_can():
+    """At angle zero A = 1 N m s, det A A^T = 1: the weights leave the rotors 0.25 exp(-10) of the torque."""
+    set_, torque = variable(), np.array([0.3, -0.2, 0.1])
+    rate, motor = set_.drive(torque, STILL, np.zeros(3), THREE, 0.0)
+    axles = set_.spin_axes
+    np.testing.assert_allclose(
+        -set_.jacobian(np.zeros(3), THREE) @ rate - axles @ motor, torque, rtol=1e-12, atol=0
+    )
+    assert 0 < np.linalg.norm(motor) < 2 * 0.25 * math.exp(-10) * np.linalg.norm(torque)
+
+
+def test_variable_speed_gyros_do_as_asked_at_any_angle():
+    """800 random attitudes of the gimbals: exact to rounding wherever nothing is at its limit."""
+    set_, rng = variable(rotor_torque_limit_nm=5.0), np.random.default_rng(4)
+    for angles in rng.uniform(-np.pi, np.pi, (800, 3)):
+        torque = 0.1 * rng.standard_normal(3)
+        rate, motor = set_.drive(torque, STILL, angles, THREE, 0.0)
+        axles = Rotation.from_rotvec((set_.gimbal_axes * angles).T).apply(set_.spin_axes.T).T
+        given = -set_.jacobian(angles, THREE) @ rate - axles @ motor
+        np.testing.assert_allclose(given, torque, rtol=0, atol=1e-12)
+
+
+def test_variable_speed_gyros_at_their_limits_keep_the_direction():
+    set_, along = variable(rotor_torque_limit_nm=0.05), np.array([2.0, 1.0, -2.0]) / 3
+    angles = singular_angles(set_, along)
+    for torque in (3.0 * along, 10 * np.array([1.0, 0, 1]) + 0.01 * along):
+        rate, motor = set_.drive(torque, STILL, angles, THREE, 0.0)
+        used = max(np.abs(rate).max() / 1.0, np.abs(motor).max() / 0.05)
+        assert used == pytest.approx(1, rel=1e-12)
+        axles = Rotation.from_rotvec((set_.gimbal_axes * angles).T).apply(set_.spin_axes.T).T
+        given = -set_.jacobian(angles, THREE) @ rate - axles @ motor
+        np.testing.assert_allclose(np.cross(given, torque), STILL, rtol=0, atol=1e-11)
+        assert given @ torque > 0
+
+
+def test_rotors_at_rest_work_as_wheels():
+    set_, torque = variable(), np.array([0.1, 0.2, -0.1])
+    rate, motor = set_.drive(torque, STILL, np.zeros(3), np.zeros(3), 0.0)
+    np.testing.assert_allclose(-set_.spin_axes @ motor, torque, rtol=1e-12, atol=0)
+    np.testing.assert_array_equal(rate, np.zeros(3))
+
+
+# ---- desaturation ----------------------------------------------------------------------------------------------
+
+PART = DesaturationConfig.model_validate({"start": "1 N m s", "stop": "0.2 N m s", "time": "8 s"})
+
+
+def test_desaturation_has_its_hysteresis():
+    fan = Desaturator(PART)
+    size = [0.5, 0.99, 1.01, 0.8, 0.21, 0.19, 0.5, 0.99, 1.5]
+    running = [bool(fan.torque(np.array([0, -h, 0])).any()) for h in size]
+    assert running == [False, False, True, True, True, False, False, False, True]
+
+
+def test_the_torque_is_the_momentum_over_the_time_against_it():
+    np.testing.assert_allclose(
+        Desaturator(PART).torque(np.array([4.0, -8.0, 0])), [-0.5, 1, 0], rtol=1e-15, atol=0
+    )
+
+
+def test_fans_empty_the_wheels_while_the_controller_holds_the_body():
+    """h falls as exp(-t / 8 s), from 1.5 to 0.2 N m s in 8 ln 7.5 = 16.1 s, and the body comes to rest where it was."""
+    set_, fan, blow = wheels(3), Desaturator(PART), fans(limit_n=1.0)
+    body = Body.start(np.eye(3), np.eye(3), set_.inertia_kg_m2, np.zeros(3), [50.0, -50, 25], STILL)
+    period, stored, turned, fanned = 0.1, [], [], []
+    for _ in range(300):
+        held = set_.momentum(body.speed)
+        outside = blow.torque(blow.drive(fan.torque(held)))
+        feedback = -BUS @ (4 * body.turn + 3.2 * body.rate) + np.cross(body.rate, body.whole)
+        body = body.move(period, motor=set_.drive(feedback, body.speed, period), outside=outside)
+        stored.append(float(np.linalg.norm(held)))
+        turned.append(float(np.linalg.norm(body.turn)))
+        fanned.append(bool(outside.any()))
+    stopped = fanned.index(False)
+    assert stored[0] == pytest.approx(1.5, rel=1e-12)
+    assert not any(fanned[stopped:])
+    # The loop of 2 rad/s follows the fans by 2 damping / bandwidth = 0.8 s.
+    assert stopped * period == pytest.approx(8 * math.log(7.5), abs=1.0)
+    assert stored[stopped] < 0.2
+    assert stored[stopped + 80] == pytest.approx(stored[-1], abs=0.001)  # stays, once the loop has settled
+    assert (
+        max(turned) < 0.2 / 3 / 4 * 1.2
+    )  # a torque of 1.5 / 8 N m against stiffness 4 BUS, and some overshoot
+    assert turned[-1] < 1e-3 * max(turned)
+
+
+# ---- mistakes --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("make", "says"),
+    [
+        (lambda: WheelSet(2 * np.eye(3), np.ones(3), 1.0, 1.0), r"wheel axes: lengths .*allowed: unit"),
+        (
+            lambda: WheelSet(np.ones((4, 3)), np.ones(3), 1.0, 1.0),
+            r"wheel axes: shape \(4, 3\); allowed: \(3, n\)",
+        ),
+        (lambda: WheelSet(np.zeros((3, 0)), np.ones(0), 1.0, 1.0), r"wheel axes: shape \(3, 0\)"),
+        (lambda: WheelSet(np.eye(3), np.array([1.0, 0, 1]), 1.0, 1.0), r"inertia.*allowed: 3 positive"),
+        (lambda: WheelSet(np.eye(3), np.ones(2), 1.0, 1.0), r"inertia.*allowed: 3 positive"),
+        (lambda: FanSet(np.eye(3), np.ones((3, 2)), 1.0), r"fan places_m: shape \(3, 2\); allowed: \(3, 3\)"),
+        (lambda: CmgSet(np.eye(3), np.eye(3), np.ones(3), 1.0), "rotor axes: .*at right angles"),
+        (
+            lambda: CmgSet(*pyramid(1.0, 3), np.ones(3), 1.0, None, "magic"),
+            "'magic' is none of pseudo_inverse, ",
+        ),
+    ],
+)
+def test_bad_sets_are_refused_in_one_line(make: Callable[[], object], says: str) -> None:
+    with pytest.raises(InputError, match=says) as caught:
+        make()
+    assert "\n" not in str(caught.value)

@@ -1,0 +1,188 @@
+"""A stranger's vehicle reads no file outside of its folder, in whatever way it names one."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from xml.etree import ElementTree
+
+import mujoco
+import pytest
+
+from skysim.core.errors import InputError
+from skysim.dynamics.multibody import mjcf, mjcf_sandbox
+from skysim.dynamics.multibody.mjcf_sandbox import parsed
+
+BUS = '<body name="bus"><camera name="star_camera"/><geom size=".1"/></body>'
+SECRET = '<body name="secret"><geom size=".1"/></body>'
+OUT = '<include file="../out/secret.xml"/>'
+CHILD = f"<mujoco>{OUT}</mujoco>"
+SOLID = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 1 4 3\n"
+USED = '<worldbody><geom type="mesh" mesh="m"/></worldbody>'
+ATTACHED = (
+    '<asset><model name="c" file="c.xml" content_type="text/xml"/></asset><worldbody><body name="z">'
+    '<geom size=".1"/><attach model="c" body="secret" prefix="p"/></body></worldbody>'
+)
+URDF = (
+    '<robot name="r"><mujoco><compiler strippath="false"/></mujoco><link name="secret"><inertial><mass value="1"/>'
+    '<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial><collision><geometry>'
+    '<mesh filename="../out/x.obj"/></geometry></collision></link></robot>'
+)
+MESHED = (
+    '<mujoco><compiler meshdir="dd"/><asset><mesh name="m" file="x.obj"/></asset><worldbody><body name="secret">'
+    '<geom type="mesh" mesh="m"/></body></worldbody></mujoco>'
+)
+
+
+def mesh(name: str, compiler: str = "") -> str:
+    return f'<compiler {compiler}/><asset><mesh name="m" file="{name}"/></asset>{USED}'
+
+
+def whole(names: str, attributes: str = "") -> str:
+    return f"<mujoco{attributes}>{names}<worldbody>{BUS}</worldbody></mujoco>"
+
+
+# The files of the stranger's folder, and its links into the folder above it.
+WAYS: dict[str, tuple[dict[str, str], dict[str, str]]] = {
+    "attached model": ({"v.xml": whole(ATTACHED), "c.xml": CHILD}, {}),
+    "attached model of another suffix": (
+        {"v.xml": whole(ATTACHED.replace("c.xml", "c.bin")), "c.bin": CHILD},
+        {},
+    ),
+    "attached URDF": ({"v.xml": whole(ATTACHED), "c.xml": URDF}, {}),
+    "attached meshdir": ({"v.xml": whole(ATTACHED), "c.xml": MESHED}, {"dd/x.obj": "out/x.obj"}),
+    "namespace of an include": ({"v.xml": whole('<include xmlns="a" file="c.xml"/>'), "c.xml": CHILD}, {}),
+    "namespace of all": ({"v.xml": whole(OUT, ' xmlns="a"')}, {}),
+    "backslash": ({"v.xml": whole(OUT.replace("/o", "\\o").replace("t/", "t\\"))}, {}),
+    "character by number": ({"v.xml": whole(OUT.replace("..", "&#46;."))}, {}),
+    "link beneath meshdir": ({"v.xml": whole(mesh("x.obj", 'meshdir="dd"'))}, {"dd/x.obj": "out/x.obj"}),
+    "link without its folder": (
+        {"v.xml": whole(mesh("a/x.obj", 'strippath="true"'))},
+        {"x.obj": "out/x.obj"},
+    ),
+    "link before ..": (
+        {"v.xml": whole('<include file="lnk/../x.xml"/>'), "d/e/f": ""},
+        {"lnk": "theirs/d/e", "x.xml": "out/secret.xml"},
+    ),
+    "linked model": (
+        {"d/real.xml": whole('<include file="x.xml"/>')},
+        {"v.xml": "theirs/d/real.xml", "x.xml": "out/secret.xml"},
+    ),
+    "linked include": (
+        {
+            "v.xml": whole('<include file="a/c.xml"/>'),
+            "d/c.xml": '<mujoco><include file="x.xml"/></mujoco>',
+        },
+        {"a/c.xml": "theirs/d/c.xml", "a/x.xml": "out/secret.xml"},
+    ),
+    "another encoding": (
+        {
+            "v.xml": whole('<include file="c.xml"/>'),
+            "c.xml": f'<?xml version="1.0" encoding="utf-7"?>{CHILD}',
+        },
+        {},
+    ),
+    "mark of bytes": ({"v.xml": "\ufeff" + whole(OUT)}, {}),
+    "DOCTYPE": (
+        {"v.xml": f"<!DOCTYPE mujoco [<!-- > {whole(OUT)} --> ]><mujoco/>"},
+        {},
+    ),
+    "CDATA in a comment": ({"v.xml": whole(f"<!-- <![CDATA[ -->{OUT}<!-- ]]> -->")}, {}),
+}
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_a_way_out_that_mujoco_takes_is_refused(tmp_path: Path, way: str) -> None:
+    """MuJoCo compiles each, and could not without the file outside."""
+    files, links = WAYS[way]
+    folder, out = tmp_path / "theirs", tmp_path / "out"
+    out.mkdir()
+    (out / "secret.xml").write_text(f"<mujoco><worldbody>{SECRET}</worldbody></mujoco>")
+    (out / "x.obj").write_text(SOLID)
+    for name, text in files.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(text)
+    for name, target in links.items():
+        (folder / name).parent.mkdir(exist_ok=True)
+        (folder / name).symlink_to(tmp_path / target)
+    mujoco.MjSpec.from_file(str(folder / "v.xml")).compile()
+    with pytest.raises(InputError, match=r"allowed: (files in it|.*XML without|MJCF, no URDF)") as refusal:
+        mjcf.load(folder / "v.xml")
+    assert len(str(refusal.value).splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        '<deformable><skin file="../out/s.skn"/></deformable>',
+        '<asset><hfield name="h" file="/h.png" size="1 1 1 1"/></asset>',
+        '<worldbody><flexcomp name="f" type="gmsh" file="../x.msh"/></worldbody>',
+        '<compiler texturedir="../out"/>',
+        '<compiler ASSETDIR="/"/>',
+        '<asset><model name="c" file="../x.mjz"/></asset>',
+        '<include file="round.xml"/>',
+        '<worldbody><INCLUDE file="part.xml"/></worldbody>',
+    ],
+)
+def test_any_name_that_leaves_the_folder_is_refused(tmp_path: Path, names: str) -> None:
+    (tmp_path / "v.xml").write_text(whole(names))
+    (tmp_path / "part.xml").write_text(CHILD)
+    (tmp_path / "round.xml").symlink_to(tmp_path / "round.xml")
+    with pytest.raises(InputError, match=r"leaves .*; allowed: files in it$"):
+        mjcf.load(tmp_path / "v.xml")
+
+
+def test_a_file_that_includes_itself_in_many_ways_is_read_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each way would be a folder of its own, to which each way leads again: for hours."""
+    read = list[Path]()
+
+    def noted(path: Path) -> ElementTree.Element:
+        read.append(path)
+        return parsed(path)
+
+    monkeypatch.setattr(mjcf_sandbox, "parsed", noted)
+    (tmp_path / "sub").mkdir()
+    (tmp_path / "v.xml").write_text(
+        whole("".join(f'<include file="{"sub/../" * n}v.xml"/>' for n in (1, 2, 3)))
+    )
+    with pytest.raises(InputError, match="not a MuJoCo model"):
+        mjcf.load(tmp_path / "v.xml")
+    assert read == [tmp_path / "v.xml"]
+
+
+def test_other_encodings_archives_and_pipes_are_refused(tmp_path: Path) -> None:
+    path, pipe = tmp_path / "v.xml", tmp_path / "pipe.xml"
+    path.write_bytes(whole(OUT).encode("utf-16"))
+    with pytest.raises(InputError, match="not a MuJoCo model: 'utf-8' codec"):
+        mjcf.load(path)
+    path.write_text(whole('<asset><model name="c" file="c.mjz"/></asset>'))
+    (tmp_path / "c.mjz").write_bytes(b"PK\x03\x04")
+    with pytest.raises(InputError, match=r"c\.mjz: not a MuJoCo model"):
+        mjcf.load(path)
+    os.mkfifo(pipe)
+    path.write_text(whole('<include file="pipe.xml"/>'))
+    with pytest.raises(InputError, match="is no plain file"):
+        mjcf.load(path)
+    path.unlink()
+    path.symlink_to(pipe)
+    with pytest.raises(InputError, match="no such file"):
+        mjcf.load(path)
+
+
+def test_the_parts_of_a_folder_are_let_in(tmp_path: Path) -> None:
+    """Includes of includes from a folder beneath, meshes, an attached model; `..` that stays inside."""
+    for name, text in {
+        "v.xml": whole(ATTACHED + mesh("sub/../x.obj", 'meshdir="dd"') + '<include file="sub/c.xml"/>'),
+        "sub/c.xml": '<mujoco><include file="sub/d.xml"/></mujoco>',
+        "sub/d.xml": "<mujoco><worldbody><site name='in'/></worldbody></mujoco>",
+        "c.xml": f"<mujoco><worldbody>{SECRET}</worldbody></mujoco>",
+        "dd/x.obj": SOLID,
+    }.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(text)
+    told = mjcf.load(tmp_path / "v.xml")
+    assert told.compile().nmesh == 1
+    assert told.site("in") is not None
+    assert told.body("psecret") is not None

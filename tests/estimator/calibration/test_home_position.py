@@ -1,0 +1,320 @@
+"""The thesis's calibration: its epsilons against the noise put in, its catalogue against the dome it came from."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import stats
+from scipy.spatial.transform import Rotation
+
+from estimator.attitude import nearfield
+from estimator.attitude.dome_map import LedMap, Lever, on_sphere, project
+from estimator.calibration.home_position import (
+    SPREADS,
+    HomeCatalogue,
+    Sighting,
+    calibrate,
+    instrument_magnitude,
+    led_map,
+)
+from estimator.catalog.catalog import unit
+from estimator.core.arrays import Floats
+from estimator.core.camera import Camera
+from estimator.core.errors import ImageError
+
+# AFIT's SimSat: 35 mm lens, 4 um pixels, camera 15 in above the bearing, apex at 48 in, LEDs 8 mm apart.
+CAMERA = Camera(1600, 1200, 8750.0, (799.5, 599.5))
+R_M, M_M = 1.2192, 0.381
+LEVER = Lever(np.array([0.0, 0.0, M_M]), Rotation.identity())
+SPHERE = LedMap(np.arange(0), np.zeros((0, 3)), np.zeros(3), np.full(3, R_M))
+PLACES_MM = np.array(
+    [
+        [-9, -11],
+        [-7, 6],
+        [-1, -4],
+        [0, 10],
+        [3, -12],
+        [4, 3],
+        [8, 9],
+        [9, -5],
+        [12, 1],
+        [-12, -2],
+        [-4, 12],
+        [6, -8],
+    ]
+)
+MAGNITUDE = np.linspace(160, 20, len(PLACES_MM))
+NOISE_PX, NOISE_MAG = 0.3, 2.0
+SIGMA_M = (R_M - M_M) * NOISE_PX / CAMERA.focal_px  # of a coordinate: eq. 43 is linear in pixels
+ARCSEC = np.pi / 648_000
+# Each law below is broken by chance once in ten thousand; the draws are fixed.
+RARE = 1e-4
+
+
+def dome() -> LedMap:
+    """Twelve LEDs about the apex of a sphere centred on the bearing."""
+    across = PLACES_MM * 1e-3
+    place = np.column_stack([across, np.sqrt(R_M**2 - np.sum(across**2, axis=1))])
+    return replace(SPHERE, id=np.arange(100, 112), position_m=place)
+
+
+def sighting(
+    rng: np.random.Generator,
+    leds: LedMap,
+    truth: Rotation,
+    imu: Rotation,
+    position: int,
+    noise_px: float = NOISE_PX,
+    lever: Lever = LEVER,
+) -> Sighting:
+    xy = project(truth, leds.position_m, lever, CAMERA) + rng.normal(0, noise_px, (len(leds.id), 2))
+    magnitude = MAGNITUDE[: len(leds.id)] + rng.normal(0, NOISE_MAG, len(leds.id))
+    order = rng.permutation(len(leds.id))  # names, not the order, say which is which
+    return Sighting(position, imu, leds.id[order], xy[order], magnitude[order])
+
+
+def at_home(rng: np.random.Generator, frames: int) -> list[Sighting]:
+    home = Rotation.identity()
+    return [sighting(rng, dome(), home, home, 0) for _ in range(frames)]
+
+
+def greatest_sd(count: int, freedom: int) -> tuple[float, float]:
+    """Between what the greatest of so many independent sample deviations of unit variance lies, but for RARE."""
+    chance = np.array([RARE / 2, 1 - RARE / 2]) ** (1 / count)
+    low, high = np.sqrt(stats.chi2.ppf(chance, freedom) / freedom)
+    return float(low), float(high)
+
+
+# ---- the vectors: eqs 43-45 ----------------------------------------------------------------------------------------
+
+
+def pair_error_arcsec(wide_rad: float, sine: bool) -> float:
+    """How much too wide a pair astride the boresight reads about the bearing, on a perfect centred sphere."""
+    half = wide_rad / 2
+    rays = np.array([[np.sin(half), 0, np.cos(half)], [-np.sin(half), 0, np.cos(half)]])
+    point, reach_m = nearfield.thesis_points(rays, SPHERE, LEVER, sine)
+    np.testing.assert_allclose(reach_m, R_M - M_M, rtol=0, atol=1e-15)
+    read, true = unit(point + LEVER.camera_body_m), unit(on_sphere(rays, LEVER.camera_body_m, R_M))
+    return float((np.arccos(read[0] @ read[1]) - np.arccos(true[0] @ true[1])) / ARCSEC)
+
+
+def test_the_thesis_s_slip_widens_an_eight_degree_pair_by_44_arcsec() -> None:
+    # Reference 1.2, item 11: + 44 arcsec. Half a unit of its last digit.
+    assert abs(pair_error_arcsec(np.radians(8), sine=False) - 44) < 0.5
+
+
+def test_with_the_sine_put_right_a_tenth_of_that_is_left() -> None:
+    # By plane trigonometry: the ray meets the sphere `along` from the camera; the thesis stops at R - M.
+    half = np.radians(4)
+    along = -M_M * np.cos(half) + np.sqrt(R_M**2 - (M_M * np.sin(half)) ** 2)
+    true = np.arctan2(along * np.sin(half), M_M + along * np.cos(half))
+    near = np.arctan2((R_M - M_M) * np.sin(half), M_M + (R_M - M_M) * np.cos(half))
+    expected = 2 * (near - true) / ARCSEC
+    found = pair_error_arcsec(2 * half, sine=True)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-6)  # the arc cosine's rounding
+    assert -5 < found < -4
+
+
+def test_with_the_sine_a_point_lies_on_its_ray_r_minus_m_away() -> None:
+    rng = np.random.default_rng(60)
+    rays = CAMERA.rays(rng.uniform(0, [1599, 1199], (50, 2)))
+    point, _ = nearfield.thesis_points(rays, SPHERE, LEVER, sine=True)
+    np.testing.assert_allclose(point, (R_M - M_M) * rays, rtol=0, atol=1e-15)  # rounding
+
+
+# ---- the epsilons --------------------------------------------------------------------------------------------------
+
+
+def test_the_epsilons_at_one_place_are_the_noise_put_in() -> None:
+    found = calibrate(at_home(np.random.default_rng(61), 250), CAMERA, SPHERE, LEVER)
+    # x and y of twelve LEDs; z hardly moves.
+    low, high = greatest_sd(24, 249)
+    assert low < found.epsilon_pos_m / SIGMA_M < high
+    low, high = greatest_sd(12, 249)
+    assert low < found.epsilon_mag / NOISE_MAG < high
+    # The angle of a pair: both ends move along it. 66 pairs are not independent: at least one, at most 66.
+    sigma = np.sqrt(2) * SIGMA_M / R_M
+    assert greatest_sd(1, 249)[0] < found.epsilon_sep_rad / sigma < greatest_sd(66, 249)[1]
+
+
+IMU_RAD = 1.9861e-3 / R_M  # .0933 degree: Table 9's epsilon_position, were it all the IMU's (A7)
+
+
+@pytest.fixture(scope="module")
+def stops() -> list[Sighting]:
+    """300 stops of two frames, truly all at home, the IMU wrong by IMU_RAD about each axis at each stop."""
+    rng, level = np.random.default_rng(62), Rotation.identity()
+    wrong = Rotation.from_rotvec(rng.normal(0, IMU_RAD, (300, 3)))
+    return [sighting(rng, dome(), level, imu, stop) for stop, imu in enumerate(wrong) for _ in range(2)]
+
+
+def test_an_imu_s_error_between_stops_is_r_sigma_in_the_pooled_spread(stops: list[Sighting]) -> None:
+    found = calibrate(stops, CAMERA, SPHERE, LEVER)
+    # All LEDs share the IMU's 300 errors of x and of y; their yaw moves an LED 13 mm out by a hundredth of that.
+    low, high = greatest_sd(2, 299)
+    assert low < found.epsilon_pos_m / np.hypot(R_M * IMU_RAD, SIGMA_M) < high
+    np.testing.assert_allclose(
+        found.epsilon_pos_rad, found.epsilon_pos_m / R_M, rtol=1e-3
+    )  # places are off by .2 mm
+    # An angle between LEDs needs no IMU: as at one place.
+    sigma = np.sqrt(2) * SIGMA_M / R_M
+    assert greatest_sd(1, 599)[0] < found.epsilon_sep_rad / sigma < greatest_sd(66, 599)[1]
+
+
+def test_the_averaged_spread_does_not_see_an_imu_s_error_between_stops(stops: list[Sighting]) -> None:
+    # This is how .72 degree of Table 15 and 1.99 mm of Table 9 can both be (reference 1.2, item 15).
+    found = calibrate(stops, CAMERA, SPHERE, LEVER, spread="averaged")
+    # The deviation of two frames has the mean sqrt(2 / pi) and, by that, the spread sqrt(pi / 2 - 1); 24 coordinates.
+    scatter = np.sqrt((np.pi / 2 - 1) / 300)
+    low, high = 1 + scatter * stats.norm.ppf(np.array([RARE / 2, 1 - RARE / 2]) ** (1 / 24))
+    assert low < found.epsilon_pos_m / (np.sqrt(2 / np.pi) * SIGMA_M) < high
+
+
+def test_stops_apart_show_the_geometry_s_own_error_without_noise() -> None:
+    # Five of AFIT's stops (Table 6) and no noise: what spread is left is eq. 44's on a dome seen from M.
+    stops = np.radians(
+        [[0, 0, 0], [-0.009, 2.3, 0.007], [0.25, -2.1, 0.004], [3.3, -0.14, -0.028], [-1.9, 0.28, 0.19]]
+    )
+    rng, spread = np.random.default_rng(63), {}
+    for sine in (False, True):
+        seen = [
+            sighting(rng, dome(), attitude, attitude, stop, noise_px=0.0)
+            for stop, attitude in enumerate(Rotation.from_euler("ZYX", stops[:, ::-1]))
+        ]
+        spread[sine] = calibrate(seen, CAMERA, SPHERE, LEVER, sine).epsilon_pos_m
+    # The greatest lateral error, of an LED at the greatest tilt, bounds a deviation from above: eq. 44's point less
+    # where the ray meets the sphere, at the ray of an apex LED leaning 3.3 degrees and half a board.
+    tilt = np.radians(3.3) + 0.0125 / R_M
+    ray = unit(np.array([[R_M * np.sin(tilt), 0, R_M * np.cos(tilt) - M_M]]))
+    true = on_sphere(ray, LEVER.camera_body_m, R_M)
+    for sine, found in spread.items():
+        off = nearfield.thesis_points(ray, SPHERE, LEVER, sine)[0] + LEVER.camera_body_m - true
+        assert 0 < found < np.linalg.norm(off)
+    assert spread[True] < spread[False]
+
+
+def test_the_spreads_by_hand() -> None:
+    value = np.array([1.0, 3, 11, 13, 5, 5, 7])
+    group = np.array([0, 0, 0, 0, 2, 2, 1])
+    stop = np.array([7, 7, 9, 9, 7, 9, 9])
+    root = np.sqrt(2)
+    # 1, 3, 11, 13: mean 7, squares 36 + 16 + 16 + 36 over 3; at either stop sqrt(2).
+    by_hand = {"pooled": [np.sqrt(104 / 3), np.nan, 0], "averaged": [root, np.nan, np.nan]}
+    for name, expected in by_hand.items():
+        np.testing.assert_allclose(SPREADS[name](value, group, stop), expected, rtol=1e-15, atol=0)
+
+
+# ---- the catalogue -------------------------------------------------------------------------------------------------
+
+
+def angles(vectors: Floats) -> Floats:
+    i, j = np.triu_indices(len(vectors), 1)
+    return 2 * np.arcsin(np.linalg.norm(vectors[i] - vectors[j], axis=1) / 2)
+
+
+@pytest.fixture(scope="module")
+def home() -> HomeCatalogue:
+    return calibrate(at_home(np.random.default_rng(64), 50), CAMERA, SPHERE, LEVER)
+
+
+def test_the_home_catalogue_has_the_dome_s_angles_within_noise(home: HomeCatalogue) -> None:
+    leds = dome()
+    truth = {led: place for led, place in zip(leds.id, leds.position_m, strict=True)}
+    true = angles(unit(np.array([truth[led] for led in home.id])))
+    z = (angles(home.vectors) - true) / (np.sqrt(2) * SIGMA_M / R_M / np.sqrt(50))
+    # 66 angles of twelve LEDs: the greatest of 66 normal deviates, at most. The slip adds under .01 of one here.
+    assert np.abs(z).max() < stats.norm.isf(RARE / 66 / 2)
+    # and they are noisy: 21 independent squares (24 coordinates less a turn) or so have a mean near 1.
+    assert 0.3 < np.mean(z**2) < 2.5
+
+
+def test_the_catalogue_is_brightest_first_and_carries_its_samples(home: HomeCatalogue) -> None:
+    assert home.id.tolist() == list(range(100, 112))  # the dome's were made in this order
+    assert (home.samples == 50).all()
+    z = (home.magnitude - MAGNITUDE) / (NOISE_MAG / np.sqrt(50))
+    assert np.abs(z).max() < stats.norm.isf(RARE / 12 / 2)
+    np.testing.assert_allclose(np.linalg.norm(home.vectors, axis=1), 1, rtol=0, atol=1e-15)
+
+
+def test_the_covariance_is_the_noise_s(home: HomeCatalogue) -> None:
+    # n - 1 times the sum of 24 sample variances of x and y over sigma^2 is chi-squared with 24 * 49 degrees.
+    variances = home.covariance_m2[:, [0, 1], [0, 1]].sum() * 49 / SIGMA_M**2
+    assert stats.chi2.ppf(RARE, 24 * 49) < variances < stats.chi2.isf(RARE, 24 * 49)
+    # z = sqrt(c^2 - x^2 - y^2) moves by x / c of x: 1.4 % at the board's edge.
+    assert home.covariance_m2[:, 2, 2].max() < (0.02 * SIGMA_M) ** 2
+
+
+def test_the_mean_over_all_stops_keeps_their_imu_error_and_home_does_not() -> None:
+    rng, wrong = np.random.default_rng(65), Rotation.from_rotvec([2e-3, 0, 0])
+    seen = at_home(rng, 20) + [sighting(rng, dome(), Rotation.identity(), wrong, 1) for _ in range(20)]
+    home, both = (calibrate(seen, CAMERA, SPHERE, LEVER, home_only=only) for only in (True, False))
+    assert home.samples.tolist() == [20] * 12
+    assert both.samples.tolist() == [40] * 12
+    # Half of the frames are turned back by 2e-3 too much: y moves by R 1e-3 (z is up, x the axis: + y).
+    moved = (both.position_m - home.position_m)[:, 1].mean()
+    # The difference of a mean of 40 and of 20, of which 20 are shared, over 12 LEDs.
+    sigma = SIGMA_M * np.sqrt(1 / 80 + 1 / 80) / np.sqrt(12)
+    assert abs(moved - R_M * 1e-3) < stats.norm.isf(RARE / 2) * sigma + R_M * 1e-3 * 1e-4
+
+
+def test_leds_unseen_at_home_are_left_out_of_its_catalogue() -> None:
+    rng, level = np.random.default_rng(66), Rotation.identity()
+    few = replace(dome(), id=dome().id[:4], position_m=dome().position_m[:4])
+    seen = [sighting(rng, few, level, level, 0), *(sighting(rng, dome(), level, level, 1) for _ in range(3))]
+    assert sorted(calibrate(seen, CAMERA, SPHERE, LEVER).id) == [100, 101, 102, 103]
+    assert len(calibrate(seen, CAMERA, SPHERE, LEVER, home_only=False)) == 12
+
+
+def test_a_camera_mounted_askew_gives_the_same_places() -> None:
+    # cam_from_body turned about the boresight, the pupil aside: mapping back must undo both.
+    askew = Lever(np.array([0.004, -0.003, M_M]), Rotation.from_euler("z", 0.7))
+    rng, level = np.random.default_rng(67), Rotation.identity()
+    seen = [sighting(rng, dome(), level, level, 0, noise_px=0.0, lever=askew) for _ in range(2)]
+    found = calibrate(seen, CAMERA, SPHERE, askew)
+    off = found.position_m - dome().position_m
+    # Eq. 44's own error: 17 mm from the boresight the sphere is .12 mm lower, .12 mm of range shifts by 17 / 838.
+    assert np.abs(off[:, :2]).max() < 0.12e-3 * 0.02 * 1.3
+
+
+def test_the_map_for_a_tracker_lies_on_the_surface_in_the_catalogue_s_directions(home: HomeCatalogue) -> None:
+    oval = LedMap(
+        np.arange(0), np.zeros((0, 3)), np.array([0.0, 0.003, 0.492]), np.array([0.9876, 0.9876, 0.7264])
+    )
+    leds = led_map(home, oval)
+    scaled = (leds.position_m - oval.centre_m) / oval.semi_axes_m
+    np.testing.assert_allclose(np.sum(scaled**2, axis=1), 1, rtol=0, atol=1e-14)  # a quadratic's rounding
+    np.testing.assert_allclose(unit(leds.position_m), home.vectors, rtol=0, atol=1e-15)
+    assert (leds.id == home.id).all()
+
+
+def test_the_thesis_s_magnitude_by_hand() -> None:
+    # Areas 60, 80 and 100: the median is 80.
+    found = instrument_magnitude(np.array([120.0, 100, 20]), np.array([100.0, 80, 60]))
+    np.testing.assert_allclose(found, [150, 100, 15], rtol=1e-15, atol=0)
+
+
+# ---- what is refused -----------------------------------------------------------------------------------------------
+
+
+def test_what_cannot_be_calibrated_is_refused_in_one_line() -> None:
+    seen = at_home(np.random.default_rng(68), 2)
+    twice = replace(seen[0], led=np.full(12, 100))
+    short = replace(seen[0], magnitude=np.ones(3))
+    blind = replace(seen[0], xy_px=np.full((12, 2), np.nan))
+    one = Sighting(0, Rotation.identity(), np.array([1]), np.array([[800.0, 600]]), np.array([9.0]))
+    for sightings, message in [
+        ([], "no sightings"),
+        ([seen[0], twice], "sighting 1: a light has two centroids"),
+        ([short], "sighting 0: 12 names, centroids .*; allowed: K names"),
+        ([blind], "sighting 0: a centroid or a magnitude is not finite"),
+        (seen[:1], "each light has one sample"),
+        ([one, one], "no frame shows two lights"),
+    ]:
+        with pytest.raises(ImageError, match=message):
+            calibrate(sightings, CAMERA, SPHERE, LEVER)
+
+
+def test_a_direction_that_misses_the_surface_is_named(home: HomeCatalogue) -> None:
+    beside = LedMap(np.arange(0), np.zeros((0, 3)), np.array([5.0, 0, 0]), np.ones(3))
+    with pytest.raises(ImageError, match="LED 100: its direction from the bearing misses"):
+        led_map(home, beside)

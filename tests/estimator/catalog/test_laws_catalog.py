@@ -1,0 +1,206 @@
+"""Laws of the star catalogue and of its indexes, on any sky."""
+
+from __future__ import annotations
+
+import datetime
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as some
+from hypothesis.extra.numpy import arrays
+from laws import ANY, NUMBERS, SEEDS, answered, drawn, law, units
+from numpy.typing import NDArray
+
+from estimator.catalog import catalog, pair_buckets, pair_index, ptase, shefex, sky_index, spatial_grid
+from estimator.catalog.catalog import StarList
+from estimator.catalog.sky_index import Sky
+from estimator.core.camera import Camera
+from estimator.core.errors import ImageError
+
+pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning")
+CAMERA = Camera.from_fov(640, 480, np.radians(40))
+RAYS = arrays("f8", some.tuples(some.integers(0, 12), some.just(3)), elements=ANY)
+
+
+def apart(a: NDArray, b: NDArray) -> NDArray:
+    """Angles between all of two lists of unit vectors, by the cross product."""
+    return np.arctan2(np.linalg.norm(np.cross(a[:, None], b[None]), axis=2), a @ b.T)
+
+
+# Catalogue
+
+
+@law(catalog.from_columns, catalog.at_epoch, catalog.apparent, catalog.unit)
+@given(rng=SEEDS, year=some.floats(1900, 2100))
+def test_stars_move_across_the_sky_and_no_farther_than_they_can(
+    rng: np.random.Generator, year: float
+) -> None:
+    stars = drawn(rng)
+    np.testing.assert_allclose(np.sum(stars.vectors * stars.drift_rad_yr, axis=1), 0, rtol=0, atol=1e-15)
+    np.testing.assert_allclose(catalog.at_epoch(stars, catalog.EPOCH_YR), stars.vectors, rtol=0, atol=1e-15)
+    np.testing.assert_allclose(catalog.unit(stars.vectors * 7.0), stars.vectors, rtol=0, atol=1e-15)
+    there = catalog.Observer(year, units(rng, 1)[0], 3e4 * units(rng, 1)[0])
+    seen = catalog.apparent(stars, there)
+    np.testing.assert_allclose(np.linalg.norm(seen, axis=1), 1, rtol=0, atol=1e-12)
+    moved = np.linalg.norm(seen - catalog.at_epoch(stars, year), axis=1)
+    away = np.linalg.norm(seen + there.position_au, axis=1)  # near the Sun light is bent by more than a bit
+    assert (moved < 1.01e-4 + stars.parallax_rad + 2 * catalog.SUN_BENDS_RAD / np.maximum(away, 1e-9)).all()
+
+
+@law(catalog.on_earth)
+@given(some.datetimes(datetime.datetime(1900, 1, 1), datetime.datetime(2100, 1, 1)))
+def test_the_earth_is_an_au_from_the_sun_and_goes_30_km_a_second(utc: datetime.datetime) -> None:
+    there = catalog.on_earth(utc)
+    assert 0.97 < np.linalg.norm(there.position_au) < 1.03
+    assert 29e3 < np.linalg.norm(there.velocity_m_s) < 30.6e3
+    zone = datetime.timezone(datetime.timedelta(hours=5))
+    same = catalog.on_earth(utc.replace(tzinfo=datetime.UTC).astimezone(zone))
+    np.testing.assert_allclose(same.position_au, there.position_au, rtol=0, atol=1e-15)
+
+
+@law(StarList.take, catalog.brighter, catalog.limit_for_density, shefex.asymmetric)
+@given(rng=SEEDS, limit=some.floats(-2, 7), wanted=some.floats(0, 1e3))
+def test_a_catalogue_s_subset_is_what_was_asked_for(
+    rng: np.random.Generator, limit: float, wanted: float
+) -> None:
+    stars = drawn(rng)
+    bright = catalog.brighter(stars, limit)
+    assert bright.id.tolist() == [n for n, mag in zip(stars.id, stars.v_mag, strict=True) if mag <= limit]
+    south = shefex.asymmetric(stars, limit, limit + 1)
+    assert set(bright.id) <= set(south.id) <= set(catalog.brighter(stars, limit + 1).id)
+    density = catalog.limit_for_density(stars, 1.0, wanted)
+    assert len(catalog.brighter(stars, density)) == np.clip(int(wanted * 4 * np.pi), 1, len(stars))
+
+
+@law(shefex.spread, shefex.uniform)
+@given(rng=SEEDS, apart_rad=some.floats(0.01, 1), count=some.integers(-1, 70))
+def test_spread_stars_are_apart_and_none_is_left_out_for_nothing(
+    rng: np.random.Generator, apart_rad: float, count: int
+) -> None:
+    stars = drawn(rng)
+    kept = shefex.spread(stars, apart_rad)
+    between = apart(kept.vectors, kept.vectors)[np.triu_indices(len(kept), 1)]
+    assert (between > apart_rad - 1e-9).all()
+    assert (apart(stars.vectors, kept.vectors).min(axis=1) <= apart_rad + 1e-9).all()
+    few = answered(lambda: shefex.uniform(stars, count), ImageError)
+    assert (few is not None) == (1 <= count <= 60)
+    assert few is None or (set(few.id) <= set(stars.id) and abs(len(few) - count) <= 2)
+
+
+@law(shefex.chosen, slow=True)
+@given(rng=SEEDS)
+def test_the_flown_catalogue_has_its_number_or_is_refused(rng: np.random.Generator) -> None:
+    many = replace(drawn(rng, 2600), v_mag=np.linspace(4, 5.2, 2600))
+    assert abs(len(shefex.chosen(many)) - shefex.COUNT) <= 3
+    with pytest.raises(ImageError, match="2023 stars of"):
+        shefex.chosen(drawn(rng))
+
+
+@law(catalog.light_centres, catalog.close_groups, catalog.merge_doubles)
+@given(rng=SEEDS, near_rad=some.floats(0, 1))
+def test_merged_stars_keep_their_light(rng: np.random.Generator, near_rad: float) -> None:
+    stars = drawn(rng)
+    groups = catalog.close_groups(stars.vectors, near_rad)
+    near = apart(stars.vectors, stars.vectors) < near_rad - 1e-9
+    assert (groups[:, None] == groups)[near].all()
+    alone = ~(near & ~np.eye(len(stars), dtype=bool)).any(axis=1) & (near_rad > 1e-9)
+    assert (np.bincount(groups)[groups[alone]] == 1).all() or near_rad < 1e-6
+    _, mag = catalog.light_centres(stars.vectors, stars.v_mag, groups)
+    merged = catalog.merge_doubles(stars, near_rad)
+    for told in (mag, merged.v_mag):
+        np.testing.assert_allclose(
+            np.sum(10 ** (-0.4 * told)), np.sum(10 ** (-0.4 * stars.v_mag)), rtol=1e-9, atol=0
+        )
+    assert set(merged.id) <= set(stars.id)
+    assert (np.diff(merged.v_mag) >= 0).all()
+
+
+@law(catalog.read, catalog.columns, ptase.read_cat)
+@given(
+    rows=some.lists(some.lists(some.floats() | some.text(max_size=5), min_size=5, max_size=8), max_size=3),
+    rng=SEEDS,
+)
+def test_any_table_is_a_catalogue_or_is_none(
+    tmp_path_factory: pytest.TempPathFactory, rows: list[list[object]], rng: np.random.Generator
+) -> None:
+    path = tmp_path_factory.mktemp("catalogue") / "x.ecsv"
+    head = ",".join(catalog.COLUMNS)
+    path.write_text("\n".join([head, *(",".join(map(str, row)) for row in rows)]), encoding="utf-8")
+    answered(lambda: catalog.read(path), ImageError)
+    answered(lambda: ptase.read_cat(path, 5.0), ImageError)
+    table = rng.uniform(1, 50, (4, 7))
+    path.write_text("\n".join([head, *(",".join(map(repr, row)) for row in table.tolist())]))
+    np.testing.assert_array_equal(catalog.columns(path, catalog.COLUMNS), table.T)
+    assert catalog.read(path).v_mag.tolist() == sorted(table[:, 6])
+    assert len(ptase.read_cat(path, 60.0)) == 4
+
+
+@law(ptase.proc_cat, ptase.histogram, ptase.log)
+@given(rng=SEEDS, near_rad=some.floats(0, 1), step_mag=some.floats(0.1, 2))
+def test_a_prepared_catalogue_counts_every_star(
+    rng: np.random.Generator, near_rad: float, step_mag: float
+) -> None:
+    stars = drawn(rng)
+    raw = ptase.OnBoard(stars.id, stars.vectors, stars.v_mag, np.ones(len(stars), np.int64), 2000.0)
+    told = ptase.proc_cat(raw, near_rad)
+    assert told.components.sum() == len(stars)
+    assert (np.diff(told.magnitude) >= 0).all()
+    edges, count = ptase.histogram(told.magnitude, step_mag)
+    assert count.sum() == len(told)
+    assert edges[0] <= told.magnitude[0] + 1e-6 and told.magnitude[-1] < edges[-1] + step_mag  # noqa: PT018
+    assert len(ptase.log(told, step_mag).splitlines()) == 6 + len(count) + len(told)
+
+
+# Indexes
+
+
+@law(
+    pair_index.build,
+    pair_index.line,
+    spatial_grid.build,
+    pair_buckets.bucketed,
+    sky_index.sky_of,
+    sky_index.unpaired,
+    Sky.bytes,
+)
+@given(rng=SEEDS, most_rad=some.floats(0.3, 3.2), count=some.integers(8, 50))
+def test_three_indexes_hold_the_pairs_that_there_are(
+    rng: np.random.Generator, most_rad: float, count: int
+) -> None:
+    vectors, mag = units(rng, count), np.sort(rng.uniform(0, 6, count))
+    every = apart(vectors, vectors)[np.triu_indices(count, 1)]
+    pairs = int(np.count_nonzero(every <= most_rad))
+    for build in (pair_index.build, lambda *told: sky_index.sky_of(told[0], mag, told[1])):
+        made = answered(lambda: build(vectors, most_rad), ImageError)  # noqa: B023
+        assert (len(made.pair) if made else 0) == (pairs if pairs >= 3 else 0)
+    known = pair_buckets.bucketed(vectors, mag, 0.01, (0.0, most_rad)) if pairs else None
+    assert known is None or known.table[-1] == len(known.pair) == pairs
+    assert sorted(spatial_grid.build(vectors).row.tolist()) == list(range(count))
+    kvector, slope, offset = pair_index.line(np.sort(every))
+    z = slope * np.arange(len(kvector)) + offset
+    assert all(np.count_nonzero(every <= at) == n for at, n in zip(z, kvector, strict=True))
+    bare = sky_index.unpaired(vectors, mag)
+    assert bare.bytes == sum(part.nbytes for part in bare if isinstance(part, np.ndarray))
+    assert set(bare.cell_star.tolist()) == set(range(count))
+
+
+@law(pair_index.build)
+@given(vectors=RAYS, mag=NUMBERS, most_rad=ANY)
+def test_any_array_is_indexed_or_refused(vectors: NDArray, mag: NDArray, most_rad: float) -> None:
+    answered(lambda: pair_index.build(vectors, most_rad))
+    answered(lambda: pair_index.build(vectors, 1.0, None, mag))
+
+
+def test_the_shipped_catalogue_is_brightest_first() -> None:
+    stars = catalog.read(Path(__file__).parents[3] / "data/catalogues/hipparcos_hp6.5.ecsv")
+    assert (np.diff(stars.v_mag) >= 0).all()
+
+
+@given(place=ANY, last=some.integers(0, 1000))
+def test_a_place_s_cell_is_the_nearest_there_is(place: float, last: int) -> None:
+    """Whatever the number: casts of NaN and of 1e300 once led beyond a table's end."""
+    expected = 0 if np.isnan(place) else min(max(place, 0), last)
+    assert spatial_grid.cell_of(float(place), last) == int(expected)

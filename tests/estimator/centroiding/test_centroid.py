@@ -1,0 +1,268 @@
+"""Centroids: against our own rendering by erf, and the Cramér-Rao bound from its numerical derivatives."""
+
+import numpy as np
+import pytest
+from scipy import ndimage
+from scipy.special import erf, j1
+
+from estimator.centroiding.centroid import CENTROIDERS, cog, gaussian_fit
+from estimator.core.least_squares import SETTLED_PX
+from estimator.core.types import Centroids, FramePriors
+from estimator.detection import detect
+
+SIGMA_PX = 0.7
+CELL_PX, CELLS = 64, 12  # stars so far apart that the sky between them is not lifted by their light
+
+
+def gaussian(shape: tuple[int, int], x: float, y: float, flux: float, sigma: float = SIGMA_PX) -> np.ndarray:
+    """Light of a Gaussian integrated over each pixel, whose middle is the integer."""
+
+    def share(count: int, at: float) -> np.ndarray:
+        return np.diff(erf((np.arange(count + 1) - 0.5 - at) / (sigma * 2**0.5))) / 2
+
+    return flux * np.outer(share(shape[0], y), share(shape[1], x))
+
+
+def disc(shape: tuple[int, int], x: float, y: float, radius: float) -> np.ndarray:
+    """A uniform disc: 200 chords a row of pixels, each cut exactly into pixels."""
+    chords = np.add.outer(np.arange(shape[0]), (np.arange(200) + 0.5) / 200 - 0.5).ravel()
+    half = np.sqrt(np.maximum(radius**2 - (chords - y) ** 2, 0))[:, None]
+    edges = np.arange(shape[1] + 1) - 0.5
+    inside = np.diff(np.clip(edges, x - half, x + half), axis=1)
+    return inside.reshape(shape[0], 200, shape[1]).mean(axis=1)
+
+
+def cramer_rao_px(flux_e: float, read_noise_e: float) -> float:
+    """Bound for x of a star whose place, flux, width and sky are unknown, averaged over places in a pixel."""
+    shape, step = (25, 25), 1e-4
+
+    def bound(x: float, y: float) -> float:
+        def model(p: np.ndarray) -> np.ndarray:
+            return (p[4] + gaussian(shape, p[0], p[1], flux_e * p[2], p[3])).ravel()
+
+        p = np.array([x, y, 1.0, SIGMA_PX, 0.0])
+        slopes = np.array([(model(p + step * e) - model(p - step * e)) / (2 * step) for e in np.eye(5)])
+        fisher = slopes / (model(p) + read_noise_e**2) @ slopes.T
+        return np.linalg.inv(fisher)[0, 0]
+
+    places = np.linspace(-0.4, 0.4, 5)
+    return float(np.sqrt(np.mean([bound(12 + x, 12 + y) for x in places for y in places])))
+
+
+def starfield(rng: np.random.Generator, flux_e: float, noise_e: float) -> tuple[np.ndarray, np.ndarray]:
+    """An image of 144 equal stars with photon and read noise on a sky of 100, and where they are."""
+    image, places = np.empty((CELL_PX * CELLS, CELL_PX * CELLS)), []
+    for row in range(CELLS):
+        for column in range(CELLS):
+            x, y = rng.uniform(31, 32, 2)
+            cell = rng.poisson(gaussian((CELL_PX, CELL_PX), x, y, flux_e))
+            image[row * CELL_PX : (row + 1) * CELL_PX, column * CELL_PX : (column + 1) * CELL_PX] = cell
+            places.append((column * CELL_PX + x, row * CELL_PX + y))
+    return image + rng.normal(100, noise_e, image.shape), np.array(places)
+
+
+def errors_of(name: str, flux_e: float, noise_e: float, gain_e_dn: float, seed: int) -> tuple:
+    """Errors and reported sigmas over five star fields in DN of so many electrons."""
+    rng = np.random.default_rng(seed)
+    off, sigma = [], []
+    for _ in range(5):
+        image, places = starfield(rng, flux_e, noise_e)
+        image /= gain_e_dn
+        found = CENTROIDERS[name](image, detect.local(image, 6.0, max_blobs=1000), gain_e_dn)
+        error, told = matched(found, places)
+        off.append(error)
+        sigma.append(told)
+    return np.concatenate(off), np.concatenate(sigma)
+
+
+def matched(found: Centroids, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Error and reported sigma of the centroid that is nearest to each place."""
+    rows = np.linalg.norm(found.xy_px[None] - places[:, None], axis=2).argmin(axis=1)
+    return found.xy_px[rows] - places, found.sigma_px[rows]
+
+
+@pytest.mark.parametrize("sigma", [0.5, 0.7, 1.0, 1.3])
+def test_the_fit_recovers_a_noise_free_gaussian(sigma: float) -> None:
+    rng = np.random.default_rng(20)
+    for _ in range(20):
+        x, y = rng.uniform(29, 35, 2)
+        image = 100 + gaussian((64, 64), x, y, 1e4, sigma)
+        found = gaussian_fit(image, detect.local(image, min_area_px=1))
+        # Newton's last step is below a thousandth of a pixel, and what it leaves is its square.
+        np.testing.assert_allclose(found.xy_px, [[x, y]], rtol=0, atol=SETTLED_PX**2)
+        assert found.flux[0] == pytest.approx(1e4, rel=SETTLED_PX**2)
+
+
+@pytest.mark.parametrize("name", list(CENTROIDERS))
+def test_a_centroid_follows_its_star_by_whole_pixels_and_across_the_diagonal(name: str) -> None:
+    image = np.full((80, 96), 50.0)
+    image += gaussian((80, 96), 40.3, 30.8, 1e4)
+    seen = CENTROIDERS[name](image, detect.local(image, min_area_px=1)).xy_px
+    turned = CENTROIDERS[name](image.T.copy(), detect.local(image.T.copy(), min_area_px=1)).xy_px
+    np.testing.assert_allclose(turned, seen[:, ::-1], rtol=0, atol=1e-9)  # rounding
+    rolled = np.roll(image, (7, -5), axis=(0, 1))
+    moved = CENTROIDERS[name](rolled, detect.local(rolled, min_area_px=1)).xy_px
+    np.testing.assert_allclose(moved - seen, [[-5, 7]], rtol=0, atol=1e-9)  # rounding
+
+
+@pytest.mark.parametrize("radius", [2.0, 5.0, 10.4])
+def test_the_centre_of_gravity_of_a_disc_is_its_middle(radius: float) -> None:
+    # Reference section 2: an LED of 2 mm is a disc of 20.8 px. Larger than the fit's window, it falls back.
+    x, y = 60.37, 58.81
+    image = 10 + 200 * disc((128, 128), x, y, radius)
+    found = cog(image, detect.local(image, min_area_px=1))
+    light = image - 10
+    moments = [(light.sum(axis) @ np.arange(128)) / light.sum() for axis in (0, 1)]
+    # Rounding.
+    np.testing.assert_allclose(found.xy_px, [moments], rtol=0, atol=1e-9)
+    # Pixels sample the disc: its transform 2 J1(z) / z at n cycles a pixel aliases to an S-curve (reference
+    # section 3 has the Gaussian's). The harmonics at their worst, and 1e-4 for the rendering by chords.
+    n = np.arange(1, 50)
+    z = 2 * np.pi * radius * n
+    aliased = np.sum(2 * np.abs(j1(z)) / z / (np.pi * n))
+    np.testing.assert_allclose(found.xy_px, [[x, y]], rtol=0, atol=aliased + 1e-4)
+    assert found.flux[0] == pytest.approx(200 * np.pi * radius**2, rel=1e-3)
+
+
+@pytest.mark.parametrize("sigma", [0.3, 0.4, 0.5])
+def test_the_centre_of_gravity_has_the_s_curve_of_theory(sigma: float) -> None:
+    # Reference section 3: the centre of gravity errs by exp(-2 pi^2 sigma^2) / pi sin(2 pi x), wide window.
+    phases = np.linspace(-0.5, 0.5, 21)
+    images = [100 + gaussian((40, 40), 20 + x, 20.0, 1e4, sigma) for x in phases]
+    off = np.array(
+        [
+            cog(im, detect.local(im, min_area_px=1)).xy_px[0, 0] - 20 - x
+            for im, x in zip(images, phases, strict=True)
+        ]
+    )
+    curve = -np.exp(-2 * (np.pi * sigma) ** 2) / np.pi * np.sin(2 * np.pi * phases)
+    # The second harmonic is exp(-8 pi^2 sigma^2) / (2 pi), .0001 at sigma .3.
+    np.testing.assert_allclose(off, curve, rtol=0, atol=2e-4)
+
+
+def test_what_the_fit_cannot_fit_keeps_its_centre_of_gravity() -> None:
+    image = 10 + 200 * disc((128, 128), 60.37, 58.81, 10.4)
+    image += gaussian((128, 128), 2.0, 100.2, 2e4)  # too near the border for a window of 7x7
+    blobs = detect.local(image, min_area_px=1)
+    assert len(blobs) == 2
+    fitted, wanted = gaussian_fit(image, blobs), cog(image, blobs)
+    np.testing.assert_array_equal(fitted.xy_px, wanted.xy_px)
+    np.testing.assert_array_equal(fitted.sigma_px, wanted.sigma_px)
+    np.testing.assert_array_equal(fitted.flux, wanted.flux)
+
+
+@pytest.mark.parametrize(
+    ("flux_e", "noise_e", "published_px"),
+    [(1e4, 15, 0.0097), (1e5, 15, 0.0025), (3e3, 15, 0.022), (1e5, 0.5, 0.0024)],
+)
+def test_the_fit_reaches_the_cramer_rao_bound(flux_e: float, noise_e: float, published_px: float) -> None:
+    bound = cramer_rao_px(flux_e, noise_e)
+    # The reference's table, section 3, has two figures.
+    assert bound == pytest.approx(published_px, rel=0.04)
+    off, _ = errors_of("gaussian_fit", flux_e, noise_e, 1.0, seed=21)
+    # 1,440 errors give their deviation to 1.9 %; no unbiased estimate may pass the bound.
+    assert 0.94 < off.std() / bound < 1.10
+    assert np.abs(off.mean(axis=0)).max() < 4 * bound / np.sqrt(len(off))
+
+
+# cog's own variance is photon + pixel noise over its box; its box moves with the noise, hence the wider band.
+# The S-curves of the other two are in their variance as if their profiles were Gaussian.
+@pytest.mark.parametrize(
+    ("name", "band"),
+    [
+        ("cog", (0.75, 1.25)),
+        ("weighted", (0.75, 1.25)),
+        ("gaussian_window", (0.75, 1.25)),
+        ("gaussian_fit", (0.88, 1.12)),
+    ],
+)
+@pytest.mark.parametrize("gain_e_dn", [1.0, 20.0])
+@pytest.mark.parametrize(("flux_e", "noise_e"), [(1e4, 15), (1e5, 15), (1e5, 1)])
+def test_the_reported_sigma_is_true(
+    name: str, band: tuple[float, float], gain_e_dn: float, flux_e: float, noise_e: float
+) -> None:
+    off, sigma = errors_of(name, flux_e, noise_e, gain_e_dn, seed=22)
+    # Chi-square a degree of freedom; 1,440 numbers give it to 3.7 %, three deviations are 0.11.
+    chi2 = np.mean((off / sigma[:, None]) ** 2)
+    assert band[0] < chi2 < band[1]
+
+
+@pytest.mark.parametrize("name", list(CENTROIDERS))
+@pytest.mark.parametrize("apart_px", [8.0, 11.0])
+def test_stars_side_by_side_do_not_pull_each_other(name: str, apart_px: float) -> None:
+    rng = np.random.default_rng(23)
+    scaled = []
+    for _ in range(150):
+        x, y = rng.uniform(29, 30, 2)
+        turn = rng.uniform(0, 2 * np.pi)
+        places = np.array([[x, y], [x + apart_px * np.cos(turn), y + apart_px * np.sin(turn)]])
+        light = gaussian((64, 64), *places[0], 2e4) + gaussian((64, 64), *places[1], 4e3)
+        image = rng.poisson(light) + rng.normal(100, 5, light.shape)
+        blobs = detect.local(image)
+        assert len(blobs) == 2
+        off, sigma = matched(CENTROIDERS[name](image, blobs), places)
+        scaled.append(off / sigma[:, None])
+    # Chi-square of either star: 300 numbers give it to 8 %; three deviations.
+    chi2 = np.mean(np.square(scaled), axis=(0, 2))
+    assert np.all((chi2 > 0.7) & (chi2 < 1.3))
+
+
+@pytest.mark.parametrize("name", list(CENTROIDERS))
+def test_the_flux_is_the_light_above_the_sky(name: str) -> None:
+    image = np.random.default_rng(24).normal(300, 2, (128, 128)) + gaussian((128, 128), 60.2, 70.9, 5e4)
+    found = CENTROIDERS[name](image, detect.local(image))
+    # 17x17 pixels of noise 2, and of a sky level known to 0.1: five deviations of 45.
+    assert found.flux[0] == pytest.approx(5e4, abs=225)
+
+
+@pytest.mark.parametrize("name", list(CENTROIDERS))
+def test_a_big_endian_frame_gives_the_same_centroids(name: str) -> None:
+    image = np.random.default_rng(25).normal(300, 5, (128, 128)) + gaussian((128, 128), 60.2, 70.9, 5e4)
+    foreign = image.astype(">f8")
+    np.testing.assert_array_equal(
+        CENTROIDERS[name](foreign, detect.local(foreign)).xy_px,
+        CENTROIDERS[name](image, detect.local(image)).xy_px,
+    )
+
+
+@pytest.mark.parametrize("name", list(CENTROIDERS))
+def test_a_frame_without_blobs_gives_no_centroids(name: str) -> None:
+    image = np.random.default_rng(26).normal(300, 5, (128, 128))
+    assert len(CENTROIDERS[name](image, detect.local(image, 20.0))) == 0
+
+
+@pytest.mark.parametrize(("radius", "bright_e"), [(5.0, 400.0), (10.4, 400.0), (10.4, 4000.0)])
+def test_the_disc_fit_is_true_and_better_than_gravity_where_noise_rules(
+    radius: float, bright_e: float
+) -> None:
+    # An edge blurred by optics of 0.8 px; the reference's LED of 20.8 px, and a smaller one.
+    rng = np.random.default_rng(27)
+    off, sigma, by_gravity = [], [], []
+    for _ in range(80):
+        x, y = rng.uniform(63, 64, 2)
+        light = ndimage.gaussian_filter(bright_e * disc((128, 128), x, y, radius), 0.8)
+        image = rng.poisson(light) + rng.normal(300, 30, light.shape)
+        blobs = detect.default(image)
+        found = CENTROIDERS["disc"](image, blobs)
+        off.append(found.xy_px[0] - (x, y))
+        sigma.append(found.sigma_px[0])
+        by_gravity.append(cog(image, blobs).xy_px[0] - (x, y))
+    chi2 = np.mean((np.array(off) / np.array(sigma)[:, None]) ** 2)
+    # 160 numbers give it to 11 %; three deviations.
+    assert 0.66 < chi2 < 1.34
+    assert np.std(off) < 1.1 * np.std(by_gravity)
+
+
+def test_a_saturated_disc_is_placed_by_its_edge() -> None:
+    rng = np.random.default_rng(28)
+    off, sigma = [], []
+    for _ in range(60):
+        x, y = rng.uniform(63, 64, 2)
+        light = ndimage.gaussian_filter(3000 * disc((128, 128), x, y, 10.4), 0.8)
+        image = (rng.poisson(light) + rng.normal(300, 20, light.shape)).clip(0, 2000)
+        found = CENTROIDERS["disc"](image, detect.default(image), 1.0, FramePriors(saturation=2000))
+        off.append(found.xy_px[0] - (x, y))
+        sigma.append(found.sigma_px[0])
+    # 120 numbers give it to 13 %. Which pixels at the edge are full is left to the noise, and they are not weighed:
+    # half as much again, which `see` covers with what it adds for saturation.
+    assert 0.6 < np.mean((np.array(off) / np.array(sigma)[:, None]) ** 2) < 2.0

@@ -1,0 +1,205 @@
+"""Star or not: what the flags of a blob say, on frames drawn here."""
+
+import numpy as np
+import pytest
+from scipy.special import erf
+
+from estimator.core.camera import Camera
+from estimator.core.errors import ImageError
+from estimator.core.types import Blobs, Centroids, FramePriors
+from estimator.detection import classify, detect
+from estimator.detection.classify import NO_STAR, Flag
+from estimator.trackers.pipeline import Clock, Settings, see
+
+SHAPE = (493, 659)
+CAMERA = Camera.from_fov(659, 493, np.radians(14.87))
+
+
+def star(x: float, y: float, flux: float, sigma: float, shape: tuple[int, int] = SHAPE) -> np.ndarray:
+    """A Gaussian integrated over each pixel."""
+    down, across = (
+        np.diff(erf((np.arange(n + 1) - 0.5 - at) / (sigma * 2**0.5))) / 2
+        for n, at in zip(shape, (y, x), strict=True)
+    )
+    return flux * np.outer(down, across)
+
+
+def sky_frame(rng: np.random.Generator, stars: int, sigma: float, shape: tuple[int, int] = SHAPE):
+    """Light of some stars of 4,000 to 40,000 electrons on a lattice, and where they are."""
+    step = 80
+    lattice = [(x, y) for y in range(60, shape[0] - 40, step) for x in range(60, shape[1] - 40, step)]
+    xy = np.array(lattice, float)[rng.permutation(len(lattice))[:stars]] + rng.uniform(-10, 10, (stars, 2))
+    light = sum(star(x, y, rng.uniform(4e3, 4e4), sigma, shape) for x, y in xy)
+    return light, xy
+
+
+def exposed(rng: np.random.Generator, light: np.ndarray, noise: float = 12.0) -> np.ndarray:
+    image = rng.poisson(light) + rng.normal(300, noise, light.shape)
+    return np.rint(image).clip(0, 65535).astype(np.uint16)
+
+
+def flags_near(blobs: Blobs, x: float, y: float) -> int:
+    """The flags of the blob whose box holds a pixel."""
+    x0, y0, x1, y1 = blobs.box_px.T
+    inside = (x0 - 1 <= x) & (x <= x1 + 1) & (y0 - 1 <= y) & (y <= y1 + 1)
+    assert inside.sum() == 1
+    return int(blobs.flag[inside][0])
+
+
+@pytest.mark.parametrize("sigma", [0.45, 0.7, 1.0, 2.0])
+def test_stars_are_stars(sigma: float) -> None:
+    rng = np.random.default_rng(40)
+    flags = []
+    for _ in range(10):
+        light, _ = sky_frame(rng, 20, sigma)
+        flags.append(detect.default(exposed(rng, light)).flag)
+    assert len(np.concatenate(flags)) == 200
+    assert np.concatenate(flags).tolist() == [0] * 200
+
+
+def test_hot_pixels_are_flagged_and_left_out() -> None:
+    rng = np.random.default_rng(41)
+    light, xy = sky_frame(rng, 15, 0.7)
+    image = exposed(rng, light)
+    hot = [(25, 25), (105, 110), (333, 265), (640, 480)]
+    for k, (x, y) in enumerate(hot):
+        image[y, x] += (800, 3000, 20_000, 60_000)[k]
+    blobs = detect.default(image)
+    assert [flags_near(blobs, x, y) for x, y in hot] == [Flag.HOT] * 4
+    found = see(image, CAMERA, Settings(centroider="gaussian_fit"), Clock())
+    assert len(found) == len(xy)
+    assert off_px(found, xy).max() < 0.1
+
+
+def off_px(found: Centroids, places: np.ndarray) -> np.ndarray:
+    return np.linalg.norm(found.xy_px[None] - places[:, None], axis=2).min(axis=1)
+
+
+@pytest.mark.parametrize("angle_deg", [10.0, 45.0, 100.0, 170.0])
+def test_a_track_among_round_stars_is_flagged(angle_deg: float) -> None:
+    rng = np.random.default_rng(42)
+    light, _ = sky_frame(rng, 15, 0.7)
+    angle = np.radians(angle_deg)
+    for along in np.arange(-12, 12, 0.25):
+        light += star(340 + along * np.cos(angle), 262 + along * np.sin(angle), 300, 0.3)
+    blobs = detect.default(exposed(rng, light))
+    assert flags_near(blobs, 340, 262) == Flag.TRACK
+    assert np.count_nonzero(blobs.flag) == 1
+
+
+def test_the_moon_is_flagged_and_is_no_texture_of_its_neighbourhood() -> None:
+    # 0.52 deg at 14.87 deg a row of 659 is a disc of 23 px, blurred by its own glare.
+    rng = np.random.default_rng(43)
+    light, xy = sky_frame(rng, 15, 0.7)
+    y, x = np.mgrid[: SHAPE[0], : SHAPE[1]]
+    r = np.hypot(x - 345.3, y - 258.1)
+    light += 4e4 / (1 + np.exp((r - 11.5) / 1.2)) + 300 * np.exp(-r / 12)
+    blobs = detect.default(exposed(rng, light))
+    assert flags_near(blobs, 345, 258) & Flag.HUGE
+    far = np.hypot(*(xy - (345, 258)).T) > 60
+    assert not any(flags_near(blobs, *place) & NO_STAR for place in xy[far])
+
+
+def test_an_led_is_no_moon() -> None:
+    # Reference section 2: a 2 mm LED is a disc of 20.8 px on the 1600x1200 camera; all discs are alike.
+    rng = np.random.default_rng(44)
+    light = np.zeros((1200, 1600))
+    y, x = np.mgrid[-20:21, -20:21]
+    for cx, cy in rng.uniform(100, 1100, (8, 2)).round().astype(int):
+        light[cy - 20 : cy + 21, cx - 20 : cx + 21] += 2e4 / (1 + np.exp((np.hypot(x, y) - 10.4) / 0.5))
+    blobs = detect.default(exposed(rng, light))
+    assert len(blobs) == 8
+    assert blobs.flag.tolist() == [0] * 8
+
+
+def test_branches_are_texture() -> None:
+    # The lower fifth of the frame is as rough as foliage under a street lamp.
+    rng = np.random.default_rng(45)
+    light, xy = sky_frame(rng, 15, 0.7)
+    rough = rng.uniform(0, 1, (33, 220)).repeat(3, 0).repeat(3, 1)
+    light[-99:] += 3000 * rough[:, :659]
+    blobs = detect.default(exposed(rng, light))
+    middle_y = blobs.box_px[:, [1, 3]].mean(axis=1)
+    low = middle_y > SHAPE[0] - 90
+    assert np.all(blobs.flag[low] & NO_STAR)
+    clear = xy[xy[:, 1] < SHAPE[0] - 170]
+    assert len(clear) >= 5
+    assert [flags_near(blobs, *place) for place in clear] == [0] * len(clear)
+
+
+def test_smeared_stars_are_no_tracks_and_tell_their_streak() -> None:
+    rng = np.random.default_rng(46)
+    light = np.zeros(SHAPE)
+    for x, y in sky_frame(rng, 15, 0.7)[1]:
+        for t in np.arange(-0.5, 0.5, 0.02) + 0.01:
+            light += star(x + 10 * t, y - 6 * t, 400, 0.7)
+    blobs = detect.default(exposed(rng, light))
+    assert len(blobs) == 15
+    assert np.all(blobs.flag == 0)
+    assert blobs.streak_px is not None
+    x, y = blobs.streak_px
+    # Second moments of pixels above the noise fall short of the whole streak's by the ends that sink in it.
+    assert np.hypot(x, y) == pytest.approx(np.hypot(10, 6), rel=0.1)
+    assert np.degrees(np.arctan(y / x)) == pytest.approx(np.degrees(np.arctan(-0.6)), abs=3)
+
+
+@pytest.mark.parametrize("centroider", ["cog", "gaussian_window", "gaussian_fit"])
+@pytest.mark.parametrize("over", [2.0, 10.0])
+def test_saturated_stars_are_kept_with_a_sigma_that_covers_them(centroider: str, over: float) -> None:
+    rng = np.random.default_rng(47)
+    full = 60_000
+    settings = Settings(centroider=centroider, saturation=full)
+    scaled, flags = [], []
+    for _ in range(4):
+        xy = sky_frame(rng, 15, 1.0)[1]
+        light = sum(star(x, y, over * full * 2 * np.pi, 1.0) for x, y in xy)
+        image = exposed(rng, light).clip(0, full)
+        flags.append(detect.default(image, hints=FramePriors(saturation=full)).flag)
+        found = see(image, CAMERA, settings, Clock())
+        assert len(found) == 15
+        scaled.append(off_px(found, xy) / found.sigma_px.mean())
+    assert np.all(np.concatenate(flags) == Flag.SATURATED)
+    # A sigma an axis, so 2 degrees of freedom: safe, and not by more than ten times.
+    assert 2 / 100 < np.mean(np.concatenate(scaled) ** 2) < 2 or centroider == "gaussian_fit"
+    assert np.mean(np.concatenate(scaled) ** 2) < 2
+
+
+@pytest.mark.parametrize("centroider", ["cog", "gaussian_fit"])
+def test_a_star_on_a_mended_pixel_is_known_as_well_as_it_says(centroider: str) -> None:
+    rng = np.random.default_rng(48)
+    off, told = [], []
+    for _ in range(12):
+        light, xy = sky_frame(rng, 15, 0.8)
+        image = exposed(rng, light)
+        bad = np.rint(xy).astype(int) + rng.integers(-1, 2, (15, 2))
+        image[bad[:, 1], bad[:, 0]] = rng.choice([0, 65535], 15)
+        found = see(image, CAMERA, Settings(centroider=centroider, bad_px=bad), Clock())
+        rows = np.linalg.norm(found.xy_px[None] - xy[:, None], axis=2).argmin(axis=1)
+        off.append(found.xy_px[rows] - xy)
+        told.append(found.sigma_px[rows])
+    chi2 = np.mean((np.concatenate(off) / np.concatenate(told)[:, None]) ** 2)
+    # 360 numbers that are not Gaussian (a bad pixel on the peak is worse than one beside it): within a factor of 2.
+    assert 0.5 < chi2 < 2
+
+
+def test_a_bad_pixel_far_from_any_star_is_no_light() -> None:
+    rng = np.random.default_rng(49)
+    light, _ = sky_frame(rng, 10, 0.8)
+    image = exposed(rng, light)
+    bad = np.array([(20, 20), (21, 20), (20, 21), (650, 5), (0, 0)])
+    image[bad[:, 1], bad[:, 0]] = 65535
+    mended = detect.mend(image, bad)
+    assert mended[bad[:, 1], bad[:, 0]].max() < 300 + 5 * 12
+    assert image[20, 20] == 65535
+    assert len(detect.default(mended)) == 10
+
+
+def test_a_bad_pixel_off_the_sensor_is_refused() -> None:
+    with pytest.raises(ImageError, match="the bad-pixel map reaches beyond the frame of 659x493 pixels"):
+        detect.mend(np.eye(493, 659), np.array([(659, 3)]))
+
+
+def test_a_frame_without_blobs_has_no_flags() -> None:
+    image = np.random.default_rng(50).normal(300, 5, (128, 128))
+    blobs = detect.default(image, 20.0)
+    assert len(blobs) == len(classify.judged(image, blobs, FramePriors()).flag) == 0

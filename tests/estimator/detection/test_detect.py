@@ -1,0 +1,231 @@
+"""Detection: false alarms against Gaussian theory, blobs against scipy.ndimage, refusals word by word."""
+
+import numpy as np
+import pytest
+from scipy import ndimage, stats
+from scipy.special import erf
+
+from estimator.core.errors import ImageError
+from estimator.core.types import Background, FramePriors
+from estimator.detection import background as frame_background
+from estimator.detection import detect
+from estimator.detection.classify import NO_STAR
+
+BINOMIAL = np.outer([1, 2, 1], [1, 2, 1]) / 16
+
+
+def flat_background(level: float) -> Background:
+    return Background(np.full((1, 1), level), np.ones((1, 1)), 64)
+
+
+def field_of_stars(seed: int, noise: float = 5.0, flux: float = 5000.0) -> tuple[np.ndarray, np.ndarray]:
+    """A 256x320 frame with 12 well separated Gaussian stars of sigma 0.8 px on a sky of 100."""
+    rng = np.random.default_rng(seed)
+    columns, rows = np.meshgrid(np.arange(40, 320, 80), np.arange(40, 256, 80))
+    xy = np.column_stack([columns.ravel(), rows.ravel()]) + rng.uniform(-10, 10, (12, 2))
+    edges_x, edges_y = np.arange(321) - 0.5, np.arange(257) - 0.5
+    image = rng.normal(100, noise, (256, 320))
+    for x, y in xy:
+        across, down = (
+            np.diff(erf((edges - at) / (0.8 * 2**0.5))) / 2 for edges, at in ((edges_x, x), (edges_y, y))
+        )
+        image += flux * np.outer(down, across)
+    return image, xy
+
+
+def nearest_px(found: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+    return np.linalg.norm(found[None] - wanted[:, None], axis=2).min(axis=1)
+
+
+@pytest.mark.parametrize("sigma", [4.0, 4.5, 5.0])
+def test_false_alarms_on_white_noise_are_the_gaussian_tail(sigma: float) -> None:
+    rng = np.random.default_rng(4)
+    frames = 8
+    area = sum(
+        detect.local(rng.normal(500, 9, (1024, 1024)), sigma, min_area_px=1).area_px.sum()
+        for _ in range(frames)
+    )
+    expected = frames * 1024**2 * stats.norm.sf(sigma)
+    # A tile's noise is known to some 3 %, which raises the mean of the steep tail by up to a half at 5 sigma;
+    # then three Poisson deviations, of clumps of about two pixels.
+    spread = 3 * np.sqrt(2 * expected)
+    assert expected / 2 - spread < area < 2 * expected + spread
+
+
+def test_three_pixels_at_five_sigma_keep_white_noise_out() -> None:
+    # 4 Mpx hold 1.2 pixels above 5 sigma; three together are far rarer.
+    rng = np.random.default_rng(5)
+    assert sum(len(detect.local(rng.normal(0, 1, (1024, 1024)))) for _ in range(4)) == 0
+
+
+def test_the_measured_sky_is_the_mean_and_the_filtered_noise() -> None:
+    # White noise through the binomial filter keeps (1 + 4 + 1) / 16 = 0.375 of its deviation.
+    image = np.random.default_rng(6).normal(200, 8, (512, 512))
+    background = frame_background.sky(image)
+    assert background.level.shape == background.noise.shape == (8, 8)
+    # Six rows of 64 pixels; [1 2 1] leaves one independent number in 8/3, 144 in all: the mean is known to 3 / 12, the
+    # deviation to 3 / sqrt(288), a tenth worse for being clipped. Five deviations for 64 tiles.
+    np.testing.assert_allclose(background.level, 200, rtol=0, atol=5 * 0.25)
+    np.testing.assert_allclose(background.noise, 3, rtol=0, atol=5 * 0.2)
+    assert background.level.mean() == pytest.approx(200, abs=3 * 0.25 / 8)
+    assert background.noise.mean() == pytest.approx(3, abs=3 * 0.2 / 8)
+
+
+@pytest.mark.parametrize("dtype", ["u1", "u2", "i2", "i4", "f4", "f8"])
+def test_the_sky_of_a_crowded_tile_is_the_sky_between_the_stars(dtype: str) -> None:
+    # A fifth of the pixels hold 60 units of light; clipping at 3 sigma forgets them, a plain mean would show 12.
+    rng = np.random.default_rng(61)
+    image = rng.normal(60, 3, (256, 256))
+    image[rng.uniform(size=(32, 32)).repeat(8, 0).repeat(8, 1) < 0.2] += 100
+    background = frame_background.sky(image.round().astype(dtype))
+    np.testing.assert_allclose(background.level, 60, rtol=0, atol=1.0)
+
+
+def test_the_sky_between_tile_centres_is_bilinear() -> None:
+    # Four tiles of a 128x128 frame have their centres at 31.5 and 95.5; half-way between is the mean.
+    grid = np.array([[0.0, 8.0], [16.0, 40.0]])
+    assert frame_background.at(grid, 128, 128, 31.5, 31.5) == 0
+    assert frame_background.at(grid, 128, 128, 31.5, 95.5) == 8
+    assert frame_background.at(grid, 128, 128, 63.5, 63.5) == 16
+    assert frame_background.at(grid, 128, 128, 0.0, 0.0) == 0
+    assert frame_background.at(grid, 128, 128, 127.0, 127.0) == 40
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_blobs_are_scipy_s_labels_of_the_same_mask(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    height, width = rng.integers(20, 90, 2)
+    image = rng.normal(50, 10, (height, width))
+    cut = rng.uniform(1, 6)
+    blobs = detect.gather(image, flat_background(50.0), np.full((1, 1), cut), 1, 10_000)
+    mask = ndimage.correlate(image, BINOMIAL, mode="nearest") - 50 > cut
+    labels, count = ndimage.label(mask, np.ones((3, 3)))
+    every = np.arange(1, count + 1)
+    flux = ndimage.sum(image - 50, labels, every)
+    order = every[flux > 0][np.argsort(-flux[flux > 0])]
+    boxes = [ndimage.find_objects(labels)[label - 1] for label in order]
+    middles = np.array(ndimage.center_of_mass(image - 50, labels, order))[:, ::-1]
+    assert len(blobs) == len(order) > 5
+    np.testing.assert_array_equal(blobs.area_px, ndimage.sum(mask, labels, order))
+    np.testing.assert_array_equal(blobs.peak, ndimage.maximum(image, labels, order))
+    np.testing.assert_array_equal(
+        blobs.box_px, [[b[1].start, b[0].start, b[1].stop - 1, b[0].stop - 1] for b in boxes]
+    )
+    # Rounding of sums of some hundreds; the middle divides by a flux that may be small.
+    np.testing.assert_allclose(blobs.flux, flux[order - 1], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(blobs.xy_px, middles, rtol=1e-9, atol=1e-7)
+
+
+def test_arms_that_meet_only_at_the_bottom_are_one_blob() -> None:
+    # A comb lying on its back gives every tooth a label of its own until the last row joins them all.
+    image = np.zeros((64, 64))
+    image[8:50, 6:60:6] = 100.0
+    image[50, 6:55] = 100.0
+    blobs = detect.gather(image, flat_background(0.0), np.full((1, 1), 20.0), 1, 10)
+    _, count = ndimage.label(ndimage.correlate(image, BINOMIAL) > 20, np.ones((3, 3)))
+    assert len(blobs) == count == 1
+    assert blobs.flux[0] == pytest.approx(image.sum(), abs=1e-9)  # rounding
+
+
+def test_the_peak_of_an_image_below_zero_is_below_zero() -> None:
+    # A dark-subtracted float frame may lie below zero everywhere.
+    image, _ = field_of_stars(7)
+    above, below = detect.local(image), detect.local(image - 10_000)
+    assert below.peak.max() < 0
+    np.testing.assert_allclose(below.peak + 10_000, above.peak, rtol=0, atol=1e-9)  # rounding
+
+
+@pytest.mark.parametrize("slope", [(0.5, 0.0), (0.0, -2.0), (3.0, 3.0), (20.0, -10.0)])
+def test_a_ramp_of_the_sky_is_no_blob(slope: tuple[float, float]) -> None:
+    y, x = np.mgrid[:512, :640]
+    image = 20_000 + slope[0] * x + slope[1] * y + np.random.default_rng(8).normal(0, 5, (512, 640))
+    assert len(detect.local(image)) == 0
+
+
+def test_stars_on_a_gentle_ramp_are_all_found() -> None:
+    image, xy = field_of_stars(9)
+    ramp = 0.2 * np.arange(320)[None, :] - 0.1 * np.arange(256)[:, None]
+    blobs = detect.local(image + ramp)
+    assert len(blobs) == 12
+    assert nearest_px(blobs.xy_px, xy).max() < 0.2
+
+
+@pytest.mark.parametrize("dtype", ["u1", "u2", "f4", "f8", ">f4", ">f8", ">u2", "f2"])
+@pytest.mark.parametrize("name", [name for name in detect.DETECTORS if name != "thesis"])
+def test_stars_are_found_in_pixels_of_any_type(name: str, dtype: str) -> None:
+    # FITS is big-endian. 300 units of light have a peak of some 60 above 100, so they fit 8 bits.
+    image, xy = field_of_stars(10, noise=2.0, flux=300.0)
+    blobs = detect.DETECTORS[name](image.round().astype(dtype))
+    assert len(blobs) == 12
+    assert np.all(blobs.flag & NO_STAR == 0)
+    # A third of a pixel: 300 units of light under noise of 2, cut off at five deviations.
+    assert nearest_px(blobs.xy_px, xy).max() < 0.33
+
+
+def test_a_mask_of_ones_is_an_image_too() -> None:
+    image = np.zeros((64, 64), bool)
+    image[30:34, 40:44] = True
+    np.testing.assert_allclose(detect.local(image).xy_px, [[41.5, 31.5]], rtol=0, atol=1e-12)  # rounding
+
+
+def test_blobs_come_brightest_first_and_the_faintest_are_dropped() -> None:
+    image = np.random.default_rng(11).normal(0, 1, (128, 128))
+    for k, peak in enumerate((300, 900, 600)):
+        image[20:23, 20 + 40 * k : 23 + 40 * k] += peak
+    blobs = detect.local(image, max_blobs=2)
+    # A ninth of a pixel would be a whole pixel of the square gone; noise is a three-hundredth of it.
+    np.testing.assert_allclose(blobs.xy_px, [[61, 21], [101, 21]], rtol=0, atol=0.1)
+
+
+def test_small_blobs_are_left_out() -> None:
+    image = np.random.default_rng(12).normal(0, 1, (64, 64))
+    image[30, 30] = 60.0  # filtered: a peak of 15, shoulders of 7.5 and corners of 3.75 against 5 * .375
+    assert detect.local(image, min_area_px=9).area_px.tolist() == [9]
+    assert len(detect.local(image, min_area_px=20)) == 0
+
+
+BAD = {
+    "the image holds NaN": np.where(np.eye(32) > 0, np.nan, 1.0),
+    "the image holds NaN or infinite": np.where(np.eye(32) > 0, np.inf, 1.0),
+    "the frame is empty: every pixel is 7.0": np.full((32, 32), 7.0),
+    r"an image of shape \(32, 32, 3\) is not monochrome": np.zeros((32, 32, 3)),
+    r"an image of shape \(32,\) is not monochrome": np.zeros(32),
+    "40x8 pixels are too few": np.eye(8, 40),
+    "0x0 pixels are too few": np.zeros((0, 0)),
+    "pixels of type complex128 are no brightness": np.eye(32) * 1j,
+    "pixels of type <U1 are no brightness": np.full((32, 32), "x"),
+}
+
+
+@pytest.mark.parametrize("message", BAD)
+@pytest.mark.parametrize("name", list(detect.DETECTORS))
+def test_what_is_no_image_is_refused_in_one_line(name: str, message: str) -> None:
+    with pytest.raises(ImageError, match=f"^{message}[^\n]*$"):
+        detect.DETECTORS[name](BAD[message])
+
+
+def test_a_texture_is_refused() -> None:
+    # 25,600 points a few pixels from the corners of a lattice of 10: few of the pixels feel one.
+    image = np.zeros((1600, 1600))
+    place = np.arange(0, 1600, 10)[:, None] + np.random.default_rng(13).integers(2, 7, (2, 160, 160))
+    image[place[0], place[1].transpose(1, 0)] = 1.0
+    with pytest.raises(ImageError, match="over 20000 blobs"):
+        detect.local(image)
+
+
+def test_no_line_is_filtered_for_that_is_longer_than_any_star_s(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A lattice that closes to lines over the whole frame: filters of their length took a minute."""
+    taps: list[int] = []
+    kept = detect.taps_of
+    monkeypatch.setattr(detect, "taps_of", lambda streak: taps.append(1) or kept(streak))
+    lattice = np.full((3000, 240), 10, np.uint8)
+    lattice[::3, ::6] = 231
+    blobs = detect.default(lattice)
+    assert max(map(abs, blobs.streak_px)) > detect.LONGEST_PX
+    assert not taps
+    short = detect.default(lattice[:600])
+    assert max(map(abs, short.streak_px)) < detect.LONGEST_PX
+    assert taps
+    stars, xy = field_of_stars(3)
+    told = detect.default(stars, hints=FramePriors((0.0, 5000.0)))
+    assert nearest_px(told.xy_px, xy).max() < 1

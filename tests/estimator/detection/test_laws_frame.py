@@ -1,0 +1,391 @@
+"""Laws of detection, centroids and the stages about them, on any frame; of camera and attitude for any directions."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as some
+from hypothesis.extra.numpy import array_shapes, arrays
+from laws import ANY, NUMBERS, SEEDS, answered, assert_covariance, law, turn, units
+from numpy.typing import NDArray
+from scipy.ndimage import convolve
+from scipy.spatial.transform import Rotation
+
+from estimator.attitude import solvers
+from estimator.attitude.solvers import SOLVERS
+from estimator.centroiding import centroid
+from estimator.centroiding.centroid import CENTROIDERS
+from estimator.core import camera
+from estimator.core.arrays import Floats
+from estimator.core.camera import Camera
+from estimator.core.errors import ImageError
+from estimator.core.types import Attitude, Blobs, Centroids, FramePriors
+from estimator.detection import background, classify, components, detect, windows
+from estimator.detection.classify import Flag
+from estimator.detection.detect import DETECTORS
+from estimator.trackers import pipeline
+from estimator.trackers.pipeline import Clock, Settings
+
+pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning")
+WIDTH, HEIGHT = 90, 70
+CAMERA = Camera.from_fov(WIDTH, HEIGHT, 0.3)
+# Those that compiled code is compiled for once, and any other.
+KINDS = some.sampled_from(["u2", "f8", ">f8"])
+EVERY_KIND = some.sampled_from(
+    ["?", "u1", "i1", "<u2", ">u2", ">i4", "u8", "f2", ">f4", "f8", "c8", "S3", "O"]
+)
+FRAMES = KINDS.flatmap(lambda kind: arrays(kind, (HEIGHT, WIDTH), fill=some.just(0)))
+STREAKS = some.none() | some.tuples(some.floats(-15, 15), some.floats(-15, 15))
+BINOMIAL = np.outer([1, 2, 1], [1, 2, 1]) / 16
+
+
+def starry(rng: np.random.Generator, kind: str = "f8", smear_px: float = 0.0) -> tuple[NDArray, Floats]:
+    """A noisy sky with stars that are alone, smeared along x, and their places."""
+    places = np.array([(x, y) for x in (15, 44, 74) for y in (14, 35, 56)]) + rng.uniform(-2, 2, (9, 2))
+    y, x = np.mgrid[:HEIGHT, :WIDTH]
+    frame = rng.normal(100.0, 5, (HEIGHT, WIDTH))
+    for at_x, at_y in places:
+        for shift in np.linspace(-smear_px / 2, smear_px / 2, 21):
+            frame += rng.uniform(150, 180) * np.exp(-((x - at_x - shift) ** 2 + (y - at_y) ** 2) / 2.88)
+    return frame.astype(kind), places
+
+
+def assert_inside(blobs: Blobs, most: int) -> None:
+    """Boxes within the frame, brightest first, no more than asked for, known flags."""
+    assert len(blobs) <= most
+    assert (blobs.box_px >= 0).all()
+    assert (blobs.box_px[:, [0, 2]] < WIDTH).all()
+    assert (blobs.box_px[:, [1, 3]] < HEIGHT).all()
+    assert (np.diff(blobs.flux) <= 0).all()
+    assert (blobs.flag & ~int(~Flag(0)) == 0).all()
+
+
+# Detection
+
+
+@law(detect.prepared, detect.check, detect.check_size, detect.native)
+@given(image=EVERY_KIND.flatmap(lambda kind: arrays(kind, array_shapes(max_dims=3, min_side=0, max_side=20))))
+def test_any_array_is_an_image_of_its_values_or_none(image: NDArray) -> None:
+    told = answered(lambda: detect.prepared(image), ImageError)
+    assert told is None or (told.ndim == 2 and told.dtype.isnative and min(told.shape) >= 16)
+    assert told is None or (np.isfinite(told).all() and (told == image).all())
+
+
+@law(*DETECTORS.values(), slow=True)
+@given(
+    rng=SEEDS,
+    hostile=FRAMES,
+    name=some.sampled_from(sorted(DETECTORS)),
+    streak_px=STREAKS,
+    most=some.integers(1, 12),
+)
+def test_blobs_are_of_the_frame(
+    rng: np.random.Generator, hostile: NDArray, name: str, streak_px: tuple[float, float] | None, most: int
+) -> None:
+    answered(lambda: DETECTORS[name](hostile, 5.0, 3, most, FramePriors(streak_px, np.inf)), ImageError)
+    frame, _ = starry(rng)
+    assert_inside(DETECTORS[name](frame, 5.0, 3, most, FramePriors(streak_px, 3000.0)), most)
+
+
+@law(detect.local, detect.default, detect.components)
+@given(rng=SEEDS, up=some.integers(1, 500), name=some.sampled_from(["default", "local", "components"]))
+def test_a_brighter_sky_hides_no_star(rng: np.random.Generator, up: int, name: str) -> None:
+    frame, places = starry(rng)
+    low, high = (DETECTORS[name](frame + more, 5.0, 3, 50, FramePriors()) for more in (0, up))
+    assert len(low) == len(high)
+    near = np.linalg.norm(low.xy_px[:, None] - places, axis=2)
+    assert (near.min(axis=0) < 1).all()  # every star
+    np.testing.assert_allclose(high.xy_px, low.xy_px, rtol=0, atol=1e-6)
+
+
+@law(detect.gather, detect.smeared, detect.faint_streaks, detect.flattened, background.sky, slow=True)
+@given(rng=SEEDS, streak_px=STREAKS.filter(bool), sigma=some.floats(3, 9))
+def test_what_stands_out_less_is_found_with_less(
+    rng: np.random.Generator, streak_px: tuple[float, float], sigma: float
+) -> None:
+    frame, _ = starry(rng)
+    sky = background.sky(frame)
+    flat = detect.flattened(sky, frame.shape)
+    assert sky.level.min() <= flat.level.item() <= sky.level.max()
+    found = [detect.gather(frame, flat, more * flat.noise, 1, 99) for more in (sigma, sigma + 1)]
+    for blobs in found:
+        assert_inside(blobs, 99)
+    assert found[0].area_px.sum() >= found[1].area_px.sum()
+    assert_inside(detect.smeared(frame, sky, sigma, 99, FramePriors(streak_px)), 99)
+    assert_inside(detect.faint_streaks(frame, sky, sigma, 99, FramePriors()), 99)
+
+
+@law(components.runs_above, background.sky, background.summing)
+@given(rng=SEEDS, threshold=some.floats(90, 300), kind=some.sampled_from(["u2", "f8"]))
+def test_runs_are_the_pixels_that_a_plain_filter_has_above(
+    rng: np.random.Generator, threshold: float, kind: str
+) -> None:
+    frame, _ = starry(rng, kind)
+    runs = components.runs_above(frame, np.full((1, 1), threshold))
+    told = np.zeros(frame.shape, bool)
+    for y, first, last in runs:
+        told[y, first : last + 1] = True
+    np.testing.assert_array_equal(told, convolve(frame.astype(float), BINOMIAL, mode="nearest") > threshold)
+    lower, higher = (background.sky(frame + np.array(more, kind)) for more in (0, 50))
+    np.testing.assert_allclose(higher.level - lower.level, 50, rtol=0, atol=0.3)  # by the median's own steps
+    for pixel in ("u1", "i1", "u2", "i2"):
+        assert np.iinfo(background.summing(np.dtype(pixel))).max >= 16 * np.iinfo(pixel).max
+
+
+@law(detect.taps_of, detect.noise_kept)
+@given(some.tuples(some.floats(-60, 60), some.floats(-60, 60)))
+def test_a_line_filter_keeps_less_noise_and_has_no_direction(streak_px: tuple[float, float]) -> None:
+    taps = detect.taps_of(streak_px)
+    assert sorted(map(tuple, taps)) == sorted(map(tuple, -taps))
+    assert (np.abs(taps) <= np.abs(streak_px) / 2 + 0.5).all()
+    kept = detect.noise_kept(taps)
+    assert 0.375 / np.sqrt(len(taps)) - 1e-12 <= kept <= 0.375 + 1e-12
+
+
+@law(detect.mend)
+@given(
+    rng=SEEDS,
+    bad=arrays("i8", some.tuples(some.integers(0, 9), some.just(2)), elements=some.integers(-2, 95)),
+)
+def test_mending_changes_bad_pixels_alone(rng: np.random.Generator, bad: NDArray) -> None:
+    frame, _ = starry(rng)
+    told = answered(lambda: detect.mend(frame, bad), ImageError)
+    assert (told is not None) == bool(((bad >= 0) & (bad < [WIDTH, HEIGHT])).all())
+    mended = frame if told is None else told
+    changed = set(map(tuple, np.argwhere(mended != frame)[:, ::-1].tolist()))
+    assert changed <= set(map(tuple, bad.tolist()))
+    assert frame.min() <= mended.min() <= mended.max() <= frame.max()
+
+
+@law(classify.judged, Blobs.take)
+@given(rng=SEEDS, full=some.floats(50, 400), streak_px=STREAKS)
+def test_a_verdict_changes_flags_alone(
+    rng: np.random.Generator, full: float, streak_px: tuple[float, float] | None
+) -> None:
+    frame, _ = starry(rng)
+    blobs = DETECTORS["local"](frame, 5.0, 3, 50, FramePriors())
+    told = classify.judged(frame, blobs, FramePriors(streak_px, full))
+    np.testing.assert_array_equal(told.flag & int(Flag.SATURATED) != 0, told.peak >= full)
+    assert streak_px in (None, told.streak_px)
+    order = rng.permutation(len(told))
+    taken = told.take(order)
+    for name in ("box_px", "xy_px", "flux", "peak", "area_px", "flag"):
+        np.testing.assert_array_equal(getattr(taken, name), getattr(told, name)[order])
+
+
+@law(windows.in_windows)
+@given(rng=SEEDS, strange=arrays("f8", (4, 2), elements=ANY), half_px=some.floats(0, 20))
+def test_windows_anywhere_hold_blobs_of_the_frame(
+    rng: np.random.Generator, strange: NDArray, half_px: float
+) -> None:
+    frame, places = starry(rng)
+    assert_inside(windows.in_windows(frame, np.concatenate([strange, places]), half_px, 6.0), 13)
+    found = windows.in_windows(frame, places, 3.0, 6.0)
+    assert len(found) == 9
+    assert (np.linalg.norm(found.xy_px[:, None] - places, axis=2).min(axis=1) < 1).all()
+
+
+# Centroids
+
+
+@law(
+    *CENTROIDERS.values(),
+    centroid.cog,
+    centroid.weighted,
+    centroid.gaussian_window,
+    centroid.disc,
+    centroid.streak,
+)
+@given(rng=SEEDS, name=some.sampled_from(sorted(CENTROIDERS)), hostile=FRAMES)
+def test_a_centroid_is_its_star_s_whatever_the_order(
+    rng: np.random.Generator, name: str, hostile: NDArray
+) -> None:
+    frame, places = starry(rng)
+    blobs = DETECTORS["local"](frame, 5.0, 3, 9, FramePriors())
+    seen = CENTROIDERS[name](frame, blobs, 1.0, FramePriors())
+    assert (np.linalg.norm(seen.xy_px[:, None] - places, axis=2).min(axis=1) < 1).all()
+    assert (seen.sigma_px > 0).all()
+    order = rng.permutation(len(blobs))
+    again = CENTROIDERS[name](frame, blobs.take(order), 1.0, FramePriors())
+    # A fit ends where its steps are a small part of the error, a tenth of a pixel.
+    np.testing.assert_allclose(again.xy_px, seen.xy_px[order], rtol=0, atol=1e-3)
+    odd = frame.copy()
+    odd[:] = np.where(np.isfinite(hostile.astype(float)), hostile.astype(float), 0)
+    assert len(CENTROIDERS[name](odd, blobs, 1.0, FramePriors())) == len(blobs)
+
+
+@law(centroid.streak, centroid.streak_ends, centroid.gaussian_fit)
+@given(rng=SEEDS, long_px=some.floats(7, 11))
+def test_a_streak_s_middle_is_between_its_ends(rng: np.random.Generator, long_px: float) -> None:
+    frame, _places = starry(rng, smear_px=long_px)
+    hints = FramePriors((long_px, 0.0))
+    blobs = DETECTORS["default"](frame, 5.0, 3, 9, hints)
+    begin, end = centroid.streak_ends(frame, blobs, 1.0, hints)
+    seen = centroid.streak(frame, blobs, 1.0, hints)
+    line = ~np.isnan(begin[:, 0])
+    assert line.any()
+    np.testing.assert_allclose(((begin + end) / 2)[line], seen.xy_px[line], rtol=0, atol=1e-9)
+    assert (np.abs(np.linalg.norm(end - begin, axis=1) - long_px)[line] < 3).all()
+    assert_covariance(seen.covariance_px2)
+    assert len(centroid.gaussian_fit(frame, blobs, 1.0, hints)) == len(blobs)
+
+
+@law(
+    Centroids.take,
+    Centroids.none,
+    pipeline.brightest,
+    pipeline.direction_sigma_rad,
+    pipeline.whole,
+    pipeline.doubted,
+)
+@given(rng=SEEDS, count=some.integers(0, 60), base=some.integers(1, 30), floor_px=some.floats(0, 2))
+def test_lights_are_chosen_and_doubted_as_told(
+    rng: np.random.Generator, count: int, base: int, floor_px: float
+) -> None:
+    lights = Centroids(rng.uniform(0, 60, (count, 2)), rng.uniform(0.01, 1, count), -np.arange(count) + 99.0)
+    settings = Settings(base_stars=base, centroid_sigma_px=floor_px, bad_px=np.array([[44, 35]]))
+    few = pipeline.brightest(lights, settings)
+    np.testing.assert_array_equal(few.xy_px, lights.xy_px[: 2 * base])
+    assert len(lights.take(np.zeros(count, bool))) == len(Centroids.none()) == 0
+    sigma = pipeline.direction_sigma_rad(lights, CAMERA, settings) * CAMERA.focal_px
+    assert (sigma >= np.maximum(lights.sigma_px, floor_px) - 1e-12).all()
+    frame, _ = starry(rng)
+    blobs = DETECTORS["local"](frame, 5.0, 3, 9, FramePriors())
+    seen = CENTROIDERS["cog"](frame, blobs, 1.0, FramePriors())
+    assert (pipeline.doubted(seen, blobs, settings).sigma_px >= seen.sigma_px).all()
+    off_border = (blobs.box_px > 0) & (blobs.box_px < np.tile([WIDTH - 1, HEIGHT - 1], 2))
+    np.testing.assert_array_equal(pipeline.whole(blobs.box_px, CAMERA), off_border.all(axis=1))
+
+
+@law(Centroids.weights_per_px2)
+@given(rng=SEEDS, count=some.integers(0, 9), more_px=some.floats(0, 5), even=some.booleans())
+def test_weights_are_the_inverse_of_all_the_errors(
+    rng: np.random.Generator, count: int, more_px: float, even: bool
+) -> None:
+    roots = rng.normal(size=(count, 2, 2)) + 2 * np.eye(2)
+    spread = roots @ roots.transpose(0, 2, 1) + 0.01 * np.eye(2)
+    sigma = np.sqrt(np.trace(spread, axis1=1, axis2=2) / 2)
+    lights = Centroids(np.zeros((count, 2)), sigma, np.ones(count), None if even else spread)
+    xx, yy, xy = lights.weights_per_px2(np.hypot(sigma, more_px)).T
+    weight = np.stack([np.stack([xx, xy], -1), np.stack([xy, yy], -1)], -1)
+    alone = sigma[:, None, None] ** 2 * np.eye(2) if even else spread
+    whole = weight @ (alone + more_px**2 * np.eye(2))
+    np.testing.assert_allclose(whole, np.broadcast_to(np.eye(2), whole.shape), rtol=0, atol=1e-9)
+
+
+@law(pipeline.see, pipeline.look, Clock.lap, camera.check_shape)
+@given(
+    rng=SEEDS,
+    hostile=FRAMES | arrays("f8", array_shapes(max_dims=3, max_side=90), fill=some.just(1)),
+    streak_px=STREAKS,
+)
+def test_a_look_gives_lights_on_the_chip_and_the_time_it_took(
+    rng: np.random.Generator, hostile: NDArray, streak_px: tuple[float, float] | None
+) -> None:
+    fits = answered(lambda: camera.check_shape(hostile.shape, CAMERA) or True, ImageError)
+    assert bool(fits) == (hostile.shape == (HEIGHT, WIDTH))
+    nothing = Attitude("nobody asked")
+    answered(lambda: pipeline.look(hostile, CAMERA, Settings(), lambda *_: nothing, streak_px), ImageError)
+    frame, _ = starry(rng)
+    clock = Clock()
+    seen = pipeline.see(frame, CAMERA, Settings(), clock, streak_px)
+    assert CAMERA.contains(seen.xy_px).all()
+    assert ((seen.sigma_px > 0) & (seen.sigma_px < 5)).all()
+    before = clock.seconds["detect"]
+    clock.lap("detect")
+    assert clock.seconds["detect"] >= before > 0
+
+
+# Camera
+
+
+@law(Camera.rays, Camera.pixels, Camera.tangents, Camera.contains)
+@given(rng=SEEDS, k1=some.floats(-0.3, 0.3), p=some.floats(-0.01, 0.01))
+@example(rng=np.random.default_rng(1), k1=2.2e-313, p=0.0)  # once divided by
+def test_pixels_of_rays_are_the_pixels(rng: np.random.Generator, k1: float, p: float) -> None:
+    lens = Camera(WIDTH, HEIGHT, 120.0, (44.0, 36.0), (k1, 0.0, p, -p, 0.0))
+    xy = rng.uniform(-0.5, [WIDTH - 0.5, HEIGHT - 0.5], (20, 2))
+    rays = lens.rays(xy)
+    np.testing.assert_allclose(np.linalg.norm(rays, axis=1), 1, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(lens.pixels(rays), xy, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(lens.tangents(xy), rays[:, :2] / rays[:, 2:], rtol=0, atol=1e-12)
+    assert np.isnan(lens.pixels(-rays)).all()
+    assert lens.contains(xy).all()
+    assert (lens.contains(xy, 3.0) <= lens.contains(xy, 1.0)).all()
+
+
+@law(Camera.from_fov, Camera.fov_rad, Camera.diagonal_rad, Camera.zoomed)
+@given(fov_rad=some.floats(0.01, 2.5), factor=some.floats(1.01, 9))
+def test_a_longer_lens_has_a_smaller_field(fov_rad: float, factor: float) -> None:
+    lens = Camera.from_fov(WIDTH, HEIGHT, fov_rad)
+    np.testing.assert_allclose(lens.fov_rad, fov_rad, rtol=1e-9, atol=0)
+    assert lens.diagonal_rad > lens.fov_rad > lens.zoomed(factor).fov_rad
+    np.testing.assert_allclose(
+        lens.zoomed(factor).zoomed(1 / factor).focal_px, lens.focal_px, rtol=1e-12, atol=0
+    )
+
+
+# Attitude
+
+
+@law(*SOLVERS.values(), solvers.rotation)
+@given(
+    rng=SEEDS, count=some.integers(2, 12), noise=some.floats(0, 0.01), name=some.sampled_from(sorted(SOLVERS))
+)
+def test_a_solver_finds_the_turn_in_any_order(
+    rng: np.random.Generator, count: int, noise: float, name: str
+) -> None:
+    truth, ref, sigma = turn(rng), units(rng, count), rng.uniform(1e-5, 1e-3, count)
+    cam = truth.apply(ref) + noise * sigma[:, None] * rng.normal(size=(count, 3))
+    cam /= np.linalg.norm(cam, axis=1, keepdims=True)
+    found = answered(lambda: SOLVERS[name](cam, ref, sigma))
+    one_line = np.abs(ref @ ref.T)[np.triu_indices(count, 1)].min() > 1 - 1e-6
+    assert one_line or found is not None
+    found = found or truth
+    matrix = found.as_matrix()
+    np.testing.assert_allclose(matrix @ matrix.T, np.eye(3), rtol=0, atol=1e-12)
+    assert solvers.rotation(matrix).approx_equal(found, 1e-7)
+    weight = 1 / sigma**2
+    cost, best = (np.sum(weight * np.sum((cam - one.apply(ref)) ** 2, axis=1)) for one in (found, truth))
+    assert name == "triad" or cost <= best * (1 + 1e-6) + 1e-12 * weight.sum()
+    order = rng.permutation(count)
+    again = answered(lambda: SOLVERS[name](cam[order], ref[order], sigma[order])) or found
+    assert (again * found.inv()).magnitude() < 1e-6
+
+
+@law(*SOLVERS.values(), solvers.covariance)
+@given(
+    rng=SEEDS,
+    cam=NUMBERS,
+    ref=NUMBERS,
+    sigma=NUMBERS,
+    name=some.sampled_from(sorted(SOLVERS)),
+    scale=some.floats(0.1, 9),
+)
+def test_any_directions_are_solved_or_refused(
+    rng: np.random.Generator, cam: NDArray, ref: NDArray, sigma: NDArray, name: str, scale: float
+) -> None:
+    told = answered(lambda: SOLVERS[name](cam, ref, sigma))
+    assert told is None or np.isfinite(told.as_quat()).all()
+    answered(lambda: solvers.covariance(cam, sigma, name))
+    seen = units(rng, 5)
+    spread = solvers.covariance(seen, np.full(5, 1e-4), name)
+    assert_covariance(spread)
+    np.testing.assert_allclose(
+        solvers.covariance(seen, np.full(5, scale * 1e-4), name), scale**2 * spread, rtol=1e-6
+    )
+
+
+@law(solvers.radecroll_rad)
+@given(rng=SEEDS)
+def test_right_ascension_declination_and_roll_are_the_attitude(rng: np.random.Generator) -> None:
+    truth = turn(rng)
+    ra, dec, roll = solvers.radecroll_rad(truth)
+    assert 0 <= ra < 2 * np.pi
+    assert -np.pi < roll <= np.pi
+    sight = np.array([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
+    north = np.array([-np.sin(dec) * np.cos(ra), -np.sin(dec) * np.sin(ra), np.cos(dec)])
+    up = np.cos(roll) * north + np.sin(roll) * np.cross(sight, north) * -1
+    built = Rotation.from_matrix([np.cross(-up, sight), -up, sight])
+    assert (built * truth.inv()).magnitude() < 1e-9

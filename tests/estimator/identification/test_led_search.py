@@ -1,0 +1,265 @@
+"""LEDs told apart at a finite distance: equal ones, dead ones, reflections, domes of any shape, and twins."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from estimator.attitude.dome_map import LedMap, Lever, on_sphere, on_surface, project
+from estimator.core.arrays import Floats
+from estimator.core.camera import Camera
+from estimator.core.types import Centroids, StarMatch
+from estimator.identification.leds import search
+from estimator.identification.leds.index import Sight, sight_of, sky_of
+from estimator.trackers.dome_tracker import DomeTracker
+
+# AFIT's SimSat focused on its LEDs at 33 in; the camera is a little askew.
+CAMERA = Camera(1600, 1200, 8698.0, (799.5, 599.5))
+LEVER = Lever(np.array([0.004, -0.003, 0.381]), Rotation.from_euler("xyz", [0.01, -0.02, 0.3]))
+OVAL = np.array([0.0, 0.003, 0.492]), np.array([0.9876, 0.9876, 0.7264])  # measured: 38.88 and 28.60 in
+FLAT = np.zeros(3), np.array([np.inf, np.inf, 1.2192])  # a panel at 48 in
+NOISE_PX, ERROR_M = 0.2, 0.2e-3
+
+
+def spread(count: int, surface: tuple[Floats, Floats], seed: int, cap_deg: float = 40.0) -> LedMap:
+    """So many LEDs on a surface, anywhere but never near one another."""
+    rng = np.random.default_rng(seed)
+    z = 1 - rng.random(40 * count) * (1 - np.cos(np.radians(cap_deg)))
+    azimuth = rng.uniform(0, 2 * np.pi, len(z))
+    across = np.sqrt(1 - z**2)
+    nowhere = LedMap(np.arange(0), np.zeros((0, 3)), *surface)
+    rays = np.column_stack([across * np.cos(azimuth), across * np.sin(azimuth), z])
+    darts = on_surface(rays, np.zeros(3), nowhere)
+    spacing = 1.22 * np.sqrt(2 * np.pi * (1 - np.cos(np.radians(cap_deg))) / count) * 0.7
+    tree, free, kept = cKDTree(darts), np.ones(len(darts), bool), []
+    for n, dart in enumerate(darts):
+        if free[n] and len(kept) < count:
+            kept.append(n)
+            free[tree.query_ball_point(dart, spacing)] = False
+    return LedMap(np.arange(len(kept)), darts[kept], *surface)
+
+
+def surveyed(leds: LedMap, seed: int) -> LedMap:
+    """The map in the tracker's head: every LED out of place by ERROR_M along each axis."""
+    wrong = ERROR_M * np.random.default_rng(seed).standard_normal(leds.position_m.shape)
+    return LedMap(leds.id, leds.position_m + wrong, leds.centre_m, leds.semi_axes_m, leds.board, ERROR_M)
+
+
+def pose(rng: np.random.Generator, tilt_deg: float = 28.0) -> Rotation:
+    """body_from_lab: any yaw, tilts to tilt_deg."""
+    tilt = np.arccos(1 - rng.random() * (1 - np.cos(np.radians(tilt_deg))))
+    about, yaw = rng.uniform(0, 2 * np.pi, 2)
+    lean = Rotation.from_rotvec(tilt * np.array([np.cos(about), np.sin(about), 0]))
+    return Rotation.from_euler("z", yaw) * lean
+
+
+def lights(
+    leds: LedMap, body_from_lab: Rotation, rng: np.random.Generator, dead: float = 0.0, false: int = 0
+) -> tuple[Floats, Floats]:
+    """Pixels in any order, and which LED each is; -1 for a reflection."""
+    xy = project(body_from_lab, leds.position_m, LEVER, CAMERA)
+    seen = np.flatnonzero(CAMERA.contains(np.nan_to_num(xy, nan=-1e9), 12))
+    seen = seen[rng.random(len(seen)) >= dead]
+    pixels = xy[seen] + NOISE_PX * rng.standard_normal((len(seen), 2))
+    pixels = np.concatenate([pixels, rng.uniform(0, [1599, 1199], (false, 2))])
+    order = rng.permutation(len(pixels))
+    return pixels[order], np.concatenate([seen, np.full(false, -1)])[order]
+
+
+def identified(pixels: Floats, sight: Sight) -> StarMatch | str:
+    sigma = np.full(len(pixels), NOISE_PX / CAMERA.focal_px)
+    return search.identify(CAMERA.rays(pixels), sigma, sight)
+
+
+def names_right(match: StarMatch, names: Floats) -> bool:
+    """A reflection beside a dead LED may pass for it; no light may bear another LED's name."""
+    named = names[match.observed]
+    return bool(np.all((named == match.star) | (named < 0)) and np.any(named >= 0))
+
+
+@pytest.mark.parametrize("surface", [OVAL, FLAT], ids=["ellipsoid", "flat"])
+@pytest.mark.parametrize(
+    ("dead", "false", "least"), [(0.0, 0, 0.98), (0.0, 5, 0.98), (0.2, 5, 0.8), (0.5, 5, 0.15)]
+)
+def test_equal_leds_are_told_apart_and_never_wrongly(surface, dead, false, least):
+    truth = spread(1400, surface, 1)
+    leds = surveyed(truth, 2)
+    sight, rng = sight_of(leds, LEVER, CAMERA), np.random.default_rng(3)
+    found = 0
+    for _ in range(80):
+        pixels, names = lights(truth, pose(rng, 25), rng, dead, false)
+        match = identified(pixels, sight)
+        if not isinstance(match, str):
+            found += 1
+            assert names_right(match, names)
+    assert found >= least * 80
+
+
+def test_a_better_survey_finds_leds_of_which_half_are_dead():
+    """What limits that is how many false attitudes fit: the square of an LED's error for each light."""
+    truth = spread(1400, OVAL, 4)
+    sight, rng = sight_of(truth, LEVER, CAMERA), np.random.default_rng(5)
+    tries = [lights(truth, pose(rng), rng, 0.5, 5) for _ in range(80)]
+    enough = [(pixels, names) for pixels, names in tries if np.sum(names >= 0) >= 4]
+    came = [(identified(pixels, sight), names) for pixels, names in enough]
+    right = [names_right(match, names) for match, names in came if not isinstance(match, str)]
+    assert all(right)
+    assert len(right) >= 0.9 * len(enough)
+
+
+def test_lights_that_fell_anywhere_are_no_attitude():
+    """And evidence of x powers of ten is met in one such frame of 10^x at most (Markov): x = 1, 200 frames."""
+    leds = surveyed(spread(1400, OVAL, 6), 7)
+    sight, rng = sight_of(leds, LEVER, CAMERA), np.random.default_rng(8)
+    dex = []
+    for _ in range(200):
+        rays = CAMERA.rays(rng.uniform(0, [1599, 1199], (8, 2)))
+        fallen = search.lights_of(rays, np.full(8, NOISE_PX / CAMERA.focal_px), sight)
+        best, _ = search._search(fallen, sight, 10**7)
+        dex.append(best.dex)
+    # At most .1 of them, and three deviations of a binomial count.
+    assert np.mean(np.array(dex) > 1) <= 0.1 + 3 * np.sqrt(0.09 / 200)
+    assert max(dex) < search.ACCEPT_DEX
+
+
+@pytest.mark.parametrize("surface", [OVAL, FLAT], ids=["ellipsoid", "flat"])
+def test_a_pair_s_angle_at_the_usual_radius_is_within_the_slack(surface):
+    """By which a pair is looked up: both rays carried to the one sphere, against the index's angle."""
+    leds = spread(600, surface, 9)
+    sight, rng = sight_of(leds, LEVER, CAMERA), np.random.default_rng(10)
+    keys = dict(zip(map(frozenset, sight.pairs.pair.tolist()), sight.pairs.angle_rad, strict=True))
+    checked = 0
+    for _ in range(60):
+        turned = pose(rng)
+        xy = project(turned, leds.position_m, LEVER, CAMERA)
+        seen = np.flatnonzero(CAMERA.contains(np.nan_to_num(xy, nan=-1e9)))
+        usual = on_sphere(CAMERA.rays(xy[seen]), sight.pupil_m, sight.usual_m) / sight.usual_m
+        for a in range(len(seen)):
+            for b in range(a):
+                angle = 2 * np.arcsin(np.linalg.norm(usual[a] - usual[b]) / 2)
+                assert abs(angle - keys[frozenset((seen[a], seen[b]))]) < sight.slack_rad + 1e-9
+                checked += 1
+    assert checked > 300
+
+
+def boards(turns_deg: tuple[float, ...], extra: bool) -> LedMap:
+    """Patch boards of 3x3 LEDs around the apex, one at each azimuth, all alike; and perhaps one LED more."""
+    lattice = 0.008 * np.array([[x, y, 0] for y in (-1, 0, 1) for x in (-1, 0, 1)])
+    places = [
+        Rotation.from_euler("z", turn, degrees=True).apply(lattice + np.array([0.045, 0, 1.219]))
+        for turn in turns_deg
+    ]
+    place = np.concatenate([*places, *([[[0.02, -0.036, 1.219]]] if extra else [])])
+    board = np.repeat(np.arange(len(turns_deg)), 9)
+    board = np.append(board, len(turns_deg)) if extra else board
+    return LedMap(np.arange(len(place)), place, *FLAT, board)
+
+
+def seen_by_tracker(leds: LedMap, yaw_deg: float) -> tuple[str, float]:
+    """The dome tracker's status, and its attitude's error in degrees."""
+    lever = Lever(np.array([0.0, 0.0, 0.381]), Rotation.identity())
+    tracker, rng = DomeTracker(CAMERA, leds, lever), np.random.default_rng(11)
+    truth = Rotation.from_euler("z", yaw_deg, degrees=True)
+    pixels = project(truth, leds.position_m, lever, CAMERA)
+    pixels = rng.permutation(pixels + 0.05 * rng.standard_normal(pixels.shape))
+    answer = tracker.solve_centroids(Centroids(pixels, np.full(len(pixels), 0.05), np.ones(len(pixels))))
+    error = (answer.cam_from_ref * truth.inv()).magnitude() if answer.solved else np.inf
+    return answer.status, float(np.degrees(error))
+
+
+@pytest.mark.parametrize("turns", [(0.0, 180.0), (0.0, 120.0, 240.0)], ids=["two boards", "three boards"])
+def test_a_pattern_that_is_its_own_twin_is_called_ambiguous(turns):
+    assert seen_by_tracker(boards(turns, extra=False), 33.0)[0] == search.AMBIGUOUS
+
+
+def test_one_light_that_breaks_the_symmetry_is_enough():
+    status, error_deg = seen_by_tracker(boards((0.0, 120.0, 240.0), extra=True), 33.0)
+    assert status == "solved"
+    # .05 px across a pattern of 500 px: .006 deg of roll; five times that.
+    assert error_deg < 0.03
+
+
+def test_too_few_lights_are_no_attitude():
+    leds = spread(300, OVAL, 12)
+    sight = sight_of(leds, LEVER, CAMERA)
+    for count in range(3):
+        pixels = np.random.default_rng(13).uniform(0, [1599, 1199], (count, 2))
+        assert identified(pixels.reshape(-1, 2), sight) == search.NO_MATCH
+
+
+def test_the_covariance_holds_the_map_s_own_errors():
+    """NEES over maps drawn anew: chi-square of three degrees, mean 3 +- sqrt(6 / 100)."""
+    rng, nees = np.random.default_rng(14), []
+    truth = spread(1400, OVAL, 15)
+    for n in range(100):
+        body_from_lab = pose(rng)
+        pixels, _ = lights(truth, body_from_lab, rng)
+        tracker = DomeTracker(CAMERA, surveyed(truth, 100 + n), LEVER)
+        answer = tracker.solve_centroids(
+            Centroids(pixels, np.full(len(pixels), NOISE_PX), np.ones(len(pixels)))
+        )
+        if answer.solved:
+            error = (answer.cam_from_ref * (LEVER.cam_from_body * body_from_lab).inv()).as_rotvec()
+            nees.append(error @ np.linalg.inv(answer.covariance_rad2) @ error)
+    assert len(nees) >= 97
+    assert np.mean(nees) == pytest.approx(3, abs=3 * np.sqrt(6 / 100))
+
+
+def test_two_leds_whose_images_touch_are_left_out_of_the_attitude():
+    """One blob between them, nearer to the brighter: in neither's place by 10 px, where the others are to .05 px."""
+    lone = spread(1400, OVAL, 16)
+    beside = lone.position_m + np.array([0.0025, 0, 0])  # 26 px
+    leds = LedMap(np.arange(2800), np.concatenate([lone.position_m, beside]), *OVAL)
+    tracker, rng, pulls = DomeTracker(CAMERA, leds, LEVER), np.random.default_rng(17), []
+    for _ in range(30):
+        body_from_lab = pose(rng)
+        xy = project(body_from_lab, leds.position_m, LEVER, CAMERA)
+        seen = np.flatnonzero(CAMERA.contains(np.nan_to_num(xy[:1400], nan=-1e9), 40))
+        sharp, blend = seen[2:], seen[:2]
+        pixels = np.concatenate([xy[sharp], xy[sharp + 1400], 0.6 * xy[blend] + 0.4 * xy[blend + 1400]])
+        pixels += 0.05 * rng.standard_normal(pixels.shape)
+        answer = tracker.solve_centroids(Centroids(pixels, np.full(len(pixels), 0.05), np.ones(len(pixels))))
+        assert answer.solved
+        error = (answer.cam_from_ref * (LEVER.cam_from_body * body_from_lab).inv()).as_rotvec()
+        pulls.append(error @ np.linalg.inv(answer.covariance_rad2) @ error)
+    # Chi-square of three or less, a centroid's error having a floor above the noise; deviation sqrt(6 / 30).
+    assert np.mean(pulls) < 3 + 3 * np.sqrt(6 / 30)
+
+
+def test_the_covariance_holds_a_lever_s_error():
+    """A pupil believed aside by 1 mm: .047 deg at 48 in, far beyond the lights' own noise, and as it is claimed."""
+    truth, rng, nees = spread(1400, OVAL, 18), np.random.default_rng(19), []
+    for _ in range(60):
+        aside = Lever(LEVER.camera_body_m + 1e-3 * rng.standard_normal(3), LEVER.cam_from_body, 1e-3)
+        body_from_lab = pose(rng)
+        pixels, _ = lights(truth, body_from_lab, rng)
+        answer = DomeTracker(CAMERA, truth, aside).solve_centroids(
+            Centroids(pixels, np.full(len(pixels), NOISE_PX), np.ones(len(pixels)))
+        )
+        assert answer.solved
+        error = (answer.cam_from_ref * (LEVER.cam_from_body * body_from_lab).inv()).as_rotvec()
+        nees.append(error[:2] @ np.linalg.inv(answer.covariance_rad2[:2, :2]) @ error[:2])
+    # Chi-square of two: mean 2, deviation sqrt(4 / 60).
+    assert np.mean(nees) == pytest.approx(2, abs=3 * np.sqrt(4 / 60))
+
+
+def test_stars_are_lights_about_a_camera_at_the_centre():
+    """Of a sky of 6,000 stars, brightest first, only the brighter third is seen: the others are not missed."""
+    rng = np.random.default_rng(20)
+    sky = rng.standard_normal((6000, 3))
+    sky /= np.linalg.norm(sky, axis=1, keepdims=True)
+    camera = Camera.from_fov(1024, 1024, np.radians(20))
+    sight, found = sky_of(sky, camera), 0
+    for _ in range(60):
+        cam_from_sky = Rotation.random(rng=rng)
+        xy = camera.pixels(cam_from_sky.apply(sky[:2000]))
+        xy = xy[camera.contains(np.nan_to_num(xy, nan=-1e9))]
+        pixels = np.concatenate([xy + 0.1 * rng.standard_normal(xy.shape), rng.uniform(0, 1023, (3, 2))])
+        match = search.identify(camera.rays(pixels), np.full(len(pixels), 0.1 / camera.focal_px), sight)
+        assert not isinstance(match, str)
+        # .1 px of 2,800 about each axis across, and of some 300 about the boresight, by ten stars.
+        assert (match.cam_from_ref * cam_from_sky.inv()).magnitude() < 2e-3
+        found += np.all(match.star < 2000)
+    assert found == 60

@@ -1,0 +1,304 @@
+"""Laws of lights at a finite distance: surfaces, exact and thesis's solves, identification, the home catalogue."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as some
+from hypothesis.extra.numpy import arrays
+from laws import ANY, NUMBERS, SEEDS, answered, assert_covariance, law, turn, units
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from estimator.attitude import dome_map, nearfield
+from estimator.attitude.dome_map import LedMap, Lever
+from estimator.attitude.nearfield import SOLVERS
+from estimator.calibration import home_position
+from estimator.calibration.home_position import HomeCatalogue, Sighting
+from estimator.catalog import pair_index
+from estimator.core.arrays import Floats
+from estimator.core.camera import Camera
+from estimator.core.errors import ImageError
+from estimator.core.types import Centroids
+from estimator.identification.leds import index, search
+from estimator.trackers import dome_tracker
+from estimator.trackers.dome_tracker import DomeTracker
+
+pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning")
+CAMERA = Camera(640, 480, 900.0, (319.5, 239.5))
+SPHERE = LedMap(np.arange(0), np.empty((0, 3)), np.zeros(3), np.full(3, 1.2))
+OVAL = LedMap(np.arange(0), np.empty((0, 3)), np.array([0, 0, 0.4]), np.array([1.0, 1.0, 0.8]))
+RAYS = arrays("f8", (5, 3), elements=ANY)
+
+
+def lever(rng: np.random.Generator) -> Lever:
+    """Up to 0.35 m out, nearly up, the camera nearly as the body."""
+    along = np.array([0.0, 0.0, rng.uniform(0.1, 0.35)]) + rng.normal(0, 0.01, 3)
+    return Lever(along, turn(rng, 0.05))
+
+
+def seen_through(
+    rng: np.random.Generator, surface: LedMap, arm: Lever, body_from_lab: Rotation, count: int
+) -> tuple[LedMap, Floats]:
+    """Lights of a surface where a camera's rays to anywhere on its chip meet it, and those rays."""
+    rays = CAMERA.rays(rng.uniform(0, [639, 479], (count, 2)))
+    lab_from_body = body_from_lab.inv()
+    origin = lab_from_body.apply(arm.camera_body_m)
+    places = dome_map.on_surface(lab_from_body.apply(arm.cam_from_body.inv().apply(rays)), origin, surface)
+    return replace(surface, id=np.arange(count), position_m=places), rays
+
+
+def even(count: int) -> LedMap:
+    """Lights all over the sphere's upper part, by a golden spiral with a wobble that repeats nowhere."""
+    rng = np.random.default_rng(count)
+    z = 1 - (np.arange(count) + 0.5) / count * 0.4
+    azimuth = np.arange(count) * np.pi * (3 - np.sqrt(5))
+    across = np.sqrt(1 - z**2)
+    along = np.column_stack([across * np.cos(azimuth), across * np.sin(azimuth), z]) + rng.normal(
+        0, 0.01, (count, 3)
+    )
+    return replace(
+        SPHERE, id=np.arange(count), position_m=1.2 * along / np.linalg.norm(along, axis=1, keepdims=True)
+    )
+
+
+# Surfaces
+
+
+@law(dome_map.on_sphere, dome_map.on_surface, dome_map.project, dome_map.check_lever)
+@given(rng=SEEDS, radius_m=some.floats(0.1, 3), place_m=arrays("f8", 3, elements=some.floats(-2, 2)))
+def test_rays_meet_the_surface_on_their_way(
+    rng: np.random.Generator, radius_m: float, place_m: Floats
+) -> None:
+    rays = units(rng, 9)
+    met = answered(lambda: dome_map.on_sphere(rays, place_m, radius_m))
+    assert (met is not None) == (np.linalg.norm(place_m) < radius_m)
+    ball = replace(SPHERE, semi_axes_m=np.full(3, radius_m))
+    same = dome_map.on_surface(rays, place_m, ball)
+    np.testing.assert_allclose(same if met is None else met, same, rtol=0, atol=1e-6)
+    arm, body_from_lab = lever(rng), turn(rng)
+    leds, seen = seen_through(rng, OVAL, arm, body_from_lab, 9)
+    on_it = np.sum(((leds.position_m - OVAL.centre_m) / OVAL.semi_axes_m) ** 2, axis=1)
+    np.testing.assert_allclose(on_it, 1, rtol=0, atol=1e-9)
+    pixels = dome_map.project(body_from_lab, leds.position_m, arm, CAMERA)
+    np.testing.assert_allclose(CAMERA.rays(pixels), seen, rtol=0, atol=1e-9)
+    far = answered(
+        lambda: dome_map.check_lever(leds, Lever(place_m, Rotation.identity())) or True, ImageError
+    )
+    assert bool(far) == (np.linalg.norm(place_m) < np.linalg.norm(leds.position_m, axis=1).min())
+
+
+# Solves
+
+
+@law(nearfield.rotation_only, nearfield.tappe, nearfield.ray_on_surface, nearfield.pnp)
+@given(
+    rng=SEEDS,
+    count=some.integers(6, 20),
+    off_rad=some.floats(0, 0.05),
+    name=some.sampled_from(["rotation_only", "tappe", "ray_on_surface", "pnp"]),
+)
+def test_exact_solves_find_the_truth(rng: np.random.Generator, count: int, off_rad: float, name: str) -> None:
+    arm, truth = lever(rng), turn(rng, 0.4)
+    leds, rays = seen_through(rng, OVAL, arm, truth, count)
+    start = turn(rng, off_rad) * truth
+    found, covariance = SOLVERS[name](rays, np.full(count, 1e-4), leds.position_m, leds, arm, start)
+    assert (found * truth.inv()).magnitude() < 1e-6
+    assert_covariance(covariance)
+
+
+@law(nearfield.fitted_sigma_rad)
+@given(rng=SEEDS, name=some.sampled_from(sorted(SOLVERS)))
+def test_the_error_of_what_is_fitted_is_that_of_a_shifted_pixel(rng: np.random.Generator, name: str) -> None:
+    """By differences: of a pixel shifted along x and along y, the turn of its ray and the change of its tangents."""
+    pixel, step = rng.uniform([0, 0], [640, 480], (9, 2)), 1e-3
+    moved = np.array([CAMERA.rays(pixel + step * axis) - CAMERA.rays(pixel) for axis in np.eye(2)])
+    turned_rad = np.sqrt(np.sum(moved**2, axis=(0, 2)) / 2)
+    expected = np.full(9, step / 900) if name in ("rotation_only", "pnp") else turned_rad
+    found = nearfield.fitted_sigma_rad(name, CAMERA.rays(pixel), np.full(9, step / 900))
+    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=0)
+
+
+@law(nearfield.infinity, nearfield.thesis, nearfield.thesis_points)
+@given(rng=SEEDS, name=some.sampled_from(["infinity", "thesis"]))
+def test_the_thesis_s_ways_are_near_the_truth(rng: np.random.Generator, name: str) -> None:
+    """Some degrees by the field's few lights, and a light stands on its ray where the slip is put right."""
+    arm, truth = lever(rng), turn(rng, 0.4)
+    leds, rays = seen_through(rng, SPHERE, arm, truth, 12)
+    found, covariance = SOLVERS[name](rays, np.full(12, 1e-4), leds.position_m, leds, arm, truth)
+    assert (found * truth.inv()).magnitude() < np.radians(6)
+    assert_covariance(covariance)
+    points, reach_m = nearfield.thesis_points(rays, leds, arm, True)
+    np.testing.assert_allclose(points, reach_m * rays, rtol=0, atol=1e-9)
+
+
+@law(*SOLVERS.values(), nearfield.thesis_points)
+@given(
+    rng=SEEDS,
+    rays=RAYS,
+    sigma=arrays("f8", 5, elements=ANY),
+    place=RAYS,
+    name=some.sampled_from(sorted(SOLVERS)),
+)
+def test_any_rays_are_solved_or_refused(
+    rng: np.random.Generator, rays: Floats, sigma: Floats, place: Floats, name: str
+) -> None:
+    arm = lever(rng)
+    told = answered(lambda: SOLVERS[name](rays, sigma, place, SPHERE, arm, Rotation.identity()))
+    assert told is None or told[1].shape == (3, 3)
+    answered(lambda: nearfield.thesis_points(rays, SPHERE, arm))
+
+
+# Identification
+
+
+@pytest.fixture(scope="module")
+def eye() -> DomeTracker:
+    return DomeTracker(CAMERA, even(150), Lever(np.array([0.01, 0.0, 0.3]), Rotation.identity()))
+
+
+@law(DomeTracker.solve_centroids, search.identify, search.lights_of, dome_tracker.led_pairs)
+@given(rng=SEEDS, false=some.integers(0, 4))
+def test_lights_are_named_as_they_are_or_not_at_all(
+    eye: DomeTracker, rng: np.random.Generator, false: int
+) -> None:
+    truth = turn(rng, 0.3)
+    px = np.nan_to_num(dome_map.project(truth, eye.leds.position_m, eye.lever, CAMERA), nan=-1e9)
+    star = np.flatnonzero(CAMERA.contains(px, 3))
+    xy = np.concatenate(
+        [px[star] + rng.normal(0, 0.1, (len(star), 2)), rng.uniform(0, [639, 479], (false, 2))]
+    )
+    star = np.concatenate([star, np.full(false, -1)])
+    told = eye.solve_centroids(Centroids(xy, np.full(len(xy), 0.1), np.linspace(2, 1, len(xy))))
+    truth_cam = eye.lever.cam_from_body * truth
+    assert not told.solved or (told.cam_from_ref * truth_cam.inv()).magnitude() < 0.01
+    assert not told.solved or (star[told.match.observed] >= 0).sum() >= len(told.match.observed) - false
+    rays, sigma = CAMERA.rays(xy), np.full(len(xy), 1e-4)
+    sight = index.sight_of(eye.leds, eye.lever, CAMERA)
+    lights = search.lights_of(rays, sigma, sight)
+    np.testing.assert_allclose(np.linalg.norm(lights.usual, axis=1), 1, rtol=0, atol=1e-9)
+    for match in (search.identify(rays, sigma, sight), eye.identify(rays, sigma)):
+        named = [] if isinstance(match, str) else match.observed.tolist()
+        assert len(set(named)) == len(named)
+
+
+@law(DomeTracker.solve_centroids, DomeTracker.solve, dome_tracker.as_stars, slow=True)
+@given(
+    xy_px=arrays("f8", (8, 2), elements=ANY),
+    sigma=arrays("f8", 8, elements=ANY),
+    noise=SEEDS,
+    name=some.sampled_from(["pyramid", "saa"]),
+)
+def test_no_lights_of_noise_have_an_attitude_under_a_dome(
+    eye: DomeTracker, xy_px: NDArray, sigma: NDArray, noise: np.random.Generator, name: str
+) -> None:
+    assert not eye.solve_centroids(Centroids(xy_px, sigma, np.ones(8))).solved
+    assert not eye.solve(noise.normal(100, 5, (480, 640))).attitude.solved
+    answered(lambda: eye.solve(xy_px), ImageError)
+    identify = dome_tracker.as_stars(name, CAMERA, eye.leds, eye.lever, eye.settings)
+    assert isinstance(answered(lambda: identify(CAMERA.rays(xy_px), sigma)) or "refused", str)
+
+
+@law(index.sight_of, index.sky_of, index.grid_of, index.at_usual)
+@given(rng=SEEDS, count=some.integers(20, 60))
+def test_a_dome_is_laid_out_whole(rng: np.random.Generator, count: int) -> None:
+    leds = even(count)
+    sight = index.sight_of(leds, lever(rng), CAMERA)
+    grid = index.grid_of(leds.position_m / 1.2)
+    assert grid.first[-1] == len(grid.direction) == count
+    np.testing.assert_allclose(np.sort(sight.radius_m), 1.2, rtol=1e-12, atol=0)
+    assert (np.diff(sight.pairs.angle_rad) >= 0).all()
+    sky = index.sky_of(units(rng, count), CAMERA.zoomed(0.5))
+    assert sky.usual_m == pytest.approx(1, abs=1e-12)
+    known = pair_index.build(units(rng, count), 1.0)
+    scaled = index.at_usual(known, np.full(count, 1.5))
+    np.testing.assert_allclose(scaled.angle_rad, 1.5 * known.angle_rad, rtol=1e-12, atol=0)
+
+
+@law(index.corner_rays, index.inner_field, index.cap_height)
+@given(rng=SEEDS, factor=some.floats(0.3, 5), margin_rad=some.floats(0, 3))
+def test_a_field_holds_its_inner_one(rng: np.random.Generator, factor: float, margin_rad: float) -> None:
+    corners = index.corner_rays(CAMERA.zoomed(factor))
+    (left, right, top, bottom), half = index.inner_field(corners)
+    assert 0 < right - left < 2 * half[0]
+    assert 0 < bottom - top < 2 * half[1]
+    directions = units(rng, 5)
+    assert 0 <= index.cap_height(directions, 0.0) <= index.cap_height(directions, margin_rad) <= 2
+
+
+# The thesis's catalogue
+
+
+@law(home_position.pooled, home_position.averaged, home_position.instrument_magnitude)
+@given(
+    rng=SEEDS,
+    shift=some.floats(-100, 100),
+    scale=some.floats(0.1, 10),
+    deviation=some.sampled_from([home_position.pooled, home_position.averaged]),
+)
+def test_a_spread_knows_scale_and_no_shift(
+    rng: np.random.Generator, shift: float, scale: float, deviation: Callable[..., Floats]
+) -> None:
+    value, group, stop = rng.normal(size=40), np.arange(40) % 5, np.arange(40) // 5 % 2
+    one, other = deviation(value, group, stop), deviation(scale * value + shift, group, stop)
+    np.testing.assert_allclose(other, scale * one, rtol=1e-6, atol=0)
+    by_numpy = [np.std(value[group == g], ddof=1) for g in range(5)]
+    assert deviation is home_position.averaged or np.allclose(one, by_numpy, rtol=1e-9, atol=0)
+    light = home_position.instrument_magnitude(np.abs(value), 1.0 + group)
+    np.testing.assert_allclose(
+        home_position.instrument_magnitude(np.abs(value), scale * (1.0 + group)), light, rtol=1e-9
+    )
+
+
+@law(home_position.calibrate, home_position.led_map, HomeCatalogue.epsilon_pos_rad)
+@given(
+    rng=SEEDS,
+    frames=some.integers(2, 6),
+    spread=some.sampled_from(["pooled", "averaged"]),
+    sine=some.booleans(),
+)
+def test_a_home_catalogue_is_of_the_lights_that_were_shown(
+    rng: np.random.Generator, frames: int, spread: str, sine: bool
+) -> None:
+    arm = Lever(np.array([0, 0, 0.3]), Rotation.identity())
+    leds, _ = seen_through(rng, SPHERE, arm, Rotation.identity(), 8)
+    px = dome_map.project(Rotation.identity(), leds.position_m, arm, CAMERA)
+    light = rng.uniform(10, 99, 8)
+    shown = [
+        Sighting(
+            0, Rotation.identity(), leds.id, px + rng.normal(0, 0.2, px.shape), light + rng.normal(0, 1, 8)
+        )
+        for _ in range(frames)
+    ]
+    told = home_position.calibrate(shown, CAMERA, SPHERE, arm, sine, spread)
+    assert sorted(told.id) == sorted(leds.id)
+    assert (np.diff(told.magnitude) <= 0).all()
+    assert (told.samples == frames).all()
+    for covariance in told.covariance_m2:
+        assert_covariance(covariance)
+    assert 0 < told.epsilon_pos_rad < 0.01
+    on = home_position.led_map(told, SPHERE)
+    np.testing.assert_allclose(np.linalg.norm(on.position_m, axis=1), 1.2, rtol=1e-9, atol=0)
+    np.testing.assert_allclose(np.cross(on.position_m, told.vectors), 0, rtol=0, atol=1e-9)
+
+
+@law(home_position.calibrate)
+@given(
+    led=NUMBERS,
+    xy=NUMBERS | arrays("f8", (2, 2), elements=ANY),
+    magnitude=NUMBERS,
+    position=some.integers(0, 2),
+)
+def test_any_sightings_are_a_catalogue_or_refused(
+    led: NDArray, xy: NDArray, magnitude: NDArray, position: int
+) -> None:
+    arm = Lever(np.array([0, 0, 0.3]), Rotation.identity())
+    for names in (np.arange(2), np.ravel(np.nan_to_num(led)).clip(-9, 9).astype(np.int64)):
+        sighting = Sighting(position, Rotation.identity(), names, xy, magnitude)
+        answered(lambda: home_position.calibrate([sighting, sighting], CAMERA, SPHERE, arm))  # noqa: B023
+    with pytest.raises(ImageError, match="no sightings"):
+        home_position.calibrate([], CAMERA, SPHERE, arm)

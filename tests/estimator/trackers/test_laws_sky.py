@@ -1,0 +1,290 @@
+"""Laws of the identifiers and of the star tracker, on any sky and for any lights."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as some
+from hypothesis.extra.numpy import arrays
+from laws import ANY, NUMBERS, SEEDS, answered, assert_covariance, drawn, law, turn, units
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from estimator.calibration.magnitude_zero import magnitude_zero
+from estimator.catalog import pair_index
+from estimator.core.camera import Camera
+from estimator.core.errors import ImageError
+from estimator.core.types import Attitude, Centroids, StarMatch
+from estimator.identification.direct_match import answer
+from estimator.identification.options import Options
+from estimator.identification.published import saa_search, shefex
+from estimator.identification.published.fialho import fialho_1, fialho_2, fialho_3, fialho_4
+from estimator.identification.published.fialho import rules as fialho_rules
+from estimator.identification.published.master_star import master_star
+from estimator.identification.published.pyramid import pyramid
+from estimator.identification.published.saa import Pool, saa
+from estimator.identification.registry import IDENTIFIERS
+from estimator.trackers import star_tracker
+from estimator.trackers.pipeline import Settings
+from estimator.trackers.star_tracker import StarTracker
+from estimator.trackers.tracking_mode import TrackingMode
+
+pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning")
+CAMERA = Camera.from_fov(640, 480, np.radians(40))
+RAYS = arrays("f8", some.tuples(some.integers(0, 12), some.just(3)), elements=ANY)
+
+
+# Identifiers
+
+
+class World:
+    """A sky with its index, and what a camera sees of it."""
+
+    def __init__(self, rng: np.random.Generator, count: int = 800) -> None:
+        self.vectors = units(rng, count)
+        self.mag = np.sort(rng.uniform(0, 6, count))
+        self.index = pair_index.build(self.vectors, CAMERA.diagonal_rad, None, self.mag)
+        self.truth = turn(rng)
+        px = np.nan_to_num(CAMERA.pixels(self.truth.apply(self.vectors)), nan=-1e9)
+        self.star = np.flatnonzero(CAMERA.contains(px, 3))
+        self.seen = self.truth.apply(self.vectors[self.star])
+
+
+@law(
+    saa,
+    shefex.shefex,
+    master_star,
+    fialho_1,
+    fialho_2,
+    fialho_3,
+    fialho_4,
+    pyramid,
+    answer,
+    fialho_rules,
+    Pool.add,
+)
+@given(
+    rng=SEEDS, name=some.sampled_from(sorted(IDENTIFIERS)), false=some.integers(0, 6), told=some.booleans()
+)
+def test_what_is_identified_is_what_is_there(
+    rng: np.random.Generator, name: str, false: int, told: bool
+) -> None:
+    """Each star once, none of the false ones, the attitude that the stars have: or nothing."""
+    world, tolerance_rad = World(rng), 2e-4
+    seen = np.concatenate([world.seen, CAMERA.rays(rng.uniform(0, [639, 479], (false, 2)))])
+    mag = np.concatenate([world.mag[world.star], np.full(false, 6.0)])
+    star = np.concatenate([world.star, np.full(false, -1)])
+    more = {"magnitude": mag, "epsilon_mag": 0.1} if told else {}
+    match = IDENTIFIERS[name](seen, world.index, tolerance_rad, **more)
+    # None is better than a guess.
+    match = match or StarMatch(np.arange(len(world.star)), world.star, world.truth, -9.0)
+    assert len(set(match.observed.tolist())) == len(match.observed) >= min(4, len(world.star))
+    assert match.log10_chance <= -5
+    off = np.linalg.norm(match.cam_from_ref.apply(world.vectors[match.star]) - seen[match.observed], axis=1)
+    assert (off < 3 * tolerance_rad).all()
+    assert (match.cam_from_ref * world.truth.inv()).magnitude() < 10 * tolerance_rad
+    true = star[match.observed] >= 0
+    assert (match.star == star[match.observed])[true].all()
+
+
+@law(pyramid, saa, shefex.shefex, master_star, fialho_1, fialho_2, fialho_3, fialho_4, answer)
+@given(
+    rng=SEEDS,
+    rays=RAYS,
+    tolerance=some.floats(1e-6, 1e-3) | ANY,
+    mag=NUMBERS,
+    name=some.sampled_from(sorted(IDENTIFIERS)),
+)
+def test_directions_of_nothing_are_no_stars(
+    rng: np.random.Generator, rays: NDArray, tolerance: float, mag: NDArray, name: str
+) -> None:
+    world, count = World(rng, 60), len(rays)
+    for light in (None, mag):
+        more = {"max_checks": 100_000, "magnitude": light}
+        told = answered(lambda: IDENTIFIERS[name](rays, world.index, tolerance, **more))  # noqa: B023
+        assert told is None or (len(set(told.observed.tolist())) == len(told.observed) <= count)
+    with pytest.raises(ImageError, match="focal length is uncertain"):
+        Options(zooms=True).fixed_focal(name)
+
+
+@law(Options.light, Options.fixed_focal)
+@given(mag=NUMBERS, count=some.integers(0, 6))
+@example(mag=np.array(3.0), count=1)
+def test_magnitudes_are_one_a_star_or_unknown(mag: NDArray, count: int) -> None:
+    told = answered(lambda: Options(magnitude=mag).light(count), ImageError)
+    assert (told is not None) == (mag.shape == (count,))
+    assert np.isnan(Options().light(count)).tolist() == [True] * count
+    Options().fixed_focal("any")
+
+
+@law(Pool.log10_chance, Pool.answer)
+@given(rng=SEEDS)
+def test_a_pool_without_assumptions_answers_nothing(rng: np.random.Generator) -> None:
+    world = World(rng, 60)
+    known, unknown = world.index, np.full(len(world.seen), np.nan)
+    gates = saa_search.Gates(1e-4, 1e-4, np.inf, 0.0)
+    seen = saa_search.Sky(world.seen, unknown, known.vectors, known.magnitude, known.cells, gates)
+    pool = Pool(seen, (-1.0, 1.0, -1.0, 1.0), 0.0)
+    assert pool.log10_chance == 0
+    assert pool.answer() is None
+
+
+@law(shefex.cos_error)
+@given(
+    fov=some.floats(0.01, 1.5),
+    errors=some.lists(some.floats(0, 1e-3), min_size=2, max_size=2),
+    factor=some.floats(0, 9),
+)
+def test_the_gate_grows_with_the_error(fov: float, errors: list[float], factor: float) -> None:
+    small, large = (shefex.cos_error(fov, error, factor) for error in sorted(errors))
+    assert 0 <= small <= large <= factor * max(errors) * 1.000001 + 1e-15  # cosines of 16 digits
+
+
+@law(magnitude_zero)
+@given(rng=SEEDS, shift=some.floats(-5, 5), often=some.integers(1, 3))
+def test_the_magnitudes_offset_is_a_shift(rng: np.random.Generator, shift: float, often: int) -> None:
+    vectors, v_mag, seen = units(rng, 9), rng.uniform(0, 6, 9), rng.normal(0, 1, 9)
+    one = magnitude_zero(seen, v_mag, vectors)
+    order = rng.permutation(9 * often)
+    many = (
+        np.tile(seen, often)[order],
+        np.tile(v_mag + shift, often)[order],
+        np.tile(vectors, (often, 1))[order],
+    )
+    other = magnitude_zero(*many)
+    assert one.stars == other.stars == 9
+    np.testing.assert_allclose(other.offset_mag - one.offset_mag, shift, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(other.scatter_mag, one.scatter_mag, rtol=0, atol=1e-9)
+
+
+# Tracker
+
+
+@pytest.fixture(scope="module")
+def eye() -> StarTracker:
+    stars = drawn(np.random.default_rng(7), 800)
+    return StarTracker(CAMERA, stars, stars.vectors)
+
+
+def seen_by(eye: StarTracker, rng: np.random.Generator, truth: Rotation) -> tuple[Centroids, NDArray]:
+    """The field's stars, brightest first, each a tenth of a pixel off, and their rows."""
+    rows, xy = eye.in_field(CAMERA, truth)
+    inside = CAMERA.contains(xy, 2)
+    rows, xy = rows[inside], xy[inside] + rng.normal(0, 0.1, (int(inside.sum()), 2))
+    return Centroids(xy, np.full(len(rows), 0.1), 10 ** (-0.4 * eye.stars.v_mag[rows])), rows
+
+
+@law(
+    StarTracker.in_field,
+    StarTracker.solve_centroids,
+    StarTracker.solve_named,
+    StarTracker.attitude_of,
+    Attitude.solved,
+)
+@given(rng=SEEDS, false=some.integers(0, 8))
+def test_an_attitude_is_the_sky_s_or_none(eye: StarTracker, rng: np.random.Generator, false: int) -> None:
+    truth = turn(rng)
+    centroids, rows = seen_by(eye, rng, truth)
+    everywhere = np.nan_to_num(CAMERA.pixels(truth.apply(eye.stars.vectors)), nan=-1e9)
+    assert set(np.flatnonzero(CAMERA.contains(everywhere)).tolist()) <= set(
+        eye.in_field(CAMERA, truth)[0].tolist()
+    )
+    named = eye.solve_named(centroids, np.arange(len(rows)), rows)
+    assert named.solved == (len(rows) >= 2)
+    assert not named.solved or (named.cam_from_ref * truth.inv()).magnitude() < 0.02
+    xy = np.concatenate([centroids.xy_px, rng.uniform(0, [639, 479], (false, 2))])
+    mixed = Centroids(xy, np.full(len(xy), 0.1), np.linspace(2, 1, len(xy)))
+    told = eye.solve_centroids(mixed)
+    assert told.solved == (told.status == "solved") == (told.match is not None) == (told.camera is not None)
+    assert not told.solved or (told.cam_from_ref * truth.inv()).magnitude() < 0.02
+    assert not told.solved or set(told.match.observed.tolist()) <= set(range(len(xy)))
+
+
+@law(StarTracker.solve_centroids, StarTracker.sigma_px, StarTracker.lights, StarTracker.efforts)
+@given(
+    xy_px=arrays("f8", (9, 2), elements=ANY),
+    sigma_px=arrays("f8", 9, elements=ANY),
+    flux=arrays("f8", 9, elements=ANY),
+)
+def test_any_lights_are_told_apart_from_a_sky(
+    eye: StarTracker, xy_px: NDArray, sigma_px: NDArray, flux: NDArray
+) -> None:
+    lights = Centroids(xy_px, sigma_px, flux)
+    assert not eye.solve_centroids(lights).solved
+    assert not any(eye.solve_centroids(lights, effort=n).solved for n in range(eye.efforts))
+    sigma = eye.sigma_px(lights, 0.5, 0.01)
+    assert (sigma >= np.abs(sigma_px))[np.isfinite(sigma)].all()
+    assert eye.lights(lights, sigma).tangent.shape == (9, 2)
+
+
+@law(StarTracker.solve, TrackingMode.solve, TrackingMode.expected_px)
+@given(
+    rng=SEEDS, t_s=some.lists(ANY, min_size=3, max_size=3), image=arrays("u2", (48, 64), fill=some.just(0))
+)
+def test_no_picture_of_noise_has_an_attitude_at_any_time(
+    eye: StarTracker, rng: np.random.Generator, t_s: list[float], image: NDArray
+) -> None:
+    answered(lambda: eye.solve(image), ImageError)  # not this camera's
+    frame = rng.normal(100, 5, (480, 640))
+    frame[:48, :64] += image
+    follower = TrackingMode(eye)
+    assert not eye.solve(frame).attitude.solved
+    for when_s in t_s:
+        assert not follower.solve(frame, when_s).attitude.solved
+    expected = follower.expected_px(turn(rng))
+    assert CAMERA.contains(expected, follower.reach_px).all()
+    off = np.abs(expected[:, None] - expected).max(axis=2)[np.triu_indices(len(expected), 1)]
+    assert (off >= follower.reach_px).all()
+
+
+@law(star_tracker.mutual)
+@given(rng=SEEDS, radius_px=some.floats(0, 50), counts=some.tuples(some.integers(0, 9), some.integers(0, 9)))
+def test_mutual_neighbours_are_each_other_s_nearest(
+    rng: np.random.Generator, radius_px: float, counts: tuple[int, int]
+) -> None:
+    seen, there = (rng.uniform(0, 100, (count, 2)) for count in counts)
+    rows = rng.permutation(100)[: len(there)]
+    hit, row = star_tracker.mutual(seen, there, radius_px, rows)
+    between = np.linalg.norm(seen[:, None] - there, axis=2)
+    told = {(int(a), int(np.flatnonzero(rows == b)[0])) for a, b in zip(hit, row, strict=True)}
+    least = [(a, int(np.argmin(between[a]))) for a in range(len(seen)) if len(there)]
+    assert told == {(a, b) for a, b in least if np.argmin(between[:, b]) == a and between[a, b] < radius_px}
+
+
+@law(star_tracker.log10_chance)
+@given(blobs=some.integers(4, 100), predicted=some.integers(1, 100), radius_px=some.floats(0.5, 5))
+def test_more_matches_are_less_of_a_chance(blobs: int, predicted: int, radius_px: float) -> None:
+    chances = [
+        star_tracker.log10_chance(np.arange(n), blobs, predicted, radius_px, CAMERA, 1000)
+        for n in range(2, blobs + 1)
+    ]
+    assert all(b <= a + 1e-9 for a, b in pairwise(chances))
+
+
+@law(star_tracker.fit_camera, slow=True)
+@given(rng=SEEDS, longer=some.floats(-0.03, 0.03), off_rad=some.floats(0, 0.01))
+def test_a_camera_is_fitted_to_exact_pixels(rng: np.random.Generator, longer: float, off_rad: float) -> None:
+    true, truth = CAMERA.zoomed(1 + longer), turn(rng)
+    xy = rng.uniform(0, [639, 479], (20, 2))
+    start = Rotation.from_rotvec(off_rad * units(rng, 1)[0]) * truth
+    camera, found = star_tracker.fit_camera(CAMERA, start, xy, truth.inv().apply(true.rays(xy)))
+    assert abs(camera.focal_px / true.focal_px - 1) < 1e-4
+    assert (found * truth.inv()).magnitude() < 1e-4
+
+
+@law(StarTracker.solve)
+@given(
+    settings_=some.builds(
+        Settings, identifier=some.sampled_from(["pyramid"]), solver=some.sampled_from(["triad", "svd"])
+    )
+)
+def test_a_tracker_s_answer_has_a_covariance(settings_: Settings) -> None:
+    rng = np.random.default_rng(5)
+    stars = drawn(rng, 800)
+    eye = StarTracker(CAMERA, stars, stars.vectors, settings_)
+    told = eye.solve_centroids(seen_by(eye, rng, turn(rng))[0])
+    assert told.solved
+    assert_covariance(told.covariance_rad2)

@@ -1,0 +1,164 @@
+"""Tracking: it goes where the stars go, says how it is, and finds its way again when it is lost."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from scipy.special import erf
+
+from estimator.catalog import catalog
+from estimator.core.camera import Camera
+from estimator.core.errors import ImageError
+from estimator.detection.windows import in_windows
+from estimator.trackers.pipeline import Settings
+from estimator.trackers.star_tracker import StarTracker
+from estimator.trackers.tracking_mode import Health, TrackingMode
+
+FILE = Path(__file__).parents[3] / "data/catalogues/hipparcos_hp6.5.ecsv"
+CAMERA = Camera.from_fov(659, 493, np.radians(14.87))
+START = Rotation.from_euler("xyz", [20, 50, 130], degrees=True)
+RATE_RAD_S = np.radians([0.3, -0.4, 0.2])
+STEP_S = 0.1
+PSF_PX = 0.8
+
+
+@pytest.fixture(scope="module")
+def tracker() -> StarTracker:
+    stars = catalog.brighter(catalog.read(FILE), 6.0)
+    settings = Settings(centroider="gaussian_fit", centroid_sigma_px=0.02, saturation=60_000)
+    return StarTracker(CAMERA, stars, stars.vectors, settings)
+
+
+def attitude(t_s: float) -> Rotation:
+    return Rotation.from_rotvec(RATE_RAD_S * t_s) * START
+
+
+def photograph(tracker: StarTracker, cam_from_ref: Rotation, seed: int = 0, light: float = 3e5):
+    """Gaussian stars over a sky of 20 electrons, photon and read noise; 16 bits."""
+    image = np.full((CAMERA.height_px, CAMERA.width_px), 20.0)
+    rows, pixels = tracker.in_field(CAMERA, cam_from_ref)
+    edges_x, edges_y = np.arange(CAMERA.width_px + 1) - 0.5, np.arange(CAMERA.height_px + 1) - 0.5
+    for (x, y), mag in zip(pixels, tracker.stars.v_mag[rows], strict=True):
+        across, down = (
+            np.diff(erf((e - at) / (PSF_PX * 2**0.5))) / 2 for e, at in ((edges_x, x), (edges_y, y))
+        )
+        image += light * 10 ** (-0.4 * mag) * np.outer(down, across)
+    rng = np.random.default_rng(seed)
+    return np.clip(rng.poisson(image) + rng.normal(300, 12, image.shape), 0, 65535).astype(np.uint16)
+
+
+def off_rad(report, truth: Rotation) -> float:
+    return float((report.attitude.cam_from_ref * truth.inv()).magnitude())
+
+
+def test_it_searches_once_and_follows_then(tracker: StarTracker) -> None:
+    follower = TrackingMode(tracker)
+    reports = [
+        follower.solve(photograph(tracker, attitude(t), n), t) for n, t in enumerate(np.arange(8) * STEP_S)
+    ]
+    # Ten stars of a hundredth of a pixel: roll of 20".
+    assert max(off_rad(r, attitude(n * STEP_S)) for n, r in enumerate(reports)) < 2e-4
+    assert reports[0].expected == 0
+    assert reports[0].health & Health.SEARCHED
+    # The second frame's prediction knows no rate: half a degree a second is 19 px in a tenth, beyond its windows.
+    assert all(r.expected >= 8 and not r.health & Health.SEARCHED for r in reports[2:])
+    assert all(r.log10_odds > 10 for r in reports)
+    nees = [error(r, attitude(n * STEP_S)) for n, r in enumerate(reports)]
+    assert np.mean(nees) < 3 + 4 * np.sqrt(6 / 8)  # chi-square of three degrees, eight times: four deviations
+
+
+def error(report, truth: Rotation) -> float:
+    turn = (report.attitude.cam_from_ref * truth.inv()).as_rotvec()
+    return float(turn @ np.linalg.solve(report.attitude.covariance_rad2, turn))
+
+
+def test_the_gyros_turn_is_followed_at_once(tracker: StarTracker) -> None:
+    follower = TrackingMode(tracker)
+    follower.solve(photograph(tracker, attitude(0)), 0.0)
+    turn = attitude(STEP_S) * attitude(0).inv()
+    report = follower.solve(photograph(tracker, attitude(STEP_S), 1), STEP_S, now_from_then=turn)
+    assert report.expected >= 8
+    assert off_rad(report, attitude(STEP_S)) < 2e-4
+
+
+def test_a_jump_is_searched_and_never_answered_wrongly(tracker: StarTracker) -> None:
+    follower, jumped = TrackingMode(tracker), Rotation.from_rotvec([0.2, -0.1, 1.0]) * START
+    follower.solve(photograph(tracker, START), 0.0)
+    report = follower.solve(photograph(tracker, jumped), STEP_S)
+    assert report.health & Health.SEARCHED
+    assert off_rad(report, jumped) < 2e-4
+
+
+def test_a_frame_without_stars_is_lost_and_the_next_one_followed(tracker: StarTracker) -> None:
+    follower = TrackingMode(tracker)
+    still = [follower.solve(photograph(tracker, START, n), n * STEP_S) for n in range(2)]
+    dark = follower.solve(photograph(tracker, START, 5, light=0.0), 0.2)
+    again = follower.solve(photograph(tracker, START, 6), 0.3)
+    assert dark.health == Health.LOST
+    assert dark.attitude.cam_from_ref is None
+    assert np.isnan(dark.chi2_per_dof)
+    assert [still[1].expected > 0, again.expected > 0] == [True, True]
+
+
+def test_a_memory_that_is_stale_is_none(tracker: StarTracker) -> None:
+    follower = TrackingMode(tracker, stale_s=1.0)
+    follower.solve(photograph(tracker, START), 0.0)
+    assert follower.solve(photograph(tracker, START, 1), 1.5).health & Health.SEARCHED
+    assert not follower.solve(photograph(tracker, START, 2), 2.0).health & Health.SEARCHED
+    assert follower.solve(photograph(tracker, START, 2), 1.0).health & Health.SEARCHED  # time ran backwards
+
+
+def test_half_a_sky_is_called_missing_and_few_stars_few(tracker: StarTracker) -> None:
+    """A cloud over all but a corner."""
+    follower = TrackingMode(tracker)
+    follower.solve(photograph(tracker, START), 0.0)
+    image = photograph(tracker, START, 1)
+    _, pixels = tracker.in_field(CAMERA, START)
+    left = np.sort(pixels[:, 0])[3]
+    image[:, int(left) + 6 :] = photograph(tracker, START, 2, light=0.0)[:, int(left) + 6 :]
+    report = follower.solve(image, STEP_S)
+    assert off_rad(report, START) < 1e-3
+    assert report.health == Health.MISSING | Health.FEW
+
+
+def test_saturated_and_smeared_stars_are_told(tracker: StarTracker) -> None:
+    follower = TrackingMode(tracker)
+    follower.solve(photograph(tracker, START), 0.0)
+    bright = follower.solve(photograph(tracker, START, 1, light=2e7), STEP_S)
+    assert bright.health & Health.SATURATED
+    smeared = np.mean([photograph(tracker, shifted(x), 2) for x in np.linspace(-4.5, 4.5, 19)], axis=0)
+    quick = follower.solve(smeared.astype(np.uint16), 2 * STEP_S, streak_px=(9.0, 0.0))
+    assert quick.health & Health.SMEARED
+    assert off_rad(quick, START) < 1e-3
+
+
+def shifted(x_px: float) -> Rotation:
+    """The start, turned until the stars stand so much to the right."""
+    return Rotation.from_rotvec([0, x_px / CAMERA.focal_px, 0]) * START
+
+
+def test_an_uncertain_camera_cannot_be_followed() -> None:
+    stars = catalog.brighter(catalog.read(FILE), 5.0)
+    with pytest.raises(ValueError, match="must know its camera; allowed: focal_uncertainty 0"):
+        TrackingMode(StarTracker(CAMERA, stars, stars.vectors, focal_uncertainty=0.05))
+
+
+def test_another_camera_s_frame_is_bad_input(tracker: StarTracker) -> None:
+    follower = TrackingMode(tracker)
+    follower.solve(photograph(tracker, START), 0.0)
+    with pytest.raises(ImageError, match="the image is 600x493 pixels"):
+        follower.solve(photograph(tracker, START)[:, :600], STEP_S)
+
+
+def test_a_window_holds_its_star_and_no_other(tracker: StarTracker) -> None:
+    image = photograph(tracker, START)
+    rows, pixels = tracker.in_field(CAMERA, START)
+    bright = pixels[tracker.stars.v_mag[rows] < 4.5]
+    blobs = in_windows(image, bright + np.array([2.0, -1.0]), 6.0, 4.0)
+    nearest = np.abs(blobs.xy_px[:, None] - bright).max(axis=2).min(axis=1)
+    assert len(blobs) == len(bright)
+    assert nearest.max() < 0.3  # the middle of a blob, no centroid yet
+    assert len(in_windows(image, np.repeat(bright[:1], 3, axis=0), 6.0, 4.0)) == 1
+    dark = photograph(tracker, START, 1, light=0.0)
+    assert len(in_windows(dark, bright, 6.0, 6.0)) == 0

@@ -1,0 +1,31 @@
+"""What tests of studies share: what a store holds, and doing a study into one."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Callable
+from pathlib import Path
+
+from skysim.experiments.study import plan, store
+from skysim.experiments.study.execution import engines, runner
+
+
+def contents(path: Path) -> str:
+    """Points and trials, row for row, to the last bit and with their types."""
+    db = sqlite3.connect(path)
+    tables = [db.execute(f"SELECT * FROM {name} ORDER BY 1").fetchall() for name in ("points", "trials")]
+    db.close()
+    return repr(tables)
+
+
+def done(
+    told: plan.Plan,
+    path: Path,
+    engine: engines.Engine | None = None,
+    resume: bool = False,
+    watch: Callable[[runner.Progress], object] | None = None,
+) -> runner.Progress:
+    """Do a study's missing trials, in this process if no engine is named."""
+    with store.writing(path) as kept:
+        runner.begin(told, kept, resume)
+        return runner.run(told, kept, engine or engines.Serial(), watch)

@@ -1,0 +1,313 @@
+"""What many trials come to: responses against theory, Sobol indices against a function whose own are known, exports."""
+
+import csv
+import math
+
+import numpy as np
+import pytest
+from scipy import stats
+from scipy.stats import qmc
+
+from estimator.trackers.star_tracker import StarTracker
+from skysim.core.errors import InputError
+from skysim.core.paths import SCENES
+from skysim.experiments.study import loader, store
+from skysim.experiments.study.analysis import sensitivity, table
+from skysim.experiments.study.execution import engines, replay, runner
+from skysim.experiments.study.report import export
+from skysim.experiments.study.trials import FIELDS
+from skysim.results import metrics
+
+STUDY = """schema: 1
+title: a question
+scene: shefex2
+seed: 1
+set: {light.limit_mag: 6.0}
+trial: {kind: centroids, noise_px: 0.1, lights: 15}
+factors:
+  strays: {key: trial.false_lights, values: [0, 5]}
+  focal: {key: camera.focal_length, values: ["20 mm", "-1 mm"]}
+replicates: 4
+responses: [identified, cross_arcsec_p95]
+"""
+
+
+def columns(**given):
+    """Columns of trials, what is not given NaN."""
+    count = len(next(iter(given.values())))
+    empty = {name: np.full(count, np.nan) for name in (*FIELDS, "time_ms")}
+    return empty | {name: np.asarray(values, dtype=float) for name, values in given.items()}
+
+
+@pytest.mark.parametrize(("hits", "of"), [(0, 30), (15, 30), (30, 30), (999, 1000)])
+def test_a_share_has_wilsons_interval(hits, of):
+    """The roots of (p - x)^2 = z^2 x (1 - x) / n (Wilson 1927), solved here."""
+    z2 = stats.norm.ppf(0.975) ** 2
+    p = hits / of
+    roots = np.sort(np.roots([1 + z2 / of, -(2 * p + z2 / of), p**2]).real)
+    told = metrics.share(hits, of)
+    assert (told.low, told.high) == pytest.approx(tuple(roots), abs=1e-9)
+    assert (told.value, told.trials) == (p, of)
+
+
+def test_intervals_hold_what_they_promise():
+    """Of 400 samples of 60 each: how often the truth is inside, within four standard errors of 95 % or above it."""
+    rng = np.random.default_rng(2)
+    truth = {
+        "mean": 1.0,
+        "rms": math.sqrt(2),
+        "median": math.log(2),
+        "p90": math.log(10),
+    }  # of an exponential
+    inside = dict.fromkeys(truth, 0)
+    for _ in range(400):
+        sample = rng.exponential(size=60)
+        for name, value in truth.items():
+            told = metrics.STATISTICS[name](sample)
+            inside[name] += told.low <= value <= told.high
+    error = math.sqrt(0.95 * 0.05 / 400)
+    assert min(inside["median"], inside["p90"]) / 400 > 0.95 - 4 * error  # at least, for they are ranks
+    assert 0.85 < inside["mean"] / 400 < 0.95 + 4 * error  # the bootstrap's is short on few of a skew law
+    assert 0.80 < inside["rms"] / 400 < 0.95 + 4 * error
+
+
+def test_too_few_trials_leave_an_end_open():
+    told = metrics.STATISTICS["p99"](np.arange(20.0))
+    assert math.isfinite(told.low)
+    assert told.high == math.inf
+
+
+def test_responses_are_of_what_their_names_say():
+    c = columns(
+        frames=[1, 1, 1, 1, 0],
+        solved=[1, 1, 1, 0, 0],
+        wrong=[0, 0, 1, 0, 0],
+        x_arcsec=[3, 0, 2000, np.nan, np.nan],
+        y_arcsec=[4, 1, 0, np.nan, np.nan],
+        roll_arcsec=[-12, 0, 0, np.nan, np.nan],
+        nees=[3, 3, 1e5, np.nan, np.nan],
+        stars=[7, 5, 4, 2, np.nan],
+    )
+    said = {
+        **{"identified": 2 / 4, "wrong": 1 / 4, "refused": 1 / 4, "failed": 1 / 5, "overconfident": 1 / 3},
+        **{"coverage": 2 / 4, "coverage_3": 3 / 4, "stars_least": 2, "stars_mean": 4.5},
+        **{"cross_arcsec_median": 5, "roll_arcsec_worst": 12, "angle_arcsec_least": 1},
+    }
+    for name, value in said.items():
+        assert metrics.response(name)(c).value == pytest.approx(value, rel=1e-12), name
+    assert metrics.response("filter_arcsec_rms")(c) == metrics.NOTHING
+
+
+def test_honest_answers_are_not_called_overconfident():
+    nees = stats.chi2.rvs(3, size=100_000, random_state=4)
+    told = metrics.response("overconfident")(columns(nees=nees, frames=np.ones(len(nees))))
+    assert told.value == 0
+    assert stats.chi2.sf(stats.chi2.isf(metrics.BEYOND, 3), 3) == pytest.approx(1e-8, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    "name", ["identify", "cross_arcsec", "cross_p95", "stars_p91", "coverage_", "_p95", ""]
+)
+def test_a_response_that_is_none_is_refused_with_those_that_are(name):
+    with pytest.raises(InputError, match=r"responses.2: .* is none of overconfident, identified"):
+        metrics.response(name, "responses.2")
+
+
+def test_sobol_indices_of_two_outputs_are_those_worked_out_by_hand():
+    """f = (2 x + y, 3 z + x y) over the unit cube: V = 175/144; x: 51/175, y: 15/175, z: 108/175, x with y: 1/175."""
+    shares = qmc.Sobol(6, rng=1).random(4096)
+    a, b = shares[:, :3], shares[:, 3:]
+
+    def f(u):
+        return np.stack([2 * u[:, 0] + u[:, 1], 3 * u[:, 2] + u[:, 0] * u[:, 1]])
+
+    mixed = np.stack([f(np.where(np.arange(3) == n, b, a)) for n in range(3)])
+    first, total = sensitivity.generalised(f(a), f(b), mixed)
+    assert first == pytest.approx(np.array([51, 15, 108]) / 175, abs=5e-3)
+    assert total == pytest.approx(np.array([52, 16, 108]) / 175, abs=5e-3)
+
+
+ERRORS = """schema: 1
+title: an error budget
+scene: afit_simsat
+seed: 1
+set:
+  tracker.believed_camera_body: ["0 mm", "0 mm", "381 mm"]
+  tracker.survey: {turn_deg: [0, 0, 0]}
+  light.layout: {kind: random, count: 1400, cap_deg: 30}
+  tracker.centroid_sigma_px: 0.2
+trial: {kind: centroids, noise_px: 0.0, tilt_deg: [0, 10]}
+factors:
+  lever_x: {key: tracker.believed_camera_body.0, distribution: normal, mean: "0 mm", sigma: "0.2 mm"}
+  turn_x: {key: tracker.survey.turn_deg.0, distribution: normal, mean: 0, sigma: 0.01}
+  turn_z: {key: tracker.survey.turn_deg.2, distribution: normal, mean: 0, sigma: 0.02}
+design: {kind: saltelli, points: 8}
+replicates: 3
+responses: [identified]
+"""
+
+
+def test_the_error_budget_blames_whom_it_should(tmp_path):
+    """A survey turned about z is roll alone, one about x is cross alone; a lever across is mostly cross: 0.2 mm at
+    33 in of the camera's sight is 0.2 / 838 rad of a point's direction, of which the bearing's turn takes 1 - 15/48."""
+    told, kept = done(tmp_path, ERRORS)
+    with kept as rows:
+        found = {(one.response, one.factor): one for one in sensitivity.indices(told, rows)}
+    assert found["roll_arcsec", "turn_z"].total.value > 0.9
+    assert found["cross_arcsec", "turn_z"].total.value < 0.05
+    assert found["roll_arcsec", "turn_x"].total.value < 0.1
+    assert found["cross_arcsec", "turn_x"].total.value + found["cross_arcsec", "lever_x"].total.value > 0.9
+    drawn = np.degrees(1) * 3600 * 0.2 / (48 * 25.4)
+    assert found["cross_arcsec", "lever_x"].rms_arcsec == pytest.approx(drawn, rel=0.6)
+
+
+def test_a_budget_that_is_not_known_yet_is_no_fault(tmp_path):
+    path = tmp_path / "question.yaml"
+    path.write_text(ERRORS)
+    told = loader.load(path)
+    with store.writing(tmp_path / "study.sqlite") as rows:
+        runner.begin(told, rows, resume=False)
+        found = sensitivity.indices(told, rows)
+    assert len(found) == 6
+    assert all(math.isnan(one.total.value) for one in found)
+
+
+def done(folder, text):
+    """A study's plan, and its finished store to be opened."""
+    path = folder / "question.yaml"
+    path.write_text(text)
+    told = loader.load(path) if "-1 mm" not in text else loaded_with_a_fault(path)
+    with store.writing(folder / "study.sqlite") as kept:
+        runner.begin(told, kept, resume=False)
+        runner.run(told, kept, engines.Serial())
+    return told, store.open_store(folder / "study.sqlite")
+
+
+def loaded_with_a_fault(path):
+    """A plan with a level that makes no scene, which `load` would refuse before the first trial."""
+    good = path.with_name("good.yaml")
+    good.write_text(path.read_text().replace("-1 mm", "30 mm"))
+    told = loader.load(good)
+    bad = [
+        point._replace(
+            settings={key: "-1 mm" if value == "30 mm" else value for key, value in point.settings.items()}
+        )
+        for point in told.points
+    ]
+    told.points[:] = bad
+    return told
+
+
+def test_exports_say_what_the_store_says(tmp_path):
+    pandas, pyarrow = pytest.importorskip("pandas"), pytest.importorskip("pyarrow.parquet")
+    xarray = pytest.importorskip("xarray")
+    told, kept = done(tmp_path, STUDY)
+    with kept as rows:
+        for suffix in ("csv", "parquet", "zarr"):
+            export.export(rows, told.study.responses, tmp_path / f"trials.{suffix}")
+        columns, lines = rows.columns(), table.table(rows, told.study.responses)
+        with pytest.raises(InputError, match=r"'.xlsx' is none of .csv, .parquet, .zarr"):
+            export.export(rows, told.study.responses, tmp_path / "trials.xlsx")
+    with (tmp_path / "trials.csv").open() as file:
+        written = list(csv.DictReader(file))
+    assert len(written) == told.trials == 16
+    assert [float(row["x_arcsec"] or "nan") for row in written] == pytest.approx(
+        columns["x_arcsec"].tolist(), abs=0, nan_ok=True
+    )
+    frame = pandas.read_parquet(tmp_path / "trials.parquet")
+    assert frame["strays"].tolist() == [0] * 8 + [5] * 8
+    assert frame["status"].tolist() == [row["status"] for row in written]
+    assert pyarrow.read_schema(tmp_path / "trials.parquet").metadata[b"title"] == b"a question"
+    cube = xarray.open_zarr(tmp_path / "trials.zarr", consolidated=False)
+    assert dict(cube.sizes) == {"strays": 2, "focal": 2}
+    assert float(cube.identified.sel(strays=5, focal="20 mm")) == lines[2].responses["identified"].value
+    assert not list(tmp_path.glob(".*"))
+
+
+def test_a_trial_is_replayed_with_its_frames(tmp_path):
+    told, kept = done(tmp_path, STUDY)
+    with kept as rows:
+        again = replay.replay(told, rows, 9, tmp_path / "trial_9")
+        assert again.changed == []
+        assert again.row.seed == rows.trial(9)["seed"]
+        assert [path.name for path in again.files] == ["frame_0000.fits"]
+        assert all(path.is_file() for path in again.files + again.pictures)
+        failed = replay.replay(told, rows, 5, tmp_path / "trial_5")
+        assert "camera.focal_length" in failed.row.error
+        assert failed.files == []
+        with pytest.raises(InputError, match="trial 16: is none of the study's; allowed: 0 to 15"):
+            replay.replay(told, rows, 16, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("value", "told"),
+    [
+        ("1.59728308212 m", "1.597 m"),
+        ("48 in", "48 in"),
+        ("0.25 mm", "0.25 mm"),
+        (0.123456, "0.1235"),
+        ([0, 30], "0, 30"),
+    ],
+)
+def test_a_level_is_told_shortly(value, told):
+    assert table.level(value) == told
+
+
+def test_a_trial_that_raises_in_its_tracker_is_replayed_with_its_frame(tmp_path, monkeypatch):
+    told, kept = done(tmp_path, STUDY)
+
+    def broken(self, centroids, *_):
+        raise ZeroDivisionError("in the tracker")
+
+    monkeypatch.setattr(StarTracker, "solve_centroids", broken)
+    with kept as rows:
+        again = replay.replay(told, rows, 9, tmp_path / "trial_9")
+    assert "in the tracker" in again.row.error
+    assert str(SCENES.parent) not in again.row.error
+    assert [path.name for path in again.files] == ["frame_0000.fits"]
+    assert again.pictures[0].is_file()
+
+
+def test_a_store_of_a_scene_that_was_changed_is_not_gone_on_with(tmp_path):
+    (tmp_path / "mine.yaml").write_text("schema: 1\nbase: shefex2\n")
+    told, _ = done(
+        tmp_path, STUDY.replace("scene: shefex2", "scene: mine.yaml").replace('"-1 mm"', '"30 mm"')
+    )
+    with store.writing(tmp_path / "study.sqlite") as kept:
+        runner.begin(told, kept, resume=True)
+    (tmp_path / "mine.yaml").write_text("schema: 1\nbase: shefex2\ncamera: {f_number: 2.0}\n")
+    with (
+        store.writing(tmp_path / "study.sqlite") as kept,
+        pytest.raises(InputError, match="the scene of point 0 was changed since"),
+    ):
+        runner.begin(told, kept, resume=True)
+
+
+def test_failed_trials_can_be_forgotten(tmp_path):
+    told, _ = done(tmp_path, STUDY)
+    with store.writing(tmp_path / "study.sqlite") as kept:
+        assert kept.counts() == {"done": 16, "failed": 8, "wrong": 0}
+        kept.forget_failed()
+        assert kept.done(16).sum() == 8
+        runner.run(told, kept, engines.Serial())
+        assert kept.counts()["done"] == 16
+
+
+def test_frames_of_a_flight_are_counted_as_one_another_s_like():
+    """Two flights of a hundred frames each, all identified: the interval is of two, not of two hundred."""
+    c = columns(frames=[100, 100], solved=[100, 100], wrong=[0, 0], nees=[500, 500])
+    told = metrics.response("identified")(c)
+    assert (told.value, told.trials) == (1.0, 2)
+    assert told.low == pytest.approx(metrics.share(2, 2).low)
+    assert metrics.response("overconfident")(c).trials == 0  # a flight's NEES is a mean
+
+
+def test_a_table_is_of_every_point(tmp_path):
+    told, kept = done(tmp_path, STUDY)
+    with kept as rows:
+        lines = table.table(rows, told.study.responses)
+    heads, cells = table.cells(lines)
+    assert heads == ["point", "strays", "focal", "identified", "cross_arcsec_p95"]
+    assert [line[1:3] for line in cells] == [["0", "20 mm"], ["0", "30 mm"], ["5", "20 mm"], ["5", "30 mm"]]
+    assert cells[1][3:] == ["-", "-"]  # its scene cannot be
+    assert lines[0].responses["identified"].trials == 4

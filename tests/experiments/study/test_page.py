@@ -1,0 +1,434 @@
+"""The report of a study: what it says is the store's, what it shows is where it belongs."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from skysim.core.errors import InputError
+from skysim.experiments.study import designs, store
+from skysim.experiments.study.analysis.sensitivity import Index
+from skysim.experiments.study.analysis.table import Line, cells, table
+from skysim.experiments.study.designs import Point
+from skysim.experiments.study.plan import Curve, Heat, Study
+from skysim.experiments.study.report import figures, layout, page
+from skysim.experiments.study.trials import Outcome, Row
+from skysim.results.metrics import Summary
+from skysim.results.plots import INK
+
+COMMAND = "skysim study run 'a <b> & \"c\".yaml' --set=x=</code><script>alert(1)</script>"
+TILT = {"key": "trial.tilt_deg", "values": [20, 0, 10]}
+DOME: dict[str, Any] = {"levels": {name: {} for name in ("sphere", "flat", "cube")}}
+RADIUS = {"key": "light.radius", "values": ["48 in", "24 in", "96 in"]}
+RING = {"key": "trial.tilt_deg", "values": [[10, 20], [0, 10]]}
+
+
+def study(**keys: Any) -> Study:
+    base = {"schema": 1, "title": "Which <dome>?", "scene": "afit_simsat", "seed": 11, "replicates": 20}
+    base |= {"trial": {"kind": "centroids"}, "responses": ["identified", "cross_arcsec_median"]}
+    return Study.model_validate(base | {"factors": {"tilt": TILT}} | keys)
+
+
+def points(asked: Study) -> list[Point]:
+    return designs.points(asked.design, asked.factors, asked.seed)
+
+
+def outcome(point: int, replicate: int) -> Outcome:
+    """Known by hand: at point p the first p of each ten replicates are refused, the others off by p + 1 arcsec."""
+    if replicate % 10 < point % 10:
+        return Outcome("refused", 1, stars=4)
+    return Outcome("solved", 1, 1, 0, 0.6 * (point + 1), 0.8 * (point + 1), 5.0, 3.0, 9)
+
+
+def filled(
+    path: Path, asked: Study, tried: list[Point] | None = None, done: int | None = None, failed: int = 0
+) -> Path:
+    tried = points(asked) if tried is None else tried
+    rows = []
+    for trial in range(len(tried) * asked.replicates)[:done]:
+        point, replicate = divmod(trial, asked.replicates)
+        error = f"Traceback\nValueError: <b>{trial}</b>" if trial < failed else None
+        told = Outcome("failed") if error else outcome(point, replicate)
+        rows.append(Row(trial, point, replicate, trial, "scene", "cafe", told, error, 0.001))
+    with store.writing(path) as kept:
+        kept.note(study="title: Which <dome>?", code="cafe0123")
+        kept.set_points(tried)
+        kept.add(rows)
+        kept.ran("pool", 2, len(rows), 4.0)
+    return path
+
+
+def lines_of(path: Path, asked: Study) -> list[Line]:
+    with store.open_store(path) as kept:
+        return table(kept, page.responses(asked))
+
+
+class Html(HTMLParser):
+    """A page as text by element's id, rows of tables by id, images, and everything that names a source."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.ids: dict[str, str] = {}
+        self.tables: dict[str, list[list[str]]] = {}
+        self.rows: list[dict[str, str | None]] = []
+        self.keys: list[list[str]] = []
+        self.images: list[str] = []
+        self.sources: list[str] = []
+        self.tags: list[str] = []
+        self._inside: list[str] = []
+        self._table = ""
+        self._cell = False
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        told = dict(attrs)
+        self.tags.append(tag)
+        self.sources += [told[name] or "" for name in ("src", "href") if name in told]
+        if tag == "img":
+            self.images.append(told["src"] or "")
+        if tag in ("b", "code", "div", "table", "pre"):
+            self._inside.append(told.get("id") or "")
+        if tag == "table":
+            self._table = told.get("id") or "?"
+            self.tables[self._table] = []
+        if tag == "tr":
+            self.tables[self._table].append([])
+            if self._table == "points":
+                self.rows.append(told)
+                self.keys.append([])
+        if tag in ("td", "th"):
+            self._cell = True
+            self.tables[self._table][-1].append("")
+            if tag == "td" and self._table == "points":
+                self.keys[-1].append(told["data-v"] or "")
+
+    def handle_endtag(self, tag: str) -> None:
+        if tag in ("b", "code", "div", "table", "pre"):
+            self._inside.pop()
+        if tag in ("td", "th"):
+            self._cell = False
+
+    def handle_data(self, data: str) -> None:
+        for name in self._inside:
+            if name:
+                self.ids[name] = self.ids.get(name, "") + data
+        if self._cell:
+            self.tables[self._table][-1][-1] += data
+
+
+def written(path: Path, asked: Study, **more: Any) -> tuple[str, Html]:
+    with store.open_store(path) as kept:
+        lines = table(kept, page.responses(asked))
+        page.write_page(path.with_suffix(".html"), kept, asked, COMMAND, lines, **more)
+    text = path.with_suffix(".html").read_text(encoding="utf-8")
+    return text, Html(text)
+
+
+@pytest.fixture
+def bare(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pages without figures, which take the time."""
+    monkeypatch.setattr(page, "illustrated", lambda lines, study: [])
+
+
+# The page.
+
+
+@pytest.mark.usefixtures("bare")
+def test_every_fact_is_the_stores(tmp_path: Path) -> None:
+    asked = study(factors={"dome": DOME, "tilt": TILT})
+    path = filled(tmp_path / "s.sqlite", asked, failed=3)
+    _, html = written(path, asked)
+    with store.open_store(path) as kept:
+        counts, heads, rows = kept.counts(), *cells(table(kept, asked.responses))
+    assert html.ids["done"] == f"{counts['done']} / {9 * 20}"
+    assert (
+        (html.ids["failed"], html.ids["wrong"]) == (str(counts["failed"]), str(counts["wrong"])) == ("3", "0")
+    )
+    assert (html.ids["scene"], html.ids["seed"], html.ids["code"]) == ("afit_simsat", "11", "cafe0123")
+    assert html.tables["points"] == [heads, *rows]
+    assert html.tables["runs"][1:] == [["pool", "2", "180", "4.0", "45.0"]]
+    assert html.ids["study"] == "title: Which <dome>?"
+    assert "unfinished" not in html.ids
+
+
+def test_the_command_is_escaped_and_nothing_comes_from_outside(tmp_path: Path) -> None:
+    asked = study()
+    text, html = written(filled(tmp_path / "s.sqlite", asked, failed=1), asked)
+    assert html.ids["command"] == COMMAND
+    assert html.tags.count("script") == 1  # the page's own
+    assert "<title>Which &lt;dome&gt;?</title>" in text
+    assert not re.search(r"https?:|//[a-z]", re.sub(r"data:image/png;base64,[\w+/=]+", "", text))
+    assert html.sources == html.images
+    assert all(source.startswith("data:image/png;base64,") for source in html.sources)
+
+
+@pytest.mark.usefixtures("bare")
+@pytest.mark.parametrize("done", [0, 31])
+def test_a_half_finished_study_says_so(tmp_path: Path, done: int) -> None:
+    asked = study()
+    _, html = written(filled(tmp_path / "s.sqlite", asked, done=done), asked)
+    assert f"Not finished. {done} of 60 trials are in" in " ".join(html.ids["unfinished"].split())
+    assert html.tables["points"][3][2] == "-"  # a point without a trial
+    assert html.keys[3][2] == ""  # sorted last
+
+
+@pytest.mark.usefixtures("bare")
+def test_the_first_ten_failures_are_named_with_what_replays_them(tmp_path: Path) -> None:
+    asked = study()
+    _, html = written(filled(tmp_path / "s.sqlite", asked, failed=12), asked)
+    told = html.ids["failures"]
+    assert re.findall(r"trial (\d+): ValueError: <b>(\d+)</b>", told) == [(str(n), str(n)) for n in range(10)]
+    assert told.startswith("12 trials failed")
+    assert "skysim study replay FILE 0" in told
+
+
+@pytest.mark.usefixtures("bare")
+def test_a_run_that_was_killed_is_owned_up_to(tmp_path: Path) -> None:
+    asked = study()
+    path = filled(tmp_path / "s.sqlite", asked)
+    with store.writing(path) as kept, kept.db:
+        kept.db.execute("DELETE FROM runs")
+    assert "60 trials are of runs that were killed" in written(path, asked)[0]
+
+
+@pytest.mark.usefixtures("bare")
+def test_names_sort_in_the_studys_order_and_quantities_by_their_number(tmp_path: Path) -> None:
+    asked = study(factors={"dome": DOME, "radius": RADIUS})
+    _, html = written(filled(tmp_path / "s.sqlite", asked), asked)
+    by_dome, by_radius = ({row[n]: float(key[n]) for row, key in table} for n, table in (
+        (n, list(zip(html.tables["points"][1:], html.keys[1:], strict=True))) for n in (1, 2)
+    ))  # fmt: skip
+    assert by_dome == {"sphere": 0, "flat": 1, "cube": 2}
+    assert by_radius == {"48 in": 48, "24 in": 24, "96 in": 96}
+
+
+@pytest.mark.parametrize(
+    ("keys", "count"),
+    [
+        ({}, 2),
+        ({"factors": {"dome": DOME}}, 2),
+        ({"factors": {"dome": DOME, "ring": RING}}, 2),
+        ({"factors": {"tilt": TILT, "dome": DOME}, "design": {"kind": "one_at_a_time"}}, 4),
+        ({"figures": [{"kind": "curve", "x": "tilt", "y": "wrong", "log": True}]}, 1),
+        (
+            {"factors": {"tilt": TILT, "dome": DOME}}
+            | {"figures": [{"kind": "heat", "x": "tilt", "y": "dome", "value": "stars_least", "log": True}]},
+            1,
+        ),
+        ({"factors": {"tilt": {"key": "a", "from": 1, "to": 9}}, "design": {"kind": "lhs", "points": 80}}, 2),
+    ],
+)
+def test_figures_exist_of_every_kind(tmp_path: Path, keys: dict[str, Any], count: int) -> None:
+    asked = study(**keys)
+    html = written(filled(tmp_path / "s.sqlite", asked), asked)[1]
+    assert len(html.images) == count
+    assert len(set(html.images)) == count
+
+
+def test_indices_and_a_search_have_theirs(tmp_path: Path) -> None:
+    part = Summary(0.4, 0.3, 0.5, 8)
+    index = [Index("tilt", name, part, part, 1.0) for name in ("cross_arcsec", "roll_arcsec")]
+    factors = {"tilt": {"key": "a", "from": 1, "to": 9}}
+    asked = study(factors=factors, design={"kind": "saltelli", "points": 4}, responses=["identified"])
+    html = written(filled(tmp_path / "a.sqlite", asked), asked, indices=index)[1]
+    assert len(html.images) == 2 + 1
+    assert html.tables["indices"][1] == ["cross_arcsec", "tilt", "0.4 (0.3..0.5)", "0.4 (0.3..0.5)"]
+    objectives = [{"response": "cross_arcsec_median"}, {"response": "cost"}]
+    search = {"objectives": objectives, "constraints": [{"response": "stars_least", "at_least": 5}]}
+    asked = study(factors=factors, optimise=search | {"candidates": 4}, responses=["identified"])
+    tried = [designs.merged({"tilt": (n, {"a": n})}) for n in range(3)]
+    path = filled(tmp_path / "b.sqlite", asked, tried)
+    html = written(path, asked, front=[1], costs={0: 7.0, 1: 2.5})[1]
+    assert len(html.images) == 2 + 1
+    assert [row["class"] == "front" if "class" in row else False for row in html.rows[1:]] == [
+        False,
+        True,
+        False,
+    ]
+    assert [row[-1] for row in html.tables["points"]] == ["cost", "7", "2.5", "-"]
+    assert "unfinished" in html.ids  # three of four candidates
+
+
+# What is shown.
+
+
+def test_a_curve_holds_the_other_factors_and_takes_its_values_from_the_trials(tmp_path: Path) -> None:
+    asked = study(factors={"dome": DOME, "radius": RADIUS, "ring": RING})
+    lines = lines_of(filled(tmp_path / "s.sqlite", asked), asked)
+    curve = Curve(kind="curve", x="radius", y="identified", by="dome")
+    for where, ring in (({}, 0), ({"ring": [0, 10]}, 1)):
+        shown = layout.series(lines, curve.model_copy(update={"where": where}), asked)
+        assert [one.label for one in shown] == ["sphere", "flat", "cube"]
+        for dome, one in enumerate(shown):
+            # Points go with the last factor fastest; radii stand in the file as 48, 24, 96.
+            numbers = [6 * dome + 2 * radius + ring for radius in (1, 0, 2)]
+            assert one.x.tolist() == [24, 48, 96]
+            assert one.value == pytest.approx([1 - (n % 10) / 10 for n in numbers], abs=1e-12)
+            assert np.all((one.low <= one.value + 1e-12) & (one.value <= one.high + 1e-12))
+    assert "at ring = 10, 20" in layout.caption(curve, asked, lines)
+
+
+def test_what_is_drawn_is_what_was_arranged(tmp_path: Path) -> None:
+    from matplotlib.figure import Figure as Canvas
+
+    asked = study(replicates=10)  # too few for a median's interval at every point
+    lines, fig = lines_of(filled(tmp_path / "s.sqlite", asked), asked), Canvas()
+    curve = Curve(kind="curve", x="tilt", y="cross_arcsec_median")
+    figures.draw_curve(fig, lines, curve, asked)
+    (axes,) = fig.axes
+    drawn = [line for line in axes.lines if line.get_linestyle() == "-"]
+    assert [line.get_xdata().tolist() for line in drawn] == [[0, 10, 20]]
+    assert drawn[0].get_ydata() == pytest.approx([2.0, 3.0, 1.0])  # file order is 20, 0, 10
+    assert (axes.get_xlabel(), axes.get_ylabel()) == ("tilt [deg]", "cross median [arcsec]")
+
+
+def test_an_interval_without_an_end_leaves_the_picture_and_stretches_nothing() -> None:
+    from matplotlib.figure import Figure as Canvas
+
+    nan, inf = math.nan, math.inf
+    levels = zip([20, 0, 10], [(5, 4, inf), (3, -inf, 6), (8, nan, nan)], strict=True)
+    lines = [
+        Line(n, {"tilt": one}, {"roll_arcsec_p95": Summary(*told, 9)}) for n, (one, told) in enumerate(levels)
+    ]
+    for log in (False, True):
+        fig = Canvas()
+        curve = Curve(kind="curve", x="tilt", y="roll_arcsec_p95", log=log)
+        figures.draw_curve(fig, lines, curve, study())
+        (axes,) = fig.axes
+        low, high = axes.get_ylim()
+        assert high < 20
+        assert (0 < low < 3) if log else (-1 < low < 3)
+        ends = {round(one[0, 0]): sorted(one[:, 1]) for one in axes.collections[0].get_segments() if len(one)}
+        assert ends[20][0] == 4
+        assert ends[20][1] > high
+        assert ends[0][0] < low
+        assert ends[0][1] == 6
+        assert "has no end" in layout.caption(curve, study(), lines)
+
+
+def test_a_heat_map_has_its_cells_in_order_and_nan_where_nothing_is(tmp_path: Path) -> None:
+    asked = study(factors={"dome": DOME, "tilt": TILT})
+    lines = lines_of(filled(tmp_path / "s.sqlite", asked, done=8 * 20), asked)
+    heat = Heat(kind="heat", x="tilt", y="dome", value="cross_arcsec_median")
+    cell = layout.grid(lines, heat, asked)
+    assert (cell.x.levels, cell.y.levels) == ([0, 10, 20], ["sphere", "flat", "cube"])
+    # Tilts stand in the file as 20, 0, 10; the last point, cube at 10 degrees, is not done.
+    assert cell.value == pytest.approx(np.array([[2, 3, 1], [5, 6, 4], [8, np.nan, 7.0]]), nan_ok=True)
+
+
+def test_axes_know_numbers_quantities_names_and_lists() -> None:
+    def axis(factor: dict[str, Any], levels: list[Any]) -> layout.Axis:
+        return layout.axis(
+            study(factors={"a": factor}), [Line(n, {"a": one}, {}) for n, one in enumerate(levels)], "a"
+        )
+
+    quantity = axis(RADIUS, ["96 in", "24 in", "48 in"])
+    assert quantity[:3] == ("a [in]", ["24 in", "48 in", "96 in"], True)
+    rings = axis(RING, [[0, 10], [10, 20]])
+    assert rings[:3] == ("a [deg]", [[10, 20], [0, 10]], False)
+    assert rings.place([0, 10]) == 1
+    assert axis({"key": "x", "values": [True, False]}, [False, True])[1:3] == ([True, False], False)
+    assert axis({"key": "x", "values": ["1 m", "1 ft"]}, ["1 ft", "1 m"])[1:3] == (["1 m", "1 ft"], False)
+    steps = {"key": "x", "from": 1, "to": 1000}
+    assert [axis(steps | {"scale": one}, [1, 10, 100, 1000]).log for one in ("linear", "log")] == [
+        False,
+        True,
+    ]
+    assert [
+        axis({"key": "x", "values": v}, v).log for v in ([50, 100, 200, 800], [0, 1, 10, 100], [1, 5, 9, 13])
+    ] == [
+        True,
+        False,
+        False,
+    ]
+
+
+def test_two_levels_said_in_two_ways_are_one() -> None:
+    assert layout.same("5 m", "5.0 m")
+    assert layout.same([0, 10], [0.0, 10.0])
+    assert not layout.same("5 m", "5 ft")
+    assert not layout.same("5 m", 5)
+
+
+def test_where_names_what_is_there() -> None:
+    asked = study(factors={"dome": DOME, "tilt": TILT})
+    lines = [Line(n, point.levels, {}) for n, point in enumerate(points(asked))]
+    for where, said in (
+        ({"dome": "bowl"}, "'bowl' is none of sphere, flat, cube"),
+        ({"x": 1}, "none of dome, tilt"),
+    ):
+        with pytest.raises(InputError, match=said):
+            layout.kept(lines, Curve(kind="curve", x="tilt", y="wrong", where=where), asked)
+
+
+def test_figures_that_nobody_named_follow_from_the_factors() -> None:
+    many = {"key": "x", "from": 0, "to": 1, "steps": 12}
+
+    def chosen(**keys: Any) -> list[tuple[Any, ...]]:
+        asked = study(responses=["wrong"], **keys)
+        tried = points(asked)
+        lines = [Line(n, one.levels, {"wrong": Summary(0.0, 0.0, 0.1, 9)}) for n, one in enumerate(tried)]
+        return [
+            tuple(one.model_dump(exclude={"where", "log"}).values()) for one in layout.figures(asked, lines)
+        ]
+
+    assert chosen() == [("curve", "tilt", "wrong", None)]
+    assert chosen(factors={"dome": DOME, "tilt": TILT}) == [("curve", "tilt", "wrong", "dome")]
+    assert chosen(factors={"tilt": TILT, "n": many}) == [("heat", "tilt", "n", "wrong")]
+    assert chosen(factors={"tilt": TILT, "dome": DOME, "n": many}) == [("curve", "tilt", "wrong", "dome")]
+    assert chosen(factors={"tilt": {"key": "x", "values": [5]}}) == []
+    drawn = {"factors": {"n": many, "dome": DOME}, "design": {"kind": "lhs", "points": 9}}
+    assert chosen(**drawn) == [("curve", "n", "wrong", None), ("curve", "dome", "wrong", None)]
+
+
+def test_drawn_factors_part_points_into_equal_bands() -> None:
+    rng = np.random.default_rng(3)
+    asked = study(
+        factors={name: {"key": name, "from": 0, "to": 1} for name in "xb"},
+        design={"kind": "lhs", "points": 40},
+    )
+    lines = [
+        Line(n, {"x": float(x), "b": float(b)}, {"nees_mean": Summary(float(b), 0, 1, 5)})
+        for n, (x, b) in enumerate(rng.random((40, 2)))
+    ]
+    shown = layout.series(lines, Curve(kind="curve", x="x", y="nees_mean", by="b"), asked)
+    assert [len(one.x) for one in shown] == [10] * 4
+    assert all(before.value.max() < after.value.min() for before, after in itertools.pairwise(shown))
+    assert all((np.diff(one.x) > 0).all() for one in shown)
+
+
+def test_a_search_is_shown_by_candidate_with_its_bounds() -> None:
+    constraints = [{"response": "cost", "at_most": 9}, {"response": "wrong", "at_least": 0, "at_most": 0.1}]
+    asked = study(
+        optimise={"objectives": [{"response": "identified", "better": "more"}], "constraints": constraints}
+    )
+    assert asked.optimise is not None
+    responses = {"identified": Summary(0.5, 0.4, 0.6, 9), "wrong": Summary(0.2, 0.1, 0.3, 9)}
+    panels = layout.panels([Line(n, {"tilt": n}, responses) for n in (0, 1)], asked.optimise, {1: 4.0})
+    assert list(panels) == ["identified", "cost", "wrong"]
+    assert panels["identified"].label == "identified [share], more is better"
+    assert panels["cost"].value == pytest.approx([np.nan, 4.0], nan_ok=True)
+    assert panels["cost"].bounds == [9]
+    assert panels["wrong"].bounds == [0, 0.1]
+    assert panels["wrong"].high.tolist() == [0.3, 0.3]
+
+
+def test_a_figure_is_a_picture_by_itself(tmp_path: Path) -> None:
+    asked = study(factors={"dome": DOME, "tilt": TILT})
+    lines = lines_of(filled(tmp_path / "s.sqlite", asked), asked)
+    curve = Curve(kind="curve", x="tilt", y="identified", by="dome")
+    shown = figures.figure_png(lines, curve, asked)
+    picture = cv2.imdecode(np.frombuffer(shown, np.uint8), cv2.IMREAD_COLOR)
+    assert picture.shape[1] == 888
+    for ink in INK[:3]:  # every line's
+        bgr = [int(ink[n : n + 2], 16) for n in (5, 3, 1)]
+        assert (picture == bgr).all(axis=2).sum() > 50
+    assert shown == figures.figure_png(lines, curve, asked)

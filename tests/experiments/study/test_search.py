@@ -1,0 +1,413 @@
+"""The search of studies: what it finds where the answer is known, and that a kill changes nothing in its store."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+
+from skysim.core.errors import InputError
+from skysim.experiments.study import loader, plan, store
+from skysim.experiments.study.analysis import search
+from skysim.experiments.study.designs import Point
+from skysim.experiments.study.execution import engines, runner
+from skysim.experiments.study.factors import Settings
+from skysim.experiments.study.setups import code_version, seed_of
+from skysim.experiments.study.trials import FAILED, Outcome, Row
+
+pytest.importorskip("optuna")
+
+STUDY: dict[str, Any] = {
+    "schema": 1,
+    "title": "which dome",
+    "scene": "shefex2",
+    "seed": 3,
+    "trial": {"kind": "centroids"},
+    "factors": {
+        "x": {"key": "trial.noise_px", "from": 0.1, "to": 1.1, "steps": 2},
+        "y": {"key": "trial.magnitude_sigma", "from": 0, "to": 1, "steps": 2},
+    },
+    "replicates": 4,
+    "responses": ["angle_arcsec_p95"],
+    "optimise": {
+        "candidates": 30,
+        "objectives": [{"response": "angle_arcsec_median"}],
+    },
+}
+
+
+class Law:
+    """An engine that answers by a law of the settings instead of trials."""
+
+    name, workers = "law", 1
+
+    def __init__(self, law: Callable[[Settings], Outcome]) -> None:
+        self.law = law
+
+    def run(self, recipe: plan.Recipe, chunks: engines.Chunks) -> Iterator[list[Row]]:
+        while chunk := chunks.next():
+            yield [
+                self.row(recipe, segment, segment.first + n, k)
+                for segment in chunk
+                for n, k in enumerate(segment.replicates)
+            ]
+            chunks.took(chunk, 0.1)
+
+    def row(self, recipe: plan.Recipe, segment: Any, trial: int, k: int) -> Row:
+        seed, code = seed_of(recipe, segment.point, k), code_version()
+        try:
+            return Row(trial, segment.point, k, seed, "s", code, self.law(segment.settings), None, 0.0)
+        except InputError as error:
+            why = f"Traceback\nskysim.types.InputError: {error}\n"
+            return Row(trial, segment.point, k, seed, "", code, FAILED, why, 0.0)
+        except ArithmeticError as error:
+            return Row(trial, segment.point, k, seed, "s", code, FAILED, f"ArithmeticError: {error}", 0.0)
+
+
+def angle(arcsec: float, solved: bool = True) -> Outcome:
+    """A trial with that error about the boresight."""
+    return Outcome("solved", 1, 1, 0, 0.0, 0.0, arcsec) if solved else Outcome("none", 1)
+
+
+def bowl(settings: Settings) -> Outcome:
+    """Least, 1, at x = 0.7, y = 0.2."""
+    x, y = settings["trial.noise_px"], settings["trial.magnitude_sigma"]
+    return angle(1 + (x - 0.7) ** 2 + (y - 0.2) ** 2)
+
+
+@pytest.fixture(autouse=True)
+def any_scene(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A law has no scene, whose hash a run that goes on would compare."""
+    monkeypatch.setattr(runner, "check_scene", lambda *_: None)
+
+
+def loaded(folder: Path, told: dict[str, Any]) -> plan.Plan:
+    path = folder / "study.yaml"
+    path.write_text(yaml.safe_dump(told))
+    made = loader.load(path)
+    search.check(made.study)
+    return made
+
+
+def searched(told: plan.Plan, out: Path, engine: engines.Engine, watch: Any = None) -> search.Found:
+    with store.writing(out) as kept:
+        runner.begin(told, kept, bool(kept.meta("digest")))
+        return search.search(told, kept, engine, watch)
+
+
+def held(out: Path) -> tuple[list[Any], list[Any]]:
+    """All points and rows of a store."""
+    with store.open_store(out) as kept:
+        rows = kept.db.execute("SELECT * FROM trials ORDER BY trial").fetchall()
+        return kept.db.execute("SELECT * FROM points ORDER BY point").fetchall(), rows
+
+
+def changed(**keys: Any) -> dict[str, Any]:
+    """STUDY with other keys of `optimise`."""
+    return STUDY | {"optimise": STUDY["optimise"] | keys}
+
+
+def test_one_objective_comes_near_to_its_least(tmp_path: Path) -> None:
+    """Nearer than the best of as many points drawn at random, as they come on the average over the square."""
+    found = searched(loaded(tmp_path, STUDY), tmp_path / "s.db", Law(bowl))
+    (best,) = found.front
+    # E of the least squared distance of N uniform points from an inner point is 1 / (pi N).
+    assert best.objectives[0] - 1 < 1 / (math.pi * len(found.candidates))
+    assert found.finished
+    assert found.candidates[0].levels == {"x": 0.6, "y": 0.5}
+
+
+def test_more_is_better_where_the_study_says_so(tmp_path: Path) -> None:
+    told = changed(objectives=[{"response": "angle_arcsec_median", "better": "more"}])
+    (best,) = searched(loaded(tmp_path, told), tmp_path / "s.db", Law(bowl)).front
+    farthest = 1 + 0.6**2 + 0.8**2  # the corner
+    assert best.objectives[0] > 1 + 0.8 * (farthest - 1)
+
+
+def test_front_is_what_no_other_candidate_dominates(tmp_path: Path) -> None:
+    """angle = 1 / x against a price of x: every x at y = 0 is on the true front, and its law is angle * price = 1."""
+    cost = {"per": {"x": 1, "y": 1}}
+    told = changed(
+        objectives=[{"response": "angle_arcsec_median"}, {"response": "cost"}], cost=cost, candidates=40
+    )
+    found = searched(loaded(tmp_path, told), tmp_path / "s.db", Law(lambda s: angle(1 / s["trial.noise_px"])))
+    on = {one.number for one in found.front}
+    assert len(on) >= 5
+    for one in found.candidates:
+        beaten = any(
+            all(a <= b for a, b in zip(two.objectives, one.objectives, strict=True))
+            and two.objectives != one.objectives
+            for two in found.candidates
+        )
+        assert beaten == (one.number not in on)
+    assert [one.objectives[0] for one in found.front] == sorted(one.objectives[0] for one in found.front)
+    tightness = [math.prod(one.objectives) for one in found.candidates]
+    assert np.median(tightness[-15:]) < np.median(
+        tightness[:10]
+    )  # it has learnt that y costs and brings nothing
+
+
+def test_constraints_rule_out_what_would_be_best(tmp_path: Path) -> None:
+    """The bowl's bottom answers too seldom: the best is on the border x = 0.5, at a height of 1.04."""
+
+    def law(settings: Settings) -> Outcome:
+        return bowl(settings) if settings["trial.noise_px"] <= 0.5 else angle(0, solved=False)
+
+    told = changed(
+        constraints=[{"response": "identified", "at_least": 0.9}, {"response": "cost", "at_most": 10}]
+    )
+    found = searched(loaded(tmp_path, told), tmp_path / "s.db", Law(law))
+    (best,) = found.front
+    assert 1.04 <= best.objectives[0] < 1.14
+    for one in found.candidates:
+        assert one.feasible == (one.levels["x"] <= 0.5)
+        assert one.feasible or one.why.startswith("identified")
+
+
+def test_a_refused_candidate_is_infeasible_and_the_rest_goes_on(tmp_path: Path) -> None:
+    """Its trials fail after one was tried, and do not count as failures of the budget."""
+    asked = []
+
+    def law(settings: Settings) -> Outcome:
+        asked.append(settings["trial.noise_px"])
+        if settings["trial.noise_px"] > 0.8:
+            raise InputError("light.layout: no room")
+        return bowl(settings)
+
+    told = loaded(tmp_path, STUDY | {"budget": {"failures": 1}})
+    found = searched(told, tmp_path / "s.db", Law(law))
+    refused = [one for one in found.candidates if one.refused]
+    assert found.finished
+    assert refused
+    assert {one.why for one in refused} == {"light.layout: no room"}
+    assert not any(one.feasible for one in refused)
+    assert sum(x > 0.8 for x in asked) == len(refused)  # one trial each was tried
+    with store.open_store(tmp_path / "s.db") as kept:
+        assert kept.counts() == {"done": 120, "failed": 4 * len(refused), "wrong": 0}
+        seeds = kept.of_point(refused[0].number)["seed"]
+        again = [seed_of(told.recipe, refused[0].number, k) for k in range(4)]
+        assert seeds.tolist() == again
+
+
+def test_a_refused_candidate_is_never_the_best(tmp_path: Path) -> None:
+    """Not even where all that is asked is its price, which it has."""
+
+    def law(settings: Settings) -> Outcome:
+        if settings["trial.noise_px"] < 0.5:
+            raise InputError("light.layout: no room")
+        return bowl(settings)
+
+    told = changed(objectives=[{"response": "cost"}], cost={"per": {"x": 1}}, candidates=20)
+    found = searched(loaded(tmp_path, told), tmp_path / "s.db", Law(law))
+    assert any(one.refused for one in found.candidates)
+    assert found.front[0].cost == min(one.cost for one in found.candidates if not one.refused) >= 0.5
+
+
+def test_failures_end_it(tmp_path: Path) -> None:
+    def law(settings: Settings) -> Outcome:
+        raise ArithmeticError("a fault")
+
+    found = searched(loaded(tmp_path, STUDY | {"budget": {"failures": 6}}), tmp_path / "s.db", Law(law))
+    with store.open_store(tmp_path / "s.db") as kept:
+        assert 6 <= kept.counts()["failed"] <= 8
+    assert not found.finished
+    assert not found.front
+
+
+def test_time_ends_it(tmp_path: Path) -> None:
+    found = searched(loaded(tmp_path, STUDY | {"budget": {"time": "1 us"}}), tmp_path / "s.db", Law(bowl))
+    assert not found.finished
+    assert len(found.candidates) <= 1
+
+
+class Killed(Exception):
+    """In the middle."""
+
+
+def killer(after: int) -> Callable[[Any], None]:
+    """A watch that raises at its nth call."""
+    calls = itertools.count(1)
+
+    def watch(progress: runner.Progress) -> None:
+        if next(calls) == after:
+            raise Killed
+
+    return watch
+
+
+def killed_and_resumed(told: plan.Plan, out: Path, engine: engines.Engine, every: int) -> int:
+    """Kill a search at every nth batch until it ends by itself; how often it was."""
+    for kills in itertools.count():
+        try:
+            searched(told, out, engine, killer(every))
+        except Killed:
+            continue
+        return kills
+    raise AssertionError
+
+
+@pytest.mark.parametrize("every", [2, 9])
+def test_killed_and_resumed_it_leaves_the_same_store(tmp_path: Path, every: int) -> None:
+    """Two objectives, a constraint, levels and a refusal: all that the sampler hears of comes back from the store."""
+
+    def law(settings: Settings) -> Outcome:
+        if settings["trial.magnitude_sigma"] > 0.9:
+            raise InputError("light.layout: no room")
+        return bowl(settings)
+
+    told = changed(
+        objectives=[{"response": "angle_arcsec_median"}, {"response": "cost"}],
+        cost={"per": {"x": 1}, "levels": {"z": {"3": 1, "5": 2}}},
+        constraints=[{"response": "angle_arcsec_worst", "at_most": 1.2}],
+        candidates=13,
+    )
+    told["factors"] = STUDY["factors"] | {"z": {"key": "trial.lights", "values": [3, 5]}}
+    made = loaded(tmp_path, told)
+    whole = searched(made, tmp_path / "whole.db", Law(law))
+    assert killed_and_resumed(made, tmp_path / "killed.db", Law(law), every) > 2
+    assert held(tmp_path / "killed.db") == held(tmp_path / "whole.db")
+    with store.open_store(tmp_path / "killed.db") as kept:
+        assert repr(search.found(made, kept)) == repr(whole)
+
+
+def test_killed_and_resumed_with_a_real_scene(tmp_path: Path) -> None:
+    told = changed(candidates=4) | {"replicates": 3}
+    made = loaded(tmp_path, told)
+    searched(made, tmp_path / "whole.db", engines.Serial())
+    assert killed_and_resumed(made, tmp_path / "killed.db", engines.Serial(), 3) > 1
+    points, rows = held(tmp_path / "killed.db")
+    assert (points, rows) == held(tmp_path / "whole.db")
+    assert len(rows) == 12
+    assert all(error is None for *_, error in rows)
+
+
+def test_another_question_than_the_store_has_is_refused(tmp_path: Path) -> None:
+    """As of another version of the sampler: its rows would be taken for another point's."""
+    made = loaded(tmp_path, changed(candidates=3))
+    searched(made, tmp_path / "s.db", Law(bowl))
+    with store.writing(tmp_path / "s.db") as kept:
+        kept.set_points([Point({"x": 1, "y": 1}, {"trial.noise_px": 1, "trial.magnitude_sigma": 1})], first=1)
+        with pytest.raises(InputError, match=r"candidate 1 was .*version of optuna"):
+            search.search(made, kept, Law(bowl))
+
+
+def test_few_points_are_tried_once_each(tmp_path: Path) -> None:
+    told = changed(candidates=30)
+    told["factors"] = {
+        "x": {"key": "trial.noise_px", "values": [0.1, 0.5, 0.9]},
+        "y": {"key": "trial.magnitude_sigma", "values": [0.2, 0.4]},
+    }
+    found = searched(loaded(tmp_path, told), tmp_path / "s.db", Law(bowl))
+    assert found.finished
+    assert sorted((one.levels["x"], one.levels["y"]) for one in found.candidates) == [
+        (x, y) for x in (0.1, 0.5, 0.9) for y in (0.2, 0.4)
+    ]
+    assert {one.levels["y"] for one in found.front} == {0.2}
+    assert {one.levels["x"] for one in found.front} <= {0.5, 0.9}  # as near to 0.7, but for rounding
+
+
+def test_watch_is_told_of_the_whole_search(tmp_path: Path) -> None:
+    seen = []
+    made = loaded(tmp_path, changed(candidates=5))
+    searched(made, tmp_path / "s.db", Law(bowl), lambda now: seen.append((now.trials, now.done, now.now)))
+    assert {trials for trials, _, _ in seen} == {20}
+    assert [done for _, done, _ in seen] == sorted({done for _, done, _ in seen})
+    assert seen[-1] == (20, 20, 20)
+
+
+def test_cost_is_in_si_units(tmp_path: Path) -> None:
+    """base 1 + 2 a metre of 48 in + 0.01 of each of 300 + the level's 5."""
+    wanted = plan.Search.model_validate(
+        {
+            "objectives": [{"response": "cost"}],
+            "cost": {
+                "base": 1,
+                "per": {"size": 2, "leds": 0.01},
+                "levels": {"dome": {"cheap": 1, "precise": 5}},
+            },
+        }
+    )
+    price = search.cost(wanted, {"size": "48 in", "leds": 300, "dome": "precise"})
+    assert price == pytest.approx(1 + 2 * 1.2192 + 3 + 5, rel=1e-12)
+
+
+LEVELS = {"levels": {"cheap": {"trial.missing": 0.1}, "precise": {"trial.missing": 0.0}}}
+
+
+@pytest.mark.parametrize(
+    ("told", "says"),
+    [
+        ({"cost": {"per": {"radius": 1}}}, r"optimise\.cost\.per\.radius: 'radius' is none of x, y, z"),
+        ({"cost": {"per": {"z": 1}}}, r"optimise\.cost\.per\.z: 'cheap' is no number"),
+        ({"cost": {"levels": {"lens": {}}}}, r"optimise\.cost\.levels\.lens: 'lens' is none of x, y, z"),
+        (
+            {"cost": {"levels": {"z": {"dear": 5, "cheap": 1}}}},
+            r"levels\.z: .*allowed: a price of each of cheap, precise",
+        ),
+        ({"cost": {"levels": {"x": {"a": 1}}}}, r"levels\.x: .*optimise\.cost\.per, as it is a range"),
+        (
+            {"objectives": [{"response": "beauty"}]},
+            r"objectives\.0\.response: 'beauty' is none of .*, or cost",
+        ),
+        ({"objectives": [{"response": "time_ms_mean"}]}, r"time_ms_mean is another every time"),
+        ({"objectives": [{"response": "cost"}, {"response": "cost"}]}, r"objectives: cost twice"),
+        ({"constraints": [{"response": "identified"}]}, r"constraints\.0: allowed: at_least, at_most"),
+        ({"candidates": 300}, r"budget\.trials: 1000 are fewer than the search's 1200"),
+    ],
+)
+def test_wrong_names_are_answered_with_the_allowed_ones(told: dict[str, Any], says: str) -> None:
+    study = changed(**told) | {"factors": STUDY["factors"] | {"z": LEVELS}, "budget": {"trials": 1000}}
+    with pytest.raises(InputError, match=says):
+        search.check(plan.Study.model_validate(study))
+
+
+def test_a_distribution_is_not_chosen() -> None:
+    drawn = {"key": "trial.noise_px", "distribution": "normal", "mean": 0.5, "sigma": 0.1}
+    with pytest.raises(InputError, match=r"factors\.x: nobody chooses"):
+        search.check(plan.Study.model_validate(STUDY | {"factors": {"x": drawn}}))
+
+
+def test_without_optuna_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "optuna", None)
+    with pytest.raises(InputError, match=r"^[^\n]*pip install 'skysim\[optuna\]'$"):
+        search.begun(plan.Study.model_validate(STUDY))
+
+
+@pytest.mark.parametrize(
+    "factor",
+    [
+        {"values": ["1 m", "2 m"]},
+        {"from": "1 m", "to": "2 m"},
+        {"distribution": "triangular", "low": "1 m", "mode": "1.5 m", "high": "2 m"},
+    ],
+)
+def test_a_factor_sets_several_keys_alike(factor: dict[str, Any]) -> None:
+    """Apex and radius of a dome about the bearing."""
+    keys = ["light.surface.apex", "light.surface.radius"]
+    study = plan.Study.model_validate(STUDY | {"factors": {"size": factor | {"keys": keys}}})
+    value, settings = study.factors["size"].at(0.75)
+    assert settings == dict.fromkeys(keys, value)
+    assert 1 < search.si(value) <= 2
+    for wrong in ({}, {"key": "a", "keys": ["b"]}):
+        with pytest.raises(ValueError, match="takes either key or keys"):
+            plan.Study.model_validate(STUDY | {"factors": {"size": factor | wrong}})
+
+
+def test_the_shipped_study_is_what_it_says(tmp_path: Path) -> None:
+    made = loader.load("dome_for_the_money")
+    search.check(made.study)
+    first = {name: factor.at(0.5) for name, factor in made.study.factors.items()}
+    settings: Settings = {}
+    for _, sets in first.values():
+        settings |= sets
+    scene, _ = plan.resolved(made.recipe, settings)
+    surface: Any = scene.light.surface  # type: ignore[union-attr]
+    assert surface.apex_m == surface.radius_m == search.si(first["radius"][0])
+    assert scene.vehicle.camera_m == (0.0, 0.0, search.si(first["lever"][0]))

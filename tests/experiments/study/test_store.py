@@ -1,0 +1,289 @@
+"""The store of a study and how work is dealt out: whatever stops a run, what it leaves is whole and goes on."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import sqlite3
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from study_stores import contents, done
+
+from skysim.core.errors import InputError
+from skysim.experiments.study import loader, plan, setups, store, trials
+from skysim.experiments.study.designs import Point
+from skysim.experiments.study.execution import runner
+from skysim.experiments.study.setups import Bench
+from skysim.experiments.study.trials import Outcome, Row
+
+STUDY = """
+schema: 1
+title: strays
+scene: shefex2
+seed: 1
+set: {light.limit_mag: 5.0}
+trial: {kind: centroids, lights: 15}
+factors: {strays: {key: trial.false_lights, values: [0, 5, 9]}}
+replicates: 40
+responses: [identified]
+"""
+
+
+@pytest.fixture(scope="module")
+def told(tmp_path_factory: pytest.TempPathFactory) -> plan.Plan:
+    path = tmp_path_factory.mktemp("study") / "strays.yaml"
+    path.write_text(STUDY)
+    return loader.load(path)
+
+
+@pytest.fixture(scope="module")
+def whole(told: plan.Plan) -> str:
+    """What a run that nobody disturbed leaves."""
+    path = told.path.with_name("whole.sqlite")
+    assert done(told, path).failed == 0
+    return contents(path)
+
+
+def other(told: plan.Plan, **overrides: str) -> plan.Plan:
+    return loader.load(told.path, overrides)
+
+
+def child(does: Callable[[], object]) -> int:
+    """A process of its own that does something; its exit status tells whether it raised, 2 of KeyboardInterrupt."""
+    pid = os.fork()
+    if pid:
+        return pid
+    try:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        does()
+        os._exit(0)
+    except KeyboardInterrupt:
+        os._exit(2)
+    finally:
+        os._exit(1)
+
+
+def until(path: Path, count: int) -> None:
+    """Wait until a store holds so many trials."""
+    end = time.monotonic() + 20
+    while time.monotonic() < end:
+        if path.is_file():
+            db = sqlite3.connect(path, timeout=20)
+            try:
+                if db.execute("SELECT COUNT(*) FROM trials").fetchone()[0] >= count:
+                    return
+            except sqlite3.OperationalError:
+                pass  # no tables yet
+            finally:
+                db.close()
+        time.sleep(0.002)
+    raise AssertionError(f"{path}: no {count} trials within 20 s")
+
+
+# One writer, however it ends.
+
+
+def test_a_writer_killed_at_any_instant_leaves_whole_batches(
+    told: plan.Plan, whole: str, tmp_path: Path
+) -> None:
+    """And a run that goes on after each of its deaths ends with the store of a run that nobody disturbed."""
+    often, draw, left = tmp_path / "often.sqlite", random.Random(1), [0]
+    for _ in range(6):
+        pid = child(partial(done, told, often, resume=left[-1] > 0))
+        until(often, min(left[-1] + 1, told.trials))
+        time.sleep(0.05 * draw.random())
+        os.kill(pid, signal.SIGKILL)
+        assert os.waitpid(pid, 0)[1] in (signal.SIGKILL, 0)
+        with store.writing(often) as kept:
+            assert kept.check()
+            left.append(kept.counts()["done"])
+            assert kept.db.execute("SELECT COUNT(*) FROM timings").fetchone()[0] == left[-1]
+    assert 0 < left[1] < told.trials
+    done(told, often, resume=True)
+    assert contents(often) == whole
+
+
+def test_one_run_at_a_time(told: plan.Plan, tmp_path: Path) -> None:
+    path = tmp_path / "one.sqlite"
+    pid = child(lambda: done(told, path, watch=lambda progress: time.sleep(0.05)))
+    try:
+        until(path, 1)
+        with pytest.raises(InputError, match="another run is writing it; allowed: one at a time") as refused:
+            done(told, path, resume=True)
+        assert "\n" not in str(refused.value)
+        with store.open_store(path) as kept:  # who only reads is welcome
+            assert 0 < kept.counts()["done"] < told.trials
+    finally:
+        os.kill(pid, signal.SIGKILL)
+        os.waitpid(pid, 0)
+    assert done(told, path, resume=True).done == told.trials
+
+
+def test_interrupted_by_the_keyboard_it_resumes(told: plan.Plan, whole: str, tmp_path: Path) -> None:
+    path = tmp_path / "interrupted.sqlite"
+    pid = child(lambda: done(told, path, watch=lambda progress: time.sleep(0.02)))
+    until(path, 5)
+    os.kill(pid, signal.SIGINT)
+    assert os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == 2
+    with store.open_store(path) as kept:
+        (run,) = kept.runs()  # that it ended by itself
+        assert 5 <= run["trials"] == kept.counts()["done"] < told.trials
+    done(told, path, resume=True)
+    assert contents(path) == whole
+
+
+# What may be resumed.
+
+
+def test_another_study_or_other_code_is_refused(
+    told: plan.Plan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "kept.sqlite"
+    done(told, path)
+    with pytest.raises(InputError, match="120 trials are in; allowed: skysim study resume"):
+        done(told, path)
+    for key, value in {"seed": "2", "replicates": "41", "set": "{light.limit_mag: 5.5}"}.items():
+        with pytest.raises(InputError, match="another study"):
+            done(other(told, **{key: value}), path, resume=True)
+    for key, value in {"title": "another", "responses": "[wrong]", "budget": "{time: 1 h}"}.items():
+        assert done(other(told, **{key: value}), path, resume=True).now == 0
+    monkeypatch.setattr(runner, "code_version", lambda: "0123456789abcdef")
+    with pytest.raises(InputError, match=r"trials were made by skysim .*, this is 0123456789abcdef"):
+        done(told, path, resume=True)
+    with pytest.raises(InputError, match="nothing to resume"):
+        done(told, tmp_path / "new.sqlite", resume=True)
+
+
+def test_what_is_no_store_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "text.sqlite"
+    path.write_text("ten thousand identifications\n" * 100)
+    for opened in (store.open_store, store.writing):
+        with pytest.raises(InputError, match=r"text\.sqlite: .*not a database"), opened(path):
+            pass
+    with pytest.raises(InputError, match="no store"), store.open_store(tmp_path / "none.sqlite"):
+        pass
+    with pytest.raises(InputError, match="unable to open"), store.writing(taken(tmp_path)):
+        pass
+
+
+def taken(folder: Path) -> Path:
+    """A store's path whose lock cannot be made."""
+    (folder / "taken.lock").mkdir()
+    return folder / "taken.sqlite"
+
+
+# Budgets.
+
+
+def test_out_of_time_it_stops_and_resumes(told: plan.Plan, whole: str, tmp_path: Path) -> None:
+    path = tmp_path / "short.sqlite"
+    short = other(told, budget="{time: 1 us}")
+    assert 0 < done(short, path).now < told.trials
+    longer = other(told, budget="{time: 30 ms}")
+    while (progress := done(longer, path, resume=True)).done < told.trials:
+        assert progress.now > 0
+    assert contents(path) == whole
+
+
+def test_trials_that_raise_are_rows_until_they_are_too_many(
+    told: plan.Plan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fragile(ready: Bench, seed: int) -> Outcome:
+        if seed % 4 == 0:
+            raise ZeroDivisionError(f"of {seed}")
+        return Outcome("solved", 1, 1)
+
+    monkeypatch.setitem(trials.TRIALS, "centroids", fragile)
+    monkeypatch.setattr(runner, "CHUNK_S", 0.0)  # one trial a chunk
+    path = tmp_path / "fragile.sqlite"
+    told = other(told, paired="false")
+    seeds = [setups.seed_of(told.recipe, *divmod(trial, 40)) for trial in range(told.trials)]
+    bad = [trial for trial, seed in enumerate(seeds) if seed % 4 == 0]
+    stopped = done(other(told, paired="false", budget="{failures: 3}"), path)
+    assert (stopped.failed, stopped.done) == (3, bad[2] + 1)
+    assert done(told, path, resume=True).failed == len(bad)
+    with store.open_store(path) as kept:
+        assert kept.counts() == {"done": told.trials, "failed": len(bad), "wrong": 0}
+        assert kept.failures() == [(trial, f"ZeroDivisionError: of {seeds[trial]}") for trial in bad]
+        row = kept.trial(bad[0])
+        assert (row["seed"], row["status"], row["frames"]) == (seeds[bad[0]], "failed", 0)
+        assert row["error"].startswith("Traceback")
+        assert "in fragile" in row["error"]
+
+
+# Columns.
+
+
+def test_rows_come_back_as_they_went_in(tmp_path: Path) -> None:
+    rows = [
+        Row(1, 0, 1, 2**63 - 1, "scene", "code", Outcome("solved", 1, 1, 0, 1.5, -0.1), None, 2e-3),
+        Row(0, 0, 0, 0, "", "code", Outcome("failed"), "Traceback\nboom", 1e-3),
+    ]
+    with store.writing(tmp_path / "rows.sqlite") as kept:
+        kept.add(rows)
+        columns = kept.columns()
+        assert list(columns["trial"]) == [0, 1]
+        assert columns["seed"].dtype == np.int64
+        assert columns["seed"][1] == 2**63 - 1
+        assert np.isnan(columns["x_arcsec"][0])
+        assert columns["y_arcsec"][1] == -0.1
+        assert list(columns["status"]) == ["failed", "solved"]
+        assert list(columns["time_ms"]) == [1.0, 2.0]
+        assert list(kept.done(3)) == [True, True, False]
+
+
+def test_rows_are_kept_all_or_none(tmp_path: Path) -> None:
+    good = Row(0, 0, 0, 7, "scene", "code", Outcome("solved", 1, 1), None, 1e-3)
+    with store.writing(tmp_path / "rows.sqlite") as kept:
+        with pytest.raises(sqlite3.IntegrityError):
+            kept.add([good, good._replace(trial=1, scene=None)])  # type: ignore[arg-type]
+        assert kept.counts()["done"] == 0
+
+
+# How work is dealt out.
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.data())
+def test_chunks_hold_every_missing_trial_once_and_in_order(data: st.DataObject) -> None:
+    first, count = data.draw(st.integers(0, 5)), data.draw(st.integers(1, 6))
+    replicates = data.draw(st.integers(1, 50))
+    points = [Point({"n": n}, {"trial.lights": n}) for n in range(first, first + count)]
+    span = range(first * replicates, (first + count) * replicates)
+    missing = sorted(data.draw(st.sets(st.sampled_from(span))))
+    todo, came, size = runner.Todo(points, replicates, np.array(missing, np.int64), first), [], 1
+    while chunk := todo.next():
+        for point, told, number, which in chunk:
+            assert told == {"trial.lights": point}
+            assert 0 <= which.start < which.stop <= replicates
+            assert number == point * replicates + which.start
+            came += [point * replicates + replicate for replicate in which]
+        trials_in = sum(len(segment.replicates) for segment in chunk)
+        # No more than was allowed for, but to the end of a point where points are smaller than chunks.
+        assert trials_in <= size or size >= replicates > trials_in - size
+        todo.took(chunk, data.draw(st.sampled_from([1e-6, 1e-3, 0.1, 10.0])))
+        assert 1 <= todo.size <= max(2 * size, 2 * trials_in, 1)
+        size = todo.size
+    assert came == missing
+    assert not todo.next()
+
+
+def test_chunks_are_sized_by_time() -> None:
+    """Trials of 10 ms: chunks double until they take CHUNK_S, and shrink as trials take longer."""
+    point = [Point({}, {})]
+    todo, sizes = runner.Todo(point, 10_000, np.arange(10_000)), []
+    for trial_s in [0.01] * 8 + [0.1] * 2:
+        chunk = todo.next()
+        sizes.append(sum(len(segment.replicates) for segment in chunk))
+        todo.took(chunk, sizes[-1] * trial_s)
+    wanted = int(runner.CHUNK_S / 0.01)
+    assert sizes[:8] == [min(2**n, wanted) for n in range(8)]
+    assert sizes[9] == int(runner.CHUNK_S / 0.1)

@@ -1,0 +1,83 @@
+"""Our attitude messages, read and checked against the standard by ccsds-ndm-py (extra `oracle`)."""
+
+from __future__ import annotations
+
+import datetime
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from skysim.core import files
+from skysim.core.errors import InputError
+from skysim.core.paths import ROOT
+from skysim.results.files import ccsds_aem
+
+ndm = pytest.importorskip("ccsds_ndm", reason="the package ccsds-ndm-py is not installed")
+
+START = datetime.datetime(2016, 12, 31, 23, 59, 58, 250_000)
+
+
+def utc(count: int) -> list[datetime.datetime]:
+    return [START + n * datetime.timedelta(seconds=0.1) for n in range(count)]
+
+
+@pytest.mark.parametrize("frames", [(ccsds_aem.ICRF, ccsds_aem.CAMERA), (ccsds_aem.LAB, ccsds_aem.BODY)])
+@pytest.mark.parametrize("count", [1, 2, 200])
+def test_it_is_valid_and_says_what_was_meant(tmp_path: Path, frames: tuple[str, str], count: int) -> None:
+    """Version, frames, span and every digit of every quaternion; and it survives being written by them as XML."""
+    meant = Rotation.random(count, rng=np.random.default_rng(count))
+    path = tmp_path / "truth.aem"
+    files.write_text(path, ccsds_aem.message("afit_simsat", ["LED dome, 3″ off"], frames, utc(count), meant))
+    read = ndm.Aem.from_file(str(path), format="kvn")
+    assert read.validate(strict=False) is None
+    assert (read.version, read.header.originator) == ("2.0", "SKYSIM")
+    for message in (read, ndm.Aem.from_str(read.to_str("xml"))):
+        (segment,) = message.segments
+        told = segment.metadata
+        assert (told.ref_frame_a, told.ref_frame_b) == frames
+        assert (told.time_system, told.attitude_type, told.object_name) == (
+            "UTC",
+            "QUATERNION",
+            "AFIT_SIMSAT",
+        )
+        epochs = [datetime.datetime.fromisoformat(text) for text in segment.data.attitude_states_epochs]
+        assert epochs == utc(count)
+        assert (told.start_time, told.stop_time) == (ccsds_aem.epoch(epochs[0]), ccsds_aem.epoch(epochs[-1]))
+        off = (Rotation.from_quat(segment.data.attitude_states_numpy) * meant.inv()).magnitude()
+        assert off.max() < 1e-14
+
+
+def test_their_reader_refuses_what_ours_never_writes() -> None:
+    """So that the tests above can fail."""
+    good = ccsds_aem.message("x", [], (ccsds_aem.LAB, ccsds_aem.BODY), utc(2), Rotation.identity(2))
+    for old, new in (
+        ("REF_FRAME_A = LAB\n", ""),
+        ("= QUATERNION", "= QUATRNION"),
+        ("VERS = 2.0", "VERS = 7.0"),
+    ):
+        assert old in good
+        with pytest.raises(ValueError, match=r"REF_FRAME_A|QUATRNION|7\.0"):
+            ndm.Aem.from_str(good.replace(old, new), "kvn")
+    with pytest.raises(InputError):
+        ccsds_aem.message("x", [], (ccsds_aem.LAB, ccsds_aem.BODY), utc(2)[::-1], Rotation.identity(2))
+
+
+def test_the_page_s_code_reads_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    page = (ROOT / "docs/formats.md").read_text(encoding="utf-8")
+    (block,) = [
+        block for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "ccsds_ndm" in block
+    ]
+    (tmp_path / "out/shefex2").mkdir(parents=True)
+    meant = Rotation.from_euler("y", [[90]], degrees=True)  # the camera's boresight along the ICRF's x
+    text = ccsds_aem.message("shefex2", [], (ccsds_aem.ICRF, ccsds_aem.CAMERA), utc(1), meant)
+    files.write_text(tmp_path / "out/shefex2/truth.aem", text)
+    monkeypatch.chdir(tmp_path)
+    exec(compile(block, "docs/formats.md", "exec"), {})
+    frame, epoch, *sight = capsys.readouterr().out.replace("[", " ").replace("]", " ").split()
+    assert (frame, epoch) == ("ICRF", ccsds_aem.epoch(START))
+    np.testing.assert_allclose(np.array(sight, dtype=float), [1, 0, 0], rtol=0, atol=1e-8)

@@ -1,0 +1,80 @@
+"""tetra3rs as a tracker (extra `oracle`): told our camera, it finds our skies where they are."""
+
+from __future__ import annotations
+
+import json
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from estimator.core.camera import Camera
+from skysim.core.errors import InputError
+from skysim.core.paths import ROOT
+from skysim.results import scoring
+from skysim.scene import loader
+from skysim.simulation import run, testbed
+from skysim.tracking.external import interface
+from skysim.tracking.external import tetra3rs as tetra3rs_tracker
+from skysim.tracking.external.interface import Setup
+
+tetra3rs = pytest.importorskip("tetra3rs")
+
+
+def test_its_camera_is_ours() -> None:
+    """Distorted, off-centre: both turn pixels to the same tangents, by two pieces of code."""
+    f, centre, bent = 2500.0, (331.0, 244.0), (-0.1, 0.05, 1e-3, -2e-3, 0.01)
+    setup = Setup("icrs", "2012-06-22T21:00:00", 659, 493, f, centre, bent, 1.0, 4095.0, 1)
+    theirs, middle = tetra3rs_tracker.camera(tetra3rs, setup), tetra3rs_tracker.middle_px(setup)
+    xy_px = np.array([[20.0, 30.0], [600.0, 400.0], [330.0, 10.0]])
+    told = [theirs.pixel_to_tanplane(*(xy - middle)) for xy in xy_px]
+    ours = Camera(659, 493, f, centre, bent).tangents(xy_px)
+    np.testing.assert_allclose(told, ours, rtol=0, atol=1e-8)
+
+
+@pytest.mark.parametrize("options", ["{}", "{fast: true}"])
+def test_it_solves_our_frames_without_a_bias(options: str) -> None:
+    """Twelve fields; proper motion and aberration (20 arcsec) are both its own, so what is left is noise."""
+    keys = {"tracker.name": "tetra3rs", "tracker.options": options, "exposure.frames": "12"}
+    told = loader.load("scoreboard", keys | {"motion.rate_deg_s": "[0.6, 0.8, 0]"})
+    lab = run.prepare(told)
+    shots = list(run.run(lab, testbed.tracker(lab)))
+    rows = [scoring.row(shot, told, lab.mount) for shot in shots]
+    assert sum(row.status == "solved" for row in rows) >= 11
+    assert not any(row.wrong for row in rows)
+    turns = [
+        (s.report.attitude.cam_from_ref * s.truth.cam_from_lab.inv()).as_rotvec()
+        for s in shots
+        if s.report.attitude.solved
+    ]
+    assert np.degrees(np.median(np.hypot(*np.array(turns).T[:2]))) * 3600 < 10
+
+
+@pytest.mark.parametrize("name", ["afit_simsat", "bench_collimated"])
+def test_it_refuses_what_is_no_sky(name: str) -> None:
+    with pytest.raises(InputError, match=re.escape("tetra3rs knows the stars alone")):
+        testbed.tracker(testbed.build_testbed(loader.load(name, {"tracker.name": "tetra3rs"})))
+
+
+PAGE = (ROOT / "docs/trackers.md").read_text(encoding="utf-8")
+COMMANDS = re.findall(r"^skysim (.*--tracker tetra3rs.*)$", PAGE, re.MULTILINE)
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_the_page_s_commands_do_what_it_says(command: str, tmp_path: Path) -> None:
+    """Every frame has its line or its share, and none is wrong."""
+    words = [sys.executable, "-m", "skysim", *shlex.split(command), "--json", "--out", str(tmp_path)]
+    done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    told = json.loads(done.stdout)
+    lines = told.get("scoreboard", [told | {"right": told.get("solved", 0) / told.get("frames", 1)}])
+    assert [line["wrong"] for line in lines] == [0] * len(lines)
+    assert min(line["right"] for line in lines) > 0.9
+
+
+def test_it_is_an_entry_point_of_skysim() -> None:
+    assert interface.entry_points()["tetra3rs"].load() is tetra3rs_tracker.Tetra3rs

@@ -1,0 +1,73 @@
+"""Errors split by hand, and the chi-square that a true covariance gives."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from skysim.results import metrics
+
+ARCMIN_RAD = np.radians(1 / 60)
+TRUTH = Rotation.from_rotvec([0.4, -1.1, 2.0])
+
+
+def turned(x: float, y: float, z: float) -> Rotation:
+    """The truth, then a turn in camera axes."""
+    return Rotation.from_rotvec([x, y, z]) * TRUTH
+
+
+def test_no_error_is_none() -> None:
+    assert metrics.cross_and_roll_rad(TRUTH, TRUTH) == pytest.approx((0, 0), abs=1e-15)
+
+
+def test_cross_and_roll_are_the_turn_s_parts() -> None:
+    assert metrics.cross_and_roll_rad(turned(3e-4, -4e-4, 0), TRUTH) == pytest.approx((5e-4, 0), abs=1e-15)
+    assert metrics.cross_and_roll_rad(turned(0, 0, 7e-4), TRUTH) == pytest.approx((0, 7e-4), abs=1e-15)
+    assert metrics.cross_and_roll_rad(turned(0, 0, -7e-4), TRUTH) == pytest.approx((0, -7e-4), abs=1e-15)
+
+
+small = st.floats(-1e-4, 1e-4)
+
+
+@settings(max_examples=100, derandomize=True)
+@given(small, small, small)
+def test_cross_is_how_far_the_boresight_is_off(x: float, y: float, z: float) -> None:
+    """The angle between the two boresights on the sky, for small errors to their third power."""
+    estimate = turned(x, y, z)
+    sights = [rotation.inv().apply([0, 0, 1.0]) for rotation in (estimate, TRUTH)]
+    apart = np.linalg.norm(np.cross(*sights))
+    assert metrics.cross_and_roll_rad(estimate, TRUTH)[0] == pytest.approx(apart, abs=2e-12)
+
+
+@settings(max_examples=50, derandomize=True)
+@given(st.tuples(small, small, small))
+def test_error_does_not_depend_on_the_reference_frame(turn: tuple[float, float, float]) -> None:
+    other = Rotation.from_rotvec([1.0, 0.2, -0.7])
+    here = metrics.cross_and_roll_rad(turned(*turn), TRUTH)
+    there = metrics.cross_and_roll_rad(turned(*turn) * other, TRUTH * other)
+    assert here == pytest.approx(there, abs=1e-15)
+
+
+@pytest.mark.parametrize("axis", [(1, 0, 0), (0, 0.6, 0.8), (0, 0, -1)])
+def test_wrong_begins_at_ten_arc_minutes_about_any_axis(axis: tuple[float, ...]) -> None:
+    assert not metrics.is_wrong(turned(*(9.99 * ARCMIN_RAD * np.array(axis))), TRUTH)
+    assert metrics.is_wrong(turned(*(10.01 * ARCMIN_RAD * np.array(axis))), TRUTH)
+
+
+def test_normalised_error_by_hand() -> None:
+    covariance = np.diag([1e-8, 4e-8, 9e-8])
+    nees = metrics.normalised_error_squared(turned(1e-4, 2e-4, 3e-4), TRUTH, covariance)
+    assert nees == pytest.approx(1 + 1 + 1, rel=1e-10)
+
+
+def test_normalised_error_is_chi_square_of_three_for_a_true_covariance() -> None:
+    rng = np.random.default_rng(6)
+    root = 1e-5 * np.array([[1, 0, 0], [0.3, 2, 0], [-0.5, 0.4, 8]])
+    draws = rng.standard_normal((3000, 3)) @ root.T
+    nees = [metrics.normalised_error_squared(turned(*e), TRUTH, root @ root.T) for e in draws]
+    # Mean 3 and variance 6 of chi-square, to four sigmas of 3,000 draws.
+    assert np.mean(nees) == pytest.approx(3, abs=4 * np.sqrt(6 / 3000))
+    assert np.var(nees) == pytest.approx(6, abs=4 * np.sqrt(252 / 3000))

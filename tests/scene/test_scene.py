@@ -1,0 +1,930 @@
+"""Units are what they say, and every kind of bad input is one line that helps."""
+
+from __future__ import annotations
+
+import datetime
+import math
+import re
+from collections.abc import Iterable
+from pathlib import Path
+from typing import get_args
+
+import pytest
+from pydantic import BeforeValidator, ValidationError
+
+from skysim.camera.background import BACKGROUNDS
+from skysim.camera.optics import VIGNETTING
+from skysim.camera.psf.otf import PSFS
+from skysim.core.errors import InputError
+from skysim.core.paths import SCENES
+from skysim.core.units import SI_SUFFIX, ConfigModel
+from skysim.dynamics.actuators import STEERING
+from skysim.dynamics.guidance import LEGS
+from skysim.dynamics.jitter import SPECTRA
+from skysim.scene import camera, leds, light, loader, motion, scene, vehicle
+from skysim.scene.leds import Layout, Lobe
+from skysim.scene.tracker import FilterConfig
+from skysim.sources.dome.layout import LAYOUTS
+from skysim.sources.dome.led import DRIVES, LOBES
+from skysim.sources.dome.surface import SURFACES
+
+AFIT, SHEFEX = SCENES / "afit_simsat.yaml", SCENES / "shefex2.yaml"
+
+
+def line_number(text: str, fragment: str) -> int:
+    (line,) = [n for n, line in enumerate(text.splitlines(), 1) if fragment in line]
+    return line
+
+
+def complaint(path: Path, overrides: dict[str, str] | None = None) -> str:
+    """The one line that a bad scene gets."""
+    with pytest.raises(InputError) as refusal:
+        loader.load(path, overrides)
+    message = str(refusal.value)
+    assert "\n" not in message
+    assert len(message) < 400
+    return message
+
+
+def spoilt(tmp_path: Path, whole: Path, right: str, wrong: str) -> tuple[str, str]:
+    """The complaint about a scene with one slip in it, and `(file, line N)` of the slip."""
+    text = whole.read_text()
+    assert text.count(right) == 1
+    path = tmp_path / "bad.yaml"
+    path.write_text(text.replace(right, wrong))
+    return complaint(path), f"({path}, line {line_number(text, right.splitlines()[0].strip())})"
+
+
+# Units
+
+
+@pytest.mark.parametrize(
+    ("key", "quantity", "value"),
+    [
+        ("light.surface.apex", "48 in", 1.2192),
+        ("light.surface.apex", "4 ft", 1.2192),
+        ("light.surface.apex", "1219.2 mm", 1.2192),
+        ("light.surface.apex", "1.2192 m", 1.2192),
+        ("camera.pixel", "4.0 um", 4e-6),
+        ("camera.focal_length", "35 mm", 0.035),
+        ("camera.focus", "33 in", 0.8382),
+        ("camera.focus", "infinity", math.inf),
+        ("exposure.time", "10 ms", 0.010),
+        ("exposure.time", "1000 us", 0.001),
+        ("exposure.first", "1 min", 60.0),
+        ("vehicle.mass", "176.37 lb", 80.0),
+        ("vehicle.torque_limit", "1 N m", 1.0),
+        ("light.led.intensity", "16 mcd", 0.016),
+        ("vehicle.wheels.torque_limit", "500 mN m", 0.5),
+        ("vehicle.wheels.coulomb", "2 mN m", 2e-3),
+        ("vehicle.wheels.viscous", "1e-4 N m s", 1e-4),
+        ("vehicle.wheels.static_imbalance", "1 g cm", 1e-5),
+        ("vehicle.wheels.dynamic_imbalance", "10 g cm2", 1e-6),
+        ("vehicle.fans.thrust_limit", "0.1 lbf", 0.444822),
+        ("vehicle.fans.time_constant", "200 ms", 0.2),
+        ("vehicle.cmgs.gimbal_time_constant", "20 ms", 0.02),
+        ("vehicle.cmgs.rotor_torque_limit", "0.1 N m", 0.1),
+        ("vehicle.drag.viscous", "2 mN m s", 2e-3),
+        ("vehicle.drag.quadratic", "3 mN m s2", 3e-3),
+        ("vehicle.disturbances.cable.stiffness", "1e-3 N m / rad", 1e-3),
+        ("vehicle.disturbances.cable.stiffness", "1 N m / deg", 180 / math.pi),
+        ("vehicle.imu.gyro.bias_time", "5 min", 300.0),
+        ("vehicle.imu.accelerometer.bias_time", "1 h", 3600.0),
+    ],
+)
+def test_a_quantity_becomes_si(key: str, quantity: str, value: float) -> None:
+    node: object = loader.load("afit_simsat", {key: quantity})
+    for part in key.split("."):
+        (name,) = [n for n in type(node).model_fields if SI_SUFFIX.sub("", n) == part]
+        node = getattr(node, name)
+    assert node == pytest.approx(value, rel=1e-5)  # a pound is 0.45359 kg
+
+
+@pytest.mark.parametrize(
+    ("part", "given", "name", "value"),
+    [
+        (vehicle.DraughtConfig, {"rms": ["1 mN m", "2 uN m", "0 N m"]}, "rms_nm", (1e-3, 2e-6, 0.0)),
+        (
+            vehicle.DraughtConfig,
+            {"rms": ["0 N m"] * 3, "correlation": "1500 ms"},
+            "correlation_s",
+            1.5,
+        ),
+        (
+            vehicle.DisturbancesConfig,
+            {"turbine": ["1 mN m", "-1 mN m", "0 N m"]},
+            "turbine_nm",
+            (1e-3, -1e-3, 0.0),
+        ),
+        (motion.DesaturationConfig, {"start": "2 N m s", "stop": "800 mN m s"}, "stop_nms", 0.8),
+        (motion.DesaturationConfig, {"start": "2 kg m2 / s", "stop": "1 N m s"}, "start_nms", 2.0),
+        (motion.DesaturationConfig, {"start": "2 N m s", "stop": "1 N m s", "time": "1 min"}, "time_s", 60.0),
+        (
+            motion.BumpConfig,
+            {"kind": "bump", "rate_deg_s": [1, 2, 3], "duration": "40 ms", "caught_after": "200 ms"},
+            "caught_after_s",
+            0.2,
+        ),
+        (FilterConfig, {"latency": "200 ms"}, "latency_s", 0.2),
+        (FilterConfig, {"bias_time": "5 min"}, "bias_time_s", 300.0),
+    ],
+)
+def test_a_section_s_quantities_become_si(
+    part: type[ConfigModel], given: dict[str, object], name: str, value: object
+) -> None:
+    assert getattr(part.model_validate(given), name) == pytest.approx(value, rel=1e-12)
+
+
+def parts_of(annotation: object) -> set[type[ConfigModel]]:
+    """Every section that an annotation names, and theirs."""
+    if isinstance(annotation, type) and issubclass(annotation, ConfigModel):
+        fields = annotation.model_fields.values()
+        return {annotation}.union(*(parts_of(field.annotation) for field in fields))
+    return set().union(*(parts_of(one) for one in get_args(annotation)))
+
+
+def is_quantity(annotation: object, metadata: Iterable[object]) -> bool:
+    """Whether it, or each of it, is filled by a value such as "48 in"."""
+    parsers = [one.func for one in metadata if isinstance(one, BeforeValidator)]
+    own = any(
+        parser is camera.focus_distance or parser.__qualname__.startswith("quantity") for parser in parsers
+    )
+    return own or any(is_quantity(one, getattr(one, "__metadata__", ())) for one in get_args(annotation))
+
+
+SUFFIXES = ("_w_sr", "_nm_rad", "_kg_m2", "_kg_m", "_nms2", "_nms", "_nm", "_kg", "_cd", "_n", "_m", "_s")
+FIELDS = [(part, name) for part in sorted(parts_of(scene.Scene), key=str) for name in part.model_fields]
+
+
+@pytest.mark.parametrize(("part", "name"), FIELDS, ids=[f"{part.__name__}.{name}" for part, name in FIELDS])
+def test_a_key_has_a_unit_in_its_name_unless_its_value_has_one(part: type[ConfigModel], name: str) -> None:
+    """A quantity's key is its Python name less the SI suffix; every other key is the name itself."""
+    field = part.model_fields[name]
+    suffix = next((one for one in SUFFIXES if name.endswith(one)), "")
+    bare = name.removesuffix(suffix if is_quantity(field.annotation, field.metadata) else "")
+    own = {"schema_version": "schema", "name": scene.STEM} if part is scene.Scene else {}
+    assert field.alias == own.get(name, bare)
+
+
+def test_afit_says_what_the_thesis_says() -> None:
+    loaded = loader.load("afit_simsat")
+    # Reference §1.1: apex 48 in, semi-axes 38.88 and 28.60 in, pitch 8 mm, tilt +-30 deg, 35 mm, 1600 x 1200.
+    assert loaded.light.surface.apex_m == pytest.approx(48 * 0.0254, abs=1e-12)
+    assert loaded.light.surface.semi_axes_m == pytest.approx((0.987552, 0.987552, 0.72644), abs=1e-12)
+    assert loaded.light.layout.pitch_m == pytest.approx(0.008, abs=1e-15)
+    assert loaded.vehicle.tilt_stop_deg == 30
+    assert (loaded.camera.width_px, loaded.camera.height_px) == (1600, 1200)
+    # Focused at 33 in: the chip is 36.53 mm from the lens (§1.2).
+    assert loaded.camera.focal_px == pytest.approx(1 / (1 / 0.035 - 1 / 0.8382) / 4e-6, rel=1e-12)
+    assert loaded.camera.image_distance_m == pytest.approx(36.53e-3, abs=5e-6)
+    assert (loaded.name, loaded.seed) == ("afit_simsat", 1)
+    assert loaded.start_time == datetime.datetime(2012, 3, 1, 12)
+
+
+def test_a_scene_is_frozen() -> None:
+    with pytest.raises(ValidationError, match="frozen"):
+        loader.load("shefex2").seed = 3
+
+
+def test_a_scene_is_found_by_name_and_by_path() -> None:
+    assert loader.load("shefex2") == loader.load(SHEFEX) == loader.load(str(SHEFEX))
+
+
+def test_the_camera_of_a_scene_can_be_read_alone(tmp_path: Path) -> None:
+    text = SHEFEX.read_text()
+    alone = tmp_path / "camera.yaml"
+    alone.write_text(text[text.index("camera:") : text.index("exposure:")])
+    assert loader.load_camera(alone) == loader.load_camera(SHEFEX) == loader.load("shefex2").camera
+
+
+# Overrides
+
+
+def test_an_override_takes_the_place_of_the_file_s_value() -> None:
+    changed = loader.load("afit_simsat", {"camera.detector.bits": "8", "motion.start": "{yaw_deg: 40}"})
+    assert changed.camera.detector.bits == 8
+    assert changed.motion.start == motion.AttitudeConfig(yaw_deg=40)
+
+
+def test_an_override_may_add_a_section() -> None:
+    text = {"tracker.believed_camera_body": "['1 in', '0 m', '15 in']"}
+    assert loader.load("afit_simsat", text).tracker.believed_camera_body_m == pytest.approx(
+        (0.0254, 0, 0.381)
+    )
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "says"),
+    [
+        (
+            "camera.focal_lenght",
+            "25 mm",
+            "camera.focal_lenght: unknown key; did you mean focal_length?; allowed: ",
+        ),
+        (
+            "exposure.time",
+            "-1 ms",
+            "exposure.time: '-1 ms' is not allowed; it should be greater than or equal to 0.000001 (--set)",
+        ),
+        (
+            "exposure.frames",
+            "0",
+            "exposure.frames: 0 is not allowed; it should be greater than or equal to 1",
+        ),
+        ("seed.x", "3", "--set seed.x: seed holds a value, not keys"),
+        ("seed", "[", "--set seed: '[' is not YAML"),
+        ("camera..bits", "3", "--set camera..bits=3: allowed: path.to.key=value"),
+        ("camera", "", "camera: None is not allowed; it should be a mapping of keys to values (--set)"),
+        ("exposure.time", "a\nb", "is not a time; allowed: a time such as"),
+    ],
+)
+def test_a_bad_override_is_one_line_and_blamed_on_the_option(key: str, value: str, says: str) -> None:
+    message = complaint(SHEFEX, {key: value})
+    assert says in message
+    assert "--set" in message
+    assert str(SHEFEX) not in message
+
+
+# Slips in a file
+
+
+@pytest.mark.parametrize(
+    ("right", "wrong", "says"),
+    [
+        ("falloff: inverse_square", "falloff: cubic", "light.led.falloff: 'cubic' is none of inverse_square"),
+        ("  kind: dome", "  kind: domes", "light.kind: 'domes' is none of dome, stars, bench"),
+        (
+            "kind: ellipsoid",
+            "kind: torus",
+            "light.surface.kind: 'torus' is not allowed; it should be 'sphere', ",
+        ),
+        (
+            "control: pid",
+            "control: lqr",
+            "motion.control: 'lqr' is not allowed; it should be 'pid' or 'pd'",
+        ),
+        (
+            'apex: "48 in"',
+            'apexx: "48 in"',
+            "light.surface.apexx: unknown key; did you mean apex?; allowed: kind, ",
+        ),
+        (
+            'apex: "48 in"',
+            'apex: "48 kg"',
+            "light.surface.apex: '48 kg' is not a length; allowed: a length such as",
+        ),
+        (
+            'apex: "48 in"',
+            'apex: "48"',
+            "light.surface.apex: '48' is not a length; allowed: a length such as",
+        ),
+        (
+            'apex: "48 in"',
+            "apex: 48",
+            'light.surface.apex: 48 has no unit; allowed: a length such as "35 mm"',
+        ),
+        (
+            'apex: "48 in"',
+            'apex: "-48 in"',
+            "light.surface.apex: '-48 in' is not allowed; it should be greater than",
+        ),
+        (
+            '"38.88 in", "28.60 in"]',
+            '"38.88 in", "0 in"]',
+            "light.surface.semi_axes.2: '0 in' is not allowed",
+        ),
+        (
+            'time: "10 ms"',
+            'time: "-10 ms"',
+            "exposure.time: '-10 ms' is not allowed; it should be greater than or equal to 0.000001",
+        ),
+        ('time: "10 ms"', 'time: "nan ms"', "exposure.time: nan is not a finite number"),
+        ('time: "10 ms"', 'time: "1e400 ms"', "exposure.time: inf is not a finite number"),
+        ("f_number: 8", "f_number: .nan", "camera.f_number: nan is not a finite number"),
+        (
+            "preset: lu205c",
+            "width_px: 1600.5\n  preset: lu205c",
+            "camera.width_px: 1600.5 is not allowed; it should be a valid integer",
+        ),
+        (
+            "preset: lu205c",
+            "detector: {bits: 17}\n  preset: lu205c",
+            "camera.detector.bits: 17 is not allowed; it should be less than or equal to 16",
+        ),
+        ("lit: [3, 6]", "lit: [3, 12]", "allowed: 1 <= least <= most <= 9"),
+        ("lit: [3, 6]", "lit: [3]", "light.layout.lit.1: missing"),
+        ("pwm_levels: [1.0, 0.7, 0.5, 0.35]", "pwm_levels: []", "light.layout.pwm_levels: [] is not allowed"),
+        ("hardware_seed: 2012", "hardware_seed: -1", "light.layout.hardware_seed: -1 is not allowed"),
+        ('"9.0 kg m2"', '"90 kg m2"', "is no rigid body's: each positive, none above the sum of the others"),
+        ("schema: 1", "schema: 2", "schema: 2 is of a newer skysim than "),
+        ("schema: 1", "schema: 0", "schema: 0 is older than this skysim reads; allowed: 1"),
+        ("schema: 1", "schema: yes", "schema: True is not known; allowed: 1"),
+        ("seed: 1\n", "seed: one\n", "seed: 'one' is not allowed; it should be a valid integer"),
+        (
+            "2012-03-01T12:00:00",
+            "yesterday",
+            "start_time: 'yesterday' is not allowed; it should be a valid datetime",
+        ),
+        ("title: AFIT", "name: x\ntitle: AFIT", "name: unknown key"),
+        (
+            'duration: "1 s"',
+            'durations: "1 s"',
+            "unknown key; did you mean duration?; allowed: kind, duration",
+        ),
+        (
+            '{kind: hold, duration: "1 s"}',
+            '{kind: wait, duration: "1 s"}',
+            "motion.manoeuvre.0.kind: 'wait' is none of hold, step, slew, rate, spin_up, sine, jitter, bump",
+        ),
+        (
+            "pitch_deg: 0",
+            "pich_deg: 0",
+            "motion.start.pich_deg: unknown key; did you mean pitch_deg?; allowed: roll_",
+        ),
+    ],
+)
+def test_a_slip_is_answered_with_its_key_what_is_allowed_and_its_line(
+    tmp_path: Path, right: str, wrong: str, says: str
+) -> None:
+    message, place = spoilt(tmp_path, AFIT, right, wrong)
+    assert says in message
+    assert message.endswith(place)
+
+
+@pytest.mark.parametrize(
+    ("right", "wrong", "says"),
+    [
+        (
+            "ra_deg: 83.0",
+            "ra_deg: 400",
+            "motion.start.ra_deg: 400 is not allowed; it should be less than 360",
+        ),
+        (
+            "dec_deg: 2.0",
+            "dec_deg: -91",
+            "motion.start.dec_deg: -91 is not allowed; it should be greater than",
+        ),
+        ("ra_deg: 83.0", "ra_deg: .nan", "motion.start.ra_deg: nan is not a finite number"),
+        (
+            "dec_deg: 2.0",
+            "decl_deg: 2.0",
+            "motion.start.decl_deg: unknown key; did you mean dec_deg?; allowed: ra_deg",
+        ),
+        ("dec_deg: 2.0, roll_deg: 20.0", "roll_deg: 20.0", "motion.start.dec_deg: missing"),
+        (
+            "ra_deg: 83.0, dec_deg: 2.0, ",
+            "",
+            "motion.start: light of kind stars takes ra_deg, dec_deg, roll_deg",
+        ),
+    ],
+)
+def test_a_slip_in_where_the_camera_points_is_not_taken_for_a_vehicle_s(
+    tmp_path: Path, right: str, wrong: str, says: str
+) -> None:
+    message, place = spoilt(tmp_path, SHEFEX, right, wrong)
+    assert says in message
+    assert message.endswith(place)
+
+
+def test_a_dome_cannot_start_at_a_place_in_the_sky(tmp_path: Path) -> None:
+    right = "start: {roll_deg: 0, pitch_deg: 0, yaw_deg: 0}"
+    message, place = spoilt(tmp_path, AFIT, right, "start: {ra_deg: 83, dec_deg: 2}")
+    assert message == f"motion.start: light of kind dome takes roll_deg, pitch_deg, yaw_deg {place}"
+
+
+# Unions: of each the allowed kinds, as a wrong one is answered
+
+UNIONS = [
+    ("kind: gaussian", "kind: gauss", "camera.psf.kind", "gaussian, moffat, airy, disc, measured"),
+    ("kind: global", "kind: shut", "camera.shutter.kind", "global, rolling, frame_transfer, interline"),
+    (
+        "transmission: 0.85",
+        "vignetting: {kind: cos4}\n  transmission: 0.85",
+        "camera.vignetting.kind",
+        "two_stops, table",
+    ),
+    ("kind: cosine", "kind: square", "light.led.lobe.kind", "cosine, table"),
+    (
+        "exposure: {",
+        "background: [{kind: uniform, e_s: 3}, {kind: aurora}]\nexposure: {",
+        "background.1.kind",
+        "uniform, sky, moon, stray",
+    ),
+    ("control: pid", "jitter: [{kind: white}]\n  control: pid", "motion.jitter.0.kind", "line, band"),
+    (
+        "preset: lu205c",
+        "preset: lu206c",
+        "camera.preset",
+        "aps, ec655, lu205c, wat902h2",
+    ),
+]
+
+
+@pytest.mark.parametrize(("right", "wrong", "key", "allowed"), UNIONS)
+def test_a_kind_that_is_none_is_answered_with_those_that_are(
+    tmp_path: Path, right: str, wrong: str, key: str, allowed: str
+) -> None:
+    message, place = spoilt(tmp_path, AFIT, right, wrong)
+    assert re.fullmatch(rf"{re.escape(key)}: '\w+' is none of {allowed} {re.escape(place)}", message)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "says"),
+    [
+        ("camera.psf", "{kind: moffat}", "camera.psf.fwhm_px: missing"),
+        ("camera.psf", "{kind: disc, radius_px: 0}", "camera.psf.radius_px: 0 is not allowed"),
+        ("camera.psf", "{sigma_px: 0.5, fwhm_px: 2}", "camera.psf: kind is missing"),
+        ("camera.psf", "{kind: airy, wavelength: 550}", "camera.psf.wavelength: 550 has no unit"),
+        ("camera.shutter", "{kind: frame_transfer}", "camera.shutter.row_time: missing"),
+        (
+            "camera.shutter",
+            "{kind: rolling, row_time: 1 ms}",
+            "camera.shutter: reading takes 1.199 s, longer than the frame period 0.5 s",
+        ),
+        ("light.led.intensity", "null", "light.led: an LED takes either intensity or radiant_intensity"),
+        ("light.led.radiant_intensity", "3 mW/sr", "light.led: an LED takes either intensity or radiant_"),
+        (
+            "light.led.lobe",
+            "{kind: table, angle_deg: [0, 60], intensity: [20, 1]}",
+            "light.led.lobe: the table does not begin with an intensity of 1 at 0 deg",
+        ),
+        ("camera.shutter", "{kind: global, row_time: '3 us'}", "camera.shutter.row_time: unknown key"),
+        ("camera.vignetting", "{kind: two_stops, cutoff_deg: 90}", "camera.vignetting.cutoff_deg: 90 is not"),
+        (
+            "camera.vignetting",
+            "{kind: two_stops, cutof_deg: 9}",
+            "camera.vignetting.cutof_deg: unknown key; did you mean cutoff_deg?",
+        ),
+        (
+            "camera.vignetting",
+            "{kind: table, angle_deg: [0, 5, 5], transmission: [1, 1, 1]}",
+            "camera.vignetting: angle_deg does not ascend",
+        ),
+        (
+            "light.led.lobe",
+            "{kind: table, angle_deg: [0, 5, 9], intensity: [1, 1]}",
+            "light.led.lobe: angle_deg has 3 numbers, intensity 2",
+        ),
+        (
+            "motion.jitter",
+            "[{kind: band, from_hz: 9, to_hz: 3, rms_arcsec: [1, 1, 1]}]",
+            "is not below to_hz 3",
+        ),
+        (
+            "background",
+            "[{kind: sky, mag_arcsec: 20}]",
+            "background.0.mag_arcsec: unknown key; did you mean mag",
+        ),
+        (
+            "camera.detector.particles",
+            "[{per_cm2_s: -1}]",
+            "camera.detector.particles.0.per_cm2_s: -1 is not",
+        ),
+        ("camera.detector.quantum_efficiency", "ccd", "'ccd' is none of cmos, interline, thick_ccd"),
+        ("camera.detector.offset_dn", "1024", "offset_dn 1024 is beyond a converter of 10 bits"),
+    ],
+)
+def test_a_slip_within_a_kind_is_told_of_that_kind_alone(key: str, value: str, says: str) -> None:
+    message = complaint(AFIT, {key: value})
+    assert says in message
+    assert "tagged-union" not in message
+
+
+# Rules between sections: who flies, with what, at which rate
+
+
+UNLOAD = "{start: 2 N m s, stop: 1 N m s}"
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"filter": "{}"}, "filter: takes a gyro; allowed beside vehicle.imu"),
+        *(
+            (
+                {"motion.control": f"{{actuators: {kind}}}"},
+                f"motion.control.actuators: vehicle.{kind} is not switched on",
+            )
+            for kind in ("wheels", "cmgs", "fans")
+        ),
+        *(
+            (
+                {"motion.control": f"{{actuators: {kind}, desaturation: {UNLOAD}}}"} | more,
+                "motion.control.desaturation: takes vehicle.fans, and actuators: wheels or cmgs",
+            )
+            for kind, more in (
+                ("ideal", {"vehicle.fans": "{}"}),
+                ("wheels", {"vehicle.wheels": "{}"}),
+                ("fans", {"vehicle.fans": "{}"}),
+            )
+        ),
+        (
+            {"tracker.exposure_control": "{mean_dn: 150, longest: 600 ms}"},
+            "tracker.exposure_control.longest: 0.6 s is longer than the frame period 0.5 s",
+        ),
+        (
+            {"tracker.exposure_control": "{mean_dn: 150, longest: 8 ms}"},
+            "tracker.exposure_control: exposure.time 0.01 s, the first, is outside of 1e-05 s to 0.008 s",
+        ),
+        (
+            {"tracker.exposure_control": "{mean_dn: 150, shortest: 60 ms}"},
+            "tracker.exposure_control: shortest 0.06 s is above longest 0.05 s",
+        ),
+        (
+            {"tracker.exposure_control": "{mean_dn: 150, longest: 11 s}"},
+            "tracker.exposure_control.longest: '11 s' is not allowed; it should be less than or equal to 10",
+        ),
+        (
+            {"tracker.exposure_control": "{mean_dn: 150, step: 0.1 us}"},
+            "tracker.exposure_control.step: '0.1 us' is not allowed; it should be greater than or equal to 0.000001",
+        ),
+        ({"tracker.exposure_control": "{step: 2 ms}"}, "tracker.exposure_control.mean_dn: missing"),
+        (
+            {"motion.control": "{feedback: imu}"},
+            "motion.control.feedback: imu takes the section vehicle.imu",
+        ),
+        (
+            {"motion.control": "{feedback: filter}", "vehicle.imu": "{}"},
+            "motion.control.feedback: filter takes the section filter",
+        ),
+        (
+            {"motion.control": "{rate_hz: 300}"},
+            "motion.control.rate_hz: 300 Hz is no whole number of milliseconds",
+        ),
+        (
+            {"vehicle.imu": "{rate_hz: 250}"},
+            "vehicle.imu.rate_hz: 250 Hz is no multiple of motion.control.rate_hz 100 Hz",
+        ),
+        (
+            {"vehicle.imu": "{rate_hz: 100}", "filter": "{bias_time: 90 ms}"},
+            "filter.bias_time: shorter than ten samples of the IMU, 0.1 s",
+        ),
+        (
+            {"motion.manoeuvre": "[{kind: sine, amplitude_deg: [1, 0, 0], frequency_hz: 50, duration: 1 s}]"},
+            "motion.manoeuvre: a sine of 50 Hz takes a motion.control.rate_hz of more than twice that",
+        ),
+        (
+            {"motion.control": f"{{desaturation: {UNLOAD.replace('2', '0.5')}}}"},
+            "motion.control.desaturation: stop 1 N m s is not below start 0.5 N m s",
+        ),
+        (
+            {
+                "motion.manoeuvre": "[{kind: bump, rate_deg_s: [1, 2, 3], duration: 40 ms, caught_after: 30 ms}]"
+            },
+            "motion.manoeuvre.0: caught_after 0.03 s is before the knock is over",
+        ),
+    ],
+)
+def test_what_does_not_go_together_is_one_line(changes: dict[str, str], says: str) -> None:
+    assert complaint(AFIT, changes) == f"{says} (--set)"
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "says"),
+    [
+        *(
+            ("vehicle.disturbances", value, "vehicle: disturbances: a free vehicle has none; allowed: mount:")
+            for value in (
+                "{earth_rotation: true}",
+                "{turbine: [0 N m, 0 N m, 1 mN m]}",
+                "{cable: {stiffness: 1 N m / rad}}",
+                "{draught: {rms: [1 mN m, 1 mN m, 1 mN m]}}",
+            )
+        ),
+        *(
+            (
+                "vehicle.imu",
+                f"{{earth_rate: {rate}}}",
+                "vehicle: imu.earth_rate: a free vehicle is not on the Earth; allowed: none",
+            )
+            for rate in ("compensated", "uncompensated")
+        ),
+    ],
+)
+def test_a_free_vehicle_is_in_no_room(key: str, value: str, says: str) -> None:
+    free = {"vehicle.mount": "free", "vehicle.centre_of_mass": "[0 m, 0 m, 0 m]"}
+    assert says in complaint(AFIT, free | {key: value})
+    assert loader.load(AFIT, {key: value}).vehicle.mount == "air_bearing"  # where it may have it
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "says"),
+    [
+        ("vehicle.wheels", "{coulomb: 1 mN}", "coulomb: '1 mN' is not a torque; allowed: a torque such as"),
+        (
+            "vehicle.wheels",
+            "{coulomb: -1 mN m}",
+            "vehicle.wheels.coulomb: '-1 mN m' is not allowed; it should be gr",
+        ),
+        (
+            "vehicle.wheels",
+            "{torque: 1 N m}",
+            "vehicle.wheels.torque: unknown key; did you mean torque_limit?; allo",
+        ),
+        ("vehicle.wheels", "{static_imbalance: 1 g}", "'1 g' is not a mass times offset; allowed: a mass ti"),
+        ("vehicle.fans", "{thrust_limit: 1 N m}", "'1 N m' is not a force; allowed: a force such as"),
+        ("vehicle.drag", "{viscous: 1 N m}", "vehicle.drag.viscous: '1 N m' is not a torque per rate; allow"),
+        ("vehicle.drag", "{quadratic: 1 N m s}", "'1 N m s' is not a torque per squared rate; allowed: a t"),
+        ("vehicle.cmgs", "{steering: magic}", "it should be 'pseudo_inverse' or 'singularity_robust'"),
+        ("vehicle.cmgs", "{gimbal_time_constant: 1 ms}", "should be greater than or equal to 0.005"),
+        ("vehicle.disturbances", "{cable: {}}", "vehicle.disturbances.cable.stiffness: missing"),
+        (
+            "vehicle.disturbances",
+            "{cable: {stiffness: 1 N m}}",
+            "'1 N m' is not a torque per angle; allowed: ",
+        ),
+        (
+            "vehicle.disturbances",
+            "{draught: {rms: [1 N m]}}",
+            "vehicle.disturbances.draught.rms.1: missing",
+        ),
+        ("vehicle.imu", "{earth_rate: maybe}", "it should be 'none', 'uncompensated' or 'compensated'"),
+        ("vehicle.imu", "{gyro: {arw: 3}}", "vehicle.imu.gyro.arw: unknown key; allowed: arw_deg_sqrt_h, "),
+        ("motion.control", "{law: lqr}", "motion.control.law: 'lqr' is not allowed; it should be 'pid' or"),
+        ("motion.control", "{rate_hz: 0.5}", "motion.control.rate_hz: 0.5 is not allowed; it should be gr"),
+        ("motion.control", "true", "motion.control: True is not allowed; it should be a mapping of keys to"),
+        ("lab", "{latitude_deg: 91}", "lab.latitude_deg: 91 is not allowed; it should be less than or equal"),
+        ("filter", "{latency: -1 s}", "filter.latency: '-1 s' is not allowed; it should be greater than or"),
+    ],
+)
+def test_a_slip_in_what_flies_is_told_with_its_key(key: str, value: str, says: str) -> None:
+    message = complaint(AFIT, {key: value})
+    assert says in message
+    assert message.endswith("(--set)")
+
+
+@pytest.mark.parametrize("kind", ["hold", "jitter", "bump"])
+def test_nobody_need_fly_a_vehicle_that_is_told_nothing(kind: str) -> None:
+    more = {
+        "hold": "",
+        "jitter": ", parts: [{kind: line, frequency_hz: 9, rms_arcsec: [1, 1, 1]}]",
+        "bump": ", rate_deg_s: [1, 1, 1]",
+    }[kind]
+    told = {"motion.manoeuvre": f"[{{kind: {kind}, duration: 1 s{more}}}]", "motion.control": "none"}
+    assert loader.load(AFIT, told).motion.control is None
+
+
+def test_a_controller_s_name_is_short_for_its_section() -> None:
+    loaded = [loader.load(AFIT, {"motion.control": value}).motion.control for value in ("pd", "{law: pd}")]
+    assert loaded[0] == loaded[1] == motion.ControlConfig(law="pd")
+
+
+# A scene on top of another
+
+
+def written(folder: Path, name: str, text: str) -> Path:
+    path = folder / name
+    path.parent.mkdir(exist_ok=True)
+    path.write_text(text)
+    return path
+
+
+def test_a_scene_says_what_is_different_from_its_base(tmp_path: Path) -> None:
+    """Keys of a section are merged at every depth; a list is taken whole; the name is the file's own."""
+    mine = written(
+        tmp_path,
+        "mine.yaml",
+        "schema: 1\nbase: afit_simsat\ntitle: Mine\nexposure: {frames: 3}\nlight: {led: {scatter: 0.01}}\n"
+        'motion:\n  manoeuvre: [{kind: hold, duration: "2 s"}]\n',
+    )
+    base, loaded = loader.load("afit_simsat"), loader.load(mine)
+    assert (loaded.name, loaded.title) == ("mine", "Mine")
+    assert loaded.exposure == base.exposure.model_copy(update={"frames": 3})
+    led = base.light.led.model_copy(update={"scatter": 0.01})
+    assert loaded.light == base.light.model_copy(update={"led": led})
+    assert [one.kind for one in loaded.motion.manoeuvre] == ["hold"]
+    same = ("vehicle", "camera", "tracker", "seed", "start_time")
+    assert all(getattr(loaded, key) == getattr(base, key) for key in same)
+
+
+def test_a_section_of_another_kind_takes_the_place_of_the_base_s(tmp_path: Path) -> None:
+    surface = "light: {surface: {kind: sphere, apex: 1 m, radius: 90 cm}}"
+    loaded = loader.load(written(tmp_path, "mine.yaml", f"schema: 1\nbase: afit_simsat\n{surface}\n"))
+    assert loaded.light.surface == light.SurfaceConfig.model_validate(
+        {"kind": "sphere", "apex": "1 m", "radius": "90 cm"}
+    )
+
+
+def test_null_switches_a_section_of_the_base_off(tmp_path: Path) -> None:
+    assert loader.load("simsat_slew").vehicle.wheels
+    mine = "schema: 1\nbase: simsat_slew\nvehicle: {wheels: null, fans: null}\nmotion: {control: null, manoeuvre: []}\n"
+    loaded = loader.load(written(tmp_path, "mine.yaml", mine))
+    assert (loaded.vehicle.wheels, loaded.vehicle.fans, loaded.motion.control) == (None, None, None)
+    assert loaded.vehicle.drag == loader.load("simsat_slew").vehicle.drag
+
+
+def test_a_base_is_found_beside_the_scene_and_may_have_one_too(tmp_path: Path) -> None:
+    """And the files that it names are those beside itself, not beside the scene on top of it."""
+    model = (SCENES / "vehicles" / "simsat.xml").read_text()
+    written(tmp_path, "below/own.xml", model)
+    written(
+        tmp_path, "below/lower.yaml", "schema: 1\nbase: simsat_slew\nvehicle: {model: own.xml}\nseed: 77\n"
+    )
+    mine = written(tmp_path, "mine.yaml", "schema: 1\nbase: below/lower.yaml\ntitle: Mine on top\n")
+    loaded = loader.load(mine)
+    assert loaded.vehicle.model == str(tmp_path / "below" / "own.xml")
+    assert (loaded.seed, loaded.title) == (77, "Mine on top")
+    assert loaded.exposure == loader.load("simsat_slew").exposure
+    assert loaded.camera == loader.load("afit_simsat").camera == loader.load_camera(mine)
+
+
+def test_an_override_stands_above_scene_and_base(tmp_path: Path) -> None:
+    mine = written(tmp_path, "mine.yaml", "schema: 1\nbase: afit_simsat\nseed: 2\n")
+    loaded = loader.load(mine, {"seed": "3", "exposure.frames": "7"})
+    assert (loaded.seed, loaded.exposure.frames) == (3, 7)
+
+
+@pytest.mark.parametrize(
+    ("base", "says"),
+    [
+        ("nosuch", "base: nosuch: no such scene; allowed: a .yaml file or one of afit_simsat, "),
+        ("nosuch.yaml", "base: nosuch.yaml: no such scene; allowed: a .yaml file or one of "),
+        ("3", "base: 3: no such scene; allowed: "),
+        ("", "base: None: no such scene; allowed: "),
+        ("[a, b]", "base: ['a', 'b']: no such scene; allowed: "),
+        ("mine.yaml", "base: mine.yaml is this scene itself, or has it for its base"),
+        ("../mine/mine.yaml", "base: ../mine/mine.yaml is this scene itself, or has it for its base"),
+    ],
+)
+def test_a_base_that_is_none_is_one_line(tmp_path: Path, base: str, says: str) -> None:
+    path = written(tmp_path / "mine", "mine.yaml", f"schema: 1\ntitle: Mine\nbase: {base}\n")
+    message = complaint(path)
+    assert message.startswith(says)
+    assert message.endswith(f"({path}, line 3)")
+
+
+def test_scenes_that_stand_on_each_other_are_refused(tmp_path: Path) -> None:
+    one = written(tmp_path, "one.yaml", "schema: 1\nbase: two.yaml\n")
+    written(tmp_path, "two.yaml", "schema: 1\nbase: three.yaml\n")
+    three = written(tmp_path, "three.yaml", "schema: 1\ntitle: Three\nbase: one.yaml\n")
+    says = "base: one.yaml is this scene itself, or has it for its base"
+    assert complaint(one) == f"{says} ({three}, line 3)"
+
+
+def test_a_slip_is_told_with_the_file_in_which_it_stands(tmp_path: Path) -> None:
+    """Its own where it is above, the base's where it is there; a section between is in both."""
+    lower = written(
+        tmp_path, "lower.yaml", "schema: 1\nbase: afit_simsat\nexposure:\n  frames: 0\n  rate_hz: 2\n"
+    )
+    mine = written(tmp_path, "mine.yaml", "schema: 1\nbase: lower.yaml\nseed: 3\nexposure:\n  rate_hz: 1\n")
+    says = "exposure.frames: 0 is not allowed; it should be greater than or equal to 1"
+    assert complaint(mine) == f"{says} ({lower}, line 4)"
+    mine.write_text("schema: 1\nbase: lower.yaml\nseed: 3\n\nexposure:\n  rate_hz: 1\n  frames: -1\n")
+    assert complaint(mine) == f"{says.replace('0 is', '-1 is')} ({mine}, line 7)"
+    assert complaint(mine, {"exposure.frames": "0"}) == f"{says} (--set)"
+
+
+def test_what_is_missing_in_a_list_is_not_looked_for_in_the_base_s(tmp_path: Path) -> None:
+    """The base has a first element with a duration; but this list has taken its place."""
+    mine = written(
+        tmp_path, "mine.yaml", "schema: 1\nbase: afit_simsat\nmotion:\n  manoeuvre:\n    - {kind: hold}\n"
+    )
+    assert complaint(mine) == f"motion.manoeuvre.0.duration: missing ({mine}, line 5)"
+
+
+def test_a_base_that_is_no_yaml_is_one_line(tmp_path: Path) -> None:
+    lower = written(tmp_path, "lower.yaml", "title: [")
+    mine = written(tmp_path, "mine.yaml", "schema: 1\nbase: lower.yaml\n")
+    assert complaint(mine).startswith(f"{lower}, line 1: not YAML: ")
+
+
+# The camera: preset and focus
+
+
+def test_what_the_scene_says_stands_above_its_camera_s_preset(tmp_path: Path) -> None:
+    """Keys of a section are merged; a section of another kind replaces the preset's."""
+    path = tmp_path / "mine.yaml"
+    path.write_text(
+        SHEFEX.read_text().replace(
+            "preset: ec655",
+            "preset: ec655\n  width_px: 640\n  detector: {read_noise_e: 9}\n  shutter: {kind: global}",
+        )
+    )
+    plain, mine = loader.load("shefex2").camera, loader.load(path).camera
+    assert (mine.width_px, mine.detector.read_noise_e, mine.shutter.kind) == (640, 9.0, "global")
+    assert (plain.width_px, plain.detector.read_noise_e, plain.shutter.kind) == (659, 14.7, "interline")
+    changed = {"width_px": 640, "shutter": mine.shutter, "detector": mine.detector}
+    assert mine == plain.model_copy(update=changed)
+    assert mine.detector == plain.detector.model_copy(update={"read_noise_e": 9.0})
+    assert loader.load_camera(path) == mine
+
+
+def test_an_override_stands_above_the_preset() -> None:
+    assert loader.load("shefex2", {"camera.detector.bits": "8"}).camera.detector.bits == 8
+    other = loader.load("shefex2", {"camera.preset": "aps"}).camera
+    assert (other.width_px, other.shutter.kind, other.focal_length_m) == (1024, "rolling", 0.025)
+
+
+def test_a_lens_is_focused_at_infinity_unless_told_otherwise() -> None:
+    lens = loader.load("shefex2").camera
+    assert lens.focus_m == math.inf
+    assert lens.image_distance_m == pytest.approx(0.025, rel=1e-15)
+
+
+@pytest.mark.parametrize("focus", ["70 mm", "35 mm", "1 um"])
+def test_a_focus_nearer_than_twice_the_focal_length_is_refused(tmp_path: Path, focus: str) -> None:
+    """There the image would be greater than the object; at the focal length there is none at all."""
+    message, _ = spoilt(tmp_path, AFIT, 'focus: "33 in"', f'focus: "{focus}"')
+    assert re.match(r"camera: focus \S+ m is nearer than twice the focal length 0.035 m \(", message)
+
+
+@pytest.mark.parametrize(
+    ("focus", "says"),
+    [
+        ("0 m", "camera.focus: '0 m' is not allowed; it should be greater than 0"),
+        ("-33 in", "camera.focus: '-33 in' is not allowed; it should be greater than 0"),
+        ("nan m", "camera.focus: 'nan m' is not allowed"),
+        ("far", "camera.focus: 'far' is not a length; allowed: a length such as \"33 in\", or infinity"),
+        ("33", 'camera.focus: 33 has no unit; allowed: a length such as "33 in", or infinity'),
+    ],
+)
+def test_a_focus_that_is_no_distance_is_refused(focus: str, says: str) -> None:
+    assert says in complaint(AFIT, {"camera.focus": focus})
+
+
+def test_a_missing_key_is_named_with_its_section_s_line(tmp_path: Path) -> None:
+    message, _ = spoilt(tmp_path, AFIT, '    apex: "48 in"\n', "")
+    line = line_number(AFIT.read_text(), "surface:")
+    assert message == f"light.surface.apex: missing ({tmp_path / 'bad.yaml'}, line {line})"
+
+
+def test_a_missing_section_is_named(tmp_path: Path) -> None:
+    message, _ = spoilt(tmp_path, AFIT, "seed: 1\n", "")
+    assert message == f"seed: missing ({tmp_path / 'bad.yaml'})"
+
+
+def test_an_exposure_longer_than_its_period_is_refused(tmp_path: Path) -> None:
+    message, place = spoilt(tmp_path, AFIT, 'time: "10 ms"', 'time: "10 s"')
+    assert message == f"exposure: time 10.0 s is longer than the frame period 0.5 s {place}"
+
+
+def test_a_manoeuvre_without_a_controller_is_refused(tmp_path: Path) -> None:
+    message, _ = spoilt(tmp_path, AFIT, "control: pid", "control: none")
+    assert message.startswith("motion: a manoeuvre needs a controller; allowed: control: pid")
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("a: [1, 2", "not YAML"),
+        ("a:\n\t- b", "line 2: not YAML"),
+        ("a: \x00", "not YAML: unacceptable character"),
+        ("", "allowed: a mapping of keys to values"),
+        ("- 1\n- 2\n", "allowed: a mapping of keys to values"),
+        ("just words", "allowed: a mapping of keys to values"),
+        ("schema: 1\n1: 2\n", "1: 1 is not allowed"),
+    ],
+)
+def test_what_is_no_scene_at_all_is_one_line(tmp_path: Path, text: str, says: str) -> None:
+    path = tmp_path / "bad.yaml"
+    path.write_text(text)
+    message = complaint(path)
+    assert says in message
+    assert str(path) in message
+
+
+def test_bytes_that_are_no_text_are_one_line(tmp_path: Path) -> None:
+    path = tmp_path / "bad.yaml"
+    path.write_bytes(b"\xff\xfe\x80\x81")
+    assert f"{path}: cannot be read" in complaint(path)
+
+
+@pytest.mark.parametrize("name", ["nosuch", "nosuch.yaml", "scenes/nosuch", "", "."])
+def test_an_unknown_scene_is_answered_with_the_known_ones(name: str) -> None:
+    with pytest.raises(
+        InputError, match=r"no such scene; allowed: a \.yaml file or one of .*afit_simsat.*shefex2"
+    ):
+        loader.load(name)
+
+
+def test_a_camera_file_without_a_camera_is_one_line(tmp_path: Path) -> None:
+    path = tmp_path / "camera.yaml"
+    path.write_text("schema: 1\ntitle: no camera\n")
+    with pytest.raises(InputError, match=r"^camera: missing \(.*camera\.yaml\)$"):
+        loader.load_camera(path)
+
+
+def kinds(union: object) -> set[str]:
+    """The kinds of a discriminated union."""
+    return {get_args(part.model_fields["kind"].annotation)[0] for part in get_args(get_args(union)[0])}
+
+
+def test_every_algorithm_that_the_schema_names_exists() -> None:
+    assert set(light.SurfaceConfig.model_fields["kind"].annotation.__args__) == set(SURFACES)
+    assert kinds(Layout) == set(LAYOUTS)
+    assert kinds(leds.Drive) == set(DRIVES)
+    assert set(vehicle.CmgsConfig.model_fields["steering"].annotation.__args__) == set(STEERING)
+    assert kinds(camera.Psf) == set(PSFS)
+    assert kinds(get_args(camera.CameraConfig.model_fields["vignetting"].annotation)[0]) == set(VIGNETTING)
+    assert kinds(Lobe) == set(LOBES)
+    assert kinds(light.Glow) == set(BACKGROUNDS)
+    assert kinds(motion.JitterPart) == set(SPECTRA)
+    assert kinds(motion.Manoeuvre) == set(LEGS)
+
+
+def test_a_key_that_stands_twice_is_refused(tmp_path):
+    """YAML itself would take the last one without a word."""
+    path = tmp_path / "twice.yaml"
+    path.write_text((SCENES / "shefex2.yaml").read_text() + "\nseed: 3\n")
+    with pytest.raises(InputError, match=r"^seed: stands twice in one section \(.*twice.yaml, line \d+\)$"):
+        loader.load(path)

@@ -1,0 +1,203 @@
+"""Closed loop on rendered frames: the gyros lose a turn, the star tracker finds it, the vehicle goes back.
+
+The scene `simsat_bump` with its accident early and fewer frames. Steered by the filter, or by the IMU alone.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from skysim.core.types import Floats, Telemetry
+from skysim.scene import loader
+from skysim.simulation import run, testbed
+from skysim.simulation.testbed import Testbed
+
+BUMP = 'kind: bump, rate_deg_s: [3, -2, 14], duration: "40 ms", caught_after: "0.2 s"'
+EARLY = {
+    "motion.manoeuvre": f'[{{kind: hold, duration: "1.5 s"}}, {{{BUMP}}}, {{kind: hold, duration: "30 s"}}]',
+    "exposure": '{time: "10 ms", rate_hz: 1, frames: 8, first: "0.4 s"}',
+}
+AFTER_S = 1.75  # the bump and the catch are over
+IMU_ALONE = {
+    "filter": "null",
+    "motion.control": "{feedback: imu}",
+    "exposure": '{time: 10 ms, rate_hz: 1, frames: 1, first: "8.4 s"}',
+}
+
+
+def prepared(name: str = "simsat_bump", **changes: str) -> Testbed:
+    given = {key.replace("__", "."): value for key, value in changes.items()}
+    return run.prepare(loader.load(name, given))
+
+
+@pytest.fixture(scope="module")
+def bumped() -> Testbed:
+    return prepared(**EARLY)
+
+
+def told(lab: Testbed) -> Telemetry:
+    assert lab.telemetry is not None
+    return lab.telemetry
+
+
+def off_deg(telemetry: Telemetry) -> Floats:
+    """(K,) by how much the vehicle is not where it was told to be."""
+    assert telemetry.lab_from_ref is not None
+    return np.degrees((telemetry.lab_from_ref.inv() * telemetry.lab_from_body).magnitude())
+
+
+def imu_error_deg(telemetry: Telemetry) -> Floats:
+    """(K, 3) of the IMU's attitude, in body axes."""
+    assert telemetry.lab_from_imu is not None
+    return np.degrees((telemetry.lab_from_body.inv() * telemetry.lab_from_imu).as_rotvec())
+
+
+def in_sigma(telemetry: Telemetry) -> Floats:
+    """(K, 3) the filter's error about each body axis over what it believes of it."""
+    assert telemetry.lab_from_filter is not None
+    error = (telemetry.lab_from_filter.inv() * telemetry.lab_from_body).as_rotvec()
+    return np.abs(error) / telemetry.sigma_attitude_rad
+
+
+# --- the accident -------------------------------------------------------------------------------------------
+
+
+def test_every_frame_is_solved_and_used(bumped: Testbed) -> None:
+    assert bumped.verdicts == dict.fromkeys(range(8), "used")
+    assert {report.attitude.status for report in bumped.reports.values()} == {"solved"}
+
+
+def test_the_imu_is_wrong_for_good_by_the_turn_it_missed(bumped: Testbed) -> None:
+    """What is beyond its limit of 10 deg/s about z, integrated along the true rate: 0.58 deg; it stays."""
+    telemetry, path = told(bumped), bumped.trajectory
+    excess = np.maximum(np.abs(np.degrees(path.rate_body_rad_s[:, 2])) - 10, 0)
+    missed_deg = np.trapezoid(excess, path.t_s)
+    lost = imu_error_deg(telemetry)
+    before, after = lost[telemetry.t_s < 1.5], lost[telemetry.t_s > AFTER_S]
+    assert missed_deg > 0.3
+    assert np.abs(before).max() < 0.01
+    # Its own errors and the Earth's turning, 15 deg/h, are some hundredths of a degree in 6 s.
+    np.testing.assert_allclose(after[:, 2], -missed_deg, rtol=0, atol=0.04)
+    assert np.linalg.norm(after, axis=1).min() > 0.3
+    assert telemetry.saturated is not None
+    caught = telemetry.saturated[(telemetry.t_s > 1.5) & (telemetry.t_s < AFTER_S)]
+    assert caught.sum() * 0.01 == pytest.approx(0.2, abs=0.03)
+    assert caught.sum() == telemetry.saturated.sum()  # and at no other time
+
+
+def test_the_filter_knows_what_it_does_not_know(bumped: Testbed) -> None:
+    """Within four of its own sigma always: no surer than it may be before the star tracker has seen anything, while
+    turns are missed, and after.
+    """
+    telemetry = told(bumped)
+    assert in_sigma(telemetry)[1:].max() < 4
+    sigma_deg = np.degrees(telemetry.sigma_attitude_rad)
+    doubting = (telemetry.t_s > AFTER_S) & (telemetry.t_s < 2.4)
+    assert (sigma_deg[doubting] > 0.5).all()
+    assert (sigma_deg[telemetry.t_s > 2.45] < 0.01).all()
+
+
+def test_the_star_tracker_brings_attitude_and_bias_back(bumped: Testbed) -> None:
+    telemetry = told(bumped)
+    assert telemetry.lab_from_filter is not None
+    assert telemetry.believed_bias_rad_s is not None
+    assert telemetry.bias_rad_s is not None
+    error_deg = np.degrees((telemetry.lab_from_filter.inv() * telemetry.lab_from_body).magnitude())
+    assert error_deg[telemetry.t_s < 2.4].max() > 0.3  # it was lost too
+    assert error_deg[telemetry.t_s > 2.45].max() < 0.005
+    bias_error = np.abs(telemetry.believed_bias_rad_s - telemetry.bias_rad_s)[-1]
+    assert (bias_error < 4 * telemetry.sigma_bias_rad_s[-1]).all()  # type: ignore[index]
+    deg_h = np.degrees(bias_error) * 3600
+    assert deg_h.max() < 5  # of 15, the Earth's turning, that it had to find
+
+
+def test_the_vehicle_is_brought_back(bumped: Testbed) -> None:
+    off = off_deg(told(bumped))
+    assert off.max() > 1
+    assert off[told(bumped).t_s > 7].max() < 0.05
+
+
+def test_steered_by_the_imu_it_stays_where_the_imu_is_wrong() -> None:
+    telemetry = told(prepared(**EARLY | {key.replace(".", "__"): value for key, value in IMU_ALONE.items()}))
+    assert telemetry.lab_from_filter is None
+    late = telemetry.t_s > 8
+    assert off_deg(telemetry)[late].min() > 0.3
+    lost = np.linalg.norm(imu_error_deg(telemetry), axis=1)
+    np.testing.assert_allclose(off_deg(telemetry)[late], lost[late], rtol=0, atol=0.05)
+
+
+# --- frames in flight and after it --------------------------------------------------------------------------
+
+
+def test_what_was_solved_in_flight_is_what_the_frames_say_afterwards(bumped: Testbed) -> None:
+    """Rendered from a piece of the flight when its time came, and from the whole: the same photons, one answer."""
+    kept = [shot.report.attitude for shot in run.run(bumped, testbed.tracker(bumped))]
+    forgotten = replace(bumped, reports={})
+    again = [shot.report.attitude for shot in run.run(forgotten, testbed.tracker(forgotten))]
+    assert kept == [bumped.reports[index].attitude for index in range(8)]
+    assert [one.status for one in kept] == [one.status for one in again]
+    for one, other in zip(kept, again, strict=True):
+        assert np.linalg.norm((one.cam_from_ref * other.cam_from_ref.inv()).as_rotvec()) < 1e-9
+
+
+@pytest.mark.parametrize("latency_s", [0.0, 0.2])
+def test_a_solution_comes_after_its_latency(latency_s: float) -> None:
+    """The filter is sure of itself at the first tick after the exposure's end and the latency, and right."""
+    lab = prepared(
+        filter=f'{{start_deg: 0.5, latency: "{latency_s} s"}}',
+        motion__manoeuvre="[{kind: sine, amplitude_deg: [2, 1, 3], frequency_hz: 0.5, duration: 5 s}]",
+        exposure='{time: "10 ms", rate_hz: 2, frames: 4, first: "0.4 s"}',
+    )
+    telemetry = told(lab)
+    knows = telemetry.t_s[(telemetry.sigma_attitude_rad < np.radians(0.1)).all(axis=1)]
+    assert knows[0] == pytest.approx(0.41 + latency_s, abs=0.0101)
+    assert in_sigma(telemetry)[1:].max() < 4
+    # What comes too late for the flight is no longer told the filter, but solved after all.
+    assert sorted(lab.reports) == list(range(4 if latency_s == 0 else 3))
+    shots = list(run.run(lab, testbed.tracker(lab)))
+    assert [shot.report.attitude.status for shot in shots] == ["solved"] * 4
+
+
+def test_the_loop_with_latency_survives_the_accident() -> None:
+    lab = prepared(**EARLY, filter__latency="0.2 s")
+    assert set(lab.verdicts.values()) == {"used"}
+    assert in_sigma(told(lab))[1:].max() < 4
+    assert off_deg(told(lab))[told(lab).t_s > 7].max() < 0.06
+
+
+def test_a_frame_without_an_answer_leaves_the_filter_alone() -> None:
+    """The lens is capped: no LEDs, no solution; the filter goes on with the gyros and is less and less sure."""
+    lab = prepared(light__led__intensity="1 ucd", exposure='{time: "10 ms", rate_hz: 2, frames: 2}')
+    assert "used" not in lab.verdicts.values()
+    assert [lab.verdicts[k] for k in range(2)] == [lab.reports[k].attitude.status for k in range(2)]
+    sigma = told(lab).sigma_attitude_rad
+    assert sigma is not None
+    assert (np.diff(sigma, axis=0) > 0).all()
+
+
+def test_under_the_stars_the_filter_s_lab_is_the_sky() -> None:
+    """The same loop with the other tracker: a free vehicle, its attitude among the stars."""
+    lab = prepared("shefex2", vehicle__imu="{}", filter="{start_deg: 0.5}", exposure__frames="4")
+    assert lab.verdicts == dict.fromkeys(range(4), "used")
+    telemetry = told(lab)
+    assert in_sigma(telemetry)[1:].max() < 4
+    assert telemetry.sigma_attitude_rad is not None
+    assert np.degrees(telemetry.sigma_attitude_rad[-1]).max() < 0.02
+
+
+# --- once more ----------------------------------------------------------------------------------------------
+
+
+def test_the_same_seed_flies_the_same_flight_bit_for_bit() -> None:
+    short = EARLY | {"exposure": '{time: "10 ms", rate_hz: 1, frames: 2, first: "1.4 s"}'}
+    short["motion.manoeuvre"] = short["motion.manoeuvre"].replace("1.5 s", "1.6 s")
+    one, same, other = (prepared(**short, seed=seed) for seed in ("6", "6", "7"))
+    for name in ("torque_nm", "rate_body_rad_s", "believed_bias_rad_s", "sigma_attitude_rad"):
+        assert getattr(told(one), name).tobytes() == getattr(told(same), name).tobytes()
+        assert getattr(told(one), name).tobytes() != getattr(told(other), name).tobytes()
+    for telemetry in ("lab_from_body", "lab_from_imu", "lab_from_filter"):
+        quaternions = [getattr(told(lab), telemetry).as_quat().tobytes() for lab in (one, same, other)]
+        assert quaternions[0] == quaternions[1] != quaternions[2]

@@ -1,0 +1,477 @@
+"""The whole chain without noise returns the truth; frames stand alone; the streams are order-free."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from estimator.core.types import Attitude, Centroids
+from skysim.camera.optics import Optics
+from skysim.core.errors import InputError
+from skysim.core.types import Truth
+from skysim.results import metrics
+from skysim.scene import loader
+from skysim.simulation import exposure, random_streams, run, testbed
+from skysim.simulation.closed_loop import ClosedLoop
+from skysim.simulation.testbed import Testbed
+from skysim.tracking import onboard_model
+
+# Without noise a frame is the expectation in float64; without fixed pattern and with one exposure for all rows, a
+# perfect chip's.
+PERFECT_CHIP = {
+    "camera.detector.cti_parallel": "0",
+    "camera.detector.cti_serial": "0",
+    "camera.shutter": "{kind: global}",
+    "camera.detector.noise": "false",
+    "camera.detector.prnu": "0",
+    "camera.detector.dsnu": "0",
+    "camera.detector.hot_pixels": "0",
+    "camera.detector.column_offset_e": "0",
+}
+QUIET_DOME = PERFECT_CHIP | {
+    "motion.control": "none",
+    "motion.manoeuvre": "[]",
+    "vehicle.centre_of_mass": "['0 m', '0 m', '0 m']",  # balanced: it stays where it is put
+    "exposure.frames": "1",
+}
+# Stars too faint for the catalogue are light in their neighbours' fitting windows (some 10 arcsec of bias), so the
+# bar of 1e-6 deg is for a sky of isolated stars that are all on board.
+QUIET_SKY = PERFECT_CHIP | {
+    "motion.rate_deg_s": "[0, 0, 0]",
+    "light.limit_mag": "5",
+    "tracker.limit_mag": "5",
+    "exposure.frames": "1",
+}
+ATTITUDES = [
+    "{roll_deg: 7}",
+    "{roll_deg: -15, pitch_deg: 8, yaw_deg: 100}",
+    "{pitch_deg: -20, yaw_deg: -170}",
+]
+POINTINGS = ["{ra_deg: 83, dec_deg: 2}", "{ra_deg: 300, dec_deg: 20, roll_deg: 77}"]
+
+
+def prepared(name: str, **overrides: str) -> Testbed:
+    return run.prepare(loader.load(name, {k.replace("__", "."): v for k, v in overrides.items()}))
+
+
+def quiet(name: str, start: str) -> Testbed:
+    changes = {"afit_simsat": QUIET_DOME, "shefex2": QUIET_SKY}[name]
+    return run.prepare(loader.load(name, changes | {"motion.start": start}))
+
+
+def error_deg(answer: Attitude, truth: Truth) -> float:
+    assert answer.status == "solved"
+    assert answer.cam_from_ref is not None
+    return float(np.degrees((answer.cam_from_ref * truth.cam_from_lab.inv()).magnitude()))
+
+
+def shots_of(lab: Testbed) -> list[run.FrameResult]:
+    return list(run.run(lab, testbed.tracker(lab)))
+
+
+def true_centroids(truth: Truth) -> Centroids:
+    """The true pixels, brightest first, as if they had been measured to a hundredth of a pixel."""
+    order = np.argsort(-truth.seen.electrons)
+    count = len(order)
+    return Centroids(truth.seen.flux_xy_px[order], np.full(count, 0.01), truth.seen.electrons[order])
+
+
+# Without noise
+
+
+@pytest.mark.parametrize(
+    ("name", "start"), [("afit_simsat", s) for s in ATTITUDES] + [("shefex2", s) for s in POINTINGS]
+)
+def test_a_noise_free_image_gives_the_true_attitude(name: str, start: str) -> None:
+    lab = quiet(name, start)
+    frame, truth = exposure.render_frame(lab, 0)
+    assert frame.image_dn.dtype == np.float64  # neither rounded nor clipped
+    assert error_deg(testbed.tracker(lab).solve(frame.image_dn).attitude, truth) < 1e-6
+
+
+@pytest.mark.parametrize(
+    ("name", "start"), [("afit_simsat", s) for s in ATTITUDES] + [("shefex2", s) for s in POINTINGS]
+)
+def test_true_centroids_give_the_true_attitude(name: str, start: str) -> None:
+    lab = quiet(name, start)
+    _, truth = exposure.render_frame(lab, 0)
+    assert error_deg(testbed.tracker(lab).solve_centroids(true_centroids(truth)), truth) < 1e-6
+
+
+def test_true_centroids_under_the_dome_give_the_attitude_to_machine_precision() -> None:
+    # Reference §5: exact PnP noise-free, 1e-14 deg; here both sides know the very same LEDs.
+    lab = quiet("afit_simsat", ATTITUDES[1])
+    _, truth = exposure.render_frame(lab, 0)
+    assert error_deg(testbed.tracker(lab).solve_centroids(true_centroids(truth)), truth) < 1e-12
+
+
+@pytest.mark.parametrize("start", POINTINGS)
+def test_uneven_pixels_cost_what_they_move_the_stars(start: str) -> None:
+    """PRNU moves a Gaussian star's centre by prnu / sqrt(8 pi) px, whatever its width, and N stars turn by that
+    over sqrt(sum r^2): from the integral of g^2 x^2, with g the star's profile. Four sigma."""
+    uneven = {"camera.detector.prnu": "0.01", "motion.start": start}
+    lab = run.prepare(loader.load("shefex2", QUIET_SKY | uneven))
+    frame, truth = exposure.render_frame(lab, 0)
+    from_centre_px = truth.seen.xy_px - lab.scene.camera.centre_px
+    sigma_rad = 0.01 / np.sqrt(8 * np.pi) / np.sqrt(np.sum(from_centre_px**2))
+    error = error_deg(testbed.tracker(lab).solve(frame.image_dn).attitude, truth)
+    assert 1e-6 < error < 4 * np.degrees(sigma_rad)
+
+
+def test_a_distorted_lens_that_the_tracker_knows_costs_nothing() -> None:
+    lens = {
+        "camera.distortion": "[-0.2, 0.1, 0.001, -0.002, 0.05]",
+        "camera.principal_point_px": "[340, 230]",
+    }
+    lab = run.prepare(loader.load("shefex2", QUIET_SKY | lens))
+    frame, truth = exposure.render_frame(lab, 0)
+    assert error_deg(testbed.tracker(lab).solve(frame.image_dn).attitude, truth) < 1e-6
+
+
+def test_a_wrongly_believed_lever_costs_what_the_reference_says() -> None:
+    """Reference §5: 1 mm of lateral lever is .047 deg across (5 LEDs); by geometry 1 mm / 1.22 m = .047 deg."""
+    moved = {"tracker.believed_camera_body": "['1 mm', '0 m', '381 mm']", "motion.start": "{roll_deg: 7}"}
+    lab = run.prepare(loader.load("afit_simsat", QUIET_DOME | moved))
+    _, truth = exposure.render_frame(lab, 0)
+    error = error_deg(testbed.tracker(lab).solve_centroids(true_centroids(truth)), truth)
+    assert error == pytest.approx(np.degrees(1e-3 / 1.22), rel=0.15)
+
+
+# What the frames are made of
+
+
+def test_the_camera_points_where_the_scene_says() -> None:
+    lab = quiet("shefex2", "{ra_deg: 83, dec_deg: 2, roll_deg: 20}")
+    _, truth = exposure.render_frame(lab, 0)
+    right, down, sight = truth.cam_from_lab.as_matrix()
+    ra, dec = np.radians([83.0, 2.0])
+    wanted = [np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)]
+    np.testing.assert_allclose(sight, wanted, rtol=0, atol=1e-14)
+    # Position angle of the image's up: from north through east, and east is to the left.
+    north = np.array([-np.sin(dec) * np.cos(ra), -np.sin(dec) * np.sin(ra), np.cos(dec)])
+    east = np.array([-np.sin(ra), np.cos(ra), 0])
+    assert np.degrees(np.arctan2(-down @ east, -down @ north)) == pytest.approx(20, abs=1e-10)
+    assert -right @ (east * np.cos(np.radians(20)) - north * np.sin(np.radians(20))) == pytest.approx(
+        1, abs=1e-12
+    )
+
+
+def test_the_truth_is_that_of_mid_exposure() -> None:
+    """The attitude in the truth puts the stars on the pixels in the truth, while the camera slews."""
+    lab = prepared("shefex2", exposure__frames="4")
+    frame, truth = exposure.render_frame(lab, 3)
+    assert frame.t_mid_s == truth.t_s == pytest.approx(0.1 + 3 * 0.1 + 0.020, abs=1e-12)
+    rows = {hip: n for n, hip in enumerate(lab.sources.id)}
+    direction = lab.sources.place[[rows[hip] for hip in truth.seen.id], :3]
+    x, y, z = truth.cam_from_lab.apply(direction).T
+    pinhole = np.column_stack([329 + x / z * 25e-3 / 9.9e-6, 246 + y / z * 25e-3 / 9.9e-6])
+    np.testing.assert_allclose(truth.seen.xy_px, pinhole, rtol=0, atol=1e-9)
+
+
+def test_the_truth_moves_at_the_rate_of_the_scene() -> None:
+    """A sphere of 120 kg m2 in free flight turns evenly: .5 deg/s for the 2 s between frames 0 and 20."""
+    lab = prepared("shefex2", exposure__frames="21")
+    first, last = (exposure.render_frame(lab, k)[1] for k in (0, 20))
+    assert last.t_s - first.t_s == pytest.approx(2.0, abs=1e-12)
+    turned = (last.cam_from_lab * first.cam_from_lab.inv()).magnitude()
+    assert np.degrees(turned) == pytest.approx(1.0, abs=1e-9)
+    assert np.degrees(np.linalg.norm(last.rate_cam_rad_s)) == pytest.approx(0.5, abs=1e-9)
+
+
+def test_streaks_are_rate_times_exposure_times_focal_length() -> None:
+    """Near the axis; .5 deg/s, 40 ms, 2,525 px: .88 px."""
+    lab = prepared("shefex2", exposure__frames="1")
+    seen = exposure.render_frame(lab, 0)[1].seen
+    middle = np.hypot(*(seen.xy_px - [329, 246]).T) < 120
+    assert middle.sum() >= 3
+    wanted = np.radians(0.5) * 0.040 * 25e-3 / 9.9e-6
+    np.testing.assert_allclose(seen.streak_px[middle], wanted, rtol=5e-3, atol=0)  # 1 + tan^2 at 120 px: .2 %
+
+
+def test_the_camera_rides_fifteen_inches_above_the_bearing() -> None:
+    lab = prepared("afit_simsat", exposure__frames="1")
+    np.testing.assert_allclose(lab.mount.camera_body_m, [0, 0, 15 * 0.0254], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(lab.mount.cam_from_body.as_matrix(), np.eye(3), rtol=0, atol=1e-12)
+
+
+def test_shutters_open_on_time() -> None:
+    windows = [testbed.window(loader.load("shefex2"), k) for k in (0, 1, 39)]
+    assert [when.open_s for when in windows] == pytest.approx([0.1, 0.2, 4.0], abs=1e-12)
+    assert {when.exposure_s for when in windows} == {0.040}
+    assert [when.close_s(493) for when in windows] == pytest.approx([0.14, 0.24, 4.04], abs=1e-12)
+
+
+def test_a_rolling_shutter_s_truth_is_that_of_its_middle_row() -> None:
+    """493 rows, each 80 us after the one above: the last closes 39.36 ms late, the middle one 19.68 ms."""
+    # The first and last rows are .35 px off the middle's: a tracker that trusts to .03 px would leave them out.
+    loose = {"tracker__centroid_sigma_px": "0.2", "exposure__frames": "1"}
+    lab = prepared("shefex2", camera__shutter="{kind: rolling, row_time: '80 us'}", seed="3", **loose)
+    assert testbed.window(lab.scene, 0).close_s(493) == pytest.approx(0.1 + 0.040 + 0.03936, abs=1e-12)
+    frame, truth = exposure.render_frame(lab, 0)
+    assert frame.t_mid_s == truth.t_s == pytest.approx(0.1 + 0.020 + 0.01968, abs=1e-12)
+    answer = testbed.tracker(lab).solve(frame.image_dn).attitude
+    assert answer.cam_from_ref is not None
+    cross, roll = np.degrees(metrics.cross_and_roll_rad(answer.cam_from_ref, truth.cam_from_lab)) * 3600
+    # At the first row's time the boresight was 35 arcsec from this.
+    assert cross < 10
+    # Rows shear along x by .4 deg/s x 39.4 ms = .70 px in 493; the best turn takes y^2 / (x^2 + y^2) of a shear, 104
+    # arcsec if stars were spread evenly over 659 x 493.
+    assert abs(roll) == pytest.approx(np.degrees(0.695 / 493 * 493**2 / (493**2 + 659**2)) * 3600, rel=0.3)
+
+
+def test_a_background_is_under_everything_else() -> None:
+    """1000 e-/s of glow for 40 ms at 10 e-/DN: 4 DN more in every pixel, and the same stars on top."""
+    dark, lit = (
+        exposure.render_frame(run.prepare(loader.load("shefex2", QUIET_SKY | {"background": glow})), 0)
+        for glow in ("[]", "[{kind: uniform, e_s: 1000}]")
+    )
+    np.testing.assert_allclose(lit[0].image_dn - dark[0].image_dn, 4.0, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(lit[1].seen.electrons, dark[1].seen.electrons, rtol=1e-12, atol=0)
+    assert (lit[1].seen.snr < dark[1].seen.snr).all()
+
+
+def test_jitter_shakes_the_camera_by_what_the_scene_says() -> None:
+    """100 arcsec rms about the body's x, at 20 Hz: the path's turns away from the unshaken one have that rms."""
+    line = "[{kind: line, frequency_hz: 20, rms_arcsec: [100, 0, 0]}]"
+    still, shaken = (
+        prepared("shefex2", exposure__frames="11", motion__jitter=j).trajectory for j in ("[]", line)
+    )
+    t_s = np.linspace(0, 1, 2000, endpoint=False)  # twenty whole periods
+    turned = np.degrees((still.at(t_s).inv() * shaken.at(t_s)).as_rotvec()) * 3600
+    np.testing.assert_allclose(np.sqrt(np.mean(turned**2, axis=0)), [100, 0, 0], rtol=1e-3, atol=1e-3)
+
+
+def test_a_chip_s_fixed_pattern_is_its_own_and_not_the_seed_s() -> None:
+    one, same, other = (
+        prepared("shefex2", exposure__frames="1", seed=seed, camera__detector__hardware_seed=chip).chip
+        for seed, chip in (("1", "5"), ("2", "5"), ("1", "6"))
+    )
+    for name in ("sensitivity", "dark_e_s"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(same, name))
+        assert np.mean(getattr(one, name) != getattr(other, name)) > 0.9
+
+
+# Random streams
+
+
+def test_frames_do_not_depend_on_those_before() -> None:
+    lab = prepared("shefex2", exposure__frames="4")
+    in_order = [exposure.render_frame(lab, k)[0].image_dn for k in range(4)]
+    backwards = [exposure.render_frame(lab, k)[0].image_dn for k in (3, 2, 1, 0)][::-1]
+    for one, other in zip(in_order, backwards, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_noise_differs_from_frame_to_frame_and_seed_to_seed() -> None:
+    draws = [
+        random_streams.rng(seed, "detector", k).standard_normal(1000) for seed, k in ((1, 0), (1, 1), (2, 0))
+    ]
+    correlation = np.corrcoef(draws)
+    assert np.abs(correlation[np.triu_indices(3, 1)]).max() < 4 / np.sqrt(1000)
+
+
+def test_the_hardware_s_seed_is_not_the_noise_s() -> None:
+    domes = [prepared("afit_simsat", seed=seed, exposure__frames="1").sources for seed in ("1", "2")]
+    np.testing.assert_array_equal(domes[0].place, domes[1].place)
+    np.testing.assert_array_equal(domes[0].strength, domes[1].strength)
+
+
+# The run
+
+
+@pytest.fixture(scope="module")
+def shots() -> list[run.FrameResult]:
+    return shots_of(prepared("shefex2", exposure__frames="3"))
+
+
+def test_a_run_answers_every_frame(shots: list[run.FrameResult]) -> None:
+    assert [shot.frame.index for shot in shots] == [0, 1, 2]
+    for shot in shots:
+        assert error_deg(shot.report.attitude, shot.truth) < 10 / 60
+        assert all(spent >= 0 for spent in shot.seconds.values())
+
+
+def test_a_blinded_frame_is_a_status_and_no_attitude() -> None:
+    lab = prepared("shefex2", exposure__frames="1", background="[{kind: uniform, e_s: 1e8}]")
+    (shot,) = shots_of(lab)
+    assert "saturated" in shot.report.attitude.status
+    assert shot.report.attitude.cam_from_ref is None
+
+
+def test_a_starless_frame_is_a_status_and_no_attitude() -> None:
+    lab = prepared(
+        "shefex2", exposure__frames="1", light__limit_mag="0", motion__start="{ra_deg: 10, dec_deg: 60}"
+    )
+    (shot,) = shots_of(lab)
+    assert shot.report.attitude.status != "solved"
+    assert shot.report.attitude.cam_from_ref is None
+    assert len(shot.truth.seen.id) == 0
+
+
+@pytest.mark.parametrize("stage", ["detector", "centroider", "identifier", "solver"])
+@pytest.mark.parametrize("name", ["shefex2", "afit_simsat"])
+def test_an_unknown_algorithm_is_refused_before_the_flight(name: str, stage: str) -> None:
+    loaded = loader.load(name, {f"tracker.{stage}": "magic"})
+    with pytest.raises(InputError, match=rf"^tracker\.{stage}: 'magic' is none of \w+"):
+        run.prepare(loaded)
+
+
+@pytest.mark.parametrize(("name", "solver"), [("shefex2", "rotation_only"), ("afit_simsat", "quest")])
+def test_a_solver_for_the_other_sky_is_refused(name: str, solver: str) -> None:
+    loaded = loader.load(name, {"tracker.solver": solver})
+    with pytest.raises(InputError, match=rf"^tracker\.solver: '{solver}' is none of "):
+        run.prepare(loaded)
+
+
+def test_the_believed_camera_is_the_true_one_unless_told_otherwise() -> None:
+    loaded = loader.load("shefex2", {"camera.distortion": "[-0.2, 0.1, 0, 0, 0]"})
+    believed = onboard_model.believed_camera(loaded)
+    lens = Optics.of(loaded.camera)
+    vectors = Rotation.from_rotvec([0.05, -0.08, 0]).apply([[0, 0, 1.0], [0.02, 0, 1.0]])
+    np.testing.assert_allclose(believed.pixels(vectors), lens.project(vectors), rtol=0, atol=1e-10)
+    longer = onboard_model.believed_camera(
+        loader.load("shefex2", {"tracker.believed_focal_length": "25.25 mm"})
+    )
+    assert longer.focal_px == pytest.approx(believed.focal_px * 1.01, rel=1e-12)
+
+
+def test_a_calibrated_tracker_knows_how_far_the_chip_stands_from_a_focused_lens() -> None:
+    """Reference §1.2: 35 mm at 33 in is 36.53 mm, whose 1,600 pixels of 4 um see 10.01 deg."""
+    believed = onboard_model.believed_camera(loader.load("afit_simsat"))
+    assert believed.focal_px * 4e-3 == pytest.approx(36.53, abs=5e-3)
+    assert np.degrees(2 * np.arctan(800 / believed.focal_px)) == pytest.approx(10.01, abs=5e-3)
+
+
+def test_the_shutter_s_smear_counts_for_saturation_and_noise() -> None:
+    """A sky of 24,000 e- smears to half as much again in 493 rows of 40 us: stars that fit a well no longer do."""
+    bright = QUIET_SKY | {
+        "background": "[{kind: uniform, e_s: 600000}]",
+        "light.limit_mag": "4",
+        "motion.rate_deg_s": "[0, 0, 0]",
+        "camera.detector.noise": "true",
+    }
+    plain, shifted = (
+        exposure.render_frame(run.prepare(loader.load("shefex2", bright | {"camera.shutter": shutter})), 0)[
+            1
+        ].seen
+        for shutter in ("{kind: global}", '{kind: frame_transfer, row_time: "40 us"}')
+    )
+    assert not plain.saturated.all()
+    assert shifted.saturated.sum() > plain.saturated.sum()
+    smeared = (24_000 * (1 + 492 * 40e-6 / 0.04) + 0.8) / 24_000.8
+    faint = np.argmin(plain.electrons)
+    assert (plain.snr[faint] / shifted.snr[faint]) ** 2 == pytest.approx(smeared, rel=0.02)
+
+
+# Exposure control
+
+COMA = {"motion.start": "{ra_deg: 190, dec_deg: 25}", "motion.rate_deg_s": "[0, 0, 0]"}  # no bright stars
+
+
+def controlled(frames: int, start: str, control: str, **more: str) -> Testbed:
+    given = {"exposure.frames": str(frames), "exposure.time": start, "tracker.exposure_control": control}
+    return prepared("shefex2", **(COMA | given | more))
+
+
+def exposures_ms(shots: list[run.FrameResult]) -> list[float]:
+    return [1e3 * shot.frame.exposure_s for shot in shots]
+
+
+def test_an_exposure_too_short_for_stars_grows_until_there_are_four() -> None:
+    shots = shots_of(controlled(10, "1 ms", "{mean_dn: 150}"))
+    enough = next(n for n, shot in enumerate(shots) if len(shot.report.centroids) >= 4)
+    assert 1 <= enough < 9
+    grown = 1.0 + 2.0 * np.minimum(np.arange(10), enough)
+    assert exposures_ms(shots) == pytest.approx(list(grown), abs=1e-9)
+    assert all(len(shot.report.centroids) >= 4 for shot in shots[enough:])
+    assert error_deg(shots[-1].report.attitude, shots[-1].truth) < 10 / 60
+
+
+def test_a_frame_is_exposed_for_as_long_as_it_was_told() -> None:
+    """It opens on time, its truth is that of its own middle, and its glare is its own: 1e5 e-/s."""
+    glare = "[{kind: uniform, e_s: 1e5}]"
+    lab = controlled(3, "4 ms", "{mean_dn: 1000, least_stars: 1000}", background=glare)
+    shots = shots_of(lab)
+    assert exposures_ms(shots) == pytest.approx([4, 6, 8], abs=1e-9)
+    for n, shot in enumerate(shots):
+        assert (
+            shot.frame.t_mid_s == shot.truth.t_s == pytest.approx(0.1 + n * 0.1 + (2 + n) * 1e-3, abs=1e-12)
+        )
+        gathered_dn = 1e5 * shot.frame.exposure_s / lab.scene.camera.detector.gain_e_dn
+        offset_dn = lab.scene.camera.detector.offset_dn
+        assert np.median(shot.frame.image_dn) == pytest.approx(offset_dn + gathered_dn, abs=1.0)
+
+
+def test_a_bright_body_shortens_the_exposure_and_turning_away_restores_the_stars() -> None:
+    """A body at the baffle's edge while the camera turns by 6.4 degrees away from it, its light gone after four."""
+    body = "[{kind: stray, ra_deg: 190, dec_deg: 5, angle_deg: [0, 23.9, 24, 180], pst: [4e-6, 4e-6, 0, 0]}]"
+    away = {"motion__rate_deg_s": "[2, 0, 0]", "background": body}
+    shots = shots_of(controlled(33, "24 ms", "{mean_dn: 150}", **away))
+    told, mean_dn = exposures_ms(shots), np.array([shot.frame.image_dn.mean() for shot in shots])
+    gone = int(np.argmax(mean_dn < 70))
+    assert 15 < gone < 25  # four degrees at 2 deg/s, ten frames a second
+    # In its light every frame above the reference is followed by one a step shorter, down to the least.
+    assert told[1] == pytest.approx(22)
+    assert min(told[:gone]) < 5
+    for n in range(gone):
+        assert (mean_dn[n] > 150) == (told[n + 1] < told[n])
+    # After that it grows to what four stars take, and stays.
+    assert told[-1] == told[-5] > min(told)
+    assert [shot.report.attitude.status for shot in shots[-5:]] == ["solved"] * 5
+    assert not any(shot.report.attitude.solved for shot in shots[5:gone])
+
+
+def test_frames_taken_in_flight_are_taken_again_with_the_same_exposures() -> None:
+    """For the filter frames are taken in flight; the run shows the very same, and one that flies anew agrees."""
+    flight = {"vehicle__imu": "{}", "filter": "{start_deg: 0.1}", "motion__control": "none"}
+    growing = "{mean_dn: 4000, least_stars: 100000, step: 1 ms, longest: 7 ms, overexposed_objects: 100000}"
+    exposure = '{time: "4 ms", rate_hz: 5, frames: 5}'
+    flight |= {"motion__manoeuvre": "[]", "exposure": exposure, "tracker__exposure_control": growing}
+    lab = prepared("afit_simsat", **flight)
+    assert list(lab.exposures_s.values()) == pytest.approx([4e-3, 5e-3, 6e-3, 7e-3, 7e-3], abs=1e-12)
+    assert sorted(lab.reports) == list(
+        range(5)
+    )  # the flight lasts until the longest exposure of the last frame
+    shots = shots_of(lab)
+    assert [shot.frame.exposure_s for shot in shots] == list(lab.exposures_s.values())
+    anew = shots_of(replace(lab, reports={}, exposures_s={}))
+    assert exposures_ms(anew) == exposures_ms(shots)
+    for shot, other in zip(shots, anew, strict=True):
+        np.testing.assert_array_equal(shot.frame.image_dn, other.frame.image_dn)
+        gap_px = shot.report.centroids.xy_px - other.report.centroids.xy_px
+        assert np.abs(gap_px).max() < 1e-6
+
+
+# As it happens.
+
+
+@pytest.mark.parametrize("name", ["simsat_bump", "shefex2"])
+def test_frames_as_they_happen_are_those_of_the_whole_flight(name: str) -> None:
+    """To the last bit, though the flight before them is forgotten: with the filter in the loop, and flown alone."""
+    loaded = loader.load(name, {"exposure.frames": "6"})
+    whole = run.run(run.prepare(loaded), testbed.tracker(testbed.build_testbed(loaded)))
+    lab = testbed.build_testbed(loaded)
+    as_it_happens = run.live(lab, testbed.tracker(lab))
+    for shot, look in zip(whole, as_it_happens, strict=True):
+        np.testing.assert_array_equal(look.frame.image_dn, shot.frame.image_dn)
+        assert look.frame.t_mid_s == shot.frame.t_mid_s
+        assert (look.truth.cam_from_lab * shot.truth.cam_from_lab.inv()).magnitude() == 0
+        assert look.report is not None
+        assert look.report.attitude.status == shot.report.attitude.status
+
+
+def test_a_flight_that_forgets_is_the_same_flight() -> None:
+    """Nothing of it depends on how much is kept; what is older is gone."""
+    loaded = loader.load("simsat_slew", {"exposure.frames": "3"})
+    lab = testbed.build_testbed(loaded)
+    long, short = ClosedLoop(lab), ClosedLoop(lab, forgets=True)
+    while long.flight.steps_left:
+        long.tick(10)
+        short.tick(10)
+    assert len(short.flight.states) < len(long.flight.states) / 4
+    kept = short.flight.knots(short.flight.first)
+    for one, other in zip(kept, long.flight.knots(short.flight.first), strict=True):
+        np.testing.assert_array_equal(one, other)
