@@ -28,15 +28,16 @@ OURS = "what skysim itself has written, for its own process or folder"
 SHIPPED = "a file that comes along, each of which a test reads"
 SOURCES = "reads bytes for their digest alone"
 OUT_OF_REACH = {
-    "skysim.apps.cli.options.load": "hands a scene's name on to `scene.load`",
+    "skysim.apps.cli.options.load": "hands a scene's name on to `loader.load`",
+    "skysim.scene.loader.load_scene": "the same",
     "skysim.camera.detector.detector.read_out": "a chip's electrons, no file",
     "skysim.apps.gui.worker.export.files": "copies a run's files",
     "skysim.apps.gui.page.panels.monte_carlo.TrialPanel.file": OURS,
-    "skysim.apps.gui.worker.study_process.monte_carlo": "values of the page's form, which `scene.load` has taken before",
+    "skysim.apps.gui.worker.study_process.monte_carlo": "values of the page's form, which `loader.load` has taken before",
     "skysim.core.images.LiveCamera.__init__": "a device, decoded by OpenCV; tests/apps/test_plate_solver.py",
     "skysim.experiments.papers.published.read": SHIPPED,
     "skysim.sources.photometry.stellar_sequence": SHIPPED,
-    "skysim.tracking.external.process.Program.exchange": "needs a process; a line of it is target `answers`; tests/tracking/test_interface.py",
+    "skysim.tracking.external.process.Program.exchange": "needs a process; a line of it is target `answers`",
     "skysim.tracking.external.process.Program.read": "the same line",
     "skysim.results.report.write_page": "takes a picture of ours into a page",
     "skysim.experiments.study.setups.code_version": SOURCES,

@@ -135,7 +135,9 @@ def test_a_film_that_lost_frames_is_refused(
             if self.frames < 3:
                 self.film.write(image)
 
-    monkeypatch.setattr("skysim.export.cv2.VideoWriter", type("F", (Forgetful,), {"fourcc": film.fourcc}))
+    monkeypatch.setattr(
+        "skysim.results.files.export.cv2.VideoWriter", type("F", (Forgetful,), {"fourcc": film.fourcc})
+    )
     with pytest.raises(InputError, match=r"frames\.mp4: OpenCV wrote 2 of 3 frames"):
         export.export(flown, ["video"], tmp_path, lambda items, *_: iter(items))
     assert list(tmp_path.iterdir()) == []

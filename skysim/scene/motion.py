@@ -34,11 +34,11 @@ def where_it_starts(value: Any) -> str:
     """Which of the two starts is meant, so that a slip in one is not answered with the other's keys."""
     keys = value if isinstance(value, dict) else ()
     sky = isinstance(value, PointingConfig) or any(key in keys for key in ("ra_deg", "dec_deg"))
-    return "Pointing" if sky else "Attitude"
+    return "PointingConfig" if sky else "AttitudeConfig"
 
 
 Start = Annotated[
-    Annotated[AttitudeConfig, Tag("Attitude")] | Annotated[PointingConfig, Tag("Pointing")],
+    Annotated[AttitudeConfig, Tag("AttitudeConfig")] | Annotated[PointingConfig, Tag("PointingConfig")],
     Discriminator(where_it_starts),
 ]
 

@@ -325,10 +325,10 @@ def test_the_mean_of_many_frames_is_the_frame_without_noise() -> None:
 
 DRAW = """
 import sys, numba, numpy as np
-from skysim.camera import Camera
+from skysim.scene.camera import CameraConfig
 from skysim.camera.detector.detector import Chip, expose
 numba.set_num_threads(int(sys.argv[1]))
-made = Chip.of(Camera.model_validate(eval(sys.argv[2])))
+made = Chip.of(CameraConfig.model_validate(eval(sys.argv[2])))
 frames = [expose(np.full((64, 48), 100, np.float32), 0.05, made, np.random.default_rng(s)) for s in (4, 5)]
 sys.stdout.buffer.write(np.array(frames).tobytes())
 """

@@ -212,7 +212,11 @@ def test_the_reference_holds_every_module_that_a_page_names() -> None:
     text = "".join(path.read_text(encoding="utf-8") for path in all_pages())
     named = {name.replace("/", ".") for name in re.findall(r"\b((?:skysim|estimator)/[\w/]+)\.py", text)}
     named |= set(re.findall(r"^from ((?:skysim|estimator)\.[\w.]+) import", text, re.M))
-    named = {name for name in named if not name.startswith(("skysim.apps.gui.", "skysim.apps.cli.", "skysim.experiments.papers."))}
+    named = {
+        name
+        for name in named
+        if not name.startswith(("skysim.apps.gui.", "skysim.apps.cli.", "skysim.experiments.papers."))
+    }
     reference = "".join(path.read_text(encoding="utf-8") for path in (DOCS / "reference").glob("*.md"))
     assert len(named) > 90
     assert sorted(named - set(re.findall(r"^::: (\S+)$", reference, re.M))) == []

@@ -65,7 +65,9 @@ def test_a_key_s_row_says_what_it_takes_and_what_stands_for_it() -> None:
     assert "| `rate_hz` | number, > 0 | needed |" in exposure
     assert '| `led_sigma` | a length such as "35 mm" or "48 in", ≥ 0 m, ≤ 0.1 m | `0 m` |' in survey
     assert "| `surface_seed` | whole number, ≥ 0 or null | `null` |" in survey
-    assert "| `exposure` | [ExposureConfig][skysim.scene.scene.ExposureConfig] | needed |" in keys.table(Scene)
+    assert "| `exposure` | [ExposureConfig][skysim.scene.scene.ExposureConfig] | needed |" in keys.table(
+        Scene
+    )
 
 
 def test_every_section_of_a_file_has_a_page_to_stand_on() -> None:

@@ -52,8 +52,8 @@ def public() -> Iterator[str]:
 
     Left out: what numba compiles, which is called from within these; and protocols, which do nothing.
     """
-    for info in pkgutil.iter_modules(estimator.__path__):
-        module = importlib.import_module(f"estimator.{info.name}")
+    for info in pkgutil.walk_packages(estimator.__path__, "estimator."):
+        module = importlib.import_module(info.name)
         for name, one in vars(module).items():
             if name.startswith("_") or getattr(one, "__module__", None) != module.__name__:
                 continue

@@ -69,7 +69,7 @@ def test_the_predicted_errors_are_those_of_least_squares() -> None:
     """Attitudes and plates of stars of unequal errors, by Monte Carlo: 2,000 draws tell sigma to 1.6 %."""
     rng = np.random.default_rng(2)
     camera = oracles.load(SHEFEX, "tetra3rs", 1).camera
-    believed = oracles.onboard.calibration(camera)
+    believed = oracles.onboard_model.calibration(camera)
     xy_px = rng.uniform((0, 0), (camera.width_px - 1, camera.height_px - 1), (20, 2))
     sigma_px = rng.uniform(0.05, 0.2, 20)
     rays = believed.rays(xy_px)

@@ -251,7 +251,11 @@ def test_a_bad_override_is_one_line_and_blamed_on_the_option(key: str, value: st
 @pytest.mark.parametrize(
     ("right", "wrong", "says"),
     [
-        ("falloff: inverse_square", "falloff: cubic", "light.led.falloff: 'cubic' is none of inverse_square"),
+        (
+            "falloff: inverse_square",
+            "falloff: cubic",
+            "light.led.falloff: 'cubic' is not allowed; it should be 'inverse_square'",
+        ),
         ("  kind: dome", "  kind: domes", "light.kind: 'domes' is none of dome, stars, bench"),
         (
             "kind: ellipsoid",

@@ -305,7 +305,7 @@ def test_exposures_are_told_frame_by_frame(skysim: Skysim, tmp_path: Path) -> No
         (["shefex2", "--set", "exposure.time=nan s"], "nan is not a finite number"),
         (
             ["afit_simsat", "--set", "light.led.falloff=cubic"],
-            "light.led.falloff: 'cubic' is none of inverse_square",
+            "light.led.falloff: 'cubic' is not allowed; it should be 'inverse_square'",
         ),
         (
             ["afit_simsat", "--set", "motion.start={ra_deg: 3, dec_deg: 4}"],
@@ -370,7 +370,10 @@ def test_a_scene_file_s_slip_is_told_with_its_line(skysim: Skysim, tmp_path: Pat
     path.write_text((SCENES / "afit_simsat.yaml").read_text().replace("inverse_square", "cubic"))
     line = path.read_text()[: path.read_text().index("falloff:")].count("\n") + 1
     said = skysim("render", path).one_line()
-    assert said == f"skysim: light.led.falloff: 'cubic' is none of inverse_square ({path}, line {line})"
+    assert (
+        said
+        == f"skysim: light.led.falloff: 'cubic' is not allowed; it should be 'inverse_square' ({path}, line {line})"
+    )
 
 
 def test_what_is_not_yaml_is_one_line(skysim: Skysim, tmp_path: Path) -> None:

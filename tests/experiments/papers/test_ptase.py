@@ -13,7 +13,6 @@ from estimator.catalog.pair_index import PairIndex
 from skysim.apps.cli.main import app
 from skysim.core.units import ARCSEC_RAD
 from skysim.experiments.papers.ptase import ground, monte_carlo
-from skysim.experiments.papers.published import experiments
 from skysim.results.metrics import rms
 
 

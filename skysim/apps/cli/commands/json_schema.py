@@ -12,12 +12,13 @@ from typing import Any
 from pydantic import BaseModel
 
 from skysim.experiments.study.plan import Study
+from skysim.scene.camera import CameraConfig
 from skysim.scene.scene import STEM, Scene
 
 KINDS: Mapping[str, type[BaseModel]] = {"scene": Scene, "study": Study}
 BESIDE: Mapping[str, dict[str, Any]] = {  # keys that are taken out before a file is checked
-    "Scene": {"base": {"type": "string", "description": "another scene, by name or beside this one"}},
-    "Camera": {
+    Scene.__name__: {"base": {"type": "string", "description": "another scene, by name or beside this one"}},
+    CameraConfig.__name__: {
         "preset": {"type": "string", "description": "a file of data/cameras: what is left out is from there"},
         "calibration": {
             "type": "string",
