@@ -7,6 +7,7 @@ other schema.
 from __future__ import annotations
 
 import datetime
+import html
 from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, model_validator
@@ -144,6 +145,26 @@ class Scene(ConfigModel):
                 f"vehicle.imu.rate_hz: {imu.rate_hz:g} Hz is no multiple of motion.control.rate_hz {rate_hz:g} Hz"
             )
         return self
+
+    def _repr_html_(self) -> str:
+        """For notebooks: what the scene has, one row a section."""
+        camera, exposure = self.camera, self.exposure
+        rows = [
+            ("name", self.name),
+            ("light", self.light.kind),
+            ("vehicle", self.vehicle.mount),
+            (
+                "camera",
+                f"{self.camera.width_px} × {self.camera.height_px} px, f = {1e3 * self.camera.focal_length_m:g} mm",
+            ),
+            (
+                "exposure",
+                f"{exposure.frames} of {1e3 * exposure.time_s:g} ms at {exposure.rate_hz:g} Hz",
+            ),
+            ("tracker", self.tracker.name),
+        ]
+        cells = "".join(f"<tr><th>{key}</th><td>{html.escape(str(value))}</td></tr>" for key, value in rows)
+        return f"<h4>{html.escape(self.title)}</h4><table>{cells}</table>"
 
     @property
     def control_rate_hz(self) -> float:
