@@ -74,7 +74,9 @@ def paint(light: NDArray, xy: NDArray, flux: NDArray, ends: NDArray, psf_px: flo
                     light[row, column] += flux[n] / steps * down * across / (2 * np.pi * psf_px**2)
 
 
-def photograph(sight: Sight, stars: catalog.StarList, rng: np.random.Generator) -> tuple[NDArray, Rotation]:
+def photograph(
+    sight: Sight, stars: catalog.StarCatalog, rng: np.random.Generator
+) -> tuple[NDArray, Rotation]:
     """One frame and the attitude at mid-exposure."""
     camera, truth = sight.camera, Rotation.random(rng=rng)
     xy = camera.pixels(truth.apply(stars.vectors))
@@ -90,7 +92,7 @@ def photograph(sight: Sight, stars: catalog.StarList, rng: np.random.Generator) 
 Solve = Callable[[NDArray], Rotation | None]
 
 
-def ours(sight: Sight, stars: catalog.StarList) -> Solve:
+def ours(sight: Sight, stars: catalog.StarCatalog) -> Solve:
     """Our tracker as it comes, told the camera, its gain and its zero point: the camera is calibrated."""
     settings = Settings(
         gain_e_dn=sight.gain_e,
@@ -102,7 +104,7 @@ def ours(sight: Sight, stars: catalog.StarList) -> Solve:
     return lambda image: tracker.solve(image).attitude.cam_from_ref
 
 
-def tetra3rs(sight: Sight, stars: catalog.StarList, fast: bool) -> Solve | None:
+def tetra3rs(sight: Sight, stars: catalog.StarCatalog, fast: bool) -> Solve | None:
     """tetra3rs with its own catalogue, where it is installed (extra `oracle`), on one thread."""
     if importlib.util.find_spec("tetra3rs") is None:
         return None

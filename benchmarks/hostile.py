@@ -262,7 +262,7 @@ def camera() -> Camera:
 
 
 @lru_cache
-def stars() -> catalog.StarList:
+def stars() -> catalog.StarCatalog:
     """As the solvers see them, who leave aberration out of pictures without a date."""
     return catalog.brighter(catalog.read(CATALOGUES / "hipparcos_hp6.5.ecsv"), 7.0)
 

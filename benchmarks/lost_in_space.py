@@ -82,7 +82,7 @@ class Field:
     star: Ints
 
 
-def sky(limit_mag: float) -> catalog.StarList:
+def sky(limit_mag: float) -> catalog.StarCatalog:
     """The stars of a row. Builds the deeper catalogue where the repository's does not reach."""
     path = CATALOGUES / f"{DEEP}.ecsv"
     if not path.is_file():
@@ -93,13 +93,13 @@ def sky(limit_mag: float) -> catalog.StarList:
     return stars.take(np.setdiff1d(np.arange(len(stars)), fainter))
 
 
-def fields(work: Workload, stars: catalog.StarList, count: int, seed: int) -> Iterator[Field]:
+def fields(work: Workload, stars: catalog.StarCatalog, count: int, seed: int) -> Iterator[Field]:
     """Random frames of a workload."""
     for n in range(count):
         yield field(work, stars, np.random.default_rng([seed, n]))
 
 
-def field(work: Workload, stars: catalog.StarList, rng: np.random.Generator) -> Field:
+def field(work: Workload, stars: catalog.StarCatalog, rng: np.random.Generator) -> Field:
     """One random frame."""
     camera, truth = work.camera, Rotation.random(rng=rng)
     xy = camera.pixels(truth.apply(stars.vectors))
@@ -119,7 +119,7 @@ def field(work: Workload, stars: catalog.StarList, rng: np.random.Generator) -> 
     return Field(Centroids(xy[order], sigma, 10 ** (-0.4 * mag[order])), truth, names[order])
 
 
-def oracle(work: Workload, stars: catalog.StarList, one: Field) -> Rotation | None:
+def oracle(work: Workload, stars: catalog.StarCatalog, one: Field) -> Rotation | None:
     """The attitude from true names, where there are three."""
     known = one.star >= 0
     if known.sum() < 3:
@@ -132,7 +132,7 @@ def oracle(work: Workload, stars: catalog.StarList, one: Field) -> Rotation | No
 Solve = Callable[[Field], Rotation | None]
 
 
-def ours(work: Workload, stars: catalog.StarList, identifier: str) -> Solve:
+def ours(work: Workload, stars: catalog.StarCatalog, identifier: str) -> Solve:
     """Our tracker with one of its identifiers."""
     settings = Settings(
         identifier=identifier, centroid_sigma_px=0.0, field_stars=1e9, merge_px=0.0, zero_point_mag=0.0

@@ -12,9 +12,10 @@ _PUBLIC = {
     "DomeTracker": ("trackers.dome_tracker", "DomeTracker"),
     "ImageError": ("core.errors", "ImageError"),
     "Settings": ("trackers.pipeline", "Settings"),
+    "StarCatalog": ("catalog.catalog", "StarCatalog"),
     "StarTracker": ("trackers.star_tracker", "StarTracker"),
     "TrackingMode": ("trackers.tracking_mode", "TrackingMode"),
-    "radecroll_rad": ("attitude.solvers", "radecroll_rad"),
+    "ra_dec_roll_rad": ("core.types", "ra_dec_roll_rad"),
 }
 __all__ = list(_PUBLIC)
 

@@ -8,8 +8,8 @@ import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 
-from estimator.attitude.solvers import radecroll_rad
 from estimator.core.camera import Camera
+from estimator.core.types import ra_dec_roll_rad
 from skysim.camera.optics import Optics
 from skysim.camera.render import Window, render
 from skysim.core.paths import ROOT
@@ -117,7 +117,7 @@ def test_the_tracker_reads_the_pointing_that_the_simulator_set():
     """Vega in the middle (RA 279.2347, Dec +38.7837), up at position angle -25: said once each way."""
     look = Rotation.from_matrix(hand_made(279.2347, 38.7837, -25.0))
     np.testing.assert_allclose(
-        np.degrees(radecroll_rad(look)), (279.2347, 38.7837, -25.0), rtol=0, atol=1e-10
+        np.degrees(ra_dec_roll_rad(look)), (279.2347, 38.7837, -25.0), rtol=0, atol=1e-10
     )
     assert (look * cam_from_icrs(279.2347, 38.7837, -25.0).inv()).magnitude() < EXACT
 

@@ -114,3 +114,16 @@ def test_a_study_runs_and_is_continued(tmp_path) -> None:
     assert list(first.table()["rate_deg_s"]) == [0, 1]
     again = skysim.run_study("rate_smear", changes, out=tmp_path, workers=1)
     assert list(again.table()["identified"]) == list(first.table()["identified"])
+
+
+def test_a_tracker_of_one_line_solves_a_frame(run) -> None:
+    height_px, width_px = run[0].image.shape
+    camera = estimator.Camera.from_fov(width_px, height_px, fov_deg=14.87)
+    assert camera.fov_rad == pytest.approx(np.radians(14.87), rel=1e-12)
+    tracker = estimator.StarTracker.for_sky(camera, limit_mag=6, date="2012-06-22", focal_uncertainty=0.05)
+    found = tracker.solve(run[0].image).attitude
+    assert found.ra_dec_roll_deg[:2] == pytest.approx(run[0].row.truth_deg[:2], abs=0.02)
+    with pytest.raises(estimator.ImageError, match="either"):
+        estimator.Camera.from_fov(1024, 1024)
+    with pytest.raises(estimator.ImageError, match="ISO 8601"):
+        estimator.StarTracker.for_sky(camera, date="yesterday")

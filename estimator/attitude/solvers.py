@@ -111,17 +111,3 @@ def covariance(vectors_cam: Floats, sigma_rad: Floats, solver: str = "quest") ->
         pair = list(kernel.best_pair(cam, weight))
         cam, weight = cam[pair], weight[pair]
     return kernel.spread(cam, weight)
-
-
-def radecroll_rad(cam_from_icrs: Rotation) -> tuple[float, float, float]:
-    """Right ascension, declination of the boresight, and the position angle of the image's up direction.
-
-    The roll is measured at the boresight from north through east; radians, ra in [0, 2 pi), roll in (-pi, pi].
-    """
-    _, down, sight = cam_from_icrs.as_matrix()
-    ra = np.arctan2(sight[1], sight[0]) % (2 * np.pi) % (2 * np.pi)  # once more: -1e-17 % 2 pi is 2 pi
-    dec = np.arctan2(sight[2], np.hypot(sight[0], sight[1]))
-    north = np.array([-np.sin(dec) * np.cos(ra), -np.sin(dec) * np.sin(ra), np.cos(dec)])
-    east = np.array([-np.sin(ra), np.cos(ra), 0.0])
-    # A sine of -0 would make a half turn -pi.
-    return float(ra), float(dec), float(np.arctan2(0.0 - down @ east, -down @ north))

@@ -23,7 +23,7 @@ from estimator.calibration import bundle_adjustment as ba
 from estimator.calibration.bundle_adjustment import Bundle, Sightings
 from estimator.calibration.dome_survey import CAUCHY, GATE, MEDIAN_RADIUS
 from estimator.calibration.magnitude_zero import MagnitudeZero, magnitude_zero
-from estimator.catalog.catalog import StarList
+from estimator.catalog.catalog import StarCatalog
 from estimator.core.arrays import Floats, Ints
 from estimator.core.camera import Camera
 from estimator.core.types import Attitude, Centroids
@@ -140,7 +140,7 @@ def calibrate(frames: Sequence[StarFrame], camera_start: Camera, belief: Belief 
 class Tracker(Protocol):
     """What identifies: a StarTracker, or anything else with a star list and an answer to centroids."""
 
-    stars: StarList
+    stars: StarCatalog
 
     def solve_centroids(self, centroids: Centroids) -> Attitude: ...
 

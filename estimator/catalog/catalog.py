@@ -24,7 +24,7 @@ TT_MINUS_UTC_DAY = 69.184 / 86400  # since 2017; the leap seconds before change 
 
 
 @dataclass(frozen=True, slots=True)
-class StarList:
+class StarCatalog:
     """Stars as the file gives them, brightest first, at the epoch J1991.25 in the ICRS.
 
     id : (N,); vectors : (N, 3) unit; drift_rad_yr : (N, 3) proper motion, tangent; parallax_rad : (N,);
@@ -40,9 +40,9 @@ class StarList:
     def __len__(self) -> int:
         return len(self.id)
 
-    def take(self, which: NDArray[Any]) -> StarList:
+    def take(self, which: NDArray[Any]) -> StarCatalog:
         """The chosen stars, by mask or index."""
-        return StarList(*(getattr(self, name)[which] for name in self.__slots__))
+        return StarCatalog(*(getattr(self, name)[which] for name in self.__slots__))
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +64,7 @@ def on_earth(time_utc: datetime.datetime) -> Observer:
     return Observer(2000 + days / 365.25, barycentric["p"], barycentric["v"] * metres_per_second)
 
 
-def read(path: str | Path) -> StarList:
+def read(path: str | Path) -> StarCatalog:
     """Read a catalogue file: ECSV with hip, ra_deg, dec_deg, pm_ra_mas_yr, pm_dec_mas_yr, parallax_mas, v_mag.
 
     Raises ImageError with one line if it cannot be read.
@@ -76,6 +76,17 @@ def read(path: str | Path) -> StarList:
 
 
 COLUMNS = ("hip", "ra_deg", "dec_deg", "pm_ra_mas_yr", "pm_dec_mas_yr", "parallax_mas", "v_mag")
+
+
+def hipparcos() -> StarCatalog:
+    """The Hipparcos-2 subset to Hp 6.5 that comes with the package.
+
+    It lies in data/catalogues beside the package in a checkout, and in skysim/data/catalogues of an installed one.
+    Raises ImageError where neither has it.
+    """
+    root = Path(__file__).resolve().parents[2]
+    name = "data/catalogues/hipparcos_hp6.5.ecsv"
+    return read(next((path for path in (root / name, root / "skysim" / name) if path.is_file()), root / name))
 
 
 def columns(path: str | Path, names: Sequence[str], blank: Sequence[str] = ()) -> Floats:
@@ -114,22 +125,22 @@ def from_columns(
     pm_dec_mas_yr: Floats,
     parallax_mas: Floats,
     v_mag: Floats,
-) -> StarList:
+) -> StarCatalog:
     """Directions and their drift from spherical coordinates; pm_ra includes cos(dec)."""
     sa, ca, sd, cd = np.sin(ra_rad), np.cos(ra_rad), np.sin(dec_rad), np.cos(dec_rad)
     vectors = np.column_stack([cd * ca, cd * sa, sd])
     east = np.column_stack([-sa, ca, np.zeros_like(sa)])
     north = np.column_stack([-sd * ca, -sd * sa, cd])
     drift = MAS_RAD * (pm_ra_mas_yr[:, None] * east + pm_dec_mas_yr[:, None] * north)
-    return StarList(hip, vectors, drift, MAS_RAD * parallax_mas, v_mag)
+    return StarCatalog(hip, vectors, drift, MAS_RAD * parallax_mas, v_mag)
 
 
-def at_epoch(stars: StarList, epoch_yr: float) -> Floats:
+def at_epoch(stars: StarCatalog, epoch_yr: float) -> Floats:
     """(N, 3) barycentric unit vectors at a Julian year: R + (t - t0) dR/dt, renormalised."""
     return unit(stars.vectors + (epoch_yr - EPOCH_YR) * stars.drift_rad_yr)
 
 
-def apparent(stars: StarList, observer: Observer) -> Floats:
+def apparent(stars: StarCatalog, observer: Observer) -> Floats:
     """(N, 3) unit vectors as an observer sees them.
 
     Proper motion; parallax, R - pi r; the Sun's bending of light, 2 G M / (c^2 r) cot(psi / 2) away from it;
@@ -152,14 +163,14 @@ def unit(vectors: Floats) -> Floats:
     return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
 
 
-def merge_doubles(stars: StarList, closer_than_rad: float) -> StarList:
+def merge_doubles(stars: StarCatalog, closer_than_rad: float) -> StarCatalog:
     """Replace stars too close to be told apart by one at their centre of light, as bright as all together."""
     groups = close_groups(stars.vectors, closer_than_rad)
     together = np.column_stack([stars.vectors, stars.drift_rad_yr, stars.parallax_rad])
     middle, v_mag = light_centres(together, stars.v_mag, groups)
     # The brightest of each group comes first and gives the name.
     _, first = np.unique(groups, return_index=True)
-    result = StarList(stars.id[first], unit(middle[:, :3]), middle[:, 3:6], middle[:, 6], v_mag)
+    result = StarCatalog(stars.id[first], unit(middle[:, :3]), middle[:, 3:6], middle[:, 6], v_mag)
     return result.take(np.argsort(result.v_mag, kind="stable"))
 
 
@@ -182,12 +193,12 @@ def close_groups(vectors: Floats, closer_than_rad: float) -> Ints:
     return connected_components(graph, directed=False)[1].astype(np.int64)
 
 
-def brighter(stars: StarList, limit_mag: float) -> StarList:
+def brighter(stars: StarCatalog, limit_mag: float) -> StarCatalog:
     """Stars to a limiting V magnitude."""
     return stars.take(stars.v_mag <= limit_mag)
 
 
-def limit_for_density(stars: StarList, field_sr: float, wanted: float) -> float:
+def limit_for_density(stars: StarCatalog, field_sr: float, wanted: float) -> float:
     """The magnitude to which a field of so many steradians holds `wanted` stars on average."""
     count = int(np.clip(wanted * 4 * np.pi / field_sr, 1, len(stars)))
     return float(np.sort(stars.v_mag)[count - 1])

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.catalog import spatial_grid
-from estimator.catalog.catalog import StarList
+from estimator.catalog.catalog import StarCatalog
 from estimator.catalog.spatial_grid import Cells, within
 from estimator.core.arrays import Floats
 from estimator.core.errors import ImageError
@@ -29,12 +29,12 @@ KEPT_MAG = 4.5
 COUNT = 2023
 
 
-def asymmetric(stars: StarList, north_mag: float = NORTH_MAG, south_mag: float = SOUTH_MAG) -> StarList:
+def asymmetric(stars: StarCatalog, north_mag: float = NORTH_MAG, south_mag: float = SOUTH_MAG) -> StarCatalog:
     """Stars to one limit north of the equator and to another south of it: the flight was from the south."""
     return stars.take(stars.v_mag <= np.where(stars.vectors[:, 2] >= 0, north_mag, south_mag))
 
 
-def spread(stars: StarList, apart_rad: float, kept_mag: float = -np.inf) -> StarList:
+def spread(stars: StarCatalog, apart_rad: float, kept_mag: float = -np.inf) -> StarCatalog:
     """The stars to `kept_mag`, and of the others, the brightest first, those with none taken nearer than an angle."""
     order = np.argsort(stars.v_mag, kind="stable")
     vectors = np.ascontiguousarray(stars.vectors[order])
@@ -53,7 +53,7 @@ def _spread(vectors: Floats, known: Cells, kept: int, chord: float) -> NDArray:
     return taken
 
 
-def uniform(stars: StarList, count: int, kept_mag: float = -np.inf) -> StarList:
+def uniform(stars: StarCatalog, count: int, kept_mag: float = -np.inf) -> StarCatalog:
     """So many stars, spread evenly, with all to `kept_mag`; within one of the count, as one distance decides.
 
     Raises ImageError where the list has not so many stars, or more of the bright ones alone.
@@ -68,12 +68,12 @@ def uniform(stars: StarList, count: int, kept_mag: float = -np.inf) -> StarList:
     return spread(stars, low, kept_mag)
 
 
-def chosen(stars: StarList) -> StarList:
+def chosen(stars: StarCatalog) -> StarCatalog:
     """The flown catalogue: 2,023 stars, of the asymmetric one all to 4.5 and the rest spread evenly."""
     return uniform(asymmetric(stars), COUNT, KEPT_MAG)
 
 
-Selection = Callable[[StarList], StarList]
+Selection = Callable[[StarCatalog], StarCatalog]
 CATALOGUES: dict[str, Selection] = {
     "asymmetric": asymmetric,
     "uniform": lambda stars: uniform(stars.take(stars.v_mag <= 5.75), COUNT),

@@ -29,8 +29,18 @@ class Camera:
     distortion: Distortion = (0.0, 0.0, 0.0, 0.0, 0.0)
 
     @classmethod
-    def from_fov(cls, width_px: int, height_px: int, fov_rad: float) -> Camera:
-        """An undistorted camera from the angle between the middles of the left and right edge columns."""
+    def from_fov(
+        cls, width_px: int, height_px: int, fov_rad: float | None = None, *, fov_deg: float | None = None
+    ) -> Camera:
+        """An undistorted camera from its horizontal field of view, in radians or in degrees.
+
+        The field is the angle between the centers of the left and right edge columns: f = (width - 1) / 2 / tan(fov / 2).
+        Raises ImageError unless exactly one of the two is given.
+        """
+        if fov_deg is not None and fov_rad is None:
+            fov_rad = float(np.radians(fov_deg))
+        elif fov_rad is None or fov_deg is not None:
+            raise ImageError("from_fov: takes either fov_rad or fov_deg")
         focal_px = (width_px - 1) / 2 / np.tan(fov_rad / 2)
         return cls(width_px, height_px, float(focal_px), ((width_px - 1) / 2, (height_px - 1) / 2))
 

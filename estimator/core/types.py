@@ -151,6 +151,14 @@ class Attitude:
     def solved(self) -> bool:
         return self.cam_from_ref is not None
 
+    @property
+    def ra_dec_roll_deg(self) -> tuple[float, float, float]:
+        """Boresight's right ascension and declination, and the roll, of an attitude under the stars; NaN unless solved."""
+        if self.cam_from_ref is None:
+            return (float("nan"),) * 3
+        ra, dec, roll = np.degrees(ra_dec_roll_rad(self.cam_from_ref))
+        return float(ra), float(dec), float(roll)
+
 
 @dataclass(frozen=True, slots=True)
 class FilterState:
@@ -175,3 +183,17 @@ class FilterState:
     def sigma_bias_rad_s(self) -> Floats:
         """(3,) in body axes."""
         return np.sqrt(np.diag(self.covariance)[3:])
+
+
+def ra_dec_roll_rad(cam_from_icrs: Rotation) -> tuple[float, float, float]:
+    """Right ascension, declination of the boresight, and the position angle of the image's up direction.
+
+    The roll is measured at the boresight from north through east; radians, ra in [0, 2 pi), roll in (-pi, pi].
+    """
+    _, down, sight = cam_from_icrs.as_matrix()
+    ra = np.arctan2(sight[1], sight[0]) % (2 * np.pi) % (2 * np.pi)  # once more: -1e-17 % 2 pi is 2 pi
+    dec = np.arctan2(sight[2], np.hypot(sight[0], sight[1]))
+    north = np.array([-np.sin(dec) * np.cos(ra), -np.sin(dec) * np.sin(ra), np.cos(dec)])
+    east = np.array([-np.sin(ra), np.cos(ra), 0.0])
+    # A sine of -0 would make a half turn -pi.
+    return float(ra), float(dec), float(np.arctan2(0.0 - down @ east, -down @ north))

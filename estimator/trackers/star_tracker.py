@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -15,6 +16,7 @@ from estimator.attitude.solvers import SOLVERS, covariance
 from estimator.catalog import catalog, pair_index, sky_index
 from estimator.core.arrays import Floats, Ints
 from estimator.core.camera import Camera
+from estimator.core.errors import ImageError
 from estimator.core.types import Attitude, Centroids, StarMatch
 from estimator.identification.chance import ACCEPT_LOG10_CHANCE, MIN_MATCHES, log10_tail
 from estimator.identification.registry import IDENTIFIERS
@@ -49,7 +51,7 @@ class StarTracker:
     def __init__(
         self,
         camera: Camera,
-        stars: catalog.StarList,
+        stars: catalog.StarCatalog,
         vectors: Floats,
         settings: Settings = SETTINGS,
         focal_uncertainty: float = 0.0,
@@ -78,6 +80,36 @@ class StarTracker:
         self.field = np.array(
             [corners[:, 0].min(), corners[:, 0].max(), corners[:, 1].min(), corners[:, 1].max()]
         )
+
+    @classmethod
+    def for_sky(
+        cls,
+        camera: Camera,
+        limit_mag: float = 6.0,
+        date: str | datetime.datetime = "2000-01-01T12:00",
+        *,
+        stars: catalog.StarCatalog | None = None,
+        settings: Settings = SETTINGS,
+        focal_uncertainty: float = 0.0,
+    ) -> StarTracker:
+        """A tracker for the sky as seen from the Earth at a date.
+
+        limit_mag : faintest V magnitude of the on-board catalog
+        date      : UTC, ISO 8601 or datetime: fixes proper motion, parallax and aberration
+        stars     : another catalog than the Hipparcos subset that comes with the package
+
+        Raises ImageError for a date that cannot be read.
+        """
+        if isinstance(date, str):
+            try:
+                date = datetime.datetime.fromisoformat(date)
+            except ValueError:
+                raise ImageError(
+                    f"date: {date!r} is not ISO 8601; allowed: such as 2012-06-22T21:00"
+                ) from None
+        stars = catalog.brighter(stars or catalog.hipparcos(), limit_mag)
+        vectors = catalog.apparent(stars, catalog.on_earth(date))
+        return cls(camera, stars, vectors, settings, focal_uncertainty)
 
     def solve(self, image: NDArray, streak_px: tuple[float, float] | None = None) -> Report:
         """One frame to an attitude. Raises ImageError for bad input; anything else that fails is a status.

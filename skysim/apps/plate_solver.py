@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.attitude.solvers import SOLVERS, radecroll_rad
+from estimator.attitude.solvers import SOLVERS
+from estimator.core.types import ra_dec_roll_rad
 from estimator.catalog import catalog
 from estimator.centroiding.centroid import CENTROIDERS
 from estimator.core.camera import Camera
@@ -70,7 +71,7 @@ class Solver:
 
     fov_deg: float | None
     camera: CameraPart | None
-    stars: catalog.StarList
+    stars: catalog.StarCatalog
     settings: Settings
     time_utc: datetime.datetime | None = None
     calibrated: opencv.Calibration | None = None
@@ -323,7 +324,7 @@ def solution(found: Report) -> dict[str, Any]:
     assert attitude.match is not None
     camera = attitude.camera
     assert camera is not None
-    ra, dec, roll = np.degrees(radecroll_rad(at_middle(camera) * attitude.cam_from_ref))
+    ra, dec, roll = np.degrees(ra_dec_roll_rad(at_middle(camera) * attitude.cam_from_ref))
     return {
         "ra_deg": float(ra),
         "dec_deg": float(dec),

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from estimator.attitude.solvers import radecroll_rad
+from estimator.core.types import ra_dec_roll_rad
 from skysim.core.types import Mount, Row
 from skysim.core.units import ARCSEC_RAD
 from skysim.results import metrics
@@ -26,7 +26,7 @@ def angle_names(scene: Scene) -> tuple[str, str, str]:
 def angles_deg(cam_from_lab: Rotation, scene: Scene, mount: Mount) -> tuple[float, float, float]:
     """The camera's RA, Dec, roll under the stars; the vehicle's 3-2-1 roll, pitch, yaw under the dome."""
     if isinstance(scene.light, StarsConfig):
-        ra, dec, roll = np.degrees(radecroll_rad(cam_from_lab))
+        ra, dec, roll = np.degrees(ra_dec_roll_rad(cam_from_lab))
         return float(ra), float(dec), float(roll)
     lab_from_body = cam_from_lab.inv() * mount.cam_from_body
     yaw, pitch, roll = lab_from_body.as_euler("ZYX", degrees=True)

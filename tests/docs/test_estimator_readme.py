@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from estimator import Camera, radecroll_rad
+from estimator import Camera, ra_dec_roll_rad
 from estimator.attitude.solvers import SOLVERS
 from estimator.catalog import catalog
 from estimator.centroiding.centroid import CENTROIDERS
@@ -46,7 +46,7 @@ def test_five_lines_solve_an_image(tmp_path: Path, monkeypatch, capsys) -> None:
     found = names["attitude"].cam_from_ref
     # Ten stars of a tenth of a pixel of 54": some tens of arcseconds, roll ten times that.
     assert (found * truth.inv()).magnitude() < 2e-3
-    assert radecroll_rad(found)[0] == pytest.approx(radecroll_rad(truth)[0], abs=3e-4)
+    assert ra_dec_roll_rad(found)[0] == pytest.approx(ra_dec_roll_rad(truth)[0], abs=3e-4)
 
 
 @pytest.mark.parametrize(

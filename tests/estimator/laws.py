@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 import estimator
 from estimator.catalog import catalog
-from estimator.catalog.catalog import StarList
+from estimator.catalog.catalog import StarCatalog
 from estimator.core.arrays import Floats
 
 EXAMPLES = int(os.environ.get("LAW_EXAMPLES", "8"))
@@ -88,7 +88,7 @@ def units(rng: np.random.Generator, count: int) -> Floats:
     return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
 
 
-def drawn(rng: np.random.Generator, count: int = 60) -> StarList:
+def drawn(rng: np.random.Generator, count: int = 60) -> StarCatalog:
     """Stars anywhere, moving and near by more than real ones, brightest first."""
     hip, ra, dec = np.arange(1, count + 1), rng.uniform(0, 7, count), np.arcsin(rng.uniform(-1, 1, count))
     motion = rng.normal(0, 1000, (2, count))

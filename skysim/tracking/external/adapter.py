@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from estimator.attitude.dome_map import LedMap, Lever
-from estimator.catalog.catalog import StarList
+from estimator.catalog.catalog import StarCatalog
 from estimator.core.camera import Camera
 from estimator.core.types import Attitude, Centroids
 from estimator.trackers.pipeline import Report, Settings
@@ -82,7 +82,7 @@ def set_up(scene: scenes.Scene, camera: Camera, settings: Settings, lights: Star
     )
 
 
-def stars(catalogue: StarList, direction: Floats) -> Stars:
+def stars(catalogue: StarCatalog, direction: Floats) -> Stars:
     """The on-board catalogue."""
     return Stars(catalogue.id, direction, catalogue.v_mag)
 

@@ -16,9 +16,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from estimator.attitude.solvers import SOLVERS, radecroll_rad
+from estimator.attitude.solvers import SOLVERS
 from estimator.catalog import ptase
 from estimator.core.arrays import Ints
+from estimator.core.types import ra_dec_roll_rad
 from estimator.identification.published.fialho import VERSIONS, MagnitudeMatch, fialho_2, fialho_4
 from estimator.identification.registry import IDENTIFIERS
 from skysim.core import files, images
@@ -143,7 +144,7 @@ def drawn_at(folder: Path, *sets: str) -> Floats:
         if "cam_from_lab" in line
     ]
     xyzw = np.array(json.loads(told[0][told[0].index("[") : told[0].index("]") + 1]))
-    return np.degrees(radecroll_rad(Rotation.from_quat(xyzw)))
+    return np.degrees(ra_dec_roll_rad(Rotation.from_quat(xyzw)))
 
 
 def moved(folder: Path) -> bool:

@@ -5,7 +5,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from estimator.attitude import wahba as kernel
-from estimator.attitude.solvers import SOLVERS, Solver, covariance, quest, radecroll_rad
+from estimator.attitude.solvers import SOLVERS, Solver, covariance, quest
+from estimator.core.types import ra_dec_roll_rad
 from estimator.core.vectors import xyzw_of
 
 ARCSEC_RAD = np.pi / 180 / 3600
@@ -415,7 +416,7 @@ BY_HAND = {
 @pytest.mark.parametrize("case", BY_HAND)
 def test_right_ascension_declination_and_roll_by_hand(case: str) -> None:
     camera, (ra, dec, roll) = BY_HAND[case]
-    found = radecroll_rad(camera)
+    found = ra_dec_roll_rad(camera)
     assert found[:2] == pytest.approx((ra, dec), abs=1e-15)  # rounding
     assert found[2] == pytest.approx(roll, abs=1e-15)
 
@@ -431,7 +432,7 @@ def from_angles(ra: float, dec: float, roll: float) -> Rotation:
 def test_angles_survive_the_way_through_a_rotation(dec_deg: float) -> None:
     rng = np.random.default_rng(47)
     for ra, roll in rng.uniform([0, -3.1], [6.28, 3.1], (50, 2)):
-        found = np.array(radecroll_rad(from_angles(ra, np.radians(dec_deg), roll)))
+        found = np.array(ra_dec_roll_rad(from_angles(ra, np.radians(dec_deg), roll)))
         # Rounding; near a pole right ascension and roll are known to rounding over the distance from it.
         near = np.cos(np.radians(dec_deg))
         np.testing.assert_allclose(found[1], np.radians(dec_deg), rtol=0, atol=2e-15)
@@ -439,5 +440,5 @@ def test_angles_survive_the_way_through_a_rotation(dec_deg: float) -> None:
 
 
 def test_a_right_ascension_just_short_of_zero_stays_below_a_full_circle() -> None:
-    ra, _, _ = radecroll_rad(looking([-1e-17, -1, 0], [0, 0, -1], [1, -1e-17, 0]))
+    ra, _, _ = ra_dec_roll_rad(looking([-1e-17, -1, 0], [0, 0, -1], [1, -1e-17, 0]))
     assert 0 <= ra < 2 * np.pi

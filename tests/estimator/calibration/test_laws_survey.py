@@ -20,7 +20,7 @@ from estimator.calibration.bundle_adjustment import Bundle, Sightings
 from estimator.calibration.dome_survey import DomeFrame, Survey, survey
 from estimator.calibration.gauge import Gauge, Part, common_turns
 from estimator.calibration.star_field import Belief, StarFrame
-from estimator.catalog.catalog import StarList
+from estimator.catalog.catalog import StarCatalog
 from estimator.core.arrays import Floats
 from estimator.core.camera import Camera
 from estimator.core.types import Attitude, Centroids, StarMatch
@@ -255,7 +255,7 @@ class Namer:
 
     def __init__(self, frames: list[StarFrame], seen: bool) -> None:
         vectors, count = np.concatenate([frame.vectors_ref for frame in frames]), 25 * len(frames)
-        self.stars = StarList(np.arange(count), vectors, 0 * vectors, np.zeros(count), np.zeros(count))
+        self.stars = StarCatalog(np.arange(count), vectors, 0 * vectors, np.zeros(count), np.zeros(count))
         self.seen = seen
 
     def solve_centroids(self, centroids: Centroids) -> Attitude:

@@ -20,7 +20,7 @@ from estimator.calibration.star_field import (
     self_calibrated,
 )
 from estimator.catalog import catalog
-from estimator.catalog.catalog import StarList
+from estimator.catalog.catalog import StarCatalog
 from estimator.core.camera import Camera
 from estimator.core.types import Attitude, Centroids, StarMatch
 from estimator.trackers.pipeline import Clock, Settings, see
@@ -279,7 +279,7 @@ class Nearest:
     """Knows the names, and believes those of stars within 3 px of where the believed camera would have them."""
 
     camera: Camera
-    stars: StarList
+    stars: StarCatalog
     frames: list[Centroids]
 
     def solve_centroids(self, centroids: Centroids) -> Attitude:
@@ -298,7 +298,7 @@ def test_each_round_names_more_stars_until_none_are_gained() -> None:
     field = drawn(np.random.default_rng(98), frames=40)
     vectors = np.concatenate([one.vectors_ref for one in field.frames])
     v_mag = np.linspace(2, 6, len(vectors))
-    stars = StarList(np.arange(800), vectors, np.zeros((800, 3)), np.zeros(800), v_mag)
+    stars = StarCatalog(np.arange(800), vectors, np.zeros((800, 3)), np.zeros(800), v_mag)
     frames = [
         Centroids(one.xy_px, one.sigma_px, 2.0 * 10 ** (-0.4 * (v_mag[20 * k : 20 * k + 20] - 12.5)))
         for k, one in enumerate(field.frames)
@@ -352,7 +352,7 @@ def test_from_centroids_of_the_real_sky_alone(factor: float) -> None:
     assert abs(zero.offset_mag - 12.7) < 4 * zero.sigma_mag
 
 
-def starry(stars: StarList, rng: np.random.Generator) -> Centroids:
+def starry(stars: StarCatalog, rng: np.random.Generator) -> Centroids:
     """Centroids of one random field, brightest first, with colours of 0.2 mag and 0.1 px of noise."""
     xy = TRUE.pixels(Rotation.random(rng=rng).apply(stars.vectors))
     inside = TRUE.contains(np.nan_to_num(xy, nan=-9.0)) & (stars.v_mag < 6.2)

@@ -12,7 +12,7 @@ from astropy.utils import iers
 from scipy.spatial import cKDTree
 
 from estimator.catalog import catalog
-from estimator.catalog.catalog import Observer, StarList
+from estimator.catalog.catalog import Observer, StarCatalog
 from estimator.core.errors import ImageError
 
 FILE = Path(__file__).parents[3] / "data/catalogues/hipparcos_hp6.5.ecsv"
@@ -23,11 +23,11 @@ HEADER = b"hip,ra_deg,dec_deg,pm_ra_mas_yr,pm_dec_mas_yr,parallax_mas,v_mag"
 
 
 @pytest.fixture(scope="module")
-def stars() -> StarList:
+def stars() -> StarCatalog:
     return catalog.read(FILE)
 
 
-def made_up(*rows: tuple[float, ...]) -> StarList:
+def made_up(*rows: tuple[float, ...]) -> StarCatalog:
     """Stars of (id, ra deg, dec deg, pm_ra, pm_dec mas/yr, parallax mas, V)."""
     hip, ra, dec, *rest = np.array(rows).T
     return catalog.from_columns(hip.astype(int), np.radians(ra), np.radians(dec), *rest)
@@ -61,7 +61,9 @@ def oracle() -> SkyCoord:
 
 @pytest.mark.filterwarnings("ignore:ERFA function")  # negative parallaxes, set aside below
 @pytest.mark.parametrize("date", DATES)
-def test_apparent_places_are_skycoord_s(stars: StarList, oracle: SkyCoord, date: datetime.datetime) -> None:
+def test_apparent_places_are_skycoord_s(
+    stars: StarCatalog, oracle: SkyCoord, date: datetime.datetime
+) -> None:
     with iers.conf.set_temp("auto_download", False), iers.conf.set_temp("iers_degraded_accuracy", "ignore"):
         time = Time(date, scale="utc")
         wanted = oracle.apply_space_motion(new_obstime=time).transform_to(GCRS(obstime=time))
@@ -84,7 +86,7 @@ def test_apparent_places_are_skycoord_s(stars: StarList, oracle: SkyCoord, date:
 def test_the_classical_aberration_differs_by_half_a_thousandth_at_most() -> None:
     # At 29.8 km/s and 45 or 135 degrees from the motion: v^2 / 4 c^2 = 0.51 mas.
     angle = np.radians(np.arange(0, 181, 5))
-    star = StarList(
+    star = StarCatalog(
         np.arange(37),
         np.column_stack([np.cos(angle), np.sin(angle), 0 * angle]),
         np.zeros((37, 3)),
@@ -181,7 +183,7 @@ def test_a_chain_of_close_stars_is_one_and_a_star_farther_off_stays() -> None:
     assert merged.v_mag[1] == pytest.approx(5 - 2.5 * np.log10(4), abs=1e-12)
 
 
-def test_merging_keeps_all_the_light_brightest_first(stars: StarList) -> None:
+def test_merging_keeps_all_the_light_brightest_first(stars: StarCatalog) -> None:
     merged = catalog.merge_doubles(stars, 120 * ARCSEC_RAD)
     assert len(merged) < len(stars)
     assert np.all(np.diff(merged.v_mag) >= 0)
@@ -197,7 +199,7 @@ def test_brighter_keeps_the_limit_itself() -> None:
     assert catalog.brighter(stars, 5.0).id.tolist() == [1, 2]
 
 
-def test_the_limit_for_a_density_gives_that_density(stars: StarList) -> None:
+def test_the_limit_for_a_density_gives_that_density(stars: StarCatalog) -> None:
     # 14.87 x 11.15 degrees, 12 stars a field on average: count 12 * 4 pi / field over the sky.
     field_sr = np.radians(14.87) * np.radians(11.15)
     limit = catalog.limit_for_density(stars, field_sr, 12)
@@ -208,7 +210,7 @@ def test_the_limit_for_a_density_gives_that_density(stars: StarList) -> None:
     assert catalog.limit_for_density(stars, field_sr, 1e9) == stars.v_mag.max()
 
 
-def test_the_file_is_read_whole_brightest_first(stars: StarList) -> None:
+def test_the_file_is_read_whole_brightest_first(stars: StarCatalog) -> None:
     # 7,996 rows by its own header; Sirius is HIP 32349, at 6h45m09s -16d43' and -1.46.
     assert len(stars) == 7996
     assert stars.id[0] == 32349

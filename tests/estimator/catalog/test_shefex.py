@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from estimator.catalog import catalog, pair_index
-from estimator.catalog.catalog import StarList
+from estimator.catalog.catalog import StarCatalog
 from estimator.catalog.shefex import CATALOGUES, COUNT, KEPT_MAG, asymmetric, chosen, spread, uniform
 from estimator.core.errors import ImageError
 
@@ -15,7 +15,7 @@ FILE = Path(__file__).parents[3] / "data/catalogues/hipparcos_hp6.5.ecsv"
 
 
 @pytest.fixture(scope="module")
-def stars() -> StarList:
+def stars() -> StarCatalog:
     return catalog.read(FILE)
 
 
@@ -23,7 +23,7 @@ def chord(angle_rad: float) -> float:
     return 2 * np.sin(angle_rad / 2)
 
 
-def test_the_chosen_catalogue_has_the_published_stars_and_pairs(stars: StarList) -> None:
+def test_the_chosen_catalogue_has_the_published_stars_and_pairs(stars: StarCatalog) -> None:
     # Reference H3: 2,023 stars, 54,804 pairs within 18.57 deg, +-15 %.
     flown = chosen(stars)
     assert len(flown) == pytest.approx(2023, abs=1)
@@ -36,7 +36,7 @@ def test_the_chosen_catalogue_has_the_published_stars_and_pairs(stars: StarList)
     assert flown.vectors[faint, 2].max() < 0
 
 
-def test_a_uniform_sky_of_as_many_stars_has_the_expected_pairs(stars: StarList) -> None:
+def test_a_uniform_sky_of_as_many_stars_has_the_expected_pairs(stars: StarCatalog) -> None:
     # Reference H3: N (N - 1) / 2 (1 - cos theta) / 2 = 53,243; thinning leaves less clumping than the flown one has.
     even = CATALOGUES["uniform"](stars)
     expected = len(even) * (len(even) - 1) / 4 * (1 - np.cos(np.radians(18.57)))
@@ -47,7 +47,7 @@ def test_a_uniform_sky_of_as_many_stars_has_the_expected_pairs(stars: StarList) 
     assert len(pair_index.build(clumped.vectors, np.radians(18.57)).pair) > 1.1 * expected
 
 
-def test_fewer_fields_are_too_poor_in_the_uniform_catalogue(stars: StarList) -> None:
+def test_fewer_fields_are_too_poor_in_the_uniform_catalogue(stars: StarCatalog) -> None:
     # What the uniform catalogue is for: a field needs four stars. 2000 random fields as large as SHEFEX's, round.
     even = CATALOGUES["uniform"](stars)
     bright = catalog.brighter(stars, float(np.sort(stars.v_mag)[len(even) - 1]))
@@ -61,7 +61,7 @@ def test_fewer_fields_are_too_poor_in_the_uniform_catalogue(stars: StarList) -> 
     assert poor[0] < poor[1] / 3
 
 
-def test_the_hemispheres_have_their_own_limits(stars: StarList) -> None:
+def test_the_hemispheres_have_their_own_limits(stars: StarCatalog) -> None:
     both = asymmetric(stars, 4.0, 5.0)
     north = both.vectors[:, 2] >= 0
     assert both.v_mag[north].max() <= 4.0 < both.v_mag[~north].max() <= 5.0
@@ -69,7 +69,7 @@ def test_the_hemispheres_have_their_own_limits(stars: StarList) -> None:
     np.testing.assert_array_equal(both.id, stars.id[wanted])
 
 
-def test_thinned_stars_are_apart_none_is_left_out_needlessly_and_the_bright_stay(stars: StarList) -> None:
+def test_thinned_stars_are_apart_none_is_left_out_needlessly_and_the_bright_stay(stars: StarCatalog) -> None:
     apart = np.radians(3.0)
     kept = spread(stars, apart, KEPT_MAG)
     bright = stars.v_mag <= KEPT_MAG
@@ -85,7 +85,7 @@ def test_thinned_stars_are_apart_none_is_left_out_needlessly_and_the_bright_stay
     assert (within & as_bright).any(axis=1).all()
 
 
-def test_a_count_that_cannot_be_is_refused(stars: StarList) -> None:
+def test_a_count_that_cannot_be_is_refused(stars: StarCatalog) -> None:
     with pytest.raises(ImageError, match="9000 stars of 7996; allowed"):
         uniform(stars, 9000)
     with pytest.raises(ImageError, match="100 stars of 7996; allowed: from the 9"):

@@ -20,7 +20,7 @@ from estimator.core import camera
 from estimator.core.arrays import Floats
 from estimator.core.camera import Camera
 from estimator.core.errors import ImageError
-from estimator.core.types import Attitude, Blobs, Centroids, FramePriors
+from estimator.core.types import Attitude, Blobs, Centroids, FramePriors, ra_dec_roll_rad
 from estimator.detection import background, classify, components, detect, windows
 from estimator.detection.classify import Flag
 from estimator.detection.detect import DETECTORS
@@ -377,11 +377,11 @@ def test_any_directions_are_solved_or_refused(
     )
 
 
-@law(solvers.radecroll_rad)
+@law(ra_dec_roll_rad, Attitude.ra_dec_roll_deg)
 @given(rng=SEEDS)
 def test_right_ascension_declination_and_roll_are_the_attitude(rng: np.random.Generator) -> None:
     truth = turn(rng)
-    ra, dec, roll = solvers.radecroll_rad(truth)
+    ra, dec, roll = ra_dec_roll_rad(truth)
     assert 0 <= ra < 2 * np.pi
     assert -np.pi < roll <= np.pi
     sight = np.array([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
@@ -389,3 +389,5 @@ def test_right_ascension_declination_and_roll_are_the_attitude(rng: np.random.Ge
     up = np.cos(roll) * north + np.sin(roll) * np.cross(sight, north) * -1
     built = Rotation.from_matrix([np.cross(-up, sight), -up, sight])
     assert (built * truth.inv()).magnitude() < 1e-9
+    np.testing.assert_array_equal(Attitude("solved", truth).ra_dec_roll_deg, np.degrees([ra, dec, roll]))
+    assert np.isnan(Attitude("lost").ra_dec_roll_deg).all()

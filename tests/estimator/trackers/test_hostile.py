@@ -39,12 +39,12 @@ def one_line(error: Exception) -> None:
 
 
 @pytest.fixture(scope="module")
-def stars() -> catalog.StarList:
+def stars() -> catalog.StarCatalog:
     return catalog.read(CATALOGUES / "hipparcos_hp6.5.ecsv")
 
 
 @pytest.fixture(scope="module")
-def tracker(stars: catalog.StarList) -> StarTracker:
+def tracker(stars: catalog.StarCatalog) -> StarTracker:
     return StarTracker(CAMERA, stars, stars.vectors, Settings())
 
 
@@ -125,7 +125,7 @@ def test_hostile_pictures_are_refused(monkeypatch: pytest.MonkeyPatch, count: in
 
 
 @pytest.mark.parametrize("frames", [10, pytest.param(1000, marks=pytest.mark.long)])
-def test_a_mirrored_sky_is_refused(stars: catalog.StarList, frames: int) -> None:
+def test_a_mirrored_sky_is_refused(stars: catalog.StarCatalog, frames: int) -> None:
     """The true sky of each is recognised, so that the mirror alone is what is refused."""
     camera = hostile.camera()
     eye = StarTracker(camera, stars, stars.vectors)

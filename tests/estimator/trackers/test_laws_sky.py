@@ -11,10 +11,11 @@ from hypothesis import strategies as some
 from hypothesis.extra.numpy import arrays
 from laws import ANY, NUMBERS, SEEDS, answered, assert_covariance, drawn, law, turn, units
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from estimator.calibration.magnitude_zero import magnitude_zero
-from estimator.catalog import pair_index
+from estimator.catalog import catalog, pair_index
 from estimator.core.camera import Camera
 from estimator.core.errors import ImageError
 from estimator.core.types import Attitude, Centroids, StarMatch
@@ -288,3 +289,17 @@ def test_a_tracker_s_answer_has_a_covariance(settings_: Settings) -> None:
     told = eye.solve_centroids(seen_by(eye, rng, turn(rng))[0])
     assert told.solved
     assert_covariance(told.covariance_rad2)
+
+
+@law(StarTracker.for_sky, catalog.hipparcos)
+@given(limit_mag=some.floats(3, 6.5), year=some.integers(1950, 2049))
+def test_a_tracker_for_the_sky_has_the_stars_to_its_limit_as_seen_at_the_date(
+    limit_mag: float, year: int
+) -> None:
+    """No star is fainter than the limit (merged doubles are brighter); aberration is 20.5" at most."""
+    tracker = StarTracker.for_sky(CAMERA, limit_mag, f"{year}-06-22")
+    assert tracker.stars.v_mag.max() <= limit_mag
+    mean = catalog.at_epoch(catalog.hipparcos(), year + 0.47)
+    chord = cKDTree(mean).query(tracker.stars.vectors[:20])[0]
+    assert np.median(chord) < np.radians(20.6 / 3600)
+    assert chord.max() > np.radians(1 / 3600)

@@ -10,7 +10,7 @@ import erfa
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from estimator.attitude.solvers import radecroll_rad
+from estimator.core.types import ra_dec_roll_rad
 from skysim.core.types import Floats, Trajectory
 from skysim.dynamics.jitter import Vibration
 from skysim.experiments.papers.compare import Answer, Ask, Cause, Drawing, Found
@@ -60,7 +60,7 @@ def cam_from_itrs() -> Rotation:
 
 def their_angles_deg(cam_from_icrs: Rotation) -> Floats:
     """(3,) right ascension, declination, roll as in Table 2: the roll of eq. 5 is minus ours."""
-    ra, dec, roll = np.degrees(radecroll_rad(cam_from_icrs))
+    ra, dec, roll = np.degrees(ra_dec_roll_rad(cam_from_icrs))
     return np.array([(ra + 180) % 360 - 180, dec, -roll])
 
 

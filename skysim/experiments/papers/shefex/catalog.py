@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from estimator.catalog import pair_index, shefex
-from estimator.catalog.catalog import StarList
+from estimator.catalog.catalog import StarCatalog
 from skysim.core.types import Floats
 from skysim.experiments.papers.compare import Answer, Ask, Cause, Drawing, Found
 from skysim.experiments.papers.intervals import of_means
@@ -56,17 +56,17 @@ def catalogues(ask: Ask) -> Found:
     )
 
 
-def between(known: StarList, bright_mag: float, faint_mag: float) -> int:
+def between(known: StarCatalog, bright_mag: float, faint_mag: float) -> int:
     """How many stars are fainter than one magnitude, and not than the other."""
     return int(np.sum((known.v_mag > bright_mag) & (known.v_mag <= faint_mag)))
 
 
-def pairs_of(known: StarList) -> int:
+def pairs_of(known: StarCatalog) -> int:
     """Pairs nearer than the printed diagonal."""
     return len(pair_index.build(known.vectors, float(PRINTED_FIELD_RAD)).pair)
 
 
-def in_fields(many: tuple[StarList, ...], ask: Ask) -> Floats:
+def in_fields(many: tuple[StarCatalog, ...], ask: Ask) -> Floats:
     """(N, K) stars of each catalogue on the chip at N random attitudes."""
     labs = [replace(lab(), sources=lab().sources.take(np.isin(lab().sources.id, one.id))) for one in many]
     attitudes = Rotation.random(ask.trials(2000, 300), rng=np.random.default_rng([ask.seed, 0]))
@@ -80,7 +80,7 @@ def evenness(means: Floats) -> Floats:
     return np.asarray(index_of_spread[..., 1] / index_of_spread[..., 0])
 
 
-def draw(known: StarList, fig: Any) -> None:
+def draw(known: StarCatalog, fig: Any) -> None:
     """All the sky in Mollweide's projection, right ascension growing to the left; brighter stars larger."""
     axes = fig.add_subplot(projection="mollweide")
     x, y, z = known.vectors.T

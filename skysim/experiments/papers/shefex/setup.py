@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from estimator.attitude.solvers import SOLVERS
 from estimator.catalog import catalog, pair_index, shefex
-from estimator.catalog.catalog import StarList
+from estimator.catalog.catalog import StarCatalog
 from estimator.catalog.pair_index import PairIndex
 from estimator.core.arrays import Ints
 from estimator.core.errors import ImageError
@@ -44,18 +44,18 @@ def lab() -> Testbed:
 
 
 @cache
-def stars() -> StarList:
+def stars() -> StarCatalog:
     """All that the simulator's own catalogue has, as the tracker reads it."""
     return catalog.read(CATALOGUES / "hipparcos_hp6.5.ecsv")
 
 
 @cache
-def listed(name: str) -> StarList:
+def listed(name: str) -> StarCatalog:
     """One of their catalogues: asymmetric, uniform or chosen."""
     return shefex.CATALOGUES[name](stars())
 
 
-def apparent(known: StarList) -> Floats:
+def apparent(known: StarCatalog) -> Floats:
     """(N, 3) where they are seen on the night of the scene."""
     return catalog.apparent(known, catalog.on_earth(lab().scene.start_time))
 
