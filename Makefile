@@ -14,7 +14,7 @@ $(READY): pyproject.toml
 	$(PIP) -e '.[dev,catalog]'
 	touch $@
 
-.PHONY: demo test test-long oracle test-browser test-lowest lock fuzz fuzzer lint pictures studies papers docs figures lab recompile setup clean
+.PHONY: bench demo test test-long oracle test-browser test-lowest lock fuzz fuzzer lint pictures studies papers docs figures lab recompile setup clean
 setup: $(READY)
 
 demo: $(READY)
@@ -31,6 +31,11 @@ test-long: $(READY)
 oracle: $(READY)
 	$(PIP) -e '.[oracle]'
 	$(BIN)/python -m pytest -rs -m "not long" tests/oracles
+
+# Our speed beside other people's tools, which are installed first.
+bench: $(READY)
+	$(PIP) -e '.[oracle]'
+	$(BIN)/python -m benchmarks $(AREAS)
 
 lab: $(READY)
 	$(BIN)/skysim lab

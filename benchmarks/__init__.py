@@ -1,4 +1,4 @@
-"""Ourselves beside the best peer, timed in the same run. `skysim bench` prints what `measure` returns."""
+"""Ourselves beside the best peer, timed in the same run. `python -m benchmarks` prints what `measure` returns."""
 
 from __future__ import annotations
 

@@ -14,12 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.attitude.solvers import SOLVERS
-from estimator.core.types import ra_dec_roll_rad
 from estimator.catalog import catalog
 from estimator.centroiding.centroid import CENTROIDERS
 from estimator.core.camera import Camera
 from estimator.core.errors import ImageError
-from estimator.core.types import Attitude, Centroids
+from estimator.core.types import Attitude, Centroids, ra_dec_roll_rad
 from estimator.detection.detect import DETECTORS, check_size
 from estimator.identification.chance import ACCEPT_LOG10_CHANCE
 from estimator.identification.registry import IDENTIFIERS

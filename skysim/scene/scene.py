@@ -155,7 +155,7 @@ class Scene(ConfigModel):
             ("vehicle", self.vehicle.mount),
             (
                 "camera",
-                f"{self.camera.width_px} × {self.camera.height_px} px, f = {1e3 * self.camera.focal_length_m:g} mm",
+                f"{camera.width_px} × {camera.height_px} px, f = {1e3 * camera.focal_length_m:g} mm",
             ),
             (
                 "exposure",

@@ -14,7 +14,7 @@ from skysim.apps.cli.commands.files import camera, catalog_app, export, scenes_a
 from skysim.apps.cli.commands.lab import lab
 from skysim.apps.cli.commands.reproduce import reproduce
 from skysim.apps.cli.commands.run import compare, render, run, trackers
-from skysim.apps.cli.commands.solve import bench, solve, survey
+from skysim.apps.cli.commands.solve import solve, survey
 from skysim.apps.cli.commands.stream import stream
 from skysim.apps.cli.commands.study import app as studies
 from skysim.apps.cli.commands.validate import validate
@@ -37,7 +37,6 @@ for command in (
     lab,
     validate,
     export,
-    bench,
 ):
     app.command()(command)
 app.add_typer(scenes_app, name="scenes")

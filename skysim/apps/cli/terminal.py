@@ -285,10 +285,6 @@ def number(value: float | None, digits: int | None = None) -> str:
     return f"{value:.3g}" if digits is None else f"{value:.{digits}f}"
 
 
-def yes(met: bool | None) -> str:
-    return "" if met is None else "yes" if met else "NO"
-
-
 def complain(message: str, code: int = 2) -> int:
     """One line to stderr and the exit code that goes with it."""
     print(f"skysim: {printable(message)}", file=sys.stderr)

@@ -88,7 +88,7 @@ def frame_of(rendered: Path) -> np.ndarray:
 def test_help_lists_the_commands(skysim: Skysim) -> None:
     ran = skysim("--help")
     assert ran.code == 0
-    for command in ("run", "render", "solve", "scenes", "bench", "catalog"):
+    for command in ("run", "render", "solve", "scenes", "catalog"):
         assert f" {command} " in ran.out
 
 
@@ -384,7 +384,6 @@ def test_what_is_not_yaml_is_one_line(skysim: Skysim, tmp_path: Path) -> None:
 def test_an_unknown_command_is_one_line(skysim: Skysim) -> None:
     assert "nosuch" in skysim("nosuch").one_line()
     assert "nosuch" in skysim("catalog", "info", "nosuch").one_line()
-    assert "none of" in skysim("bench", "nosuch").one_line()
 
 
 def test_no_command_at_all_shows_the_help(skysim: Skysim) -> None:

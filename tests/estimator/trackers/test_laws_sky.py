@@ -298,7 +298,7 @@ def test_a_tracker_for_the_sky_has_the_stars_to_its_limit_as_seen_at_the_date(
 ) -> None:
     """No star is fainter than the limit (merged doubles are brighter); aberration is 20.5" at most."""
     tracker = StarTracker.for_sky(CAMERA, limit_mag, f"{year}-06-22")
-    assert tracker.stars.v_mag.max() <= limit_mag
+    assert tracker.stars.v_mag.max() <= limit_mag + 1e-12  # a merged magnitude is rounded
     mean = catalog.at_epoch(catalog.hipparcos(), year + 0.47)
     chord = cKDTree(mean).query(tracker.stars.vectors[:20])[0]
     assert np.median(chord) < np.radians(20.6 / 3600)

@@ -1,8 +1,7 @@
-"""`skysim solve`, `survey`, `bench`."""
+"""`skysim solve`, `survey`."""
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -24,13 +23,10 @@ from skysim.apps.cli.options import (
 )
 from skysim.apps.cli.terminal import (
     complain,
-    number,
     print_answers,
     print_survey,
-    print_table,
     progress,
     watched,
-    yes,
 )
 from skysim.core.errors import InputError
 
@@ -147,50 +143,3 @@ def survey(
     figures = dome_survey_report.figures(found, belief, lab, doubt) | errors
     figures |= {"scene": lab.scene.name, "frames": frames, "map": str(path), "picture": str(picture)}
     print(files.to_json(figures)) if json else print_survey(figures)
-
-
-def bench(
-    areas: Annotated[
-        list[str] | None,
-        typer.Argument(
-            metavar="AREAS", help="instrument, detect, identify, attitude, dynamics; all if left out."
-        ),
-    ] = None,
-    json: Json = False,
-) -> None:
-    """Time ourselves beside the best peer, in the same run."""
-    from skysim.core import files
-
-    sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
-    try:
-        from benchmarks import AREAS, measure
-    except ImportError:
-        raise InputError("bench: the benchmarks are in the project's checkout only; run it there") from None
-
-    unknown = [area for area in areas or () if area not in AREAS]
-    if unknown:
-        raise InputError(f"bench: {unknown[0]!r} is none of {', '.join(AREAS)}")
-    results = [
-        result
-        for area in progress(areas or list(AREAS), len(areas or AREAS), "bench")
-        for result in measure(area)
-    ]
-    if json:
-        print(files.to_json(results))
-    else:
-        print_table(
-            "bench",
-            ["what", "ours", "peer", "peer's", "ratio", "bar", "met"],
-            [
-                [
-                    r["name"],
-                    f"{r['value']:.3g} {r['unit']}",
-                    r["peer"],
-                    number(r["peer_value"]),
-                    number(r["ratio"]),
-                    number(r["bar"]),
-                    yes(r["met"]),
-                ]
-                for r in results
-            ],
-        )

@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from skysim.experiments.study.execution.engines import Engine
     from skysim.experiments.study.plan import Plan
     from skysim.experiments.study.store import Store
-from skysim.experiments.study.store import STORE
 
 app = typer.Typer(
     invoke_without_command=True, help="Many trials of a scene whose fields vary, answered with error bars."
@@ -109,7 +108,7 @@ def status(study: StudyArg, out: Out = None, json: Json = False) -> None:
     from skysim.experiments.study import store
 
     (told, _), folder = planned(study, out), folder_of(study, out)
-    with store.open_store(folder / STORE) as kept:
+    with store.open_store(folder / store.STORE) as kept:
         figures = facts(told, kept)
         failures = [{"trial": trial, "error": error} for trial, error in kept.failures()[:10]]
     if json:
@@ -141,7 +140,7 @@ def export(
     from skysim.experiments.study.report import export as exporting
 
     (told, _), folder = planned(study, out), folder_of(study, out)
-    with store.open_store(folder / STORE) as kept:
+    with store.open_store(folder / store.STORE) as kept:
         for path in to:
             exporting.export(kept, told.study.responses, path)
             print(path)
@@ -164,7 +163,7 @@ def replay(
     from skysim.experiments.study.execution import replay as replaying
 
     (told, _), folder = planned(study, out, program or []), folder_of(study, out)
-    with store.open_store(folder / STORE) as kept:
+    with store.open_store(folder / store.STORE) as kept:
         again = replaying.replay(told, kept, trial, folder / f"trial_{trial}")
     row = again.row
     figures: dict[str, Any] = {
@@ -226,7 +225,7 @@ def done(
     from skysim.experiments.study.execution import runner
 
     on = command(study, out, "resume")
-    with store.writing(folder_of(study, out) / STORE) as kept, stoppable(on, kept), closing(engine):
+    with store.writing(folder_of(study, out) / store.STORE) as kept, stoppable(on, kept), closing(engine):
         runner.begin(told, kept, again, overrides)
         if failed:
             kept.forget_failed()
@@ -277,7 +276,7 @@ def reported(told: Plan, study: str, out: Path | None, overrides: dict[str, str]
 
     folder = folder_of(study, out)
     path, verb = folder / "report.html", "optimise" if told.study.optimise else "run"
-    with store.open_store(folder / STORE) as kept:
+    with store.open_store(folder / store.STORE) as kept:
         repeat = command(study, out, verb, overrides)
         lines = table.table(kept, page.responses(told.study))
         page.write_page(path, kept, told.study, repeat, lines, **findings(told, kept))
@@ -361,7 +360,7 @@ def planned(study: str, out: Path | None, program: list[str] | None = None) -> t
     from skysim.experiments.study import loader, store
     from skysim.tracking.external import process
 
-    path = folder_of(study, out) / STORE
+    path = folder_of(study, out) / store.STORE
     with store.open_store(path) as kept:
         overrides = kept.overrides()
         held = kept.meta("digest")
