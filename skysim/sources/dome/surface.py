@@ -95,7 +95,7 @@ class Surface(ABC):
         return np.asarray(origin_m + np.where(on_it, distance, np.nan)[:, None] * rays)
 
     def inward(self, points_m: Floats) -> Floats:
-        """(N, 3) unit normals toward the inside, at points of the surface: minus the gradient of the level, normalized."""
+        """(N, 3) unit normals toward the inside, at points of the surface: minus the level's gradient."""
         turn = self.lab_from_own.as_matrix()
         gradient = self.gradient((points_m - self.centre_m) @ turn) @ turn.T
         return np.asarray(-gradient / np.linalg.norm(gradient, axis=1, keepdims=True))
@@ -121,7 +121,7 @@ class Surface(ABC):
         return fit_ellipsoid(self.samples_m())
 
     def as_ellipsoid(self) -> tuple[Floats, Floats]:
-        """Center and semi-axes, (3,) each, m, of the ellipsoid that an estimator uses; `believed` also has its rms error."""
+        """Center and semi-axes, (3,) each, m, of the ellipsoid that estimators use; `believed` adds its rms error."""
         nearest = self.believed()
         return nearest.centre_m, nearest.semi_axes_m
 
@@ -129,7 +129,7 @@ class Surface(ABC):
 def leaves(start: Floats, along: Floats) -> Floats:
     """(N,) the greater root s > 0 of |start + s along| = 1; NaN where there is none.
 
-    The two roots are c / q and q / a with q = |b| + sqrt(b^2 - a c), which avoids cancellation.
+    With q = |b| + sqrt(b^2 - a c) the greater root is -c / q for b > 0 and q / a otherwise, free of cancellation.
     """
     # a s^2 + 2 b s + c = 0
     a, b, c = np.sum(along**2, axis=1), along @ start, start @ start - 1
@@ -244,7 +244,7 @@ class RadiusLaw(Protocol):
     def cover_rad(self) -> float: ...
 
     def at(self, unit: Floats) -> tuple[Floats, Floats]:
-        """(N,) radius over (N, 3) unit vectors, and (N, 3) its gradient; any component along the unit vector is ignored."""
+        """(N,) radius over (N, 3) unit vectors, and (N, 3) its gradient, whose radial component is ignored."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -330,7 +330,7 @@ class Radial(Surface):
 
 
 def placed(part: light.SurfaceConfig, centre_m: float) -> dict[str, Any]:
-    """Arguments common to all surfaces: center, rim, tilt and survey error, for a center at this height above the bearing."""
+    """Center, rim, tilt and survey error, as every Surface takes them, for a center at this height above the bearing."""
     height_m, half_deg = getattr(part, "rim_height_m", None), getattr(part, "rim_deg", None)
     lowest_m = -math.inf if height_m is None else height_m - centre_m
     half_rad = math.pi if half_deg is None else math.radians(half_deg)

@@ -312,7 +312,10 @@ def exchange(
 
 
 def evenly(sites_m: Floats, spacing_m: float, count: int, halvings: int = HALVINGS) -> Ints:
-    """Indices of `count` sites at the widest spacing at which `apart` finds that many; fewer if spacing_m has no room."""
+    """Indices of `count` sites at the widest spacing at which `apart` finds that many, by bisection.
+
+    Fewer than `count` if even spacing_m does not leave room for them.
+    """
     chosen = apart(sites_m, spacing_m, count)
     near_m, far_m = spacing_m, float(np.ptp(sites_m, axis=0).max())
     for _ in range(halvings):
