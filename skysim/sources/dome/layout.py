@@ -34,7 +34,7 @@ TRIES = 100  # darts per square of the least spacing: a gap of .03 of that area 
 MOST_TRIES = 3_000_000
 DARTS = 30  # per LED of a count
 HALVINGS = 14  # bisection steps from the dome's width: to some tenths of a millimeter
-STANDS_OFF_M = 0.05  # tolerance of a listed LED's distance from the surface; more is an error in a unit or an axis
+STANDS_OFF_M = 0.05  # of a listed LED from the surface; more is an error in a unit or an axis
 
 Ints = NDArray[np.int64]
 
@@ -58,7 +58,7 @@ class Spots:
 
 @dataclass(frozen=True, slots=True)
 class Boards:
-    """Patch boards, (B, 3) each: center in the lab, m, unit normal, and the unit vectors of the two axes of their holes."""
+    """Patch boards, (B, 3) each: center in the lab, m, unit normal, and unit vectors of the two axes of their holes."""
 
     middle_m: Floats
     normal: Floats
@@ -235,7 +235,7 @@ def tangent(inside: Inside, middle_m: Floats, turn_rad: Floats) -> Boards:
 
 
 def tilted(boards: Boards, most_rad: float, rng: np.random.Generator) -> Boards:
-    """Boards tilted by the glue: normals uniform over a cap of most_rad about the surface's normal, centers unchanged."""
+    """Boards tilted by the glue: normals uniform over a cap of most_rad about the surface's, centers unchanged."""
     count = len(boards.normal)
     angle = np.arccos(1 - rng.random(count) * (1 - np.cos(most_rad)))
     towards = rng.uniform(0, 2 * np.pi, count)[:, None]
@@ -390,7 +390,7 @@ def numbers(path: Path, number: int, line: str, count: int, bright: str) -> list
 
 
 def fibres(part: leds.FibresConfig, inside: Inside, led: leds.LedConfig, band: Band) -> Sources:
-    """Ends of optical fibers at another layout's points, displaced by the shell's radius error: `display.standing_off`."""
+    """Ends of optical fibers at another layout's points, with the shell's radius error: `display.standing_off`."""
     return display.standing_off(part, LAYOUTS[part.points.kind](part.points, inside, led, band))
 
 

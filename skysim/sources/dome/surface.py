@@ -330,7 +330,7 @@ class Radial(Surface):
 
 
 def placed(part: light.SurfaceConfig, centre_m: float) -> dict[str, Any]:
-    """Center, rim, tilt and survey error, as every Surface takes them, for a center at this height above the bearing."""
+    """What every Surface takes: center, rim, tilt and survey error, for a center at this height above the bearing."""
     height_m, half_deg = getattr(part, "rim_height_m", None), getattr(part, "rim_deg", None)
     lowest_m = -math.inf if height_m is None else height_m - centre_m
     half_rad = math.pi if half_deg is None else math.radians(half_deg)

@@ -50,7 +50,7 @@ def raised_m(inside: Surface, seed: int) -> float:
 
 
 def believed_leds_m(inside: Surface, place_m: Floats, told: SurveyErrorsConfig) -> Floats:
-    """(N, 3) surveyed LED places: independent errors, the surface's common offset and the rotation of the survey's axes."""
+    """(N, 3) surveyed LED places: independent errors, the surface's common offset and the rotation of the axes."""
     raised = raised_m(inside, surface_seed(told))
     on_it = place_m - raised * inside.inward(place_m) if raised else place_m
     return turned(believed_m(on_it, told.led_sigma_m, told.seed, "leds"), told)
