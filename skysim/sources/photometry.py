@@ -24,13 +24,13 @@ from skysim.scene.camera import curve_file
 
 HC_J_M = 6.62607015e-34 * 299792458.0  # energy of a photon times its wavelength
 HC_K_M = HC_J_M / 1.380649e-23
-V0_W_M3 = 3.63e-2  # spectral irradiance of a star of V = 0: 3.63e-9 erg s^-1 cm^-2 A^-1 (reference §2)
+V0_W_M3 = 3.63e-2  # irradiance of a star of V = 0: 3.63e-9 erg s^-1 cm^-2 A^-1 (reference §2)
 LUMENS_A_WATT = 683.0  # of light at 555 nm, by definition of the candela
 
 FLAT_M = (
     400e-9,
     1000e-9,
-)  # bandpass of the silicon camera if its efficiency is a single number (reference §2)
+)  # the silicon camera's bandpass, where one number stands for a curve (reference §2)
 
 STEP_M = 1e-9
 ARCSEC2_SR = math.radians(1 / 3600) ** 2

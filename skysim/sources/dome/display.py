@@ -23,7 +23,7 @@ from skysim.sources.dome.led import DRIVES, Lamps, full_e_s_sr
 from skysim.sources.dome.surface import Plane
 from skysim.sources.photometry import SUN, Band, star_flux_e_s_m2
 
-SHELL = 2  # spawn key of the shell's own random stream, so that the other random properties do not change with it
+SHELL = 2  # spawn key of the shell's own random stream, which leaves the fibers' places unchanged
 
 Ints = NDArray[np.int64]
 
