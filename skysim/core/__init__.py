@@ -1,3 +1,3 @@
-"""Array types, errors, units, paths, compiled loops, and careful reading and writing of files. Imports
-nothing else of skysim.
+"""Array types, errors, units, paths, compiled loops, and safe reading and writing of files. Imports nothing else of
+skysim.
 """
