@@ -114,7 +114,7 @@ def lights(stars: Projected, shown: int, apart_m: float) -> Projected:
 
 
 def brightest(stars: Projected, part: leds.CelestialConfig, apart_m: float) -> Projected:
-    """The brightest stars, merged into as many LEDs as part.count, or all stars to part.limit_mag. Raises InputError."""
+    """The brightest stars, merged into part.count LEDs, or all stars to part.limit_mag. Raises InputError."""
     if part.limit_mag is not None:
         shown = int(np.sum(stars.v_mag <= part.limit_mag))
         if not shown:

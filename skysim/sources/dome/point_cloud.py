@@ -176,7 +176,7 @@ class Survey:
 
     @property
     def rms_m(self) -> float:
-        """Rms of the residuals. Noise of sigma gives sigma sqrt(1 - K / N) here and sigma sqrt(K / N) in the surface."""
+        """Rms of the residuals. Noise of sigma leaves sigma sqrt(1 - K / N) here, sigma sqrt(K / N) in the surface."""
         return float(np.sqrt(np.mean(self.residual_m**2)))
 
     @property
