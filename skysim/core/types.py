@@ -223,7 +223,7 @@ class Row:
     wrong : solved, but with an error of more than ten arcminutes
     cross_sigma_arcsec, roll_sigma_arcsec : standard deviations that the tracker claims;  log10_chance : of its
         matches
-    filter : state of the attitude filter at this frame; empty without a filter
+    filter : verdict of the attitude filter on the solution; empty without a filter
     """
 
     frame: int

@@ -52,7 +52,7 @@ def with_unit(si_unit: str, what: str, examples: str) -> BeforeValidator:
 
 
 def in_si(value: str, si_unit: str | None = None) -> float:
-    """The value of a quantity such as "48 in", in `si_unit` or else in SI base units. Raises ValueError or TypeError."""
+    """The value of a quantity such as "48 in" in `si_unit`, or else in SI units. Raises ValueError or TypeError."""
     from astropy import units
 
     # astropy spells it `inch`; scenes write `in`.

@@ -230,7 +230,7 @@ def read(name_or_path: str | Path) -> Catalogue:
 
 
 def split(path: Path) -> tuple[dict[str, Any], list[str]]:
-    """The header's meta and the lines below it, the columns' names first."""
+    """The header's meta and the lines below it, beginning with the column names. Raises InputError."""
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except FileNotFoundError as error:
