@@ -127,8 +127,8 @@ DEFLATE = 1032  # greatest compression ratio of deflate (zlib's technical detail
 SEGMENTS = 1000  # of a JPEG before its image
 ALONE = (0x01, *range(0xD0, 0xD8))  # TEM and RST: markers without a length
 
-# TIFF: integer types of 8, 16, 32 and 64 bits. libtiff accepts signed types for a size too. All are read as unsigned, so
-# a negative size, which libtiff rejects, exceeds the limit. Tags of width, height and samples per pixel.
+# TIFF: integer types of 8, 16, 32 and 64 bits. libtiff accepts signed types for a size too. All are read as unsigned,
+# so a negative size, which libtiff rejects, is a huge one here. Tags of width, height and samples per pixel.
 WHOLE = {1: "B", 3: "H", 4: "I", 16: "Q", 6: "B", 8: "H", 9: "I", 17: "Q"}
 WIDTH_TAG, HEIGHT_TAG, SAMPLES_TAG = 256, 257, 277
 
