@@ -81,6 +81,7 @@ def naming(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
+        # Some libraries report a full disk in the text only.
         full = error.errno in (None, errno.ENOSPC, errno.EDQUOT) and "space" in str(error).lower()
         number = errno.ENOSPC if full else error.errno
         if number is None:

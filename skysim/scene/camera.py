@@ -127,18 +127,14 @@ class RollingShutterConfig(ConfigModel):
 
 
 class FrameTransferConfig(ConfigModel):
-    """Charge is shifted, still exposed, into a covered store, row_time per row: each pixel collects light along its
-    column.
-    """
+    """Charge is shifted, still exposed, into a covered store, row_time per row: a pixel collects along its column."""
 
     kind: Literal["frame_transfer"]
     row_time_s: Annotated[Time, Field(gt=0)]
 
 
 class InterlineConfig(ConfigModel):
-    """The covered register leaks: it collects the fraction `leak` of the light of every row it passes, row_time per
-    row.
-    """
+    """The covered register leaks: it collects the share `leak` of the light of every row it passes, row_time per row."""
 
     kind: Literal["interline"]
     row_time_s: Annotated[Time, Field(gt=0)]
@@ -168,8 +164,7 @@ class ParticlesConfig(ConfigModel):
 
 
 class DetectorConfig(ConfigModel):
-    """The chip and its electronics, in the order of the signal path. Each effect has a parameter that switches it
-    off.
+    """The chip and its electronics, in the order of the signal path. Each effect's parameter can switch it off.
 
     quantum_efficiency : one number for 400-1000 nm, or the name of a curve in data/qe (or a file)
     hardware_seed      : this chip's fixed pattern: PRNU, DSNU, hot pixels, column offsets

@@ -131,9 +131,7 @@ class FibonacciConfig(DimmedConfig):
 
 
 class PoissonDiscConfig(DimmedConfig):
-    """LEDs at random with a least spacing: as many as fit at `spacing`, or `count` of them at the widest spacing that
-    leaves room for them.
-    """
+    """LEDs at random with a least spacing: as many as fit at `spacing`, or `count` of them as far apart as they fit."""
 
     kind: Literal["poisson_disc"]
     spacing_m: Annotated[Length, Field(gt=0)] | None = None
@@ -154,8 +152,7 @@ class RandomPlacesConfig(DimmedConfig):
 
 
 class OptimisedConfig(DimmedConfig):
-    """`count` LEDs placed for the best accuracy of one camera at its worst attitudes, of all tilts to tilt_deg and
-    any yaw.
+    """`count` LEDs placed for one camera's best accuracy at its worst attitudes: tilts to tilt_deg, any yaw.
 
     field_deg : the camera's field of view along body x and y
     camera    : its entrance pupil on the body; it looks along body z

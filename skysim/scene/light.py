@@ -102,9 +102,7 @@ class FlatSurfaceConfig(SurfaceConfig):
 
 
 class CylinderSurfaceConfig(SurfaceConfig):
-    """A vault along the lab's x or y, or a drum about z; its highest point is at apex, its ends are half a length
-    away.
-    """
+    """A vault along the lab's x or y, or a drum about z; its highest point is at apex, its ends half a length away."""
 
     kind: Literal["cylinder"]
     axis: Literal["x", "y", "z"]

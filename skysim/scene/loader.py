@@ -156,6 +156,7 @@ def list_scenes() -> list[str]:
 def where(message: str, name: str, overrides: Mapping[str, str]) -> str:
     """A message that begins with a scene's key, with file and line appended; any other message unchanged."""
     key = message.partition(":")[0]
+    # Unchanged: messages that do not begin with a key of the scene, or that already end with a place.
     told = re.fullmatch(r"[a-z_]+(\.\w+)*", key)
     if (
         not told

@@ -165,6 +165,7 @@ def black_body_v0(wavelength_m: Floats, temperature_k: Floats) -> Floats:
     """
     hot = np.asarray(temperature_k, dtype=float)[..., None]
 
+    # Planck's law up to a constant factor, which cancels against the mean in V.
     def power(wavelength_m: Floats) -> Floats:
         return np.asarray(wavelength_m**-5.0 / np.expm1(HC_K_M / (wavelength_m * hot)))
 

@@ -148,6 +148,7 @@ def levels(part: leds.CelestialConfig, stars: Projected, normal: Floats, led: le
     distance_m = np.linalg.norm(to_camera, axis=1)
     cos_emission = np.einsum("nj,nj->n", normal, to_camera) / distance_m
     one = np.ones(len(distance_m))
+    # Irradiance per unit strength on an aperture that faces the LED, as stars at infinity are measured.
     gain = irradiance_e_s_m2(one, Emitter.of(led), cos_emission, one, distance_m)
     if not np.all(gain > 0):
         raise InputError(

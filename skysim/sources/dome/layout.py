@@ -198,6 +198,7 @@ def grid(spacing_rad: float, half_angle_rad: float) -> Floats:
     out2 = x**2 + y**2
     within = out2 <= (2 * np.sin(half_angle_rad / 2)) ** 2
     x, y, out2 = x[within], y[within], out2[within]
+    # Inverse of the map: at the radius rho, z = 1 - rho^2 / 2, at the distance rho sqrt(1 - rho^2 / 4) from the axis.
     stretch = np.sqrt(1 - out2 / 4)
     return np.column_stack([x * stretch, y * stretch, 1 - out2 / 2])
 

@@ -233,10 +233,12 @@ def fit(points_m: Floats, degree: int, file: str) -> Survey:
     sector = (
         np.floor((np.arctan2(unit[:, 1], unit[:, 0]) / (2 * np.pi) + 0.5) * SECTORS).astype(int) % SECTORS
     )
+    # Covered angle: of the farthest point in each sector of azimuth, the least.
     cover = min(float(angle[sector == one].max(initial=0.0)) for one in range(SECTORS))
     half = float(angle.max())
     table, _ = zernike(degree, to_disc(unit, half)[0])
     coefficient, _, _, sizes = np.linalg.lstsq(table, radius_m)
+    # A large ratio of singular values means polynomials that the points do not determine: an area without points.
     if cover < half / 2 or sizes[-1] * WORST_CONDITION < sizes[0]:
         raise InputError(
             f"{place}the points leave parts of the dome bare; allowed: points all around +z, or a degree below {degree}"

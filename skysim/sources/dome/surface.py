@@ -24,7 +24,7 @@ from skysim.scene import light
 from skysim.sources.dome import point_cloud
 from skysim.sources.dome.point_cloud import Believed, fit_ellipsoid
 
-FLAT_RADIUS_M = 1e6  # of a sphere that is flat to a micrometre within a metre
+FLAT_RADIUS_M = 1e6  # of a sphere that is flat to a micrometer within a meter
 RINGS, SECTORS = 60, 72  # of the samples to which an ellipsoid is fitted
 MOST_STEPS = 200  # of the ray intersection
 SLACK_M = 1e-12  # rounding tolerance that keeps points on the rim within it
@@ -89,6 +89,7 @@ class Surface(ABC):
     def meet(self, origin_m: Floats, rays: Floats) -> Floats:
         """(N, 3) points where rays (N, 3) of any length leave the inside; NaN where they miss or pass below the rim."""
         turn = self.lab_from_own.as_matrix()
+        # A rotation keeps lengths, so the distance along the ray is the same in both frames.
         start, along = (origin_m - self.centre_m) @ turn, rays @ turn
         distance = self.distance(start, along)
         on_it = self.within(start + distance[:, None] * along)
@@ -381,6 +382,7 @@ def surveyed(part: light.SurveyedSurfaceConfig) -> Surface:
             f" (worst {found.worst_m:.3g} m); allowed: rms_limit {part.rms_limit_m:g} m, a greater degree, another unit"
         )
     where = placed(part, 0.0)
+    # The surface's frame begins at the best sphere's center, the scene's tilt and rim refer to the points' origin.
     where["centre_m"] = part.offset_m + where["lab_from_own"].apply(found.centre_m)
     where["rim"] = Rim(-found.centre_m, where["rim"].lowest_m - found.centre_m[2], where["rim"].half_rad)
     told = part.rim_height_m is not None or part.rim_deg is not None

@@ -371,7 +371,7 @@ def set_apart(exam: Exam, place_m: Floats, sites_m: Floats, rng: np.random.Gener
         tried_m[who] = sites_m[rng.choice(tree.query(place_m[who], k=min(BESIDE, len(sites_m)))[1])]
         if np.delete(np.linalg.norm(place_m - tried_m[who], axis=1), who).min() < part.spacing_m:
             continue
-        # Ambiguity and blind attitudes are checked first, the variance over all examined attitudes last.
+        # The nudge must reduce the ambiguity and must not leave more attitudes with fewer than two LEDs.
         nudged = alike(part, tried_m)
         if excess(nudged) >= excess(like) or exam.blind(tried_m) > blind:
             continue
