@@ -134,7 +134,7 @@ class FrameTransferConfig(ConfigModel):
 
 
 class InterlineConfig(ConfigModel):
-    """The covered register leaks: it collects the share `leak` of the light of every row it passes, row_time per row."""
+    """The covered register leaks: it takes the share `leak` of the light of every row it passes, row_time per row."""
 
     kind: Literal["interline"]
     row_time_s: Annotated[Time, Field(gt=0)]

@@ -22,8 +22,7 @@ FIVE = ("k1", "k2", "p1", "p2", "k3")
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
-    """A pinhole with square pixels and the distortion of Brown (1971), in camera axes +x right, +y down, +z
-    boresight.
+    """A pinhole with square pixels and the distortion of Brown (1971); camera axes +x right, +y down, +z boresight.
 
     focal_px   : focal length (strictly, the image distance) over the pixel pitch
     centre_px  : principal point (x, y); the center of pixel (0, 0) is (0, 0), as in OpenCV

@@ -70,6 +70,8 @@ class Scene(ConfigModel):
 
     @model_validator(mode="after")
     def one_world(self) -> Scene:
+        # Survey errors and maps need LEDs. The start is a pointing under the stars and an attitude otherwise. All rows
+        # must be read out within a frame period.
         sky = self.light.kind == "stars"
         told = self.tracker
         if not isinstance(self.light, DomeConfig) and (told.survey != SurveyErrorsConfig() or told.map):
@@ -113,6 +115,7 @@ class Scene(ConfigModel):
             raise ValueError("filter: takes a gyro; allowed beside vehicle.imu")
         if told is None:
             return self
+        # The controller's actuators and its source of the attitude must be in the scene.
         has = {"ideal": True} | {kind: getattr(self.vehicle, kind) for kind in ("wheels", "fans", "cmgs")}
         if not has[told.actuators]:
             raise ValueError(f"motion.control.actuators: vehicle.{told.actuators} is not switched on")

@@ -33,8 +33,7 @@ class WheelsConfig(ConfigModel):
     """Reaction wheels: every hinge joint `wheel_*` of the model.
 
     coulomb, viscous   : bearing friction, T = coulomb sign(speed) + viscous speed
-    static_imbalance   : mass times offset of the rotor's center of mass from its axle; disturbs with the speed
-        squared
+    static_imbalance   : mass times offset of the rotor's center from its axle; disturbs with the speed squared
     dynamic_imbalance  : product of inertia between the axle and a line across it; disturbs with the speed squared
     start_rpm          : speed of each at the start; at rest if left out
     """
@@ -88,9 +87,7 @@ class DragConfig(ConfigModel):
 
 
 class CableConfig(ConfigModel):
-    """A cable attached to the vehicle, a torsional spring that returns it to the attitude (0, 0, 0) by the shorter
-    way.
-    """
+    """A cable attached to the vehicle: a torsional spring that turns it back to (0, 0, 0) by the shorter way."""
 
     stiffness_nm_rad: Annotated[Stiffness, Field(gt=0)]
 

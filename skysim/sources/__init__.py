@@ -1,3 +1,1 @@
-"""Light sources: the stars of a catalog and the LEDs of a dome, as `Sources` with a direction or a place, a strength
-and a pulse train.
-"""
+"""Light sources: stars of a catalog and LEDs of a dome, as `Sources` with direction or place, strength and pulses."""

@@ -72,7 +72,7 @@ class Band:
         """
         first, last = self.wavelength_m[[0, -1]]
         even = np.arange(math.ceil(first / STEP_M), math.floor(last / STEP_M) + 1) * STEP_M
-        # The curve's own samples are part of the grid, so its kinks are integrated exactly.
+        # The curve's own samples are grid points too, because it has kinks there.
         grid = np.union1d(even[(even > first) & (even < last)], self.wavelength_m)
         return np.asarray(np.trapezoid(spectrum(grid) * self.at(grid), grid, axis=-1))
 

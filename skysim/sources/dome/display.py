@@ -103,7 +103,7 @@ def glass(part: leds.LcdConfig, inside: Any) -> Plane:
 
     Raises InputError if the pixels do not fit into the surface's width and height.
     """
-    assert isinstance(inside, Plane)  # light.Dome lets no other through
+    assert isinstance(inside, Plane)  # DomeConfig admits no other surface
     half_m = np.array(part.pixels) * part.pitch_m / 2
     if np.any(half_m > inside.half_m * (1 + 1e-9)):
         raise InputError(
@@ -160,8 +160,7 @@ def lab_from_icrs(part: light.BenchConfig) -> Rotation:
 
 
 def bench(part: light.BenchConfig, stars: Catalogue, time: datetime.datetime, band: Band) -> Sources:
-    """Stars on a collimated display: a pixel (x, y) off the axis becomes a parallel beam along (x, y, f), f the focal
-    length.
+    """Stars on a collimated display: a pixel (x, y) off the axis is a parallel beam along (x, y, focal length).
 
     time : UTC, of the apparent places shown
     Returns Sources in lab axes: points at infinity, or, with part.conjugate_m = D, at D from the bearing's center, so

@@ -147,6 +147,7 @@ def sequential(led: LedConfig, lamps: Lamps, rng: np.random.Generator) -> Pulses
     else:
         group = np.arange(count) // part.controller
     _, controller, sharing = np.unique(group, return_inverse=True, return_counts=True)
+    # Number the LEDs of each controller: in the stable order they are consecutive, minus the index of its first.
     order = np.argsort(controller, kind="stable")
     turn = np.empty(count)  # index of the LED's slot on its controller: 0, 1, ...
     turn[order] = np.arange(count) - np.repeat(np.cumsum(sharing) - sharing, sharing)

@@ -47,8 +47,7 @@ class Believed(NamedTuple):
 
 
 def fit_sphere(points_m: Floats) -> Ball:
-    """Geometric least-squares sphere of points (N, 3): least sum of squared distances, from the algebraic fit as the
-    start.
+    """The sphere with the least sum of squared distances from points (N, 3), iterated from the algebraic fit.
 
     Raises ValueError for points in a plane.
     """
@@ -149,8 +148,7 @@ class Zernike:
 
 
 def to_disc(unit: Floats, half_rad: float) -> tuple[Floats, Floats, Floats]:
-    """Lambert's equal-area disc of a cap: (N, 2) x, y of unit vectors (N, 3) times (N,) k; k itself; (N,) d ln k /
-    dz.
+    """Lambert's equal-area disc of a cap: (N, 2) x, y of unit vectors (N, 3) times (N,) k; k; (N,) d ln k / dz.
 
     k = 1 / (sqrt(2 (1 + z)) sin(half / 2)). It diverges straight down and is limited there.
     """

@@ -382,7 +382,7 @@ def surveyed(part: light.SurveyedSurfaceConfig) -> Surface:
             f" (worst {found.worst_m:.3g} m); allowed: rms_limit {part.rms_limit_m:g} m, a greater degree, another unit"
         )
     where = placed(part, 0.0)
-    # The surface's frame begins at the best sphere's center, the scene's tilt and rim refer to the points' origin.
+    # The surface's frame has its origin at the best sphere's center; the scene's tilt and rim refer to the points'.
     where["centre_m"] = part.offset_m + where["lab_from_own"].apply(found.centre_m)
     where["rim"] = Rim(-found.centre_m, where["rim"].lowest_m - found.centre_m[2], where["rim"].half_rad)
     told = part.rim_height_m is not None or part.rim_deg is not None

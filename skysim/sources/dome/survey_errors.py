@@ -57,8 +57,7 @@ def believed_leds_m(inside: Surface, place_m: Floats, told: SurveyErrorsConfig) 
 
 
 def believed_ellipsoid(inside: Surface, told: SurveyErrorsConfig) -> tuple[Floats, Floats]:
-    """Center and semi-axes, (3,) each, m, of the surveyed ellipsoid: the nearest one, its axes lengthened by
-    `raised_m`.
+    """Center and semi-axes, (3,) each, m, of the surveyed ellipsoid: the nearest one, longer by `raised_m`.
 
     That displaces an ellipsoid by sum(a_i n_i^2) / sqrt(sum(a_i^2 n_i^2)) of the offset where the normal is n: by all
     of it on the axes and on a sphere, and never by less than 2 sqrt(a b) / (a + b), a and b its longest and shortest

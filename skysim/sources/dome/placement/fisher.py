@@ -8,8 +8,8 @@ so that b x d is a row of the Jacobian J_i (2, 3) of LED i. With independent err
 tangent, the rotation has the covariance sigma^2 M^-1, with the information M = sum_i J_i'J_i over the LEDs in view, and
 the total variance sigma^2 tr(M^-1). `optimize` minimizes tr(M^-1), summed over attitudes with a high power.
 
-J_i'J_i is computed once for every pair of a candidate site and an attitude that sees it. Moving an LED then only adds
-and subtracts terms in the sums of the attitudes concerned.
+J_i'J_i is computed once per round for every pair of a site and an attitude that sees it (`look`). Moving an LED then
+only adds and subtracts terms in the sums of the attitudes concerned.
 """
 
 from __future__ import annotations

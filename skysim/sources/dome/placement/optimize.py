@@ -1,5 +1,4 @@
-"""Optimized LED placement: minimize the attitude variance at the worst attitudes by moving LEDs between candidate
-sites.
+"""Optimized LED placement: move LEDs between candidate sites to lower the variance of the worst attitudes.
 
 What a camera on its lever arm can learn about the attitude a from the LEDs in its field is the Fisher information of
 the rotation-only solution, M_a = sum_i J_i'J_i (`fisher`). It does not depend on any estimator. The search minimizes
@@ -73,8 +72,7 @@ class Exam(NamedTuple):
     limit: float
 
     def mark(self, place_m: Floats) -> float:
-        """Mean variance of the worst TAIL of attitudes, relative to the limit: 1 or less is as good as any even
-        layout.
+        """Mean variance of the worst TAIL of attitudes over the limit: 1 or less is as good as any even layout.
 
         The single worst attitude is unstable: it depends on one LED at the field's edge and on the sampling.
         """
@@ -126,9 +124,11 @@ def places(
 
 
 def worth(exam: Exam, place_m: Floats, rng: np.random.Generator) -> tuple[bool, bool, float]:
-    """Sort key of layouts, less is better, compared in this order: whether an even layout is better in the worst
-    attitudes; whether an attitude was found that sees fewer than two LEDs; the worst variances, times 1 + the
-    fraction of fields that share more than HALF of their LEDs with another field.
+    """Sort key of layouts, less is better.
+
+    In this order: whether an even layout is better in the worst attitudes; whether an attitude was found that sees
+    fewer than two LEDs; the worst variances, times 1 + the share of fields of which more than HALF coincides with
+    another field.
     """
     mark, like = exam.mark(place_m), alike(exam.part, place_m)
     whole = Search(exam.part, place_m, cKDTree(place_m), CAREFUL[0], 1.0)
@@ -251,8 +251,7 @@ def tan_half(part: leds.OptimisedConfig) -> Floats:
 
 
 def reach_rad(part: leds.OptimisedConfig, inside: Inside) -> float:
-    """Greatest angle from the zenith, at the bearing, of a surface point that any attitude's field contains; at most
-    the cap.
+    """Greatest angle from the zenith, at the bearing, that the field of any attitude reaches; at most the cap.
 
     Rays around the cone that encloses the field are intersected with the surface, for boresights at the greatest tilt
     in all azimuths and at every yaw.
