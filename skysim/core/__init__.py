@@ -1,3 +1,1 @@
-"""Array types, errors, units, paths, compiled loops, and careful reading and writing of files. Imports
-nothing else of skysim.
-"""
+"""Array types, errors, units, paths, compiled loops, and safe file access. Imports nothing else of skysim."""

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import sys
 
-attended = False  # whether we are a command
+attended = False  # whether skysim runs as a command, with a user at the terminal
 
 
 def note(message: str) -> None:
-    """One line to stderr, of what is no fault: for whoever sits before a terminal."""
+    """Print an informational line to stderr if it is a terminal."""
     if sys.stderr.isatty():
         print(f"skysim: {message}", file=sys.stderr, flush=True)
 
 
 def printable(text: object) -> str:
-    """On one line, and with ? for what a terminal obeys or cannot show: text from outside goes through here."""
+    """Text from outside on one line, with ? for control characters and others that a terminal cannot show."""
     return "".join(one if one.isprintable() else "?" for one in " ".join(str(text).split()))
 
 

@@ -21,16 +21,16 @@ from numpy.typing import NDArray
 
 from skysim.core.errors import InputError
 
-HOST = f"{zlib.crc32(platform.node().encode()):08x}"  # for folders that machines share
+HOST = f"{zlib.crc32(platform.node().encode()):08x}"  # distinguishes machines that share a folder
 
 NAME = re.compile(rf"\..+\.skysim-{HOST}-(\d{{1,9}})(\.\w+)?")
 
-WRITING: set[Path] = set()  # by this process
+WRITING: set[Path] = set()  # temporary paths in use by this process
 
 
 @contextlib.contextmanager
 def being_written(path: Path) -> Iterator[Path]:
-    """A hidden name beside `path` that tells who writes, for a file or a folder; what is there at the end vanishes."""
+    """A hidden name beside `path` with the host and process in it, for a file or a folder; removed at the end."""
     temporary = path.with_name(f".{path.stem}.skysim-{HOST}-{os.getpid()}{path.suffix}")
     WRITING.add(temporary.absolute())
     try:
@@ -41,31 +41,31 @@ def being_written(path: Path) -> Iterator[Path]:
 
 
 def sweep(folder: Path) -> None:
-    """Remove what processes of this machine that are no more were writing there."""
+    """Remove temporary files in the folder that processes of this machine left and that no longer run."""
     for path in folder.glob(".*.skysim-*"):
         told = NAME.fullmatch(path.name)
         if told and not lives(int(told[1]), path):
-            with contextlib.suppress(OSError):  # who may not, will be told as soon as something is written
+            with contextlib.suppress(OSError):  # a permission error will surface at the next write
                 remove(path)
 
 
 def lives(pid: int, path: Path) -> bool:
-    """Whether the process that was writing a file still may. Our own number may have been another's before us."""
+    """Whether the process that was writing a file still runs. Our own process number may be a reused one."""
     if pid == os.getpid():
         return path.absolute() in WRITING
-    if os.name != "posix":  # where there is no asking
+    if os.name != "posix":  # signal 0 is not available
         return True
     try:
         os.kill(pid, 0)
     except ProcessLookupError:
         return False
-    except PermissionError:  # it is somebody else's
+    except PermissionError:  # it runs as another user
         return True
     return True
 
 
 def remove(path: Path) -> None:
-    """A file or a folder, if it is there."""
+    """Remove a file or a folder if it exists."""
     if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path, ignore_errors=True)
     else:
@@ -74,13 +74,14 @@ def remove(path: Path) -> None:
 
 @contextmanager
 def naming(path: Path) -> Iterator[None]:
-    """Whatever cannot be written is told of `path`, in the system's own words for why.
+    """Re-raise an OSError with `path` and the system's own message.
 
-    Some libraries tell neither which file nor, of a full disk, what is wrong in a line.
+    Some libraries do not name the file, or do not report a full disk by its error number.
     """
     try:
         yield
     except OSError as error:
+        # Some libraries report a full disk in the text only.
         full = error.errno in (None, errno.ENOSPC, errno.EDQUOT) and "space" in str(error).lower()
         number = errno.ENOSPC if full else error.errno
         if number is None:
@@ -90,7 +91,10 @@ def naming(path: Path) -> Iterator[None]:
 
 @contextmanager
 def whole(path: Path) -> Iterator[Path]:
-    """A temporary name beside `path` that becomes it once everything is written, or vanishes."""
+    """Write a file atomically: yields a temporary name beside `path`, which replaces `path` at the end.
+
+    If the body raises an exception, the temporary file is removed and `path` is unchanged.
+    """
     with being_written(path) as temporary, naming(path):
         yield temporary
         os.replace(temporary, path)
@@ -98,20 +102,20 @@ def whole(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def whole_folder(path: Path) -> Iterator[Path]:
-    """`whole` of a folder: a temporary one beside `path` that takes its place, whatever was there."""
+    """`whole` for a folder: yields a temporary one beside `path` that replaces it, with any previous content."""
     aside = path.with_name(f"{path.stem}.old{path.suffix}")
     with being_written(path) as temporary, being_written(aside) as old, naming(path):
         yield temporary
-        # Put aside at once and removed at leisure: an interrupt finds the one or the other.
+        # Two renames are fast; the old folder is removed afterward. So an interruption leaves one of the two complete.
         if path.exists():
             path.rename(old)
         temporary.rename(path)
 
 
 def make_folder(path: Path) -> Path:
-    """The folder, made if it is not there, without what a killed process of ours left half-written.
+    """The folder, created if it does not exist, without temporary files of our processes that were killed.
 
-    Raises InputError where that cannot be.
+    Raises InputError if it cannot be created.
     """
     try:
         path.mkdir(parents=True, exist_ok=True)
@@ -122,18 +126,19 @@ def make_folder(path: Path) -> Path:
 
 
 def write_png16(path: Path, image_dn: NDArray) -> None:
-    """16-bit PNG of the digital numbers themselves; a noise-free frame is rounded."""
+    """16-bit PNG of the digital numbers; a noise-free frame is rounded."""
     numbers = np.clip(np.rint(image_dn), 0, 65535).astype(np.uint16)
     write_image(path, numbers)
 
 
-PLAIN = (cv2.IMWRITE_TIFF_COMPRESSION, cv2.IMWRITE_TIFF_COMPRESSION_NONE)  # some readers know no other
+PLAIN = (cv2.IMWRITE_TIFF_COMPRESSION, cv2.IMWRITE_TIFF_COMPRESSION_NONE)  # some readers support no other
 
 
 def write_image(path: Path, image: NDArray) -> None:
-    """An image by the name's ending. Raises InputError if it cannot be encoded, OSError if it cannot be written.
+    """Write an image in the format of the name's suffix.
 
-    OpenCV encodes in memory: of a file that it cannot write it would not tell why.
+    Raises InputError if it cannot be encoded, OSError if it cannot be written. OpenCV encodes in memory, because it
+    would not report why a file cannot be written.
     """
     try:
         done, coded = cv2.imencode(path.suffix, image, PLAIN if path.suffix == ".tif" else ())
@@ -152,7 +157,7 @@ def write_table(path: Path, table: Any) -> None:
 
 
 def header_numbers(path: Path, meta: dict[str, Any], key: str, count: int) -> list[float]:
-    """So many finite numbers under a key of an ECSV's header; what a size or focal length is, is above 0."""
+    """`count` finite numbers under a key of an ECSV header, positive for a size or focal length. Raises InputError."""
     try:
         numbers = np.atleast_1d(np.array(meta.get(key), dtype=float))
     except (TypeError, ValueError):
@@ -175,7 +180,7 @@ def write_bytes(path: Path, data: bytes) -> None:
 
 
 def to_json(data: Any) -> str:
-    """JSON with null for what is not a number."""
+    """JSON with null for NaN and infinity."""
 
     def plain(value: Any) -> Any:
         if isinstance(value, dict):

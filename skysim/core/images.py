@@ -1,4 +1,8 @@
-"""Image files: FITS, PNG, TIFF, JPEG and BMP, and frames of a live camera, read with limits on their size."""
+"""Image files (FITS, PNG, TIFF, JPEG, BMP) and frames of a live camera, read with limits on their size.
+
+A few bytes of a damaged or hostile file can declare an image that exceeds the memory. The declared size is therefore
+read from the header here, and checked, before astropy or OpenCV decodes the file.
+"""
 
 from __future__ import annotations
 
@@ -22,13 +26,13 @@ from numpy.typing import NDArray
 from skysim.core.errors import InputError
 
 FITS_SUFFIXES = (".fits", ".fit", ".fts")
-BEGINS = b"SIMPLE  ="  # what is packed (gzip, zip and others) does not: astropy would unpack it
-MOST_HDUS = 1000  # in which an image is looked for
+BEGINS = b"SIMPLE  ="  # start of every FITS file; a compressed one differs, which astropy would unpack
+MOST_HDUS = 1000  # that are searched for an image
 
 
 @contextmanager
 def opened(path: Path) -> Iterator[BinaryIO]:
-    """The file for astropy, whose warnings are errors within: past them it may walk a damaged file for ever."""
+    """The file for astropy, with its warnings as errors: past a warning it may read a damaged file endlessly."""
     from astropy.utils.exceptions import AstropyWarning
 
     with path.open("rb") as file, warnings.catch_warnings():
@@ -48,20 +52,20 @@ def read_fits(path: Path) -> NDArray:
     try:
         with opened(path) as file, fits.open(file, memmap=False) as hdus:
             for hdu in islice(hdus, MOST_HDUS):
-                # By the header, before the data is read or skipped.
+                # From the header, before the data is read or skipped.
                 check_pixels(path, *map(int, getattr(hdu, "shape", ()) or ()))
                 check_pixels(path, int(hdu.size) // 8)
                 if getattr(hdu, "is_image", False) and hdu.header.get("NAXIS", 0) > 0:
                     return np.ascontiguousarray(hdu.data.astype(hdu.data.dtype.newbyteorder("=")))
     except InputError:
         raise
-    except Exception as error:  # astropy meets a damaged header with whatever it stumbles over, KeyError too
+    except Exception as error:  # a damaged header makes astropy raise exceptions of many types, KeyError too
         raise InputError(f"{path}: not a whole FITS file: {' '.join(str(error).split())}") from None
     raise InputError(f"{path}: a FITS file without an image")
 
 
 def date_of(path: Path) -> datetime.datetime | None:
-    """DATE-OBS of a FITS file; None for other files and other headers."""
+    """DATE-OBS of a FITS file; None for other files and for headers without a valid one."""
     if path.suffix.lower() not in FITS_SUFFIXES:
         return None
     from astropy.io import fits
@@ -69,21 +73,21 @@ def date_of(path: Path) -> datetime.datetime | None:
     try:
         with opened(path) as file:
             return datetime.datetime.fromisoformat(str(fits.getheader(file).get("DATE-OBS")))
-    except Exception:  # as in `read_fits`, where it is told
+    except Exception:  # of many types, as in `read_fits`, which reports the fault
         return None
 
 
 class LiveCamera:
-    """An open camera, frame after frame."""
+    """An open camera or video stream, read frame by frame."""
 
     def __init__(self, source: str) -> None:
         self.source, self.taken = source, 0
         with silent_opencv():
             self.capture = cv2.VideoCapture(int(source) if source.isdigit() else source)
-            self.capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # the newest frame, not one of a while ago
+            self.capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # the newest frame, not a buffered one
 
     def frame(self) -> NDArray:
-        """The next frame, (H, W) or (H, W, 3). Raises InputError where none comes."""
+        """The next frame, (H, W) or (H, W, 3). Raises InputError if there is none."""
         with silent_opencv():
             there, frame = self.capture.read()
         if not there or frame is None:
@@ -96,19 +100,19 @@ class LiveCamera:
         return np.asarray(frame)
 
     def close(self) -> None:
-        """Leave it to others."""
+        """Release the camera."""
         self.capture.release()
 
 
 def grab(source: str) -> NDArray:
-    """One frame of a camera, (H, W) or (H, W, 3). Raises InputError where there is none."""
+    """One frame of a camera, (H, W) or (H, W, 3). Raises InputError if there is none."""
     with contextlib.closing(LiveCamera(source)) as camera:
         return camera.frame()
 
 
 @contextlib.contextmanager
 def silent_opencv() -> Iterator[None]:
-    """Without what OpenCV says by itself of a camera that is not there."""
+    """Suppress OpenCV's own messages, for example about a missing camera."""
     before = cv2.utils.logging.getLogLevel()
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:
@@ -119,18 +123,18 @@ def silent_opencv() -> Iterator[None]:
 
 MOST_PX = 1 << 28
 MOST_BYTES = 8 * MOST_PX  # of a file: each pixel a double
-DEFLATE = 1032  # times as many bytes come out of it at most (zlib's technical details)
-SEGMENTS = 1000  # of a JPEG before its picture
-ALONE = (0x01, *range(0xD0, 0xD8))  # TEM and RST: marks without a length
+DEFLATE = 1032  # greatest compression ratio of deflate (zlib's technical details)
+SEGMENTS = 1000  # of a JPEG before its image
+ALONE = (0x01, *range(0xD0, 0xD8))  # TEM and RST: markers without a length
 
-# TIFF: types of a whole number, 8, 16, 32 and 64 bits, and signed ones, which libtiff takes for a size as well (below 0
-# it does not, and we see more than is allowed); tags of width, height and samples of a pixel.
+# TIFF: integer types of 8, 16, 32 and 64 bits. libtiff accepts signed types for a size too. All are read as unsigned,
+# so a negative size, which libtiff rejects, is a huge one here. Tags of width, height and samples per pixel.
 WHOLE = {1: "B", 3: "H", 4: "I", 16: "Q", 6: "B", 8: "H", 9: "I", 17: "Q"}
 WIDTH_TAG, HEIGHT_TAG, SAMPLES_TAG = 256, 257, 277
 
 
 def read_picture(path: Path) -> NDArray:
-    """The pixels as they are, (H, W) or (H, W, channels). Raises InputError with one line."""
+    """The pixels as stored, (H, W) or (H, W, channels). Raises InputError with one line."""
     data = path.read_bytes()
     check_picture(path, data)
     try:
@@ -145,7 +149,7 @@ def read_picture(path: Path) -> NDArray:
 
 @contextmanager
 def silent_stderr() -> Iterator[None]:
-    """Keep C libraries quiet: libpng and OpenCV print their complaints on file descriptor 2 themselves."""
+    """Suppress output of C libraries: libpng and OpenCV write their messages directly to file descriptor 2."""
     sys.stderr.flush()
     kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
     try:
@@ -165,18 +169,18 @@ def check_pixels(path: Path, *sides: int) -> None:
 
 
 def check_bytes(path: Path) -> None:
-    """Raise InputError for a file greater than the greatest picture."""
+    """Raise InputError for a file larger than the largest allowed image."""
     held = path.stat().st_size
     if held > MOST_BYTES:
         raise InputError(f"{path}: {held} bytes; allowed: up to {MOST_BYTES}")
 
 
 def check_picture(path: Path, data: bytes) -> None:
-    """Raise InputError unless these are the bytes of a PNG, TIFF, JPEG or BMP file of no more pixels than allowed."""
+    """Raise InputError unless these are the bytes of a PNG, TIFF, JPEG or BMP file with at most MOST_PX pixels."""
     read = next((told for magic, told in FORMATS.items() if data.startswith(magic)), None)
     try:
         sizes = list(read(data)) if read else []
-    except (struct.error, OverflowError):  # it ends within its header, or is told to go on beyond memory
+    except (struct.error, OverflowError):  # truncated header, or an offset beyond the address space
         sizes = []
     if not sizes:
         raise InputError(f"{path}: cannot be decoded; it may be truncated or not an image")
@@ -188,9 +192,10 @@ Sizes = Iterator[tuple[int, ...]]
 
 
 def png(data: bytes) -> Sizes:
-    """The first chunk is IHDR (PNG, section 11.2.2). None where more rows or a longer chunk are told than there can be.
+    """Size from IHDR, the first chunk (PNG, section 11.2.2); nothing if a chunk or the rows exceed the file.
 
-    OpenCV takes the memory for a chunk before it reads it.
+    OpenCV allocates memory for a chunk before it reads it, so every chunk must end within the file, and the rows must
+    be no more than the file can hold at deflate's greatest compression.
     """
     width, height, bits = struct.unpack_from(">IIB", data, 16)
     at, kind = 8, b""
@@ -198,21 +203,21 @@ def png(data: bytes) -> Sizes:
         length, kind = struct.unpack_from(">I4s", data, at)
         at += 12 + length
     held = at <= len(data) and height * (1 + width * bits // 8) <= DEFLATE * len(data)
-    if held or width * height > MOST_PX:  # of so many the caller tells
+    if held or width * height > MOST_PX:  # the caller reports an excessive size
         yield width, height
 
 
 def bmp(data: bytes) -> Sizes:
-    """The old header of 12 bytes has 16-bit sizes; a negative height is a picture that begins at its top."""
+    """The old 12-byte header has 16-bit sizes; a negative height means that rows are stored from the top."""
     old = struct.unpack_from("<I", data, 14)[0] == 12
     width, height = struct.unpack_from("<HH" if old else "<ii", data, 18)
     yield abs(width), abs(height)
 
 
 def jpeg(data: bytes) -> Sizes:
-    """Every start of a frame (SOF, ITU-T T.81, B.2.2) before the first scan.
+    """Size of every start of frame (SOF, ITU-T T.81, B.2.2) before the first scan.
 
-    Between segments libjpeg passes over what is none; we read no further.
+    libjpeg skips invalid bytes between segments; here they end the search.
     """
     at = 2
     for _ in range(SEGMENTS):
@@ -231,9 +236,10 @@ def jpeg(data: bytes) -> Sizes:
 
 
 def tiff(data: bytes) -> Sizes:
-    """The first directory (TIFF 6.0, section 2), or BigTIFF's. The greatest of a tag that is there twice.
+    """Size from the first directory (TIFF 6.0, section 2), or BigTIFF's; the greatest value of a repeated tag.
 
-    Here alone a sample may have eight bytes, as a pixel of the other formats has at most.
+    Only here are samples counted as well, because a TIFF sample may have eight bytes, as many as a whole pixel of the
+    other formats.
     """
     order = "<" if data.startswith(b"II") else ">"
     big = struct.unpack_from(order + "H", data, 2)[0] == 43
@@ -263,10 +269,9 @@ IMAGE_SUFFIXES = (*FITS_SUFFIXES, ".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bm
 
 
 def read_image(path: Path) -> NDArray:
-    """The pixels of a FITS, PNG, TIFF, JPEG or BMP file as they are: (H, W) or (H, W, channels).
+    """The pixels of a FITS, PNG, TIFF, JPEG or BMP file as stored: (H, W) or (H, W, channels).
 
-    Raises InputError with one line for a file that is missing, truncated, no image, or of more pixels than are
-    allowed.
+    Raises InputError with one line for a file that is missing, truncated, not an image, or has too many pixels.
     """
     if not path.is_file():
         raise InputError(f"{path}: no such file")
@@ -280,7 +285,7 @@ def read_image(path: Path) -> NDArray:
 
 
 def monochrome(image: NDArray) -> NDArray:
-    """Luminance of a colour picture (its alpha channel aside); a monochrome one as it is."""
+    """Luminance of a color image (alpha is ignored); a monochrome one unchanged. Raises InputError."""
     if image.ndim == 2:
         return image
     if image.ndim != 3 or image.shape[2] not in (1, 3, 4):

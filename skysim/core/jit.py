@@ -1,7 +1,7 @@
-"""How every loop is compiled, said in one place.
+"""Numba options of all compiled functions.
 
-What a function leaves unsaid numba takes from the function for which it happens to be compiled first, and keeps on
-disk: then whether it divides by zero or raises, and in which order it may add, would hang on what ran first.
+Options missing on a callee are inherited from the caller that compiles it first, and are cached on disk. All of them
+are set here, so the results (division by zero, exceptions, order of additions) do not depend on the call order.
 """
 
 from __future__ import annotations
@@ -13,19 +13,19 @@ from numba.core import event
 
 from skysim.core import errors
 
-# Division by zero gives inf or nan, as arrays do; sums are added as written unless a function allows otherwise.
+# Division by zero gives inf or nan, as in NumPy; sums are not reordered unless a function sets fastmath itself.
 jit = partial(numba.njit, cache=True, error_model="numpy", fastmath=False)
 
 
 class Listener(event.Listener):
-    """Says at the first compilation that one is under way; what is read from numba's cache makes none."""
+    """Prints a note at the first compilation; functions loaded from numba's cache do not compile."""
 
     def on_start(self, _: event.Event) -> None:
         event.unregister("numba:compile", self)
         errors.note("compiling its loops, once after an installation or a change: a minute or so")
 
     def on_end(self, _: event.Event) -> None:
-        """Nothing is said of it."""
+        """Required by the interface; prints nothing."""
 
 
 if errors.attended:

@@ -1,4 +1,4 @@
-"""Folders of the scenes and the data that come with skysim."""
+"""Folders of the scenes and the data that are shipped with skysim."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
 
-# An installed package carries within it what stands beside it in a checkout.
+# In a checkout scenes/ and data/ are beside the package; an installed package contains them.
 SHIPPED = ROOT if (ROOT / "pyproject.toml").is_file() else ROOT / "skysim"
 DATA = SHIPPED / "data"
 SCENES = SHIPPED / "scenes"

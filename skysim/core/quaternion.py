@@ -1,7 +1,7 @@
-"""Single unit quaternions for the loops that run at every tick; many at a time are SciPy's `Rotation`.
+"""Single unit quaternions for the loops of every control tick; for arrays of rotations SciPy's `Rotation` is used.
 
-Each is (4,) w, x, y, z (scalar first, Hamilton's product), named a_from_b like every rotation. SciPy takes 14-35 us for
-a product or a construction of one, which is a tenth of what a control period of 10 ms may cost here.
+Each is (4,) w, x, y, z (scalar first, Hamilton's product), named a_from_b like every rotation. SciPy takes 14-35 us
+to multiply or construct one, a tenth of the time available in a control period of 10 ms.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ Floats = NDArray[np.float64]
 
 
 def of(a_from_b: Rotation) -> Floats:
-    """(4,) wxyz of one Rotation; SciPy's own scalar_first takes 30 us for its roll."""
+    """(4,) wxyz of one Rotation, reordered here: SciPy's scalar_first takes 30 us."""
     x, y, z, w = a_from_b.as_quat()
     return np.array([w, x, y, z])
 
 
 def rotation(a_from_b: Floats) -> Rotation:
-    """One Rotation of (4,) wxyz."""
+    """One Rotation from (4,) wxyz."""
     w, x, y, z = a_from_b.tolist()
     return Rotation.from_quat([x, y, z, w])
 
@@ -61,15 +61,16 @@ def apply(a_from_b: Floats, v_b: Floats) -> Floats:
 
 @jit
 def from_rotvec(turn_rad: Floats) -> Floats:
-    """The rotation by |turn_rad| about turn_rad (3,): cos(a / 2), sin(a / 2) axis."""
+    """The rotation by |turn_rad| about turn_rad (3,): (cos(a / 2), sin(a / 2) axis)."""
     angle = math.sqrt(turn_rad[0] ** 2 + turn_rad[1] ** 2 + turn_rad[2] ** 2)
-    scale = math.sin(angle / 2) / angle if angle > 1e-9 else 0.5
+    scale = math.sin(angle / 2) / angle if angle > 1e-9 else 0.5  # the limit for small angles
     return np.array([math.cos(angle / 2), scale * turn_rad[0], scale * turn_rad[1], scale * turn_rad[2]])
 
 
 @jit
 def to_rotvec(a_from_b: Floats) -> Floats:
     """(3,) axis times angle, the angle at most pi."""
+    # q and -q are the same rotation: take the one with w >= 0.
     sign = 1.0 if a_from_b[0] >= 0 else -1.0
     x, y, z = sign * a_from_b[1], sign * a_from_b[2], sign * a_from_b[3]
     sine = math.sqrt(x * x + y * y + z * z)
@@ -79,7 +80,7 @@ def to_rotvec(a_from_b: Floats) -> Floats:
 
 @jit
 def cross(a: Floats, b: Floats) -> Floats:
-    """a x b; np.cross takes ten times as long over a single pair."""
+    """a x b; np.cross takes ten times as long for a single pair."""
     return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
 
 
@@ -98,14 +99,15 @@ def times(matrix: Floats, v: Floats) -> Floats:
 
 @jit
 def along(knots_wxyz: Floats, hermite_rad: Floats, knot: NDArray[np.int64], share: Floats) -> Floats:
-    """(M, 4) attitudes between knots (N, 4): cubic Hermite in the rotation vector from the knot before.
+    """(M, 4) attitudes between knots (N, 4): cubic Hermite in the rotation vector from the previous knot.
 
-    hermite_rad : (N - 1, 3, 3) rotation vector to the next knot, and its derivative at both ends times the step
-    knot, share : (M,) the knot before each moment, and how much of the step has gone since
+    hermite_rad : (N - 1, 3, 3) rotation vector to the next knot, and its derivatives at both ends times the step
+    knot, share : (M,) index of the knot before each time, and the elapsed fraction of the step
     """
     out = np.empty((len(knot), 4))
     for m in range(len(knot)):
         k, s = knot[m], share[m]
+        # Hermite basis: value at the end, slope at the beginning, slope at the end. The value at the beginning is zero.
         a, b, c = s * s * (3 - 2 * s), s * (1 - s) ** 2, -s * s * (1 - s)
         turn, begin, end = hermite_rad[k]
         out[m] = multiply(knots_wxyz[k], from_rotvec(a * turn + b * begin + c * end))

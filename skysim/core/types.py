@@ -1,4 +1,4 @@
-"""What flows from room to room: frozen arrays with their shapes, frames and units."""
+"""Data passed between the packages: frozen arrays with their shapes, frames and units."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Mount:
-    """Where the camera sits on the vehicle.
+    """Position and orientation of the camera on the vehicle.
 
-    camera_body_m : (3,) entrance pupil in the body frame, whose origin is the bearing centre
+    camera_body_m : (3,) entrance pupil in the body frame, whose origin is the bearing center
     cam_from_body : rotation of the body frame into the camera frame (+x right, +y down, +z boresight)
     """
 
@@ -28,7 +28,7 @@ class Mount:
 
 @dataclass(frozen=True, slots=True)
 class Trajectory:
-    """The vehicle's attitude history, sampled finely enough to be interpolated.
+    """The vehicle's attitude history, sampled finely enough for interpolation.
 
     t_s             : (N,) strictly increasing
     lab_from_body   : N rotations
@@ -42,26 +42,26 @@ class Trajectory:
 
     @classmethod
     def at_rest(cls, lab_from_body: Rotation, end_s: float) -> Trajectory:
-        """One attitude from 0 to end_s."""
+        """A constant attitude from 0 to end_s."""
         both = Rotation.concatenate([lab_from_body, lab_from_body])
         return cls(np.array([0.0, end_s]), both, np.zeros((2, 3)))
 
     def between(self) -> tuple[Floats, Floats]:
-        """Attitudes (N, 4) as wxyz and (N - 1, 3, 3) what `quaternion.along` takes; worked out once, when asked."""
+        """Attitudes (N, 4) as wxyz and hermite_rad (N - 1, 3, 3) for `quaternion.along`; computed at the first call."""
         if not self._between:
             step = np.diff(self.t_s)[:, None]
             turn = (self.lab_from_body[:-1].inv() * self.lab_from_body[1:]).as_rotvec()
             begin, end = self.rate_body_rad_s[:-1] * step, self.rate_body_rad_s[1:] * step
-            # d(rotvec)/dt = omega + rotvec x omega / 2 + ...: the body rate seen from the sample before.
+            # d(rotvec)/dt = omega + rotvec x omega / 2 + ...: the rotation vector is from the previous sample.
             end = end + np.cross(turn, end) / 2
             wxyz = self.lab_from_body.as_quat(scalar_first=True)
             self._between.append((wxyz, np.stack([turn, begin, end], axis=1)))
         return self._between[0]
 
     def at(self, t_s: float | Floats) -> Rotation:
-        """lab_from_body at any time inside the history.
+        """lab_from_body at any time within the history.
 
-        Cubic Hermite in the rotation vector from the sample before, with both ends' rates: exact to fourth
+        Cubic Hermite in the rotation vector from the previous sample, with the rates at both ends: exact to fourth
         order in the step. Raises ValueError outside the history.
         """
         t = np.atleast_1d(np.asarray(t_s, dtype=float))
@@ -75,28 +75,29 @@ class Trajectory:
         return here if np.ndim(t_s) else here[0]
 
     def rate_at(self, t_s: float) -> Floats:
-        """(3,) angular velocity in body axes, linear between the samples."""
+        """(3,) angular velocity in body axes, interpolated linearly."""
         return np.array([np.interp(t_s, self.t_s, rate) for rate in self.rate_body_rad_s.T])
 
 
 @dataclass(frozen=True, slots=True)
 class Telemetry:
-    """What the vehicle did and believed at K ticks of its computer; None where it has no such thing.
+    """True and estimated states of the vehicle at K ticks of its computer; None for what it does not have.
 
     t_s             : (K,); period_s between them
-    lab_from_body   : K, the truth, without what jitter lays over it; rate_body_rad_s (K, 3) likewise
-    lab_from_ref    : K, what it was told
-    torque_nm       : (K, 3) what the controller asked for, in body axes
-    disturbance_nm  : (K, 3) what disturbed it, gravity, drag, spring and actuators apart
+    lab_from_body   : K, the truth, without the added jitter; rate_body_rad_s (K, 3) likewise
+    lab_from_ref    : K, the commanded attitude
+    torque_nm       : (K, 3) torque demanded by the controller, in body axes
+    disturbance_nm  : (K, 3) disturbance torque, without gravity, drag, spring and actuators
     momentum_nms    : (K, 3) stored in wheels and CMGs, in body axes
     wheel_rad_s, gimbal_rad : (K, n)
-    joints          : (K, nq) all joints as MuJoCo has them, for pictures
+    joints          : (K, nq) MuJoCo's positions of all joints, for rendering
     manipulability  : (K,) of the CMGs: 1 far from a singularity, 0 at one
     lab_from_imu    : K, the navigator's attitude
-    saturated       : (K,) whether the gyros were at their limit in the tick before
-    bias_rad_s      : (K, 3) what the gyros show too much: bias, scale, misalignment, the Earth if nobody allows for it
-    lab_from_filter : K, the filter's attitude, its standard deviation (K, 3) about the body's axes, the bias that it
-                      believes (K, 3) and that one's
+    saturated       : (K,) whether the gyros were at their limit in the previous tick
+    bias_rad_s      : (K, 3) rate error of the gyros: bias, scale, misalignment, and the Earth rate if not compensated
+    lab_from_filter : K, the filter's attitude; sigma_attitude_rad (K, 3) its standard deviation about the body's
+                      axes; believed_bias_rad_s (K, 3) its bias estimate, sigma_bias_rad_s (K, 3) the bias's standard
+                      deviation
     """
 
     t_s: Floats
@@ -122,15 +123,16 @@ class Telemetry:
 
 @dataclass(frozen=True, slots=True)
 class Sources:
-    """Everything that shines, stars and LEDs alike, in lab axes.
+    """All light sources, stars and LEDs alike, in lab axes.
 
     id         : (N,) Hipparcos number or LED number
     place      : (N, 4) homogeneous: (direction, 0) for a star at infinity, (x, y, z in m, 1) for an LED
     normal     : (N, 3) unit normal of the emitting disc; zeros for a star
     radius_m   : (N,) radius of the emitting disc; 0 for a star
-    strength   : (N,) in photo-electrons, that is photons weighed with the chip's quantum efficiency at each
-                 wavelength: star: e- s^-1 m^-2 at the aperture; LED: e- s^-1 sr^-1 along its normal. How it falls
-                 off with angle and distance is the dome's (`led.Emitter`)
+    strength   : (N,) in photo-electrons, that is photons weighted with the chip's quantum efficiency at each
+                 wavelength: star: e- s^-1 m^-2 at the aperture; LED: e- s^-1 sr^-1 along its normal. Its decrease
+                     with
+                 angle and distance is given by `led.Emitter`
     period_s, start_s, on_s : (N,) pulse train: lit from start_s for on_s in every period_s
     magnitude  : (N,) V magnitude of a star; NaN for an LED
     """
@@ -155,18 +157,18 @@ class Sources:
 
 @dataclass(frozen=True, slots=True)
 class SourceTruth:
-    """The truth of every source that put light on the frame.
+    """The true image of every source that contributed light to the frame.
 
     id           : (N,)
-    xy_px        : (N, 2) pixel at mid-exposure, in a rolling shutter the middle row's
+    xy_px        : (N, 2) pixel at mid-exposure; with a rolling shutter that of the middle row
     flux_xy_px   : (N, 2) flux-weighted mean pixel over the exposure
-    electrons    : (N,) mean photo-electrons that fell on the chip
+    electrons    : (N,) mean photo-electrons on the chip
     peak_e       : (N,) mean electrons in the source's brightest pixel
-    streak_px    : (N,) path length over the exposure, in a rolling shutter the first row's
+    streak_px    : (N,) path length over the exposure; with a rolling shutter that of the first row
     area_px      : (N,) noise-equivalent area (sum s)^2 / sum s^2 of its image
     peak_xy      : (N, 2) the brightest pixel
-    saturated    : (N,) whether that pixel is expected full
-    snr          : (N,) signal to noise of its electrons over that area, as if no well were full
+    saturated    : (N,) whether that pixel is expected to be full
+    snr          : (N,) signal-to-noise ratio of its electrons over that area, without saturation
     """
 
     id: NDArray[np.int64]
@@ -183,14 +185,14 @@ class SourceTruth:
 
 @dataclass(frozen=True, slots=True)
 class Truth:
-    """What the frame was made from.
+    """The true state behind a frame.
 
     t_s           : mid-exposure, seconds from the scene's start
     lab_from_body : attitude at mid-exposure
     cam_from_lab  : the camera's attitude at mid-exposure
     rate_cam_rad_s: (3,) angular velocity in camera axes
     seen          : the sources on the frame
-    hidden        : (M,) ids of those that would be on it at mid-exposure, had something not stood in the way
+    hidden        : (M,) ids of sources that are occluded and would otherwise be on the frame at mid-exposure
     """
 
     t_s: float
@@ -214,13 +216,14 @@ class Frame:
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One frame of a run as people read it: angles in degrees, errors in arcseconds, times in ms.
+    """One frame of a run for the report: angles in degrees, errors in arcseconds, times in ms.
 
     truth_deg, estimate_deg : (RA, Dec, roll) of the camera under the stars, (roll, pitch, yaw) of the vehicle
         under the dome
-    wrong : solved, and more than ten arc-minutes off
-    cross_sigma_arcsec, roll_sigma_arcsec : what the tracker claims of its errors; log10_chance : of its matches
-    filter : what the attitude filter made of it in flight; empty where there is none
+    wrong : solved, but with an error of more than ten arcminutes
+    cross_sigma_arcsec, roll_sigma_arcsec : standard deviations that the tracker claims;  log10_chance : of its
+        matches
+    filter : verdict of the attitude filter on the solution; empty without a filter
     """
 
     frame: int

@@ -1,8 +1,8 @@
-"""Values with their units, read from YAML; the base of every section of a file.
+"""Values with units, read from YAML; the base class of every section of a file.
 
 Two rules name every key. A key whose value carries its own unit has none in its name (`focal_length: "35 mm"`);
 a key whose value is a bare number ends in its unit (`tilt_stop_deg: 30`). In Python the former gains the SI
-suffix (`camera.focal_length_m`), so that a unit is always in sight.
+suffix (`camera.focal_length_m`), so that every name shows its unit.
 """
 
 from __future__ import annotations
@@ -16,22 +16,23 @@ from typing import Annotated, Any
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
 
-LONGEST = 80  # a quantity
-UNIT_FOLLOWS = r"^\s*[-+.]?\d.*[a-zA-Z]"  # what editors can tell of a quantity
+LONGEST = 80  # characters of a quantity
+UNIT_FOLLOWS = r"^\s*[-+.]?\d.*[a-zA-Z]"  # pattern of a quantity in the JSON schema, for editors
 
-# Only what a quantity parser fills: `dark_e_s` and `rate_deg_s` are bare numbers and keep their unit.
+# Suffixes that the YAML key lacks, of fields that `quantity` parses. `dark_e_s` and `rate_deg_s` are bare numbers and
+# keep theirs.
 SI_SUFFIX = re.compile(
     r"(?<!_deg)(?<!_rad)(?<!_e)(?<!^e)(?<!_cm2)(?<!_um)_(m|s|n|kg|kg_m|kg_m2|cd|w_sr|nm|nm_rad|nms|nms2)$"
 )
 
 
 def in_utc(moment: datetime.datetime) -> datetime.datetime:
-    """The moment in UTC, without a zone; one that has no zone is in UTC."""
+    """The moment in UTC, without a zone; a naive datetime is in UTC already."""
     return moment if moment.tzinfo is None else moment.astimezone(datetime.UTC).replace(tzinfo=None)
 
 
 def quantity(si_unit: str, what: str, examples: str) -> Callable[[Any], float]:
-    """A validator that turns a quantity such as "48 in" into a float in `si_unit`."""
+    """A validator that converts a quantity such as "48 in" to a float in `si_unit`."""
 
     def parse(value: Any) -> float:
         if not isinstance(value, str):
@@ -45,16 +46,16 @@ def quantity(si_unit: str, what: str, examples: str) -> Callable[[Any], float]:
 
 
 def with_unit(si_unit: str, what: str, examples: str) -> BeforeValidator:
-    """`quantity` for a key of a section; editors are told that it is a text."""
+    """`quantity` as the validator of a key; the JSON schema declares the value as a string."""
     told = Field(description=f"a {what} such as {examples}", pattern=UNIT_FOLLOWS)
     return BeforeValidator(quantity(si_unit, what, examples), json_schema_input_type=Annotated[str, told])
 
 
 def in_si(value: str, si_unit: str | None = None) -> float:
-    """A quantity such as "48 in" in that unit, or in its own of the SI. Raises ValueError or TypeError."""
+    """The value of a quantity such as "48 in" in `si_unit`, or else in SI units. Raises ValueError or TypeError."""
     from astropy import units
 
-    # astropy spells it `inch`; the lab writes `in`.
+    # astropy spells it `inch`; scenes write `in`.
     inch = units.def_unit("in", units.imperial.inch)
     if len(value) > LONGEST:
         raise ValueError(f"{len(value)} characters are no quantity")
@@ -100,7 +101,7 @@ Ascending = Annotated[tuple[Number, ...], Field(min_length=2)]
 
 
 class ConfigModel(BaseModel):
-    """Base of every section: frozen, no unknown keys, units out of the YAML names."""
+    """Base of every section: frozen, unknown keys are errors, YAML keys lack the SI suffix."""
 
     model_config = ConfigDict(
         extra="forbid",
@@ -112,14 +113,14 @@ class ConfigModel(BaseModel):
 
 
 def require_member(value: str, allowed: Mapping[str, Any]) -> str:
-    """The value, if it is a key of `allowed`."""
+    """The value, if it is a key of `allowed`. Raises ValueError."""
     if value not in allowed:
         raise ValueError(f"{value!r} is none of {', '.join(allowed)}")
     return value
 
 
 def check_table(angle_deg: Sequence[float], values: Sequence[float], name: str) -> None:
-    """Refuse two columns that are no function of an ascending angle."""
+    """Raise ValueError unless two columns have equal length and the angle ascends."""
     if len(angle_deg) != len(values):
         raise ValueError(f"angle_deg has {len(angle_deg)} numbers, {name} {len(values)}")
     if any(b <= a for a, b in itertools.pairwise(angle_deg)):

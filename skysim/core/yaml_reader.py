@@ -1,4 +1,9 @@
-"""A YAML file read with care, and what pydantic finds wrong with it told in one line."""
+"""Read YAML files safely, and turn a pydantic validation error into a one-line message with file and line.
+
+Input files may come from untrusted sources, so their size, depth and number of values are limited (`Careful`), and
+duplicate keys are rejected (`once`). `explain` takes the first error that pydantic reports, translates its location
+to the keys of the YAML tree, and `place_of` finds the line of that key in the file that defines it.
+"""
 
 from __future__ import annotations
 
@@ -15,31 +20,33 @@ from skysim import __version__
 from skysim.core.errors import InputError, printable
 
 Files = list[tuple[Path, str]]  # paths and texts
-VERSION = 1  # of scene and study files. A change that old files don't survive raises it and brings them up to date here
+VERSION = 1  # of scene and study files; raised by an incompatible change, with a conversion of old files here
 
 
 MOST_BYTES = 1 << 20  # of a file: a minute of reading
-MOST_NODES = 100_000  # of a document, what stands behind its aliases counted every time
-LONGEST = 200  # what is shown of a value
-DEEPEST = 40  # sections within sections
+MOST_NODES = 100_000  # of a document, counting the content of an alias each time
+LONGEST = 200  # characters of a value in a message
+DEEPEST = 40  # levels of nesting
 
 
 class Careful(yaml.SafeLoader):
-    """Plain YAML without what makes a small file a great one: aliases of aliases, depth, a section within itself."""
+    """SafeLoader with limits: nested aliases that expand, deep nesting and recursive aliases raise an error."""
 
     def __init__(self, text: str) -> None:
         super().__init__(text)
         self.depth = self.nodes = 0
-        self.size: dict[int, int] = {}  # of nodes that are whole, by id
+        self.size: dict[int, int] = {}  # nodes within each completely composed node, by id
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
         before, mark = self.nodes, self.peek_event().start_mark
         aliased = self.check_event(yaml.AliasEvent)
+        # Limits are checked while composing, before any value is constructed from an expanding alias.
         self.depth += 1
         if self.depth > DEEPEST:
             raise yaml.composer.ComposerError(None, None, f"more than {DEEPEST} sections deep", mark)
         node = super().compose_node(parent, index)
         self.depth -= 1
+        # An alias of a node that is not yet complete lies within that node: it is recursive.
         if aliased and id(node) not in self.size:
             raise yaml.composer.ComposerError(None, None, "an alias of what it stands in", mark)
         self.nodes += self.size[id(node)] if aliased else 1
@@ -49,7 +56,7 @@ class Careful(yaml.SafeLoader):
         return node
 
     def construct_object(self, node: yaml.Node, deep: bool = False) -> Any:
-        """As ever; what Python has against a number or a date is told as what is wrong with the YAML."""
+        """As in SafeLoader, but report invalid numbers and dates as YAML errors."""
         try:
             return super().construct_object(node, deep)
         except (ValueError, TypeError, LookupError, OverflowError, AttributeError) as error:
@@ -58,7 +65,7 @@ class Careful(yaml.SafeLoader):
 
 
 def composed(text: str, kind: type[Careful] = Careful) -> tuple[yaml.Node | None, Any]:
-    """The nodes of a YAML document, and its values. Raises YAMLError."""
+    """The node tree of a YAML document, and its values. Raises YAMLError."""
     loader = kind(text)
     try:
         node = loader.get_single_node()
@@ -68,7 +75,7 @@ def composed(text: str, kind: type[Careful] = Careful) -> tuple[yaml.Node | None
 
 
 def is_file(path: Path) -> bool:
-    """Whether there is such a file; of a name that no file can have, no."""
+    """Whether the file exists; False for a name that no file can have."""
     try:
         return path.is_file()
     except OSError:
@@ -76,7 +83,7 @@ def is_file(path: Path) -> bool:
 
 
 def find(name: str, folder: Path, what: str) -> Path:
-    """The path of a file given by path, or by its name in a folder."""
+    """The path of a file given by path, or by its name in a folder. Raises InputError."""
     path, shipped = Path(name), folder / f"{name}.yaml"
     if path.suffix in {".yaml", ".yml"} and is_file(path):
         return path
@@ -87,13 +94,13 @@ def find(name: str, folder: Path, what: str) -> Path:
 
 
 def shown(value: object) -> str:
-    """A value as it stands in a complaint: on one line, and not without end."""
+    """A value for a message: on one line, truncated to LONGEST characters."""
     text = printable(value)
     return text if len(text) <= LONGEST else f"{text[:LONGEST]}…"
 
 
 def overridden(sets: list[str] | None) -> dict[str, str]:
-    """The keys and values of `--set path.to.key=value`."""
+    """Keys and values of `--set path.to.key=value`. Raises InputError."""
     overrides = {}
     for item in sets or []:
         key, equals, value = item.partition("=")
@@ -104,7 +111,7 @@ def overridden(sets: list[str] | None) -> dict[str, str]:
 
 
 def read_yaml(path: Path) -> tuple[dict[str, Any], str]:
-    """A YAML mapping and its text."""
+    """A YAML mapping and its text. Raises InputError."""
     try:
         if path.stat().st_size > MOST_BYTES:
             raise InputError(f"{path}: {path.stat().st_size} bytes; allowed: up to {MOST_BYTES}")
@@ -124,7 +131,7 @@ def read_yaml(path: Path) -> tuple[dict[str, Any], str]:
 
 
 def once(node: yaml.Node | None, path: Path) -> None:
-    """Refuse a key that stands twice in a mapping, of which YAML would silently take the last."""
+    """Raise InputError for a key that occurs twice in a mapping; YAML would silently use the last."""
     if isinstance(node, yaml.SequenceNode):
         for item in node.value:
             once(item, path)
@@ -140,7 +147,7 @@ def once(node: yaml.Node | None, path: Path) -> None:
 
 
 def of_our_version(tree: Mapping[str, Any], path: Path, text: str) -> None:
-    """Refuse a file whose `schema` is another than ours, before keys that we don't know are taken for mistakes."""
+    """Raise InputError for a file of another schema version, before its unknown keys are reported as mistakes."""
     if "schema" not in tree:
         raise InputError(f"schema: missing; add the line schema: {VERSION} ({path})")
     told = tree["schema"]
@@ -155,7 +162,7 @@ def of_our_version(tree: Mapping[str, Any], path: Path, text: str) -> None:
 
 
 def put(tree: dict[str, Any], key: str, value: str) -> None:
-    """Set one dotted key of the raw scene; the value is YAML. A number is a place in a list: `camera_body.2`."""
+    """Set one dotted key of the raw scene; the value is YAML. A number is an index into a list: `camera_body.2`."""
     *parents, last = key.split(".")
     if not all((*parents, last)):
         raise InputError(f"--set {shown(key)}={shown(value)}: allowed: path.to.key=value")
@@ -173,7 +180,7 @@ def put(tree: dict[str, Any], key: str, value: str) -> None:
 
 
 def place_in(values: list[Any], place: str, key: str) -> int:
-    """The place in a list that a part of a dotted key names."""
+    """The list index that a component of a dotted key gives. Raises InputError."""
     if not (place.isascii() and place.isdigit() and len(place) < 10) or int(place) >= len(values):
         raise InputError(
             f"--set {shown(key)}: {shown(place)} is no place in a list; allowed: 0 to {len(values) - 1}"
@@ -188,11 +195,11 @@ def explain(
     files: Files,
     overrides: Mapping[str, str],
 ) -> str:
-    """One line for the first fault: `led.falloff: 'cubic' is none of … (scenes/x.yaml, line 31)`.
+    """One-line message of the first validation error: `led.falloff: 'cubic' is none of … (scenes/x.yaml, line 31)`.
 
-    tree is what the files came to, files they themselves with what stands above first.
+    tree is the merged content of the files; files are their paths and texts, the one with the highest priority first.
     """
-    # A key that is unknown explains one that is missing, so what is missing waits.
+    # A misspelled key causes two errors, unknown and missing. Report the unknown one.
     first = min(error.errors(), key=lambda fault: fault["type"] == "missing")
     keys = [str(key) for key in in_tree(first["loc"], tree, first["type"] == "missing")]
     message = re.sub(r"^(Value error, |\w+ should )", "", first["msg"])
@@ -207,19 +214,22 @@ def explain(
         message = "kind is missing"
     elif first["type"] in ("model_type", "model_attributes_type"):
         message = f"{shown(repr(first['input']))} is not allowed; it should be a mapping of keys to values"
-    elif first["type"] == "value_error" and not keys:  # of the whole scene: the message begins with the key
+    elif (
+        first["type"] == "value_error" and not keys
+    ):  # validator of the whole scene: its message begins with the key
         dotted, _, message = message.partition(": ")
         keys = dotted.split(".")
     elif not first["type"].startswith("value_error"):
         message = f"{shown(repr(first['input']))} is not allowed; it should {message}"
     dotted = ".".join(keys)
-    # What is missing is in no file; but a file may have it in a section or list that another one replaces.
+    # A missing key has no line of its own, so its section's is given. (A file may have it in a section or list that
+    # another file replaces.)
     given = keys[:-1] if first["type"] == "missing" else keys
     return f"{shown(dotted) + ': ' if dotted else ''}{message} {place_of(given, files, overrides)}"
 
 
 def place_of(keys: list[str], files: Files, overrides: Mapping[str, str]) -> str:
-    """Where a key was given: `(scenes/x.yaml, line 31)` or `(--set)`; in the file that has most of it."""
+    """Where a key was given: `(--set)`, or `(scenes/x.yaml, line 31)` in the file that has most of its components."""
     dotted = ".".join(keys)
     if any(k == dotted or dotted.startswith(k + ".") for k in overrides):
         return "(--set)"
@@ -230,7 +240,7 @@ def place_of(keys: list[str], files: Files, overrides: Mapping[str, str]) -> str
 
 
 def in_tree(loc: tuple[int | str, ...], tree: Any, missing: bool) -> list[int | str]:
-    """The location without pydantic's own words for the branches of a union; its last key may be missing."""
+    """The error's location as keys of the tree, without pydantic's names of union branches; the last may be missing."""
     keys: list[int | str] = []
     for n, key in enumerate(loc):
         last = missing and n == len(loc) - 1
@@ -244,11 +254,12 @@ def in_tree(loc: tuple[int | str, ...], tree: Any, missing: bool) -> list[int | 
 
 
 def allowed_keys(model: type[BaseModel], loc: tuple[int | str, ...]) -> list[str]:
-    """The keys that a section takes, found by walking the schema along an error's location."""
+    """The keys that a section takes, found by following an error's location through the JSON schema."""
     schema = model.model_json_schema(by_alias=True)
     node: dict[str, Any] = schema
     for key in loc:
         node = resolve(node, schema)
+        # Branches of a union; an optional section has its union nested one level deeper.
         options = [resolve(option, schema) for option in node.get("anyOf", []) + node.get("oneOf", [])]
         options += [resolve(option, schema) for one in options for option in one.get("oneOf", [])]
         if key in node.get("properties", {}):
@@ -262,7 +273,7 @@ def allowed_keys(model: type[BaseModel], loc: tuple[int | str, ...]) -> list[str
 
 
 def resolve(node: dict[str, Any], schema: dict[str, Any]) -> dict[str, Any]:
-    """What a reference points to; of a section that may be left out, the section."""
+    """The schema that a node refers to; for an optional section, the section's."""
     options = [option for option in node.get("anyOf", []) if option.get("type") != "null"]
     if len(options) == 1:
         node = options[0]
@@ -280,7 +291,7 @@ def hint(word: str, allowed: list[str]) -> str:
 
 
 def line_of(text: str, keys: list[str]) -> tuple[int, int | None]:
-    """How many of a dotted key's parts stand in the text, and the line of the last that does."""
+    """How many components of a dotted key occur in the text, and the line of the last one that does."""
     node = yaml.compose(text, yaml.SafeLoader)
     depth, line = 0, None
     for key in keys:

@@ -1,4 +1,4 @@
-"""The camera as the hardware is: lens, chip and electronics, read from YAML. A part of the scene's schema."""
+"""Schema of the scene section `camera`: lens, chip and electronics as the hardware is."""
 
 from __future__ import annotations
 
@@ -24,25 +24,25 @@ from skysim.scene.opencv_calibration import Calibration
 
 FOCUS = Annotated[
     str, Field(description='a length such as "33 in", or infinity')
-]  # what editors are told of it
+]  # shown by editors, from the JSON schema
 
 Electrons = Annotated[Number, Field(ge=0, le=1e9)]
 
 Radial = Annotated[Number, Field(ge=-1e6, le=1e6)]
 
-Tangential = Annotated[Number, Field(ge=-0.1, le=0.1)]  # more would fold the image
+Tangential = Annotated[Number, Field(ge=-0.1, le=0.1)]  # a larger value would fold the image
 
 
 def focus_distance(value: Any) -> float:
-    """A length, or the word infinity."""
+    """A length in m; infinity for the word infinity."""
     return math.inf if value == "infinity" else quantity("m", "length", '"33 in", or infinity')(value)
 
 
 class PsfConfig(ConfigModel):
-    """What every point-spread function has: a Gaussian blur that grows towards the field's corner.
+    """Base of all point-spread functions: a Gaussian blur that grows toward the corner of the field.
 
-    corner_sigma_px : standard deviation, added in quadrature, proportional to the field radius, reached at the
-                      farthest corner of the chip (field curvature and coma, to first order)
+    corner_sigma_px : standard deviation at the farthest corner of the chip, proportional to the field radius, added
+                      in quadrature (field curvature and coma, to first order)
     """
 
     corner_sigma_px: Annotated[Number, Field(ge=0, le=20)] = 0.0
@@ -64,7 +64,7 @@ class MoffatPsfConfig(PsfConfig):
 
 
 class AiryPsfConfig(PsfConfig):
-    """Diffraction at the lens's working f-number and a blur of sigma_px on top."""
+    """Diffraction at the lens's working f-number, convolved with a Gaussian blur of sigma_px."""
 
     kind: Literal["airy"]
     wavelength_m: Annotated[Length, Field(ge=200e-9, le=2e-6)] = 550e-9
@@ -72,7 +72,7 @@ class AiryPsfConfig(PsfConfig):
 
 
 class DiscPsfConfig(PsfConfig):
-    """A uniform disc, the geometric image of a lens out of focus, and a blur of sigma_px on its edge."""
+    """A uniform disc, the geometric image of a defocused lens, convolved with a Gaussian blur of sigma_px."""
 
     kind: Literal["disc"]
     radius_px: Annotated[Number, Field(gt=0, le=200)]
@@ -80,7 +80,7 @@ class DiscPsfConfig(PsfConfig):
 
 
 class MeasuredPsfConfig(PsfConfig):
-    """A point's image as it was measured: a square table of numbers, `oversampling` samples a pixel each way."""
+    """A measured image of a point: a square table of numbers, `oversampling` samples per pixel along each axis."""
 
     kind: Literal["measured"]
     file: str
@@ -94,7 +94,7 @@ Psf = Annotated[
 
 
 class TwoStopsConfig(ConfigModel):
-    """Mechanical vignetting by two equal round stops, one behind the other; nothing passes at cutoff_deg."""
+    """Mechanical vignetting by two equal round stops, one behind the other; zero transmission at cutoff_deg."""
 
     kind: Literal["two_stops"]
     cutoff_deg: Annotated[Number, Field(gt=0, lt=90)]
@@ -114,7 +114,7 @@ class VignettingTableConfig(ConfigModel):
 
 
 class GlobalShutterConfig(ConfigModel):
-    """Every row sees the same exposure."""
+    """All rows are exposed at the same time."""
 
     kind: Literal["global"] = "global"
 
@@ -127,14 +127,14 @@ class RollingShutterConfig(ConfigModel):
 
 
 class FrameTransferConfig(ConfigModel):
-    """Charge is shifted under light into a store, row_time a row: every pixel gathers from its whole column."""
+    """Charge is shifted, still exposed, into a covered store, row_time per row: a pixel collects along its column."""
 
     kind: Literal["frame_transfer"]
     row_time_s: Annotated[Time, Field(gt=0)]
 
 
 class InterlineConfig(ConfigModel):
-    """The covered register leaks: it takes `leak` of the light of every row that it passes, row_time a row."""
+    """The covered register leaks: it takes the share `leak` of the light of every row it passes, row_time per row."""
 
     kind: Literal["interline"]
     row_time_s: Annotated[Time, Field(gt=0)]
@@ -148,12 +148,12 @@ Shutter = Annotated[
 
 
 class ParticlesConfig(ConfigModel):
-    """Ionising particles that leave straight tracks: cosmic rays, trapped protons.
+    """Ionizing particles that leave straight tracks: cosmic rays, trapped protons.
 
-    per_cm2_s     : crossings of a square centimetre of the chip a second, from all sides: half of the omnidirectional
-                    flux
+    per_cm2_s     : crossings per square centimeter of the chip and second, from all sides: half of the
+                    omnidirectional flux
     depth_m       : thickness of the sensitive layer
-    electrons_um  : most probable charge a micrometre of track (about 80 for a fast singly charged particle)
+    electrons_um  : most probable charge per micrometer of track (about 80 for a fast singly charged particle)
     diffusion_px  : standard deviation of the charge cloud
     """
 
@@ -164,21 +164,21 @@ class ParticlesConfig(ConfigModel):
 
 
 class DetectorConfig(ConfigModel):
-    """The chip and its electronics, in the charge's order. A step is switched off by its parameter.
+    """The chip and its electronics, in the order of the signal path. Each effect's parameter can switch it off.
 
     quantum_efficiency : one number for 400-1000 nm, or the name of a curve in data/qe (or a file)
-    hardware_seed      : this chip's own fixed pattern: PRNU, DSNU, hot pixels, column offsets
+    hardware_seed      : this chip's fixed pattern: PRNU, DSNU, hot pixels, column offsets
     prnu               : standard deviation of the pixels' relative sensitivity
     dark_e_s           : mean dark current at dark_temperature_c; it doubles every dark_doubling_c
     dsnu               : standard deviation of the pixels' relative dark current
-    hot_pixels         : share of the pixels that are hot, with an exponential spread of mean hot_e_s
-    blooming           : column: what a full well cannot hold flows along its column; anti_blooming of it drains
+    hot_pixels         : share of the pixels that are hot, with exponentially distributed dark current of mean hot_e_s
+    blooming           : column: charge beyond a full well flows along its column; anti_blooming is the share drained
     cti_parallel, cti_serial : share of the charge left behind in each transfer
     read_noise_e, reset_noise_e : Gaussian, every pixel, every frame
     column_offset_e    : standard deviation of the columns' fixed offsets
     nonlinearity       : share of the signal missing at full well: e (1 - nonlinearity e / full_well)
-    noise              : false gives the expectation itself, unrounded: fixed pattern and transfer loss in it, but no
-                         particles, and neither well, bend nor converter have an end
+    noise              : false gives the expected value, not rounded: with fixed pattern and transfer loss, but
+                         without particles, full-well limit, nonlinearity and converter range
     """
 
     quantum_efficiency: Annotated[Number, Field(gt=0, le=1)] | str
@@ -225,7 +225,7 @@ class DetectorConfig(ConfigModel):
 
     @property
     def doublings(self) -> float:
-        """How often the dark current doubles from the temperature it is quoted for to the chip's own."""
+        """How many times the dark current doubles from dark_temperature_c to the chip's temperature."""
         warm_c = 0.0 if self.temperature_c is None else self.temperature_c - self.dark_temperature_c
         return warm_c / self.dark_doubling_c
 
@@ -237,7 +237,7 @@ class DetectorConfig(ConfigModel):
 
 
 class CameraConfig(ConfigModel):
-    """Lens and chip as they are. What the tracker believes of them stands in `tracker`."""
+    """Lens and chip as the hardware is. What the tracker believes of them is in `tracker`."""
 
     width_px: Annotated[int, Field(ge=16, le=20000)]
     height_px: Annotated[int, Field(ge=16, le=20000)]
@@ -270,26 +270,26 @@ class CameraConfig(ConfigModel):
 
     @property
     def image_distance_m(self) -> float:
-        """From lens to chip, by the thin lens: 1/v = 1/f - 1/u. The focal length, if focused at infinity."""
+        """Distance from lens to chip, by the thin lens: 1/v = 1/f - 1/u. The focal length if focused at infinity."""
         return 1 / (1 / self.focal_length_m - 1 / self.focus_m)
 
     @property
     def focal_px(self) -> float:
-        """Pixels a unit of tangent: what a star tracker calls its focal length."""
+        """Image distance in pixels: pixels per unit tangent, the focal length of a star tracker."""
         return self.image_distance_m / self.pixel_m
 
     @property
     def centre_px(self) -> tuple[float, float]:
-        """The principal point: as given, or the chip's middle."""
+        """The principal point; the chip's center if none is given."""
         return self.principal_point_px or ((self.width_px - 1) / 2, (self.height_px - 1) / 2)
 
     def calibration(self) -> Calibration:
-        """What a perfect calibration would find."""
+        """The result of a perfect calibration of this camera."""
         return Calibration(self.width_px, self.height_px, self.focal_px, self.centre_px, self.distortion)
 
     @property
     def corner_px(self) -> float:
-        """From the principal point to the farthest corner of the chip."""
+        """Distance from the principal point to the farthest corner of the chip."""
         x, y = self.centre_px
         return math.hypot(max(x + 0.5, self.width_px - 0.5 - x), max(y + 0.5, self.height_px - 0.5 - y))
 
@@ -300,7 +300,7 @@ CURVES = DATA / "qe"
 def curve_file(name: str) -> Path:
     """The file of a quantum efficiency: a name in data/qe, or a path that ends in .csv.
 
-    Raises ValueError, with the names that there are, if it is neither.
+    Raises ValueError, with the known names, if it is neither.
     """
     known = {path.stem: path for path in sorted(CURVES.glob("*.csv"))}
     if name in known:

@@ -1,4 +1,4 @@
-"""A dome's LEDs as a scene says it: how they are laid out, how each is driven and shines. Schema only."""
+"""Schema of a dome's LEDs: layout, brightness, drive and emission lobe."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from skysim.core.units import (
     check_table,
 )
 
-HOLES = 9  # on a patch board: 3x3
+HOLES = 9  # of a patch board: 3x3
 Level = Annotated[Number, Field(gt=0, le=1)]
 Levels = Annotated[tuple[Level, ...], Field(min_length=1)]
 Magnitudes = Annotated[tuple[Annotated[Number, Field(ge=-30, le=30)], ...], Field(min_length=1)]
@@ -31,16 +31,16 @@ FieldOfView = Annotated[Number, Field(ge=1, le=90)]
 
 
 def levels_of(magnitudes: Sequence[float]) -> tuple[float, ...]:
-    """Pogson's law: 10^(-0.4 m), the brightest of the list at full level."""
+    """Levels by Pogson's law, 10^(-0.4 m), relative to the brightest of the list, which has level 1."""
     return tuple(10.0 ** (-0.4 * (float(one) - float(min(magnitudes)))) for one in magnitudes)
 
 
 class BoardConfig(ConfigModel):
-    """One patch board, glued where the bearing's centre sees its middle.
+    """One patch board, glued with its center in this direction from the bearing's center.
 
-    azimuth_deg, tilt_deg : from the lab's +x towards +y, and from the zenith
-    turn_deg : of its columns about its normal
-    leds     : the holes that are soldered, 0 to 8, row by row; levels: of each, full if left out
+    azimuth_deg, tilt_deg : from the lab's +x toward +y, and from the zenith
+    turn_deg : rotation of its columns about its normal
+    leds     : the holes that hold an LED, 0 to 8, row by row;  levels : one per LED, full brightness if left out
     """
 
     azimuth_deg: Number
@@ -59,14 +59,14 @@ class BoardConfig(ConfigModel):
 
 
 class PatchBoardsConfig(ConfigModel):
-    """3x3 LED boards on a cap of the surface: spread evenly or on a grid, each with a pattern of its own, or by list.
+    """3x3 LED boards on a cap of the surface: spread evenly or on a grid with random patterns, or listed.
 
-    cap_deg : as far from the zenith as the dome carries LEDs, seen from the bearing; so for every layout
-    spacing, lit, pwm_levels : of boards that are spread; `boards` takes their place
-    spread  : along a spiral, as evenly as can be, or in rows and columns of the lab's x and y, seen from above;
-        on a dome of the apex's height all about, which sets how many a spiral has
+    cap_deg : angle from the zenith, seen from the bearing, to which the dome carries LEDs; so for every layout
+    spacing, lit, pwm_levels : of boards that are spread; `boards` replaces them
+    spread  : spiral: as evenly as possible; grid: rows and columns along the lab's x and y, seen from above. The
+        number of boards on a spiral is that of a dome with the apex's height in all directions
     glue_scatter  : standard deviation of an LED's place along each axis of its board
-    glue_tilt_deg : a board's normal is off the surface's by up to this, evenly over that cap
+    glue_tilt_deg : greatest angle between a board's normal and the surface's; normals are uniform over that cap
     """
 
     kind: Literal["patch_boards"]
@@ -100,10 +100,10 @@ class PatchBoardsConfig(ConfigModel):
 
 
 class DimmedConfig(ConfigModel):
-    """Base of the layouts of single LEDs: how bright each is made, by shares of full brightness or by magnitudes.
+    """Base of the layouts of single LEDs: their brightness, as shares of full brightness or as magnitudes.
 
-    Brightness is drawn from the list for each LED (in `listed`, the list is theirs, one by one); the least of the
-    magnitudes is full brightness.
+    Each LED's brightness is drawn from the list (in `listed`, the list has one value per LED). The smallest magnitude
+    is full brightness.
     """
 
     cap_deg: Cap
@@ -113,7 +113,7 @@ class DimmedConfig(ConfigModel):
 
     @property
     def dimming(self) -> tuple[float, ...]:
-        """The levels, whichever way they are given."""
+        """The levels, given as levels or as magnitudes."""
         return levels_of(self.magnitudes) if self.magnitudes else self.levels or (1.0,)
 
     @model_validator(mode="after")
@@ -124,16 +124,14 @@ class DimmedConfig(ConfigModel):
 
 
 class FibonacciConfig(DimmedConfig):
-    """So many LEDs on Fibonacci's spiral: as evenly as can be."""
+    """`count` LEDs on a Fibonacci spiral: as evenly as possible."""
 
     kind: Literal["fibonacci"]
     count: Count
 
 
 class PoissonDiscConfig(DimmedConfig):
-    """LEDs at random, none nearer to another than the spacing, as many as find room; or so many, as far apart as they
-    find it.
-    """
+    """LEDs at random with a least spacing: as many as fit at `spacing`, or `count` of them as far apart as they fit."""
 
     kind: Literal["poisson_disc"]
     spacing_m: Annotated[Length, Field(gt=0)] | None = None
@@ -147,20 +145,21 @@ class PoissonDiscConfig(DimmedConfig):
 
 
 class RandomPlacesConfig(DimmedConfig):
-    """So many LEDs, each anywhere."""
+    """`count` LEDs at independent random places."""
 
     kind: Literal["random"]
     count: Count
 
 
 class OptimisedConfig(DimmedConfig):
-    """So many LEDs where they make the worst attitude best: of all tilts to tilt_deg and any yaw, by one camera.
+    """`count` LEDs placed for one camera's best accuracy at its worst attitudes: tilts to tilt_deg, any yaw.
 
     field_deg : the camera's field of view along body x and y
     camera    : its entrance pupil on the body; it looks along body z
-    spacing   : no two LEDs are nearer to each other
-    alike     : LEDs of two fields coincide that are nearer when one is laid on the other: a few of the survey's errors
-    wanted    : LEDs that every field should hold; a field that has fewer counts as a worse one
+    spacing   : least distance between two LEDs
+    alike     : LEDs of two fields coincide if they are nearer than this when one field is laid on the other: a few
+        times the survey's error
+    wanted    : LEDs that every field should hold; fewer are penalized
     rounds    : how often each LED is offered another place
     """
 
@@ -178,12 +177,12 @@ class OptimisedConfig(DimmedConfig):
 class CelestialConfig(ConfigModel):
     """The real sky: an LED for each of the brightest stars, where the camera at its nominal place sees it.
 
-    count or limit_mag : so many stars on the dome, or all to this V
-    camera : the entrance pupil in the lab when the vehicle stands level
-    zenith_ra_deg, zenith_dec_deg, roll_deg : what is overhead, and the position angle there of the lab's -y (a level
-        camera's up), as `ra_deg`, `dec_deg`, `roll_deg` of a camera that looks up
-    epoch  : whose apparent places they are, UTC
-    brightness : band, each LED is as bright as the chip finds its star, whose colour the LED lacks; v, as its V
+    count or limit_mag : number of LEDs for the brightest stars on the dome, or all stars to this V
+    camera : the entrance pupil in the lab when the vehicle is level
+    zenith_ra_deg, zenith_dec_deg, roll_deg : the direction at the zenith, and the position angle there of the lab's
+        -y (a level camera's up), as `ra_deg`, `dec_deg`, `roll_deg` of a camera that looks up
+    epoch  : time of the apparent places, UTC
+    brightness : band: each LED is as bright as the chip measures its star, whose color the LED lacks; v: as its V
     brightest_mag : no star is shown brighter than this, which is full brightness; the brightest star's if left out
     """
 
@@ -213,7 +212,7 @@ class CelestialConfig(ConfigModel):
 class ListedConfig(DimmedConfig):
     """LEDs by list: places in the lab, or directions from the bearing onto the surface, or a CSV file of either.
 
-    directions_deg : azimuth from +x towards +y, and tilt from the zenith
+    directions_deg : azimuth from +x toward +y, and tilt from the zenith
     file : columns x_m, y_m, z_m or azimuth_deg, tilt_deg, and level or magnitude
     """
 
@@ -247,10 +246,10 @@ Points = Annotated[
 
 
 class FibresConfig(ConfigModel):
-    """Ends of optical fibres through the shell (JHU/APL's dome), where any layout of single LEDs has its points.
+    """Ends of optical fibers through the shell (JHU/APL's dome), at the points of any layout of single LEDs.
 
-    radius_variation : the dome's radius is another at every fibre, by up to this share of the distance from the
-        bearing, evenly: the end stands off the surface along its normal, inwards or outwards
+    radius_variation : greatest error of the dome's radius at a fiber, as a share of the distance from the bearing,
+        uniformly distributed: the end is displaced along the surface's normal, inward or outward
     """
 
     kind: Literal["fibres"]
@@ -259,16 +258,16 @@ class FibresConfig(ConfigModel):
 
     @property
     def cap_deg(self) -> float:
-        """As far from the zenith as there are points."""
+        """Angle from the zenith to which there are points."""
         return self.points.cap_deg
 
 
 class PixelsConfig(ConfigModel):
-    """A display's grid and its greys: what a panel on the ceiling and a micro-display on a bench have alike.
+    """A display's grid and gray levels, common to an LCD panel and a collimated micro-display.
 
-    pixels : columns and rows;  pitch : from a pixel to the next, along both
-    block  : a star is drawn as so many by so many pixels, all of one grey
-    grey_levels, gamma : grey g = 0, 1, ... lets (g / (grey_levels - 1))^gamma of white through
+    pixels : columns and rows;  pitch : from one pixel to the next, along both
+    block  : a star is drawn as a square of this many pixels a side, all of one gray
+    grey_levels, gamma : gray g = 0, 1, ... transmits (g / (grey_levels - 1))^gamma of white
     contrast : white over black, which glows all over the display; none: black is dark
     """
 
@@ -291,9 +290,9 @@ class PixelsConfig(ConfigModel):
 class LcdConfig(PixelsConfig):
     """A flat LCD panel (the Naval Postgraduate School's screen): any layout of single LEDs, drawn on its pixels.
 
-    It lies in the middle of the flat surface and ends where its pixels end, columns along the surface's own x, rows
-    along its y, which a level camera sees as right and down. `led` is one white pixel while its backlight is lit, its
-    disc_diameter that of a disc of its area.
+    It is centered on the flat surface and ends where its pixels end, with columns along the surface's own x and rows
+    along its y, which a level camera sees as right and down. `led` is one white pixel while its backlight is lit; its
+    disc_diameter is that of a disc of the pixel's area.
     """
 
     kind: Literal["lcd"]
@@ -301,7 +300,7 @@ class LcdConfig(PixelsConfig):
 
     @property
     def cap_deg(self) -> float:
-        """As far from the zenith as there are points."""
+        """Angle from the zenith to which there are points."""
         return self.points.cap_deg
 
 
@@ -320,14 +319,14 @@ Layout = Annotated[
 
 
 class CosineLobeConfig(ConfigModel):
-    """Radiant intensity as cos^exponent of the angle from the normal; 1 is Lambert's law."""
+    """Radiant intensity proportional to cos^exponent of the angle from the normal; 1 is Lambert's law."""
 
     kind: Literal["cosine"] = "cosine"
     exponent: NotNegative = 1.0
 
 
 class LobeTableConfig(ConfigModel):
-    """Relative intensity against angle as it was measured, 1 on the axis, nothing beyond the last angle."""
+    """Measured relative intensity against angle, 1 on the axis, zero beyond the last angle."""
 
     kind: Literal["table"]
     angle_deg: Ascending
@@ -345,21 +344,21 @@ Lobe = Annotated[CosineLobeConfig | LobeTableConfig, Field(discriminator="kind")
 
 
 class DirectConfig(ConfigModel):
-    """Direct current: always lit, the level in its strength."""
+    """Direct current: always lit, the level scales the strength."""
 
     kind: Literal["direct"]
 
 
 class PwmConfig(ConfigModel):
-    """Hardware PWM: lit for its level of every led.pwm_period, each LED with a phase of its own."""
+    """Hardware PWM: lit for its level of every led.pwm_period, each LED with a random phase."""
 
     kind: Literal["pwm"] = "pwm"
 
 
 class SequentialConfig(ConfigModel):
-    """An Arduino's software PWM: its LEDs one after another, each lit for its level of its slot.
+    """An Arduino's software PWM: its LEDs in sequence, each lit for its level of its slot.
 
-    controller : `board`, one to each patch board; `dome`, one for all; or how many LEDs, by number, share one
+    controller : `board`: one per patch board; `dome`: one for all; or how many LEDs, by number, share one
     """
 
     kind: Literal["sequential"]
@@ -368,7 +367,7 @@ class SequentialConfig(ConfigModel):
 
 
 class RefreshConfig(ConfigModel):
-    """A panel's backlight, lit for `duty` of every frame: row after row from the top, in the course of a frame."""
+    """A panel's backlight, lit for `duty` of every frame: row after row from the top, over the course of a frame."""
 
     kind: Literal["refresh"]
     rate_hz: Annotated[Number, Field(gt=0)]
@@ -379,9 +378,9 @@ Drive = Annotated[DirectConfig | PwmConfig | SequentialConfig | RefreshConfig, F
 
 
 class LedConfig(ConfigModel):
-    """One kind of LED, for the whole dome: so bright along its normal, in candela or in watts a steradian.
+    """The one LED type of the dome: intensity along its normal, in candela or in watts per steradian.
 
-    drive : what makes its level; pwm_period belongs to the kind pwm
+    drive : how its level is made; pwm_period belongs to the kind pwm
     """
 
     intensity_cd: Annotated[Intensity, Field(gt=0)] | None = None

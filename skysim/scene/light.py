@@ -1,4 +1,4 @@
-"""What shines, as a scene says it: a dome with its LEDs or the stars, and the glow behind them. Schema only."""
+"""Schema of the scene sections `light` and `background`: a dome with its LEDs, stars or a star simulator, and glow."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ Tilt = Annotated[Number, Field(ge=-45, le=45)]
 
 
 class SurfaceConfig(ConfigModel):
-    """The inside of the dome, in the lab frame (metres, bearing centre at the origin): what every kind has.
+    """The inside of the dome, in the lab frame (meters, bearing center at the origin): keys common to all kinds.
 
-    Sizes, apex and rim are the dome's before it is displaced, its axis upright through the bearing's centre.
+    Sizes, apex and rim are the dome's before it is displaced, its axis upright through the bearing's center.
 
     offset   : the whole dome's displacement
-    tilt_deg : about the lab's x, then about its y, through the surface's own centre (the origin of surveyed points)
-    error    : standard deviation of the lab's survey of it, along the normal: one draw for all of it, for what its
-               points err each by itself averages out; `tracker.survey.seed` draws it
+    tilt_deg : about the lab's x, then about its y, through the surface's own center (the origin of surveyed points)
+    error    : standard deviation of the lab's survey of it, along the normal: one draw for the whole surface, because
+               errors of single points average out; drawn by `tracker.survey.seed`
     """
 
     kind: Literal["sphere", "ellipsoid", "flat", "cylinder", "surveyed"]
@@ -33,13 +33,13 @@ class SurfaceConfig(ConfigModel):
     @model_validator(mode="wrap")
     @classmethod
     def of_its_kind(cls, value: Any, handler: ModelWrapValidatorHandler[SurfaceConfig]) -> SurfaceConfig:
-        """`Surface.model_validate` makes the part of the kind that is told."""
+        """Validate a section with the class of its `kind` when called on the base class."""
         kind = value.get("kind") if cls is SurfaceConfig and isinstance(value, dict) else None
         return PARTS[kind].model_validate(value) if kind in list(PARTS) else handler(value)
 
 
 class RimmedConfig(SurfaceConfig):
-    """A surface that ends: at a height above the bearing, or at an angle from its axis seen from the bearing."""
+    """A surface with a rim: at a height above the bearing, or at an angle from its axis seen from the bearing."""
 
     rim_height_m: Length | None = None
     rim_deg: Annotated[Number, Field(gt=0, lt=180)] | None = None
@@ -56,9 +56,9 @@ class RimmedConfig(SurfaceConfig):
 
 
 class WallConfig(ConfigModel):
-    """A formed sheet, which is thinnest at the apex: its thickness is linear in the angle about the sphere's centre.
+    """A formed sheet, thinnest at the apex: its thickness is linear in the angle about the sphere's center.
 
-    base_deg  : the angle of thickness_base, beyond which it stays
+    base_deg  : the angle of thickness_base, beyond which the thickness is constant
     radius_of : the face that is a sphere: the outside, or the middle of the wall
     """
 
@@ -69,7 +69,7 @@ class WallConfig(ConfigModel):
 
 
 class SphereSurfaceConfig(RimmedConfig):
-    """A sphere; with a wall, what is inside of a formed shell whose outside or middle is a sphere."""
+    """A sphere; with a wall, the inner face of a formed shell whose outside or middle is a sphere."""
 
     kind: Literal["sphere"]
     apex_m: Annotated[Length, Field(gt=0)]
@@ -85,7 +85,7 @@ class SphereSurfaceConfig(RimmedConfig):
 
 
 class EllipsoidSurfaceConfig(RimmedConfig):
-    """An ellipsoid: oblate, prolate or with three axes of its own."""
+    """An ellipsoid: oblate, prolate or triaxial."""
 
     kind: Literal["ellipsoid"]
     apex_m: Annotated[Length, Field(gt=0)]
@@ -93,7 +93,7 @@ class EllipsoidSurfaceConfig(RimmedConfig):
 
 
 class FlatSurfaceConfig(SurfaceConfig):
-    """A level panel; of a width along x and a height along y, or without an end."""
+    """A level panel, with a width along x and a height along y, or infinite."""
 
     kind: Literal["flat"]
     apex_m: Annotated[Length, Field(gt=0)]
@@ -102,7 +102,7 @@ class FlatSurfaceConfig(SurfaceConfig):
 
 
 class CylinderSurfaceConfig(SurfaceConfig):
-    """A vault along the lab's x or y, or a drum about z; its highest place is at apex, its ends half a length off."""
+    """A vault along the lab's x or y, or a drum about z; its highest point is at apex, its ends half a length away."""
 
     kind: Literal["cylinder"]
     axis: Literal["x", "y", "z"]
@@ -123,7 +123,7 @@ class CylinderSurfaceConfig(SurfaceConfig):
 
 
 class SurveyedSurfaceConfig(RimmedConfig):
-    """Points that a measuring arm took on the inside, made smooth: Zernike polynomials up to a degree.
+    """A smooth surface fitted to points of a measuring arm on the inside: Zernike polynomials to a degree.
 
     file      : comments (#), a line of names, then lines of x, y, z in `unit`, z up
     rms_limit : of the points' distances from the smooth surface
@@ -153,7 +153,7 @@ PARTS: dict[Any, type[SurfaceConfig]] = {
 
 
 def of_a_known_kind(value: Any) -> Any:
-    """The value; an unknown kind is answered by the key `kind` itself, with those that there are."""
+    """The value; an unknown kind raises an error at the key `kind`, with the known kinds."""
     if isinstance(value, dict) and "kind" in value and value["kind"] not in list(PARTS):
         SurfaceConfig.model_validate({"kind": value["kind"]})
     return value
@@ -171,7 +171,7 @@ AnySurface = Annotated[
 
 
 class DomeConfig(ConfigModel):
-    """An LED dome as the light.
+    """An LED dome as the light source.
 
     occlusion : whether the vehicle's parts and the dome's own wall hide LEDs
     """
@@ -203,7 +203,7 @@ class DomeConfig(ConfigModel):
 
 
 class StarsConfig(ConfigModel):
-    """The real sky as the light.
+    """The real sky as the light source.
 
     occlusion : whether the vehicle's parts hide stars
     """
@@ -215,17 +215,18 @@ class StarsConfig(ConfigModel):
 
 
 class BenchConfig(PixelsConfig):
-    """A star simulator: a micro-display in the focus of a collimator, which stands above the level camera.
+    """A star simulator: a micro-display in the focus of a collimator, above the level camera.
 
-    Its axis is the lab's zenith, the display's columns run along the lab's x and its rows along y. Its exit covers
-    the lens wherever that moves to; what it does to colours and to the image is left out, and so is its refresh.
+    Its axis is the lab's zenith; the display's columns run along the lab's x and its rows along y. The exit pupil
+    covers the lens wherever it moves. The collimator's color and image errors and the display's refresh are
+    neglected.
 
     focal_length : of the collimator
-    catalogue, limit_mag : the stars shown, to this V, as they stand at the scene's start_time
-    axis_ra_deg, axis_dec_deg, roll_deg : what is in the display's middle, and the position angle there of the lab's
-        -y (a level camera's up), as `ra_deg`, `dec_deg`, `roll_deg` of a camera that looks up
-    brightest_mag : V that a white block has for the camera, in the Sun's colour; brighter stars are shown so
-    conjugate : as far from the bearing's centre the stars stand, by an error of collimation; none: at infinity
+    catalogue, limit_mag : the stars shown, to this V, at the scene's start_time
+    axis_ra_deg, axis_dec_deg, roll_deg : the direction at the display's center, and the position angle there of the
+        lab's -y (a level camera's up), as `ra_deg`, `dec_deg`, `roll_deg` of a camera that looks up
+    brightest_mag : V of a white block for the camera, in the Sun's color; brighter stars are limited to it
+    conjugate : distance of the stars from the bearing's center, from an error of collimation; none: infinite
     """
 
     kind: Literal["bench"]
@@ -240,14 +241,14 @@ class BenchConfig(PixelsConfig):
 
 
 class UniformGlowConfig(ConfigModel):
-    """The same everywhere: e_s electrons a second in every pixel (a light leak, a lit room)."""
+    """Uniform glow: e_s electrons per second in every pixel (a light leak, a lit room)."""
 
     kind: Literal["uniform"]
     e_s: Annotated[Number, Field(ge=0, le=1e12)]
 
 
 class SkyGlowConfig(ConfigModel):
-    """The night sky's surface brightness at the boresight, with a relative slope along the image's axes."""
+    """The night sky's surface brightness at the boresight, with a relative gradient along the image's axes."""
 
     kind: Literal["sky"]
     mag_arcsec2: Annotated[Number, Field(ge=0, le=30)]
@@ -255,10 +256,10 @@ class SkyGlowConfig(ConfigModel):
 
 
 class MoonGlowConfig(ConfigModel):
-    """Moonlight scattered by the air (Krisciunas & Schaefer 1991), the Moon at ra_deg, dec_deg.
+    """Moonlight scattered by the atmosphere (Krisciunas & Schaefer 1991), the Moon at ra_deg, dec_deg.
 
     phase_angle_deg : 0 at full moon, 90 at the quarters
-    extinction_mag  : of the air at the zenith, in V
+    extinction_mag  : of the atmosphere at the zenith, in V
     moon_zenith_deg, field_zenith_deg : zenith distances of the Moon and of the boresight
     """
 
@@ -272,10 +273,10 @@ class MoonGlowConfig(ConfigModel):
 
 
 class StrayLightConfig(ConfigModel):
-    """A bright body outside of the field through baffle and lens, by their point source transmittance.
+    """Stray light of a bright body outside the field, by the point source transmittance of baffle and lens.
 
-    ra_deg, dec_deg : where it stands, in the lab's axes (under the stars those of the ICRS)
-    v_mag           : how bright it is; the Sun's -26.74 if left out
+    ra_deg, dec_deg : its direction, in the lab's axes (under the stars those of the ICRS)
+    v_mag           : its V magnitude; the Sun's -26.74 if left out
     angle_deg, pst  : irradiance on the chip over irradiance before the lens, against the angle from the boresight
     """
 

@@ -1,4 +1,10 @@
-"""Load a scene: presets, calibration files, `base` scenes and overrides, then validation."""
+"""Load a scene: presets, calibration files, `base` scenes and overrides, then validation.
+
+The raw YAML tree is built in layers, the later ones over the earlier: the `base` scene (recursively), the scene's own
+keys, then the overrides of `--set`. Next, the camera's preset is put beneath the camera section and a calibration
+file's values over it (`with_preset`). Only then does pydantic validate the tree. Every error becomes an InputError of
+one line with key, file and line.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +32,7 @@ PRESETS = DATA / "cameras"
 
 
 def preset(name: str, where: str) -> dict[str, Any]:
-    """The `camera` section of data/cameras/NAME.yaml. Raises BadInput for a name that is none."""
+    """The `camera` section of data/cameras/NAME.yaml. Raises InputError for an unknown name."""
     from skysim.core.yaml_reader import read_yaml
 
     known = sorted(path.stem for path in PRESETS.glob("*.yaml"))
@@ -37,8 +43,11 @@ def preset(name: str, where: str) -> dict[str, Any]:
 
 
 def with_preset(tree: dict[str, Any]) -> dict[str, Any]:
-    """The raw scene with its camera's preset beneath what the scene itself says of the camera, and its calibration
-    in its place. Raises BadInput beginning with the key."""
+    """The raw scene with its camera's preset and calibration applied.
+
+    The camera's own keys override the preset's; the calibration's values are added to both. Raises InputError; its
+    message begins with the key.
+    """
     part = tree.get("camera")
     if not isinstance(part, dict) or not {"preset", "calibration"} & set(part):
         return tree
@@ -59,7 +68,11 @@ CALIBRATED = ("width_px", "height_px", "focal_length", "principal_point_px", "di
 
 
 def calibrated(path: Path, part: dict[str, Any]) -> dict[str, Any]:
-    """What a calibration of OpenCV says of a camera whose pixel and focus are told: size, focal length, distortion."""
+    """The camera keys that an OpenCV calibration defines: size, focal length, principal point, distortion.
+
+    The focal length in meters follows from the camera's pixel pitch and focus, which the file does not contain.
+    Raises InputError.
+    """
     try:
         told = read_calibration(path)
         pixel_m = quantity("m", "length", '"5.5 um"')(part.get("pixel"))
@@ -74,7 +87,7 @@ def calibrated(path: Path, part: dict[str, Any]) -> dict[str, Any]:
             f"camera.calibration: {path}: of frames of {told.width_px}x{told.height_px}; the preset's are"
             f" {size[0]}x{size[1]}"
         )
-    # By the thin lens, as Camera.image_distance_m.
+    # Thin lens: a calibration measures the image distance v, and 1/f = 1/v + 1/u, as in CameraConfig.image_distance_m.
     focal_m = 1 / (1 / (told.focal_px * pixel_m) + 1 / focus_m)
     return {
         "width_px": told.width_px,
@@ -86,7 +99,7 @@ def calibrated(path: Path, part: dict[str, Any]) -> dict[str, Any]:
 
 
 def over(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
-    """Two mappings merged; where both have a section of one kind the sections are merged too."""
+    """Merge two mappings, `above` over `below`, recursively; sections of different kinds are replaced, not merged."""
     merged = below | above
     for key, value in above.items():
         ground = below.get(key)
@@ -98,20 +111,20 @@ def over(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
 
 
 class CameraFileConfig(ConfigModel):
-    """A file that describes a camera and nothing else."""
+    """A file with a camera section only."""
 
     camera: CameraConfig
 
 
 def find(name: str) -> Path:
-    """The path of a scene given by path or by its name in scenes/."""
+    """The path of a scene given by path or by its name in scenes/. Raises InputError."""
     return yaml_reader.find(name, SCENES, "scene")
 
 
 def load(name: str | Path, overrides: Mapping[str, str] | None = None) -> Scene:
     """Read, override (`path.to.key` -> YAML value) and validate a scene.
 
-    Raises BadInput with one line: the key, what is wrong with it, what is allowed, the file and line.
+    Raises InputError with one line: the key, what is wrong with it, what is allowed, the file and line.
     """
     path = find(str(name))
     tree, files = read(path)
@@ -125,7 +138,7 @@ def load(name: str | Path, overrides: Mapping[str, str] | None = None) -> Scene:
 
 
 def load_scene(name: str | Path, overrides: Mapping[str, Any] | None = None) -> Scene:
-    """`load` for Python: the values of the overrides may be numbers, lists and mappings too.
+    """`load` for Python: override values may also be numbers, lists and mappings.
 
         load_scene("shefex2", {"exposure.frames": 3, "exposure.time": "20 ms"})
 
@@ -136,13 +149,14 @@ def load_scene(name: str | Path, overrides: Mapping[str, Any] | None = None) -> 
 
 
 def list_scenes() -> list[str]:
-    """Names of the scenes that come with skysim."""
+    """Names of the scenes that are shipped with skysim."""
     return sorted(path.stem for path in SCENES.glob("*.yaml"))
 
 
 def where(message: str, name: str, overrides: Mapping[str, str]) -> str:
-    """A complaint that begins with a key of a scene, and where that stands; any other as it is."""
+    """A message that begins with a scene's key, with file and line appended; any other message unchanged."""
     key = message.partition(":")[0]
+    # Unchanged: messages that do not begin with a key of the scene, or that already end with a place.
     told = re.fullmatch(r"[a-z_]+(\.\w+)*", key)
     if (
         not told
@@ -154,9 +168,9 @@ def where(message: str, name: str, overrides: Mapping[str, str]) -> str:
 
 
 def read(path: Path, above: tuple[Path, ...] = ()) -> tuple[dict[str, Any], Files]:
-    """A scene's keys over those of its `base`, another scene by name or path; and the files, this one first."""
+    """A scene's keys merged over those of its `base` scene, and the files read, this one first. Raises InputError."""
     tree, text = read_yaml(path)
-    if above or tree.keys() != {"camera"}:  # a camera's file, which is no scene
+    if above or tree.keys() != {"camera"}:  # a file with a camera only has no schema version
         of_our_version(tree, path, text)
     tree = beside(path, tree)
     if "base" not in tree:
@@ -174,7 +188,7 @@ def read(path: Path, above: tuple[Path, ...] = ()) -> tuple[dict[str, Any], File
 
 
 def beneath(tree: dict[str, Any], files: Files, overrides: Mapping[str, str]) -> dict[str, Any]:
-    """`with_preset`, which knows neither file nor line."""
+    """`with_preset`, with file and line added to its errors."""
     try:
         return with_preset(tree)
     except InputError as error:
@@ -182,7 +196,7 @@ def beneath(tree: dict[str, Any], files: Files, overrides: Mapping[str, str]) ->
         raise InputError(f"{error} {place_of(key.split('.'), files, overrides)}") from None
 
 
-# Keys that name a file of the scene's own.
+# Keys whose value may be a file in the scene's folder.
 FILES = (
     ("vehicle", "model"),
     ("camera", "psf", "file"),
@@ -195,14 +209,14 @@ FILES = (
 
 
 def beside(path: Path, tree: dict[str, Any]) -> dict[str, Any]:
-    """The scene with the files that it names taken from its own folder, where there are any of that name."""
+    """The scene with file names made absolute if such a file exists in the scene's folder."""
     for keys in FILES:
         tree = anchored(path.resolve().parent, tree, *keys)
     return tree
 
 
 def anchored(folder: Path, tree: dict[str, Any], key: str, *inner: str) -> dict[str, Any]:
-    """A mapping in which the file named under these keys, if it is in the folder, has its whole path."""
+    """The mapping with the file name under these nested keys made absolute if the file is in the folder."""
     value = tree.get(key)
     if inner and isinstance(value, dict):
         return tree | {key: anchored(folder, value, *inner)}
@@ -212,9 +226,9 @@ def anchored(folder: Path, tree: dict[str, Any], key: str, *inner: str) -> dict[
 
 
 def load_camera(path: Path, lens: Mapping[str, Any] | None = None) -> CameraConfig:
-    """The `camera` section of a scene, or of a file that has nothing else. Raises BadInput with one line.
+    """The `camera` section of a scene, or of a file with a camera only. Raises InputError with one line.
 
-    lens : keys that stand in for those which a preset leaves to its scene
+    lens : values for keys that a preset leaves to its scene; keys of the file override them
     """
     tree, files = read(path)
     if isinstance(tree.get("camera"), dict):

@@ -1,4 +1,4 @@
-"""What the vehicle is told to do, and by whom it is flown. A part of the scene's schema."""
+"""Schema of the scene section `motion`: start, maneuver, attitude controller and jitter."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class AttitudeConfig(ConfigModel):
 
 
 class PointingConfig(ConfigModel):
-    """Where the camera looks in the ICRS: its boresight, and the position angle of the image's up direction."""
+    """Pointing of the camera in the ICRS: its boresight, and the position angle of the image's up direction."""
 
     ra_deg: Annotated[Number, Field(ge=0, lt=360)]
     dec_deg: Annotated[Number, Field(ge=-90, le=90)]
@@ -31,7 +31,7 @@ class PointingConfig(ConfigModel):
 
 
 def where_it_starts(value: Any) -> str:
-    """Which of the two starts is meant, so that a slip in one is not answered with the other's keys."""
+    """Tag of the kind of start, so that an error in one kind is not reported with the keys of the other."""
     keys = value if isinstance(value, dict) else ()
     sky = isinstance(value, PointingConfig) or any(key in keys for key in ("ra_deg", "dec_deg"))
     return "PointingConfig" if sky else "AttitudeConfig"
@@ -44,7 +44,7 @@ Start = Annotated[
 
 
 class JitterLineConfig(ConfigModel):
-    """A vibration of one frequency: rms_arcsec about each of the body's axes, phases at random."""
+    """A vibration at one frequency: rms_arcsec about each of the body's axes, random phases."""
 
     kind: Literal["line"]
     frequency_hz: Positive
@@ -71,21 +71,21 @@ JitterPart = Annotated[JitterLineConfig | JitterBandConfig, Field(discriminator=
 
 
 class HoldConfig(ConfigModel):
-    """Keep the attitude for a while."""
+    """Hold the attitude for a duration."""
 
     kind: Literal["hold"]
     duration_s: Duration
 
 
 class StepConfig(AttitudeConfig):
-    """Ask for a 3-2-1 attitude all at once, and keep asking for a while: the controller's step response."""
+    """Command a 3-2-1 attitude as a step and hold it for a duration: the controller's step response."""
 
     kind: Literal["step"]
     duration_s: Duration
 
 
 class SlewConfig(AttitudeConfig):
-    """Rest-to-rest eigen-axis turn to a 3-2-1 attitude, no faster than rate_deg_s."""
+    """Rest-to-rest eigenaxis rotation to a 3-2-1 attitude, at most at rate_deg_s."""
 
     kind: Literal["slew"]
     rate_deg_s: Positive = 2.0
@@ -93,7 +93,7 @@ class SlewConfig(AttitudeConfig):
 
 
 class RateConfig(ConfigModel):
-    """Turn at a constant rate about a body axis: rate_deg_s about x, y, z, from the first moment on."""
+    """Rotate at a constant rate: rate_deg_s about body x, y, z, from the first moment."""
 
     kind: Literal["rate"]
     rate_deg_s: RatesDegS
@@ -101,7 +101,7 @@ class RateConfig(ConfigModel):
 
 
 class SpinUpConfig(ConfigModel):
-    """Change the rate smoothly from what it is to rate_deg_s about body x, y, z."""
+    """Change the rate smoothly from its present value to rate_deg_s about body x, y, z."""
 
     kind: Literal["spin_up"]
     rate_deg_s: RatesDegS
@@ -109,7 +109,7 @@ class SpinUpConfig(ConfigModel):
 
 
 class SineConfig(ConfigModel):
-    """Swing about the attitude: amplitude_deg about body x, y, z at frequency_hz, growing and dying smoothly."""
+    """Oscillate about the attitude: amplitude_deg about body x, y, z at frequency_hz, starting and ending smoothly."""
 
     kind: Literal["sine"]
     amplitude_deg: tuple[Number, Number, Number]
@@ -118,7 +118,7 @@ class SineConfig(ConfigModel):
 
 
 class ShakeConfig(ConfigModel):
-    """Hold while the vehicle vibrates, as `motion.jitter` but for this while only."""
+    """Hold while the vehicle vibrates, as `motion.jitter` but for this duration only."""
 
     kind: Literal["jitter"]
     duration_s: Duration
@@ -126,11 +126,11 @@ class ShakeConfig(ConfigModel):
 
 
 class BumpConfig(ConfigModel):
-    """Somebody knocks against the vehicle, which is told to hold.
+    """An external torque impulse hits the vehicle while it is commanded to hold.
 
-    rate_deg_s : by how much the knock alone would change the rate about body x, y, z
-    duration   : of the knock, a half-sine of torque
-    caught_after : how long after its beginning an equal knock the other way stops it again; never if left out
+    rate_deg_s : change of the rate about body x, y, z that the impulse alone would cause
+    duration   : of the impulse, a half-sine of torque
+    caught_after : time from its beginning to an equal and opposite impulse; none if left out
     """
 
     kind: Literal["bump"]
@@ -152,9 +152,9 @@ Manoeuvre = Annotated[
 
 
 class DesaturationConfig(ConfigModel):
-    """The fans take momentum out of wheels or CMGs: begun above start, ended below stop.
+    """The fans unload momentum from wheels or CMGs: from above start until below stop.
 
-    time : the fans' torque is the stored momentum over this time, within what they can do
+    time : the fans' torque is the stored momentum over this time, within their limits
     """
 
     start_nms: Annotated[Momentum, Field(gt=0)]
@@ -171,11 +171,11 @@ class DesaturationConfig(ConfigModel):
 class ControlConfig(ConfigModel):
     """The attitude controller on the vehicle's computer.
 
-    law       : pid, or pd, which leaves what a constant torque does
+    law       : pid, or pd, which leaves the offset caused by a constant torque
     actuators : ideal torques about the body's axes, or one of the sets that `vehicle` switches on
-    feedback  : what it knows of the attitude: truth, imu (the navigator), filter (star tracker and gyro)
-    bandwidth_rad_s, damping : of the attitude loop; integral_rad_s : the pole of the integral. Keep the bandwidth times
-        the delay (a period of rate_hz, and the fans' time constant with fans) well below 1: 0.3 is fine
+    feedback  : source of the attitude: truth, imu (the navigator), filter (star tracker and gyro)
+    bandwidth_rad_s, damping : of the attitude loop;  integral_rad_s : the pole of the integral. Keep the bandwidth
+        times the delay (a period of rate_hz, and the fans' time constant with fans) well below 1: 0.3 is fine
     """
 
     law: Law = "pid"
@@ -189,14 +189,14 @@ class ControlConfig(ConfigModel):
 
 
 def spelt_out(value: Any) -> Any:
-    """`control: pid` is short for {law: pid}, `none` for nobody."""
+    """`control: pid` is short for {law: pid}, `none` for no controller."""
     if value == "none":
         return None
     return {"law": value} if isinstance(value, str) else value
 
 
 class MotionConfig(ConfigModel):
-    """How it starts and what it is told to do."""
+    """The vehicle's start, its maneuver, its controller and its jitter."""
 
     start: Start = AttitudeConfig()
     rate_deg_s: RatesDegS = (0.0, 0.0, 0.0)

@@ -1,4 +1,4 @@
-"""A camera's calibration as OpenCV's YAML has it, read with care and written so that OpenCV reads it back."""
+"""Camera calibrations in OpenCV's YAML format: read with checks, and written so that OpenCV can read them."""
 
 from __future__ import annotations
 
@@ -12,18 +12,20 @@ import yaml
 from skysim.core.errors import InputError
 from skysim.core.yaml_reader import Careful, composed, shown
 
-MOST_BYTES = 1 << 20  # a calibration with all its views' points; beyond that it is something else
-SQUARE = 1e-3  # by which fx and fy may differ: a calibration's own error, for the pixels of a chip are square
-MOST_PX = 20000  # a side of the chip, as of a scene's camera
+MOST_BYTES = 1 << 20  # enough for a calibration with the points of all its views
+SQUARE = (
+    1e-3  # allowed relative difference of fx and fy, the calibration's own error: a chip's pixels are square
+)
+MOST_PX = 20000  # a side of the chip, as in a scene's camera
 FIVE = ("k1", "k2", "p1", "p2", "k3")
 
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
-    """A pinhole with square pixels and the distortion of Brown (1971), in camera axes +x right, +y down, +z boresight.
+    """A pinhole with square pixels and the distortion of Brown (1971); camera axes +x right, +y down, +z boresight.
 
-    focal_px   : focal length, better: the image's distance, over the pixel's pitch
-    centre_px  : principal point (x, y); the middle of pixel (0, 0) is (0, 0), as with OpenCV
+    focal_px   : focal length (strictly, the image distance) over the pixel pitch
+    centre_px  : principal point (x, y); the center of pixel (0, 0) is (0, 0), as in OpenCV
     distortion : k1, k2, p1, p2, k3 in OpenCV's order
     """
 
@@ -35,7 +37,7 @@ class Calibration:
 
 
 class Loader(Careful):
-    """Plain YAML, and OpenCV's matrices as the mappings that they are."""
+    """`Careful`, with OpenCV's matrices as mappings."""
 
 
 def matrix_node(loader: yaml.SafeLoader, node: yaml.Node) -> Any:
@@ -58,10 +60,10 @@ def is_one(path: Path) -> bool:
 
 
 def read(path: Path) -> Calibration:
-    """The file of OpenCV's calibration samples (or of ROS, whose keys are the same).
+    """Read a file of OpenCV's calibration samples (or of ROS, whose keys are the same).
 
-    Keys: image_width, image_height, camera_matrix, distortion_coefficients; others are passed over. Raises InputError
-    with one line for a file that is none, and for a lens that is not of this kind: fisheye, rational, skewed.
+    Keys: image_width, image_height, camera_matrix, distortion_coefficients; others are ignored. Raises InputError
+    with one line for another file, and for another lens model: fisheye, rational, skewed.
     """
     tree = parsed(path)
     for key, allowed in (("fisheye_model", (0, False)), ("distortion_model", ("plumb_bob",))):
@@ -91,7 +93,7 @@ def read(path: Path) -> Calibration:
 
 
 def parsed(path: Path) -> dict[str, Any]:
-    """The file's mapping. OpenCV before 5 begins it with %YAML:1.0, which is no YAML."""
+    """The file's mapping. OpenCV before 5 begins it with %YAML:1.0, which is invalid YAML. Raises InputError."""
     try:
         with path.open("rb") as file:
             data = file.read(MOST_BYTES + 1)
@@ -111,7 +113,7 @@ def parsed(path: Path) -> dict[str, Any]:
 
 
 def side(path: Path, tree: dict[str, Any], key: str) -> int:
-    """A size of the image, px."""
+    """The width or height of the image, px. Raises InputError."""
     value = tree.get(key)
     if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= MOST_PX:
         raise InputError(
@@ -121,7 +123,7 @@ def side(path: Path, tree: dict[str, Any], key: str) -> int:
 
 
 def matrix(path: Path, tree: dict[str, Any], key: str, shapes: tuple[tuple[int, int], ...]) -> list[float]:
-    """The numbers of a matrix, row by row."""
+    """The numbers of a matrix, row by row. Raises InputError."""
     node = tree.get(key)
     if not isinstance(node, dict):
         raise InputError(f"{path}: {key}: missing; allowed: a matrix with rows, cols and data")
@@ -138,12 +140,12 @@ def matrix(path: Path, tree: dict[str, Any], key: str, shapes: tuple[tuple[int, 
 
 
 def is_number(value: Any) -> bool:
-    """Whether it is a finite one."""
+    """Whether the value is a finite number."""
     return type(value) in (int, float) and abs(value) < 1e12
 
 
 def text(told: Calibration) -> str:
-    """What `read` and OpenCV's FileStorage (4 and 5) read."""
+    """The calibration as YAML that `read` and OpenCV's FileStorage (4 and 5) read."""
     fx, (cx, cy) = told.focal_px, told.centre_px
     return (
         "%YAML:1.0\n---\n"
@@ -154,12 +156,12 @@ def text(told: Calibration) -> str:
 
 
 def layout(key: str, rows: int, cols: int, data: list[float]) -> str:
-    """A matrix of 64-bit floats, every digit of them."""
+    """A matrix of 64-bit floats, with all digits."""
     numbers = ", ".join(number(one) for one in data)
     return f"{key}: !!opencv-matrix\n   rows: {rows}\n   cols: {cols}\n   dt: d\n   data: [ {numbers} ]\n"
 
 
 def number(value: float) -> str:
-    """With a point, without which YAML takes 1e-07 for a word."""
+    """The number with a decimal point, without which YAML reads 1e-07 as a string."""
     mantissa, e, exponent = repr(float(value)).partition("e")
     return f"{mantissa if '.' in mantissa else mantissa + '.0'}{e}{exponent}"

@@ -1,7 +1,7 @@
-"""A scene file (YAML) becomes a validated, frozen `Scene`.
+"""Schema of a scene file (YAML): the validated, frozen `Scene`, and the checks between its sections.
 
-Its sections stand in `vehicle`, `motion`, `light` and `camera`, what a value with a unit is in `quantity`; there is no
-other schema.
+The sections are defined in `vehicle`, `motion`, `light`, `leds`, `camera` and `tracker`; values with units in
+`core.units`.
 """
 
 from __future__ import annotations
@@ -19,20 +19,20 @@ from skysim.scene.motion import MotionConfig, PointingConfig
 from skysim.scene.tracker import FilterConfig, SurveyErrorsConfig, TrackerConfig
 from skysim.scene.vehicle import SiteConfig, VehicleConfig
 
-STEM = "(the file's name)"  # no key that a file could have
+STEM = "(the file's name)"  # alias of Scene.name, not a valid key in a file
 
-MOST_FRAMES, MOST_S = 1_000_000, 86_400.0  # of a flight, which memory holds
+MOST_FRAMES, MOST_S = 1_000_000, 86_400.0  # of a run, limited by memory
 
 
 def in_our_time(value: datetime.datetime) -> datetime.datetime:
-    """UTC without a zone. The Earth's ephemeris and straight proper motion hold for a century or so."""
+    """UTC without a zone. The Earth's ephemeris and linear proper motion are valid for about a century."""
     if not 1900 <= value.year <= 2100:
         raise ValueError(f"{value.isoformat()} is outside of 1900 to 2100")
     return in_utc(value)
 
 
 class ExposureConfig(ConfigModel):
-    """When the shutter opens."""
+    """Exposure time, frame rate, number of frames, and the time of the first."""
 
     time_s: Annotated[Time, Field(ge=1e-6)]
     rate_hz: Annotated[Number, Field(gt=0)]
@@ -52,7 +52,7 @@ class ExposureConfig(ConfigModel):
 
 
 class Scene(ConfigModel):
-    """The whole story, before it happens."""
+    """A complete simulation: the laboratory, the vehicle and its motion, the light, the camera and the tracker."""
 
     schema_version: Annotated[Literal[1], Field(alias="schema")]
     title: str
@@ -71,6 +71,8 @@ class Scene(ConfigModel):
 
     @model_validator(mode="after")
     def one_world(self) -> Scene:
+        # Survey errors and maps need LEDs. The start is a pointing under the stars and an attitude otherwise. All rows
+        # must be read out within a frame period.
         sky = self.light.kind == "stars"
         told = self.tracker
         if not isinstance(self.light, DomeConfig) and (told.survey != SurveyErrorsConfig() or told.map):
@@ -91,7 +93,7 @@ class Scene(ConfigModel):
 
     @model_validator(mode="after")
     def exposures(self) -> Scene:
-        """Any exposure that the tracker may ask for ends before the next begins."""
+        """Check that any exposure the exposure control may select ends before the next one begins."""
         told, period_s = self.tracker.exposure_control, 1 / self.exposure.rate_hz
         if told is None:
             return self
@@ -114,6 +116,7 @@ class Scene(ConfigModel):
             raise ValueError("filter: takes a gyro; allowed beside vehicle.imu")
         if told is None:
             return self
+        # The controller's actuators and its source of the attitude must be in the scene.
         has = {"ideal": True} | {kind: getattr(self.vehicle, kind) for kind in ("wheels", "fans", "cmgs")}
         if not has[told.actuators]:
             raise ValueError(f"motion.control.actuators: vehicle.{told.actuators} is not switched on")
@@ -126,7 +129,7 @@ class Scene(ConfigModel):
 
     @model_validator(mode="after")
     def clocks(self) -> Scene:
-        """Steps in a control period, and IMU samples in one, come out whole."""
+        """Check that a control period is a whole number of milliseconds and of IMU samples."""
         rate_hz = self.control_rate_hz
         if abs(1000 / rate_hz - round(1000 / rate_hz)) > 1e-9:
             raise ValueError(f"motion.control.rate_hz: {rate_hz:g} Hz is no whole number of milliseconds")
@@ -168,5 +171,5 @@ class Scene(ConfigModel):
 
     @property
     def control_rate_hz(self) -> float:
-        """The vehicle's computer ticks at this rate, whether it steers or listens only."""
+        """Tick rate of the vehicle's computer, with or without a controller."""
         return self.motion.control.rate_hz if self.motion.control else 100.0

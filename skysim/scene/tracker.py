@@ -12,19 +12,19 @@ from skysim.core.yaml_reader import is_file
 
 
 def existing_file(value: str) -> str:
-    """A path that is there."""
+    """A path that exists. Raises ValueError."""
     if not is_file(Path(value)):
         raise ValueError(f"{value!r} is no file; allowed: one beside the scene, or a path")
     return value
 
 
 class SurveyErrorsConfig(ConfigModel):
-    """How well the lab knows what it built. Drawn once, from a seed of its own; `light.surface.error` from it too.
+    """Errors of the survey of LEDs and camera, drawn once from their own seed; also draws `light.surface.error`.
 
-    led_sigma    : standard deviation of every LED's believed place, about each axis of the lab
-    lever_sigma  : of the camera's believed place, about each axis of the body
-    turn_deg     : rotation vector by which the survey's axes stand turned in the lab's: what level or IMU it was
-        referred to erred by. All believed LEDs are turned with it
+    led_sigma    : standard deviation of every LED's surveyed place, about each axis of the lab
+    lever_sigma  : of the camera's surveyed place, about each axis of the body
+    turn_deg     : rotation vector of the survey's axes relative to the lab's: the error of the level or IMU that it
+        was referenced to. All surveyed LEDs are rotated by it
     surface_seed : draws `light.surface.error`; `seed` if left out
     """
 
@@ -36,14 +36,15 @@ class SurveyErrorsConfig(ConfigModel):
 
 
 class ExposureControlConfig(ConfigModel):
-    """How long to expose, decided on the frame before: SHEFEX-2's chart, `estimator.trackers.exposure_control` (Samaan & Theil 2011).
+    """Exposure control from frame to frame: the SHEFEX-2 flow chart (Samaan & Theil 2011).
 
-    `exposure.time` is the first frame's. Too bright is a step shorter, else too few stars a step longer. What the
-    exposure of a frame is hangs on all frames before it, so frame 57 does not render alone with this section.
+    `exposure.time` is that of the first frame. If a frame is too bright, the next exposure is one step shorter;
+    otherwise, if it has too few stars, one step longer. Each exposure time depends on earlier frames, so with
+    exposure control a frame cannot be rendered on its own. See `estimator.trackers.exposure_control`.
 
-    mean_dn             : of a frame, above which it is no picture of stars: twice its bias and sky, say
+    mean_dn             : mean of a frame above which it is overexposed: twice its bias and sky, for example
     least_stars         : fewer cannot be identified
-    overexposed_objects : so many with more than saturated_px full pixels each are too many
+    overexposed_objects : number of objects with more than saturated_px full pixels each that is too many
     """
 
     mean_dn: Positive
@@ -62,15 +63,15 @@ class ExposureControlConfig(ConfigModel):
 
 
 class TrackerConfig(ConfigModel):
-    """What the star tracker's computer does and believes. `null` believes what the hardware is.
+    """What the star tracker's computer does and believes. `null` in a believed value means the true one.
 
-    name : own, or a tracker of somebody else's: an entry point, or a program that the command line names (`--program`)
-    options, time_limit : what such a tracker is told, and for how long it may look at a frame
+    name : own, or an external tracker: an entry point, or a program given on the command line (`--program`)
+    options, time_limit : options of an external tracker, and its time limit per frame
     map : a file that `skysim survey` wrote: LEDs, lever, focal length and distortion as measured
     detector, centroider, identifier, solver : if left out, under a dome local, cog, led_pairs and rotation_only, and
         under the stars all of them `default`
     believed_distortion : k1, k2, p1, p2, k3 of the lens; as it is if left out
-    brightest : no more lights of a frame than that are looked at
+    brightest : only this many of the brightest detections of a frame are used
     exposure_control : every frame is exposed for `exposure.time` if left out
     """
 
@@ -117,16 +118,17 @@ class TrackerConfig(ConfigModel):
 
 
 class FilterConfig(ConfigModel):
-    """What the attitude filter believes of the gyro and of the star tracker (MEKF: attitude and gyro bias).
+    """Noise model and settings of the attitude filter (MEKF: attitude and gyro bias), for gyro and star tracker.
 
-    The bias is believed to wander about zero in body axes. The Earth's turning where imu.earth_rate is uncompensated is
-    learnt as bias while the attitude stays; a vehicle that turns takes it for another one, unless bias_deg_h has room
-    for it (15) and bias_time is that of the turning. So with the gyro's scale and misalignment.
+    The bias is modeled as a Gauss-Markov process about zero in body axes. If imu.earth_rate is uncompensated, the
+    filter estimates the Earth rate as bias while the attitude is constant. When the vehicle rotates, this bias
+    changes in body axes, so bias_deg_h must allow for it (15) and bias_time must be that of the rotation. The same
+    holds for the gyro's scale factor and misalignment.
 
     arw_deg_sqrt_h, bias_deg_h, bias_time : of the gyro; the bias a Gauss-Markov process
     start_deg, start_bias_deg_h           : standard deviation of attitude and bias about each axis at the start
-    floor_arcsec : of a star tracker's solution, added to its own covariance: what is the same in every frame
-    gate_sigma   : a solution farther off than this is refused
+    floor_arcsec : systematic error of a star tracker's solution, the same in every frame, added to its covariance
+    gate_sigma   : a solution farther off than this is rejected
     latency      : from the end of an exposure to its solution
     """
 

@@ -1,4 +1,4 @@
-"""The vehicle as the lab has it: body, bearing, actuators, sensors, what disturbs it. A part of the scene's schema."""
+"""Schema of the scene section `vehicle`: body, bearing, actuators, sensors and disturbances."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ class WheelsConfig(ConfigModel):
     """Reaction wheels: every hinge joint `wheel_*` of the model.
 
     coulomb, viscous   : bearing friction, T = coulomb sign(speed) + viscous speed
-    static_imbalance   : mass times offset of the rotor's centre from its axle; shakes with its speed squared
-    dynamic_imbalance  : product of inertia between axle and a line across it; likewise
+    static_imbalance   : mass times offset of the rotor's center from its axle; disturbs with the speed squared
+    dynamic_imbalance  : product of inertia between the axle and a line across it; disturbs with the speed squared
     start_rpm          : speed of each at the start; at rest if left out
     """
 
@@ -54,7 +54,7 @@ class WheelsConfig(ConfigModel):
 
 
 class FansConfig(ConfigModel):
-    """Fans: every site `fan_*` of the model pushes the vehicle along its own z, forwards and backwards.
+    """Fans: every site `fan_*` of the model exerts a thrust along its own z, in both directions.
 
     time_constant : of the first-order lag between command and thrust
     """
@@ -64,11 +64,11 @@ class FansConfig(ConfigModel):
 
 
 class CmgsConfig(ConfigModel):
-    """Control moment gyroscopes: hinge joints `gimbal_*` and on each the joint `rotor_*` of the same ending.
+    """Control moment gyroscopes: hinge joints `gimbal_*`, each with the joint `rotor_*` of the same suffix.
 
-    steering           : how gimbal rates are found; see `actuators.STEERING`
+    steering           : method that computes gimbal rates; see `actuators.STEERING`
     start_deg          : gimbal angles at the start; those of the model if left out
-    rotor_torque_limit : None holds the rotors at their speed; a torque makes them variable-speed CMGs
+    rotor_torque_limit : None keeps the rotor speeds constant; a torque makes them variable-speed CMGs
     """
 
     rotor_rpm: Annotated[Number, Field(gt=0, le=60_000)] = 2600.0
@@ -80,30 +80,30 @@ class CmgsConfig(ConfigModel):
 
 
 class DragConfig(ConfigModel):
-    """What the air takes from a turn, about each body axis for itself: T = -(viscous + quadratic |rate|) rate."""
+    """Air drag about each body axis independently: T = -(viscous + quadratic |rate|) rate."""
 
     viscous_nms: Annotated[Damping, Field(ge=0)] = 0.0
     quadratic_nms2: Annotated[QuadraticDrag, Field(ge=0)] = 0.0
 
 
 class CableConfig(ConfigModel):
-    """A cable that hangs on the vehicle and turns it back to (0, 0, 0), like a spring, by the shorter way round."""
+    """A cable attached to the vehicle: a torsional spring that turns it back to (0, 0, 0) by the shorter way."""
 
     stiffness_nm_rad: Annotated[Stiffness, Field(gt=0)]
 
 
 class DraughtConfig(ConfigModel):
-    """Air of the room: a random torque about each lab axis that forgets itself with the correlation time."""
+    """Air currents: a random torque about each lab axis, correlated over the correlation time."""
 
     rms_nm: tuple[TorqueLevel, TorqueLevel, TorqueLevel]
     correlation_s: Annotated[Time, Field(gt=0)] = 2.0
 
 
 class DisturbancesConfig(ConfigModel):
-    """Torques that nobody asked for; each is off where it is left out.
+    """Disturbance torques; each is off if it is left out.
 
-    turbine        : what the bearing's jets twist the ball with, constant about the lab's axes
-    earth_rotation : the lab turns with the Earth (`lab` says where), the vehicle's momentum would not
+    turbine        : turbine torque of the bearing's air jets, constant about the lab's axes
+    earth_rotation : the lab rotates with the Earth (`lab` gives the site), the vehicle's momentum does not
     """
 
     turbine_nm: tuple[Torque, Torque, Torque] = (0.0, 0.0, 0.0)
@@ -113,14 +113,14 @@ class DisturbancesConfig(ConfigModel):
 
 
 class GyroConfig(ConfigModel):
-    """Three fibre-optic gyroscopes. The defaults are an LN-200's, of which only the first two have a source.
+    """Three fiber-optic gyroscopes. The defaults are an LN-200's, of which only the first two have a source.
 
     arw_deg_sqrt_h     : angle random walk
     bias_deg_h         : bias instability: standard deviation of a Gauss-Markov process with bias_time
     turn_on_bias_deg_h : constant part of the bias, standard deviation over units
     scale_ppm, misalignment_arcsec : of each axis, standard deviations over units
     quantum_arcsec     : step of the angle counter
-    rate_limit_deg_s   : beyond it the output stays at it
+    rate_limit_deg_s   : the output saturates at this rate
     """
 
     arw_deg_sqrt_h: NotNegative = 0.07
@@ -134,7 +134,7 @@ class GyroConfig(ConfigModel):
 
 
 class AccelerometerConfig(ConfigModel):
-    """Three accelerometers, the errors in the gyro's terms. The defaults are `assumed`."""
+    """Three accelerometers, with the errors named as for the gyros. The defaults are `assumed`."""
 
     vrw_ug_sqrt_hz: NotNegative = 50.0
     bias_ug: NotNegative = 50.0
@@ -149,10 +149,10 @@ class AccelerometerConfig(ConfigModel):
 class ImuConfig(ConfigModel):
     """An inertial measurement unit and the navigator that integrates it to 3-2-1 Euler angles.
 
-    earth_rate    : none: the gyros do not feel the Earth turn; uncompensated: they do and the navigator takes it
-                    for the vehicle's; compensated: it takes it away
-    home_error_deg: roll, pitch, yaw by which the vehicle stood wrong when the navigator was zeroed
-    hardware_seed : which unit off the line: its turn-on bias, scale factors and misalignments
+    earth_rate    : none: the gyros do not measure the Earth's rotation; uncompensated: they do, and the navigator
+                    takes it for the vehicle's; compensated: the navigator subtracts it
+    home_error_deg: roll, pitch, yaw error of the vehicle's attitude when the navigator was zeroed
+    hardware_seed : selects one unit of the production: its turn-on bias, scale factors and misalignments
     """
 
     rate_hz: Annotated[Number, Field(ge=10, le=1000)] = 400.0
@@ -164,9 +164,9 @@ class ImuConfig(ConfigModel):
 
 
 class VehicleConfig(ConfigModel):
-    """What moves: an MJCF file and what the scene declares over it.
+    """The moving body: an MJCF file, and values of the scene that replace the file's.
 
-    camera       : where its entrance pupil is on the body, its housing with it; where the MJCF has it if left out
+    camera       : entrance pupil on the body, the housing moves with it; the MJCF's if left out
     torque_limit : of each of the ideal torques about body x, y, z
     wheels, fans, cmgs : the actuators that are switched on; joints of the others are locked
     """
@@ -206,7 +206,7 @@ class VehicleConfig(ConfigModel):
 
 
 class SiteConfig(ConfigModel):
-    """Where on the Earth the lab stands, and the azimuth of its x axis from north through east."""
+    """Where on the Earth the lab is, and the azimuth of its x axis from north through east."""
 
     latitude_deg: Annotated[Number, Field(ge=-90, le=90)] = 39.8
     x_azimuth_deg: Annotated[Number, Field(ge=-360, le=360)] = 90.0

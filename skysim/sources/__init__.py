@@ -1,3 +1,1 @@
-"""What shines: stars of a catalog and LEDs of a dome, as `Sources` with a direction or a place, a strength
-and pulses.
-"""
+"""Light sources: stars of a catalog and LEDs of a dome, as `Sources` with direction or place, strength and pulses."""

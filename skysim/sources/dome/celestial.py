@@ -1,4 +1,9 @@
-"""The real sky on the inside of a dome: where an LED has to be, and how bright, to pass for a star."""
+"""The real sky on a dome: where an LED must be, and how bright, to appear as a star to the camera.
+
+Each star's apparent direction is traced from the camera's nominal place to the surface. Stars closer than an LED's
+diameter are merged into one LED at their center of light. Levels compensate for the distance and emission angle of
+each LED, so that the irradiance at the camera follows the magnitudes.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +27,7 @@ from skysim.sources.photometry import Band, synthetic_mag
 class Projected(NamedTuple):
     """Stars on the dome, brightest first: hip, v_mag, shown_mag (N,), place_m (N, 3) in the lab.
 
-    shown_mag : what the LED has to be: V, or how bright the chip finds the star
+    shown_mag : magnitude that the LED has to show: V, or the instrumental magnitude in the chip's band
     """
 
     hip: NDArray[np.int64]
@@ -32,11 +37,11 @@ class Projected(NamedTuple):
 
 
 def projected(part: leds.CelestialConfig, inside: Inside, led: leds.LedConfig, band: Band) -> Projected:
-    """Each star's apparent direction at part.epoch followed from the camera's nominal place to the surface.
+    """Stars as LED places: apparent directions at part.epoch, traced from the camera's nominal place to the surface.
 
-    The lab's axes have the zenith at RA, Dec, and roll is the position angle of the lab's -y there. Of the stars that
-    come to lie on the dome's cap the brightest; those that one LED's disc would cover are one, see `lights`.
-    Raises InputError for a camera outside, and for no stars or too few.
+    The lab's +z is the zenith at RA, Dec; roll is the position angle of the lab's -y there. Of the stars on the
+    dome's cap the brightest are taken; those that one LED's disc would cover are merged, see `lights`.
+    Raises InputError for a camera outside the dome, and if there are no stars or too few.
     """
     camera_m = np.array(part.camera_m)
     if not inside.inside(camera_m):
@@ -56,17 +61,19 @@ def projected(part: leds.CelestialConfig, inside: Inside, led: leds.LedConfig, b
     mag = synthetic_mag(stars.v_mag, stars.b_v, stars.v_i, band) if part.brightness == "band" else stars.v_mag
     together = brightest(Projected(stars.hip, stars.v_mag, mag, place_m), part, led.disc_diameter_m)
     rays = together.place_m - camera_m
+    # A merged place is a mean of points on the surface and so lies inside it: trace it back onto the surface.
     return together._replace(
         place_m=inside.meet(camera_m, rays / np.linalg.norm(rays, axis=1, keepdims=True))
     )
 
 
 def leaders(place_m: Floats, apart_m: float) -> NDArray[np.int64]:
-    """(N,) the brightest star whose LED each one falls into: itself, unless a brighter leader is within apart_m.
+    """(N,) index of the star into whose LED each star is merged: itself, unless a brighter leader is within apart_m.
 
-    place_m : (N, 3), brightest first. So a star's leader does not depend on fainter ones.
+    place_m : (N, 3), brightest first, so that a star's leader does not depend on fainter stars.
     """
     leader = np.arange(len(place_m))
+    # Sorted pairs: when a pair is reached, its brighter star is known to be a leader or not.
     for bright, faint in sorted(cKDTree(place_m).query_pairs(apart_m * (1 - 1e-9))):
         if leader[bright] == bright and leader[faint] == faint:
             leader[faint] = bright
@@ -74,9 +81,9 @@ def leaders(place_m: Floats, apart_m: float) -> NDArray[np.int64]:
 
 
 def merged(stars: Projected, leader: NDArray[np.int64]) -> Projected:
-    """The stars with the light of each added to its leader's; they stand at its centre of light.
+    """The stars with the light of each added to its leader's, at their center of light.
 
-    Numbers are the leaders', order is that of V together.
+    The numbers are the leaders'; the order is by combined V.
     """
     first, group = np.unique(leader, return_inverse=True)
 
@@ -94,9 +101,9 @@ def merged(stars: Projected, leader: NDArray[np.int64]) -> Projected:
 
 
 def lights(stars: Projected, shown: int, apart_m: float) -> Projected:
-    """The first `shown` stars as LEDs, none nearer to another than apart_m.
+    """The first `shown` stars as LEDs, no two nearer to each other than apart_m.
 
-    Two that are one stand between their places, and so may come near to a third: until none is too near.
+    A merged LED is between the places of its stars and may be too near a third, so merging repeats until none is.
     """
     leds = Projected(stars.hip[:shown], stars.v_mag[:shown], stars.shown_mag[:shown], stars.place_m[:shown])
     while True:
@@ -107,7 +114,7 @@ def lights(stars: Projected, shown: int, apart_m: float) -> Projected:
 
 
 def brightest(stars: Projected, part: leds.CelestialConfig, apart_m: float) -> Projected:
-    """The stars, brightest first, that make as many LEDs as the scene asks for, or that are within its limit."""
+    """The brightest stars, merged into part.count LEDs, or all stars to part.limit_mag. Raises InputError."""
     if part.limit_mag is not None:
         shown = int(np.sum(stars.v_mag <= part.limit_mag))
         if not shown:
@@ -119,7 +126,7 @@ def brightest(stars: Projected, part: leds.CelestialConfig, apart_m: float) -> P
     shown = min(count, len(stars.hip))
     leds = lights(stars, shown, apart_m)
     while len(leds.hip) < count and shown < len(stars.hip):
-        shown = min(shown + count - len(leds.hip), len(stars.hip))  # a star more is an LED more, or none
+        shown = min(shown + count - len(leds.hip), len(stars.hip))  # each star adds one LED at most
         leds = lights(stars, shown, apart_m)
     if len(leds.hip) < count:
         raise InputError(
@@ -130,16 +137,18 @@ def brightest(stars: Projected, part: leds.CelestialConfig, apart_m: float) -> P
 
 
 def levels(part: leds.CelestialConfig, stars: Projected, normal: Floats, led: leds.LedConfig) -> Floats:
-    """(N,) levels by which the light that reaches the camera's nominal place follows Pogson's law, 10^(-0.4 m).
+    """(N,) levels for which the irradiance at the camera's nominal place follows Pogson's law, 10^(-0.4 m).
 
-    m is stars.shown_mag. All LEDs are of one colour, so that on the chip, and there only, m is to be the chip's own.
-    Each LED makes up for its own distance and angle; the one that needs most has level 1. No star is shown brighter
-    than part.brightest_mag. normal : (N, 3) of the LEDs. Raises InputError for an LED that sends the camera nothing.
+    m is stars.shown_mag. All LEDs have one color, so the magnitudes hold for this chip only, where m should be its
+    instrumental magnitude. The level compensates for the LED's distance and emission angle; the LED that needs most
+    has level 1. No star is shown brighter than part.brightest_mag. normal : (N, 3) of the LEDs.
+    Raises InputError for an LED whose lobe does not reach the camera.
     """
     to_camera = np.array(part.camera_m) - stars.place_m
     distance_m = np.linalg.norm(to_camera, axis=1)
     cos_emission = np.einsum("nj,nj->n", normal, to_camera) / distance_m
     one = np.ones(len(distance_m))
+    # Irradiance per unit strength on an aperture that faces the LED, as stars at infinity are measured.
     gain = irradiance_e_s_m2(one, Emitter.of(led), cos_emission, one, distance_m)
     if not np.all(gain > 0):
         raise InputError(

@@ -1,4 +1,8 @@
-"""Stars on displays and at the ends of fibres: an LCD panel overhead, a collimated micro-display, an APL dome."""
+"""Stars shown by other devices than LEDs: optical fibers in a shell (APL), an LCD panel, a collimated micro-display.
+
+A display rounds places to its pixels and levels to its gray levels (`drawn`). On an LCD panel each star is a block of
+pixels at a finite distance; behind a collimator it is a parallel beam, a source at infinity.
+"""
 
 from __future__ import annotations
 
@@ -19,17 +23,18 @@ from skysim.sources.dome.led import DRIVES, Lamps, full_e_s_sr
 from skysim.sources.dome.surface import Plane
 from skysim.sources.photometry import SUN, Band, star_flux_e_s_m2
 
-SHELL = 2  # the spawn key of the shell's own random stream: fibres keep their places when the radius varies
+SHELL = 2  # spawn key of the shell's own random stream, which leaves the fibers' places unchanged
 
 Ints = NDArray[np.int64]
 
 
 def standing_off(part: leds.FibresConfig, ends: Sources) -> Sources:
-    """A stretched shell's radius varies: each fibre's end is off the surface along its normal, by v R.
+    """Displace each fiber's end along the surface's normal by v R, the radius error of a stretched shell.
 
-    v is uniform in +-part.radius_variation, R the end's distance from the bearing; positive is outwards. To a camera
-    r off the centre of a dome that it takes for a perfect one, an end is wrong by up to (r / R) v (JHU/APL's .4 % of
-    4 ft, 50 mm off: 34"). Normals stay. The numbers come from part.points.hardware_seed.
+    v is uniform in +-part.radius_variation, R the end's distance from the bearing; positive is outward. A camera that
+    is r off the center and assumes a perfect dome sees an end displaced by up to (r / R) v rad (JHU/APL's .4 % of 4
+    ft, 50 mm
+    off: 34"). Normals are unchanged. The random stream is that of part.points.hardware_seed.
     """
     rng = np.random.default_rng(np.random.SeedSequence(part.points.hardware_seed, spawn_key=(SHELL,)))
     place_m = ends.place[:, :3]
@@ -40,12 +45,12 @@ def standing_off(part: leds.FibresConfig, ends: Sources) -> Sources:
 
 
 class Drawn(NamedTuple):
-    """Stars on a display, M of them, as many as blocks are lit.
+    """Stars on a display, one for each of M lit blocks.
 
-    star      : (M,) which of the stars wanted each is; where several fall on one block, the brightest of them
+    star      : (M,) index of the star; where several fall on one block, of the brightest
     corner_px : (M, 2) column and row of the block's first pixel
-    middle_px : (M, 2) column and row of its middle, from the display's middle
-    level     : (M,) the light that gets through above that of black, as a share of a white block's
+    middle_px : (M, 2) column and row of its center, from the display's center
+    level     : (M,) transmitted light above that of black, as a share of a white block's
     """
 
     star: Ints
@@ -55,16 +60,17 @@ class Drawn(NamedTuple):
 
 
 def drawn(part: leds.PixelsConfig, from_middle_m: Floats, level: Floats) -> Drawn:
-    """Stars become blocks of pixels: places rounded to the nearest block that fits, levels to the nearest grey.
+    """Draw stars as blocks of pixels: places rounded to the nearest block that fits, levels to the nearest gray.
 
-    from_middle_m : (N, 2) places on the display along its columns' and its rows' direction
-    level         : (N,) share of white; stars on one block add up, to white
-    Rounding to a pitch p is an error uniform over p, p / sqrt(12) along each axis. A level of 0 is a star too faint
-    for the greys.
+    from_middle_m : (N, 2) places on the display along its columns' and its rows' direction, from its center
+    level         : (N,) share of white; stars on one block add up, to white at most
+    Rounding to a pitch p is an error uniform over p, p / sqrt(12) rms along each axis. A returned level of 0 is a
+    star too faint for the gray levels.
     """
     pixels = np.array(part.pixels)
     wanted_px = from_middle_m / part.pitch_m + (pixels - 1) / 2 - (part.block - 1) / 2
     corner = np.clip(np.rint(wanted_px), 0, pixels - part.block).astype(np.int64)
+    # Brightest first, so that `first` is the brightest star of each block.
     order = np.argsort(-level, kind="stable")
     _, first, block = np.unique(corner[order] @ [1, pixels[0]], return_index=True, return_inverse=True)
     together = np.minimum(np.bincount(block, level[order], len(first)), 1.0)
@@ -74,30 +80,30 @@ def drawn(part: leds.PixelsConfig, from_middle_m: Floats, level: Floats) -> Draw
 
 
 def black(part: leds.PixelsConfig) -> float:
-    """What a black pixel lets through, as a share of white."""
+    """Transmission of a black pixel, as a share of white."""
     return 1 / part.contrast if part.contrast else 0.0
 
 
 def grey(part: leds.PixelsConfig, level: Floats) -> Floats:
-    """(N,) transmission of the nearest of the display's greys: (g / (G - 1))^gamma, g rounded from level^(1 / gamma).
+    """(N,) transmission of the nearest gray level: (g / (G - 1))^gamma, g rounded from (G - 1) level^(1 / gamma).
 
-    The nearest in g, as a program does that writes a picture: steps are fine for the faint.
+    Rounding is in g, as in a program that writes a picture, so steps are fine for faint stars.
     """
     top = part.grey_levels - 1
     return np.asarray((np.rint(top * level ** (1 / part.gamma)) / top) ** part.gamma)
 
 
 def faintest(part: leds.PixelsConfig) -> float:
-    """Levels below it are black: half a step of grey."""
+    """Level below which a star is black: half a step of gray."""
     return float((0.5 / (part.grey_levels - 1)) ** part.gamma)
 
 
 def glass(part: leds.LcdConfig, inside: Any) -> Plane:
-    """The panel as a surface: the flat one, which ends where the pixels do.
+    """The panel as a surface: the flat surface, cut to the extent of the pixels.
 
-    Raises InputError for pixels that the surface, which has a width and a height of its own, has no room for.
+    Raises InputError if the pixels do not fit into the surface's width and height.
     """
-    assert isinstance(inside, Plane)  # light.Dome lets no other through
+    assert isinstance(inside, Plane)  # DomeConfig admits no other surface
     half_m = np.array(part.pixels) * part.pitch_m / 2
     if np.any(half_m > inside.half_m * (1 + 1e-9)):
         raise InputError(
@@ -108,16 +114,16 @@ def glass(part: leds.LcdConfig, inside: Any) -> Plane:
 
 
 def steady(led: leds.LedConfig) -> leds.LedConfig:
-    """The same LED on direct current, each like the other: what a layout wants, before a panel draws it."""
+    """The LED on direct current without scatter, which gives the levels a layout wants before the panel draws them."""
     return led.model_copy(update={"drive": leds.DirectConfig(kind="direct"), "scatter": 0.0})
 
 
 def on_panel(part: leds.LcdConfig, panel: Plane, led: leds.LedConfig, band: Band, wanted: Sources) -> Sources:
     """Stars on an LCD panel, each a block of n x n equal pixels: n^2 times a pixel's light from n times its width.
 
-    wanted : the stars as LEDs that shine all the time, anywhere on the panel (or near it, and they are put onto it)
-    Places and greys as `drawn`; a disc of the block's area stands for it, numbers are those of the stars.
-    Raises InputError for a star that is nearer to black than to the first grey.
+    wanted : the stars as LEDs that are always lit, on the panel or near it; they are projected onto it
+    Places and gray levels as in `drawn`. A block is represented by a disc of its area; numbers are those of the
+    stars. Raises InputError for a star that is nearer to black than to the first gray.
     """
     own_m = panel.lab_from_own.inv().apply(wanted.place[:, :3] - panel.centre_m)
     level = wanted.strength / full_e_s_sr(led, band)
@@ -129,7 +135,7 @@ def on_panel(part: leds.LcdConfig, panel: Plane, led: leds.LedConfig, band: Band
         )
     rng = np.random.default_rng(part.points.hardware_seed)
     count = len(show.star)
-    # Each pixel has its own share in the scatter; a block's is that of the mean of n^2 of them.
+    # Pixels scatter independently: the mean of n^2 of them scatters by 1 / n as much.
     scatter = np.exp(led.scatter / part.block * rng.standard_normal(count))
     row = show.corner_px[:, 1] / part.pixels[1]
     pulses = DRIVES[led.drive.kind](led, Lamps(show.level, np.zeros(count, dtype=np.int64), row), rng)
@@ -149,18 +155,18 @@ def on_panel(part: leds.LcdConfig, panel: Plane, led: leds.LedConfig, band: Band
 
 
 def lab_from_icrs(part: light.BenchConfig) -> Rotation:
-    """Where the bench has put the lab among the stars: its axis is the lab's +z, position angle roll the lab's -y."""
+    """Rotation from ICRS to lab axes: the collimator's axis is lab +z, and roll is the position angle of lab -y."""
     return star_sources.cam_from_icrs(part.axis_ra_deg, part.axis_dec_deg, part.roll_deg)
 
 
 def bench(part: light.BenchConfig, stars: Catalogue, time: datetime.datetime, band: Band) -> Sources:
-    """A collimator of focal length f sends a pixel (x, y) off its axis as a beam along (x, y, f), parallel in itself.
+    """Stars on a collimated display: a pixel (x, y) off the axis is a parallel beam along (x, y, focal length).
 
-    time : UTC, whose apparent places are shown
-    Returns Sources in lab axes: points at infinity, or, with part.conjugate_m = D, at D from the bearing's centre:
-    a camera off it by r sees them shifted by r / D. Strength is that of a star of part.brightest_mag and the Sun's
-    colour, times `grey`; magnitude is the catalogue's. Pixels are not resolved.
-    Raises InputError for no star in the field, and for one that is nearer to black than to the first grey.
+    time : UTC, of the apparent places shown
+    Returns Sources in lab axes: points at infinity, or, with part.conjugate_m = D, at D from the bearing's center, so
+    that a camera off it by r sees them shifted by r / D. Strength is that of a star of part.brightest_mag and the
+    Sun's color, times the gray level; magnitude is the catalog's. Pixels are not resolved.
+    Raises InputError if no star is in the field, and for a star that is nearer to black than to the first gray.
     """
     stars = stars.take(stars.v_mag <= part.limit_mag)
     direction = (
@@ -188,7 +194,7 @@ def bench(part: light.BenchConfig, stars: Catalogue, time: datetime.datetime, ba
 
 
 def collimated(part: light.BenchConfig, beam: Floats, flux_e_s_m2: Floats, stars: Catalogue) -> Sources:
-    """Beams along (N, 3) as sources that always shine, at infinity or, where the collimator is off, at a distance."""
+    """Beams along (N, 3) as steady sources at infinity or, for an imperfect collimator, at part.conjugate_m."""
     direction = beam / np.linalg.norm(beam, axis=1, keepdims=True)
     zero, one = np.zeros(len(beam)), np.ones(len(beam))
     place, normal, strength = np.column_stack([direction, zero]), 0 * direction, flux_e_s_m2

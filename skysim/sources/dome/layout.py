@@ -1,4 +1,9 @@
-"""Where the LEDs of a dome sit, and how bright each is made: patch boards, even and random spreads, the real sky."""
+"""LED layouts of a dome: where the LEDs are and how bright each is.
+
+LAYOUTS maps the scene's `light.layout.kind` to a function that returns all LEDs as `Sources`. The kinds are patch
+boards, even (Fibonacci), Poisson-disc, random and optimized spreads, the real sky, lists, and two that take the
+points of another layout: optical fibers and an LCD panel.
+"""
 
 from __future__ import annotations
 
@@ -24,24 +29,24 @@ from skysim.sources.photometry import Band
 
 HOLES = leds.HOLES  # on a patch board; LED number = board * HOLES + hole
 GOLDEN_ANGLE_RAD = np.pi * (3 - np.sqrt(5))
-GLUE = 1  # the spawn key of the glue's own random stream: a board keeps its pattern when its place scatters
-TRIES = 100  # darts on every square of the least spacing: room of .03 of it is found 95 times of a hundred
+GLUE = 1  # spawn key of the glue's own random stream, so that glue errors leave a board's pattern unchanged
+TRIES = 100  # darts per square of the least spacing: a gap of .03 of that area is found with probability .95
 MOST_TRIES = 3_000_000
-DARTS = 30  # for each LED of a count
-HALVINGS = 14  # of the dome's width: to some tenths of a millimetre
-STANDS_OFF_M = 0.05  # of a listed LED from the surface; more is a slip in a unit or an axis
+DARTS = 30  # per LED of a count
+HALVINGS = 14  # bisection steps from the dome's width: to some tenths of a millimeter
+STANDS_OFF_M = 0.05  # of a listed LED from the surface; more is an error in a unit or an axis
 
 Ints = NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True)
 class Spots:
-    """LEDs as they are glued, before they are lit.
+    """LED positions before drive and brightness are assigned.
 
-    id        : (N,) their numbers
+    id        : (N,) LED numbers
     place_m   : (N, 3) in the lab;  normal : (N, 3) unit
     level     : (N,) share of full brightness, 0 < level <= 1
-    magnitude : (N,) of the star that each stands for; NaN where it stands for none
+    magnitude : (N,) of the star that the LED represents; NaN if it represents none
     """
 
     id: Ints
@@ -53,7 +58,7 @@ class Spots:
 
 @dataclass(frozen=True, slots=True)
 class Boards:
-    """Patch boards: (B, 3) each of middle in the lab's metres, unit normal, and the two axes of their holes."""
+    """Patch boards, (B, 3) each: center in the lab, m, unit normal, and unit vectors of the two axes of their holes."""
 
     middle_m: Floats
     normal: Floats
@@ -62,10 +67,10 @@ class Boards:
 
 
 def lit(spots: Spots, led: leds.LedConfig, band: Band, rng: np.random.Generator) -> Sources:
-    """Spots with lamps in them: brightness scatters from LED to LED, and each has its place in the drive's cycle.
+    """The sources at these spots: strength with its scatter from LED to LED, and the drive's pulse timing.
 
-    Brightness is lognormal about the declared one: the logarithm's standard deviation is led.scatter, AFIT's
-    Table 2 has .07 to .09. rng is the hardware's.
+    The strength is lognormal about the nominal one; the logarithm's standard deviation is led.scatter, for which
+    AFIT's Table 2 gives .07 to .09. rng is the hardware's.
     """
     count = len(spots.id)
     scatter = np.exp(led.scatter * rng.standard_normal(count))
@@ -85,13 +90,13 @@ def lit(spots: Spots, led: leds.LedConfig, band: Band, rng: np.random.Generator)
 
 
 def on_surface(inside: Inside, place_m: Floats, level: Floats) -> Spots:
-    """Spots at (N, 3) places with the surface's normals there, in running numbers."""
+    """Spots at (N, 3) places with the surface's normals there, numbered from 0."""
     number = np.arange(len(place_m), dtype=np.int64)
     return Spots(number, place_m, inside.inward(place_m), level, np.full(len(place_m), np.nan))
 
 
 def cap(count: int, half_angle_rad: float) -> Floats:
-    """(count, 3) unit vectors spread evenly over a cap about +z: Fibonacci's spiral, equal areas in z."""
+    """(count, 3) unit vectors spread evenly over a cap about +z: Fibonacci spiral, equal areas in z."""
     n = np.arange(count) + 0.5
     z = 1 - n / count * (1 - np.cos(half_angle_rad))
     ring = np.sqrt(1 - z**2)
@@ -99,20 +104,20 @@ def cap(count: int, half_angle_rad: float) -> Floats:
 
 
 def scattered_cap(count: int, half_angle_rad: float, rng: np.random.Generator) -> Floats:
-    """(count, 3) unit vectors over a cap about +z, each by itself: uniform in z and in azimuth."""
+    """(count, 3) independent unit vectors, uniform over a cap about +z: uniform in z and in azimuth."""
     z = 1 - rng.random(count) * (1 - np.cos(half_angle_rad))
     azimuth, ring = rng.uniform(0, 2 * np.pi, count), np.sqrt(1 - z**2)
     return np.column_stack([ring * np.cos(azimuth), ring * np.sin(azimuth), z])
 
 
 def rays(directions_deg: Any) -> Floats:
-    """(N, 3) unit vectors of (N, 2) azimuth from +x towards +y and tilt from +z, seen from the bearing."""
+    """(N, 3) unit vectors from the bearing, for (N, 2) azimuth from +x toward +y and tilt from +z."""
     azimuth, tilt = np.radians(np.asarray(directions_deg, dtype=float)).T
     return np.column_stack([np.sin(tilt) * np.cos(azimuth), np.sin(tilt) * np.sin(azimuth), np.cos(tilt)])
 
 
 def check_cap(key: str, directions: Floats, cap_deg: float) -> None:
-    """Refuse the first of (N, 3) directions from the bearing that is beyond the cap."""
+    """Raise InputError for the first of (N, 3) directions from the bearing that is outside the cap."""
     length = np.linalg.norm(directions, axis=1)
     tilt_deg = np.degrees(np.arctan2(np.hypot(*directions.T[:2]), directions[:, 2]))
     beyond = np.flatnonzero(~((length > 0) & (tilt_deg <= cap_deg * (1 + 1e-12))))
@@ -124,7 +129,7 @@ def check_cap(key: str, directions: Floats, cap_deg: float) -> None:
 
 
 def from_bearing(inside: Inside, directions: Floats) -> Floats:
-    """(N, 3) points of the surface that the bearing's centre sees in these directions."""
+    """(N, 3) points where rays from the bearing's center meet the surface. Raises InputError where they miss it."""
     place_m = inside.meet(np.zeros(3), directions)
     if np.isnan(place_m).any():
         raise InputError(
@@ -134,11 +139,11 @@ def from_bearing(inside: Inside, directions: Floats) -> Floats:
 
 
 def patch_boards(part: leds.PatchBoardsConfig, inside: Inside, led: leds.LedConfig, band: Band) -> Sources:
-    """3x3 boards glued flat to the surface, by list or spread evenly, each with its own choice of LEDs and levels.
+    """3x3 boards glued flat to the surface, listed or spread evenly, each with its own choice of LEDs and levels.
 
-    A board is a plane tangent at its middle, so that its outer LEDs stand off the surface as on the real thing;
-    glue tilts it and solder moves each LED in its plane. Everything random here is the hardware's and comes from
-    part.hardware_seed: which LEDs are soldered, how bright each is, the phase of its pulses.
+    A board is a plane tangent at its center, so its outer LEDs are off the surface, as on the real dome. The glue
+    tilts the board, and each LED is displaced in the board's plane. Everything random here is hardware and is drawn
+    from part.hardware_seed: which LEDs are soldered, their levels and strengths, the phases of their pulses.
     """
     rng = np.random.default_rng(part.hardware_seed)
     boards, holes, level = listed_boards(part, inside) if part.boards else spread_boards(part, inside, rng)
@@ -150,6 +155,7 @@ def patch_boards(part: leds.PatchBoardsConfig, inside: Inside, led: leds.LedConf
     if part.glue_tilt_deg:
         boards = tilted(boards, np.radians(part.glue_tilt_deg), glue)
     slip_m = part.glue_scatter_m * glue.standard_normal((2, len(board)))
+    # Hole h is in column h % 3 and row h // 3; hole 4 is the center.
     place = (
         boards.middle_m[board]
         + ((hole % 3 - 1) * part.pitch_m + slip_m[0])[:, None] * boards.u[board]
@@ -164,7 +170,7 @@ def spread_boards(
 ) -> tuple[Boards, list[Ints], None]:
     """Boards all over the cap as seen from the bearing, and the holes that each uses.
 
-    Along a spiral each is turned at random; on a grid all lie along its rows.
+    On a spiral each board has a random orientation; on a grid all are aligned with its rows.
     """
     half, spacing_m = np.radians(part.cap_deg), part.spacing_m or part.pitch_m
     apex_m = from_bearing(inside, np.array([[0.0, 0.0, 1.0]]))[0, 2]
@@ -172,6 +178,7 @@ def spread_boards(
         directions = grid(spacing_m / apex_m, half)
         turn = np.zeros(len(directions))
     else:
+        # The cap's area on a sphere of the apex's height, over one square of the spacing per board.
         area_m2 = 2 * np.pi * apex_m**2 * (1 - np.cos(half))
         directions = cap(max(1, round(area_m2 / spacing_m**2)), half)
         turn = rng.uniform(0, 2 * np.pi, len(directions))
@@ -181,21 +188,23 @@ def spread_boards(
 
 
 def grid(spacing_rad: float, half_angle_rad: float) -> Floats:
-    """(N, 3) unit vectors in rows and columns over a cap about +z, one of them there.
+    """(N, 3) unit vectors in rows and columns over a cap about +z, one of them at +z.
 
-    Equal steps on Lambert's equal-area map, on which a direction at t from the middle is 2 sin(t / 2) out.
+    Equal steps on Lambert's equal-area map, where a direction at the angle t from the center is at radius 2 sin(t /
+    2).
     """
     steps = int(2 * np.sin(half_angle_rad / 2) / spacing_rad)
     x, y = (one.ravel() * spacing_rad for one in np.meshgrid(*2 * [np.arange(-steps, steps + 1)]))
     out2 = x**2 + y**2
     within = out2 <= (2 * np.sin(half_angle_rad / 2)) ** 2
     x, y, out2 = x[within], y[within], out2[within]
+    # Inverse of the map: at the radius rho, z = 1 - rho^2 / 2, at the distance rho sqrt(1 - rho^2 / 4) from the axis.
     stretch = np.sqrt(1 - out2 / 4)
     return np.column_stack([x * stretch, y * stretch, 1 - out2 / 2])
 
 
 def listed_boards(part: leds.PatchBoardsConfig, inside: Inside) -> tuple[Boards, list[Ints], Floats]:
-    """Boards where the list says, their holes, and the level of every LED. Raises InputError where two overlap."""
+    """Boards at the listed places, their holes, and the level of every LED. Raises InputError if two boards overlap."""
     listed = part.boards
     directions = rays([(one.azimuth_deg, one.tilt_deg) for one in listed])
     check_cap("light.layout.boards", directions, part.cap_deg)
@@ -214,10 +223,10 @@ def listed_boards(part: leds.PatchBoardsConfig, inside: Inside) -> tuple[Boards,
 
 
 def tangent(inside: Inside, middle_m: Floats, turn_rad: Floats) -> Boards:
-    """Boards flat on the surface. At turn 0 the holes' columns run along normal x (lab x)."""
+    """Boards tangent to the surface. At turn 0 the holes' columns run along normal x (lab x)."""
     normal = inside.inward(middle_m)
     across = np.cross(normal, [1.0, 0.0, 0.0])
-    edge_on = np.linalg.norm(across, axis=1) < 1e-9  # its normal is the lab's x
+    edge_on = np.linalg.norm(across, axis=1) < 1e-9  # the normal is parallel to lab x
     across[edge_on] = [0.0, 1.0, 0.0]
     across /= np.linalg.norm(across, axis=1, keepdims=True)
     along = np.cross(normal, across)
@@ -227,7 +236,7 @@ def tangent(inside: Inside, middle_m: Floats, turn_rad: Floats) -> Boards:
 
 
 def tilted(boards: Boards, most_rad: float, rng: np.random.Generator) -> Boards:
-    """Boards as glue holds them: normals evenly over a cap of most_rad about the surface's, middles in place."""
+    """Boards tilted by the glue: normals uniform over a cap of most_rad about the surface's, centers unchanged."""
     count = len(boards.normal)
     angle = np.arccos(1 - rng.random(count) * (1 - np.cos(most_rad)))
     towards = rng.uniform(0, 2 * np.pi, count)[:, None]
@@ -237,27 +246,27 @@ def tilted(boards: Boards, most_rad: float, rng: np.random.Generator) -> Boards:
 
 
 def fibonacci(part: leds.FibonacciConfig, inside: Inside, led: leds.LedConfig, band: Band) -> Sources:
-    """LEDs on Fibonacci's spiral: as many in equal solid angles about the bearing, to a handful."""
+    """LEDs on a Fibonacci spiral: equal solid angles about the bearing hold equal numbers, to within a few."""
     rng = np.random.default_rng(part.hardware_seed)
     place_m = from_bearing(inside, cap(part.count, np.radians(part.cap_deg)))
     return lit(on_surface(inside, place_m, rng.choice(part.dimming, part.count)), led, band, rng)
 
 
 def at_random(part: leds.RandomPlacesConfig, inside: Inside, led: leds.LedConfig, band: Band) -> Sources:
-    """LEDs that know nothing of each other, uniform in solid angle about the bearing: a Poisson field, as stars'."""
+    """Independent LEDs, uniform in solid angle about the bearing: a Poisson field, like that of real stars."""
     rng = np.random.default_rng(part.hardware_seed)
     place_m = from_bearing(inside, scattered_cap(part.count, np.radians(part.cap_deg), rng))
     return lit(on_surface(inside, place_m, rng.choice(part.dimming, part.count)), led, band, rng)
 
 
 def poisson_disc(part: leds.PoissonDiscConfig, inside: Inside, led: leds.LedConfig, band: Band) -> Sources:
-    """LEDs at random, none nearer to another than the spacing, until room is scarce: random sequential adsorption.
+    """LEDs at random with a least spacing, as many as fit: random sequential adsorption.
 
-    Darts uniform over the cap are kept in the order thrown where none kept lies within the spacing. Discs of that
-    diameter would jam at a cover of .547 (Feder 1980, J. theor. Biol. 87, 237; assumed); TRIES darts come to .52, .66
-    LEDs on every square of the spacing, and denser along the rim. For a count it is the first so many of those at the
-    widest spacing that finds them room.
-    Raises InputError for a spacing that makes more LEDs than fit into memory.
+    Random points, uniform over the cap, are taken in turn; each is kept if no kept one is within the spacing. Discs
+    of that diameter would jam at a coverage of .547 (Feder 1980, J. theor. Biol. 87, 237; assumed). TRIES points per
+    square of the spacing reach .52, that is .66 LEDs per square of the spacing, and a higher density along the rim.
+    If a count is given instead, the result is the first `count` of the points kept at the widest spacing that leaves
+    room for them. Raises InputError for a spacing that makes more LEDs than fit into memory.
     """
     rng = np.random.default_rng(part.hardware_seed)
     half = np.radians(part.cap_deg)
@@ -268,7 +277,8 @@ def poisson_disc(part: leds.PoissonDiscConfig, inside: Inside, led: leds.LedConf
         return lit(on_surface(inside, place_m, rng.choice(part.dimming, count)), led, band, rng)
     directions = cap(1000, half)
     points = from_bearing(inside, directions)
-    # Square metres in a steradian as the bearing sees it: where they are most the darts are fewest.
+    # Surface area per steradian seen from the bearing, r^2 / cos(incidence). Where it is greatest, points uniform in
+    # solid angle are sparsest on the surface, so this maximum sets how many are needed.
     slant = -np.einsum("nj,nj->n", inside.inward(points), directions)
     metres2_sr = np.sum(points**2, axis=1) / slant
     tries = TRIES * 2 * np.pi * (1 - np.cos(half)) * metres2_sr.max() / part.spacing_m**2
@@ -283,9 +293,10 @@ def poisson_disc(part: leds.PoissonDiscConfig, inside: Inside, led: leds.LedConf
 
 
 def optimised(part: leds.OptimisedConfig, inside: Inside, led: leds.LedConfig, band: Band) -> Sources:
-    """LEDs where a camera learns most of its worst attitude: see `optimise.places`.
+    """LEDs at the places that make the camera's worst attitudes most accurate: see `optimize.places`.
 
-    No LED goes where no attitude looks. By the worst attitudes' mean it is not worse than Fibonacci's spiral is.
+    No LED is placed where no attitude's field reaches. In the mean of the worst attitudes the layout is not worse
+    than a Fibonacci spiral.
     """
     rng = np.random.default_rng(part.hardware_seed)
     reach = optimize.reach_rad(part, inside)
@@ -298,7 +309,7 @@ def optimised(part: leds.OptimisedConfig, inside: Inside, led: leds.LedConfig, b
 def celestial(part: leds.CelestialConfig, inside: Inside, led: leds.LedConfig, band: Band) -> Sources:
     """The real sky (JHU/APL's idea): an LED where the camera at its nominal place sees each of the brightest stars.
 
-    Numbers are Hipparcos'. Where and how bright: `planetarium.projected`, `planetarium.levels`.
+    LED numbers are Hipparcos numbers. Places are from `celestial.projected`, levels from `celestial.levels`.
     """
     stars = celestial_dome.projected(part, inside, led, band)
     normal = inside.inward(stars.place_m)
@@ -308,7 +319,7 @@ def celestial(part: leds.CelestialConfig, inside: Inside, led: leds.LedConfig, b
 
 
 def listed(part: leds.ListedConfig, inside: Inside, led: leds.LedConfig, band: Band) -> Sources:
-    """LEDs where a list or a CSV file has them: places in the lab as they are, or directions from the bearing.
+    """LEDs from a list or a CSV file: places in the lab, used as given, or directions from the bearing.
 
     Normals are the surface's. Raises InputError for a place more than 5 cm off the surface or beyond the cap.
     """
@@ -328,7 +339,7 @@ def listed(part: leds.ListedConfig, inside: Inside, led: leds.LedConfig, band: B
 
 
 def check_near(key: str, inside: Inside, place_m: Floats) -> None:
-    """Refuse the first LED that is not near the surface, along the ray from the bearing."""
+    """Raise InputError for the first LED that is too far from the surface, along the ray from the bearing."""
     directions = place_m / np.linalg.norm(place_m, axis=1, keepdims=True)
     off_m = np.linalg.norm(from_bearing(inside, directions) - place_m, axis=1)
     far = np.flatnonzero(~(off_m <= STANDS_OFF_M))
@@ -339,9 +350,9 @@ def check_near(key: str, inside: Inside, place_m: Floats) -> None:
 
 
 def read_csv(path: Path) -> tuple[Floats, Floats | None]:
-    """A file of LEDs: columns x_m, y_m, z_m or azimuth_deg, tilt_deg; and level or magnitude, or neither.
+    """Read a file of LEDs: columns x_m, y_m, z_m or azimuth_deg, tilt_deg; and level or magnitude, or neither.
 
-    Comments begin with #; the first line is the names. Returns (N, 3) or (N, 2), and the levels (N,) if it has any.
+    Comments begin with #; the first other line holds the names. Returns (N, 3) or (N, 2), and levels (N,) or None.
     Raises InputError, one line, with the line's number.
     """
     try:
@@ -367,7 +378,7 @@ COLUMNS = (("x_m", "y_m", "z_m"), ("azimuth_deg", "tilt_deg"))
 
 
 def numbers(path: Path, number: int, line: str, count: int, bright: str) -> list[float]:
-    """One line of such a file."""
+    """The numbers of one line of an LED file. Raises InputError."""
     try:
         row = [float(cell) for cell in line.split(",")]
     except ValueError:
@@ -380,18 +391,18 @@ def numbers(path: Path, number: int, line: str, count: int, bright: str) -> list
 
 
 def fibres(part: leds.FibresConfig, inside: Inside, led: leds.LedConfig, band: Band) -> Sources:
-    """Ends of fibres where another layout has its LEDs, but for the shell's radius: `display.standing_off`."""
+    """Ends of optical fibers at another layout's points, with the shell's radius error: `display.standing_off`."""
     return display.standing_off(part, LAYOUTS[part.points.kind](part.points, inside, led, band))
 
 
 def lcd(part: leds.LcdConfig, inside: Inside, led: leds.LedConfig, band: Band) -> Sources:
-    """What another layout would light, drawn on the nearest pixels of a panel: `display.on_panel`."""
+    """Another layout's LEDs drawn on the nearest pixels of a panel: `display.on_panel`."""
     glass = display.glass(part, inside)
     wanted = LAYOUTS[part.points.kind](part.points, glass, display.steady(led), band)
     return display.on_panel(part, glass, led, band, wanted)
 
 
-# Each of (its part of the scene, the surface, the LEDs' kind, the chip's band) -> every LED.
+# Each takes (its section of the scene, the surface, the LED type, the chip's band) and returns all LEDs.
 LAYOUTS: dict[str, Callable[[Any, Inside, leds.LedConfig, Band], Sources]] = {
     "patch_boards": patch_boards,
     "fibonacci": fibonacci,
@@ -406,6 +417,6 @@ LAYOUTS: dict[str, Callable[[Any, Inside, leds.LedConfig, Band], Sources]] = {
 
 
 def board_of(part: leds.Layout, numbers: Ints) -> Ints | None:
-    """Which board each LED of these numbers sits on; None where no two share a lattice: no boards, or one."""
+    """(N,) board of each of these LED numbers; None if no two boards can be distinguished: no boards, or only one."""
     board = numbers // HOLES
     return board if isinstance(part, leds.PatchBoardsConfig) and len(np.unique(board)) > 1 else None

@@ -1,6 +1,7 @@
-"""What an LED sends towards the camera: emission lobe, falloff with distance, and the drive that makes its level.
+"""Light of an LED toward the camera: emission lobe, falloff with distance, drive, and on-time within an exposure.
 
-When a pulse train shines within an exposure is in pulse.py.
+A drive turns the level of each LED into a pulse train (`DRIVES`). `lit_moments_s` integrates such a train over an
+exposure.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ Falloff = Callable[[Floats], Floats]
 
 
 def inverse_square(distance_m: Floats) -> Floats:
-    """Flux spreads over a sphere: 1 / d^2, in m^-2."""
+    """Falloff of the flux of a point source: 1 / d^2, in m^-2."""
     return 1.0 / distance_m**2
 
 
@@ -37,26 +38,26 @@ FALLOFF: dict[str, Falloff] = {"inverse_square": inverse_square}
 
 
 def cosine_lobe(part: CosineLobeConfig, cos_emission: Floats) -> Floats:
-    """A lamp's radiant intensity as a power of the cosine: cos^m; m = 1 is Lambert's disc, seen foreshortened."""
+    """Relative radiant intensity cos^m of the emission angle; m = 1 is a Lambertian disc."""
     return np.asarray(np.maximum(cos_emission, 0.0) ** part.exponent)
 
 
 def table_lobe(part: LobeTableConfig, cos_emission: Floats) -> Floats:
-    """A measured lobe: relative intensity linear between the angles measured, which neither overshoots nor ripples.
+    """Measured lobe: relative intensity, interpolated linearly in angle, which neither overshoots nor oscillates.
 
-    Within the first angle it is the first value; beyond the last it is nothing.
+    Constant within the first angle, zero beyond the last.
     """
     angle_deg = np.degrees(np.arccos(np.clip(cos_emission, -1.0, 1.0)))
     return np.asarray(np.interp(angle_deg, part.angle_deg, part.intensity, right=0.0))
 
 
-# Each of (its part of the scene, cosine of the angle from the LED's normal) -> intensity, 1 on the normal.
+# Each takes (its section of the scene, cosine of the angle from the LED's normal); intensity is 1 on the normal.
 LOBES: dict[str, Callable[[Any, Floats], Floats]] = {"cosine": cosine_lobe, "table": table_lobe}
 
 
 @dataclass(frozen=True, slots=True)
 class Emitter:
-    """How a dome's LEDs shine: the laws of distance and of angle. By default a Lambertian disc's.
+    """Emission of a dome's LEDs: falloff with distance and lobe over angle. The default is a Lambertian disc.
 
     falloff : a key of FALLOFF
     lobe    : its kind is a key of LOBES
@@ -67,14 +68,14 @@ class Emitter:
 
     @classmethod
     def of(cls, led: LedConfig) -> Emitter:
-        """The laws that a scene names."""
+        """The emitter of a scene's LED section."""
         return cls(led.falloff, led.lobe)
 
 
 def irradiance_e_s_m2(
     strength_e_s_sr: Floats, emitter: Emitter, cos_emission: Floats, cos_incidence: Floats, distance_m: Floats
 ) -> Floats:
-    """Light through a square metre of the aperture: E = I_0 L(theta) cos(phi) f(d), zero behind either.
+    """Irradiance at the aperture: E = I_0 L(theta) cos(phi) f(d), zero where either surface faces away.
 
     strength_e_s_sr : photo-electrons s^-1 sr^-1 along the LED's normal
     cos_emission    : of theta, at the LED from its normal; L is the emitter's lobe
@@ -90,18 +91,18 @@ def irradiance_e_s_m2(
 
 
 def full_e_s_sr(led: LedConfig, band: Band) -> float:
-    """An LED at full brightness as the chip counts it: photo-electrons s^-1 sr^-1 along its normal."""
+    """Strength of an LED at full brightness in the chip's band: photo-electrons s^-1 sr^-1 along its normal."""
     if led.intensity_cd is not None:
         return float(led_strength_e_s_sr(led.intensity_cd, led.spectrum, band))
     return float(radiant_strength_e_s_sr(led.radiant_intensity_w_sr or 0.0, led.spectrum, band))
 
 
 class Lamps(NamedTuple):
-    """What a drive has to make, (N,) each.
+    """Input of a drive, (N,) each.
 
     level : share of full brightness
-    board : which board each LED sits on
-    row   : where each pixel's row is on its panel, from 0 at the top to below 1; 0 for LEDs
+    board : number of the board that carries the LED
+    row   : of a pixel on its panel, from 0 at the top to below 1; 0 for LEDs
     """
 
     level: Floats
@@ -110,7 +111,7 @@ class Lamps(NamedTuple):
 
 
 class Pulses(NamedTuple):
-    """What it makes of it, (N,) each: lit from start_s for on_s in every period_s, so strong while it is lit."""
+    """Output of a drive per LED, (N,): lit from start_s for on_s in every period_s; relative strength while lit."""
 
     period_s: Floats
     start_s: Floats
@@ -119,23 +120,23 @@ class Pulses(NamedTuple):
 
 
 def direct(_led: LedConfig, lamps: Lamps, _rng: np.random.Generator) -> Pulses:
-    """Direct current: the LED never goes out, and its level is in its strength."""
+    """Direct current: the LED is always lit, and its level scales its strength."""
     one = np.ones(len(lamps.level))
     return Pulses(one, 0 * one, one, lamps.level)
 
 
 def pwm(led: LedConfig, lamps: Lamps, rng: np.random.Generator) -> Pulses:
-    """Hardware PWM: V_avg = D V_max, D = t_on / T (thesis, eqs 35 and 36); phases are random, T is led.pwm_period_s."""
+    """Hardware PWM: V_avg = D V_max, D = t_on / T (thesis, eqs 35 and 36); random phases, T is led.pwm_period_s."""
     count = len(lamps.level)
     start_s = rng.uniform(0, led.pwm_period_s, count)
     return Pulses(np.full(count, led.pwm_period_s), start_s, lamps.level * led.pwm_period_s, np.ones(count))
 
 
 def sequential(led: LedConfig, lamps: Lamps, rng: np.random.Generator) -> Pulses:
-    """An Arduino switches one LED after another, so that each waits for all: D_i = t_on,i / sum T (thesis, eq. 37).
+    """Software PWM of a controller that lights its LEDs one after another: D_i = t_on,i / sum T (thesis, eq. 37).
 
-    Each LED of a controller has a slot T, t_on is its level of it, and the controller's cycle is the sum of its
-    slots. The controllers' phases are random. The microcontroller's own delays are left out, as in the thesis.
+    Each LED of a controller has a slot T and is lit for its level of it; the controller's cycle is the sum of its
+    slots. The controllers' phases are random. The microcontroller's own delays are neglected, as in the thesis.
     """
     part, count = led.drive, len(lamps.level)
     assert isinstance(part, SequentialConfig)
@@ -146,8 +147,9 @@ def sequential(led: LedConfig, lamps: Lamps, rng: np.random.Generator) -> Pulses
     else:
         group = np.arange(count) // part.controller
     _, controller, sharing = np.unique(group, return_inverse=True, return_counts=True)
+    # Number the LEDs of each controller: in the stable order they are consecutive, minus the index of its first.
     order = np.argsort(controller, kind="stable")
-    turn = np.empty(count)  # whose turn it is on its controller: 0, 1, ...
+    turn = np.empty(count)  # index of the LED's slot on its controller: 0, 1, ...
     turn[order] = np.arange(count) - np.repeat(np.cumsum(sharing) - sharing, sharing)
     cycle_s = sharing * np.float64(part.slot_s)
     start_s = rng.uniform(0, cycle_s)[controller] + turn * part.slot_s
@@ -155,11 +157,12 @@ def sequential(led: LedConfig, lamps: Lamps, rng: np.random.Generator) -> Pulses
 
 
 def refresh(led: LedConfig, lamps: Lamps, rng: np.random.Generator) -> Pulses:
-    """A panel's rows are lit one after another, once a frame: on for duty / rate, a row later by its share of 1 / rate.
+    """A panel whose rows are lit one after another once a frame, each for duty / rate.
 
-    A grey is in the strength, for the liquid crystal stays as it is. All pixels of a row shine together; the panel's
-    phase is random. Mean light is level * duty; over an exposure of (n + f) frames, n whole, it flickers by
-    sqrt(f (1 - f) - duty / 3) / (n + f) where duty <= f <= 1 - duty, and not at all where f = 0 (reference 1.3).
+    A row is delayed by its position on the panel, `row` / rate. A gray level is in the strength, because the liquid
+    crystal keeps its state. All pixels of a row are lit together; the panel's phase is random. The mean light is
+    level * duty. Over an exposure of n + f frames, n whole, the relative flicker is
+    sqrt(f (1 - f) - duty / 3) / (n + f) where duty <= f <= 1 - duty, and zero for f = 0 (reference 1.3).
     """
     part, one = led.drive, np.ones(len(lamps.level))
     assert isinstance(part, RefreshConfig)
@@ -169,7 +172,7 @@ def refresh(led: LedConfig, lamps: Lamps, rng: np.random.Generator) -> Pulses:
     )
 
 
-# Each of (the LEDs' kind, what each LED has to be, the hardware's random stream) -> when it is lit and how strong.
+# Each takes (the LED section, the LEDs' levels and places, the hardware's random stream) and returns the pulses.
 DRIVES: dict[str, Callable[[LedConfig, Lamps, np.random.Generator], Pulses]] = {
     "direct": direct,
     "pwm": pwm,
@@ -180,11 +183,12 @@ DRIVES: dict[str, Callable[[LedConfig, Lamps, np.random.Generator], Pulses]] = {
 
 @jit
 def lit_moments_s(begin_s: float, end_s: float, period_s: float, start_s: float, on_s: float) -> Any:
-    """Seconds of [begin, end] during which a pulse train shines, their mean time and its standard deviation.
+    """On-time of a pulse train within [begin, end], s, its mean time and the standard deviation about it.
 
-    It is lit from start_s for on_s in every period_s, before and after. Exact for any interval: the first and the
-    last pulse are cut where it ends; the n whole ones between have the moments of a comb, whose centres' variance
-    is period^2 (n^2 - 1) / 12. (0, the middle, 0) where it is dark.
+    The train is lit from start_s for on_s in every period_s, before and after. The result is exact for any interval:
+    the first and the last pulse are clipped to it; the n whole pulses between them have the moments of a comb, whose
+    centers have the variance period^2 (n^2 - 1) / 12, each pulse adding on^2 / 12. Returns (0, the middle, 0) if it
+    is dark.
     """
     middle = (begin_s + end_s) / 2
     if on_s >= period_s:
@@ -192,7 +196,8 @@ def lit_moments_s(begin_s: float, end_s: float, period_s: float, start_s: float,
     first = floor((begin_s - start_s - on_s) / period_s) + 1
     last = ceil((end_s - start_s) / period_s) - 1
     lit, sum1, sum2 = 0.0, 0.0, 0.0
-    for j in range(first, last + 1, max(last - first, 1)):  # the two at the ends, or the only one
+    # Times are taken from the middle of the interval, where the squares lose the fewest digits.
+    for j in range(first, last + 1, max(last - first, 1)):  # the two pulses at the ends, or the only one
         up = max(start_s + j * period_s, begin_s)
         width = min(start_s + j * period_s + on_s, end_s) - up
         if width > 0:

@@ -1,4 +1,10 @@
-"""Points that a measuring arm took on the dome's inside: read, and made into a smooth surface with its residuals."""
+"""Measured points of the dome's inside: read, and fitted by a smooth surface with residuals.
+
+The points are those of a measuring arm. A sphere is fitted first. The distance from its center is then fitted as a
+function of direction: Zernike polynomials in the disc onto which Lambert's equal-area projection maps the cap,
+r(u) = sum_k c_k Z_k, by linear least squares (`fit`). `fit_ellipsoid` gives the nearest ellipsoid, for estimators
+that know no other surface.
+"""
 
 from __future__ import annotations
 
@@ -14,14 +20,14 @@ from skysim.core.errors import InputError
 from skysim.core.types import Floats
 
 UNIT_M = {"m": 1.0, "cm": 0.01, "mm": 1e-3, "in": 0.0254}
-POINTS_PER_TERM = 3  # fewer would leave little by which to judge the fit
-WORST_CONDITION = 1e3  # points spread evenly over the disc come to some 5
-SECTORS = 12  # in each of which the points must reach the surface's edge
-AROUND = 72
+POINTS_PER_TERM = 3  # fewer would leave too few degrees of freedom to judge the fit
+WORST_CONDITION = 1e3  # of the fit; points spread evenly over the disc have about 5
+SECTORS = 12  # of azimuth, in each of which points must reach the surface's edge
+AROUND = 72  # points on the edge of the fitted surface
 
 
 class Ball(NamedTuple):
-    """The sphere nearest to points: its centre (3,), radius, and the rms of their distances from it."""
+    """The sphere nearest to points: its center (3,), radius, and the rms of the points' distances from it."""
 
     centre_m: Floats
     radius_m: float
@@ -29,7 +35,7 @@ class Ball(NamedTuple):
 
 
 class Believed(NamedTuple):
-    """The ellipsoid with its axes along the lab's that is nearest to a surface.
+    """The ellipsoid, with axes along the lab's, that is nearest to a surface.
 
     centre_m, semi_axes_m : (3,) each
     rms_m                 : of the surface's distances from it, over the surface within its rim as the bearing sees it
@@ -41,12 +47,13 @@ class Believed(NamedTuple):
 
 
 def fit_sphere(points_m: Floats) -> Ball:
-    """The sphere nearest to points (N, 3): sum of squared distances least, from the algebraic fit on.
+    """The sphere with the least sum of squared distances from points (N, 3), iterated from the algebraic fit.
 
-    Raises ValueError for points that lie in a plane.
+    Raises ValueError for points in a plane.
     """
     middle, size = points_m.mean(axis=0), np.ptp(points_m, axis=0).max()
     near = (points_m - middle) / size
+    # Algebraic fit, linear in the center c and r^2 - |c|^2: |x|^2 = 2 c . x + (r^2 - |c|^2).
     table = np.column_stack([2 * near, np.ones(len(near))])
     first, _, rank, _ = np.linalg.lstsq(table, np.sum(near**2, axis=1), rcond=1e-9)
     if rank < 4:
@@ -63,14 +70,14 @@ def fit_sphere(points_m: Floats) -> Ball:
 
 
 def fit_ellipsoid(points_m: Floats) -> Believed:
-    """The ellipsoid with axes along the lab's nearest to points: least squares of (|w| - 1) / |grad |w||.
+    """The ellipsoid, with axes along the lab's, nearest to points: least squares of (|w| - 1) / |grad |w||.
 
-    points_m : (N, 3), N > 6;  w = (x - centre) / semi_axes. To first order the residual is the distance.
+    points_m : (N, 3), N > 6;  w = (x - center) / semi_axes. To first order the residual is the distance.
     """
     ball = fit_sphere(points_m)
 
     def apart_m(told: Floats) -> Floats:
-        axes = np.exp(told[3:]) * ball.radius_m
+        axes = np.exp(told[3:]) * ball.radius_m  # logarithms as parameters keep the semi-axes positive
         w = (points_m - ball.centre_m - ball.radius_m * told[:3]) / axes
         size = np.linalg.norm(w, axis=1)
         return np.asarray((size - 1) * size / np.linalg.norm(w / axes, axis=1))
@@ -84,7 +91,7 @@ def fit_ellipsoid(points_m: Floats) -> Believed:
 
 
 def zernike(degree: int, disc: Floats) -> tuple[Floats, Floats]:
-    """Zernike's polynomials over the unit disc up to a degree, (N, K), and their gradients, (N, K, 2).
+    """Zernike polynomials over the unit disc to a degree, (N, K), and their gradients, (N, K, 2).
 
     disc : (N, 2). K = (degree + 1)(degree + 2) / 2; none exceeds 1 in the disc. The first is 1.
     Z = Re or Im of w^m R(q), w = x + iy, q = |w|^2,
@@ -111,12 +118,12 @@ def zernike(degree: int, disc: Floats) -> tuple[Floats, Floats]:
 
 @dataclass(frozen=True, slots=True)
 class Zernike:
-    """A radius over a cap of directions about +z: polynomials in the disc onto which the cap goes in equal areas.
+    """Radius over a cap of directions about +z: Zernike polynomials in the cap's equal-area disc.
 
-    The disc's radius is sin(angle / 2) / sin(half / 2), so that the polynomials are orthogonal over the cap too.
+    The disc's radius is sin(angle / 2) / sin(half / 2), so the polynomials are orthogonal over the cap too.
 
-    half_rad     : the cap's half angle, 1 in the disc. Beyond, the radius stays as it is at the edge
-    cover_rad    : so far the points reach in every azimuth
+    half_rad     : the cap's half angle, 1 in the disc; beyond it the radius keeps its value at the edge
+    cover_rad    : angle to which the points reach in every azimuth
     coefficient_m : (K,)
     """
 
@@ -127,7 +134,7 @@ class Zernike:
 
     @property
     def most_m(self) -> float:
-        """No polynomial exceeds 1."""
+        """Upper bound of the radius: no polynomial exceeds 1."""
         return float(np.abs(self.coefficient_m).sum())
 
     def at(self, unit: Floats) -> tuple[Floats, Floats]:
@@ -141,9 +148,9 @@ class Zernike:
 
 
 def to_disc(unit: Floats, half_rad: float) -> tuple[Floats, Floats, Floats]:
-    """Lambert's equal-area disc of a cap: (N, 2) x, y of unit vectors (N, 3) times (N,) k; and (N,) d ln k / dz.
+    """Lambert's equal-area disc of a cap: (N, 2) x, y of unit vectors (N, 3) times (N,) k; k; (N,) d ln k / dz.
 
-    k = 1 / (sqrt(2 (1 + z)) sin(half / 2)). Straight down, where it has none, k is very great.
+    k = 1 / (sqrt(2 (1 + z)) sin(half / 2)). It diverges straight down and is limited there.
     """
     up = np.maximum(1 + unit[:, 2], 1e-12)
     stretch = 1 / (np.sqrt(2 * up) * math.sin(half_rad / 2))
@@ -152,11 +159,11 @@ def to_disc(unit: Floats, half_rad: float) -> tuple[Floats, Floats, Floats]:
 
 @dataclass(frozen=True, slots=True)
 class Survey:
-    """Points and the smooth surface through them.
+    """Measured points and the smooth surface fitted to them.
 
     centre_m   : (3,) of their best sphere, in the points' own frame
     law        : radius over direction about it
-    residual_m : (N,) points' radii less the surface's
+    residual_m : (N,) points' radii minus the surface's
     ball       : that best sphere, with its own rms
     """
 
@@ -167,16 +174,16 @@ class Survey:
 
     @property
     def rms_m(self) -> float:
-        """Of the residuals. Noise of sigma leaves sigma sqrt(1 - K / N), and is sigma sqrt(K / N) in the surface."""
+        """Rms of the residuals. Noise of sigma leaves sigma sqrt(1 - K / N) here, sigma sqrt(K / N) in the surface."""
         return float(np.sqrt(np.mean(self.residual_m**2)))
 
     @property
     def worst_m(self) -> float:
-        """The greatest residual, without its sign."""
+        """The greatest absolute residual."""
         return float(np.abs(self.residual_m).max())
 
     def edge_m(self) -> Floats:
-        """(M, 3) where the surface ends for want of points, about its centre."""
+        """(M, 3) points on the edge of the area that the points cover, relative to its center."""
         azimuth = np.arange(AROUND) * (2 * np.pi / AROUND)
         out, up = np.sin(self.law.cover_rad), np.full(AROUND, np.cos(self.law.cover_rad))
         unit = np.column_stack([out * np.cos(azimuth), out * np.sin(azimuth), up])
@@ -201,12 +208,12 @@ def read(file: str, unit: str) -> Floats:
 
 
 def fit(points_m: Floats, degree: int, file: str) -> Survey:
-    """The smooth surface nearest to points of a dome whose axis is about +z: least squares in the radius.
+    """Smooth surface fitted to points of a dome whose axis is about +z: linear least squares in the radius.
 
     points_m : (N, 3) in the arm's own frame
-    degree   : of the polynomials over direction, seen from the centre of the points' best sphere
+    degree   : of the polynomials over direction, seen from the center of the points' best sphere
     file     : to name in messages
-    Raises InputError for too few points, for a plane's, and for points that leave parts of the surface bare.
+    Raises InputError for too few points, for points in a plane, and if the points leave parts of the surface bare.
     """
     terms = (degree + 1) * (degree + 2) // 2
     place = f"light.surface.file: {file}: "
@@ -224,10 +231,12 @@ def fit(points_m: Floats, degree: int, file: str) -> Survey:
     sector = (
         np.floor((np.arctan2(unit[:, 1], unit[:, 0]) / (2 * np.pi) + 0.5) * SECTORS).astype(int) % SECTORS
     )
+    # Covered angle: of the farthest point in each sector of azimuth, the least.
     cover = min(float(angle[sector == one].max(initial=0.0)) for one in range(SECTORS))
     half = float(angle.max())
     table, _ = zernike(degree, to_disc(unit, half)[0])
     coefficient, _, _, sizes = np.linalg.lstsq(table, radius_m)
+    # A large ratio of singular values means polynomials that the points do not determine: an area without points.
     if cover < half / 2 or sizes[-1] * WORST_CONDITION < sizes[0]:
         raise InputError(
             f"{place}the points leave parts of the dome bare; allowed: points all around +z, or a degree below {degree}"

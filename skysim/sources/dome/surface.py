@@ -1,7 +1,9 @@
-"""The inside of the dome as a surface in the lab frame: where rays meet it, its normals, its rim.
+"""The inside of the dome as a surface in the lab frame: ray intersection, normals, rim.
 
-Every surface is a level set in a frame of its own, at its centre, upright before it is tilted. What a scene's
-`light.surface.kind` names stands in SURFACES.
+Every surface is a level set f(x) = 0 in its own frame, f < 0 inside. The frame's origin is the surface's center; its
+axes are the lab's unless the surface is tilted. A ray from the inside meets the surface where f first becomes zero:
+in closed form for planes and quadrics (`leaves`), by safeguarded Newton steps for a radius over direction (`Radial`).
+SURFACES maps the scene's `light.surface.kind` to the function that builds the surface.
 """
 
 from __future__ import annotations
@@ -22,19 +24,19 @@ from skysim.scene import light
 from skysim.sources.dome import point_cloud
 from skysim.sources.dome.point_cloud import Believed, fit_ellipsoid
 
-FLAT_RADIUS_M = 1e6  # of a sphere that is flat to a micrometre within a metre
-RINGS, SECTORS = 60, 72  # of the samples by which a surface is told as an ellipsoid
-MOST_STEPS = 200
-SLACK_M = 1e-12  # a point on the rim itself, rounded, is within it
+FLAT_RADIUS_M = 1e6  # of a sphere that is flat to a micrometer within a meter
+RINGS, SECTORS = 60, 72  # of the samples to which an ellipsoid is fitted
+MOST_STEPS = 200  # of the ray intersection
+SLACK_M = 1e-12  # rounding tolerance that keeps points on the rim within it
 
 
 @dataclass(frozen=True, slots=True)
 class Rim:
     """Where a surface ends, in its own frame.
 
-    eye_m    : (3,) the bearing's centre as it was before the surface was displaced
-    lowest_m : height of the lowest place
-    half_rad : the greatest angle from the upright, seen from the eye
+    eye_m    : (3,) the bearing's center before the surface was displaced
+    lowest_m : height of the lowest point
+    half_rad : greatest angle from the upright axis, seen from the eye
     """
 
     eye_m: Floats = field(default_factory=lambda: np.zeros(3))
@@ -47,7 +49,7 @@ class Rim:
         return self.lowest_m == -math.inf and self.half_rad == math.pi
 
     def holds(self, own_m: Floats) -> NDArray[np.bool_]:
-        """(N,) whether (N, 3) points of the surface's own frame are within; NaN is not."""
+        """(N,) whether (N, 3) points in the surface's own frame are within the rim; False for NaN."""
         seen = own_m - self.eye_m
         slack = SLACK_M - np.cos(self.half_rad) * np.linalg.norm(seen, axis=1)
         return np.asarray((own_m[:, 2] >= self.lowest_m - SLACK_M) & (seen[:, 2] + slack >= 0))
@@ -55,9 +57,10 @@ class Rim:
 
 @dataclass(frozen=True, slots=True)
 class Surface(ABC):
-    """A surface seen from inside: a level set, negative inside, in a frame of its own that is displaced and tilted.
+    """A surface seen from inside: a level set, negative inside, in its own displaced and tilted frame.
 
     centre_m       : (3,) origin of its own frame, in the lab
+    rim            : where it ends
     lab_from_own   : its tilt
     survey_sigma_m : standard deviation, along the normal, of the lab's survey of it
     """
@@ -69,41 +72,42 @@ class Surface(ABC):
 
     @abstractmethod
     def level(self, own_m: Floats) -> Floats:
-        """(N,) negative inside, zero on the surface, of (N, 3) points in its own frame."""
+        """(N,) level at (N, 3) points in its own frame: negative inside, zero on the surface."""
 
     @abstractmethod
     def gradient(self, own_m: Floats) -> Floats:
-        """(N, 3) the level's gradient, or a positive multiple of it, at points of the surface."""
+        """(N, 3) gradient of the level at points of the surface, or a positive multiple of it."""
 
     @abstractmethod
     def distance(self, start_m: Floats, along: Floats) -> Floats:
-        """(N,) how many times its ray (N, 3) until a ray from inside leaves; NaN where it never does."""
+        """(N,) distance at which a ray from the inside leaves, in lengths of `along` (N, 3); NaN if it never does."""
 
     def within(self, own_m: Floats) -> NDArray[np.bool_]:
         """(N,) whether points of the level set belong to the surface."""
         return self.rim.holds(own_m)
 
     def meet(self, origin_m: Floats, rays: Floats) -> Floats:
-        """(N, 3) points where rays (N, 3) of any length leave the inside; NaN where they miss or pass under the rim."""
+        """(N, 3) points where rays (N, 3) of any length leave the inside; NaN where they miss or pass below the rim."""
         turn = self.lab_from_own.as_matrix()
+        # A rotation keeps lengths, so the distance along the ray is the same in both frames.
         start, along = (origin_m - self.centre_m) @ turn, rays @ turn
         distance = self.distance(start, along)
         on_it = self.within(start + distance[:, None] * along)
         return np.asarray(origin_m + np.where(on_it, distance, np.nan)[:, None] * rays)
 
     def inward(self, points_m: Floats) -> Floats:
-        """(N, 3) unit normals towards the inside, at points of the surface: minus the level's gradient."""
+        """(N, 3) unit normals toward the inside, at points of the surface: minus the level's gradient."""
         turn = self.lab_from_own.as_matrix()
         gradient = self.gradient((points_m - self.centre_m) @ turn) @ turn.T
         return np.asarray(-gradient / np.linalg.norm(gradient, axis=1, keepdims=True))
 
     def inside(self, point_m: Floats) -> bool:
-        """Whether a point of the lab, (3,), is inside; rim or none."""
+        """Whether a point of the lab, (3,), is inside; the rim is ignored."""
         own = (point_m - self.centre_m) @ self.lab_from_own.as_matrix()
         return bool(self.level(own[None])[0] < 0)
 
     def samples_m(self) -> Floats:
-        """(N, 3) points within the rim, in as equal shares of the cap that the bearing sees as rings allow."""
+        """(N, 3) points of the surface within its rim, on rings of equal solid angle as seen from the bearing."""
         lowest = np.cos(min(self.rim.half_rad, np.pi / 2))
         up = 1 - (np.arange(RINGS) + 0.5) / RINGS * (1 - lowest)
         azimuth = np.arange(SECTORS) * (2 * np.pi / SECTORS)
@@ -114,17 +118,21 @@ class Surface(ABC):
         return met[np.isfinite(met[:, 0])]
 
     def believed(self) -> Believed:
-        """The nearest ellipsoid: least squares over the surface within its rim."""
+        """The nearest ellipsoid: a least-squares fit to `samples_m`."""
         return fit_ellipsoid(self.samples_m())
 
     def as_ellipsoid(self) -> tuple[Floats, Floats]:
-        """Centre and semi-axes, (3,) each, m, by which an estimator knows the surface; `believed` has its rms too."""
+        """Center and semi-axes, (3,) each, m, of the ellipsoid that estimators use; `believed` adds its rms error."""
         nearest = self.believed()
         return nearest.centre_m, nearest.semi_axes_m
 
 
 def leaves(start: Floats, along: Floats) -> Floats:
-    """(N,) the greater root s > 0 of |start + s along| = 1; NaN where there is none. Free of cancellation."""
+    """(N,) the greater root s > 0 of |start + s along| = 1; NaN where there is none.
+
+    With q = |b| + sqrt(b^2 - a c) the greater root is -c / q for b > 0 and q / a otherwise, free of cancellation.
+    """
+    # a s^2 + 2 b s + c = 0
     a, b, c = np.sum(along**2, axis=1), along @ start, start @ start - 1
     under = b**2 - a * c
     reach = np.abs(b) + np.sqrt(np.where((under >= 0) & (a > 0), under, np.nan))
@@ -149,7 +157,7 @@ class Ellipsoid(Surface):
         return leaves(start_m / self.semi_axes_m, along / self.semi_axes_m)
 
     def believed(self) -> Believed:
-        """Itself, unless it is tilted and no sphere."""
+        """The ellipsoid itself; a fit if it is tilted and not a sphere."""
         if self.lab_from_own.magnitude() > 0 and np.ptp(self.semi_axes_m) > 0:
             return fit_ellipsoid(self.samples_m())
         return Believed(self.centre_m, self.semi_axes_m, 0.0)
@@ -157,7 +165,7 @@ class Ellipsoid(Surface):
 
 @dataclass(frozen=True, slots=True)
 class Plane(Surface):
-    """A panel z = 0 in its own frame, seen from below.
+    """A panel at z = 0 in its own frame, seen from below.
 
     half_m : (2,) half its extent along its own x and y
     """
@@ -166,7 +174,7 @@ class Plane(Surface):
 
     @property
     def height_m(self) -> float:
-        """Of its middle, above the bearing."""
+        """Height of its center above the bearing."""
         return float(self.centre_m[2])
 
     def level(self, own_m: Floats) -> Floats:
@@ -176,7 +184,7 @@ class Plane(Surface):
         return np.tile([0.0, 0.0, 1.0], (len(own_m), 1))
 
     def distance(self, start_m: Floats, along: Floats) -> Floats:
-        """Rays that point down never meet it."""
+        """As `Surface.distance`; NaN for rays that point down."""
         distance = -start_m[2] / np.where(along[:, 2] > 0, along[:, 2], np.nan)
         return np.where(distance > 0, distance, np.nan)
 
@@ -184,16 +192,17 @@ class Plane(Surface):
         return np.asarray(np.all(np.abs(own_m[:, :2]) <= self.half_m + SLACK_M, axis=1))
 
     def believed(self) -> Believed:
-        """A sphere so great that it is flat to a micrometre within a metre."""
+        """A sphere so large that it is flat to a micrometer within a meter."""
         up = self.lab_from_own.apply([0.0, 0.0, 1.0])
         return Believed(self.centre_m - FLAT_RADIUS_M * up, np.full(3, FLAT_RADIUS_M), 0.0)
 
 
 @dataclass(frozen=True, slots=True)
 class Cylinder(Surface):
-    """(x / radius)^2 summed over the two axes across = 1 in its own frame.
+    """sum((x_i / radius)^2) = 1 over the two axes i across, in its own frame.
 
-    axis : 0, 1, 2 its own x, y, z
+    axis          : 0, 1, 2 for its own x, y, z
+    half_length_m : half its extent along the axis
     """
 
     radius_m: float
@@ -217,14 +226,17 @@ class Cylinder(Surface):
         return np.asarray(self.rim.holds(own_m) & ends)
 
     def believed(self) -> Believed:
-        """An ellipsoid so long that it is straight, where it is not tilted."""
+        """An ellipsoid so long that it is straight; a fit if the cylinder is tilted."""
         if self.lab_from_own.magnitude() > 0:
             return fit_ellipsoid(self.samples_m())
         return Believed(self.centre_m, self.semi_axes_m(FLAT_RADIUS_M), 0.0)
 
 
 class RadiusLaw(Protocol):
-    """A surface's distance from its centre over direction: at most most_m, known to cover_rad from the axis."""
+    """Distance of a surface from its center as a function of direction.
+
+    It is at most most_m, and known out to the angle cover_rad from the axis.
+    """
 
     @property
     def most_m(self) -> float: ...
@@ -233,16 +245,17 @@ class RadiusLaw(Protocol):
     def cover_rad(self) -> float: ...
 
     def at(self, unit: Floats) -> tuple[Floats, Floats]:
-        """(N,) radius over (N, 3) unit vectors, and (N, 3) its gradient (of which the part along the unit is free)."""
+        """(N,) radius over (N, 3) unit vectors, and (N, 3) its gradient, whose radial component is ignored."""
 
 
 @dataclass(frozen=True, slots=True)
 class Shell:
-    """Inside of a formed wall: r = R - share t(angle), t linear from apex to base and then constant.
+    """Inner radius of a formed wall: r = R - share t(angle), t linear from apex to base and constant beyond.
 
-    share : of the wall that lies inside of R: 1 where R is the outside's, 1/2 where it is the middle's
+    share : fraction of the wall's thickness that is inside R: 1 if R is the outer radius, 1/2 if it is the mid-wall's
     AFIT's design contour, 48.033 in at the apex and 48.010 in at 40 deg (Padro 2012, sec. 3.7), follows from its
-    0.2036 in and 0.25 in of acrylic about R = 48.135 in as the middle's; as the outside's it does not.
+    0.2036 in and 0.25 in of acrylic about R = 48.135 in as the mid-wall radius. With R as the outer radius it does
+    not.
     """
 
     most_m: float
@@ -256,16 +269,16 @@ class Shell:
         angle = np.arctan2(out, unit[:, 2])
         slope = -self.share * (self.thickness_m[1] - self.thickness_m[0]) / self.base_rad
         radius = self.most_m - self.share * self.thickness_m[0] + slope * np.minimum(angle, self.base_rad)
-        # The unit vector towards greater angles; none at the apex itself, where the law has its tip.
+        # Unit vector toward greater angles; zero at the apex, where the law has no tangent.
         around = np.column_stack([unit[:, :2] * (unit[:, 2] / np.where(out > 0, out, np.inf))[:, None], -out])
         return radius, np.where(angle < self.base_rad, slope, 0.0)[:, None] * around
 
 
 @dataclass(frozen=True, slots=True)
 class Radial(Surface):
-    """|x| = r(x / |x|) in its own frame: one radius in every direction from its centre.
+    """|x| = r(x / |x|) in its own frame: one radius in every direction from its center.
 
-    survey : the points that it was fitted to, if it was
+    survey : the measured points that it was fitted to, if any
     """
 
     radius: RadiusLaw
@@ -278,9 +291,9 @@ class Radial(Surface):
         return self.level_and_gradient(own_m)[1]
 
     def level_and_gradient(self, own_m: Floats) -> tuple[Floats, Floats]:
-        """(N,) |x| - r and (N, 3) x/|x| - (grad r - its part along x)/|x|."""
+        """(N,) level |x| - r and (N, 3) its gradient x/|x| - (grad r - its part along x) / |x|."""
         far = np.linalg.norm(own_m, axis=1, keepdims=True)
-        far = np.where(far > 0, far, np.finfo(float).tiny)  # at the centre itself every direction will do
+        far = np.where(far > 0, far, np.finfo(float).tiny)  # avoids 0 / 0 at the center
         unit = own_m / far
         radius, slope = self.radius.at(unit)
         across = slope - np.sum(slope * unit, axis=1, keepdims=True) * unit
@@ -291,11 +304,12 @@ class Radial(Surface):
         return np.asarray(self.rim.holds(own_m) & (cosine >= -SLACK_M))
 
     def distance(self, start_m: Floats, along: Floats) -> Floats:
-        """Newton's steps inside of a bracket that always holds a crossing: the level is negative below, not so above.
+        """Newton's method within a bracket: the level is negative at its low end and not negative at its high end.
 
-        The bracket ends on the sphere of the greatest radius. A step that leaves it, or follows one that did not halve
-        the level, is a bisection; so it ends. Only a level of some roundings is a result: raises ArithmeticError
-        otherwise. An inside that is convex is left but once; of several crossings it would be one.
+        The bracket ends on the sphere of the greatest radius. A step is a bisection if Newton's step would leave the
+        bracket or if the last step did not halve the level; so the iteration converges. Raises ArithmeticError if a
+        level larger than a few roundings remains. A ray leaves a convex inside only once; otherwise one of several
+        crossings is found.
         """
         low, high = np.zeros(len(along)), leaves(start_m / self.radius.most_m, along / self.radius.most_m)
         if self.level(start_m[None])[0] >= 0:
@@ -303,6 +317,7 @@ class Radial(Surface):
         distance, before = high.copy(), np.full(len(along), np.inf)
         for _ in range(MOST_STEPS):
             level, gradient = self.level_and_gradient(start_m + distance[:, None] * along)
+            # Rays that have not converged; those that have keep their distance.
             open_ = np.abs(level) > 16 * np.finfo(float).eps * self.radius.most_m
             if not open_.any():
                 return distance
@@ -316,7 +331,7 @@ class Radial(Surface):
 
 
 def placed(part: light.SurfaceConfig, centre_m: float) -> dict[str, Any]:
-    """Where a scene puts an upright surface whose centre is so high above the bearing: what every Surface takes."""
+    """What every Surface takes: center, rim, tilt and survey error, for a center at this height above the bearing."""
     height_m, half_deg = getattr(part, "rim_height_m", None), getattr(part, "rim_deg", None)
     lowest_m = -math.inf if height_m is None else height_m - centre_m
     half_rad = math.pi if half_deg is None else math.radians(half_deg)
@@ -329,7 +344,7 @@ def placed(part: light.SurfaceConfig, centre_m: float) -> dict[str, Any]:
 
 
 def sphere(part: light.SphereSurfaceConfig) -> Surface:
-    """A sphere whose top is part.apex_m above the bearing, or the inside of a wall about one."""
+    """A sphere with its top at part.apex_m above the bearing, or the inner face of a formed wall."""
     if part.wall is None:
         return Ellipsoid(semi_axes_m=np.full(3, part.radius_m), **placed(part, part.apex_m - part.radius_m))
     thickness_m = (part.wall.thickness_apex_m, part.wall.thickness_base_m)
@@ -339,19 +354,19 @@ def sphere(part: light.SphereSurfaceConfig) -> Surface:
 
 
 def ellipsoid(part: light.EllipsoidSurfaceConfig) -> Surface:
-    """An ellipsoid with its top part.apex_m above the bearing."""
+    """An ellipsoid with its top at part.apex_m above the bearing."""
     axes_m = np.array(part.semi_axes_m)
     return Ellipsoid(semi_axes_m=axes_m, **placed(part, part.apex_m - axes_m[2]))
 
 
 def flat(part: light.FlatSurfaceConfig) -> Surface:
-    """A panel whose middle is part.apex_m above the bearing."""
+    """A panel with its center at part.apex_m above the bearing."""
     size_m = [math.inf if one is None else one for one in (part.width_m, part.height_m)]
     return Plane(half_m=np.array(size_m) / 2, **placed(part, part.apex_m))
 
 
 def cylinder(part: light.CylinderSurfaceConfig) -> Surface:
-    """A vault whose top line is part.apex_m above the bearing, or a drum whose upper edge is."""
+    """A vault with its top line, or a drum with its upper edge, at part.apex_m above the bearing."""
     half_m = math.inf if part.length_m is None else part.length_m / 2
     below_m = half_m if part.axis == "z" else part.radius_m
     where = placed(part, part.apex_m - below_m)
@@ -359,7 +374,7 @@ def cylinder(part: light.CylinderSurfaceConfig) -> Surface:
 
 
 def surveyed(part: light.SurveyedSurfaceConfig) -> Surface:
-    """What a measuring arm found, made smooth; tilted about the origin of its points. Raises InputError."""
+    """A smooth surface fitted to measured points; tilted about the origin of the points. Raises InputError."""
     found = point_cloud.fit(point_cloud.read(part.file, part.unit), part.degree, part.file)
     if found.rms_m > part.rms_limit_m:
         raise InputError(
@@ -367,6 +382,7 @@ def surveyed(part: light.SurveyedSurfaceConfig) -> Surface:
             f" (worst {found.worst_m:.3g} m); allowed: rms_limit {part.rms_limit_m:g} m, a greater degree, another unit"
         )
     where = placed(part, 0.0)
+    # The surface's frame has its origin at the best sphere's center; the scene's tilt and rim refer to the points'.
     where["centre_m"] = part.offset_m + where["lab_from_own"].apply(found.centre_m)
     where["rim"] = Rim(-found.centre_m, where["rim"].lowest_m - found.centre_m[2], where["rim"].half_rad)
     told = part.rim_height_m is not None or part.rim_deg is not None
@@ -388,7 +404,10 @@ SURFACES: dict[str, Callable[[Any], Surface]] = {
 
 
 def build_surface(part: light.SurfaceConfig) -> Surface:
-    """The surface that a scene describes. Raises InputError unless the bearing is inside of it and sees some of it."""
+    """The surface that a scene describes.
+
+    Raises InputError unless the bearing's center is inside the surface and sees a part of it.
+    """
     made = SURFACES[part.kind](part)
     if not made.inside(np.zeros(3)):
         check = "file, unit, offset" if part.kind == "surveyed" else "apex, sizes and offset"
@@ -402,13 +421,13 @@ def build_surface(part: light.SurfaceConfig) -> Surface:
 
 
 class Inside(Protocol):
-    """A surface, as far as LEDs have to know it."""
+    """The part of a surface's interface that the LED layouts use."""
 
     def meet(self, origin_m: Floats, rays: Floats) -> Floats:
         """(N, 3) points where rays from the inside leave it."""
 
     def inward(self, points_m: Floats) -> Floats:
-        """(N, 3) unit normals towards the inside."""
+        """(N, 3) unit normals toward the inside."""
 
     def inside(self, point_m: Floats) -> bool:
         """Whether a point is inside."""

@@ -1,3 +1,1 @@
-"""Where LEDs go: Fisher information of the attitude, ambiguity between fields of view, and the search for
-the best layout.
-"""
+"""LED placement: Fisher information of the attitude, ambiguity between fields, and the search for the best layout."""

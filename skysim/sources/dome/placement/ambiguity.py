@@ -1,7 +1,16 @@
-"""How alike two fields of one dome can look: whether an identifier, however clever, could tell one from the other.
+"""Ambiguity of an LED layout: the fraction of LEDs that coincide when one field of view is laid over another.
 
-An attitude is identified by which LEDs are where in its field. If another attitude has LEDs at the same places, but
-for a few, then noise, a dead LED or a reflection decides between them. Pairs of equal separation do not matter.
+A tracker identifies an attitude by the pattern of LEDs in its field. If another attitude shows nearly the same
+pattern, then noise, a failed LED or a reflection decides between the two. Pairs of LEDs with equal separation are
+harmless, so the whole field is compared.
+
+For each LED that a boresight can reach, the other LEDs of its field are stored in polar image coordinates: the tangent
+of the angle from the center and the azimuth. For every pair of fields (i, j) one field is laid on the other, center on
+center. Every rotation about the center that makes a second LED coincide is tried, and the LEDs that then lie within
+the tolerance are counted. The ambiguity of field i is the maximum over j and over the rotations of
+    share = (1 + coincident LEDs) / (1 + LEDs of the fuller field),
+where the 1 is the center LED. A field is also compared with itself, rotated. A cheap upper bound (`reach`) skips most
+pairs.
 """
 
 from __future__ import annotations
@@ -19,10 +28,10 @@ Ints = NDArray[np.int64]
 
 
 class Fields(NamedTuple):
-    """What is about each of C LEDs, in polar coordinates of the image whose middle it has, nearest first.
+    """The neighbors of each of C center LEDs, in polar image coordinates about it, nearest first.
 
-    centre : (C,) the LED;  first : (C + 1,) row `n` of what is about LED centre[c] has first[c] <= n < first[c + 1]
-    radius, angle_rad : (M,) tangent of the angle from the middle, and the direction;  alike : (C,) tolerance, a tangent
+    centre : (C,) the LED;  first : (C + 1,) neighbor n belongs to centre[c] where first[c] <= n < first[c + 1]
+    radius, angle_rad : (M,) tangent of the angle from the center, and the azimuth;  alike : (C,) tolerance, a tangent
     """
 
     centre: Ints
@@ -33,10 +42,10 @@ class Fields(NamedTuple):
 
 
 class Likeness(NamedTuple):
-    """The likest other field of the field about each of C LEDs.
+    """For the field about each of C LEDs, the most similar other field.
 
-    led, other : (C,) numbers of LEDs in the middle of the field and of its likest
-    share      : (C,) LEDs that coincide, of those in the fuller of the two fields; the middle ones count
+    led, other : (C,) numbers of the LEDs at the centers of the field and of its most similar one
+    share      : (C,) fraction of LEDs that coincide, of those in the fuller of the two fields; the center LEDs count
     """
 
     led: Ints
@@ -47,15 +56,16 @@ class Likeness(NamedTuple):
 def likeness(
     place_m: Floats, height_m: float, tilt_rad: float, radius_rad: float, alike_m: float
 ) -> Likeness:
-    """For every LED the camera can point at, how much of the field about it another attitude shows as well.
+    """For every LED that the boresight can reach, the largest fraction of its field that another attitude also shows.
 
-    place_m    : (N, 3) in the lab, origin at the bearing's centre
-    height_m   : of the entrance pupil over it, along the boresight (what it is aside of that is left out)
-    tilt_rad   : no LED farther from the zenith has a field about it; radius_rad: of the field, a round one
-    alike_m    : two LEDs nearer than that after one field is laid on the other coincide
-    One LED is laid on another and the field turned about it, which for a camera on its lever is a turn about the
-    bearing: every turn is tried that brings a second LED to coincide. An LED is also laid on itself, turned.
-    Coincidence is judged as the camera sees it, so a dome that is not a sphere makes fields differ.
+    place_m    : (N, 3) in the lab, origin at the bearing's center
+    height_m   : of the entrance pupil above the bearing, along the boresight (its lateral offset is neglected)
+    tilt_rad   : fields are centered on the LEDs within this angle from the zenith;  radius_rad : of the field, round
+    alike_m    : two LEDs coincide if they are nearer than this after one field is laid on the other
+    One center LED is laid on another and the field is rotated about it. For a camera on its lever arm that is a
+    rotation about the bearing. The rotations tried are those that bring a second LED to coincide. A field is also
+    laid on itself, rotated. Coincidence is judged in the camera's perspective, so on a dome that is not a sphere the
+    fields differ.
     """
     fields = fields_about(place_m, height_m, tilt_rad, radius_rad, alike_m)
     share, other = likest(fields)
@@ -65,16 +75,17 @@ def likeness(
 def fields_about(
     place_m: Floats, height_m: float, tilt_rad: float, radius_rad: float, alike_m: float
 ) -> Fields:
-    """Every LED within the tilt brought to the boresight, and what it has about it."""
+    """The neighbors of every LED within the tilt, as seen with that LED on the boresight."""
     range_m = np.linalg.norm(place_m, axis=1)
     up = place_m / range_m[:, None]
     centre = np.flatnonzero(up[:, 2] >= math.cos(tilt_rad))
+    # Image axes: x = y_lab x boresight, which is defined because the tilt stays below 90 deg.
     across = np.cross([0.0, 1.0, 0.0], up[centre])
     across /= np.linalg.norm(across, axis=1, keepdims=True)
     x_m, y_m = across @ place_m.T, np.cross(up[centre], across) @ place_m.T
     ahead_m = up[centre] @ place_m.T - height_m
     radius = np.hypot(x_m, y_m) / np.where(ahead_m > 0, ahead_m, np.nan)
-    radius[np.arange(len(centre)), centre] = np.nan
+    radius[np.arange(len(centre)), centre] = np.nan  # the center LED is not its own neighbor
     row, led = np.nonzero(radius <= math.tan(radius_rad))
     radius, angle_rad = radius[row, led], np.arctan2(y_m[row, led], x_m[row, led])
     order = np.lexsort((radius, row))
@@ -85,13 +96,13 @@ def fields_about(
 
 @jit
 def likest(fields: Fields) -> tuple[Floats, Ints]:
-    """(C,) greatest share of each field that another one has, and which one that is."""
+    """(C,) greatest share of each field that another field has, and (C,) the index of that field."""
     count = len(fields.centre)
     share, other = np.zeros(count), np.arange(count)
     for i in range(count):
         for j in range(i, count):
             fuller = 1 + max(fields.first[i + 1] - fields.first[i], fields.first[j + 1] - fields.first[j])
-            # Only what would raise either of the two is worth a search.
+            # The exact search is needed only if the pair can raise the maximum of one of its two fields.
             enough = min(share[i], share[j]) * fuller
             alike = (1 + coincide(fields, i, j, enough - 1)) / fuller
             if alike > share[i]:
@@ -103,16 +114,18 @@ def likest(fields: Fields) -> tuple[Floats, Ints]:
 
 @jit
 def coincide(fields: Fields, i: int, j: int, enough: float) -> int:
-    """The most LEDs about i that meet ones about j at one turn; 0 if they cannot be more than `enough`."""
+    """The most neighbors of i that coincide with ones of j at any rotation; 0 if no more than `enough` can."""
     first, radius, angle, alike = fields.first, fields.radius, fields.angle_rad, fields.alike[i]
     if reach(fields, i, j) <= enough:
         return 0
     most, begin = 0, first[j]
     for k in range(first[i], first[i + 1]):
+        # Radii ascend, so the window of equal radii in field j only moves forward.
         while begin < first[j + 1] and radius[begin] < radius[k] - alike:
             begin += 1
         n = begin
         while n < first[j + 1] and radius[n] <= radius[k] + alike:
+            # The identity, which lays a field on itself unrotated, is no ambiguity.
             if i != j or n != k:
                 most = max(most, met(fields, i, j, angle[n] - angle[k]))
             n += 1
@@ -121,7 +134,7 @@ def coincide(fields: Fields, i: int, j: int, enough: float) -> int:
 
 @jit
 def reach(fields: Fields, i: int, j: int) -> int:
-    """How many LEDs about i have one about j as far from the middle: no turn makes more of them meet."""
+    """Upper bound of `met` over all rotations: neighbors of i that have a neighbor of j at an equal radius."""
     first, radius, alike = fields.first, fields.radius, fields.alike[i]
     total, n = 0, first[j]
     for k in range(first[i], first[i + 1]):
@@ -133,7 +146,7 @@ def reach(fields: Fields, i: int, j: int) -> int:
 
 @jit
 def met(fields: Fields, i: int, j: int, turn_rad: float) -> int:
-    """How many LEDs about i, turned, meet one about j."""
+    """Number of neighbors of i that coincide with a neighbor of j after field i is rotated by turn_rad."""
     first, radius, angle, alike = fields.first, fields.radius, fields.angle_rad, fields.alike[i]
     total, begin = 0, first[j]
     for k in range(first[i], first[i + 1]):

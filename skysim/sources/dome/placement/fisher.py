@@ -1,6 +1,15 @@
-"""What the LEDs in a camera's field tell of the attitude: the Fisher information of turns about the bearing.
+"""Fisher information about the attitude from the LEDs in the camera's field of view.
 
-For very many attitudes and places at once; how much of it makes a good dome is `optimise`'s to say.
+An LED at b in body axes, seen from the entrance pupil at r, has the line of sight q = b - r and the image tangents
+x = q_x / q_z and y = q_y / q_z. A small rotation w of the body about the bearing changes b by w x b, up to the sign.
+A tangent with the gradient d with respect to q, for example d = (1, 0, -x) / q_z, therefore changes by
+    d . (w x b) = w . (b x d),
+so that b x d is a row of the Jacobian J_i (2, 3) of LED i. With independent errors of equal variance sigma^2 in each
+tangent, the rotation has the covariance sigma^2 M^-1, with the information M = sum_i J_i'J_i over the LEDs in view, and
+the total variance sigma^2 tr(M^-1). `optimize` minimizes tr(M^-1), summed over attitudes with a high power.
+
+J_i'J_i is computed once per round for every pair of a site and an attitude that sees it (`look`). Moving an LED then
+only adds and subtracts terms in the sums of the attitudes concerned.
 """
 
 from __future__ import annotations
@@ -16,16 +25,17 @@ from skysim.core.types import Floats
 
 Ints = NDArray[np.int64]
 
-UNKNOWN = 1e-6  # information, rad^-2, of a turn that no LED tells: a variance of a million
-HARDNESS = 10  # the soft maximum's power of the variance: 1 is the mean, infinity the worst
-COLUMNS = 4  # to a field's reach, by which attitudes are sorted
-SHORT = 1.5  # an LED too few in a field counts as this factor of its variance
+UNKNOWN = 1e-6  # prior information, rad^-2, that keeps M invertible when too few LEDs are in view
+HARDNESS = 10  # power of the variance in the soft maximum: 1 is the mean, infinity the worst case
+COLUMNS = 4  # columns of the attitude index per half width of the search window
+SHORT = 1.5  # factor on the variance for each LED that a field has too few
 
 
 class Seen(NamedTuple):
     """Which attitudes see each of K sites: those of site k are attitude[start[k]:start[k + 1]].
 
-    told : (M, 7) by one LED there, J'J per rad^2 of a ray's tangents: xx, yy, zz, xy, xz, yz of body axes; and a 1
+    told : (M, 7) information J'J of one LED at the site for unit variance of the tangents: xx, yy, zz, xy, xz, yz in
+        body axes, rad^-2; and a 1, which counts LEDs when rows are added
     """
 
     start: Ints
@@ -35,7 +45,7 @@ class Seen(NamedTuple):
 
 @jit
 def in_field(R: Floats, point_m: Floats, camera_m: Floats, tan_half: Floats, b: Floats) -> bool:
-    """Whether the attitude R_body_from_lab has a point in its field; b becomes the point in body axes."""
+    """Whether the attitude R_body_from_lab has a point in its field of view; writes the point in body axes to b."""
     b[2] = R[2, 0] * point_m[0] + R[2, 1] * point_m[1] + R[2, 2] * point_m[2]
     ahead_m = b[2] - camera_m[2]
     b[0] = R[0, 0] * point_m[0] + R[0, 1] * point_m[1] + R[0, 2] * point_m[2]
@@ -47,7 +57,8 @@ def in_field(R: Floats, point_m: Floats, camera_m: Floats, tan_half: Floats, b: 
 
 @jit
 def tell(b: Floats, camera_m: Floats, out: Floats) -> None:
-    """(7,) J'J of one LED, and 1: q = b - r, dq = w x b, so a tangent q_x / q_z turns by w . (b x d), d its slope."""
+    """Write the information of one LED at b (body axes) to out (7,): J'J and a 1. The module docstring derives J."""
+    # gx = b x (dx, 0, x) and gy = b x (0, dy, y): the rows of J.
     ahead_m = b[2] - camera_m[2]
     dx, dy = 1 / ahead_m, 1 / ahead_m
     x, y = -(b[0] - camera_m[0]) / ahead_m**2, -(b[1] - camera_m[1]) / ahead_m**2
@@ -63,7 +74,7 @@ def tell(b: Floats, camera_m: Floats, out: Floats) -> None:
 
 @jit
 def widest(sites_m: Floats, camera_m: Floats, tan_half: Floats) -> float:
-    """Chord of unit vectors, between a boresight and what is in its field, both seen from the bearing; or more."""
+    """Upper bound of the chord between the unit vectors from the bearing to a boresight and to a site in its field."""
     aside_m = math.hypot(camera_m[0], camera_m[1])
     chord = 0.0
     for k in range(len(sites_m)):
@@ -78,13 +89,15 @@ def widest(sites_m: Floats, camera_m: Floats, tan_half: Floats) -> float:
 def look(
     sites_m: Floats, R_body_from_lab: Floats, camera_m: Floats, tan_half: Floats
 ) -> tuple[Ints, Ints, Floats]:
-    """Seen of every site: its attitudes, and what an LED there would tell them.
+    """Start, attitude and information as in `Seen`, for every site.
 
-    Attitudes are taken by columns of their boresights' x, in each in the order of y: only those near a site are asked.
+    Only attitudes whose boresight is within the chord `widest` of the site are tested. To find them, the boresights
+    are sorted into columns of lab x, and by lab y within each column.
     """
     b, wide = np.empty(3), widest(sites_m, camera_m, tan_half)
     columns = max(int(2 * COLUMNS / wide), 1)
     column = np.minimum(((R_body_from_lab[:, 2, 0] + 1) / 2 * columns).astype(np.int64), columns - 1)
+    # |y| <= 1, so the factor 4 keeps the columns apart in one sort key.
     order = np.argsort(4.0 * column + R_body_from_lab[:, 2, 1])
     R, y = R_body_from_lab[order], R_body_from_lab[order, 2, 1]
     first = np.searchsorted(column[order], np.arange(columns + 1))
@@ -103,7 +116,7 @@ def look(
             ):
                 if not in_field(R[q], sites_m[k], camera_m, tan_half, b):
                     continue
-                if m == len(attitude):
+                if m == len(attitude):  # double the buffers when they are full
                     attitude = np.concatenate((attitude, np.empty_like(attitude)))
                     information = np.concatenate((information, np.empty_like(information)))
                 tell(b, camera_m, information[m])
@@ -114,14 +127,17 @@ def look(
 
 
 def told(place_m: Floats, R_body_from_lab: Floats, camera_m: Floats, tan_half: Floats) -> Floats:
-    """(A, 7) of every attitude, what all LEDs in its field tell together; the last is how many they are."""
+    """(A, 7) information of all LEDs in the field of each attitude, as in `Seen`; the last column is their number."""
     seen = Seen(*look(place_m, R_body_from_lab, camera_m, tan_half))
     return tally(np.arange(len(place_m)), seen, len(R_body_from_lab))
 
 
 @jit
 def variance(m: Floats) -> float:
-    """tr(M^-1) of a symmetric (3, 3) matrix as (6,), by its minors: the turn's variance for rays of 1 rad^2."""
+    """tr(M^-1) of a symmetric (3, 3) matrix given as (6,): the rotation's variance for tangents of unit variance.
+
+    Principal minors over the determinant, with UNKNOWN added to the diagonal.
+    """
     a, b, c, d, e, f = m[0] + UNKNOWN, m[1] + UNKNOWN, m[2] + UNKNOWN, m[3], m[4], m[5]
     minors = (a * b - d * d) + (a * c - e * e) + (b * c - f * f)
     whole = a * (b * c - f * f) - d * (d * c - e * f) + e * (d * f - b * e)
@@ -130,7 +146,7 @@ def variance(m: Floats) -> float:
 
 @jit
 def variances(total: Floats) -> Floats:
-    """(A,) of every attitude."""
+    """(A,) `variance` of every attitude."""
     out = np.empty(len(total))
     for a in range(len(total)):
         out[a] = variance(total[a])
@@ -139,7 +155,7 @@ def variances(total: Floats) -> Floats:
 
 @jit
 def cost(m: Floats, wanted: int) -> float:
-    """One attitude's share of the soft maximum: (SHORT^missing tr(M^-1))^HARDNESS."""
+    """One attitude's term of the soft maximum: (SHORT^missing tr(M^-1))^HARDNESS, missing = max(wanted - LEDs, 0)."""
     each = variance(m)
     for _ in range(wanted - round(m[6])):
         each *= SHORT
@@ -148,7 +164,7 @@ def cost(m: Floats, wanted: int) -> float:
 
 @jit
 def costs(total: Floats, wanted: int) -> Floats:
-    """(A,) of every attitude."""
+    """(A,) `cost` of every attitude."""
     out = np.empty(len(total))
     for a in range(len(total)):
         out[a] = cost(total[a], wanted)
@@ -157,7 +173,7 @@ def costs(total: Floats, wanted: int) -> Floats:
 
 @jit
 def tally(chosen: Ints, seen: Seen, attitude_count: int) -> Floats:
-    """(A, 7) of every attitude, as `told`, from what the sites are known to tell."""
+    """(A, 7) information of every attitude, as `told`, summed from the stored terms of the chosen sites."""
     total = np.zeros((attitude_count, 7))
     for site in chosen:
         add(site, 1, seen, total)
@@ -166,7 +182,7 @@ def tally(chosen: Ints, seen: Seen, attitude_count: int) -> Floats:
 
 @jit
 def add(site: int, sign: int, seen: Seen, total: Floats) -> None:
-    """Light an LED (sign 1) or put it out (-1) in the sums of those who see it."""
+    """Add (sign 1) or remove (-1) an LED at a site in the sums of the attitudes that see it. In place."""
     for m in range(seen.start[site], seen.start[site + 1]):
         a = seen.attitude[m]
         for i in range(7):
@@ -175,7 +191,7 @@ def add(site: int, sign: int, seen: Seen, total: Floats) -> None:
 
 @jit
 def renew(site: int, seen: Seen, total: Floats, each: Floats, wanted: int) -> float:
-    """By how much the cost of those who see a site changes; `each` becomes the new one."""
+    """Recompute the cost of the attitudes that see a site, in place in `each`, and return the change of its sum."""
     change = 0.0
     for m in range(seen.start[site], seen.start[site + 1]):
         a = seen.attitude[m]

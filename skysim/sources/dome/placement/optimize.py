@@ -1,8 +1,17 @@
-"""Where to glue so many LEDs that the worst attitude is known as well as can be: LEDs exchange their places.
+"""Optimized LED placement: move LEDs between candidate sites to lower the variance of the worst attitudes.
 
-What a camera on its lever can learn of the attitude from the LEDs in its field is the Fisher information of the
-rotation-only solve; here it is written down by itself and never asked of an estimator. By the mean of the worst drawn
-attitudes no layout returned is worse than the even ones it began with; one attitude alone may be.
+What a camera on its lever arm can learn about the attitude a from the LEDs in its field is the Fisher information of
+the rotation-only solution, M_a = sum_i J_i'J_i (`fisher`). It does not depend on any estimator. The search minimizes
+    sum_a (SHORT^missing_a tr(M_a^-1))^HARDNESS,
+a smooth substitute for the worst case over all attitudes to the greatest tilt, in which missing_a is the number of
+LEDs that the field lacks of `wanted`. It is a local search: LEDs take turns, each is offered a random site nearby,
+and a move is kept if it lowers the sum and respects the least spacing. Because no finite set of attitudes contains
+the worst one, the hardest attitudes of a fresh random sample join the set between generations (`hardest`).
+
+The search starts from even layouts: Fibonacci spirals and a Poisson-disc sample of the sites, the best of them also
+contracted toward the zenith. A final stage nudges LEDs whose fields of view are too similar to another field
+(`set_apart`). Layouts are compared by the mean variance of the worst 1 % of independent attitudes (`Exam`). By this
+measure the result is never worse than the even layouts; at a single attitude it can be.
 """
 
 from __future__ import annotations
@@ -26,35 +35,36 @@ from skysim.sources.dome.surface import Inside
 
 Ints = NDArray[np.int64]
 
-SITES_AN_LED = 500  # places to choose from: a twentieth of the LEDs' own spacing apart
-EVEN = 10  # of them are enough to be spread evenly
-HALVINGS = 12  # of the sites' width, until they are
-# Steps, of the LEDs' own spacing, from the least to the greatest; and how much of the field a search believes in, for
-# none is judged at every attitude. Evenness is all where few LEDs are seen; where many are, there is more to gain.
-FEW = 8.0  # LEDs in a field, on average
+SITES_AN_LED = 500  # candidate sites per LED: their spacing is a twentieth of the LEDs' own
+EVEN = 10  # sites per LED that suffice for an even layout
+HALVINGS = 12  # bisection steps of its spacing, which starts between the least spacing and the sites' extent
+# Step sizes (least, greatest) in units of the LEDs' spacing, and the fraction of the field that the search uses. The
+# smaller field keeps a margin, because attitudes between the sampled ones lose LEDs at the edge. Where a field holds
+# few LEDs, evenness matters most and steps must be small; where it holds many, larger steps gain more.
+FEW = 8.0  # LEDs in a field, on average, below which the search is CAREFUL
 CAREFUL, BOLD = ((0.02, 0.06), 0.93), ((0.01, 0.3), 0.97)
 SEERS = 400  # attitudes that see a site: a field's border passes it in steps of a twentieth of the field
-FEWEST, MOST = 2000, 20_000  # attitudes judged
-GOLDEN = 1.2207440846057596  # g^4 = g + 1: by its powers points fill a cube evenly (Roberts 2018; assumed)
+FEWEST, MOST = 2000, 20_000  # limits of the number of attitudes in the cost
+GOLDEN = 1.2207440846057596  # g^4 = g + 1: base of the R3 low-discrepancy sequence (Roberts 2018; assumed)
 EXAMINED = 40_000  # attitudes by which layouts are compared
-TAIL = 0.01  # of them, the worst: what is asked of a dome
-DRAWN_IN = (0.98, 0.96, 0.94, 0.92, 0.9, 0.88, 0.86, 0.84)  # of the solid angle, what spreads are drawn in to
-GENERATIONS = 15  # of attitudes: after each the hardest of fresh ones join those that are judged
-KEPT = 3  # from that many generations to the next what it came to is kept
-DRAWN, HARDEST = 20_000, 600
-SHAKES, SHAKE = 6, 0.1  # the hardest are turned that often, by that much of half a field, to find harder ones
-HALF = 0.5  # of a field's LEDs may coincide with another field's
+TAIL = 0.01  # fraction of them, the worst, whose mean variance is compared
+DRAWN_IN = (0.98, 0.96, 0.94, 0.92, 0.9, 0.88, 0.86, 0.84)  # of the solid angle, for contracted layouts
+GENERATIONS = 15  # of attitudes: after each the hardest of fresh ones join the cost
+KEPT = 3  # every so many generations the layout is kept as a candidate
+DRAWN, HARDEST = 20_000, 600  # fresh attitudes, and how many of them are kept
+SHAKES, SHAKE = 6, 0.1  # random perturbations of each of the hardest attitudes, and their size in half fields
+HALF = 0.5  # fraction of a field's LEDs that may coincide with another field's
 NUDGES = 100  # tries to make a field differ
-BESIDE = 60  # nearest sites, to which it is tried: a fifth of the LEDs' own spacing
-ABOUT = 4  # LEDs in the middle of a field, one of which is nudged
-SLACK = 0.02  # by which the worst variance may rise for it
-BLIND = 0.95  # of the field, where no more attitudes than before may hold fewer than two LEDs for it
+BESIDE = 60  # nearest sites that a nudged LED may take: a fifth of the LEDs' own spacing
+ABOUT = 4  # LEDs nearest to the center of a field, one of which is nudged
+SLACK = 0.02  # relative rise of the worst variance that the nudges may cost
+BLIND = 0.95  # part of the field in which nudges must not leave more attitudes with fewer than two LEDs
 
 
 class Exam(NamedTuple):
-    """What layouts are compared by: (A, 3, 3) attitudes that no search looks at, and what is to be beaten in them.
+    """Comparison of layouts on (A, 3, 3) attitudes that no search uses.
 
-    limit : the least worst variance that layouts to begin with have
+    limit : mean variance of the worst TAIL of attitudes, for the best of the even layouts
     """
 
     part: leds.OptimisedConfig
@@ -62,31 +72,33 @@ class Exam(NamedTuple):
     limit: float
 
     def mark(self, place_m: Floats) -> float:
-        """Mean variance of the worst TAIL of attitudes over the limit: 1 or less is as good as any to begin with.
+        """Mean variance of the worst TAIL of attitudes over the limit: 1 or less is as good as any even layout.
 
-        The very worst one is a matter of a hair's breadth, by which an LED leaves the field, and of luck to find.
+        The single worst attitude is unstable: it depends on one LED at the field's edge and on the sampling.
         """
         each = np.sort(variances(told(place_m, self.R_body_from_lab, *camera(self.part))))
         return float(each[-math.ceil(TAIL * len(each)) :].mean()) / self.limit
 
     def blind(self, place_m: Floats) -> int:
-        """How many of them have fewer than the two LEDs that an attitude takes in the BLIND part of their field."""
+        """Number of attitudes with fewer than two LEDs in the BLIND part of the field; two fix an attitude."""
         return int(np.sum(told(place_m, self.R_body_from_lab, *camera(self.part, BLIND))[:, 6] < 2))
 
 
 def places(
     part: leds.OptimisedConfig, sites_m: Floats, begin_m: Sequence[Floats], rng: np.random.Generator
 ) -> Floats:
-    """(N, 3) of the sites, m, where part.count LEDs make the worst attitude within the tilt as good as possible.
+    """(N, 3) sites, m, at which part.count LEDs make the worst attitudes within the tilt as good as possible.
 
-    sites_m : (K, 3) allowed places in the lab, on the surface within its rim and cap; SITES_AN_LED times the count do
-    begin_m : (N, 3) each, layouts to begin with, beside one of the sites that is as even as chance makes it
-    The best of them, drawn in from the rim as far as the worst attitudes gain by it, begins a descent of sum_a
-    c_a^HARDNESS, c_a = SHORT^missing tr((sum_i J_i'J_i)^-1), over attitudes a to the tilt, with what LED i tells of a
-    turn in J_i: one LED after another is offered a site beside it. Steps are small, for evenness once lost is not
-    found again; they are enough to make one field unlike the others. Of what it came to the best by `worth` is kept,
-    so none of the layouts to begin with is better in the worst attitudes. Then `set_apart`, where that is of worth.
-    Raises InputError where so many do not find room at the spacing.
+    sites_m : (K, 3) allowed places in the lab, on the surface within its rim and cap; K = SITES_AN_LED times the
+        count
+    begin_m : (N, 3) each, layouts to start from; a Poisson-disc sample of the sites, as even as possible, is added
+    1. The best even layout by `Exam.mark` sets the limit. It is also contracted toward the zenith by DRAWN_IN.
+    2. From the best of these `searched` descends sum_a c_a^HARDNESS, c_a = SHORT^missing tr((sum_i J_i'J_i)^-1),
+       over attitudes a to the tilt. The Jacobian J_i of LED i is with respect to a rotation about the bearing. Steps
+       are small, because evenness once lost is not regained, but they suffice to make one field differ from others.
+    3. The best by `worth` of all layouts reached is kept, so no even layout is better in the worst attitudes.
+    4. `set_apart` reduces the ambiguity between fields; its result is kept if `worth` prefers it.
+    Raises InputError if not all LEDs find room at the spacing.
     """
     beginnings = [one for one in begin_m if roomy(one, part.spacing_m)]
     chosen = evenly(sites_m[: EVEN * part.count], part.spacing_m, part.count)
@@ -112,8 +124,11 @@ def places(
 
 
 def worth(exam: Exam, place_m: Floats, rng: np.random.Generator) -> tuple[bool, bool, float]:
-    """Less is better: whether a layout to begin with is better in the worst attitudes; whether an attitude was found
-    that has fewer than two LEDs; then worst variances times 1 to 2, as none or all fields are more than HALF another's.
+    """Sort key of layouts, less is better.
+
+    In this order: whether an even layout is better in the worst attitudes; whether an attitude was found that sees
+    fewer than two LEDs; the worst variances, times 1 + the share of fields of which more than HALF coincides with
+    another field.
     """
     mark, like = exam.mark(place_m), alike(exam.part, place_m)
     whole = Search(exam.part, place_m, cKDTree(place_m), CAREFUL[0], 1.0)
@@ -122,14 +137,15 @@ def worth(exam: Exam, place_m: Floats, rng: np.random.Generator) -> tuple[bool, 
 
 
 def roomy(place_m: Floats, spacing_m: float) -> bool:
-    """Whether no two are nearer to each other than the spacing."""
+    """Whether no two LEDs are nearer to each other than the spacing."""
     return bool(cKDTree(place_m).query(place_m, k=2)[0][:, 1].min() >= spacing_m)
 
 
 def drawn_in(place_m: Floats, sites_m: Floats, share: float) -> Floats:
-    """(N, 3) of the sites, nearest to places drawn in on that share of their solid angle about the zenith.
+    """(N, 3) sites nearest to a layout that is contracted to this share of its solid angle about the zenith.
 
-    Few attitudes look at the rim, and all of them gain by LEDs that are moved from there to where the others are.
+    Few attitudes see the rim, so its LEDs help more where more fields overlap. With z = cos(zenith angle) the
+    contraction is 1 - z' = share (1 - z), which scales every solid angle alike.
     """
     up = place_m / np.linalg.norm(place_m, axis=1, keepdims=True)
     z = 1 - share * (1 - up[:, 2])
@@ -139,7 +155,7 @@ def drawn_in(place_m: Floats, sites_m: Floats, share: float) -> Floats:
 
 
 class Search(NamedTuple):
-    """In what manner places are sought: among (K, 3) sites, m, and a tree of them; steps and edge as in CAREFUL."""
+    """Settings of the local search: (K, 3) candidate sites, m, a k-d tree of them, and steps and edge as in CAREFUL."""
 
     part: leds.OptimisedConfig
     sites_m: Floats
@@ -148,26 +164,32 @@ class Search(NamedTuple):
     edge: float
 
     def offers(self, place_m: Floats, rng: np.random.Generator) -> Floats:
-        """(N, 3) of the sites, one an LED, a step beside it; the steps' logarithms are even."""
+        """(N, 3) one site per LED, a random step away; step lengths are log-uniform between the limits in `steps`."""
         usual_m = np.median(cKDTree(place_m).query(place_m, k=2)[0][:, 1])
         least, most = np.log(self.steps)
         step_m = usual_m * np.exp(rng.uniform(least, most, (len(place_m), 1)))
         return self.sites_m[self.tree.query(place_m + step_m * rng.standard_normal(place_m.shape))[1]]
 
     def camera(self) -> tuple[Floats, Floats]:
-        """As `camera`, of the field that is believed in."""
+        """As `camera`, with the part of the field that the search uses."""
         return camera(self.part, self.edge)
 
 
 def searched(search: Search, place_m: Floats, judged: int, rng: np.random.Generator) -> list[Floats]:
-    """(N, 3) of the sites each, what the generations came to from these places; judged: attitudes at first."""
+    """Layouts, (N, 3) sites each, that the descent from place_m reaches: one every KEPT generations, and the last.
+
+    judged : number of attitudes in the first generation's cost
+    """
     part, found, R_body_from_lab = search.part, [], attitudes(search.part, judged, rng)
     ends = np.linspace(0, part.rounds, GENERATIONS + 1).round().astype(int)[1:-1]
     for n in range(part.rounds):
         if n in ends[KEPT - 1 :: KEPT]:
             found.append(place_m)
+        # The descent improves the sampled attitudes at the expense of those between them. Adding the worst of a fresh
+        # sample closes these gaps.
         if n in ends:
             R_body_from_lab = np.concatenate([R_body_from_lab, hardest(search, place_m, rng)])
+        # Sites 0 to count - 1 are the present places, site count + n is the offer to LED n.
         both_m = np.concatenate([place_m, search.offers(place_m, rng)])
         seen = Seen(*look(both_m, R_body_from_lab, *search.camera()))
         chosen, who = np.arange(part.count), rng.permutation(part.count)
@@ -179,14 +201,15 @@ def searched(search: Search, place_m: Floats, judged: int, rng: np.random.Genera
 
 
 def seen_share(part: leds.OptimisedConfig, sites_m: Floats, rng: np.random.Generator) -> float:
-    """Of the sites, how many a few attitudes see on average: times the LEDs, how many a field holds."""
+    """Mean fraction of the sites that an attitude sees; times the number of LEDs it is the mean number in a field."""
     return float(told(sites_m, attitudes(part, 200, rng), *camera(part))[:, 6].mean()) / len(sites_m)
 
 
 def hardest(search: Search, place_m: Floats, rng: np.random.Generator) -> Floats:
-    """(H, 3, 3) R_body_from_lab: of fresh attitudes those that these LEDs serve worst, or still worse ones beside.
+    """(H, 3, 3) R_body_from_lab with the highest cost for these LEDs: the worst of a fresh sample, then perturbed.
 
-    About the boresight they are turned by more, since what is in the field's corner moves less.
+    Each perturbation is kept if the cost rises. Rotations about the boresight are larger, because they move an LED
+    less than rotations across it do: by the tangent of its field angle, at most that of the field's corner.
     """
     drawn = attitudes(search.part, DRAWN, rng)
     each = served(search, place_m, drawn)
@@ -204,12 +227,13 @@ def hardest(search: Search, place_m: Floats, rng: np.random.Generator) -> Floats
 
 
 def served(search: Search, place_m: Floats, R_body_from_lab: Floats) -> Floats:
-    """(A,) how badly, by the search's cost."""
+    """(A,) cost of every attitude in the search's field."""
     return costs(told(place_m, R_body_from_lab, *search.camera()), search.part.wanted)
 
 
 def attitudes(part: leds.OptimisedConfig, count: int, rng: np.random.Generator) -> Floats:
-    """(A, 3, 3) R_body_from_lab of boresights evenly over the cap of the tilt, of any yaw: a shifted lattice's."""
+    """(A, 3, 3) R_body_from_lab: boresights uniform over the cap of the tilt, yaw uniform; a shifted R3 lattice."""
+    # R3 sequence: the multiples of 1/g, 1/g^2 and 1/g^3 modulo 1 fill the unit cube evenly.
     turn = (rng.random(3) + np.arange(count)[:, None] / GOLDEN ** np.arange(1, 4)) % 1
     tilt = np.arccos(1 - turn[:, 0] * (1 - math.cos(math.radians(part.tilt_deg))))
     angles = np.column_stack([2 * math.pi * turn[:, 1], tilt, 2 * math.pi * turn[:, 2]])
@@ -217,7 +241,7 @@ def attitudes(part: leds.OptimisedConfig, count: int, rng: np.random.Generator) 
 
 
 def camera(part: leds.OptimisedConfig, edge: float = 1.0) -> tuple[Floats, Floats]:
-    """Where its pupil is on the body, m, and the tangents of half its field, or of that part of it."""
+    """(3,) entrance pupil on the body, m, and (2,) tangents of half the field, scaled by `edge`."""
     return np.array(part.camera_m), edge * tan_half(part)
 
 
@@ -227,9 +251,10 @@ def tan_half(part: leds.OptimisedConfig) -> Floats:
 
 
 def reach_rad(part: leds.OptimisedConfig, inside: Inside) -> float:
-    """How far from the zenith, as the bearing sees it, any attitude's field comes on a surface; at most the cap.
+    """Greatest angle from the zenith, at the bearing, that the field of any attitude reaches; at most the cap.
 
-    From every side of the greatest tilt, at every yaw, the rays of the field's diagonal turned about the boresight.
+    Rays around the cone that encloses the field are intersected with the surface, for boresights at the greatest tilt
+    in all azimuths and at every yaw.
     """
     half_diagonal, around = np.hypot(*tan_half(part)), np.linspace(0, 2 * np.pi, 24, endpoint=False)
     rim = np.column_stack([half_diagonal * np.cos(around), half_diagonal * np.sin(around), np.ones(24)])
@@ -244,7 +269,7 @@ def reach_rad(part: leds.OptimisedConfig, inside: Inside) -> float:
 
 @jit
 def room_at(site: int, without: int, chosen: Ints, sites_m: Floats, spacing_m: float) -> bool:
-    """Whether a site is as far as the spacing from every LED but that one."""
+    """Whether a site keeps the spacing to every LED except `without`."""
     for n in range(len(chosen)):
         away2 = 0.0
         for i in range(3):
@@ -265,18 +290,20 @@ def exchange(
     who: Ints,
     where: Ints,
 ) -> None:
-    """One offer a LED: who[n] moves to where[n] if there is room and the cost falls. In place."""
+    """One offer per LED: who[n] moves to where[n] if there is room and the cost falls. Changes `chosen` in place."""
     total = tally(chosen, seen, attitude_count)
     each = costs(total, wanted)
     for n in range(len(who)):
         old, new = chosen[who[n]], where[n]
         if old == new or not room_at(new, who[n], chosen, sites_m, spacing_m):
             continue
+        # Only attitudes that see the old or the new site change. The cost is a sum over attitudes, so the changes at
+        # the two sites add up: the second call finds attitudes that see both already up to date.
         add(old, -1, seen, total)
         add(new, 1, seen, total)
         if renew(old, seen, total, each, wanted) + renew(new, seen, total, each, wanted) < 0:
             chosen[who[n]] = new
-        else:
+        else:  # undo the move
             add(new, -1, seen, total)
             add(old, 1, seen, total)
             renew(old, seen, total, each, wanted)
@@ -284,7 +311,10 @@ def exchange(
 
 
 def evenly(sites_m: Floats, spacing_m: float, count: int, halvings: int = HALVINGS) -> Ints:
-    """The sites, in their order, that are as far apart as finds `count` of them room; or fewer at the spacing."""
+    """Indices of `count` sites at the widest spacing at which `apart` finds that many, by bisection.
+
+    Fewer than `count` if even spacing_m does not leave room for them.
+    """
     chosen = apart(sites_m, spacing_m, count)
     near_m, far_m = spacing_m, float(np.ptp(sites_m, axis=0).max())
     for _ in range(halvings):
@@ -298,7 +328,10 @@ def evenly(sites_m: Floats, spacing_m: float, count: int, halvings: int = HALVIN
 
 
 def apart(sites_m: Floats, spacing_m: float, count: int | None = None) -> Ints:
-    """The first `count` of the sites, or all, taken in their order, that have none taken before within the spacing."""
+    """Indices of sites taken in order, each if none taken before is within the spacing, to `count`.
+
+    This is random sequential adsorption where the sites are in random order.
+    """
     tree, free = cKDTree(sites_m), np.ones(len(sites_m), dtype=bool)
     taken: list[int] = []
     for site in range(len(sites_m)):
@@ -308,20 +341,21 @@ def apart(sites_m: Floats, spacing_m: float, count: int | None = None) -> Ints:
     return np.array(taken, dtype=np.int64)
 
 
-# Fields that are told apart.
+# Reduce the ambiguity between fields of view.
 
 
 def alike(part: leds.OptimisedConfig, place_m: Floats) -> Likeness:
-    """How much of the field about each LED another attitude shows as well; a round field of the camera's own area."""
+    """Ambiguity of the layout (`likeness`), for a round field of the same area as the camera's."""
     radius_rad = math.atan(math.sqrt(4 * float(np.prod(tan_half(part))) / math.pi))
     return likeness(place_m, part.camera_m[2], math.radians(part.tilt_deg), radius_rad, part.alike_m)
 
 
 def set_apart(exam: Exam, place_m: Floats, sites_m: Floats, rng: np.random.Generator) -> Floats:
-    """The places after LEDs of fields too much alike were nudged to free sites beside, where that makes less of it.
+    """The layout after LEDs in ambiguous fields are moved to free sites nearby, where that reduces `excess`.
 
-    Too much is more than HALF of a field. The worst variances may rise by SLACK in all, not beyond what layouts to
-    begin with have. What NUDGES tries do not part stays: of three LEDs in a field two have their like almost anywhere.
+    A field is ambiguous if more than HALF of its LEDs coincide with another field's. The worst variances may rise by
+    SLACK in total, but not beyond those of the best even layout. Ambiguity that remains after NUDGES tries is
+    accepted: with three LEDs in a field, two of them have a similar pair almost anywhere.
     """
     part, tree = exam.part, cKDTree(sites_m)
     like, mark, blind = alike(part, place_m), exam.mark(place_m), exam.blind(place_m)
@@ -336,6 +370,7 @@ def set_apart(exam: Exam, place_m: Floats, sites_m: Floats, rng: np.random.Gener
         tried_m[who] = sites_m[rng.choice(tree.query(place_m[who], k=min(BESIDE, len(sites_m)))[1])]
         if np.delete(np.linalg.norm(place_m - tried_m[who], axis=1), who).min() < part.spacing_m:
             continue
+        # The nudge must reduce the ambiguity and must not leave more attitudes with fewer than two LEDs.
         nudged = alike(part, tried_m)
         if excess(nudged) >= excess(like) or exam.blind(tried_m) > blind:
             continue
@@ -345,5 +380,5 @@ def set_apart(exam: Exam, place_m: Floats, sites_m: Floats, rng: np.random.Gener
 
 
 def excess(like: Likeness) -> float:
-    """By how much fields are more alike than HALF, all together."""
+    """Sum over the fields of the ambiguity in excess of HALF."""
     return float(np.maximum(like.share - HALF, 0).sum())
