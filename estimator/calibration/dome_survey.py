@@ -18,10 +18,10 @@ The focal length is observable (yaw closes at 360 degrees). The principal point 
 from a rotation of the camera only by the square of the field angle.
 
 Three more moves are nearly free if the field of view is narrow: conformal maps of the sphere of directions.
-tan(t/2) <- k tan(t/2) for every angle t from an axis stretches each field equally in both directions, and a small change
-of the lights' distances hides the stretch; only its gradient across one field remains. The scale of tilts is then wrong
-by about 0.1 percent, whatever the number of lights. The start map constrains these moves if it is used as a measurement
-(leds_sigma_m): each of its positions is inaccurate, but there are many.
+tan(t/2) <- k tan(t/2) for every angle t from an axis stretches each field equally in both directions, and a small
+change of the lights' distances hides the stretch; only its gradient across one field remains. The scale of tilts is
+then wrong by about 0.1 percent, whatever the number of lights. The start map constrains these moves if it is used as a
+measurement (leds_sigma_m): each of its positions is inaccurate, but there are many.
 """
 
 from __future__ import annotations
@@ -120,7 +120,7 @@ def survey(
     reference_frame: int | None = None,
     leds_sigma_m: float = np.inf,
 ) -> Survey:
-    """Survey the dome: least squares over all lights and attitudes, the lever and the lens. See the module for the gauge.
+    """Survey the dome: least squares over all lights and attitudes, the lever and the lens.
 
     known_length    : rows of two lights and the distance between them in m; fixes the scale
     fit_distortion  : also fit k1, k2, p1, p2; k3 has no visible effect in a narrow field
@@ -213,9 +213,9 @@ def _start(frames: Sequence[DomeFrame], leds: LedMap, lever: Lever, camera: Came
 def _without_strangers(whole: Bundle, seen: Sightings, width: float) -> tuple[Bundle, np.ndarray]:
     """Improve the start values and reject wrong identifications.
 
-    First only the attitudes are fitted. For a finite width, gross outliers are rejected, the whole bundle is fitted with
-    Cauchy's loss, whose width shrinks with the noise until it settles, and residuals beyond GATE are rejected. Returns
-    the bundle and the (M,) mask of sightings kept.
+    First only the attitudes are fitted. For a finite width, gross outliers are rejected, the whole bundle is fitted
+    with Cauchy's loss, whose width shrinks with the noise until it settles, and residuals beyond GATE are rejected.
+    Returns the bundle and the (M,) mask of sightings kept.
     """
     keep = np.ones(len(seen.led), dtype=bool)
     part = _tied(whole, seen, keep)
@@ -244,9 +244,10 @@ def _inside(bundle: Bundle, seen: Sightings, gate: float) -> np.ndarray:
 
 
 def _tied(whole: Bundle, seen: Sightings, keep: np.ndarray) -> Part:
-    """The subset that the sightings determine: lights in two or more frames with crossing rays, frames with two such lights.
+    """The subset that the sightings determine.
 
-    Raises ValueError if too few sightings remain, or if they form groups of frames that are not connected.
+    It holds lights seen in two or more frames with crossing rays, and frames that see two or more such lights. Raises
+    ValueError if too few sightings remain, or if they form groups of frames that are not connected.
     """
     ahead = np.isfinite(ba.residuals(whole, seen)).all(axis=1)
     index = np.flatnonzero(keep & ahead)

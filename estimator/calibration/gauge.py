@@ -1,6 +1,6 @@
 """Gauge freedoms of the dome survey (rotation of the lab frame, scale) and the constraints that fix them.
 
-The pixels do not change if the lab frame rotates or if all lengths are scaled; see estimator/calibration/dome_survey.py.
+No pixel changes if the lab frame rotates or if all lengths are scaled; see estimator/calibration/dome_survey.py.
 The rotation is fixed by the start map (least squares) or by the attitude of one reference frame, and the scale by one
 known length or by the start map. `Gauge.onto` transforms a solution to the gauge; `Gauge.held` linearizes the four
 constraints for the covariance.
