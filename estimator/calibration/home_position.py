@@ -1,9 +1,9 @@
 """AFIT's laboratory calibration: an LED catalog measured from the home position, and its repeatability.
 
-Padro 2012, sections 3.6.3 and 3.6.4: the vehicle is held at several positions (stops). In every frame the directions of
-the lights are transformed from the camera to the bearing (his eqs 43-44) and from there to the lab frame with the IMU's
-angles. The repeatability of a light's position gives epsilon_position; that of the angles between lights (eq. 45), which
-need no IMU, gives epsilon_separation; that of the brightness gives epsilon_magnitude.
+Padro 2012, sections 3.6.3 and 3.6.4: the vehicle is held at several positions (stops). In every frame the directions
+of the lights are transformed from the camera to the bearing (his eqs 43-44) and from there to the lab frame with the
+IMU's angles. The repeatability of a light's position gives epsilon_position; that of the angles between lights
+(eq. 45), which need no IMU, gives epsilon_separation; that of the brightness gives epsilon_magnitude.
 """
 
 from __future__ import annotations

@@ -306,7 +306,7 @@ def _normal(problem: _Problem, seen: Sightings, weight: Floats) -> _Normal:
     np.add.at(turn, seen.frame, by_turn.transpose(0, 2, 1) @ heavy_turn)
     np.add.at(coupling, seen.frame, by_turn.transpose(0, 2, 1) @ heavy_lens)
     np.add.at(pull, seen.frame, np.einsum("mai,ma->mi", heavy_turn, terms.residual))
-    turn[np.bincount(seen.frame, minlength=frames) == 0] = np.eye(3)  # keeps unused frames regular, with zero step
+    turn[np.bincount(seen.frame, minlength=frames) == 0] = np.eye(3)  # an unused frame gets a zero step
     lens = np.einsum("mai,maj->ij", heavy_lens, by_lens) + np.diag(problem.sigma**-2)
     from_belief = (problem.believed - problem.bundle.lens) / problem.sigma**2
     return _Normal(
