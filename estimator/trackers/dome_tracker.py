@@ -42,8 +42,8 @@ def led_pairs(camera: Camera, leds: LedMap, lever: Lever, settings: Settings) ->
 def as_stars(name: str, camera: Camera, leds: LedMap, lever: Lever, settings: Settings) -> Identify:
     """A star identifier applied to directions from the bearing, where the rays meet one sphere of the median radius.
 
-    On a dome that is not a sphere this changes the angles; the tolerance therefore has a stretch, from the spread of the
-    radii and the lever.
+    On a dome that is not a sphere this changes the angles; the tolerance therefore has a stretch, from the spread of
+    the radii and the lever.
     """
     radius = np.linalg.norm(leds.position_m, axis=1)
     usual_m, pupil_m = float(np.median(radius)), lever.cam_from_body.apply(lever.camera_body_m)
@@ -182,8 +182,8 @@ class DomeTracker:
         """Reject matches with outlying residuals; returns the rest and a factor for their covariance.
 
         Two LEDs whose images touch form one blob at neither's position. Residual lengths are divided by their sigmas;
-        those above 5 times the median (at least 5 sigma) are rejected. The rest has 2 K - 3 degrees of freedom; if its
-        reduced chi-square exceeds 1 by more than 3 standard deviations, it is the factor, else the factor is 1.
+        those above 5 times the median (above 5 if the median is below 1) are rejected. The rest has 2 K - 3 degrees of
+        freedom; if its reduced chi-square exceeds 1 by more than 3 standard deviations, it is the factor, else 1.
         """
         residual = self._residual_px(centroids, observed, star, body_from_lab)
         length = np.linalg.norm(residual, axis=1) / (sigma_rad[observed] * self.camera.focal_px)

@@ -1,9 +1,9 @@
 """Star tracker for the real sky: from a frame to an attitude, lost in space. `dome_tracker` does the same for a dome.
 
 Stages: detect and centroid (`pipeline`), identify, solve. The default identifier (`identification/stars/search.py`)
-computes identity, attitude and covariance in one step by Bayesian evidence. With a published identifier (`registry`) its
-candidates are matched to the full catalog, refined, and accepted if the match is significant. If the focal length is
-uncertain, it and the first radial distortion coefficient are fitted to each frame's stars.
+computes identity, attitude and covariance in one step by Bayesian evidence. The candidates of a published identifier
+(`registry`) are matched to the full catalog, refined, and accepted if the match is significant. If the focal length
+is uncertain, it and the first radial distortion coefficient are fitted to each frame's stars.
 """
 
 from __future__ import annotations
@@ -305,8 +305,8 @@ class StarTracker:
         observed, star = mutual(centroids.xy_px, xy, radius_px, rows)
         if len(star) < MIN_MATCHES:
             return observed, star
-        # The zero point from each match is about the same for all stars; saturation loses flux and makes it smaller. One
-        # far above the median is a planet, a lamp or a reflection near a faint star.
+        # The zero point from each match is about the same for all stars; saturation loses flux and makes it smaller.
+        # One far above the median is a planet, a lamp or a reflection near a faint star.
         zero_mag = self.stars.v_mag[star] + 2.5 * np.log10(centroids.flux[observed])
         off = zero_mag - np.median(zero_mag)
         own = off < max(TOO_BRIGHT_MAG, 4 * float(np.median(np.abs(off))))

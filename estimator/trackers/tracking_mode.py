@@ -27,8 +27,8 @@ from estimator.identification.stars.search import ACCEPT_DEX
 from estimator.trackers.pipeline import Clock, Report, doubted, see
 from estimator.trackers.star_tracker import StarTracker
 
-WINDOW_SIGMA = 4.0  # detection threshold in windows: lower than for a frame, because fewer pixels are searched
-LONGEST_STREAK_PX = 4.0  # longer streaks are detected with a matched filter in the whole frame
+WINDOW_SIGMA = 4.0  # detection threshold in windows: lower than in a frame, as fewer pixels are searched
+LONGEST_STREAK_PX = 4.0  # longer streaks are detected with the streak filter in the whole frame
 ROUGH = 3.0  # reduced chi-square above which a solution is flagged
 
 
@@ -140,10 +140,10 @@ class TrackingMode:
         sigma_px = tracker.sigma_px(centroids)
         lights = tracker.lights(centroids, sigma_px)
         reach_rad = self.reach_px / tracker.camera.focal_px
-        gates = np.full(len(centroids), 1.5 * reach_rad)  # covers the window's corner, at sqrt(2) times reach_rad
+        gates = np.full(len(centroids), 1.5 * reach_rad)  # covers a window's corner
         guess = evidence.weigh(lights, tracker.sky, predicted.as_matrix(), 1.0, gates, -np.inf)
-        # The prior volume of attitudes is not 8 pi^2 but that within the windows: boresight within a square of
-        # 2 reach_rad, roll within the angle that moves a star at the field's edge by 2 reach_rad.
+        # The prior volume of attitudes is not 8 pi^2 but that of the prediction: the boresight in a square of side
+        # 2 reach_rad, the roll in an interval of 2 reach_rad over the half field.
         half = float(np.min(tracker.field[1::2] - tracker.field[::2])) / 2
         spared = log10(8 * pi**2 / ((2 * reach_rad) ** 2 * min(2 * reach_rad / half, 2 * pi)))
         if guess.dex + spared < ACCEPT_DEX:
