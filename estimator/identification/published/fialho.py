@@ -38,7 +38,7 @@ from estimator.identification.options import Options
 
 GATE_SIGMAS = 3.0  # of a magnitude: three stars pass with 0.9973^3 = 99.2 %, the paper's 99.12 +- 0.25 %
 LEAST_ANGLE = 0.1  # of the field's diagonal, between the stars of a triangle; the paper gives no value
-SHARE_BASIC, SHARE_FALSE_STARS = 0.5, 0.3  # fraction of observed stars that must match: basic, with false stars
+SHARE_BASIC, SHARE_FALSE_STARS = 0.5, 0.3  # fraction of stars that must match: basic, with false stars
 
 
 @dataclass(frozen=True, slots=True)
@@ -182,7 +182,7 @@ def _found(vectors_cam: Floats, index: PairIndex, asked: Options, by: Rules) -> 
 
 @jit
 def search(seen: Floats, light: Floats, index: PairIndex, by: Rules) -> Found:
-    """Compiled search over observed triangles: the brightest first, then others in an order that changes all stars soon.
+    """Compiled search over observed triangles: the brightest first, then others, with all stars changing soon.
 
     seen, light : (N, 3) unit vectors, brightest first, and their (N,) magnitudes, NaN if unknown
     Returns the rows of the observed stars and of the catalog, R_cam_from_ref, and log10 of the expected number of
@@ -284,7 +284,7 @@ def _by_neighbours(
     by: Rules,
     tried: NDArray,
 ) -> Found:
-    """The optimized assembly: the first list is a range of the sorted catalog, the others are neighbors of its stars."""
+    """The optimized assembly: the first list is a range of the sorted catalog, the others its stars' neighbors."""
     handed = triple(seen[corners[0]], seen[corners[1]], seen[corners[2]])
     second = np.empty(len(index.vectors), np.int64)
     begin, end = alike(index, light[corners[0]], by.gate_mag)

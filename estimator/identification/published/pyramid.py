@@ -1,8 +1,8 @@
 """Pyramid star identification (Mortari, Samaan & Junkins 2001), verified by the direct match of the whole field.
 
-A triangle of observed stars is compared with catalog triangles through the k-vector index. A fourth star whose angles to
-all three corners fit makes a pyramid; the direct match then tests its attitude on all stars. With an uncertain focal
-length each triangle also estimates it, from the ratio of its perimeters.
+A triangle of observed stars is compared with catalog triangles through the k-vector index. A fourth star whose angles
+to all three corners fit makes a pyramid; the direct match then tests its attitude on all stars. With an uncertain
+focal length each triangle also estimates it, from the ratio of the catalog's to the observed perimeter.
 """
 
 from __future__ import annotations

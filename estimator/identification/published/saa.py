@@ -89,7 +89,7 @@ class Pool:
         self.tried: list[tuple[Ints, Floats, Ints]] = []
         self.count, self.cost, self.star = 0, np.inf, np.full(len(sky.seen), -1, np.int32)
         self.p, self.missed = 1.0, 0.0
-        self._doubts = np.zeros(3)  # of assumptions that contradict the best: count, sum of matches, least cost
+        self._doubts = np.zeros(3)  # assumptions that contradict the best: count, sum of matches, least cost
 
     def add(self, primary: Primary, assumed: tuple[Ints, Floats, Ints]) -> None:
         """Add the assumptions of one more pair, and update the best one and those that contradict it."""
@@ -134,7 +134,7 @@ class Pool:
 
 
 def _fill(pool: Pool, index: PairIndex | PairCatalogue, asked: Options) -> None:
-    """Add the assumptions of pair after pair, until the pool's best is significant and has beaten CHALLENGES more pairs.
+    """Add the assumptions of pair after pair, until the pool's best is significant and has beaten CHALLENGES more.
 
     One pair is not enough: if noise moves A or B out of a gate, the truth is not among its assumptions.
     """
