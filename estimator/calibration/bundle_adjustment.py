@@ -205,6 +205,7 @@ def normal(bundle: Bundle, seen: Sightings, weight: Floats) -> Normal:
     by_turn = _spread(terms.by_turn * root, seen.frame, 3 * frames)
     shared = (terms.by_shared * root).reshape(2 * count, -1)
     residual = (terms.residual * root[:, 0]).ravel()
+    # The lights' own normal matrix is block diagonal, so that only its blocks are accumulated.
     blocks = np.zeros((lights, 3, 3))
     np.add.at(blocks, seen.led, np.einsum("mai,maj->mij", terms.by_led, terms.by_led) * root**2)
     by_rest = _beside(by_turn, shared)
@@ -327,7 +328,7 @@ def adjust(
                 raise
             damping *= 10
             continue
-        slope = terms.pull_led @ led + terms.pull_rest @ rest
+        slope = terms.pull_led @ led + terms.pull_rest @ rest  # g' times the step: the Newton decrement
         trial = bundle.moved(led, rest)
         new_cost, new_weight = trial.cost(seen, width)
         # Near the minimum the costs differ only by rounding, so that a step is accepted within that.
@@ -378,6 +379,7 @@ def covariance(
     led_free, rest_free = freedoms(bundle)
     part = reduce(terms, _unresisted(bundle), 0.0)
     size = len(part.scale)
+    # Inverse of the Schur complement: covariance Q of the rest before the transformation to the gauge.
     rest = cho_solve(part.factor, np.eye(size)) * part.scale * part.scale[:, None]
     lights = len(bundle.position_m)
     spread = part.spread.toarray()
@@ -389,6 +391,7 @@ def covariance(
     k_led, k_rest = led_fixed @ back, rest_fixed @ back
     spare = back.T @ (fixed_led.T @ led_fixed + fixed_rest.T @ rest_fixed) @ back
 
+    # Covariance of the lights by block inversion: A^-1 + S Q S', S = A^-1 C' the spread.
     by_led = np.einsum(
         "nik,njk->nij", (spread @ rest).reshape(lights, 3, size), spread.reshape(lights, 3, size)
     )

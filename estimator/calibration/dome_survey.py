@@ -225,6 +225,7 @@ def _without_strangers(whole: Bundle, seen: Sightings, width: float) -> tuple[Bu
         return whole, keep
     keep[part.index] = _inside(found, part.seen, GROSS_GATE)
     part = _tied(whole, seen, keep)
+    # Graduated robust fit: each round shrinks the width with the residuals, until it shrinks by less than 10 %.
     found, before = part.bundle, np.inf
     while (now := width * _noise(found, part.seen)) < 0.9 * before:
         found, before = ba.adjust(found, part.seen, now, decrement=0.1)[0], now

@@ -86,6 +86,8 @@ class Gauge:
         else:
             turn = self.R_body_from_lab[self.frame].T @ found.R_body_from_lab[self._frame(part)]
         if self.length is None:
+            # The scale for which the survey's projection on the start map equals the start map's own sum of squares:
+            # the linear constraint that `held` uses.
             grown = np.sum(start**2) / np.sum(start * (place @ turn.T))
         else:
             i, j = self._pair(part)

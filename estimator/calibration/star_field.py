@@ -171,6 +171,7 @@ def self_calibrated(
     for _ in range(rounds):
         named = _named(frames, tracker(belief_in, focal_uncertainty), exposure_s)
         stars = np.concatenate([np.empty((0, 3)), *(frame.vectors_ref for frame in named)])
+        # Each round identifies with the calibrated camera, but calibrates from the start camera, which is the prior.
         if np.array_equal(stars, stars_before) or len(stars) < MOST_LOST * most:
             break
         best, most, stars_before = calibrate(named, camera), max(most, len(stars)), stars

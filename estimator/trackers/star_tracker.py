@@ -249,6 +249,7 @@ class StarTracker:
         """
         fits = self.focal_uncertainty > 0
         reach_px = np.hypot(camera.width_px, camera.height_px) / 2
+        # With an uncertain lens the first radii allow for its error at the corner; each fit permits a smaller radius.
         radii_px = [0.008 * reach_px + 2, 0.004 * reach_px + 2, 4, 3, 2.5, 2.5] if fits else [3, 2.5, 2.5]
         for radius_px in radii_px:
             observed, star = self._nearest(centroids, camera, cam_from_ref, radius_px)

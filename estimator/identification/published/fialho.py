@@ -6,9 +6,9 @@ from a list of candidates for each; then the rest are matched at the attitude th
 "greater than a minimum threshold (e.g, half the number of observed stars)"; else the search goes on. The paper names
 four improvements since alg_ide_mf1_1 of 2003 and says what mf1_2 has; mf1_3 is inferred to lie between 2 and 4:
 
-    mf1_1  the basic algorithm: every list from the whole catalogue
-    mf1_2  lists "assembled in an optimized way", and a hint of where the optical axis points
-    mf1_3  another triangle of observed stars where the first fails: false stars are withstood
+    mf1_1  the basic algorithm: every list from the whole catalog
+    mf1_2  lists "assembled in an optimized way", and a prior direction of the optical axis
+    mf1_3  another triangle of observed stars if the first fails: false stars are tolerated
     mf1_4  also returns mean and variance of the identified stars' magnitude errors
 
 The paper does not say what "optimized" means. Here the first list is a range of the catalog, which is sorted by
@@ -285,6 +285,8 @@ def _by_neighbours(
     tried: NDArray,
 ) -> Found:
     """The optimized assembly: the first list is a range of the sorted catalog, the others its stars' neighbors."""
+    # For each candidate a of the first star: collect candidates b of the second at the angle of side 0, then test each
+    # candidate c of the third at the angle of side 1 against all of them.
     handed = triple(seen[corners[0]], seen[corners[1]], seen[corners[2]])
     second = np.empty(len(index.vectors), np.int64)
     begin, end = alike(index, light[corners[0]], by.gate_mag)

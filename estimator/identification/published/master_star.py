@@ -72,6 +72,7 @@ def search(seen: Floats, light: Floats, index: PairIndex, by: Rules) -> Found:
         if len(repeated) == 0 or repeated.max() < MIN_MATCHES - 1:
             continue
         best, rival = nothing(), np.zeros(1)
+        # One angle less than the best is allowed: a false candidate can have an additional angle by chance.
         for candidate in np.flatnonzero(repeated >= repeated.max() - 1) + begin:
             best = _proved(seen, index, master, candidate, by, tried, best, rival)
             if tried[1] >= by.checks:

@@ -97,6 +97,7 @@ def _triangle(seen: Floats, index: PairIndex, corners: NDArray, rules: Rules, tr
     # If the three sides agree on one focal length, only the lens distortion remains of the stretch.
     tight = rules.stretch / 3 if rules.zooms else rules.stretch
     handed = triple(seen[i], seen[j], seen[k])
+    # Catalog pairs (a, b) for side ij, in both orders; then neighbors c of a for side ik; then side jk is tested.
     begin, end = between(index, ij - t_ij, ij + t_ij)
     for p in range(begin, end):
         if tried[2] >= rules.checks:
@@ -118,6 +119,7 @@ def _triangle(seen: Floats, index: PairIndex, corners: NDArray, rules: Rules, tr
                     continue
                 if handed * triple(index.vectors[a], index.vectors[b], index.vectors[c]) <= 0:
                     continue
+                # One zoom for all three sides: here the assumed over the true focal length.
                 zoom = (side + near + far) / (ij + ik + jk) if rules.zooms else 1.0
                 slip = max(
                     abs(side - zoom * ij) - tight * ij,

@@ -102,6 +102,7 @@ class Pool:
         if cost[best] < self.cost:
             self.cost, self.star = float(cost[best]), star[best]
             self.p, self.missed = _by_chance(self.sky, primary, star[best], self.field_tan)
+            # A new best: all earlier assumptions are compared with it again.
             self._doubts = np.array([0.0, 0.0, np.inf])
             for one in self.tried:
                 contradicting(*one, self.star, self._doubts)
@@ -150,6 +151,7 @@ def _fill(pool: Pool, index: PairIndex | PairCatalogue, asked: Options) -> None:
         left -= 1
         primary = primary_of(sky, a, b)
         pool.add(primary, matched(sky, primary, index.pair[begin:end]))
+        # Once the best is significant, only CHALLENGES more pairs are tried.
         if left >= CHALLENGES and pool.log10_chance <= ACCEPT_LOG10_CHANCE:
             left = CHALLENGES
 
@@ -159,7 +161,7 @@ def _primary_pairs(sky: Sky, base_stars: int, high_rad: float) -> Iterator[tuple
     base, gates = min(base_stars, len(sky.seen)), sky.gates
     apart = np.linalg.norm(sky.seen[:base, None] - sky.seen[:base], axis=2)
     angles = 2 * np.arcsin(np.minimum(apart / 2, 1.0))
-    for both in range(1, 2 * base - 2):
+    for both in range(1, 2 * base - 2):  # sum of the two rows: the brightest pairs have the least
         for a in range(max(both - base + 1, 0), (both + 1) // 2):
             angle = float(angles[a, both - a])
             if 4 * 3 * gates.separation_rad < angle <= high_rad + gate_rad(gates, angle):

@@ -207,6 +207,7 @@ def _partners(
                 continue
             cost += (slip_a**2 + slip_b**2) / sky.gates.separation_rad**2
             dx, dy, dz = sky.vectors[s, 0] - x, sky.vectors[s, 1] - y, sky.vectors[s, 2] - z
+            # The position decides between several partners, but is not part of the assumption's cost.
             place = (dx * dx + dy * dy + dz * dz) / primary.sigma_rad[k] ** 2
             if cost + place < least:
                 least, partner[k], spent[k] = cost + place, s, cost

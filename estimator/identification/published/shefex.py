@@ -110,6 +110,7 @@ def _triangle(seen: Floats, index: PairIndex, corners: NDArray, by: Rules, tried
     near_low, near_high = gate(ik, by.cos_error)
     far_low, far_high = gate(jk, by.cos_error)
     rings = _rings(seen, corners, by)
+    # Catalog pairs (a, b) for side ij, in both orders; then neighbors c of a for side ik; then side jk is tested.
     begin, end = between(index, low, high)
     for p in range(begin, end):
         if tried[1] >= by.checks:
@@ -183,6 +184,7 @@ def _rest(
     observed, star, count = observed[kept], star[kept], kept.sum()
     if count < MIN_MATCHES:
         return nothing()
+    # Probability that a random direction falls into the gates of an observed star, from the local catalog density.
     cap_sr = 2 * np.pi * (1 - np.cos(index.max_angle_rad))
     density = (index.first[stars[0] + 1] - index.first[stars[0]] + 1) / cap_sr
     p = 1 - np.exp(-density * rings[:, 9].sum() / (len(seen) - 3))

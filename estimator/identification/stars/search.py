@@ -281,10 +281,11 @@ def _gates(lights: Lights, a: int, b: int) -> Floats:
 
 @jit
 def _wanted(lights: Lights, a: int, b: int) -> int:
-    """Least number of matches that can reach ACCEPT_DEX, from an upper bound of `_evidence`.
+    """Least number of matches that can reach ACCEPT_DEX, from an estimate of the greatest `_evidence`.
 
-    The bound has no residuals, no missing stars, and the attitude uncertainty of the pair alone: sqrt(2) sigma /
-    separation about the boresight (and of the zoom), sigma / sqrt(2) across it.
+    The estimate has no residuals, no missing stars, and the attitude uncertainty of the pair alone: sqrt(2) sigma /
+    separation about the boresight (and of the zoom), sigma / sqrt(2) across it. It takes the least sigma of all
+    detections, isotropic errors, a constant density of detections and no magnitudes.
     """
     total, sigma = len(lights.sigma), lights.sigma.min()
     each = -log10(2 * pi * sigma**2 * total / area(lights))
