@@ -1,11 +1,18 @@
-"""Bundle adjustment of lights seen by a camera that turns about a fixed centre: model, derivatives, least squares.
+"""Bundle adjustment for a camera that rotates about a fixed center: model, derivatives, least squares, covariance.
 
 The pixel of light i in frame k is p = c + f d(q_x / q_z, q_y / q_z), q = C (A_k x_i - r): light x_i and lever r from
-the bearing's centre, A_k = body_from_lab, C = cam_from_body, d Brown-Conrady's distortion. Lights meet one another
-only through frames, so each light's 3 x 3 block is eliminated and a dense system of frames, lever and lens remains
-(Triggs et al. 2000, Bundle adjustment: a modern synthesis, section 6). Measured on AFIT's dome (892 lights,
-600 frames): 14 exact steps come to rest; scipy's least_squares with the same sparse Jacobian and lsmr for the steps had
-brought the cost after 12 evaluations from 5.4e8 to 4.1e8 only, of 1.1e4: its steps are inexact.
+the bearing center, A_k = body_from_lab, C = cam_from_body, d the Brown-Conrady distortion. The unknowns are the
+positions x_i, small rotations of the A_k, the lever r and the lens; C is fixed.
+
+Each step solves the damped normal equations (Levenberg-Marquardt). Lights are coupled to one another only through
+frames, so each light's 3 x 3 block is eliminated by the Schur complement, and a dense system of frames, lever and lens
+remains (Triggs et al. 2000, Bundle adjustment: a modern synthesis, section 6). Wrong identifications are
+down-weighted with Cauchy's loss. Moves that change no pixel (`freedoms`) are held by a penalty, and the covariance is
+transformed to the requested gauge afterwards (Baarda's S-transformation).
+
+Measured on AFIT's dome (892 lights, 600 frames): 14 such steps converge to a cost of 1.1e4. scipy's least_squares
+with the same sparse Jacobian and lsmr, whose steps are inexact, had only reduced the cost from 5.4e8 to 4.1e8 after
+12 evaluations.
 """
 
 from __future__ import annotations
@@ -20,14 +27,15 @@ from scipy.spatial.transform import Rotation
 
 from estimator.core.arrays import Floats, Ints
 
-# Newton's decrement g'N^-1 g is the squared step in standard deviations: far below what 1e-9 of a length needs.
+# Newton decrement g'N^-1 g at convergence: the squared step in standard deviations. Small enough for a relative
+# accuracy of 1e-9 in lengths.
 DECREMENT = 1e-12
 STEPS = 100
 
 
 @dataclass(frozen=True, slots=True)
 class Sightings:
-    """Every light in every frame: frame, led (M,) rows; xy_px (M, 2); sigma_px (M,) of each coordinate."""
+    """Observations of all frames: rows of frame and led (M,); xy_px (M, 2); sigma_px (M,) of each coordinate."""
 
     frame: Ints
     led: Ints
@@ -35,21 +43,21 @@ class Sightings:
     sigma_px: Floats
 
     def take(self, which: np.ndarray) -> Sightings:
-        """The chosen sightings, by mask or index."""
+        """The selected sightings, by mask or index."""
         return Sightings(self.frame[which], self.led[which], self.xy_px[which], self.sigma_px[which])
 
 
 @dataclass(frozen=True, slots=True)
 class Bundle:
-    """All that the pixels depend on.
+    """Parameters of the model: everything that the pixels depend on, and the prior map.
 
-    position_m       : (N, 3) lights in the lab
+    position_m       : (N, 3) lights in the lab frame
     R_body_from_lab  : (F, 3, 3)
     camera_body_m    : (3,) entrance pupil in the body frame
-    R_cam_from_body  : (3, 3), held: a turn of it is a turn of every body_from_lab and of the lever
-    lens             : (8,) focal_px, centre x and y in px, k1, k2, p1, p2, k3
-    free_lens        : how many of `lens`, from the front, are unknowns
-    map_m, map_sigma_m : (N, 3) where the lights were believed, and how well, each axis; inf is not at all
+    R_cam_from_body  : (3, 3), fixed: its rotation is equivalent to one of every body_from_lab and of the lever
+    lens             : (8,) focal_px, center x and y in px, k1, k2, p1, p2, k3
+    free_lens        : the first free_lens elements of `lens` are unknowns
+    map_m, map_sigma_m : (N, 3) prior positions of the lights, and their standard deviation per axis; inf for no prior
     """
 
     position_m: Floats
@@ -62,12 +70,16 @@ class Bundle:
     map_sigma_m: float = np.inf
 
     def cost(self, seen: Sightings, width: float) -> tuple[float, Floats]:
-        """Loss of pixels and of the believed map together, and the (M,) weights of the sightings."""
+        """Total loss of the pixels and the prior map, and the (M,) robust weights of the sightings."""
         loss, weight = cauchy(np.sum(residuals(self, seen) ** 2, axis=1), width)
         return loss + float(np.sum(((self.map_m - self.position_m) / self.map_sigma_m) ** 2)), weight
 
     def moved(self, led: Floats, rest: Floats) -> Bundle:
-        """The bundle after a step: (3 N,) metres, then 3 F small body-axis turns, 3 of the lever, the free lens."""
+        """The bundle after a step.
+
+        led  : (3 N,) changes of the positions, m
+        rest : 3 F small rotations in body axes (rad), 3 changes of the lever (m), changes of the free lens elements
+        """
         turns = 3 * len(self.R_body_from_lab)
         lens = self.lens.copy()
         lens[: self.free_lens] += rest[turns + 3 :]
@@ -82,7 +94,11 @@ class Bundle:
 
 
 class Rows(NamedTuple):
-    """Residuals over sigma (M, 2), and the pixel over sigma's derivative (M, 2, n) by light, turn, lever and lens."""
+    """Weighted residuals and Jacobian: both divided by sigma_px.
+
+    residual : (M, 2);  by_led, by_turn : (M, 2, 3) derivatives of the pixel with respect to position and rotation
+    by_shared : (M, 2, 3 + free_lens) with respect to the lever and the free lens elements
+    """
 
     residual: Floats
     by_led: Floats
@@ -91,7 +107,7 @@ class Rows(NamedTuple):
 
 
 def residuals(bundle: Bundle, seen: Sightings) -> Floats:
-    """(M, 2) measured minus predicted pixel, over its sigma; infinite for a light behind the camera."""
+    """(M, 2) measured minus predicted pixel, divided by sigma_px; inf for a light behind the camera."""
     q = _in_camera(bundle, seen)[1]
     ahead = q[:, 2] > 0
     tangent = q[:, :2] / np.where(ahead, q[:, 2], 1.0)[:, None]
@@ -100,7 +116,7 @@ def residuals(bundle: Bundle, seen: Sightings) -> Floats:
 
 
 def rows(bundle: Bundle, seen: Sightings) -> Rows:
-    """Residuals and their exact derivatives; every light must be ahead of the camera."""
+    """Residuals and analytic derivatives; every light must be in front of the camera."""
     b, q = _in_camera(bundle, seen)
     tangent = q[:, :2] / q[:, 2:]
     focal, coefficients = bundle.lens[0], bundle.lens[3:]
@@ -123,7 +139,7 @@ def rows(bundle: Bundle, seen: Sightings) -> Rows:
 
 
 def _in_camera(bundle: Bundle, seen: Sightings) -> tuple[Floats, Floats]:
-    """(M, 3) lights from the bearing's centre in body axes, and from the camera in its own."""
+    """(M, 3) lights from the bearing center in body axes, and (M, 3) from the camera's pupil in camera axes."""
     b = np.einsum("mij,mj->mi", bundle.R_body_from_lab[seen.frame], bundle.position_m[seen.led])
     return b, (b - bundle.camera_body_m) @ bundle.R_cam_from_body.T
 
@@ -138,12 +154,12 @@ def _distorted(tangent: Floats, coefficients: Floats) -> Floats:
 
 
 def _by_tangent(tangent: Floats, coefficients: Floats) -> Floats:
-    """(M, 2, 2) derivative of the distorted tangent by the true one; it is symmetric."""
+    """(M, 2, 2) derivative of the distorted tangent with respect to the undistorted one; it is symmetric."""
     k1, k2, p1, p2, k3 = coefficients
     x, y = tangent.T
     r2 = x * x + y * y
     radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    slope = 2 * (k1 + r2 * (2 * k2 + 3 * r2 * k3))  # of the radial factor by x, over x
+    slope = 2 * (k1 + r2 * (2 * k2 + 3 * r2 * k3))  # derivative of the radial factor by x, divided by x
     by = np.empty((len(x), 2, 2))
     by[:, 0, 0] = radial + slope * x * x + 2 * p1 * y + 6 * p2 * x
     by[:, 0, 1] = by[:, 1, 0] = slope * x * y + 2 * p1 * x + 2 * p2 * y
@@ -152,7 +168,7 @@ def _by_tangent(tangent: Floats, coefficients: Floats) -> Floats:
 
 
 def _by_coefficients(tangent: Floats) -> Floats:
-    """(M, 2, 5) derivative of the distorted tangent by k1, k2, p1, p2, k3."""
+    """(M, 2, 5) derivative of the distorted tangent with respect to k1, k2, p1, p2, k3."""
     x, y = tangent.T
     r2 = x * x + y * y
     return np.stack(
@@ -168,7 +184,10 @@ def _by_coefficients(tangent: Floats) -> Floats:
 
 
 class Normal(NamedTuple):
-    """The normal equations: by_led (N, 3, 3) blocks, coupling (R, 3 N) sparse, rest (R, R), and both right sides."""
+    """The normal equations, with lights and the R other unknowns (rotations, lever, lens) in separate blocks.
+
+    by_led : (N, 3, 3);  coupling : (R, 3 N) sparse;  rest : (R, R);  pull_led, pull_rest : right-hand sides
+    """
 
     by_led: Floats
     coupling: csr_array
@@ -178,7 +197,7 @@ class Normal(NamedTuple):
 
 
 def normal(bundle: Bundle, seen: Sightings, weight: Floats) -> Normal:
-    """J'WJ and J'W residual, W one weight a sighting."""
+    """The normal equations J'WJ and J'W residual, with one weight per sighting and the prior map added."""
     terms = rows(bundle, seen)
     root = np.sqrt(weight)[:, None, None]
     count, frames, lights = len(weight), len(bundle.R_body_from_lab), len(bundle.position_m)
@@ -186,6 +205,7 @@ def normal(bundle: Bundle, seen: Sightings, weight: Floats) -> Normal:
     by_turn = _spread(terms.by_turn * root, seen.frame, 3 * frames)
     shared = (terms.by_shared * root).reshape(2 * count, -1)
     residual = (terms.residual * root[:, 0]).ravel()
+    # The lights' own normal matrix is block diagonal, so that only its blocks are accumulated.
     blocks = np.zeros((lights, 3, 3))
     np.add.at(blocks, seen.led, np.einsum("mai,maj->mij", terms.by_led, terms.by_led) * root**2)
     by_rest = _beside(by_turn, shared)
@@ -201,13 +221,13 @@ def normal(bundle: Bundle, seen: Sightings, weight: Floats) -> Normal:
 
 
 def _spread(blocks: Floats, column: Ints, width: int) -> csr_array:
-    """(M, 2, 3) blocks, each in its own two rows, at columns 3 * column."""
+    """Sparse (2 M, width) matrix of (M, 2, 3) blocks: block m is in rows 2 m, columns 3 * column[m]."""
     start = np.arange(len(blocks) + 1)
     return csr_array(bsr_array((blocks, column, start), shape=(2 * len(blocks), width)))
 
 
 def _beside(left: csr_array, right: Floats) -> csr_array:
-    """The two matrices side by side."""
+    """The sparse matrix `left` and the dense matrix `right` side by side; rows of `left` have equal lengths."""
     width = right.shape[1]
     columns = np.tile(np.arange(width), len(right)) + left.shape[1]
     per_row = np.diff(left.indptr)[0]
@@ -218,9 +238,10 @@ def _beside(left: csr_array, right: Floats) -> csr_array:
 
 
 def freedoms(bundle: Bundle) -> tuple[Floats, Floats]:
-    """(3 N, 4) and (R, 4): the moves that change no pixel: three turns of the lab, and the size of everything.
+    """Gauge freedoms: the four moves that change no pixel, three rotations of the lab frame and the scale.
 
-    Lab turn e: x <- e x x, and A <- A exp(-e) = exp(-A e) A. Size: x and r grow alike. A believed map resists them.
+    Returns their (3 N, 4) parts in the positions and (R, 4) in the other unknowns. A rotation by e of the lab changes x
+    by e x x, and A to A exp(-e) = exp(-A e) A. A change of scale multiplies x and r alike. A prior map fixes all four.
     """
     lights, frames = len(bundle.position_m), len(bundle.R_body_from_lab)
     led = np.zeros((lights, 3, 4))
@@ -234,13 +255,17 @@ def freedoms(bundle: Bundle) -> tuple[Floats, Floats]:
 
 
 def _unresisted(bundle: Bundle) -> Floats:
-    """The freedoms of the rest, or (R, 0) where a believed map resists them."""
+    """(R, 4) part of the gauge freedoms in the rest of the unknowns, or (R, 0) if a prior map fixes them."""
     rest = freedoms(bundle)[1]
     return rest if np.isinf(bundle.map_sigma_m) else rest[:, :0]
 
 
 class Reduced(NamedTuple):
-    """Lights eliminated: inverse light blocks, spread = their product with the coupling, the rest's factor."""
+    """The reduced system after elimination of the lights.
+
+    inverse_led : inverse blocks of the lights;  spread : (3 N, R) their product with the transposed coupling
+    factor      : Cholesky factor of the scaled (R, R) Schur complement;  scale : (R,) its scaling to a unit diagonal
+    """
 
     inverse_led: bsr_array
     spread: csr_array
@@ -249,10 +274,11 @@ class Reduced(NamedTuple):
 
 
 def reduce(terms: Normal, still: Floats, damping: float) -> Reduced:
-    """Schur complement over the lights, with Marquardt's damping, unit diagonal and the free moves held.
+    """Eliminate the lights (Schur complement), with Marquardt's damping and the gauge freedoms held.
 
-    `still` (R, 4 or 0) are the freedoms that nothing resists: added as a penalty they make the matrix regular and
-    change no other move. Raises LinAlgError where lever or lens is left unknown besides.
+    still : (R, 4 or 0) gauge freedoms without a constraint. Their outer product is added as a penalty, which makes the
+        matrix regular and changes no other move
+    Raises LinAlgError if the lever or the lens is undetermined as well.
     """
     swell = 1 + damping
     blocks = terms.by_led * np.where(np.eye(3, dtype=bool), swell, 1.0)
@@ -261,6 +287,7 @@ def reduce(terms: Normal, still: Floats, damping: float) -> Reduced:
     spread = csr_array(inverse @ terms.coupling.T)
     matrix = terms.rest - (terms.coupling @ spread).toarray()
     matrix[np.diag_indices_from(matrix)] += damping * terms.rest.diagonal()
+    # Scaling to a unit diagonal: the unknowns have different units (rad, m, px).
     scale = 1 / np.sqrt(terms.rest.diagonal())
     held, _ = np.linalg.qr(still / scale[:, None])
     matrix = matrix * scale * scale[:, None] + held @ held.T
@@ -268,14 +295,14 @@ def reduce(terms: Normal, still: Floats, damping: float) -> Reduced:
 
 
 def step(terms: Normal, part: Reduced) -> tuple[Floats, Floats]:
-    """The move of lights and of the rest."""
+    """Solve the reduced system and back-substitute: (3 N,) step of the positions and (R,) of the rest."""
     pull = terms.pull_rest - part.spread.T @ terms.pull_led
     rest = part.scale * cho_solve(part.factor, part.scale * pull)
     return part.inverse_led @ terms.pull_led - part.spread @ rest, rest
 
 
 def cauchy(squared: Floats, width: float) -> tuple[float, Floats]:
-    """Cost and (M,) weights of w^2 log(1 + s / w^2); an infinite width is plain least squares."""
+    """Cauchy's loss w^2 log(1 + s / w^2), summed, and its (M,) weights; an infinite width gives least squares."""
     if np.isinf(width):
         return float(squared.sum()), np.ones_like(squared)
     return float(width**2 * np.log1p(squared / width**2).sum()), 1 / (1 + squared / width**2)
@@ -284,9 +311,11 @@ def cauchy(squared: Floats, width: float) -> tuple[float, Floats]:
 def adjust(
     bundle: Bundle, seen: Sightings, width: float, decrement: float = DECREMENT
 ) -> tuple[Bundle, bool]:
-    """Least squares over everything by Levenberg-Marquardt, and whether it came to rest.
+    """Minimize the loss over all unknowns by Levenberg-Marquardt; returns the bundle and whether it converged.
 
-    width: of Cauchy's loss in sigmas; inf for plain least squares. Raises LinAlgError where an unknown is free.
+    width     : of Cauchy's loss in sigmas; inf for least squares
+    decrement : Newton decrement at which the iteration ends
+    Raises LinAlgError if an unknown is undetermined.
     """
     damping = 1e-4
     cost, weight = bundle.cost(seen, width)
@@ -299,10 +328,10 @@ def adjust(
                 raise
             damping *= 10
             continue
-        slope = terms.pull_led @ led + terms.pull_rest @ rest
+        slope = terms.pull_led @ led + terms.pull_rest @ rest  # g' times the step: the Newton decrement
         trial = bundle.moved(led, rest)
         new_cost, new_weight = trial.cost(seen, width)
-        # Near rest the costs differ by their rounding only.
+        # Near the minimum the costs differ only by rounding, so that a step is accepted within that.
         if new_cost <= cost * (1 + 1e-13) + 1e-20:
             bundle, cost, damping = trial, new_cost, max(damping / 10, 1e-12)
             if slope < decrement:
@@ -316,7 +345,10 @@ def adjust(
 
 
 def turn_frames(bundle: Bundle, seen: Sightings, rounds: int) -> Bundle:
-    """Every frame's attitude alone, with Cauchy's weights about the median residual: a start for the whole."""
+    """Starting values: Gauss-Newton on each frame's attitude alone, with all other unknowns fixed.
+
+    Uses Cauchy's weights with the median residual as width, for `rounds` iterations.
+    """
     turns = 3 * len(bundle.R_body_from_lab)
     still = np.zeros(3 * len(bundle.position_m))
     rest = np.zeros(turns + 3 + bundle.free_lens)
@@ -337,19 +369,21 @@ def turn_frames(bundle: Bundle, seen: Sightings, rounds: int) -> Bundle:
 def covariance(
     terms: Normal, bundle: Bundle, fixed_led: Floats, fixed_rest: Floats
 ) -> tuple[Floats, Floats, Floats]:
-    """Covariances (N, 3, 3) of lights, (F, 3, 3) of turns, and of lever and free lens, in the gauge that is asked.
+    """Covariances in a given gauge: (N, 3, 3) of positions, (F, 3, 3) of rotations, and of lever and free lens.
 
-    fixed_led (3 N, 4), fixed_rest (R, 4): the four linear functions H'd that the gauge holds at zero. With Z the
-    freedoms, any generalised inverse Q of the normal matrix becomes T Q T', T = I - Z (H'Z)^-1 H' (Baarda's
-    S-transformation). Raises LinAlgError where an unknown is left free.
+    fixed_led, fixed_rest : (3 N, 4), (R, 4) the matrix H of the four linear gauge constraints H'd = 0
+    With Z the gauge freedoms, any generalized inverse Q of the normal matrix becomes T Q T', T = I - Z (H'Z)^-1 H'
+    (Baarda's S-transformation). Only the diagonal blocks are computed. Raises LinAlgError if an unknown is
+    undetermined.
     """
     led_free, rest_free = freedoms(bundle)
     part = reduce(terms, _unresisted(bundle), 0.0)
     size = len(part.scale)
+    # Inverse of the Schur complement: covariance Q of the rest before the transformation to the gauge.
     rest = cho_solve(part.factor, np.eye(size)) * part.scale * part.scale[:, None]
     lights = len(bundle.position_m)
     spread = part.spread.toarray()
-    # Covariance of the gauge's four functions with everything: Q H.
+    # Q H: covariance of all unknowns with the four gauge constraints.
     through = fixed_rest - part.spread.T @ fixed_led
     rest_fixed = rest @ through
     led_fixed = part.inverse_led @ fixed_led - part.spread @ rest_fixed
@@ -357,6 +391,7 @@ def covariance(
     k_led, k_rest = led_fixed @ back, rest_fixed @ back
     spare = back.T @ (fixed_led.T @ led_fixed + fixed_rest.T @ rest_fixed) @ back
 
+    # Covariance of the lights by block inversion: A^-1 + S Q S', S = A^-1 C' the spread.
     by_led = np.einsum(
         "nik,njk->nij", (spread @ rest).reshape(lights, 3, size), spread.reshape(lights, 3, size)
     )
@@ -371,6 +406,6 @@ def covariance(
 
 
 def _transformed(with_gauge: Floats, free: Floats, spare: Floats) -> Floats:
-    """What the S-transformation adds to diagonal blocks: -K Z' - Z K' + Z P Z'."""
+    """The terms that the S-transformation adds to the diagonal blocks: -K Z' - Z K' + Z P Z'."""
     cross = with_gauge @ free.transpose(0, 2, 1)
     return free @ spare @ free.transpose(0, 2, 1) - cross - cross.transpose(0, 2, 1)

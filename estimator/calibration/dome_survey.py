@@ -1,23 +1,27 @@
-"""The self-survey of an LED dome: frames at many attitudes give the lights' places, the lever, the lens, the attitudes.
+"""Self-calibration of an LED dome: LED positions, lever, lens and attitudes from frames at many attitudes.
 
-What pixels can never tell, and what settles it here:
+The method is bundle adjustment (`bundle_adjustment`) from an approximate map and approximate attitudes, after removal
+of wrong identifications and of lights and frames that the observations do not determine.
 
-* a turn of the lab (3): every light turned by G, every body_from_lab by G^-1. Held by the start map (the survey is
-  turned onto it in the least-squares sense), or by the attitude of one reference frame.
-* a turn of the body against the camera (3): body_from_lab <- B body_from_lab, lever <- B lever, cam_from_body <-
-  cam_from_body B^-1. cam_from_body is therefore held where it started: the vehicle's axes mean nothing to the camera.
-  Attitudes from outside, an IMU's, define both: `gauge.common_turns` finds B and G between two sets of attitudes.
-* size (1): lights and lever grow alike. A known lens does not help, because a camera that turns about the bearing
-  sees directions only; one known length between two lights sets it, or else the mean size of the start map. The
-  attitude does not depend on it.
+Gauge freedoms, which no pixel can determine, and the constraints that fix them here:
 
-The focal length *is* seen (yaw closes at 360 degrees), and so is the principal point, weakly: next to a turn of the
-camera it differs by the square of the field's angle only.
+* rotation of the lab frame (3): every light rotates by G, every body_from_lab by G^-1. Fixed by the start map (the
+  survey is rotated onto it in the least-squares sense), or by the attitude of one reference frame.
+* rotation of the body frame against the camera (3): body_from_lab <- B body_from_lab, lever <- B lever,
+  cam_from_body <- cam_from_body B^-1. cam_from_body is therefore fixed at its start value. External attitudes, such as
+  an IMU's, define both frames: `gauge.common_turns` computes B and G between two sets of attitudes.
+* scale (1): lights and lever scale together. A known lens does not help, because a camera that rotates about the
+  bearing measures only directions. One known distance between two lights fixes it, or else the mean size of the start
+  map. The attitude does not depend on it.
 
-Three more moves are all but free under a dome seen through a narrow field: conformal maps of the sphere of directions.
-tan(t/2) <- k tan(t/2) of every angle t from an axis stretches each field alike both ways, and lights a little nearer
-or further hide the stretch; only its change across one field is left. Tilts then have a wrong scale by some 0.1 per
-cent, whatever the number of lights. The start map, poor light by light but rich in lights, settles it: leds_sigma_m.
+The focal length is observable (yaw closes at 360 degrees). The principal point is observable weakly: its effect differs
+from a rotation of the camera only by the square of the field angle.
+
+Three more moves are nearly free if the field of view is narrow: conformal maps of the sphere of directions.
+tan(t/2) <- k tan(t/2) for every angle t from an axis stretches each field equally in both directions, and a small
+change of the lights' distances hides the stretch; only its gradient across one field remains. The scale of tilts is
+then wrong by about 0.1 percent, whatever the number of lights. The start map constrains these moves if it is used as a
+measurement (leds_sigma_m): each of its positions is inaccurate, but there are many.
 """
 
 from __future__ import annotations
@@ -40,18 +44,18 @@ from estimator.core.camera import Camera
 # Cauchy's width for 95 % efficiency under Gaussian noise (Holland & Welsch 1977), in sigmas.
 CAUCHY = 2.385
 LOSSES: dict[str, float] = {"linear": np.inf, "cauchy": CAUCHY}
-GATE = 5.0
-GROSS_GATE = 6.0
-CROSSING_RAD = 0.005
-MEDIAN_RADIUS = np.sqrt(2 * np.log(2))  # of a two-dimensional unit Gaussian
+GATE = 5.0  # residuals above this many robust sigmas are outliers in the final fit
+GROSS_GATE = 6.0  # the same for the first rejection, after only the attitudes are fitted
+CROSSING_RAD = 0.005  # least rms angle between the rays to one light; below, its distance is undetermined
+MEDIAN_RADIUS = np.sqrt(2 * np.log(2))  # median distance of a two-dimensional unit Gaussian from its mean
 
 
 @dataclass(frozen=True, slots=True)
 class DomeFrame:
-    """One frame of a survey: lights found and named.
+    """One frame of a survey: identified LEDs and their centroids.
 
     led      : (K,) rows of the LED map;  xy_px : (K, 2);  sigma_px : (K,) of each coordinate
-    body_from_lab : where to start from, good to some degrees: an IMU's, or nearfield.rotation_only's with the old map
+    body_from_lab : start value, accurate to a few degrees: from an IMU, or nearfield.rotation_only with the old map
     """
 
     led: Ints
@@ -62,19 +66,19 @@ class DomeFrame:
 
 @dataclass(frozen=True, slots=True)
 class Survey:
-    """What the frames tell of dome and camera, and how well; covariances are relative to the gauge, without its error.
+    """Result of a dome survey. The covariances are relative to the gauge and do not include its error.
 
-    status         : "converged", or "stopped ..." where the numbers are not at rest
-    leds           : the map with its surveyed places; lights that are not `surveyed` stand where they started
-    surveyed       : (N,) lights seen in two tied frames or more, from places apart
-    lever, camera  : cam_from_body as it started
-    body_from_lab  : (F,) attitudes; of a frame that is not `tied`, the start
-    tied           : (F,) frames that see two surveyed lights or more
-    outliers       : (K, 2) frame, and row in it, of the sightings left out as wrongly named
-    led_covariance_m2 (N, 3, 3), attitude_covariance_rad2 (F, 3, 3) in body axes: NaN where not surveyed or tied
-    lever_covariance_m2 (3, 3), lens_covariance: of what was fitted of focal_px, centre x and y, k1, k2, p1, p2
+    status         : "converged", or "stopped ..." if the iteration did not converge
+    leds           : the map with surveyed positions; lights that are not `surveyed` keep their start positions
+    surveyed       : (N,) lights seen in two or more tied frames, from different directions
+    lever, camera  : fitted; cam_from_body is the start value
+    body_from_lab  : (F,) attitudes; the start value for a frame that is not `tied`
+    tied           : (F,) frames that see two or more surveyed lights
+    outliers       : (K, 2) frame, and row in it, of the sightings rejected as wrong identifications
+    led_covariance_m2 (N, 3, 3), attitude_covariance_rad2 (F, 3, 3) in body axes: NaN if not surveyed or tied
+    lever_covariance_m2 (3, 3), lens_covariance: of the fitted elements of focal_px, center x and y, k1, k2, p1, p2
     rms_px         : of the residual coordinates
-    misfit         : sqrt(chi-square / degrees of freedom), 1 where sigma_px is honest
+    misfit         : sqrt(chi-square / degrees of freedom), near 1 if sigma_px is correct
     """
 
     status: str
@@ -94,12 +98,12 @@ class Survey:
 
     @property
     def focal_sigma_px(self) -> float:
-        """Standard deviation of the focal length."""
+        """Standard deviation of the focal length, px."""
         return float(np.sqrt(self.lens_covariance[0, 0]))
 
     @property
     def surveyed_leds(self) -> LedMap:
-        """The map of surveyed lights alone."""
+        """The map of the surveyed lights only."""
         board = None if self.leds.board is None else self.leds.board[self.surveyed]
         kept = self.leds.id[self.surveyed], self.leds.position_m[self.surveyed]
         return LedMap(*kept, self.leds.centre_m, self.leds.semi_axes_m, board)
@@ -116,15 +120,19 @@ def survey(
     reference_frame: int | None = None,
     leds_sigma_m: float = np.inf,
 ) -> Survey:
-    """Least squares over every light, attitude, the lever and the lens at once; the module says what fixes the gauge.
+    """Survey the dome: least squares over all lights and attitudes, the lever and the lens.
 
-    known_length: rows of two lights and the metres between them. fit_distortion: k1, k2, p1, p2 too; k3 moves no
-    pixel of a narrow lens. loss: "linear", or "cauchy", which survives wrong names: iteratively reweighted, its width
-    shrinking with the median residual, then what lies beyond 5 sigma is left out and the rest fitted by plain least
-    squares, so that the covariance is that of a plain fit. A light seen but twice has hardly a check on its names.
-    reference_frame: its start attitude holds the lab, instead of the start map. leds_sigma_m: how well the start map
-    is known, each axis; it then takes part as a measurement, which the weak moves need. inf: a start, no more.
-    Raises ValueError in one line where the frames are malformed or do not determine the unknowns.
+    known_length    : rows of two lights and the distance between them in m; fixes the scale
+    fit_distortion  : also fit k1, k2, p1, p2; k3 has no visible effect in a narrow field
+    loss            : "linear", or "cauchy", which tolerates wrong identifications: iteratively reweighted, its width
+        shrinking with the median residual; then residuals beyond 5 sigma are rejected and the rest is fitted by least
+        squares, so that the covariance is that of a least-squares fit. Errors of a light seen only twice are hard to
+        detect
+    reference_frame : row of the frame whose start attitude fixes the lab frame, instead of the start map
+    leds_sigma_m    : standard deviation of the start map per axis; the map is then used as a measurement, which the
+        weakly determined moves need. inf: the map is only a start value
+
+    Raises ValueError in one line if the frames are malformed or do not determine the unknowns.
     """
     if loss not in LOSSES:
         raise ValueError(f"survey: loss {loss!r} is none of {', '.join(LOSSES)}")
@@ -144,7 +152,11 @@ def survey(
 def _settled(
     start: Bundle, seen: Sightings, gauge: Gauge, width: float
 ) -> tuple[Part, np.ndarray, bool, tuple[Floats, Floats, Floats]]:
-    """The part that hangs together at its best, which sightings were kept, whether it is at rest, covariances."""
+    """Fit the connected subset of the observations in the given gauge.
+
+    Returns the fitted subset, the (M,) mask of sightings kept, whether it converged, and the covariances. Raises
+    ValueError if the lever or the lens is undetermined.
+    """
     spread = None
     try:
         near, keep = _without_strangers(start, seen, width)
@@ -156,14 +168,14 @@ def _settled(
         terms = ba.normal(found, part.seen, np.ones(len(part.index)))
         spread = ba.covariance(terms, found, *gauge.held(found, part))
     except LinAlgError:
-        pass  # a matrix that is singular is refused below, as one that is nearly so
+        pass  # a singular matrix raises the same ValueError below as a nearly singular one
     if spread is None or not _determined(found, spread[2]):
         raise ValueError("survey: the frames leave the lever or the lens unknown; take more tilts and yaws")
     return part, keep, at_rest, spread
 
 
 def _gathered(frames: Sequence[DomeFrame], lights: int) -> Sightings:
-    """All frames' sightings in one table. Raises ValueError for the first that is malformed."""
+    """The sightings of all frames in one table. Raises ValueError for the first malformed frame."""
     if not frames:
         raise ValueError("survey: no frames; a dome needs some tens")
     for k, frame in enumerate(frames):
@@ -199,7 +211,12 @@ def _start(frames: Sequence[DomeFrame], leds: LedMap, lever: Lever, camera: Came
 
 
 def _without_strangers(whole: Bundle, seen: Sightings, width: float) -> tuple[Bundle, np.ndarray]:
-    """The start brought near, and (M,) which sightings to keep: all of them for an infinite width."""
+    """Improve the start values and reject wrong identifications.
+
+    First only the attitudes are fitted. For a finite width, gross outliers are rejected, the whole bundle is fitted
+    with Cauchy's loss, whose width shrinks with the noise until it settles, and residuals beyond GATE are rejected.
+    Returns the bundle and the (M,) mask of sightings kept.
+    """
     keep = np.ones(len(seen.led), dtype=bool)
     part = _tied(whole, seen, keep)
     found = ba.turn_frames(part.bundle, part.seen, 12)
@@ -208,6 +225,7 @@ def _without_strangers(whole: Bundle, seen: Sightings, width: float) -> tuple[Bu
         return whole, keep
     keep[part.index] = _inside(found, part.seen, GROSS_GATE)
     part = _tied(whole, seen, keep)
+    # Graduated robust fit: each round shrinks the width with the residuals, until it shrinks by less than 10 %.
     found, before = part.bundle, np.inf
     while (now := width * _noise(found, part.seen)) < 0.9 * before:
         found, before = ba.adjust(found, part.seen, now, decrement=0.1)[0], now
@@ -216,7 +234,7 @@ def _without_strangers(whole: Bundle, seen: Sightings, width: float) -> tuple[Bu
 
 
 def _noise(bundle: Bundle, seen: Sightings) -> float:
-    """Robust size of the residuals in sigmas, one at least: the median distance over that of unit noise."""
+    """Robust scale of the residuals in sigmas, at least 1: their median distance over that of unit noise."""
     distance = np.linalg.norm(ba.residuals(bundle, seen), axis=1)
     return max(1.0, float(np.median(distance) / MEDIAN_RADIUS))
 
@@ -227,13 +245,15 @@ def _inside(bundle: Bundle, seen: Sightings, gate: float) -> np.ndarray:
 
 
 def _tied(whole: Bundle, seen: Sightings, keep: np.ndarray) -> Part:
-    """The sightings that determine anything: lights in two frames with rays that cross, frames with two such lights.
+    """The subset that the sightings determine.
 
-    Raises ValueError where too little is left, or where it falls apart into groups of frames.
+    It holds lights seen in two or more frames with crossing rays, and frames that see two or more such lights. Raises
+    ValueError if too few sightings remain, or if they form groups of frames that are not connected.
     """
     ahead = np.isfinite(ba.residuals(whole, seen)).all(axis=1)
     index = np.flatnonzero(keep & ahead)
     lights, frames = len(whole.position_m), len(whole.R_body_from_lab)
+    # Removing a light can leave its frames with too few lights, and the reverse: repeat until nothing changes.
     while True:
         led, frame = seen.led[index], seen.frame[index]
         incidence = csr_array((np.ones(len(index)), (frame, led)), shape=(frames, lights)) > 0
@@ -262,7 +282,10 @@ def _tied(whole: Bundle, seen: Sightings, keep: np.ndarray) -> Part:
 
 
 def _crossing(whole: Bundle, seen: Sightings) -> np.ndarray:
-    """(N,) whether each light's rays spread enough: 1 - largest eigenvalue of their mean u u' is the mean sin^2."""
+    """(N,) whether each light's rays differ enough in direction to determine its distance.
+
+    1 minus the largest eigenvalue of the mean of u u' is the mean sin^2 of the rays' angles from their main direction.
+    """
     camera_lab = np.einsum("kji,j->ki", whole.R_body_from_lab, whole.camera_body_m)
     ray = whole.position_m[seen.led] - camera_lab[seen.frame]
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)
@@ -274,7 +297,11 @@ def _crossing(whole: Bundle, seen: Sightings) -> np.ndarray:
 
 
 def _check_one_group(incidence: csr_array, frame_rows: Ints) -> None:
-    """Raise ValueError unless every frame hangs on the others by two lights: about one, a group could turn freely."""
+    """Raise ValueError unless the frames form one group, each sharing two or more lights with the rest.
+
+    A group that shares only one light with the rest could rotate about it. The group grows from the frame with the most
+    lights.
+    """
     table = incidence[frame_rows].astype(float)
     member = np.zeros(len(frame_rows), dtype=bool)
     member[np.argmax(table.sum(axis=1))] = True
@@ -293,7 +320,7 @@ def _check_one_group(incidence: csr_array, frame_rows: Ints) -> None:
 
 
 def _determined(found: Bundle, shared: Floats) -> bool:
-    """Whether lever and focal length are known to a tenth of the distances, as numbers near an answer are."""
+    """Whether the lever is determined to 10 % of the least LED distance, and the focal length to 10 %."""
     sigma = np.sqrt(np.maximum(np.diag(shared), 0))
     reach = np.linalg.norm(found.position_m, axis=1).min()
     return bool(np.isfinite(sigma).all() and sigma[:3].max() < 0.1 * reach and sigma[3] < 0.1 * found.lens[0])

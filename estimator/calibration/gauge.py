@@ -1,4 +1,10 @@
-"""What pixels can never tell of a dome, and what settles it; estimator/calibration/dome_survey.py says which moves these are."""
+"""Gauge freedoms of the dome survey (rotation of the lab frame, scale) and the constraints that fix them.
+
+No pixel changes if the lab frame rotates or if all lengths are scaled; see estimator/calibration/dome_survey.py.
+The rotation is fixed by the start map (least squares) or by the attitude of one reference frame, and the scale by one
+known length or by the start map. `Gauge.onto` transforms a solution to the gauge; `Gauge.held` linearizes the four
+constraints for the covariance.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +19,10 @@ from estimator.core.arrays import Floats, Ints
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """The lights, frames and sightings that hang together, renumbered; led, frame, index: their rows in the whole."""
+    """The connected subset of lights, frames and sightings, renumbered from 0.
+
+    led, frame, index : their rows in the full set of lights, frames and sightings
+    """
 
     bundle: Bundle
     seen: Sightings
@@ -22,7 +31,7 @@ class Part:
     index: Ints
 
     def into(self, whole: Bundle, found: Bundle) -> Bundle:
-        """The whole with this part's new values."""
+        """The full bundle with the adjusted values of this subset inserted."""
         position, turned = whole.position_m.copy(), whole.R_body_from_lab.copy()
         position[self.led], turned[self.frame] = found.position_m, found.R_body_from_lab
         return replace(found, position_m=position, R_body_from_lab=turned, map_m=whole.map_m)
@@ -30,7 +39,12 @@ class Part:
 
 @dataclass(frozen=True, slots=True)
 class Gauge:
-    """What holds the lab's turn and the size of things."""
+    """The constraints that fix the rotation and the scale of the lab frame.
+
+    length : rows of two lights and the distance between them in m; None: the start map's mean size
+    frame  : row of the reference frame; None: the start map's mean orientation
+    map_m, R_body_from_lab : (N, 3), (F, 3, 3) start values
+    """
 
     length: tuple[int, int, float] | None
     frame: int | None
@@ -45,7 +59,7 @@ class Gauge:
         map_m: Floats,
         R_body_from_lab: Floats,
     ) -> Gauge:
-        """The gauge that is asked for, over the start. Raises ValueError for rows that there are not."""
+        """The requested gauge. Raises ValueError for rows outside of the map or the frames."""
         count = len(map_m)
         if length is not None:
             i, j, metres = length
@@ -58,20 +72,22 @@ class Gauge:
         return cls(length, frame, map_m, R_body_from_lab)
 
     def check(self, part: Part) -> None:
-        """Raise ValueError where the gauge rests on a light or a frame that is not surveyed."""
+        """Raise ValueError if the gauge uses a light or a frame that is not surveyed."""
         if self.length is not None:
             self._pair(part)
         if self.frame is not None:
             self._frame(part)
 
     def onto(self, found: Bundle, part: Part) -> Bundle:
-        """The same bundle, as the pixels see it, turned and grown to fit the gauge."""
+        """The bundle rotated and scaled to satisfy the gauge; its pixels do not change."""
         place, start = found.position_m, self.map_m[part.led]
         if self.frame is None:
             turn = Rotation.align_vectors(start, place)[0].as_matrix()
         else:
             turn = self.R_body_from_lab[self.frame].T @ found.R_body_from_lab[self._frame(part)]
         if self.length is None:
+            # The scale for which the survey's projection on the start map equals the start map's own sum of squares:
+            # the linear constraint that `held` uses.
             grown = np.sum(start**2) / np.sum(start * (place @ turn.T))
         else:
             i, j = self._pair(part)
@@ -85,7 +101,7 @@ class Gauge:
         )
 
     def held(self, found: Bundle, part: Part) -> tuple[Floats, Floats]:
-        """The gauge's four conditions, linear in a small move: (3 n, 4) of the lights and (R, 4) of the rest."""
+        """The gauge's four constraints, linearized: (3 n, 4) for the positions and (R, 4) for the other unknowns."""
         start = self.map_m[part.led]
         by_led = np.zeros((len(start), 3, 4))
         by_rest = np.zeros((3 * len(part.frame) + 3 + found.free_lens, 4))
@@ -120,11 +136,12 @@ class Gauge:
 
 
 def common_turns(ours: Rotation, theirs: Rotation) -> tuple[Rotation, Rotation]:
-    """The two turns between two sets of attitudes of the same moments: theirs = left * ours * right, least squares.
+    """The constant rotations of body and lab between two sets of simultaneous attitudes: theirs = left * ours * right.
 
     left = theirs_body_from_our_body (so cam_from_their_body = cam_from_our_body * left.inv()), right =
-    our_lab_from_their_lab. Gauss-Newton on the rotation vectors of what is left over, from the start that two
-    averages give; attitudes that all turn about one axis leave a turn to share between the two, and get the least.
+    our_lab_from_their_lab. Least squares by Gauss-Newton on the rotation vectors of the residuals, starting from the
+    mean rotation. If all attitudes rotate about one axis, a rotation can be divided between the two; the minimum-norm
+    step is taken.
     """
     left, right = Rotation.identity(), (ours.inv() * theirs).mean()
     for _ in range(50):

@@ -1,9 +1,9 @@
-"""The lab's own calibration, as AFIT did it: a catalogue seen from the home position, and how well it repeats.
+"""AFIT's laboratory calibration: an LED catalog measured from the home position, and its repeatability.
 
-Padro 2012, sections 3.6.3 and 3.6.4: the vehicle is held at several positions; in every frame the lights are carried
-from the camera to the bearing (his eqs 43-44) and from there into the lab by the IMU's angles. How closely the same
-light comes back to the same place gives epsilon_position; the angles between lights (eq. 45) need no IMU and give
-epsilon_separation; the brightness gives epsilon_magnitude.
+Padro 2012, sections 3.6.3 and 3.6.4: the vehicle is held at several positions (stops). In every frame the directions
+of the lights are transformed from the camera to the bearing (his eqs 43-44) and from there to the lab frame with the
+IMU's angles. The repeatability of a light's position gives epsilon_position; that of the angles between lights
+(eq. 45), which need no IMU, gives epsilon_separation; that of the brightness gives epsilon_magnitude.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ from estimator.core.errors import ImageError
 
 @dataclass(frozen=True, slots=True)
 class Sighting:
-    """One frame whose lights have names.
+    """One frame with identified lights.
 
-    position      : at which of the vehicle's stops it was taken; that of the first sighting is home
-    body_from_lab : the attitude by the IMU. It was zeroed at home: the body's axes there are the lab's
+    position      : number of the vehicle's stop; the stop of the first sighting is home
+    body_from_lab : attitude from the IMU, which is zeroed at home: there the body axes are those of the lab frame
     led           : (K,) ids, each once;  xy_px : (K, 2) centroids;  magnitude : (K,) see `instrument_magnitude`
     """
 
@@ -42,15 +42,15 @@ class Sighting:
 
 @dataclass(frozen=True, slots=True)
 class HomeCatalogue:
-    """Where the lights stand about the bearing, seen from home, brightest first (section 3.6.4), in the lab frame.
+    """LED catalog about the bearing, in the lab frame, brightest first (section 3.6.4).
 
-    id, magnitude  : (N,) a magnitude grows with the light
+    id, magnitude  : (N,); a greater magnitude is a brighter light
     vectors        : (N, 3) unit, from the bearing
-    position_m     : (N, 3) where eqs 43-44 put the light: near the dome, not on it
-    covariance_m2  : (N, 3, 3) of one frame's position about its mean, over all frames; NaN where there is one
-    samples        : (N,) frames that the place and the magnitude are the mean of
-    epsilon_mag, epsilon_pos_m, epsilon_sep_rad : one standard deviation of a magnitude, of a coordinate of a place
-        and of the angle between two lights: the greatest of all lights, coordinates and pairs
+    position_m     : (N, 3) positions by eqs 43-44: near the dome, not on it
+    covariance_m2  : (N, 3, 3) of one frame's position about its mean, over all frames; NaN for a single frame
+    samples        : (N,) number of frames averaged for position and magnitude
+    epsilon_mag, epsilon_pos_m, epsilon_sep_rad : standard deviations of a magnitude, of a coordinate of a position
+        and of the angle between two lights: the greatest over all lights, coordinates and pairs
     """
 
     id: Ints
@@ -73,19 +73,19 @@ class HomeCatalogue:
 
 
 def instrument_magnitude(mean_dn: Floats, area_px: Floats) -> Floats:
-    """(N,) light of each blob of a frame by the frame's median blob: mean brightness times area over median area.
+    """(N,) brightness of each blob of a frame: mean brightness times its area over the frame's median area.
 
     Section 3.6.2.1 says only that the mean brightness is "normalised against the median LED area"; his dim means of
-    7 lie below his own threshold of 10.2, so that the area must come in (reference 1.2, item 13: inferred). What all
-    blobs share, such as a defocus that spreads them alike, changes it as it changes mean brightness.
+    7 are below his own threshold of 10.2, so that the area must be a factor (reference 1.2, item 13: inferred). A
+    change common to all blobs, such as defocus, changes the result in the same ratio as the mean brightness.
     """
     return mean_dn * area_px / np.median(area_px)
 
 
 def pooled(value: Floats, group: Ints, position: Ints) -> Floats:
-    """(G,) standard deviation, n - 1, of each group's values over all frames: what differs between stops counts.
+    """(G,) sample standard deviation (n - 1) of each group's values over all frames; differences between stops count.
 
-    Section 3.6.3: "across the total number of recorded observations". One value gives NaN.
+    Section 3.6.3: "across the total number of recorded observations". NaN for a single value.
     """
     count = np.bincount(group)
     off_mean = value - (np.bincount(group, value) / np.maximum(count, 1))[group]
@@ -94,10 +94,10 @@ def pooled(value: Floats, group: Ints, position: Ints) -> Floats:
 
 
 def averaged(value: Floats, group: Ints, position: Ints) -> Floats:
-    """(G,) mean over the stops of the standard deviation at each: what differs between stops, as an error of the IMU's
-    angles does, leaves no trace.
+    """(G,) mean over the stops of the standard deviation at each stop.
 
-    Section 4.4.1: "the averaged multi-positional standard deviation values". NaN where no stop has two frames.
+    Differences between stops, such as errors of the IMU's angles, have no effect. Section 4.4.1: "the averaged
+    multi-positional standard deviation values". NaN if no stop has two frames.
     """
     _, stop = np.unique(position, return_inverse=True)
     stops = stop.max() + 1
@@ -111,14 +111,14 @@ def averaged(value: Floats, group: Ints, position: Ints) -> Floats:
     return np.where(some, total / np.maximum(known.sum(axis=1), 1), np.nan)
 
 
-# The thesis says both; Table 4 has a pooled figure under "Avg", and Table 9 a position's that is too small for one if
-# the IMU's angles were those of Tables 10-14 (reference 1.2, items 3 and 15).
+# The thesis describes both. Table 4 has a pooled value under "Avg"; the position value of Table 9 is too small for a
+# pooled one if the IMU's angles were those of Tables 10-14 (reference 1.2, items 3 and 15).
 Spread = Callable[[Floats, Ints, Ints], Floats]
 SPREADS: dict[str, Spread] = {"pooled": pooled, "averaged": averaged}
 
 
 class _Samples(NamedTuple):
-    """Every light of every frame: rows of the ids, the frame, its stop, places in body and lab axes, magnitudes."""
+    """Every light of every frame: row of its id, frame, stop, position in body and in lab axes, magnitude."""
 
     led: Ints
     frame: Ints
@@ -137,14 +137,14 @@ def calibrate(
     spread: str = "pooled",
     home_only: bool = True,
 ) -> HomeCatalogue:
-    """The catalogue and its epsilons by AFIT's procedure (Padro 2012, sections 3.6.3-3.6.4 and 4.4.1).
+    """The catalog and its epsilons by AFIT's procedure (Padro 2012, sections 3.6.3-3.6.4 and 4.4.1).
 
-    surface   : the believed dome, of which R is taken; its LEDs are not used
-    sine      : whether the slip of tan for sin in eq. 44 is put right (reference 1.2, item 11)
-    spread    : a name in SPREADS: which standard deviation an epsilon is the greatest of
-    home_only : the catalogue from the frames at home, as he did, with every epsilon from all frames; else the mean
-        over all frames (the black marks of his Fig. 79), in which an IMU's error at a stop stays
-    Raises ImageError for sightings that disagree with themselves or leave a spread unknown.
+    surface   : dome model, which gives R; its LEDs are not used
+    sine      : correct eq. 44, which has tan instead of sin (reference 1.2, item 11)
+    spread    : a name in SPREADS: the standard deviation whose maximum is an epsilon
+    home_only : take the catalog from the frames at home, as in the thesis, with every epsilon from all frames; else
+        from the mean over all frames (the black marks of his Fig. 79), which keeps the IMU's errors at the stops
+    Raises ImageError for inconsistent sightings, or if a spread is unknown.
     """
     id_, samples = _placed(sightings, camera, surface, lever, sine)
     deviation = SPREADS[spread]
@@ -162,7 +162,7 @@ def calibrate(
 
 
 def _brightest_first(samples: _Samples, used: NDArray[np.bool_]) -> tuple[Ints, Floats, Floats, Ints]:
-    """Rows of the lights seen in the frames used, their mean places (N, 3), mean magnitudes, and how many frames."""
+    """Lights seen in the frames used, brightest first: rows, mean positions (N, 3), magnitudes, numbers of frames."""
     led = samples.led[used]
     count = np.bincount(led)
     total = [np.bincount(led, column) for column in (*samples.lab_m[used].T, samples.magnitude[used])]
@@ -175,7 +175,7 @@ def _brightest_first(samples: _Samples, used: NDArray[np.bool_]) -> tuple[Ints, 
 def _placed(
     sightings: Sequence[Sighting], camera: Camera, surface: LedMap, lever: Lever, sine: bool
 ) -> tuple[Ints, _Samples]:
-    """The ids seen, and each light of each frame brought to the home attitude by the IMU's angles."""
+    """The ids seen, and each light of each frame transformed to the lab frame with the IMU's attitude."""
     if not len(sightings):
         raise ImageError("no sightings: a calibration needs at least two frames")
     for number, seen in enumerate(sightings):
@@ -208,9 +208,9 @@ def _check(number: int, seen: Sighting) -> None:
 
 
 def _separations(samples: _Samples) -> tuple[Floats, Ints, Ints]:
-    """The angle about the bearing of every pair in every frame (eq. 45), rad; which pair it is; the frame's stop.
+    """Angle about the bearing of every pair in every frame (eq. 45), rad; number of the pair; stop of the frame.
 
-    By the half-chord, which keeps the digits of small angles that the arc cosine of eq. 45 loses.
+    Computed from half the chord, which is accurate for small angles, unlike the arc cosine of eq. 45.
     """
     direction = unit(samples.body_m)
     first, second = [], []
@@ -235,7 +235,7 @@ def _greatest(spread: Floats, of: str) -> float:
 
 
 def _covariance(lab_m: Floats, led: Ints) -> Floats:
-    """(N, 3, 3) sample covariance of each light's places, m^2."""
+    """(N, 3, 3) sample covariance of each light's positions, m^2."""
     count = np.bincount(led)
     mean_m = np.array([np.bincount(led, column) for column in lab_m.T]) / count
     off_mean = lab_m - mean_m.T[led]
@@ -246,9 +246,9 @@ def _covariance(lab_m: Floats, led: Ints) -> Floats:
 
 
 def led_map(catalogue: HomeCatalogue, surface: LedMap) -> LedMap:
-    """The catalogue's lights on a believed surface: where their directions from the bearing meet it, for a tracker.
+    """LED map for a tracker: the intersections of the catalog's directions from the bearing with the dome surface.
 
-    surface : whose ellipsoid is believed; its own LEDs are not used. Raises ImageError where a direction misses it.
+    surface : provides the ellipsoid; its LEDs are not used. Raises ImageError if a direction misses it.
     """
     position_m = on_surface(catalogue.vectors, np.zeros(3), surface)
     missed = catalogue.id[np.isnan(position_m).any(axis=1)]

@@ -1,4 +1,4 @@
-"""From a star's brightness in the image to its magnitude in the catalogue: the offset between the two scales."""
+"""Photometric zero point: the offset between instrumental magnitudes and catalog magnitudes."""
 
 from __future__ import annotations
 
@@ -11,9 +11,11 @@ from estimator.core.arrays import Floats
 
 @dataclass(frozen=True, slots=True)
 class MagnitudeZero:
-    """V - instrumental magnitude, where that is -2.5 log10(flux / exposure): the median over the stars.
+    """Zero point: median over the stars of V minus the instrumental magnitude -2.5 log10(flux / exposure).
 
-    sigma_mag   : of the offset;  scatter_mag : of one star about it, its colour above all;  stars : different ones
+    sigma_mag   : standard deviation of the offset
+    scatter_mag : of one star about the offset, mainly by its color
+    stars       : number of different stars
     """
 
     offset_mag: float
@@ -23,11 +25,12 @@ class MagnitudeZero:
 
 
 def magnitude_zero(instrumental_mag: Floats, v_mag: Floats, vectors_ref: Floats) -> MagnitudeZero:
-    """The magnitudes' offset as the median over different stars, each the median of its sightings.
+    """Zero point as the median over different stars of each star's median difference.
 
-    Colours are not known, and put a star off by some tenths of a magnitude, the same in every frame: the scatter is
-    1.4826 times the median deviation, and the median's error sqrt(pi / 2) of the scatter over the root of the number
-    of stars. Stars near the detection limit should be left out: of them the too bright are seen, the others not.
+    Colors are unknown and shift a star by some tenths of a magnitude, equally in every frame; therefore the sample is
+    the stars, not the sightings. The scatter is 1.4826 times the median absolute deviation, and the standard deviation
+    of the median is sqrt(pi / 2) times the scatter over the square root of the number of stars. Leave out stars near
+    the detection limit: only those with positive errors are detected, which biases the median.
     """
     _, star = np.unique(vectors_ref, axis=0, return_inverse=True)
     star = np.ravel(star)

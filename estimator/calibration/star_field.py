@@ -1,10 +1,14 @@
-"""A camera's calibration from star fields at unknown attitudes: focal length, principal point, distortion, magnitudes.
+"""Camera calibration from star fields at unknown attitudes: focal length, principal point, distortion, magnitude zero.
 
-Stars are the best test chart: their directions are known to milliarcseconds. Every frame brings three unknowns of its
-own, its attitude, which are eliminated (Schur complement), so that the eight of the lens remain whatever the number
-of frames. What pixels can tell but weakly is held by a belief in ordinary lenses, `Belief`: a principal point moved
-is next to a turn of the camera, and differs from it by the square of the field's angle only; k2 and k3 look like k1
-over a narrow field. Along such directions the lens may be wrong together with the attitudes, and the pixels are right.
+Star directions are known to milliarcseconds, so that the unknowns are the eight lens parameters and three attitude
+angles per frame. The projection and its derivatives are those of `bundle_adjustment`, with the stars as lights at
+distance 1 and no lever. Levenberg-Marquardt minimizes the weighted residuals; the attitudes are eliminated (Schur
+complement), so that each step solves an 8 x 8 system whatever the number of frames. `self_calibrated` alternates
+identification and calibration.
+
+Some lens parameters are weakly observable: a shift of the principal point differs from a rotation of the camera only
+by the square of the field angle, and k2 and k3 resemble k1 over a narrow field. A Gaussian prior on ordinary lenses
+(`Belief`) constrains them. Along such directions errors of the lens and of the attitudes can cancel in the pixels.
 """
 
 from __future__ import annotations
@@ -29,17 +33,17 @@ from estimator.core.camera import Camera
 from estimator.core.types import Attitude, Centroids
 
 LENS = 8  # focal_px, centre x and y, k1, k2, p1, p2, k3
-LEAST_STARS = 3  # of a frame: two determine its attitude and leave one number for the lens
-START_ROUNDS = 30
-MOST_LOST = 0.9  # a round that names fewer than so many of the best one's stars is a step back
+LEAST_STARS = 3  # in a frame: two determine its attitude and leave only one coordinate for the lens
+START_ROUNDS = 30  # iterations of the robust start attitude
+MOST_LOST = 0.9  # self_calibrated stops at a round with fewer than this fraction of the most stars so far
 
 
 @dataclass(frozen=True, slots=True)
 class StarFrame:
-    """Stars of one frame, found and named.
+    """Identified stars of one frame.
 
-    xy_px : (K, 2);  sigma_px : (K,) of each coordinate;  vectors_ref : (K, 3) unit, of the stars that they are
-    flux, v_mag : (K,) brightness in the image and in the catalogue, where the magnitudes' offset is wanted
+    xy_px : (K, 2);  sigma_px : (K,) of each coordinate;  vectors_ref : (K, 3) unit vectors of the identified stars
+    flux, v_mag : (K,) brightness in the image and catalog magnitude, for the magnitude zero point; None without it
     exposure_s  : of the frame
     """
 
@@ -53,10 +57,11 @@ class StarFrame:
 
 @dataclass(frozen=True, slots=True)
 class Belief:
-    """How far ordinary lenses are from the camera that one starts with, as standard deviations.
+    """Prior standard deviations of the lens parameters about the start camera.
 
-    centre : of the principal point, over the chip's width
-    radial, tangential : what each coefficient alone does in the farthest corner, over the corner's distance
+    centre : of the principal point, as a fraction of the chip's width
+    radial, tangential : displacement by each coefficient alone in the farthest corner, as a fraction of the corner's
+        distance from the center
     """
 
     centre: float = 0.05
@@ -64,7 +69,7 @@ class Belief:
     tangential: float = 0.02
 
     def sigma(self, camera: Camera) -> Floats:
-        """(8,) of focal_px (which is not believed at all), centre, k1, k2, p1, p2, k3."""
+        """(8,) standard deviations of focal_px (inf: no prior), center x and y, k1, k2, p1, p2, k3."""
         r = np.tan(camera.diagonal_rad / 2)
         k1, p = self.radial / r**2, self.tangential / (3 * r)
         centre = self.centre * camera.width_px
@@ -73,17 +78,17 @@ class Belief:
 
 @dataclass(frozen=True, slots=True)
 class FieldReport:
-    """How a calibration came about.
+    """Diagnostics of a calibration.
 
-    status       : "converged", or "stopped ..." where the numbers are not at rest
+    status       : "converged", or "stopped ..." if the iteration did not converge
     cam_from_ref : (F,) attitudes; identity for a frame that is not `tied`
-    attitude_covariance_rad2 : (F, 3, 3) in camera axes, the lens's errors included; NaN where not tied
-    tied         : (F,) frames with three stars or more
-    outliers     : (K, 2) frame, and row in it, of the stars left out as wrongly named
-    stars        : how many sightings it rests on
+    attitude_covariance_rad2 : (F, 3, 3) in camera axes, including the lens's errors; NaN if not tied
+    tied         : (F,) frames with three or more stars
+    outliers     : (K, 2) frame, and row in it, of the stars rejected as wrong identifications
+    stars        : number of sightings used
     rms_px       : of the residual coordinates
-    misfit       : sqrt(chi-square / degrees of freedom), 1 where sigma_px is honest
-    magnitude    : None where the frames have no brightness
+    misfit       : sqrt(chi-square / degrees of freedom), near 1 if sigma_px is correct
+    magnitude    : zero point; None if the frames have no brightness
     """
 
     status: str
@@ -98,7 +103,7 @@ class FieldReport:
 
 
 class Calibration(NamedTuple):
-    """The camera, the (8, 8) covariance of focal_px, centre x, y, k1, k2, p1, p2, k3, and the report."""
+    """The camera, the (8, 8) covariance of focal_px, center x, y, k1, k2, p1, p2, k3, and the report."""
 
     camera: Camera
     covariance: Floats
@@ -109,11 +114,11 @@ BELIEF = Belief()
 
 
 def calibrate(frames: Sequence[StarFrame], camera_start: Camera, belief: Belief = BELIEF) -> Calibration:
-    """Least squares over the lens and every frame's attitude, from a focal length that is right to some per cent.
+    """Fit the lens and every frame's attitude by least squares, from a focal length accurate to a few percent.
 
-    Wrong names are survived: Cauchy's loss first, its width shrinking with the median residual; then what lies beyond
-    5 sigma is left out, and the rest is fitted by plain least squares, whose covariance is returned.
-    Raises ValueError in one line where the frames are malformed or do not determine the lens.
+    Wrong identifications are tolerated: the fit first uses Cauchy's loss, its width shrinking with the median residual;
+    then residuals beyond 5 sigma are rejected, and the rest is fitted by least squares, whose covariance is returned.
+    Raises ValueError in one line if the frames are malformed or do not determine the lens.
     """
     whole = _gathered(frames)
     rows = np.concatenate([np.arange(len(frame.xy_px)) for frame in frames])
@@ -123,6 +128,7 @@ def calibrate(frames: Sequence[StarFrame], camera_start: Camera, belief: Belief 
     keep = counts[whole.frame] >= LEAST_STARS
     _check_enough(whole.take(keep))
     problem, before = problem._replace(bundle=_turned(problem.bundle, whole.take(keep))), np.inf
+    # Graduated robust fit: each round shrinks the width with the residuals, until it shrinks by less than 10 %.
     while (now := CAUCHY * _noise(problem.bundle, whole.take(keep))) < 0.9 * before:
         problem, _ = _adjusted(problem, whole.take(keep), now)
         before = now
@@ -138,7 +144,7 @@ def calibrate(frames: Sequence[StarFrame], camera_start: Camera, belief: Belief 
 
 
 class Tracker(Protocol):
-    """What identifies: a StarTracker, or anything else with a star list and an answer to centroids."""
+    """Interface of the identifying tracker: a star list and a solution for centroids. StarTracker has it."""
 
     stars: StarCatalog
 
@@ -153,18 +159,19 @@ def self_calibrated(
     exposure_s: float = 1.0,
     rounds: int = 8,
 ) -> Calibration:
-    """From centroids alone to a calibrated camera: identify, calibrate, identify with the better camera, and so on.
+    """Calibrate a camera from centroids alone: alternately identify the stars and calibrate with them.
 
-    tracker : makes one from a camera and its focal length's relative uncertainty, 0 once there is a calibration
-    camera  : what is known beforehand: the chip, and the focal length to `focal_uncertainty`
+    tracker : makes a tracker from a camera and the relative uncertainty of its focal length, 0 after a calibration
+    camera  : prior knowledge: the chip, and the focal length to `focal_uncertainty`
 
-    It ends when a round names the same stars as the one before: as many may be others still. Raises ValueError
-    where no frame is identified.
+    Stops when a round identifies the same stars as the one before (an equal number is not enough), or has lost too
+    many (MOST_LOST). Raises ValueError if no frame is identified.
     """
     best, most, stars_before, belief_in = None, 0, np.empty((0, 3)), camera
     for _ in range(rounds):
         named = _named(frames, tracker(belief_in, focal_uncertainty), exposure_s)
         stars = np.concatenate([np.empty((0, 3)), *(frame.vectors_ref for frame in named)])
+        # Each round identifies with the calibrated camera, but calibrates from the start camera, which is the prior.
         if np.array_equal(stars, stars_before) or len(stars) < MOST_LOST * most:
             break
         best, most, stars_before = calibrate(named, camera), max(most, len(stars)), stars
@@ -175,9 +182,9 @@ def self_calibrated(
 
 
 def disagreement_px(camera: Camera, other: Camera, nodes: int = 41) -> float:
-    """Rms distance over the sensor between the pixels of one camera and the other's, after the best common turn.
+    """Rms distance over the sensor between the projections of two cameras, after the best common rotation, px.
 
-    A turn of the camera in its mount belongs to no lens: stars cannot tell it, and every attitude takes it up.
+    The rotation is removed because it is not a property of the lens: every attitude absorbs it.
     """
     x = np.linspace(-0.5, camera.width_px - 0.5, nodes)
     y = np.linspace(-0.5, camera.height_px - 0.5, nodes)
@@ -188,20 +195,20 @@ def disagreement_px(camera: Camera, other: Camera, nodes: int = 41) -> float:
 
 
 class _Problem(NamedTuple):
-    """The bundle with the stars as its lights at distance 1, and the (8,) believed lens with its sigmas."""
+    """The bundle with the stars as lights at distance 1, and the (8,) prior lens with its standard deviations."""
 
     bundle: Bundle
     believed: Floats
     sigma: Floats
 
     def cost(self, seen: Sightings, width: float) -> tuple[float, Floats]:
-        """Loss of pixels and belief together, and the (M,) weights of the sightings."""
+        """Total loss of the pixels and the prior, and the (M,) robust weights of the sightings."""
         loss, weight = ba.cauchy(np.sum(ba.residuals(self.bundle, seen) ** 2, axis=1), width)
         return loss + float(np.sum(((self.bundle.lens - self.believed) / self.sigma) ** 2)), weight
 
 
 class _Normal(NamedTuple):
-    """The normal equations: (F, 3, 3) of turns, (F, 3, 8) coupling, (8, 8) of the lens, both right sides."""
+    """The normal equations: (F, 3, 3) of rotations, (F, 3, 8) coupling, (8, 8) of the lens, right-hand sides."""
 
     turn: Floats
     coupling: Floats
@@ -211,7 +218,7 @@ class _Normal(NamedTuple):
 
 
 def _gathered(frames: Sequence[StarFrame]) -> Sightings:
-    """All frames' stars in one table; every sighting has a direction of its own. Raises ValueError."""
+    """The stars of all frames in one table, each sighting with its own light. Raises ValueError if malformed."""
     if not frames:
         raise ValueError("calibrate: no frames; a lens needs some tens")
     for k, frame in enumerate(frames):
@@ -234,7 +241,7 @@ def _gathered(frames: Sequence[StarFrame]) -> Sightings:
 
 
 def _check_enough(seen: Sightings) -> None:
-    """Raise ValueError unless there are more coordinates than unknowns."""
+    """Raise ValueError if there are fewer coordinates than unknowns."""
     frames = len(np.unique(seen.frame))
     if 2 * len(seen.frame) < 3 * frames + LENS:
         raise ValueError(
@@ -244,7 +251,7 @@ def _check_enough(seen: Sightings) -> None:
 
 
 def _start(whole: Sightings, vectors: Floats, camera: Camera, belief: Belief, count: int) -> _Problem:
-    """The camera as it is believed, and each frame's attitude by it."""
+    """Start values: the start camera, and each frame's robust attitude with it."""
     lens = np.array([camera.focal_px, *camera.centre_px, *camera.distortion])
     rays = camera.rays(whole.xy_px)
     turned = np.tile(np.eye(3), (count, 1, 1))
@@ -257,21 +264,22 @@ def _start(whole: Sightings, vectors: Floats, camera: Camera, belief: Belief, co
 
 
 def _robust_attitude(rays: Floats, vectors: Floats) -> Floats:
-    """(3, 3) least sum of distances, by reweighting: a star named wrongly pulls no more than any other.
+    """(3, 3) rotation of the least sum of distances, by iteratively reweighted Wahba solutions.
 
-    Raises ValueError for stars that are all in one place.
+    With the sum of distances (not of squares) an outlier has no more influence than any other star. Raises ValueError
+    if all stars coincide.
     """
     weight = np.ones(len(rays))
     for _ in range(START_ROUNDS):
         answer, _ = kernel.wahba(rays, vectors, weight)
         apart = np.linalg.norm(rays - vectors @ answer.T, axis=1)
-        # The floor keeps one exact pair from deciding alone.
+        # Without the floor, one pair of residual 0 would have infinite weight.
         weight = 1 / np.maximum(apart, 0.1 * np.median(apart) + 1e-9)
     return answer
 
 
 def _turned(bundle: Bundle, seen: Sightings) -> Bundle:
-    """Every frame's attitude at its best under Cauchy's loss, the lens as it is."""
+    """The bundle with every frame's attitude fitted under Cauchy's loss, the lens fixed."""
     frames = np.unique(seen.frame)
     mine = replace(bundle, R_body_from_lab=bundle.R_body_from_lab[frames])
     numbered = replace(seen, frame=np.searchsorted(frames, seen.frame))
@@ -281,25 +289,25 @@ def _turned(bundle: Bundle, seen: Sightings) -> Bundle:
 
 
 def _noise(bundle: Bundle, seen: Sightings) -> float:
-    """Robust size of the residuals in sigmas, one at least: the median distance over that of unit noise."""
+    """Robust scale of the residuals in sigmas, at least 1: their median distance over that of unit noise."""
     distance = np.linalg.norm(ba.residuals(bundle, seen), axis=1)
     return max(1.0, float(np.median(distance) / MEDIAN_RADIUS))
 
 
 def _normal(problem: _Problem, seen: Sightings, weight: Floats) -> _Normal:
-    """J'WJ and J'W residual, W one weight a sighting, with the belief in the lens."""
+    """The normal equations J'WJ and J'W residual, with one weight per sighting and the prior on the lens added."""
     terms = ba.rows(problem.bundle, seen)
     frames = len(problem.bundle.R_body_from_lab)
     by_turn, by_lens = (
         terms.by_turn,
         terms.by_shared[:, :, 3:],
-    )  # the lever comes first and is held at nothing
+    )  # the first three columns are the lever, which is fixed at zero
     heavy_turn, heavy_lens = weight[:, None, None] * by_turn, weight[:, None, None] * by_lens
     turn, coupling, pull = np.zeros((frames, 3, 3)), np.zeros((frames, 3, LENS)), np.zeros((frames, 3))
     np.add.at(turn, seen.frame, by_turn.transpose(0, 2, 1) @ heavy_turn)
     np.add.at(coupling, seen.frame, by_turn.transpose(0, 2, 1) @ heavy_lens)
     np.add.at(pull, seen.frame, np.einsum("mai,ma->mi", heavy_turn, terms.residual))
-    turn[np.bincount(seen.frame, minlength=frames) == 0] = np.eye(3)  # a frame left out stays where it is
+    turn[np.bincount(seen.frame, minlength=frames) == 0] = np.eye(3)  # an unused frame gets a zero step
     lens = np.einsum("mai,maj->ij", heavy_lens, by_lens) + np.diag(problem.sigma**-2)
     from_belief = (problem.believed - problem.bundle.lens) / problem.sigma**2
     return _Normal(
@@ -308,7 +316,10 @@ def _normal(problem: _Problem, seen: Sightings, weight: Floats) -> _Normal:
 
 
 def _reduced(terms: _Normal, damping: float) -> tuple[Floats, Floats, Floats]:
-    """Attitudes eliminated, with Marquardt's damping: (F, 3, 8) A^-1 C, (F, 3) A^-1 pull, (8, 8) Schur complement."""
+    """Eliminate the attitudes, with Marquardt's damping: (F, 3, 8) A^-1 C, (F, 3) A^-1 pull, (8, 8) Schur complement.
+
+    A are the blocks of the attitudes, C their coupling with the lens.
+    """
     blocks = terms.turn * np.where(np.eye(3, dtype=bool), 1 + damping, 1.0)
     both = np.concatenate([terms.coupling, terms.pull_turn[:, :, None]], axis=2)
     solved = np.asarray(np.linalg.solve(blocks, both), dtype=np.float64)
@@ -319,9 +330,10 @@ def _reduced(terms: _Normal, damping: float) -> tuple[Floats, Floats, Floats]:
 
 
 def _adjusted(problem: _Problem, seen: Sightings, width: float) -> tuple[_Problem, bool]:
-    """Levenberg-Marquardt on lens and attitudes, and whether it came to rest; width of Cauchy's loss in sigmas.
+    """Minimize over lens and attitudes by Levenberg-Marquardt; returns the problem and whether it converged.
 
-    Raises ValueError where the lens is left unknown.
+    width : of Cauchy's loss in sigmas; inf for least squares
+    Raises ValueError if the lens is undetermined.
     """
     damping = 1e-4
     cost, weight = problem.cost(seen, width)
@@ -335,7 +347,7 @@ def _adjusted(problem: _Problem, seen: Sightings, width: float) -> tuple[_Proble
         moved = problem.bundle.moved(still, np.concatenate([turn.ravel(), np.zeros(3), lens]))
         trial = problem._replace(bundle=moved)
         new_cost, new_weight = trial.cost(seen, width)
-        # Near rest the costs differ by their rounding only.
+        # Near the minimum the costs differ only by rounding, so that a step is accepted within that.
         if new_cost <= cost * (1 + 1e-13) + 1e-20:
             problem, cost, damping = trial, new_cost, max(damping / 10, 1e-12)
             if slope < ba.DECREMENT:
@@ -347,7 +359,7 @@ def _adjusted(problem: _Problem, seen: Sightings, width: float) -> tuple[_Proble
 
 
 def _solved(matrix: Floats, right: Floats) -> Floats:
-    """matrix^-1 right for a positive definite matrix, scaled to a unit diagonal first. Raises ValueError."""
+    """matrix^-1 right for a positive definite matrix, scaled to a unit diagonal. Raises ValueError if it is not."""
     try:
         scale = 1 / np.sqrt(np.maximum(matrix.diagonal(), 1e-300))
         factor = cho_factor(matrix * scale * scale[:, None], lower=True)
@@ -393,7 +405,7 @@ def _report(
 
 
 def _magnitude(frames: Sequence[StarFrame], keep: np.ndarray) -> MagnitudeZero | None:
-    """The magnitudes' offset from the stars that were kept, where every frame tells its brightness."""
+    """The magnitude zero point from the stars that were kept; None unless every frame has brightnesses."""
     flux = [frame.flux for frame in frames if frame.flux is not None]
     v_mag = [frame.v_mag for frame in frames if frame.v_mag is not None]
     if not len(flux) == len(v_mag) == len(frames):
@@ -405,7 +417,7 @@ def _magnitude(frames: Sequence[StarFrame], keep: np.ndarray) -> MagnitudeZero |
 
 
 def _named(frames: Sequence[Centroids], tracker: Tracker, exposure_s: float) -> list[StarFrame]:
-    """The frames that the tracker solves, with the stars that it finds in them."""
+    """The frames that the tracker solves, with their identified stars."""
     named = []
     for centroids in frames:
         match = tracker.solve_centroids(centroids).match

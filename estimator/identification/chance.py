@@ -1,4 +1,4 @@
-"""When a match is beyond chance."""
+"""Significance of a match: binomial probability of as many matches by chance, and the acceptance threshold."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 
 from estimator.core.jit import jit
 
-ACCEPT_LOG10_CHANCE = -5.0  # matches as good as that are expected less often over all that was tried
+ACCEPT_LOG10_CHANCE = -5.0  # log10 of the expected number of chance matches this good, over all hypotheses
 MIN_MATCHES = 4
 
 

@@ -1,4 +1,9 @@
-"""What the identifiers share: angles, an attitude for a few stars, and the direct match of a whole field."""
+"""Direct match: the attitude of a few identified stars is applied to the whole field, and tested against chance.
+
+Common to the published identifiers: angles between directions, the least-squares attitude of a hypothesis (Wahba's
+problem), nearest-neighbor matching of all observed stars at that attitude, and the probability of such a match by
+chance.
+"""
 
 from __future__ import annotations
 
@@ -16,12 +21,12 @@ from estimator.core.jit import jit
 from estimator.core.types import StarMatch
 from estimator.identification.chance import ACCEPT_LOG10_CHANCE, MIN_MATCHES, log10_tail
 
-# Rows of the observed stars, of the catalogue's, R_cam_from_ref, log10 of how often chance does as well.
+# Rows of the observed stars, rows of the catalog, R_cam_from_ref, log10 of the expected number of chance matches.
 Found = tuple[NDArray[np.int64], NDArray[np.int64], Floats, float]
 
 
 def answer(found: Found) -> StarMatch | None:
-    """A match that is beyond chance, or None."""
+    """The match as a StarMatch, or None if it is not significant (ACCEPT_LOG10_CHANCE, MIN_MATCHES)."""
     observed, star, matrix, chance = found
     if len(observed) < MIN_MATCHES or chance > ACCEPT_LOG10_CHANCE:
         return None
@@ -38,13 +43,13 @@ def settled(
     stretch: float,
     tried: int,
 ) -> Found:
-    """The direct match: all observed stars at the attitude of a few, refined once and weighed against chance.
+    """The direct match: match all observed stars at the attitude of a few, refine it once, and test against chance.
 
-    corners, stars : rows of the observed and of the catalogue's stars that the hypothesis rests on, three or more
-    tried          : hypotheses so far, which the chance is multiplied by
+    corners, stars : rows of the observed and of the catalog stars of the hypothesis, two or more
+    tried          : number of hypotheses so far, which multiplies the probability
     """
     matrix = turned(seen[corners], index.vectors[stars])
-    # A few stars' attitude is worse than a star's direction; the refined one needs no such allowance.
+    # The attitude of a few stars is less accurate than a star's direction: the first match has twice the tolerance.
     observed, star, _ = match(seen, index, stars[0], matrix, 2 * tolerance, stretch)
     if len(observed) < MIN_MATCHES:
         return nothing()
@@ -58,20 +63,20 @@ def settled(
 
 @jit
 def nothing() -> Found:
-    """No match: a chance of 1."""
+    """The empty match, with probability 1 by chance."""
     return np.empty(0, np.int64), np.empty(0, np.int64), np.eye(3), 0.0
 
 
 @jit
 def angle(u: Floats, v: Floats) -> float:
-    """Angle between unit vectors by the half-chord, exact when small."""
+    """Angle between unit vectors, from half the chord: accurate for small angles."""
     half = sqrt((u[0] - v[0]) ** 2 + (u[1] - v[1]) ** 2 + (u[2] - v[2]) ** 2) / 2
     return 2 * np.arcsin(min(half, 1.0))
 
 
 @jit
 def triple(u: Floats, v: Floats, w: Floats) -> float:
-    """u . (v x w): whose sign is the handedness of a triangle of directions."""
+    """Triple product u . (v x w); its sign is the handedness of a triangle of directions."""
     return (
         u[0] * (v[1] * w[2] - v[2] * w[1])
         + u[1] * (v[2] * w[0] - v[0] * w[2])
@@ -81,7 +86,7 @@ def triple(u: Floats, v: Floats, w: Floats) -> float:
 
 @jit
 def turned(cam: Floats, ref: Floats) -> Floats:
-    """R_cam_from_ref of directions that weigh alike."""
+    """R_cam_from_ref by Wahba's problem with equal weights."""
     return wahba(cam, ref, np.ones(len(cam)))[0]
 
 
@@ -89,10 +94,11 @@ def turned(cam: Floats, ref: Floats) -> Floats:
 def match(
     seen: Floats, index: PairIndex, centre: int, matrix: Floats, tolerance: float, stretch: float
 ) -> tuple[NDArray, NDArray, float]:
-    """Nearest catalogue star to each observed one within its tolerance; each star once.
+    """Match each observed star to the nearest catalog star within its tolerance; each catalog star is used once.
 
-    centre : a star of the field, about which the density of the catalogue is taken
-    Also returns how probable it is that a direction drawn at random has a star as near as that.
+    centre : row of a catalog star in the field; its neighbors give the local density of the catalog
+    Returns the rows of the observed stars, the rows of the catalog, and the probability that a random direction has a
+    catalog star within the mean tolerance.
     """
     observed, star = np.empty(len(seen), np.int64), np.empty(len(seen), np.int64)
     cap_sr = 2 * pi * (1 - np.cos(index.max_angle_rad))
@@ -117,11 +123,11 @@ def match(
 
 @jit
 def log10_chance(groups: NDArray, seen: int, p: float) -> float:
-    """log10 of the probability that a false attitude matches this much, three independent matches being spent.
+    """log10 of the probability that a false attitude gives this match; three independent matches define the attitude.
 
-    The first match of each group is as improbable as a star's, p. What follows in a group follows from its
-    pattern, which is everybody's: the second light fixes which way the lattice lies (one in ten), each further
-    one is there or not (one in two). Where each star is its own group this is the binomial tail.
+    The first match of each group (patch board) has probability p. All boards have the same pattern, so that further
+    matches of a group are not independent: the second counts 1/10 (it fixes the orientation of the lattice), each
+    further one 1/2 (lit or not). If every star is its own group, this is the binomial tail.
     """
     independent, second, further = 0, 0, 0
     for n in range(len(groups)):

@@ -1,4 +1,4 @@
-"""What every identifier may be told beside the directions, the index and the tolerance."""
+"""Optional parameters common to all identification methods."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from estimator.core.errors import ImageError
 
 @dataclass(frozen=True, slots=True)
 class Options:
-    """The keywords of an identifier, the same for all: one that its method has no use for changes nothing.
+    """Keyword arguments of an identifier. A method ignores those that it does not use.
 
-    stretch       : added to the tolerance of an angle, times the angle
-    zooms         : whether the stretch is one unknown focal length, for each pattern to measure; see `fixed_focal`
+    stretch       : relative tolerance of an angle: stretch * angle is added to its tolerance
+    zooms         : the stretch is one unknown focal length, which each pattern measures; see `fixed_focal`
     max_triangles, max_checks : observed patterns tried, and angles compared, before giving up; the latter bounds
-        the time, at some nanoseconds to tens of them each
-    base_stars    : among how many of the brightest the patterns are sought
-    missed_dex    : what a catalogue star that should be in the field and is not costs, in powers of ten; 0 where
-        nobody knows how faint the camera sees, more where every light is known to shine
+        the time, at a few to tens of nanoseconds each
+    base_stars    : number of brightest stars from which patterns are formed
+    missed_dex    : penalty for each catalog star that is predicted in the field and not observed, in powers of ten;
+        0 if the detection limit is unknown, greater if all sources are known to be on
     field_tan     : (left, right, top, bottom) tangents of the field's edges, for missed_dex
-    magnitude     : (N,) of the observed stars, in the index's scale; None where there is no such scale
-    epsilon_mag   : its error, one standard deviation
-    epsilon_sep_rad : that of an angle between two stars, where the method takes one
-    boresight_ref : (3,) unit vector, where the optical axis is believed to point;  within_rad : and how nearly
+    magnitude     : (N,) of the observed stars, on the index's scale; None if unknown
+    epsilon_mag   : standard deviation of a magnitude
+    epsilon_sep_rad : standard deviation of an angle between two stars, for methods that use it
+    boresight_ref : (3,) unit vector, prior direction of the optical axis;  within_rad : its greatest error
     """
 
     stretch: float = 0.0
@@ -42,14 +42,14 @@ class Options:
     within_rad: float = np.pi
 
     def fixed_focal(self, name: str) -> None:
-        """Raises ImageError for a method whose angles are all it has, where the focal length is unknown."""
+        """Raise ImageError if the focal length is uncertain: method `name` needs calibrated angles."""
         if self.zooms:
             raise ImageError(
                 f"{name}: the focal length is uncertain; allowed: a calibrated camera, or pyramid"
             )
 
     def light(self, count: int) -> Floats:
-        """(N,) magnitudes of the observed stars, NaN where they are not known."""
+        """(N,) magnitudes of the observed stars, NaN if unknown. Raises ImageError for an array of another shape."""
         if self.magnitude is None:
             return np.full(count, np.nan)
         if np.shape(self.magnitude) != (count,):

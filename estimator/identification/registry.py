@@ -13,7 +13,7 @@ from estimator.identification.published.shefex import shefex
 
 Identifier = Callable[..., StarMatch | None]
 
-# `default` is the pyramid where the focal length is uncertain; a known camera's stars are found by evidence (ledpairs).
+# StarTracker does not look up `default`: it uses identification/stars/search.py. The entry is for direct callers.
 IDENTIFIERS: dict[str, Identifier] = {
     "default": pyramid,
     "pyramid": pyramid,

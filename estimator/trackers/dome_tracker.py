@@ -1,4 +1,8 @@
-"""From a frame to an attitude under an LED dome, with a camera on a lever arm about the bearing centre."""
+"""Star tracker for an LED dome: from a frame to an attitude, with the camera on a lever arm about the bearing center.
+
+Stages: detect and centroid (`pipeline`), identify LEDs, match the whole field with the exact near-field geometry,
+reject blended LEDs, and solve.
+"""
 
 from __future__ import annotations
 
@@ -23,22 +27,23 @@ from estimator.identification.registry import IDENTIFIERS as STAR_IDENTIFIERS
 from estimator.trackers.pipeline import Clock, Report, Settings, brightest, direction_sigma_rad, look
 from estimator.trackers.star_tracker import NO_STARS, mutual
 
-LEAST_ERROR_PX = 0.3  # of a light, for what no survey and no calibration knows of
+LEAST_ERROR_PX = 0.3  # least centroid error of an LED, for effects outside of survey and calibration
 SETTINGS = Settings(identifier="led_pairs", solver="rotation_only")
 Identify = Callable[[Floats, Floats], StarMatch | str]
 
 
 def led_pairs(camera: Camera, leds: LedMap, lever: Lever, settings: Settings) -> Identify:
-    """Pairs of lights at the LEDs' own distances, by evidence; see `ledpairs.identify`."""
+    """The default LED identifier: pair hypotheses and evidence; see `identification.leds.search.identify`."""
     sight = sight_of(leds, lever, camera)
     least_rad = LEAST_ERROR_PX / camera.focal_px
     return lambda rays_cam, sigma_rad: search.identify(rays_cam, np.hypot(sigma_rad, least_rad), sight)
 
 
 def as_stars(name: str, camera: Camera, leds: LedMap, lever: Lever, settings: Settings) -> Identify:
-    """One of the stars' identifiers, after every ray is carried to one sphere about the bearing.
+    """A star identifier applied to directions from the bearing, where the rays meet one sphere of the median radius.
 
-    A dome that is no sphere stretches the angles, as the lever stretches an error of range.
+    On a dome that is not a sphere this changes the angles; the tolerance therefore has a stretch, from the spread of
+    the radii and the lever.
     """
     radius = np.linalg.norm(leds.position_m, axis=1)
     usual_m, pupil_m = float(np.median(radius)), lever.cam_from_body.apply(lever.camera_body_m)
@@ -63,7 +68,8 @@ def as_stars(name: str, camera: Camera, leds: LedMap, lever: Lever, settings: Se
     return identify
 
 
-# Each of (camera, leds, lever, settings) -> what tells (N, 3) rays and their (N,) errors apart, or says why not.
+# Each maps (camera, leds, lever, settings) to a function that identifies (N, 3) rays with (N,) errors: it returns the
+# match, or the reason for a refusal.
 IDENTIFIERS: dict[str, Callable[[Camera, LedMap, Lever, Settings], Identify]] = {
     "led_pairs": led_pairs,
     "pyramid": partial(as_stars, "pyramid"),
@@ -72,10 +78,10 @@ IDENTIFIERS: dict[str, Callable[[Camera, LedMap, Lever, Settings], Identify]] = 
 
 
 class DomeTracker:
-    """Lost under an LED dome, with a camera on a lever arm about the bearing centre.
+    """Lost-in-space tracker under an LED dome, with the camera on a lever arm about the bearing center.
 
-    cam_from_ref of the answer is cam_from_lab; `lever` turns it into the vehicle's attitude. Raises ImageError for a
-    lever longer than the dome is wide, and for too few LEDs.
+    cam_from_ref of the result is cam_from_lab; `lever` converts it to the vehicle's attitude. Raises ImageError if
+    the lever is longer than the dome is wide, or if there are too few LEDs.
     """
 
     def __init__(
@@ -92,14 +98,14 @@ class DomeTracker:
         self.led_sigma_rad = float(leds.sigma_m / reach_m)
 
     def solve(self, image: NDArray, streak_px: tuple[float, float] | None = None) -> Report:
-        """One frame to an attitude. Raises ImageError for bad input; anything else that fails is a status.
+        """Solve one frame. Raises ImageError for bad input; any other failure is reported in the status.
 
-        streak_px : (dx, dy) that stars move in the exposure, from the gyro; None where there is none
+        streak_px : (dx, dy) that lights move during the exposure, from the gyro; None if unknown
         """
         return look(image, self.camera, self.settings, self.solve_centroids, streak_px)
 
     def solve_centroids(self, centroids: Centroids, clock: Clock | None = None) -> Attitude:
-        """The stages after centroiding, for centroids from anywhere (the truth included)."""
+        """Identify and solve centroids from any source (the truth included)."""
         clock = clock or Clock()
         if len(centroids) < LEAST:
             return Attitude(NO_STARS)
@@ -115,9 +121,10 @@ class DomeTracker:
         return attitude
 
     def _refined(self, centroids: Centroids, match: StarMatch) -> Attitude:
-        """Match every centroid by the exact geometry, then let the chosen solver say what it makes of the matches.
+        """Match every centroid with the exact geometry, then solve these matches with the solver of the settings.
 
-        A solver that is not exact would lose the lights themselves: it is compared on the same matches as the others.
+        The matching always uses the exact solver: an approximate one could lose matches. All solvers are therefore
+        compared on the same matches.
         """
         observed, star = match.observed, match.star
         body_from_lab = self.lever.cam_from_body.inv() * match.cam_from_ref
@@ -130,7 +137,7 @@ class DomeTracker:
                     "rotation_only", rays, sigma_rad, observed, star, body_from_lab
                 )
                 observed, star = self._nearest(centroids, body_from_lab, widened * radius_px)
-                # The exact geometry must confirm all that identification found.
+                # The exact geometry must confirm as many matches as identification found.
                 if len(observed) < len(match.observed):
                     return Attitude(NO_MATCH)
             observed, star, misfit = self._without_blends(centroids, sigma_rad, observed, star, body_from_lab)
@@ -153,14 +160,14 @@ class DomeTracker:
         )
 
     def _sigma_rad(self, centroids: Centroids, rays: Floats, solver: str) -> Floats:
-        """(N,) error of what a method fits, by the pixels and by the LEDs' places."""
+        """(N,) standard deviation of a solver's residuals, from the centroids and the LED positions."""
         pixel_rad = direction_sigma_rad(centroids, self.camera, self.settings)
         return np.hypot(fitted_sigma_rad(solver, rays, pixel_rad), self.led_sigma_rad)
 
     def _residual_px(
         self, centroids: Centroids, observed: NDArray, star: NDArray, body_from_lab: Rotation
     ) -> Floats:
-        """(K, 2) predicted less seen."""
+        """(K, 2) predicted minus observed pixels."""
         predicted = project(body_from_lab, self.leds.position_m[star], self.lever, self.camera)
         return predicted - centroids.xy_px[observed]
 
@@ -172,11 +179,11 @@ class DomeTracker:
         star: NDArray,
         body_from_lab: Rotation,
     ) -> tuple[NDArray, NDArray, float]:
-        """The matches without those far beyond the others' residuals, and by how much the rest scatter too much.
+        """Reject matches with outlying residuals; returns the rest and a factor for their covariance.
 
-        Two LEDs whose images touch are one blob, in neither's place: far from where the sharp ones are. Residuals are
-        weighed by their sigmas; 5 times their median length is beyond 20 sigma^2 of a chi-square of two. What is left
-        has 2 K - 3 degrees of freedom; a chi-square above that by more than chance widens the covariance.
+        Two LEDs whose images touch form one blob at neither's position. Residual lengths are divided by their sigmas;
+        those above 5 times the median (above 5 if the median is below 1) are rejected. The rest has 2 K - 3 degrees of
+        freedom; if its reduced chi-square exceeds 1 by more than 3 standard deviations, it is the factor, else 1.
         """
         residual = self._residual_px(centroids, observed, star, body_from_lab)
         length = np.linalg.norm(residual, axis=1) / (sigma_rad[observed] * self.camera.focal_px)
@@ -189,9 +196,9 @@ class DomeTracker:
         return observed[kept], star[kept], excess if excess > by_chance else 1.0
 
     def _lever_covariance(self, cam_from_lab: Rotation, star: NDArray) -> Floats:
-        """(3, 3) covariance in camera axes by the pupil's place, the same in every frame.
+        """(3, 3) covariance in camera axes from the error of the pupil's position, which is common to all frames.
 
-        The sight of a light at p from the bearing stays as it was if the vehicle turns by p x shift / |p|^2.
+        A shift of the pupil has the same effect on a light at p from the bearing as a rotation by p x shift / |p|^2.
         """
         middle_m = cam_from_lab.apply(self.leds.position_m[star].mean(axis=0))
         along = middle_m / np.linalg.norm(middle_m)
@@ -207,7 +214,7 @@ class DomeTracker:
         star: NDArray,
         body_from_lab: Rotation,
     ) -> tuple[Rotation, Floats]:
-        """body_from_lab and its covariance in body axes, by the matched rays alone."""
+        """body_from_lab and its covariance in body axes, from the matched rays."""
         place_m = self.leds.position_m[star]
         return SOLVERS[solver](
             rays[observed], sigma_rad[observed], place_m, self.leds, self.lever, body_from_lab
@@ -216,8 +223,8 @@ class DomeTracker:
     def _nearest(
         self, centroids: Centroids, body_from_lab: Rotation, radius_px: float
     ) -> tuple[NDArray, NDArray]:
-        """Pairs of centroid and LED that are each other's nearest within a radius."""
+        """Mutual nearest neighbors of centroids and LEDs within a radius: rows of both."""
         xy = project(body_from_lab, self.leds.position_m, self.lever, self.camera)
-        # An LED whose middle is just off the chip still shines onto it.
+        # An LED whose center is just off the chip may still have light on it.
         inside = np.flatnonzero(self.camera.contains(np.nan_to_num(xy, nan=-1e9), -30.0))
         return mutual(centroids.xy_px, xy[inside], radius_px, inside)

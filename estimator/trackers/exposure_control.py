@@ -1,14 +1,14 @@
-"""How long to expose: SHEFEX-2's camera control (Samaan & Theil 2011, section 3.1 and fig. 2).
+"""Automatic exposure control of SHEFEX-2's camera (Samaan & Theil 2011, section 3.1 and fig. 2).
 
-Two flags decide. `saturated`: the mean of the frame is above a reference, as where a bright body shines into the
-lens; or at least four objects hold more than one saturated pixel each, so that one planet shortens nothing.
-`no_stars`: fewer than four objects, too few to identify. A step is 2 ms.
+Two flags decide. `saturated`: the mean of the frame is above a reference, for example because a bright body shines into
+the lens; or at least four objects have more than one saturated pixel each, so that a single planet does not shorten the
+exposure. `no_stars`: fewer than four objects, too few to identify. A step is 2 ms.
 
     saturated                shorter by a step
     not saturated, no_stars  longer by a step
     neither                  unchanged
 
-`saturated` comes first: in glare stars are lost too, and the chart's first purpose is not to expose longer then.
+`saturated` has priority: glare also hides stars, and a longer exposure would make it worse.
 """
 
 from __future__ import annotations
@@ -30,14 +30,15 @@ INCREMENT_S = 1e-6
 
 @dataclass(frozen=True, slots=True)
 class Control:
-    """The chart's constants; the paper's, but for the reference mean, which it does not print.
+    """Parameters of the control. The defaults are the paper's; it does not state mean_dn.
 
-    mean_dn     : the frame's mean above which it is no picture of stars
+    mean_dn     : reference mean; a frame with a greater mean is saturated
     longest_s   : 50 ms is the paper's on-board limit, for a smear of 4.5 px at 2 deg/s
-    least_stars : fewer cannot be identified
-    overexposed_objects, saturated_px : so many objects of more saturated pixels than that are too many
+    least_stars : with fewer objects the flag no_stars is set
+    overexposed_objects, saturated_px : a frame is saturated if at least overexposed_objects objects have more than
+        saturated_px saturated pixels each
 
-    Raises ValueError for limits outside of the camera's or numbers that are not usable.
+    Raises ValueError for limits outside of the camera's range or for invalid numbers.
     """
 
     mean_dn: float
@@ -62,11 +63,11 @@ class Control:
 
 @dataclass(frozen=True, slots=True)
 class Observation:
-    """What the image processing says of one frame.
+    """Measurements of one frame for the exposure control.
 
     mean_dn     : of all pixels
-    stars       : how many objects the centroiding delivered
-    overexposed : how many of them hold more than `Control.saturated_px` saturated pixels
+    stars       : number of objects from centroiding
+    overexposed : number of objects with more than `Control.saturated_px` saturated pixels
     """
 
     mean_dn: float
@@ -76,7 +77,7 @@ class Observation:
 
 @dataclass(frozen=True, slots=True)
 class Exposure:
-    """The exposure to take next, and the flags of the frame that it was decided on."""
+    """The next exposure time, and the flags of the frame that it is based on."""
 
     time_s: float
     saturated: bool = False
@@ -84,7 +85,7 @@ class Exposure:
 
 
 def step(state: Exposure, seen: Observation, control: Control) -> Exposure:
-    """Once through the chart: the next exposure, within the limits and in whole microseconds."""
+    """The next exposure from one frame's measurements, within the limits and in whole microseconds."""
     saturated = seen.mean_dn > control.mean_dn or seen.overexposed >= control.overexposed_objects
     no_stars = seen.stars < control.least_stars
     longer = -1 if saturated else int(no_stars)
@@ -94,12 +95,12 @@ def step(state: Exposure, seen: Observation, control: Control) -> Exposure:
 
 
 def observe(image: NDArray, box_px: Ints, saturation_dn: float, control: Control) -> Observation:
-    """Look at a frame for the chart.
+    """Measure a frame for the exposure control.
 
-    image  : (H, W); box_px : (N, 4) x0, y0, x1, y1 of the objects, both ends included, as Blobs has them
-    saturation_dn : the value from which a pixel counts as saturated
+    image  : (H, W); box_px : (N, 4) x0, y0, x1, y1 of the objects, both ends included, as in Blobs
+    saturation_dn : least value of a saturated pixel
 
-    Raises ImageError for boxes beyond the image.
+    Raises ImageError for boxes outside of the image.
     """
     boxes = np.asarray(box_px, dtype=np.int64).reshape(-1, 4)
     height, width = image.shape
@@ -112,7 +113,7 @@ def observe(image: NDArray, box_px: Ints, saturation_dn: float, control: Control
 
 @jit
 def _counted(image: NDArray, box_px: Ints, saturation_dn: float, allowed: int) -> tuple[float, int]:
-    """Mean of the frame, and how many boxes hold more saturated pixels than allowed."""
+    """Mean of the frame, and number of boxes with more than `allowed` saturated pixels."""
     total = 0.0
     for y in range(image.shape[0]):
         row = 0.0

@@ -1,4 +1,4 @@
-"""What every tracker shares: its settings, and the stages from a frame to its lights."""
+"""Settings and processing stages common to all trackers: detection, centroiding, timing."""
 
 from __future__ import annotations
 
@@ -18,24 +18,26 @@ from estimator.detection.classify import NO_STAR, Flag
 from estimator.detection.detect import DETECTORS, mend
 
 SATURATED = "the frame is saturated"
-# A plateau's edge falls by whole pixels: 0.01 to 0.07 by Monte Carlo, as it is cut off deeper.
+# Extra centroid error of a saturated blob, whose plateau has edges at whole pixels. Monte Carlo: 0.01 to 0.07 px, more
+# with deeper saturation.
 SATURATED_SIGMA_PX = 0.05
-VAGUE_PX = 5.0  # a light of so great an error may be any star, and costs the search more than it can tell
-MENDED_SIGMA_PX = 0.06  # of a star on a bad pixel, for the guess at what that would have held: Monte Carlo
+VAGUE_PX = 5.0  # a centroid with a greater error could match any star: it costs the search more than it helps
+MENDED_SIGMA_PX = 0.06  # extra error of a centroid on an interpolated bad pixel, from Monte Carlo
 
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """Which algorithm does each stage, and its thresholds.
+    """Algorithm of each stage, and its parameters.
 
-    centroid_sigma_px : floor of a centroid's error, for what its own noise does not cover
-    base_stars        : among how many of the brightest blobs patterns are sought
-    field_stars       : how many catalogue stars a field should hold on average when patterns are sought
-    merge_px          : catalogue stars nearer to one another are one light
-    zero_point_mag    : magnitude of a light of flux 1; None where it is not known, and magnitudes tell nothing
-    magnitude_sigma   : error of a star's magnitude, what its colour does included
-    reject            : flags of `judge.Flag` with which a blob is taken for no star and dropped
-    bad_px            : (K, 2) x and y of the sensor's bad pixels; None where there is no map
+    centroid_sigma_px : floor of a centroid's error, for errors beyond its own noise
+    base_stars        : number of brightest blobs from which patterns are formed
+    field_stars       : mean number of catalog stars per field in the pattern index
+    merge_px          : catalog stars closer than this are merged into one
+    zero_point_mag    : magnitude of a source of flux 1; None if unknown: magnitudes are then not used
+    magnitude_sigma   : standard deviation of a star's magnitude, including the effect of its color
+    missed_dex        : see `identification.options.Options`
+    reject            : flags of `detection.classify.Flag` that exclude a blob
+    bad_px            : (K, 2) x and y of the sensor's bad pixels; None without a map
     """
 
     detector: str = "default"
@@ -60,7 +62,7 @@ class Settings:
 
 @dataclass(slots=True)
 class Report:
-    """One frame's answer with what it rests on: the centroids, and seconds spent by stage."""
+    """Result of one frame: the attitude, the centroids, and the time of each stage in seconds."""
 
     attitude: Attitude
     centroids: Centroids
@@ -68,7 +70,7 @@ class Report:
 
 
 class Clock:
-    """Seconds between laps, by name."""
+    """Stopwatch: accumulated seconds between laps, by name."""
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}
@@ -87,13 +89,14 @@ def see(
     clock: Clock,
     streak_px: tuple[float, float] | None = None,
 ) -> Centroids:
-    """Detect and centroid. Raises ImageError for a frame that cannot be one of this camera's.
+    """Detect blobs and compute their centroids, without those that cannot be stars or are too inaccurate.
 
-    streak_px : (dx, dy) that stars move during the exposure, from the gyro; None where there is none
+    streak_px : (dx, dy) that stars move during the exposure, from the gyro; None if unknown
+    Raises ImageError for a frame of another shape than the camera's, or a saturated one.
     """
     check_shape(image.shape, camera)
     if np.isfinite(settings.saturation):
-        some = image[::37]  # enough to tell a half
+        some = image[::37]  # a sample of rows is enough to estimate the saturated fraction
         if np.count_nonzero(some >= settings.saturation) > 0.5 * some.size:
             raise ImageError(f"{SATURATED}: over half of its pixels are at {settings.saturation:g}")
     if settings.bad_px is not None:
@@ -114,7 +117,7 @@ def see(
 
 
 def doubted(centroids: Centroids, blobs: Blobs, settings: Settings) -> Centroids:
-    """The centroids with what their noise does not tell: of saturated blobs, and of those on bad pixels."""
+    """The centroids with increased errors for saturated blobs and for blobs that touch bad pixels."""
     extra = SATURATED_SIGMA_PX * (blobs.flag & int(Flag.SATURATED) != 0)
     if settings.bad_px is not None and len(blobs):
         bad = np.asarray(settings.bad_px)[:, None]
@@ -135,23 +138,23 @@ def look(
     solve: Callable[[Centroids, Clock], Attitude],
     streak_px: tuple[float, float] | None = None,
 ) -> Report:
-    """A frame through all stages, timed."""
+    """Process a frame through all stages: detect, centroid, then `solve`. Returns the report with timings."""
     clock = Clock()
     centroids = see(image, camera, settings, clock, streak_px)
     return Report(solve(centroids, clock), centroids, clock.seconds)
 
 
 def brightest(centroids: Centroids, settings: Settings) -> Centroids:
-    """As many as identification looks at: twice those among which it seeks its patterns."""
+    """The brightest centroids, 2 * base_stars at most, for identification."""
     return centroids.take(np.arange(min(len(centroids), 2 * settings.base_stars)))
 
 
 def direction_sigma_rad(centroids: Centroids, camera: Camera, settings: Settings) -> Floats:
-    """(N,) error of a direction: the centroid's own, and the floor for what that does not cover."""
+    """(N,) standard deviation of a direction, rad: the centroid's own error and the floor centroid_sigma_px."""
     return np.hypot(centroids.sigma_px, settings.centroid_sigma_px) / camera.focal_px
 
 
 def whole(box_px: NDArray, camera: Camera) -> NDArray:
-    """(N,) whether a blob's box keeps off the border: one cut off by it has its centre elsewhere."""
+    """(N,) whether a blob's box is away from the border; a blob cut off by the border has a biased centroid."""
     x0, y0, x1, y1 = box_px.T
     return (x0 > 0) & (y0 > 0) & (x1 < camera.width_px - 1) & (y1 < camera.height_px - 1)

@@ -1,4 +1,10 @@
-"""The sequence of stages, from a frame to an attitude, for stars at infinity; `dometracker` has that for a dome."""
+"""Star tracker for the real sky: from a frame to an attitude, lost in space. `dome_tracker` does the same for a dome.
+
+Stages: detect and centroid (`pipeline`), identify, solve. The default identifier (`identification/stars/search.py`)
+computes identity, attitude and covariance in one step by Bayesian evidence. The candidates of a published identifier
+(`registry`) are matched to the full catalog, refined, and accepted if the match is significant. If the focal length
+is uncertain, it and the first radial distortion coefficient are fitted to each frame's stars.
+"""
 
 from __future__ import annotations
 
@@ -26,26 +32,26 @@ from estimator.trackers.pipeline import Clock, Report, Settings, brightest, dire
 
 NO_STARS = "too few stars detected"
 NO_MATCH = "no identification beyond chance"
-LEAST_ERROR_PX = 0.02  # of a star, for what no calibration knows of
-# By how much lights may be off, in pixels and as a share of the distance from the middle, and how many are looked up
-# before a frame is given up: 400,000 take two hundredths of a second.
+LEAST_ERROR_PX = 0.02  # least centroid error of a star, for uncalibrated effects
+# Error model and effort of one search: extra centroid error in px, error as a fraction of the distance from the
+# principal point, and greatest number of star look-ups: 400,000 take about 0.02 s.
 Lens = tuple[float, float, int]
 KNOWN_LENS: tuple[Lens, ...] = ((LEAST_ERROR_PX, 0.0, 400_000),)
 UNKNOWN_LENS: tuple[Lens, ...] = ((0.5, 0.0, 200_000), (1.0, 0.005, 600_000), (2.0, 0.01, 300_000))
-# By which a light outshines what its star should give: beyond colours, variables and doubles.
+# A detection brighter than its star by this much is a mismatch: more than colors, variables and doubles explain.
 TOO_BRIGHT_MAG = 2.0
 CORNERS = np.array([[0, 0], [1, 0], [0, 1], [1, 1]])
 SETTINGS = Settings()
 
 
 class StarTracker:
-    """Lost in space under the real sky.
+    """Lost-in-space star tracker for the real sky.
 
-    camera  : the believed calibration
-    stars   : the on-board star list
+    camera  : on-board calibration
+    stars   : on-board star list
     vectors : (N, 3) apparent directions of `stars` at the time of the frames
-    focal_uncertainty : relative; 0 for a calibrated camera, 0.05 where only the field of view is known to 5 %.
-        Where it is not 0 the focal length and, with enough stars, the radial distortion are fitted in each frame.
+    focal_uncertainty : relative; 0 for a calibrated camera, 0.05 if the field of view is only known to 5 %.
+        Unless it is 0, the focal length and, with enough stars, the radial distortion are fitted in each frame.
     """
 
     def __init__(
@@ -112,23 +118,23 @@ class StarTracker:
         return cls(camera, stars, vectors, settings, focal_uncertainty)
 
     def solve(self, image: NDArray, streak_px: tuple[float, float] | None = None) -> Report:
-        """One frame to an attitude. Raises ImageError for bad input; anything else that fails is a status.
+        """Solve one frame. Raises ImageError for bad input; any other failure is reported in the status.
 
-        streak_px : (dx, dy) that stars move in the exposure, from the gyro; None where there is none
+        streak_px : (dx, dy) that stars move during the exposure, from the gyro; None if unknown
         """
         return look(image, self.camera, self.settings, self.solve_centroids, streak_px)
 
     @property
     def efforts(self) -> int:
-        """How many searches, each of more effort than the one before, are made before a frame is given up."""
+        """Number of searches, with different error models and efforts, that are made before a frame is given up."""
         return len(self.lenses) if self.patterns is not None else 1
 
     def solve_centroids(
         self, centroids: Centroids, clock: Clock | None = None, effort: int | None = None
     ) -> Attitude:
-        """The stages after centroiding, for centroids from anywhere (the truth included).
+        """Identify and solve centroids from any source (the truth included).
 
-        effort : this one of `efforts` alone, from 0; all of them in turn if left out
+        effort : run only this one of the `efforts` searches, from 0; None: all of them in turn
         """
         clock = clock or Clock()
         if len(centroids) < LEAST:
@@ -146,9 +152,10 @@ class StarTracker:
         return Attitude(NO_MATCH)
 
     def solve_named(self, centroids: Centroids, observed: Ints, star: Ints) -> Attitude:
-        """The attitude alone, for names from anywhere (the truth included): centroids `observed` are the stars `star`.
+        """Solve the attitude for given matches from any source (the truth included), without identification.
 
-        Both (K,), K >= 2; `star` are rows of `self.stars`. Nothing is held against chance: its log10 is NaN.
+        observed, star : (K,) rows of the centroids and of `self.stars`, K >= 2
+        The match is not tested against chance: its log10_chance is NaN.
         """
         sigma_px = self.sigma_px(centroids)[observed]
         rays, vectors = self.camera.rays(centroids.xy_px[observed]), self.stars.vectors[star]
@@ -168,7 +175,7 @@ class StarTracker:
         )
 
     def sigma_px(self, centroids: Centroids, loose_px: float = LEAST_ERROR_PX, slack: float = 0.0) -> Floats:
-        """(N,) a centroid's error all told: its own, the floor, and a share of the distance from the middle."""
+        """(N,) total centroid error: its own, a floor, and slack times the distance from the principal point."""
         sigma_px = np.hypot(centroids.sigma_px, max(self.settings.centroid_sigma_px, loose_px))
         if slack == 0:
             return sigma_px
@@ -176,13 +183,17 @@ class StarTracker:
         return np.hypot(sigma_px, slack * from_middle_px)
 
     def lights(self, centroids: Centroids, sigma_px: Floats) -> Lights:
-        """Centroids laid out for the search."""
+        """The centroids as input of the search, with magnitudes if the zero point is known.
+
+        sigma_px : (N,) total errors
+        """
         settings = self.settings
         mag = np.full(len(centroids), np.nan)
         if settings.zero_point_mag is not None:
             mag = settings.zero_point_mag - 2.5 * np.log10(centroids.flux)
         weight = centroids.weights_per_px2(sigma_px) * self.camera.focal_px**2
         xx, yy, xy = weight.T
+        # The smaller eigenvalue of the inverse covariance belongs to the axis of the greatest error.
         return Lights(
             self.camera.tangents(centroids.xy_px),
             1 / np.sqrt((xx + yy) / 2 - np.hypot((xx - yy) / 2, xy)),
@@ -196,7 +207,10 @@ class StarTracker:
     def _by_evidence(
         self, centroids: Centroids, patterns: sky_index.Sky, lenses: tuple[Lens, ...], clock: Clock
     ) -> Attitude:
-        """Identity, attitude and covariance in one; where the lens is uncertain, it is fitted to all stars then."""
+        """Solve by the default identifier; if the focal length is uncertain, then fit the lens to all stars.
+
+        If that fit fails, the fix itself is returned for a search without slack; with slack the next search follows.
+        """
         for loose_px, slack, checks in lenses:
             sigma_px = self.sigma_px(centroids, loose_px, slack)
             base = self.settings.base_stars
@@ -216,7 +230,7 @@ class StarTracker:
         return Attitude(NO_MATCH)
 
     def attitude_of(self, centroids: Centroids, fix: Fix, sigma_px: Floats) -> Attitude:
-        """The answer that a fix is, solved again where another solver is named."""
+        """The attitude of a fix; solved again from its matches if the settings name another solver."""
         camera = self.camera.zoomed(fix.zoom) if self.focal_uncertainty else self.camera
         cam_from_ref, covariance_rad2 = Rotation.from_quat(fix.cam_from_ref_xyzw), fix.covariance_rad2
         solver = self.settings.solver
@@ -230,9 +244,10 @@ class StarTracker:
         return Attitude("solved", cam_from_ref, covariance_rad2, match, rms_px, camera)
 
     def _lost_in_space(self, centroids: Centroids) -> Iterator[tuple[Camera, Rotation]]:
-        """Attitudes worth refining, by the identifier that is named.
+        """Candidate attitudes and cameras by the published identifier that the settings name.
 
-        Of the focal lengths that are possible: a little effort at all before much at any.
+        If the focal length is uncertain, its interval is searched in steps of 2 %, first with little effort at all
+        steps, then with more.
         """
         identify = IDENTIFIERS[self.settings.identifier]
         step, stretch = 0.02, 0.011 if self.focal_uncertainty else 5e-4
@@ -259,9 +274,14 @@ class StarTracker:
                     yield camera, match.cam_from_ref
 
     def _refined(self, centroids: Centroids, camera: Camera, cam_from_ref: Rotation) -> Attitude:
-        """Match the whole field to the full catalogue, fit, tighten, and weigh the result against chance."""
+        """Refine an attitude: match the field to the full catalog and fit, with decreasing radii; test against chance.
+
+        If the focal length is uncertain, each round also fits the camera (`fit_camera`), and the result must be within
+        1.2 times the uncertainty.
+        """
         fits = self.focal_uncertainty > 0
         reach_px = np.hypot(camera.width_px, camera.height_px) / 2
+        # With an uncertain lens the first radii allow for its error at the corner; each fit permits a smaller radius.
         radii_px = [0.008 * reach_px + 2, 0.004 * reach_px + 2, 4, 3, 2.5, 2.5] if fits else [3, 2.5, 2.5]
         for radius_px in radii_px:
             observed, star = self._nearest(centroids, camera, cam_from_ref, radius_px)
@@ -300,7 +320,7 @@ class StarTracker:
         )
 
     def in_field(self, camera: Camera, cam_from_ref: Rotation) -> tuple[NDArray, Floats]:
-        """Rows and pixels of the catalogue stars on the sensor."""
+        """Rows and pixels of the catalog stars on the sensor, brightest first."""
         boresight = cam_from_ref.inv().apply([0.0, 0.0, 1.0])
         rows = np.array(
             self.tree.query_ball_point(boresight, 2 * np.sin(camera.diagonal_rad / 4) * 1.05), int
@@ -313,13 +333,13 @@ class StarTracker:
     def _nearest(
         self, centroids: Centroids, camera: Camera, cam_from_ref: Rotation, radius_px: float
     ) -> tuple[NDArray, NDArray]:
-        """Pairs of centroid and catalogue star that are each other's nearest within a radius."""
+        """Mutual nearest neighbors of centroids and catalog stars within a radius, without much too bright ones."""
         rows, xy = self.in_field(camera, cam_from_ref)
         observed, star = mutual(centroids.xy_px, xy, radius_px, rows)
         if len(star) < MIN_MATCHES:
             return observed, star
-        # The catalogue's magnitude of a light of one count is about the same for all, and less only where not all of a
-        # light is seen (saturation). A light far above the others' is a planet, a lamp, a mirror image.
+        # The zero point from each match is about the same for all stars; saturation loses flux and makes it smaller.
+        # One far above the median is a planet, a lamp or a reflection near a faint star.
         zero_mag = self.stars.v_mag[star] + 2.5 * np.log10(centroids.flux[observed])
         off = zero_mag - np.median(zero_mag)
         own = off < max(TOO_BRIGHT_MAG, 4 * float(np.median(np.abs(off))))
@@ -329,12 +349,12 @@ class StarTracker:
 def log10_chance(
     observed: NDArray, blobs: int, predicted: int, radius_px: float, camera: Camera, patterns: int
 ) -> float:
-    """log10 of how many matches this good were to be expected by chance among all patterns tried.
+    """log10 of the expected number of matches this good by chance, over all patterns tried.
 
-    A false blob falls within the radius of one of the predicted stars with the probability p = share of the
-    sensor that the circles cover; two matches are spent on the attitude itself. Faint blobs are mostly false, so
-    the matches are weighed among the brightest 15, 30, 60 and all of the blobs, the best counts, and the choice
-    among four is paid for.
+    A false blob falls within the radius of a predicted star with probability p, the fraction of the sensor that the
+    circles cover; two matches define the attitude and do not count. Faint blobs are mostly false, so that the binomial
+    tail is computed among the brightest 15, 30, 60 and all of the blobs. The least counts, multiplied by the number of
+    choices.
     """
     p = 1 - np.exp(-predicted * np.pi * radius_px**2 / (camera.width_px * camera.height_px))
     heads = [head for head in (15, 30, 60) if head < blobs] + [blobs]
@@ -343,7 +363,7 @@ def log10_chance(
 
 
 def mutual(seen_px: Floats, predicted_px: Floats, radius_px: float, rows: NDArray) -> tuple[NDArray, NDArray]:
-    """Indices of pixels and the rows of predictions that are each other's nearest within a radius."""
+    """Mutual nearest neighbors within a radius: indices of seen_px, and `rows` of the predictions."""
     if not len(predicted_px) or not len(seen_px):
         return np.empty(0, int), np.empty(0, int)
     apart, nearest = cKDTree(predicted_px).query(seen_px, distance_upper_bound=radius_px)
@@ -356,9 +376,9 @@ def mutual(seen_px: Floats, predicted_px: Floats, radius_px: float, rows: NDArra
 def fit_camera(
     camera: Camera, cam_from_ref: Rotation, xy_px: Floats, vectors_ref: Floats
 ) -> tuple[Camera, Rotation]:
-    """Attitude, focal length and (from 12 stars on) the first radial coefficient that fit the pixels best.
+    """Fit attitude, focal length and (with 12 stars or more) the first radial distortion coefficient to the pixels.
 
-    Robust (soft L1 beyond a pixel), so that a wrong pair does not bend the lens.
+    Robust least squares (soft L1 loss beyond one pixel), so that a wrong match has little effect on the lens.
     """
     radial = len(xy_px) >= 12
     start = np.zeros(5 if radial else 4)

@@ -1,4 +1,10 @@
-"""A star tracker that remembers: it looks where the stars must be now, and everywhere when they are not there."""
+"""Tracking mode of a star tracker: predict the attitude, centroid only in windows around the predicted stars.
+
+The prediction is the last attitude, propagated with the gyros or with the last rate. Stars are searched for in small
+windows around their predicted positions, and the fitted attitude is accepted by the same Bayes factor as in the
+lost-in-space search, increased because the prediction restricts the volume of possible attitudes. If that fails, or the
+last attitude is too old, the whole frame is solved lost in space.
+"""
 
 from __future__ import annotations
 
@@ -21,32 +27,32 @@ from estimator.identification.stars.search import ACCEPT_DEX
 from estimator.trackers.pipeline import Clock, Report, doubted, see
 from estimator.trackers.star_tracker import StarTracker
 
-WINDOW_SIGMA = 4.0  # a star is expected there: fewer false ones than in a whole frame
-LONGEST_STREAK_PX = 4.0  # a longer one is sought by a filter of its own, in the whole frame
-ROUGH = 3.0  # chi-square a degree of freedom
+WINDOW_SIGMA = 4.0  # detection threshold in windows: lower than in a frame, as fewer pixels are searched
+LONGEST_STREAK_PX = 4.0  # longer streaks are detected with the streak filter in the whole frame
+ROUGH = 3.0  # reduced chi-square above which a solution is flagged
 
 
 class Health(IntFlag):
-    """What is to be known of an answer."""
+    """Quality flags of a solution."""
 
     GOOD = 0
     LOST = 1  # no attitude
-    SEARCHED = 2  # found lost in space, in this frame
-    FEW = 4  # five stars or fewer
-    MISSING = 8  # less than half of the stars that were to be seen
-    ROUGH = 16  # residuals of more than their errors: chi-square over three a degree of freedom
-    SATURATED = 32  # a star too bright
-    SMEARED = 64  # streaks of more than eight pixels
+    SEARCHED = 2  # solved lost in space in this frame
+    FEW = 4  # five matched stars or fewer
+    MISSING = 8  # fewer than half of the expected stars are matched
+    ROUGH = 16  # residuals exceed their errors: reduced chi-square above 3
+    SATURATED = 32  # a star is saturated
+    SMEARED = 64  # streaks are longer than eight pixels
 
 
 @dataclass(slots=True)
 class Tracked(Report):
-    """A frame's report with how the tracker is.
+    """A frame's report with the quality of its solution.
 
     health       : flags
-    log10_odds   : that the attitude is right, over chance; -inf where there is none
-    chi2_per_dof : of the residuals; NaN where there is no attitude
-    expected     : how many stars were looked for in windows; 0 in a search
+    log10_odds   : log10 of the odds of the attitude over chance; -inf without an attitude
+    chi2_per_dof : reduced chi-square of the residuals; NaN without an attitude
+    expected     : number of stars searched for in windows; 0 if solved lost in space
     """
 
     health: Health = Health.LOST
@@ -57,7 +63,7 @@ class Tracked(Report):
 
 @dataclass(frozen=True, slots=True)
 class Memory:
-    """The last attitude, and how fast it turned, in camera axes of then."""
+    """The last attitude, with its time and angular rate (camera axes at that time)."""
 
     t_s: float
     cam_from_ref: Rotation
@@ -65,12 +71,12 @@ class Memory:
 
 
 class TrackingMode:
-    """Lost in space, then tracking, and lost again.
+    """Star tracker with memory: tracks the predicted stars, and solves lost in space if that fails.
 
-    tracker  : searches when there is nothing to follow; a known camera's
-    reach_px : half a side of the windows: how far the prediction may be off
-    most     : windows at most, of the brightest stars
-    stale_s  : a memory older than this is no prediction
+    tracker  : lost-in-space tracker with a calibrated camera; ValueError if its focal length is uncertain
+    reach_px : half the side of a window: greatest error of the prediction
+    most     : greatest number of windows, for the brightest stars
+    stale_s  : greatest age of the last attitude for a prediction
     """
 
     def __init__(
@@ -88,10 +94,10 @@ class TrackingMode:
         now_from_then: Rotation | None = None,
         streak_px: tuple[float, float] | None = None,
     ) -> Tracked:
-        """The attitude at t_s. Raises ImageError for bad input; anything else that fails is a status.
+        """Solve the frame at t_s. Raises ImageError for bad input; any other failure is reported in the status.
 
-        now_from_then : cam(t_s) from cam at the last solved frame, from the gyros; the last rate goes on without it
-        streak_px     : (dx, dy) that stars move in the exposure, from the gyros
+        now_from_then : cam(t_s) from cam at the last solved frame, from the gyros; None: the last rate is extrapolated
+        streak_px     : (dx, dy) that stars move during the exposure, from the gyros
         """
         predicted = self._predicted(t_s, now_from_then)
         clock = Clock()
@@ -102,7 +108,7 @@ class TrackingMode:
         return report
 
     def _predicted(self, t_s: float, now_from_then: Rotation | None) -> Rotation | None:
-        """cam_from_ref as it should be; None without a memory that is fresh."""
+        """Predicted cam_from_ref, or None without a recent attitude."""
         memory = self.memory
         if memory is None or not 0 <= t_s - memory.t_s <= self.stale_s:
             return None
@@ -111,7 +117,7 @@ class TrackingMode:
         return now_from_then * memory.cam_from_ref
 
     def _remember(self, t_s: float, cam_from_ref: Rotation | None) -> None:
-        """A frame without an attitude leaves the memory as it was, to grow stale."""
+        """Store the attitude and its rate. A frame without an attitude leaves the memory unchanged."""
         if cam_from_ref is None:
             return
         last, rate_rad_s = self.memory, np.zeros(3)
@@ -122,7 +128,7 @@ class TrackingMode:
     def _track(
         self, image: NDArray, predicted: Rotation, streak_px: tuple[float, float] | None, clock: Clock
     ) -> Tracked | None:
-        """The attitude from what stands in the windows; None where that is not beyond chance."""
+        """Solve from the detections in windows; None if the evidence is below ACCEPT_DEX."""
         tracker = self.tracker
         check_shape(image.shape, tracker.camera)
         expected_px = self.expected_px(predicted)
@@ -134,9 +140,10 @@ class TrackingMode:
         sigma_px = tracker.sigma_px(centroids)
         lights = tracker.lights(centroids, sigma_px)
         reach_rad = self.reach_px / tracker.camera.focal_px
-        gates = np.full(len(centroids), 1.5 * reach_rad)  # a window's corner
+        gates = np.full(len(centroids), 1.5 * reach_rad)  # covers a window's corner
         guess = evidence.weigh(lights, tracker.sky, predicted.as_matrix(), 1.0, gates, -np.inf)
-        # The prediction has spared the search all attitudes but those within its reach.
+        # The prior volume of attitudes is not 8 pi^2 but that of the prediction: the boresight in a square of side
+        # 2 reach_rad, the roll in an interval of 2 reach_rad over the half field.
         half = float(np.min(tracker.field[1::2] - tracker.field[::2])) / 2
         spared = log10(8 * pi**2 / ((2 * reach_rad) ** 2 * min(2 * reach_rad / half, 2 * pi)))
         if guess.dex + spared < ACCEPT_DEX:
@@ -147,14 +154,17 @@ class TrackingMode:
         return self._told(attitude, centroids, sigma_px, clock, len(expected_px), saturated, streak_px)
 
     def _search(self, image: NDArray, streak_px: tuple[float, float] | None, clock: Clock) -> Tracked:
-        """The whole frame, lost in space."""
+        """Solve the whole frame lost in space."""
         tracker = self.tracker
         centroids = see(image, tracker.camera, tracker.settings, clock, streak_px)
         attitude = tracker.solve_centroids(centroids, clock)
         return self._told(attitude, centroids, tracker.sigma_px(centroids), clock, 0, False, streak_px)
 
     def expected_px(self, cam_from_ref: Rotation) -> Floats:
-        """(N, 2) pixels of the brightest stars that are to be seen whole; of those in one window the brightest."""
+        """(N, 2) predicted pixels of the brightest stars whose windows are on the sensor.
+
+        Of stars closer than reach_px only the brightest is kept.
+        """
         tracker = self.tracker
         rows, xy = tracker.in_field(tracker.camera, cam_from_ref)
         inside = tracker.camera.contains(xy, self.reach_px)
@@ -166,7 +176,7 @@ class TrackingMode:
     def _in_windows(
         self, image: NDArray, expected_px: Floats, streak_px: tuple[float, float] | None, clock: Clock
     ) -> tuple[Centroids, bool]:
-        """Centroids of what stands in the windows, and whether a star was saturated."""
+        """Centroids of the detections in windows, and whether any of them is saturated."""
         settings, hints = self.tracker.settings, FramePriors(streak_px, self.tracker.settings.saturation)
         if streak_px is not None and np.hypot(*streak_px) > LONGEST_STREAK_PX:
             centroids = see(image, self.tracker.camera, settings, clock, streak_px)
@@ -191,7 +201,7 @@ class TrackingMode:
         saturated: bool,
         streak_px: tuple[float, float] | None,
     ) -> Tracked:
-        """The report with its health."""
+        """The report with quality flags."""
         if attitude.match is None or attitude.cam_from_ref is None:
             return Tracked(attitude, centroids, clock.seconds)
         match: StarMatch = attitude.match

@@ -1,4 +1,9 @@
-"""What an attitude under a dome is worth: the LEDs that it puts where lights are, as evidence."""
+"""Bayes factor of a candidate attitude under an LED dome, from matched and missing LEDs.
+
+`prove` projects the LEDs at a candidate attitude, matches them to the detections, refines the attitude, and returns
+log10 of the Bayes factor ("dex") of this attitude over detections at random positions; see `_evidence` for its terms.
+Unlike stars, LEDs are near: the projection includes the lever from the bearing to the camera's entrance pupil.
+"""
 
 from __future__ import annotations
 
@@ -14,15 +19,16 @@ from estimator.core.jit import jit
 from estimator.core.vectors import Vector
 from estimator.identification.leds.index import Sight
 
-GATE = 3.5  # standard deviations within which a light is an LED's: one in 450 is lost
-LEAST = 3  # matches
+GATE = 3.5  # matching radius in standard deviations: it loses one true match in 450
+LEAST = 3  # matches needed for a solution
 
 
 class Lights(NamedTuple):
-    """What is seen, in camera axes.
+    """The detections of one frame, in camera axes.
 
-    ray     : (N, 3) unit;  tangent : (N, 2) x / z and y / z;  sigma : (N,) of each tangent, all told
-    usual   : (N, 3) where the bearing sees the ray meet the usual sphere;  rise : (N, 3) d(usual) / d(radius)
+    ray     : (N, 3) unit;  tangent : (N, 2) x / z and y / z;  sigma : (N,) total standard deviation of each tangent
+    usual   : (N, 3) unit vector from the bearing to the point where the ray meets the sphere of the median LED radius
+    rise    : (N, 3) derivative of `usual` with respect to that radius, 1 / m
     """
 
     ray: Floats
@@ -33,7 +39,7 @@ class Lights(NamedTuple):
 
 
 class Guess(NamedTuple):
-    """An attitude with what speaks for it: observed, star (K,), R_cam_from_lab (3, 3), evidence in powers of ten."""
+    """A hypothesis: matched rows of detections and LEDs (K,), R_cam_from_lab (3, 3), log10 of the Bayes factor."""
 
     observed: NDArray[np.int64]
     star: NDArray[np.int64]
@@ -43,13 +49,13 @@ class Guess(NamedTuple):
 
 @jit
 def apart(tangent: Floats, a: int, b: int) -> float:
-    """Distance of two lights in the image, in tangents."""
+    """Distance between two detections, in tangents."""
     return sqrt((tangent[a, 0] - tangent[b, 0]) ** 2 + (tangent[a, 1] - tangent[b, 1]) ** 2)
 
 
 @jit
 def alike(one: Guess, other: Guess) -> bool:
-    """Whether two guesses are the same attitude: more than half of the smaller one's lights are the same LEDs."""
+    """Whether two hypotheses agree: more than half of the matches of the smaller one are also in the other."""
     common = 0
     for n in range(len(one.observed)):
         for m in range(len(other.observed)):
@@ -59,7 +65,13 @@ def alike(one: Guess, other: Guess) -> bool:
 
 @jit
 def prove(lights: Lights, sight: Sight, matrix: Floats, centre: int, a: int, b: int) -> Guess:
-    """Match the field at a pair's attitude, fit the attitude to the matches, match again, and weigh them."""
+    """Evaluate the attitude of a pair of detections a, b: match, fit and match again (twice), compute the evidence.
+
+    matrix : R_cam_from_lab, changed in place by the fit;  centre : row of the LED whose neighborhood is matched
+    The evidence is -inf if fewer than LEAST LEDs match.
+    """
+    # Error of the pair's attitude, in units of a detection's variance: 1/2 from its midpoint (beside the detection's
+    # own 1), and 2 / separation^2 per squared distance from the midpoint from its direction.
     middle = (lights.tangent[a] + lights.tangent[b]) / 2
     turning = 2 / apart(lights.tangent, a, b) ** 2
     observed, star, missed = _match(lights, sight, matrix, centre, middle, 1.5, turning)
@@ -75,7 +87,7 @@ def prove(lights: Lights, sight: Sight, matrix: Floats, centre: int, a: int, b: 
 
 @jit
 def _seen_from_pupil(sight: Sight, matrix: Floats, star: int) -> Vector:
-    """An LED from the camera's pupil at R_cam_from_lab, in camera axes."""
+    """Vector from the camera's entrance pupil to an LED, in camera axes, m."""
     x, y, z = vectors.row(sight.position_m, star)
     return (
         matrix[0, 0] * x + matrix[0, 1] * y + matrix[0, 2] * z - sight.pupil_m[0],
@@ -88,15 +100,19 @@ def _seen_from_pupil(sight: Sight, matrix: Floats, star: int) -> Vector:
 def _match(
     lights: Lights, sight: Sight, matrix: Floats, centre: int, middle: Floats, own: float, turning: float
 ) -> tuple[NDArray, NDArray, int]:
-    """Each LED's nearest light within the gate, each light once; and how many LEDs that must be seen are not.
+    """Match each LED near `centre` to its nearest detection within the gate, one LED for each detection.
 
-    The gate's variance is `own` + turning * (distance from `middle`)^2 times a light's.
+    The gate is GATE standard deviations; its variance is own + turning * (distance from `middle`)^2, times the
+    detection's. Returns rows of detections, rows of LEDs, and the number of missing LEDs: predicted well inside the
+    field, or rivals for a detection that a nearer LED keeps. With `brightest_first` only LEDs brighter than the
+    faintest match count as missing.
     """
     left, right, top, bottom = sight.field_tan
     first = sight.pairs.first
     count, missed, total = 0, 0, len(lights.ray)
     unseen = np.empty(first[centre + 1] - first[centre] + 1, np.int64)
     observed, star, gap = np.empty(total, np.int64), np.empty(total, np.int64), np.empty(total)
+    # The LED `centre` itself, then its neighbors in the pair index: all LEDs that can share a field with it.
     for step in range(first[centre] - 1, first[centre + 1]):
         s = centre if step < first[centre] else sight.pairs.neighbour[step]
         qx, qy, qz = _seen_from_pupil(sight, matrix, s)
@@ -123,7 +139,7 @@ def _match(
             observed[count], star[count], gap[count] = best, s, nearest
             count += 1
             continue
-        unseen[missed] = s  # two LEDs for one light
+        unseen[missed] = s  # two LEDs match one detection: the farther one is missing
         if nearest < gap[place]:
             unseen[missed], star[place], gap[place] = star[place], s, nearest
         missed += 1
@@ -134,9 +150,10 @@ def _match(
 
 @jit
 def _fit(lights: Lights, sight: Sight, matrix: Floats, observed: NDArray, star: NDArray) -> Floats:
-    """One Gauss-Newton step of the exact rotation-only solve, in place; its (3, 3) information, in camera axes.
+    """One Gauss-Newton step of the attitude about the bearing (matrix, in place), with exact near-field projection.
 
-    With b = R P, q = b - r and R <- exp([w]) R a tangent moves by d . (w x b) = w . (b x d), d its slope by q.
+    With b = R P, q = b - r (r the pupil) and R <- exp([w]) R, a tangent changes by d . (w x b) = w . (b x d), d its
+    gradient with respect to q. Returns the (3, 3) Fisher information of w, in camera axes.
     """
     info, pull, row = np.zeros((3, 3)), np.zeros(3), np.empty(3)
     for k in range(len(observed)):
@@ -167,14 +184,16 @@ def _evidence(
     missed: int,
     info: Floats,
 ) -> float:
-    """How many powers of ten more probable the lights are at this attitude than fallen anywhere (Bayes' factor).
+    """log10 of the Bayes factor of this attitude over detections at random positions.
 
-    Each match is worth N(residual) / rho, rho the lights on the sensor's area; that so many of the LEDs are lit and
-    so many are not is B(m + 1, k + 1), every share of dead LEDs being as probable before; and the attitude is one
-    among all: (2 pi)^1.5 / sqrt(det info) of the volume (Laplace's integral over it). Among lights that fell
-    anywhere evidence beyond 10^x for any attitude is met once in 10^x frames at most (Markov's inequality).
-    What follows in a patch board follows from its pattern, which is every board's: its second light tells which way
-    the lattice lies (one in ten), each further one is there or not (one in two).
+    Each match contributes N(residual) / rho, rho the density of detections on the sensor. The counts of matched (m)
+    and missing (k) LEDs contribute B(m + 1, k + 1), a uniform prior on the fraction of dead LEDs. The attitude
+    contributes (2 pi)^1.5 / sqrt(det info) over the prior volume (Laplace's approximation). By Markov's inequality,
+    random detections reach 10^x for any attitude in at most one of 10^x frames.
+
+    All patch boards have the same pattern, so that further matches on one board are not independent: the second LED of
+    a board counts at most a factor of 10 (it fixes the orientation of the lattice), each further one at most a factor
+    of 2 (it is lit or not).
     """
     density, group = len(lights.ray) / sight.area, sight.pairs.group
     total = 1.5 * log10(2 * pi) - 0.5 * log10(max(np.linalg.det(info), 1e-300)) - log10(sight.volume)

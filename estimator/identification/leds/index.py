@@ -1,4 +1,4 @@
-"""What is believed of a dome, laid out for identification: LEDs by the angles between them and by direction."""
+"""Index of a dome's LEDs for identification: pairs by the angle between them, and LEDs by direction."""
 
 from __future__ import annotations
 
@@ -13,15 +13,16 @@ from estimator.catalog.pair_index import PairIndex, build, line
 from estimator.core.arrays import Floats
 from estimator.core.camera import Camera
 
-INNER = 0.95  # of the field: an LED nearer to its border may be cut off, which is no reason to miss it
+INNER = 0.95  # fraction of the field in which an unmatched LED counts as missing; the border may cut it off
 
 
 class Grid(NamedTuple):
-    """Where LEDs are, by cells: a square of side * side cells over their directions' x and y.
+    """LED directions in a square grid of side * side cells over their x and y components.
 
-    R_grid_from_lab : (3, 3) turns their middle to +z
-    cell, side      : of a cell, and how many are along a side
-    first           : LEDs first[c] to first[c + 1] are in cell c;  direction : (N, 3) of the LEDs in that order, turned
+    R_grid_from_lab : (3, 3) rotates the mean direction of the LEDs to +z
+    cell, side      : width of a cell, and number of cells along a side
+    first           : LEDs first[c] to first[c + 1] are in cell c
+    direction       : (N, 3) unit vectors of the LEDs in that order, in grid axes
     """
 
     R_grid_from_lab: Floats
@@ -32,18 +33,18 @@ class Grid(NamedTuple):
 
 
 class Sight(NamedTuple):
-    """What is believed, laid out for the search. A plain tuple, so that compiled code can take it.
+    """The dome map prepared for the search. A named tuple, because numba can compile functions that take one.
 
-    pairs      : of LEDs by the angle in which the bearing would see them at the usual radius (`at_usual`)
+    pairs      : LED pairs by their angle about the bearing, scaled to the median radius (`at_usual`)
     grid       : the LEDs by direction
-    position_m : (L, 3) LEDs in the lab;  radius_m : (L,) from the bearing;  usual_m : their median
-    pupil_m    : (3,) from the bearing, in camera axes
-    slack_rad  : by which an angle at the usual radius may differ from a pair's at its own radii
-    field_tan  : (4,) tangents left, right, top, bottom within which an LED must be seen whole
+    position_m : (L, 3) LEDs in the lab frame;  radius_m : (L,) from the bearing;  usual_m : their median radius
+    pupil_m    : (3,) camera's entrance pupil from the bearing, in camera axes
+    slack_rad  : greatest error of a pair angle that results from the scaling to the median radius
+    field_tan  : (4,) tangents left, right, top, bottom inside which an LED is fully visible
     area       : of the sensor, in tangents squared
-    volume     : of attitudes that show any of it: steradians of boresights times 2 pi of rolls
-    led_sigma, lever_sigma : of an LED's place and of the pupil's, by the least distance between the two
-    brightest_first : whether rows go by brightness, so that what is fainter than all that is seen is not missed
+    volume     : prior volume of attitudes that see the dome: steradians of boresight times 2 pi of roll
+    led_sigma, lever_sigma : standard deviations of LED positions and of the pupil, over their least distance
+    brightest_first : rows are sorted by brightness: LEDs fainter than every match do not count as missing
     """
 
     pairs: PairIndex
@@ -62,19 +63,20 @@ class Sight(NamedTuple):
 
 
 def sight_of(leds: LedMap, lever: Lever, camera: Camera) -> Sight:
-    """Lay out a dome for the search: every pair of LEDs that one field can hold.
+    """Index of a dome: every pair of LEDs that one field of view can hold.
 
-    The bearing sees a ray at alpha off the boresight at theta, R sin(alpha - theta) = M sin(alpha), so that an angle
-    at radius R is one at the usual radius R0 times ((R0 - M) / R0) / ((R - M) / R) for small angles. What that leaves
-    out is d(theta)/dR = M alpha / R^2 times what the two radii differ by, and alpha^2 of itself where the field is
-    wide, and a second-order rest. Raises ImageError where there are no pairs.
+    A ray at angle alpha from the boresight meets radius R at an angle theta about the bearing, with
+    R sin(alpha - theta) = M sin(alpha), M the length of the lever. For small angles a pair angle at radius R therefore
+    scales to the median radius R0 by the factor ((R0 - M) / R0) / ((R - M) / R). `slack_rad` bounds the neglected
+    terms: d(theta)/dR = M alpha / R^2 times the difference of the two radii, a relative term alpha^2 in wide fields,
+    and a second-order term. Raises ImageError if there are no pairs.
     """
     radius = np.linalg.norm(leds.position_m, axis=1)
     usual, lever_m = float(np.median(radius)), float(np.linalg.norm(lever.camera_body_m))
     rays = corner_rays(camera)
     inner, half = inner_field(rays)
     alpha = float(np.arccos(rays[:, 2].min()))
-    # From the bearing the farthest light in a corner is the widest apart.
+    # At a given angle from the boresight, the LED of the greatest radius has the greatest angle about the bearing.
     theta = alpha - np.arcsin(min(lever_m / radius.max() * np.sin(alpha), 1.0))
     index = build(leds.position_m / radius[:, None], min(2.1 * theta, np.pi), leds.board)
     scale = (usual - lever_m) / usual * radius / (radius - lever_m)
@@ -100,25 +102,29 @@ def sight_of(leds: LedMap, lever: Lever, camera: Camera) -> Sight:
 
 
 def sky_of(vectors: Floats, camera: Camera) -> Sight:
-    """Stars, (N, 3) unit vectors, brightest first: a dome of radius 1 with the camera at its centre."""
+    """Index of stars, (N, 3) unit vectors sorted by brightness: a dome of radius 1 with the camera at its center."""
     stars = LedMap(np.arange(len(vectors)), vectors, np.zeros(3), np.ones(3))
     return sight_of(stars, Lever(np.zeros(3), Rotation.identity()), camera)._replace(brightest_first=True)
 
 
 def corner_rays(camera: Camera) -> Floats:
-    """(4, 3) rays of the sensor's corners."""
+    """(4, 3) unit rays of the sensor's corners, in camera axes."""
     return camera.rays(np.array([[0, 0], [1, 0], [0, 1], [1, 1]]) * [camera.width_px, camera.height_px] - 0.5)
 
 
 def inner_field(corners: Floats) -> tuple[Floats, Floats]:
-    """Of a field's corners, (4, 3): tangents left, right, top, bottom of what is well inside, and half of all, (2,)."""
+    """The inner field of a sensor with (4, 3) corner rays.
+
+    Returns its (4,) tangents left, right, top, bottom, INNER times the full field, and (2,) the half-size of the full
+    field.
+    """
     tangent = corners[:, :2] / corners[:, 2:]
     middle, half = (tangent.max(axis=0) + tangent.min(axis=0)) / 2, np.ptp(tangent, axis=0) / 2
     return np.array([middle - INNER * half, middle + INNER * half]).T.ravel(), half
 
 
 def grid_of(directions: Floats) -> Grid:
-    """(N, 3) unit vectors by cells, one to a cell on average."""
+    """Grid of (N, 3) unit vectors with one vector per cell on average."""
     middle = directions.mean(axis=0)
     R_grid_from_lab = Rotation.align_vectors([[0.0, 0.0, 1.0]], [middle])[0].as_matrix()
     turned = directions @ R_grid_from_lab.T
@@ -134,7 +140,7 @@ def grid_of(directions: Floats) -> Grid:
 
 
 def at_usual(index: PairIndex, scale: Floats) -> PairIndex:
-    """The index with each pair's angle times the mean of its LEDs' scales (N,), sorted by that."""
+    """The index with each pair angle multiplied by the mean scale (N,) of its LEDs, sorted again by angle."""
     first, second = index.pair.T
     angle = index.angle_rad * (scale[first] + scale[second]) / 2
     order = np.argsort(angle, kind="stable")
@@ -149,7 +155,7 @@ def at_usual(index: PairIndex, scale: Floats) -> PairIndex:
 
 
 def cap_height(directions: Floats, margin_rad: float) -> float:
-    """1 - cos of the half-angle of the cap about (N, 3) directions' middle that holds them, and a margin more."""
+    """1 - cos(half-angle) of the cap about the mean of (N, 3) directions that holds all of them, plus a margin."""
     middle = directions.mean(axis=0)
     nearest = (directions @ middle).min() / max(np.linalg.norm(middle), 1e-9)
     return float(1 - np.cos(min(np.arccos(np.clip(nearest, -1, 1)) + margin_rad, np.pi)))

@@ -1,9 +1,12 @@
-"""Which LED is which, lost under a dome: pairs of lights at their own distances, proved by the whole field.
+"""Lost-in-space LED identification under a dome: pair hypotheses and a Bayes factor, with near-field parallax.
 
-Inter-LED angles depend on where the camera stands. But the camera can only turn about the bearing's centre, from
-which each LED keeps its distance: a ray carried to the sphere of a hypothetical LED's own radius meets it at a known
-direction in the body, whatever the attitude. Two rays and two LEDs then have one angle to agree on, and give an
-attitude, which must put the other LEDs where lights are in the image.
+The angles between near LEDs, seen from the camera, change with the attitude. But the camera only rotates about the
+bearing center, from which every LED has a fixed distance. A measured ray is intersected with the sphere of the
+hypothetical LED's own radius about the bearing, which gives the direction from the bearing to the LED in body axes
+without knowledge of the attitude. A pair of detections and a pair of LEDs must then agree in one angle about the
+bearing, and determine an attitude. A quick check counts the other detections that have an LED at the predicted
+direction; if enough do, the candidate is fitted to the whole field and its Bayes factor is computed
+(`evidence.prove`).
 """
 
 from __future__ import annotations
@@ -25,11 +28,11 @@ from estimator.core.vectors import Vector
 from estimator.identification.leds.evidence import GATE, LEAST, Guess, Lights, alike, apart, prove
 from estimator.identification.leds.index import Grid, Sight
 
-ACCEPT_DEX = 5.0  # evidence for an attitude, against lights that fell anywhere, in powers of ten
+ACCEPT_DEX = 5.0  # least log10 Bayes factor of an accepted attitude, over detections at random positions
 MARGIN_DEX = 5.0  # by which the best attitude must beat every other one
-TWIN_DEX = 2.0  # two attitudes of as much evidence are worth to be called ambiguous
-SAME = 1e-9  # as tangents: two lights so near to one another have no direction between them
-LONG = 0.2  # of the field: pairs as long as that say where the other LEDs are
+TWIN_DEX = 2.0  # least evidence of the best attitude for a near rival to be reported as an ambiguity
+SAME = 1e-9  # least separation of a pair, in tangents: closer detections have no direction between them
+LONG = 0.2  # of the field size: shorter pairs determine the roll poorly and are tried last
 AMBIGUOUS = "ambiguous: another attitude fits the lights as well"
 NO_MATCH = "no identification beyond chance"
 
@@ -37,15 +40,15 @@ NO_MATCH = "no identification beyond chance"
 def identify(
     rays_cam: Floats, sigma_rad: Floats, sight: Sight, max_checks: int = 4_000_000
 ) -> StarMatch | str:
-    """The LEDs that (N, 3) rays come from and the attitude that says so, or the reason for a refusal.
+    """Identify the LEDs of (N, 3) rays in camera axes: the matches and the attitude, or the reason for a refusal.
 
-    sigma_rad  : (N,) of a ray about each axis; what the errors of the survey add is in `sight`
-    max_checks : pairs of LEDs looked at, and lights times LEDs compared, before giving up
-    Pairs of lights are taken, and for each every pair of LEDs that may be it (`_attempt`). An attitude's worth is the
-    evidence (`_evidence`) for it over lights that fell anywhere. One beyond ACCEPT_DEX is sought once more, from two
-    lights that it did not come from: whatever rival explains almost as much must have one of the two pairs. If a
-    rival comes within MARGIN_DEX the pattern is one that cannot be told apart.
-    No brightness is used: every LED may be equal.
+    sigma_rad  : (N,) standard deviation of a ray about each axis; `sight` holds the survey's own errors
+    max_checks : LED pairs tested, plus detections times LEDs compared, before giving up
+
+    Detection pairs are tested against all LED pairs of the same angle (`_attempt`), in the order of how few these are.
+    After an attitude reaches ACCEPT_DEX, rivals are searched for with a second, disjoint pair of its detections: a
+    rival that explains almost as much must contain one of the two pairs. If a rival comes within MARGIN_DEX, the
+    pattern is ambiguous and no attitude is returned. Brightness is not used, because all LEDs may be equally bright.
     """
     if len(rays_cam) < LEAST:
         return NO_MATCH
@@ -58,11 +61,12 @@ def identify(
 
 
 def lights_of(rays_cam: Floats, sigma_rad: Floats, sight: Sight) -> Lights:
-    """Rays laid out for the search, with the errors of what is believed in theirs.
+    """Detections for the search: rays with their total errors, which include those of the LED map and of the lever.
 
-    A camera that is aside sees all LEDs aside, which is a turn; one that is nearer sees them farther from the middle.
+    A lateral error of the pupil shifts all LEDs alike and is absorbed by the attitude; an axial one scales the
+    image and adds an error proportional to the distance from the boresight.
 
-    With p = r + s u on the sphere |p| = R, ds/dR = R / (u . p), so that p / R moves by u / (u . p) - p / R^2.
+    With p = r + s u on the sphere |p| = R, ds/dR = R / (u . p), so that d(p / R)/dR = u / (u . p) - p / R^2.
     """
     tangent = np.ascontiguousarray(rays_cam[:, :2] / rays_cam[:, 2:])
     nearer = sight.lever_sigma * np.linalg.norm(tangent, axis=1)
@@ -80,7 +84,7 @@ def lights_of(rays_cam: Floats, sigma_rad: Floats, sight: Sight) -> Lights:
 
 @jit
 def _search(lights: Lights, sight: Sight, max_checks: int) -> tuple[Guess, float]:
-    """The best attitude, and how much speaks for the best that is another."""
+    """The best hypothesis, and the evidence of the best one with another attitude."""
     best = Guess(np.empty(0, np.int64), np.empty(0, np.int64), np.eye(3), -np.inf)
     rival_dex, checks = -np.inf, np.zeros(1, np.int64)
     order = _pairs(lights, sight)
@@ -88,8 +92,10 @@ def _search(lights: Lights, sight: Sight, max_checks: int) -> tuple[Guess, float
         a, b = order[rank]
         best, rival_dex = _attempt(lights, sight, a, b, ACCEPT_DEX, best, rival_dex, checks)
         if best.dex >= ACCEPT_DEX:
+            # A rival below this floor cannot matter. If the floor is below ACCEPT_DEX, `_attempt` has skipped such
+            # rivals so far, and the same pair is tested again; then a second pair is tested.
             rival_floor = best.dex - MARGIN_DEX
-            if rival_floor < ACCEPT_DEX:  # too weak to be found so far
+            if rival_floor < ACCEPT_DEX:
                 best, rival_dex = _attempt(lights, sight, a, b, rival_floor, best, rival_dex, checks)
             a, b = order[_second(order, rank, best)]
             return _attempt(lights, sight, a, b, rival_floor, best, rival_dex, checks)
@@ -100,9 +106,10 @@ def _search(lights: Lights, sight: Sight, max_checks: int) -> tuple[Guess, float
 
 @jit
 def _pairs(lights: Lights, sight: Sight) -> NDArray[np.int64]:
-    """(P, 2) pairs of lights, those that the fewest LEDs may be first; short ones last, two in one place not at all.
+    """(P, 2) pairs of detections, sorted by the number of LED pairs they may be; short pairs come last.
 
-    A short pair may be few LEDs too, but says little of the turn about the boresight.
+    Short pairs also match few LED pairs, but determine the roll about the boresight poorly. Coincident detections are
+    left out.
     """
     total, long = len(lights.ray), LONG * sqrt(sight.area)
     pair, cost = np.empty((total * (total - 1) // 2, 2), np.int64), np.empty(total * (total - 1) // 2)
@@ -121,7 +128,7 @@ def _pairs(lights: Lights, sight: Sight) -> NDArray[np.int64]:
 
 @jit
 def _window(lights: Lights, sight: Sight, a: int, b: int) -> tuple[int, int, float]:
-    """Which pairs of the index two lights may be, half-open, and the gate for the angle about the bearing."""
+    """Half-open range of index pairs that two detections may be, and the gate of their angle about the bearing, rad."""
     gate = GATE * sqrt(lights.sigma[a] ** 2 + lights.sigma[b] ** 2) * _to_bearing(sight)
     at_a, at_b = vectors.row(lights.usual, a), vectors.row(lights.usual, b)
     angle = 2 * np.arcsin(min(vectors.chord(at_a, at_b) / 2, 1.0))
@@ -131,13 +138,13 @@ def _window(lights: Lights, sight: Sight, a: int, b: int) -> tuple[int, int, flo
 
 @jit
 def _to_bearing(sight: Sight) -> float:
-    """An angle about the bearing for one at the camera: (R - M) / R."""
+    """Ratio of an angle about the bearing to the angle seen by the camera: (R - M) / R."""
     return 1 - sqrt(sight.pupil_m[0] ** 2 + sight.pupil_m[1] ** 2 + sight.pupil_m[2] ** 2) / sight.usual_m
 
 
 @jit
 def _second(pairs: NDArray, rank: int, best: Guess) -> int:
-    """The first of the pairs of matched lights that has none of that pair's, or as few as can be."""
+    """Rank of the first pair of two matched detections that shares none with pair `rank`, or as few as possible."""
     kept, cost = rank, 9
     for other in range(len(pairs)):
         stale = 0
@@ -145,7 +152,7 @@ def _second(pairs: NDArray, rank: int, best: Guess) -> int:
             known = False
             for n in best.observed:
                 known = known or n == pairs[other, end]
-            stale += 3 * (not known)
+            stale += 3 * (not known)  # an unmatched detection is worse than two shared ones
             stale += pairs[other, end] == pairs[rank, 0] or pairs[other, end] == pairs[rank, 1]
         if stale < cost:
             kept, cost = other, stale
@@ -163,9 +170,10 @@ def _attempt(
     rival_dex: float,
     checks: NDArray,
 ) -> tuple[Guess, float]:
-    """Two lights as every pair of LEDs that they may be; the best attitude so far and its best rival's evidence.
+    """Test two detections against every LED pair of the same angle, in both orders.
 
-    What cannot have more than floor_dex of evidence is passed over.
+    Candidates that cannot reach floor_dex are skipped. Returns the updated best hypothesis and the evidence of its best
+    rival. checks : (1,) effort so far, increased in place.
     """
     index, radius = sight.pairs, sight.radius_m
     begin, end, gate = _window(lights, sight, a, b)
@@ -178,6 +186,7 @@ def _attempt(
             i, j = index.pair[p, flip], index.pair[p, 1 - flip]
             at_i, at_j = _carried(lights.ray[a], sight, radius[i]), _carried(lights.ray[b], sight, radius[j])
             led_i, led_j = vectors.row(index.vectors, i), vectors.row(index.vectors, j)
+            # The index holds angles scaled to the median radius; here each ray meets the LED's own radius.
             if abs(vectors.chord(at_i, at_j) - vectors.chord(led_i, led_j)) > gate:
                 continue
             vectors.axes(at_i, at_j, in_cam)
@@ -199,7 +208,7 @@ def _attempt(
 
 @jit
 def _carried(ray: Floats, sight: Sight, radius_m: float) -> Vector:
-    """Unit vector from the bearing to where a ray from the camera meets the sphere of a radius, in camera axes."""
+    """Unit vector from the bearing to the point where a camera ray meets the sphere of radius_m, in camera axes."""
     px, py, pz = sight.pupil_m
     along = ray[0] * px + ray[1] * py + ray[2] * pz
     reach = -along + sqrt(max(along * along - px * px - py * py - pz * pz + radius_m * radius_m, 0.0))
@@ -209,10 +218,10 @@ def _carried(ray: Floats, sight: Sight, radius_m: float) -> Vector:
 
 @jit
 def _wanted(lights: Lights, sight: Sight, a: int, b: int, floor_dex: float) -> int:
-    """How many matches it takes for that evidence.
+    """Least number of matches that can reach floor_dex, from an upper bound of `_evidence`.
 
-    An upper bound of `_evidence`: no residuals, nothing missed, and an attitude as loose as the pair alone leaves it:
-    sqrt(2) sigma / apart about the boresight, sigma / sqrt(2) across it.
+    The bound has no residuals, no missing LEDs, and the attitude uncertainty of the pair alone: sqrt(2) sigma /
+    separation about the boresight, sigma / sqrt(2) across it.
     """
     sigma = lights.sigma.min()
     each = -log10(2 * pi * sigma**2 * len(lights.ray) / sight.area)
@@ -226,9 +235,9 @@ def _wanted(lights: Lights, sight: Sight, a: int, b: int, floor_dex: float) -> i
 
 @jit
 def _first_gates(lights: Lights, sight: Sight, a: int, b: int) -> Floats:
-    """(N,) angles about the bearing within which an LED is to be where a pair's attitude puts a light.
+    """(N,) matching radius of each detection at a pair's attitude, as an angle about the bearing, rad.
 
-    The pair's own error shifts what it predicts by half of a light's variance, and turns it by 2 sigma^2 / apart^2.
+    The pair's own error adds a shift with half of a detection's variance and a rotation with 2 sigma^2 / separation^2.
     """
     x, y = (lights.tangent[a] + lights.tangent[b]) / 2
     turning = 2 / apart(lights.tangent, a, b) ** 2
@@ -250,7 +259,11 @@ def _glance(
     gates: Floats,
     wanted: int,
 ) -> int:
-    """How many lights have an LED where an attitude puts them, the pair's two included; no more than are wanted."""
+    """Quick check: number of detections with an LED at the predicted direction, the pair included.
+
+    Stops as soon as `wanted` is reached or out of reach. Every ray is taken to the radius of the hypothetical LED
+    (radius_m) by a first-order step from the median radius.
+    """
     count, total, higher_m = 2, len(lights.ray), radius_m - sight.usual_m
     for n in range(total):
         if count >= wanted or count + total - n < wanted:
@@ -271,7 +284,7 @@ def _glance(
 
 @jit
 def _anything(grid: Grid, where: Vector, gate: float) -> bool:
-    """Whether an LED is within an angle of a direction in the grid's axes."""
+    """Whether any LED is within `gate` (rad) of a direction in grid axes."""
     inverse, half, reach = 1 / grid.cell, grid.side / 2, gate / grid.cell
     x, y = where[0] * inverse + half, where[1] * inverse + half
     for line in range(cell_of(y - reach, grid.side), cell_of(y + reach, grid.side - 1) + 1):

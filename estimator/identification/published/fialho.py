@@ -1,4 +1,4 @@
-"""Fialho's triangle, PTASE's identifier in its four versions: lists of candidates, a triplet, the direct match.
+"""Fialho's triangle method, PTASE's identifier in its four versions: candidate lists, a triplet, the direct match.
 
 Fialho & Saotome 2005, section 3.5: "In the first step it tries to match a triangle of observed stars (the three
 brightest stars above a minimum magnitude and with a minimum angular distance) with a triangle of catalogued stars"
@@ -6,15 +6,15 @@ from a list of candidates for each; then the rest are matched at the attitude th
 "greater than a minimum threshold (e.g, half the number of observed stars)"; else the search goes on. The paper names
 four improvements since alg_ide_mf1_1 of 2003 and says what mf1_2 has; mf1_3 is inferred to lie between 2 and 4:
 
-    mf1_1  the basic algorithm: every list from the whole catalogue
-    mf1_2  lists "assembled in an optimized way", and a hint of where the optical axis points
-    mf1_3  another triangle of observed stars where the first fails: false stars are withstood
+    mf1_1  the basic algorithm: every list from the whole catalog
+    mf1_2  lists "assembled in an optimized way", and a prior direction of the optical axis
+    mf1_3  another triangle of observed stars if the first fails: false stars are tolerated
     mf1_4  also returns mean and variance of the identified stars' magnitude errors
 
-What "optimized" is goes unpublished. Here the first list is a range of the catalogue, which is sorted by magnitude,
-and the others are those of its neighbours that stand at the observed angle. Ours, and in all versions: the attitude
-must be beyond chance, and triangles must have the same handedness, which no attitude could mend. As in the paper the
-first triplet that passes is the answer: a catalogue that repeats itself, as a lattice of LEDs does, is for `saa`.
+The paper does not say what "optimized" means. Here the first list is a range of the catalog, which is sorted by
+magnitude, and the other lists are the neighbors of its stars at the observed angles. Two tests are added in all
+versions: the match must be significant against chance, and the triangles must have the same handedness. As in the
+paper, the first triplet that passes is the solution; for a repetitive catalog, such as a lattice of LEDs, use `saa`.
 """
 
 from __future__ import annotations
@@ -37,15 +37,15 @@ from estimator.identification.direct_match import Found, angle, answer, nothing,
 from estimator.identification.options import Options
 
 GATE_SIGMAS = 3.0  # of a magnitude: three stars pass with 0.9973^3 = 99.2 %, the paper's 99.12 +- 0.25 %
-LEAST_ANGLE = 0.1  # of the field's diagonal, between the stars of a triangle; the paper's is unpublished
-SHARE_BASIC, SHARE_FALSE_STARS = 0.5, 0.3  # of the observed stars that must match; with false stars fewer can
+LEAST_ANGLE = 0.1  # of the field's diagonal, between the stars of a triangle; the paper gives no value
+SHARE_BASIC, SHARE_FALSE_STARS = 0.5, 0.3  # fraction of stars that must match: basic, with false stars
 
 
 @dataclass(frozen=True, slots=True)
 class MagnitudeMatch(StarMatch):
-    """A match with what it says of the camera's magnitudes: mean and variance of observed less catalogued.
+    """A match with the mean and the variance of observed minus catalog magnitude; NaN if magnitudes are unknown.
 
-    What Fialho, Lopes & Saotome 2005 calibrate a sensor's magnitude offset with; NaN where magnitudes are unknown.
+    Fialho, Lopes & Saotome 2005 use these to calibrate a sensor's magnitude offset.
     """
 
     offset_mag: float = float("nan")
@@ -53,14 +53,14 @@ class MagnitudeMatch(StarMatch):
 
 
 class Rules(NamedTuple):
-    """How a search is done. A plain tuple, so that compiled code can take it.
+    """Search parameters. A named tuple, because numba can compile functions that take one.
 
-    tolerance_rad, stretch : of a direction; of an angle sqrt(2) times it plus stretch times the angle
-    gate_mag     : of a magnitude
-    triangles, checks, base : as in `Options`: observed triangles, angles compared, among how many stars
-    share        : of the observed stars must match
-    optimised    : whether the lists are assembled from neighbours
-    x, y, z, chord : the believed boresight, and the squared straight-line distance that candidates keep to it
+    tolerance_rad, stretch : tolerance of a direction; that of an angle is sqrt(2) times it plus stretch times the angle
+    gate_mag     : tolerance of a magnitude
+    triangles, checks, base : as in `Options`: limits of observed triangles and of angles compared, number of stars
+    share        : fraction of the observed stars that must match
+    optimised    : assemble the lists from neighbors
+    x, y, z, chord : prior boresight, and the greatest squared chord of a candidate from it
     """
 
     tolerance_rad: float
@@ -78,7 +78,7 @@ class Rules(NamedTuple):
 
 
 def rules(tolerance_rad: float, asked: Options, share: float, optimised: bool, falls_back: bool) -> Rules:
-    """The rules of a search. Raises ImageError for a tolerance or an error that is none."""
+    """Search parameters from options. Raises ImageError unless the tolerance and the magnitude error are positive."""
     if not min(tolerance_rad, asked.epsilon_mag) > 0:
         raise ImageError(
             f"fialho: tolerance {tolerance_rad} rad, magnitude error {asked.epsilon_mag}; allowed: more than 0"
@@ -103,14 +103,14 @@ def rules(tolerance_rad: float, asked: Options, share: float, optimised: bool, f
 
 
 def fialho_1(vectors_cam: Floats, index: PairIndex, tolerance_rad: float, **options: Any) -> StarMatch | None:
-    """The basic algorithm: one triangle, each list from the whole catalogue, no hint. See `fialho_4`."""
+    """The basic algorithm: one triangle, each list from the whole catalog, no boresight prior. See `fialho_4`."""
     asked = Options(**options)
     bare = rules(tolerance_rad, asked, SHARE_BASIC, False, False)
     return answer(_found(vectors_cam, index, asked, bare._replace(chord=5.0)))
 
 
 def fialho_2(vectors_cam: Floats, index: PairIndex, tolerance_rad: float, **options: Any) -> StarMatch | None:
-    """One triangle from optimised lists, about a believed boresight if there is one. See `fialho_4`."""
+    """One triangle with optimized lists, near the prior boresight if there is one. See `fialho_4`."""
     asked = Options(**options)
     return answer(
         _found(
@@ -123,7 +123,7 @@ def fialho_2(vectors_cam: Floats, index: PairIndex, tolerance_rad: float, **opti
 
 
 def fialho_3(vectors_cam: Floats, index: PairIndex, tolerance_rad: float, **options: Any) -> StarMatch | None:
-    """Triangle after triangle from optimised lists, about a believed boresight if there is one. See `fialho_4`."""
+    """Several triangles with optimized lists, near the prior boresight if there is one. See `fialho_4`."""
     asked = Options(**options)
     return answer(
         _found(
@@ -138,14 +138,14 @@ def fialho_3(vectors_cam: Floats, index: PairIndex, tolerance_rad: float, **opti
 def fialho_4(
     vectors_cam: Floats, index: PairIndex, tolerance_rad: float, **options: Any
 ) -> MagnitudeMatch | None:
-    """Fialho's triangle, latest version: as the third, and says how the magnitudes are off.
+    """Fialho's triangle method, latest version: as the third, and returns the errors of the magnitudes.
 
     vectors_cam   : (N, 3) observed unit vectors, brightest first
-    tolerance_rad : of a direction; of an angle sqrt(2) times it, plus `stretch` times the angle
-    options       : those of `Options`: `magnitude`, with an index that has them too, makes the lists short;
-        `boresight_ref` and `within_rad` are the hint: candidates keep to that distance from the optical axis, so that
-        it must hold half the field's diagonal beside the hint's error
-    Returns None rather than a guess: where too few stars match or chance does as well in 1e5 such searches.
+    tolerance_rad : of a direction; that of an angle is sqrt(2) times it, plus `stretch` times the angle
+    options       : those of `Options`: `magnitude`, if the index has magnitudes too, shortens the lists;
+        `boresight_ref` and `within_rad` are the prior boresight: candidates are within that angle of it, which must
+        therefore include half the field's diagonal beside the error of the prior
+    Returns None if too few stars match, or if the match is not significant (1e-5 expected by chance).
     """
     asked = Options(**options)
     found = _found(
@@ -182,10 +182,11 @@ def _found(vectors_cam: Floats, index: PairIndex, asked: Options, by: Rules) -> 
 
 @jit
 def search(seen: Floats, light: Floats, index: PairIndex, by: Rules) -> Found:
-    """The compiled identifier: (N, 3) unit vectors brightest first and their (N,) magnitudes, NaN if unknown.
+    """Compiled search over observed triangles: the brightest first, then others, with all stars changing soon.
 
-    Returns the rows of the observed and of the catalogue's stars, R_cam_from_ref, and log10 of the chance; it is
-    an answer only where that is at most ACCEPT_LOG10_CHANCE.
+    seen, light : (N, 3) unit vectors, brightest first, and their (N,) magnitudes, NaN if unknown
+    Returns the rows of the observed stars and of the catalog, R_cam_from_ref, and log10 of the expected number of
+    chance matches; it is a solution only if that is at most ACCEPT_LOG10_CHANCE.
     """
     tried = np.zeros(2, np.int64)  # triplets, angles compared
     least, base = LEAST_ANGLE * index.max_angle_rad, min(by.base, len(seen))
@@ -213,14 +214,14 @@ def search(seen: Floats, light: Floats, index: PairIndex, by: Rules) -> Found:
 
 @jit
 def _closest(seen: Floats, corners: NDArray) -> float:
-    """The least angle between three stars."""
+    """The least angle between any two of three stars."""
     i, j, k = corners
     return min(angle(seen[i], seen[j]), angle(seen[i], seen[k]), angle(seen[j], seen[k]))
 
 
 @jit
 def _brightest(seen: Floats, base: int, least_rad: float) -> NDArray:
-    """Rows of the three brightest stars with a least distance between them; -1 where there are none."""
+    """Rows of the three brightest stars that are at least least_rad apart; -1 if there are none."""
     for i in range(base):
         for j in range(i + 1, base):
             if angle(seen[i], seen[j]) < least_rad:
@@ -236,7 +237,7 @@ def _brightest(seen: Floats, base: int, least_rad: float) -> NDArray:
 def triplets(
     seen: Floats, light: Floats, index: PairIndex, corners: NDArray, by: Rules, tried: NDArray
 ) -> Found:
-    """Every triplet of candidates like an observed triangle, and the direct match of each, until one is accepted."""
+    """Test every triplet of candidates that fits an observed triangle by direct match, until one is accepted."""
     sides = np.array(
         [
             angle(seen[corners[0]], seen[corners[1]]),
@@ -256,7 +257,7 @@ def triplets(
 def _accepted(
     seen: Floats, index: PairIndex, corners: NDArray, stars: NDArray, by: Rules, tried: int
 ) -> Found:
-    """The second step: the direct match of one triplet, or nothing where its share of the stars is too small."""
+    """The second step: the direct match of one triplet; empty if too few stars match or it is not significant."""
     found = settled(seen, index, corners, stars, by.tolerance_rad, by.stretch, tried)
     if len(found[0]) <= by.share * len(seen) or found[3] > ACCEPT_LOG10_CHANCE:
         return nothing()
@@ -265,8 +266,8 @@ def _accepted(
 
 @jit
 def _candidate(index: PairIndex, star: int, magnitude: float, by: Rules) -> bool:
-    """Whether a star is bright enough, faint enough, and near enough to the believed boresight."""
-    if abs(index.magnitude[star] - magnitude) > by.gate_mag:  # NaN is not
+    """Whether a star is within the magnitude gate and near enough to the prior boresight."""
+    if abs(index.magnitude[star] - magnitude) > by.gate_mag:  # False for NaN: an unknown magnitude passes
         return False
     x, y, z = index.vectors[star]
     return (x - by.x) ** 2 + (y - by.y) ** 2 + (z - by.z) ** 2 <= by.chord
@@ -283,7 +284,9 @@ def _by_neighbours(
     by: Rules,
     tried: NDArray,
 ) -> Found:
-    """The optimised assembly: the first list is a range of the sorted catalogue, the others its neighbours."""
+    """The optimized assembly: the first list is a range of the sorted catalog, the others its stars' neighbors."""
+    # For each candidate a of the first star: collect candidates b of the second at the angle of side 0, then test each
+    # candidate c of the third at the angle of side 1 against all of them.
     handed = triple(seen[corners[0]], seen[corners[1]], seen[corners[2]])
     second = np.empty(len(index.vectors), np.int64)
     begin, end = alike(index, light[corners[0]], by.gate_mag)
@@ -324,7 +327,7 @@ def _by_neighbours(
 
 @jit
 def _list(index: PairIndex, magnitude: float, by: Rules) -> NDArray:
-    """Candidates for one star, from the whole catalogue."""
+    """Candidates for one star, from the whole catalog."""
     out, count = np.empty(len(index.vectors), np.int64), 0
     for star in range(len(index.vectors)):
         if _candidate(index, star, magnitude, by):
@@ -344,7 +347,7 @@ def _by_lists(
     by: Rules,
     tried: NDArray,
 ) -> Found:
-    """The basic assembly: three lists, each from the whole catalogue, and every triplet of them."""
+    """The basic assembly: three lists, each from the whole catalog, and every triplet of them."""
     first, second, third = (
         _list(index, light[corners[0]], by),
         _list(index, light[corners[1]], by),

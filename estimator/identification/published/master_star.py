@@ -1,10 +1,10 @@
-"""NPS TAS-2's identifier: the angles of a master star to all others, and the catalogue star with most of them.
+"""NPS TAS-2's identifier: the angles of a master star to all others, and the catalog star with most of them.
 
-Tappe 2009 as told by Padro 2012, sections 2.7.2 and 3.2: "star separation angles were measured only with respect to the
+Tappe 2009, cited by Padro 2012, sections 2.7.2 and 3.2: "star separation angles were measured only with respect to the
 brightest star in the image, or the 'master star'", and "star matches were made based solely on the most commonly
 reoccurring angle matches associated with the master stars from the cataloged and tracked images", within 500 arcsec,
-of nine stars. That alone cannot tell a pattern from its mirror image, nor a match from luck: here the names that the
-angles leave open are settled by an attitude, and the match must be beyond chance.
+of nine stars. This test alone cannot distinguish a pattern from its mirror image, or a true match from a chance one.
+Here the ambiguities of the angles are resolved with an attitude (direct match), and the match must be significant.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from estimator.identification.options import Options
 
 
 class Rules(NamedTuple):
-    """How a search is done: tolerances as in `Options`, the magnitude's gate, masters in turn, angles compared."""
+    """Search parameters: tolerances as in `Options`, magnitude gate, number of masters, limit of angles compared."""
 
     tolerance_rad: float
     stretch: float
@@ -38,15 +38,15 @@ class Rules(NamedTuple):
 def master_star(
     vectors_cam: Floats, index: PairIndex, tolerance_rad: float, masters: int = 1, **options: Any
 ) -> StarMatch | None:
-    """NPS's master star: the catalogue star that repeats most of the angles which the brightest star has to others.
+    """NPS's master-star method: find the catalog star that has most of the brightest star's angles to the others.
 
     vectors_cam   : (N, 3) observed unit vectors, brightest first;  tolerance_rad : of a direction
-    masters       : how many of the brightest are tried in turn. NPS's one fails where it is false or not listed, or
-        where another is as bright (the thesis's criticism)
-    options       : those of `Options`; with magnitudes, candidates are those like the master
-    The candidates are ranked by how many of the observed angles they repeat, and the direct match proves each that
-    repeats as many as the best or one less: its angle to a second star fixes an attitude. Returns None rather than a
-    guess: where chance does as well, and where a lattice leaves two answers.
+    masters       : number of brightest stars to try as master. NPS's single master fails if it is false or not in the
+        catalog, or if another star is as bright (the thesis's criticism)
+    options       : those of `Options`; with magnitudes, candidates are within the magnitude gate of the master
+    The candidates are ranked by how many of the observed angles they have. Each candidate with as many as the best, or
+    one less, is tested by direct match: its angle to a second star determines an attitude. Returns None if the match
+    is not significant, or if a contradicting match is nearly as good, as on a lattice.
     """
     asked = Options(**options)
     asked.fixed_focal("master_star")
@@ -62,7 +62,7 @@ def master_star(
 
 @jit
 def search(seen: Floats, light: Floats, index: PairIndex, by: Rules) -> Found:
-    """The compiled identifier: rows of the observed and the catalogue's stars, R_cam_from_ref, log10 of the chance."""
+    """Compiled search: rows of the observed stars and of the catalog, R_cam_from_ref, log10 of the chance."""
     tried = np.zeros(2, np.int64)  # assumed pairs, angles compared
     for master in range(by.masters):
         begin, end = alike(index, light[master], by.gate_mag)
@@ -72,19 +72,20 @@ def search(seen: Floats, light: Floats, index: PairIndex, by: Rules) -> Found:
         if len(repeated) == 0 or repeated.max() < MIN_MATCHES - 1:
             continue
         best, rival = nothing(), np.zeros(1)
+        # One angle less than the best is allowed: a false candidate can have an additional angle by chance.
         for candidate in np.flatnonzero(repeated >= repeated.max() - 1) + begin:
             best = _proved(seen, index, master, candidate, by, tried, best, rival)
             if tried[1] >= by.checks:
                 break
         if best[3] <= ACCEPT_LOG10_CHANCE:
-            # A pattern that repeats itself has another answer as good: 1e5 times as likely is told apart.
+            # A repetitive pattern has another match as good. The best must be 1e5 times less likely by chance.
             return best if rival[0] > best[3] - ACCEPT_LOG10_CHANCE else nothing()
     return nothing()
 
 
 @jit
 def _contradict(one: Found, other: Found) -> bool:
-    """Whether two matches give an observed star different names."""
+    """Whether two matches identify an observed star differently."""
     for n in range(len(one[0])):
         for m in range(len(other[0])):
             if one[0][n] == other[0][m] and one[1][n] != other[1][m]:
@@ -94,7 +95,7 @@ def _contradict(one: Found, other: Found) -> bool:
 
 @jit
 def _repeated(seen: Floats, index: PairIndex, master: int, candidate: int, by: Rules, tried: NDArray) -> int:
-    """How many of the master's angles the candidate has to stars of its own."""
+    """Number of the master's angles that the candidate has to any of its neighbors."""
     count = 0
     for n in range(len(seen)):
         if n == master:
@@ -118,10 +119,10 @@ def _proved(
     best: Found,
     rival: Floats,
 ) -> Found:
-    """The better of `best` and the direct matches at the attitudes that the master and one more star can give.
+    """The better of `best` and the direct matches at the attitudes from the master and a second star.
 
-    The farthest star, for its leverage; if it is false or missing, one of the next three will do. `rival` keeps the
-    least chance of those that contradict the best.
+    The second star is the farthest from the master, for its leverage, and each of the next three, in case it is false
+    or not in the catalog. rival : (1,) least chance of a match that contradicts the best, updated in place.
     """
     sides = np.array([angle(seen[master], seen[n]) for n in range(len(seen))])
     for n in np.argsort(-sides)[: min(4, len(seen) - 1)]:

@@ -1,4 +1,9 @@
-"""Which star is which, lost in space: pyramids of angles, proved by every star in the field."""
+"""Pyramid star identification (Mortari, Samaan & Junkins 2001), verified by the direct match of the whole field.
+
+A triangle of observed stars is compared with catalog triangles through the k-vector index. A fourth star whose angles
+to all three corners fit makes a pyramid; the direct match then tests its attitude on all stars. With an uncertain
+focal length each triangle also estimates it, from the ratio of the catalog's to the observed perimeter.
+"""
 
 from __future__ import annotations
 
@@ -18,9 +23,9 @@ from estimator.identification.options import Options
 
 
 class Rules(NamedTuple):
-    """How a search is done. A plain tuple, so that compiled code can take it.
+    """Search parameters. A named tuple, because numba can compile functions that take one.
 
-    tolerance, stretch, zooms, triangles, checks, base, missed_dex : as `Options` says
+    tolerance, stretch, zooms, triangles, checks, base, missed_dex : as in `Options`
     left, right, top, bottom : tangents of the sensor's edges from the boresight
     """
 
@@ -41,13 +46,12 @@ def pyramid(vectors_cam: Floats, index: PairIndex, tolerance_rad: float, **optio
     """Pyramid (Mortari, Samaan & Junkins 2001): a triangle, a fourth star, then the whole field.
 
     vectors_cam   : (N, 3) observed unit vectors, brightest first
-    tolerance_rad : of a direction; of an angle sqrt(2) times it, plus `stretch` times the angle
-    options       : those of `Options`; no magnitudes are used
-    Triangles are taken from three groups of the index, in an order that changes all three stars soon (their
-    `smart` order), so that one false star costs little. A pyramid is only a hypothesis: the attitude that it gives
-    must explain so many of the observed stars that, over all that was tried, a match this good is expected less
-    than 1e-5 times by chance.
-    Returns None rather than a guess.
+    tolerance_rad : of a direction; that of an angle is sqrt(2) times it, plus `stretch` times the angle
+    options       : those of `Options`; magnitudes are not used
+    The three catalog stars are from different groups of the index (patch boards). Observed triangles are tried in the
+    paper's `smart` order, which changes all three stars soon, so that one false star costs little. A pyramid is only a
+    hypothesis: its attitude must match so many observed stars that, over all hypotheses tried, less than 1e-5 matches
+    this good are expected by chance. Otherwise returns None.
     """
     asked = Options(**options)
     if len(vectors_cam) < MIN_MATCHES:
@@ -67,7 +71,7 @@ def pyramid(vectors_cam: Floats, index: PairIndex, tolerance_rad: float, **optio
 
 @jit
 def _search(seen: Floats, index: PairIndex, rules: Rules) -> Found:
-    """Walk the triangles (i, i + dj, i + dj + dk) and stop at the first attitude beyond chance."""
+    """Try the triangles (i, i + dj, i + dj + dk) in the smart order; return the first significant match."""
     tried = np.zeros(3, np.int64)  # observed triangles, hypotheses, checks
     for dj in range(1, rules.base - 1):
         for dk in range(1, rules.base - dj):
@@ -84,15 +88,16 @@ def _search(seen: Floats, index: PairIndex, rules: Rules) -> Found:
 
 @jit
 def _triangle(seen: Floats, index: PairIndex, corners: NDArray, rules: Rules, tried: NDArray) -> Found:
-    """Every catalogue triangle like an observed one, of the same handedness, that a fourth star confirms."""
+    """Test every catalog triangle that fits an observed one in its sides and its handedness; needs a fourth star."""
     i, j, k = corners
     ij, ik, jk = angle(seen[i], seen[j]), angle(seen[i], seen[k]), angle(seen[j], seen[k])
     t_ij, t_ik, t_jk = sqrt(2.0) * rules.tolerance + rules.stretch * np.array([ij, ik, jk])
     if min(ij, ik, jk) < 4 * t_ij or max(ij, ik, jk) > index.max_angle_rad:
         return nothing()
-    # Three sides that agree on one focal length leave only what the lens distorts.
+    # If the three sides agree on one focal length, only the lens distortion remains of the stretch.
     tight = rules.stretch / 3 if rules.zooms else rules.stretch
     handed = triple(seen[i], seen[j], seen[k])
+    # Catalog pairs (a, b) for side ij, in both orders; then neighbors c of a for side ik; then side jk is tested.
     begin, end = between(index, ij - t_ij, ij + t_ij)
     for p in range(begin, end):
         if tried[2] >= rules.checks:
@@ -114,6 +119,7 @@ def _triangle(seen: Floats, index: PairIndex, corners: NDArray, rules: Rules, tr
                     continue
                 if handed * triple(index.vectors[a], index.vectors[b], index.vectors[c]) <= 0:
                     continue
+                # One zoom for all three sides: here the assumed over the true focal length.
                 zoom = (side + near + far) / (ij + ik + jk) if rules.zooms else 1.0
                 slip = max(
                     abs(side - zoom * ij) - tight * ij,
@@ -140,7 +146,7 @@ def _pyramid(
     stretch: float,
     tried: NDArray,
 ) -> Found:
-    """A triangle with a fourth star is worth proving."""
+    """Find a fourth star that fits a triangle; if there is one, return the direct match."""
     for r in range(rules.base):
         tried[2] += 1
         if r == corners[0] or r == corners[1] or r == corners[2]:
@@ -164,7 +170,7 @@ def _pyramid(
 
 @jit
 def _zoomed(seen: Floats, zoom: float) -> Floats:
-    """The directions with all angles from the boresight stretched, as a shorter focal length would see them."""
+    """The directions with their tangents multiplied by zoom: those for a focal length shorter by that factor."""
     out = np.empty_like(seen)
     for n in range(len(seen)):
         x, y = seen[n, 0] / seen[n, 2] * zoom, seen[n, 1] / seen[n, 2] * zoom
@@ -183,7 +189,7 @@ def _prove(
     stretch: float,
     hypotheses: int,
 ) -> Found:
-    """The direct match of the whole field, with a price for every star that should be there and is not."""
+    """The direct match of the whole field, with a penalty of missed_dex for each catalog star that is missing."""
     observed, star, matrix, chance = settled(
         seen, index, corners, stars, rules.tolerance, stretch, hypotheses
     )
@@ -195,7 +201,7 @@ def _prove(
 
 @jit
 def _expected(index: PairIndex, centre: int, matrix: Floats, rules: Rules) -> int:
-    """How many catalogue stars should be in the field at an attitude."""
+    """Number of catalog stars in the field at an attitude; `centre` is a star whose neighbors are tested."""
     count = 0
     begin, end = index.first[centre], index.first[centre + 1]
     for place in range(begin - 1, end):

@@ -1,6 +1,9 @@
 """Stellar Attitude Acquisition, the angle method of Boeing and of AFIT's thesis: a pair, then a direct match.
 
-Needelman, Li & Wu 2005 as told by Padro 2012, sections 2.4.2 to 2.4.5 and 3.6.4. `saasearch` has its compiled steps.
+Needelman, Li & Wu 2005, cited by Padro 2012, sections 2.4.2 to 2.4.5 and 3.6.4. A primary pair of observed stars is
+assumed to be each catalog pair of the same angle; each assumption gives an attitude, at which all other stars are
+matched, and a cost in squared standard deviations. The assumption of the least cost is accepted if its match is
+significant and no contradicting assumption is nearly as good. `saa_search` has the compiled steps.
 """
 
 from __future__ import annotations
@@ -29,10 +32,10 @@ from estimator.identification.published.saa_search import (
     triad,
 )
 
-CHALLENGES = (
-    10  # pairs that the best assumption must stand against; of two true stars each time in two, 1e-3 is left
-)
-MOST_ASSUMPTIONS = 100_000  # 16 MB of names at 40 observed stars
+# Further pairs whose assumptions the best one must beat. If half of the pairs are of true stars, the true assumption is
+# missed by all ten with probability 1e-3.
+CHALLENGES = 10
+MOST_ASSUMPTIONS = 100_000  # 16 MB of matches at 40 observed stars
 
 
 def saa(
@@ -41,13 +44,14 @@ def saa(
     """SAA (Needelman, Li & Wu 2005; Padro 2012, 2.4.2): two bright stars, all pairs like them, all other stars.
 
     vectors_cam   : (N, 3) observed unit vectors, brightest first
-    index         : pairs in buckets; or a k-vector
-    tolerance_rad : 3 epsilon_position: of a direction
-    options       : those of `Options`: magnitudes count where the index has them too; epsilon_sep_rad is
-        sqrt(2) / 3 of the tolerance if left out; max_triangles are observed pairs
-    Steps 2 to 8 of 2.4.2, but that it does not stop at the first assumption that passes: of all those of ten more
-    pairs, the best must be beyond chance (1e-5), and 1e5 times as likely as the next that names a star otherwise.
-    Where it is not, the answer is None. A lattice that is not in the catalogue is sometimes taken for one that is.
+    index         : pairs in buckets, or a k-vector index
+    tolerance_rad : of a direction, 3 epsilon_position
+    options       : those of `Options`: magnitudes are used if the index has them too; epsilon_sep_rad is
+        sqrt(2) / 3 of the tolerance if None; max_triangles is the limit of observed pairs
+    Steps 2 to 8 of 2.4.2, except that the search does not stop at the first assumption that passes: with the
+    assumptions of ten more pairs, the best must be significant (1e-5), and 1e5 times as likely as the next one that
+    identifies a star differently. Otherwise returns None. A lattice of LEDs that is not in the catalog is sometimes
+    identified as one that is.
     """
     asked = Options(**options)
     asked.fixed_focal("saa")
@@ -74,10 +78,10 @@ def saa(
 
 
 class Pool:
-    """Every assumption tried, in the pairs' order, and the best of them.
+    """All assumptions tried, in the order of the pairs, and the best of them.
 
-    Of each: (N,) the catalogue's row for each observed star, -1 for none; its cost in squared standard deviations;
-    and how many stars matched beside the pair.
+    Each assumption has (N,) the catalog's row for each observed star (-1: none), its cost in squared standard
+    deviations, and the number of stars matched beside the pair.
     """
 
     def __init__(self, sky: Sky, field_tan: tuple[float, float, float, float], missed_dex: float) -> None:
@@ -85,10 +89,10 @@ class Pool:
         self.tried: list[tuple[Ints, Floats, Ints]] = []
         self.count, self.cost, self.star = 0, np.inf, np.full(len(sky.seen), -1, np.int32)
         self.p, self.missed = 1.0, 0.0
-        self._doubts = np.zeros(3)  # of those that contradict the best: how many, their matches, least cost
+        self._doubts = np.zeros(3)  # assumptions that contradict the best: count, sum of matches, least cost
 
     def add(self, primary: Primary, assumed: tuple[Ints, Floats, Ints]) -> None:
-        """The assumptions of one more pair."""
+        """Add the assumptions of one more pair, and update the best one and those that contradict it."""
         star, cost, _ = assumed
         if not len(cost):
             return
@@ -98,6 +102,7 @@ class Pool:
         if cost[best] < self.cost:
             self.cost, self.star = float(cost[best]), star[best]
             self.p, self.missed = _by_chance(self.sky, primary, star[best], self.field_tan)
+            # A new best: all earlier assumptions are compared with it again.
             self._doubts = np.array([0.0, 0.0, np.inf])
             for one in self.tried:
                 contradicting(*one, self.star, self._doubts)
@@ -106,9 +111,9 @@ class Pool:
 
     @property
     def log10_chance(self) -> float:
-        """How often chance does as well as the best in such a search; 0 where there is too little to tell.
+        """log10 of the expected number of chance matches as good as the best one; 0 with too few matches.
 
-        On a lattice a false assumption finds partners often: how often is measured on those that contradict the best.
+        On a lattice false assumptions match often; their match rate is measured on those that contradict the best.
         """
         trials, hits = len(self.star) - 2, int((self.star >= 0).sum()) - 2
         if hits + 2 < MIN_MATCHES:
@@ -118,7 +123,7 @@ class Pool:
         return tail + self.missed_dex * self.missed + float(np.log10(self.count))
 
     def answer(self) -> StarMatch | None:
-        """The best, where it is beyond chance and no other is nearly as likely."""
+        """The best assumption, or None if it is not significant or a contradicting one is nearly as likely."""
         chance = self.log10_chance
         slack = -2 * np.log(10) * ACCEPT_LOG10_CHANCE
         if chance > ACCEPT_LOG10_CHANCE or (self._doubts[0] and self._doubts[2] < self.cost + slack):
@@ -130,9 +135,9 @@ class Pool:
 
 
 def _fill(pool: Pool, index: PairIndex | PairCatalogue, asked: Options) -> None:
-    """Every assumption of pair after pair, until the pool's best has stood against CHALLENGES more pairs.
+    """Add the assumptions of pair after pair, until the pool's best is significant and has beaten CHALLENGES more.
 
-    If noise carries A or B out of a gate, the truth is not among a pair's assumptions: one pair is not enough.
+    One pair is not enough: if noise moves A or B out of a gate, the truth is not among its assumptions.
     """
     sky, left = pool.sky, asked.max_triangles
     budget = min(asked.max_checks // len(sky.seen), MOST_ASSUMPTIONS)
@@ -146,16 +151,17 @@ def _fill(pool: Pool, index: PairIndex | PairCatalogue, asked: Options) -> None:
         left -= 1
         primary = primary_of(sky, a, b)
         pool.add(primary, matched(sky, primary, index.pair[begin:end]))
+        # Once the best is significant, only CHALLENGES more pairs are tried.
         if left >= CHALLENGES and pool.log10_chance <= ACCEPT_LOG10_CHANCE:
             left = CHALLENGES
 
 
 def _primary_pairs(sky: Sky, base_stars: int, high_rad: float) -> Iterator[tuple[int, int, float]]:
-    """Step 2: pairs of observed stars, the brightest first, far enough apart to fix a roll; and their angle."""
+    """Step 2: pairs of observed stars, the brightest first, far enough apart to determine the roll; and their angle."""
     base, gates = min(base_stars, len(sky.seen)), sky.gates
     apart = np.linalg.norm(sky.seen[:base, None] - sky.seen[:base], axis=2)
     angles = 2 * np.arcsin(np.minimum(apart / 2, 1.0))
-    for both in range(1, 2 * base - 2):
+    for both in range(1, 2 * base - 2):  # sum of the two rows: the brightest pairs have the least
         for a in range(max(both - base + 1, 0), (both + 1) // 2):
             angle = float(angles[a, both - a])
             if 4 * 3 * gates.separation_rad < angle <= high_rad + gate_rad(gates, angle):
@@ -165,10 +171,11 @@ def _primary_pairs(sky: Sky, base_stars: int, high_rad: float) -> Iterator[tuple
 def _by_chance(
     sky: Sky, primary: Primary, star: Ints, field_tan: tuple[float, float, float, float]
 ) -> tuple[float, float]:
-    """How likely an even field gives an observed star a partner at an assumption's attitude; and how many stars
-    that should be in the field then are not seen.
+    """Chance statistics of an assumption's attitude.
 
-    By chance: the stars of like brightness that an even field would have within the gates.
+    Returns the mean probability that an observed star finds a partner by chance, from the number of catalog stars of
+    similar brightness in a field of uniform density and the area of the gates, and the number of catalog stars that
+    are predicted in the field and not matched.
     """
     pair = star[primary.rows]
     R_cam_from_ref = primary.triad.T @ triad(sky.vectors[pair[0]], sky.vectors[pair[1]])
@@ -180,7 +187,7 @@ def _by_chance(
     rows = np.flatnonzero(field & (from_middle < primary.reach_rad))
     rows = rows[(rows != pair[0]) & (rows != pair[1])]
     off = np.abs(sky.light[primary.others][:, None] - sky.magnitude[rows])
-    alike = len(rows) - (off > 3 * sky.gates.magnitude).sum(axis=1)  # NaN is not
+    alike = len(rows) - (off > 3 * sky.gates.magnitude).sum(axis=1)  # NaN > x is False: unknown passes
     cap_sr = 2 * np.pi * (1 - np.cos(primary.reach_rad))
     p = float(np.mean(1 - np.exp(-alike * primary.area_sr / cap_sr)))
     return p, max(int(field.sum()) - int((star >= 0).sum()), 0)

@@ -1,4 +1,4 @@
-"""SAA's steps 4 to 7 compiled: every assumption of a primary pair, and the direct match of each."""
+"""SAA's steps 3 to 7, compiled: every assumption of a primary pair, and the direct match of each. See `saa`."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from estimator.core.arrays import Floats, Ints
 from estimator.core.jit import jit
 from estimator.identification.direct_match import angle
 
-# What an observed star without a partner costs, in squared standard deviations; a bad partner costs no more. Four
-# of them: a match lost to noise or to a reflection is then as likely as one in three thousand.
+# Cost of an observed star without a partner, in squared standard deviations; a bad partner costs no more. 16 is four
+# standard deviations: it corresponds to a probability of one in three thousand that a star has no partner.
 UNMATCHED = 16.0
 
 
 class Gates(NamedTuple):
-    """One standard deviation of what is compared: an angle, a place's angle, a magnitude. Gates are three of them.
+    """Standard deviations of an angle between stars, a direction, and a magnitude. A gate is three of them.
 
-    stretch : added to the gate of an angle, times the angle
+    stretch : stretch * angle is added to the gate of an angle
     """
 
     separation_rad: float
@@ -30,10 +30,11 @@ class Gates(NamedTuple):
 
 
 class Sky(NamedTuple):
-    """What is compared with what: observed stars, brightest first, the catalogue's, and how near is near.
+    """The observed stars, brightest first, the catalog, and the gates.
 
-    seen, vectors : (N, 3), (M, 3) unit vectors, camera and reference;  light, magnitude : NaN where unknown
-    cells         : the catalogue's stars by direction
+    seen, vectors    : (N, 3) observed unit vectors, camera axes;  (M, 3) catalog unit vectors, reference axes
+    light, magnitude : (N,), (M,) their magnitudes, NaN if unknown
+    cells            : spatial grid of the catalog's directions
     """
 
     seen: Floats
@@ -45,12 +46,13 @@ class Sky(NamedTuple):
 
 
 class Primary(NamedTuple):
-    """The primary pair A, B, and where it leaves the other stars X.
+    """The primary pair A, B, and the geometry of the X other stars about it.
 
-    rows, triad : (2,) of the observed stars, (3, 3) see `triad`;  middle : (3,) unit, halfway
-    others      : (X,) rows;  corner_rad, gate_rad : (2, X) their angles from A and from B, and the gates of those
-    sigma_rad, radius_rad : (X,) deviation of their predicted places and its gate;  area_sr : (X,) what all gates leave
-    reach_rad   : how far from the middle stars are seen
+    rows, triad : (2,) rows of the observed stars;  (3, 3) see `triad`;  middle : (3,) unit vector halfway
+    others      : (X,) rows;  corner_rad, gate_rad : (2, X) their angles from A and from B, and the gates of these
+    sigma_rad, radius_rad : (X,) standard deviation of the predicted position and its gate
+    area_sr     : (X,) area inside all gates
+    reach_rad   : greatest angle of an observed star from the middle, with a gate added
     """
 
     rows: Ints
@@ -67,7 +69,7 @@ class Primary(NamedTuple):
 
 @jit
 def gate_rad(gates: Gates, angle_rad: float) -> float:
-    """How far an angle may be off."""
+    """Tolerance of an angle: three standard deviations plus the stretch."""
     return 3 * gates.separation_rad + gates.stretch * angle_rad
 
 
@@ -75,7 +77,7 @@ def gate_rad(gates: Gates, angle_rad: float) -> float:
 def triad(a: Floats, b: Floats) -> Floats:
     """Rows: unit vectors along a + b, a - b and their cross product.
 
-    To carry one pair's onto another's is Wahba's best rotation for two stars of equal weight."""
+    The rotation that maps one pair's triad to another's is Wahba's solution for two stars of equal weight."""
     rows = np.empty((3, 3))
     rows[0], rows[1] = a + b, a - b
     rows[2, 0] = b[1] * a[2] - b[2] * a[1]
@@ -88,11 +90,11 @@ def triad(a: Floats, b: Floats) -> Floats:
 
 @jit
 def primary_of(sky: Sky, row_a: int, row_b: int) -> Primary:
-    """What the direct match needs of the pair, whatever it is assumed to be.
+    """The geometry that the direct match needs of an observed pair; it is the same for all its assumptions.
 
-    The thesis's position gate is 3 epsilon_position everywhere; Needelman's epsilon_position(S) knows that a pair
-    b apart turns by sqrt(2) sigma / b and shifts by sigma / sqrt(2) with its noise sigma: at d from its middle
-    sigma^2 (1 + 1/2 + 2 d^2 / b^2), which is what is used here.
+    The thesis's position gate is 3 epsilon_position everywhere. Needelman's epsilon_position(S) includes the error of
+    the pair's attitude: with noise sigma, a pair of separation b rotates by sqrt(2) sigma / b and shifts by
+    sigma / sqrt(2). At distance d from its middle the variance is sigma^2 (1 + 1/2 + 2 d^2 / b^2), which is used here.
     """
     gates, seen = sky.gates, sky.seen
     a, b, count = seen[row_a], seen[row_b], len(seen) - 2
@@ -112,7 +114,8 @@ def primary_of(sky: Sky, row_a: int, row_b: int) -> Primary:
         gate[0, k], gate[1, k] = gate_rad(gates, corner[0, k]), gate_rad(gates, corner[1, k])
         sigma[k] = gates.position_rad * np.sqrt(1.5 + 2 * (from_middle / base_rad) ** 2)
         radius[k] = 3 * sigma[k] + gates.stretch * from_middle
-        # Two rings about A and B cross at the angle that X sees them under: a rhombus.
+        # The rings about A and B, of the gates' widths, cross at X in a rhombus; its angle is that of A and B seen
+        # from X.
         sides = max(corner[0, k] * corner[1, k], 1e-20)
         sine = np.sqrt(np.sum(np.cross(a - x, b - x) ** 2)) / sides
         rhombus = 4 * gate[0, k] * gate[1, k] / max(sine, 1e-9)
@@ -125,7 +128,7 @@ def primary_of(sky: Sky, row_a: int, row_b: int) -> Primary:
 
 @jit
 def magnitude_cost(sky: Sky, observed: int, star: int) -> float:
-    """Squared deviation of a magnitude, infinite beyond three; 0 where none is known."""
+    """Squared deviation of a magnitude in standard deviations, inf beyond three; 0 if it is unknown."""
     off = (sky.light[observed] - sky.magnitude[star]) / sky.gates.magnitude
     if np.isnan(off):
         return 0.0
@@ -134,10 +137,10 @@ def magnitude_cost(sky: Sky, observed: int, star: int) -> float:
 
 @jit
 def matched(sky: Sky, primary: Primary, pairs: NDArray) -> tuple[NDArray, Floats, Ints]:
-    """Steps 3 to 7: every assumption that one of the catalogue's (K, 2) pairs makes, either way round.
+    """Steps 3 to 7: every assumption from the catalog's (K, 2) pairs, in both orders.
 
-    Returns of each: (N,) names of the observed stars, -1 for none; the cost; matches beside the pair. The ends of
-    a bucket, or of the k-vector's step, hold pairs outside the gate.
+    Returns for each assumption (N,) catalog rows of the observed stars (-1: none), the cost, and the number of matches
+    beside the pair. Pairs outside the gate, at the ends of a bucket or of a k-vector step, are skipped.
     """
     a, b = primary.rows
     apart = angle(sky.seen[a], sky.seen[b])
@@ -172,10 +175,10 @@ def matched(sky: Sky, primary: Primary, pairs: NDArray) -> tuple[NDArray, Floats
 def _partners(
     sky: Sky, primary: Primary, first: int, second: int, near: NDArray, partner: NDArray, spent: Floats
 ) -> None:
-    """Steps 5 and 6: the pair's attitude, and for each other star its partner there (-1: none) and what it costs.
+    """Steps 5 and 6: the pair's attitude, and for each other star its partner (-1: none) and its cost, in place.
 
-    Section 2.4.5's four conditions: the magnitude, the place, and the angles to A and to B. Place settles what the
-    angles to two stars cannot tell: a star from its mirror image in their line.
+    Section 2.4.5's four conditions: magnitude, position, and the angles to A and to B. The position distinguishes a
+    star from its mirror image about the line A B, which the two angles cannot.
     """
     stars = triad(sky.vectors[first], sky.vectors[second])
     R = np.empty((3, 3))  # R_ref_from_cam
@@ -204,6 +207,7 @@ def _partners(
                 continue
             cost += (slip_a**2 + slip_b**2) / sky.gates.separation_rad**2
             dx, dy, dz = sky.vectors[s, 0] - x, sky.vectors[s, 1] - y, sky.vectors[s, 2] - z
+            # The position decides between several partners, but is not part of the assumption's cost.
             place = (dx * dx + dy * dy + dz * dz) / primary.sigma_rad[k] ** 2
             if cost + place < least:
                 least, partner[k], spent[k] = cost + place, s, cost
@@ -211,7 +215,7 @@ def _partners(
 
 @jit
 def _each_once(partner: NDArray, spent: Floats) -> int:
-    """A star that two observed ones want goes to the cheaper; how many have one."""
+    """If two observed stars have the same partner, the one of less cost keeps it; returns the number of matches."""
     count = 0
     for k in range(len(partner)):
         if partner[k] < 0:
@@ -228,7 +232,10 @@ def _each_once(partner: NDArray, spent: Floats) -> int:
 
 @jit
 def contradicting(star: NDArray, cost: Floats, hits: NDArray, best: NDArray, doubts: Floats) -> None:
-    """Add up those that give an observed star another name than the best does: how many, their matches, least cost."""
+    """Accumulate the assumptions that identify an observed star differently from the best one.
+
+    doubts : (3,) their number, the sum of their matches and their least cost, updated in place
+    """
     for n in range(len(cost)):
         for m in range(len(best)):
             if star[n, m] >= 0 and best[m] >= 0 and star[n, m] != best[m]:

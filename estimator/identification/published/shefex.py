@@ -1,7 +1,7 @@
 """SHEFEX-2's identifier: a base triangle of the brightest, a fourth star, then the rest, by cosines of angles.
 
-Samaan & Theil 2011, section 3.4 and Fig. 6. Two angles are alike where their cosines differ by less than cosError,
-which is a wide gate for stars close together: at 5.5e-5 it is 0.090 deg at 2 deg, and 0.010 at 18.57 deg.
+Samaan & Theil 2011, section 3.4 and Fig. 6. Two angles agree if their cosines differ by less than cosError, which is a
+wide gate for stars close together: for 5.5e-5 it is 0.090 deg at 2 deg, and 0.010 deg at 18.57 deg.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from estimator.identification.direct_match import Found, angle, answer, nothing,
 from estimator.identification.options import Options
 
 FOURTH_STAR = 1e300  # the paper's own rule: "it is already certain that a success will occur"
-APART = 6.0  # tolerances between base stars, and from them: closer, an angle says little
+APART = 6.0  # least angle between base stars, and from them, in tolerances: smaller angles carry little information
 
 
 class Rules(NamedTuple):
-    """How a search is done: cosError, a direction's tolerance, and when to give up (see `Options`).
+    """Search parameters: cosError, a direction's tolerance, and the limits of the effort (see `Options`).
 
-    accept : log10 of the chance at which a match is the answer; FOURTH_STAR takes whatever has a fourth star
+    accept : log10 of the chance at which a match is accepted; FOURTH_STAR accepts any match with a fourth star
     """
 
     cos_error: float
@@ -45,9 +45,9 @@ def cos_error(fov_rad: float, centroid_error_rad: float, factor: float = 1.0) ->
 
 @jit
 def gate(angle_rad: float, cos_error: float) -> tuple[float, float]:
-    """The angles whose cosine differs from that of one by cosError at most: eqs 4 and 5 with their signs mended.
+    """Interval of angles whose cosines differ by at most cosError from that of an angle: eqs 4, 5 with correct signs.
 
-    By the half-angle's sine, for cos a = 1 - 2 sin^2(a / 2): a small angle keeps its digits.
+    Computed with cos a = 1 - 2 sin^2(a / 2), which is accurate for small angles.
     """
     half = np.sin(angle_rad / 2) ** 2
     low = 2 * np.arcsin(np.sqrt(max(half - cos_error / 2, 0.0)))
@@ -58,12 +58,11 @@ def shefex(vectors_cam: Floats, index: PairIndex, tolerance_rad: float, **option
     """SHEFEX-2's pyramid, brightest first, with cosError by eq. 3 from the tolerance and the index's greatest angle.
 
     vectors_cam   : (N, 3) observed unit vectors, brightest first; the paper has 15 at most
-    tolerance_rad : of a direction;  options : those of `Options`; no magnitudes are used
-    All triangles in the order of brightness: the base triangle's stars are found by the k-vector, a fourth and then
-    every other star by its three angles to them. Ours beside the paper: the triangle's handedness, which its angles
-    leave open, the places at the attitude found, and the verdict. The paper takes a fourth star for success; here as
-    many stars must have matched as chance would bring less than 1e-5 times in all that was tried, or the answer is
-    None.
+    tolerance_rad : of a direction;  options : those of `Options`; magnitudes are not used
+    All triangles are tried in the order of brightness: the base triangle's stars are found with the k-vector, a fourth
+    star and then every other star by its three angles to them. Three tests are added to the paper's: the handedness of
+    the triangle, the positions at the attitude found, and significance. The paper accepts any fourth star; here a
+    match this good must be expected less than 1e-5 times by chance over all triangles tried. Otherwise returns None.
     """
     asked = Options(**options)
     asked.fixed_focal("shefex")
@@ -80,13 +79,13 @@ def shefex(vectors_cam: Floats, index: PairIndex, tolerance_rad: float, **option
 
 @jit
 def search(seen: Floats, index: PairIndex, by: Rules) -> Found:
-    """The compiled identifier: rows of the observed and the catalogue's stars, R_cam_from_ref, log10 of the chance."""
+    """Compiled search: rows of the observed stars and of the catalog, R_cam_from_ref, log10 of the chance."""
     return sought(seen, index, by, np.zeros(3, np.int64))
 
 
 @jit
 def sought(seen: Floats, index: PairIndex, by: Rules, tried: NDArray) -> Found:
-    """As `search`, and what it took is added to (3,) tried: base triangles found, angles compared, triangles seen."""
+    """As `search`; adds its effort to (3,) tried: base triangles found, angles compared, observed triangles."""
     for i in range(by.base - 2):
         for j in range(i + 1, by.base - 1):
             for k in range(j + 1, by.base):
@@ -101,7 +100,7 @@ def sought(seen: Floats, index: PairIndex, by: Rules, tried: NDArray) -> Found:
 
 @jit
 def _triangle(seen: Floats, index: PairIndex, corners: NDArray, by: Rules, tried: NDArray) -> Found:
-    """Every catalogue triangle like an observed one, with the other stars named by their angles to its corners."""
+    """Test every catalog triangle that fits an observed one; other stars are identified by their angles to it."""
     i, j, k = corners
     ij, ik, jk = angle(seen[i], seen[j]), angle(seen[i], seen[k]), angle(seen[j], seen[k])
     if min(ij, ik, jk) < APART * by.tolerance_rad or max(ij, ik, jk) > index.max_angle_rad:
@@ -111,6 +110,7 @@ def _triangle(seen: Floats, index: PairIndex, corners: NDArray, by: Rules, tried
     near_low, near_high = gate(ik, by.cos_error)
     far_low, far_high = gate(jk, by.cos_error)
     rings = _rings(seen, corners, by)
+    # Catalog pairs (a, b) for side ij, in both orders; then neighbors c of a for side ik; then side jk is tested.
     begin, end = between(index, low, high)
     for p in range(begin, end):
         if tried[1] >= by.checks:
@@ -137,9 +137,9 @@ def _triangle(seen: Floats, index: PairIndex, corners: NDArray, by: Rules, tried
 
 @jit
 def _rings(seen: Floats, corners: NDArray, by: Rules) -> Floats:
-    """(N, 10) where a star must be about the base: lower ends of its angles' gates, upper ends, cosines of the angles.
+    """(N, 10) gates of each observed star's three angles to the base: lower ends, upper ends, cosines, and the area.
 
-    Last comes the area that the gates leave, 0 for a base star and for one too close to any, which is not named.
+    The area inside the gates is 0 for base stars and for stars too close to one; these are not identified.
     """
     rings, side = np.zeros((len(seen), 10)), np.empty(3)
     for n in range(len(seen)):
@@ -162,9 +162,9 @@ def _rest(
     by: Rules,
     tried: NDArray,
 ) -> Found:
-    """A fourth star and all others, each by its angles to the base triangle, and then by its place at their attitude.
+    """Identify the other stars by their angles to the base triangle, then keep those near their predicted positions.
 
-    A slim base, and stars in its line, look much like their mirror image in angles, not in places.
+    The second test rejects mirror images, which a slim base, or stars in line with it, cannot distinguish by angles.
     """
     observed, star = np.empty(len(seen), np.int64), np.empty(len(seen), np.int64)
     observed[:3], star[:3] = corners, stars
@@ -184,6 +184,7 @@ def _rest(
     observed, star, count = observed[kept], star[kept], kept.sum()
     if count < MIN_MATCHES:
         return nothing()
+    # Probability that a random direction falls into the gates of an observed star, from the local catalog density.
     cap_sr = 2 * np.pi * (1 - np.cos(index.max_angle_rad))
     density = (index.first[stars[0] + 1] - index.first[stars[0]] + 1) / cap_sr
     p = 1 - np.exp(-density * rings[:, 9].sum() / (len(seen) - 3))
@@ -195,9 +196,10 @@ def _rest(
 def _partner(
     seen: Floats, index: PairIndex, corners: NDArray, stars: NDArray, n: int, ring: Floats, tried: NDArray
 ) -> int:
-    """The star whose three angles to the base are like an observed one's, nearest in the sum of their cosines; or -1.
+    """The catalog star whose three angles to the base fit those of observed star n, or -1.
 
-    Three rings do not tell a place from its mirror image where the base is slim: its side is looked at too.
+    Of several, the one of the least sum of cosine differences. With a slim base three angles do not distinguish a
+    position from its mirror image, so that the side of the base line is tested too.
     """
     best, least = -1, np.inf
     place = around(index, stars[0], ring[0])
@@ -221,7 +223,7 @@ def _partner(
 
 @jit
 def _same_side(seen: Floats, index: PairIndex, corners: NDArray, stars: NDArray, n: int, d: int) -> bool:
-    """Whether a star is on the same side of the base's line that it is farthest from, observed and catalogued."""
+    """Whether observed star n and catalog star d are on the same side of the base line farthest from the star."""
     best, product = 0.0, 1.0
     for m in range(3):
         a, b = m, (m + 1) % 3
@@ -234,10 +236,10 @@ def _same_side(seen: Floats, index: PairIndex, corners: NDArray, stars: NDArray,
 
 @jit
 def _crossing(seen: Floats, corners: NDArray, n: int, side: Floats, width: Floats) -> float:
-    """The least of the three rhombi in which two rings about base stars cross at a star, in steradians.
+    """The least area of the three rhombi in which two rings about base stars cross at a star, in steradians.
 
-    They cross at the angle that the star sees the two under, whose sine is the volume of the three over the sines of
-    their sides.
+    The rings cross at the angle between the two base stars as seen from the star; its sine is the triple product of the
+    three directions over the sines of the two sides.
     """
     least = np.inf
     for m in range(3):

@@ -1,4 +1,16 @@
-"""What an attitude under the stars is worth: the stars that it puts where lights are, as evidence."""
+"""Bayes factor of a candidate attitude from matched and missing stars.
+
+`weigh` matches the detections to the catalog stars that the candidate attitude projects next to them, fits the attitude
+(and the focal length, if it is uncertain) to the matches, and returns log10 of the Bayes factor ("dex") of the
+hypothesis "this attitude" over the hypothesis "the detections are distributed at random over the sensor":
+
+    dex = sum_k log10( N(residual_k) / rho ) + sum_k log10( p(magnitude_k | star) / p(magnitude_k) )
+          + log10( (2 pi)^(n/2) / sqrt(det info) / V ) + log10 B(matched + 1, missing + 1) - penalty
+
+rho is the density of detections on the sensor and info the n x n Fisher information of the fit. V is the prior volume
+of attitudes (8 pi^2) and focal lengths; the term with V is Laplace's approximation of the integral over them. By
+Markov's inequality, random detections reach x dex for any attitude in at most one of 10^x frames.
+"""
 
 from __future__ import annotations
 
@@ -14,23 +26,24 @@ from estimator.core import least_squares, vectors
 from estimator.core.arrays import Floats
 from estimator.core.jit import jit
 
-GATE = 3.5  # standard deviations within which a light is a star's: one in 450 is lost
-LEAST = 3  # matches
-MAG_ODD = (
-    0.05  # of the stars have another magnitude than the catalogue's: variables, doubles, what a filter does
-)
-TOLL_DEX = 0.5  # for each light of no star, as bright as those matched, by which these outnumber the matches
-INNER = 0.97  # of the field: a star nearer to its border may be cut off, which is no reason to miss it
+GATE = 3.5  # matching radius in standard deviations: it loses one true match in 450
+LEAST = 3  # matches needed for a solution
+# Fraction of stars whose magnitude disagrees with the catalog: variable stars, doubles, an unusual passband.
+MAG_ODD = 0.05
+# Penalty for unmatched detections brighter than the faintest match, for each one in excess of the number of matches.
+TOLL_DEX = 0.5
+INNER = 0.97  # fraction of the field in which an unmatched star counts as missing; the border may cut it off
 
 
 class Lights(NamedTuple):
-    """What is seen. A plain tuple, so that compiled code can take it.
+    """The detections of one frame. A named tuple, because numba can compile functions that take one.
 
     tangent : (N, 2) x / z and y / z in camera axes, brightest first
-    sigma   : (N,) in the direction of the greatest error;  weight : (N, 3) the inverse covariance: xx, yy, xy
-    mag     : (N,) magnitudes on the catalogue's scale, mag_sigma their error; NaN where they are not known
+    sigma   : (N,) standard deviation of a tangent along the major axis of its error ellipse
+    weight  : (N, 3) inverse covariance of the tangents: xx, yy, xy
+    mag     : (N,) magnitudes on the catalog's scale, NaN if unknown;  mag_sigma : their standard deviation
     field   : (4,) tangents left, right, top, bottom of the sensor's edges
-    zoom    : the share by which the focal length may differ; 0 for a camera that is known
+    zoom    : relative uncertainty of the focal length; 0 for a calibrated camera
     """
 
     tangent: Floats
@@ -43,11 +56,12 @@ class Lights(NamedTuple):
 
 
 class Guess(NamedTuple):
-    """An attitude with what speaks for it.
+    """A hypothesis: candidate attitude, matches and evidence.
 
-    observed, star : (K,) rows of lights and stars;  R_cam_from_ref : (3, 3)
-    zoom : the true focal length over the believed;  info : (4, 4) of the small turn in camera axes and of log zoom
-    dex  : evidence in powers of ten
+    observed, star : (K,) rows of detections and of stars;  R_cam_from_ref : (3, 3)
+    zoom : ratio of the true to the assumed focal length
+    info : (4, 4) Fisher information of the small rotation in camera axes and of log zoom
+    dex  : log10 of the Bayes factor
     """
 
     observed: NDArray[np.int64]
@@ -59,11 +73,12 @@ class Guess(NamedTuple):
 
 
 class Fix(NamedTuple):
-    """An attitude from all lights and stars.
+    """The solution from all detections and stars.
 
-    observed, star : (K,) rows; none where there is no attitude
-    cam_from_ref_xyzw : (4,);  covariance_rad2 : (3, 3) of the small turn in camera axes
-    zoom : the true focal length over the believed;  rms : of the residuals, tangents;  dex : evidence in powers of ten
+    observed, star : (K,) rows of detections and of stars; empty if there is no solution
+    cam_from_ref_xyzw : (4,);  covariance_rad2 : (3, 3) of the small rotation in camera axes
+    zoom : ratio of the true to the assumed focal length;  rms : of the residuals, tangents
+    dex  : log10 of the Bayes factor
     """
 
     observed: NDArray[np.int64]
@@ -77,19 +92,19 @@ class Fix(NamedTuple):
 
 @jit
 def nothing() -> Guess:
-    """No attitude."""
+    """The empty hypothesis, with evidence -inf."""
     return Guess(np.empty(0, np.int64), np.empty(0, np.int64), np.eye(3), 1.0, np.eye(4), -np.inf)
 
 
 @jit
 def share_at(sky: Sky, mag: float) -> float:
-    """Density of the catalogue's magnitudes at one."""
+    """Probability density of the catalog's magnitudes at `mag`, 1 / mag."""
     return sky.share[cell_of((mag - sky.mag[0]) / MAG_STEP, len(sky.share) - 1)]
 
 
 @jit
 def ray(tangent: Floats, n: int, zoom: float) -> vectors.Vector:
-    """Unit vector of a light for a focal length `zoom` times the believed one."""
+    """Unit vector of detection n in camera axes, for a focal length `zoom` times the assumed one."""
     x, y = tangent[n, 0] / zoom, tangent[n, 1] / zoom
     inverse = 1 / sqrt(x * x + y * y + 1)
     return x * inverse, y * inverse, inverse
@@ -97,7 +112,7 @@ def ray(tangent: Floats, n: int, zoom: float) -> vectors.Vector:
 
 @jit
 def volume_dex(lights: Lights) -> float:
-    """log10 of the volume of all attitudes, 8 pi^2, and of all zooms."""
+    """log10 of the prior volume: 8 pi^2 of attitudes times the width of the interval of log zoom."""
     return log10(8 * pi * pi) + (log10(2 * lights.zoom) if lights.zoom > 0 else 0.0)
 
 
@@ -119,10 +134,13 @@ def turned(matrix: Floats, u: vectors.Vector) -> vectors.Vector:
 def weigh(
     lights: Lights, sky: Sky, R_cam_from_ref: Floats, zoom: float, gates: Floats, floor_dex: float
 ) -> Guess:
-    """Match the field at an attitude (turned in place), fit it to the matches, twice, and weigh what they match.
+    """Evaluate a candidate attitude: match detections to stars, fit attitude and zoom (twice), compute the evidence.
 
-    Nothing where the evidence is below floor_dex, or would be though every match were exact and no star missed: that
-    is seen before most of the work.
+    gates : (N,) rad, matching radius of each detection in the first round; later rounds use GATE standard deviations
+
+    R_cam_from_ref is changed in place by the fit. Returns the empty hypothesis if fewer than LEAST stars match, the
+    zoom leaves its interval, or the evidence is below floor_dex. The last test is made early with an upper bound of
+    the evidence (exact matches, no missing star), which rejects most false candidates before the full evaluation.
     """
     R, info = R_cam_from_ref, np.zeros((4, 4))
     own = GATE * lights.sigma
@@ -131,6 +149,7 @@ def weigh(
         if len(observed) < LEAST:
             return nothing()
         if turn == 1:
+            # `info` is that of the first fit; without the residuals the evidence is an upper bound.
             most_dex = _evidence(lights, sky, R, zoom, observed, star, info, False)
             if most_dex + _seen_dex(len(observed), 0) < floor_dex:
                 return nothing()
@@ -149,7 +168,11 @@ def weigh(
 def _match(
     lights: Lights, sky: Sky, R_cam_from_ref: Floats, zoom: float, gates: Floats, most_sigma: float
 ) -> tuple[NDArray, NDArray]:
-    """Each light's nearest star within its gate and so many of its errors; of two lights at one star the nearer."""
+    """Match each detection to its nearest star, within gates[n] rad and most_sigma standard deviations.
+
+    If two detections match one star, the one with the smaller Mahalanobis distance keeps it. Returns the rows of the
+    detections and of the stars.
+    """
     total, count = len(lights.sigma), 0
     observed, star, gap = np.empty(total, np.int64), np.empty(total, np.int64), np.empty(total)
     R_ref_from_cam, tangent, vectors_ref = R_cam_from_ref.T.copy(), lights.tangent, sky.vectors
@@ -162,7 +185,7 @@ def _match(
         off2 = misfit2(lights, sky, R_cam_from_ref, zoom, n, s)
         if off2 > most_sigma**2:
             continue
-        place = 0
+        place = 0  # of an earlier match of the same star, or `count`
         while place < count and star[place] != s:
             place += 1
         if place == count:
@@ -175,14 +198,14 @@ def _match(
 
 @jit
 def predicted(vectors_ref: Floats, R: Floats, star: int) -> vectors.Vector:
-    """A star in camera axes: tangents of x and y, and z."""
+    """Project a star into camera axes: x / z, y / z, and z."""
     x, y, z = turned(R, vectors.row(vectors_ref, star))
     return x / z, y / z, z
 
 
 @jit
 def misfit2(lights: Lights, sky: Sky, R_cam_from_ref: Floats, zoom: float, light: int, star: int) -> float:
-    """Square of a light's distance from a star in its own standard deviations (Mahalanobis)."""
+    """Squared Mahalanobis distance of a detection from a star's predicted image."""
     x, y, _ = predicted(sky.vectors, R_cam_from_ref, star)
     off_x, off_y = lights.tangent[light, 0] - zoom * x, lights.tangent[light, 1] - zoom * y
     xx, yy, xy = vectors.row(lights.weight, light)
@@ -199,10 +222,11 @@ def _fit(
     star: NDArray,
     info: Floats,
 ) -> float:
-    """One Gauss-Newton step of the attitude (in place) and of the zoom (returned), weighted by the lights' errors.
+    """One weighted Gauss-Newton step of the attitude (in place) and of the zoom (returned).
 
-    With t = zoom (x, y) / z and q <- q + w x q the slopes of t_x by w are zoom (-x y / z^2, 1 + x^2 / z^2, -y / z), of
-    t_y zoom (-1 - y^2 / z^2, x y / z^2, x / z), and both by log zoom t itself. Leaves the information in `info`.
+    With t = zoom (x, y) / z and a small rotation q <- q + w x q, the derivative of t_x with respect to w is
+    zoom (-x y / z^2, 1 + x^2 / z^2, -y / z), that of t_y is zoom (-1 - y^2 / z^2, x y / z^2, x / z), and that of t with
+    respect to log zoom is t itself. The (4, 4) Fisher information is written to `info`.
     """
     count = 4 if lights.zoom > 0 else 3
     info[:] = 0.0
@@ -230,7 +254,10 @@ def _fit(
 
 @jit
 def solved(a: Floats, b: Floats) -> Floats:
-    """x of a x = b by Cholesky; `a` (its lower half) becomes the factor, be it as good as singular."""
+    """Solve a x = b by Cholesky factorization; the lower triangle of `a` is replaced by its factor.
+
+    Pivots are floored, so that a nearly singular matrix gives large but finite values.
+    """
     x = b.copy()
     for i in range(len(b)):
         for j in range(i + 1):
@@ -243,11 +270,12 @@ def solved(a: Floats, b: Floats) -> Floats:
 
 @jit
 def _missed(lights: Lights, sky: Sky, R: Floats, zoom: float, observed: NDArray, star: NDArray) -> int:
-    """How many stars that are brighter than the faintest match, and well within the field, no light is matched to."""
+    """Number of missing stars: brighter than the faintest matched star, well inside the field, and not matched."""
     left, right, top, bottom = lights.field * (INNER / zoom)
     vectors_ref, inside = sky.vectors, 0
+    # Cosine of the angle from the boresight to the farthest corner: it rejects most stars with one dot product.
     corner = 1 / sqrt(1 + max(left * left, right * right) + max(top * top, bottom * bottom))
-    for s in range(star.max() + 1):
+    for s in range(star.max() + 1):  # stars are sorted by brightness
         x, y, z = vectors.row(vectors_ref, s)
         if R[2, 0] * x + R[2, 1] * y + R[2, 2] * z > corner:
             x, y, z = turned(R, (x, y, z))
@@ -270,24 +298,24 @@ def _evidence(
     info: Floats,
     misfit: bool,
 ) -> float:
-    """How many powers of ten more probable the lights are at this attitude than fallen anywhere (Bayes' factor).
+    """log10 of the Bayes factor of this attitude over detections at random positions, without the term `_seen_dex`.
 
-    But for `_seen_dex`. Each match is worth N(residual) / rho, rho the lights on the sensor's area, and as much for the
-    magnitude; the attitude is one among all: sqrt(2 pi)^n / sqrt(det info) of their volume (Laplace's integral over
-    it). Among lights that fell anywhere evidence beyond 10^x for any attitude is met once in 10^x frames at most
-    (Markov's inequality). So much for strangers up to half of the lights; more of them are less and less likely
-    (TOLL_DEX).
-    misfit : whether the residuals count; without them it is the most that these matches could be worth
+    Each match contributes N(residual) / rho, rho the density of detections on the sensor, and the ratio of `_mag_dex`.
+    The attitude and the zoom contribute sqrt(2 pi)^n / sqrt(det info) over their prior volume (Laplace's
+    approximation). Unmatched detections cost nothing as long as they are no more than the matches; each one above
+    that, among the detections brighter than the faintest match, costs TOLL_DEX.
+    misfit : include the residuals; without them the result is an upper bound for these matches
     """
     count = 4 if lights.zoom > 0 else 3
     factor = info[:count, :count].copy()
     solved(factor, np.zeros(count))
     total = 0.5 * count * log10(2 * pi) - volume_dex(lights)
-    for i in range(count):
+    for i in range(count):  # the product of the Cholesky factor's diagonal is sqrt(det info)
         total -= log10(factor[i, i])
     as_bright = _share_to(sky, lights.mag)
     for k in range(len(observed)):
-        # Any number of false lights being as probable, n of them are n! / (n - m)! times as many as n - m.
+        # Every number of false detections is equally probable a priori, so that n of them against n - m contribute the
+        # ratio n! / (n - m)!: the density drops by one detection per match.
         density = (len(lights.sigma) - k) / area(lights)
         xx, yy, xy = vectors.row(lights.weight, observed[k])
         total -= log10(2 * pi * density / sqrt(xx * yy - xy * xy))
@@ -299,13 +327,13 @@ def _evidence(
 
 @jit
 def _seen_dex(seen: int, missed: int) -> float:
-    """That so many of the stars are seen and so many are not: B(m + 1, k + 1), every share being as probable before."""
+    """log10 B(seen + 1, missed + 1): likelihood of the counts, with a uniform prior on the detection probability."""
     return (lgamma(seen + 1.0) + lgamma(missed + 1.0) - lgamma(seen + missed + 2.0)) / log(10.0)
 
 
 @jit
 def _share_to(sky: Sky, mag: Floats) -> float:
-    """Share of the stars that are as bright as the faintest of the lights."""
+    """Fraction of the stars that are at least as bright as the faintest detection; 1 if magnitudes are unknown."""
     faintest = mag[0]
     for one in mag:
         faintest = max(faintest, one)
@@ -316,9 +344,10 @@ def _share_to(sky: Sky, mag: Floats) -> float:
 
 @jit
 def _mag_dex(lights: Lights, sky: Sky, light: int, star: int, as_bright: float) -> float:
-    """What a light's magnitude says for a star, dex: N(difference) over its density among stars as bright as these.
+    """log10 of the likelihood ratio of a detection's magnitude: given its star, over a random star as bright as these.
 
-    MAG_ODD of the stars have any magnitude.
+    A fraction MAG_ODD of the stars is taken to have any magnitude, so that one outlier costs log10(MAG_ODD) at most.
+    Returns 0 if the magnitude is unknown.
     """
     off = lights.mag[light] - sky.mag[star]
     if not np.isfinite(off):
@@ -330,7 +359,10 @@ def _mag_dex(lights: Lights, sky: Sky, light: int, star: int, as_bright: float) 
 
 @jit
 def fixed(lights: Lights, stars: Sky, guess: Guess) -> Fix:
-    """A guess with its errors. The covariance is of the attitude with the zoom unknown, where it is."""
+    """The solution of a hypothesis, with attitude covariance and rms residual.
+
+    The covariance is marginalized over the zoom if the focal length is uncertain.
+    """
     covariance, total, count = np.zeros((3, 3)), 0.0, 4 if lights.zoom > 0 else 3
     for axis in range(3):
         unit = np.zeros(count)

@@ -1,8 +1,13 @@
-"""Which star is which, lost in space: the default. A pair of lights as every pair of stars, proved by the whole field.
+"""Lost-in-space star identification by pair hypotheses and a Bayes factor: the default method.
 
-Two lights and two stars as far apart give an attitude, which must put other stars where lights are. What it puts there
-is weighed as evidence over lights that fell anywhere; the first attitude beyond chance is the answer. Where the focal
-length is only known within a share, the pair's own angle tells it, and the rest of the field must agree.
+A pair of detections and a pair of catalog stars with the same angular separation determine a candidate attitude. A
+quick check counts how many of the other detections have a star at the predicted position; if enough do, the candidate
+is fitted to the whole field and its Bayes factor is computed (`evidence.weigh`). Pairs that few catalog pairs can
+match are tried first. The search ends at DECISIVE_DEX; a weaker candidate must have ACCEPT_DEX and beat every other
+attitude by MARGIN_DEX.
+
+If the focal length is uncertain, each pair hypothesis also determines it, from the ratio of the measured to the catalog
+separation, and the rest of the field must confirm both.
 """
 
 from __future__ import annotations
@@ -33,32 +38,28 @@ from estimator.identification.stars.evidence import (
     weigh,
 )
 
-# Evidence for an attitude, against lights that fell anywhere, in powers of ten. Markov's inequality allows one such in
-# 10^5 frames of false lights. With 4 a mirrored sky had an attitude, one in 10^5 hostile pictures (docs/trust.md); 5
-# costs two in a thousand of the hardest frames (python -m benchmarks.lost_in_space), 6 would cost twelve.
+# Least log10 Bayes factor of an accepted attitude. By Markov's inequality, random detections reach it in at most one of
+# 10^5 frames. With 4, a mirrored sky was solved in one of 10^5 adversarial images (docs/trust.md); 5 loses two in a
+# thousand of the hardest frames (python -m benchmarks.lost_in_space), 6 would lose twelve.
 ACCEPT_DEX = 5.0
-DECISIVE_DEX = 10.0  # evidence beyond which no rival is looked for
-MARGIN_DEX = 3.0  # by which the answer must beat every other attitude
-NO_RIVAL_DEX = ACCEPT_DEX - MARGIN_DEX  # of less evidence an attitude is neither the answer nor in its way
-AGAIN, AGAIN_LEAST = (
-    2,
-    2000,
-)  # how much more is looked for rivals: times the effort so far, and lights at least
-LONG = 0.2  # of the field: pairs as long as that say where the other stars are
-MAG_GATE = (
-    4.0  # standard deviations by which a light's magnitude may differ from its star's, in the first round
-)
-WEIGH_CHECKS = (
-    6  # what weighing an attitude counts for beside looking up a light: a frame with no answer must end
-)
-PATIENCE = 4  # lights without a star, before an attitude is given up in the first round
+DECISIVE_DEX = 10.0  # evidence at which the search stops without looking for rivals
+MARGIN_DEX = 3.0  # by which the solution must beat every other attitude
+NO_RIVAL_DEX = ACCEPT_DEX - MARGIN_DEX  # below this an attitude is neither acceptable nor a rival
+# Extra effort for finding rivals of an accepted attitude: multiple of the effort so far, plus a number of look-ups.
+AGAIN, AGAIN_LEAST = 2, 2000
+LONG = 0.2  # of the field size: shorter pairs determine the roll poorly and are tried last
+MAG_GATE = 4.0  # greatest difference of magnitudes in the first round, in standard deviations
+WEIGH_CHECKS = 6  # cost of one evaluation in units of one star look-up, so that frames without a solution end
+PATIENCE = 4  # detections without a star after which the first round drops a candidate
 
 
 @jit
 def lost_in_space(lights: Lights, patterns: Sky, stars: Sky, base_lights: int, max_checks: int) -> Fix:
-    """Which of the stars all the lights are: sought among the brightest lights and the patterns, told by all.
+    """Identify the detections and solve the attitude.
 
-    No answer unless the brightest are beyond chance, nor where the whole field does not hold what they found.
+    The search uses the `base_lights` brightest detections and the pairs of `patterns`; the attitude found is then
+    fitted to all detections and all `stars`. Returns an empty solution if the search finds nothing beyond chance, or
+    if the full field keeps no more than half of its matches. max_checks bounds the effort (see `search`).
     """
     few = min(base_lights, len(lights.sigma))
     head = Lights(
@@ -85,13 +86,15 @@ def lost_in_space(lights: Lights, patterns: Sky, stars: Sky, base_lights: int, m
 
 @jit
 def search(lights: Lights, sky: Sky, max_checks: int) -> Guess:
-    """The first attitude with DECISIVE_DEX of evidence; else the best one met, if it is beyond chance and every rival.
+    """The first attitude with DECISIVE_DEX of evidence; else the best one, if it passes ACCEPT_DEX and MARGIN_DEX.
 
-    Pairs go by how few pairs of stars they may be: short ones, of those long enough, of lights of a rare brightness; a
-    light that has been tried goes back. A first round gives an attitude up after PATIENCE lights without a star, so
-    that false pairs cost little, and passes over stars of another magnitude; a second one looks at all. An attitude
-    that is beyond chance and not decisive is held against what other pairs find, AGAIN times the effort so far.
-    max_checks bounds the lights looked up, and WEIGH_CHECKS for each attitude weighed.
+    Detection pairs are tried in the order of the expected number of matching catalog pairs: short pairs (above LONG)
+    and rare magnitudes first. Each attempt doubles the cost of its two detections, so that a false detection does not
+    hold up the search. The first round drops a candidate after PATIENCE detections without a star and skips stars
+    outside of the magnitude gate; the second round has neither limit, and is skipped if there are so few detections
+    that PATIENCE covers them. After an attitude reaches ACCEPT_DEX the search continues for rivals, with AGAIN times
+    the effort so far.
+    max_checks : bound on the effort: star look-ups, plus WEIGH_CHECKS for each candidate evaluated
     """
     total = len(lights.sigma)
     length, rare = _lengths(lights), _rarity(lights, sky)
@@ -105,6 +108,7 @@ def search(lights: Lights, sky: Sky, max_checks: int) -> Guess:
             guess = _attempt(lights, sky, a, b, patience, best, checks)
             same = _alike(guess, best)
             if guess.dex > best.dex:
+                # The previous best becomes a rival unless it is the same attitude.
                 rival_dex = rival_dex if same else max(rival_dex, best.dex)
                 if best.dex < ACCEPT_DEX <= guess.dex:
                     limit = min(max_checks, (1 + AGAIN) * checks[0] + AGAIN_LEAST)
@@ -124,13 +128,13 @@ def search(lights: Lights, sky: Sky, max_checks: int) -> Guess:
 
 @jit
 def _alike(one: Guess, other: Guess) -> bool:
-    """Whether two guesses are one attitude, to some degrees; nothing is like nothing."""
+    """Whether two hypotheses are the same attitude within 5.7 degrees (trace > 2.99); False if `other` is empty."""
     return other.dex > -np.inf and bool(np.sum(one.R_cam_from_ref * other.R_cam_from_ref) > 2.99)
 
 
 @jit
 def _lengths(lights: Lights) -> Floats:
-    """(N, N) of every pair a < b; those too short to tell the turn about the boresight count as very long."""
+    """(N, N) length in tangents of every pair a < b; pairs too short to determine the roll count as very long."""
     total, field = len(lights.sigma), lights.field
     long = LONG * sqrt((field[1] - field[0]) * (field[3] - field[2]))
     out = np.empty((total, total))
@@ -143,7 +147,7 @@ def _lengths(lights: Lights) -> Floats:
 
 @jit
 def _rarity(lights: Lights, sky: Sky) -> Floats:
-    """(N,) share of the stars that are as bright as a light."""
+    """(N,) fraction of the stars inside the magnitude gate of each detection; 1 if its magnitude is unknown."""
     out = np.ones(len(lights.sigma))
     for n in range(len(out)):
         if np.isfinite(lights.mag[n]):
@@ -158,7 +162,7 @@ def _apart2(tangent: Floats, a: int, b: int) -> float:
 
 @jit
 def _next(length: Floats, tried: NDArray, vain: Floats) -> tuple[int, int]:
-    """The most promising pair that is left."""
+    """The untried pair a < b of the least cost length[a, b] * vain[a] * vain[b]."""
     best, at_a, at_b = np.inf, 0, 1
     for a in range(len(vain)):
         for b in range(a + 1, len(vain)):
@@ -170,9 +174,10 @@ def _next(length: Floats, tried: NDArray, vain: Floats) -> tuple[int, int]:
 
 @jit
 def _attempt(lights: Lights, sky: Sky, a: int, b: int, patience: int, known: Guess, checks: NDArray) -> Guess:
-    """Two lights as every pair of stars that they may be: the first attitude beyond chance, else the best.
+    """Test two detections against every catalog pair of the same separation, in both orders.
 
-    An attitude that is known by now is not the first: its rivals are looked for.
+    Returns the first hypothesis with ACCEPT_DEX that is another attitude than `known`, else the best one. checks : (1,)
+    effort so far, increased in place.
     """
     gates, order = _gates(lights, a, b), _others(len(lights.sigma), a, b)
     wanted = _wanted(lights, a, b)
@@ -186,14 +191,14 @@ def _attempt(lights: Lights, sky: Sky, a: int, b: int, patience: int, known: Gue
     last = len(sky.first) - 2
     low = cell_of((angle / (1 + lights.zoom) - gate) / sky.bin_rad, last + 1)
     high = cell_of((angle / (1 - lights.zoom) + gate) / sky.bin_rad, last)
-    # Members of tuples are taken out here: in the loop each would cost two counts of its references.
+    # Tuple members are unpacked here: in the loop each access would cost two updates of a reference count.
     tangent, first, pair, star, mag = lights.tangent, sky.first, sky.pair, sky.vectors, sky.mag
     cell_first, cell_star, side, zooms = sky.cell_first, sky.cell_star, sky.side, lights.zoom
     mag_a, mag_b = lights.mag[a], lights.mag[b]
     mag_gate = MAG_GATE * lights.mag_sigma if patience == PATIENCE else np.inf
     for p in range(first[low], first[high + 1]):
         i, j = pair[p, 0], pair[p, 1]
-        # A magnitude that is not known, NaN, is not beyond any gate.
+        # Written with `not ... >`, so that an unknown magnitude (NaN) passes.
         forward = not (abs(mag_a - mag[i]) > mag_gate or abs(mag_b - mag[j]) > mag_gate)
         backward = not (abs(mag_a - mag[j]) > mag_gate or abs(mag_b - mag[i]) > mag_gate)
         if not (forward or backward):
@@ -232,7 +237,7 @@ def _attempt(lights: Lights, sky: Sky, a: int, b: int, patience: int, known: Gue
                         return guess
                     if guess.dex > best.dex:
                         best = guess
-            for k in range(3):  # the same two stars the other way round
+            for k in range(3):  # the star pair in reverse order: a half turn about its first axis
                 in_ref[k, 1], in_ref[k, 2] = -in_ref[k, 1], -in_ref[k, 2]
     return best
 
@@ -249,7 +254,7 @@ def _others(total: int, a: int, b: int) -> NDArray[np.int64]:
 
 @jit
 def _zoom(tangent: Floats, a: int, b: int, chord: float, wanted: float) -> float:
-    """The zoom at which two lights are a chord apart."""
+    """The zoom at which the chord between two detections is `wanted`: two fixed-point iterations from its ratio."""
     zoom = chord / wanted
     for _ in range(2):
         zoom *= vectors.chord(ray(tangent, a, zoom), ray(tangent, b, zoom)) / wanted
@@ -258,9 +263,10 @@ def _zoom(tangent: Floats, a: int, b: int, chord: float, wanted: float) -> float
 
 @jit
 def _gates(lights: Lights, a: int, b: int) -> Floats:
-    """(N,) angles within which a star is to be where a pair's attitude puts a light: its own error and the pair's.
+    """(N,) matching radius of each detection at a pair's attitude: its own error and that of the attitude.
 
-    The pair's middle errs by (sa^2 + sb^2) / 4, its direction and its length by (sa^2 + sb^2) / apart^2.
+    The variance of the pair's midpoint is (sa^2 + sb^2) / 4; that of its direction, and of its relative length, is
+    (sa^2 + sb^2) / separation^2 and grows with the squared distance from the midpoint.
     """
     tangent = lights.tangent
     x, y = (tangent[a, 0] + tangent[b, 0]) / 2, (tangent[a, 1] + tangent[b, 1]) / 2
@@ -275,10 +281,11 @@ def _gates(lights: Lights, a: int, b: int) -> Floats:
 
 @jit
 def _wanted(lights: Lights, a: int, b: int) -> int:
-    """How many matches it takes for ACCEPT_DEX, at best: an upper bound of `_evidence`.
+    """Least number of matches that can reach ACCEPT_DEX, from an estimate of the greatest `_evidence`.
 
-    No residuals, nothing missed, and an attitude as loose as the pair alone leaves it: sqrt(2) sigma / apart about the
-    boresight (and of the zoom), sigma / sqrt(2) across it.
+    The estimate has no residuals, no missing stars, and the attitude uncertainty of the pair alone: sqrt(2) sigma /
+    separation about the boresight (and of the zoom), sigma / sqrt(2) across it. It takes the least sigma of all
+    detections, isotropic errors, a constant density of detections and no magnitudes.
     """
     total, sigma = len(lights.sigma), lights.sigma.min()
     each = -log10(2 * pi * sigma**2 * total / area(lights))
@@ -306,9 +313,10 @@ def _glance(
     wanted: int,
     patience: int,
 ) -> tuple[int, bool]:
-    """How many lights were looked at, and whether as many as wanted have a star where an attitude puts them.
+    """Quick check of an attitude: how many detections were looked up, and whether `wanted` of them have a star nearby.
 
-    The pair's two count.
+    The two detections of the pair count as matched. Stops as soon as the count is reached or out of reach, or after
+    `patience` detections without any match.
     """
     count, left = 2, len(order)
     for step in range(left):
