@@ -52,7 +52,7 @@ def simulate_motion(lab: Testbed, watch: Watch | None = None) -> Testbed:
     """
     aloft = ClosedLoop(lab)
     flight = aloft.flight
-    aloft.vibration.pieces(flight.times_s(0, flight.last + 1))  # an overlong vibration raises InputError before the simulation
+    aloft.vibration.pieces(flight.times_s(0, flight.last + 1))  # may raise InputError: do it first
     eyes = OnboardCamera(aloft, tracker(lab)) if lab.scene.filter and aloft.navigation else None
     diary = TelemetryRecorder(flight, aloft.pilot, aloft.navigation)
     # With nothing that reacts to the motion, one call integrates all of it.
