@@ -37,8 +37,7 @@ def doubts(scene: Scene, sources: Sources, mount: Mount) -> list[str]:
 
 
 def cloud(light: DomeConfig, inside: Surface) -> str:
-    """How far the points of a surveyed surface lie from the smooth surface fitted to them; empty for other surfaces.
-    """
+    """How far the points of a surveyed surface are from the smooth surface fitted to them; else empty."""
     part = light.surface
     fit = inside.survey if isinstance(inside, Radial) else None
     if fit is None or not isinstance(part, SurveyedSurfaceConfig):

@@ -41,8 +41,7 @@ Wanted = Callable[[int, float], bool]
 
 
 class CapturedFrame(NamedTuple):
-    """A frame rendered during the motion, its truth, the star tracker's report, and the filter's status of the update.
-    """
+    """A frame rendered during the motion, its truth, the tracker's report, and the filter's status of the update."""
 
     frame: Frame
     truth: Truth
@@ -155,8 +154,7 @@ class OnboardCamera:
 
 
 def memory_s(scene: Scene) -> float:
-    """Seconds of past states that a frame needs when it becomes due: longest exposure, latency, two control periods.
-    """
+    """Seconds of past states that a frame needs when due: longest exposure, latency, two control periods."""
     control, latency_s = scene.tracker.exposure_control, scene.filter.latency_s if scene.filter else 0.0
     when = window(scene, 0, control.longest_s if control else None)
     return (

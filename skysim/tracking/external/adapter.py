@@ -1,5 +1,4 @@
-"""Adapter for an external star tracker, run in its own process: it gets the same set-up and frames as skysim's own.
-"""
+"""Adapter for an external star tracker in its own process; it gets the same set-up and frames as skysim's own."""
 
 from __future__ import annotations
 

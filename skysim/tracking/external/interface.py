@@ -156,8 +156,7 @@ class Answer:
 
 
 class Tracker(Protocol):
-    """What an entry point's callable makes of a `Setup`; the callable may raise for a set-up that it cannot work with.
-    """
+    """What an entry point's callable makes of a `Setup`; the callable raises for a set-up that it cannot use."""
 
     def solve(self, picture: Picture) -> Answer:
         """The attitude at mid-exposure, or why there is none."""

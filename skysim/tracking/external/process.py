@@ -1,8 +1,7 @@
-"""Run an external tracker program: it is started once, gets frames on its standard input, answers each with a
-JSON line.
+"""Run an external tracker program: started once, it gets frames on standard input and answers each with a JSON line.
 
-The program is the leader of its own process group, which is killed when the program ends, when skysim ends, or after
-a timeout. Commands come only from the user's command line; no file can name one.
+The program leads its own process group, which is killed when the program ends, when skysim ends, or after a timeout.
+Commands come only from the user's command line; no file can name one.
 """
 
 from __future__ import annotations

@@ -47,8 +47,8 @@ class Tetra3rs:
         )
 
     def solve(self, picture: Picture) -> Answer:
-        """Solve one frame. Its quaternion is scalar first, ICRS to camera; its covariance uses other angles and
-        is left out.
+        """Solve one frame. The quaternion is scalar first, ICRS to camera; the covariance uses other
+        angles: left out.
         """
         found = self.extract(
             picture.image_dn,
@@ -72,7 +72,8 @@ def middle_px(setup: Setup) -> Any:
 
 
 def camera(tetra3rs: Any, setup: Setup) -> Any:
-    """tetra3rs's camera model: the same distortion polynomial in pixels, so coefficients are divided by powers of f.
+    """tetra3rs's camera model: the same distortion polynomial in pixels, so coefficients are divided by powers
+    of the focal length.
     """
     f, (k1, k2, p1, p2, k3) = setup.focal_px, setup.distortion
     bent = tetra3rs.RadialDistortion(k1=k1 / f**2, k2=k2 / f**4, k3=k3 / f**6, p1=p1 / f, p2=p2 / f)
