@@ -227,8 +227,7 @@ class Program:
         )
 
     def read(self, told: Any, frame: int) -> Answer:
-        """Convert JSON to an Answer. Raises Fault; an answer to another frame ends the program, which is out of step.
-        """
+        """Convert JSON to an Answer. Raises Fault. An answer to another frame ends the program: it is out of step."""
         if not isinstance(told, dict) or told.get("frame") != frame:
             raise self.ended(f"no answer to frame {frame}, but {str(told)[:80]!r}")
         try:
