@@ -28,7 +28,7 @@ from skysim.core.jit import jit
 from skysim.core.types import Floats, Mount, Sources, SourceTruth, Trajectory
 from skysim.sources.dome.led import Emitter, irradiance_e_s_m2, lit_moments_s
 
-STEP = 1.3  # largest motion in one piece of the exposure, in units of the image's sharpest feature (its sigma)
+STEP = 1.3  # largest motion in one piece of the exposure, over the image's sharpest feature (sigma)
 MAX_PIECES = 100_000
 FEWEST, MOST = 9, 32_769  # number of poses in an exposure
 SHORT = 0.4  # path length, in steps, up to which one piece is enough: error 1e-4 of the peak

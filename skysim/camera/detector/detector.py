@@ -94,7 +94,7 @@ def expose(light_e: NDArray[Any], exposure_s: float, chip: Chip, rng: Generator)
     if not part.noise:
         return expectation(light_e, exposure_s, chip)
     counting, reading = noise.seeds(rng, len(light_e)), noise.seeds(rng, len(light_e))
-    # Without steps that move charge between rows, one fused loop does it all, with the same numbers.
+    # With no step between counting and read-out, one fused loop does both, with the same numbers.
     if not (part.particles or part.blooming == "column" or part.cti_parallel or part.cti_serial):
         return count_and_read(light_e, exposure_s, chip, counting, reading)
     count(light_e, exposure_s, chip, counting)
@@ -161,7 +161,7 @@ def _gather(row: Any, sensitivity: Any, dark_e_s: Any, rules: Rules, seed: Any, 
     PRNU is a pixel's relative quantum efficiency, so it scales the mean and the sum stays a Poisson variable.
     """
     for x in range(row.size):
-        # Interpolated images may be slightly negative (1e-6 of the peak).
+        # Interpolated images may be slightly negative (about 1e-6).
         row[x] = max(row[x], float32(0)) * sensitivity[x] + dark_e_s[x] * rules.exposure_s
     noise.count(row, seed, tables)
 

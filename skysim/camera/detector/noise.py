@@ -86,7 +86,7 @@ def ziggurat() -> NDArray[np.float64]:
     low, high = 3.0, 5.0
     for _ in range(60):
         middle = (low + high) / 2
-        low, high = (middle, high) if tower(middle)[1] else (low, middle)  # a smaller r has larger areas: the layers reach the peak too early
+        low, high = (middle, high) if tower(middle)[1] else (low, middle)  # an r too small passes the peak
     x = tower(high)[0]
     x[LAYERS] = 0.0
     return x
