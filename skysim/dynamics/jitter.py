@@ -162,9 +162,10 @@ class Vibration:
         return Trajectory(t_s, trajectory.at(t_s) * turn, turn.inv().apply(rate) + own_rate(phi, phi_rate))
 
     def pieces(self, t_s: Floats) -> NDArray[np.int64]:
-        """(N - 1,) into how many pieces each step is cut, so that every period has PER_PERIOD samples.
+        """(N - 1,) number of pieces of each step, so that every period has PER_PERIOD samples.
 
-        Raises InputError if those are too many. A flight that is laid over piece by piece asks first, with all its times.
+        Raises InputError if there are too many samples. Before applying vibration piece by piece, call this
+        with all times.
         """
         highest_hz = np.zeros(len(t_s) - 1)
         for one in self.voices:

@@ -91,7 +91,7 @@ def images(
     steps = np.rint(np.column_stack([extra, emitter, blur]) / QUANTUM_PX).astype(np.int64)
     gaussian = camera.psf.kind == "gaussian"
     if gaussian:
-        steps[(steps[:, 1:] == 0).all(axis=1), 0] = 0  # Gaussians are drawn by formula, each with its own width
+        steps[(steps[:, 1:] == 0).all(axis=1), 0] = 0  # Gaussians need no shared table
     held = shelf(camera)
     packed = steps @ PACKED
     alike = packed.size > 0 and not packed.any()  # stars in focus share one key: skip the sort
