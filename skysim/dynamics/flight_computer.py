@@ -2,7 +2,7 @@
 
 `FlightComputer.steer` calls the control law (attitude_control.py) with the measured attitude and rate, subtracts
 what the fans give for momentum dumping, and has the chosen actuator set convert the rest to commands (`allot`). The
-law is then told how much torque the actuators can give, for its anti-windup.
+law gets the torque that the actuators give back, for its anti-windup.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from skysim.dynamics.multibody import World
 from skysim.scene.scene import Scene
 from skysim.scene.vehicle import CmgsConfig, FansConfig, WheelsConfig
 
-WITHIN_GYROS = 0.7  # return rate over the gyros' limit (`assumed`)
+WITHIN_GYROS = 0.7  # of the gyros' rate limit (`assumed`)
 
 
 class Now(NamedTuple):
@@ -225,7 +225,7 @@ class FlightComputer:
 def believable_rad_s(scene: Scene) -> float:
     """Rate limit of the controller's return to the reference: below the gyros' limit if it uses them, else infinite.
 
-    A saturated gyro reads less than the true rate, so the controller would brake too little.
+    A saturated gyro reads less than the true rate, so a return faster than its limit would not be braked.
     """
     told, imu = scene.motion.control, scene.vehicle.imu
     if told is None or told.feedback == "truth" or imu is None:

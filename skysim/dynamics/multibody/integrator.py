@@ -70,7 +70,7 @@ class Flight:
         if vehicle.cmgs:
             angles = np.radians(as_many(vehicle.cmgs.start_deg, len(world.gimbals), "vehicle.cmgs.start_deg"))
             data.qpos[world.gimbals.qpos] = angles
-            data.act[self.model.actuator_actadr[world.gimbals.motor]] = angles  # set-points of the gimbal servos
+            data.act[self.model.actuator_actadr[world.gimbals.motor]] = angles  # servo set-points
             data.qvel[world.rotors.dof] = vehicle.cmgs.rotor_rpm * RPM_RAD_S
         mujoco.mj_getState(self.model, data, self.states[0], int(STATE))
         mujoco.mj_forward(self.model, data)
