@@ -14,7 +14,7 @@ from skysim.core.types import Floats
 from skysim.dynamics.guidance import Reference
 from skysim.scene.motion import ControlConfig
 
-SHORT = 0.01  # relative torque deficit that counts as an actuator limit; steering laws near a singularity give smaller ones
+SHORT = 0.01  # relative torque deficit that counts as a limit; damped steering gives smaller ones
 
 
 @dataclass(slots=True)

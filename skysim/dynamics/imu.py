@@ -98,9 +98,7 @@ def felt(
     if len(t_s) < 2:
         raise InputError(f"imu: {len(t_s)} knots of the flight; allowed: two or more")
     first_s, last_s = np.min(ends_s, initial=np.inf) - step_s, np.max(ends_s, initial=-np.inf)
-    if len(ends_s) and not (
-        t_s[0] - SLACK_S <= first_s and last_s <= t_s[-1] + SLACK_S
-    ):  # also rejects NaN
+    if len(ends_s) and not (t_s[0] - SLACK_S <= first_s and last_s <= t_s[-1] + SLACK_S):  # also rejects NaN
         raise InputError(
             f"imu: samples from {first_s:.6f} to {last_s:.6f} s; allowed: within the flight,"
             f" {t_s[0]:.6f} to {t_s[-1]:.6f} s"

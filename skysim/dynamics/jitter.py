@@ -1,8 +1,8 @@
 """Vibration: small rotations about the body axes added to the simulated attitude, always or for an interval.
 
 A vibration is a sum of sines of the rotation vector in body axes: single frequencies (`line`) or a random spectrum
-(`band`). It is kinematic: it is added after the dynamics, and neither MuJoCo nor the controller acts on it, but the
-IMU senses it (`closed_loop.felt`) and it smears the images.
+(`band`). It is kinematic: MuJoCo does not simulate it, but the IMU senses it (`closed_loop.felt`) and it smears the
+images.
 """
 
 from __future__ import annotations
