@@ -52,11 +52,9 @@ class View:
     def gathered_m2_sr(self) -> Floats:
         """(M,) étendue of each node's pixel: electrons per second = radiance times this.
 
-        The pupil is foreshortened by cos(field), and a pixel's solid angle falls as cos^3: its distance grows
-        as 1/cos,
-        squared, and it is inclined. Together with vignetting this is the cos^4 law of illumination.
-        Distortion changes the
-        solid angle of the pixels, which pixel_sr includes.
+        The pupil is foreshortened by cos(field), and a pixel's solid angle falls as cos^3: its distance grows as
+        1/cos, squared, and it is inclined. Together with vignetting this is the cos^4 law of illumination.
+        Distortion changes the solid angle of the pixels, which pixel_sr includes.
         """
         return self.optics.collecting_m2 * self.optics.passed(np.cos(self.field_rad)) * self.pixel_sr
 
@@ -114,10 +112,8 @@ def scattering(separation_deg: float | Floats) -> Floats:
     """Scattering function of the air: Rayleigh (molecules) and Mie (aerosol, forward) (KS91 eqs 16-19).
 
     f = 10^5.36 (1.06 + cos^2 rho) + the greater of 10^(6.15 - rho / 40) and 6.2e7 / rho^2. The paper switches
-    between
-    the two aerosol laws at 10 degrees, where they differ by a quarter; the greater is continuous (they cross
-    at 8.6).
-    Within the Moon's disc the value at its edge is used.
+    between the two aerosol laws at 10 degrees, where they differ by a quarter; the greater is continuous (they
+    cross at 8.6). Within the Moon's disc the value at its edge is used.
     """
     rho = np.maximum(np.asarray(separation_deg, dtype=float), MOON_RADIUS_DEG)
     molecules = 10**5.36 * (1.06 + np.cos(np.radians(rho)) ** 2)

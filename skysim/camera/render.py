@@ -180,9 +180,8 @@ def look(sources: Sources, optics: Optics, poses: Poses) -> tuple[Floats, Floats
 def in_view(sources: Sources, optics: Optics, poses: Poses) -> NDArray[np.int64]:
     """Rows of the sources within a cone about the boresight at any of these poses.
 
-    The cone's half-angle is the field's circle, a quarter more for images that reach in from outside, and
-    half of the
-    largest rotation between two poses for sources that cross the field between them.
+    The cone's half-angle is the field's circle, a quarter more for images that reach in from outside, and half of
+    the largest rotation between two poses for sources that cross the field between them.
     """
     sight = np.ascontiguousarray(poses.cam_from_lab[:, 2])
     turn = np.arccos(np.clip(np.sum(sight[1:] * sight[:-1], axis=1), -1, 1)).max(initial=0.0)
@@ -212,10 +211,9 @@ def _in_cone(place: Floats, sight: Floats, camera_m: Floats, edge: float) -> Any
 def draw(image: NDArray[Any], paths: Paths, shapes: Images, window: Window) -> Floats:
     """Draw every source on a patch of its own and add the patches to the image, as many at a time as memory allows.
 
-    Returns (N, 8): electrons on the chip, those of the brightest pixel, flux-weighted mean x and y, sum of
-    the squared
-    pixels, path length in pixels, and the brightest pixel's x and y. The mean is that of the whole image, but in a
-    rolling shutter of the part on the chip, since there each row has its own time.
+    Returns (N, 8): electrons on the chip, those of the brightest pixel, flux-weighted mean x and y, sum of the
+    squared pixels, path length in pixels, and the brightest pixel's x and y. The mean is that of the whole image,
+    but in a rolling shutter of the part on the chip, since there each row has its own time.
     """
     boxes = patches(paths.xy_px, shapes.reach_px, image.shape)
     areas = (boxes[:, 1] - boxes[:, 0]) * (boxes[:, 3] - boxes[:, 2])
@@ -296,13 +294,11 @@ def _integrate(
 ) -> Any:
     """Add the light of one source from begin_s to end_s to the rows [row0, row1) of its patch.
 
-    The interval is cut into equal pieces short enough that the image moves by less than its blur in each. In
-    a piece the
-    light has a duration `lit`, a mean time and a standard deviation `spread` (from the pulses). Two points of
-    half the
-    light each at mean - spread and mean + spread reproduce these moments: for steady light spread = length /
-    (2 sqrt 3),
-    which is the two-point Gauss-Legendre rule, with an error of the fourth order in the length.
+    The interval is cut into equal pieces short enough that the image moves by less than its blur in each. In a
+    piece the light has a duration `lit`, a mean time and a standard deviation `spread` (from the pulses). Two
+    points of half the light each at mean - spread and mean + spread reproduce these moments: for steady light
+    spread = length / (2 sqrt 3), which is the two-point Gauss-Legendre rule, with an error of the fourth order in
+    the length.
 
     Returns the electrons of the whole image and their first moments in x and y.
     """

@@ -2,8 +2,8 @@
 
 MuJoCo simulates the rotors. Here every vector is in body axes and a set's n members are the columns of (3, n). A
 wanted torque is one on the body; the stored momentum changes by its opposite. Stored momentum also acts on a
-rotating
-body, with -rate x h; the actuators do not compensate this: the controller adds +rate x h to the torque it wants.
+rotating body, with -rate x h; the actuators do not compensate this: the controller adds +rate x h to the torque it
+wants.
 
 The inertia that responds to the torque is that of the body without its rotors' inertia about their axles, which do
 not follow the body about these: J - sum inertia axle axle^T.
@@ -86,11 +86,10 @@ class WheelSet:
     def drive(self, torque_nm: Floats, speed_rad_s: Floats, period_s: float) -> Floats:
         """Motor torques (n,) on the wheels that give torque_nm (3,) on the body for the next period_s.
 
-        The smallest ones that do; if the axes do not span space (n < 3, or all in a plane), those nearest in
-        least squares.
-        Beyond the torque limit all are scaled together, which keeps the direction. A torque that would carry
-        a wheel beyond
-        its speed limit is then reduced to what just reaches it (I d(speed)/dt = u, without the body's own
+        The smallest ones that do; if the axes do not span space (n < 3, or all in a plane), those nearest in least
+        squares. Beyond the torque limit all are scaled together, which keeps the direction. A torque that would
+        carry a wheel beyond its speed limit is then reduced to what just reaches it (I d(speed)/dt = u, without the
+        body's own
         acceleration): a
         wheel at its limit can only be braked, and the direction is not kept.
         """
@@ -131,9 +130,8 @@ class FanSet:
     def drive(self, torque_nm: Floats) -> Floats:
         """Thrusts (n,), the smallest that give the torque (3,), or the nearest to it in least squares.
 
-        Beyond the limit all are scaled together, which keeps the direction. Fans can blow both ways. The
-        bearing takes the
-        net force.
+        Beyond the limit all are scaled together, which keeps the direction. Fans can blow both ways. The bearing
+        takes the net force.
         """
         return within(self.thrust_from_torque @ torque_nm, self.thrust_limit_n)
 
@@ -171,11 +169,10 @@ def pseudo_inverse(jacobian_unit: Floats, wanted: Floats, t_s: float) -> Floats:
 def singularity_robust(jacobian_unit: Floats, wanted: Floats, t_s: float) -> Floats:
     """Gimbal rates by the generalized singularity-robust inverse: A^T (A A^T + lambda E)^-1 dh/dt.
 
-    Near a singularity lambda = 0.01 exp(-10 det A A^T) keeps the rates bounded, at the price of an error in
-    the torque.
-    The off-diagonal elements e_i = 0.01 sin(pi t / 2 + phase_i) of the matrix E, of unit diagonal, move the gimbals
-    sideways for a torque along the singular direction, and so out of the singularity. Wie, Bailey & Heiberg 2001,
-    J. Guidance, Control, and Dynamics 24 (5), 865; the numbers are `assumed`.
+    Near a singularity lambda = 0.01 exp(-10 det A A^T) keeps the rates bounded, at the price of an error in the
+    torque. The off-diagonal elements e_i = 0.01 sin(pi t / 2 + phase_i) of the matrix E, of unit diagonal, move the
+    gimbals sideways for a torque along the singular direction, and so out of the singularity. Wie, Bailey & Heiberg
+    2001, J. Guidance, Control, and Dynamics 24 (5), 865; the numbers are `assumed`.
     """
     gram = jacobian_unit @ jacobian_unit.T
     damping = DAMPING * math.exp(-FADING * determinant(gram))
@@ -232,9 +229,8 @@ class CmgSet:
     steering               : a key of STEERING, which variable-speed CMGs do not use
 
     A rotor's axle points along s cos(angle) + g x s sin(angle), g the gimbal's and s the spin axis. The torque of
-    accelerating a gimbal about its own axis is left out. Raises InputError (one line) for axes that are not
-    unit vectors
-    or not at right angles, and for an unknown steering law.
+    accelerating a gimbal about its own axis is left out. Raises InputError (one line) for axes that are not unit
+    vectors or not at right angles, and for an unknown steering law.
     """
 
     gimbal_axes: Floats
@@ -271,9 +267,8 @@ class CmgSet:
     def manipulability(self, angle_rad: Floats, rotor_rad_s: Floats) -> Floats:
         """Distance from singularity: 1 if torque is equally easy in every direction, 0 if a direction has none.
 
-        sqrt(det A A^T) over its greatest value for the same trace, (sum h^2 / 3)^1.5, which is independent of
-        the rotors'
-        size and number. 0 with the rotors at rest. (..., n) -> (...).
+        sqrt(det A A^T) over its greatest value for the same trace, (sum h^2 / 3)^1.5, which is independent of the
+        rotors' size and number. 0 with the rotors at rest. (..., n) -> (...).
         """
         angle, spin = np.asarray(angle_rad)[..., None, :], np.asarray(rotor_rad_s)[..., None, :]
         across = self.cross_axes * np.cos(angle) - self.spin_axes * np.sin(angle)
@@ -293,13 +288,11 @@ class CmgSet:
         """Gimbal rates (n,) and motor torques (n,) on the rotors that give torque_nm (3,) on the body.
 
         torque on the body = -A d(angle)/dt - sum axle u, with A from the rotors' inertial spin, which is their
-        speed plus the body's rate along the axle. The body also feels -rate x h: the controller's
-        feed-forward has to
-        include +rate x h in torque_nm, it is not added here.
+        speed plus the body's rate along the axle. The body also feels -rate x h: the controller's feed-forward has
+        to include +rate x h in torque_nm, it is not added here.
 
-        Without a rotor torque limit the rotors get no torque. Beyond a limit everything is scaled together,
-        which keeps the
-        torque's direction.
+        Without a rotor torque limit the rotors get no torque. Beyond a limit everything is scaled together, which
+        keeps the torque's direction.
         """
         axle, across = turned(self.spin_axes, self.cross_axes, angle_rad)
         spin_nms = self.rotor_inertia_kg_m2 * (rotor_rad_s + rate_body_rad_s @ axle)

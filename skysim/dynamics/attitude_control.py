@@ -28,10 +28,9 @@ class Pid:
         w_most = min(rate limit, sqrt(a |e|)),    a = authority / greatest moment of inertia,
 
     from which half of the authority still brakes within the angle |e| (cascade saturation: Wie & Lu 1995, J.
-    Guidance
-    18, 1372; its variable limit: Wie, Bailey & Heiberg 2002, J. Guidance 25, 96; both `assumed`). Without
-    this limit a
-    large error or rate drives the torque from one limit to the other and the vehicle never comes to rest.
+    Guidance 18, 1372; its variable limit: Wie, Bailey & Heiberg 2002, J. Guidance 25, 96; both `assumed`). Without
+    this limit a large error or rate drives the torque from one limit to the other and the vehicle never comes to
+    rest.
 
     Here e is the rotation vector of ref_from_body and h the momentum stored in wheels or CMGs. The feed-forward
     J alpha + w x (J w + h) is Euler's equation, so that the feedback only has to reject disturbances. Rates and

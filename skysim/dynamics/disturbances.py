@@ -64,9 +64,8 @@ def steady(
 class Gusts:
     """Air currents: an Ornstein-Uhlenbeck torque about each lab axis, (3,) at every control period.
 
-    Exact for samples a period apart: T' = a T + sqrt(1 - a^2) rms N(0, 1), a = exp(-period / correlation
-    time), started
-    in its stationary distribution. Its autocorrelation is rms^2 exp(-|lag| / correlation time).
+    Exact for samples a period apart: T' = a T + sqrt(1 - a^2) rms N(0, 1), a = exp(-period / correlation time),
+    started in its stationary distribution. Its autocorrelation is rms^2 exp(-|lag| / correlation time).
     """
 
     def __init__(self, part: DraughtConfig, period_s: float, rng: np.random.Generator) -> None:

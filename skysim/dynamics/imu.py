@@ -78,11 +78,10 @@ def felt(
         w = rate + body_from_lab earth_rate           angle    = int w dt
         f = dw/dt x r + w x (w x r) - g_body          velocity = int f dt
 
-    (Titterton & Weston, Strapdown Inertial Navigation Technology, ch. 3; `assumed`). With w the inertial
-    rate, f also
-    has the centripetal and Coriolis acceleration of the lab's rotation; g is plumb-line gravity, (0, 0, -gravity) in
-    the lab, which includes the Earth's centrifugal part at the origin. int dw/dt x r is the difference of w between
-    both ends, crossed with r.
+    (Titterton & Weston, Strapdown Inertial Navigation Technology, ch. 3; `assumed`). With w the inertial rate, f
+    also has the centripetal and Coriolis acceleration of the lab's rotation; g is plumb-line gravity, (0, 0,
+    -gravity) in the lab, which includes the Earth's centrifugal part at the origin. int dw/dt x r is the difference
+    of w between both ends, crossed with r.
 
     t_s                : (K,) knots of the motion, ascending, K >= 2, in any spacing
     lab_from_body_wxyz : (K, 4) attitudes there
@@ -375,10 +374,9 @@ class Navigator:
 def turned(lab_from_body_wxyz: Floats, angle_rad: Floats, earth_rate: Floats, step_s: float) -> Floats:
     """The attitude after (N, 3) increments: lab_from_body <- exp(-earth_rate step) lab_from_body exp(angle).
 
-    The left factor is the rotation of the lab, in lab axes, so that the Earth rate is compensated
-    continuously and not
-    at the attitude of the sample's start. Each increment is taken as a rotation vector. If the axis moves within a
-    sample, this has an error of half the integral of angle x rate (coning; `assumed`).
+    The left factor is the rotation of the lab, in lab axes, so that the Earth rate is compensated continuously and
+    not at the attitude of the sample's start. Each increment is taken as a rotation vector. If the axis moves
+    within a sample, this has an error of half the integral of angle x rate (coning; `assumed`).
     """
     lab_now_from_before = quaternion.from_rotvec(-step_s * earth_rate)
     here = lab_from_body_wxyz

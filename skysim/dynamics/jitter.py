@@ -53,11 +53,10 @@ def line(part: JitterLineConfig, rng: np.random.Generator) -> Sines:
 def band(part: JitterBandConfig, rng: np.random.Generator) -> Sines:
     """Power spectral density proportional to f^slope from from_hz to to_hz, the sum of many sines.
 
-    The band is split into pieces of equal frequency ratio. Each has one sine with the piece's whole power, so
-    that the
-    rms is exact in every draw, at a frequency drawn from the spectrum within the piece, so that the density
-    is exact in
-    expectation (Shinozuka & Deodatis 1991, ASME Appl. Mech. Rev. 44, 191, whose frequencies are fixed; `assumed`).
+    The band is split into pieces of equal frequency ratio. Each has one sine with the piece's whole power, so that
+    the rms is exact in every draw, at a frequency drawn from the spectrum within the piece, so that the density is
+    exact in expectation (Shinozuka & Deodatis 1991, ASME Appl. Mech. Rev. 44, 191, whose frequencies are fixed;
+    `assumed`).
     """
     edges = np.linspace(0, math.log(part.to_hz / part.from_hz), SINES + 1)  # logarithm of f / from_hz
     rise = part.slope + 1  # power up to f goes as f^rise, of which only ratios count
@@ -107,9 +106,8 @@ class Voice:
     def highest_hz(self) -> float:
         """The frequency that sets the sampling: the sines' highest plus one period per rise.
 
-        The envelope is smoother than a sine of that frequency. The error of cubic Hermite interpolation
-        follows from the
-        fourth derivative, at most 360 / rise^4, and the jumps of the third, 60 / rise^3; for the sine they
+        The envelope is smoother than a sine of that frequency. The error of cubic Hermite interpolation follows
+        from the fourth derivative, at most 360 / rise^4, and the jumps of the third, 60 / rise^3; for the sine they
         are 1559 and 248.
         """
         edge_hz = 1 / self.rise_s if math.isfinite(self.begin_s) else 0.0
@@ -155,13 +153,11 @@ class Vibration:
     def lay_over(self, trajectory: Trajectory) -> Trajectory:
         """Add the vibration to a trajectory, or to a part of one: lab_from_body exp(phi(t)), phi in body axes.
 
-        Where vibration is active the trajectory is resampled so finely that `Trajectory.at` between two
-        samples keeps phi to
-        1e-4 of its amplitude; all samples are kept. The body rate becomes exp(-phi) omega + J(phi) dphi/dt,
-        in the vibrating
-        axes, with omega linear between the samples of the trajectory. Without active vibration the same
-        object is returned.
-        Raises InputError (one line) where more than five million samples would be needed.
+        Where vibration is active the trajectory is resampled so finely that `Trajectory.at` between two samples
+        keeps phi to 1e-4 of its amplitude; all samples are kept. The body rate becomes exp(-phi) omega + J(phi)
+        dphi/dt, in the vibrating axes, with omega linear between the samples of the trajectory. Without active
+        vibration the same object is returned. Raises InputError (one line) where more than five million samples
+        would be needed.
         """
         if not any(one.sounds(trajectory.t_s).any() for one in self.voices):
             return trajectory

@@ -102,9 +102,8 @@ class Navigation:
     def apparent_bias_rad_s(self, lab_from_body_wxyz: Floats, rate_body_rad_s: Floats) -> Floats:
         """(3,) error of the measured rate, without noise, at this true attitude and rate (3,).
 
-        The sum of the gyro bias, of scale factor and misalignment errors times the rate, and of the Earth
-        rate if it is
-        not compensated.
+        The sum of the gyro bias, of scale factor and misalignment errors times the rate, and of the Earth rate if
+        it is not compensated.
         """
         unknown = self.earth_felt_rad_s - self.earth_known_rad_s
         earth = quaternion.apply(quaternion.inverse(lab_from_body_wxyz), unknown)

@@ -156,11 +156,9 @@ def frame_transfer_smear(light_e: NDArray[Any], exposure_s: float, row_time_s: f
 
     light_e : light of the exposure; the smear is added in place. Dark current is the same in every row, so it is not
         affected.
-    The chip is shifted into its store row by row before the exposure as after it. A pixel that ends at row y
-    was shifted
-    in, empty, over the rows above y (greater y) and is shifted out over those below, for row_time in each. So
-    it passes
-    every other row of its column once, with the same brightness as in the exposure.
+    The chip is shifted into its store row by row before the exposure as after it. A pixel that ends at row y was
+    shifted in, empty, over the rows above y (greater y) and is shifted out over those below, for row_time in each.
+    So it passes every other row of its column once, with the same brightness as in the exposure.
     """
     _smear(light_e, row_time_s / exposure_s)
 

@@ -45,10 +45,9 @@ def hit(
 ) -> NDArray[Any]:
     """Add the particle tracks of an exposure to a frame of electrons (in place, float32 or float64).
 
-    Returns the truth of the tracks that left charge on the chip, a structured array of dtype TRACK: entry at
-    the front
-    and exit at the back (pixels, also outside of the frame), path length through the layer, charge released, and the
-    charge that fell on the frame.
+    Returns the truth of the tracks that left charge on the chip, a structured array of dtype TRACK: entry at the
+    front and exit at the back (pixels, also outside of the frame), path length through the layer, charge released,
+    and the charge that fell on the frame.
     """
     tracks = [tracks_of(part, electrons.shape, exposure_s, pixel_m, rng) for part in particles]
     for part, some in zip(particles, tracks, strict=True):
@@ -66,11 +65,10 @@ def tracks_of(
     per_cm2_s counts the particles that cross a square centimeter of the chip's plane in a second, from either
     side; an isotropic flux of J through a sphere of 1 cm^2 section gives J / 2. Directions are isotropic, but
     the chip is
-    foreshortened: p(theta) = 2 sin(theta) cos(theta) = sin(2 theta) from its normal, so cos^2(theta) is
-    uniform. The path
-    length is depth / cos(theta). The charge follows Moyal's law (1955, Phil. Mag. 46, 263) about the most
-    probable value,
-    electrons_um times the length, with a scale of WIDTH times that. More than MOST_TRACKS raise InputError.
+    foreshortened: p(theta) = 2 sin(theta) cos(theta) = sin(2 theta) from its normal, so cos^2(theta) is uniform.
+    The path length is depth / cos(theta). The charge follows Moyal's law (1955, Phil. Mag. 46, 263) about the most
+    probable value, electrons_um times the length, with a scale of WIDTH times that. More than MOST_TRACKS raise
+    InputError.
     """
     height, width = shape
     margin = MOST_ASLANT * part.depth_m / pixel_m  # also tracks that enter beside the frame

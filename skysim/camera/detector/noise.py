@@ -67,9 +67,8 @@ def seeds(rng: Generator, rows: int) -> NDArray[np.uint64]:
 def ziggurat() -> NDArray[np.float64]:
     """(LAYERS + 1,) corners of layers of equal area under exp(-x^2 / 2) (Marsaglia & Tsang 2000).
 
-    The lowest layer holds the tail beyond r: its corner is area / height. The layers built on r reach exactly
-    the peak
-    for only one r, found by bisection.
+    The lowest layer holds the tail beyond r: its corner is area / height. The layers built on r reach exactly the
+    peak for only one r, found by bisection.
     """
 
     def tower(r: float) -> tuple[NDArray[np.float64], bool]:
@@ -98,8 +97,7 @@ def _guide() -> Any:
 
     A count n is certain where the whole bucket is above F(n - 1) of the smallest mean and below F(n) of the greatest
     mean of the row, since F falls with the mean. The other buckets, one at each step of F and 1/PER_E of the
-    numbers,
-    are UNSURE.
+    numbers, are UNSURE.
     """
     rows = int(FEW_E * PER_E)
     guide = np.empty((rows, BUCKETS), np.uint8)
@@ -137,9 +135,9 @@ def _uniform(state: Any) -> Any:
 def count(row: Any, state: Any, tables: Tables) -> Any:
     """Turn a row of means >= 0 into Poisson counts, exactly, in place. Returns the stream's next state.
 
-    Small means use inversion: ten bits choose the guide's bucket, and only where the count is not certain
-    more bits are
-    drawn and the law is summed at the exact mean. Large means use Ahrens & Dieter's PD (1982), see `_count_many`.
+    Small means use inversion: ten bits choose the guide's bucket, and only where the count is not certain more bits
+    are drawn and the law is summed at the exact mean. Large means use Ahrens & Dieter's PD (1982), see
+    `_count_many`.
     """
     later, many = np.empty(row.size, np.int32), 0
     bits = uint64(0)
@@ -181,9 +179,8 @@ def _count_many(row: Any, which: Any, state: Any, edge: Any, height: Any, width:
     """Poisson counts for the chosen pixels of a row, with means of at least ten.
 
     PD: the floor of a normal number of the same mean and variance has the Poisson law but for an error of order
-    mean^-1/2. A squeeze accepts most numbers without computing the law: u >= (mean - k)^3 / (6 mean^2). The
-    rest go to
-    `_mend`, which accepts or replaces them so that the law is exact.
+    mean^-1/2. A squeeze accepts most numbers without computing the law: u >= (mean - k)^3 / (6 mean^2). The rest go
+    to `_mend`, which accepts or replaces them so that the law is exact.
     """
     for x in which:
         mean = float64(row[x])

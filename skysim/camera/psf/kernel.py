@@ -39,9 +39,8 @@ NO_RADIAL, NO_GRID = np.empty((0, 3), np.float32), np.empty((0, 0, 0, 0), np.flo
 class Kernel:
     """A source's image integrated over the pixels, as `splat.add` draws it; its light adds up to 1.
 
-    One of three: sigma_px > 0, an exact Gaussian; radial (R, 3, 5 or 7), see `splat.add_round`; grid (P, P,
-    N, N), see
-    `splat.add_grid`. Tables that are not used are empty.
+    One of three: sigma_px > 0, an exact Gaussian; radial (R, 3, 5 or 7), see `splat.add_round`; grid (P, P, N, N),
+    see `splat.add_grid`. Tables that are not used are empty.
     """
 
     sigma_px: float
@@ -68,12 +67,11 @@ def kernel(
     extra_sigma_px    : Gaussian blur added to the lens's own, see `otf.field_sigma_px`
     emitter_radius_px : of the emitting disc's geometric image
     blur_radius_px    : of the defocus disc
-    All three are rounded to QUANTUM_PX, except that a Gaussian lens's image of a point is exact. A round
-    image gets up
-    to three harmonics of the pixel's shape, which leave out 1e-4 of the peak at a blur of 0.2 px and 1e-3 on the
+    All three are rounded to QUANTUM_PX, except that a Gaussian lens's image of a point is exact. A round image gets
+    up to three harmonics of the pixel's shape, which leave out 1e-4 of the peak at a blur of 0.2 px and 1e-3 on the
     edge of a disc as sharp as 0.08 px; a sharper point, or a lens that is not round, gets a grid. The light of
-    power-law wings beyond their reach is added to the image by normalization, so that its total is 1.
-    Raises InputError for an unreadable file of a measured PSF.
+    power-law wings beyond their reach is added to the image by normalization, so that its total is 1. Raises
+    InputError for an unreadable file of a measured PSF.
     """
     steps = tuple(round(value / QUANTUM_PX) for value in (extra_sigma_px, emitter_radius_px, blur_radius_px))
     if psf.kind == "gaussian" and not (steps[1] or steps[2]):
@@ -173,9 +171,8 @@ def series(box_px: float, reach_px: float, highest: float, per_px: int) -> Serie
 def round_kernel(psf: Psf, camera: CameraConfig, *steps: int) -> Kernel | None:
     """A kernel of radial tables; None where three harmonics cannot represent the pixel's corners.
 
-    A series holds at most 16 cycles a pixel and TERMS terms; a sharper image is softened to that: one of 130
-    px radius
-    by 0.2 px.
+    A series holds at most 16 cycles a pixel and TERMS terms; a sharper image is softened to that: one of 130 px
+    radius by 0.2 px.
     """
     blend = Blend.of(psf, camera, *steps)
     reach, wanted = blend.reach_px(), cutoff(psf, camera, blend.sigma_px, FAINT)

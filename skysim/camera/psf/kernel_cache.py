@@ -139,9 +139,8 @@ def sharpness_px(made: Kernel) -> float:
     """How far an image may move before its pixels change much: half its peak over its steepest slope.
 
     For the table of a Gaussian it is 0.82 sigma. For a soft edge it is 1.25 sigma, which is still safe: two nodes in
-    1.6 sigma leave a ripple of 0.5 exp(-2 pi^2 / 1.6^2) = 2e-4, and the ends' share falls with the disc's
-    width. For a
-    Gaussian drawn by formula it is sigma with the pixel's own variance, 1/12, added.
+    1.6 sigma leave a ripple of 0.5 exp(-2 pi^2 / 1.6^2) = 2e-4, and the ends' share falls with the disc's width.
+    For a Gaussian drawn by formula it is sigma with the pixel's own variance, 1/12, added.
     """
     if len(made.grid):
         steps = made.grid.shape[0] - 3

@@ -104,12 +104,10 @@ def measured(psf: MeasuredPsfConfig, camera: CameraConfig, fx: Floats, fy: Float
     """A measured point-spread function about its own center of gravity, so that a centroid is a star's position.
 
     Each number is the light on a cell of 1 / oversampling px. The cell's own integration is divided out, so that the
-    pixel's blur is not counted twice: with an oversampling of 1 a star in the middle of a pixel gives the
-    table back,
-    with S the pixels are sums of S x S cells. Between these positions Keys' cubic convolution (1981, IEEE
-    ASSP 29, 1153)
-    interpolates. A table that already includes the pixel's blur at an oversampling above 1 (an "effective" PSF) is
-    widened by that blur again.
+    pixel's blur is not counted twice: with an oversampling of 1 a star in the middle of a pixel gives the table
+    back, with S the pixels are sums of S x S cells. Between these positions Keys' cubic convolution (1981, IEEE
+    ASSP 29, 1153) interpolates. A table that already includes the pixel's blur at an oversampling above 1 (an
+    "effective" PSF) is widened by that blur again.
     """
     cells = cells_of(psf.file)
     x_px, y_px = cell_places_px(psf)

@@ -80,12 +80,10 @@ def add_round(
 
     radial (R, 3, 5 or 7): at r = i / PER_PX of T0 the value, the step to the next entry and Bessel's second
     difference
-    (a parabola: linear interpolation would lose 1e-4 of a sharp image's light); then value and step of T4 /
-    r^4 and of
-    T8 / r^8, where needed. With these powers the cosines are polynomials of u = dx^2, v = dy^2,
-    r^4 cos 4 theta = (u + v)^2 - 8 u v and r^8 cos 8 theta = 2 (r^4 cos 4 theta)^2 - r^8: no division, no
-    trigonometry.
-    Square roots and polynomials run as SIMD over LANES pixels; only the table look-up runs pixel by pixel.
+    (a parabola: linear interpolation would lose 1e-4 of a sharp image's light); then value and step of T4 / r^4 and
+    of T8 / r^8, where needed. With these powers the cosines are polynomials of u = dx^2, v = dy^2, r^4 cos 4 theta
+    = (u + v)^2 - 8 u v and r^8 cos 8 theta = 2 (r^4 cos 4 theta)^2 - r^8: no division, no trigonometry. Square
+    roots and polynomials run as SIMD over LANES pixels; only the table look-up runs pixel by pixel.
     """
     height, width = patch.shape
     reach = (radial.shape[0] - 2) / PER_PX

@@ -119,9 +119,8 @@ class Flight:
     def advance(self, control: Floats) -> None:
         """Integrate one step for each row of control (K, nu). Raises InputError if MuJoCo warned.
 
-        MuJoCo resets an unstable model to its start and continues, and clears its warnings with the next
-        call, so they are
-        checked after every call.
+        MuJoCo resets an unstable model to its start and continues, and clears its warnings with the next call, so
+        they are checked after every call.
         """
         self.forget(len(control))
         row, end = self.row, self.row + len(control)

@@ -216,11 +216,9 @@ def add_wheels(spec: Any, wheels: WheelsConfig) -> None:
 def add_cmgs(spec: Any, model: Any, cmgs: CmgsConfig) -> None:
     """A rate servo at each gimbal, and a motor at each variable-speed rotor; other rotors keep their momentum.
 
-    The servo's set-point is the integral of the commanded rate. A critically damped spring pulls the gimbal
-    to it with
-    the scene's time constant, so that the rate is held against gyroscopic torque from the vehicle's rotation;
-    a damper
-    alone would not hold it.
+    The servo's set-point is the integral of the commanded rate. A critically damped spring pulls the gimbal to it
+    with the scene's time constant, so that the rate is held against gyroscopic torque from the vehicle's rotation;
+    a damper alone would not hold it.
     """
     tau_s = cmgs.gimbal_time_constant_s
     for joint, inertia in zip(joints(spec, GIMBAL), Hinges.of(model, GIMBAL).inertia_kg_m2, strict=True):

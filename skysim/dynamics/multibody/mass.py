@@ -73,10 +73,9 @@ def unbalance(model: Any, joints: list[Any], wheels: WheelsConfig, path: Path) -
     """Unbalance the wheels: offset each center of mass from the axle and tilt the principal axes.
 
     Static: the rotor's center is moved across the axle by static_imbalance / mass; the axle feels the force
-    U_s speed^2, the bearing its moment. Dynamic: a product of inertia U_d between the axle and the second
-    axis across
-    it; the axle feels the torque U_d speed^2, 90 deg from the former. Changes the joints' bodies; model is what they
-    compiled to while balanced.
+    U_s speed^2, the bearing its moment. Dynamic: a product of inertia U_d between the axle and the second axis
+    across it; the axle feels the torque U_d speed^2, 90 deg from the former. Changes the joints' bodies; model is
+    what they compiled to while balanced.
     """
     if not (wheels.static_imbalance_kg_m or wheels.dynamic_imbalance_kg_m2):
         return

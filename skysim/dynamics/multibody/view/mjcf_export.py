@@ -51,9 +51,8 @@ def mjcf(world: World, scene: Scene, sources: Sources, lab_from_body: Rotation) 
 
     sources       : LEDs in lab coordinates (m), or stars, of which the brightest are put on a sphere
     lab_from_body : attitude in the keyframe `start`, which also has the speeds and gimbal angles of the scene
-    The simulated model is not changed. Raises InputError for a start beyond the tilt stop, and for a vehicle
-    that has
-    a camera named `lab`.
+    The simulated model is not changed. Raises InputError for a start beyond the tilt stop, and for a vehicle that
+    has a camera named `lab`.
     """
     spec, here = world.spec.copy(), mount(world)
     if spec.camera(LAB_CAMERA):

@@ -53,9 +53,8 @@ def picture(mjcf: str, qpos: Floats, size_px: tuple[int, int] = PICTURE_PX) -> P
 def film(mjcf: str, qpos: Floats, size_px: tuple[int, int] = FILM_PX) -> Iterator[Picture]:
     """As `picture`, for each row of qpos (N, nq), yielded as they are rendered.
 
-    Rendering runs in its own process: MuJoCo chooses its OpenGL when first imported, by MUJOCO_GL (here EGL
-    by default),
-    and a graphics driver may crash the whole process.
+    Rendering runs in its own process: MuJoCo chooses its OpenGL when first imported, by MUJOCO_GL (here EGL by
+    default), and a graphics driver may crash the whole process.
     """
     width, height = size_px
     with tempfile.TemporaryFile() as task, tempfile.TemporaryFile() as complaints:
