@@ -102,14 +102,17 @@ def render(
     rows = image.shape[0]
     t_s = moments(window.open_s, window.close_s(rows), trajectory)
     during = poses(trajectory, mount, t_s)
+    # Coarse selection with a few poses, before the sources are projected at all of them.
     near = sources.take(in_view(sources, optics, Poses(*(part[:: len(t_s) // 8] for part in during))))
     if hides:
         near = near.take(~hides(near))
     paths, distance_m, cos_in = follow(near, optics, during, t_s, emitter or Emitter())
     middle_px = paths.xy_px[len(t_s) // 2]
     shapes = images(optics.camera, middle_px, near.radius_m, near.place[:, 3] > 0, distance_m, cos_in)
+    # From here on sharp_px is the longest motion allowed in one piece.
     stride = shapes._replace(sharp_px=STEP * shapes.sharp_px)
     table = draw(image, paths, stride, window)
+    # Only sources that gave light to the chip are reported.
     kept = table[:, 0] > 0
     electrons, peak, x, y, squares, length = table[kept, :6].T
     return SourceTruth(

@@ -86,13 +86,13 @@ class WheelSet:
     def drive(self, torque_nm: Floats, speed_rad_s: Floats, period_s: float) -> Floats:
         """Motor torques (n,) on the wheels that give torque_nm (3,) on the body for the next period_s.
 
-        The smallest ones that do; if the axes do not span space (n < 3, or all in a plane), those nearest in least
-        squares. Beyond the torque limit all are scaled together, which keeps the direction. A torque that would
-        carry a wheel beyond its speed limit is then reduced to what just reaches it (I d(speed)/dt = u, without the
-        body's own
-        acceleration): a
-        wheel at its limit can only be braked, and the direction is not kept.
+        The smallest ones that do; if the axes do not span space (n < 3, or all in a plane), those nearest in
+        least squares.
+        Beyond the torque limit all are scaled together, which keeps the direction. A torque that would carry a wheel
+        beyond its speed limit is then reduced to what just reaches it (I d(speed)/dt = u, without the body's own
+        acceleration): a wheel at its limit can only be braked, and the direction is not kept.
         """
+        # Scaling keeps the torque's direction; the clip to the speed limits afterwards may change it.
         motor = within(self.motor_from_torque @ torque_nm, self.torque_limit_nm)
         torque_s = self.inertia_kg_m2 / period_s
         most = np.maximum(torque_s * (self.speed_limit_rad_s - speed_rad_s), 0.0)
@@ -130,7 +130,8 @@ class FanSet:
     def drive(self, torque_nm: Floats) -> Floats:
         """Thrusts (n,), the smallest that give the torque (3,), or the nearest to it in least squares.
 
-        Beyond the limit all are scaled together, which keeps the direction. Fans can blow both ways. The bearing
+        Beyond the limit all are scaled together, which keeps the direction. Each fan can blow either way. The
+        bearing
         takes the net force.
         """
         return within(self.thrust_from_torque @ torque_nm, self.thrust_limit_n)
@@ -213,6 +214,7 @@ def shared(
     gram = jacobian @ jacobian.T
     clear = determinant(gram) / unit_nms**6 if unit_nms > 0 else 0.0
     gimbals, rotors = rate_limit**2, torque_limit**2 * math.exp(-FADING * clear)
+    # Weighted minimum norm: x = W B^T (B W B^T)^-1 dh/dt with B = [jacobian, axle] and W = diag(limits^2).
     effort = solve(gimbals * gram + rotors * (axle @ axle.T), wanted_nm)
     rate, torque = gimbals * (jacobian.T @ effort), rotors * (axle.T @ effort)
     scale = 1 / max(1.0, np.abs(rate).max() / rate_limit, np.abs(torque).max() / torque_limit)
@@ -295,6 +297,8 @@ class CmgSet:
         keeps the torque's direction.
         """
         axle, across = turned(self.spin_axes, self.cross_axes, angle_rad)
+        # A gimbal rotates the rotor's inertial angular momentum, which includes the body's rate along the
+        # axle.
         spin_nms = self.rotor_inertia_kg_m2 * (rotor_rad_s + rate_body_rad_s @ axle)
         jacobian = across * spin_nms
         unit_nms = float(np.abs(spin_nms).mean())

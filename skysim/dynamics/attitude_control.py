@@ -87,6 +87,7 @@ def law(
     lab_from_body, rate = present
     kp, ki, kd, authority, fastest = gains
     body_from_ref = multiply(inverse(lab_from_body), lab_from_ref)
+    # e is the rotation vector of ref_from_body, the inverse of body_from_ref.
     error = -to_rotvec(body_from_ref)
     lag = rate - apply(body_from_ref, rate_ref)
     pull = kp * error + ki * error_sum
@@ -105,6 +106,7 @@ def law(
 def add_unless_short(total: Floats, error: Floats, wanted: Floats, given: Floats, period_s: float) -> None:
     """`Pid.learn`, in place."""
     for i in range(3):
+        # Anti-windup: do not integrate further into a limit, but do integrate out of it.
         short = abs(given[i]) < abs(wanted[i]) * (1 - SHORT)
         if not short or error[i] * wanted[i] > 0:
             total[i] += error[i] * period_s

@@ -172,6 +172,7 @@ class Unloading:
         """Command the fans; return (3,) the torque that they give now according to the lag model."""
         before = self.blown_nm
         asked = self.fans.allot(control, self.desaturator.torque(momentum_nms), now)
+        # First-order lag of the fans over one period; the torque at its start is the one that acts now.
         self.blown_nm = before + (asked - before) * -math.expm1(-now.period_s / self.fans.lag_s)
         return before
 
@@ -216,6 +217,7 @@ class FlightComputer:
         self.wanted_nm = self.law.torque_nm(now.t_s, lab_from_body_wxyz, now.rate_body_rad_s, momentum_nms)
         rest_nm = self.wanted_nm
         if self.unloading:
+            # The other actuators give the wanted torque less the fans', which takes momentum out of them.
             rest_nm = rest_nm - self.unloading.allot(control, momentum_nms, now)
         given_nm = self.hands.allot(control, rest_nm, now)
         self.law.learn(rest_nm, given_nm, self.period_s)

@@ -78,6 +78,7 @@ def rest_to_rest(
 
     The acceleration is continuous: zero at both ends of a ramp and 1.5 rate / ramp at its middle.
     """
+    # Symmetric profile: the braking half is the first half in reversed time.
     braking = t_s > duration_s / 2  # the second half mirrors the first
     since_s = duration_s - t_s if braking else t_s
     x = min(since_s / ramp_s, 1.0)

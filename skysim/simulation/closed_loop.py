@@ -92,6 +92,7 @@ class ClosedLoop:
         t_s, angles, speeds = flight.now_s, flight.angles_rad, flight.speeds_rad_s
         attitude, rate = flight.lab_from_body_wxyz, flight.rate_body_rad_s
         stored = pilot.momentum_nms(angles, speeds)
+        # The controller sees the truth or, with feedback imu or filter, the navigation's estimates.
         seen, turning = attitude, rate
         if pilot.told and pilot.told.feedback != "truth" and navigation:
             seen, turning = (
@@ -103,10 +104,13 @@ class ClosedLoop:
         if not self.room.quiet:
             times_s = flight.times_s(flight.step, flight.step + len(control) + 1)
             disturbance = self.room.torque_nm(times_s, attitude, rate, stored)
+            # Disturbances act through the model's ideal torque actuators, step by step; commands are
+            # constant.
             control[:, flight.world.torques] += disturbance
             if diary:
                 diary.disturbed(disturbance.sum(axis=0) / len(control))
         if diary:
+            # Before the motion advances: every column of a row is of the same time.
             diary.note(stored)
         flight.advance(control)
         if navigation:
@@ -139,6 +143,7 @@ class OnboardCamera:
         while self.index < aloft.lab.frames:
             when = window(scene, self.index, self.meter.exposure_s)
             close_s = when.close_s(scene.camera.height_px)
+            # Not due yet: the exposure is not over, or the solution would still be in processing.
             if close_s + self.latency_s > aloft.flight.now_s:
                 return
             if self.wanted and not self.wanted(self.index, close_s):
@@ -147,6 +152,7 @@ class OnboardCamera:
             frame, truth = render_frame(aloft.here(when.open_s), self.index, clock, when.exposure_s)
             self.meter.see(frame)
             report = factory.answer(self.tracker, frame) if self.tracker else None
+            # The filter takes the solution at its mid-exposure time, although it arrives later.
             told = aloft.navigation if scene.filter and report else None
             verdict = told.see(frame.t_mid_s, report.attitude) if told and report else ""
             self.index += 1

@@ -24,9 +24,8 @@ TAIL = 1e-6  # fraction of a packet that the table of late shares does not resol
 def bloom(electrons: NDArray[Any], full_well_e: float, anti_blooming: float = 0.0) -> None:
     """Spread charge above the full well along its column: half of each excess to either neighbor, until all fits.
 
-    anti_blooming : fraction of every pixel's excess that a drain removes first; the rest is conserved, except
-    for what
-        leaves the ends of the column, which is lost.
+    anti_blooming : fraction of every pixel's excess that a drain removes first; the rest is conserved, except for
+        what leaves the ends of the column, which is lost.
     The final state does not depend on the order of the halvings, and it conserves the charge's sum and first moment
     (the divisible sandpile in one dimension: Levine & Peres 2009, Potential Anal. 30, 1; `assumed`). These two
     conserved numbers give the ends of the streak directly, see `_settle`. Columns without excess are skipped.
@@ -48,6 +47,7 @@ def _bloom(
         for y in range(height):
             room[y] = full_well_e - electrons[y, x]
             if room[y] < 0:
+                # The drain takes its fraction of the excess before the rest spreads.
                 room[y] *= 1 - anti_blooming
                 first, last = min(first, y), max(last, y)
         for y in range(height):
@@ -55,6 +55,7 @@ def _bloom(
                 a, b = _settle(room, y)
                 first, last = min(first, a), max(last, b)
         for y in range(max(first, 0), min(last, height - 1) + 1):
+            # Back from remaining capacity to charge, only where something changed.
             electrons[y, x] = full_well_e - room[y]
 
 
@@ -72,6 +73,7 @@ def _settle(room: Floats, y: int) -> tuple[int, int]:
     room[y] = 0.0
     a, b = y - 1, y + 1
     while True:
+        # Lever rule: the charge left over is split so that its sum and its moment about y are conserved.
         to_b = (moment + left * (y - a)) / (b - a)
         to_a = left - to_b
         if a >= 0 and to_a > room[a]:
@@ -128,6 +130,7 @@ def _late_rows(electrons: NDArray[Any], share: Floats) -> None:
     for block in numba.prange((width + BLOCK - 1) // BLOCK):
         x0, x1 = block * BLOCK, min((block + 1) * BLOCK, width)
         gathered = np.empty(BLOCK, dtype=electrons.dtype)
+        # Backwards, so that the rows that row y gathers from still hold the charge before transfer.
         for y in range(height - 1, -1, -1):
             gathered[:] = 0
             for k in range(min(len(share), y + 1)):
@@ -154,8 +157,8 @@ def frame_transfer_smear(light_e: NDArray[Any], exposure_s: float, row_time_s: f
     """Smear of a frame-transfer chip: rows shifted under light collect row_time / exposure of the light of every
     row passed.
 
-    light_e : light of the exposure; the smear is added in place. Dark current is the same in every row, so it is not
-        affected.
+    light_e : light of the exposure; the smear is added in place. Dark current is the same in every row, so it
+        is not affected.
     The chip is shifted into its store row by row before the exposure as after it. A pixel that ends at row y was
     shifted in, empty, over the rows above y (greater y) and is shifted out over those below, for row_time in each.
     So it passes every other row of its column once, with the same brightness as in the exposure.
@@ -166,9 +169,8 @@ def frame_transfer_smear(light_e: NDArray[Any], exposure_s: float, row_time_s: f
 def interline_smear(light_e: NDArray[Any], exposure_s: float, row_time_s: float, leak: float) -> None:
     """Smear of an interline chip: the covered register collects `leak` of the light of every row passed.
 
-    light_e : light of the exposure; the smear is added in place. The register is clocked all the time, so the
-    register
-        cell that takes over a pixel's charge has passed the rows above it and will pass those below.
+    light_e : light of the exposure; the smear is added in place. The register is clocked all the time, so
+        the register cell that takes over a pixel's charge has passed the rows above it and will pass those below.
     """
     _smear(light_e, leak * row_time_s / exposure_s)
 

@@ -81,6 +81,7 @@ def tracks_of(
         )
     count = rng.poisson(expected)
     made = np.zeros(count, TRACK)
+    # cos^2(theta) is uniform; its lower end bounds the tangent by MOST_ASLANT.
     cosine = np.sqrt(rng.uniform(1 / (1 + MOST_ASLANT**2), 1, count))
     azimuth = rng.uniform(0, 2 * np.pi, count)
     reach_px = part.depth_m / pixel_m * np.sqrt(1 / cosine**2 - 1)

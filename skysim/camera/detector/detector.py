@@ -265,6 +265,7 @@ def judge(seen: SourceTruth, light_e: NDArray[Any], exposure_s: float, chip: Chi
     own_e = seen.peak_e * chip.sensitivity[y, x]
     mean_e = light_e[y, x] * chip.sensitivity[y, x] + chip.dark_e_s[y, x] * exposure_s
     bent = mean_e * (1 - part.nonlinearity * np.minimum(mean_e / part.full_well_e, 1))
+    # The relative nonlinearity is held at its value at full well, since beyond it the parabola turns down.
     full = bent / part.gain_e_dn + part.offset_dn >= saturation_dn(part)
     noise_e = np.sqrt(part.read_noise_e**2 + part.reset_noise_e**2 + part.gain_e_dn**2 / 12)
     ratio = snr(seen.electrons, seen.area_px, np.maximum(mean_e - own_e, 0), noise_e)

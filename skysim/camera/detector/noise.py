@@ -188,11 +188,13 @@ def _count_many(row: Any, which: Any, state: Any, edge: Any, height: Any, width:
         bits, state = draw(state)
         layer, across = uint32(bits) & uint32(LAYERS - 1), int32(uint32(bits)) >> int32(9)
         g = float32(across) * width[layer]
+        # Inside the next, narrower layer the position is accepted; about 1 in 160 is not.
         if abs(across) >= sure[layer]:
             g, state = _edge(int64(across), int64(layer), state, edge, height)
         k = np.floor(mean + sigma * g)
         u = float64(int64(bits >> uint64(32))) * 2.0**-32
         short = mean - k
+        # PD accepts every k above mean - 1.1484 at once, and the squeeze most of the others.
         if min(short, short * short * short - 6 * mean * mean * u) > 1.1484:
             k, state = _mend(mean, sigma, k, u, state)
         row[x] = k
@@ -233,6 +235,7 @@ def _densities(mean: float, sigma: float, k: float) -> Any:
     else:
         v = (mean - k) / k
         r = 1 / (k * k)
+        # Stirling's series with k (log(1 + v) - v) avoids cancellation of large terms.
         px = k * (np.log1p(v) - v) - (1 / 12 - (1 / 360 - r / 1260) * r) / k
         py = 1 / sqrt(2 * pi * k)
     x2 = ((0.5 - mean + k) / sigma) ** 2

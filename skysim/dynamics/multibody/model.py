@@ -75,7 +75,7 @@ class World:
 
     @property
     def inertia_kg_m2(self) -> Floats:
-        """(3, 3) inertia tensor about the bearing's centre, in body axes, as if every joint were locked."""
+        """(3, 3) inertia tensor about the bearing's center, in body axes, as if every joint were locked."""
         return self.mass.inertia_kg_m2
 
     @property

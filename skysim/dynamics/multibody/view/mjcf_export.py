@@ -206,9 +206,8 @@ def shell_m(inside: Surface, cap_rad: float) -> Floats:
 def seen_shell_m(inside: Surface, around: Floats) -> Floats:
     """(RINGS, SECTORS, 3) points where rays from the bearing meet a surface, from its upper edge to its rim.
 
-    around : (SECTORS, 3) horizontal unit vectors. Edge and rim are found to a fifth of a degree, between 0
-    and 80 deg
-             from the zenith and above a third of the surface's height
+    around : (SECTORS, 3) horizontal unit vectors. Edge and rim are found to a fifth of a degree, between 0 and
+             80 deg from the zenith and above a third of the surface's height
     """
     up = np.array([0.0, 0.0, 1.0])
 
