@@ -233,6 +233,7 @@ def unproject(xy_px: Floats, optics: Optics) -> Floats:
         image_r = r * radial(camera.distortion, r**2)
         wanted, aslant = plane, np.zeros_like(plane)
         for _ in range(10 if any(camera.distortion[2:4]) else 1):
+            # Remove the last estimate of the tangential part, then invert the radial part by the table.
             straight = wanted - aslant
             length = np.hypot(*straight.T)
             plane = straight * (np.interp(length, image_r, r) / np.maximum(length, 1e-300))[:, None]

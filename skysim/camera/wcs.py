@@ -107,6 +107,7 @@ def fitted(camera: CameraConfig) -> Sip | None:
     chip = everywhere[on_chip]
     if not lit.any():
         return None
+    # Offsets are scaled to 1, or the high powers would make the least squares ill-conditioned.
     scale, found = np.abs(bent).max(), []
     for order in range(2, MAX_ORDER + 1):
         powers = [(p, n - p) for n in range(2, order + 1) for p in range(n, -1, -1)]

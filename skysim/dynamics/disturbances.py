@@ -146,6 +146,8 @@ class DisturbanceModel:
         )
         for knock in self.knocks:
             if knock.begin_s < times_s[-1] and times_s[0] < knock.begin_s + knock.duration_s:
+                # Impulse fraction of each step over its length: the mean torque of the step for a unit
+                # impulse.
                 share = [knock.share(a, b) / (b - a) for a, b in itertools.pairwise(times_s)]
                 every += np.outer(share, self.inertia_kg_m2 @ knock.rate_rad_s)
         return every

@@ -65,6 +65,7 @@ def band(part: JitterBandConfig, rng: np.random.Generator) -> Sines:
     if abs(rise) < 1e-6:
         share, middle = high - low, low + drawn * (high - low)
     else:
+        # Power of each piece, and a frequency drawn from it by inverting its cumulative power.
         share = np.exp(rise * low) * np.expm1(rise * (high - low)) / rise
         middle = low + np.log1p(drawn * np.expm1(rise * (high - low))) / rise
     return with_phases(part.from_hz * np.exp(middle), share / share.sum(), part.rms_arcsec, rng)

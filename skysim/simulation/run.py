@@ -84,10 +84,11 @@ def live(
 ) -> Iterator[CapturedFrame]:
     """Yield the frames of a test bed during its motion, each rendered as its exposure ends.
 
-    Only the most recent states are kept, so that the motion may last for ever. The frames equal those of `run`.
+    Only the most recent states are kept, so that the motion may last without end. The frames equal those of `run`.
 
     estimator : solves each frame; if None, frames are solved only where the scene has a filter
-    wanted(index, close_s) : whether to render a frame; skipping one does not change the others
+    wanted(index, close_s) : whether to render a frame. Skipping one does not change the others, except that exposure
+        control and filter do not see it
     """
     aloft = ClosedLoop(lab, forgets=True)
     flight = aloft.flight

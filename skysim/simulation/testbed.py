@@ -56,7 +56,7 @@ class Testbed:
     reports   : the star tracker's reports on frames solved during the motion (for the filter), by frame index
     verdicts  : the filter's status of each of those updates
     exposures_s: exposure time of each of those frames
-    programs  : external tracker commands by name, which only the user's command line sets them
+    programs  : external tracker commands by name, for `tracker.name`; only the user's command line sets them
     endless   : frames continue without end, whatever the scene's number; only for `live`
     """
 

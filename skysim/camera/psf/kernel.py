@@ -186,6 +186,7 @@ def round_kernel(psf: Psf, camera: CameraConfig, *steps: int) -> Kernel | None:
     rows, count = int(reach * PER_PX / coarse) + 2, int(reach * PER_PX) + 1
     pairs = zip(terms.matrix[:, :rows], passed.astype(np.float32), strict=True)
     t = refined(np.array([matrix @ amount for matrix, amount in pairs], dtype=float), coarse)[:, :count]
+    # A strong eighth harmonic means that the higher ones, which are left out, matter too.
     if np.abs(t[2]).max() > min(SHARP[0] * t[0].max(), SHARP[1]):
         return None
     if psf.kind in WINGED:
@@ -211,12 +212,15 @@ def packed(t: Floats) -> Singles:
     """(R + 1, 3, 5 or 7) table for `splat.add_round` from (3, R) harmonics: normalized to 1, nowhere negative."""
     sizes = np.abs(t).max(axis=1)
     t = t[: 1 + np.count_nonzero(sizes[1:] > NOTHING * sizes[0])]
+    # Raise T0 where the other harmonics would make the image negative.
     t[0] = np.maximum(t[0], np.abs(t[1:]).sum(axis=0))
     r = np.arange(t.shape[1]) / PER_PX
+    # Total light 2 pi int r T0 dr by the trapezoid rule, with its end correction at r = 0 (Euler-Maclaurin).
     t /= 2 * np.pi / PER_PX * (r @ t[0] + t[0, 0] / 12 / PER_PX)
     out = np.zeros((len(r) + 1, 1 + 2 * len(t)), np.float32)
     bend = np.zeros(len(r) + 1)
     bend[0], bend[1:-2] = 2 * (t[0, 1] - t[0, 0]), t[0, 2:] - 2 * t[0, 1:-1] + t[0, :-2]
+    # Bessel's interpolation uses the mean of the second differences at both ends, over 2.
     out[:-1, 2] = (bend[:-1] + bend[1:]) / 4
     for value, n, harmonic in zip((0, 3, 5), HARMONICS, t, strict=False):
         harmonic[1:] /= r[1:] ** n
@@ -238,6 +242,7 @@ def grid_kernel(psf: Psf, camera: CameraConfig, *steps: int) -> Kernel:
     places = 128
     while places > 4 and (places >= 14 * wanted or places * size > 3072):
         places //= 2
+    # The transform is periodic: wings need room beyond the image, or they fold back into it.
     room = min(size + 2 * int(np.ceil(blend.beyond_px())), 3072 // places)
     box = fft.next_fast_len(max(size, room), real=True)
     fx = fft.rfftfreq(places * box, 1 / places)[None, :]
@@ -245,6 +250,7 @@ def grid_kernel(psf: Psf, camera: CameraConfig, *steps: int) -> Kernel:
     otf = blend.otf(fx, fy, softening_px(wanted, 0.4 * places)) * np.sinc(fx) * np.sinc(fy)
     image = fft.irfft2(otf, s=(places * box,) * 2)
     pixel, place = np.arange(size) - half, np.arange(-1, places + 2)
+    # Sub-pixel sample of each pixel and position; the modulo wraps negative indices of the periodic image.
     pick = (pixel * places + places // 2 - place[:, None]) % (places * box)
     tables = np.maximum(image[pick[:, None, :, None], pick[None, :, None, :]], 0)  # clip the negative ringing
     return Kernel(0.0, NO_RADIAL, (tables / tables.sum(axis=(2, 3), keepdims=True)).astype(np.float32))

@@ -111,6 +111,7 @@ def measured(psf: MeasuredPsfConfig, camera: CameraConfig, fx: Floats, fy: Float
     """
     cells = cells_of(psf.file)
     x_px, y_px = cell_places_px(psf)
+    # The transform is separable: compute it on the distinct fx and fy, then spread it to all pairs.
     across, i = np.unique(fx, return_inverse=True)
     down, j = np.unique(fy, return_inverse=True)
     wave_x = np.exp(-2j * np.pi * np.outer(x_px, across)) * cell_response(across / psf.oversampling)

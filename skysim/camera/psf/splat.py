@@ -79,11 +79,13 @@ def add_round(
     """Add a round image seen by square pixels: T0(r) + T4(r) cos 4 theta + T8(r) cos 8 theta.
 
     radial (R, 3, 5 or 7): at r = i / PER_PX of T0 the value, the step to the next entry and Bessel's second
-    difference
-    (a parabola: linear interpolation would lose 1e-4 of a sharp image's light); then value and step of T4 / r^4 and
-    of T8 / r^8, where needed. With these powers the cosines are polynomials of u = dx^2, v = dy^2, r^4 cos 4 theta
-    = (u + v)^2 - 8 u v and r^8 cos 8 theta = 2 (r^4 cos 4 theta)^2 - r^8: no division, no trigonometry. Square
-    roots and polynomials run as SIMD over LANES pixels; only the table look-up runs pixel by pixel.
+    difference (a parabola: linear interpolation would lose 1e-4 of a sharp image's light); then value and step of
+    T4 / r^4 and of T8 / r^8, where needed. With these powers the cosines are polynomials of u = dx^2, v = dy^2,
+
+        r^4 cos 4 theta = (u + v)^2 - 8 u v,    r^8 cos 8 theta = 2 (r^4 cos 4 theta)^2 - r^8,
+
+    without division or trigonometry. Square roots and polynomials run as SIMD over LANES pixels; only the table
+    look-up runs pixel by pixel.
     """
     height, width = patch.shape
     reach = (radial.shape[0] - 2) / PER_PX
@@ -98,6 +100,7 @@ def add_round(
         u[i] = (left + i - x) ** 2
     for j in range(top, bottom):
         v = np.float32((j - y) ** 2)
+        # Only the pixels of this row that are within the circle of the image.
         half = sqrt(max(reach * reach - v, 0.0))
         # Unsigned: saves numba's check for negative indices.
         first = np.uint64(max(ceil(x - half) - left, 0))

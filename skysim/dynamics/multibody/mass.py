@@ -63,6 +63,7 @@ def declare_mass(bus: Any, model: Any, vehicle: VehicleConfig, path: Path) -> Ma
             f"vehicle.mass: {wanted.mass_kg:g} kg leaves nothing for the bus, which carries"
             f" {carried.mass_kg:g} kg ({path})"
         )
+    # The bus's own center follows from the first moments: total minus carried, over the bus's mass.
     place = (wanted.mass_kg * wanted.centre_m - carried.mass_kg * carried.centre_m) / mass
     whose = f"vehicle.inertia: less what the bus carries ({path}), its"
     give_inertial(bus, mass, place, inertia - carried.inertia_kg_m2 - parallel_axis(mass, place), whose)

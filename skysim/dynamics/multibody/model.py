@@ -118,6 +118,7 @@ def compose(vehicle: VehicleConfig, path: Path) -> tuple[Any, MassProperties]:
     spec.compiler.fusestatic = False  # keep bodies separate until the bearing is added
     bus = put_at_origin(spec, path)
     place_camera(spec, vehicle)
+    # Locking comes before the mass: a locked rotor is part of the rigid vehicle.
     locked = lock_unused(spec, vehicle, path)
     try:
         bare = compiled(spec, path)
@@ -129,6 +130,7 @@ def compose(vehicle: VehicleConfig, path: Path) -> tuple[Any, MassProperties]:
     except ValueError as error:  # a name is taken
         raise InputError(f"{path}: skysim adds its bearing under this name: {one_line(error)}") from error
     balanced = compiled(spec, path)
+    # Checked while the wheels are balanced, since `unbalance` changes the mass properties on purpose.
     check(balanced, mass, path)
     if vehicle.wheels:
         unbalance(balanced, joints(spec, WHEEL), vehicle.wheels, path)

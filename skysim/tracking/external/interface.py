@@ -173,7 +173,7 @@ def plain(value: Any) -> Any:
 
 
 def checked(answer: Any) -> Answer:
-    """Check an answer: shapes of arrays, a unit quaternion, a valid covariance. Raises ValueError."""
+    """Check an answer (shapes of arrays, quaternion, covariance) and normalize its quaternion. Raises ValueError."""
     if not isinstance(answer, Answer):
         raise ValueError(f"a {type(answer).__name__} is no Answer")
     status = printable(answer.status)[:MOST_TEXT] if isinstance(answer.status, str) else ""
