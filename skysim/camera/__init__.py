@@ -1,3 +1,1 @@
-"""Photons to digital numbers: optics, point-spread function, smear and the detector. Knows nothing of the
-vehicle.
-"""
+"""Photons to digital numbers: optics, point-spread function, smear and the detector. Independent of the vehicle."""

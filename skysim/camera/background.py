@@ -1,7 +1,7 @@
-"""Light that is no point: sky, Moon, stray light and leaks, as electrons a second in every pixel.
+"""Extended light: sky, Moon, stray light and light leaks, in electrons per second and pixel.
 
-An extended source fills the frame smoothly, so that it is worked out at nodes some tens of pixels apart and drawn
-between them (`fill`), in place of the zeros that a frame would begin with.
+Extended light varies smoothly over the frame, so it is computed at nodes some tens of pixels apart (`glow_map`) and
+interpolated between them (`fill`), which also initializes the frame.
 """
 
 from __future__ import annotations
@@ -25,17 +25,17 @@ from skysim.scene.light import Glow, MoonGlowConfig, SkyGlowConfig, StrayLightCo
 from skysim.sources.photometry import SUN, Band, sky_radiance_e_s_m2_sr, star_flux_e_s_m2
 
 NODE_PX = 32.0
-NODE_RAD = 1 / 40  # a node's spacing as an angle: cos^4 bends by less than 1e-3 between two of them
+NODE_RAD = 1 / 40  # largest node spacing: linear interpolation of cos^4 is within 1e-3
 NANOLAMBERT_V0 = 34.08 * math.exp(20.7233)  # brightness of V = 0 mag arcsec^-2 (KS91 eq. 1)
 MOON_RADIUS_DEG = 0.26
-LEAST_PST = 1e-30  # what a transmittance of 0 is for the logarithm: no electron comes of it
+LEAST_PST = 1e-30  # stands for a transmittance of 0 in the logarithm: gives no electrons
 
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """What M nodes of the chip look at, through the pixel that stands there.
+    """Viewing directions of M nodes of the chip.
 
-    toward_cam, toward_lab : (M, 3) unit vectors in camera and in lab axes (under the stars those of the ICRS)
+    toward_cam, toward_lab : (M, 3) unit vectors in camera and in lab axes (in star scenes those of the ICRS)
     boresight_lab  : (3,) unit vector
     field_rad      : (M,) angle from the boresight
     pixel_sr       : (M,) solid angle of the node's pixel; 1 / focal_px^2 on the axis
@@ -50,22 +50,22 @@ class View:
     band: Band
 
     def gathered_m2_sr(self) -> Floats:
-        """(M,) étendue of each node's pixel: radiance times this is the light that it gets.
+        """(M,) étendue of each node's pixel: electrons per second = radiance times this.
 
-        A slanting beam sees the pupil foreshortened by cos(field), and the pixel under a solid angle that falls
-        as cos^3: its distance grows as 1/cos, squared, and it is seen aslant. Together the law of illumination,
-        cos^4, times the vignetting. A distorting lens shares the sky out otherwise, and pixel_sr knows it.
+        The pupil is foreshortened by cos(field), and a pixel's solid angle falls as cos^3: its distance grows as
+        1/cos, squared, and it is inclined. Together with vignetting this is the cos^4 law of illumination.
+        Distortion changes the solid angle of the pixels, which pixel_sr includes.
         """
         return self.optics.collecting_m2 * self.optics.passed(np.cos(self.field_rad)) * self.pixel_sr
 
 
 def uniform(part: UniformGlowConfig, view: View) -> Floats:
-    """A leak of light that has seen no lens: the same in every pixel."""
+    """Light that reaches the chip past the lens (a leak): the same in every pixel."""
     return np.full(len(view.field_rad), float(part.e_s))
 
 
 def sky(part: SkyGlowConfig, view: View) -> Floats:
-    """The night sky's radiance, changing linearly with the angles along the image's axes, but never below zero."""
+    """Radiance of the night sky, linear in the angles along the image axes, and never below zero."""
     x, y, z = view.toward_cam.T
     slope = np.degrees(np.arctan2(x, z)) * part.gradient_per_deg[0]
     slope = slope + np.degrees(np.arctan2(y, z)) * part.gradient_per_deg[1]
@@ -74,9 +74,9 @@ def sky(part: SkyGlowConfig, view: View) -> Floats:
 
 
 def moon(part: MoonGlowConfig, view: View) -> Floats:
-    """Moonlight on the air, brighter near the Moon; its separation is every node's own, the air that of the boresight.
+    """Moonlight scattered by the air. Each node has its own angle to the Moon; the air mass is that of the boresight.
 
-    The model itself holds to 8-23 % (its authors), more than the air mass changes over a camera's field.
+    The model is accurate to 8-23 % (its authors), more than the air mass varies over a camera's field.
     """
     separation_deg = apart_deg(view.toward_lab, direction(part.ra_deg, part.dec_deg))
     nanolamberts = moonlight_nl(
@@ -97,7 +97,7 @@ def moonlight_nl(
     moon_zenith_deg: float,
     field_zenith_deg: float,
 ) -> Floats:
-    """Surface brightness in V of moonlight scattered once by the air, in nanolamberts; shape of separation_deg.
+    """V surface brightness of moonlight scattered once by the air, in nanolamberts; shape of separation_deg.
 
     B = f(rho) I 10^(-0.4 k X(Zm)) (1 - 10^(-0.4 k X(Z))), I = 10^(-0.4 (3.84 + 0.026 |a| + 4e-9 a^4)),
     X = (1 - 0.96 sin^2 Z)^-1/2 (Krisciunas & Schaefer 1991, PASP 103, 1033: eqs 3, 15, 20).
@@ -109,11 +109,11 @@ def moonlight_nl(
 
 
 def scattering(separation_deg: float | Floats) -> Floats:
-    """How much the air scatters by an angle: Rayleigh's molecules and, forwards, the aerosol (KS91 eqs 16-19).
+    """Scattering function of the air: Rayleigh (molecules) and Mie (aerosol, forward) (KS91 eqs 16-19).
 
-    f = 10^5.36 (1.06 + cos^2 rho) + the greater of 10^(6.15 - rho / 40) and 6.2e7 / rho^2. The paper changes from
-    one aerosol law to the other at 10 degrees, with a step of a quarter; the greater has none (they cross at 8.6).
-    Inside of the Moon's own disc it stays as at its edge.
+    f = 10^5.36 (1.06 + cos^2 rho) + the greater of 10^(6.15 - rho / 40) and 6.2e7 / rho^2. The paper switches
+    between the two aerosol laws at 10 degrees, where they differ by a quarter; the greater is continuous (they
+    cross at 8.6). Within the Moon's disc the value at its edge is used.
     """
     rho = np.maximum(np.asarray(separation_deg, dtype=float), MOON_RADIUS_DEG)
     molecules = 10**5.36 * (1.06 + np.cos(np.radians(rho)) ** 2)
@@ -121,15 +121,15 @@ def scattering(separation_deg: float | Floats) -> Floats:
 
 
 def air_mass(zenith_deg: float) -> float:
-    """Air along the line of sight over that at the zenith (KS91 eq. 3); 5 on the horizon."""
+    """Air mass along the line of sight relative to the zenith (KS91 eq. 3); 5 on the horizon."""
     return float((1 - 0.96 * math.sin(math.radians(zenith_deg)) ** 2) ** -0.5)
 
 
 def stray(part: StrayLightConfig, view: View) -> Floats:
-    """A bright body's irradiance before the lens times the point source transmittance: the same in every pixel.
+    """Stray light of a bright body: its irradiance before the lens times the point source transmittance, uniform.
 
-    The transmittance is of the lens and its baffle together, irradiance on the chip over irradiance before the
-    lens, at the body's angle from the boresight (`transmittance`). The body has the Sun's colours.
+    The transmittance is that of lens and baffle together: irradiance on the chip over irradiance before the lens at
+    the body's angle from the boresight (`transmittance`). The body has the Sun's color.
     """
     angle_deg = float(apart_deg(view.boresight_lab[None, :], direction(part.ra_deg, part.dec_deg))[0])
     irradiance = float(star_flux_e_s_m2(part.v_mag, *SUN, view.band))
@@ -138,11 +138,11 @@ def stray(part: StrayLightConfig, view: View) -> Floats:
 
 
 def transmittance(angle_deg: float, table_deg: Sequence[float], pst: Sequence[float]) -> float:
-    """A table over decades: its logarithm is linear between two rows, and beyond either end stays as there."""
+    """Interpolate the logarithm of a table linearly; constant beyond its ends."""
     return float(np.exp(np.interp(angle_deg, table_deg, np.log(np.maximum(pst, LEAST_PST)))))
 
 
-# What shines. A third kind is a class in light.py and a function here.
+# Radiance models by kind. To add one, add a class to scene/light.py and a function here.
 BACKGROUNDS: dict[str, Callable[[Any, View], Floats]] = {
     "uniform": uniform,
     "sky": sky,
@@ -158,16 +158,16 @@ def direction(ra_deg: float, dec_deg: float) -> Floats:
 
 
 def apart_deg(many: Floats, one: Floats) -> Floats:
-    """(M,) angles between (M, 3) unit vectors and another, exact for small ones too."""
+    """(M,) angles between (M, 3) unit vectors and one, accurate for small angles too (atan2)."""
     return np.degrees(np.arctan2(np.linalg.norm(np.cross(many, one), axis=-1), many @ one))
 
 
 def glow_map(parts: Sequence[Glow], optics: Optics, cam_from_lab: Rotation, band: Band) -> Floats:
-    """(h, w) electrons s^-1 px^-1 of all that glows, at nodes evenly spread over the chip with its edges among them.
+    """(h, w) electrons s^-1 px^-1 of all extended light, at nodes evenly spread over the chip up to its edges.
 
-    `fill` draws the frame from it, to 1e-3 of a map as smooth as these (test_background). A cusp is rounded off: that
-    of two_stops on the axis by up to 2 % within a node of it, and the Moon's own where it stands in the field.
-    Where nothing depends on the place, or nothing glows, there is one node.
+    `fill` interpolates the frame from it, to 1e-3 for maps as smooth as these (test_background). Cusps are smoothed:
+    that of two_stops on the axis by up to 2 % within a node of it, and that at the Moon if it is in the field.
+    One node is enough where no light depends on the position, or there is none.
     """
     if all(part.kind in ("uniform", "stray") for part in parts):
         (toward, pixel_sr), shape = look(np.array([optics.camera.centre_px]), optics), (1, 1)
@@ -182,13 +182,13 @@ def glow_map(parts: Sequence[Glow], optics: Optics, cam_from_lab: Rotation, band
 
 @lru_cache(maxsize=8)
 def look_of_nodes(optics: Optics) -> tuple[Floats, Floats, tuple[int, int]]:
-    """`look` at the nodes, and their (h, w): the same for every frame of a camera."""
+    """`look` at the nodes, and their (h, w); cached, since it depends only on the camera."""
     xy_px, shape = nodes_px(optics.camera)
     return *look(xy_px, optics), shape
 
 
 def nodes_px(camera: CameraConfig) -> tuple[Floats, tuple[int, int]]:
-    """(h * w, 2) places of the nodes, row by row, and (h, w)."""
+    """(h * w, 2) pixel positions of the nodes, row by row, and (h, w)."""
     spacing = min(NODE_PX, max(NODE_RAD * camera.focal_px, 1.0))
     w, h = (math.ceil((size - 1) / spacing) + 1 for size in (camera.width_px, camera.height_px))
     x, y = np.meshgrid(np.linspace(0, camera.width_px - 1, w), np.linspace(0, camera.height_px - 1, h))
@@ -196,9 +196,9 @@ def nodes_px(camera: CameraConfig) -> tuple[Floats, tuple[int, int]]:
 
 
 def look(xy_px: Floats, optics: Optics) -> tuple[Floats, Floats]:
-    """(M, 3) unit vectors in camera axes that the pixels at (M, 2) places look along, and (M,) their solid angles.
+    """Viewing directions (M, 3) in camera axes of pixels at (M, 2), and (M,) their solid angles.
 
-    A pixel's solid angle is that between its neighbours' middles: 1e-6 off where the lens bends as it does.
+    The solid angle is spanned by central differences of the directions one pixel to either side: error 1e-6.
     """
     across, down = (
         (unproject(xy_px + step, optics) - unproject(xy_px - step, optics)) / 2 for step in np.eye(2)
@@ -207,7 +207,7 @@ def look(xy_px: Floats, optics: Optics) -> tuple[Floats, Floats]:
 
 
 def view_of(toward: Floats, pixel_sr: Floats, optics: Optics, cam_from_lab: Rotation, band: Band) -> View:
-    """What is seen along such looks from a camera in this attitude."""
+    """The View of these directions for a camera in this attitude."""
     lab_from_cam = cam_from_lab.inv()
     return View(
         toward_cam=toward,
@@ -221,10 +221,10 @@ def view_of(toward: Floats, pixel_sr: Floats, optics: Optics, cam_from_lab: Rota
 
 
 def unproject(xy_px: Floats, optics: Optics) -> Floats:
-    """(M, 3) unit vectors in camera axes of (M, 2) pixels: `Optics.project` turned round.
+    """(M, 3) unit vectors in camera axes of (M, 2) pixels: the inverse of `Optics.project`.
 
-    The radial part by a table, the small tangential part by iteration. Pixels where barrel distortion has no image
-    left all look at its fold, and so under no solid angle.
+    The radial part is inverted by a table, the small tangential part by fixed-point iteration. Pixels that barrel
+    distortion leaves without light all map to its fold, and so have no solid angle.
     """
     camera = optics.camera
     plane = (xy_px - np.array(camera.centre_px)) / camera.focal_px
@@ -233,6 +233,7 @@ def unproject(xy_px: Floats, optics: Optics) -> Floats:
         image_r = r * radial(camera.distortion, r**2)
         wanted, aslant = plane, np.zeros_like(plane)
         for _ in range(10 if any(camera.distortion[2:4]) else 1):
+            # Remove the last estimate of the tangential part, then invert the radial part by the table.
             straight = wanted - aslant
             length = np.hypot(*straight.T)
             plane = straight * (np.interp(length, image_r, r) / np.maximum(length, 1e-300))[:, None]
@@ -242,10 +243,10 @@ def unproject(xy_px: Floats, optics: Optics) -> Floats:
 
 
 def fill(image: NDArray[Any], coarse: Floats, factor: float) -> None:
-    """Set an (H, W) frame, whatever it held, to coarse * factor, drawn bilinearly between the nodes (in place).
+    """Set an (H, W) frame, whatever it held, to coarse * factor, bilinear between the nodes (in place).
 
-    coarse : (h, w) at even spacing from the first pixel's middle to the last one's, as of `glow_map`; a single node
-             stands for the whole frame. image is float32 or float64, factor seconds for electrons.
+    coarse : (h, w) evenly spaced from the first pixel's center to the last one's, from `glow_map`; a single node
+             stands for the whole frame. image is float32 or float64; factor is the exposure in s for electrons.
     """
     if coarse.max() == coarse.min():
         _fill_flat(image, float(coarse[0, 0]) * factor)
@@ -261,12 +262,12 @@ def _fill_flat(image: NDArray[Any], value: float) -> None:
 
 @jit(parallel=True)
 def _fill_between(image: NDArray[Any], coarse: Floats) -> None:
-    """A row of nodes is drawn up for every row of pixels, and a straight line from node to node."""
+    """Interpolate along y for the nodes of each row of pixels, then linearly along x from node to node."""
     (height, width), (h, w) = image.shape, coarse.shape
     place = np.arange(width) * ((w - 1) / (width - 1))
     cell = np.minimum(place.astype(np.int64), w - 2)
     within = (place - cell).astype(image.dtype)
-    # Each cell's first pixel, and the end; unsigned, as a check for negative places keeps the loop from vectors.
+    # First pixel of each cell, and the end. Unsigned: numba's check for negative indices prevents vectorization.
     begin = np.searchsorted(cell, np.arange(w)).astype(np.uint64)
     for y in numba.prange(height):
         j = min(int(y * ((h - 1) / (height - 1))), h - 2)

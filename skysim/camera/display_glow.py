@@ -1,4 +1,4 @@
-"""Light of an LCD panel where it shows black, at every pixel of the camera."""
+"""Residual light of an LCD panel's black pixels, in every pixel of the camera."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ def black_glow(
     camera_m: Floats,
     band: Band,
 ) -> Floats | None:
-    """(H, W) electrons s^-1 px^-1 of a display's black pixels, 1 / contrast of white; None where nothing glows so.
+    """(H, W) electrons s^-1 px^-1 of a display's black pixels, 1 / contrast of white; None without such a display.
 
     camera_m : (3,) the entrance pupil in the lab
-    A pixel of the chip sees the display or not, by its middle; so sharp an edge, the movement in an exposure and the
-    rows' turns are left out.
+    A chip pixel sees the display or not, by the direction of its center. So the edge is sharp, and motion during the
+    exposure and the row times of a rolling shutter are left out.
     """
     screen = part.layout if isinstance(part, light.DomeConfig) else part
     if not isinstance(screen, leds.PixelsConfig) or not screen.contrast:
@@ -45,7 +45,7 @@ def black_glow(
 
 @lru_cache(maxsize=2)
 def look_of_all(optics: Optics) -> tuple[Floats, Floats]:
-    """Where every pixel of the chip looks, (H * W, 3) in camera axes, and its solid angle."""
+    """Viewing directions of all pixels of the chip, (H * W, 3) in camera axes, and their solid angles."""
     y, x = np.indices((optics.camera.height_px, optics.camera.width_px), dtype=float)
     return look(np.column_stack([x.ravel(), y.ravel()]), optics)
 
@@ -55,7 +55,7 @@ def panel_radiance_e_s_m2_sr(
 ) -> Floats:
     """(N,) radiance of a white panel, mean over a frame, towards the camera: L = I(theta) / (p^2 cos theta).
 
-    0 along (N, 3) looks that miss it. p is the pitch, I a white pixel's intensity by the LED's lobe.
+    0 for directions (N, 3) that miss it. p is the pitch, I a white pixel's intensity from the LED's lobe.
     """
     assert isinstance(part.layout, leds.LcdConfig)
     panel = glass(part.layout, build_surface(part.surface))
@@ -67,9 +67,9 @@ def panel_radiance_e_s_m2_sr(
 
 
 def bench_radiance_e_s_m2_sr(part: light.BenchConfig, toward_lab: Floats, band: Band) -> Floats:
-    """(N,) radiance behind the collimator of a white display: each pixel's light from (p / f)^2 cos^3 of a steradian.
+    """(N,) radiance behind the collimator of a white display; each pixel spans (p / f)^2 cos^3 steradian.
 
-    0 along (N, 3) looks past it.
+    0 for directions (N, 3) that miss it.
     """
     white_e_s_m2 = float(star_flux_e_s_m2(part.brightest_mag, *SUN, band)) / part.block**2
     up = np.maximum(toward_lab[:, 2], 1e-9)

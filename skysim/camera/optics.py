@@ -1,4 +1,4 @@
-"""The lens as it is: direction to pixel with distortion, and what of the light it lets through."""
+"""The lens: projection of directions to pixels with distortion, and throughput with vignetting."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from skysim.scene.camera import CameraConfig, TwoStopsConfig, VignettingTableCon
 
 
 def two_stops(part: TwoStopsConfig, field_rad: Floats) -> Floats:
-    """Share of the light that passes two equal round stops: the overlap of two circles, over a circle.
+    """Fraction of the light that passes two equal round stops: the overlap area of two circles, over a circle's.
 
     V = (2 / pi) (acos u - u sqrt(1 - u^2)), u = tan(field) / tan(cutoff): seen obliquely, one stop is displaced
     against the other by u diameters.
@@ -23,7 +23,7 @@ def two_stops(part: TwoStopsConfig, field_rad: Floats) -> Floats:
 
 
 def table(part: VignettingTableConfig, field_rad: Floats) -> Floats:
-    """Transmission as it was measured, linear between the angles and level beyond them."""
+    """Measured transmission, linear between the angles and constant beyond them."""
     return np.interp(np.degrees(field_rad), part.angle_deg, part.transmission)
 
 
@@ -32,12 +32,12 @@ VIGNETTING: dict[str, Callable[[Any, Floats], Floats]] = {"two_stops": two_stops
 
 @dataclass(frozen=True, slots=True)
 class Optics:
-    """A lens before a chip, in camera axes +x right, +y down, +z boresight.
+    """Lens and image geometry of a camera, in camera axes +x right, +y down, +z boresight.
 
     camera        : focal length, principal point, distortion, point-spread function
     collecting_m2 : entrance pupil's area times transmission
-    fold_r        : tangent of the field angle at which strong barrel distortion turns back: no image beyond
-    field_rad     : greatest angle from the boresight of anything on the chip
+    fold_r        : tangent of the field angle at which strong barrel distortion folds back: no image beyond
+    field_rad     : greatest field angle (from the boresight) on the chip
     """
 
     camera: CameraConfig
@@ -47,7 +47,7 @@ class Optics:
 
     @classmethod
     def of(cls, camera: CameraConfig) -> Optics:
-        """The optics that a scene's camera describes."""
+        """The optics of a scene's camera."""
         area_m2, turn = np.pi / 4 * camera.pupil_m**2, fold_r(camera.distortion)
         return cls(camera, float(area_m2 * camera.transmission), turn, field_rad(camera, turn))
 
@@ -70,8 +70,9 @@ class Optics:
         return x * stretch + across, y * stretch + down
 
     def passed(self, cos_field: Floats) -> Floats:
-        """Share of a point's light that the pupil takes in at an angle from the boresight: its foreshortening,
-        cos, and vignetting. Zero behind the camera. Any shape."""
+        """Cosine of the field angle (foreshortening of the pupil) times vignetting. Zero behind the
+        camera. Any shape.
+        """
         cosine = np.maximum(cos_field, 0)
         part = self.camera.vignetting
         if part is None:
@@ -80,20 +81,20 @@ class Optics:
 
 
 def radial(distortion: tuple[float, ...], r2: Floats) -> Floats:
-    """1 + k1 r^2 + k2 r^4 + k3 r^6 of k1, k2, p1, p2, k3 (OpenCV's order)."""
+    """Radial distortion factor 1 + k1 r^2 + k2 r^4 + k3 r^6 from k1, k2, p1, p2, k3 (OpenCV's order)."""
     k1, k2, _, _, k3 = distortion
     return 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
 
 
 def tangential(distortion: tuple[float, ...], x: Floats, y: Floats) -> tuple[Floats, Floats]:
-    """2 p1 x y + p2 (r^2 + 2 x^2) and p1 (r^2 + 2 y^2) + 2 p2 x y: what a lens element set askew adds to x and y."""
+    """Tangential (decentering) distortion: 2 p1 x y + p2 (r^2 + 2 x^2) and p1 (r^2 + 2 y^2) + 2 p2 x y."""
     p1, p2 = distortion[2:4]
     r2 = x**2 + y**2
     return 2 * p1 * x * y + p2 * (r2 + 2 * x**2), p1 * (r2 + 2 * y**2) + 2 * p2 * x * y
 
 
 def field_rad(camera: CameraConfig, fold_r: float) -> float:
-    """Angle from the boresight of the chip's farthest corner, distortion undone."""
+    """Field angle of the chip's farthest corner, with the radial distortion inverted."""
     corner = camera.corner_px / camera.focal_px
     r = np.linspace(0, min(fold_r, 20 * corner), 4001)
     return float(np.arctan(np.interp(corner, r * radial(camera.distortion, r**2), r)))
@@ -102,6 +103,6 @@ def field_rad(camera: CameraConfig, fold_r: float) -> float:
 def fold_r(distortion: tuple[float, ...]) -> float:
     """The least r at which r (1 + k1 r^2 + k2 r^4 + k3 r^6) stops growing; infinity if it always grows."""
     k1, k2, _, _, k3 = distortion
-    s = np.roots([1.0, 3 * k1, 5 * k2, 7 * k3])  # in 1 / r^2, as any of the coefficients may be nothing
+    s = np.roots([1.0, 3 * k1, 5 * k2, 7 * k3])  # polynomial in 1 / r^2: its leading coefficient is never 0
     turns = s.real[(abs(s.imag) < 1e-9 * (1 + abs(s.real))) & (s.real > 1e-12)]
     return float(1 / np.sqrt(turns.max())) if len(turns) else float("inf")

@@ -1,4 +1,14 @@
-"""Sources over an exposure to mean photo-electrons a pixel. Smear lives here: everything is one time integral."""
+"""Integrate the sources' images over an exposure to mean photo-electrons per pixel.
+
+A source's contribution to a pixel is a time integral over the exposure of its rate times its pixel-integrated image
+at its moving position. Smear by body rate, jitter, pulsed LEDs and rolling shutters are all part of this integral.
+
+1. `follow` projects every source at K even times of the exposure: positions in pixels and rates, as `Paths`.
+2. `images` (psf/kernel_cache.py) gives each source its pixel-integrated image and that image's sharpest feature.
+3. `draw` integrates each source on a patch of its own (`_integrate`): the exposure is cut into pieces in which the
+   image moves by less than STEP times that feature, and each piece is replaced by two points of light (a two-point
+   Gauss rule for steady light), added by psf/splat.py. The patches are then added to the frame.
+"""
 
 from __future__ import annotations
 
@@ -18,34 +28,34 @@ from skysim.core.jit import jit
 from skysim.core.types import Floats, Mount, Sources, SourceTruth, Trajectory
 from skysim.sources.dome.led import Emitter, irradiance_e_s_m2, lit_moments_s
 
-STEP = 1.3  # of the image's sharpest feature (its sigma): how far it may move in one piece of the exposure
+STEP = 1.3  # largest motion in one piece of the exposure, over the image's sharpest feature (sigma)
 MAX_PIECES = 100_000
-FEWEST, MOST = 9, 32_769  # poses of an exposure
-SHORT = 0.4  # strides up to which a path is one piece: 1e-4 of the peak
-STILL_PX = 1e-3  # an image that moves less stands still
-AT_ONCE = 1 << 20  # pixels of patches in one go, or as many as the frame has
+FEWEST, MOST = 9, 32_769  # number of poses in an exposure
+SHORT = 0.4  # path length, in steps, up to which one piece is enough: error 1e-4 of the peak
+STILL_PX = 1e-3  # an image that moves less is drawn as one point
+AT_ONCE = 1 << 20  # pixels of patches held in memory at once, or as many as the frame has
 
-Hides = Callable[[Sources], NDArray[np.bool_]]  # which of N sources something stands before, (N,)
+Hides = Callable[[Sources], NDArray[np.bool_]]  # (N,) which of N sources are occluded
 
 
 class Window(NamedTuple):
-    """When the chip gathers light: the first row from open_s for exposure_s, each next row row_time_s later."""
+    """Exposure interval: the first row from open_s for exposure_s, each next row row_time_s later."""
 
     open_s: float
     exposure_s: float
     row_time_s: float = 0.0
 
     def close_s(self, rows: int) -> float:
-        """When the last of so many rows is closed."""
+        """End of the last row's exposure for a chip of so many rows."""
         return self.open_s + self.exposure_s + self.row_time_s * (rows - 1)
 
     def middle_s(self, rows: int) -> float:
-        """Mid-exposure of the middle row, to which the frame's truth belongs."""
+        """Mid-exposure of the middle row, the time of the frame's truth."""
         return (self.open_s + self.close_s(rows)) / 2
 
 
 class Poses(NamedTuple):
-    """Where the camera stands at K times.
+    """The camera's pose at K times.
 
     cam_from_lab : (K, 3, 3) matrices
     camera_m     : (K, 3) entrance pupil in the lab
@@ -56,11 +66,11 @@ class Poses(NamedTuple):
 
 
 class Paths(NamedTuple):
-    """What every source does during the exposure, at K even moments: numba's side of the scene.
+    """Image position and rate of every source at K even times of the exposure, as arrays for numba.
 
-    first_s, step_s : the moments
-    xy_px  : (K, N, 2) where its image is, NaN where it has none
-    rate_e_s : (K, N) photo-electrons a second, if it is lit
+    first_s, step_s : the times
+    xy_px  : (K, N, 2) position of the image, NaN where it has none
+    rate_e_s : (K, N) photo-electrons a second while lit
     pulse_s  : (N, 3) period, start and duration of its pulses
     """
 
@@ -81,24 +91,28 @@ def render(
     emitter: Emitter | None = None,
     hides: Hides | None = None,
 ) -> SourceTruth:
-    """Add the mean photo-electrons of every source to the (H, W) image, in place; the truth of those that gave any.
+    """Add the mean photo-electrons of every source to the (H, W) image, in place; return the truth of those that
+    gave any.
 
-    Each image runs along its true path while it is lit. A piece of the exposure in which it moves by less than its
-    own blur is two points of light, placed where the light of that piece has its mean and variance (for steady
-    light Gauss's own two points). Energy and mean place are exact whatever the pulses, and a streak's profile
-    converges with the fourth power of the piece. In a rolling shutter every row has its own exposure.
+    Each image moves along its true path while it is lit. A piece of the exposure in which it moves by less than its
+    own blur is drawn as two points of light whose mean time and variance are those of the light in the piece (for
+    steady light the two-point Gauss rule). Total light and mean position are exact for any pulses, and the streak's
+    profile converges with the fourth power of the piece. In a rolling shutter every row has its own exposure.
     """
     rows = image.shape[0]
     t_s = moments(window.open_s, window.close_s(rows), trajectory)
     during = poses(trajectory, mount, t_s)
+    # Coarse selection with a few poses, before the sources are projected at all of them.
     near = sources.take(in_view(sources, optics, Poses(*(part[:: len(t_s) // 8] for part in during))))
     if hides:
         near = near.take(~hides(near))
     paths, distance_m, cos_in = follow(near, optics, during, t_s, emitter or Emitter())
     middle_px = paths.xy_px[len(t_s) // 2]
     shapes = images(optics.camera, middle_px, near.radius_m, near.place[:, 3] > 0, distance_m, cos_in)
+    # From here on sharp_px is the longest motion allowed in one piece.
     stride = shapes._replace(sharp_px=STEP * shapes.sharp_px)
     table = draw(image, paths, stride, window)
+    # Only sources that gave light to the chip are reported.
     kept = table[:, 0] > 0
     electrons, peak, x, y, squares, length = table[kept, :6].T
     return SourceTruth(
@@ -116,9 +130,9 @@ def render(
 
 
 def moments(open_s: float, close_s: float, trajectory: Trajectory) -> Floats:
-    """Even moments, as dense as the attitude's own samples; an odd number, so that one is in the middle.
+    """K even times over the exposure, as dense as the attitude's samples; K is odd, so that one is in the middle.
 
-    Raises InputError for more samples than memory should hold: to leave some out could leave out the jitter.
+    Raises InputError for more samples than memory should hold: dropping samples could drop the jitter.
     """
     first, last = np.searchsorted(trajectory.t_s, (open_s, close_s))
     count = max(int(last - first) + 1, FEWEST) | 1
@@ -131,7 +145,7 @@ def moments(open_s: float, close_s: float, trajectory: Trajectory) -> Floats:
 
 
 def poses(trajectory: Trajectory, mount: Mount, t_s: Floats) -> Poses:
-    """The camera's pose at K times."""
+    """The camera's poses at K times."""
     lab_from_body = trajectory.at(t_s).as_matrix()
     cam_from_lab = mount.cam_from_body.as_matrix() @ lab_from_body.transpose(0, 2, 1)
     return Poses(cam_from_lab, lab_from_body @ mount.camera_body_m)
@@ -140,7 +154,7 @@ def poses(trajectory: Trajectory, mount: Mount, t_s: Floats) -> Poses:
 def follow(
     sources: Sources, optics: Optics, poses: Poses, t_s: Floats, emitter: Emitter
 ) -> tuple[Paths, Floats, Floats]:
-    """The paths of N sources, their mean distances (N,) in m (1 for stars) and mean cosines from the boresight."""
+    """The paths of N sources, their mean distances (N,) in m (1 for stars) and mean field-angle cosines (N,)."""
     xy, distance_m, cos_out, cos_in = look(sources, optics, poses)
     passed = optics.passed(cos_in)
     rate = np.where(
@@ -154,7 +168,7 @@ def follow(
 
 
 def look(sources: Sources, optics: Optics, poses: Poses) -> tuple[Floats, Floats, Floats, Floats]:
-    """Where each of N sources is seen from each of K poses.
+    """Project N sources at each of K poses.
 
     Returns (K, N, 2) pixels, (K, N) distances in m (1 for stars), (K, N) cosines at the emitter and at the aperture.
     """
@@ -167,8 +181,11 @@ def look(sources: Sources, optics: Optics, poses: Poses) -> tuple[Floats, Floats
 
 
 def in_view(sources: Sources, optics: Optics, poses: Poses) -> NDArray[np.int64]:
-    """Rows of the sources within the field's circle from any of these poses, with a quarter more for images that
-    reach in from outside, and half of the largest turn between two poses for what passes between them."""
+    """Rows of the sources within a cone about the boresight at any of these poses.
+
+    The cone's half-angle is the field's circle, a quarter more for images that reach in from outside, and half of
+    the largest rotation between two poses for sources that cross the field between them.
+    """
     sight = np.ascontiguousarray(poses.cam_from_lab[:, 2])
     turn = np.arccos(np.clip(np.sum(sight[1:] * sight[:-1], axis=1), -1, 1)).max(initial=0.0)
     edge = math.cos(min(1.25 * optics.field_rad + 0.02 + turn / 2, math.pi))
@@ -177,7 +194,9 @@ def in_view(sources: Sources, optics: Optics, poses: Poses) -> NDArray[np.int64]
 
 @jit
 def _in_cone(place: Floats, sight: Floats, camera_m: Floats, edge: float) -> Any:
-    """(N,) whether a place's direction from any of K cameras has a cosine above `edge` with that one's sight."""
+    """(N,) whether a source's direction from any of K cameras is within the cone: cosine with the boresight
+    above `edge`.
+    """
     out = np.zeros(len(place), np.bool_)
     for n in range(len(place)):
         for k in range(len(sight)):
@@ -193,11 +212,11 @@ def _in_cone(place: Floats, sight: Floats, camera_m: Floats, edge: float) -> Any
 
 
 def draw(image: NDArray[Any], paths: Paths, shapes: Images, window: Window) -> Floats:
-    """Add every source to the image, some at a time, each first on a patch of its own.
+    """Draw every source on a patch of its own and add the patches to the image, as many at a time as memory allows.
 
-    Returns (N, 8): electrons that fell on the chip, those of the brightest pixel, flux-weighted mean x and y,
-    sum of the squares of the pixels, length of its path, and the brightest pixel's x and y. The mean is that of
-    the whole image, of the part on the chip alone in a rolling shutter, where no time is the same in all rows.
+    Returns (N, 8): electrons on the chip, those of the brightest pixel, flux-weighted mean x and y, sum of the
+    squared pixels, path length in pixels, and the brightest pixel's x and y. The mean is that of the whole image,
+    but in a rolling shutter of the part on the chip, since there each row has its own time.
     """
     boxes = patches(paths.xy_px, shapes.reach_px, image.shape)
     areas = (boxes[:, 1] - boxes[:, 0]) * (boxes[:, 3] - boxes[:, 2])
@@ -216,14 +235,16 @@ def draw(image: NDArray[Any], paths: Paths, shapes: Images, window: Window) -> F
 
 
 def patches(xy_px: Floats, reach_px: Floats, shape: tuple[int, ...]) -> NDArray[np.int64]:
-    """(N, 4) first and last + 1 column, first and last + 1 row that an image can touch; empty where it misses."""
+    """(N, 4) first and last + 1 column, first and last + 1 row that each image can reach; empty where it misses
+    the chip.
+    """
     if not xy_px.shape[1]:
         return np.zeros((0, 4), np.int64)
     hidden = np.isnan(xy_px)
     low = np.where(hidden, np.inf, xy_px).min(axis=0)
     high = np.where(hidden, -np.inf, xy_px).max(axis=0)
     jump = np.nan_to_num(np.abs(np.diff(xy_px, axis=0))).max(axis=0)
-    margin = reach_px[:, None] + 1 + jump / 4  # between two moments a curved path bulges
+    margin = reach_px[:, None] + 1 + jump / 4  # a curved path leaves the chord between two samples
     limit = np.array(shape[1::-1])
     begin = np.clip(np.floor(low - margin), 0, limit)
     end = np.clip(np.ceil(high + margin) + 1, begin, limit)
@@ -246,7 +267,8 @@ def _draw(
 def _expose(
     patch: Any, x0: int, y0: int, n: int, paths: Paths, shapes: Images, window: Window, row: Any
 ) -> None:
-    """One source on its patch; its light's mean place and its path's length into row[2:6]."""
+    """Integrate one source on its patch; write the light's mean position and the path length into row[2:6]."""
+    # Without a rolling shutter all rows share one integral; with it each row needs its own interval.
     whole = window.open_s + window.exposure_s
     row[5] = _length(paths, n, window.open_s, whole)
     if window.row_time_s == 0:
@@ -273,26 +295,32 @@ def _integrate(
     begin_s: float,
     end_s: float,
 ) -> Any:
-    """Add the light of one source from begin to end to the rows [row0, row1) of its patch.
+    """Add the light of one source from begin_s to end_s to the rows [row0, row1) of its patch.
+
+    The interval is cut into equal pieces short enough that the image moves by less than its blur in each. In a
+    piece the light has a duration `lit`, a mean time and a standard deviation `spread` (from the pulses). Two
+    points of half the light each at mean - spread and mean + spread reproduce these moments: for steady light
+    spread = length / (2 sqrt 3), which is the two-point Gauss-Legendre rule, with an error of the fourth order in
+    the length.
 
     Returns the electrons of the whole image and their first moments in x and y.
     """
     total, total_x, total_y = 0.0, 0.0, 0.0
     speed = _speed(paths, n, begin_s, end_s)
     strides = speed * (end_s - begin_s) / shapes.sharp_px[n]
-    # One more than the strides, for a short path has no other pieces to share its ends' error with.
+    # One piece more than the motion needs: in a short path the ends, where the error is largest, weigh more.
     pieces = 1 if strides < SHORT else int(min(np.ceil(strides) + 1, MAX_PIECES))
     for k in range(pieces):
         a = begin_s + (end_s - begin_s) * k / pieces
         b = begin_s + (end_s - begin_s) * (k + 1) / pieces
         lit, mean, spread = lit_moments_s(a, b, paths.pulse_s[n, 0], paths.pulse_s[n, 1], paths.pulse_s[n, 2])
-        if lit <= 0:
+        if lit <= 0:  # no pulse in this piece
             continue
         points = 1 if speed * spread < STILL_PX else 2
         for p in range(points):
             x, y, rate = _at(paths, n, mean + spread * (2 * p - points + 1))
             electrons = rate * lit / points
-            if not electrons > 0:
+            if not electrons > 0:  # no image here (NaN position), or faces away
                 continue
             _stamp(patch, row0, row1, x - x0, y - y0, electrons, n, shapes)
             total, total_x, total_y = total + electrons, total_x + electrons * x, total_y + electrons * y
@@ -303,7 +331,7 @@ def _integrate(
 def _stamp(
     patch: Any, row0: int, row1: int, x: float, y: float, electrons: float, n: int, shapes: Images
 ) -> None:
-    """The image of a point of light, by its kind."""
+    """Add the image of a point of light to the patch, by its kind of kernel."""
     begin, end, p, q = shapes.table[n]
     if shapes.kind[n] == GAUSS:
         add_gaussian(patch, row0, row1, x, y, electrons, shapes.sigma_px[n])
@@ -315,7 +343,7 @@ def _stamp(
 
 @jit
 def _at(paths: Paths, n: int, t_s: float) -> Any:
-    """Pixel and rate of a source at any time: cubic through the four moments around it (Lagrange)."""
+    """Position and rate of a source at any time, by the cubic (Lagrange) through the four nearest samples."""
     last = paths.xy_px.shape[0] - 4
     u = (t_s - paths.first_s) / paths.step_s
     k = min(max(int(u) - 1, 0), last)
@@ -333,7 +361,7 @@ def _at(paths: Paths, n: int, t_s: float) -> Any:
 
 @jit
 def _speed(paths: Paths, n: int, begin_s: float, end_s: float) -> float:
-    """The fastest that a source's image moves between two times, pixels a second."""
+    """The greatest speed of a source's image between two times, pixels a second."""
     first = max(int((begin_s - paths.first_s) / paths.step_s), 0)
     last = min(int(np.ceil((end_s - paths.first_s) / paths.step_s)), paths.xy_px.shape[0] - 1)
     fastest = 0.0
@@ -346,7 +374,7 @@ def _speed(paths: Paths, n: int, begin_s: float, end_s: float) -> float:
 
 @jit
 def _length(paths: Paths, n: int, begin_s: float, end_s: float) -> float:
-    """Length of a source's path between two times, pixels, in as many chords as there are moments."""
+    """Path length of a source's image between two times, pixels, as a sum of chords."""
     chords = max(int(np.ceil((end_s - begin_s) / paths.step_s)), 8)
     total = 0.0
     x, y, _ = _at(paths, n, begin_s)
@@ -360,7 +388,7 @@ def _length(paths: Paths, n: int, begin_s: float, end_s: float) -> float:
 
 @jit
 def _measure(patch: Any, x0: int, y0: int, row: Any) -> None:
-    """Sum, peak, sum of squares and the peak's pixel of a finished patch."""
+    """Sum, peak, sum of squares and brightest pixel of a finished patch."""
     for j in range(patch.shape[0]):
         for i in range(patch.shape[1]):
             e = patch[j, i]
@@ -372,7 +400,7 @@ def _measure(patch: Any, x0: int, y0: int, row: Any) -> None:
 
 @jit
 def _mean_place(patch: Any, x0: int, y0: int) -> Any:
-    """Centre of gravity of a patch; its corner if it is empty."""
+    """Center of gravity of a patch; its corner if it is empty."""
     total, x, y = 0.0, 0.0, 0.0
     for j in range(patch.shape[0]):
         for i in range(patch.shape[1]):
@@ -383,7 +411,7 @@ def _mean_place(patch: Any, x0: int, y0: int) -> Any:
 
 @jit
 def _deposit(image: Any, buffer: Any, starts: Any, boxes: Any) -> None:
-    """Add all patches to the image."""
+    """Add all patches to the image, one after another: patches overlap, so threads would collide."""
     for i in range(len(boxes)):
         x0, x1, y0, y1 = boxes[i]
         k, width = starts[i], x1 - x0

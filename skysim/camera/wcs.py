@@ -1,4 +1,4 @@
-"""Where on the sky a pixel looks, as FITS tells it: gnomonic projection, lens distortion as SIP polynomials."""
+"""World coordinate system of the frames for FITS: gnomonic projection, lens distortion as SIP polynomials."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from skysim.camera.optics import Optics
 from skysim.core.types import Floats
 from skysim.scene.camera import CameraConfig
 
-MAX_ORDER = 9  # SIP has no more
-ENOUGH_PX = 1e-4  # no higher order than this takes
-GOOD_PX = 0.01  # beyond which a user is told
+MAX_ORDER = 9  # the highest that SIP allows
+ENOUGH_PX = 1e-4  # error at which the order is high enough
+GOOD_PX = 0.01  # error above which a warning is given
 SIDE = 41  # points along each side of the field that the polynomials are fitted to; checked at three times as many
-MARGIN = 0.02  # of the chip's sides, beyond them, so that the edges are inside of what is fitted
+MARGIN = 0.02  # of the chip's sides: the fit extends beyond the edges by this
 
 Coefficients = dict[tuple[int, int], float]
 
@@ -27,8 +27,8 @@ Coefficients = dict[tuple[int, int], float]
 class Sip:
     """Distortion as polynomials about the principal point (Shupe et al. 2005), coefficients by powers (p, q).
 
-    a, b   : pixel offsets u, v as they are -> what is added for the offsets of a lens without distortion
-    ap, bp : the way back, which is the law of Brown (1971) itself, of no more than the seventh order
+    a, b   : from distorted pixel offsets u, v to what is added to get the undistorted offsets
+    ap, bp : the inverse, which is Brown's law (1971) itself, a polynomial of at most seventh order
     worst_px : the greatest error of a and b on the chip
     """
 
@@ -40,11 +40,11 @@ class Sip:
 
 
 def header(camera: CameraConfig, cam_from_icrs: Rotation) -> dict[str, Any]:
-    """TAN-SIP (TAN for a lens without distortion) of the true pointing (Calabretta & Greisen 2002; Shupe et al. 2005).
+    """TAN-SIP header (TAN without distortion) of the true pointing (Calabretta & Greisen 2002; Shupe et al. 2005).
 
     CD carries pixel offsets to degrees east (xi) and north (eta) of the tangent point; rows of the attitude
     matrix are the camera's axes in the ICRS, so its products with the local east and north are the CD's columns.
-    Axes are the ICRS's, directions apparent: where the light comes from, with aberration and all (`sky.apparent`).
+    Axes are the ICRS's; directions are apparent, aberration included (`sky.apparent`).
     """
     right, down, sight = cam_from_icrs.as_matrix()
     ra, dec = np.arctan2(sight[1], sight[0]), np.arcsin(np.clip(sight[2], -1, 1))
@@ -71,7 +71,7 @@ def header(camera: CameraConfig, cam_from_icrs: Rotation) -> dict[str, Any]:
 
 
 def keywords(lens: Sip) -> dict[str, Any]:
-    """The polynomials as keywords of a FITS header; SIPERR, not of the standard, is how wrong they are."""
+    """The polynomials as FITS keywords, with SIPERR (not in the standard), their greatest error in pixels."""
     told: dict[str, Any] = {"SIPERR": lens.worst_px}
     for name in ("A", "B", "AP", "BP"):
         table: Coefficients = getattr(lens, name.lower())
@@ -81,7 +81,7 @@ def keywords(lens: Sip) -> dict[str, Any]:
 
 
 def doubt(camera: CameraConfig) -> str:
-    """What is wrong with the WCS of this camera's frames; empty where nothing is."""
+    """A warning if the WCS of this camera's frames is inaccurate; else empty."""
     lens = sip(camera)
     if lens is None or lens.worst_px <= GOOD_PX:
         return ""
@@ -92,18 +92,22 @@ def doubt(camera: CameraConfig) -> str:
 
 
 def sip(camera: CameraConfig) -> Sip | None:
-    """The distortion of a camera as SIP; None where it has none, and where it keeps all light off the chip."""
+    """The camera's distortion as SIP; None without distortion, or if distortion keeps all light off the chip."""
     return fitted(camera) if any(camera.distortion) else None
 
 
 @lru_cache(maxsize=8)
 def fitted(camera: CameraConfig) -> Sip | None:
-    """Polynomials of the least order that is good enough, else of the best."""
+    """Fit polynomials of increasing order until one is within ENOUGH_PX; else return the most accurate.
+
+    The error is checked by a round trip on the chip: undistort by the polynomials, distort by the lens.
+    """
     straight, bent, lit = lattice(camera, SIDE)
     _, everywhere, on_chip = lattice(camera, 3 * SIDE)
     chip = everywhere[on_chip]
     if not lit.any():
         return None
+    # Offsets are scaled to 1, or the high powers would make the least squares ill-conditioned.
     scale, found = np.abs(bent).max(), []
     for order in range(2, MAX_ORDER + 1):
         powers = [(p, n - p) for n in range(2, order + 1) for p in range(n, -1, -1)]
@@ -126,8 +130,10 @@ def monomials(xy: Floats, powers: list[tuple[int, int]]) -> Floats:
 
 
 def lattice(camera: CameraConfig, side: int) -> tuple[Floats, Floats, NDArray[np.bool_]]:
-    """Offsets (N, 2) from the principal point, px, by a lens without distortion and by this one; (N,) which are on the
-    chip: the others lie a little beyond its edges, so that no edge is outside of what is fitted."""
+    """Offsets (N, 2) from the principal point, px, without and with distortion; (N,) which are on the chip.
+
+    The others are slightly beyond its edges, so that the fit does not extrapolate at an edge.
+    """
     centre, size = np.array(camera.centre_px), np.array([camera.width_px, camera.height_px])
     corner = camera.focal_px * np.tan(Optics.of(camera).field_rad)
     wider = max(corner / camera.corner_px, 1.0) * (1 + 2 * MARGIN)
@@ -146,15 +152,17 @@ def lattice(camera: CameraConfig, side: int) -> tuple[Floats, Floats, NDArray[np
 
 
 def distorted(straight: Floats, camera: CameraConfig) -> Floats:
-    """(N, 2) offsets from the principal point by a lens without distortion to those by this one, px; what lies beyond
-    the distortion's fold is far away."""
+    """Apply the lens's distortion to (N, 2) undistorted offsets from the principal point, px.
+
+    Points beyond the distortion's fold, which have no image, get a large offset.
+    """
     rays = np.column_stack([straight / camera.focal_px, np.ones(len(straight))])
     bent = Optics.of(camera).project(rays) - np.array(camera.centre_px)
     return np.where(np.isfinite(bent), bent, 1e9)
 
 
 def brown(camera: CameraConfig) -> tuple[Coefficients, Coefficients]:
-    """What distortion adds to the offsets of a straight lens, as polynomials in them: Brown's law, multiplied out.
+    """Brown's distortion as polynomials in the undistorted offsets, multiplied out.
 
     x (k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x y + p2 (3 x^2 + y^2), y likewise, with x = U / focal; r^2n by the binomial.
     """

@@ -1,3 +1,1 @@
-"""Torques to attitude: guidance, control, actuators, disturbances and the IMU. Only `multibody` imports
-MuJoCo.
-"""
+"""Torques to attitude: guidance, control, actuators, disturbances and the IMU. Only `multibody` imports MuJoCo."""

@@ -1,11 +1,12 @@
-"""The vehicle computer's side of wheels, fans and gyros: their geometry and what is commanded of them.
+"""Command laws of wheels, fans and control moment gyroscopes: torque on the body to actuator commands.
 
-MuJoCo turns the rotors. Here every vector is in body axes and a set's n members are the columns of (3, n). A torque
-asked for is one on the body; what the set stores changes by its opposite. What is stored also acts on a turning body,
-with -rate x h; that is none of the actuators' business: the controller asks for +rate x h on top of what it wants.
+MuJoCo simulates the rotors. Here every vector is in body axes and a set's n members are the columns of (3, n). A
+wanted torque is one on the body; the stored momentum changes by its opposite. Stored momentum also acts on a
+rotating body, with -rate x h; the actuators do not compensate this: the controller adds +rate x h to the torque it
+wants.
 
-The inertia that answers to the torque is that of the body without what its rotors have about their axles, which a
-motor's torque or a free axle leaves behind: J - sum inertia axle axle^T.
+The inertia that responds to the torque is that of the body without its rotors' inertia about their axles, which do
+not follow the body about these: J - sum inertia axle axle^T.
 """
 
 from __future__ import annotations
@@ -21,23 +22,23 @@ from skysim.core.jit import jit
 from skysim.core.types import Floats
 from skysim.scene.motion import DesaturationConfig
 
-# Generalised singularity-robust inverse and the weights of variable-speed CMGs: the sizes are `assumed`.
+# Generalized singularity-robust inverse and the weights of variable-speed CMGs: the sizes are `assumed`.
 DAMPING = 0.01  # lambda at a singularity, in units of the rotors' momentum squared
 DITHER = 0.01  # off-diagonal part of the damping
 DITHER_RAD_S = math.pi / 2
-FADING = 10.0  # how fast either dies away from a singularity: exp(-FADING det A A^T)
-DROPPED = 1e-6  # a direction in which a set is weaker than this part of its strongest one is given up
+FADING = 10.0  # decay of both away from a singularity: exp(-FADING det A A^T)
+DROPPED = 1e-6  # directions weaker than this fraction of the strongest get no torque
 
 
 @jit
 def within(command: Floats, limit: float) -> Floats:
-    """The command scaled as a whole, so that its direction is kept and no part of it exceeds the limit."""
+    """Scale a command as a whole, which keeps its direction, so that no element exceeds the limit."""
     peak = np.abs(command).max()
     return command * (limit / peak if peak > limit else 1.0)
 
 
 def unit_columns(axes: Floats, name: str) -> Floats:
-    """(3, n) floats; raises InputError where they are none, or not unit vectors."""
+    """(3, n) floats; raises InputError unless they are unit vectors."""
     columns = np.ascontiguousarray(axes, dtype=float)  # one layout, or numba compiles for each
     if columns.ndim != 2 or len(columns) != 3 or not columns.size:
         raise InputError(f"{name}: shape {columns.shape}; allowed: (3, n), a column for each")
@@ -48,7 +49,7 @@ def unit_columns(axes: Floats, name: str) -> Floats:
 
 
 def of_each(value: Floats, n: int, name: str) -> Floats:
-    """(n,) positive floats; raises InputError where they are not."""
+    """(n,) positive floats; raises InputError otherwise."""
     each = np.asarray(value, dtype=float)
     if each.shape != (n,) or not np.all(each > 0):
         raise InputError(f"{name}: {each.tolist()}; allowed: {n} positive numbers")
@@ -57,12 +58,12 @@ def of_each(value: Floats, n: int, name: str) -> Floats:
 
 @dataclass(frozen=True, slots=True)
 class WheelSet:
-    """Reaction wheels: a motor's torque on its wheel pushes the body the other way, T = -sum axis u.
+    """Reaction wheels: a motor's torque on its wheel acts oppositely on the body, T = -sum axis u.
 
     axes : (3, n) unit vectors; a positive speed is right-handed about them
     inertia_kg_m2 : (n,) of each wheel about its axle
     speed_limit_rad_s : relative to the body
-    Raises InputError (one line) for axes that are no unit vectors and inertias that are not positive.
+    Raises InputError (one line) for axes that are not unit vectors and inertias that are not positive.
     """
 
     axes: Floats
@@ -83,14 +84,15 @@ class WheelSet:
         return self.axes @ (self.inertia_kg_m2 * speed_rad_s)
 
     def drive(self, torque_nm: Floats, speed_rad_s: Floats, period_s: float) -> Floats:
-        """Motor torques (n,) on the wheels that push the body with torque_nm (3,) for the next period_s.
+        """Motor torques (n,) on the wheels that give torque_nm (3,) on the body for the next period_s.
 
-        The smallest ones that do; where the axes do not span space (n < 3, or all in a plane), those that come
-        nearest in least squares. Beyond the torque limit all are scaled together and the direction is kept. A
-        torque that would carry a wheel beyond its speed limit is then cut to what just reaches it (I d(speed)/dt
-        = u, the body's own acceleration left out): a wheel at its limit can only be braked, and the direction is
-        lost.
+        The smallest ones that do; if the axes do not span space (n < 3, or all in a plane), those nearest in
+        least squares.
+        Beyond the torque limit all are scaled together, which keeps the direction. A torque that would carry a wheel
+        beyond its speed limit is then reduced to what just reaches it (I d(speed)/dt = u, without the body's own
+        acceleration): a wheel at its limit can only be braked, and the direction is not kept.
         """
+        # Scaling keeps the torque's direction; the clip to the speed limits afterwards may change it.
         motor = within(self.motor_from_torque @ torque_nm, self.torque_limit_nm)
         torque_s = self.inertia_kg_m2 / period_s
         most = np.maximum(torque_s * (self.speed_limit_rad_s - speed_rad_s), 0.0)
@@ -100,11 +102,11 @@ class WheelSet:
 
 @dataclass(frozen=True, slots=True)
 class FanSet:
-    """Fans: a thrust at a place off the bearing's centre turns the vehicle, T = sum place x direction thrust.
+    """Fans: a thrust off the bearing's center rotates the vehicle, T = sum place x direction thrust.
 
     force_axes : (3, n) unit vectors along which a positive thrust pushes the body
-    places_m   : (3, n) from the centre of rotation
-    Raises InputError (one line) for axes that are no unit vectors and places of another shape.
+    places_m   : (3, n) from the center of rotation
+    Raises InputError (one line) for axes that are not unit vectors and places of another shape.
     """
 
     force_axes: Floats
@@ -126,17 +128,18 @@ class FanSet:
         return self.arms_m @ thrust_n
 
     def drive(self, torque_nm: Floats) -> Floats:
-        """Thrusts (n,), the smallest that make the torque (3,), or come nearest to it in least squares.
+        """Thrusts (n,), the smallest that give the torque (3,), or the nearest to it in least squares.
 
-        Beyond the limit all are scaled together and the direction is kept. A fan blows either way. What they
-        push with besides turning is the bearing's to carry.
+        Beyond the limit all are scaled together, which keeps the direction. Each fan can blow either way. The
+        bearing
+        takes the net force.
         """
         return within(self.thrust_from_torque @ torque_nm, self.thrust_limit_n)
 
 
 @jit
 def solve(gram: Floats, wanted: Floats) -> Floats:
-    """x of gram x = wanted for a symmetric (3, 3) without negative eigenvalues; singular directions are given up."""
+    """x of gram x = wanted for a symmetric positive semidefinite (3, 3); singular directions get zero."""
     value, vector = np.linalg.eigh(gram)
     x = np.zeros(3)
     for k in range(3):
@@ -147,7 +150,7 @@ def solve(gram: Floats, wanted: Floats) -> Floats:
 
 @jit
 def determinant(m: Floats) -> float:
-    """Of A A^T (3, 3), which rounding alone makes negative; np.linalg.det takes several times as long."""
+    """Determinant of A A^T (3, 3), clipped at zero against rounding; np.linalg.det takes several times as long."""
     by_a = m[1, 1] * m[2, 2] - m[1, 2] * m[2, 1]
     by_b = m[1, 0] * m[2, 2] - m[1, 2] * m[2, 0]
     by_c = m[1, 0] * m[2, 1] - m[1, 1] * m[2, 0]
@@ -156,21 +159,21 @@ def determinant(m: Floats) -> float:
 
 @jit
 def pseudo_inverse(jacobian_unit: Floats, wanted: Floats, t_s: float) -> Floats:
-    """The smallest gimbal rates that change the momentum as wanted, A^T (A A^T)^-1 dh/dt: blind to singularities.
+    """The smallest gimbal rates that change the momentum as wanted, A^T (A A^T)^-1 dh/dt; no singularity avoidance.
 
-    Rates grow without bound towards a singularity, and into one is where they lead.
+    The rates grow without bound near a singularity, and this law tends to steer into one.
     """
     return jacobian_unit.T @ solve(jacobian_unit @ jacobian_unit.T, wanted)
 
 
 @jit
 def singularity_robust(jacobian_unit: Floats, wanted: Floats, t_s: float) -> Floats:
-    """Gimbal rates by the generalised singularity-robust inverse: A^T (A A^T + lambda E)^-1 dh/dt.
+    """Gimbal rates by the generalized singularity-robust inverse: A^T (A A^T + lambda E)^-1 dh/dt.
 
-    Near a singularity lambda = 0.01 exp(-10 det A A^T) keeps the rates bounded, at the price of a torque that is
-    not quite the one asked for. The off-diagonal elements e_i = 0.01 sin(pi t / 2 + phase_i) of the matrix E, of
-    unit diagonal, see to it that a torque along the singular direction moves the gimbals sideways and so out. Wie,
-    Bailey & Heiberg 2001, J. Guidance, Control, and Dynamics 24 (5), 865; the numbers are `assumed`.
+    Near a singularity lambda = 0.01 exp(-10 det A A^T) keeps the rates bounded, at the price of an error in the
+    torque. The off-diagonal elements e_i = 0.01 sin(pi t / 2 + phase_i) of the matrix E, of unit diagonal, move the
+    gimbals sideways for a torque along the singular direction, and so out of the singularity. Wie, Bailey & Heiberg
+    2001, J. Guidance, Control, and Dynamics 24 (5), 865; the numbers are `assumed`.
     """
     gram = jacobian_unit @ jacobian_unit.T
     damping = DAMPING * math.exp(-FADING * determinant(gram))
@@ -178,7 +181,7 @@ def singularity_robust(jacobian_unit: Floats, wanted: Floats, t_s: float) -> Flo
         dither = damping * DITHER * math.sin(DITHER_RAD_S * t_s + phase)
         gram[row, column] += dither
         gram[column, row] += dither
-        gram[row, row] += damping / 2  # each row comes twice
+        gram[row, row] += damping / 2  # each row is visited twice
         gram[column, column] += damping / 2
     return jacobian_unit.T @ solve(gram, wanted)
 
@@ -192,7 +195,7 @@ STEERING: dict[str, Callable[[Floats, Floats, float], Floats]] = {
 
 @jit
 def turned(spin_axes: Floats, cross_axes: Floats, angle_rad: Floats) -> tuple[Floats, Floats]:
-    """Where the axles (3, n) of the rotors point, s cos + t sin, and the derivative (3, n) by the gimbal angles."""
+    """Rotor axles (3, n) at the gimbal angles, s cos + t sin, and their derivative (3, n) by the gimbal angles."""
     cosine, sine = np.cos(angle_rad), np.sin(angle_rad)
     return spin_axes * cosine + cross_axes * sine, cross_axes * cosine - spin_axes * sine
 
@@ -201,16 +204,17 @@ def turned(spin_axes: Floats, cross_axes: Floats, angle_rad: Floats) -> tuple[Fl
 def shared(
     axle: Floats, jacobian: Floats, unit_nms: float, wanted_nm: Floats, rate_limit: float, torque_limit: float
 ) -> tuple[Floats, Floats]:
-    """Variable-speed CMGs: gimbals and rotors share dh/dt (3,), the rotors where the gimbals are singular.
+    """Variable-speed CMGs: gimbals and rotors share dh/dt (3,), with the rotors active near gimbal singularities.
 
-    The exact solution that is smallest in the weighted norm: gimbal rates in units of their limit, rotor torques in
+    The exact solution that is smallest in a weighted norm: gimbal rates in units of their limit, rotor torques in
     units of theirs times exp(-5 det A A^T) (A of unit rotor momentum), which keeps the rotors idle away from
     singularities. Beyond a limit all are scaled together. Schaub, Vadali & Junkins 1998, J. Astronautical Sciences
-    46 (3); to weigh by what each can give is our own, the number is `assumed`.
+    46 (3); weighting by the limits is our own choice, the number is `assumed`.
     """
     gram = jacobian @ jacobian.T
     clear = determinant(gram) / unit_nms**6 if unit_nms > 0 else 0.0
     gimbals, rotors = rate_limit**2, torque_limit**2 * math.exp(-FADING * clear)
+    # Weighted minimum norm: x = W B^T (B W B^T)^-1 dh/dt with B = [jacobian, axle] and W = diag(limits^2).
     effort = solve(gimbals * gram + rotors * (axle @ axle.T), wanted_nm)
     rate, torque = gimbals * (jacobian.T @ effort), rotors * (axle.T @ effort)
     scale = 1 / max(1.0, np.abs(rate).max() / rate_limit, np.abs(torque).max() / torque_limit)
@@ -219,7 +223,7 @@ def shared(
 
 @dataclass(frozen=True, slots=True)
 class CmgSet:
-    """Control moment gyroscopes: turning a spinning rotor's axle takes, and gives back, the torque d(angle)/dt x h.
+    """Control moment gyroscopes: rotating a spinning rotor's axle gives the torque d(angle)/dt x h.
 
     gimbal_axes, spin_axes : (3, n) unit vectors at right angles; the rotor's axle at gimbal angle zero
     rotor_inertia_kg_m2    : (n,) of each rotor about its axle
@@ -227,8 +231,8 @@ class CmgSet:
     steering               : a key of STEERING, which variable-speed CMGs do not use
 
     A rotor's axle points along s cos(angle) + g x s sin(angle), g the gimbal's and s the spin axis. The torque of
-    accelerating a gimbal about its own axis is left out. Raises InputError (one line) for axes that are none, are not
-    at right angles, or a steering that is not known.
+    accelerating a gimbal about its own axis is left out. Raises InputError (one line) for axes that are not unit
+    vectors or not at right angles, and for an unknown steering law.
     """
 
     gimbal_axes: Floats
@@ -263,10 +267,10 @@ class CmgSet:
         return across * (self.rotor_inertia_kg_m2 * rotor_rad_s)
 
     def manipulability(self, angle_rad: Floats, rotor_rad_s: Floats) -> Floats:
-        """How far from a singularity: 1 where a torque is as easy in every direction, 0 where one has none.
+        """Distance from singularity: 1 if torque is equally easy in every direction, 0 if a direction has none.
 
-        sqrt(det A A^T) over its greatest value for a trace of the same size, (sum h^2 / 3)^1.5, which depends
-        neither on the rotors' size nor on their number. 0 with the rotors at rest. (..., n) -> (...).
+        sqrt(det A A^T) over its greatest value for the same trace, (sum h^2 / 3)^1.5, which is independent of the
+        rotors' size and number. 0 with the rotors at rest. (..., n) -> (...).
         """
         angle, spin = np.asarray(angle_rad)[..., None, :], np.asarray(rotor_rad_s)[..., None, :]
         across = self.cross_axes * np.cos(angle) - self.spin_axes * np.sin(angle)
@@ -283,16 +287,18 @@ class CmgSet:
         rotor_rad_s: Floats,
         t_s: float,
     ) -> tuple[Floats, Floats]:
-        """Gimbal rates (n,) and motor torques (n,) on the rotors that push the body with torque_nm (3,).
+        """Gimbal rates (n,) and motor torques (n,) on the rotors that give torque_nm (3,) on the body.
 
-        torque on the body = -A d(angle)/dt - sum axle u, with A from the rotors' spin in inertial space, their
-        speed plus the body's rate along the axle, which is what a gimbal turns. The body also feels -rate x h: the
-        controller's feed-forward has to hold +rate x h ready in torque_nm, it is not added here.
+        torque on the body = -A d(angle)/dt - sum axle u, with A from the rotors' inertial spin, which is their
+        speed plus the body's rate along the axle. The body also feels -rate x h: the controller's feed-forward has
+        to include +rate x h in torque_nm, it is not added here.
 
-        Rotors that are left to spin get no torque. Beyond a limit everything is scaled together: the direction of
-        the torque is kept.
+        Without a rotor torque limit the rotors get no torque. Beyond a limit everything is scaled together, which
+        keeps the torque's direction.
         """
         axle, across = turned(self.spin_axes, self.cross_axes, angle_rad)
+        # A gimbal rotates the rotor's inertial angular momentum, which includes the body's rate along the
+        # axle.
         spin_nms = self.rotor_inertia_kg_m2 * (rotor_rad_s + rate_body_rad_s @ axle)
         jacobian = across * spin_nms
         unit_nms = float(np.abs(spin_nms).mean())
@@ -307,10 +313,10 @@ class CmgSet:
 
 @dataclass(slots=True)
 class Desaturator:
-    """The fans' torque takes momentum out of wheels or CMGs: -h / time, once h has grown too large.
+    """Momentum dumping by fans: torque -h / time on the body, once the stored momentum h exceeds a threshold.
 
-    The actuators hold h. A torque -h / time from outside would turn the body; the controller, which keeps it still,
-    lets the wheels take it up, and what they hold dies away as exp(-t / time). Stateful: one flight each.
+    The controller holds the body still against this torque, so that the wheels or CMGs absorb it and h decays as
+    exp(-t / time). Stateful: one motion each.
     """
 
     part: DesaturationConfig

@@ -1,4 +1,4 @@
-"""The attitude controller: what torque the vehicle is to be given. Knows neither simulator nor actuators."""
+"""The attitude control law: the torque wanted on the vehicle. Independent of the simulator and the actuators."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from skysim.core.types import Floats
 from skysim.dynamics.guidance import Reference
 from skysim.scene.motion import ControlConfig
 
-SHORT = 0.01  # who gives less by more than this is at a limit; by less, a steering law damps its singularity
+SHORT = 0.01  # relative torque deficit that counts as a limit; damped steering gives smaller ones
 
 
 @dataclass(slots=True)
@@ -23,17 +23,18 @@ class Pid:
 
         torque = J (alpha_ref - kp e - ki int(e) - kd (w - w_ref)) + w x (J w + h)
 
-    so long as the vehicle can give it. What e and its integral ask for is limited as a whole to kd times the rate
+    The proportional and integral terms together are limited to kd times the rate
 
         w_most = min(rate limit, sqrt(a |e|)),    a = authority / greatest moment of inertia,
 
-    at which half of the authority still brakes within the angle |e| (cascade saturation: Wie & Lu 1995, J. Guidance
-    18, 1372; its variable limit: Wie, Bailey & Heiberg 2002, J. Guidance 25, 96; both `assumed`). Without it a far or
-    fast vehicle is driven from one limit of the torque to the other and never comes to rest.
+    from which half of the authority still brakes within the angle |e| (cascade saturation: Wie & Lu 1995, J.
+    Guidance 18, 1372; its variable limit: Wie, Bailey & Heiberg 2002, J. Guidance 25, 96; both `assumed`). Without
+    this limit a large error or rate drives the torque from one limit to the other and the vehicle never comes to
+    rest.
 
     Here e is the rotation vector of ref_from_body and h the momentum stored in wheels or CMGs. The feed-forward
-    J alpha + w x (J w + h) is Euler's equation, so that the feedback has only the disturbances to fight. Rates and
-    torques are in body axes; J is (3, 3). Stateful: one flight each. ki = 0 is a PD controller.
+    J alpha + w x (J w + h) is Euler's equation, so that the feedback only has to reject disturbances. Rates and
+    torques are in body axes; J is (3, 3). Stateful: one motion each. ki = 0 is a PD controller.
     """
 
     reference: Reference
@@ -63,10 +64,10 @@ class Pid:
         return torque_nm
 
     def learn(self, wanted_nm: Floats, given_nm: Floats, period_s: float) -> None:
-        """Add the error to the integral, but not on an axis where less was given than wanted (anti-windup).
+        """Integrate the error, except on axes that got less torque than wanted (anti-windup), and not while limited.
 
-        Nor anywhere while what the error asks for is limited. A positive error asks for a negative torque: it does
-        count on an axis that is stuck at the positive limit.
+        A positive error asks for a negative torque, so on an axis stuck at the positive limit a positive
+        error still counts.
         """
         if not self.limited:
             add_unless_short(self.error_sum_rad_s, self.error_rad, wanted_nm, given_nm, period_s)
@@ -81,18 +82,19 @@ def law(
     momentum: Floats,
     gains: tuple[float, float, float, float, float],
 ) -> tuple[Floats, Floats, bool]:
-    """Error and torque, (3,) each, of Pid's equation, and whether it was limited; compiled, asked at every tick."""
+    """Error and torque, (3,) each, of Pid's equation, and whether it was limited; compiled, called every period."""
     lab_from_ref, rate_ref, accel_ref = reference
     lab_from_body, rate = present
     kp, ki, kd, authority, fastest = gains
     body_from_ref = multiply(inverse(lab_from_body), lab_from_ref)
+    # e is the rotation vector of ref_from_body, the inverse of body_from_ref.
     error = -to_rotvec(body_from_ref)
     lag = rate - apply(body_from_ref, rate_ref)
     pull = kp * error + ki * error_sum
     size = math.sqrt((pull**2).sum())
     far = math.sqrt((error**2).sum())
     most = kd * min(fastest, math.sqrt(authority / max(inertia[0, 0], inertia[1, 1], inertia[2, 2]) * far))
-    # A small error stays with the integral, which alone holds against a constant torque.
+    # Small errors are not limited: there the integral must be free to balance a constant torque.
     limited = size > most and kp * far > most
     if limited:
         pull = pull * (most / size)
@@ -104,6 +106,7 @@ def law(
 def add_unless_short(total: Floats, error: Floats, wanted: Floats, given: Floats, period_s: float) -> None:
     """`Pid.learn`, in place."""
     for i in range(3):
+        # Anti-windup: do not integrate further into a limit, but do integrate out of it.
         short = abs(given[i]) < abs(wanted[i]) * (1 - SHORT)
         if not short or error[i] * wanted[i] > 0:
             total[i] += error[i] * period_s
@@ -119,9 +122,9 @@ def controller(
     """A controller with its poles placed: the error obeys (s^2 + 2 z b s + b^2)(s + p) = 0 on each axis.
 
     inertia_kg_m2 : (3,) principal moments or (3, 3) tensor about the bearing, in body axes
-    authority_nm  : the torque that the actuators have in every direction; rate_limit_rad_s : the fastest turn back
-    Bandwidth b and damping z are those of the attitude loop; p, integral_rad_s, is the pole that takes away what a
-    constant torque, such as an unbalanced bearing's, would leave; law pd is p = 0, and leaves torque / (J b^2). The
+    authority_nm  : torque available in every direction; rate_limit_rad_s : greatest return rate
+    Bandwidth b and damping z are those of the attitude loop; p, integral_rad_s, is the pole that removes the steady
+    error of a constant torque, such as an unbalanced bearing's; law pd is p = 0, and leaves torque / (J b^2). The
     defaults settle in some 5 s, slow enough for a control period of 10 ms (b x period = 0.03).
     """
     part = part or ControlConfig()

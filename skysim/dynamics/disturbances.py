@@ -1,4 +1,8 @@
-"""Torques that nobody asked for: the bearing's jets, the turning Earth, the room's air, a knock."""
+"""Disturbance torques: bearing turbine torque, Earth rotation, air currents, impulses.
+
+The cable's spring and the air drag depend on the state within a step and are part of the MuJoCo model
+(multibody/model.py), not of this module.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +24,7 @@ from skysim.scene.vehicle import DisturbancesConfig, DraughtConfig
 def earth_torque_nm(
     inertia_kg_m2: Floats, momentum_nms: Floats, rate_body_rad_s: Floats, earth_body_rad_s: Floats
 ) -> Floats:
-    """(3,) what a vehicle feels in a lab that turns with the Earth, in body axes, as if the lab stood still.
+    """(3,) apparent torque of the Earth's rotation on a vehicle in the lab, in body axes.
 
     With the body's rate w in the lab, the Earth's rate W in body axes (dW/dt = -w x W there), the inertia J and the
     rotors' momentum h in the body, Euler's equation J (w + W)' + h' + (w + W) x (J (w + W) + h) = T is that of a lab
@@ -28,7 +32,7 @@ def earth_torque_nm(
 
         T_earth = J (w x W) - w x J W - W x (J w + J W + h).
 
-    All in body axes, (3,) and (3, 3). The plumb line is taken for gravity, as a lab does.
+    All in body axes, (3,) and (3, 3). Gravity is along the plumb line.
     """
     turning = times(inertia_kg_m2, earth_body_rad_s)
     whole = times(inertia_kg_m2, rate_body_rad_s) + turning + momentum_nms
@@ -46,7 +50,8 @@ def steady(
     inertia_kg_m2: Floats,
     present: tuple[Floats, Floats, Floats],
 ) -> Floats:
-    """(3,) body torque of one that stands still in the lab and of the Earth's turning; compiled, for every tick.
+    """(3,) body torque of a torque constant in the lab plus the Earth's rotation; compiled, called every control
+    period.
 
     present : lab_from_body_wxyz (4,), the body's rate (3,) and the rotors' momentum (3,)
     """
@@ -57,10 +62,10 @@ def steady(
 
 
 class Gusts:
-    """The room's air: an Ornstein-Uhlenbeck torque about each lab axis, (3,) at every tick.
+    """Air currents: an Ornstein-Uhlenbeck torque about each lab axis, (3,) at every control period.
 
-    Exact at ticks a period apart: T' = a T + sqrt(1 - a^2) rms N(0, 1), a = exp(-period / correlation time), started
-    in its stationary distribution. Its autocorrelation is rms^2 exp(-|lag| / correlation time).
+    Exact for samples a period apart: T' = a T + sqrt(1 - a^2) rms N(0, 1), a = exp(-period / correlation time),
+    started in its stationary distribution. Its autocorrelation is rms^2 exp(-|lag| / correlation time).
     """
 
     def __init__(self, part: DraughtConfig, period_s: float, rng: np.random.Generator) -> None:
@@ -70,7 +75,7 @@ class Gusts:
         self.torque_nm = self.rms_nm * rng.standard_normal(3)
 
     def next(self) -> Floats:
-        """The torque of this tick, in lab axes."""
+        """The torque of this control period, in lab axes; draw the next."""
         now = self.torque_nm
         fresh = math.sqrt(1 - self.keeps**2) * self.rms_nm * self.rng.standard_normal(3)
         self.torque_nm = self.keeps * now + fresh
@@ -79,12 +84,12 @@ class Gusts:
 
 @dataclass(slots=True)
 class DisturbanceModel:
-    """All that disturbs a vehicle, tick by tick. Stateful: one flight each.
+    """The disturbances of a vehicle, period by period. Stateful: one motion each.
 
     turbine_lab_nm   : (3,) constant
-    earth_lab_rad_s  : (3,) the Earth's rate, zeros where it does not count
-    gusts            : None where the air is still
-    knocks           : the bumps
+    earth_lab_rad_s  : (3,) the Earth's rate, zeros where it is off
+    gusts            : air currents, or None
+    knocks           : impulses
     inertia_kg_m2    : (3, 3) about the bearing, in body axes
     """
 
@@ -104,7 +109,7 @@ class DisturbanceModel:
         period_s: float,
         rng: np.random.Generator,
     ) -> DisturbanceModel:
-        """What the scene switches on; period_s is that of the ticks."""
+        """The disturbances that the scene switches on; period_s is the control period."""
         return cls(
             np.array(part.turbine_nm),
             earth_lab_rad_s if part.earth_rotation else np.zeros(3),
@@ -115,7 +120,7 @@ class DisturbanceModel:
 
     @property
     def quiet(self) -> bool:
-        """Whether there is nothing at all."""
+        """Whether there is no disturbance."""
         return not (self.turbine_lab_nm.any() or self.earth_lab_rad_s.any() or self.gusts or self.knocks)
 
     def torque_nm(
@@ -125,11 +130,11 @@ class DisturbanceModel:
         rate_body_rad_s: Floats,
         momentum_nms: Floats,
     ) -> NDArray[np.float64]:
-        """(K, 3) body torque in each of K steps between the (K + 1,) times of a tick.
+        """(K, 3) body torque in each of K steps between the (K + 1,) times of a control period.
 
-        Attitude, rate and the rotors' momentum (3,) are those of the tick's beginning, held over it: in 10 ms they
-        change by a thousandth. A knock is a half-sine with J times its change of rate for its impulse, each step
-        getting its exact share.
+        Attitude, rate and the rotors' momentum (3,) are those at its start, held over it: in 10 ms they change by a
+        thousandth. A knock is a half-sine whose impulse is J times its change of rate; each step gets its
+        exact share.
         """
         blown = self.turbine_lab_nm + self.gusts.next() if self.gusts else self.turbine_lab_nm
         every = np.empty((len(times_s) - 1, 3))
@@ -141,6 +146,8 @@ class DisturbanceModel:
         )
         for knock in self.knocks:
             if knock.begin_s < times_s[-1] and times_s[0] < knock.begin_s + knock.duration_s:
+                # Impulse fraction of each step over its length: the mean torque of the step for a unit
+                # impulse.
                 share = [knock.share(a, b) / (b - a) for a, b in itertools.pairwise(times_s)]
                 every += np.outer(share, self.inertia_kg_m2 @ knock.rate_rad_s)
         return every

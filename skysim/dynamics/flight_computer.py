@@ -1,4 +1,9 @@
-"""The vehicle's computer at every tick: the controller's torque, allotted to the actuators that it flies with."""
+"""Flight computer: at every control period compute the control torque and allocate it to the actuators.
+
+`FlightComputer.steer` calls the control law (attitude_control.py) with the measured attitude and rate, subtracts
+what the fans give for momentum dumping, and has the chosen actuator set convert the rest to commands (`allot`). The
+law gets the torque that the actuators give back, for its anti-windup.
+"""
 
 from __future__ import annotations
 
@@ -17,13 +22,13 @@ from skysim.dynamics.multibody import World
 from skysim.scene.scene import Scene
 from skysim.scene.vehicle import CmgsConfig, FansConfig, WheelsConfig
 
-WITHIN_GYROS = 0.7  # `assumed`
+WITHIN_GYROS = 0.7  # of the gyros' rate limit (`assumed`)
 
 
 class Now(NamedTuple):
-    """A tick's beginning: the body's believed rate (3,), and all of qpos and qvel.
+    """The controller's inputs at the start of a control period: measured body rate (3,), all of qpos and qvel.
 
-    Only wheels' and gimbals' own encoders read the latter, which have no errors.
+    Of the latter only angles and speeds of wheels and gimbals are used, as encoders without errors.
     """
 
     t_s: float
@@ -34,24 +39,24 @@ class Now(NamedTuple):
 
 
 class Actuators(Protocol):
-    """One set: it takes a torque (3,) wanted on the body and writes into the controls (nu,)."""
+    """An actuator set: converts a torque (3,) wanted on the body to entries of the controls (nu,)."""
 
     def allot(self, control: Floats, wanted_nm: Floats, now: Now) -> Floats:
-        """(3,) the torque that the commands will give."""
+        """Write the commands; return (3,) the torque that they will give."""
         ...
 
     def momentum_nms(self, angles_rad: Floats, speeds_rad_s: Floats) -> Floats:
-        """(3,) stored, in body axes."""
+        """(3,) stored angular momentum, in body axes."""
         ...
 
     @property
     def authority_nm(self) -> float:
-        """The torque that it can give in every direction, while nothing is at its limit."""
+        """The torque available in every direction while no member is at its limit."""
         ...
 
 
 class Torques:
-    """Torques from nowhere about the body's axes, each within its limit."""
+    """Ideal actuator: body-axis torques clipped to a limit."""
 
     def __init__(self, ship: World) -> None:
         self.motor, self.limit_nm = ship.torques, ship.vehicle.torque_limit_nm
@@ -116,7 +121,7 @@ class OnCmgs:
 
     @property
     def authority_nm(self) -> float:
-        """With every gimbal at zero."""
+        """Torque available in every direction, with every gimbal at zero."""
         jacobian = self.set.jacobian(np.zeros(len(self.gimbals)), np.full(len(self.rotors), self.rotor_rad_s))
         return weakest(
             np.asarray(np.linalg.pinv(jacobian), dtype=np.float64), self.set.gimbal_rate_limit_rad_s
@@ -127,7 +132,7 @@ class OnCmgs:
 
 
 class OnFans:
-    """Fans, as if they gave at once what they give after their lag; see `actuators.FanSet`."""
+    """Fans, commanded as if they had no lag; see `actuators.FanSet`."""
 
     def __init__(self, ship: World, part: FansConfig) -> None:
         self.motor, self.lag_s = ship.fans.motor, part.time_constant_s
@@ -147,16 +152,16 @@ class OnFans:
 
 
 def weakest(command_from_torque: Floats, limit: float) -> float:
-    """The torque in every direction that keeps each of n commands (n, 3) within its limit."""
+    """Torque available in every direction with each of n commands, rows of (n, 3), within its limit."""
     return float(limit / np.linalg.norm(command_from_torque, axis=1).max())
 
 
-# How each key of `vehicle` that switches actuators on is flown with.
+# The actuator set for each key of `vehicle` that switches one on.
 ACTUATORS: dict[str, Callable[..., Actuators]] = {"wheels": OnWheels, "cmgs": OnCmgs, "fans": OnFans}
 
 
 class Unloading:
-    """Fans that take momentum out of the other actuators, and what they give in the meantime."""
+    """Momentum dumping by fans, with a model of their lag."""
 
     def __init__(self, fans: Actuators, desaturator: Desaturator) -> None:
         assert isinstance(fans, OnFans)
@@ -164,18 +169,19 @@ class Unloading:
         self.blown_nm = np.zeros(3)
 
     def allot(self, control: Floats, momentum_nms: Floats, now: Now) -> Floats:
-        """(3,) torque that the fans give now, as their lag is believed to be."""
+        """Command the fans; return (3,) the torque that they give now according to the lag model."""
         before = self.blown_nm
         asked = self.fans.allot(control, self.desaturator.torque(momentum_nms), now)
+        # First-order lag of the fans over one period; the torque at its start is the one that acts now.
         self.blown_nm = before + (asked - before) * -math.expm1(-now.period_s / self.fans.lag_s)
         return before
 
 
 class FlightComputer:
-    """Steers with one set of actuators, and takes momentum out of it with the fans. Stateful: one flight each.
+    """Attitude control with one set of actuators, and momentum dumping with the fans. Stateful: one motion each.
 
     sets      : all actuators that are switched on, by their key in `vehicle`
-    wanted_nm : (3,) what the controller asked for at the last tick, zeros where nobody flies
+    wanted_nm : (3,) control torque of the last period, zeros without a controller
     """
 
     def __init__(self, scene: Scene, ship: World, reference: Reference) -> None:
@@ -204,13 +210,14 @@ class FlightComputer:
         return stored
 
     def steer(self, now: Now, lab_from_body_wxyz: Floats, momentum_nms: Floats) -> Floats:
-        """(nu,) controls for the tick that begins, from the believed attitude (4,) and the stored momentum (3,)."""
+        """(nu,) controls for this period from the measured attitude (4,) and the stored momentum (3,)."""
         control = np.zeros(self.nu)
         if self.told is None:
             return control
         self.wanted_nm = self.law.torque_nm(now.t_s, lab_from_body_wxyz, now.rate_body_rad_s, momentum_nms)
         rest_nm = self.wanted_nm
         if self.unloading:
+            # The other actuators give the wanted torque less the fans', which takes momentum out of them.
             rest_nm = rest_nm - self.unloading.allot(control, momentum_nms, now)
         given_nm = self.hands.allot(control, rest_nm, now)
         self.law.learn(rest_nm, given_nm, self.period_s)
@@ -218,9 +225,9 @@ class FlightComputer:
 
 
 def believable_rad_s(scene: Scene) -> float:
-    """How fast the controller may let the vehicle turn back: below what its gyros can follow, if it steers by them.
+    """Rate limit of the controller's return to the reference: below the gyros' limit if it uses them, else infinite.
 
-    A gyro at its limit shows less than the true rate. A rate of return below that limit still brakes.
+    A saturated gyro reads less than the true rate, so a return faster than its limit would not be braked.
     """
     told, imu = scene.motion.control, scene.vehicle.imu
     if told is None or told.feedback == "truth" or imu is None:

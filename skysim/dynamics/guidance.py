@@ -1,7 +1,7 @@
-"""The attitude that a scene's list of manoeuvres asks for, and the knocks and vibration that stand in it.
+"""Guidance: the reference attitude over time from a scene's list of maneuvers, and its impulses and vibration.
 
-Knows neither the simulator nor the controller. A reference is a chain of legs: every one begins in the attitude in
-which the one before ended. Attitudes are unit quaternions `lab_from_ref_wxyz` (4,), scalar first; rates and
+Independent of the simulator and the controller. A reference is a chain of legs, each of which begins at the attitude
+at which the previous one ended. Attitudes are unit quaternions `lab_from_ref_wxyz` (4,), scalar first; rates and
 accelerations are (3,) in the reference's own axes.
 """
 
@@ -37,8 +37,8 @@ from skysim.scene.motion import (
 State = tuple[Floats, Floats, Floats]  # lab_from_ref_wxyz, rate_rad_s, acceleration_rad_s2
 Law = Callable[[float], tuple[float, float, float]]  # time to angle, rate and acceleration about one axis
 
-KNOT_RAD = 0.01  # a change of rate is integrated in steps of at most so much turn ...
-FEWEST_KNOTS = 128  # ... and of its own duration over this: together 2e-10 rad, see `Change`
+KNOT_RAD = 0.01  # a change of rate is integrated in steps of at most this rotation ...
+FEWEST_KNOTS = 128  # ... and at least this many: error 2e-10 rad, see `Change`
 MOST_KNOTS = 5_000_000
 
 
@@ -48,16 +48,16 @@ def attitude(angles: AttitudeConfig) -> Rotation:
 
 
 def start(motion: MotionConfig) -> Rotation:
-    """lab_from_body at the start: the identity for a pointing, which defines the lab by the body."""
+    """lab_from_body at the start: the identity for a pointing, since then the lab is defined by the body."""
     return attitude(motion.start) if isinstance(motion.start, AttitudeConfig) else Rotation.identity()
 
 
 def wxyz(rotation: Rotation) -> Floats:
-    """(4,) of one rotation, laid out as the kernels want it."""
+    """(4,) quaternion of one rotation, contiguous for the compiled functions."""
     return np.ascontiguousarray(rotation.as_quat(scalar_first=True))
 
 
-# Laws of one angle: how a turn about an axis that stands still goes in time.
+# Profiles of one angle over time: rotation about a fixed axis.
 
 
 def still(t_s: float) -> tuple[float, float, float]:
@@ -76,9 +76,10 @@ def rest_to_rest(
 ) -> tuple[float, float, float]:
     """The rate rises along the smoothstep 3x^2 - 2x^3 (x = t / ramp), cruises at rate_rad_s and falls likewise.
 
-    So the acceleration is continuous, zero at both ends of a ramp and 1.5 rate / ramp at its middle.
+    The acceleration is continuous: zero at both ends of a ramp and 1.5 rate / ramp at its middle.
     """
-    braking = t_s > duration_s / 2  # the second half is the first one played backwards
+    # Symmetric profile: the braking half is the first half in reversed time.
+    braking = t_s > duration_s / 2  # the second half mirrors the first
     since_s = duration_s - t_s if braking else t_s
     x = min(since_s / ramp_s, 1.0)
     angle = rate_rad_s * (ramp_s * x**3 * (1 - x / 2) + max(since_s - ramp_s, 0.0))
@@ -90,7 +91,8 @@ def rest_to_rest(
 def envelope(t_s: float, duration_s: float, growth_s: float) -> tuple[float, float, float]:
     """1 in the middle, 0 at and beyond both ends, and its two derivatives (1/s, 1/s2), all three continuous.
 
-    It grows along 10x^3 - 15x^4 + 6x^5 (x = t / growth_s) and dies likewise; growth_s is at most half of duration_s.
+    It rises along 10x^3 - 15x^4 + 6x^5 (x = t / growth_s) and falls likewise; growth_s is at most half of
+    duration_s.
     """
     dying = t_s > duration_s / 2
     x = min(max((duration_s - t_s if dying else t_s) / growth_s, 0.0), 1.0)
@@ -115,12 +117,12 @@ def sway(
 def turned(
     lab_from_start_wxyz: Floats, axis: Floats, angle_rad: float, rate_rad_s: float, acceleration_rad_s2: float
 ) -> tuple[Floats, Floats, Floats]:
-    """The state after a turn by an angle about a unit axis, which stays where it is in the turning body too."""
+    """The state after a rotation by an angle about a unit axis, which is the same in lab and body axes."""
     lab_from_ref_wxyz = quaternion.multiply(lab_from_start_wxyz, quaternion.from_rotvec(angle_rad * axis))
     return lab_from_ref_wxyz, rate_rad_s * axis, acceleration_rad_s2 * axis
 
 
-# A change of the rate, whose axis may move.
+# A smooth change of the rate, during which its axis may move.
 
 
 @jit
@@ -134,12 +136,12 @@ def rate_at(t_s: float, duration_s: float, rate_rad_s: Floats, change_rad_s: Flo
 def turn_between(
     begin_s: float, step_s: float, duration_s: float, rate_rad_s: Floats, change_rad_s: Floats
 ) -> Floats:
-    """(3,) rotation vector of the turn in a short while: Magnus' expansion to fourth order, two Gauss points.
+    """(3,) rotation vector of the motion in a short step: Magnus' expansion to fourth order, two Gauss points.
 
         phi = h (w1 + w2) / 2 + sqrt(3) / 12 h^2 w1 x w2
 
     (Iserles & Norsett 1999, `assumed`; the sign is that of rates in moving axes). The first term is exact here, the
-    rate being a cubic of time; where the axis stands still it is all there is, whatever the step.
+    rate being a cubic of time; if the axis is fixed, the second term is zero for any step.
     """
     middle, apart = begin_s + step_s / 2, step_s / math.sqrt(12.0)
     early = rate_at(middle - apart, duration_s, rate_rad_s, change_rad_s)
@@ -158,7 +160,7 @@ def knots(
         lab_from_knot_wxyz[k] = here
         turn = turn_between(k * step_s, step_s, duration_s, rate_rad_s, change_rad_s)
         here = quaternion.multiply(here, quaternion.from_rotvec(turn))
-        here = here / math.sqrt((here**2).sum())  # else the norm walks off by 1e-16 a step
+        here = here / math.sqrt((here**2).sum())  # prevents drift of the norm, 1e-16 a step
     return lab_from_knot_wxyz
 
 
@@ -166,7 +168,7 @@ def knots(
 def changing(
     lab_from_knot_wxyz: Floats, duration_s: float, rate_rad_s: Floats, change_rad_s: Floats, t_s: float
 ) -> tuple[Floats, Floats, Floats]:
-    """The state within a change: from the knot before by the step that made the knots, so without interpolation."""
+    """The state within a change of rate, integrated from the previous knot by the rule that made the knots."""
     step_s = duration_s / len(lab_from_knot_wxyz)
     k = min(int(t_s / step_s), len(lab_from_knot_wxyz) - 1)
     turn = turn_between(k * step_s, t_s - k * step_s, duration_s, rate_rad_s, change_rad_s)
@@ -178,11 +180,11 @@ def changing(
     )
 
 
-# Legs: one for each element of the list.
+# Legs: one for each maneuver of the list.
 
 
 class Leg(Protocol):
-    """A piece of the reference: how long it lasts, and the state 0 <= t_s <= duration_s after its start."""
+    """A part of the reference: its duration, and the state 0 <= t_s <= duration_s after its start."""
 
     @property
     def duration_s(self) -> float: ...
@@ -192,7 +194,7 @@ class Leg(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Turn:
-    """A turn by a law of its angle about one axis (3,), which stands still in body and lab; zeros turn nothing."""
+    """A rotation about one fixed axis (3,) with a profile of its angle; a zero axis is no rotation."""
 
     lab_from_start_wxyz: Floats
     axis: Floats
@@ -207,8 +209,8 @@ class Turn:
 class Change:
     """A smooth change of the rate: rate_rad_s + change_rad_s (3x^2 - 2x^3), x = t / duration.
 
-    lab_from_knot_wxyz : (K, 4) attitudes at K even steps. What Magnus' expansion leaves out in n steps of a change
-    that turns by a goes as a^3 / n^4: below 2e-10 rad for the knots that `spin_up` takes.
+    lab_from_knot_wxyz : (K, 4) attitudes at K even steps. The error of Magnus' expansion in n steps of a change that
+    rotates by a goes as a^3 / n^4: below 2e-10 rad for the knots that `spin_up` takes.
     """
 
     lab_from_knot_wxyz: Floats
@@ -221,7 +223,7 @@ class Change:
 
 
 class Here(NamedTuple):
-    """Where an element begins: the attitude and rate of the reference, and whose axes its Euler angles are in."""
+    """Start of a leg: attitude and rate of the reference, and the frame of its Euler angles."""
 
     lab_from_ref_wxyz: Floats
     rate_rad_s: Floats
@@ -229,27 +231,27 @@ class Here(NamedTuple):
 
 
 def split(vector: Floats) -> tuple[float, Floats]:
-    """The size and the (3,) unit direction of a vector; zeros have none."""
+    """Length and (3,) unit direction of a vector; the direction of zeros is zeros."""
     size = float(np.linalg.norm(vector))
     return size, vector / size if size else np.zeros(3)
 
 
 def hold(element: Any, here: Here) -> Leg:
-    """No motion, and no rate at once, even after a rate."""
+    """Rest at the present attitude; a preceding rate drops to zero at once."""
     caught_s = element.caught_after_s if isinstance(element, BumpConfig) else None
     return Turn(here.lab_from_ref_wxyz, np.zeros(3), element.duration_s + (caught_s or 0.0), still)
 
 
 def step(element: StepConfig, here: Here) -> Leg:
-    """Another attitude all at once, and no motion there."""
+    """Jump to another attitude and rest there."""
     there = wxyz(here.lab_from_home * attitude(element))
     return Turn(there, np.zeros(3), element.duration_s, still)
 
 
 def slew(element: SlewConfig, here: Here) -> Leg:
-    """The shortest eigen-axis turn from rest to rest, as quick as the two limits allow.
+    """The shortest eigen-axis rotation from rest to rest, as fast as the two limits allow.
 
-    A ramp to the rate v takes 1.5 v / a and 0.75 v^2 / a of angle; a turn too short for two of them peaks at
+    A ramp to the rate v takes 1.5 v / a and 0.75 v^2 / a of angle; a rotation too short for two of them peaks at
     v = sqrt(a angle / 1.5) and never cruises.
     """
     lab_from_there = wxyz(here.lab_from_home * attitude(element))
@@ -265,13 +267,13 @@ def slew(element: SlewConfig, here: Here) -> Leg:
 
 
 def rate(element: RateConfig, here: Here) -> Leg:
-    """start exp(w t), from the first moment on: the rate jumps."""
+    """A constant rate, start exp(w t), from the first moment on: the rate jumps."""
     size, axis = split(np.radians(element.rate_deg_s))
     return Turn(here.lab_from_ref_wxyz, axis, element.duration_s, partial(steady, size))
 
 
 def spin_up(element: SpinUpConfig, here: Here) -> Leg:
-    """From the rate that is to another, along a smoothstep of each component; the axis may move.
+    """Change the present rate to another, each component along a smoothstep; the axis may move.
 
     Raises InputError (one line) where more than five million knots would be needed.
     """
@@ -290,10 +292,10 @@ def spin_up(element: SpinUpConfig, here: Here) -> Leg:
 
 
 def sine(element: SineConfig, here: Here) -> Leg:
-    """A swing about the attitude, rotation vector amplitude envelope(t) sin(2 pi f t) in body axes.
+    """Oscillate about the attitude: rotation vector amplitude envelope(t) sin(2 pi f t) in body axes.
 
-    One phase for the three axes, so that they make one. It grows and dies within a period, or half of the duration
-    where that is shorter.
+    The three axes have the same phase, so that the axis of rotation is fixed. The envelope rises and falls within a
+    period, or half of the duration if that is shorter.
     """
     lasts_s, omega = element.duration_s, 2 * math.pi * element.frequency_hz
     growth_s = min(1 / element.frequency_hz, lasts_s / 2)
@@ -301,7 +303,7 @@ def sine(element: SineConfig, here: Here) -> Leg:
     return Turn(here.lab_from_ref_wxyz, axis, lasts_s, partial(sway, size, omega, lasts_s, growth_s))
 
 
-# What each kind of element asks for. Another kind is a class in motion.py and a function here.
+# The leg of each kind of maneuver. To add one, add a class to scene/motion.py and a function here.
 LEGS: dict[str, Callable[[Any, Here], Leg]] = {
     "hold": hold,
     "step": step,
@@ -316,7 +318,7 @@ LEGS: dict[str, Callable[[Any, Here], Leg]] = {
 
 @dataclass(frozen=True, slots=True)
 class Reference:
-    """The attitude asked for, at every time: leg after leg, the last of which goes on for ever.
+    """The commanded attitude over time: leg after leg, the last of which continues without end.
 
     start_s : when each leg starts, ascending from 0
     """
@@ -326,13 +328,13 @@ class Reference:
 
     @property
     def duration_s(self) -> float:
-        """How long the list takes, after which the last leg begins."""
+        """Duration of the list, after which the last leg begins."""
         return self.start_s[-1]
 
     def at(self, t_s: float) -> State:
         """lab_from_ref_wxyz (4,), rate (rad/s) and acceleration (rad/s2), each (3,) in the reference's own axes.
 
-        At the very moment of a joint it is the beginning of the leg that comes. Before 0 it is what it is at 0.
+        At the time where two legs meet, the later one applies. Before 0 the state is that at 0.
         """
         k = max(bisect.bisect_right(self.start_s, t_s) - 1, 0)
         leg = self.legs[k]
@@ -344,17 +346,17 @@ class Reference:
 
 
 def plan(motion: MotionConfig, lab_from_start: Rotation | None = None) -> Reference:
-    """The list of manoeuvres as one reference; every element starts where the one before it ended.
+    """The reference of the list of maneuvers; each begins where the previous one ended.
 
     lab_from_start defaults to motion.start, or to the identity where that is a pointing among the stars. The Euler
-    angles of steps and slews are those of the body in the lab; where the start is a pointing they are counted from
-    the attitude in which it starts, whatever axes lab_from_start is in. A spin_up begins at the rate at which the
-    element before it ended, which is zero but after a rate or another spin_up; the first begins at the vehicle's
+    angles of steps and slews are those of the body in the lab; where the start is a pointing they are relative to
+    the attitude at the start, whatever axes lab_from_start is in. A spin_up begins at the rate at which the
+    previous maneuver ended, which is zero except after a rate or another spin_up; the first begins at the vehicle's
     own, motion.rate_deg_s.
 
-    After its end the list goes on as it ended: at rest, or turning at the rate of a last rate or spin_up. Between
-    elements only a step lets the attitude jump, and only the beginning of a rate, and whatever but a spin_up
-    follows a rate or spin_up, lets the rate jump.
+    After its end the reference continues as it ended: at rest, or at the rate of a last rate or spin_up. Between
+    maneuvers only a step lets the attitude jump. The rate jumps at the start of a rate, and where anything but a
+    spin_up follows a rate or spin_up.
     """
     first = lab_from_start if lab_from_start is not None else start(motion)
     home = Rotation.identity() if isinstance(motion.start, AttitudeConfig) else first
@@ -370,12 +372,12 @@ def plan(motion: MotionConfig, lab_from_start: Rotation | None = None) -> Refere
     return Reference((*legs, onward), tuple(starts))
 
 
-# What else happens on the manoeuvre's clock.
+# Impulses and vibration that are scheduled in the list.
 
 
 @dataclass(frozen=True, slots=True)
 class Knock:
-    """A half-sine of torque on the vehicle, which alone would change its rate by rate_rad_s, (3,) in body axes.
+    """An impulse: a half-sine of torque that alone would change the vehicle's rate by rate_rad_s, (3,) in body axes.
 
     Its impulse is the inertia times that.
     """
@@ -385,13 +387,13 @@ class Knock:
     rate_rad_s: Floats
 
     def share(self, from_s: float, to_s: float) -> float:
-        """The share of the impulse that falls between two times: (cos(pi a) - cos(pi b)) / 2, a, b in durations."""
+        """The fraction of the impulse between two times: (cos(pi a) - cos(pi b)) / 2, a, b in durations."""
         a, b = (min(max((t_s - self.begin_s) / self.duration_s, 0.0), 1.0) for t_s in (from_s, to_s))
         return (math.cos(math.pi * a) - math.cos(math.pi * b)) / 2
 
 
 def knocks(motion: MotionConfig) -> tuple[Knock, ...]:
-    """The knocks of the list's bumps in order of time; a caught bump is two, equal and opposite."""
+    """The impulses of the list's bumps in order of time; a caught bump is two, equal and opposite."""
     made: list[Knock] = []
     for begin_s, bump in zip(plan(motion).start_s, motion.manoeuvre, strict=False):
         if isinstance(bump, BumpConfig):

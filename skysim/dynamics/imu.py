@@ -1,7 +1,12 @@
-"""What the inertial measurement unit feels, how it errs, and the lab's navigator that believes it.
+"""Inertial measurement unit: ideal increments, sensor errors, and the inertial navigator that integrates the gyros.
 
-The unit's axes are the body's. It counts increments: the integrals of angular rate and of specific force over each
-sample interval, as a strapdown unit does; nothing of a fast motion is lost between two samples but their order.
+1. `felt` integrates the ideal angular rate and specific force over each sample interval from the simulated motion.
+2. `Unit.measure` adds scale factor, misalignment, bias (constant and Gauss-Markov), white noise, limits and
+   quantization.
+3. `Navigator.add` integrates the gyro increments to an attitude.
+
+The unit's axes are the body's. Its outputs are increments (delta angle, delta velocity), as of a strapdown unit, so
+motion between two samples is not missed; only its order within the interval is lost.
 """
 
 from __future__ import annotations
@@ -18,11 +23,11 @@ from skysim.core.jit import jit
 from skysim.core.types import Floats
 from skysim.scene.vehicle import AccelerometerConfig, GyroConfig, ImuConfig, SiteConfig
 
-EARTH_RATE_RAD_S = 7.2921150e-5  # against the stars, 15.041 deg/h: WGS 84's
-STANDARD_GRAVITY_M_S2 = 9.80665  # what the accelerometers' g and ug mean, whatever the lab's own gravity is
-POINTS = 4  # knots that a polynomial goes through: a cubic, off by the fourth power of their spacing
-GAUSS = 0.5 / math.sqrt(3)  # two such places beside the middle integrate a cubic exactly (Gauss-Legendre)
-SLACK_S = 1e-9  # rounding of sample times against knots
+EARTH_RATE_RAD_S = 7.2921150e-5  # sidereal rate, 15.041 deg/h (WGS 84)
+STANDARD_GRAVITY_M_S2 = 9.80665  # unit of the accelerometers' g and ug, independent of the lab's gravity
+POINTS = 4  # knots per polynomial: a cubic, with an error of the fourth order in their spacing
+GAUSS = 0.5 / math.sqrt(3)  # the two Gauss-Legendre points, at +-this from the middle: exact for a cubic
+SLACK_S = 1e-9  # tolerance for rounding of sample times
 STILL = np.zeros(3)
 
 
@@ -32,10 +37,10 @@ class Increments:
 
     t_s          : (N,) ends of the intervals
     step_s       : length of each
-    angle_rad    : (N, 3) integral of the rate about each body axis: no rotation vector, unless the axis stands still
+    angle_rad    : (N, 3) integral of the rate about each body axis; a rotation vector only if the axis is constant
     velocity_m_s : (N, 3) integral of the specific force, which is +g along the vertical for a unit at rest
-    saturated    : (N,) a gyro stood at its limit; False where ideal
-    overloaded   : (N,) an accelerometer did; likewise
+    saturated    : (N,) a gyro was at its limit; False if ideal
+    overloaded   : (N,) an accelerometer was at its limit; False if ideal
     """
 
     t_s: Floats
@@ -47,7 +52,7 @@ class Increments:
 
 
 def earth_rate_lab_rad_s(site: SiteConfig) -> Floats:
-    """(3,) the Earth's turning against the stars in lab axes: up by its sine of latitude, north by its cosine.
+    """(3,) Earth rate against the stars in lab axes: up by its sine of latitude, north by its cosine.
 
     Lab z is up, x at the azimuth from north through east, y = z cross x.
     """
@@ -68,33 +73,31 @@ def felt(
     gravity_m_s2: float,
     earth_rate_lab_rad_s: Floats = STILL,
 ) -> Increments:
-    """What a unit without errors counts on a body that turns about the lab's origin.
+    """Increments of an ideal unit (without errors) on a body that rotates about the lab's origin.
 
         w = rate + body_from_lab earth_rate           angle    = int w dt
         f = dw/dt x r + w x (w x r) - g_body          velocity = int f dt
 
-    (Titterton & Weston, Strapdown Inertial Navigation Technology, ch. 3; `assumed`). With w the rate against the
-    stars, f holds centripetal and Coriolis acceleration of the lab's own turning too; g is a plumb line's gravity,
-    (0, 0, -gravity) in the lab, which has the Earth's centrifugal part at the origin. int dw/dt x r is the
-    difference of w between both ends, crossed with r.
+    (Titterton & Weston, Strapdown Inertial Navigation Technology, ch. 3; `assumed`). With w the inertial rate, f
+    also has the centripetal and Coriolis acceleration of the lab's rotation; g is plumb-line gravity, (0, 0,
+    -gravity) in the lab, which includes the Earth's centrifugal part at the origin. int dw/dt x r is the difference
+    of w between both ends, crossed with r.
 
-    t_s                : (K,) knots of the flight, ascending, K >= 2, in any spacing
+    t_s                : (K,) knots of the motion, ascending, K >= 2, in any spacing
     lab_from_body_wxyz : (K, 4) attitudes there
     rate_body_rad_s    : (K, 3) rates of the body in the lab, in body axes
-    ends_s, step_s     : (N,) ends of the sample intervals and their length; they need not meet the knots
-    place_body_m       : (3,) r, the unit's place on the body
-    earth_rate_lab_rad_s : (3,) zeros for a unit that does not feel the Earth turn
+    ends_s, step_s     : (N,) ends of the sample intervals and their length; they need not coincide with knots
+    place_body_m       : (3,) r, the unit's position on the body
+    earth_rate_lab_rad_s : (3,) zeros for a unit that does not sense the Earth rate
 
     Between knots every component is the cubic through the four nearest, integrated exactly: fourth order in the
-    spacing h. Where the acceleration jumps by dalpha at a knot, the angle is off by dalpha h^2 / 12, once.
+    spacing h. If the acceleration jumps by dalpha at a knot, the angle has an error of dalpha h^2 / 12, once.
     Raises InputError for fewer than two knots or an interval outside them.
     """
     if len(t_s) < 2:
         raise InputError(f"imu: {len(t_s)} knots of the flight; allowed: two or more")
     first_s, last_s = np.min(ends_s, initial=np.inf) - step_s, np.max(ends_s, initial=-np.inf)
-    if len(ends_s) and not (
-        t_s[0] - SLACK_S <= first_s and last_s <= t_s[-1] + SLACK_S
-    ):  # nor is NaN allowed
+    if len(ends_s) and not (t_s[0] - SLACK_S <= first_s and last_s <= t_s[-1] + SLACK_S):  # also rejects NaN
         raise InputError(
             f"imu: samples from {first_s:.6f} to {last_s:.6f} s; allowed: within the flight,"
             f" {t_s[0]:.6f} to {t_s[-1]:.6f} s"
@@ -120,7 +123,7 @@ def sensed(
     gravity_m_s2: float,
     earth_rate: Floats,
 ) -> Floats:
-    """(K, 6) at every knot: rate against the stars, then specific force but for dw/dt x r."""
+    """(K, 6) at every knot: inertial rate, then specific force without the term dw/dt x r."""
     knots = np.empty((len(rate_body_rad_s), 6))
     up = np.array([0.0, 0.0, gravity_m_s2])
     for k in range(len(knots)):
@@ -138,13 +141,14 @@ def integrals(
 ) -> tuple[Floats, Floats]:
     """(N, 3) angle and (N, 3) velocity of every sample interval from the knots of `sensed`.
 
-    An interval is cut at the knots; on each piece all is one cubic, and two points of Gauss integrate it.
+    An interval is split at the knots; each part is one cubic, which two Gauss points integrate exactly.
     """
     angle, velocity = np.empty((len(ends_s), 3)), np.empty((len(ends_s), 3))
     last = len(t_s) - 2
     for n in range(len(ends_s)):
         begin, end = ends_s[n] - step_s, ends_s[n]
         first = min(max(np.searchsorted(t_s, begin, side="right") - 1, 0), last)
+        # change = w(end) - w(begin), which is the integral of dw/dt.
         total, change = np.zeros(6), np.zeros(6)
         add_cubic(t_s, knots, first, begin, -1.0, change)
         for k in range(first, last + 1):
@@ -163,9 +167,9 @@ def integrals(
 
 @jit
 def add_cubic(t_s: Floats, knots: Floats, k: int, at_s: float, factor: float, out: Floats) -> None:
-    """Add to out (C,) factor times the value at at_s, of the cubic (Lagrange) through the knots about t_s[k]..t_s[k+1].
+    """Add to out (C,) factor times the value at at_s of the cubic (Lagrange) through the knots about t_s[k]..t_s[k+1].
 
-    Through all the knots there are where they are fewer than four.
+    If there are fewer than four knots, the polynomial goes through all of them.
     """
     count = min(POINTS, len(t_s))
     first = min(max(k - 1, 0), len(t_s) - count)
@@ -180,15 +184,15 @@ def add_cubic(t_s: Floats, knots: Floats, k: int, at_s: float, factor: float, ou
 
 @dataclass(slots=True)
 class Triad:
-    """Three sensors of one kind at right angles, and how they err; SI units, x is rad or m/s.
+    """Three orthogonal sensors of one kind and their errors; SI units, x is rad or m/s.
 
-    matrix    : (3, 3) what each reads of a motion along each body axis: 1 + scale error on the diagonal, the
-                misalignment of sensor i towards axis j beside it
+    matrix    : (3, 3) response of each sensor to motion along each body axis: 1 + scale error on the diagonal, the
+                misalignment of sensor i towards axis j off it
     turn_on   : (3,) constant bias, x/s
-    markov    : (3,) bias that wanders, x/s: a state
+    markov    : (3,) wandering bias (Gauss-Markov), x/s: a state
     markov_sd, markov_time_s : its standard deviation and correlation time
     white     : random walk of the integral, x/sqrt(s)
-    limit     : x/s beyond which the output stays there
+    limit     : x/s at which the output saturates
     quantum   : x of one count; 0 for none
     residue   : (3,) x not yet counted: a state
     """
@@ -204,7 +208,7 @@ class Triad:
     residue: Floats = field(default_factory=lambda: np.zeros(3))
 
     def measure(self, ideal: Floats, step_s: float, normal: Floats) -> tuple[Floats, NDArray[np.bool_]]:
-        """(N, 3) increments as counted, and (N,) whether one was limited; see `corrupt`. normal : (N, 6) draws."""
+        """(N, 3) measured increments, and (N,) whether one was limited; see `corrupt`. normal : (N, 6) draws."""
         keep = math.exp(-step_s / self.markov_time_s)
         stir = self.markov_sd * math.sqrt(-math.expm1(-2 * step_s / self.markov_time_s))
         counted, limited = corrupt(
@@ -229,12 +233,12 @@ def corrupt(
     normal: Floats,
     law: tuple[float, float, float, float, float, float],
 ) -> tuple[Floats, NDArray[np.bool_]]:
-    """Increments (N, 3) to what is counted; markov and residue (3,) are carried on in place.
+    """Apply the sensor errors to increments (N, 3); markov and residue (3,) are updated in place.
 
         b_n = keep b_(n-1) + stir z        exact for a Gauss-Markov process (Gelb 1974, ch. 3; `assumed`)
-        x_n = matrix ideal_n + (turn_on + b_n) step + white z',   cut to +-top, counted in whole quanta
+        x_n = matrix ideal_n + (turn_on + b_n) step + white z',   clipped to +-top, quantized
 
-    What a cut takes is lost; what the counter leaves over waits for the next sample.
+    The clipped part is lost; the quantization remainder is carried to the next sample.
     """
     step, keep, stir, white, top, quantum = law
     counted, limited = np.empty(ideal.shape), np.zeros(len(ideal), dtype=np.bool_)
@@ -255,7 +259,7 @@ def corrupt(
 
 
 def gyros(part: GyroConfig, hardware: Floats, start: Floats) -> Triad:
-    """The gyro triad of standard normal draws: hardware (4, 3), start (3,) of the wandering bias."""
+    """The gyro triad from standard normal draws: hardware (4, 3), start (3,) of the wandering bias."""
     per_hour = math.radians(1) / 3600
     return Triad(
         matrix=errors_of_axes(part.scale_ppm, part.misalignment_arcsec, hardware[1:]),
@@ -270,7 +274,9 @@ def gyros(part: GyroConfig, hardware: Floats, start: Floats) -> Triad:
 
 
 def accelerometers(part: AccelerometerConfig, hardware: Floats, start: Floats) -> Triad:
-    """The accelerometer triad, as `gyros`. Its density in ug/sqrt(Hz) squared is the variance of a mean over 1 s."""
+    """The accelerometer triad, as `gyros`. Its noise density in ug/sqrt(Hz), squared, is the variance of a mean
+    over 1 s.
+    """
     ug = 1e-6 * STANDARD_GRAVITY_M_S2
     return Triad(
         matrix=errors_of_axes(part.scale_ppm, part.misalignment_arcsec, hardware[1:]),
@@ -285,17 +291,17 @@ def accelerometers(part: AccelerometerConfig, hardware: Floats, start: Floats) -
 
 
 def errors_of_axes(scale_ppm: float, misalignment_arcsec: float, normal: Floats) -> Floats:
-    """(3, 3) unity, the scale errors on its diagonal, and every sensor's own tilt towards the two other axes."""
+    """(3, 3) identity plus the scale errors on its diagonal and every sensor's misalignment off it."""
     tilt = math.radians(misalignment_arcsec / 3600)
     return np.eye(3) + np.where(np.eye(3) > 0, 1e-6 * scale_ppm, tilt) * normal
 
 
 @dataclass(slots=True)
 class Unit:
-    """One inertial measurement unit: its hardware for good, its wandering biases and counters as they stand.
+    """One inertial measurement unit: fixed hardware errors, wandering biases, quantization remainders.
 
-    Twelve draws a sample, whichever errors are on: a run in pieces is the run at once, bit for bit, and one error
-    more or less leaves the others as they were.
+    Twelve numbers are drawn per sample, whichever errors are on: a run split into pieces equals one run bit for bit,
+    and switching one error does not change the others.
     """
 
     gyro: Triad
@@ -304,7 +310,7 @@ class Unit:
 
     @classmethod
     def of(cls, part: ImuConfig, rng: np.random.Generator) -> Unit:
-        """The unit that hardware_seed tells, switched on: the biases start as they wander for ever."""
+        """The unit of hardware_seed, switched on: the wandering biases start in their stationary distribution."""
         hardware = np.random.default_rng(np.random.SeedSequence(part.hardware_seed)).standard_normal(
             (2, 4, 3)
         )
@@ -316,7 +322,7 @@ class Unit:
         )
 
     def measure(self, ideal: Increments) -> Increments:
-        """What the unit puts out for the next samples of `felt`."""
+        """The unit's output for the next samples of `felt`."""
         normal = self.rng.standard_normal((len(ideal.t_s), 2, 6))
         angle, fast = self.gyro.measure(ideal.angle_rad, ideal.step_s, normal[:, 0])
         velocity, hard = self.accelerometer.measure(ideal.velocity_m_s, ideal.step_s, normal[:, 1])
@@ -324,21 +330,21 @@ class Unit:
 
     @property
     def gyro_bias_rad_s(self) -> Floats:
-        """(3,) bias of the last sample, turn-on and wandering part together; before the first, of the start."""
+        """(3,) bias at the last sample, turn-on plus wandering part; before the first, that of the start."""
         return self.gyro.turn_on + self.gyro.markov
 
     @property
     def accelerometer_bias_m_s2(self) -> Floats:
-        """(3,) likewise."""
+        """(3,) bias at the last sample, as `gyro_bias_rad_s`."""
         return self.accelerometer.turn_on + self.accelerometer.markov
 
 
 @dataclass(slots=True)
 class Navigator:
-    """The attitude as the lab has it: the gyros' increments added up from where the vehicle was zeroed.
+    """Attitude by integration of the gyro increments from the attitude at which the vehicle was zeroed.
 
-    lab_from_body_wxyz   : (4,) believed; at the start that of the home position
-    earth_rate_lab_rad_s : (3,) what it takes away; zeros take the Earth's turning for the vehicle's
+    lab_from_body_wxyz   : (4,) estimate; at the start that of the home position
+    earth_rate_lab_rad_s : (3,) Earth rate to compensate; with zeros the Earth's rotation appears as the vehicle's
     """
 
     lab_from_body_wxyz: Floats
@@ -349,7 +355,7 @@ class Navigator:
         self.lab_from_body_wxyz = start / np.linalg.norm(start)
 
     def add(self, increments: Increments) -> None:
-        """The next samples, in order; see `turned`."""
+        """Integrate the next samples, in order; see `turned`."""
         self.lab_from_body_wxyz = turned(
             self.lab_from_body_wxyz, increments.angle_rad, self.earth_rate_lab_rad_s, increments.step_s
         )
@@ -368,9 +374,9 @@ class Navigator:
 def turned(lab_from_body_wxyz: Floats, angle_rad: Floats, earth_rate: Floats, step_s: float) -> Floats:
     """The attitude after (N, 3) increments: lab_from_body <- exp(-earth_rate step) lab_from_body exp(angle).
 
-    The left factor is the lab's own turning, in its own axes: the Earth rate turned into the body's and taken away
-    at every moment, not at the sample's start. Each increment is taken for a rotation vector, as the lab does. An
-    axis that swings within a sample makes that wrong by half the integral of angle x rate (coning; `assumed`).
+    The left factor is the rotation of the lab, in lab axes, so that the Earth rate is compensated continuously and
+    not at the attitude of the sample's start. Each increment is taken as a rotation vector. If the axis moves
+    within a sample, this has an error of half the integral of angle x rate (coning; `assumed`).
     """
     lab_now_from_before = quaternion.from_rotvec(-step_s * earth_rate)
     here = lab_from_body_wxyz
@@ -383,7 +389,7 @@ def turned(lab_from_body_wxyz: Floats, angle_rad: Floats, earth_rate: Floats, st
 
 
 def tilt_rad(velocity_m_s: Floats) -> tuple[float, float]:
-    """(roll, pitch) of a vehicle at rest from its accelerometers: the force that carries it points up.
+    """(roll, pitch) of a vehicle at rest from its accelerometers, whose specific force points up.
 
     In body axes it is g (-sin pitch, sin roll cos pitch, cos roll cos pitch). velocity_m_s : (N, 3) increments.
     """

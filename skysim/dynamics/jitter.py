@@ -1,4 +1,9 @@
-"""Vibration: small turns in the body's own axes, laid over the attitude history, always or for a while."""
+"""Vibration: small rotations about the body axes added to the simulated attitude, always or for an interval.
+
+A vibration is a sum of sines of the rotation vector in body axes: single frequencies (`line`) or a random spectrum
+(`band`). It is kinematic: MuJoCo does not simulate it, but the IMU senses it (`closed_loop.felt`) and it smears the
+images.
+"""
 
 from __future__ import annotations
 
@@ -18,12 +23,12 @@ from skysim.core.types import Floats, Trajectory
 from skysim.dynamics.guidance import envelope, shakes
 from skysim.scene.motion import JitterBandConfig, JitterLineConfig, JitterPart, MotionConfig
 
-SINES = 128  # a band is a sum of so many; an uneven spectrum still has tens of equal ones
+SINES = 128  # sines in a band; even a steep spectrum has tens of similar amplitude
 PER_PERIOD = (
-    16  # samples of the shortest period: cubic Hermite is then off by (2 pi / 16)^4 / 384 = 6e-5 of it
+    16  # samples per shortest period: cubic Hermite interpolation has an error of (2 pi / 16)^4 / 384 = 6e-5
 )
 MOST_SAMPLES = 5_000_000
-RISE = 0.1  # of a while of vibration is its rise, and so its fall ...
+RISE = 0.1  # of an interval of vibration is its rise, and as much its fall ...
 LONGEST_RISE_S = 1.0  # ... but no longer
 
 
@@ -41,16 +46,17 @@ class Sines:
 
 
 def line(part: JitterLineConfig, rng: np.random.Generator) -> Sines:
-    """One frequency: sqrt(2) rms sin(2 pi f t + phase) about each axis, its phase at random."""
+    """One frequency: sqrt(2) rms sin(2 pi f t + phase) about each axis, with random phases."""
     return with_phases(np.array([part.frequency_hz]), np.ones(1), part.rms_arcsec, rng)
 
 
 def band(part: JitterBandConfig, rng: np.random.Generator) -> Sines:
     """Power spectral density proportional to f^slope from from_hz to to_hz, the sum of many sines.
 
-    The band is cut into pieces of equal ratio. A sine in each has the piece's whole power, so that the rms is
-    exact in every draw, and a frequency drawn from the spectrum within the piece, so that the density is exact in
-    expectation (Shinozuka & Deodatis 1991, ASME Appl. Mech. Rev. 44, 191, whose frequencies are fixed; `assumed`).
+    The band is split into pieces of equal frequency ratio. Each has one sine with the piece's whole power, so that
+    the rms is exact in every draw, at a frequency drawn from the spectrum within the piece, so that the density is
+    exact in expectation (Shinozuka & Deodatis 1991, ASME Appl. Mech. Rev. 44, 191, whose frequencies are fixed;
+    `assumed`).
     """
     edges = np.linspace(0, math.log(part.to_hz / part.from_hz), SINES + 1)  # logarithm of f / from_hz
     rise = part.slope + 1  # power up to f goes as f^rise, of which only ratios count
@@ -59,6 +65,7 @@ def band(part: JitterBandConfig, rng: np.random.Generator) -> Sines:
     if abs(rise) < 1e-6:
         share, middle = high - low, low + drawn * (high - low)
     else:
+        # Power of each piece, and a frequency drawn from it by inverting its cumulative power.
         share = np.exp(rise * low) * np.expm1(rise * (high - low)) / rise
         middle = low + np.log1p(drawn * np.expm1(rise * (high - low))) / rise
     return with_phases(part.from_hz * np.exp(middle), share / share.sum(), part.rms_arcsec, rng)
@@ -67,22 +74,22 @@ def band(part: JitterBandConfig, rng: np.random.Generator) -> Sines:
 def with_phases(
     frequency_hz: Floats, share: Floats, rms_arcsec: Sequence[float], rng: np.random.Generator
 ) -> Sines:
-    """Sines of (K,) frequencies and shares of the power, each axis with phases of its own."""
+    """Sines of (K,) frequencies and fractions of the power, with independent random phases for each axis."""
     amplitude = np.sqrt(2 * share)[:, None] * np.radians(np.array(rms_arcsec) / 3600)
     phase = rng.uniform(0, 2 * np.pi, amplitude.shape)
     return Sines(2 * np.pi * frequency_hz, amplitude * np.cos(phase), amplitude * np.sin(phase))
 
 
-# How a vibration sounds. A third kind is a class in motion.py and a function here.
+# Spectra by kind. To add one, add a class to scene/motion.py and a function here.
 SPECTRA: dict[str, Callable[[Any, np.random.Generator], Sines]] = {"line": line, "band": band}
 
 
 @dataclass(frozen=True, slots=True)
 class Voice:
-    """Sines and when they sound: phi(t) = envelope(t) sines(t), from begin_s to end_s.
+    """Sines and their interval: phi(t) = envelope(t) sines(t), from begin_s to end_s.
 
-    The envelope is 1 but for a rise and a fall of a tenth of the while each, a second at most, in which it goes along
-    10x^3 - 15x^4 + 6x^5: phi, its rate and its acceleration are continuous. For a voice that sounds always it is 1.
+    The envelope is 1 except for a rise and a fall of a tenth of the interval each, a second at most, along
+    10x^3 - 15x^4 + 6x^5: phi, its rate and its acceleration are continuous. Without an interval it is 1.
 
     name : where in the scene it is declared
     """
@@ -98,20 +105,21 @@ class Voice:
 
     @property
     def highest_hz(self) -> float:
-        """The frequency to be sampled for: the sines' highest and one period a rise.
+        """The frequency that sets the sampling: the sines' highest plus one period per rise.
 
-        The envelope is smoother than a sine of that: cubic Hermite is off by what its fourth derivative, at most
-        360 / rise^4, and the jumps of its third, 60 / rise^3, make of it; the sine's are 1559 and 248.
+        The envelope is smoother than a sine of that frequency. The error of cubic Hermite interpolation follows
+        from the fourth derivative, at most 360 / rise^4, and the jumps of the third, 60 / rise^3; for the sine they
+        are 1559 and 248.
         """
         edge_hz = 1 / self.rise_s if math.isfinite(self.begin_s) else 0.0
         return float(self.sines.omega_rad_s.max()) / (2 * np.pi) + edge_hz
 
     def sounds(self, t_s: Floats) -> NDArray[np.bool_]:
-        """(N - 1,) whether it is heard between each of (N,) times and the next."""
+        """(N - 1,) whether it is active between each of (N,) times and the next."""
         return np.asarray((t_s[:-1] < self.end_s) & (self.begin_s < t_s[1:]))
 
     def swing(self, t_s: Floats) -> tuple[Floats, Floats]:
-        """(N, 3) phi and (N, 3) its derivative at (N,) times within."""
+        """(N, 3) phi and (N, 3) its derivative at (N,) times within the interval."""
         phi, rate = swing(t_s, self.sines.omega_rad_s, self.sines.sine_rad, self.sines.cosine_rad)
         if not math.isfinite(self.begin_s):
             return phi, rate
@@ -121,13 +129,13 @@ class Voice:
 
 @dataclass(frozen=True, slots=True)
 class Vibration:
-    """All that shakes a vehicle in one run, its phases drawn once: alike over a whole flight and piece by piece."""
+    """All vibration of one run. Its phases are drawn once, so that evaluation in pieces equals that of the whole."""
 
     voices: tuple[Voice, ...]
 
     @classmethod
     def of(cls, motion: MotionConfig, rng: np.random.Generator) -> Vibration:
-        """What `motion.jitter` declares for always and each jitter of the manoeuvre for its while."""
+        """The vibration of `motion.jitter`, always on, and of each jitter maneuver during its interval."""
         drawn = [voice(motion.jitter, rng, "motion.jitter")]
         for begin_s, end_s, parts in shakes(motion):
             drawn.append(voice(parts, rng, f"motion.manoeuvre jitter at {begin_s:g} s", begin_s, end_s))
@@ -144,12 +152,13 @@ class Vibration:
         return phi, rate
 
     def lay_over(self, trajectory: Trajectory) -> Trajectory:
-        """The attitude history, or a piece of one, with its vibration: lab_from_body exp(phi(t)), phi in body axes.
+        """Add the vibration to a trajectory, or to a part of one: lab_from_body exp(phi(t)), phi in body axes.
 
-        Resampled so finely, where something sounds, that `Trajectory.at` between two samples keeps phi to 1e-4 of its
-        amplitude. The body then turns at exp(-phi) omega + J(phi) dphi/dt, in its own shaken axes. The rates of the
-        history are taken as straight between its samples, all of which stay. The same object comes back if nothing
-        sounds. Raises InputError (one line) where more than five million samples would be needed.
+        Where vibration is active the trajectory is resampled so finely that `Trajectory.at` between two samples
+        keeps phi to 1e-4 of its amplitude; all samples are kept. The body rate becomes exp(-phi) omega + J(phi)
+        dphi/dt, in the vibrating axes, with omega linear between the samples of the trajectory. Without active
+        vibration the same object is returned. Raises InputError (one line) where more than five million samples
+        would be needed.
         """
         if not any(one.sounds(trajectory.t_s).any() for one in self.voices):
             return trajectory
@@ -162,9 +171,10 @@ class Vibration:
         return Trajectory(t_s, trajectory.at(t_s) * turn, turn.inv().apply(rate) + own_rate(phi, phi_rate))
 
     def pieces(self, t_s: Floats) -> NDArray[np.int64]:
-        """(N - 1,) into how many pieces each step is cut, so that every period has PER_PERIOD samples.
+        """(N - 1,) number of pieces of each step, so that every period has PER_PERIOD samples.
 
-        Raises InputError if those are too many. A flight that is laid over piece by piece asks first, with all its times.
+        Raises InputError if there are too many samples. Before applying vibration piece by piece, call this
+        with all times.
         """
         highest_hz = np.zeros(len(t_s) - 1)
         for one in self.voices:
@@ -187,7 +197,7 @@ def voice(
     begin_s: float = -math.inf,
     end_s: float = math.inf,
 ) -> Voice | None:
-    """The parts drawn, or None where none shakes."""
+    """Draw a vibration's parts; None if all have zero rms."""
     loud = [part for part in parts if any(part.rms_arcsec)]
     if not loud:
         return None
@@ -195,12 +205,12 @@ def voice(
 
 
 def shake(trajectory: Trajectory, parts: Sequence[JitterPart], rng: np.random.Generator) -> Trajectory:
-    """The whole attitude history with a vibration that sounds always, see `Vibration.lay_over`."""
+    """The whole trajectory with a vibration that is always active, see `Vibration.lay_over`."""
     return Vibration.of(MotionConfig(jitter=tuple(parts)), rng).lay_over(trajectory)
 
 
 def joined(many: Sequence[Sines]) -> Sines:
-    """All of them at once."""
+    """All sines in one set."""
     return Sines(
         np.concatenate([one.omega_rad_s for one in many]),
         np.concatenate([one.sine_rad for one in many]),
@@ -209,7 +219,7 @@ def joined(many: Sequence[Sines]) -> Sines:
 
 
 def finer(t_s: Floats, pieces: NDArray[np.int64]) -> Floats:
-    """The samples' times, and between them so many more that each step is cut evenly into its pieces."""
+    """The sample times with each step divided evenly into its pieces."""
     begin = np.repeat(np.cumsum(pieces) - pieces, pieces)  # the first sample of each one's own step
     within = (np.arange(len(begin)) - begin) / np.repeat(pieces, pieces)
     return np.append(np.repeat(t_s[:-1], pieces) + within * np.repeat(np.diff(t_s), pieces), t_s[-1])
@@ -224,7 +234,7 @@ def own_rate(phi: Floats, phi_rate: Floats) -> Floats:
     """
     angle = np.linalg.norm(phi, axis=1, keepdims=True)
     first = np.sinc(angle / (2 * np.pi)) ** 2 / 2
-    # The quotient of two small numbers is 1/6 to a^2 / 120, and rounding in it counts for a^2 of the rate only.
+    # For small a the quotient loses precision; there it is 1/6 to a^2 / 120, and its term is only a^2 of the rate.
     second = np.where(angle > 1e-4, (1 - np.sinc(angle / np.pi)) / np.maximum(angle, 1e-4) ** 2, 1 / 6)
     cross = np.cross(phi, phi_rate)
     return np.asarray(phi_rate - first * cross + second * np.cross(phi, cross))

@@ -1,3 +1,1 @@
-"""One run: set up the test bed, step the dynamics, expose the frames, close the loop. Owns the random
-streams.
-"""
+"""Run a scene: build the test bed, step the dynamics, expose the frames, close the loop. Owns the random streams."""

@@ -1,4 +1,4 @@
-"""What a user should know before the flight: where the scene is not what its tracker takes it for."""
+"""Pre-run warnings: where the scene breaks an assumption of its tracker or of the frames' WCS."""
 
 from __future__ import annotations
 
@@ -11,15 +11,17 @@ from skysim.scene.scene import Scene
 from skysim.sources.dome import surface
 from skysim.sources.dome.surface import Radial, Surface
 
-# Of the ellipsoid from the surface, rms. A camera 0.2 m beside the line through the bearing along which it looks, 1 m
-# under the dome, has a sight's point wrong by 0.2 mm for it: 0.01 deg, which is what a dome is surveyed for.
+# Largest rms distance of the fitted ellipsoid from the surface that gives no warning. For a camera whose line of
+# sight passes 0.2 m beside the bearing, 1 m under the dome, it puts the intersection of the line of sight with the
+# surface off by 0.2 mm: 0.01 deg, the accuracy that a dome is surveyed for.
 MISFIT_M = 1e-3
-# Of an LED's image: half of a tile of the local detector's sky (`TILE_PX` there), beyond which the disc is its own sky.
+# Largest diameter of an LED's image: half of a background tile of the local detector (`TILE_PX` there). The detector
+# takes wider discs for background.
 LOCAL_PX = 32.0
 
 
 def doubts(scene: Scene, sources: Sources, mount: Mount) -> list[str]:
-    """A line each; none in front of a bench."""
+    """Return the warnings for a scene, one line each. A bench (collimated display) gives none."""
     if isinstance(scene.light, StarsConfig):
         return [line for line in [wcs.doubt(scene.camera)] if line]
     if not isinstance(scene.light, DomeConfig):
@@ -35,7 +37,7 @@ def doubts(scene: Scene, sources: Sources, mount: Mount) -> list[str]:
 
 
 def cloud(light: DomeConfig, inside: Surface) -> str:
-    """How well a surveyed cloud is a smooth surface."""
+    """How far the points of a surveyed surface are from the smooth surface fitted to them; else empty."""
     part = light.surface
     fit = inside.survey if isinstance(inside, Radial) else None
     if fit is None or not isinstance(part, SurveyedSurfaceConfig):
@@ -47,7 +49,7 @@ def cloud(light: DomeConfig, inside: Surface) -> str:
 
 
 def no_ellipsoid(inside: Surface) -> str:
-    """How far the surface is from the ellipsoid that the tracker's methods know."""
+    """Warn where the surface is more than MISFIT_M rms from the ellipsoid that the tracker's methods assume."""
     rms_m = inside.believed().rms_m
     if rms_m <= MISFIT_M:
         return ""
@@ -58,10 +60,10 @@ def no_ellipsoid(inside: Surface) -> str:
 
 
 def wide_images(scene: Scene, sources: Sources, mount: Mount) -> str:
-    """Discs that are their own sky for a detector that looks for it beside each blob.
+    """Warn where the local detector would take an LED's image for background.
 
-    The image of a disc D at a distance d is D f / d wide; out of focus by the thin lens it is wider by the pupil's
-    shadow, A |1 / d - 1 / focus| f.
+    The image of a disc of diameter D at a distance d is D f / d wide. Defocus by the thin lens adds the blur disc of
+    the pupil A, A |1 / d - 1 / focus| f wide.
     """
     if scene.tracker.detector != "local":
         return ""
@@ -79,7 +81,7 @@ def wide_images(scene: Scene, sources: Sources, mount: Mount) -> str:
 
 
 def unlit(scene: Scene, sources: Sources) -> str:
-    """LEDs that wait for their turn longer than the shutter is open."""
+    """Warn where the exposure is shorter than the drive's cycle, so that a frame shows only some of the LEDs."""
     part = sources.on_s < sources.period_s
     if not part.any():
         return ""

@@ -1,4 +1,10 @@
-"""A lab in flight: tick by tick its computer steers, MuJoCo moves, the sensors feel, the star tracker looks."""
+"""Closed-loop simulation: step flight computer, dynamics, IMU and star tracker together.
+
+Every control period (`ClosedLoop.tick`) the flight computer reads the true or the estimated attitude and sets the
+actuator controls, the disturbance torques are added, MuJoCo integrates the equations of motion, and the IMU samples
+the motion. `OnboardCamera.looks` then renders and solves each frame whose exposure and latency have passed and
+updates the attitude filter, which the controller may use in the next period.
+"""
 
 from __future__ import annotations
 
@@ -28,14 +34,14 @@ from skysim.tracking.navigation import Navigation
 if TYPE_CHECKING:
     from skysim.simulation.testbed import Testbed
 
-LOOK_S = 0.05  # between two looks at what a manoeuvre asks for
-MARGIN_S = 0.05  # kept of the past beyond what is needed
+LOOK_S = 0.05  # sampling interval of a maneuver when its tilt is checked
+MARGIN_S = 0.05  # kept of past states beyond what a frame needs
 
 Wanted = Callable[[int, float], bool]
 
 
 class CapturedFrame(NamedTuple):
-    """A frame that was taken in flight, what was true of it, what the star tracker and the filter made of it."""
+    """A frame rendered during the motion, its truth, the tracker's report, and the filter's status of the update."""
 
     frame: Frame
     truth: Truth
@@ -44,9 +50,9 @@ class CapturedFrame(NamedTuple):
 
 
 class ClosedLoop:
-    """A lab in flight. Stateful: one flight each.
+    """A test bed in motion. Stateful: use one instance for one motion.
 
-    forgets : keep no more of the past than the next frame needs; else all of it
+    forgets : keep only the past states that the next frame needs; else all of them
     """
 
     def __init__(self, lab: Testbed, forgets: bool = False) -> None:
@@ -73,15 +79,20 @@ class ClosedLoop:
 
     @property
     def nobody_speaks(self) -> bool:
-        """Whether all of the flight is settled at its start."""
+        """Whether nothing reacts to the motion: no disturbances, no controller and no navigation."""
         return self.room.quiet and not (self.lab.scene.motion.control or self.navigation)
 
     def tick(self, steps: int, diary: TelemetryRecorder | None = None) -> None:
-        """One control period or what is left of the flight: believe, steer, be disturbed, move, feel."""
+        """Simulate one control period, or what is left of the motion, and record it.
+
+        The order is: attitude and rate as the controller gets them, controls, disturbance torques, integration, IMU.
+        The controls are held over the period.
+        """
         flight, pilot, navigation = self.flight, self.pilot, self.navigation
         t_s, angles, speeds = flight.now_s, flight.angles_rad, flight.speeds_rad_s
         attitude, rate = flight.lab_from_body_wxyz, flight.rate_body_rad_s
         stored = pilot.momentum_nms(angles, speeds)
+        # The controller sees the truth or, with feedback imu or filter, the navigation's estimates.
         seen, turning = attitude, rate
         if pilot.told and pilot.told.feedback != "truth" and navigation:
             seen, turning = (
@@ -93,26 +104,29 @@ class ClosedLoop:
         if not self.room.quiet:
             times_s = flight.times_s(flight.step, flight.step + len(control) + 1)
             disturbance = self.room.torque_nm(times_s, attitude, rate, stored)
+            # Disturbances act through the model's ideal torque actuators, step by step; commands are
+            # constant.
             control[:, flight.world.torques] += disturbance
             if diary:
                 diary.disturbed(disturbance.sum(axis=0) / len(control))
         if diary:
+            # Before the motion advances: every column of a row is of the same time.
             diary.note(stored)
         flight.advance(control)
         if navigation:
             navigation.feel(flight.now_s, *felt(flight, self.vibration, len(control)))
 
     def here(self, open_s: float) -> Testbed:
-        """The lab with the flight from shortly before a moment until now."""
+        """The test bed with the trajectory from shortly before a time until now."""
         since = self.flight.trajectory(max(int(open_s / self.flight.step_s) - 1, 0))
         return replace(self.lab, trajectory=self.vibration.lay_over(since))
 
 
 class OnboardCamera:
-    """The camera in flight, and the star tracker: every frame is taken when its time has come, solved, and told the
-    filter, if there is one.
+    """The camera and star tracker during the motion: render each frame when due, solve it, update the filter.
 
-    tracker : who solves them, if anybody does;  wanted(index, close_s) : whether a frame is taken at all
+    tracker : solves the frames; None leaves them unsolved
+    wanted(index, close_s) : whether to render a frame
     """
 
     def __init__(
@@ -124,11 +138,12 @@ class OnboardCamera:
         self.index = 0
 
     def looks(self, clock: Clock | None = None) -> Iterator[CapturedFrame]:
-        """All frames whose exposure ended the filter's latency ago, and which were not taken yet."""
+        """Yield the frames not yet rendered whose exposure ended at least the filter's latency ago."""
         scene, aloft = self.scene, self.aloft
         while self.index < aloft.lab.frames:
             when = window(scene, self.index, self.meter.exposure_s)
             close_s = when.close_s(scene.camera.height_px)
+            # Not due yet: the exposure is not over, or the solution would still be in processing.
             if close_s + self.latency_s > aloft.flight.now_s:
                 return
             if self.wanted and not self.wanted(self.index, close_s):
@@ -137,6 +152,7 @@ class OnboardCamera:
             frame, truth = render_frame(aloft.here(when.open_s), self.index, clock, when.exposure_s)
             self.meter.see(frame)
             report = factory.answer(self.tracker, frame) if self.tracker else None
+            # The filter takes the solution at its mid-exposure time, although it arrives later.
             told = aloft.navigation if scene.filter and report else None
             verdict = told.see(frame.t_mid_s, report.attitude) if told and report else ""
             self.index += 1
@@ -144,7 +160,7 @@ class OnboardCamera:
 
 
 def memory_s(scene: Scene) -> float:
-    """How much of the flight a frame is made from, once its time has come."""
+    """Seconds of past states that a frame needs when due: longest exposure, latency, two control periods."""
     control, latency_s = scene.tracker.exposure_control, scene.filter.latency_s if scene.filter else 0.0
     when = window(scene, 0, control.longest_s if control else None)
     return (
@@ -153,7 +169,7 @@ def memory_s(scene: Scene) -> float:
 
 
 def check_reference(reference: guidance.Reference, lab: Testbed) -> None:
-    """Refuse a manoeuvre that asks for a tilt beyond the stop, which the controller would push against."""
+    """Raise InputError for a maneuver that commands a tilt beyond the stop: the controller would push against it."""
     vehicle = lab.scene.vehicle
     if vehicle.mount != "air_bearing" or lab.scene.motion.control is None:
         return
@@ -168,7 +184,7 @@ def check_reference(reference: guidance.Reference, lab: Testbed) -> None:
 
 
 def felt(flight: multibody.Flight, vibration: Vibration, steps: int) -> tuple[Floats, Floats, Floats]:
-    """Times (K,), attitudes (K, 4) as wxyz and rates (K, 3) of the last steps, with what shakes them."""
+    """Times (K,), attitudes (K, 4) as wxyz and rates (K, 3) of the last steps, with the vibration added."""
     begin = max(flight.step - steps, 0)
     if not vibration.voices:
         return flight.knots(begin)
@@ -177,7 +193,7 @@ def felt(flight: multibody.Flight, vibration: Vibration, steps: int) -> tuple[Fl
 
 
 def navigator(lab: Testbed, start: Rotation, records: bool) -> Navigation | None:
-    """The computer that listens to the gyros, where there are any; records: whether it keeps all that they said."""
+    """The on-board navigation, or None without an IMU. records: whether it keeps every IMU sample."""
     if lab.scene.vehicle.imu is None:
         return None
     place_m = multibody.imu_place_m(lab.ship)

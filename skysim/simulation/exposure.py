@@ -1,4 +1,8 @@
-"""One frame: the light that a camera in flight gathers between two moments, and what was true meanwhile."""
+"""Render one frame with its truth.
+
+The order is that of the light: background and display glow, the sources integrated along their paths
+(camera/render.py), charge smear of the shutter, then the detector (camera/detector).
+"""
 
 from __future__ import annotations
 
@@ -25,7 +29,10 @@ from skysim.simulation.testbed import window
 def render_frame(
     lab: Testbed, index: int, clock: Clock | None = None, exposure_s: float | None = None
 ) -> tuple[Frame, Truth]:
-    """One frame with its truth. Depends on the scene, the index and the exposure (the scene's if left out) alone."""
+    """Render one frame and its truth, both for mid-exposure of the middle row.
+
+    They depend only on the test bed, the index and the exposure time (the scene's if left out), not on other frames.
+    """
     clock = clock or Clock()
     scene, camera = lab.scene, lab.scene.camera
     when = window(scene, index, exposure_s)
@@ -33,6 +40,7 @@ def render_frame(
     lab_from_body = lab.trajectory.at(middle_s)
     cam_from_lab = lab.mount.cam_from_body * lab_from_body.inv()
     light_e = lab.canvas
+    # The canvas is reused for every frame: the background overwrites it, all else is added to it.
     glow = background.glow_map(scene.background, lab.optics, cam_from_lab, lab.band)
     background.fill(light_e, glow, when.exposure_s)
     camera_m = lab_from_body.apply(lab.mount.camera_body_m)
@@ -42,6 +50,7 @@ def render_frame(
     hides = partial(multibody.hidden, lab.obstacles, lab_from_body) if lab.obstacles else None
     seen = render(light_e, lab.sources, lab.optics, lab.trajectory, lab.mount, when, lab.emitter, hides)
     smear(light_e, when.exposure_s, lab.chip.shutter)
+    # Saturation and SNR need the light of the whole frame, which `expose` then overwrites.
     seen = judge(seen, light_e, when.exposure_s, lab.chip)
     clock.lap("render")
     image = expose(light_e, when.exposure_s, lab.chip, rng(scene.seed, "detector", index))
@@ -52,7 +61,7 @@ def render_frame(
 
 
 def behind_things(lab: Testbed, lab_from_body: Rotation) -> NDArray[np.int64]:
-    """(M,) ids of the sources that would be on the chip at that attitude, had something not stood in the way."""
+    """(M,) ids of the occluded sources that would otherwise be on the chip at that attitude."""
     if lab.obstacles is None:
         return np.zeros(0, np.int64)
     cam_from_lab = (lab.mount.cam_from_body * lab_from_body.inv()).as_matrix()

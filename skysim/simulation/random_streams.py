@@ -14,5 +14,9 @@ STAGE_ID = {"detector": 1, "jitter": 2, "imu": 3, "draught": 4}
 
 
 def rng(seed: int, stage: str, frame: int) -> np.random.Generator:
-    """A stage's random stream for one frame, the same whatever was drawn before: frame 57 renders alone."""
+    """The random generator of one stage for one frame.
+
+    The SeedSequence is keyed by stage and frame, not by what was drawn before, so that any frame renders the same
+    on its own.
+    """
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(STAGE_ID[stage], frame)))

@@ -1,4 +1,9 @@
-"""The whole story: a scene is lit, flown, photographed and solved, afterwards or as it happens."""
+"""Run a scene from start to end: build, simulate the motion, render and solve the frames.
+
+Without an attitude filter the motion is simulated first (`simulate_motion`) and the frames are rendered and solved
+afterwards (`run`). With a filter, frames are rendered and solved during the motion, because the filter and possibly
+the controller use their attitudes. `live` yields frames during the motion and keeps only the most recent states.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +26,7 @@ Watch = Callable[[float, float], None]
 
 @dataclass(frozen=True, slots=True)
 class FrameResult:
-    """One frame, what it was made from, what the tracker made of it, and seconds spent making it by stage."""
+    """One frame, its truth, the tracker's report, and the seconds spent in each stage."""
 
     frame: Frame
     truth: Truth
@@ -30,24 +35,27 @@ class FrameResult:
 
 
 def prepare(scene: Scene, watch: Watch | None = None) -> Testbed:
-    """Build the vehicle, light the sky or the dome, and fly to the last exposure.
+    """Build the test bed and simulate its motion up to the end of the last exposure.
 
-    watch(t_s, duration_s) is called at every tick on the way.
+    watch(t_s, duration_s) is called after every control period.
     """
     return simulate_motion(build_testbed(scene), watch)
 
 
 def simulate_motion(lab: Testbed, watch: Watch | None = None) -> Testbed:
-    """The lab after the flight: tick by tick the vehicle's computer steers, MuJoCo moves, the sensors feel.
+    """Return the test bed with its simulated motion, telemetry and IMU record.
 
-    A tick is a control period. With `filter` the frames are taken and solved as their exposures end, and what the
-    star tracker says is in the filter, and with feedback: filter in the controls, after the latency declared.
+    Each step is a control period: the flight computer sets the controls, MuJoCo integrates, the IMU samples. With
+    `filter`, frames are rendered and solved as their exposures end; the star tracker's attitudes reach the
+    filter (and
+    with feedback: filter the controller) after the declared latency.
     """
     aloft = ClosedLoop(lab)
     flight = aloft.flight
-    aloft.vibration.pieces(flight.times_s(0, flight.last + 1))  # too much is told before the flight
+    aloft.vibration.pieces(flight.times_s(0, flight.last + 1))  # may raise InputError: do it first
     eyes = OnboardCamera(aloft, tracker(lab)) if lab.scene.filter and aloft.navigation else None
     diary = TelemetryRecorder(flight, aloft.pilot, aloft.navigation)
+    # With nothing that reacts to the motion, one call integrates all of it.
     steps = flight.steps_left if aloft.nobody_speaks else round(aloft.pilot.period_s / flight.step_s)
     reports: dict[int, Report] = {}
     verdicts, exposures_s = {}, {}
@@ -74,11 +82,13 @@ def simulate_motion(lab: Testbed, watch: Watch | None = None) -> Testbed:
 def live(
     lab: Testbed, estimator: factory.Estimator | None, wanted: Callable[[int, float], bool] | None = None
 ) -> Iterator[CapturedFrame]:
-    """Frame after frame of a lab on the ground as it happens; memory holds the last moments alone, however long it
-    lasts. They are the frames that `run` makes of it.
+    """Yield the frames of a test bed during its motion, each rendered as its exposure ends.
 
-    estimator : solves each; without one they are not solved, but where a filter needs it
-    wanted(index, close_s) : whether a frame is made at all; the others are as they would have been
+    Only the most recent states are kept, so that the motion may last without end. The frames equal those of `run`.
+
+    estimator : solves each frame; if None, frames are solved only where the scene has a filter
+    wanted(index, close_s) : whether to render a frame. Skipping one does not change the others, except that exposure
+        control and filter do not see it
     """
     aloft = ClosedLoop(lab, forgets=True)
     flight = aloft.flight
@@ -90,9 +100,10 @@ def live(
 
 
 def render_frames(lab: Testbed) -> Iterator[tuple[Frame, Truth, dict[str, float]]]:
-    """Frame after frame with its truth and the seconds it took, each exposed as the one before asks for.
+    """Yield every frame with its truth and the seconds spent in each stage; automatic exposure sets each
+    exposure time.
 
-    A frame that was taken in flight is taken again as it was then.
+    A frame that was already rendered during the motion keeps the exposure time it had then.
     """
     meter = ExposureController(lab.scene)
     for index in range(lab.scene.exposure.frames):
@@ -103,14 +114,17 @@ def render_frames(lab: Testbed) -> Iterator[tuple[Frame, Truth, dict[str, float]
 
 
 def warm_up(lab: Testbed, estimator: factory.Estimator) -> None:
-    """A frame for the compiler, whose seconds are nobody's; somebody else's tracker gets every frame once, in order."""
+    """Render and solve one frame so that numba compiles before timing.
+
+    External trackers are skipped: each frame must reach them once, in order.
+    """
     frame, _ = render_frame(lab, 0)
     if not isinstance(estimator, ExternalTracker):
         factory.answer(estimator, frame)
 
 
 def run(lab: Testbed, estimator: factory.Estimator) -> Iterator[FrameResult]:
-    """Photograph and solve frame after frame; what was solved in flight is not solved again."""
+    """Render and solve the frames in order; reuse the reports of frames that were solved during the motion."""
     warm_up(lab, estimator)
     for frame, truth, seconds in render_frames(lab):
         report = lab.reports.get(frame.index) or factory.answer(estimator, frame)

@@ -1,4 +1,4 @@
-"""What the vehicle did and believed, written down at every tick of its computer."""
+"""Record what the vehicle did and what its navigation estimated, at every control period."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from skysim.tracking.navigation import Navigation
 
 
 class TelemetryRecorder:
-    """The flight's records, one row a tick; `telemetry` closes it.
+    """Records of a simulated motion, one row per control period; `telemetry` returns them as a table.
 
-    What the states of the flight hold is read from them at the end; only what is forgotten otherwise is noted.
+    Quantities held in the flight's states are read from them at the end; only the others are recorded on the way.
     """
 
     def __init__(self, flight: Flight, pilot: FlightComputer, navigation: Navigation | None) -> None:
@@ -32,11 +32,11 @@ class TelemetryRecorder:
         self.believed = np.zeros((rows, 3, 3))  # filter: sigma of the attitude, bias, its sigma
 
     def disturbed(self, torque_nm: Floats) -> None:
-        """(3,) the mean of this tick, before it is noted."""
+        """Record the mean disturbance torque (3,) of this control period; call it before `note`."""
         self.disturbance_nm[self.row] = torque_nm
 
     def note(self, momentum_nms: Floats) -> None:
-        """All else of this tick, once the computer has decided and before the vehicle moves."""
+        """Record the rest of this control period, after the controls are set and before the vehicle moves."""
         k = self.row
         self.row += 1
         self.torque_nm[k], self.momentum_nms[k] = self.pilot.wanted_nm, momentum_nms
@@ -44,7 +44,7 @@ class TelemetryRecorder:
             self.believe(k, self.navigation)
 
     def believe(self, k: int, navigation: Navigation) -> None:
-        """What the navigator and the filter have of the present."""
+        """Record the present estimates of the inertial navigator and of the filter in row k."""
         self.imu_wxyz[k] = navigation.attitude_wxyz("imu")
         self.saturated[k] = navigation.saturated
         self.bias_rad_s[k] = navigation.apparent_bias_rad_s(
@@ -56,9 +56,9 @@ class TelemetryRecorder:
             self.believed[k] = state.sigma_attitude_rad, state.bias_rad_s, state.sigma_bias_rad_s
 
     def telemetry(self, reference: Reference | None) -> Telemetry:
-        """All rows; reference is what the vehicle was told, if anything."""
+        """All rows as Telemetry; reference is the commanded attitude profile, if there is one."""
         flight, ship, noted = self.flight, self.flight.world, self.at_step[: self.row]
-        at_one_go = self.row == 1  # nobody was asked in between
+        at_one_go = self.row == 1  # integrated in a single call, see `ClosedLoop.nobody_speaks`
         if at_one_go:
             noted = self.at_step
         states, nq = flight.states[noted], flight.model.nq

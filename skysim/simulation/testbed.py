@@ -1,4 +1,4 @@
-"""A scene set up: vehicle, sources, optics, detector and tracker, before and after its motion is simulated."""
+"""The test bed of a scene: vehicle, sources, optics, detector and trajectory."""
 
 from __future__ import annotations
 
@@ -34,30 +34,30 @@ from skysim.tracking.external import interface
 
 
 def window(scene: Scene, index: int, exposure_s: float | None = None) -> Window:
-    """When the chip gathers the light of a frame; for the scene's own exposure if none is given."""
+    """The exposure window of a frame; with the scene's exposure time if none is given."""
     shutter = scene.camera.shutter
     row_time_s = shutter.row_time_s if isinstance(shutter, RollingShutterConfig) else 0.0
     begin_s = scene.exposure.first_s + index / scene.exposure.rate_hz
     return Window(begin_s, scene.exposure.time_s if exposure_s is None else exposure_s, row_time_s)
 
 
-SPARE_S = 2e-3  # flown beyond the last exposure
+SPARE_S = 2e-3  # simulated beyond the last exposure
 
 
 @dataclass(frozen=True, slots=True)
 class Testbed:
-    """What a scene becomes before the first frame is kept: hardware, lights and the flight.
+    """Hardware, light sources and trajectory of a scene, before or after its motion is simulated.
 
-    canvas    : (H, W) where the light of one frame after another is drawn; float64 where noise is off, for such a
-                frame is the truth to many digits, and float32 otherwise
-    trajectory: the flight, jitter and all; telemetry: what the vehicle's computers did in it
-    obstacles : what can hide a light; None where the scene has light.occlusion off
-    record    : what the IMU put out, every sample of it; None where there is none
-    reports   : the star tracker's answers to the frames that were taken and solved in flight, for the filter
-    verdicts  : what the filter made of each
-    exposures_s: of each
-    programs  : commands by name, which the scene's tracker may be: the user's, who alone may say what is run
-    endless   : frame follows frame for ever, whatever number the scene has; for `live` alone, which forgets
+    canvas    : (H, W) array in which every frame's light is drawn; float64 where noise is off, since such a frame
+                is the expectation itself, and float32 otherwise
+    trajectory: the simulated motion, jitter included; telemetry: what the vehicle's computers did in it
+    obstacles : occluders of the sources; None where the scene has light.occlusion off
+    record    : every sample of the IMU; None without one
+    reports   : the star tracker's reports on frames solved during the motion (for the filter), by frame index
+    verdicts  : the filter's status of each of those updates
+    exposures_s: exposure time of each of those frames
+    programs  : external tracker commands by name, for `tracker.name`; only the user's command line sets them
+    endless   : frames continue without end, whatever the scene's number; only for `live`
     """
 
     scene: Scene
@@ -81,12 +81,12 @@ class Testbed:
 
     @property
     def frames(self) -> float:
-        """How many there are."""
+        """Number of frames; infinite if endless."""
         return math.inf if self.endless else self.scene.exposure.frames
 
     @property
     def flown_s(self) -> float:
-        """How long the flight has to be, for the longest exposure of the last frame."""
+        """Duration to simulate, s: to the end of the last frame's longest exposure."""
         if self.endless:
             return math.inf
         part = self.scene.tracker.exposure_control
@@ -95,16 +95,19 @@ class Testbed:
 
     @property
     def log(self) -> Telemetry:
-        """The telemetry of a lab that has flown."""
+        """The telemetry; only after `simulate_motion`."""
         assert self.telemetry is not None, "not flown yet"
         return self.telemetry
 
 
 def build_testbed(scene: Scene, programs: Mapping[str, str] = factory.NO_PROGRAMS) -> Testbed:
-    """The lab on the ground: all but the flight, of which there is the start alone."""
-    settings.believed_settings(scene)  # a wrong name is told before the flight
-    interface.known(scene.tracker.name, programs)  # this one too
-    EXTENT[scene.camera.psf.kind](scene.camera.psf, scene.camera)  # and so is a measured PSF's bad file
+    """Build hardware, sources and the initial attitude; do not simulate the motion.
+
+    Raises InputError for wrong names of algorithms or trackers and for an unreadable PSF file, before any long work.
+    """
+    settings.believed_settings(scene)  # raises for a wrong algorithm name
+    interface.known(scene.tracker.name, programs)  # raises for an unknown tracker
+    EXTENT[scene.camera.psf.kind](scene.camera.psf, scene.camera)  # raises for a bad PSF file
     ship = multibody.build(scene.vehicle)
     band = Band.of(scene.camera.detector.quantum_efficiency)
     kind = np.float32 if scene.camera.detector.noise else np.float64
@@ -127,7 +130,7 @@ def build_testbed(scene: Scene, programs: Mapping[str, str] = factory.NO_PROGRAM
 
 
 def obstacles(scene: Scene, ship: multibody.World) -> multibody.Obstacles | None:
-    """What can hide a light from the camera, if the scene would have it so; a bench has nothing in its beam."""
+    """Occluders, or None if `light.occlusion` is off (always for a bench)."""
     if not getattr(scene.light, "occlusion", False):
         return None
     return multibody.obstacles(
@@ -136,12 +139,12 @@ def obstacles(scene: Scene, ship: multibody.World) -> multibody.Obstacles | None
 
 
 def staged(lab: Testbed) -> str:
-    """The lab as one MJCF text, for MuJoCo's own viewer and for pictures."""
+    """The test bed as MJCF text, for MuJoCo's viewer and for pictures."""
     return mjcf_export.mjcf(lab.ship, lab.scene, lab.sources, lab.trajectory.lab_from_body[0])
 
 
 def lab_from_body_start(scene: Scene, mount: Mount) -> Rotation:
-    """The attitude at t = 0. Under the stars the lab's axes are those of the ICRS."""
+    """The attitude at t = 0. For a star scene the lab frame is the ICRS."""
     start = scene.motion.start
     if isinstance(start, PointingConfig):
         return (
@@ -152,7 +155,7 @@ def lab_from_body_start(scene: Scene, mount: Mount) -> Rotation:
 
 
 def light_sources(scene: Scene, band: Band) -> Sources:
-    """Everything that shines, as the band sees it."""
+    """All light sources of the scene, with strengths in the camera's band."""
     if isinstance(scene.light, DomeConfig):
         return dome.sources(scene.light, band)
     stars = catalog.read(known_catalogue("light.catalogue", scene.light.catalogue))
@@ -162,5 +165,5 @@ def light_sources(scene: Scene, band: Band) -> Sources:
 
 
 def tracker(lab: Testbed) -> factory.Estimator:
-    """The star tracker with what it believes of the hardware."""
+    """The star tracker with the hardware parameters that it assumes (see tracking/factory.py)."""
     return factory.tracker(lab.scene, lab.mount, lab.sources, lab.programs)

@@ -1,1 +1,1 @@
-"""The star tracker on board: builds the estimator from a scene, with what it believes of its hardware."""
+"""The star tracker on board: build the estimator of a scene with the hardware parameters that it assumes."""

@@ -16,12 +16,15 @@ from skysim.core.types import Floats
 
 @dataclass(frozen=True, slots=True)
 class DomeMap:
-    """A dome and its camera as a survey found them, in the lab frame; what `tracker.map` reads.
+    """A surveyed dome and its camera in the lab frame; `tracker.map` names its file.
 
-    id, position_m : (N,) and (N, 3) of the LEDs surveyed, m;  sigma_m : (N,) of a place, rms of the three axes
-    camera_body_m  : (3,) the entrance pupil in the body frame;  lever_sigma_m : of it, rms of the three axes
+    id, position_m : (N,) and (N, 3) of the LEDs surveyed, m
+    sigma_m        : (N,) standard deviation of an LED's position, rms of the three axes, m
+    camera_body_m  : (3,) the entrance pupil in the body frame, m
+    lever_sigma_m  : its standard deviation, rms of the three axes, m
     size_px        : width and height of the chip
-    focal_px, centre_px, distortion (k1, k2, p1, p2, k3), and the standard deviation of each number; 0 where it was held
+    focal_px, centre_px, distortion (k1, k2, p1, p2, k3), and the standard deviation of each number; 0 where
+    it was held
     """
 
     id: NDArray[np.int64]
@@ -40,7 +43,7 @@ class DomeMap:
 
 MAP_COLUMNS = ("id", "x_m", "y_m", "z_m", "sigma_m")
 
-# Numbers in the header of a dome's map, and how many.
+# Keys in the header of a dome map, and how many numbers each holds.
 MAP_META = {
     **{"size_px": 2, "focal_px": 1, "focal_sigma_px": 1, "centre_px": 2, "centre_sigma_px": 2},
     **{"distortion": 5, "distortion_sigma": 5, "camera_body_m": 3, "lever_sigma_m": 1},
@@ -48,7 +51,7 @@ MAP_META = {
 
 
 def write_dome_map(path: Path, dome: DomeMap) -> None:
-    """A surveyed dome as ECSV: one row an LED, the camera in the header."""
+    """Write a surveyed dome as ECSV: one row per LED, the camera in the header."""
     from astropy.table import Table
 
     table = Table(dict(zip(MAP_COLUMNS, (dome.id, *dome.position_m.T, dome.sigma_m), strict=True)))
@@ -57,7 +60,7 @@ def write_dome_map(path: Path, dome: DomeMap) -> None:
 
 
 def read_dome_map(path: Path) -> DomeMap:
-    """What `write_dome_map` wrote. Raises BadInput with one line for a file that is none."""
+    """Read what `write_dome_map` wrote. Raises InputError with one line for any other file."""
     import warnings
 
     from astropy.table import Table
@@ -66,7 +69,7 @@ def read_dome_map(path: Path) -> DomeMap:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             table = Table.read(path, format="ascii.ecsv")
-    except Exception as error:  # of a file that is no ECSV astropy says whatever its parsers stumble over
+    except Exception as error:  # astropy's parsers raise many types of error
         raise InputError(f"{path}: no ECSV table: {' '.join(str(error).split())[:120]}") from None
     missing = [name for name in MAP_COLUMNS if name not in table.colnames]
     if missing or not len(table):

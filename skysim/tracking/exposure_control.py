@@ -1,4 +1,4 @@
-"""Automatic exposure: the next exposure time from the frame before."""
+"""Automatic exposure: set the next exposure time from the last frame."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from skysim.tracking.settings import believed_settings
 
 
 class ExposureController:
-    """The camera's control: how long to expose the next frame, told by the one before.
+    """The camera's exposure controller: sets the next exposure time from the last frame.
 
     exposure_s : of the next frame; always the scene's `exposure.time` without `tracker.exposure_control`
     """
@@ -25,22 +25,23 @@ class ExposureController:
         self.exposure_s = scene.exposure.time_s
 
     def see(self, frame: Frame) -> None:
-        """Take note of the frame that was exposed for `exposure_s`."""
+        """Update the exposure time from a frame, which was exposed for `frame.exposure_s`."""
         if self.control:
             state = Exposure(frame.exposure_s)
             self.exposure_s = step(state, observed(self.settings, self.control, frame), self.control).time_s
 
 
 def exposure_control(scene: Scene) -> Control | None:
-    """The constants of the chart, as the scene has them; None where exposures are fixed."""
+    """The constants of the control law from the scene; None where exposure times are fixed."""
     part = scene.tracker.exposure_control
     return Control(**dict(part)) if part else None
 
 
 def observed(settings: Settings, control: Control, frame: Frame) -> Observation:
-    """What the image processing says of a frame: objects that are no stars (defects, tracks, the Moon) do not count.
+    """What the control law needs from a frame: brightness statistics of the detected blobs.
 
-    A full pixel is one near the value at which this camera's are cut off.
+    Blobs that are not stars (defects, tracks, the Moon) are left out. A pixel counts as saturated near the camera's
+    saturation value.
     """
     try:
         blobs = DETECTORS[settings.detector](
@@ -50,7 +51,7 @@ def observed(settings: Settings, control: Control, frame: Frame) -> Observation:
             settings.max_blobs,
             FramePriors(None, settings.saturation),
         )
-    except ImageError:  # a coarse converter's frame may hold one value alone: there is nothing in it
+    except ImageError:  # a coarse converter may give a frame of one value: no blobs
         return observe(frame.image_dn, np.empty((0, 4), np.int64), settings.saturation, control)
     box_px = blobs.box_px[blobs.flag & settings.reject == 0]
     return observe(frame.image_dn, box_px, settings.saturation, control)

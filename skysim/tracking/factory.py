@@ -1,4 +1,9 @@
-"""The computers on board, as the scene sets them up: the star tracker's, and the one that listens to the gyros."""
+"""Build the star tracker of a scene, and solve frames with it.
+
+`tracker` chooses the class by scene: DomeTracker under LEDs, StarTracker under stars, ExternalTracker for another
+program. All get the camera, map and settings that the tracker assumes (onboard_model.py, settings.py), which may
+differ from the simulated hardware.
+"""
 
 from __future__ import annotations
 
@@ -30,10 +35,11 @@ NO_PROGRAMS: Mapping[str, str] = {}
 def tracker(
     scene: Scene, mount: Mount, sources: Sources, programs: Mapping[str, str] = NO_PROGRAMS
 ) -> Estimator:
-    """The star tracker with what it believes of the hardware: the scene's `tracker` section, else the truth.
+    """The star tracker with the hardware parameters that it assumes: those of the scene's `tracker` section,
+    else the true ones.
 
     programs : commands by name, any of which `tracker.name` may be
-    Raises InputError for a dome that no tracker can work under.
+    Raises InputError for a dome that the tracker cannot work with.
     """
     camera, settings = believed_camera(scene), believed_settings(scene)
     if isinstance(scene.light, DomeConfig):
@@ -50,7 +56,7 @@ def tracker(
     stars = catalog.brighter(stars, scene.tracker.limit_mag)
     directions = catalog.apparent(stars, catalog.on_earth(scene.start_time))
     if isinstance(scene.light, BenchConfig):
-        # Where the bench has its display decides where the stars are in the lab.
+        # The display's mounting defines where the stars are in the lab frame.
         directions = display.lab_from_icrs(scene.light).apply(directions)
     if scene.tracker.name != OWN:
         return ExternalTracker.of(scene, camera, settings, adapter.stars(stars, directions), programs)
@@ -58,9 +64,9 @@ def tracker(
 
 
 def answer(estimator: Estimator, frame: Frame, streak_px: tuple[float, float] | None = None) -> Report:
-    """The tracker's report; a frame that it will not look at (empty, saturated) is a status too.
+    """The tracker's report on a frame; an image that it refuses (empty, saturated) gives a report with that status.
 
-    streak_px : (dx, dy) that lights move in the exposure, where a gyro tells the tracker
+    streak_px : (dx, dy) that lights move in the exposure, if a gyro measures it
     """
     if isinstance(estimator, ExternalTracker):
         return estimator.look(frame, streak_px)

@@ -1,4 +1,8 @@
-"""On-board navigation: IMU, attitude filter and what each controller is given as attitude."""
+"""On-board navigation: IMU, inertial navigator, attitude filter, and the attitude that the controller gets.
+
+The IMU's samples are integrated to an attitude (`imu.Navigator`) and, if the scene has a filter, propagate a
+multiplicative extended Kalman filter (`estimator.filter.mekf`). Each star-tracker attitude updates the filter.
+"""
 
 from __future__ import annotations
 
@@ -18,12 +22,12 @@ from skysim.scene.tracker import FilterConfig
 
 
 class Navigation:
-    """What the vehicle believes of its attitude: gyros added up, and corrected by the star tracker.
+    """The vehicle's attitude estimates: integrated gyros, and the filter that the star tracker corrects.
 
-    scene : with `vehicle.imu`, and `filter` where there is one
+    scene : with `vehicle.imu`, and optionally `filter`
     lab_from_body_wxyz : (4,) the true attitude at the start, when the navigator is zeroed
     place_body_m, gravity_m_s2 : of the accelerometers
-    records : whether all that the unit put out is kept, for `record`
+    records : whether all IMU samples are kept, for `record`
     """
 
     def __init__(
@@ -54,7 +58,11 @@ class Navigation:
         self.saturated = False
 
     def feel(self, now_s: float, t_s: Floats, lab_from_body_wxyz: Floats, rate_body_rad_s: Floats) -> None:
-        """The unit's samples up to now, from the knots (K,), (K, 4), (K, 3) of the flight since the last call."""
+        """Take the IMU samples due up to now_s; update navigator and filter with them.
+
+        t_s (K,), lab_from_body_wxyz (K, 4), rate_body_rad_s (K, 3) : knots of the motion since the last call
+        """
+        # The small term keeps a sample that is due exactly now from being lost to rounding.
         due = int(now_s / self.step_s + 1e-6) - self.samples
         if due < 1:
             return
@@ -78,11 +86,12 @@ class Navigation:
         known = self.earth_body_rad_s(self.navigator.lab_from_body_wxyz)
         self.rate_rad_s = measured.angle_rad.mean(axis=0) / self.step_s - known
         if self.filter:
+            # The filter's reference is the lab, so the Earth rate is removed at its own attitude estimate.
             known = self.earth_body_rad_s(self.attitude_wxyz("filter"))
             self.filter.propagate(ends_s, measured.angle_rad - known * self.step_s, measured.saturated)
 
     def record(self) -> imu.Increments:
-        """All that the unit put out so far."""
+        """All IMU samples so far."""
         columns = zip(
             *((m.t_s, m.angle_rad, m.velocity_m_s, m.saturated, m.overloaded) for m in self.measured),
             strict=True,
@@ -91,20 +100,24 @@ class Navigation:
         return imu.Increments(t_s, self.step_s, angle, velocity, saturated, overloaded)
 
     def apparent_bias_rad_s(self, lab_from_body_wxyz: Floats, rate_body_rad_s: Floats) -> Floats:
-        """(3,) what the gyros show too much at that true attitude and rate (3,), noise apart.
+        """(3,) error of the measured rate, without noise, at this true attitude and rate (3,).
 
-        Their bias, what scale factors and misalignments make of the rate, and the Earth where nobody takes it away.
+        The sum of the gyro bias, of scale factor and misalignment errors times the rate, and of the Earth rate if
+        it is not compensated.
         """
         unknown = self.earth_felt_rad_s - self.earth_known_rad_s
         earth = quaternion.apply(quaternion.inverse(lab_from_body_wxyz), unknown)
         return self.unit.gyro_bias_rad_s + self.unit.gyro.matrix @ rate_body_rad_s - rate_body_rad_s + earth
 
     def earth_body_rad_s(self, lab_from_body_wxyz: Floats) -> Floats:
-        """(3,) what is taken away for the Earth's turning, in body axes."""
+        """(3,) Earth rate to subtract, in body axes; zeros if it is not compensated."""
         return quaternion.apply(quaternion.inverse(lab_from_body_wxyz), self.earth_known_rad_s)
 
     def see(self, t_s: float, answer: Attitude) -> str:
-        """A star tracker's solution for mid-exposure t_s; what the filter made of it."""
+        """Update the filter with a star tracker's attitude at mid-exposure t_s; return the status of the update.
+
+        Without filter, attitude or covariance the tracker's own status is returned.
+        """
         if self.filter is None or answer.cam_from_ref is None or answer.covariance_rad2 is None:
             return answer.status
         body_from_cam = self.body_from_cam.as_matrix()
@@ -112,25 +125,25 @@ class Navigation:
         return self.filter.update(t_s, self.body_from_cam * answer.cam_from_ref, covariance).status
 
     def attitude_wxyz(self, feedback: str) -> Floats:
-        """(4,) lab_from_body as the navigator or the filter has it."""
+        """(4,) lab_from_body from the inertial navigator ("imu") or the filter."""
         if feedback == "imu" or self.filter is None:
             return self.navigator.lab_from_body_wxyz
         return self.filter.ref_from_body_wxyz
 
     def rate(self, feedback: str) -> Floats:
-        """(3,) the body's rate in the lab as either has it, the mean over the last tick."""
+        """(3,) body rate in the lab from the same source: the mean over the last control period for the IMU."""
         return self.rate_rad_s if feedback == "imu" or self.filter is None else self.filter.rate_rad_s
 
 
 def at_home(lab_from_body: Rotation, error_deg: tuple[float, float, float]) -> Rotation:
-    """What the navigator takes the attitude for when it is zeroed: the true one less the error in roll, pitch, yaw."""
+    """The attitude to which the navigator is zeroed: the true one less the error in roll, pitch, yaw."""
     yaw, pitch, roll = lab_from_body.as_euler("ZYX", degrees=True)
     wrong = [yaw - error_deg[2], pitch - error_deg[1], roll - error_deg[0]]
     return Rotation.from_euler("ZYX", wrong, degrees=True)
 
 
 def mekf(part: FilterConfig, lab_from_body: Rotation) -> Mekf:
-    """The attitude filter at the start, its reference the lab."""
+    """The attitude filter at the start; its reference frame is the lab."""
     hour_s = 3600.0
     gyro = GyroModel(
         math.radians(part.arw_deg_sqrt_h) / math.sqrt(hour_s),

@@ -1,4 +1,4 @@
-"""What the tracker believes of its camera, its lever arm and the dome."""
+"""The tracker's models of its camera, lever arm and dome: the true values with calibration and survey errors."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from skysim.tracking import dome_map_file
 
 
 def believed_dome(scene: Scene, light: DomeConfig, sources: Sources) -> LedMap:
-    """The dome on the tracker's map: the true one, and the errors of its survey."""
+    """The dome map that the tracker uses: the true LED positions and surface with the errors of the survey."""
     inside, told = surface.build_surface(light.surface), scene.tracker.survey
     place_m = survey_errors.believed_leds_m(inside, sources.place[:, :3], told)
     board = layout.board_of(light.layout, sources.id)
@@ -28,7 +28,10 @@ def believed_dome(scene: Scene, light: DomeConfig, sources: Sources) -> LedMap:
 
 
 def believed_lever(scene: Scene, mount: Mount) -> Lever:
-    """The camera's place on the vehicle as it was told, else as it was surveyed; its attitude is known."""
+    """The camera's lever arm that the tracker assumes: `believed_camera_body_m`, else the true one with survey error.
+
+    The camera's attitude on the vehicle is known exactly.
+    """
     told = scene.tracker.survey
     arm_m = scene.tracker.believed_camera_body_m or survey_errors.believed_m(
         mount.camera_body_m, told.lever_sigma_m, told.seed, "lever"
@@ -37,9 +40,9 @@ def believed_lever(scene: Scene, mount: Mount) -> Lever:
 
 
 def surveyed_dome(scene: Scene, path: str, leds: LedMap, lever: Lever) -> tuple[Camera, LedMap, Lever]:
-    """Camera, LEDs and lever from the file of a survey; surface and boards as they are believed without it.
+    """Camera, LEDs and lever arm from a survey's file; surface and boards stay those of the given LedMap.
 
-    One sigma stands for all LEDs, the median of the file's. Raises BadInput for a file that is of another dome.
+    One sigma serves for all LEDs, the median of the file's. Raises InputError for a file of another dome or camera.
     """
     told = dome_map_file.read_dome_map(Path(path))
     size_px = (scene.camera.width_px, scene.camera.height_px)
@@ -66,7 +69,7 @@ def surveyed_dome(scene: Scene, path: str, leds: LedMap, lever: Lever) -> tuple[
 
 
 def believed_camera(scene: Scene) -> Camera:
-    """The calibration in the tracker's head."""
+    """The camera calibration that the tracker uses."""
     told, true = scene.tracker, calibration(scene.camera)
     if told.believed_distortion is not None:
         true = replace(true, distortion=told.believed_distortion)
@@ -75,5 +78,5 @@ def believed_camera(scene: Scene) -> Camera:
 
 
 def calibration(camera: CameraPart) -> Camera:
-    """A perfect calibration of a camera, in the tracker's own terms."""
+    """The exact calibration of a camera, as the estimator's Camera."""
     return Camera(camera.width_px, camera.height_px, camera.focal_px, camera.centre_px, camera.distortion)

@@ -1,4 +1,4 @@
-"""Settings of the tracker from a scene; names of algorithms are checked here."""
+"""Settings of the tracker from a scene; the names of algorithms are checked here."""
 
 from __future__ import annotations
 
@@ -19,7 +19,10 @@ from skysim.scene.scene import Scene
 
 
 def believed_settings(scene: Scene) -> Settings:
-    """The tracker's algorithms and thresholds as the scene names them. Raises BadInput for a wrong name."""
+    """The tracker's algorithms and thresholds as the scene sets them. Raises InputError for an unknown name.
+
+    What the scene leaves out depends on the light: a dome uses the local detector, centers of gravity and LED pairs.
+    """
     part, usual = scene.tracker, Settings()
     near = isinstance(scene.light, DomeConfig)
     return Settings(
@@ -46,7 +49,7 @@ def believed_settings(scene: Scene) -> Settings:
 
 
 def choices(scene: Scene) -> dict[str, tuple[str, ...]]:
-    """Every algorithm that a scene's tracker may name, by stage."""
+    """All algorithms that a scene's tracker may name, by stage."""
     near = isinstance(scene.light, DomeConfig)
     return {
         "detector": tuple(DETECTORS),
@@ -57,7 +60,10 @@ def choices(scene: Scene) -> dict[str, tuple[str, ...]]:
 
 
 def known(key: str, name: str, algorithms: Mapping[str, object]) -> str:
-    """The name, if there is such an algorithm: only the estimator knows, and scene.py may not ask it."""
+    """Return the name if it is one of the algorithms, else raise InputError.
+
+    Only the estimator has the list, and the scene package may not import it, so the name is checked here.
+    """
     try:
         return require_member(name, algorithms)
     except ValueError as error:

@@ -1,1 +1,1 @@
-"""The detector: fixed pattern, noise, charge transfer and cosmic rays, one function a step."""
+"""The detector: fixed pattern, noise, charge transfer and cosmic rays, one function per step."""

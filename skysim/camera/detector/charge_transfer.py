@@ -1,4 +1,4 @@
-"""Charge that does not stay where the light put it: blooming, transfer loss and smear, in place on a frame.
+"""Charge transport in the chip: blooming, transfer loss and smear, in place on a frame.
 
 A frame is (H, W) electrons, float32 or float64. It is read out towards row 0 and then towards column 0: the packet
 of pixel (x, y) makes y + 1 parallel and x + 1 serial transfers.
@@ -17,19 +17,18 @@ from numpy.typing import NDArray
 from skysim.core.jit import jit
 from skysim.core.types import Floats
 
-BLOCK = 64  # columns worked at together: a few cache lines of every row
-TAIL = 1e-6  # share of a packet below which its places are not told apart
+BLOCK = 64  # columns processed together: a few cache lines of every row
+TAIL = 1e-6  # fraction of a packet that the table of late shares does not resolve
 
 
 def bloom(electrons: NDArray[Any], full_well_e: float, anti_blooming: float = 0.0) -> None:
-    """What a full well cannot hold goes in halves to the two neighbours in its column, and on, until all fits.
+    """Spread charge above the full well along its column: half of each excess to either neighbor, until all fits.
 
-    anti_blooming : share of every pixel's excess that a drain takes first; the rest is conserved, but for what runs
-        off the ends of the column, which is lost.
-    Where the halving ends does not depend on its order, and it keeps the charge's centre as well as its sum (the
-    divisible sandpile in one dimension: Levine & Peres 2009, Potential Anal. 30, 1; `assumed`). From these two
-    conserved numbers the ends of the streak follow without a single halving, see `_settle`. Columns without excess
-    are only looked at.
+    anti_blooming : fraction of every pixel's excess that a drain removes first; the rest is conserved, except for
+        what leaves the ends of the column, which is lost.
+    The final state does not depend on the order of the halvings, and it conserves the charge's sum and first moment
+    (the divisible sandpile in one dimension: Levine & Peres 2009, Potential Anal. 30, 1; `assumed`). These two
+    conserved numbers give the ends of the streak directly, see `_settle`. Columns without excess are skipped.
     """
     over = np.flatnonzero(electrons.max(axis=0) > full_well_e)
     if len(over):
@@ -43,11 +42,12 @@ def _bloom(
     height = electrons.shape[0]
     for k in numba.prange(len(over)):
         x = over[k]
-        room = np.empty(height)  # negative where there is too much
+        room = np.empty(height)  # remaining capacity; negative: excess
         first, last = height, -1
         for y in range(height):
             room[y] = full_well_e - electrons[y, x]
             if room[y] < 0:
+                # The drain takes its fraction of the excess before the rest spreads.
                 room[y] *= 1 - anti_blooming
                 first, last = min(first, y), max(last, y)
         for y in range(height):
@@ -55,22 +55,25 @@ def _bloom(
                 a, b = _settle(room, y)
                 first, last = min(first, a), max(last, b)
         for y in range(max(first, 0), min(last, height - 1) + 1):
+            # Back from remaining capacity to charge, only where something changed.
             electrons[y, x] = full_well_e - room[y]
 
 
 @jit
 def _settle(room: Floats, y: int) -> tuple[int, int]:
-    """Spread the excess of pixel y until it and all it reaches are full; returns the two ends, full in part.
+    """Spread the excess of pixel y until it fits; return the two ends of the streak, which are filled partly.
 
-    Between the ends a and b, not yet full, everything is; what is left over lands on these two, and sum and first
-    moment say how much on each (the lever). One that cannot hold its part joins the full ones, or gives its own
-    excess if it has any. Beyond the column's ends there is room for everything, and it is lost.
+    All pixels between the ends a and b are full. The charge that is left over, `left` with its first moment `moment`
+    about y, is split between a and b so that sum and first moment are conserved (the lever rule). An end pixel that
+    cannot hold its part is filled and the end moves on; if that pixel has excess itself (negative room), its excess
+    joins the charge to spread. Beyond the column's ends any amount fits, and is lost.
     """
     height = len(room)
     left, moment = -room[y], 0.0  # moment about y
     room[y] = 0.0
     a, b = y - 1, y + 1
     while True:
+        # Lever rule: the charge left over is split so that its sum and its moment about y are conserved.
         to_b = (moment + left * (y - a)) / (b - a)
         to_a = left - to_b
         if a >= 0 and to_a > room[a]:
@@ -91,11 +94,12 @@ def _settle(room: Floats, y: int) -> tuple[int, int]:
 
 
 def transfer_loss(electrons: NDArray[Any], cti_parallel: float, cti_serial: float) -> None:
-    """Every transfer leaves a share behind, which follows in the next packet: tails that point away from read-out.
+    """Charge-transfer inefficiency: every transfer leaves a fraction behind, which joins the next packet:
+    trailing tails.
 
-    cti_parallel, cti_serial : that share, the same for every charge (linear, no traps that fill).
-    Of a packet that makes n transfers, C(n + k - 1, k) cti^k (1 - cti)^n comes out k places late: it takes k
-    failures before the n-th success, the negative binomial law. What comes later than the frame's last row or
+    cti_parallel, cti_serial : that fraction, the same for every charge (linear, no traps that fill).
+    Of a packet that makes n transfers, C(n + k - 1, k) cti^k (1 - cti)^n arrives k pixels late: it takes k
+    failures before the n-th success, the negative binomial law. What arrives later than the frame's last row or
     column is in the overscan and not in the frame; nothing else is lost.
     """
     height, width = electrons.shape
@@ -107,9 +111,9 @@ def transfer_loss(electrons: NDArray[Any], cti_parallel: float, cti_serial: floa
 
 @functools.lru_cache(maxsize=8)
 def late_shares(transfers: int, cti: float) -> Floats:
-    """(K + 1, transfers) share of the packet of n + 1 transfers that comes k places late; columns add up to 1.
+    """(K + 1, transfers) fraction of the packet of n + 1 transfers that arrives k pixels late; columns add up to 1.
 
-    Ends where less than 1e-6 of the longest way's charge is later still, and counts that as K places late.
+    K is where less than 1e-6 of the charge with the most transfers is later still; that is counted as K pixels late.
     """
     last = int(scipy.stats.nbinom.ppf(1 - TAIL, transfers, 1 - cti))
     late, n = np.arange(last + 1)[:, None], np.arange(1, transfers + 1)
@@ -121,11 +125,12 @@ def late_shares(transfers: int, cti: float) -> Floats:
 
 @jit(parallel=True)
 def _late_rows(electrons: NDArray[Any], share: Floats) -> None:
-    """From the last row to the first, each gathers what the rows before it left: those are still as they were."""
+    """Apply the parallel loss from the last row to the first: each row gathers from rows that are not yet changed."""
     height, width = electrons.shape
     for block in numba.prange((width + BLOCK - 1) // BLOCK):
         x0, x1 = block * BLOCK, min((block + 1) * BLOCK, width)
         gathered = np.empty(BLOCK, dtype=electrons.dtype)
+        # Backwards, so that the rows that row y gathers from still hold the charge before transfer.
         for y in range(height - 1, -1, -1):
             gathered[:] = 0
             for k in range(min(len(share), y + 1)):
@@ -149,28 +154,30 @@ def _late_columns(electrons: NDArray[Any], share: Floats) -> None:
 
 
 def frame_transfer_smear(light_e: NDArray[Any], exposure_s: float, row_time_s: float) -> None:
-    """Charge that is shifted under light takes some of every row's, row_time / exposure of what it gave.
+    """Smear of a frame-transfer chip: rows shifted under light collect row_time / exposure of the light of every
+    row passed.
 
-    light_e : the exposure's light (in place it gains the smear); dark current is the same in any row.
-    The chip is emptied into its store row by row before the exposure as after it. A pixel that ends at row y came
-    in with nothing over the rows above y (greater y) and goes out over those below, row_time in each: once every
-    other row of its column, before or after, as bright as in the exposure.
+    light_e : light of the exposure; the smear is added in place. Dark current is the same in every row, so it
+        is not affected.
+    The chip is shifted into its store row by row before the exposure as after it. A pixel that ends at row y was
+    shifted in, empty, over the rows above y (greater y) and is shifted out over those below, for row_time in each.
+    So it passes every other row of its column once, with the same brightness as in the exposure.
     """
     _smear(light_e, row_time_s / exposure_s)
 
 
 def interline_smear(light_e: NDArray[Any], exposure_s: float, row_time_s: float, leak: float) -> None:
-    """A covered register takes `leak` of the light of every row that it passes: smear as above, times the leak.
+    """Smear of an interline chip: the covered register collects `leak` of the light of every row passed.
 
-    light_e : the exposure's light (in place it gains the smear). The register runs all the time, so that the place
-    that takes over a pixel's charge has passed the rows above it and will pass those below.
+    light_e : light of the exposure; the smear is added in place. The register is clocked all the time, so
+        the register cell that takes over a pixel's charge has passed the rows above it and will pass those below.
     """
     _smear(light_e, leak * row_time_s / exposure_s)
 
 
 @jit(parallel=True)
 def _smear(light_e: NDArray[Any], share: float) -> None:
-    """Add a share of the rest of its column to every pixel."""
+    """Add to every pixel a fraction of the sum of the other pixels in its column."""
     height, width = light_e.shape
     for block in numba.prange((width + BLOCK - 1) // BLOCK):
         x0, x1 = block * BLOCK, min((block + 1) * BLOCK, width)

@@ -1,4 +1,4 @@
-"""Ionising particles: straight tracks of charge through the chip, light or no light."""
+"""Ionizing particles: straight tracks of charge through the chip, with or without light."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ STEP_PX = 0.25
 # Landau's scale 0.1535 MeV cm^2/g x Z/A 0.498 x 2.33 g/cm^3 = 17.8 eV a micrometre, 4.9 electrons of 3.65 eV, over
 # 80 most probable ones (`assumed`, for a fast singly charged particle). Layers of a few micrometres straggle more.
 WIDTH = 0.06
-MOST_ASLANT = 100.0  # tangent of the steepest angle from the normal; 1e-4 of an isotropic flux is beyond
+MOST_ASLANT = 100.0  # tangent of the largest angle from the normal; 1e-4 of an isotropic flux is beyond
 MOST_TRACKS = 1_000_000
 
 TRACK = np.dtype(
@@ -43,11 +43,11 @@ def hit(
     particles: Sequence[ParticlesConfig],
     rng: np.random.Generator,
 ) -> NDArray[Any]:
-    """Add the tracks of an exposure to a frame of electrons (in place, float32 or float64).
+    """Add the particle tracks of an exposure to a frame of electrons (in place, float32 or float64).
 
-    Returns the truth of those that left charge on the chip, a structured array of dtype TRACK: where the particle
-    went in at the front and out at the back (pixels, also outside of the frame), its way through the layer, the
-    charge that it set free and how much of that the frame has.
+    Returns the truth of the tracks that left charge on the chip, a structured array of dtype TRACK: entry at the
+    front and exit at the back (pixels, also outside of the frame), path length through the layer, charge released,
+    and the charge that fell on the frame.
     """
     tracks = [tracks_of(part, electrons.shape, exposure_s, pixel_m, rng) for part in particles]
     for part, some in zip(particles, tracks, strict=True):
@@ -60,17 +60,18 @@ def hit(
 def tracks_of(
     part: ParticlesConfig, shape: tuple[int, ...], exposure_s: float, pixel_m: float, rng: np.random.Generator
 ) -> NDArray[Any]:
-    """Every track that could touch a chip of this shape (H, W): its ends, its length and its charge.
+    """Draw every track that could reach a chip of this shape (H, W): its ends, length and charge.
 
-    per_cm2_s counts the particles that cross a square centimetre of the chip's plane in a second, from either
-    side; an isotropic flux of J through a sphere of 1 cm^2 section gives J / 2. They come from all directions alike,
-    but a plate is seen foreshortened: p(theta) = 2 sin(theta) cos(theta) = sin(2 theta) from its normal, so
-    cos^2(theta) is uniform. The way through is depth / cos(theta). Its charge is Moyal's law (1955, Phil. Mag. 46,
-    263) about the most probable electrons_um times the length, of scale WIDTH times that. More than MOST_TRACKS are
-    refused (InputError).
+    per_cm2_s counts the particles that cross a square centimeter of the chip's plane in a second, from either
+    side; an isotropic flux of J through a sphere of 1 cm^2 section gives J / 2. Directions are isotropic, but
+    the chip is
+    foreshortened: p(theta) = 2 sin(theta) cos(theta) = sin(2 theta) from its normal, so cos^2(theta) is uniform.
+    The path length is depth / cos(theta). The charge follows Moyal's law (1955, Phil. Mag. 46, 263) about the most
+    probable value, electrons_um times the length, with a scale of WIDTH times that. More than MOST_TRACKS raise
+    InputError.
     """
     height, width = shape
-    margin = MOST_ASLANT * part.depth_m / pixel_m  # also those that go in beside the frame and come to it
+    margin = MOST_ASLANT * part.depth_m / pixel_m  # also tracks that enter beside the frame
     area_cm2 = (width + 2 * margin) * (height + 2 * margin) * pixel_m**2 * 1e4
     expected = part.per_cm2_s * area_cm2 * exposure_s
     if expected > MOST_TRACKS:
@@ -80,6 +81,7 @@ def tracks_of(
         )
     count = rng.poisson(expected)
     made = np.zeros(count, TRACK)
+    # cos^2(theta) is uniform; its lower end bounds the tangent by MOST_ASLANT.
     cosine = np.sqrt(rng.uniform(1 / (1 + MOST_ASLANT**2), 1, count))
     azimuth = rng.uniform(0, 2 * np.pi, count)
     reach_px = part.depth_m / pixel_m * np.sqrt(1 / cosine**2 - 1)
@@ -97,9 +99,10 @@ def tracks_of(
 
 @jit
 def deposit(image: NDArray[Any], ends_px: Floats, electrons: Floats, sigma_px: float) -> Floats:
-    """Lay each charge evenly along its track, in steps under a quarter pixel, each a Gaussian integrated by pixels.
+    """Spread each charge evenly along its track, in steps of at most a quarter pixel, each a pixel-integrated
+    Gaussian.
 
-    ends_px (N, 4): x, y in and x, y out. Returns (N,) charge that fell on the frame.
+    ends_px (N, 4): x, y of entry and of exit. Returns (N,) charge that fell on the frame.
     """
     height, width = image.shape
     kept = np.zeros(len(electrons))
@@ -116,6 +119,6 @@ def deposit(image: NDArray[Any], ends_px: Floats, electrons: Floats, sigma_px: f
 
 @jit
 def _share(place: float, size: int, sigma_px: float) -> float:
-    """Of a Gaussian at a place, what lies between the two ends of an axis of so many pixels."""
+    """Fraction of a Gaussian centered at `place` that is within an axis of so many pixels."""
     scale = 1 / (sigma_px * sqrt(2.0))
     return (erf((size - 0.5 - place) * scale) - erf((-0.5 - place) * scale)) / 2

@@ -1,7 +1,7 @@
-"""Mean photo-electrons to digital numbers, one function a step, in the charge's own order.
+"""The detector model: mean photo-electrons to digital numbers, one function per step, in the order of the signal.
 
-Light falls (and smears in the shutter), pixels gather it with the dark current and count, particles hit, full wells
-overflow, transfers lose, the amplifier and the converter read. A step is switched off by its parameter.
+Light and shutter smear, PRNU and dark current, Poisson counting, particles, full well or blooming, transfer loss,
+read noise, nonlinearity and the converter. Each step is switched off by its parameter.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from skysim.sources.photometry import snr
 
 @dataclass(frozen=True, slots=True)
 class Chip:
-    """One chip off the line: its parameters and its own fixed pattern, which comes from its hardware seed.
+    """One chip: its parameters and its fixed pattern, drawn from its hardware seed.
 
     sensitivity     : (H, W) relative, mean 1: PRNU
     dark_e_s        : (H, W) dark current at the chip's temperature, with DSNU and hot pixels
-    column_offset_e : (W,) the columns' amplifiers
+    column_offset_e : (W,) offsets of the column amplifiers
     """
 
     part: DetectorConfig
@@ -56,7 +56,7 @@ class Chip:
 
 
 def sensitivity(part: DetectorConfig, shape: tuple[int, int], rng: Generator) -> NDArray[np.float32]:
-    """Photo-response non-uniformity: a Gaussian share about 1 in each pixel, none below 0."""
+    """Photo-response non-uniformity (PRNU): Gaussian about 1, independent in each pixel, not below 0."""
     if part.prnu == 0:
         return np.ones(shape, np.float32)
     spread = rng.standard_normal(shape, np.float32)
@@ -66,7 +66,7 @@ def sensitivity(part: DetectorConfig, shape: tuple[int, int], rng: Generator) ->
 
 
 def dark_current_e_s(part: DetectorConfig, shape: tuple[int, int], rng: Generator) -> NDArray[np.float32]:
-    """Dark current of every pixel: D = D_ref 2^((T - T_ref) / T_double), D_ref lognormal from pixel to pixel.
+    """Dark current of every pixel: D = D_ref 2^((T - T_ref) / T_double), D_ref lognormal over the pixels.
 
     A lognormal of mean 1 and standard deviation dsnu has s^2 = ln(1 + dsnu^2) and median exp(-s^2 / 2). Hot pixels
     add an exponential of mean hot_e_s. Generation in the depletion region doubles every 6 to 8 K near room
@@ -84,17 +84,17 @@ def dark_current_e_s(part: DetectorConfig, shape: tuple[int, int], rng: Generato
 
 
 def expose(light_e: NDArray[Any], exposure_s: float, chip: Chip, rng: Generator) -> NDArray[Any]:
-    """A frame from its light: charge, then electronics. Returns (H, W) uint16.
+    """Convert a frame's light to digital numbers. Returns (H, W) uint16.
 
-    light_e : (H, W) float32 mean photo-electrons of a perfect pixel, the shutter's `smear` in it; it is used up, its
-              array is worked in
-    With noise off the frame is the expectation itself in digital numbers: of light_e's own type, neither rounded
-    nor clipped, for tests of everything behind it.
+    light_e : (H, W) float32 mean photo-electrons of a perfect pixel, including the shutter's `smear`; overwritten
+    With noise off the frame is the expected value in digital numbers, of light_e's own type, neither rounded nor
+    clipped, for tests of the steps that follow.
     """
     part = chip.part
     if not part.noise:
         return expectation(light_e, exposure_s, chip)
     counting, reading = noise.seeds(rng, len(light_e)), noise.seeds(rng, len(light_e))
+    # With no step between counting and read-out, one fused loop does both, with the same numbers.
     if not (part.particles or part.blooming == "column" or part.cti_parallel or part.cti_serial):
         return count_and_read(light_e, exposure_s, chip, counting, reading)
     count(light_e, exposure_s, chip, counting)
@@ -110,7 +110,7 @@ def expose(light_e: NDArray[Any], exposure_s: float, chip: Chip, rng: Generator)
 
 
 def expectation(light_e: NDArray[Any], exposure_s: float, chip: Chip) -> NDArray[Any]:
-    """Mean digital numbers of a chip that neither fills nor bends, and that no particle hits."""
+    """Expected digital numbers without full well, nonlinearity and particles."""
     part = chip.part
     mean_e = light_e * chip.sensitivity + chip.dark_e_s * exposure_s
     charge_transfer.transfer_loss(mean_e, part.cti_parallel, part.cti_serial)
@@ -118,8 +118,10 @@ def expectation(light_e: NDArray[Any], exposure_s: float, chip: Chip) -> NDArray
 
 
 def smear(light_e: NDArray[Any], exposure_s: float, shutter: Shutter) -> None:
-    """What a shutter of charge lets in while the frame moves (in place). Rolling shutters are in the time integral
-    of render.py."""
+    """Add the smear of a frame-transfer or interline shutter to the light (in place). Other shutters add none.
+
+    Rolling shutters are part of the time integral in render.py.
+    """
     if isinstance(shutter, FrameTransferConfig):
         charge_transfer.frame_transfer_smear(light_e, exposure_s, shutter.row_time_s)
     elif isinstance(shutter, InterlineConfig):
@@ -127,7 +129,7 @@ def smear(light_e: NDArray[Any], exposure_s: float, shutter: Shutter) -> None:
 
 
 class Rules(NamedTuple):
-    """A chip's numbers as the loops take them, single precision."""
+    """Detector parameters for the compiled loops, in single precision."""
 
     exposure_s: np.float32
     well_e: np.float32
@@ -139,14 +141,14 @@ class Rules(NamedTuple):
 
 
 def rules(part: DetectorConfig, exposure_s: float) -> Rules:
-    """What _gather and _convert need to know."""
+    """The parameters that _gather and _convert need."""
     numbers = (
         exposure_s,
         np.inf if part.blooming == "column" else part.full_well_e,
         hypot(part.read_noise_e, part.reset_noise_e),
         part.nonlinearity / part.full_well_e,
         1 / part.gain_e_dn,
-        part.offset_dn + 0.5,  # what is cut off after this is rounded
+        part.offset_dn + 0.5,  # truncation after adding 0.5 rounds
         2**part.bits - 1,
     )
     return Rules(*map(np.float32, numbers))
@@ -154,22 +156,22 @@ def rules(part: DetectorConfig, exposure_s: float) -> Rules:
 
 @jit
 def _gather(row: Any, sensitivity: Any, dark_e_s: Any, rules: Rules, seed: Any, tables: noise.Tables) -> None:
-    """Electrons are counted, light and dark together: Poisson, variance equal to the mean. One row, in place.
+    """Count electrons, light and dark together: Poisson, variance equal to the mean. One row, in place.
 
-    PRNU is a pixel's own quantum efficiency, so it scales the mean and the sum stays a Poisson variable.
+    PRNU is a pixel's relative quantum efficiency, so it scales the mean and the sum stays a Poisson variable.
     """
     for x in range(row.size):
-        # An interpolated image may dip below zero by a millionth.
+        # Interpolated images may be slightly negative (about 1e-6).
         row[x] = max(row[x], float32(0)) * sensitivity[x] + dark_e_s[x] * rules.exposure_s
     noise.count(row, seed, tables)
 
 
 @jit
 def _convert(row: Any, offset_e: Any, rules: Rules, seed: Any, tables: noise.Tables, numbers: Any) -> None:
-    """Charge to numbers: full well, column offset and Gaussian noise, the amplifier's bend, gain, rounding, the ends.
+    """Convert charge to numbers: full well, column offset and read noise, nonlinearity, gain, rounding, clipping.
 
-    A well that does not bloom holds no more than its capacity. The amplifier gives e (1 - nonlinearity e / full_well);
-    DN = round(that / gain + offset), within the bits.
+    Without blooming a well holds at most its capacity. The amplifier gives e (1 - nonlinearity e / full_well);
+    DN = round(that / gain + offset), clipped to the converter's bits.
     """
     random = np.empty(row.size, np.float32)
     noise.normal(random, seed, tables)
@@ -193,7 +195,7 @@ def _count(
 
 
 def read_out(electrons: NDArray[Any], chip: Chip, seeds: NDArray[np.uint64]) -> NDArray[np.uint16]:
-    """Electrons to numbers; see _convert."""
+    """Electrons to digital numbers; see _convert."""
     frame = np.empty(electrons.shape, np.uint16)
     _read_out(electrons, chip.column_offset_e, rules(chip.part, 0.0), seeds, noise.tables(), frame)
     return frame
@@ -214,7 +216,9 @@ def count_and_read(
     counting: NDArray[np.uint64],
     reading: NDArray[np.uint64],
 ) -> NDArray[np.uint16]:
-    """`count` and `read_out` row by row, where no charge leaves its row in between: the same numbers, sooner."""
+    """`count` and `read_out` fused row by row: the same numbers, faster. Only if no charge leaves its
+    row in between.
+    """
     frame = np.empty(light_e.shape, np.uint16)
     pattern = (chip.sensitivity, chip.dark_e_s, chip.column_offset_e)
     _count_and_read(light_e, *pattern, rules(chip.part, exposure_s), counting, reading, noise.tables(), frame)
@@ -239,8 +243,8 @@ def _count_and_read(
 
 
 def saturation_dn(part: DetectorConfig) -> float:
-    """The digital number from which a pixel tells nothing more: full well, less three sigma of what read-out
-    adds to it, or the converter's end.
+    """The digital number from which a pixel counts as saturated: full well less three sigma of the read-out noise,
+    or the converter's maximum.
     """
     well_e = part.full_well_e - 3 * hypot(part.read_noise_e, part.reset_noise_e)
     well_dn = well_e * (1 - part.nonlinearity * well_e / part.full_well_e) / part.gain_e_dn + part.offset_dn
@@ -248,19 +252,20 @@ def saturation_dn(part: DetectorConfig) -> float:
 
 
 def judge(seen: SourceTruth, light_e: NDArray[Any], exposure_s: float, chip: Chip) -> SourceTruth:
-    """Which sources are expected to saturate, and how far each stands out of the noise.
+    """Which sources are expected to saturate, and the signal-to-noise ratio of each.
 
-    light_e : (H, W) mean photo-electrons of the whole frame, smear included, before `expose` uses it up
-    Both are of the light that falls: what a full well or the amplifier's bend then hides is not taken off.
-    Saturated is a source in whose brightest pixel the expectation reaches `saturation_dn`. The signal to noise is
-    the CCD equation's over the noise-equivalent area of its image, with all else that falls on its brightest
-    pixel as background, and the converter's rounding among the read noise.
+    light_e : (H, W) mean photo-electrons of the whole frame, smear included, before `expose` overwrites it
+    Both use the incident light: losses by full well or nonlinearity are not subtracted. A source is saturated if the
+    expected value in its brightest pixel reaches `saturation_dn`. The ratio is that of the CCD equation over the
+    noise-equivalent area of its image, with all other charge in its brightest pixel as background, and with the
+    converter's rounding added to the read noise.
     """
     part = chip.part
     x, y = seen.peak_xy.T
     own_e = seen.peak_e * chip.sensitivity[y, x]
     mean_e = light_e[y, x] * chip.sensitivity[y, x] + chip.dark_e_s[y, x] * exposure_s
     bent = mean_e * (1 - part.nonlinearity * np.minimum(mean_e / part.full_well_e, 1))
+    # The relative nonlinearity is held at its value at full well, since beyond it the parabola turns down.
     full = bent / part.gain_e_dn + part.offset_dn >= saturation_dn(part)
     noise_e = np.sqrt(part.read_noise_e**2 + part.reset_noise_e**2 + part.gain_e_dn**2 / 12)
     ratio = snr(seen.electrons, seen.area_px, np.maximum(mean_e - own_e, 0), noise_e)

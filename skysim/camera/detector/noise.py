@@ -1,8 +1,13 @@
-"""Random counts and random numbers for millions of pixels: exact, and less than one 64-bit draw a pixel.
+"""Fast exact random numbers for millions of pixels: Poisson counts and Gaussian read noise.
 
-Every row of a frame has its own stream, SplitMix64 (Steele, Lea & Flood 2014) from a seed that the frame's generator
-drew, so that rows may be done in any order by any number of threads with the same outcome. A stream's state is one
-integer; the functions take it and give it back.
+Photo-electrons follow a Poisson law of the expected number in each pixel; read noise is normal. `count` draws the
+Poisson numbers: below FEW_E electrons by inversion of the distribution function with a guide table, above by the PD
+algorithm of Ahrens & Dieter (1982), which corrects a rounded normal number so that the law is exact. `normal` uses
+the ziggurat of Marsaglia & Tsang (2000). Both take less than one 64-bit draw per pixel on average.
+
+Every row of a frame has its own SplitMix64 stream (Steele, Lea & Flood 2014) from a seed that the frame's generator
+drew, so the result does not depend on the order of the rows or the number of threads. A stream's state is one
+integer; the functions take it and return its next value.
 """
 
 from __future__ import annotations
@@ -18,11 +23,11 @@ from numpy.typing import NDArray
 
 from skysim.core.jit import jit
 
-BUCKETS = 1024  # ten bits, six times in a draw: the tables of a dark frame then fit the fastest cache
-PER_E = 128  # guide tables an electron
-FEW_E = 16.0  # above it counts are a corrected Gaussian
-UNSURE = 255
-LAYERS = 512  # nine bits, and 23 to go across a layer: two numbers a draw
+BUCKETS = 1024  # ten bits, six pixels per draw; the rows of a dark frame's means then fit the L1 cache
+PER_E = 128  # guide tables per electron of mean
+FEW_E = 16.0  # means above it use the PD algorithm
+UNSURE = 255  # entry of the guide table for buckets that more than one count shares
+LAYERS = 512  # nine bits for the layer and 23 for the position in it: two numbers per draw
 HALF = 2.0**22
 
 GAMMA = 0x9E3779B97F4A7C15
@@ -30,12 +35,12 @@ MIX1, MIX2 = 0xBF58476D1CE4E5B9, 0x94D049BB133111EB
 
 
 class Tables(NamedTuple):
-    """What the draws look up.
+    """Lookup tables of the draws.
 
-    guide : (FEW_E * PER_E, BUCKETS) counts: row k holds the Poisson law of any mean from k to k + 1 steps, bucket b
-            the count that a uniform number in [b, b + 1) / BUCKETS stands for, or UNSURE
+    guide : (FEW_E * PER_E, BUCKETS) counts: row k is for means from k / PER_E to (k + 1) / PER_E, bucket b holds the
+            count of every uniform number in [b, b + 1) / BUCKETS, or UNSURE
     edge, height : (LAYERS + 1,) the ziggurat's corners x and exp(-x^2 / 2)
-    width, sure  : (LAYERS,) x and the next x over x, in steps of the signed 23-bit number that falls across a layer
+    width, sure  : (LAYERS,) x and the next x over x, in steps of the signed 23-bit position in a layer
     """
 
     guide: NDArray[np.uint8]
@@ -47,7 +52,7 @@ class Tables(NamedTuple):
 
 @lru_cache(maxsize=1)
 def tables() -> Tables:
-    """Made once a process, in 20 ms."""
+    """The tables, made once per process in 20 ms."""
     edge = ziggurat()
     width = (edge[:LAYERS] / HALF).astype(np.float32)
     sure = (edge[1:] / edge[:LAYERS] * HALF).astype(np.int32)
@@ -55,15 +60,15 @@ def tables() -> Tables:
 
 
 def seeds(rng: Generator, rows: int) -> NDArray[np.uint64]:
-    """A stream for every row."""
+    """A seed for the stream of every row."""
     return rng.integers(0, 2**64, rows, dtype=np.uint64)
 
 
 def ziggurat() -> NDArray[np.float64]:
     """(LAYERS + 1,) corners of layers of equal area under exp(-x^2 / 2) (Marsaglia & Tsang 2000).
 
-    The lowest layer holds the tail beyond r: its corner is area / height, and the tower built on r ends at the
-    peak for one r alone, found by bisection.
+    The lowest layer holds the tail beyond r: its corner is area / height. The layers built on r reach exactly the
+    peak for only one r, found by bisection.
     """
 
     def tower(r: float) -> tuple[NDArray[np.float64], bool]:
@@ -80,7 +85,7 @@ def ziggurat() -> NDArray[np.float64]:
     low, high = 3.0, 5.0
     for _ in range(60):
         middle = (low + high) / 2
-        low, high = (middle, high) if tower(middle)[1] else (low, middle)  # an r too small overfills it
+        low, high = (middle, high) if tower(middle)[1] else (low, middle)  # an r too small passes the peak
     x = tower(high)[0]
     x[LAYERS] = 0.0
     return x
@@ -88,8 +93,12 @@ def ziggurat() -> NDArray[np.float64]:
 
 @jit
 def _guide() -> Any:
-    """A count is sure where the whole bucket lies above F(n - 1) of the smallest mean and below F(n) of the
-    greatest: F falls with the mean. Unsure is 1/PER_E of the numbers, and a bucket at every step of F."""
+    """The guide table of the Poisson law for small means.
+
+    A count n is certain where the whole bucket is above F(n - 1) of the smallest mean and below F(n) of the greatest
+    mean of the row, since F falls with the mean. The other buckets, one at each step of F and 1/PER_E of the
+    numbers, are UNSURE.
+    """
     rows = int(FEW_E * PER_E)
     guide = np.empty((rows, BUCKETS), np.uint8)
     for k in range(rows):
@@ -108,7 +117,7 @@ def _guide() -> Any:
 
 @jit(inline="always")
 def draw(state: Any) -> Any:
-    """64 random bits and the stream's next state."""
+    """64 random bits (SplitMix64) and the stream's next state."""
     state += uint64(GAMMA)
     z = (state ^ (state >> uint64(30))) * uint64(MIX1)
     z = (z ^ (z >> uint64(27))) * uint64(MIX2)
@@ -117,7 +126,7 @@ def draw(state: Any) -> Any:
 
 @jit(inline="always")
 def _uniform(state: Any) -> Any:
-    """A number within (0, 1), 52 bits of it, and the next state."""
+    """A uniform number in (0, 1) with 52 bits, and the next state."""
     bits, state = draw(state)
     return (float64(int64(bits >> uint64(12))) + 0.5) * 2.0**-52, state
 
@@ -126,15 +135,17 @@ def _uniform(state: Any) -> Any:
 def count(row: Any, state: Any, tables: Tables) -> Any:
     """Turn a row of means >= 0 into Poisson counts, exactly, in place. Returns the stream's next state.
 
-    Small means by inversion: ten bits choose the guide's bucket, and only where the count is unsure are more bits
-    drawn and the law summed at this very mean. Great ones by Ahrens & Dieter's PD (1982).
+    Small means use inversion: ten bits choose the guide's bucket, and only where the count is not certain more bits
+    are drawn and the law is summed at the exact mean. Large means use Ahrens & Dieter's PD (1982), see
+    `_count_many`.
     """
     later, many = np.empty(row.size, np.int32), 0
     bits = uint64(0)
     for x in range(row.size):
+        # One draw of 64 bits serves six pixels of ten bits each.
         if x % 6 == 0:
             bits, state = draw(state)
-        bucket = bits & uint64(BUCKETS - 1)  # unsigned indices are not tested for being negative
+        bucket = bits & uint64(BUCKETS - 1)  # unsigned: saves numba's check for negative indices
         bits >>= uint64(10)
         mean = row[x]
         if mean < float32(FEW_E):
@@ -153,7 +164,7 @@ def count(row: Any, state: Any, tables: Tables) -> Any:
 
 @jit
 def _invert(mean: Any, u: Any) -> Any:
-    """The least n with F(n) > u."""
+    """The least n with F(n) > u, by summing the Poisson law."""
     n, p = 0.0, exp(-mean)
     total = p
     while u >= total and n < 1000.0:
@@ -165,10 +176,11 @@ def _invert(mean: Any, u: Any) -> Any:
 
 @jit
 def _count_many(row: Any, which: Any, state: Any, edge: Any, height: Any, width: Any, sure: Any) -> Any:
-    """The same for the chosen pixels of a row, whose means are ten or more.
+    """Poisson counts for the chosen pixels of a row, with means of at least ten.
 
-    PD: the floor of a Gaussian of the same mean and variance, which is right but for a part of order mean^-1/2; that
-    is told by a squeeze (u >= (mean - k)^3 / (6 mean^2) accepts) and mended in `_mend`.
+    PD: the floor of a normal number of the same mean and variance has the Poisson law but for an error of order
+    mean^-1/2. A squeeze accepts most numbers without computing the law: u >= (mean - k)^3 / (6 mean^2). The rest go
+    to `_mend`, which accepts or replaces them so that the law is exact.
     """
     for x in which:
         mean = float64(row[x])
@@ -176,11 +188,13 @@ def _count_many(row: Any, which: Any, state: Any, edge: Any, height: Any, width:
         bits, state = draw(state)
         layer, across = uint32(bits) & uint32(LAYERS - 1), int32(uint32(bits)) >> int32(9)
         g = float32(across) * width[layer]
+        # Inside the next, narrower layer the position is accepted; about 1 in 160 is not.
         if abs(across) >= sure[layer]:
             g, state = _edge(int64(across), int64(layer), state, edge, height)
         k = np.floor(mean + sigma * g)
         u = float64(int64(bits >> uint64(32))) * 2.0**-32
         short = mean - k
+        # PD accepts every k above mean - 1.1484 at once, and the squeeze most of the others.
         if min(short, short * short * short - 6 * mean * mean * u) > 1.1484:
             k, state = _mend(mean, sigma, k, u, state)
         row[x] = k
@@ -210,7 +224,7 @@ def _mend(mean: float, sigma: float, k: float, u: float, state: Any) -> Any:
 
 @jit
 def _densities(mean: float, sigma: float, k: float) -> Any:
-    """PD's procedure F: the Poisson probability of k is py exp(px), the discrete normal's near fy exp(fx).
+    """PD's procedure F: the Poisson probability of k is py exp(px), that of the discrete normal is about fy exp(fx).
 
     k >= 10 by Stirling's series: px = k (log(1 + v) - v) - 1/(12 k) + ..., v = (mean - k) / k.
     """
@@ -221,6 +235,7 @@ def _densities(mean: float, sigma: float, k: float) -> Any:
     else:
         v = (mean - k) / k
         r = 1 / (k * k)
+        # Stirling's series with k (log(1 + v) - v) avoids cancellation of large terms.
         px = k * (np.log1p(v) - v) - (1 / 12 - (1 / 360 - r / 1260) * r) / k
         py = 1 / sqrt(2 * pi * k)
     x2 = ((0.5 - mean + k) / sigma) ** 2
@@ -238,8 +253,8 @@ def _densities(mean: float, sigma: float, k: float) -> Any:
 def normal(row: Any, state: Any, tables: Tables) -> Any:
     """Fill a row with standard normal numbers by the ziggurat. Returns the stream's next state.
 
-    Of 32 bits nine choose the layer, 23 with their sign the place across it; 99.4 % need no more. (The same lines
-    stand in `_count_many`: a function handed the tables would count references to them, which is ten times the work.)
+    Of 32 bits nine choose the layer and 23, signed, the position in it; 99.4 % need no more. (`_count_many` repeats
+    these lines: a function that takes the Tables tuple would count references to its arrays, ten times the work.)
     """
     for x in range(0, row.size, 2):
         bits, state = draw(state)
@@ -255,7 +270,7 @@ def normal(row: Any, state: Any, tables: Tables) -> Any:
 
 @jit
 def _edge(across: Any, layer: Any, state: Any, edge: Any, height: Any) -> Any:
-    """The ziggurat's corners by comparison with the density, its tail by Marsaglia's exponential."""
+    """The ziggurat's slow path: test the position against the density, or draw from the tail in the lowest layer."""
     while True:
         x = across * (edge[layer] / HALF)
         if abs(x) < edge[layer + 1]:

@@ -1,3 +1,3 @@
-"""The point-spread function: transfer functions, pixel-integrated kernels, their cache, and the loop that
-adds them to pixels.
+"""The point-spread function: transfer functions, pixel-integrated kernels, their cache, and the loops that add them
+to pixels.
 """

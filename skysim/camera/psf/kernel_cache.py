@@ -1,4 +1,4 @@
-"""Which image each source of a frame makes: kernels fetched, shared, and laid out for compiled code."""
+"""Assign each source of a frame its kernel: look kernels up, share them, and lay them out for compiled code."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from skysim.core.types import Floats
 from skysim.scene.camera import CameraConfig
 
 GAUSS, ROUND, GRID = 0, 1, 2
-PACKED = np.array([1 << 42, 1 << 21, 1])  # three sizes in steps of 0.01 px as one whole number
+PACKED = np.array([1 << 42, 1 << 21, 1])  # packs three sizes, in steps of 0.01 px, into one integer
 
 
 class Images(NamedTuple):
@@ -25,9 +25,9 @@ class Images(NamedTuple):
     kind     : (N,) GAUSS, ROUND or GRID
     sigma_px : (N,) of a Gaussian
     reach_px : (N,) no light beyond it in x or in y
-    sharp_px : (N,) the sharpest feature: brightness falls by 1/e of its scale over this
-    table    : (N, 4) where in `tables` the source's own begins and ends, and two sizes of its shape
-    tables   : every table that is needed, end to end
+    sharp_px : (N,) size of the sharpest feature, see `sharpness_px`
+    table    : (N, 4) begin and end of the source's table in `tables`, and two sizes of its shape
+    tables   : all tables that are needed, end to end
     """
 
     kind: NDArray[np.int64]
@@ -39,21 +39,21 @@ class Images(NamedTuple):
 
 
 class KernelCache(NamedTuple):
-    """A camera's kernels, laid end to end as they come into use; a key's row of each list is its place."""
+    """A camera's kernels, laid end to end in the order of first use; `places` gives a key's row in each list."""
 
     places: dict[tuple[int, ...], int]
     kernels: list[tuple[int, float, float, float]]  # kind, sigma_px, reach_px, sharp_px
     spans: list[tuple[int, int, int, int]]
-    tables: list[Singles]  # one, all of them joined
+    tables: list[Singles]  # one element: all tables joined
 
 
 SHELF_BYTES = 1 << 27
-MOST_PX = 500.0  # larger discs are no images, and their tables are large
+MOST_PX = 500.0  # largest radius of an image: beyond, tables are too large
 
 
 @lru_cache(maxsize=16)
 def shelf(camera: CameraConfig) -> KernelCache:
-    """Empty at first."""
+    """The kernel cache of a camera, empty at first."""
     return KernelCache({}, [], [], [np.empty(0, np.float32)])
 
 
@@ -65,11 +65,11 @@ def images(
     distance_m: Floats,
     cos_field: Floats,
 ) -> Images:
-    """What N sources look like on the chip.
+    """The kernels of N sources.
 
-    middle_px  : (N, 2) where they stand, for the blur that grows with the field; NaN is taken for the centre
+    middle_px  : (N, 2) image positions, for the blur that grows with the field; NaN is taken as the principal point
     radius_m   : (N,) of the emitting disc, 0 for a star; drawn as a round disc of angular radius radius / distance
-    near       : (N,) LEDs, which may be out of focus by their own distance_m; stars are infinitely far
+    near       : (N,) LEDs, which may be out of focus by their own distance_m; stars are at infinity
     cos_field  : (N,) of the angle from the boresight
     Raises InputError for a source too far out of focus.
     """
@@ -81,7 +81,7 @@ def images(
     aside = np.maximum(np.maximum(-place, place - size), 0).max(axis=1)
     emitter, blur = (
         np.where(aside < MOST_PX, disc, 0.0) for disc in (emitter, blur)
-    )  # no image of what is far out
+    )  # far outside the frame: no image
     largest = (emitter + blur).max(initial=0.0)
     if largest > MOST_PX:
         raise InputError(
@@ -91,10 +91,10 @@ def images(
     steps = np.rint(np.column_stack([extra, emitter, blur]) / QUANTUM_PX).astype(np.int64)
     gaussian = camera.psf.kind == "gaussian"
     if gaussian:
-        steps[(steps[:, 1:] == 0).all(axis=1), 0] = 0  # drawn by formula, each with its own width
+        steps[(steps[:, 1:] == 0).all(axis=1), 0] = 0  # Gaussians need no shared table
     held = shelf(camera)
     packed = steps @ PACKED
-    alike = packed.size > 0 and not packed.any()  # stars in focus: no need to sort them
+    alike = packed.size > 0 and not packed.any()  # stars in focus share one key: skip the sort
     first, which = ([0], np.zeros(len(packed), int)) if alike else np.unique(packed, True, True)[1:]
     keys = [tuple(key) for key in steps[first].tolist()]
     stock(held, camera, keys)
@@ -110,7 +110,7 @@ def images(
 
 
 def stock(held: KernelCache, camera: CameraConfig, keys: list[tuple[int, ...]]) -> None:
-    """Make the kernels that are not on the shelf yet; a shelf that is full is emptied before."""
+    """Make the kernels that the cache does not hold yet; empty the cache first if it is over SHELF_BYTES."""
     if held.tables[0].nbytes > SHELF_BYTES:
         for part in held:
             part.clear()
@@ -136,10 +136,11 @@ def stock(held: KernelCache, camera: CameraConfig, keys: list[tuple[int, ...]]) 
 
 
 def sharpness_px(made: Kernel) -> float:
-    """How far an image may move before anything changes much: half its peak over its steepest slope.
+    """How far an image may move before its pixels change much: half its peak over its steepest slope.
 
-    0.82 sigma of a Gaussian's table. 1.25 sigma of a soft edge, which bears it: two nodes in 1.6 sigma leave a ripple
-    of 0.5 exp(-2 pi^2 / 1.6^2) = 2e-4, and the ends' share falls with the disc's width. Drawn by formula, sigma.
+    For the table of a Gaussian it is 0.82 sigma. For a soft edge it is 1.25 sigma, which is still safe: two nodes in
+    1.6 sigma leave a ripple of 0.5 exp(-2 pi^2 / 1.6^2) = 2e-4, and the ends' share falls with the disc's width.
+    For a Gaussian drawn by formula it is sigma with the pixel's own variance, 1/12, added.
     """
     if len(made.grid):
         steps = made.grid.shape[0] - 3

@@ -1,8 +1,9 @@
-"""What the lens makes of a point: optical transfer functions, how far they scatter light, and the defocus disc.
+"""Optical transfer functions of lenses, how far they scatter light, and the defocus disc.
 
 The image of a source is a convolution: lens x Gaussian blur x emitter's disc x defocus disc x pixel. At a spatial
-frequency (fx, fy) in cycles a pixel it is a product of transfer functions (Goodman, Introduction to Fourier Optics,
-ch. 6). The lens's are here; `skysim.camera.psf.kernel` multiplies them into an image that `skysim.camera.psf.splat` adds to a frame.
+frequency (fx, fy) in cycles a pixel its spectrum is the product of their transfer functions (Goodman, Introduction
+to Fourier Optics, ch. 6). Those of the lens are here; `skysim.camera.psf.kernel` multiplies them into an image that
+`skysim.camera.psf.splat` adds to a frame.
 """
 
 from __future__ import annotations
@@ -28,16 +29,16 @@ from skysim.scene.camera import (
     Psf,
 )
 
-Otf = NDArray[Any]  # real, or complex where a point's image has no symmetry
+Otf = NDArray[Any]  # real, or complex where the PSF is not symmetric
 
-WINGS = 1e-5  # of the peak: power-law wings end where they fall below it
+WINGS = 1e-5  # power-law wings are cut where they fall below this fraction of the peak
 
 
 def blur_radius_px(camera: CameraConfig, distance_m: Any) -> Any:
-    """Radius of the disc that a point out of focus becomes, in pixels, by the thin lens.
+    """Radius of the defocus disc of a point, in pixels, by the thin lens.
 
     The cone from a pupil A to the image at v(u) meets the chip at v0 in a disc of diameter A |v - v0| / v =
-    A v0 |1/u - 1/u0|, u0 the distance in focus: no pole anywhere, and stars (u infinite) are no special case.
+    A v0 |1/u - 1/u0|, u0 the distance in focus. This form has no pole and holds for stars (u infinite) as well.
     distance_m: scalar or array of axial distances, infinity allowed.
     """
     distance = np.asarray(distance_m, dtype=float)
@@ -52,23 +53,23 @@ def field_sigma_px(psf: Psf, camera: CameraConfig, xy_px: Floats) -> Floats:
 
 
 def blur(sigma_px: float, fx: Floats, fy: Floats) -> Floats:
-    """A Gaussian's: exp(-2 pi^2 sigma^2 f^2)."""
+    """Transfer function of a Gaussian: exp(-2 pi^2 sigma^2 f^2)."""
     return np.asarray(np.exp(-2 * (np.pi * sigma_px) ** 2 * (fx**2 + fy**2)))
 
 
 def uniform_disc(radius_px: float, fx: Floats, fy: Floats) -> Floats:
-    """A uniform disc's: 2 J1(z) / z, z = 2 pi a f."""
+    """Transfer function of a uniform disc: 2 J1(z) / z, z = 2 pi a f."""
     z = np.maximum(2 * np.pi * radius_px * np.hypot(fx, fy), 1e-9)
     return np.asarray(2 * special.j1(z) / z)
 
 
 def gaussian(psf: GaussianPsfConfig, camera: CameraConfig, fx: Floats, fy: Floats) -> Floats:
-    """A lens whose points are Gaussians."""
+    """A lens with a Gaussian point-spread function."""
     return blur(psf.sigma_px, fx, fy)
 
 
 def moffat(psf: MoffatPsfConfig, camera: CameraConfig, fx: Floats, fy: Floats) -> Floats:
-    """A core with power-law wings: 2 (z/2)^n K_n(z) / Gamma(n), z = 2 pi alpha f, n = beta - 1.
+    """Moffat profile, a core with power-law wings: 2 (z/2)^n K_n(z) / Gamma(n), z = 2 pi alpha f, n = beta - 1.
 
     The Hankel transform of (beta - 1) / (pi alpha^2) (1 + r^2 / alpha^2)^-beta (Moffat 1969, A&A 3, 455).
     """
@@ -78,7 +79,7 @@ def moffat(psf: MoffatPsfConfig, camera: CameraConfig, fx: Floats, fy: Floats) -
 
 
 def moffat_alpha_px(psf: MoffatPsfConfig) -> float:
-    """The scale of a Moffat profile of this full width at half maximum."""
+    """The scale alpha of a Moffat profile from its full width at half maximum."""
     return float(psf.fwhm_px / (2 * np.sqrt(2 ** (1 / psf.beta) - 1)))
 
 
@@ -90,7 +91,7 @@ def airy(psf: AiryPsfConfig, camera: CameraConfig, fx: Floats, fy: Floats) -> Fl
 
 
 def airy_unit_px(psf: AiryPsfConfig, camera: CameraConfig) -> float:
-    """lambda N in pixels. N is the working f-number v / A: the lens's own when it is focused at infinity."""
+    """lambda N in pixels. N is the working f-number v / A, the lens's own when it is focused at infinity."""
     return psf.wavelength_m * camera.image_distance_m / camera.pupil_m / camera.pixel_m
 
 
@@ -100,15 +101,17 @@ def disc(psf: DiscPsfConfig, camera: CameraConfig, fx: Floats, fy: Floats) -> Fl
 
 
 def measured(psf: MeasuredPsfConfig, camera: CameraConfig, fx: Floats, fy: Floats) -> Otf:
-    """A point's image as it was measured, about its own centre of gravity (so a centroid is a star's place).
+    """A measured point-spread function about its own center of gravity, so that a centroid is a star's position.
 
-    Each number is the light on a cell of 1 / oversampling px, the pixel's own blur not counted twice: with an
-    oversampling of 1 a star in the middle of a pixel gives the table back, with S the pixels are sums of S x S
-    cells. Between these places Keys' cubic convolution (1981, IEEE ASSP 29, 1153) tells. A table that already holds
-    the pixel's blur at an oversampling above 1 (an "effective" PSF) comes out wider by that blur.
+    Each number is the light on a cell of 1 / oversampling px. The cell's own integration is divided out, so that the
+    pixel's blur is not counted twice: with an oversampling of 1 a star in the middle of a pixel gives the table
+    back, with S the pixels are sums of S x S cells. Between these positions Keys' cubic convolution (1981, IEEE
+    ASSP 29, 1153) interpolates. A table that already includes the pixel's blur at an oversampling above 1 (an
+    "effective" PSF) is widened by that blur again.
     """
     cells = cells_of(psf.file)
     x_px, y_px = cell_places_px(psf)
+    # The transform is separable: compute it on the distinct fx and fy, then spread it to all pairs.
     across, i = np.unique(fx, return_inverse=True)
     down, j = np.unique(fy, return_inverse=True)
     wave_x = np.exp(-2j * np.pi * np.outer(x_px, across)) * cell_response(across / psf.oversampling)
@@ -118,7 +121,7 @@ def measured(psf: MeasuredPsfConfig, camera: CameraConfig, fx: Floats, fy: Float
 
 
 def cell_places_px(psf: MeasuredPsfConfig) -> tuple[Floats, Floats]:
-    """x of a measured table's columns and y of its rows, from its centre of gravity."""
+    """x of a measured table's columns and y of its rows, from its center of gravity."""
     cells = cells_of(psf.file)
     place = np.arange(len(cells)) / psf.oversampling
     return place - cells.sum(axis=0) @ place, place - cells.sum(axis=1) @ place
@@ -126,9 +129,9 @@ def cell_places_px(psf: MeasuredPsfConfig) -> tuple[Floats, Floats]:
 
 @lru_cache(maxsize=16)
 def cells_of(file: str) -> Floats:
-    """(n, n) numbers of a measured PSF, CSV or an image (FITS, PNG, TIFF), scaled to a sum of 1.
+    """(n, n) numbers of a measured PSF from CSV or an image (FITS, PNG, TIFF), scaled to a sum of 1.
 
-    Raises InputError with one line, `camera.psf.file: ...`, for a file that is none or holds no image of a point.
+    Raises InputError with one line, `camera.psf.file: ...`, for an unreadable file or an unusable table.
     """
     from skysim.core.images import monochrome, read_image
 
@@ -154,7 +157,7 @@ def cells_of(file: str) -> Floats:
 
 
 def cell_response(u: Floats) -> Floats:
-    """Keys' interpolation of cells' sums, over the cell's own sinc; u in cycles a cell. 0 at whole u but 0.
+    """Transfer function of Keys' interpolation over that of a cell; u in cycles a cell. 0 at whole u except 0.
 
     Keys' kernel (a = -1/2) has the transform (3 s1^2 - 3 s2^2 - s2 + s4) / (pi u)^2 with sk = sinc(k u).
     """
@@ -174,14 +177,14 @@ PSFS: dict[str, Callable[[Any, CameraConfig, Floats, Floats], Otf]] = {
 
 
 def moffat_reach_px(psf: MoffatPsfConfig, camera: CameraConfig) -> float:
-    """Where a Moffat profile falls below WINGS of its image's brightest pixel: at most 64 px or four alpha."""
+    """Radius where a Moffat profile falls below WINGS of its image's brightest pixel; at most 64 px or four alpha."""
     alpha = moffat_alpha_px(psf)
     level = WINGS / max(1.0, (psf.beta - 1) / (np.pi * alpha**2))
     return float(min(alpha * np.sqrt(level ** (-1 / psf.beta) - 1), max(64.0, 4 * alpha)))
 
 
 def airy_reach_px(psf: AiryPsfConfig, camera: CameraConfig) -> float:
-    """Where the mean of Airy's rings, 4 / (pi z^3) of its peak at z = pi r / (lambda N), falls below WINGS.
+    """Radius where the mean of Airy's rings, 4 / (pi z^3) of its peak at z = pi r / (lambda N), falls below WINGS.
 
     At most 64 px or eight lambda N. The light beyond, 2 / (pi z), is within 2 %.
     """
@@ -191,11 +194,11 @@ def airy_reach_px(psf: AiryPsfConfig, camera: CameraConfig) -> float:
 
 
 def measured_reach_px(psf: MeasuredPsfConfig, camera: CameraConfig) -> float:
-    """The farthest cell's distance in x or y, and the two cells that interpolation adds."""
+    """The farthest cell's distance in x or y, plus the two cells that interpolation adds."""
     return float(np.abs(cell_places_px(psf)).max() + 2 / psf.oversampling)
 
 
-# Radius that holds a point's light, before a Gaussian of what standard deviation.
+# By kind: radius that holds the light of a point, and sigma of the Gaussian that widens it.
 EXTENT: dict[str, Callable[[Any, CameraConfig], tuple[float, float]]] = {
     "gaussian": lambda psf, camera: (0.0, psf.sigma_px),
     "moffat": lambda psf, camera: (moffat_reach_px(psf, camera), 0.0),
@@ -203,5 +206,5 @@ EXTENT: dict[str, Callable[[Any, CameraConfig], tuple[float, float]]] = {
     "disc": lambda psf, camera: (psf.radius_px, psf.sigma_px),
     "measured": lambda psf, camera: (measured_reach_px(psf, camera), 0.0),
 }
-WINGED = ("moffat", "airy")  # kinds whose light has no end
-SQUARE = ("measured",)  # kinds that need not be round
+WINGED = ("moffat", "airy")  # kinds with infinite wings
+SQUARE = ("measured",)  # kinds that may not be round

@@ -1,8 +1,9 @@
-"""Images of points and discs added to a patch of pixels: the hot path, in compiled code.
+"""Add images of points and discs to a patch of pixels (compiled; most of the rendering time).
 
-Every `add_*` adds `electrons` spread as an image centred on (x, y), in pixels of the patch (0-based, the integer is
-the pixel's centre), to the rows row0 <= j < row1 of a C-ordered float64 patch. What falls outside of these rows or of
-the patch is left out; the rows of a rolling shutter add up to the whole. The tables come from `skysim.camera.psf.kernel`.
+Every `add_*` adds `electrons` spread as an image centered on (x, y), in pixels of the patch (0-based, the integer is
+the pixel's center), to the rows row0 <= j < row1 of a C-ordered float64 patch. Light outside of these rows or of
+the patch is left out; the rows of a rolling shutter add up to the whole. The tables come from
+`skysim.camera.psf.kernel`.
 """
 
 from __future__ import annotations
@@ -17,9 +18,9 @@ from skysim.core.types import Floats
 
 Singles = NDArray[np.float32]
 
-PER_PX = 64  # entries of a radial table a pixel
-REACH_SIGMA = 6.5  # a Gaussian's share beyond is 7e-10
-LANES = 32  # what the compiler takes at a time (four registers of eight); a remainder would run one by one
+PER_PX = 64  # entries of a radial table per pixel
+REACH_SIGMA = 6.5  # 7e-10 of a Gaussian's light is beyond
+LANES = 32  # buffers are multiples of this (four registers of eight), so that SIMD loops leave no remainder
 
 
 @jit
@@ -34,7 +35,7 @@ def add(
     radial: Singles,
     grid: Singles,
 ) -> None:
-    """Whichever image a `kernel.Kernel` holds: its grid, its radial table, or its Gaussian."""
+    """Add the image of a `kernel.Kernel`, whichever it holds: grid, radial table or Gaussian."""
     if grid.shape[0] > 0:
         add_grid(patch, row0, row1, x, y, electrons, grid)
     elif radial.shape[0] > 0:
@@ -47,7 +48,7 @@ def add(
 def add_gaussian(
     patch: Floats, row0: int, row1: int, x: float, y: float, electrons: float, sigma_px: float
 ) -> None:
-    """A Gaussian's exact share of each pixel: the product of two differences of the error function."""
+    """Add a Gaussian's exact share of each pixel: the product of two differences of the error function."""
     height, width = patch.shape
     reach = REACH_SIGMA * sigma_px + 0.5
     left, right = max(ceil(x - reach), 0), min(floor(x + reach) + 1, width)
@@ -75,13 +76,16 @@ def add_gaussian(
 def add_round(
     patch: Floats, row0: int, row1: int, x: float, y: float, electrons: float, radial: Singles
 ) -> None:
-    """A round image seen by square pixels: T0(r) + T4(r) cos 4 theta + T8(r) cos 8 theta.
+    """Add a round image seen by square pixels: T0(r) + T4(r) cos 4 theta + T8(r) cos 8 theta.
 
-    radial (R, 3, 5 or 7): at r = i / PER_PX of T0 the value, the step to the next and Bessel's second difference
-    (a parabola: straight chords would lose 1e-4 of a sharp image's light); then value and step of T4 / r^4 and of
-    T8 / r^8, if they are anything, so that the cosines are the polynomials r^4 cos 4 theta = (u + v)^2 - 8 u v and
-    r^8 cos 8 theta = 2 (r^4 cos 4 theta)^2 - r^8 of u = dx^2, v = dy^2: no division, no trigonometry. Square roots
-    and polynomials go LANES at a time; only the look-up goes pixel by pixel.
+    radial (R, 3, 5 or 7): at r = i / PER_PX of T0 the value, the step to the next entry and Bessel's second
+    difference (a parabola: linear interpolation would lose 1e-4 of a sharp image's light); then value and step of
+    T4 / r^4 and of T8 / r^8, where needed. With these powers the cosines are polynomials of u = dx^2, v = dy^2,
+
+        r^4 cos 4 theta = (u + v)^2 - 8 u v,    r^8 cos 8 theta = 2 (r^4 cos 4 theta)^2 - r^8,
+
+    without division or trigonometry. Square roots and polynomials run as SIMD over LANES pixels; only the table
+    look-up runs pixel by pixel.
     """
     height, width = patch.shape
     reach = (radial.shape[0] - 2) / PER_PX
@@ -96,8 +100,9 @@ def add_round(
         u[i] = (left + i - x) ** 2
     for j in range(top, bottom):
         v = np.float32((j - y) ** 2)
+        # Only the pixels of this row that are within the circle of the image.
         half = sqrt(max(reach * reach - v, 0.0))
-        # Unsigned, so that no index is tested for being negative.
+        # Unsigned: saves numba's check for negative indices.
         first = np.uint64(max(ceil(x - half) - left, 0))
         last = np.uint64(max(min(floor(x + half) + 1, right) - left, 0))
         row = patch[j, left:]
@@ -121,7 +126,7 @@ def add_round(
 
 @jit(fastmath=True)
 def radii(u: Singles, v: float, entry: NDArray[np.int32], fraction: Singles) -> None:
-    """Which entry of a radial table each pixel of a row falls on, and how far past it."""
+    """Entry of the radial table for each pixel of a row, and the fraction past it."""
     for i in range(u.size):
         r = np.sqrt(u[i] + v) * np.float32(PER_PX)
         entry[i] = np.int32(r)
@@ -139,14 +144,14 @@ def cosines(u: Singles, v: float, c4: Singles, c8: Singles) -> None:
 
 @jit(fastmath=True)
 def along(radial: Singles, entry: int, f: float) -> float:
-    """T0 at a fraction f past an entry."""
+    """T0 at a fraction f past an entry, by a parabola."""
     k = np.uint64(entry)
     return radial[k, 0] + f * (radial[k, 1] + (f - np.float32(1)) * radial[k, 2])
 
 
 @jit
 def cubic(t: float) -> tuple[float, float, float, float]:
-    """Lagrange's weights of the samples at -1, 0, 1, 2 for a place 0 <= t < 1 between the middle two."""
+    """Lagrange's weights of the samples at -1, 0, 1, 2 at 0 <= t < 1."""
     a, b, c, d = t + 1, t, t - 1, t - 2
     return -b * c * d / 6, a * c * d / 2, -a * b * d / 2, a * b * c / 6
 
@@ -155,11 +160,12 @@ def cubic(t: float) -> tuple[float, float, float, float]:
 def add_grid(
     patch: Floats, row0: int, row1: int, x: float, y: float, electrons: float, grid: Singles
 ) -> None:
-    """An image of any shape from its tables at S x S sub-pixel places, cubic between the places.
+    """Add an image of any shape from its tables at S x S sub-pixel positions, with cubic interpolation between them.
 
-    grid (S + 3, S + 3, N, N): grid[q, p, j, i] is the share of pixel (i, j) of an image that stands at
+    grid (S + 3, S + 3, N, N): grid[q, p, j, i] is the share of pixel (i, j) of an image centered at
     ((p - 1) / S - 1/2, (q - 1) / S - 1/2) from the middle pixel. All pixels of one image use the same sixteen
-    weights, so the pixels of a row stand side by side. Each table adds up to 1, and so does every mixture.
+    weights, so the inner loop runs over contiguous pixels of a row. Each table adds up to 1, and so does
+    every mixture.
     """
     height, width = patch.shape
     steps, size = grid.shape[0] - 3, grid.shape[2]

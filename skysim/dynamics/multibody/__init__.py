@@ -1,4 +1,4 @@
-"""The vehicle on its bearing, moved by MuJoCo. The only package that knows MuJoCo."""
+"""Multibody dynamics of the vehicle on its bearing by MuJoCo. The only package that imports MuJoCo."""
 
 from skysim.dynamics.multibody.integrator import Flight as Flight
 from skysim.dynamics.multibody.integrator import fly as fly

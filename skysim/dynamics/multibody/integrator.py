@@ -1,4 +1,8 @@
-"""Flying: the model is stepped tick by tick, and every step is kept."""
+"""Integrate the equations of motion: the model is stepped with given controls, and every state is kept.
+
+MuJoCo computes the multibody dynamics and integrates by the fourth-order Runge-Kutta method with a fixed step
+(model.STEP_S). Controls are constant within each step.
+"""
 
 from __future__ import annotations
 
@@ -23,14 +27,15 @@ Controller = Callable[[float, Rotation, Floats], Floats]
 
 
 class Flight:
-    """A vehicle in flight. `advance` moves it on by some steps with their controls; the past stays.
+    """A simulated motion in progress. `advance` integrates some steps with given controls and keeps all states.
 
-    MuJoCo's rollout steps in C and writes every state into `states`, so that a step costs what MuJoCo's own costs.
-    The present is the last state flown: angles, rates and speeds are read from it without a copy.
+    MuJoCo's rollout steps in C and writes every state directly into `states`, so that there is no overhead per step.
+    The present is the last state; angles, rates and speeds are views of it, without a copy. A row of `states` is
+    MuJoCo's full physics state: time, qpos (its first four lab_from_body), qvel, actuator states.
 
     lab_from_body : at the start; rate_body_rad_s : (3,) likewise
-    duration_s    : the longest that this flight can last; room is made for so many steps. With kept_s it may be inf
-    kept_s        : room is made for twice so many only, and what is older than that is forgotten
+    duration_s    : the longest that this motion can last, which sets the memory. With kept_s it may be inf
+    kept_s        : keep only states of this age or younger; memory is for twice as many
     """
 
     def __init__(
@@ -48,13 +53,13 @@ class Flight:
         self.kept = self.last if kept_s is None else int(np.ceil(kept_s / self.step_s))
         rows = min(self.last, 2 * self.kept) + 1
         self.states = np.empty((rows, mujoco.mj_stateSize(self.model, int(STATE))))
-        self.step = self.first = 0  # the present; which step the first of `states` is
+        self.step = self.first = 0  # step number of the present, and of the first row of `states`
         self.data = mujoco.MjData(self.model)
         self.rollout = Rollout(nthread=0)
         self.start(lab_from_body, rate_body_rad_s)
 
     def start(self, lab_from_body: Rotation, rate_body_rad_s: Floats) -> None:
-        """The first state: wheels, rotors and gimbals as the scene has them."""
+        """Set the first state: wheels, rotors and gimbals as the scene has them."""
         world, data = self.world, self.data
         vehicle = world.vehicle
         data.qpos[:4] = lab_from_body.as_quat(scalar_first=True)
@@ -65,7 +70,7 @@ class Flight:
         if vehicle.cmgs:
             angles = np.radians(as_many(vehicle.cmgs.start_deg, len(world.gimbals), "vehicle.cmgs.start_deg"))
             data.qpos[world.gimbals.qpos] = angles
-            data.act[self.model.actuator_actadr[world.gimbals.motor]] = angles  # where the servos aim
+            data.act[self.model.actuator_actadr[world.gimbals.motor]] = angles  # servo set-points
             data.qvel[world.rotors.dof] = vehicle.cmgs.rotor_rpm * RPM_RAD_S
         mujoco.mj_getState(self.model, data, self.states[0], int(STATE))
         mujoco.mj_forward(self.model, data)
@@ -90,21 +95,21 @@ class Flight:
 
     @property
     def angles_rad(self) -> Floats:
-        """All of qpos; `Hinges.qpos` tells which is whose."""
+        """All of qpos; `Hinges.qpos` has the indices of the joints."""
         return self.states[self.row, 1 : 1 + self.model.nq]
 
     @property
     def speeds_rad_s(self) -> Floats:
-        """All of qvel; `Hinges.dof` tells which is whose."""
+        """All of qvel; `Hinges.dof` has the indices of the joints."""
         return self.states[self.row, 1 + self.model.nq :][: self.model.nv]
 
     @property
     def row(self) -> int:
-        """Where in `states` the present is."""
+        """Row of the present state in `states`."""
         return self.step - self.first
 
     def forget(self, steps: int) -> None:
-        """Make room for so many steps, if there is none, by what is older than `kept`."""
+        """If there is no room for so many steps, drop states older than `kept` steps."""
         if self.row + steps < len(self.states):
             return
         old = max(self.row - self.kept, 0)
@@ -112,9 +117,10 @@ class Flight:
         self.first += old
 
     def advance(self, control: Floats) -> None:
-        """Fly one step for each row of control (K, nu). Raises InputError where MuJoCo warned.
+        """Integrate one step for each row of control (K, nu). Raises InputError if MuJoCo warned.
 
-        MuJoCo puts an unstable model back to its start and goes on, and forgets its warnings with the next call.
+        MuJoCo resets an unstable model to its start and continues, and clears its warnings with the next call, so
+        they are checked after every call.
         """
         self.forget(len(control))
         row, end = self.row, self.row + len(control)
@@ -141,14 +147,14 @@ class Flight:
             )
 
     def warned(self) -> str:
-        """Which of MuJoCo's warnings it was."""
+        """Names of MuJoCo's warnings."""
         kinds = [
             kind for kind in mujoco.mjtWarning.__members__.values() if int(kind) < len(self.data.warning)
         ]
         return ", ".join(str(kind.name) for kind in kinds if self.data.warning[int(kind)].number)
 
     def times_s(self, begin: int, end: int) -> Floats:
-        """Of the steps from begin to before end."""
+        """Times of the steps from begin to before end."""
         return np.arange(begin, end) * np.float64(self.step_s)
 
     def knots(self, begin: int = 0) -> tuple[Floats, Floats, Floats]:
@@ -157,13 +163,13 @@ class Flight:
         return self.times_s(begin, self.step + 1), flown[:, 1:5], flown[:, 1 + nq : 4 + nq]
 
     def trajectory(self, begin: int = 0) -> Trajectory:
-        """What was flown from a step on, as a history of its own."""
+        """The motion from a step on, as a Trajectory."""
         t_s, lab_from_body_wxyz, rate = self.knots(begin)
         return Trajectory(t_s, Rotation.from_quat(lab_from_body_wxyz, scalar_first=True), rate.copy())
 
 
 def as_many(values: tuple[float, ...], count: int, key: str) -> Floats:
-    """One value for each, zeros where none are given."""
+    """One value for each of `count` members; zeros if none are given. Raises InputError for another number."""
     if values and len(values) != count:
         raise InputError(f"{key}: {len(values)} values for {count} of them")
     return np.array(values or (0.0,) * count)
@@ -179,9 +185,9 @@ def fly(
 ) -> Trajectory:
     """The vehicle's motion under gravity, its stop and a controller's ideal torques, sampled at every step.
 
-    controller(t_s, lab_from_body, rate_body_rad_s) -> (3,) torque in N m about the body axes. It is asked at
+    controller(t_s, lab_from_body, rate_body_rad_s) -> (3,) torque in N m about the body axes. It is called at
     the start and every control period (whole steps); its torque, clipped to the limit, is held in between.
-    rate_body_rad_s : (3,) at the start. Raises InputError for a start beyond the tilt stop, and where MuJoCo warned.
+    rate_body_rad_s : (3,) at the start. Raises InputError for a start beyond the tilt stop, and if MuJoCo warned.
     """
     flight = Flight(world, lab_from_body_start, rate_body_rad_s, duration_s)
     every = max(1, round(control_period_s / flight.step_s)) if controller else flight.steps_left
@@ -197,12 +203,12 @@ def fly(
 
 
 def tilt_deg(lab_from_body: Rotation) -> Floats:
-    """Angle between the body's z and the lab's, of one attitude or of many."""
+    """Angle between the body's z axis and the lab's, of one attitude or of many."""
     return np.degrees(np.arccos(np.clip(lab_from_body.as_matrix()[..., 2, 2], -1, 1)))
 
 
 def check_tilt(world: World, lab_from_body: Rotation) -> None:
-    """Refuse a start that the bearing does not allow."""
+    """Raise InputError for a start beyond the tilt stop."""
     tilt = float(tilt_deg(lab_from_body))
     if world.vehicle.mount == "air_bearing" and tilt > world.vehicle.tilt_stop_deg:
         raise InputError(

@@ -1,7 +1,7 @@
-"""The actuators in the model: which joints and sites they are, and the motors that drive them.
+"""Actuators in the MuJoCo model: their joints and sites, and the motors that drive them.
 
-A vehicle's MJCF says where they are, by name: hinge joints `wheel_*`; hinge joints `gimbal_*` and on each a hinge
-joint `rotor_*` of the same ending; sites `fan_*`, which push along their own z. The scene says what they can do.
+A vehicle's MJCF places them by name: hinge joints `wheel_*`; hinge joints `gimbal_*`, each carrying a hinge
+joint `rotor_*` with the same suffix; sites `fan_*`, which push along their own z. The scene sets their limits.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ class Hinges:
     """Hinge joints of one kind, in the order of their names.
 
     names        : (n)
-    axes         : (3, n) unit axes in the body's axes, all joints at their zero
-    inertia_kg_m2: (n,) about each axis, of all that turns with it
-    qpos, dof    : (n,) where angle and speed stand in the state
-    motor        : (n,) actuator numbers, -1 where it has none
+    axes         : (3, n) unit axes in body axes, with all joints at zero
+    inertia_kg_m2: (n,) about each axis, of all that rotates with it
+    qpos, dof    : (n,) indices of angle and speed in qpos and qvel
+    motor        : (n,) actuator numbers, -1 without one
     """
 
     names: tuple[str, ...]
@@ -68,7 +68,7 @@ class Hinges:
 
 @dataclass(frozen=True, slots=True)
 class Fans:
-    """Fans, in the order of their names: (3, n) where they push along, where they sit, and actuator numbers."""
+    """Fans, in the order of their names: (3, n) thrust directions and positions, and actuator numbers."""
 
     names: tuple[str, ...]
     axes: Floats
@@ -77,7 +77,7 @@ class Fans:
 
     @classmethod
     def of(cls, model: Any) -> Fans:
-        """Those that have an actuator."""
+        """The fans that have an actuator."""
         data = mujoco.MjData(model)
         mujoco.mj_forward(model, data)
         names = sorted(name for name in all_names(model.actuator, model.nu) if name.startswith(FAN))
@@ -91,7 +91,7 @@ class Fans:
 
 
 def all_names(element: Any, count: int) -> list[str]:
-    """The names of a compiled model's elements of one kind; `element` is its accessor by number."""
+    """Names of a compiled model's elements of one kind; `element` is its accessor by number."""
     return [element(k).name for k in range(count)]
 
 
@@ -101,9 +101,9 @@ def joints(spec: Any, prefix: str) -> list[Any]:
 
 
 def lock_unused(spec: Any, vehicle: VehicleConfig, path: Path) -> dict[str, str]:
-    """Take away the joints of actuators that are not switched on; refuse a vehicle that lacks one that is.
+    """Delete the joints of actuators that are off. Raises InputError if an actuator that is on has no joint.
 
-    Returns the names of the joints that it took, and the key of the scene that would have kept each.
+    Returns the names of the deleted joints, each with the scene's key that would have kept it.
     """
     locked: dict[str, str] = {}
     check_names(spec, path)
@@ -136,13 +136,13 @@ def lock_unused(spec: Any, vehicle: VehicleConfig, path: Path) -> dict[str, str]
 
 
 def why_locked(complaint: str, locked: dict[str, str]) -> str:
-    """What MuJoCo cannot know of a joint that it does not find."""
+    """An addition to MuJoCo's message about an unknown joint, if that joint was deleted."""
     named = [name for name in locked if f"'{name}'" in complaint]
     return f"; {locked[named[0]]} is off, which locks joint {named[0]}" if named else ""
 
 
 def check_names(spec: Any, path: Path) -> None:
-    """Refuse a joint or site that is nearly an actuator's, and would fly as something else without a word."""
+    """Raise InputError for a joint or site whose name nearly matches an actuator's: it would silently not be one."""
     for element in (*spec.joints, *spec.sites):
         word = next((p for p in (WHEEL, GIMBAL, ROTOR, FAN) if element.name.startswith(p[:-1])), None)
         if word and not element.name.startswith(word):
@@ -152,7 +152,9 @@ def check_names(spec: Any, path: Path) -> None:
 
 
 def check_bare(joint: Any, path: Path) -> None:
-    """Refuse what would stop, drive or load an actuator's joint beside what the scene declares."""
+    """Raise InputError for limits, springs, damping or drives of an actuator's joint in the file: the
+    scene sets them.
+    """
     given = {
         "range": joint.range,
         "stiffness": joint.stiffness,
@@ -167,7 +169,7 @@ def check_bare(joint: Any, path: Path) -> None:
 
 
 def pair_up(spec: Any, path: Path) -> None:
-    """Each rotor rides on the gimbal of the same ending, across its axis."""
+    """Check that each rotor is on the gimbal with the same suffix. Raises InputError."""
     for gimbal in joints(spec, GIMBAL):
         ending = gimbal.name.removeprefix(GIMBAL)
         rotor = spec.joint(ROTOR + ending)
@@ -184,9 +186,9 @@ def fans(spec: Any) -> list[Any]:
 
 
 def add_actuators(spec: Any, model: Any, vehicle: VehicleConfig) -> None:
-    """The motors of all that is switched on, and three ideal torques; model is what the spec compiled to."""
+    """Add the motors of all actuators that are on, and three ideal torques; model is the compiled spec."""
     for name, axis in zip(TORQUES, np.eye(3), strict=True):
-        # A ball joint's motor turns about an axis of the body.
+        # A ball joint's motor acts about a body axis.
         add_motor(spec, name, mujoco.mjtTrn.mjTRN_JOINT, "bearing", gear=[*axis, 0, 0, 0])
     if vehicle.wheels:
         add_wheels(spec, vehicle.wheels)
@@ -197,14 +199,14 @@ def add_actuators(spec: Any, model: Any, vehicle: VehicleConfig) -> None:
 
 
 def add_motor(spec: Any, name: str, kind: Any, target: str, **more: Any) -> Any:
-    """A motor of that name: force = control."""
+    """Add a motor of that name: force = control."""
     motor = spec.add_actuator(name=name, trntype=kind, target=target, **more)
     motor.set_to_motor()
     return motor
 
 
 def add_wheels(spec: Any, wheels: WheelsConfig) -> None:
-    """A motor at each wheel, and the friction of its axle: Coulomb's is MuJoCo's, which sticks at rest."""
+    """A motor at each wheel, and its axle's friction; Coulomb friction is MuJoCo's, which holds at rest."""
     for joint in joints(spec, WHEEL):
         joint.frictionloss, joint.damping = wheels.coulomb_nm, [wheels.viscous_nms, 0.0, 0.0]
         motor = add_motor(spec, joint.name, mujoco.mjtTrn.mjTRN_JOINT, joint.name)
@@ -212,10 +214,11 @@ def add_wheels(spec: Any, wheels: WheelsConfig) -> None:
 
 
 def add_cmgs(spec: Any, model: Any, cmgs: CmgsConfig) -> None:
-    """A rate servo at each gimbal, and a motor at each rotor of variable speed; other rotors keep their momentum.
+    """A rate servo at each gimbal, and a motor at each variable-speed rotor; other rotors keep their momentum.
 
-    The servo's aim is the integral of the commanded rate; a critically damped spring draws the gimbal to it with the
-    time constant of the scene, so that the rate is held against the vehicle's own turn, which a mere damper is not.
+    The servo's set-point is the integral of the commanded rate. A critically damped spring pulls the gimbal to it
+    with the scene's time constant, so that the rate is held against gyroscopic torque from the vehicle's rotation;
+    a damper alone would not hold it.
     """
     tau_s = cmgs.gimbal_time_constant_s
     for joint, inertia in zip(joints(spec, GIMBAL), Hinges.of(model, GIMBAL).inertia_kg_m2, strict=True):
@@ -229,10 +232,10 @@ def add_cmgs(spec: Any, model: Any, cmgs: CmgsConfig) -> None:
 
 
 def add_fans(spec: Any, part: FansPart) -> None:
-    """A force at each fan, along its site's z, that follows the command with a first-order lag."""
+    """A force at each fan, along its site's z, which follows the command with a first-order lag."""
     for site in fans(spec):
         fan = add_motor(spec, site.name, mujoco.mjtTrn.mjTRN_SITE, site.name, gear=[0, 0, 1, 0, 0, 0])
-        # Not FILTEREXACT, which is exact for Euler's steps: under Runge-Kutta it lags by half a step more.
+        # Not FILTEREXACT, which is exact for Euler steps only: with Runge-Kutta it adds half a step of lag.
         fan.dyntype = mujoco.mjtDyn.mjDYN_FILTER
         fan.dynprm[0] = part.time_constant_s
         limit(fan, part.thrust_limit_n)

@@ -1,4 +1,4 @@
-"""Mass properties: what the vehicle weighs, and making it weigh what the scene declares."""
+"""Mass properties: compute those of the vehicle, and set those that the scene declares."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from skysim.scene.vehicle import VehicleConfig, WheelsConfig
 
 @dataclass(frozen=True, slots=True)
 class MassProperties:
-    """Of the whole tree, in body axes: mass, centre of mass (3,), inertia (3, 3) about the body's origin."""
+    """Of the whole vehicle, in body axes: mass, center of mass (3,), inertia (3, 3) about the body's origin."""
 
     mass_kg: float
     centre_m: Floats
@@ -25,7 +25,9 @@ class MassProperties:
 
 
 def tree_mass(model: Any, without_bus: bool = False) -> MassProperties:
-    """The bus and all it carries, as the compiled model has them; without_bus only what it carries."""
+    """Mass properties of the bus and all it carries, from the compiled model; with without_bus of what
+    it carries only.
+    """
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     bus = model.body("bus").id
@@ -39,16 +41,17 @@ def tree_mass(model: Any, without_bus: bool = False) -> MassProperties:
 
 
 def parallel_axis(mass_kg: float, place_m: Floats) -> Floats:
-    """(3, 3) inertia about the origin of a point mass: m (r.r E - r r^T) (Steiner)."""
+    """(3, 3) inertia of a point mass about the origin: m (r.r E - r r^T) (Steiner)."""
     return mass_kg * (place_m @ place_m * np.eye(3) - np.outer(place_m, place_m))
 
 
 def declare_mass(bus: Any, model: Any, vehicle: VehicleConfig, path: Path) -> MassProperties:
-    """Give the bus the inertial that makes the whole tree come out as declared: wanted minus what it carries.
+    """Set the bus's inertial so that the whole vehicle has the declared mass properties: declared minus what it
+    carries.
 
-    Mass and inertia that the scene leaves out stay as in the file; the centre of mass is always the scene's.
-    The inertia is that about the bearing's centre, its principal axes the body's. Nothing is moved: what a
-    lab does with balance masses is done to the bus's inertial alone, and the camera stays where it is.
+    Mass and inertia that the scene leaves out stay as in the file; the center of mass is always the scene's.
+    The inertia is that about the bearing's center, with principal axes along the body's. No part is moved: only the
+    bus's inertial changes (in place of a lab's balance masses), and the camera keeps its position.
     """
     own, carried = tree_mass(model), tree_mass(model, without_bus=True)
     centre = np.array(vehicle.centre_of_mass_m)
@@ -60,6 +63,7 @@ def declare_mass(bus: Any, model: Any, vehicle: VehicleConfig, path: Path) -> Ma
             f"vehicle.mass: {wanted.mass_kg:g} kg leaves nothing for the bus, which carries"
             f" {carried.mass_kg:g} kg ({path})"
         )
+    # The bus's own center follows from the first moments: total minus carried, over the bus's mass.
     place = (wanted.mass_kg * wanted.centre_m - carried.mass_kg * carried.centre_m) / mass
     whose = f"vehicle.inertia: less what the bus carries ({path}), its"
     give_inertial(bus, mass, place, inertia - carried.inertia_kg_m2 - parallel_axis(mass, place), whose)
@@ -67,12 +71,12 @@ def declare_mass(bus: Any, model: Any, vehicle: VehicleConfig, path: Path) -> Ma
 
 
 def unbalance(model: Any, joints: list[Any], wheels: WheelsConfig, path: Path) -> None:
-    """Set every wheel's mass off its axle and tilt its principal axes: it shakes the vehicle with its speed squared.
+    """Unbalance the wheels: offset each center of mass from the axle and tilt the principal axes.
 
-    Static: the rotor's centre is moved across the axle by static_imbalance / mass; the axle feels the force
-    U_s speed^2, the bearing its moment. Dynamic: a product of inertia U_d between the axle and the other line across
-    it; the axle feels the torque U_d speed^2, at a quarter of a turn from the former. Changes the joints' bodies;
-    model is what they compiled to while they were balanced.
+    Static: the rotor's center is moved across the axle by static_imbalance / mass; the axle feels the force
+    U_s speed^2, the bearing its moment. Dynamic: a product of inertia U_d between the axle and the second axis
+    across it; the axle feels the torque U_d speed^2, 90 deg from the former. Changes the joints' bodies; model is
+    what they compiled to while balanced.
     """
     if not (wheels.static_imbalance_kg_m or wheels.dynamic_imbalance_kg_m2):
         return
@@ -96,7 +100,7 @@ def unbalance(model: Any, joints: list[Any], wheels: WheelsConfig, path: Path) -
 
 
 def give_inertial(body: Any, mass_kg: float, place_m: Floats, inertia_kg_m2: Floats, whose: str) -> None:
-    """Write mass, centre and inertia (3, 3) about it into a body of a spec; refuse what no rigid body has."""
+    """Set mass, center and inertia (3, 3) about it in a body of a spec. Raises InputError for impossible inertia."""
     moments, axes = np.linalg.eigh(inertia_kg_m2)
     if moments[0] <= 0 or moments[2] > (moments[0] + moments[1]) * (1 + 1e-12):
         raise InputError(
@@ -104,9 +108,9 @@ def give_inertial(body: Any, mass_kg: float, place_m: Floats, inertia_kg_m2: Flo
             f" {', '.join(f'{m:.3g}' for m in moments)} kg m2, which no rigid body has"
         )
     body.explicitinertial = True
-    # MuJoCo takes a NaN ipos for the body's pos without a word: always set it.
+    # MuJoCo silently takes a NaN ipos as the body's pos: always set it.
     body.mass, body.ipos, body.inertia = mass_kg, place_m, moments
     body.iquat = Rotation.from_matrix(axes * np.linalg.det(axes)).as_quat(scalar_first=True)
-    # An orientation or a full inertia that the file gave in another way would win over these.
+    # An orientation or full inertia that the file gives in another form would override these.
     body.ialt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
     body.fullinertia = np.full(6, np.nan)

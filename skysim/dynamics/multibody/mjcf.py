@@ -1,4 +1,4 @@
-"""MuJoCo's model files: read and compiled, with its complaints told in one line."""
+"""Read and compile MJCF files; report MuJoCo's errors in one line."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def compiled(spec: Any, path: Path) -> Any:
 
 @contextmanager
 def mujoco_warnings() -> Iterator[list[str]]:
-    """Collect MuJoCo's warnings, which it would print and append to a file in the user's folder."""
+    """Collect MuJoCo's warnings, which it would otherwise print and append to a file in the working folder."""
     caught: list[str] = []
     before = mujoco.get_mju_user_warning()
     mujoco.set_mju_user_warning(caught.append)

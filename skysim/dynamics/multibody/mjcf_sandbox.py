@@ -1,7 +1,9 @@
-"""A vehicle's model may be a stranger's: it names no file outside of its own folder, by itself or in what it includes.
+"""Check that an untrusted MJCF file and all it includes name only files within its own folder.
 
-MuJoCo would read any. It and we have to see the same names, so XML that two parsers could take differently is refused:
-another encoding than UTF-8, a DOCTYPE, namespaces. And of the places where MuJoCo may look for a name all are checked.
+MuJoCo itself would read any file. The check must see the same names as MuJoCo's parser, so XML that two
+parsers could
+read differently is refused: encodings other than UTF-8, a DOCTYPE, namespaces. Of each name all places are checked
+where MuJoCo may look for it.
 """
 
 from __future__ import annotations
@@ -22,22 +24,22 @@ SIDES = ("right", "left", "up", "down", "front", "back")
 FOLDERS = {"meshdir", "texturedir", "assetdir"}
 FILES = {"file", *(f"file{side}" for side in SIDES)}
 MOST_BYTES = 1 << 24  # of an XML file
-MOST_PLACES = 100_000  # where a model's files might lie
+MOST_PLACES = 100_000  # candidate paths of a model's files
 
 
 class Named(NamedTuple):
     """A file or folder as a model names it."""
 
     value: str
-    told: str  # by whom, in words
+    told: str  # which element names it, for the error message
     xml: bool
 
 
 @dataclass
 class Names:
-    """What has been found so far: a setting in one file moves the files of another, so all are taken together.
+    """Names found so far. A setting in one file affects the paths of another, so all files are collected together.
 
-    bases : folders that a name may start from;  folders : what meshdir and its like put between
+    bases : folders that a relative name may start from;  folders : values of meshdir and the like
     """
 
     folder: Path
@@ -46,9 +48,9 @@ class Names:
     files: set[Named] = field(default_factory=set)
 
     def add(self, path: Path) -> None:
-        """What an XML file names."""
-        # Without `..`, or a file that includes itself by way of one would lie in ever new folders. What the system
-        # makes of a `..` after a link is in the others.
+        """Add the names in an XML file."""
+        # Normalized, since a file that includes itself through `..` would otherwise give new folders without end.
+        # The other two cover how the system resolves `..` after a link.
         self.bases |= {os.path.normpath(path.parent), str(path.parent.resolve()), str(path.resolve().parent)}
         for element in parsed(path).iter():
             tag = element.tag.lower()
@@ -60,7 +62,9 @@ class Names:
                     )
 
     def places(self) -> Iterator[tuple[Named, Path]]:
-        """Wherever MuJoCo may look for a name; it takes `..` away before links are followed, and others after."""
+        """All paths where MuJoCo may look for each name. Some versions remove `..` before they follow links,
+        some after.
+        """
         between = {"", *(one.value for one in self.folders)}
         if len(self.bases) * len(between) * len(self.files) > MOST_PLACES:
             raise InputError(
@@ -76,13 +80,13 @@ class Names:
 
 
 def both(*parts: str) -> tuple[Path, Path]:
-    """A joined path as it is, and with each `..` and what stands before it left out."""
+    """A joined path as it is, and normalized (each `..` removed with the part before it)."""
     path = os.path.join(*parts)
     return Path(path), Path(os.path.normpath(path))
 
 
 def confined(path: Path) -> None:
-    """Refuse a model that leaves the folder it is in. Raises InputError with one line."""
+    """Raise InputError (one line) for a model that names files outside of its folder."""
     names, looked = Names(path.resolve().parent, set()), set[tuple[Named, Path]]()
     waiting, seen = [path], {same(path)}
     while waiting:
@@ -100,7 +104,7 @@ def confined(path: Path) -> None:
 
 
 def check_place(name: Named, place: Path, folder: Path) -> None:
-    """Refuse a place outside of the folder, and what is there and no plain file. Raises InputError with one line."""
+    """Raise InputError (one line) for a path outside of the folder, and for one that is not a plain file."""
     if "\\" in name.value or not resolved(place).is_relative_to(folder):
         raise InputError(f"{name.told} leaves {folder}; allowed: files in it")
     if os.path.exists(place) and not (os.path.isfile(place) or os.path.isdir(place)):
@@ -108,12 +112,12 @@ def check_place(name: Named, place: Path, folder: Path) -> None:
 
 
 def same(place: Path) -> tuple[str, Path, Path]:
-    """What two places share that are one file, and from which the same names lead to the same places."""
+    """Identity of a file: equal for two paths only if they are one file and relative names resolve alike."""
     return os.path.normpath(place), resolved(place.parent), resolved(place)
 
 
 def resolved(place: Path) -> Path:
-    """The place with all links followed; of links in a circle the root, which is in no folder."""
+    """The path with all links followed; the root, which is in no folder, if links form a circle."""
     try:
         return place.resolve()
     except (OSError, RuntimeError):
@@ -121,7 +125,7 @@ def resolved(place: Path) -> Path:
 
 
 def parsed(path: Path) -> ElementTree.Element:
-    """The XML, if MuJoCo's parser and Python's read the same in it. Raises InputError with one line."""
+    """The parsed XML, if MuJoCo's parser reads it the same way. Raises InputError with one line."""
     try:
         with path.open("rb") as file:
             data = file.read(MOST_BYTES + 1)
@@ -130,7 +134,7 @@ def parsed(path: Path) -> ElementTree.Element:
     check(path, len(data) <= MOST_BYTES, f"up to {MOST_BYTES} bytes")
     check(path, b"<!DOCTYPE" not in data, "XML without DOCTYPE")
     try:
-        # UTF-8 whatever its first line says: so MuJoCo does.
+        # UTF-8 whatever the XML declaration says, as in MuJoCo.
         root = ElementTree.fromstring(data.decode("utf-8"))
     except (ElementTree.ParseError, ValueError) as error:
         raise unread(path, error) from None
@@ -141,11 +145,11 @@ def parsed(path: Path) -> ElementTree.Element:
 
 
 def unread(path: Path, error: Exception) -> InputError:
-    """What to say of a file that cannot be read, is no UTF-8 or no XML."""
+    """The error for a file that cannot be read, or is not UTF-8 or not XML."""
     return InputError(f"{path}: not a MuJoCo model: {' '.join(str(error).split())}")
 
 
 def check(path: Path, holds: bool, allowed: str) -> None:
-    """InputError with one line where a rule for a model's file does not hold."""
+    """Raise InputError (one line) where a rule for model files is violated."""
     if not holds:
         raise InputError(f"{path}: not a MuJoCo model that skysim reads; allowed: {allowed}")

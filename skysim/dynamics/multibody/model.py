@@ -1,4 +1,8 @@
-"""The vehicle's MJCF put on its bearing, with the actuators that the scene switches on, as one MuJoCo model.
+"""Build the MuJoCo model: the vehicle's MJCF on its bearing, with the actuators that the scene switches on.
+
+`compose` loads the file, moves body bus to the lab's origin and frees it of joints, places the camera, locks the
+joints of unused actuators, sets the declared mass properties, and adds a ball joint (the air bearing) with drag,
+cable spring and tilt stop. `build` compiles this and looks up the actuators.
 
 MuJoCo's qpos of a ball joint is lab_from_body as wxyz, its qvel the angular rate in body axes.
 """
@@ -43,20 +47,20 @@ NEEDED = f"body bus and camera {CAMERA}"
 # MuJoCo's camera has +y up and looks along -z; ours has +y down and looks along +z.
 CAM_FROM_MJCAM = Rotation.from_matrix(np.diag([1.0, -1.0, -1.0]))
 
-# The tilt stop's two ends, above the bearing in the lab and on the vehicle. Unequal, so that the line between
-# them never vanishes and its length has a slope at every tilt but none.
+# The tilt stop's two ends, above the bearing in the lab and on the vehicle. Unequal, so that the distance between
+# them never vanishes and its derivative is not zero at any tilt except 0.
 STOP_LAB_M, STOP_BODY_M = 1.0, 0.5
 
 
 @dataclass(frozen=True, slots=True)
 class World:
-    """A vehicle on its bearing, ready to fly. The model is not changed by flying.
+    """A vehicle on its bearing, ready to simulate. Simulation does not change the model.
 
     spec    : mujoco.MjSpec that the model was made from
     model   : mujoco.MjModel, whose first four qpos and three qvel are the bearing's
-    mass    : what the whole vehicle came out as, its wheels balanced
+    mass    : mass properties of the whole vehicle, with balanced wheels
     torques : (3,) actuator numbers of the ideal torques about body x, y, z
-    wheels, gimbals, rotors, fans : the actuators, without members where they are not switched on
+    wheels, gimbals, rotors, fans : the actuators, empty where they are not switched on
     """
 
     spec: Any
@@ -71,17 +75,17 @@ class World:
 
     @property
     def inertia_kg_m2(self) -> Floats:
-        """(3, 3) inertia tensor about the bearing's centre, in body axes, as if every joint were locked."""
+        """(3, 3) inertia tensor about the bearing's center, in body axes, as if every joint were locked."""
         return self.mass.inertia_kg_m2
 
     @property
     def gravity_m_s2(self) -> float:
-        """What pulls along lab -z."""
+        """Gravity along lab -z, a positive number."""
         return float(-self.model.opt.gravity[2])
 
 
 def build(vehicle: VehicleConfig) -> World:
-    """Compose and compile the vehicle, and find what its actuators are and where. Raises InputError with one line."""
+    """Compose and compile the vehicle, and look up its actuators. Raises InputError with one line."""
     path = SCENES / vehicle.model
     with mujoco_warnings():
         spec, mass = compose(vehicle, path)
@@ -102,8 +106,8 @@ def build(vehicle: VehicleConfig) -> World:
 def compose(vehicle: VehicleConfig, path: Path) -> tuple[Any, MassProperties]:
     """The vehicle's MJCF on a bearing at the lab's origin, as MjSpec, with the mass properties declared.
 
-    mount `air_bearing`: gravity along lab -z and a tilt stop. mount `free`: neither, and the vehicle turns
-    about its centre of mass, which must be the body's origin. Joints of actuators that the scene does not switch
+    mount `air_bearing`: gravity along lab -z and a tilt stop. mount `free`: neither, and the vehicle rotates
+    about its center of mass, which must be the body's origin. Joints of actuators that the scene does not switch
     on are locked. Raises InputError with one line.
     """
     if vehicle.mount == "free" and any(vehicle.centre_of_mass_m):
@@ -111,9 +115,10 @@ def compose(vehicle: VehicleConfig, path: Path) -> tuple[Any, MassProperties]:
             "vehicle.centre_of_mass: a free vehicle turns about it, so it is the body's origin; leave it out"
         )
     spec = load(path)
-    spec.compiler.fusestatic = False  # bodies keep their names until the bearing is there
+    spec.compiler.fusestatic = False  # keep bodies separate until the bearing is added
     bus = put_at_origin(spec, path)
     place_camera(spec, vehicle)
+    # Locking comes before the mass: a locked rotor is part of the rigid vehicle.
     locked = lock_unused(spec, vehicle, path)
     try:
         bare = compiled(spec, path)
@@ -125,6 +130,7 @@ def compose(vehicle: VehicleConfig, path: Path) -> tuple[Any, MassProperties]:
     except ValueError as error:  # a name is taken
         raise InputError(f"{path}: skysim adds its bearing under this name: {one_line(error)}") from error
     balanced = compiled(spec, path)
+    # Checked while the wheels are balanced, since `unbalance` changes the mass properties on purpose.
     check(balanced, mass, path)
     if vehicle.wheels:
         unbalance(balanced, joints(spec, WHEEL), vehicle.wheels, path)
@@ -133,7 +139,7 @@ def compose(vehicle: VehicleConfig, path: Path) -> tuple[Any, MassProperties]:
 
 
 def put_at_origin(spec: Any, path: Path) -> Any:
-    """The bus, freed of the joints and the place that its file gave it: the bearing decides on both."""
+    """Return body bus, moved to the origin without joints of its own: the bearing defines both."""
     has = {"body bus": spec.body("bus"), f"camera {CAMERA}": spec.camera(CAMERA)}
     missing = [name for name, element in has.items() if element is None]
     if missing:
@@ -153,7 +159,9 @@ def put_at_origin(spec: Any, path: Path) -> Any:
 
 
 def place_camera(spec: Any, vehicle: VehicleConfig) -> None:
-    """The camera's pupil where the scene has it: the body that carries the camera is moved, or on bus the camera."""
+    """Move the camera's pupil to the scene's position: move the body that carries the camera, or the
+    camera if on bus.
+    """
     if vehicle.camera_m is None:
         return
     model = spec.compile()
@@ -168,10 +176,11 @@ def place_camera(spec: Any, vehicle: VehicleConfig) -> None:
 
 
 def add_bearing(spec: Any, bus: Any, vehicle: VehicleConfig) -> None:
-    """A ball joint with the air's drag and the cable's spring, gravity and a tilt stop where there is a lab.
+    """Add a ball joint with air drag and cable spring; for an air bearing also gravity and a tilt stop.
 
-    Drag and spring are MuJoCo's own, so they are felt at every stage of a step: T = -(viscous + quadratic |rate|)
-    rate about each axis, T = -stiffness times the rotation vector of lab_from_body.
+    Drag and spring are MuJoCo's own, so that they are evaluated at every stage of a Runge-Kutta step:
+    T = -(viscous + quadratic |rate|) rate about each axis, T = -stiffness times the rotation vector of
+    lab_from_body.
     """
     drag, cable = vehicle.drag, vehicle.disturbances.cable
     bus.add_joint(
@@ -184,9 +193,9 @@ def add_bearing(spec: Any, bus: Any, vehicle: VehicleConfig) -> None:
     spec.option.gravity = [0.0, 0.0, -GRAVITY_M_S2 if lab else 0.0]
     spec.option.timestep = STEP_S
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_RK4
-    # In units of the mean inertia: at MuJoCo's 1e-8 friction of a small wheel drowns in a heavy vehicle. Costs nothing.
+    # In units of the mean inertia: MuJoCo's 1e-8 would hide a small wheel's friction in a heavy vehicle. No cost.
     spec.option.tolerance = 1e-16
-    # A handful of constraints on one tree: neither contacts nor a search for islands; PGS is the quickest on them.
+    # Few constraints on one tree: no contacts, no search for islands; PGS is the fastest solver here.
     spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_ISLAND)
     spec.option.solver = mujoco.mjtSolver.mjSOL_PGS
     spec.option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
@@ -196,11 +205,12 @@ def add_bearing(spec: Any, bus: Any, vehicle: VehicleConfig) -> None:
 
 
 def add_tilt_stop(spec: Any, bus: Any, stop_deg: float) -> None:
-    """A rope from the lab's z axis to the body's: its length is a function of tilt alone, so yaw is free.
+    """Limit the tilt by a tendon between the lab's z axis and the body's: its length depends on tilt only, so
+    yaw is free.
 
     length^2 = L^2 + b^2 - 2 L b cos(tilt). A ball joint's own range would limit the whole rotation, yaw too.
     The limit has the shortest time constant that MuJoCo allows, two steps, and twice the critical damping: it
-    gives way by 0.001 deg for each deg/s of the blow, and throws back 6 % of it.
+    yields by 0.001 deg for each deg/s of impact and returns 6 % of that rate.
     """
     spec.worldbody.add_site(name="tilt_stop_lab", pos=[0.0, 0.0, STOP_LAB_M])
     bus.add_site(name="tilt_stop_body", pos=[0.0, 0.0, STOP_BODY_M])
@@ -218,7 +228,7 @@ def add_tilt_stop(spec: Any, bus: Any, stop_deg: float) -> None:
 
 
 def check(model: Any, wanted: MassProperties, path: Path) -> None:
-    """The compiled model is what was asked for; MuJoCo has ways of changing it without a word."""
+    """Check that the compiled model is as declared; MuJoCo may change it silently. Raises InputError."""
     bus = model.body("bus").id
     mass = tree_mass(model)
     fans = [model.site(k).bodyid[0] for k in range(model.nsite) if model.site(k).name.startswith(FAN)]
@@ -241,7 +251,9 @@ def check(model: Any, wanted: MassProperties, path: Path) -> None:
 
 
 def mount(world: World) -> Mount:
-    """Where the compiled camera sits on the body; MuJoCo's camera axes become ours here and nowhere else."""
+    """Position and attitude of the camera on the body. The only place where MuJoCo's camera axes are
+    converted to ours.
+    """
     data = mujoco.MjData(world.model)
     mujoco.mj_forward(world.model, data)  # at qpos0 the body frame is the lab frame
     camera = data.camera(CAMERA)
@@ -250,7 +262,7 @@ def mount(world: World) -> Mount:
 
 
 def imu_place_m(world: World) -> Floats:
-    """(3,) where the accelerometers sit on the body: at site `imu`, else at the bearing's centre."""
+    """(3,) position of the accelerometers on the body: site `imu`, else the bearing's center."""
     if IMU not in [world.model.site(k).name for k in range(world.model.nsite)]:
         return np.zeros(3)
     data = mujoco.MjData(world.model)

@@ -1,7 +1,7 @@
-"""What stands between the camera and a light: the vehicle's own parts and the lab's, by MuJoCo's rays; the dome's wall.
+"""Occlusion of sources by the vehicle and the lab (MuJoCo ray casting) and by the dome's wall.
 
-A light is a point here and so is the pupil: a source is seen or it is not, at the pose of mid-exposure. Wheels and
-gimbals stand as they do at the start.
+Sources and pupil are points: a source is visible or not, at the pose of mid-exposure. Wheels and gimbals are as at
+the start.
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ from skysim.dynamics.multibody.mjcf import compiled, load, mujoco_warnings
 from skysim.dynamics.multibody.model import CAMERA, World, mount, place_camera, put_at_origin
 from skysim.sources.dome.surface import Surface
 
-BLOCKS, PASSES = 0, 5  # groups of geoms: those that are in the way of light, and the camera's own housing
-GROUPS = np.array([1, 0, 0, 0, 0, 0], dtype=np.uint8)  # of which rays heed the first alone
-INWARDS = 1e-6  # share of its distance from the bearing by which an LED is taken off the wall that it sits on
+BLOCKS, PASSES = 0, 5  # groups of geoms: those that block light, and the camera's own housing
+GROUPS = np.array([1, 0, 0, 0, 0, 0], dtype=np.uint8)  # rays are tested against the first only
+INWARDS = 1e-6  # an LED is moved off its wall by this fraction of its distance from the bearing
 
 
 @dataclass(frozen=True, slots=True)
 class Obstacles:
-    """All that can hide a light, with the vehicle free to be turned.
+    """Everything that can hide a source; the vehicle's attitude can be set.
 
-    model, data   : of MuJoCo, not those that are flown: body bus is moved by hand
+    model, data   : MuJoCo model and data of their own, not the simulated ones; body bus is set as a mocap body
     camera_body_m : (3,) the pupil, where all rays end
-    wall          : the dome's inside; None under the stars
+    wall          : the dome's inside; None in star scenes
     """
 
     model: Any
@@ -44,11 +44,11 @@ class Obstacles:
 
 
 def obstacles(world: World, wall: Surface | None) -> Obstacles:
-    """The vehicle's file once more, each body by itself: the flown model has all rigid ones fused into bus.
+    """Compile the vehicle's file again with separate bodies: the simulated model has all rigid ones fused into bus.
 
     The camera's housing lets light through: all geoms of the body that carries the camera, if it is not bus, and any
-    geom that stands all around the pupil, for then the camera looks out through a hole in it. A geom whose alpha is 0
-    is none for MuJoCo's rays.
+    geom that surrounds the pupil, since the camera then looks out through a hole in it. MuJoCo's rays ignore geoms
+    with an alpha of 0.
     """
     path = SCENES / world.vehicle.model
     with mujoco_warnings():
@@ -56,7 +56,7 @@ def obstacles(world: World, wall: Surface | None) -> Obstacles:
         spec.compiler.fusestatic = False
         bus = put_at_origin(spec, path)
         place_camera(spec, world.vehicle)
-        bus.mocap = True  # a body that stands where it is put
+        bus.mocap = True  # its pose is set, not simulated
         lock_unused(spec, world.vehicle, path)
         model = compiled(spec, path)
     data = mujoco.MjData(model)
@@ -71,7 +71,7 @@ def obstacles(world: World, wall: Surface | None) -> Obstacles:
 
 
 def housing(model: Any, data: Any, camera_body_m: Floats) -> NDArray[np.bool_]:
-    """(ngeom,) which geoms the camera sits in, the vehicle level. The groups are left in disorder."""
+    """(ngeom,) which geoms belong to the camera's housing. Overwrites the geoms' groups."""
     body = model.cam_bodyid[model.camera(CAMERA).id]
     own = (model.geom_bodyid == body) & (body != model.body("bus").id)
     six_ways = np.vstack([np.eye(3), -np.eye(3)])
@@ -82,7 +82,7 @@ def housing(model: Any, data: Any, camera_body_m: Floats) -> NDArray[np.bool_]:
 
 
 def hidden(things: Obstacles, lab_from_body: Rotation, sources: Sources) -> NDArray[np.bool_]:
-    """(N,) whether something stands on the line from the pupil to each source, LED or star, at that attitude."""
+    """(N,) whether an obstacle is on the line from the pupil to each source, LED or star, at that attitude."""
     turn = quaternion.of(lab_from_body)
     camera_m = quaternion.apply(turn, things.camera_body_m)
     place_m, near = sources.place[:, :3], sources.place[:, 3] > 0
@@ -98,7 +98,7 @@ def hidden(things: Obstacles, lab_from_body: Rotation, sources: Sources) -> NDAr
 
 
 def clear_m(model: Any, data: Any, from_m: Floats, rays: Floats) -> Floats:
-    """(N,) how far one sees from a point of the lab along unit vectors (N, 3): to the next geom that blocks, or inf."""
+    """(N,) distance from a point of the lab along unit vectors (N, 3) to the next geom that blocks; inf if none."""
     count = len(rays)
     geom, distance_m = np.empty(count, np.int32), np.empty(count)
     if count:
@@ -110,9 +110,10 @@ def clear_m(model: Any, data: Any, from_m: Floats, rays: Floats) -> Floats:
 
 
 def behind_wall(wall: Surface, camera_m: Floats, place_m: Floats) -> NDArray[np.bool_]:
-    """(N,) whether the way from LEDs at (N, 3) to the camera leaves the dome through its wall, not beneath its rim.
+    """(N,) whether the line from LEDs at (N, 3) to the camera passes through the dome's wall (not beneath its rim).
 
-    From inside nothing is behind a wall that is convex, and all our surfaces are, but for a survey's millimetres.
+    A camera inside sees no LED through the wall, as convex surfaces cannot hide their inside; all surfaces here are
+    convex, except for the millimeters of a surveyed one.
     """
     out = np.zeros(len(place_m), dtype=bool)
     if wall.inside(camera_m):

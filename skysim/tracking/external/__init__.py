@@ -1,1 +1,1 @@
-"""Star trackers of other people: the interface, the process that runs one, and the adapter of tetra3rs."""
+"""External star trackers: the interface, the process that runs one, and the plug-in for tetra3rs."""

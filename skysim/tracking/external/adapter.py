@@ -1,4 +1,4 @@
-"""A star tracker of somebody else's in the place of our own: set up alike, asked alike, and scored by the same code."""
+"""Adapter for an external star tracker in its own process; it gets the same set-up and frames as skysim's own."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from skysim.tracking.external.interface import FAILED, OWN, Answer, Leds, Pictur
 
 
 class ExternalTracker:
-    """A tracker in a process of its own. Whatever goes wrong there is the status of a frame."""
+    """A tracker in its own process. Every failure there becomes the status of a frame."""
 
     def __init__(self, program: process.Program) -> None:
         self.program = program
@@ -37,7 +37,7 @@ class ExternalTracker:
         lights: Stars | Leds,
         commands: Mapping[str, str],
     ) -> ExternalTracker:
-        """The one that the scene names. Raises InputError where there is none, or where it will not work here."""
+        """Start the tracker that the scene names. Raises InputError if there is none, or if it refuses the set-up."""
         told, name = scene.tracker, scene.tracker.name
         interface.known(name, commands)
         setup = set_up(scene, camera, settings, lights)
@@ -45,13 +45,13 @@ class ExternalTracker:
             parts, kind = process.words(name, commands[name])
             return cls(process.Program(name, parts, kind, setup, told.time_limit_s))
         host = [sys.executable, "-m", "skysim.tracking.external.host", name]
-        # What this process can import, that one can: an entry point that was found here is found there.
+        # The child gets this process's import path, so that it finds the same entry points.
         path = os.pathsep.join(part or os.getcwd() for part in sys.path)
         environment = {**os.environ, "PYTHONPATH": path}
         return cls(process.Program(name, host, None, setup, told.time_limit_s, environment))
 
     def look(self, frame: Frame, streak_px: tuple[float, float] | None = None) -> Report:
-        """Its report on a frame."""
+        """Send a frame; return the tracker's report."""
         picture = Picture(frame.image_dn, frame.index, frame.t_mid_s, frame.exposure_s, streak_px)
         try:
             return report(self.program.solve(picture))
@@ -59,12 +59,12 @@ class ExternalTracker:
             return Report(Attitude(f"{FAILED}{fault}"), Centroids.none())
 
     def solve_centroids(self, centroids: Centroids) -> Attitude:
-        """Nothing that another tracker could be asked. Raises InputError."""
+        """Not supported by external trackers. Raises InputError."""
         raise InputError(f"tracker.name: {self.program.name} takes frames; allowed under centroids: {OWN}")
 
 
 def set_up(scene: scenes.Scene, camera: Camera, settings: Settings, lights: Stars | Leds) -> Setup:
-    """What it is told: what our own tracker believes."""
+    """The set-up sent to the tracker: the same assumed hardware as skysim's own tracker gets."""
     return Setup(
         "icrs" if isinstance(scene.light, StarsConfig) else "lab",
         scene.start_time.isoformat(),
@@ -83,17 +83,17 @@ def set_up(scene: scenes.Scene, camera: Camera, settings: Settings, lights: Star
 
 
 def stars(catalogue: StarCatalog, direction: Floats) -> Stars:
-    """The on-board catalogue."""
+    """The on-board catalog."""
     return Stars(catalogue.id, direction, catalogue.v_mag)
 
 
 def leds(believed: LedMap, lever: Lever) -> Leds:
-    """The dome's map, and where the camera sits."""
+    """The dome map and the camera's mounting."""
     return Leds(believed.id, believed.position_m, lever.camera_body_m, lever.cam_from_body.as_quat())
 
 
 def report(answer: Answer) -> Report:
-    """An answer, checked before, in our tracker's own terms. Which star is which it does not say."""
+    """Convert a checked answer to a Report. External trackers do not say which star is which."""
     xy_px = answer.centroids_px
     unknown = np.full(len(xy_px), np.nan)
     seconds = {} if answer.seconds is None else {"solve": answer.seconds}

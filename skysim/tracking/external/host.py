@@ -1,6 +1,6 @@
 """The process in which an entry point's tracker runs: `python -m skysim.tracking.external.host NAME`.
 
-It is a program as docs/trackers.md has them. Frames come on standard input and answers go to what was standard
+It speaks the protocol of docs/trackers.md. Frames come on standard input and answers go to the original standard
 output; what the tracker itself prints goes to standard error.
 """
 
@@ -19,7 +19,7 @@ from skysim.tracking.external.interface import FAILED, Answer, Picture, Setup, T
 
 
 def picture(header: dict[str, Any], frames: IO[bytes]) -> Picture:
-    """A frame by its header, and the bytes after it."""
+    """Read a frame: its header is given, its pixels follow on the stream."""
     count = header["bytes"]
     image = np.frombuffer(frames.read(count), header["dtype"]).reshape(
         header["height_px"], header["width_px"]
@@ -30,12 +30,12 @@ def picture(header: dict[str, Any], frames: IO[bytes]) -> Picture:
 
 
 def why(error: Exception) -> str:
-    """An exception in one line."""
+    """An exception as one line."""
     return printable(f"{type(error).__name__}: {error}")
 
 
 def solved(tracker: Tracker, sight: Picture) -> Answer:
-    """The tracker's answer; what it raises, and what is no answer, are answers that it failed."""
+    """The tracker's answer; an exception or an invalid answer becomes an answer with status "failed: ..."."""
     begin_s = time.perf_counter()
     try:
         answer = tracker.solve(sight)
@@ -47,7 +47,7 @@ def solved(tracker: Tracker, sight: Picture) -> Answer:
 
 
 def made(name: str, setup: Setup) -> Tracker:
-    """The tracker of an entry point."""
+    """Load an entry point and build its tracker."""
     tracker = entry_points()[name].load()(setup)
     if not callable(getattr(tracker, "solve", None)):
         raise TypeError(f"a {type(tracker).__name__} has no method solve")
@@ -55,7 +55,7 @@ def made(name: str, setup: Setup) -> Tracker:
 
 
 def main(name: str) -> None:
-    """Set up, then answer frame after frame until there are no more."""
+    """Set up the tracker, then answer each frame until the input ends."""
     frames, answers = sys.stdin.buffer, os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
 

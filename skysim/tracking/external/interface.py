@@ -1,7 +1,7 @@
-"""A star tracker of your own: what it is told, what it answers, and how it is found (entry points `skysim.trackers`).
+"""The interface for external star trackers: set-up, frame, answer, and discovery by entry points `skysim.trackers`.
 
-An entry point names a callable that makes a `Tracker` from a `Setup`. It runs in a process of its own, so that what
-it does there, be it to hang or to crash, is an answer and no end of a run; docs/trackers.md has examples.
+An entry point names a callable that makes a `Tracker` from a `Setup`. It runs in its own process, so that a hang or
+a crash there becomes a failed answer and does not end the run; docs/trackers.md has examples.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from skysim.core.errors import InputError, printable
 GROUP = "skysim.trackers"
 OWN = "own"  # the name of skysim's own estimator
 SOLVED = "solved"
-FAILED = "failed: "  # what the status of a tracker begins with that raised, hung, died or answered nonsense
-PROTOCOL = 1  # its version, first in the set-up
-UNIT_TOLERANCE = 1e-3  # of a quaternion's norm: single precision is let pass, and made a unit again
-LARGEST_RAD2 = (2 * np.pi) ** 2  # an axis of a covariance: nothing at all is known
+FAILED = "failed: "  # start of the status after an exception, hang, crash or invalid answer
+PROTOCOL = 1  # version, the first key of the set-up
+UNIT_TOLERANCE = 1e-3  # of a quaternion's norm: single precision passes and is normalized
+LARGEST_RAD2 = (2 * np.pi) ** 2  # largest eigenvalue of a covariance: no information
 EXTRAS = {
     "skysim.tracking.external.tetra3rs:Tetra3rs": ("tetra3rs", "oracle")
 }  # module and extra of the trackers in our own package
-LEAST_RAD2 = 1e-24  # 0.2 micro-arcseconds
+LEAST_RAD2 = 1e-24  # smallest eigenvalue: (0.2 micro-arcseconds)^2
 MOST_CENTROIDS = 100_000
 MOST_TEXT = 300  # characters of a status
 
@@ -36,9 +36,9 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Stars:
-    """The catalogue that the scene's tracker is given, brightest first.
+    """The star catalog given to the tracker, brightest first.
 
-    id : (N,) Hipparcos numbers; direction : (N, 3) unit vectors in the reference, as seen at the scene's date
+    id : (N,) Hipparcos numbers; direction : (N, 3) apparent unit vectors in the reference frame at the scene's date
     (proper motion, parallax, aberration); magnitude : (N,) V
     """
 
@@ -49,7 +49,7 @@ class Stars:
 
 @dataclass(frozen=True, slots=True)
 class Leds:
-    """The dome as it was surveyed. The vehicle turns about the lab's origin, and the camera is not there.
+    """The surveyed dome. The vehicle rotates about the lab's origin; the camera is offset from it.
 
     id : (N,); position_m : (N, 3) in the lab
     camera_body_m : (3,) entrance pupil in body axes; cam_from_body_xyzw : (4,) body axes to camera axes
@@ -63,13 +63,13 @@ class Leds:
 
 @dataclass(frozen=True, slots=True)
 class Setup:
-    """What a tracker is told before the first frame: the hardware as it is believed to be.
+    """What a tracker gets before the first frame: the hardware as the scene's tracker assumes it.
 
-    reference  : "icrs" under the stars, "lab" under a dome or on a bench: what attitudes refer to
+    reference  : frame of the attitudes: "icrs" under the stars, "lab" under a dome or on a bench
     time_utc   : ISO 8601, when t_s is 0
     width_px, height_px, focal_px, centre_px : a pinhole in camera axes, +x right, +y down, +z boresight;
-        the middle of the first pixel is (0, 0)
-    distortion : k1, k2, p1, p2, k3 of Brown and Conrady, as OpenCV has them
+        the center of the first pixel is (0, 0)
+    distortion : k1, k2, p1, p2, k3 of Brown and Conrady, in OpenCV's order
     stars, leds: the map; one of them is None
     seed       : for a tracker that draws random numbers
     options    : the scene's `tracker.options`
@@ -90,13 +90,13 @@ class Setup:
     options: Mapping[str, Any] = field(default_factory=dict)
 
     def as_tree(self) -> dict[str, Any]:
-        """What JSON can say; arrays are lists."""
+        """As a JSON object; arrays become lists."""
         told: dict[str, Any] = plain(asdict(self))
         return {"skysim_tracker": PROTOCOL, **told}
 
     @classmethod
     def of_tree(cls, tree: Mapping[str, Any]) -> Self:
-        """What `as_tree` told."""
+        """The inverse of `as_tree`."""
         told = {name: value for name, value in tree.items() if name != "skysim_tracker"}
         for name, part in (("stars", Stars), ("leds", Leds)):
             if told[name] is not None:
@@ -109,9 +109,9 @@ class Setup:
 class Picture:
     """One frame as a tracker gets it.
 
-    image_dn   : (height_px, width_px), uint16; float64 of a camera without noise
+    image_dn   : (height_px, width_px), uint16; float64 from a camera without noise
     frame      : its number; t_s : mid-exposure since the scene's start; exposure_s
-    streak_px  : (dx, dy) that lights move in the exposure, where a gyro tells; else None
+    streak_px  : (dx, dy) that lights move in the exposure, if a gyro measures it; else None
     """
 
     image_dn: NDArray[Any]
@@ -123,13 +123,13 @@ class Picture:
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """What a tracker makes of a frame.
+    """A tracker's solution of a frame.
 
     status             : "solved", or why there is no attitude
-    cam_from_ref_xyzw  : (4,) unit quaternion, scalar last: v_cam = q v_ref q*, reference to camera; where solved
-    covariance_rad2    : (3, 3) of the small rotation in camera axes, if it is known; an attitude filter needs it
-    centroids_px       : (N, 2) x and y of the lights that were found, if it tells
-    seconds            : what it took, if not from the frame's sending to its answer
+    cam_from_ref_xyzw  : (4,) unit quaternion, scalar last: v_cam = q v_ref q*, reference to camera; only if solved
+    covariance_rad2    : (3, 3) of the small rotation in camera axes, optional; an attitude filter needs it
+    centroids_px       : (N, 2) x and y of the lights found, optional
+    seconds            : processing time; if None, the time from sending the frame to its answer
     """
 
     status: str
@@ -139,13 +139,13 @@ class Answer:
     seconds: float | None = None
 
     def as_tree(self) -> dict[str, Any]:
-        """What JSON can say; what is None is left out."""
+        """As a JSON object; entries that are None are left out."""
         told = {part.name: getattr(self, part.name) for part in fields(self)}
         return {name: plain(value) for name, value in told.items() if value is not None}
 
     @classmethod
     def of_tree(cls, tree: Any) -> Self:
-        """Raises ValueError for keys that an answer has not."""
+        """The inverse of `as_tree`. Raises ValueError for unknown keys or a missing status."""
         if not isinstance(tree, dict) or "status" not in tree:
             raise ValueError("an answer is an object with a status")
         known = [part.name for part in fields(cls)]
@@ -156,7 +156,7 @@ class Answer:
 
 
 class Tracker(Protocol):
-    """What an entry point's callable makes of a `Setup`. It may raise there what it cannot work with."""
+    """What an entry point's callable makes of a `Setup`; the callable raises for a set-up that it cannot use."""
 
     def solve(self, picture: Picture) -> Answer:
         """The attitude at mid-exposure, or why there is none."""
@@ -164,7 +164,7 @@ class Tracker(Protocol):
 
 
 def plain(value: Any) -> Any:
-    """Arrays as lists, mappings and sequences all through."""
+    """Convert arrays to lists, in mappings and sequences at any depth."""
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
     if isinstance(value, Mapping):
@@ -173,7 +173,7 @@ def plain(value: Any) -> Any:
 
 
 def checked(answer: Any) -> Answer:
-    """An answer that can be scored: arrays of the right shape, a unit quaternion. Raises ValueError for any other."""
+    """Check an answer (shapes of arrays, quaternion, covariance) and normalize its quaternion. Raises ValueError."""
     if not isinstance(answer, Answer):
         raise ValueError(f"a {type(answer).__name__} is no Answer")
     status = printable(answer.status)[:MOST_TEXT] if isinstance(answer.status, str) else ""
@@ -194,7 +194,7 @@ def checked(answer: Any) -> Answer:
 
 
 def numbers(value: Any, name: str, shape: tuple[int, ...]) -> Floats:
-    """Finite numbers of a shape. Raises ValueError."""
+    """An array of finite numbers of the given shape. Raises ValueError."""
     try:
         array = np.array(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
@@ -207,7 +207,7 @@ def numbers(value: Any, name: str, shape: tuple[int, ...]) -> Floats:
 
 
 def unit(quaternion: Floats) -> Floats:
-    """Made exactly a unit where it nearly is. Raises ValueError."""
+    """Normalize a quaternion whose norm is within UNIT_TOLERANCE of 1. Raises ValueError for others."""
     norm = float(np.linalg.norm(quaternion))
     if abs(norm - 1) > UNIT_TOLERANCE:
         raise ValueError(f"cam_from_ref_xyzw has norm {norm:.6g}; allowed: 1")
@@ -215,7 +215,7 @@ def unit(quaternion: Floats) -> Floats:
 
 
 def spread(covariance: Floats) -> Floats:
-    """Symmetric and positive definite, in reason. Raises ValueError."""
+    """Check that a covariance is symmetric and positive definite within plausible limits. Raises ValueError."""
     if not np.allclose(covariance, covariance.T, rtol=1e-6, atol=0):
         raise ValueError("covariance_rad2 is not symmetric")
     axes = np.linalg.eigvalsh(covariance)
@@ -228,7 +228,7 @@ def spread(covariance: Floats) -> Floats:
 
 
 def places(centroids: Any) -> Floats:
-    """(N, 2) of finite numbers; none where none are told. Raises ValueError."""
+    """(N, 2) centroids as finite numbers; empty for None. Raises ValueError."""
     count = 0 if centroids is None else np.shape(centroids)[0] if np.ndim(centroids) else -1
     if count > MOST_CENTROIDS:
         raise ValueError(f"centroids_px has {count} rows; allowed: up to {MOST_CENTROIDS}")
@@ -236,24 +236,24 @@ def places(centroids: Any) -> Floats:
 
 
 def entry_points() -> dict[str, metadata.EntryPoint]:
-    """The trackers that installed packages offer, by name; none is loaded. The name `own` is kept for skysim's."""
+    """Trackers that installed packages offer, by name; none is loaded. The name `own` is reserved for skysim's."""
     return {point.name: point for point in metadata.entry_points(group=GROUP) if point.name != OWN}
 
 
 def release(name: str) -> str:
-    """The package that offers a tracker, with its version; empty for skysim's own and for programs."""
+    """Name and version of the package that offers a tracker; empty for skysim's own and for programs."""
     point = entry_points().get(name) if name != OWN else None
     return f"{point.dist.name} {point.dist.version}" if point and point.dist else ""
 
 
 def needs(point: metadata.EntryPoint) -> str:
-    """What has to be installed for a tracker of skysim's own package, else nothing. Nothing is imported."""
+    """The extra to install for one of skysim's own plug-ins, if it is missing; else empty. Imports nothing."""
     package = EXTRAS.get(point.value)
     return f"skysim[{package[1]}]" if package and find_spec(package[0]) is None else ""
 
 
 def known(name: str, commands: Mapping[str, str]) -> None:
-    """Refuse a tracker that is not there. Raises InputError."""
+    """Raise InputError for an unknown tracker name."""
     allowed = [OWN, *entry_points(), *commands]
     if name not in allowed:
         raise InputError(

@@ -1,7 +1,7 @@
-"""A program that solves frames: started once, told each frame on its standard input, answers a line of JSON each.
+"""Run an external tracker program: started once, it gets frames on standard input and answers each with a JSON line.
 
-It is a process group of its own, which ends with it, with us, or when it has had its time. The commands come from
-the user's command line alone: no file can name one.
+The program leads its own process group, which is killed when the program ends, when skysim ends, or after a timeout.
+Commands come only from the user's command line; no file can name one.
 """
 
 from __future__ import annotations
@@ -31,22 +31,22 @@ from skysim.core.errors import InputError, printable
 from skysim.tracking.external import interface
 from skysim.tracking.external.interface import Answer, Picture, Setup
 
-START_LIMIT_S = 120.0  # to be ready
-GRACE_S = 1.0  # to end by itself once its input has
-TRIES = 3  # in a row that may fail before a program is not started again
-MOST_BYTES = 16_000_000  # of an answer
+START_LIMIT_S = 120.0  # for the program to report ready
+GRACE_S = 1.0  # for the program to exit after its input is closed
+TRIES = 3  # consecutive failures after which a program is not restarted
+MOST_BYTES = 16_000_000  # largest answer
 PIECE = 1 << 20
-LAST_LINES = 3  # of standard error that are told
+LAST_LINES = 3  # of standard error that an error message quotes
 FOLDER = re.compile(r"\{folder(?::(\w+))?\}")
 NAME = re.compile(r"[a-z][a-z0-9_-]*")
 
 
 class Fault(Exception):
-    """The program hung, died or said what is no answer; the message is one line."""
+    """The program hung, exited or sent an invalid answer; the message is one line."""
 
 
 def named(told: Sequence[str] | None) -> dict[str, str]:
-    """The commands of `--program NAME=COMMAND`, by name. Raises InputError."""
+    """Parse the options `--program NAME=COMMAND` to commands by name. Raises InputError."""
     programs: dict[str, str] = {}
     for item in told or ():
         name, equals, command = item.partition("=")
@@ -62,7 +62,7 @@ def named(told: Sequence[str] | None) -> dict[str, str]:
 
 
 def words(name: str, command: str) -> tuple[list[str], str | None]:
-    """A command taken apart, and in which format its folder gets frames; None where it has no `{folder}`."""
+    """Split a command into its arguments; also return the file format of `{folder}`, None without one."""
     try:
         parts = shlex.split(command)
     except ValueError as error:
@@ -76,14 +76,14 @@ def words(name: str, command: str) -> tuple[list[str], str | None]:
 
 
 def write_png(path: Path, picture: Picture) -> None:
-    """16 bits."""
+    """Write the frame as a 16-bit PNG."""
     from skysim.core import files
 
     files.write_png16(path, picture.image_dn)
 
 
 def write_fits(path: Path, picture: Picture) -> None:
-    """As the camera gave it, with times in the header, and without the truth that a run's own frames carry."""
+    """Write the frame as FITS with times in the header, without the truth that a run's own frames carry."""
     from astropy.io import fits
 
     from skysim.core import files
@@ -98,7 +98,7 @@ WRITERS: dict[str, Callable[[Path, Picture], None]] = {"png": write_png, "fits":
 
 @dataclass
 class Running:
-    """A process with the last of what it wrote on standard error, and its folder; `end` leaves nothing of it."""
+    """A running process with the last lines of its standard error and its folder; `end` cleans up all of it."""
 
     process: subprocess.Popen[bytes]
     folder: Path | None
@@ -106,7 +106,7 @@ class Running:
     listener: threading.Thread | None = None
 
     def listen(self, errors: IO[bytes]) -> None:
-        """Keep the last lines; a program that says much must not wait for us."""
+        """Read standard error and keep the last lines, so that a full pipe never blocks the program."""
         with errors:
             for line in iter(lambda: errors.readline(4096), b""):
                 text = printable(line.decode(errors="replace"))
@@ -114,7 +114,7 @@ class Running:
                     self.last.append(text[: interface.MOST_TEXT // 2])
 
     def end(self, grace_s: float = GRACE_S) -> int:
-        """Let it end by itself for a while, then end it and all that it started; its exit code."""
+        """Wait for the process to exit, kill its group after grace_s, remove its folder; return the exit code."""
         if self.process.returncode is not None:
             return self.process.returncode
         assert self.process.stdin is not None
@@ -122,7 +122,7 @@ class Running:
         with contextlib.suppress(OSError):
             self.process.stdin.close()
         until_s = time.monotonic() + grace_s
-        # Not waited for yet, its number is nobody else's, so the whole group can be ended.
+        # WNOWAIT leaves the process unreaped, so its id cannot be reused and killpg hits only this group.
         flags = os.WEXITED | os.WNOWAIT | os.WNOHANG
         while time.monotonic() < until_s and os.waitid(os.P_PID, self.process.pid, flags) is None:
             time.sleep(0.005)
@@ -137,17 +137,17 @@ class Running:
         return code
 
     def death(self) -> str:
-        """How it ended, and its last words."""
+        """How the process ended, with its last lines of standard error."""
         code = self.end()
         how = f"code {code}" if code >= 0 else signal.Signals(-code).name
         return f"the program ended ({how}): {' | '.join(self.last) or 'nothing on standard error'}"
 
 
 class Program:
-    """A program at work. Where it fails it is begun anew for the next frame, up to TRIES times in a row.
+    """An external tracker program. After a failure it is restarted for the next frame, up to TRIES times in a row.
 
-    parts, kind : of `words`;  limit_s : for a frame;  environment : in place of ours
-    Raises InputError where it cannot be started, or will not work with this set-up.
+    parts, kind : of `words`;  limit_s : time limit per frame;  environment : in place of this process's
+    Raises InputError where it cannot be started or refuses the set-up.
     """
 
     def __init__(
@@ -172,7 +172,7 @@ class Program:
             raise InputError(f"tracker.name: {name}: {fault}") from None
 
     def start(self) -> None:
-        """Begin the process and wait until it is ready. Raises Fault."""
+        """Start the process and wait until it is ready. Raises Fault."""
         folder = Path(tempfile.mkdtemp(prefix="skysim-")) if self.kind else None
         parts = [FOLDER.sub(str(folder), part) for part in self.parts]
         pipe = subprocess.PIPE
@@ -192,7 +192,7 @@ class Program:
             raise Fault(f"{parts[0]!r} cannot be started: {error.strerror}") from None
         running = Running(process, folder)
         self.running, self.heard = running, bytearray()
-        # With us, be we the command or a worker of a study's pool, where `atexit` is silent.
+        # Ends the program with this process; `atexit` does not run in a multiprocessing worker, Finalize does.
         self._finalizer = Finalize(self, running.end, (0.0,), exitpriority=10)
         assert process.stdin is not None
         assert process.stdout is not None
@@ -206,7 +206,7 @@ class Program:
             raise self.ended(printable(said if said else told)[: interface.MOST_TEXT])
 
     def solve(self, picture: Picture) -> Answer:
-        """Its answer to a frame, with the seconds it took. Raises Fault."""
+        """The program's answer to a frame, with the seconds it took. Raises Fault."""
         if self.failed >= TRIES:
             raise Fault(f"given up after {TRIES} failures in a row, the last: {self.why}")
         try:
@@ -227,7 +227,7 @@ class Program:
         )
 
     def read(self, told: Any, frame: int) -> Answer:
-        """An answer out of JSON. Raises Fault; after an answer to another frame the program is out of step."""
+        """Convert JSON to an Answer. Raises Fault. An answer to another frame ends the program: it is out of step."""
         if not isinstance(told, dict) or told.get("frame") != frame:
             raise self.ended(f"no answer to frame {frame}, but {str(told)[:80]!r}")
         try:
@@ -236,7 +236,7 @@ class Program:
             raise Fault(str(error)) from None
 
     def message(self, picture: Picture) -> list[bytes]:
-        """A frame's header and, where it is not in the folder, its pixels, row by row, little-endian."""
+        """A frame's header and, unless it is written to the folder, its pixels, row by row, little-endian."""
         header: dict[str, Any] = {
             "frame": picture.frame,
             "t_s": picture.t_s,
@@ -258,7 +258,7 @@ class Program:
         return [(json.dumps(header) + "\n").encode(), pixels]
 
     def exchange(self, message: list[bytes], limit_s: float) -> Any:
-        """Write all of a message and read a line of JSON, neither for longer than the limit. Raises Fault."""
+        """Write a message and read one line of JSON within the time limit. Raises Fault."""
         line = self.wait(b"".join(message), time.monotonic() + limit_s, limit_s)
         try:
             return json.loads(line)
@@ -266,7 +266,7 @@ class Program:
             raise self.ended(f"{line[:80].decode(errors='replace')!r} is no JSON") from None
 
     def wait(self, message: bytes, until_s: float, limit_s: float) -> bytes:
-        """Both pipes at once: a program may well say something before it has read everything."""
+        """Serve both pipes at once: the program may answer before it has read everything, and must not deadlock."""
         assert self.running is not None
         process = self.running.process
         assert process.stdin is not None
@@ -293,7 +293,7 @@ class Program:
         return line
 
     def hear(self, piece: bytes) -> None:
-        """What came from the program. Raises Fault at its end, or of an answer without one."""
+        """Buffer what the program wrote. Raises Fault when it ends or when an answer is too long."""
         if not piece:
             assert self.running is not None
             raise self.ended(self.running.death())
@@ -302,12 +302,12 @@ class Program:
             raise self.ended(f"an answer of more than {MOST_BYTES} bytes", 0.0)
 
     def ended(self, why: str, grace_s: float = GRACE_S) -> Fault:
-        """End the process: whatever it says next would be the answer to another question."""
+        """End the process, since its next output could answer an earlier frame; return the Fault to raise."""
         self.close(grace_s)
         return Fault(why)
 
     def close(self, grace_s: float = GRACE_S) -> None:
-        """End the process and all that it started; its folder goes too."""
+        """End the process and its group, and remove its folder."""
         if self._finalizer and self.running:
             self._finalizer.cancel()
             self.running.end(grace_s)

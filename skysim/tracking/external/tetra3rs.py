@@ -1,8 +1,8 @@
-"""tetra3rs (github.com/ssmichael1/tetra3rs, MIT) as a star tracker: its own catalogue (Gaia), centroids and solver.
+"""tetra3rs (github.com/ssmichael1/tetra3rs, MIT) as a star tracker: its own catalog (Gaia), centroids and solver.
 
 The entry point `tetra3rs`; the package comes with the extra `oracle`. Options, from `tracker.options`:
-fast : its single-pass centroiding in place of the full one;  sigma : threshold;  brightest : most centroids
-limit_mag : of its catalogue; left out, it takes as many stars as the field asks for
+fast : single-pass centroiding instead of the full one;  sigma : threshold;  brightest : most centroids
+limit_mag : of its catalog; if left out, it takes as many stars as the field needs
 """
 
 from __future__ import annotations
@@ -15,15 +15,15 @@ import numpy as np
 from skysim.core.units import in_utc
 from skysim.tracking.external.interface import SOLVED, Answer, Picture, Setup
 
-WIDER = 1.1  # than the field: for what patterns are made
+WIDER = 1.1  # field of the pattern database over that of the camera
 OPTIONS = ("fast", "sigma", "brightest", "limit_mag")
 
 
 class Tetra3rs:
-    """Lost in space at every frame. The camera is believed calibrated, the observer on Earth."""
+    """Lost-in-space solution of every frame. It assumes a calibrated camera and an observer on Earth."""
 
     def __init__(self, setup: Setup) -> None:
-        """Raises ValueError for what it cannot work with, ImportError where it is not installed."""
+        """Raises ValueError for a set-up that it cannot work with, ImportError where tetra3rs is not installed."""
         if setup.reference != "icrs":
             raise ValueError("tetra3rs knows the stars alone; allowed: scenes with light.kind: stars")
         strange = [name for name in setup.options if name not in OPTIONS]
@@ -47,7 +47,9 @@ class Tetra3rs:
         )
 
     def solve(self, picture: Picture) -> Answer:
-        """Its quaternion is scalar first, ICRS to camera; its covariance is of other angles and is not told."""
+        """Solve one frame. The quaternion is scalar first, ICRS to camera; the covariance uses other
+        angles: left out.
+        """
         found = self.extract(
             picture.image_dn,
             sigma_threshold=self.options.get("sigma", 5.0),
@@ -65,12 +67,14 @@ class Tetra3rs:
 
 
 def middle_px(setup: Setup) -> Any:
-    """(2,) of the image, from which tetra3rs counts pixels."""
+    """(2,) center of the image, the origin of tetra3rs's pixel coordinates."""
     return np.array([(setup.width_px - 1) / 2, (setup.height_px - 1) / 2])
 
 
 def camera(tetra3rs: Any, setup: Setup) -> Any:
-    """Its camera model: the same polynomial of distortion, but in pixels, so that coefficients have powers of 1/f."""
+    """tetra3rs's camera model: the same distortion polynomial in pixels, so coefficients are divided by powers
+    of the focal length.
+    """
     f, (k1, k2, p1, p2, k3) = setup.focal_px, setup.distortion
     bent = tetra3rs.RadialDistortion(k1=k1 / f**2, k2=k2 / f**4, k3=k3 / f**6, p1=p1 / f, p2=p2 / f)
     return tetra3rs.CameraModel(

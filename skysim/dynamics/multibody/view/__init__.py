@@ -1,1 +1,1 @@
-"""Pictures of the laboratory: its shapes, its MJCF for MuJoCo's own viewer, and rendered views."""
+"""Pictures of the laboratory: shapes, MJCF for MuJoCo's viewer, and rendered views."""

@@ -1,7 +1,7 @@
-"""The laboratory in three dimensions: one MJCF of all that stands in it. `picture` draws it.
+"""Export the whole laboratory as one MJCF file, for MuJoCo's viewer and for `picture`.
 
-What is added to the vehicle is for the eye: it has no mass, touches nothing and is in no constraint. Groups of the
-viewer: 0 vehicle, floor and pedestal, 1 dome and LEDs or stars, 2 the star camera's field; hidden in 4, the tilt stop.
+What is added to the vehicle is for display only: no mass, no contacts, no constraints. Groups of the viewer:
+0 vehicle, floor and pedestal, 1 dome and LEDs or stars, 2 the star camera's field of view; 4, hidden, the tilt stop.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ FOVY_DEG = 38.0
 SKY_RADIUS_M = 5.0
 SKY = Ellipsoid(np.zeros(3), np.full(3, SKY_RADIUS_M))
 MOST_STARS = 300
-LED_RADIUS_M = 5e-3  # larger than life: the disc itself would be less than a pixel
-LEVELS, DIM = 12, 0.15  # steps of brightness, and the darkest beside the brightest
+LED_RADIUS_M = 5e-3  # larger than the true disc, which would be less than a pixel
+LEVELS, DIM = 12, 0.15  # steps of brightness, and the darkest over the brightest
 RIM_M = 0.03
 SECTORS, RINGS = 72, 24  # of the dome's mesh
 FLOOR_BELOW_M, VEHICLE_BELOW_M = 0.95, 0.6
@@ -47,12 +47,12 @@ LIT_RGB, FIELD_RGB = np.array([1.0, 0.93, 0.78]), np.array([0.25, 0.75, 1.0])
 
 
 def mjcf(world: World, scene: Scene, sources: Sources, lab_from_body: Rotation) -> str:
-    """The whole laboratory as the text of one MJCF file, which MuJoCo's own viewer opens and flies.
+    """The whole laboratory as the text of one MJCF file, which MuJoCo's own viewer can open and simulate.
 
-    sources       : LEDs in the lab's metres, or stars, of which the brightest are put on a sphere
-    lab_from_body : attitude in the keyframe `start`, beside the speeds and gimbal angles of the scene
-    The model that is stepped stays as it is. Raises InputError for a start beyond the tilt stop, and for a vehicle with
-    a camera `lab` of its own.
+    sources       : LEDs in lab coordinates (m), or stars, of which the brightest are put on a sphere
+    lab_from_body : attitude in the keyframe `start`, which also has the speeds and gimbal angles of the scene
+    The simulated model is not changed. Raises InputError for a start beyond the tilt stop, and for a vehicle that
+    has a camera named `lab`.
     """
     spec, here = world.spec.copy(), mount(world)
     if spec.camera(LAB_CAMERA):
@@ -82,16 +82,16 @@ def mjcf(world: World, scene: Scene, sources: Sources, lab_from_body: Rotation) 
 
 
 def hide_tilt_stop(spec: Any) -> None:
-    """Its rope and its ends are no hardware."""
+    """Put the tilt stop's tendon and its ends, which are no hardware, into the hidden group."""
     for element in (*spec.tendons, *spec.sites):
         if element.name.startswith("tilt_stop"):
             element.group = GROUP_HIDDEN
 
 
 def inline_meshes(spec: Any, model: Any) -> None:
-    """Put the vertices of the vehicle's mesh files into the model, so that it stands alone.
+    """Copy the vertices of the vehicle's mesh files into the model, so that it needs no other file.
 
-    A compiled mesh is turned to its principal axes; mesh_pos and mesh_quat tell where they were.
+    A compiled mesh is rotated to its principal axes; mesh_pos and mesh_quat undo this.
     """
     for mesh in spec.meshes:
         if not mesh.file:
@@ -109,7 +109,7 @@ def inline_meshes(spec: Any, model: Any) -> None:
 
 
 def add_backdrop(spec: Any, on_earth: bool) -> None:
-    """A dim room, or the black of space, and the light to see a vehicle by."""
+    """A dim room or black space as background, and a lamp."""
     top, bottom = ([0.16, 0.19, 0.24], [0.03, 0.035, 0.05]) if on_earth else ([0.0, 0.0, 0.01], [0.0] * 3)
     spec.add_texture(
         name="stage_backdrop",
@@ -168,22 +168,22 @@ def add_room(spec: Any) -> None:
 
 
 def show(body: Any, name: str, kind: Any, **more: Any) -> Any:
-    """A geom for the eye alone: no mass, no contact."""
+    """A geom for display only: no mass, no contact."""
     return body.add_geom(name=name, type=kind, mass=0.0, contype=0, conaffinity=0, **more)
 
 
 def add_dome(spec: Any, rings_m: Floats) -> None:
-    """The dome as dark cloth seen from inside and as glass from outside, with a rim."""
+    """The dome, opaque from inside and transparent from outside, with a rim."""
     add_sheet(spec, "stage_dome", rings_m, [0.16, 0.19, 0.27, 1.0], [0.60, 0.72, 0.90, 0.10])
     rim_m = np.stack([rings_m[-1], rings_m[-1] - [0.0, 0.0, RIM_M]])
     add_sheet(spec, "stage_rim", rim_m, [0.45, 0.50, 0.58, 1.0], [0.45, 0.50, 0.58, 0.6])
 
 
 def shell_m(inside: Surface, cap_rad: float) -> Floats:
-    """(RINGS, SECTORS, 3) points of the dome, ring under ring from its top down, each against the clock's hands.
+    """(RINGS, SECTORS, 3) points of the dome, ring under ring from its top down, each counterclockwise from above.
 
-    A panel ends a little beyond its LEDs, an upright ellipsoid without a rim where it is widest or above the vehicle
-    if that is higher; every other surface as the bearing sees it end.
+    A panel ends slightly beyond its LEDs; an upright ellipsoid without a rim ends where it is widest, or above the
+    vehicle if that is higher; every other surface ends where it does as seen from the bearing.
     """
     azimuth = np.arange(SECTORS) * (2 * np.pi / SECTORS)
     around = np.stack([np.cos(azimuth), np.sin(azimuth), np.zeros(SECTORS)], axis=1)
@@ -206,8 +206,8 @@ def shell_m(inside: Surface, cap_rad: float) -> Floats:
 def seen_shell_m(inside: Surface, around: Floats) -> Floats:
     """(RINGS, SECTORS, 3) points where rays from the bearing meet a surface, from its upper edge to its rim.
 
-    around : (SECTORS, 3) level unit vectors. Edge and rim are found to a fifth of a degree, between 0 and 80 deg from
-             the zenith and above a third of the surface's height
+    around : (SECTORS, 3) horizontal unit vectors. Edge and rim are found to a fifth of a degree, between 0 and
+             80 deg from the zenith and above a third of the surface's height
     """
     up = np.array([0.0, 0.0, 1.0])
 
@@ -226,9 +226,9 @@ def seen_shell_m(inside: Surface, around: Floats) -> Floats:
 def add_sheet(
     spec: Any, name: str, rings_m: Floats, inside_rgba: list[float], outside_rgba: list[float]
 ) -> None:
-    """A sheet with two faces of their own colour: OpenGL draws no triangle from behind.
+    """A surface with a color for each side; OpenGL does not draw the back of a triangle, so it is two meshes.
 
-    rings_m : (K, n, 3) each against the clock's hands seen from above, every one beneath or around that before it
+    rings_m : (K, n, 3) each counterclockwise seen from above, every one beneath or around the previous one
     """
     here = np.arange(rings_m.shape[0] * rings_m.shape[1]).reshape(rings_m.shape[:2])
     a, d = here[:-1].ravel(), here[1:].ravel()
@@ -251,7 +251,7 @@ def add_mesh(
     group: int,
     **more: Any,
 ) -> None:
-    """A mesh, open or closed, and the geom that shows it; as a shell it needs no volume."""
+    """A mesh, open or closed, and its geom; its inertia is that of a shell, which needs no volume."""
     mesh = spec.add_mesh(
         name=name, uservert=np.round(vertices_m, 6).ravel(), userface=faces.astype(np.int32).ravel()
     )
@@ -260,11 +260,11 @@ def add_mesh(
 
 
 def add_lights(spec: Any, sources: Sources) -> None:
-    """A glowing grain for each LED, and for each of the brightest stars; how bright, by its mean strength.
+    """A glowing grain for each LED, and for each of the brightest stars; brightness from its mean strength.
 
-    An LED's colour goes with its light; a star's size does, with the root, for it has nothing else to show. Grains
-    of about the same colour are one mesh: as many sites would cost eight times the time of a step, and seconds a
-    picture.
+    An LED's color shows its strength; a star's size does, by the square root. Grains of similar color share
+    one mesh: as
+    many sites would make a step eight times as slow, and a picture seconds.
     """
     glow = spec.add_material(name="stage_glow", emission=0.8, specular=0.0)
     mean = sources.strength * sources.on_s / sources.period_s
@@ -286,16 +286,16 @@ def grains(place_m: Floats, radius_m: Floats) -> tuple[Floats, NDArray[np.int64]
     corners = np.concatenate([np.eye(3), -np.eye(3)])
     signs = np.array([[x, y, z] for x in (0, 3) for y in (0, 3) for z in (0, 3)])
     faces = signs + np.arange(3)
-    odd = (signs > 0).sum(axis=1) % 2 == 1  # mirrored, so turned back to face outwards
+    odd = (signs > 0).sum(axis=1) % 2 == 1  # mirrored: reverse the order, to face outwards
     faces[odd] = faces[odd][:, ::-1]
     vertices = place_m[:, None, :] + radius_m[:, None, None] * corners
     return vertices.reshape(-1, 3), (6 * np.arange(len(place_m))[:, None, None] + faces).reshape(-1, 3)
 
 
 def field_corners(camera: CameraConfig, here: Mount, lab_from_body: Rotation, inside: Surface) -> Floats:
-    """(4, 3) in body axes: where a pinhole's rays of the chip's corners meet dome or sky, in a given attitude.
+    """(4, 3) in body axes: where a pinhole's rays of the chip's corners meet dome or sky, at a given attitude.
 
-    One that misses a flat panel, or meets it far away, ends as far off as the sky.
+    A ray that misses a flat panel, or meets it far away, ends at the distance of the sky.
     """
     x = np.array([-0.5, camera.width_px - 0.5, camera.width_px - 0.5, -0.5]) - camera.centre_px[0]
     y = np.array([-0.5, -0.5, camera.height_px - 0.5, camera.height_px - 0.5]) - camera.centre_px[1]
@@ -308,9 +308,11 @@ def field_corners(camera: CameraConfig, here: Mount, lab_from_body: Rotation, in
 
 
 def add_field(spec: Any, here: Mount, corners_m: Floats) -> None:
-    """The star camera's field as a pyramid of light on the vehicle, with its edges."""
+    """The star camera's field of view as a translucent pyramid on the vehicle, with its edges."""
     bus, tip = spec.body("bus"), here.camera_body_m
-    sides = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 4, 1]])  # open, so that the camera itself sees out
+    sides = np.array(
+        [[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 4, 1]]
+    )  # open, so that it does not block the camera's own view
     glow = spec.add_material(name="stage_field", emission=0.6, specular=0.0)
     more = {"material": glow.name, "group": GROUP_FIELD}
     vertices = np.vstack([tip, corners_m])
@@ -330,9 +332,9 @@ def add_field(spec: Any, here: Mount, corners_m: Floats) -> None:
 
 
 def dome_view(rings_m: Floats) -> tuple[Floats, Floats, Floats, float]:
-    """(eye, what it looks at, up, size), m: from the side, so that one sees under the dome's rim and through it.
+    """(eye, target, up, size), m: from the side, so that one sees under the dome's rim and through it.
 
-    The eye is as far off as dome and vehicle need to fill a picture of 4:3; the rim's near side is the widest.
+    The eye's distance makes dome and vehicle fill a picture of 4:3; the rim's near side is the widest.
     """
     wide, top = np.hypot(*rings_m[-1, :, :2].T).max(), rings_m[..., 2].max()
     size = (top + VEHICLE_BELOW_M) / 2
@@ -343,7 +345,7 @@ def dome_view(rings_m: Floats) -> tuple[Floats, Floats, Floats, float]:
 
 
 def sky_view(world: World, boresight: Floats) -> tuple[Floats, Floats, Floats, float]:
-    """Likewise, from beside the vehicle and from behind it, with the camera's field along the picture's diagonal."""
+    """As `dome_view`, from beside and behind the vehicle, with the camera's field along the picture's diagonal."""
     size = float(world.model.stat.extent) / 2 + SKY_RADIUS_M / 2
     beside = np.cross(boresight, np.eye(3)[np.argmin(np.abs(boresight))])
     back = beside / np.linalg.norm(beside) - 0.5 * boresight
@@ -358,7 +360,7 @@ def direction(azimuth_deg: float, elevation_deg: float) -> Floats:
 
 
 def look_at(spec: Any, eye_m: Floats, middle_m: Floats, up: Floats, size_m: float) -> None:
-    """The camera `lab`, and what the viewer opens on: MuJoCo's cameras look along -z, y is up."""
+    """Add the camera `lab` and set the viewer's initial view: MuJoCo's cameras look along -z, y is up."""
     back = (eye_m - middle_m) / np.linalg.norm(eye_m - middle_m)
     right = np.cross(up, back) / np.linalg.norm(np.cross(up, back))
     turn = Rotation.from_matrix(np.column_stack([right, np.cross(back, right), back]))
@@ -370,7 +372,7 @@ def look_at(spec: Any, eye_m: Floats, middle_m: Floats, up: Floats, size_m: floa
 
 
 def add_start(spec: Any, world: World, scene: Scene, lab_from_body: Rotation) -> None:
-    """The keyframe `start`: attitude and rate, wheel and rotor speeds, gimbal angles and where their servos aim."""
+    """The keyframe `start`: attitude and rate, wheel and rotor speeds, gimbal angles and servo set-points."""
     flight = Flight(world, lab_from_body, np.radians(scene.motion.rate_deg_s), 0.0)
     data = flight.data
     spec.add_key(name="start", qpos=data.qpos, qvel=data.qvel, act=data.act, ctrl=data.ctrl)
@@ -378,9 +380,9 @@ def add_start(spec: Any, world: World, scene: Scene, lab_from_body: Rotation) ->
 
 @contextmanager
 def every_digit() -> Iterator[None]:
-    """MJCF is written with six digits, which shifts a balanced vehicle's centre of mass; here with fifteen.
+    """Write MJCF with fifteen digits; MuJoCo's six would shift a balanced vehicle's center of mass.
 
-    MuJoCo has a switch for it, but no public one: where a version lacks it, six it is.
+    MuJoCo's switch for it is private; if a version lacks it, six digits are written.
     """
     library = ctypes.CDLL(mujoco._functions.__file__)
     switch = getattr(library, "_mjPRIVATE__set_xml_precision", lambda digits: None)
@@ -392,7 +394,7 @@ def every_digit() -> Iterator[None]:
 
 
 def short_colours(text: str) -> str:
-    """Colours are single precision, of which fifteen digits make 0.1 into 0.100000001490116."""
+    """Write colors with four digits: they are single precision, so fifteen digits make 0.1 into 0.100000001490116."""
     return re.sub(
         r'(rgba|rgb1|rgb2)="([^"]*)"',
         lambda m: f'{m[1]}="{" ".join(f"{float(x):.4g}" for x in m[2].split())}"',

@@ -1,4 +1,4 @@
-"""Pictures of the laboratory by MuJoCo's renderer, without a screen, and films of them."""
+"""Render pictures of the laboratory by MuJoCo without a screen, and animations of them."""
 
 from __future__ import annotations
 
@@ -25,36 +25,36 @@ from skysim.dynamics.multibody.mjcf import mujoco_warnings, one_line
 
 Picture = NDArray[np.uint8]
 
-LAB_CAMERA = "lab"  # stands in the MJCF and sees all of it
+LAB_CAMERA = "lab"  # the MJCF's camera that sees everything
 PICTURE_PX, FILM_PX = (960, 720), (480, 360)  # width, height
 NO_OPENGL = (
     "no picture of the lab: {why}; MuJoCo draws with OpenGL by EGL: apt-get install libegl1 libgl1-mesa-dri"
     " (or libosmesa6, and MUJOCO_GL=osmesa)"
 )
-ANIMATED = {  # what a browser shows, and how OpenCV's encoders are kept below 20 kB a frame of FILM_PX
+ANIMATED = {  # browser formats, with encoder options for less than 20 kB per frame of FILM_PX
     ".gif": [cv2.IMWRITE_GIF_DITHER, 3],
     ".webp": [cv2.IMWRITE_WEBP_QUALITY, 75],
 }
 
 
 class NoPicture(RuntimeError):
-    """Nothing can be drawn here; the message is one line and says what to do about it."""
+    """Rendering is not possible here; the message is one line and says what to install."""
 
 
 def picture(mjcf: str, qpos: Floats, size_px: tuple[int, int] = PICTURE_PX) -> Picture:
     """(H, W, 3) RGB: the laboratory from its camera `lab`, in the state qpos (nq,). Raises NoPicture.
 
-    mjcf    : as `stage.mjcf` writes it
-    size_px : width and height, at most `stage.MOST_PX`
+    mjcf    : from `mjcf_export.mjcf`
+    size_px : width and height, at most `mjcf_export.MOST_PX`
     """
     return next(film(mjcf, np.atleast_2d(qpos), size_px))
 
 
 def film(mjcf: str, qpos: Floats, size_px: tuple[int, int] = FILM_PX) -> Iterator[Picture]:
-    """As `picture`, for each row of qpos (N, nq), as they are drawn.
+    """As `picture`, for each row of qpos (N, nq), yielded as they are rendered.
 
-    They are drawn in a process of its own: MuJoCo chooses its OpenGL when it is first imported, by MUJOCO_GL (here EGL
-    unless told otherwise), and a graphics driver may take the whole process with it.
+    Rendering runs in its own process: MuJoCo chooses its OpenGL when first imported, by MUJOCO_GL (here EGL by
+    default), and a graphics driver may crash the whole process.
     """
     width, height = size_px
     with tempfile.TemporaryFile() as task, tempfile.TemporaryFile() as complaints:
@@ -74,13 +74,14 @@ def film(mjcf: str, qpos: Floats, size_px: tuple[int, int] = FILM_PX) -> Iterato
                         raise NoPicture(NO_OPENGL.format(why=why(painter.wait(), complaints)))
                     yield np.frombuffer(raw, np.uint8).reshape(height, width, 3)
             finally:
-                painter.kill()  # whoever wants no more pictures need not wait for them
+                painter.kill()  # a caller may stop before the last picture
 
 
 def write_film(pictures: Iterable[Picture], path: Path, fps: float) -> None:
-    """RGB pictures as .gif, or as .webp, which is a quarter as large. Raises InputError for another; OSError.
+    """Write RGB pictures as .gif, or as .webp, which is a quarter as large. Raises InputError for other types;
+    OSError.
 
-    fps : pictures a second; a GIF counts in hundredths of a second, and browsers go no faster than 50
+    fps : pictures a second; a GIF counts in hundredths of a second, and browsers show 50 at most
     """
     if path.suffix not in ANIMATED:
         raise InputError(f"{path}: a film is none of {', '.join(ANIMATED)}")
@@ -95,7 +96,7 @@ def write_film(pictures: Iterable[Picture], path: Path, fps: float) -> None:
 
 
 def why(code: int, complaints: IO[bytes]) -> str:
-    """What the painter said last before it went, or how it ended."""
+    """The last line that the rendering process wrote to standard error, or how it ended."""
     complaints.seek(0)
     lines = complaints.read().decode(errors="replace").strip().splitlines()
     if code < 0:
@@ -104,9 +105,9 @@ def why(code: int, complaints: IO[bytes]) -> str:
 
 
 def paint() -> None:
-    """The painter's own process: a task as npz on stdin, raw pictures on stdout, what went wrong on stderr."""
+    """The rendering process: task as npz on stdin, raw pictures on stdout, errors on stderr."""
     with os.fdopen(os.dup(1), "wb") as out:
-        os.dup2(2, 1)  # a driver that prints would print into a picture
+        os.dup2(2, 1)  # a driver's output must not reach the pictures
         with np.load(io.BytesIO(sys.stdin.buffer.read())) as task, mujoco_warnings():
             text, states, (width, height) = str(task["mjcf"]), task["qpos"], task["size_px"].tolist()
             model = mujoco.MjModel.from_xml_string(text)

@@ -1,4 +1,4 @@
-"""What the vehicle looks like, as plain shapes for a drawing program of another kind than MuJoCo's."""
+"""The vehicle's geometry as plain shapes, for other drawing programs than MuJoCo's."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ KINDS = {
 
 
 class Shape(NamedTuple):
-    """A part of the vehicle in body axes, every joint at rest.
+    """A part of the vehicle in body axes, every joint at zero.
 
     kind   : box (size_m half its edges), sphere (its radius first), cylinder (radius, half its length, along its z)
     """
@@ -34,7 +34,7 @@ class Shape(NamedTuple):
 
 
 def shapes(world: World) -> list[Shape]:
-    """All that the vehicle's file draws, the bearing's own geometry left out."""
+    """All shapes of the vehicle's file, without those of the bearing."""
     model = world.model
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
