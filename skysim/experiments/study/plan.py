@@ -86,7 +86,7 @@ Trial = Annotated[CentroidTrial | FrameTrial | FlightTrial, Field(discriminator=
 
 
 class Budget(ConfigModel):
-    """Limits of a study: total trials, wall-clock time, failed trials; it can be resumed after either of the last two."""
+    """Limits of a study: total trials, wall-clock time, failed trials; it can be resumed after the last two."""
 
     trials: Annotated[int, Field(ge=1)] | None = None
     time_s: Annotated[Time, Field(gt=0)] | None = None

@@ -214,7 +214,7 @@ def attitude(ready: Bench, rng: np.random.Generator) -> Rotation:
 
 
 def zyz(first_rad: float, second_rad: float, third_rad: float) -> Floats:
-    """(4,) quaternion wxyz of Rz(first) Ry(second) Rz(third), which rotates z to azimuth `first`, zenith angle `second`."""
+    """(4,) wxyz of Rz(first) Ry(second) Rz(third), which rotates z to azimuth `first` and zenith angle `second`."""
     half, both, unlike = second_rad / 2, (first_rad + third_rad) / 2, (first_rad - third_rad) / 2
     sine, cosine = math.sin(half), math.cos(half)
     return np.array(

@@ -32,7 +32,7 @@ from skysim.results.metrics import Columns, Summary
 COST = "cost"
 START = 10  # random candidates before the sampler uses earlier results
 REPEATS = 50  # repeated proposals in succession after which all points count as tried
-UNANSWERED = 1e3  # constraint violation of a candidate without a value; larger than a usual relative violation
+UNANSWERED = 1e3  # violation of a candidate without a value; larger than usual relative violations
 LEAST = 1e-9  # scale of the relative violation of a bound of zero
 
 

@@ -19,7 +19,7 @@ from skysim.experiments.study.setups import code_version, scene_hash
 from skysim.experiments.study.store import Store
 from skysim.experiments.study.trials import Row, Segment
 
-CHUNK_S = 0.25  # run time of a chunk: long compared with its overhead, short enough to lose little if a worker dies
+CHUNK_S = 0.25  # run time of a chunk: long relative to its overhead, short in case a worker dies
 
 MOST = 5000  # maximum number of trials in a chunk
 
