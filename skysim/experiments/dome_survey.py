@@ -39,7 +39,7 @@ from skysim.tracking import settings as tracker_settings
 from skysim.tracking.dome_map_file import DomeMap
 
 Ints = NDArray[np.int64]
-STREAM = {"attitudes": 101, "imu": 102, "checks": 103}  # apart from shutter.STAGE_ID
+STREAM = {"attitudes": 101, "imu": 102, "checks": 103}  # distinct from random_streams.STAGE_ID
 GATE = 3.5  # sigmas of a two-dimensional error; Gaussian noise exceeds it once in 450
 ANCHORS = 10  # number of central lights that are paired with every LED to find the common shift
 # Lights that a frame must share with others: two determine its attitude; a misidentified patch board accounts for six.
@@ -150,7 +150,7 @@ class Names(NamedTuple):
 
 
 def doubted(scene: Scene, doubt: Doubt) -> Scene:
-    """The scene with the onboard model of an unsurveyed dome: errors as `doubt` says, drawn with `tracker.survey.seed`."""
+    """The scene with the onboard model before a survey: errors of size `doubt`, drawn with `tracker.survey.seed`."""
     errors = {"led_sigma_m": doubt.led_sigma_m, "lever_sigma_m": doubt.lever_sigma_m}
     believed = {
         "survey": scene.tracker.survey.model_copy(update=errors),
@@ -401,7 +401,7 @@ def linked(shown: NDArray[np.bool_], links: int) -> list[int]:
 
 
 def led_sigma_m(found: Survey, doubt: Doubt) -> Floats:
-    """(N,) standard deviation of each LED's position, RMS of three axes; the value before the survey if not surveyed."""
+    """(N,) standard deviation of each LED's position, RMS of three axes; that before the survey if not surveyed."""
     variance_m2 = np.einsum("nii->n", found.led_covariance_m2) / 3
     return np.sqrt(np.where(found.surveyed, variance_m2, doubt.led_sigma_m**2))
 
