@@ -61,7 +61,7 @@ SIGHTS = (
 
 @numba.njit(cache=True)
 def paint(light: NDArray, xy: NDArray, flux: NDArray, ends: NDArray, psf_px: float) -> None:
-    """Add stars to `light`: for each, Gaussians of total `flux` at equal steps along a streak (dx, dy) centered at xy."""
+    """Add stars to `light`: each is a sum of Gaussians at equal steps along a streak (dx, dy) centered at xy."""
     reach, height, width = int(5 * psf_px) + 2, *light.shape
     for n in range(len(xy)):
         steps = int(np.hypot(ends[n, 0], ends[n, 1]) / STEP_PX) + 1

@@ -137,7 +137,7 @@ def repeated(rng: Rng) -> Shot:
 
 
 def duplicated(rng: Rng) -> Shot:
-    """Two superimposed skies: one sky displaced by a bumped lens, or two different ones. Either is a correct solution."""
+    """Two superimposed skies: one sky doubled by a bumped lens, or two different ones. Either solution is correct."""
     one, there = starry(rng)
     if rng.uniform() < 0.5:
         shift = rng.integers(-40, 41, 2)
@@ -177,7 +177,7 @@ def shuffled(rng: Rng) -> Shot:
 
 
 def carried(xy_px: NDArray) -> Rotation:
-    """Rotation in camera axes that moves a small image patch from xy_px[0] to xy_px[1] without turning it in the image."""
+    """Rotation in camera axes that moves a small image patch from xy_px[0] to xy_px[1] and keeps it upright."""
     frames = []
     for ray in camera().rays(xy_px):
         x = np.array([ray[2], 0, -ray[0]]) / np.hypot(ray[0], ray[2])
