@@ -143,6 +143,7 @@ def duplicated(rng: Rng) -> Shot:
         shift = rng.integers(-40, 41, 2)
         moved = np.roll(one, shift, (0, 1))
         ground = np.median(one)
+        # np.roll moves rows by shift[0] (y) and columns by shift[1] (x); near the boresight that is this rotation.
         turned = Rotation.from_rotvec(np.array([-shift[0], shift[1], 0]) / camera().focal_px) * there
         return Shot(np.clip(one + (moved - ground), 0, DEPTH).astype(np.uint16), skies=(there, turned))
     other, elsewhere = starry(rng)

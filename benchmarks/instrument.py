@@ -173,7 +173,8 @@ def numpy_noise(mean_e: Floats) -> Callable[[], Any]:
 def sky_frame() -> list[dict[str, Any]]:
     """1024 x 1024 pixels over 20 deg, PSF sigma 0.8 px: the 15,200 stars to V 7 give 146 in such a field."""
     lens = camera(1024, 1024, 512 / np.tan(np.radians(10)), 0.8, prnu=0.0, dsnu=0.0, hot_pixels=0.0)
-    magnitude = 7 + np.log10(np.random.default_rng(3).uniform(0, 1, 146)) / 0.51  # star counts: slope 0.51 dex/mag at V 7
+    # Star counts grow by 0.51 dex per magnitude at V 7; this draws magnitudes from that distribution.
+    magnitude = 7 + np.log10(np.random.default_rng(3).uniform(0, 1, 146)) / 0.51
     electrons = 2e4 * 10 ** (-0.4 * (magnitude - 4))
     sources = lights(lens, 146, electrons)
     ours = camera_shot(lens, sources, 0.0)

@@ -107,6 +107,7 @@ def field(work: Workload, stars: catalog.StarList, rng: np.random.Generator) -> 
     row = np.flatnonzero(camera.contains(np.nan_to_num(xy, nan=-1e9)))
     row = row[rng.random(len(row)) >= work.missing]
     mag = stars.v_mag[row] + MAGNITUDE_SIGMA * rng.standard_normal(len(row))
+    # With a limit on the centroids, the false share counts within the limit; 1000 means no limit.
     true = round(work.brightest * (1 - work.false_share)) if work.brightest < 1000 else 1000
     row, mag = row[np.argsort(mag)[:true]], np.sort(mag)[:true]
     false = work.false + round(len(row) * work.false_share / (1 - work.false_share))

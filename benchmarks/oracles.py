@@ -224,8 +224,8 @@ def star_sigmas_px(found: Sequence[Found]) -> list[NDArray]:
 
     The variance is the mean over all frames in a class of equal brightness. If the residuals of a frame scatter more,
     for example because of a misidentified star, the variances of all its stars are scaled up by that ratio. Frames
-    whose ratio exceeds MISTAKEN are left out of the mean. For this test the variance comes from the median, which for
-    two Gaussian axes is sigma^2 ln 2 of the mean square per axis.
+    whose ratio exceeds MISTAKEN are left out of the mean. For that test the variance comes from the median, because the
+    median of (dx^2 + dy^2) / 2 is sigma^2 ln 2 for Gaussian errors.
     """
     brightness = np.concatenate([one.brightness for one in found])
     edges = np.quantile(brightness, np.linspace(0, 1, CLASSES + 1))[1:-1]
@@ -276,6 +276,7 @@ def plate_spread(found: Found, sigma_px: NDArray, camera: Camera) -> tuple[float
     inverse = np.linalg.pinv(monomials(found.xy_px))
     covariance = (inverse * sigma_px**2) @ inverse.T
     pixels = lattice(camera.width_px, camera.height_px)
+    # Least-squares rotation of the lattice by a small displacement field: sum(arm x displacement) / sum(arm^2).
     shift = monomials(pixels).mean(axis=0)
     arms = (pixels - middle) / np.sum((pixels - middle) ** 2)
     turns = arms.T @ monomials(pixels)

@@ -44,7 +44,7 @@ KINDS = ("patch boards", "Fibonacci", "Poisson disc", "optimised")
 
 @dataclass(frozen=True)
 class Bench:
-    """Test geometry from the scene: inner surface, camera, lever arm, LED hardware, and half-angle of the visible cap."""
+    """Test geometry from the scene: inner surface, camera, lever arm, LED hardware, half-angle of the visible cap."""
 
     inside: Inside
     camera: Camera
@@ -125,6 +125,7 @@ def leds(of: Bench, kind: str, count: int, seed: int) -> tuple[Floats, Ints | No
         parts = [led_schema.FibonacciConfig.model_validate({"kind": "fibonacci", "count": count} | cap)]
     area_m2 = 2 * np.pi * np.square(of.inside.meet(np.zeros(3), np.eye(3)[2:])[0, 2])
     each_m2 = area_m2 * (1 - np.cos(np.radians(of.cap_deg))) / count
+    # Candidates with up to 50% more LEDs than asked for, in small steps; the first with enough of them is used.
     for more in np.linspace(1.0, 1.5, 51) if not parts else ():
         if kind == "patch boards":
             spacing_m = np.sqrt(each_m2 * np.mean(of.boards.lit) / more)
@@ -148,6 +149,7 @@ def sigmas_arcsec(of: Bench, place_m: Floats) -> tuple[Floats, Floats, Floats]:
     fresh = optimize.attitudes(part, FRESH, np.random.default_rng(SEEN_BY_CHANCE))
     total = fisher.told(place_m, fresh, *optimize.camera(part))
     solved, variance = total[:, 6] >= 2, np.full((FRESH, 3), np.inf)
+    # Unpack the six elements of the symmetric information matrix (xx, yy, zz, xy, xz, yz).
     matrix = total[solved][:, [0, 3, 4, 3, 1, 5, 4, 5, 2]].reshape(-1, 3, 3)
     variance[solved] = np.linalg.inv(matrix).diagonal(axis1=1, axis2=2)
     unit = NOISE_PX / of.camera.focal_px / ARCSEC_RAD

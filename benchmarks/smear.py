@@ -46,6 +46,7 @@ def frames(
         rng = np.random.default_rng([seed, n])
         middle, angle = southern(rng), rng.uniform(0, 2 * np.pi)
         rate_cam = np.radians(rate_deg_s) * np.array([np.cos(angle), np.sin(angle), 0.0])
+        # Knots from 5 ms before the exposure; the attitude is `middle` at mid-exposure, 25 ms after its start.
         t_s = n * FRAME_S + np.arange(-10, 200) * KNOT_S
         cam_from_icrs = Rotation.from_rotvec(np.outer(t_s - n * FRAME_S - 0.025, rate_cam)) * middle
         lab_from_body = cam_from_icrs.inv() * lab.mount.cam_from_body

@@ -263,7 +263,7 @@ def shift_px(
     inner = np.argsort(np.linalg.norm(seen_px - middle_px, axis=1))[:ANCHORS]
     tried = (seen_px[inner, None] - predicted_px).reshape(-1, 2)
     tried = tried[np.linalg.norm(tried, axis=1) < GATE * np.hypot(common_px, own_px)]
-    tried = np.vstack([np.zeros((1, 2)), tried])
+    tried = np.vstack([np.zeros((1, 2)), tried])  # no shift is a candidate too
     apart, nearest = cKDTree(predicted_px).query(seen_px - tried[:, None])
     off = np.minimum(apart / own_px, GATE)
     best = int(np.argmin(np.sum(tried**2, axis=1) / common_px**2 + np.sum(off**2, axis=1)))
@@ -279,6 +279,7 @@ def paired(seen_px: Floats, predicted_px: Floats, gate_px: Floats) -> tuple[Ints
     It minimizes the sum of min(distance / gate, 1)^2. Pairs beyond their gate are left out.
     """
     apart = np.linalg.norm(seen_px[:, None] - predicted_px, axis=2) / gate_px
+    # Clipping at the gate keeps detections without a counterpart from pulling the other pairs apart.
     rows, column = linear_sum_assignment(np.minimum(apart, 1.0) ** 2)
     inside = apart[rows, column] < 1
     return rows[inside].astype(np.int64), column[inside].astype(np.int64)
@@ -316,6 +317,7 @@ def surveyed(
     for done in range(ROUNDS):
         if found:
             better = Belief(found.camera, found.leds, found.lever, floor_px)
+            # The attitudes are adjusted now, so only the map's and the residual error remain in the predictions.
             sigma_px = np.hypot(led_sigma_m(found, doubt) * better.px_per_m, max(found.rms_px, floor_px))
             looks = [
                 replace(looks[k], body_from_lab=found.body_from_lab[k])
@@ -367,6 +369,7 @@ def crossed(looks: Sequence[Look], names: Sequence[Names], belief: Belief) -> ND
     shown = np.zeros((len(names), len(belief.leds.id)), dtype=bool)
     for frame, name in zip(shown, names, strict=True):
         frame[name.led] = True
+    # RMS spread of the camera positions over the frames that show an LED, as an angle seen from the nearest LED.
     arm_m = belief.lever.camera_body_m
     camera_m = np.array([look.body_from_lab.inv().apply(arm_m) for look in looks])
     count = np.maximum(shown.sum(axis=0), 1)[:, None]
@@ -389,6 +392,7 @@ def linked(shown: NDArray[np.bool_], links: int) -> list[int]:
     while left.any():
         group = np.zeros(frames, dtype=bool)
         group[np.argmax(left * (1 + shown.sum(axis=1)))] = True
+        # Add frames that share enough LEDs with the group until it no longer grows.
         while True:
             known = shown[group].any(axis=0)
             grown = group | (left & ((shown & known).sum(axis=1) >= links))

@@ -71,7 +71,7 @@ def shots(
     that the first tracker solved for the attitude filter during the motion simulation are not solved again.
     """
     order = list(estimators)
-    flown = order[0]
+    flown = order[0]  # the tracker whose solutions updated the attitude filter
     for name in order:
         run.warm_up(lab, estimators[name])
     for frame, truth, seconds in run.render_frames(lab):

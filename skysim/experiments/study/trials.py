@@ -35,7 +35,7 @@ from skysim.simulation.testbed import SPARE_S, Testbed
 from skysim.tracking import factory
 
 KNOTS = 9  # samples of a frame trial's trajectory
-ANY_TIME_S = np.array([0.0, 1.0])  # the scene is static for a single pose, so the times are arbitrary
+ANY_TIME_S = np.array([0.0, 1.0])  # the pose does not change, so the times are arbitrary
 
 
 @dataclass(frozen=True, slots=True)
@@ -202,6 +202,7 @@ def attitude(ready: Bench, rng: np.random.Generator) -> Rotation:
     trial = ready.trial
     assert isinstance(trial, CentroidTrial | FrameTrial)
     first, last = rng.uniform(0, 2 * math.pi, 2)
+    # A uniform cosine of the tilt, or sine of the declination, is uniform in solid angle.
     if isinstance(ready.lab.scene.light, DomeConfig):
         low, high = trial.tilt_deg if isinstance(trial.tilt_deg, tuple) else (trial.tilt_deg,) * 2
         cosine = rng.uniform(math.cos(math.radians(high)), math.cos(math.radians(low)))
@@ -259,6 +260,7 @@ def spoilt(
 
     The flux of a false detection is that of a random true source, including those that `lights` leaves out.
     """
+    # Draw noise for all sources, also the missing ones, so that the stream does not depend on which are missing.
     kept = np.flatnonzero(rng.random(len(xy_px)) >= trial.missing)
     flux = electrons * 10 ** (0.4 * trial.magnitude_sigma * rng.standard_normal(len(xy_px)))
     xy_px = xy_px + trial.noise_px * rng.standard_normal(xy_px.shape)
@@ -283,6 +285,7 @@ def shot(ready: Bench, seed: int) -> tuple[Frame, Truth, tuple[float, float] | N
     rate_cam = math.radians(trial.rate_deg_s) * np.array([math.cos(towards), math.sin(towards), 0.0])
     rate_body = lab.mount.cam_from_body.inv().apply(rate_cam)
     when, rows = testbed.window(lab.scene, 0), lab.scene.camera.height_px
+    # A trajectory at constant rate around the exposure, with the drawn attitude at mid-exposure.
     t_s = np.linspace(when.open_s - SPARE_S, when.close_s(rows) + SPARE_S, KNOTS)
     turned = Rotation.from_rotvec(np.outer(t_s - when.middle_s(rows), rate_body))
     path = Trajectory(t_s, middle * turned, np.tile(rate_body, (KNOTS, 1)))

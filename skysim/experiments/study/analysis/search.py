@@ -353,6 +353,7 @@ def answered(
     whole   : progress of the whole search, passed to `watch`
     refused : number of failed trials of invalid scenes, which the budget does not count
     """
+    # Budgets are for the whole search: subtract the time spent, and the failures of earlier candidates.
     before, budget = replace(whole), plan.study.budget
     left_s = None if budget.time_s is None else budget.time_s - (time.perf_counter() - whole.began)
     if left_s is not None and left_s <= 0:

@@ -84,6 +84,7 @@ def outputs(plan: Plan, store: Store, axes: tuple[str, ...]) -> tuple[Floats, Fl
     """
     width, each = len(plan.study.factors), plan.study.replicates
     columns = store.columns()
+    # Trial number = point * replicates + replicate, and points are in the order A, B, AB_1 .. AB_D.
     values = np.full((len(axes), plan.trials), np.nan)
     values[:, columns["trial"]] = [columns[name] for name in axes]
     grid = values.reshape(len(axes), -1, each).transpose(0, 2, 1).reshape(len(axes) * each, -1)

@@ -89,6 +89,7 @@ class Pool:
                 yield from self._until_one_dies(self._ready(recipe), chunks, suspects, flying)
                 done = True
             except BrokenProcessPool:
+                # Count a death only for a trial that was alone in flight; otherwise the culprit is unknown.
                 at_hand = [one for chunk in flying.values() for one in singly(chunk)]
                 deaths.update(one[0].first for one in at_hand if len(at_hand) == 1)
                 for one in at_hand:
@@ -134,6 +135,7 @@ class Pool:
         Raises BrokenProcessPool if a worker dies; `flying` then holds the chunks that were lost.
         """
         while True:
+            # A suspect runs with nothing else in flight, so that a worker's death can be attributed to it.
             room = self.workers * (1 + AHEAD) if not suspects else 1
             while len(flying) < room and (chunk := suspects.popleft() if suspects else chunks.next()):
                 try:

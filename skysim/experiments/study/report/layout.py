@@ -194,6 +194,7 @@ def figures(study: Study, lines: Sequence[Line]) -> list[Figure]:
         x = next((name for name in varied if axes[name].numeric), varied[0])
         by = next((name for name in varied if name != x), None)
         pairs = [(x, by, y) for y in study.responses]
+    # If there are too many figures, show fewer responses, each with all of its figures.
     most = max(MOST_FIGURES * len(study.responses) // len(pairs), 1)  # responses to show
     return [sensible(x, by, y, axes, lines) for x, by, y in pairs if y in study.responses[:most]]
 
@@ -256,6 +257,7 @@ def one_series(name: str, lines: Sequence[Line], figure: Curve, across: Axis) ->
 
 def grouped(lines: Sequence[Line], apart: Axis, name: str, study: Study) -> dict[str, list[Line]]:
     """Table lines grouped by the level of factor `name`, in the order of its axis `apart`."""
+    # A sampled factor has about as many levels as points: divide the sorted points into BANDS groups of equal size.
     if is_drawn(study) and apart.numeric and len(apart.levels) > 2 * BANDS:
         ordered = sorted(lines, key=lambda line: apart.place(line.levels[name]))
         ends = [round(n * len(ordered) / BANDS) for n in range(BANDS + 1)]
@@ -294,6 +296,7 @@ def limits(values: Sequence[Floats], ends: Sequence[Floats], log: bool, share: b
     if log:
         pad = max((high / low) ** 0.06, 1.15 if high > 2 * low else 1.5)
         return low / pad, high * pad
+    # Start at zero if the values come near it.
     low = 0.0 if 0 < low < 0.4 * high else low
     pad = 0.06 * (high - low) or 0.1 * abs(high) or 1.0
     low, high = low - (pad if low else pad / 2), high + pad
