@@ -45,8 +45,8 @@ ARCSEC_DEG = 1 / 3600
 class Sight:
     """A GalSim camera and a date.
 
-    lens : makes a PSF in pixels;  scale_arcsec : pixel scale at the image center;  fov_error : relative error of the
-    field of view given to the solver
+    lens : makes a PSF in pixels;  scale_arcsec : pixel scale at the image center
+    fov_error : relative error of the field of view given to the solver
     """
 
     width_px: int

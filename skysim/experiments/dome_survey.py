@@ -64,9 +64,8 @@ ROUNDS = 3  # rounds of identification and adjustment; from the second on with t
 class Doubt:
     """Uncertainty before the survey: standard deviations per axis, and a focal length error.
 
-    imu_sigma_rad : attitude from the IMU at each frame;  led_sigma_m : position of each LED;  lever_sigma_m : position
-    of the camera in the body
-    focal_error   : relative error of the assumed focal length
+    imu_sigma_rad : attitude from the IMU at each frame;  led_sigma_m : position of each LED
+    lever_sigma_m : position of the camera in the body;  focal_error : relative error of the assumed focal length
     """
 
     imu_sigma_rad: float

@@ -47,8 +47,8 @@ class CentroidTrial(Anywhere):
 
     noise_px : standard deviation of a centroid, each axis;  magnitude_sigma : of its brightness, magnitudes
     lights   : maximum number of true sources, the brightest;  missing : fraction of the true sources not detected
-    false_lights : number of false detections, uniform over the image;  false_share : fraction of all detections that
-    are false, rounded to a whole number
+    false_lights : number of false detections, uniform over the image
+    false_share  : fraction of all detections that are false; their number is rounded
     """
 
     kind: Literal["centroids"]
@@ -63,8 +63,8 @@ class CentroidTrial(Anywhere):
 class FrameTrial(Anywhere):
     """One frame, rendered with all camera noise, then solved.
 
-    rate_deg_s : rate about a random axis perpendicular to the boresight;  gyro : whether the tracker receives the
-    streak vector of the stars
+    rate_deg_s : rate about a random axis perpendicular to the boresight
+    gyro : whether the tracker receives the streak vector of the stars
     """
 
     kind: Literal["frames"]
