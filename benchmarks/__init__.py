@@ -1,4 +1,7 @@
-"""Ourselves beside the best peer, timed in the same run. `python -m benchmarks` prints what `measure` returns."""
+"""Benchmarks of skysim and the estimator against the best peer, timed in the same run.
+
+`python -m benchmarks` prints what `measure` returns.
+"""
 
 from __future__ import annotations
 

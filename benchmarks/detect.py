@@ -1,4 +1,4 @@
-"""Detection and centroids beside scipy.ndimage, OpenCV and sep, and their error beside the least possible."""
+"""Detection and centroiding speed against scipy.ndimage, OpenCV and sep, and error against the Cramer-Rao bound."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Floats = NDArray[np.float64]
 
 
 def measure() -> list[dict[str, Any]]:
-    """Milliseconds of detecting and centroiding one frame on one core, and the centroids' rms error."""
+    """Time to detect and centroid one frame on one core, and the RMS error of the centroids."""
     results = []
     for name, (height, width, stars) in SIZES.items():
         image, _ = frame(np.random.default_rng(2), height, width, stars)
@@ -51,7 +51,7 @@ def measure() -> list[dict[str, Any]]:
 
 
 def precision() -> list[dict[str, Any]]:
-    """Root-mean-square error of 1,200 centroids over Cramer and Rao's bound for a star of unknown place and flux."""
+    """RMS error of 1,200 centroids divided by the Cramer-Rao bound for a star of unknown position and flux."""
     errors: dict[str, list[Floats]] = {name: [] for name in CENTROIDERS if name != "disc"}
     errors["scipy.ndimage"] = []
     for seed in range(40):
@@ -71,7 +71,7 @@ def precision() -> list[dict[str, Any]]:
 
 
 def frame(rng: np.random.Generator, height: int, width: int, stars: int) -> tuple[NDArray[np.uint16], Floats]:
-    """Gaussian stars integrated over their pixels, 30 px and more apart, with photon and read noise."""
+    """A frame of pixel-integrated Gaussian stars, at least 30 px apart, with photon and read noise; true positions."""
     places = np.empty((0, 2))
     while len(places) < stars:
         place = rng.uniform(20, (width - 20, height - 20))
@@ -90,7 +90,11 @@ def frame(rng: np.random.Generator, height: int, width: int, stars: int) -> tupl
 
 
 def cramer_rao_px() -> float:
-    """Bound of either coordinate for unknown place and flux, averaged over places in a pixel."""
+    """Cramer-Rao bound of either coordinate with unknown position and flux; RMS over positions within a pixel.
+
+    It is the square root of the diagonal of the inverse Fisher matrix sum_k g_k g_k^T / var_k, where g_k is the
+    gradient of pixel k with respect to x, y and flux, and var_k its photon and background noise.
+    """
     edges, step = np.arange(18) - 8.5, 1e-4
 
     def model(x: float, y: float) -> Floats:
@@ -113,7 +117,7 @@ def cramer_rao_px() -> float:
 
 
 def scipy_way(image: NDArray) -> Floats:
-    """Threshold, label and centre of gravity by scipy, as its users write it."""
+    """Threshold, labels and center of gravity with scipy.ndimage, in the usual way."""
     level = float(np.median(image[::8, ::8]))
     labels, count = ndimage.label(image > level + 5 * PIXEL_NOISE_E)
     middles = ndimage.center_of_mass(image - level, labels, np.arange(1, count + 1))
@@ -121,7 +125,7 @@ def scipy_way(image: NDArray) -> Floats:
 
 
 def peers(image: NDArray) -> dict[str, Callable[[], Any] | None]:
-    """What others do with the same frame; None for what is not installed."""
+    """Functions of the peers for the same frame; None for those not installed."""
     return {"scipy.ndimage": lambda: scipy_way(image), "cv2": cv2_way(image), "sep winpos": sep_way(image)}
 
 

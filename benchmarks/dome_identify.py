@@ -1,7 +1,7 @@
-"""Lost under a dome: how often LEDs are identified, wrongly identified and refused, and how long it takes.
+"""LED identification without a prior attitude: rates of correct, wrong and ambiguous results, and time.
 
-`python benchmarks/dome_identify.py [TRIALS] [SEED]` takes AFIT's SimSat under its measured dome with 1,400 equal LEDs,
-random attitudes to 30 degrees of tilt and no prior.
+`python benchmarks/dome_identify.py [TRIALS] [SEED]` uses AFIT's SimSat under its measured dome with 1,400 equal LEDs,
+at random attitudes up to 30 degrees of tilt.
 """
 
 from __future__ import annotations
@@ -30,7 +30,8 @@ COUNT, CAP_DEG, TILT_DEG = 1400, 40.0, 30.0
 
 @dataclass(frozen=True)
 class Case:
-    """What is done to the frames: noise of a centroid, error of a believed place, share of LEDs dead, false lights."""
+    """Test conditions: LED layout, centroid noise, error of the LED map per axis, fraction of LEDs off, number of
+    false detections."""
 
     name: str
     places: str = "poisson_disc"
@@ -53,7 +54,10 @@ CASES = (
 
 
 def leds_m(places: str, count: int, inside: Inside, rng: np.random.Generator) -> Floats:
-    """(count, 3) LEDs on the dome."""
+    """(count, 3) LED positions on the dome, m.
+
+    A Poisson-disc layout comes from thinning random darts to a minimum distance; surplus LEDs are dropped at random.
+    """
     half = np.radians(CAP_DEG)
     if places == "fibonacci":
         return layout.from_bearing(inside, layout.cap(count, half))
@@ -66,7 +70,7 @@ def leds_m(places: str, count: int, inside: Inside, rng: np.random.Generator) ->
 
 
 def attitude(rng: np.random.Generator) -> Rotation:
-    """body_from_lab with the boresight anywhere within TILT_DEG of the zenith, and any yaw."""
+    """Random body_from_lab: boresight uniform in solid angle within TILT_DEG of the zenith, yaw uniform."""
     tilt = np.arccos(1 - rng.random() * (1 - np.cos(np.radians(TILT_DEG))))
     towards, yaw = rng.uniform(0, 2 * np.pi, 2)
     tilted = Rotation.from_rotvec(tilt * np.array([np.cos(towards), np.sin(towards), 0]))
@@ -81,7 +85,7 @@ def trial(
     sight: Sight,
     rng: np.random.Generator,
 ) -> tuple[str, float, int]:
-    """What came of one frame, its time, and how many LEDs were in it."""
+    """Result of one frame ("identified", "WRONG" or the reason for none), its time, and the number of LEDs in it."""
     body_from_lab = attitude(rng)
     xy = project(body_from_lab, truth_m, lever, camera)
     seen = np.flatnonzero(camera.contains(np.nan_to_num(xy, nan=-1e9), 12))
@@ -96,14 +100,14 @@ def trial(
     spent = time.perf_counter() - begin
     if isinstance(found, str):
         return found, spent, len(seen)
-    # A reflection near a dead LED is no error; a light called by another's name is.
+    # A reflection matched to a dead LED nearby is not an error; a true light matched to another LED is.
     named = name[found.observed]
     wrong = np.any((named != found.star) & (named >= 0)) or np.all(named < 0)
     return ("WRONG" if wrong else "identified"), spent, len(seen)
 
 
 def measure(case: Case, trials: int, seed: int) -> str:
-    """One line of the table."""
+    """One table line."""
     rng = np.random.default_rng(seed)
     lab = testbed.build_testbed(loader.load("afit_simsat"))
     inside = build_surface(lab.scene.light.surface)

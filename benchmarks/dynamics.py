@@ -1,4 +1,4 @@
-"""Flying SimSat: open loop beside the bare mj_step on the same model, closed loop beside the clock on the wall."""
+"""Simulation speed of SimSat: open loop against bare mj_step on the same model, closed loop against real time."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ POSES = 200
 
 
 def measure() -> list[dict[str, Any]]:
-    """Every model that SimSat can be, the scenes' own closed loops, and an exposure's poses."""
+    """Open loop of each SimSat model, closed loop of three scenes, and interpolation of poses in an exposure."""
     return [*open_loops(), *closed_loops(), poses()]
 
 
 def open_loops() -> list[dict[str, Any]]:
-    """Two seconds at 1 ms: the vehicle alone, with its wheels, with all that it has."""
+    """FLOWN_S seconds at 1 ms steps: the vehicle alone, with wheels, and with all actuators."""
     sets = {
         "alone": {},
         "wheels": {"wheels": "{}"},
@@ -33,7 +33,7 @@ def open_loops() -> list[dict[str, Any]]:
 
 
 def open_loop(name: str, more: dict[str, str]) -> dict[str, Any]:
-    """By what `skysim run` flies with, nobody steering."""
+    """The simulation of `skysim run` without control, against bare mj_step."""
     overrides = {f"vehicle.{key}": part for key, part in more.items()}
     overrides |= {"motion.control": "none", "motion.manoeuvre": "[]", "exposure.frames": "1"}
     lab = testbed.build_testbed(
@@ -51,7 +51,7 @@ def open_loop(name: str, more: dict[str, str]) -> dict[str, Any]:
 
 
 def closed_loops() -> list[dict[str, Any]]:
-    """Flight seconds a second of the clock, with a controller in Python at 100 Hz; the scenes' own disturbances."""
+    """Simulated seconds per second, with a controller in Python at 100 Hz and the scenes' own disturbances."""
     return [closed_loop(name) for name in ("afit_simsat", "simsat_slew", "simsat_cmg")]
 
 
@@ -62,14 +62,14 @@ def closed_loop(name: str) -> dict[str, Any]:
 
 
 def poses() -> dict[str, Any]:
-    """The attitudes at 200 moments of one exposure."""
+    """Time to interpolate the attitudes at POSES moments of one exposure."""
     flight = run.prepare(loader.load("simsat_slew", {"exposure.frames": "1"})).trajectory
     moments = np.linspace(0.5, 0.51, POSES)
     return verdict(f"{POSES} poses in an exposure", 1e3 * best(lambda: flight.at(moments)), "ms", "", 0.3)
 
 
 def best(work: Callable[[], Any], repeats: int = 30) -> float:
-    """Seconds of the quickest run, after one that does not count."""
+    """Minimum run time in seconds, after one warm-up run."""
     work()
     spent = []
     for _ in range(repeats):

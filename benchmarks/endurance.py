@@ -1,8 +1,8 @@
-"""An hour of closed loop: does memory grow, do time stamps drift, does the tracker stay right?
+"""Endurance test of the closed loop over an hour: memory growth, drift of time stamps, wrong attitudes.
 
-`python -m benchmarks.endurance [SECONDS] [HERTZ]` flies SimSat on its wheels under a slow sine, steered by the filter,
-which is fed by every frame, and says every minute of flight how much memory is in use. An hour at 10 Hz takes half an
-hour.
+`python -m benchmarks.endurance [SECONDS] [HERTZ]` simulates SimSat on its wheels with a slow sinusoidal reference and
+feedback from the attitude filter, which is updated by every frame. It prints memory use every simulated minute. An
+hour at 10 Hz takes half an hour.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from skysim.results import metrics
 from skysim.scene.loader import load
 from skysim.simulation import run, testbed
 
-WARM_S = 60.0  # of flight: by then everything was called once
+WARM_S = 60.0  # simulated time after which all code was called once; memory growth is counted from here
 SCENE = {
     "seed": "11",
     "motion.start": "{roll_deg: 0, pitch_deg: 0, yaw_deg: 0}",
@@ -29,7 +29,7 @@ SCENE = {
 
 
 def main(duration_s: float, rate_hz: float) -> None:
-    """Fly, and print a line a minute of flight and what came of it."""
+    """Run the simulation; print one line per simulated minute, then memory growth, drift and attitude errors."""
     frames = round(duration_s * rate_hz)
     told = SCENE | {"exposure.rate_hz": str(rate_hz), "exposure.frames": str(frames)}
     lab = testbed.build_testbed(load("simsat_bump", told))

@@ -1,7 +1,8 @@
-"""Frames without a star: how often the tracker answers one. `python -m benchmarks.false_frames [FRAMES] [SEED]`.
+"""False-alarm rate: how often the tracker solves frames without stars.
 
-Three to thirty lights fall anywhere, with magnitudes of the catalogue's, before the cameras of `lost_in_space`; every
-answer is wrong. A hundred thousand frames take a quarter of an hour.
+`python -m benchmarks.false_frames [FRAMES] [SEED]`. Each frame has 3 to 30 lights at uniform random positions with
+magnitudes drawn from the catalog, for the cameras of `lost_in_space`; every solution is false. A hundred thousand
+frames take a quarter of an hour.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ LIGHTS = (3, 30)
 
 
 def false_frame(work: Workload, mag: np.ndarray, rng: np.random.Generator) -> Centroids:
-    """Lights that fell anywhere, brightest first."""
+    """Lights at uniform random positions, brightest first."""
     count = rng.integers(LIGHTS[0], LIGHTS[1] + 1)
     camera = work.camera
     xy = rng.uniform(-0.5, [camera.width_px - 0.5, camera.height_px - 0.5], (count, 2))
@@ -28,7 +29,7 @@ def false_frame(work: Workload, mag: np.ndarray, rng: np.random.Generator) -> Ce
 
 
 def answered(count: int, seed: int) -> dict[str, tuple[int, int]]:
-    """Frames looked at and frames answered, by camera."""
+    """Number of frames and number of (false) solutions, by camera."""
     settings = Settings(centroid_sigma_px=0.0, field_stars=1e9, merge_px=0.0, zero_point_mag=0.0)
     trackers = []
     for work in WORKLOADS:

@@ -1,7 +1,8 @@
-"""From image to attitude, lost in space, beside tetra3rs. `python -m benchmarks.frames [FRAMES] [SEED]`.
+"""Time and error from image to attitude, lost in space, compared with tetra3rs.
 
-Frames are painted here: Gaussian stars of the Hipparcos catalogue along a streak, photon and read noise. Both solve
-one by one on one core; the errors are those of the boresight's place, in arcsec, over the frames that were solved.
+`python -m benchmarks.frames [FRAMES] [SEED]`. The frames are drawn by this module, independently of skysim's camera:
+Gaussian stars of the Hipparcos catalog along a streak, with photon and read noise. Both solvers process one frame at a
+time on one core. Errors are those of the boresight direction in arcseconds, over correctly solved frames.
 """
 
 from __future__ import annotations
@@ -25,15 +26,15 @@ from skysim.core.paths import CATALOGUES
 from skysim.core.units import ARCSEC_RAD
 
 WRONG_RAD = np.radians(10 / 60)
-STEP_PX = 0.1  # of a streak
+STEP_PX = 0.1  # step of the Gaussians along a streak
 
 
 @dataclass(frozen=True)
 class Sight:
-    """A camera and what it sees.
+    """A camera and its signal levels.
 
-    zero_e : electrons of a star of magnitude 0; deepest : magnitude of the faintest that is painted
-    gain_e : electrons a count; depth : its greatest count
+    zero_e : electrons of a star of magnitude 0; deepest : magnitude of the faintest star drawn
+    gain_e : electrons per count; depth : maximum count
     """
 
     name: str
@@ -60,7 +61,7 @@ SIGHTS = (
 
 @numba.njit(cache=True)
 def paint(light: NDArray, xy: NDArray, flux: NDArray, ends: NDArray, psf_px: float) -> None:
-    """Gaussians of each flux, spread evenly along streaks of (dx, dy) about xy."""
+    """Add stars to `light`: each is a sum of Gaussians at equal steps along a streak (dx, dy) centered at xy."""
     reach, height, width = int(5 * psf_px) + 2, *light.shape
     for n in range(len(xy)):
         steps = int(np.hypot(ends[n, 0], ends[n, 1]) / STEP_PX) + 1
@@ -74,10 +75,8 @@ def paint(light: NDArray, xy: NDArray, flux: NDArray, ends: NDArray, psf_px: flo
                     light[row, column] += flux[n] / steps * down * across / (2 * np.pi * psf_px**2)
 
 
-def photograph(
-    sight: Sight, stars: catalog.StarCatalog, rng: np.random.Generator
-) -> tuple[NDArray, Rotation]:
-    """One frame and the attitude at mid-exposure."""
+def photograph(sight: Sight, stars: catalog.StarCatalog, rng: np.random.Generator) -> tuple[NDArray, Rotation]:
+    """One frame at a random attitude, and that attitude at mid-exposure."""
     camera, truth = sight.camera, Rotation.random(rng=rng)
     xy = camera.pixels(truth.apply(stars.vectors))
     inside = camera.contains(np.nan_to_num(xy, nan=-1e9), -10.0)
@@ -93,7 +92,7 @@ Solve = Callable[[NDArray], Rotation | None]
 
 
 def ours(sight: Sight, stars: catalog.StarCatalog) -> Solve:
-    """Our tracker as it comes, told the camera, its gain and its zero point: the camera is calibrated."""
+    """The skysim star tracker with default settings and a calibrated camera: known gain and zero point."""
     settings = Settings(
         gain_e_dn=sight.gain_e,
         saturation=sight.depth,
@@ -105,7 +104,7 @@ def ours(sight: Sight, stars: catalog.StarCatalog) -> Solve:
 
 
 def tetra3rs(sight: Sight, stars: catalog.StarCatalog, fast: bool) -> Solve | None:
-    """tetra3rs with its own catalogue, where it is installed (extra `oracle`), on one thread."""
+    """tetra3rs with its own catalog on one thread; None if it is not installed (extra `oracle`)."""
     if importlib.util.find_spec("tetra3rs") is None:
         return None
     import tetra3rs as peer
@@ -128,7 +127,7 @@ def tetra3rs(sight: Sight, stars: catalog.StarCatalog, fast: bool) -> Solve | No
 
 
 def compare(sight: Sight, solvers: dict[str, Solve | None], frames: list[tuple[NDArray, Rotation]]) -> None:
-    """A line a solver, frame by frame side by side."""
+    """Run all solvers frame by frame and print one line per solver."""
     known = {name: solve for name, solve in solvers.items() if solve is not None}
     ms: dict[str, list[float]] = {name: [] for name in known}
     off: dict[str, list[NDArray]] = {name: [] for name in known}
@@ -136,7 +135,7 @@ def compare(sight: Sight, solvers: dict[str, Solve | None], frames: list[tuple[N
         solve(frames[0][0])  # compiles
     order = list(known.items())
     for image, truth in frames:
-        order.append(order.pop(0))  # who comes first finds the frame in no cache: all take turns
+        order.append(order.pop(0))  # rotate: the first solver finds the frame uncached
         for name, solve in order:
             begin = time.perf_counter()
             answer = solve(image)

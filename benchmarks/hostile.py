@@ -1,9 +1,10 @@
-"""Pictures that are no sky of ours: how `skysim solve` takes them. `python -m benchmarks.hostile [COUNT] [SEED]`.
+"""Robustness of `skysim solve` against adversarial and malformed images.
 
-Each is a file: noise, stripes, text, lights that repeat, skies in a mirror, headers that lie, bytes that are no
-picture. None may be answered, but for a frame of two skies at once, which may be answered by either. Nothing may raise,
-take more than 2 s of a processor a megapixel (a megapixel at least) or more memory than ten of the decoded frames and
-64 MiB. Most are told the camera or the field of view; one in 400 is searched at all focal lengths.
+`python -m benchmarks.hostile [COUNT] [SEED]`. Each input is a file: noise, stripes, text, repeating lights, mirrored
+skies, false headers, or bytes that are not an image. None may be solved, except images that contain (parts of) a true
+sky, which may be solved with the attitude of any of these. No input may raise an exception, take more than 2 s of
+processor time per megapixel (at least one megapixel is counted), or use more memory than ten decoded frames plus 64
+MiB. For most inputs the camera or the field of view is given; one in 400 is searched over all focal lengths.
 """
 
 from __future__ import annotations
@@ -38,15 +39,15 @@ CAMERA_FILE, FOV_DEG, WIDTH, HEIGHT = SCENES / "shefex2.yaml", 14.87, 659, 493
 SMALL, LARGE = (240, 320), (4096, 4096)
 USUAL = ((HEIGHT, WIDTH), SMALL, LARGE)
 DEPTH = 4095
-EIGHT_BIT = 0.2  # of the pictures of sixteen bits
-SEARCHED = 1 / 400  # told neither camera nor field of view
+EIGHT_BIT = 0.2  # fraction of the 16-bit images that are reduced to 8 bits
+SEARCHED = 1 / 400  # fraction solved with neither camera nor field of view
 Rng = np.random.Generator
-Skies = tuple[Rotation, ...]  # the attitudes that a picture shows
+Skies = tuple[Rotation, ...]  # attitudes of the skies in an image
 
 
 @dataclass(frozen=True)
 class Shot:
-    """A picture, or a file's bytes; its ending; the attitudes with which it may be answered."""
+    """An image or the bytes of a file, its suffix, and the attitudes that are correct solutions."""
 
     picture: NDArray | None
     suffix: str = ".png"
@@ -56,7 +57,7 @@ class Shot:
 
 @dataclass
 class Tally:
-    """What became of the pictures of a family."""
+    """Results for the images of one family: counts, defects, worst time, and most memory in frames."""
 
     looked: int = 0
     right: int = 0
@@ -65,11 +66,11 @@ class Tally:
     most_frames: float = 0.0
 
 
-# The families, each a picture from a random stream
+# The families, each a function that makes an input from a random stream
 
 
 def size(rng: Rng) -> tuple[int, int]:
-    """That of the camera, or a small one."""
+    """Size of the camera's images, or a smaller one."""
     return (HEIGHT, WIDTH) if rng.uniform() < 0.5 else SMALL
 
 
@@ -116,13 +117,13 @@ def text(rng: Rng) -> Shot:
 
 
 def scattered(rng: Rng) -> Shot:
-    """Lights that fell anywhere, as bright as stars are, few and many."""
+    """Lights at uniform random positions with fluxes of stars, from few to many."""
     count = int(rng.choice([3, 6, 12, 25, 60, 200]))
     return Shot(lit(rng.uniform(0, [WIDTH, HEIGHT], (count, 2)), star_light(count, rng), rng))
 
 
 def repeated(rng: Rng) -> Shot:
-    """A few lights again and again on a lattice, as panels of LEDs and ghosts of windows are."""
+    """A few lights repeated on a lattice, as from LED panels or reflections in windows."""
     across, down = rng.uniform(30, 200, 2)
     cell = rng.uniform(0, [across, down], (rng.integers(1, 8), 2))
     steps = np.stack(np.meshgrid(np.arange(-1, 25), np.arange(-1, 20)), axis=-1).reshape(-1, 2)
@@ -136,12 +137,13 @@ def repeated(rng: Rng) -> Shot:
 
 
 def duplicated(rng: Rng) -> Shot:
-    """Two skies at once: a lens that was bumped, or one sky over another. Either may be the answer."""
+    """Two superimposed skies: one sky doubled by a bumped lens, or two different ones. Either solution is correct."""
     one, there = starry(rng)
     if rng.uniform() < 0.5:
         shift = rng.integers(-40, 41, 2)
         moved = np.roll(one, shift, (0, 1))
         ground = np.median(one)
+        # np.roll moves rows by shift[0] (y) and columns by shift[1] (x); near the boresight that is this rotation.
         turned = Rotation.from_rotvec(np.array([-shift[0], shift[1], 0]) / camera().focal_px) * there
         return Shot(np.clip(one + (moved - ground), 0, DEPTH).astype(np.uint16), skies=(there, turned))
     other, elsewhere = starry(rng)
@@ -149,21 +151,21 @@ def duplicated(rng: Rng) -> Shot:
 
 
 def mirrored(rng: Rng) -> Shot:
-    """No turn of the sky is its mirror image, through whatever lens."""
+    """A mirrored sky. No rotation of the sky equals its mirror image, with any lens."""
     lens = camera() if rng.uniform() < 0.7 else Camera.from_fov(WIDTH, HEIGHT, np.radians(rng.uniform(6, 60)))
     picture = starry(rng, lens)[0]
     return Shot(np.ascontiguousarray(picture[:, ::-1] if rng.uniform() < 0.5 else picture[::-1]))
 
 
 def kaleidoscope(rng: Rng) -> Shot:
-    """Half a mirrored sky and its mirror image; the true half may be recognised."""
+    """Half of a sky and its mirror image; the true half may be solved."""
     picture, there = starry(rng)
     half = picture[:, : WIDTH // 2]
     return Shot(np.hstack([half, picture[:, WIDTH // 2 : WIDTH // 2 + 1], half[:, ::-1]]), skies=(there,))
 
 
 def shuffled(rng: Rng) -> Shot:
-    """A true sky cut into squares that are dealt out anew; the sky of a square or two may be recognised."""
+    """A true sky cut into squares that are permuted; the sky of a few squares may be solved."""
     picture, there = starry(rng)
     side = 82
     cells = [(r, c) for r in range(0, 6 * side, side) for c in range(0, 8 * side, side)]
@@ -176,7 +178,7 @@ def shuffled(rng: Rng) -> Shot:
 
 
 def carried(xy_px: NDArray) -> Rotation:
-    """The turn of the camera's frame that takes a small piece at xy_px[0] to xy_px[1], upright as it was."""
+    """Rotation in camera axes that moves a small image patch from xy_px[0] to xy_px[1] and keeps it upright."""
     frames = []
     for ray in camera().rays(xy_px):
         x = np.array([ray[2], 0, -ray[0]]) / np.hypot(ray[0], ray[2])
@@ -187,7 +189,7 @@ def carried(xy_px: NDArray) -> Rotation:
 def flat(rng: Rng) -> Shot:
     level = int(rng.choice([0, 1, 2000, DEPTH, 65535]))
     picture = np.full(size(rng), level, np.uint16)
-    if rng.uniform() < 0.5:  # but for a few
+    if rng.uniform() < 0.5:  # all equal but for a few pixels
         at = rng.integers(0, picture.shape, (rng.integers(1, 40), 2))
         picture[at[:, 0], at[:, 1]] = rng.integers(0, DEPTH)
     return Shot(picture)
@@ -199,7 +201,7 @@ def tiny(rng: Rng) -> Shot:
 
 
 def no_numbers(rng: Rng) -> Shot:
-    """Floats that are not finite, or beyond all measure."""
+    """Floating-point images with values that are not finite, or extremely large or small."""
     picture = rng.normal(100, 10, size(rng)).astype(rng.choice(["f4", "f8"]))
     at = rng.integers(0, picture.size, rng.integers(1, 50))
     picture.ravel()[at] = rng.choice([np.nan, np.inf, -np.inf, 3e38, -3e38, 1e-40], len(at))
@@ -207,7 +209,7 @@ def no_numbers(rng: Rng) -> Shot:
 
 
 def broken(rng: Rng) -> Shot:
-    """A whole file with some of its bytes changed, or cut off."""
+    """A valid file with some bytes changed, or truncated."""
     suffix = str(rng.choice([".png", ".tiff", ".jpg", ".bmp", ".fits"]))
     data = bytearray(encoded(rng.integers(0, 255, (64, 80), dtype=np.uint8), suffix))
     for _ in range(rng.integers(1, 20)):
@@ -223,14 +225,14 @@ def rubbish(rng: Rng) -> Shot:
 
 
 def promises(rng: Rng) -> Shot:
-    """A header of a great picture and a body that ends."""
+    """The header of a very large image with truncated data."""
     side = int(rng.choice([20_000, 60_000, 2**30]))
     suffix = str(rng.choice([".png", ".bmp", ".tiff", ".jpg", ".fits"]))
     return Shot(None, suffix, promise(suffix, side, side) + rng.bytes(int(rng.integers(0, 3000))))
 
 
 def large(rng: Rng) -> Shot:
-    """Sixteen megapixels of noise, of lights, or of a lattice of a million lights in eight bits."""
+    """Sixteen megapixels of noise with lights, or of a lattice of up to four million lights in eight bits."""
     if rng.uniform() < 0.4:
         picture = np.full(LARGE, 10, np.uint8)
         picture[:: rng.integers(2, 9), :: rng.integers(2, 9)] = rng.integers(60, 256)
@@ -243,7 +245,7 @@ def large(rng: Rng) -> Shot:
 
 
 Family = Callable[[Rng], Shot]
-# How often each comes up.
+# Relative frequency of each family.
 FAMILIES: dict[Family, float] = {
     **dict.fromkeys((noise, stripes, gradients, text, scattered, repeated), 10),
     **dict.fromkeys((duplicated, kaleidoscope, shuffled), 4),
@@ -253,7 +255,7 @@ FAMILIES: dict[Family, float] = {
 }
 
 
-# What they are made of
+# Parts of the inputs
 
 
 @lru_cache
@@ -263,22 +265,22 @@ def camera() -> Camera:
 
 @lru_cache
 def stars() -> catalog.StarCatalog:
-    """As the solvers see them, who leave aberration out of pictures without a date."""
+    """Catalog stars without aberration, because the solvers do not apply it to images without a date."""
     return catalog.brighter(catalog.read(CATALOGUES / "hipparcos_hp6.5.ecsv"), 7.0)
 
 
 def starry(rng: Rng, lens: Camera | None = None) -> tuple[NDArray, Rotation]:
-    """A true sky, and its attitude."""
+    """An image of a true sky, and its attitude."""
     return photograph(Sight("", lens or camera(), LIEBE_E, 7.0, 60, 15, 16, DEPTH), stars(), rng)
 
 
 def star_light(count: int, rng: Rng) -> NDArray:
-    """Digital numbers of lights as bright as the catalogue's stars."""
+    """Fluxes in digital numbers, drawn from those of the catalog's stars."""
     return LIEBE_E / 16 * 10 ** (-0.4 * rng.choice(stars().v_mag[:4000], count))
 
 
 def lit(xy_px: NDArray, light_dn: NDArray, rng: Rng) -> NDArray:
-    """Gaussian lights over a sky."""
+    """An image of Gaussian lights on a uniform background, with noise."""
     picture = np.full((HEIGHT, WIDTH), 20.0)
     inside = np.all((xy_px > 0) & (xy_px < [WIDTH, HEIGHT]), axis=1)
     paint(picture, xy_px[inside], light_dn[inside], np.zeros((int(inside.sum()), 2)), 0.7)
@@ -289,18 +291,21 @@ def speckled(picture: NDArray, rng: Rng) -> NDArray:
     return np.clip(picture + rng.normal(0, 1.5, picture.shape), 0, DEPTH).astype(np.uint16)
 
 
-# How they are taken
+# Solving and checking the inputs
 
 
 @dataclass
 class Judge:
-    """The solvers, and a folder for the files."""
+    """Cached solvers, and a folder for the files."""
 
     folder: Path
     solvers: dict[str, dict[tuple[int, ...], plate_solver.Solver]] = field(default_factory=dict)
 
     def solver(self, told: str, shape: tuple[int, ...]) -> plate_solver.Solver:
-        """One for each usual size, whose trackers take seconds to build, and one for all others."""
+        """A cached solver for each usual size, because its trackers take seconds to build, and one for other sizes.
+
+        told : given information: "camera", "field" (of view) or "nothing"
+        """
         shape = shape if shape in USUAL else ()
         how = {"camera": (None, CAMERA_FILE), "field": (FOV_DEG, None), "nothing": (None, None)}[told]
         kept = self.solvers.setdefault(told, {})
@@ -311,7 +316,7 @@ class Judge:
         return kept[shape]
 
     def take(self, n: int, seed: int) -> tuple[str, Shot, dict, float, float]:
-        """Picture number n: its family, the answer, the seconds, and the memory in frames."""
+        """Make and solve input number n: family, input, answer, processor seconds, bytes of memory above the floor."""
         rng = np.random.default_rng([seed, n])
         weight = np.array(list(FAMILIES.values()))
         family = list(FAMILIES)[rng.choice(len(FAMILIES), p=weight / weight.sum())]
@@ -327,25 +332,25 @@ class Judge:
         answer, seconds, taken = timed(path, solver)
         if any(
             defects(shot, answer | {"told": told}, seconds, taken)
-        ):  # it may have been compiling: once more
+        ):  # solve again, because compilation may have caused the defect
             answer, seconds, taken = timed(path, solver)
         return family.__name__, shot, answer | {"told": told}, seconds, taken
 
 
 def timed(path: Path, solver: plate_solver.Solver) -> tuple[dict, float, float]:
-    """The answer to a file, seconds of the processor, and bytes beyond the floor."""
+    """Solve a file: answer, processor seconds, and peak memory above MEMORY_FLOOR in bytes."""
     before = memory("VmRSS", reset=True)
     begin = time.process_time()
     try:
         answer = plate_solver.solve(path, solver, None)
-    except Exception as error:  # which is the defect that is looked for
+    except Exception as error:  # any exception is a defect
         answer = {"status": f"raised {error!r}", "raised": True}
     seconds = time.process_time() - begin
     return answer, seconds, max(memory("VmHWM") - before - MEMORY_FLOOR, 0)
 
 
 def memory(key: str, reset: bool = False) -> int:
-    """Bytes of memory held now (VmRSS), or the most since the last reset (VmHWM); Linux only, else 0."""
+    """Current memory in bytes (VmRSS), or the peak since the last reset (VmHWM); 0 on systems other than Linux."""
     try:
         if reset:
             Path("/proc/self/clear_refs").write_text("5")
@@ -356,7 +361,7 @@ def memory(key: str, reset: bool = False) -> int:
 
 
 def wrong(answer: dict, skies: Skies) -> bool:
-    """An attitude that puts the sky elsewhere in the picture than where it is."""
+    """Whether the solution is wrong: it displaces the image corners by more than ten arcminutes for all true skies."""
     if answer.get("ra_deg") is None:
         return False
     told = star_sources.cam_from_icrs(answer["ra_deg"], answer["dec_deg"], answer["roll_deg"])
@@ -366,14 +371,14 @@ def wrong(answer: dict, skies: Skies) -> bool:
 
 
 def judged(count: int, seed: int, quiet: bool = True) -> dict[str, Tally]:
-    """What became of so many pictures, by family."""
+    """Results for `count` inputs, by family."""
     tallies: dict[str, Tally] = {}
     with tempfile.TemporaryDirectory() as folder:
         judge = Judge(Path(folder))
         for n in progress(range(count), count, "hostile pictures", quiet):
             try:
                 name, shot, answer, seconds, taken = judge.take(n, seed)
-            except KeyboardInterrupt:  # what was seen so far is told
+            except KeyboardInterrupt:  # report the results so far
                 break
             tally = tallies.setdefault(name, Tally())
             tally.looked += 1
@@ -386,7 +391,7 @@ def judged(count: int, seed: int, quiet: bool = True) -> dict[str, Tally]:
 
 
 def defects(shot: Shot, answer: dict, seconds: float, taken: float) -> Iterator[str]:
-    """What is wrong with how a picture was taken."""
+    """Yield a description of each violated requirement."""
     pixels, held = (shot.picture.size, shot.picture.nbytes) if shot.picture is not None else (0, 0)
     if answer.get("raised"):
         yield answer["status"]

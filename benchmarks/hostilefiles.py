@@ -1,4 +1,4 @@
-"""Files for `hostile`: a picture encoded, and headers that promise more than there is."""
+"""Files for `hostile`: encoded images, and headers that declare more data than the file has."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 
 def encoded(picture: NDArray, suffix: str) -> bytes:
-    """A picture as a file's bytes."""
+    """An image encoded as the bytes of a file with this suffix."""
     if suffix == ".fits":
         from io import BytesIO
 
@@ -25,7 +25,7 @@ def encoded(picture: NDArray, suffix: str) -> bytes:
 
 
 def promise(suffix: str, width: int, height: int) -> bytes:
-    """The header of a picture of that size, with the beginning of a body at most."""
+    """The header of an image file of that size, with at most the beginning of the pixel data."""
     if suffix == ".png":
         parts = [
             (b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)),

@@ -1,4 +1,4 @@
-"""Lost in space from centroids of SHEFEX-2's camera, beside tetra3rs."""
+"""Lost-in-space solution from centroids of SHEFEX-2's camera, compared with tetra3rs."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ FIELDS = 100
 
 
 def measure() -> list[dict[str, Any]]:
-    """100 random fields of 14.87 x 11.15 deg, stars to V 5.75, the brightest 15, 0.1 px, no false stars."""
+    """100 random fields of 14.87 x 11.15 deg: the 15 brightest stars to V 5.75, 0.1 px noise, no false stars."""
     camera = Camera(659, 493, 25e-3 / 9.9e-6, (329.0, 246.0))
     stars = catalog.brighter(catalog.read(CATALOGUES / "hipparcos_hp6.5.ecsv"), 5.75)
     tracker = StarTracker(camera, stars, catalog.at_epoch(stars, 2020.0), Settings(centroid_sigma_px=0.1))
@@ -37,7 +37,7 @@ def measure() -> list[dict[str, Any]]:
 
 
 def field(tracker: StarTracker, rng: np.random.Generator) -> Centroids:
-    """The brightest 15 stars seen at a random attitude, with noise."""
+    """The 15 brightest stars in the field at a random attitude, with noise."""
     camera, attitude = tracker.camera, Rotation.random(rng=rng)
     pixels = camera.pixels(attitude.apply(tracker.stars.vectors))
     rows = np.flatnonzero(camera.contains(np.nan_to_num(pixels, nan=-1e9)))[:15]
@@ -46,7 +46,7 @@ def field(tracker: StarTracker, rng: np.random.Generator) -> Centroids:
 
 
 def tetra3rs(camera: Camera, fields: list[Centroids]) -> Callable[[], Any] | None:
-    """The same fields solved by tetra3rs, where it is installed (extra `oracle`)."""
+    """A function that solves the same fields with tetra3rs; None if it is not installed (extra `oracle`)."""
     if importlib.util.find_spec("tetra3rs") is None:
         return None
     from tetra3rs import SolverDatabase

@@ -1,4 +1,4 @@
-"""Frames from light, beside getframes, GalSim and numpy; how the time grows; the machine's own limit."""
+"""Frame rendering speed against getframes, GalSim and NumPy; scaling of time and memory; noise against random bytes."""
 
 from __future__ import annotations
 
@@ -38,19 +38,19 @@ NOISE = {
 
 
 def camera(width: int, height: int, focal_px: float, sigma_px: float, **noise: Any) -> CameraConfig:
-    """A square pixel of 5 um behind a lens that is focused where everything stands."""
+    """A camera with square 5 um pixels and a Gaussian PSF; f/10000, so that defocus is negligible."""
     part = {"width_px": width, "height_px": height, "pixel": "5 um", "focal_length": f"{5e-6 * focal_px} m"}
     lens = {"f_number": 1e4, "psf": {"kind": "gaussian", "sigma_px": sigma_px}}
     return CameraConfig.model_validate(part | lens | {"detector": NOISE | noise})
 
 
 def square_metre(lens: CameraConfig) -> Optics:
-    """The lens with a pupil of a square metre, so that a source's strength is its electrons a second."""
+    """The optics with a pupil of one square meter, so that a source's strength equals its electrons per second."""
     return replace(Optics.of(lens), collecting_m2=1.0)
 
 
 def turning(rate_rad_s: float) -> Trajectory:
-    """About the camera's y axis, through the identity in the middle of the exposure."""
+    """A rotation about the camera's y axis at a constant rate, with the identity at mid-exposure."""
     t = np.linspace(0, EXPOSURE_S, 11)
     rate = np.tile([0.0, rate_rad_s, 0.0], (11, 1))
     return Trajectory(t, Rotation.from_rotvec((t[:, None] - EXPOSURE_S / 2) * rate[:1]), rate)
@@ -59,7 +59,10 @@ def turning(rate_rad_s: float) -> Trajectory:
 def lights(
     lens: CameraConfig, count: int, electrons: Floats, radius_px: float = 0.0, seed: int = 1
 ) -> Sources:
-    """So many stars, or lamps two metres away, spread over the frame; electrons each in one exposure."""
+    """`count` stars, or discs two meters away if radius_px > 0, at random positions in the frame.
+
+    electrons : electrons of each source in one exposure
+    """
     rng = np.random.default_rng(seed)
     xy = rng.uniform((30, 30), (lens.width_px - 30, lens.height_px - 30), (count, 2))
     toward = np.column_stack([(xy - lens.centre_px) / lens.focal_px, np.ones(count)])
@@ -82,7 +85,7 @@ def lights(
 
 
 def camera_shot(lens: CameraConfig, sources: Sources, rate_rad_s: float) -> Callable[[], Any]:
-    """One frame after another: light, smear, and every noise."""
+    """A function that makes one frame: light with smear, then all noise."""
     optics, chip, rng = square_metre(lens), Chip.of(lens), np.random.default_rng(0)
     path, image = turning(rate_rad_s), np.empty((lens.height_px, lens.width_px), np.float32)
 
@@ -95,21 +98,21 @@ def camera_shot(lens: CameraConfig, sources: Sources, rate_rad_s: float) -> Call
 
 
 def light_of(lens: CameraConfig, sources: Sources, rate_rad_s: float) -> Floats:
-    """The same frame's mean photo-electrons."""
+    """Mean photoelectrons of the same frame."""
     image = np.zeros((lens.height_px, lens.width_px))
     render(image, sources, square_metre(lens), turning(rate_rad_s), AT_CENTRE, Window(0.0, EXPOSURE_S))
     return image
 
 
 def measure() -> list[dict[str, Any]]:
-    """The dome frame, the sky frame, the noise alone, and how they grow."""
+    """Results for the dome frame, the sky frame, the noise alone, and the scaling."""
     return [*dome_frame(), *sky_frame(), noise_floor(), *growth()]
 
 
 def dome_frame() -> list[dict[str, Any]]:
-    """1600 x 1200, 45 discs 20 px wide that move by 20 px, all noise with its fixed pattern.
+    """1600 x 1200 pixels, 45 discs 20 px wide that move by 20 px, all noise including the fixed pattern.
 
-    The peers are given the light ready made: their time is the noise's alone.
+    The peers receive the finished light image, so their time is that of the noise alone.
     """
     lens = camera(1600, 1200, 8000.0, 1.0)
     sources = lights(lens, 45, np.full(45, 3e6), radius_px=10.0)
@@ -123,7 +126,10 @@ def dome_frame() -> list[dict[str, Any]]:
 
 
 def getframes(lens: CameraConfig, mean_e: Floats) -> Callable[[], Any] | None:
-    """The same chain in getframes: PRNU, dark current and its spread, hot pixels, shot and read noise, converter."""
+    """The same detector model in getframes: PRNU, dark current and DSNU, hot pixels, shot and read noise, ADC.
+
+    None if it is not installed.
+    """
     if importlib.util.find_spec("getframes") is None:
         return None
     import getframes as gf
@@ -154,7 +160,7 @@ def getframes(lens: CameraConfig, mean_e: Floats) -> Callable[[], Any] | None:
 
 
 def numpy_noise(mean_e: Floats) -> Callable[[], Any]:
-    """Poisson, read noise, converter; no fixed pattern."""
+    """Poisson noise, read noise and ADC in NumPy, without fixed pattern."""
     rng = np.random.default_rng(2)
 
     def noise() -> Any:
@@ -165,9 +171,10 @@ def numpy_noise(mean_e: Floats) -> Callable[[], Any]:
 
 
 def sky_frame() -> list[dict[str, Any]]:
-    """1024 x 1024 and 20 deg: the whole sky's stars to V 7 (15,200) are 146 in such a field; sigma .8 px."""
+    """1024 x 1024 pixels over 20 deg, PSF sigma 0.8 px: the 15,200 stars to V 7 give 146 in such a field."""
     lens = camera(1024, 1024, 512 / np.tan(np.radians(10)), 0.8, prnu=0.0, dsnu=0.0, hot_pixels=0.0)
-    magnitude = 7 + np.log10(np.random.default_rng(3).uniform(0, 1, 146)) / 0.51  # the counts' slope at V 7
+    # Star counts grow by 0.51 dex per magnitude at V 7; this draws magnitudes from that distribution.
+    magnitude = 7 + np.log10(np.random.default_rng(3).uniform(0, 1, 146)) / 0.51
     electrons = 2e4 * 10 ** (-0.4 * (magnitude - 4))
     sources = lights(lens, 146, electrons)
     ours = camera_shot(lens, sources, 0.0)
@@ -178,7 +185,7 @@ def sky_frame() -> list[dict[str, Any]]:
 
 
 def galsim(lens: CameraConfig, sources: Sources, electrons: Floats) -> Callable[[], Any] | None:
-    """The same stars drawn by GalSim on stamps of its own choice, and its CCDNoise."""
+    """The same stars drawn by GalSim on stamps of its default size, with its CCDNoise; None if it is not installed."""
     if importlib.util.find_spec("galsim") is None:
         return None
     import galsim
@@ -200,7 +207,7 @@ def galsim(lens: CameraConfig, sources: Sources, electrons: Floats) -> Callable[
 
 
 def noise_floor() -> dict[str, Any]:
-    """A dark frame's noise against the machine's own limit: as many random bytes as the frame has."""
+    """Noise of a dark frame against the time to generate as many random bytes as the frame has."""
     lens = camera(1600, 1200, 8000.0, 1.0)
     chip, rng = Chip.of(lens), np.random.default_rng(0)
     dark = np.zeros((1200, 1600), np.float32)
@@ -209,7 +216,7 @@ def noise_floor() -> dict[str, Any]:
         dark[:] = 0
         expose(dark, EXPOSURE_S, chip, rng)
 
-    # A ratio of 1/3 is three times as long as filling the frame with random bytes.
+    # A ratio of 1/3 means three times the time of filling the frame with random bytes.
     return versus(
         "noise of a dark frame, 1600x1200",
         ours,
@@ -220,7 +227,7 @@ def noise_floor() -> dict[str, Any]:
 
 
 def growth() -> list[dict[str, Any]]:
-    """Time against stars beyond 500 is a line, against area it is level but for the noise; memory in frames."""
+    """Scaling: drawing time is linear in the number of stars and independent of the area; memory in frames."""
     few, many = camera(1024, 1024, 3000.0, 0.8), camera(2048, 2048, 3000.0, 0.8)
 
     def drawing(lens: CameraConfig, count: int) -> Callable[[], Any]:
@@ -238,7 +245,10 @@ def growth() -> list[dict[str, Any]]:
 
 
 def memory_frames() -> float:
-    """Growth of the process while it makes a frame of 36 megapixels, in such frames, the fixed pattern included."""
+    """Memory growth of the process while it makes a frame of 36 megapixels, in float32 frames of that size.
+
+    The fixed pattern is included.
+    """
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     lens = camera(6000, 6000, 8000.0, 1.0)
     camera_shot(lens, lights(lens, 500, np.full(500, 1e4)), 0.0)()

@@ -1,8 +1,8 @@
-"""The lab's page in Chromium: frames a second while a key is held, and from a key to the picture on the screen.
+"""Speed of the browser GUI in Chromium: frames per second while a key is held, and latency from key to image.
 
-`python -m benchmarks.lab [SECONDS]` serves shefex2 with a chip of 1024 x 1024, every frame identified, and prints both
-for a screen of 1280 x 800 and one of 1920 x 1080. A browser without a graphics card draws on the cores that make the
-frames.
+`python -m benchmarks.lab [SECONDS]` serves shefex2 with a detector of 1024 x 1024 pixels and prints both numbers for
+screens of 1280 x 800 and 1920 x 1080. Every frame is solved. A browser without a graphics card draws on the same cores
+that render the frames.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ LOADS = """() => { window.came = [];
 
 @contextmanager
 def served(name: str) -> Iterator[str]:
-    """A server of a scene, and its address."""
+    """Start a GUI server for a scene; yields its address."""
     with tempfile.TemporaryDirectory() as folder, socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
@@ -52,7 +52,7 @@ def served(name: str) -> Iterator[str]:
 
 
 def reached(url: str) -> str:
-    """The address, once somebody answers there."""
+    """Wait until a server responds at the address, and return it. Raises TimeoutError."""
     for _ in range(600):
         try:
             urllib.request.urlopen(url, timeout=2).read()
@@ -63,18 +63,18 @@ def reached(url: str) -> str:
 
 
 def held(page: Any, seconds: float) -> float:
-    """Frames a second while an arrow is held."""
+    """Frames per second while an arrow key is held."""
     page.evaluate("() => { window.came = [] }")
     end = time.monotonic() + seconds
     while time.monotonic() < end:
         page.keyboard.down("ArrowLeft")
-        time.sleep(0.03)  # as keyboards repeat
+        time.sleep(0.03)  # a keyboard's repeat interval
     page.keyboard.up("ArrowLeft")
     return float(page.evaluate("window.came.length")) / seconds
 
 
 def delays_ms(page: Any) -> np.ndarray:
-    """From each of some presses to the next picture."""
+    """(PRESSES,) milliseconds from a key press to the next image."""
     found = []
     for _ in range(PRESSES):
         before = page.evaluate("window.came.length")
@@ -87,7 +87,7 @@ def delays_ms(page: Any) -> np.ndarray:
 
 
 def main(seconds: float) -> None:
-    """Print both figures at each size."""
+    """Print both numbers for each screen size."""
     from playwright.sync_api import sync_playwright
 
     print(f"{'screen':12s} frames/s   key to picture: median, 90 %, ms   (bars: 15; 100)")
@@ -99,13 +99,13 @@ def main(seconds: float) -> None:
 
 
 def measured(driver: Any, url: str, seconds: float) -> None:
-    """A line a size of screen."""
+    """Print one line per screen size."""
     browser = driver.chromium.launch(executable_path=chromium(), args=["--no-sandbox"])
     for width, height in SIZES:
         page = browser.new_page(viewport={"width": width, "height": height})
         page.goto(url)
         page.locator(".lab-card .good").wait_for(timeout=90_000)
-        page.wait_for_timeout(20_000)  # the server begins the next tab's worker
+        page.wait_for_timeout(20_000)  # the server starts the spare worker for the next tab
         page.evaluate(LOADS)
         rate, late = held(page, seconds), delays_ms(page)
         middle, most = np.quantile(late, [0.5, 0.9])
@@ -115,7 +115,7 @@ def measured(driver: Any, url: str, seconds: float) -> None:
 
 
 def chromium() -> str:
-    """The browser. Raises StopIteration where there is none."""
+    """Path of the browser. Raises StopIteration if there is none."""
     return next(path for name in BROWSERS if (path := shutil.which(name)))
 
 

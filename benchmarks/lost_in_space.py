@@ -1,9 +1,10 @@
-"""Lost in space on six workloads, from centroids and magnitudes alone, beside an oracle that knows every name.
+"""Lost-in-space identification on six workloads, from centroids and magnitudes, compared with an oracle.
 
-`python -m benchmarks.lost_in_space [FIELDS] [SEED] [IDENTIFIER ...]` prints success, wrong answers and time. The sky is
-Hipparcos to the row's limit with the fainter of any two stars closer than 30" dropped; attitudes are uniform; a star's
-magnitude is wrong by 0.25 (1 sigma), a false one's drawn from the catalogue's. The oracle is what anybody could have
-done with three true stars. Wrong is an attitude more than 10' off where the oracle's is not.
+`python -m benchmarks.lost_in_space [FIELDS] [SEED] [IDENTIFIER ...]` prints success, wrong attitudes and time. The sky
+is Hipparcos to the workload's limiting magnitude, without the fainter of any two stars closer than 30". Attitudes are
+uniform over all rotations. A star's magnitude has an error of 0.25 (1 sigma); a false star's is drawn from the catalog.
+The oracle solves the attitude from the true identities of all true stars and needs at least three. A solution is
+wrong if it is more than 10' off, unless the oracle's is too.
 """
 
 from __future__ import annotations
@@ -36,11 +37,11 @@ DEEP = "hipparcos_hp7.5"
 
 @dataclass(frozen=True)
 class Workload:
-    """A camera, how deep it sees, and what is done to its fields.
+    """A camera, its limiting magnitude, and the disturbances of its fields.
 
-    fov_deg       : (2,) across the chip of width_px, which has square pixels
-    brightest     : no more centroids than that; false_share : so many of the centroids are false, after the cut
-    false, missing: so many false lights, and the share of stars that is not seen
+    fov_deg       : (2,) field of view, width and height; width_px pixels wide, with square pixels
+    brightest     : maximum number of centroids; false_share : fraction of the centroids that are false, after this cut
+    false, missing: number of false lights, and fraction of the stars not detected
     """
 
     name: str
@@ -55,7 +56,7 @@ class Workload:
 
     @property
     def camera(self) -> Camera:
-        """The pinhole camera of that field."""
+        """The pinhole camera with this field of view."""
         width, height = np.tan(np.radians(self.fov_deg) / 2)
         height_px = round(self.width_px * float(height / width))
         return Camera.from_fov(self.width_px, height_px, float(np.radians(self.fov_deg[0])))
@@ -75,7 +76,7 @@ WORKLOADS = (
 
 @dataclass(frozen=True)
 class Field:
-    """One frame: what is seen, brightest first, its truth, and each centroid's star (-1: none)."""
+    """One frame: centroids, brightest first, true attitude, and the star of each centroid (-1: false)."""
 
     centroids: Centroids
     cam_from_icrs: Rotation
@@ -83,13 +84,13 @@ class Field:
 
 
 def sky(limit_mag: float) -> catalog.StarCatalog:
-    """The stars of a row. Builds the deeper catalogue where the repository's does not reach."""
+    """The stars to a limiting magnitude, without close doubles. Builds the deeper catalog if it does not exist yet."""
     path = CATALOGUES / f"{DEEP}.ecsv"
     if not path.is_file():
         star_catalog.build(7.5, path)
     stars = catalog.brighter(catalog.read(path), limit_mag)
     near = cKDTree(stars.vectors).query_pairs(2 * np.sin(DOUBLES_RAD / 2), output_type="ndarray")
-    fainter = near.max(axis=1)  # rows are by growing magnitude
+    fainter = near.max(axis=1)  # rows are sorted by magnitude
     return stars.take(np.setdiff1d(np.arange(len(stars)), fainter))
 
 
@@ -106,6 +107,7 @@ def field(work: Workload, stars: catalog.StarCatalog, rng: np.random.Generator) 
     row = np.flatnonzero(camera.contains(np.nan_to_num(xy, nan=-1e9)))
     row = row[rng.random(len(row)) >= work.missing]
     mag = stars.v_mag[row] + MAGNITUDE_SIGMA * rng.standard_normal(len(row))
+    # With a limit on the centroids, the false share counts within the limit; 1000 means no limit.
     true = round(work.brightest * (1 - work.false_share)) if work.brightest < 1000 else 1000
     row, mag = row[np.argsort(mag)[:true]], np.sort(mag)[:true]
     false = work.false + round(len(row) * work.false_share / (1 - work.false_share))
@@ -120,7 +122,7 @@ def field(work: Workload, stars: catalog.StarCatalog, rng: np.random.Generator) 
 
 
 def oracle(work: Workload, stars: catalog.StarCatalog, one: Field) -> Rotation | None:
-    """The attitude from true names, where there are three."""
+    """The attitude from the true identities; None with fewer than three stars."""
     known = one.star >= 0
     if known.sum() < 3:
         return None
@@ -133,7 +135,7 @@ Solve = Callable[[Field], Rotation | None]
 
 
 def ours(work: Workload, stars: catalog.StarCatalog, identifier: str) -> Solve:
-    """Our tracker with one of its identifiers."""
+    """The skysim star tracker with one of its identifiers."""
     settings = Settings(
         identifier=identifier, centroid_sigma_px=0.0, field_stars=1e9, merge_px=0.0, zero_point_mag=0.0
     )
@@ -142,7 +144,7 @@ def ours(work: Workload, stars: catalog.StarCatalog, identifier: str) -> Solve:
 
 
 def compare(work: Workload, count: int, seed: int, identifier: str) -> str:
-    """One line of the table."""
+    """One table line."""
     stars = sky(work.limit_mag)
     begin = time.perf_counter()
     solve = ours(work, stars, identifier)

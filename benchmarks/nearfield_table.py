@@ -1,7 +1,8 @@
-"""Attitude error of six methods under five surfaces: `python -m benchmarks.nearfield_table` prints the docs' table.
+"""Attitude error of six near-field methods under five surfaces.
 
-The lights are where random rays meet the true surface; the methods are told the lights' true places and a centred
-sphere for the surface, as a lab believes of its dome.
+`python -m benchmarks.nearfield_table` prints the table of the docs. The lights are at intersections of random rays
+with the true surface. The methods receive the true positions of the lights, and a centered sphere as the assumed
+surface of the dome.
 """
 
 from __future__ import annotations
@@ -19,12 +20,12 @@ from estimator.core.camera import Camera
 
 INCH_M = 0.0254
 NOISE_PX = 0.1
-START_OFF_RAD = np.radians(2)  # what Tappe's iterated trial began with
+START_OFF_RAD = np.radians(2)  # start error of Tappe's iterated trial
 
 
 @dataclass(frozen=True, slots=True)
 class Bench:
-    """Where so many lights really are, under which camera, and the radius of the sphere they are believed on."""
+    """A test geometry: true surface, camera, radius of the assumed sphere, tilts, and number of lights."""
 
     surface: LedMap
     camera: Camera
@@ -39,7 +40,7 @@ class Bench:
 
 
 def _dome(centre_in: tuple[float, float, float], semi_axes_in: tuple[float, float, float]) -> LedMap:
-    """A surface without lights; infinite semi-axes make it flat."""
+    """A surface without lights; infinite semi-axes make it a plane."""
     nowhere = np.empty(0, dtype=np.int64), np.empty((0, 3))
     return LedMap(*nowhere, np.array(centre_in) * INCH_M, np.array(semi_axes_in) * INCH_M)
 
@@ -62,7 +63,7 @@ BENCHES = {
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """One attitude and what the camera sees at it."""
+    """One attitude, the start attitude, the lights, and their pixel positions."""
 
     truth: Rotation
     start: Rotation
@@ -71,7 +72,10 @@ class Trial:
 
 
 def trial(bench: Bench, tilt_deg: float, rng: np.random.Generator, noise_px: float = 0.0) -> Trial:
-    """Random yaw and azimuth of the tilt; lights where random pixels look; a start START_OFF_RAD from the truth."""
+    """A trial at random yaw and tilt direction, with lights where the rays of random pixels meet the true surface.
+
+    The start attitude is START_OFF_RAD from the truth, about a random axis.
+    """
     azimuth, yaw = rng.uniform(0, 2 * np.pi, 2)
     lean = np.radians(tilt_deg) * np.array([np.cos(azimuth), np.sin(azimuth), 0])
     truth = Rotation.from_rotvec(lean) * Rotation.from_rotvec([0, 0, yaw])
@@ -87,7 +91,7 @@ def trial(bench: Bench, tilt_deg: float, rng: np.random.Generator, noise_px: flo
 
 
 def solved(method: str, bench: Bench, one: Trial) -> tuple[Rotation, NDArray[np.float64]]:
-    """What a method makes of a trial: body_from_lab and its covariance."""
+    """body_from_lab and its covariance from one method."""
     rays = bench.camera.rays(one.pixels)
     sigma_rad = fitted_sigma_rad(method, rays, np.full(bench.lights, NOISE_PX / bench.camera.focal_px))
     return SOLVERS[method](rays, sigma_rad, one.leds.position_m, one.leds, bench.lever, one.start)
@@ -106,13 +110,13 @@ def errors_deg(
 
 
 def cross_and_roll(errors: NDArray[np.float64]) -> tuple[float, float]:
-    """rms of the error across the boresight, sqrt(mean(x^2 + y^2)), and about it."""
+    """RMS cross-boresight error, sqrt(mean(x^2 + y^2)), and RMS roll error."""
     square = np.mean(errors**2, axis=0)
     return float(np.sqrt(square[0] + square[1])), float(np.sqrt(square[2]))
 
 
 def table(trials: int, seed: int) -> None:
-    """Print rms cross (roll), degrees: methods and tilts down, surfaces across, without noise and with NOISE_PX."""
+    """Print RMS cross (roll) in degrees: methods and tilts in rows, surfaces in columns, without noise and with."""
     for noise_px in (0.0, NOISE_PX):
         print(f"\n{noise_px} px of noise, {trials} trials a cell: rms cross (roll), degrees\n")
         print("| method, tilt | " + " | ".join(BENCHES) + " |")

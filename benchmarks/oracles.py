@@ -1,9 +1,10 @@
-"""Our sky frames, solved by others. `python -m benchmarks.oracles [FRAMES] [SEED]`.
+"""Sky frames rendered by skysim, solved by independent solvers ("oracles").
 
-Frames at random attitudes go to tetra3rs and to astrometry.net as FITS files, with nothing of ours but the camera's
-field of view (tetra3rs: its calibration). Each finds the stars by its own code and names them by its own catalogue.
-Its world coordinates, and its stars alone, are held against the world coordinates in the frame's header, and the
-difference against the error that the oracle's own residuals predict. `benchmarks.galsim_sky` is the way back.
+`python -m benchmarks.oracles [FRAMES] [SEED]`. Frames at random attitudes go to tetra3rs and to astrometry.net as FITS
+files, with only the field of view (tetra3rs: the camera calibration) given. Each detects the stars with its own code
+and identifies them with its own catalog. Its world coordinates (WCS), and separately its identified stars, are
+compared with the WCS in the frame's header, and the difference with the error predicted from the oracle's own
+residuals. `benchmarks.galsim_sky` tests the opposite direction.
 """
 
 from __future__ import annotations
@@ -44,10 +45,10 @@ from skysim.tracking.external import adapter
 from skysim.tracking.external import tetra3rs as tetra3rs_tracker
 from skysim.tracking.external.interface import Stars
 
-# When the stars stood where the catalogue has them: the index files' Tycho-2, and Gaia, both without proper motions.
+# Epochs of the catalogs: Tycho-2 in the index files, and Gaia; both are used without proper motions.
 EPOCHS = {"astrometry.net": "2000-01-01T12:00:00", "tetra3rs": "2016-01-01T12:00:00"}
 STILL = {"motion.rate_deg_s": "[0, 0, 0]"}
-# EC655 as it is; and 1600 x 1200 pixels on 25 degrees, behind a lens that moves its corners by 12.5 pixels.
+# EC655 unchanged; and 1600 x 1200 pixels over 25 degrees with a lens whose distortion is 12.5 pixels at the corners.
 SCENES = {
     "shefex2": STILL,
     "shefex2, wide": STILL
@@ -63,23 +64,23 @@ SCENES = {
 TWEAK_ORDER = {
     "shefex2": 1,
     "shefex2, wide": 3,
-}  # of astrometry.net's polynomials: 1 is a lens without distortion
-SIDE = 9  # pixels along each side of the frame where world coordinates are compared
-CLASSES = 12  # of brightness, of which each has its own error of a star
-MISTAKEN = 4.0  # of the variance that stars have, from which on one of a frame's is taken to be another
-TIMES = 3.0  # the predicted error
-DEEPEST_G = 7.5  # of tetra3rs's stars: those to V = 6.5 are drawn
-STAR_PX = 1.0  # how near to one of them a centroid is that star
+}  # order of astrometry.net's distortion polynomials: 1 is a lens without distortion
+SIDE = 9  # lattice points along each side of the frame at which world coordinates are compared
+CLASSES = 12  # number of brightness classes, each with its own centroid variance
+MISTAKEN = 4.0  # ratio to the usual variance above which a frame is taken to have a misidentified star
+TIMES = 3.0  # tolerance as a multiple of the predicted error
+DEEPEST_G = 7.5  # limiting magnitude of tetra3rs's stars; the frames have stars to V = 6.5
+STAR_PX = 1.0  # maximum distance of a centroid from its catalog star
 
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """What an oracle says of a frame. Directions are apparent, in ICRS axes.
+    """Result of an oracle for a frame. Directions are apparent, in ICRS axes.
 
-    direction  : (N, 3) where the pixels of `lattice` look, by its own world coordinates
-    order      : of the polynomials in them; 0 for an attitude alone
-    xy_px      : (K, 2) stars that it found, left_px: how far its coordinates and catalogue put them from there
-    brightness : (K,) by its own measure;  named : (K, 3) where its catalogue has them
+    direction  : (N, 3) directions of the pixels of `lattice` by its world coordinates
+    order      : order of the polynomials in the world coordinates; 0 for an attitude alone
+    xy_px      : (K, 2) detected stars;  left_px : (K, 2) residuals, detected minus catalog position
+    brightness : (K,) in the oracle's units;  named : (K, 3) catalog directions of the stars
     """
 
     direction: NDArray
@@ -91,7 +92,7 @@ class Found:
 
     @property
     def variance_px2(self) -> NDArray:
-        """(K,) of each star, each axis, for the coefficients that were fitted."""
+        """(K,) squared residual of each star per axis, corrected for the number of fitted coefficients."""
         coefficients = (self.order + 1) * (self.order + 2) / 2 if self.order else 1.5
         count = len(self.xy_px)
         return np.asarray(np.sum(self.left_px**2, axis=1) / 2 * count / max(count - coefficients, 1.0))
@@ -99,9 +100,10 @@ class Found:
 
 @dataclass(frozen=True, slots=True)
 class Sighting:
-    """A solved frame: by what turn, in camera axes, the oracle's coordinates, and its stars, are off the header's.
+    """A solved frame and the error of the oracle relative to the header, as rotation vectors in camera axes.
 
-    rays : (K, 3) the stars in camera axes
+    coordinates : error of its world coordinates;  stars : error of the attitude from its stars alone
+    rays        : (K, 3) the stars in camera axes
     """
 
     frame: int
@@ -113,7 +115,7 @@ class Sighting:
 
 @dataclass(frozen=True, slots=True)
 class Agreement:
-    """One solved frame: the oracle's attitude against the truth, and what it may be off by."""
+    """One solved frame: error of the oracle's attitude, and the predicted standard deviations."""
 
     frame: int
     cross_rad: float
@@ -124,7 +126,7 @@ class Agreement:
 
     @property
     def within(self) -> bool:
-        """Whether boresight and roll are both within TIMES the predicted error."""
+        """Whether cross-boresight and roll errors are both within TIMES the predicted error."""
         return (
             self.cross_rad <= TIMES * self.sigma_cross_rad
             and abs(self.roll_rad) <= TIMES * self.sigma_roll_rad
@@ -142,13 +144,13 @@ Pair = tuple[Agreement, Agreement]  # by the oracle's own world coordinates, and
 
 
 def load(name: str, who: str, frames: int) -> Scene:
-    """A scene of SCENES at rest, of so many frames, taken in the epoch of that oracle's catalogue."""
+    """A scene of SCENES at rest with `frames` frames, at the epoch of the oracle's catalog."""
     keys = SCENES[name] | {"start_time": EPOCHS[who], "exposure.frames": str(frames)}
     return loader.load(name.split(",")[0], keys)
 
 
 def photographs(told: Scene, seed: int) -> Iterator[tuple[Frame, Truth]]:
-    """A scene's frames, each at an attitude of its own, uniform over all rotations, and at rest."""
+    """Yield the frames of a scene, each at rest at its own uniformly random attitude."""
     lab = testbed.build_testbed(told)
     for n in range(told.exposure.frames):
         cam_from_icrs = Rotation.random(rng=np.random.default_rng([seed, n]))
@@ -157,13 +159,13 @@ def photographs(told: Scene, seed: int) -> Iterator[tuple[Frame, Truth]]:
 
 
 def lattice(width_px: int, height_px: int) -> NDArray:
-    """(SIDE^2, 2) pixels all over a frame."""
+    """(SIDE^2, 2) pixels on a regular lattice over the frame."""
     sides = np.linspace(0, width_px - 1, SIDE), np.linspace(0, height_px - 1, SIDE)
     return np.stack(np.meshgrid(*sides), axis=-1).reshape(-1, 2)
 
 
 def directions(header: fits.Header, xy_px: NDArray) -> NDArray:
-    """(N, 3) where pixels look, by astropy from a FITS header."""
+    """(N, 3) directions of pixels from the WCS of a FITS header, by astropy."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FITSFixedWarning)  # astrometry.net's header belongs to no image
         told = WCS(header, fix=False)
@@ -171,25 +173,28 @@ def directions(header: fits.Header, xy_px: NDArray) -> NDArray:
 
 
 def unit_vectors(ra_deg: NDArray, dec_deg: NDArray) -> NDArray:
-    """(N, 3)."""
+    """(N, 3) unit vectors of right ascensions and declinations."""
     return np.asarray(SkyCoord(ra_deg, dec_deg, unit="deg").cartesian.xyz.value.T)
 
 
 def radec_deg(vectors: NDArray) -> tuple[NDArray, NDArray]:
-    """Right ascension and declination of (N, 3) vectors."""
+    """Right ascension and declination of (N, 3) vectors, degrees."""
     x, y, z = vectors.T
     return np.degrees(np.arctan2(y, x)) % 360, np.degrees(np.arctan2(z, np.hypot(x, y)))
 
 
 def aberrated(direction: NDArray, utc: str) -> NDArray:
-    """(N, 3) catalogue directions as seen from the Earth, by astropy: aberration and the Sun's bending."""
+    """(N, 3) apparent directions from the Earth, by astropy: aberration and light deflection by the Sun."""
     seen = SkyCoord(*radec_deg(direction), unit="deg").transform_to(GCRS(obstime=Time(utc)))
     return np.asarray(seen.cartesian.xyz.value.T)
 
 
 def sighting(frame: Frame, truth: Truth, header: fits.Header, found: Found) -> Sighting:
-    """The rotations in camera axes that take the header's directions nearest to the oracle's: on a lattice over the
-    frame, where the oracle's world coordinates tell them, and at its stars, where its catalogue does."""
+    """Compare an oracle's result with the header of a frame.
+
+    Each error is the rotation in camera axes that best aligns the header's directions with the oracle's: over the
+    lattice by its world coordinates, and at its stars by its catalog.
+    """
     turn = truth.cam_from_lab.apply
     everywhere = turn(directions(header, lattice(*frame.image_dn.shape[::-1])))
     rays = turn(directions(header, found.xy_px))
@@ -201,7 +206,7 @@ def sighting(frame: Frame, truth: Truth, header: fits.Header, found: Found) -> S
 
 
 def agreements(seen: Sequence[Sighting], camera: Camera) -> list[Pair]:
-    """Every frame's two turns beside what is to be expected of them, by how the oracle's stars scatter."""
+    """The two errors of each frame with their standard deviations, predicted from the scatter of the oracle's stars."""
     held = []
     for one, sigma_px in zip(seen, star_sigmas_px([each.found for each in seen]), strict=True):
         by_stars = attitude_spread(one.rays, sigma_px / camera.focal_px)
@@ -215,11 +220,12 @@ def agreement(one: Sighting, turn: NDArray, sigma: tuple[float, float]) -> Agree
 
 
 def star_sigmas_px(found: Sequence[Found]) -> list[NDArray]:
-    """(K,) of each frame: the oracle's error of a star, from its own residuals alone.
+    """(K,) standard deviations of the stars of each frame, pixels per axis, from the oracle's residuals alone.
 
-    That of a star of that brightness: the mean variance over the frames. A frame's stars that scatter by more, for one
-    of them was taken for another, count as worse by as much, all of them; in the mean are no frames MISTAKEN times as
-    bad as the median has them (of a Gaussian in two axes, sigma^2 2 ln 2).
+    The variance is the mean over all frames in a class of equal brightness. If the residuals of a frame scatter more,
+    for example because of a misidentified star, the variances of all its stars are scaled up by that ratio. Frames
+    whose ratio exceeds MISTAKEN are left out of the mean. For that test the variance comes from the median, because the
+    median of (dx^2 + dy^2) / 2 is sigma^2 ln 2 for Gaussian errors.
     """
     brightness = np.concatenate([one.brightness for one in found])
     edges = np.quantile(brightness, np.linspace(0, 1, CLASSES + 1))[1:-1]
@@ -244,8 +250,11 @@ def star_sigmas_px(found: Sequence[Found]) -> list[NDArray]:
 
 
 def attitude_spread(rays: NDArray, sigma_rad: NDArray) -> tuple[float, float]:
-    """Errors of an unweighted least-squares attitude of (K, 3) rays, camera axes: rms across the boresight, and about
-    it, rad. Covariance H^-1 sum(sigma^2 (I - b b^T)) H^-1 with H = sum(I - b b^T)."""
+    """Standard deviations, rad, of an unweighted least-squares attitude from (K, 3) rays in camera axes: RMS across
+    the boresight, and about it.
+
+    The covariance is H^-1 sum(sigma^2 (I - b b^T)) H^-1 with H = sum(I - b b^T).
+    """
     projectors = np.eye(3) - rays[:, :, None] * rays[:, None, :]
     inverse = np.linalg.inv(projectors.sum(axis=0))
     covariance = inverse @ np.tensordot(sigma_rad**2, projectors, axes=1) @ inverse
@@ -253,10 +262,10 @@ def attitude_spread(rays: NDArray, sigma_rad: NDArray) -> tuple[float, float]:
 
 
 def plate_spread(found: Found, sigma_px: NDArray, camera: Camera) -> tuple[float, float]:
-    """The same of an unweighted least-squares plate, whose turn is that of the whole lattice.
+    """The same for an unweighted least-squares plate solution, whose error is the mean rotation of the lattice.
 
-    Shift and turn are linear in the plate's coefficients, whose covariance, one for x and one for y, is
-    (A^T A)^-1 A^T diag(sigma^2) A (A^T A)^-1.
+    Shift and rotation of the lattice are linear in the plate coefficients. The covariance of these is
+    (A^T A)^-1 A^T diag(sigma^2) A (A^T A)^-1, separately for x and y, with A the monomials at the stars.
     """
     middle = np.array([(camera.width_px - 1) / 2, (camera.height_px - 1) / 2])
 
@@ -267,6 +276,7 @@ def plate_spread(found: Found, sigma_px: NDArray, camera: Camera) -> tuple[float
     inverse = np.linalg.pinv(monomials(found.xy_px))
     covariance = (inverse * sigma_px**2) @ inverse.T
     pixels = lattice(camera.width_px, camera.height_px)
+    # Least-squares rotation of the lattice by a small displacement field: sum(arm x displacement) / sum(arm^2).
     shift = monomials(pixels).mean(axis=0)
     arms = (pixels - middle) / np.sum((pixels - middle) ** 2)
     turns = arms.T @ monomials(pixels)
@@ -275,7 +285,7 @@ def plate_spread(found: Found, sigma_px: NDArray, camera: Camera) -> tuple[float
 
 
 def astrometry_net(name: str) -> Solve | None:
-    """astrometry.net's own `solve-field`, lost in space but for the field's width to 5 %; None where it is not."""
+    """astrometry.net's `solve-field`, given only the field width to 5%; None if it is not installed."""
     if not (shutil.which("solve-field") and list(Path("/usr/share/astrometry").glob("index-*"))):
         return None
     camera = load(name, "astrometry.net", 1).camera
@@ -284,7 +294,7 @@ def astrometry_net(name: str) -> Solve | None:
     options = ["--overwrite", "--no-plots", "--no-verify", "--crpix-center", "--cpulimit", "30"]
     options += ["--scale-units", "degwidth", "--scale-low", f"{0.95 * width_deg}"]
     options += ["--scale-high", f"{1.05 * width_deg}", "--tweak-order", str(order)]
-    options += ["--no-remove-lines", "--uniformize", "0"]  # what is written in Python needs more packages
+    options += ["--no-remove-lines", "--uniformize", "0"]  # skip its Python steps, which need more packages
     options += [
         part for kind in ("new-fits", "rdls", "match", "index-xyls") for part in (f"--{kind}", "none")
     ]
@@ -306,7 +316,8 @@ def astrometry_net(name: str) -> Solve | None:
 
 
 def tetra3rs(name: str) -> Solve | None:
-    """tetra3rs, told our calibration, with its own centroids, catalogue and aberration; None where it is not."""
+    """tetra3rs with the camera calibration given, and its own centroids, catalog and aberration; None if it is not
+    installed."""
     if importlib.util.find_spec("tetra3rs") is None:
         return None
     told = load(name, "tetra3rs", 1)
@@ -333,10 +344,10 @@ def tetra3rs(name: str) -> Solve | None:
 def its_stars(
     tracker: tetra3rs_tracker.Tetra3rs, centroids: Sequence[Any], answer: Any
 ) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-    """All of tetra3rs's centroids that are stars of its catalogue: the last four fields of Found.
+    """All centroids of tetra3rs that agree with a star of its catalog: the last four fields of Found.
 
-    Its own matches, and its own `attitude_sigma_rad` with them, are those left after clipping, which takes an eighth
-    of the stars, the worst, and three tenths of the variance with them.
+    Its own matches are not used (nor is its `attitude_sigma_rad`), because they remain after a clipping that removes
+    the worst eighth of the stars and with them three tenths of the variance.
     """
     radius_deg = 0.7 * tracker.camera.fov_deg
     listed = tracker.database.cone_search(answer.crval_ra_deg, answer.crval_dec_deg, radius_deg)
@@ -356,7 +367,7 @@ ORACLES = {"tetra3rs": tetra3rs, "astrometry.net": astrometry_net}
 
 
 def confront(name: str, who: str, oracle: Solve, frames: int, seed: int) -> list[Pair]:
-    """Every frame that the oracle solves."""
+    """Errors and predictions of every frame that the oracle solves."""
     seen, told = [], load(name, who, frames)
     for frame, truth in photographs(told, seed):
         with tempfile.TemporaryDirectory() as folder:
@@ -369,13 +380,13 @@ def confront(name: str, who: str, oracle: Solve, frames: int, seed: int) -> list
 
 
 def squares(solved: Sequence[Agreement]) -> NDArray:
-    """(2,) mean square of the error over what was predicted, across the boresight and about it: 1 if that is right."""
+    """(2,) mean of (error / predicted sigma)^2, cross-boresight and roll; 1 if the prediction is correct."""
     ratio = [(one.cross_rad / one.sigma_cross_rad, one.roll_rad / one.sigma_roll_rad) for one in solved]
     return np.asarray(np.mean(np.square(ratio), axis=0))
 
 
 def line(label: str, frames: int, solved: Sequence[Agreement]) -> str:
-    """A row of the table: medians and worst in arcsec."""
+    """A row of the table; medians and worst errors are in arcseconds."""
     cross = np.array([one.cross_rad for one in solved]) / ARCSEC_RAD
     roll = np.abs([one.roll_rad for one in solved]) / ARCSEC_RAD
     over = squares(solved)

@@ -1,8 +1,8 @@
-"""Where to put so many LEDs: patch boards, a spiral, Poisson's discs and the optimiser, at attitudes none was made for.
+"""LED layouts compared at independent attitudes: patch boards, Fibonacci spiral, Poisson disc and optimized layout.
 
-`python -m benchmarks.placement [LEDS [FRAMES [SEED]]]` prints docs/dome.md's table: AFIT's SimSat under its measured
-dome, the scene's own camera and lever, so many equal LEDs over the same cap, which is as far as any field within 30
-degrees of tilt reaches, and so many frames for the tracker. `compare` returns its rows.
+`python -m benchmarks.placement [LEDS [FRAMES [SEED]]]` prints the table of docs/dome.md: AFIT's SimSat under its
+measured dome with the scene's camera and lever arm, LEDS equal LEDs over the cap that any field within 30 degrees of
+tilt can reach, and FRAMES frames for the tracker. `compare` returns its rows.
 """
 
 from __future__ import annotations
@@ -33,18 +33,18 @@ from skysim.tracking.onboard_model import calibration
 
 Ints = NDArray[np.int64]
 
-FRESH = 100_000  # attitudes
-ASKED = (400, 1000, 1)  # LEDs, frames that the tracker is given, seed
-NOISE_PX = 0.1  # of the sigmas
-TAIL = 0.01  # of the attitudes, the worst
-HALF = 0.5  # of a neighbourhood that another one repeats
-SEEN_BY_CHANCE = 0xD03E  # the attitudes' own seed: no layout is drawn from it
+FRESH = 100_000  # number of test attitudes
+ASKED = (400, 1000, 1)  # default arguments: LEDs, frames for the tracker, seed
+NOISE_PX = 0.1  # centroid noise for the predicted sigmas
+TAIL = 0.01  # fraction of the attitudes, the worst, that is averaged
+HALF = 0.5  # overlap above which two neighborhoods count as alike
+SEEN_BY_CHANCE = 0xD03E  # seed of the test attitudes; no layout uses it
 KINDS = ("patch boards", "Fibonacci", "Poisson disc", "optimised")
 
 
 @dataclass(frozen=True)
 class Bench:
-    """The dome's inside, what looks at it, and how far from the zenith it sees LEDs: from the scene."""
+    """Test geometry from the scene: inner surface, camera, lever arm, LED hardware, half-angle of the visible cap."""
 
     inside: Inside
     camera: Camera
@@ -57,14 +57,15 @@ class Bench:
 
 @dataclass(frozen=True)
 class Row:
-    """One layout.
+    """Results for one layout.
 
-    seen       : LEDs in a field: mean, fewest
-    blind      : share of attitudes that see fewer than the two LEDs that an attitude takes
-    roll_arcsec, cross_arcsec : sigma for NOISE_PX; median, mean of the worst TAIL, worst; infinite where blind
-    alike      : share of neighbourhoods that match another in more than HALF of their LEDs
-    found, ambiguous, wrong : shares of the frames, and how many, by what the tracker made of them
-    made_s     : processor time that it took to lay out
+    seen       : LEDs in a field: mean, minimum
+    blind      : fraction of attitudes that see fewer than two LEDs, the minimum for an attitude
+    roll_arcsec, cross_arcsec : sigma for NOISE_PX: median, mean of the worst TAIL, worst; infinite where blind
+    alike      : fraction of neighborhoods that match another one in more than HALF of their LEDs
+    found, ambiguous : fractions of the frames that the tracker identified, and called ambiguous
+    wrong      : number of frames identified wrongly
+    made_s     : processor time to make the layout
     """
 
     layout: str
@@ -81,7 +82,7 @@ class Row:
 
 
 def bench() -> Bench:
-    """AFIT's SimSat as its scene has it."""
+    """The test geometry of scene afit_simsat."""
     lab = testbed.build_testbed(loader.load("afit_simsat"))
     light, camera = lab.scene.light, calibration(lab.scene.camera)
     lever = Lever(np.array(lab.mount.camera_body_m), lab.mount.cam_from_body)
@@ -94,7 +95,7 @@ def bench() -> Bench:
 
 
 def wish(of: Bench, count: int, seed: int) -> led_schema.OptimisedConfig:
-    """The optimiser's part of a scene; everything it may leave out is left out."""
+    """Configuration of an optimized layout, with defaults for all optional keys."""
     half = np.array([of.camera.width_px, of.camera.height_px]) / 2 / of.camera.focal_px
     return led_schema.OptimisedConfig.model_validate(
         {
@@ -111,7 +112,11 @@ def wish(of: Bench, count: int, seed: int) -> led_schema.OptimisedConfig:
 
 
 def leds(of: Bench, kind: str, count: int, seed: int) -> tuple[Floats, Ints | None]:
-    """(count, 3) LEDs, m, and which board each sits on. Boards and discs are a few too many, and some are left out."""
+    """(count, 3) LED positions, m, and the board of each.
+
+    The number of LEDs of patch boards and Poisson discs follows from their spacing, so the spacing is reduced until
+    there are enough, and surplus LEDs are dropped at random.
+    """
     cap = {"cap_deg": of.cap_deg, "hardware_seed": seed}
     parts: list[led_schema.Layout] = []
     if kind == "optimised":
@@ -120,6 +125,7 @@ def leds(of: Bench, kind: str, count: int, seed: int) -> tuple[Floats, Ints | No
         parts = [led_schema.FibonacciConfig.model_validate({"kind": "fibonacci", "count": count} | cap)]
     area_m2 = 2 * np.pi * np.square(of.inside.meet(np.zeros(3), np.eye(3)[2:])[0, 2])
     each_m2 = area_m2 * (1 - np.cos(np.radians(of.cap_deg))) / count
+    # Candidates with up to 50% more LEDs than asked for, in small steps; the first with enough of them is used.
     for more in np.linspace(1.0, 1.5, 51) if not parts else ():
         if kind == "patch boards":
             spacing_m = np.sqrt(each_m2 * np.mean(of.boards.lit) / more)
@@ -134,14 +140,16 @@ def leds(of: Bench, kind: str, count: int, seed: int) -> tuple[Floats, Ints | No
 
 
 def sigmas_arcsec(of: Bench, place_m: Floats) -> tuple[Floats, Floats, Floats]:
-    """(A,) of roll and across the boresight, and of LEDs in the field, at attitudes that no layout was made for.
+    """(A,) sigma of roll, sigma across the boresight, both in arcseconds, and number of LEDs in the field.
 
-    The covariance of the rotation-only solve at the truth, (sum_i J_i'J_i)^-1 sigma^2; body z is the boresight.
+    The A = FRESH attitudes are independent of any layout. The covariance is that of the rotation-only solution at the
+    truth, (sum_i J_i^T J_i)^-1 sigma^2; body z is the boresight. Sigmas are infinite for fewer than two LEDs.
     """
     part = wish(of, len(place_m), 0)
     fresh = optimize.attitudes(part, FRESH, np.random.default_rng(SEEN_BY_CHANCE))
     total = fisher.told(place_m, fresh, *optimize.camera(part))
     solved, variance = total[:, 6] >= 2, np.full((FRESH, 3), np.inf)
+    # Unpack the six elements of the symmetric information matrix (xx, yy, zz, xy, xz, yz).
     matrix = total[solved][:, [0, 3, 4, 3, 1, 5, 4, 5, 2]].reshape(-1, 3, 3)
     variance[solved] = np.linalg.inv(matrix).diagonal(axis1=1, axis2=2)
     unit = NOISE_PX / of.camera.focal_px / ARCSEC_RAD
@@ -149,13 +157,13 @@ def sigmas_arcsec(of: Bench, place_m: Floats) -> tuple[Floats, Floats, Floats]:
 
 
 def summed(each: Floats) -> tuple[float, float, float]:
-    """Median, mean of the worst TAIL, worst."""
+    """Median, mean of the worst fraction TAIL, and maximum."""
     worst = np.sort(each)[-round(TAIL * len(each)) :]
     return float(np.median(each)), float(worst.mean()), float(worst[-1])
 
 
 def verdicts(of: Bench, place_m: Floats, board: Ints | None, frames: int, seed: int) -> NDArray[np.str_]:
-    """(frames,) what the tracker says of each, of equal LEDs, noise and a survey's errors as `Case` has them."""
+    """(frames,) result of the tracker for each frame, with equal LEDs and the noise and map errors of `Case`."""
     case, rng = Case("placement"), np.random.default_rng(seed)
     believed_m = place_m + case.believed_m * rng.standard_normal(place_m.shape)
     known = LedMap(
@@ -167,7 +175,7 @@ def verdicts(of: Bench, place_m: Floats, board: Ints | None, frames: int, seed: 
 
 
 def row(of: Bench, kind: str, count: int, seed: int, frames: int) -> Row:
-    """One layout, made and judged."""
+    """Make and evaluate one layout."""
     begin = time.process_time()
     place_m, board = leds(of, kind, count, seed)
     made_s = time.process_time() - begin
@@ -189,13 +197,13 @@ def row(of: Bench, kind: str, count: int, seed: int, frames: int) -> Row:
 
 
 def compare(count: int, frames: int, seed: int) -> Iterator[Row]:
-    """Every layout of so many LEDs."""
+    """Yield the results for every kind of layout with `count` LEDs."""
     of = bench()
     yield from (row(of, kind, count, seed, frames) for kind in KINDS)
 
 
 def printed(one: Row) -> str:
-    """A row of the docs' table."""
+    """A row of the table in the docs."""
     arcsec = ["—" if np.isinf(value) else f"{value:.3g}" for value in one.roll_arcsec + one.cross_arcsec]
     cells = [
         f"{one.count:,} {one.layout}",

@@ -1,9 +1,9 @@
-"""PTASE's Monte Carlo simulation (Fialho & Saotome 2005, table 1) and how long a thousand runs take.
+"""PTASE's Monte Carlo simulation (Fialho & Saotome 2005, table 1) and the time of a thousand runs.
 
-`python -m benchmarks.ptase [RUNS] [SEED]` prints, for each version of their identifier, success, errors and time of
-RUNS random attitudes: 20 x 20 degrees, 3 arcsec per axis, 0.25 mag, stars of the catalogue itself. The paper leaves its
-limiting magnitude out; its errors are those of some 17 stars a field, which V < 5.1 gives, and V < 6 is the naked
-eye's limit. One core; drawing the field, identification and attitude are all in the time.
+`python -m benchmarks.ptase [RUNS] [SEED]` prints success, errors and time of RUNS random attitudes for each version of
+their identifier: field of 20 x 20 degrees, noise of 3 arcsec per axis and 0.25 mag, true stars only. The paper does
+not state its limiting magnitude. Its errors correspond to about 17 stars per field, which V < 5.1 gives; V < 6 is the
+naked-eye limit. One core; the time includes simulation of the field, identification and attitude.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ PAPER_S, BAR_S = 24.06, 0.3
 
 
 def table_row(name: str, limit_mag: float, runs: int, seed: int) -> str:
-    """One line: success, wrong answers, mean errors, and seconds for 1000 runs."""
+    """One table line: success, wrong attitudes, mean errors, and seconds per 1000 runs."""
     known, by = catalogue(limit_mag), version(name)
     simulate(known, by, 2, seed)
     begin = time.perf_counter()
@@ -33,7 +33,7 @@ def table_row(name: str, limit_mag: float, runs: int, seed: int) -> str:
 
 
 def measure() -> list[dict[str, Any]]:
-    """1000 runs of the version that the paper timed, to V < 6: the best of five."""
+    """Time of 1000 runs of the version that the paper timed, with V < 6: the minimum of five."""
     known, by = catalogue(6.0), version("fialho_2")
     simulate(known, by, 2, 1)
     spent_s = []

@@ -1,9 +1,10 @@
-"""How fast SHEFEX-2 may turn before its stars are lost: the paper's own chain and the default one, on the same frames.
+"""Success against angular rate for SHEFEX-2: the paper's processing chain and the default one on the same frames.
 
-`python -m benchmarks.smear [FRAMES] [SEED]`: scene shefex2's camera at 50 ms, turning across the boresight at random
-attitudes that look south, for which their catalogue was made. Samaan & Theil (2011) found stars mostly identified to
-2 deg/s and rarely above 4. Their chain: one scan of the frame, no more than 15 centroids, centres of gravity, triangles
-and pyramids over their 2,023 stars, QUEST. The default one is told the streak by a gyro, or finds it itself.
+`python -m benchmarks.smear [FRAMES] [SEED]`: the camera of scene shefex2 with 50 ms exposure, rotating about an axis
+perpendicular to the boresight, at random attitudes in the southern sky, for which the paper's catalog was made. Samaan
+& Theil (2011) report mostly successful identification up to 2 deg/s and rarely above 4 deg/s. Their chain: one scan of
+the frame, at most 15 centroids, center of gravity, triangles and pyramids over their 2,023 stars, QUEST. The default
+chain runs twice: with the streak from a gyro, and estimating the streak itself.
 """
 
 from __future__ import annotations
@@ -37,11 +38,15 @@ Streak = tuple[float, float] | None
 def frames(
     lab: Testbed, rate_deg_s: float, count: int, seed: int
 ) -> Iterator[tuple[Frame, Rotation, Streak]]:
-    """Frames at random attitudes, each turning about a random axis across the boresight; cam_from_icrs, streak."""
+    """Yield frames at random attitudes, each rotating about a random axis perpendicular to the boresight.
+
+    Each comes with cam_from_icrs at mid-exposure and the streak vector at the image center.
+    """
     for n in range(count):
         rng = np.random.default_rng([seed, n])
         middle, angle = southern(rng), rng.uniform(0, 2 * np.pi)
         rate_cam = np.radians(rate_deg_s) * np.array([np.cos(angle), np.sin(angle), 0.0])
+        # Knots from 5 ms before the exposure; the attitude is `middle` at mid-exposure, 25 ms after its start.
         t_s = n * FRAME_S + np.arange(-10, 200) * KNOT_S
         cam_from_icrs = Rotation.from_rotvec(np.outer(t_s - n * FRAME_S - 0.025, rate_cam)) * middle
         lab_from_body = cam_from_icrs.inv() * lab.mount.cam_from_body
@@ -60,13 +65,13 @@ def southern(rng: np.random.Generator) -> Rotation:
 
 
 def streak_of(rate_cam_rad_s: np.ndarray, lab: Testbed) -> tuple[float, float]:
-    """How far stars in the middle move: d(x / z)/dt = -w_y, d(y / z)/dt = w_x."""
+    """Streak (dx, dy) in pixels of a star on the boresight: d(x / z)/dt = -w_y, d(y / z)/dt = w_x."""
     reach_px = lab.scene.exposure.time_s * lab.scene.camera.focal_px
     return -rate_cam_rad_s[1] * reach_px, rate_cam_rad_s[0] * reach_px
 
 
 def solved(tracker: StarTracker, frame: Frame, truth: Rotation, streak_px: Streak) -> tuple[bool, bool]:
-    """Whether a frame is solved rightly, and wrongly."""
+    """Whether a frame is solved correctly, and whether it is solved wrongly."""
     try:
         answer = tracker.solve(frame.image_dn, streak_px).attitude.cam_from_ref
     except ImageError:
@@ -76,7 +81,7 @@ def solved(tracker: StarTracker, frame: Frame, truth: Rotation, streak_px: Strea
 
 
 def chains(lab: Testbed) -> dict[str, StarTracker]:
-    """The paper's chain with its chosen catalogue, and the default one with the paper's limit of magnitude."""
+    """The paper's chain with its star selection, and the default chain with the paper's limiting magnitude (twice)."""
     camera, scene = calibration(lab.scene.camera), lab.scene
     stars = catalog.read(CATALOGUES / "hipparcos_hp6.5.ecsv")
     observer = catalog.on_earth(scene.start_time)
@@ -101,7 +106,7 @@ def chains(lab: Testbed) -> dict[str, StarTracker]:
 
 
 def measure(count: int, seed: int) -> Iterator[str]:
-    """A line a rate."""
+    """One table line per rate."""
     told = {"exposure.time": "50 ms", "exposure.first": "0 s", "exposure.frames": str(count)}
     lab = testbed.build_testbed(load("shefex2", told))
     trackers = chains(lab)

@@ -1,6 +1,7 @@
-"""Studies on two cores: trials a second with the store, what a second worker brings, what a trial costs beside itself.
+"""Studies on two cores: trials per second including the store, speedup by a second worker, overhead per trial.
 
-`python -m benchmarks.studies` (OPENBLAS_NUM_THREADS=1, an idle machine). Peerless: each figure stands beside its bar.
+`python -m benchmarks.studies` (OPENBLAS_NUM_THREADS=1, on an idle machine). There is no peer; each result is compared
+with a fixed target (bar).
 """
 
 from __future__ import annotations
@@ -41,11 +42,11 @@ FRAMES = {
     "factor": "rate: {key: trial.rate_deg_s, values: [0, 0.1]}",
     "replicates": 500,
 }
-SETTLED = 0.2  # of the trials, after which every worker has its scene and full chunks
+SETTLED = 0.2  # fraction of the trials after which every worker has its scene and full chunks
 
 
 class Clocked:
-    """A pool with a clock. came : (when, how many trials, seconds that they took) of every batch."""
+    """A pool that records each batch. came : (arrival time, number of trials, seconds spent in trials) by batch."""
 
     def __init__(self, pool: Pool) -> None:
         self.pool, self.name, self.workers = pool, pool.name, pool.workers
@@ -60,11 +61,11 @@ class Clocked:
 
 @dataclass(frozen=True)
 class Spent:
-    """What a study took.
+    """Time of a study.
 
-    total_s     : from its file to its closed store, processes begun and ended
-    rate        : trials a second once it has settled
-    overhead_ms : a trial's share of its worker's time that was not the trial
+    total_s     : from loading the file to closing the store, including start and end of the processes
+    rate        : trials per second after the first SETTLED of them
+    overhead_ms : worker time per trial that was not spent in the trial itself
     """
 
     total_s: float
@@ -73,7 +74,7 @@ class Spent:
 
 
 def spent(asked: dict[str, Any], workers: int) -> Spent:
-    """Do a study with a pool, in a folder that goes away."""
+    """Run a study with a pool in a temporary folder."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "study.yaml"
         path.write_text(STUDY.format(**asked))
@@ -89,14 +90,14 @@ def spent(asked: dict[str, Any], workers: int) -> Spent:
         )
     when_s, count, worked_s = np.array(clocked.came).T
     late = np.cumsum(count) > SETTLED * told.trials
-    first = int(np.argmax(late))  # its end is where the clock starts
+    first = int(np.argmax(late))  # the timed window starts at its end
     window_s, trials = when_s[-1] - when_s[first], count[first + 1 :].sum()
     beside_s = workers * window_s - worked_s[first + 1 :].sum()
     return Spent(total_s, trials / window_s, 1e3 * beside_s / trials)
 
 
 def measure() -> list[dict[str, Any]]:
-    """The bars of studies; the first pool is begun cold, as a user's is."""
+    """Results of the studies benchmark; the first pool is started cold, as for a user."""
     points, frames = spent(CENTROIDS, 2), spent(FRAMES, 2)
     alone = {"centroids": spent(CENTROIDS, 1), "frames": spent(FRAMES, 1)}
     both = {"centroids": points, "frames": frames}

@@ -1,4 +1,4 @@
-"""Fair clocks: both sides warmed up, then alternately timed, the best of each."""
+"""Paired timing: both sides are warmed up, then timed alternately; the minimum of each counts."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ def versus(
     bar: float | None = None,
     repeats: int = 30,
 ) -> dict[str, Any]:
-    """One result: milliseconds of either side, and how many times faster than the peer we are.
+    """One result: milliseconds of both sides, and the speed ratio (peer's time / our time).
 
-    The best of all repeats counts, for what else the machine does only ever adds.
+    The minimum over the repeats counts, because other load on the machine only adds time.
 
-    bar : the least ratio wanted; None where there is none. peer : None where it is not installed.
+    bar : minimum ratio to meet, or None. peer : None if it is not installed.
     """
     sides = [ours] + ([peer] if peer else [])
     for side in sides:
@@ -27,7 +27,7 @@ def versus(
     spent: list[list[float]] = [[] for _ in sides]
     for _ in range(repeats):
         for side, times in zip(sides, spent, strict=True):
-            side()  # what the other one left in the caches is nobody's
+            side()  # refill the caches, which the other side has used
             begin = time.perf_counter()
             side()
             times.append(1e3 * (time.perf_counter() - begin))
@@ -49,7 +49,7 @@ def versus(
 
 
 def verdict(name: str, value: float, unit: str, what: str, bar: float, least: bool = False) -> dict[str, Any]:
-    """One result without a peer: a figure and the most that it may be, or the least."""
+    """One result without a peer: a value and its maximum `bar`, or its minimum if `least`."""
     return {
         "name": name,
         "value": value,

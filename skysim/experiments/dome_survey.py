@@ -1,10 +1,11 @@
-"""A glued dome measured from the frames of the camera beneath it: held at many attitudes, named, surveyed, checked.
+"""Simulated survey of an LED dome with the vehicle's own camera: render frames, identify LEDs, adjust, and check.
 
-The lab tilts the vehicle by hand, waits, and takes a frame; the IMU tells the attitude to half a degree. Which light is
-which LED follows from that: the hint's error moves all lights of a frame together by more than LEDs are apart, so the
-common shift is sought first (`shift_px`), of all that the declared errors allow the likeliest. Then
-`estimator.calibration.dome_survey.survey` adjusts LEDs, lever, lens and attitudes at once, every frame is named again by what that
-found, and adjusted again. What comes out is a `DomeMap`, the file that `tracker.map` reads.
+The vehicle is held still at many attitudes and takes a frame at each; the IMU gives the attitude to about half a
+degree. At first the detections are matched to LEDs with the IMU attitude. Its error shifts all lights of a frame
+together by more than the LED spacing, so the most likely common shift is found first (`shift_px`). Then
+`estimator.calibration.dome_survey.survey` adjusts LED positions, lever arm, lens and attitudes together by least
+squares. Identification and adjustment are repeated with the improved values, ROUNDS times. The result is a `DomeMap`,
+the file that `tracker.map` reads.
 """
 
 from __future__ import annotations
@@ -38,16 +39,17 @@ from skysim.tracking import settings as tracker_settings
 from skysim.tracking.dome_map_file import DomeMap
 
 Ints = NDArray[np.int64]
-STREAM = {"attitudes": 101, "imu": 102, "checks": 103}  # apart from shutter.STAGE_ID
-GATE = 3.5  # sigmas of a two-dimensional error; Gaussian noise goes beyond once in 450
-ANCHORS = 10  # lights whose every possible name is tried for the common shift
-LINKS = (3, 8)  # lights that hang a frame on others: two tie its turn; a patch board all misnamed has six
+STREAM = {"attitudes": 101, "imu": 102, "checks": 103}  # distinct from random_streams.STAGE_ID
+GATE = 3.5  # sigmas of a two-dimensional error; Gaussian noise exceeds it once in 450
+ANCHORS = 10  # number of central lights that are paired with every LED to find the common shift
+# Lights that a frame must share with others: two determine its attitude; a misidentified patch board accounts for six.
+LINKS = (3, 8)
 
 CROSSING_RAD = (
-    0.01  # rms angle between a light's rays that gives its distance; calibrate.survey takes half of it
+    0.01  # minimum rms angle between an LED's rays for its distance; dome_survey.survey requires half of it
 )
 
-# Of the options: unit, what it is, an example, least and greatest value. A map without any error is no measurement.
+# Options: unit, quantity, example, minimum and maximum. The LED error must be > 0, because it weights the map.
 DOUBTS = {
     "imu_sigma": ("rad", "plane angle", '"0.5 deg"', 0.0, 0.1),
     "led_sigma": ("m", "length", '"2 mm"', 1e-6, 0.1),
@@ -55,15 +57,15 @@ DOUBTS = {
     "focal_error": ("", "share", '"1%" or "0.01"', -0.1, 0.1),
 }
 
-ROUNDS = 3  # of naming and adjusting; from the second on by what was found
+ROUNDS = 3  # rounds of identification and adjustment; from the second on with the adjusted values
 
 
 @dataclass(frozen=True, slots=True)
 class Doubt:
-    """What the lab does not know before: standard deviations about each axis, and a wrong focal length.
+    """Uncertainty before the survey: standard deviations per axis, and a focal length error.
 
-    imu_sigma_rad : of the attitude at each frame;  led_sigma_m : of each LED's place;  lever_sigma_m : of the camera's
-    focal_error   : relative, of the believed focal length
+    imu_sigma_rad : attitude from the IMU at each frame;  led_sigma_m : position of each LED
+    lever_sigma_m : position of the camera in the body;  focal_error : relative error of the assumed focal length
     """
 
     imu_sigma_rad: float
@@ -73,7 +75,7 @@ class Doubt:
 
 
 def doubt(imu_sigma: str, led_sigma: str, lever_sigma: str, focal_error: str) -> Doubt:
-    """Quantities as the command line has them. Raises InputError for one that is none, or out of its range."""
+    """Parse the quantities of the command line. Raises InputError for an invalid or out-of-range value."""
     told = {
         "imu_sigma": imu_sigma,
         "led_sigma": led_sigma,
@@ -95,9 +97,9 @@ def doubt(imu_sigma: str, led_sigma: str, lever_sigma: str, focal_error: str) ->
 
 @dataclass(frozen=True, slots=True)
 class Belief:
-    """What is believed of dome and camera, before a survey or by it.
+    """Assumed model of dome and camera, before a survey or from it.
 
-    floor_px : of a centroid's error, for what its own noise does not cover
+    floor_px : added in quadrature to each centroid's sigma, for errors that its noise does not cover
     """
 
     camera: Camera
@@ -107,12 +109,12 @@ class Belief:
 
     @property
     def px_per_m(self) -> float:
-        """Pixels of a metre across the sight where an LED is nearest to the camera."""
+        """Image scale in pixels per meter perpendicular to the line of sight, at the least distance of an LED."""
         nearest_m = np.linalg.norm(self.leds.position_m, axis=1).min()
         return float(self.camera.focal_px / (nearest_m - np.linalg.norm(self.lever.camera_body_m)))
 
     def pixels(self, body_from_lab: Rotation) -> Floats:
-        """(N, 2) where the LEDs are seen; far off the chip where that is behind the camera."""
+        """(N, 2) pixel positions of the LEDs; a value far outside the image for LEDs behind the camera."""
         in_body = body_from_lab.apply(self.leds.position_m) - self.lever.camera_body_m
         xy_px = self.camera.pixels(self.lever.cam_from_body.apply(in_body))
         return np.nan_to_num(xy_px, nan=-1e9)
@@ -120,14 +122,14 @@ class Belief:
 
 @dataclass(frozen=True, slots=True)
 class Look:
-    """One frame of a survey: its lights, and the vehicle's attitude by the IMU."""
+    """One frame of a survey: its detections, and the vehicle's attitude from the IMU or a previous adjustment."""
 
     lights: Centroids
     body_from_lab: Rotation
 
 
 def belief_of(lab: Testbed) -> Belief:
-    """What the tracker of the lab's scene believes. Raises InputError for a scene without a dome."""
+    """The onboard model of the tracker of a test bed. Raises InputError for a scene without a dome."""
     light = lab.scene.light
     if not isinstance(light, DomeConfig):
         raise InputError(f"light.kind: {light.kind} has nothing to survey; allowed: dome")
@@ -140,14 +142,14 @@ def belief_of(lab: Testbed) -> Belief:
 
 
 class Names(NamedTuple):
-    """Rows of the lights of a frame and of the LEDs on the map that they are."""
+    """Correspondences: rows of a frame's detections, and rows of the map's LEDs that they are matched to."""
 
     light: Ints
     led: Ints
 
 
 def doubted(scene: Scene, doubt: Doubt) -> Scene:
-    """The scene whose tracker believes what the lab does before its survey, drawn by `tracker.survey.seed`."""
+    """The scene with the onboard model before a survey: errors of size `doubt`, drawn with `tracker.survey.seed`."""
     errors = {"led_sigma_m": doubt.led_sigma_m, "lever_sigma_m": doubt.lever_sigma_m}
     believed = {
         "survey": scene.tracker.survey.model_copy(update=errors),
@@ -159,7 +161,7 @@ def doubted(scene: Scene, doubt: Doubt) -> Scene:
 
 
 def with_map(scene: Scene, path: str) -> Scene:
-    """The scene whose tracker believes a surveyed dome's file, and nothing of what it was told before."""
+    """The scene whose tracker uses the map file of a surveyed dome, and no other onboard errors."""
     none = {"led_sigma_m": 0.0, "lever_sigma_m": 0.0}
     believed = {
         "survey": scene.tracker.survey.model_copy(update=none),
@@ -171,7 +173,10 @@ def with_map(scene: Scene, path: str) -> Scene:
 
 
 def attitudes(scene: Scene, what: str, count: int, tilt_deg: float) -> Rotation:
-    """lab_from_body of so many stops: tilts evenly over the cap, every yaw. Raises InputError beyond the tilt stop."""
+    """Random lab_from_body at `count` stops: tilt uniform in solid angle up to tilt_deg, yaw uniform.
+
+    what : random stream, a key of STREAM. Raises InputError if the tilt exceeds the vehicle's tilt stop.
+    """
     stop_deg = scene.vehicle.tilt_stop_deg if scene.vehicle.mount == "air_bearing" else 90.0
     if not 0 < tilt_deg <= stop_deg:
         raise InputError(
@@ -185,12 +190,13 @@ def attitudes(scene: Scene, what: str, count: int, tilt_deg: float) -> Rotation:
 
 
 def stream(seed: int, what: str) -> np.random.Generator:
-    """Random numbers of a kind, the same for a seed whatever else is drawn."""
+    """Random generator for one purpose (a key of STREAM), independent of the other streams of the seed."""
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(STREAM[what],)))
 
 
 def frames(lab: Testbed, lab_from_body: Rotation, first: int = 0) -> Iterator[tuple[Frame, Truth]]:
-    """A frame at each attitude, the vehicle standing still; `first` is the index, and the noise, of the first one."""
+    """Render a frame at each attitude with the vehicle at rest. `first` is the index of the first frame, which also
+    selects its noise."""
     for n, turned in enumerate(lab_from_body):
         end_s = testbed.window(lab.scene, first + n).close_s(lab.scene.camera.height_px) + SPARE_S
         still = Trajectory(np.array([0.0, end_s]), Rotation.concatenate([turned, turned]), np.zeros((2, 3)))
@@ -198,7 +204,7 @@ def frames(lab: Testbed, lab_from_body: Rotation, first: int = 0) -> Iterator[tu
 
 
 def looks(lab: Testbed, belief: Belief, doubt: Doubt, count: int, tilt_deg: float) -> Iterator[Look]:
-    """The lights of a frame at each of so many stops, and what the IMU says there."""
+    """Detections and IMU attitude at each of `count` random stops."""
     lab_from_body = attitudes(lab.scene, "attitudes", count, tilt_deg)
     told, settings = (
         hints(lab.scene, lab_from_body, doubt.imu_sigma_rad),
@@ -209,18 +215,19 @@ def looks(lab: Testbed, belief: Belief, doubt: Doubt, count: int, tilt_deg: floa
 
 
 def hints(scene: Scene, lab_from_body: Rotation, sigma_rad: float) -> Rotation:
-    """body_from_lab at each stop by an IMU that errs by itself at each, Gaussian about each axis of the body."""
+    """body_from_lab at each stop from an IMU with independent Gaussian errors about each body axis."""
     wrong = sigma_rad * stream(scene.seed, "imu").standard_normal((len(lab_from_body), 3))
     return Rotation.from_rotvec(wrong) * lab_from_body.inv()
 
 
-# --- which light is which LED -------------------------------------------------------------------------------
+# --- identification of the LEDs -------------------------------------------------------------------------------
 
 
 def expected_px(belief: Belief, doubt: Doubt) -> tuple[float, float]:
-    """Standard deviations, a coordinate: of what moves all lights of a frame alike, and of each light by itself.
+    """Standard deviations per coordinate in pixels: of the common shift of a frame, and of each light individually.
 
-    A turn and the lever move all. The LED's own place, and at the chip's corner the roll and the focal length, do not.
+    The attitude error across the boresight and the lever arm error shift all lights alike. The LED position error, and
+    the roll and focal length errors (largest, and evaluated, at the image corner), act on each light differently.
     """
     camera = belief.camera
     corner_px = np.hypot(camera.width_px, camera.height_px) / 2
@@ -230,7 +237,7 @@ def expected_px(belief: Belief, doubt: Doubt) -> tuple[float, float]:
 
 
 def by_hint(look: Look, belief: Belief, doubt: Doubt) -> Names:
-    """Which light is which LED by the IMU's attitude and the errors declared."""
+    """Match detections to LEDs with the IMU attitude and the declared errors: common shift first, then assignment."""
     common_px, own_px = expected_px(belief, doubt)
     predicted = belief.pixels(look.body_from_lab)
     near = np.flatnonzero(belief.camera.contains(predicted, -GATE * (common_px + own_px)))
@@ -245,15 +252,17 @@ def by_hint(look: Look, belief: Belief, doubt: Doubt) -> Names:
 def shift_px(
     seen_px: Floats, predicted_px: Floats, common_px: float, own_px: float, middle_px: tuple[float, float]
 ) -> Floats:
-    """(2,) the likeliest shift of (P, 2) predictions onto (S, 2) lights.
+    """(2,) most likely common shift of (P, 2) predictions onto (S, 2) detections, pixels.
 
-    Every prediction near a light of the middle, where a roll moves least, is tried for it. A shift costs its square
-    over common_px, each light the square of its distance from the nearest prediction over own_px, up to the gate's.
+    Candidates are the shifts that move a prediction onto one of the ANCHORS detections nearest to the image center,
+    where a roll error displaces least. The cost of a shift t is
+    |t|^2 / common_px^2 + sum_i min(d_i / own_px, GATE)^2, where d_i is the distance of detection i from the nearest
+    shifted prediction. The best candidate is refined by the mean residual of the detections inside the gate.
     """
     inner = np.argsort(np.linalg.norm(seen_px - middle_px, axis=1))[:ANCHORS]
     tried = (seen_px[inner, None] - predicted_px).reshape(-1, 2)
     tried = tried[np.linalg.norm(tried, axis=1) < GATE * np.hypot(common_px, own_px)]
-    tried = np.vstack([np.zeros((1, 2)), tried])
+    tried = np.vstack([np.zeros((1, 2)), tried])  # no shift is a candidate too
     apart, nearest = cKDTree(predicted_px).query(seen_px - tried[:, None])
     off = np.minimum(apart / own_px, GATE)
     best = int(np.argmin(np.sum(tried**2, axis=1) / common_px**2 + np.sum(off**2, axis=1)))
@@ -264,17 +273,22 @@ def shift_px(
 
 
 def paired(seen_px: Floats, predicted_px: Floats, gate_px: Floats) -> tuple[Ints, Ints]:
-    """Rows of (S, 2) lights and (P, 2) predictions that are one: the least sum of squares over the (P,) gates squared,
-    a pair beyond its gate costing as much as one at it, and left out.
+    """Optimal one-to-one assignment of (S, 2) detections to (P, 2) predictions with (P,) gates; returns their rows.
+
+    It minimizes the sum of min(distance / gate, 1)^2. Pairs beyond their gate are left out.
     """
     apart = np.linalg.norm(seen_px[:, None] - predicted_px, axis=2) / gate_px
+    # Clipping at the gate keeps detections without a counterpart from pulling the other pairs apart.
     rows, column = linear_sum_assignment(np.minimum(apart, 1.0) ** 2)
     inside = apart[rows, column] < 1
     return rows[inside].astype(np.int64), column[inside].astype(np.int64)
 
 
 def by_survey(look: Look, belief: Belief, sigma_px: Floats) -> Names:
-    """Which light is which LED by what a survey found; sigma_px (N,) of each LED's predicted coordinate."""
+    """Match detections to LEDs with the attitudes and map of an adjustment.
+
+    sigma_px : (N,) standard deviation of each LED's predicted coordinates
+    """
     predicted = belief.pixels(look.body_from_lab)
     near = np.flatnonzero(belief.camera.contains(predicted, -GATE * float(sigma_px.max())))
     light, led = paired(look.lights.xy_px, predicted[near], GATE * sigma_px[near])
@@ -291,17 +305,18 @@ def surveyed(
     fit_distortion: bool = False,
     watch: Callable[[float, float], None] | None = None,
 ) -> Survey:
-    """LEDs, lever, lens and attitudes from all frames, starting from what is believed, which errs as `doubt` says.
+    """Survey LEDs, lever arm, lens and attitudes from all frames, starting from `belief` with the errors of `doubt`.
 
-    fit_distortion : k1, k2, p1, p2 too. A narrow field hardly sees them, and they take the focal length with them: on
-        the AFIT dome its sigma grows from 10 to 80 px, the attitude is the same
-    watch(rounds done, rounds) is called after each round of naming and adjusting
-    Raises InputError where the frames do not determine them.
+    fit_distortion : fit k1, k2, p1, p2 as well. A narrow field hardly determines them, and they correlate with the
+        focal length: on the AFIT dome its sigma grows from 10 to 80 px, while the attitude does not change
+    watch(rounds done, rounds) is called after each round of identification and adjustment
+    Raises InputError if the frames do not determine the unknowns.
     """
     found, floor_px, names = None, belief.floor_px, [by_hint(look, belief, doubt) for look in looks]
     for done in range(ROUNDS):
         if found:
             better = Belief(found.camera, found.leds, found.lever, floor_px)
+            # The attitudes are adjusted now, so only the map's and the residual error remain in the predictions.
             sigma_px = np.hypot(led_sigma_m(found, doubt) * better.px_per_m, max(found.rms_px, floor_px))
             looks = [
                 replace(looks[k], body_from_lab=found.body_from_lab[k])
@@ -310,7 +325,7 @@ def surveyed(
             names = [by_survey(look, better, sigma_px) for look in looks]
             belief = replace(
                 better, leds=belief.leds
-            )  # the map that is a measurement is the one before the survey
+            )  # keep the map from before the survey: it enters each adjustment as a measurement
         looks, found = adjusted(looks, names, belief, doubt, fit_distortion)
         if watch:
             watch(done + 1, ROUNDS)
@@ -321,9 +336,10 @@ def surveyed(
 def adjusted(
     looks: Sequence[Look], names: Sequence[Names], belief: Belief, doubt: Doubt, fit_distortion: bool
 ) -> tuple[list[Look], Survey]:
-    """The frames that hang together, and their survey. Raises InputError where they do not determine it.
+    """Adjust the largest group of connected frames. Returns its frames and the survey.
 
-    Some hang on others by misnamed lights alone, which the adjustment finds out: stronger links are asked for then.
+    A frame may be connected only by misidentified lights. The adjustment rejects these and then fails, so it is tried
+    again with a larger minimum number of shared lights (LINKS). Raises InputError if the last attempt fails.
     """
     shown = crossed(looks, names, belief)
     for links in LINKS:
@@ -345,10 +361,14 @@ def adjusted(
 
 
 def crossed(looks: Sequence[Look], names: Sequence[Names], belief: Belief) -> NDArray[np.bool_]:
-    """(F, N) which frame shows which LED, of those alone that are seen from places so far apart that rays cross."""
+    """(F, N) mask of the LEDs in each frame, without LEDs whose rays are nearly parallel in all frames.
+
+    Such an LED, seen from camera positions close together, has no measurable distance and connects no frames.
+    """
     shown = np.zeros((len(names), len(belief.leds.id)), dtype=bool)
     for frame, name in zip(shown, names, strict=True):
         frame[name.led] = True
+    # RMS spread of the camera positions over the frames that show an LED, as an angle seen from the nearest LED.
     arm_m = belief.lever.camera_body_m
     camera_m = np.array([look.body_from_lab.inv().apply(arm_m) for look in looks])
     count = np.maximum(shown.sum(axis=0), 1)[:, None]
@@ -358,15 +378,20 @@ def crossed(looks: Sequence[Look], names: Sequence[Names], belief: Belief) -> ND
 
 
 def linked(shown: NDArray[np.bool_], links: int) -> list[int]:
-    """The greatest group of frames that each share so many lights or more with the others; shown (F, N) which where.
+    """Indices of the largest group of frames connected by shared LEDs.
 
-    Of where the group stands other frames say nothing, and `calibrate.survey` refuses to guess.
+    shown : (F, N) mask of the LEDs in each frame
+    links : minimum number of LEDs that a frame shares with the rest of the group
+
+    Frames outside the group have an undetermined position relative to it, which `dome_survey.survey` rejects. A group
+    grows from the frame with the most LEDs, adding connected frames until none is left.
     """
     frames = len(shown)
     left, best = np.ones(frames, dtype=bool), np.zeros(frames, dtype=bool)
     while left.any():
         group = np.zeros(frames, dtype=bool)
         group[np.argmax(left * (1 + shown.sum(axis=1)))] = True
+        # Add frames that share enough LEDs with the group until it no longer grows.
         while True:
             known = shown[group].any(axis=0)
             grown = group | (left & ((shown & known).sum(axis=1) >= links))
@@ -379,19 +404,19 @@ def linked(shown: NDArray[np.bool_], links: int) -> list[int]:
 
 
 def led_sigma_m(found: Survey, doubt: Doubt) -> Floats:
-    """(N,) standard deviation of each LED's place, the rms of three axes; of one not surveyed, what it was before."""
+    """(N,) standard deviation of each LED's position, RMS of three axes; that before the survey if not surveyed."""
     variance_m2 = np.einsum("nii->n", found.led_covariance_m2) / 3
     return np.sqrt(np.where(found.surveyed, variance_m2, doubt.led_sigma_m**2))
 
 
 def lens_sigma(found: Survey) -> Floats:
-    """(8,) standard deviations of focal_px, centre x and y, k1, k2, p1, p2, k3; 0 of what was held."""
+    """(8,) standard deviations of focal_px, center x and y, k1, k2, p1, p2, k3; 0 for those not fitted."""
     fitted = np.sqrt(np.maximum(np.diag(found.lens_covariance), 0))
     return np.concatenate([fitted, np.zeros(8 - len(fitted))])
 
 
 def dome_map(found: Survey, doubt: Doubt) -> DomeMap:
-    """What a survey leaves behind for the tracker."""
+    """The map file of a survey for the tracker: surveyed LEDs, lever arm, lens, and their standard deviations."""
     kept = found.surveyed
     focal_sigma_px, x_sigma_px, y_sigma_px, *k_sigma = lens_sigma(found).tolist()
     return DomeMap(
@@ -411,7 +436,7 @@ def dome_map(found: Survey, doubt: Doubt) -> DomeMap:
 
 
 def detect_lights(settings: Settings, camera: Camera, frame: Frame) -> Centroids:
-    """The lights of a frame, unnamed; none of a frame that the tracker would not look at."""
+    """Centroids of a frame; none if the tracker would reject the image."""
     try:
         return see(frame.image_dn, camera, settings, Clock())
     except ImageError:
@@ -425,7 +450,7 @@ def sighting(
     body_from_lab: Rotation,
     floor_px: float,
 ) -> DomeFrame:
-    """A frame of a survey: the rows of its lights that have a name, and the rows of the LEDs that they are."""
+    """Input frame of the adjustment: matched detections `light`, their LEDs `led`, and the start attitude."""
     sigma_px = np.hypot(seen.sigma_px[light], floor_px)
     return DomeFrame(led, seen.xy_px[light], sigma_px, body_from_lab)
 
@@ -438,7 +463,7 @@ def robust_survey(
     led_sigma_m: float,
     fit_distortion: bool,
 ) -> Survey:
-    """`calibrate.survey`, robust against wrong names, with the map before it as a measurement. Raises InputError."""
+    """`dome_survey.survey` with a robust (Cauchy) loss and the prior map as a measurement. Raises InputError."""
     try:
         return dome_survey.survey(
             frames, leds, lever, camera, None, fit_distortion, loss="cauchy", leds_sigma_m=led_sigma_m

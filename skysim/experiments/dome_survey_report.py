@@ -1,4 +1,4 @@
-"""A survey of a dome against the truth: figures, the attitude before and after, and a picture of the LEDs' errors."""
+"""Compare a dome survey with the truth: statistics, attitude errors before and after, and a plot of LED errors."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from skysim.tracking import factory
 
 
 class Check(NamedTuple):
-    """How a tracker does over new stops: those solved, and (S,) errors of these across and about the boresight."""
+    """Result of a tracker at new stops: number of stops, and (S,) cross-boresight and roll errors of those solved."""
 
     stops: int
     cross_rad: Floats
     roll_rad: Floats
 
     def figures(self) -> dict[str, float | int | None]:
-        """In degrees; None where nothing was solved."""
+        """Median and worst errors in degrees; None if nothing was solved."""
         told: dict[str, float | int | None] = {"stops": self.stops, "solved": len(self.cross_rad)}
         for name, error in (("cross", self.cross_rad), ("roll", self.roll_rad)):
             off_deg = np.degrees(np.abs(error))
@@ -37,7 +37,7 @@ class Check(NamedTuple):
 def checked(
     eyes: Mapping[str, factory.Estimator], shots: Iterable[tuple[Frame, Truth]]
 ) -> dict[str, dict[str, float | int | None]]:
-    """How each of these trackers does on the same frames, by its name."""
+    """Statistics of each tracker on the same frames, by name."""
     errors: dict[str, list[tuple[float, float]]] = {name: [] for name in eyes}
     stops = 0
     for frame, truth in shots:
@@ -50,10 +50,11 @@ def checked(
 
 
 class Misplaced(NamedTuple):
-    """The S surveyed LEDs: true places (S, 3), how far they were and are believed off (S, 3), and under whose name.
+    """The S surveyed LEDs: true positions (S, 3), position errors before and after the survey (S, 3), renamed (S,).
 
-    Two LEDs of which the map before the survey had each nearer to the other's place may go by each other's name. To an
-    attitude that is no error, for a place counts and not its number: `after_m` is from the nearest true LED.
+    If the map before the survey has two LEDs each closer to the other's true position, the survey may exchange their
+    numbers. This does not affect an attitude, which depends on positions only. `after_m` is therefore the error from
+    the nearest true LED, and `renamed` marks LEDs whose nearest true LED has another number.
     """
 
     true_m: Floats
@@ -63,7 +64,7 @@ class Misplaced(NamedTuple):
 
 
 def misplaced(found: Survey, belief: Belief, lab: Testbed) -> Misplaced:
-    """What the survey did to the LEDs."""
+    """LED position errors before and after the survey."""
     true_m = lab.sources.place[:, :3]
     row = np.flatnonzero(found.surveyed)
     place_m = found.leds.position_m[row]
@@ -74,7 +75,7 @@ def misplaced(found: Survey, belief: Belief, lab: Testbed) -> Misplaced:
 
 
 def figures(found: Survey, belief: Belief, lab: Testbed, doubt: Doubt) -> dict[str, Any]:
-    """What a survey found beside what was believed and what is true; `values` are what, unit and the four numbers."""
+    """Statistics of a survey. `values` holds one row per lens and lever parameter: believed, found, truth, sigma."""
     sigma_mm = 1e3 * led_sigma_m(found, doubt)[found.surveyed]
     off = misplaced(found, belief, lab)
     camera = lab.scene.camera
@@ -109,7 +110,10 @@ def figures(found: Survey, belief: Belief, lab: Testbed, doubt: Doubt) -> dict[s
 
 
 def figure(off: Misplaced) -> NDArray[np.uint8]:
-    """The dome from above with every surveyed LED's error before and after, each as long as its legend says: BGR."""
+    """BGR image of the dome from above with arrows for the errors of the surveyed LEDs before and after the survey.
+
+    Each panel has its own arrow scale, shown in its key; color is the vertical error.
+    """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

@@ -1,4 +1,4 @@
-"""Trackers side by side: the same frames, scored by the same code."""
+"""Compare trackers on the same frames, scored by the same code."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ from skysim.tracking.external.interface import FAILED, SOLVED
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """What a tracker came to.
+    """Statistics of one tracker.
 
-    right    : share of all frames that were answered within ten arc-minutes, with its interval at 95 %
-    wrong    : answered and farther off;  refused : not answered;  failed : raised, hung, died or answered nonsense
-    refusals : how often each status that is no answer came, the most frequent first
-    errors   : arc-seconds, of the right answers alone: a wrong one has no error, it is wrong
-    time_ms  : from image to answer, of all frames
+    right    : fraction of all frames solved within ten arcminutes, with its 95% interval
+    wrong    : solutions farther off;  refused : no solution;  failed : exception, timeout, crash or invalid output
+    refusals : count of each status other than solved, most frequent first
+    errors   : arcseconds, over correct solutions only; wrong ones are counted instead
+    time_ms  : time from image to solution, over the frames on which the tracker did not fail
     """
 
     tracker: str
@@ -49,7 +49,7 @@ class Line:
 
 
 def entrants(lab: Testbed, names: Sequence[str]) -> dict[str, factory.Estimator]:
-    """The trackers, set up; the scene's own options and beliefs go to all of them. Raises InputError."""
+    """Set up the trackers by name, all with the scene's tracker options and onboard model. Raises InputError."""
     twice = [name for name, count in Counter(names).items() if count > 1]
     if twice:
         raise InputError(f"--tracker {twice[0]}: is told twice; allowed: once")
@@ -57,7 +57,7 @@ def entrants(lab: Testbed, names: Sequence[str]) -> dict[str, factory.Estimator]
 
 
 def with_tracker(lab: Testbed, name: str) -> Testbed:
-    """The same lab with another tracker on board."""
+    """The same test bed with another tracker."""
     told = lab.scene.tracker.model_copy(update={"name": name})
     return replace(lab, scene=lab.scene.model_copy(update={"tracker": told}))
 
@@ -65,12 +65,13 @@ def with_tracker(lab: Testbed, name: str) -> Testbed:
 def shots(
     lab: Testbed, estimators: Mapping[str, factory.Estimator]
 ) -> Iterator[tuple[Frame, Truth, dict[str, Row]]]:
-    """Frame after frame, with each tracker's row of it. They take turns at who is asked first.
+    """Yield each frame with its truth and the row of each tracker.
 
-    What the first one said in flight, to the filter, is not asked again.
+    The order of the trackers rotates from frame to frame, so that none always runs first (with cold caches). Frames
+    that the first tracker solved for the attitude filter during the motion simulation are not solved again.
     """
     order = list(estimators)
-    flown = order[0]
+    flown = order[0]  # the tracker whose solutions updated the attitude filter
     for name in order:
         run.warm_up(lab, estimators[name])
     for frame, truth, seconds in run.render_frames(lab):
@@ -84,13 +85,13 @@ def shots(
 
 
 def line(tracker: str, rows: Sequence[Row]) -> Line:
-    """A tracker's rows summed up."""
+    """Statistics of a tracker over its rows."""
     right = [row for row in rows if row.status == SOLVED and not row.wrong]
     unsolved = Counter(row.status for row in rows if row.status != SOLVED)
     failed = sum(count for status, count in unsolved.items() if status.startswith(FAILED))
     cross = np.array([row.cross_arcsec for row in right] or [np.nan])
     roll = np.abs([row.roll_arcsec for row in right] or [np.nan])
-    # A frame on which it failed has no time: nobody knows for how long it would have gone on.
+    # Frames on which it failed are left out of the times: the time to a solution is unknown there.
     ms = np.array([row.time_ms for row in rows if not row.status.startswith(FAILED)] or [np.nan])
     return Line(
         tracker,
@@ -110,7 +111,7 @@ def line(tracker: str, rows: Sequence[Row]) -> Line:
 
 
 def write(folder: Path, rows: Mapping[str, list[Row]], scene: Scene) -> list[Line]:
-    """solutions.NAME.ecsv of every tracker, and the scoreboard."""
+    """Write solutions.NAME.ecsv of every tracker and scoreboard.ecsv. Returns the statistics of each tracker."""
     lines = [line(name, told) for name, told in rows.items()]
     for name, told in rows.items():
         files.write_table(folder / f"solutions.{name}.ecsv", scoring.table(told, scoring.angle_names(scene)))
@@ -119,7 +120,7 @@ def write(folder: Path, rows: Mapping[str, list[Row]], scene: Scene) -> list[Lin
 
 
 def as_dicts(lines: Sequence[Line]) -> list[dict[str, Any]]:
-    """For JSON."""
+    """The statistics as dictionaries for JSON; `right` becomes three numbers."""
     return [
         asdict(one) | {"right": one.right.value, "right_low": one.right.low, "right_high": one.right.high}
         for one in lines
@@ -127,7 +128,7 @@ def as_dicts(lines: Sequence[Line]) -> list[dict[str, Any]]:
 
 
 def table(lines: Sequence[Line]) -> Any:
-    """One row a tracker, as an astropy table; refusals stand in the solutions."""
+    """One row per tracker as an astropy table, without `refusals`; the status of each frame is in the solutions."""
     from astropy.table import Table
 
     rows = as_dicts(lines)

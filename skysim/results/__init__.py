@@ -1,1 +1,1 @@
-"""What a run leaves and what it means: metrics, scores, reports and files."""
+"""Results of a run: metrics, scores, reports and files."""

@@ -1,4 +1,9 @@
-"""Truth against estimate, and what many trials come to, with its interval. Pure functions."""
+"""Attitude error metrics, and statistics over many trials with confidence intervals. Pure functions.
+
+A statistic is named by a string (`response`), for example `cross_arcsec_p95` or `coverage_5`. Each is computed from
+the columns of a table of trials and returned with a 95% confidence interval: Wilson's interval for proportions, the
+percentile bootstrap for means and RMS, and the distribution-free binomial interval for quantiles.
+"""
 
 from __future__ import annotations
 
@@ -14,43 +19,46 @@ from scipy.spatial.transform import Rotation
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
 
-WRONG_RAD = np.radians(10 / 60)  # PTASE's bar for a wrong attitude: ten arc-minutes
+WRONG_RAD = np.radians(10 / 60)  # limit of PTASE for a wrong attitude: ten arcminutes
 
 
 def cross_and_roll_rad(cam_from_ref_estimate: Rotation, cam_from_ref_truth: Rotation) -> tuple[float, float]:
-    """Attitude error split in two: across the boresight (>= 0) and about it (signed).
+    """Cross-boresight (>= 0) and roll (signed) components of the attitude error, rad.
 
-    The error rotation in camera axes, estimate after truth undone, as a rotation vector: hypot of its x and y,
-    and its z.
+    The error is cam_from_ref_estimate * cam_from_ref_truth^-1 as a rotation vector in camera axes, with the boresight
+    along z. Cross-boresight is hypot(x, y), roll is z.
     """
     x, y, z = (cam_from_ref_estimate * cam_from_ref_truth.inv()).as_rotvec()
     return float(np.hypot(x, y)), float(z)
 
 
 def is_wrong(cam_from_ref_estimate: Rotation, cam_from_ref_truth: Rotation) -> bool:
-    """Whether an answer is worse than none: off by over ten arc-minutes in rotation angle."""
+    """Whether the rotation angle between estimate and truth exceeds ten arcminutes: worse than no solution."""
     return bool((cam_from_ref_estimate * cam_from_ref_truth.inv()).magnitude() > WRONG_RAD)
 
 
 def normalised_error_squared(
     cam_from_ref_estimate: Rotation, cam_from_ref_truth: Rotation, covariance_rad2: Floats
 ) -> float:
-    """NEES: e^T P^-1 e, chi-square with three degrees of freedom where the covariance is true."""
+    """NEES: e^T P^-1 e, with e the error rotation vector in camera axes.
+
+    Chi-square distributed with three degrees of freedom if the covariance is correct.
+    """
     error = (cam_from_ref_estimate * cam_from_ref_truth.inv()).as_rotvec()
     return float(error @ np.linalg.solve(covariance_rad2, error))
 
 
-# What many trials come to. A trial's outcome is a row; the columns are arrays, NaN where a trial has no such figure.
+# Statistics over many trials. Each trial is a row; the columns are arrays, NaN where a trial has no such value.
 
 Columns = Mapping[str, NDArray[Any]]
 CONFIDENCE = 0.95
 RESAMPLES = 999
-BEYOND = 1e-8  # of answers may be so far off by chance
+BEYOND = 1e-8  # probability with which a correct covariance allows an error counted as overconfident
 FEWEST_STARS = 5  # "5 stars everywhere" (Padro 2012)
 
 
 class Summary(NamedTuple):
-    """A figure, its interval at CONFIDENCE (NaN where there is none) and over how many trials."""
+    """A statistic, its confidence interval at CONFIDENCE (NaN if it has none) and the number of trials."""
 
     value: float
     low: float
@@ -63,12 +71,12 @@ Response = Callable[[Columns], Summary]
 
 
 def exact(value: float) -> Summary:
-    """A figure that no chance had a part in."""
+    """Summary of a deterministic value: an interval of zero width."""
     return Summary(float(value), float(value), float(value), 1)
 
 
 def share(hits: Any, of: Any) -> Summary:
-    """hits / of with Wilson's interval (Wilson 1927), which holds at no hits and at none missed too."""
+    """The proportion hits / of with Wilson's interval (Wilson 1927), which is valid at 0 and at 1 too."""
     if of < 1:
         return NOTHING
     found = scipy.stats.binomtest(int(hits), int(of)).proportion_ci(CONFIDENCE, "wilson")
@@ -76,13 +84,16 @@ def share(hits: Any, of: Any) -> Summary:
 
 
 def resampled(values: Floats, statistic: Callable[..., Any]) -> Summary:
-    """A mean or the like, with the bootstrap's percentile interval (Efron 1979); always the same resamples."""
+    """A mean or similar statistic with the percentile bootstrap interval (Efron 1979); the resampling seed is fixed.
+
+    Equal values have an interval of zero width; a single value has none.
+    """
     value = float(statistic(values))
     if len(values) < 2 or np.ptp(values) == 0:
         return Summary(
             value, value if len(values) > 1 else np.nan, value if len(values) > 1 else np.nan, len(values)
         )
-    batch = max(1, 2_000_000 // len(values))
+    batch = max(1, 2_000_000 // len(values))  # limits the memory of a batch to two million values
     found = scipy.stats.bootstrap(
         (values,),
         statistic,
@@ -97,15 +108,18 @@ def resampled(values: Floats, statistic: Callable[..., Any]) -> Summary:
 
 
 def quantile(values: Floats, part: float) -> Summary:
-    """A quantile with the interval between two of the ordered values that the binomial distribution gives (Conover
-    1999, section 3.2): of no assumption; an end is infinite where there are too few values for it."""
+    """The quantile at probability `part` with a distribution-free interval.
+
+    The interval is between two order statistics whose ranks follow from the binomial distribution (Conover 1999,
+    section 3.2). A bound is infinite where there are too few values for it.
+    """
     low, high = scipy.stats.quantile_test(values, p=part).confidence_interval(CONFIDENCE)
     ends = (float(low) if np.isfinite(low) else -np.inf, float(high) if np.isfinite(high) else np.inf)
     return Summary(float(np.quantile(values, part)), *ends, len(values))
 
 
 def extreme(values: Floats, which: Callable[[Floats], Any]) -> Summary:
-    """The worst or the least: of these trials, without an interval."""
+    """The largest or smallest value of these trials, without an interval."""
     return Summary(float(which(values)), float("nan"), float("nan"), len(values))
 
 
@@ -114,7 +128,7 @@ def rms(values: Floats, axis: int = -1) -> Any:
     return np.sqrt(np.mean(np.square(values), axis=axis))
 
 
-# What a response such as `cross_arcsec_p95` ends in.
+# The ending of a response name such as `cross_arcsec_p95`.
 STATISTICS: dict[str, Callable[[Floats], Summary]] = {
     "mean": lambda values: resampled(values, np.mean),
     "rms": lambda values: resampled(values, rms),
@@ -125,7 +139,7 @@ STATISTICS: dict[str, Callable[[Floats], Summary]] = {
     "worst": lambda values: extreme(values, np.max),
     "least": lambda values: extreme(values, np.min),
 }
-# And what it begins with. Errors count by their size.
+# The beginning of a response name. Errors are taken as magnitudes.
 FIGURES: dict[str, Callable[[Columns], NDArray[Any]]] = {
     "cross_arcsec": lambda c: np.hypot(c["x_arcsec"], c["y_arcsec"]),
     "roll_arcsec": lambda c: np.abs(c["roll_arcsec"]),
@@ -141,13 +155,21 @@ FIGURES: dict[str, Callable[[Columns], NDArray[Any]]] = {
 
 
 def overconfident(c: Columns) -> Summary:
-    """Answers farther off than their covariance allows once in 10^8: wrong names, or errors not known of."""
-    answered = np.isfinite(c["nees"]) & (c["frames"] == 1)  # a flight's NEES is a mean
+    """Proportion of the solutions whose NEES exceeds the chi-square limit at probability BEYOND (1e-8).
+
+    Causes are wrong identifications and errors that the covariance does not model.
+    """
+    # For a trial of many frames the column holds a mean NEES, which has another distribution.
+    answered = np.isfinite(c["nees"]) & (c["frames"] == 1)
     return share(np.sum(c["nees"][answered] > scipy.stats.chi2.isf(BEYOND, 3)), np.sum(answered))
 
 
 def of_frames(hits: NDArray[Any], frames: NDArray[Any]) -> Summary:
-    """A share of all frames. Those of a flight are like one another, so there the interval is of so many flights."""
+    """A proportion of all frames.
+
+    The frames of one simulated run are correlated. Where trials have many frames, the interval is therefore that of
+    as many independent samples as there are runs, widened if necessary to include the value.
+    """
     told = share(np.sum(hits), np.sum(frames))
     if not len(frames) or np.max(frames) <= 1:
         return told
@@ -167,13 +189,13 @@ COVERAGE = re.compile(r"coverage(?:_(\d+))?$")
 
 
 def response(name: str, where: str = "response") -> Response:
-    """What makes a figure of trials' columns, by its name. Raises InputError for a name that is none.
+    """The function that computes the named statistic from the columns of trials. Raises InputError for other names.
 
-    overconfident : share of the answers farther off than they claim
-    identified, wrong, refused : shares of the frames: right within ten arc-minutes, wrong, neither
-    failed     : share of the trials that raised
-    coverage_N : share of the trials with at least N lights in the field, 5 if left out
-    else a figure and a statistic: stars_least, cross_arcsec_p95 (of all answers, wrong ones too)
+    overconfident : proportion of the solutions with an error far outside their covariance
+    identified, wrong, refused : proportions of the frames: correct within ten arcminutes, wrong, without a solution
+    failed     : proportion of the trials that raised an exception
+    coverage_N : proportion of the trials with at least N sources in the field of view; N is 5 if omitted
+    otherwise a quantity and a statistic: stars_least, cross_arcsec_p95 (over all solutions, wrong ones included)
     """
     if name in SHARES:
         return SHARES[name]

@@ -1,4 +1,4 @@
-"""How our pictures look, whoever draws them: colours, lines, and an empty figure that becomes a PNG."""
+"""Plot style shared by all figures (colors, lines, markers), and rendering of a figure to PNG."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 DPI = 120
-# For all kinds of sight (Okabe & Ito 2008), and two more.
+# Palette for color-blind readers (Okabe & Ito 2008), plus two colors.
 INK = ["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#555555", "#882255"]
 MARKS = "osD^vP<X"
 LOOK: Any = {
@@ -19,7 +19,7 @@ LOOK: Any = {
 
 
 def png(draw: Callable[[Any], None], size_in: tuple[float, float]) -> bytes:
-    """What is drawn into an empty figure."""
+    """PNG bytes of the figure that `draw` fills, in the shared style, without a software tag (reproducible bytes)."""
     import matplotlib
     from matplotlib.figure import Figure as Canvas
 

@@ -1,4 +1,4 @@
-"""Pictures and one self-contained HTML page of a run."""
+"""Annotated frames, plots and one self-contained HTML page of a run."""
 
 from __future__ import annotations
 
@@ -19,7 +19,11 @@ TRUTH_BGR, FOUND_BGR, MATCHED_BGR = (200, 160, 60), (80, 80, 235), (110, 220, 90
 
 
 def stretch(image: NDArray) -> NDArray[np.uint8]:
-    """An 8-bit picture for the eye: from the sky to the brightest, with a square root."""
+    """(H, W) frame as uint8 for display: clipped to black and white levels, then a square-root curve.
+
+    Black is the 30th percentile (the sky). White is the 99.95th percentile, or a quarter of the peak if that is
+    higher, so that a few bright sources do not leave a large part of the image white.
+    """
     low, high = np.percentile(image, (30, 99.95))
     high = max(high, low + 1.0, float(image.max()) * 0.25)
     return (255 * np.sqrt(np.clip((image - low) / (high - low), 0, 1))).astype(np.uint8)
@@ -32,9 +36,10 @@ def annotate(
     labels: list[str] | None = None,
     truth_px: Floats | None = None,
 ) -> NDArray[np.uint8]:
-    """The stretched frame with truth ticked (blue), detections squared (red), matched stars circled (green).
+    """The stretched frame in BGR with blue ticks (truth), red squares (detections), green circles (matched stars).
 
-    Every mark leaves its middle open. A small frame is doubled, so that marks do not bury its stars.
+    All markers leave their center open. A frame smaller than 1000 pixels is enlarged twice, so that the markers do
+    not cover its stars. `labels` are written beside the matched stars.
     """
     scale = 2 if max(image.shape) < 1000 else 1
     picture = cv2.cvtColor(stretch(image), cv2.COLOR_GRAY2BGR)
@@ -52,9 +57,9 @@ def annotate(
 
 
 def preview(image: NDArray, seen: SourceTruth) -> NDArray[np.uint8]:
-    """The stretched frame with every true source ticked where its light lies and the brightest forty named.
+    """The stretched frame in BGR with ticks at the flux centroid of each true source and the 40 brightest labeled.
 
-    Blue for what the detector can measure, red for what is expected to saturate. A small frame is doubled.
+    Blue marks unsaturated sources, red those expected to saturate. A frame smaller than 1000 pixels is enlarged twice.
     """
     scale = 2 if max(image.shape) < 1000 else 1
     picture = cv2.cvtColor(stretch(image), cv2.COLOR_GRAY2BGR)
@@ -70,19 +75,22 @@ def preview(image: NDArray, seen: SourceTruth) -> NDArray[np.uint8]:
 
 
 def ticks(picture: NDArray[np.uint8], x: int, y: int, size: int, colour: tuple[int, int, int]) -> None:
-    """Four strokes that leave the middle open."""
+    """Draw four strokes around (x, y), with an open center."""
     for dx, dy in ((1, 0), (-1, 0), (0, 1), (0, -1)):
         begin, end = size - 4, size + 6
         cv2.line(picture, (x + begin * dx, y + begin * dy), (x + end * dx, y + end * dy), colour, 1)
 
 
 def write(picture: NDArray[np.uint8], text: str, x: int, y: int, colour: tuple[int, int, int]) -> None:
-    """A small label."""
+    """Draw a small label with its lower left corner at (x, y)."""
     cv2.putText(picture, text, (x, y), cv2.FONT_HERSHEY_SIMPLEX, 0.4, colour, 1, cv2.LINE_AA)
 
 
 def contact_sheet(images: list[NDArray], captions: list[str], scale: int) -> NDArray[np.uint8]:
-    """Frames of one size side by side, each enlarged and named, all stretched alike so that they compare."""
+    """Frames of one size side by side, enlarged `scale` times and captioned.
+
+    All use the black and white levels of the first frame, so that their brightnesses can be compared.
+    """
     low, high = np.percentile(images[0], 30), float(np.percentile(images[0], 99.95))
     strips = []
     for image, caption in zip(images, captions, strict=True):
@@ -95,14 +103,20 @@ def contact_sheet(images: list[NDArray], captions: list[str], scale: int) -> NDA
 
 
 def places(xy_px: Floats | None, scale: int) -> list[tuple[int, int]]:
-    """Whole pixels of an enlarged picture; the middle of a pixel stays its middle."""
+    """Integer pixel positions in an image enlarged `scale` times; empty for None.
+
+    Pixel centers are at integers, so the center of pixel x moves to x * scale + (scale - 1) / 2.
+    """
     if xy_px is None:
         return []
     return [(round(x), round(y)) for x, y in xy_px * scale + (scale - 1) / 2]
 
 
 def summary(rows: list[Row]) -> dict[str, Any]:
-    """Counts and figures of a run."""
+    """Frame counts, median and worst errors in arcseconds, and median solve time of a run.
+
+    Errors are over solved frames, wrong ones included; NaN if no frame was solved.
+    """
     solved = [row for row in rows if row.status == "solved"]
     cross = np.array([row.cross_arcsec for row in solved]) if solved else np.array([np.nan])
     roll = np.abs([row.roll_arcsec for row in solved]) if solved else np.array([np.nan])
@@ -124,7 +138,7 @@ def as_dicts(rows: list[Row]) -> list[dict[str, Any]]:
 
 @dataclass(frozen=True, slots=True)
 class Images:
-    """What a page shows: the annotated frame, the plot of the flight (PNG), pictures of the lab (files), if any."""
+    """Images of a page: annotated frame, telemetry plot (PNG bytes), image files of the laboratory (may be empty)."""
 
     annotated: NDArray[np.uint8]
     flight: bytes
@@ -140,9 +154,9 @@ def write_page(
     stages_ms: dict[str, float],
     images: Images,
 ) -> None:
-    """One HTML file with everything inside: figures, the picture of a frame, the table, the command.
+    """Write one HTML file with its images embedded: statistics, plots, an annotated frame, the table, the command.
 
-    angles : what the three angles of a row are called; stages_ms : median time by stage.
+    angles : names of the three angles of a row; stages_ms : median time by stage.
     """
     from jinja2 import Environment
 
@@ -167,7 +181,7 @@ def embed(image: bytes, kind: str = "png") -> str:
 
 
 def figure(rows: list[Row]) -> bytes:
-    """Errors, stars and rate against time, as PNG."""
+    """Errors, detected and matched sources, and rate against time, as PNG. Red lines mark unsolved frames."""
     from matplotlib.figure import Figure
 
     fig = Figure(figsize=(10, 6.4), layout="constrained")

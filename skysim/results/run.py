@@ -1,6 +1,6 @@
-"""A whole run from Python: simulate a scene, render and solve its frames, score them, save them.
+"""Python interface to a complete run: simulate a scene, render, solve and score its frames, and save them.
 
-`simulate` does what `skysim run` does and `render` what `skysim render` does; both commands are built on this module.
+`simulate` is the equivalent of `skysim run` and `render` of `skysim render`; both commands use this module.
 """
 
 from __future__ import annotations
@@ -37,10 +37,10 @@ Progress = Callable[[float, float], None]
 
 @dataclass(frozen=True, slots=True)
 class ScoredFrame:
-    """One frame with its truth, the tracker's solution and the error of it.
+    """One frame with its truth, the tracker's solution and its error.
 
     result : frame, truth, the tracker's report, and seconds by step
-    row    : the same as numbers: angles in degrees, errors and their claimed deviations in arcseconds
+    row    : the same as numbers: angles in degrees, errors and the tracker's standard deviations in arcseconds
     """
 
     result: simulation.FrameResult
@@ -48,17 +48,17 @@ class ScoredFrame:
 
     @property
     def image(self) -> NDArray[Any]:
-        """(H, W) digital numbers: uint16, or float64 of a noise-free detector."""
+        """(H, W) digital numbers: uint16, or float64 for a noise-free detector."""
         return self.result.frame.image_dn
 
     @property
     def truth(self) -> Truth:
-        """Attitude, rates and sources as they were at mid-exposure."""
+        """Attitude, rates and sources at mid-exposure."""
         return self.result.truth
 
     @property
     def attitude(self) -> Attitude:
-        """The tracker's solution; without an attitude its `status` says why."""
+        """The tracker's solution; if it has no attitude, its `status` gives the reason."""
         return self.result.report.attitude
 
     @property
@@ -70,7 +70,7 @@ class ScoredFrame:
         return float((estimate * self.truth.cam_from_lab.inv()).magnitude() / ARCSEC_RAD)
 
     def annotated(self) -> NDArray[np.uint8]:
-        """(H, W, 3) the frame in BGR, stretched: truth in blue, detections in red, identified sources in green."""
+        """(H, W, 3) stretched frame in BGR: truth in blue, detections in red, identified sources in green."""
         return scoring.annotated(self.result)
 
     def _repr_html_(self) -> str:
@@ -83,8 +83,8 @@ class ScoredFrame:
 class Run(Sequence[ScoredFrame]):
     """The result of `simulate`: a sequence of scored frames.
 
-    testbed : the scene set up, its trajectory simulated
-    frames  : one entry a frame, in order
+    testbed : the scene's test bed with its simulated trajectory
+    frames  : one entry per frame, in order
     """
 
     testbed: Testbed
@@ -97,12 +97,12 @@ class Run(Sequence[ScoredFrame]):
 
     @property
     def telemetry(self) -> Telemetry:
-        """What the vehicle did and what its computer measured and commanded, sampled at the control rate."""
+        """Motion of the vehicle, and measurements and commands of its computer, sampled at the control rate."""
         return self.testbed.log
 
     @property
     def rows(self) -> list[Row]:
-        """One row of numbers a frame."""
+        """One row of numbers per frame."""
         return [frame.row for frame in self.frames]
 
     def __len__(self) -> int:
@@ -116,7 +116,7 @@ class Run(Sequence[ScoredFrame]):
         return self.frames[index]
 
     def table(self) -> Table:
-        """One row a frame, as in `solutions.ecsv`: angles in degrees, errors in arcseconds."""
+        """One row per frame, as in `solutions.ecsv`: angles in degrees, errors in arcseconds."""
         return scoring.table(self.rows, scoring.angle_names(self.scene))
 
     def to_pandas(self) -> pd.DataFrame:
@@ -124,7 +124,7 @@ class Run(Sequence[ScoredFrame]):
         return self.table().to_pandas()
 
     def save(self, folder: str | Path) -> Path:
-        """Write what `skysim run` writes: frames with their truth, tables and report.html. Returns the folder."""
+        """Write the same files as `skysim run`: frames with truth, tables and report.html. Returns the folder."""
         recorder = Recorder(Path(folder), self.testbed)
         for frame in self.frames:
             recorder.add(frame)
@@ -138,9 +138,9 @@ class Run(Sequence[ScoredFrame]):
 
 @dataclass(slots=True)
 class Recorder:
-    """Writes a run into a folder, frame by frame, so that a long run need not stay in memory.
+    """Writes a run to a folder, frame by frame, so that a long run need not be kept in memory.
 
-    What an earlier run left in the folder is removed first.
+    Files of an earlier run in the folder are removed first.
     """
 
     folder: Path
@@ -159,7 +159,7 @@ class Recorder:
         self.tally.add(frame.result)
 
     def finish(self, command: str, pictures: Sequence[Path] = ()) -> dict[str, Any]:
-        """Write tables, annotated picture and report. Returns the figures that `skysim run --json` prints."""
+        """Write tables, annotated image and report. Returns the statistics that `skysim run --json` prints."""
         scene, log = self.testbed.scene, self.testbed.log
         names = scoring.angle_names(scene)
         write_table(self.folder / "solutions.ecsv", scoring.table(self.rows, names))
@@ -176,7 +176,7 @@ class Recorder:
 
 
 def score_frames(testbed: Testbed) -> Iterator[ScoredFrame]:
-    """Render, solve and score the frames of a test bed whose motion is simulated, one after another."""
+    """Render, solve and score the frames of a test bed one after another; its motion must be simulated already."""
     for result in simulation.run(testbed, tracker(testbed)):
         verdict = testbed.verdicts.get(result.frame.index, "")
         yield ScoredFrame(result, scoring.row(result, testbed.scene, testbed.mount, verdict))
@@ -187,20 +187,20 @@ def simulate(
 ) -> Run:
     """Simulate a scene's motion, render every frame, solve it and score the solution against the truth.
 
-    programs : commands of external trackers by name, one of which the scene's `tracker.name` may be
-    progress : called as progress(t_s, duration_s) while the motion is simulated
+    programs : commands of external trackers by name, for scenes whose `tracker.name` is one of these
+    progress : called as progress(t_s, duration_s) during the motion simulation
 
-    All frames are kept in memory; `skysim run` writes them one by one instead. Raises InputError.
+    All frames are kept in memory; `skysim run` writes them one by one. Raises InputError.
     """
     testbed = simulation.simulate_motion(build_testbed(scene, programs), progress)
     return Run(testbed, tuple(_kept(frame) for frame in score_frames(testbed)))
 
 
 def render(scene: Scene, index: int = 0) -> tuple[Frame, Truth]:
-    """One frame of a scene with its truth, bit for bit that of the whole run; the frames before it are not rendered.
+    """One frame of a scene with its truth, bit-identical to that frame of the complete run.
 
-    Only the motion up to that frame is simulated. With a `filter` section or exposure control a frame depends on the
-    frames before it, and these are rendered too. Raises InputError for an index outside of the scene's frames.
+    Earlier frames are not rendered, except with a `filter` section or exposure control, where a frame depends on
+    them. Raises InputError for an index outside the scene's frames.
     """
     frames = scene.exposure.frames
     if not 0 <= index < frames:
@@ -214,14 +214,14 @@ def render(scene: Scene, index: int = 0) -> tuple[Frame, Truth]:
 
 
 def _kept(frame: ScoredFrame) -> ScoredFrame:
-    """The frame with an image of its own, in case the next frame is rendered into the same memory."""
+    """The frame with a copy of its image, because the next frame may be rendered into the same memory."""
     image = frame.result.frame
     owned = replace(image, image_dn=np.array(image.image_dn))
     return replace(frame, result=replace(frame.result, frame=owned))
 
 
 def _picture(image: NDArray[np.uint8]) -> str:
-    """An <img> of a picture, at most 800 pixels wide."""
+    """An HTML <img> element of an image, reduced to at most 800 pixels in width."""
     height, width = image.shape[:2]
     if width > 800:
         image = cv2.resize(image, (800, round(height * 800 / width)), interpolation=cv2.INTER_AREA)

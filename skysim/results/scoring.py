@@ -1,4 +1,4 @@
-"""A shot becomes a row: the tracker's answer beside the truth."""
+"""Compare the tracker's solution of each frame with the truth, as rows and tables of numbers."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from skysim.simulation.run import FrameResult
 
 
 def angle_names(scene: Scene) -> tuple[str, str, str]:
-    """What the three angles of a row are called."""
+    """Names of the three angles of a row."""
     return ("RA", "Dec", "roll") if isinstance(scene.light, StarsConfig) else ("roll", "pitch", "yaw")
 
 
 def angles_deg(cam_from_lab: Rotation, scene: Scene, mount: Mount) -> tuple[float, float, float]:
-    """The camera's RA, Dec, roll under the stars; the vehicle's 3-2-1 roll, pitch, yaw under the dome."""
+    """RA, Dec, roll of the camera under the stars; otherwise roll, pitch, yaw (3-2-1 sequence) of the vehicle."""
     if isinstance(scene.light, StarsConfig):
         ra, dec, roll = np.degrees(ra_dec_roll_rad(cam_from_lab))
         return float(ra), float(dec), float(roll)
@@ -34,7 +34,10 @@ def angles_deg(cam_from_lab: Rotation, scene: Scene, mount: Mount) -> tuple[floa
 
 
 def row(shot: FrameResult, scene: Scene, mount: Mount, verdict: str = "") -> Row:
-    """One frame of a run as people read it; verdict is what the attitude filter made of it."""
+    """Truth, solution and errors of one frame; `verdict` is how the attitude filter used the solution.
+
+    Errors and standard deviations are in arcseconds, NaN without a solution.
+    """
     truth, answer = shot.truth, shot.report.attitude
     cross = roll = cross_sigma = roll_sigma = chance = float("nan")
     estimate, wrong = None, False
@@ -70,7 +73,7 @@ def row(shot: FrameResult, scene: Scene, mount: Mount, verdict: str = "") -> Row
 
 
 def table(rows: list[Row], names: tuple[str, str, str]) -> Any:
-    """The rows as an astropy table, one column a figure."""
+    """The rows as an astropy table, one column per quantity."""
     from astropy.table import Table
 
     nothing = (float("nan"),) * 3
@@ -99,31 +102,31 @@ def table(rows: list[Row], names: tuple[str, str, str]) -> Any:
 
 
 class Tally:
-    """What a run gathers beside its rows: seconds by stage, and the last solved shot for the picture."""
+    """Accumulates, in addition to a run's rows, the seconds by stage and the last solved frame for the image."""
 
     def __init__(self) -> None:
         self._seconds: dict[str, list[float]] = {}
         self._last: FrameResult | None = None
 
     def add(self, shot: FrameResult) -> None:
-        """Take note of a shot."""
+        """Add the times of a frame, and keep the frame if it is solved or the first."""
         for stage, spent in (shot.seconds | shot.report.seconds).items():
             self._seconds.setdefault(stage, []).append(spent)
         if self._last is None or shot.report.attitude.solved:
             self._last = shot
 
     def median_ms(self) -> dict[str, float]:
-        """Median milliseconds a frame, by stage."""
+        """Median milliseconds per frame, by stage."""
         return {stage: 1e3 * float(np.median(spent)) for stage, spent in self._seconds.items()}
 
     def picture(self) -> NDArray[np.uint8]:
-        """The last solved frame, annotated."""
+        """The last solved frame, annotated; the first frame if none was solved."""
         assert self._last is not None
         return annotated(self._last)
 
 
 def annotated(result: FrameResult) -> NDArray[np.uint8]:
-    """The stretched frame with the true sources, the detections and the identified ones marked."""
+    """The stretched frame with true sources, detections and identified detections marked."""
     seen, match = result.report.centroids.xy_px, result.report.attitude.match
     matched = seen[match.observed] if match else np.empty((0, 2))
     return annotate(result.frame.image_dn, seen, matched, truth_px=result.truth.seen.xy_px)

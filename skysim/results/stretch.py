@@ -1,4 +1,4 @@
-"""A frame for the eye: stretched by a table, packed as JPEG."""
+"""Convert frames to 8-bit images for display, and encode them as JPEG."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ CURVES: dict[str, Any] = {
     "linear": lambda share: share,
     "logarithm": lambda share: np.log1p(200 * share) / np.log1p(200),
 }
-SAMPLED = 8  # every so many rows and columns tell the sky
+SAMPLED = 8  # stride in rows and columns of the sample for the sky statistics
 
 
 @dataclass(frozen=True, slots=True)
 class Facts:
-    """A frame's numbers: median and scatter of its sky, its brightest pixel, in DN; how many pixels are saturated."""
+    """Statistics of a frame: sky median, sky standard deviation and peak, all in DN; number of saturated pixels."""
 
     sky_dn: float
     scatter_dn: float
@@ -28,7 +28,8 @@ class Facts:
 
 
 def span(image: NDArray) -> tuple[float, float]:
-    """What is black in a frame and what is white: the sky, and a quarter of the way to the brightest pixel."""
+    """Black and white levels in DN: the sky (30th percentile), and the 99.9th percentile or, if that is higher,
+    a quarter of the way from the sky to the brightest pixel."""
     low, high = np.percentile(image[::SAMPLED, ::SAMPLED], (30, 99.9))
     return float(low), max(float(high), float(low + 0.25 * (image.max() - low)))
 
@@ -36,13 +37,15 @@ def span(image: NDArray) -> tuple[float, float]:
 def stretched(
     image: NDArray, curve: str, bright: float = 1.0, between: tuple[float, float] | None = None
 ) -> NDArray[np.uint8]:
-    """(H, W) of 8 bits, from the sky to near the brightest pixel.
+    """(H, W) uint8 image, stretched from the black level to the white level by one of CURVES.
 
-    bright  : how much brighter than usual faint light is shown
-    between : black and white, where they are another frame's; the frame's own if left out
+    bright  : gain; the white level is lowered by this factor so that faint sources appear brighter
+    between : black and white levels in DN, for example of another frame; by default those of `span`
+
+    A uint16 frame is mapped through a lookup table, which is faster than evaluating the curve at each pixel.
     """
     low, high = between or span(image)
-    top = low + max((high - low) / bright, 1.0)
+    top = low + max((high - low) / bright, 1.0)  # at least 1 DN, to avoid division by zero in a flat frame
     if image.dtype != np.uint16:
         return (255 * CURVES[curve](np.clip((image - low) / (top - low), 0, 1))).astype(np.uint8)
     levels = np.arange(int(image.max()) + 1)
@@ -50,9 +53,11 @@ def stretched(
 
 
 def facts(image: NDArray, saturation_dn: float) -> Facts:
-    """The sky by a sample: its median, and the scatter of what is near it, stars left out; peak and saturation by all.
+    """Sky median and standard deviation from a sample of the pixels; peak and saturation count from all of them.
 
-    Near is within five sigma by the median deviation (Gauss: 1.4826), and no less than 3 DN: both are whole numbers.
+    Stars are excluded from the standard deviation by a clip at five sigma, with sigma = 1.4826 x the median absolute
+    deviation (exact for a Gaussian). The limit is at least 3 DN, because in digitized frames the median and the
+    deviation are integers and the deviation can be 0.
     """
     sample = image[:: 2 * SAMPLED, ::SAMPLED].astype(float)
     sky = float(np.median(sample))
@@ -64,7 +69,7 @@ def facts(image: NDArray, saturation_dn: float) -> Facts:
 
 
 def fitted(grey: NDArray[np.uint8], widest_px: int) -> NDArray[np.uint8]:
-    """No wider than that: each pixel the mean of those that it stands for, so that no star is left out."""
+    """The image reduced to at most `widest_px` columns; area averaging, so that no star is skipped."""
     height, width = grey.shape
     if width <= widest_px:
         return grey
@@ -73,5 +78,5 @@ def fitted(grey: NDArray[np.uint8], widest_px: int) -> NDArray[np.uint8]:
 
 
 def jpeg(grey: NDArray[np.uint8]) -> bytes:
-    """Packed for the way to the browser."""
+    """The image as JPEG bytes for the browser."""
     return bytes(cv2.imencode(".jpg", grey, [cv2.IMWRITE_JPEG_QUALITY, 88])[1])

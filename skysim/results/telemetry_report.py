@@ -1,4 +1,4 @@
-"""A flight as people read it: figures, a table and a plot of what the vehicle did and believed."""
+"""Summary, tables and plots of a run's telemetry: true motion, estimates, commands and actuator states."""
 
 from __future__ import annotations
 
@@ -19,22 +19,26 @@ ARCSEC_DEG = 1 / 3600
 
 
 def euler_deg(lab_from_body: Rotation) -> Floats:
-    """(K, 3) roll, pitch, yaw of the 3-2-1 sequence."""
+    """(K, 3) roll, pitch, yaw of the 3-2-1 sequence, degrees."""
     return np.asarray(lab_from_body.as_euler("ZYX", degrees=True)[:, ::-1])
 
 
 def off_deg(believed: Rotation | None, truth: Rotation) -> Floats | None:
-    """(K,) angle between what is believed, or asked for, and the truth."""
+    """(K,) rotation angle between an estimated or commanded attitude and the truth, degrees; None for None."""
     return None if believed is None else np.degrees((believed.inv() * truth).magnitude())
 
 
 def per_hour(rate_rad_s: Floats) -> Floats:
-    """deg/h"""
+    """Convert rad/s to deg/h."""
     return np.degrees(rate_rad_s) * 3600
 
 
 def summary(log: Telemetry) -> dict[str, float]:
-    """The figures of a flight, those that it has."""
+    """Worst and final values of the recorded quantities; units are in the names.
+
+    Only the entries that the telemetry supports are present: pointing error with a reference attitude, wheel speed
+    with wheels, and so on.
+    """
     told, imu = off_deg(log.lab_from_ref, log.lab_from_body), off_deg(log.lab_from_imu, log.lab_from_body)
     by_filter = off_deg(log.lab_from_filter, log.lab_from_body)
     figures: dict[str, float] = {}
@@ -58,7 +62,7 @@ def summary(log: Telemetry) -> dict[str, float]:
 
 
 def table(log: Telemetry) -> Any:
-    """One row a tick, as an astropy table; angles in degrees."""
+    """Telemetry as an astropy table, one row per control tick; angles in degrees."""
     from astropy.table import Table
 
     columns: dict[str, Any] = {"t_s": log.t_s}
@@ -98,7 +102,10 @@ def table(log: Telemetry) -> Any:
 
 
 def imu_table(record: Increments) -> Any:
-    """Every sample of the IMU, for a filter of one's own; the tilt that the accelerometers alone would give."""
+    """Every IMU sample as an astropy table, for use in a separate attitude filter.
+
+    Columns: angle and velocity increments, and roll and pitch from each accelerometer sample alone.
+    """
     from astropy.table import Table
 
     columns: dict[str, Any] = {"t_s": record.t_s}
@@ -184,7 +191,7 @@ def momentum_panel(log: Telemetry, axes: Any) -> None:
 
 
 def panels(log: Telemetry) -> list[Callable[[Telemetry, Any], None]]:
-    """What there is to be shown of a flight."""
+    """The panels for which the telemetry has data."""
     stores = bool(log.wheel_rad_s.size or log.gimbal_rad.size)
     believes = log.lab_from_imu is not None or log.lab_from_ref is not None
     chosen = {
@@ -200,7 +207,7 @@ def panels(log: Telemetry) -> list[Callable[[Telemetry, Any], None]]:
 
 
 def figure(log: Telemetry) -> bytes:
-    """The flight against time, as PNG."""
+    """Telemetry against time, as PNG."""
     from matplotlib.figure import Figure
 
     shown = panels(log)

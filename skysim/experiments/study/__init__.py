@@ -1,5 +1,5 @@
-"""Studies: many trials of a scene whose fields vary, answered with error bars.
+"""Studies: Monte Carlo trials of a scene with varied parameters; results have confidence intervals.
 
-A study file becomes a `plan`; `trials` does one; an engine of `engines` does them all; `store` keeps a row of each;
-`table` says what came of it, `page` shows it.
+`loader` reads a study file into a `plan`; `trials` runs one trial; `execution` runs them all; `store` keeps one row
+per trial; `analysis` computes statistics and `report` shows them.
 """

@@ -1,4 +1,4 @@
-"""Studies from Python: run all trials of a study and return its table."""
+"""Python interface to studies: run all trials of a study and return its tables."""
 
 from __future__ import annotations
 
@@ -20,21 +20,21 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class StudyResult:
-    """A study whose trials are in a store: its plan, the store's path and how many trials failed."""
+    """A study with its trials in a store: plan, path of the store, number of failed trials."""
 
     plan: Plan
     path: Path
     failed: int
 
     def table(self) -> Table:
-        """One row a design point: its factors, and each response with its confidence interval and count."""
+        """One row per design point: its factors, and each response with its confidence interval and trial count."""
         from astropy.table import Table
 
         with store.open_store(self.path) as kept:
             return Table(tables.flat(tables.table(kept, self.plan.study.responses)))
 
     def trials(self) -> Table:
-        """One row a trial: the design point, its factors and every measured number."""
+        """One row per trial: design point, factors and every measured quantity."""
         from astropy.table import Table
 
         with store.open_store(self.path) as kept:
@@ -52,11 +52,12 @@ def run_study(
     out: str | Path | None = None,
     workers: int | None = None,
 ) -> StudyResult:
-    """Run the missing trials of a study, a file or a name in scenes/studies, and keep them in a store.
+    """Run the missing trials of a study and keep them in a store.
 
+    name      : path of a study file, or name of a study in scenes/studies
     overrides : keys of the study and their values, such as {"replicates": 20}
-    out       : folder of the store; out/NAME if left out. A store of the same study is continued
-    workers   : processes, as many as there are cores if left out; 1 runs the trials in this process
+    out       : folder of the store, by default out/NAME. A store of the same study is continued
+    workers   : number of processes, by default the number of cores; 1 runs the trials in this process
 
     A script that uses several processes needs the usual `if __name__ == "__main__":`. Raises InputError.
     """

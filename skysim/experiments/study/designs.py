@@ -1,4 +1,8 @@
-"""Which combinations of the factors are tried: full factorial, one at a time, or spread over their shares' cube."""
+"""Experimental designs: full factorial, one factor at a time, and samples of the unit cube of the factors.
+
+The sampled designs (Latin hypercube, Sobol sequence, Saltelli) generate points in [0, 1]^D, one coordinate per
+factor, and `Factor.at` maps each coordinate to a value.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +21,7 @@ from skysim.experiments.study.factors import Factor, Settings, Value
 
 
 class Point(NamedTuple):
-    """One combination: what each factor is called there, and the keys that all of them set."""
+    """One combination of factor levels: the level of each factor, and all settings together."""
 
     levels: dict[str, Value]
     settings: Settings
@@ -26,10 +30,10 @@ class Point(NamedTuple):
 class Design(ConfigModel):
     """How points are chosen.
 
-    kind  : factorial, every combination of levels; one_at_a_time, the first levels and each other level alone;
-            lhs, a Latin hypercube; sobol, Sobol's sequence; saltelli, what Sobol indices take: A, B, and A with each
-            of B's columns in turn, points * (factors + 2) in all (Saltelli et al. 2010)
-    points: of lhs, sobol and saltelli; for sobol and saltelli a power of two
+    kind  : factorial, every combination of levels; one_at_a_time, the first levels, then each other level alone;
+            lhs, a Latin hypercube; sobol, a Sobol sequence; saltelli, the sample for Sobol indices: matrices A and B,
+            and A with each column of B in turn, points * (factors + 2) in all (Saltelli et al. 2010)
+    points: number of points, for lhs, sobol and saltelli only; a power of two for sobol and saltelli
     """
 
     kind: Literal["factorial", "one_at_a_time", "lhs", "sobol", "saltelli"] = "factorial"
@@ -40,7 +44,7 @@ Factors = Mapping[str, Factor]
 
 
 def points(design: Design, factors: Factors, seed: int) -> list[Point]:
-    """All points of a design, in their order. Raises InputError where factors and design do not go together."""
+    """All points of a design, in order. Raises InputError if factors and design are incompatible."""
     drawn = design.kind in ("lhs", "sobol", "saltelli")
     if drawn != (design.points is not None):
         wanted = "takes how many" if drawn else "has as many as its levels make"
@@ -60,7 +64,7 @@ def points(design: Design, factors: Factors, seed: int) -> list[Point]:
 
 
 def merged(chosen: Mapping[str, tuple[Value, Settings]]) -> Point:
-    """One point of what each factor is at."""
+    """The point with these levels and settings of each factor."""
     settings: Settings = {}
     for _, sets in chosen.values():
         settings |= sets
@@ -83,7 +87,7 @@ def one_at_a_time(design: Design, factors: Factors, seed: int) -> Iterator[Point
 
 
 def at_shares(factors: Factors, shares: Floats) -> Iterator[Point]:
-    """The points at (P, D) shares of 1."""
+    """The points at (P, D) coordinates in the unit cube."""
     for row in shares:
         yield merged(
             {name: factor.at(float(u)) for (name, factor), u in zip(factors.items(), row, strict=True)}
@@ -91,19 +95,22 @@ def at_shares(factors: Factors, shares: Floats) -> Iterator[Point]:
 
 
 def lhs(design: Design, factors: Factors, seed: int) -> Iterator[Point]:
-    """A Latin hypercube: each factor's range is cut in as many strips as there are points, one in each."""
+    """A Latin hypercube: each factor's range is divided into as many strips as points, with one point in each."""
     yield from at_shares(
         factors, scipy.stats.qmc.LatinHypercube(len(factors), rng=seed).random(design.points or 0)
     )
 
 
 def sobol(design: Design, factors: Factors, seed: int) -> Iterator[Point]:
-    """Sobol's sequence, scrambled by the seed."""
+    """A Sobol sequence, scrambled by the seed."""
     yield from at_shares(factors, scipy.stats.qmc.Sobol(len(factors), rng=seed).random(design.points or 0))
 
 
 def saltelli(design: Design, factors: Factors, seed: int) -> Iterator[Point]:
-    """A, B, then for each factor A with that column of B: `sensitivity.indices` knows this order."""
+    """A, B, then for each factor A with that column taken from B. `sensitivity.outputs` relies on this order.
+
+    A and B are the two halves of the columns of one scrambled Sobol sequence of dimension 2 D.
+    """
     count, width = design.points or 0, len(factors)
     both = scipy.stats.qmc.Sobol(2 * width, rng=seed).random(count)
     a, b = both[:, :width], both[:, width:]

@@ -1,4 +1,9 @@
-"""What a study varies: a factor's levels, or how it is distributed. Schema, and from a share of 1 to a value."""
+"""Factors of a study: schema of levels, values, ranges and distributions.
+
+Every factor maps a number u in [0, 1] to a value (`at`). For a distribution this is its quantile function (inverse
+transform sampling), for a range the fraction of the way, and for levels the level of that cell of [0, 1]. A sampled
+design therefore only generates points in the unit cube.
+"""
 
 from __future__ import annotations
 
@@ -12,14 +17,14 @@ from pydantic import Discriminator, Field, Tag, model_validator
 
 from skysim.core.units import ConfigModel
 
-Value = Any  # of a key: what YAML can say
+Value = Any  # value of a key: any YAML value
 Settings = dict[str, Value]  # dotted keys of the scene, or of `trial.`, to values
 QUANTITY = re.compile(r"^\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(\D.*?)?\s*$")
 Name = Annotated[str, Field(pattern=r"^[a-z_]+(\.\w+)*$")]
 
 
 def split(value: Value) -> tuple[float, str]:
-    """A number, or one with a unit ("48 in"), as number and unit."""
+    """Split a number, or a quantity such as "48 in", into number and unit. Raises ValueError."""
     if isinstance(value, int | float) and not isinstance(value, bool):
         return float(value), ""
     told = QUANTITY.match(value) if isinstance(value, str) else None
@@ -29,7 +34,7 @@ def split(value: Value) -> tuple[float, str]:
 
 
 def joined(number: float, unit: str) -> Value:
-    """What `split` took apart; a whole number stays one."""
+    """The inverse of `split`; integral numbers become int."""
     if unit:
         return f"{number:.12g} {unit}"
     return int(number) if number == int(number) and abs(number) < 2**53 else float(f"{number:.12g}")
@@ -41,16 +46,16 @@ class Levels(ConfigModel):
     levels: Annotated[dict[str, Settings], Field(min_length=1)]
 
     def options(self) -> list[tuple[str, Settings]]:
-        """Every level: what it is called in tables and what it sets."""
+        """Every level: its name in tables and its settings."""
         return list(self.levels.items())
 
     def at(self, share: float) -> tuple[Value, Settings]:
-        """Of equally likely levels, the one at a share of 1."""
+        """The level at u = share in [0, 1]; all levels are equally likely."""
         return pick(self.options(), share)
 
 
 class Keyed(ConfigModel):
-    """Base of the factors of one value: it goes to one key, or to several that must be alike (apex and radius)."""
+    """Base of factors with one value, set at one key or at several keys that must be equal (apex and radius)."""
 
     key: Name | None = None
     keys: tuple[Name, ...] = ()
@@ -62,28 +67,28 @@ class Keyed(ConfigModel):
         return self
 
     def sets(self, value: Value) -> Settings:
-        """The value at every key."""
+        """Settings that give every key this value."""
         return dict.fromkeys(self.keys or (self.key or "",), value)
 
 
 class Values(Keyed):
-    """The values of a key."""
+    """Explicit values of a key."""
 
     values: Annotated[tuple[Value, ...], Field(min_length=1)]
 
     def options(self) -> list[tuple[Value, Settings]]:
-        """Every value."""
+        """Every value with its settings."""
         return [(value, self.sets(value)) for value in self.values]
 
     def at(self, share: float) -> tuple[Value, Settings]:
-        """Of equally likely values, the one at a share of 1."""
+        """The value at u = share in [0, 1]; all values are equally likely."""
         return pick(self.options(), share)
 
 
 class Range(Keyed):
-    """A key between two ends: `steps` values where levels are wanted, evenly likely in between where draws are.
+    """A key between two bounds: `steps` values in a design with levels, uniformly distributed in a sampled design.
 
-    scale : of equal steps (linear) or of equal ratios (log); whole : rounded to whole numbers
+    scale : equal steps (linear) or equal ratios (log); whole : rounded to whole numbers
     """
 
     from_: Annotated[Value, Field(alias="from")]
@@ -104,11 +109,11 @@ class Range(Keyed):
         return self
 
     def options(self) -> list[tuple[Value, Settings]]:
-        """`steps` values from one end to the other."""
+        """`steps` values from one bound to the other, both included."""
         return [self.at(share) for share in np.linspace(0, 1, self.steps)]
 
     def at(self, share: float) -> tuple[Value, Settings]:
-        """The value at a share of the way."""
+        """The value at the fraction `share` of the way from `from` to `to`."""
         (low, unit), (high, _) = split(self.from_), split(self.to)
         between = low * (high / low) ** share if self.scale == "log" else low + (high - low) * share
         value = joined(round(between) if self.whole else between, unit)
@@ -116,10 +121,10 @@ class Range(Keyed):
 
 
 class Distribution(Keyed):
-    """A key, drawn: normal (mean, sigma), lognormal (median, sigma of the logarithm), triangular (low, mode, high),
-    integers (low to high, both ends). Uniform and log-uniform are `from` and `to`.
+    """A random key: normal (mean, sigma), lognormal (median, sigma of the logarithm), triangular (low, mode, high),
+    integers (low to high, both included). For uniform and log-uniform use `from` and `to`.
 
-    With a unit all numbers but a lognormal's sigma have it.
+    All numbers have the same unit, except the sigma of a lognormal, which has none.
     """
 
     distribution: Literal["normal", "lognormal", "triangular", "integers"]
@@ -142,7 +147,7 @@ class Distribution(Keyed):
         return self
 
     def numbers(self) -> tuple[list[float], str]:
-        """The parameters in their order, and their unit."""
+        """The parameters in the order of PARAMETERS, and their unit. Raises ValueError."""
         parts = [split(getattr(self, name)) for name in PARAMETERS[self.distribution]]
         units = {unit for _, unit in (parts[:1] if self.distribution == "lognormal" else parts)}
         if len(units) > 1:
@@ -159,7 +164,7 @@ class Distribution(Keyed):
         return []
 
     def at(self, share: float) -> tuple[Value, Settings]:
-        """The quantile at a share of 1."""
+        """The quantile at probability `share`."""
         numbers, unit = self.numbers()
         value = joined(float(QUANTILES[self.distribution](share, *numbers)), unit)
         return value, self.sets(value)
@@ -183,12 +188,12 @@ QUANTILES: dict[str, Callable[..., Any]] = {
 
 
 def pick(options: list[tuple[Any, Settings]], share: float) -> tuple[Value, Settings]:
-    """The option that a share of 1 falls to, all of one width."""
+    """The option at u = share, with [0, 1] divided equally among the options."""
     return options[min(int(share * len(options)), len(options) - 1)]
 
 
 def kind_of(value: Any) -> str:
-    """Which sort of factor is meant, so that a slip in one is not answered with another's keys."""
+    """Tag of the kind of factor, from its keys, so that error messages name the keys of that kind only."""
     keys = value if isinstance(value, dict) else getattr(value, "__dict__", {})
     for name in ("levels", "values", "distribution"):
         if name in keys:

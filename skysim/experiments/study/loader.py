@@ -1,4 +1,4 @@
-"""Load a study: its file, its checks and the plan."""
+"""Load a study file, validate it and make its plan."""
 
 from __future__ import annotations
 
@@ -32,8 +32,9 @@ def load(
 ) -> Plan:
     """Read, override (`path.to.key` -> YAML value) and validate a study and every level of its factors.
 
-    programs : commands by name for `tracker.name`; None where the study shall not be run, and they need not be there
-    Raises BadInput with one line: the key, what is wrong with it, what is allowed, the file and line.
+    programs : commands of external trackers by name, for `tracker.name`; None if the study will not be run, and its
+               trackers need not be installed
+    Raises InputError with one line: the key, the fault, what is allowed, the file and line.
     """
     path = find(str(name))
     tree, text = read_yaml(path)
@@ -53,9 +54,9 @@ def load(
 
 
 def check(plan: Plan, to_run: bool) -> None:
-    """Refuse, before the first trial, what cannot be asked: responses, figures, budget, and levels one by one.
+    """Validate responses, figures, budget and each level of each factor before the first trial. Raises InputError.
 
-    to_run : whether the trackers have to be there
+    to_run : whether the trackers must be installed
     """
     from skysim.experiments.study.analysis import search
     from skysim.experiments.study.analysis.table import Line
@@ -96,7 +97,7 @@ def check(plan: Plan, to_run: bool) -> None:
 
 
 def check_tracker(plan: Plan, scene: Scene, trial: CentroidTrial | FrameTrial | FlightTrial) -> None:
-    """Refuse a tracker that no worker would find, or that a trial of centroids has nothing to show. Raises BadInput."""
+    """Raise InputError for an unknown tracker, and for an external tracker in a centroid trial (it takes images)."""
     name = scene.tracker.name
     known(name, plan.recipe.programs)
     if name != OWN and isinstance(trial, CentroidTrial):
@@ -104,7 +105,7 @@ def check_tracker(plan: Plan, scene: Scene, trial: CentroidTrial | FrameTrial | 
 
 
 def one_by_one(factors: Mapping[str, Factor]) -> Iterator[tuple[str, Value, Settings]]:
-    """Every level of every factor, the others at their middle: which factor, the level, all that is set."""
+    """Every level of every factor with the other factors at their middle: factor, level, all settings."""
     middle = {name: factor.at(0.5)[1] for name, factor in factors.items()}
     for name, factor in factors.items():
         for level, settings in factor.options() or [factor.at(0.5)]:
@@ -115,6 +116,6 @@ def one_by_one(factors: Mapping[str, Factor]) -> Iterator[tuple[str, Value, Sett
 
 
 def located(message: str, path: Path, text: str) -> str:
-    """A complaint of a study's key with its file and line."""
+    """An error message about a key of a study, with file and line added."""
     line = line_of(text, message.partition(":")[0].split("."))[1]
     return f"{message.removesuffix(' (--set)')} ({path}{f', line {line}' if line else ''})"

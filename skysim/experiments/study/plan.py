@@ -1,4 +1,4 @@
-"""A study file (YAML) becomes a validated `Plan`: which scene, which trial, which points, how often, what is asked."""
+"""Schema of a study file (YAML) and its validated `Plan`: scene, trial, design points, replicates and responses."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ Tilt = Annotated[Number, Field(ge=0, le=90)]
 class Anywhere(ConfigModel):
     """A random attitude in every trial, roll or yaw uniform.
 
-    tilt_deg : under a dome the body's lean from upright, one angle or uniform over the cap's ring between two
-    dec_deg  : under the stars the boresight is uniform over the sphere between two declinations
-    noise_seed : other noise at the same attitudes; a factor of it makes noise an input, as Sobol indices want
+    tilt_deg : under a dome, tilt of the body from vertical: one angle, or uniform in solid angle between two
+    dec_deg  : under the stars, the boresight is uniform over the sphere between two declinations
+    noise_seed : selects the noise at unchanged attitudes; as a factor it makes noise an input, as Sobol indices need
     """
 
     noise_seed: Annotated[int, Field(ge=0)] = 0
@@ -43,11 +43,12 @@ class Anywhere(ConfigModel):
 
 
 class CentroidTrial(Anywhere):
-    """Star identification and attitude from centroids, without a picture.
+    """Identification and attitude from simulated centroids, without an image.
 
-    noise_px : of a centroid, each axis;  magnitude_sigma : of its brightness
-    lights   : at most so many true ones, the brightest;  missing : share of the true lights not seen
-    false_lights : so many anywhere;  false_share : of all lights seen, rounded to a whole number of false ones
+    noise_px : standard deviation of a centroid, each axis;  magnitude_sigma : of its brightness, magnitudes
+    lights   : maximum number of true sources, the brightest;  missing : fraction of the true sources not detected
+    false_lights : number of false detections, uniform over the image
+    false_share  : fraction of all detections that are false; their number is rounded
     """
 
     kind: Literal["centroids"]
@@ -60,9 +61,10 @@ class CentroidTrial(Anywhere):
 
 
 class FrameTrial(Anywhere):
-    """One whole frame: rendered, with all the camera's noise, then solved.
+    """One frame, rendered with all camera noise, then solved.
 
-    rate_deg_s : about a random axis across the boresight;  gyro : whether the tracker is told how stars smear
+    rate_deg_s : rate about a random axis perpendicular to the boresight
+    gyro : whether the tracker receives the streak vector of the stars
     """
 
     kind: Literal["frames"]
@@ -71,9 +73,9 @@ class FrameTrial(Anywhere):
 
 
 class FlightTrial(ConfigModel):
-    """The whole scene: flown, photographed, solved and, where it has a filter, filtered.
+    """The complete scene: motion simulated, frames rendered and solved, with the attitude filter if it has one.
 
-    settle : frames before this do not count
+    settle : frames before this time are not counted
     """
 
     kind: Literal["flight"]
@@ -84,7 +86,7 @@ Trial = Annotated[CentroidTrial | FrameTrial | FlightTrial, Field(discriminator=
 
 
 class Budget(ConfigModel):
-    """What a study may cost: trials in all, wall-clock time, failed trials; after the latter two it can be resumed."""
+    """Limits of a study: total trials, wall-clock time, failed trials; it can be resumed after the last two."""
 
     trials: Annotated[int, Field(ge=1)] | None = None
     time_s: Annotated[Time, Field(gt=0)] | None = None
@@ -92,7 +94,7 @@ class Budget(ConfigModel):
 
 
 class Curve(ConfigModel):
-    """A figure: one response against a factor, a line for each level of another."""
+    """A figure: one response against a factor, with a line for each level of another factor."""
 
     kind: Literal["curve"]
     x: str
@@ -117,7 +119,7 @@ Figure = Annotated[Curve | Heat, Field(discriminator="kind")]
 
 
 class Cost(ConfigModel):
-    """What a point costs: base + sum of `per` times a factor's value + the named level's price."""
+    """Cost of a point: base + sum of `per` times the factor's value + the prices of its named levels."""
 
     base: Number = 0.0
     per: dict[str, Number] = Field(default_factory=dict)
@@ -132,7 +134,7 @@ class Objective(ConfigModel):
 
 
 class Constraint(ConfigModel):
-    """A response (or `cost`) and what it must not leave."""
+    """A response (or `cost`) and its bounds."""
 
     response: str
     at_least: Number | None = None
@@ -140,9 +142,9 @@ class Constraint(ConfigModel):
 
 
 class Search(ConfigModel):
-    """What `skysim study optimise` looks for: one objective, or two and their Pareto front.
+    """The optimization of `skysim study optimise`: one objective, or the Pareto front of two.
 
-    candidates : points tried, each with all replicates
+    candidates : number of points evaluated, each with all replicates
     """
 
     objectives: Annotated[tuple[Objective, ...], Field(min_length=1, max_length=2)]
@@ -152,11 +154,11 @@ class Search(ConfigModel):
 
 
 class Study(ConfigModel):
-    """A question, before it is answered.
+    """A study file: scene, trial, factors, design and responses.
 
-    scene      : by name or by path, from the study file's folder; `set` overrides keys of it for all points
-    paired     : the same random attitudes and noise at every point, replicate by replicate, so that points compare
-    responses  : as `metrics.RESPONSES` names them
+    scene      : name, or path relative to the study file's folder; `set` overrides keys of it at all points
+    paired     : use the same random attitudes and noise at every point for each replicate (common random numbers)
+    responses  : names that `metrics.response` accepts
     """
 
     schema_version: Annotated[Literal[1], Field(alias="schema")]
@@ -177,10 +179,10 @@ class Study(ConfigModel):
 
 @dataclass(frozen=True, slots=True)
 class Recipe:
-    """What a worker has to know of a study to do any trial of it.
+    """The part of a study that a worker needs to run any of its trials.
 
-    folder : of the study file, against which scenes are named
-    programs : commands by name, which `tracker.name` may be: of the command line, and no part of a study's digest
+    folder : folder of the study file, to which scene paths are relative
+    programs : commands of external trackers by name, from the command line; not part of the study's digest
     """
 
     scene: str
@@ -194,7 +196,7 @@ class Recipe:
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """A study with its points. Trial number = point * replicates + replicate."""
+    """A study with its design points. Trial number = point * replicates + replicate."""
 
     path: Path
     study: Study
@@ -203,40 +205,40 @@ class Plan:
 
     @property
     def name(self) -> str:
-        """The study file's."""
+        """Name of the study: the stem of its file."""
         return self.path.stem
 
     @property
     def trials(self) -> int:
-        """How many there are in all."""
+        """Total number of trials."""
         return len(self.points) * self.study.replicates
 
     @property
     def digest(self) -> str:
-        """A hash of everything that decides on a trial; title, figures, budget and the like may change."""
+        """Hash of everything that affects a trial's outcome; title, figures, responses and budget may change."""
         told = self.study.model_dump(mode="json", by_alias=True)
         kept = ("scene", "seed", "set", "trial", "factors", "design", "replicates", "paired", "optimise")
         return digest({key: told[key] for key in kept})
 
 
 def digest(told: Any) -> str:
-    """Sixteen hexadecimal digits of a JSON value's SHA-256."""
+    """First 16 hexadecimal digits of the SHA-256 of a JSON value."""
     text = json.dumps(told, sort_keys=True, separators=(",", ":"), default=str)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 def find(name: str) -> Path:
-    """The path of a study given by path or by its name in scenes/studies/."""
+    """Path of a study that is given by path or by its name in scenes/studies/."""
     return yaml_reader.find(name, STUDIES, "study")
 
 
 def title_of(path: Path) -> str:
-    """A study file's title, the rest of it unread."""
+    """Title of a study file; the rest is not validated."""
     return str(read_yaml(path)[0].get("title", ""))
 
 
 def planned(path: Path, study: Study, trial: dict[str, Any], programs: Mapping[str, str]) -> Plan:
-    """The study's points and what a worker has to know; `trial` as the file has it, units and all."""
+    """The plan of a study; `trial` is the section as written in the file, with units."""
     chosen = [] if study.optimise else points(study.design, study.factors, study.seed)
     folder = str(path.resolve().parent)
     told = Recipe(study.scene, folder, study.seed, study.set, trial, study.paired, dict(programs))
@@ -244,7 +246,7 @@ def planned(path: Path, study: Study, trial: dict[str, Any], programs: Mapping[s
 
 
 def resolved(recipe: Recipe, settings: Settings) -> tuple[Scene, CentroidTrial | FrameTrial | FlightTrial]:
-    """The scene and the trial at a point. Raises InputError with one line."""
+    """The scene and the trial at a point, with its settings applied. Raises InputError with one line."""
     told = recipe.base | settings
     name = str(told.get("scene", recipe.scene))
     tree: dict[str, Any] = {"trial": dict(recipe.trial)}
@@ -264,16 +266,16 @@ def resolved(recipe: Recipe, settings: Settings) -> tuple[Scene, CentroidTrial |
 
 
 def told_of(error: ValidationError, tree: dict[str, Any]) -> str:
-    """A fault of a trial as of any file, without a place: the factor that made it is told by who asked."""
+    """One-line message of a validation error in section `trial`, without file and line; the caller adds the factor."""
     return explain(error, Asked, tree, [(Path(), "")], {}).removesuffix(f" ({Path()})")
 
 
 class Asked(ConfigModel):
-    """The section `trial` alone."""
+    """Wrapper that validates section `trial` alone."""
 
     trial: Trial
 
 
 def as_yaml(value: Value) -> str:
-    """A value as YAML, on one line."""
+    """A value as YAML on one line."""
     return yaml.safe_dump(value, default_flow_style=True, width=1_000_000).removesuffix("\n...\n")

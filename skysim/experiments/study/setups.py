@@ -1,4 +1,4 @@
-"""What trials are made on: a scene's hardware and its tracker, set up once; and where a row says that it is from."""
+"""Prepared test beds and trackers for trials, cached per worker; hashes and seeds that record a row's origin."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from skysim.simulation.testbed import Testbed
 from skysim.tracking import factory
 from skysim.tracking.external import interface
 
-KEPT = 4  # benches a worker keeps ready
+KEPT = 4  # benches that a worker caches
 
 
 class Bench(NamedTuple):
-    """A scene set up for trials: hardware, flown nowhere; the tracker with its index; what a trial is; a hash of it."""
+    """A scene prepared for trials: hardware without simulated motion, tracker with its index, trial, scene hash."""
 
     lab: Testbed
     estimator: factory.Estimator
@@ -35,7 +35,7 @@ class Bench(NamedTuple):
 
 
 class Shelf(threading.local):
-    """The benches that a thread of a worker has ready, the last used last; a lab's canvas is for one at a time."""
+    """Least-recently-used cache of benches. One per thread, because a test bed's canvas serves one trial at a time."""
 
     def __init__(self) -> None:
         self.benches: OrderedDict[str, Bench] = OrderedDict()
@@ -45,7 +45,7 @@ SHELF = Shelf()
 
 
 def bench(recipe: Recipe, settings: Settings) -> Bench:
-    """The bench of a point, from the shelf where it is there. Raises InputError."""
+    """The bench of a design point, from the cache if it is there. Raises InputError."""
     key = digest([recipe.scene, recipe.folder, recipe.base, recipe.trial, recipe.programs, settings])
     shelf = SHELF.benches
     if key not in shelf:
@@ -57,7 +57,7 @@ def bench(recipe: Recipe, settings: Settings) -> Bench:
 
 
 def set_up(recipe: Recipe, settings: Settings) -> Bench:
-    """Hardware and tracker of a point; of the bench before where the two differ in the trial alone."""
+    """Build hardware and tracker of a point, or reuse those of a cached bench that differs only in its trial."""
     scene, trial = resolved(recipe, settings)
     told = scene_hash(scene)
     for ready in SHELF.benches.values():
@@ -69,7 +69,10 @@ def set_up(recipe: Recipe, settings: Settings) -> Bench:
 
 
 def like_before(scene: Scene) -> Testbed | None:
-    """The lab of a bench whose scene differs in what its tracker believes alone: its hardware is the same."""
+    """The test bed of a cached bench whose scene differs only in section `tracker`, so that the hardware is the same.
+
+    Returns None if there is no such bench.
+    """
     for ready in SHELF.benches.values():
         if ready.lab.scene.model_copy(update={"tracker": scene.tracker}) == scene:
             return replace(ready.lab, scene=scene)
@@ -77,14 +80,14 @@ def like_before(scene: Scene) -> Testbed | None:
 
 
 def scene_hash(scene: Scene) -> str:
-    """Of a scene, of the files that it names and of the tracker that another package offers."""
+    """Hash of a scene, of the contents of the files it names, and of the release of an external tracker."""
     tree = scene.model_dump(mode="json", by_alias=True)
     named = [sha256(Path(path).read_bytes()).hexdigest() for path in files_of(tree)]
     return digest([tree, named, interface.release(scene.tracker.name)])
 
 
 def files_of(tree: dict[str, Any]) -> list[str]:
-    """The files of its own that a scene names, where they are there."""
+    """Paths of the files that a scene names in its keys, if they exist."""
     found = []
     for keys in FILES:
         node: Any = tree
@@ -97,7 +100,7 @@ def files_of(tree: dict[str, Any]) -> list[str]:
 
 @cache
 def code_version() -> str:
-    """A hash of the sources of skysim and estimator and of their data: what a stored trial was made with."""
+    """Hash of the source code of skysim and estimator and of their data; stored with each trial."""
     told = sha256()
     sources = [path for package in ("skysim", "estimator") for path in (ROOT / package).rglob("*.py")]
     data = [
@@ -112,6 +115,6 @@ def code_version() -> str:
 
 
 def seed_of(recipe: Recipe, point: int, replicate: int) -> int:
-    """A trial's own seed, 63 bits, from the study's; with `paired` the same at every point."""
+    """Seed of a trial, 63 bits, derived from the study's seed; with `paired` it is the same at every point."""
     key = (replicate,) if recipe.paired else (replicate, point)
     return int(np.random.SeedSequence(recipe.seed, spawn_key=key).generate_state(1, np.uint64)[0] >> 1)

@@ -1,7 +1,7 @@
-"""Where a study keeps its trials: one SQLite file, one row a trial, written by one run at a time.
+"""Store of a study's trials: one SQLite file with one row per trial, written by one run at a time.
 
-`trials` and `points` depend on the study alone; who did a trial, when and how quickly is in `timings` and `runs`.
-Every batch of rows is one transaction of a write-ahead log, so a run that is killed leaves whole batches.
+Tables `trials` and `points` depend only on the study; engine, time and speed are in `timings` and `runs`. Every batch
+of rows is one transaction of a write-ahead log, so a killed run leaves only complete batches.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ COLUMNS = (
     *FIELDS,
     "error",
     "time_ms",
-)  # of `columns`
+)  # of `Store.columns`
 
 TABLES = f"""
 CREATE TABLE IF NOT EXISTS meta (key TEXT PRIMARY KEY, value TEXT NOT NULL);
@@ -62,23 +62,23 @@ INSERT = f"INSERT OR REPLACE INTO trials VALUES ({', '.join('?' * (7 + len(FIELD
 
 
 class Store:
-    """One study's file. `open_store` makes or opens one; without `lock` it is for reading."""
+    """An open store of one study. `open_store` opens one for reading, `writing` makes or opens one for writing."""
 
     def __init__(self, path: Path, connection: sqlite3.Connection) -> None:
         self.path, self.db = path, connection
 
     def meta(self, key: str) -> str:
-        """What is noted under a key; empty where nothing is."""
+        """The value of a metadata key; empty if it is not set."""
         found = self.db.execute("SELECT value FROM meta WHERE key = ?", (key,)).fetchone()
         return found[0] if found else ""
 
     def note(self, **values: str) -> None:
-        """Note values under keys."""
+        """Set metadata keys."""
         with self.db:
             self.db.executemany("INSERT OR REPLACE INTO meta VALUES (?, ?)", values.items())
 
     def overrides(self) -> dict[str, str]:
-        """What the run's command line had put over the study: texts by key."""
+        """Overrides of study keys from the run's command line: YAML text by key. Raises InputError."""
         with self.sound():
             told = json.loads(self.meta("overrides") or "{}")
             if not isinstance(told, dict) or not all(isinstance(value, str) for value in told.values()):
@@ -86,7 +86,7 @@ class Store:
             return told
 
     def begin(self, points: Iterable[Point], **values: str) -> None:
-        """Make the store a study's: its points and what is noted of it, all or nothing."""
+        """Initialize the store with a study's points and metadata, in one transaction."""
         rows = (
             (n, json.dumps(one.levels, default=str), json.dumps(one.settings, default=str))
             for n, one in enumerate(points)
@@ -97,17 +97,17 @@ class Store:
             self.db.executemany("INSERT OR REPLACE INTO meta VALUES (?, ?)", values.items())
 
     def scenes(self) -> list[tuple[int, str]]:
-        """The first and the last point of trials that did not fail, with their scenes' hashes."""
+        """Point and scene hash of the first and the last trial that did not fail."""
         told = "SELECT point, scene FROM trials WHERE scene != '' AND error IS NULL ORDER BY trial {} LIMIT 1"
         return [row for order in ("ASC", "DESC") for row in self.db.execute(told.format(order))]
 
     def forget_failed(self) -> None:
-        """Drop the trials that raised, so that they are done again."""
+        """Delete the failed trials, so that they are run again."""
         with self.db:
             self.db.execute("DELETE FROM trials WHERE error IS NOT NULL")
 
     def set_points(self, points: Iterable[Point], first: int = 0) -> None:
-        """Points by their numbers, from `first`."""
+        """Insert or replace points, numbered from `first`."""
         rows = (
             (first + n, json.dumps(point.levels, default=str), json.dumps(point.settings, default=str))
             for n, point in enumerate(points)
@@ -116,13 +116,13 @@ class Store:
             self.db.executemany("INSERT OR REPLACE INTO points VALUES (?, ?, ?)", rows)
 
     def points(self) -> list[Point]:
-        """All points, in order."""
+        """All points, in order. Raises InputError."""
         rows = self.db.execute("SELECT levels, settings FROM points ORDER BY point")
         with self.sound():
             return [Point(json.loads(levels), json.loads(settings)) for levels, settings in rows]
 
     def add(self, rows: list[Row]) -> None:
-        """Keep rows, all or none of them."""
+        """Store rows in one transaction."""
         values = [(*row[:6], *map(plain, astuple(row.outcome)), row.error) for row in rows]
         with self.db:
             self.db.executemany(INSERT, values)
@@ -130,36 +130,36 @@ class Store:
             self.db.executemany("INSERT OR REPLACE INTO timings VALUES (?, ?)", times)
 
     def ran(self, engine: str, workers: int, trials: int, seconds: float) -> None:
-        """Note that a run ended."""
+        """Record a finished run."""
         with self.db:
             row = (None, time.time() - seconds, engine, workers, trials, seconds)
             self.db.execute("INSERT INTO runs VALUES (?, ?, ?, ?, ?, ?)", row)
 
     def runs(self) -> list[dict[str, Any]]:
-        """Every run that ended by itself: engine, workers, trials, seconds."""
+        """Every run that was not killed: engine, workers, trials, seconds."""
         rows = self.db.execute("SELECT engine, workers, trials, seconds FROM runs ORDER BY run")
         return [dict(zip(("engine", "workers", "trials", "seconds"), row, strict=True)) for row in rows]
 
     def done(self, count: int) -> NDArray[np.bool_]:
-        """(count,) which trials are in; those that failed too."""
+        """(count,) mask of the trials in the store, failed ones included."""
         mask = np.zeros(count, bool)
         for (trial,) in self.db.execute("SELECT trial FROM trials WHERE trial < ?", (count,)):
             mask[trial] = True
         return mask
 
     def counts(self) -> dict[str, int]:
-        """How many trials are in, failed, were answered wrongly."""
+        """Number of trials in the store, of failed trials, and of wrong attitudes."""
         told = "SELECT COUNT(*), COALESCE(SUM(error IS NOT NULL), 0), COALESCE(SUM(wrong), 0) FROM trials"
         return dict(zip(("done", "failed", "wrong"), self.db.execute(told).fetchone(), strict=True))
 
     def failures(self) -> list[tuple[int, str]]:
-        """Trials that raised, and the last line of what."""
+        """Number of each failed trial and the last line of its traceback. Raises InputError."""
         rows = self.db.execute("SELECT trial, error FROM trials WHERE error IS NOT NULL ORDER BY trial")
         with self.sound():
             return [(trial, error.strip().splitlines()[-1]) for trial, error in rows]
 
     def trial(self, number: int) -> dict[str, Any]:
-        """One row with its names. Raises InputError where it is not in."""
+        """One row by column name. Raises InputError if the trial is not in the store."""
         found = self.db.execute("SELECT * FROM trials WHERE trial = ?", (number,))
         row = found.fetchone()
         if row is None:
@@ -167,12 +167,12 @@ class Store:
         return dict(zip((column[0] for column in found.description), row, strict=True))
 
     def span(self) -> str:
-        """The numbers of the trials that are in."""
+        """Range of the trial numbers in the store, as text for messages."""
         low, high = self.db.execute("SELECT MIN(trial), MAX(trial) FROM trials").fetchone()
         return "none yet" if low is None else f"{low} to {high}"
 
     def columns(self, where: str = "1", values: tuple[Any, ...] = ()) -> dict[str, NDArray[Any]]:
-        """Every column of `trials` and `timings.time_ms` as an array, in the trials' order; NaN for what is missing."""
+        """Every column of `trials`, and `timings.time_ms`, as arrays in trial order; NaN for missing values."""
         told = f"SELECT trials.*, time_ms FROM trials LEFT JOIN timings USING (trial) WHERE {where} ORDER BY trial"
         found = self.db.execute(told, values)
         names = [column[0] for column in found.description]
@@ -184,12 +184,12 @@ class Store:
             return {name: as_array(name, column) for name, column in zip(names, lists, strict=True)}
 
     def of_point(self, point: int) -> dict[str, NDArray[Any]]:
-        """The columns of one point's trials."""
+        """The columns of the trials of one point."""
         return self.columns("point = ?", (point,))
 
     @contextmanager
     def sound(self) -> Iterator[None]:
-        """Values that SQLite holds and we never wrote are told as such. Raises InputError."""
+        """Raise InputError, instead of a decoding error, for values that skysim cannot have written."""
         try:
             yield
         except (ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError) as error:
@@ -198,19 +198,19 @@ class Store:
             ) from None
 
     def check(self) -> bool:
-        """Whether SQLite finds the file whole."""
+        """Whether SQLite's integrity check passes."""
         return bool(self.db.execute("PRAGMA integrity_check").fetchone()[0] == "ok")
 
 
 def plain(value: Any) -> Any:
-    """A value as SQLite has it: no NaN, no numpy."""
+    """A value as stored in SQLite: None for NaN, a Python float for a NumPy float."""
     if isinstance(value, float):
         return None if math.isnan(value) else float(value)
     return value
 
 
 def as_array(name: str, column: list[Any]) -> NDArray[Any]:
-    """A column: text as objects, whole numbers as such, else floats."""
+    """A column as an array: objects for text, int64 for integers, otherwise floats with NaN for null."""
     if name in TEXT or name in ("scene", "code", "error"):
         return np.array(column, dtype=object)
     if name in WHOLE or name in ("trial", "point", "replicate", "seed"):
@@ -220,7 +220,7 @@ def as_array(name: str, column: list[Any]) -> NDArray[Any]:
 
 @contextmanager
 def open_store(path: Path) -> Iterator[Store]:
-    """A store to be read while a run may write it. Raises InputError where there is none, or none that is whole."""
+    """Open a store for reading; a run may write it at the same time. Raises InputError if it is missing or damaged."""
     if not path.is_file():
         raise InputError(f"{path}: no store; allowed: one that skysim study run made")
     with legible(path, "no store of a study: "), connected(path) as db:
@@ -232,8 +232,8 @@ def open_store(path: Path) -> Iterator[Store]:
 
 @contextmanager
 def legible(path: Path, what: str = "") -> Iterator[None]:
-    """What SQLite and its adapter say of a file that is none of theirs, of bytes that are no text, and of a size that
-    no memory holds is told as such. Raises InputError."""
+    """Raise InputError instead of the errors of SQLite for a damaged file: not a database, invalid text, or a declared
+    size that exceeds memory."""
     try:
         yield
     except (sqlite3.DatabaseError, UnicodeDecodeError, MemoryError) as error:
@@ -243,9 +243,10 @@ def legible(path: Path, what: str = "") -> Iterator[None]:
 
 @contextmanager
 def writing(path: Path) -> Iterator[Store]:
-    """The store of a path for the one run that may write it; made where it is not there.
+    """Open a store for writing by one run; it is created if missing.
 
-    A lock beside it, itself SQLite's, goes when its holder ends in whatever way. Raises InputError where another has it.
+    The lock is an SQLite transaction on a second file. The operating system releases it even if the run is killed.
+    Raises InputError if another run holds it.
     """
     make_folder(path.parent)
     lock_file = path.with_suffix(".lock")
@@ -265,7 +266,7 @@ def writing(path: Path) -> Iterator[Store]:
 
 
 def hold(lock: sqlite3.Connection, path: Path) -> None:
-    """Take the lock until its connection is closed. Raises InputError where another has it."""
+    """Hold the lock until its connection is closed. Raises InputError if another run holds it."""
     try:
         lock.execute("BEGIN EXCLUSIVE")
     except sqlite3.OperationalError as error:
@@ -277,7 +278,7 @@ def hold(lock: sqlite3.Connection, path: Path) -> None:
 
 @contextmanager
 def connected(path: Path) -> Iterator[sqlite3.Connection]:
-    """A connection that is closed at the end."""
+    """A database connection that is closed on exit."""
     db = sqlite3.connect(os.fspath(path), timeout=30)
     try:
         yield db
@@ -285,6 +286,6 @@ def connected(path: Path) -> Iterator[sqlite3.Connection]:
         db.close()
 
 
-# What they share.
+# File name of the store in a study's results folder.
 
 STORE = "study.sqlite"

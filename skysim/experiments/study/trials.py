@@ -1,6 +1,6 @@
-"""One trial: a random attitude, what the camera makes of it, what the tracker makes of that, and how wrong it is.
+"""Run one trial: draw a random attitude, simulate centroids or a frame (or a complete run), solve, and score.
 
-A trial hangs on its recipe, its point and its seed alone: not on what was tried before, nor on who tries it.
+A trial depends only on its recipe, design point and seed, not on the order of trials or the worker.
 """
 
 from __future__ import annotations
@@ -34,22 +34,23 @@ from skysim.simulation import exposure, run, testbed
 from skysim.simulation.testbed import SPARE_S, Testbed
 from skysim.tracking import factory
 
-KNOTS = 9  # of a frame trial's flight
-ANY_TIME_S = np.array([0.0, 1.0])
+KNOTS = 9  # samples of a frame trial's trajectory
+ANY_TIME_S = np.array([0.0, 1.0])  # the pose does not change, so the times are arbitrary
 
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What came of a trial. Of a flight errors are rms over its solved frames, counts sums or what is told.
+    """Result of a trial. For a flight trial, errors are RMS over the solved frames and counts are sums unless noted.
 
-    status   : "solved", why there is no attitude, or of a trial that raised "failed"
-    frames, solved, wrong : how many were photographed, answered, answered more than ten arc-minutes off
-    x_arcsec, y_arcsec, roll_arcsec : error in camera axes, signed (of a flight rms); NaN where nothing was answered
-    nees     : e' P^-1 e of three degrees of freedom, what the tracker claims of its errors for P; a flight's mean
-    stars    : true lights on the chip; a flight's least.  detected, matched : centroids and names; a flight's means
-    availability : share of a flight's ticks at which its filter is within ten arc-minutes; without one of its frames
-    filter_arcsec, filter_worst_arcsec : angle by which a flight's filter is off, rms and worst
-    drift_arcsec : filter_arcsec of the flight's last quarter less the first's
+    status   : "solved", the reason why there is no attitude, or "failed" if the trial raised an exception
+    frames, solved, wrong : number of frames, of solved frames, and of solutions more than ten arcminutes off
+    x_arcsec, y_arcsec, roll_arcsec : error in camera axes, signed (RMS for a flight); NaN without a solution
+    nees     : e^T P^-1 e with three degrees of freedom and the tracker's covariance P; mean for a flight
+    stars    : true sources on the detector, minimum for a flight.  detected, matched : numbers, means for a flight
+    availability : fraction of a flight's ticks with a filter error below ten arcminutes; without a filter, fraction
+               of its frames solved correctly
+    filter_arcsec, filter_worst_arcsec : angular error of a flight's filter, RMS and worst
+    drift_arcsec : filter_arcsec of the last quarter of a flight minus that of the first quarter
     """
 
     status: str
@@ -74,7 +75,7 @@ FAILED = Outcome("failed")
 
 
 class Row(NamedTuple):
-    """One trial as it is stored."""
+    """One trial as stored."""
 
     trial: int
     point: int
@@ -88,7 +89,7 @@ class Row(NamedTuple):
 
 
 class Segment(NamedTuple):
-    """Successive replicates of one point, the unit that travels to a worker."""
+    """Consecutive replicates of one point, starting with trial number `first`; chunks of these go to workers."""
 
     point: int
     settings: Settings
@@ -96,11 +97,11 @@ class Segment(NamedTuple):
     replicates: range
 
 
-# Doing them.
+# Running trials.
 
 
 def work(recipe: Recipe, segments: tuple[Segment, ...]) -> list[Row]:
-    """All trials of some segments, in their order."""
+    """Run all trials of some segments, in order."""
     return [
         one(recipe, segment, segment.first + n, replicate)
         for segment in segments
@@ -109,7 +110,7 @@ def work(recipe: Recipe, segments: tuple[Segment, ...]) -> list[Row]:
 
 
 def one(recipe: Recipe, segment: Segment, trial: int, replicate: int) -> Row:
-    """One trial; what it raises is in its row."""
+    """Run one trial; an exception is stored in its row as a traceback."""
     seed = seed_of(recipe, segment.point, replicate)
     scene, outcome, error, begin = "", FAILED, None, time.perf_counter()
     try:
@@ -117,20 +118,20 @@ def one(recipe: Recipe, segment: Segment, trial: int, replicate: int) -> Row:
         scene, begin = ready.scene_hash, time.perf_counter()
         outcome = TRIALS[ready.trial.kind](ready, seed)
     except Exception:
-        error = traceback.format_exc().replace(f"{ROOT}/", "")  # the same wherever skysim is installed
+        error = traceback.format_exc().replace(f"{ROOT}/", "")  # independent of the installation path
     spent = time.perf_counter() - begin
     return Row(trial, segment.point, replicate, seed, scene, code_version(), outcome, error, spent)
 
 
 def centroids(ready: Bench, seed: int) -> Outcome:
-    """Random attitude, true lights with noise, false ones; identified and solved."""
+    """Centroid trial: random attitude, noisy true detections and false ones; identified and solved."""
     lab_from_body, xy_px, seen = sight(ready, seed)
     answer = ready.estimator.solve_centroids(seen)
     return scored(answer, cam_from_lab_wxyz(ready.lab, lab_from_body), len(xy_px), len(seen))
 
 
 def sight(ready: Bench, seed: int) -> tuple[Rotation, Floats, Centroids]:
-    """A centroid trial's attitude lab_from_body, (N, 2) pixels of the true lights, and what is told of them."""
+    """Inputs of a centroid trial: lab_from_body, (N, 2) true pixel positions, and the simulated detections."""
     trial, (where, noise) = ready.trial, streams(ready, seed)
     assert isinstance(trial, CentroidTrial)
     lab_from_body = attitude(ready, where)
@@ -139,26 +140,26 @@ def sight(ready: Bench, seed: int) -> tuple[Rotation, Floats, Centroids]:
 
 
 def streams(ready: Bench, seed: int) -> tuple[np.random.Generator, np.random.Generator]:
-    """Of a trial's attitude, and of its noise: the latter is another for another `noise_seed`, the attitude stays."""
+    """Random generators of a trial's attitude and of its noise; `noise_seed` changes the noise only."""
     trial = ready.trial
     assert isinstance(trial, CentroidTrial | FrameTrial)
     return np.random.default_rng([seed, 0]), np.random.default_rng([seed, 1, trial.noise_seed])
 
 
 def frames(ready: Bench, seed: int) -> Outcome:
-    """Random attitude, one whole frame, solved."""
+    """Frame trial: random attitude, one rendered frame, solved."""
     frame, truth, streak_px = shot(ready, seed)
     return answered(factory.answer(ready.estimator, frame, streak_px), truth)
 
 
 def answered(report: Report, truth: Truth) -> Outcome:
-    """What the tracker made of a frame, beside the frame's truth."""
+    """Outcome of a frame from the tracker's report and the truth."""
     truly = quaternion.of(truth.cam_from_lab)
     return scored(report.attitude, truly, len(truth.seen.id), len(report.centroids))
 
 
 def flight(ready: Bench, seed: int) -> Outcome:
-    """The whole scene by another seed."""
+    """Flight trial: the complete scene with another seed."""
     trial = ready.trial
     assert isinstance(trial, FlightTrial)
     lab = run.simulate_motion(reseeded(ready.lab, seed))
@@ -167,7 +168,10 @@ def flight(ready: Bench, seed: int) -> Outcome:
 
 
 def scores(lab: Testbed, estimator: factory.Estimator) -> Iterator[tuple[float, Outcome]]:
-    """Mid-exposure and outcome of every frame; those that were solved in flight are not taken again."""
+    """Mid-exposure time and outcome of every frame.
+
+    Frames already solved during the motion simulation (`lab.reports`) are not rendered again.
+    """
     if not lab.reports:
         for shot in run.run(lab, estimator):
             yield shot.truth.t_s, answered(shot.report, shot.truth)
@@ -186,14 +190,19 @@ TRIALS: dict[str, Callable[[Bench, int], Outcome]] = {
 }
 
 
-# What they are made of.
+# Parts of trials.
 
 
 def attitude(ready: Bench, rng: np.random.Generator) -> Rotation:
-    """lab_from_body: under a dome leaning to any side, else with the boresight anywhere; any turn about it."""
+    """Random lab_from_body.
+
+    Under a dome: tilt uniform in solid angle within `tilt_deg`, tilt direction and yaw uniform. Otherwise: boresight
+    uniform over the sphere within `dec_deg`, roll uniform.
+    """
     trial = ready.trial
     assert isinstance(trial, CentroidTrial | FrameTrial)
     first, last = rng.uniform(0, 2 * math.pi, 2)
+    # A uniform cosine of the tilt, or sine of the declination, is uniform in solid angle.
     if isinstance(ready.lab.scene.light, DomeConfig):
         low, high = trial.tilt_deg if isinstance(trial.tilt_deg, tuple) else (trial.tilt_deg,) * 2
         cosine = rng.uniform(math.cos(math.radians(high)), math.cos(math.radians(low)))
@@ -206,7 +215,7 @@ def attitude(ready: Bench, rng: np.random.Generator) -> Rotation:
 
 
 def zyz(first_rad: float, second_rad: float, third_rad: float) -> Floats:
-    """(4,) wxyz of Rz(first) Ry(second) Rz(third), which takes z to azimuth `first`, zenith distance `second`."""
+    """(4,) wxyz of Rz(first) Ry(second) Rz(third), which rotates z to azimuth `first` and zenith angle `second`."""
     half, both, unlike = second_rad / 2, (first_rad + third_rad) / 2, (first_rad - third_rad) / 2
     sine, cosine = math.sin(half), math.cos(half)
     return np.array(
@@ -215,13 +224,16 @@ def zyz(first_rad: float, second_rad: float, third_rad: float) -> Floats:
 
 
 def cam_from_lab_wxyz(lab: Testbed, lab_from_body: Rotation) -> Floats:
-    """(4,) the camera's attitude."""
+    """(4,) quaternion wxyz of cam_from_lab."""
     cam_from_body = quaternion.of(lab.mount.cam_from_body)
     return quaternion.multiply(cam_from_body, quaternion.inverse(quaternion.of(lab_from_body)))
 
 
 def lights(lab: Testbed, lab_from_body: Rotation) -> tuple[Floats, Floats]:
-    """(N, 2) pixels and (N,) photo-electrons of the lights whose middle is on the chip, as the hardware has them."""
+    """(N, 2) pixel positions and (N,) photoelectrons of the visible sources whose center is on the detector.
+
+    Occluded sources are left out.
+    """
     R_lab_from_body = lab_from_body.as_matrix()
     R_cam_from_lab = lab.mount.cam_from_body.as_matrix() @ R_lab_from_body.T
     here = Poses(R_cam_from_lab[None], (R_lab_from_body @ lab.mount.camera_body_m)[None])
@@ -237,17 +249,18 @@ def lights(lab: Testbed, lab_from_body: Rotation) -> tuple[Floats, Floats]:
 
 
 def lit_share(sources: Sources) -> Floats:
-    """(N,) of the time that a light is on, at most 1."""
+    """(N,) duty cycle of each source, at most 1."""
     return np.minimum(sources.on_s / sources.period_s, 1.0)
 
 
 def spoilt(
     trial: CentroidTrial, xy_px: Floats, electrons: Floats, scene: Scene, rng: np.random.Generator
 ) -> Centroids:
-    """What a camera would tell of true lights: some missed, all noisy, some false; brightest first.
+    """Simulated detections, brightest first: some true sources missed, all with noise, false detections added.
 
-    A false light is as bright as any of the field's, those too that `lights` leaves out.
+    The flux of a false detection is that of a random true source, including those that `lights` leaves out.
     """
+    # Draw noise for all sources, also the missing ones, so that the stream does not depend on which are missing.
     kept = np.flatnonzero(rng.random(len(xy_px)) >= trial.missing)
     flux = electrons * 10 ** (0.4 * trial.magnitude_sigma * rng.standard_normal(len(xy_px)))
     xy_px = xy_px + trial.noise_px * rng.standard_normal(xy_px.shape)
@@ -264,7 +277,7 @@ def spoilt(
 
 
 def shot(ready: Bench, seed: int) -> tuple[Frame, Truth, tuple[float, float] | None]:
-    """A frame trial's frame, its truth and, with a gyro, how far (dx, dy) px stars in the middle move in it."""
+    """Frame of a frame trial, its truth and, with a gyro, the streak vector (dx, dy) in pixels at the image center."""
     trial, (where, noise) = ready.trial, streams(ready, seed)
     assert isinstance(trial, FrameTrial)
     lab = reseeded(ready.lab, int(noise.integers(2**62)))
@@ -272,22 +285,26 @@ def shot(ready: Bench, seed: int) -> tuple[Frame, Truth, tuple[float, float] | N
     rate_cam = math.radians(trial.rate_deg_s) * np.array([math.cos(towards), math.sin(towards), 0.0])
     rate_body = lab.mount.cam_from_body.inv().apply(rate_cam)
     when, rows = testbed.window(lab.scene, 0), lab.scene.camera.height_px
+    # A trajectory at constant rate around the exposure, with the drawn attitude at mid-exposure.
     t_s = np.linspace(when.open_s - SPARE_S, when.close_s(rows) + SPARE_S, KNOTS)
     turned = Rotation.from_rotvec(np.outer(t_s - when.middle_s(rows), rate_body))
     path = Trajectory(t_s, middle * turned, np.tile(rate_body, (KNOTS, 1)))
     frame, truth = exposure.render_frame(replace(lab, trajectory=path), 0)
     reach_px = when.exposure_s * lab.scene.camera.focal_px
-    # A star at the middle: d(x / z)/dt = -w_y, d(y / z)/dt = w_x.
+    # For a star on the boresight: d(x / z)/dt = -w_y, d(y / z)/dt = w_x.
     return frame, truth, (-rate_cam[1] * reach_px, rate_cam[0] * reach_px) if trial.gyro else None
 
 
 def reseeded(lab: Testbed, seed: int) -> Testbed:
-    """The same hardware; noise, jitter and IMU of another seed."""
+    """The same hardware with another seed for noise, jitter and IMU."""
     return replace(lab, scene=lab.scene.model_copy(update={"seed": seed}))
 
 
 def scored(answer: Attitude, cam_from_lab_wxyz: Floats, stars: int, detected: int) -> Outcome:
-    """An answer beside the truth. Quaternions of NumPy's, for SciPy's Rotation takes a tenth of a trial."""
+    """Outcome of one solution compared with the truth, a quaternion wxyz.
+
+    Quaternions are NumPy arrays because SciPy's Rotation would take a tenth of a trial's time.
+    """
     matched = len(answer.match.observed) if answer.match else 0
     if answer.cam_from_ref is None:
         return Outcome(answer.status, 1, stars=stars, detected=detected, matched=matched)
@@ -304,7 +321,7 @@ def scored(answer: Attitude, cam_from_lab_wxyz: Floats, stars: int, detected: in
 
 
 def summed(lab: Testbed, came: list[Outcome], settle_s: float) -> Outcome:
-    """A flight's outcome of its frames' and, where it has a filter, of its filter's errors at every tick."""
+    """Outcome of a flight trial from the outcomes of its frames and, with a filter, from its error at every tick."""
     solved = [outcome for outcome in came if outcome.solved]
     x, y, roll = (
         _rms([getattr(one, name) for one in solved]) for name in ("x_arcsec", "y_arcsec", "roll_arcsec")
@@ -333,7 +350,7 @@ def summed(lab: Testbed, came: list[Outcome], settle_s: float) -> Outcome:
 
 
 def filter_off_arcsec(lab: Testbed, settle_s: float) -> Floats:
-    """(K,) angle by which the filter is off at the ticks after it settled; none where there is no filter."""
+    """(K,) angular error of the filter at the ticks from `settle_s` on; empty without a filter."""
     log = lab.log
     if log.lab_from_filter is None:
         return np.empty(0)

@@ -1,4 +1,4 @@
-"""Attitudes as a CCSDS Attitude Ephemeris Message, version 2.0, in keyword = value notation (CCSDS 504.0-B-2)."""
+"""Write attitudes as a CCSDS Attitude Ephemeris Message, version 2.0, in keyword = value notation (CCSDS 504.0-B-2)."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from skysim.core.errors import InputError
 from skysim.core.types import Floats
 from skysim.core.units import in_utc
 
-MOST_CHARACTERS = 254  # of a line, 6.3 of the standard
-ORIGINATOR = "SKYSIM"  # which no registry knows; the standard leaves that to those who exchange files
+MOST_CHARACTERS = 254  # limit of a line, section 6.3 of the standard
+ORIGINATOR = "SKYSIM"  # not in the SANA registry; the standard leaves that to those who exchange the files
 ICRF, LAB, CAMERA, BODY = "ICRF", "LAB", "STARTRACKER_1", "SC_BODY_1"
 MEANING = {
     ICRF: "axes of the ICRS",
@@ -30,14 +30,17 @@ def message(
     utc: Sequence[datetime.datetime],
     a_from_b: Rotation,
 ) -> str:
-    """The file's text: one segment of type QUATERNION.
+    """The text of an AEM file with one segment of type QUATERNION.
 
-    frames   : (A, B), keys of MEANING
-    utc      : K epochs, ascending;  a_from_b : K rotations
+    name     : object name
     told     : comments
-    The quaternion "from A to B" turns A's basis vectors into B's (annex F2): it is that of a_from_b, whose
-    matrix has B's axes in A's coordinates as columns, while coordinates go by X_B = a_from_b^-1 X_A. Scalar last.
-    Raises InputError where there is no epoch, or they do not ascend.
+    frames   : (A, B), keys of MEANING
+    utc      : K epochs, ascending
+    a_from_b : K rotations
+
+    The standard's quaternion "from A to B" rotates the basis vectors of A into those of B (annex F2). That is the
+    quaternion of a_from_b, whose matrix has the axes of B in coordinates of A as columns; coordinates transform by
+    X_B = a_from_b^-1 X_A. Scalar last. Raises InputError if there is no epoch or the epochs do not ascend.
     """
     if not utc:
         raise InputError(f"{name}: no attitude to write")
@@ -75,19 +78,23 @@ def message(
 
 
 def unbroken(xyzw: Floats) -> Floats:
-    """(K, 4) the same attitudes, no sign changing from one to the next; of the first the scalar is not negative."""
+    """(K, 4) the same attitudes as a continuous sequence of quaternions; the first has a scalar part >= 0.
+
+    q and -q are the same attitude. Each quaternion takes the sign that makes its dot product with the previous one
+    positive, so that other tools can interpolate between them.
+    """
     along = np.sign(np.sum(xyzw[1:] * xyzw[:-1], axis=1))
     first = -1.0 if xyzw[0, 3] < 0 else 1.0
     sign = first * np.concatenate([[1.0], np.cumprod(np.where(along < 0, -1.0, 1.0))])
-    return np.asarray(xyzw * sign[:, None] + 0.0)  # no minus zero
+    return np.asarray(xyzw * sign[:, None] + 0.0)  # + 0.0 turns -0.0 into 0.0
 
 
 def epoch(utc: datetime.datetime) -> str:
-    """Of 6.8.9 in the standard: 2012-06-22T21:00:00.120000."""
+    """Time string of section 6.8.9 of the standard, in UTC: 2012-06-22T21:00:00.120000."""
     return in_utc(utc).isoformat(timespec="microseconds")
 
 
 def plain(line: str) -> str:
-    """The line in the characters and the length that the standard allows."""
+    """The line cut to the allowed length, with characters outside printable ASCII replaced by "?"."""
     printable = "".join(one if " " <= one <= "~" else "?" for one in line)
     return printable[:MOST_CHARACTERS]

@@ -1,4 +1,4 @@
-"""A finished run in the formats of other tools: CCSDS AEM, ECSV, Parquet, TIFF, Zarr, video."""
+"""Export a finished run to the formats of other tools: CCSDS AEM, ECSV, Parquet, TIFF, Zarr, video."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from skysim.results.files import frames as frame_files
 from skysim.results.files.recording import Recording, Told
 
 EXTRA = "takes more packages; install them: pip install 'skysim[export]'"
-BATCH_ROWS = 1 << 16  # of Parquet that are kept before they are written
-SAMPLED_FRAMES = 9  # of a video that tell its black and white
+BATCH_ROWS = 1 << 16  # rows buffered before a Parquet row group is written
+SAMPLED_FRAMES = 9  # about this many frames determine the black and white levels of a video
 FOURCC = "mp4v"  # MPEG-4 part 2, which every wheel of OpenCV can write
 MORE_BYTES = 1 << 20
 
-Bar = Callable[[Iterable[Any], int, str], Iterator[Any]]  # items, how many, what is being done
+Bar = Callable[[Iterable[Any], int, str], Iterator[Any]]  # progress bar over items: items, count, label
 
-# What a column's name ends in -> its unit; the longest ending that fits counts.
+# Unit by the ending of a column's name; the longest matching ending applies.
 UNITS = {
     **{
         "_deg_s": "deg/s",
@@ -46,7 +46,11 @@ UNITS = {
 
 
 def to_aem(run: Recording, out: Path, bar: Bar) -> list[Path]:
-    """truth.aem, and solutions.aem where frames were solved: the camera in the ICRF, or the body in the lab."""
+    """Write truth.aem, and solutions.aem if frames were solved. Returns the paths.
+
+    Attitudes are those of the camera in the ICRF under the stars, and of the body in the laboratory under a dome.
+    Raises InputError if a solution has no truth.
+    """
     stars = run.under_the_stars
     frames = (ccsds_aem.ICRF, ccsds_aem.CAMERA) if stars else (ccsds_aem.LAB, ccsds_aem.BODY)
     told = [(truth.frame, truth.mid_utc, attitude(truth, stars)) for truth in truths(run, bar)]
@@ -72,7 +76,7 @@ def to_aem(run: Recording, out: Path, bar: Bar) -> list[Path]:
 
 
 def attitude(truth: Told, stars: bool) -> Rotation:
-    """lab_from_cam under the stars, lab_from_body in a laboratory: what `Recording.solved` gives of the answers."""
+    """lab_from_cam under the stars, lab_from_body in a laboratory; the same convention as `Recording.solved`."""
     if stars:
         return Rotation.from_quat(truth.cam_from_lab_xyzw).inv()
     return Rotation.from_quat(truth.lab_from_body_xyzw)
@@ -83,7 +87,7 @@ def truths(run: Recording, bar: Bar) -> Iterator[Told]:
 
 
 def truth_table(run: Recording, bar: Bar) -> Any:
-    """The truth as an astropy table, one row a frame."""
+    """The truth as an astropy table, one row per frame."""
     from astropy.table import Table
 
     rows = [truth_row(truth) for truth in truths(run, bar)]
@@ -102,13 +106,16 @@ def truth_row(truth: Told) -> dict[str, Any]:
 
 
 def to_ecsv(run: Recording, out: Path, bar: Bar) -> list[Path]:
-    """truth.ecsv, one row a frame; solutions.ecsv is there already."""
+    """Write truth.ecsv, one row per frame; the run has already written solutions.ecsv."""
     files.write_table(out / "truth.ecsv", truth_table(run, bar))
     return [out / "truth.ecsv"]
 
 
 def to_parquet(run: Recording, out: Path, bar: Bar) -> list[Path]:
-    """truth (a row a frame), sources (a row a light a frame), the run's own tables; units in the fields' metadata."""
+    """Write truth (one row per frame), sources (one row per source and frame) and the run's own tables as Parquet.
+
+    Units are in the field metadata. Raises InputError if pyarrow is not installed.
+    """
     try:
         import pyarrow.parquet
     except ImportError:
@@ -127,7 +134,7 @@ def to_parquet(run: Recording, out: Path, bar: Bar) -> list[Path]:
 
 
 def sources_parquet(run: Recording, path: Path, bar: Bar) -> Path:
-    """Every light of every frame, as its truth has it; some frames at a time."""
+    """Write every source of every frame from the truth files, in batches of about BATCH_ROWS rows to limit memory."""
     import pyarrow
     import pyarrow.parquet
 
@@ -151,7 +158,7 @@ def sources_parquet(run: Recording, path: Path, bar: Bar) -> Path:
 
 
 def arrow(found: Any, run: Recording) -> Any:
-    """An astropy table as one of Arrow's; what is masked is null."""
+    """Convert an astropy table to an Arrow table; masked values become null. Units and run metadata are kept."""
     import pyarrow
 
     fields, columns = [], []
@@ -170,13 +177,13 @@ def arrow(found: Any, run: Recording) -> Any:
 
 
 def unit_of(name: str) -> str:
-    """Of a column, by what its name ends in; empty where it has none."""
+    """Unit of a column from the ending of its name; empty if it has none."""
     ending = max((one for one in UNITS if name.endswith(one)), key=len, default="")
     return UNITS.get(ending, "")
 
 
 def to_tiff(run: Recording, out: Path, bar: Bar) -> list[Path]:
-    """frame_NNNN.tif: the digital numbers as they are, 16 bits (64-bit floats of a noise-free camera)."""
+    """Write frame_NNNN.tif with unchanged digital numbers: 16 bits (64-bit floats for a noise-free camera)."""
     written = []
     for stem in bar(run.stems, len(run.stems), "TIFF"):
         written.append(out / f"{stem.name}.tif")
@@ -185,7 +192,10 @@ def to_tiff(run: Recording, out: Path, bar: Bar) -> list[Path]:
 
 
 def to_zarr(run: Recording, out: Path, bar: Bar) -> list[Path]:
-    """frames.zarr (Zarr 3): frames in chunks of one, times, exposures, attitudes and rates beside them."""
+    """Write frames.zarr (Zarr 3): frames in chunks of one, with times, exposures, attitudes and rates.
+
+    Raises InputError if zarr is not installed or the frames differ in size or type.
+    """
     try:
         import zarr
     except ImportError:
@@ -214,7 +224,7 @@ def to_zarr(run: Recording, out: Path, bar: Bar) -> list[Path]:
 
 
 def beside(told: list[Told]) -> Iterator[tuple[str, Any, str, str]]:
-    """What stands beside the frames of a sequence: name, array, name of its second axis, unit."""
+    """Arrays stored with the frames of a sequence: name, array, name of its second axis, unit."""
     utc = [one.mid_utc.isoformat(timespec="microseconds") for one in told]
     yield "frame", np.array([one.frame for one in told]), "", ""
     yield (
@@ -231,7 +241,7 @@ def beside(told: list[Told]) -> Iterator[tuple[str, Any, str, str]]:
 
 
 def like(image: Any, first: Any, stem: Path) -> Any:
-    """The image, if it is of the first one's size and type."""
+    """The image itself. Raises InputError if its size or type differs from the first one's."""
     if image.shape != first.shape or image.dtype != first.dtype:
         raise InputError(
             f"{stem}.fits: {image.shape[1]}x{image.shape[0]} {image.dtype}; the first frame is"
@@ -241,16 +251,17 @@ def like(image: Any, first: Any, stem: Path) -> Any:
 
 
 def to_video(run: Recording, out: Path, bar: Bar) -> list[Path]:
-    """frames.mp4: for the eye, 8 bits, square root, one black and white for all frames, at the scene's pace.
+    """Write frames.mp4 for display: 8 bits, square-root stretch, at the scene's frame rate.
 
-    A side of an odd number of pixels is one pixel shorter.
+    All frames share the same black and white levels. A side with an odd number of pixels is cropped by one pixel.
+    Raises InputError if OpenCV cannot write the video, and OSError if the disk is full.
     """
     path, first = out / "frames.mp4", run.image(run.stems[0])
     seconds = [truth.t_mid_s for truth in truths(run, bar)]
     pace_hz = 1 / float(np.median(np.diff(seconds))) if len(seconds) > 1 else 1.0
     some = run.stems[:: max(len(run.stems) // SAMPLED_FRAMES, 1)]
     low, high = np.median([stretch.span(run.image(stem)) for stem in some], axis=0)
-    height, width = (side // 2 * 2 for side in first.shape)  # the codec halves the colours' rows and columns
+    height, width = (side // 2 * 2 for side in first.shape)  # color subsampling needs even sides
     with files.whole(path) as temporary:
         film = cv2.VideoWriter(
             str(temporary), cv2.VideoWriter.fourcc(*FOURCC), pace_hz, (width, height), False
@@ -269,20 +280,24 @@ def to_video(run: Recording, out: Path, bar: Bar) -> list[Path]:
         finally:
             film.release()
         there, count = frames_of(temporary), len(run.stems)
-        if there != count:  # OpenCV does not tell of what it could not write
+        # OpenCV reports no write errors, so count the frames that can be read back.
+        if there != count:
             more_room(temporary)
             raise InputError(f"{path}: OpenCV wrote {there} of {count} frames and does not tell why")
     return [path]
 
 
 def frames_of(film: Path) -> int:
-    """How many frames can be read of a video file."""
+    """Number of readable frames in a video file."""
     with silent_stderr(), closing(images.LiveCamera(str(film))) as reader:
         return sum(1 for _ in iter(reader.capture.grab, False))
 
 
 def more_room(path: Path) -> None:
-    """Make a file longer by more than a film's index takes: raises the OSError of who did not tell of one."""
+    """Append MORE_BYTES to a file, more than a video index needs, to raise the OSError that OpenCV did not report.
+
+    A full disk then raises "no space left on device" rather than an unexplained failure of OpenCV.
+    """
     with path.open("ab") as file:
         file.write(bytes(MORE_BYTES))
         os.fsync(file.fileno())
@@ -299,7 +314,10 @@ EXPORTS: dict[str, Callable[[Recording, Path, Bar], list[Path]]] = {
 
 
 def export(run: Recording, formats: Iterable[str], out: Path, bar: Bar) -> list[Path]:
-    """Write a run in each of the formats. Raises InputError for one that is none, before anything is written."""
+    """Write a run in each of the formats and return the paths.
+
+    Raises InputError for an unknown format before anything is written.
+    """
     wanted = list(dict.fromkeys(formats))
     for name in wanted:
         if name not in EXPORTS:

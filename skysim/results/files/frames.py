@@ -1,4 +1,4 @@
-"""Files in and out: frames, truth, solutions. Nothing is ever half-written."""
+"""Write frames and their truth to a results folder, and clear an earlier run from it. Writes are atomic."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ ZARR = "frames.zarr"
 
 
 def clear(folder: Path) -> None:
-    """Remove what an earlier run left: its frames, what was said of them and what `skysim export` made of it."""
+    """Remove the files of an earlier run: its frames, solutions, reports, and the files of `skysim export`."""
     for suffix in ("fits", "png", "ecsv", "tif"):
         for path in folder.glob(f"frame_[0-9][0-9][0-9][0-9]*.{suffix}"):
             path.unlink()
@@ -39,7 +39,7 @@ def clear(folder: Path) -> None:
 
 
 def unlike(paths: list[Path]) -> list[Path]:
-    """The paths, numbered where one would overwrite another."""
+    """The paths, with a number appended to every repeated one so that no file overwrites another."""
     seen: dict[Path, int] = {}
     named = []
     for path in paths:
@@ -50,15 +50,15 @@ def unlike(paths: list[Path]) -> list[Path]:
 
 
 def write_frame(folder: Path, frame: Frame, truth: Truth, scene: Scene) -> None:
-    """frame_NNNN.fits (16 bits, header with WCS under the stars), .png (16 bits) and the truth as .ecsv."""
+    """Write frame_NNNN.fits (16 bits, with a WCS header under the stars), .png (16 bits) and the truth as .ecsv."""
     stem = folder / f"frame_{frame.index:04d}"
     write_truth(stem.with_suffix(".ecsv"), frame, truth, scene)
     write_png16(stem.with_suffix(".png"), frame.image_dn)
-    write_fits(stem.with_suffix(".fits"), frame, truth, scene)  # last: where it is, the others are
+    write_fits(stem.with_suffix(".fits"), frame, truth, scene)  # last: marks a complete frame
 
 
 def write_fits(path: Path, frame: Frame, truth: Truth, scene: Scene) -> None:
-    """FITS: uint16 (or float64 of a noise-free frame) with exposure, time, scene, seed."""
+    """Write a FITS file: uint16 (float64 for a noise-free frame) with exposure, time, scene and seed in the header."""
     from astropy.io import fits
 
     header = fits.Header()
@@ -83,7 +83,7 @@ def mid_time(scene: Scene, frame: Frame) -> datetime.datetime:
 
 
 def write_truth(path: Path, frame: Frame, truth: Truth, scene: Scene) -> None:
-    """The truth beside the frame: attitude and rates in the header, one row a source."""
+    """Write the truth of a frame as ECSV: attitude and rates in the header, one row per source."""
     from astropy.table import Table
 
     seen = truth.seen

@@ -1,4 +1,4 @@
-"""What `skysim run` and `skysim render` left in a folder, read frame by frame."""
+"""Read the results folder of `skysim run` or `skysim render`, frame by frame."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from skysim.core.errors import InputError
 from skysim.core.types import Floats
 from skysim.sources import stars
 
-STARS = "ICRS axes"  # what the header of a truth calls the lab's axes under the stars
+STARS = "ICRS axes"  # value of `lab` in a truth header for a scene under the stars
 UNIT_NORM = 1e-6
 SKY_ANGLES, LAB_ANGLES = ("ra_deg", "dec_deg", "roll_deg"), ("roll_deg", "pitch_deg", "yaw_deg")
 
 
 @dataclass(frozen=True, slots=True)
 class Told:
-    """The truth of one frame, as its file has it: attitudes (4,) as xyzw, rate (3,); sources the table itself."""
+    """The truth of one frame, as read from its file: attitudes (4,) as xyzw, rate (3,), and the table of sources."""
 
     frame: int
     mid_utc: datetime.datetime
@@ -40,14 +40,14 @@ class Told:
 
 @dataclass(frozen=True)
 class Recording:
-    """A finished run: the folder, and its frames' files without their suffix, in the frames' order."""
+    """A finished run: its folder, and the frames' file paths without suffix, in frame order."""
 
     folder: Path
     stems: list[Path] = field(repr=False)
 
     @cached_property
     def meta(self) -> dict[str, Any]:
-        """Scene, seed and what the lab's axes are, as the first frame has it."""
+        """Scene, seed and definition of the lab axes, from the truth of the first frame. Raises InputError."""
         told = table(self.stems[0].with_suffix(".ecsv")).meta
         missing = [key for key in ("scene", "seed", "lab") if key not in told]
         if missing:
@@ -58,7 +58,7 @@ class Recording:
 
     @property
     def under_the_stars(self) -> bool:
-        """Whether the lab's axes are those of the ICRS."""
+        """Whether the lab axes are those of the ICRS."""
         return bool(self.meta["lab"] == STARS)
 
     def truths(self) -> Iterator[Told]:
@@ -66,20 +66,23 @@ class Recording:
         return (truth(stem.with_suffix(".ecsv")) for stem in self.stems)
 
     def image(self, stem: Path) -> NDArray[Any]:
-        """A frame as it is: (H, W) of uint16, or of float64 from a noise-free camera."""
+        """A frame's digital numbers: (H, W) uint16, or float64 from a noise-free camera. Raises InputError."""
         image = images.read_fits(stem.with_suffix(".fits"))
         if image.ndim != 2 or not image.size:
             raise InputError(f"{stem}.fits: an image of shape {image.shape}; allowed: (height, width)")
         return image
 
     def table(self, name: str) -> Any:
-        """solutions, telemetry or imu as an astropy table; None where the run left none."""
+        """The table `solutions`, `telemetry` or `imu` as an astropy table; None if the run wrote none."""
         path = self.folder / f"{name}.ecsv"
         return table(path) if path.is_file() else None
 
     def solved(self) -> tuple[NDArray[np.int64], Rotation] | None:
-        """(K,) indices of the frames that were solved, and the attitudes found: lab_from_cam under the stars,
-        lab_from_body in a laboratory. None where nothing was, or nothing solved."""
+        """(K,) indices of the solved frames and the attitudes found.
+
+        Attitudes are lab_from_cam under the stars and lab_from_body in a laboratory. Returns None if there is no
+        table of solutions or no frame was solved. Raises InputError if a column is missing.
+        """
         found = self.table("solutions")
         if found is None:
             return None
@@ -97,15 +100,18 @@ class Recording:
 
 
 def attitudes(angles_deg: Floats, under_the_stars: bool) -> Rotation:
-    """Of (K, 3) angles as `score.angles_deg` gives them: lab_from_cam of RA, Dec, roll; lab_from_body of the 3-2-1
-    sequence's roll, pitch, yaw."""
+    """Rotations from (K, 3) angles in the convention of `scoring.angles_deg`.
+
+    Under the stars: lab_from_cam from RA, Dec, roll. Otherwise: lab_from_body from the roll, pitch, yaw of the 3-2-1
+    sequence.
+    """
     if under_the_stars:
         return Rotation.concatenate([stars.cam_from_icrs(*row).inv() for row in angles_deg])
     return Rotation.from_euler("ZYX", angles_deg[:, ::-1], degrees=True)
 
 
 def recording(folder: Path) -> Recording:
-    """The run in a folder. Raises InputError where there is none."""
+    """The run in a folder. Raises InputError if the folder holds no frame with its truth."""
     found = {}
     for path in folder.glob("frame_*.fits"):
         number = re.fullmatch(r"frame_(\d{4,})", path.stem)
@@ -119,17 +125,20 @@ def recording(folder: Path) -> Recording:
 
 
 def table(path: Path) -> Any:
-    """An ECSV file as an astropy table. Raises InputError with one line for a file that is none."""
+    """Read an ECSV file as an astropy table. Raises InputError (one line) if the file is not valid ECSV."""
     from astropy.table import Table
 
     try:
         return Table.read(path, format="ascii.ecsv")
-    except Exception as error:  # of a file that is no ECSV astropy says whatever its parsers stumble over
+    except Exception as error:  # astropy's parsers raise many types of exception for a file that is not ECSV
         raise InputError(f"{path}: no ECSV table: {' '.join(str(error).split())[:120]}") from None
 
 
 def truth(path: Path) -> Told:
-    """A frame's truth. Raises InputError with one line for a file that is none, or is of an older skysim."""
+    """Read the truth of a frame.
+
+    Raises InputError (one line) for a file that is not a truth file or that an older skysim wrote.
+    """
     found = table(path)
     numbers = {
         key: np.array(files.header_numbers(path, found.meta, key, count))

@@ -1,1 +1,1 @@
-"""Answers from a study's rows: tables, sensitivity (error budget) and the search for the best design."""
+"""Analysis of a study's trials: tables, sensitivity (error budget) and design optimization."""

@@ -1,7 +1,8 @@
-"""Which point is best: a sampler asks for one after another, and each is answered by all its replicates.
+"""Design optimization: a sampler proposes candidate points one after another, each evaluated by all its replicates.
 
-The sampler (optuna's) is seeded by the study and learns from the store alone. So a search that was killed asks the same
-questions when it is resumed, finds their rows and goes on.
+The sampler is optuna's tree-structured Parzen estimator with constraints. It is seeded by the study and learns only
+from rows in the store, so a resumed search proposes the same candidates again, finds their rows and continues after
+them. The result is the feasible candidate with the best objective or, with two objectives, the Pareto front.
 """
 
 from __future__ import annotations
@@ -29,19 +30,19 @@ from skysim.results import metrics
 from skysim.results.metrics import Columns, Summary
 
 COST = "cost"
-START = 10  # candidates before the sampler makes use of what it was told
-REPEATS = 50  # questions in succession that were asked before: the sampler has no other
-UNANSWERED = 1e3  # by which a candidate without a figure misses: more than any limit's own share
-LEAST = 1e-9  # a limit of zero is missed by shares of this
+START = 10  # random candidates before the sampler uses earlier results
+REPEATS = 50  # repeated proposals in succession after which all points count as tried
+UNANSWERED = 1e3  # violation of a candidate without a value; larger than usual relative violations
+LEAST = 1e-9  # scale of the relative violation of a bound of zero
 
 
 class Candidate(NamedTuple):
-    """One point tried.
+    """One evaluated point.
 
-    figures  : of each response that is an objective or a constraint
-    feasible : no constraint is missed, by the figures themselves and not their intervals, and no figure is missing
-    refused  : its scene cannot be
-    why      : what is missed, or with what the scene was refused; empty where it is feasible
+    figures  : statistic of each response that is an objective or a constraint
+    feasible : all constraints hold for the values (intervals are ignored), and no value is missing
+    refused  : its scene is invalid
+    why      : the violated constraints, or the error message of the scene; empty if feasible
     """
 
     number: int
@@ -55,11 +56,10 @@ class Candidate(NamedTuple):
 
 
 class Found(NamedTuple):
-    """What a search came to.
+    """Result of a search.
 
-    front    : the feasible candidates that none beats in every objective, the first objective's best first; of one
-               objective the best
-    finished : whether all candidates were tried, or all points that there are
+    front    : the Pareto-optimal feasible candidates, best in the first objective first; with one objective, the best
+    finished : whether all candidates, or all existing points, were evaluated
     """
 
     candidates: list[Candidate]
@@ -68,14 +68,14 @@ class Found(NamedTuple):
 
 
 class Refused(Exception):
-    """A candidate's scene cannot be: none of its trials will be."""
+    """Raised when a candidate's scene is invalid, so that none of its trials can run."""
 
 
-# Before the first trial.
+# Validation before the first trial.
 
 
 def check(study: Study) -> None:
-    """Refuse what cannot be searched, with the key that says so. Raises InputError."""
+    """Validate section `optimise` of a study. Raises InputError with the key at fault."""
     wanted = study.optimise
     if wanted is None:
         return
@@ -101,7 +101,7 @@ def check(study: Study) -> None:
 
 
 def known(response: str, where: str) -> None:
-    """Refuse a name that is no response, and one that would not be the same again."""
+    """Raise InputError for an unknown response and for one that is not reproducible (time_ms)."""
     if response == COST:
         return
     try:
@@ -115,7 +115,7 @@ def known(response: str, where: str) -> None:
 
 
 def check_cost(study: Study, wanted: Search) -> None:
-    """Refuse prices of factors and of levels that are none, and of what is no number."""
+    """Raise InputError for prices of unknown factors or levels, and for prices per unit of a factor without numbers."""
     priced: dict[str, Factor] = dict(study.factors)
     for name in wanted.cost.per:
         where = f"optimise.cost.per.{name}"
@@ -140,30 +140,30 @@ def check_cost(study: Study, wanted: Search) -> None:
 
 
 def one_of(name: str, factors: dict[str, Factor], where: str) -> Factor:
-    """The factor of a name."""
+    """The factor with a name. Raises InputError if there is none."""
     if name not in factors:
         raise InputError(f"{where}: {name!r} is none of {', '.join(factors)}")
     return factors[name]
 
 
 def si(value: Value) -> float:
-    """A number as it is, a quantity in SI units: "48 in" is 1.2192. Raises ValueError."""
+    """A plain number unchanged, or a quantity in SI units: "48 in" is 1.2192. Raises ValueError."""
     number, unit = split(value)
     return in_si(value) if unit else number
 
 
 def cost(wanted: Search, levels: dict[str, Value]) -> float:
-    """base + sum per[factor] value + the levels' prices, values in SI units."""
+    """Cost of a point: base + sum of per[factor] * value + prices of the named levels, with values in SI units."""
     told = wanted.cost
     linear = sum(price * si(levels[name]) for name, price in told.per.items())
     return told.base + linear + sum(prices[str(levels[name])] for name, prices in told.levels.items())
 
 
-# What came of a candidate.
+# Evaluation of a candidate.
 
 
 def judged(study: Study, number: int, point: Point, columns: Columns) -> Candidate:
-    """A candidate by the columns of all its trials."""
+    """The candidate computed from the columns of all its trials."""
     wanted = study.optimise
     assert wanted is not None
     asked = [one.response for one in wanted.objectives] + [one.response for one in wanted.constraints]
@@ -179,7 +179,7 @@ def judged(study: Study, number: int, point: Point, columns: Columns) -> Candida
 
 
 def misses(limit: Constraint, value: float) -> float:
-    """By what share of itself a limit is missed; not above zero where it is kept."""
+    """Relative violation of a constraint, (value - bound) / |bound|; <= 0 if it holds, UNANSWERED for NaN."""
     if math.isnan(value):
         return UNANSWERED
     over = [] if limit.at_most is None else [(value - limit.at_most) / max(abs(limit.at_most), LEAST)]
@@ -188,7 +188,10 @@ def misses(limit: Constraint, value: float) -> float:
 
 
 def refusal(columns: Columns) -> str:
-    """What a scene that cannot be was refused with: its trials have no scene and raised InputError."""
+    """Traceback of the InputError with which a candidate's scene was rejected; empty if the scene is valid.
+
+    Trials of an invalid scene have an empty scene hash.
+    """
     refused = [
         error
         for scene, error in zip(columns["scene"], columns["error"], strict=True)
@@ -198,12 +201,15 @@ def refusal(columns: Columns) -> str:
 
 
 def told(error: str) -> str:
-    """A traceback's last line without the exception's name."""
+    """Last line of a traceback without the exception's name."""
     return error.strip().splitlines()[-1].partition(f"{InputError.__name__}: ")[2] if error else ""
 
 
 def front(wanted: Search, candidates: Sequence[Candidate]) -> list[Candidate]:
-    """The feasible candidates that no other dominates: as good in every objective and better in one (Pareto)."""
+    """The Pareto front: feasible candidates that no other dominates.
+
+    One candidate dominates another if it is at least as good in every objective and better in one.
+    """
     feasible = [one for one in candidates if one.feasible]
     sign = np.array([1.0 if one.better == "less" else -1.0 for one in wanted.objectives])
     values = np.array([one.objectives for one in feasible]).reshape(-1, len(sign)) * sign
@@ -216,7 +222,7 @@ def front(wanted: Search, candidates: Sequence[Candidate]) -> list[Candidate]:
 
 
 def found(plan: Plan, store: Store) -> Found:
-    """What is in a store of a search, finished or not: its candidates whose trials are all in."""
+    """The candidates in a store whose trials are complete, and their front; the search may be unfinished."""
     study, replicates = plan.study, plan.study.replicates
     assert study.optimise is not None
     columns = ((n, point, store.of_point(n)) for n, point in enumerate(store.points()))
@@ -228,7 +234,10 @@ def found(plan: Plan, store: Store) -> Found:
 
 
 def search(plan: Plan, store: Store, engine: Engine, watch: Watch | None = None) -> Found:
-    """Try candidates until there are as many as wanted, or the budget ends. Raises InputError, for want of optuna too."""
+    """Evaluate candidates until `candidates` of them are complete, all points are tried, or the budget is spent.
+
+    Raises InputError, also if optuna is not installed or proposes other candidates than those in the store.
+    """
     study, wanted = plan.study, plan.study.optimise
     assert wanted is not None
     sampler, stored = begun(study), store.points()
@@ -254,9 +263,10 @@ def search(plan: Plan, store: Store, engine: Engine, watch: Watch | None = None)
 
 
 def begun(study: Study) -> Any:
-    """An optuna study: tree-structured Parzen estimators, of several objectives where there are two.
+    """An optuna study with the tree-structured Parzen estimator (TPE), which handles one or two objectives.
 
-    The first question is the factors' middle. NSGA-II takes a population of fifty before it learns; this takes START.
+    The first candidate is the middle of all factors. TPE learns after START candidates; NSGA-II would need a
+    population of fifty.
     """
     try:
         import optuna
@@ -277,7 +287,7 @@ def begun(study: Study) -> Any:
 
 
 def asked_of(study: Study) -> dict[str, Any]:
-    """Each factor as the sampler knows it: a share of 1, or which of its levels or values."""
+    """Search space of the sampler: a number in [0, 1] for a range, an index for levels or values."""
     from optuna.distributions import CategoricalDistribution, FloatDistribution
 
     return {
@@ -289,7 +299,10 @@ def asked_of(study: Study) -> dict[str, Any]:
 
 
 def question(sampler: Any, study: Study, tried: dict[str, Candidate]) -> tuple[Any, Point | None]:
-    """What the sampler asks for next that was not tried; what was is told it again. No point where it has no other."""
+    """The sampler's next proposal that was not evaluated yet: optuna trial and point; (None, None) if there is none.
+
+    A repeated proposal is answered with the known result, so that the sampler moves on.
+    """
     assert study.optimise is not None
     for _ in range(REPEATS):
         asked = sampler.ask(asked_of(study))
@@ -307,12 +320,15 @@ def question(sampler: Any, study: Study, tried: dict[str, Candidate]) -> tuple[A
 
 
 def key_of(point: Point) -> str:
-    """A point by what it sets."""
+    """Identity of a point: its settings as text."""
     return json.dumps(point.settings, sort_keys=True)
 
 
 def tell(sampler: Any, asked: Any, wanted: Search, candidate: Candidate) -> None:
-    """The sampler learns a candidate's objectives and by how much it misses each constraint."""
+    """Report a candidate's objectives and constraint violations to the sampler.
+
+    A candidate without values gets infinitely bad objectives and an extra violated constraint.
+    """
     worth = {name: figure.value for name, figure in candidate.figures.items()} | {COST: candidate.cost}
     for n, limit in enumerate(wanted.constraints):
         asked.set_constraint(str(n), misses(limit, worth[limit.response]))
@@ -332,10 +348,12 @@ def answered(
     refused: int,
     watch: Watch | None,
 ) -> bool:
-    """Whether all replicates of a candidate are in the store, those missing done; not where the budget ends before.
+    """Run the missing replicates of a candidate. Returns False if the budget is spent before all are in the store.
 
-    whole : the search's progress, which `watch` is shown;  refused : failed trials that the budget does not count
+    whole   : progress of the whole search, passed to `watch`
+    refused : number of failed trials of invalid scenes, which the budget does not count
     """
+    # Budgets are for the whole search: subtract the time spent, and the failures of earlier candidates.
     before, budget = replace(whole), plan.study.budget
     left_s = None if budget.time_s is None else budget.time_s - (time.perf_counter() - whole.began)
     if left_s is not None and left_s <= 0:
@@ -364,7 +382,7 @@ def answered(
 
 
 def none_of(plan: Plan, store: Store, number: int) -> list[Row]:
-    """The rows of a refused candidate's trials that nobody tried: they fail as the first did."""
+    """Rows for the remaining trials of a candidate with an invalid scene: failed, with the error of the first one."""
     columns, replicates = store.of_point(number), plan.study.replicates
     why, there = refusal(columns), set(columns["replicate"].tolist())
     return [

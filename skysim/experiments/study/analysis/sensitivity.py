@@ -1,8 +1,12 @@
-"""The error budget: how much of the attitude error's variance each factor is to blame for (Sobol 1993).
+"""Error budget: Sobol indices of the attitude error for each factor (Sobol 1993).
 
-First-order index: the share of the variance that would go were the factor known. Total: the share that would stay were
-all others known. Several outputs, the error about each axis at every one of the attitudes, are summed with their
-variances as weights: generalised indices (Lamboni, Monod & Makowski 2011; Gamboa et al. 2014).
+For an output Y and a factor X_i the first-order index is Var(E[Y | X_i]) / Var(Y), the fraction of the variance that
+would vanish if X_i were known. The total index is E[Var(Y | X_~i)] / Var(Y), the fraction that would remain if all
+other factors were known.
+
+There are many outputs: the error about each axis at each of the random attitudes (replicates). Their indices are
+averaged with their variances as weights, which gives generalized indices (Lamboni, Monod & Makowski 2011; Gamboa et
+al. 2014). Intervals come from a bootstrap over the rows of the sample.
 """
 
 from __future__ import annotations
@@ -24,7 +28,10 @@ RESAMPLES = 200
 
 
 class Index(NamedTuple):
-    """A factor's part in one error: its indices, and rms_arcsec, the error that it alone makes (from the first)."""
+    """Contribution of a factor to one error: its indices, and rms_arcsec, the error due to this factor alone.
+
+    rms_arcsec is the standard deviation of the error times the square root of the first-order index.
+    """
 
     factor: str
     response: str
@@ -34,14 +41,14 @@ class Index(NamedTuple):
 
 
 def indices(plan: Plan, store: Store) -> list[Index]:
-    """Every factor's indices for the errors across and about the boresight. Raises InputError for another design."""
+    """Indices of every factor for the cross-boresight and roll errors. Raises InputError for another design."""
     if plan.study.design.kind != "saltelli" or plan.study.optimise:
         raise InputError("design.kind: indices take a study of kind saltelli")
     return [index for response in AXES for index in of_response(plan, store, response)]
 
 
 def of_response(plan: Plan, store: Store, response: str) -> list[Index]:
-    """The factors' indices for one error."""
+    """Indices of every factor for one error; NaN if no replicate is complete."""
     a, b, ab = outputs(plan, store, AXES[response])
     names, count = list(plan.study.factors), a.shape[1]
     if not len(a):
@@ -49,6 +56,7 @@ def of_response(plan: Plan, store: Store, response: str) -> list[Index]:
         return [Index(name, response, nothing, nothing, np.nan) for name in names]
     found = generalised(a, b, ab)
     rng = np.random.default_rng(1)
+    # Resample rows of A, B and AB together, so that each resample is a valid Saltelli sample.
     drawn = np.array(
         [
             generalised(a[:, pick], b[:, pick], ab[:, :, pick])
@@ -60,7 +68,7 @@ def of_response(plan: Plan, store: Store, response: str) -> list[Index]:
         [Summary(float(v), float(lo), float(hi), count) for v, lo, hi in zip(*part, strict=True)]
         for part in zip(found, low, high, strict=True)
     )
-    # The variance of an attitude's error is the sum of its axes'.
+    # The variance of the cross-boresight error is the sum of the variances about its two axes.
     size = float(np.sqrt(np.var(np.concatenate([a, b], axis=1), axis=1).mean() * len(AXES[response])))
     return [
         Index(name, response, alone, all_told, size * float(np.sqrt(max(alone.value, 0.0))))
@@ -69,12 +77,14 @@ def of_response(plan: Plan, store: Store, response: str) -> list[Index]:
 
 
 def outputs(plan: Plan, store: Store, axes: tuple[str, ...]) -> tuple[Floats, Floats, Floats]:
-    """(S, N), (S, N) and (D, S, N) errors at A, B and A with a column of B; S outputs: every axis at every replicate.
+    """(S, N), (S, N) and (D, S, N) errors at A, at B, and at A with one column of B.
 
-    A replicate with a trial anywhere that was not answered, or not done yet, is left out.
+    There are N sample rows, D factors and S outputs, one per axis and replicate. A replicate is left out if any of its
+    trials has no solution or is not done yet.
     """
     width, each = len(plan.study.factors), plan.study.replicates
     columns = store.columns()
+    # Trial number = point * replicates + replicate, and points are in the order A, B, AB_1 .. AB_D.
     values = np.full((len(axes), plan.trials), np.nan)
     values[:, columns["trial"]] = [columns[name] for name in axes]
     grid = values.reshape(len(axes), -1, each).transpose(0, 2, 1).reshape(len(axes) * each, -1)
@@ -84,7 +94,10 @@ def outputs(plan: Plan, store: Store, axes: tuple[str, ...]) -> tuple[Floats, Fl
 
 
 def generalised(a: Floats, b: Floats, ab: Floats) -> NDArray[np.float64]:
-    """(2, D) first-order and total indices over all outputs (Saltelli et al. 2010's estimators, by SciPy)."""
+    """(2, D) first-order and total indices, averaged over the outputs with their variances as weights.
+
+    The estimators are those of Saltelli et al. (2010), from SciPy. Outputs without variance have weight zero.
+    """
     found = scipy.stats.sobol_indices(func={"f_A": a, "f_B": b, "f_AB": ab}, n=a.shape[1])
     weight = np.var(np.concatenate([a, b], axis=1), axis=1)
     if weight.sum() == 0:

@@ -1,4 +1,4 @@
-"""What came of a study: a line a point with every response and its interval; and all trials for other tools."""
+"""Result tables of a study: one line per point with every response and its interval, and one row per trial."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ LONG = re.compile(r"(-?\d*\.\d{4,}(?:e[-+]?\d+)?)(\s\S.*)$")
 
 
 class Line(NamedTuple):
-    """One point: its number, the factors' levels there, and what was asked of its trials."""
+    """One point: its number, factor levels, and the responses computed from its trials."""
 
     point: int
     levels: dict[str, Any]
@@ -26,23 +26,23 @@ class Line(NamedTuple):
 
 
 def table(store: Store, responses: Sequence[str]) -> list[Line]:
-    """Every point of a store, those without a trial yet too: their figures are NaN."""
+    """One line for every point of a store; responses of points without trials are NaN."""
     asked = {name: metrics.response(name) for name in responses}
     return [line(number, point, store.of_point(number), asked) for number, point in enumerate(store.points())]
 
 
 def asked(lines: Sequence[Line], responses: Sequence[str]) -> list[Line]:
-    """The lines with these of their responses alone."""
+    """The lines with only these responses."""
     return [one._replace(responses={name: one.responses[name] for name in responses}) for one in lines]
 
 
 def line(number: int, point: Point, columns: Columns, asked: dict[str, metrics.Response]) -> Line:
-    """One point's line."""
+    """The line of one point."""
     return Line(number, point.levels, {name: response(columns) for name, response in asked.items()})
 
 
 def cells(lines: Sequence[Line]) -> tuple[list[str], list[list[str]]]:
-    """Heads and lines of a table for people: `0.97 (0.95..0.98)`."""
+    """Column heads and cell texts of a table, such as `0.97 (0.95..0.98)`."""
     if not lines:
         return [], []
     heads = ["point", *lines[0].levels, *lines[0].responses]
@@ -54,16 +54,16 @@ def cells(lines: Sequence[Line]) -> tuple[list[str], list[list[str]]]:
 
 
 def level(value: Any) -> str:
-    """A factor's level in a table."""
+    """Text of a factor's level, numbers rounded to four digits."""
     if isinstance(value, float):
         return f"{value:.4g}"
-    if isinstance(value, str) and (told := LONG.match(value)):  # a quantity that was drawn
+    if isinstance(value, str) and (told := LONG.match(value)):  # a sampled quantity with a unit
         return f"{float(told[1]):.4g}{told[2]}"
     return ", ".join(map(str, value)) if isinstance(value, list) else str(value)
 
 
 def figure(summary: Summary) -> str:
-    """A figure with its interval where it has one."""
+    """Text of a statistic with its interval, if it has one."""
     if np.isnan(summary.value):
         return "-"
     if np.isnan(summary.low) or summary.low == summary.high:
@@ -72,7 +72,7 @@ def figure(summary: Summary) -> str:
 
 
 def flat(lines: Sequence[Line]) -> dict[str, list[Any]]:
-    """The lines as columns: point, factors, and of each response its value, low, high and count."""
+    """The lines as columns: point, factors, and value, low, high and trial count of each response."""
     columns: dict[str, list[Any]] = {"point": [one.point for one in lines]}
     for name in lines[0].levels if lines else ():
         columns[name] = [one.levels[name] for one in lines]
@@ -84,7 +84,7 @@ def flat(lines: Sequence[Line]) -> dict[str, list[Any]]:
 
 
 def everything(store: Store) -> dict[str, NDArray[Any]]:
-    """All trials: the columns of the store, and each factor's level beside them."""
+    """All trials: the columns of the store, and a column for the levels of each factor."""
     columns, points = store.columns(), store.points()
     for name in points[0].levels if points else ():
         levels = [points[number].levels[name] for number in columns["point"]]

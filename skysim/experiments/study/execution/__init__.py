@@ -1,1 +1,1 @@
-"""Who does a study's trials: this process, a pool of processes or a Dask cluster; and replaying one trial."""
+"""Execution of a study's trials: in this process, a process pool or a Dask cluster; replay of one trial."""

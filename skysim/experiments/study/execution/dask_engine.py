@@ -1,6 +1,6 @@
-"""Trials on a Dask cluster: its scheduler hands chunks to the workers it has, and hands out again what a lost one had.
+"""Run trials on a Dask cluster. Its scheduler assigns chunks to workers, and reassigns those of a lost worker.
 
-Scheduler and workers need this same skysim. A worker is best a process of one thread, its numerics too:
+Scheduler and workers need this version of skysim. Each worker should be a process with one numerical thread:
 `OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 NUMBA_NUM_THREADS=1 dask worker ADDRESS --nworkers 8 --nthreads 1`
 """
 
@@ -32,28 +32,28 @@ except ImportError:
         "engine: dask is not installed; allowed: pip install 'skysim[dask]', or another engine"
     ) from None
 
-WAIT_S = 10.0  # for an answer
+WAIT_S = 10.0  # timeout for a reply
 
-LOOK_S = 5.0  # after which the cluster is asked again how many threads it has: workers come and go
+LOOK_S = 5.0  # interval between queries of the cluster's thread count, because workers join and leave
 
 WANTED = "allowed: a scheduler's address, such as tcp://10.0.0.1:8786"
 
 
 class Flight(NamedTuple):
-    """A chunk that the cluster has, and whether it has no other."""
+    """A submitted chunk, and whether it is the only one in flight."""
 
     chunk: Chunk
     alone: bool
 
 
 def connect(scheduler: str) -> Client:
-    """A cluster that answers, has workers, and of this code. Raises InputError with one line where it does not."""
+    """Connect to a cluster and check that it has workers of this code version. Raises InputError with one line."""
     try:
         if get_address_host_port(scheduler)[1] > 65535:
             raise ValueError("no such port")
     except ValueError as error:
         raise InputError(f"scheduler: {scheduler!r}: {error}; {WANTED}") from None
-    # What goes wrong is told in one line here, not in pages there.
+    # Silence the long logs of distributed; errors are reported here in one line.
     logging.getLogger("distributed").setLevel(logging.CRITICAL)
     try:
         client = Client(scheduler, timeout=WAIT_S, set_as_default=False, name="skysim")
@@ -70,7 +70,7 @@ def connect(scheduler: str) -> Client:
 
 
 def agree(client: Client, scheduler: str) -> None:
-    """Raises InputError where a cluster has no workers, or one has other code."""
+    """Raise InputError if a cluster has no workers, or a worker has another code version."""
     try:
         client.wait_for_workers(1, WAIT_S)
         found = client.run(code_version, on_error="return")
@@ -90,12 +90,12 @@ def agree(client: Client, scheduler: str) -> None:
 
 
 def threads(client: Client) -> int:
-    """How many trials the cluster does at a time."""
+    """Number of trials that the cluster runs at a time."""
     return int(sum(client.nthreads().values()))
 
 
 def run(client: Client, recipe: Recipe, chunks: Chunks) -> Iterator[list[Row]]:
-    """See `Engine`; the client is closed at the end. Raises InputError where the scheduler is lost."""
+    """See `Engine`; the client is closed at the end. Raises InputError if the connection to the scheduler is lost."""
     name, flying = f"skysim-{uuid4().hex}", dict[Future, Flight]()
     try:
         client.register_plugin(Told(name, recipe, code_version()), name)
@@ -103,7 +103,7 @@ def run(client: Client, recipe: Recipe, chunks: Chunks) -> Iterator[list[Row]]:
     except (CancelledError, OSError):
         raise InputError("scheduler: it was lost; what came is kept; allowed: skysim study resume") from None
     finally:
-        # The link may be what failed, and a lost scheduler has nothing to tidy.
+        # The connection itself may have failed, and a lost scheduler needs no cleanup.
         with suppress(CancelledError, OSError, RuntimeError, ValueError):
             if client.status == "running":
                 client.cancel(list(flying))
@@ -114,10 +114,11 @@ def run(client: Client, recipe: Recipe, chunks: Chunks) -> Iterator[list[Row]]:
 def coming(
     client: Client, name: str, recipe: Recipe, chunks: Chunks, flying: dict[Future, Flight]
 ) -> Iterator[list[Row]]:
-    """Rows as they come. `flying` has what is at hand.
+    """Yield rows as chunks complete. `flying` maps futures to their chunks.
 
-    Dask gives up a task after a few dead workers, be it the cause or only in line there; so each trial of such a chunk
-    is tried with nothing else at hand, and one that is given up then is put down as failed.
+    Dask gives up a task (KilledWorker) after several of its workers died, whether the task was the cause or was only
+    queued there. The trials of such a chunk are therefore retried one at a time with nothing else in flight, and a
+    trial that is given up again is recorded as failed.
     """
     suspects: deque[Chunk] = deque()
     landed, room, looked = as_completed(loop=client.loop), 0, -LOOK_S
@@ -148,42 +149,42 @@ def coming(
 
 
 def packed(chunk: Chunk) -> str:
-    """A chunk as text: in anything else Dask would look for its own keys. Floats come back bit for bit."""
+    """A chunk as JSON text, because Dask searches other arguments for its task keys. Floats round-trip exactly."""
     rows = [(one.point, one.settings, one.first, one.replicates.start, one.replicates.stop) for one in chunk]
-    return json.dumps(rows, default=str)  # a moment of YAML's as its text, which scenes take too
+    return json.dumps(rows, default=str)  # YAML dates become text, which scenes accept
 
 
 def unpacked(text: str) -> Chunk:
-    """What was `packed`."""
+    """The chunk in a text made by `packed`."""
     rows = json.loads(text)
     return tuple(Segment(point, settings, first, range(*which)) for point, settings, first, *which in rows)
 
 
 # On the workers.
 
-RECIPES: dict[str, Recipe] = {}  # of the runs that this worker serves
+RECIPES: dict[str, Recipe] = {}  # recipe of each run that this worker serves
 
 
 class Told(WorkerPlugin):
-    """Tells a run's recipe to every worker once, also to those that come later."""
+    """Worker plugin that gives every worker a run's recipe, including workers that join later."""
 
     def __init__(self, name: str, recipe: Recipe, code: str) -> None:
         self.name, self.recipe, self.code = name, recipe, code
 
     def setup(self, worker: Any) -> None:
-        """Learn it. Raises InputError where this worker's code is not the run's."""
+        """Store the recipe on the worker. Raises InputError if the worker's code version is not that of the run."""
         if code_version() != self.code:
             raise InputError(f"{worker.address} has skysim {code_version()}, the run {self.code}")
         cv2.setNumThreads(1)
         RECIPES[self.name] = self.recipe
 
     def teardown(self, worker: Any) -> None:
-        """Forget it."""
+        """Remove the recipe from the worker."""
         RECIPES.pop(self.name, None)
 
 
 def remembered(name: str, text: str) -> tuple[list[Row], float]:
-    """`timed`, by the recipe that this worker was told. Raises InputError where it refused that."""
+    """`timed` with the run's recipe on this worker. Raises InputError if `Told.setup` rejected it."""
     if name not in RECIPES:
         raise InputError(
             f"scheduler: a worker that came later has skysim {code_version()}; allowed: one code"
@@ -192,9 +193,11 @@ def remembered(name: str, text: str) -> tuple[list[Row], float]:
 
 
 class Dask:
-    """An existing Dask cluster. A task that loses its worker is done by another.
+    """Engine that uses an existing Dask cluster. A task that loses its worker is run by another.
 
-    scheduler : its address, such as tcp://10.0.0.1:8786. Raises InputError where nobody answers, or with other code.
+    scheduler : its address, such as tcp://10.0.0.1:8786
+
+    Raises InputError if the scheduler does not respond or a worker has another code version.
     """
 
     name = "dask"
@@ -205,7 +208,7 @@ class Dask:
 
     def run(self, recipe: Recipe, chunks: Chunks) -> Iterator[list[Row]]:
         """See `Engine`."""
-        if self.client.status != "running":  # a run before has closed it
+        if self.client.status != "running":  # a previous run closed it
             self.client = connect(self.scheduler)
         yield from run(self.client, recipe, chunks)
 

@@ -1,4 +1,7 @@
-"""Who does the trials: this process, a pool of processes, or a Dask cluster. All make the same, row for row."""
+"""Execution engines: this process (Serial) or a pool of processes (Pool); `dask_engine` adds a Dask cluster.
+
+All engines produce identical rows.
+"""
 
 from __future__ import annotations
 
@@ -19,22 +22,22 @@ from skysim.experiments.study.plan import Recipe
 from skysim.experiments.study.setups import code_version, seed_of
 from skysim.experiments.study.trials import FAILED, Row, Segment, work
 
-AHEAD = 1  # chunks that wait for each worker beside the one at hand
+AHEAD = 1  # chunks queued for each worker in addition to the one it runs
 
-TRIES = 3  # of a trial whose worker dies
+TRIES = 3  # attempts of a trial whose worker dies
 
 Chunk = tuple[Segment, ...]
 
 
 class Chunks(Protocol):
-    """Work to be handed out: the next chunk, or none; and how long one took, by which the next are sized."""
+    """Source of work: `next` returns the next chunk (empty at the end); `took` reports run times, to size chunks."""
 
     def next(self) -> Chunk: ...
     def took(self, chunk: Chunk, seconds: float) -> None: ...
 
 
 class Engine(Protocol):
-    """Does chunks of trials; rows come in any order, each chunk's at once."""
+    """Runs chunks of trials. Chunks complete in any order; the rows of a chunk come together."""
 
     name: str
     workers: int
@@ -42,11 +45,11 @@ class Engine(Protocol):
     def run(self, recipe: Recipe, chunks: Chunks) -> Iterator[list[Row]]: ...
 
     def close(self) -> None:
-        """Let go of what is kept from one run to the next."""
+        """Release the resources kept between runs."""
 
 
 class Serial:
-    """One trial after another in this process."""
+    """Runs one trial after another in this process."""
 
     name, workers = "serial", 1
 
@@ -62,10 +65,10 @@ class Serial:
 
 
 class Pool:
-    """Processes of this machine. Each builds a scene and its index once and keeps them, from one run to the next.
+    """Pool of processes on this machine. Each caches the scenes and indices it has built, also between runs.
 
-    Where one dies, the pool is begun anew and the trials at hand are tried one by one; one that was alone when its
-    worker died, TRIES times, is put down as failed.
+    If a worker dies, the pool is restarted and the trials in flight are retried one at a time, because it is not known
+    which of them killed it. A trial that is alone in flight when its worker dies, TRIES times, is recorded as failed.
     """
 
     name = "pool"
@@ -86,6 +89,7 @@ class Pool:
                 yield from self._until_one_dies(self._ready(recipe), chunks, suspects, flying)
                 done = True
             except BrokenProcessPool:
+                # Count a death only for a trial that was alone in flight; otherwise the culprit is unknown.
                 at_hand = [one for chunk in flying.values() for one in singly(chunk)]
                 deaths.update(one[0].first for one in at_hand if len(at_hand) == 1)
                 for one in at_hand:
@@ -104,7 +108,7 @@ class Pool:
         self._pool = None
 
     def _ready(self, recipe: Recipe) -> ProcessPoolExecutor:
-        """The pool of the run before, if it was begun with this recipe; else a new one."""
+        """The pool of the previous run if it was started with this recipe, otherwise a new one."""
         if recipe != self._recipe:
             self.close()
         if self._pool is None:
@@ -112,7 +116,7 @@ class Pool:
         return self._pool
 
     def _kill(self) -> None:
-        """End the pool at once: what is not in the store is done again."""
+        """Kill the pool at once; trials that are not in the store are run again."""
         if self._pool is not None:
             for process in list((self._pool._processes or {}).values()):
                 process.kill()
@@ -126,13 +130,17 @@ class Pool:
         suspects: deque[Chunk],
         flying: dict[Future[tuple[list[Row], float]], Chunk],
     ) -> Iterator[list[Row]]:
-        """Rows as they come, suspects first and each of them alone. `flying` has what is at hand."""
+        """Yield rows as chunks complete; suspects first, each alone in flight. `flying` maps futures to their chunks.
+
+        Raises BrokenProcessPool if a worker dies; `flying` then holds the chunks that were lost.
+        """
         while True:
+            # A suspect runs with nothing else in flight, so that a worker's death can be attributed to it.
             room = self.workers * (1 + AHEAD) if not suspects else 1
             while len(flying) < room and (chunk := suspects.popleft() if suspects else chunks.next()):
                 try:
                     flying[pool.submit(remembered, chunk)] = chunk
-                except BrokenProcessPool:  # a worker died while rows were kept
+                except BrokenProcessPool:  # a worker died while the caller stored rows
                     suspects.appendleft(chunk)
                     raise
                 room = room if not suspects else 1
@@ -145,13 +153,13 @@ class Pool:
 
 
 def timed(recipe: Recipe, chunk: Chunk) -> tuple[list[Row], float]:
-    """A chunk's rows, and the seconds that it took where it was done."""
+    """Rows of a chunk and the seconds it took on the worker."""
     begin_s = time.perf_counter()
     return work(recipe, chunk), time.perf_counter() - begin_s
 
 
 def singly(chunk: Chunk) -> Iterator[Chunk]:
-    """A chunk's trials, each a chunk."""
+    """Split a chunk into chunks of one trial each."""
     for segment in chunk:
         for n, replicate in enumerate(segment.replicates):
             alone = range(replicate, replicate + 1)
@@ -159,24 +167,24 @@ def singly(chunk: Chunk) -> Iterator[Chunk]:
 
 
 def dead(recipe: Recipe, segment: Segment) -> Row:
-    """The row of a trial that kills its workers."""
+    """The row of a trial that repeatedly killed its worker."""
     replicate = segment.replicates[0]
     seed, why = seed_of(recipe, segment.point, replicate), f"its worker process died, {TRIES} times"
     return Row(segment.first, segment.point, replicate, seed, "", code_version(), FAILED, why, 0.0)
 
 
 def cores() -> int:
-    """How many this process may use."""
+    """Number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 # Worker processes.
 
-RECIPE: list[Recipe] = []  # a worker's
+RECIPE: list[Recipe] = []  # the recipe of this worker process
 
 
 def started(count: int, recipe: Recipe) -> ProcessPoolExecutor:
-    """A pool whose processes have imported all that a trial takes and have one thread each."""
+    """Start a pool of single-threaded processes that have imported everything a trial needs. Raises InputError."""
     pool = ProcessPoolExecutor(count, workers.warm(), begin, (recipe,))
     try:
         for one in [pool.submit(code_version) for _ in range(count)]:
@@ -189,7 +197,7 @@ def started(count: int, recipe: Recipe) -> ProcessPoolExecutor:
 
 
 def begin(recipe: Recipe) -> None:
-    """A worker's first act. Ctrl-C is its parent's affair, and it ends when that does, even by -9."""
+    """Initialize a worker: ignore Ctrl-C, which the parent handles, and exit when the parent ends, even by kill -9."""
     import cv2
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -199,7 +207,7 @@ def begin(recipe: Recipe) -> None:
 
 
 def end_with_parent() -> None:
-    """Wait for the parent's end."""
+    """Wait until the parent process ends, then exit."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()
@@ -207,5 +215,5 @@ def end_with_parent() -> None:
 
 
 def remembered(chunk: Chunk) -> tuple[list[Row], float]:
-    """`timed`, by the recipe that this worker was begun with."""
+    """`timed` with the recipe with which this worker was started."""
     return timed(RECIPE[0], chunk)

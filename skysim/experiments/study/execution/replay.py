@@ -1,4 +1,4 @@
-"""One trial of a study again, alone, with its frames to look at."""
+"""Repeat one trial of a study and write its frames for inspection."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ from skysim.results.report import annotate
 from skysim.simulation import run
 from skysim.tracking import factory
 
-MOST = 100  # frames of a flight that are written
+MOST = 100  # maximum number of frames written for a flight
 
 
 class Replay(NamedTuple):
-    """A trial done again: its row, the names of stored figures that differ now, its frames' files, its pictures."""
+    """A repeated trial: its row, names of stored quantities that differ now, frame files, annotated images."""
 
     row: Row
     changed: list[str]
@@ -36,7 +36,7 @@ class Replay(NamedTuple):
 
 
 def segment_of(plan: Plan, store: Store, trial: int) -> Segment:
-    """What a worker was given for a trial. Raises InputError for one that the study has not."""
+    """The segment with this trial alone. Raises InputError if the study has no such trial."""
     points, each = store.points(), plan.study.replicates
     if not 0 <= trial < len(points) * each:
         raise InputError(f"trial {trial}: is none of the study's; allowed: 0 to {len(points) * each - 1}")
@@ -45,10 +45,10 @@ def segment_of(plan: Plan, store: Store, trial: int) -> Segment:
 
 
 def replay(plan: Plan, store: Store, trial: int, folder: Path) -> Replay:
-    """Do a trial again by its seed, and write what the camera saw in it, each frame with an annotated picture.
+    """Repeat a trial with its seed, and write each of its frames with an annotated image.
 
-    Of a flight the first MOST frames. What a trial raised is in its row, and its frame is written all the same where
-    it was taken.
+    Only the first MOST frames of a flight are written. An exception of the trial is in its row; frames rendered
+    before it are written too.
     """
     segment = segment_of(plan, store, trial)
     row = one(plan.recipe, segment, trial, segment.replicates[0])
@@ -56,7 +56,7 @@ def replay(plan: Plan, store: Store, trial: int, folder: Path) -> Replay:
     now = {name: plain(getattr(row.outcome, name)) for name in row.outcome.__slots__}
     changed = [name for name, value in now.items() if kept and kept[name] != value]
     files, pictures = [], []
-    if row.scene:  # else there is no lab to photograph
+    if row.scene:  # an invalid scene has no test bed
         ready = bench(plan.recipe, segment.settings)
         frames.clear(file_io.make_folder(folder))
         try:
@@ -72,14 +72,17 @@ def replay(plan: Plan, store: Store, trial: int, folder: Path) -> Replay:
 
 
 def picture(frame: Frame, truth: Truth, report: Report) -> Any:
-    """The frame with truth, centroids and names."""
+    """The annotated frame: truth, detections and identified detections."""
     match, xy_px = report.attitude.match, report.centroids.xy_px
     matched_px = xy_px[match.observed] if match else np.empty((0, 2))
     return annotate(frame.image_dn, xy_px, matched_px, truth_px=truth.seen.xy_px)
 
 
 def seen(ready: Bench, seed: int) -> Iterator[tuple[Frame, Truth, Report]]:
-    """A trial's frames. A centroid trial has none, so its attitude is photographed and its own centroids are shown."""
+    """Frames of a trial with truth and report.
+
+    A centroid trial has no frame, so one is rendered at its attitude and shown with the trial's own centroids.
+    """
     trial = ready.trial
     if isinstance(trial, CentroidTrial):
         _, _, centroids = sight(ready, seed)
@@ -96,7 +99,7 @@ def seen(ready: Bench, seed: int) -> Iterator[tuple[Frame, Truth, Report]]:
 
 
 def tried(solve: Callable[[], Report]) -> Report:
-    """A tracker's report; an empty one where it raises, which the trial's row tells of."""
+    """The tracker's report, or an empty one if it raises; the trial's row holds the exception."""
     try:
         return solve()
     except Exception as error:

@@ -1,4 +1,4 @@
-"""A study from its first missing trial to its last: work is handed out in chunks, rows are kept as they come."""
+"""Run the missing trials of a study: chunks of trials go to an engine, and rows are stored as they arrive."""
 
 from __future__ import annotations
 
@@ -19,14 +19,17 @@ from skysim.experiments.study.setups import code_version, scene_hash
 from skysim.experiments.study.store import Store
 from skysim.experiments.study.trials import Row, Segment
 
-CHUNK_S = 0.25  # of work in a chunk: a worker that dies loses no more, and handing it over costs nothing
+CHUNK_S = 0.25  # run time of a chunk: long relative to its overhead, short in case a worker dies
 
-MOST = 5000  # trials in a chunk
+MOST = 5000  # maximum number of trials in a chunk
 
 
 @dataclass(slots=True)
 class Progress:
-    """How far a run is: trials in all, in the store, of those failed, and done by this run since it began."""
+    """Progress of a run.
+
+    trials : total;  done : in the store, of which failed and wrong;  now : done by this run since `began`
+    """
 
     trials: int
     done: int = 0
@@ -37,11 +40,11 @@ class Progress:
 
     @property
     def rate(self) -> float:
-        """Trials a second of this run."""
+        """Trials per second of this run."""
         return self.now / max(time.perf_counter() - self.began, 1e-9)
 
     def add(self, rows: list[Row]) -> None:
-        """Count rows that came."""
+        """Count finished rows."""
         self.done += len(rows)
         self.now += len(rows)
         self.failed += sum(row.error is not None for row in rows)
@@ -52,9 +55,11 @@ Watch = Callable[[Progress], Any]
 
 
 class Todo:
-    """The missing trials of some points as chunks, each of about CHUNK_S of work and, where that is more, whole points.
+    """Divides the missing trials of some points into chunks of about CHUNK_S seconds.
 
-    missing : (M,) numbers of trials, ascending
+    Chunks larger than a point are extended to complete points, so that a point's bench is set up on one worker only.
+
+    missing : (M,) trial numbers, ascending
     """
 
     def __init__(
@@ -64,13 +69,13 @@ class Todo:
         self.at, self.size = 0, 1
 
     def next(self) -> Chunk:
-        """The next chunk; empty where nothing is left."""
+        """The next chunk; empty if nothing is left."""
         end = min(self.at + self.size, len(self.missing))
         if self.size >= self.replicates and end < len(self.missing):
             last = self.missing[end - 1] // self.replicates
             end = int(np.searchsorted(self.missing, (last + 1) * self.replicates))
         chosen, self.at = self.missing[self.at : end], end
-        # A segment ends where the next trial is not the next number, or is another point's.
+        # A segment ends where the trial numbers are not consecutive or the next point begins.
         breaks = np.flatnonzero((np.diff(chosen) != 1) | (chosen[1:] % self.replicates == 0)) + 1
         return tuple(self._segment(part) for part in np.split(chosen, breaks) if len(part))
 
@@ -80,16 +85,19 @@ class Todo:
         return Segment(point, settings, int(part[0]), range(begin, begin + len(part)))
 
     def took(self, chunk: Chunk, seconds: float) -> None:
-        """Size the next chunks by how long this one took; no more than twice the size."""
+        """Set the size of the next chunks from the run time of this one; the size at most doubles."""
         count = sum(len(segment.replicates) for segment in chunk)
         wanted = int(CHUNK_S * count / max(seconds, 1e-6))
         self.size = int(np.clip(wanted, 1, min(2 * max(count, self.size), MOST)))
 
 
 def begin(plan: Plan, store: Store, resume: bool, overrides: Mapping[str, str] | None = None) -> None:
-    """Make a store the plan's, or see that it is. Raises InputError where it holds another study, or other code's rows.
+    """Initialize a store for a plan, or check that it belongs to the plan.
 
-    resume : whether trials that are in already are wanted there;  overrides : the command line's, kept with the store
+    resume    : whether to continue a store that already has trials
+    overrides : study keys from the command line, saved in the store
+
+    Raises InputError if the store holds another study or rows of another code version, or if `resume` does not fit.
     """
     held, done = store.meta("digest"), store.counts()["done"]
     if held and held != plan.digest:
@@ -116,7 +124,7 @@ def begin(plan: Plan, store: Store, resume: bool, overrides: Mapping[str, str] |
 
 
 def check_scene(plan: Plan, store: Store) -> None:
-    """See that the first and the last point that are in were of scenes that are still the same, files and all."""
+    """Raise InputError if the scene of the first or the last stored point, or a file it names, has changed."""
     points = store.points()
     for point, told in store.scenes():
         now = scene_hash(resolved(plan.recipe, points[point].settings)[0])
@@ -128,14 +136,17 @@ def check_scene(plan: Plan, store: Store) -> None:
 
 
 def run(plan: Plan, store: Store, engine: Engine, watch: Watch | None = None) -> Progress:
-    """Do all missing trials of a plan's points, or as many as its budget allows."""
+    """Run all missing trials of a plan, or as many as its budget allows."""
     return run_points(plan, store, engine, plan.points, 0, watch)
 
 
 def run_points(
     plan: Plan, store: Store, engine: Engine, points: Sequence[Point], first: int, watch: Watch | None = None
 ) -> Progress:
-    """Do the missing trials of points `first` and following; rows are in the store once they are counted."""
+    """Run the missing trials of `points`, numbered from `first`, within the budget of time and failures.
+
+    Rows are stored before they are counted, so a killed run loses at most the chunks in flight.
+    """
     replicates = plan.study.replicates
     span = np.arange(first * replicates, (first + len(points)) * replicates)
     missing = span[~store.done(int(span[-1]) + 1)[span]]

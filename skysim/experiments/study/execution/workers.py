@@ -1,4 +1,4 @@
-"""The process that a pool's workers are forked from: it imports all that a trial takes while others read files."""
+"""Fork server of the process pool: it imports everything a trial needs once, and workers are forked from it."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ ONE_THREAD = ("NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "M
 
 
 def warm() -> ForkServerContext:
-    """Begin that process, with one thread for each of its children, and return at once."""
+    """Start the fork server, with one numerical thread per worker. Returns at once; the imports run in parallel."""
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(["skysim.experiments.study.trials"])
     with one_thread():
@@ -22,13 +22,13 @@ def warm() -> ForkServerContext:
 
 
 def one_thread() -> AbstractContextManager[None]:
-    """An environment for what is begun in it: as many workers as cores have no use for threads."""
+    """Context in which started processes use one numerical thread each; there is already one worker per core."""
     return environment(dict.fromkeys(ONE_THREAD, "1"))
 
 
 @contextmanager
 def environment(values: Mapping[str, str]) -> Iterator[None]:
-    """What is begun in it has these variables."""
+    """Context with these environment variables set; processes started in it inherit them."""
     before = {name: os.environ.get(name) for name in values}
     os.environ.update(values)
     try:

@@ -1,4 +1,4 @@
-"""A study's results for other tools: CSV, Parquet, and xarray's datasets as NetCDF or Zarr."""
+"""Export a study's results for other tools: CSV, Parquet and Zarr, and as an xarray dataset."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from skysim.results.files.export import EXTRA
 
 
 def to_csv(store: Store, responses: tuple[str, ...], path: Path) -> None:
-    """One line a trial, what is not there left empty; numbers as Python writes them, which read back the same."""
+    """Write one line per trial, missing values empty; numbers in Python's shortest form, which reads back exactly."""
     columns = everything(store)
     with files.whole(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
@@ -27,7 +27,10 @@ def to_csv(store: Store, responses: tuple[str, ...], path: Path) -> None:
 
 
 def to_parquet(store: Store, responses: tuple[str, ...], path: Path) -> None:
-    """One row a trial; study's title and code version in the file's metadata."""
+    """Write one row per trial; title, code version and study file are in the file's metadata.
+
+    Raises InputError if pyarrow is not installed.
+    """
     try:
         import pyarrow
         import pyarrow.parquet
@@ -40,8 +43,11 @@ def to_parquet(store: Store, responses: tuple[str, ...], path: Path) -> None:
 
 
 def dataset(store: Store, responses: tuple[str, ...], path: Path) -> Any:
-    """An xarray.Dataset: every response, its interval and count; over the factors as dimensions where the design is
-    full, else over the points."""
+    """An xarray.Dataset of every response with its interval and count.
+
+    The dimensions are the factors if the design is a full factorial, otherwise the points. Raises InputError if
+    xarray or pandas is not installed.
+    """
     try:
         import pandas
         import xarray
@@ -61,7 +67,7 @@ def dataset(store: Store, responses: tuple[str, ...], path: Path) -> Any:
 
 
 def to_zarr(store: Store, responses: tuple[str, ...], path: Path) -> None:
-    """`dataset` as a Zarr folder."""
+    """Write `dataset` as a Zarr folder."""
     made = dataset(store, responses, path)
     with files.whole_folder(path) as temporary:
         made.to_zarr(temporary, mode="w", consolidated=False)
@@ -75,7 +81,7 @@ EXPORTS: dict[str, Callable[[Store, tuple[str, ...], Path], None]] = {
 
 
 def export(store: Store, responses: tuple[str, ...], path: Path) -> None:
-    """Write a study's results in the format that the path ends in. Raises InputError for one that is none."""
+    """Write a study's results in the format given by the path's suffix. Raises InputError for an unknown suffix."""
     if path.suffix not in EXPORTS:
         raise InputError(f"{path}: {path.suffix or 'no suffix'!r} is none of {', '.join(EXPORTS)}")
     files.make_folder(path.parent)

@@ -1,4 +1,4 @@
-"""A study's pictures, each a PNG that stands alone. What goes where in them is `arrange`'s."""
+"""Draw a study's figures, each as a PNG. `layout` selects their contents."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from skysim.results.plots import INK, MARKS, png
 if TYPE_CHECKING:
     from skysim.experiments.study.analysis.sensitivity import Index
 
-TICKS = 16  # levels up to which each has its tick
-UPRIGHT = 8  # names below an axis up to which they are broken into lines, then turned
-WIDE = 88  # letters that fit below an axis
-WRITTEN = 12  # rows and columns of a heat map up to which its cells tell their value
-NAMED = 12  # points of a front up to which each is named
+TICKS = 16  # maximum number of levels with a tick each
+UPRIGHT = 8  # maximum number of tick labels that are wrapped; with more, long ones are rotated
+WIDE = 88  # characters that fit below an axis
+WRITTEN = 12  # maximum rows and columns of a heat map with values written in its cells
+NAMED = 12  # maximum number of Pareto points that are labeled
 QUIET, FRONT = "#8fa1b3", "#d55e00"
 
 
 def figure_png(lines: Sequence[Line], figure: Figure, study: Study) -> bytes:
-    """A figure of a study as PNG. Raises InputError where its `where` names what is not there."""
+    """A figure of a study as PNG. Raises InputError if its `where` names an unknown factor or level."""
     if isinstance(figure, Curve):
         return png(lambda fig: draw_curve(fig, lines, figure, study), (7.4, 3.9))
     if is_drawn(study):
@@ -43,7 +43,7 @@ def figure_png(lines: Sequence[Line], figure: Figure, study: Study) -> bytes:
 
 
 def draw_curve(fig: Any, lines: Sequence[Line], figure: Curve, study: Study) -> None:
-    """Lines with their intervals; drawn points by themselves, many of them with their running median."""
+    """Draw series with their intervals; sampled points as markers, with a running median if they are many."""
     axes, across, loose = fig.subplots(), layout.axis(study, lines, figure.x), is_drawn(study)
     shown = layout.series(lines, figure, study)
     dots = layout.in_dots(study, across, sum(len(one.x) for one in shown))
@@ -53,7 +53,7 @@ def draw_curve(fig: Any, lines: Sequence[Line], figure: Curve, study: Study) -> 
     for n, one in enumerate(shown):
         ink = colour(n, len(shown), apart is not None and apart.numeric)
         wide_pt = min(3.0, 20 / len(shown)) if across.numeric else min(6.0, 60 / len(shown))
-        step_pt = (n - (len(shown) - 1) / 2) * wide_pt  # so that bars stand side by side
+        step_pt = (n - (len(shown) - 1) / 2) * wide_pt  # bars side by side
         if loose:
             draw_points(axes, one, ink, MARKS[n % len(MARKS)], across.numeric, dots)
         else:
@@ -66,7 +66,7 @@ def draw_curve(fig: Any, lines: Sequence[Line], figure: Curve, study: Study) -> 
 
 
 def upright(axes: Any, name: str, shown: Sequence[Series | Panel], log: bool, bars: bool = True) -> None:
-    """A y axis that shows all values and, where they have bars, those bars' ends."""
+    """Set up the y axis: limits that include all values and, if drawn, their error bars; label and scale."""
     ends = [end for one in shown for end in (one.low, one.high)] if bars else []
     low, high = layout.limits([one.value for one in shown], ends, log, layout.is_share(name))
     if log:
@@ -76,7 +76,10 @@ def upright(axes: Any, name: str, shown: Sequence[Series | Panel], log: bool, ba
 
 
 def draw_line(axes: Any, one: Series, ink: Any, mark: str, across: Axis, step_pt: float) -> None:
-    """One line, a few points aside; names are joined by dots only."""
+    """Draw one series, offset sideways by `step_pt` points; named levels are joined by a dotted line.
+
+    On a logarithmic axis a value of zero cannot be drawn; an open triangle marks its upper bound.
+    """
     from matplotlib.transforms import offset_copy
 
     beside = offset_copy(axes.transData, axes.figure, x=step_pt, units="points")
@@ -95,7 +98,10 @@ def draw_line(axes: Any, one: Series, ink: Any, mark: str, across: Axis, step_pt
 
 
 def draw_points(axes: Any, one: Series, ink: Any, mark: str, numeric: bool, dots: bool) -> None:
-    """Points that lie anywhere; many with their running median, or over names with the median of each."""
+    """Draw sampled points: with error bars, or, if they are many, with their running median.
+
+    On an axis of named levels the median at each level replaces the running median.
+    """
     style = {"marker": mark, "color": ink, "linestyle": "none"}
     if not dots:
         draw_bars(axes, one, ink, axes.transData)
@@ -111,7 +117,7 @@ def draw_points(axes: Any, one: Series, ink: Any, mark: str, numeric: bool, dots
 
 
 def draw_bars(axes: Any, one: Series | Panel, ink: Any, where: Any, x: Floats | None = None) -> None:
-    """Intervals as bars. One without an end leaves the picture."""
+    """Draw intervals as bars; an infinite bound extends beyond the axis limits."""
     places = one.x if isinstance(one, Series) else x
     low, high = reach(axes, one)
     axes.vlines(places, low, high, color=ink, alpha=0.6, linewidth=1, transform=where)
@@ -128,14 +134,15 @@ def draw_bars(axes: Any, one: Series | Panel, ink: Any, where: Any, x: Floats | 
 
 
 def reach(axes: Any, one: Series | Panel) -> tuple[Floats, Floats]:
-    """Intervals' ends to be drawn: of what is infinite, or nowhere on a logarithmic axis, well outside the picture."""
+    """Interval bounds for drawing; infinite bounds, and those <= 0 on a logarithmic axis, are moved to a point well
+    outside the axis limits."""
     bottom, top = axes.get_ylim()
     beyond = (bottom / 10, top * 10) if axes.get_yscale() == "log" else (2 * bottom - top, 2 * top - bottom)
     return np.clip(one.low, *beyond), np.clip(one.high, *beyond)
 
 
 def running(one: Series) -> tuple[Floats, Floats]:
-    """Medians of place and value of a dozen equal parts of a line's points."""
+    """Medians of x and of value in twelve groups of equal size, along a series ascending in x."""
     good = np.isfinite(one.value)
     parts = zip(np.array_split(one.x[good], 12), np.array_split(one.value[good], 12), strict=True)
     told = np.array([(np.median(x), np.median(y)) for x, y in parts if len(x)]).reshape(-1, 2)
@@ -143,20 +150,20 @@ def running(one: Series) -> tuple[Floats, Floats]:
 
 
 def by_name(one: Series) -> tuple[Floats, Floats]:
-    """Medians of value at each place."""
+    """Median of the values at each distinct x."""
     places = np.unique(one.x[np.isfinite(one.value)])
     return places, np.array([np.nanmedian(one.value[one.x == place]) for place in places])
 
 
 def colour(n: int, count: int, ordered: bool) -> Any:
-    """Of a line among others: by rank where they have an order, else as unlike as can be."""
+    """Color of line n of `count`: from a color scale if the lines are ordered, else from the palette."""
     from matplotlib import colormaps
 
     return colormaps["viridis"](0.82 * n / max(count - 1, 1)) if ordered and count > 2 else INK[n % len(INK)]
 
 
 def along(axes: Any, across: Axis) -> None:
-    """An x axis: a tick for each of a few levels, names turned where they would touch."""
+    """Set up the x axis: one tick per level if they are few, with labels rotated if they would overlap."""
     axes.set_xlabel(across.label)
     places = np.array([across.place(one) for one in across.levels])
     if across.log:
@@ -178,12 +185,12 @@ def along(axes: Any, across: Axis) -> None:
 
 
 def wrapped(name: str, count: int) -> str:
-    """One of so many names below an axis, in lines that do not touch the next name's."""
+    """A tick label wrapped so that `count` labels fit below the axis without overlap."""
     return textwrap.fill(name, max(WIDE // count, 8)) if count <= UPRIGHT else name
 
 
 def logarithmic(axes: Any, which: str, low: float, high: float) -> None:
-    """A logarithmic axis with plain numbers."""
+    """Make axis `which` logarithmic, with plain decimal tick labels."""
     from matplotlib.ticker import NullFormatter
 
     getattr(axes, f"set_{which}scale")("log")
@@ -195,18 +202,22 @@ def logarithmic(axes: Any, which: str, low: float, high: float) -> None:
 
 
 def ticks(low: float, high: float) -> tuple[Any, Any]:
-    """Of a logarithmic axis: over many decades each, over few 1, 2 and 5 of each, within one as they come."""
+    """Tick locator and formatter of a logarithmic axis.
+
+    Ticks are at each decade over three decades or more, at 1, 2 and 5 of each decade over less, and at round numbers
+    if the range is a factor of 8 or less.
+    """
     from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator
 
     where = LogLocator(subs=(1, 2, 5) if high < 1000 * low else (1,)) if high > 8 * low else MaxNLocator(5)
     return where, FuncFormatter(lambda value, _: f"{value:.6g}")
 
 
-# Two factors.
+# Heat maps and scatter plots of two factors.
 
 
 def draw_heat(fig: Any, cells: Grid, figure: Heat) -> None:
-    """A cell for each pair of levels; hatched where nothing is known."""
+    """Draw one cell for each pair of levels, hatched if it has no value."""
     axes = fig.subplots()
     image = axes.imshow(
         np.ma.masked_invalid(cells.value),
@@ -237,13 +248,13 @@ def draw_heat(fig: Any, cells: Grid, figure: Heat) -> None:
 
 
 def bar(fig: Any, image: Any, figure: Heat) -> None:
-    """The colour bar, with the response's name."""
+    """Add the color bar, labeled with the response."""
     locator, formatter = ticks(image.norm.vmin, image.norm.vmax) if figure.log else (None, None)
     fig.colorbar(image, label=label(figure.value), ticks=locator, format=formatter).minorticks_off()
 
 
 def norm(values: Floats, log: bool) -> Any:
-    """How values become colours; with no difference between them, or none, something all the same."""
+    """Color normalization over the finite values; a valid default range if all are equal or there are none."""
     from matplotlib.colors import LogNorm, Normalize
 
     told = values[np.isfinite(values) & ((values > 0) | (not log))]
@@ -253,19 +264,19 @@ def norm(values: Floats, log: bool) -> Any:
 
 
 def patch(place: tuple[float, float], **look: Any) -> Any:
-    """A cell."""
+    """A rectangle of one heat map cell."""
     from matplotlib.patches import Rectangle
 
     return Rectangle(place, 1, 1, **look)
 
 
 def short(value: float) -> str:
-    """A number that fits its cell."""
+    """A number in a form short enough for a cell."""
     return f"{value:.0f}" if 1000 <= abs(value) < 1e5 else f"{value:.3g}"
 
 
 def draw_scatter(fig: Any, lines: Sequence[Line], figure: Heat, study: Study) -> None:
-    """Drawn points over two factors, coloured by their value."""
+    """Draw sampled points over two factors, colored by response."""
     axes, chosen = fig.subplots(), layout.kept(lines, figure, study)
     x, y = (layout.axis(study, lines, name) for name in (figure.x, figure.y))
     places = [(x.place(line.levels[figure.x]), y.place(line.levels[figure.y])) for line in chosen]
@@ -287,14 +298,14 @@ def draw_scatter(fig: Any, lines: Sequence[Line], figure: Heat, study: Study) ->
 
 
 def indices_png(indices: Sequence[Index], response: str) -> bytes:
-    """Bars of one response's first-order and total indices, the greatest total first."""
+    """Bar chart of the first-order and total Sobol indices of one response, largest total first, as PNG."""
     told = [one for one in indices if one.response == response]
     told.sort(key=lambda one: -np.nan_to_num(one.total.value, nan=-np.inf))
     return png(lambda fig: draw_indices(fig, told, response), (7.0, 1.1 + 0.42 * len(told)))
 
 
 def draw_indices(fig: Any, told: Sequence[Index], response: str) -> None:
-    """Two bars a factor, with their intervals."""
+    """Draw two bars per factor, with their intervals."""
     axes, rows = fig.subplots(), np.arange(len(told))
     for shift, name, ink, parts in (
         (-0.19, "first order", INK[0], [one.first for one in told]),
@@ -313,11 +324,11 @@ def draw_indices(fig: Any, told: Sequence[Index], response: str) -> None:
     fig.legend(loc="outside right upper")
 
 
-# Searches.
+# Optimizations.
 
 
 def search_png(panels: dict[str, Panel], points: Sequence[int], front: Sequence[int]) -> bytes:
-    """What a search looked at by candidate, one panel above another; the front marked, bounds dashed."""
+    """Responses of an optimization against candidate number, stacked panels; Pareto points marked, bounds dashed."""
 
     def draw(fig: Any) -> None:
         x, marked = np.array(points, dtype=float), np.isin(points, front)
@@ -337,7 +348,7 @@ def search_png(panels: dict[str, Panel], points: Sequence[int], front: Sequence[
 
 
 def pareto_png(one: Panel, other: Panel, points: Sequence[int], front: Sequence[int]) -> bytes:
-    """Every candidate by its two objectives; those that none beats in both are joined and named."""
+    """Candidates in the plane of the two objectives; Pareto-optimal ones are joined and, if few, labeled."""
     from matplotlib.patheffects import withStroke
 
     def draw(fig: Any) -> None:

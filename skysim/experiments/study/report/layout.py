@@ -1,4 +1,8 @@
-"""What goes where in a study's pictures: which figures there are, their axes, lines and cells, their captions."""
+"""Contents of a study's figures: which figures to draw, their axes, series, grid cells and captions.
+
+`figures` draws what this module selects. Points of the designs in DRAWN and of optimizations are scattered: no two
+share a level, so they are not grouped by level but shown as points, with running medians where there are many.
+"""
 
 from __future__ import annotations
 
@@ -15,21 +19,21 @@ from skysim.experiments.study.factors import Distribution, Levels, Range, Value,
 from skysim.experiments.study.plan import Curve, Figure, Heat, Search, Study
 from skysim.results import metrics
 
-DRAWN = ("lhs", "sobol", "saltelli")  # designs whose points share no levels
-BARS = 12  # places on an axis up to which intervals are bars, then bands
-CROWD = 60  # drawn points up to which each has its bar; beyond, their running median is drawn
-BANDS = 4  # of a drawn factor that tells lines apart
-MOST_LINES = 7  # of a curve that no study file asked for; with more levels it is a heat map
-MOST_FIGURES = 24  # that no study file asked for
-RATIO = 10  # of the last level to the first, from which a factor may be shown by its logarithm
-SPAN = 30  # of a response's values, from which a figure that no study file asked for has a logarithmic axis
-FAR = 30  # times below the least value, an interval's end no longer stretches a logarithmic axis
+DRAWN = ("lhs", "sobol", "saltelli")  # sampled designs: no two points share a level
+BARS = 12  # maximum number of x values for error bars; with more, intervals are drawn as a band
+CROWD = 60  # maximum number of sampled points with error bars; with more, a running median is drawn
+BANDS = 4  # number of groups into which a sampled factor `by` is divided
+MOST_LINES = 7  # maximum number of lines in an automatic curve; with more levels it becomes a heat map
+MOST_FIGURES = 24  # maximum number of automatic figures
+RATIO = 10  # minimum ratio of last to first level for a logarithmic factor axis
+SPAN = 30  # minimum ratio of largest to smallest response for a logarithmic axis of an automatic figure
+FAR = 30  # interval bounds below the smallest value / FAR do not extend a logarithmic axis
 UNITS = {"_deg_s": "deg/s", "_arcsec": "arcsec", "_deg": "deg", "_mag": "mag", "_px": "px", "_um": "um"}
 UNITS |= {"_mm": "mm", "_ms": "ms", "_hz": "Hz", "_m": "m", "_s": "s"}
 
 
 class Axis(NamedTuple):
-    """A factor as an axis: its levels in order, ascending where they are numbers of one unit, else the study's."""
+    """A factor as an axis: label and levels, ascending if they are numbers of one unit, else in the study's order."""
 
     label: str
     levels: list[Value]
@@ -37,13 +41,13 @@ class Axis(NamedTuple):
     log: bool
 
     def place(self, one: Value) -> float:
-        """Where a level stands: its number, or how many stand before it."""
+        """Coordinate of a level on the axis: its numeric value, or its index if levels are not numeric."""
         if self.numeric:
             return split(one)[0]
         return float(next(n for n, other in enumerate(self.levels) if same(one, other)))
 
     def told(self, one: Value) -> str:
-        """What stands at a level; a number without its unit, which the label has."""
+        """Tick text of a level; a number is written without its unit, which is in the axis label."""
         if not self.numeric:
             return level(one)
         number = self.place(one)
@@ -51,7 +55,7 @@ class Axis(NamedTuple):
 
 
 class Series(NamedTuple):
-    """A line of a curve: what it is called and (N,) places, values and ends of their intervals, by place."""
+    """A line of a curve: its label and (N,) x, values and interval bounds, ascending in x."""
 
     label: str
     x: Floats
@@ -61,7 +65,7 @@ class Series(NamedTuple):
 
 
 class Grid(NamedTuple):
-    """A heat map: its axes and (Y, X) values, NaN where nothing is known."""
+    """A heat map: its axes and (Y, X) values, NaN where there is no value."""
 
     x: Axis
     y: Axis
@@ -69,7 +73,7 @@ class Grid(NamedTuple):
 
 
 class Panel(NamedTuple):
-    """What a search looked at: (N,) values by candidate and ends of their intervals, and what they must not pass."""
+    """One response of an optimization: (N,) values and interval bounds by candidate, and its constraint bounds."""
 
     label: str
     value: Floats
@@ -82,12 +86,12 @@ class Panel(NamedTuple):
 
 
 def is_drawn(study: Study) -> bool:
-    """Whether points lie anywhere, so that no two share their levels."""
+    """Whether the points are sampled, so that no two share a level: a design in DRAWN, or an optimization."""
     return study.optimise is not None or study.design.kind in DRAWN
 
 
 def same(one: Value, other: Value) -> bool:
-    """Whether two levels are one: 5 and 5.0 are, "5 m" and "5.0 m" too."""
+    """Whether two levels are equal, as numbers where possible: 5 equals 5.0, and "5 m" equals "5.0 m"."""
     try:
         return split(one) == split(other)
     except ValueError:
@@ -95,12 +99,12 @@ def same(one: Value, other: Value) -> bool:
 
 
 def distinct(levels: Iterable[Value]) -> list[Value]:
-    """Levels, each once."""
+    """The levels without duplicates, in order of first appearance."""
     return list({repr(one): one for one in levels}.values())
 
 
 def label(name: str, unit: str = "") -> str:
-    """A name for people, its unit in brackets: `cross_arcsec_p95` is "cross p95 [arcsec]"."""
+    """Readable name with its unit in brackets: `cross_arcsec_p95` becomes "cross p95 [arcsec]"."""
     figure, _, statistic = name.rpartition("_")
     stem, tail = (figure, f" {statistic}") if statistic in metrics.STATISTICS else (name, "")
     ending = next((ending for ending in UNITS if stem.endswith(ending)), "")
@@ -110,12 +114,12 @@ def label(name: str, unit: str = "") -> str:
 
 
 def is_share(name: str) -> bool:
-    """Whether a response lies between 0 and 1."""
+    """Whether a response is a proportion between 0 and 1."""
     return name in metrics.SHARES or bool(metrics.COVERAGE.match(name)) or name.startswith("availability_")
 
 
 def axis(study: Study, lines: Sequence[Line], name: str) -> Axis:
-    """A factor of a study as an axis, of the levels at which there are points."""
+    """The axis of a factor, with the levels at which there are points."""
     factor, levels = study.factors[name], distinct(line.levels[name] for line in lines)
     key = "" if isinstance(factor, Levels) else factor.key or ""
     unit = next((unit for ending, unit in UNITS.items() if key.endswith(ending)), "")
@@ -124,7 +128,8 @@ def axis(study: Study, lines: Sequence[Line], name: str) -> Axis:
         levels = [levels[n] for n in np.argsort(numbers)]
         told = isinstance(factor, Range) and factor.scale == "log"
         told |= isinstance(factor, Distribution) and factor.distribution == "lognormal"
-        even = isinstance(factor, Range | Distribution)  # in what they say themselves
+        # A range or distribution declares its own scale; explicit values are judged by their spacing.
+        even = isinstance(factor, Range | Distribution)
         return Axis(label(name, own or unit), levels, True, told or (not even and by_ratio(np.sort(numbers))))
     order = [one for one, _ in factor.options()]
     levels.sort(key=lambda one: next((n for n, other in enumerate(order) if same(one, other)), len(order)))
@@ -133,7 +138,7 @@ def axis(study: Study, lines: Sequence[Line], name: str) -> Axis:
 
 
 def numbers_of(levels: Sequence[Value]) -> tuple[Floats | None, str]:
-    """Levels as numbers of one unit, no two alike; None where they are not."""
+    """(N,) levels as numbers, and their unit. None unless all are numbers of the same unit and distinct."""
     try:
         parts = [split(one) for one in levels]
     except ValueError:
@@ -145,31 +150,36 @@ def numbers_of(levels: Sequence[Value]) -> tuple[Floats | None, str]:
 
 
 def in_bands(across: Axis) -> bool:
-    """Whether a line has so many places that its intervals are a band."""
+    """Whether intervals are drawn as a band: a numeric axis with more than BARS levels."""
     return across.numeric and len(across.levels) > BARS
 
 
 def in_dots(study: Study, across: Axis, count: int) -> bool:
-    """Whether drawn points are so many, or so close, that their medians are shown instead of intervals."""
+    """Whether medians are drawn instead of intervals: sampled points that are many or share a non-numeric axis."""
     return is_drawn(study) and (count > CROWD or not across.numeric)
 
 
 def by_ratio(numbers: Floats) -> bool:
-    """Whether ascending numbers over a wide range step by ratios more evenly than by differences."""
+    """Whether ascending numbers suit a logarithmic axis.
+
+    True if they are positive, extend over a ratio of at least RATIO, and their steps vary less as ratios than as
+    differences (compared by the coefficient of variation).
+    """
     if len(numbers) < 4 or numbers[0] <= 0 or numbers[-1] < RATIO * numbers[0]:
         return False
     uneven = [np.std(steps) / np.mean(steps) for steps in (np.diff(np.log(numbers)), np.diff(numbers))]
     return bool(uneven[0] < uneven[1])
 
 
-# Which figures, and of which points.
+# Selection of figures and of their points.
 
 
 def figures(study: Study, lines: Sequence[Line]) -> list[Figure]:
-    """The study file's; where it names none, sensible ones of every response, or of the first: MOST_FIGURES.
+    """The figures of the study file; if it has none, automatic figures of the responses, about MOST_FIGURES at most.
 
-    Drawn points, and those of one factor at a time, against each factor; else against the first that is numeric,
-    with a line for each level of another, or over both where those were too many lines.
+    With sampled points and with one factor at a time, each response is drawn against each factor. Otherwise it is
+    drawn against the first numeric factor, with a line for each level of a second factor, or as a heat map over both
+    if there would be too many lines.
     """
     if study.figures or not lines:
         return list(study.figures)
@@ -184,12 +194,13 @@ def figures(study: Study, lines: Sequence[Line]) -> list[Figure]:
         x = next((name for name in varied if axes[name].numeric), varied[0])
         by = next((name for name in varied if name != x), None)
         pairs = [(x, by, y) for y in study.responses]
-    most = max(MOST_FIGURES * len(study.responses) // len(pairs), 1)  # responses, each with all its figures
+    # If there are too many figures, show fewer responses, each with all of its figures.
+    most = max(MOST_FIGURES * len(study.responses) // len(pairs), 1)  # responses to show
     return [sensible(x, by, y, axes, lines) for x, by, y in pairs if y in study.responses[:most]]
 
 
 def sensible(x: str, by: str | None, y: str, axes: Mapping[str, Axis], lines: Sequence[Line]) -> Figure:
-    """A figure that no study file asked for."""
+    """An automatic figure: a curve, or a heat map if `by` has more than MOST_LINES levels."""
     values = np.array([line.responses[y].value for line in lines])
     values = values[np.isfinite(values)]
     log = bool(len(values) and values.min() > 0 and values.max() > SPAN * values.min())
@@ -199,9 +210,11 @@ def sensible(x: str, by: str | None, y: str, axes: Mapping[str, Axis], lines: Se
 
 
 def held(figure: Figure, study: Study, lines: Sequence[Line]) -> dict[str, Value]:
-    """The levels at which a figure holds factors: as its `where` says, else, of those it does not show, the first.
+    """The levels at which a figure keeps factors fixed: those of its `where`, and the first level of other factors
+    that it does not show.
 
-    Drawn points share no levels: there `where` alone holds. Raises InputError where it names what is not there.
+    Sampled points share no levels, so only `where` applies to them. Raises InputError if `where` names an unknown
+    factor or level.
     """
     for name, wanted in figure.where.items():
         if name not in study.factors:
@@ -222,13 +235,13 @@ def held(figure: Figure, study: Study, lines: Sequence[Line]) -> dict[str, Value
 
 
 def kept(lines: Sequence[Line], figure: Figure, study: Study) -> list[Line]:
-    """The lines of the table that a figure shows."""
+    """The table lines (points) that a figure shows."""
     levels = held(figure, study, lines)
     return [line for line in lines if all(same(line.levels[name], one) for name, one in levels.items())]
 
 
 def series(lines: Sequence[Line], figure: Curve, study: Study) -> list[Series]:
-    """The lines of a curve, one for each level of `by`; of a drawn `by`, for each of BANDS equal parts."""
+    """The series of a curve, one for each level of `by`; for a sampled `by`, one for each of BANDS equal groups."""
     across, chosen = axis(study, lines, figure.x), kept(lines, figure, study)
     groups = {"": chosen}
     if figure.by is not None:
@@ -237,13 +250,14 @@ def series(lines: Sequence[Line], figure: Curve, study: Study) -> list[Series]:
 
 
 def one_series(name: str, lines: Sequence[Line], figure: Curve, across: Axis) -> Series:
-    """Some lines of the table as a line of a curve."""
+    """Some table lines as one series, ascending in x."""
     told = [(across.place(line.levels[figure.x]), *line.responses[figure.y][:3]) for line in lines]
     return Series(name, *np.array(sorted(told, key=lambda one: one[0]), dtype=float).T)
 
 
 def grouped(lines: Sequence[Line], apart: Axis, name: str, study: Study) -> dict[str, list[Line]]:
-    """Lines of the table by a factor's level, in the axis's order."""
+    """Table lines grouped by the level of factor `name`, in the order of its axis `apart`."""
+    # A sampled factor has about as many levels as points: divide the sorted points into BANDS groups of equal size.
     if is_drawn(study) and apart.numeric and len(apart.levels) > 2 * BANDS:
         ordered = sorted(lines, key=lambda line: apart.place(line.levels[name]))
         ends = [round(n * len(ordered) / BANDS) for n in range(BANDS + 1)]
@@ -254,7 +268,7 @@ def grouped(lines: Sequence[Line], apart: Axis, name: str, study: Study) -> dict
 
 
 def grid(lines: Sequence[Line], figure: Heat, study: Study) -> Grid:
-    """The cells of a heat map."""
+    """The axes and cell values of a heat map."""
     x, y = axis(study, lines, figure.x), axis(study, lines, figure.y)
     columns = {x.place(one): n for n, one in enumerate(x.levels)}
     rows = {y.place(one): n for n, one in enumerate(y.levels)}
@@ -266,7 +280,10 @@ def grid(lines: Sequence[Line], figure: Heat, study: Study) -> Grid:
 
 
 def limits(values: Sequence[Floats], ends: Sequence[Floats], log: bool, share: bool) -> tuple[float, float]:
-    """Of an axis that shows all values and what is finite of their intervals' ends, unless far below on a log axis."""
+    """Axis limits that include all values and all finite interval bounds, with padding.
+
+    On a logarithmic axis nonpositive numbers, and bounds far below the smallest value (FAR), are left out.
+    """
     inner, outer = (np.concatenate([*arrays, np.empty(0)]) for arrays in (values, ends))
     inner, outer = inner[np.isfinite(inner)], outer[np.isfinite(outer)]
     if log:
@@ -279,24 +296,25 @@ def limits(values: Sequence[Floats], ends: Sequence[Floats], log: bool, share: b
     if log:
         pad = max((high / low) ** 0.06, 1.15 if high > 2 * low else 1.5)
         return low / pad, high * pad
+    # Start at zero if the values come near it.
     low = 0.0 if 0 < low < 0.4 * high else low
     pad = 0.06 * (high - low) or 0.1 * abs(high) or 1.0
     low, high = low - (pad if low else pad / 2), high + pad
     return (max(low, -0.03), min(high, 1.03)) if share else (low, high)
 
 
-# A search's candidates.
+# Candidates of an optimization.
 
 
 def panels(lines: Sequence[Line], search: Search, costs: Mapping[int, float] | None) -> dict[str, Panel]:
-    """What a search looked at, by name: its objectives, what else it constrains, and costs where they are given."""
+    """One panel per objective, constrained response and, if costs are given, cost; by name."""
     names = [one.response for one in search.objectives] + [one.response for one in search.constraints]
     names += ["cost"] * (costs is not None)
     return {name: panel(name, lines, search, costs or {}) for name in dict.fromkeys(names)}
 
 
 def panel(name: str, lines: Sequence[Line], search: Search, costs: Mapping[int, float]) -> Panel:
-    """One response, or `cost`, by candidate."""
+    """The panel of one response, or of `cost`, over the candidates."""
     nothing = float("nan")
     if name == "cost":
         told: list[Any] = [(costs.get(line.point, nothing), nothing, nothing) for line in lines]
@@ -314,11 +332,11 @@ def panel(name: str, lines: Sequence[Line], search: Search, costs: Mapping[int, 
     return Panel(label(name) + better, value, low, high, bounds)
 
 
-# Words.
+# Captions.
 
 
 def caption(figure: Figure, study: Study, lines: Sequence[Line]) -> str:
-    """What a figure shows, what it holds, of how many values, and what its marks mean."""
+    """Caption of a figure: its axes, the fixed levels, the number of trials per point, and the markers used."""
     curve = isinstance(figure, Curve)
     value = figure.y if isinstance(figure, Curve) else figure.value
     other = (figure.by, "by") if isinstance(figure, Curve) else (figure.y, "and")
@@ -350,5 +368,5 @@ def caption(figure: Figure, study: Study, lines: Sequence[Line]) -> str:
 
 
 def varies(lines: Sequence[Line], name: str) -> bool:
-    """Whether points differ in a factor."""
+    """Whether a factor has more than one level among the points."""
     return len(distinct(line.levels[name] for line in lines)) > 1

@@ -1,4 +1,4 @@
-"""The report of a study: one self-contained HTML page of its facts, figures and table, all from its store."""
+"""HTML report of a study: one self-contained page with counts, figures and a table, made from its store."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ from skysim.results.report import embed
 if TYPE_CHECKING:
     from skysim.experiments.study.analysis.sensitivity import Index
 
-LISTED = 10  # failures
-ROWS = 5000  # of the table
+LISTED = 10  # maximum number of failures listed
+ROWS = 5000  # maximum number of rows in the table
 
 
 class Picture(NamedTuple):
-    """A picture as the page has it: a data URI and its caption."""
+    """An image of the page: a data URI and its caption."""
 
     source: str
     caption: str
 
 
 class Cell(NamedTuple):
-    """A cell of the table: what it says, what it is sorted by (nothing: last), whether it is a number."""
+    """A table cell: its text, its sort key (an empty key sorts last), and whether it is a number."""
 
     text: str
     key: float | str
@@ -46,12 +46,12 @@ def write_page(
     front: Sequence[int] | None = None,
     costs: Mapping[int, float] | None = None,
 ) -> None:
-    """One HTML file with everything inside.
+    """Write the report as one self-contained HTML file.
 
-    command : what repeats the study;  lines : its table, of all that `responses` names
-    indices : of a study of design saltelli
-    front   : the points of an optimised study that none beats;  costs : by point, where it has any
-    Raises InputError where a figure's `where` names what is not there.
+    command : command that repeats the study;  lines : its table with all responses of `responses`
+    indices : Sobol indices, for a study of design saltelli
+    front   : Pareto-optimal points of an optimization;  costs : cost by point, if the study has costs
+    Raises InputError if `where` of a figure names an unknown factor or level.
     """
     from jinja2 import Environment
 
@@ -79,11 +79,11 @@ def write_page(
     write_text(path, text)
 
 
-# What it says.
+# Text and tables.
 
 
 def responses(study: Study) -> list[str]:
-    """The study's responses, and what else its figures and its search ask for."""
+    """The study's responses and those used by its figures, objectives and constraints, without `cost`."""
     shown = [one.y if isinstance(one, Curve) else one.value for one in study.figures]
     search = study.optimise
     sought = [one.response for one in (search.objectives if search else ())]
@@ -92,7 +92,7 @@ def responses(study: Study) -> list[str]:
 
 
 def facts(store: Store, study: Study) -> dict[str, Any]:
-    """What was done, of how much, with what."""
+    """Counts of points and trials (planned, done, failed, wrong), and the code version."""
     counts, points = store.counts(), len(store.points())
     wanted = study.optimise.candidates if study.optimise else points
     trials, by_runs = wanted * study.replicates, sum(run["trials"] for run in store.runs())
@@ -104,14 +104,14 @@ def facts(store: Store, study: Study) -> dict[str, Any]:
         "trials": trials,
         "whole": points > 0 and counts["done"] >= trials,
         "code": store.meta("code"),
-        "unnoted": max(counts["done"] - by_runs, 0),  # of runs that were killed
+        "unnoted": max(counts["done"] - by_runs, 0),  # trials of killed runs
     }
 
 
 def sortable(
     lines: Sequence[Line], study: Study, costs: Mapping[int, float] | None
 ) -> tuple[list[str], list[list[Cell]]]:
-    """The table's heads and cells; a factor of names sorts in the study's order."""
+    """Column heads and cells of the table. Named levels sort in the order of the study file."""
     heads, told = cells(lines)
     axes = {name: layout.axis(study, lines, name) for name in (lines[0].levels if lines else ())}
     rows = []
@@ -128,11 +128,11 @@ def sortable(
 
 
 def plain(key: float) -> float | str:
-    """What a script sorts by; nothing for NaN."""
+    """Sort key of a number for the page's script; an empty string for NaN."""
     return "" if math.isnan(key) else key
 
 
-# What it shows.
+# Images.
 
 
 def illustrated(lines: Sequence[Line], study: Study) -> list[Picture]:
@@ -144,13 +144,13 @@ def illustrated(lines: Sequence[Line], study: Study) -> list[Picture]:
 
 
 def undrawn(study: Study, lines: Sequence[Line]) -> list[str]:
-    """The study's responses that no figure shows."""
+    """Responses of the study that no figure shows."""
     shown = {one.y if isinstance(one, Curve) else one.value for one in layout.figures(study, lines)}
     return [name for name in study.responses if name not in shown]
 
 
 def budgeted(indices: Sequence[Index]) -> list[Picture]:
-    """Sobol indices, a picture a response."""
+    """Sobol indices, one image per response."""
     named = dict.fromkeys(one.response for one in indices)
     told = "Sobol indices of {}: the share of its variance that would go were a factor known, and that would stay"
     told += " were all others known; intervals of 95 %."
@@ -160,7 +160,7 @@ def budgeted(indices: Sequence[Index]) -> list[Picture]:
 def searched(
     lines: Sequence[Line], study: Study, front: Sequence[int], costs: Mapping[int, float] | None
 ) -> list[Picture]:
-    """What an optimised study looked at and, with two objectives, their Pareto front."""
+    """Plots of an optimization: every candidate and, with two objectives, the Pareto front."""
     if study.optimise is None or not lines:
         return []
     panels, points = layout.panels(lines, study.optimise, costs), [line.point for line in lines]
