@@ -1,7 +1,8 @@
-"""JSON Schema of scene and study files, for editors; and which versions of such a file this skysim reads.
+"""JSON Schema of scene and study files, for editors.
 
-An editor is told what a key may hold before anything is run. It cannot know what a `base` or a preset has, so that it
-takes nothing but the version for missing; `skysim validate` does.
+The schema tells an editor which keys exist and what values they may hold. It requires only the key `schema` (the
+(version), because an editor does not know which keys come from a `base` or a preset; `skysim validate` also reports
+missing keys.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from skysim.experiments.study.plan import Study
 from skysim.scene.scene import STEM, Scene
 
 KINDS: Mapping[str, type[BaseModel]] = {"scene": Scene, "study": Study}
-BESIDE: Mapping[str, dict[str, Any]] = {  # keys that are taken out before a file is checked
+BESIDE: Mapping[str, dict[str, Any]] = {  # keys that the loader removes before validation
     "Scene": {"base": {"type": "string", "description": "another scene, by name or beside this one"}},
     "Camera": {
         "preset": {"type": "string", "description": "a file of data/cameras: what is left out is from there"},
@@ -40,7 +41,10 @@ def json_schema(kind: str) -> dict[str, Any]:
 
 
 def loosened(node: Any, name: str = "") -> Any:
-    """A schema in which nothing is missing; of a choice between sections any that fits will do."""
+    """Return the schema without required keys, defaults and discriminators; `oneOf` becomes `anyOf`.
+
+    name : of the definition that `node` is, for which BESIDE may add keys
+    """
     if isinstance(node, list):
         return [loosened(one) for one in node]
     if not isinstance(node, dict):
@@ -52,7 +56,7 @@ def loosened(node: Any, name: str = "") -> Any:
             kept[key] = told | BESIDE.get(name, {})
         elif key == "$defs":
             kept[key] = {one: loosened(of, one) for one, of in value.items()}
-        elif key in BOUNDS:  # pydantic's own words, where a check of ours stands between
+        elif key in BOUNDS:  # pydantic's keyword remains where a validator precedes the bound
             kept |= {BOUNDS[key]: value} if node.get("type") in ("number", "integer") else {}
         elif key not in DROPPED and (key != "title" or name):
             kept["anyOf" if key == "oneOf" else key] = loosened(value)
