@@ -1,5 +1,5 @@
-// A frame and its marks on one canvas: unpacked off the page's thread, drawn together, so that a mark never stands
-// over another frame than its own. An <img> beneath an <svg> took the browser twice as long.
+// A frame and its marks on one canvas. The frame is decoded off the main thread and drawn together with its marks, so
+// that marks never appear on another frame. An <img> below an <svg> took the browser twice as long.
 export default {
   template: `<canvas role="img" @click="told" @mousemove="told" @mouseleave="told"></canvas>`,
   props: { look: Object }, // src: the frame's address; size: of the frame; marks: see overlay.py; label: in words
@@ -20,7 +20,7 @@ export default {
     },
   },
   methods: {
-    // Draw the newest look; one that is overtaken while its frame is fetched is drawn all the same, then the newest.
+    // Draw the newest look. If a newer one arrives while a frame is fetched, draw the fetched one first, then the newer.
     async renew() {
       if (this.fetching) return;
       this.fetching = true;
