@@ -99,6 +99,7 @@ class Solver:
         from_middle_out = sorted(range(TRACKERS), key=lambda n: abs(n - (TRACKERS - 1) / 2))
         # A tracker of focal length f covers f (1 - u) to f (1 + u): u = (ratio - 1) / (ratio + 1) makes neighbors meet.
         uncertainty = (ratio - 1) / (ratio + 1)
+        # Each range's longest field is widest / ratio^n; its tracker believes the middle of the range.
         tangents = [widest / ratio**n * (1 - uncertainty) for n in from_middle_out]
         return [
             (Camera.from_fov(width_px, height_px, 2 * math.atan(tangent)), uncertainty + OVERLAP)
@@ -114,7 +115,7 @@ class Solver:
         """
         taken = self.time_utc or taken
         if (width_px, height_px, taken) not in self.built:
-            self.built.clear()
+            self.built.clear()  # keep the trackers of one image size and date only
         ready = self.built.setdefault((width_px, height_px, taken), {})
         for believed, uncertainty in self.beliefs(width_px, height_px):
             if believed not in ready:
@@ -295,8 +296,9 @@ def sought(
     if not found:
         return attitude, tracker
     best, its = min(found, key=lambda one: log10_chance(one[0]))
+    # The same attitude found by neighboring trackers, whose ranges overlap, is no rival.
     rivals = [log10_chance(one) for one, _ in found if not alike(one, best)]
-    share = ACCEPT_LOG10_CHANCE - math.log10(TRACKERS)
+    share = ACCEPT_LOG10_CHANCE - math.log10(TRACKERS)  # Bonferroni correction for TRACKERS searches
     beyond = log10_chance(best) <= min(share, min(rivals, default=0.0) - MARGIN_DEX)
     return (best if beyond else Attitude(NO_MATCH)), its
 

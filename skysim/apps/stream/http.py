@@ -157,6 +157,7 @@ class Handler(BaseHTTPRequestHandler):
         mine, number = self.board.come(), -1
         try:
             while packet := self.board.after(number):
+                # Packet numbers are consecutive, so a gap counts the packets that this client missed.
                 mine.dropped += packet.number - number - 1 if mine.sent else 0
                 number = packet.number
                 told = packet.after(mine.dropped)

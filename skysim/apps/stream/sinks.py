@@ -63,7 +63,7 @@ class Sink:
 
     def offer(self, packet: Packet, patient: bool) -> None:
         """Queue a packet. If the queue is full, wait if `patient`, else drop the packet."""
-        packet = packet.after(self.dropped)
+        packet = packet.after(self.dropped)  # the header's count includes frames dropped by this sink
         while not self.fault:
             try:
                 self.waiting.put(packet, timeout=0.1 if patient else 0.0001)
