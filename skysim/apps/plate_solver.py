@@ -99,7 +99,7 @@ class Solver:
         from_middle_out = sorted(range(TRACKERS), key=lambda n: abs(n - (TRACKERS - 1) / 2))
         # A tracker of focal length f covers f (1 - u) to f (1 + u): u = (ratio - 1) / (ratio + 1) makes neighbors meet.
         uncertainty = (ratio - 1) / (ratio + 1)
-        # Each range's longest field is widest / ratio^n; its tracker believes the middle of the range.
+        # Half-field tangents: range n begins at widest / ratio^n, where the focal length is f (1 - u).
         tangents = [widest / ratio**n * (1 - uncertainty) for n in from_middle_out]
         return [
             (Camera.from_fov(width_px, height_px, 2 * math.atan(tangent)), uncertainty + OVERLAP)

@@ -69,7 +69,7 @@ def send(
     for look in run.live(lab, None, pace.in_time if watched else None):
         closed_s = closes_s(lab, look)
         if pace.zero_s is None:
-            pace.start(closed_s)  # the first frame is ready by definition when its exposure ends
+            pace.start(closed_s)  # so that the first frame has no delay
         pace.wait(closed_s)
         due_s, now_s = pace.due_s(closed_s), time.monotonic()
         left_out = look.frame.index - tally.made

@@ -106,6 +106,7 @@ def labels(
     cells of half the font size: one integer per row, one bit per column.
     """
     side, taken = font / 2, dict[int, int]()
+    # The marks themselves occupy space first, so that no label covers one.
     for one in spots:
         x, y, half = one.x + 0.5, one.y + 0.5, 0.9 * size
         take(taken, max(x - half, 0.0), max(y - half, 0.0), x + half, y + half, side)
@@ -129,6 +130,7 @@ def labels(
 def take(taken: dict[int, int], left: float, top: float, right: float, bottom: float, side: float) -> bool:
     """Mark the cells of a box as occupied; return False, and mark none, if one of them is occupied already."""
     first = max(int(left / side), 0)
+    # Bits first..last of a row.
     bits = (2 << (int(right / side) - first)) - 1 << first
     rows = range(int(top / side), int(bottom / side) + 1)
     if any(taken.get(row, 0) & bits for row in rows):

@@ -65,6 +65,7 @@ class Flown:
         long_s = when.close_s(scene.camera.height_px) - when.open_s
         begin_s = min(max(t_s, 0.0), last_s - long_s)
         exposure = scene.exposure.model_copy(update={"first_s": begin_s})
+        # The start time in units of 0.1 ms is part of the seed.
         seed = scene.seed + 1 + round(begin_s * 1e4)
         here = replace(self.lab, scene=scene.model_copy(update={"exposure": exposure, "seed": seed}))
         desk.lab_from_body = self.lab.trajectory.at(begin_s)

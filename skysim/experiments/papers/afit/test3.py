@@ -113,13 +113,13 @@ def fitted_places(lab: Testbed) -> Floats:
     """(5, 3) LED positions in the board's plane for which the thesis's eqs 43-45, without noise, give Table 8.
 
     Least squares of eight coordinates to ten angles; the central LED is fixed. Table 8 is sorted, so its angles are
-    assigned to pairs by the order of the angles from the scene's nominal positions.
+    assigned to pairs by the order of the angles from the scene's positions, which neglect the error of eq. 44.
     """
     rows = experiments()[ID].rows
     published = np.array([rows[f"separation_{n}"].published for n in range(1, 11)], dtype=float)
     place_m = lab.sources.place[:, :3].copy()
     start = seen_arcsec(lab, place_m)
-    # Table 8 is in ascending order: give its k-th angle to the pair with the k-th nominal angle.
+    # Table 8 is in ascending order: its k-th angle belongs to the pair with the k-th smallest start angle.
     aim = np.empty(len(published))
     aim[np.argsort(start)] = published
 

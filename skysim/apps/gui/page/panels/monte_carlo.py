@@ -146,6 +146,7 @@ class TrialPanel:
         if not (self.count.value and 1 <= self.count.value <= 100_000):
             raise InputError("runs: allowed: 1 to 100000")
         told = self.tab.scene_path, self.tab.overrides, trial, int(self.count.value)
+        # A stopped run with unchanged settings is resumed from its own file.
         before = self.trials.folder / "monte_carlo.yaml"
         if self.stopped and before.is_file() and before.read_text() == monte_carlo(*told, self.runs):
             return before

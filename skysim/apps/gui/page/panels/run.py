@@ -261,7 +261,7 @@ def options() -> dict[str, Any]:
     """ECharts options of four stacked strips with a common time axis; each has a title, a legend and an empty text."""
     text, rule = {"color": INK["quiet"], "fontSize": 10}, {"lineStyle": {"color": INK["line"]}}
     plain = text | {"fontWeight": "normal", "fontSize": 11}
-    last, slot = len(STRIPS) - 1, 24.2  # per cent of the chart's height
+    last, slot = len(STRIPS) - 1, 24.2  # percent of the chart's height
     tops = [1 + n * slot for n in range(last + 1)]
     legend = {"textStyle": text, "itemWidth": 12, "itemHeight": 6, "itemGap": 8, "right": 10, "padding": 0}
     return {
