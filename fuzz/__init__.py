@@ -1,1 +1,1 @@
-"""Files that nobody wrote by hand, for every parser: bytes grown from a small corpus. See `fuzz.__main__`."""
+"""Fuzzing of all parsers with mutated files, starting from a small corpus. See `fuzz.__main__`."""

@@ -1,8 +1,9 @@
-"""`python -m fuzz SECONDS [TARGET ...] [--plain]`: every target for its share of the time; exit code 1 for a finding.
+"""`python -m fuzz SECONDS [TARGET ...] [--plain]`: fuzz the targets, each for an equal share of the time.
 
-Guided by coverage (atheris, libFuzzer) where that is installed; else, or with --plain, by nothing but mutation of the
-corpus. It begins with fuzz/corpus/, with what earlier runs grew in out/fuzz/, and with files that skysim ships. What is
-found is kept in out/fuzz/; once it is mended it goes into fuzz/corpus/, which the tests read too.
+Exit code 1 if there is a finding. Fuzzing is guided by coverage (atheris, libFuzzer) if atheris is installed;
+otherwise, or with --plain, the corpus is only mutated at random. Seeds are fuzz/corpus/, files that skysim ships, and
+(guided) the inputs that earlier runs have added in out/fuzz/. Findings are kept in out/fuzz/; after the bug is fixed,
+the file goes into fuzz/corpus/, which the tests read too.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from types import FunctionType, ModuleType
 HERE = Path(__file__).parent
 CORPUS, OUT = HERE / "corpus", HERE.parent / "out" / "fuzz"
 SLOWEST_S, MOST_MB = 10, 3000
-# Of each target: shipped files that it begins with too.
+# Targets, and the shipped files that are seeds of each.
 TARGETS = {
     "scenes": ("scenes/*.yaml", "data/cameras/*.yaml"),
     "studies": (),
@@ -43,7 +44,7 @@ TARGETS = {
     "quantities": (),
 }
 NAMES = tuple(TARGETS)
-# What guides: whole packages; and of a great one, all of which would take half a minute, the parts that read files.
+# Instrumented for coverage: whole packages, and of astropy only the modules that read files (all would take 30 s).
 GUIDES = ["skysim", "estimator", "yaml", "json"]
 PARTS = ("astropy.io.ascii.", "astropy.io.fits.", "astropy.table.")
 TOKENS = (
@@ -65,17 +66,17 @@ TOKENS = (
 
 
 def shipped(name: str) -> list[Path]:
-    """Files of a target that are in the tree for another reason."""
+    """Shipped files that are seeds of a target."""
     return [path for glob in TARGETS[name] for path in sorted(HERE.parent.glob(glob))]
 
 
 def seeds(name: str) -> list[bytes]:
-    """What a target begins with."""
+    """All seeds of a target: corpus and shipped files."""
     return [path.read_bytes() for path in (*sorted((CORPUS / name).iterdir()), *shipped(name))]
 
 
 def dictionary(name: str) -> Path:
-    """A dictionary for libFuzzer: the words of a target's seeds, of its schema, and TOKENS."""
+    """Write libFuzzer's dictionary for a target (words of its seeds and schemas, and TOKENS) and return its path."""
     schemas = {"scenes": ("scene",), "overrides": ("scene",), "studies": ("scene", "study")}.get(name, ())
     texts = [*seeds(name), *((HERE.parent / f"data/schema/{one}.json").read_bytes() for one in schemas)]
     found = {word for text in texts for word in re.findall(rb"[A-Za-z_][\w-]{2,40}", text)}
@@ -86,7 +87,7 @@ def dictionary(name: str) -> Path:
 
 
 def mutated(seed: bytes, others: list[bytes], rng: Random) -> bytes:
-    """A seed with a few bytes changed, cut, doubled, or taken from another."""
+    """Apply 1 to 6 random mutations to a seed: change, delete or duplicate bytes, insert tokens or parts of another."""
     data = bytearray(seed)
     for _ in range(rng.randint(1, 6)):
         at = rng.randrange(len(data) + 1)
@@ -110,7 +111,7 @@ def mutated(seed: bytes, others: list[bytes], rng: Random) -> bytes:
 
 
 def timed(target: Callable[[bytes], None], data: bytes) -> None:
-    """A target; a finding too where it takes long by the processor's clock, which no other work stretches."""
+    """Run a target. Raises AssertionError above SLOWEST_S of CPU time, which other load does not lengthen."""
     begin = time.process_time()
     target(data)
     if (took_s := time.process_time() - begin) > SLOWEST_S:
@@ -118,11 +119,12 @@ def timed(target: Callable[[bytes], None], data: bytes) -> None:
 
 
 def plainly(name: str, seconds: float, seed: int = 1) -> int:
-    """Mutation alone: how many findings."""
+    """Fuzz a target by random mutation only; return the number of findings."""
     from fuzz.targets import TARGETS
 
     rng, corpus, end, findings, tries = Random(seed), seeds(name), time.monotonic() + seconds, 0, 0
     while time.monotonic() < end:
+        # First every seed unchanged, then mutations of random seeds.
         data = corpus[tries] if tries < len(corpus) else mutated(rng.choice(corpus), corpus, rng)
         tries += 1
         try:
@@ -137,14 +139,17 @@ def plainly(name: str, seconds: float, seed: int = 1) -> int:
 
 
 def guided(names: list[str], share_s: float) -> int:
-    """libFuzzer: how many targets were found out. It ends its process by itself, so each has one of its own."""
+    """Fuzz with libFuzzer; return the number of targets with a finding.
+
+    libFuzzer ends its process itself, so each target runs in a forked child.
+    """
     import atheris
 
     with atheris.instrument_imports(include=GUIDES):
         from fuzz.targets import TARGETS
 
         for name in names:
-            for path in (CORPUS / name).iterdir():  # what is imported only now is a guide too
+            for path in (CORPUS / name).iterdir():  # imports on first use must be instrumented too
                 with suppress(Exception):
                     TARGETS[name](path.read_bytes())
     for name, module in sorted(sys.modules.items()):
@@ -173,7 +178,7 @@ def guided(names: list[str], share_s: float) -> int:
 
 
 def functions(module: ModuleType) -> Iterator[FunctionType]:
-    """Those of a module and the methods of its classes."""
+    """Functions of a module and methods of its classes."""
     for one in vars(module).values():
         for inner in vars(one).values() if isinstance(one, type) else [one]:
             if isinstance(inner, FunctionType) and inner.__module__ == module.__name__:
@@ -181,7 +186,7 @@ def functions(module: ModuleType) -> Iterator[FunctionType]:
 
 
 def fuzzed(target: Callable[[bytes], None], words: list[str]) -> None:
-    """libFuzzer on a target; there is no way back."""
+    """Run libFuzzer on a target; does not return."""
     import atheris
 
     atheris.Setup(words, partial(timed, target))
@@ -189,16 +194,16 @@ def fuzzed(target: Callable[[bytes], None], words: list[str]) -> None:
 
 
 def alone(work: Callable[[], None]) -> int:
-    """Work in a process of its own: its exit code."""
+    """Run `work` in a forked process and return its exit code."""
     sys.stdout.flush()
     if (child := os.fork()) == 0:
-        work()  # libFuzzer writes down what it has found as the interpreter ends
+        work()  # libFuzzer writes its findings when the interpreter exits
         sys.exit()
     return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
 
 
 def main() -> int:
-    """The targets that are asked for, one after another."""
+    """Fuzz the requested targets one after another; return the exit code."""
     words = [word for word in sys.argv[1:] if not word.startswith("-")]
     seconds, names = float(words[0]) if words else 60.0, words[1:] or list(NAMES)
     OUT.mkdir(parents=True, exist_ok=True)

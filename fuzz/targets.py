@@ -1,4 +1,4 @@
-"""What is fuzzed: each target takes the bytes of one file and must read it or refuse it in one line."""
+"""Fuzz targets: each takes the bytes of one file and must read it or reject it with a one-line error."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ COLOUR = ptase.Colour(0.1, 0.2, 0.0)
 
 @cache
 def folder() -> tempfile.TemporaryDirectory[str]:
-    """Of this process alone; it goes with it."""
+    """A temporary folder of this process, removed at its end."""
     return tempfile.TemporaryDirectory(prefix="skysim-fuzz-")
 
 
 def written(data: bytes, name: str) -> Path:
-    """The bytes as a file."""
+    """Write the bytes to a file in the temporary folder and return its path."""
     path = Path(folder().name) / name
     path.parent.mkdir(exist_ok=True)
     path.write_bytes(data)
@@ -47,7 +47,7 @@ def written(data: bytes, name: str) -> Path:
 
 
 def refused(read: Callable[[], object], *ways: type[Exception]) -> bool:
-    """Whether it was refused, in one of these ways and in one line."""
+    """Return True if `read` raises one of these exceptions. Raises AssertionError if its message is not one line."""
     try:
         read()
     except ways as error:
@@ -109,11 +109,11 @@ def calibrations(data: bytes) -> None:
 
 
 def tables(data: bytes) -> None:
-    """LEDs, points of a dome, a curve over the wavelength, a point-spread function."""
+    """CSV tables: LEDs, surveyed points of a dome, a curve over wavelength, a point-spread function."""
     path = written(data, "table.csv")
     refused(lambda: layout.read_csv(path), InputError)
     refused(lambda: point_cloud.fit(point_cloud.read(str(path), "m"), 2, str(path)), InputError)
-    refused(lambda: photometry._read.__wrapped__(path), InputError)  # what is cached goes by the file's name
+    refused(lambda: photometry._read.__wrapped__(path), InputError)  # bypass the cache, whose key is the path
     refused(lambda: otf.cells_of.__wrapped__(str(path)), InputError)
 
 
@@ -123,7 +123,7 @@ def vehicles(data: bytes) -> None:
 
 
 def stores(data: bytes) -> None:
-    """The file of a study, as its reports read it, and as a run that goes on does."""
+    """A study's store, read as for a report, and as for resuming a run."""
     path = written(data, "trials.sqlite")
 
     def read() -> None:
@@ -135,17 +135,17 @@ def stores(data: bytes) -> None:
         with store.writing(path) as kept:
             kept.meta("digest"), kept.meta("code"), kept.counts(), kept.points(), kept.scenes()
 
-    for beside in path.parent.glob(f"{path.name}-*"):  # a log of the file before
+    for beside in path.parent.glob(f"{path.name}-*"):  # SQLite's journal of the previous file
         beside.unlink()
     refused(read, InputError)
     refused(resume, InputError)
 
 
 def answers(data: bytes) -> None:
-    """What a tracker says, which may be anybody's program."""
+    """An external tracker's answer: parsed, checked, and printed without control characters."""
     try:
         told = json.loads(data)
-    except (ValueError, RecursionError):  # as `programs` has it
+    except (ValueError, RecursionError):  # as in tracking.external.process
         return
     statuses: list[str] = []
     if refused(lambda: statuses.append(interface.checked(interface.Answer.of_tree(told)).status), ValueError):

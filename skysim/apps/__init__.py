@@ -1,1 +1,1 @@
-"""What people start: the command line, the page in the browser, the real-time stream and the plate solver."""
+"""User-facing programs: command line, browser GUI, real-time stream and plate solver."""

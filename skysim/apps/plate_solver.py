@@ -1,4 +1,12 @@
-"""Images from files, of any camera, to right ascension, declination and roll, or a refusal."""
+"""Plate solver: right ascension, declination and roll of image files from any camera, lost in space.
+
+If the field of view is known (a camera file, an OpenCV calibration or `--fov`), one `StarTracker` solves the image.
+If it is unknown, 5 to 40 degrees are split into TRACKERS overlapping ranges of focal length in geometric
+progression, each searched by a tracker that fits the focal length within its range. The image's stars are detected
+once; all trackers are tried with little effort before any is tried with more. The solution with the lowest
+probability of being due to chance is accepted only if it is significant after division of the significance level by
+the number of trackers (Bonferroni), and if it beats every solution elsewhere on the sky by MARGIN_DEX.
+"""
 
 from __future__ import annotations
 
@@ -36,18 +44,18 @@ from skysim.scene.camera import CameraConfig as CameraPart
 from skysim.tracking.onboard_model import calibration
 
 CALIBRATED_UNCERTAINTY = (
-    0.003  # of a focal length by OpenCV: a chessboard's is good to a part in a thousand or so
+    0.003  # relative; an OpenCV chessboard calibration gives the focal length to about 0.1 %
 )
-FOV_UNCERTAINTY = 0.055  # "to 5 %", with half a per cent for how people measure it
+FOV_UNCERTAINTY = 0.055  # relative; the 5 % that the user is asked for, plus 0.5 % for how it was measured
 PHOTO_EPOCH = datetime.datetime(2020, 1, 1, 12)
 
-# Where nobody tells the field of view: horizontal, and how many trackers share it, each a range of focal lengths. Wide
-# ranges, as the index of a field serves another 1.5 times as wide, and a search takes its time however wide.
+# Horizontal fields of view searched if none is given, and the number of trackers that share the range. The ranges are
+# wide because one index of star pairs serves fields 1.5 times as wide, and a search takes as long for a narrow range.
 WIDEST_DEG, NARROWEST_DEG = 40.0, 5.0
 TRACKERS = 5
 OVERLAP = 0.01  # of the focal length
-DECISIVE_LOG10_CHANCE = -10.0  # beyond which no other field of view is looked at
-MARGIN_DEX = 3.0  # by which an answer must beat one elsewhere
+DECISIVE_LOG10_CHANCE = -10.0  # a solution below this ends the search without trying other fields of view
+MARGIN_DEX = 3.0  # by which a solution must beat those with another attitude
 SAME_RAD = math.radians(0.2)
 
 STAGES: dict[str, Mapping[str, object]] = {
@@ -60,12 +68,12 @@ STAGES: dict[str, Mapping[str, object]] = {
 
 @dataclass(frozen=True, slots=True)
 class Solver:
-    """How to look at images: a field of view known to 5 %, a camera known exactly or by calibration, or neither: 5 to
-    40 degrees.
+    """Settings of the plate solver: a field of view known to 5 %, or a camera known exactly or by calibration; with
+    neither, 5 to 40 degrees are searched.
 
-    time_utc : when the pictures were taken; None takes each FITS file's own, or 2020, when aberration (20") is
-        left out because it turns with the season.
-    built    : the trackers for images of the last one's size and time
+    time_utc : when the images were taken; None takes the date of each FITS header. Without any date the epoch is
+        2020, and stellar aberration (20") is left out because its direction depends on the season.
+    built    : cache of the trackers for the last image size and time
     """
 
     fov_deg: float | None
@@ -77,7 +85,7 @@ class Solver:
     built: dict[Any, dict[Camera, StarTracker]] = field(default_factory=dict, compare=False, repr=False)
 
     def beliefs(self, width_px: int, height_px: int) -> list[tuple[Camera, float]]:
-        """Cameras to try on images of this size, and how uncertain the focal length of each is; the likeliest first."""
+        """Cameras to try for this image size, each with its relative focal-length uncertainty, the likeliest first."""
         if self.camera:
             return [(calibration(self.camera), 0.0)]
         if self.calibrated:
@@ -89,8 +97,9 @@ class Solver:
         widest, narrowest = (math.tan(math.radians(deg) / 2) for deg in (WIDEST_DEG, NARROWEST_DEG))
         ratio = (widest / narrowest) ** (1 / TRACKERS)
         from_middle_out = sorted(range(TRACKERS), key=lambda n: abs(n - (TRACKERS - 1) / 2))
-        # A tracker of focal length f finds those from f (1 - u) to f (1 + u), ratio times as long.
+        # A tracker of focal length f covers f (1 - u) to f (1 + u): u = (ratio - 1) / (ratio + 1) makes neighbors meet.
         uncertainty = (ratio - 1) / (ratio + 1)
+        # Half-field tangents: range n begins at widest / ratio^n, where the focal length is f (1 - u).
         tangents = [widest / ratio**n * (1 - uncertainty) for n in from_middle_out]
         return [
             (Camera.from_fov(width_px, height_px, 2 * math.atan(tangent)), uncertainty + OVERLAP)
@@ -100,10 +109,13 @@ class Solver:
     def trackers(
         self, width_px: int, height_px: int, taken: datetime.datetime | None
     ) -> Iterator[StarTracker]:
-        """The star trackers for an image of this size, taken then: one, or those that share the fields of view."""
+        """Yield the trackers for an image of this size and date: one, or one per range of fields of view.
+
+        Trackers are built when first needed and cached until an image of another size or date comes.
+        """
         taken = self.time_utc or taken
         if (width_px, height_px, taken) not in self.built:
-            self.built.clear()
+            self.built.clear()  # keep the trackers of one image size and date only
         ready = self.built.setdefault((width_px, height_px, taken), {})
         for believed, uncertainty in self.beliefs(width_px, height_px):
             if believed not in ready:
@@ -117,7 +129,7 @@ class Solver:
 
 
 def named_scene(path: Path) -> Path:
-    """The file, or the path of the shipped scene of that name. Raises InputError with the allowed names."""
+    """Return the file's path, or that of the shipped scene of this name. Raises InputError with the allowed names."""
     return path if path.suffix or path.exists() else loader.find(str(path))
 
 
@@ -128,7 +140,10 @@ def make_solver(
     time_utc: datetime.datetime | None = None,
     stages: Mapping[str, str] | None = None,
 ) -> Solver:
-    """Check what the user gave; stages: names of algorithms by STAGES. Raises InputError with one line."""
+    """Build a Solver from user input. Raises InputError with one line.
+
+    stages : names of algorithms by stage (keys of STAGES); the tracker's defaults for the others
+    """
     if fov_deg is not None and camera_file is not None:
         raise InputError("give either --fov DEG or --camera FILE")
     if fov_deg is not None and not 1 <= fov_deg <= 120:
@@ -151,7 +166,7 @@ def make_solver(
 
 
 def believable(taken: datetime.datetime | None) -> tuple[datetime.datetime | None, str]:
-    """A picture's date, if there is one for which we know the Earth's and the stars' motion, and else why not."""
+    """Return (date in UTC, ""), or (None, reason) for a date outside the supported range; (None, "") without a date."""
     try:
         return (scene.in_our_time(taken) if taken else None), ""
     except ValueError as error:
@@ -159,7 +174,7 @@ def believable(taken: datetime.datetime | None) -> tuple[datetime.datetime | Non
 
 
 def known(stage: str, name: str) -> str:
-    """The name, if there is such an algorithm."""
+    """Return the name if the stage has such an algorithm. Raises InputError with the allowed names."""
     try:
         return require_member(name, STAGES[stage])
     except ValueError as error:
@@ -168,11 +183,11 @@ def known(stage: str, name: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class PlateSolution:
-    """Where an image looks; the angles are None unless `status` is solved.
+    """Pointing of an image; the angles are None unless `status` is solved.
 
-    ra_deg, dec_deg : of the image's middle, ICRS;  roll_deg : position angle of the image's up, north through east
-    fov_deg         : horizontal field of view as fitted
-    matches         : identified stars;  rms_arcsec : their residual
+    ra_deg, dec_deg : of the image center, ICRS;  roll_deg : position angle of the image's up, north through east
+    fov_deg         : fitted horizontal field of view
+    matches         : number of identified stars;  rms_arcsec : rms of their residuals
     """
 
     status: str
@@ -191,10 +206,10 @@ def solve_image(
     camera: str | Path | None = None,
     time_utc: datetime.datetime | None = None,
 ) -> PlateSolution:
-    """Attitude of an image file of the sky, lost in space. It is `skysim.solve`.
+    """Solve the attitude of an image file of the sky, lost in space. Public as `skysim.solve`.
 
     fov_deg  : horizontal field of view to 5 %; 5 to 40 degrees are tried if neither it nor `camera` is given
-    camera   : a scene, a camera file or OpenCV's calibration in place of fov_deg
+    camera   : a scene, a camera file or an OpenCV calibration in place of fov_deg
     time_utc : when the image was taken; the FITS header's date if left out
 
     Raises InputError with one line for an image that cannot be read.
@@ -208,10 +223,10 @@ def solve_image(
 
 
 def solve(path: Path, solver: Solver, annotated: Path | None) -> dict[str, Any]:
-    """One file to one answer: the fields of `skysim solve --json`. Writes the annotated PNG.
+    """Solve one file and return the fields of `skysim solve --json`. Writes the annotated PNG if `annotated` is given.
 
-    Bad input does not raise here, for other files wait behind it: its line becomes the status, with
-    `bad_input` true for the exit code. `doubt` is what of the header was not believed.
+    An unreadable image does not raise, so that the files after it are still solved: its error line becomes `status`,
+    and `bad_input` is true (for the exit code). `doubt` says why the header's date was ignored, if it was.
     """
     answer: dict[str, Any] = {
         "file": str(path),
@@ -249,14 +264,14 @@ def solve(path: Path, solver: Solver, annotated: Path | None) -> dict[str, Any]:
 
 
 def look(image: NDArray, solver: Solver, taken: datetime.datetime | None) -> tuple[Report, StarTracker]:
-    """An image's answer, and the tracker whose it is."""
+    """Solve one monochrome image and return the report and the tracker that made it. taken : UTC, if known."""
     height_px, width_px = image.shape
     first = next(solver.trackers(width_px, height_px, taken))
     if solver.camera or solver.calibrated or solver.fov_deg:
         return first.solve(image), first
     clock = Clock()
-    centroids = see(image, first.camera, solver.settings, clock)  # of which only the camera's size counts
-    for effort in range(first.efforts):  # a little at all fields of view before much at any
+    centroids = see(image, first.camera, solver.settings, clock)  # detection uses the camera's size only
+    for effort in range(first.efforts):  # try all fields of view quickly before trying any thoroughly
         attitude, tracker = sought(centroids, solver.trackers(width_px, height_px, taken), clock, effort)
         if attitude.solved:
             break
@@ -266,9 +281,10 @@ def look(image: NDArray, solver: Solver, taken: datetime.datetime | None) -> tup
 def sought(
     centroids: Centroids, trackers: Iterator[StarTracker], clock: Clock, effort: int
 ) -> tuple[Attitude, StarTracker]:
-    """Of the attitudes that trackers of different fields of view find, the one beyond chance and beyond its rivals.
+    """Return the most significant attitude among those of trackers with different fields of view, and its tracker.
 
-    Each field of view is one more occasion for a wrong answer, so each is allowed its share of the chance.
+    Each tracker is one more opportunity for a false match, so the accepted probability of chance is divided by
+    TRACKERS. The best attitude must also beat every different attitude by MARGIN_DEX; otherwise the result is NO_MATCH.
     """
     found: list[tuple[Attitude, StarTracker]] = []
     for tracker in trackers:
@@ -280,26 +296,30 @@ def sought(
     if not found:
         return attitude, tracker
     best, its = min(found, key=lambda one: log10_chance(one[0]))
+    # The same attitude found by neighboring trackers, whose ranges overlap, is no rival.
     rivals = [log10_chance(one) for one, _ in found if not alike(one, best)]
-    share = ACCEPT_LOG10_CHANCE - math.log10(TRACKERS)
+    share = ACCEPT_LOG10_CHANCE - math.log10(TRACKERS)  # Bonferroni correction for TRACKERS searches
     beyond = log10_chance(best) <= min(share, min(rivals, default=0.0) - MARGIN_DEX)
     return (best if beyond else Attitude(NO_MATCH)), its
 
 
 def log10_chance(attitude: Attitude) -> float:
-    """Of the answer being due to chance; 0 where there is none."""
+    """log10 of the probability that the match is due to chance; 0 without a match."""
     return attitude.match.log10_chance if attitude.match else 0.0
 
 
 def alike(one: Attitude, other: Attitude) -> bool:
-    """Whether two answers are one."""
+    """Return True if two solved attitudes differ by less than SAME_RAD."""
     assert one.cam_from_ref is not None
     assert other.cam_from_ref is not None
     return bool((one.cam_from_ref * other.cam_from_ref.inv()).magnitude() < SAME_RAD)
 
 
 def check(path: Path, image: NDArray, solver: Solver) -> None:
-    """A known camera makes frames of one size, a scene's of one channel and one depth; anything else is another's."""
+    """Check the image's size against the known camera, and for a scene's camera also its channels and bit depth.
+
+    Raises InputError if the image cannot come from this camera.
+    """
     camera = solver.camera
     if camera and image.ndim != 2:
         raise InputError(f"{path}: a colour image of shape {image.shape}; this camera's are monochrome")
@@ -317,7 +337,7 @@ def check(path: Path, image: NDArray, solver: Solver) -> None:
 
 
 def solution(found: Report) -> dict[str, Any]:
-    """The numbers of a solved image, at the image's middle."""
+    """Fields of a solved image for the JSON output; the angles are those of the image center."""
     attitude = found.attitude
     assert attitude.cam_from_ref is not None
     assert attitude.match is not None
@@ -335,7 +355,11 @@ def solution(found: Report) -> dict[str, Any]:
 
 
 def at_middle(camera: Camera) -> Any:
-    """middle_from_cam: turns the boresight onto the image's middle, its y onto the image's down there."""
+    """Rotation middle_from_cam into a frame with z along the ray of the image center and y along the image's down.
+
+    The principal point need not be the image center, so the camera's own boresight is not used. The down direction
+    comes from the ray of the pixel one row below, made orthogonal to z.
+    """
     from scipy.spatial.transform import Rotation
 
     middle = np.array([(camera.width_px - 1) / 2, (camera.height_px - 1) / 2])
@@ -346,7 +370,7 @@ def at_middle(camera: Camera) -> Any:
 
 
 def picture(image: NDArray, found: Report, tracker: StarTracker) -> NDArray[np.uint8]:
-    """The image with what was seen and who it is."""
+    """The image annotated with detections, matched stars and their Hipparcos numbers."""
     match = found.attitude.match
     seen = found.centroids.xy_px
     if match is None:

@@ -1,4 +1,4 @@
-"""The command line: what commands there are, and how whatever goes wrong ends in one line."""
+"""Entry point of the command line: registers the commands and turns user errors into one line on stderr."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ app.add_typer(studies, name="study")
 
 
 def version(asked: bool) -> None:
-    """Print what a report of a defect should name."""
+    """Print the versions that a bug report should contain."""
     if asked:
         import platform
         from importlib.metadata import version as of
@@ -62,13 +62,13 @@ def options(
         bool, typer.Option("--version", callback=version, is_eager=True, help="Print versions.")
     ] = False,
 ) -> None:
-    """A star tracker's laboratory in software: fly, light, photograph, solve, score."""
+    """Simulate a star-tracker laboratory: motion, light sources, camera, attitude determination, scoring."""
 
 
 def main() -> None:
-    """Run the command; whatever the user got wrong ends as one line and exit code 2."""
+    """Run the command. A user error prints one line and exits with code 2; Ctrl-C and SIGTERM exit with 130."""
     errors.attended = True
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # whoever ends us, nothing stays half-written
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # clean up after SIGTERM as after Ctrl-C
     try:
         code = app(standalone_mode=False)
     except (InputError, ImageError) as error:
@@ -80,7 +80,7 @@ def main() -> None:
     except (typer.Abort, KeyboardInterrupt):
         code = 130
     except Exception as error:
-        # Usage errors: typer's own since it carries its parser within, click's before that.
+        # Usage errors: recent typer bundles its parser and raises its own class, older versions raise click's.
         if not hasattr(error, "format_message"):
             raise
         code = complain(" ".join(error.format_message().split()) or "give a command; see skysim --help")

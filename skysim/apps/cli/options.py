@@ -1,4 +1,4 @@
-"""Options that several commands take, and what is made of them."""
+"""Options shared by several commands, and the functions that interpret them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 LOADED: list[
     tuple[str, dict[str, str]]
-] = []  # the scene at hand: its name, and what the command line overrides
+] = []  # loaded scenes: name and command-line overrides, for error locations
 
 SceneArg = Annotated[
     str, typer.Argument(metavar="SCENE", help="A scene file (.yaml) or the name of one in scenes/.")
@@ -43,7 +43,7 @@ Json = Annotated[bool, typer.Option("--json", help="Print JSON for machines inst
 
 
 def load(name: str, frames: int | None, seed: int | None, sets: list[str] | None) -> Scene:
-    """The scene with what the command line overrides."""
+    """Load the scene with the command line's overrides. Raises InputError."""
     from skysim.core.yaml_reader import overridden
     from skysim.scene.loader import load as load_scene
 
@@ -57,12 +57,12 @@ def load(name: str, frames: int | None, seed: int | None, sets: list[str] | None
 
 
 def named(**stages: str | None) -> dict[str, str]:
-    """The tracker's stages that the command line names."""
+    """The tracker stages for which the command line names an algorithm."""
     return {stage: name for stage, name in stages.items() if name is not None}
 
 
 def fresh(folder: Path) -> Path:
-    """The folder without the frames and results of an earlier run, which would speak of other frames."""
+    """Make the folder and remove the frames and results of an earlier run; return it."""
     from skysim.core import files
     from skysim.results.files import frames
 
@@ -80,7 +80,7 @@ def moment(text: str | None) -> datetime.datetime | None:
 
 
 def located(message: str) -> str:
-    """A complaint of a key that only made sense too late, with the file and line of the scene where it stands."""
+    """Add file and line of the scene to an error message about a key that was only checked after loading."""
     if not LOADED:
         return message
     from skysim.scene.loader import where

@@ -1,4 +1,4 @@
-"""What the command line shows: progress bars, tables, summaries. Heavy imports wait for their use."""
+"""Terminal output of the command line: progress bars, tables, summaries. Slow imports are inside the functions."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ SURVEY = ("believed", "found", "sigma", "truth")
 
 
 def begun(items: Iterable[T]) -> Iterator[T]:
-    """The same items, the first of them made at once: what is wrong with it is told before old results are cleared."""
+    """Return the same items, the first computed at once: its errors then appear before old results are cleared."""
     rest = iter(items)
     return itertools.chain([next(rest)], rest)
 
 
 def progress(items: Iterable[T], total: int, what: str, quiet: bool = False) -> Iterator[T]:
-    """The items, with a bar on stderr that goes away when it is done."""
+    """Yield the items, with a progress bar on stderr that disappears at the end."""
     from rich.progress import BarColumn, TaskProgressColumn, TimeRemainingColumn
 
     with bar(BarColumn(), TaskProgressColumn(), TimeRemainingColumn(), quiet=quiet) as shown:
@@ -41,24 +41,24 @@ def progress(items: Iterable[T], total: int, what: str, quiet: bool = False) -> 
 
 
 def bar(*columns: ProgressColumn, quiet: bool = False) -> Bar:
-    """A bar on stderr that goes away when it is done, what is done before its columns, and none where nobody looks."""
+    """A transient progress bar on stderr: description, then columns. Disabled if stderr is no terminal."""
     from rich.console import Console
     from rich.progress import Progress, TextColumn
 
     console = Console(stderr=True)
-    what = TextColumn("{task.description}", markup=False)  # a title, and who knows what is in it
+    what = TextColumn("{task.description}", markup=False)  # a title may contain brackets
     return Progress(what, *columns, console=console, transient=True, disable=quiet or not console.is_terminal)
 
 
 def inked(text: str, ink: str) -> Text:
-    """A text of a table in a colour."""
+    """Colored text for a table cell."""
     from rich.text import Text
 
     return Text(text, ink)
 
 
 def print_table(title: str, heads: Sequence[str], lines: Sequence[Sequence[str | Text]]) -> None:
-    """The cells as they are: what looks like rich's markup is none."""
+    """Print a table. Strings are printed literally: rich's markup in them has no effect."""
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text
@@ -78,7 +78,7 @@ def print_table(title: str, heads: Sequence[str], lines: Sequence[Sequence[str |
 
 
 def print_rows(rows: list[Row], names: tuple[str, str, str], exposures_ms: list[float]) -> None:
-    """The rows of a run, and the exposure of each frame."""
+    """Print one line per frame of a run. exposures_ms : exposure time of each frame;  names : of the three angles."""
     triple = "/".join(names)
     heads = [
         "frame",
@@ -118,7 +118,7 @@ def degrees(angles_deg: tuple[float, float, float] | None) -> str:
 
 @contextmanager
 def watched(what: str, quiet: bool = False) -> Iterator[Callable[[float, float], None]]:
-    """A bar on stderr for work that tells how far it is: done(now, all)."""
+    """Show a progress bar on stderr and yield its update function done(completed, total)."""
     from rich.progress import BarColumn, TaskProgressColumn, TimeRemainingColumn
 
     with bar(BarColumn(), TaskProgressColumn(), TimeRemainingColumn(), quiet=quiet) as shown:
@@ -128,9 +128,9 @@ def watched(what: str, quiet: bool = False) -> Iterator[Callable[[float, float],
 
 @contextmanager
 def counted(what: str, total: int) -> Iterator[Callable[[Progress], None]]:
-    """A bar on stderr for trials: how many, how many a second, how long still, how many failed.
+    """Show a progress bar for trials on stderr: done, rate, time left, failures. Yields its update function.
 
-    Where stderr is no terminal, a line at every tenth.
+    If stderr is no terminal, print a line after every tenth of the trials instead.
     """
     from rich.console import Console
     from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
@@ -160,7 +160,7 @@ def counted(what: str, total: int) -> Iterator[Callable[[Progress], None]]:
 
 
 def print_flight(figures: dict[str, float]) -> None:
-    """What is not there is not printed."""
+    """Print the metrics of the motion; those that a scene does not have are skipped."""
     lines = {
         "pointing_deg_worst": "pointing: worst {pointing_deg_worst:.3g}°, at the end {pointing_deg_end:.2g}°; "
         "torque asked for up to {torque_nm_worst:.3g} N m",
@@ -190,7 +190,7 @@ def print_summary(figures: dict[str, Any]) -> None:
 
 
 def print_scores(lines: list[Line], folder: Path) -> None:
-    """The scoreboard, and why frames had no answer."""
+    """Print the scoreboard of a comparison, and the reasons for unsolved frames."""
     heads = ["what", "frames", "right %", "(95 %)", "wrong", "refused", "failed"]
     heads += ["cross ″", "worst ″", "roll ″", "worst ″", "ms", "95 % ms"]
     rows = [
@@ -268,7 +268,7 @@ def print_catalogue(figures: dict[str, Any], json: bool, to_json: Any) -> None:
 
 
 def print_titles(folder: Path, title: Callable[[Path], str], json: bool, to_json: Any) -> None:
-    """The files of a folder by name, with their titles."""
+    """Print names and titles of the YAML files in a folder."""
     listed = [
         {"name": path.stem, "title": title(path), "file": str(path)} for path in sorted(folder.glob("*.yaml"))
     ]
@@ -286,13 +286,16 @@ def number(value: float | None, digits: int | None = None) -> str:
 
 
 def complain(message: str, code: int = 2) -> int:
-    """One line to stderr and the exit code that goes with it."""
+    """Print one line to stderr and return the exit code."""
     print(f"skysim: {printable(message)}", file=sys.stderr)
     return code
 
 
 def draw(lab: Testbed, folder: Path) -> list[Path]:
-    """The laboratory as a picture and as a film; without OpenGL a word about it, and the run goes on."""
+    """Write a still and an animation of the laboratory in 3-D; return their paths.
+
+    Without OpenGL print a message and return an empty list, so that the run continues.
+    """
     from skysim.core import files
     from skysim.dynamics.multibody.view import picture
     from skysim.simulation import testbed

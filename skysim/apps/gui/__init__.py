@@ -1,6 +1,7 @@
-"""The lab in the browser: a page over simulate and study.
+"""Browser GUI: an interactive front end for the simulation and for studies.
 
-    page (what is shown) ── session (a tab's worker process) ── desk (the lab that the worker has before it)
+    page (browser elements) ── worker.session (a worker process per tab) ── worker.workbench (the worker's scene)
 
-The event loop does no work: frames are made, solved and flown in the tab's own process, studies in a process of theirs.
+The server's event loop does no heavy work. Each tab has a worker process that renders and solves frames and simulates
+the motion; a study runs in a further process (worker.study_process).
 """

@@ -1,4 +1,4 @@
-"""What goes from a worker to its page: plain numbers, names and bytes."""
+"""Messages from a worker to its page: plain numbers, strings and bytes, so that they can be pickled."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Light:
 
 @dataclass(frozen=True, slots=True)
 class Spot:
-    """What the tracker saw: pixel, error, flux; the light that it took it for (-1: none), residual in pixels."""
+    """A detection: pixel, standard error, flux; id of the matched light (-1: none) and its residual in pixels."""
 
     x: float
     y: float
@@ -35,10 +35,11 @@ class Spot:
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """The tracker's answer to a frame, and its error where the truth is known.
+    """The tracker's solution of a frame, and its error if the truth is known.
 
-    status : "solved", or why not;  angles_deg : as the page's scene names them
-    sigma_arcsec : what it claims of cross and roll;  windows_px : (x, y) where its map would have lights
+    status : "solved", or the reason why not;  angles_deg : in the order of the scene's angle names
+    sigma_arcsec : estimated standard errors, cross-boresight and roll
+    windows_px : (x, y) at which the tracker's map predicts lights
     """
 
     status: str
@@ -62,10 +63,11 @@ class Answer:
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """One look: the picture, where the camera was, what shone there, and the tracker's answer if it was asked.
+    """One rendered frame: image, true attitude, true lights, and the tracker's solution if the frame was solved.
 
-    body_wxyz : lab_from_body;  t_s : in the flight that is played, else 0
-    filter_arcsec, innovation_arcsec : by how much the filter was off, and the star tracker off the filter, in flight
+    body_wxyz : lab_from_body;  t_s : time in the motion that is played, else 0
+    filter_arcsec : error of the filter during the motion
+    innovation_arcsec : angle between the star tracker's attitude and the filter's
     """
 
     jpeg: bytes
@@ -84,7 +86,7 @@ class View:
 
 @dataclass(frozen=True, slots=True)
 class Zoom:
-    """The pixels around one: their numbers, row by row, and which pixel is the first."""
+    """A small window of pixels: x, y of its first pixel and the digital numbers row by row."""
 
     x: int
     y: int
@@ -93,11 +95,11 @@ class Zoom:
 
 @dataclass(frozen=True, slots=True)
 class Setting:
-    """A scene that is set up: what the page has to know of it.
+    """Facts about a loaded scene that the page displays.
 
-    names : of its three angles;  prefix : of its lights
-    field_deg : across;  stages : the tracker's algorithm by stage, and all that there are
-    tree : the keys of the scene as its file and the files beneath it have them
+    names : of its three angles;  prefix : of its lights' numbers (HIP or LED)
+    field_deg : horizontal field of view;  stages : the tracker's algorithm by stage;  choices : all algorithms by stage
+    flies : whether it has a motion;  duration_s : of the motion
     """
 
     scene: str
@@ -115,10 +117,10 @@ class Setting:
 
 @dataclass(frozen=True, slots=True)
 class Stage:
-    """The laboratory in three dimensions, in lab metres.
+    """3-D geometry of the laboratory; meters in the lab frame unless stated otherwise.
 
-    shapes  : the vehicle's, in body axes (kind, size, place, wxyz, rgb)
-    ids, lights_m, size : the lights and how large each is drawn, 0 to 1; stars stand on a sphere
+    shapes  : the vehicle's, in body axes (kind, size, position, wxyz, rgb)
+    ids, lights_m, size : the lights and their drawn sizes, 0 to 1; stars are placed on a sphere
     camera_m : its pupil in body axes;  corners_m : where the four corners of its field meet the surface, in body axes
     shell_m : lines on the dome, each a list of points
     """
@@ -134,7 +136,7 @@ class Stage:
 
 @dataclass(frozen=True, slots=True)
 class FlightLog:
-    """A flight that can be played: curves against time, thinned for the screen."""
+    """A simulated motion for playback: curves against time, decimated for display; frame_s : times of the frames."""
 
     t_s: tuple[float, ...]
     curves: dict[str, tuple[float, ...]] = field(default_factory=dict)

@@ -1,4 +1,4 @@
-"""The server of the page: routes, and a guard before all of them."""
+"""HTTP server of the GUI: routes, and an access check in front of all of them."""
 
 from __future__ import annotations
 
@@ -20,15 +20,16 @@ from skysim.scene.loader import find
 
 LOOPBACK = ("127.0.0.1", "localhost", "::1", "[::1]")
 COOKIE = "skysim_lab"
-PATIENCE_S = 50.0  # with a browser that is still loading the page
-RECONNECT_S = 6.0  # with one that is gone: its work ends then
+PATIENCE_S = 50.0  # for a browser to load the page
+RECONNECT_S = 6.0  # for a lost browser to reconnect, before its work ends
 
 
 class Guard:
-    """Refuses who is not of this machine or has no token, pages of other sites, and what is too large.
+    """ASGI middleware that refuses unknown host names, requests of other sites or without token, and large requests.
 
-    hosts : names that the page may be called by (a page of another site that points its name at us has another)
-    token : asked of everybody where it is not empty; `/?token=...` puts it in a cookie
+    hosts : allowed Host headers ("*": any). This stops DNS rebinding: another site's name that resolves to this
+        server comes with its own Host header.
+    token : required if not empty; `/?token=...` stores it in a cookie
     """
 
     def __init__(self, app: Any, hosts: tuple[str, ...], token: str) -> None:
@@ -49,7 +50,7 @@ class Guard:
             await send({"type": "websocket.close", "code": 1008})
 
     def refusal(self, headers: dict[str, str], query: dict[str, list[str]]) -> Response | None:
-        """What is answered in place of the page; None where it may be seen."""
+        """The response to a refused request; None if it is allowed."""
         if "*" not in self.hosts and host_of(headers.get("host", "")) not in self.hosts:
             return PlainTextResponse("this host name is not served", 403)
         origin = headers.get("origin", "")
@@ -70,17 +71,17 @@ class Guard:
 
 
 def same(told: str, token: str) -> bool:
-    """Whether it is the token, in a time that does not tell how much of it."""
+    """Compare with the token in constant time, so that timing reveals nothing about it."""
     return hmac.compare_digest(told.encode(), token.encode())
 
 
 def host_of(header: str) -> str:
-    """A Host header without its port."""
+    """The host of a Host header, without the port."""
     return header.rpartition(":")[0] if header.rpartition(":")[2].isdigit() else header
 
 
 def limited(receive: Any) -> Any:
-    """Bytes of a request's body up to the limit, whatever it said of its length."""
+    """Wrap `receive` so that a body beyond the limit ends the request, whatever its Content-Length says."""
     came = 0
 
     async def some() -> Any:
@@ -96,14 +97,14 @@ def limited(receive: Any) -> Any:
 
 
 def routes(scene: str, folder: Path, out: Path) -> None:
-    """All pages."""
+    """Register all routes, with a spare worker ready for the next tab."""
     spare = Spare(str(find(scene).resolve()))
     app.on_startup(spare.begin)
     app.on_shutdown(spare.end)
 
     @app.get("/frame/{tab}/{number}")
     def frame(tab: str, number: int) -> Response:
-        """A frame of a tab, while it is among its newest."""
+        """A frame of a tab; 404 if it is no longer among the newest."""
         data = FRAMES.get(tab, {}).get(number)
         if data is None:
             return Response(status_code=404)
@@ -124,7 +125,7 @@ def routes(scene: str, folder: Path, out: Path) -> None:
         client = ui.context.client
         try:
             await client.connected(timeout=PATIENCE_S)
-        except TimeoutError:  # nobody's browser: it gets no worker
+        except TimeoutError:  # no browser has connected: start no worker
             return
         tab.session = spare.take()
         client.on_delete(tab.close)

@@ -1,1 +1,1 @@
-"""A scene sent out as it happens, at the pace of real time: for trackers that run on other programs or processors."""
+"""Real-time stream of a scene's frames, for trackers in other programs or on other processors."""

@@ -1,4 +1,8 @@
-"""Frames over HTTP: MJPEG for the eye, packets for a tracker, the newest frame, truth and tallies for who asks."""
+"""HTTP server of a stream: MJPEG for display, packets for a tracker; newest frame, truth and counters on request.
+
+The simulation thread posts each packet to the `Board`; each client has a thread that waits on the board's condition
+variable and takes the newest packet. A slow client skips packets and does not delay the simulation or other clients.
+"""
 
 from __future__ import annotations
 
@@ -18,9 +22,9 @@ from skysim.core.errors import InputError
 from skysim.results.stretch import jpeg, stretched
 
 BOUNDARY = "frame"
-PATIENCE_S = 10.0  # with a client that takes nothing
-GRACE_S = 5.0  # for who still takes the last frame at the end
-REMEMBERED = 20  # clients that left
+PATIENCE_S = 10.0  # socket timeout for a client that stops reading
+GRACE_S = 5.0  # for clients to take the last frame at the end
+REMEMBERED = 20  # disconnected clients with their own counters
 INDEX = b"""<!doctype html><meta charset="utf-8"><title>skysim stream</title>
 <body style="margin:0;background:#0d1015;color:#8b95a5;font:13px system-ui"><img src="/stream.mjpg" style="width:100%">
 <p style="padding:0 12px">/stream.mjpg, /stream.raw, /frame.png, /frame.raw, /truth.json, /status.json</p>"""
@@ -28,16 +32,18 @@ INDEX = b"""<!doctype html><meta charset="utf-8"><title>skysim stream</title>
 
 @dataclass(eq=False)
 class Client:
-    """Of one: frames sent, frames that it was too slow for."""
+    """Counters of one client: frames sent, and frames dropped because it was too slow."""
 
     sent: int = 0
     dropped: int = 0
 
 
 class Board:
-    """The newest packet, and who waits for the next.
+    """The newest packet, shared between the simulation thread and the clients' threads.
 
-    clients : who is there, and the REMEMBERED that left last;  earlier : how many left before them, and their frames
+    status  : returns the sender's counters
+    clients : connected clients and the last REMEMBERED that disconnected
+    earlier : number of clients that disconnected before those, and the sums of their counters
     """
 
     def __init__(self, status: Callable[[], dict[str, Any]]) -> None:
@@ -50,13 +56,13 @@ class Board:
         self.earlier = {"clients": 0, "sent": 0, "dropped": 0}
 
     def come(self) -> Client:
-        """Somebody begins to watch."""
+        """Register a client."""
         with self.changed:
             self.clients.append(Client())
             return self.clients[-1]
 
     def leave(self, client: Client) -> None:
-        """And ends it. Of who left long ago the sums are kept, so that memory is constant."""
+        """Mark a client as disconnected. The oldest ones are merged into `earlier`, so that memory stays bounded."""
         with self.changed:
             self.left.append(client)
             self.changed.notify_all()
@@ -67,7 +73,7 @@ class Board:
                     self.earlier[name] += more
 
     def tallies(self) -> dict[str, Any]:
-        """What each client was sent, and what it was too slow for."""
+        """Counters of each client, and the sums of the earlier ones."""
         with self.changed:
             told = [{"sent": one.sent, "dropped": one.dropped} for one in self.clients]
             return {"clients": told, "earlier_clients": dict(self.earlier)}
@@ -78,14 +84,14 @@ class Board:
             self.changed.notify_all()
 
     def end(self) -> None:
-        """No more packets come; who watches is given some time to take the last."""
+        """End the stream; wait up to GRACE_S for the clients to take the last packet."""
         with self.changed:
             self.ended = True
             self.changed.notify_all()
             self.changed.wait_for(lambda: len(self.clients) == len(self.left), GRACE_S)
 
     def after(self, number: int) -> Packet | None:
-        """The next packet that is newer; None once it has ended and the last was given."""
+        """Wait for a packet newer than `number` and return it; None if the stream has ended without one."""
         with self.changed:
             self.changed.wait_for(lambda: self.ended or self.newer(number))
             return self.newest if self.newer(number) else None
@@ -95,7 +101,7 @@ class Board:
 
 
 class Handler(BaseHTTPRequestHandler):
-    """One client. What it is too slow for it does not get; it is told by `dropped` how much that was."""
+    """Request handler of one client. A slow client skips frames; `dropped` in the header says how many so far."""
 
     board: Board
     timeout = PATIENCE_S
@@ -128,7 +134,7 @@ class Handler(BaseHTTPRequestHandler):
     do_HEAD = do_GET  # the same without a body
 
     def answer(self, data: bytes, kind: str, header: dict[str, Any] | None = None) -> None:
-        """One thing, whole."""
+        """Send a complete response."""
         self.send_response(200)
         self.send_header("Content-Type", kind)
         self.send_header("Content-Length", str(len(data)))
@@ -140,7 +146,7 @@ class Handler(BaseHTTPRequestHandler):
             self.wfile.write(data)
 
     def stream(self, raw: bool) -> None:
-        """Frame after frame: packets one after another, or parts of JPEG with their header's numbers."""
+        """Send frames until the stream ends: packets if `raw`, else multipart JPEG with numbers from the header."""
         self.send_response(200)
         kind = "application/octet-stream" if raw else f"multipart/x-mixed-replace; boundary={BOUNDARY}"
         self.send_header("Content-Type", kind)
@@ -151,27 +157,28 @@ class Handler(BaseHTTPRequestHandler):
         mine, number = self.board.come(), -1
         try:
             while packet := self.board.after(number):
+                # Packet numbers are consecutive, so a gap counts the packets that this client missed.
                 mine.dropped += packet.number - number - 1 if mine.sent else 0
                 number = packet.number
                 told = packet.after(mine.dropped)
                 self.wfile.write(told.pack() if raw else part(told))
                 mine.sent += 1
-        except OSError:  # it has gone
+        except OSError:  # the client has disconnected or timed out
             self.close_connection = True
         finally:
             self.board.leave(mine)
 
     def handle(self) -> None:
-        """A client that goes in the middle of an answer is no fault of ours."""
+        """Handle the connection; ignore a client that disconnects during a response."""
         with contextlib.suppress(ConnectionError):
             super().handle()
 
     def log_message(self, *_: Any) -> None:
-        """Nobody reads it."""
+        """Suppress the access log."""
 
 
 def part(packet: Packet) -> bytes:
-    """A part of a multipart answer."""
+    """One part of a multipart/x-mixed-replace response: a JPEG with header fields of the packet."""
     data = jpeg(stretched(packet.pixels, "square root"))
     head = f"--{BOUNDARY}\r\nContent-Type: image/jpeg\r\nContent-Length: {len(data)}\r\n"
     head += "".join(
@@ -181,7 +188,7 @@ def part(packet: Packet) -> bytes:
 
 
 def served(board: Board, host: str, port: int) -> ThreadingHTTPServer:
-    """A server in threads of its own. Raises InputError where the address is taken."""
+    """Start a server in background threads and return it. Raises InputError if the address cannot be bound."""
     handler = type("Here", (Handler,), {"board": board})
     try:
         server = ThreadingHTTPServer((host, port), handler)

@@ -1,4 +1,4 @@
-"""How a frame travels: a line of JSON that says what follows, then the pixels as they are in memory."""
+"""Wire format of a frame: a header as one line of JSON, then the raw pixels."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from skysim.core import quaternion
 from skysim.core.errors import InputError
 from skysim.simulation.closed_loop import CapturedFrame
 
-MOST_LINE, MOST_PIXELS = 1 << 16, 1 << 28  # of what a reader takes for a packet
+MOST_LINE, MOST_PIXELS = 1 << 16, 1 << 28  # limits of a reader: bytes of a header, pixels of a frame
 
 
 class Packet(NamedTuple):
-    """A frame on its way.
+    """A frame to send.
 
     header : what a tracker may know. index, t_s (mid-exposure since the scene's start), exposure_s, width, height,
-             dtype (numpy's, little-endian), bytes (of the pixels), due_unix_s and made_unix_s (when the exposure
-             ended by the clock on the wall, when the frame was there), dropped (frames left out before this one)
+             dtype (numpy's, little-endian), bytes (of the pixels), due_unix_s and made_unix_s (wall-clock times at
+             which the exposure ended and the frame was ready), dropped (frames left out before this one)
     pixels : (H, W)
-    truth  : cam_from_ref_xyzw (scalar last; ref: ICRS or the lab), rate_cam_rad_s, and of the lights on the chip
-             ids, x_px, y_px
+    truth  : cam_from_ref_xyzw (scalar last; ref: ICRS or the lab), rate_cam_rad_s, and ids, x_px, y_px of the lights
+             on the detector
     """
 
     header: dict[str, Any]
@@ -33,20 +33,20 @@ class Packet(NamedTuple):
 
     @property
     def number(self) -> int:
-        """Among the frames that were made."""
+        """Sequence number among the frames that were rendered."""
         return int(self.header["index"] - self.header["dropped"])
 
     def after(self, more: int) -> Packet:
-        """The same for a taker that did not get so many others."""
+        """The same packet for a receiver that missed `more` frames: its header's `dropped` is that much larger."""
         return self._replace(header=self.header | {"dropped": self.header["dropped"] + more})
 
     def pack(self) -> bytes:
-        """The line and the pixels, row after row from the top."""
+        """Serialize: the header line, then the pixels row by row from the top."""
         return json.dumps(self.header).encode() + b"\n" + self.pixels.tobytes()
 
 
 def packet(look: CapturedFrame, due_unix_s: float, made_unix_s: float, dropped: int) -> Packet:
-    """What is sent of a look."""
+    """Make the packet of a captured frame. Times: due and made, Unix seconds;  dropped : frames left out before it."""
     frame, truth = look.frame, look.truth
     pixels = np.ascontiguousarray(frame.image_dn, frame.image_dn.dtype.newbyteorder("<"))
     height, width = pixels.shape
@@ -66,7 +66,7 @@ def packet(look: CapturedFrame, due_unix_s: float, made_unix_s: float, dropped: 
 
 
 def unpack(stream: BinaryIO) -> tuple[dict[str, Any], NDArray[Any]] | None:
-    """The next header and its (H, W) pixels; None at the end. Raises InputError for what is no packet or is cut short."""
+    """Read the next header and its (H, W) pixels; None at the end. Raises InputError for malformed or cut-off data."""
     line = stream.readline(MOST_LINE)
     if not line:
         return None

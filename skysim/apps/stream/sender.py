@@ -1,4 +1,4 @@
-"""A scene sent to its sinks: made in time or left out, counted either way."""
+"""Real-time sender: renders a scene's frames when they are due, drops late ones, and sends them to sinks."""
 
 from __future__ import annotations
 
@@ -17,14 +17,15 @@ from skysim.simulation import run, testbed
 from skysim.simulation.closed_loop import CapturedFrame
 from skysim.simulation.testbed import Testbed
 
-KEPT = 10_000  # delays of the newest frames, for their quantiles
+KEPT = 10_000  # newest delays from which the quantiles are computed
 
 
 @dataclass
 class Tally:
-    """What became of the frames.
+    """Counters of the sender.
 
-    made, dropped : by the scene; late_ms: from a frame's exposure to its being there, of the newest
+    made, dropped : number of frames rendered and left out
+    late_ms       : delay from the end of the exposure to the frame being ready, of the newest KEPT frames
     """
 
     made: int = 0
@@ -32,13 +33,13 @@ class Tally:
     late_ms: deque[float] = field(default_factory=lambda: deque(maxlen=KEPT))
 
     def note(self, late_ms: float, left_out: int) -> None:
-        """A frame was made after so many that were not."""
+        """Record a rendered frame; left_out : number of frames dropped so far."""
         self.made, self.dropped = self.made + 1, left_out
-        if self.made > 1:  # the first starts the clock
+        if self.made > 1:  # the first frame starts the clock, so it has no delay
             self.late_ms.append(late_ms)
 
     def figures(self, sinks: list[Sink]) -> dict[str, Any]:
-        """Everything in numbers."""
+        """Counts, delay statistics in ms, and the counters of each sink."""
         late = np.array(self.late_ms or [np.nan])
         return {
             **{"made": self.made, "dropped": self.dropped},
@@ -59,15 +60,16 @@ def send(
     tally: Tally,
     post: Callable[[Packet], None] | None = None,
 ) -> None:
-    """Fly a lab that stands on the ground, and send every frame when it is due; until the last, or nobody takes any.
+    """Simulate a testbed and send each frame when it is due, until the last frame or until all sinks have failed.
 
-    A frame is left out if there is no time for it, unless the scene steers by its frames or runs as fast as it can.
+    Late frames are dropped, unless pacing is off or the scene has a filter: then the loop needs every frame.
+    lab : as built, before its motion is simulated;  post : also called with each packet
     """
     watched = lab.scene.filter is None
     for look in run.live(lab, None, pace.in_time if watched else None):
         closed_s = closes_s(lab, look)
         if pace.zero_s is None:
-            pace.start(closed_s)
+            pace.start(closed_s)  # so that the first frame has no delay
         pace.wait(closed_s)
         due_s, now_s = pace.due_s(closed_s), time.monotonic()
         left_out = look.frame.index - tally.made
@@ -79,11 +81,11 @@ def send(
         tally.note(1e3 * (now_s - due_s), left_out)
         if sinks and not post and all(sink.fault for sink in sinks):
             return
-    tally.dropped = lab.scene.exposure.frames - tally.made  # with those after the last that was made
+    tally.dropped = lab.scene.exposure.frames - tally.made  # and those after the last rendered
 
 
 def closes_s(lab: Testbed, look: CapturedFrame) -> float:
-    """When the exposure of a frame ends, and its last row is read."""
+    """Scene time at which a frame's exposure ends, with a rolling shutter that of its last row."""
     frame = look.frame
     when = testbed.window(lab.scene, frame.index, frame.exposure_s)
     return when.close_s(lab.scene.camera.height_px)

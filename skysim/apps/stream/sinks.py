@@ -1,5 +1,5 @@
-"""Where frames go: a folder, a pipe. Each has a thread of its own and never holds up the scene: what it cannot take in
-time is left out and counted."""
+"""Sinks of a stream: a folder or a pipe. Each writes in its own thread behind a short queue and never delays the
+simulation: packets that do not fit into the queue are dropped and counted."""
 
 from __future__ import annotations
 
@@ -20,28 +20,28 @@ from skysim.apps.stream.packet import Packet
 from skysim.core import files
 from skysim.core.errors import InputError, printable
 
-WAITING = 2  # packets that may wait for a sink
-GRACE_S = 5.0  # for what still waits at the end
+WAITING = 2  # length of a sink's queue, packets
+GRACE_S = 5.0  # for a sink to write its queued packets at the end
 GONE = "its reader is gone"
 
 
 class Sink:
-    """A thread that hands packets on, the oldest first.
+    """A thread that passes packets to `take`, the oldest first.
 
-    sent, dropped : so far;  fault : why it takes no more
+    sent, dropped : packets so far;  fault : the error that stopped it, or ""
     """
 
     def __init__(self, name: str, take: Callable[[Packet], None]) -> None:
         self.name, self.take = name, take
         self.sent = self.dropped = 0
-        self.busy = False  # with a packet that is neither sent nor left out as yet
+        self.busy = False  # writing a packet that is counted neither as sent nor as dropped yet
         self.fault = ""
         self.waiting: queue.Queue[Packet | None] = queue.Queue(WAITING)
         self.thread = threading.Thread(target=self.work, name=f"sink {name}", daemon=True)
         self.thread.start()
 
     def work(self) -> None:
-        """Until None comes, or what takes the packets is gone."""
+        """Body of the thread: pass packets on until None arrives or `take` fails."""
         while (packet := self.waiting.get()) is not None:
             self.busy = True
             try:
@@ -51,7 +51,7 @@ class Sink:
             except OSError as error:
                 file = f"{error.filename}: " if error.filename else ""
                 self.fault = file + (error.strerror or str(error))
-            except Exception as error:  # whatever it is, who offers packets must not wait for us for ever
+            except Exception as error:  # a dead thread without `fault` would block a patient offer() for ever
                 self.fault = printable(f"{type(error).__name__}: {error}")
             if self.fault:
                 self.dropped += 1
@@ -62,8 +62,8 @@ class Sink:
                 return
 
     def offer(self, packet: Packet, patient: bool) -> None:
-        """Take a packet, or leave it out if too many wait; patient: wait instead."""
-        packet = packet.after(self.dropped)
+        """Queue a packet. If the queue is full, wait if `patient`, else drop the packet."""
+        packet = packet.after(self.dropped)  # the header's count includes frames dropped by this sink
         while not self.fault:
             try:
                 self.waiting.put(packet, timeout=0.1 if patient else 0.0001)
@@ -74,21 +74,25 @@ class Sink:
         self.dropped += 1
 
     def close(self) -> None:
-        """Let it finish what waits."""
+        """End the thread after its queued packets, within GRACE_S; count what is left as dropped."""
         until = time.monotonic() + GRACE_S
         while self.thread.is_alive() and time.monotonic() < until:
             with contextlib.suppress(queue.Full):
                 self.waiting.put(None, timeout=0.1)
                 break
         self.thread.join(max(until - time.monotonic(), 0.0))
-        with contextlib.suppress(queue.Empty):  # nobody takes what still waits
+        with contextlib.suppress(queue.Empty):  # what is still queued is lost
             while True:
                 self.dropped += self.waiting.get_nowait() is not None
-        self.dropped += self.busy  # of one that still holds a packet we wait no longer
+        self.dropped += self.busy  # the packet that a blocked thread still holds
 
 
 def folder(path: Path) -> Callable[[Packet], None]:
-    """frame_NNNNNN.png (16 bits) and .json beside it with header and truth; the .json comes last, and whole."""
+    """Return a `take` that writes frame_NNNNNN.png (16 bits; else .raw) and frame_NNNNNN.json with header and truth.
+
+    The .json is written last and atomically, so that a reader may wait for it. Raises InputError if the folder holds
+    frames of an earlier stream.
+    """
     files.make_folder(path)
     if any(path.glob("frame_*.json")):
         raise InputError(f"{path}: frames of an earlier stream are there; allowed: an empty folder")
@@ -105,12 +109,15 @@ def folder(path: Path) -> Callable[[Packet], None]:
 
 
 def png(packet: Packet) -> bytes:
-    """Packed with little effort: a frame is due soon again."""
+    """Encode the pixels as PNG at the lowest compression level, for speed."""
     return bytes(cv2.imencode(".png", packet.pixels, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1])
 
 
 def pipe(path: str) -> Callable[[Packet], None]:
-    """Packets as `packet.unpack` reads them, to standard output (-) or a named pipe, opened when a reader does."""
+    """Return a `take` that writes packets, as `packet.unpack` reads them, to standard output (-) or a named pipe.
+
+    The pipe is opened at the first packet, which blocks until a reader opens it. Raises InputError if it is no pipe.
+    """
     if path != "-" and not Path(path).is_fifo():
         raise InputError(f"--pipe {path}: no named pipe; allowed: - or what mkfifo made")
 

@@ -1,7 +1,7 @@
-"""The papers' experiments done again: each published number beside ours, with its interval and a verdict.
+"""Reproduction of published experiments: each published number is compared with ours, with an interval and a verdict.
 
     data/published/*.yaml ─ published ┐
-    an experiment's module ─ answers ─┴─ compare ─ page, commands
+    an experiment's module ─ answers ─┴─ compare ─ page, cli.commands.reproduce
 
-A module an experiment or a few that belong together; `experiments.EXPERIMENTS` names them all.
+Each module holds one experiment or a few related ones; `registry.EXPERIMENTS` lists them all.
 """

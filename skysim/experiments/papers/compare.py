@@ -1,4 +1,9 @@
-"""Ours beside the published: the verdict follows from the numbers and from nothing else."""
+"""Comparison of our results with published numbers; the verdict follows from the numbers alone.
+
+A published number has a tolerance, which gives a band; ours has an interval of 95 %. The verdict is `agrees` if the
+interval and the band overlap; `explained` if they overlap only after a named cause is simulated too (for instance a
+fault of the paper's laboratory); else `disagrees`.
+"""
 
 from __future__ import annotations
 
@@ -16,10 +21,10 @@ VERDICTS: tuple[Verdict, ...] = ("agrees", "explained", "disagrees")
 
 @dataclass(frozen=True, slots=True)
 class Ask:
-    """How an experiment is to be done.
+    """Options of an experiment.
 
     quick: fewer trials, wider intervals;  seed: of all its random streams
-    watch: to be called with how much is done of how much
+    watch: progress callback, called with (done, total)
     """
 
     quick: bool = False
@@ -31,14 +36,14 @@ class Ask:
 
 
 class Cause(NamedTuple):
-    """What a paper's lab had and our baseline has not: its name, and ours when it is simulated too."""
+    """A property of the paper's laboratory that our baseline lacks: its name, and our number with it simulated too."""
 
     name: str
     ours: Summary
 
 
 class Answer(NamedTuple):
-    """Our number for a published one; a cause where the baseline alone would not give it."""
+    """Our number for a published one; a cause if the baseline alone does not reproduce it."""
 
     ours: Summary
     note: str = ""
@@ -46,7 +51,7 @@ class Answer(NamedTuple):
 
 
 class Drawing(NamedTuple):
-    """A picture of our data: draw(figure) draws into an empty figure of matplotlib of that size."""
+    """A figure of our data: draw(figure) draws into an empty matplotlib figure of that size."""
 
     caption: str
     draw: Callable[[Any], None]
@@ -55,14 +60,14 @@ class Drawing(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """What an experiment found: an answer to every published row, by key, and pictures."""
+    """Results of an experiment: an answer to every published row, by key, and figures."""
 
     answers: Mapping[str, Answer]
     drawings: tuple[Drawing, ...] = ()
 
 
 class Comparison(NamedTuple):
-    """A line of the table."""
+    """One row of the table: published number, ours and the verdict."""
 
     id: str
     row: Row
@@ -71,14 +76,14 @@ class Comparison(NamedTuple):
 
     @property
     def note(self) -> str:
-        """The cause and what comes of it; how weak the comparison is; what data and experiment say besides."""
+        """Remarks: our number with the cause, the weakness of the comparison, and notes of experiment and data."""
         cause = self.answer.cause
         told = f"with {cause.name}: {number(cause.ours)}" if cause else ""
         return "; ".join(part for part in (told, self.weakness, self.answer.note, self.row.note) if part)
 
     @property
     def weakness(self) -> str:
-        """Said where a verdict other than disagrees rests on an interval that leaves it open."""
+        """Why the interval leaves the verdict open, or "": it is wider than the band, or contains a one-sided bound."""
         cause, (low, high) = self.answer.cause, self.row.band
         if self.verdict == "disagrees":
             return ""
@@ -89,7 +94,7 @@ class Comparison(NamedTuple):
         return "the bound lies within the interval" if ours.low < bound < ours.high else ""
 
     def as_dict(self) -> dict[str, Any]:
-        """For machines. A bound is published as [least, most], an open end as null."""
+        """For JSON. A bound is published as [least, most], an open end as null."""
         row, ours = self.row, self.answer.ours
         bounds = [row.at_least, row.at_most]
         return {
@@ -106,7 +111,7 @@ class Comparison(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Reproduction:
-    """An experiment that was done: what is published, line by line ours, pictures, seconds."""
+    """A reproduced experiment: the published data, the comparison of each row, figures, and run time in seconds."""
 
     id: str
     published: Experiment
@@ -116,7 +121,7 @@ class Reproduction:
 
     @property
     def counts(self) -> dict[str, int]:
-        """Lines of each verdict; of them those whose number is derived, and whose verdict an interval leaves open."""
+        """Number of rows by verdict, of rows with a derived number (`derived`), and of open verdicts (`open`)."""
         told: dict[str, int] = {
             verdict: sum(line.verdict == verdict for line in self.lines) for verdict in VERDICTS
         }
@@ -126,9 +131,9 @@ class Reproduction:
 
 
 def compare(id: str, published: Experiment, found: Found, seconds: float) -> Reproduction:
-    """Every published row beside its answer.
+    """Compare every published row with its answer.
 
-    Raises ValueError where an experiment leaves a row unanswered or answers one that nobody published.
+    Raises ValueError if an experiment leaves a row unanswered or answers one that is not published.
     """
     if missed := published.rows.keys() ^ found.answers.keys():
         raise ValueError(f"{id}: published or answered, but not both: {', '.join(sorted(missed))}")
@@ -140,35 +145,35 @@ def compare(id: str, published: Experiment, found: Found, seconds: float) -> Rep
 
 
 def verdict(row: Row, answer: Answer) -> Verdict:
-    """agrees where our interval meets the published number's band; explained where it does with the cause alone."""
+    """agrees: our interval overlaps the published number's band; explained: it does so only with the cause."""
     if meets(row, answer.ours):
         return "agrees"
     return "explained" if answer.cause and meets(row, answer.cause.ours) else "disagrees"
 
 
 def meets(row: Row, ours: Summary) -> bool:
-    """Whether the interval, or the number where it has none, and the band have a point in common."""
+    """Return True if our interval (the number itself if it has none) and the row's band overlap."""
     low, high = row.band
-    ends = (ours.value if end != end else end for end in (ours.low, ours.high))
+    ends = (ours.value if end != end else end for end in (ours.low, ours.high))  # NaN: no interval
     least, most = ends
     return least <= high and most >= low
 
 
 def printed(row: Row) -> str:
-    """The published number and where it stands; `derived` where it is not printed."""
+    """Format the published number with its source; `derived` if the paper does not print it."""
     where = "; ".join(part for part in ("derived" if row.derived else "", row.source) if part)
     return f"{stated(row)} ({where})" if where else stated(row)
 
 
 def number(told: Summary) -> str:
-    """A number with its interval where it has one."""
+    """Format a number, with its interval if it has one."""
     if told.low == told.high or told.low != told.low:
         return f"{told.value:.4g}"
     return f"{told.value:.4g} ({told.low:.4g}..{told.high:.4g})"
 
 
 def stated(row: Row) -> str:
-    """The published number or bounds, and the tolerance."""
+    """Format the published number or its bounds, with the tolerance."""
     if row.published is not None:
         told = f"{row.published:.6g}"
     elif row.at_least is None:

@@ -1,4 +1,4 @@
-"""What was reproduced as one HTML page, and as a page of Markdown with its pictures beside it."""
+"""Reports of reproduced experiments: one HTML page, or a Markdown page with its figures in a folder beside it."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ KINDS = (*VERDICTS, "derived", "open")
 
 
 class Told(NamedTuple):
-    """What the command was given."""
+    """The arguments of the command."""
 
     ids: tuple[str, ...]
     quick: bool
@@ -24,13 +24,13 @@ class Told(NamedTuple):
 
     @property
     def command(self) -> str:
-        """What repeats it."""
+        """The shell command that repeats the run."""
         seed = ["--seed", str(self.seed)] if self.seed != 1 else []
         return shlex.join(["skysim", "reproduce", *self.ids, *["--quick"] * self.quick, *seed])
 
 
 def papers(done: Sequence[Reproduction]) -> dict[str, list[Reproduction]]:
-    """Experiments by paper, in the order of their files."""
+    """Group experiments by paper, in their given order."""
     found: dict[str, list[Reproduction]] = {}
     for one in done:
         found.setdefault(one.published.paper, []).append(one)
@@ -38,12 +38,12 @@ def papers(done: Sequence[Reproduction]) -> dict[str, list[Reproduction]]:
 
 
 def counts(done: Sequence[Reproduction]) -> dict[str, int]:
-    """How many lines of each kind."""
+    """Number of rows of each kind in KINDS, over all experiments."""
     return {kind: sum(one.counts[kind] for one in done) for kind in KINDS}
 
 
 def write_html(path: Path, done: Sequence[Reproduction], told: Told) -> None:
-    """One HTML file with everything inside."""
+    """Write one HTML file with embedded figures."""
     from jinja2 import Environment
 
     page = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True).from_string(PAGE)
@@ -61,7 +61,7 @@ def write_html(path: Path, done: Sequence[Reproduction], told: Told) -> None:
 
 
 def write_markdown(path: Path, done: Sequence[Reproduction], told: Told) -> None:
-    """A page of Markdown; its pictures in a folder of its name beside it."""
+    """Write a Markdown page, and its figures to a folder of the same name beside it."""
     lines = [HEAD.format(command=told.command, seed=told.seed)]
     lines += [f"| experiment | {' | '.join(KINDS)} | seconds |", "|---" * (len(KINDS) + 2) + "|"]
     for one in done:
@@ -82,7 +82,7 @@ def write_markdown(path: Path, done: Sequence[Reproduction], told: Told) -> None
 
 
 def section(one: Reproduction, folder: Path) -> list[str]:
-    """An experiment's part of the page; its pictures are written."""
+    """Lines of an experiment's section; writes its figures to the folder."""
     published = one.published
     lines = [f"\n### {one.id}\n", f"{published.title}. {published.source}.\n"]
     for head, told in remarks(one):
@@ -97,7 +97,7 @@ def section(one: Reproduction, folder: Path) -> list[str]:
 
 
 def remarks(one: Reproduction) -> list[tuple[str, str]]:
-    """What stands above an experiment's table."""
+    """(heading, text) of the remarks above an experiment's table."""
     published = one.published
     told = [
         ("What the paper gets wrong", published.wrong),
@@ -108,7 +108,7 @@ def remarks(one: Reproduction) -> list[tuple[str, str]]:
 
 
 def cells(line: Comparison) -> list[str]:
-    """A comparison's cells, safe in a table of Markdown."""
+    """Cells of a comparison, escaped for a Markdown table."""
     verdict = f"**{line.verdict}**" if line.verdict == "disagrees" else line.verdict
     told = [line.row.quantity, printed(line.row), number(line.answer.ours), verdict, line.note]
     return [text.replace("|", "\\|") for text in told]

@@ -1,4 +1,4 @@
-"""What was published: numbers with their page, the tolerance to reproduce them to, and what the papers get wrong."""
+"""Published data: numbers with their source, the tolerance of the reproduction, and the papers' errors."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ FOLDER = DATA / "published"
 class Row(ConfigModel):
     """One published number.
 
-    quantity : what it is, with its unit in brackets
-    published: the number; in its place at_least and at_most, one or both, where a bound is all that was stated
-    tolerance: how far ours may be off, in the same unit
-    source   : the table, figure or page, where it is another than its experiment's
-    derived  : not printed, but what follows from what is: by arithmetic, or by theory that is not ours alone
-    note     : what the reader should know: a misprint, how the tolerance was come by
+    quantity : its description, with the unit in parentheses
+    published: the number; at_least and at_most, one or both, replace it if the paper states only a bound
+    tolerance: allowed difference of ours, in the same unit
+    source   : the table, figure or page, if it differs from its experiment's
+    derived  : not printed, but follows from printed numbers by arithmetic or by generally accepted theory
+    note     : remark for the reader, such as a misprint or the reason for the tolerance
     """
 
     quantity: str
@@ -45,7 +45,7 @@ class Row(ConfigModel):
 
     @property
     def band(self) -> tuple[float, float]:
-        """From where to where ours agrees; an open end is infinite."""
+        """(low, high): values with which ours agrees; an open end is infinite."""
         if self.published is not None:
             return self.published - self.tolerance, self.published + self.tolerance
         low = float("-inf") if self.at_least is None else self.at_least - self.tolerance
@@ -53,12 +53,12 @@ class Row(ConfigModel):
 
 
 class Experiment(ConfigModel):
-    """What is published of one experiment.
+    """Published data of one experiment.
 
-    source : table, figure or section;  wrong: what the paper gets wrong, and the value corrected
-    assumed: what the paper does not tell, and what was put in its place
-    fitted : parameters that were chosen so that a number comes out: never without being told here
-    data   : published tables that an experiment is set up by, row by row
+    source : table, figure or section;  wrong: errors of the paper, with the corrected values
+    assumed: our assumptions where the paper gives no value
+    fitted : parameters chosen so that a number is reproduced; all such parameters are listed here
+    data   : published tables that are inputs of the experiment, row by row
     """
 
     title: str
@@ -80,7 +80,7 @@ class Paper(ConfigModel):
 
 @cache
 def experiments() -> dict[str, Experiment]:
-    """All published experiments by id, in the order of the files and in them. Raises InputError."""
+    """All published experiments by id, in the order of the files and within them. Raises InputError."""
     found: dict[str, Experiment] = {}
     for path in sorted(FOLDER.glob("*.yaml")):
         told = read(path)
@@ -92,7 +92,7 @@ def experiments() -> dict[str, Experiment]:
 
 
 def read(path: Path) -> Paper:
-    """One file."""
+    """Read one file of data/published. Raises InputError."""
     tree, text = read_yaml(path)
     try:
         return Paper.model_validate(tree)

@@ -1,4 +1,4 @@
-"""All experiments by id, and doing one."""
+"""All experiments by id, and the function that runs one."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ EXPERIMENTS: dict[str, Run] = {
 
 
 def named(ids: list[str]) -> list[str]:
-    """The ids that are asked for, `all` for every one. Raises InputError."""
+    """The requested ids without repeats; `all` for every experiment. Raises InputError for an unknown id."""
     if ids == ["all"]:
         return list(experiments())
     for id in ids:
@@ -47,7 +47,7 @@ def named(ids: list[str]) -> list[str]:
 
 
 def reproduce(id: str, ask: Ask) -> Reproduction:
-    """Do one experiment and compare."""
+    """Run one experiment and compare it with the published numbers."""
     begin = time.perf_counter()
     found = EXPERIMENTS[id](ask)
     return compare(id, experiments()[id], found, time.perf_counter() - begin)

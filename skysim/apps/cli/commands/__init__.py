@@ -1,1 +1,1 @@
-"""The commands, one topic a file."""
+"""The commands of `skysim`, one file per topic. They parse options, call the library and print its results."""

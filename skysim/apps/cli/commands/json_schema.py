@@ -1,7 +1,8 @@
-"""JSON Schema of scene and study files, for editors; and which versions of such a file this skysim reads.
+"""JSON Schema of scene and study files, for editors.
 
-An editor is told what a key may hold before anything is run. It cannot know what a `base` or a preset has, so that it
-takes nothing but the version for missing; `skysim validate` does.
+The schema tells an editor which keys exist and what values they may hold. It requires only the key `schema` (the
+(version), because an editor does not know which keys come from a `base` or a preset; `skysim validate` also reports
+missing keys.
 """
 
 from __future__ import annotations
@@ -41,7 +42,10 @@ def json_schema(kind: str) -> dict[str, Any]:
 
 
 def loosened(node: Any, name: str = "") -> Any:
-    """A schema in which nothing is missing; of a choice between sections any that fits will do."""
+    """Return the schema without required keys, defaults and discriminators; `oneOf` becomes `anyOf`.
+
+    name : of the definition that `node` is, for which BESIDE may add keys
+    """
     if isinstance(node, list):
         return [loosened(one) for one in node]
     if not isinstance(node, dict):
@@ -53,7 +57,7 @@ def loosened(node: Any, name: str = "") -> Any:
             kept[key] = told | BESIDE.get(name, {})
         elif key == "$defs":
             kept[key] = {one: loosened(of, one) for one, of in value.items()}
-        elif key in BOUNDS:  # pydantic's own words, where a check of ours stands between
+        elif key in BOUNDS:  # pydantic's keyword remains where a validator precedes the bound
             kept |= {BOUNDS[key]: value} if node.get("type") in ("number", "integer") else {}
         elif key not in DROPPED and (key != "title" or name):
             kept["anyOf" if key == "oneOf" else key] = loosened(value)

@@ -1,4 +1,4 @@
-"""`skysim lab`: thin, like `cli`."""
+"""Command `skysim lab`."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def lab(
     out: Annotated[Path, typer.Option(help="Where studies and their reports are.")] = Path("out"),
     show: Annotated[bool, typer.Option("--open/--no-open", help="Open a browser.")] = True,
 ) -> None:
-    """Open the lab in the browser: be the star sensor (extra `lab`)."""
+    """Open the interactive lab in the browser (extra `lab`)."""
     from skysim.scene.loader import load
 
     load(scene)

@@ -1,4 +1,4 @@
-"""`skysim reproduce`: thin, like `cli`."""
+"""Command `skysim reproduce`."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def reproduce(
     ] = None,
     json: Annotated[bool, typer.Option("--json", help="Print JSON for machines instead of tables.")] = False,
 ) -> None:
-    """Do the papers' experiments again and set the published numbers beside ours."""
+    """Repeat the experiments of papers and compare the published numbers with ours."""
     from skysim.core import files
 
     if not ids:
@@ -62,7 +62,7 @@ def reproduce(
 
 
 def pages(done: list[Reproduction], told: Told, out: Path | None, markdown: Path | None) -> list[Path]:
-    """The pages that were asked for, written: HTML in a folder, Markdown as a file."""
+    """Write the requested pages (HTML in folder `out`, Markdown to a file) and return their paths."""
     from skysim.core import files
     from skysim.experiments.papers import page
 
@@ -78,7 +78,7 @@ def pages(done: list[Reproduction], told: Told, out: Path | None, markdown: Path
 
 
 def listing(json: bool) -> None:
-    """What there is."""
+    """Print the identifiers and titles of all experiments."""
     from skysim.core import files
     from skysim.experiments.papers.published import experiments
 
@@ -91,7 +91,7 @@ def listing(json: bool) -> None:
 
 
 def show(one: Reproduction) -> None:
-    """An experiment's table, and the notes on it."""
+    """Print an experiment's table, with notes on the rows that disagree or have a weakness."""
     from skysim.experiments.papers.compare import number, stated
 
     heads = ["what", "published", "ours", "verdict"]
@@ -114,7 +114,7 @@ def show(one: Reproduction) -> None:
 
 
 def summed(done: list[Reproduction]) -> None:
-    """How many of each verdict."""
+    """Print the number of rows with each verdict."""
     from skysim.experiments.papers.page import counts
 
     print(", ".join(f"{count} {kind}" for kind, count in counts(done).items()))

@@ -1,4 +1,4 @@
-"""`skysim run`, `render`, `compare`, `trackers`."""
+"""Commands `skysim run`, `render`, `compare` and `trackers`."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def run(
     ] = False,
     json: Json = False,
 ) -> None:
-    """Fly a scene, photograph it, solve every frame and score the answers."""
+    """Simulate a scene: motion, frames, attitude solutions and their scores."""
     from skysim.core.files import to_json
     from skysim.results import scoring
     from skysim.results.report import as_dicts
@@ -105,7 +105,7 @@ def compare(
     set_: Sets = None,
     json: Json = False,
 ) -> None:
-    """Let trackers solve the same frames, and score them side by side. Where there is a filter the first one flies."""
+    """Let trackers solve the same frames and compare their scores. With a filter, the first one closes the loop."""
     from skysim.core import files
     from skysim.experiments import tracker_comparison
     from skysim.results.files import frames as frame_files
@@ -133,7 +133,7 @@ def compare(
 
 
 def trackers(json: Json = False) -> None:
-    """List the trackers that are there, and what they still need."""
+    """List the available trackers, and what each still needs to be installed."""
     from skysim.core import files
     from skysim.tracking.external import interface as known
 
@@ -162,7 +162,7 @@ def render(
     ] = False,
     json: Json = False,
 ) -> None:
-    """Fly a scene and write its frames with their truth, without solving them."""
+    """Simulate a scene and write its frames with their truth, without solving them."""
     from skysim.core import files
     from skysim.results import report
     from skysim.results.files import frames as frame_files

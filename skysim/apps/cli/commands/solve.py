@@ -64,9 +64,9 @@ def solve(
     out: Annotated[Path, typer.Option(help="Folder for the annotated pictures.")] = Path("out/solve"),
     json: Json = False,
 ) -> None:
-    """Find where pictures of the sky look, lost in space; refuse rather than guess.
+    """Solve the attitude of sky images, lost in space; uncertain matches are rejected.
 
-    Exit code 0 when every image was looked at, solved or not; 2 when one could not be.
+    Exit code 0 if all images could be read, solved or not; 2 otherwise.
     """
     from skysim.apps import plate_solver as solving
     from skysim.core import files
@@ -96,7 +96,7 @@ def solve(
 
 
 def kept(image: NDArray[Any], path: Path) -> Path:
-    """The file of a camera's frame."""
+    """Write a camera frame to a file and return its path."""
     from skysim.core import files
 
     files.write_image(path, image)
@@ -118,7 +118,7 @@ def survey(
     checks: Annotated[int, typer.Option(min=1, help="New stops where the attitude is compared.")] = 40,
     json: Json = False,
 ) -> None:
-    """Measure a dome from frames at many attitudes: LEDs, lever and lens, in a file for `tracker.map`."""
+    """Survey a dome from frames at many attitudes: LED positions, lever arm and lens, to a file for `tracker.map`."""
     from skysim.core import files
     from skysim.experiments import dome_survey, dome_survey_report
     from skysim.simulation import testbed

@@ -1,4 +1,4 @@
-"""`skysim stream`: thin, like `cli`."""
+"""Command `skysim stream`."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def stream(
     ] = None,
     json: Annotated[bool, typer.Option("--json", help="Print the tallies as JSON.")] = False,
 ) -> None:
-    """Send a scene's frames out as they happen, at the pace of real time: for hardware or a processor in the loop."""
+    """Stream a scene's frames in real time, for hardware or a processor in the loop."""
     from skysim.apps.stream import http as http_server
     from skysim.apps.stream import sender, sinks
     from skysim.apps.stream.pacing import Pace
@@ -106,7 +106,7 @@ def stream(
 
 
 def summary(figures: dict[str, Any]) -> str:
-    """Lines for people."""
+    """Text summary of the frames made, sent and dropped."""
     lines = [
         f"{figures['made']} frames, {figures['dropped']} left out for want of time; late by a median of"
         f" {figures['late_ms_median']:.1f} ms, p99 {figures['late_ms_p99']:.1f}, worst {figures['late_ms_worst']:.1f}"

@@ -1,4 +1,4 @@
-"""`skysim study`: run, look at, resume, export and replay studies. Thin, like `cli`."""
+"""Command `skysim study`: run, inspect, resume, export and replay studies."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def run(
     program: Programs = None,
     json: Json = False,
 ) -> None:
-    """Do all trials of a study and report them. Ctrl-C leaves a store that `resume` goes on with."""
+    """Run all trials of a study and write its report. After Ctrl-C, `resume` continues."""
     warmed(engine)
     from skysim.core.yaml_reader import overridden
     from skysim.experiments.study import loader
@@ -95,7 +95,7 @@ def resume(
     program: Programs = None,
     json: Json = False,
 ) -> None:
-    """Go on with a study or a search that was stopped, killed or ran out of its budget."""
+    """Continue a study or a search that was stopped or killed, or that used up its budget."""
     warmed(engine)
     told, overrides = planned(study, out, program or [])
     done(told, study, out, engine_of(engine, workers, scheduler), overrides, json, again=True, failed=failed)
@@ -103,7 +103,7 @@ def resume(
 
 @app.command()
 def status(study: StudyArg, out: Out = None, json: Json = False) -> None:
-    """How far a study is, while it runs or after."""
+    """Show the progress of a study, while it runs or after."""
     from skysim.core import files
     from skysim.experiments.study import store
 
@@ -157,7 +157,7 @@ def replay(
     program: Programs = None,
     json: Json = False,
 ) -> None:
-    """Do one trial again, alone, and write its frames."""
+    """Repeat one trial alone and write its frames."""
     from skysim.core import files
     from skysim.experiments.study import store
     from skysim.experiments.study.execution import replay as replaying
@@ -194,7 +194,7 @@ def optimise(
     program: Programs = None,
     json: Json = False,
 ) -> None:
-    """Search a study's factors for the best point, or the Pareto front of two objectives. `resume` goes on with it."""
+    """Search a study's factors for the best point, or the Pareto front of two objectives. `resume` continues it."""
     warmed(engine)
     from skysim.core.yaml_reader import overridden
     from skysim.experiments.study import loader
@@ -219,7 +219,11 @@ def done(
     again: bool = False,
     failed: bool = False,
 ) -> None:
-    """Do what is missing of a study or a search, with a bar, and report. again : trials may be in already."""
+    """Run the missing trials of a study or a search with a progress bar, then report.
+
+    again  : the store may hold trials already
+    failed : repeat the failed trials too
+    """
     from skysim.experiments.study import store
     from skysim.experiments.study.analysis import search
     from skysim.experiments.study.execution import runner
@@ -244,7 +248,7 @@ def done(
 
 
 def total(told: Plan) -> int:
-    """How many trials a study or a search has in all."""
+    """Total number of trials of a study or a search."""
     return told.study.replicates * (
         told.study.optimise.candidates if told.study.optimise else len(told.points)
     )
@@ -252,7 +256,7 @@ def total(told: Plan) -> int:
 
 @contextmanager
 def stoppable(on: str, kept: Store) -> Iterator[None]:
-    """Ctrl-C and SIGTERM end a run with a word on the command `on` by which it goes on."""
+    """Within this context Ctrl-C and SIGTERM print `on`, the command that continues the run, and end it."""
 
     def stop(*_: Any) -> None:
         raise KeyboardInterrupt
@@ -268,7 +272,7 @@ def stoppable(on: str, kept: Store) -> Iterator[None]:
 
 
 def reported(told: Plan, study: str, out: Path | None, overrides: dict[str, str], json: bool) -> None:
-    """The page, and the table on the terminal."""
+    """Write the HTML report and print the table of results."""
     from skysim.core import files
     from skysim.experiments.study import store
     from skysim.experiments.study.analysis import table
@@ -294,7 +298,7 @@ def reported(told: Plan, study: str, out: Path | None, overrides: dict[str, str]
 
 
 def findings(told: Plan, kept: Store) -> dict[str, Any]:
-    """What a study's kind adds to its page: Sobol indices, or the front of a search and what its candidates cost."""
+    """Extra content of the report: Sobol indices, or a search's Pareto front and the cost of each candidate."""
     from skysim.experiments.study.analysis import search, sensitivity
 
     if told.study.optimise is not None:
@@ -304,11 +308,11 @@ def findings(told: Plan, kept: Store) -> dict[str, Any]:
     return {"indices": sensitivity.indices(told, kept)} if told.study.design.kind == "saltelli" else {}
 
 
-MOST_LINES = 60  # of a table on the terminal
+MOST_LINES = 60  # printed of a table; the report has all
 
 
 def facts(told: Plan, kept: Store) -> dict[str, Any]:
-    """How far a study is and what it rests on."""
+    """Progress and provenance of a study: trial counts, code version, run time and store."""
     counts, trials = kept.counts(), total(told)
     return {
         "study": told.name,
@@ -353,9 +357,11 @@ def print_replay(figures: dict[str, Any]) -> None:
 
 
 def planned(study: str, out: Path | None, program: list[str] | None = None) -> tuple[Plan, dict[str, str]]:
-    """The plan of a study's store, with what its command line overrode. Raises InputError where they do not match.
+    """Load the study with the overrides saved in its store; return the plan and the overrides.
 
-    program : of the command line; None where no trial shall be done
+    program : external trackers of the command line; None if no trial will be run
+
+    Raises InputError if the store holds another study, or this one before it was changed.
     """
     from skysim.experiments.study import loader, store
     from skysim.tracking.external import process
@@ -373,7 +379,7 @@ def planned(study: str, out: Path | None, program: list[str] | None = None) -> t
 
 
 def warmed(engine: str) -> None:
-    """Begin the workers' imports before our own, which take as long."""
+    """Start the worker processes first, so that their imports run in parallel with ours."""
     if engine == "pool":
         from skysim.experiments.study.execution import workers
 
@@ -381,7 +387,7 @@ def warmed(engine: str) -> None:
 
 
 def engine_of(name: str, workers: int | None, scheduler: str) -> Engine:
-    """Who does the trials. Raises InputError for a wrong name."""
+    """Create the engine that runs the trials. Raises InputError for an unknown name or a missing scheduler."""
     from skysim.experiments.study.execution.runner import ENGINES
 
     if name not in ENGINES:
@@ -392,11 +398,11 @@ def engine_of(name: str, workers: int | None, scheduler: str) -> Engine:
 
 
 def folder_of(study: str, out: Path | None) -> Path:
-    """Where a study's store is: by its name, of its file or as it is."""
+    """The folder of a study's store and report: `out`, or out/NAME."""
     return out or Path("out") / Path(study).stem
 
 
 def command(study: str, out: Path | None, verb: str, overrides: dict[str, str] | None = None) -> str:
-    """A command for a study as it is typed."""
+    """The shell command that applies `verb` to the study."""
     words = ["skysim", "study", verb, study, *(["--out", str(out)] if out else [])]
     return shlex.join([*words, *(f"--set={key}={value}" for key, value in (overrides or {}).items())])

@@ -1,4 +1,4 @@
-"""`skysim validate`: what is wrong with a file, before anything is flown; and its schema for an editor."""
+"""Command `skysim validate`: check input files without simulating, or print their JSON Schema for an editor."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from skysim.apps.cli.terminal import complain
 from skysim.core.errors import InputError
 
 KINDS = ("scene", "study")
-LENS = {"focal_length": "1 m", "f_number": 1.0}  # of no meaning: a preset has none
+LENS = {"focal_length": "1 m", "f_number": 1.0}  # placeholder values: a camera preset has no lens
 
 
 class Verdict(NamedTuple):
-    """A file, what it is in words, what one might doubt of it; or what is wrong with it, in one line."""
+    """Result for one file: a description and warnings, or `fault`, the error in one line."""
 
     file: str
     what: str = ""
@@ -37,7 +37,7 @@ def validate(
     ] = None,
     json: Annotated[bool, typer.Option("--json", help="Print JSON for machines.")] = False,
 ) -> None:
-    """Check files: keys, units, what goes together, whether a scene can be set up. Exit code 2 if one is refused."""
+    """Check files: keys, units, consistency, and whether a scene can be set up. Exit code 2 if one is invalid."""
     from skysim.apps.cli.commands import json_schema
     from skysim.core import files as file_io
 
@@ -61,7 +61,7 @@ def validate(
 
 
 def checked(path: Path) -> Verdict:
-    """One file."""
+    """Check one file; errors become the verdict's `fault`."""
     try:
         return Verdict(str(path), *looked_at(path))
     except (InputError, OSError) as error:
@@ -69,14 +69,14 @@ def checked(path: Path) -> Verdict:
 
 
 def looked_at(path: Path) -> tuple[str, tuple[str, ...]]:
-    """What a file is, in words, and doubts. Raises InputError with one line."""
+    """Return a description of the file and warnings. Raises InputError with one line."""
     from skysim.core.yaml_reader import is_file, read_yaml
     from skysim.scene import opencv_calibration
 
     path = path if path.suffix else named(path)
     if path.suffix not in (".yaml", ".yml", ".ecsv", ".xml"):
         raise InputError(f"{path}: allowed: .yaml, .ecsv, .xml or the name of a scene or a study")
-    if not is_file(path):  # a pipe would be waited for
+    if not is_file(path):  # reading a named pipe would block
         raise InputError(f"{path}: is no plain file")
     if path.suffix == ".ecsv":
         return table(path), ()
@@ -100,7 +100,7 @@ def looked_at(path: Path) -> tuple[str, tuple[str, ...]]:
 
 
 def named(path: Path) -> Path:
-    """The scene or the study that comes with skysim by this name. Raises InputError with the names that there are."""
+    """Path of the shipped study or scene of this name. Raises InputError with the allowed names."""
     from skysim.experiments.study import plan
     from skysim.scene import loader
 
@@ -111,7 +111,7 @@ def named(path: Path) -> Path:
 
 
 def vehicle(path: Path) -> str:
-    """A vehicle's model, on its bearing."""
+    """Build the multibody model of an MJCF file and describe it."""
     from skysim.dynamics import multibody
     from skysim.scene.vehicle import VehicleConfig
 
@@ -120,7 +120,7 @@ def vehicle(path: Path) -> str:
 
 
 def scene(path: Path) -> tuple[str, tuple[str, ...]]:
-    """A scene, set up as far as it goes without flying: vehicle, lights, tracker."""
+    """Set up a scene without simulating its motion: vehicle, lights, tracker. Returns a description and warnings."""
     from skysim.scene.loader import load, where
     from skysim.simulation import checks, testbed
 
@@ -137,7 +137,7 @@ def scene(path: Path) -> tuple[str, tuple[str, ...]]:
 
 
 def table(path: Path) -> str:
-    """A star catalogue, else a map of LEDs."""
+    """Describe an ECSV table: a star catalog if its header has a column `hip`, else an LED map."""
     from skysim.sources import catalog
     from skysim.tracking import dome_map_file
 

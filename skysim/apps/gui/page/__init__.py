@@ -1,1 +1,1 @@
-"""What the browser shows: page, 3-D view, overlay, forms, keys and panels."""
+"""The page in the browser: layout, 3-D view, overlay, forms, keyboard map and panels."""

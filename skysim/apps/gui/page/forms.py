@@ -1,4 +1,4 @@
-"""A scene's keys as fields of a form, made from the schema: what each holds, its unit, what it may be."""
+"""A scene's keys as form fields, derived from the schema: value, unit and allowed values of each."""
 
 from __future__ import annotations
 
@@ -60,9 +60,9 @@ SECTIONS = ("vehicle", "motion", "lab", "light", "background", "camera", "exposu
 class Field(NamedTuple):
     """One key of a scene.
 
-    key   : dotted;  text: its value as YAML, as its file has it, else the value that stands in for it
-    unit  : of a bare number;  choices: all that it may be, where those are few
-    given : whether a file has it
+    key   : dotted;  text: its value as YAML, from the file, or else the default
+    unit  : of a bare number;  choices: the allowed values of an enumeration
+    given : whether a file sets it
     """
 
     key: str
@@ -78,7 +78,7 @@ class Field(NamedTuple):
 
 
 def fields(name: str, overrides: Mapping[str, str]) -> list[Field]:
-    """Every key that a scene has or could have, sections in the order of the README. Raises InputError."""
+    """All keys that a scene has or could have, sections in the order of the README. Raises InputError."""
     scene = load(name, overrides)
     tree = read(find(name))[0]
     found = [
@@ -91,7 +91,7 @@ def fields(name: str, overrides: Mapping[str, str]) -> list[Field]:
 
 
 def leaves(model: BaseModel, tree: Any, above: str) -> Iterator[Field]:
-    """The fields beneath a section; a list of sections is one field, and so is one told by a word (`control: pid`)."""
+    """Yield the fields of a section. A list of sections is one field, as is one given by a word (`control: pid`)."""
     for name, info in type(model).model_fields.items():
         own = info.alias or SI_SUFFIX.sub("", name)
         key, value = f"{above}{own}", getattr(model, name)
@@ -106,7 +106,7 @@ def leaves(model: BaseModel, tree: Any, above: str) -> Iterator[Field]:
 
 
 def short(value: Any) -> Any:
-    """A file that comes along by its name in scenes/."""
+    """Shorten the path of a shipped file to its name in scenes/."""
     return (
         str(Path(value).relative_to(SCENES))
         if isinstance(value, str) and value.startswith(str(SCENES))
@@ -115,19 +115,19 @@ def short(value: Any) -> Any:
 
 
 def unit_of(name: str) -> str:
-    """The unit in which a value with a unit is kept."""
+    """The SI unit of a model field, from the suffix of its name."""
     told = SI_SUFFIX.search(name)
     return UNITS.get(told[1], "") if told else ""
 
 
 def shown_unit(own: str) -> str:
-    """The unit of a bare number, by its key's end."""
+    """The unit of a bare number, from the suffix of its key."""
     told = SUFFIX.search(own)
     return SHOWN[told[1]] if told else ""
 
 
 def choices(annotation: Any) -> tuple[str, ...]:
-    """What a key of few values may be."""
+    """The allowed values of a Boolean or an enumeration; () for others."""
     if annotation is bool:
         return ("true", "false")
     if get_origin(annotation) is Literal:
@@ -137,7 +137,7 @@ def choices(annotation: Any) -> tuple[str, ...]:
 
 
 def plain(value: Any, unit: str) -> Any:
-    """A value as a file would have it: with its unit, without pydantic."""
+    """Convert a validated value to what a file would contain: plain types, with the unit."""
     if isinstance(value, BaseModel):
         return value.model_dump(mode="json", by_alias=True)
     if isinstance(value, tuple | list):
@@ -148,7 +148,7 @@ def plain(value: Any, unit: str) -> Any:
 
 
 def in_yaml(value: Any) -> str:
-    """One line of YAML; a text as it is."""
+    """Format a value as one line of YAML; strings are returned unchanged."""
     if isinstance(value, str):
         return value
     told = yaml.safe_dump(value, default_flow_style=True, width=10_000, allow_unicode=True, sort_keys=False)
@@ -156,7 +156,7 @@ def in_yaml(value: Any) -> str:
 
 
 def checked(name: str, overrides: Mapping[str, str]) -> Scene:
-    """The scene with those keys, if it is one and names no file outside its folder. Raises InputError."""
+    """Load the scene with the overrides. Raises InputError if it is invalid or names a file outside its folder."""
     scene = load(name, overrides)
     tree, folder = scene.model_dump(mode="json", by_alias=True), find(name).resolve().parent
     for keys in FILES:
@@ -172,7 +172,7 @@ def checked(name: str, overrides: Mapping[str, str]) -> Scene:
 
 
 def is_scene(path: Path) -> bool:
-    """Whether a YAML file looks like a scene of its own or one that changes another."""
+    """Return True if a YAML file looks like a scene: no study, with a camera or a base scene."""
     try:
         tree, _ = read_yaml(path)
     except InputError:
@@ -189,7 +189,7 @@ LOOPS = {
 
 
 def looped(name: str, overrides: Mapping[str, str], feedback: str) -> dict[str, str]:
-    """What closes the loop of a scene that has a controller by something else; `` opens it: nobody steers."""
+    """Overrides that close the loop with another feedback (a key of LOOPS); "" removes controller and maneuver."""
     tree = read(find(name))[0]
     for key, value in overrides.items():
         put(tree, key, value)
@@ -200,7 +200,7 @@ def looped(name: str, overrides: Mapping[str, str], feedback: str) -> dict[str, 
 
 
 def save(folder: Path, name: str, base: str, overrides: Mapping[str, str], title: str) -> Path:
-    """A new scene file in a folder: the base's keys but for those changed. Raises InputError; overwrites nothing."""
+    """Save a new scene file that consists of a base and overrides. Raises InputError, also if the file exists."""
     from skysim.apps.gui.worker.export import base_of, scene_yaml
     from skysim.core import files
 

@@ -1,4 +1,4 @@
-"""The map of keys: PTASE's where it had one (Fialho & Saotome 2005, section 3.1)."""
+"""Keyboard map; the keys of PTASE where it had one (Fialho & Saotome 2005, section 3.1)."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 
 class Key(NamedTuple):
-    """Keys as the browser names them, the action that they are, and what the map on the screen says."""
+    """Keys as the browser names them, their action, and their label and description on the screen."""
 
     keys: tuple[str, ...]
     shown: str
@@ -14,7 +14,7 @@ class Key(NamedTuple):
     told: str
 
 
-MOVES = {  # fields right, fields up, turns clockwise: of the step of a key
+MOVES = {  # right, up, roll clockwise, in steps of a key press
     "ArrowLeft": (-1, 0, 0),
     "ArrowRight": (1, 0, 0),
     "ArrowUp": (0, 1, 0),
@@ -38,13 +38,13 @@ KEYS = (
 )
 ACTION = {key: one.action for one in KEYS for key in one.keys}
 
-# What was chosen from, a list or a tab, would else go on to take the keys.
+# A list or tab keeps the keyboard focus after a choice, so the focus is removed from it.
 LEAVE = (
     "() => document.activeElement.closest('.q-select__focus-target, .q-tab') && document.activeElement.blur()"
 )
 
-# The browser has uses of its own for these; while no field is being typed in, the page has them. F keys and Esc leave a
-# field first (before the page's own listener, which hears nothing from a field).
+# Suppress the browser's own actions for these keys unless the user types in a field. F keys and Esc remove the focus
+# from a field first, in the capture phase, because the page's own listener ignores events from fields.
 TAKEN = """
 document.addEventListener("keydown", event => {
   const typing = event.target.closest && event.target.closest("input, textarea, [contenteditable], .q-menu, .q-tab");

@@ -1,4 +1,4 @@
-"""What is drawn over a frame, as paths in the frame's pixels; every kind can be switched off."""
+"""Overlay of a frame: marks as SVG paths in the frame's pixels. Each kind can be switched off."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ INK = {
     "windows": "#7f8a9a",
 }
 KINDS = tuple(INK)
-NAMED = 40  # labels at most: the brightest
-MARKED = 400  # true lights at most
-NEAR_PX = 4.0  # within which a spot is a true light's
-# Room for the frame in the smallest window, in pixels of the screen: marks and names are readable there.
+NAMED = 40  # most labels; the brightest lights get them
+MARKED = 400  # most marks of true lights
+NEAR_PX = 4.0  # a detection within this distance of a true light is not false
+# Smallest size of the frame on the screen, in screen pixels: marks and names must be readable there.
 SCREEN_PX = (806.0, 511.0)
 MARK_PX, FONT_PX = 5.2, 10.0
-LETTER = 0.61  # width of a letter, of its font's size
+LETTER = 0.61  # width of a letter over its font size
 
 
 def marks(
@@ -28,9 +28,10 @@ def marks(
     shown: Collection[str],
     name: Callable[[int], str],
 ) -> list[dict[str, Any]]:
-    """The marks of a look: truth ticked, detections squared, identified circled and named, false crossed, windows.
+    """Marks of a frame: ticks for true lights, squares for detections, circles and names for identified ones, crosses
+    for false ones, dashed squares for predicted windows.
 
-    A kind is one path as SVG writes it, with what frame.js draws it by: ink, width, dash, font, names (x, y, text).
+    Each kind is one SVG path with its style for frame.js: ink, width, dash, font, names (x, y, text).
     """
     share = max(size_px[0] / SCREEN_PX[0], size_px[1] / SCREEN_PX[1])
     size, font = MARK_PX * share, FONT_PX * share
@@ -56,7 +57,7 @@ def marks(
 
 
 def false(spots: Collection[Spot], lights: Collection[Light]) -> list[Spot]:
-    """What was seen where no true light is."""
+    """Detections that have no true light within NEAR_PX; none if the truth is unknown."""
     if not lights:
         return []
     return [
@@ -67,7 +68,7 @@ def false(spots: Collection[Spot], lights: Collection[Light]) -> list[Spot]:
 
 
 def ticks(x: float, y: float, size: float) -> str:
-    """Four strokes that leave the middle open. An integer is a pixel's centre; SVG's is its corner."""
+    """Four strokes around an open center. Half a pixel is added: integers are pixel centers here, corners in SVG."""
     x, y, near, long = x + 0.5, y + 0.5, 0.6 * size, 0.6 * size
     far = near + long
     return (
@@ -82,7 +83,7 @@ def box(x: float, y: float, half: float) -> str:
 
 
 def circle(x: float, y: float, radius: float) -> str:
-    """Two half circles."""
+    """A circle as two semicircular arcs."""
     half = f"a{radius:.1f} {radius:.1f} 0 1 0"
     return f"M{x + 0.5 - radius:.1f} {y + 0.5:.1f}{half} {2 * radius:.1f} 0{half} {-2 * radius:.1f} 0"
 
@@ -99,11 +100,13 @@ def labels(
     size_px: tuple[int, int],
     name: Callable[[int], str],
 ) -> list[tuple[float, float, str]]:
-    """(x, y, name) beside each spot, where it is free and within the frame: right, left, above, below, else none.
+    """Place labels without overlap: (x, y, name) to the right or left of a spot, above or below it, or none.
 
-    Earlier spots choose first. What is taken: by rows of half a letter's height a bit for each column of that width.
+    The first free position inside the frame is taken, and earlier spots choose first. The occupied area is a bitmap of
+    cells of half the font size: one integer per row, one bit per column.
     """
     side, taken = font / 2, dict[int, int]()
+    # The marks themselves occupy space first, so that no label covers one.
     for one in spots:
         x, y, half = one.x + 0.5, one.y + 0.5, 0.9 * size
         take(taken, max(x - half, 0.0), max(y - half, 0.0), x + half, y + half, side)
@@ -125,8 +128,9 @@ def labels(
 
 
 def take(taken: dict[int, int], left: float, top: float, right: float, bottom: float, side: float) -> bool:
-    """Take a box, if nobody has any of it."""
+    """Mark the cells of a box as occupied; return False, and mark none, if one of them is occupied already."""
     first = max(int(left / side), 0)
+    # Bits first..last of a row.
     bits = (2 << (int(right / side) - first)) - 1 << first
     rows = range(int(top / side), int(bottom / side) + 1)
     if any(taken.get(row, 0) & bits for row in rows):
@@ -137,7 +141,7 @@ def take(taken: dict[int, int], left: float, top: float, right: float, bottom: f
 
 
 def magnified(dn: tuple[tuple[int, ...], ...], spots: Collection[Spot], x0: int, y0: int, high: int) -> str:
-    """Pixels as squares with their numbers, and crosses at the centroids among them; `high` pixels of the screen."""
+    """SVG of enlarged pixels with their values, and crosses at the centroids. high : height in screen pixels."""
     rows, columns = len(dn), len(dn[0])
     cell, wide = high / rows, columns * high / rows
     low, most = min(map(min, dn)), max(map(max, dn))
@@ -159,7 +163,7 @@ def magnified(dn: tuple[tuple[int, ...], ...], spots: Collection[Spot], x0: int,
 
 
 def pixel(x: int, y: int, dn: int, bright: float, cell: float, first: tuple[int, int]) -> str:
-    """A pixel's square, its number, and where it is for who rests the mouse on it."""
+    """SVG of one enlarged pixel: a square, its value, and its coordinates as a tooltip."""
     grey = round(255 * bright)
     square = f'x="{x * cell:.1f}" y="{y * cell:.1f}" width="{cell:.1f}" height="{cell:.1f}"'
     middle = (

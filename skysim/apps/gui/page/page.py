@@ -1,4 +1,4 @@
-"""The page of a tab: it builds the panels and hands what keys and clicks ask for to the session."""
+"""The page of a browser tab: builds the panels and passes key and mouse actions to the session."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ LOGGED = 500
 
 
 class Tab:
-    """One tab: its worker, the scene that it looks at, and the elements that show it.
+    """One tab: its worker, its scene, and its page elements.
 
-    session : its worker, given once a browser is there
+    session : its worker; set when a browser has connected
     folder : where scenes are saved;  out : where studies are
     overrides : keys of the scene that differ from its file
-    solving : whether every look is identified
-    steps : (3,) right, up, roll that keys have asked for and no frame shows yet
+    solving : whether every frame is solved
+    steps : (3,) right, up, roll: movements asked for by keys that no frame shows yet
     """
 
     session: Session
@@ -57,16 +57,16 @@ class Tab:
         self.lines: list[str] = []
 
     def close(self) -> None:
-        """The tab is gone, and so is all its work."""
+        """Release the tab's resources after its browser has gone: frames, study and worker."""
         self.open_still = False
         FRAMES.pop(self.id, None)
         self.trials.trials.kill()
         self.session.close()
 
-    # What is on the page.
+    # Page elements.
 
     def build(self) -> None:
-        """All elements."""
+        """Build all page elements."""
         ui.add_css(style.CSS)
         ui.add_body_html(f"<script>{keys.TAKEN}</script>")
         ui.colors(
@@ -88,7 +88,7 @@ class Tab:
         ui.keyboard(on_key=self.key, ignore=["input", "textarea"])
 
     def head(self) -> None:
-        """Title, scene, what is going on, export."""
+        """Build the head: scene list, title, message, progress, frame rate, export menu."""
         with ui.element("div").classes("lab-head"):
             ui.label("skysim lab").classes("lab-name")
             self.picker = ui.select(self.scenes(), value=self.scene, on_change=self.pick)
@@ -108,7 +108,7 @@ class Tab:
                     item.props("dense").style("white-space: nowrap")
 
     def scenes(self) -> dict[str, str]:
-        """What can be opened, and how it is shown: scenes that skysim has, those saved here, the one at hand."""
+        """Scenes to choose from and their labels: shipped ones, those saved in the folder, and the current one."""
         own = [path for path in sorted(self.folder.glob("*.yaml")) if forms.is_scene(path)]
         return (
             {path.stem: path.stem for path in sorted(SCENES.glob("*.yaml"))}
@@ -117,12 +117,12 @@ class Tab:
         )
 
     def side(self) -> None:
-        """The panels beneath the attitude."""
+        """Build the panels below the attitude card."""
         with ui.element("div").style(
             "display: grid; grid-template: 34px minmax(0, 1fr) / minmax(0, 1fr); min-height: 0"
         ):
             with ui.tabs().props("dense align=left no-caps indicator-color=primary") as self.tabs:
-                # Else the arrow keys would go on to choose tabs.
+                # Otherwise the arrow keys would select tabs.
                 self.tabs.on("click", js_handler=keys.LEAVE)
                 for name in PANELS:
                     ui.tab(name).mark(f"tab-{name}")
@@ -142,7 +142,7 @@ class Tab:
                     self.told = ui.label("Nothing yet.").classes("mono lab-log").mark("log")
 
     def dialog(self) -> ui.dialog:
-        """Help: what the page is and its keys."""
+        """Build the help dialog: purpose and keys."""
         with ui.dialog() as dialog, ui.card().style("max-width: 600px; padding: 20px 24px; gap: 12px"):
             ui.label("skysim lab").style("font-weight: 600; font-size: 15px")
             ui.label(
@@ -158,21 +158,21 @@ class Tab:
                     ui.label(HELP[key.action if key.action != "move" else key.told])
         return dialog
 
-    # What happens.
+    # Actions.
 
     async def pick(self) -> None:
-        """Another scene, from the list."""
+        """Open the scene that was chosen in the list."""
         if self.picker.value != self.scene:
             await self.open(str(self.picker.value))
 
     async def open(self, scene: str, overrides: Mapping[str, str] | None = None) -> None:
-        """Set a scene up and look."""
+        """Set up a scene and show a first frame; keep the old scene if that fails."""
         self.rest()
         before = self.scene, self.overrides
         self.scene, self.overrides = scene, dict(overrides or {})
         doing = (
             f"setting up {Path(scene).name} …" if self.view else ""
-        )  # the first says so in the frame's place
+        )  # the first time the sensor view says so
         answer = await self.ask("open", self.scene_path, self.overrides, self.solving, doing=doing)
         if answer is None:
             self.scene, self.overrides = before
@@ -182,7 +182,7 @@ class Tab:
             return
         self.setting, view = answer
         self.feedback = await self.fed_back()
-        self.title.props["title"] = self.setting.title  # the whole of a long one
+        self.title.props["title"] = self.setting.title  # tooltip with the full title
         self.title.set_text(self.setting.title)
         self.attitude.set(self.setting)
         self.space.set(self.setting)
@@ -196,11 +196,11 @@ class Tab:
         )
 
     async def change(self, keys_: Mapping[str, str]) -> None:
-        """Other values for some keys of the scene."""
+        """Reopen the scene with further overrides."""
         await self.open(self.scene, {**self.overrides, **keys_})
 
     async def refield(self, field_deg: float) -> None:
-        """Another field of view, by another focal length."""
+        """Change the field of view by the focal length: f' = f tan(field / 2) / tan(field' / 2)."""
         if self.setting is None or not 0.5 <= field_deg <= 120:
             self.say("field: allowed: 0.5 to 120 deg")
             return
@@ -209,17 +209,17 @@ class Tab:
         await self.change({"camera.focal_length": f"{1e3 * camera.focal_length_m * longer:.5g} mm"})
 
     async def fed_back(self) -> str | None:
-        """What the scene's controller is fed with; None without one."""
+        """The feedback of the scene's controller; None without a controller."""
         control = load(self.scene_path, self.overrides).motion.control
         return control.feedback if control else None
 
     @property
     def scene_path(self) -> str:
-        """The scene's file: studies are written elsewhere."""
+        """Absolute path of the scene file, since study files are written to other folders."""
         return str(find(self.scene).resolve())
 
     async def show(self, asked: Awaitable[Any]) -> View | None:
-        """A look that was asked for, on the page; None where it was overtaken or went wrong."""
+        """Wait for a frame and display it; None if the request failed or the tab has closed."""
         begin = time.perf_counter()
         view = await self.wait(asked)
         if view is not None:
@@ -228,19 +228,22 @@ class Tab:
         return view
 
     def display(self, view: View) -> None:
-        """A look, everywhere."""
+        """Display a frame in the sensor view, the attitude card and the 3-D view."""
         self.view = view
         self.sensor.show(view)
         self.attitude.show(view)
         self.space.show(view)
 
     def rest(self) -> None:
-        """What plays or looks by itself ends: the picture is wanted for something else."""
+        """Stop playback and the live camera, because the sensor view is needed for something else."""
         self.flight.pause()
         self.photo.stop()
 
     async def ask(self, task: str, *arguments: Any, doing: str = "") -> Any:
-        """What the session answers; None where it went wrong, which is said. Until then: what is being done."""
+        """Run a task in the worker and return its result, or None after an error, which is displayed.
+
+        doing : message shown until the task ends
+        """
         self.say(doing, "quiet")
         self.busy.set_visibility(True)
         try:
@@ -252,7 +255,7 @@ class Tab:
                     self.say("")
 
     async def wait(self, asked: Awaitable[Any]) -> Any:
-        """An answer; what is wrong is said in one line."""
+        """Await a result; display an error in one line and return None."""
         try:
             answer = await asked
         except (InputError, Gone) as error:
@@ -262,27 +265,27 @@ class Tab:
         return answer if self.open_still else None
 
     def say(self, text: str, ink: str = "warn") -> None:
-        """A message at the top, until the next action: what is wrong, what went well or what is being done."""
+        """Show a message in the head until the next action; warnings are also logged."""
         if text == self.said:
             return
         self.said = text
-        self.message.props["title"] = text  # the whole of a long one
+        self.message.props["title"] = text  # tooltip with the full text
         self.message.set_text(text)
         self.message.classes(remove="good warn quiet", add=ink)
         if text and ink == "warn":
             self.log(text)
 
     def log(self, text: str) -> None:
-        """Note what was done."""
+        """Add a line to the log, the newest first."""
         self.lines = [f"{time.strftime('%H:%M:%S')}  {text}", *self.lines[: LOGGED - 1]]
         self.told.set_text("\n".join(self.lines))
 
     async def solve_every(self) -> None:
-        """Whether each look is identified."""
+        """Take over the switch that solves every frame."""
         self.solving = bool(self.every.value)
 
     async def export(self, kind: str) -> None:
-        """Download files of the newest look."""
+        """Download files of the newest frame."""
         found = await self.ask("export")
         if not found:
             return
@@ -297,7 +300,7 @@ class Tab:
     # Keys.
 
     async def key(self, event: KeyEventArguments) -> None:
-        """What a key does."""
+        """Handle a key press."""
         name = event.key.name.lower() if len(event.key.name) == 1 else event.key.name
         action = keys.ACTION.get(name)
         if not event.action.keydown or action is None or event.modifiers.ctrl or event.modifiers.meta:
@@ -313,7 +316,7 @@ class Tab:
             await self.act(action)
 
     async def move(self, right: float, up: float, roll_deg: float) -> None:
-        """Move by this; what keys ask for while a frame is made is added up for the next."""
+        """Move the camera by these steps; steps asked for while a frame is rendered are summed for the next frame."""
         self.rest()
         self.say("")
         self.steps += (right, up, roll_deg)
@@ -329,7 +332,7 @@ class Tab:
             self.moving = False
 
     async def act(self, action: str) -> None:
-        """What the other keys do."""
+        """Perform the action of a key other than a movement."""
         self.say("")
         if action == "identify":
             self.rest()

@@ -1,4 +1,4 @@
-"""The laboratory in three dimensions: dome or sky, lights, vehicle, the camera's field; turned with the mouse."""
+"""3-D view of the laboratory (three.js): dome or sky, lights, vehicle and the camera's field of view."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from scipy.spatial.transform import Rotation
 from skysim.apps.gui.messages import Setting, Stage, View
 from skysim.apps.gui.page.style import INK
 
-CLASSES = 3  # of brightness, each drawn in a size of its own
+CLASSES = 3  # of brightness, each with its own point size
 POINT_M = (0.008, 0.013, 0.02)
 DIM, LIT = (0.75, 0.72, 0.62), (1.0, 0.85, 0.25)
 SHELL = (0.25, 0.30, 0.38)
-# Without a graphics card the browser draws this on the cores that make the frames: seldom then, but under the mouse.
+# Without a GPU the browser draws on the CPU cores that also render frames: draw rarely then, except under the mouse.
 FPS, FPS_SLOW, MOVED_S, MOVED_SLOW_S = 30, 2, 0.1, 0.5
 CARD = """(() => { const gl = document.createElement("canvas").getContext("webgl");
   const told = gl && gl.getExtension("WEBGL_debug_renderer_info");
@@ -24,7 +24,7 @@ CARD = """(() => { const gl = document.createElement("canvas").getContext("webgl
 
 
 class Space:
-    """The scene of three.js; `set` builds it, `show` moves it."""
+    """The three.js scene; `set` builds it, `show` sets the attitude, which a timer draws."""
 
     def __init__(self) -> None:
         self.scene = ui.scene(
@@ -41,13 +41,13 @@ class Space:
         self.moves = ui.timer(MOVED_SLOW_S, self.move)
 
     async def suit(self) -> None:
-        """Draw as often as the browser can without taking the cores' time."""
+        """Raise the frame rate if the browser has a GPU."""
         if await ui.run_javascript(CARD, timeout=10):
             self.fps, self.moves.interval = FPS, MOVED_S
             self.scene.props(f"fps={self.fps}")
 
     def set(self, setting: Setting) -> None:
-        """Another scene."""
+        """Build the view of a new scene."""
         self.stage = stage = setting.stage
         self.scene.clear()
         with self.scene:
@@ -61,7 +61,7 @@ class Space:
         self.scene.move_camera(away, -away, 0.7 * away, 0, 0, 0.0 if setting.under_stars else 0.5, duration=0)
 
     def cloud(self, stage: Stage) -> None:
-        """The lights by classes of brightness, the bright drawn larger."""
+        """Draw the lights in CLASSES of brightness, brighter ones larger."""
         size, places = np.array(stage.size), np.array(stage.lights_m).reshape(-1, 3)
         edges = np.quantile(size, [1 / 3, 2 / 3]) if len(size) else np.zeros(2)
         kind = np.digitize(size, edges)
@@ -71,14 +71,14 @@ class Space:
                 self.scene.point_cloud(points, [list(DIM)] * len(points), POINT_M[n])
 
     def body(self, stage: Stage) -> None:
-        """The vehicle, and the edges of the camera's field."""
+        """Draw the vehicle and the edges of the camera's field of view."""
         for kind, size, place, wxyz, rgb in stage.shapes:
             turn = Rotation.from_quat(wxyz, scalar_first=True)
             if kind == "box":
                 shape: Any = self.scene.box(*(2 * one for one in size))
             elif kind == "sphere":
                 shape = self.scene.sphere(size[0], 20, 12)
-            else:  # three.js' cylinder stands along y, MuJoCo's along z
+            else:  # the axis of a cylinder is y in three.js, z in MuJoCo
                 shape = self.scene.cylinder(size[0], size[0], 2 * size[1], 24)
                 turn = turn * Rotation.from_euler("x", 90, degrees=True)
             shape.move(*place).rotate_R(turn.as_matrix().tolist())
@@ -89,11 +89,11 @@ class Space:
             self.scene.line(corner, corners[(n + 1) % 4]).material(INK["accent"])
 
     def show(self, view: View) -> None:
-        """The vehicle as it stands, in a moment."""
+        """Queue the newest attitude for the timer."""
         self.newest = view
 
     def move(self) -> None:
-        """Move the vehicle; the lights that the camera sees are lit."""
+        """Timer: set the vehicle's attitude and highlight the lights in view."""
         view, self.newest = self.newest, None
         if view is None or self.vehicle is None or self.stage is None:
             return
@@ -103,7 +103,7 @@ class Space:
         self.lit.set_points(points, [list(LIT)] * len(points))
 
     def places(self, seen: Collection[int]) -> list[list[float]]:
-        """Where the lights with these ids are."""
+        """Positions of the lights with these ids."""
         assert self.stage is not None
         pairs = zip(self.stage.ids, self.stage.lights_m, strict=True)
         return [list(place) for id, place in pairs if id in seen]

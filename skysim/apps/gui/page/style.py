@@ -1,4 +1,4 @@
-"""How the page looks: dark, quiet, aligned. Sizes that would make it jump are fixed here."""
+"""Colors and CSS of the page. Sizes are fixed where changing content would otherwise shift the layout."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ TOOLTIP = {
 
 
 def digits(value: float) -> str:
-    """Three of them, and never an exponent."""
+    """Format with three significant digits, from 100 up as an integer."""
     return f"{value:.0f}" if value >= 100 else f"{value:.3g}"
 
 

@@ -1,1 +1,1 @@
-"""The process behind a browser tab: it holds the scene and the tracker, and does the work."""
+"""The worker process of a browser tab: holds scene and tracker, renders, solves and simulates."""

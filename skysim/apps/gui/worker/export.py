@@ -1,4 +1,4 @@
-"""The newest look as files: frame, truth, solution, scene."""
+"""Export of the newest frame as files: frame, truth, solution, scene."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from skysim.results.files import frames
 from skysim.results.report import annotate
 from skysim.scene.loader import find
 
-KINDS = {  # what the menu offers, and the file that it is
+KINDS = {  # file by menu entry
     "frame, FITS": "frame.fits",
     "frame, PNG": "frame.png",
     "truth": "frame.ecsv",
@@ -32,7 +32,7 @@ KINDS = {  # what the menu offers, and the file that it is
 
 
 def files(desk: Desk, base: str, overrides: dict[str, str]) -> dict[str, bytes]:
-    """Every file by name."""
+    """All files by name. Raises InputError if no frame has been rendered."""
     if desk.frame is None or desk.truth is None:
         raise InputError("nothing to export yet")
     with tempfile.TemporaryDirectory() as folder:
@@ -53,7 +53,7 @@ def files(desk: Desk, base: str, overrides: dict[str, str]) -> dict[str, bytes]:
 
 
 def figure(desk: Desk) -> bytes:
-    """The frame with its truth, what was detected and who was identified."""
+    """PNG of the frame with true lights, detections and identified lights marked."""
     assert desk.frame is not None
     assert desk.truth is not None
     empty = np.empty((0, 2))
@@ -65,7 +65,7 @@ def figure(desk: Desk) -> bytes:
 
 
 def base_of(scene: str, folder: Path | None = None) -> str:
-    """A scene as a file in a folder names it for its base: one that skysim has by its name, else by its path."""
+    """The value of `base` by which a file in `folder` refers to a scene: a shipped scene's name, else a path."""
     path = find(scene).resolve()
     if path.parent == SCENES.resolve():
         return path.stem
@@ -73,7 +73,7 @@ def base_of(scene: str, folder: Path | None = None) -> str:
 
 
 def scene_yaml(base: str, overrides: dict[str, str], title: str = "") -> str:
-    """A scene that is another with some keys of its own."""
+    """YAML of a scene that consists of a base and overrides."""
     tree: dict[str, object] = {"schema": VERSION, "base": base}
     if title:
         tree["title"] = title
@@ -83,7 +83,7 @@ def scene_yaml(base: str, overrides: dict[str, str], title: str = "") -> str:
 
 
 def packed(found: dict[str, bytes]) -> bytes:
-    """All of them in one archive."""
+    """Pack all files into a ZIP archive."""
     buffer = BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, data in found.items():

@@ -1,4 +1,4 @@
-"""A scene flown, then played: at any moment of the flight a frame, solved if that is asked for."""
+"""Playback of a simulated motion: renders a frame at any time of it, solved on request."""
 
 from __future__ import annotations
 
@@ -16,26 +16,26 @@ from skysim.results import telemetry_report
 from skysim.simulation import run, testbed
 from skysim.simulation.testbed import SPARE_S, Testbed
 
-MOST_POINTS = 500  # of a curve on the screen
-FLOOR = 1e-3  # arcsec; a logarithm has no zero
+MOST_POINTS = 500  # of a curve on the page, roughly
+FLOOR = 1e-3  # arcsec; lower limit of values on a logarithmic axis
 
 
 @dataclass(frozen=True, slots=True)
 class Flown:
-    """The lab after its flight."""
+    """A testbed after the simulation of its motion, and its telemetry."""
 
     lab: Testbed
     log: Telemetry
 
     @classmethod
     def of(cls, desk: Desk, watch: Callable[[float, float], None]) -> Flown:
-        """Fly the desk's scene from its own start."""
+        """Simulate the motion of the workbench's scene. watch : progress(done, total)"""
         lab = run.simulate_motion(desk.lab, watch)
         return cls(lab, lab.log)
 
     @property
     def curves(self) -> FlightLog:
-        """What the vehicle did and believed."""
+        """Curves of true and estimated attitude errors (arcsec), momentum (N m s) and rate (deg/s), decimated."""
         log, every = self.log, max(len(self.log.t_s) // MOST_POINTS, 1)
         off = {
             "off what was asked": log.lab_from_ref,
@@ -55,13 +55,17 @@ class Flown:
         return FlightLog(tuple(log.t_s[::every].tolist()), thinned, tuple(frames))
 
     def at(self, desk: Desk, t_s: float, solve: bool) -> View:
-        """The frame whose exposure begins at t_s."""
+        """Render the frame whose exposure begins at t_s, limited so that it ends within the motion.
+
+        The noise seed depends on the time, so that the same time always gives the same frame.
+        """
         scene = self.lab.scene
         last_s = float(self.lab.trajectory.t_s[-1]) - SPARE_S
         when = testbed.window(scene, 0)
         long_s = when.close_s(scene.camera.height_px) - when.open_s
         begin_s = min(max(t_s, 0.0), last_s - long_s)
         exposure = scene.exposure.model_copy(update={"first_s": begin_s})
+        # The start time in units of 0.1 ms is part of the seed.
         seed = scene.seed + 1 + round(begin_s * 1e4)
         here = replace(self.lab, scene=scene.model_copy(update={"exposure": exposure, "seed": seed}))
         desk.lab_from_body = self.lab.trajectory.at(begin_s)
@@ -70,7 +74,7 @@ class Flown:
         return replace(view, t_s=begin_s, filter_arcsec=believed, innovation_arcsec=innovation)
 
     def filter_at(self, desk: Desk, t_s: float) -> tuple[float, float]:
-        """By how much the filter is off the truth, and the star tracker's answer off the filter, in arcsec."""
+        """Error of the filter, and angle between the star tracker's attitude and the filter's, arcsec; NaN if none."""
         believed = self.log.lab_from_filter
         if believed is None:
             return math.nan, math.nan
@@ -84,6 +88,6 @@ class Flown:
 
 
 def arcsec(degrees: Floats | None) -> Floats:
-    """For a logarithmic axis."""
+    """Degrees to arc-seconds, at least FLOOR, for a logarithmic axis."""
     assert degrees is not None
     return np.maximum(3600 * degrees, FLOOR)

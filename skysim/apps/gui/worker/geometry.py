@@ -1,4 +1,4 @@
-"""The laboratory in three dimensions, as numbers for the browser to draw."""
+"""3-D geometry of the laboratory, as numbers for the browser to draw."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from skysim.sources.dome.surface import Surface
 
 SKY_RADIUS_M = 2.5
 MOST_STARS, MOST_LEDS = 600, 4000
-RAY_M = 2.5  # length of the field's edges where they meet nothing
+RAY_M = 2.5  # drawn length of the field's edges that meet no surface
 RINGS, SECTORS, DOTS = 4, 12, 144  # of the dotted lines on a dome
 
 
 def of(lab: Testbed) -> Stage:
-    """Vehicle, lights and camera of a lab."""
+    """Geometry of a testbed: vehicle, lights, camera and dome."""
     under_dome = isinstance(lab.scene.light, DomeConfig)
     ids, place, size = lights(lab, under_dome)
     shapes = tuple(
@@ -39,7 +39,10 @@ def of(lab: Testbed) -> Stage:
 
 
 def lights(lab: Testbed, under_dome: bool) -> tuple[NDArray[np.int64], Floats, Floats]:
-    """Ids, (N, 3) places and (N,) sizes, the brightest first."""
+    """Ids, (N, 3) positions and (N,) drawn sizes of the brightest lights, the brightest first.
+
+    The size grows with the time-averaged power to the power of 0.3, so that faint lights remain visible.
+    """
     sources = lab.sources
     power = sources.strength * np.minimum(sources.on_s / sources.period_s, 1.0)
     rows = np.argsort(-power)[: MOST_LEDS if under_dome else MOST_STARS]
@@ -49,7 +52,7 @@ def lights(lab: Testbed, under_dome: bool) -> tuple[NDArray[np.int64], Floats, F
 
 
 def corners_m(lab: Testbed) -> Floats:
-    """(4, 3) where the field's corners meet the dome with the vehicle upright, else RAY_M away; body axes."""
+    """(4, 3) points where the field's corners meet the dome with the vehicle level, else RAY_M away; body axes."""
     camera = lab.scene.camera
     x, y = camera.width_px / 2 / camera.focal_px, camera.height_px / 2 / camera.focal_px
     rays_cam = np.array([[-x, -y, 1], [x, -y, 1], [x, y, 1], [-x, y, 1.0]])
@@ -62,7 +65,7 @@ def corners_m(lab: Testbed) -> Floats:
 
 
 def shell(lab: Testbed) -> tuple[tuple[Triple, ...], ...]:
-    """Rings and ribs on the dome's inside."""
+    """Circles of equal polar angle and meridians on the dome's inside, as lists of points."""
     assert isinstance(lab.scene.light, DomeConfig)
     inside = surface.build_surface(lab.scene.light.surface)
     most = np.radians(lab.scene.light.layout.cap_deg)
@@ -73,7 +76,7 @@ def shell(lab: Testbed) -> tuple[tuple[Triple, ...], ...]:
 
 
 def met(inside: Surface, lean: Floats, azimuth: Floats) -> Floats:
-    """(K, 3) where rays from the bearing meet the dome, those that do."""
+    """(K, 3) points where rays from the bearing meet the dome; rays that miss it are left out. Angles in rad."""
     rays = np.column_stack([np.sin(lean) * np.cos(azimuth), np.sin(lean) * np.sin(azimuth), np.cos(lean)])
     places = inside.meet(np.zeros(3), rays)
     return places[np.isfinite(places).all(axis=1)]

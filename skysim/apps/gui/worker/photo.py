@@ -1,4 +1,4 @@
-"""Pictures of the user's own, from a file or a live camera, solved and shown, or refused with the reason."""
+"""Solves images that are not of the current scene: uploaded files, a live camera's frames, a study's trials."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ SUFFIXES = (".fits", ".fit", ".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
 
 @dataclass(frozen=True, slots=True)
 class Photo:
-    """A picture that is not the scene's at hand, and its answer; size_px is its own, jpeg what the page shows.
+    """An image that is not of the current scene, and its solution; size_px is the image's, jpeg what the page shows.
 
-    names, true_deg : of its three angles, and what they truly are
-    lights, prefix : what truly shone, of a study's trial, and what lights' numbers are numbers of
+    names, true_deg : of its three angles, and their true values if known
+    lights, prefix : true lights of a study's trial, and the catalog of the lights' numbers (HIP or LED)
     """
 
     size_px: tuple[int, int]
@@ -47,11 +47,11 @@ class Photo:
     prefix: str = "HIP"
 
 
-Seen = tuple[Photo, NDArray]  # with the picture's pixels
+Seen = tuple[Photo, NDArray]  # with the image's pixels
 
 
 def of_file(name: str, data: bytes, fov_deg: float | None, stages: dict[str, str]) -> Seen:
-    """An uploaded file, solved. Raises InputError for what cannot be an image."""
+    """Solve an uploaded file. Raises InputError if it is no readable image."""
     suffix = Path(name).suffix.lower()
     if suffix not in SUFFIXES:
         raise InputError(f"{Path(name).name}: allowed: {', '.join(SUFFIXES)}")
@@ -69,12 +69,12 @@ def of_file(name: str, data: bytes, fov_deg: float | None, stages: dict[str, str
 
 
 def of_camera(camera: LiveCamera, fov_deg: float | None, stages: dict[str, str]) -> Seen:
-    """The next frame of a live camera. Raises InputError."""
+    """Solve the next frame of a live camera. Raises InputError."""
     return solved(images.monochrome(camera.frame()), fov_deg, stages, None)
 
 
 def of_trial(study: str, folder: Path, trial: int) -> Seen:
-    """The frame of a study's trial, done again, with what the tracker made of it."""
+    """Repeat a study's trial: its first frame with the tracker's solution."""
     planned = loader.load(study)
     with store.open_store(folder / STORE) as kept:
         segment = replay.segment_of(planned, kept, trial)
@@ -99,7 +99,7 @@ def of_trial(study: str, folder: Path, trial: int) -> Seen:
 
 
 def solved(image: NDArray, fov_deg: float | None, stages: dict[str, str], taken: Any) -> Seen:
-    """The answer to a picture, or why there is none."""
+    """Solve an image; the result's status says why if there is no solution. taken : UTC, if known."""
     check_size(image)
     how = plate_solver.make_solver(fov_deg, None, stages=stages)
     found, tracker = plate_solver.look(image, how, taken)

@@ -1,4 +1,4 @@
-"""Where the camera looks, and how keys move it: turns about the camera's own axes, so that no pole is in the way."""
+"""Camera pointing: from typed angles, or by rotations about the camera's own axes, which have no singularity."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from skysim.scene.motion import AttitudeConfig
 from skysim.scene.scene import Scene
 from skysim.sources import stars
 
-FINE, COARSE = 0.02, 0.2  # of the field: what an arrow key moves it by, without and with shift
+FINE, COARSE = 0.02, 0.2  # step of an arrow key without and with shift, in fields of view
 ROLL_FINE_DEG, ROLL_COARSE_DEG = 1.0, 10.0
 RANGES = {  # degrees
     "RA": (0.0, 360.0),
@@ -27,7 +27,7 @@ RANGES = {  # degrees
 
 
 def from_angles(scene: Scene, mount: Mount, angles_deg: tuple[float, float, float]) -> Rotation:
-    """lab_from_body of RA, Dec, roll under the stars, of roll, pitch, yaw under a dome; degrees.
+    """lab_from_body from RA, Dec, roll of the camera under stars, else from roll, pitch, yaw of the vehicle; degrees.
 
     Raises InputError for an angle out of range, or a tilt beyond the vehicle's stop.
     """
@@ -46,9 +46,10 @@ def from_angles(scene: Scene, mount: Mount, angles_deg: tuple[float, float, floa
 def moved(
     scene: Scene, mount: Mount, lab_from_body: Rotation, right: float, up: float, roll_deg: float
 ) -> Rotation:
-    """The attitude after the boresight has gone so many fields to the right and up, and the camera rolled clockwise.
+    """lab_from_body after moving the boresight right and up (in fields of view) and rolling the camera clockwise.
 
-    Turns are of the camera about its own axes (x right, y down, z boresight). Raises InputError at the tilt stop.
+    The three form one rotation vector about the camera's axes (x right, y down, z boresight). Raises InputError
+    beyond the tilt stop.
     """
     camera = scene.camera
     across_rad = 2 * math.atan(camera.width_px / 2 / camera.focal_px)
@@ -59,7 +60,7 @@ def moved(
 
 
 def within_stop(scene: Scene, lab_from_body: Rotation) -> Rotation:
-    """The attitude, if the bearing's stop lets it be."""
+    """Return the attitude. Raises InputError if its tilt is beyond the air bearing's stop."""
     vehicle = scene.vehicle
     tilt_deg = float(multibody.tilt_deg(lab_from_body))
     if vehicle.mount == "air_bearing" and tilt_deg > vehicle.tilt_stop_deg:

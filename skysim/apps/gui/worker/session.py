@@ -1,4 +1,4 @@
-"""A tab's worker: a process that has a desk, asked over a pipe, one thing at a time; the page never waits for it."""
+"""Session of a tab: a worker process that runs tasks one at a time, driven over a pipe without blocking the page."""
 
 from __future__ import annotations
 
@@ -13,21 +13,22 @@ from estimator.core.errors import ImageError
 from skysim.core.errors import InputError
 from skysim.experiments.study.execution.workers import environment, one_thread
 
-CAREFUL = {"OPENCV_IO_MAX_IMAGE_PIXELS": str(2**27)}  # of a picture that is unpacked
+CAREFUL = {"OPENCV_IO_MAX_IMAGE_PIXELS": str(2**27)}  # most pixels that OpenCV decodes
 
 
 class Gone(Exception):
-    """The worker died or was closed."""
+    """The worker has died or was closed."""
 
 
 def serve(pipe: Connection, progress: Any, stop: Any) -> None:
-    """The worker: (task, arguments) in, ("ok", answer) or ("bad", message) out, until the pipe closes.
+    """Main loop of the worker: receives (task, arguments), sends ("ok", result) or ("bad", message), until the pipe
+    closes.
 
-    progress : shared, two numbers: how much is done of how much;  stop : shared, not 0 where the task is to end
+    progress : shared (done, total) of the current task;  stop : shared flag; not 0 asks the task to end
     """
     from skysim.apps.gui.worker.tasks import TASKS, Kept, Stopped
 
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the server's, which closes the pipe
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the server, which closes the pipe
 
     def watch(done: float, everything: float) -> None:
         progress[:] = done, everything
@@ -49,12 +50,12 @@ def serve(pipe: Connection, progress: Any, stop: Any) -> None:
             pipe.send(("bad", str(error)))
         except MemoryError:
             pipe.send(("bad", "not enough memory for this"))
-        except Exception as error:  # a defect of ours must not end the tab
+        except Exception as error:  # a bug in one task must not end the tab
             pipe.send(("bad", f"{type(error).__name__}: {error}"))
 
 
 class Session:
-    """One tab's process. Calls stand in line."""
+    """One tab's worker process. Calls are queued and run one at a time."""
 
     def __init__(self) -> None:
         context = multiprocessing.get_context("spawn")
@@ -67,11 +68,11 @@ class Session:
         self.thread = ThreadPoolExecutor(1, "lab")
 
     async def ask(self, task: str, *arguments: Any) -> Any:
-        """What a task answers. Raises InputError for what the user got wrong, Gone where the worker is no more."""
+        """Run a task and return its result. Raises InputError for a user error, Gone if the worker has ended."""
         return await asyncio.get_running_loop().run_in_executor(self.thread, self.call, task, arguments)
 
     def call(self, task: str, arguments: tuple[Any, ...]) -> Any:
-        """In the session's own thread: send, wait, receive."""
+        """Send a task and wait for its result; runs in the session's thread."""
         self.stop.value = 0
         try:
             self.pipe.send((task, arguments))
@@ -83,17 +84,17 @@ class Session:
         return answer
 
     def halt(self) -> None:
-        """End the task at hand, if it is one that tells its progress."""
+        """Ask the current task to end; only tasks that report progress do."""
         self.stop.value = 1
 
     @property
     def share(self) -> float:
-        """How much of the task at hand is done."""
+        """Completed fraction of the current task."""
         done, everything = self.progress[:]
         return done / everything if everything else 0.0
 
     def close(self) -> None:
-        """End the work of a tab that was closed."""
+        """End the worker process."""
         self.halt()
         self.process.terminate()
         self.process.join(2.0)
@@ -102,9 +103,9 @@ class Session:
 
 
 class Spare:
-    """A worker begun ahead of the next tab: what it imports and compiles takes seconds.
+    """Keeps a worker ready for the next tab, because its imports and compilation take seconds.
 
-    scene : the file that it looks at once, to have done everything before
+    scene : file from which it solves a frame to warm up
     """
 
     def __init__(self, scene: str) -> None:
@@ -112,17 +113,17 @@ class Spare:
         self.next: Session | None = None
 
     def begin(self) -> None:
-        """One, if there is none."""
+        """Start a spare worker if there is none."""
         if self.next is None:
             self.next = Session()
             self.next.thread.submit(self.next.call, "warm", (self.scene,))
 
     def take(self) -> Session:
-        """The spare, else a new one."""
+        """Return the spare worker, or else a new one."""
         found, self.next = self.next, None
         return found if found and found.process.is_alive() else Session()
 
     def end(self) -> None:
-        """The server ends."""
+        """Close the spare worker as the server ends."""
         if self.next:
             self.next.close()

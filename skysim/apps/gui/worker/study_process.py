@@ -1,4 +1,4 @@
-"""A study in a process of its own, watched through its store: Monte Carlo of the scene at hand, or a study file."""
+"""Runs a study in its own process and reads its progress from its store: Monte Carlo of a scene, or a study file."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ RESPONSES = (
     "time_ms_median",
 )
 BINS = 28
-SHOWN = 20  # failed trials at most
+SHOWN = 20  # most failed trials in a tally
 
 
 class Tally(NamedTuple):
-    """A study's trials so far.
+    """Results of a study so far.
 
-    figures : by response its value and interval;  bins, counts : a histogram of the angle of error, arcsec
-    failed  : by number trials that raised, then those wrong, then those refused; the first few
+    figures : (value, low, high) by response;  bins, counts : histogram of the error angle, arcsec
+    failed  : (number, reason) of trials that raised, then of wrong ones, then of unsolved ones; the first SHOWN
     """
 
     done: int
@@ -49,7 +49,7 @@ class Tally(NamedTuple):
 def monte_carlo(
     scene: str, overrides: Mapping[str, str], trial: Mapping[str, Any], count: int, seed: int
 ) -> str:
-    """The study file of `count` random attitudes of a scene."""
+    """YAML of a study with `count` random attitudes of a scene."""
     tree = {
         "schema": 1,
         "title": f"Monte Carlo of {Path(scene).stem}, {count} trials of {trial['kind']}",
@@ -65,7 +65,7 @@ def monte_carlo(
 
 
 class Trials:
-    """One study's process. It ends with its tab."""
+    """One study's process, which ends with its tab."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -78,7 +78,7 @@ class Trials:
         return self.process is not None and self.process.returncode is None
 
     async def begin(self, study: Path, verb: str = "run") -> None:
-        """Start it. What it says is kept for the page."""
+        """Start the process; its standard error is kept for `end`. verb : run or resume"""
         command = ["-m", "skysim", "study", verb, str(study), "--out", str(self.folder), "--workers", "1"]
         self.process = await asyncio.create_subprocess_exec(
             sys.executable,
@@ -89,7 +89,7 @@ class Trials:
         )
 
     async def end(self) -> str:
-        """Wait for it; its last line where it went wrong."""
+        """Wait for the process; return the last line of its standard error if it failed, else ""."""
         if self.process is None:
             return ""
         _, told = await self.process.communicate()
@@ -97,19 +97,19 @@ class Trials:
         return lines[-1] if self.process.returncode and lines else ""
 
     def stop(self) -> None:
-        """As Ctrl-C does: what is done is kept."""
+        """Interrupt the process as Ctrl-C does: finished trials are kept."""
         if self.process and self.process.returncode is None:
             with contextlib.suppress(ProcessLookupError):
                 self.process.send_signal(signal.SIGINT)
 
     def kill(self) -> None:
-        """The tab is gone."""
+        """Terminate the process when its tab has closed."""
         if self.process and self.process.returncode is None:
             with contextlib.suppress(ProcessLookupError):
                 self.process.terminate()
 
     def tally(self) -> Tally | None:
-        """What the store has; None while there is none."""
+        """Results in the store so far; None before the first trial is done."""
         path = self.folder / STORE
         if not path.is_file():
             return None
@@ -131,7 +131,7 @@ class Trials:
 
 
 def unsolved(columns: Mapping[str, Any]) -> list[tuple[int, str]]:
-    """Trials with a frame that was answered wrongly, then those with one that was not answered, and why."""
+    """(number, reason) of trials with a wrong frame, then of those with an unsolved one."""
     wrong = columns["wrong"] > 0
     refused = (columns["solved"] < columns["frames"]) & ~wrong
     told = zip(columns["trial"][refused].tolist(), columns["status"][refused].tolist(), strict=True)
@@ -139,7 +139,7 @@ def unsolved(columns: Mapping[str, Any]) -> list[tuple[int, str]]:
 
 
 def histogram(off_arcsec: Any) -> tuple[tuple[float, ...], tuple[int, ...]]:
-    """Bins alike in the logarithm, for errors of arc-seconds and of degrees on one axis."""
+    """Bin centers and counts with logarithmic bins, because errors range from arc-seconds to degrees."""
     if not len(off_arcsec):
         return (), ()
     low, high = max(float(off_arcsec.min()), 1e-3), max(float(off_arcsec.max()), 2e-3)
@@ -149,6 +149,6 @@ def histogram(off_arcsec: Any) -> tuple[tuple[float, ...], tuple[int, ...]]:
 
 
 def finished(folder: Path) -> list[Path]:
-    """The studies with a report in a folder, the newest first."""
+    """Folders of the studies that have a report, the newest first."""
     found = [path.parent for path in folder.glob("*/report.html") if (path.parent / STORE).is_file()]
     return sorted(found, key=lambda path: -(path / "report.html").stat().st_mtime)

@@ -1,4 +1,4 @@
-"""What a worker can be asked, by name. Each is given what the worker keeps between tasks, and how to tell progress."""
+"""Tasks of a worker, by name in TASKS. Each takes the state that the worker keeps between tasks, and its arguments."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ Watch = Callable[[float, float], None]
 
 @dataclass
 class Kept:
-    """Between tasks: the desk, the flight that was flown on it, and the user's picture while the page shows one.
+    """State between tasks: the workbench, its simulated motion, and the other image if the page shows one.
 
-    watch : tells how far a long task is; raises Stopped where it is to end
-    image : (H, W) of that picture;  camera : a live one that is open
+    watch : reports progress(done, total) of a long task; raises Stopped if the task shall end
+    image : (H, W) pixels of an image that is not of the scene;  camera : an open live camera
     """
 
     watch: Watch
@@ -36,23 +36,23 @@ class Kept:
     camera: LiveCamera | None = None
 
     def ready(self) -> Desk:
-        """The desk, once a scene is set up."""
+        """Return the workbench. Raises InputError if no scene is set up."""
         if self.desk is None:
             raise InputError("no scene is set up")
         return self.desk
 
     def seen(self, view: View) -> View:
-        """The page shows the scene: the user's picture is put away."""
+        """Return the view, and forget the other image, because the page now shows the scene."""
         self.image = None
         return view
 
     def pictured(self, seen: photo.Seen) -> photo.Photo:
-        """A picture of the user's, packed for the page."""
+        """Keep an image that is not of the scene, and return it with its JPEG."""
         told, self.image = seen
         return replace(told, jpeg=self.packed())
 
     def packed(self) -> bytes:
-        """What the page shows, as the desk has it stretched."""
+        """JPEG of the shown image, with the workbench's stretch."""
         desk = self.ready()
         if self.image is not None:
             return desk.packed(self.image)
@@ -61,16 +61,16 @@ class Kept:
 
 
 class Stopped(Exception):
-    """The user has stopped a task."""
+    """Raised in a task that the user has stopped."""
 
 
 def warm(_: Kept, scene: str) -> None:
-    """Do once what a tab will do, for nobody."""
+    """Warm up: set up a scene and solve one frame, so that code is imported and compiled."""
     Desk.of(scene, {}).look(solve=True)
 
 
 def open_scene(kept: Kept, scene: str, overrides: Mapping[str, str], solve: bool) -> tuple[Setting, View]:
-    """Set a scene up and look."""
+    """Set up a scene and render a first frame."""
     kept.desk = Desk.of(scene, overrides, kept.desk)
     kept.scene, kept.overrides, kept.flown = scene, dict(overrides), None
     return kept.desk.setting, look(kept, solve)
@@ -91,40 +91,40 @@ def move(kept: Kept, right: float, up: float, roll_deg: float, solve: bool) -> V
 
 
 def show(kept: Kept, stretch: str, bright: float) -> bytes:
-    """What is shown as JPEG, stretched otherwise."""
+    """Change stretch and brightness; return the shown image as JPEG."""
     desk = kept.ready()
     desk.stretch, desk.bright = stretch, bright
     return kept.packed()
 
 
 def fit(kept: Kept, widest_px: int) -> bytes:
-    """What is shown, for a screen that has so many pixels for it."""
+    """Limit the image's width to the pixels that the screen has for it; return the shown image as JPEG."""
     kept.ready().widest_px = widest_px
     return kept.packed()
 
 
 def zoom(kept: Kept, x: float, y: float) -> Zoom:
-    """The pixels around one of what is shown."""
+    """The pixels of the shown image around (x, y)."""
     frame = kept.ready().frame
     assert frame is not None
     return zoomed(frame.image_dn if kept.image is None else kept.image, x, y)
 
 
 def fly(kept: Kept) -> FlightLog:
-    """The whole flight, to be played."""
+    """Simulate the whole motion, for playback."""
     kept.flown = Flown.of(kept.ready(), kept.watch)
     return kept.flown.curves
 
 
 def play(kept: Kept, t_s: float, solve: bool) -> View:
-    """A moment of the flight."""
+    """Render the frame at time t_s of the motion. Raises InputError if none was simulated."""
     if kept.flown is None:
         raise InputError("nothing was flown yet")
     return kept.seen(kept.flown.at(kept.ready(), t_s, solve))
 
 
 def replay(kept: Kept, study: str, folder: str, trial: int) -> photo.Photo:
-    """A trial of a study again, as the page shows a picture."""
+    """Repeat a study's trial; the page shows its frame."""
     return kept.pictured(photo.of_trial(study, Path(folder), trial))
 
 
@@ -139,14 +139,14 @@ def solve_file(
 
 
 def solve_camera(kept: Kept, source: str, fov_deg: float | None, stages: dict[str, str]) -> photo.Photo:
-    """The next frame of a camera, which stays open."""
+    """Solve the next frame of a live camera, which stays open."""
     if kept.camera is None:
         kept.camera = LiveCamera(source)
     return kept.pictured(photo.of_camera(kept.camera, fov_deg, stages))
 
 
 def release(kept: Kept) -> None:
-    """The camera is no longer wanted."""
+    """Close the live camera."""
     if kept.camera:
         kept.camera.close()
     kept.camera = None

@@ -1,4 +1,4 @@
-"""What a tab's worker has before it: one scene's lab and tracker, and the attitude that it is looked at from."""
+"""State of a GUI worker: a scene's testbed and tracker, and the current attitude."""
 
 from __future__ import annotations
 
@@ -31,15 +31,17 @@ from skysim.tracking import factory
 from skysim.tracking import settings as tracker_settings
 from skysim.tracking.external.adapter import ExternalTracker
 
-ZOOMED = (11, 7)  # pixels across and down: as many as can be read
+ZOOMED = (11, 7)  # enlarged pixels across and down; their values remain readable
 STAGES = ("detector", "centroider", "identifier", "solver")
 
 
 @dataclass
 class Desk:
-    """A scene set up.
+    """A scene that is set up, with the current attitude and the newest frame.
 
-    stretch, bright, widest_px : how frames are shown;  shots : how many were taken, each with noise of its own
+    stretch, bright, widest_px : how frames are displayed
+    shots : number of frames rendered; it changes the seed, so that each frame has independent noise
+    magnitude : V magnitude by a light's number
     """
 
     scene: Scene
@@ -57,7 +59,10 @@ class Desk:
 
     @classmethod
     def of(cls, name: str, overrides: Mapping[str, str], before: Desk | None = None) -> Desk:
-        """Raises InputError. Where the desk before differs in the tracker alone, its hardware and attitude stay."""
+        """Set up a scene. If only the tracker differs from `before`, its testbed and attitude are kept.
+
+        Raises InputError.
+        """
         scene = load(name, overrides)
         if before and before.scene.model_copy(update={"tracker": scene.tracker}) == scene:
             lab = replace(before.lab, scene=scene)
@@ -70,14 +75,14 @@ class Desk:
         return desk
 
     def packed(self, image: NDArray) -> bytes:
-        """A picture as the page shows it."""
+        """JPEG of an image: stretched, and reduced to the width on the screen."""
         return contrast.jpeg(
             contrast.fitted(contrast.stretched(image, self.stretch, self.bright), self.widest_px)
         )
 
     @property
     def setting(self) -> Setting:
-        """What the page has to know of the scene."""
+        """Facts about the scene for the page."""
         scene, settings = self.scene, tracker_settings.believed_settings(self.scene)
         camera = scene.camera
         return Setting(
@@ -95,17 +100,17 @@ class Desk:
         )
 
     def point(self, angles_deg: Triple) -> None:
-        """Look there."""
+        """Set the attitude. Raises InputError."""
         self.lab_from_body = pointing.from_angles(self.scene, self.lab.mount, angles_deg)
 
     def move(self, right: float, up: float, roll_deg: float) -> None:
-        """Look a little aside."""
+        """Change the attitude by a step. Raises InputError."""
         self.lab_from_body = pointing.moved(
             self.scene, self.lab.mount, self.lab_from_body, right, up, roll_deg
         )
 
     def look(self, solve: bool = False) -> View:
-        """A frame from here, every one with noise of its own."""
+        """Render a frame at the current attitude at rest, with independent noise; solve it if asked."""
         self.shots += 1
         scene = self.scene.model_copy(update={"seed": self.scene.seed + self.shots})
         when = testbed.window(scene, 0)
@@ -115,13 +120,13 @@ class Desk:
 
     @property
     def answer(self) -> Answer | None:
-        """What the tracker made of the newest frame."""
+        """The tracker's solution of the newest frame; None if it was not solved."""
         if self.report is None or self.truth is None:
             return None
         return answered(self.lab, self.estimator, self.report, self.truth)
 
     def shown(self, lab: Testbed, solve: bool) -> View:
-        """Frame 0 of a lab, solved if that is asked for, as the page shows it."""
+        """Render frame 0 of a testbed, solve it if asked, and return the view for the page."""
         clock = Clock()
         self.frame, self.truth = exposure.render_frame(lab, 0)
         self.report = factory.answer(self.estimator, self.frame) if solve else None
@@ -141,7 +146,7 @@ class Desk:
 
 
 def prefix_of(lab: Testbed) -> str:
-    """What its lights' numbers are numbers of."""
+    """Catalog of the lights' numbers: LED if no light has a magnitude, else HIP."""
     return "LED" if np.isnan(lab.sources.magnitude).all() else "HIP"
 
 
@@ -156,12 +161,12 @@ def lights_of(truth: Truth, magnitude: Mapping[int, float]) -> tuple[Light, ...]
 
 
 def magnitudes(lab: Testbed) -> dict[int, float]:
-    """By a light's number its V magnitude, NaN of an LED."""
+    """V magnitude by a light's number; NaN for an LED."""
     return dict(zip(lab.sources.id.tolist(), lab.sources.magnitude.tolist(), strict=True))
 
 
 def answered(lab: Testbed, estimator: factory.Estimator, report: Report, truth: Truth) -> Answer:
-    """The tracker's report beside the truth."""
+    """The tracker's report with its errors relative to the truth."""
     told, ms = report.attitude, 1e3 * sum(report.seconds.values())
     spots = spots_of(report, named(estimator, told, report.centroids.xy_px))
     if told.cam_from_ref is None:
@@ -181,7 +186,7 @@ def answered(lab: Testbed, estimator: factory.Estimator, report: Report, truth: 
 
 
 def spots_of(report: Report, names: Mapping[int, tuple[int, float]]) -> tuple[Spot, ...]:
-    """What was seen, with the names that were given."""
+    """Detections with id and residual of their matched lights. names : (id, residual in pixels) by centroid row"""
     seen = report.centroids
     rows = zip(seen.xy_px.tolist(), seen.sigma_px.tolist(), seen.flux.tolist(), strict=True)
     return tuple(
@@ -190,7 +195,7 @@ def spots_of(report: Report, names: Mapping[int, tuple[int, float]]) -> tuple[Sp
 
 
 def zoomed(image: NDArray, x: float, y: float) -> Zoom:
-    """The pixels around one."""
+    """The window of ZOOMED pixels around (x, y), moved inside the image at its border."""
     (height, width), (across, down) = image.shape, ZOOMED
     x0 = min(max(round(x) - across // 2, 0), max(width - across, 0))
     y0 = min(max(round(y) - down // 2, 0), max(height - down, 0))
@@ -199,7 +204,7 @@ def zoomed(image: NDArray, x: float, y: float) -> Zoom:
 
 
 def claimed_arcsec(told: Attitude) -> tuple[float, float]:
-    """What the tracker claims of its error, across the boresight and about it."""
+    """Estimated standard errors across the boresight (both axes) and about it, arcsec; NaN without a covariance."""
     if told.covariance_rad2 is None:
         return math.nan, math.nan
     variance = np.diag(told.covariance_rad2)
@@ -207,9 +212,9 @@ def claimed_arcsec(told: Attitude) -> tuple[float, float]:
 
 
 def predicted(estimator: DomeTracker | StarTracker, told: Attitude) -> tuple[NDArray[np.int64], Floats]:
-    """(N,) ids and (N, 2) pixels of all lights on the tracker's map, as its camera would see them from where it says.
+    """(N,) ids and (N, 2) predicted pixels of all lights on the tracker's map, for its attitude and camera model.
 
-    Of a picture whose field was not known the camera is the answer's: it was found with it.
+    If the solution has its own camera (the field of view was fitted), that camera is used.
     """
     assert told.cam_from_ref is not None
     if isinstance(estimator, DomeTracker):
@@ -221,7 +226,7 @@ def predicted(estimator: DomeTracker | StarTracker, told: Attitude) -> tuple[NDA
 
 
 def named(estimator: factory.Estimator, told: Attitude, xy_px: Floats) -> dict[int, tuple[int, float]]:
-    """By a centroid's row the light that it is, and how far from where the answer would have it, in pixels."""
+    """By centroid row: (id of the matched light, distance from its predicted position in pixels)."""
     if told.match is None or told.cam_from_ref is None or isinstance(estimator, ExternalTracker):
         return {}
     ids, where = predicted(estimator, told)
@@ -231,7 +236,7 @@ def named(estimator: factory.Estimator, told: Attitude, xy_px: Floats) -> dict[i
 
 
 def windows(estimator: factory.Estimator, told: Attitude) -> tuple[tuple[float, float], ...]:
-    """Where a tracker that follows would look for its lights in the next frame."""
+    """Predicted pixels of up to 200 lights in the field: where tracking mode would search in the next frame."""
     if isinstance(estimator, ExternalTracker):
         return ()
     _, xy_px = predicted(estimator, told)

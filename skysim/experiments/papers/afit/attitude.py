@@ -1,4 +1,10 @@
-"""AFIT's Test 3, attitudes (Padro 2012, 4.4.2, Tables 10-15): his algorithm against the IMU, and what parts them."""
+"""AFIT's Test 3, attitudes (Padro 2012, 4.4.2, Tables 10-15): the thesis's algorithm against the IMU.
+
+The thesis gives the attitude by its algorithm and by the IMU at five positions. Our baseline repeats the algorithm on
+clean images with a perfect IMU. Then the likely causes of the differences are simulated together: camera noise with
+two LEDs under a rolling shutter, drift of an LN-200 during a stay at each position, and the bump at position 5
+(module `bump`).
+"""
 
 from __future__ import annotations
 
@@ -42,7 +48,7 @@ from skysim.scene import loader
 from skysim.simulation import testbed
 from skysim.simulation.testbed import Testbed
 
-STAY_MIN = 0.75  # at a position: fitted, see `drawings`
+STAY_MIN = 0.75  # time at a position: fitted, see `drawings`
 STAYS_MIN = (0.25, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0)
 AZIMUTH_DEG = "0"  # of the lab's x axis: fitted
 KNOT_S = 0.05  # the vehicle turns at 2 deg/s at most
@@ -58,10 +64,10 @@ BUMPED = f"{IMU}, position 5 bumped"
 
 
 class Solved(NamedTuple):
-    """D times five images, one a position, the catalogue from the first.
+    """D sets of five images, one per position; the catalog is from the home position's image.
 
-    off_deg  : (D, 5, 3) roll, pitch, yaw by the algorithm less the true ones
-    named    : images whose LEDs all got their own names, of how many
+    off_deg  : (D, 5, 3) roll, pitch, yaw by the algorithm minus the true ones
+    named    : number of images with all LEDs identified correctly, and number of images
     """
 
     off_deg: Floats
@@ -69,10 +75,12 @@ class Solved(NamedTuple):
 
 
 class World(NamedTuple):
-    """One lab with all its causes at once: (K, 5, 3) the algorithm less the IMU, of how many images, IMUs and bumps.
+    """Results with all causes simulated together.
 
-    images : the fewest images or IMUs, on which positions 1 to 4 rest;  bumps : the fewest of all, for position 5
-    earth_deg : (5, 3) what an IMU that feels the Earth turn would add
+    off_deg : (K, 5, 3) attitude by the algorithm minus that of the IMU
+    images : number of independent draws for positions 1 to 4 (the fewer of images and IMUs)
+    bumps : number of independent draws for position 5 (the fewest of images, IMUs and bumps)
+    earth_deg : (5, 3) what an uncorrected Earth rate in the IMU would add
     """
 
     off_deg: Floats
@@ -82,7 +90,7 @@ class World(NamedTuple):
 
 
 def attitudes(ask: Ask) -> Found:
-    """Tables 10-15: clean images and a perfect IMU; and a lab with camera noise, an IMU's own drift and the bump."""
+    """Tables 10-15: with clean images and a perfect IMU; with camera noise, IMU drift and the bump as the cause."""
     images, units = ask.trials(50, 3), ask.trials(60, 8)
     clean = solved(bench(), images, LEDS, np.random.default_rng([ask.seed, 0]))
     ask.watch(1, 4)
@@ -112,16 +120,17 @@ def attitudes(ask: Ask) -> Found:
 
 
 def all_at_once(pair_deg: Floats, drift_deg: Floats, bump_deg: Floats, earth_deg: Floats) -> World:
-    """Images, IMUs and bumps in turn; a bump is of the IMU at position 5."""
+    """Combine images, IMUs and bumps by cycling through each; a bump adds to the IMU's error at position 5."""
     counts = len(pair_deg), len(drift_deg), len(bump_deg)
     turn = np.arange(max(counts))
+    # The algorithm's errors minus the IMU's, each sequence repeated to the length of the longest.
     off = pair_deg[turn % counts[0]] - drift_deg[turn % counts[1]]
     off[:, -1] -= bump_deg[turn % counts[2]]
     return World(off, min(counts[:2]), min(counts), earth_deg)
 
 
 def with_earth(world: World, value: float) -> str:
-    """What it would be were the Earth's turning in the IMU besides."""
+    """Note with the value if the IMU also contained the Earth rate."""
     return f"were the Earth's turning in the IMU besides: {value:.3f}"
 
 
@@ -130,7 +139,7 @@ def in_percent(part: Summary) -> Summary:
 
 
 def each(clean: Floats, world: World) -> dict[str, Answer]:
-    """Tables 10-14: the algorithm's angles less the IMU's."""
+    """Tables 10-14: the algorithm's angles minus the IMU's."""
     answers = {}
     for position in range(len(IMU_DEG)):
         last = position == len(IMU_DEG) - 1
@@ -147,7 +156,7 @@ def each(clean: Floats, world: World) -> dict[str, Answer]:
 
 
 def table_15(clean: Floats, world: World) -> dict[str, Answer]:
-    """Least, greatest, mean and deviation (n - 1) of the five differences of an angle, and the angles' average."""
+    """Minimum, maximum, mean and standard deviation (n - 1) of an angle's five differences, and the angles' average."""
     answers = {}
     for name, statistic in STATISTICS.items():
         ours, theirs, besides = (
@@ -168,11 +177,15 @@ def table_15(clean: Floats, world: World) -> dict[str, Answer]:
 
 
 def solved(lab: Testbed, images: int, lights: int, rng: np.random.Generator) -> Solved:
-    """The thesis's chain: eqs 43-44, SAA with Table 9's epsilons, QUEST by so many of the brightest LEDs."""
+    """The thesis's processing: eqs 43-44, SAA with Table 9's epsilons, QUEST with the `lights` brightest LEDs.
+
+    images : number of images per position
+    """
     seen = [photographed(lab, n, lab_from_body(one), images, rng) for n, one in enumerate(IMU_DEG)]
     sets = list(zip(*seen, strict=False))
     off, right = np.empty((len(sets), len(IMU_DEG), 3)), 0
     for d, shots in enumerate(sets):
+        # The home image is the map: all attitudes of a set are relative to it, as in the thesis.
         catalogue = home_catalogue(lab, shots[HOME])
         for n, shot in enumerate(shots):
             order = np.argsort(-shot.magnitude, kind="stable")
@@ -186,15 +199,15 @@ def solved(lab: Testbed, images: int, lights: int, rng: np.random.Generator) -> 
 
 
 def home_catalogue(lab: Testbed, home: Sighting) -> PairCatalogue:
-    """Section 3.6.4: what is seen from the home position, in buckets of 100 arcsec."""
+    """Catalog of section 3.6.4: the LEDs as seen from the home position, pairs in buckets of 100 arcsec."""
     return bucketed(unit(vectors_m(lab, home.xy_px)), home.magnitude)
 
 
 def identified(vectors: Floats, magnitude: Floats, catalogue: PairCatalogue) -> Ints:
-    """(N,) the catalogue's row of each observed LED, brightest first, -1 for none: SAA of the two brightest.
+    """(N,) catalog row of each observed LED, brightest first, -1 for none, by SAA from the two brightest.
 
-    The best of the assumptions that the pair makes, as the thesis takes it: without our own SAA's demand that it is
-    beyond chance, which five LEDs that are 2 mm wrong in a cross of 8 mm seldom meet.
+    As in the thesis, the hypothesis of lowest cost is accepted. Our own SAA also requires that a match is significant
+    against chance, which five LEDs with errors of 2 mm in a cross of 8 mm rarely are.
     """
     gates = Gates(EPSILON_SEP_ARCSEC * ARCSEC_RAD, EPSILON_POS_M / (48 * INCH_M), EPSILON_MAG, 0.0)
     sky = Sky(vectors, magnitude, catalogue.vectors, catalogue.magnitude, catalogue.cells, gates)
@@ -209,14 +222,15 @@ def identified(vectors: Floats, magnitude: Floats, catalogue: PairCatalogue) -> 
 
 
 def drifted(stay_min: float, units: int, rng: np.random.Generator, earth: bool = True) -> Floats:
-    """(U, 5, 3) what IMUs off the line show at the end of each stay, less the truth: roll, pitch, yaw in degrees.
+    """(U, 5, 3) error of U random IMUs at the end of each stay: roll, pitch, yaw in degrees.
 
-    Test 3 moved just as it was asked for. earth : its rate is felt and not taken away
+    The vehicle follows Test 3's commanded attitudes exactly; each IMU has its own hardware seed.
+    earth : measure the Earth rate and do not correct for it
     """
     lab = testbed.build_testbed(loader.load("afit_test3", {"lab.x_azimuth_deg": AZIMUTH_DEG}))
     part = lab.scene.vehicle.imu
     assert part is not None
-    asked = lab.scene.motion.manoeuvre[1:]  # zeroed as it leaves home
+    asked = lab.scene.motion.manoeuvre[1:]  # the IMU is zeroed as the vehicle leaves home
     tour = [
         one.model_copy(update={"duration_s": 60 * stay_min}) if one.kind == "hold" else one for one in asked
     ]
@@ -240,7 +254,7 @@ def drifted(stay_min: float, units: int, rng: np.random.Generator, earth: bool =
 
 
 def readings(measured: imu.Increments, stops: Ints) -> Floats:
-    """(5, 3) roll, pitch, yaw of the navigator when so many samples are in."""
+    """(5, 3) roll, pitch, yaw in degrees from integrated IMU increments, after each number of samples in `stops`."""
     here, shown = np.array([1.0, 0.0, 0.0, 0.0]), []
     for piece in np.split(measured.angle_rad, stops)[: len(stops)]:
         here = imu.turned(here, piece, np.zeros(3), measured.step_s)
@@ -268,7 +282,7 @@ def drawings(world: World, drift: dict[float, Floats]) -> tuple[Drawing, ...]:
 
 
 def draw_differences(fig: Any, world: World) -> None:
-    """A panel an angle, signed."""
+    """Signed differences, one panel per angle."""
     at = np.arange(1, len(IMU_DEG) + 1)
     panels = fig.subplots(1, 3, sharey=True)
     for axis, axes in enumerate(panels):
@@ -287,7 +301,7 @@ def draw_differences(fig: Any, world: World) -> None:
 
 
 def draw_stays(fig: Any, drift: dict[float, Floats]) -> None:
-    """The mean of the five differences of roll and of pitch by the minutes of a stay."""
+    """Mean absolute difference of roll and of pitch against the duration of a stay."""
     published = np.abs(np.subtract(ALGORITHM_DEG, IMU_DEG)).mean(axis=0)
     for axis, axes in enumerate(fig.subplots(1, 2, sharey=True)):
         mean = np.array([np.abs(one[:, :, axis]).mean(axis=1) for one in drift.values()])

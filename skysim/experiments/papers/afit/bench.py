@@ -1,4 +1,4 @@
-"""AFIT's lab for its LED tests: frames at attitudes that stand still, and their lights measured as the thesis does."""
+"""AFIT's test stand for LEDs: frames at fixed attitudes, with lights measured as in the thesis (Padro 2012)."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ from skysim.simulation.testbed import Testbed
 from skysim.sources.dome.led import Emitter
 from skysim.tracking import onboard_model
 
-FULL = 255  # the thesis's grey scale
-GREY_E = 40000 / FULL  # electrons of a level: a full well of the camera's file is white
-MOST_PHASE_S = 1.0  # the exposure begins anywhere within
+FULL = 255  # white in the thesis's gray levels
+GREY_E = 40000 / FULL  # electrons per gray level: the camera's full well is white
+MOST_PHASE_S = 1.0  # the exposure starts at a random time within this
 
 
 class Lights(NamedTuple):
-    """What the thesis takes from a frame, (N, ...) its lights, the brightest by magnitude first."""
+    """Measured lights of a frame, (N, ...), in descending order of instrument magnitude (larger is brighter)."""
 
     xy_px: Floats
     area_px: Floats
@@ -42,7 +42,7 @@ class Lights(NamedTuple):
 
 
 def changed(scene: Scene, part: str, **told: Any) -> Scene:
-    """The scene with some values of a section changed; `light.led` is a section too. None of them is checked."""
+    """Copy a scene with values of a section changed, without validation; `part` may have two parts, as `light.led`."""
     head, _, rest = part.partition(".")
     if rest:
         inner = getattr(scene, head)
@@ -54,12 +54,12 @@ def changed(scene: Scene, part: str, **told: Any) -> Scene:
 
 @cache
 def bare() -> Testbed:
-    """A lab of AFIT's, for its vehicle and its chip: every scene of theirs has the same."""
+    """A testbed of AFIT's, kept for its vehicle and detector, which all AFIT scenes share."""
     return testbed.build_testbed(load("afit_test1"))
 
 
 def furnished(scene: Scene) -> Testbed:
-    """The lab of a scene whose lights, lens and electronics may be others; the chip's fixed pattern is made once."""
+    """Testbed of a scene with other lights, lens or electronics; the detector's fixed pattern is computed only once."""
     lab = bare()
     assert isinstance(scene.light, DomeConfig)
     return replace(
@@ -74,7 +74,7 @@ def furnished(scene: Scene) -> Testbed:
 
 
 def shot(lab: Testbed, lab_from_body: Rotation, rng: np.random.Generator) -> tuple[Frame, Truth]:
-    """A frame at an attitude that stands still, begun at a random moment of the LEDs' cycle."""
+    """Render a frame at a fixed attitude, started at a random time of the LEDs' cycle."""
     scene = changed(lab.scene, "exposure", first_s=rng.uniform(0, MOST_PHASE_S))
     scene = scene.model_copy(update={"seed": int(rng.integers(2**62))})
     path = Trajectory.at_rest(lab_from_body, MOST_PHASE_S + scene.exposure.time_s + 1)
@@ -82,14 +82,14 @@ def shot(lab: Testbed, lab_from_body: Rotation, rng: np.random.Generator) -> tup
 
 
 def grey(frame: Frame, lab: Testbed) -> NDArray[np.uint8]:
-    """The frame as MATLAB had it: 0 is black, 255 a full well."""
+    """The frame in 8-bit gray levels, as in the thesis's MATLAB code: 0 is black, 255 a full well."""
     part = lab.scene.camera.detector
     level = (frame.image_dn - part.offset_dn) * (part.gain_e_dn / GREY_E)
     return np.clip(np.rint(level), 0, FULL).astype(np.uint8)
 
 
 def measured(image: NDArray[np.uint8]) -> Lights:
-    """Lights of at least 50 px above 4 % with their instrument magnitudes (sections 3.4.1.3 and 3.6.2.1)."""
+    """Lights of at least 50 px above a threshold of 4 %, with instrument magnitudes (sections 3.4.1.3 and 3.6.2.1)."""
     try:
         blobs = detect.thesis(image.astype(np.uint16), hints=FramePriors(saturation=FULL))
     except ImageError:
@@ -102,9 +102,9 @@ def measured(image: NDArray[np.uint8]) -> Lights:
 
 
 def vectors_m(lab: Testbed, xy_px: Floats, camera: Camera | None = None) -> Floats:
-    """(N, 3) lights in body axes: eqs 43-44 and the camera's place.
+    """(N, 3) positions of lights in body axes, by eqs 43-44 and the camera's lever arm.
 
-    camera : the believed one; the true one if left out
+    camera : camera model to use; the tracker's own if left out
     """
     assert isinstance(lab.scene.light, DomeConfig)
     leds = onboard_model.believed_dome(lab.scene, lab.scene.light, lab.sources)
@@ -118,7 +118,7 @@ def vectors_m(lab: Testbed, xy_px: Floats, camera: Camera | None = None) -> Floa
 def pair_angles_arcsec(vectors: Floats) -> Floats:
     """(..., N (N - 1) / 2) angle of every pair of (..., N, 3) vectors, in the order of np.triu_indices.
 
-    By the half-chord, which keeps the digits of small angles.
+    2 arcsin(chord / 2), which is accurate for small angles, unlike arccos of the dot product.
     """
     unit = vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
     a, b = np.triu_indices(unit.shape[-2], 1)

@@ -1,4 +1,8 @@
-"""The fifth position's accident (Padro 2012, 4.4, Table 14): SimSat is bumped, its IMU loses a turn, the stars know."""
+"""AFIT's bump at position 5 (Padro 2012, 4.4, Table 14): the gyros saturate and the IMU loses part of the rotation.
+
+A short motion is simulated without a bump, with a bump fitted to Table 14, and with the scene's assumed bump. The
+error of the IMU alone is compared with Table 14; the errors of star tracker and filter after the bump are given too.
+"""
 
 from __future__ import annotations
 
@@ -22,17 +26,17 @@ FITTED: Knock = (
     0.0,
     -12.1,
     -15.0,
-)  # deg/s of the knock about the body's axes, to Table 14's theta_2 and theta_3
+)  # deg/s about the body axes, fitted to Table 14's theta_2 and theta_3
 ASSUMED: Knock = (3.0, -2.0, 14.0)  # the scene's own
 BEGIN_S, OVER_S, SEEN_S = 1.5, 2.0, 2.5
 CAUSE = f"a knock of {FITTED} deg/s, gyros that stop at 10"
 
 
 class Flight(NamedTuple):
-    """A short flight of `simsat_bump`.
+    """A simulated motion of `simsat_bump`.
 
-    t_s, imu_deg, filter_deg : (K,), (K, 3) roll, pitch and yaw of the IMU less the true ones, (K,) the filter's error
-    limited_s : for how long a gyro was at its limit;  tracker_deg : worst of the star tracker after the bump
+    t_s, imu_deg, filter_deg : (K,), (K, 3) roll, pitch and yaw of the IMU minus the true ones, (K,) the filter's error
+    limited_s : how long a gyro was saturated;  tracker_deg : the star tracker's worst error after the bump
     """
 
     t_s: Floats
@@ -43,7 +47,7 @@ class Flight(NamedTuple):
 
 
 def bump(ask: Ask) -> Found:
-    """Undisturbed; knocked as Table 14 asks for; knocked as the scene assumes. Each with several IMUs."""
+    """Errors without a bump, with the fitted bump and with the scene's bump, each with several IMUs."""
     found = []
     for n, knock in enumerate((None, FITTED, ASSUMED)):
         ask.watch(n, 3)
@@ -76,23 +80,23 @@ def bump(ask: Ask) -> Found:
 
 
 def flights(knock_deg_s: Knock | None, units: int, seed: int) -> list[Flight]:
-    """The same flight with so many IMUs off the line."""
+    """Simulate the same motion with `units` IMUs of random hardware seeds."""
     seeds = np.random.default_rng([seed, 14]).integers(2**31, size=units)
     return [flown(knock_deg_s, int(one)) for one in seeds]
 
 
 def lost_deg(one: Flight, axis: int) -> float:
-    """By how much the IMU is wrong at the end."""
+    """Absolute error of one of the IMU's angles at the end."""
     return float(abs(one.imu_deg[-1, axis]))
 
 
 def after(one: Flight) -> Floats:
-    """(K,) the filter's errors when an image after the bump is in."""
+    """(K,) the filter's errors after the first image that follows the bump."""
     return one.filter_deg[one.t_s > SEEN_S]
 
 
 def flown(knock_deg_s: Knock | None, seed: int) -> Flight:
-    """Six seconds about a knock, an image a second."""
+    """Simulate six seconds around a bump, with one image per second."""
     kind = (
         f'{{kind: bump, rate_deg_s: {list(knock_deg_s or ())}, duration: "40 ms", caught_after: "0.2 s"}}, '
     )
@@ -122,7 +126,7 @@ def flown(knock_deg_s: Knock | None, seed: int) -> Flight:
 
 
 def tracker_deg(lab: Testbed) -> float:
-    """The star tracker's worst error after the bump; infinite where an image was not solved."""
+    """The star tracker's worst error after the bump; infinite if an image was not solved."""
     off = []
     for index, report in lab.reports.items():
         t_s = testbed.window(lab.scene, index).middle_s(lab.scene.camera.height_px)
@@ -134,7 +138,7 @@ def tracker_deg(lab: Testbed) -> float:
 
 
 def draw(fig: Any, one: Flight) -> None:
-    """Errors by time."""
+    """Errors against time."""
     axes, rows = fig.subplots(), experiments()["afit-bump"].rows
     for axis in range(3):
         axes.plot(

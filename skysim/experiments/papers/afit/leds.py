@@ -34,24 +34,24 @@ LEDS, STAND_IN, DOME_IN, CAMERA_IN, PITCH_MM = 9, 36.0, 33.0, 15.0, 8.0
 BOARD = (1.0, 0.2, 0.1, 0.7, 0.14, 0.07, 0.4, 0.08, 0.04)
 DIMMEST, STAND_CD, STAND_S = 8, 0.05, 20e-3
 WINGS = MoffatPsfConfig(kind="moffat", fwhm_px=2.5, beta=2.0)
-NARROW, ASKEW_DEG = CosineLobeConfig(exponent=20.0), 10.0  # half of the light at 15 deg
+NARROW, ASKEW_DEG = CosineLobeConfig(exponent=20.0), 10.0  # half intensity at 15 deg
 SEEN_DEG = (
     (0.0, 0.0),
     (1.5, 2.0),
     (1.5, -2.0),
     (-1.5, -2.0),
 )  # roll and pitch of the positions of Figs 38 and 40
-WHITE_CD, WHITE_S, SLOT_S = LEDS / 2 * INTENSITY_CD, 0.1, 1e-3  # light as Test 2's, in a ninth of the cycle
+WHITE_CD, WHITE_S, SLOT_S = LEDS / 2 * INTENSITY_CD, 0.1, 1e-3  # light as in Test 2, in a ninth of the cycle
 PULSES_US = (1000.0, 500.0, 400.0, 200.0, 1.0)
 LEAST_PX, BESIDE_PX, DARK_PX = 50, 18, 60  # from an LED's middle; its own radius is 10 px
 WELL, WELL_TOLD = 0.72, "pixels full at 0.72 of the converter's range"
-BETWEEN = 2.5  # grey levels of noise, of which neither Test 2 nor the camera's file tells
+BETWEEN = 2.5  # gray levels of noise, between the camera's own and Test 2's; no source states it
 NOISY = f"noise of {NOISE_E / GREY_E:.1f} grey levels, as in Test 2"
 LASTING = f"1 us lasting {1e6 * ON_SHARE * SLOT_S:.0f} us, as in Test 2"
 
 
 class Settings(NamedTuple):
-    """Lens of one of Fig. 36's pictures, and noise if it is another than the camera's own."""
+    """Lens settings of one of Fig. 36's images, and read noise if it differs from the camera's own."""
 
     f_number: float = 8.0
     focus_in: float = STAND_IN
@@ -64,7 +64,7 @@ AS_IT_IS = Settings()
 def bench(
     levels: Sequence[float], distance_in: float = STAND_IN, settings: Settings = AS_IT_IS, **led: Any
 ) -> Scene:
-    """A board of nine holes, as many as there are levels lit, so far above the camera of a level vehicle."""
+    """Scene with a board of nine holes, the first len(levels) with LEDs, above the camera of a level vehicle."""
     height_in, across_mm = CAMERA_IN + distance_in, PITCH_MM * np.array([1.0, 0.0, -1.0])
     holes = [[f"{x} mm", f"{y} mm", f"{height_in} in"] for x in across_mm for y in across_mm]
     listed = ListedConfig.model_validate(
@@ -82,15 +82,15 @@ def bench(
 
 
 def stand(settings: Settings = AS_IT_IS, **led: Any) -> Testbed:
-    """The first board: three colours by three resistors, always lit."""
+    """Test stand with the first board: three colors by three resistors, always on."""
     scene = bench(BOARD, STAND_IN, settings, drive=DirectConfig(kind="direct"), intensity_cd=STAND_CD, **led)
     return furnished(changed(changed(scene, "camera", psf=WINGS), "exposure", time_s=STAND_S))
 
 
 def white(pulses_us: Sequence[float], well: float = 1.0) -> Testbed:
-    """The last board under the dome: white LEDs one after another, each lit for so long of its slot.
+    """The last board under the dome: white LEDs lit one after another, each for its pulse within its slot.
 
-    well : a pixel is full at this share of the converter's range
+    well : a pixel saturates at this fraction of the converter's range
     """
     levels = [pulse * 1e-6 / SLOT_S for pulse in pulses_us]
     scene = bench(levels, DOME_IN, Settings(8.0, DOME_IN), intensity_cd=WHITE_CD)
@@ -105,13 +105,13 @@ def exposed(lab: Testbed, time_s: float) -> Testbed:
 def picture(
     lab: Testbed, rng: np.random.Generator, seen_deg: tuple[float, float] = (0.0, 0.0)
 ) -> tuple[Grey, Floats]:
-    """A grey picture, and the (N, 2) pixels of its LEDs by number."""
+    """An image in gray levels, and the (N, 2) true pixels of its LEDs in the order of their numbers."""
     frame, truth = shot(lab, Rotation.from_euler("xy", seen_deg, degrees=True), rng)
     return grey(frame, lab), truth.seen.xy_px[np.argsort(truth.seen.id)]
 
 
 class Passed(NamedTuple):
-    """What passes a threshold: (N,) pixels of each LED's blob, pixels beside the LEDs, and pixels far from them all."""
+    """Pixels above a threshold: (N,) area of each LED's blob, pixels beside the LEDs, and pixels far from all LEDs."""
 
     area_px: Floats
     beside_px: int
@@ -119,10 +119,11 @@ class Passed(NamedTuple):
 
 
 def passed(image: Grey, xy_px: Floats, share: float) -> Passed:
-    """Pixels above a share of full scale, joined with their eight neighbours; an LED's blob lies at its middle."""
+    """Count pixels above a fraction of full scale. Blobs are 8-connected; an LED's blob is the one at its center."""
     above = image > share * FULL
     x0, y0 = np.maximum(np.floor(xy_px.min(axis=0)).astype(int) - DARK_PX, 0)
     x1, y1 = np.ceil(xy_px.max(axis=0)).astype(int) + DARK_PX
+    # Label only the neighborhood of the LEDs: noise elsewhere would give many blobs.
     label, _ = scipy.ndimage.label(above[y0:y1, x0:x1], np.ones((3, 3)))
     areas = np.bincount(label.ravel())
     areas[0] = 0
@@ -140,7 +141,7 @@ def passed(image: Grey, xy_px: Floats, share: float) -> Passed:
 
 
 def leds(ask: Ask) -> Found:
-    """All of section 3.4 that can be counted."""
+    """All numbers of section 3.4 that can be simulated."""
     images = ask.trials(12, 2)
     rng = [np.random.default_rng([ask.seed, stage]) for stage in range(5)]
     answers = lobe(rng[0]) | duty(rng[1])
@@ -154,12 +155,12 @@ def leds(ask: Ask) -> Found:
 
 
 def lobe(rng: np.random.Generator) -> dict[str, Answer]:
-    """Light of an LED that is turned away, from the frame's own electrons (Fig. 44)."""
+    """Relative light of an LED that is turned 60 deg from the camera, in electrons of the frame (Fig. 44)."""
     return {"lobe_60": Answer(exact(turned(60.0, rng) / turned(0.0, rng)))}
 
 
 def turned(angle_deg: float, rng: np.random.Generator) -> float:
-    """Electrons of the middle LED of a board whose LEDs are turned by so much from the camera."""
+    """Electrons of the board's central LED, turned away from the camera by angle_deg."""
     lab = white([1000.0] * 9)
     normal = Rotation.from_euler("y", angle_deg, degrees=True).apply([0.0, 0.0, -1.0])
     alone = lab.sources.take(np.array([4]))
@@ -168,7 +169,7 @@ def turned(angle_deg: float, rng: np.random.Generator) -> float:
 
 
 def duty(rng: np.random.Generator) -> dict[str, Answer]:
-    """Eq. 37: what nine LEDs on one controller have of the light of one that is always lit."""
+    """Eq. 37: light of each of nine multiplexed LEDs relative to one that is always on."""
     part = [1000.0, 500.0, 400.0, 200.0, 1.0, 1000.0, 1000.0, 1000.0, 1000.0]
     lab = exposed(white(part), 4 * 9 * SLOT_S)
     steady = exposed(replace(lab, sources=replace(lab.sources, on_s=lab.sources.period_s)), 4 * 9 * SLOT_S)
@@ -181,7 +182,7 @@ def duty(rng: np.random.Generator) -> dict[str, Answer]:
 
 
 def thresholds(images: int, rng: np.random.Generator) -> dict[str, Answer]:
-    """Fig. 37: what passes 2, 10 and 25 % on the first board."""
+    """Fig. 37: pixels of the first board above thresholds of 2, 10 and 25 %."""
     calm, wild = (
         [seen_at(*picture(lab, rng)) for _ in range(images)]
         for lab in (stand(), stand(Settings(noise_e=NOISE_E)))
@@ -205,7 +206,7 @@ def thresholds(images: int, rng: np.random.Generator) -> dict[str, Answer]:
 
 
 class Seen(NamedTuple):
-    """One picture at its thresholds, and how many lights the thesis's detector finds in it."""
+    """One image at three thresholds, and how many lights the thesis's detector finds in it (at 4 %)."""
 
     at_2: Passed
     at_10: Passed
@@ -223,7 +224,7 @@ def outside(one: Passed) -> int:
 
 
 def apertures(images: int, rng: np.random.Generator) -> dict[str, Answer]:
-    """Fig. 36: focused and wide, less focus and narrow, balanced."""
+    """Fig. 36: LEDs found with a wide aperture in focus, a narrow one out of focus, and a balanced one."""
     answers: dict[str, Answer] = {}
     for name, settings in APERTURES.items():
         lab = stand(settings)
@@ -243,7 +244,7 @@ APERTURES = {
 
 
 def viewing(images: int, rng: np.random.Generator) -> dict[str, Answer]:
-    """Figs 38 and 40: by how much an LED's area differs from position to position."""
+    """Figs 38 and 40: how much an LED's area varies between positions, for a directional and a diffuse lobe."""
     narrow = stand(lobe=NARROW)
     turn = Rotation.from_euler("y", ASKEW_DEG, degrees=True)
     askew = replace(narrow, sources=replace(narrow.sources, normal=turn.apply(narrow.sources.normal)))
@@ -264,7 +265,7 @@ def viewing(images: int, rng: np.random.Generator) -> dict[str, Answer]:
 
 
 def steady(lab: Testbed, share: float, images: int, rng: np.random.Generator) -> tuple[Floats, Floats]:
-    """(n, 9) least over greatest area of each LED over the positions; (n,) per cent of the frame outside of them."""
+    """(n, 9) smallest over largest area of each LED over the positions; (n,) percent of pixels outside LEDs."""
     ratio, stray = [], []
     for _ in range(images):
         seen = [
@@ -278,7 +279,7 @@ def steady(lab: Testbed, share: float, images: int, rng: np.random.Generator) ->
 
 
 def brightness(images: int, rng: np.random.Generator) -> tuple[dict[str, Answer], Floats]:
-    """Figs 43 and 46: magnitude by pulse of five LEDs, and whether those of 1 us are seen at all."""
+    """Figs 43 and 46: magnitude of five LEDs against their pulse, and whether LEDs of 1 us are detected."""
     lab, lasting = white(PULSES_US), white((*PULSES_US[:-1], 1e6 * ON_SHARE * SLOT_S))
     found = np.array([by_number(lasting, rng) for _ in range(images)])
     per_us = found[:, :4] / np.array(PULSES_US[:4])
@@ -306,7 +307,7 @@ def brightness(images: int, rng: np.random.Generator) -> tuple[dict[str, Answer]
 
 
 def ordered(images: Sequence[Floats] | Floats) -> Summary:
-    """Share of images in which all LEDs are seen, each with less than the one before it, whose pulse is longer."""
+    """Fraction of images in which all LEDs are detected, with magnitudes in the order of their pulses."""
     magnitude = np.asarray(images)
     return metrics.share(
         np.sum(np.all(magnitude > 0, axis=1) & np.all(np.diff(magnitude) < 0, axis=1)), len(magnitude)
@@ -314,13 +315,13 @@ def ordered(images: Sequence[Floats] | Floats) -> Summary:
 
 
 def table_7() -> list[float]:
-    """The magnitudes published for PULSES_US, of Test 3."""
+    """The magnitudes of Test 3 published for PULSES_US."""
     rows = experiments()["afit-table-6-9"].rows
     return [rows[f"magnitude_{n}"].published or 0.0 for n in range(1, len(PULSES_US) + 1)]
 
 
 def by_number(lab: Testbed, rng: np.random.Generator) -> Floats:
-    """(N,) magnitude of each LED; 0 where it is not found."""
+    """(N,) magnitude of each LED; 0 if it is not found."""
     image, xy_px = picture(lab, rng)
     lights = measured(image)
     apart_px = np.linalg.norm(xy_px[:, None] - lights.xy_px, axis=2)
@@ -349,7 +350,7 @@ def drawings(magnitude: Floats, rng: np.random.Generator) -> tuple[Drawing, ...]
 
 
 def middle(image: Grey) -> Grey:
-    """The part of a frame that holds the board."""
+    """The part of a frame that contains the board."""
     y, x = np.array(image.shape) // 2
     return image[y - 200 : y + 200, x - 200 : x + 200]
 
@@ -374,7 +375,7 @@ def draw_thresholds(fig: Any, shown: Sequence[Grey]) -> None:
 
 
 def draw_pulses(fig: Any, magnitude: Floats) -> None:
-    """At the scale of the 200 us LED."""
+    """Magnitude against pulse, ours scaled so that the 200 us LED has its published magnitude."""
     axes, told = fig.subplots(), np.array(table_7())
     ours = magnitude * told[3] / magnitude[:, 3].mean()
     axes.errorbar(

@@ -1,4 +1,4 @@
-"""AFIT's Test 3 held still (Padro 2012, 3.7.3): five LEDs, photographed from five attitudes and seen as he saw them."""
+"""AFIT's Test 3 at fixed attitudes (Padro 2012, 3.7.3): five LEDs imaged from five attitudes, measured as he did."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ IMU_DEG = experiments()["afit-table-10-15"].data["imu_deg"]
 ALGORITHM_DEG = experiments()["afit-table-10-15"].data["algorithm_deg"]
 LEDS, HOME = 5, 0
 
-TURN_DEG = 55.0  # of the camera about its boresight: assumed, for square on the vehicle it loses position 4
+TURN_DEG = 55.0  # of the camera about its boresight: assumed; at 0 deg it misses position 4
 EPSILON_MAG, EPSILON_POS_M, EPSILON_SEP_ARCSEC = 10.191, 1.9861e-3, 9.675  # Table 9
 
-# What the thesis tells of its images, and what was put in the place of what it does not; see data/published.
+# What the thesis states about its images, and assumptions for the rest; see data/published.
 GIVEN = {
     "camera.detector.bits": "8",
     "camera.detector.gain_e_dn": "164",
@@ -43,25 +43,25 @@ GIVEN = {
     "light.layout.levels": "[1.0, 0.5, 0.4, 0.2, 0.075]",
     "exposure.rate_hz": "0.987",
 }
-LAB = {  # a rolling shutter, an exposure of no whole number of the LEDs' cycles, pixels that fill early
+LAB = {  # rolling shutter, exposure of a non-integer number of LED cycles, early saturation
     "camera.shutter": '{kind: rolling, row_time: "83 us"}',
     "camera.detector.full_well_e": "30500",
     "exposure.time": "16.667 ms",
     "light.led.intensity": "73.5 mcd",
 }
-LATEST = 1_000_000  # frames are taken at any time: their moments against the LEDs' cycle are by chance
+LATEST = 1_000_000  # frame indices are random up to this, so that the phase of the LEDs' cycle is random
 FOREVER_S = 2e6
 
 
 def bench(changes: Mapping[str, str] | None = None) -> Testbed:
-    """Test 3's lab on the ground, its camera turned so that all five positions are on the chip."""
+    """Test 3's testbed, with the camera turned so that all five positions are on the detector."""
     lab = testbed.build_testbed(loader.load("afit_test3", GIVEN | dict(changes or {})))
     turned = Rotation.from_euler("z", TURN_DEG, degrees=True) * lab.mount.cam_from_body
     return replace(lab, mount=Mount(lab.mount.camera_body_m, turned))
 
 
 def lab_from_body(angles_deg: Sequence[float]) -> Rotation:
-    """The attitude of roll, pitch and yaw."""
+    """lab_from_body from roll, pitch and yaw."""
     roll, pitch, yaw = angles_deg
     return guidance.attitude(AttitudeConfig(roll_deg=roll, pitch_deg=pitch, yaw_deg=yaw))
 
@@ -72,16 +72,16 @@ def angles_deg(lab_from_body: Rotation) -> Floats:
 
 
 def held(lab: Testbed, where: Rotation) -> Testbed:
-    """The lab whose vehicle stands still there for ever."""
+    """The testbed with the vehicle at rest at an attitude."""
     return replace(lab, trajectory=Trajectory.at_rest(where, FOREVER_S))
 
 
 def photographed(
     lab: Testbed, position: int, where: Rotation, images: int, rng: np.random.Generator
 ) -> list[Sighting]:
-    """Images from one attitude, each at a moment of its own; their lights named by the truth, in the LEDs' order.
+    """Images from one attitude at random times; lights identified by the truth, in the order of the LEDs.
 
-    The IMU is right; see `told` for another. An image that does not show all five is left out.
+    The IMU's attitude is the true one; `told` replaces it. Images that do not show all five LEDs are left out.
     """
     here, camera, seen = held(lab, where), onboard_model.calibration(lab.scene.camera), []
     settings = tracker_settings.believed_settings(lab.scene)
@@ -100,7 +100,7 @@ def photographed(
 
 
 def told(sightings: Sequence[Sighting], lab_from_body: Rotation) -> list[Sighting]:
-    """The same images with another attitude from the IMU."""
+    """The same images with another IMU attitude."""
     return [replace(one, body_from_lab=lab_from_body.inv()) for one in sightings]
 
 
@@ -108,8 +108,8 @@ def told(sightings: Sequence[Sighting], lab_from_body: Rotation) -> list[Sightin
 class Sights:
     """F images of all five LEDs as the thesis measures them (eqs 43-45).
 
-    position : (F,) of the vehicle, from 0;  magnitude : (F, 5);  body_m, lab_m : (F, 5, 3) places in body axes, and
-    carried into the lab by the IMU
+    position : (F,) of the vehicle, from 0;  magnitude : (F, 5)
+    body_m, lab_m : (F, 5, 3) LED positions in body axes, and rotated to the lab frame by the IMU's attitude
     """
 
     position: Ints
@@ -124,7 +124,7 @@ class Sights:
 
 
 def measured(lab: Testbed, sightings: Sequence[Sighting]) -> Sights:
-    """What the thesis makes of the images."""
+    """Measure the images as in the thesis."""
     body_m = np.array([vectors_m(lab, one.xy_px) for one in sightings])
     lab_m = [one.body_from_lab.inv().apply(place) for one, place in zip(sightings, body_m, strict=True)]
     position = np.array([one.position for one in sightings])

@@ -32,16 +32,16 @@ EDGE_RAD, WIDE_IN, OUTSIDE_IN = (
     np.radians(40.0),
     62.0,
     48.135,
-)  # it covers 80 deg, is 62 in wide; the design's sphere
+)  # the dome covers 80 deg and is 62 in wide; radius of the design's sphere
 RINGS, SECTORS = 400, 12
 
 
 def width_in(shape: Surface, mount_in: float, angle_deg: float) -> float:
     """Width of the image plane where the field's inner edge meets a surface: c' of the thesis's eq. 38, in inches.
 
-    The camera stands mount_in above the bearing on a vehicle that leans by angle_deg; the ray along the edge of its
-    field nearer to the apex goes s far to the surface, and a plane there across the boresight is 2 s sin(field / 2)
-    wide. s is of our own surface's intersection, so that eq. 38 is its oracle and not its source.
+    The camera is mount_in above the bearing on a vehicle tilted by angle_deg. The ray along the edge of the field
+    nearer to the apex has length s to the surface, and the plane through its end across the boresight has the width
+    2 s sin(field / 2). s comes from our own intersection code, so eq. 38 is an independent check of it.
     """
     lean, half = np.radians(angle_deg), FIELD_RAD / 2
     camera_m = mount_in * INCH_M * along(lean)
@@ -51,12 +51,12 @@ def width_in(shape: Surface, mount_in: float, angle_deg: float) -> float:
 
 
 def along(lean_rad: float) -> Floats:
-    """(3,) the direction that leans so far from the upright, towards x."""
+    """(3,) unit vector tilted from the vertical by lean_rad towards x."""
     return np.array([np.sin(lean_rad), 0.0, np.cos(lean_rad)])
 
 
 def flat(ask: Ask) -> Found:
-    """Table 1: the mount that the thesis states, and the one that gives its numbers."""
+    """Table 1: with the mount height that the thesis states, and with the one that reproduces its numbers."""
     panel = build_surface(FLAT)
     stated, fitted = (
         np.array([width_in(panel, mount_in, angle) for angle in ANGLES_DEG])
@@ -80,12 +80,12 @@ def flat(ask: Ask) -> Found:
 
 
 def more(width: Floats, n: int) -> Summary:
-    """By how many per cent of their mean a width is more than the first, as the thesis takes its differences."""
+    """Difference of a width from the first, in percent of their mean (the thesis's definition)."""
     return exact(200 * (width[n] - width[0]) / (width[n] + width[0]))
 
 
 def chord_in(shape: Surface, mount_in: float, angle_deg: float) -> float:
-    """Chord between the places where the two edges of the field meet a surface (eq. 42), in inches."""
+    """Chord between the points where the two edges of the field meet a surface (eq. 42), in inches."""
     lean, half = np.radians(angle_deg), FIELD_RAD / 2
     edges = np.array([along(lean - half), along(lean + half)])
     ends = shape.meet(mount_in * INCH_M * along(lean), edges)
@@ -93,7 +93,7 @@ def chord_in(shape: Surface, mount_in: float, angle_deg: float) -> float:
 
 
 def draw(fig: Any, panel: Surface) -> None:
-    """Widths by the angle, of both mounts, with the published ones."""
+    """Widths against the angle for both mount heights, with the published ones."""
     axes, rows = fig.subplots(), experiments()["afit-table-1"].rows
     angle = np.linspace(0, 30, 61)
     for mount_in, ink in ((STATED_MOUNT_IN, INK[0]), (FITTED_MOUNT_IN, INK[2])):
@@ -110,11 +110,11 @@ def draw(fig: Any, panel: Surface) -> None:
 
 
 def contour(inside: Surface) -> dict[str, Answer]:
-    """The design's inside and the measured one (section 3.5.3), from our surfaces; inches."""
+    """Dimensions of the designed and of the measured inner surface (section 3.5.3), from our surface models; inches."""
     design = build_surface(DESIGN)
     ends = along(0.0), along(EDGE_RAD)
     radii = np.linalg.norm(design.meet(design.centre_m, np.array(ends)) - design.centre_m, axis=1) / INCH_M
-    # A spheroid through both: 1 / r^2 = cos^2 / a^2 + sin^2 / b^2.
+    # A spheroid through apex and edge, solved for b: 1 / r^2 = cos^2 / a^2 + sin^2 / b^2.
     across = np.sin(EDGE_RAD) / np.sqrt(radii[1] ** -2 - np.cos(EDGE_RAD) ** 2 / radii[0] ** 2)
     _, axes_m = inside.as_ellipsoid()
     wide, tall = axes_m[0] / INCH_M, axes_m[2] / INCH_M
@@ -131,18 +131,18 @@ def contour(inside: Surface) -> dict[str, Answer]:
 
 
 def per_cent(one: float, other: float) -> float:
-    """By how many per cent of their mean two lengths differ, as the thesis takes its differences."""
+    """Difference of two lengths in percent of their mean (the thesis's definition)."""
     return float(200 * abs(one - other) / (one + other))
 
 
 def met_in(inside: Surface, lean_rad: Any) -> Floats:
-    """(N, 3) where rays from the bearing that lean so far meet a surface, its rim left out of account; inches."""
+    """(N, 3) points where rays from the bearing, tilted by lean_rad, meet a surface extended beyond its rim; inches."""
     rays = np.array([along(one) for one in np.atleast_1d(lean_rad)])
     return np.asarray(replace(inside, rim=Rim(inside.rim.eye_m)).meet(np.zeros(3), rays) / INCH_M)
 
 
 def rim_and_radii(inside: Surface) -> dict[str, Answer]:
-    """Where the measured inside is as wide as the dome, and its distances from the bearing."""
+    """Rim of the measured surface (where it is as wide as the dome), and its distances from the bearing."""
     rim_rad = brentq(lambda lean: met_in(inside, lean)[0, 0] - WIDE_IN / 2, 0.5, 0.9)
     rim = met_in(inside, rim_rad)[0]
     height = Answer(exact(met_in(inside, 0.0)[0, 2] - rim[2]))
@@ -159,9 +159,10 @@ def rim_and_radii(inside: Surface) -> dict[str, Answer]:
 
 
 def best_sphere(inside: Surface) -> dict[str, Answer]:
-    """The sphere nearest to the measured inside over equal areas of the design's cap, and the contour's rms off it.
+    """Least-squares sphere of the measured surface, sampled uniformly by area over the design's cap, and the rms of the
+    contour's distance from it.
 
-    The contour's points are even in polar angle, as those of a measuring arm that goes along a meridian.
+    The contour's points are uniform in polar angle, as those of a measuring arm moved along a meridian.
     """
     cap_rad = np.arcsin(WIDE_IN / 2 / OUTSIDE_IN)
     part = (np.arange(RINGS) + 0.5) / RINGS

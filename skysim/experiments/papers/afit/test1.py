@@ -1,4 +1,4 @@
-"""AFIT's Test 1: nine equal LEDs of one board, seen from five attitudes (Padro 2012, sections 3.7.1 and 4.2)."""
+"""AFIT's Test 1: nine equal LEDs of one board, imaged from five attitudes (Padro 2012, sections 3.7.1 and 4.2)."""
 
 from __future__ import annotations
 
@@ -26,42 +26,42 @@ from skysim.simulation.testbed import Testbed
 from skysim.tracking import onboard_model
 
 LEDS, POSITIONS = 9, 5
-WHOLE_S, FRAME_S = 36e-3, 100e-3  # four cycles of nine slots; the camera's ten frames a second, 11 1/9 cycles
+WHOLE_S, FRAME_S = 36e-3, 100e-3  # four cycles of nine 1 ms slots; the frame time at 10 Hz, 11 1/9 cycles
 INTENSITY_CD = 10.4e-3  # at FRAME_S; the mean magnitude of the nine is then the published one
 PITCH_M = 8e-3
-NEIGHBOURS = ((1, 4), (3, 4), (4, 5), (4, 7))  # of the board's middle, in the scene's order
+NEIGHBOURS = ((1, 4), (3, 4), (4, 5), (4, 7))  # pairs of the central LED, in the scene's order
 STEPS = (1.0, 2.0, 4.0, 5.0, 8.0)  # squared distances in a 3x3 lattice, in pitches
-PAIRS = (12, 8, 6, 8, 2)  # at each of them
-GAP_ARCSEC = 100.0  # between two of the distinct angles there is more than this
+PAIRS = (12, 8, 6, 8, 2)  # number of pairs at each of these distances
+GAP_ARCSEC = 100.0  # sorted angles with a larger gap are counted as distinct
 
 
 class Board(NamedTuple):
-    """A board's images: (n, 9) magnitudes ranked in each, (n,) the attitude's number."""
+    """A board's images: (n, 9) magnitudes, sorted within each image, and (n,) attitude number."""
 
     magnitude: Floats
     position: Floats
 
 
 def attitudes(scene: Scene) -> list[Rotation]:
-    """The five that the scene holds."""
+    """The five attitudes of the scene's maneuver."""
     legs = [leg for leg in scene.motion.manoeuvre if isinstance(leg, SlewConfig)]
     return [guidance.start(scene.motion), *(guidance.attitude(leg) for leg in legs)]
 
 
 def exposed(time_s: float) -> Scene:
-    """The scene exposed for so long, its LEDs so strong that a frame has the same light."""
+    """The scene with another exposure time, its LEDs scaled so that a frame has the same light."""
     scene = changed(load("afit_test1"), "exposure", time_s=time_s)
     return changed(scene, "light.led", intensity_cd=INTENSITY_CD * FRAME_S / time_s)
 
 
 def another(lab: Testbed, hardware_seed: int) -> Testbed:
-    """The same board with nine other LEDs soldered in."""
+    """The same board with nine other LEDs, by another hardware seed."""
     scene = changed(lab.scene, "light.layout", hardware_seed=hardware_seed)
     return replace(lab, scene=scene, sources=testbed.light_sources(scene, lab.band))
 
 
 def board(lab: Testbed, images: int, rng: np.random.Generator) -> Board:
-    """So many images from each of the five attitudes; those that do not show all nine are left out."""
+    """Images from each of the five attitudes; those that do not show all nine LEDs are left out."""
     magnitude, position = [], []
     for number, lab_from_body in enumerate(attitudes(lab.scene)):
         for _ in range(images):
@@ -91,7 +91,7 @@ def nine(ask: Ask) -> Found:
 
 
 def ranks(whole: Sequence[Board], frame: Sequence[Board]) -> dict[str, Answer]:
-    """Table 2: mean and pooled standard deviation of each rank, over boards; magnitudes at the published mean."""
+    """Table 2: mean and pooled standard deviation of each rank, over boards; magnitudes scaled to published mean."""
     level = told_mean()
     pairs = [[level / one.magnitude.mean() for one in runs] for runs in (whole, frame)]
     mean, deviation = (
@@ -109,7 +109,7 @@ def ranks(whole: Sequence[Board], frame: Sequence[Board]) -> dict[str, Answer]:
 
 
 def told_mean() -> float:
-    """The published mean of all nine."""
+    """The published mean magnitude of all nine LEDs."""
     rows = experiments()["afit-table-2"].rows
     return float(np.mean([rows[f"mean_{rank}"].published or 0.0 for rank in range(1, LEDS + 1)]))
 
@@ -120,7 +120,7 @@ def by_rank(one: Board) -> Floats:
 
 
 def of_frame(whole: Floats, frame: Floats) -> Answer:
-    """What whole cycles give; beside it what the camera's frame time gives."""
+    """Result for whole cycles, with the result for the camera's frame time as the cause."""
     return Answer(
         mean_of(whole), cause=Cause("100 ms, 11 1/9 cycles: one LED has a twelfth pulse", mean_of(frame))
     )
@@ -133,13 +133,13 @@ def scatter(one: Board) -> Floats:
 
 
 def alike(whole: Sequence[Board]) -> dict[str, Answer]:
-    """How much the nine LEDs of a board differ from each other."""
+    """Relative standard deviation among the nine LEDs of a board, percent."""
     mean = np.array([by_rank(one) for one in whole])
     return {"scatter": Answer(mean_of(100 * mean.std(axis=1, ddof=1) / mean.mean(axis=1)))}
 
 
 def lattice(lab: Testbed, images: int, rng: np.random.Generator) -> Floats:
-    """(n, 36) angles of all pairs, ascending, by the thesis's own scale: four spacings of the first image are 8 mm."""
+    """(n, 36) angles of all pairs, ascending, by the thesis's scale: four spacings of the first image average 8 mm."""
     camera = onboard_model.believed_camera(lab.scene)
     found: list[Floats] = []
     for lab_from_body in attitudes(lab.scene):
@@ -156,7 +156,7 @@ def lattice(lab: Testbed, images: int, rng: np.random.Generator) -> Floats:
 
 
 def separations(found_arcsec: Floats) -> dict[str, Answer]:
-    """How many angles can be told apart, and the five of them."""
+    """Number of distinct angles, and the five of them."""
     middle = found_arcsec.mean(axis=0)
     breaks = np.flatnonzero(np.diff(middle) > GAP_ARCSEC) + 1
     answers = {"distinct": Answer(exact(len(breaks) + 1))}
@@ -183,7 +183,7 @@ def drawings(whole: Sequence[Board], frame: Sequence[Board], found_arcsec: Float
 
 
 def draw_ranks(fig: Any, whole: Sequence[Board], frame: Sequence[Board]) -> None:
-    """Published beside ours with whole cycles and with the frame time."""
+    """Published magnitudes by rank, and ours with whole cycles and with the frame time."""
     rows, axes, rank = experiments()["afit-table-2"].rows, fig.subplots(), np.arange(1, LEDS + 1)
     told = [rows[f"mean_{n}"].published for n in rank]
     for shift, ink, mark, name, runs in (
@@ -201,7 +201,7 @@ def draw_ranks(fig: Any, whole: Sequence[Board], frame: Sequence[Board]) -> None
 
 
 def draw_board(fig: Any, one: Board) -> None:
-    """Histograms of the ranks."""
+    """Histograms of the magnitudes by rank."""
     axes = fig.subplots()
     bins = np.linspace(one.magnitude.min(), one.magnitude.max(), 60)
     shades = [*INK, "#bbbbbb"]
@@ -216,7 +216,7 @@ def draw_board(fig: Any, one: Board) -> None:
 
 
 def draw_angles(fig: Any, found_arcsec: Floats) -> None:
-    """The angles and the lattice's."""
+    """Histogram of the angles, with those of a perfect lattice."""
     axes = fig.subplots()
     axes.hist(found_arcsec.ravel(), np.arange(1200, 4000, 20), color=INK[0], label="ours")
     for n, squared in enumerate(STEPS):

@@ -1,4 +1,8 @@
-"""AFIT's Test 2: one pair of LEDs at three places of the dome (Padro 2012, sections 3.5.3, 3.7.2 and 4.3)."""
+"""AFIT's Test 2: one pair of LEDs at three places of the dome (Padro 2012, sections 3.5.3, 3.7.2 and 4.3).
+
+The pair's separation should be the same at every place; the thesis finds a smaller one towards the edge. Causes that
+are simulated: camera noise, a board that is not parallel to the dome, a dome off its center, and glare of the lens.
+"""
 
 from __future__ import annotations
 
@@ -35,7 +39,7 @@ from skysim.simulation.testbed import Testbed
 from skysim.sources.dome.surface import Surface, build_surface
 from skysim.tracking import onboard_model
 
-PLACES_DEG = (0.0, 14.0, 28.0)  # of the scene: the apex, half way, the edge within the stop
+PLACES_DEG = (0.0, 14.0, 28.0)  # tilts of the scene's places: apex, halfway, edge within the tilt stop
 HALF_WAY_DEG, LEAN_DEG, LEAN_TOO_DEG, DECENTRE_IN = 23.6, 5.5, 4.0, 0.125
 PAIR_M = 16.119e-3  # gives Table 5's 2727" at the apex; 16 mm gives 2706.9"
 EXPOSURE_S, INTENSITY_CD, ON_SHARE, NOISE_E = 0.1, 2.85e-3, 0.0594, 700.0
@@ -44,7 +48,7 @@ NOISY = f"noise of {NOISE_E / GREY_E:.1f} grey levels"
 
 
 class Place(NamedTuple):
-    """Where the board is: its tilt seen from the bearing, how far it leans, how far the dome is displaced to it."""
+    """Place of the board: tilt from the vertical at the bearing, lean off the dome's surface, dome offset in x."""
 
     tilt_deg: float
     lean_deg: float = 0.0
@@ -52,21 +56,21 @@ class Place(NamedTuple):
 
 
 class Series(NamedTuple):
-    """What n images of a place gave: (n, 2) magnitudes of the bright and the dim LED, (n,) their angle."""
+    """Measurements of n images of a place: (n, 2) magnitudes of the bright and the dim LED, (n,) their angle."""
 
     magnitude: Floats
     angle_arcsec: Floats
 
 
 def scene(dim_share: float) -> Scene:
-    """The scene at the light that Table 3's bright LED asks for; the dim LED is lit for a share of its slot."""
+    """The scene with intensities that give Table 3's bright LED; the dim LED is on for a fraction of its slot."""
     told = changed(load("afit_test2"), "exposure", time_s=EXPOSURE_S)
     told = changed(told, "light.layout", levels=(1.0, dim_share) * len(PLACES_DEG))
     return changed(told, "light.led", intensity_cd=INTENSITY_CD, scatter=0.0)
 
 
 def noisy() -> Scene:
-    """The same in the noise that Table 5's deviations ask for, and not in the camera's own."""
+    """The same scene with the read noise that gives Table 5's standard deviations."""
     return changed(scene(ON_SHARE), "camera.detector", read_noise_e=NOISE_E)
 
 
@@ -77,7 +81,7 @@ def dome_of(told: Scene, decentre_in: float = 0.0) -> Surface:
 
 
 def glued(lab: Testbed, place: Place) -> Testbed:
-    """The pair on a board that is flat to the dome, or leans off it, its LEDs along the meridian."""
+    """The pair on a board tangent to the dome, or leaning off it, with its LEDs along the meridian."""
     inside, tilt = dome_of(lab.scene, place.decentre_in), np.radians(place.tilt_deg)
     middle_m = inside.meet(np.zeros(3), np.array([[np.sin(tilt), 0.0, np.cos(tilt)]]))[0]
     lean = Rotation.from_euler("y", place.lean_deg, degrees=True)
@@ -92,12 +96,12 @@ def glued(lab: Testbed, place: Place) -> Testbed:
 
 
 def towards(place: Place) -> Rotation:
-    """lab_from_body with the boresight on the board."""
+    """lab_from_body that points the boresight at the board."""
     return Rotation.from_euler("y", place.tilt_deg, degrees=True)
 
 
 def series(lab: Testbed, place: Place, count: int, rng: np.random.Generator) -> Series:
-    """Images of a place; those that do not show two lights are left out."""
+    """Measure images of a place; those that do not show two lights are left out."""
     board, attitude = glued(lab, place), towards(place)
     magnitudes, angles = [], []
     for _ in range(count):
@@ -109,7 +113,7 @@ def series(lab: Testbed, place: Place, count: int, rng: np.random.Generator) -> 
 
 
 def dome(ask: Ask) -> Found:
-    """Tables 3 to 5 and the dome's contour: one lab with the camera's own noise; the same with more as a cause."""
+    """Tables 3 to 5 and the dome's contour: with the camera's own noise, and with more noise as the cause."""
     count, quiet, faint = ask.trials(50, 10), furnished(scene(ON_SHARE)), furnished(noisy())
     rng = [np.random.default_rng([ask.seed, stage]) for stage in range(3)]
     own, wild = [], []
@@ -124,7 +128,7 @@ def dome(ask: Ask) -> Found:
 
 
 def magnitudes(own: Sequence[Series], wild: Sequence[Series], count: int) -> dict[str, Answer]:
-    """Table 3, and by how much its bright LED gains from the first place to the last."""
+    """Table 3, and the relative change of the bright LED's magnitude from the first place to the last."""
     answers: dict[str, Answer] = {}
     seen = [f"{len(one.magnitude)} and {len(two.magnitude)}" for one, two in zip(own, wild, strict=True)]
     for led, name in enumerate(("bright", "dim")):
@@ -139,7 +143,7 @@ def magnitudes(own: Sequence[Series], wild: Sequence[Series], count: int) -> dic
 
 
 def gained(places: Sequence[Summary]) -> Summary:
-    """By how many per cent the last place's mean is more than the first's; their errors are independent."""
+    """Increase of the mean from the first place to the last in percent; independent errors add in quadrature."""
     first, last = places[0], places[-1]
     value = 100 * (last.value / first.value - 1)
     half = 100 * float(np.hypot(last.high - last.value, first.high - first.value)) / first.value
@@ -147,7 +151,7 @@ def gained(places: Sequence[Summary]) -> Summary:
 
 
 def averaged(places: Sequence[Summary]) -> Summary:
-    """Mean of the places' means; their errors are independent."""
+    """Mean of the places' means; independent errors add in quadrature."""
     value = float(np.mean([one.value for one in places]))
     half = float(np.sqrt(sum((one.high - one.value) ** 2 for one in places)) / len(places))
     return Summary(value, value - half, value + half, sum(one.trials for one in places))
@@ -165,19 +169,19 @@ def spreads(own: Sequence[Series], wild: Sequence[Series]) -> dict[str, Answer]:
 
 
 def spread(own: Floats, wild: Floats) -> Answer:
-    """A deviation in the camera's own noise, and in more of it."""
+    """Standard deviation with the camera's own noise, and with more noise as the cause."""
     return Answer(deviation(own), cause=Cause(NOISY, deviation(wild)))
 
 
 def deviation(values: Floats) -> Summary:
-    """Standard deviation, n - 1, with the bootstrap's interval."""
+    """Standard deviation (n - 1) with its bootstrap interval."""
     return resampled(values, lambda x, axis=-1: np.std(x, ddof=1, axis=axis))
 
 
 def angles(
     lab: Testbed, own: Sequence[Series], wild: Sequence[Series], count: int, rng: np.random.Generator
 ) -> dict[str, Answer]:
-    """Table 5's means, and what each declared cause makes of the last two."""
+    """Table 5's means, with the effect of each cause on the last two."""
     edge = PLACES_DEG[2]
     half_way, decentred, leaning, both, more = (
         mean_of(series(lab, place, count, rng).angle_arcsec)
@@ -212,13 +216,16 @@ def angles(
 
 
 def fallen(angle: Summary, before: float) -> Summary:
-    """By how many per cent an angle is less than before, whose own error is as small."""
+    """Decrease of an angle relative to `before` in percent; the error of `before` is neglected."""
     value, high, low = (100 * (1 - one / before) for one in (angle.value, angle.low, angle.high))
     return Summary(value, low, high, angle.trials)
 
 
 def glare(lab: Testbed, count: int, rng: np.random.Generator) -> float:
-    """By how much more the angle falls to the edge where a lens's wide wings lay light of one LED under the other."""
+    """Change of the angle from apex to edge in arcsec, beyond geometry, due to a PSF with wide wings.
+
+    The wings add light of one LED below the other, which biases the centroids.
+    """
     wide = furnished(
         changed(scene(2 * ON_SHARE), "camera", psf=MoffatPsfConfig(kind="moffat", fwhm_px=2.5, beta=1.5))
     )
@@ -228,7 +235,7 @@ def glare(lab: Testbed, count: int, rng: np.random.Generator) -> float:
 
 
 def geometric(lab: Testbed, place: Place) -> float:
-    """The pair's angle by eqs 43-45 from where its LEDs are, without any image."""
+    """The pair's angle by eqs 43-45 from its LEDs' projected positions, without rendering."""
     lever, camera = (
         onboard_model.believed_lever(lab.scene, lab.mount),
         onboard_model.believed_camera(lab.scene),
@@ -253,7 +260,7 @@ def drawings(lab: Testbed, own: Sequence[Series], wild: Sequence[Series]) -> tup
 
 
 def draw_magnitudes(fig: Any, wild: Sequence[Series]) -> None:
-    """Histograms of ours, with the published means."""
+    """Histograms of our magnitudes, with the published means and deviations."""
     rows = experiments()["afit-table-3-5"].rows
     both = fig.subplots(1, 2)
     for column, name, axes in zip((DIM, BRIGHT), ("dim", "bright"), both, strict=True):
@@ -284,7 +291,7 @@ def draw_magnitudes(fig: Any, wild: Sequence[Series]) -> None:
 
 
 def draw_angles(fig: Any, lab: Testbed, own: Sequence[Series]) -> None:
-    """Curves of the geometry, ours from images, and the published ones."""
+    """Angles against the tilt: geometric curves, ours from images, and the published ones."""
     rows, axes = experiments()["afit-table-3-5"].rows, fig.subplots()
     tilt_deg = np.linspace(0, 32, 33)
     curves = (

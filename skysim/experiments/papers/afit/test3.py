@@ -1,4 +1,9 @@
-"""AFIT's Test 3, calibration (Padro 2012, 4.4.1, Tables 6-9, Figs 74-79): five LEDs, five positions, 50 images each."""
+"""AFIT's Test 3, calibration (Padro 2012, 4.4.1, Tables 6-9, Figs 74-79): five LEDs, five positions, 50 images each.
+
+The thesis derives its identification tolerances (epsilons) from the scatter of magnitudes, positions and separations
+over 250 images. We repeat this on rendered images with LED positions that are fitted to Table 8, then with likely
+faults of the camera, and with the IMU errors of Tables 10-14.
+"""
 
 from __future__ import annotations
 
@@ -36,12 +41,12 @@ from skysim.tracking import onboard_model
 
 ID = "afit-table-6-9"
 BUMPED = 4
-# Where the vehicle stood: the IMU's angles, but for the knocked fifth position, where the algorithm is believed.
+# True attitudes: the IMU's angles, but the algorithm's at the fifth position, where the IMU was bumped.
 TRUE_DEG = (*IMU_DEG[:BUMPED], ALGORITHM_DEG[BUMPED])
 ON_US = np.array([1000.0, 500.0, 400.0, 200.0, 1.0])
 LINEAR = slice(1, 4)  # LEDs of 500, 400 and 200 us
-LINES = ((0, 4), (4, 8), (8, 10))  # of Table 8: neighbours, diagonals, the whole cross
-APART_ARCSEC = 100.0  # the catalogue's bucket: what is nearer is one angle
+LINES = ((0, 4), (4, 8), (8, 10))  # rows of Table 8: neighbors, diagonals, opposite ends of the cross
+APART_ARCSEC = 100.0  # width of the catalog's buckets; angles closer than this count as one
 NOMINAL = '[["0 mm", "0 mm", "48 in"], ["8 mm", "0 mm", "48 in"], ["0 mm", "8 mm", "48 in"], \
 ["-8 mm", "0 mm", "48 in"], ["0 mm", "-8 mm", "48 in"]]'
 CAUSE = "a rolling shutter, 1/60 s and pixels full at 186 DN"
@@ -50,7 +55,7 @@ Statistic = Callable[[Floats], Any]
 
 
 def calibration(ask: Ask) -> Found:
-    """The calibration as our lab is; with the camera's likely faults; and with the bumped IMU."""
+    """Tables 6-9: with our baseline, with likely faults of the camera as the cause, and with a bumped IMU."""
     images, few = ask.trials(50, 3), ask.trials(10, 2)
     plan = {
         "ours": ({}, images),
@@ -75,7 +80,7 @@ def calibration(ask: Ask) -> Found:
 
 
 class Run(NamedTuple):
-    """Images of one lab."""
+    """Images of one testbed."""
 
     lab: Testbed
     sightings: list[Sighting]
@@ -85,7 +90,7 @@ class Run(NamedTuple):
         return measured(self.lab, self.sightings)
 
     def bumped(self, *positions: int) -> Sights:
-        """The same images, at these positions with an IMU as wrong as Tables 10-14 have it."""
+        """The same images, with the IMU errors of Tables 10-14 at these positions."""
         wrong = {
             n: lab_from_body((np.add(TRUE_DEG[n], IMU_DEG[n]) - ALGORITHM_DEG[n]).tolist()) for n in positions
         }
@@ -96,7 +101,7 @@ class Run(NamedTuple):
 
 
 def every_position(lab: Testbed, images: int, rng: np.random.Generator) -> list[Sighting]:
-    """So many images at each of the five; an IMU without error."""
+    """Images at each of the five positions, with a perfect IMU."""
     return [
         one
         for n, angles in enumerate(TRUE_DEG)
@@ -105,14 +110,16 @@ def every_position(lab: Testbed, images: int, rng: np.random.Generator) -> list[
 
 
 def fitted_places(lab: Testbed) -> Floats:
-    """(5, 3) the LEDs in the plane of the board for which the thesis's own eqs 43-45, without noise, give Table 8.
+    """(5, 3) LED positions in the board's plane for which the thesis's eqs 43-45, without noise, give Table 8.
 
-    Eight coordinates to ten angles; the scene's places, which forget the equations' slip, say which angle is whose.
+    Least squares of eight coordinates to ten angles; the central LED is fixed. Table 8 is sorted, so its angles are
+    assigned to pairs by the order of the angles from the scene's positions, which neglect the error of eq. 44.
     """
     rows = experiments()[ID].rows
     published = np.array([rows[f"separation_{n}"].published for n in range(1, 11)], dtype=float)
     place_m = lab.sources.place[:, :3].copy()
     start = seen_arcsec(lab, place_m)
+    # Table 8 is in ascending order: its k-th angle belongs to the pair with the k-th smallest start angle.
     aim = np.empty(len(published))
     aim[np.argsort(start)] = published
 
@@ -126,7 +133,7 @@ def fitted_places(lab: Testbed) -> Floats:
 
 
 def seen_arcsec(lab: Testbed, place_m: Floats) -> Floats:
-    """(10,) mean over the positions of every pair's angle as the thesis measures it, without noise."""
+    """(10,) angle of every pair as the thesis measures it, without noise, averaged over the vehicle's positions."""
     lever = onboard_model.believed_lever(lab.scene, lab.mount)
     camera = onboard_model.calibration(lab.scene.camera)
     seen = [project(lab_from_body(one).inv(), place_m, lever, camera) for one in TRUE_DEG]
@@ -136,17 +143,18 @@ def seen_arcsec(lab: Testbed, place_m: Floats) -> Floats:
 
 
 def placed(place_m: Floats) -> str:
-    """The places as a scene has them."""
+    """The positions in a scene's YAML syntax."""
     told = [f'["{x * 1e3:.4f} mm", "{y * 1e3:.4f} mm", "48 in"]' for x, y, _ in place_m]
     return f"[{', '.join(told)}]"
 
 
-# What the images tell, with intervals over the images.
+# Statistics of the images, with intervals over the images.
 
 
 def of_images(sights: Sights, values: Floats, statistic: Statistic) -> Summary:
-    """A figure of (F, ...) values of the images, with its interval: images drawn again at each position.
+    """A statistic of (F, ...) values of the images, with a bootstrap interval stratified by position.
 
+    Images are resampled within each position only, because the differences between positions are systematic.
     statistic : of (..., F, K) values to (...), over the last two axes
     """
     position, rows = sights.position, np.arange(len(values))
@@ -156,6 +164,7 @@ def of_images(sights: Sights, values: Floats, statistic: Statistic) -> Summary:
 
     def drawn(index: Floats, axis: int = -1) -> Any:
         same = np.array_equal(index, rows)
+        # A resampled index becomes an image of the position of the image that it replaces (stratified bootstrap).
         chosen = index if same else first + index % count
         return statistic(table[chosen.astype(int)])
 
@@ -167,33 +176,33 @@ def mean(values: Floats) -> Any:
 
 
 def spread(values: Floats) -> Any:
-    """The greatest standard deviation of the columns over all images: what differs between positions counts, and that
-    is no draw, so the sum is divided by n."""
+    """Largest standard deviation of the columns over all images. It includes the systematic differences between
+    positions, so the sum is divided by n and not by n - 1."""
     return values.std(axis=-2).max(axis=-1)
 
 
 def within(sights: Sights) -> float:
-    """The greatest deviation of a pair's angle at one position, the mean over the positions."""
+    """Standard deviation of a pair's angle within a position, averaged over positions; the largest over pairs."""
     angle = sights.separation_arcsec
     at_one = [angle[sights.position == n].std(axis=0, ddof=1) for n in np.unique(sights.position)]
     return float(np.mean(at_one, axis=0).max())
 
 
 def slope(values: Floats) -> Any:
-    """Least-squares slope of the mean magnitude by the microseconds lit."""
+    """Least-squares slope of the mean magnitude against the on-time in microseconds."""
     lit = ON_US[LINEAR] - ON_US[LINEAR].mean()
     return values.mean(axis=-2) @ lit / (lit @ lit)
 
 
 def magnitudes(ours: Sights, lab: Sights, as_told: Run) -> dict[str, Answer]:
-    """Table 7."""
+    """Table 7: means and standard deviations of the magnitudes."""
     answers = {}
     for n in range(len(ON_US)):
         told = [of_images(one, one.magnitude[:, [n]], mean) for one in (ours, lab)]
         answers[f"magnitude_{n + 1}"] = Answer(told[0], cause=Cause(CAUSE, told[1]))
         told = [of_images(one, one.magnitude[:, [n]], spread) for one in (ours, lab)]
         answers[f"magnitude_sd_{n + 1}"] = Answer(told[0], cause=Cause(CAUSE, told[1]))
-    # An image of `as told` that shows five LEDs shows the one of 1 us.
+    # Only images with five LEDs are kept, so every one of `as_told` shows the LED of 1 us.
     found = exact(as_told.sights.magnitude[:, -1].mean() if as_told.sightings else 0.0)
     answers["magnitude_5"] = Answer(
         found, cause=Cause("75 us of light (fitted)", answers["magnitude_5"].ours)
@@ -205,7 +214,7 @@ def magnitudes(ours: Sights, lab: Sights, as_told: Run) -> dict[str, Answer]:
 
 
 def separations(ours: Sights, lab: Sights, nominal: Sights) -> dict[str, Answer]:
-    """Table 8, from the least to the greatest."""
+    """Table 8: separations of the pairs in ascending order."""
     order = np.argsort(ours.separation_arcsec.mean(axis=0))
     angle, rolled = ours.separation_arcsec[:, order], lab.separation_arcsec[:, order]
     answers = {}
@@ -222,7 +231,7 @@ def separations(ours: Sights, lab: Sights, nominal: Sights) -> dict[str, Answer]
 
 
 def epsilons(ours: Sights, lab: Sights, bumped: Sights, drifted: Sights) -> dict[str, Answer]:
-    """Table 9 and Figs 77-79: the greatest of the pooled deviations; positions in millimetres."""
+    """Table 9 and Figs 77-79: the largest pooled standard deviations; positions in millimeters."""
     position = {
         name: of_images(one, one.lab_m.reshape(len(one.lab_m), -1) * 1e3, spread)
         for name, one in (("ours", ours), ("bumped", bumped), ("drifted", drifted))
@@ -248,12 +257,12 @@ def epsilons(ours: Sights, lab: Sights, bumped: Sights, drifted: Sights) -> dict
 
 
 def buckets() -> dict[str, Answer]:
-    """Section 2.4.6: how long its example's table is, how much of what is looked at is in vain, and eq. 12."""
+    """Section 2.4.6: length of the example's bucket table, percentage searched outside the gate, and eq. 12."""
     low, high = np.radians([1.5, 8.0])
     width, gate = 5 * ARCSEC_RAD, 20 * ARCSEC_RAD
     stars = unit(np.random.default_rng(0).standard_normal((500, 3)))
     entries = len(bucketed(stars, np.zeros(len(stars)), width, (low, high)).table) - 1
-    # Every phase of a pair's angle against the buckets, once.
+    # Average over the phase of a pair's angle within a bucket.
     angle = (low + high) / 2 + width * (np.arange(1000) + 0.5) / 1000
     first, last = (bucket_of(angle + end, high, width, entries) for end in (-gate, gate))
     looked_at = (last - first + 1).mean() * width
@@ -271,7 +280,7 @@ def buckets() -> dict[str, Answer]:
 
 
 def published(key: str) -> Floats:
-    """The rows key_1, key_2, ... of Tables 7 and 8."""
+    """Published values of the rows key_1, key_2, ... of Tables 7 and 8."""
     rows = experiments()[ID].rows
     told = [row.published for name, row in rows.items() if name.rpartition("_")[0] == key]
     return np.array(told, dtype=float)
@@ -291,7 +300,7 @@ def drawings(lab: Sights, bumped: Sights) -> tuple[Drawing, ...]:
 
 
 def draw_magnitudes(fig: Any, lab: Sights) -> None:
-    """A histogram of each LED, and Table 7's mean and deviation over it."""
+    """A histogram for each LED, with Table 7's mean and deviation above."""
     axes = fig.subplots()
     edges = np.arange(0, 171, 2.0)
     heights = [axes.hist(one, edges, color=INK[0], alpha=0.75)[0].max() for one in lab.magnitude.T]
@@ -333,7 +342,7 @@ def draw_separations(fig: Any, lab: Sights) -> None:
 
 
 def draw_scatter(fig: Any, bumped: Sights) -> None:
-    """X and Y of every LED in the lab, a mark a position, the mean over all in black, and Table 9's deviation."""
+    """X and Y of every LED in the lab frame, one marker per position, the mean in black, and Table 9's deviation."""
     axes = fig.subplots()
     place_mm = bumped.lab_m * 1e3
     for n in range(len(IMU_DEG)):

@@ -1,1 +1,1 @@
-"""Experiments of other laboratories' star simulators: APL, NPS and OLED."""
+"""Experiments with other laboratories' star simulators: JHU/APL's dome, NPS's panel and AFIT's OLED dome."""

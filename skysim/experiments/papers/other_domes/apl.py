@@ -1,4 +1,8 @@
-"""JHU/APL's dome of a hundred fibres (Boone et al. 2005, told by Padro 2012, section 2.6): angular discrepancies."""
+"""JHU/APL's dome of a hundred fibers (Boone et al. 2005, cited by Padro 2012, section 2.6): angular discrepancies.
+
+A tracker that assumes a perfect sphere, seen from its center, has angular errors when the pupil is off the center and
+the shell's radius varies. The discrepancy is the angle between a fiber's observed ray and its expected direction.
+"""
 
 from __future__ import annotations
 
@@ -28,11 +32,11 @@ from skysim.tracking import onboard_model
 
 SHELL_OFF_M, SMALL_OFF_M = 0.05, 1e-3
 CIRCLE_DEG, WANTED_STARS = 10.0, 5.0
-LEAN_DEG = 60.0  # attitudes are any with the boresight no farther from the zenith
+LEAN_DEG = 60.0  # greatest angle of the boresight from the zenith
 
 
 def shell(radius_variation: float, seed: int) -> Scene:
-    """The scene with a shell of another stretching: the fibres are in the same directions."""
+    """The scene with another random variation of the shell's radius; the fibers keep their directions."""
     return loader.load(
         "apl_dome",
         {
@@ -43,7 +47,7 @@ def shell(radius_variation: float, seed: int) -> Scene:
 
 
 class AplTestbed:
-    """The dome as it is, seen through the scene's camera with its pupil off the centre, across the boresight."""
+    """The true dome seen by the scene's camera, with its pupil displaced across the boresight by off_m."""
 
     def __init__(self, told: Scene, lab: Testbed, off_m: float) -> None:
         assert isinstance(told.light, DomeConfig)
@@ -56,9 +60,9 @@ class AplTestbed:
         self.off_m = lab.mount.cam_from_body.inv().apply([off_m, 0.0, 0.0])
 
     def discrepancies_arcsec(self, lab_from_body: Rotation, lever: Lever) -> Floats:
-        """(N,) angles between the fibres' rays from their pixels and where the tracker expects them.
+        """(N,) angles between the observed rays of the fibers in view and the directions that the tracker expects.
 
-        The tracker takes the dome for a perfect one and the pupil for where `lever` says.
+        The tracker assumes a perfect sphere and the pupil at the lever arm of `lever`.
         """
         cam_from_lab = lever.cam_from_body * lab_from_body.inv()
         here = Poses(cam_from_lab.as_matrix()[None], lab_from_body.apply(self.off_m)[None])
@@ -75,14 +79,14 @@ class AplTestbed:
 
 
 def attitudes(count: int, rng: np.random.Generator) -> list[Rotation]:
-    """lab_from_body of a body whose camera looks along its z: the boresight anywhere within LEAN_DEG, any turn."""
+    """Random lab_from_body of a body with boresight z: boresight uniform within LEAN_DEG of the zenith, any roll."""
     lean = np.arccos(rng.uniform(np.cos(np.radians(LEAN_DEG)), 1, count))
     first, last = rng.uniform(0, 2 * np.pi, (2, count))
     return [Rotation.from_euler("ZYZ", one) for one in np.column_stack([first, lean, last])]
 
 
 def worst_arcsec(told: Scene, lab: Testbed, off_m: float, corrected: bool, poses: list[Rotation]) -> Floats:
-    """(K,) greatest discrepancy in each attitude's field that holds a fibre; corrected: the pupil's place is told."""
+    """(K,) largest discrepancy of each attitude with a fiber in view. corrected : the pupil's offset is known."""
     bed = AplTestbed(told, lab, off_m)
     lever = Lever(bed.off_m if corrected else np.zeros(3), lab.mount.cam_from_body)
     boresight = lab.mount.cam_from_body.inv().apply([0.0, 0.0, 1.0])
@@ -92,20 +96,20 @@ def worst_arcsec(told: Scene, lab: Testbed, off_m: float, corrected: bool, poses
 
 
 def counts(lab: Testbed, diameter_deg: float, boresights: Floats) -> Floats:
-    """(K,) fibres in a circle of that diameter about each of the (K, 3) unit boresights from the centre."""
+    """(K,) number of fibers in a circle of this diameter about each of the (K, 3) unit boresights from the center."""
     place = lab.sources.place[:, :3]
     towards = place / np.linalg.norm(place, axis=1, keepdims=True)
     return np.asarray((boresights @ towards.T > np.cos(np.radians(diameter_deg / 2))).sum(axis=1), float)
 
 
 def anywhere(count: int, rng: np.random.Generator) -> Floats:
-    """(count, 3) unit vectors uniform over the hemisphere above."""
+    """(count, 3) unit vectors uniform over the upper hemisphere."""
     z, azimuth = rng.uniform(0, 1, count), rng.uniform(0, 2 * np.pi, count)
     return np.column_stack([np.sqrt(1 - z**2) * np.cos(azimuth), np.sqrt(1 - z**2) * np.sin(azimuth), z])
 
 
 def fibres(ask: Ask) -> Found:
-    """Discrepancies over shells and attitudes, and how many fibres a field holds."""
+    """Discrepancies over shells and attitudes, and the number of fibers in a field."""
     rng = np.random.default_rng([ask.seed, 2005])
     lab = testbed.build_testbed(loader.load("apl_dome"))
     shells = [shell(0.004, int(seed)) for seed in rng.integers(2**31, size=ask.trials(30, 5))]
@@ -139,13 +143,13 @@ OFFS_M = (1e-4, 1e-3, 1e-2, 5e-2, 1e-1)
 
 
 def told_off(lab: Testbed, told: Scene, poses: list[Rotation], off_m: float) -> tuple[float, float]:
-    """Worst discrepancies, arcsec: uncorrected, corrected."""
+    """Worst discrepancies in arcsec: without and with the pupil's offset known."""
     before, after = (worst_arcsec(told, lab, off_m, corrected, poses).max() for corrected in (False, True))
     return float(before), float(after)
 
 
 def draw(fig: Any, offs: Floats) -> None:
-    """Both, with the stated numbers."""
+    """Both discrepancies against the offset, with the stated numbers."""
     axes, rows = fig.subplots(), experiments()["apl"].rows
     off_mm = 1e3 * np.array(OFFS_M)
     for n, name in enumerate(("ours, place not told", "ours, place told: the shell is left")):

@@ -1,4 +1,9 @@
-"""NPS's TAS-2 under nine stars on a panel (Tappe 2009, told by Padro 2012, section 2.7.2): distances by an estimate."""
+"""NPS's TAS-2 under nine stars on a flat panel (Tappe 2009, cited by Padro 2012, section 2.7.2).
+
+The stars are near, so their directions from the bearing depend on the attitude. The tracker computes the distances
+from a believed attitude (eq. 33), identifies the stars and solves; the solution can be the next believed attitude. The
+experiment shows how large the initial attitude error may be.
+"""
 
 from __future__ import annotations
 
@@ -31,14 +36,14 @@ from skysim.tracking import onboard_model, settings
 INITIAL_DEG = (-6, -3, 0, 3, 6)
 ITERATED_DEG, UPDATES = 2.0, 5
 SEPARATION_RAD = 500 * ARCSEC_RAD
-APPROXIMATE_DEG = 1.0  # a solution as near as that approximates the attitude
+APPROXIMATE_DEG = 1.0  # a solution with a smaller error counts as approximating the attitude
 FITTED_CAMERA_M = np.array([0.30, 0.0, 0.20])
 
 
 class Known(NamedTuple):
-    """What the tracker knows: panel and lever as they are, and the nine stars as it saw them from the level vehicle.
+    """What the tracker knows: the true panel and lever arm, and the nine stars as seen from the level vehicle.
 
-    lab : the true one;  panel : the plane;  vectors : (9, 3) unit, from the bearing;  pairs : their index
+    lab : the true testbed;  panel : the plane;  vectors : (9, 3) unit, from the bearing;  pairs : their index
     """
 
     lab: Testbed
@@ -48,21 +53,21 @@ class Known(NamedTuple):
 
 
 class Solution(NamedTuple):
-    """How many of the nine were matched, 0 where no match was beyond chance, and body_from_lab, None with it."""
+    """Number of matched stars and body_from_lab; 0 and None if no match is significant against chance."""
 
     matched: int
     body_from_lab: Rotation | None
 
     @property
     def off_deg(self) -> float:
-        """From the true attitude, which is level."""
+        """Error of the attitude; the true one is level. NaN without a solution."""
         return float(np.degrees(self.body_from_lab.magnitude())) if self.body_from_lab else np.nan
 
 
 def at(camera_m: Floats | None, seed: int, frames: int) -> Known:
-    """The scene with its camera there on the vehicle (as its file has it if None), and the panel above it as before.
+    """The scene with the camera moved to camera_m on the vehicle (None: not moved), and the panel moved along with it.
 
-    The catalogue is the mean of so many frames from the level vehicle.
+    The catalog is the mean of `frames` frames from the level vehicle.
     """
     told = loader.load("nps_tas2")
     lab = testbed.build_testbed(told)
@@ -81,7 +86,7 @@ def at(camera_m: Floats | None, seed: int, frames: int) -> Known:
     nowhere = np.empty(0, np.int64), np.empty((0, 3))
     panel = LedMap(*nowhere, np.zeros(3), np.array([np.inf, np.inf, height_m]))
     shots = [rays_body(lab, seed + n) for n in range(frames)]
-    # Brightest first is another order in every frame: by place, it is one.
+    # Noise changes the order of brightness between frames, so sort by position before averaging.
     by_place = [rays[np.lexsort((rays[:, 1], rays[:, 0]))] for rays in shots]
     mean = np.mean([one for one in by_place if len(one) == len(lab.sources)], axis=0)
     vectors = directions(lab, panel, mean, Rotation.identity())
@@ -97,7 +102,10 @@ def rays_body(lab: Testbed, seed: int) -> Floats:
 
 
 def directions(lab: Testbed, panel: LedMap, rays: Floats, body_from_lab: Rotation) -> Floats:
-    """(N, 3) R_0 + alpha_i b_i as unit vectors in body axes: alpha_i by the believed attitude (eq. 33)."""
+    """(N, 3) unit vectors along R_0 + alpha_i b_i in body axes, distances alpha_i from the believed attitude (eq. 33).
+
+    R_0 is the camera's position and b_i the ray of light i; alpha_i is the distance to the panel along the ray.
+    """
     camera_m, lab_from_body = lab.mount.camera_body_m, body_from_lab.inv()
     origin_m = lab_from_body.apply(camera_m)
     met_m = on_surface(lab_from_body.apply(rays), origin_m, panel)
@@ -106,7 +114,7 @@ def directions(lab: Testbed, panel: LedMap, rays: Floats, body_from_lab: Rotatio
 
 
 def solve(known: Known, rays: Floats, believed: Rotation) -> Solution:
-    """One solution: distances by the believed attitude, the master star's angles within 500 arcsec, QUEST."""
+    """Solve once: distances from the believed attitude, master-star identification within 500 arcsec, QUEST."""
     seen = directions(known.lab, known.panel, rays, believed)
     # master_star takes the error of a direction; an angle's is sqrt(2) times that.
     match = master_star(seen, known.pairs, SEPARATION_RAD / np.sqrt(2))
@@ -117,7 +125,7 @@ def solve(known: Known, rays: Floats, believed: Rotation) -> Solution:
 
 
 def iterated(known: Known, rays: Floats, believed: Rotation) -> Solution:
-    """Five updates of the attitude, each the next one's estimate."""
+    """Solve UPDATES times, each time with the last solution as the believed attitude."""
     for _ in range(UPDATES):
         found = solve(known, rays, believed)
         if found.body_from_lab is None:
@@ -127,30 +135,30 @@ def iterated(known: Known, rays: Floats, believed: Rotation) -> Solution:
 
 
 def wrong_by(error_deg: float) -> Rotation:
-    """The initial error matrix: all three Euler angles off alike."""
+    """Rotation of the initial error: the same error in all three Euler angles."""
     return Rotation.from_euler("ZYX", [error_deg] * 3, degrees=True)
 
 
 class Course(NamedTuple):
-    """Solutions of all trials, by initial error in degrees, and the iterated ones."""
+    """Solutions of all trials by initial error in degrees, and the iterated solutions."""
 
     trials: dict[float, list[Solution]]
     iterated: list[Solution]
 
     @property
     def matched(self) -> Summary:
-        """Mean of the stars matched over the five trials."""
+        """Mean number of matched stars over the five trials."""
         count = [[one.matched for one in self.trials[error]] for error in INITIAL_DEG]
-        return resampled(np.mean(count, axis=0), np.mean)  # a frame is solved in every trial
+        return resampled(np.mean(count, axis=0), np.mean)  # mean per frame: its trials are not independent
 
     def near(self, error_deg: float) -> Summary:
-        """Share of a trial's solutions that approximate the attitude."""
+        """Fraction of a trial's solutions with an error below APPROXIMATE_DEG."""
         off = np.array([one.off_deg for one in self.trials[error_deg]])
         return share(int(np.sum(off < APPROXIMATE_DEG)), len(off))
 
     @property
     def euler(self) -> Summary:
-        """Mean size of the three Euler angles after the updates, deg; the truth is zero."""
+        """Mean absolute Euler angle after the updates, deg; the true angles are zero."""
         angles = [
             np.abs(one.body_from_lab.as_euler("ZYX", degrees=True)).mean()
             for one in self.iterated
@@ -160,7 +168,7 @@ class Course(NamedTuple):
 
 
 def course(known: Known, errors_deg: Sequence[float], frames: int, seed: int, ask: Ask) -> Course:
-    """So many frames from the level vehicle, each solved from every initial error, and from two degrees iterated."""
+    """Solve frames from the level vehicle, each from every initial error, and iterated from ITERATED_DEG."""
     trials: dict[float, list[Solution]] = {error: [] for error in errors_deg}
     last = []
     for n in range(frames):
@@ -173,7 +181,7 @@ def course(known: Known, errors_deg: Sequence[float], frames: int, seed: int, as
 
 
 def trials(ask: Ask) -> Found:
-    """Five tests of 50 solutions for each initial error, with the scene's camera and with the fitted one."""
+    """Solutions for each initial error (five tests of 50 frames), with the scene's and a fitted camera position."""
     errors = INITIAL_DEG if ask.quick else (*INITIAL_DEG, -10, -8, -4.5, 4.5, 8, 10)
     frames, sky = ask.trials(250, 40), ask.trials(50, 10)
     seeds = np.random.default_rng([ask.seed, 2009]).integers(2**31, size=4).tolist()
@@ -192,7 +200,7 @@ def trials(ask: Ask) -> Found:
 
 
 def draw(fig: Any, courses: dict[str, Course]) -> None:
-    """Counts above, errors below."""
+    """Matched stars above, errors below."""
     above, below = fig.subplots(2, 1, sharex=True)
     for n, (name, one) in enumerate(courses.items()):
         errors = sorted(one.trials)

@@ -1,4 +1,4 @@
-"""AFIT's later OLED dome: how finely and how truly an attitude is had from many small lights on AFIT's field."""
+"""AFIT's later OLED dome: noise-equivalent angle and absolute error of the attitude with many small lights in view."""
 
 from __future__ import annotations
 
@@ -23,33 +23,33 @@ from skysim.simulation import testbed
 
 NOISE_PX = 0.1
 STATED_LIGHTS, MANY_LIGHTS = 20, 80
-SPACING_MM = {10: 30, 20: 22, 40: 15.5, 80: 11}  # leaves some more than so many lights in the field
+SPACING_MM = {10: 30, 20: 22, 40: 15.5, 80: 11}  # by number of lights; slightly more are in view
 ARCSEC_TICKS = (0.2, 0.5, 1, 2, 5, 10)
 TILT_DEG, CAP_DEG = 10.0, 18.0
-MEASURED = {"led_sigma": "0.2 mm", "lever_sigma": "0.2 mm"}  # by a laser tracker or a measuring arm
+MEASURED = {"led_sigma": "0.2 mm", "lever_sigma": "0.2 mm"}  # of a laser tracker or a measuring arm
 BY_FRAMES = {"led_sigma": "0.08 mm", "lever_sigma": "0.09 mm"}  # left by `skysim survey`, docs/dome.md
-LEVEL_SIGMA_DEG = 0.005  # of the survey's axes
+LEVEL_SIGMA_DEG = 0.005  # orientation error of the survey's axes
 
 
 class Spread(NamedTuple):
-    """(N, 3) errors of as many attitudes about the camera's axes, arcsec; and how many were asked for."""
+    """(N, 3) attitude errors about the camera's axes of N solved attitudes, arcsec; and the number attempted."""
 
     error_arcsec: Floats
     asked: int
 
     @property
     def across(self) -> Summary:
-        """rms about one axis across the boresight, both axes taken together."""
+        """rms error about one axis across the boresight, from both axes."""
         return resampled(rms(self.error_arcsec[:, :2]), rms)
 
     @property
     def roll(self) -> Summary:
-        """rms about the boresight."""
+        """rms error about the boresight."""
         return resampled(self.error_arcsec[:, 2], rms)
 
 
 def bench(lights: int) -> Bench:
-    """AFIT's camera under its measured dome with lights anywhere, of which no more than so many are looked at."""
+    """AFIT's camera under its measured dome with randomly placed lights, of which at most `lights` are used."""
     layout = f'{{kind: poisson_disc, spacing: "{SPACING_MM[lights]} mm", cap_deg: {CAP_DEG}}}'
     told = loader.load("afit_simsat", {"light.layout": layout, "tracker.centroid_sigma_px": str(NOISE_PX)})
     lab = testbed.build_testbed(told)
@@ -58,14 +58,14 @@ def bench(lights: int) -> Bench:
 
 
 def spread(ready: Bench, seeds: Sequence[int]) -> Spread:
-    """From centroids at random attitudes, lost in space at each."""
+    """Errors of lost-in-space solutions from simulated centroids at random attitudes."""
     came = [centroids(ready, seed) for seed in seeds]
     off = np.array([[one.x_arcsec, one.y_arcsec, one.roll_arcsec] for one in came])
     return Spread(off[np.isfinite(off[:, 0])], len(came))
 
 
 def surveyed(ready: Bench, sigmas: dict[str, str], seed: int) -> Bench:
-    """The same dome, the tracker told its places by a survey with errors, whose axes are turned a little."""
+    """The same dome with a tracker whose map comes from a survey with position errors and slightly rotated axes."""
     turn = np.random.default_rng([seed, 2]).normal(0, LEVEL_SIGMA_DEG, 3)
     told = SurveyErrorsConfig.model_validate(sigmas | {"turn_deg": turn.tolist(), "seed": seed})
     part = ready.lab.scene.tracker.model_copy(update={"survey": told})
@@ -74,16 +74,16 @@ def surveyed(ready: Bench, sigmas: dict[str, str], seed: int) -> Bench:
 
 
 def absolute_deg(ready: Bench, sigmas: dict[str, str], seeds: list[list[int]]) -> Summary:
-    """Mean rotation angle of the error. The attitudes of one survey share its errors: surveys are what is independent.
+    """Mean error angle in degrees. The attitudes of one survey share its errors, so the interval is over surveys.
 
-    seeds : of each survey, and of the attitudes that it is tried at
+    seeds : one list per survey: its seed, then the seeds of its attitudes
     """
     off = [spread(surveyed(ready, sigmas, first), rest).error_arcsec for first, *rest in seeds]
     return resampled(np.array([np.mean(np.linalg.norm(one, axis=1)) for one in off]) / 3600, np.mean)
 
 
 def dome(ask: Ask) -> Found:
-    """Noise-equivalent angle with the map exact, at several numbers of lights; absolute error with it surveyed."""
+    """Noise-equivalent angle with an exact map for several numbers of lights; absolute error with a surveyed map."""
     rng = np.random.default_rng([ask.seed, 76398981])
     counts = [STATED_LIGHTS, MANY_LIGHTS] if ask.quick else list(SPACING_MM)
     trials, spreads = ask.trials(600, 60), {}
@@ -106,7 +106,7 @@ def dome(ask: Ask) -> Found:
 
 
 def draw(fig: Any, spreads: dict[int, Spread]) -> None:
-    """Both angles, with the law of the square root through all points."""
+    """Both angles against the number of lights n, with a fitted line proportional to 1 / sqrt(n)."""
     axes, rows = fig.subplots(), experiments()["oled"].rows
     lights = np.array(list(spreads))
     for n, (key, name) in enumerate((("across", "across, one axis"), ("roll", "roll"))):

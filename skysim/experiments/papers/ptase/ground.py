@@ -1,4 +1,9 @@
-"""PTASE's camera on the ground (Fialho & Saotome 2005, section 4, table 2): the turning sky, solved."""
+"""PTASE's camera on the ground (Fialho & Saotome 2005, section 4, table 2): attitudes from a fixed camera at night.
+
+The camera is fixed to the Earth, so its right ascension grows at the sidereal rate. Frames are rendered with the
+Earth's attitude from SOFA (precession, nutation, rotation) and solved: with a calibrated camera at rest, and with
+uncalibrated decentering distortion and vibration as the cause of the paper's larger scatter.
+"""
 
 from __future__ import annotations
 
@@ -37,12 +42,12 @@ TABLE_2 = np.array(
     [[TOLD[f"{angle}_{n}"].published for angle in ("ra", "dec", "roll")] for n in range(1, 5)], dtype=float
 )
 NIGHT = {"background": "[{kind: sky, mag_arcsec2: 21}]"}  # "very clear and dark"
-FITTED_DECENTRING = 0.0018  # sqrt(p1^2 + p2^2), uncalibrated: some 0.4 px at the chip's corner
-FITTED_JITTER = "[{kind: line, frequency_hz: 1, rms_arcsec: [22, 22, 22]}]"  # a floor under heavy machines
+FITTED_DECENTRING = 0.0018  # sqrt(p1^2 + p2^2), uncalibrated: about 0.4 px at the detector's corner
+FITTED_JITTER = "[{kind: line, frequency_hz: 1, rms_arcsec: [22, 22, 22]}]"  # a vibrating floor
 
 
 def itrs_from_icrs(local: datetime.datetime) -> Rotation:
-    """The Earth's attitude: precession, nutation, turning (SOFA's c2t06a); polar motion is left out."""
+    """The Earth's attitude: precession, nutation and rotation (SOFA's c2t06a); polar motion is neglected."""
     j2000, days = (
         erfa.DJ00,
         (local + UTC_LESS_LOCAL - datetime.datetime(2000, 1, 1, 12)) / datetime.timedelta(1),
@@ -52,22 +57,23 @@ def itrs_from_icrs(local: datetime.datetime) -> Rotation:
 
 
 def cam_from_itrs() -> Rotation:
-    """The tripod: fitted, three numbers, so that the middle of the table's rows is met at the middle of their times."""
+    """Attitude of the camera on its tripod, fitted so that the mean of the table's rows is met at their mean time."""
     ra_deg, dec_deg, roll_deg = TABLE_2.mean(axis=0)
     middle = LOCAL[0] + sum((at - LOCAL[0] for at in LOCAL), datetime.timedelta()) / len(LOCAL)
     return stars.cam_from_icrs(ra_deg, dec_deg, -roll_deg) * itrs_from_icrs(middle).inv()
 
 
 def their_angles_deg(cam_from_icrs: Rotation) -> Floats:
-    """(3,) right ascension, declination, roll as in Table 2: the roll of eq. 5 is minus ours."""
+    """(3,) right ascension, declination, roll in degrees as in Table 2; the roll of eq. 5 is minus ours."""
     ra, dec, roll = np.degrees(ra_dec_roll_rad(cam_from_icrs))
     return np.array([(ra + 180) % 360 - 180, dec, -roll])
 
 
 class Evening(NamedTuple):
-    """Frames and what became of them: times (N,), angles as in the table (N, 3), true ones, and the error's angle.
+    """Solutions of N frames.
 
-    local : (N,);  told_deg, true_deg : (N, 3), told NaN where refused;  off_rad : (N,) NaN likewise
+    local : (N,) local times;  told_deg, true_deg : (N, 3) estimated and true angles as in Table 2
+    off_rad : (N,) error angle. Estimates and errors are NaN for unsolved frames.
     """
 
     local: list[datetime.datetime]
@@ -81,14 +87,14 @@ class Evening(NamedTuple):
 
     @property
     def errors_arcsec(self) -> Floats:
-        """(M, 3) of those solved, about their mean: on the sky in right ascension and declination, and of the roll."""
+        """(M, 3) errors of the solved frames minus their mean: RA times cos(dec), declination, roll."""
         off = (self.told_deg - self.true_deg) * [np.cos(np.radians(TABLE_2[0, 1])), 1, 1]
         off = off[np.isfinite(off[:, 0])] * 3600
         return np.asarray(off - off.mean(axis=0))
 
 
 def as_they_had(towards_rad: float) -> dict[str, str]:
-    """Their lens decentred to one side, a tracker that does not know of it, and the vibration."""
+    """Overrides for the cause: decentering distortion that the tracker does not know, and vibration."""
     p1, p2 = FITTED_DECENTRING * np.array([np.sin(towards_rad), np.cos(towards_rad)])
     return {
         "camera.distortion": f"[0, 0, {p1:.9f}, {p2:.9f}, 0]",
@@ -98,7 +104,7 @@ def as_they_had(towards_rad: float) -> dict[str, str]:
 
 
 def photographed(overrides: dict[str, str], local: list[datetime.datetime], seed: int) -> Evening:
-    """A frame at each time from the standing camera, rendered as the Earth turns it, and solved."""
+    """Render and solve a frame at each time from the Earth-fixed camera."""
     lab = testbed.build_testbed(loader.load("ptase_2003", NIGHT | overrides))
     tracker, tripod = testbed.tracker(lab), cam_from_itrs()
     told, true, off = np.full((len(local), 3), np.nan), np.empty((len(local), 3)), np.full(len(local), np.nan)
@@ -115,11 +121,13 @@ def photographed(overrides: dict[str, str], local: list[datetime.datetime], seed
 
 
 def standing(lab: Testbed, cam_from_icrs: Rotation) -> Testbed:
-    """The lab about the first frame's exposure, whose middle has that attitude, on the turning Earth; and shaken."""
+    """Testbed with a motion around the first frame's exposure: the given attitude at mid-exposure, rotation at the
+    sidereal rate, and the scene's vibration."""
     when, rows = testbed.window(lab.scene, 0), lab.scene.camera.height_px
     t_s = np.linspace(when.open_s - SPARE_S, when.close_s(rows) + SPARE_S, KNOTS)
     middle = cam_from_icrs.inv() * lab.mount.cam_from_body
     earth_rad_s = 2 * np.pi * 1.00273781191135448 / erfa.DAYSEC
+    # The sky turns at the sidereal rate about the celestial pole, the z axis of ICRS (precession neglected).
     rate_body = earth_rad_s * middle.inv().apply([0.0, 0.0, 1.0])
     turned = Rotation.from_rotvec(np.outer(t_s - when.middle_s(rows), rate_body))
     path = Trajectory(t_s, middle * turned, np.tile(rate_body, (KNOTS, 1)))
@@ -128,7 +136,7 @@ def standing(lab: Testbed, cam_from_icrs: Rotation) -> Testbed:
 
 
 def ground(ask: Ask) -> Found:
-    """Eighteen attempts with a calibrated camera at rest; as many, of several lenses, as the paper's was."""
+    """Table 2: eighteen frames with a calibrated camera at rest, and as many with each of several decentered lenses."""
     rng = np.random.default_rng([ask.seed, 2003])
     between = [LOCAL[0] + n / 13 * (LOCAL[3] - LOCAL[0]) for n in range(ATTEMPTS - len(LOCAL))]
     local, lenses = LOCAL + between, ask.trials(10, 2)
@@ -153,7 +161,8 @@ def ground(ask: Ask) -> Found:
 
 
 def scatters(still: Evening, theirs: list[Evening]) -> dict[str, Answer]:
-    """Of each angle, and the mean size of the error; with the cause over lenses, whose frames share the optics."""
+    """Standard deviation of each angle, and mean error. The interval with the cause is over lenses, because the frames
+    of one lens share its distortion."""
     name, answers = "optics decentred and not calibrated, and vibration, fitted", {}
     for axis, what in enumerate(ANGLES):
         each = np.array([deviation(one.errors_arcsec[:, axis]) for one in theirs])
@@ -166,12 +175,12 @@ def scatters(still: Evening, theirs: list[Evening]) -> dict[str, Answer]:
 
 
 def deviation(values: Floats, axis: int = -1) -> Any:
-    """Standard deviation, n - 1."""
+    """Standard deviation (n - 1)."""
     return np.std(values, axis=axis, ddof=1)
 
 
 def rate(one: Evening) -> Summary:
-    """Slope of the right ascension, deg/min, with the interval of its residuals."""
+    """Least-squares slope of the right ascension, deg/min, with the 95 % interval from its residuals."""
     slope, scatter = np.polyfit(one.minutes, one.told_deg[:, 0], 1, cov=True)
     return Summary(
         slope[0],
@@ -182,7 +191,7 @@ def rate(one: Evening) -> Summary:
 
 
 def zenith_distance_deg(angles_deg: Floats) -> float:
-    """Of the boresight at the first row's time, from the site's vertical."""
+    """Zenith distance of the boresight at the first row's time, at the site."""
     latitude, longitude = np.radians(SITE_DEG)
     up = np.array(
         [np.cos(latitude) * np.cos(longitude), np.cos(latitude) * np.sin(longitude), np.sin(latitude)]
@@ -192,7 +201,7 @@ def zenith_distance_deg(angles_deg: Floats) -> float:
 
 
 def drawings(still: Evening, theirs: list[Evening]) -> tuple[Drawing, ...]:
-    """The table's right ascension, and the errors."""
+    """Figures: right ascension against time, and errors."""
     return (
         Drawing(
             "Right ascension of the standing camera against time: Table 2 on ours.",
@@ -207,7 +216,7 @@ def drawings(still: Evening, theirs: list[Evening]) -> tuple[Drawing, ...]:
 
 
 def draw_rate(fig: Any, still: Evening) -> None:
-    """Ours, the four, and the line."""
+    """Our right ascensions, the four published ones, and the sidereal line."""
     axes = fig.subplots()
     axes.plot(still.minutes, still.told_deg[:, 0], MARKS[0], color=INK[0], label="ours")
     axes.plot(still.minutes[:4], TABLE_2[:, 0], "*", ms=11, color=INK[1], label="published")
@@ -219,7 +228,7 @@ def draw_rate(fig: Any, still: Evening) -> None:
 
 
 def draw_errors(fig: Any, still: Evening, theirs: list[Evening]) -> None:
-    """All three angles by time."""
+    """Errors of all three angles against time."""
     panels = fig.subplots(3, 1, sharex=True)
     minutes = still.minutes[:4]
     published = (TABLE_2 - TABLE_2.mean(axis=0)) * 3600

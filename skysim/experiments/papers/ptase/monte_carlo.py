@@ -1,4 +1,9 @@
-"""PTASE's Monte Carlo simulation (Fialho & Saotome 2005, section 4, table 1): its engine, and the table done again."""
+"""PTASE's Monte Carlo simulation (Fialho & Saotome 2005, section 4, table 1).
+
+Each run draws a uniform random attitude, projects the catalog's stars into a field of 20 x 20 degrees, adds noise to
+their directions and magnitudes, and identifies them with one of the paper's four algorithm versions. Errors follow
+the paper's definitions (eqs. 7-9). No images are rendered.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +36,7 @@ from skysim.results.plots import INK, MARKS
 
 HALF_FIELD_TAN = float(np.tan(np.radians(10)))
 SIGMA_RAD, SIGMA_MAG = 3 * ARCSEC_RAD, 0.25
-TOLERANCE_RAD = 5 * SIGMA_RAD  # a star in 3e5 is farther off; what fails is the magnitudes' gate
+TOLERANCE_RAD = 5 * SIGMA_RAD  # one star in 3e5 is outside; failures are due to the magnitude gate
 DIAGONAL_RAD = 2 * np.arctan(np.sqrt(2) * HALF_FIELD_TAN)
 DOUBLES_RAD = 30 * ARCSEC_RAD
 FITTED_LIMIT_MAG, FITTED_GATE_SIGMAS = 5.1, 3.2
@@ -41,13 +46,13 @@ TABLE_1 = np.array(experiments()["ptase-table-1"].data["simulations"])
 
 
 def catalogue(limit_mag: float) -> PairIndex:
-    """Hipparcos by READCAT and PROC_CAT to a limit, doubles closer than 30 arcsec merged, with the field's pairs."""
+    """Hipparcos by READCAT and PROC_CAT to a limiting magnitude, doubles within 30 arcsec merged, with a pair index."""
     stars = ptase.proc_cat(ptase.read_cat(CATALOGUES / "hipparcos_hp6.5.ecsv", limit_mag), DOUBLES_RAD)
     return pair_index.build(stars.vectors, float(DIAGONAL_RAD), magnitude=stars.magnitude)
 
 
 def version(name: str) -> Rules:
-    """The rules of one of the paper's versions, as estimator.identification.published.fialho runs it."""
+    """Parameters of one of the paper's versions, as in estimator.identification.published.fialho."""
     asked = Options(epsilon_mag=SIGMA_MAG)
     falls_back = name in ("fialho_3", "fialho_4")
     part = SHARE_FALSE_STARS if falls_back else SHARE_BASIC
@@ -56,9 +61,9 @@ def version(name: str) -> Rules:
 
 @jit
 def simulate(known: PairIndex, by: Rules, runs: int, seed: int) -> tuple[Floats, Floats, Ints]:
-    """R_cam_from_icrs (runs, 3, 3) that was and that was found, NaN where refused; (runs,) stars seen.
+    """True and estimated R_cam_from_icrs (runs, 3, 3), the latter NaN if unsolved; (runs,) number of stars in view.
 
-    Attitudes are uniform: a quaternion of four normal numbers.
+    Attitudes are uniform over all rotations (see `_attitude`).
     """
     np.random.seed(seed)  # noqa: NPY002  (numba has no other generator that is seeded inside)
     truly, told = np.empty((runs, 3, 3)), np.full((runs, 3, 3), np.nan)
@@ -77,7 +82,7 @@ def simulate(known: PairIndex, by: Rules, runs: int, seed: int) -> tuple[Floats,
 
 @jit
 def _attitude() -> Floats:
-    """A rotation matrix uniform over all rotations."""
+    """A rotation matrix uniform over all rotations: its quaternion is a normalized vector of four normal numbers."""
     a, b, c, d = np.random.standard_normal(4)  # noqa: NPY002
     length = np.sqrt(a * a + b * b + c * c + d * d)
     a, b, c, d = a / length, b / length, c / length, d / length
@@ -90,11 +95,11 @@ def _attitude() -> Floats:
 
 @jit
 def _field(R: Floats, known: PairIndex) -> tuple[Floats, Floats]:
-    """PTASE's gen_sia_input2: the stars in the field with noise on their directions and magnitudes, brightest first."""
+    """PTASE's gen_sia_input2: noisy directions and magnitudes of the stars in the field, brightest first."""
     seen, light = np.empty((len(known.vectors), 3)), np.empty(len(known.vectors))
     least = 1 / np.sqrt(
         1 + 2 * HALF_FIELD_TAN**2
-    )  # the field's corner: most stars need no more than this product
+    )  # cosine to the field's corner: rejects most stars by their z alone
     count = 0
     for star in range(len(known.vectors)):
         u, v, w = known.vectors[star]
@@ -116,9 +121,10 @@ def _field(R: Floats, known: PairIndex) -> tuple[Floats, Floats]:
 
 
 class Errors(NamedTuple):
-    """(N,) of the runs that were answered, as the paper takes them (eqs. 7-9), arcsec; and the true angle.
+    """(N,) errors of the solved runs in arcsec, as the paper defines them (eqs. 7-9), and the rotation angle.
 
-    attitude : |M_true - M_est|, the Frobenius norm: sqrt(2) times the angle
+    attitude : |M_true - M_est|, Frobenius norm, sqrt(2) times the rotation angle for small angles
+    angle    : rotation angle of the error
     roll     : |phi_true - phi_est| of eq. 5's angle, which counts from north
     axis     : |Z_true - Z_est|
     """
@@ -130,7 +136,11 @@ class Errors(NamedTuple):
 
 
 def errors(truly: Floats, told: Floats) -> Errors:
-    """Of (N, 3, 3) attitude matrices. The image's x and y are eq. 5's, up to a turn that both have."""
+    """Errors of (N, 3, 3) attitude matrices.
+
+    The rotation angle is 2 arcsin(|M_est - M_true| / sqrt(8)). Our image axes differ from those of eq. 5 by a constant
+    rotation, which cancels in the roll error.
+    """
     norm = np.linalg.norm(told - truly, axis=(1, 2))
     turn = 2 * np.arcsin(np.minimum(norm / np.sqrt(8), 1))
     phi = [np.arctan2(R[:, 0, 2], R[:, 1, 2]) for R in (truly, told)]
@@ -143,7 +153,7 @@ def errors(truly: Floats, told: Floats) -> Errors:
 
 
 class Done(NamedTuple):
-    """Runs of one version: how many, how many were answered and wrongly so, and the errors of the right answers."""
+    """Runs of one version: number of runs, of solved ones, of wrong ones, and the errors of the correct solutions."""
 
     runs: int
     answered: int
@@ -152,7 +162,7 @@ class Done(NamedTuple):
 
 
 def runs_of(known: PairIndex, by: Rules, runs: int, seed: int) -> Done:
-    """As the paper counts: a wrong answer is a success."""
+    """Simulate and count. As in the paper, a wrong solution counts as solved."""
     truly, told, _ = simulate(known, by, runs, seed)
     answered = np.isfinite(told[:, 0, 0])
     all_of_them = errors(truly[answered], told[answered])
@@ -161,7 +171,7 @@ def runs_of(known: PairIndex, by: Rules, runs: int, seed: int) -> Done:
 
 
 def table_1(ask: Ask) -> Found:
-    """All four versions, and the second once more with a wider gate for magnitudes."""
+    """Table 1: all four versions, and the second with a wider magnitude gate as the cause."""
     known, done = catalogue(FITTED_LIMIT_MAG), {}
     seeds = np.random.default_rng([ask.seed, 1]).integers(2**31, size=len(VERSIONS) + 1)
     for n, (name, seed) in enumerate(zip(VERSIONS, seeds, strict=False)):
@@ -185,13 +195,13 @@ def table_1(ask: Ask) -> Found:
 
 
 def per_cent(done: Done) -> Summary:
-    """Success."""
+    """Success rate in percent."""
     value, low, high, runs = share(done.answered, done.runs)
     return Summary(100 * value, 100 * low, 100 * high, runs)
 
 
 def scatter(done: Done) -> dict[str, Answer]:
-    """The sd of a figure over simulations of a thousand runs: that of one run by the square root of a thousand."""
+    """Standard deviation of a simulation's mean over 1000 runs: that of one run divided by sqrt(1000)."""
     right, found = done.right, np.where(np.arange(done.runs) < done.answered, 100.0, 0.0)
     values: dict[str, Floats] = {
         "success": found,
@@ -203,12 +213,12 @@ def scatter(done: Done) -> dict[str, Answer]:
 
 
 def of_a_thousand(values: Floats, axis: int = -1) -> Any:
-    """Standard deviation of the mean of a simulation."""
+    """Standard deviation of the mean of SIMULATION_RUNS values."""
     return np.std(values, axis=axis, ddof=1) / np.sqrt(SIMULATION_RUNS)
 
 
 def drawings(done: dict[str, Done]) -> tuple[Drawing, ...]:
-    """What the paper logs, and its table."""
+    """Figures: histogram of the attitude error, and the simulations' means."""
     second = done["fialho_2"].right
     return (
         Drawing(
@@ -223,7 +233,7 @@ def drawings(done: dict[str, Done]) -> tuple[Drawing, ...]:
 
 
 def draw_histogram(fig: Any, right: Errors) -> None:
-    """Of the Frobenius norm, with the means of both."""
+    """Histogram of the Frobenius norm, with our mean and the published one."""
     axes, bins = fig.subplots(), np.arange(0, 25.5, 0.5)
     axes.hist(np.minimum(right.attitude, bins[-1]), bins, color=INK[0], alpha=0.5, label="ours")
     axes.axvline(right.attitude.mean(), color=INK[0], label=f"ours, mean {right.attitude.mean():.2f}")
@@ -234,7 +244,7 @@ def draw_histogram(fig: Any, right: Errors) -> None:
 
 
 def draw_simulations(fig: Any, done: dict[str, Done]) -> None:
-    """Mean attitude error by mean roll error."""
+    """Mean attitude error against mean roll error of each simulation."""
     axes = fig.subplots()
     for n, (name, one) in enumerate(done.items()):
         parts = max(1, one.runs // SIMULATION_RUNS)

@@ -1,4 +1,4 @@
-"""SHEFEX-2's ways through a frame, timed, and its exposure control in a loop of rendered frames (sections 3.1, 3.2)."""
+"""SHEFEX-2's two detection scans, timed, and its exposure control in closed loop (Samaan & Theil 2011, 3.1, 3.2)."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ THRESHOLD_SIGMA, MIN_AREA_PX = 5.0, 3
 
 
 def scans(ask: Ask) -> Found:
-    """Fig. 3: one pass with a sorted table against a pass for every object, on the same rendered frames."""
+    """Fig. 3: run time of a single pass with a sorted table against one pass per object, on the same frames."""
     images = [frame.image_dn for _, frame, _ in shots(at(50), 0.0, ask.trials(60, 8), ask.seed)]
     times_s = np.array(
         [[clocked(scan, image) for scan in (sequential_scan, maximum_scan)] for image in images]
@@ -53,7 +53,8 @@ def scans(ask: Ask) -> Found:
 
 
 def clocked(scan: Callable[..., Any], image: NDArray[Any]) -> float:
-    """Least seconds of some repeats: what else the machine does only adds."""
+    """Minimum run time of REPEATS repeats in seconds; other load on the machine can only lengthen a repeat."""
+    # Background noise from the median absolute deviation, 1.4826 MAD = sigma for a normal distribution.
     level, noise = float(np.median(image)), 1.4826 * float(np.median(np.abs(image - np.median(image))))
     spent_s = []
     for _ in range(REPEATS + 1):  # the first one compiles
@@ -64,7 +65,10 @@ def clocked(scan: Callable[..., Any], image: NDArray[Any]) -> float:
 
 
 def common(image: NDArray[Any], most: int) -> tuple[int, float]:
-    """How many objects the maximum search finds, so many at most, and the share that the sequential scan has too."""
+    """Number of objects that the maximum scan finds (at most `most`), and the overlap of both scans' objects.
+
+    The overlap is the intersection over the union of the sets of bounding boxes.
+    """
     found = [
         {tuple(box) for box in DETECTORS[name](image, THRESHOLD_SIGMA, MIN_AREA_PX, most).box_px.tolist()}
         for name in ("maximum", "sequential")
@@ -90,7 +94,7 @@ MEAN_DN, COARSE_DN = 150.0, 9.5  # the same light on 12 bits and on 8
 GLARE_E_S = 4e5
 PLANET_MAG = -4.0
 EDGE_PX = 20
-BLIND_FRAMES = 24  # 2 ms each from 10 ms: to the limit, and some at it
+BLIND_FRAMES = 24  # steps of 2 ms from 10 ms: reaches the limit and stays there for some frames
 REST = 4
 EIGHT_BITS = {
     "camera.detector.gain_e_dn": "157",
@@ -112,9 +116,9 @@ DISTURBED: dict[str, dict[str, Any]] = {
 
 
 class Loop:
-    """A camera at rest whose control tells the exposure of frame after frame.
+    """A camera at rest with closed-loop exposure control.
 
-    told : changes of the scene;  attitude : where it looks
+    told : overrides of the scene;  lab_from_body : its attitude;  start_ms : first exposure time
     """
 
     def __init__(self, told: dict[str, str], lab_from_body: Rotation, start_ms: int = 10) -> None:
@@ -124,7 +128,7 @@ class Loop:
         self.meter, self.frames = ExposureController(scene), 0
 
     def take(self, glare_e_s: float = 0.0, planets: int = 0) -> float:
-        """A frame with so much stray light and so many planets; the exposure that is asked for next, in ms."""
+        """Render a frame with stray light and planets; return the next commanded exposure time in ms."""
         here = self.lab
         if glare_e_s:
             glow = (*here.scene.background, UniformGlowConfig(kind="uniform", e_s=glare_e_s))
@@ -138,7 +142,7 @@ class Loop:
 
 
 def brightened(where: Testbed, count: int) -> Sources:
-    """The lights, with so many stars of those well on the chip as bright as a planet."""
+    """The light sources, with the `count` brightest stars well inside the detector raised to a planet's magnitude."""
     seen, size_px = exposure.render_frame(where, 0)[1].seen, np.array(where.canvas.shape[::-1])
     inside = np.all((seen.xy_px > EDGE_PX) & (seen.xy_px < size_px - EDGE_PX), axis=1)
     chosen = seen.id[inside][np.argsort(-seen.electrons[inside])[:count]]
@@ -148,14 +152,14 @@ def brightened(where: Testbed, count: int) -> Sources:
 
 
 def attitudes(count: int, seed: int) -> Rotation:
-    """lab_from_body, anywhere."""
+    """Uniform random lab_from_body."""
     return Rotation.random(count, rng=np.random.default_rng([seed, 3]))
 
 
 def rests_ms(told: dict[str, str], many: Rotation) -> Floats:
-    """Where the exposure comes to rest from 4 ms, in each field; 50 ms where it finds its limit.
+    """Steady-state exposure time from a start at 4 ms, for each attitude; 50 ms is the controller's limit.
 
-    Rest is three frames that change nothing.
+    Steady state means three frames without a change.
     """
     out = []
     for one in many:
@@ -167,17 +171,17 @@ def rests_ms(told: dict[str, str], many: Rotation) -> Floats:
 
 
 def run_ms(loop: Loop, frames: int, **cause: Any) -> list[float]:
-    """The exposures asked for after each of so many frames."""
+    """Commanded exposure times in ms after each of `frames` frames."""
     return [loop.take(**cause) for _ in range(frames)]
 
 
 def changes_ms(many: Rotation, cause: dict[str, Any]) -> Floats:
-    """By how much one frame with a cause changes an exposure of 40 ms, in each field."""
+    """Change of a 40 ms exposure after one frame with a disturbance, for each attitude, in ms."""
     return np.array([Loop(FULL_MOON, one, 40).take(**cause) - 40.0 for one in many])
 
 
 def control(ask: Ask) -> Found:
-    """Fig. 2: where the exposure rests, how it gets there, and what single causes change in a frame."""
+    """Fig. 2: steady-state exposure, the way to it, and the effect of single disturbances on one frame."""
     many = attitudes(ask.trials(40, 3), ask.seed)
     rest = {}
     for name, told in CAMERAS.items():
@@ -201,7 +205,7 @@ def control(ask: Ask) -> Found:
 
 
 def span(values: Floats) -> Summary:
-    """The mean, and from the least to the greatest."""
+    """The mean, with minimum and maximum as the interval."""
     return Summary(float(values.mean()), float(values.min()), float(values.max()), len(values))
 
 
@@ -216,7 +220,7 @@ STORY: tuple[tuple[str, int, dict[str, Any]], ...] = (
 
 
 def draw_control(where: Rotation, fig: Any) -> None:
-    """A story of what comes into the field, for the scene's 12 bits and for 8."""
+    """Exposure against frames for a sequence of disturbances (STORY), for the scene's 12 bits and for 8 bits."""
     axes, ends = fig.subplots(), np.cumsum([0, *(frames for _, frames, _ in STORY)])
     for n, (name, label) in enumerate((("ground", "ours, 12 bits"), ("8 bits", "ours, 8 bits"))):
         loop = Loop(CAMERAS[name], where)

@@ -1,4 +1,4 @@
-"""SHEFEX-2's on-board catalogues: counts, pairs, sky maps, evenness (Samaan & Theil 2011, section 3.3, figs 4, 5)."""
+"""SHEFEX-2's on-board catalogs: counts, pairs, sky maps, uniformity (Samaan & Theil 2011, section 3.3, figs 4, 5)."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ LEAST = 4
 
 
 def catalogues(ask: Ask) -> Found:
-    """What the paper counts, counted in ours; stars in a field at random attitudes; the two maps."""
+    """The paper's counts for our versions of its catalogs, stars in view at random attitudes, and two sky maps."""
     asymmetric, uniform, chosen = (listed(name) for name in ("asymmetric", "uniform", "chosen"))
     counts = in_fields((asymmetric, uniform), ask)
     bright = stars().id[stars().v_mag <= KEPT_MAG]
@@ -57,31 +57,34 @@ def catalogues(ask: Ask) -> Found:
 
 
 def between(known: StarCatalog, bright_mag: float, faint_mag: float) -> int:
-    """How many stars are fainter than one magnitude, and not than the other."""
+    """Number of stars with bright_mag < V <= faint_mag."""
     return int(np.sum((known.v_mag > bright_mag) & (known.v_mag <= faint_mag)))
 
 
 def pairs_of(known: StarCatalog) -> int:
-    """Pairs nearer than the printed diagonal."""
+    """Number of pairs closer than the field's printed diagonal."""
     return len(pair_index.build(known.vectors, float(PRINTED_FIELD_RAD)).pair)
 
 
 def in_fields(many: tuple[StarCatalog, ...], ask: Ask) -> Floats:
-    """(N, K) stars of each catalogue on the chip at N random attitudes."""
+    """(N, K) number of stars of each catalog on the detector at N random attitudes."""
     labs = [replace(lab(), sources=lab().sources.take(np.isin(lab().sources.id, one.id))) for one in many]
     attitudes = Rotation.random(ask.trials(2000, 300), rng=np.random.default_rng([ask.seed, 0]))
     return np.array([[len(trials.lights(one, each)[0]) for one in labs] for each in attitudes], float)
 
 
 def evenness(means: Floats) -> Floats:
-    """Variance over mean of the uniform catalogue's counts over the asymmetric one's; 1 is as uneven."""
+    """Index of dispersion (variance over mean) of the uniform catalog's counts, divided by the asymmetric one's.
+
+    means : (..., 4) mean counts of both catalogs, then mean squared counts
+    """
     mean, square = means[..., :2], means[..., 2:]
     index_of_spread = (square - mean**2) / mean
     return np.asarray(index_of_spread[..., 1] / index_of_spread[..., 0])
 
 
 def draw(known: StarCatalog, fig: Any) -> None:
-    """All the sky in Mollweide's projection, right ascension growing to the left; brighter stars larger."""
+    """Sky map in Mollweide projection, right ascension increasing to the left; brighter stars are larger."""
     axes = fig.add_subplot(projection="mollweide")
     x, y, z = known.vectors.T
     size = 0.6 + 1.6 * np.clip(6 - known.v_mag, 0, None)

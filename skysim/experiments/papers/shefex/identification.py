@@ -1,4 +1,9 @@
-"""SHEFEX-2's identifier: time, success, wrong names, attitude errors (Samaan & Theil 2011, section 3.4, figs 7-10)."""
+"""SHEFEX-2's star identification: time, success, false matches, attitude errors (Samaan & Theil 2011, 3.4, figs 7-10).
+
+Star positions at random attitudes get centroid noise and false stars ("spikes") and go through the paper's identifier
+and ESOQ2. The identifier's tolerance cosError (on cosines of angles) is varied. Run time is measured by the number of
+angles compared, which does not depend on the computer.
+"""
 
 from __future__ import annotations
 
@@ -37,14 +42,14 @@ AT = {float(one): n for n, one in enumerate(COS_ERRORS)}
 CENTROID_PX = (0.1, 0.2, 0.3)
 SPIKES, SPIKED = (0, 2, 4, 6, 8, 10), (4e-5, CHOSEN, 8e-5, 1.2e-4)
 ERRORS_PX = np.array([0.1, 0.2, 0.3, 0.45, 0.6, 0.8, 1.0])
-AT_LIMIT = 3  # 0.45 px among them
+AT_LIMIT = 3  # index of 0.45 px
 LIMIT_DEG = 0.1
-EQ3 = 2.47  # c of eq 3 that makes the chosen cosError of 0.2 px
-ASTRAY_RAD = np.radians(1.0)  # another place in the sky, not a bad attitude
+EQ3 = 2.47  # c of eq. 3 that gives the chosen cosError for 0.2 px
+ASTRAY_RAD = np.radians(1.0)  # a larger error is a false identification, not an inaccurate attitude
 
 
 class Tried(NamedTuple):
-    """One identification: what it took, 1 or 0 for right and wrong, (3,) errors pitch, yaw, roll in deg or NaN."""
+    """One identification: work, 1 or 0 for right and for wrong, (3,) errors about camera x, y, z in degrees or NaN."""
 
     work: float
     right: float
@@ -55,10 +60,10 @@ class Tried(NamedTuple):
 def attempt(
     field: Field, centroid_px: float, error: float, spikes: int, accept: float, rng: np.random.Generator
 ) -> Tried:
-    """Stars of a field with noise, among as many spikes, through the identifier and ESOQ2.
+    """Identify noisy stars of a field among spikes, and solve with ESOQ2.
 
-    At most 15 lights, the stars in the order of brightness and the spikes as bright as any. Work is angles: those
-    that candidates are compared in, and three of every triangle that is looked at.
+    At most 15 lights are used: stars in the order of brightness, with spikes inserted at random ranks. Work is the
+    number of compared angles: those of candidates, and three for each triangle tested.
     """
     camera = onboard_model.calibration(lab().scene.camera)
     xy_px = field.xy_px + centroid_px * rng.standard_normal(field.xy_px.shape)
@@ -84,11 +89,11 @@ def attempt(
 
 
 class Curves(NamedTuple):
-    """What was run on N attitudes.
+    """Results for N attitudes. The paper accepts a match with a fourth star; our rule requires significance.
 
     work, right : (centroid errors, cosErrors, N) by the paper's rule; careful : right by our rule at 0.2 px
     wrong, strict : (spikes, cosErrors of SPIKED, N) by the paper's rule, (spikes, N) by ours, both at 0.2 px
-    off_deg     : (centroid errors of ERRORS_PX, N, 3);  enough : (N,) whether four stars are on the chip
+    off_deg     : (centroid errors of ERRORS_PX, N, 3);  enough : (N,) whether four stars are on the detector
     """
 
     work: Floats
@@ -101,7 +106,8 @@ class Curves(NamedTuple):
 
 
 class Sky:
-    """The attitudes of an experiment; each has its own noise, the same at every point of a curve."""
+    """The attitudes of an experiment. Each has its own noise seed, the same at every point of a curve, so that points
+    differ by their parameters only."""
 
     def __init__(self, ask: Ask, count: int, points: int) -> None:
         self.seen, self.seed = fields(count, ask.seed), ask.seed
@@ -110,7 +116,7 @@ class Sky:
     def through(
         self, centroid_px: float, error: float, spikes: int = 0, accept: float = FOURTH_STAR
     ) -> dict[str, Floats]:
-        """All attitudes at one point, by the names of `Tried`."""
+        """Results of all attitudes at one point of a curve, as arrays by the field names of `Tried`."""
         told = [
             attempt(field, centroid_px, error, spikes, accept, np.random.default_rng([self.seed, 1, n]))
             for n, field in enumerate(self.seen)
@@ -121,7 +127,7 @@ class Sky:
 
 
 def run(ask: Ask) -> Curves:
-    """All curves."""
+    """Compute all curves."""
     careful = ACCEPT_LOG10_CHANCE
     points = 4 * len(COS_ERRORS) + len(SPIKES) * (len(SPIKED) + 1) + len(ERRORS_PX)
     sky = Sky(ask, ask.trials(1000, 60), points)
@@ -138,12 +144,12 @@ def run(ask: Ask) -> Curves:
 
 
 def eq3(centroid_px: float, factor: float) -> float:
-    """cosError of a centroid error with the paper's field and angle a pixel."""
+    """cosError by eq. 3 for a centroid error, with the paper's field of view and angle per pixel."""
     return cos_error(PRINTED_FIELD_RAD, centroid_px * PIXEL_RAD, factor)
 
 
 def figures(ask: Ask) -> Found:
-    """Figs 7 to 10, the choice of cosError, and the equations that lead to it."""
+    """Figs 7 to 10, the choice of cosError, and the equations it is based on."""
     curves = run(ask)
     answers = of_time(curves) | of_success(curves) | of_wrong(curves) | of_attitude(curves)
     answers |= of_equations(np.random.default_rng([ask.seed, 2]))
@@ -161,7 +167,7 @@ def figures(ask: Ask) -> Found:
 
 
 def of_time(curves: Curves) -> dict[str, Answer]:
-    """A minimum, and where it is: the curves' ends over it, and how far it moves."""
+    """Fig. 7: the ends of the curves relative to their minimum, and how far the minimum moves with centroid error."""
     low = [of_means(work.T, lambda m: m[..., 0] / m.min(axis=-1)) for work in curves.work]
     high = [of_means(work.T, lambda m: m[..., -1] / m.min(axis=-1)) for work in curves.work]
     sharp, blurred = curves.work[0].T, curves.work[-1].T
@@ -179,7 +185,7 @@ def of_time(curves: Curves) -> dict[str, Answer]:
 
 
 def of_success(curves: Curves) -> dict[str, Answer]:
-    """That it rises, which curve is above, and what the choice gives."""
+    """Fig. 8: rise with cosError, order of the curves, and the success rate at the chosen cosError."""
     chosen, four = curves.right[1, AT[CHOSEN]], curves.enough
     rise = chosen - curves.right[1, AT[1e-5]]
     above = curves.right[0, AT[2e-5]] - curves.right[2, AT[2e-5]]
@@ -194,7 +200,7 @@ def of_success(curves: Curves) -> dict[str, Answer]:
 
 
 def of_wrong(curves: Curves) -> dict[str, Answer]:
-    """That it rises with spikes and with cosError, and how low it is at the chosen one."""
+    """Fig. 9: rise with the number of spikes and with cosError, and the rate at the chosen cosError."""
     more = curves.wrong[-1, -1] - curves.wrong[0, -1]
     wider = curves.wrong[-1, -1] - curves.wrong[-1, 0]
     at = SPIKED.index(CHOSEN)
@@ -207,7 +213,7 @@ def of_wrong(curves: Curves) -> dict[str, Answer]:
 
 
 def of_attitude(curves: Curves) -> dict[str, Answer]:
-    """Errors at 0.45 px, and where yaw passes the limit as rms and as twice that."""
+    """Fig. 10: errors at 0.45 px, and the centroid error at which yaw exceeds the limit, as rms and as 2 sigma."""
     yaw, cross = curves.off_deg[:, :, 2].T, np.hypot(curves.off_deg[:, :, 0], curves.off_deg[:, :, 1]).T
     here, square = yaw[:, [AT_LIMIT]], yaw**2
 
@@ -230,7 +236,7 @@ def of_attitude(curves: Curves) -> dict[str, Answer]:
 
 
 def passes(times: float, squares: Floats) -> Floats:
-    """The centroid error in px at which so many times the rms is the limit; the last one where it never is."""
+    """Centroid error in px at which `times` times the rms reaches the limit; the largest one if it never does."""
     yaw_deg = times * np.sqrt(squares)
     rows = yaw_deg.reshape(-1, yaw_deg.shape[-1])
     found = [np.interp(LIMIT_DEG, row, ERRORS_PX) for row in rows]
@@ -238,7 +244,7 @@ def passes(times: float, squares: Floats) -> Floats:
 
 
 def of_equations(rng: np.random.Generator) -> dict[str, Answer]:
-    """Eq. 1 by a search that finds nothing, eqs 3 and 4 by our k-vector's ranges, eq. 5 as printed and mended."""
+    """Eq. 1 by a search that finds nothing, eqs 3 and 4 by our k-vector's ranges, eq. 5 as printed and corrected."""
     answers = {f"c_{n}": Answer(exact(CHOSEN / eq3(one, 1.0))) for n, one in enumerate(CENTROID_PX, 1)}
     answers |= {f"gate_{name}": Answer(exact(gate_deg(angle))) for name, angle in GATES.items()}
     answers["triangles"] = Answer(exact(triangles(rng)))
@@ -252,14 +258,14 @@ GATES = {"2": 2.0, "5": 5.0, "10": 10.0, "18": 18.4}
 
 
 def gate_deg(angle_deg: float) -> float:
-    """Half the width of the catalogue's angles that the k-vector search returns for one: eqs 4 and 5 mended."""
+    """Half the range of catalog angles that a k-vector search returns for an angle, degrees (eqs 4, 5 corrected)."""
     known = pairs()
     low, high = pair_index.between(known, *gate(np.radians(angle_deg), CHOSEN))
     return float(np.degrees(known.angle_rad[high - 1] - known.angle_rad[low]) / 2)
 
 
 def triangles(rng: np.random.Generator) -> int:
-    """How many base triangles a search goes through for 15 spikes that are no stars."""
+    """Number of base triangles that a search tests for 15 spikes."""
     camera, tried = onboard_model.calibration(lab().scene.camera), np.zeros(3, np.int64)
     rays = camera.rays(rng.random((MOST, 2)) * [camera.width_px, camera.height_px] - 0.5)
     none = Rules(CHOSEN, slack_rad(pairs(), CHOSEN), UNLIMITED, UNLIMITED, MOST, -np.inf)
@@ -268,7 +274,8 @@ def triangles(rng: np.random.Generator) -> int:
 
 
 def eq5(rng: np.random.Generator, count: int = 2000) -> tuple[int, int]:
-    """Of so many measured pairs: upper indices beyond the k-vector as printed; true pairs not in the mended range."""
+    """Test eq. 5 on `count` measured pairs: number of upper indices outside the k-vector with the printed equation, and
+    number of true pairs outside the range with the corrected one."""
     cosines = np.sort(np.cos(pairs().angle_rad))
     kvector, slope, offset = pair_index.line(cosines)
     true = rng.integers(0, len(cosines), count)
@@ -334,10 +341,10 @@ def draw_attitude(curves: Curves, fig: Any) -> None:
 
 
 def sigmas(times: float, squares: Floats) -> Floats:
-    """So many times the root of the one mean square."""
+    """`times` times the root of the mean square in the first column."""
     return np.asarray(times * np.sqrt(squares[..., 0]))
 
 
 def shares(rows: Floats) -> list[Summary]:
-    """A share for each row of ones and noughts."""
+    """Fraction of ones with its interval, for each row."""
     return [share(row.sum(), len(row)) for row in rows]

@@ -1,4 +1,8 @@
-"""SHEFEX-2's night sky tests, end to end on rendered frames (Samaan & Theil 2011, sections 4 and 5)."""
+"""SHEFEX-2's night-sky tests, end to end on rendered frames (Samaan & Theil 2011, sections 4 and 5).
+
+Frames at random attitudes of the northern sky, with moonlit sky and atmospheric absorption or in space, go through
+the paper's processing chain and through our default one. Varied: exposure time, rotation rate, focus.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +33,7 @@ FROM_MOON_DEG = 30.0
 SKY = "{kind: sky, mag_arcsec2: 20}"
 MOON = "{kind: moon, ra_deg: 90, dec_deg: 20, phase_angle_deg: 0, moon_zenith_deg: 40, field_zenith_deg: 30}"
 ONE = {"exposure.first": "10 ms", "exposure.frames": "1"}
-AIR = {"camera.transmission": "0.595"}  # 30 per cent less than the scene's 0.85
+AIR = {"camera.transmission": "0.595"}  # 30 % less than the scene's 0.85
 MOONLESS, FULL_MOON = AIR | {"background": f"[{SKY}]"}, AIR | {"background": f"[{SKY}, {MOON}]"}
 NORTH_DEG = (8.0, 90.0)  # declinations that culminate above 45 deg at Bremen
 RATES, QUICK_RATES = (0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0), (0.0, 2.0, 4.0, 5.0)
@@ -39,9 +43,9 @@ CATALOGUE = "uniform"  # "processed using the uniform Hipparcos catalog"
 
 
 class Tally(NamedTuple):
-    """What came of N frames: (N,) rightly named, wrongly named, centroids, by the paper's chain at 5 sigma.
+    """Results of N frames, each (N,): solved correctly, solved wrongly, number of centroids, by the paper's chain.
 
-    low : rightly named by it at LOW_SIGMA;  ours : by our default chain
+    low : solved correctly by it with a threshold of LOW_SIGMA in place of SIGMA;  ours : by our default chain
     """
 
     right: Floats
@@ -63,7 +67,7 @@ class Tally(NamedTuple):
 def shots(
     told: dict[str, str], rate_deg_s: float, count: int, seed: int
 ) -> Iterator[tuple[Bench, Frame, Truth]]:
-    """Frames at random attitudes of the northern sky, none near the Moon; the same attitudes at every rate."""
+    """Yield frames at random attitudes of the northern sky, not near the Moon; the same attitudes for every rate."""
     where = testbed.build_testbed(load("shefex2", ONE | told))
     ready = Bench(
         where,
@@ -83,7 +87,7 @@ def shots(
 
 
 def tally(told: dict[str, str], rate_deg_s: float, count: int, seed: int) -> Tally:
-    """Frames through all chains."""
+    """Process frames with all chains."""
     rows = []
     for ready, frame, truth in shots(told, rate_deg_s, count, seed):
         theirs, lower = (
@@ -98,12 +102,12 @@ def tally(told: dict[str, str], rate_deg_s: float, count: int, seed: int) -> Tal
 
 
 def rightly(found: Rotation | None, truth: Truth) -> bool:
-    """Whether a frame is answered, and to ten arc-minutes."""
+    """Return True if a frame is solved with an error below ten arc-minutes."""
     return found is not None and not metrics.is_wrong(found, truth.cam_from_lab)
 
 
 def nights(ask: Ask) -> Found:
-    """Success at rest, from 35 to 50 ms and in space; against the rate; out of focus; and what needs no night."""
+    """Success rates at rest (35 to 50 ms, in space), against the rate, and out of focus; and the camera's optics."""
     rates, space = (QUICK_RATES, QUICK_RATES[:1]) if ask.quick else (RATES, SPACE_RATES)
     wanted: dict[str, tuple[dict[str, str], float]] = {
         **{f"ground {rate:g}": (FULL_MOON | at(50), rate) for rate in rates},
@@ -128,7 +132,7 @@ def nights(ask: Ask) -> Found:
 
 
 def of_nights(came: dict[str, Tally]) -> dict[str, Answer]:
-    """What the frames say to the statements of sections 4 and 5."""
+    """Answers from the frames to the statements of sections 4 and 5."""
     blurred, half, still = came["defocus"], came["half defocus"], came["ground 0"]
     dark = f"without the Moon {came['moonless'].share.value:.2f}"
     seen = came["40 ms"].centroids
@@ -171,7 +175,7 @@ def draw_rates(came: dict[str, Tally], fig: Any) -> None:
 
 
 def draw_frame(seed: int, fig: Any) -> None:
-    """The first frame that the paper's chain names at least eight stars in, or the last of forty."""
+    """Draw the first frame in which the paper's chain identifies at least eight stars, or the last of forty."""
     axes = fig.subplots()
     for ready, frame, _ in shots(FULL_MOON | at(40), 0.0, 40, seed):
         found = chain(CATALOGUE, SIGMA, ready.lab.scene.camera.focal_px).solve(frame.image_dn)

@@ -1,4 +1,4 @@
-"""SHEFEX-2's camera as it is rendered: field, smear, what smear takes of the peak, defocus, the focal length found."""
+"""SHEFEX-2's camera as rendered: field of view, smear length, peak loss by smear, defocus, calibrated focal length."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ EXPOSURE_S = 0.05
 
 
 def answers(ask: Ask) -> dict[str, Answer]:
-    """All that needs no night."""
+    """Answers that need no night-sky frames."""
     horizontal, vertical, diagonal = field_deg(onboard_model.calibration(lab().scene.camera))
     out = {
         "field_h": Answer(exact(horizontal)),
@@ -52,7 +52,7 @@ def answers(ask: Ask) -> dict[str, Answer]:
 
 
 def field_deg(camera: Camera) -> tuple[float, float, float]:
-    """The angles between the middles of opposite edges, and of opposite corners, of the chip's own border."""
+    """Horizontal, vertical and diagonal field of view in degrees, between the detector's outer edges and corners."""
     right, bottom = camera.width_px - 0.5, camera.height_px - 0.5
     x, y = camera.centre_px
     ends = [[(-0.5, y), (right, y)], [(x, -0.5), (x, bottom)], [(-0.5, -0.5), (right, bottom)]]
@@ -62,7 +62,7 @@ def field_deg(camera: Camera) -> tuple[float, float, float]:
 
 @cache
 def ground() -> Testbed:
-    """The camera under an atmosphere that absorbs 30 per cent."""
+    """The camera below an atmosphere that absorbs 30 %."""
     through = 0.7 * lab().scene.camera.transmission
     return testbed.build_testbed(load("shefex2", {"camera.transmission": str(through)}))
 
@@ -71,14 +71,16 @@ def light(
     where: Testbed, exposure_s: float, rate_deg_s: float = 0.0, place_rad: tuple[float, float] = (0.0, 0.0),
     towards_rad: float = 0.0,
 ) -> Floats:  # fmt: skip
-    """(H, W) mean electrons of the catalogue's brightest star alone, noise-free, turning across the boresight.
+    """(H, W) noise-free electrons of the catalog's brightest star alone, with the camera rotating across the boresight.
 
-    place_rad : how far the star is off the boresight, to the right and down, at mid-exposure
+    place_rad : offset of the star from the boresight, right and down, at mid-exposure
+    towards_rad : direction of the rotation axis, from camera x towards y
     """
     brightest = where.sources.take(np.array([np.argmax(where.sources.strength)]))
     towards_star = brightest.place[0, :3]
     roll = Rotation.align_vectors([[0.0, 0.0, 1.0]], [towards_star])[0]
     cam_from_lab = Rotation.from_rotvec([-place_rad[1], place_rad[0], 0.0]) * roll
+    # A rate about an axis in the image plane moves the star along a straight line.
     rate_cam = np.radians(rate_deg_s) * np.array([np.cos(towards_rad), np.sin(towards_rad), 0.0])
     lab_from_body = cam_from_lab.inv() * where.mount.cam_from_body
     rate_body = where.mount.cam_from_body.inv().apply(rate_cam)
@@ -91,7 +93,7 @@ def light(
 
 
 def variance_px2(image: Floats) -> Floats:
-    """(2,) greatest and least variance of an image about its middle, along any direction."""
+    """(2,) largest and smallest variance of an image about its centroid (eigenvalues of its second moments)."""
     y, x = np.indices(image.shape)
     total = image.sum()
     off = np.stack([x - (image * x).sum() / total, y - (image * y).sum() / total])
@@ -100,15 +102,15 @@ def variance_px2(image: Floats) -> Floats:
 
 
 def smear_px(rate_deg_s: float) -> float:
-    """Length of a streak: the variance along a uniform line is L^2 / 12 more than of the star at rest."""
+    """Length L of a streak in pixels: smear along a line adds L^2 / 12 to the variance of the star at rest."""
     moved, still = (variance_px2(light(lab(), EXPOSURE_S, rate))[0] for rate in (rate_deg_s, 0.0))
     return float(np.sqrt(12 * (moved - still)))
 
 
 def peak_loss(rate_deg_s: float, count: int, seed: int) -> Answer:
-    """By how much the brightest pixel falls where the star is on its middle and moves along a row, in magnitudes.
+    """Loss of the brightest pixel by smear in magnitudes, for a star centered on a pixel and moving along a row.
 
-    The note has the mean over random places in the pixel and random directions.
+    The note gives the mean over random positions in the pixel and random directions.
     """
     rng, pixel_rad = np.random.default_rng([seed, 4]), 1 / lab().optics.camera.focal_px
     places = [((0.0, 0.0), np.pi / 2)]
@@ -124,7 +126,7 @@ def peak_loss(rate_deg_s: float, count: int, seed: int) -> Answer:
 
 
 def blur_px() -> float:
-    """Diameter of a star's disc with the chip 0.1 mm off the focus: a disc's variance along an axis is D^2 / 16."""
+    """Diameter D in pixels of a star's blur disc, 0.1 mm out of focus: a uniform disc adds D^2 / 16 per axis."""
     scene = load("shefex2", out_of_focus(DEFOCUS_M))
     disc, sharp = (
         variance_px2(light(one, EXPOSURE_S)).mean() for one in (testbed.build_testbed(scene), lab())
@@ -133,13 +135,16 @@ def blur_px() -> float:
 
 
 def out_of_focus(defocus_m: float) -> dict[str, str]:
-    """What puts the scene's chip so far behind where stars are sharp: the lens is focused at a finite distance."""
+    """Overrides that put the detector defocus_m behind the focus of stars: the lens is focused at a finite distance.
+
+    By the thin-lens equation, 1 / distance = 1 / f - 1 / (f + defocus).
+    """
     focal_m = lab().scene.camera.focal_length_m
     return {"camera.focus": f"{1 / (1 / focal_m - 1 / (focal_m + defocus_m)):.9g} m"}
 
 
 def focal_mm(ask: Ask) -> tuple[Summary, str]:
-    """The focal length that our star-field calibration finds for a lens of 24.95 mm that is sold as 25 mm."""
+    """Focal length in mm by our star-field calibration, of a 24.95 mm lens with a nominal 25 mm; with a note."""
     told = {"camera.focal_length": f"{FOUND_MM} mm", "exposure.time": "50 ms", "exposure.first": "10 ms"}
     where = testbed.build_testbed(load("shefex2", told | {"exposure.frames": "1"}))
     ready = Bench(where, testbed.tracker(where), FrameTrial(kind="frames"), "")

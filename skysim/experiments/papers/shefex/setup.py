@@ -1,4 +1,4 @@
-"""SHEFEX-2's hardware, catalogues and fields of stars, as its experiments share them (Samaan & Theil 2011)."""
+"""Camera, catalogs and star fields shared by SHEFEX-2's experiments (Samaan & Theil 2011)."""
 
 from __future__ import annotations
 
@@ -39,37 +39,37 @@ PRINTED_FIELD_RAD = np.radians(18.57)
 
 @cache
 def lab() -> Testbed:
-    """The scene's camera under the sky."""
+    """The scene's testbed."""
     return testbed.build_testbed(load("shefex2"))
 
 
 @cache
 def stars() -> StarCatalog:
-    """All that the simulator's own catalogue has, as the tracker reads it."""
+    """The simulator's full star catalog, as the tracker reads it."""
     return catalog.read(CATALOGUES / "hipparcos_hp6.5.ecsv")
 
 
 @cache
 def listed(name: str) -> StarCatalog:
-    """One of their catalogues: asymmetric, uniform or chosen."""
+    """One of the paper's catalogs: asymmetric, uniform or chosen."""
     return shefex.CATALOGUES[name](stars())
 
 
 def apparent(known: StarCatalog) -> Floats:
-    """(N, 3) where they are seen on the night of the scene."""
+    """(N, 3) apparent directions at the scene's start time."""
     return catalog.apparent(known, catalog.on_earth(lab().scene.start_time))
 
 
 @cache
 def pairs() -> PairIndex:
-    """The chosen catalogue's pairs within the field's diagonal."""
+    """Pair index of the chosen catalog, up to the field's diagonal."""
     return pair_index.build(
         apparent(listed("chosen")), onboard_model.calibration(lab().scene.camera).diagonal_rad
     )
 
 
 class Answered(NamedTuple):
-    """A frame through the paper's chain: its lights, which of them were named, the attitude or None."""
+    """Result of the paper's chain for a frame: its centroids, rows of the identified ones, the attitude or None."""
 
     centroids: Centroids
     observed: Ints
@@ -77,9 +77,9 @@ class Answered(NamedTuple):
 
 
 class Chain:
-    """The paper's computer: one scan, 15 centroids, triangles and pyramids at cosError 5.5e-5, ESOQ2.
+    """The paper's processing chain: sequential scan, 15 centroids, triangles and pyramids at cosError 5.5e-5, ESOQ2.
 
-    name : of its catalogue;  threshold_sigma : of the scan, in the frame's noise;  focal_px : as it was calibrated
+    name : of its catalog;  threshold_sigma : of the scan, in units of the frame's noise;  focal_px : calibrated
     """
 
     def __init__(self, name: str, threshold_sigma: float, focal_px: float) -> None:
@@ -95,7 +95,7 @@ class Chain:
         )
 
     def solve(self, image: NDArray[Any]) -> Answered:
-        """A frame, with the paper's own rule: a fourth star is success."""
+        """Solve a frame; by the paper's rule, a match with a fourth star is accepted."""
         try:
             seen = see(image, self.camera, self.settings, Clock())
         except ImageError:
@@ -113,25 +113,25 @@ class Chain:
 
 @cache
 def chain(name: str, threshold_sigma: float, focal_px: float) -> Chain:
-    """The chain with one of the catalogues."""
+    """The chain with one of the catalogs, cached."""
     return Chain(name, threshold_sigma, focal_px)
 
 
 def slack_rad(known: PairIndex, error: float) -> float:
-    """A direction's tolerance that goes with cosError: eq. 3 at the index's greatest angle turned round."""
+    """Angular tolerance that corresponds to cosError at the index's largest angle (inverse of eq. 3), rad."""
     wide = known.max_angle_rad
     return float(wide - np.arccos(min(np.cos(wide) + error, 1.0)))
 
 
 class Field(NamedTuple):
-    """The catalogue's stars on the chip at a random attitude: (N, 2) pixels, brightest first; the truth."""
+    """The catalog's stars on the detector at a random attitude: (N, 2) pixels, brightest first; the true attitude."""
 
     xy_px: Floats
     cam_from_ref: Rotation
 
 
 def fields(count: int, seed: int) -> list[Field]:
-    """Random attitudes over the whole sky, with the stars of the chosen catalogue as our optics places them."""
+    """Random attitudes over the whole sky, with the projected stars of the chosen catalog."""
     known = replace(lab(), sources=lab().sources.take(np.isin(lab().sources.id, listed("chosen").id)))
     out = []
     for lab_from_body in Rotation.random(count, rng=np.random.default_rng([seed, 0])):
@@ -142,7 +142,7 @@ def fields(count: int, seed: int) -> list[Field]:
 
 
 def line(axes: Any, x: Any, told: list[Summary], n: int, label: str) -> None:
-    """A curve of ours with its intervals; INK[1] is for what is published."""
+    """Plot a curve of ours with its intervals; INK[1] is reserved for published data."""
     value, low, high, _ = np.array(told).T
     ink = [one for one in INK if one != PUBLISHED][n]
     axes.errorbar(x, value, [value - low, high - value], marker=MARKS[n], color=ink, capsize=2, label=label)

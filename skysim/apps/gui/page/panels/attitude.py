@@ -1,4 +1,4 @@
-"""The attitude card: where the camera is (typed or moved), what the tracker says, by how much it is off; its stages."""
+"""Attitude card: true angles (editable), the tracker's angles, its error, and its algorithms by stage."""
 
 from __future__ import annotations
 
@@ -20,7 +20,10 @@ ASIDE = {"detector": "F6", "identifier": "F7"}
 
 
 class AttitudeCard:
-    """Three angles, the answer beside them, the error; four stages of the tracker."""
+    """True and estimated angles with the error, and one list of algorithms for each of the tracker's four stages.
+
+    foreign : whether the card shows an image that is not of the current scene
+    """
 
     def __init__(self, tab: Tab) -> None:
         self.tab, self.foreign = tab, False
@@ -44,37 +47,37 @@ class AttitudeCard:
             }
 
     def typed(self, n: int) -> ui.input:
-        """One angle."""
+        """Input field of one angle."""
         field = ui.input().props(f'dense outlined input-class="text-right" aria-label="angle {n + 1}"')
         return field.classes("mono").mark(f"angle-{n}").on("keydown.enter", self.point)
 
     def stage(self, name: str) -> ui.select:
-        """One stage's algorithm."""
+        """List of one stage's algorithms."""
         label = f"{name} {ASIDE[name]}" if name in ASIDE else name
         field = ui.select([], label=label, on_change=partial(self.choose, name))
         field.on("popup-hide", js_handler=keys.LEAVE)
         return field.props("dense outlined options-dense").mark(name)
 
     def set(self, setting: Setting) -> None:
-        """A scene was set up."""
+        """Take over a new scene: angle names and algorithms."""
         self.head(setting.names)
         for name, field in self.stages.items():
-            field.props["title"] = f"{name}: {setting.stages[name]}"  # the whole of a long name
+            field.props["title"] = f"{name}: {setting.stages[name]}"  # tooltip with the full name
             field.set_options(list(setting.choices[name]), value=setting.stages[name])
 
     def head(self, names: tuple[str, str, str]) -> None:
-        """What the three angles are."""
+        """Set the heads of the three angle columns."""
         for head, name in zip(self.heads, names, strict=True):
             head.set_text(f"{name}, deg")
 
     async def choose(self, stage: str) -> None:
-        """Another algorithm: the tracker is built anew, the lab stays."""
+        """Select an algorithm: the tracker is rebuilt, the rest of the scene is kept."""
         setting, value = self.tab.setting, self.stages[stage].value
         if setting and value and value != setting.stages[stage]:
             await self.tab.change({f"tracker.{stage}": value})
 
     async def point(self) -> None:
-        """Look where the three fields say."""
+        """Point the camera at the typed attitude."""
         self.tab.rest()
         self.tab.say("")
         try:
@@ -84,10 +87,10 @@ class AttitudeCard:
             return
         if await self.tab.show(self.tab.session.ask("point", angles, self.tab.solving)):
             for field in self.inputs:
-                field.run_method("blur")  # the arrow keys go on from there
+                field.run_method("blur")  # so that the arrow keys move the camera again
 
     def show(self, view: View) -> None:
-        """The newest look."""
+        """Display the newest frame's attitudes."""
         if self.foreign and self.tab.setting:
             self.foreign = False
             self.head(self.tab.setting.names)
@@ -97,7 +100,7 @@ class AttitudeCard:
         self.tell(view.answer)
 
     def show_photo(self, photo: Photo) -> None:
-        """A picture that is not the scene's at hand: of the user's nobody knows where it was taken."""
+        """Display the attitudes of an image that is not of the current scene; a user's image has no true attitude."""
         self.foreign = True
         self.head(photo.names)
         self.hint("unknown")
@@ -107,13 +110,13 @@ class AttitudeCard:
         self.tell(photo.answer)
 
     def hint(self, text: str) -> None:
-        """What stands in fields that are empty."""
+        """Set the placeholder of empty angle fields."""
         for field in self.inputs:
             field.props["placeholder"] = text
             field.update()
 
     def tell(self, answer: Answer | None) -> None:
-        """The tracker's answer, or that it was not asked."""
+        """Display the tracker's angles, errors and status; dashes without a solution."""
         if answer is None or answer.angles_deg is None:
             for label in (*self.estimates, *self.errors):
                 label.set_text("–")
@@ -134,16 +137,16 @@ class AttitudeCard:
 
 
 def degrees(angle: float) -> str:
-    """Four decimals; no minus zero."""
+    """Format with four decimals; adding 0.0 turns minus zero into zero."""
     return f"{round(angle, 4) + 0.0:.4f}"
 
 
 def verdict(answer: Answer | None) -> tuple[str, str]:
-    """A colour and a line: solved, refused, wrong, or not asked."""
+    """Style class and status line: solved, refused, wrong, or not asked."""
     if answer is None:
         return "quiet", "not asked: press 1 to identify"
     if not answer.solved:
         return "warn", f"{answer.status}; {len(answer.spots)} lights seen"
-    took = f", {answer.ms:.1f} ms" if answer.ms else ""  # of a trial done again nobody took the time
+    took = f", {answer.ms:.1f} ms" if answer.ms else ""  # a replayed trial has no time
     counts = f"{answer.identified} of {len(answer.spots)} lights named{took}"
     return ("bad", f"WRONG by more than 10′; {counts}") if answer.wrong else ("good", f"solved; {counts}")

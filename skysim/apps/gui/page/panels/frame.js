@@ -1,5 +1,5 @@
-// A frame and its marks on one canvas: unpacked off the page's thread, drawn together, so that a mark never stands
-// over another frame than its own. An <img> beneath an <svg> took the browser twice as long.
+// A frame and its marks on one canvas. The frame is decoded off the main thread and drawn together with its marks, so
+// that marks never appear on another frame. An <img> below an <svg> took the browser twice as long.
 export default {
   template: `<canvas role="img" @click="told" @mousemove="told" @mouseleave="told"></canvas>`,
   props: { look: Object }, // src: the frame's address; size: of the frame; marks: see overlay.py; label: in words
@@ -20,7 +20,7 @@ export default {
     },
   },
   methods: {
-    // Draw the newest look; one that is overtaken while its frame is fetched is drawn all the same, then the newest.
+    // Draw the newest look. If a newer one arrives while a frame is fetched, draw the fetched one first, then the newer.
     async renew() {
       if (this.fetching) return;
       this.fetching = true;
@@ -39,7 +39,7 @@ export default {
         this.fetching = false;
       }
     },
-    // A frame, unpacked; null where the server is gone or has newer ones only, and tells of them in a moment.
+    // Fetch and decode a frame; null if the server is unreachable or holds only newer frames, which it will announce.
     async fetched(src) {
       try {
         const answer = await fetch((window.path_prefix || "") + src);
@@ -48,7 +48,7 @@ export default {
         return null;
       }
     },
-    // The canvas has as many pixels as the screen gives it: a frame is scaled once.
+    // The canvas has the resolution of the screen, so that a frame is scaled only once.
     paint() {
       const canvas = this.$el, pen = this.pen;
       const wide = Math.round(canvas.clientWidth * devicePixelRatio);
@@ -57,10 +57,10 @@ export default {
       const { look, bitmap } = this.drawn;
       if (canvas.width !== wide || canvas.height !== high) {
         [canvas.width, canvas.height] = [wide, high];
-        this.$emit("sized", { wide }); // what is wider need not travel
+        this.$emit("sized", { wide }); // the server need not send wider images
       }
       pen.resetTransform();
-      pen.imageSmoothingEnabled = wide < bitmap.width; // enlarged, pixels are to be seen
+      pen.imageSmoothingEnabled = wide < bitmap.width; // enlarged frames show their pixels
       pen.drawImage(bitmap, 0, 0, wide, high);
       pen.scale(wide / look.size[0], high / look.size[1]);
       for (const mark of look.marks) {
@@ -69,7 +69,7 @@ export default {
         pen.setLineDash(mark.dash);
         pen.stroke(new Path2D(mark.path));
         pen.font = `${mark.font}px ui-monospace, monospace`;
-        for (const [x, y, name] of mark.names) { // on a ground of its own, to be read over a bright sky too
+        for (const [x, y, name] of mark.names) { // dark background, readable over a bright sky
           pen.fillStyle = "rgb(13 16 21 / 65%)";
           pen.fillRect(x, y - 0.8 * mark.font, 0.61 * mark.font * name.length, mark.font);
           pen.fillStyle = mark.ink;
@@ -79,7 +79,7 @@ export default {
       canvas.dataset.frame = look.src;
       canvas.ariaLabel = look.label;
     },
-    // Where the mouse is, in the frame's pixels from its corner.
+    // Report the mouse position in frame pixels from the frame's corner.
     told(event) {
       if (!this.drawn) return;
       const { clientWidth, clientHeight } = this.$el, [wide, high] = this.drawn.look.size;

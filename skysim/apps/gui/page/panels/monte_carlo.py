@@ -1,4 +1,4 @@
-"""Monte Carlo and studies: start, progress, stop; figures and histogram while they grow; a failed trial again."""
+"""Monte Carlo panel: start and stop studies, show statistics and histogram while they run, replay failed trials."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ KINDS = {"centroids": "centroids", "frames": "whole frames"}
 
 
 class TrialPanel:
-    """One study at a time in a tab."""
+    """Panel that runs one study at a time."""
 
     def __init__(self, tab: Tab) -> None:
         self.tab, self.trials, self.runs = tab, Trials(Path()), 0
@@ -79,7 +79,7 @@ class TrialPanel:
         self.list()
 
     def set(self) -> None:
-        """Another scene."""
+        """Take over a new scene."""
         options = {"": f"Monte Carlo of {Path(self.tab.scene).stem}"}
         options |= {
             path.stem: f"{path.stem}: {plan.title_of(path)}" for path in sorted(STUDIES.glob("*.yaml"))
@@ -89,17 +89,17 @@ class TrialPanel:
             self.field.set_value(round(self.tab.setting.field_deg, 3))
 
     def chosen(self) -> None:
-        """A study file has its own numbers."""
+        """Hide the Monte Carlo fields when a study file is chosen."""
         self.fields.set_visibility(not self.what.value)
 
     async def refield(self) -> None:
-        """Another field of view: another focal length."""
+        """Change the field of view, by the focal length."""
         setting = self.tab.setting
         if setting and self.field.value:
             await self.tab.refield(float(self.field.value))
 
     async def start_or_stop(self) -> None:
-        """The button."""
+        """Handle the button: start a study or stop the running one."""
         if self.trials.running:
             self.trials.stop()
             self.stopped = True
@@ -108,7 +108,7 @@ class TrialPanel:
         await self.start()
 
     async def start(self) -> None:
-        """Begin the study that is chosen."""
+        """Start the chosen study and wait for its end; resume it if its store exists."""
         if self.trials.running:
             return
         self.tab.say("")
@@ -134,7 +134,10 @@ class TrialPanel:
             self.ended("" if self.stopped else fault)
 
     def file(self) -> Path:
-        """The study file: one that is there, or Monte Carlo's, written; what was stopped goes on."""
+        """Path of the study file: the chosen one, or a new Monte Carlo study; a stopped one if it is unchanged.
+
+        Raises InputError for a wrong number of runs.
+        """
         if self.what.value:
             return STUDIES / f"{self.what.value}.yaml"
         trial: dict[str, Any] = {"kind": self.kind.value}
@@ -143,6 +146,7 @@ class TrialPanel:
         if not (self.count.value and 1 <= self.count.value <= 100_000):
             raise InputError("runs: allowed: 1 to 100000")
         told = self.tab.scene_path, self.tab.overrides, trial, int(self.count.value)
+        # A stopped run with unchanged settings is resumed from its own file.
         before = self.trials.folder / "monte_carlo.yaml"
         if self.stopped and before.is_file() and before.read_text() == monte_carlo(*told, self.runs):
             return before
@@ -153,7 +157,7 @@ class TrialPanel:
         return folder / "monte_carlo.yaml"
 
     def ended(self, fault: str) -> None:
-        """Say how it went."""
+        """Display the final result of a study, or its error."""
         self.button.set_text("Start")
         told = self.trials.tally()
         if told:
@@ -169,7 +173,7 @@ class TrialPanel:
         self.list()
 
     async def poll(self) -> None:
-        """Look into the store while it grows."""
+        """Read the store of a running study and display its results so far."""
         if self.trials.running:
             told = await run.io_bound(self.trials.tally)
             if told and self.trials.running:
@@ -177,7 +181,7 @@ class TrialPanel:
                 self.note.set_text(f"{told.done} of {self.trials.total} trials")
 
     def show(self, told: Tally) -> None:
-        """Figures and histogram."""
+        """Display statistics, histogram and failed trials."""
         self.bar.set_value(told.done / max(self.trials.total, 1))
         self.chart.options["xAxis"]["data"] = [digits(one) for one in told.bins]
         self.chart.options["series"][0]["data"] = list(told.counts)
@@ -203,7 +207,7 @@ class TrialPanel:
                     )
 
     async def replay(self, number: int) -> None:
-        """A failed trial's frame, in the sensor view."""
+        """Repeat a failed trial and show its frame in the sensor view."""
         study = next(iter(self.trials.folder.glob("*.yaml")), STUDIES / f"{self.what.value}.yaml")
         self.tab.rest()
         photo = await self.tab.ask(
@@ -215,7 +219,7 @@ class TrialPanel:
             self.tab.log(f"replayed trial {number}: {photo.answer.status}")
 
     def list(self) -> None:
-        """The reports that are there."""
+        """List the reports of finished studies."""
         self.reports.clear()
         with self.reports:
             found = finished(self.tab.out)
@@ -230,13 +234,13 @@ class TrialPanel:
 
 
 def named(folder: Path) -> str:
-    """A study's title where its file is beside its report, else its folder's name."""
+    """The study's title if its file is in the report's folder, else the folder's name."""
     file = next(iter(sorted(folder.glob("*.yaml"))), None)
     return (plan.title_of(file) if file else "") or folder.name
 
 
 def figure(value: float, low: float, high: float) -> str:
-    """A number with its interval."""
+    """Format a value with its interval."""
     if math.isnan(value):
         return "       –"
     told = f"{value:8.4g}"
@@ -244,7 +248,7 @@ def figure(value: float, low: float, high: float) -> str:
 
 
 def options() -> dict[str, Any]:
-    """A histogram of the angle of error."""
+    """ECharts options of the histogram of the error angle."""
     text = {"color": INK["quiet"], "fontSize": 10}
     return {
         "animation": False,

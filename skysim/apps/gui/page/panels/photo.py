@@ -1,4 +1,4 @@
-"""A picture of the user's own: dropped, or from a live camera; solved, annotated, or refused with the reason."""
+"""Image panel: solves an uploaded image or frames of a live camera; shows the solution or the reason for none."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ LIMIT_BYTES = 64 * 2**20
 
 
 class PhotoPanel:
-    """Drop, look, read."""
+    """Panel with upload area, live camera and result text."""
 
     def __init__(self, tab: Tab) -> None:
         self.tab, self.live, self.logged = tab, False, ""
@@ -49,7 +49,7 @@ class PhotoPanel:
         self.facts.mark("facts")
 
     async def dropped(self, event: Any) -> None:
-        """A file has come."""
+        """Solve an uploaded file."""
         data = await event.file.read()
         name = str(event.file.name)
         self.upload.reset()
@@ -63,13 +63,13 @@ class PhotoPanel:
         )
 
     def stop(self) -> None:
-        """No more of a live camera, once the frame at hand is done."""
+        """Stop the live camera after the current frame."""
         if self.live:
             self.live = False
             self.button.disable()
 
     async def watch(self) -> None:
-        """Frame after frame of a live camera, until pressed again."""
+        """Solve frames of a live camera until the button is pressed again or a frame fails."""
         if self.live:
             self.stop()
             return
@@ -80,7 +80,7 @@ class PhotoPanel:
             photo = await self.tab.ask("solve_camera", source, self.fov.value, {})
             if not self.tab.open_still:
                 return
-            if photo or not seen:  # what ends keeps its last answer
+            if photo or not seen:  # a camera that ends keeps its last result on the page
                 self.show("camera", photo)
             seen += 1
             self.live = self.live and photo is not None
@@ -90,14 +90,14 @@ class PhotoPanel:
         self.button.enable()
 
     def show(self, name: str, photo: Photo | None) -> None:
-        """The picture with its marks, and the numbers."""
+        """Display the image with its marks, and the solution."""
         if photo is None:
             self.say(self.tab.said if self.tab.said.startswith(name) else f"{name}: {self.tab.said}", "warn")
             return
         self.tab.sensor.show_photo(photo)
         self.tab.attitude.show_photo(photo)
         told = f"{name}: {photo.answer.status}"
-        if told != self.logged:  # a live camera's say the same again and again
+        if told != self.logged:  # log the repeated status of a live camera once
             self.logged = told
             self.tab.log(told)
         found = photo.solution
@@ -109,6 +109,6 @@ class PhotoPanel:
         self.say(f"{told}\n{where}\n{how}", "good")
 
     def say(self, text: str, ink: str) -> None:
-        """What came of the picture."""
+        """Set the result text."""
         self.facts.set_text(text)
         self.facts.classes(remove="quiet good warn", add=ink)

@@ -1,4 +1,4 @@
-"""A manoeuvre flown and played: real time or slower, with strip charts of what vehicle and tracker make of it."""
+"""Run panel: simulates the scene's motion and plays it at a chosen speed, with strip charts of errors and lights."""
 
 from __future__ import annotations
 
@@ -24,7 +24,12 @@ OFF = ("off what was asked", "IMU alone", "filter", "star tracker")
 
 
 class RunPanel:
-    """Fly, play, pause, seek."""
+    """Panel that simulates the motion, plays, pauses and seeks.
+
+    begun_s, from_s : monotonic time of the last start of playback, and the playback time there
+    came : by curve its points (t_s, value) from frames played so far
+    of, closed : scene with a closed loop, and its overrides then, so that an opened loop can be closed again
+    """
 
     def __init__(self, tab: Tab) -> None:
         self.tab, self.log = tab, FlightLog(())
@@ -55,7 +60,7 @@ class RunPanel:
         ui.timer(1 / 30, self.tick)
 
     def set(self) -> None:
-        """Another scene: nothing is flown yet."""
+        """Take over a new scene, which has no simulated motion yet."""
         self.pause()
         self.log, self.came, self.from_s = FlightLog(()), {}, 0.0
         self.play.disable()
@@ -69,7 +74,7 @@ class RunPanel:
         self.draw()
 
     async def close_loop(self) -> None:
-        """Another feedback is another scene. Who opens the loop can close it again, as it was steered before."""
+        """Reopen the scene with another feedback. An opened loop can be closed again with its old controller."""
         now, wanted = self.tab.feedback or "", str(self.loop.value or "")
         if self.of != self.tab.scene or wanted == now:
             return
@@ -77,14 +82,14 @@ class RunPanel:
         steered = {key: told for key, told in self.closed.items() if key.startswith(STEERED)}
         control = looped(self.tab.scene_path, {**kept, **steered}, wanted)
         flown = {key: told for key, told in steered.items() if key.startswith(STEERED[1]) and wanted}
-        self.loop.disable()  # one after the other
+        self.loop.disable()  # no second change while this one runs
         await self.tab.open(self.tab.scene, {**kept, **flown, **control})
         if self.tab.open_still:
-            self.loop.set_value(self.tab.feedback or "")  # where that was refused
+            self.loop.set_value(self.tab.feedback or "")  # the old value, if the scene refused the change
             self.loop.enable()
 
     async def begin(self) -> None:
-        """Fly from the start, or stop flying."""
+        """Simulate the motion from its start, then play it; if a simulation runs, stop it."""
         if self.flying:
             self.tab.session.halt()
             return
@@ -107,13 +112,13 @@ class RunPanel:
         self.start()
 
     def start(self) -> None:
-        """Play on."""
+        """Start or continue playback."""
         self.tab.photo.stop()
         self.playing, self.begun_s = True, time.monotonic()
         self.play.props("icon=pause")
 
     def toggle(self) -> None:
-        """Play or pause."""
+        """Play or pause; at the end, play again from the start."""
         if self.playing:
             self.pause()
             return
@@ -122,35 +127,35 @@ class RunPanel:
         self.start()
 
     def pause(self) -> None:
-        """Stay at this moment."""
+        """Pause at the current time."""
         self.from_s, self.playing = self.now_s, False
         self.play.props("icon=play_arrow")
 
     @property
     def now_s(self) -> float:
-        """Where in the flight the play is."""
+        """Current playback time, limited to the duration of the motion."""
         since = (time.monotonic() - self.begun_s) * self.factor if self.playing else 0.0
         return min(self.from_s + since, self.log.t_s[-1] if self.log.t_s else 0.0)
 
     def resync(self) -> None:
-        """Another speed from here on."""
+        """Continue from the current time at another speed."""
         if self.playing:
             self.from_s, self.begun_s = self.now_s, time.monotonic()
         self.factor = SPEEDS[str(self.speed.value)]
 
     async def sought(self, event: Any) -> None:
-        """Jump there."""
+        """Jump to the slider's time."""
         if not self.log.t_s:
             return
         self.from_s, self.begun_s = float(event.args), time.monotonic()
         await self.moment()
 
     def hold(self, event: Any) -> None:
-        """While the slider is in somebody's hand the play does not move it."""
+        """Note whether the user drags the slider; playback does not move it then."""
         self.held = event.args == "start"
 
     async def tick(self) -> None:
-        """The next moment, if the one before is on the screen."""
+        """Timer: update the progress bar, and show the next frame if the last one has been displayed."""
         if self.flying:
             self.bar.set_value(self.tab.session.share)
         if self.playing and not self.busy:
@@ -159,7 +164,7 @@ class RunPanel:
                 self.pause()
 
     async def moment(self) -> None:
-        """Show the flight as it is now."""
+        """Render and show the frame at the current playback time."""
         self.busy = True
         try:
             now_s = self.now_s
@@ -174,7 +179,7 @@ class RunPanel:
             self.busy = False
 
     def gather(self, view: View) -> None:
-        """Keep what came of a frame."""
+        """Append a frame's values to the curves."""
         answer = view.answer
         off = math.hypot(answer.cross_arcsec, answer.roll_arcsec) if answer and answer.solved else math.nan
         for name, value in (
@@ -188,7 +193,7 @@ class RunPanel:
         self.draw(view.t_s)
 
     def draw(self, now_s: float = 0.0) -> None:
-        """The strips, and where in them the play is."""
+        """Draw the strip charts with the playback time marked."""
         curves = [
             *((name, 0, self.came.get(name) or curve(self.log, name)) for name in OFF),
             *((name, 1, self.came.get(name, [])) for name in ("in the field", "named")),
@@ -211,7 +216,7 @@ class RunPanel:
         self.chart.update()
 
     def empty(self, strip: int) -> str:
-        """Why there is nothing in a strip."""
+        """The text of an empty strip: why it has no curve."""
         if not self.log.t_s:
             told = self.tab.setting
             return f"not flown yet: Fly flies {told.duration_s:.4g} s" if told and strip == 0 else ""
@@ -224,7 +229,7 @@ class RunPanel:
 
 
 def decades(values: list[float]) -> dict[str, float]:
-    """Whole decades around the values."""
+    """Axis limits: whole decades that contain the values."""
     positive = [one for one in values if one > 0] or [1.0]
     low, high = math.floor(math.log10(min(positive))), math.ceil(math.log10(max(positive)))
     return {"min": 10.0**low, "max": 10.0 ** max(high, low + 1)}
@@ -235,7 +240,7 @@ def curve(log: FlightLog, name: str) -> list[list[float]]:
 
 
 def line(name: str, strip: int, points: list[list[float]], ink: str) -> dict[str, Any]:
-    """A curve of one strip; what comes frame by frame is dots."""
+    """ECharts series of a curve in one strip; values that exist per frame are drawn as dots."""
     dots = name in ("star tracker", "innovation")
     return {
         **{"name": name, "type": "scatter" if dots else "line", "data": points, "xAxisIndex": strip},
@@ -245,7 +250,7 @@ def line(name: str, strip: int, points: list[list[float]], ink: str) -> dict[str
 
 
 def moment(strip: int, now_s: float) -> dict[str, Any]:
-    """A line upright in a strip at a moment."""
+    """ECharts series of a vertical line in a strip at a time."""
     look = {"color": INK["quiet"], "width": 1, "type": "solid"}
     at = {"silent": True, "symbol": "none", "animation": False, "label": {"show": False}, "lineStyle": look}
     marked = {"markLine": at | {"data": [{"xAxis": now_s}]}}
@@ -253,10 +258,10 @@ def moment(strip: int, now_s: float) -> dict[str, Any]:
 
 
 def options() -> dict[str, Any]:
-    """Four strips above one another, one time; each with its title, its legend, and why it is empty."""
+    """ECharts options of four stacked strips with a common time axis; each has a title, a legend and an empty text."""
     text, rule = {"color": INK["quiet"], "fontSize": 10}, {"lineStyle": {"color": INK["line"]}}
     plain = text | {"fontWeight": "normal", "fontSize": 11}
-    last, slot = len(STRIPS) - 1, 24.2  # per cent of the chart's height
+    last, slot = len(STRIPS) - 1, 24.2  # percent of the chart's height
     tops = [1 + n * slot for n in range(last + 1)]
     legend = {"textStyle": text, "itemWidth": 12, "itemHeight": 6, "itemGap": 8, "right": 10, "padding": 0}
     return {

@@ -1,4 +1,4 @@
-"""The scene as forms: every key with its unit, refused at the field where it is wrong, saved as a new file."""
+"""Scene panel: a form with all keys and units of the scene; errors appear at the field; saves a new scene file."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ if TYPE_CHECKING:
 
 
 class ScenePanel:
-    """Sections that open; what differs from the file is marked.
+    """Form with one expandable section per scene section; values that differ from the file are marked.
 
-    shown : the fields as the scene has them;  tried : by key what was typed and taken or refused
-    boxes, heads, entries : by key its row, its name there and what is typed in
+    shown : the fields as the scene has them;  tried : by key the last typed value, accepted or refused
+    boxes, heads, entries : by key its row, its label and its input element
     """
 
     def __init__(self, tab: Tab) -> None:
@@ -48,7 +48,7 @@ class ScenePanel:
         self.heads: dict[str, ui.label] = {}
 
     async def set(self) -> None:
-        """The fields of the scene at hand. What is open stays open, and what is being typed stays."""
+        """Show the fields of the current scene. Open sections stay open, and text being typed is kept."""
         fields = await run.io_bound(forms.fields, self.tab.scene, dict(self.tab.overrides))
         told = {field.key: field for field in fields}
         if self.scene == self.tab.scene and told.keys() == self.shown.keys():
@@ -61,7 +61,7 @@ class ScenePanel:
         self.filter()
 
     def build(self, told: Mapping[str, forms.Field]) -> None:
-        """All fields anew."""
+        """Rebuild all fields."""
         open_now = {name for name, one in self.opened.items() if one.value}
         self.sections.clear()
         for kept in (self.opened, self.tried, self.boxes, self.heads, self.entries):
@@ -76,7 +76,7 @@ class ScenePanel:
                             self.row(field)
 
     def row(self, field: forms.Field) -> None:
-        """One key."""
+        """Build the row of one key."""
         own = field.key.removeprefix(f"{field.section}.")
         with ui.row().classes("w-full no-wrap items-start gap-2") as box:
             head = ui.label(own).classes("mono w-48 flex-none ellipsis").style("padding-top: 6px")
@@ -96,11 +96,11 @@ class ScenePanel:
         self.boxes[field.key], self.entries[field.key], self.heads[field.key] = box, entry, head
 
     def ink(self, field: forms.Field) -> str:
-        """Changed, given by a file, or what stands in for it."""
+        """Style class of a key: changed here, set in a file, or default."""
         return "warn" if field.key in self.tab.overrides else "given" if field.given else "quiet"
 
     def renew(self, field: forms.Field, before: forms.Field) -> None:
-        """A field after another value was taken; what was typed since stays."""
+        """Update a field after the scene has changed; text typed since then is kept."""
         self.heads[field.key].classes(remove="warn given quiet", add=self.ink(field))
         if field.text != before.text and (not field.choices or field.text in field.choices):
             self.tried[field.key] = field.text
@@ -108,10 +108,10 @@ class ScenePanel:
             self.refuse(field.key, "")
 
     async def edit(self, key: str, *_: object) -> None:
-        """Take a value, or say at the field why not."""
+        """Apply a typed value, or show at the field why it is refused."""
         value, held = str(self.entries[key].value), self.shown[key].text
         if value == self.tried.get(key, held):
-            return  # Enter and then the leaving of a field tell the same
+            return  # leaving a field after Enter reports the same value again
         self.tried[key] = value
         self.refuse(key, "")
         if value == held:
@@ -123,11 +123,11 @@ class ScenePanel:
             self.refuse(key, str(error).replace(" (--set)", "").removeprefix(f"{key}: "))
             return
         await self.tab.change({key: value})
-        if self.tab.overrides.get(key) != value:  # the lab could not be built with it
+        if self.tab.overrides.get(key) != value:  # the scene could not be set up with it
             self.refuse(key, self.tab.said)
 
     def refuse(self, key: str, why: str) -> None:
-        """Say at a field what is wrong with it, or that nothing is."""
+        """Show an error message at a field; an empty one removes it."""
         entry = self.entries[key]
         if why:
             entry.props("error").props["error-message"] = why
@@ -136,7 +136,7 @@ class ScenePanel:
         entry.update()
 
     def filter(self) -> None:
-        """Only keys with these letters, and sections with such keys."""
+        """Show only keys that contain the search text, and sections with such keys."""
         letters = (self.find.value or "").lower()
         for key, box in self.boxes.items():
             box.set_visibility(letters in key.lower())
@@ -146,14 +146,14 @@ class ScenePanel:
         self.none.set_visibility(not found)
 
     def search(self) -> None:
-        """Filter, and open the first section that has such a key."""
+        """Filter, and open the first section with a matching key if none is open."""
         self.filter()
         first = next((one for one in self.opened.values() if one.visible), None)
         if self.find.value and first and not any(one.value and one.visible for one in self.opened.values()):
             first.open()
 
     async def save(self) -> None:
-        """A new file beside where the server was begun."""
+        """Save the scene as a new file in the tab's folder."""
         name = (self.name.value or "").strip()
         known = self.tab.setting.title.removesuffix(", changed") if self.tab.setting else ""
         title = f"{known}, changed" if known else name
@@ -170,6 +170,6 @@ class ScenePanel:
         self.tab.say(f"saved as {path.name}", "good")
 
     async def revert(self) -> None:
-        """The scene as its file has it."""
-        self.scene = ""  # what was refused goes too
+        """Reopen the scene without overrides."""
+        self.scene = ""  # forces a rebuild, which removes refused values too
         await self.tab.open(self.tab.scene)

@@ -1,4 +1,4 @@
-"""The sensor view: the newest frame with its marks, a star's pixels enlarged, what the mouse is over."""
+"""Sensor view: the newest frame with its marks, enlarged pixels of a star, and data on what is under the mouse."""
 
 from __future__ import annotations
 
@@ -22,18 +22,22 @@ if TYPE_CHECKING:
 ZOOM_PX = 160  # height of the enlarged pixels on the screen
 FIRST = "The first look on a machine takes up to a minute: the code is loaded and compiled, once."
 STRETCHES = list(stretch.CURVES)
-NUMBER = itertools.count(1)  # of frames, so that each has an address of its own
-FRAMES: dict[str, dict[int, bytes]] = {}  # by tab and number, the newest few
+NUMBER = itertools.count(1)  # of frames, so that each has its own address
+FRAMES: dict[str, dict[int, bytes]] = {}  # JPEG by tab and number, the newest KEPT
 KEPT = 3
-PATIENCE_S = 1.0  # with a browser that does not tell what it has drawn
+PATIENCE_S = 1.0  # for the browser to report a drawn frame
 
 
 class Canvas(ui.element, component="frame.js"):  # type: ignore[call-arg]
-    """A frame with its marks: frame.js."""
+    """Canvas with a frame and its marks, implemented in frame.js."""
 
 
 class Sensor:
-    """The view and its controls. What is shown is a look of the scene or a picture of the user's."""
+    """The view and its controls. It shows a frame of the scene, or another image such as a user's.
+
+    at : pixel under the mouse, or None;  fresh : whether the enlarged pixels are of the current frame
+    sent, came : number of the last frame sent to the browser, and of the last it reported as drawn
+    """
 
     def __init__(self, tab: Tab) -> None:
         self.tab = tab
@@ -41,9 +45,9 @@ class Sensor:
         self.lights: tuple[Light, ...] = ()
         self.answer: Answer | None = None
         self.size_px, self.prefix = (4, 3), "HIP"
-        self.facts = ""  # of the frame, told where the mouse is nowhere
+        self.facts = ""  # numbers of the frame, shown while the mouse is outside
         self.at: tuple[float, float] | None = None
-        self.fresh = False  # what is enlarged is of the frame that is shown
+        self.fresh = False
         self.sent = self.came = 0
         self.arrived = asyncio.Event()
         with ui.element("div").classes("lab-sensor"):
@@ -64,11 +68,11 @@ class Sensor:
         self.rest()
 
     def waiting(self, *lines: str) -> None:
-        """What the first frame is waiting for, or why there is none."""
+        """Show what the first frame waits for, or why there is none."""
         self.why.set_text("\n".join(lines))
 
     def bar(self) -> None:
-        """Overlays, stretch, brightness."""
+        """Build the controls: overlays, stretch, brightness."""
         with ui.element("div").classes("lab-bar"):
             for kind in overlay.KINDS:
                 box = ui.checkbox(kind, value=kind in self.shown).props("dense size=xs")
@@ -82,7 +86,7 @@ class Sensor:
             self.bright.classes("w-24").on("change", self.restretch)
 
     def rest(self) -> None:
-        """Nothing enlarged, nothing under the mouse."""
+        """Clear the enlarged pixels and the mouse position."""
         self.at, self.fresh = None, False
         self.magnified.set_content('<div class="lab-zoom">click a star: its pixels</div>')
         self.magnified.classes(remove="stale")
@@ -92,13 +96,13 @@ class Sensor:
         self.mark()
 
     async def restretch(self) -> None:
-        """Show the same frame otherwise."""
+        """Show the same frame with another stretch or brightness."""
         data = await self.tab.ask("show", self.stretch.value, 2.0 ** float(self.bright.value))
         if data:
             self.picture(data, self.size_px)
 
     def picture(self, data: bytes, size_px: tuple[int, int]) -> None:
-        """Put an image on the screen, as large as there is room for it."""
+        """Display an image, as large as the window allows."""
         if size_px != self.size_px:
             share = size_px[0] / size_px[1]
             self.canvas.style(f"width: min(100cqw, calc(100cqh * {share:.5f})); aspect-ratio: {share:.5f}")
@@ -113,18 +117,18 @@ class Sensor:
         self.mark()
 
     def drawn(self, event: Any) -> None:
-        """The browser has drawn a frame."""
+        """The browser reports a drawn frame."""
         self.came = int(event.args["src"].rpartition("/")[2])
         self.arrived.set()
 
     async def sized(self, event: Any) -> None:
-        """The screen has so many pixels for the picture."""
+        """The browser reports the width of the image on the screen; fit the image to it."""
         data = await self.tab.wait(self.tab.session.ask("fit", max(int(event.args["wide"]), 1)))
         if data:
             self.picture(data, self.size_px)
 
     async def ready(self) -> None:
-        """Wait until no more than one frame is on its way to the screen: more would but take the browser's time."""
+        """Wait until at most one frame is not drawn yet, so that frames do not queue up in the browser."""
         while self.sent > self.came + 1:
             self.arrived.clear()
             try:
@@ -133,7 +137,7 @@ class Sensor:
                 return
 
     def show(self, view: View) -> None:
-        """A look at the scene."""
+        """Show a frame of the scene."""
         self.lights, self.answer = view.lights, view.answer
         self.prefix = self.tab.setting.prefix if self.tab.setting else "HIP"
         self.facts = facts(view.size_px, view.facts, view.answer, view, self.tab.setting)
@@ -141,28 +145,28 @@ class Sensor:
         self.picture(view.jpeg, view.size_px)
 
     def show_photo(self, photo: Photo) -> None:
-        """A picture of the user's, or a study's trial."""
+        """Show a user's image or the frame of a study's trial."""
         self.lights, self.answer, self.prefix = photo.lights, photo.answer, photo.prefix
         self.facts = facts(photo.size_px, photo.facts, photo.answer)
         self.renewed()
         self.picture(photo.jpeg, photo.size_px)
 
     def renewed(self) -> None:
-        """What stands beneath the frame is told of the new one; what is enlarged is of an older one."""
+        """Update the text for a new frame, and mark the enlarged pixels as those of an older one."""
         self.tell()
         if self.fresh:
             self.fresh = False
             self.magnified.classes("stale")
 
     def tell(self) -> None:
-        """What is under the mouse, else the frame's own numbers."""
+        """Show data on what is under the mouse, or else the frame's numbers."""
         if self.at is None:
             self.hover.set_text(self.facts)
             return
         self.hover.set_text(self.told(*self.at, *self.nearest(*self.at)))
 
     def mark(self) -> None:
-        """Draw the marks anew."""
+        """Send the frame's address and its marks to the canvas."""
         self.canvas.props["look"] = {
             "src": f"/frame/{self.tab.id}/{self.sent}",
             "size": self.size_px,
@@ -172,16 +176,16 @@ class Sensor:
         self.canvas.update()
 
     def words(self) -> str:
-        """The view for who does not see it."""
+        """Text alternative of the view for screen readers."""
         known = [self.name(spot.id) for spot in self.answer.spots if spot.id >= 0] if self.answer else []
         return f"Sensor view: {len(self.lights)} true lights; named: {', '.join(known) or 'none'}"
 
     def name(self, id: int) -> str:
-        """A light by its name."""
+        """Name of a light by its number."""
         return NAMES.get(id, f"HIP {id}") if self.prefix == "HIP" else f"{self.prefix} {id}"
 
     async def mouse(self, event: Any) -> None:
-        """Tell what is under the mouse; a click enlarges it."""
+        """Handle the mouse: show data on what is under it; a click enlarges the pixels there."""
         x, y = event.args["x"] - 0.5, event.args["y"] - 0.5
         self.at = None if event.args["kind"] == "mouseleave" else (x, y)
         self.tell()
@@ -197,7 +201,7 @@ class Sensor:
             self.fresh = True
 
     def nearest(self, x: float, y: float) -> tuple[Spot | None, Light | None]:
-        """What was seen there and what truly is, within a few marks' width."""
+        """The nearest detection and the nearest true light within a few marks' width, or None."""
         reach = max(8.0, self.size_px[0] / 60)
 
         def off(one: Spot | Light) -> float:
@@ -208,7 +212,7 @@ class Sensor:
         return min(spots, key=off, default=None), min(lights, key=off, default=None)
 
     def told(self, x: float, y: float, spot: Spot | None, light: Light | None) -> str:
-        """Pixel, true light, what the tracker made of it."""
+        """Text on a pixel: its true light, the detection and its error."""
         lines = [f"pixel      {x:8.1f} {y:8.1f}"]
         if light:
             bright = "" if math.isnan(light.magnitude) else f"V {light.magnitude:.2f}  "
@@ -233,7 +237,7 @@ def facts(
     view: View | None = None,
     setting: Setting | None = None,
 ) -> str:
-    """A frame's numbers in two columns; of a picture of the user's fewer are known."""
+    """A frame's numbers in two columns; fewer for an image that is not of the scene (view is None)."""
     rows = [
         (
             "frame",
