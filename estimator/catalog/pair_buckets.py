@@ -50,7 +50,7 @@ def bucketed(
     range_rad: tuple[float, float] | None = None,
     magnitudes: tuple[float, float] = (-np.inf, np.inf),
 ) -> PairCatalogue:
-    """Build the catalog of the pairs of (N, 3) unit vectors whose angle and magnitudes (N,) are in range (section 2.4.6).
+    """Build the catalog of pairs of (N, 3) unit vectors whose angle and magnitudes (N,) are in range (section 2.4.6).
 
     range_rad : range of angles, both ends included; if omitted, that of the pairs found
     Buckets are counted back from the largest angle. Raises ImageError where there is no pair.
