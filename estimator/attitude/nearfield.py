@@ -307,9 +307,8 @@ def pnp(
 
     OpenCV's Levenberg-Marquardt starts from the believed position. (A small pattern seen face on fits almost as well
     when flipped; SQPnP, which needs no start, converged to the flipped solution in 5 % of noise-free trials.)
-    Gauss-Newton with
-    step halving then weights the rays: residual and D as in rotation_only, q = b + t, b = A (P - mean P), unknowns
-    w, t.
+    Gauss-Newton with step halving then weights the rays: residual and D as in rotation_only, q = b + t,
+    b = A (P - mean P), unknowns w and t.
 
     A translation of a small pattern is hard to distinguish from a rotation: knowing the bearing improves the
     cross-boresight error by a factor of about a thousand (reference, section 5). The covariance is of first order;
