@@ -72,6 +72,7 @@ def rotation_only(
         jacobian = _jacobian(b, q) * weight[:, None]
         residual = (measured - q[:, :2] / q[:, 2:]).ravel() * weight
         step, _, rank, _ = np.linalg.lstsq(jacobian, residual, rcond=None)
+        # Rank 2: the LEDs lie in one direction from the bearing, about which any rotation fits.
         if rank < 3:
             raise ValueError(f"{len(rays_cam)} lights leave a turn unknown; two apart are needed")
         body_from_lab = cam_from_body.inv() * Rotation.from_rotvec(step) * cam_from_body * body_from_lab
@@ -243,6 +244,7 @@ def tappe(
     """
     rays = lever.cam_from_body.inv().apply(rays_cam)
     for _ in range(UPDATES):
+        # The distances change little with the attitude, so a few updates converge.
         reach = np.linalg.norm(body_from_lab.apply(position_m) - lever.camera_body_m, axis=1)
         point = lever.camera_body_m + reach[:, None] * rays
         better = _wahba(point, reach, sigma_rad, position_m)
@@ -318,6 +320,7 @@ def pnp(
     if len(rays_cam) < 4:
         raise ValueError(f"{len(rays_cam)} lights leave the camera's place unknown; 4 are needed")
     measured = rays_cam[:, :2] / rays_cam[:, 2:]
+    # With the pattern's centroid as origin, rotation and translation are nearly uncorrelated.
     middle_m = position_m.mean(axis=0)
     pattern_m = position_m - middle_m
     believed_shift_m = lever.cam_from_body.apply(body_from_lab.apply(middle_m) - lever.camera_body_m)

@@ -69,10 +69,12 @@ def profile(cam: Floats, ref: Floats, weight: Floats) -> Floats:
         total += weight[n]
         off = max(off, abs(cam[n, 0] ** 2 + cam[n, 1] ** 2 + cam[n, 2] ** 2 - 1))
         off = max(off, abs(ref[n, 0] ** 2 + ref[n, 1] ** 2 + ref[n, 2] ** 2 - 1))
+        # The directions must differ from the first one in both frames.
         apart = max(apart, min(_sine2(cam, 0, n), _sine2(ref, 0, n)))
         for i in range(3):
             for j in range(3):
                 B[i, j] += weight[n] * cam[n, i] * ref[n, j]
+    # A single NaN or infinity makes the sum of the elements non-finite.
     entries = 0.0
     for i in range(3):
         for j in range(3):
@@ -129,6 +131,7 @@ def greatest(B: Floats) -> float:
 
 @jit
 def _cofactor(matrix: Floats, i: int, j: int) -> float:
+    # Cyclic indices give the cofactor with its sign.
     a, b, c, d = (i + 1) % 3, (i + 2) % 3, (j + 1) % 3, (j + 2) % 3
     return matrix[a, c] * matrix[b, d] - matrix[a, d] * matrix[b, c]
 
@@ -219,6 +222,7 @@ def raw_esoq2(B: Floats) -> Floats:
     products of M's rows, and the quaternion is ((x - tr) e, z . e), normalized. M vanishes for the identity rotation;
     the reference frame is therefore first rotated by the 180-degree rotation that gives the smallest trace.
     """
+    # A rotation by 180 degrees about an axis keeps that diagonal element and negates the two others.
     x, frame, least = greatest(B), 3, B[0, 0] + B[1, 1] + B[2, 2]
     for axis in range(3):
         trace = 2 * B[axis, axis] - (B[0, 0] + B[1, 1] + B[2, 2])
@@ -230,6 +234,7 @@ def raw_esoq2(B: Floats) -> Floats:
         for j in range(3):
             M[i, j] = -(x - trace) * S[i, j] - z[i] * z[j]
         M[i, i] += (x - trace) * (x + trace)
+    # Row i of the cofactors of M is the cross product of the two other rows.
     e, length2 = np.zeros(3), -1.0
     for i in range(3):
         u, v, w = _cofactor(M, i, 0), _cofactor(M, i, 1), _cofactor(M, i, 2)

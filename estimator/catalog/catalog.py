@@ -62,6 +62,7 @@ def on_earth(time_utc: datetime.datetime) -> Observer:
     """Return the observer at the Earth's center at a UTC time (naive means UTC), from the IAU ephemeris `epv00`."""
     if time_utc.tzinfo is not None:
         time_utc = time_utc.astimezone(datetime.UTC).replace(tzinfo=None)
+    # epv00 takes TDB; TT is within 2 ms of it.
     days = (time_utc - datetime.datetime(2000, 1, 1, 12)) / datetime.timedelta(days=1) + TT_MINUS_UTC_DAY
     _, barycentric = erfa.epv00(erfa.DJ00, days)
     metres_per_second = erfa.DAU / erfa.DAYSEC

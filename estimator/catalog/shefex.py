@@ -62,6 +62,7 @@ def uniform(stars: StarList, count: int, kept_mag: float = -np.inf) -> StarList:
     bright = int((stars.v_mag <= kept_mag).sum())
     if not max(bright, 1) <= count <= len(stars):
         raise ImageError(f"{count} stars of {len(stars)}; allowed: from the {max(bright, 1)} to be kept on")
+    # A larger distance selects fewer stars; `low` always gives at least `count`.
     low, high = 0.0, np.pi
     for _ in range(40):
         middle = (low + high) / 2

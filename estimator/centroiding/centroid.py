@@ -82,7 +82,7 @@ def streak(image: NDArray, blobs: Blobs, gain_e_dn: float = 1.0, hints: FramePri
     Cramer-Rao bound, larger along than across, plus the error of a faint streak's ends (see `streak_fit`).
 
     A frame that is not smeared is passed to `gaussian_fit`. In a smeared frame, blobs that are not streaks are too;
-    but if the streak is longer than a round star's window, they keep their center of gravity.
+    but if the streak is longer than half a round star's window, they keep their center of gravity.
     """
     lines = _streaks(image, blobs, gain_e_dn, hints)
     lost = np.isnan(lines[:, 0])

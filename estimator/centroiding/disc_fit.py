@@ -58,6 +58,7 @@ def fit_all(
         others = near[: neighbours(boxes, n, x0, y0, x1, y1, near)]
         sky = at(level, height, width, xy[n, 1], xy[n, 0])
         sigma = at(noise, height, width, xy[n, 1], xy[n, 0]) / FILTERED_NOISE
+        # Initial values: the radius of a disc of the blob's area, and the mean brightness.
         p[EDGE], p[BRIGHT], p[SKY] = 1.0, flux[n] / area[n], sky
         count = 0
         for y in range(y0, y1 + 1):

@@ -1,10 +1,10 @@
 """Centroids by moments of the light: center of gravity, light-weighted, and in a Gaussian window.
 
-Each kernel sums over the pixels of the blob's box and a margin, above the interpolated sky, and returns x, y, sigma and
-flux. The variance propagates photon noise (I / gain) and the sky's noise through the estimator's derivative with
-respect to each pixel. The two weighted estimators also have a systematic error that depends on the position of the star
-within its pixel (the S-curve), since they see the profile at the pixel centers only; `sampling_variance` gives its
-mean square.
+Each kernel sums the light above the interpolated sky and returns x, y, sigma and flux per blob, or NaN where the
+position is undefined. `gravity` and `squared` use the blob's box and a margin, `windowed` the window. The variance
+propagates photon noise (I / gain) and the sky's noise through the estimator's derivative with respect to each pixel.
+The two weighted estimators also have a systematic error that depends on the position of the star within its pixel
+(the S-curve), since they see the profile at the pixel centers only; `sampling_variance` gives its mean square.
 """
 
 from __future__ import annotations

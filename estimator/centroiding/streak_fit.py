@@ -47,6 +47,7 @@ def fit_all(
     height, width = image.shape
     out = np.full((len(xy), 8), np.nan)
     near, p = np.empty(len(xy), np.int64), np.empty(7)
+    # The window covers the frame's streak, with a margin, about the blob's center.
     half_x, half_y = int(abs(streak[0]) / 2) + MARGIN_PX, int(abs(streak[1]) / 2) + MARGIN_PX
     if max(half_x, half_y) > WIDEST_PX:
         return out
@@ -126,6 +127,7 @@ def _fit(
             out[5], out[6], out[7] = least_squares.place_covariance(normal, move)
             # Degrees of freedom: seven parameters, three priors.
             out[5:] *= least_squares.misfit_factor(normal[7, 7], count - 4)
+            # A scalar variance along the streak becomes a covariance in x and y.
             lost = _slip_px2(p, noise, gain_e_dn) / p[LENGTH] ** 2
             out[5] += lost * out[3] ** 2
             out[6] += lost * out[4] ** 2

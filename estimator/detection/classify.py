@@ -138,11 +138,13 @@ def _shared(lines: Floats) -> tuple[float, float]:
 
 
 def _doubled(streak_px: tuple[float, float]) -> tuple[float, float]:
+    # (dx, dy) to L^2 (cos 2a, sin 2a).
     x, y = streak_px
     return float(x * x - y * y), float(2 * x * y)
 
 
 def _halved(line: tuple[float, float]) -> tuple[float, float]:
+    # L^2 (cos 2a, sin 2a) to (dx, dy).
     length, angle = sqrt(hypot(*line)), atan2(line[1], line[0]) / 2
     return length * cos(angle), length * sin(angle)
 

@@ -61,6 +61,7 @@ def default(
             image, background, threshold_sigma * background.noise, min_area_px, max_blobs, GROW_SIGMA
         )
         blobs = classify.judged(image, blobs, hints)
+        # Round or too few. With very few stars, the rest may be streaks too faint for the round filter.
         if blobs.streak_px is None:
             stars = int(np.count_nonzero(blobs.flag & classify.NO_STAR == 0))
             wanting = hints.streak_px is None and stars < FEW_STARS and np.all(blobs.area_px < LARGE_PX)
@@ -68,6 +69,7 @@ def default(
             return classify.judged(image, unseen, hints) if len(unseen) > stars + 1 else blobs
         if max(map(abs, blobs.streak_px)) > LONGEST_PX:
             return blobs
+        # The bright blobs have revealed the streak: detect again with the filter along it.
         hints = FramePriors(blobs.streak_px, hints.saturation)
     return classify.judged(image, smeared(image, background, threshold_sigma, max_blobs, hints), hints)
 

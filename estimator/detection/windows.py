@@ -29,6 +29,7 @@ def in_windows(
     beyond its window. A blob found in two windows is returned once. Raises ImageError for an image that cannot be used.
     """
     image = prepared(image)
+    # The background is a sparse sample of the frame; only the windows are read in full.
     background = sky(image)
     level, noise = background.level, background.noise
     rows = np.ascontiguousarray(centre_px, dtype=float)

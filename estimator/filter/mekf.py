@@ -72,9 +72,9 @@ class Update:
     """Result of an update with a star tracker's solution.
 
     status       : "used", "reset" (the filter was lost and adopted the solution), or "refused: why"
-    residual_rad : (3,) rotation vector in body axes from the filter's attitude to the solution's; NaN if too old
-    distance     : Mahalanobis distance of the residual, the root of a chi-square with 3 degrees of freedom; NaN if
-    too old
+    residual_rad : (3,) rotation vector in body axes from the filter's attitude to the solution's
+    distance     : Mahalanobis distance of the residual, the root of a chi-square with 3 degrees of freedom
+    Both are NaN for a solution that is too old.
     """
 
     status: str
@@ -237,6 +237,7 @@ class Mekf:
         then = self._after(leg.moment, before)
         residual, noise, distance2 = _innovation(then, solution)
         if distance2 <= self._gate:
+            # Split the leg at the solution, then repeat the later solutions from the corrected state.
             status, then = USED, _corrected(then, residual, noise)
             self._legs[k : k + 1] = [leg._replace(samples=before), _Leg(then, after, solution)]
             self._replay(k + 1)
@@ -264,6 +265,7 @@ class Mekf:
         """Delete history before a time: whole legs, and the first half of the samples of a long leg."""
         while len(self._legs) > 1 and self._legs[1].moment.t_s < before_s:
             del self._legs[0]
+        # Half at a time, so that the cost of propagating the first state is spread over many calls.
         first = self._legs[0]
         if len(first.samples) and first.samples[0, 0] < before_s:
             half = len(first.samples) // 2
@@ -285,6 +287,7 @@ class Mekf:
                 then.body_from_ref * moment.body_from_ref.inv()
             )  # from the gyro alone: no solution was used in between
             apart = (turn * earlier.body_from_ref * solution.body_from_ref.inv()).as_rotvec()
+            # Both covariances in the later body axes, plus what the gyro's noise and bias add in the gap.
             gap_s, R = abs(then.t_s - moment.t_s), turn.as_matrix()
             spread = R @ earlier.covariance_rad2 @ R.T + solution.covariance_rad2
             spread += gap_s * self._gyro.arw_rad_sqrt_s**2 * np.eye(3) + gap_s**2 * then.covariance[3:, 3:]
@@ -294,7 +297,7 @@ class Mekf:
         return len(self._refused) >= AGREEING
 
     def _taken(self, then: _Moment, solution: _Solution) -> _Moment:
-        """Reset to the solution's attitude and covariance; keep the bias, with its variance increased by the initial one."""
+        """Reset to the solution's attitude and covariance; keep the bias and add the initial variance to its own."""
         bias_covariance = then.covariance[3:, 3:] + np.diag(self._start_variance)
         return then._replace(
             ref_from_body_wxyz=_ref_from_body_wxyz(solution.body_from_ref),
@@ -313,6 +316,7 @@ def _corrected(then: _Moment, residual: Floats, noise: Floats) -> _Moment:
     """Kalman update in Joseph form; the attitude error is then multiplied into the quaternion."""
     gain = np.linalg.solve(then.covariance[:3, :3] + noise, then.covariance[:3]).T
     error = gain @ residual
+    # Joseph form, (I - K H) P (I - K H)^T + K R K^T with H = [I 0], stays symmetric and positive.
     left = np.eye(6)
     left[:, :3] -= gain
     # Reset of the error state: exp(error) exp(rest) = exp(error + change) gives rest = J(error) change.
