@@ -106,7 +106,7 @@ class _Solution(NamedTuple):
 class _Leg(NamedTuple):
     """History from one used solution to the next: the state after it, the gyro samples since, and the solution.
 
-    The first leg's solution is None: it begins at the start or at the oldest state kept.
+    The solution of the oldest leg is not applied again, and is None if the leg begins between two solutions.
     """
 
     moment: _Moment
