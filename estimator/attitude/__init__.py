@@ -1,1 +1,1 @@
-"""Vectors to attitude: solvers of Wahba's problem, and of the near-field problem under a dome."""
+"""Attitude from vectors: solvers of Wahba's problem, and of the near-field problem under an LED dome."""

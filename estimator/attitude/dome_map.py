@@ -1,7 +1,8 @@
-"""What is believed of a dome and of the camera under it: lights at known places on a known surface, on a lever arm.
+"""The tracker's model of an LED dome: LED positions, the dome's surface, and the camera's lever arm.
 
-Inter-star angles are not invariant there. A ray brought onto the believed surface gives angles about the bearing
-centre that are.
+Under a dome the stars (LEDs) are at a finite distance, and the camera moves as the vehicle rotates about the bearing,
+so the angles between LEDs as seen from the camera depend on the attitude. Intersecting each ray with the believed
+surface gives points whose directions from the bearing center have angles that do not.
 """
 
 from __future__ import annotations
@@ -18,13 +19,13 @@ from estimator.core.errors import ImageError
 
 @dataclass(frozen=True, slots=True)
 class LedMap:
-    """The believed dome: where its LEDs are and how its inside is shaped, in the lab frame.
+    """The believed dome: LED positions and inner surface, in the lab frame.
 
     id         : (N,)
     position_m : (N, 3)
-    centre_m, semi_axes_m : (3,) the ellipsoid x'A x' = 1 that the LEDs sit on
-    board      : (N,) which LEDs share a patch board, whose lattice is every board's; None where each is by itself
-    sigma_m    : standard deviation of a place along each axis
+    centre_m, semi_axes_m : (3,) the ellipsoid |(x - centre) / semi_axes| = 1 that the LEDs are on
+    board      : (N,) label of the patch board of each LED, as all boards have the same pattern; None without boards
+    sigma_m    : standard deviation of an LED's position along each axis
     """
 
     id: Ints
@@ -37,10 +38,10 @@ class LedMap:
 
 @dataclass(frozen=True, slots=True)
 class Lever:
-    """The believed place of the camera on the vehicle.
+    """The believed position and orientation of the camera on the vehicle.
 
     camera_body_m : (3,) entrance pupil in the body frame;  cam_from_body : rotation
-    sigma_m       : standard deviation of the pupil's place along each axis
+    sigma_m       : standard deviation of the pupil's position along each axis
     """
 
     camera_body_m: Floats
@@ -49,10 +50,10 @@ class Lever:
 
 
 def on_sphere(rays_body: Floats, camera_body_m: Floats, radius_m: float) -> Floats:
-    """(N, 3) points where rays from the camera meet a sphere about the bearing centre, in the body frame.
+    """Return (N, 3) intersections of rays from the camera with a sphere about the bearing center, in the body frame.
 
-    |c + s u| = R gives s = -c.u + sqrt((c.u)^2 - c.c + R^2). No attitude is needed: a sphere looks the same
-    from every one. Raises ValueError if the camera is outside the sphere.
+    |c + s u| = R gives s = -c.u + sqrt((c.u)^2 - c.c + R^2). No attitude is needed: the sphere is the same in every
+    attitude. Raises ValueError if the camera is outside the sphere.
     """
     along = rays_body @ camera_body_m
     under_root = along**2 - camera_body_m @ camera_body_m + radius_m**2
@@ -64,9 +65,9 @@ def on_sphere(rays_body: Floats, camera_body_m: Floats, radius_m: float) -> Floa
 
 
 def on_surface(rays_lab: Floats, origin_lab_m: Floats, leds: LedMap) -> Floats:
-    """(N, 3) points where rays meet the believed ellipsoid from inside, in the lab frame; NaN where they miss.
+    """Return (N, 3) intersections of rays from inside with the believed ellipsoid, in the lab frame; NaN if none.
 
-    With scaled coordinates w = (x - centre) / semi_axes the surface is |w| = 1: a quadratic in the distance.
+    In scaled coordinates w = (x - centre) / semi_axes the surface is |w| = 1: a quadratic equation for the distance.
     """
     start = (origin_lab_m - leds.centre_m) / leds.semi_axes_m
     along = rays_lab / leds.semi_axes_m
@@ -78,13 +79,13 @@ def on_surface(rays_lab: Floats, origin_lab_m: Floats, leds: LedMap) -> Floats:
 
 
 def project(body_from_lab: Rotation, position_m: Floats, lever: Lever, camera: Camera) -> Floats:
-    """(N, 2) pixels of lights at (N, 3) lab places; NaN behind the camera."""
+    """Project LEDs at (N, 3) lab positions to (N, 2) pixels; NaN behind the camera."""
     in_body = body_from_lab.apply(position_m) - lever.camera_body_m
     return camera.pixels(lever.cam_from_body.apply(in_body))
 
 
 def check_lever(leds: LedMap, lever: Lever) -> None:
-    """Raise ImageError unless the lever arm reaches less far than the nearest LED."""
+    """Raise ImageError unless the lever arm is shorter than the distance of the nearest LED."""
     nearest = np.linalg.norm(leds.position_m, axis=1).min()
     reach = np.linalg.norm(lever.camera_body_m)
     if reach >= nearest:

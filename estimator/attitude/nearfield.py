@@ -1,17 +1,26 @@
-"""Attitude from stars at a finite distance: a camera on a lever arm about a known centre, under lights at known places.
+"""Near-field attitude: a camera on a lever arm about the bearing center, under LEDs at known positions.
 
-Six methods of one signature, from the one that takes the lights for stars to the exact one, which knows that the
-camera can only turn about the bearing centre. Each takes
+Under a dome the direction from the camera to an LED depends on the attitude in two ways: the camera rotates, and its
+lever arm c moves it. The measured ray is that of q = A P - c in body axes, with A = R_body_from_lab, P the LED's
+position in the lab frame and c the camera's position in the body frame. The methods differ in how they treat c:
+
+- `infinity` ignores it and solves Wahba's problem for the rays.
+- `thesis`, `tappe` and `ray_on_surface` estimate the distance of each LED along its ray, which gives points about the
+  bearing center, and solve Wahba's problem for their directions from there. The latter two iterate.
+- `rotation_only` fits A to the rays by Gauss-Newton with the exact model, c known.
+- `pnp` fits A and the camera's position, six degrees of freedom, as if c were unknown.
+
+All have the same signature. Each takes
 
 rays_cam      : (N, 3) unit vectors in camera axes
 sigma_rad     : (N,) their standard deviation per axis; for the methods of OF_TANGENTS, that of their tangents
-position_m    : (N, 3) where the lights of these rays are, in the lab frame
-leds, lever   : the believed surface and the believed place of the camera
-body_from_lab : the attitude to start from; infinity and thesis need none
+position_m    : (N, 3) position of each ray's LED in the lab frame
+leds, lever   : the believed surface and the believed position of the camera
+body_from_lab : the initial attitude; not used by infinity and thesis
 
-and gives body_from_lab with its (3, 3) covariance in body axes, rad^2: that of the rays' noise alone. It leaves out
-every error of what is believed and the method's own bias, which noise-free rays show. All raise ValueError where no
-attitude follows.
+and returns body_from_lab with its (3, 3) covariance in body axes, rad^2. The covariance includes the noise of the rays
+only: neither errors of the believed positions nor the bias of the method, which noise-free rays reveal. All raise
+ValueError if the rays do not determine an attitude.
 """
 
 from __future__ import annotations
@@ -46,12 +55,13 @@ def rotation_only(
     lever: Lever,
     body_from_lab: Rotation,
 ) -> tuple[Rotation, Floats]:
-    """The exact solve: body_from_lab and its (3, 3) covariance in body axes, from N >= 2 rays and their lights.
+    """Exact solution: body_from_lab and its (3, 3) covariance in body axes, from N >= 2 rays and their LEDs.
 
-    Minimises the tangent-plane residual of q = b - r, b = A P, with A <- exp([w]) A and the Jacobian
-    J_i = D(q) (-[b_i]x), D = [[1/q_z, 0, -q_x/q_z^2], [0, 1/q_z, -q_y/q_z^2]] by Gauss-Newton in camera axes.
-    The surface is not used: only where the lights are, and that the camera turns about the bearing centre.
-    Raises ValueError where it does not converge, or where the lights leave a turn unknown.
+    Minimizes the weighted residual of the tangents (q_x / q_z, q_y / q_z) by Gauss-Newton in camera axes, with
+    q = b - r, b = A P and r the lever arm. The update is A <- exp([w]) A, the Jacobian J_i = D(q) (-[b_i]x) with
+    D = [[1/q_z, 0, -q_x/q_z^2], [0, 1/q_z, -q_y/q_z^2]]. Uses the LEDs' positions and the constraint that the camera
+    rotates about the bearing center, but not the surface. Raises ValueError if it does not converge, or if the LEDs do
+    not determine all three angles.
     """
     measured = rays_cam[:, :2] / rays_cam[:, 2:]
     weight = np.repeat(1 / sigma_rad, 2)
@@ -62,6 +72,7 @@ def rotation_only(
         jacobian = _jacobian(b, q) * weight[:, None]
         residual = (measured - q[:, :2] / q[:, 2:]).ravel() * weight
         step, _, rank, _ = np.linalg.lstsq(jacobian, residual, rcond=None)
+        # Rank 2: the LEDs lie in one direction from the bearing, about which any rotation fits.
         if rank < 3:
             raise ValueError(f"{len(rays_cam)} lights leave a turn unknown; two apart are needed")
         body_from_lab = cam_from_body.inv() * Rotation.from_rotvec(step) * cam_from_body * body_from_lab
@@ -74,7 +85,7 @@ def rotation_only(
 
 
 def _tangent_slopes(q: Floats) -> Floats:
-    """(N, 2, 3) derivative of the tangents (q_x / q_z, q_y / q_z) by q."""
+    """Return the (N, 2, 3) derivative of the tangents (q_x / q_z, q_y / q_z) with respect to q."""
     inverse_z = 1 / q[:, 2]
     zero = np.zeros_like(inverse_z)
     d_x = np.column_stack([inverse_z, zero, -q[:, 0] * inverse_z**2])
@@ -83,7 +94,7 @@ def _tangent_slopes(q: Floats) -> Floats:
 
 
 def _jacobian(b: Floats, q: Floats) -> Floats:
-    """(2 N, 3) derivative of the tangents of q = b - r by a small rotation w of b: dq = w x b."""
+    """Return the (2 N, 3) derivative of the tangents of q = b - r by a small rotation w of b: dq = w x b."""
     # d . (w x b) = w . (b x d)
     return np.cross(b[:, None, :], _tangent_slopes(q)).reshape(-1, 3)
 
@@ -94,9 +105,11 @@ def _in_body_axes(covariance_cam: np.ndarray, lever: Lever) -> Floats:
 
 
 def _wahba(point_body_m: Floats, reach_m: Floats, sigma_rad: Floats, position_m: Floats) -> Rotation:
-    """body_from_lab from points in body axes and in the lab, by their directions from the bearing centre.
+    """Solve body_from_lab from points in body axes and in the lab, by their directions from the bearing center.
 
-    A ray's error, sigma at the camera, moves the point by sigma * reach and its direction by that over its radius.
+    reach_m : (N,) distance of each point from the camera
+    A ray error of sigma at the camera displaces the point by sigma * reach, and its direction from the center by
+    sigma * reach / radius, which sets the weights.
     """
     radius = np.linalg.norm(point_body_m, axis=1)
     target = position_m / np.linalg.norm(position_m, axis=1, keepdims=True)
@@ -113,13 +126,14 @@ def _wahba_covariance(
     slope_m: Floats,
     gain_m: Floats | float = 0.0,
 ) -> Floats:
-    """(3, 3) covariance in body axes of what _wahba finds, by the noise of the rays that the points came from.
+    """Return the (3, 3) covariance in body axes of the solution of _wahba, from the noise of the rays.
 
-    slope_m : (N, 3, 3) dp/du, how a point p moves with its ray u
-    gain_m  : (N, 3) how far p moves along u with the attitude, where the method places it by the attitude
+    slope_m : (N, 3, 3) dp/du, the derivative of a point p with respect to its ray u
+    gain_m  : (N, 3) derivative of the point's distance along u with respect to the attitude; 0 where the method does
+        not use the attitude to place the point
 
-    At Wahba's least the torques balance, sum(k a x d) = 0 with a = A P / |P|, d = p / |p|, weight k. Their change
-    by noise and by the turn w that answers it is zero too:
+    At the minimum of Wahba's loss the gradient vanishes, sum(k a x d) = 0 with a = A P / |P|, d = p / |p| and weight k.
+    To first order, ray noise du causes a rotation w that keeps it zero:
     sum(k [(a.d) I - a d']) w = sum(k a x (I - d d') dp / |p|), dp = slope du + u (gain . w). Derived here.
     """
     radius = np.linalg.norm(point_body_m, axis=1)
@@ -127,7 +141,7 @@ def _wahba_covariance(
     a = body_from_lab.apply(position_m / np.linalg.norm(position_m, axis=1, keepdims=True))
     weight = (radius / (sigma_rad * reach_m)) ** 2
     sideways = np.eye(3) - np.einsum("ni,nj->nij", d, d)
-    # Columns: the torque of a point's shift along each axis.
+    # Columns: the change of a point's term k a x d by a shift along each axis.
     torque = np.cross(a[:, None, :], np.swapaxes(sideways, 1, 2)).swapaxes(1, 2)
     torque *= (weight / radius)[:, None, None]
     pull = np.einsum("nij,nj->ni", torque, rays_body)
@@ -146,11 +160,12 @@ def infinity(
     lever: Lever,
     body_from_lab: Rotation,
 ) -> tuple[Rotation, Floats]:
-    """Stars at infinity: the rays themselves for directions from the bearing centre, Wahba.
+    """Stars at infinity: Wahba's problem with the rays as directions from the bearing center.
 
-    What a flight tracker does under a dome. From the camera, M nearer, the pattern is R / (R - M) larger: it fits
-    about its middle, and that is as far out of place as it is off the boresight. Bias .52 degree cross on AFIT's dome
-    with five LEDs, at every tilt (reference, section 5).
+    This is what a flight tracker does under a dome. The camera is closer to the dome by M, so the pattern appears
+    larger by R / (R - M). The solution aligns the center of the pattern, whose own direction is wrong in proportion
+    to its angle off the boresight. The bias on AFIT's dome with five LEDs is .52 degrees cross-boresight at every tilt
+    (reference, section 5).
     """
     rays = lever.cam_from_body.inv().apply(rays_cam)
     at_infinity = np.ones(len(rays))
@@ -162,11 +177,12 @@ def infinity(
 
 
 def thesis_points(rays_cam: Floats, leds: LedMap, lever: Lever, sine: bool = False) -> tuple[Floats, float]:
-    """AFIT's vectors to the lights (Padro 2012, eqs 43-44): (N, 3) points in camera axes, m, and R - M, m.
+    """Return AFIT's vectors to the LEDs (Padro 2012, eqs 43-44): (N, 3) points in camera axes, m, and R - M, m.
 
-    R is the believed surface's height over the bearing, M the camera's distance from the bearing along the boresight.
-    sine : put the slip right, (x, y) = (R - M) sin a: then the point lies on its ray, R - M from the camera
-    Raises ValueError where eq. 44 has no root.
+    R is the height of the believed surface above the bearing, M the camera's distance from the bearing along the
+    boresight.
+    sine : correct the error in eq. 43, (x, y) = (R - M) sin a: the point is then on its ray, R - M from the camera
+    Raises ValueError if eq. 44 has no root.
     """
     boresight_body = lever.cam_from_body.inv().apply([0.0, 0.0, 1.0])
     height_m = on_surface(np.array([[0.0, 0.0, 1.0]]), np.zeros(3), leds)[0, 2]
@@ -188,16 +204,17 @@ def thesis(
     lever: Lever,
     body_from_lab: Rotation,
 ) -> tuple[Rotation, Floats]:
-    """AFIT's vectors: each light on a sphere of radius R - M about the camera, carried to the bearing; Wahba.
+    """AFIT's method: place each LED on a sphere of radius R - M about the camera, solve Wahba about the bearing.
 
-    Across the boresight a light is where its ray meets a plane R - M away, (x, y) = (R - M) tan a, as the image is
-    calibrated; along it z = sqrt((R - M)^2 - x^2 - y^2); the camera's place is added, and angles are taken about
-    the bearing (Padro 2012, eqs 43-45, with his x, y, z for z, x, y here). The slip of tan for sin is his
-    (reference 1.2, item 11) and gives the bias: .0036 degree cross on AFIT's dome, .07 under a flat at 30 degrees.
+    Across the boresight an LED is where its ray meets a plane at R - M, (x, y) = (R - M) tan a, as the image is
+    calibrated; along the boresight z = sqrt((R - M)^2 - x^2 - y^2). The camera's position is added, and directions are
+    taken from the bearing (Padro 2012, eqs 43-45, with his x, y, z for z, x, y here). The use of tan instead of sin is
+    his error (reference 1.2, item 11). It causes the bias: .0036 degrees cross-boresight on AFIT's dome, .07 under a
+    flat ceiling at 30 degrees.
     """
     point_cam, reach_m = thesis_points(rays_cam, leds, lever)
     across_m = point_cam[:, :2]
-    # dp by the tangents, then the tangents by the ray.
+    # Chain rule: the point's derivative by the tangents, then the tangents' by the ray.
     by_tangent = np.zeros((len(rays_cam), 3, 2))
     by_tangent[:, [0, 1], [0, 1]] = reach_m
     by_tangent[:, 2, :] = -reach_m * across_m / point_cam[:, 2:]
@@ -218,15 +235,16 @@ def tappe(
     lever: Lever,
     body_from_lab: Rotation,
 ) -> tuple[Rotation, Floats]:
-    """NPS's distances: each light as far along its ray as the last attitude puts it, Wahba, again.
+    """NPS's method: compute the distance of each LED from the last attitude, solve Wahba, and iterate.
 
-    R_0 + alpha_i b_i = A beta_i r_i with alpha_i = |A P_i - R_0| (Tappe, by Padro 2012, eq. 33). Tappe stopped after
-    one attitude, or five; here it goes on until it stands still. The error of a distance moves a point along its ray,
-    almost along its direction: an update leaves about M / R times the square of the field's half-angle of the error.
-    The fixed point is the truth: no bias.
+    R_0 + alpha_i b_i = A beta_i r_i with alpha_i = |A P_i - R_0| (Tappe, cited by Padro 2012, eq. 33). Tappe stopped
+    after one update, or five; here it iterates to convergence. An error of a distance moves the point along its ray,
+    which is almost its direction from the bearing, so an update reduces the error by a factor of about M / R times
+    the square of the field's half-angle. The true attitude is the fixed point: there is no bias.
     """
     rays = lever.cam_from_body.inv().apply(rays_cam)
     for _ in range(UPDATES):
+        # The distances change little with the attitude, so a few updates converge.
         reach = np.linalg.norm(body_from_lab.apply(position_m) - lever.camera_body_m, axis=1)
         point = lever.camera_body_m + reach[:, None] * rays
         better = _wahba(point, reach, sigma_rad, position_m)
@@ -241,7 +259,7 @@ def tappe(
     )
 
 
-# Updates of an attitude that places its own points, and the turn below which they end.
+# Iterations of tappe and ray_on_surface at most, and the rotation below which they stop.
 UPDATES = 20
 STILL_RAD = 1e-13
 
@@ -254,9 +272,10 @@ def ray_on_surface(
     lever: Lever,
     body_from_lab: Rotation,
 ) -> tuple[Rotation, Floats]:
-    """Bring each ray onto the believed ellipsoid at the last attitude, solve Wahba about the centre, repeat.
+    """Intersect each ray with the believed ellipsoid at the last attitude, solve Wahba about the center, and iterate.
 
-    Its bias is the surface's: an LED off the believed ellipsoid, or one whose ray meets it obliquely.
+    A bias comes only from errors of the surface: LEDs off the believed ellipsoid, amplified where rays meet it
+    obliquely.
     """
     rays = lever.cam_from_body.inv().apply(rays_cam)
     for _ in range(UPDATES):
@@ -269,9 +288,9 @@ def ray_on_surface(
         placed_by, body_from_lab = body_from_lab, _wahba(point, reach, sigma_rad, position_m)
         if (body_from_lab * placed_by.inv()).magnitude() < STILL_RAD:
             break
-    normal = placed_by.apply((met - leds.centre_m) / leds.semi_axes_m**2)  # of any length
+    normal = placed_by.apply((met - leds.centre_m) / leds.semi_axes_m**2)  # not normalized
     slant = normal / np.sum(normal * rays, axis=1, keepdims=True)
-    # Held to the surface, p moves by reach (du - u slant.du); the surface turns with w, p along u by slant.(w x p).
+    # On the surface p moves by reach (du - u slant.du); rotating the surface by w moves p along u by slant.(w x p).
     slope = reach[:, None, None] * (np.eye(3) - np.einsum("ni,nj->nij", rays, slant))
     return body_from_lab, _wahba_covariance(
         body_from_lab, point, reach, sigma_rad, position_m, rays, slope, np.cross(point, slant)
@@ -286,18 +305,22 @@ def pnp(
     lever: Lever,
     body_from_lab: Rotation,
 ) -> tuple[Rotation, Floats]:
-    """Six degrees of freedom: attitude and place from N >= 4 rays, as if nothing held the camera to the bearing.
+    """Perspective-n-point: attitude and position, six degrees of freedom, from N >= 4 rays; ignores the bearing.
 
-    OpenCV's Levenberg-Marquardt from the believed place (a small pattern seen face on fits about as well turned over;
-    a start from nothing, SQPnP, took that fit in 5 % of trials without noise), then Gauss-Newton with halved steps,
-    which weighs the rays: residual and D as in rotation_only, q = b + t, b = A (P - mean P), unknowns w and t.
-    A small pattern moved aside looks almost as one turned: knowing the bearing is worth a thousand in cross
-    (reference, section 5). Its covariance is of first order; where a pattern is seen face on and the noise reaches
-    the turned-over fit, errors are not Gaussian. Raises ValueError for lights in a line and where it does not settle.
+    OpenCV's Levenberg-Marquardt starts from the believed position. (A small pattern seen face on fits almost as well
+    when flipped; SQPnP, which needs no start, converged to the flipped solution in 5 % of noise-free trials.)
+    Gauss-Newton with step halving then weights the rays: residual and D as in rotation_only, q = b + t,
+    b = A (P - mean P), unknowns w and t.
+
+    A translation of a small pattern is hard to distinguish from a rotation: knowing the bearing improves the
+    cross-boresight error by a factor of about a thousand (reference, section 5). The covariance is of first order;
+    where a pattern is seen face on and the noise makes the flipped solution possible, the errors are not Gaussian.
+    Raises ValueError for LEDs in a line and if it does not converge.
     """
     if len(rays_cam) < 4:
         raise ValueError(f"{len(rays_cam)} lights leave the camera's place unknown; 4 are needed")
     measured = rays_cam[:, :2] / rays_cam[:, 2:]
+    # With the pattern's centroid as origin, rotation and translation are nearly uncorrelated.
     middle_m = position_m.mean(axis=0)
     pattern_m = position_m - middle_m
     believed_shift_m = lever.cam_from_body.apply(body_from_lab.apply(middle_m) - lever.camera_body_m)
@@ -312,7 +335,7 @@ def pnp(
 def _weighed(
     pattern_m: Floats, measured: Floats, cam_from_lab: Rotation, shift_m: Floats, weight: Floats
 ) -> tuple[Rotation, np.ndarray]:
-    """Gauss-Newton to the least of the weighted residual, steps halved till it falls; (3, 3) covariance of the turn."""
+    """Gauss-Newton with step halving on the weighted residual; returns cam_from_lab and its (3, 3) covariance."""
     residual, jacobian = _six_slopes(pattern_m, measured, cam_from_lab, shift_m, weight)
     for _ in range(100):
         step, _, rank, _ = np.linalg.lstsq(jacobian, residual, rcond=None)
@@ -338,7 +361,7 @@ def _weighed(
 def _six_slopes(
     pattern_m: Floats, measured: Floats, cam_from_lab: Rotation, shift_m: Floats, weight: Floats
 ) -> tuple[Floats, Floats]:
-    """Weighted residual (2 N,) of the tangents and its Jacobian (2 N, 6) by a small turn and a shift."""
+    """Return the tangents' weighted residual (2 N,) and its Jacobian (2 N, 6) by a small rotation and a shift."""
     b = cam_from_lab.apply(pattern_m)
     q = b + shift_m
     jacobian = np.hstack([_jacobian(b, q), _tangent_slopes(q).reshape(-1, 3)])
@@ -348,7 +371,7 @@ def _six_slopes(
 def _opencv_pnp(
     pattern_m: Floats, tangent: Floats, cam_from_lab: Rotation, shift_m: Floats
 ) -> tuple[Rotation, Floats]:
-    """cam_from_lab and the shift in camera axes, (3,), from points and their tangents and a start."""
+    """Return cam_from_lab and the shift in camera axes, (3,), by OpenCV's iterative PnP from an initial guess."""
     start = cam_from_lab.as_rotvec()[:, None], np.array(shift_m)[:, None]
     try:
         found, rotvec, shift = cv2.solvePnP(
@@ -370,14 +393,16 @@ SOLVERS: dict[str, NearSolver] = {
     "tappe": tappe,
     "pnp": pnp,
 }
-OF_TANGENTS = ("rotation_only", "pnp")  # they fit a ray's (x/z, y/z), in which a pixel is as wide everywhere
+# These fit tangents (x/z, y/z), in which a pixel has the same size everywhere.
+OF_TANGENTS = ("rotation_only", "pnp")
 
 
 def fitted_sigma_rad(solver: str, rays_cam: Floats, pixel_rad: Floats) -> Floats:
-    """(N,) error per axis of what a method fits, from that of the pixels over the focal length.
+    """Return the (N,) error per axis of the quantity that a solver fits: tangents or unit vectors.
 
-    At an angle a off the boresight a ray turns by cos^2 a of a tangent's change along the radius and by cos a across:
-    its error is the rms of both.
+    pixel_rad : (N,) centroid error over the focal length
+    At an angle a off the boresight a change of the tangent rotates the ray by cos^2 a of it in the radial direction
+    and by cos a of it in the tangential one. The ray's error is the rms of both.
     """
     if solver in OF_TANGENTS:
         return pixel_rad

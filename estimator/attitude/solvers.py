@@ -1,7 +1,8 @@
-"""Wahba's problem: the rotation that best carries reference vectors into observed ones, with its covariance.
+"""Solvers of Wahba's problem: the rotation that best maps reference vectors to observed ones, with its covariance.
 
-Six classical methods, each as its author wrote it, on the compiled kernels of `wahba`. All but TRIAD minimise
-sum(w |cam - A ref|^2), w = 1 / sigma^2, over all stars, and the shared polish makes them agree to the last digits.
+Six classical methods, each as published, based on the compiled kernels in `estimator.attitude.wahba`. All but TRIAD
+minimize sum(w |cam - A ref|^2), w = 1 / sigma^2, over all stars. Gauss-Newton steps on the vectors (`polish`) refine
+their results, so that they agree to the last digits.
 """
 
 from __future__ import annotations
@@ -19,41 +20,41 @@ Solver = Callable[..., Rotation]
 
 
 def triad(vectors_cam: Floats, vectors_ref: Floats, sigma_rad: Floats) -> Rotation:
-    """TRIAD (Black 1964; optimal for its two stars by Markley 2002): cam_from_ref from the best pair alone.
+    """TRIAD (Black 1964; optimal for its two stars by Markley 2002): cam_from_ref from the best pair only.
 
-    Of more than two stars it takes the two that leave the least variance about the worst axis: good ones far apart.
-    Its covariance is theirs: covariance(..., solver="triad"). Arguments, errors: those of `quest`.
+    Of more than two stars it uses the pair with the smallest variance about the worst axis: accurate ones, far apart.
+    Its covariance is that of the pair: covariance(..., solver="triad"). Arguments and errors are those of `quest`.
     """
     cam, ref, weight = _vectors(vectors_cam, vectors_ref, sigma_rad)
-    kernel.profile(cam, ref, weight)  # refuses what no method can solve
+    kernel.profile(cam, ref, weight)  # raises ValueError for unusable or parallel directions
     return rotation(kernel.raw_triad(cam, ref, weight))
 
 
 def davenport(vectors_cam: Floats, vectors_ref: Floats, sigma_rad: Floats) -> Rotation:
-    """Davenport's q-method: the eigenvector of the greatest eigenvalue, polished. As `quest`."""
+    """Davenport's q-method: the eigenvector of the largest eigenvalue, refined. Arguments and errors as `quest`."""
     return _solved(kernel.raw_davenport, vectors_cam, vectors_ref, sigma_rad)
 
 
 def quest(vectors_cam: Floats, vectors_ref: Floats, sigma_rad: Floats) -> Rotation:
-    """QUEST (Shuster & Oh 1981): cam_from_ref from (N, 3) unit vectors, N >= 2, of errors (N,) sigma_rad.
+    """QUEST (Shuster & Oh 1981): cam_from_ref from (N, 3) unit vectors, N >= 2, with errors (N,) sigma_rad.
 
-    Polished. Raises ValueError for fewer than two directions, or numbers that are not usable.
+    Refined by `polish`. Raises ValueError for fewer than two directions and for unusable numbers.
     """
     return _solved(kernel.raw_quest, vectors_cam, vectors_ref, sigma_rad)
 
 
 def esoq2(vectors_cam: Floats, vectors_ref: Floats, sigma_rad: Floats) -> Rotation:
-    """ESOQ2 (Mortari 1997): the axis of the turn from a singular matrix, polished. As `quest`."""
+    """ESOQ2 (Mortari 1997): the rotation axis from a singular matrix, refined. Arguments and errors as `quest`."""
     return _solved(kernel.raw_esoq2, vectors_cam, vectors_ref, sigma_rad)
 
 
 def svd(vectors_cam: Floats, vectors_ref: Floats, sigma_rad: Floats) -> Rotation:
-    """The singular value decomposition (Markley 1988), polished. As `quest`."""
+    """Singular value decomposition (Markley 1988), refined. Arguments and errors as `quest`."""
     return _solved(kernel.raw_svd, vectors_cam, vectors_ref, sigma_rad)
 
 
 def least_squares(vectors_cam: Floats, vectors_ref: Floats, sigma_rad: Floats) -> Rotation:
-    """Least squares on the directions: Gauss-Newton from TRIAD's answer until it rests. As `quest`."""
+    """Least squares on the vectors: Gauss-Newton from TRIAD's solution. Arguments and errors as `quest`."""
     cam, ref, weight = _vectors(vectors_cam, vectors_ref, sigma_rad)
     kernel.profile(cam, ref, weight)
     answer = kernel.raw_triad(cam, ref, weight)
@@ -75,7 +76,7 @@ SOLVERS: dict[str, Solver] = {
 def _solved(
     raw: Callable[[Floats], Floats], vectors_cam: Floats, vectors_ref: Floats, sigma_rad: Floats
 ) -> Rotation:
-    """A method's own answer to the profile, polished on the directions."""
+    """Solve the attitude profile with the method `raw`, then refine the solution on the vectors."""
     cam, ref, weight = _vectors(vectors_cam, vectors_ref, sigma_rad)
     answer = raw(kernel.profile(cam, ref, weight))
     kernel.polish(answer, cam, ref, weight)
@@ -83,7 +84,7 @@ def _solved(
 
 
 def _vectors(vectors_cam: Floats, vectors_ref: Floats, sigma_rad: Floats) -> tuple[Floats, Floats, Floats]:
-    """What the kernels take: two (N, 3) arrays and (N,) weights in rad^-2. Raises ValueError for other shapes."""
+    """Prepare the kernels' arguments: two (N, 3) arrays, (N,) weights in rad^-2. Raises ValueError for other shapes."""
     cam, ref = np.ascontiguousarray(vectors_cam, dtype=float), np.ascontiguousarray(vectors_ref, dtype=float)
     sigma = np.asarray(sigma_rad, dtype=float)
     count = len(cam)
@@ -93,18 +94,18 @@ def _vectors(vectors_cam: Floats, vectors_ref: Floats, sigma_rad: Floats) -> tup
 
 
 def rotation(R_a_from_b: Floats) -> Rotation:
-    """A matrix that is a rotation to rounding, as a Rotation.
+    """Convert a matrix that is a rotation to within rounding to a Rotation.
 
-    Through the quaternion: from_matrix makes any matrix orthogonal first, and takes four times as long.
+    It goes through the quaternion, as Rotation.from_matrix orthogonalizes any matrix and takes four times as long.
     """
     return Rotation.from_quat(xyzw_of(R_a_from_b))
 
 
 def covariance(vectors_cam: Floats, sigma_rad: Floats, solver: str = "quest") -> Floats:
-    """(3, 3) covariance of the small rotation in camera axes: [sum((I - b b^T) / sigma^2)]^-1, rad^2.
+    """Return the (3, 3) covariance of the small rotation in camera axes: [sum((I - b b^T) / sigma^2)]^-1, rad^2.
 
-    QUEST's measurement model (Shuster & Oh 1981, eq. 97), of all methods that use all stars; of TRIAD, the sum is
-    over its pair. Confirmed by Monte Carlo in the tests. Raises ValueError where the roll is unknown.
+    QUEST's measurement model (Shuster & Oh 1981, eq. 97). It holds for all methods that use all stars; for TRIAD the
+    sum is over its pair. Confirmed by Monte Carlo in the tests. Raises ValueError if the roll is unobservable.
     """
     cam, _, weight = _vectors(vectors_cam, vectors_cam, sigma_rad)
     if solver == "triad" and len(cam) > 2:

@@ -1,7 +1,16 @@
-"""Wahba's problem compiled: the attitude profile, six classical answers to it, one polish, and the covariance.
+"""Compiled kernels for Wahba's problem: attitude profile, classical solvers, refinement and covariance.
 
-All kernels take unit vectors as C-ordered (N, 3) arrays; `weight` is (N,), in rad^-2 where a covariance is asked. The
-profile is B = sum(w cam ref^T) with the weights' sum at 1, and the best rotation maximises tr(A B^T) (Wahba 1965).
+Wahba's problem (1965) is to find the rotation A = R_cam_from_ref that minimizes the loss sum(w |cam - A ref|^2). Since
+cam and ref are unit vectors, this is the rotation that maximizes tr(A B^T), where B = sum(w cam ref^T) / sum(w) is the
+attitude profile matrix. In terms of the quaternion q the gain is q^T K q with Davenport's symmetric 4x4 matrix K, so
+the optimal q is the eigenvector of K's largest eigenvalue. The methods differ in how they find it: Davenport's
+q-method by an eigensolver, QUEST and ESOQ2 from the characteristic polynomial, SVD from the singular vectors of B.
+TRIAD uses two stars only.
+
+The elements of B lose the small differences between vectors of a narrow field, so `polish` refines the solution by
+Gauss-Newton on the vectors themselves. The covariance is the inverse of the Fisher information, sum(w (I - b b^T)).
+
+All kernels take unit vectors as C-ordered (N, 3) arrays; `weight` is (N,), in rad^-2 where a covariance is computed.
 """
 
 from __future__ import annotations
@@ -16,18 +25,19 @@ from estimator.core.vectors import turn
 
 Quaternion = tuple[float, float, float, float]
 
-# Least squared sine of the angle between the first direction and any other: 13 arcsec.
+# Smallest accepted squared sine of the largest angle to the first direction: 13 arcsec.
 PARALLEL = 4e-9
-UNIT = 1e-2  # a squared length farther from 1 is no direction's
+UNIT = 1e-2  # largest deviation of a unit vector's squared length from 1
 POLISHES = 30
-RESTING = 1e-26  # squared radians: a step that changes no digit
+RESTING = 1e-26  # squared radians: a step below double precision
 
 
 @jit
 def wahba(cam: Floats, ref: Floats, weight: Floats) -> tuple[Floats, Floats]:
-    """R_cam_from_ref (3, 3) that minimises sum(w |cam - A ref|^2), and its covariance (3, 3) in camera axes, rad^2.
+    """Return R_cam_from_ref (3, 3) that minimizes sum(w |cam - A ref|^2), and its (3, 3) camera-axes covariance, rad^2.
 
-    QUEST and the polish, some microseconds for twenty stars. Raises ValueError where the directions leave it unknown.
+    QUEST and `polish`; a few microseconds for twenty stars. Raises ValueError if the directions do not determine the
+    rotation.
     """
     answer = raw_quest(profile(cam, ref, weight))
     polish(answer, cam, ref, weight)
@@ -36,10 +46,10 @@ def wahba(cam: Floats, ref: Floats, weight: Floats) -> tuple[Floats, Floats]:
 
 @jit
 def weights(sigma_rad: Floats) -> Floats:
-    """(N,) 1 / sigma^2. Raises ValueError for a sigma that is not finite and above 0."""
+    """Return (N,) 1 / sigma^2. Raises ValueError for a sigma that is not finite and above 0."""
     out = np.empty(len(sigma_rad))
     for n in range(len(out)):
-        if not 1e-150 < sigma_rad[n] < 1e150:  # whose square is a number too
+        if not 1e-150 < sigma_rad[n] < 1e150:  # so that its square neither overflows nor underflows
             raise ValueError("a sigma_rad is not usable; allowed: finite, above 0")
         out[n] = 1 / sigma_rad[n] ** 2
     return out
@@ -47,7 +57,10 @@ def weights(sigma_rad: Floats) -> Floats:
 
 @jit
 def profile(cam: Floats, ref: Floats, weight: Floats) -> Floats:
-    """(3, 3) B with the weights' sum at 1. Raises ValueError for directions that do not determine a rotation."""
+    """Return the attitude profile (3, 3) B = sum(w cam ref^T) / sum(w).
+
+    Raises ValueError for directions that are not unit vectors or do not determine a rotation.
+    """
     if len(cam) < 2:
         raise ValueError("all vectors are parallel: fewer than two directions leave the roll unknown")
     B = np.zeros((3, 3))
@@ -56,10 +69,12 @@ def profile(cam: Floats, ref: Floats, weight: Floats) -> Floats:
         total += weight[n]
         off = max(off, abs(cam[n, 0] ** 2 + cam[n, 1] ** 2 + cam[n, 2] ** 2 - 1))
         off = max(off, abs(ref[n, 0] ** 2 + ref[n, 1] ** 2 + ref[n, 2] ** 2 - 1))
+        # The directions must differ from the first one in both frames.
         apart = max(apart, min(_sine2(cam, 0, n), _sine2(ref, 0, n)))
         for i in range(3):
             for j in range(3):
                 B[i, j] += weight[n] * cam[n, i] * ref[n, j]
+    # A single NaN or infinity makes the sum of the elements non-finite.
     entries = 0.0
     for i in range(3):
         for j in range(3):
@@ -78,7 +93,7 @@ def profile(cam: Floats, ref: Floats, weight: Floats) -> Floats:
 
 @jit
 def _sine2(vectors: Floats, m: int, n: int) -> float:
-    """Squared sine of the angle between two of the unit vectors."""
+    """Squared sine of the angle between unit vectors m and n, from their cross product."""
     x = vectors[m, 1] * vectors[n, 2] - vectors[m, 2] * vectors[n, 1]
     y = vectors[m, 2] * vectors[n, 0] - vectors[m, 0] * vectors[n, 2]
     z = vectors[m, 0] * vectors[n, 1] - vectors[m, 1] * vectors[n, 0]
@@ -87,9 +102,10 @@ def _sine2(vectors: Floats, m: int, n: int) -> float:
 
 @jit
 def greatest(B: Floats) -> float:
-    """Greatest eigenvalue of Davenport's matrix, by Newton from 1 downwards.
+    """Return the largest eigenvalue of Davenport's matrix, by Newton's method from 1 downwards.
 
-    Its characteristic equation is (x^2 - |B|^2)^2 - 8 x det B - 4 |adj B|^2 = 0 (Markley 1993, J. Astronautical
+    With normalized weights the eigenvalue is at most 1, and close to 1 for small errors. The characteristic equation
+    is (x^2 - |B|^2)^2 - 8 x det B - 4 |adj B|^2 = 0 (Markley 1993, J. Astronautical
     Sciences 41, 261), the same polynomial as QUEST's quartic.
     """
     square, minors, det = 0.0, 0.0, 0.0
@@ -104,7 +120,7 @@ def greatest(B: Floats) -> float:
     for _ in range(50):
         inner = x * x - square
         slope = 4 * x * inner - 8 * det
-        if slope <= 0:  # past a double root
+        if slope <= 0:  # rounding has carried x past a double root
             break
         step = (inner * inner - 8 * x * det - 4 * minors) / slope
         x -= step
@@ -115,13 +131,14 @@ def greatest(B: Floats) -> float:
 
 @jit
 def _cofactor(matrix: Floats, i: int, j: int) -> float:
+    # Cyclic indices give the cofactor with its sign.
     a, b, c, d = (i + 1) % 3, (i + 2) % 3, (j + 1) % 3, (j + 2) % 3
     return matrix[a, c] * matrix[b, d] - matrix[a, d] * matrix[b, c]
 
 
 @jit
 def _turned(B: Floats, axis: int) -> Floats:
-    """The profile for a reference frame turned by half a turn about an axis 0, 1, 2; not at all for 3."""
+    """Return the profile for a reference frame rotated by 180 degrees about axis 0, 1 or 2; unchanged for 3."""
     out = B.copy()
     if axis < 3:
         for j in range(3):
@@ -133,7 +150,7 @@ def _turned(B: Floats, axis: int) -> Floats:
 
 @jit
 def _turned_back(q: Quaternion, axis: int) -> Quaternion:
-    """Hamilton's product of a quaternion (x, y, z, w) and a half-turn about an axis: back to the true reference."""
+    """Undo `_turned`: Hamilton product of a quaternion (x, y, z, w) and a 180-degree rotation about an axis."""
     x, y, z, w = q
     if axis == 0:
         return w, z, -y, -x
@@ -146,9 +163,9 @@ def _turned_back(q: Quaternion, axis: int) -> Quaternion:
 
 @jit
 def _symmetric(B: Floats) -> tuple[Floats, Floats, float]:
-    """S = B + B^T, z (3,) and the trace: the parts of Davenport's matrix [[S - tr, z], [z^T, tr]].
+    """Return S = B + B^T, z (3,) and the trace, the parts of Davenport's matrix K = [[S - tr I, z], [z^T, tr]].
 
-    Shuster's quaternion carries ref into cam as A(q), the transpose of the active matrix: hence the sign of z.
+    Shuster's attitude matrix A(q) is the transpose of the active rotation matrix used here, hence the sign of z.
     """
     z = np.array([B[2, 1] - B[1, 2], B[0, 2] - B[2, 0], B[1, 0] - B[0, 1]])
     return B + B.T, z, B[0, 0] + B[1, 1] + B[2, 2]
@@ -156,12 +173,12 @@ def _symmetric(B: Floats) -> tuple[Floats, Floats, float]:
 
 @jit
 def raw_quest(B: Floats) -> Floats:
-    """QUEST (Shuster & Oh 1981, J. Guidance & Control 4, 70): the Gibbs vector from the greatest eigenvalue.
+    """QUEST (Shuster & Oh 1981, J. Guidance & Control 4, 70): the Gibbs vector from the largest eigenvalue.
 
-    The vector is infinite at half a turn. So it is sought in four reference frames, each turned by half a turn
-    ("sequential rotations"), and that is taken in which the quaternion's scalar part is the greatest. The parts
-    are compared before the quaternions are normalised: where the turn is half a turn all four numbers vanish, and
-    their ratios are noise.
+    The Gibbs vector is infinite at a rotation of 180 degrees. It is therefore computed in four reference frames, the
+    original one and those rotated by 180 degrees about each axis ("sequential rotations"), and the solution with the
+    largest scalar part of the quaternion is returned. The scalar parts are compared before normalization: at 180
+    degrees all four components of the quaternion vanish, and their ratios are rounding noise.
     """
     x = greatest(B)
     best, frame = (0.0, 0.0, 0.0, 0.0), 3
@@ -174,7 +191,7 @@ def raw_quest(B: Floats) -> Floats:
 
 @jit
 def _quest_once(B: Floats, x: float) -> Quaternion:
-    """QUEST's quaternion (x, y, z, w), not normalised, for the eigenvalue x."""
+    """Return QUEST's quaternion (x, y, z, w), not normalized, for the eigenvalue x (Shuster & Oh 1981)."""
     S, z, trace = _symmetric(B)
     det, kappa = 0.0, 0.0
     for j in range(3):
@@ -201,10 +218,11 @@ def _times(matrix: Floats, v: Floats) -> Floats:
 def raw_esoq2(B: Floats) -> Floats:
     """ESOQ2 (Mortari 1997; Markley & Mortari 2000, J. Astronautical Sciences 48, 359): the axis e and angle.
 
-    From Davenport's equations, M e = 0 with M = (x - tr)((x + tr) - S) - z z^T: the axis is the greatest of the
-    cross products of M's rows, and the quaternion is ((x - tr) e, z . e) normalised. M vanishes without a turn; so
-    the reference frame is first turned by the half-turn which makes the trace the least.
+    From Davenport's equations, M e = 0 with M = (x - tr)((x + tr) - S) - z z^T. The axis e is the longest of the cross
+    products of M's rows, and the quaternion is ((x - tr) e, z . e), normalized. M vanishes for the identity rotation;
+    the reference frame is therefore first rotated by the 180-degree rotation that gives the smallest trace.
     """
+    # A rotation by 180 degrees about an axis keeps that diagonal element and negates the two others.
     x, frame, least = greatest(B), 3, B[0, 0] + B[1, 1] + B[2, 2]
     for axis in range(3):
         trace = 2 * B[axis, axis] - (B[0, 0] + B[1, 1] + B[2, 2])
@@ -216,6 +234,7 @@ def raw_esoq2(B: Floats) -> Floats:
         for j in range(3):
             M[i, j] = -(x - trace) * S[i, j] - z[i] * z[j]
         M[i, i] += (x - trace) * (x + trace)
+    # Row i of the cofactors of M is the cross product of the two other rows.
     e, length2 = np.zeros(3), -1.0
     for i in range(3):
         u, v, w = _cofactor(M, i, 0), _cofactor(M, i, 1), _cofactor(M, i, 2)
@@ -229,7 +248,7 @@ def raw_esoq2(B: Floats) -> Floats:
 
 @jit
 def raw_davenport(B: Floats) -> Floats:
-    """Davenport's q-method (Keat 1977, CSC/TM-77/6034): the eigenvector of K's greatest eigenvalue."""
+    """Davenport's q-method (Keat 1977, CSC/TM-77/6034): the eigenvector of K's largest eigenvalue."""
     S, z, trace = _symmetric(B)
     K = np.empty((4, 4))
     K[:3, :3], K[3, 3] = S, trace
@@ -242,7 +261,7 @@ def raw_davenport(B: Floats) -> Floats:
 
 @jit
 def raw_svd(B: Floats) -> Floats:
-    """Markley 1988 (J. Astronautical Sciences 36, 245): with B = U S V^T, A = U diag(1, 1, det U det V) V^T."""
+    """SVD method (Markley 1988, J. Astronautical Sciences 36, 245): B = U S V^T, A = U diag(1, 1, det U det V) V^T."""
     U, _, Vt = np.linalg.svd(B)
     handed = np.linalg.det(U) * np.linalg.det(Vt)
     answer = np.zeros((3, 3))
@@ -254,16 +273,17 @@ def raw_svd(B: Floats) -> Floats:
 
 @jit
 def best_pair(cam: Floats, weight: Floats) -> tuple[int, int]:
-    """The two stars that leave the least variance about the worst axis.
+    """Return the pair of stars with the smallest variance about the worst axis.
 
-    Two stars' information has the least eigenvalue (p + q - sqrt((p + q)^2 - 4 p q sin^2)) / 2 for the weights p, q.
+    The smallest eigenvalue of a pair's information matrix is (p + q - sqrt((p + q)^2 - 4 p q sin^2)) / 2, with weights
+    p and q and the sine of their separation; the best pair has the largest.
     """
     first, second, best = 0, 1, -1.0
     for m in range(len(cam)):
         for n in range(m + 1, len(cam)):
             p, q = weight[m], weight[n]
             product = p * q * _sine2(cam, m, n)
-            # The same eigenvalue without the difference of near equals.
+            # The same eigenvalue in a form without cancellation.
             least = 2 * product / (p + q + sqrt(max((p + q) ** 2 - 4 * product, 0.0)))
             if least > best:
                 first, second, best = m, n, least
@@ -274,11 +294,11 @@ def best_pair(cam: Floats, weight: Floats) -> tuple[int, int]:
 def raw_triad(cam: Floats, ref: Floats, weight: Floats) -> Floats:
     """TRIAD for two stars, in its optimal form (Markley 2002, J. Guidance 25, 411).
 
-    With the normals b3, r3 of the two planes, w the weights and l a normaliser,
+    With b3, r3 the normals of the planes that the two stars span, w the weights and l a normalization factor,
 
         A = b3 r3^T + sum over the two of (w / l) [b r^T + (b x b3)(r x r3)^T],
 
-    which is Wahba's optimum for two stars, and Black's (1964) triad of vectors when one weight is nothing.
+    which is the optimum of Wahba's problem for two stars, and Black's (1964) TRIAD if one weight is zero.
     """
     m, n = best_pair(cam, weight)
     b, r = cam[np.array([m, n])], ref[np.array([m, n])]
@@ -290,7 +310,7 @@ def raw_triad(cam: Floats, ref: Floats, weight: Floats) -> Floats:
         for i in range(3):
             for j in range(3):
                 along[i, j] += share * (b[k, i] * r[k, j] + c[i] * s[j])
-    # `along` is l times a rotation of the plane: its squared entries sum up to 2 l^2.
+    # `along` is l times a rotation of the plane: the sum of its squared entries is 2 l^2.
     scale = sqrt(2 / (along**2).sum())
     for i in range(3):
         for j in range(3):
@@ -306,11 +326,12 @@ def _normal(u: Floats, v: Floats) -> Floats:
 
 @jit
 def polish(answer: Floats, cam: Floats, ref: Floats, weight: Floats) -> None:
-    """Gauss-Newton on sum(w |cam - A ref|^2), in place: sum(w (1 - a a^T)) turn = sum(w a x cam), a = A ref.
+    """Refine `answer` in place by Gauss-Newton on sum(w |cam - A ref|^2).
 
-    Directions close together make the two greatest eigenvalues of Davenport's matrix nearly equal, and what works
-    on the profile loses digits as the inverse square of their spread; here the small differences a x cam are taken
-    star by star, which keeps them. Wahba's problem has no other maximum to fall into.
+    Each step solves sum(w (I - a a^T)) turn = sum(w a x cam), a = A ref. If the directions are close together, the two
+    largest eigenvalues of Davenport's matrix are nearly equal, and methods based on the profile lose precision as the
+    inverse square of the directions' spread. Here the small differences a x cam are computed star by star, which keeps
+    the precision. Wahba's problem has no other local minimum, so the iteration cannot converge to a wrong one.
     """
     a, pull, normal, step = np.empty(3), np.empty(3), np.empty((3, 3)), np.empty(3)
     for _ in range(POLISHES):
@@ -333,7 +354,7 @@ def polish(answer: Floats, cam: Floats, ref: Floats, weight: Floats) -> None:
 
 @jit
 def _add_information(matrix: Floats, v: Floats, w: float) -> None:
-    """Lower triangle of matrix += w (|v|^2 - v v^T), without the difference of near equals on the diagonal."""
+    """Add w (|v|^2 I - v v^T) to the lower triangle of `matrix`, without cancellation on the diagonal."""
     matrix[0, 0] += w * (v[1] * v[1] + v[2] * v[2])
     matrix[1, 1] += w * (v[0] * v[0] + v[2] * v[2])
     matrix[2, 2] += w * (v[0] * v[0] + v[1] * v[1])
@@ -344,7 +365,7 @@ def _add_information(matrix: Floats, v: Floats, w: float) -> None:
 
 @jit
 def spread(cam: Floats, weight: Floats) -> Floats:
-    """(3, 3) inverse of the information sum(w (1 - b b^T)). Raises ValueError where it is singular."""
+    """Return the (3, 3) covariance: the inverse of sum(w (I - b b^T)). Raises ValueError if that is singular."""
     factor, out, unit = np.zeros((3, 3)), np.empty((3, 3)), np.empty(3)
     for n in range(len(cam)):
         _add_information(factor, cam[n], weight[n])
@@ -361,7 +382,10 @@ def spread(cam: Floats, weight: Floats) -> Floats:
 
 @jit
 def cholesky(matrix: Floats) -> None:
-    """The lower triangle of a positive definite (3, 3) matrix becomes its factor L, L L^T = matrix. ValueError."""
+    """Replace the lower triangle of a (3, 3) matrix by its Cholesky factor L, L L^T = matrix.
+
+    Raises ValueError unless the matrix is positive definite.
+    """
     for j in range(3):
         for i in range(j, 3):
             total = matrix[i, j]
@@ -377,7 +401,7 @@ def cholesky(matrix: Floats) -> None:
 
 @jit
 def solve(factor: Floats, right: Floats, out: Floats) -> None:
-    """out = (L L^T)^-1 right."""
+    """Compute out = (L L^T)^-1 right by forward and back substitution."""
     for i in range(3):
         out[i] = right[i]
         for k in range(i):
@@ -391,7 +415,7 @@ def solve(factor: Floats, right: Floats, out: Floats) -> None:
 
 @jit
 def matrix_of(q: Quaternion) -> Floats:
-    """(3, 3) rotation of a quaternion (x, y, z, w) of any length."""
+    """Return the (3, 3) rotation matrix of a quaternion (x, y, z, w) of any norm."""
     x, y, z, w = q
     s = 2 / (x * x + y * y + z * z + w * w)
     R = np.empty((3, 3))

@@ -1,4 +1,8 @@
-"""The on-board star catalogue: from a star list to apparent unit vectors, prepared apart from the simulator's."""
+"""On-board star catalog: read a star list and compute apparent unit vectors, independently of the simulator.
+
+`read` parses an ECSV file, `apparent` applies proper motion, parallax, light deflection and aberration for an
+`Observer`, and `merge_doubles` replaces unresolved stars by one at their center of light.
+"""
 
 from __future__ import annotations
 
@@ -20,14 +24,14 @@ SPEED_OF_LIGHT_M_S = 299_792_458.0
 EPOCH_YR = 1991.25
 MAS_RAD = np.pi / 180 / 3.6e6
 SUN_BENDS_RAD = 1.974e-8  # 2 G M_sun / (c^2 1 au)
-TT_MINUS_UTC_DAY = 69.184 / 86400  # since 2017; the leap seconds before change nothing here
+TT_MINUS_UTC_DAY = 69.184 / 86400  # since 2017; fewer leap seconds before that are negligible here
 
 
 @dataclass(frozen=True, slots=True)
 class StarCatalog:
-    """Stars as the file gives them, brightest first, at the epoch J1991.25 in the ICRS.
+    """Stars as given in the file, at the epoch J1991.25 in the ICRS, brightest first.
 
-    id : (N,); vectors : (N, 3) unit; drift_rad_yr : (N, 3) proper motion, tangent; parallax_rad : (N,);
+    id : (N,); vectors : (N, 3) unit; drift_rad_yr : (N, 3) proper motion, in the tangent plane; parallax_rad : (N,);
     v_mag : (N,)
     """
 
@@ -41,13 +45,13 @@ class StarCatalog:
         return len(self.id)
 
     def take(self, which: NDArray[Any]) -> StarCatalog:
-        """The chosen stars, by mask or index."""
+        """Select stars by mask or index."""
         return StarCatalog(*(getattr(self, name)[which] for name in self.__slots__))
 
 
 @dataclass(frozen=True, slots=True)
 class Observer:
-    """Who looks: barycentric position_au and velocity_m_s, (3,) in ICRS axes, and the Julian year."""
+    """State of the observer: barycentric position_au and velocity_m_s, (3,) in ICRS axes, and the Julian year."""
 
     epoch_yr: float
     position_au: Floats
@@ -55,9 +59,10 @@ class Observer:
 
 
 def on_earth(time_utc: datetime.datetime) -> Observer:
-    """An observer at the Earth's centre at a date (UTC; naive is UTC), by the IAU's ephemeris `epv00`."""
+    """Return the observer at the Earth's center at a UTC time (naive means UTC), from the IAU ephemeris `epv00`."""
     if time_utc.tzinfo is not None:
         time_utc = time_utc.astimezone(datetime.UTC).replace(tzinfo=None)
+    # epv00 takes TDB; TT is within 2 ms of it.
     days = (time_utc - datetime.datetime(2000, 1, 1, 12)) / datetime.timedelta(days=1) + TT_MINUS_UTC_DAY
     _, barycentric = erfa.epv00(erfa.DJ00, days)
     metres_per_second = erfa.DAU / erfa.DAYSEC
@@ -65,7 +70,7 @@ def on_earth(time_utc: datetime.datetime) -> Observer:
 
 
 def read(path: str | Path) -> StarCatalog:
-    """Read a catalogue file: ECSV with hip, ra_deg, dec_deg, pm_ra_mas_yr, pm_dec_mas_yr, parallax_mas, v_mag.
+    """Read a catalog file: ECSV with hip, ra_deg, dec_deg, pm_ra_mas_yr, pm_dec_mas_yr, parallax_mas, v_mag.
 
     Raises ImageError with one line if it cannot be read.
     """
@@ -90,9 +95,9 @@ def hipparcos() -> StarCatalog:
 
 
 def columns(path: str | Path, names: Sequence[str], blank: Sequence[str] = ()) -> Floats:
-    """(len(names) + len(blank), N) numbers of a catalogue file's columns, in the file's order.
+    """Read columns of a catalog file as (len(names) + len(blank), N) numbers, with rows in the file's order.
 
-    blank : columns whose gaps and missing numbers are NaN. Raises ImageError with one line if it cannot be read.
+    blank : columns in which empty fields are allowed and become NaN. Raises ImageError if the file cannot be read.
     """
     try:
         lines = Path(path).read_text(encoding="utf-8").splitlines()
@@ -126,7 +131,7 @@ def from_columns(
     parallax_mas: Floats,
     v_mag: Floats,
 ) -> StarCatalog:
-    """Directions and their drift from spherical coordinates; pm_ra includes cos(dec)."""
+    """Convert spherical coordinates and proper motions to vectors; pm_ra includes the factor cos(dec)."""
     sa, ca, sd, cd = np.sin(ra_rad), np.cos(ra_rad), np.sin(dec_rad), np.cos(dec_rad)
     vectors = np.column_stack([cd * ca, cd * sa, sd])
     east = np.column_stack([-sa, ca, np.zeros_like(sa)])
@@ -136,46 +141,48 @@ def from_columns(
 
 
 def at_epoch(stars: StarCatalog, epoch_yr: float) -> Floats:
-    """(N, 3) barycentric unit vectors at a Julian year: R + (t - t0) dR/dt, renormalised."""
+    """Return (N, 3) barycentric unit vectors at a Julian year: R + (t - t0) dR/dt, normalized."""
     return unit(stars.vectors + (epoch_yr - EPOCH_YR) * stars.drift_rad_yr)
 
 
 def apparent(stars: StarCatalog, observer: Observer) -> Floats:
-    """(N, 3) unit vectors as an observer sees them.
+    """Return (N, 3) apparent unit vectors for an observer.
 
-    Proper motion; parallax, R - pi r; the Sun's bending of light, 2 G M / (c^2 r) cot(psi / 2) away from it;
-    aberration by PTASE's eq. 4, (R + v/c) / |R + v/c|: the classical law, at most 0.5 mas from the relativistic.
-    The Sun is taken at the barycentre, which moves a bent star by less than 0.1 mas beyond 10 degrees from it.
+    Applies in this order: proper motion; parallax, R - pi r; deflection of light by the Sun, 2 G M / (c^2 r)
+    cot(psi / 2) away from the Sun; aberration by PTASE's eq. 4, (R + v/c) / |R + v/c|, the classical law, which is
+    within 0.5 mas of the relativistic one. The Sun is assumed at the barycenter; for stars more than 10 degrees from
+    the Sun the error is below 0.1 mas.
     """
     vectors = at_epoch(stars, observer.epoch_yr)
     vectors = unit(vectors - stars.parallax_rad[:, None] * observer.position_au)
     distance_au = np.linalg.norm(observer.position_au)
     from_sun = observer.position_au / distance_au
     along = vectors @ from_sun
-    # (e - (u.e) u) / (1 + u.e) has the length cot(psi / 2); within a solar radius there is no star to be seen.
+    # The vector (e - (u.e) u) / (1 + u.e) has length cot(psi / 2). The floor keeps it finite behind the Sun's disc,
+    # where no star is visible.
     away = (from_sun - along[:, None] * vectors) / np.maximum(1 + along, 1e-5)[:, None]
     vectors = unit(vectors + SUN_BENDS_RAD / distance_au * away)
     return unit(vectors + observer.velocity_m_s / SPEED_OF_LIGHT_M_S)
 
 
 def unit(vectors: Floats) -> Floats:
-    """(N, 3) vectors at length 1."""
+    """Normalize (N, 3) vectors."""
     return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
 
 
 def merge_doubles(stars: StarCatalog, closer_than_rad: float) -> StarCatalog:
-    """Replace stars too close to be told apart by one at their centre of light, as bright as all together."""
+    """Replace each group of unresolved stars by one star at their center of light, with their total flux."""
     groups = close_groups(stars.vectors, closer_than_rad)
     together = np.column_stack([stars.vectors, stars.drift_rad_yr, stars.parallax_rad])
     middle, v_mag = light_centres(together, stars.v_mag, groups)
-    # The brightest of each group comes first and gives the name.
+    # Stars are sorted by brightness, so the first of each group is its brightest and gives the id.
     _, first = np.unique(groups, return_index=True)
     result = StarCatalog(stars.id[first], unit(middle[:, :3]), middle[:, 3:6], middle[:, 6], v_mag)
     return result.take(np.argsort(result.v_mag, kind="stable"))
 
 
 def light_centres(values: Floats, magnitude: Floats, group: Ints) -> tuple[Floats, Floats]:
-    """(G, K) means of (N, K) values weighted by light, and the (G,) magnitudes of all the light in each group."""
+    """Return (G, K) flux-weighted means of (N, K) values, and the (G,) magnitudes of the total flux of each group."""
     light = 10 ** (-0.4 * magnitude)
     total = np.bincount(group, light)
     middle = np.column_stack([np.bincount(group, light * column) / total for column in values.T])
@@ -183,7 +190,7 @@ def light_centres(values: Floats, magnitude: Floats, group: Ints) -> tuple[Float
 
 
 def close_groups(vectors: Floats, closer_than_rad: float) -> Ints:
-    """Label of each star's group, where groups are joined through pairs closer than an angle."""
+    """Label each star with its group: the connected components of the graph of pairs closer than an angle."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
@@ -194,11 +201,11 @@ def close_groups(vectors: Floats, closer_than_rad: float) -> Ints:
 
 
 def brighter(stars: StarCatalog, limit_mag: float) -> StarCatalog:
-    """Stars to a limiting V magnitude."""
+    """Select the stars down to a limiting V magnitude."""
     return stars.take(stars.v_mag <= limit_mag)
 
 
 def limit_for_density(stars: StarCatalog, field_sr: float, wanted: float) -> float:
-    """The magnitude to which a field of so many steradians holds `wanted` stars on average."""
+    """Return the limiting magnitude at which a field of `field_sr` steradians holds `wanted` stars on average."""
     count = int(np.clip(wanted * 4 * np.pi / field_sr, 1, len(stars)))
     return float(np.sort(stars.v_mag)[count - 1])

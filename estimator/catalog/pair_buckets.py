@@ -1,8 +1,9 @@
-"""Boeing's pair catalogue: which two stars are how far apart, in buckets of angle and without the angles.
+"""Boeing's pair catalog: star pairs grouped into buckets of separation, without storing the separations.
 
-Needelman, Li & Wu 2005 as told by Padro 2012, section 2.4.6. Pairs lie in buckets of equal width in angle, unsorted
-within, and a table says where each bucket begins. That halves the memory and needs no search; a few pairs too many
-are looked at.
+Needelman, Li & Wu 2005, as described by Padro 2012, section 2.4.6. Buckets have equal width in angle, pairs within a
+bucket are unsorted, and a table gives the first pair of each bucket. A lookup computes the bucket numbers of the two
+ends of the range, without a search, and leaving out the angles halves the memory. The price: the range returned is
+rounded outwards to whole buckets, so the caller has to check a few pairs too many.
 """
 
 from __future__ import annotations
@@ -20,17 +21,17 @@ from estimator.core.errors import ImageError
 from estimator.core.jit import jit
 
 ARCSEC_RAD = np.pi / 648_000
-WIDTH_RAD = 100 * ARCSEC_RAD  # the thesis's (section 3.7.3)
+WIDTH_RAD = 100 * ARCSEC_RAD  # from the thesis (Padro 2012, section 3.7.3)
 
 
 class PairCatalogue(NamedTuple):
-    """Stars, and pairs of them in buckets of angle.
+    """Stars, and their pairs in buckets of separation.
 
     vectors   : (N, 3) unit;  magnitude : (N,) any scale
-    pair      : (P, 2) rows, bucket after bucket, unsorted within
-    table     : (M + 1,) where each bucket begins in `pair`; the last entry is P
+    pair      : (P, 2) star rows, bucket after bucket, unsorted within a bucket
+    table     : (M + 1,) first pair of each bucket; the last entry is P
     max_rad   : upper end of the last bucket; bucket i of 0 .. M - 1 begins at max_rad - (M - i) width_rad
-    cells     : the stars by direction, where Boeing sorts them by declination
+    cells     : the stars by direction; Boeing sorts them by declination instead
     """
 
     vectors: Floats
@@ -49,16 +50,16 @@ def bucketed(
     range_rad: tuple[float, float] | None = None,
     magnitudes: tuple[float, float] = (-np.inf, np.inf),
 ) -> PairCatalogue:
-    """Every pair of (N, 3) unit vectors whose angle and whose two magnitudes (N,) are in range (section 2.4.6).
+    """Build the catalog of pairs of (N, 3) unit vectors whose angle and magnitudes (N,) are in range (section 2.4.6).
 
-    range_rad : of the angles, both ends included; that of the pairs there are if left out
-    Buckets are counted back from the greatest angle. Raises ImageError where there is no pair.
+    range_rad : range of angles, both ends included; if omitted, that of the pairs found
+    Buckets are counted back from the largest angle. Raises ImageError where there is no pair.
     """
     vectors = np.ascontiguousarray(vectors, dtype=float)
     if not width_rad > 0:
         raise ImageError(f"bucket width {width_rad} rad: allowed is more than 0")
     low, high = range_rad or (0.0, np.pi)
-    # A hair wider than the range, which the exact angles then cut.
+    # Search slightly beyond the range, then select by the exact angles.
     chord = 2 * np.sin(min(high, np.pi) / 2) + 1e-12
     pair = cKDTree(vectors).query_pairs(chord, output_type="ndarray").astype(np.int32)
     angle = 2 * np.arcsin(np.linalg.norm(vectors[pair[:, 0]] - vectors[pair[:, 1]], axis=1) / 2)
@@ -69,7 +70,7 @@ def bucketed(
         raise ImageError(f"no pair of stars from {np.degrees(low):.3f} to {np.degrees(high):.3f} deg")
     if range_rad is None:
         low, high = float(angle.min()), float(angle.max())
-    # A range of whole buckets is one bucket more by rounding, but for the 1e-9.
+    # The 1e-9 keeps rounding from adding a bucket where the range is a whole number of buckets.
     buckets = max(int(np.ceil((high - low) / width_rad - 1e-9)), 1)
     bucket = bucket_of(angle, high, width_rad, buckets)
     table = np.concatenate([[0], np.cumsum(np.bincount(bucket, minlength=buckets))])
@@ -80,10 +81,10 @@ def bucketed(
 
 @jit
 def bucket_of(angle_rad: Floats, max_rad: float, width_rad: float, buckets: int) -> Ints:
-    """Which bucket, 0 .. buckets - 1, each angle belongs to; what lies outside goes to the first or the last.
+    """Return the bucket, 0 .. buckets - 1, of each angle; angles outside go to the first or the last bucket.
 
-    Each step of it grows with the angle, in floating point too: an angle inside a gate is in a bucket between
-    those of the gate's ends, whatever is rounded.
+    Each operation is monotonic in the angle, in floating point too. An angle between two limits is therefore always in
+    a bucket between those of the limits, whatever the rounding.
     """
     number = np.floor(buckets - (max_rad - angle_rad) / width_rad)
     return np.clip(number, 0, buckets - 1).astype(np.int64)
@@ -91,9 +92,9 @@ def bucket_of(angle_rad: Floats, max_rad: float, width_rad: float, buckets: int)
 
 @jit
 def candidates(catalogue: PairCatalogue, low_rad: float, high_rad: float) -> tuple[int, int]:
-    """Half-open range of pairs that holds every angle in [low, high], and a bucket's rest at either end.
+    """Return the half-open range of pairs that holds every angle in [low, high], rounded out to whole buckets.
 
-    From the bucket with the greatest lower end below `low` to before that with the least above `high` (eq. 12).
+    It begins at the last bucket whose lower end is below `low` and ends before the first one above `high` (eq. 12).
     """
     buckets = len(catalogue.table) - 1
     ends = np.array([low_rad, high_rad])

@@ -1,4 +1,14 @@
-"""The on-board catalogue's pairs: a k-vector over all angles, and every star's neighbours by angle."""
+"""Pair index of the on-board catalog: star pairs sorted by separation with a k-vector, and neighbor lists.
+
+The k-vector (Mortari 1997) finds all pairs with a separation in [low, high] without a search. A straight line
+z(k) = slope k + offset spans the sorted separations from just below the smallest to just above the largest; kvector[k]
+counts the pairs with a separation of at most z(k). Inverting the line at `low` and `high` gives two indices k, and the
+counts at these are the ends of the range. The separations are nearly enough linear in their rank that the range holds
+only a few pairs too many.
+
+The neighbor lists serve the other question, which stars are at a given separation from one star: for each star they
+hold the other stars of its pairs, sorted by separation, and are searched by bisection.
+"""
 
 from __future__ import annotations
 
@@ -16,16 +26,17 @@ from estimator.core.jit import jit
 
 
 class PairIndex(NamedTuple):
-    """Pairs of catalogue stars closer than max_angle_rad. A plain tuple, so that compiled code can take it.
+    """Pairs of catalog stars closer than max_angle_rad. A named tuple, so that compiled code accepts it.
 
     vectors   : (N, 3) unit vectors, brightest star first
-    pair      : (P, 2) star rows, by growing angle;  angle_rad : (P,)
+    pair      : (P, 2) star rows, by increasing angle;  angle_rad : (P,)
     kvector   : (P + 2,) kvector[k] = number of pairs with angle <= slope k + offset (Mortari 1997)
-    slope_rad, offset_rad : the k-vector's line
-    first     : (N + 1,) where each star's neighbours begin
-    neighbour : their rows, by growing angle;  separation_rad : the angles
-    group     : (N,) which stars were made as one; no pair is listed within a group, for its pattern repeats
-    magnitude : (N,) growing, in the camera's own scale; NaN where it is not known
+    slope_rad, offset_rad : the line of the k-vector
+    first     : (N + 1,) first entry of each star in `neighbour`
+    neighbour : rows of the neighbors, by increasing angle;  separation_rad : their angles
+    group     : (N,) label of each star's group (patch board); pairs within a group are left out of `pair`, as
+        the pattern of a board repeats on every other board
+    magnitude : (N,) increasing, in the camera's own scale; NaN if unknown
     cells     : the stars by direction
     """
 
@@ -50,10 +61,12 @@ def build(
     group: NDArray[np.int64] | None = None,
     magnitude: Floats | None = None,
 ) -> PairIndex:
-    """Index all pairs of (N, 3) unit vectors up to an angle, brightest first. Raises ImageError where there are none.
+    """Index all pairs of (N, 3) unit vectors, brightest first, up to an angle.
 
-    group     : (N,) labels of what is not placed independently (LEDs of one patch board); each its own if left out
-    magnitude : (N,) never falling; unknown if left out
+    group     : (N,) labels of stars not placed independently (LEDs of one patch board); if omitted, each star is
+        its own group
+    magnitude : (N,) non-decreasing; unknown if omitted
+    Raises ImageError for fewer than 3 pairs and for magnitudes that decrease or are not one for each star.
     """
     group = np.arange(len(vectors)) if group is None else np.asarray(group, np.int64)
     vectors = np.ascontiguousarray(vectors, dtype=float)
@@ -68,6 +81,7 @@ def build(
     angle = 2 * np.arcsin(np.linalg.norm(vectors[pair[:, 0]] - vectors[pair[:, 1]], axis=1) / 2)
     order = np.argsort(angle, kind="stable")
     pair, angle = np.ascontiguousarray(pair[order]), angle[order]
+    # Each pair appears in the neighbor lists of both its stars. The lists keep pairs within a group.
     owner = np.concatenate([pair[:, 0], pair[:, 1]])
     other = np.concatenate([pair[:, 1], pair[:, 0]])
     both = np.concatenate([angle, angle])
@@ -100,9 +114,10 @@ def build(
 
 
 def line(angle_rad: Floats) -> tuple[NDArray[np.int64], float, float]:
-    """The k-vector of sorted angles: counts below a line through just under the least and just over the greatest.
+    """Return the k-vector of sorted angles, with the slope and the offset of its line.
 
-    z(k) = slope k + offset with k = 0 .. P + 1; count[k] = #{angle <= z(k)}.
+    The line runs from just below the smallest to just above the largest angle: z(k) = slope k + offset with
+    k = 0 .. P + 1, and count[k] = #{angle <= z(k)}.
     """
     count = len(angle_rad)
     margin = max(1e-12, 1e-12 * angle_rad[-1])
@@ -114,11 +129,11 @@ def line(angle_rad: Floats) -> tuple[NDArray[np.int64], float, float]:
 
 @jit
 def between(index: PairIndex, low_rad: float, high_rad: float) -> tuple[int, int]:
-    """Half-open range of pairs that holds every angle in [low, high].
+    """Return the half-open range of pairs that holds every angle in [low, high].
 
-    Mortari's formula, j_b = floor((low - q) / m) and j_t = ceil((high - q) / m), may take in a neighbour or two
-    at either end; SHEFEX's eq. 5 has the signs of the error and of q wrong. A thousandth of a step is added, for
-    an angle that lies on a node of the line together with the range's end, and for the rounding of the two.
+    Mortari's formula, j_b = floor((low - q) / m) and j_t = ceil((high - q) / m), may include one or two pairs
+    outside the range at either end (SHEFEX's eq. 5 has the signs of the error and of q wrong). The range is widened by
+    a thousandth of a step on each side, so that rounding cannot exclude an angle on a node of the line.
     """
     last = len(index.kvector) - 1
     k_low = int(np.floor((low_rad - index.offset_rad) / index.slope_rad - 1e-3))
@@ -132,7 +147,7 @@ def between(index: PairIndex, low_rad: float, high_rad: float) -> tuple[int, int
 
 @jit
 def alike(index: PairIndex, magnitude: float, gate: float) -> tuple[int, int]:
-    """Half-open range of rows whose magnitude is within a gate of one; all of them where one is not known."""
+    """Return the half-open range of rows within `gate` of a magnitude; all rows if magnitude or gate is unknown."""
     if not np.isfinite(gate) or np.isnan(magnitude) or np.isnan(index.magnitude[0]):
         return 0, len(index.magnitude)
     begin = int(np.searchsorted(index.magnitude, magnitude - gate))
@@ -141,7 +156,7 @@ def alike(index: PairIndex, magnitude: float, gate: float) -> tuple[int, int]:
 
 @jit
 def around(index: PairIndex, star: int, low_rad: float) -> int:
-    """Place of a star's first neighbour at `low_rad` or farther, by bisection."""
+    """Return the position in `neighbour` of a star's first neighbor at `low_rad` or farther, by bisection."""
     begin, end = index.first[star], index.first[star + 1]
     while begin < end:
         middle = (begin + end) // 2

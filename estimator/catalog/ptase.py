@@ -1,8 +1,8 @@
-"""PTASE's on-board catalogue: READCAT takes it from the file, PROC_CAT makes it fit for a star tracker.
+"""PTASE's on-board catalog: READCAT selects stars from a file, PROC_CAT prepares them for a star tracker.
 
-Fialho & Saotome 2005, section 3.3. READCAT takes all stars to a limiting visual magnitude, is able "to convert visual
+Fialho & Saotome 2005, section 3.3. READCAT selects all stars to a limiting visual magnitude, is able "to convert visual
 magnitudes to instrumental magnitudes through an empirical formula that relates these magnitudes with B-V and V-I", and
-corrects proper motion "from the Hipparcos mean epoch (J1991.25) to the mean mission epoch"; the file's order stays.
+corrects proper motion "from the Hipparcos mean epoch (J1991.25) to the mean mission epoch"; it keeps the file's order.
 PROC_CAT "merges optically double or multiple systems into a single photometrically equivalent star and rearranges the
 stars in order of increasing magnitude", and logs a histogram and every star. The fixed-point layout of their files is
 unpublished and is not imitated.
@@ -20,12 +20,12 @@ from estimator.catalog import catalog
 from estimator.core.arrays import Floats, Ints
 from estimator.core.errors import ImageError
 
-SUN_B_V, SUN_V_I = 0.65, 0.72  # of a G2 star, where a catalogue has no colour
-BYTES_A_STAR = 20  # two angles and a magnitude in 4 bytes each, a number, flags and checksum in 8
+SUN_B_V, SUN_V_I = 0.65, 0.72  # of a G2 star, used where the catalog has no color
+BYTES_A_STAR = 20  # two angles and a magnitude of 4 bytes each; id, flags and checksum in 8
 
 
 class Colour(NamedTuple):
-    """An instrument's magnitude: m = V + constant + b_v (B - V) + v_i (V - I)."""
+    """Coefficients of an instrumental magnitude: m = V + constant + b_v (B - V) + v_i (V - I)."""
 
     constant: float = 0.0
     b_v: float = 0.0
@@ -34,10 +34,10 @@ class Colour(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class OnBoard:
-    """A catalogue at one epoch, as a tracker stores it.
+    """A catalog at one epoch, as a tracker stores it.
 
-    id        : (N,) of the brightest star in each entry;  vectors : (N, 3) unit, ICRS axes at the barycentre
-    magnitude : (N,) the instrument's;  components : (N,) catalogue stars in each entry;  epoch_yr : Julian year
+    id        : (N,) of the brightest star in each entry;  vectors : (N, 3) unit, barycentric, ICRS axes
+    magnitude : (N,) instrumental;  components : (N,) number of catalog stars in each entry;  epoch_yr : Julian year
     """
 
     id: Ints
@@ -53,10 +53,11 @@ class OnBoard:
 def read_cat(
     path: str | Path, limit_v_mag: float, epoch_yr: float = catalog.EPOCH_YR, colour: Colour | None = None
 ) -> OnBoard:
-    """READCAT: the stars to a limiting V, at the mission's epoch, with instrumental magnitudes, in the file's order.
+    """READCAT: select stars to a limiting V, propagate to the mission epoch, compute instrumental magnitudes.
 
-    colour : the instrument's; V itself if left out, and then the file needs no colours. Where one is missing it is
-        the Sun's. Raises ImageError for a file that is no catalogue, and where no star is bright enough.
+    colour : coefficients of the instrument; if omitted the magnitude is V, and the file needs no color columns. A
+        missing color is replaced by that of the Sun
+    Keeps the order of the file. Raises ImageError for a file that is not a catalog, and if no star is bright enough.
     """
     numbers = catalog.columns(path, catalog.COLUMNS, ("b_v", "v_i") if colour else ())
     numbers = numbers[:, numbers[6] <= limit_v_mag]
@@ -74,9 +75,10 @@ def read_cat(
 
 
 def proc_cat(stars: OnBoard, closer_than_rad: float) -> OnBoard:
-    """PROC_CAT: stars closer than an angle become one at their centre of light; then the brightest comes first.
+    """PROC_CAT: merge stars closer than an angle into one at their center of light, and sort by magnitude.
 
-    The light of all stays: m = -2.5 log10 sum 10^(-0.4 m). Groups are joined through pairs, so that a chain is one.
+    The merged star has the total flux, m = -2.5 log10 sum 10^(-0.4 m). Groups are joined through pairs, so a chain of
+    close stars is one group.
     """
     order = np.argsort(stars.magnitude, kind="stable")
     vectors, magnitude = stars.vectors[order], stars.magnitude[order]
@@ -95,14 +97,14 @@ def proc_cat(stars: OnBoard, closer_than_rad: float) -> OnBoard:
 
 
 def histogram(magnitude: Floats, step_mag: float = 0.5) -> tuple[Floats, Ints]:
-    """Lower edges of the magnitude bins, whole multiples of the step, and (M,) how many stars are in each."""
+    """Return the (M,) lower edges of the magnitude bins, multiples of the step, and the (M,) star counts."""
     bins = np.floor(np.asarray(magnitude) / step_mag + 1e-9).astype(np.int64)
     count = np.bincount(bins - bins.min())
     return step_mag * (bins.min() + np.arange(len(count))), count
 
 
 def log(stars: OnBoard, step_mag: float = 0.5) -> str:
-    """PROC_CAT's log file: how many stars of which magnitude, the memory that they take, and every star."""
+    """Return the text of PROC_CAT's log file: a magnitude histogram, the memory needed, and every star."""
     edges, count = histogram(stars.magnitude, step_mag)
     several = stars.components[stars.components > 1]
     lines = [

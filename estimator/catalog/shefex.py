@@ -1,13 +1,13 @@
-"""SHEFEX-2's on-board catalogues: one limit for each hemisphere, and stars spread evenly over the sky.
+"""SHEFEX-2's on-board catalogs: a magnitude limit for each hemisphere, and a uniform distribution over the sky.
 
-Samaan & Theil 2011, section 3.3. The asymmetric catalogue has no star fainter than 5.4 and about 180 between 5.2 and
-5.4, "the difference in stars between the hemispheres"; the uniform one about 450 from 5.25 to 5.75; the chosen one all
-of the asymmetric to 4.5, and of its fainter stars so many, spread evenly, that there are 2,023.
+Samaan & Theil 2011, section 3.3. The asymmetric catalog has no star fainter than 5.4 and about 180 between 5.2 and 5.4,
+"the difference in stars between the hemispheres". The uniform one has about 450 stars from 5.25 to 5.75. The chosen one
+has all stars of the asymmetric one to 4.5 and an evenly distributed subset of its fainter stars, 2,023 in total.
 
-How they thinned is unpublished (Samaan, Bruccoleri, Mortari & Junkins 2003 have several ways). Ours: the brightest
-first, a star is taken if none that is taken already is nearer than a distance; the distance that leaves the wanted
-number is found by bisection. From Hipparcos-2 this gives 59,410 pairs within 18.57 deg where they have 54,804, and 183
-stars between 5.2 and 5.4 (254 before thinning).
+Their thinning method is unpublished (Samaan, Bruccoleri, Mortari & Junkins 2003 describe several). Ours is greedy:
+stars are visited by increasing magnitude, and a star is selected if no star selected before is closer than a minimum
+distance. The distance that gives the wanted number is found by bisection. From Hipparcos-2 this gives 59,410 pairs
+within 18.57 deg, compared with their 54,804, and 183 stars between 5.2 and 5.4 (254 before thinning).
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ COUNT = 2023
 
 
 def asymmetric(stars: StarCatalog, north_mag: float = NORTH_MAG, south_mag: float = SOUTH_MAG) -> StarCatalog:
-    """Stars to one limit north of the equator and to another south of it: the flight was from the south."""
+    """Select stars to one limit north of the equator and to another (fainter by default) south of it."""
     return stars.take(stars.v_mag <= np.where(stars.vectors[:, 2] >= 0, north_mag, south_mag))
 
 
 def spread(stars: StarCatalog, apart_rad: float, kept_mag: float = -np.inf) -> StarCatalog:
-    """The stars to `kept_mag`, and of the others, the brightest first, those with none taken nearer than an angle."""
+    """Select all stars to `kept_mag`, then, brightest first, each star with no selected one closer than an angle."""
     order = np.argsort(stars.v_mag, kind="stable")
     vectors = np.ascontiguousarray(stars.vectors[order])
     kept = int(np.searchsorted(stars.v_mag[order], kept_mag, side="right"))
@@ -44,7 +44,7 @@ def spread(stars: StarCatalog, apart_rad: float, kept_mag: float = -np.inf) -> S
 
 @jit
 def _spread(vectors: Floats, known: Cells, kept: int, chord: float) -> NDArray:
-    """(N,) whether each star is taken, the brightest deciding first."""
+    """Return (N,) whether each star is selected; stars are visited in order, brightest first."""
     taken = np.zeros(len(vectors), np.bool_)
     near = np.empty(len(vectors), np.int64)
     for n in range(len(vectors)):
@@ -54,13 +54,15 @@ def _spread(vectors: Floats, known: Cells, kept: int, chord: float) -> NDArray:
 
 
 def uniform(stars: StarCatalog, count: int, kept_mag: float = -np.inf) -> StarCatalog:
-    """So many stars, spread evenly, with all to `kept_mag`; within one of the count, as one distance decides.
+    """Select about `count` evenly distributed stars, including all to `kept_mag`.
 
-    Raises ImageError where the list has not so many stars, or more of the bright ones alone.
+    One minimum distance decides for all stars, so the number can differ from the count by about one. Raises ImageError
+    if the list has fewer stars, or more stars to `kept_mag`, than the count.
     """
     bright = int((stars.v_mag <= kept_mag).sum())
     if not max(bright, 1) <= count <= len(stars):
         raise ImageError(f"{count} stars of {len(stars)}; allowed: from the {max(bright, 1)} to be kept on")
+    # A larger distance selects fewer stars; `low` always gives at least `count`.
     low, high = 0.0, np.pi
     for _ in range(40):
         middle = (low + high) / 2
@@ -69,7 +71,7 @@ def uniform(stars: StarCatalog, count: int, kept_mag: float = -np.inf) -> StarCa
 
 
 def chosen(stars: StarCatalog) -> StarCatalog:
-    """The flown catalogue: 2,023 stars, of the asymmetric one all to 4.5 and the rest spread evenly."""
+    """Select the flown catalog: 2,023 stars, all of the asymmetric one to 4.5 and the rest evenly distributed."""
     return uniform(asymmetric(stars), COUNT, KEPT_MAG)
 
 

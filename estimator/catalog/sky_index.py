@@ -1,4 +1,14 @@
-"""The on-board stars laid out for the search: pairs by their angle, and every star by where it stands."""
+"""Sky index for star identification: star pairs binned by separation, and stars binned by direction.
+
+Pairs are sorted into bins of equal width in angle (a counting sort), so the candidates for a measured angle are the
+pairs of a few adjacent bins. They are found by a sweep along z: with the stars sorted by z, only stars with |dz| up to
+the maximum chord can form a pair.
+
+Directions are binned on the six faces of a cube about the observer. A star is projected onto a face by the gnomonic
+projection (u, v) = the two other components over the face's component, and each face is a grid of side x side cells.
+The grid extends beyond the face's edges (|u|, |v| = 1) to EDGE, so that a search around any direction needs only the
+cells of one face; stars near an edge are therefore stored on more than one face.
+"""
 
 from __future__ import annotations
 
@@ -16,20 +26,20 @@ from estimator.core.jit import jit
 PAIRS_A_BIN = 8
 STARS_A_CELL = 0.5
 MAG_STEP = 0.1
-MAG_BLUR = 0.25  # by which the histogram of magnitudes is smoothed
-# A face of the cube reaches so far beyond its 45 degrees that no gate to .05 rad needs another face.
+MAG_BLUR = 0.25  # standard deviation of the Gaussian that smooths the histogram of magnitudes
+# Half-width of a face's grid in tangents. It exceeds 1 (45 degrees) so that a gate up to 0.05 rad stays on one face.
 EDGE = 1.2
 
 
 class Sky(NamedTuple):
-    """A plain tuple, so that compiled code can take it.
+    """Stars and pairs in bins. A named tuple, so that compiled code accepts it.
 
     vectors : (N, 3) unit vectors, brightest star first
-    pair    : (P, 2) rows of stars, by bins of the angle between them
-    first   : (B + 1,) pairs first[k] to first[k + 1] are k to k + 1 times bin_rad apart
-    mag     : (N,) magnitudes, growing;  share : their density a magnitude, from mag[0] on in steps of MAG_STEP
-    cell_first, cell_star : stars cell_star[cell_first[c]] onwards stand in cell c; there are side x side cells on each
-        face of a cube about the observer (gnomonic projection)
+    pair    : (P, 2) rows of stars, in bins of the angle between them
+    first   : (B + 1,) pairs first[k] to first[k + 1] are separated by k to k + 1 times bin_rad
+    mag     : (N,) magnitudes, increasing;  share : their density per magnitude, from mag[0] in steps of MAG_STEP
+    cell_first, cell_star : the stars of cell c are cell_star[cell_first[c] : cell_first[c + 1]]; each face of the
+        cube has side x side cells
     """
 
     vectors: Floats
@@ -44,16 +54,20 @@ class Sky(NamedTuple):
 
     @property
     def bytes(self) -> int:
-        """Memory that it takes."""
+        """Memory of the arrays, bytes."""
         return sum(part.nbytes for part in self if isinstance(part, np.ndarray))
 
 
 def sky_of(vectors: Floats, mag: Floats, max_angle_rad: float) -> Sky:
-    """Lay out (N, 3) unit vectors, brightest first, with all pairs up to an angle. Raises ImageError without any."""
+    """Build the index of (N, 3) unit vectors, brightest first, with all pairs up to an angle.
+
+    Raises ImageError for fewer than 3 pairs.
+    """
     sky = unpaired(vectors, mag)
     vectors = sky.vectors
     order = np.argsort(vectors[:, 2])
     max_angle_rad = min(max_angle_rad, np.pi)
+    # Three sweeps: count all pairs, count them by bin, then store each pair in its bin.
     one_bin = np.zeros(1, np.int64)
     _pairs(vectors, order, max_angle_rad, max_angle_rad * (1 + 1e-9), one_bin, np.empty((0, 2), np.int32))
     total = int(one_bin[0])
@@ -72,7 +86,7 @@ def sky_of(vectors: Floats, mag: Floats, max_angle_rad: float) -> Sky:
 
 
 def unpaired(vectors: Floats, mag: Floats) -> Sky:
-    """Lay out (N, 3) unit vectors, brightest first, without pairs: to find what stands in a place."""
+    """Build the index of (N, 3) unit vectors, brightest first, without pairs: for lookups by direction only."""
     vectors, mag = np.ascontiguousarray(vectors, dtype=float), np.ascontiguousarray(mag, dtype=float)
     side = max(int(np.sqrt(len(vectors) / STARS_A_CELL / 6)), 1)
     no_pairs = np.empty((0, 2), np.int32), np.zeros(2, np.int32), np.pi
@@ -80,7 +94,7 @@ def unpaired(vectors: Floats, mag: Floats) -> Sky:
 
 
 def _share(mag: Floats) -> Floats:
-    """Density of sorted magnitudes a magnitude, smoothed by MAG_BLUR."""
+    """Return the density of sorted magnitudes per magnitude: a histogram smoothed by MAG_BLUR."""
     reach = 4 * MAG_BLUR
     edges = np.arange(mag[0] - reach, mag[-1] + reach + MAG_STEP, MAG_STEP)
     count = np.histogram(mag, edges)[0] / len(mag) / MAG_STEP
@@ -98,7 +112,10 @@ def _pairs(
     place: NDArray,
     pair: NDArray,
 ) -> None:
-    """Every pair up to an angle, by a sweep along z: counted by bins where there is no room for it, else put there."""
+    """Sweep along z over every pair up to an angle: count pairs by bin in `place`, and store them if `pair` has room.
+
+    place : (B,) in the counting sweeps zeros, in the storing sweep the first position of each bin
+    """
     reach = 2 * np.sin(max_angle_rad / 2)
     for one in range(len(order)):
         i = order[one]
@@ -106,7 +123,7 @@ def _pairs(
             j = order[other]
             dz = vectors[j, 2] - vectors[i, 2]
             if dz > reach:
-                break
+                break  # the stars are sorted by z: all further ones are out of reach too
             dx, dy = vectors[j, 0] - vectors[i, 0], vectors[j, 1] - vectors[i, 1]
             chord2 = dx * dx + dy * dy + dz * dz
             if chord2 > reach * reach:
@@ -119,7 +136,7 @@ def _pairs(
 
 
 def _cells(vectors: Floats, side: int) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Stars by cells; one near the border of a face is on the neighbouring face too."""
+    """Sort the stars by cell; a star near the edge of a face is also on the neighboring face."""
     cell, star = [], []
     for axis in range(3):
         for sign in (1, -1):
@@ -146,10 +163,12 @@ def nearest(
     z: float,
     gate: float,
 ) -> tuple[int, float]:
-    """The star nearest to a unit vector within .05 rad or less, and the square of its distance; -1 if there is none.
+    """Return the star nearest to a unit vector and its squared chord; (-1, gate^2) if none is within the gate.
 
-    The first four are a Sky's: passing it whole would cost more than the search.
+    gate : radians, at most 0.05
+    The first four arguments are fields of a Sky: passing the whole tuple would cost more than the search.
     """
+    # The largest component selects the face; the two others over it are the gnomonic coordinates.
     ax, ay, az = abs(x), abs(y), abs(z)
     if ax >= ay and ax >= az:
         face, inverse = (0 if x > 0 else 1), 1 / ax
@@ -161,12 +180,14 @@ def nearest(
         face, inverse = (4 if z > 0 else 5), 1 / az
         u, v = x * inverse, y * inverse
     scale = side / (2 * EDGE)
-    # A tangent grows by no more than 1 + u^2 + v^2 times the angle, and a little for the angle's own size.
+    # A gnomonic coordinate changes by at most (1 + u^2 + v^2) times the angle, to first order; the last factor bounds
+    # the higher orders.
     reach = gate * (1 + u * u + v * v) * (1 + 4 * gate)
     left, right = cell_of((u - reach + EDGE) * scale, side), cell_of((u + reach + EDGE) * scale, side - 1)
     top, bottom = cell_of((v - reach + EDGE) * scale, side), cell_of((v + reach + EDGE) * scale, side - 1)
     best, closest = -1, gate * gate
     for row in range(top, bottom + 1):
+        # The cells of a row are contiguous in `cell_star`: one loop covers them.
         line = (face * side + row) * side
         for place in range(cell_first[line + left], cell_first[line + right + 1]):
             star = cell_star[place]

@@ -1,4 +1,8 @@
-"""Which catalogue stars are near a direction: the cube about the unit sphere, cut into cells."""
+"""Spatial grid for searches by direction: the cube [-1, 1]^3 about the unit sphere, divided into cells.
+
+A counting sort lists the stars cell after cell. A search within a chord visits the cells that intersect the box of that
+half-width about the direction; cells adjacent in z are adjacent in the list, so each (x, y) column is one loop.
+"""
 
 from __future__ import annotations
 
@@ -11,14 +15,14 @@ from numpy.typing import NDArray
 from estimator.core.arrays import Floats
 from estimator.core.jit import jit
 
-MOST_A_SIDE = 64  # a table of a megabyte
+MOST_A_SIDE = 64  # 64^3 cells: a table of a megabyte
 
 
 class Cells(NamedTuple):
-    """Stars by the cell of the cube [-1, 1]^3 that their direction is in. A plain tuple, for compiled code.
+    """Stars by the cell of the cube [-1, 1]^3 that holds their direction. A named tuple, for compiled code.
 
     side  : cells along an edge
-    first : (side^3 + 1,) where each cell's stars begin in `row`;  row : (N,) rows of the vectors, cell after cell
+    first : (side^3 + 1,) first entry of each cell in `row`;  row : (N,) rows of the vectors, cell after cell
     """
 
     side: int
@@ -27,9 +31,9 @@ class Cells(NamedTuple):
 
 
 def build(vectors: Floats) -> Cells:
-    """The cells of (N, 3) unit vectors: about one star in each cell that the sphere goes through.
+    """Build the cells of (N, 3) unit vectors, with about one star in each cell that the sphere intersects.
 
-    The sphere meets about 4 pi / (2 / side)^2 = pi side^2 of them.
+    The sphere intersects about 4 pi / (2 / side)^2 = pi side^2 cells.
     """
     side = min(max(int(sqrt(len(vectors) / pi)), 2), MOST_A_SIDE)
     return Cells(side, *_sorted(vectors, side))
@@ -37,7 +41,7 @@ def build(vectors: Floats) -> Cells:
 
 @jit
 def _sorted(vectors: Floats, side: int) -> tuple[NDArray, NDArray]:
-    """Counting sort of the stars by cell."""
+    """Sort the stars by cell (counting sort); returns the fields `first` and `row` of Cells."""
     first = np.zeros(side**3 + 1, np.int32)
     row, cell = np.empty(len(vectors), np.int32), np.empty(len(vectors), np.int64)
     for n in range(len(vectors)):
@@ -55,9 +59,9 @@ def _sorted(vectors: Floats, side: int) -> tuple[NDArray, NDArray]:
 
 @jit
 def cell_of(place: float, last: int) -> int:
-    """The cell, 0 to last, of a place counted in cells: the nearest one where it is outside, 0 where it is NaN.
+    """Return the cell, 0 to last, of a coordinate in units of cells, clamped to the range; 0 for NaN.
 
-    A cast of NaN, or of more than an integer holds, is whatever the processor makes of it.
+    The clamp comes before the cast: casting NaN or a number too large for an integer is undefined.
     """
     if not place > 0:
         return 0
@@ -66,13 +70,13 @@ def cell_of(place: float, last: int) -> int:
 
 @jit
 def _spot(x: float, side: int) -> int:
-    """Which cell along an edge a coordinate is in."""
+    """Return the cell along an edge that holds a coordinate in [-1, 1]."""
     return cell_of((x + 1) / 2 * side, side - 1)
 
 
 @jit
 def within(cells: Cells, vectors: Floats, x: float, y: float, z: float, chord: float, out: NDArray) -> int:
-    """How many stars are within a straight-line distance `chord` of (x, y, z); the rows of the first len(out)."""
+    """Count the stars within a straight-line distance `chord` of (x, y, z); writes the first len(out) rows to `out`."""
     count, side = 0, cells.side
     for i in range(_spot(x - chord, side), _spot(x + chord, side) + 1):
         for j in range(_spot(y - chord, side), _spot(y + chord, side) + 1):
@@ -91,7 +95,7 @@ def within(cells: Cells, vectors: Floats, x: float, y: float, z: float, chord: f
 
 @jit
 def nearest(cells: Cells, vectors: Floats, x: float, y: float, z: float, chord: float) -> int:
-    """Row of the star nearest to (x, y, z) within a straight-line distance; -1 where there is none."""
+    """Return the row of the star nearest to (x, y, z) within a straight-line distance `chord`; -1 if there is none."""
     best, least, side = -1, chord * chord, cells.side
     for i in range(_spot(x - chord, side), _spot(x + chord, side) + 1):
         for j in range(_spot(y - chord, side), _spot(y + chord, side) + 1):

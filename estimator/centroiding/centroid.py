@@ -1,4 +1,9 @@
-"""Where each blob is, to a fraction of a pixel, and how well that is known."""
+"""Centroiding: the subpixel position of each blob, with its standard deviation.
+
+Each centroider takes the frame and its `Blobs` and returns `Centroids`. The first three are moments of the light (see
+`estimator.centroiding.moments`); the others fit a model by weighted least squares: a Gaussian, a streak, a disc. A
+blob that the model does not fit keeps its center of gravity.
+"""
 
 from __future__ import annotations
 
@@ -13,15 +18,15 @@ from estimator.core.arrays import Floats
 from estimator.core.types import NO_PRIORS, Blobs, Centroids, FramePriors
 from estimator.detection.detect import native
 
-# (image, blobs, gain_e_dn, hints): the gain in electrons a unit of the image tells the light's own noise.
+# (image, blobs, gain_e_dn, hints): the gain, in electrons per unit of the image, determines the photon noise.
 Centroider = Callable[..., Centroids]
 
 
 def cog(image: NDArray, blobs: Blobs, gain_e_dn: float = 1.0, hints: FramePriors = NO_PRIORS) -> Centroids:
-    """Centre of gravity of the light above the sky in the blob's box and a margin around it.
+    """Center of gravity of the light above the sky, in the blob's box and a margin around it.
 
     x = sum(I x) / sum(I), with var(x) = sum((I / g + noise^2) (x - x_mean)^2) / sum(I)^2 for a gain of g
-    electrons a unit. A pixel that lies nearer to another blob's box is left out.
+    electrons per unit. Pixels closer to another blob's box are excluded.
     """
     sky = blobs.background
     return _measured(moments.gravity(native(image), blobs.box_px, sky.level, sky.noise, gain_e_dn))
@@ -30,10 +35,11 @@ def cog(image: NDArray, blobs: Blobs, gain_e_dn: float = 1.0, hints: FramePriors
 def weighted(
     image: NDArray, blobs: Blobs, gain_e_dn: float = 1.0, hints: FramePriors = NO_PRIORS
 ) -> Centroids:
-    """Centre of gravity with the light itself as the weight: x = sum(I^2 x) / sum(I^2).
+    """Center of gravity weighted by the light itself: x = sum(I^2 x) / sum(I^2).
 
-    The wings, which are mostly noise, count less. var(x) = sum(4 I^2 (x - x_mean)^2 (I / g + noise^2)) / sum(I^2)^2,
-    and the S-curve's mean square of a profile narrower by the square root of 2.
+    The wings, which are mostly noise, get less weight. The variance is
+    sum(4 I^2 (x - x_mean)^2 (I / g + noise^2)) / sum(I^2)^2 plus the mean square of the S-curve (the pixel-phase error)
+    of the squared profile, which is narrower by the square root of 2.
     """
     sky = blobs.background
     return _measured(moments.squared(native(image), blobs.box_px, sky.level, sky.noise, gain_e_dn))
@@ -42,12 +48,12 @@ def weighted(
 def gaussian_window(
     image: NDArray, blobs: Blobs, gain_e_dn: float = 1.0, hints: FramePriors = NO_PRIORS
 ) -> Centroids:
-    """Centre of gravity in a Gaussian window w, moved until it is in the window's own middle: sum(w I (x - c)) = 0.
+    """Center of gravity in a Gaussian window w, iterated until it is the center c of the window: sum(w I (x - c)) = 0.
 
-    As SExtractor's XWIN (Bertin & Arnouts 1996), but by Newton's method, and with a window of twice the star's own
-    variance. var(c) = sum(w^2 (x - c)^2 (I / g + noise^2)) / sum(w I (1 - (x - c)^2 / s^2))^2, and the S-curve's mean
-    square. An eighth above the least error for faint and for bright stars. A blob on which it does not settle keeps
-    its centre of gravity.
+    As SExtractor's XWIN (Bertin & Arnouts 1996), but solved by Newton's method, and with a window of twice the star's
+    variance. var(c) = sum(w^2 (x - c)^2 (I / g + noise^2)) / sum(w I (1 - (x - c)^2 / s^2))^2 plus the mean square of
+    the S-curve. The error is an eighth above the minimum, for faint and for bright stars. A blob for which the
+    iteration does not converge keeps its center of gravity.
     """
     sky = blobs.background
     rows = moments.windowed(native(image), blobs.xy_px, blobs.box_px, sky.level, sky.noise, gain_e_dn)
@@ -57,24 +63,26 @@ def gaussian_window(
 def gaussian_fit(
     image: NDArray, blobs: Blobs, gain_e_dn: float = 1.0, hints: FramePriors = NO_PRIORS
 ) -> Centroids:
-    """Least-squares fit of a Gaussian integrated over each pixel: x, y, flux, sigma and the sky under it.
+    """Least-squares fit of a Gaussian integrated over each pixel; free are x, y, flux, sigma and the sky level.
 
-    Gauss-Newton on a 7x7 window around the blob's middle. The model is I = b + F gx gy with
-    gx = [erf((x - x0 + 1/2) / (sigma sqrt 2)) - erf((x - x0 - 1/2) / (sigma sqrt 2))] / 2, and a pixel weighs
-    1 / (noise^2 + F gx gy / g) for a gain of g electrons a unit: with equal weights a bright star is placed
-    4/3 times worse than the photons allow. Saturated pixels are left out: the wings tell where the star is. A blob
-    that the model does not fit (no convergence, larger than the window) keeps its centre of gravity.
+    Gauss-Newton on a 7x7 window around the blob's center. The model is I = b + F gx gy with
+    gx = [erf((x - x0 + 1/2) / (sigma sqrt 2)) - erf((x - x0 - 1/2) / (sigma sqrt 2))] / 2, and a pixel's weight is
+    1 / (noise^2 + F gx gy / g) for a gain of g electrons per unit; with equal weights the error of a bright star would
+    be 4/3 of the photon-noise limit. Saturated pixels are excluded: the wings determine the position. A blob that the
+    model does not fit (no convergence, larger than the window) keeps its center of gravity.
     """
     return _measured(_or_gravity(_gaussians(image, blobs, gain_e_dn, hints), image, blobs, gain_e_dn))
 
 
 def streak(image: NDArray, blobs: Blobs, gain_e_dn: float = 1.0, hints: FramePriors = NO_PRIORS) -> Centroids:
-    """Least-squares fit of a line segment blurred by a Gaussian: its middle is the star at mid-exposure.
+    """Least-squares fit of a line segment blurred by a Gaussian; its center is the star's position at mid-exposure.
 
-    Middle, flux and sky are free; length, direction and width nearly so, about the hints' streak, else what the
-    frame's blobs share. The ends are `streak_ends`. The covariance is Cramer and Rao's, worse along than across, and
-    what noise makes of the ends of a faint one. Frames that are not smeared get `gaussian_fit`; in the others blobs
-    that are no streak get it too, or their centre of gravity where a streak is longer than a round star's window.
+    Center, flux and sky are free. Length, direction and width have Gaussian priors around the streak of the hints, or
+    otherwise around the streak that the frame's blobs share. `streak_ends` returns the ends. The covariance is the
+    Cramer-Rao bound, larger along than across, plus the error of a faint streak's ends (see `streak_fit`).
+
+    A frame that is not smeared is passed to `gaussian_fit`. In a smeared frame, blobs that are not streaks are too;
+    but if the streak is longer than half a round star's window, they keep their center of gravity.
     """
     lines = _streaks(image, blobs, gain_e_dn, hints)
     lost = np.isnan(lines[:, 0])
@@ -85,7 +93,7 @@ def streak(image: NDArray, blobs: Blobs, gain_e_dn: float = 1.0, hints: FramePri
     rows[:, 2] = np.sqrt((lines[:, 5] + lines[:, 6]) / 2)
     if lost.any():
         rows[lost] = np.nan
-        # A longer one does not fit the window of a round star.
+        # A streak longer than half the window of a round star does not fit into it.
         if np.hypot(*_smear(blobs, hints)) <= gaussian.HALF_PX:
             rows[lost] = _gaussians(image, blobs.take(lost), gain_e_dn, hints)
         rows = _or_gravity(rows, image, blobs, gain_e_dn)
@@ -96,17 +104,17 @@ def streak(image: NDArray, blobs: Blobs, gain_e_dn: float = 1.0, hints: FramePri
 def streak_ends(
     image: NDArray, blobs: Blobs, gain_e_dn: float = 1.0, hints: FramePriors = NO_PRIORS
 ) -> tuple[Floats, Floats]:
-    """(N, 2) and (N, 2) where each streak of `streak` begins and ends, or the reverse; NaN for what is none."""
+    """Return (N, 2) and (N, 2): the two ends of each streak in arbitrary order; NaN for a blob that is not a streak."""
     rows = _streaks(image, blobs, gain_e_dn, hints)
     return rows[:, :2] - rows[:, 3:5] / 2, rows[:, :2] + rows[:, 3:5] / 2
 
 
 def disc(image: NDArray, blobs: Blobs, gain_e_dn: float = 1.0, hints: FramePriors = NO_PRIORS) -> Centroids:
-    """Least-squares fit of an evenly bright disc with a blurred edge: an LED near by.
+    """Least-squares fit of a uniform disc with a blurred edge: the image of a nearby LED.
 
-    Middle, radius, edge width, brightness and sky are free. The edge alone tells the place, so that a saturated
-    disc is placed as well as another; its full pixels are left out. A blob too small for a disc, or none, keeps its
-    centre of gravity.
+    Center, radius, edge width, brightness and sky are free. Only the edge carries information about the position, so a
+    saturated disc is measured as accurately as any other; its saturated pixels are excluded. A blob that is too small
+    or not a disc keeps its center of gravity.
     """
     sky = blobs.background
     rows = disc_fit.fit_all(
@@ -135,7 +143,7 @@ CENTROIDERS: dict[str, Centroider] = {
 
 
 def _gaussians(image: NDArray, blobs: Blobs, gain_e_dn: float, hints: FramePriors) -> Floats:
-    """The rows of `starfit.fit_all`."""
+    """Return the rows of `gaussian_fit.fit_all`."""
     sky = blobs.background
     return gaussian.fit_all(
         native(image),
@@ -151,7 +159,7 @@ def _gaussians(image: NDArray, blobs: Blobs, gain_e_dn: float, hints: FramePrior
 
 
 def _streaks(image: NDArray, blobs: Blobs, gain_e_dn: float, hints: FramePriors) -> Floats:
-    """The rows of `streaks.fit_all`; all NaN for a frame that is not smeared."""
+    """Return the rows of `streak_fit.fit_all`; all NaN for a frame that is not smeared."""
     line = _smear(blobs, hints)
     if np.hypot(*line) < streak_fit.SHORTEST_PX:
         return np.full((len(blobs), 8), np.nan)
@@ -162,12 +170,12 @@ def _streaks(image: NDArray, blobs: Blobs, gain_e_dn: float, hints: FramePriors)
 
 
 def _smear(blobs: Blobs, hints: FramePriors) -> tuple[float, float]:
-    """(dx, dy) of the frame's streaks, px: as told, else as its blobs share; 0 where there are none."""
+    """Return (dx, dy) of the frame's streaks, px: from the hints, otherwise from its blobs, otherwise (0, 0)."""
     return hints.streak_px or blobs.streak_px or (0.0, 0.0)
 
 
 def _or_gravity(rows: Floats, image: NDArray, blobs: Blobs, gain_e_dn: float) -> Floats:
-    """The rows, and the centre of gravity's where they are NaN."""
+    """Replace the rows that are NaN by those of the center of gravity, in place."""
     lost = np.isnan(rows[:, 0])
     if lost.any():
         sky = blobs.background

@@ -1,4 +1,9 @@
-"""One lamp as a disc with a blurred edge, by least squares."""
+"""Disc fit of one nearby LED: a uniform disc with a blurred edge, by weighted least squares.
+
+The model of a pixel at distance r from the center is sky + A erfc((r - R) / (w sqrt 2)) / 2: a disc of radius R with an
+edge blurred by a Gaussian of width w. Gauss-Newton solves for center, R, w, A and sky. The position is determined by
+the pixels at the edge alone, so saturated pixels inside can be left out.
+"""
 
 from __future__ import annotations
 
@@ -14,10 +19,11 @@ from estimator.core.jit import jit
 from estimator.detection.background import FILTERED_NOISE, at
 
 MARGIN_PX = 4
-SMALLEST_PX = 2.0  # radius of a disc that its edge's blur leaves flat in the middle
+SMALLEST_PX = 2.0  # radius of the smallest disc that still has a flat center despite its blurred edge
 ROUNDS = 40
-MODEL_PX = 0.004  # what a square pixel at a curved edge differs from the model: without noise, at 5 and 10 px
-# Parameters: middle, radius, the edge's width, brightness, sky.
+# Model error at a curved edge of square pixels, measured without noise at radii of 5 and 10 px.
+MODEL_PX = 0.004
+# Parameters: center, radius, edge width, brightness, sky.
 X, Y, RADIUS, EDGE, BRIGHT, SKY = range(6)
 
 
@@ -33,7 +39,7 @@ def fit_all(
     gain_e_dn: float,
     saturation: float,
 ) -> Floats:
-    """(N, 5) x, y, sigma of the place, flux, radius; NaN for what is no disc."""
+    """Fit every blob: (N, 5) x, y, sigma of the position, flux, radius; NaN if it is not a disc."""
     height, width = image.shape
     out = np.full((len(xy), 5), np.nan)
     near, p = np.empty(len(xy), np.int64), np.empty(6)
@@ -52,6 +58,7 @@ def fit_all(
         others = near[: neighbours(boxes, n, x0, y0, x1, y1, near)]
         sky = at(level, height, width, xy[n, 1], xy[n, 0])
         sigma = at(noise, height, width, xy[n, 1], xy[n, 0]) / FILTERED_NOISE
+        # Initial values: the radius of a disc of the blob's area, and the mean brightness.
         p[EDGE], p[BRIGHT], p[SKY] = 1.0, flux[n] / area[n], sky
         count = 0
         for y in range(y0, y1 + 1):
@@ -66,7 +73,7 @@ def fit_all(
 
 @jit
 def _largest_window(boxes: Ints) -> int:
-    """Pixels of the largest blob's window."""
+    """Return the number of pixels in the largest blob's window."""
     most = 0
     for x0, y0, x1, y1 in boxes:
         most = max(most, (x1 - x0 + 1 + 2 * MARGIN_PX) * (y1 - y0 + 1 + 2 * MARGIN_PX))
@@ -77,10 +84,10 @@ def _largest_window(boxes: Ints) -> int:
 def _fit(
     pixels: Floats, noise: float, gain_e_dn: float, rows: Floats, weight: Floats, p: Floats, out: Floats
 ) -> None:
-    """Gauss-Newton from `p`; leaves `out` NaN where it does not settle near its start.
+    """Fit one disc by Gauss-Newton, starting from `p`; leaves `out` NaN if it does not converge near its start.
 
-    pixels : (3, K) x, y and value of those that count
-    A lamp is no perfect disc: where the residuals are larger than the noise, the covariance grows with them.
+    pixels : (3, K) x, y and value of the pixels used
+    An LED is not a perfect disc: where the residuals exceed the noise, the covariance is inflated.
     """
     count = pixels.shape[1]
     start_x, start_y, start_radius = p[X], p[Y], p[RADIUS]
@@ -92,6 +99,7 @@ def _fit(
         if not fall >= 0:
             return
         moved = max(abs(move[X]), abs(move[Y]), abs(move[RADIUS]))
+        # At most one pixel per step, and a quarter of a pixel in the edge's width.
         p += min(1.0, 1 / max(moved, 4 * abs(move[EDGE]), 1e-300)) * move
         p[EDGE] = min(max(p[EDGE], 0.25), 0.6 * p[RADIUS])
         if hypot(p[X] - start_x, p[Y] - start_y) > start_radius / 2 or p[BRIGHT] <= 0:
@@ -102,17 +110,17 @@ def _fit(
             xx, yy, _ = least_squares.place_covariance(normal, move)
             grown = (xx + yy) / 2 * least_squares.misfit_factor(normal[6, 6], count - 6)
             out[0], out[1], out[2], out[4] = p[X], p[Y], sqrt(grown + MODEL_PX**2), p[RADIUS]
-            # The whole light of a blurred disc: pi (R^2 + w^2), the edge being symmetric about R.
+            # Total flux of a blurred disc: A pi (R^2 + w^2), as the edge is symmetric about R.
             out[3] = p[BRIGHT] * pi * (p[RADIUS] ** 2 + p[EDGE] ** 2)
             return
 
 
 @jit
 def _rows(pixels: Floats, noise: float, gain_e_dn: float, p: Floats, rows: Floats, weight: Floats) -> None:
-    """The model's slopes by the six parameters at every pixel, what it leaves over, and the weights.
+    """Fill the model's derivatives by the six parameters, the residual and the weight of every pixel.
 
-    The light is A erfc((r - R) / (w sqrt 2)) / 2: exact for a straight edge blurred by a Gaussian; w^2 is the
-    optics' sigma^2 and the pixel's 1/12.
+    The model A erfc((r - R) / (w sqrt 2)) / 2 is exact for a straight edge blurred by a Gaussian; w^2 is the optics'
+    sigma^2 plus the pixel's 1/12.
     """
     bright, w = p[BRIGHT], p[EDGE]
     for k in range(pixels.shape[1]):

@@ -1,4 +1,10 @@
-"""One star as a Gaussian integrated over each pixel, by least squares."""
+"""Gaussian fit of one star: a Gaussian integrated over each pixel, by weighted least squares.
+
+The model of a pixel is I = sky + F gx gy, where gx and gy are the integrals of a one-dimensional Gaussian over the
+pixel's width and height (differences of erf). Gauss-Newton solves for x, y, F, sigma and sky; the weights are the
+inverse variances of the current model, so they are updated in each iteration. The covariance is the inverse normal
+matrix, inflated by the reduced chi-square where the model does not fit.
+"""
 
 from __future__ import annotations
 
@@ -12,11 +18,11 @@ from estimator.core.arrays import Floats, Ints
 from estimator.core.jit import jit
 from estimator.detection.background import FILTERED_NOISE, at
 
-HALF_PX, WIDEST_HALF_PX = 3, 10  # of the window: of a star, and of one that fills its pixels
-NARROWEST_PX, WIDEST_PX = 0.2, 3.0  # sigma that a window of 7x7 can tell
-USUAL_PX = 0.8  # sigma that the first star starts from
+HALF_PX, WIDEST_HALF_PX = 3, 10  # half-width of the window: default, and largest for a saturated star
+NARROWEST_PX, WIDEST_PX = 0.2, 3.0  # limits of sigma that a 7x7 window can resolve
+USUAL_PX = 0.8  # initial sigma of the first star
 ROUNDS = 40
-# Parameters: middle, flux, width, sky.
+# Parameters: center, flux, width, sky.
 X, Y, FLUX, WIDTH, SKY = range(5)
 
 
@@ -32,9 +38,9 @@ def fit_all(
     gain_e_dn: float,
     saturation: float,
 ) -> Floats:
-    """(N, 4) x, y, sigma of the place, flux; NaN for what is no single Gaussian.
+    """Fit every blob: (N, 4) x, y, sigma of the position, flux; NaN if it is not a single Gaussian.
 
-    Each star starts from the width of the one before: the optics are the same.
+    The fit of each star starts from the width of the star before, as the optics are the same.
     """
     height, width = image.shape
     out = np.full((len(xy), 4), np.nan)
@@ -44,7 +50,7 @@ def fit_all(
     p, usual_px = np.empty(5), USUAL_PX
     for n in range(len(xy)):
         half = HALF_PX
-        if peak[n] >= saturation:  # only its wings tell where it is
+        if peak[n] >= saturation:  # only the wings are usable: enlarge the window
             longer = max(boxes[n, 2] - boxes[n, 0], boxes[n, 3] - boxes[n, 1])
             half = min(max(longer // 2 + 2, HALF_PX), WIDEST_HALF_PX)
         left, top = round(xy[n, 0]) - half, round(xy[n, 1]) - half
@@ -60,7 +66,7 @@ def fit_all(
             out[n, 0] += left
             out[n, 1] += top
         if not out[n, 3] > flux[n] / 2:
-            out[n] = np.nan  # a window on the plateau of a disc sees a little light on a bright sky
+            out[n] = np.nan  # on the plateau of a disc the fit finds a weak star on a bright sky
     return out
 
 
@@ -76,9 +82,9 @@ def _fit(
     p: Floats,
     out: Floats,
 ) -> bool:
-    """One Gaussian by Gauss-Newton from `p`; False where it does not settle inside its window.
+    """Fit one Gaussian by Gauss-Newton, starting from `p`; return False if it does not converge within its window.
 
-    Two stars in one window are no star: the covariance grows with what the model leaves over.
+    Where the model does not fit (two stars in one window) the covariance is inflated by the residuals.
     """
     start_x, start_y = p[X], p[Y]
     normal, move = np.empty((6, 6)), np.empty(5)
@@ -90,6 +96,7 @@ def _fit(
         if not fall >= 0:
             return False
         moved = max(abs(move[X]), abs(move[Y]), abs(move[WIDTH]))
+        # Steps of more than half a pixel are shortened: the model is too nonlinear for them.
         p += min(1.0, 0.5 / max(moved, 1e-300)) * move
         if abs(p[X] - start_x) > 2 or abs(p[Y] - start_y) > 2 or p[FLUX] <= 0:
             return False
@@ -115,7 +122,7 @@ def _rows(
     weight: Floats,
     edges: Floats,
 ) -> int:
-    """The model's slopes at every pixel of the window, what it leaves over, and the weights; how many count."""
+    """Fill the model's derivatives, the residuals and the weights at every pixel; return the number of pixels used."""
     side, flux, pixels = len(window), p[FLUX], window.size
     gx, dgx, sgx, gy, dgy, sgy = edges
     _cells(side, p[X], p[WIDTH], gx, dgx, sgx)
@@ -129,7 +136,7 @@ def _rows(
             part[X, i], part[Y, i], part[FLUX, i] = share * dgx[i], slope * gx[i], gy[j] * gx[i]
             part[WIDTH, i] = share * sgx[i] + widening * gx[i]
             part[5, i] = line[i] - p[SKY] - light
-            # The 1e-9 keeps a noise-free image's sky from weighing infinitely much.
+            # The 1e-9 keeps the weights finite in the sky of a noise-free image.
             heavy[i] = 1 / (noise * noise + (light + 1e-9 * flux) / gain_e_dn)
         for i in range(side):
             if line[i] >= saturation:
@@ -140,7 +147,10 @@ def _rows(
 
 @jit
 def _cells(count: int, middle: float, sigma: float, share: Floats, slope: Floats, widening: Floats) -> None:
-    """Share of a 1-D Gaussian in each pixel; its slopes by the middle and by sigma. From edge to edge."""
+    """Integrate a 1-D Gaussian over each pixel; also its derivatives with respect to the center and to sigma.
+
+    Adjacent pixels share an edge, so erf and exp are computed once per edge.
+    """
     scale = 1 / sigma
     low = (-0.5 - middle) * scale
     low_sum, low_bell = erf(low * sqrt(0.5)) / 2, exp(-low * low / 2) / sqrt(2 * pi)

@@ -1,4 +1,11 @@
-"""Centroids by moments of the light: centre of gravity, weighted, and in a Gaussian window."""
+"""Centroids by moments of the light: center of gravity, light-weighted, and in a Gaussian window.
+
+Each kernel sums the light above the interpolated sky and returns x, y, sigma and flux per blob, or NaN where the
+position is undefined. `gravity` and `squared` use the blob's box and a margin, `windowed` the window. The variance
+propagates photon noise (I / gain) and the sky's noise through the estimator's derivative with respect to each pixel.
+The two weighted estimators also have a systematic error that depends on the position of the star within its pixel
+(the S-curve), since they see the profile at the pixel centers only; `sampling_variance` gives its mean square.
+"""
 
 from __future__ import annotations
 
@@ -12,16 +19,16 @@ from estimator.core.jit import jit
 from estimator.detection.background import FILTERED_NOISE, at
 
 MARGIN_PX = 4
-LEAST_WINDOW_PX, MOST_WINDOW_PX = 0.6, 4.0  # sigma of the window
+LEAST_WINDOW_PX, MOST_WINDOW_PX = 0.6, 4.0  # limits of the window's sigma
 WINDOW_SHARE = (
-    2.0  # the window's variance over the star's: faint and bright ones lose an eighth each, see below
+    2.0  # the window's variance over the star's: the error is an eighth above the minimum, see `windowed`
 )
-SIZING, ROUNDS = 4, 60  # rounds in which the window takes the star's width, and at most
+SIZING, ROUNDS = 4, 60  # iterations that adapt the window's width, and iterations at most
 
 
 @jit
 def gravity(image: NDArray, boxes: Ints, level: Floats, noise: Floats, gain_e_dn: float) -> Floats:
-    """(N, 4) x, y, sigma of the place, flux, of the light in the box and a margin around it."""
+    """Compute the center of gravity in each box and a margin: (N, 4) x, y, sigma of the position, flux."""
     height, width = image.shape
     out = np.empty((len(boxes), 4))
     near = np.empty(len(boxes), np.int64)
@@ -41,6 +48,7 @@ def gravity(image: NDArray, boxes: Ints, level: Floats, noise: Floats, gain_e_dn
                 flux += light
                 sx += light * u
                 sy += light * v
+                # Photon noise needs the light itself, without the negative noise of the sky.
                 bright = max(light, 0.0)
                 s_light += bright
                 light_x += bright * u
@@ -50,7 +58,7 @@ def gravity(image: NDArray, boxes: Ints, level: Floats, noise: Floats, gain_e_dn
                 px += u
                 py += v
                 pxx += u * u + v * v
-        if flux == 0:  # as much darkness as light: it is nowhere
+        if flux == 0:  # the center of gravity is undefined
             out[n] = np.nan, np.nan, np.nan, 0.0
             continue
         cx, cy = sx / flux, sy / flux
@@ -70,7 +78,7 @@ def gravity(image: NDArray, boxes: Ints, level: Floats, noise: Floats, gain_e_dn
 
 @jit
 def squared(image: NDArray, boxes: Ints, level: Floats, noise: Floats, gain_e_dn: float) -> Floats:
-    """(N, 4) x, y, sigma of the place, flux; each pixel weighs as its light squared."""
+    """Compute the mean position weighted by the squared light: (N, 4) x, y, sigma of the position, flux."""
     height, width = image.shape
     out = np.empty((len(boxes), 4))
     near = np.empty(len(boxes), np.int64)
@@ -80,7 +88,7 @@ def squared(image: NDArray, boxes: Ints, level: Floats, noise: Floats, gain_e_dn
         others = near[: neighbours(boxes, n, x0, y0, x1, y1, near)]
         cx = cy = flux = weight = spread = wide = 0.0
         sigma2 = 0.0
-        for turn in range(2):  # the place first, then its variance about it
+        for turn in range(2):  # first the position, then its variance about it
             for y in range(y0, y1 + 1):
                 for x in range(x0, x1 + 1):
                     if foreign(boxes, others, n, x, y):
@@ -114,11 +122,15 @@ def squared(image: NDArray, boxes: Ints, level: Floats, noise: Floats, gain_e_dn
 def windowed(
     image: NDArray, xy: Floats, boxes: Ints, level: Floats, noise: Floats, gain_e_dn: float
 ) -> Floats:
-    """(N, 4) x, y, sigma of the place, flux, in a Gaussian window that has found its place and the star's width.
+    """Compute the centroid in an adaptive Gaussian window: (N, 4) x, y, sigma of the position, flux.
 
-    With t the window's variance over the star's, the error exceeds the least possible by (t + 1)^2 / 4 t where the
-    sky's noise rules, by (t + 1)^2 / t (t + 2) where the star's own does: 1.125 either way at t = 2. A narrower
-    window also sees the star at too few pixels.
+    The center c solves f(c) = sum(w I (x - c)) = 0 with w = exp(-|x - c|^2 / 2 s^2), by Newton's method with the
+    derivative -sum(w I (1 - (x - c)^2 / s^2)). The first SIZING iterations also set s^2 to WINDOW_SHARE times the
+    star's variance. Rows are NaN where it does not converge.
+
+    With t the window's variance over the star's, the error exceeds the minimum by a factor (t + 1)^2 / 4 t if the sky's
+    noise dominates, and (t + 1)^2 / t (t + 2) if the star's photon noise dominates: 1.125 in both cases at t = 2. A
+    narrower window also samples the star at too few pixels.
     """
     height, width = image.shape
     out = np.full((len(boxes), 4), np.nan)
@@ -146,7 +158,7 @@ def windowed(
                     m2 += w * light * (u * u + v * v) / 2
                     spread += w * w * (u * u + v * v) / 2 * (max(light, 0.0) / gain_e_dn + sigma2)
                     flux += light
-            # The window's own motion takes m2 / s2 of the slope of the first moment.
+            # Negative derivative of the first moment: the window moves with c, which subtracts m2 / s2.
             slope = total - m2 / s2
             if not (total > 0 and slope > 0):
                 break
@@ -156,7 +168,7 @@ def windowed(
             if abs(cx - xy[n, 0]) > 2 + sqrt(s2) or abs(cy - xy[n, 1]) > 2 + sqrt(s2):
                 break
             if turn < SIZING:
-                # The product of the window and a star of variance q has the variance 1 / (1/q + 1/s2).
+                # A star of variance q times the window has the variance 1 / (1/q + 1/s2): solve for q.
                 seen = m2 / total
                 q = 1 / (1 / seen - 1 / s2) if 0 < seen < 0.95 * s2 else MOST_WINDOW_PX**2
                 s2 = min(max(WINDOW_SHARE * q, LEAST_WINDOW_PX**2), MOST_WINDOW_PX**2)
@@ -170,16 +182,16 @@ def windowed(
 
 @jit
 def sampling_variance(variance_px2: float) -> float:
-    """Mean square of the S-curve of a Gaussian v seen at points only: its amplitude is 4 pi v exp(-2 pi^2 v).
+    """Mean square of the S-curve of a Gaussian of variance v sampled at points; the amplitude is 4 pi v exp(-2 pi^2 v).
 
-    The first harmonic of Poisson's sum over the pixels of (x - c) exp(-(x - c)^2 / 2 v).
+    It is the first harmonic of the Poisson summation of (x - c) exp(-(x - c)^2 / 2 v) over the pixels.
     """
     return (4 * pi * variance_px2 * exp(-2 * pi * pi * variance_px2)) ** 2 / 2
 
 
 @jit
 def neighbours(boxes: Ints, n: int, x0: int, y0: int, x1: int, y1: int, near: Ints) -> int:
-    """Fill `near` with the other blobs whose boxes reach into a window; how many."""
+    """Write to `near` the other blobs whose boxes overlap a window; return their number."""
     count = 0
     for m in range(len(boxes)):
         apart = boxes[m, 0] > x1 or boxes[m, 2] < x0 or boxes[m, 1] > y1 or boxes[m, 3] < y0
@@ -191,7 +203,7 @@ def neighbours(boxes: Ints, n: int, x0: int, y0: int, x1: int, y1: int, near: In
 
 @jit
 def foreign(boxes: Ints, near: Ints, n: int, x: int, y: int) -> bool:
-    """Whether a pixel lies nearer to another blob's box."""
+    """Whether a pixel is closer to the box of another blob than to that of blob n."""
     if len(near) == 0:
         return False
     mine = _apart(boxes[n], x, y)
@@ -203,7 +215,7 @@ def foreign(boxes: Ints, near: Ints, n: int, x: int, y: int) -> bool:
 
 @jit
 def _apart(box: Ints, x: int, y: int) -> float:
-    """Squared distance of a pixel from a box; 0 inside."""
+    """Squared distance of a pixel to a box; 0 inside."""
     dx = max(box[0] - x, 0, x - box[2])
     dy = max(box[1] - y, 0, y - box[3])
     return dx * dx + dy * dy

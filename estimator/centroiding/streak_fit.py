@@ -1,4 +1,11 @@
-"""One smeared star as a line segment blurred by a Gaussian, by least squares."""
+"""Streak fit of one smeared star: a line segment blurred by a Gaussian, by weighted least squares.
+
+The model is a uniform segment of length L and direction a, convolved with a Gaussian of width w (see `_rows` for the
+equation). Gauss-Newton solves for center, flux, length, direction, width and sky. Length, direction and width have
+Gaussian priors around the streak shared by the frame: without them, the fit of a faint streak would settle on its
+brightest piece. The covariance is the Cramer-Rao bound of the center, inflated by the reduced chi-square where the
+model does not fit, plus the error along the streak of misplacing its ends in noise (`_slip_px2`).
+"""
 
 from __future__ import annotations
 
@@ -13,16 +20,15 @@ from estimator.core.arrays import Floats, Ints
 from estimator.core.jit import jit
 from estimator.detection.background import FILTERED_NOISE, at
 
-MARGIN_PX, WIDEST_PX = 4, 96  # of the window about the streak
-REACH_PX = 4.5  # from the line that the fit starts from: beyond there is but sky
-SHORTEST_PX = 1.5  # of a streak whose length and direction the light still tells
+MARGIN_PX, WIDEST_PX = 4, 96  # margin of the window about the streak, and its largest half-width
+REACH_PX = 4.5  # from the initial line: pixels farther away contain only sky and are not used
+SHORTEST_PX = 1.5  # shortest streak whose length and direction can be measured
 ROUNDS = 40
-# By how much a star's own streak may differ from the frame's (1 sigma): the field turns about the boresight too, a
-# lens stretches; and its width from that of the star before. Faint light tells less, and left to itself it calls the
-# brightest piece of its streak the streak.
+# Priors (1 sigma): difference of a star's streak from the frame's, as rotation about the boresight and distortion make
+# streaks vary over the field; and of its width from that of the star before.
 LENGTH_SHARE, LENGTH_PX, ANGLE_RAD, WIDTH_SHARE = 0.15, 0.5, 0.15, 0.15
-FAR_SIGMA = 5.0  # from an end of the line: 3e-7 of the light is farther out
-# Parameters: middle, flux, length, direction, width, sky.
+FAR_SIGMA = 5.0  # from an end of the line: 3e-7 of the light is beyond
+# Parameters: center, flux, length, direction, width, sky.
 X, Y, FLUX, LENGTH, ANGLE, WIDTH, SKY = range(7)
 
 
@@ -37,10 +43,11 @@ def fit_all(
     gain_e_dn: float,
     saturation: float,
 ) -> Floats:
-    """(N, 8) x, y, flux, dx, dy, and xx, yy, xy of the middle's covariance; NaN for what is no single streak."""
+    """Fit every blob: (N, 8) x, y, flux, dx, dy, and xx, yy, xy of the center's covariance; NaN if not a streak."""
     height, width = image.shape
     out = np.full((len(xy), 8), np.nan)
     near, p = np.empty(len(xy), np.int64), np.empty(7)
+    # The window covers the frame's streak, with a margin, about the blob's center.
     half_x, half_y = int(abs(streak[0]) / 2) + MARGIN_PX, int(abs(streak[1]) / 2) + MARGIN_PX
     if max(half_x, half_y) > WIDEST_PX:
         return out
@@ -68,7 +75,7 @@ def fit_all(
                     pixels[0, count], pixels[1, count], pixels[2, count] = x, y, image[y, x]
                     count += 1
         if p[FLUX] > 0 and _fit(pixels[:, :count], sigma, gain_e_dn, rows, weight, p, out[n]):
-            width_px = p[WIDTH]  # the optics are the same
+            width_px = p[WIDTH]  # the optics are the same for the next star
     return out
 
 
@@ -85,11 +92,11 @@ def _off_line(p: Floats, x: float, y: float) -> float:
 def _fit(
     pixels: Floats, noise: float, gain_e_dn: float, rows: Floats, weight: Floats, p: Floats, out: Floats
 ) -> bool:
-    """Gauss-Newton from `p`; False where it does not settle near its start.
+    """Fit one streak by Gauss-Newton, starting from `p`; return False if it does not converge near its start.
 
-    pixels : (3, K) x, y and value of those that count
-    Where it starts is the frame's streak, from which its own differs by LENGTH_SHARE and so on. Two streaks that cross
-    are no streak: the covariance grows with what the model leaves over.
+    pixels : (3, K) x, y and value of the pixels used
+    The start is the frame's streak; it is also the mean of the priors on length, direction and width. Where the model
+    does not fit (two crossing streaks) the covariance is inflated by the residuals.
     """
     count = pixels.shape[1]
     start_x, start_y = p[X], p[Y]
@@ -107,6 +114,7 @@ def _fit(
             return False
         moved = max(abs(move[X]), abs(move[Y]), abs(move[LENGTH]))
         turned = abs(move[ANGLE]) * p[LENGTH] / 2
+        # The step is shortened so that center, length and direction move an end by about a pixel at most.
         p += min(1.0, 1 / max(moved, turned, 2 * abs(move[WIDTH]), 1e-300)) * move
         p[WIDTH] = min(max(p[WIDTH], 0.3), 4.0)
         if abs(p[X] - start_x) + abs(p[Y] - start_y) > 2 + start_length / 2:
@@ -117,7 +125,9 @@ def _fit(
             out[0], out[1], out[2] = p[X], p[Y], p[FLUX]
             out[3], out[4] = p[LENGTH] * cos(p[ANGLE]), p[LENGTH] * sin(p[ANGLE])
             out[5], out[6], out[7] = least_squares.place_covariance(normal, move)
+            # Degrees of freedom: seven parameters, three priors.
             out[5:] *= least_squares.misfit_factor(normal[7, 7], count - 4)
+            # A scalar variance along the streak becomes a covariance in x and y.
             lost = _slip_px2(p, noise, gain_e_dn) / p[LENGTH] ** 2
             out[5] += lost * out[3] ** 2
             out[6] += lost * out[4] ** 2
@@ -128,11 +138,12 @@ def _fit(
 
 @jit
 def _slip_px2(p: Floats, noise: float, gain_e_dn: float) -> float:
-    """Variance along the streak that Cramer and Rao do not see: in noise an end may be taken for where it is not.
+    """Variance along the streak that the Cramer-Rao bound omits: the error of locating its ends in noise.
 
-    Where light of a a pixel's way begins in noise of n, the likeliest place is off by 26 (n / a)^4 in the mean square
-    (Yao 1987: the maximum of a Brownian motion that falls to both sides). Two ends whose distance is told fall
-    together, twice as steeply: a quarter of that. Weighed across the streak n^2 is 2 sqrt(pi) w that of a pixel.
+    Where light of brightness a per pixel of length begins in noise of deviation n, the maximum-likelihood position of
+    the onset has a mean square error of 26 (n / a)^4 px^2 (Yao 1987: the maximum of a Brownian motion with a drift
+    down to both sides). Two ends at a known distance shift together; their likelihood falls twice as steeply, so the
+    variance is a quarter of that. After optimal weighting across the streak, n^2 is 2 sqrt(pi) w times that of a pixel.
     """
     across = 2 * sqrt(pi) * p[WIDTH]
     variance = noise * noise + p[FLUX] / (across * p[LENGTH]) / gain_e_dn
@@ -141,10 +152,10 @@ def _slip_px2(p: Floats, noise: float, gain_e_dn: float) -> float:
 
 @jit
 def _rows(pixels: Floats, noise: float, gain_e_dn: float, p: Floats, rows: Floats, weight: Floats) -> None:
-    """The model's slopes by the seven parameters at every pixel, what it leaves over, and the weights.
+    """Fill the model's derivatives by the seven parameters, the residual and the weight of every pixel.
 
-    The light is F / L * [erf((u + L/2) / (w sqrt 2)) - erf((u - L/2) / (w sqrt 2))] / 2 * exp(-v^2 / 2 w^2) /
-    (w sqrt(2 pi)) at u along and v across. The pixel's own width is in w: w^2 = sigma^2 + 1/12.
+    The model is F / L * [erf((u + L/2) / (w sqrt 2)) - erf((u - L/2) / (w sqrt 2))] / 2 * exp(-v^2 / 2 w^2) /
+    (w sqrt(2 pi)) at u along and v across the streak. The pixel's width is part of w: w^2 = sigma^2 + 1/12.
     """
     along_x, along_y = cos(p[ANGLE]), sin(p[ANGLE])
     flux, length, w = p[FLUX], p[LENGTH], p[WIDTH]
@@ -170,7 +181,7 @@ def _rows(pixels: Floats, noise: float, gain_e_dn: float, p: Floats, rows: Float
 
 @jit
 def _step(t: float) -> tuple[float, float]:
-    """A Gaussian's integral from its middle, and its density, at t of its sigmas; far off without much ado."""
+    """Return a unit Gaussian's integral from 0 to t and its density at t; the limits beyond FAR_SIGMA, to save time."""
     if abs(t) > FAR_SIGMA:
         return (0.5 if t > 0 else -0.5), 0.0
     return erf(t * sqrt(0.5)) / 2, exp(-t * t / 2) / sqrt(2 * pi)

@@ -1,4 +1,8 @@
-"""The believed calibration: pixel to unit vector and back. What the tracker thinks its camera is."""
+"""Camera model of the tracker: converts pixels to unit vectors and back, with the believed calibration.
+
+The model is a pinhole with Brown-Conrady distortion in OpenCV's convention. Projection (`Camera.pixels`) applies
+the distortion in closed form; back-projection (`Camera.rays`) inverts it by fixed-point iteration.
+"""
 
 from __future__ import annotations
 
@@ -17,8 +21,8 @@ Distortion = tuple[float, float, float, float, float]
 class Camera:
     """A pinhole with Brown-Conrady distortion, in camera axes +x right, +y down, +z boresight.
 
-    focal_px : focal length over pixel pitch
-    centre_px: principal point (x, y); the middle of pixel (0, 0) is (0, 0)
+    focal_px : focal length divided by the pixel pitch
+    centre_px: principal point (x, y); the center of pixel (0, 0) is (0, 0)
     distortion: k1, k2, p1, p2, k3 in OpenCV's order
     """
 
@@ -46,40 +50,43 @@ class Camera:
 
     @property
     def fov_rad(self) -> float:
-        """Horizontal field: the angle between the rays of the left and right edges' middle pixels."""
+        """Horizontal field of view: the angle between the rays of the left and right edge pixels at mid-height."""
         row = (self.height_px - 1) / 2
         left, right = self.rays(np.array([[0.0, row], [self.width_px - 1.0, row]]))
         return float(np.arctan2(np.linalg.norm(np.cross(left, right)), left @ right))
 
     @property
     def diagonal_rad(self) -> float:
-        """The greatest angle between two directions on the sensor."""
+        """Diagonal field of view: the angle between opposite corners, without distortion."""
         half = np.hypot(self.width_px, self.height_px) / 2
         return float(2 * np.arctan(half / self.focal_px))
 
     def zoomed(self, factor: float) -> Camera:
-        """The same camera with its focal length times `factor`."""
+        """Return a copy with the focal length multiplied by `factor`."""
         return replace(self, focal_px=self.focal_px * factor)
 
     def rays(self, xy_px: Floats) -> Floats:
-        """(N, 2) pixels to (N, 3) unit vectors in camera axes."""
+        """Convert (N, 2) pixels to (N, 3) unit vectors in camera axes."""
         tangent = self.tangents(xy_px)
         rays = np.column_stack([tangent, np.ones(len(tangent))])
         return rays / np.linalg.norm(rays, axis=1, keepdims=True)
 
     def tangents(self, xy_px: Floats) -> Floats:
-        """(N, 2) pixels to (N, 2) x / z and y / z in camera axes."""
+        """Convert (N, 2) pixels to (N, 2) tangents (x / z, y / z) in camera axes, without distortion."""
         return undistorted(np.asarray(xy_px, dtype=float), self.focal_px, *self.centre_px, self.distortion)
 
     def pixels(self, vectors_cam: Floats) -> Floats:
-        """(N, 3) vectors in camera axes to (N, 2) pixels; NaN behind the camera and beyond the distortion's fold."""
+        """Project (N, 3) vectors in camera axes to (N, 2) pixels.
+
+        NaN for a vector behind the camera or beyond the angle at which the radial distortion folds back.
+        """
         z = np.where(vectors_cam[:, 2] > 0, vectors_cam[:, 2], np.nan)
         tangent = vectors_cam[:, :2] / z[:, None]
         tangent[np.sum(tangent**2, axis=1) >= self._fold()] = np.nan
         return distorted(tangent, self.distortion) * self.focal_px + self.centre_px
 
     def contains(self, xy_px: Floats, margin_px: float = 0.0) -> np.ndarray:
-        """(N,) whether a pixel lies on the sensor, shrunk by the margin."""
+        """Return (N,) whether each pixel position is on the sensor, shrunk by the margin on every side."""
         x, y = xy_px[:, 0], xy_px[:, 1]
         low, right, bottom = (
             margin_px - 0.5,
@@ -89,14 +96,16 @@ class Camera:
         return (x >= low) & (x <= right) & (y >= low) & (y <= bottom)
 
     def _fold(self) -> float:
-        """Squared tangent at which a barrel distortion turns back: what lies beyond would appear in the field.
+        """Squared tangent at which the radial distortion folds back.
+
+        Beyond it, directions outside the field would project into the field.
 
         The least positive root of d(r radial)/dr = 1 + 3 k1 r^2 + 5 k2 r^4 + 7 k3 r^6; infinite if there is none.
         """
         k1, k2, _, _, k3 = self.distortion
         if not (k1 or k2 or k3):
             return np.inf
-        # Of 1 / r^2, so that a coefficient of next to nothing is never divided by.
+        # Solve for 1 / r^2: the leading coefficient is then 1, so no tiny coefficient is divided by.
         roots = np.roots([1.0, 3 * k1, 5 * k2, 7 * k3])
         greatest = float(max(roots.real[(np.abs(roots.imag) < 1e-12) & (roots.real > 0)], default=0.0))
         return 1 / greatest if greatest else np.inf
@@ -104,7 +113,7 @@ class Camera:
 
 @jit
 def _bent(x: float, y: float, distortion: Distortion) -> tuple[float, float]:
-    """A tangent through the lens (Brown 1966, as OpenCV has it)."""
+    """Apply the distortion to one tangent (Brown 1966, in OpenCV's form)."""
     k1, k2, p1, p2, k3 = distortion
     r2 = x * x + y * y
     radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
@@ -116,7 +125,7 @@ def _bent(x: float, y: float, distortion: Distortion) -> tuple[float, float]:
 
 @jit
 def distorted(tangent: Floats, distortion: Distortion) -> Floats:
-    """(N, 2) tangents through the lens."""
+    """Apply the distortion to (N, 2) tangents."""
     out = np.empty_like(tangent)
     for n in range(len(tangent)):
         out[n, 0], out[n, 1] = _bent(tangent[n, 0], tangent[n, 1], distortion)
@@ -127,9 +136,10 @@ def distorted(tangent: Floats, distortion: Distortion) -> Floats:
 def undistorted(
     xy_px: Floats, focal_px: float, centre_x_px: float, centre_y_px: float, distortion: Distortion
 ) -> Floats:
-    """(N, 2) pixels to (N, 2) tangents.
+    """Convert (N, 2) pixels to (N, 2) tangents without distortion.
 
-    Fixed-point inverse of the distortion; a lens of some per cent converges to 1e-15 in a few tens.
+    The distortion is inverted by fixed-point iteration, t <- t + (measured - distort(t)). For a distortion of a few
+    percent it converges to 1e-15 in a few tens of iterations.
     """
     out = np.empty(xy_px.shape)
     k1, k2, p1, p2, k3 = distortion
@@ -147,7 +157,7 @@ def undistorted(
 
 
 def check_shape(image_shape: tuple[int, ...], camera: Camera) -> None:
-    """Raise ImageError unless the image is the camera's."""
+    """Raise ImageError unless the image has the camera's width and height."""
     if image_shape != (camera.height_px, camera.width_px):
         size = "x".join(map(str, image_shape[1::-1])) if len(image_shape) >= 2 else image_shape
         raise ImageError(

@@ -4,4 +4,4 @@ from __future__ import annotations
 
 
 class ImageError(ValueError):
-    """The image or the calibration cannot be used. The message is one line: what, and what is allowed."""
+    """The image or the calibration cannot be used. The one-line message names the fault and what is allowed."""

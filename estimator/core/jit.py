@@ -1,7 +1,7 @@
-"""How every loop is compiled, said in one place.
+"""Compiler options of all numba functions.
 
-What a function leaves unsaid numba takes from the function for which it happens to be compiled first, and keeps on
-disk: then whether it divides by zero or raises, and in which order it may add, would hang on what ran first.
+Options that a callee leaves out are inherited from the caller that compiles it first, and are cached on disk. We set
+them all, so that the results (division by zero, order of summation) do not depend on the order of calls.
 """
 
 from __future__ import annotations
@@ -10,5 +10,5 @@ from functools import partial
 
 import numba
 
-# Division by zero gives inf or nan, as arrays do; sums are added as written unless a function allows otherwise.
+# Division by zero gives inf or nan, as in NumPy; sums keep the order of the source unless a function sets fastmath.
 jit = partial(numba.njit, cache=True, error_model="numpy", fastmath=False)

@@ -1,4 +1,9 @@
-"""Small normal equations, for fits of a few parameters to the pixels of one light."""
+"""Normal equations of small Gauss-Newton fits: a few parameters, fitted to the pixels of one source.
+
+A fit linearizes its model at the current parameters p: with slopes J, residuals r and weights w, the step is
+dp = N^-1 g, N = J^T W J, g = J^T W r. `normal_equations` computes N, g and chi-square r^T W r in one matrix, `step`
+solves for dp by Cholesky factorization, and `place_covariance` reads the position's covariance from N^-1.
+"""
 
 from __future__ import annotations
 
@@ -9,21 +14,22 @@ import numpy as np
 from estimator.core.arrays import Floats
 from estimator.core.jit import jit
 
-# A fit has settled once a step is a hundredth of the standard deviation of what is fitted, or a thousandth of a
-# pixel: where the model fits, Newton's next step is its square.
+# A fit has converged once a step is below a hundredth of a standard deviation (its square is the fall of chi-square),
+# or below a thousandth of a pixel: convergence is quadratic where the model fits, so the next step is negligible.
 SETTLED_CHI2, SETTLED_PX = 1e-4, 1e-3
 
 
 @jit(fastmath={"reassoc", "contract"})
 def normal_equations(rows: Floats, weight: Floats, count: int, normal: Floats) -> None:
-    """sum(w r_i r_j) over `count` pixels, the lower half.
+    """Fill the lower triangle of `normal` with sum(w r_i r_j) over `count` pixels.
 
-    rows : (P + 1, K) a model's slopes by its P parameters, and last what it leaves over. So the last row of `normal`
-        is the gradient, and its corner the chi-square. The pixels are innermost: so they pass through a vector unit
+    rows : (P + 1, K) the model's derivatives with respect to its P parameters, then the residual. The last row of
+        `normal` is therefore the gradient, and its last element is chi-square
     """
     for i in range(len(rows)):
         for j in range(i + 1):
             total = 0.0
+            # The pixels are the inner loop, so that the compiler can vectorize the sum.
             for k in range(count):
                 total += weight[k] * rows[i, k] * rows[j, k]
             normal[i, j] = total
@@ -31,7 +37,7 @@ def normal_equations(rows: Floats, weight: Floats, count: int, normal: Floats) -
 
 @jit
 def expect(normal: Floats, n: int, off: float, sigma: float) -> None:
-    """Add what is known of parameter n beforehand: that it lies `off` from here, give or take sigma."""
+    """Add a Gaussian prior on parameter n: its mean is `off` from the current value, its standard deviation sigma."""
     last, weight = len(normal) - 1, 1 / sigma**2
     normal[n, n] += weight
     normal[last, n] += weight * off
@@ -40,9 +46,10 @@ def expect(normal: Floats, n: int, off: float, sigma: float) -> None:
 
 @jit
 def step(normal: Floats, out: Floats) -> float:
-    """Gauss-Newton's step from the matrix of `normal_equations`, which keeps Cholesky's factor; NaN if singular.
+    """Compute the Gauss-Newton step into `out` from the matrix of `normal_equations`.
 
-    What it returns is by how much chi-square falls, g^T N^-1 g: the step's square in standard deviations.
+    Overwrites N with its Cholesky factor. Returns the predicted fall of chi-square, g^T N^-1 g, which is the squared
+    length of the step in standard deviations; NaN if N is singular.
     """
     count = len(out)
     if not factorise(normal[:count, :count]):
@@ -57,7 +64,7 @@ def step(normal: Floats, out: Floats) -> float:
 
 @jit
 def factorise(normal: Floats) -> bool:
-    """Cholesky's L in place of the lower half of N = L L^T; False where N has no inverse worth the name."""
+    """Replace the lower triangle of N = L L^T by its Cholesky factor L; return False if N is numerically singular."""
     for i in range(len(normal)):
         diagonal = normal[i, i]
         for j in range(i + 1):
@@ -75,7 +82,7 @@ def factorise(normal: Floats) -> bool:
 
 @jit
 def solve(factor: Floats, vector: Floats) -> None:
-    """Replace v by N^-1 v, for Cholesky's factor of N."""
+    """Replace v by N^-1 v, given the Cholesky factor of N: forward, then back substitution."""
     count = len(vector)
     for i in range(count):
         for k in range(i):
@@ -89,7 +96,10 @@ def solve(factor: Floats, vector: Floats) -> None:
 
 @jit
 def place_covariance(factor: Floats, column: Floats) -> tuple[float, float, float]:
-    """xx, yy and xy of N^-1 for the first two parameters: where the weights are inverse variances, Cramer and Rao's."""
+    """Return xx, yy and xy of N^-1 for the first two parameters, which are the position.
+
+    With weights that are inverse variances this is the Cramer-Rao bound.
+    """
     column[:] = 0.0
     column[0] = 1.0
     solve(factor, column)
@@ -102,9 +112,9 @@ def place_covariance(factor: Floats, column: Floats) -> tuple[float, float, floa
 
 @jit
 def misfit_factor(chi2: float, freedom: int) -> float:
-    """By how much a covariance grows where the model is not the light: chi-square a degree, if that is no accident.
+    """Factor that inflates a covariance where the model does not fit the pixels: the reduced chi-square.
 
-    Beyond four standard deviations of a chi-square, 1 + 4 sqrt(2 / freedom); else 1.
+    Applied only if the reduced chi-square exceeds 1 + 4 sqrt(2 / freedom), four standard deviations; otherwise 1.
     """
     if freedom < 1:
         return 1.0

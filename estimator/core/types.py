@@ -1,4 +1,4 @@
-"""What a detector and a centroider may be told beyond the frame itself."""
+"""Data passed between the steps of the tracker: priors, blobs, centroids, matches, attitudes, filter state."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from estimator.core.arrays import Floats, Ints
 
 @dataclass(frozen=True, slots=True)
 class FramePriors:
-    """What is known of a frame before it is looked at.
+    """Prior information about a frame, known before it is processed.
 
-    streak_px  : (dx, dy) that stars move over the sensor during the exposure, from the gyro; None where unknown.
-        Its sign does not matter: the light is the same either way
-    saturation : least value of a pixel that is full
+    streak_px  : (dx, dy) by which stars move over the sensor during the exposure, from the gyro; None if unknown.
+        The sign does not matter: a streak looks the same in either direction
+    saturation : smallest value of a saturated pixel
     """
 
     streak_px: tuple[float, float] | None = None
@@ -32,9 +32,9 @@ NO_PRIORS = FramePriors()
 
 @dataclass(frozen=True, slots=True)
 class Background:
-    """Sky level and noise of an image, on a coarse grid of tile centres.
+    """Sky level and noise of an image, on a coarse grid of tile centers.
 
-    level, noise : (rows, columns) in the image's units; between the centres both are bilinear
+    level, noise : (rows, columns) in the image's units, interpolated bilinearly between the centers
     tile_px      : side of a tile
     """
 
@@ -48,13 +48,13 @@ class Blobs:
     """Connected pixels above the threshold, brightest first.
 
     box_px    : (N, 4) x0, y0, x1, y1, both ends included
-    xy_px     : (N, 2) brightness-weighted middle of the pixels above the threshold
+    xy_px     : (N, 2) flux-weighted mean position of the pixels above the threshold
     flux      : (N,) sum above the background over those pixels
-    peak      : (N,) greatest value of the image in the blob
-    area_px   : (N,) how many pixels
-    background: the level and noise they were found over
-    flag      : (N,) of `judge.Flag`, 0 for a plain star
-    streak_px : (dx, dy) that the frame's stars are smeared by, from either end; None if they are round or few
+    peak      : (N,) maximum of the image in the blob
+    area_px   : (N,) number of pixels
+    background: the level and noise used for the detection
+    flag      : (N,) bits of `estimator.detection.classify.Flag`, 0 for a normal star
+    streak_px : (dx, dy) by which the frame's stars are smeared, sign arbitrary; None if they are round or too few
     """
 
     box_px: Ints
@@ -70,19 +70,19 @@ class Blobs:
         return len(self.flux)
 
     def take(self, which: NDArray[Any]) -> Blobs:
-        """The chosen blobs, by mask or index."""
+        """Select blobs by mask or index."""
         names = ("box_px", "xy_px", "flux", "peak", "area_px", "flag")
         return replace(self, **{name: getattr(self, name)[which] for name in names})
 
 
 @dataclass(frozen=True, slots=True)
 class Centroids:
-    """Where the light is, brightest first.
+    """Measured positions of the blobs, brightest first.
 
     xy_px    : (N, 2)
-    sigma_px : (N,) standard deviation of each coordinate; of an uneven one the root of the mean variance
+    sigma_px : (N,) standard deviation per coordinate; the root of the mean variance where x and y differ
     flux     : (N,) above the background
-    covariance_px2 : (N, 2, 2) where a centroider knows that x and y differ (streaks), else None
+    covariance_px2 : (N, 2, 2) from a centroider that models x and y separately (streaks), else None
     """
 
     xy_px: Floats
@@ -98,12 +98,15 @@ class Centroids:
         return cls(np.empty((0, 2)), np.empty(0), np.empty(0))
 
     def take(self, which: NDArray[Any]) -> Centroids:
-        """The chosen centroids, by mask or index."""
+        """Select centroids by mask or index."""
         spread = None if self.covariance_px2 is None else self.covariance_px2[which]
         return Centroids(self.xy_px[which], self.sigma_px[which], self.flux[which], spread)
 
     def weights_per_px2(self, sigma_px: Floats) -> Floats:
-        """(N, 3) xx, yy, xy of the inverse covariances, for errors sigma_px all told (N,), which add to their own."""
+        """Return (N, 3) xx, yy, xy of the inverse covariances for total errors sigma_px (N,).
+
+        The excess of sigma_px over the centroids' own sigma is added to the covariance as isotropic variance.
+        """
         even = 1 / sigma_px**2
         if self.covariance_px2 is None:
             return np.stack([even, even, 0 * even], axis=1)
@@ -114,12 +117,12 @@ class Centroids:
 
 @dataclass(frozen=True, slots=True)
 class StarMatch:
-    """Which centroid is which catalogue star.
+    """Correspondence between centroids and catalog stars.
 
-    observed : (K,) rows of the centroids
-    star     : (K,) rows of the catalogue
-    cam_from_ref : the attitude that these matches were verified with
-    log10_chance : log10 of the expected number of matches this good by chance over the whole search
+    observed : (K,) row of each centroid
+    star     : (K,) row of its catalog star
+    cam_from_ref : the attitude with which the matches were verified
+    log10_chance : log10 of the expected number of equally good chance matches over the whole search
     """
 
     observed: Ints
@@ -130,14 +133,14 @@ class StarMatch:
 
 @dataclass(frozen=True, slots=True)
 class Attitude:
-    """The tracker's answer, or its refusal.
+    """The tracker's solution, or the reason why there is none.
 
     status          : "solved", or the reason why there is no attitude
     cam_from_ref    : reference (ICRS for stars, lab for the dome) to camera; None unless solved
     covariance_rad2 : (3, 3) of the small rotation in camera axes; None unless solved
-    match           : the stars it rests on; None unless solved
-    rms_px          : of the matched centroids' residuals; NaN unless solved
-    camera          : the calibration that it was solved with, fitted where it was uncertain; None unless solved
+    match           : the stars used; None unless solved
+    rms_px          : RMS residual of the matched centroids; NaN unless solved
+    camera          : the calibration used, fitted where it was uncertain; None unless solved
     """
 
     status: str
@@ -162,11 +165,11 @@ class Attitude:
 
 @dataclass(frozen=True, slots=True)
 class FilterState:
-    """What the attitude filter believes at a time.
+    """State estimate of the attitude filter at one time.
 
     body_from_ref : reference (ICRS, or lab under the dome) to body
     bias_rad_s    : (3,) of the gyro, in body axes
-    covariance    : (6, 6) of the small turn in body axes (rad^2), then of the bias (rad^2/s^2)
+    covariance    : (6, 6) of the small rotation in body axes (rad^2), then of the bias (rad^2/s^2)
     """
 
     t_s: float
@@ -176,12 +179,12 @@ class FilterState:
 
     @property
     def sigma_attitude_rad(self) -> Floats:
-        """(3,) about the body axes."""
+        """(3,) standard deviation of the attitude about each body axis."""
         return np.sqrt(np.diag(self.covariance)[:3])
 
     @property
     def sigma_bias_rad_s(self) -> Floats:
-        """(3,) in body axes."""
+        """(3,) standard deviation of the gyro bias in body axes."""
         return np.sqrt(np.diag(self.covariance)[3:])
 
 

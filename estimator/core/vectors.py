@@ -1,4 +1,4 @@
-"""Vectors and small rotations for compiled code that makes no arrays of them."""
+"""3-vectors and small rotations for compiled code, without allocating arrays."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ def row(array: Floats, n: int) -> Vector:
 
 @jit
 def chord(u: Vector, v: Vector) -> float:
-    """Distance between the ends of unit vectors; it changes by no more than their angle."""
+    """Chord length |u - v| of two unit vectors: 2 sin(angle / 2), never larger than the angle."""
     return sqrt((u[0] - v[0]) ** 2 + (u[1] - v[1]) ** 2 + (u[2] - v[2]) ** 2)
 
 
 @jit
 def axes(u: Vector, v: Vector, out: Floats) -> None:
-    """Right-handed axes as the columns of out (3, 3): the middle of two unit vectors, their normal, and the third."""
+    """Write right-handed axes to the columns of out (3, 3): bisector of two unit vectors, their normal, third axis."""
     out[0, 0], out[1, 0], out[2, 0] = u[0] + v[0], u[1] + v[1], u[2] + v[2]
     out[0, 1] = u[1] * v[2] - u[2] * v[1]
     out[1, 1] = u[2] * v[0] - u[0] * v[2]
@@ -41,7 +41,7 @@ def axes(u: Vector, v: Vector, out: Floats) -> None:
 
 @jit
 def times_transposed(one: Floats, other: Floats, out: Floats) -> None:
-    """out = one other', (3, 3) each."""
+    """Compute out = one other^T for (3, 3) matrices."""
     for i in range(3):
         for j in range(3):
             out[i, j] = one[i, 0] * other[j, 0] + one[i, 1] * other[j, 1] + one[i, 2] * other[j, 2]
@@ -49,7 +49,11 @@ def times_transposed(one: Floats, other: Floats, out: Floats) -> None:
 
 @jit
 def turn(w: Floats, matrix: Floats) -> None:
-    """A small turn w of a rotation matrix, in place: exp([w]) to second order, then made orthonormal."""
+    """Left-multiply a rotation matrix by exp([w]) in place, to second order, then orthonormalize it.
+
+    The second-order term makes the error of the small rotation w of order |w|^3; Gram-Schmidt on the rows removes the
+    remaining loss of orthogonality.
+    """
     for c in range(3):
         x, y, z = matrix[0, c], matrix[1, c], matrix[2, c]
         cx, cy, cz = w[1] * z - w[2] * y, w[2] * x - w[0] * z, w[0] * y - w[1] * x
@@ -73,7 +77,10 @@ def turn(w: Floats, matrix: Floats) -> None:
 
 @jit
 def xyzw_of(R: Floats) -> Floats:
-    """(4,) quaternion (x, y, z, w) of a rotation matrix, by its greatest part (Shepperd 1978, J. Guidance 1, 223)."""
+    """(4,) quaternion (x, y, z, w) of a rotation matrix, by its largest component (Shepperd 1978, J. Guidance 1, 223).
+
+    Solving for the largest component first avoids a division by a small number.
+    """
     trace = R[0, 0] + R[1, 1] + R[2, 2]
     q = np.empty(4)
     i = 0 if R[0, 0] >= R[1, 1] else 1

@@ -1,1 +1,1 @@
-"""Frame to blobs: background, thresholding, connected components, and what is a star."""
+"""Frame to blobs: background, thresholding, connected components, and blob classification."""

@@ -1,4 +1,13 @@
-"""The sky under the stars: its level and noise on a coarse grid, from a sparse sample of the frame."""
+"""Background estimation: sky level and noise on a coarse grid, from a sparse sample of the frame.
+
+The frame is divided into tiles of about 64x64 pixels. In each tile a few rows are sampled after a 3x3 binomial filter
+[1 2 1] x [1 2 1] / 16, the filter that the detector uses too. The estimate starts from the median and the scaled median
+absolute deviation of a few samples, which stars hardly disturb, and is refined by two rounds of sigma clipping at 3
+sigma over all samples of the tile. The variance of the clipped samples is divided by that of a Gaussian truncated at 3
+sigma. Between the tile centers level and noise are interpolated bilinearly (`at`).
+
+The noise is measured on the filtered image. For white noise it is FILTERED_NOISE times the noise of a raw pixel.
+"""
 
 from __future__ import annotations
 
@@ -10,19 +19,18 @@ from estimator.core.jit import jit
 from estimator.core.types import Background
 
 TILE_PX = 64
-SAMPLE_ROWS = 6  # of a tile: some 370 filtered pixels, of which 130 are independent
-STARTERS = 33  # pixels that the robust start looks at
+SAMPLE_ROWS = 6  # sampled per tile: some 370 filtered pixels, of which about 130 are independent
+STARTERS = 33  # samples of the robust initial estimate; odd, as `_middle` needs
 CLIP_SIGMA = 3.0
-CLIPPED_VARIANCE = 0.9733  # of a Gaussian cut off at 3 sigma: 1 - 6 phi(3) / (2 Phi(3) - 1)
-FILTERED_NOISE = 0.375  # white noise through the binomial filter keeps (1 + 4 + 1) / 16 of its deviation
+CLIPPED_VARIANCE = 0.9733  # of a unit Gaussian truncated at 3 sigma: 1 - 6 phi(3) / (2 Phi(3) - 1)
+FILTERED_NOISE = 0.375  # the binomial filter reduces the deviation of white noise to (1 + 4 + 1) / 16
 
 
 def sky(image: NDArray, tile_px: int = TILE_PX) -> Background:
-    """Mean and standard deviation of the 3x3-filtered image, tile by tile, without what stands out by 3 sigma.
+    """Estimate the sigma-clipped mean and standard deviation of the 3x3-filtered image, tile by tile.
 
-    The start is a median and a scaled median absolute deviation of a few pixels; two rounds of clipping over more
-    follow. The noise is that of the filtered image itself, so that correlated noise (JPEG, demosaicing) counts as
-    it is. It has a floor of what quantisation leaves in a flat patch, lest a dark JPEG have none.
+    The noise is measured on the filtered image itself, so correlated noise (JPEG, demosaicing) is included. Its floor
+    is the quantization noise of an integer image, as a dark JPEG can have tiles without any noise.
     """
     tile_px = min(tile_px, *image.shape)
     kind = summing(image.dtype)
@@ -35,9 +43,10 @@ def sky(image: NDArray, tile_px: int = TILE_PX) -> Background:
 
 
 def summing(pixel: np.dtype, greatest: float = np.inf) -> type:
-    """The narrowest type that holds 16 times a pixel: narrow ones pass more pixels through a vector unit.
+    """Return the narrowest type that holds 16 times a pixel: narrow types process more pixels per vector instruction.
 
-    greatest : of the pixels, where it is known: those of 12 bits fit a narrower type than their own tells
+    greatest : largest pixel value, if known: 12-bit pixels stored in 16 bits fit a narrower type than their own dtype
+        suggests
     """
     if pixel.kind not in "iu" or pixel.itemsize > 2:
         return np.float64
@@ -46,7 +55,7 @@ def summing(pixel: np.dtype, greatest: float = np.inf) -> type:
 
 @jit
 def filtered(image: NDArray, y: int, x: int) -> float:
-    """The 3x3 binomial filter [1 2 1] x [1 2 1] / 16 at one pixel; edges repeat their last row or column."""
+    """The 3x3 binomial filter [1 2 1] x [1 2 1] / 16 at one pixel; the edge rows and columns are repeated."""
     height, width = image.shape
     up, down = max(y - 1, 0), min(y + 1, height - 1)
     left, right = max(x - 1, 0), min(x + 1, width - 1)
@@ -58,7 +67,11 @@ def filtered(image: NDArray, y: int, x: int) -> float:
 
 @jit
 def filtered_row(image: NDArray, y: int, sums: NDArray, out: NDArray) -> None:
-    """16 times a row of `filtered`, by way of column sums 1 2 1, one more at either end, in a buffer of theirs."""
+    """Write 16 times a row of `filtered` to `out`.
+
+    The filter is separable: the vertical [1 2 1] sums go to the buffer `sums` (width + 2, padded by one column at
+    either end), and the horizontal pass reads them.
+    """
     height, width = image.shape
     above, row, below = image[max(y - 1, 0)], image[y], image[min(y + 1, height - 1)]
     left, middle, right = sums[:width], sums[1 : width + 1], sums[2:]
@@ -71,10 +84,10 @@ def filtered_row(image: NDArray, y: int, sums: NDArray, out: NDArray) -> None:
 
 @jit
 def at(grid: Floats, height: int, width: int, y: float, x: float) -> float:
-    """Bilinear value of a tile grid at a pixel; constant beyond the outermost tile centres."""
+    """Interpolate a tile grid bilinearly at a pixel; constant beyond the outermost tile centers."""
     rows, columns = grid.shape
     v, u = (y + 0.5) * rows / height - 0.5, (x + 0.5) * columns / width - 0.5
-    # Not max(): of NaN, a place that is none, it makes NaN, and that a row beyond the grid.
+    # Not max(): it would pass on a NaN position, whose cast is an index outside the grid.
     v, u = min(v if v > 0 else 0.0, rows - 1.0), min(u if u > 0 else 0.0, columns - 1.0)
     row, column = min(int(v), max(rows - 2, 0)), min(int(u), max(columns - 2, 0))
     below, beside = min(row + 1, rows - 1), min(column + 1, columns - 1)
@@ -86,7 +99,10 @@ def at(grid: Floats, height: int, width: int, y: float, x: float) -> float:
 
 @jit
 def _tiles(image: NDArray, tile_px: int, smooth: NDArray, starters: NDArray) -> tuple[Floats, Floats]:
-    """Level and noise of every tile from some of its rows; the last two are room, and tell the types to work in."""
+    """Compute level and noise of every tile from SAMPLE_ROWS of its rows.
+
+    smooth, starters : buffers; their dtypes select the types of the computation
+    """
     height, width = image.shape
     rows, columns = max(height // tile_px, 1), max(width // tile_px, 1)
     level, noise = np.empty((rows, columns)), np.empty((rows, columns))
@@ -114,13 +130,13 @@ def _tiles(image: NDArray, tile_px: int, smooth: NDArray, starters: NDArray) -> 
 
 @jit
 def median(values: Floats) -> float:
-    """As numpy's, without its checks, which cost more than a short list."""
+    """Median by numba's np.median, without NumPy's argument checks, which cost more than a short list."""
     return np.median(values)
 
 
 @jit
 def _robust(values: NDArray, starters: NDArray) -> tuple[float, float]:
-    """Median and 1.4826 MAD of a few values spread evenly over all."""
+    """Return median and 1.4826 MAD (a Gaussian's sigma) of len(starters) values, sampled evenly."""
     count = len(starters)
     for k in range(count):
         starters[k] = values[(2 * k + 1) * len(values) // (2 * count)]
@@ -132,7 +148,10 @@ def _robust(values: NDArray, starters: NDArray) -> tuple[float, float]:
 
 @jit
 def _middle(values: NDArray) -> float:
-    """Median of an odd number of values, by counting those below each: a few tens of them, without a branch."""
+    """Median of an odd number of values: the value with at most half below it and more than half up to it.
+
+    Counting takes quadratic time but has no branches; for a few tens of values it is faster than sorting.
+    """
     half = len(values) // 2
     for value in values:
         below, up_to = np.int32(0), np.int32(0)
@@ -146,10 +165,11 @@ def _middle(values: NDArray) -> float:
 
 @jit(fastmath={"reassoc", "contract"})
 def _clipped(values: NDArray, middle: float, spread: float) -> tuple[float, float]:
-    """Mean and standard deviation of what lies within 3 sigma, the latter made good for the tails cut off."""
+    """Mean and standard deviation of the values within 3 sigma; the latter is corrected for the truncated tails."""
     number = values.dtype.type
     centre, reach, one = number(middle), number(CLIP_SIGMA * spread), number(1)
     count = total = squares = number(0)
+    # Rejected values are added with weight 0 instead of skipped: without a branch the loop vectorizes.
     for i in range(len(values)):
         off = values[i] - centre
         kept = one if abs(off) <= reach else number(0)

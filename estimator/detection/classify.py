@@ -1,4 +1,10 @@
-"""Star or not: what a blob's shape and surroundings tell."""
+"""Blob classification: flag blobs that are not stars, from their shape and their surroundings.
+
+The shape is described by second moments. A uniform line of length L has a variance along it that exceeds the variance
+across it by L^2 / 12, so 12 (xx - yy, 2 xy) = L^2 (cos 2a, sin 2a) gives length and direction a. In this form a line
+and its reverse are equal, and lines are averaged and compared as plain vectors. If most of the brightest blobs agree on
+one line, the frame is smeared (a streak); a line that differs from the others is a particle track or a satellite.
+"""
 
 from __future__ import annotations
 
@@ -14,23 +20,23 @@ from estimator.core.jit import jit
 from estimator.core.types import Blobs, FramePriors
 from estimator.detection.background import FILTERED_NOISE, at, filtered, median
 
-# Light of the four neighbours over the middle pixel's: .5 of a centred Gaussian of 0.4 px, 0 of a spike.
+# Sum of the four neighbors over the central pixel: about .5 for a centered Gaussian of sigma 0.4 px, 0 for a spike.
 SHARPEST = 0.25
-LARGEST_SHARE = 0.05  # of the frame's shorter side: no star is that wide, the Moon and a tree are
-ROUGHEST = 4.0  # times the frame's own noise
-CLEAR_SIGMA = 10.0  # of a pixel: light whose shape can be told
-VOTERS = 15  # of the brightest blobs that say whether the frame is smeared
-STREAK_PX, TRACK_PX = 6.0, 6.0  # lines that are no accident of noise, no pair of stars, no soft focus
+LARGEST_SHARE = 0.05  # of the frame's shorter side: no star is that wide; the Moon and trees are
+ROUGHEST = 4.0  # local noise over the frame's median noise
+CLEAR_SIGMA = 10.0  # of a pixel: bright enough for its shape to be significant
+VOTERS = 15  # number of brightest blobs that decide whether the frame is smeared
+STREAK_PX, TRACK_PX = 6.0, 6.0  # shortest lines not explained by noise, a pair of stars or defocus
 
 
 class Flag(IntFlag):
-    """What is odd about a blob.
+    """Anomalies of a blob.
 
-    SATURATED : a pixel is full: still a star, less well placed
-    HOT       : one pixel, sharper than any optics: a defect or a hit by a particle
-    TRACK     : a line that the other blobs do not share: a particle, a satellite
-    HUGE      : the Moon, a lamp, the horizon
-    TEXTURE   : in a part of the frame much rougher than the rest: trees, clouds
+    SATURATED : a pixel is saturated: still a star, with a less accurate position
+    HOT       : a single pixel, sharper than the optics allow: a defect or a particle hit
+    TRACK     : a line that the other blobs do not share: a particle or a satellite
+    HUGE      : too large for a star: the Moon, a lamp, the horizon
+    TEXTURE   : in a part of the frame much noisier than the rest: trees, clouds
     """
 
     SATURATED = 1
@@ -41,14 +47,13 @@ class Flag(IntFlag):
 
 
 NO_STAR = Flag.HOT | Flag.TRACK | Flag.HUGE | Flag.TEXTURE
-SATURATED, HOT, TRACK, HUGE, TEXTURE = (int(flag) for flag in Flag)  # as compiled code takes them
+SATURATED, HOT, TRACK, HUGE, TEXTURE = (int(flag) for flag in Flag)  # plain integers for compiled code
 
 
 def judged(image: NDArray, blobs: Blobs, hints: FramePriors) -> Blobs:
-    """The blobs with their flags, and with the streak (dx, dy) that the frame's stars share, if any.
+    """Return the blobs with their flags, and with the streak (dx, dy) that the frame's stars share, if any.
 
-    A blob's streak is told by its second moments: those of a uniform line of length L exceed across by L^2 / 12. As
-    a line has no sign, lines are compared as L^2 (cos 2a, sin 2a).
+    The streak is that of the hints if given, otherwise the one that most of the brightest blobs share.
     """
     if not len(blobs):
         return replace(blobs, streak_px=hints.streak_px)
@@ -91,7 +96,11 @@ def _flags(
     saturation: float,
     step: float,
 ) -> Ints:
-    """(N,) what each blob's row of `_shapes` tells, beside the line that they share; `step` is quantisation's noise."""
+    """Return the (N,) flags of each blob, from its row of `_shapes` and the line shared by the blobs.
+
+    shared : shared line as L^2 (cos 2a, sin 2a);  smeared : whether the frame has streaks
+    step   : floor of the noise, from quantization
+    """
     height, width = size
     ordinary, narrow = max(median(noise), step), median(shape[:, 2])
     allowed = max(LARGEST_SHARE * min(height, width) + sqrt(hypot(shared[0], shared[1])), 16.0)
@@ -101,9 +110,11 @@ def _flags(
         here = at(noise, height, width, xy[n, 1], xy[n, 0])
         pixel_noise = here / FILTERED_NOISE
         long2 = hypot(line_x - shared[0], line_y - shared[1])
+        # 6 pixel_noise: three sigma of the sum of four pixels.
         sharp = sides + 6 * pixel_noise < SHARPEST * middle
+        # A track differs from the shared line, is narrow, and is at least twice as long as wide (in rms).
         track = long2 > TRACK_PX**2 and width2 < 4 * narrow and long2 > 12 * 4 * width2
-        if smeared:  # no star is a spike there, and a faint streak has the shape of its noise
+        if smeared:  # no star is a spike there, and noise dominates the shape of a faint streak
             sharp = False
             track = track and middle > CLEAR_SIGMA * pixel_noise
         side = max(boxes[n, 2] - boxes[n, 0], boxes[n, 3] - boxes[n, 1]) + 1
@@ -117,7 +128,7 @@ def _flags(
 
 @jit
 def _shared(lines: Floats) -> tuple[float, float]:
-    """The line, as L^2 (cos 2a, sin 2a), that most of the brightest blobs share; 0 where they do not agree."""
+    """Return the line, as L^2 (cos 2a, sin 2a), shared by over 60 % of the brightest blobs, or (0, 0)."""
     voters = lines[:VOTERS]
     x, y = median(voters[:, 0]), median(voters[:, 1])
     agree = 0
@@ -127,19 +138,24 @@ def _shared(lines: Floats) -> tuple[float, float]:
 
 
 def _doubled(streak_px: tuple[float, float]) -> tuple[float, float]:
+    # (dx, dy) to L^2 (cos 2a, sin 2a).
     x, y = streak_px
     return float(x * x - y * y), float(2 * x * y)
 
 
 def _halved(line: tuple[float, float]) -> tuple[float, float]:
+    # L^2 (cos 2a, sin 2a) to (dx, dy).
     length, angle = sqrt(hypot(*line)), atan2(line[1], line[0]) / 2
     return length * cos(angle), length * sin(angle)
 
 
 @jit
 def _shapes(image: NDArray, boxes: Ints, level: Floats, noise: Floats) -> Floats:
-    """(N, 5) a blob's greatest pixel above the sky, the sum of its four neighbours, the variance across its longer
-    axis, and 12 (xx - yy, 2 xy) of the pixels whose filtered light is above 3 sigma: L^2 (cos 2a, sin 2a).
+    """Return (N, 5): the shape of each blob.
+
+    Columns: the largest pixel above the sky, the sum of its four neighbors above the sky, the variance across the
+    longer axis, and 12 (xx - yy, 2 xy) = L^2 (cos 2a, sin 2a). The moments use the pixels whose filtered value is above
+    3 sigma.
     """
     height, width = image.shape
     out = np.zeros((len(boxes), 5))
@@ -168,6 +184,7 @@ def _shapes(image: NDArray, boxes: Ints, level: Floats, noise: Floats) -> Floats
         if total > 0:
             xx, yy = xx / total - (x_sum / total) ** 2, yy / total - (y_sum / total) ** 2
             xy = xy / total - x_sum * y_sum / total**2
+            # The variance across is the smaller eigenvalue of the matrix of second moments.
             apart = np.sqrt((xx - yy) ** 2 + 4 * xy * xy)
             out[n, 2] = (xx + yy - apart) / 2
             out[n, 3], out[n, 4] = 12 * (xx - yy), 24 * xy

@@ -1,4 +1,14 @@
-"""The pass over the frame: which pixels stand out, as runs, and the runs that touch, as blobs."""
+"""Connected components: thresholding of the filtered frame into runs, and labeling of connected runs as blobs.
+
+A run is a row's sequence of adjacent pixels above the threshold. `runs_above` filters each row and compares it with the
+threshold, `labelled` joins the runs that touch (eight-connected) by union-find, and `summed` accumulates flux, moments
+and bounding box of each blob from its runs. Memory and time of the last two depend on the number of bright pixels, not
+on the size of the frame.
+
+The threshold varies over the frame: it is a tile grid, interpolated bilinearly. Interpolating it at every pixel would
+dominate the cost. So each row is first compared, in vector instructions, with a lower bound that is constant within a
+grid cell (the smallest of the cell's four corners); the exact threshold is computed only for pixels above the bound.
+"""
 
 from __future__ import annotations
 
@@ -12,19 +22,18 @@ from estimator.core.jit import jit
 from estimator.detection.background import at, filtered, filtered_row, summing
 
 Ints32 = NDArray[np.int32]  # half the memory where there are millions of runs
-FIRST_RUNS = 2048  # how many the first pass has room for
-# Columns of a blob's sums. STRONG counts the pixels above the higher threshold, TOP is the highest filtered light.
+FIRST_RUNS = 2048  # capacity of the first pass; a second pass follows if there are more runs
+# Columns of a blob's sums. STRONG: pixels above the higher threshold. TOP: largest filtered value above the sky.
 AREA, STRONG, FLUX, X, Y, PEAK, TOP, TOP_X, TOP_Y = range(9)
 SUMS = 9
-STRETCH = 64  # pixels that are looked at closely if one of them is bright
+STRETCH = 64  # pixels that are tested together; only a stretch with a bright pixel is examined further
 ONE_TAP = np.zeros((1, 2), np.int64)
 
 
 def runs_above(image: NDArray, threshold: Floats, taps: Ints | None = None) -> Ints32:
-    """(N, 3) y, first x and last x of the runs whose filtered light is above a grid's bilinear threshold.
+    """Return (N, 3) y, first x and last x of the runs whose filtered value is above the threshold grid.
 
-    Every row is filtered and compared in whole vectors with a bound that is nowhere above the threshold; only the
-    stretches of pixels in which one exceeds the bound are looked at closely.
+    threshold : (rows, columns) on tile centers, interpolated bilinearly
     taps : (K, 2) x, y offsets over which the filtered image is averaged, for streaks; None for round stars
     """
     kind = summing(image.dtype, image.max() if image.dtype == np.uint16 else np.inf)
@@ -45,10 +54,13 @@ def runs_above(image: NDArray, threshold: Floats, taps: Ints | None = None) -> I
 
 @jit
 def _scan(image: NDArray, threshold: Floats, taps: Ints, sums: NDArray, ring: NDArray, runs: Ints32) -> int:
-    """Fill `runs`; how many there are, which may be more than fit. `ring` has room for the rows that taps reach."""
+    """Fill `runs` and return the number of runs, which may exceed its capacity.
+
+    ring : circular buffer of filtered rows, (2 reach + 1) of them, so that each row is filtered only once
+    """
     height, width = image.shape
     reach, scale = len(ring) // 2, 16.0 * len(taps)
-    room = max(width, STRETCH)  # a narrow frame fills no stretch: the rest is dark
+    room = max(width, STRETCH)  # a frame narrower than a stretch is padded with zeros
     bounds, lights = np.zeros(room, ring.dtype), np.zeros(room, ring.dtype)
     bound, line = bounds[:width], lights[:width]
     mask = np.zeros(STRETCH, np.uint8)
@@ -64,15 +76,17 @@ def _scan(image: NDArray, threshold: Floats, taps: Ints, sums: NDArray, ring: ND
                 ready += 1
             _line(ring, taps, y, height, line)
         for first in range(0, width, STRETCH):
-            start = max(min(first, width - STRETCH), 0)  # the last one begins where it is whole
+            # The last stretch overlaps the one before, to be of full length.
+            start = max(min(first, width - STRETCH), 0)
             part, least = lights[start : start + STRETCH], bounds[start : start + STRETCH]
             hit = False
-            for i in range(STRETCH):  # a number known to the compiler: a handful of vectors
+            for i in range(STRETCH):  # constant length: the compiler unrolls it into vector instructions
                 hit |= part[i] > least[i]
             if not hit:
                 continue
             for i in range(STRETCH):
                 mask[i] = part[i] > least[i]
+            # Eight mask bytes are tested as one integer, to skip dark pixels quickly.
             for k in range(len(eights)):
                 if eights[k] == 0:
                     continue
@@ -85,7 +99,7 @@ def _scan(image: NDArray, threshold: Floats, taps: Ints, sums: NDArray, ring: ND
 
 @jit
 def _line(ring: NDArray, taps: Ints, y: int, height: int, out: NDArray) -> None:
-    """Sum of the filtered rows at the taps about a row."""
+    """Sum the filtered rows over the taps around row y; rows beyond the frame repeat its edge."""
     reach, width = len(ring) // 2, len(out)
     out[:] = 0
     for k in range(len(taps)):
@@ -97,7 +111,7 @@ def _line(ring: NDArray, taps: Ints, y: int, height: int, out: NDArray) -> None:
 
 @jit
 def _padded_row(image: NDArray, y: int, reach: int, sums: NDArray, out: NDArray) -> None:
-    """16 times the filtered row, its ends repeated."""
+    """Write 16 times the filtered row to `out`, padded at both ends by repeating the end values."""
     inner = out[reach : len(out) - reach]
     filtered_row(image, y, sums, inner)
     out[:reach], out[len(out) - reach :] = inner[0], inner[-1]
@@ -105,7 +119,7 @@ def _padded_row(image: NDArray, y: int, reach: int, sums: NDArray, out: NDArray)
 
 @jit
 def _extend(runs: Ints32, count: int, y: int, x: int) -> int:
-    """Lengthen the last run or begin another."""
+    """Extend the last run by pixel (y, x), or begin a new run; return the number of runs."""
     if 0 < count <= len(runs) and runs[count - 1, 0] == y and runs[count - 1, 2] == x - 1:
         runs[count - 1, 2] = x
         return count
@@ -116,9 +130,10 @@ def _extend(runs: Ints32, count: int, y: int, x: int) -> int:
 
 @jit
 def _bounds(threshold: Floats, height: int, y: int, cell: int, scale: float, bound: NDArray) -> int:
-    """`scale` times the least threshold of the bilinear cell about every pixel of a row; the row's cell.
+    """Fill `bound` with `scale` times the smallest threshold of each pixel's grid cell; return the row's cell row.
 
-    Nothing is done while the row is in the cell of the row before.
+    A bilinear interpolation is never below the smallest of its four corners. If the row is in the same cell row as the
+    previous row (`cell`), the bounds are still valid and nothing is computed.
     """
     rows, columns = threshold.shape
     width = len(bound)
@@ -135,9 +150,9 @@ def _bounds(threshold: Floats, height: int, y: int, cell: int, scale: float, bou
             value = scale * least
         elif bound.itemsize == 4:
             value = floor(min(max(scale * least, -2e9), 2e9))
-        else:  # integer sums are above a number if they are above its floor
+        else:  # an integer exceeds a number exactly if it exceeds its floor
             value = floor(min(max(scale * least, 0.0), 65535.0))
-        # From one tile centre to the next; the outermost reach to the frame's edge.
+        # A cell extends from one tile center to the next; the outermost ones extend to the frame's edge.
         first = 0 if column == 0 else int((column + 0.5) * width / columns)
         last = width if column >= columns - 2 else int((column + 1.5) * width / columns)
         bound[first:last] = value
@@ -146,9 +161,11 @@ def _bounds(threshold: Floats, height: int, y: int, cell: int, scale: float, bou
 
 @jit
 def labelled(runs: Ints32) -> tuple[Ints32, int]:
-    """Which blob each run belongs to, eight-connected, numbered from 0 in raster order; and how many blobs.
+    """Return the blob number of each run, from 0 in raster order, and the number of blobs.
 
-    Runs of neighbouring rows are met pairwise from left to right; those that touch share a root (union-find).
+    Two runs of adjacent rows are connected if they overlap or touch at a corner. The runs of the row above (i) and of
+    this row (j) are merged like two sorted lists, always advancing the one that ends first, so that every touching pair
+    is met once; each pair is joined in a union-find forest. A root is the first run of its blob in raster order.
     """
     count = len(runs)
     parent = np.arange(count, dtype=np.int32)
@@ -170,7 +187,7 @@ def labelled(runs: Ints32) -> tuple[Ints32, int]:
         start, end = first, k
     blob = np.empty(count, np.int32)
     blobs = 0
-    for n in range(count):  # a root comes before all that hang on it
+    for n in range(count):  # a root precedes all other runs of its blob, so its number is known
         root = _find(parent, n)
         if root == n:
             blob[n] = blobs
@@ -182,6 +199,7 @@ def labelled(runs: Ints32) -> tuple[Ints32, int]:
 
 @jit
 def _find(parent: Ints32, n: int) -> int:
+    # Path halving: each node visited is linked to its grandparent, which keeps the trees flat.
     while parent[n] != n:
         parent[n] = parent[parent[n]]
         n = parent[n]
@@ -191,7 +209,7 @@ def _find(parent: Ints32, n: int) -> int:
 @jit
 def _join(parent: Ints32, a: int, b: int) -> None:
     a, b = _find(parent, a), _find(parent, b)
-    if a != b:
+    if a != b:  # the earlier run becomes the root, as `labelled` relies on
         parent[max(a, b)] = min(a, b)
 
 
@@ -199,7 +217,7 @@ def _join(parent: Ints32, a: int, b: int) -> None:
 def summed(
     image: NDArray, level: Floats, strong: Floats, runs: Ints32, blob: Ints32, blobs: int
 ) -> tuple[Ints32, Floats]:
-    """(blobs, 4) boxes and (blobs, SUMS) sums over every blob's pixels; see the columns' names."""
+    """Return (blobs, 4) bounding boxes and (blobs, SUMS) sums over each blob's pixels, in the columns AREA .. TOP_Y."""
     height, width = image.shape
     boxes = np.empty((blobs, 4), np.int32)
     boxes[:, :2], boxes[:, 2:] = max(height, width), -1
@@ -230,10 +248,10 @@ def summed(
 def ranked(
     boxes: Ints | Ints32, sums: Floats, least_area: float, grown_area: float, grown_light: float, most: int
 ) -> tuple[Ints, Floats, Floats, Floats, Ints, int]:
-    """Boxes, (x, y), flux, peak and area of the `most` brightest that count, and how many count.
+    """Return boxes, (x, y), flux, peak and area of the `most` brightest accepted blobs, and the number accepted.
 
-    Those count that have `least_area` pixels above the higher threshold, or `grown_area` pixels in all whose light
-    is `grown_light` times the root of their number.
+    A blob is accepted if it has `least_area` pixels above the higher threshold, or if it is significant as a whole: at
+    least `grown_area` pixels in all, with a flux of at least `grown_light` sqrt(area).
     """
     rows, count = np.empty(len(sums), np.int64), 0
     for n in range(len(sums)):

@@ -1,4 +1,9 @@
-"""Which pixels are light: background, threshold, connected blobs, and what of them is no star."""
+"""Blob detection: background, threshold, connected components and classification.
+
+Each detector takes a frame and returns `Blobs`. `default` is a matched filter: the frame is correlated with an
+approximation of the star's image (the 3x3 binomial filter, averaged along the streak for smeared stars) and compared
+with a threshold in units of the filtered noise. The other detectors follow published trackers, for comparison.
+"""
 
 from __future__ import annotations
 
@@ -17,15 +22,16 @@ from estimator.detection.shefex import maximum_scan, sequential_scan
 
 MAX_BLOBS = 20_000
 GROW_SIGMA = 3.5
-FEWEST_GROWN = 8  # pixels of a blob that is significant as a whole, though nowhere by itself
-FEW_STARS, DIRECTIONS, SOUGHT_PX = 8, 8, 10.0  # fewer may be streaks too faint to be seen; what is tried then
-LARGE_PX = 150  # a blob of so many pixels is no faint streak, and a line filter makes many of its noise
-LONGEST_PX = 1024  # of a streak that is filtered for: along such a line no pixel holds much of a star
-FEWEST_SMEARED = 5  # noise averaged along a line is above the threshold three pixels in a row, or not at all
+FEWEST_GROWN = 8  # smallest area of a blob that is significant only as a whole
+# With fewer stars than FEW_STARS, faint streaks of SOUGHT_PX are searched in so many DIRECTIONS.
+FEW_STARS, DIRECTIONS, SOUGHT_PX = 8, 8, 10.0
+LARGE_PX = 150  # a blob this large is not a faint streak, and a line filter finds many in its noise
+LONGEST_PX = 1024  # longest streak filtered for: a longer one spreads the star too thinly
+FEWEST_SMEARED = 5  # noise averaged along a line is correlated: it exceeds the threshold in several pixels
 THESIS_INTENSITY, THESIS_AREA_PX = 0.04, 50
 
 # (image, threshold_sigma, min_area_px, max_blobs, hints): the image is (H, W) of any real dtype. Each raises ImageError
-# where there is nothing to look at.
+# for an image that cannot be used (see `check`).
 Detector = Callable[..., Blobs]
 
 
@@ -36,14 +42,17 @@ def default(
     max_blobs: int = 200,
     hints: FramePriors = NO_PRIORS,
 ) -> Blobs:
-    """Matched filters for round and for smeared stars over the local sky, grown to where the light ends.
+    """Matched filters for round and for smeared stars above the local sky, with two thresholds (hysteresis).
 
-    Round stars: the binomial filter [1 2 1] x [1 2 1] / 16 is close to the matched filter of sigma 0.7 px. A blob is
-    the connected pixels above 3.5 sigma of which `min_area_px` are above `threshold_sigma`, or whose light as a whole
-    is a sigma more significant than that: noise does not break a faint streak into pieces.
-    Smeared stars: the filtered image is averaged along the streak (dx, dy), which gains the square root of its
-    length. The streak is the hints' (from the gyro), else what the brightest blobs agree on, else, where there are
-    but few, the direction in which most are found. Beyond LONGEST_PX it stays with the filter for round stars.
+    Round stars: the binomial filter [1 2 1] x [1 2 1] / 16 is close to the matched filter of sigma 0.7 px. A blob is a
+    set of connected pixels above 3.5 sigma. It is accepted if `min_area_px` of them are above `threshold_sigma`, or if
+    its total flux is significant by one sigma more than that. The low threshold keeps noise from breaking a faint
+    streak into pieces.
+
+    Smeared stars: the filtered image is averaged along the streak (dx, dy), which improves the signal-to-noise ratio by
+    the square root of its length. The streak is that of the hints (from the gyro); otherwise the one that the brightest
+    blobs share; otherwise, if few stars were found, the direction in which most streaks are found. Streaks longer than
+    LONGEST_PX are detected with the filter for round stars.
     """
     image = prepared(image)
     background = sky(image)
@@ -52,6 +61,7 @@ def default(
             image, background, threshold_sigma * background.noise, min_area_px, max_blobs, GROW_SIGMA
         )
         blobs = classify.judged(image, blobs, hints)
+        # Round or too few. With very few stars, the rest may be streaks too faint for the round filter.
         if blobs.streak_px is None:
             stars = int(np.count_nonzero(blobs.flag & classify.NO_STAR == 0))
             wanting = hints.streak_px is None and stars < FEW_STARS and np.all(blobs.area_px < LARGE_PX)
@@ -59,6 +69,7 @@ def default(
             return classify.judged(image, unseen, hints) if len(unseen) > stars + 1 else blobs
         if max(map(abs, blobs.streak_px)) > LONGEST_PX:
             return blobs
+        # The bright blobs have revealed the streak: detect again with the filter along it.
         hints = FramePriors(blobs.streak_px, hints.saturation)
     return classify.judged(image, smeared(image, background, threshold_sigma, max_blobs, hints), hints)
 
@@ -70,7 +81,7 @@ def local(
     max_blobs: int = 200,
     hints: FramePriors = NO_PRIORS,
 ) -> Blobs:
-    """Blobs that stand `threshold_sigma` above the local sky after a 3x3 binomial filter."""
+    """Detect blobs `threshold_sigma` above the local sky after a 3x3 binomial filter."""
     image = prepared(image)
     background = sky(image)
     return gather(image, background, threshold_sigma * background.noise, min_area_px, max_blobs)
@@ -83,7 +94,7 @@ def components(
     max_blobs: int = 200,
     hints: FramePriors = NO_PRIORS,
 ) -> Blobs:
-    """Blobs above one level for the whole frame: its median sky plus `threshold_sigma` times its noise."""
+    """Detect blobs above a global threshold: the frame's median sky plus `threshold_sigma` times its noise."""
     image = prepared(image)
     flat = flattened(sky(image), image.shape)
     return gather(image, flat, threshold_sigma * flat.noise, min_area_px, max_blobs)
@@ -96,10 +107,10 @@ def thesis(
     max_blobs: int = 200,
     hints: FramePriors = NO_PRIORS,
 ) -> Blobs:
-    """Blobs of at least 50 pixels above 4 % of full scale (Padro 2012, sections 3.4.1.3 and 3.5).
+    """Detect blobs of at least 50 pixels above 4 % of full scale (Padro 2012, sections 3.4.1.3 and 3.5).
 
-    Full scale is the saturation in the hints, else what the integer type holds. Neither `threshold_sigma` nor
-    `min_area_px` plays a part: the thesis has two fixed thresholds. Raises ImageError for floats of unknown scale.
+    Full scale is the saturation in the hints, otherwise the maximum of the integer type. `threshold_sigma` and
+    `min_area_px` are ignored: the thesis has two fixed thresholds. Raises ImageError for floats of unknown scale.
     """
     image = prepared(image)
     full = hints.saturation
@@ -110,7 +121,8 @@ def thesis(
             )
         full = float(np.iinfo(image.dtype).max)
     flat = flattened(sky(image), image.shape)
-    # The threshold is on the raw pixel; a plateau of 50 pixels has the filtered image's contour within a pixel of it.
+    # The thesis thresholds raw pixels. We threshold the filtered image, whose contour around a plateau of 50 pixels is
+    # within a pixel of the raw one.
     return gather(image, flat, THESIS_INTENSITY * full - flat.level, THESIS_AREA_PX, max_blobs)
 
 
@@ -121,10 +133,10 @@ def sequential(
     max_blobs: int = 200,
     hints: FramePriors = NO_PRIORS,
 ) -> Blobs:
-    """SHEFEX-2's scan: once through the frame, each object summed as it is met and sorted into a table.
+    """SHEFEX-2's sequential scan: one pass over the frame that inserts each object found into a sorted table.
 
-    The table holds the `max_blobs` brightest so far. An object is the eight-connected pixels above one level for the
-    frame, sky + `threshold_sigma` times a raw pixel's noise (reference: the SHEFEX-2 paper, fig. 3 right).
+    The table holds the `max_blobs` brightest objects so far. An object is a set of eight-connected pixels above a
+    global threshold, sky + `threshold_sigma` times a raw pixel's noise (reference: the SHEFEX-2 paper, fig. 3 right).
     """
     return _scanned(sequential_scan, image, threshold_sigma, min_area_px, max_blobs)
 
@@ -136,7 +148,7 @@ def maximum(
     max_blobs: int = 200,
     hints: FramePriors = NO_PRIORS,
 ) -> Blobs:
-    """SHEFEX-2's rival scan: the whole frame for its greatest pixel, again for every object (fig. 3 left)."""
+    """SHEFEX-2's alternative scan: search the whole frame for its largest pixel, once per object (fig. 3 left)."""
     return _scanned(maximum_scan, image, threshold_sigma, min_area_px, max_blobs)
 
 
@@ -152,13 +164,13 @@ DETECTORS: dict[str, Detector] = {
 
 
 def prepared(image: NDArray) -> NDArray:
-    """The image checked, in a type that compiled code takes."""
+    """Check the image and convert it to a type that compiled code accepts."""
     check(image)
     return native(image)
 
 
 def check(image: NDArray) -> None:
-    """Raise ImageError with one line unless the image is a plain, finite, uneven (H, W) array of real numbers."""
+    """Raise ImageError with one line unless the image is a finite, non-constant (H, W) array of real numbers."""
     if image.dtype.kind not in "buif":
         raise ImageError(f"pixels of type {image.dtype} are no brightness; allowed: integers and floats")
     if image.ndim != 2:
@@ -166,7 +178,7 @@ def check(image: NDArray) -> None:
     check_size(image)
     some = image[::97, ::89]
     if image.dtype.kind != "f" and some.min() != some.max():
-        return  # integers cannot be NaN, and some of these are uneven
+        return  # integers are finite, and the sample shows that the image is not constant
     low, high = image.min(), image.max()
     if not (np.isfinite(low) and np.isfinite(high)):
         raise ImageError("the image holds NaN or infinite pixels; allowed: finite values")
@@ -175,7 +187,7 @@ def check(image: NDArray) -> None:
 
 
 def native(image: NDArray) -> NDArray:
-    """The image in a type that compiled code takes: FITS files are big-endian, masks are boolean."""
+    """Convert the image to a type that compiled code accepts: FITS files are big-endian, masks are boolean."""
     if image.dtype == np.uint16 and image.dtype.isnative:
         return image
     kind = {"b": "uint8", "f": "float32" if image.itemsize == 2 else "float64"}.get(image.dtype.kind)
@@ -191,10 +203,10 @@ def check_size(image: NDArray) -> None:
 
 
 def mend(image: NDArray, bad_px: Ints) -> NDArray:
-    """A copy of the image whose bad pixels, (K, 2) x and y, hold the median of their good neighbours.
+    """Return a copy of the image with each bad pixel, (K, 2) x and y, replaced by the median of its good neighbors.
 
-    The map comes from dark frames on the ground. A bad pixel without a good neighbour within two takes the frame's
-    median: it then is no light.
+    The map comes from dark frames taken on the ground. The neighbors are those within one pixel, otherwise within two;
+    without any good one the pixel gets the frame's median. Raises ImageError for a map beyond the frame.
     """
     mended = native(image).copy()
     height, width = image.shape
@@ -217,7 +229,7 @@ def mend(image: NDArray, bad_px: Ints) -> NDArray:
 
 
 def flattened(background: Background, shape: tuple[int, ...]) -> Background:
-    """One level and noise for the whole frame: the medians of the tiles'."""
+    """Return one level and noise for the whole frame: the medians over the tiles."""
     level, noise = median(background.level), median(background.noise)
     return Background(np.full((1, 1), level), np.full((1, 1), noise), max(shape))
 
@@ -230,10 +242,11 @@ def gather(
     max_blobs: int,
     grow_sigma: float | None = None,
 ) -> Blobs:
-    """Label what is more than `above` (on the background's grid) over the level, and keep the brightest.
+    """Detect blobs more than `above` (on the background's grid) over the level, and return the brightest.
 
-    With `grow_sigma` a blob reaches down to so many times the noise, and counts if enough of it is above `above` or
-    if its whole light is significant: flux / (pixel noise sqrt(area)) one more than the threshold's sigma.
+    With `grow_sigma` a blob extends down to that many sigma. It is accepted if `min_area_px` of its pixels exceed
+    `above`, or if its flux is significant: flux / (pixel noise sqrt(area)) at least one more than the threshold in
+    sigma.
     """
     strong = background.level + above
     low = strong
@@ -250,10 +263,11 @@ def gather(
 def smeared(
     image: NDArray, background: Background, threshold_sigma: float, max_blobs: int, hints: FramePriors
 ) -> Blobs:
-    """Streaks of the hints' (dx, dy), by the filtered image averaged along them.
+    """Detect streaks of the hints' (dx, dy) in the filtered image, averaged along the streak.
 
-    The average's noise is that of white noise through both filters. A streak's response is symmetric about its
-    middle and twice as long as itself: its box is put about the middle, as large as the streak.
+    The noise of the average is computed for white noise passed through both filters. The response to a streak is
+    symmetric about the streak's center and twice as long as the streak, so the box is set around the center with the
+    size of the streak.
     """
     assert hints.streak_px is not None
     taps = taps_of(hints.streak_px)
@@ -272,9 +286,10 @@ def smeared(
 def faint_streaks(
     image: NDArray, background: Background, threshold_sigma: float, max_blobs: int, hints: FramePriors
 ) -> Blobs:
-    """Streaks that nobody told of: those of the direction, of a few, in which a line filter finds the most.
+    """Search for streaks without a prior: return the blobs of the line filter, out of DIRECTIONS, that finds most.
 
-    The best of several directions is a better one by chance too, which half a sigma makes good.
+    Taking the best of several directions increases the number of false detections; the threshold is therefore raised
+    by half a sigma.
     """
     turns = np.pi * np.arange(DIRECTIONS) / DIRECTIONS
     found = []
@@ -286,14 +301,14 @@ def faint_streaks(
 
 
 def taps_of(streak_px: tuple[float, float]) -> Ints:
-    """(K, 2) pixels of a line of that length and direction, about 0: one a pixel of its longer side."""
+    """Return the (K, 2) pixel offsets of a line centered on 0, one per pixel along its longer axis."""
     count = max(round(max(map(abs, streak_px))), 1) | 1
     along = (np.arange(count) - count // 2) / count
     return np.rint(along[:, None] * np.array(streak_px)).astype(np.int64)
 
 
 def noise_kept(taps: Ints) -> float:
-    """What of white noise's deviation is left after the binomial filter and the mean over the taps."""
+    """Return the factor by which the binomial filter and the mean over the taps reduce the deviation of white noise."""
     reach = int(np.abs(taps).max()) + 1
     kernel = np.zeros((2 * reach + 1, 2 * reach + 1))
     binomial = np.outer([1, 2, 1], [1, 2, 1]) / 16 / len(taps)
@@ -309,7 +324,7 @@ def _scanned(
     min_area_px: int,
     max_blobs: int,
 ) -> Blobs:
-    """The table of one of SHEFEX's scans as blobs."""
+    """Run one of SHEFEX's scans and convert its table to Blobs."""
     image = prepared(image)
     flat = flattened(sky(image), image.shape)
     level, noise = float(flat.level[0, 0]), float(flat.noise[0, 0]) / FILTERED_NOISE
@@ -326,7 +341,10 @@ def _kept(
     grown_area: int = 0,
     grown_light: float = np.inf,
 ) -> Blobs:
-    """The brightest of what counts, see `ranked`, as Blobs without any flag."""
+    """Return the brightest accepted blobs (see `ranked`) as Blobs, without flags.
+
+    Raises ImageError for more than MAX_BLOBS accepted blobs.
+    """
     box, xy, flux, peak, area, count = ranked(boxes, sums, min_area_px, grown_area, grown_light, max_blobs)
     if count > MAX_BLOBS:
         raise ImageError(f"over {MAX_BLOBS} blobs: the frame is noise or texture, not a star field")

@@ -1,4 +1,4 @@
-"""SHEFEX-2's two ways through a frame: one sequential pass with a sorted table, or the maximum again and again."""
+"""SHEFEX-2's two scans of a frame: one sequential pass with a sorted table, or a repeated search for the maximum."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from estimator.detection.components import AREA, FLUX, PEAK, SUMS, X, Y
 def sequential_scan(
     image: NDArray, level: float, threshold: float, min_area_px: int, table_size: int
 ) -> tuple[Ints, Floats]:
-    """Boxes (N, 4) and sums (N, SUMS) of the N <= table_size brightest objects, brightest first.
+    """Return boxes (N, 4) and sums (N, SUMS) of the N <= table_size brightest objects, brightest first.
 
-    One raster pass: a pixel above the threshold that belongs to no object yet is summed with all that is connected
-    to it, and the object takes its place in the table by intensity; the faintest falls off the end.
+    One raster pass. Each pixel above the threshold that does not belong to an object yet starts a new one: all pixels
+    connected to it are summed, and the object is inserted into the table by intensity; the faintest one drops out.
     """
     height, width = image.shape
     taken = np.zeros(image.shape, np.uint8)
@@ -40,9 +40,9 @@ def sequential_scan(
 def maximum_scan(
     image: NDArray, level: float, threshold: float, min_area_px: int, table_size: int
 ) -> tuple[Ints, Floats]:
-    """As `sequential_scan`, but by looking through the whole frame for the greatest pixel left, object by object.
+    """As `sequential_scan`, but search the whole frame for the largest remaining pixel before each object.
 
-    Ends where that pixel is below the threshold, or with the table full: it then holds the objects of the highest
+    Ends when that pixel is below the threshold or the table is full; the table then holds the objects with the highest
     peaks.
     """
     height, width = image.shape
@@ -77,9 +77,9 @@ def _object(
     box: Ints,
     mine: Floats,
 ) -> None:
-    """Sum all pixels above the threshold that are connected to one by sides or corners, and take them.
+    """Sum all pixels above the threshold connected to (y, x) by sides or corners, and mark them in `taken`.
 
-    The paper's recursive centroiding, with a stack of its own instead of the computer's.
+    The paper's recursive centroiding as a flood fill with an explicit stack instead of recursion.
     """
     height, width = image.shape
     box[0], box[1], box[2], box[3] = x, y, x, y
@@ -109,7 +109,7 @@ def _object(
 
 @jit
 def _insert(boxes: Ints, sums: Floats, count: int, box: Ints, mine: Floats) -> int:
-    """Put an object into the table by its intensity; how many it then holds."""
+    """Insert an object into the table by intensity; return the number of objects it then holds."""
     k = min(count, len(sums) - 1)
     while k > 0 and sums[k - 1, FLUX] < mine[FLUX]:
         sums[k], boxes[k] = sums[k - 1], boxes[k - 1]

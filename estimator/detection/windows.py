@@ -1,4 +1,8 @@
-"""Light in windows: what stands where stars are expected, without a look at the rest of the frame."""
+"""Detection in windows: search for blobs only where stars are expected, without processing the rest of the frame.
+
+Used in tracking mode. In each window the largest filtered value in units of the local noise is the peak; a flood fill
+around it collects the connected pixels above 3 sigma.
+"""
 
 from __future__ import annotations
 
@@ -18,13 +22,14 @@ GROW_SIGMA = 3.0
 def in_windows(
     image: NDArray, centre_px: Floats, half_px: float, threshold_sigma: float, hints: FramePriors = NO_PRIORS
 ) -> Blobs:
-    """The brightest blob of each window, brightest first: its peak stands `threshold_sigma` above the local sky.
+    """Detect the brightest blob of each window with a peak `threshold_sigma` above the local sky; brightest first.
 
-    image : (H, W) real;  centre_px : (N, 2) middles of square windows of half a side `half_px`
-    A blob is the eight-connected pixels above 3 sigma of the 3x3-filtered image about its peak; it may reach beyond
-    its window. Two windows that hold one blob have it once. Raises ImageError where there is nothing to look at.
+    image : (H, W) real;  centre_px : (N, 2) centers of square windows of half-width `half_px`
+    A blob is the set of eight-connected pixels above 3 sigma of the 3x3-filtered image around its peak; it may extend
+    beyond its window. A blob found in two windows is returned once. Raises ImageError for an image that cannot be used.
     """
     image = prepared(image)
+    # The background is a sparse sample of the frame; only the windows are read in full.
     background = sky(image)
     level, noise = background.level, background.noise
     rows = np.ascontiguousarray(centre_px, dtype=float)
@@ -49,7 +54,7 @@ def in_windows(
 def _brightest(
     image: NDArray, centre_px: Floats, half_px: float, level: Floats, noise: Floats, threshold_sigma: float
 ) -> tuple[Ints, Floats, int]:
-    """Boxes (N, 4), sums (N, 5: area, flux, flux x, flux y, peak) and how many there are."""
+    """Return boxes (N, 4), sums (N, 5: area, flux, flux x, flux y, peak) and the number of blobs."""
     height, width = image.shape
     boxes, sums, count = np.empty((len(centre_px), 4), np.int64), np.zeros((len(centre_px), 5)), 0
     for n in range(len(centre_px)):
@@ -62,6 +67,7 @@ def _brightest(
                 above = (filtered(image, y, x) - at(level, height, width, y, x)) / max(spread, 1e-12)
                 if above > best:
                     best, at_x, at_y = above, x, y
+        # A peak inside the box of an earlier blob is taken to be that blob.
         new = at_x >= 0
         for m in range(count):
             inside = boxes[m, 0] <= at_x <= boxes[m, 2] and boxes[m, 1] <= at_y <= boxes[m, 3]
@@ -74,7 +80,7 @@ def _brightest(
 
 @jit
 def _span(middle_px: float, half_px: float, size: int) -> tuple[int, int]:
-    """First and last pixel of a window along an axis; none where its middle is NaN."""
+    """Return first and last pixel of a window along an axis; (0, -1), an empty range, outside the frame and for NaN."""
     low, high = middle_px - half_px, middle_px + half_px
     if not (high > -1 and low < size):
         return 0, -1
@@ -83,7 +89,7 @@ def _span(middle_px: float, half_px: float, size: int) -> tuple[int, int]:
 
 @jit
 def _grow(image: NDArray, x: int, y: int, level: Floats, noise: Floats, box: NDArray, total: NDArray) -> None:
-    """Collect the pixels connected to a peak; at most 4096 of them."""
+    """Sum the pixels connected to a peak by flood fill; stops at 4096 pixels."""
     height, width = image.shape
     stack, seen = [(x, y)], {(x, y)}
     box[0], box[1], box[2], box[3] = x, y, x, y

@@ -1,1 +1,1 @@
-"""The attitude filter (MEKF): attitude and gyro bias from gyro and star tracker."""
+"""Attitude filter (MEKF): attitude and gyro bias from gyro and star tracker."""

@@ -1,4 +1,13 @@
-"""Attitude and gyro bias from gyro and star tracker together: the multiplicative extended Kalman filter.
+"""Multiplicative extended Kalman filter (MEKF): attitude and gyro bias from gyro and star tracker.
+
+The attitude is a unit quaternion, its error a three-component rotation vector in body axes. Gyro samples propagate the
+attitude, the bias and their covariance (`propagate`); a star tracker's solution corrects them (`update`). After each
+correction the estimated error is multiplied into the quaternion and reset to zero, so the quaternion keeps its unit
+norm and the covariance (6, 6) is not singular. The equations are in the docstring of Mekf.
+
+Solutions arrive late. The filter therefore keeps its recent history: the states after the solutions used, and the gyro
+samples since. A late solution is applied to the state at its own time, and the later samples and solutions are applied
+again.
 
 Sources: Farrenkopf 1978 (J. Guidance & Control 1, 282) for the gyro's noise; Lefferts, Markley & Shuster 1982 (J.
 Guidance 5, 417) for the six-state filter; Crassidis & Junkins, Optimal Estimation of Dynamic Systems, chapter 7, for
@@ -26,21 +35,21 @@ RESET = "reset"
 OUTSIDE = "refused: outside the gate"
 TOO_OLD = "refused: older than the filter remembers"
 
-# What was felt and seen is kept for so long at most, and for half of it at least. `assumed`: some frames.
+# Duration of the history of samples and solutions; at least half of it is kept. `assumed`: some frames.
 MEMORY_S = 10.0
-# Refused solutions in a row that must agree with one another before they are believed instead of the filter.
+# Number of consecutive refused solutions that must agree before the filter is reset to them.
 AGREEING = 3
-# A solution's time may be ahead of the last gyro sample by rounding, not more.
+# A solution's time may be ahead of the last gyro sample by this much, for rounding.
 ROUNDING_S = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
 class GyroModel:
-    """What is wrong with a gyro, on each axis alike: measured rate = rate + bias + white noise.
+    """Error model of a gyro, the same for each axis: measured rate = rate + bias + white noise.
 
     arw_rad_sqrt_s : angle random walk, rad / sqrt(s)
     bias_rad_s     : standard deviation of the bias, a first-order Gauss-Markov process (ignored if its time is inf)
-    bias_time_s    : its correlation time, long against a sample interval; inf is a constant bias
+    bias_time_s    : its correlation time, long compared with a sample interval; inf for a constant bias
 
     Farrenkopf's random walk of the bias with density u (rad / s^1.5) is the limit of a long time t with
     bias_rad_s = u sqrt(t / 2). Raises ValueError for negative or unusable numbers.
@@ -60,11 +69,12 @@ class GyroModel:
 
 @dataclass(frozen=True, slots=True)
 class Update:
-    """What became of a star tracker's solution.
+    """Result of an update with a star tracker's solution.
 
-    status       : "used", "reset" (the filter was lost and took the solution), or "refused: why"
-    residual_rad : (3,) the turn, in body axes, from where the filter was to where the solution says; NaN if too old
-    distance     : Mahalanobis distance of the residual, the root of a chi-square of 3 degrees of freedom
+    status       : "used", "reset" (the filter was lost and adopted the solution), or "refused: why"
+    residual_rad : (3,) rotation vector in body axes from the filter's attitude to the solution's
+    distance     : Mahalanobis distance of the residual, the root of a chi-square with 3 degrees of freedom
+    Both are NaN for a solution that is too old.
     """
 
     status: str
@@ -73,7 +83,7 @@ class Update:
 
 
 class _Moment(NamedTuple):
-    """All that the filter knows at one time; `missed_rad` is the spread gathered in a saturation that lasts."""
+    """State of the filter at one time; `missed_rad` is the attitude uncertainty gathered in the current saturation."""
 
     t_s: float
     ref_from_body_wxyz: Floats
@@ -87,16 +97,16 @@ class _Moment(NamedTuple):
 
 
 class _Solution(NamedTuple):
-    """The star tracker's, at the filter's moment."""
+    """A star tracker's solution, at the time of a _Moment."""
 
     body_from_ref: Rotation
     covariance_rad2: Floats
 
 
 class _Leg(NamedTuple):
-    """From one used solution to the next: the moment after it was used, the gyro's samples since, the solution.
+    """History from one used solution to the next: the state after it, the gyro samples since, and the solution.
 
-    The first leg's is None: nothing before it is remembered.
+    The solution of the oldest leg is not applied again, and is None if the leg begins between two solutions.
     """
 
     moment: _Moment
@@ -105,38 +115,40 @@ class _Leg(NamedTuple):
 
 
 class Mekf:
-    """A star tracker's attitude filter: the attitude as a quaternion, its error e as a small turn in body axes.
+    """Attitude filter of a star tracker: the attitude as a quaternion, its error e as a small rotation in body axes.
 
-    With ref_from_body = estimate exp(e), a gyro sample of turn p (its bias taken away) in the interval T gives
+    With ref_from_body = estimate exp(e), a gyro sample of rotation p (with the bias subtracted) in the interval T gives
 
         e+ = exp(-[p]) e - T J(p) db - noise,      db+ = exp(-T / bias_time) db + noise,
         J(p) = 1 - (1 - cos p) / p^2 [p] + (p - sin p) / p^3 [p]^2,
 
     and Farrenkopf's process noise with v = arw, u^2 = 2 bias^2 / bias_time: v^2 T + u^2 T^3 / 3 in the angle,
-    -u^2 T^2 / 2 between, u^2 T in the bias. Every sample is treated on its own (1 us each, compiled), so that the
-    result does not depend on how samples are cut into calls.
+    -u^2 T^2 / 2 in the cross-covariance, u^2 T in the bias. Each sample is propagated separately (1 us each,
+    compiled), so the result does not depend on how the samples are divided among calls.
 
-    gyro               : what the filter believes of the gyro
-    t_s, body_from_ref : the start; its bias is 0
+    gyro               : error model of the gyro
+    t_s, body_from_ref : initial time and attitude; the initial bias is 0
     sigma_attitude_rad, sigma_bias_rad_s : standard deviations at the start, one number or (3,) in body axes
     floor_rad          : added in quadrature to every solution's covariance, for errors common to its stars
-    gate_sigma         : a solution is refused at a distance as improbable as so many sigma of one number
+    gate_sigma         : a solution is refused if its distance is less probable than so many sigma of a scalar Gaussian
 
-    Saturation. While the gyro is at its limit the true rate is anything above it. The error is then taken for a rate
-    that is constant through the saturation and as large as the measured one (sigma, on each axis; `assumed`): the
-    spread grows in proportion to the time, to |measured rate| t, and a blow of six times the limit is still within the
-    usual gate. All axes grow: a turn missed about one carries the turns about the others the wrong way. The growth
-    is in the attitude alone: a large residual then is laid to the missed turn, not to the bias.
+    Saturation. While the gyro is at its rate limit, the true rate can be anything above it. The rate error is assumed
+    constant throughout the saturation, with a standard deviation on each axis as large as the measured rate
+    (`assumed`). The standard deviation of the attitude then grows linearly with time, as |measured rate| t, and a
+    shock of six times the limit is still within the default gate. The uncertainty grows about all axes, because a
+    rotation missed about one axis misdirects the rotations about the others. Only the attitude's covariance grows,
+    so that a large residual is attributed to the missed rotation and not to the bias.
 
-    Order. Solutions may come at any rate, late, in any order, or not at all: each is used at its own time, and those
-    for later times that were used before it are used again after it, so that the result is that of the right order.
+    Order. Solutions may come at any rate, late, in any order, or not at all. Each is used at its own time, and
+    solutions for later times that were already used are applied again after it, so the result is that of the correct
+    order.
 
-    Gate. A wrong solution is worse than none, so an improbable one is refused and changes nothing. But a filter that
-    is wrong itself would then refuse the truth for ever. So when three solutions, refused one after another, agree
-    with each other (each carried to the next by the gyro, within the gate of their own covariances and the gyro's),
-    the filter takes the last of them with its covariance. It keeps the bias, the variance increased by that of the
-    start: it may have been what led astray. False solutions agree twice in a row only where the tracker is
-    fooled by the same thing each time.
+    Gate. A wrong solution is worse than none, so an improbable one is refused and changes nothing. But a filter whose
+    own state is wrong would refuse correct solutions forever. So if three consecutive refused solutions agree with each
+    other (each propagated to the next by the gyro, within the gate of their own covariances and the gyro's), the filter
+    adopts the last of them with its covariance. The bias is kept, but its variance is increased by the initial
+    variance, as a wrong bias may have been the cause. False solutions agree repeatedly only if the tracker makes the
+    same error each time.
     """
 
     def __init__(
@@ -151,19 +163,19 @@ class Mekf:
     ) -> None:
         self._gyro = gyro
         self._floor_rad2 = _not_negative("floor_rad", floor_rad) ** 2
-        # The chi-square of 3 degrees of freedom that is exceeded as seldom as gate_sigma by one normal number.
+        # The chi-square of 3 degrees of freedom with the tail probability of gate_sigma for a scalar Gaussian.
         self._gate = float(chdtri(3, chdtrc(1, _not_negative("gate_sigma", gate_sigma) ** 2)))
         sigma_attitude = _not_negative("sigma_attitude_rad", sigma_attitude_rad) * np.ones(3)
         self._start_variance = (_not_negative("sigma_bias_rad_s", sigma_bias_rad_s) * np.ones(3)) ** 2
         covariance = np.diag(np.concatenate([sigma_attitude**2, self._start_variance]))
         self._now = _Moment(float(t_s), _ref_from_body_wxyz(body_from_ref), np.zeros(3), covariance, 0.0)
         self._legs = [_Leg(self._now, np.empty((0, 5)), None)]  # rows of _checked_samples
-        self._refused: list[tuple[_Moment, _Solution]] = []  # in a row, each agreeing with the one before
+        self._refused: list[tuple[_Moment, _Solution]] = []  # in a row, each agrees with the one before
         self._measured_rad_s = np.zeros(3)
 
     @property
     def state(self) -> FilterState:
-        """Attitude and bias with their covariance after the last gyro sample."""
+        """Attitude, bias and their covariance after the last gyro sample."""
         now = self._now
         return FilterState(now.t_s, now.body_from_ref, now.bias_rad_s.copy(), now.covariance.copy())
 
@@ -173,12 +185,12 @@ class Mekf:
 
     @property
     def ref_from_body_wxyz(self) -> Floats:
-        """(4,) the inverse of body_from_ref as the filter keeps it, scalar first: for loops that ask at every tick."""
+        """(4,) quaternion of the inverse of body_from_ref, scalar first, as stored: for callers in every tick."""
         return self._now.ref_from_body_wxyz
 
     @property
     def bias_rad_s(self) -> Floats:
-        """(3,) in body axes."""
+        """(3,) estimated gyro bias in body axes."""
         return self._now.bias_rad_s.copy()
 
     @property
@@ -187,16 +199,17 @@ class Mekf:
         return self._measured_rad_s - self._now.bias_rad_s
 
     def propagate(self, t_s: ArrayLike, angle_rad: ArrayLike, saturated: ArrayLike) -> None:
-        """Follow the gyro.
+        """Propagate the state by gyro samples.
 
-        t_s       : (N,) ends of the sample intervals; the first begins at the filter's time
-        angle_rad : (N, 3) turn in each, in body axes
+        t_s       : (N,) ends of the sample intervals; the first interval begins at the filter's time
+        angle_rad : (N, 3) rotation angle in each interval, about the body axes
         saturated : (N,) whether the gyro was at its rate limit
 
-        Raises ValueError for other shapes, numbers that are not finite, or times that do not go forwards.
+        Raises ValueError for other shapes, non-finite numbers, times that do not increase, or intervals that are too
+        long.
         """
         start_s = self._now.t_s
-        # A tenth: the process noise is a series in the ratio of the two times.
+        # At most a tenth: the process noise is a series in the ratio of sample interval to bias time.
         samples = _checked_samples(start_s, t_s, angle_rad, saturated, 0.1 * self._gyro.bias_time_s)
         self._now = self._after(self._now, samples)
         self._measured_rad_s = samples[:, 1:4].sum(axis=0) / (samples[-1, 0] - start_s)
@@ -205,11 +218,11 @@ class Mekf:
         self._forget(float(samples[-1, 0]) - MEMORY_S)
 
     def update(self, t_s: float, body_from_ref_measured: Rotation, covariance_rad2: ArrayLike) -> Update:
-        """Take a star tracker's solution for a time now or in the past, from which the gyro is followed again.
+        """Apply a star tracker's solution for the current or a past time, then repropagate from there to the present.
 
-        covariance_rad2 : (3, 3) of the solution's small turn, in body axes
+        covariance_rad2 : (3, 3) of the small rotation error of the solution, in body axes
 
-        Raises ValueError for a covariance that is not symmetric and positive definite, or a time ahead of the gyro's.
+        Raises ValueError for a covariance that is not symmetric and positive definite, or a time after the last sample.
         """
         spread = _checked_covariance(covariance_rad2) + self._floor_rad2 * np.eye(3)
         solution, now_s = _Solution(body_from_ref_measured, spread), self._now.t_s
@@ -217,18 +230,20 @@ class Mekf:
             raise ValueError(f"update: a solution at {t_s} s; allowed: up to the last gyro sample, {now_s} s")
         if t_s < self._legs[0].moment.t_s:
             return Update(TOO_OLD, np.full(3, np.nan), math.nan)
+        # Find the leg that contains t_s, and propagate its state to that time.
         k = next(k for k in reversed(range(len(self._legs))) if self._legs[k].moment.t_s <= t_s)
         leg = self._legs[k]
         before, after = _split(leg.samples, leg.moment.t_s, min(float(t_s), now_s))
         then = self._after(leg.moment, before)
         residual, noise, distance2 = _innovation(then, solution)
         if distance2 <= self._gate:
+            # Split the leg at the solution, then repeat the later solutions from the corrected state.
             status, then = USED, _corrected(then, residual, noise)
             self._legs[k : k + 1] = [leg._replace(samples=before), _Leg(then, after, solution)]
             self._replay(k + 1)
         elif self._agrees(then, solution):
             status = RESET
-            # What was used after it, by a filter that was lost, is forgotten with it.
+            # Solutions used later than t_s were judged by a lost filter: only their gyro samples are kept.
             rest = np.concatenate([after, *(later.samples for later in self._legs[k + 1 :])])
             self._legs = [_Leg(self._taken(then, solution), rest, None)]
         else:
@@ -238,7 +253,7 @@ class Mekf:
         return Update(status, residual, math.sqrt(distance2))
 
     def _replay(self, k: int) -> None:
-        """The solutions after leg k once more, from where leg k now leaves the filter; they have passed the gate."""
+        """Apply again the solutions after leg k, from the new state of leg k; they have passed the gate already."""
         for j in range(k + 1, len(self._legs)):
             earlier, leg = self._legs[j - 1], self._legs[j]
             assert leg.solution is not None
@@ -247,9 +262,10 @@ class Mekf:
             self._legs[j] = leg._replace(moment=_corrected(then, residual, noise))
 
     def _forget(self, before_s: float) -> None:
-        """Let go of whole legs, and of half of a long one."""
+        """Delete history before a time: whole legs, and the first half of the samples of a long leg."""
         while len(self._legs) > 1 and self._legs[1].moment.t_s < before_s:
             del self._legs[0]
+        # Half at a time, so that the cost of propagating the first state is spread over many calls.
         first = self._legs[0]
         if len(first.samples) and first.samples[0, 0] < before_s:
             half = len(first.samples) // 2
@@ -257,20 +273,21 @@ class Mekf:
             self._legs[0] = _Leg(moment, first.samples[half:], None)
 
     def _after(self, moment: _Moment, samples: Floats) -> _Moment:
-        """A moment carried through samples by the gyro."""
+        """Propagate a state through gyro samples."""
         if not len(samples):
             return moment
         noise = (self._gyro.arw_rad_sqrt_s**2, self._gyro.bias_rad_s**2, 1 / self._gyro.bias_time_s)
         return _Moment(float(samples[-1, 0]), *advance(tuple(moment), samples, noise))
 
     def _agrees(self, then: _Moment, solution: _Solution) -> bool:
-        """Whether a refused solution is the third in a row of which each agrees with the one before."""
+        """Whether a refused solution is the third in a row, each in agreement with the one before."""
         if self._refused:
             moment, earlier = self._refused[-1]
             turn = (
                 then.body_from_ref * moment.body_from_ref.inv()
-            )  # no solution was used between: the gyro's alone
+            )  # from the gyro alone: no solution was used in between
             apart = (turn * earlier.body_from_ref * solution.body_from_ref.inv()).as_rotvec()
+            # Both covariances in the later body axes, plus what the gyro's noise and bias add in the gap.
             gap_s, R = abs(then.t_s - moment.t_s), turn.as_matrix()
             spread = R @ earlier.covariance_rad2 @ R.T + solution.covariance_rad2
             spread += gap_s * self._gyro.arw_rad_sqrt_s**2 * np.eye(3) + gap_s**2 * then.covariance[3:, 3:]
@@ -280,7 +297,7 @@ class Mekf:
         return len(self._refused) >= AGREEING
 
     def _taken(self, then: _Moment, solution: _Solution) -> _Moment:
-        """Lost and found: the solution's attitude and covariance, the bias as it was but less certain."""
+        """Reset to the solution's attitude and covariance; keep the bias and add the initial variance to its own."""
         bias_covariance = then.covariance[3:, 3:] + np.diag(self._start_variance)
         return then._replace(
             ref_from_body_wxyz=_ref_from_body_wxyz(solution.body_from_ref),
@@ -289,19 +306,20 @@ class Mekf:
 
 
 def _innovation(then: _Moment, solution: _Solution) -> tuple[Floats, Floats, float]:
-    """Residual (3,) in body axes, the solution's noise as it appears in it, the squared Mahalanobis distance."""
+    """Return the residual (3,) in body axes, its noise covariance (3, 3), and the squared Mahalanobis distance."""
     residual = (then.body_from_ref * solution.body_from_ref.inv()).as_rotvec()
     noise = _seen_from(residual, solution.covariance_rad2)
     return residual, noise, float(residual @ np.linalg.solve(then.covariance[:3, :3] + noise, residual))
 
 
 def _corrected(then: _Moment, residual: Floats, noise: Floats) -> _Moment:
-    """Kalman's update in Joseph's form, its attitude error moved into the quaternion."""
+    """Kalman update in Joseph form; the attitude error is then multiplied into the quaternion."""
     gain = np.linalg.solve(then.covariance[:3, :3] + noise, then.covariance[:3]).T
     error = gain @ residual
+    # Joseph form, (I - K H) P (I - K H)^T + K R K^T with H = [I 0], stays symmetric and positive.
     left = np.eye(6)
     left[:, :3] -= gain
-    # exp(error) exp(rest) = exp(error + change) makes rest = J(error) change.
+    # Reset of the error state: exp(error) exp(rest) = exp(error + change) gives rest = J(error) change.
     moved = np.eye(6)
     moved[:3, :3] = _smear(error[:3])
     covariance = moved @ (left @ then.covariance @ left.T + gain @ noise @ gain.T) @ moved.T
@@ -311,16 +329,17 @@ def _corrected(then: _Moment, residual: Floats, noise: Floats) -> _Moment:
 
 
 def _smear(turn_rad: Floats) -> Floats:
-    """(3, 3) J(p) of Mekf's docstring."""
+    """Return (3, 3) J(p) of Mekf's docstring: the right Jacobian of SO(3)."""
     rows = np.empty((3, 6))
     transition(turn_rad, -1.0, rows)
     return rows[:, 3:]
 
 
 def _seen_from(residual: Floats, measured_rad2: Floats) -> Floats:
-    """(3, 3) covariance of the residual's rotation vector; the solution's own but where the residual is large.
+    """Return the (3, 3) noise covariance of the residual's rotation vector.
 
-    The solution is truth exp(v), so truth = filter exp(residual) exp(-v), and the vector is off by J(residual)^-1 v.
+    The solution is truth exp(v), so truth = filter exp(residual) exp(-v), and the error of the vector is
+    J(residual)^-1 v. For a small residual this is the covariance of the solution itself.
     """
     inverse = np.linalg.inv(_smear(residual))
     return inverse @ measured_rad2 @ inverse.T
@@ -331,7 +350,7 @@ def _ref_from_body_wxyz(body_from_ref: Rotation) -> Floats:
 
 
 def _not_negative(name: str, value: ArrayLike) -> NDArray:
-    """Standard deviations as an array. Raises ValueError."""
+    """Convert standard deviations to an array. Raises ValueError unless they are 0 or more, one or three."""
     array = np.asarray(value, dtype=float)
     if array.shape not in ((), (3,)) or not (array >= 0).all():
         raise ValueError(f"{name} is {array.tolist()}; allowed: 0 or more, one number or one for each axis")
@@ -341,7 +360,10 @@ def _not_negative(name: str, value: ArrayLike) -> NDArray:
 def _checked_samples(
     start_s: float, t_s: ArrayLike, angle_rad: ArrayLike, saturated: ArrayLike, longest_s: float
 ) -> Floats:
-    """(N, 5) gyro samples: end of the interval, turn about x, y, z, 1 at the rate limit and 0 below. ValueError."""
+    """Return (N, 5) gyro samples: end of the interval, rotation about x, y, z, and 1 if saturated, otherwise 0.
+
+    Raises ValueError for wrong shapes, non-finite numbers, and intervals not above 0 and up to longest_s.
+    """
     ends_s, angle = np.asarray(t_s, float), np.asarray(angle_rad, float)
     count, shapes = ends_s.size, [ends_s.shape, angle.shape, np.shape(saturated)]
     if not count or shapes != [(count,), (count, 3), (count,)]:
@@ -361,7 +383,10 @@ def _checked_samples(
 
 
 def _split(samples: Floats, start_s: float, t_s: float) -> tuple[Floats, Floats]:
-    """Those before t_s and after; one that contains it is taken for an even turn. The first starts at start_s."""
+    """Split samples at t_s into those before and after; the first interval begins at start_s.
+
+    An interval that contains t_s is divided, assuming a constant rate in it.
+    """
     k = int(np.searchsorted(samples[:, 0], t_s, side="right"))
     begin_s = samples[k - 1, 0] if k else start_s
     if k == len(samples) or begin_s == t_s:
@@ -375,7 +400,7 @@ def _split(samples: Floats, start_s: float, t_s: float) -> tuple[Floats, Floats]
 
 
 def _checked_covariance(covariance_rad2: ArrayLike) -> Floats:
-    """(3, 3). Raises ValueError unless it is symmetric and positive definite."""
+    """Return the covariance as a (3, 3) array. Raises ValueError unless it is symmetric and positive definite."""
     matrix = np.asarray(covariance_rad2, dtype=float)
     sound = matrix.shape == (3, 3) and bool(np.isfinite(matrix).all())
     if sound:

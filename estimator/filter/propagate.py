@@ -1,4 +1,4 @@
-"""The filter between two solutions: the gyro's samples carry attitude, bias and covariance along, compiled."""
+"""Compiled propagation of the filter: gyro samples advance attitude, bias and covariance between two solutions."""
 
 from __future__ import annotations
 
@@ -16,9 +16,10 @@ def advance(
     samples: Floats,
     noise: tuple[float, float, float],
 ) -> tuple[Floats, Floats, Floats, float]:
-    """Attitude, bias, covariance and missed angle after the samples; Mekf's docstring has the equations.
+    """Return attitude, bias, covariance and missed angle after the samples; the equations are in Mekf's docstring.
 
-    samples : (N, 5) rows of t_s, the turn in the interval that ends there (3), whether the gyro was saturated
+    moment  : t_s, ref_from_body_wxyz, bias_rad_s, covariance, missed_rad
+    samples : (N, 5) rows of t_s, the rotation in the interval that ends there (3), and whether the gyro was saturated
     noise   : arw^2, bias^2, 1 / bias_time
     """
     t_s, wxyz, bias, covariance, missed_rad = moment
@@ -30,7 +31,7 @@ def advance(
         t_s = samples[n, 0]
         acting_s = step_s * (
             1 - step_s * forget_per_s / 2
-        )  # the integral of the decaying bias, over the bias
+        )  # integral of the decaying bias over the interval, divided by the bias
         decay = math.exp(-step_s * forget_per_s)
         for i in range(3):
             turn[i] = samples[n, 1 + i] - acting_s * bias[i]
@@ -39,9 +40,10 @@ def advance(
         turn_on(wxyz, turn)
         transition(turn, acting_s, matrix)
         congruent(matrix, covariance, passed)
-        walk = -bias2 * math.expm1(-2 * step_s * forget_per_s)  # what the bias wanders in a step
+        # Process noise: `walk` is the variance gained by the bias in the interval, u^2 T to first order.
+        walk = -bias2 * math.expm1(-2 * step_s * forget_per_s)
         grown = arw2 * step_s + walk * step_s**2 / 3
-        # The spread of the missed turn is proportional to time: its square grows by a difference of squares.
+        # In saturation the attitude's standard deviation grows linearly: the variance grows by a difference of squares.
         before = missed_rad
         missed_rad = 0.0
         if samples[n, 4]:
@@ -57,7 +59,7 @@ def advance(
 
 @jit
 def congruent(matrix: Floats, covariance: Floats, passed: Floats) -> None:
-    """covariance <- matrix covariance matrix^T, exactly symmetric; `passed` is room for the product between."""
+    """covariance <- matrix covariance matrix^T, exactly symmetric; `passed` is a buffer for the first product."""
     size = len(matrix)
     for i in range(size):
         for j in range(size):
@@ -74,9 +76,9 @@ def congruent(matrix: Floats, covariance: Floats, passed: Floats) -> None:
 
 @jit
 def transition(p: Floats, acting_s: float, out: Floats) -> None:
-    """The attitude's rows of the transition: out[:3] = exp(-[p]), -acting_s J(p); [p] v = p x v."""
+    """Fill the attitude rows of the transition matrix: out[:3] = [exp(-[p]), -acting_s J(p)], with [p] v = p x v."""
     square = p[0] * p[0] + p[1] * p[1] + p[2] * p[2]
-    if square < 1e-6:  # series, whose next terms are below 1e-16; the quotients would lose digits
+    if square < 1e-6:  # series, whose error in `out` is below 1e-16; the quotients would lose digits
         sine, cosine, cubic = 1 - square / 6, 0.5 - square / 24, 1 / 6 - square / 120
     else:
         angle = math.sqrt(square)
@@ -84,7 +86,8 @@ def transition(p: Floats, acting_s: float, out: Floats) -> None:
         cubic = (1 - sine) / square
     for i in range(3):
         for j in range(3):
-            # The third axis with the sign of the permutation makes [p]; [p]^2 = p p^T - p^2.
+            # Element (i, j) of [p] is the third axis' component with the sign of the permutation; [p]^2 = p p^T -
+            # |p|^2 I.
             crossed = 0.0 if i == j else p[3 - i - j] * (1.0 if (j - i) % 3 == 2 else -1.0)
             one = 1.0 if i == j else 0.0
             twice = p[i] * p[j] - square * one
@@ -94,7 +97,7 @@ def transition(p: Floats, acting_s: float, out: Floats) -> None:
 
 @jit
 def turn_on(ref_from_body_wxyz: Floats, turn_rad: Floats) -> None:
-    """The unit quaternion times that of a rotation vector in body axes (Hamilton's product), in place."""
+    """Multiply the unit quaternion by that of a rotation vector in body axes (Hamilton product), in place."""
     q, (x, y, z) = ref_from_body_wxyz, turn_rad
     half = math.sqrt(x * x + y * y + z * z) / 2
     scale = math.sin(half) / (2 * half) if half > 1e-9 else 0.5
