@@ -14,7 +14,9 @@ def module_of(path: Path) -> str:
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
 
-FILES = {module_of(path): path for package in ("skysim", "estimator") for path in (ROOT / package).rglob("*.py")}
+FILES = {
+    module_of(path): path for package in ("skysim", "estimator") for path in (ROOT / package).rglob("*.py")
+}
 
 
 def statements(node: ast.AST) -> Iterator[ast.AST]:
@@ -63,7 +65,12 @@ def test_no_module_imports_itself_by_way_of_others() -> None:
 def test_no_folder_holds_more_than_a_reader_takes_in(package: str) -> None:
     """About nine; the flow of skysim itself is ten words long, and a study's plan has two parts more."""
     for folder in {path.parent for path in FILES.values() if path.is_relative_to(ROOT / package)}:
-        entries = {path.name for path in folder.iterdir()} - {"__init__.py", "__pycache__", "__main__.py", "README.md"}
+        entries = {path.name for path in folder.iterdir()} - {
+            "__init__.py",
+            "__pycache__",
+            "__main__.py",
+            "README.md",
+        }
         assert len(entries) <= MOST.get(folder.relative_to(ROOT).as_posix(), 9), sorted(entries)
 
 

@@ -83,7 +83,7 @@ def test_a_notebook_shows_picture_and_numbers(run) -> None:
         page = shown._repr_html_()
         assert page.count("<table") == page.count("</table>")
         assert "shefex2" in page.lower() or "SHEFEX-2" in page or "frame 0" in page
-    assert "data:image/png;base64," in run._repr_html_()
+    assert "data:image/jpeg;base64," in run._repr_html_()
 
 
 def test_an_image_is_solved_where_the_truth_is(run, tmp_path) -> None:

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 Progress = Callable[[float, float], None]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, repr=False)
 class ScoredFrame:
     """One frame with its truth, the tracker's solution and its error.
 
@@ -73,10 +73,12 @@ class ScoredFrame:
         """(H, W, 3) stretched frame in BGR: truth in blue, detections in red, identified sources in green."""
         return scoring.annotated(self.result)
 
+    def __repr__(self) -> str:
+        found = f"{self.row.matched} of {self.row.detected} detections identified"
+        return f"<frame {self.row.frame}: {self.row.status}, error {self.error_arcsec:.3g} arcsec, {found}>"
+
     def _repr_html_(self) -> str:
-        facts = f"frame {self.row.frame}: {self.row.status}, error {self.error_arcsec:.3g}″, "
-        facts += f"{self.row.matched} of {self.row.detected} detections identified"
-        return f"{_picture(self.annotated())}<p>{html.escape(facts)}</p>"
+        return f"{_picture(self.annotated())}<p>{html.escape(repr(self)[1:-1])}</p>"
 
 
 @dataclass(frozen=True, slots=True)
@@ -225,5 +227,5 @@ def _picture(image: NDArray[np.uint8]) -> str:
     height, width = image.shape[:2]
     if width > 800:
         image = cv2.resize(image, (800, round(height * 800 / width)), interpolation=cv2.INTER_AREA)
-    data = base64.b64encode(cv2.imencode(".png", image)[1].tobytes()).decode()
-    return f'<img src="data:image/png;base64,{data}">'
+    data = base64.b64encode(cv2.imencode(".jpg", image)[1].tobytes()).decode()
+    return f'<img src="data:image/jpeg;base64,{data}">'
