@@ -75,7 +75,9 @@ def paint(light: NDArray, xy: NDArray, flux: NDArray, ends: NDArray, psf_px: flo
                     light[row, column] += flux[n] / steps * down * across / (2 * np.pi * psf_px**2)
 
 
-def photograph(sight: Sight, stars: catalog.StarCatalog, rng: np.random.Generator) -> tuple[NDArray, Rotation]:
+def photograph(
+    sight: Sight, stars: catalog.StarCatalog, rng: np.random.Generator
+) -> tuple[NDArray, Rotation]:
     """One frame at a random attitude, and that attitude at mid-exposure."""
     camera, truth = sight.camera, Rotation.random(rng=rng)
     xy = camera.pixels(truth.apply(stars.vectors))

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-if TYPE_CHECKING:
-    from estimator.core.camera import Camera
 from estimator.core.arrays import Floats, Ints
+from estimator.core.camera import Camera
 
 
 @dataclass(frozen=True, slots=True)

@@ -210,8 +210,6 @@ class DetectorConfig(ConfigModel):
     @classmethod
     def known_curve(cls, value: float | str) -> float | str:
         if isinstance(value, str):
-            from skysim.scene.camera import curve_file
-
             curve_file(value)
         return value
 

@@ -33,8 +33,6 @@ PRESETS = DATA / "cameras"
 
 def preset(name: str, where: str) -> dict[str, Any]:
     """The `camera` section of data/cameras/NAME.yaml. Raises InputError for an unknown name."""
-    from skysim.core.yaml_reader import read_yaml
-
     known = sorted(path.stem for path in PRESETS.glob("*.yaml"))
     if name not in known:
         raise InputError(f"{where}: {name!r} is none of {', '.join(known)}")

@@ -7,7 +7,6 @@ The order is that of the light: background and display glow, the sources integra
 from __future__ import annotations
 
 from functools import partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,11 +18,8 @@ from skysim.camera.detector.detector import expose, judge, saturation_dn, smear
 from skysim.camera.render import Poses, in_view, look, render
 from skysim.core.types import Frame, Truth
 from skysim.dynamics import multibody
-
-if TYPE_CHECKING:
-    from skysim.simulation.testbed import Testbed
 from skysim.simulation.random_streams import rng
-from skysim.simulation.testbed import window
+from skysim.simulation.testbed import Testbed, window
 
 
 def render_frame(

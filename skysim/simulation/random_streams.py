@@ -2,13 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
-
-if TYPE_CHECKING:
-    pass
-
 
 STAGE_ID = {"detector": 1, "jitter": 2, "imu": 3, "draught": 4}
 
