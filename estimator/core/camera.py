@@ -38,7 +38,7 @@ class Camera:
     ) -> Camera:
         """An undistorted camera from its horizontal field of view, in radians or in degrees.
 
-        The field is the angle between the centers of the left and right edge columns: f = (width - 1) / 2 / tan(fov / 2).
+        The field is the angle between the centers of the edge columns: f = (width - 1) / 2 / tan(fov / 2).
         Raises ImageError unless exactly one of the two is given.
         """
         if fov_deg is not None and fov_rad is None:

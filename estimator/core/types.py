@@ -155,7 +155,7 @@ class Attitude:
 
     @property
     def ra_dec_roll_deg(self) -> tuple[float, float, float]:
-        """Boresight's right ascension and declination, and the roll, of an attitude under the stars; NaN unless solved."""
+        """Right ascension and declination of the boresight, and the roll, under the stars; NaN unless solved."""
         if self.cam_from_ref is None:
             return (float("nan"),) * 3
         ra, dec, roll = np.degrees(ra_dec_roll_rad(self.cam_from_ref))
