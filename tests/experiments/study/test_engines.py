@@ -42,14 +42,15 @@ budget: {failures: 1000}
 DRIVER = """
 import sys
 from pathlib import Path
-from skysim.experiments.study import engines, plan, runner, store
-told = plan.load(sys.argv[1])
+from skysim.experiments.study import loader, store
+from skysim.experiments.study.execution import engines, runner
+told = loader.load(sys.argv[1])
 with store.writing(Path(sys.argv[2])) as kept:
     runner.begin(told, kept, kept.counts()["done"] > 0)
     runner.run(told, kept, engines.Pool(int(sys.argv[3])), lambda progress: print(progress.done, flush=True))
 """
 ONE_THREAD = dict.fromkeys(workers.ONE_THREAD, "1")
-HERE = os.environ | ONE_THREAD | {"PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "tests")])}
+HERE = os.environ | ONE_THREAD | {"PYTHONPATH": os.pathsep.join([str(ROOT), str(Path(__file__).parent)])}
 
 
 def study(folder: Path, text: str = STUDY) -> plan.Plan:
@@ -99,7 +100,8 @@ def test_what_raises_is_told_with_seed_and_traceback_and_the_rest_is_done(tmp_pa
 # A module for workers to import: trials that do nothing, or now and then kill their worker.
 STUBS = """
 import os
-from skysim.experiments.study import engines, trials
+from skysim.experiments.study import trials
+from skysim.experiments.study.execution import engines
 from skysim.experiments.study.trials import Outcome
 BEGIN = engines.begin
 def deadly(ready, seed):
@@ -407,7 +409,7 @@ def test_without_the_extra_it_says_what_to_install(monkeypatch: pytest.MonkeyPat
 def test_a_trial_that_kills_dask_workers_fails_and_no_other(
     told: plan.Plan, tmp_path: Path, stubs: Any
 ) -> None:
-    bad, found = deaths(told), os.pathsep.join([str(ROOT), str(tmp_path)])
+    bad, found = deaths(told), os.pathsep.join([str(ROOT), str(Path(__file__).parent), str(tmp_path)])
     dask = {"DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "0", "PYTHONPATH": found}
     for lab in cluster_of(tmp_path, "--nworkers", "2", environment=dask):
         engine, path = on_dask(lab, 2), tmp_path / "deadly.sqlite"
