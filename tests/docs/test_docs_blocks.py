@@ -27,11 +27,11 @@ from skysim.core.paths import ROOT
 DOCS = ROOT / "docs"
 ELSEWHERE = {  # pages whose blocks have a test of their own, which knows what is to come out
     "README.md": "test_readme.py",
-    "docs/dome.md": "test_docs.py",
-    "docs/formats.md": "test_formats_docs.py",
-    "docs/trackers.md": "test_trackers.py",
-    "docs/papers.md": "test_papers.py",
-    "docs/studies.md": "test_docs.py",
+    "docs/findings/dome.md": "test_docs.py",
+    "docs/howto/export.md": "test_formats_docs.py",
+    "docs/howto/external_tracker.md": "test_trackers.py",
+    "docs/findings/papers.md": "test_papers.py",
+    "docs/findings/studies.md": "test_docs.py",
     "estimator/README.md": "test_est_readme.py",
 }
 LONG = {

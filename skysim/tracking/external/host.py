@@ -1,6 +1,6 @@
 """The process in which an entry point's tracker runs: `python -m skysim.tracking.external.host NAME`.
 
-It is a program as docs/trackers.md has them. Frames come on standard input and answers go to what was standard
+It is a program as docs/howto/external_tracker.md has them. Frames come on standard input and answers go to what was standard
 output; what the tracker itself prints goes to standard error.
 """
 

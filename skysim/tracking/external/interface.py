@@ -1,7 +1,7 @@
 """A star tracker of your own: what it is told, what it answers, and how it is found (entry points `skysim.trackers`).
 
 An entry point names a callable that makes a `Tracker` from a `Setup`. It runs in a process of its own, so that what
-it does there, be it to hang or to crash, is an answer and no end of a run; docs/trackers.md has examples.
+it does there, be it to hang or to crash, is an answer and no end of a run; docs/howto/external_tracker.md has examples.
 """
 
 from __future__ import annotations
