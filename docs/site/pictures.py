@@ -1,4 +1,4 @@
-"""The README's pictures, from what `make demo` left in out/ and from frames of its own. `make pictures` runs it."""
+"""The pages' pictures, from what `make demo` left in out/ and from frames of its own. `make pictures` runs it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The pages docs/findings/studies/*.md with their pictures, from the stores of studies that were run. `make studies` does both.
+"""Write docs/findings/studies/*.md with their figures, from the stores of completed studies. `make studies` does both.
 
 `python docs/site/studies.py [FOLDER]`: of every study's store in FOLDER/NAME (out/ if left out).
 """
