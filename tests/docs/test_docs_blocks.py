@@ -216,7 +216,8 @@ def test_the_reference_holds_every_module_that_a_page_names() -> None:
     files = re.findall(r"(?<!tests/)\b((?:skysim|estimator)/[\w/]+)\.py", text)
     for package, name in re.findall(r"^from ((?:skysim|estimator)\.[\w.]+) import (\w+)", text, re.M):
         folder = package.replace(".", "/")
-        files.append(f"{folder}/{name}" if (ROOT / folder / f"{name}.py").is_file() else folder)
+        there = (ROOT / folder / f"{name}.py").is_file() or (ROOT / folder / name / "__init__.py").is_file()
+        files.append(f"{folder}/{name}" if there else folder)
     named = {name.replace("/", ".") for name in files}
     named = {
         name
