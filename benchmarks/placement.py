@@ -1,8 +1,8 @@
 """Where to put so many LEDs: patch boards, a spiral, Poisson's discs and the optimiser, at attitudes none was made for.
 
-`python -m benchmarks.placement [LEDS [FRAMES [SEED]]]` prints the table of docs/findings/dome.md: AFIT's SimSat under its
-measured dome, the scene's own camera and lever, so many equal LEDs over the same cap, which is as far as any field within 30
-degrees of tilt reaches, and so many frames for the tracker. `compare` returns its rows.
+`python -m benchmarks.placement [LEDS [FRAMES [SEED]]]` prints the table of docs/findings/dome.md: AFIT's SimSat
+under its measured dome, the scene's own camera and lever, so many equal LEDs over the same cap, which is as far as any
+field within 30 degrees of tilt reaches, and so many frames for the tracker. `compare` returns its rows.
 """
 
 from __future__ import annotations

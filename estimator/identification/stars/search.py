@@ -35,7 +35,8 @@ from estimator.identification.stars.evidence import (
 
 # Evidence for an attitude, against lights that fell anywhere, in powers of ten. Markov's inequality allows one such in
 # 10^5 frames of false lights. With 4 a mirrored sky had an attitude, one in 10^5 hostile pictures
-# (docs/findings/robustness.md); 5 costs two in a thousand of the hardest frames (python -m benchmarks.lost_in_space), 6 would cost twelve.
+# (docs/findings/robustness.md); 5 costs two in a thousand of the hardest frames (python -m benchmarks.lost_in_space), 6
+# would cost twelve.
 ACCEPT_DEX = 5.0
 DECISIVE_DEX = 10.0  # evidence beyond which no rival is looked for
 MARGIN_DEX = 3.0  # by which the answer must beat every other attitude
