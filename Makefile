@@ -27,7 +27,7 @@ test: $(READY)
 test-long: $(READY)
 	NUMBA_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n 2 -m long
 
-# Other people's instruments. astrometry.net is no Python package: docs/oracles.md tells how to get it.
+# Other people's instruments. astrometry.net is no Python package: docs/findings/oracles.md tells how to get it.
 oracle: $(READY)
 	$(PIP) -e '.[oracle]'
 	$(BIN)/python -m pytest -rs -m "not long" tests/oracles
@@ -41,16 +41,16 @@ lab: $(READY)
 	$(BIN)/skysim lab
 
 pictures: demo
-	$(BIN)/python docs/pictures.py
+	$(BIN)/python docs/site/pictures.py
 
 STUDIES := dome_shape dome_size led_count rate_smear false_stars error_budget end_to_end
 studies: $(READY)
 	for name in $(STUDIES); do $(BIN)/skysim study run $$name || $(BIN)/skysim study resume $$name || exit 1; done
 	$(BIN)/skysim study optimise dome_for_the_money
-	$(BIN)/python docs/studies.py
+	$(BIN)/python docs/site/studies.py
 
 papers: $(READY)
-	$(BIN)/skysim reproduce all --report --markdown docs/papers.md
+	$(BIN)/skysim reproduce all --report --markdown docs/findings/papers.md
 
 # The site, in out/site. Nothing in it is fetched from elsewhere.
 docs: $(READY)
@@ -58,7 +58,7 @@ docs: $(READY)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 figures: $(READY)
-	$(BIN)/python docs/figures.py
+	$(BIN)/python docs/site/figures.py
 
 # The lab's page in Chromium. Where that is missing the tests say so and are skipped.
 test-browser: $(READY)

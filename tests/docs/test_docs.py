@@ -1,4 +1,4 @@
-"""The commands of docs/dome.md and of the estimator's README run, and print what the page shows in kind."""
+"""The commands of docs/findings/dome.md and of the estimator's README run, and print what the page shows in kind."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import pytest
 from skysim.core.paths import ROOT
 from skysim.experiments.study import loader, plan
 
-DOME = (ROOT / "docs/dome.md").read_text(encoding="utf-8")
+DOME = (ROOT / "docs/findings/dome.md").read_text(encoding="utf-8")
 ESTIMATOR = (ROOT / "estimator/README.md").read_text(encoding="utf-8")
 TRIALS_AT = {"benchmarks.placement": 4}  # the word that says how many trials; else the fourth
 MINUTES = {"benchmarks.placement", "benchmarks.lost_in_space"}  # even with two trials
@@ -104,7 +104,7 @@ def test_the_page_s_surveys_are_tests() -> None:
 
 # The pages of the studies.
 
-STUDIES = (ROOT / "docs/studies.md").read_text(encoding="utf-8")
+STUDIES = (ROOT / "docs/findings/studies.md").read_text(encoding="utf-8")
 
 
 def test_every_study_that_comes_along_has_its_page_and_its_command() -> None:
@@ -115,7 +115,9 @@ def test_every_study_that_comes_along_has_its_page_and_its_command() -> None:
         assert (verb == "optimise") == (loader.load(name).study.optimise is not None)
 
 
-@pytest.mark.parametrize("path", sorted((ROOT / "docs/studies").glob("*.md")), ids=lambda path: path.stem)
+@pytest.mark.parametrize(
+    "path", sorted((ROOT / "docs/findings/studies").glob("*.md")), ids=lambda path: path.stem
+)
 def test_a_study_s_page_is_of_its_study_and_shows_what_is_there(path: Path) -> None:
     text, told = path.read_text(encoding="utf-8"), loader.load(path.stem)
     assert text.startswith(f"# {told.study.title}\n")

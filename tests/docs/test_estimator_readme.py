@@ -65,6 +65,6 @@ def test_the_table_names_every_algorithm(name: str, algorithms: dict) -> None:
 
 
 def test_every_link_leads_somewhere() -> None:
-    links = re.findall(r"\]\((\w+\.py)\)", README)
+    links = re.findall(r"\]\(([\w/]+\.py)\)", README)
     assert len(links) > 10
     assert [link for link in links if not (ROOT / "estimator" / link).is_file()] == []

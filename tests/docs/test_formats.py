@@ -1,4 +1,4 @@
-"""Every command and code block of docs/formats.md runs, in its order, in one folder."""
+"""Every command and code block of docs/howto/export.md runs, in its order, in one folder."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from skysim.core.paths import ROOT
 from skysim.results.files import frames
 from skysim.results.files.export import EXPORTS
 
-PAGE = (ROOT / "docs/formats.md").read_text(encoding="utf-8")
+PAGE = (ROOT / "docs/howto/export.md").read_text(encoding="utf-8")
 COMMANDS = [line for block in re.findall(r"```sh\n(.*?)```", PAGE, re.DOTALL) for line in block.splitlines()]
 BLOCKS = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
 
@@ -48,7 +48,7 @@ def test_the_code_blocks_run(folder: Path) -> None:
     printed = std_io.StringIO()
     with contextlib.chdir(folder), contextlib.redirect_stdout(printed):
         for block in [block for block in BLOCKS if "ccsds_ndm" not in block]:
-            exec(compile(block, "docs/formats.md", "exec"), names)
+            exec(compile(block, "docs/howto/export.md", "exec"), names)
     assert "SkyCoord (ICRS)" in printed.getvalue()
     assert "(492, 658, 3)" in printed.getvalue()
     assert "-0.1     0.05    0.0005 -0.0003  0." in printed.getvalue()

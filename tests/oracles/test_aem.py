@@ -68,7 +68,7 @@ def test_their_reader_refuses_what_ours_never_writes() -> None:
 def test_the_page_s_code_reads_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    page = (ROOT / "docs/formats.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs/howto/export.md").read_text(encoding="utf-8")
     (block,) = [
         block for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "ccsds_ndm" in block
     ]
@@ -77,7 +77,7 @@ def test_the_page_s_code_reads_it(
     text = ccsds_aem.message("shefex2", [], (ccsds_aem.ICRF, ccsds_aem.CAMERA), utc(1), meant)
     files.write_text(tmp_path / "out/shefex2/truth.aem", text)
     monkeypatch.chdir(tmp_path)
-    exec(compile(block, "docs/formats.md", "exec"), {})
+    exec(compile(block, "docs/howto/export.md", "exec"), {})
     frame, epoch, *sight = capsys.readouterr().out.replace("[", " ").replace("]", " ").split()
     assert (frame, epoch) == ("ICRF", ccsds_aem.epoch(START))
     np.testing.assert_allclose(np.array(sight, dtype=float), [1, 0, 0], rtol=0, atol=1e-8)

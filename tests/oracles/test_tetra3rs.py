@@ -60,7 +60,7 @@ def test_it_refuses_what_is_no_sky(name: str) -> None:
         testbed.tracker(testbed.build_testbed(loader.load(name, {"tracker.name": "tetra3rs"})))
 
 
-PAGE = (ROOT / "docs/trackers.md").read_text(encoding="utf-8")
+PAGE = (ROOT / "docs/howto/external_tracker.md").read_text(encoding="utf-8")
 COMMANDS = re.findall(r"^skysim (.*--tracker tetra3rs.*)$", PAGE, re.MULTILINE)
 
 

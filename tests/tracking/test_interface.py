@@ -37,7 +37,7 @@ from skysim.tracking.external import interface, process
 from skysim.tracking.external.interface import Answer, Leds, Picture, Setup, Stars, checked
 from skysim.tracking.external.process import Fault, Program
 
-PAGE = (ROOT / "docs/trackers.md").read_text(encoding="utf-8")
+PAGE = (ROOT / "docs/howto/external_tracker.md").read_text(encoding="utf-8")
 SETUP = Setup("icrs", "2012-06-22T21:00:00", 8, 6, 100.0, (3.5, 2.5), (0.0,) * 5, 1.0, 4095.0, 1)
 PICTURE = Picture(np.arange(48, dtype=np.uint16).reshape(6, 8), 7, 0.5, 0.04)
 UNIT = [0.5, -0.5, 0.5, 0.5]

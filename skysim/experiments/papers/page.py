@@ -120,11 +120,11 @@ Every experiment of which the papers publish numbers, done again by our own simu
 number, ours with its interval of 95 %, and a verdict. This page is written by
 
 ```sh
-{command} --markdown docs/papers.md
+{command} --markdown docs/findings/papers.md
 ```
 
 and by nobody else; seed {seed}. The published numbers, each with its table or page, and the tolerances are in
-[`data/published`](../data/published).
+[`data/published`](../../data/published).
 
 * **agrees**: our interval meets the published number's tolerance.
 * **explained**: it does not, but does with causes that the row names and that were simulated too. A cause may have been

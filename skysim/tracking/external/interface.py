@@ -1,7 +1,7 @@
 """The interface for external star trackers: set-up, frame, answer, and discovery by entry points `skysim.trackers`.
 
 An entry point names a callable that makes a `Tracker` from a `Setup`. It runs in its own process, so that a hang or
-a crash there becomes a failed answer and does not end the run; docs/trackers.md has examples.
+a crash there becomes a failed answer and does not end the run; docs/howto/external_tracker.md has examples.
 """
 
 from __future__ import annotations

@@ -268,8 +268,8 @@ def test_monte_carlo_of_200_by_2(page: Any) -> None:
 def test_a_dropped_picture_is_solved_shown_or_refused(page: Any, tmp_path: Path) -> None:
     before = angles(page)
     panel(page, "Image")
-    photo = cv2.imread(str(ROOT / "docs" / "sky.jpg"), cv2.IMREAD_GRAYSCALE)
-    page.set_input_files("input[type=file]", ROOT / "docs" / "sky.jpg")
+    photo = cv2.imread(str(ROOT / "docs" / "images" / "sky.jpg"), cv2.IMREAD_GRAYSCALE)
+    page.set_input_files("input[type=file]", ROOT / "docs" / "images" / "sky.jpg")
     page.get_by_text("sky.jpg: solved").wait_for()
     assert page.get_by_label("angle 1").input_value() == ""  # nobody knows where it was taken
     page.mouse.click(*screen(page, photo.shape[::-1], 600, 400))
@@ -312,7 +312,7 @@ def rolled(page: Any, name: str) -> float:
 
 
 def test_a_live_camera_is_followed_to_its_end(page: Any, tmp_path: Path) -> None:
-    photo = cv2.imread(str(ROOT / "docs" / "sky.jpg"))
+    photo = cv2.imread(str(ROOT / "docs" / "images" / "sky.jpg"))
     high, wide = photo.shape[:2]
     video = cv2.VideoWriter(str(tmp_path / "clip.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 5, (wide, high))
     for turn_deg in (0, 10):
@@ -320,7 +320,7 @@ def test_a_live_camera_is_followed_to_its_end(page: Any, tmp_path: Path) -> None
         video.write(cv2.warpAffine(photo, turn, (wide, high)))
     video.release()
     panel(page, "Image")
-    page.set_input_files("input[type=file]", ROOT / "docs" / "sky.jpg")
+    page.set_input_files("input[type=file]", ROOT / "docs" / "images" / "sky.jpg")
     still = rolled(page, "sky.jpg")
     page.get_by_label("live camera").fill(str(tmp_path / "clip.avi"))
     page.get_by_role("button", name="Look").click()

@@ -228,7 +228,7 @@ def test_what_disagrees_is_red_in_the_report_and_bold_in_the_page(tmp_path: Path
 
 # The page that the command wrote.
 
-PAGE = ROOT / "docs" / "papers.md"
+PAGE = ROOT / "docs/findings/papers.md"
 NUMBER = r"(-?[\d.]+(?:e[-+]?\d+)?)"
 TOLD = re.compile(rf"{NUMBER}(?: \({NUMBER}\.\.{NUMBER}\))?$")
 

@@ -30,7 +30,7 @@ def reproduce(
     out: Annotated[Path, typer.Option(help="Folder for the report.")] = Path("out/reproduce"),
     markdown: Annotated[
         Path | None,
-        typer.Option(help="Also a page of Markdown with its pictures beside it, as docs/papers.md."),
+        typer.Option(help="Also a page of Markdown with its pictures beside it, as docs/findings/papers.md."),
     ] = None,
     json: Annotated[bool, typer.Option("--json", help="Print JSON for machines instead of tables.")] = False,
 ) -> None:

@@ -1,4 +1,4 @@
-"""The README's pictures, from what `make demo` left in out/ and from frames of its own. `make pictures` runs it."""
+"""The pages' pictures, from what `make demo` left in out/ and from frames of its own. `make pictures` runs it."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from skysim.results import report, telemetry_report
 from skysim.scene import loader
 from skysim.simulation import exposure, run, testbed
 
-DOCS = Path(__file__).parent
-OUT = DOCS.parent / "out"
+IMAGES = Path(__file__).parents[1] / "images"
+OUT = Path(__file__).parents[2] / "out"
 RATES_DEG_S = (0, 1, 2, 4, 8)
 WINDOW = (slice(196, 296), slice(279, 379))  # the middle hundred pixels
 
@@ -35,18 +35,18 @@ def main() -> None:
         annotated = cv2.imread(str(OUT / scene_name / "annotated.png"))
         width = 1200
         size = (width, round(width * annotated.shape[0] / annotated.shape[1]))
-        files.write_image(DOCS / f"{name}.jpg", cv2.resize(annotated, size, interpolation=cv2.INTER_AREA))
+        files.write_image(IMAGES / f"{name}.jpg", cv2.resize(annotated, size, interpolation=cv2.INTER_AREA))
     lab = run.prepare(loader.load("simsat_slew"))
     drawn = picture(testbed.staged(lab), lab.log.joints[700])
-    files.write_image(DOCS / "lab.jpg", drawn[:, :, ::-1])
-    (DOCS / "bump.png").write_bytes(telemetry_report.figure(run.prepare(loader.load("simsat_bump")).log))
+    files.write_image(IMAGES / "lab.jpg", drawn[:, :, ::-1])
+    (IMAGES / "bump.png").write_bytes(telemetry_report.figure(run.prepare(loader.load("simsat_bump")).log))
     shots = [frame(rate) for rate in RATES_DEG_S]
     captions = [
         f"{rate} deg/s, {truth.seen.streak_px.max():.1f} px"
         for rate, (_, truth) in zip(RATES_DEG_S, shots, strict=True)
     ]
     sheet = report.contact_sheet([shot.image_dn[WINDOW] for shot, _ in shots], captions, scale=3)
-    files.write_image(DOCS / "smear.png", sheet)
+    files.write_image(IMAGES / "smear.png", sheet)
     pages()
 
 
@@ -65,14 +65,14 @@ def pages() -> None:
         box = page.locator(".lab-frame canvas").bounding_box()
         page.mouse.click(box["x"] + 0.71 * box["width"], box["y"] + 0.186 * box["height"])  # Bellatrix
         page.wait_for_timeout(3000)
-        page.screenshot(path=DOCS / "lab_page.jpg", quality=85)
+        page.screenshot(path=IMAGES / "lab_page.jpg", quality=85)
         page.get_by_role("combobox", name="Scene").click()
         page.get_by_role("option", name="simsat_slew").click()
         page.get_by_text("SimSat slews on its reaction wheels").wait_for(timeout=90_000)
         page.get_by_role("tab", name="Run").click()
         page.get_by_role("button", name="Fly").click()
         page.get_by_text(re.compile(r"^2\d\.\d\d s$")).wait_for(timeout=180_000)
-        page.screenshot(path=DOCS / "lab_run.jpg", quality=85)
+        page.screenshot(path=IMAGES / "lab_run.jpg", quality=85)
         browser.close()
 
 

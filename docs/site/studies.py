@@ -1,6 +1,6 @@
-"""The pages docs/studies/*.md with their pictures, from the stores of studies that were run. `make studies` does both.
+"""Write docs/findings/studies/*.md with their figures, from the stores of completed studies. `make studies` does both.
 
-`python docs/studies.py [FOLDER]`: of every study's store in FOLDER/NAME (out/ if left out).
+`python docs/site/studies.py [FOLDER]`: of every study's store in FOLDER/NAME (out/ if left out).
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from skysim.experiments.study.report import figures as study_figures
 from skysim.experiments.study.report import layout
 from skysim.experiments.study.store import STORE, Store
 
-PAGES = Path(__file__).parent / "studies"
+PAGES = Path(__file__).parents[1] / "findings" / "studies"
 MOST = 72  # lines of a table that is printed whole
 
 
@@ -53,7 +53,7 @@ def page(told: Plan, kept: Store) -> Iterator[str]:
     yield (
         f"{counts['done']} trials, {counts['failed']} failed, in {effort}; scene"
         f" `{study.scene}`, seed {study.seed}. What is varied:"
-        f" [`{told.path.name}`](../../scenes/studies/{told.path.name}). Intervals are of 95 %.\n"
+        f" [`{told.path.name}`](../../../scenes/studies/{told.path.name}). Intervals are of 95 %.\n"
     )
     lines = table.table(kept, study.responses)
     if study.optimise:

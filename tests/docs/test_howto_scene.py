@@ -1,0 +1,139 @@
+"""The blocks of docs/howto/scene.md are scenes that fly and solve; its error message is what a user sees."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import get_args
+
+import doc_pages as pages
+import numpy as np
+import pytest
+import yaml
+
+from skysim.camera.optics import VIGNETTING
+from skysim.camera.psf.otf import PSFS
+from skysim.core.errors import InputError
+from skysim.core.paths import ROOT
+from skysim.scene import camera, motion, vehicle
+from skysim.scene.loader import load
+from skysim.scene.scene import Scene
+from skysim.sources.dome import led
+from skysim.sources.dome.layout import LAYOUTS
+from skysim.sources.dome.surface import SURFACES
+
+PAGE = "docs/howto/scene.md"
+REFERENCE = "docs/reference/scenes.md"
+
+
+@pytest.fixture
+def folder(tmp_path) -> Path:
+    """A folder that looks like the checkout."""
+    return pages.checkout(tmp_path)
+
+
+def test_the_camera_block_is_a_camera_that_sees(folder):
+    """The block's lines in a copy of the scene that the text names, flown for two frames by the real command."""
+    block = pages.yaml_block(PAGE, "camera")
+    tree = yaml.safe_load((ROOT / "scenes/afit_simsat.yaml").read_text(encoding="utf-8"))
+    mine = yaml.safe_load(block)
+    assert set(mine) == {"camera", "background", "motion"}
+    assert not set(mine["motion"]) & set(tree["motion"])
+    path = folder / "mine.yaml"
+    path.write_text(
+        yaml.safe_dump(tree | mine | {"motion": tree["motion"] | mine["motion"]}, sort_keys=False)
+    )
+    told = pages.answer(folder, "run", str(path), "--frames", "2")
+    assert (told["frames"], told["solved"], told["wrong"]) == (2, 2, 0)
+
+
+def test_every_kind_that_the_camera_block_names_is_one():
+    """`# or ...` beside a kind lists the others, all of them."""
+    block = pages.yaml_block(PAGE, "camera")
+    rest = re.findall(r"(\w+): \{kind: (\w+)[^#]*# or ([\w, ]+)", block)
+    told = {section: {kind, *others.split(", ")} for section, kind, others in rest}
+    shutters = get_args(get_args(camera.Shutter)[0])
+    assert told == {
+        "vignetting": set(VIGNETTING),
+        "psf": set(PSFS),
+        "shutter": {get_args(part.model_fields["kind"].annotation)[0] for part in shutters},
+    }
+
+
+def test_the_dome_block_is_a_dome_under_which_the_tracker_finds_itself(folder):
+    path = folder / "dome.yaml"
+    path.write_text("schema: 1\nbase: afit_simsat\n" + pages.yaml_block(PAGE, "light"))
+    told = pages.answer(folder, "run", str(path), "--frames", "3")
+    assert (told["frames"], told["solved"], told["wrong"]) == (3, 3, 0)
+
+
+def test_the_vehicle_block_flies_and_is_told_where_it_is(folder):
+    """The block as a scene, two seconds of it by the real command: wheels, fans, gyros, filter, all disturbances."""
+    path = folder / "flown.yaml"
+    path.write_text("schema: 1\n" + pages.yaml_block(PAGE, "base"))
+    told = pages.answer(folder, "run", str(path), "--frames", "3")
+    assert (told["frames"], told["solved"], told["wrong"]) == (3, 3, 0)
+    assert told["flight"]["filter_arcsec_end"] < 30
+    assert [row["filter"] for row in told["rows"]] == ["used"] * 3
+
+
+def test_every_choice_that_the_vehicle_block_names_is_one():
+    """`# or ...` beside a choice lists the others, all of them; and every kind of manoeuvre is shown."""
+    block = pages.yaml_block(PAGE, "base")
+    told = {
+        key: {one, *others.split(", ")}
+        for key, one, others in re.findall(r"(\w+): (\w+) +# or ([\w, ]+)", block)
+    }
+    choices = {
+        key: set(get_args(part.model_fields[key].annotation))
+        for part, keys in (
+            (motion.ControlConfig, ("law", "actuators", "feedback")),
+            (vehicle.ImuConfig, ("earth_rate",)),
+        )
+        for key in keys
+    }
+    assert told == choices
+    shown = {element["kind"] for element in yaml.safe_load(block)["motion"]["manoeuvre"]}
+    kinds = {
+        get_args(part.model_fields["kind"].annotation)[0] for part in get_args(get_args(motion.Manoeuvre)[0])
+    }
+    assert shown == kinds
+
+
+def test_the_controller_of_the_page_damps(folder):
+    """Each rate dies as exp(-5 t / J), the angle is its integral; gravity on tens of micrometres adds 0.1 deg or so."""
+    (block,) = pages.blocks(PAGE, "python")
+    done = subprocess.run([sys.executable, "-c", block], cwd=folder, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    numbers = [float(word) for word in re.findall(r"[-\d.]+(?:e[-+]\d+)?", done.stdout)]
+    turned, rate = np.array(numbers[:3]), np.array(numbers[3:])
+    inertia = np.array([6.0, 6.5, 9.0])
+    expected = np.array([2, 0, 5]) * inertia / 5 * (1 - np.exp(-5 * 1.25 / inertia))
+    np.testing.assert_allclose(turned, expected, rtol=0, atol=0.2)
+    assert np.abs(rate).max() < 0.2
+
+
+def test_the_error_message_is_what_a_user_sees(tmp_path, monkeypatch):
+    (block,) = pages.blocks(PAGE, "text")
+    bad = (ROOT / "scenes/afit_simsat.yaml").read_text(encoding="utf-8")
+    (tmp_path / "scenes").mkdir()
+    (tmp_path / "scenes/afit_simsat.yaml").write_text(
+        bad.replace("falloff: inverse_square", "falloff: cubic")
+    )
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError) as raised:
+        load("scenes/afit_simsat.yaml")
+    assert block.strip() == f"skysim: {raised.value}"
+
+
+def test_every_kind_of_dome_is_in_the_reference():
+    """Surfaces, layouts and drives, each by its name in the section on domes."""
+    section = pages.text(REFERENCE).partition("## Kinds of dome\n")[2].partition("\n## ")[0]
+    kinds = [*SURFACES, *LAYOUTS, *led.DRIVES]
+    assert [kind for kind in kinds if f"`{kind}`" not in section] == []
+
+
+def test_every_section_of_a_scene_is_in_the_reference():
+    section = pages.text(REFERENCE).partition("## Sections\n")[2].partition("\n## ")[0]
+    told = set(re.findall(r"^\| `(\w+)` \|", section, re.MULTILINE))
+    assert told == set(Scene.model_fields) - {"schema_version", "name", "title", "seed", "start_time"}
