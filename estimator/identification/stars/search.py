@@ -39,8 +39,9 @@ from estimator.identification.stars.evidence import (
 )
 
 # Least log10 Bayes factor of an accepted attitude. By Markov's inequality, random detections reach it in at most one of
-# 10^5 frames. With 4, a mirrored sky was solved in one of 10^5 adversarial images (docs/findings/robustness.md); 5 loses two in a
-# thousand of the hardest frames (python -m benchmarks.lost_in_space), 6 would lose twelve.
+# 10^5 frames. With 4, a mirrored sky was solved in one of 10^5 adversarial images
+# (docs/findings/robustness.md); 5 loses two in a thousand of the hardest frames (python -m benchmarks.lost_in_space),
+# 6 would lose twelve.
 ACCEPT_DEX = 5.0
 DECISIVE_DEX = 10.0  # evidence at which the search stops without looking for rivals
 MARGIN_DEX = 3.0  # by which the solution must beat every other attitude

@@ -1,7 +1,7 @@
 """The process in which an entry point's tracker runs: `python -m skysim.tracking.external.host NAME`.
 
-It speaks the protocol of docs/howto/external_tracker.md. Frames come on standard input and answers go to the original standard
-output; what the tracker itself prints goes to standard error.
+It speaks the protocol of docs/howto/external_tracker.md. Frames come on standard input and answers go to the
+original standard output; what the tracker itself prints goes to standard error.
 """
 
 from __future__ import annotations

@@ -27,7 +27,10 @@ SPACING_MM = {10: 30, 20: 22, 40: 15.5, 80: 11}  # by number of lights; slightly
 ARCSEC_TICKS = (0.2, 0.5, 1, 2, 5, 10)
 TILT_DEG, CAP_DEG = 10.0, 18.0
 MEASURED = {"led_sigma": "0.2 mm", "lever_sigma": "0.2 mm"}  # of a laser tracker or a measuring arm
-BY_FRAMES = {"led_sigma": "0.08 mm", "lever_sigma": "0.09 mm"}  # left by `skysim survey`, docs/findings/dome.md
+BY_FRAMES = {
+    "led_sigma": "0.08 mm",
+    "lever_sigma": "0.09 mm",
+}  # left by `skysim survey`, docs/findings/dome.md
 LEVEL_SIGMA_DEG = 0.005  # orientation error of the survey's axes
 
 
