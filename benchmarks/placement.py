@@ -1,8 +1,8 @@
 """LED layouts compared at independent attitudes: patch boards, Fibonacci spiral, Poisson disc and optimized layout.
 
 `python -m benchmarks.placement [LEDS [FRAMES [SEED]]]` prints the table of docs/findings/dome.md: AFIT's SimSat under
-its measured dome with the scene's camera and lever arm, LEDS equal LEDs over the cap that any field within 30 degrees of
-tilt can reach, and FRAMES frames for the tracker. `compare` returns its rows.
+its measured dome with the scene's camera and lever arm, LEDS equal LEDs over the cap that any field within 30 degrees
+of tilt can reach, and FRAMES frames for the tracker. `compare` returns its rows.
 """
 
 from __future__ import annotations
