@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.timing import verdict, versus
 from skysim.camera.background import fill
-from skysim.camera.detector.detector import Chip, expose
+from skysim.camera.detector.detector import Detector, expose
 from skysim.camera.optics import Optics
 from skysim.camera.render import Window, render
 from skysim.core.types import Floats, Mount, Sources, Trajectory
@@ -86,7 +86,7 @@ def lights(
 
 def camera_shot(lens: CameraConfig, sources: Sources, rate_rad_s: float) -> Callable[[], Any]:
     """A function that makes one frame: light with smear, then all noise."""
-    optics, chip, rng = square_metre(lens), Chip.of(lens), np.random.default_rng(0)
+    optics, chip, rng = square_metre(lens), Detector.of(lens), np.random.default_rng(0)
     path, image = turning(rate_rad_s), np.empty((lens.height_px, lens.width_px), np.float32)
 
     def shot() -> Any:
@@ -209,7 +209,7 @@ def galsim(lens: CameraConfig, sources: Sources, electrons: Floats) -> Callable[
 def noise_floor() -> dict[str, Any]:
     """Noise of a dark frame against the time to generate as many random bytes as the frame has."""
     lens = camera(1600, 1200, 8000.0, 1.0)
-    chip, rng = Chip.of(lens), np.random.default_rng(0)
+    chip, rng = Detector.of(lens), np.random.default_rng(0)
     dark = np.zeros((1200, 1600), np.float32)
 
     def ours() -> None:

@@ -147,7 +147,7 @@ def sigmas_arcsec(of: Bench, place_m: Floats) -> tuple[Floats, Floats, Floats]:
     """
     part = wish(of, len(place_m), 0)
     fresh = optimize.attitudes(part, FRESH, np.random.default_rng(SEEN_BY_CHANCE))
-    total = fisher.told(place_m, fresh, *optimize.camera(part))
+    total = fisher.total_information(place_m, fresh, *optimize.camera(part))
     solved, variance = total[:, 6] >= 2, np.full((FRESH, 3), np.inf)
     # Unpack the six elements of the symmetric information matrix (xx, yy, zz, xy, xz, yz).
     matrix = total[solved][:, [0, 3, 4, 3, 1, 5, 4, 5, 2]].reshape(-1, 3, 3)

@@ -19,7 +19,7 @@ from benchmarks.timing import verdict
 from skysim.experiments.study import loader, store
 from skysim.experiments.study.execution import engines, runner
 from skysim.experiments.study.execution.engines import Chunks, Pool
-from skysim.experiments.study.plan import Recipe
+from skysim.experiments.study.plan import TrialSpec
 from skysim.experiments.study.trials import Row
 
 STUDY = """
@@ -52,7 +52,7 @@ class Clocked:
         self.pool, self.name, self.workers = pool, pool.name, pool.workers
         self.came: list[tuple[float, int, float]] = []
 
-    def run(self, recipe: Recipe, chunks: Chunks) -> Iterator[list[Row]]:
+    def run(self, recipe: TrialSpec, chunks: Chunks) -> Iterator[list[Row]]:
         """See `engines.Engine`."""
         for rows in self.pool.run(recipe, chunks):
             self.came.append((time.perf_counter(), len(rows), sum(row.seconds for row in rows)))

@@ -70,7 +70,7 @@ def studies(data: bytes) -> None:
 
 def overrides(data: bytes) -> None:
     text = data.decode("utf-8", "replace")
-    refused(lambda: loader.load("shefex2", yaml_reader.overridden(text.split("\n"))), InputError)
+    refused(lambda: loader.load("shefex2", yaml_reader.parse_overrides(text.split("\n"))), InputError)
 
 
 def fits(data: bytes) -> None:

@@ -123,7 +123,7 @@ def test_yaml_that_is_more_than_it_seems_is_refused(tmp_path: Path, text: str, w
 
 def test_yaml_keeps_aliases_and_merges(tmp_path: Path) -> None:
     text = "a: &a {b: 1, c: [2, 3]}\nd: {<<: *a, b: 4}\ne: *a\n"
-    _, values = yaml_reader.composed(text)
+    _, values = yaml_reader.parse_yaml(text)
     assert values == {"a": {"b": 1, "c": [2, 3]}, "d": {"b": 4, "c": [2, 3]}, "e": {"b": 1, "c": [2, 3]}}
 
 

@@ -37,7 +37,7 @@ def main() -> None:
         size = (width, round(width * annotated.shape[0] / annotated.shape[1]))
         files.write_image(IMAGES / f"{name}.jpg", cv2.resize(annotated, size, interpolation=cv2.INTER_AREA))
     lab = run.prepare(loader.load("simsat_slew"))
-    drawn = picture(testbed.staged(lab), lab.log.joints[700])
+    drawn = picture(testbed.export_mjcf(lab), lab.log.joints[700])
     files.write_image(IMAGES / "lab.jpg", drawn[:, :, ::-1])
     (IMAGES / "bump.png").write_bytes(telemetry_report.figure(run.prepare(loader.load("simsat_bump")).log))
     shots = [frame(rate) for rate in RATES_DEG_S]

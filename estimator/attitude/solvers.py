@@ -111,4 +111,4 @@ def covariance(vectors_cam: Floats, sigma_rad: Floats, solver: str = "quest") ->
     if solver == "triad" and len(cam) > 2:
         pair = list(kernel.best_pair(cam, weight))
         cam, weight = cam[pair], weight[pair]
-    return kernel.spread(cam, weight)
+    return kernel.attitude_covariance(cam, weight)

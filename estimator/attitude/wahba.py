@@ -41,7 +41,7 @@ def wahba(cam: Floats, ref: Floats, weight: Floats) -> tuple[Floats, Floats]:
     """
     answer = raw_quest(profile(cam, ref, weight))
     polish(answer, cam, ref, weight)
-    return answer, spread(cam, weight)
+    return answer, attitude_covariance(cam, weight)
 
 
 @jit
@@ -101,7 +101,7 @@ def _sine2(vectors: Floats, m: int, n: int) -> float:
 
 
 @jit
-def greatest(B: Floats) -> float:
+def largest_eigenvalue(B: Floats) -> float:
     """Return the largest eigenvalue of Davenport's matrix, by Newton's method from 1 downwards.
 
     With normalized weights the eigenvalue is at most 1, and close to 1 for small errors. The characteristic equation
@@ -180,7 +180,7 @@ def raw_quest(B: Floats) -> Floats:
     largest scalar part of the quaternion is returned. The scalar parts are compared before normalization: at 180
     degrees all four components of the quaternion vanish, and their ratios are rounding noise.
     """
-    x = greatest(B)
+    x = largest_eigenvalue(B)
     best, frame = (0.0, 0.0, 0.0, 0.0), 3
     for axis in (3, 0, 1, 2):
         found = _quest_once(_turned(B, axis), x)
@@ -223,7 +223,7 @@ def raw_esoq2(B: Floats) -> Floats:
     the reference frame is therefore first rotated by the 180-degree rotation that gives the smallest trace.
     """
     # A rotation by 180 degrees about an axis keeps that diagonal element and negates the two others.
-    x, frame, least = greatest(B), 3, B[0, 0] + B[1, 1] + B[2, 2]
+    x, frame, least = largest_eigenvalue(B), 3, B[0, 0] + B[1, 1] + B[2, 2]
     for axis in range(3):
         trace = 2 * B[axis, axis] - (B[0, 0] + B[1, 1] + B[2, 2])
         if trace < least:
@@ -364,7 +364,7 @@ def _add_information(matrix: Floats, v: Floats, w: float) -> None:
 
 
 @jit
-def spread(cam: Floats, weight: Floats) -> Floats:
+def attitude_covariance(cam: Floats, weight: Floats) -> Floats:
     """Return the (3, 3) covariance: the inverse of sum(w (I - b b^T)). Raises ValueError if that is singular."""
     factor, out, unit = np.zeros((3, 3)), np.empty((3, 3)), np.empty(3)
     for n in range(len(cam)):

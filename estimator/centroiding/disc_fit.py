@@ -16,7 +16,7 @@ from estimator.centroiding.moments import foreign, neighbours
 from estimator.core import least_squares
 from estimator.core.arrays import Floats, Ints
 from estimator.core.jit import jit
-from estimator.detection.background import FILTERED_NOISE, at
+from estimator.detection.background import FILTERED_NOISE, interpolate
 
 MARGIN_PX = 4
 SMALLEST_PX = 2.0  # radius of the smallest disc that still has a flat center despite its blurred edge
@@ -56,8 +56,8 @@ def fit_all(
         if x0 < 0 or y0 < 0 or x1 >= width or y1 >= height:
             continue
         others = near[: neighbours(boxes, n, x0, y0, x1, y1, near)]
-        sky = at(level, height, width, xy[n, 1], xy[n, 0])
-        sigma = at(noise, height, width, xy[n, 1], xy[n, 0]) / FILTERED_NOISE
+        sky = interpolate(level, height, width, xy[n, 1], xy[n, 0])
+        sigma = interpolate(noise, height, width, xy[n, 1], xy[n, 0]) / FILTERED_NOISE
         # Initial values: the radius of a disc of the blob's area, and the mean brightness.
         p[EDGE], p[BRIGHT], p[SKY] = 1.0, flux[n] / area[n], sky
         count = 0

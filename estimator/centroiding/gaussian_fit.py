@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from estimator.core import least_squares
 from estimator.core.arrays import Floats, Ints
 from estimator.core.jit import jit
-from estimator.detection.background import FILTERED_NOISE, at
+from estimator.detection.background import FILTERED_NOISE, interpolate
 
 HALF_PX, WIDEST_HALF_PX = 3, 10  # half-width of the window: default, and largest for a saturated star
 NARROWEST_PX, WIDEST_PX = 0.2, 3.0  # limits of sigma that a 7x7 window can resolve
@@ -58,9 +58,9 @@ def fit_all(
         if left < 0 or top < 0 or left + side > width or top + side > height:
             continue
         window = image[top : top + side, left : left + side]
-        sigma = at(noise, height, width, xy[n, 1], xy[n, 0]) / FILTERED_NOISE
+        sigma = interpolate(noise, height, width, xy[n, 1], xy[n, 0]) / FILTERED_NOISE
         p[X], p[Y] = xy[n, 0] - left, xy[n, 1] - top
-        p[WIDTH], p[SKY] = usual_px, at(level, height, width, xy[n, 1], xy[n, 0])
+        p[WIDTH], p[SKY] = usual_px, interpolate(level, height, width, xy[n, 1], xy[n, 0])
         if _fit(window, sigma, gain_e_dn, saturation, rows, weight, edges, p, out[n]):
             usual_px = p[WIDTH]
             out[n, 0] += left

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from estimator.core.arrays import Floats, Ints
 from estimator.core.jit import jit
-from estimator.detection.background import FILTERED_NOISE, at
+from estimator.detection.background import FILTERED_NOISE, interpolate
 
 MARGIN_PX = 4
 LEAST_WINDOW_PX, MOST_WINDOW_PX = 0.6, 4.0  # limits of the window's sigma
@@ -43,7 +43,7 @@ def gravity(image: NDArray, boxes: Ints, level: Floats, noise: Floats, gain_e_dn
             for x in range(x0, x1 + 1):
                 if foreign(boxes, others, n, x, y):
                     continue
-                light = image[y, x] - at(level, height, width, y, x)
+                light = image[y, x] - interpolate(level, height, width, y, x)
                 u, v = x - ox, y - oy
                 flux += light
                 sx += light * u
@@ -65,7 +65,7 @@ def gravity(image: NDArray, boxes: Ints, level: Floats, noise: Floats, gain_e_dn
         # Sums of (x - cx)^2 + (y - cy)^2 over the pixels, and weighted by their light.
         by_light = light_xx - 2 * (cx * light_x + cy * light_y) + (cx * cx + cy * cy) * s_light
         by_pixel = pxx - 2 * (cx * px + cy * py) + (cx * cx + cy * cy) * pixels
-        sigma2 = (at(noise, height, width, cy + oy, cx + ox) / FILTERED_NOISE) ** 2
+        sigma2 = (interpolate(noise, height, width, cy + oy, cx + ox) / FILTERED_NOISE) ** 2
         spread = (by_light / gain_e_dn + sigma2 * by_pixel) / 2
         out[n, 0], out[n, 1], out[n, 2], out[n, 3] = (
             cx + ox,
@@ -93,7 +93,7 @@ def squared(image: NDArray, boxes: Ints, level: Floats, noise: Floats, gain_e_dn
                 for x in range(x0, x1 + 1):
                     if foreign(boxes, others, n, x, y):
                         continue
-                    light = image[y, x] - at(level, height, width, y, x)
+                    light = image[y, x] - interpolate(level, height, width, y, x)
                     if turn == 0:
                         flux += light
                         light = max(light, 0.0)
@@ -109,7 +109,7 @@ def squared(image: NDArray, boxes: Ints, level: Floats, noise: Floats, gain_e_dn
                 if weight == 0:
                     break
                 cx, cy = cx / weight, cy / weight
-                sigma2 = (at(noise, height, width, cy, cx) / FILTERED_NOISE) ** 2
+                sigma2 = (interpolate(noise, height, width, cy, cx) / FILTERED_NOISE) ** 2
         if weight == 0:
             out[n] = np.nan, np.nan, np.nan, 0.0
             continue
@@ -138,7 +138,7 @@ def windowed(
     for n in range(len(boxes)):
         cx, cy = xy[n]
         s2 = 1.0
-        sigma2 = (at(noise, height, width, cy, cx) / FILTERED_NOISE) ** 2
+        sigma2 = (interpolate(noise, height, width, cy, cx) / FILTERED_NOISE) ** 2
         for turn in range(ROUNDS):
             reach = 4 * sqrt(s2)
             x0, y0 = max(round(cx - reach), 0), max(round(cy - reach), 0)
@@ -149,7 +149,7 @@ def windowed(
                 for x in range(x0, x1 + 1):
                     if foreign(boxes, others, n, x, y):
                         continue
-                    light = image[y, x] - at(level, height, width, y, x)
+                    light = image[y, x] - interpolate(level, height, width, y, x)
                     u, v = x - cx, y - cy
                     w = exp(-(u * u + v * v) / (2 * s2))
                     total += w * light

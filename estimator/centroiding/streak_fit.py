@@ -18,7 +18,7 @@ from estimator.centroiding.moments import foreign, neighbours
 from estimator.core import least_squares
 from estimator.core.arrays import Floats, Ints
 from estimator.core.jit import jit
-from estimator.detection.background import FILTERED_NOISE, at
+from estimator.detection.background import FILTERED_NOISE, interpolate
 
 MARGIN_PX, WIDEST_PX = 4, 96  # margin of the window about the streak, and its largest half-width
 REACH_PX = 4.5  # from the initial line: pixels farther away contain only sky and are not used
@@ -61,8 +61,8 @@ def fit_all(
         if x0 < 0 or y0 < 0 or x1 >= width or y1 >= height:
             continue
         others = near[: neighbours(boxes, n, x0, y0, x1, y1, near)]
-        sky = at(level, height, width, xy[n, 1], xy[n, 0])
-        sigma = at(noise, height, width, xy[n, 1], xy[n, 0]) / FILTERED_NOISE
+        sky = interpolate(level, height, width, xy[n, 1], xy[n, 0])
+        sigma = interpolate(noise, height, width, xy[n, 1], xy[n, 0]) / FILTERED_NOISE
         p[X], p[Y], p[FLUX] = xy[n, 0], xy[n, 1], 0.0
         p[LENGTH], p[ANGLE], p[WIDTH], p[SKY] = length, angle, width_px, sky
         count = 0

@@ -26,7 +26,7 @@ CLIPPED_VARIANCE = 0.9733  # of a unit Gaussian truncated at 3 sigma: 1 - 6 phi(
 FILTERED_NOISE = 0.375  # the binomial filter reduces the deviation of white noise to (1 + 4 + 1) / 16
 
 
-def sky(image: NDArray, tile_px: int = TILE_PX) -> Background:
+def estimate_background(image: NDArray, tile_px: int = TILE_PX) -> Background:
     """Estimate the sigma-clipped mean and standard deviation of the 3x3-filtered image, tile by tile.
 
     The noise is measured on the filtered image itself, so correlated noise (JPEG, demosaicing) is included. Its floor
@@ -83,7 +83,7 @@ def filtered_row(image: NDArray, y: int, sums: NDArray, out: NDArray) -> None:
 
 
 @jit
-def at(grid: Floats, height: int, width: int, y: float, x: float) -> float:
+def interpolate(grid: Floats, height: int, width: int, y: float, x: float) -> float:
     """Interpolate a tile grid bilinearly at a pixel; constant beyond the outermost tile centers."""
     rows, columns = grid.shape
     v, u = (y + 0.5) * rows / height - 0.5, (x + 0.5) * columns / width - 0.5

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from estimator.core.arrays import Floats, Ints
 from estimator.core.jit import jit
 from estimator.core.types import Blobs, FramePriors
-from estimator.detection.background import FILTERED_NOISE, at, filtered, median
+from estimator.detection.background import FILTERED_NOISE, filtered, interpolate, median
 
 # Sum of the four neighbors over the central pixel: about .5 for a centered Gaussian of sigma 0.4 px, 0 for a spike.
 SHARPEST = 0.25
@@ -50,7 +50,7 @@ NO_STAR = Flag.HOT | Flag.TRACK | Flag.HUGE | Flag.TEXTURE
 SATURATED, HOT, TRACK, HUGE, TEXTURE = (int(flag) for flag in Flag)  # plain integers for compiled code
 
 
-def judged(image: NDArray, blobs: Blobs, hints: FramePriors) -> Blobs:
+def classify(image: NDArray, blobs: Blobs, hints: FramePriors) -> Blobs:
     """Return the blobs with their flags, and with the streak (dx, dy) that the frame's stars share, if any.
 
     The streak is that of the hints if given, otherwise the one that most of the brightest blobs share.
@@ -107,7 +107,7 @@ def _flags(
     flag = np.zeros(len(shape), np.int64)
     for n in range(len(shape)):
         middle, sides, width2, line_x, line_y = shape[n]
-        here = at(noise, height, width, xy[n, 1], xy[n, 0])
+        here = interpolate(noise, height, width, xy[n, 1], xy[n, 0])
         pixel_noise = here / FILTERED_NOISE
         long2 = hypot(line_x - shared[0], line_y - shared[1])
         # 6 pixel_noise: three sigma of the sum of four pixels.
@@ -165,11 +165,11 @@ def _shapes(image: NDArray, boxes: Ints, level: Floats, noise: Floats) -> Floats
         top, top_x, top_y = -np.inf, x0, y0
         for y in range(y0, y1 + 1):
             for x in range(x0, x1 + 1):
-                sky = at(level, height, width, y, x)
+                sky = interpolate(level, height, width, y, x)
                 light = image[y, x] - sky
                 if light > top:
                     top, top_x, top_y = light, x, y
-                if light > 0 and filtered(image, y, x) - sky > 3 * at(noise, height, width, y, x):
+                if light > 0 and filtered(image, y, x) - sky > 3 * interpolate(noise, height, width, y, x):
                     u, v = x - x0, y - y0
                     total += light
                     x_sum += light * u
@@ -177,7 +177,7 @@ def _shapes(image: NDArray, boxes: Ints, level: Floats, noise: Floats) -> Floats
                     xx += light * u * u
                     yy += light * v * v
                     xy += light * u * v
-        sky = at(level, height, width, top_y, top_x)
+        sky = interpolate(level, height, width, top_y, top_x)
         out[n, 0] = top
         for a, b in ((top_x - 1, top_y), (top_x + 1, top_y), (top_x, top_y - 1), (top_x, top_y + 1)):
             out[n, 1] += float(image[min(max(b, 0), height - 1), min(max(a, 0), width - 1)]) - sky

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from estimator.core.arrays import Floats, Ints
 from estimator.core.jit import jit
-from estimator.detection.background import at, filtered, filtered_row, summing
+from estimator.detection.background import filtered, filtered_row, interpolate, summing
 
 Ints32 = NDArray[np.int32]  # half the memory where there are millions of runs
 FIRST_RUNS = 2048  # capacity of the first pass; a second pass follows if there are more runs
@@ -92,7 +92,11 @@ def _scan(image: NDArray, threshold: Floats, taps: Ints, sums: NDArray, ring: ND
                     continue
                 for i in range(8 * k, 8 * k + 8):
                     x = start + i
-                    if mask[i] and x >= first and line[x] > scale * at(threshold, height, width, y, x):
+                    if (
+                        mask[i]
+                        and x >= first
+                        and line[x] > scale * interpolate(threshold, height, width, y, x)
+                    ):
                         count = _extend(runs, count, y, x)
     return count
 
@@ -230,7 +234,7 @@ def summed(
         box[2], box[3] = max(box[2], x1), max(box[3], y)
         mine[AREA] += x1 - x0 + 1
         for x in range(x0, x1 + 1):
-            sky = at(level, height, width, y, x)
+            sky = interpolate(level, height, width, y, x)
             smooth = filtered(image, y, x)
             light = image[y, x] - sky
             mine[FLUX] += light
@@ -239,7 +243,7 @@ def summed(
             mine[PEAK] = max(mine[PEAK], float(image[y, x]))
             if smooth - sky > mine[TOP]:
                 mine[TOP], mine[TOP_X], mine[TOP_Y] = smooth - sky, x, y
-            if smooth > at(strong, height, width, y, x):
+            if smooth > interpolate(strong, height, width, y, x):
                 mine[STRONG] += 1
     return boxes, sums
 

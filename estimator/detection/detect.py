@@ -16,7 +16,7 @@ from estimator.core.arrays import Floats, Ints
 from estimator.core.errors import ImageError
 from estimator.core.types import NO_PRIORS, Background, Blobs, FramePriors
 from estimator.detection import classify
-from estimator.detection.background import FILTERED_NOISE, median, sky
+from estimator.detection.background import FILTERED_NOISE, estimate_background, median
 from estimator.detection.components import Ints32, labelled, ranked, runs_above, summed
 from estimator.detection.shefex import maximum_scan, sequential_scan
 
@@ -55,23 +55,23 @@ def default(
     LONGEST_PX are detected with the filter for round stars.
     """
     image = prepared(image)
-    background = sky(image)
+    background = estimate_background(image)
     if hints.streak_px is None or not 2 <= max(map(abs, hints.streak_px)) <= LONGEST_PX:
         blobs = gather(
             image, background, threshold_sigma * background.noise, min_area_px, max_blobs, GROW_SIGMA
         )
-        blobs = classify.judged(image, blobs, hints)
+        blobs = classify.classify(image, blobs, hints)
         # Round or too few. With very few stars, the rest may be streaks too faint for the round filter.
         if blobs.streak_px is None:
             stars = int(np.count_nonzero(blobs.flag & classify.NO_STAR == 0))
             wanting = hints.streak_px is None and stars < FEW_STARS and np.all(blobs.area_px < LARGE_PX)
             unseen = faint_streaks(image, background, threshold_sigma, max_blobs, hints) if wanting else blobs
-            return classify.judged(image, unseen, hints) if len(unseen) > stars + 1 else blobs
+            return classify.classify(image, unseen, hints) if len(unseen) > stars + 1 else blobs
         if max(map(abs, blobs.streak_px)) > LONGEST_PX:
             return blobs
         # The bright blobs have revealed the streak: detect again with the filter along it.
         hints = FramePriors(blobs.streak_px, hints.saturation)
-    return classify.judged(image, smeared(image, background, threshold_sigma, max_blobs, hints), hints)
+    return classify.classify(image, smeared(image, background, threshold_sigma, max_blobs, hints), hints)
 
 
 def local(
@@ -83,7 +83,7 @@ def local(
 ) -> Blobs:
     """Detect blobs `threshold_sigma` above the local sky after a 3x3 binomial filter."""
     image = prepared(image)
-    background = sky(image)
+    background = estimate_background(image)
     return gather(image, background, threshold_sigma * background.noise, min_area_px, max_blobs)
 
 
@@ -96,7 +96,7 @@ def components(
 ) -> Blobs:
     """Detect blobs above a global threshold: the frame's median sky plus `threshold_sigma` times its noise."""
     image = prepared(image)
-    flat = flattened(sky(image), image.shape)
+    flat = flattened(estimate_background(image), image.shape)
     return gather(image, flat, threshold_sigma * flat.noise, min_area_px, max_blobs)
 
 
@@ -120,7 +120,7 @@ def thesis(
                 f"4 % of what? pixels of type {image.dtype} have no full scale; give the saturation"
             )
         full = float(np.iinfo(image.dtype).max)
-    flat = flattened(sky(image), image.shape)
+    flat = flattened(estimate_background(image), image.shape)
     # The thesis thresholds raw pixels. We threshold the filtered image, whose contour around a plateau of 50 pixels is
     # within a pixel of the raw one.
     return gather(image, flat, THESIS_INTENSITY * full - flat.level, THESIS_AREA_PX, max_blobs)
@@ -326,7 +326,7 @@ def _scanned(
 ) -> Blobs:
     """Run one of SHEFEX's scans and convert its table to Blobs."""
     image = prepared(image)
-    flat = flattened(sky(image), image.shape)
+    flat = flattened(estimate_background(image), image.shape)
     level, noise = float(flat.level[0, 0]), float(flat.noise[0, 0]) / FILTERED_NOISE
     boxes, sums = scan(image, level, level + threshold_sigma * noise, min_area_px, max_blobs)
     return _kept(boxes, sums, 0, max_blobs, flat)

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from estimator.core.arrays import Floats, Ints
 from estimator.core.jit import jit
 from estimator.core.types import NO_PRIORS, Blobs, FramePriors
-from estimator.detection.background import at, filtered, sky
-from estimator.detection.classify import judged
+from estimator.detection.background import estimate_background, filtered, interpolate
+from estimator.detection.classify import classify
 from estimator.detection.detect import prepared
 
 GROW_SIGMA = 3.0
@@ -30,7 +30,7 @@ def in_windows(
     """
     image = prepared(image)
     # The background is a sparse sample of the frame; only the windows are read in full.
-    background = sky(image)
+    background = estimate_background(image)
     level, noise = background.level, background.noise
     rows = np.ascontiguousarray(centre_px, dtype=float)
     boxes, sums, count = _brightest(image, rows, half_px, level, noise, threshold_sigma)
@@ -47,7 +47,7 @@ def in_windows(
         background,
         np.zeros(count, np.int64),
     )
-    return judged(image, blobs, hints)
+    return classify(image, blobs, hints)
 
 
 @jit
@@ -63,8 +63,8 @@ def _brightest(
         best, at_x, at_y = threshold_sigma, -1, -1
         for y in range(y0, y1 + 1):
             for x in range(x0, x1 + 1):
-                spread = at(noise, height, width, y, x)
-                above = (filtered(image, y, x) - at(level, height, width, y, x)) / max(spread, 1e-12)
+                spread = interpolate(noise, height, width, y, x)
+                above = (filtered(image, y, x) - interpolate(level, height, width, y, x)) / max(spread, 1e-12)
                 if above > best:
                     best, at_x, at_y = above, x, y
         # A peak inside the box of an earlier blob is taken to be that blob.
@@ -96,7 +96,7 @@ def _grow(image: NDArray, x: int, y: int, level: Floats, noise: Floats, box: NDA
     total[:] = 0.0
     while len(stack) > 0 and len(seen) < 4096:
         px, py = stack.pop()
-        light = image[py, px] - at(level, height, width, py, px)
+        light = image[py, px] - interpolate(level, height, width, py, px)
         total[0] += 1
         total[1] += light
         total[2] += light * px
@@ -108,7 +108,7 @@ def _grow(image: NDArray, x: int, y: int, level: Floats, noise: Floats, box: NDA
             for qx in range(max(px - 1, 0), min(px + 2, width)):
                 if (qx, qy) in seen:
                     continue
-                above = filtered(image, qy, qx) - at(level, height, width, qy, qx)
-                if above > GROW_SIGMA * at(noise, height, width, qy, qx):
+                above = filtered(image, qy, qx) - interpolate(level, height, width, qy, qx)
+                if above > GROW_SIGMA * interpolate(noise, height, width, qy, qx):
                     seen.add((qx, qy))
                     stack.append((qx, qy))

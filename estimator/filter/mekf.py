@@ -82,7 +82,7 @@ class Update:
     distance: float
 
 
-class _Moment(NamedTuple):
+class _State(NamedTuple):
     """State of the filter at one time; `missed_rad` is the attitude uncertainty gathered in the current saturation."""
 
     t_s: float
@@ -103,13 +103,13 @@ class _Solution(NamedTuple):
     covariance_rad2: Floats
 
 
-class _Leg(NamedTuple):
+class _Segment(NamedTuple):
     """History from one used solution to the next: the state after it, the gyro samples since, and the solution.
 
     The solution of the oldest leg is not applied again, and is None if the leg begins between two solutions.
     """
 
-    moment: _Moment
+    moment: _State
     samples: Floats
     solution: _Solution | None
 
@@ -168,9 +168,9 @@ class Mekf:
         sigma_attitude = _not_negative("sigma_attitude_rad", sigma_attitude_rad) * np.ones(3)
         self._start_variance = (_not_negative("sigma_bias_rad_s", sigma_bias_rad_s) * np.ones(3)) ** 2
         covariance = np.diag(np.concatenate([sigma_attitude**2, self._start_variance]))
-        self._now = _Moment(float(t_s), _ref_from_body_wxyz(body_from_ref), np.zeros(3), covariance, 0.0)
-        self._legs = [_Leg(self._now, np.empty((0, 5)), None)]  # rows of _checked_samples
-        self._refused: list[tuple[_Moment, _Solution]] = []  # in a row, each agrees with the one before
+        self._now = _State(float(t_s), _ref_from_body_wxyz(body_from_ref), np.zeros(3), covariance, 0.0)
+        self._legs = [_Segment(self._now, np.empty((0, 5)), None)]  # rows of _checked_samples
+        self._refused: list[tuple[_State, _Solution]] = []  # in a row, each agrees with the one before
         self._measured_rad_s = np.zeros(3)
 
     @property
@@ -239,13 +239,13 @@ class Mekf:
         if distance2 <= self._gate:
             # Split the leg at the solution, then repeat the later solutions from the corrected state.
             status, then = USED, _corrected(then, residual, noise)
-            self._legs[k : k + 1] = [leg._replace(samples=before), _Leg(then, after, solution)]
+            self._legs[k : k + 1] = [leg._replace(samples=before), _Segment(then, after, solution)]
             self._replay(k + 1)
         elif self._agrees(then, solution):
             status = RESET
             # Solutions used later than t_s were judged by a lost filter: only their gyro samples are kept.
             rest = np.concatenate([after, *(later.samples for later in self._legs[k + 1 :])])
-            self._legs = [_Leg(self._taken(then, solution), rest, None)]
+            self._legs = [_Segment(self._taken(then, solution), rest, None)]
         else:
             return Update(OUTSIDE, residual, math.sqrt(distance2))
         self._refused = []
@@ -270,16 +270,16 @@ class Mekf:
         if len(first.samples) and first.samples[0, 0] < before_s:
             half = len(first.samples) // 2
             moment = self._after(first.moment, first.samples[:half])
-            self._legs[0] = _Leg(moment, first.samples[half:], None)
+            self._legs[0] = _Segment(moment, first.samples[half:], None)
 
-    def _after(self, moment: _Moment, samples: Floats) -> _Moment:
+    def _after(self, moment: _State, samples: Floats) -> _State:
         """Propagate a state through gyro samples."""
         if not len(samples):
             return moment
         noise = (self._gyro.arw_rad_sqrt_s**2, self._gyro.bias_rad_s**2, 1 / self._gyro.bias_time_s)
-        return _Moment(float(samples[-1, 0]), *advance(tuple(moment), samples, noise))
+        return _State(float(samples[-1, 0]), *advance(tuple(moment), samples, noise))
 
-    def _agrees(self, then: _Moment, solution: _Solution) -> bool:
+    def _agrees(self, then: _State, solution: _Solution) -> bool:
         """Whether a refused solution is the third in a row, each in agreement with the one before."""
         if self._refused:
             moment, earlier = self._refused[-1]
@@ -296,7 +296,7 @@ class Mekf:
         self._refused.append((then, solution))
         return len(self._refused) >= AGREEING
 
-    def _taken(self, then: _Moment, solution: _Solution) -> _Moment:
+    def _taken(self, then: _State, solution: _Solution) -> _State:
         """Reset to the solution's attitude and covariance; keep the bias and add the initial variance to its own."""
         bias_covariance = then.covariance[3:, 3:] + np.diag(self._start_variance)
         return then._replace(
@@ -305,14 +305,14 @@ class Mekf:
         )
 
 
-def _innovation(then: _Moment, solution: _Solution) -> tuple[Floats, Floats, float]:
+def _innovation(then: _State, solution: _Solution) -> tuple[Floats, Floats, float]:
     """Return the residual (3,) in body axes, its noise covariance (3, 3), and the squared Mahalanobis distance."""
     residual = (then.body_from_ref * solution.body_from_ref.inv()).as_rotvec()
     noise = _seen_from(residual, solution.covariance_rad2)
     return residual, noise, float(residual @ np.linalg.solve(then.covariance[:3, :3] + noise, residual))
 
 
-def _corrected(then: _Moment, residual: Floats, noise: Floats) -> _Moment:
+def _corrected(then: _State, residual: Floats, noise: Floats) -> _State:
     """Kalman update in Joseph form; the attitude error is then multiplied into the quaternion."""
     gain = np.linalg.solve(then.covariance[:3, :3] + noise, then.covariance[:3]).T
     error = gain @ residual
@@ -325,7 +325,7 @@ def _corrected(then: _Moment, residual: Floats, noise: Floats) -> _Moment:
     covariance = moved @ (left @ then.covariance @ left.T + gain @ noise @ gain.T) @ moved.T
     wxyz, bias = then.ref_from_body_wxyz.copy(), then.bias_rad_s + error[3:]
     turn_on(wxyz, error[:3])
-    return _Moment(then.t_s, wxyz, bias, (covariance + covariance.T) / 2, then.missed_rad)
+    return _State(then.t_s, wxyz, bias, (covariance + covariance.T) / 2, then.missed_rad)
 
 
 def _smear(turn_rad: Floats) -> Floats:

@@ -24,7 +24,7 @@ from estimator.identification.leds.evidence import LEAST
 from estimator.identification.leds.index import corner_rays, inner_field, sight_of
 from estimator.identification.leds.search import NO_MATCH
 from estimator.identification.registry import IDENTIFIERS as STAR_IDENTIFIERS
-from estimator.trackers.pipeline import Clock, Report, Settings, brightest, direction_sigma_rad, look
+from estimator.trackers.pipeline import Clock, Report, Settings, brightest, direction_sigma_rad, process_frame
 from estimator.trackers.star_tracker import NO_STARS, mutual
 
 LEAST_ERROR_PX = 0.3  # least centroid error of an LED, for effects outside of survey and calibration
@@ -102,7 +102,7 @@ class DomeTracker:
 
         streak_px : (dx, dy) that lights move during the exposure, from the gyro; None if unknown
         """
-        return look(image, self.camera, self.settings, self.solve_centroids, streak_px)
+        return process_frame(image, self.camera, self.settings, self.solve_centroids, streak_px)
 
     def solve_centroids(self, centroids: Centroids, clock: Clock | None = None) -> Attitude:
         """Identify and solve centroids from any source (the truth included)."""

@@ -82,7 +82,7 @@ class Clock:
         self._last = now
 
 
-def see(
+def detect_and_centroid(
     image: NDArray,
     camera: Camera,
     settings: Settings,
@@ -105,18 +105,18 @@ def see(
     blobs = DETECTORS[settings.detector](
         image, settings.threshold_sigma, settings.min_area_px, settings.max_blobs, hints
     )
-    stars = whole(blobs.box_px, camera) & (blobs.flag & settings.reject == 0)
+    stars = away_from_border(blobs.box_px, camera) & (blobs.flag & settings.reject == 0)
     if not stars.all():
         blobs = blobs.take(stars)
     clock.lap("detect")
     centroids = CENTROIDERS[settings.centroider](image, blobs, settings.gain_e_dn, hints)
-    centroids = doubted(centroids, blobs, settings)
+    centroids = inflate_uncertainty(centroids, blobs, settings)
     clock.lap("centroid")
     sound = camera.contains(centroids.xy_px) & (centroids.sigma_px < VAGUE_PX) & (centroids.flux > 0)
     return centroids if sound.all() else centroids.take(sound)
 
 
-def doubted(centroids: Centroids, blobs: Blobs, settings: Settings) -> Centroids:
+def inflate_uncertainty(centroids: Centroids, blobs: Blobs, settings: Settings) -> Centroids:
     """The centroids with increased errors for saturated blobs and for blobs that touch bad pixels."""
     extra = SATURATED_SIGMA_PX * (blobs.flag & int(Flag.SATURATED) != 0)
     if settings.bad_px is not None and len(blobs):
@@ -131,7 +131,7 @@ def doubted(centroids: Centroids, blobs: Blobs, settings: Settings) -> Centroids
     return replace(centroids, sigma_px=np.hypot(centroids.sigma_px, extra), covariance_px2=spread)
 
 
-def look(
+def process_frame(
     image: NDArray,
     camera: Camera,
     settings: Settings,
@@ -140,7 +140,7 @@ def look(
 ) -> Report:
     """Process a frame through all stages: detect, centroid, then `solve`. Returns the report with timings."""
     clock = Clock()
-    centroids = see(image, camera, settings, clock, streak_px)
+    centroids = detect_and_centroid(image, camera, settings, clock, streak_px)
     return Report(solve(centroids, clock), centroids, clock.seconds)
 
 
@@ -154,7 +154,7 @@ def direction_sigma_rad(centroids: Centroids, camera: Camera, settings: Settings
     return np.hypot(centroids.sigma_px, settings.centroid_sigma_px) / camera.focal_px
 
 
-def whole(box_px: NDArray, camera: Camera) -> NDArray:
+def away_from_border(box_px: NDArray, camera: Camera) -> NDArray:
     """(N,) whether a blob's box is away from the border; a blob cut off by the border has a biased centroid."""
     x0, y0, x1, y1 = box_px.T
     return (x0 > 0) & (y0 > 0) & (x1 < camera.width_px - 1) & (y1 < camera.height_px - 1)

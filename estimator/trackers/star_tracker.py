@@ -27,8 +27,8 @@ from estimator.core.types import Attitude, Centroids, StarMatch
 from estimator.identification.chance import ACCEPT_LOG10_CHANCE, MIN_MATCHES, log10_tail
 from estimator.identification.registry import IDENTIFIERS
 from estimator.identification.stars import search
-from estimator.identification.stars.evidence import LEAST, Fix, Lights
-from estimator.trackers.pipeline import Clock, Report, Settings, brightest, direction_sigma_rad, look
+from estimator.identification.stars.evidence import LEAST, Detections, Solution
+from estimator.trackers.pipeline import Clock, Report, Settings, brightest, direction_sigma_rad, process_frame
 
 NO_STARS = "too few stars detected"
 NO_MATCH = "no identification beyond chance"
@@ -122,7 +122,7 @@ class StarTracker:
 
         streak_px : (dx, dy) that stars move during the exposure, from the gyro; None if unknown
         """
-        return look(image, self.camera, self.settings, self.solve_centroids, streak_px)
+        return process_frame(image, self.camera, self.settings, self.solve_centroids, streak_px)
 
     @property
     def efforts(self) -> int:
@@ -182,7 +182,7 @@ class StarTracker:
         from_middle_px = np.linalg.norm(centroids.xy_px - self.camera.centre_px, axis=1)
         return np.hypot(sigma_px, slack * from_middle_px)
 
-    def lights(self, centroids: Centroids, sigma_px: Floats) -> Lights:
+    def lights(self, centroids: Centroids, sigma_px: Floats) -> Detections:
         """The centroids as input of the search, with magnitudes if the zero point is known.
 
         sigma_px : (N,) total errors
@@ -194,7 +194,7 @@ class StarTracker:
         weight = centroids.weights_per_px2(sigma_px) * self.camera.focal_px**2
         xx, yy, xy = weight.T
         # The smaller eigenvalue of the inverse covariance belongs to the axis of the greatest error.
-        return Lights(
+        return Detections(
             self.camera.tangents(centroids.xy_px),
             1 / np.sqrt((xx + yy) / 2 - np.hypot((xx - yy) / 2, xy)),
             weight,
@@ -229,7 +229,7 @@ class StarTracker:
                 return found
         return Attitude(NO_MATCH)
 
-    def attitude_of(self, centroids: Centroids, fix: Fix, sigma_px: Floats) -> Attitude:
+    def attitude_of(self, centroids: Centroids, fix: Solution, sigma_px: Floats) -> Attitude:
         """The attitude of a fix; solved again from its matches if the settings name another solver."""
         camera = self.camera.zoomed(fix.zoom) if self.focal_uncertainty else self.camera
         cam_from_ref, covariance_rad2 = Rotation.from_quat(fix.cam_from_ref_xyzw), fix.covariance_rad2

@@ -24,7 +24,7 @@ from estimator.detection.classify import Flag
 from estimator.detection.windows import in_windows
 from estimator.identification.stars import evidence
 from estimator.identification.stars.search import ACCEPT_DEX
-from estimator.trackers.pipeline import Clock, Report, doubted, see
+from estimator.trackers.pipeline import Clock, Report, detect_and_centroid, inflate_uncertainty
 from estimator.trackers.star_tracker import StarTracker
 
 WINDOW_SIGMA = 4.0  # detection threshold in windows: lower than in a frame, as fewer pixels are searched
@@ -46,7 +46,7 @@ class Health(IntFlag):
 
 
 @dataclass(slots=True)
-class Tracked(Report):
+class TrackedReport(Report):
     """A frame's report with the quality of its solution.
 
     health       : flags
@@ -93,7 +93,7 @@ class TrackingMode:
         t_s: float,
         now_from_then: Rotation | None = None,
         streak_px: tuple[float, float] | None = None,
-    ) -> Tracked:
+    ) -> TrackedReport:
         """Solve the frame at t_s. Raises ImageError for bad input; any other failure is reported in the status.
 
         now_from_then : cam(t_s) from cam at the last solved frame, from the gyros; None: the last rate is extrapolated
@@ -127,7 +127,7 @@ class TrackingMode:
 
     def _track(
         self, image: NDArray, predicted: Rotation, streak_px: tuple[float, float] | None, clock: Clock
-    ) -> Tracked | None:
+    ) -> TrackedReport | None:
         """Solve from the detections in windows; None if the evidence is below ACCEPT_DEX."""
         tracker = self.tracker
         check_shape(image.shape, tracker.camera)
@@ -141,7 +141,7 @@ class TrackingMode:
         lights = tracker.lights(centroids, sigma_px)
         reach_rad = self.reach_px / tracker.camera.focal_px
         gates = np.full(len(centroids), 1.5 * reach_rad)  # covers a window's corner
-        guess = evidence.weigh(lights, tracker.sky, predicted.as_matrix(), 1.0, gates, -np.inf)
+        guess = evidence.evaluate(lights, tracker.sky, predicted.as_matrix(), 1.0, gates, -np.inf)
         # The prior volume of attitudes is not 8 pi^2 but that of the prediction: the boresight in a square of side
         # 2 reach_rad, the roll in an interval of 2 reach_rad over the half field.
         half = float(np.min(tracker.field[1::2] - tracker.field[::2])) / 2
@@ -153,10 +153,10 @@ class TrackingMode:
         clock.lap("solve")
         return self._told(attitude, centroids, sigma_px, clock, len(expected_px), saturated, streak_px)
 
-    def _search(self, image: NDArray, streak_px: tuple[float, float] | None, clock: Clock) -> Tracked:
+    def _search(self, image: NDArray, streak_px: tuple[float, float] | None, clock: Clock) -> TrackedReport:
         """Solve the whole frame lost in space."""
         tracker = self.tracker
-        centroids = see(image, tracker.camera, tracker.settings, clock, streak_px)
+        centroids = detect_and_centroid(image, tracker.camera, tracker.settings, clock, streak_px)
         attitude = tracker.solve_centroids(centroids, clock)
         return self._told(attitude, centroids, tracker.sigma_px(centroids), clock, 0, False, streak_px)
 
@@ -179,14 +179,14 @@ class TrackingMode:
         """Centroids of the detections in windows, and whether any of them is saturated."""
         settings, hints = self.tracker.settings, FramePriors(streak_px, self.tracker.settings.saturation)
         if streak_px is not None and np.hypot(*streak_px) > LONGEST_STREAK_PX:
-            centroids = see(image, self.tracker.camera, settings, clock, streak_px)
+            centroids = detect_and_centroid(image, self.tracker.camera, settings, clock, streak_px)
             near = np.abs(centroids.xy_px[:, None] - expected_px).max(axis=2) < self.reach_px
             return centroids.take(near.any(axis=1)), False
         blobs = in_windows(image, expected_px, self.reach_px, WINDOW_SIGMA, hints)
         blobs = blobs.take(blobs.flag & settings.reject == 0)
         clock.lap("detect")
         centroids = CENTROIDERS[settings.centroider](image, blobs, settings.gain_e_dn, hints)
-        centroids = doubted(centroids, blobs, settings)
+        centroids = inflate_uncertainty(centroids, blobs, settings)
         clock.lap("centroid")
         sound = np.isfinite(centroids.sigma_px) & (centroids.flux > 0)
         return centroids.take(sound), bool(np.any(blobs.flag & Flag.SATURATED))
@@ -200,10 +200,10 @@ class TrackingMode:
         expected: int,
         saturated: bool,
         streak_px: tuple[float, float] | None,
-    ) -> Tracked:
+    ) -> TrackedReport:
         """The report with quality flags."""
         if attitude.match is None or attitude.cam_from_ref is None:
-            return Tracked(attitude, centroids, clock.seconds)
+            return TrackedReport(attitude, centroids, clock.seconds)
         match: StarMatch = attitude.match
         vectors_cam = attitude.cam_from_ref.apply(self.tracker.stars.vectors[match.star])
         off_px = self.tracker.camera.pixels(vectors_cam) - centroids.xy_px[match.observed]
@@ -221,4 +221,4 @@ class TrackingMode:
         ):
             health |= flag if raised else Health.GOOD
         odds = -match.log10_chance
-        return Tracked(attitude, centroids, clock.seconds, health, odds, chi2_per_dof, expected)
+        return TrackedReport(attitude, centroids, clock.seconds, health, odds, chi2_per_dof, expected)

@@ -30,7 +30,7 @@ from estimator.core.types import Attitude, Centroids, ra_dec_roll_rad
 from estimator.detection.detect import DETECTORS, check_size
 from estimator.identification.chance import ACCEPT_LOG10_CHANCE
 from estimator.identification.registry import IDENTIFIERS
-from estimator.trackers.pipeline import Clock, Report, Settings, see
+from estimator.trackers.pipeline import Clock, Report, Settings, detect_and_centroid
 from estimator.trackers.star_tracker import NO_MATCH, StarTracker
 from skysim.camera.detector.detector import saturation_dn
 from skysim.core import files, images
@@ -270,7 +270,9 @@ def look(image: NDArray, solver: Solver, taken: datetime.datetime | None) -> tup
     if solver.camera or solver.calibrated or solver.fov_deg:
         return first.solve(image), first
     clock = Clock()
-    centroids = see(image, first.camera, solver.settings, clock)  # detection uses the camera's size only
+    centroids = detect_and_centroid(
+        image, first.camera, solver.settings, clock
+    )  # detection uses the camera's size only
     for effort in range(first.efforts):  # try all fields of view quickly before trying any thoroughly
         attitude, tracker = sought(centroids, solver.trackers(width_px, height_px, taken), clock, effort)
         if attitude.solved:

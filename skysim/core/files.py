@@ -73,7 +73,7 @@ def remove(path: Path) -> None:
 
 
 @contextmanager
-def naming(path: Path) -> Iterator[None]:
+def name_in_errors(path: Path) -> Iterator[None]:
     """Re-raise an OSError with `path` and the system's own message.
 
     Some libraries do not name the file, or do not report a full disk by its error number.
@@ -90,21 +90,21 @@ def naming(path: Path) -> Iterator[None]:
 
 
 @contextmanager
-def whole(path: Path) -> Iterator[Path]:
+def atomic_file(path: Path) -> Iterator[Path]:
     """Write a file atomically: yields a temporary name beside `path`, which replaces `path` at the end.
 
     If the body raises an exception, the temporary file is removed and `path` is unchanged.
     """
-    with being_written(path) as temporary, naming(path):
+    with being_written(path) as temporary, name_in_errors(path):
         yield temporary
         os.replace(temporary, path)
 
 
 @contextmanager
-def whole_folder(path: Path) -> Iterator[Path]:
+def atomic_folder(path: Path) -> Iterator[Path]:
     """`whole` for a folder: yields a temporary one beside `path` that replaces it, with any previous content."""
     aside = path.with_name(f"{path.stem}.old{path.suffix}")
-    with being_written(path) as temporary, being_written(aside) as old, naming(path):
+    with being_written(path) as temporary, being_written(aside) as old, name_in_errors(path):
         yield temporary
         # Two renames are fast; the old folder is removed afterward. So an interruption leaves one of the two complete.
         if path.exists():
@@ -146,13 +146,13 @@ def write_image(path: Path, image: NDArray) -> None:
         done = False
     if not done:
         raise InputError(f"{path}: an image of {image.dtype} and shape {image.shape} cannot be encoded so")
-    with whole(path) as temporary:
+    with atomic_file(path) as temporary:
         temporary.write_bytes(coded.data)
 
 
 def write_table(path: Path, table: Any) -> None:
     """An astropy table as ECSV."""
-    with whole(path) as temporary:
+    with atomic_file(path) as temporary:
         table.write(temporary, format="ascii.ecsv", overwrite=True)
 
 
@@ -170,12 +170,12 @@ def header_numbers(path: Path, meta: dict[str, Any], key: str, count: int) -> li
 
 
 def write_text(path: Path, text: str) -> None:
-    with whole(path) as temporary:
+    with atomic_file(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
 
 
 def write_bytes(path: Path, data: bytes) -> None:
-    with whole(path) as temporary:
+    with atomic_file(path) as temporary:
         temporary.write_bytes(data)
 
 

@@ -29,7 +29,7 @@ LONGEST = 200  # characters of a value in a message
 DEEPEST = 40  # levels of nesting
 
 
-class Careful(yaml.SafeLoader):
+class StrictLoader(yaml.SafeLoader):
     """SafeLoader with limits: nested aliases that expand, deep nesting and recursive aliases raise an error."""
 
     def __init__(self, text: str) -> None:
@@ -64,7 +64,7 @@ class Careful(yaml.SafeLoader):
             raise yaml.constructor.ConstructorError(None, None, problem, node.start_mark) from None
 
 
-def composed(text: str, kind: type[Careful] = Careful) -> tuple[yaml.Node | None, Any]:
+def parse_yaml(text: str, kind: type[StrictLoader] = StrictLoader) -> tuple[yaml.Node | None, Any]:
     """The node tree of a YAML document, and its values. Raises YAMLError."""
     loader = kind(text)
     try:
@@ -99,7 +99,7 @@ def shown(value: object) -> str:
     return text if len(text) <= LONGEST else f"{text[:LONGEST]}…"
 
 
-def overridden(sets: list[str] | None) -> dict[str, str]:
+def parse_overrides(sets: list[str] | None) -> dict[str, str]:
     """Keys and values of `--set path.to.key=value`. Raises InputError."""
     overrides = {}
     for item in sets or []:
@@ -116,7 +116,7 @@ def read_yaml(path: Path) -> tuple[dict[str, Any], str]:
         if path.stat().st_size > MOST_BYTES:
             raise InputError(f"{path}: {path.stat().st_size} bytes; allowed: up to {MOST_BYTES}")
         text = path.read_text(encoding="utf-8")
-        node, tree = composed(text)
+        node, tree = parse_yaml(text)
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from error
     except yaml.YAMLError as error:
@@ -126,15 +126,15 @@ def read_yaml(path: Path) -> tuple[dict[str, Any], str]:
         raise InputError(f"{path}{where}: not YAML: {problem}") from error
     if not isinstance(tree, dict):
         raise InputError(f"{path}: allowed: a mapping of keys to values")
-    once(node, path)
+    reject_duplicate_keys(node, path)
     return tree, text
 
 
-def once(node: yaml.Node | None, path: Path) -> None:
+def reject_duplicate_keys(node: yaml.Node | None, path: Path) -> None:
     """Raise InputError for a key that occurs twice in a mapping; YAML would silently use the last."""
     if isinstance(node, yaml.SequenceNode):
         for item in node.value:
-            once(item, path)
+            reject_duplicate_keys(item, path)
     if isinstance(node, yaml.MappingNode):
         seen: set[str] = set()
         for key, value in node.value:
@@ -143,10 +143,10 @@ def once(node: yaml.Node | None, path: Path) -> None:
                     f"{shown(key.value)}: stands twice in one section ({path}, line {key.start_mark.line + 1})"
                 )
             seen.add(str(key.value))
-            once(value, path)
+            reject_duplicate_keys(value, path)
 
 
-def of_our_version(tree: Mapping[str, Any], path: Path, text: str) -> None:
+def check_version(tree: Mapping[str, Any], path: Path, text: str) -> None:
     """Raise InputError for a file of another schema version, before its unknown keys are reported as mistakes."""
     if "schema" not in tree:
         raise InputError(f"schema: missing; add the line schema: {VERSION} ({path})")
@@ -161,7 +161,7 @@ def of_our_version(tree: Mapping[str, Any], path: Path, text: str) -> None:
     raise InputError(f"schema: {what}; allowed: {VERSION} {place_of(['schema'], [(path, text)], {})}")
 
 
-def put(tree: dict[str, Any], key: str, value: str) -> None:
+def set_key(tree: dict[str, Any], key: str, value: str) -> None:
     """Set one dotted key of the raw scene; the value is YAML. A number is an index into a list: `camera_body.2`."""
     *parents, last = key.split(".")
     if not all((*parents, last)):
@@ -174,7 +174,7 @@ def put(tree: dict[str, Any], key: str, value: str) -> None:
                 f"--set {shown(key)}: {shown('.'.join(parents[: depth + 1]))} holds a value, not keys"
             )
     try:
-        node[last if isinstance(node, dict) else place_in(node, last, key)] = composed(value)[1]
+        node[last if isinstance(node, dict) else place_in(node, last, key)] = parse_yaml(value)[1]
     except yaml.YAMLError as error:
         raise InputError(f"--set {shown(key)}: {shown(repr(value))} is not YAML") from error
 

@@ -55,7 +55,7 @@ class Actuators(Protocol):
         ...
 
 
-class Torques:
+class IdealTorque:
     """Ideal actuator: body-axis torques clipped to a limit."""
 
     def __init__(self, ship: World) -> None:
@@ -73,7 +73,7 @@ class Torques:
         return np.zeros(3)
 
 
-class OnWheels:
+class WheelActuator:
     """Reaction wheels; see `actuators.WheelSet`."""
 
     def __init__(self, ship: World, part: WheelsConfig) -> None:
@@ -94,7 +94,7 @@ class OnWheels:
         return self.set.momentum(speeds_rad_s[self.at.dof])
 
 
-class OnCmgs:
+class CmgActuator:
     """Control moment gyroscopes; see `actuators.CmgSet`."""
 
     def __init__(self, ship: World, part: CmgsConfig) -> None:
@@ -131,7 +131,7 @@ class OnCmgs:
         return self.set.momentum(angles_rad[self.gimbals.qpos], speeds_rad_s[self.rotors.dof])
 
 
-class OnFans:
+class FanActuator:
     """Fans, commanded as if they had no lag; see `actuators.FanSet`."""
 
     def __init__(self, ship: World, part: FansConfig) -> None:
@@ -157,14 +157,18 @@ def weakest(command_from_torque: Floats, limit: float) -> float:
 
 
 # The actuator set for each key of `vehicle` that switches one on.
-ACTUATORS: dict[str, Callable[..., Actuators]] = {"wheels": OnWheels, "cmgs": OnCmgs, "fans": OnFans}
+ACTUATORS: dict[str, Callable[..., Actuators]] = {
+    "wheels": WheelActuator,
+    "cmgs": CmgActuator,
+    "fans": FanActuator,
+}
 
 
-class Unloading:
+class MomentumDump:
     """Momentum dumping by fans, with a model of their lag."""
 
     def __init__(self, fans: Actuators, desaturator: Desaturator) -> None:
-        assert isinstance(fans, OnFans)
+        assert isinstance(fans, FanActuator)
         self.fans, self.desaturator = fans, desaturator
         self.blown_nm = np.zeros(3)
 
@@ -193,14 +197,14 @@ class FlightComputer:
         }
         self.nu = ship.model.nu
         self.wanted_nm = np.zeros(3)
-        self.unloading: Unloading | None = None
+        self.unloading: MomentumDump | None = None
         if self.told is None:
             return
-        self.hands = Torques(ship) if self.told.actuators == "ideal" else self.sets[self.told.actuators]
+        self.hands = IdealTorque(ship) if self.told.actuators == "ideal" else self.sets[self.told.actuators]
         authority_nm, fastest_rad_s = self.hands.authority_nm, believable_rad_s(scene)
         self.law = controller(reference, ship.inertia_kg_m2, self.told, authority_nm, fastest_rad_s)
         if self.told.desaturation:
-            self.unloading = Unloading(self.sets["fans"], Desaturator(self.told.desaturation))
+            self.unloading = MomentumDump(self.sets["fans"], Desaturator(self.told.desaturation))
 
     def momentum_nms(self, angles_rad: Floats, speeds_rad_s: Floats) -> Floats:
         """(3,) stored in wheels and CMGs, in body axes; the arguments are all of qpos and qvel."""

@@ -26,7 +26,7 @@ from estimator.calibration.dome_survey import DomeFrame, Survey
 from estimator.core.camera import Camera
 from estimator.core.errors import ImageError
 from estimator.core.types import Centroids
-from estimator.trackers.pipeline import Clock, Settings, see
+from estimator.trackers.pipeline import Clock, Settings, detect_and_centroid
 from skysim.core.errors import InputError
 from skysim.core.types import Floats, Frame, Trajectory, Truth
 from skysim.core.units import quantity
@@ -61,7 +61,7 @@ ROUNDS = 3  # rounds of identification and adjustment; from the second on with t
 
 
 @dataclass(frozen=True, slots=True)
-class Doubt:
+class SurveyUncertainty:
     """Uncertainty before the survey: standard deviations per axis, and a focal length error.
 
     imu_sigma_rad : attitude from the IMU at each frame;  led_sigma_m : position of each LED
@@ -74,7 +74,7 @@ class Doubt:
     focal_error: float
 
 
-def doubt(imu_sigma: str, led_sigma: str, lever_sigma: str, focal_error: str) -> Doubt:
+def doubt(imu_sigma: str, led_sigma: str, lever_sigma: str, focal_error: str) -> SurveyUncertainty:
     """Parse the quantities of the command line. Raises InputError for an invalid or out-of-range value."""
     told = {
         "imu_sigma": imu_sigma,
@@ -92,11 +92,11 @@ def doubt(imu_sigma: str, led_sigma: str, lever_sigma: str, focal_error: str) ->
             raise InputError(f"{option}: {error}") from None
         if not low <= value[name] <= high:
             raise InputError(f"{option} {text}: allowed: {low:g} to {high:g} {unit or 'of it'}")
-    return Doubt(*value.values())
+    return SurveyUncertainty(*value.values())
 
 
 @dataclass(frozen=True, slots=True)
-class Belief:
+class CalibrationPrior:
     """Assumed model of dome and camera, before a survey or from it.
 
     floor_px : added in quadrature to each centroid's sigma, for errors that its noise does not cover
@@ -121,19 +121,19 @@ class Belief:
 
 
 @dataclass(frozen=True, slots=True)
-class Look:
+class SurveyFrame:
     """One frame of a survey: its detections, and the vehicle's attitude from the IMU or a previous adjustment."""
 
     lights: Centroids
     body_from_lab: Rotation
 
 
-def belief_of(lab: Testbed) -> Belief:
+def belief_of(lab: Testbed) -> CalibrationPrior:
     """The onboard model of the tracker of a test bed. Raises InputError for a scene without a dome."""
     light = lab.scene.light
     if not isinstance(light, DomeConfig):
         raise InputError(f"light.kind: {light.kind} has nothing to survey; allowed: dome")
-    return Belief(
+    return CalibrationPrior(
         onboard_model.believed_camera(lab.scene),
         onboard_model.believed_dome(lab.scene, light, lab.sources),
         onboard_model.believed_lever(lab.scene, lab.mount),
@@ -141,14 +141,14 @@ def belief_of(lab: Testbed) -> Belief:
     )
 
 
-class Names(NamedTuple):
+class Correspondences(NamedTuple):
     """Correspondences: rows of a frame's detections, and rows of the map's LEDs that they are matched to."""
 
     light: Ints
     led: Ints
 
 
-def doubted(scene: Scene, doubt: Doubt) -> Scene:
+def with_survey_errors(scene: Scene, doubt: SurveyUncertainty) -> Scene:
     """The scene with the onboard model before a survey: errors of size `doubt`, drawn with `tracker.survey.seed`."""
     errors = {"led_sigma_m": doubt.led_sigma_m, "lever_sigma_m": doubt.lever_sigma_m}
     believed = {
@@ -203,7 +203,9 @@ def frames(lab: Testbed, lab_from_body: Rotation, first: int = 0) -> Iterator[tu
         yield exposure.render_frame(replace(lab, trajectory=still), first + n)
 
 
-def looks(lab: Testbed, belief: Belief, doubt: Doubt, count: int, tilt_deg: float) -> Iterator[Look]:
+def looks(
+    lab: Testbed, belief: CalibrationPrior, doubt: SurveyUncertainty, count: int, tilt_deg: float
+) -> Iterator[SurveyFrame]:
     """Detections and IMU attitude at each of `count` random stops."""
     lab_from_body = attitudes(lab.scene, "attitudes", count, tilt_deg)
     told, settings = (
@@ -211,7 +213,7 @@ def looks(lab: Testbed, belief: Belief, doubt: Doubt, count: int, tilt_deg: floa
         tracker_settings.believed_settings(lab.scene),
     )
     for (frame, _), body_from_lab in zip(frames(lab, lab_from_body), told, strict=True):
-        yield Look(detect_lights(settings, belief.camera, frame), body_from_lab)
+        yield SurveyFrame(detect_lights(settings, belief.camera, frame), body_from_lab)
 
 
 def hints(scene: Scene, lab_from_body: Rotation, sigma_rad: float) -> Rotation:
@@ -223,7 +225,7 @@ def hints(scene: Scene, lab_from_body: Rotation, sigma_rad: float) -> Rotation:
 # --- identification of the LEDs -------------------------------------------------------------------------------
 
 
-def expected_px(belief: Belief, doubt: Doubt) -> tuple[float, float]:
+def expected_px(belief: CalibrationPrior, doubt: SurveyUncertainty) -> tuple[float, float]:
     """Standard deviations per coordinate in pixels: of the common shift of a frame, and of each light individually.
 
     The attitude error across the boresight and the lever arm error shift all lights alike. The LED position error, and
@@ -236,17 +238,17 @@ def expected_px(belief: Belief, doubt: Doubt) -> tuple[float, float]:
     return float(common), float(np.hypot(doubt.led_sigma_m * belief.px_per_m, aside))
 
 
-def by_hint(look: Look, belief: Belief, doubt: Doubt) -> Names:
+def by_hint(look: SurveyFrame, belief: CalibrationPrior, doubt: SurveyUncertainty) -> Correspondences:
     """Match detections to LEDs with the IMU attitude and the declared errors: common shift first, then assignment."""
     common_px, own_px = expected_px(belief, doubt)
     predicted = belief.pixels(look.body_from_lab)
     near = np.flatnonzero(belief.camera.contains(predicted, -GATE * (common_px + own_px)))
     seen = look.lights.xy_px
     if not len(near) or not len(seen):
-        return Names(np.zeros(0, np.int64), np.zeros(0, np.int64))
+        return Correspondences(np.zeros(0, np.int64), np.zeros(0, np.int64))
     moved = predicted[near] + shift_px(seen, predicted[near], common_px, own_px, belief.camera.centre_px)
     light, led = paired(seen, moved, np.full(len(near), GATE * own_px))
-    return Names(light, near[led])
+    return Correspondences(light, near[led])
 
 
 def shift_px(
@@ -284,7 +286,7 @@ def paired(seen_px: Floats, predicted_px: Floats, gate_px: Floats) -> tuple[Ints
     return rows[inside].astype(np.int64), column[inside].astype(np.int64)
 
 
-def by_survey(look: Look, belief: Belief, sigma_px: Floats) -> Names:
+def by_survey(look: SurveyFrame, belief: CalibrationPrior, sigma_px: Floats) -> Correspondences:
     """Match detections to LEDs with the attitudes and map of an adjustment.
 
     sigma_px : (N,) standard deviation of each LED's predicted coordinates
@@ -292,16 +294,16 @@ def by_survey(look: Look, belief: Belief, sigma_px: Floats) -> Names:
     predicted = belief.pixels(look.body_from_lab)
     near = np.flatnonzero(belief.camera.contains(predicted, -GATE * float(sigma_px.max())))
     light, led = paired(look.lights.xy_px, predicted[near], GATE * sigma_px[near])
-    return Names(light, near[led])
+    return Correspondences(light, near[led])
 
 
 # --- the survey ---------------------------------------------------------------------------------------------
 
 
 def surveyed(
-    looks: Sequence[Look],
-    belief: Belief,
-    doubt: Doubt,
+    looks: Sequence[SurveyFrame],
+    belief: CalibrationPrior,
+    doubt: SurveyUncertainty,
     fit_distortion: bool = False,
     watch: Callable[[float, float], None] | None = None,
 ) -> Survey:
@@ -315,7 +317,7 @@ def surveyed(
     found, floor_px, names = None, belief.floor_px, [by_hint(look, belief, doubt) for look in looks]
     for done in range(ROUNDS):
         if found:
-            better = Belief(found.camera, found.leds, found.lever, floor_px)
+            better = CalibrationPrior(found.camera, found.leds, found.lever, floor_px)
             # The attitudes are adjusted now, so only the map's and the residual error remain in the predictions.
             sigma_px = np.hypot(led_sigma_m(found, doubt) * better.px_per_m, max(found.rms_px, floor_px))
             looks = [
@@ -334,16 +336,20 @@ def surveyed(
 
 
 def adjusted(
-    looks: Sequence[Look], names: Sequence[Names], belief: Belief, doubt: Doubt, fit_distortion: bool
-) -> tuple[list[Look], Survey]:
+    looks: Sequence[SurveyFrame],
+    names: Sequence[Correspondences],
+    belief: CalibrationPrior,
+    doubt: SurveyUncertainty,
+    fit_distortion: bool,
+) -> tuple[list[SurveyFrame], Survey]:
     """Adjust the largest group of connected frames. Returns its frames and the survey.
 
     A frame may be connected only by misidentified lights. The adjustment rejects these and then fails, so it is tried
     again with a larger minimum number of shared lights (LINKS). Raises InputError if the last attempt fails.
     """
-    shown = crossed(looks, names, belief)
+    shown = led_visibility(looks, names, belief)
     for links in LINKS:
-        kept = linked(shown, links)
+        kept = largest_connected_group(shown, links)
         sightings = [
             sighting(looks[k].lights, names[k].light, names[k].led, looks[k].body_from_lab, belief.floor_px)
             for k in kept
@@ -360,7 +366,9 @@ def adjusted(
     return [looks[k] for k in kept], found
 
 
-def crossed(looks: Sequence[Look], names: Sequence[Names], belief: Belief) -> NDArray[np.bool_]:
+def led_visibility(
+    looks: Sequence[SurveyFrame], names: Sequence[Correspondences], belief: CalibrationPrior
+) -> NDArray[np.bool_]:
     """(F, N) mask of the LEDs in each frame, without LEDs whose rays are nearly parallel in all frames.
 
     Such an LED, seen from camera positions close together, has no measurable distance and connects no frames.
@@ -377,7 +385,7 @@ def crossed(looks: Sequence[Look], names: Sequence[Names], belief: Belief) -> ND
     return shown & (angle_rad > CROSSING_RAD)
 
 
-def linked(shown: NDArray[np.bool_], links: int) -> list[int]:
+def largest_connected_group(shown: NDArray[np.bool_], links: int) -> list[int]:
     """Indices of the largest group of frames connected by shared LEDs.
 
     shown : (F, N) mask of the LEDs in each frame
@@ -403,7 +411,7 @@ def linked(shown: NDArray[np.bool_], links: int) -> list[int]:
     return np.flatnonzero(best).tolist()
 
 
-def led_sigma_m(found: Survey, doubt: Doubt) -> Floats:
+def led_sigma_m(found: Survey, doubt: SurveyUncertainty) -> Floats:
     """(N,) standard deviation of each LED's position, RMS of three axes; that before the survey if not surveyed."""
     variance_m2 = np.einsum("nii->n", found.led_covariance_m2) / 3
     return np.sqrt(np.where(found.surveyed, variance_m2, doubt.led_sigma_m**2))
@@ -415,7 +423,7 @@ def lens_sigma(found: Survey) -> Floats:
     return np.concatenate([fitted, np.zeros(8 - len(fitted))])
 
 
-def dome_map(found: Survey, doubt: Doubt) -> DomeMap:
+def dome_map(found: Survey, doubt: SurveyUncertainty) -> DomeMap:
     """The map file of a survey for the tracker: surveyed LEDs, lever arm, lens, and their standard deviations."""
     kept = found.surveyed
     focal_sigma_px, x_sigma_px, y_sigma_px, *k_sigma = lens_sigma(found).tolist()
@@ -438,7 +446,7 @@ def dome_map(found: Survey, doubt: Doubt) -> DomeMap:
 def detect_lights(settings: Settings, camera: Camera, frame: Frame) -> Centroids:
     """Centroids of a frame; none if the tracker would reject the image."""
     try:
-        return see(frame.image_dn, camera, settings, Clock())
+        return detect_and_centroid(frame.image_dn, camera, settings, Clock())
     except ImageError:
         return Centroids.none()
 

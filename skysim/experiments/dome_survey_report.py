@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from estimator.calibration.dome_survey import Survey
 from skysim.core.types import Floats, Frame, Truth
-from skysim.experiments.dome_survey import Belief, Doubt, led_sigma_m, lens_sigma
+from skysim.experiments.dome_survey import CalibrationPrior, SurveyUncertainty, led_sigma_m, lens_sigma
 from skysim.results import metrics
 from skysim.simulation.testbed import Testbed
 from skysim.tracking import factory
@@ -43,13 +43,13 @@ def checked(
     for frame, truth in shots:
         stops += 1
         for name, tracker in eyes.items():
-            told = factory.answer(tracker, frame).attitude.cam_from_ref
+            told = factory.solve_frame(tracker, frame).attitude.cam_from_ref
             if told is not None:
                 errors[name].append(metrics.cross_and_roll_rad(told, truth.cam_from_lab))
     return {name: Check(stops, *np.array(off).reshape(-1, 2).T).figures() for name, off in errors.items()}
 
 
-class Misplaced(NamedTuple):
+class LedErrors(NamedTuple):
     """The S surveyed LEDs: true positions (S, 3), position errors before and after the survey (S, 3), renamed (S,).
 
     If the map before the survey has two LEDs each closer to the other's true position, the survey may exchange their
@@ -63,18 +63,20 @@ class Misplaced(NamedTuple):
     renamed: NDArray[np.bool_]
 
 
-def misplaced(found: Survey, belief: Belief, lab: Testbed) -> Misplaced:
+def misplaced(found: Survey, belief: CalibrationPrior, lab: Testbed) -> LedErrors:
     """LED position errors before and after the survey."""
     true_m = lab.sources.place[:, :3]
     row = np.flatnonzero(found.surveyed)
     place_m = found.leds.position_m[row]
     _, nearest = cKDTree(true_m).query(place_m)
-    return Misplaced(
+    return LedErrors(
         true_m[row], belief.leds.position_m[row] - true_m[row], place_m - true_m[nearest], nearest != row
     )
 
 
-def figures(found: Survey, belief: Belief, lab: Testbed, doubt: Doubt) -> dict[str, Any]:
+def figures(
+    found: Survey, belief: CalibrationPrior, lab: Testbed, doubt: SurveyUncertainty
+) -> dict[str, Any]:
     """Statistics of a survey. `values` holds one row per lens and lever parameter: believed, found, truth, sigma."""
     sigma_mm = 1e3 * led_sigma_m(found, doubt)[found.surveyed]
     off = misplaced(found, belief, lab)
@@ -109,7 +111,7 @@ def figures(found: Survey, belief: Belief, lab: Testbed, doubt: Doubt) -> dict[s
     }
 
 
-def figure(off: Misplaced) -> NDArray[np.uint8]:
+def figure(off: LedErrors) -> NDArray[np.uint8]:
     """BGR image of the dome from above with arrows for the errors of the surveyed LEDs before and after the survey.
 
     Each panel has its own arrow scale, shown in its key; color is the vertical error.

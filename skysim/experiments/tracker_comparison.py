@@ -78,7 +78,7 @@ def shots(
         answers = {}
         for name in order:
             report = lab.reports.get(frame.index) if name == flown else None
-            report = report or factory.answer(estimators[name], frame)
+            report = report or factory.solve_frame(estimators[name], frame)
             answers[name] = scoring.row(FrameResult(frame, truth, report, seconds), lab.scene, lab.mount)
         yield frame, truth, answers
         order.append(order.pop(0))

@@ -24,6 +24,7 @@ from skysim.core.units import ARCSEC_RAD
 from skysim.results import report, scoring, telemetry_report
 from skysim.results.files.frames import clear, write_frame
 from skysim.scene.scene import Scene
+from skysim.simulation import exposure
 from skysim.simulation import run as simulation
 from skysim.simulation.testbed import Testbed, build_testbed, tracker
 from skysim.tracking.factory import NO_PROGRAMS
@@ -209,7 +210,7 @@ def render(scene: Scene, index: int = 0) -> tuple[Frame, Truth]:
         raise InputError(f"index: {index} is outside of the scene's frames; allowed: 0 to {frames - 1}")
     testbed = simulation.prepare(scene)
     if scene.tracker.exposure_control is None and index not in testbed.exposures_s:
-        return simulation.render_frame(testbed, index)
+        return exposure.render_frame(testbed, index)
     return next(
         (frame, truth) for frame, truth, _ in simulation.render_frames(testbed) if frame.index == index
     )

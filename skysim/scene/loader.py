@@ -19,11 +19,8 @@ from pydantic import ValidationError
 from skysim.core import yaml_reader
 from skysim.core.errors import InputError
 from skysim.core.paths import DATA, SCENES
-from skysim.core.units import (
-    ConfigModel,
-    quantity,
-)
-from skysim.core.yaml_reader import Files, explain, is_file, of_our_version, place_of, put, read_yaml
+from skysim.core.units import ConfigModel, quantity
+from skysim.core.yaml_reader import Files, check_version, explain, is_file, place_of, read_yaml, set_key
 from skysim.scene.camera import CameraConfig, focus_distance
 from skysim.scene.opencv_calibration import read as read_calibration
 from skysim.scene.scene import STEM, Scene
@@ -52,13 +49,13 @@ def with_preset(tree: dict[str, Any]) -> dict[str, Any]:
     own = {key: value for key, value in part.items() if key not in ("preset", "calibration")}
     below = preset(str(part["preset"]), "camera.preset") if part.get("preset") is not None else {}
     if part.get("calibration") is None:
-        return tree | {"camera": over(below, own)}
+        return tree | {"camera": merge(below, own)}
     for key in CALIBRATED:
         if own.pop(key, None) is not None:
             raise InputError(
                 f"camera.{key}: the file of camera.calibration tells it; allowed: one of the two (null for a base's)"
             )
-    whole = over(below, own)
+    whole = merge(below, own)
     return tree | {"camera": whole | calibrated(Path(str(part["calibration"])), whole)}
 
 
@@ -96,7 +93,7 @@ def calibrated(path: Path, part: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def over(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
+def merge(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
     """Merge two mappings, `above` over `below`, recursively; sections of different kinds are replaced, not merged."""
     merged = below | above
     for key, value in above.items():
@@ -104,7 +101,7 @@ def over(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
         if not isinstance(value, dict) or not isinstance(ground, dict):
             continue
         if value.get("kind") in (None, ground.get("kind")):
-            merged[key] = over(ground, value)
+            merged[key] = merge(ground, value)
     return merged
 
 
@@ -127,9 +124,9 @@ def load(name: str | Path, overrides: Mapping[str, str] | None = None) -> Scene:
     path = find(str(name))
     tree, files = read(path)
     for key, value in (overrides or {}).items():
-        put(tree, key, value)
+        set_key(tree, key, value)
     try:
-        raw = beneath(tree, files, overrides or {})
+        raw = apply_preset(tree, files, overrides or {})
         return Scene.model_validate(raw | {STEM: path.stem})
     except ValidationError as error:
         raise InputError(explain(error, Scene, tree, files, overrides or {})) from None
@@ -151,7 +148,7 @@ def list_scenes() -> list[str]:
     return sorted(path.stem for path in SCENES.glob("*.yaml"))
 
 
-def where(message: str, name: str, overrides: Mapping[str, str]) -> str:
+def with_location(message: str, name: str, overrides: Mapping[str, str]) -> str:
     """A message that begins with a scene's key, with file and line appended; any other message unchanged."""
     key = message.partition(":")[0]
     # Unchanged: messages that do not begin with a key of the scene, or that already end with a place.
@@ -169,8 +166,8 @@ def read(path: Path, above: tuple[Path, ...] = ()) -> tuple[dict[str, Any], File
     """A scene's keys merged over those of its `base` scene, and the files read, this one first. Raises InputError."""
     tree, text = read_yaml(path)
     if above or tree.keys() != {"camera"}:  # a file with a camera only has no schema version
-        of_our_version(tree, path, text)
-    tree = beside(path, tree)
+        check_version(tree, path, text)
+    tree = resolve_files(path, tree)
     if "base" not in tree:
         return tree, [(path, text)]
     base = tree.pop("base")
@@ -182,10 +179,10 @@ def read(path: Path, above: tuple[Path, ...] = ()) -> tuple[dict[str, Any], File
     if below.resolve() in above or below.resolve() == path.resolve():
         raise InputError(f"base: {base} is this scene itself, or has it for its base {place}")
     beneath_it, files = read(below, (*above, path.resolve()))
-    return over(beneath_it, tree), [(path, text), *files]
+    return merge(beneath_it, tree), [(path, text), *files]
 
 
-def beneath(tree: dict[str, Any], files: Files, overrides: Mapping[str, str]) -> dict[str, Any]:
+def apply_preset(tree: dict[str, Any], files: Files, overrides: Mapping[str, str]) -> dict[str, Any]:
     """`with_preset`, with file and line added to its errors."""
     try:
         return with_preset(tree)
@@ -206,18 +203,18 @@ FILES = (
 )
 
 
-def beside(path: Path, tree: dict[str, Any]) -> dict[str, Any]:
+def resolve_files(path: Path, tree: dict[str, Any]) -> dict[str, Any]:
     """The scene with file names made absolute if such a file exists in the scene's folder."""
     for keys in FILES:
-        tree = anchored(path.resolve().parent, tree, *keys)
+        tree = resolve_file(path.resolve().parent, tree, *keys)
     return tree
 
 
-def anchored(folder: Path, tree: dict[str, Any], key: str, *inner: str) -> dict[str, Any]:
+def resolve_file(folder: Path, tree: dict[str, Any], key: str, *inner: str) -> dict[str, Any]:
     """The mapping with the file name under these nested keys made absolute if the file is in the folder."""
     value = tree.get(key)
     if inner and isinstance(value, dict):
-        return tree | {key: anchored(folder, value, *inner)}
+        return tree | {key: resolve_file(folder, value, *inner)}
     if not inner and isinstance(value, str) and is_file(folder / value):
         return tree | {key: str(folder / value)}
     return tree
@@ -232,7 +229,7 @@ def load_camera(path: Path, lens: Mapping[str, Any] | None = None) -> CameraConf
     if isinstance(tree.get("camera"), dict):
         tree = tree | {"camera": {**(lens or {}), **tree["camera"]}}
     try:
-        own = beside(path, {key: tree[key] for key in tree if key == "camera"})
-        return CameraFileConfig.model_validate(beneath(own, files, {})).camera
+        own = resolve_files(path, {key: tree[key] for key in tree if key == "camera"})
+        return CameraFileConfig.model_validate(apply_preset(own, files, {})).camera
     except ValidationError as error:
         raise InputError(explain(error, CameraFileConfig, tree, files, {})) from None

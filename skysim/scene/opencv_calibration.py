@@ -10,7 +10,7 @@ from typing import Any
 import yaml
 
 from skysim.core.errors import InputError
-from skysim.core.yaml_reader import Careful, composed, shown
+from skysim.core.yaml_reader import StrictLoader, parse_yaml, shown
 
 MOST_BYTES = 1 << 20  # enough for a calibration with the points of all its views
 SQUARE = (
@@ -36,7 +36,7 @@ class Calibration:
     distortion: tuple[float, float, float, float, float]
 
 
-class Loader(Careful):
+class Loader(StrictLoader):
     """`Careful`, with OpenCV's matrices as mappings."""
 
 
@@ -101,7 +101,7 @@ def parsed(path: Path) -> dict[str, Any]:
             raise InputError(f"{path}: more than {MOST_BYTES >> 20} MiB; allowed: a calibration of OpenCV")
         text = data.decode("utf-8")
         first, _, rest = text.partition("\n")
-        _, tree = composed(rest if first.startswith("%YAML") else text, Loader)
+        _, tree = parse_yaml(rest if first.startswith("%YAML") else text, Loader)
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from None
     except (yaml.YAMLError, ValueError, RecursionError, TypeError, OverflowError) as error:

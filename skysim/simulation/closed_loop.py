@@ -151,7 +151,7 @@ class OnboardCamera:
                 continue
             frame, truth = render_frame(aloft.here(when.open_s), self.index, clock, when.exposure_s)
             self.meter.see(frame)
-            report = factory.answer(self.tracker, frame) if self.tracker else None
+            report = factory.solve_frame(self.tracker, frame) if self.tracker else None
             # The filter takes the solution at its mid-exposure time, although it arrives later.
             told = aloft.navigation if scene.filter and report else None
             verdict = told.see(frame.t_mid_s, report.attitude) if told and report else ""

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from estimator.trackers.pipeline import Clock
 from skysim.camera import background, display_glow
-from skysim.camera.detector.detector import expose, judge, saturation_dn, smear
+from skysim.camera.detector.detector import add_snr_and_saturation, expose, saturation_dn, smear
 from skysim.camera.render import Poses, in_view, look, render
 from skysim.core.types import Frame, Truth
 from skysim.dynamics import multibody
@@ -47,16 +47,16 @@ def render_frame(
     seen = render(light_e, lab.sources, lab.optics, lab.trajectory, lab.mount, when, lab.emitter, hides)
     smear(light_e, when.exposure_s, lab.chip.shutter)
     # Saturation and SNR need the light of the whole frame, which `expose` then overwrites.
-    seen = judge(seen, light_e, when.exposure_s, lab.chip)
+    seen = add_snr_and_saturation(seen, light_e, when.exposure_s, lab.chip)
     clock.lap("render")
     image = expose(light_e, when.exposure_s, lab.chip, rng(scene.seed, "detector", index))
     clock.lap("detector")
     rate_cam = lab.mount.cam_from_body.apply(lab.trajectory.rate_at(middle_s))
-    truth = Truth(middle_s, lab_from_body, cam_from_lab, rate_cam, seen, behind_things(lab, lab_from_body))
+    truth = Truth(middle_s, lab_from_body, cam_from_lab, rate_cam, seen, occluded_ids(lab, lab_from_body))
     return Frame(index, image, middle_s, when.exposure_s, saturation_dn(camera.detector)), truth
 
 
-def behind_things(lab: Testbed, lab_from_body: Rotation) -> NDArray[np.int64]:
+def occluded_ids(lab: Testbed, lab_from_body: Rotation) -> NDArray[np.int64]:
     """(M,) ids of the occluded sources that would otherwise be on the chip at that attitude."""
     if lab.obstacles is None:
         return np.zeros(0, np.int64)

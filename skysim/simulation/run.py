@@ -21,7 +21,7 @@ from skysim.tracking import factory
 from skysim.tracking.exposure_control import ExposureController
 from skysim.tracking.external.adapter import ExternalTracker
 
-Watch = Callable[[float, float], None]
+ProgressCallback = Callable[[float, float], None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,7 +34,7 @@ class FrameResult:
     seconds: dict[str, float]
 
 
-def prepare(scene: Scene, watch: Watch | None = None) -> Testbed:
+def prepare(scene: Scene, watch: ProgressCallback | None = None) -> Testbed:
     """Build the test bed and simulate its motion up to the end of the last exposure.
 
     watch(t_s, duration_s) is called after every control period.
@@ -42,7 +42,7 @@ def prepare(scene: Scene, watch: Watch | None = None) -> Testbed:
     return simulate_motion(build_testbed(scene), watch)
 
 
-def simulate_motion(lab: Testbed, watch: Watch | None = None) -> Testbed:
+def simulate_motion(lab: Testbed, watch: ProgressCallback | None = None) -> Testbed:
     """Return the test bed with its simulated motion, telemetry and IMU record.
 
     Each step is a control period: the flight computer sets the controls, MuJoCo integrates, the IMU samples. With
@@ -120,12 +120,12 @@ def warm_up(lab: Testbed, estimator: factory.Estimator) -> None:
     """
     frame, _ = render_frame(lab, 0)
     if not isinstance(estimator, ExternalTracker):
-        factory.answer(estimator, frame)
+        factory.solve_frame(estimator, frame)
 
 
 def run(lab: Testbed, estimator: factory.Estimator) -> Iterator[FrameResult]:
     """Render and solve the frames in order; reuse the reports of frames that were solved during the motion."""
     warm_up(lab, estimator)
     for frame, truth, seconds in render_frames(lab):
-        report = lab.reports.get(frame.index) or factory.answer(estimator, frame)
+        report = lab.reports.get(frame.index) or factory.solve_frame(estimator, frame)
         yield FrameResult(frame, truth, report, seconds)

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from skysim.core.types import Floats, Telemetry
-from skysim.dynamics.flight_computer import FlightComputer, OnCmgs
+from skysim.dynamics.flight_computer import CmgActuator, FlightComputer
 from skysim.dynamics.guidance import Reference
 from skysim.dynamics.multibody import Flight
 from skysim.tracking.navigation import Navigation
@@ -83,7 +83,7 @@ class TelemetryRecorder:
             states[:, 1 + nq + ship.wheels.dof],
             gimbals,
             states[:, 1 : 1 + nq].copy(),
-            cmgs.set.manipulability(gimbals, rotors) if isinstance(cmgs, OnCmgs) else None,
+            cmgs.set.manipulability(gimbals, rotors) if isinstance(cmgs, CmgActuator) else None,
             reference.attitudes(t_s) if reference else None,
             turned(self.imu_wxyz) if listens else None,
             self.saturated if listens else None,

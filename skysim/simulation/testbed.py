@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from estimator.trackers.pipeline import Report
-from skysim.camera.detector.detector import Chip
+from skysim.camera.detector.detector import Detector
 from skysim.camera.optics import Optics
 from skysim.camera.psf.otf import EXTENT
 from skysim.camera.render import Window
@@ -66,7 +66,7 @@ class Testbed:
     sources: Sources
     emitter: Emitter
     optics: Optics
-    chip: Chip
+    chip: Detector
     band: Band
     canvas: NDArray[Any]
     trajectory: Trajectory
@@ -120,7 +120,7 @@ def build_testbed(scene: Scene, programs: Mapping[str, str] = factory.NO_PROGRAM
         light_sources(scene, band),
         Emitter.of(scene.light.led) if isinstance(scene.light, DomeConfig) else Emitter(),
         Optics.of(scene.camera),
-        Chip.of(scene.camera),
+        Detector.of(scene.camera),
         band,
         np.empty((scene.camera.height_px, scene.camera.width_px), kind),
         Trajectory.at_rest(start, 1.0),
@@ -138,7 +138,7 @@ def obstacles(scene: Scene, ship: multibody.World) -> multibody.Obstacles | None
     )
 
 
-def staged(lab: Testbed) -> str:
+def export_mjcf(lab: Testbed) -> str:
     """The test bed as MJCF text, for MuJoCo's viewer and for pictures."""
     return mjcf_export.mjcf(lab.ship, lab.scene, lab.sources, lab.trajectory.lab_from_body[0])
 

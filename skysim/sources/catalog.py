@@ -20,7 +20,7 @@ from skysim.core import files
 from skysim.core.errors import InputError
 from skysim.core.paths import CATALOGUES
 from skysim.core.types import Floats
-from skysim.core.yaml_reader import composed
+from skysim.core.yaml_reader import parse_yaml
 
 EPOCH_JYEAR = 1991.25
 MAS_RAD = np.pi / 180 / 3.6e6
@@ -186,7 +186,7 @@ def write(path: Path, rows: list[dict[str, Any]], meta: dict[str, Any], extra: t
     head = {"delimiter": ",", "datatype": datatype}
     comment = yaml.safe_dump(head, sort_keys=False, default_flow_style=None)
     comment += yaml.safe_dump({"meta": meta | {"rows": len(rows)}}, sort_keys=False, width=105)
-    with files.whole(path) as temporary, open(temporary, "w", encoding="utf-8", newline="") as out:
+    with files.atomic_file(path) as temporary, open(temporary, "w", encoding="utf-8", newline="") as out:
         out.writelines(f"# {line}\n" for line in ["%ECSV 1.0", "---", *comment.splitlines(), SCHEMA])
         table = csv.writer(out, lineterminator="\n")
         table.writerow([*NAMES, *texts])
@@ -239,7 +239,7 @@ def split(path: Path) -> tuple[dict[str, Any], list[str]]:
         raise bad(path, f"it cannot be read ({error})") from error
     size = next((n for n, line in enumerate(lines) if not line.startswith("#")), len(lines))
     try:
-        meta = composed("\n".join(line[2:] for line in lines[1:size]))[1]["meta"]
+        meta = parse_yaml("\n".join(line[2:] for line in lines[1:size]))[1]["meta"]
         whole = lines[size].split(",")[: len(NAMES)] == NAMES and {"rows", "epoch_jyear"} <= set(meta)
     except (yaml.YAMLError, TypeError, KeyError, IndexError) as error:
         raise bad(path, "its header is not a skysim catalogue's") from error

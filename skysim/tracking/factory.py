@@ -63,7 +63,7 @@ def tracker(
     return StarTracker(camera, stars, directions, settings)
 
 
-def answer(estimator: Estimator, frame: Frame, streak_px: tuple[float, float] | None = None) -> Report:
+def solve_frame(estimator: Estimator, frame: Frame, streak_px: tuple[float, float] | None = None) -> Report:
     """The tracker's report on a frame; an image that it refuses (empty, saturated) gives a report with that status.
 
     streak_px : (dx, dy) that lights move in the exposure, if a gyro measures it

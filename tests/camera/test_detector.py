@@ -12,7 +12,7 @@ import pytest
 from scipy import stats
 
 from skysim.camera.detector import detector
-from skysim.camera.detector.detector import Chip
+from skysim.camera.detector.detector import Detector
 from skysim.core.types import SourceTruth
 from skysim.scene.camera import CameraConfig
 
@@ -28,12 +28,12 @@ CLEAN = {
 LENS = {"pixel": "5 um", "focal_length": "25 mm", "f_number": 2}
 
 
-def chip(shape: tuple[int, int] = SHAPE, shutter: dict[str, Any] | None = None, **changes: Any) -> Chip:
+def chip(shape: tuple[int, int] = SHAPE, shutter: dict[str, Any] | None = None, **changes: Any) -> Detector:
     part = LENS | {"height_px": shape[0], "width_px": shape[1], "detector": CLEAN | changes}
-    return Chip.of(CameraConfig.model_validate(part | ({"shutter": shutter} if shutter else {})))
+    return Detector.of(CameraConfig.model_validate(part | ({"shutter": shutter} if shutter else {})))
 
 
-def expose(light_e: np.ndarray, made: Chip, seed: int = 1, exposure_s: float = 0.05) -> np.ndarray:
+def expose(light_e: np.ndarray, made: Detector, seed: int = 1, exposure_s: float = 0.05) -> np.ndarray:
     kind = np.float32 if made.part.noise else np.float64
     return detector.expose(light_e.astype(kind), exposure_s, made, np.random.default_rng(seed)).astype(float)
 
@@ -326,9 +326,9 @@ def test_the_mean_of_many_frames_is_the_frame_without_noise() -> None:
 DRAW = """
 import sys, numba, numpy as np
 from skysim.scene.camera import CameraConfig
-from skysim.camera.detector.detector import Chip, expose
+from skysim.camera.detector.detector import Detector, expose
 numba.set_num_threads(int(sys.argv[1]))
-made = Chip.of(CameraConfig.model_validate(eval(sys.argv[2])))
+made = Detector.of(CameraConfig.model_validate(eval(sys.argv[2])))
 frames = [expose(np.full((64, 48), 100, np.float32), 0.05, made, np.random.default_rng(s)) for s in (4, 5)]
 sys.stdout.buffer.write(np.array(frames).tobytes())
 """
@@ -382,7 +382,7 @@ def test_signal_to_noise_is_what_repeated_photometry_scatters() -> None:
     light_e = np.full((64, 32), 30.0)
     light_e[28:33, 8:13] += 40
     made = chip((64, 32), read_noise_e=10.0, gain_e_dn=12.0, offset_dn=20.0)
-    told = detector.judge(seen(1000.0, 25.0, 40.0), light_e.astype(np.float32), 0.05, made)
+    told = detector.add_snr_and_saturation(seen(1000.0, 25.0, 40.0), light_e.astype(np.float32), 0.05, made)
     sums = [(expose(light_e, made, n)[28:33, 8:13]).sum() * 12.0 for n in range(400)]
     assert told.snr[0] == pytest.approx(1000 / np.std(sums), rel=4 / np.sqrt(2 * 400))
     assert not told.saturated[0]
@@ -391,5 +391,7 @@ def test_signal_to_noise_is_what_repeated_photometry_scatters() -> None:
 @pytest.mark.parametrize(("peak_e", "full"), [(39000.0, False), (41000.0, True)])
 def test_a_source_is_saturated_where_its_brightest_pixel_is(peak_e: float, full: bool) -> None:
     made = chip((64, 32), full_well_e=40000.0, gain_e_dn=10.0, offset_dn=64.0)
-    told = detector.judge(seen(peak_e, 1.0, peak_e), spot(peak_e).astype(np.float32), 0.05, made)
+    told = detector.add_snr_and_saturation(
+        seen(peak_e, 1.0, peak_e), spot(peak_e).astype(np.float32), 0.05, made
+    )
     assert told.saturated[0] == full

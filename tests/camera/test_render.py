@@ -13,7 +13,7 @@ from scipy.special import erf
 from scipy.stats import ncx2
 
 from skysim.camera import render as rendering
-from skysim.camera.detector.detector import Chip, expose
+from skysim.camera.detector.detector import Detector, expose
 from skysim.camera.optics import Optics
 from skysim.camera.render import Window, render
 from skysim.core.errors import InputError
@@ -655,7 +655,7 @@ def test_centroids_follow_the_cramer_rao_bound(
 ) -> None:
     """Reference §3, sigma .7: within a tenth, 600 stars at 30 places within a pixel, through optics and detector."""
     rng, errors = np.random.default_rng(int(electrons + read_noise_e)), []
-    chip = Chip.of(
+    chip = Detector.of(
         lens_of(
             width_px=16, height_px=16,
             detector={"quantum_efficiency": 0.5, "full_well_e": 1e6, "gain_e_dn": 1, "bits": 16,

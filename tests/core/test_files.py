@@ -213,7 +213,7 @@ def test_under_the_dome_there_is_no_wcs(tmp_path: Path, dome: Shot) -> None:
 
 
 def break_off(path: Path, words: str) -> None:
-    with files.whole(path) as temporary:
+    with files.atomic_file(path) as temporary:
         temporary.write_text(words)
         raise KeyboardInterrupt
 
@@ -248,7 +248,7 @@ def test_an_interrupt_leaves_the_old_folder_or_the_new(
         raise KeyboardInterrupt
 
     def shoot(text: str) -> None:
-        with files.whole_folder(film) as folder:
+        with files.atomic_folder(film) as folder:
             folder.mkdir()
             (folder / "zarr.json").write_text(text)
 
@@ -293,7 +293,7 @@ def test_what_a_killed_process_left_is_swept_and_nothing_else(tmp_path: Path) ->
         f"-{pid}.", f"-{os.getpid()}."
     )  # of an earlier process by our number
     ours_before.write_text("half")
-    with files.whole(tmp_path / "truth.ecsv") as temporary:
+    with files.atomic_file(tmp_path / "truth.ecsv") as temporary:
         temporary.write_text("whole")
         files.make_folder(tmp_path)
     assert {path.name for path in tmp_path.iterdir()} == others | {"truth.ecsv"}

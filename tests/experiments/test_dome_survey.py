@@ -81,7 +81,7 @@ def told(folder: Path) -> dict[str, Any]:
 @pytest.fixture(scope="module")
 def lab(folder: Path) -> Testbed:
     """The small dome as it is believed before the survey."""
-    return testbed.build_testbed(dome_survey.doubted(loader.load(folder / "small.yaml"), DOUBT))
+    return testbed.build_testbed(dome_survey.with_survey_errors(loader.load(folder / "small.yaml"), DOUBT))
 
 
 # --- end to end ---------------------------------------------------------------------------------------------
@@ -140,7 +140,7 @@ def test_a_scene_beside_the_file_believes_it(told: dict[str, Any], folder: Path)
     found = {row["what"]: row["found"] for row in told["values"]}
     assert eyes.camera.focal_px == pytest.approx(found["focal length px"], rel=1e-12)
     ((frame, truth),) = dome_survey.frames(lab, dome_survey.attitudes(lab.scene, "checks", 1, 10.0))
-    answer = factory.answer(eyes, frame).attitude
+    answer = factory.solve_frame(eyes, frame).attitude
     assert answer.cam_from_ref is not None
     assert np.degrees((answer.cam_from_ref * truth.cam_from_lab.inv()).magnitude()) < 0.1
 
@@ -243,8 +243,8 @@ def test_frames_that_hang_on_no_others_are_left_out() -> None:
     table = np.zeros((len(shown), 13), dtype=bool)
     for row, leds in zip(table, shown, strict=True):
         row[leds] = True
-    assert dome_survey.linked(table, 3) == [0, 1, 2]
-    assert dome_survey.linked(table[3:], 3) == [0, 1]
+    assert dome_survey.largest_connected_group(table, 3) == [0, 1, 2]
+    assert dome_survey.largest_connected_group(table[3:], 3) == [0, 1]
 
 
 # --- the file -----------------------------------------------------------------------------------------------

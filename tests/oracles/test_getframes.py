@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from skysim.camera.detector import detector
-from skysim.camera.detector.detector import Chip
+from skysim.camera.detector.detector import Detector
 from skysim.scene.camera import CameraConfig
 
 gf = pytest.importorskip("getframes")
@@ -35,7 +35,7 @@ def both(mean_e: float, exposure_s: float = 0.5, **part: Any) -> tuple[np.ndarra
         "focal_length": "25 mm",
         "f_number": 2,
     }
-    chip = Chip.of(CameraConfig.model_validate(lens | {"detector": ours}))
+    chip = Detector.of(CameraConfig.model_validate(lens | {"detector": ours}))
     rng = np.random.default_rng(1)
     light = np.full(SHAPE, mean_e, np.float32)
     mine = np.array([detector.expose(light.copy(), exposure_s, chip, rng) for _ in range(FRAMES)], float)

@@ -15,7 +15,7 @@ from skysim.scene import leds as led_schema
 from skysim.scene.light import DomeConfig
 from skysim.sources import catalog, dome
 from skysim.sources.dome.placement import fisher, optimize
-from skysim.sources.dome.placement.ambiguity import likeness
+from skysim.sources.dome.placement.ambiguity import field_ambiguity
 from skysim.sources.photometry import Band, star_flux_e_s_m2
 
 MEASURED = {"kind": "ellipsoid", "apex": "48 in", "semi_axes": ["38.88 in", "38.88 in", "28.60 in"]}
@@ -93,7 +93,7 @@ def sparse_is_not_worse(seed: int, **more: int) -> None:
     unseen = optimize.attitudes(part, 100_000, np.random.default_rng(77))
 
     def worst(leds: Sources) -> float:
-        each = fisher.variances(fisher.told(leds.place[:, :3], unseen, *optimize.camera(part)))
+        each = fisher.variances(fisher.total_information(leds.place[:, :3], unseen, *optimize.camera(part)))
         return float(np.sort(each)[-1000:].mean())
 
     mine = worst(lit(wanted))
@@ -141,8 +141,8 @@ def test_its_information_is_the_estimator_s(best: Sources) -> None:
     """The same law in two pieces of code: sum J'J against the covariance of the exact solve at the truth, level."""
     part, place_m = led_schema.OptimisedConfig.model_validate(WANTED), best.place[:, :3]
     judged = [np.eye(3)[None], np.array(part.camera_m), optimize.tan_half(part)]
-    seen = fisher.Seen(*fisher.look(place_m, *judged))
-    total = fisher.told(place_m, *judged)[0]
+    seen = fisher.Visibility(*fisher.visible_from(place_m, *judged))
+    total = fisher.total_information(place_m, *judged)[0]
     q = place_m[np.diff(seen.start) == 1] - part.camera_m
     assert total[6] == len(q) >= 5
     rays = q / np.linalg.norm(q, axis=1, keepdims=True)
@@ -170,12 +170,14 @@ def test_a_field_that_is_turned_about_the_bearing_is_wholly_alike_and_its_mirror
         np.radians(6),
         1e-4,
     )  # each LED in the middle of its pattern has all others about it
-    whole = likeness(np.concatenate([pattern, turned]), *seen)
+    whole = field_ambiguity(np.concatenate([pattern, turned]), *seen)
     assert whole.share[0] == 1
     np.testing.assert_array_equal(whole.other[[0, 7]], [7, 0])
-    assert likeness(np.concatenate([pattern, turned[:5]]), *seen).share[0] == pytest.approx(5 / 7, abs=1e-12)
+    assert field_ambiguity(np.concatenate([pattern, turned[:5]]), *seen).share[0] == pytest.approx(
+        5 / 7, abs=1e-12
+    )
     mirrored = turned.copy() @ np.diag([1.0, -1.0, 1.0])
-    assert likeness(np.concatenate([pattern, mirrored]), *seen).share[0] < 0.5
+    assert field_ambiguity(np.concatenate([pattern, mirrored]), *seen).share[0] < 0.5
 
 
 def test_leds_that_are_off_by_more_than_the_tolerance_do_not_coincide() -> None:
@@ -183,7 +185,9 @@ def test_leds_that_are_off_by_more_than_the_tolerance_do_not_coincide() -> None:
     turned = Rotation.from_euler("ZYZ", [40, 30, 75], degrees=True).apply(pattern)
     turned[4] += [0.0, 2e-3, 0.0]
     for alike_m, coincide in ((1e-4, 5), (3e-3, 6)):
-        found = likeness(np.concatenate([pattern, turned]), 0.3, np.radians(60), np.radians(6), alike_m)
+        found = field_ambiguity(
+            np.concatenate([pattern, turned]), 0.3, np.radians(60), np.radians(6), alike_m
+        )
         assert found.share[0] == pytest.approx(coincide / 6, abs=1e-12)
 
 

@@ -183,7 +183,7 @@ def test_a_pupil_believed_aside_turns_the_attitude_by_its_shift_over_the_led_s_d
     told = f"{{lever_sigma: 2 mm, seed: {seed}}}"
     eyes, lab = believing(tracker__survey=told, motion__start="{roll_deg: 7}", **BARE_CAMERA)
     frame, truth = exposure.render_frame(lab, 0)
-    answer = factory.answer(eyes, frame).attitude
+    answer = factory.solve_frame(eyes, frame).attitude
     assert answer.status == "solved"
     assert answer.cam_from_ref is not None
     shift = eyes.lever.camera_body_m - lab.mount.camera_body_m

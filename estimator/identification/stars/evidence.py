@@ -31,11 +31,11 @@ LEAST = 3  # matches needed for a solution
 # Fraction of stars whose magnitude disagrees with the catalog: variable stars, doubles, an unusual passband.
 MAG_ODD = 0.05
 # Penalty for unmatched detections brighter than the faintest match, for each one in excess of the number of matches.
-TOLL_DEX = 0.5
+UNMATCHED_PENALTY_DEX = 0.5
 INNER = 0.97  # fraction of the field in which an unmatched star counts as missing; the border may cut it off
 
 
-class Lights(NamedTuple):
+class Detections(NamedTuple):
     """The detections of one frame. A named tuple, because numba can compile functions that take one.
 
     tangent : (N, 2) x / z and y / z in camera axes, brightest first
@@ -55,7 +55,7 @@ class Lights(NamedTuple):
     zoom: float
 
 
-class Guess(NamedTuple):
+class Hypothesis(NamedTuple):
     """A hypothesis: candidate attitude, matches and evidence.
 
     observed, star : (K,) rows of detections and of stars;  R_cam_from_ref : (3, 3)
@@ -72,7 +72,7 @@ class Guess(NamedTuple):
     dex: float
 
 
-class Fix(NamedTuple):
+class Solution(NamedTuple):
     """The solution from all detections and stars.
 
     observed, star : (K,) rows of detections and of stars; empty if there is no solution
@@ -91,9 +91,9 @@ class Fix(NamedTuple):
 
 
 @jit
-def nothing() -> Guess:
+def no_hypothesis() -> Hypothesis:
     """The empty hypothesis, with evidence -inf."""
-    return Guess(np.empty(0, np.int64), np.empty(0, np.int64), np.eye(3), 1.0, np.eye(4), -np.inf)
+    return Hypothesis(np.empty(0, np.int64), np.empty(0, np.int64), np.eye(3), 1.0, np.eye(4), -np.inf)
 
 
 @jit
@@ -111,13 +111,13 @@ def ray(tangent: Floats, n: int, zoom: float) -> vectors.Vector:
 
 
 @jit
-def volume_dex(lights: Lights) -> float:
+def volume_dex(lights: Detections) -> float:
     """log10 of the prior volume: 8 pi^2 of attitudes times the width of the interval of log zoom."""
     return log10(8 * pi * pi) + (log10(2 * lights.zoom) if lights.zoom > 0 else 0.0)
 
 
 @jit
-def area(lights: Lights) -> float:
+def area(lights: Detections) -> float:
     return (lights.field[1] - lights.field[0]) * (lights.field[3] - lights.field[2])
 
 
@@ -131,9 +131,9 @@ def turned(matrix: Floats, u: vectors.Vector) -> vectors.Vector:
 
 
 @jit
-def weigh(
-    lights: Lights, sky: Sky, R_cam_from_ref: Floats, zoom: float, gates: Floats, floor_dex: float
-) -> Guess:
+def evaluate(
+    lights: Detections, sky: Sky, R_cam_from_ref: Floats, zoom: float, gates: Floats, floor_dex: float
+) -> Hypothesis:
     """Evaluate a candidate attitude: match detections to stars, fit attitude and zoom (twice), compute the evidence.
 
     gates : (N,) rad, matching radius of each detection in the first round; later rounds use GATE standard deviations
@@ -147,26 +147,26 @@ def weigh(
     for turn in range(3):
         observed, star = _match(lights, sky, R, zoom, own if turn else gates, GATE if turn else np.inf)
         if len(observed) < LEAST:
-            return nothing()
+            return no_hypothesis()
         if turn == 1:
             # `info` is that of the first fit; without the residuals the evidence is an upper bound.
             most_dex = _evidence(lights, sky, R, zoom, observed, star, info, False)
             if most_dex + _seen_dex(len(observed), 0) < floor_dex:
-                return nothing()
+                return no_hypothesis()
         if turn < 2:
             zoom = _fit(lights, sky, R, zoom, observed, star, info)
             if abs(zoom - 1) > 1.2 * lights.zoom + 1e-12:
-                return nothing()
+                return no_hypothesis()
     dex, seen = _evidence(lights, sky, R, zoom, observed, star, info, True), len(observed)
     if dex + _seen_dex(seen, 0) < floor_dex:
-        return nothing()
+        return no_hypothesis()
     dex += _seen_dex(seen, _missed(lights, sky, R, zoom, observed, star))
-    return Guess(observed, star, R, zoom, info, dex)
+    return Hypothesis(observed, star, R, zoom, info, dex)
 
 
 @jit
 def _match(
-    lights: Lights, sky: Sky, R_cam_from_ref: Floats, zoom: float, gates: Floats, most_sigma: float
+    lights: Detections, sky: Sky, R_cam_from_ref: Floats, zoom: float, gates: Floats, most_sigma: float
 ) -> tuple[NDArray, NDArray]:
     """Match each detection to its nearest star, within gates[n] rad and most_sigma standard deviations.
 
@@ -204,7 +204,9 @@ def predicted(vectors_ref: Floats, R: Floats, star: int) -> vectors.Vector:
 
 
 @jit
-def misfit2(lights: Lights, sky: Sky, R_cam_from_ref: Floats, zoom: float, light: int, star: int) -> float:
+def misfit2(
+    lights: Detections, sky: Sky, R_cam_from_ref: Floats, zoom: float, light: int, star: int
+) -> float:
     """Squared Mahalanobis distance of a detection from a star's predicted image."""
     x, y, _ = predicted(sky.vectors, R_cam_from_ref, star)
     off_x, off_y = lights.tangent[light, 0] - zoom * x, lights.tangent[light, 1] - zoom * y
@@ -214,7 +216,7 @@ def misfit2(lights: Lights, sky: Sky, R_cam_from_ref: Floats, zoom: float, light
 
 @jit
 def _fit(
-    lights: Lights,
+    lights: Detections,
     sky: Sky,
     R_cam_from_ref: Floats,
     zoom: float,
@@ -269,7 +271,7 @@ def solved(a: Floats, b: Floats) -> Floats:
 
 
 @jit
-def _missed(lights: Lights, sky: Sky, R: Floats, zoom: float, observed: NDArray, star: NDArray) -> int:
+def _missed(lights: Detections, sky: Sky, R: Floats, zoom: float, observed: NDArray, star: NDArray) -> int:
     """Number of missing stars: brighter than the faintest matched star, well inside the field, and not matched."""
     left, right, top, bottom = lights.field * (INNER / zoom)
     vectors_ref, inside = sky.vectors, 0
@@ -289,7 +291,7 @@ def _missed(lights: Lights, sky: Sky, R: Floats, zoom: float, observed: NDArray,
 
 @jit
 def _evidence(
-    lights: Lights,
+    lights: Detections,
     sky: Sky,
     R: Floats,
     zoom: float,
@@ -322,7 +324,7 @@ def _evidence(
         if misfit:
             total -= misfit2(lights, sky, R, zoom, observed[k], star[k]) / 2 / log(10.0)
         total += _mag_dex(lights, sky, observed[k], star[k], as_bright)
-    return total - TOLL_DEX * max(observed.max() + 1 - 2.0 * len(observed), 0.0)
+    return total - UNMATCHED_PENALTY_DEX * max(observed.max() + 1 - 2.0 * len(observed), 0.0)
 
 
 @jit
@@ -343,7 +345,7 @@ def _share_to(sky: Sky, mag: Floats) -> float:
 
 
 @jit
-def _mag_dex(lights: Lights, sky: Sky, light: int, star: int, as_bright: float) -> float:
+def _mag_dex(lights: Detections, sky: Sky, light: int, star: int, as_bright: float) -> float:
     """log10 of the likelihood ratio of a detection's magnitude: given its star, over a random star as bright as these.
 
     A fraction MAG_ODD of the stars is taken to have any magnitude, so that one outlier costs log10(MAG_ODD) at most.
@@ -358,7 +360,7 @@ def _mag_dex(lights: Lights, sky: Sky, light: int, star: int, as_bright: float) 
 
 
 @jit
-def fixed(lights: Lights, stars: Sky, guess: Guess) -> Fix:
+def fixed(lights: Detections, stars: Sky, guess: Hypothesis) -> Solution:
     """The solution of a hypothesis, with attitude covariance and rms residual.
 
     The covariance is marginalized over the zoom if the focal length is uncertain.
@@ -374,4 +376,4 @@ def fixed(lights: Lights, stars: Sky, guess: Guess) -> Fix:
         total += (tx - guess.zoom * x) ** 2 + (ty - guess.zoom * y) ** 2
     rms = sqrt(total / max(2 * len(guess.star), 1))
     xyzw = vectors.xyzw_of(guess.R_cam_from_ref)
-    return Fix(guess.observed, guess.star, xyzw, covariance, guess.zoom, rms, guess.dex)
+    return Solution(guess.observed, guess.star, xyzw, covariance, guess.zoom, rms, guess.dex)

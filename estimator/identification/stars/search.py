@@ -25,17 +25,17 @@ from estimator.core.jit import jit
 from estimator.identification.stars.evidence import (
     GATE,
     LEAST,
-    Fix,
-    Guess,
-    Lights,
+    Detections,
+    Hypothesis,
+    Solution,
     area,
+    evaluate,
     fixed,
-    nothing,
+    no_hypothesis,
     ray,
     share_at,
     turned,
     volume_dex,
-    weigh,
 )
 
 # Least log10 Bayes factor of an accepted attitude. By Markov's inequality, random detections reach it in at most one of
@@ -55,7 +55,9 @@ PATIENCE = 4  # detections without a star after which the first round drops a ca
 
 
 @jit
-def lost_in_space(lights: Lights, patterns: Sky, stars: Sky, base_lights: int, max_checks: int) -> Fix:
+def lost_in_space(
+    lights: Detections, patterns: Sky, stars: Sky, base_lights: int, max_checks: int
+) -> Solution:
     """Identify the detections and solve the attitude.
 
     The search uses the `base_lights` brightest detections and the pairs of `patterns`; the attitude found is then
@@ -63,7 +65,7 @@ def lost_in_space(lights: Lights, patterns: Sky, stars: Sky, base_lights: int, m
     if the full field keeps no more than half of its matches. max_checks bounds the effort (see `search`).
     """
     few = min(base_lights, len(lights.sigma))
-    head = Lights(
+    head = Detections(
         lights.tangent[:few],
         lights.sigma[:few],
         lights.weight[:few],
@@ -74,19 +76,19 @@ def lost_in_space(lights: Lights, patterns: Sky, stars: Sky, base_lights: int, m
     )
     found = search(head, patterns, max_checks)
     if found.dex < ACCEPT_DEX:
-        return fixed(lights, stars, nothing())
+        return fixed(lights, stars, no_hypothesis())
     gates = 1.5 * GATE * lights.sigma
-    whole = weigh(lights, stars, found.R_cam_from_ref.copy(), found.zoom, gates, -np.inf)
+    whole = evaluate(lights, stars, found.R_cam_from_ref.copy(), found.zoom, gates, -np.inf)
     if 2 * len(whole.observed) <= len(found.observed):
-        return fixed(lights, stars, nothing())
-    best = Guess(
+        return fixed(lights, stars, no_hypothesis())
+    best = Hypothesis(
         whole.observed, whole.star, whole.R_cam_from_ref, whole.zoom, whole.info, max(whole.dex, found.dex)
     )
     return fixed(lights, stars, best)
 
 
 @jit
-def search(lights: Lights, sky: Sky, max_checks: int) -> Guess:
+def search(lights: Detections, sky: Sky, max_checks: int) -> Hypothesis:
     """The first attitude with DECISIVE_DEX of evidence; else the best one, if it passes ACCEPT_DEX and MARGIN_DEX.
 
     Detection pairs are tried in the order of the expected number of matching catalog pairs: short pairs (above LONG)
@@ -99,7 +101,7 @@ def search(lights: Lights, sky: Sky, max_checks: int) -> Guess:
     """
     total = len(lights.sigma)
     length, rare = _lengths(lights), _rarity(lights, sky)
-    best, rival_dex, checks, limit = nothing(), -np.inf, np.zeros(1, np.int64), max_checks
+    best, rival_dex, checks, limit = no_hypothesis(), -np.inf, np.zeros(1, np.int64), max_checks
     for patience in (PATIENCE, total):
         tried = np.zeros((total, total), np.bool_)
         cost = rare.copy()
@@ -124,17 +126,17 @@ def search(lights: Lights, sky: Sky, max_checks: int) -> Guess:
                 break
         if checks[0] > limit or total - 2 <= PATIENCE:
             break
-    return best if best.dex >= ACCEPT_DEX and best.dex - rival_dex >= MARGIN_DEX else nothing()
+    return best if best.dex >= ACCEPT_DEX and best.dex - rival_dex >= MARGIN_DEX else no_hypothesis()
 
 
 @jit
-def _alike(one: Guess, other: Guess) -> bool:
+def _alike(one: Hypothesis, other: Hypothesis) -> bool:
     """Whether two hypotheses are the same attitude within 5.7 degrees (trace > 2.99); False if `other` is empty."""
     return other.dex > -np.inf and bool(np.sum(one.R_cam_from_ref * other.R_cam_from_ref) > 2.99)
 
 
 @jit
-def _lengths(lights: Lights) -> Floats:
+def _lengths(lights: Detections) -> Floats:
     """(N, N) length in tangents of every pair a < b; pairs too short to determine the roll count as very long."""
     total, field = len(lights.sigma), lights.field
     long = LONG * sqrt((field[1] - field[0]) * (field[3] - field[2]))
@@ -147,7 +149,7 @@ def _lengths(lights: Lights) -> Floats:
 
 
 @jit
-def _rarity(lights: Lights, sky: Sky) -> Floats:
+def _rarity(lights: Detections, sky: Sky) -> Floats:
     """(N,) fraction of the stars inside the magnitude gate of each detection; 1 if its magnitude is unknown."""
     out = np.ones(len(lights.sigma))
     for n in range(len(out)):
@@ -174,7 +176,9 @@ def _next(length: Floats, tried: NDArray, vain: Floats) -> tuple[int, int]:
 
 
 @jit
-def _attempt(lights: Lights, sky: Sky, a: int, b: int, patience: int, known: Guess, checks: NDArray) -> Guess:
+def _attempt(
+    lights: Detections, sky: Sky, a: int, b: int, patience: int, known: Hypothesis, checks: NDArray
+) -> Hypothesis:
     """Test two detections against every catalog pair of the same separation, in both orders.
 
     Returns the first hypothesis with ACCEPT_DEX that is another attitude than `known`, else the best one. checks : (1,)
@@ -183,7 +187,7 @@ def _attempt(lights: Lights, sky: Sky, a: int, b: int, patience: int, known: Gue
     gates, order = _gates(lights, a, b), _others(len(lights.sigma), a, b)
     wanted = _wanted(lights, a, b)
     in_cam, in_ref, R_ref_from_cam = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-    best, zoom = nothing(), 1.0
+    best, zoom = no_hypothesis(), 1.0
     at_a, at_b = ray(lights.tangent, a, 1.0), ray(lights.tangent, b, 1.0)
     chord = vectors.chord(at_a, at_b)
     vectors.axes(at_a, at_b, in_cam)
@@ -233,7 +237,7 @@ def _attempt(lights: Lights, sky: Sky, a: int, b: int, patience: int, known: Gue
                 checks[0] += 1 + looked
                 if fits:
                     checks[0] += WEIGH_CHECKS
-                    guess = weigh(lights, sky, R_ref_from_cam.T.copy(), zoom, gates, NO_RIVAL_DEX)
+                    guess = evaluate(lights, sky, R_ref_from_cam.T.copy(), zoom, gates, NO_RIVAL_DEX)
                     if guess.dex >= ACCEPT_DEX and not _alike(guess, known):
                         return guess
                     if guess.dex > best.dex:
@@ -263,7 +267,7 @@ def _zoom(tangent: Floats, a: int, b: int, chord: float, wanted: float) -> float
 
 
 @jit
-def _gates(lights: Lights, a: int, b: int) -> Floats:
+def _gates(lights: Detections, a: int, b: int) -> Floats:
     """(N,) matching radius of each detection at a pair's attitude: its own error and that of the attitude.
 
     The variance of the pair's midpoint is (sa^2 + sb^2) / 4; that of its direction, and of its relative length, is
@@ -281,7 +285,7 @@ def _gates(lights: Lights, a: int, b: int) -> Floats:
 
 
 @jit
-def _wanted(lights: Lights, a: int, b: int) -> int:
+def _wanted(lights: Detections, a: int, b: int) -> int:
     """Least number of matches that can reach ACCEPT_DEX, from an estimate of the greatest `_evidence`.
 
     The estimate has no residuals, no missing stars, and the attitude uncertainty of the pair alone: sqrt(2) sigma /

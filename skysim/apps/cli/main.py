@@ -18,8 +18,8 @@ from skysim.apps.cli.commands.solve import solve, survey
 from skysim.apps.cli.commands.stream import stream
 from skysim.apps.cli.commands.study import app as studies
 from skysim.apps.cli.commands.validate import validate
-from skysim.apps.cli.options import located
-from skysim.apps.cli.terminal import complain
+from skysim.apps.cli.options import with_location
+from skysim.apps.cli.terminal import print_error
 from skysim.core import errors
 from skysim.core.errors import InputError
 
@@ -72,18 +72,20 @@ def main() -> None:
     try:
         code = app(standalone_mode=False)
     except (InputError, ImageError) as error:
-        code = complain(located(str(error)))
+        code = print_error(with_location(str(error)))
     except OSError as error:
-        code = complain(f"{error.filename}: {error.strerror}" if error.filename else str(error))
+        code = print_error(f"{error.filename}: {error.strerror}" if error.filename else str(error))
     except (MemoryError, OverflowError) as error:
-        code = complain(f"a value of the scene is too large for this machine: {' '.join(str(error).split())}")
+        code = print_error(
+            f"a value of the scene is too large for this machine: {' '.join(str(error).split())}"
+        )
     except (typer.Abort, KeyboardInterrupt):
         code = 130
     except Exception as error:
         # Usage errors: recent typer bundles its parser and raises its own class, older versions raise click's.
         if not hasattr(error, "format_message"):
             raise
-        code = complain(" ".join(error.format_message().split()) or "give a command; see skysim --help")
+        code = print_error(" ".join(error.format_message().split()) or "give a command; see skysim --help")
     if code == 130:  # typer's own answer to Ctrl-C
-        complain("stopped")
+        print_error("stopped")
     sys.exit(code if isinstance(code, int) else 0)

@@ -44,10 +44,10 @@ Json = Annotated[bool, typer.Option("--json", help="Print JSON for machines inst
 
 def load(name: str, frames: int | None, seed: int | None, sets: list[str] | None) -> Scene:
     """Load the scene with the command line's overrides. Raises InputError."""
-    from skysim.core.yaml_reader import overridden
+    from skysim.core.yaml_reader import parse_overrides
     from skysim.scene.loader import load as load_scene
 
-    overrides = overridden(sets)
+    overrides = parse_overrides(sets)
     if frames is not None:
         overrides["exposure.frames"] = str(frames)
     if seed is not None:
@@ -56,12 +56,12 @@ def load(name: str, frames: int | None, seed: int | None, sets: list[str] | None
     return load_scene(name, overrides)
 
 
-def named(**stages: str | None) -> dict[str, str]:
+def given_stages(**stages: str | None) -> dict[str, str]:
     """The tracker stages for which the command line names an algorithm."""
     return {stage: name for stage, name in stages.items() if name is not None}
 
 
-def fresh(folder: Path) -> Path:
+def clean_folder(folder: Path) -> Path:
     """Make the folder and remove the frames and results of an earlier run; return it."""
     from skysim.core import files
     from skysim.results.files import frames
@@ -79,10 +79,10 @@ def moment(text: str | None) -> datetime.datetime | None:
         raise InputError(f"--time {text}: allowed: ISO 8601, e.g. 2012-06-22T21:00:00") from None
 
 
-def located(message: str) -> str:
+def with_location(message: str) -> str:
     """Add file and line of the scene to an error message about a key that was only checked after loading."""
     if not LOADED:
         return message
-    from skysim.scene.loader import where
+    from skysim.scene.loader import with_location
 
-    return where(message, *LOADED[-1])
+    return with_location(message, *LOADED[-1])

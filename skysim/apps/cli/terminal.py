@@ -26,7 +26,7 @@ FILM_FRAMES = 60
 SURVEY = ("believed", "found", "sigma", "truth")
 
 
-def begun(items: Iterable[T]) -> Iterator[T]:
+def eager_first(items: Iterable[T]) -> Iterator[T]:
     """Return the same items, the first computed at once: its errors then appear before old results are cleared."""
     rest = iter(items)
     return itertools.chain([next(rest)], rest)
@@ -50,7 +50,7 @@ def bar(*columns: ProgressColumn, quiet: bool = False) -> Bar:
     return Progress(what, *columns, console=console, transient=True, disable=quiet or not console.is_terminal)
 
 
-def inked(text: str, ink: str) -> Text:
+def colored(text: str, ink: str) -> Text:
     """Colored text for a table cell."""
     from rich.text import Text
 
@@ -105,7 +105,7 @@ def print_rows(rows: list[Row], names: tuple[str, str, str], exposures_ms: list[
             f"{row.roll_arcsec:+.3f}" if row.estimate_deg else "",
             f"{row.matched}/{row.detected}",
             f"{row.time_ms:.1f}",
-            inked("WRONG", "red") if row.wrong else row.status,
+            colored("WRONG", "red") if row.wrong else row.status,
         ]
         for row, exposure_ms in zip(rows, exposures_ms, strict=True)
     ]
@@ -117,7 +117,7 @@ def degrees(angles_deg: tuple[float, float, float] | None) -> str:
 
 
 @contextmanager
-def watched(what: str, quiet: bool = False) -> Iterator[Callable[[float, float], None]]:
+def progress_callback(what: str, quiet: bool = False) -> Iterator[Callable[[float, float], None]]:
     """Show a progress bar on stderr and yield its update function done(completed, total)."""
     from rich.progress import BarColumn, TaskProgressColumn, TimeRemainingColumn
 
@@ -127,7 +127,7 @@ def watched(what: str, quiet: bool = False) -> Iterator[Callable[[float, float],
 
 
 @contextmanager
-def counted(what: str, total: int) -> Iterator[Callable[[Progress], None]]:
+def trial_progress(what: str, total: int) -> Iterator[Callable[[Progress], None]]:
     """Show a progress bar for trials on stderr: done, rate, time left, failures. Yields its update function.
 
     If stderr is no terminal, print a line after every tenth of the trials instead.
@@ -199,7 +199,7 @@ def print_scores(lines: list[Line], folder: Path) -> None:
             str(line.frames),
             f"{100 * line.right.value:.1f}",
             f"{100 * line.right.low:.1f} to {100 * line.right.high:.1f}",
-            inked(str(line.wrong), "red") if line.wrong else "0",
+            colored(str(line.wrong), "red") if line.wrong else "0",
             str(line.refused),
             str(line.failed),
             *(f"{value:.3g}" for value in (line.cross_arcsec_median, line.cross_arcsec_worst)),
@@ -285,13 +285,13 @@ def number(value: float | None, digits: int | None = None) -> str:
     return f"{value:.3g}" if digits is None else f"{value:.{digits}f}"
 
 
-def complain(message: str, code: int = 2) -> int:
+def print_error(message: str, code: int = 2) -> int:
     """Print one line to stderr and return the exit code."""
     print(f"skysim: {printable(message)}", file=sys.stderr)
     return code
 
 
-def draw(lab: Testbed, folder: Path) -> list[Path]:
+def write_3d_views(lab: Testbed, folder: Path) -> list[Path]:
     """Write a still and an animation of the laboratory in 3-D; return their paths.
 
     Without OpenGL print a message and return an empty list, so that the run continues.
@@ -300,7 +300,7 @@ def draw(lab: Testbed, folder: Path) -> list[Path]:
     from skysim.dynamics.multibody.view import picture
     from skysim.simulation import testbed
 
-    mjcf, joints = testbed.staged(lab), lab.log.joints
+    mjcf, joints = testbed.export_mjcf(lab), lab.log.joints
     still, film = folder / "lab.png", folder / "lab.gif"
     steps = max(len(joints) // FILM_FRAMES, 1)
     moments = joints[::steps]
@@ -309,6 +309,6 @@ def draw(lab: Testbed, folder: Path) -> list[Path]:
         shown = progress(picture.film(mjcf, moments), len(moments), "filming")
         picture.write_film(shown, film, len(moments) / float(lab.log.t_s[-1] + 1e-9))
     except picture.NoPicture as error:
-        complain(str(error))
+        print_error(str(error))
         return []
     return [still, film]

@@ -22,7 +22,7 @@ class Light:
 
 
 @dataclass(frozen=True, slots=True)
-class Spot:
+class Detection:
     """A detection: pixel, standard error, flux; id of the matched light (-1: none) and its residual in pixels."""
 
     x: float
@@ -43,7 +43,7 @@ class Answer:
     """
 
     status: str
-    spots: tuple[Spot, ...]
+    spots: tuple[Detection, ...]
     ms: float
     angles_deg: Triple | None = None
     cross_arcsec: float = NAN
@@ -62,7 +62,7 @@ class Answer:
 
 
 @dataclass(frozen=True, slots=True)
-class View:
+class FrameView:
     """One rendered frame: image, true attitude, true lights, and the tracker's solution if the frame was solved.
 
     body_wxyz : lab_from_body;  t_s : time in the motion that is played, else 0
@@ -94,7 +94,7 @@ class Zoom:
 
 
 @dataclass(frozen=True, slots=True)
-class Setting:
+class SceneInfo:
     """Facts about a loaded scene that the page displays.
 
     names : of its three angles;  prefix : of its lights' numbers (HIP or LED)

@@ -15,7 +15,7 @@ from starlette.responses import FileResponse, PlainTextResponse, RedirectRespons
 from skysim.apps.gui.page.page import Tab
 from skysim.apps.gui.page.panels.photo import LIMIT_BYTES
 from skysim.apps.gui.page.panels.sensor import FRAMES
-from skysim.apps.gui.worker.session import Spare
+from skysim.apps.gui.worker.session import SpareWorker
 from skysim.scene.loader import find
 
 LOOPBACK = ("127.0.0.1", "localhost", "::1", "[::1]")
@@ -98,7 +98,7 @@ def limited(receive: Any) -> Any:
 
 def routes(scene: str, folder: Path, out: Path) -> None:
     """Register all routes, with a spare worker ready for the next tab."""
-    spare = Spare(str(find(scene).resolve()))
+    spare = SpareWorker(str(find(scene).resolve()))
     app.on_startup(spare.begin)
     app.on_shutdown(spare.end)
 

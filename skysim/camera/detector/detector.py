@@ -24,7 +24,7 @@ from skysim.sources.photometry import snr
 
 
 @dataclass(frozen=True, slots=True)
-class Chip:
+class Detector:
     """One chip: its parameters and its fixed pattern, drawn from its hardware seed.
 
     sensitivity     : (H, W) relative, mean 1: PRNU
@@ -40,7 +40,7 @@ class Chip:
     column_offset_e: NDArray[np.float32]
 
     @classmethod
-    def of(cls, camera: CameraConfig) -> Chip:
+    def of(cls, camera: CameraConfig) -> Detector:
         """Draw the fixed pattern."""
         part, shape = camera.detector, (camera.height_px, camera.width_px)
         streams = np.random.SeedSequence(part.hardware_seed).spawn(3)
@@ -83,7 +83,7 @@ def dark_current_e_s(part: DetectorConfig, shape: tuple[int, int], rng: Generato
     return dark
 
 
-def expose(light_e: NDArray[Any], exposure_s: float, chip: Chip, rng: Generator) -> NDArray[Any]:
+def expose(light_e: NDArray[Any], exposure_s: float, chip: Detector, rng: Generator) -> NDArray[Any]:
     """Convert a frame's light to digital numbers. Returns (H, W) uint16.
 
     light_e : (H, W) float32 mean photo-electrons of a perfect pixel, including the shutter's `smear`; overwritten
@@ -109,7 +109,7 @@ def expose(light_e: NDArray[Any], exposure_s: float, chip: Chip, rng: Generator)
     return read_out(light_e, chip, reading)
 
 
-def expectation(light_e: NDArray[Any], exposure_s: float, chip: Chip) -> NDArray[Any]:
+def expectation(light_e: NDArray[Any], exposure_s: float, chip: Detector) -> NDArray[Any]:
     """Expected digital numbers without full well, nonlinearity and particles."""
     part = chip.part
     mean_e = light_e * chip.sensitivity + chip.dark_e_s * exposure_s
@@ -128,7 +128,7 @@ def smear(light_e: NDArray[Any], exposure_s: float, shutter: Shutter) -> None:
         charge_transfer.interline_smear(light_e, exposure_s, shutter.row_time_s, shutter.leak)
 
 
-class Rules(NamedTuple):
+class ReadoutConstants(NamedTuple):
     """Detector parameters for the compiled loops, in single precision."""
 
     exposure_s: np.float32
@@ -140,7 +140,7 @@ class Rules(NamedTuple):
     top_dn: np.float32
 
 
-def rules(part: DetectorConfig, exposure_s: float) -> Rules:
+def rules(part: DetectorConfig, exposure_s: float) -> ReadoutConstants:
     """The parameters that _gather and _convert need."""
     numbers = (
         exposure_s,
@@ -151,11 +151,13 @@ def rules(part: DetectorConfig, exposure_s: float) -> Rules:
         part.offset_dn + 0.5,  # truncation after adding 0.5 rounds
         2**part.bits - 1,
     )
-    return Rules(*map(np.float32, numbers))
+    return ReadoutConstants(*map(np.float32, numbers))
 
 
 @jit
-def _gather(row: Any, sensitivity: Any, dark_e_s: Any, rules: Rules, seed: Any, tables: noise.Tables) -> None:
+def _gather(
+    row: Any, sensitivity: Any, dark_e_s: Any, rules: ReadoutConstants, seed: Any, tables: noise.Tables
+) -> None:
     """Count electrons, light and dark together: Poisson, variance equal to the mean. One row, in place.
 
     PRNU is a pixel's relative quantum efficiency, so it scales the mean and the sum stays a Poisson variable.
@@ -167,7 +169,9 @@ def _gather(row: Any, sensitivity: Any, dark_e_s: Any, rules: Rules, seed: Any, 
 
 
 @jit
-def _convert(row: Any, offset_e: Any, rules: Rules, seed: Any, tables: noise.Tables, numbers: Any) -> None:
+def _convert(
+    row: Any, offset_e: Any, rules: ReadoutConstants, seed: Any, tables: noise.Tables, numbers: Any
+) -> None:
     """Convert charge to numbers: full well, column offset and read noise, nonlinearity, gain, rounding, clipping.
 
     Without blooming a well holds at most its capacity. The amplifier gives e (1 - nonlinearity e / full_well);
@@ -181,20 +185,20 @@ def _convert(row: Any, offset_e: Any, rules: Rules, seed: Any, tables: noise.Tab
         numbers[x] = np.uint16(int32(min(max(dn, float32(0)), rules.top_dn)))
 
 
-def count(light_e: NDArray[Any], exposure_s: float, chip: Chip, seeds: NDArray[np.uint64]) -> None:
+def count(light_e: NDArray[Any], exposure_s: float, chip: Detector, seeds: NDArray[np.uint64]) -> None:
     """Light to electrons, in place; see _gather."""
     _count(light_e, chip.sensitivity, chip.dark_e_s, rules(chip.part, exposure_s), seeds, noise.tables())
 
 
 @jit(parallel=True)
 def _count(
-    light_e: Any, sensitivity: Any, dark_e_s: Any, rules: Rules, seeds: Any, tables: noise.Tables
+    light_e: Any, sensitivity: Any, dark_e_s: Any, rules: ReadoutConstants, seeds: Any, tables: noise.Tables
 ) -> None:
     for y in numba.prange(light_e.shape[0]):
         _gather(light_e[y], sensitivity[y], dark_e_s[y], rules, seeds[y], tables)
 
 
-def read_out(electrons: NDArray[Any], chip: Chip, seeds: NDArray[np.uint64]) -> NDArray[np.uint16]:
+def read_out(electrons: NDArray[Any], chip: Detector, seeds: NDArray[np.uint64]) -> NDArray[np.uint16]:
     """Electrons to digital numbers; see _convert."""
     frame = np.empty(electrons.shape, np.uint16)
     _read_out(electrons, chip.column_offset_e, rules(chip.part, 0.0), seeds, noise.tables(), frame)
@@ -203,7 +207,7 @@ def read_out(electrons: NDArray[Any], chip: Chip, seeds: NDArray[np.uint64]) -> 
 
 @jit(parallel=True)
 def _read_out(
-    electrons: Any, offset_e: Any, rules: Rules, seeds: Any, tables: noise.Tables, frame: Any
+    electrons: Any, offset_e: Any, rules: ReadoutConstants, seeds: Any, tables: noise.Tables, frame: Any
 ) -> None:
     for y in numba.prange(electrons.shape[0]):
         _convert(electrons[y], offset_e, rules, seeds[y], tables, frame[y])
@@ -212,7 +216,7 @@ def _read_out(
 def count_and_read(
     light_e: NDArray[Any],
     exposure_s: float,
-    chip: Chip,
+    chip: Detector,
     counting: NDArray[np.uint64],
     reading: NDArray[np.uint64],
 ) -> NDArray[np.uint16]:
@@ -231,7 +235,7 @@ def _count_and_read(
     sensitivity: Any,
     dark_e_s: Any,
     offset_e: Any,
-    rules: Rules,
+    rules: ReadoutConstants,
     counting: Any,
     reading: Any,
     tables: noise.Tables,
@@ -251,7 +255,9 @@ def saturation_dn(part: DetectorConfig) -> float:
     return float(min(max(well_dn, 0.0), 2**part.bits - 1))
 
 
-def judge(seen: SourceTruth, light_e: NDArray[Any], exposure_s: float, chip: Chip) -> SourceTruth:
+def add_snr_and_saturation(
+    seen: SourceTruth, light_e: NDArray[Any], exposure_s: float, chip: Detector
+) -> SourceTruth:
     """Which sources are expected to saturate, and the signal-to-noise ratio of each.
 
     light_e : (H, W) mean photo-electrons of the whole frame, smear included, before `expose` overwrites it

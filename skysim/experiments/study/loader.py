@@ -8,7 +8,7 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from skysim.core.errors import InputError
-from skysim.core.yaml_reader import explain, line_of, of_our_version, put, read_yaml
+from skysim.core.yaml_reader import check_version, explain, line_of, read_yaml, set_key
 from skysim.experiments.study.factors import Factor, Settings, Value
 from skysim.experiments.study.plan import (
     CentroidTrial,
@@ -38,9 +38,9 @@ def load(
     """
     path = find(str(name))
     tree, text = read_yaml(path)
-    of_our_version(tree, path, text)
+    check_version(tree, path, text)
     for key, value in (overrides or {}).items():
-        put(tree, key, value)
+        set_key(tree, key, value)
     try:
         study = Study.model_validate(tree)
     except ValidationError as error:
@@ -81,7 +81,7 @@ def check(plan: Plan, to_run: bool) -> None:
     for name in study.factors:
         if name in COLUMNS or name in study.responses:
             raise InputError(f"factors.{name}: is a column of every trial; allowed: another name")
-    for name, level, settings in one_by_one(study.factors):
+    for name, level, settings in each_level(study.factors):
         try:
             scene, trial = resolved(plan.recipe, settings)
             if isinstance(scene.light, BenchConfig) and not isinstance(trial, FlightTrial):
@@ -104,7 +104,7 @@ def check_tracker(plan: Plan, scene: Scene, trial: CentroidTrial | FrameTrial | 
         raise InputError(f"tracker.name: {name} takes frames; allowed: {OWN}, or another trial.kind")
 
 
-def one_by_one(factors: Mapping[str, Factor]) -> Iterator[tuple[str, Value, Settings]]:
+def each_level(factors: Mapping[str, Factor]) -> Iterator[tuple[str, Value, Settings]]:
     """Every level of every factor with the other factors at their middle: factor, level, all settings."""
     middle = {name: factor.at(0.5)[1] for name, factor in factors.items()}
     for name, factor in factors.items():

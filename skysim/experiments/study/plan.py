@@ -16,7 +16,7 @@ from skysim.core import yaml_reader
 from skysim.core.errors import InputError
 from skysim.core.paths import SCENES
 from skysim.core.units import ConfigModel, NotNegative, Number, Share, Time
-from skysim.core.yaml_reader import explain, is_file, put, read_yaml
+from skysim.core.yaml_reader import explain, is_file, read_yaml, set_key
 from skysim.experiments.study.designs import Design, Point, points
 from skysim.experiments.study.factors import Factor, Settings, Value
 from skysim.scene.loader import find as find_scene
@@ -29,7 +29,7 @@ Declination = Annotated[Number, Field(ge=-90, le=90)]
 Tilt = Annotated[Number, Field(ge=0, le=90)]
 
 
-class Anywhere(ConfigModel):
+class RandomAttitude(ConfigModel):
     """A random attitude in every trial, roll or yaw uniform.
 
     tilt_deg : under a dome, tilt of the body from vertical: one angle, or uniform in solid angle between two
@@ -42,7 +42,7 @@ class Anywhere(ConfigModel):
     dec_deg: tuple[Declination, Declination] = (-90.0, 90.0)
 
 
-class CentroidTrial(Anywhere):
+class CentroidTrial(RandomAttitude):
     """Identification and attitude from simulated centroids, without an image.
 
     noise_px : standard deviation of a centroid, each axis;  magnitude_sigma : of its brightness, magnitudes
@@ -60,7 +60,7 @@ class CentroidTrial(Anywhere):
     false_share: Annotated[Number, Field(ge=0, le=0.95)] = 0.0
 
 
-class FrameTrial(Anywhere):
+class FrameTrial(RandomAttitude):
     """One frame, rendered with all camera noise, then solved.
 
     rate_deg_s : rate about a random axis perpendicular to the boresight
@@ -178,7 +178,7 @@ class Study(ConfigModel):
 
 
 @dataclass(frozen=True, slots=True)
-class Recipe:
+class TrialSpec:
     """The part of a study that a worker needs to run any of its trials.
 
     folder : folder of the study file, to which scene paths are relative
@@ -200,7 +200,7 @@ class Plan:
 
     path: Path
     study: Study
-    recipe: Recipe
+    recipe: TrialSpec
     points: list[Point]
 
     @property
@@ -241,11 +241,11 @@ def planned(path: Path, study: Study, trial: dict[str, Any], programs: Mapping[s
     """The plan of a study; `trial` is the section as written in the file, with units."""
     chosen = [] if study.optimise else points(study.design, study.factors, study.seed)
     folder = str(path.resolve().parent)
-    told = Recipe(study.scene, folder, study.seed, study.set, trial, study.paired, dict(programs))
+    told = TrialSpec(study.scene, folder, study.seed, study.set, trial, study.paired, dict(programs))
     return Plan(path, study, told, chosen)
 
 
-def resolved(recipe: Recipe, settings: Settings) -> tuple[Scene, CentroidTrial | FrameTrial | FlightTrial]:
+def resolved(recipe: TrialSpec, settings: Settings) -> tuple[Scene, CentroidTrial | FrameTrial | FlightTrial]:
     """The scene and the trial at a point, with its settings applied. Raises InputError with one line."""
     told = recipe.base | settings
     name = str(told.get("scene", recipe.scene))
@@ -253,24 +253,24 @@ def resolved(recipe: Recipe, settings: Settings) -> tuple[Scene, CentroidTrial |
     scene_keys = {}
     for key, value in told.items():
         if key.startswith(TRIAL):
-            put(tree, key, as_yaml(value))
+            set_key(tree, key, as_yaml(value))
         elif key != "scene":
             scene_keys[key] = as_yaml(value)
     try:
-        trial = Asked.model_validate(tree).trial
+        trial = TrialSection.model_validate(tree).trial
     except ValidationError as error:
-        raise InputError(told_of(error, tree)) from None
+        raise InputError(error_text(error, tree)) from None
     beside = Path(recipe.folder) / name
     path = beside if beside.suffix in {".yaml", ".yml"} and is_file(beside) else find_scene(name)
     return load_scene(path, scene_keys), trial
 
 
-def told_of(error: ValidationError, tree: dict[str, Any]) -> str:
+def error_text(error: ValidationError, tree: dict[str, Any]) -> str:
     """One-line message of a validation error in section `trial`, without file and line; the caller adds the factor."""
-    return explain(error, Asked, tree, [(Path(), "")], {}).removesuffix(f" ({Path()})")
+    return explain(error, TrialSection, tree, [(Path(), "")], {}).removesuffix(f" ({Path()})")
 
 
-class Asked(ConfigModel):
+class TrialSection(ConfigModel):
     """Wrapper that validates section `trial` alone."""
 
     trial: Trial

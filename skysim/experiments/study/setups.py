@@ -14,7 +14,7 @@ import numpy as np
 
 from skysim.core.paths import DATA, ROOT
 from skysim.experiments.study.factors import Settings
-from skysim.experiments.study.plan import CentroidTrial, FlightTrial, FrameTrial, Recipe, digest, resolved
+from skysim.experiments.study.plan import CentroidTrial, FlightTrial, FrameTrial, TrialSpec, digest, resolved
 from skysim.scene.loader import FILES
 from skysim.scene.scene import Scene
 from skysim.simulation import testbed
@@ -25,7 +25,7 @@ from skysim.tracking.external import interface
 KEPT = 4  # benches that a worker caches
 
 
-class Bench(NamedTuple):
+class Setup(NamedTuple):
     """A scene prepared for trials: hardware without simulated motion, tracker with its index, trial, scene hash."""
 
     lab: Testbed
@@ -38,13 +38,13 @@ class Shelf(threading.local):
     """Least-recently-used cache of benches. One per thread, because a test bed's canvas serves one trial at a time."""
 
     def __init__(self) -> None:
-        self.benches: OrderedDict[str, Bench] = OrderedDict()
+        self.benches: OrderedDict[str, Setup] = OrderedDict()
 
 
 SHELF = Shelf()
 
 
-def bench(recipe: Recipe, settings: Settings) -> Bench:
+def prepared_setup(recipe: TrialSpec, settings: Settings) -> Setup:
     """The bench of a design point, from the cache if it is there. Raises InputError."""
     key = digest([recipe.scene, recipe.folder, recipe.base, recipe.trial, recipe.programs, settings])
     shelf = SHELF.benches
@@ -56,7 +56,7 @@ def bench(recipe: Recipe, settings: Settings) -> Bench:
     return shelf[key]
 
 
-def set_up(recipe: Recipe, settings: Settings) -> Bench:
+def set_up(recipe: TrialSpec, settings: Settings) -> Setup:
     """Build hardware and tracker of a point, or reuse those of a cached bench that differs only in its trial."""
     scene, trial = resolved(recipe, settings)
     told = scene_hash(scene)
@@ -65,7 +65,7 @@ def set_up(recipe: Recipe, settings: Settings) -> Bench:
             return ready._replace(trial=trial)
     lab = like_before(scene) or testbed.build_testbed(scene, recipe.programs)
     lab = replace(lab, programs=recipe.programs)
-    return Bench(lab, testbed.tracker(lab), trial, told)
+    return Setup(lab, testbed.tracker(lab), trial, told)
 
 
 def like_before(scene: Scene) -> Testbed | None:
@@ -114,7 +114,7 @@ def code_version() -> str:
     return told.hexdigest()[:16]
 
 
-def seed_of(recipe: Recipe, point: int, replicate: int) -> int:
+def seed_of(recipe: TrialSpec, point: int, replicate: int) -> int:
     """Seed of a trial, 63 bits, derived from the study's seed; with `paired` it is the same at every point."""
     key = (replicate,) if recipe.paired else (replicate, point)
     return int(np.random.SeedSequence(recipe.seed, spawn_key=key).generate_state(1, np.uint64)[0] >> 1)

@@ -25,8 +25,8 @@ from skysim.core.types import Floats, Frame, Sources, Trajectory, Truth
 from skysim.core.units import ARCSEC_RAD
 from skysim.dynamics import multibody
 from skysim.experiments.study.factors import Settings
-from skysim.experiments.study.plan import CentroidTrial, FlightTrial, FrameTrial, Recipe
-from skysim.experiments.study.setups import Bench, bench, code_version, seed_of
+from skysim.experiments.study.plan import CentroidTrial, FlightTrial, FrameTrial, TrialSpec
+from skysim.experiments.study.setups import Setup, code_version, prepared_setup, seed_of
 from skysim.results import metrics
 from skysim.scene.light import DomeConfig
 from skysim.scene.scene import Scene
@@ -100,7 +100,7 @@ class Segment(NamedTuple):
 # Running trials.
 
 
-def work(recipe: Recipe, segments: tuple[Segment, ...]) -> list[Row]:
+def work(recipe: TrialSpec, segments: tuple[Segment, ...]) -> list[Row]:
     """Run all trials of some segments, in order."""
     return [
         one(recipe, segment, segment.first + n, replicate)
@@ -109,12 +109,12 @@ def work(recipe: Recipe, segments: tuple[Segment, ...]) -> list[Row]:
     ]
 
 
-def one(recipe: Recipe, segment: Segment, trial: int, replicate: int) -> Row:
+def one(recipe: TrialSpec, segment: Segment, trial: int, replicate: int) -> Row:
     """Run one trial; an exception is stored in its row as a traceback."""
     seed = seed_of(recipe, segment.point, replicate)
     scene, outcome, error, begin = "", FAILED, None, time.perf_counter()
     try:
-        ready = bench(recipe, segment.settings)
+        ready = prepared_setup(recipe, segment.settings)
         scene, begin = ready.scene_hash, time.perf_counter()
         outcome = TRIALS[ready.trial.kind](ready, seed)
     except Exception:
@@ -123,14 +123,14 @@ def one(recipe: Recipe, segment: Segment, trial: int, replicate: int) -> Row:
     return Row(trial, segment.point, replicate, seed, scene, code_version(), outcome, error, spent)
 
 
-def centroids(ready: Bench, seed: int) -> Outcome:
+def centroids(ready: Setup, seed: int) -> Outcome:
     """Centroid trial: random attitude, noisy true detections and false ones; identified and solved."""
     lab_from_body, xy_px, seen = sight(ready, seed)
     answer = ready.estimator.solve_centroids(seen)
     return scored(answer, cam_from_lab_wxyz(ready.lab, lab_from_body), len(xy_px), len(seen))
 
 
-def sight(ready: Bench, seed: int) -> tuple[Rotation, Floats, Centroids]:
+def sight(ready: Setup, seed: int) -> tuple[Rotation, Floats, Centroids]:
     """Inputs of a centroid trial: lab_from_body, (N, 2) true pixel positions, and the simulated detections."""
     trial, (where, noise) = ready.trial, streams(ready, seed)
     assert isinstance(trial, CentroidTrial)
@@ -139,17 +139,17 @@ def sight(ready: Bench, seed: int) -> tuple[Rotation, Floats, Centroids]:
     return lab_from_body, xy_px, spoilt(trial, xy_px, electrons, ready.lab.scene, noise)
 
 
-def streams(ready: Bench, seed: int) -> tuple[np.random.Generator, np.random.Generator]:
+def streams(ready: Setup, seed: int) -> tuple[np.random.Generator, np.random.Generator]:
     """Random generators of a trial's attitude and of its noise; `noise_seed` changes the noise only."""
     trial = ready.trial
     assert isinstance(trial, CentroidTrial | FrameTrial)
     return np.random.default_rng([seed, 0]), np.random.default_rng([seed, 1, trial.noise_seed])
 
 
-def frames(ready: Bench, seed: int) -> Outcome:
+def frames(ready: Setup, seed: int) -> Outcome:
     """Frame trial: random attitude, one rendered frame, solved."""
     frame, truth, streak_px = shot(ready, seed)
-    return answered(factory.answer(ready.estimator, frame, streak_px), truth)
+    return answered(factory.solve_frame(ready.estimator, frame, streak_px), truth)
 
 
 def answered(report: Report, truth: Truth) -> Outcome:
@@ -158,7 +158,7 @@ def answered(report: Report, truth: Truth) -> Outcome:
     return scored(report.attitude, truly, len(truth.seen.id), len(report.centroids))
 
 
-def flight(ready: Bench, seed: int) -> Outcome:
+def flight(ready: Setup, seed: int) -> Outcome:
     """Flight trial: the complete scene with another seed."""
     trial = ready.trial
     assert isinstance(trial, FlightTrial)
@@ -183,7 +183,7 @@ def scores(lab: Testbed, estimator: factory.Estimator) -> Iterator[tuple[float, 
         yield t_s, scored(answer.attitude, truly, stars, len(answer.centroids))
 
 
-TRIALS: dict[str, Callable[[Bench, int], Outcome]] = {
+TRIALS: dict[str, Callable[[Setup, int], Outcome]] = {
     "centroids": centroids,
     "frames": frames,
     "flight": flight,
@@ -193,7 +193,7 @@ TRIALS: dict[str, Callable[[Bench, int], Outcome]] = {
 # Parts of trials.
 
 
-def attitude(ready: Bench, rng: np.random.Generator) -> Rotation:
+def attitude(ready: Setup, rng: np.random.Generator) -> Rotation:
     """Random lab_from_body.
 
     Under a dome: tilt uniform in solid angle within `tilt_deg`, tilt direction and yaw uniform. Otherwise: boresight
@@ -276,7 +276,7 @@ def spoilt(
     return Centroids(np.concatenate([xy_px[kept], strays_px])[order], sigma_px, everything[order])
 
 
-def shot(ready: Bench, seed: int) -> tuple[Frame, Truth, tuple[float, float] | None]:
+def shot(ready: Setup, seed: int) -> tuple[Frame, Truth, tuple[float, float] | None]:
     """Frame of a frame trial, its truth and, with a gyro, the streak vector (dx, dy) in pixels at the image center."""
     trial, (where, noise) = ready.trial, streams(ready, seed)
     assert isinstance(trial, FrameTrial)

@@ -127,7 +127,7 @@ def to_parquet(run: Recording, out: Path, bar: Bar) -> list[Path]:
     written = []
     for name, found in tables.items():
         path = out / f"{name}.parquet"
-        with files.whole(path) as temporary:
+        with files.atomic_file(path) as temporary:
             pyarrow.parquet.write_table(arrow(found, run), temporary)
         written.append(path)
     return [*written, sources_parquet(run, out / "sources.parquet", bar)]
@@ -138,7 +138,7 @@ def sources_parquet(run: Recording, path: Path, bar: Bar) -> Path:
     import pyarrow
     import pyarrow.parquet
 
-    with files.whole(path) as temporary:
+    with files.atomic_file(path) as temporary:
         writer, waiting = None, []
         try:
             for truth in truths(run, bar):
@@ -203,7 +203,7 @@ def to_zarr(run: Recording, out: Path, bar: Bar) -> list[Path]:
     path, count = out / frame_files.ZARR, len(run.stems)
     told = [replace(truth, sources=None) for truth in truths(run, bar)]
     first = run.image(run.stems[0])
-    with files.whole_folder(path) as temporary:
+    with files.atomic_folder(path) as temporary:
         group = zarr.create_group(temporary, zarr_format=3, attributes=run.meta | {"made_by": "skysim"})
         frames = group.create_array(
             "frames",
@@ -262,7 +262,7 @@ def to_video(run: Recording, out: Path, bar: Bar) -> list[Path]:
     some = run.stems[:: max(len(run.stems) // SAMPLED_FRAMES, 1)]
     low, high = np.median([stretch.span(run.image(stem)) for stem in some], axis=0)
     height, width = (side // 2 * 2 for side in first.shape)  # color subsampling needs even sides
-    with files.whole(path) as temporary:
+    with files.atomic_file(path) as temporary:
         film = cv2.VideoWriter(
             str(temporary), cv2.VideoWriter.fourcc(*FOURCC), pace_hz, (width, height), False
         )

@@ -7,7 +7,7 @@ import shutil
 from pathlib import Path
 
 from skysim.camera import wcs
-from skysim.core.files import whole, write_png16, write_table
+from skysim.core.files import atomic_file, write_png16, write_table
 from skysim.core.types import Frame, Truth
 from skysim.scene.light import StarsConfig
 from skysim.scene.scene import Scene
@@ -74,7 +74,7 @@ def write_fits(path: Path, frame: Frame, truth: Truth, scene: Scene) -> None:
         header["COMMENT"] = "WCS: of the true attitude at mid-exposure; apparent directions in ICRS axes"
     else:
         header["COMMENT"] = "no WCS: the lights are in the laboratory"
-    with whole(path) as temporary:
+    with atomic_file(path) as temporary:
         fits.PrimaryHDU(frame.image_dn, header).writeto(temporary, overwrite=True)
 
 

@@ -89,7 +89,7 @@ def write_fits(path: Path, picture: Picture) -> None:
     from skysim.core import files
 
     header = fits.Header({"EXPTIME": picture.exposure_s, "TMID": picture.t_s, "FRAME": picture.frame})
-    with files.whole(path) as temporary:
+    with files.atomic_file(path) as temporary:
         fits.PrimaryHDU(picture.image_dn, header).writeto(temporary, overwrite=True)
 
 

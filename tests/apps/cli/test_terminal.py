@@ -22,7 +22,7 @@ class Screen(io.StringIO):
 
 
 def test_a_table_shows_cells_heads_and_title_as_they_are(capsys: pytest.CaptureFixture[str]) -> None:
-    terminal.print_table(HOSTILE, ["file", HOSTILE], [["a[/b]/m[red].png", terminal.inked("WRONG", "red")]])
+    terminal.print_table(HOSTILE, ["file", HOSTILE], [["a[/b]/m[red].png", terminal.colored("WRONG", "red")]])
     title, heads, line = capsys.readouterr().out.splitlines()
     assert title.strip() == HOSTILE
     assert heads.split(maxsplit=1)[1].strip() == HOSTILE
@@ -34,9 +34,9 @@ def test_bars_show_a_title_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "200")
     monkeypatch.setattr(sys, "stderr", screen := Screen())
     assert list(terminal.progress([1, 2], 2, HOSTILE)) == [1, 2]
-    with terminal.watched("watched " + HOSTILE) as watch:
+    with terminal.progress_callback("watched " + HOSTILE) as watch:
         watch(1.0, 1.0)
-    with terminal.counted("counted " + HOSTILE, 2) as watch_trials:
+    with terminal.trial_progress("counted " + HOSTILE, 2) as watch_trials:
         watch_trials(Progress(2, 2))
     for name in ("", "watched ", "counted "):
         assert name + HOSTILE in screen.getvalue()
@@ -44,5 +44,5 @@ def test_bars_show_a_title_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_what_a_tracker_says_moves_no_cursor(capsys: pytest.CaptureFixture[str]) -> None:
     assert checked(Answer("lost \x1b[2J\x07\ud800 in\u202e space")).status == "lost ?[2J?? in? space"
-    terminal.complain("a\x1b[31m.png: no such\nfile")
+    terminal.print_error("a\x1b[31m.png: no such\nfile")
     assert capsys.readouterr().err == "skysim: a?[31m.png: no such file\n"

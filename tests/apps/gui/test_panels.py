@@ -13,12 +13,12 @@ from scipy.spatial.transform import Rotation
 
 pytest.importorskip("nicegui", reason="the extra `lab` is not installed")
 
-from skysim.apps.gui.messages import Answer, Light, Spot
+from skysim.apps.gui.messages import Answer, Detection, Light
 from skysim.apps.gui.page import forms, keys, overlay
 from skysim.apps.gui.page.star_names import NAMES
 from skysim.apps.gui.server import Guard, host_of
 from skysim.apps.gui.worker import export, pointing, study_process
-from skysim.apps.gui.worker.session import Gone, Session
+from skysim.apps.gui.worker.session import Session, WorkerLost
 from skysim.core.errors import InputError
 from skysim.core.paths import SCENES
 from skysim.core.types import Mount
@@ -147,7 +147,7 @@ def test_a_scene_is_saved_as_what_differs_and_nothing_is_overwritten(tmp_path: P
 # Marks.
 
 LIGHTS = (Light(1, 10.0, 20.0, 1e4, 2.0), Light(2, 50.0, 60.0, 1e3, 4.0))
-SPOTS = (Spot(10.1, 20.0, 0.01, 5.0, 1, 0.1), Spot(80.0, 80.0, 0.1, 1.0))
+SPOTS = (Detection(10.1, 20.0, 0.01, 5.0, 1, 0.1), Detection(80.0, 80.0, 0.1, 1.0))
 
 
 def test_each_kind_of_mark_can_be_switched_off_and_stands_where_it_should() -> None:
@@ -168,7 +168,7 @@ def test_each_kind_of_mark_can_be_switched_off_and_stands_where_it_should() -> N
 def test_names_are_beside_their_stars_within_the_frame_and_cover_no_other(size_px: tuple[int, int]) -> None:
     random = np.random.default_rng(4)
     places = np.vstack([random.uniform(0, size_px, (20, 2)), [[size_px[0] - 1, 5], [3, size_px[1] - 2]]])
-    spots = tuple(Spot(x, y, 0.1, 1.0, n) for n, (x, y) in enumerate(places.tolist()))
+    spots = tuple(Detection(x, y, 0.1, 1.0, n) for n, (x, y) in enumerate(places.tolist()))
     (marked,) = overlay.marks((), Answer("solved", spots, 1.0), size_px, {"identified"}, "HIP {}".format)
     font, names = marked["font"], marked["names"]
     assert 15 <= len(names) <= len(spots)
@@ -271,7 +271,7 @@ def test_a_session_answers_refuses_and_ends_with_its_tab() -> None:
         finally:
             session.close()
         assert not session.process.is_alive()
-        with pytest.raises((Gone, RuntimeError)):
+        with pytest.raises((WorkerLost, RuntimeError)):
             await session.ask("look", False)
 
     asyncio.run(story())

@@ -23,7 +23,7 @@ from estimator.catalog import catalog
 from estimator.catalog.catalog import StarCatalog
 from estimator.core.camera import Camera
 from estimator.core.types import Attitude, Centroids, StarMatch
-from estimator.trackers.pipeline import Clock, Settings, see
+from estimator.trackers.pipeline import Clock, Settings, detect_and_centroid
 from estimator.trackers.star_tracker import StarTracker
 from skysim.core import images
 from skysim.core.paths import ROOT
@@ -381,7 +381,9 @@ def test_four_photographs_of_one_camera_agree_on_its_lens() -> None:
         return StarTracker(camera, stars, vectors, focal_uncertainty=focal_uncertainty)
 
     def seen(file: str) -> Centroids:
-        found = see(images.monochrome(images.read_image(REAL_SKY / file)), sheet, Settings(), Clock())
+        found = detect_and_centroid(
+            images.monochrome(images.read_image(REAL_SKY / file)), sheet, Settings(), Clock()
+        )
         # JPEG, and refraction's change over the field.
         return replace(found, sigma_px=np.hypot(found.sigma_px, 0.15))
 

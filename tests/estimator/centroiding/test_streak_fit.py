@@ -113,7 +113,7 @@ def test_smears_of_12_px_are_found_by_the_gyro_s_streak_and_without(told: bool) 
 def test_of_noise_alone_the_line_filter_keeps_what_is_five_pixels_and_bright() -> None:
     # At two sigma noise itself makes blobs: they are scipy's labels of the filtered frame, by the rule.
     image, streak_px = np.random.default_rng(69).normal(1000, 9, (256, 256)), (9.0, 0.0)
-    background = frame_background.sky(image)
+    background = frame_background.estimate_background(image)
     blobs = detect.smeared(image, background, 2.0, 1000, FramePriors(streak_px))
     taps = detect.taps_of(streak_px)
     above = 2.0 * detect.noise_kept(taps) / frame_background.FILTERED_NOISE * background.noise
@@ -236,7 +236,7 @@ def test_false_streaks_of_white_noise_are_rare() -> None:
         found += len(detect.default(image, hints=FramePriors((10.0, 6.0))))
     expected = 6 * 2**20 / 5 * stats.norm.sf(5)
     assert found <= 3 + 4 * expected
-    assert frame_background.sky(image).noise.mean() == pytest.approx(9 * 0.375, rel=0.03)
+    assert frame_background.estimate_background(image).noise.mean() == pytest.approx(9 * 0.375, rel=0.03)
 
 
 def test_streaks_too_faint_to_be_seen_are_found_by_their_direction() -> None:

@@ -9,7 +9,7 @@ from estimator.core.errors import ImageError
 from estimator.core.types import Blobs, Centroids, FramePriors
 from estimator.detection import classify, detect
 from estimator.detection.classify import NO_STAR, Flag
-from estimator.trackers.pipeline import Clock, Settings, see
+from estimator.trackers.pipeline import Clock, Settings, detect_and_centroid
 
 SHAPE = (493, 659)
 CAMERA = Camera.from_fov(659, 493, np.radians(14.87))
@@ -66,7 +66,7 @@ def test_hot_pixels_are_flagged_and_left_out() -> None:
         image[y, x] += (800, 3000, 20_000, 60_000)[k]
     blobs = detect.default(image)
     assert [flags_near(blobs, x, y) for x, y in hot] == [Flag.HOT] * 4
-    found = see(image, CAMERA, Settings(centroider="gaussian_fit"), Clock())
+    found = detect_and_centroid(image, CAMERA, Settings(centroider="gaussian_fit"), Clock())
     assert len(found) == len(xy)
     assert off_px(found, xy).max() < 0.1
 
@@ -155,7 +155,7 @@ def test_saturated_stars_are_kept_with_a_sigma_that_covers_them(centroider: str,
         light = sum(star(x, y, over * full * 2 * np.pi, 1.0) for x, y in xy)
         image = exposed(rng, light).clip(0, full)
         flags.append(detect.default(image, hints=FramePriors(saturation=full)).flag)
-        found = see(image, CAMERA, settings, Clock())
+        found = detect_and_centroid(image, CAMERA, settings, Clock())
         assert len(found) == 15
         scaled.append(off_px(found, xy) / found.sigma_px.mean())
     assert np.all(np.concatenate(flags) == Flag.SATURATED)
@@ -173,7 +173,7 @@ def test_a_star_on_a_mended_pixel_is_known_as_well_as_it_says(centroider: str) -
         image = exposed(rng, light)
         bad = np.rint(xy).astype(int) + rng.integers(-1, 2, (15, 2))
         image[bad[:, 1], bad[:, 0]] = rng.choice([0, 65535], 15)
-        found = see(image, CAMERA, Settings(centroider=centroider, bad_px=bad), Clock())
+        found = detect_and_centroid(image, CAMERA, Settings(centroider=centroider, bad_px=bad), Clock())
         rows = np.linalg.norm(found.xy_px[None] - xy[:, None], axis=2).argmin(axis=1)
         off.append(found.xy_px[rows] - xy)
         told.append(found.sigma_px[rows])
@@ -202,4 +202,4 @@ def test_a_bad_pixel_off_the_sensor_is_refused() -> None:
 def test_a_frame_without_blobs_has_no_flags() -> None:
     image = np.random.default_rng(50).normal(300, 5, (128, 128))
     blobs = detect.default(image, 20.0)
-    assert len(blobs) == len(classify.judged(image, blobs, FramePriors()).flag) == 0
+    assert len(blobs) == len(classify.classify(image, blobs, FramePriors()).flag) == 0

@@ -61,7 +61,7 @@ def test_three_pixels_at_five_sigma_keep_white_noise_out() -> None:
 def test_the_measured_sky_is_the_mean_and_the_filtered_noise() -> None:
     # White noise through the binomial filter keeps (1 + 4 + 1) / 16 = 0.375 of its deviation.
     image = np.random.default_rng(6).normal(200, 8, (512, 512))
-    background = frame_background.sky(image)
+    background = frame_background.estimate_background(image)
     assert background.level.shape == background.noise.shape == (8, 8)
     # Six rows of 64 pixels; [1 2 1] leaves one independent number in 8/3, 144 in all: the mean is known to 3 / 12, the
     # deviation to 3 / sqrt(288), a tenth worse for being clipped. Five deviations for 64 tiles.
@@ -77,18 +77,18 @@ def test_the_sky_of_a_crowded_tile_is_the_sky_between_the_stars(dtype: str) -> N
     rng = np.random.default_rng(61)
     image = rng.normal(60, 3, (256, 256))
     image[rng.uniform(size=(32, 32)).repeat(8, 0).repeat(8, 1) < 0.2] += 100
-    background = frame_background.sky(image.round().astype(dtype))
+    background = frame_background.estimate_background(image.round().astype(dtype))
     np.testing.assert_allclose(background.level, 60, rtol=0, atol=1.0)
 
 
 def test_the_sky_between_tile_centres_is_bilinear() -> None:
     # Four tiles of a 128x128 frame have their centres at 31.5 and 95.5; half-way between is the mean.
     grid = np.array([[0.0, 8.0], [16.0, 40.0]])
-    assert frame_background.at(grid, 128, 128, 31.5, 31.5) == 0
-    assert frame_background.at(grid, 128, 128, 31.5, 95.5) == 8
-    assert frame_background.at(grid, 128, 128, 63.5, 63.5) == 16
-    assert frame_background.at(grid, 128, 128, 0.0, 0.0) == 0
-    assert frame_background.at(grid, 128, 128, 127.0, 127.0) == 40
+    assert frame_background.interpolate(grid, 128, 128, 31.5, 31.5) == 0
+    assert frame_background.interpolate(grid, 128, 128, 31.5, 95.5) == 8
+    assert frame_background.interpolate(grid, 128, 128, 63.5, 63.5) == 16
+    assert frame_background.interpolate(grid, 128, 128, 0.0, 0.0) == 0
+    assert frame_background.interpolate(grid, 128, 128, 127.0, 127.0) == 40
 
 
 @pytest.mark.parametrize("seed", range(6))

@@ -99,13 +99,20 @@ def test_a_brighter_sky_hides_no_star(rng: np.random.Generator, up: int, name: s
     np.testing.assert_allclose(high.xy_px, low.xy_px, rtol=0, atol=1e-6)
 
 
-@law(detect.gather, detect.smeared, detect.faint_streaks, detect.flattened, background.sky, slow=True)
+@law(
+    detect.gather,
+    detect.smeared,
+    detect.faint_streaks,
+    detect.flattened,
+    background.estimate_background,
+    slow=True,
+)
 @given(rng=SEEDS, streak_px=STREAKS.filter(bool), sigma=some.floats(3, 9))
 def test_what_stands_out_less_is_found_with_less(
     rng: np.random.Generator, streak_px: tuple[float, float], sigma: float
 ) -> None:
     frame, _ = starry(rng)
-    sky = background.sky(frame)
+    sky = background.estimate_background(frame)
     flat = detect.flattened(sky, frame.shape)
     assert sky.level.min() <= flat.level.item() <= sky.level.max()
     found = [detect.gather(frame, flat, more * flat.noise, 1, 99) for more in (sigma, sigma + 1)]
@@ -116,7 +123,7 @@ def test_what_stands_out_less_is_found_with_less(
     assert_inside(detect.faint_streaks(frame, sky, sigma, 99, FramePriors()), 99)
 
 
-@law(components.runs_above, background.sky, background.summing)
+@law(components.runs_above, background.estimate_background, background.summing)
 @given(rng=SEEDS, threshold=some.floats(90, 300), kind=some.sampled_from(["u2", "f8"]))
 def test_runs_are_the_pixels_that_a_plain_filter_has_above(
     rng: np.random.Generator, threshold: float, kind: str
@@ -127,7 +134,7 @@ def test_runs_are_the_pixels_that_a_plain_filter_has_above(
     for y, first, last in runs:
         told[y, first : last + 1] = True
     np.testing.assert_array_equal(told, convolve(frame.astype(float), BINOMIAL, mode="nearest") > threshold)
-    lower, higher = (background.sky(frame + np.array(more, kind)) for more in (0, 50))
+    lower, higher = (background.estimate_background(frame + np.array(more, kind)) for more in (0, 50))
     np.testing.assert_allclose(higher.level - lower.level, 50, rtol=0, atol=0.3)  # by the median's own steps
     for pixel in ("u1", "i1", "u2", "i2"):
         assert np.iinfo(background.summing(np.dtype(pixel))).max >= 16 * np.iinfo(pixel).max
@@ -158,14 +165,14 @@ def test_mending_changes_bad_pixels_alone(rng: np.random.Generator, bad: NDArray
     assert frame.min() <= mended.min() <= mended.max() <= frame.max()
 
 
-@law(classify.judged, Blobs.take)
+@law(classify.classify, Blobs.take)
 @given(rng=SEEDS, full=some.floats(50, 400), streak_px=STREAKS)
 def test_a_verdict_changes_flags_alone(
     rng: np.random.Generator, full: float, streak_px: tuple[float, float] | None
 ) -> None:
     frame, _ = starry(rng)
     blobs = DETECTORS["local"](frame, 5.0, 3, 50, FramePriors())
-    told = classify.judged(frame, blobs, FramePriors(streak_px, full))
+    told = classify.classify(frame, blobs, FramePriors(streak_px, full))
     np.testing.assert_array_equal(told.flag & int(Flag.SATURATED) != 0, told.peak >= full)
     assert streak_px in (None, told.streak_px)
     order = rng.permutation(len(told))
@@ -236,8 +243,8 @@ def test_a_streak_s_middle_is_between_its_ends(rng: np.random.Generator, long_px
     Centroids.none,
     pipeline.brightest,
     pipeline.direction_sigma_rad,
-    pipeline.whole,
-    pipeline.doubted,
+    pipeline.away_from_border,
+    pipeline.inflate_uncertainty,
 )
 @given(rng=SEEDS, count=some.integers(0, 60), base=some.integers(1, 30), floor_px=some.floats(0, 2))
 def test_lights_are_chosen_and_doubted_as_told(
@@ -253,9 +260,9 @@ def test_lights_are_chosen_and_doubted_as_told(
     frame, _ = starry(rng)
     blobs = DETECTORS["local"](frame, 5.0, 3, 9, FramePriors())
     seen = CENTROIDERS["cog"](frame, blobs, 1.0, FramePriors())
-    assert (pipeline.doubted(seen, blobs, settings).sigma_px >= seen.sigma_px).all()
+    assert (pipeline.inflate_uncertainty(seen, blobs, settings).sigma_px >= seen.sigma_px).all()
     off_border = (blobs.box_px > 0) & (blobs.box_px < np.tile([WIDTH - 1, HEIGHT - 1], 2))
-    np.testing.assert_array_equal(pipeline.whole(blobs.box_px, CAMERA), off_border.all(axis=1))
+    np.testing.assert_array_equal(pipeline.away_from_border(blobs.box_px, CAMERA), off_border.all(axis=1))
 
 
 @law(Centroids.weights_per_px2)
@@ -274,7 +281,7 @@ def test_weights_are_the_inverse_of_all_the_errors(
     np.testing.assert_allclose(whole, np.broadcast_to(np.eye(2), whole.shape), rtol=0, atol=1e-9)
 
 
-@law(pipeline.see, pipeline.look, Clock.lap, camera.check_shape)
+@law(pipeline.detect_and_centroid, pipeline.process_frame, Clock.lap, camera.check_shape)
 @given(
     rng=SEEDS,
     hostile=FRAMES | arrays("f8", array_shapes(max_dims=3, max_side=90), fill=some.just(1)),
@@ -286,10 +293,12 @@ def test_a_look_gives_lights_on_the_chip_and_the_time_it_took(
     fits = answered(lambda: camera.check_shape(hostile.shape, CAMERA) or True, ImageError)
     assert bool(fits) == (hostile.shape == (HEIGHT, WIDTH))
     nothing = Attitude("nobody asked")
-    answered(lambda: pipeline.look(hostile, CAMERA, Settings(), lambda *_: nothing, streak_px), ImageError)
+    answered(
+        lambda: pipeline.process_frame(hostile, CAMERA, Settings(), lambda *_: nothing, streak_px), ImageError
+    )
     frame, _ = starry(rng)
     clock = Clock()
-    seen = pipeline.see(frame, CAMERA, Settings(), clock, streak_px)
+    seen = pipeline.detect_and_centroid(frame, CAMERA, Settings(), clock, streak_px)
     assert CAMERA.contains(seen.xy_px).all()
     assert ((seen.sigma_px > 0) & (seen.sigma_px < 5)).all()
     before = clock.seconds["detect"]

@@ -11,7 +11,7 @@ from estimator.catalog import sky_index
 from estimator.core.errors import ImageError
 from estimator.core.vectors import xyzw_of
 from estimator.identification.stars import evidence, search
-from estimator.identification.stars.evidence import Fix
+from estimator.identification.stars.evidence import Solution
 
 WIDE_RAD = np.radians(12.0)
 FIELD = np.tan(np.radians([-5.0, 5.0, -4.0, 4.0]))
@@ -44,17 +44,19 @@ def seen(truth: Rotation, rng, sigma=SIGMA, zoom=1.0, vectors=VECTORS, mag=MAG):
     return noisy[order], shown[order], row[order]
 
 
-def lights_of(tangent, mag, sigma=SIGMA, zoom=0.0) -> evidence.Lights:
+def lights_of(tangent, mag, sigma=SIGMA, zoom=0.0) -> evidence.Detections:
     sigmas = np.full(len(tangent), sigma)
     weight = np.stack([sigmas**-2, sigmas**-2, 0 * sigmas], axis=1)
-    return evidence.Lights(np.ascontiguousarray(tangent), sigmas, weight, np.array(mag), 0.25, FIELD, zoom)
+    return evidence.Detections(
+        np.ascontiguousarray(tangent), sigmas, weight, np.array(mag), 0.25, FIELD, zoom
+    )
 
 
-def solve(lights: evidence.Lights, sky: sky_index.Sky = SKY) -> Fix:
+def solve(lights: evidence.Detections, sky: sky_index.Sky = SKY) -> Solution:
     return search.lost_in_space(lights, sky, sky, BASE, CHECKS)
 
 
-def turn(fix: Fix, truth: Rotation):
+def turn(fix: Solution, truth: Rotation):
     """The small turn from the truth to the answer, in camera axes."""
     return (Rotation.from_quat(fix.cam_from_ref_xyzw) * truth.inv()).as_rotvec()
 

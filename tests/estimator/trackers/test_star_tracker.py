@@ -16,7 +16,7 @@ from estimator.core.camera import Camera
 from estimator.core.errors import ImageError
 from estimator.core.types import Attitude, Centroids
 from estimator.trackers.dome_tracker import SETTINGS, DomeTracker
-from estimator.trackers.pipeline import SATURATED, Clock, Settings, see
+from estimator.trackers.pipeline import SATURATED, Clock, Settings, detect_and_centroid
 from estimator.trackers.star_tracker import NO_MATCH, NO_STARS, StarTracker, mutual
 
 FILE = Path(__file__).parents[3] / "data/catalogues/hipparcos_hp6.5.ecsv"
@@ -187,7 +187,7 @@ def test_a_saturated_frame_is_refused(tracker: StarTracker) -> None:
 def test_a_light_cut_off_by_the_border_is_left_out(tracker: StarTracker) -> None:
     places = np.array([[0.4, 200.0], [300.0, 491.8], [100.0, 100.0], [400.0, 300.0]])
     image = frame(CAMERA, places, np.full(4, 2e4), seed=90)
-    found = see(image, CAMERA, Settings(), Clock())
+    found = detect_and_centroid(image, CAMERA, Settings(), Clock())
     assert len(found) == 2
     # .1 px: centre of gravity of 2e4 electrons under read noise 12 (reference section 3).
     np.testing.assert_allclose(np.sort(found.xy_px[:, 0]), [100, 400], rtol=0, atol=0.3)

@@ -51,7 +51,7 @@ class Law:
     def __init__(self, law: Callable[[Settings], Outcome]) -> None:
         self.law = law
 
-    def run(self, recipe: plan.Recipe, chunks: engines.Chunks) -> Iterator[list[Row]]:
+    def run(self, recipe: plan.TrialSpec, chunks: engines.Chunks) -> Iterator[list[Row]]:
         while chunk := chunks.next():
             yield [
                 self.row(recipe, segment, segment.first + n, k)
@@ -60,7 +60,7 @@ class Law:
             ]
             chunks.took(chunk, 0.1)
 
-    def row(self, recipe: plan.Recipe, segment: Any, trial: int, k: int) -> Row:
+    def row(self, recipe: plan.TrialSpec, segment: Any, trial: int, k: int) -> Row:
         seed, code = seed_of(recipe, segment.point, k), code_version()
         try:
             return Row(trial, segment.point, k, seed, "s", code, self.law(segment.settings), None, 0.0)

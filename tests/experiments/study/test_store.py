@@ -21,7 +21,7 @@ from skysim.core.errors import InputError
 from skysim.experiments.study import loader, plan, setups, store, trials
 from skysim.experiments.study.designs import Point
 from skysim.experiments.study.execution import runner
-from skysim.experiments.study.setups import Bench
+from skysim.experiments.study.setups import Setup
 from skysim.experiments.study.trials import Outcome, Row
 
 STUDY = """
@@ -196,7 +196,7 @@ def test_out_of_time_it_stops_and_resumes(told: plan.Plan, whole: str, tmp_path:
 def test_trials_that_raise_are_rows_until_they_are_too_many(
     told: plan.Plan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def fragile(ready: Bench, seed: int) -> Outcome:
+    def fragile(ready: Setup, seed: int) -> Outcome:
         if seed % 4 == 0:
             raise ZeroDivisionError(f"of {seed}")
         return Outcome("solved", 1, 1)

@@ -11,11 +11,11 @@ from scipy.spatial.transform import Rotation
 from skysim.core.paths import SCENES
 from skysim.core.types import Trajectory
 from skysim.experiments.study import plan, setups, trials
-from skysim.experiments.study.plan import CentroidTrial, FrameTrial, Recipe
+from skysim.experiments.study.plan import CentroidTrial, FrameTrial, TrialSpec
 from skysim.simulation import exposure
 
-SKY = Recipe("shefex2", ".", 1, {}, {"kind": "centroids"}, True)
-DOME = Recipe("afit_simsat", ".", 1, {}, {"kind": "centroids"}, True)
+SKY = TrialSpec("shefex2", ".", 1, {}, {"kind": "centroids"}, True)
+DOME = TrialSpec("afit_simsat", ".", 1, {}, {"kind": "centroids"}, True)
 
 
 def test_a_trial_is_the_same_whatever_was_tried_before():
@@ -45,7 +45,7 @@ def test_what_a_trial_raises_is_in_its_row_with_its_seed():
 def test_attitudes_are_even_over_what_is_allowed(recipe, key):
     """Boresights by area, turns about them evenly: Kolmogorov and Smirnov's test, one in 10^4."""
     low, high = (-60.0, 30.0) if recipe is SKY else (10.0, 30.0)
-    ready = setups.bench(recipe, {key: [low, high]})
+    ready = setups.prepared_setup(recipe, {key: [low, high]})
     rng = np.random.default_rng(3)
     drawn = Rotation.concatenate([trials.attitude(ready, rng) for _ in range(2000)])
     if recipe is SKY:
@@ -64,7 +64,7 @@ def test_attitudes_are_even_over_what_is_allowed(recipe, key):
 
 def test_any_turn_about_the_boresight_is_as_likely_as_another():
     """The body's x axis against the meridian through the boresight; under the dome against its own lean."""
-    ready = setups.bench(DOME, {"trial.tilt_deg": 20})
+    ready = setups.prepared_setup(DOME, {"trial.tilt_deg": 20})
     rng = np.random.default_rng(4)
     drawn = Rotation.concatenate([trials.attitude(ready, rng) for _ in range(2000)])
     seen = drawn.inv().apply([0, 0, 1])
@@ -83,7 +83,7 @@ def test_three_turns_are_scipys(angles):
 @pytest.mark.parametrize("recipe", [SKY, DOME])
 def test_lights_are_where_the_renderer_puts_them_and_as_bright(recipe):
     """Pixel and electrons against the truth of a rendered frame, of those lights whose whole image is on the chip."""
-    ready = setups.bench(recipe, {"background": []})
+    ready = setups.prepared_setup(recipe, {"background": []})
     lab = ready.lab
     lab_from_body = trials.attitude(ready, np.random.default_rng(5))
     still = Trajectory(np.array([-1.0, 9.0]), Rotation.concatenate([lab_from_body] * 2), np.zeros((2, 3)))
@@ -103,7 +103,7 @@ def test_lights_are_where_the_renderer_puts_them_and_as_bright(recipe):
 
 def test_what_is_spoilt_is_spoilt_as_told():
     """Noise, share missed, false lights: mean and spread over many fields."""
-    ready = setups.bench(SKY, {})
+    ready = setups.prepared_setup(SKY, {})
     trial = CentroidTrial(kind="centroids", noise_px=0.3, missing=0.25, false_share=0.5, magnitude_sigma=0.0)
     xy_px, electrons = np.full((40, 2), 300.0), np.linspace(1e5, 2e5, 40)
     rng = np.random.default_rng(6)
@@ -119,14 +119,14 @@ def test_what_is_spoilt_is_spoilt_as_told():
 
 
 def test_the_brightest_are_kept_where_only_so_many_may_be():
-    ready = setups.bench(SKY, {})
+    ready = setups.prepared_setup(SKY, {})
     trial = CentroidTrial(kind="centroids", noise_px=0.0, lights=3, magnitude_sigma=0.0)
     seen = trials.spoilt(trial, np.zeros((9, 2)), np.arange(9.0), ready.lab.scene, np.random.default_rng(1))
     assert seen.flux.tolist() == [8, 7, 6]
 
 
 def test_other_noise_leaves_the_attitude():
-    told = [setups.bench(SKY, {"trial.noise_seed": n}) for n in (0, 1)]
+    told = [setups.prepared_setup(SKY, {"trial.noise_seed": n}) for n in (0, 1)]
     (first, xy_px, seen), (again, its_px, other) = (trials.sight(ready, 12) for ready in told)
     assert (first * again.inv()).magnitude() == 0
     assert (xy_px == its_px).all()
@@ -147,7 +147,7 @@ def test_centroid_trials_err_as_much_as_theory_says():
 def test_a_frame_that_turns_is_smeared_by_what_the_gyro_tells():
     """Streak length in the truth against rate times exposure, at the middle of the field."""
     recipe = replace(SKY, trial={"kind": "frames", "rate_deg_s": 4.0, "gyro": True})
-    ready = setups.bench(recipe, {})
+    ready = setups.prepared_setup(recipe, {})
     assert isinstance(ready.trial, FrameTrial)
     _, truth, told_px = trials.shot(ready, 77)
     wanted = math.radians(4.0) * ready.lab.scene.exposure.time_s * ready.lab.scene.camera.focal_px
@@ -160,7 +160,7 @@ def test_a_frame_that_turns_is_smeared_by_what_the_gyro_tells():
 
 def test_a_flight_counts_its_frames_after_it_settled():
     recipe = replace(DOME, base={"exposure.frames": 6}, trial={"kind": "flight", "settle": "2.1 s"})
-    ready = setups.bench(recipe, {})
+    ready = setups.prepared_setup(recipe, {})
     came = trials.flight(ready, 5)
     # 2 Hz from 1 s on: 1, 1.5 and 2 s are before.
     assert came.frames == 3
@@ -175,7 +175,7 @@ def test_a_flights_filter_is_scored_at_every_tick():
         "motion.control": {"law": "pid", "feedback": "filter"},
     }
     recipe = replace(DOME, base=told, trial={"kind": "flight"})
-    ready = setups.bench(recipe, {})
+    ready = setups.prepared_setup(recipe, {})
     came = trials.flight(ready, 5)
     assert came.frames == came.solved == 4
     assert 0 < came.filter_arcsec < came.filter_worst_arcsec < 600
@@ -184,14 +184,14 @@ def test_a_flights_filter_is_scored_at_every_tick():
 
 
 def test_a_bench_is_kept_and_shared_where_only_the_trial_differs():
-    first = setups.bench(SKY, {"trial.noise_px": 0.1})
-    other = setups.bench(SKY, {"trial.noise_px": 0.2})
+    first = setups.prepared_setup(SKY, {"trial.noise_px": 0.1})
+    other = setups.prepared_setup(SKY, {"trial.noise_px": 0.2})
     assert first.lab is other.lab
-    assert setups.bench(SKY, {"trial.noise_px": 0.1}) is first
+    assert setups.prepared_setup(SKY, {"trial.noise_px": 0.1}) is first
     assert other.trial.noise_px == 0.2
     for n in range(setups.KEPT):
-        setups.bench(SKY, {"camera.focal_length": f"{20 + n} mm"})
-    assert setups.bench(SKY, {"trial.noise_px": 0.1}) is not first
+        setups.prepared_setup(SKY, {"camera.focal_length": f"{20 + n} mm"})
+    assert setups.prepared_setup(SKY, {"trial.noise_px": 0.1}) is not first
 
 
 def test_the_scenes_hash_is_of_its_values_and_of_its_files(tmp_path):

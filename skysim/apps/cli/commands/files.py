@@ -41,7 +41,7 @@ def scenes_export(
 
     loaded = load(scene, None, seed, set_)
     path = out or Path("out") / f"{loaded.name}.xml"
-    text = testbed.staged(testbed.build_testbed(loaded))
+    text = testbed.export_mjcf(testbed.build_testbed(loaded))
     files.make_folder(path.parent)
     files.write_text(path, text)
     print(f"{path}: python -m mujoco.viewer --mjcf={path}")
@@ -129,13 +129,13 @@ def camera(
     import dataclasses
 
     from skysim.core import files
-    from skysim.core.yaml_reader import overridden
+    from skysim.core.yaml_reader import parse_overrides
     from skysim.scene import loader, opencv_calibration
 
     if opencv_calibration.is_one(file):
         told = opencv_calibration.read(file)
     elif set_:
-        told = loader.load(file, overridden(set_)).camera.calibration()
+        told = loader.load(file, parse_overrides(set_)).camera.calibration()
     else:
         told = loader.load_camera(loader.find(str(file))).calibration()
     if out:

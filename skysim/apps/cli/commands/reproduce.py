@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from skysim.apps.cli.terminal import inked, print_table, watched
+from skysim.apps.cli.terminal import colored, print_table, progress_callback
 
 if TYPE_CHECKING:
     from rich.text import Text
@@ -47,7 +47,7 @@ def reproduce(
 
     done = []
     for id in named(ids):
-        with watched(id, quiet=json) as watch:
+        with progress_callback(id, quiet=json) as watch:
             done.append(do(id, Ask(quick, seed, watch)))
         if not json:
             show(done[-1])
@@ -100,7 +100,7 @@ def show(one: Reproduction) -> None:
             line.row.quantity,
             stated(line.row),
             number(line.answer.ours),
-            inked(line.verdict, INK[line.verdict]),
+            colored(line.verdict, INK[line.verdict]),
         ]
         for line in one.lines
     ]

@@ -21,19 +21,19 @@ from skysim.apps.cli.options import (
     Seed,
     Sets,
     SolverName,
-    fresh,
+    clean_folder,
+    given_stages,
     load,
-    named,
 )
 from skysim.apps.cli.terminal import (
-    begun,
-    complain,
-    draw,
+    eager_first,
+    print_error,
     print_rows,
     print_scores,
     print_summary,
     progress,
-    watched,
+    progress_callback,
+    write_3d_views,
 )
 
 if TYPE_CHECKING:
@@ -70,20 +70,22 @@ def run(
     from skysim.simulation.testbed import build_testbed
     from skysim.tracking.external import process
 
-    stages = named(detector=detector, centroider=centroider, identifier=identifier, solver=solver)
+    stages = given_stages(detector=detector, centroider=centroider, identifier=identifier, solver=solver)
     more = [f"tracker.{stage}={name}" for stage, name in stages.items()]
     more += [] if tracker is None else [f"tracker.name={tracker}"]
     loaded = load(scene, frames, seed, [*(set_ or []), *more])
     testbed = build_testbed(loaded, process.named(program))
     for doubt in checks.doubts(loaded, testbed.sources, testbed.mount):
-        complain(doubt)
-    with watched("flying") as watch:
+        print_error(doubt)
+    with progress_callback("flying") as watch:
         testbed = simulate_motion(testbed, watch)
-    scored = begun(score_frames(testbed))  # an error in the first frame comes before old results are removed
+    scored = eager_first(
+        score_frames(testbed)
+    )  # an error in the first frame comes before old results are removed
     recorder = Recorder(out or Path("out") / loaded.name, testbed)
     for frame in progress(scored, loaded.exposure.frames, loaded.title):
         recorder.add(frame)
-    drawn = draw(testbed, recorder.folder) if picture else []
+    drawn = write_3d_views(testbed, recorder.folder) if picture else []
     figures = recorder.finish(shlex.join(["skysim", *sys.argv[1:]]), drawn)
     if json:
         print(to_json({"scene": loaded.name, **figures, "rows": as_dicts(recorder.rows)}))
@@ -116,10 +118,10 @@ def compare(
     loaded = load(scene, frames, seed, [*(set_ or []), f"tracker.name={tracker[0]}"])
     lab = testbed.build_testbed(loaded, process.named(program))
     entrants = tracker_comparison.entrants(lab, tracker)
-    with watched("flying", quiet=json) as watch:
+    with progress_callback("flying", quiet=json) as watch:
         lab = simulation.simulate_motion(lab, watch)
-    shots = begun(tracker_comparison.shots(lab, entrants))
-    folder = fresh(out or Path("out") / loaded.name)
+    shots = eager_first(tracker_comparison.shots(lab, entrants))
+    folder = clean_folder(out or Path("out") / loaded.name)
     rows: dict[str, list[Row]] = {name: [] for name in entrants}
     for frame, truth, answers in progress(shots, loaded.exposure.frames, loaded.title, quiet=json):
         frame_files.write_frame(folder, frame, truth, loaded)
@@ -169,10 +171,10 @@ def render(
     from skysim.simulation import run as simulation
 
     loaded = load(scene, frames, seed, set_)
-    with watched("flying") as watch:
+    with progress_callback("flying") as watch:
         lab = simulation.prepare(loaded, watch)
-    shots = begun(simulation.render_frames(lab))
-    folder = fresh(out or Path("out") / loaded.name)
+    shots = eager_first(simulation.render_frames(lab))
+    folder = clean_folder(out or Path("out") / loaded.name)
     written = []
     for frame, truth, _ in progress(shots, loaded.exposure.frames, loaded.title):
         frame_files.write_frame(folder, frame, truth, loaded)

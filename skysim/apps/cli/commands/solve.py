@@ -17,17 +17,11 @@ from skysim.apps.cli.options import (
     Seed,
     Sets,
     SolverName,
+    given_stages,
     load,
     moment,
-    named,
 )
-from skysim.apps.cli.terminal import (
-    complain,
-    print_answers,
-    print_survey,
-    progress,
-    watched,
-)
+from skysim.apps.cli.terminal import print_answers, print_error, print_survey, progress, progress_callback
 from skysim.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -73,7 +67,7 @@ def solve(
     from skysim.core.images import grab
     from skysim.results.files import frames
 
-    stages = named(detector=detector, centroider=centroider, identifier=identifier, solver=solver)
+    stages = given_stages(detector=detector, centroider=centroider, identifier=identifier, solver=solver)
     how = solving.make_solver(fov, camera, time_utc=moment(time), stages=stages)
     files.make_folder(out)
     paths = [*(images or ()), *([kept(grab(live), out / "live.png")] if live is not None else ())]
@@ -90,7 +84,7 @@ def solve(
     else:
         print_answers(answers, out)
     for fault in doubts + faults:
-        complain(fault)
+        print_error(fault)
     if faults:
         raise typer.Exit(2)
 
@@ -125,11 +119,11 @@ def survey(
     from skysim.tracking import dome_map_file, factory
 
     doubt = dome_survey.doubt(imu_sigma, led_sigma, lever_sigma, focal_error)
-    lab = testbed.build_testbed(dome_survey.doubted(load(scene, None, seed, set_), doubt))
+    lab = testbed.build_testbed(dome_survey.with_survey_errors(load(scene, None, seed, set_), doubt))
     belief = dome_survey.belief_of(lab)
     before = testbed.tracker(lab)
     looks = list(progress(dome_survey.looks(lab, belief, doubt, frames, tilt), frames, "photographing"))
-    with watched("adjusting") as watch:
+    with progress_callback("adjusting") as watch:
         found = dome_survey.surveyed(looks, belief, doubt, distortion, watch)
     folder = files.make_folder(out or Path("out") / lab.scene.name)
     path, picture = folder / "leds.ecsv", folder / "survey.png"

@@ -60,7 +60,7 @@ def stream(
     from skysim.apps.stream.pacing import Pace
     from skysim.apps.stream.sinks import GONE
     from skysim.core import files
-    from skysim.core.yaml_reader import overridden
+    from skysim.core.yaml_reader import parse_overrides
     from skysim.scene.loader import load
     from skysim.simulation import testbed
 
@@ -68,7 +68,7 @@ def stream(
         raise InputError("skysim stream: give where to: --folder DIR, --http PORT or --pipe PATH")
     if endless and frames is not None:
         raise InputError("skysim stream: give either --frames N or --endless")
-    told = overridden(set_) | ({"seed": str(seed)} if seed is not None else {})
+    told = parse_overrides(set_) | ({"seed": str(seed)} if seed is not None else {})
     told |= {"exposure.frames": str(frames)} if frames is not None else {}
     lab = replace(testbed.build_testbed(load(scene, told)), endless=endless)
     takers: list[Sink] = []

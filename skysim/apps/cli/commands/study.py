@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from skysim.apps.cli.terminal import complain, counted, print_table, print_titles
+from skysim.apps.cli.terminal import print_error, print_table, print_titles, trial_progress
 from skysim.core.errors import InputError, printable
 
 if TYPE_CHECKING:
@@ -73,11 +73,11 @@ def run(
 ) -> None:
     """Run all trials of a study and write its report. After Ctrl-C, `resume` continues."""
     warmed(engine)
-    from skysim.core.yaml_reader import overridden
+    from skysim.core.yaml_reader import parse_overrides
     from skysim.experiments.study import loader
     from skysim.tracking.external import process
 
-    overrides = overridden(set_)
+    overrides = parse_overrides(set_)
     told = loader.load(study, overrides, process.named(program))
     if told.study.optimise is not None:
         raise InputError(f"{told.path}: optimise: has no design to run; allowed: skysim study optimise")
@@ -196,11 +196,11 @@ def optimise(
 ) -> None:
     """Search a study's factors for the best point, or the Pareto front of two objectives. `resume` continues it."""
     warmed(engine)
-    from skysim.core.yaml_reader import overridden
+    from skysim.core.yaml_reader import parse_overrides
     from skysim.experiments.study import loader
     from skysim.tracking.external import process
 
-    overrides = overridden(set_)
+    overrides = parse_overrides(set_)
     told = loader.load(study, overrides, process.named(program))
     if told.study.optimise is None:
         raise InputError(
@@ -233,7 +233,7 @@ def done(
         runner.begin(told, kept, again, overrides)
         if failed:
             kept.forget_failed()
-        with counted(told.study.title, total(told)) as watch:
+        with trial_progress(told.study.title, total(told)) as watch:
             if told.study.optimise is not None:
                 whole = search.search(told, kept, engine, watch).finished
             else:
@@ -241,9 +241,9 @@ def done(
                 whole = progress.done == progress.trials
         counts = kept.counts()
     if not whole:
-        complain(f"{counts['done']} of {total(told)} trials done within the budget; {on} goes on")
+        print_error(f"{counts['done']} of {total(told)} trials done within the budget; {on} goes on")
     if counts["failed"]:
-        complain(f"{counts['failed']} trials failed; {command(study, out, 'status')} names them")
+        print_error(f"{counts['failed']} trials failed; {command(study, out, 'status')} names them")
     reported(told, study, out, overrides, json)
 
 
@@ -265,7 +265,7 @@ def stoppable(on: str, kept: Store) -> Iterator[None]:
     try:
         yield
     except KeyboardInterrupt:
-        complain(f"{kept.counts()['done']} trials are in; {on} goes on")
+        print_error(f"{kept.counts()['done']} trials are in; {on} goes on")
         raise
     finally:
         signal.signal(signal.SIGTERM, before)
@@ -349,7 +349,7 @@ def print_replay(figures: dict[str, Any]) -> None:
     ):
         print(f"{name:12s} {figures[name]}")
     if figures["changed"]:
-        complain(f"differs from the store in {', '.join(figures['changed'])}: made with other code")
+        print_error(f"differs from the store in {', '.join(figures['changed'])}: made with other code")
     if figures["error"]:
         print(figures["error"])
     for path in figures["pictures"][:10]:

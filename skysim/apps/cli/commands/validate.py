@@ -7,7 +7,7 @@ from typing import Annotated, NamedTuple
 
 import typer
 
-from skysim.apps.cli.terminal import complain
+from skysim.apps.cli.terminal import print_error
 from skysim.core.errors import InputError
 
 KINDS = ("scene", "study")
@@ -53,7 +53,7 @@ def validate(
         print(file_io.to_json([one._asdict() for one in told]))
     for one in told if not json else []:
         if one.fault:
-            complain(one.fault)
+            print_error(one.fault)
         else:
             print(f"{one.file}: {one.what}", *one.doubts, sep="\n  ")
     if any(one.fault for one in told):
@@ -121,7 +121,7 @@ def vehicle(path: Path) -> str:
 
 def scene(path: Path) -> tuple[str, tuple[str, ...]]:
     """Set up a scene without simulating its motion: vehicle, lights, tracker. Returns a description and warnings."""
-    from skysim.scene.loader import load, where
+    from skysim.scene.loader import load, with_location
     from skysim.simulation import checks, testbed
 
     told = load(path)
@@ -129,7 +129,7 @@ def scene(path: Path) -> tuple[str, tuple[str, ...]]:
         lab = testbed.build_testbed(told)
         testbed.tracker(lab)
     except InputError as error:
-        raise InputError(where(str(error), str(path), {})) from None
+        raise InputError(with_location(str(error), str(path), {})) from None
     count, frames = len(lab.sources.id), told.exposure.frames
     return f"a scene of {count} lights and {frames} frames", tuple(
         checks.doubts(told, lab.sources, lab.mount)

@@ -14,7 +14,7 @@ from pydantic import BaseModel
 from skysim.core.errors import InputError
 from skysim.core.paths import SCENES
 from skysim.core.units import SI_SUFFIX
-from skysim.core.yaml_reader import put, read_yaml
+from skysim.core.yaml_reader import read_yaml, set_key
 from skysim.scene.loader import FILES, find, load, read
 from skysim.scene.motion import spelt_out
 from skysim.scene.scene import STEM, Scene
@@ -192,7 +192,7 @@ def looped(name: str, overrides: Mapping[str, str], feedback: str) -> dict[str, 
     """Overrides that close the loop with another feedback (a key of LOOPS); "" removes controller and maneuver."""
     tree = read(find(name))[0]
     for key, value in overrides.items():
-        put(tree, key, value)
+        set_key(tree, key, value)
     control = spelt_out(tree.get("motion", {}).get("control"))
     if not feedback or control is None:
         return {"motion.control": "null", "motion.manoeuvre": "[]"}

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
-from skysim.apps.gui.messages import Answer, Light, Spot
+from skysim.apps.gui.messages import Answer, Detection, Light
 
 INK = {
     **{"truth": "#5aa9ff", "detected": "#ff7b6b", "identified": "#6fdc7f", "false": "#ffc04d"},
@@ -56,7 +56,7 @@ def marks(
     ]
 
 
-def false(spots: Collection[Spot], lights: Collection[Light]) -> list[Spot]:
+def false(spots: Collection[Detection], lights: Collection[Light]) -> list[Detection]:
     """Detections that have no true light within NEAR_PX; none if the truth is unknown."""
     if not lights:
         return []
@@ -94,7 +94,7 @@ def cross(x: float, y: float, size: float) -> str:
 
 
 def labels(
-    spots: Collection[Spot],
+    spots: Collection[Detection],
     size: float,
     font: float,
     size_px: tuple[int, int],
@@ -140,7 +140,9 @@ def take(taken: dict[int, int], left: float, top: float, right: float, bottom: f
     return True
 
 
-def magnified(dn: tuple[tuple[int, ...], ...], spots: Collection[Spot], x0: int, y0: int, high: int) -> str:
+def magnified(
+    dn: tuple[tuple[int, ...], ...], spots: Collection[Detection], x0: int, y0: int, high: int
+) -> str:
     """SVG of enlarged pixels with their values, and crosses at the centroids. high : height in screen pixels."""
     rows, columns = len(dn), len(dn[0])
     cell, wide = high / rows, columns * high / rows

@@ -13,7 +13,7 @@ import numpy as np
 from nicegui import ui
 from nicegui.events import KeyEventArguments
 
-from skysim.apps.gui.messages import Setting, View
+from skysim.apps.gui.messages import FrameView, SceneInfo
 from skysim.apps.gui.page import forms, keys, style
 from skysim.apps.gui.page.panels.attitude import AttitudeCard
 from skysim.apps.gui.page.panels.monte_carlo import TrialPanel
@@ -23,7 +23,7 @@ from skysim.apps.gui.page.panels.scene import ScenePanel
 from skysim.apps.gui.page.panels.sensor import FRAMES, Sensor
 from skysim.apps.gui.page.scene_3d import Space
 from skysim.apps.gui.worker import export, pointing
-from skysim.apps.gui.worker.session import Gone, Session
+from skysim.apps.gui.worker.session import Session, WorkerLost
 from skysim.core.errors import InputError
 from skysim.core.paths import SCENES
 from skysim.scene.loader import find, load
@@ -48,8 +48,8 @@ class Tab:
         self.id = secrets.token_hex(8)
         self.scene, self.folder, self.out = scene, folder, out
         self.overrides: dict[str, str] = {}
-        self.setting: Setting | None = None
-        self.view: View | None = None
+        self.setting: SceneInfo | None = None
+        self.view: FrameView | None = None
         self.feedback: str | None = None
         self.solving, self.open_still = True, True
         self.steps, self.moving = np.zeros(3), False
@@ -218,7 +218,7 @@ class Tab:
         """Absolute path of the scene file, since study files are written to other folders."""
         return str(find(self.scene).resolve())
 
-    async def show(self, asked: Awaitable[Any]) -> View | None:
+    async def show(self, asked: Awaitable[Any]) -> FrameView | None:
         """Wait for a frame and display it; None if the request failed or the tab has closed."""
         begin = time.perf_counter()
         view = await self.wait(asked)
@@ -227,7 +227,7 @@ class Tab:
             self.rate.set_text(f"{1e3 * (time.perf_counter() - begin):.0f} ms")
         return view
 
-    def display(self, view: View) -> None:
+    def display(self, view: FrameView) -> None:
         """Display a frame in the sensor view, the attitude card and the 3-D view."""
         self.view = view
         self.sensor.show(view)
@@ -258,7 +258,7 @@ class Tab:
         """Await a result; display an error in one line and return None."""
         try:
             answer = await asked
-        except (InputError, Gone) as error:
+        except (InputError, WorkerLost) as error:
             if self.open_still:
                 self.say(str(error))
             return None

@@ -9,7 +9,7 @@ import numpy as np
 from nicegui import ui
 from scipy.spatial.transform import Rotation
 
-from skysim.apps.gui.messages import Setting, Stage, View
+from skysim.apps.gui.messages import FrameView, SceneInfo, Stage
 from skysim.apps.gui.page.style import INK
 
 CLASSES = 3  # of brightness, each with its own point size
@@ -37,7 +37,7 @@ class Space:
         self.vehicle: Any = None
         self.lit: Any = None
         self.stage: Stage | None = None
-        self.newest: View | None = None
+        self.newest: FrameView | None = None
         self.moves = ui.timer(MOVED_SLOW_S, self.move)
 
     async def suit(self) -> None:
@@ -46,7 +46,7 @@ class Space:
             self.fps, self.moves.interval = FPS, MOVED_S
             self.scene.props(f"fps={self.fps}")
 
-    def set(self, setting: Setting) -> None:
+    def set(self, setting: SceneInfo) -> None:
         """Build the view of a new scene."""
         self.stage = stage = setting.stage
         self.scene.clear()
@@ -88,7 +88,7 @@ class Space:
             self.scene.line(eye, corner).material(INK["accent"])
             self.scene.line(corner, corners[(n + 1) % 4]).material(INK["accent"])
 
-    def show(self, view: View) -> None:
+    def show(self, view: FrameView) -> None:
         """Queue the newest attitude for the timer."""
         self.newest = view
 

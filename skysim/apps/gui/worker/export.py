@@ -11,11 +11,11 @@ import cv2
 import numpy as np
 import yaml
 
-from skysim.apps.gui.worker.workbench import Desk
+from skysim.apps.gui.worker.workbench import Workbench
 from skysim.core import files as file_io
 from skysim.core.errors import InputError
 from skysim.core.paths import SCENES
-from skysim.core.yaml_reader import VERSION, put
+from skysim.core.yaml_reader import VERSION, set_key
 from skysim.results.files import frames
 from skysim.results.report import annotate
 from skysim.scene.loader import find
@@ -31,7 +31,7 @@ KINDS = {  # file by menu entry
 }
 
 
-def files(desk: Desk, base: str, overrides: dict[str, str]) -> dict[str, bytes]:
+def files(desk: Workbench, base: str, overrides: dict[str, str]) -> dict[str, bytes]:
     """All files by name. Raises InputError if no frame has been rendered."""
     if desk.frame is None or desk.truth is None:
         raise InputError("nothing to export yet")
@@ -52,7 +52,7 @@ def files(desk: Desk, base: str, overrides: dict[str, str]) -> dict[str, bytes]:
     return found
 
 
-def figure(desk: Desk) -> bytes:
+def figure(desk: Workbench) -> bytes:
     """PNG of the frame with true lights, detections and identified lights marked."""
     assert desk.frame is not None
     assert desk.truth is not None
@@ -78,7 +78,7 @@ def scene_yaml(base: str, overrides: dict[str, str], title: str = "") -> str:
     if title:
         tree["title"] = title
     for key, value in overrides.items():
-        put(tree, key, value)
+        set_key(tree, key, value)
     return yaml.safe_dump(tree, sort_keys=False, allow_unicode=True)
 
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from skysim.apps.gui.messages import FlightLog, View
-from skysim.apps.gui.worker.workbench import Desk
+from skysim.apps.gui.messages import FlightLog, FrameView
+from skysim.apps.gui.worker.workbench import Workbench
 from skysim.core.types import Floats, Telemetry
 from skysim.core.units import ARCSEC_RAD
 from skysim.results import telemetry_report
@@ -28,7 +28,7 @@ class Flown:
     log: Telemetry
 
     @classmethod
-    def of(cls, desk: Desk, watch: Callable[[float, float], None]) -> Flown:
+    def of(cls, desk: Workbench, watch: Callable[[float, float], None]) -> Flown:
         """Simulate the motion of the workbench's scene. watch : progress(done, total)"""
         lab = run.simulate_motion(desk.lab, watch)
         return cls(lab, lab.log)
@@ -54,7 +54,7 @@ class Flown:
         thinned = {name: tuple(values[::every].tolist()) for name, values in found.items()}
         return FlightLog(tuple(log.t_s[::every].tolist()), thinned, tuple(frames))
 
-    def at(self, desk: Desk, t_s: float, solve: bool) -> View:
+    def at(self, desk: Workbench, t_s: float, solve: bool) -> FrameView:
         """Render the frame whose exposure begins at t_s, limited so that it ends within the motion.
 
         The noise seed depends on the time, so that the same time always gives the same frame.
@@ -73,7 +73,7 @@ class Flown:
         believed, innovation = self.filter_at(desk, begin_s)
         return replace(view, t_s=begin_s, filter_arcsec=believed, innovation_arcsec=innovation)
 
-    def filter_at(self, desk: Desk, t_s: float) -> tuple[float, float]:
+    def filter_at(self, desk: Workbench, t_s: float) -> tuple[float, float]:
         """Error of the filter, and angle between the star tracker's attitude and the filter's, arcsec; NaN if none."""
         believed = self.log.lab_from_filter
         if believed is None:

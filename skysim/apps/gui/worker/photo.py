@@ -20,7 +20,7 @@ from skysim.core.errors import InputError
 from skysim.core.images import LiveCamera
 from skysim.experiments.study import loader, store
 from skysim.experiments.study.execution import replay
-from skysim.experiments.study.setups import bench
+from skysim.experiments.study.setups import prepared_setup
 from skysim.experiments.study.store import STORE
 from skysim.experiments.study.trials import one
 from skysim.results import scoring, stretch
@@ -79,7 +79,7 @@ def of_trial(study: str, folder: Path, trial: int) -> Seen:
     with store.open_store(folder / STORE) as kept:
         segment = replay.segment_of(planned, kept, trial)
     row = one(planned.recipe, segment, trial, segment.replicates[0])
-    ready = bench(planned.recipe, segment.settings)
+    ready = prepared_setup(planned.recipe, segment.settings)
     frame, truth, report = next(replay.seen(ready, row.seed))
     answer = answered(ready.lab, ready.estimator, report, truth)
     if row.error:

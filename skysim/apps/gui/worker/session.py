@@ -16,7 +16,7 @@ from skysim.experiments.study.execution.workers import environment, one_thread
 CAREFUL = {"OPENCV_IO_MAX_IMAGE_PIXELS": str(2**27)}  # most pixels that OpenCV decodes
 
 
-class Gone(Exception):
+class WorkerLost(Exception):
     """The worker has died or was closed."""
 
 
@@ -78,7 +78,7 @@ class Session:
             self.pipe.send((task, arguments))
             verdict, answer = self.pipe.recv()
         except (EOFError, OSError) as error:
-            raise Gone("this tab's worker has stopped: reload the page") from error
+            raise WorkerLost("this tab's worker has stopped: reload the page") from error
         if verdict == "bad":
             raise InputError(answer)
         return answer
@@ -102,7 +102,7 @@ class Session:
         self.thread.shutdown(wait=False, cancel_futures=True)
 
 
-class Spare:
+class SpareWorker:
     """Keeps a worker ready for the next tab, because its imports and compilation take seconds.
 
     scene : file from which it solves a frame to warm up

@@ -9,10 +9,10 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from skysim.apps.gui.messages import FlightLog, Setting, Triple, View, Zoom
+from skysim.apps.gui.messages import FlightLog, FrameView, SceneInfo, Triple, Zoom
 from skysim.apps.gui.worker import export, photo
 from skysim.apps.gui.worker.flight import Flown
-from skysim.apps.gui.worker.workbench import Desk, zoomed
+from skysim.apps.gui.worker.workbench import Workbench, zoomed
 from skysim.core.errors import InputError
 from skysim.core.images import LiveCamera
 
@@ -28,20 +28,20 @@ class Kept:
     """
 
     watch: Watch
-    desk: Desk | None = None
+    desk: Workbench | None = None
     flown: Flown | None = None
     image: NDArray | None = None
     scene: str = ""
     overrides: Mapping[str, str] | None = None
     camera: LiveCamera | None = None
 
-    def ready(self) -> Desk:
+    def ready(self) -> Workbench:
         """Return the workbench. Raises InputError if no scene is set up."""
         if self.desk is None:
             raise InputError("no scene is set up")
         return self.desk
 
-    def seen(self, view: View) -> View:
+    def seen(self, view: FrameView) -> FrameView:
         """Return the view, and forget the other image, because the page now shows the scene."""
         self.image = None
         return view
@@ -66,26 +66,28 @@ class Stopped(Exception):
 
 def warm(_: Kept, scene: str) -> None:
     """Warm up: set up a scene and solve one frame, so that code is imported and compiled."""
-    Desk.of(scene, {}).look(solve=True)
+    Workbench.of(scene, {}).look(solve=True)
 
 
-def open_scene(kept: Kept, scene: str, overrides: Mapping[str, str], solve: bool) -> tuple[Setting, View]:
+def open_scene(
+    kept: Kept, scene: str, overrides: Mapping[str, str], solve: bool
+) -> tuple[SceneInfo, FrameView]:
     """Set up a scene and render a first frame."""
-    kept.desk = Desk.of(scene, overrides, kept.desk)
+    kept.desk = Workbench.of(scene, overrides, kept.desk)
     kept.scene, kept.overrides, kept.flown = scene, dict(overrides), None
     return kept.desk.setting, look(kept, solve)
 
 
-def look(kept: Kept, solve: bool) -> View:
+def look(kept: Kept, solve: bool) -> FrameView:
     return kept.seen(kept.ready().look(solve))
 
 
-def point(kept: Kept, angles_deg: Triple, solve: bool) -> View:
+def point(kept: Kept, angles_deg: Triple, solve: bool) -> FrameView:
     kept.ready().point(angles_deg)
     return look(kept, solve)
 
 
-def move(kept: Kept, right: float, up: float, roll_deg: float, solve: bool) -> View:
+def move(kept: Kept, right: float, up: float, roll_deg: float, solve: bool) -> FrameView:
     kept.ready().move(right, up, roll_deg)
     return look(kept, solve)
 
@@ -116,7 +118,7 @@ def fly(kept: Kept) -> FlightLog:
     return kept.flown.curves
 
 
-def play(kept: Kept, t_s: float, solve: bool) -> View:
+def play(kept: Kept, t_s: float, solve: bool) -> FrameView:
     """Render the frame at time t_s of the motion. Raises InputError if none was simulated."""
     if kept.flown is None:
         raise InputError("nothing was flown yet")

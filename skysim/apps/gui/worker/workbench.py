@@ -15,7 +15,7 @@ from estimator.core.types import Attitude
 from estimator.trackers.dome_tracker import DomeTracker
 from estimator.trackers.pipeline import Clock, Report
 from estimator.trackers.star_tracker import StarTracker
-from skysim.apps.gui.messages import Answer, Light, Setting, Spot, Triple, View, Zoom
+from skysim.apps.gui.messages import Answer, Detection, FrameView, Light, SceneInfo, Triple, Zoom
 from skysim.apps.gui.worker import geometry, pointing
 from skysim.core import quaternion
 from skysim.core.types import Floats, Frame, Trajectory, Truth
@@ -36,7 +36,7 @@ STAGES = ("detector", "centroider", "identifier", "solver")
 
 
 @dataclass
-class Desk:
+class Workbench:
     """A scene that is set up, with the current attitude and the newest frame.
 
     stretch, bright, widest_px : how frames are displayed
@@ -58,7 +58,7 @@ class Desk:
     magnitude: dict[int, float] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, name: str, overrides: Mapping[str, str], before: Desk | None = None) -> Desk:
+    def of(cls, name: str, overrides: Mapping[str, str], before: Workbench | None = None) -> Workbench:
         """Set up a scene. If only the tracker differs from `before`, its testbed and attitude are kept.
 
         Raises InputError.
@@ -81,11 +81,11 @@ class Desk:
         )
 
     @property
-    def setting(self) -> Setting:
+    def setting(self) -> SceneInfo:
         """Facts about the scene for the page."""
         scene, settings = self.scene, tracker_settings.believed_settings(self.scene)
         camera = scene.camera
-        return Setting(
+        return SceneInfo(
             scene.name,
             scene.title,
             isinstance(scene.light, StarsConfig),
@@ -109,7 +109,7 @@ class Desk:
             self.scene, self.lab.mount, self.lab_from_body, right, up, roll_deg
         )
 
-    def look(self, solve: bool = False) -> View:
+    def look(self, solve: bool = False) -> FrameView:
         """Render a frame at the current attitude at rest, with independent noise; solve it if asked."""
         self.shots += 1
         scene = self.scene.model_copy(update={"seed": self.scene.seed + self.shots})
@@ -125,14 +125,14 @@ class Desk:
             return None
         return answered(self.lab, self.estimator, self.report, self.truth)
 
-    def shown(self, lab: Testbed, solve: bool) -> View:
+    def shown(self, lab: Testbed, solve: bool) -> FrameView:
         """Render frame 0 of a testbed, solve it if asked, and return the view for the page."""
         clock = Clock()
         self.frame, self.truth = exposure.render_frame(lab, 0)
-        self.report = factory.answer(self.estimator, self.frame) if solve else None
+        self.report = factory.solve_frame(self.estimator, self.frame) if solve else None
         packed, (height, width) = self.packed(self.frame.image_dn), self.frame.image_dn.shape
         clock.lap("all")
-        return View(
+        return FrameView(
             packed,
             (width, height),
             scoring.angles_deg(self.truth.cam_from_lab, self.scene, self.lab.mount),
@@ -185,12 +185,13 @@ def answered(lab: Testbed, estimator: factory.Estimator, report: Report, truth: 
     )
 
 
-def spots_of(report: Report, names: Mapping[int, tuple[int, float]]) -> tuple[Spot, ...]:
+def spots_of(report: Report, names: Mapping[int, tuple[int, float]]) -> tuple[Detection, ...]:
     """Detections with id and residual of their matched lights. names : (id, residual in pixels) by centroid row"""
     seen = report.centroids
     rows = zip(seen.xy_px.tolist(), seen.sigma_px.tolist(), seen.flux.tolist(), strict=True)
     return tuple(
-        Spot(x, y, sigma, flux, *names.get(n, (-1, math.nan))) for n, ((x, y), sigma, flux) in enumerate(rows)
+        Detection(x, y, sigma, flux, *names.get(n, (-1, math.nan)))
+        for n, ((x, y), sigma, flux) in enumerate(rows)
     )
 
 

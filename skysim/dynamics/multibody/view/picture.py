@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skysim.core.errors import InputError
-from skysim.core.files import whole
+from skysim.core.files import atomic_file
 from skysim.core.types import Floats
 from skysim.dynamics.multibody.mjcf import mujoco_warnings, one_line
 
@@ -91,7 +91,7 @@ def write_film(pictures: Iterable[Picture], path: Path, fps: float) -> None:
     done, coded = cv2.imencodeanimation(path.suffix, animation, ANIMATED[path.suffix])
     if not done:
         raise OSError(errno.EIO, "OpenCV could not encode the film", str(path))
-    with whole(path) as temporary:
+    with atomic_file(path) as temporary:
         temporary.write_bytes(coded.tobytes())
 
 

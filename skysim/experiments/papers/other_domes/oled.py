@@ -13,7 +13,7 @@ from skysim.experiments.papers.compare import Answer, Ask, Cause, Drawing, Found
 from skysim.experiments.papers.intervals import resampled
 from skysim.experiments.papers.published import experiments
 from skysim.experiments.study.plan import CentroidTrial
-from skysim.experiments.study.setups import Bench
+from skysim.experiments.study.setups import Setup
 from skysim.experiments.study.trials import centroids
 from skysim.results.metrics import Summary, rms
 from skysim.results.plots import INK, MARKS
@@ -51,23 +51,23 @@ class Spread(NamedTuple):
         return resampled(self.error_arcsec[:, 2], rms)
 
 
-def bench(lights: int) -> Bench:
+def bench(lights: int) -> Setup:
     """AFIT's camera under its measured dome with randomly placed lights, of which at most `lights` are used."""
     layout = f'{{kind: poisson_disc, spacing: "{SPACING_MM[lights]} mm", cap_deg: {CAP_DEG}}}'
     told = loader.load("afit_simsat", {"light.layout": layout, "tracker.centroid_sigma_px": str(NOISE_PX)})
     lab = testbed.build_testbed(told)
     trial = CentroidTrial(kind="centroids", noise_px=NOISE_PX, lights=lights, tilt_deg=(0, TILT_DEG))
-    return Bench(lab, testbed.tracker(lab), trial, "")
+    return Setup(lab, testbed.tracker(lab), trial, "")
 
 
-def spread(ready: Bench, seeds: Sequence[int]) -> Spread:
+def spread(ready: Setup, seeds: Sequence[int]) -> Spread:
     """Errors of lost-in-space solutions from simulated centroids at random attitudes."""
     came = [centroids(ready, seed) for seed in seeds]
     off = np.array([[one.x_arcsec, one.y_arcsec, one.roll_arcsec] for one in came])
     return Spread(off[np.isfinite(off[:, 0])], len(came))
 
 
-def surveyed(ready: Bench, sigmas: dict[str, str], seed: int) -> Bench:
+def surveyed(ready: Setup, sigmas: dict[str, str], seed: int) -> Setup:
     """The same dome with a tracker whose map comes from a survey with position errors and slightly rotated axes."""
     turn = np.random.default_rng([seed, 2]).normal(0, LEVEL_SIGMA_DEG, 3)
     told = SurveyErrorsConfig.model_validate(sigmas | {"turn_deg": turn.tolist(), "seed": seed})
@@ -76,7 +76,7 @@ def surveyed(ready: Bench, sigmas: dict[str, str], seed: int) -> Bench:
     return ready._replace(lab=lab, estimator=testbed.tracker(lab))
 
 
-def absolute_deg(ready: Bench, sigmas: dict[str, str], seeds: list[list[int]]) -> Summary:
+def absolute_deg(ready: Setup, sigmas: dict[str, str], seeds: list[list[int]]) -> Summary:
     """Mean error angle in degrees. The attitudes of one survey share its errors, so the interval is over surveys.
 
     seeds : one list per survey: its seed, then the seeds of its attitudes

@@ -112,7 +112,7 @@ def photographed(overrides: dict[str, str], local: list[datetime.datetime], seed
         cam_from_icrs = tripod * itrs_from_icrs(at)
         here = standing(reseeded(lab, seed + n), cam_from_icrs)
         frame, _ = exposure.render_frame(here, 0)
-        answer = factory.answer(tracker, frame).attitude
+        answer = factory.solve_frame(tracker, frame).attitude
         true[n] = their_angles_deg(cam_from_icrs)
         if answer.cam_from_ref is not None:
             told[n] = their_angles_deg(answer.cam_from_ref)

@@ -21,7 +21,7 @@ from skysim.experiments.papers.shefex.optics import DEFOCUS_M, answers, out_of_f
 from skysim.experiments.papers.shefex.setup import PUBLISHED, chain, line
 from skysim.experiments.study import trials
 from skysim.experiments.study.plan import FrameTrial
-from skysim.experiments.study.setups import Bench
+from skysim.experiments.study.setups import Setup
 from skysim.results import metrics
 from skysim.results.metrics import Summary, share
 from skysim.scene.loader import load
@@ -66,10 +66,10 @@ class Tally(NamedTuple):
 
 def shots(
     told: dict[str, str], rate_deg_s: float, count: int, seed: int
-) -> Iterator[tuple[Bench, Frame, Truth]]:
+) -> Iterator[tuple[Setup, Frame, Truth]]:
     """Yield frames at random attitudes of the northern sky, not near the Moon; the same attitudes for every rate."""
     where = testbed.build_testbed(load("shefex2", ONE | told))
-    ready = Bench(
+    ready = Setup(
         where,
         testbed.tracker(where),
         FrameTrial(kind="frames", rate_deg_s=rate_deg_s, dec_deg=NORTH_DEG),
@@ -96,7 +96,7 @@ def tally(told: dict[str, str], rate_deg_s: float, count: int, seed: int) -> Tal
         )
         found = theirs.cam_from_ref
         right, low = rightly(found, truth), rightly(lower.cam_from_ref, truth)
-        ours = rightly(factory.answer(ready.estimator, frame).attitude.cam_from_ref, truth)
+        ours = rightly(factory.solve_frame(ready.estimator, frame).attitude.cam_from_ref, truth)
         rows.append((right, found is not None and not right, len(theirs.centroids), low, ours))
     return Tally(*np.array(rows, float).T)
 

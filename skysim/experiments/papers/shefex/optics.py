@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from estimator.calibration.star_field import self_calibrated
 from estimator.core.camera import Camera
-from estimator.trackers.pipeline import Clock, Settings, see
+from estimator.trackers.pipeline import Clock, Settings, detect_and_centroid
 from estimator.trackers.star_tracker import StarTracker
 from skysim.camera.detector.detector import saturation_dn
 from skysim.camera.render import Window, render
@@ -19,7 +19,7 @@ from skysim.experiments.papers.intervals import resampled
 from skysim.experiments.papers.shefex.setup import apparent, lab, stars
 from skysim.experiments.study import trials
 from skysim.experiments.study.plan import FrameTrial
-from skysim.experiments.study.setups import Bench
+from skysim.experiments.study.setups import Setup
 from skysim.results.metrics import Summary, exact
 from skysim.scene.loader import load
 from skysim.simulation import testbed
@@ -147,13 +147,13 @@ def focal_mm(ask: Ask) -> tuple[Summary, str]:
     """Focal length in mm by our star-field calibration, of a 24.95 mm lens with a nominal 25 mm; with a note."""
     told = {"camera.focal_length": f"{FOUND_MM} mm", "exposure.time": "50 ms", "exposure.first": "10 ms"}
     where = testbed.build_testbed(load("shefex2", told | {"exposure.frames": "1"}))
-    ready = Bench(where, testbed.tracker(where), FrameTrial(kind="frames"), "")
+    ready = Setup(where, testbed.tracker(where), FrameTrial(kind="frames"), "")
     sheet = onboard_model.calibration(lab().scene.camera)
     detector = where.scene.camera.detector
     settings = Settings(gain_e_dn=detector.gain_e_dn, saturation=saturation_dn(detector))
     first = 1_000_000 * ask.seed
     frames = [
-        see(trials.shot(ready, first + n)[0].image_dn, sheet, settings, Clock())
+        detect_and_centroid(trials.shot(ready, first + n)[0].image_dn, sheet, settings, Clock())
         for n in range(ask.trials(40, 8))
     ]
 

@@ -18,7 +18,7 @@ from estimator.core.arrays import Ints
 from estimator.core.errors import ImageError
 from estimator.core.types import Centroids
 from estimator.identification.published.shefex import FOURTH_STAR, Rules, search
-from estimator.trackers.pipeline import Clock, Settings, see
+from estimator.trackers.pipeline import Clock, Settings, detect_and_centroid
 from skysim.core.paths import CATALOGUES
 from skysim.core.types import Floats
 from skysim.experiments.study import trials
@@ -97,7 +97,7 @@ class Chain:
     def solve(self, image: NDArray[Any]) -> Answered:
         """Solve a frame; by the paper's rule, a match with a fourth star is accepted."""
         try:
-            seen = see(image, self.camera, self.settings, Clock())
+            seen = detect_and_centroid(image, self.camera, self.settings, Clock())
         except ImageError:
             return Answered(Centroids.none(), np.empty(0, np.int64), None)
         if len(seen) < 4:

@@ -19,8 +19,8 @@ from uuid import uuid4
 import cv2
 
 from skysim.core.errors import InputError
-from skysim.experiments.study.execution.engines import AHEAD, Chunk, Chunks, dead, singly, timed
-from skysim.experiments.study.plan import Recipe
+from skysim.experiments.study.execution.engines import AHEAD, Chunk, Chunks, failed_row, split_chunk, timed
+from skysim.experiments.study.plan import TrialSpec
 from skysim.experiments.study.setups import code_version
 from skysim.experiments.study.trials import Row, Segment
 
@@ -94,7 +94,7 @@ def threads(client: Client) -> int:
     return int(sum(client.nthreads().values()))
 
 
-def run(client: Client, recipe: Recipe, chunks: Chunks) -> Iterator[list[Row]]:
+def run(client: Client, recipe: TrialSpec, chunks: Chunks) -> Iterator[list[Row]]:
     """See `Engine`; the client is closed at the end. Raises InputError if the connection to the scheduler is lost."""
     name, flying = f"skysim-{uuid4().hex}", dict[Future, Flight]()
     try:
@@ -112,7 +112,7 @@ def run(client: Client, recipe: Recipe, chunks: Chunks) -> Iterator[list[Row]]:
 
 
 def coming(
-    client: Client, name: str, recipe: Recipe, chunks: Chunks, flying: dict[Future, Flight]
+    client: Client, name: str, recipe: TrialSpec, chunks: Chunks, flying: dict[Future, Flight]
 ) -> Iterator[list[Row]]:
     """Yield rows as chunks complete. `flying` maps futures to their chunks.
 
@@ -140,9 +140,9 @@ def coming(
             rows, seconds = future.result()
         except KilledWorker:
             if flight.alone:
-                yield [dead(recipe, flight.chunk[0])]
+                yield [failed_row(recipe, flight.chunk[0])]
             else:
-                suspects.extend(singly(flight.chunk))
+                suspects.extend(split_chunk(flight.chunk))
         else:
             chunks.took(flight.chunk, seconds)
             yield rows
@@ -162,13 +162,13 @@ def unpacked(text: str) -> Chunk:
 
 # On the workers.
 
-RECIPES: dict[str, Recipe] = {}  # recipe of each run that this worker serves
+RECIPES: dict[str, TrialSpec] = {}  # recipe of each run that this worker serves
 
 
 class Told(WorkerPlugin):
     """Worker plugin that gives every worker a run's recipe, including workers that join later."""
 
-    def __init__(self, name: str, recipe: Recipe, code: str) -> None:
+    def __init__(self, name: str, recipe: TrialSpec, code: str) -> None:
         self.name, self.recipe, self.code = name, recipe, code
 
     def setup(self, worker: Any) -> None:
@@ -206,7 +206,7 @@ class Dask:
         self.scheduler, self.client = scheduler, connect(scheduler)
         self.workers = threads(self.client)
 
-    def run(self, recipe: Recipe, chunks: Chunks) -> Iterator[list[Row]]:
+    def run(self, recipe: TrialSpec, chunks: Chunks) -> Iterator[list[Row]]:
         """See `Engine`."""
         if self.client.status != "running":  # a previous run closed it
             self.client = connect(self.scheduler)

@@ -18,7 +18,7 @@ from typing import Protocol
 
 from skysim.core.errors import InputError
 from skysim.experiments.study.execution import workers
-from skysim.experiments.study.plan import Recipe
+from skysim.experiments.study.plan import TrialSpec
 from skysim.experiments.study.setups import code_version, seed_of
 from skysim.experiments.study.trials import FAILED, Row, Segment, work
 
@@ -42,7 +42,7 @@ class Engine(Protocol):
     name: str
     workers: int
 
-    def run(self, recipe: Recipe, chunks: Chunks) -> Iterator[list[Row]]: ...
+    def run(self, recipe: TrialSpec, chunks: Chunks) -> Iterator[list[Row]]: ...
 
     def close(self) -> None:
         """Release the resources kept between runs."""
@@ -53,7 +53,7 @@ class Serial:
 
     name, workers = "serial", 1
 
-    def run(self, recipe: Recipe, chunks: Chunks) -> Iterator[list[Row]]:
+    def run(self, recipe: TrialSpec, chunks: Chunks) -> Iterator[list[Row]]:
         """See `Engine`."""
         while chunk := chunks.next():
             rows, seconds = timed(recipe, chunk)
@@ -76,9 +76,9 @@ class Pool:
     def __init__(self, count: int | None = None) -> None:
         self.workers = count or cores()
         self._pool: ProcessPoolExecutor | None = None
-        self._recipe: Recipe | None = None
+        self._recipe: TrialSpec | None = None
 
-    def run(self, recipe: Recipe, chunks: Chunks) -> Iterator[list[Row]]:
+    def run(self, recipe: TrialSpec, chunks: Chunks) -> Iterator[list[Row]]:
         """See `Engine`."""
         suspects: deque[Chunk] = deque()
         deaths: Counter[int] = Counter()  # by trial
@@ -90,11 +90,11 @@ class Pool:
                 done = True
             except BrokenProcessPool:
                 # Count a death only for a trial that was alone in flight; otherwise the culprit is unknown.
-                at_hand = [one for chunk in flying.values() for one in singly(chunk)]
+                at_hand = [one for chunk in flying.values() for one in split_chunk(chunk)]
                 deaths.update(one[0].first for one in at_hand if len(at_hand) == 1)
                 for one in at_hand:
                     if deaths[one[0].first] == TRIES:
-                        yield [dead(recipe, one[0])]
+                        yield [failed_row(recipe, one[0])]
                     else:
                         suspects.append(one)
             finally:
@@ -107,7 +107,7 @@ class Pool:
             self._pool.shutdown()
         self._pool = None
 
-    def _ready(self, recipe: Recipe) -> ProcessPoolExecutor:
+    def _ready(self, recipe: TrialSpec) -> ProcessPoolExecutor:
         """The pool of the previous run if it was started with this recipe, otherwise a new one."""
         if recipe != self._recipe:
             self.close()
@@ -139,7 +139,7 @@ class Pool:
             room = self.workers * (1 + AHEAD) if not suspects else 1
             while len(flying) < room and (chunk := suspects.popleft() if suspects else chunks.next()):
                 try:
-                    flying[pool.submit(remembered, chunk)] = chunk
+                    flying[pool.submit(run_chunk, chunk)] = chunk
                 except BrokenProcessPool:  # a worker died while the caller stored rows
                     suspects.appendleft(chunk)
                     raise
@@ -152,13 +152,13 @@ class Pool:
                 yield rows
 
 
-def timed(recipe: Recipe, chunk: Chunk) -> tuple[list[Row], float]:
+def timed(recipe: TrialSpec, chunk: Chunk) -> tuple[list[Row], float]:
     """Rows of a chunk and the seconds it took on the worker."""
     begin_s = time.perf_counter()
     return work(recipe, chunk), time.perf_counter() - begin_s
 
 
-def singly(chunk: Chunk) -> Iterator[Chunk]:
+def split_chunk(chunk: Chunk) -> Iterator[Chunk]:
     """Split a chunk into chunks of one trial each."""
     for segment in chunk:
         for n, replicate in enumerate(segment.replicates):
@@ -166,7 +166,7 @@ def singly(chunk: Chunk) -> Iterator[Chunk]:
             yield (segment._replace(first=segment.first + n, replicates=alone),)
 
 
-def dead(recipe: Recipe, segment: Segment) -> Row:
+def failed_row(recipe: TrialSpec, segment: Segment) -> Row:
     """The row of a trial that repeatedly killed its worker."""
     replicate = segment.replicates[0]
     seed, why = seed_of(recipe, segment.point, replicate), f"its worker process died, {TRIES} times"
@@ -180,10 +180,10 @@ def cores() -> int:
 
 # Worker processes.
 
-RECIPE: list[Recipe] = []  # the recipe of this worker process
+RECIPE: list[TrialSpec] = []  # the recipe of this worker process
 
 
-def started(count: int, recipe: Recipe) -> ProcessPoolExecutor:
+def started(count: int, recipe: TrialSpec) -> ProcessPoolExecutor:
     """Start a pool of single-threaded processes that have imported everything a trial needs. Raises InputError."""
     pool = ProcessPoolExecutor(count, workers.warm(), begin, (recipe,))
     try:
@@ -196,7 +196,7 @@ def started(count: int, recipe: Recipe) -> ProcessPoolExecutor:
     return pool
 
 
-def begin(recipe: Recipe) -> None:
+def begin(recipe: TrialSpec) -> None:
     """Initialize a worker: ignore Ctrl-C, which the parent handles, and exit when the parent ends, even by kill -9."""
     import cv2
 
@@ -214,6 +214,6 @@ def end_with_parent() -> None:
         os._exit(1)
 
 
-def remembered(chunk: Chunk) -> tuple[list[Row], float]:
+def run_chunk(chunk: Chunk) -> tuple[list[Row], float]:
     """`timed` with the recipe with which this worker was started."""
     return timed(RECIPE[0], chunk)

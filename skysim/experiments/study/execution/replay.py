@@ -15,7 +15,7 @@ from skysim.core import files as file_io
 from skysim.core.errors import InputError
 from skysim.core.types import Frame, Truth
 from skysim.experiments.study.plan import CentroidTrial, FlightTrial, FrameTrial, Plan
-from skysim.experiments.study.setups import Bench, bench
+from skysim.experiments.study.setups import Setup, prepared_setup
 from skysim.experiments.study.store import Store, plain
 from skysim.experiments.study.trials import Row, Segment, one, reseeded, shot, sight
 from skysim.results.files import frames
@@ -57,7 +57,7 @@ def replay(plan: Plan, store: Store, trial: int, folder: Path) -> Replay:
     changed = [name for name, value in now.items() if kept and kept[name] != value]
     files, pictures = [], []
     if row.scene:  # an invalid scene has no test bed
-        ready = bench(plan.recipe, segment.settings)
+        ready = prepared_setup(plan.recipe, segment.settings)
         frames.clear(file_io.make_folder(folder))
         try:
             for frame, truth, report in islice(seen(ready, row.seed), MOST):
@@ -78,7 +78,7 @@ def picture(frame: Frame, truth: Truth, report: Report) -> Any:
     return annotate(frame.image_dn, xy_px, matched_px, truth_px=truth.seen.xy_px)
 
 
-def seen(ready: Bench, seed: int) -> Iterator[tuple[Frame, Truth, Report]]:
+def seen(ready: Setup, seed: int) -> Iterator[tuple[Frame, Truth, Report]]:
     """Frames of a trial with truth and report.
 
     A centroid trial has no frame, so one is rendered at its attitude and shown with the trial's own centroids.
@@ -95,7 +95,7 @@ def seen(ready: Bench, seed: int) -> Iterator[tuple[Frame, Truth, Report]]:
             yield taken.frame, taken.truth, taken.report
     else:
         frame, truth, streak_px = shot(ready, seed)
-        yield frame, truth, tried(lambda: factory.answer(ready.estimator, frame, streak_px))
+        yield frame, truth, tried(lambda: factory.solve_frame(ready.estimator, frame, streak_px))
 
 
 def tried(solve: Callable[[], Report]) -> Report:

@@ -19,7 +19,7 @@ from skysim.results.files.export import EXTRA
 def to_csv(store: Store, responses: tuple[str, ...], path: Path) -> None:
     """Write one line per trial, missing values empty; numbers in Python's shortest form, which reads back exactly."""
     columns = everything(store)
-    with files.whole(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+    with files.atomic_file(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(columns)
         for row in zip(*(column.tolist() for column in columns.values()), strict=True):
@@ -38,7 +38,7 @@ def to_parquet(store: Store, responses: tuple[str, ...], path: Path) -> None:
         raise InputError(f"{path}: Parquet {EXTRA}") from None
     columns = {name: pyarrow.array(column.tolist()) for name, column in everything(store).items()}
     told = {key: store.meta(key) for key in ("title", "code", "study")}
-    with files.whole(path) as temporary:
+    with files.atomic_file(path) as temporary:
         pyarrow.parquet.write_table(pyarrow.table(columns).replace_schema_metadata(told), temporary)
 
 
@@ -69,7 +69,7 @@ def dataset(store: Store, responses: tuple[str, ...], path: Path) -> Any:
 def to_zarr(store: Store, responses: tuple[str, ...], path: Path) -> None:
     """Write `dataset` as a Zarr folder."""
     made = dataset(store, responses, path)
-    with files.whole_folder(path) as temporary:
+    with files.atomic_folder(path) as temporary:
         made.to_zarr(temporary, mode="w", consolidated=False)
 
 

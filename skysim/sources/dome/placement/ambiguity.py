@@ -41,7 +41,7 @@ class Fields(NamedTuple):
     alike: Floats
 
 
-class Likeness(NamedTuple):
+class Ambiguity(NamedTuple):
     """For the field about each of C LEDs, the most similar other field.
 
     led, other : (C,) numbers of the LEDs at the centers of the field and of its most similar one
@@ -53,9 +53,9 @@ class Likeness(NamedTuple):
     share: Floats
 
 
-def likeness(
+def field_ambiguity(
     place_m: Floats, height_m: float, tilt_rad: float, radius_rad: float, alike_m: float
-) -> Likeness:
+) -> Ambiguity:
     """For every LED that the boresight can reach, the largest fraction of its field that another attitude also shows.
 
     place_m    : (N, 3) in the lab, origin at the bearing's center
@@ -68,8 +68,8 @@ def likeness(
     fields differ.
     """
     fields = fields_about(place_m, height_m, tilt_rad, radius_rad, alike_m)
-    share, other = likest(fields)
-    return Likeness(fields.centre, fields.centre[other], share)
+    share, other = most_similar(fields)
+    return Ambiguity(fields.centre, fields.centre[other], share)
 
 
 def fields_about(
@@ -95,7 +95,7 @@ def fields_about(
 
 
 @jit
-def likest(fields: Fields) -> tuple[Floats, Ints]:
+def most_similar(fields: Fields) -> tuple[Floats, Ints]:
     """(C,) greatest share of each field that another field has, and (C,) the index of that field."""
     count = len(fields.centre)
     share, other = np.zeros(count), np.arange(count)
@@ -116,7 +116,7 @@ def likest(fields: Fields) -> tuple[Floats, Ints]:
 def coincide(fields: Fields, i: int, j: int, enough: float) -> int:
     """The most neighbors of i that coincide with ones of j at any rotation; 0 if no more than `enough` can."""
     first, radius, angle, alike = fields.first, fields.radius, fields.angle_rad, fields.alike[i]
-    if reach(fields, i, j) <= enough:
+    if upper_bound(fields, i, j) <= enough:
         return 0
     most, begin = 0, first[j]
     for k in range(first[i], first[i + 1]):
@@ -127,13 +127,13 @@ def coincide(fields: Fields, i: int, j: int, enough: float) -> int:
         while n < first[j + 1] and radius[n] <= radius[k] + alike:
             # The identity, which lays a field on itself unrotated, is no ambiguity.
             if i != j or n != k:
-                most = max(most, met(fields, i, j, angle[n] - angle[k]))
+                most = max(most, count_coincident(fields, i, j, angle[n] - angle[k]))
             n += 1
     return most
 
 
 @jit
-def reach(fields: Fields, i: int, j: int) -> int:
+def upper_bound(fields: Fields, i: int, j: int) -> int:
     """Upper bound of `met` over all rotations: neighbors of i that have a neighbor of j at an equal radius."""
     first, radius, alike = fields.first, fields.radius, fields.alike[i]
     total, n = 0, first[j]
@@ -145,7 +145,7 @@ def reach(fields: Fields, i: int, j: int) -> int:
 
 
 @jit
-def met(fields: Fields, i: int, j: int, turn_rad: float) -> int:
+def count_coincident(fields: Fields, i: int, j: int, turn_rad: float) -> int:
     """Number of neighbors of i that coincide with a neighbor of j after field i is rotated by turn_rad."""
     first, radius, angle, alike = fields.first, fields.radius, fields.angle_rad, fields.alike[i]
     total, begin = 0, first[j]

@@ -25,13 +25,13 @@ from skysim.core.types import Floats
 
 Ints = NDArray[np.int64]
 
-UNKNOWN = 1e-6  # prior information, rad^-2, that keeps M invertible when too few LEDs are in view
+PRIOR_INFORMATION = 1e-6  # prior information, rad^-2, that keeps M invertible when too few LEDs are in view
 HARDNESS = 10  # power of the variance in the soft maximum: 1 is the mean, infinity the worst case
 COLUMNS = 4  # columns of the attitude index per half width of the search window
-SHORT = 1.5  # factor on the variance for each LED that a field has too few
+MISSING_LED_FACTOR = 1.5  # factor on the variance for each LED that a field has too few
 
 
-class Seen(NamedTuple):
+class Visibility(NamedTuple):
     """Which attitudes see each of K sites: those of site k are attitude[start[k]:start[k + 1]].
 
     told : (M, 7) information J'J of one LED at the site for unit variance of the tangents: xx, yy, zz, xy, xz, yz in
@@ -56,7 +56,7 @@ def in_field(R: Floats, point_m: Floats, camera_m: Floats, tan_half: Floats, b: 
 
 
 @jit
-def tell(b: Floats, camera_m: Floats, out: Floats) -> None:
+def led_information(b: Floats, camera_m: Floats, out: Floats) -> None:
     """Write the information of one LED at b (body axes) to out (7,): J'J and a 1. The module docstring derives J."""
     # gx = b x (dx, 0, x) and gy = b x (0, dy, y): the rows of J.
     ahead_m = b[2] - camera_m[2]
@@ -86,7 +86,7 @@ def widest(sites_m: Floats, camera_m: Floats, tan_half: Floats) -> float:
 
 
 @jit
-def look(
+def visible_from(
     sites_m: Floats, R_body_from_lab: Floats, camera_m: Floats, tan_half: Floats
 ) -> tuple[Ints, Ints, Floats]:
     """Start, attitude and information as in `Seen`, for every site.
@@ -119,17 +119,17 @@ def look(
                 if m == len(attitude):  # double the buffers when they are full
                     attitude = np.concatenate((attitude, np.empty_like(attitude)))
                     information = np.concatenate((information, np.empty_like(information)))
-                tell(b, camera_m, information[m])
+                led_information(b, camera_m, information[m])
                 attitude[m] = order[q]
                 m += 1
         start[k + 1] = m
     return start, attitude[:m], information[:m]
 
 
-def told(place_m: Floats, R_body_from_lab: Floats, camera_m: Floats, tan_half: Floats) -> Floats:
+def total_information(place_m: Floats, R_body_from_lab: Floats, camera_m: Floats, tan_half: Floats) -> Floats:
     """(A, 7) information of all LEDs in the field of each attitude, as in `Seen`; the last column is their number."""
-    seen = Seen(*look(place_m, R_body_from_lab, camera_m, tan_half))
-    return tally(np.arange(len(place_m)), seen, len(R_body_from_lab))
+    seen = Visibility(*visible_from(place_m, R_body_from_lab, camera_m, tan_half))
+    return sum_information(np.arange(len(place_m)), seen, len(R_body_from_lab))
 
 
 @jit
@@ -138,7 +138,14 @@ def variance(m: Floats) -> float:
 
     Principal minors over the determinant, with UNKNOWN added to the diagonal.
     """
-    a, b, c, d, e, f = m[0] + UNKNOWN, m[1] + UNKNOWN, m[2] + UNKNOWN, m[3], m[4], m[5]
+    a, b, c, d, e, f = (
+        m[0] + PRIOR_INFORMATION,
+        m[1] + PRIOR_INFORMATION,
+        m[2] + PRIOR_INFORMATION,
+        m[3],
+        m[4],
+        m[5],
+    )
     minors = (a * b - d * d) + (a * c - e * e) + (b * c - f * f)
     whole = a * (b * c - f * f) - d * (d * c - e * f) + e * (d * f - b * e)
     return minors / max(whole, 1e-30)
@@ -158,7 +165,7 @@ def cost(m: Floats, wanted: int) -> float:
     """One attitude's term of the soft maximum: (SHORT^missing tr(M^-1))^HARDNESS, missing = max(wanted - LEDs, 0)."""
     each = variance(m)
     for _ in range(wanted - round(m[6])):
-        each *= SHORT
+        each *= MISSING_LED_FACTOR
     return each**HARDNESS
 
 
@@ -172,7 +179,7 @@ def costs(total: Floats, wanted: int) -> Floats:
 
 
 @jit
-def tally(chosen: Ints, seen: Seen, attitude_count: int) -> Floats:
+def sum_information(chosen: Ints, seen: Visibility, attitude_count: int) -> Floats:
     """(A, 7) information of every attitude, as `told`, summed from the stored terms of the chosen sites."""
     total = np.zeros((attitude_count, 7))
     for site in chosen:
@@ -181,7 +188,7 @@ def tally(chosen: Ints, seen: Seen, attitude_count: int) -> Floats:
 
 
 @jit
-def add(site: int, sign: int, seen: Seen, total: Floats) -> None:
+def add(site: int, sign: int, seen: Visibility, total: Floats) -> None:
     """Add (sign 1) or remove (-1) an LED at a site in the sums of the attitudes that see it. In place."""
     for m in range(seen.start[site], seen.start[site + 1]):
         a = seen.attitude[m]
@@ -190,7 +197,7 @@ def add(site: int, sign: int, seen: Seen, total: Floats) -> None:
 
 
 @jit
-def renew(site: int, seen: Seen, total: Floats, each: Floats, wanted: int) -> float:
+def update_costs(site: int, seen: Visibility, total: Floats, each: Floats, wanted: int) -> float:
     """Recompute the cost of the attitudes that see a site, in place in `each`, and return the change of its sum."""
     change = 0.0
     for m in range(seen.start[site], seen.start[site + 1]):

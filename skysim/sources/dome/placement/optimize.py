@@ -29,8 +29,17 @@ from skysim.core.errors import InputError
 from skysim.core.jit import jit
 from skysim.core.types import Floats
 from skysim.scene import leds
-from skysim.sources.dome.placement.ambiguity import Likeness, likeness
-from skysim.sources.dome.placement.fisher import Seen, add, costs, look, renew, tally, told, variances
+from skysim.sources.dome.placement.ambiguity import Ambiguity, field_ambiguity
+from skysim.sources.dome.placement.fisher import (
+    Visibility,
+    add,
+    costs,
+    sum_information,
+    total_information,
+    update_costs,
+    variances,
+    visible_from,
+)
 from skysim.sources.dome.surface import Inside
 
 Ints = NDArray[np.int64]
@@ -76,12 +85,14 @@ class Exam(NamedTuple):
 
         The single worst attitude is unstable: it depends on one LED at the field's edge and on the sampling.
         """
-        each = np.sort(variances(told(place_m, self.R_body_from_lab, *camera(self.part))))
+        each = np.sort(variances(total_information(place_m, self.R_body_from_lab, *camera(self.part))))
         return float(each[-math.ceil(TAIL * len(each)) :].mean()) / self.limit
 
     def blind(self, place_m: Floats) -> int:
         """Number of attitudes with fewer than two LEDs in the BLIND part of the field; two fix an attitude."""
-        return int(np.sum(told(place_m, self.R_body_from_lab, *camera(self.part, BLIND))[:, 6] < 2))
+        return int(
+            np.sum(total_information(place_m, self.R_body_from_lab, *camera(self.part, BLIND))[:, 6] < 2)
+        )
 
 
 def places(
@@ -132,7 +143,7 @@ def worth(exam: Exam, place_m: Floats, rng: np.random.Generator) -> tuple[bool, 
     """
     mark, like = exam.mark(place_m), alike(exam.part, place_m)
     whole = Search(exam.part, place_m, cKDTree(place_m), CAREFUL[0], 1.0)
-    fewest = told(place_m, hardest(whole, place_m, rng), *whole.camera())[:, 6].min()
+    fewest = total_information(place_m, hardest(whole, place_m, rng), *whole.camera())[:, 6].min()
     return mark > 1, bool(fewest < 2), mark * (1 + float(np.mean(like.share > HALF)))
 
 
@@ -191,7 +202,7 @@ def searched(search: Search, place_m: Floats, judged: int, rng: np.random.Genera
             R_body_from_lab = np.concatenate([R_body_from_lab, hardest(search, place_m, rng)])
         # Sites 0 to count - 1 are the present places, site count + n is the offer to LED n.
         both_m = np.concatenate([place_m, search.offers(place_m, rng)])
-        seen = Seen(*look(both_m, R_body_from_lab, *search.camera()))
+        seen = Visibility(*visible_from(both_m, R_body_from_lab, *search.camera()))
         chosen, who = np.arange(part.count), rng.permutation(part.count)
         exchange(
             chosen, both_m, seen, len(R_body_from_lab), part.wanted, part.spacing_m, who, who + part.count
@@ -202,7 +213,9 @@ def searched(search: Search, place_m: Floats, judged: int, rng: np.random.Genera
 
 def seen_share(part: leds.OptimisedConfig, sites_m: Floats, rng: np.random.Generator) -> float:
     """Mean fraction of the sites that an attitude sees; times the number of LEDs it is the mean number in a field."""
-    return float(told(sites_m, attitudes(part, 200, rng), *camera(part))[:, 6].mean()) / len(sites_m)
+    return float(total_information(sites_m, attitudes(part, 200, rng), *camera(part))[:, 6].mean()) / len(
+        sites_m
+    )
 
 
 def hardest(search: Search, place_m: Floats, rng: np.random.Generator) -> Floats:
@@ -228,7 +241,7 @@ def hardest(search: Search, place_m: Floats, rng: np.random.Generator) -> Floats
 
 def served(search: Search, place_m: Floats, R_body_from_lab: Floats) -> Floats:
     """(A,) cost of every attitude in the search's field."""
-    return costs(told(place_m, R_body_from_lab, *search.camera()), search.part.wanted)
+    return costs(total_information(place_m, R_body_from_lab, *search.camera()), search.part.wanted)
 
 
 def attitudes(part: leds.OptimisedConfig, count: int, rng: np.random.Generator) -> Floats:
@@ -283,7 +296,7 @@ def room_at(site: int, without: int, chosen: Ints, sites_m: Floats, spacing_m: f
 def exchange(
     chosen: Ints,
     sites_m: Floats,
-    seen: Seen,
+    seen: Visibility,
     attitude_count: int,
     wanted: int,
     spacing_m: float,
@@ -291,7 +304,7 @@ def exchange(
     where: Ints,
 ) -> None:
     """One offer per LED: who[n] moves to where[n] if there is room and the cost falls. Changes `chosen` in place."""
-    total = tally(chosen, seen, attitude_count)
+    total = sum_information(chosen, seen, attitude_count)
     each = costs(total, wanted)
     for n in range(len(who)):
         old, new = chosen[who[n]], where[n]
@@ -301,13 +314,13 @@ def exchange(
         # the two sites add up: the second call finds attitudes that see both already up to date.
         add(old, -1, seen, total)
         add(new, 1, seen, total)
-        if renew(old, seen, total, each, wanted) + renew(new, seen, total, each, wanted) < 0:
+        if update_costs(old, seen, total, each, wanted) + update_costs(new, seen, total, each, wanted) < 0:
             chosen[who[n]] = new
         else:  # undo the move
             add(new, -1, seen, total)
             add(old, 1, seen, total)
-            renew(old, seen, total, each, wanted)
-            renew(new, seen, total, each, wanted)
+            update_costs(old, seen, total, each, wanted)
+            update_costs(new, seen, total, each, wanted)
 
 
 def evenly(sites_m: Floats, spacing_m: float, count: int, halvings: int = HALVINGS) -> Ints:
@@ -344,10 +357,10 @@ def apart(sites_m: Floats, spacing_m: float, count: int | None = None) -> Ints:
 # Reduce the ambiguity between fields of view.
 
 
-def alike(part: leds.OptimisedConfig, place_m: Floats) -> Likeness:
+def alike(part: leds.OptimisedConfig, place_m: Floats) -> Ambiguity:
     """Ambiguity of the layout (`likeness`), for a round field of the same area as the camera's."""
     radius_rad = math.atan(math.sqrt(4 * float(np.prod(tan_half(part))) / math.pi))
-    return likeness(place_m, part.camera_m[2], math.radians(part.tilt_deg), radius_rad, part.alike_m)
+    return field_ambiguity(place_m, part.camera_m[2], math.radians(part.tilt_deg), radius_rad, part.alike_m)
 
 
 def set_apart(exam: Exam, place_m: Floats, sites_m: Floats, rng: np.random.Generator) -> Floats:
@@ -379,6 +392,6 @@ def set_apart(exam: Exam, place_m: Floats, sites_m: Floats, rng: np.random.Gener
     return place_m
 
 
-def excess(like: Likeness) -> float:
+def excess(like: Ambiguity) -> float:
     """Sum over the fields of the ambiguity in excess of HALF."""
     return float(np.maximum(like.share - HALF, 0).sum())

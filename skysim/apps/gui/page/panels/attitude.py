@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from nicegui import ui
 
-from skysim.apps.gui.messages import Answer, Setting, View
+from skysim.apps.gui.messages import Answer, FrameView, SceneInfo
 from skysim.apps.gui.page import keys
 from skysim.apps.gui.page.style import digits
 
@@ -58,7 +58,7 @@ class AttitudeCard:
         field.on("popup-hide", js_handler=keys.LEAVE)
         return field.props("dense outlined options-dense").mark(name)
 
-    def set(self, setting: Setting) -> None:
+    def set(self, setting: SceneInfo) -> None:
         """Take over a new scene: angle names and algorithms."""
         self.head(setting.names)
         for name, field in self.stages.items():
@@ -89,7 +89,7 @@ class AttitudeCard:
             for field in self.inputs:
                 field.run_method("blur")  # so that the arrow keys move the camera again
 
-    def show(self, view: View) -> None:
+    def show(self, view: FrameView) -> None:
         """Display the newest frame's attitudes."""
         if self.foreign and self.tab.setting:
             self.foreign = False

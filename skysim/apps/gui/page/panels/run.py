@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from nicegui import ui
 
-from skysim.apps.gui.messages import FlightLog, View
+from skysim.apps.gui.messages import FlightLog, FrameView
 from skysim.apps.gui.page import keys
 from skysim.apps.gui.page.forms import LOOPS, looped
 from skysim.apps.gui.page.style import CURVES, INK, TOOLTIP
@@ -178,7 +178,7 @@ class RunPanel:
         finally:
             self.busy = False
 
-    def gather(self, view: View) -> None:
+    def gather(self, view: FrameView) -> None:
         """Append a frame's values to the curves."""
         answer = view.answer
         off = math.hypot(answer.cross_arcsec, answer.roll_arcsec) if answer and answer.solved else math.nan

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from nicegui import ui
 
-from skysim.apps.gui.messages import Answer, Light, Setting, Spot, View
+from skysim.apps.gui.messages import Answer, Detection, FrameView, Light, SceneInfo
 from skysim.apps.gui.page import keys, overlay
 from skysim.apps.gui.page.star_names import NAMES
 from skysim.results import stretch
@@ -136,7 +136,7 @@ class Sensor:
             except TimeoutError:
                 return
 
-    def show(self, view: View) -> None:
+    def show(self, view: FrameView) -> None:
         """Show a frame of the scene."""
         self.lights, self.answer = view.lights, view.answer
         self.prefix = self.tab.setting.prefix if self.tab.setting else "HIP"
@@ -200,18 +200,18 @@ class Sensor:
             self.magnified.classes(remove="stale")
             self.fresh = True
 
-    def nearest(self, x: float, y: float) -> tuple[Spot | None, Light | None]:
+    def nearest(self, x: float, y: float) -> tuple[Detection | None, Light | None]:
         """The nearest detection and the nearest true light within a few marks' width, or None."""
         reach = max(8.0, self.size_px[0] / 60)
 
-        def off(one: Spot | Light) -> float:
+        def off(one: Detection | Light) -> float:
             return math.hypot(one.x - x, one.y - y)
 
         spots = [spot for spot in (self.answer.spots if self.answer else ()) if off(spot) < reach]
         lights = [light for light in self.lights if off(light) < reach]
         return min(spots, key=off, default=None), min(lights, key=off, default=None)
 
-    def told(self, x: float, y: float, spot: Spot | None, light: Light | None) -> str:
+    def told(self, x: float, y: float, spot: Detection | None, light: Light | None) -> str:
         """Text on a pixel: its true light, the detection and its error."""
         lines = [f"pixel      {x:8.1f} {y:8.1f}"]
         if light:
@@ -234,8 +234,8 @@ def facts(
     size_px: tuple[int, int],
     told: stretch.Facts,
     answer: Answer | None,
-    view: View | None = None,
-    setting: Setting | None = None,
+    view: FrameView | None = None,
+    setting: SceneInfo | None = None,
 ) -> str:
     """A frame's numbers in two columns; fewer for an image that is not of the scene (view is None)."""
     rows = [
