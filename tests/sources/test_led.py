@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import get_args
+
 import numpy as np
 import pytest
 
@@ -127,3 +129,7 @@ def test_reference_electrons_of_a_bright_led() -> None:
     at_camera = irradiance_e_s_m2(strength, LAMBERT, ONE, ONE, 33 * 0.0254 * ONE)
     pupil_m2 = np.pi / 4 * (0.035 / 8) ** 2
     assert float(at_camera[0] * pupil_m2 * 0.85 * 1e-3) == pytest.approx(3.1e7, rel=0.02)  # two digits
+
+
+def test_every_falloff_law_can_be_named_in_a_scene() -> None:
+    assert set(get_args(LedConfig.model_fields["falloff"].annotation)) == set(FALLOFF)
