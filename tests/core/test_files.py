@@ -265,7 +265,7 @@ import os, sys
 from pathlib import Path
 from skysim.core import files as io
 out = Path(sys.argv[1])
-with io.whole(out / "solutions.ecsv") as file, io.whole_folder(out / "frames.zarr") as folder:
+with io.atomic_file(out / "solutions.ecsv") as file, io.atomic_folder(out / "frames.zarr") as folder:
     file.write_text("half")
     folder.mkdir()
     (folder / "zarr.json").write_text("half")

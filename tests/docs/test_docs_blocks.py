@@ -192,6 +192,7 @@ SITE = yaml.load((ROOT / "mkdocs.yml").read_text(encoding="utf-8"), Loader)
 
 def test_every_page_has_its_place_in_the_site() -> None:
     there = {path.relative_to(DOCS).as_posix() for path in DOCS.rglob("*.md")}
+    there |= {path.relative_to(DOCS).with_suffix(".md").as_posix() for path in DOCS.glob("notebooks/*.ipynb")}
     outside = {name for name in nav(SITE["nav"]) if name.startswith("source/")}
     assert set(nav(SITE["nav"])) - outside == there
     assert all((ROOT / name.removeprefix("source/")).is_file() for name in outside)
