@@ -8,6 +8,7 @@ to the keys of the YAML tree, and `place_of` finds the line of that key in the f
 from __future__ import annotations
 
 import difflib
+import json
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -108,6 +109,11 @@ def parse_overrides(sets: list[str] | None) -> dict[str, str]:
             raise InputError(f"--set {shown(item)}: allowed: path.to.key=value")
         overrides[key] = value
     return overrides
+
+
+def override_texts(overrides: Mapping[str, Any] | None) -> dict[str, str]:
+    """Overrides given in Python as the YAML texts of `--set`: strings as they are, other values as JSON."""
+    return {key: one if isinstance(one, str) else json.dumps(one) for key, one in (overrides or {}).items()}
 
 
 def read_yaml(path: Path) -> tuple[dict[str, Any], str]:

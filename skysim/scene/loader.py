@@ -8,7 +8,6 @@ one line with key, file and line.
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -139,8 +138,7 @@ def load_scene(name: str | Path, overrides: Mapping[str, Any] | None = None) -> 
 
     A string is YAML, as on the command line; None switches a section off. Raises InputError with one line.
     """
-    texts = {key: one if isinstance(one, str) else json.dumps(one) for key, one in (overrides or {}).items()}
-    return load(name, texts)
+    return load(name, yaml_reader.override_texts(overrides))
 
 
 def list_scenes() -> list[str]:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from skysim.core.yaml_reader import override_texts
 from skysim.experiments.study import loader, store
 from skysim.experiments.study.analysis import table as tables
 from skysim.experiments.study.execution import runner
@@ -61,7 +61,7 @@ def run_study(
 
     A script that uses several processes needs the usual `if __name__ == "__main__":`. Raises InputError.
     """
-    texts = {key: one if isinstance(one, str) else json.dumps(one) for key, one in (overrides or {}).items()}
+    texts = override_texts(overrides)
     plan = loader.load(str(name), texts)
     folder = Path(out) if out is not None else Path("out") / Path(name).stem
     engine = runner.ENGINES["serial" if workers == 1 else "pool"](workers, "")
