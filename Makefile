@@ -14,7 +14,7 @@ $(READY): pyproject.toml
 	$(PIP) -e '.[dev,catalog]'
 	touch $@
 
-.PHONY: bench demo test test-long oracle test-browser test-lowest lock fuzz fuzzer lint pictures studies papers docs figures lab recompile setup clean
+.PHONY: bench demo test test-long oracle test-browser test-lowest lock fuzz fuzzer lint pictures studies papers docs figures gui recompile setup clean
 setup: $(READY)
 
 demo: $(READY)
@@ -37,8 +37,8 @@ bench: $(READY)
 	$(PIP) -e '.[oracle]'
 	$(BIN)/python -m benchmarks $(AREAS)
 
-lab: $(READY)
-	$(BIN)/skysim lab
+gui: $(READY)
+	$(BIN)/skysim gui
 
 pictures: demo
 	$(BIN)/python docs/site/pictures.py
@@ -46,7 +46,7 @@ pictures: demo
 STUDIES := dome_shape dome_size led_count rate_smear false_stars error_budget end_to_end
 studies: $(READY)
 	for name in $(STUDIES); do $(BIN)/skysim study run $$name || $(BIN)/skysim study resume $$name || exit 1; done
-	$(BIN)/skysim study optimise dome_for_the_money
+	$(BIN)/skysim study optimize dome_for_the_money
 	$(BIN)/python docs/site/studies.py
 
 papers: $(READY)

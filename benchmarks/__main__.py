@@ -17,15 +17,15 @@ def main(words: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
     parser.add_argument("areas", nargs="*", metavar="AREA", help=", ".join(AREAS))
     parser.add_argument("--json", action="store_true", help="print JSON rows in place of a table")
-    given = parser.parse_args(words)
-    unknown = [area for area in given.areas if area not in AREAS]
+    arguments = parser.parse_args(words)
+    unknown = [area for area in arguments.areas if area not in AREAS]
     if unknown:
-        parser.error(f"{unknown[0]!r} is no area; allowed: {', '.join(AREAS)}")
+        parser.error(f"{unknown[0]!r} is not an area; allowed: {', '.join(AREAS)}")
     rows = []
-    for area in given.areas or AREAS:
+    for area in arguments.areas or AREAS:
         print(f"benchmarks: {area}", file=sys.stderr, flush=True)
         rows += measure(area)
-    print(to_json(rows) if given.json else table(rows))
+    print(to_json(rows) if arguments.json else table(rows))
 
 
 def table(rows: list[dict[str, Any]]) -> str:
@@ -43,8 +43,7 @@ def table(rows: list[dict[str, Any]]) -> str:
     lines = [list(HEADS), *cells]
     widths = [max(len(line[n]) for line in lines) for n in range(len(HEADS))]
     return "\n".join(
-        "  ".join(f"{cell:{width}}" for cell, width in zip(line, widths, strict=True)).rstrip()
-        for line in lines
+        "  ".join(f"{cell:{width}}" for cell, width in zip(line, widths, strict=True)).rstrip() for line in lines
     )
 
 

@@ -20,7 +20,7 @@ BUDGET_US = 10.0
 
 def measure() -> list[dict[str, Any]]:
     """Every solver, with directions within about 10 deg and 10 arcsec of noise; then the compiled core."""
-    cam, ref, sigma = drawn(10)
+    cam, ref, sigma = random_directions(10)
 
     def align() -> None:
         for _ in range(100):
@@ -31,15 +31,14 @@ def measure() -> list[dict[str, Any]]:
             SOLVERS[name](cam, ref, sigma)
 
     results = [
-        versus(f"{name}, 10 stars, 100 times", partial(hundred, name), "scipy align_vectors", align)
-        for name in SOLVERS
+        versus(f"{name}, 10 stars, 100 times", partial(hundred, name), "scipy align_vectors", align) for name in SOLVERS
     ]
     spent = core_us(20)
     results.append(verdict("wahba, 20 stars, with covariance", spent, "us", "budget", BUDGET_US))
     return results
 
 
-def drawn(count: int) -> tuple[Floats, Floats, Floats]:
+def random_directions(count: int) -> tuple[Floats, Floats, Floats]:
     """(count, 3) noisy unit vectors in camera axes, the same in reference axes, and (count,) sigmas in rad."""
     rng = np.random.default_rng(4)
     ref = rng.normal((0, 0, 1), (0.1, 0.1, 0), (count, 3))
@@ -51,7 +50,7 @@ def drawn(count: int) -> tuple[Floats, Floats, Floats]:
 
 def core_us(count: int, repeats: int = 30) -> float:
     """Microseconds per call of the compiled core, the minimum over all repeats."""
-    cam, ref, sigma = drawn(count)
+    cam, ref, sigma = random_directions(count)
     weight = sigma**-2
     wahba(cam, ref, weight)
     best = np.inf

@@ -34,9 +34,7 @@ def measure() -> list[dict[str, Any]]:
         for peer_name, peer in peers(image).items():
             results.append(versus(f"detect + centroid, {name}", ours, peer_name, peer, bar=1.0))
         own = min(row["value"] for row in results if name in row["name"])
-        results.append(
-            verdict(f"detect + centroid, {name}: time", own, "ms", "the bar of a frame", BAR_MS[name])
-        )
+        results.append(verdict(f"detect + centroid, {name}: time", own, "ms", "the bar of a frame", BAR_MS[name]))
     image, _ = frame(np.random.default_rng(2), 493, 659, 15)
     results.append(
         versus(
@@ -52,19 +50,19 @@ def measure() -> list[dict[str, Any]]:
 
 def precision() -> list[dict[str, Any]]:
     """RMS error of 1,200 centroids divided by the Cramer-Rao bound for a star of unknown position and flux."""
-    errors: dict[str, list[Floats]] = {name: [] for name in CENTROIDERS if name != "disc"}
+    errors: dict[str, list[Floats]] = {name: [] for name in CENTROIDERS if name != "disk"}
     errors["scipy.ndimage"] = []
     for seed in range(40):
         image, places = frame(np.random.default_rng(100 + seed), 1200, 1600, 30)
         blobs = default(image)
         for name in errors:
             found = scipy_way(image) if name == "scipy.ndimage" else CENTROIDERS[name](image, blobs).xy_px
-            apart = np.linalg.norm(found[None] - places[:, None], axis=2)
-            errors[name].append((found[apart.argmin(axis=1)] - places)[apart.min(axis=1) < 1])
+            separation = np.linalg.norm(found[None] - places[:, None], axis=2)
+            errors[name].append((found[separation.argmin(axis=1)] - places)[separation.min(axis=1) < 1])
     bound = cramer_rao_px()
     results = []
-    for name, off in errors.items():
-        ratio = float(np.sqrt(np.mean(np.concatenate(off) ** 2))) / bound
+    for name, error in errors.items():
+        ratio = float(np.sqrt(np.mean(np.concatenate(error) ** 2))) / bound
         row = verdict(f"centroid error, {name}", ratio, "x", f"the bound of {bound:.4f} px", 1.15)
         results.append(row if name == "gaussian_fit" else row | {"bar": None, "met": None})
     return results

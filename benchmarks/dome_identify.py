@@ -16,13 +16,13 @@ from scipy.spatial.transform import Rotation
 from estimator.attitude.dome_map import LedMap, Lever, project
 from estimator.core.camera import Camera
 from estimator.identification.leds import search
-from estimator.identification.leds.index import Sight, sight_of
+from estimator.identification.leds.index import DomeIndex, build_dome_index
 from skysim.core.types import Floats
 from skysim.scene import loader
-from skysim.simulation import testbed
+from skysim.simulation.testbed import build_testbed
 from skysim.sources.dome import layout
 from skysim.sources.dome.placement import optimize
-from skysim.sources.dome.surface import Inside, build_surface
+from skysim.sources.dome.surface import Surface, build_surface
 from skysim.tracking.onboard_model import calibration
 
 COUNT, CAP_DEG, TILT_DEG = 1400, 40.0, 30.0
@@ -34,46 +34,46 @@ class Case:
     false detections."""
 
     name: str
-    places: str = "poisson_disc"
+    places: str = "poisson_disk"
     noise_px: float = 0.2
-    believed_m: float = 0.2e-3
+    assumed_m: float = 0.2e-3
     dead: float = 0.0
     false: int = 0
 
 
 CASES = (
-    Case("poisson disc"),
+    Case("poisson disk"),
     Case("random", "random"),
     Case("fibonacci", "fibonacci"),
     Case("half dead, 5 reflections", dead=0.5, false=5),
-    Case("the same, LEDs known", dead=0.5, false=5, believed_m=0.0),
+    Case("the same, LEDs known", dead=0.5, false=5, assumed_m=0.0),
     Case("5 reflections", false=5),
-    Case("fibonacci, LEDs known", "fibonacci", believed_m=0.0),
+    Case("fibonacci, LEDs known", "fibonacci", assumed_m=0.0),
     Case("reflections only", dead=1.0, false=16),
 )
 
 
-def leds_m(places: str, count: int, inside: Inside, rng: np.random.Generator) -> Floats:
+def leds_m(places: str, count: int, surface: Surface, rng: np.random.Generator) -> Floats:
     """(count, 3) LED positions on the dome, m.
 
-    A Poisson-disc layout comes from thinning random darts to a minimum distance; surplus LEDs are dropped at random.
+    A Poisson-disk layout comes from thinning random darts to a minimum distance; surplus LEDs are dropped at random.
     """
     half = np.radians(CAP_DEG)
     if places == "fibonacci":
-        return layout.from_bearing(inside, layout.cap(count, half))
-    darts_m = layout.from_bearing(inside, layout.scattered_cap(100 * count, half, rng))
+        return layout.project_from_bearing(surface, layout.cap(count, half))
+    darts_m = layout.project_from_bearing(surface, layout.scattered_cap(100 * count, half, rng))
     if places == "random":
         return darts_m[:count]
     area_m2 = 2 * np.pi * 1.22**2 * (1 - np.cos(half))
-    kept = darts_m[optimize.apart(darts_m, np.sqrt(0.6 * area_m2 / count))]
-    return kept[:count] if len(kept) < count else kept[rng.permutation(len(kept))[:count]]
+    thinned = darts_m[optimize.thin(darts_m, np.sqrt(0.6 * area_m2 / count))]
+    return thinned[:count] if len(thinned) < count else thinned[rng.permutation(len(thinned))[:count]]
 
 
 def attitude(rng: np.random.Generator) -> Rotation:
     """Random body_from_lab: boresight uniform in solid angle within TILT_DEG of the zenith, yaw uniform."""
     tilt = np.arccos(1 - rng.random() * (1 - np.cos(np.radians(TILT_DEG))))
-    towards, yaw = rng.uniform(0, 2 * np.pi, 2)
-    tilted = Rotation.from_rotvec(tilt * np.array([np.cos(towards), np.sin(towards), 0]))
+    azimuth, yaw = rng.uniform(0, 2 * np.pi, 2)
+    tilted = Rotation.from_rotvec(tilt * np.array([np.cos(azimuth), np.sin(azimuth), 0]))
     return Rotation.from_euler("z", yaw) * tilted
 
 
@@ -82,7 +82,7 @@ def trial(
     truth_m: Floats,
     lever: Lever,
     camera: Camera,
-    sight: Sight,
+    dome: DomeIndex,
     rng: np.random.Generator,
 ) -> tuple[str, float, int]:
     """Result of one frame ("identified", "WRONG" or the reason for none), its time, and the number of LEDs in it."""
@@ -91,40 +91,41 @@ def trial(
     seen = np.flatnonzero(camera.contains(np.nan_to_num(xy, nan=-1e9), 12))
     seen = seen[rng.random(len(seen)) >= case.dead]
     false = rng.random((case.false, 2)) * [camera.width_px, camera.height_px]
-    lights_px = np.concatenate([xy[seen] + case.noise_px * rng.standard_normal((len(seen), 2)), false])
-    order = rng.permutation(len(lights_px))
-    lights_px, name = lights_px[order], np.concatenate([seen, np.full(case.false, -1)])[order]
-    sigma = np.full(len(lights_px), case.noise_px / camera.focal_px)
+    detections_px = np.concatenate([xy[seen] + case.noise_px * rng.standard_normal((len(seen), 2)), false])
+    order = rng.permutation(len(detections_px))
+    detections_px, name = detections_px[order], np.concatenate([seen, np.full(case.false, -1)])[order]
+    sigma = np.full(len(detections_px), case.noise_px / camera.focal_px)
     begin = time.perf_counter()
-    found = search.identify(camera.rays(lights_px), sigma, sight)
-    spent = time.perf_counter() - begin
-    if isinstance(found, str):
-        return found, spent, len(seen)
+    match = search.identify(camera.rays(detections_px), sigma, dome)
+    elapsed_s = time.perf_counter() - begin
+    if isinstance(match, str):
+        return match, elapsed_s, len(seen)
     # A reflection matched to a dead LED nearby is not an error; a true light matched to another LED is.
-    named = name[found.observed]
-    wrong = np.any((named != found.star) & (named >= 0)) or np.all(named < 0)
-    return ("WRONG" if wrong else "identified"), spent, len(seen)
+    named = name[match.observed]
+    wrong = np.any((named != match.star) & (named >= 0)) or np.all(named < 0)
+    return ("WRONG" if wrong else "identified"), elapsed_s, len(seen)
 
 
 def measure(case: Case, trials: int, seed: int) -> str:
     """One table line."""
     rng = np.random.default_rng(seed)
-    lab = testbed.build_testbed(loader.load("afit_simsat"))
-    inside = build_surface(lab.scene.light.surface)
-    truth_m = leds_m(case.places, COUNT, inside, rng)
-    camera = calibration(lab.scene.camera)
-    lever = Lever(np.array(lab.mount.camera_body_m), lab.mount.cam_from_body)
-    believed_m = truth_m + case.believed_m * rng.standard_normal(truth_m.shape)
-    leds = LedMap(np.arange(len(truth_m)), believed_m, np.zeros(3), np.ones(3), sigma_m=case.believed_m)
-    sight = sight_of(leds, lever, camera)
-    trial(case, truth_m, lever, camera, sight, rng)
-    came = [trial(case, truth_m, lever, camera, sight, rng) for _ in range(trials)]
-    verdicts = np.array([verdict.split(":")[0] for verdict, _, _ in came])
-    ms = 1e3 * np.array([spent for _, spent, _ in came])
-    share = {name: 100 * np.mean(verdicts == name) for name in ("identified", "WRONG", "ambiguous")}
+    testbed = build_testbed(loader.load("afit_simsat"))
+    surface = build_surface(testbed.scene.light.surface)
+    truth_m = leds_m(case.places, COUNT, surface, rng)
+    camera = calibration(testbed.scene.camera)
+    lever = Lever(np.array(testbed.mount.camera_body_m), testbed.mount.cam_from_body)
+    assumed_m = truth_m + case.assumed_m * rng.standard_normal(truth_m.shape)
+    leds = LedMap(np.arange(len(truth_m)), assumed_m, np.zeros(3), np.ones(3), sigma_m=case.assumed_m)
+    dome = build_dome_index(leds, lever, camera)
+    trial(case, truth_m, lever, camera, dome, rng)
+    results = [trial(case, truth_m, lever, camera, dome, rng) for _ in range(trials)]
+    outcomes = np.array([outcome.split(":")[0] for outcome, _, _ in results])
+    ms = 1e3 * np.array([elapsed_s for _, elapsed_s, _ in results])
+    counts = [n for _, _, n in results]
+    percent = {name: 100 * np.mean(outcomes == name) for name in ("identified", "WRONG", "ambiguous")}
     return (
-        f"{case.name:26s} {len(truth_m):5d} {np.mean([n for _, _, n in came]):6.1f} {min(n for _, _, n in came):4d}"
-        f" {share['identified']:9.2f} {int(np.sum(verdicts == 'WRONG')):6d} {share['ambiguous']:9.2f}"
+        f"{case.name:26s} {len(truth_m):5d} {np.mean(counts):6.1f} {min(counts):4d}"
+        f" {percent['identified']:9.2f} {int(np.sum(outcomes == 'WRONG')):6d} {percent['ambiguous']:9.2f}"
         f" {np.median(ms):8.2f} {np.percentile(ms, 99):8.2f}"
     )
 

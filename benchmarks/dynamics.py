@@ -11,7 +11,8 @@ import numpy as np
 
 from benchmarks.timing import verdict, versus
 from skysim.scene import loader
-from skysim.simulation import run, testbed
+from skysim.simulation import run
+from skysim.simulation.testbed import build_testbed
 
 FLOWN_S = 5.0
 POSES = 200
@@ -35,11 +36,9 @@ def open_loops() -> list[dict[str, Any]]:
 def open_loop(name: str, more: dict[str, str]) -> dict[str, Any]:
     """The simulation of `skysim run` without control, against bare mj_step."""
     overrides = {f"vehicle.{key}": part for key, part in more.items()}
-    overrides |= {"motion.control": "none", "motion.manoeuvre": "[]", "exposure.frames": "1"}
-    lab = testbed.build_testbed(
-        loader.load("afit_simsat", overrides | {"exposure.first": f"{FLOWN_S - 0.012} s"})
-    )
-    model = lab.ship.model
+    overrides |= {"motion.control": "none", "motion.maneuver": "[]", "exposure.frames": "1"}
+    testbed = build_testbed(loader.load("afit_simsat", overrides | {"exposure.first": f"{FLOWN_S - 0.012} s"}))
+    model = testbed.vehicle.model
 
     def bare() -> None:
         data = mujoco.MjData(model)
@@ -47,7 +46,7 @@ def open_loop(name: str, more: dict[str, str]) -> dict[str, Any]:
             mujoco.mj_step(model, data)
 
     what = f"fly {FLOWN_S:g} s open loop, {name}"
-    return versus(what, lambda: run.simulate_motion(lab), "bare mj_step", bare, bar=0.9)
+    return versus(what, lambda: run.simulate_motion(testbed), "bare mj_step", bare, bar=0.9)
 
 
 def closed_loops() -> list[dict[str, Any]]:
@@ -56,8 +55,8 @@ def closed_loops() -> list[dict[str, Any]]:
 
 
 def closed_loop(name: str) -> dict[str, Any]:
-    lab = run.prepare(loader.load(name, {"exposure.frames": "3"}))
-    ratio = float(lab.trajectory.t_s[-1]) / best(lambda: run.simulate_motion(lab), 30)
+    testbed = run.prepare(loader.load(name, {"exposure.frames": "3"}))
+    ratio = float(testbed.trajectory.t_s[-1]) / best(lambda: run.simulate_motion(testbed), 30)
     return verdict(f"{name} closed loop, 100 Hz", ratio, "x real time", "the clock", 30.0, least=True)
 
 
@@ -65,7 +64,7 @@ def poses() -> dict[str, Any]:
     """Time to interpolate the attitudes at POSES moments of one exposure."""
     flight = run.prepare(loader.load("simsat_slew", {"exposure.frames": "1"})).trajectory
     moments = np.linspace(0.5, 0.51, POSES)
-    return verdict(f"{POSES} poses in an exposure", 1e3 * best(lambda: flight.at(moments)), "ms", "", 0.3)
+    return verdict(f"{POSES} poses in an exposure", 1e3 * best(lambda: flight.attitude_at(moments)), "ms", "", 0.3)
 
 
 def best(work: Callable[[], Any], repeats: int = 30) -> float:

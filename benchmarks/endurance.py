@@ -16,13 +16,14 @@ import psutil
 from skysim.core.units import ARCSEC_RAD
 from skysim.results import metrics
 from skysim.scene.loader import load
-from skysim.simulation import run, testbed
+from skysim.simulation import run
+from skysim.simulation.testbed import build_testbed, build_tracker
 
 WARM_S = 60.0  # simulated time after which all code was called once; memory growth is counted from here
 SCENE = {
     "seed": "11",
     "motion.start": "{roll_deg: 0, pitch_deg: 0, yaw_deg: 0}",
-    "motion.manoeuvre": "[{kind: sine, amplitude_deg: [4, 3, 10], frequency_hz: 0.01, duration: 1e6 s}]",
+    "motion.maneuver": "[{kind: sine, amplitude_deg: [4, 3, 10], frequency_hz: 0.01, duration: 1e6 s}]",
     "motion.control.feedback": "filter",
     "exposure.first": "0.1 s",
 }
@@ -31,35 +32,31 @@ SCENE = {
 def main(duration_s: float, rate_hz: float) -> None:
     """Run the simulation; print one line per simulated minute, then memory growth, drift and attitude errors."""
     frames = round(duration_s * rate_hz)
-    told = SCENE | {"exposure.rate_hz": str(rate_hz), "exposure.frames": str(frames)}
-    lab = testbed.build_testbed(load("simsat_bump", told))
-    us, begin = psutil.Process(), time.monotonic()
+    overrides = SCENE | {"exposure.rate_hz": str(rate_hz), "exposure.frames": str(frames)}
+    testbed = build_testbed(load("simsat_bump", overrides))
+    process, begin = psutil.Process(), time.monotonic()
     memory_mb: list[float] = []
     solved = wrong = 0
     first_s = late_s = 0.0
     print(f"{'flight':>8s} {'wall':>8s} {'memory':>10s}  solved  wrong")
-    for n, look in enumerate(run.live(lab, testbed.tracker(lab)), 1):
-        first_s = first_s or look.frame.t_mid_s
-        late_s = max(late_s, abs(look.frame.t_mid_s - first_s - (n - 1) / rate_hz))
-        answer = look.report.attitude.cam_from_ref if look.report else None
-        solved += answer is not None
-        wrong += answer is not None and metrics.is_wrong(answer, look.truth.cam_from_lab)
+    for n, result in enumerate(run.live(testbed, build_tracker(testbed)), 1):
+        first_s = first_s or result.frame.t_mid_s
+        late_s = max(late_s, abs(result.frame.t_mid_s - first_s - (n - 1) / rate_hz))
+        attitude = result.report.attitude.cam_from_ref if result.report else None
+        solved += attitude is not None
+        wrong += attitude is not None and metrics.is_wrong(attitude, result.truth.cam_from_lab)
         if n % round(60 * rate_hz) == 0 or n == frames:
             gc.collect()
-            memory_mb.append(us.memory_info().rss / 1e6)
+            memory_mb.append(process.memory_info().rss / 1e6)
             wall_s = time.monotonic() - begin
             print(
                 f"{n / rate_hz:6.0f} s {wall_s:6.0f} s {memory_mb[-1]:7.1f} MB {solved:7d} {wrong:6d}",
                 flush=True,
             )
     after = memory_mb[round(WARM_S // 60) - 1 :]
-    grown = max(after) / after[0] - 1
-    off = (
-        metrics.cross_and_roll_rad(answer, look.truth.cam_from_lab)[0] / ARCSEC_RAD
-        if answer
-        else float("nan")
-    )
-    print(f"memory grew by {100 * grown:.2f} % after the first minute (bar 1 %)")
+    growth = max(after) / after[0] - 1
+    off = metrics.cross_and_roll_rad(attitude, result.truth.cam_from_lab)[0] / ARCSEC_RAD if attitude else float("nan")
+    print(f"memory grew by {100 * growth:.2f} % after the first minute (bar 1 %)")
     print(f"time stamps drifted by {late_s:.2g} s")
     print(f"{solved} of {n} solved, {wrong} wrong, the last off by {off:.2g} arcsec")
 

@@ -28,7 +28,7 @@ def false_frame(work: Workload, mag: np.ndarray, rng: np.random.Generator) -> Ce
     return Centroids(xy, np.full(count, work.noise_px), 10 ** (-0.4 * np.sort(rng.choice(mag, count))))
 
 
-def answered(count: int, seed: int) -> dict[str, tuple[int, int]]:
+def count_solutions(count: int, seed: int) -> dict[str, tuple[int, int]]:
     """Number of frames and number of (false) solutions, by camera."""
     settings = Settings(centroid_sigma_px=0.0, field_stars=1e9, merge_px=0.0, zero_point_mag=0.0)
     trackers = []
@@ -38,12 +38,12 @@ def answered(count: int, seed: int) -> dict[str, tuple[int, int]]:
     out = {work.name: (0, 0) for work in WORKLOADS}
     for n, (work, mag, tracker) in zip(range(count), cycle(trackers), strict=False):
         centroids = false_frame(work, mag, np.random.default_rng([seed, n]))
-        looked, wrong = out[work.name]
-        out[work.name] = looked + 1, wrong + tracker.solve_centroids(centroids).solved
+        frames, wrong = out[work.name]
+        out[work.name] = frames + 1, wrong + tracker.solve_centroids(centroids).solved
     return out
 
 
 if __name__ == "__main__":
     count, seed = (int(one) for one in (sys.argv[1:3] + ["100000", "1"][len(sys.argv[1:3]) :]))
-    for name, (looked, wrong) in answered(count, seed).items():
-        print(f"{name:30s} {looked:7d} frames without a star, {wrong} answered")
+    for name, (frames, wrong) in count_solutions(count, seed).items():
+        print(f"{name:30s} {frames:7d} frames without a star, {wrong} answered")

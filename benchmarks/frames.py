@@ -22,15 +22,15 @@ from estimator.catalog import catalog
 from estimator.core.camera import Camera
 from estimator.trackers.pipeline import Settings
 from estimator.trackers.star_tracker import StarTracker
-from skysim.core.paths import CATALOGUES
+from skysim.core.paths import CATALOGS
 from skysim.core.units import ARCSEC_RAD
+from skysim.results.metrics import WRONG_RAD
 
-WRONG_RAD = np.radians(10 / 60)
 STEP_PX = 0.1  # step of the Gaussians along a streak
 
 
 @dataclass(frozen=True)
-class Sight:
+class CameraSetup:
     """A camera and its signal levels.
 
     zero_e : electrons of a star of magnitude 0; deepest : magnitude of the faintest star drawn
@@ -52,22 +52,22 @@ class Sight:
 EC655 = Camera.from_fov(659, 493, float(np.radians(14.87)))
 SQUARE = Camera.from_fov(1024, 1024, float(np.radians(13.5)))  # holds 22 stars brighter than 6
 LIEBE_E = 6008 * 10 ** (0.4 * 4)  # EC655, f/1.4, 50 ms: a star of magnitude 4 gives 6008 e
-SIGHTS = (
-    Sight("EC655, 50 ms", EC655, LIEBE_E, 7.0, 60, 15, 16, 4095),
-    Sight("1024 x 1024", SQUARE, LIEBE_E, 7.0, 60, 15, 16, 4095, psf_px=0.9),
-    Sight("1024 x 1024, smear of 12 px", SQUARE, LIEBE_E, 7.0, 60, 15, 16, 4095, psf_px=0.9, streak_px=12),
+SETUPS = (
+    CameraSetup("EC655, 50 ms", EC655, LIEBE_E, 7.0, 60, 15, 16, 4095),
+    CameraSetup("1024 x 1024", SQUARE, LIEBE_E, 7.0, 60, 15, 16, 4095, psf_px=0.9),
+    CameraSetup("1024 x 1024, smear of 12 px", SQUARE, LIEBE_E, 7.0, 60, 15, 16, 4095, psf_px=0.9, streak_px=12),
 )
 
 
 @numba.njit(cache=True)
-def paint(light: NDArray, xy: NDArray, flux: NDArray, ends: NDArray, psf_px: float) -> None:
+def paint(light: NDArray, xy: NDArray, flux: NDArray, streak: NDArray, psf_px: float) -> None:
     """Add stars to `light`: each is a sum of Gaussians at equal steps along a streak (dx, dy) centered at xy."""
     reach, height, width = int(5 * psf_px) + 2, *light.shape
     for n in range(len(xy)):
-        steps = int(np.hypot(ends[n, 0], ends[n, 1]) / STEP_PX) + 1
+        steps = int(np.hypot(streak[n, 0], streak[n, 1]) / STEP_PX) + 1
         for k in range(steps):
             along = (k + 0.5) / steps - 0.5
-            x, y = xy[n, 0] + along * ends[n, 0], xy[n, 1] + along * ends[n, 1]
+            x, y = xy[n, 0] + along * streak[n, 0], xy[n, 1] + along * streak[n, 1]
             for row in range(max(round(y) - reach, 0), min(round(y) + reach + 1, height)):
                 down = np.exp(-((row - y) ** 2) / 2 / psf_px**2)
                 for column in range(max(round(x) - reach, 0), min(round(x) + reach + 1, width)):
@@ -75,48 +75,44 @@ def paint(light: NDArray, xy: NDArray, flux: NDArray, ends: NDArray, psf_px: flo
                     light[row, column] += flux[n] / steps * down * across / (2 * np.pi * psf_px**2)
 
 
-def photograph(
-    sight: Sight, stars: catalog.StarCatalog, rng: np.random.Generator
-) -> tuple[NDArray, Rotation]:
+def render(setup: CameraSetup, stars: catalog.StarCatalog, rng: np.random.Generator) -> tuple[NDArray, Rotation]:
     """One frame at a random attitude, and that attitude at mid-exposure."""
-    camera, truth = sight.camera, Rotation.random(rng=rng)
+    camera, truth = setup.camera, Rotation.random(rng=rng)
     xy = camera.pixels(truth.apply(stars.vectors))
     inside = camera.contains(np.nan_to_num(xy, nan=-1e9), -10.0)
     angle = rng.uniform(0, 2 * np.pi)
-    ends = np.tile(sight.streak_px * np.array([np.cos(angle), np.sin(angle)]), (inside.sum(), 1))
-    light = np.full((camera.height_px, camera.width_px), sight.sky_e)
-    paint(light, xy[inside], sight.zero_e * 10 ** (-0.4 * stars.v_mag[inside]), ends, sight.psf_px)
-    noisy = rng.poisson(light) + rng.normal(0, sight.read_e, light.shape)
-    return np.clip(noisy / sight.gain_e + 16, 0, sight.depth).astype(np.uint16), truth
+    streak = np.tile(setup.streak_px * np.array([np.cos(angle), np.sin(angle)]), (inside.sum(), 1))
+    light = np.full((camera.height_px, camera.width_px), setup.sky_e)
+    paint(light, xy[inside], setup.zero_e * 10 ** (-0.4 * stars.v_mag[inside]), streak, setup.psf_px)
+    noisy = rng.poisson(light) + rng.normal(0, setup.read_e, light.shape)
+    return np.clip(noisy / setup.gain_e + 16, 0, setup.depth).astype(np.uint16), truth
 
 
 Solve = Callable[[NDArray], Rotation | None]
 
 
-def ours(sight: Sight, stars: catalog.StarCatalog) -> Solve:
+def ours(setup: CameraSetup, stars: catalog.StarCatalog) -> Solve:
     """The skysim star tracker with default settings and a calibrated camera: known gain and zero point."""
     settings = Settings(
-        gain_e_dn=sight.gain_e,
-        saturation=sight.depth,
+        gain_e_dn=setup.gain_e,
+        saturation=setup.depth,
         centroid_sigma_px=0.03,
-        zero_point_mag=float(2.5 * np.log10(sight.zero_e / sight.gain_e)),
+        zero_point_mag=float(2.5 * np.log10(setup.zero_e / setup.gain_e)),
     )
-    tracker = StarTracker(sight.camera, stars, stars.vectors, settings)
+    tracker = StarTracker(setup.camera, stars, stars.vectors, settings)
     return lambda image: tracker.solve(image).attitude.cam_from_ref
 
 
-def tetra3rs(sight: Sight, stars: catalog.StarCatalog, fast: bool) -> Solve | None:
+def tetra3rs(setup: CameraSetup, stars: catalog.StarCatalog, fast: bool) -> Solve | None:
     """tetra3rs with its own catalog on one thread; None if it is not installed (extra `oracle`)."""
     if importlib.util.find_spec("tetra3rs") is None:
         return None
     import tetra3rs as peer
 
-    fov_deg = float(np.degrees(sight.camera.fov_rad))
-    database = peer.SolverDatabase.generate_from_gaia(
-        max_fov_deg=fov_deg * 1.1, epoch_proper_motion_year=1991.25
-    )
-    shape = (sight.camera.height_px, sight.camera.width_px)
-    model = peer.CameraModel(sight.camera.focal_px, shape[1], shape[0])
+    fov_deg = float(np.degrees(setup.camera.fov_rad))
+    database = peer.SolverDatabase.generate_from_gaia(max_fov_deg=fov_deg * 1.1, epoch_proper_motion_year=1991.25)
+    shape = (setup.camera.height_px, setup.camera.width_px)
+    model = peer.CameraModel(setup.camera.focal_px, shape[1], shape[0])
     extract = peer.extract_centroids_fast if fast else peer.extract_centroids
 
     def solve(image: NDArray) -> Rotation | None:
@@ -128,29 +124,29 @@ def tetra3rs(sight: Sight, stars: catalog.StarCatalog, fast: bool) -> Solve | No
     return solve
 
 
-def compare(sight: Sight, solvers: dict[str, Solve | None], frames: list[tuple[NDArray, Rotation]]) -> None:
+def compare(setup: CameraSetup, solvers: dict[str, Solve | None], frames: list[tuple[NDArray, Rotation]]) -> None:
     """Run all solvers frame by frame and print one line per solver."""
-    known = {name: solve for name, solve in solvers.items() if solve is not None}
-    ms: dict[str, list[float]] = {name: [] for name in known}
-    off: dict[str, list[NDArray]] = {name: [] for name in known}
-    for solve in known.values():
+    available = {name: solve for name, solve in solvers.items() if solve is not None}
+    ms: dict[str, list[float]] = {name: [] for name in available}
+    errors: dict[str, list[NDArray]] = {name: [] for name in available}
+    for solve in available.values():
         solve(frames[0][0])  # compiles
-    order = list(known.items())
+    order = list(available.items())
     for image, truth in frames:
         order.append(order.pop(0))  # rotate: the first solver finds the frame uncached
         for name, solve in order:
             begin = time.perf_counter()
-            answer = solve(image)
+            attitude = solve(image)
             ms[name].append(1e3 * (time.perf_counter() - begin))
-            if answer is not None:
-                off[name].append((answer * truth.inv()).as_rotvec())
-    for name in known:
-        turn = np.array(off[name]).reshape(-1, 3)
-        right = np.linalg.norm(turn, axis=1) < WRONG_RAD
-        cross = np.hypot(turn[right, 0], turn[right, 1]) / ARCSEC_RAD
+            if attitude is not None:
+                errors[name].append((attitude * truth.inv()).as_rotvec())
+    for name in available:
+        error = np.array(errors[name]).reshape(-1, 3)
+        right = np.linalg.norm(error, axis=1) < WRONG_RAD
+        cross = np.hypot(error[right, 0], error[right, 1]) / ARCSEC_RAD
         solved, wrong = (100 * part.sum() / len(frames) for part in (right, ~right))
         print(
-            f"{sight.name:28s} {name:14s} {solved:8.2f} {wrong:7.2f}"
+            f"{setup.name:28s} {name:14s} {solved:8.2f} {wrong:7.2f}"
             f" {np.median(ms[name]):8.3f} {np.percentile(ms[name], 99):8.2f}"
             f" {np.median(cross):8.2f} {np.sqrt(np.mean(cross**2)):8.2f}",
             flush=True,
@@ -160,13 +156,13 @@ def compare(sight: Sight, solvers: dict[str, Solve | None], frames: list[tuple[N
 if __name__ == "__main__":
     count, seed = (int(one) for one in (sys.argv[1:3] + ["300", "1"][len(sys.argv[1:3]) :]))
     print(f'{"":28s} {"":14s} solved %  wrong %       ms   p99 ms   cross"    rms"')
-    stars = catalog.read(CATALOGUES / "hipparcos_hp6.5.ecsv")
-    for sight in SIGHTS:
-        deep = catalog.brighter(stars, sight.deepest)
-        shots = [photograph(sight, deep, np.random.default_rng([seed, n])) for n in range(count)]
+    stars = catalog.read(CATALOGS / "hipparcos_hp6.5.ecsv")
+    for setup in SETUPS:
+        deep = catalog.brighter_than(stars, setup.deepest)
+        frames = [render(setup, deep, np.random.default_rng([seed, n])) for n in range(count)]
         solvers = {
-            "ours": ours(sight, deep),
-            "tetra3rs fast": tetra3rs(sight, deep, True),
-            "tetra3rs": tetra3rs(sight, deep, False),
+            "ours": ours(setup, deep),
+            "tetra3rs fast": tetra3rs(setup, deep, True),
+            "tetra3rs": tetra3rs(setup, deep, False),
         }
-        compare(sight, solvers, shots)
+        compare(setup, solvers, frames)

@@ -29,9 +29,9 @@ from estimator.trackers.pipeline import Settings
 from estimator.trackers.star_tracker import StarTracker
 from skysim.apps import plate_solver
 from skysim.core import images
-from skysim.core.paths import CATALOGUES
+from skysim.core.paths import CATALOGS
 from skysim.results.files import frames
-from skysim.results.metrics import normalised_error_squared
+from skysim.results.metrics import normalized_error_squared
 
 DEEPEST_G = 8.0  # limiting magnitude of the stars drawn; the tracker's catalog ends at 6.5
 ZERO_E = 239_000.0  # electrons of a star of G = 0
@@ -42,7 +42,7 @@ ARCSEC_DEG = 1 / 3600
 
 
 @dataclass(frozen=True, slots=True)
-class Sight:
+class CameraSetup:
     """A GalSim camera and a date.
 
     lens : makes a PSF in pixels;  scale_arcsec : pixel scale at the image center
@@ -79,24 +79,20 @@ def astigmatic(galsim: Any) -> Any:
 
     There is no coma, because it displaces every star equally and so cannot be separated from the attitude.
     """
-    return galsim.OpticalPSF(
-        lam_over_diam=1.2, obscuration=0.3, defocus=0.15, astig1=0.08, astig2=-0.05, spher=0.05
-    )
+    return galsim.OpticalPSF(lam_over_diam=1.2, obscuration=0.3, defocus=0.15, astig1=0.08, astig2=-0.05, spher=0.05)
 
 
-SIGHTS = {
-    "Gaussian, 640 x 480, 75″/px": Sight(640, 480, 75, blurred, 10, 60, 15, 0.03, "2015-10-03T04:05:06"),
-    "Moffat, 1024 x 1024, 45″/px": Sight(1024, 1024, 45, winged, 3, 150, 8, -0.02, "2016-03-21T20:15:00"),
-    "optical, 1280 x 960, 35″/px": Sight(
-        1280, 960, 35, astigmatic, 1.5, 40, 4, -0.045, "2012-06-22T21:00:00"
-    ),
+SETUPS = {
+    "Gaussian, 640 x 480, 75″/px": CameraSetup(640, 480, 75, blurred, 10, 60, 15, 0.03, "2015-10-03T04:05:06"),
+    "Moffat, 1024 x 1024, 45″/px": CameraSetup(1024, 1024, 45, winged, 3, 150, 8, -0.02, "2016-03-21T20:15:00"),
+    "optical, 1280 x 960, 35″/px": CameraSetup(1280, 960, 35, astigmatic, 1.5, 40, 4, -0.045, "2012-06-22T21:00:00"),
 }
 SATURATED_DN = 65535
 OFFSET_DN = 200
 
 
 @dataclass(frozen=True, slots=True)
-class Shot:
+class RenderedFrame:
     """A GalSim frame as a file, and the (N, 3) apparent directions of a lattice of its pixels."""
 
     index: int
@@ -115,95 +111,84 @@ def stars(utc: str) -> tuple[NDArray, NDArray]:
     return aberrated(unit_vectors(rows["ra"], rows["dec"]), utc), rows["g"]
 
 
-def photographs(sight: Sight, frames: int, seed: int, folder: Path) -> Iterator[Shot]:
+def render_frames(setup: CameraSetup, frames: int, seed: int, folder: Path) -> Iterator[RenderedFrame]:
     """Yield frames at uniformly random attitudes; each overwrites the file of the previous one."""
     import galsim
 
-    directions, g_mag = stars(sight.utc)
-    image_px = lattice(sight.width_px, sight.height_px) + 1  # GalSim counts from 1
+    directions, g_mag = stars(setup.utc)
+    image_px = lattice(setup.width_px, setup.height_px) + 1  # GalSim counts from 1
     for n in range(frames):
         rng = np.random.default_rng([seed, n])
-        image = galsim.ImageD(sight.width_px, sight.height_px, scale=1)
-        plate = plate_at(galsim, sight, rng, image.true_center)
-        middle = unit_vectors(
-            *np.degrees(plate.xyToradec(image.true_center.x, image.true_center.y, units="rad"))
-        )
-        near = directions @ middle > np.cos(sight.camera.diagonal_rad)
-        draw(galsim, image, sight, plate, directions[near], g_mag[near])
-        image += sight.sky_e / sight.gain_e_dn
-        image.addNoise(
-            galsim.CCDNoise(galsim.BaseDeviate(seed * 100_003 + n + 1), 0.0, sight.gain_e_dn, sight.read_e)
-        )
+        image = galsim.ImageD(setup.width_px, setup.height_px, scale=1)
+        plate = plate_at(galsim, setup, rng, image.true_center)
+        middle = unit_vectors(*np.degrees(plate.xyToradec(image.true_center.x, image.true_center.y, units="rad")))
+        near = directions @ middle > np.cos(setup.camera.diagonal_rad)
+        draw(galsim, image, setup, plate, directions[near], g_mag[near])
+        image += setup.sky_e / setup.gain_e_dn
+        image.addNoise(galsim.CCDNoise(galsim.BaseDeviate(seed * 100_003 + n + 1), 0.0, setup.gain_e_dn, setup.read_e))
         counts = np.clip(np.rint(image.array + OFFSET_DN), 0, SATURATED_DN).astype(np.uint16)
         file = galsim.ImageUS(counts, xmin=1, ymin=1, wcs=plate)
-        file.header = galsim.FitsHeader({"DATE-OBS": sight.utc})
+        file.header = galsim.FitsHeader({"DATE-OBS": setup.utc})
         path = folder / "frame.fits"
         file.write(str(path))
-        yield Shot(n, path, unit_vectors(*np.degrees(plate.xyToradec(*image_px.T, units="rad"))))
+        yield RenderedFrame(n, path, unit_vectors(*np.degrees(plate.xyToradec(*image_px.T, units="rad"))))
 
 
-def plate_at(galsim: Any, sight: Sight, rng: np.random.Generator, middle: Any) -> Any:
+def plate_at(galsim: Any, setup: CameraSetup, rng: np.random.Generator, middle: Any) -> Any:
     """GalSim's gnomonic projection at a random attitude: u points west and v north, while image rows run down."""
     ra, dec, roll = rng.uniform(0, 2 * np.pi), np.arcsin(rng.uniform(-1, 1)), rng.uniform(0, 2 * np.pi)
-    across, along = sight.scale_arcsec * np.cos(roll), sight.scale_arcsec * np.sin(roll)
+    across, along = setup.scale_arcsec * np.cos(roll), setup.scale_arcsec * np.sin(roll)
     affine = galsim.AffineTransform(across, along, along, -across, origin=middle)
     return galsim.TanWCS(affine, galsim.CelestialCoord(ra * galsim.radians, dec * galsim.radians))
 
 
-def draw(galsim: Any, image: Any, sight: Sight, plate: Any, directions: NDArray, g_mag: NDArray) -> None:
+def draw(galsim: Any, image: Any, setup: CameraSetup, plate: Any, directions: NDArray, g_mag: NDArray) -> None:
     """Draw every star within MARGIN_PX of the frame."""
     x, y, z = directions.T
     place = plate.radecToxy(np.arctan2(y, x), np.arctan2(z, np.hypot(x, y)), units="rad")
-    lens = in_pixels(galsim, sight.lens(galsim))
+    lens = in_pixels(galsim, setup.lens(galsim))
     for right, down, g in zip(*place, g_mag, strict=True):
-        square = galsim.BoundsI(
-            *(round(one) + side for one in (right, down) for side in (-STAMP_PX, STAMP_PX))
-        )
-        within = (
-            -MARGIN_PX < right < sight.width_px + MARGIN_PX
-            and -MARGIN_PX < down < sight.height_px + MARGIN_PX
-        )
+        square = galsim.BoundsI(*(round(one) + side for one in (right, down) for side in (-STAMP_PX, STAMP_PX)))
+        within = -MARGIN_PX < right < setup.width_px + MARGIN_PX and -MARGIN_PX < down < setup.height_px + MARGIN_PX
         seen = square & image.bounds
         if within and seen.isDefined():
-            light = lens.withFlux(ZERO_E / sight.gain_e_dn * 10 ** (-0.4 * float(g)))
-            light.drawImage(
-                image[seen], center=galsim.PositionD(right, down), add_to_image=True, method="no_pixel"
-            )
+            light = lens.withFlux(ZERO_E / setup.gain_e_dn * 10 ** (-0.4 * float(g)))
+            light.drawImage(image[seen], center=galsim.PositionD(right, down), add_to_image=True, method="no_pixel")
 
 
 @lru_cache(maxsize=8)
 def in_pixels(galsim: Any, lens: Any) -> Any:
     """The PSF convolved with the pixel and tabulated, which GalSim draws a hundred times as fast."""
-    whole = galsim.Convolve(lens, galsim.Pixel(1.0))
-    table = whole.drawImage(nx=2 * STAMP_PX * FINE, ny=2 * STAMP_PX * FINE, scale=1 / FINE, method="no_pixel")
+    effective_psf = galsim.Convolve(lens, galsim.Pixel(1.0))
+    table = effective_psf.drawImage(nx=2 * STAMP_PX * FINE, ny=2 * STAMP_PX * FINE, scale=1 / FINE, method="no_pixel")
     return galsim.InterpolatedImage(table, x_interpolant="lanczos5")
 
 
 Ours = Callable[[NDArray, Path], Attitude]
 
 
-def as_a_photograph(sight: Sight) -> Ours:
+def plate_solver_way(setup: CameraSetup) -> Ours:
     """The solver of `skysim solve FILE --fov DEG`."""
-    fov_deg = float(np.degrees(sight.camera.fov_rad)) * (1 + sight.fov_error)
+    fov_deg = float(np.degrees(setup.camera.fov_rad)) * (1 + setup.fov_error)
     solver = plate_solver.make_solver(fov_deg, None)
-    return lambda image, path: plate_solver.look(image, solver, images.date_of(path))[0].attitude
+    return lambda image, path: plate_solver.solve_array(image, solver, images.read_date_obs(path))[0].attitude
 
 
-def as_a_tracker(sight: Sight) -> Ours:
+def calibrated_way(setup: CameraSetup) -> Ours:
     """A star tracker with a calibrated camera."""
-    listed = catalog.read(CATALOGUES / "hipparcos_hp6.5.ecsv")
+    listed = catalog.read(CATALOGS / "hipparcos_hp6.5.ecsv")
     settings = Settings(
         centroider="gaussian_fit",
-        gain_e_dn=sight.gain_e_dn,
+        gain_e_dn=setup.gain_e_dn,
         saturation=SATURATED_DN,
         centroid_sigma_px=0.03,
     )
-    seen = catalog.apparent(listed, catalog.on_earth(frames.datetime.datetime.fromisoformat(sight.utc)))
-    tracker = StarTracker(sight.camera, listed, seen, settings)
+    seen = catalog.apparent(listed, catalog.on_earth(frames.datetime.datetime.fromisoformat(setup.utc)))
+    tracker = StarTracker(setup.camera, listed, seen, settings)
     return lambda image, path: tracker.solve(image).attitude
 
 
-WAYS = {"--fov": as_a_photograph, "calibrated": as_a_tracker}
+WAYS = {"--fov": plate_solver_way, "calibrated": calibrated_way}
 
 
 @dataclass(frozen=True, slots=True)
@@ -215,25 +200,25 @@ class Outcome:
     mirrored: int
 
 
-def confront(sight: Sight, ways: Sequence[Ours], frames: int, seed: int, mirrors: int) -> list[Outcome]:
+def compare(setup: CameraSetup, ways: Sequence[Ours], frames: int, seed: int, mirrors: int) -> list[Outcome]:
     """Solve every frame in every way; the first `mirrors` of them mirrored as well."""
     outcomes = [Outcome([], [], 0) for _ in ways]
-    pixels = lattice(sight.width_px, sight.height_px)
+    pixels = lattice(setup.width_px, setup.height_px)
     with tempfile.TemporaryDirectory() as folder:
-        for shot in photographs(sight, frames, seed, Path(folder)):
-            image = images.read_image(shot.path)
+        for frame in render_frames(setup, frames, seed, Path(folder)):
+            image = images.read_image(frame.path)
             for n, way in enumerate(ways):
-                answer = way(image, shot.path)
+                answer = way(image, frame.path)
                 if answer.solved:
-                    held, nees = agreement(shot, answer, pixels)
-                    outcomes[n].solved.append(held)
+                    result, nees = agreement(frame, answer, pixels)
+                    outcomes[n].solved.append(result)
                     outcomes[n].nees.append(nees)
-                if shot.index < mirrors and way(np.ascontiguousarray(image[:, ::-1]), shot.path).solved:
+                if frame.index < mirrors and way(np.ascontiguousarray(image[:, ::-1]), frame.path).solved:
                     outcomes[n] = Outcome(outcomes[n].solved, outcomes[n].nees, outcomes[n].mirrored + 1)
     return outcomes
 
 
-def agreement(shot: Shot, answer: Attitude, pixels: NDArray) -> tuple[Agreement, float]:
+def agreement(frame: RenderedFrame, answer: Attitude, pixels: NDArray) -> tuple[Agreement, float]:
     """Compare a solution with GalSim's projection; returns the agreement and the NEES for the tracker's covariance.
 
     The true attitude is the rotation that best aligns the directions of the pixel lattice in camera axes, by the
@@ -243,26 +228,26 @@ def agreement(shot: Shot, answer: Attitude, pixels: NDArray) -> tuple[Agreement,
     assert answer.covariance_rad2 is not None
     assert answer.camera is not None
     assert answer.match is not None
-    truth, _ = Rotation.align_vectors(answer.camera.rays(pixels), shot.direction)
+    truth, _ = Rotation.align_vectors(answer.camera.rays(pixels), frame.direction)
     x, y, z = (answer.cam_from_ref * truth.inv()).as_rotvec()
     variance = np.diag(answer.covariance_rad2)
-    held = Agreement(
-        shot.index,
+    result = Agreement(
+        frame.index,
         float(np.hypot(x, y)),
         float(z),
         float(np.sqrt(variance[0] + variance[1])),
         float(np.sqrt(variance[2])),
         len(answer.match.observed),
     )
-    return held, normalised_error_squared(answer.cam_from_ref, truth, answer.covariance_rad2)
+    return result, normalized_error_squared(answer.cam_from_ref, truth, answer.covariance_rad2)
 
 
 if __name__ == "__main__":
     count, first = (int(one) for one in (sys.argv[1:3] + ["200", "1"][len(sys.argv[1:3]) :]))
-    count = -(-count // len(SIGHTS))
+    count = -(-count // len(SETUPS))
     print(f"{HEAD} {'NEES':>6s} {'mirror':>6s}")
-    for name, seen_by in SIGHTS.items():
-        ready = [way(seen_by) for way in WAYS.values()]
-        for label, one in zip(WAYS, confront(seen_by, ready, count, first, count // 5), strict=True):
-            told = line(f"{name}, {label}", count, one.solved)
-            print(f"{told} {np.mean(one.nees):6.2f} {one.mirrored:6d}", flush=True)
+    for name, setup_used in SETUPS.items():
+        ready = [way(setup_used) for way in WAYS.values()]
+        for label, one in zip(WAYS, compare(setup_used, ready, count, first, count // 5), strict=True):
+            row = line(f"{name}, {label}", count, one.solved)
+            print(f"{row} {np.mean(one.nees):6.2f} {one.mirrored:6d}", flush=True)

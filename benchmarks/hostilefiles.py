@@ -16,11 +16,11 @@ def encoded(picture: NDArray, suffix: str) -> bytes:
 
         from astropy.io import fits
 
-        told = BytesIO()
-        fits.PrimaryHDU(picture).writeto(told)
-        return told.getvalue()
-    done, data = cv2.imencode(suffix, picture)
-    assert done
+        buffer = BytesIO()
+        fits.PrimaryHDU(picture).writeto(buffer)
+        return buffer.getvalue()
+    success, data = cv2.imencode(suffix, picture)
+    assert success
     return data.tobytes()
 
 
@@ -31,8 +31,8 @@ def promise(suffix: str, width: int, height: int) -> bytes:
             (b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)),
             (b"IDAT", zlib.compress(b"\0" * 999)),
         ]
-        told = [struct.pack(">I", len(data)) + kind + data for kind, data in parts]
-        return b"\x89PNG\r\n\x1a\n" + b"".join(one + struct.pack(">I", zlib.crc32(one[4:])) for one in told)
+        chunks = [struct.pack(">I", len(data)) + kind + data for kind, data in parts]
+        return b"\x89PNG\r\n\x1a\n" + b"".join(chunk + struct.pack(">I", zlib.crc32(chunk[4:])) for chunk in chunks)
     if suffix == ".bmp":
         head = struct.pack("<IiiHHIIiiII", 40, width, height, 1, 24, 0, 0, 0, 0, 0, 0)
         return b"BM" + struct.pack("<IHHI", 54 + 999, 0, 0, 54) + head

@@ -15,7 +15,7 @@ from estimator.core.camera import Camera
 from estimator.core.types import Centroids
 from estimator.trackers.pipeline import Settings
 from estimator.trackers.star_tracker import StarTracker
-from skysim.core.paths import CATALOGUES
+from skysim.core.paths import CATALOGS
 
 FIELDS = 100
 
@@ -23,7 +23,7 @@ FIELDS = 100
 def measure() -> list[dict[str, Any]]:
     """100 random fields of 14.87 x 11.15 deg: the 15 brightest stars to V 5.75, 0.1 px noise, no false stars."""
     camera = Camera(659, 493, 25e-3 / 9.9e-6, (329.0, 246.0))
-    stars = catalog.brighter(catalog.read(CATALOGUES / "hipparcos_hp6.5.ecsv"), 5.75)
+    stars = catalog.brighter_than(catalog.read(CATALOGS / "hipparcos_hp6.5.ecsv"), 5.75)
     tracker = StarTracker(camera, stars, catalog.at_epoch(stars, 2020.0), Settings(centroid_sigma_px=0.1))
     fields = [field(tracker, np.random.default_rng([3, n])) for n in range(FIELDS)]
     result = versus(
@@ -52,7 +52,7 @@ def tetra3rs(camera: Camera, fields: list[Centroids]) -> Callable[[], Any] | Non
     from tetra3rs import SolverDatabase
 
     database = SolverDatabase.generate_from_gaia(max_fov_deg=16.0, star_max_magnitude=6.0)
-    middle = np.array([*camera.centre_px])
+    middle = np.array([*camera.center_px])
     tables = [np.column_stack([c.xy_px - middle, c.flux]) for c in fields]
     degrees = float(np.degrees(camera.fov_rad))
     return lambda: [

@@ -19,7 +19,7 @@ from skysim.camera.render import Window, render
 from skysim.core.types import Floats, Mount, Sources, Trajectory
 from skysim.scene.camera import CameraConfig
 
-AT_CENTRE = Mount(np.zeros(3), Rotation.identity())
+AT_CENTER = Mount(np.zeros(3), Rotation.identity())
 EXPOSURE_S = 0.01
 NOISE = {
     "quantum_efficiency": 0.5,
@@ -44,9 +44,9 @@ def camera(width: int, height: int, focal_px: float, sigma_px: float, **noise: A
     return CameraConfig.model_validate(part | lens | {"detector": NOISE | noise})
 
 
-def square_metre(lens: CameraConfig) -> Optics:
+def square_meter(lens: CameraConfig) -> Optics:
     """The optics with a pupil of one square meter, so that a source's strength equals its electrons per second."""
-    return replace(Optics.of(lens), collecting_m2=1.0)
+    return replace(Optics.from_camera(lens), collecting_m2=1.0)
 
 
 def turning(rate_rad_s: float) -> Trajectory:
@@ -56,16 +56,14 @@ def turning(rate_rad_s: float) -> Trajectory:
     return Trajectory(t, Rotation.from_rotvec((t[:, None] - EXPOSURE_S / 2) * rate[:1]), rate)
 
 
-def lights(
-    lens: CameraConfig, count: int, electrons: Floats, radius_px: float = 0.0, seed: int = 1
-) -> Sources:
-    """`count` stars, or discs two meters away if radius_px > 0, at random positions in the frame.
+def lights(lens: CameraConfig, count: int, electrons: Floats, radius_px: float = 0.0, seed: int = 1) -> Sources:
+    """`count` stars, or disks two meters away if radius_px > 0, at random positions in the frame.
 
     electrons : electrons of each source in one exposure
     """
     rng = np.random.default_rng(seed)
     xy = rng.uniform((30, 30), (lens.width_px - 30, lens.height_px - 30), (count, 2))
-    toward = np.column_stack([(xy - lens.centre_px) / lens.focal_px, np.ones(count)])
+    toward = np.column_stack([(xy - lens.center_px) / lens.focal_px, np.ones(count)])
     toward /= np.linalg.norm(toward, axis=1, keepdims=True)
     near = radius_px > 0
     place = np.column_stack([toward * (2.0 if near else 1.0), np.full(count, float(near))])
@@ -86,13 +84,13 @@ def lights(
 
 def camera_shot(lens: CameraConfig, sources: Sources, rate_rad_s: float) -> Callable[[], Any]:
     """A function that makes one frame: light with smear, then all noise."""
-    optics, chip, rng = square_metre(lens), Detector.of(lens), np.random.default_rng(0)
+    optics, detector, rng = square_meter(lens), Detector.from_camera(lens), np.random.default_rng(0)
     path, image = turning(rate_rad_s), np.empty((lens.height_px, lens.width_px), np.float32)
 
     def shot() -> Any:
         fill(image, np.zeros((1, 1)), EXPOSURE_S)
-        render(image, sources, optics, path, AT_CENTRE, Window(0.0, EXPOSURE_S))
-        return expose(image, EXPOSURE_S, chip, rng)
+        render(image, sources, optics, path, AT_CENTER, Window(0.0, EXPOSURE_S))
+        return expose(image, EXPOSURE_S, detector, rng)
 
     return shot
 
@@ -100,7 +98,7 @@ def camera_shot(lens: CameraConfig, sources: Sources, rate_rad_s: float) -> Call
 def light_of(lens: CameraConfig, sources: Sources, rate_rad_s: float) -> Floats:
     """Mean photoelectrons of the same frame."""
     image = np.zeros((lens.height_px, lens.width_px))
-    render(image, sources, square_metre(lens), turning(rate_rad_s), AT_CENTRE, Window(0.0, EXPOSURE_S))
+    render(image, sources, square_meter(lens), turning(rate_rad_s), AT_CENTER, Window(0.0, EXPOSURE_S))
     return image
 
 
@@ -110,7 +108,7 @@ def measure() -> list[dict[str, Any]]:
 
 
 def dome_frame() -> list[dict[str, Any]]:
-    """1600 x 1200 pixels, 45 discs 20 px wide that move by 20 px, all noise including the fixed pattern.
+    """1600 x 1200 pixels, 45 disks 20 px wide that move by 20 px, all noise including the fixed pattern.
 
     The peers receive the finished light image, so their time is that of the noise alone.
     """
@@ -118,7 +116,7 @@ def dome_frame() -> list[dict[str, Any]]:
     sources = lights(lens, 45, np.full(45, 3e6), radius_px=10.0)
     rate = 20 / 8000.0 / EXPOSURE_S
     ours, mean = camera_shot(lens, sources, rate), light_of(lens, sources, rate)
-    what = "frame: 45 smeared discs, 1600x1200"
+    what = "frame: 45 smeared disks, 1600x1200"
     return [
         versus(what, ours, "getframes, its noise alone", getframes(lens, mean), bar=10),
         versus(what, ours, "numpy Poisson + normal", numpy_noise(mean + 0.25), bar=8),
@@ -178,9 +176,7 @@ def sky_frame() -> list[dict[str, Any]]:
     electrons = 2e4 * 10 ** (-0.4 * (magnitude - 4))
     sources = lights(lens, 146, electrons)
     ours = camera_shot(lens, sources, 0.0)
-    result = versus(
-        "frame: 146 stars to V 7, 1024x1024", ours, "GalSim", galsim(lens, sources, electrons), bar=15
-    )
+    result = versus("frame: 146 stars to V 7, 1024x1024", ours, "GalSim", galsim(lens, sources, electrons), bar=15)
     return [result, verdict("the same, in ms", result["value"], "ms", "most wanted", 5.0)]
 
 
@@ -191,7 +187,7 @@ def galsim(lens: CameraConfig, sources: Sources, electrons: Floats) -> Callable[
     import galsim
 
     toward = sources.place[:, :3] / sources.place[:, 2:3]
-    xy = toward[:, :2] * lens.focal_px + lens.centre_px + 1  # GalSim counts from 1
+    xy = toward[:, :2] * lens.focal_px + lens.center_px + 1  # GalSim counts from 1
     psf, rng = galsim.Gaussian(sigma=0.8), galsim.BaseDeviate(1)
 
     def shot() -> Any:
@@ -209,12 +205,12 @@ def galsim(lens: CameraConfig, sources: Sources, electrons: Floats) -> Callable[
 def noise_floor() -> dict[str, Any]:
     """Noise of a dark frame against the time to generate as many random bytes as the frame has."""
     lens = camera(1600, 1200, 8000.0, 1.0)
-    chip, rng = Detector.of(lens), np.random.default_rng(0)
+    detector, rng = Detector.from_camera(lens), np.random.default_rng(0)
     dark = np.zeros((1200, 1600), np.float32)
 
     def ours() -> None:
         dark[:] = 0
-        expose(dark, EXPOSURE_S, chip, rng)
+        expose(dark, EXPOSURE_S, detector, rng)
 
     # A ratio of 1/3 means three times the time of filling the frame with random bytes.
     return versus(
@@ -231,9 +227,9 @@ def growth() -> list[dict[str, Any]]:
     few, many = camera(1024, 1024, 3000.0, 0.8), camera(2048, 2048, 3000.0, 0.8)
 
     def drawing(lens: CameraConfig, count: int) -> Callable[[], Any]:
-        image, optics = np.zeros((lens.height_px, lens.width_px), np.float32), square_metre(lens)
+        image, optics = np.zeros((lens.height_px, lens.width_px), np.float32), square_meter(lens)
         sources, path = lights(lens, count, np.full(count, 1e4)), turning(0.0)
-        return lambda: render(image, sources, optics, path, AT_CENTRE, Window(0.0, EXPOSURE_S))
+        return lambda: render(image, sources, optics, path, AT_CENTER, Window(0.0, EXPOSURE_S))
 
     stars = versus("draw 500 stars", drawing(few, 500), "ten times as many, a star", drawing(few, 5000))
     area = versus("draw 500 stars, 1024x1024", drawing(few, 500), "on 2048x2048", drawing(many, 500))

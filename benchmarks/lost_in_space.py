@@ -25,11 +25,11 @@ from estimator.core.camera import Camera
 from estimator.core.types import Centroids
 from estimator.trackers.pipeline import Settings
 from estimator.trackers.star_tracker import StarTracker
-from skysim.core.paths import CATALOGUES
+from skysim.core.paths import CATALOGS
 from skysim.core.units import ARCSEC_RAD
+from skysim.results.metrics import WRONG_RAD
 from skysim.sources import catalog as star_catalog
 
-WRONG_RAD = np.radians(10 / 60)
 DOUBLES_RAD = 30 * ARCSEC_RAD
 MAGNITUDE_SIGMA = 0.25
 DEEP = "hipparcos_hp7.5"
@@ -85,10 +85,10 @@ class Field:
 
 def sky(limit_mag: float) -> catalog.StarCatalog:
     """The stars to a limiting magnitude, without close doubles. Builds the deeper catalog if it does not exist yet."""
-    path = CATALOGUES / f"{DEEP}.ecsv"
+    path = CATALOGS / f"{DEEP}.ecsv"
     if not path.is_file():
         star_catalog.build(7.5, path)
-    stars = catalog.brighter(catalog.read(path), limit_mag)
+    stars = catalog.brighter_than(catalog.read(path), limit_mag)
     near = cKDTree(stars.vectors).query_pairs(2 * np.sin(DOUBLES_RAD / 2), output_type="ndarray")
     fainter = near.max(axis=1)  # rows are sorted by magnitude
     return stars.take(np.setdiff1d(np.arange(len(stars)), fainter))
@@ -111,24 +111,24 @@ def field(work: Workload, stars: catalog.StarCatalog, rng: np.random.Generator) 
     true = round(work.brightest * (1 - work.false_share)) if work.brightest < 1000 else 1000
     row, mag = row[np.argsort(mag)[:true]], np.sort(mag)[:true]
     false = work.false + round(len(row) * work.false_share / (1 - work.false_share))
-    seen = xy[row] + work.noise_px * rng.standard_normal((len(row), 2))
-    strays = rng.uniform(-0.5, [camera.width_px - 0.5, camera.height_px - 0.5], (false, 2))
-    xy = np.concatenate([seen, strays])
+    detected = xy[row] + work.noise_px * rng.standard_normal((len(row), 2))
+    false_xy = rng.uniform(-0.5, [camera.width_px - 0.5, camera.height_px - 0.5], (false, 2))
+    xy = np.concatenate([detected, false_xy])
     mag = np.concatenate([mag, rng.choice(stars.v_mag, false)])
     order = np.argsort(mag)
     sigma = np.full(len(xy), work.noise_px)
-    names = np.concatenate([row, np.full(false, -1)])
-    return Field(Centroids(xy[order], sigma, 10 ** (-0.4 * mag[order])), truth, names[order])
+    star = np.concatenate([row, np.full(false, -1)])
+    return Field(Centroids(xy[order], sigma, 10 ** (-0.4 * mag[order])), truth, star[order])
 
 
-def oracle(work: Workload, stars: catalog.StarCatalog, one: Field) -> Rotation | None:
+def oracle(work: Workload, stars: catalog.StarCatalog, frame: Field) -> Rotation | None:
     """The attitude from the true identities; None with fewer than three stars."""
-    known = one.star >= 0
+    known = frame.star >= 0
     if known.sum() < 3:
         return None
-    rays = work.camera.rays(one.centroids.xy_px[known])
+    rays = work.camera.rays(frame.centroids.xy_px[known])
     sigma = np.full(len(rays), work.noise_px / work.camera.focal_px)
-    return quest(rays, stars.vectors[one.star[known]], sigma)
+    return quest(rays, stars.vectors[frame.star[known]], sigma)
 
 
 Solve = Callable[[Field], Rotation | None]
@@ -136,11 +136,9 @@ Solve = Callable[[Field], Rotation | None]
 
 def ours(work: Workload, stars: catalog.StarCatalog, identifier: str) -> Solve:
     """The skysim star tracker with one of its identifiers."""
-    settings = Settings(
-        identifier=identifier, centroid_sigma_px=0.0, field_stars=1e9, merge_px=0.0, zero_point_mag=0.0
-    )
+    settings = Settings(identifier=identifier, centroid_sigma_px=0.0, field_stars=1e9, merge_px=0.0, zero_point_mag=0.0)
     tracker = StarTracker(work.camera, stars, stars.vectors, settings)
-    return lambda one: tracker.solve_centroids(one.centroids).cam_from_ref
+    return lambda frame: tracker.solve_centroids(frame.centroids).cam_from_ref
 
 
 def compare(work: Workload, count: int, seed: int, identifier: str) -> str:
@@ -149,30 +147,30 @@ def compare(work: Workload, count: int, seed: int, identifier: str) -> str:
     begin = time.perf_counter()
     solve = ours(work, stars, identifier)
     build_s = time.perf_counter() - begin
-    ms, found, wrong, possible = [], 0, 0, 0
-    for n, one in enumerate(fields(work, stars, count, seed)):
+    ms, solved, wrong, possible = [], 0, 0, 0
+    for n, frame in enumerate(fields(work, stars, count, seed)):
         if n == 0:
-            solve(one)  # compiles
-        best = oracle(work, stars, one)
+            solve(frame)  # compiles
+        best = oracle(work, stars, frame)
         possible += best is not None
         begin = time.perf_counter()
-        answer = solve(one)
+        answer = solve(frame)
         ms.append(1e3 * (time.perf_counter() - begin))
         if answer is None:
             continue
-        right = (answer * one.cam_from_icrs.inv()).magnitude() < WRONG_RAD
-        reachable = best is not None and (best * one.cam_from_icrs.inv()).magnitude() < WRONG_RAD
-        found += right
-        wrong += not right and (reachable or best is None)
+        right = (answer * frame.cam_from_icrs.inv()).magnitude() < WRONG_RAD
+        oracle_right = best is not None and (best * frame.cam_from_icrs.inv()).magnitude() < WRONG_RAD
+        solved += right
+        wrong += not right and (oracle_right or best is None)
     return (
-        f"{work.name:30s} {identifier:10s} {100 * found / count:8.2f} {100 * wrong / count:7.2f}"
+        f"{work.name:30s} {identifier:10s} {100 * solved / count:8.2f} {100 * wrong / count:7.2f}"
         f" {100 * possible / count:8.2f} {np.median(ms):8.3f} {np.percentile(ms, 99):8.2f} {build_s:7.2f}"
     )
 
 
 if __name__ == "__main__":
     arguments = sys.argv[1:]
-    count, seed = (int(one) for one in (arguments[:2] + ["1000", "1"][len(arguments[:2]) :]))
+    count, seed = (int(text) for text in (arguments[:2] + ["1000", "1"][len(arguments[:2]) :]))
     print(f"{'workload':30s} {'':10s}  found %  wrong % oracle %       ms   p99 ms build s")
     for work in WORKLOADS:
         for identifier in arguments[2:] or ["pyramid", "default"]:

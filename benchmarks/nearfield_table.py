@@ -24,7 +24,7 @@ START_OFF_RAD = np.radians(2)  # start error of Tappe's iterated trial
 
 
 @dataclass(frozen=True, slots=True)
-class Bench:
+class Geometry:
     """A test geometry: true surface, camera, radius of the assumed sphere, tilts, and number of lights."""
 
     surface: LedMap
@@ -39,10 +39,10 @@ class Bench:
         return Lever(np.array([0.0, 0.0, self.lever_m]), Rotation.identity())
 
 
-def _dome(centre_in: tuple[float, float, float], semi_axes_in: tuple[float, float, float]) -> LedMap:
+def _dome(center_in: tuple[float, float, float], semi_axes_in: tuple[float, float, float]) -> LedMap:
     """A surface without lights; infinite semi-axes make it a plane."""
     nowhere = np.empty(0, dtype=np.int64), np.empty((0, 3))
-    return LedMap(*nowhere, np.array(centre_in) * INCH_M, np.array(semi_axes_in) * INCH_M)
+    return LedMap(*nowhere, np.array(center_in) * INCH_M, np.array(semi_axes_in) * INCH_M)
 
 
 # AFIT: 10.45 x 7.85 deg on 1600 x 1200 pixels, camera 15 in up, apex at 48 in (reference, 1.1 and 1.2 item 12).
@@ -50,12 +50,12 @@ AFIT_CAMERA = Camera(1600, 1200, float(800 / np.tan(np.radians(10.45 / 2))), (79
 # NPS: nine lights; 8.5 mm lens on a 1/2-inch chip, 41 x 32 deg; its pixel, 10 um, and the lever, 0.30 m, are assumed.
 NPS_CAMERA = Camera(640, 480, 850.0, (319.5, 239.5))
 AFIT = AFIT_CAMERA, 15 * INCH_M, 48 * INCH_M
-BENCHES = {
-    "sphere": Bench(_dome((0, 0, 0), (48, 48, 48)), *AFIT),
-    "sphere 0.125 in off": Bench(_dome((0.125, 0, 0), (48, 48, 48)), *AFIT),
-    "measured ellipsoid": Bench(_dome((0, 0, 48 - 28.60), (38.88, 38.88, 28.60)), *AFIT),
-    "flat at 48 in": Bench(_dome((0, 0, 0), (np.inf, np.inf, 48)), *AFIT),
-    "NPS flat at 1 m": Bench(
+GEOMETRIES = {
+    "sphere": Geometry(_dome((0, 0, 0), (48, 48, 48)), *AFIT),
+    "sphere 0.125 in off": Geometry(_dome((0.125, 0, 0), (48, 48, 48)), *AFIT),
+    "measured ellipsoid": Geometry(_dome((0, 0, 48 - 28.60), (38.88, 38.88, 28.60)), *AFIT),
+    "flat at 48 in": Geometry(_dome((0, 0, 0), (np.inf, np.inf, 48)), *AFIT),
+    "NPS flat at 1 m": Geometry(
         _dome((0, 0, 0), (np.inf, np.inf, 1 / INCH_M)), NPS_CAMERA, 0.30, 1.0, (0, 5, 10, 15), 9
     ),
 }
@@ -71,41 +71,41 @@ class Trial:
     pixels: NDArray[np.float64]
 
 
-def trial(bench: Bench, tilt_deg: float, rng: np.random.Generator, noise_px: float = 0.0) -> Trial:
+def trial(geometry: Geometry, tilt_deg: float, rng: np.random.Generator, noise_px: float = 0.0) -> Trial:
     """A trial at random yaw and tilt direction, with lights where the rays of random pixels meet the true surface.
 
     The start attitude is START_OFF_RAD from the truth, about a random axis.
     """
     azimuth, yaw = rng.uniform(0, 2 * np.pi, 2)
-    lean = np.radians(tilt_deg) * np.array([np.cos(azimuth), np.sin(azimuth), 0])
-    truth = Rotation.from_rotvec(lean) * Rotation.from_rotvec([0, 0, yaw])
-    camera, lever = bench.camera, bench.lever
-    pixels = rng.uniform(-0.5, [camera.width_px - 0.5, camera.height_px - 0.5], (bench.lights, 2))
+    tilt = np.radians(tilt_deg) * np.array([np.cos(azimuth), np.sin(azimuth), 0])
+    truth = Rotation.from_rotvec(tilt) * Rotation.from_rotvec([0, 0, yaw])
+    camera, lever = geometry.camera, geometry.lever
+    pixels = rng.uniform(-0.5, [camera.width_px - 0.5, camera.height_px - 0.5], (geometry.lights, 2))
     rays_lab = (lever.cam_from_body * truth).inv().apply(camera.rays(pixels))
-    place = on_surface(rays_lab, truth.inv().apply(lever.camera_body_m), bench.surface)
-    leds = LedMap(np.arange(bench.lights), place, np.zeros(3), np.full(3, bench.radius_m))
+    place = on_surface(rays_lab, truth.inv().apply(lever.camera_body_m), geometry.surface)
+    leds = LedMap(np.arange(geometry.lights), place, np.zeros(3), np.full(3, geometry.radius_m))
     axis = rng.standard_normal(3)
     start = Rotation.from_rotvec(START_OFF_RAD * axis / np.linalg.norm(axis)) * truth
-    seen = project(truth, place, lever, camera) + noise_px * rng.standard_normal((bench.lights, 2))
+    seen = project(truth, place, lever, camera) + noise_px * rng.standard_normal((geometry.lights, 2))
     return Trial(truth, start, leds, seen)
 
 
-def solved(method: str, bench: Bench, one: Trial) -> tuple[Rotation, NDArray[np.float64]]:
+def solved(method: str, geometry: Geometry, one: Trial) -> tuple[Rotation, NDArray[np.float64]]:
     """body_from_lab and its covariance from one method."""
-    rays = bench.camera.rays(one.pixels)
-    sigma_rad = fitted_sigma_rad(method, rays, np.full(bench.lights, NOISE_PX / bench.camera.focal_px))
-    return SOLVERS[method](rays, sigma_rad, one.leds.position_m, one.leds, bench.lever, one.start)
+    rays = geometry.camera.rays(one.pixels)
+    sigma_rad = fitted_sigma_rad(method, rays, np.full(geometry.lights, NOISE_PX / geometry.camera.focal_px))
+    return SOLVERS[method](rays, sigma_rad, one.leds.position_m, one.leds, geometry.lever, one.start)
 
 
 def errors_deg(
-    method: str, bench: Bench, tilt_deg: float, trials: int, seed: int, noise_px: float = 0.0
+    method: str, geometry: Geometry, tilt_deg: float, trials: int, seed: int, noise_px: float = 0.0
 ) -> NDArray[np.float64]:
     """(trials, 3) errors about the body's axes, degrees; the same trials for every method."""
     rng = np.random.default_rng(seed)
     errors = np.empty((trials, 3))
     for n in range(trials):
-        one = trial(bench, tilt_deg, rng, noise_px)
-        errors[n] = (solved(method, bench, one)[0] * one.truth.inv()).as_rotvec(degrees=True)
+        case = trial(geometry, tilt_deg, rng, noise_px)
+        errors[n] = (solved(method, geometry, case)[0] * case.truth.inv()).as_rotvec(degrees=True)
     return errors
 
 
@@ -119,19 +119,17 @@ def table(trials: int, seed: int) -> None:
     """Print RMS cross (roll) in degrees: methods and tilts in rows, surfaces in columns, without noise and with."""
     for noise_px in (0.0, NOISE_PX):
         print(f"\n{noise_px} px of noise, {trials} trials a cell: rms cross (roll), degrees\n")
-        print("| method, tilt | " + " | ".join(BENCHES) + " |")
-        print("|---" * (len(BENCHES) + 1) + "|")
+        print("| method, tilt | " + " | ".join(GEOMETRIES) + " |")
+        print("|---" * (len(GEOMETRIES) + 1) + "|")
         for method in SOLVERS:
             for n in range(4):
-                tilts = sorted({bench.tilts_deg[n] for bench in BENCHES.values()})
+                tilts = sorted({geometry.tilts_deg[n] for geometry in GEOMETRIES.values()})
                 cells = [
-                    cross_and_roll(errors_deg(method, bench, bench.tilts_deg[n], trials, seed, noise_px))
-                    for bench in BENCHES.values()
+                    cross_and_roll(errors_deg(method, geometry, geometry.tilts_deg[n], trials, seed, noise_px))
+                    for geometry in GEOMETRIES.values()
                 ]
                 name = f"{method}, {' / NPS '.join(f'{tilt:g}' for tilt in reversed(tilts))}"
-                print(
-                    f"| {name} | " + " | ".join(f"{cross:.2g} ({roll:.2g})" for cross, roll in cells) + " |"
-                )
+                print(f"| {name} | " + " | ".join(f"{cross:.2g} ({roll:.2g})" for cross, roll in cells) + " |")
 
 
 if __name__ == "__main__":

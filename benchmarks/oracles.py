@@ -36,8 +36,8 @@ from skysim.results.files import frames as frame_files
 from skysim.results.metrics import WRONG_RAD
 from skysim.scene import loader
 from skysim.scene.scene import Scene
-from skysim.simulation import testbed
 from skysim.simulation.exposure import render_frame
+from skysim.simulation.testbed import build_testbed
 from skysim.sources.stars import C_M_S
 from skysim.tracking import onboard_model
 from skysim.tracking import settings as tracker_settings
@@ -127,10 +127,7 @@ class Agreement:
     @property
     def within(self) -> bool:
         """Whether cross-boresight and roll errors are both within TIMES the predicted error."""
-        return (
-            self.cross_rad <= TIMES * self.sigma_cross_rad
-            and abs(self.roll_rad) <= TIMES * self.sigma_roll_rad
-        )
+        return self.cross_rad <= TIMES * self.sigma_cross_rad and abs(self.roll_rad) <= TIMES * self.sigma_roll_rad
 
     @property
     def wrong(self) -> bool:
@@ -149,13 +146,13 @@ def load(name: str, who: str, frames: int) -> Scene:
     return loader.load(name.split(",")[0], keys)
 
 
-def photographs(told: Scene, seed: int) -> Iterator[tuple[Frame, Truth]]:
+def render_frames(scene: Scene, seed: int) -> Iterator[tuple[Frame, Truth]]:
     """Yield the frames of a scene, each at rest at its own uniformly random attitude."""
-    lab = testbed.build_testbed(told)
-    for n in range(told.exposure.frames):
+    testbed = build_testbed(scene)
+    for n in range(scene.exposure.frames):
         cam_from_icrs = Rotation.random(rng=np.random.default_rng([seed, n]))
-        still = Trajectory.at_rest(cam_from_icrs.inv() * lab.mount.cam_from_body, lab.flown_s)
-        yield render_frame(replace(lab, trajectory=still), n)
+        still = Trajectory.at_rest(cam_from_icrs.inv() * testbed.mount.cam_from_body, testbed.duration_s)
+        yield render_frame(replace(testbed, trajectory=still), n)
 
 
 def lattice(width_px: int, height_px: int) -> NDArray:
@@ -168,8 +165,8 @@ def directions(header: fits.Header, xy_px: NDArray) -> NDArray:
     """(N, 3) directions of pixels from the WCS of a FITS header, by astropy."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FITSFixedWarning)  # astrometry.net's header belongs to no image
-        told = WCS(header, fix=False)
-    return unit_vectors(*told.all_pix2world(xy_px, 0).T)
+        wcs = WCS(header, fix=False)
+    return unit_vectors(*wcs.all_pix2world(xy_px, 0).T)
 
 
 def unit_vectors(ra_deg: NDArray, dec_deg: NDArray) -> NDArray:
@@ -237,16 +234,11 @@ def star_sigmas_px(found: Sequence[Found]) -> list[NDArray]:
         return np.array([take(variance[member == n]) for n in range(CLASSES)])
 
     def worse(usual: NDArray) -> list[float]:
-        return [
-            float(np.mean(one.variance_px2 / usual[member]))
-            for one, member in zip(found, members, strict=True)
-        ]
+        return [float(np.mean(one.variance_px2 / usual[member])) for one, member in zip(found, members, strict=True)]
 
     rough = law(np.median, range(len(found))) / np.log(2)
     usual = law(np.mean, [n for n, times in enumerate(worse(rough)) if times < MISTAKEN])
-    return [
-        np.sqrt(usual[member] * max(1.0, times)) for member, times in zip(members, worse(usual), strict=True)
-    ]
+    return [np.sqrt(usual[member] * max(1.0, times)) for member, times in zip(members, worse(usual), strict=True)]
 
 
 def attitude_spread(rays: NDArray, sigma_rad: NDArray) -> tuple[float, float]:
@@ -295,9 +287,7 @@ def astrometry_net(name: str) -> Solve | None:
     options += ["--scale-units", "degwidth", "--scale-low", f"{0.95 * width_deg}"]
     options += ["--scale-high", f"{1.05 * width_deg}", "--tweak-order", str(order)]
     options += ["--no-remove-lines", "--uniformize", "0"]  # skip its Python steps, which need more packages
-    options += [
-        part for kind in ("new-fits", "rdls", "match", "index-xyls") for part in (f"--{kind}", "none")
-    ]
+    options += [part for kind in ("new-fits", "rdls", "match", "index-xyls") for part in (f"--{kind}", "none")]
 
     def solve(path: Path, frame: Frame) -> Found | None:
         stem = path.with_suffix("")
@@ -320,13 +310,13 @@ def tetra3rs(name: str) -> Solve | None:
     installed."""
     if importlib.util.find_spec("tetra3rs") is None:
         return None
-    told = load(name, "tetra3rs", 1)
-    camera, settings = onboard_model.believed_camera(told), tracker_settings.believed_settings(told)
+    scene = load(name, "tetra3rs", 1)
+    camera, settings = onboard_model.assumed_camera(scene), tracker_settings.assumed_settings(scene)
     nothing = np.zeros(0)
     tracker = tetra3rs_tracker.Tetra3rs(
-        adapter.set_up(told, camera, settings, Stars(nothing, nothing, nothing))
+        adapter.build_setup(scene, camera, settings, Stars(nothing.astype(int), nothing, nothing))
     )
-    pixels = lattice(camera.width_px, camera.height_px) - tracker.middle_px
+    pixels = lattice(camera.width_px, camera.height_px) - tracker.image_center_px
 
     def solve(path: Path, frame: Frame) -> Found | None:
         seen = tracker.extract(fits.getdata(path).astype(np.uint16), max_centroids=60, threads=1)
@@ -360,7 +350,7 @@ def its_stars(
     near = apart_px < STAR_PX
     (x, y, brightness), star = seen[near].T, star[near]
     xy_px = np.column_stack([x, y])
-    return xy_px + tracker.middle_px, xy_px - there_px[star], brightness, moved[star]
+    return xy_px + tracker.image_center_px, xy_px - there_px[star], brightness, moved[star]
 
 
 ORACLES = {"tetra3rs": tetra3rs, "astrometry.net": astrometry_net}
@@ -368,15 +358,15 @@ ORACLES = {"tetra3rs": tetra3rs, "astrometry.net": astrometry_net}
 
 def confront(name: str, who: str, oracle: Solve, frames: int, seed: int) -> list[Pair]:
     """Errors and predictions of every frame that the oracle solves."""
-    seen, told = [], load(name, who, frames)
-    for frame, truth in photographs(told, seed):
+    seen, scene = [], load(name, who, frames)
+    for frame, truth in render_frames(scene, seed):
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "frame.fits"
-            frame_files.write_fits(path, frame, truth, told)
+            frame_files.write_fits(path, frame, truth, scene)
             found = oracle(path, frame)
             if found:
                 seen.append(sighting(frame, truth, fits.getheader(path), found))
-    return agreements(seen, onboard_model.calibration(told.camera))
+    return agreements(seen, onboard_model.calibration(scene.camera))
 
 
 def squares(solved: Sequence[Agreement]) -> NDArray:
@@ -406,11 +396,11 @@ if __name__ == "__main__":
     count, first = (int(one) for one in (sys.argv[1:3] + ["200", "1"][len(sys.argv[1:3]) :]))
     print(HEAD)
     for scene_name in SCENES:
-        for who, made in ORACLES.items():
-            asked = made(scene_name)
-            if asked is None:
+        for who, build_oracle in ORACLES.items():
+            solve_with_oracle = build_oracle(scene_name)
+            if solve_with_oracle is None:
                 print(f"{who}: not installed")
                 continue
-            both = zip(*confront(scene_name, who, asked, count, first), strict=True)
+            both = zip(*confront(scene_name, who, solve_with_oracle, count, first), strict=True)
             for what, pairs in zip(("its coordinates", "its stars"), both, strict=True):
                 print(line(f"{who}, {scene_name}, {what}", count, pairs), flush=True)

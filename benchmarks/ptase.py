@@ -13,28 +13,26 @@ import time
 from typing import Any
 
 from benchmarks.timing import verdict
-from skysim.experiments.papers.ptase.monte_carlo import catalogue, runs_of, simulate, version
+from skysim.experiments.papers.ptase.monte_carlo import catalog, run_version, simulate, version
 
-PAPER = (
-    "mf1_2 in the paper: 99.12 +- .25 %, 4.79 (its Frobenius norm 6.77 / sqrt 2), 4.69 +- .14, .962 +- .013"
-)
+PAPER = "mf1_2 in the paper: 99.12 +- .25 %, 4.79 (its Frobenius norm 6.77 / sqrt 2), 4.69 +- .14, .962 +- .013"
 PAPER_S, BAR_S = 24.06, 0.3
 
 
 def table_row(name: str, limit_mag: float, runs: int, seed: int) -> str:
     """One table line: success, wrong attitudes, mean errors, and seconds per 1000 runs."""
-    known, by = catalogue(limit_mag), version(name)
+    known, by = catalog(limit_mag), version(name)
     simulate(known, by, 2, seed)
     begin = time.perf_counter()
-    done = runs_of(known, by, runs, seed)
+    done = run_version(known, by, runs, seed)
     spent_s = 1000 / runs * (time.perf_counter() - begin)
     means = " ".join(f"{values.mean():7.3f}" for values in done.right[1:])
-    return f"{name:9s} V < {limit_mag:3.1f} {100 * done.answered / runs:8.2f} {done.wrong:6d} {means} {spent_s:10.3f}"
+    return f"{name:9s} V < {limit_mag:3.1f} {100 * done.solved / runs:8.2f} {done.wrong:6d} {means} {spent_s:10.3f}"
 
 
 def measure() -> list[dict[str, Any]]:
     """Time of 1000 runs of the version that the paper timed, with V < 6: the minimum of five."""
-    known, by = catalogue(6.0), version("fialho_2")
+    known, by = catalog(6.0), version("fialho_2")
     simulate(known, by, 2, 1)
     spent_s = []
     for _ in range(5):

@@ -20,43 +20,41 @@ from estimator.catalog import catalog, shefex
 from estimator.core.errors import ImageError
 from estimator.trackers.pipeline import Settings
 from estimator.trackers.star_tracker import StarTracker
-from skysim.core.paths import CATALOGUES
+from skysim.core.paths import CATALOGS
 from skysim.core.types import Frame, Trajectory
+from skysim.results.metrics import WRONG_RAD
 from skysim.scene.loader import load
-from skysim.simulation import exposure, testbed
-from skysim.simulation.testbed import Testbed
+from skysim.simulation import exposure
+from skysim.simulation.testbed import Testbed, build_testbed
 from skysim.tracking.onboard_model import calibration
 
 RATES_DEG_S = (0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0)
-WRONG_RAD = np.radians(10 / 60)
 FRAME_S = 0.1
 KNOT_S = 0.5e-3
 
 Streak = tuple[float, float] | None
 
 
-def frames(
-    lab: Testbed, rate_deg_s: float, count: int, seed: int
-) -> Iterator[tuple[Frame, Rotation, Streak]]:
+def frames(testbed: Testbed, rate_deg_s: float, count: int, seed: int) -> Iterator[tuple[Frame, Rotation, Streak]]:
     """Yield frames at random attitudes, each rotating about a random axis perpendicular to the boresight.
 
     Each comes with cam_from_icrs at mid-exposure and the streak vector at the image center.
     """
     for n in range(count):
         rng = np.random.default_rng([seed, n])
-        middle, angle = southern(rng), rng.uniform(0, 2 * np.pi)
+        middle, angle = random_southern_attitude(rng), rng.uniform(0, 2 * np.pi)
         rate_cam = np.radians(rate_deg_s) * np.array([np.cos(angle), np.sin(angle), 0.0])
         # Knots from 5 ms before the exposure; the attitude is `middle` at mid-exposure, 25 ms after its start.
         t_s = n * FRAME_S + np.arange(-10, 200) * KNOT_S
         cam_from_icrs = Rotation.from_rotvec(np.outer(t_s - n * FRAME_S - 0.025, rate_cam)) * middle
-        lab_from_body = cam_from_icrs.inv() * lab.mount.cam_from_body
-        rate_body = lab.mount.cam_from_body.inv().apply(rate_cam)
+        lab_from_body = cam_from_icrs.inv() * testbed.mount.cam_from_body
+        rate_body = testbed.mount.cam_from_body.inv().apply(rate_cam)
         trajectory = Trajectory(t_s, lab_from_body, np.tile(rate_body, (len(t_s), 1)))
-        frame, truth = exposure.render_frame(replace(lab, trajectory=trajectory), n)
-        yield frame, truth.cam_from_lab, streak_of(rate_cam, lab)
+        frame, truth = exposure.render_frame(replace(testbed, trajectory=trajectory), n)
+        yield frame, truth.cam_from_lab, streak_of(rate_cam, testbed)
 
 
-def southern(rng: np.random.Generator) -> Rotation:
+def random_southern_attitude(rng: np.random.Generator) -> Rotation:
     """A random attitude whose boresight is south of the equator."""
     while True:
         cam_from_icrs = Rotation.random(rng=rng)
@@ -64,13 +62,13 @@ def southern(rng: np.random.Generator) -> Rotation:
             return cam_from_icrs
 
 
-def streak_of(rate_cam_rad_s: np.ndarray, lab: Testbed) -> tuple[float, float]:
+def streak_of(rate_cam_rad_s: np.ndarray, testbed: Testbed) -> tuple[float, float]:
     """Streak (dx, dy) in pixels of a star on the boresight: d(x / z)/dt = -w_y, d(y / z)/dt = w_x."""
-    reach_px = lab.scene.exposure.time_s * lab.scene.camera.focal_px
-    return -rate_cam_rad_s[1] * reach_px, rate_cam_rad_s[0] * reach_px
+    pixels_per_rad_s = testbed.scene.exposure.time_s * testbed.scene.camera.focal_px
+    return -rate_cam_rad_s[1] * pixels_per_rad_s, rate_cam_rad_s[0] * pixels_per_rad_s
 
 
-def solved(tracker: StarTracker, frame: Frame, truth: Rotation, streak_px: Streak) -> tuple[bool, bool]:
+def is_solved(tracker: StarTracker, frame: Frame, truth: Rotation, streak_px: Streak) -> tuple[bool, bool]:
     """Whether a frame is solved correctly, and whether it is solved wrongly."""
     try:
         answer = tracker.solve(frame.image_dn, streak_px).attitude.cam_from_ref
@@ -80,13 +78,13 @@ def solved(tracker: StarTracker, frame: Frame, truth: Rotation, streak_px: Strea
     return right, answer is not None and not right
 
 
-def chains(lab: Testbed) -> dict[str, StarTracker]:
+def build_trackers(testbed: Testbed) -> dict[str, StarTracker]:
     """The paper's chain with its star selection, and the default chain with the paper's limiting magnitude (twice)."""
-    camera, scene = calibration(lab.scene.camera), lab.scene
-    stars = catalog.read(CATALOGUES / "hipparcos_hp6.5.ecsv")
+    camera, scene = calibration(testbed.scene.camera), testbed.scene
+    stars = catalog.read(CATALOGS / "hipparcos_hp6.5.ecsv")
     observer = catalog.on_earth(scene.start_time)
-    theirs = shefex.chosen(stars)
-    ours = catalog.brighter(stars, scene.tracker.limit_mag)
+    paper_stars = shefex.chosen(stars)
+    stars_default = catalog.brighter_than(stars, scene.tracker.limit_mag)
     gain = scene.camera.detector.gain_e_dn
     paper = Settings(
         detector="sequential",
@@ -99,27 +97,25 @@ def chains(lab: Testbed) -> dict[str, StarTracker]:
     )
     default = Settings(gain_e_dn=gain, centroid_sigma_px=scene.tracker.centroid_sigma_px)
     return {
-        "paper": StarTracker(camera, theirs, catalog.apparent(theirs, observer), paper),
-        "default": StarTracker(camera, ours, catalog.apparent(ours, observer), default),
-        "with gyro": StarTracker(camera, ours, catalog.apparent(ours, observer), default),
+        "paper": StarTracker(camera, paper_stars, catalog.apparent(paper_stars, observer), paper),
+        "default": StarTracker(camera, stars_default, catalog.apparent(stars_default, observer), default),
+        "with gyro": StarTracker(camera, stars_default, catalog.apparent(stars_default, observer), default),
     }
 
 
 def measure(count: int, seed: int) -> Iterator[str]:
     """One table line per rate."""
-    told = {"exposure.time": "50 ms", "exposure.first": "0 s", "exposure.frames": str(count)}
-    lab = testbed.build_testbed(load("shefex2", told))
-    trackers = chains(lab)
+    overrides = {"exposure.time": "50 ms", "exposure.first": "0 s", "exposure.frames": str(count)}
+    testbed = build_testbed(load("shefex2", overrides))
+    trackers = build_trackers(testbed)
     for rate in RATES_DEG_S:
         score = {name: np.zeros(2, int) for name in trackers}
-        for frame, truth, streak_px in frames(lab, rate, count, seed):
+        for frame, truth, streak_px in frames(testbed, rate, count, seed):
             for name, tracker in trackers.items():
-                score[name] += solved(tracker, frame, truth, streak_px if name == "with gyro" else None)
-        told = [
-            f"{100 * score[name][0] / count:10.1f} {100 * score[name][1] / count:7.1f}" for name in trackers
-        ]
-        pixels = np.radians(rate) * 0.05 * lab.scene.camera.focal_px
-        yield f"{rate:5.1f} {pixels:6.1f}  " + "  ".join(told)
+                score[name] += is_solved(tracker, frame, truth, streak_px if name == "with gyro" else None)
+        cells = [f"{100 * score[name][0] / count:10.1f} {100 * score[name][1] / count:7.1f}" for name in trackers]
+        pixels = np.radians(rate) * 0.05 * testbed.scene.camera.focal_px
+        yield f"{rate:5.1f} {pixels:6.1f}  " + "  ".join(cells)
 
 
 if __name__ == "__main__":

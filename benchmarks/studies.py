@@ -19,8 +19,8 @@ from benchmarks.timing import verdict
 from skysim.experiments.study import loader, store
 from skysim.experiments.study.execution import engines, runner
 from skysim.experiments.study.execution.engines import Chunks, Pool
+from skysim.experiments.study.execution.trials import Row
 from skysim.experiments.study.plan import TrialSpec
-from skysim.experiments.study.trials import Row
 
 STUDY = """
 schema: 1
@@ -42,25 +42,25 @@ FRAMES = {
     "factor": "rate: {key: trial.rate_deg_s, values: [0, 0.1]}",
     "replicates": 500,
 }
-SETTLED = 0.2  # fraction of the trials after which every worker has its scene and full chunks
+WARM_UP = 0.2  # fraction of the trials after which every worker has its scene and full chunks
 
 
-class Clocked:
-    """A pool that records each batch. came : (arrival time, number of trials, seconds spent in trials) by batch."""
+class TimedPool:
+    """A pool that records each batch. batches : (arrival time, number of trials, seconds spent in trials) by batch."""
 
     def __init__(self, pool: Pool) -> None:
         self.pool, self.name, self.workers = pool, pool.name, pool.workers
-        self.came: list[tuple[float, int, float]] = []
+        self.batches: list[tuple[float, int, float]] = []
 
-    def run(self, recipe: TrialSpec, chunks: Chunks) -> Iterator[list[Row]]:
+    def run(self, spec: TrialSpec, chunks: Chunks) -> Iterator[list[Row]]:
         """See `engines.Engine`."""
-        for rows in self.pool.run(recipe, chunks):
-            self.came.append((time.perf_counter(), len(rows), sum(row.seconds for row in rows)))
+        for rows in self.pool.run(spec, chunks):
+            self.batches.append((time.perf_counter(), len(rows), sum(row.seconds for row in rows)))
             yield rows
 
 
 @dataclass(frozen=True)
-class Spent:
+class StudyTime:
     """Time of a study.
 
     total_s     : from loading the file to closing the store, including start and end of the processes
@@ -73,33 +73,31 @@ class Spent:
     overhead_ms: float
 
 
-def spent(asked: dict[str, Any], workers: int) -> Spent:
+def run_study(settings: dict[str, Any], workers: int) -> StudyTime:
     """Run a study with a pool in a temporary folder."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "study.yaml"
-        path.write_text(STUDY.format(**asked))
-        clocked, begin = Clocked(engines.Pool(workers)), time.perf_counter()
-        told = loader.load(path)
-        with store.writing(path.with_suffix(".sqlite")) as kept:
-            runner.begin(told, kept, False)
-            progress = runner.run(told, kept, clocked)
+        path.write_text(STUDY.format(**settings))
+        pool, begin = TimedPool(engines.Pool(workers)), time.perf_counter()
+        study = loader.load(path)
+        with store.writing(path.with_suffix(".sqlite")) as database:
+            runner.prepare_store(study, database, False)
+            progress = runner.run(study, database, pool)
         total_s = time.perf_counter() - begin
-    if (progress.done, progress.failed) != (told.trials, 0):
-        raise RuntimeError(
-            f"{progress.done} of {told.trials} trials are in, {progress.failed} of them failed"
-        )
-    when_s, count, worked_s = np.array(clocked.came).T
-    late = np.cumsum(count) > SETTLED * told.trials
+    if (progress.done, progress.failed) != (study.trials, 0):
+        raise RuntimeError(f"{progress.done} of {study.trials} trials are in, {progress.failed} of them failed")
+    when_s, count, worked_s = np.array(pool.batches).T
+    late = np.cumsum(count) > WARM_UP * study.trials
     first = int(np.argmax(late))  # the timed window starts at its end
     window_s, trials = when_s[-1] - when_s[first], count[first + 1 :].sum()
     beside_s = workers * window_s - worked_s[first + 1 :].sum()
-    return Spent(total_s, trials / window_s, 1e3 * beside_s / trials)
+    return StudyTime(total_s, trials / window_s, 1e3 * beside_s / trials)
 
 
 def measure() -> list[dict[str, Any]]:
     """Results of the studies benchmark; the first pool is started cold, as for a user."""
-    points, frames = spent(CENTROIDS, 2), spent(FRAMES, 2)
-    alone = {"centroids": spent(CENTROIDS, 1), "frames": spent(FRAMES, 1)}
+    points, frames = run_study(CENTROIDS, 2), run_study(FRAMES, 2)
+    alone = {"centroids": run_study(CENTROIDS, 1), "frames": run_study(FRAMES, 1)}
     both = {"centroids": points, "frames": frames}
     ratios = [
         verdict(
@@ -113,12 +111,8 @@ def measure() -> list[dict[str, Any]]:
         for name, one in alone.items()
     ]
     return [
-        verdict(
-            "10,000 centroid trials with the store", points.total_s, "s", f"then {points.rate:.0f}/s", 5.0
-        ),
-        verdict(
-            "1,000 EC655 frame trials with the store", frames.total_s, "s", f"then {frames.rate:.0f}/s", 20.0
-        ),
+        verdict("10,000 centroid trials with the store", points.total_s, "s", f"then {points.rate:.0f}/s", 5.0),
+        verdict("1,000 EC655 frame trials with the store", frames.total_s, "s", f"then {frames.rate:.0f}/s", 20.0),
         *ratios,
         verdict("overhead a trial of a pool of two", points.overhead_ms, "ms", "centroid trials", 1.0),
     ]
@@ -126,7 +120,7 @@ def measure() -> list[dict[str, Any]]:
 
 if __name__ == "__main__":
     for one in measure():
-        kept = "met" if one["met"] else "MISSED"
+        outcome = "met" if one["met"] else "MISSED"
         print(
-            f"{one['name']:40s} {one['value']:8.3g} {one['unit']:3s} bar {one['bar']:4.3g} {kept:7s} {one['peer']}"
+            f"{one['name']:40s} {one['value']:8.3g} {one['unit']:3s} bar {one['bar']:4.3g} {outcome:7s} {one['peer']}"
         )

@@ -22,9 +22,9 @@ from pathlib import Path
 from random import Random
 from types import FunctionType, ModuleType
 
-HERE = Path(__file__).parent
-CORPUS, OUT = HERE / "corpus", HERE.parent / "out" / "fuzz"
-SLOWEST_S, MOST_MB = 10, 3000
+FOLDER = Path(__file__).parent
+CORPUS, OUT = FOLDER / "corpus", FOLDER.parent / "out" / "fuzz"
+TIME_LIMIT_S, MEMORY_LIMIT_MB = 10, 3000
 # Targets, and the shipped files that are seeds of each.
 TARGETS = {
     "scenes": ("scenes/*.yaml", "data/cameras/*.yaml"),
@@ -32,7 +32,7 @@ TARGETS = {
     "overrides": (),
     "fits": (),
     "pictures": (),
-    "catalogues": (),
+    "catalogs": (),
     "maps": (),
     "truths": (),
     "calibrations": (),
@@ -45,8 +45,8 @@ TARGETS = {
 }
 NAMES = tuple(TARGETS)
 # Instrumented for coverage: whole packages, and of astropy only the modules that read files (all would take 30 s).
-GUIDES = ["skysim", "estimator", "yaml", "json"]
-PARTS = ("astropy.io.ascii.", "astropy.io.fits.", "astropy.table.")
+INSTRUMENTED_PACKAGES = ["skysim", "estimator", "yaml", "json"]
+INSTRUMENTED_MODULES = ("astropy.io.ascii.", "astropy.io.fits.", "astropy.table.")
 TOKENS = (
     b"[",
     b"{",
@@ -65,87 +65,90 @@ TOKENS = (
 )
 
 
-def shipped(name: str) -> list[Path]:
+def shipped_files(name: str) -> list[Path]:
     """Shipped files that are seeds of a target."""
-    return [path for glob in TARGETS[name] for path in sorted(HERE.parent.glob(glob))]
+    return [path for glob in TARGETS[name] for path in sorted(FOLDER.parent.glob(glob))]
 
 
 def seeds(name: str) -> list[bytes]:
     """All seeds of a target: corpus and shipped files."""
-    return [path.read_bytes() for path in (*sorted((CORPUS / name).iterdir()), *shipped(name))]
+    return [path.read_bytes() for path in (*sorted((CORPUS / name).iterdir()), *shipped_files(name))]
 
 
-def dictionary(name: str) -> Path:
+def write_dictionary(name: str) -> Path:
     """Write libFuzzer's dictionary for a target (words of its seeds and schemas, and TOKENS) and return its path."""
     schemas = {"scenes": ("scene",), "overrides": ("scene",), "studies": ("scene", "study")}.get(name, ())
-    texts = [*seeds(name), *((HERE.parent / f"data/schema/{one}.json").read_bytes() for one in schemas)]
-    found = {word for text in texts for word in re.findall(rb"[A-Za-z_][\w-]{2,40}", text)}
+    texts = [
+        *seeds(name),
+        *((FOLDER.parent / f"data/schema/{schema}.json").read_bytes() for schema in schemas),
+    ]
+    words = {word for text in texts for word in re.findall(rb"[A-Za-z_][\w-]{2,40}", text)}
     path = OUT / f"{name}.dict"
-    told = ["".join(f"\\x{byte:02x}" for byte in word) for word in sorted(found.union(TOKENS))]
-    path.write_text("".join(f'"{word}"\n' for word in told))
+    entries = ["".join(f"\\x{byte:02x}" for byte in word) for word in sorted(words.union(TOKENS))]
+    path.write_text("".join(f'"{word}"\n' for word in entries))
     return path
 
 
-def mutated(seed: bytes, others: list[bytes], rng: Random) -> bytes:
+def mutate(seed: bytes, others: list[bytes], rng: Random) -> bytes:
     """Apply 1 to 6 random mutations to a seed: change, delete or duplicate bytes, insert tokens or parts of another."""
     data = bytearray(seed)
     for _ in range(rng.randint(1, 6)):
-        at = rng.randrange(len(data) + 1)
-        to = min(at + rng.choice((1, 2, 8, 40)), len(data))
+        start = rng.randrange(len(data) + 1)
+        stop = min(start + rng.choice((1, 2, 8, 40)), len(data))
         match rng.randrange(6):
-            case 0 if at < len(data):
-                data[at] = rng.randrange(256)
+            case 0 if start < len(data):
+                data[start] = rng.randrange(256)
             case 1:
-                del data[at:to]
+                del data[start:stop]
             case 2:
-                data[at:at] = data[at:to]
+                data[start:start] = data[start:stop]
             case 3:
-                data[at:to] = rng.choice(TOKENS)
+                data[start:stop] = rng.choice(TOKENS)
             case 4:
                 other = rng.choice(others)
                 begin = rng.randrange(len(other) + 1)
-                data[at:to] = other[begin : begin + rng.choice((4, 30))]
+                data[start:stop] = other[begin : begin + rng.choice((4, 30))]
             case _:
-                data[at:at] = rng.choice(TOKENS)
+                data[start:start] = rng.choice(TOKENS)
     return bytes(data)
 
 
-def timed(target: Callable[[bytes], None], data: bytes) -> None:
+def run_timed(target: Callable[[bytes], None], data: bytes) -> None:
     """Run a target. Raises AssertionError above SLOWEST_S of CPU time, which other load does not lengthen."""
-    begin = time.process_time()
+    start_s = time.process_time()
     target(data)
-    if (took_s := time.process_time() - begin) > SLOWEST_S:
-        raise AssertionError(f"{took_s:.1f} s")
+    if (cpu_s := time.process_time() - start_s) > TIME_LIMIT_S:
+        raise AssertionError(f"{cpu_s:.1f} s")
 
 
-def plainly(name: str, seconds: float, seed: int = 1) -> int:
+def fuzz_by_mutation(name: str, seconds: float, seed: int = 1) -> int:
     """Fuzz a target by random mutation only; return the number of findings."""
     from fuzz.targets import TARGETS
 
-    rng, corpus, end, findings, tries = Random(seed), seeds(name), time.monotonic() + seconds, 0, 0
-    while time.monotonic() < end:
+    rng, corpus, end_s, findings, tries = Random(seed), seeds(name), time.monotonic() + seconds, 0, 0
+    while time.monotonic() < end_s:
         # First every seed unchanged, then mutations of random seeds.
-        data = corpus[tries] if tries < len(corpus) else mutated(rng.choice(corpus), corpus, rng)
+        data = corpus[tries] if tries < len(corpus) else mutate(rng.choice(corpus), corpus, rng)
         tries += 1
         try:
-            timed(TARGETS[name], data)
+            run_timed(TARGETS[name], data)
         except Exception:
             findings += 1
-            kept = OUT / f"{name}-{sha256(data).hexdigest()[:12]}"
-            kept.write_bytes(data)
-            print(f"{name}: {kept}\n{traceback.format_exc()}", flush=True)
+            path = OUT / f"{name}-{sha256(data).hexdigest()[:12]}"
+            path.write_bytes(data)
+            print(f"{name}: {path}\n{traceback.format_exc()}", flush=True)
     print(f"{name}: {tries} files, {findings} findings", flush=True)
     return findings
 
 
-def guided(names: list[str], share_s: float) -> int:
+def fuzz_by_coverage(names: list[str], seconds_each: float) -> int:
     """Fuzz with libFuzzer; return the number of targets with a finding.
 
     libFuzzer ends its process itself, so each target runs in a forked child.
     """
     import atheris
 
-    with atheris.instrument_imports(include=GUIDES):
+    with atheris.instrument_imports(include=INSTRUMENTED_PACKAGES):
         from fuzz.targets import TARGETS
 
         for name in names:
@@ -153,65 +156,67 @@ def guided(names: list[str], share_s: float) -> int:
                 with suppress(Exception):
                     TARGETS[name](path.read_bytes())
     for name, module in sorted(sys.modules.items()):
-        if name.startswith(PARTS):
-            for one in functions(module):
-                atheris.instrument_func(one)
-    found = 0
+        if name.startswith(INSTRUMENTED_MODULES):
+            for function in functions_of(module):
+                atheris.instrument_func(function)
+    findings = 0
     for name in names:
-        grown = OUT / f"{name}-grown"
-        grown.mkdir(exist_ok=True)
-        for path in shipped(name):
-            (grown / f"shipped-{path.name}").write_bytes(path.read_bytes())
+        grown_corpus = OUT / f"{name}-grown"
+        grown_corpus.mkdir(exist_ok=True)
+        for path in shipped_files(name):
+            (grown_corpus / f"shipped-{path.name}").write_bytes(path.read_bytes())
         limits = [
-            f"-max_total_time={max(round(share_s), 1)}",
-            f"-timeout={12 * SLOWEST_S}",
-            f"-rss_limit_mb={MOST_MB}",
+            f"-max_total_time={max(round(seconds_each), 1)}",
+            f"-timeout={12 * TIME_LIMIT_S}",
+            f"-rss_limit_mb={MEMORY_LIMIT_MB}",
         ]
-        told = [f"-dict={dictionary(name)}", f"-artifact_prefix={OUT / name}-"]
-        quiet = ["-verbosity=0", "-print_final_stats=1"]
-        code = alone(
-            partial(fuzzed, TARGETS[name], [name, *limits, *told, *quiet, str(grown), str(CORPUS / name)])
-        )
-        print(f"{name}: {'nothing found' if code == 0 else f'FOUND, exit code {code}'}", flush=True)
-        found += code != 0
-    return found
+        files = [f"-dict={write_dictionary(name)}", f"-artifact_prefix={OUT / name}-"]
+        output = ["-verbosity=0", "-print_final_stats=1"]
+        arguments = [name, *limits, *files, *output, str(grown_corpus), str(CORPUS / name)]
+        exit_code = run_forked(partial(run_libfuzzer, TARGETS[name], arguments))
+        print(f"{name}: {f'finding, exit code {exit_code}' if exit_code else 'no finding'}", flush=True)
+        findings += exit_code != 0
+    return findings
 
 
-def functions(module: ModuleType) -> Iterator[FunctionType]:
+def functions_of(module: ModuleType) -> Iterator[FunctionType]:
     """Functions of a module and methods of its classes."""
-    for one in vars(module).values():
-        for inner in vars(one).values() if isinstance(one, type) else [one]:
-            if isinstance(inner, FunctionType) and inner.__module__ == module.__name__:
-                yield inner
+    for member in vars(module).values():
+        for function in vars(member).values() if isinstance(member, type) else [member]:
+            if isinstance(function, FunctionType) and function.__module__ == module.__name__:
+                yield function
 
 
-def fuzzed(target: Callable[[bytes], None], words: list[str]) -> None:
+def run_libfuzzer(target: Callable[[bytes], None], arguments: list[str]) -> None:
     """Run libFuzzer on a target; does not return."""
     import atheris
 
-    atheris.Setup(words, partial(timed, target))
+    atheris.Setup(arguments, partial(run_timed, target))
     atheris.Fuzz()
 
 
-def alone(work: Callable[[], None]) -> int:
-    """Run `work` in a forked process and return its exit code."""
+def run_forked(task: Callable[[], None]) -> int:
+    """Run `task` in a forked process and return its exit code."""
     sys.stdout.flush()
-    if (child := os.fork()) == 0:
-        work()  # libFuzzer writes its findings when the interpreter exits
+    if (pid := os.fork()) == 0:
+        task()  # libFuzzer writes its findings when the interpreter exits
         sys.exit()
-    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+    return os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
 
 
 def main() -> int:
     """Fuzz the requested targets one after another; return the exit code."""
-    words = [word for word in sys.argv[1:] if not word.startswith("-")]
-    seconds, names = float(words[0]) if words else 60.0, words[1:] or list(NAMES)
+    arguments = [word for word in sys.argv[1:] if not word.startswith("-")]
+    seconds, names = float(arguments[0]) if arguments else 60.0, arguments[1:] or list(NAMES)
     OUT.mkdir(parents=True, exist_ok=True)
-    share_s = seconds / len(names)
+    seconds_each = seconds / len(names)
     if "--plain" in sys.argv or importlib.util.find_spec("atheris") is None:
-        print("By mutation alone; the extra `fuzz` (atheris) has it guided by coverage.", flush=True)
-        return int(sum([plainly(name, share_s) for name in names]) > 0)
-    return int(guided(names, share_s) > 0)
+        print("Fuzzing by random mutation; the extra `fuzz` (atheris) adds coverage guidance.", flush=True)
+        findings = sum([fuzz_by_mutation(name, seconds_each) for name in names])
+    else:
+        findings = fuzz_by_coverage(names, seconds_each)
+    print(f"{len(names)} targets, {findings} findings", flush=True)
+    return int(findings > 0)
 
 
 if __name__ == "__main__":

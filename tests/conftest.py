@@ -1,8 +1,12 @@
-"""Before the tests: no machine code from before the last change."""
+"""Before the tests: remove outdated machine code, and compile what most tests need in two processes at once."""
 
 from __future__ import annotations
 
 import contextlib
+import subprocess
+import sys
+import tempfile
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -26,3 +30,26 @@ def pytest_configure(config: pytest.Config) -> None:
             with contextlib.suppress(FileNotFoundError):  # another run of the tests was quicker
                 if path.stat().st_mtime < changed_s:
                     path.unlink()
+
+
+# Modules run as commands, one group per process: the trackers, and the renderer. They share no compiled function.
+SCENES = ("shefex2", "afit_simsat")
+GROUPS = (
+    [["skysim.simulation.compilation", scene] for scene in SCENES],
+    [["skysim", "render", scene, "--frames", "1", "--out", "{folder}"] for scene in SCENES],
+)
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_setupnodes(config: pytest.Config) -> None:
+    """Fill numba's cache, if it is empty, before the workers of xdist start: each of them would compile everything."""
+    if config.args != config.getini("testpaths") or any(ROOT.glob("estimator/*/__pycache__/*.nbi")):
+        return
+    with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor() as pool:
+        list(pool.map(lambda group: [run_module(words, folder) for words in group], GROUPS))
+
+
+def run_module(words: list[str], folder: str) -> None:
+    """Run `python -m WORDS`; its output appears only if it fails."""
+    command = [sys.executable, "-m", *(word.format(folder=folder) for word in words)]
+    subprocess.run(command, cwd=ROOT, check=True, stdout=subprocess.DEVNULL)

@@ -21,7 +21,7 @@ from skysim.scene.vehicle import VehicleConfig
 from skysim.sources.stars import cam_from_icrs
 
 # A pinhole whose arithmetic can be done in the head: f = 1000 px, middle of the chip at (320, 240).
-OPTICS = Optics.of(
+OPTICS = Optics.from_camera(
     CameraConfig.model_validate(
         {
             "width_px": 641,
@@ -60,7 +60,7 @@ def test_a_direction_falls_on_the_pixel_worked_out_by_hand(vector_cam, pixel):
 
 
 def test_pixel_zero_is_the_middle_of_the_first_pixel():
-    """0-based, the integer is the pixel's centre: the chip reaches from -0.5 to width - 0.5."""
+    """0-based, the integer is the pixel's center: the chip reaches from -0.5 to width - 0.5."""
     edges = np.array([[-0.5, -0.5], [-0.51, 0.0], [640.5, 480.5], [640.51, 0.0]])
     assert BELIEVED.contains(edges).tolist() == [True, False, True, False]
 
@@ -116,9 +116,7 @@ def test_three_stars_keep_their_handedness():
 def test_the_tracker_reads_the_pointing_that_the_simulator_set():
     """Vega in the middle (RA 279.2347, Dec +38.7837), up at position angle -25: said once each way."""
     look = Rotation.from_matrix(hand_made(279.2347, 38.7837, -25.0))
-    np.testing.assert_allclose(
-        np.degrees(ra_dec_roll_rad(look)), (279.2347, 38.7837, -25.0), rtol=0, atol=1e-10
-    )
+    np.testing.assert_allclose(np.degrees(ra_dec_roll_rad(look)), (279.2347, 38.7837, -25.0), rtol=0, atol=1e-10)
     assert (look * cam_from_icrs(279.2347, 38.7837, -25.0).inv()).magnitude() < EXACT
 
 
@@ -152,7 +150,7 @@ def test_quaternion_orders():
 
 
 def test_names_of_rotations_cancel():
-    """v_a = a_from_b.apply(v_b), and neighbours cancel: cam_from_lab = cam_from_body * body_from_lab."""
+    """v_a = a_from_b.apply(v_b), and neighbors cancel: cam_from_lab = cam_from_body * body_from_lab."""
     lab_from_body = Rotation.from_euler("z", 90, degrees=True)  # the vehicle has yawed to the left
     cam_from_body = Rotation.identity()
     cam_from_lab = cam_from_body * lab_from_body.inv()
@@ -165,33 +163,33 @@ def test_mujocos_camera_against_ours():
 
     MuJoCo's own camera (+y up, looks along -z) then has its x along lab x, y along lab -y, z along lab -z.
     """
-    vehicle = VehicleConfig.model_validate({"model": "vehicles/simsat.xml"})
-    ship = multibody.build(vehicle)
-    data = mujoco.MjData(ship.model)
-    mujoco.mj_forward(ship.model, data)
+    config = VehicleConfig.model_validate({"model": "vehicles/simsat.xml"})
+    vehicle = multibody.build(config)
+    data = mujoco.MjData(vehicle.model)
+    mujoco.mj_forward(vehicle.model, data)
     axes = data.camera("star_camera").xmat.reshape(3, 3)
     np.testing.assert_allclose(axes, np.diag([1.0, -1.0, -1.0]), rtol=0, atol=EXACT)
-    mount = multibody.mount(ship)
+    mount = multibody.camera_mount(vehicle)
     np.testing.assert_allclose(mount.camera_body_m, [0, 0, 0.381], rtol=0, atol=EXACT)
     np.testing.assert_allclose(mount.cam_from_body.as_matrix(), np.eye(3), rtol=0, atol=EXACT)
 
 
-def flown(parts: dict[str, object], motor: int, control: float) -> tuple[multibody.World, multibody.Flight]:
+def flown(parts: dict[str, object], motor: int, control: float) -> tuple[multibody.VehicleModel, multibody.Simulation]:
     """A second of SimSat, free and at rest, one of its motors at work."""
     given = {"model": "vehicles/simsat.xml", "mount": "free", "inertia": ["6 kg m2", "6.5 kg m2", "9 kg m2"]}
-    ship = multibody.build(VehicleConfig.model_validate(given | parts))
-    flight = multibody.Flight(ship, Rotation.identity(), np.zeros(3), 1.0)
-    controls = np.zeros((1000, ship.model.nu))
+    vehicle = multibody.build(VehicleConfig.model_validate(given | parts))
+    flight = multibody.Simulation(vehicle, Rotation.identity(), np.zeros(3), 1.0)
+    controls = np.zeros((1000, vehicle.model.nu))
     controls[:, motor] = control
     flight.advance(controls)
-    return ship, flight
+    return vehicle, flight
 
 
 def test_a_wheel_spun_up_turns_the_body_the_other_way():
     """+0.1 N m for 1 s on wheel z (0.010125 kg m2, the vehicle without it 8.989875): both right-handed about z."""
-    ship, flight = flown({"wheels": {}}, 5, 0.1)
+    vehicle, flight = flown({"wheels": {}}, 5, 0.1)
     assert flight.rate_body_rad_s[2] == pytest.approx(-0.1 / 8.989875, rel=1e-9)
-    assert flight.speeds_rad_s[ship.wheels.dof[2]] == pytest.approx(0.1 / 0.010125 + 0.1 / 8.989875, rel=1e-9)
+    assert flight.speeds_rad_s[vehicle.wheels.dof[2]] == pytest.approx(0.1 / 0.010125 + 0.1 / 8.989875, rel=1e-9)
 
 
 def test_a_fan_pushes_the_vehicle_along_its_own_z():
@@ -207,9 +205,7 @@ def test_a_gimbal_turned_takes_the_torque_the_rotors_momentum_gains():
     after a turn of 0.1 rad +0.035 N m s about x, -0.049 about z. The little that the moving gimbal itself holds, a
     hundredth, is left out.
     """
-    _, flight = flown(
-        {"cmgs": {"rotor_rpm": 2600}, "inertia": ["600 kg m2", "650 kg m2", "900 kg m2"]}, 3, 0.1
-    )
+    _, flight = flown({"cmgs": {"rotor_rpm": 2600}, "inertia": ["600 kg m2", "650 kg m2", "900 kg m2"]}, 3, 0.1)
     momentum = flight.rate_body_rad_s * [600, 650, 900]
     turned = 0.1 * (1 - 2 * 0.01)  # the servo is two time constants late
     expected = 0.6126106 * np.array([np.sin(turned) * 0.5773503, 0, -np.sin(turned) * 0.8164966])

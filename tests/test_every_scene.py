@@ -12,8 +12,8 @@ from skysim.core.paths import SCENES
 from skysim.dynamics import multibody
 from skysim.scene import loader
 from skysim.scene.vehicle import VehicleConfig
-from skysim.simulation import exposure, run, testbed
-from skysim.simulation.testbed import Testbed
+from skysim.simulation import exposure, run
+from skysim.simulation.testbed import Testbed, build_tracker, exposure_window
 
 NAMES = sorted(path.stem for path in SCENES.glob("*.yaml"))
 # What a published experiment shows instead of five sources and an attitude.
@@ -29,7 +29,7 @@ def prepared(name: str, frames: int, **overrides: str) -> Testbed:
 
 
 @pytest.fixture(scope="module", params=NAMES)
-def lab(request: pytest.FixtureRequest) -> Testbed:
+def testbed(request: pytest.FixtureRequest) -> Testbed:
     return prepared(request.param, 2)
 
 
@@ -42,27 +42,27 @@ def test_there_are_scenes() -> None:
         "nps_tas2",
         "apl_dome",
         "celestial_dome",
-        "bench_collimated",
+        "collimated_display",
     }
     assert flown | lit <= set(NAMES)
 
 
-def test_it_says_what_it_is(lab: Testbed) -> None:
-    assert lab.scene.name in NAMES
-    assert 10 < len(lab.scene.title) < 80
+def test_it_says_what_it_is(testbed: Testbed) -> None:
+    assert testbed.scene.name in NAMES
+    assert 10 < len(testbed.scene.title) < 80
 
 
-def test_its_first_frame_shows_at_least_five_sources_or_what_was_published(lab: Testbed) -> None:
-    frame, truth = exposure.render_frame(lab, 0)
-    camera, chip = lab.scene.camera, lab.scene.camera.detector
+def test_its_first_frame_shows_at_least_five_sources_or_what_was_published(testbed: Testbed) -> None:
+    frame, truth = exposure.render_frame(testbed, 0)
+    camera, detector = testbed.scene.camera, testbed.scene.camera.detector
     assert frame.image_dn.shape == (camera.height_px, camera.width_px)
-    above_noise = truth.seen.peak_e > 5 * np.hypot(chip.read_noise_e, np.sqrt(truth.seen.peak_e))
-    assert above_noise.sum() >= 5 or above_noise.sum() == SHOWN[lab.scene.name]
+    above_noise = truth.sources.peak_e > 5 * np.hypot(detector.read_noise_e, np.sqrt(truth.sources.peak_e))
+    assert above_noise.sum() >= 5 or above_noise.sum() == SHOWN[testbed.scene.name]
     # And none of them blinds the chip.
     assert np.mean(frame.image_dn >= frame.saturation_dn) < 1e-3
 
 
-def test_its_light_is_on_the_frame(lab: Testbed) -> None:
+def test_its_light_is_on_the_frame(testbed: Testbed) -> None:
     """Sum above offset, dark and the chip's own pattern, against the truth's electrons, to five sigmas.
 
     Through a converter of 16 bits, finer than any read noise: a step four times the noise, as the LU205c's, swallows
@@ -70,52 +70,50 @@ def test_its_light_is_on_the_frame(lab: Testbed) -> None:
     Sensitivity is the one part of the pattern that goes with the light: a source of E electrons over A pixels has
     it as prnu E / sqrt(A).
     """
-    told = lab.scene.camera.detector
+    told = testbed.scene.camera.detector
     step_e = told.full_well_e / 60000
-    offset_dn = (
-        told.offset_dn * told.gain_e_dn / step_e
-    )  # the same in electrons, or noise would be cut off at 0
+    offset_dn = told.offset_dn * told.gain_e_dn / step_e  # the same in electrons, or noise would be cut off at 0
     fine = {"bits": "16", "gain_e_dn": str(step_e), "offset_dn": str(offset_dn)}
     fine = {f"camera.detector.{key}": value for key, value in fine.items()}
-    lab = prepared(lab.scene.name, 1, **fine)
-    frame, truth = exposure.render_frame(lab, 0)
-    part, chip, pixels = lab.scene.camera.detector, lab.chip, frame.image_dn.size
-    assert lab.scene.background == ()
-    pattern_e = chip.dark_e_s.sum(dtype=float) * frame.exposure_s
-    pattern_e += len(frame.image_dn) * chip.column_offset_e.sum(dtype=float)
+    testbed = prepared(testbed.scene.name, 1, **fine)
+    frame, truth = exposure.render_frame(testbed, 0)
+    part, detector, pixels = testbed.scene.camera.detector, testbed.detector, frame.image_dn.size
+    assert testbed.scene.background == ()
+    pattern_e = detector.dark_e_s.sum(dtype=float) * frame.exposure_s
+    pattern_e += len(frame.image_dn) * detector.column_offset_e.sum(dtype=float)
     found_e = (frame.image_dn.sum(dtype=float) - pixels * part.offset_dn) * part.gain_e_dn - pattern_e
-    light_e = truth.seen.electrons
+    light_e = truth.sources.electrons
     read = pixels * (part.read_noise_e**2 + part.reset_noise_e**2 + part.gain_e_dn**2 / 12)
-    shot = light_e.sum() + chip.dark_e_s.sum(dtype=float) * frame.exposure_s
-    uneven = part.prnu**2 * np.sum(light_e**2 / truth.seen.area_px)
+    shot = light_e.sum() + detector.dark_e_s.sum(dtype=float) * frame.exposure_s
+    uneven = part.prnu**2 * np.sum(light_e**2 / truth.sources.area_px)
     # What a star beyond full well loses is less than all it has.
-    clipped_e = light_e[truth.seen.saturated].sum()
+    clipped_e = light_e[truth.sources.saturated].sum()
     assert abs(found_e - light_e.sum()) < 5 * np.sqrt(read + shot + uneven) + clipped_e
 
 
-def test_the_same_seed_gives_the_same_bytes_and_another_seed_others(lab: Testbed) -> None:
-    name, image = lab.scene.name, exposure.render_frame(lab, 0)[0].image_dn
+def test_the_same_seed_gives_the_same_bytes_and_another_seed_others(testbed: Testbed) -> None:
+    name, image = testbed.scene.name, exposure.render_frame(testbed, 0)[0].image_dn
     again = exposure.render_frame(prepared(name, 2), 0)[0].image_dn
-    other = exposure.render_frame(prepared(name, 2, seed=str(lab.scene.seed + 1)), 0)[0].image_dn
+    other = exposure.render_frame(prepared(name, 2, seed=str(testbed.scene.seed + 1)), 0)[0].image_dn
     assert image.tobytes() == again.tobytes()
     assert np.mean(image != other) > 0.1
 
 
-def test_a_frame_alone_is_the_frame_of_a_sequence(lab: Testbed) -> None:
-    sequence = [shot.frame.image_dn for shot in run.run(lab, testbed.tracker(lab))]
-    alone, _ = exposure.render_frame(prepared(lab.scene.name, 2), 1)
+def test_a_frame_alone_is_the_frame_of_a_sequence(testbed: Testbed) -> None:
+    sequence = [shot.frame.image_dn for shot in run.run(testbed, build_tracker(testbed))]
+    alone, _ = exposure.render_frame(prepared(testbed.scene.name, 2), 1)
     assert alone.image_dn.tobytes() == sequence[1].tobytes()
 
 
-def test_its_first_frames_are_solved_and_right(lab: Testbed) -> None:
-    for shot in run.run(lab, testbed.tracker(lab)):
+def test_its_first_frames_are_solved_and_right(testbed: Testbed) -> None:
+    for shot in run.run(testbed, build_tracker(testbed)):
         answer = shot.report.attitude
-        if lab.scene.name in SHOWN:  # seen, each where it is, to half a pixel; two are no attitude
-            found_px, seen_px = shot.report.centroids.xy_px, shot.truth.seen.xy_px
+        if testbed.scene.name in SHOWN:  # seen, each where it is, to half a pixel; two are no attitude
+            found_px, seen_px = shot.report.centroids.xy_px, shot.truth.sources.xy_px
             apart_px = np.linalg.norm(found_px[:, None] - seen_px, axis=2)
-            assert len(found_px) == len(seen_px) == SHOWN[lab.scene.name]
+            assert len(found_px) == len(seen_px) == SHOWN[testbed.scene.name]
             assert apart_px.min(axis=1).max() < 0.5
-            assert lab.scene.name != PAIR or answer.status == "too few stars detected"
+            assert testbed.scene.name != PAIR or answer.status == "too few stars detected"
             continue
         assert answer.status == "solved"
         error = (answer.cam_from_ref * shot.truth.cam_from_lab.inv()).magnitude()
@@ -124,17 +122,15 @@ def test_its_first_frames_are_solved_and_right(lab: Testbed) -> None:
 
 def test_a_square_of_equal_leds_is_never_solved_wrong() -> None:
     """AFIT's nine LEDs are their own picture after a quarter turn, but for 0.12 mm of glue: 1.3 px."""
-    lab = prepared(GRID, 4)
-    for shot in run.run(lab, testbed.tracker(lab)):
+    testbed = prepared(GRID, 4)
+    for shot in run.run(testbed, build_tracker(testbed)):
         answer = shot.report.attitude
         if answer.solved:
             assert np.degrees((answer.cam_from_ref * shot.truth.cam_from_lab.inv()).magnitude()) < 10 / 60
 
 
 STEERED = [name for name in NAMES if loader.load(name).motion.control]
-NO_EYES = {
-    "simsat_bump": {"filter": "null", "motion.control.feedback": "truth"}
-}  # which would render and solve
+NO_EYES = {"simsat_bump": {"filter": "null", "motion.control.feedback": "truth"}}  # which would render and solve
 
 
 @pytest.fixture(scope="module", params=STEERED)
@@ -143,11 +139,11 @@ def whole(request: pytest.FixtureRequest) -> Testbed:
     return run.prepare(loader.load(request.param, NO_EYES.get(request.param)))
 
 
-def test_the_camera_sees_five_leds_all_along_the_manoeuvre(whole: Testbed) -> None:
+def test_the_camera_sees_five_leds_all_along_the_maneuver(whole: Testbed) -> None:
     """In every frame, at geometry alone: what is on the chip, by the tracker's map."""
-    eyes, counts = testbed.tracker(whole), []
+    eyes, counts = build_tracker(whole), []
     for index in range(whole.scene.exposure.frames):
-        body_from_lab = whole.trajectory.at(testbed.window(whole.scene, index).open_s).inv()
+        body_from_lab = whole.trajectory.attitude_at(exposure_window(whole.scene, index).open_s).inv()
         pixels = project(body_from_lab, eyes.leds.position_m, eyes.lever, eyes.camera)
         counts.append(int(eyes.camera.contains(np.nan_to_num(pixels, nan=-1e9), 12).sum()))
     assert len(counts) >= 20
@@ -168,18 +164,18 @@ def test_it_is_steered_to_where_it_is_told_and_off_its_stop(whole: Testbed) -> N
 # --- the vehicles, at the hands of chance -------------------------------------------------------------------
 
 
-def at_random(vehicle: VehicleConfig, rate_body_rad_s: np.ndarray) -> multibody.Flight:
+def at_random(config: VehicleConfig, rate_body_rad_s: np.ndarray) -> multibody.Simulation:
     """A second of flight, every motor told something else each 10 ms, all over the range that it has.
 
     A vehicle's own motors have the range of their file. `Flight.check` raises where MuJoCo warned.
     """
-    ship, rng = multibody.build(vehicle), np.random.default_rng(7)
-    most = np.where(ship.model.actuator_ctrllimited, ship.model.actuator_ctrlrange[:, 1], 1.0)
-    most[ship.torques] = vehicle.torque_limit_nm
-    most[ship.gimbals.motor] = np.radians(vehicle.cmgs.gimbal_rate_limit_deg_s) if vehicle.cmgs else 0.0
-    flight = multibody.Flight(ship, Rotation.identity(), rate_body_rad_s, 1.0)
-    flight.advance(np.repeat(most * rng.uniform(-1, 1, (100, ship.model.nu)), 10, axis=0))
-    flight.check()
+    vehicle, rng = multibody.build(config), np.random.default_rng(7)
+    most = np.where(vehicle.model.actuator_ctrllimited, vehicle.model.actuator_ctrlrange[:, 1], 1.0)
+    most[vehicle.torques] = config.torque_limit_nm
+    most[vehicle.gimbals.motor] = np.radians(config.cmgs.gimbal_rate_limit_deg_s) if config.cmgs else 0.0
+    flight = multibody.Simulation(vehicle, Rotation.identity(), rate_body_rad_s, 1.0)
+    flight.advance(np.repeat(most * rng.uniform(-1, 1, (100, vehicle.model.nu)), 10, axis=0))
+    flight.check_warnings()
     return flight
 
 
@@ -193,17 +189,13 @@ def test_a_second_of_random_control_makes_no_warning(name: str) -> None:
 
 @pytest.mark.parametrize("mount", ["free", "air_bearing"])
 @pytest.mark.parametrize("model", MODELS)
-def test_a_second_of_random_control_of_all_that_a_vehicle_has_makes_no_warning(
-    model: str, mount: str
-) -> None:
+def test_a_second_of_random_control_of_all_that_a_vehicle_has_makes_no_warning(model: str, mount: str) -> None:
     """At 1.1 rad/s and, on the bearing, against its stop; wheels at 3000 rpm and out of balance."""
     spec = mujoco.MjSpec.from_file(str(SCENES / "vehicles" / model))
     named = [element.name for element in [*spec.joints, *spec.sites]]
     wheels = sum(name.startswith("wheel_") for name in named)
     parts = {
-        "wheel_": {
-            "wheels": {"start_rpm": [3000] * wheels, "coulomb": "2 mN m", "static_imbalance": "1 g cm"}
-        },
+        "wheel_": {"wheels": {"start_rpm": [3000] * wheels, "coulomb": "2 mN m", "static_imbalance": "1 g cm"}},
         "gimbal_": {"cmgs": {"rotor_torque_limit": "0.1 N m"}},
         "fan_": {"fans": {}},
     }
@@ -213,9 +205,7 @@ def test_a_second_of_random_control_of_all_that_a_vehicle_has_makes_no_warning(
     flight = at_random(VehicleConfig.model_validate(given), np.array([0.6, 0.5, 0.8]))
     assert flight.steps_left == 0
     assert np.isfinite(flight.states).all()
-    assert flight.model.nu == 3 + sum(
-        name.startswith(("wheel_", "gimbal_", "rotor_", "fan_")) for name in named
-    )
+    assert flight.model.nu == 3 + sum(name.startswith(("wheel_", "gimbal_", "rotor_", "fan_")) for name in named)
     up = Rotation.from_quat(flight.states[:, 1:5], scalar_first=True).as_matrix()[:, 2, 2]
     tilt_deg = np.degrees(np.arccos(np.clip(up, -1, 1))).max()
     lowest, highest = {"free": (30.0, 180.0), "air_bearing": (29.9, 30.1)}[mount]

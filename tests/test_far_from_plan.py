@@ -32,7 +32,7 @@ def test_a_blow_far_beyond_the_torque_s_reach_is_braked_and_the_vehicle_comes_ba
     """80 deg/s about z: J w / T = 12.6 s at the least to stop, more than once round; home within four times that."""
     blow = "[{kind: hold, duration: 1 s}, {kind: bump, rate_deg_s: [0, 0, 80], duration: 40 ms}]"
     overrides = {
-        "motion.manoeuvre": blow,
+        "motion.maneuver": blow,
         "motion.control": f"{{actuators: {actuators}}}",
         "exposure": QUIET % 50,
         **more,
@@ -49,18 +49,16 @@ def test_steered_by_gyros_at_their_limit_the_vehicle_still_brakes() -> None:
     overrides = {
         "vehicle.imu": "{gyro: {rate_limit_deg_s: 10}}",
         "motion.control": "{feedback: imu}",
-        "motion.manoeuvre": "[{kind: bump, rate_deg_s: [0, 0, 60], duration: 40 ms}]",
+        "motion.maneuver": "[{kind: bump, rate_deg_s: [0, 0, 60], duration: 40 ms}]",
         "exposure": QUIET % 40,
     }
     log = run.prepare(loader.load("afit_simsat", overrides)).log
     assert np.degrees(np.linalg.norm(log.rate_body_rad_s[-1])) < 0.05
 
 
-def test_a_manoeuvre_beyond_the_stop_is_refused_before_the_flight() -> None:
-    overrides = {"motion.manoeuvre": "[{kind: slew, roll_deg: 45, rate_deg_s: 10}]", "exposure": QUIET % 20}
-    with pytest.raises(
-        InputError, match=r"motion.manoeuvre: asks for a tilt of 30\.\d deg at \d+\.\d+ s, beyond"
-    ):
+def test_a_maneuver_beyond_the_stop_is_refused_before_the_flight() -> None:
+    overrides = {"motion.maneuver": "[{kind: slew, roll_deg: 45, rate_deg_s: 10}]", "exposure": QUIET % 20}
+    with pytest.raises(InputError, match=r"motion.maneuver: tilt of 30\.\d deg at \d+\.\d+ s; allowed: up to"):
         run.prepare(loader.load("afit_simsat", overrides))
 
 
@@ -69,7 +67,7 @@ def test_what_cannot_be_stepped_is_told_in_one_line_and_leaves_no_file(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     overrides = {"vehicle.disturbances": "{cable: {stiffness: 1e8 N m / rad}}", "exposure": QUIET % 0.3}
-    with pytest.raises(InputError, match="the flight cannot be stepped at 1 ms: MuJoCo warned before"):
+    with pytest.raises(InputError, match="motion: not integrable at a step of 1 ms: MuJoCo warned before"):
         run.prepare(loader.load("afit_simsat", overrides))
     assert not list(tmp_path.iterdir())
 
@@ -81,8 +79,8 @@ def test_the_gyros_apparent_bias_is_what_the_navigator_drifts_by() -> None:
         " misalignment_arcsec: 60, quantum_arcsec: 0}}",
         "motion.rate_deg_s": "[0, 0, 5]",
         "motion.control": "none",
-        "motion.manoeuvre": "[]",
-        "vehicle.centre_of_mass": "[0 m, 0 m, 0 m]",
+        "motion.maneuver": "[]",
+        "vehicle.center_of_mass": "[0 m, 0 m, 0 m]",
         "exposure": QUIET % 20,
     }
     log = run.prepare(loader.load("afit_simsat", overrides)).log
@@ -96,5 +94,5 @@ def test_the_gyros_apparent_bias_is_what_the_navigator_drifts_by() -> None:
 
 def test_a_vehicle_of_one_tick_is_reported_too() -> None:
     overrides = {"vehicle.imu": "{}", "exposure": "{time: 1 ms, rate_hz: 10, frames: 1, first: 0 s}"}
-    lab = run.prepare(loader.load("afit_simsat", overrides))
-    assert telemetry_report.summary(lab.log)["gyro_saturated_s"] == 0
+    testbed = run.prepare(loader.load("afit_simsat", overrides))
+    assert telemetry_report.summary(testbed.log)["gyro_saturated_s"] == 0

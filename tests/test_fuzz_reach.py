@@ -28,27 +28,26 @@ OURS = "what skysim itself has written, for its own process or folder"
 SHIPPED = "a file that comes along, each of which a test reads"
 SOURCES = "reads bytes for their digest alone"
 OUT_OF_REACH = {
+    "skysim.apps.cli.commands.study.load_stored_plan": "the store is read by `open_store`, the study by `loader.load`",
     "skysim.apps.cli.options.load": "hands a scene's name on to `loader.load`",
     "skysim.scene.loader.load_scene": "the same",
-    "skysim.camera.detector.detector.read_out": "a chip's electrons, no file",
-    "skysim.apps.gui.worker.export.files": "copies a run's files",
-    "skysim.apps.gui.page.panels.monte_carlo.TrialPanel.file": OURS,
+    "skysim.apps.gui.worker.export.frame_files": "copies a run's files",
+    "skysim.apps.gui.page.panels.monte_carlo.MonteCarloPanel.study_file": OURS,
     "skysim.apps.gui.worker.study_process.monte_carlo": "values of the page's form, checked by `loader.load`",
     "skysim.core.images.LiveCamera.__init__": "a device, decoded by OpenCV",
     "skysim.experiments.papers.published.read": SHIPPED,
     "skysim.sources.photometry.stellar_sequence": SHIPPED,
     "skysim.tracking.external.process.Program.exchange": "needs a process; a line of it is target `answers`",
-    "skysim.tracking.external.process.Program.read": "the same line",
     "skysim.results.report.write_page": "takes a picture of ours into a page",
-    "skysim.experiments.study.setups.code_version": SOURCES,
-    "skysim.experiments.study.setups.scene_hash": SOURCES,
-    "skysim.experiments.study.execution.dask_engine.unpacked": OURS,
-    "skysim.experiments.study.execution.runner.begin": "copies the study's text, which `plan.load` has read",
+    "skysim.experiments.study.execution.setups.code_version": SOURCES,
+    "skysim.experiments.study.execution.setups.scene_hash": SOURCES,
+    "skysim.experiments.study.execution.dask_engine.decode_chunk": OURS,
+    "skysim.experiments.study.execution.runner.prepare_store": "copies the study's text, which `plan.load` has read",
     "skysim.tracking.external.host.main": OURS,
-    "skysim.tracking.external.host.picture": OURS,
+    "skysim.tracking.external.host.receive_picture": OURS,
     "skysim.tracking.external.interface.Setup.of_tree": OURS,
     "skysim.dynamics.multibody.view.picture.film": OURS,
-    "skysim.dynamics.multibody.view.picture.paint": OURS,
+    "skysim.dynamics.multibody.view.picture.render_task": OURS,
 }
 
 
@@ -91,8 +90,7 @@ def called() -> set[str]:
             sys.setprofile(None)
     own = [code for code in codes if Path(code.co_filename).is_relative_to(ROOT)]
     return {
-        f"{Path(code.co_filename).relative_to(ROOT).with_suffix('').as_posix().replace('/', '.')}"
-        f".{code.co_qualname}"
+        f"{Path(code.co_filename).relative_to(ROOT).with_suffix('').as_posix().replace('/', '.')}.{code.co_qualname}"
         for code in own
     }
 

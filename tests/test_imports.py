@@ -14,9 +14,7 @@ def module_of(path: Path) -> str:
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
 
-FILES = {
-    module_of(path): path for package in ("skysim", "estimator") for path in (ROOT / package).rglob("*.py")
-}
+FILES = {module_of(path): path for package in ("skysim", "estimator") for path in (ROOT / package).rglob("*.py")}
 
 
 def statements(node: ast.AST) -> Iterator[ast.AST]:
@@ -63,7 +61,7 @@ def test_no_module_imports_itself_by_way_of_others() -> None:
 
 @pytest.mark.parametrize("package", ["skysim", "estimator"])
 def test_no_folder_holds_more_than_a_reader_takes_in(package: str) -> None:
-    """About nine; the flow of skysim itself is ten words long, and a study's plan has two parts more."""
+    """About nine; the flow of skysim itself is ten words long."""
     for folder in {path.parent for path in FILES.values() if path.is_relative_to(ROOT / package)}:
         entries = {path.name for path in folder.iterdir()} - {
             "__init__.py",
@@ -74,4 +72,4 @@ def test_no_folder_holds_more_than_a_reader_takes_in(package: str) -> None:
         assert len(entries) <= MOST.get(folder.relative_to(ROOT).as_posix(), 9), sorted(entries)
 
 
-MOST = {"skysim": 10, "skysim/dynamics": 8, "skysim/experiments/study": 11, "skysim/apps/cli/commands": 10}
+MOST = {"skysim": 10, "skysim/dynamics": 8, "skysim/apps/cli/commands": 10}

@@ -27,9 +27,7 @@ def test_every_public_name_is_there(package: object) -> None:
 
 @pytest.mark.parametrize("package", ["skysim", "estimator"])
 def test_an_import_loads_no_library(package: str) -> None:
-    script = (
-        f"import sys, {package}; print({{'numpy', 'scipy', 'numba', 'mujoco', 'cv2'}} & set(sys.modules))"
-    )
+    script = f"import sys, {package}; print({{'numpy', 'scipy', 'numba', 'mujoco', 'cv2'}} & set(sys.modules))"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "set()"
 

@@ -32,7 +32,7 @@ def by_file(rows):
 def answer(row, fov_error: float) -> dict:
     """What `skysim solve` says of a photograph when told a field of view wrong by so much."""
     fov_deg = float(row["fov_deg_horizontal"] or 10.0) * (1 + fov_error)
-    return plate_solver.solve(FOLDER / row["file"], plate_solver.make_solver(fov_deg, None), None)
+    return plate_solver.solve_file(FOLDER / row["file"], plate_solver.make_solver(fov_deg, None), None)
 
 
 @pytest.fixture(scope="module")
@@ -77,21 +77,21 @@ def test_a_picture_without_stars_is_refused(row):
 @needs_photographs
 @by_file(TO_SOLVE[4:5])
 def test_a_photograph_is_solved_with_its_field_unknown(row, blind):
-    check_right(plate_solver.solve(FOLDER / row["file"], blind, None), row)
+    check_right(plate_solver.solve_file(FOLDER / row["file"], blind, None), row)
 
 
 @pytest.mark.long
 @needs_photographs
 @by_file(TO_SOLVE)
 def test_every_photograph_is_solved_with_its_field_unknown(row, blind):
-    check_right(plate_solver.solve(FOLDER / row["file"], blind, None), row)
+    check_right(plate_solver.solve_file(FOLDER / row["file"], blind, None), row)
 
 
 @pytest.mark.long
 @needs_photographs
 @by_file(NOT_TO_SOLVE + ANY)
 def test_no_photograph_is_answered_wrongly_with_its_field_unknown(row, blind):
-    found = plate_solver.solve(FOLDER / row["file"], blind, None)
+    found = plate_solver.solve_file(FOLDER / row["file"], blind, None)
     right = bool(row["ra_deg"]) and found["status"] == "solved" and errors_deg(found, row)[0] < 0.05
     assert right or found["status"] != "solved"
     assert not found["bad_input"]
@@ -103,7 +103,7 @@ def test_no_photograph_is_answered_wrongly_with_its_field_unknown(row, blind):
 def test_a_photograph_in_a_mirror_is_refused(row, blind):
     """No turn of the sky is its mirror image, so whatever were answered would be wrong."""
     image = images.monochrome(images.read_image(FOLDER / row["file"]))
-    found, _ = plate_solver.look(np.ascontiguousarray(image[:, ::-1]), blind, None)
+    found, _ = plate_solver.solve_array(np.ascontiguousarray(image[:, ::-1]), blind, None)
     assert not found.attitude.solved
     assert len(found.centroids) >= 10
 

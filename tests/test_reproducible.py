@@ -66,7 +66,7 @@ def test_a_loop_is_compiled_alike_whoever_calls_it_first(package: Any) -> None:
 
 LOOPS = """
 from skysim.core import errors
-errors.attended = {attended}
+errors.running_as_command = {attended}
 from skysim.core.jit import jit
 @jit
 def one(x): return x + 1
@@ -98,7 +98,7 @@ def test_a_command_says_once_that_it_compiles_and_nothing_once_it_has(tmp_path: 
             told += os.read(ours, 10_000)
         said.append(told.decode().replace("\r", ""))
         os.close(ours), os.close(theirs)
-    assert re.fullmatch(r"skysim: compiling its loops.*\nend\n", said[0])
+    assert re.fullmatch(r"skysim: compiling numba functions.*\nend\n", said[0])
     assert said[1:] == ["end\n"] * 3
 
 

@@ -55,9 +55,7 @@ def mounted(tmp_path: Path) -> Iterator[Path]:
     """A file system of two megabytes."""
     place = tmp_path / "disk"
     place.mkdir()
-    done = subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", "size=2m", "tmpfs", place], check=False, capture_output=True
-    )
+    done = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=2m", "tmpfs", place], check=False, capture_output=True)
     if done.returncode:
         pytest.skip("nothing can be mounted here")
     yield place
@@ -78,10 +76,10 @@ def test_a_full_disk_is_named_and_what_was_written_is_whole(mounted: Path) -> No
 def flown(tmp_path_factory: pytest.TempPathFactory) -> recording.Recording:
     """Three frames with their truth."""
     folder = tmp_path_factory.mktemp("flown")
-    lab = run.prepare(loader.load("shefex2", {"exposure.frames": "3", "light.limit_mag": "5"}))
-    for frame, truth, _ in run.render_frames(lab):
-        frames.write_frame(folder, frame, truth, lab.scene)
-    return recording.recording(folder)
+    testbed = run.prepare(loader.load("shefex2", {"exposure.frames": "3", "light.limit_mag": "5"}))
+    for frame, truth, _ in run.render_frames(testbed):
+        frames.write_frame(folder, frame, truth, testbed.scene)
+    return recording.open_recording(folder)
 
 
 @contextlib.contextmanager
@@ -135,9 +133,7 @@ def test_a_film_that_lost_frames_is_refused(
             if self.frames < 3:
                 self.film.write(image)
 
-    monkeypatch.setattr(
-        "skysim.results.files.export.cv2.VideoWriter", type("F", (Forgetful,), {"fourcc": film.fourcc})
-    )
+    monkeypatch.setattr("skysim.results.files.export.cv2.VideoWriter", type("F", (Forgetful,), {"fourcc": film.fourcc}))
     with pytest.raises(InputError, match=r"frames\.mp4: OpenCV wrote 2 of 3 frames"):
         export.export(flown, ["video"], tmp_path, lambda items, *_: iter(items))
     assert list(tmp_path.iterdir()) == []
@@ -173,7 +169,7 @@ def test_a_folder_that_cannot_be_written_is_told_in_a_line(mounted: Path) -> Non
         assert done.returncode == 2
         assert (
             done.stderr.splitlines()[-1]
-            == f"skysim: {mounted / 'run'}: cannot be made a folder: Read-only file system"
+            == f"skysim: {mounted / 'run'}: cannot be created as a folder: Read-only file system"
         )
 
 

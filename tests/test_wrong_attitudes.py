@@ -9,7 +9,8 @@ from estimator.core.types import Centroids
 from estimator.trackers.dome_tracker import DomeTracker
 from skysim.results import metrics
 from skysim.scene import loader
-from skysim.simulation import run, testbed
+from skysim.simulation import run
+from skysim.simulation.testbed import build_tracker
 
 FIELDS = 60
 
@@ -17,7 +18,7 @@ FIELDS = 60
 @pytest.fixture(scope="module")
 def afit() -> DomeTracker:
     """The tracker of the AFIT scene: patch boards that repeat one 8 mm lattice all over the dome."""
-    tracker = testbed.tracker(run.prepare(loader.load("afit_simsat", {"exposure.frames": "1"})))
+    tracker = build_tracker(run.prepare(loader.load("afit_simsat", {"exposure.frames": "1"})))
     assert isinstance(tracker, DomeTracker)
     return tracker
 
@@ -29,9 +30,7 @@ def body_from_lab(rng: np.random.Generator) -> Rotation:
     return (lean * Rotation.from_euler("z", yaw)).inv()
 
 
-def field(
-    tracker: DomeTracker, turned: Rotation, missing: float, false: int, rng: np.random.Generator
-) -> Centroids:
+def field(tracker: DomeTracker, turned: Rotation, missing: float, false: int, rng: np.random.Generator) -> Centroids:
     """The LEDs wholly in view but for a share of them, with 0.2 px of noise, and false lights anywhere."""
     pixels = project(turned, tracker.leds.position_m, tracker.lever, tracker.camera)
     pixels = pixels[tracker.camera.contains(np.nan_to_num(pixels, nan=-1e9), 12)]

@@ -1,4 +1,4 @@
-"""The page of the command line, written from the commands themselves whenever the site is built."""
+"""MkDocs hook: write the reference page of the command line from the commands themselves."""
 
 from __future__ import annotations
 
@@ -14,44 +14,46 @@ MARK = "<!-- commands -->"
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
-    """The page with its commands in place of the mark."""
-    return markdown.replace(MARK, told()) if page.file.src_uri == PAGE else markdown
+    """Replace the mark on the page by the commands."""
+    return markdown.replace(MARK, commands_markdown()) if page.file.src_uri == PAGE else markdown
 
 
-def told() -> str:
-    """Every command: a heading, what it does, how it is typed, and a table of what it takes."""
-    return "\n\n".join(section(context) for context in contexts(typer.Context(root(), info_name="skysim")))
+def commands_markdown() -> str:
+    """All commands: heading, description, usage, and a table of the parameters."""
+    return "\n\n".join(
+        section(context) for context in command_contexts(typer.Context(root_command(), info_name="skysim"))
+    )
 
 
-def root() -> Any:
+def root_command() -> Any:
     return typer.main.get_command(app)
 
 
-def contexts(above: Any) -> Iterator[Any]:
-    """A command and all beneath it, in the order of `skysim --help`."""
-    yield above
-    for name, command in getattr(above.command, "commands", {}).items():
-        yield from contexts(typer.Context(command, info_name=name, parent=above))
+def command_contexts(parent: Any) -> Iterator[Any]:
+    """A command and all its subcommands, in the order of `skysim --help`."""
+    yield parent
+    for name, command in getattr(parent.command, "commands", {}).items():
+        yield from command_contexts(typer.Context(command, info_name=name, parent=parent))
 
 
 def section(context: Any) -> str:
-    """One command."""
+    """Section of one command."""
     command = context.command
-    rows = [row(part, context) for part in command.get_params(context) if part.name != "help"]
+    rows = [row(parameter, context) for parameter in command.get_params(context) if parameter.name != "help"]
     name, usage = context.command_path, command.get_usage(context).removeprefix("Usage: ")
-    head = f"{'##' if context.parent is None or context.parent.parent is None else '###'} `{name}`"
-    table = "\n".join(["| it takes | for |", "|---|---|", *rows]) if rows else ""
-    return "\n\n".join(filter(None, [head, command.help or "", f"```text\n{usage}\n```", table]))
+    heading = f"{'##' if context.parent is None or context.parent.parent is None else '###'} `{name}`"
+    table = "\n".join(["| parameter | meaning |", "|---|---|", *rows]) if rows else ""
+    return "\n\n".join(filter(None, [heading, command.help or "", f"```text\n{usage}\n```", table]))
 
 
-def row(part: Any, context: Any) -> str:
-    """An argument or an option: how it is written, and what it is for."""
-    what, meaning = part.get_help_record(context)
-    if part.param_type_name == "argument":
-        what = what.partition(" <")[0]
-    return f"| `{cell(what)}` | {cell(meaning)} |"
+def row(parameter: Any, context: Any) -> str:
+    """Table row of an argument or option: usage and meaning."""
+    usage, meaning = parameter.get_help_record(context)
+    if parameter.param_type_name == "argument":
+        usage = usage.partition(" <")[0]
+    return f"| `{escape_cell(usage)}` | {escape_cell(meaning)} |"
 
 
-def cell(text: str) -> str:
-    """A text in a table: Markdown's and HTML's marks as the letters that they are."""
+def escape_cell(text: str) -> str:
+    """Escape a text for a cell of a Markdown table."""
     return " ".join(text.split()).replace("|", "\\|").replace("*", "\\*")

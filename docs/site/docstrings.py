@@ -1,6 +1,6 @@
-"""Docstrings as they are written here, for Markdown: equations are indented, and `name : meaning` stands on a line.
+"""Griffe extension: convert this project's docstrings (indented equations, lines `name : meaning`) to Markdown.
 
-A section of a scene or study file gains the table of its keys.
+The model of a section of scene or study files gets a table of its keys.
 """
 
 from __future__ import annotations
@@ -27,42 +27,40 @@ class Docstrings(griffe.Extension):
 
     def on_object(self, *, obj: Any, **_: Any) -> None:
         """Called once an object has been read."""
-        told = [] if obj.docstring is None else [markdown(obj.docstring.value)]
+        parts = [] if obj.docstring is None else [to_markdown(obj.docstring.value)]
         if obj.path in SECTIONS:
-            told.append(keys.table(SECTIONS[obj.path]))
-        if told:
-            obj.docstring = griffe.Docstring("\n\n".join(told), parent=obj)
+            parts.append(keys.table(SECTIONS[obj.path]))
+        if parts:
+            obj.docstring = griffe.Docstring("\n\n".join(parts), parent=obj)
 
 
-def markdown(text: str) -> str:
-    """Lists of terms become lists, marks become letters; indented blocks stay the code that they are."""
-    return "\n\n".join(shown(part) for part in re.split(r"\n\s*\n", text))
+def to_markdown(text: str) -> str:
+    """Convert lines `name : meaning` to lists and escape marks; indented blocks stay code."""
+    return "\n\n".join(paragraph_to_markdown(paragraph) for paragraph in re.split(r"\n\s*\n", text))
 
 
-def shown(part: str) -> str:
-    """One paragraph."""
-    lines = part.split("\n")
+def paragraph_to_markdown(paragraph: str) -> str:
+    """Convert one paragraph."""
+    lines = paragraph.split("\n")
     if all(line.startswith("    ") for line in lines):
-        return part
-    out: list[str] = []
-    listed = False
+        return paragraph
+    lines_out: list[str] = []
+    in_list = False
     for line in lines:
         term = TERM.match(line)
         if term:
-            gap = [""] if out and not listed else []
-            out += [*gap, f"- `{term[1].strip()}`: {plain(line[term.end() :])}"]
-            listed = True
-        elif listed and line.startswith(" "):
-            out.append(f"    {plain(line.strip())}")
+            separator = [""] if lines_out and not in_list else []
+            lines_out += [*separator, f"- `{term[1].strip()}`: {escape(line[term.end() :])}"]
+            in_list = True
+        elif in_list and line.startswith(" "):
+            lines_out.append(f"    {escape(line.strip())}")
         else:
-            out += ["", plain(line.strip())] if listed else [plain(line.strip())]
-            listed = False
-    return "\n".join(out)
+            lines_out += ["", escape(line.strip())] if in_list else [escape(line.strip())]
+            in_list = False
+    return "\n".join(lines_out)
 
 
-def plain(text: str) -> str:
-    """Markdown's and HTML's marks outside of code as the letters that they are."""
+def escape(text: str) -> str:
+    """Escape Markdown and HTML outside of code."""
     pieces = CODE.split(text)
-    return "".join(
-        piece if piece[:1] == "`" else MARKS.sub(r"\\\1", piece.replace("<", "&lt;")) for piece in pieces
-    )
+    return "".join(piece if piece[:1] == "`" else MARKS.sub(r"\\\1", piece.replace("<", "&lt;")) for piece in pieces)

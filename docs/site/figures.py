@@ -1,4 +1,4 @@
-"""The figures of the pages on conventions and near stars, drawn from the code's own laws. `make figures` runs it."""
+"""Draw the figures of the pages on conventions and near stars with the simulator's code. `make figures` runs it."""
 
 from __future__ import annotations
 
@@ -22,14 +22,8 @@ from skysim.sources import stars as star_sources
 from skysim.sources.catalog import read
 from skysim.sources.dome import surface
 
-mpl.rcParams.update(
-    {"svg.fonttype": "none", "svg.hashsalt": "skysim", "font.family": "sans-serif", "font.size": 11}
-)
-BARE = {
-    "facecolor": "white",
-    "edgecolor": "none",
-    "pad": 1.0,
-}  # what stands under a label is not seen through it
+mpl.rcParams.update({"svg.fonttype": "none", "svg.hashsalt": "skysim", "font.family": "sans-serif", "font.size": 11})
+LABEL_BOX = {"facecolor": "white", "edgecolor": "none", "pad": 1.0}  # an opaque background for labels
 INK, LAB, BODY, CAM, LIGHT = "#333333", "#666666", "#1f6fb2", "#c0392b", "#d68910"
 ORION = {
     "Betelgeuse": 27989, "Rigel": 24436, "Bellatrix": 25336, "Saiph": 27366,
@@ -39,7 +33,7 @@ ORION = {
 
 def axes(path: Path) -> None:
     """Lab, body and camera axes of SimSat, yawed by 30 and rolled by 20 degrees."""
-    mount = multibody.mount(multibody.build(loader.load("afit_simsat").vehicle))
+    mount = multibody.camera_mount(multibody.build(loader.load("afit_simsat").vehicle))
     lab_from_body = Rotation.from_euler("ZYX", [30, 0, 20], degrees=True)
     lab_from_cam = lab_from_body * mount.cam_from_body.inv()
     camera_m = lab_from_body.apply(mount.camera_body_m)
@@ -54,7 +48,7 @@ def axes(path: Path) -> None:
     )
     fig, ax = plt.subplots(figsize=(6.4, 5.6))
     ax.plot(*np.transpose([np.zeros(2), camera_m @ flat]), color=INK, linestyle=":", linewidth=1.4)
-    for name, lab_from_own, origin_m, colour, length_m in frames:
+    for name, lab_from_own, origin_m, color, length_m in frames:
         begin = origin_m @ flat
         for letter, axis in zip("xyz", lab_from_own.apply(np.eye(3)), strict=True):
             end = begin + length_m * axis @ flat
@@ -62,19 +56,19 @@ def axes(path: Path) -> None:
                 "",
                 end,
                 begin,
-                arrowprops={"arrowstyle": "-|>", "color": colour, "lw": 2, "shrinkA": 0, "shrinkB": 0},
+                arrowprops={"arrowstyle": "-|>", "color": color, "lw": 2, "shrinkA": 0, "shrinkB": 0},
             )
             ax.annotate(
                 f"{name} {letter}",
                 end,
                 (5 if end[0] >= begin[0] - 1e-9 else -5, 3 if end[1] >= begin[1] else -3),
                 textcoords="offset points",
-                color=colour,
+                color=color,
                 ha="left" if end[0] >= begin[0] - 1e-9 else "right",
                 va="center",
             )
     ax.plot(0, 0, "o", color=INK)
-    ax.text(-0.012, -0.012, "bearing's centre", color=INK, ha="right", va="top")
+    ax.text(-0.012, -0.012, "bearing's center", color=INK, ha="right", va="top")
     ax.text(
         *(0.35 * camera_m @ flat - [0.015, 0.0]),
         f"lever {np.linalg.norm(camera_m):.3f} m",
@@ -86,10 +80,10 @@ def axes(path: Path) -> None:
     save(fig, path)
 
 
-def chip() -> Optics:
-    """A small chip behind a lens whose arithmetic is easy: f = 1000 px, principal point (3, 2)."""
+def optics_with_detector() -> Optics:
+    """A small detector and a lens with round numbers: f = 1000 px, principal point (3, 2)."""
     detector = {"quantum_efficiency": 0.5, "full_well_e": 40000, "gain_e_dn": 10, "bits": 12}
-    part = {
+    config = {
         "width_px": 16,
         "height_px": 16,
         "principal_point_px": [3, 2],
@@ -97,29 +91,29 @@ def chip() -> Optics:
         "focal_length": "10 mm",
         "f_number": 2,
     }
-    return Optics.of(CameraConfig.model_validate(part | {"detector": detector}))
+    return Optics.from_camera(CameraConfig.model_validate(config | {"detector": detector}))
 
 
 def pixels(path: Path) -> None:
     """A star drawn by the renderer, in a corner of seven by five pixels."""
-    optics = chip()
-    toward = np.array([[1.3e-3, -0.6e-3, 1.0]])  # 1.3 px right of the boresight, 0.6 px above it
-    toward /= np.linalg.norm(toward)
-    one, image = np.ones(1), np.zeros((16, 16))
+    optics = optics_with_detector()
+    direction = np.array([[1.3e-3, -0.6e-3, 1.0]])  # 1.3 px right of the boresight, 0.6 px above it
+    direction /= np.linalg.norm(direction)
+    ones, image = np.ones(1), np.zeros((16, 16))
     still = Trajectory(np.array([0.0, 1.0]), Rotation.identity(2), np.zeros((2, 3)))
     star = Sources(
         np.array([1]),
-        np.column_stack([toward, [0.0]]),
+        np.column_stack([direction, [0.0]]),
         np.zeros((1, 3)),
-        0 * one,
-        1e9 * one,
-        one,
-        0 * one,
-        one,
-        0 * one,
+        0 * ones,
+        1e9 * ones,
+        ones,
+        0 * ones,
+        ones,
+        0 * ones,
     )
-    seen = render(image, star, optics, still, Mount(np.zeros(3), Rotation.identity()), Window(0.0, 1.0))
-    (x, y), (column, row) = seen.xy_px[0], seen.peak_xy[0]
+    visible = render(image, star, optics, still, Mount(np.zeros(3), Rotation.identity()), Window(0.0, 1.0))
+    (x, y), (column, row) = visible.xy_px[0], visible.peak_xy[0]
     fig, ax = plt.subplots(figsize=(6.4, 4.6))
     ax.imshow(image[:5, :7], cmap="gray_r", vmax=1.6 * image.max())
     ax.set_xticks(np.arange(7))
@@ -136,7 +130,7 @@ def pixels(path: Path) -> None:
         (x, y),
         (x - 3.9, y + 1.5),
         color=CAM,
-        bbox=BARE,
+        bbox=LABEL_BOX,
         arrowprops={"arrowstyle": "-", "color": CAM},
     )
     ax.annotate(
@@ -144,7 +138,7 @@ def pixels(path: Path) -> None:
         (column, row),
         (column - 1.4, row + 3.0),
         color=INK,
-        bbox=BARE,
+        bbox=LABEL_BOX,
         arrowprops={"arrowstyle": "-", "color": INK},
     )
     ax.annotate(
@@ -152,11 +146,11 @@ def pixels(path: Path) -> None:
         (-0.5, -0.5),
         (-0.2, 0.3),
         color=INK,
-        bbox=BARE,
+        bbox=LABEL_BOX,
         arrowprops={"arrowstyle": "-", "color": INK},
     )
     ax.plot(*optics.project(np.array([0.0, 0.0, 1.0])), "x", color=BODY, markersize=9)
-    ax.text(2.8, 2.0, "boresight (3, 2)", color=BODY, ha="right", va="center", bbox=BARE)
+    ax.text(2.8, 2.0, "boresight (3, 2)", color=BODY, ha="right", va="center", bbox=LABEL_BOX)
     ax.set_xlabel("x, right: columns", loc="left")
     ax.xaxis.set_label_position("top")
     ax.set_ylabel("y, down: rows", loc="top")
@@ -167,16 +161,16 @@ def roll(path: Path) -> None:
     """Orion at roll 0 and at roll 30, in the image, with north, east and the image's up."""
     stars = read("hipparcos_hp6.5")
     camera = loader.load("shefex2", {"camera.focal_length": "14 mm"}).camera
-    optics = Optics.of(camera)
+    optics = Optics.from_camera(camera)
     rows = [int(np.flatnonzero(stars.hip == number)[0]) for number in ORION.values()]
-    toward = unit(stars.ra_rad, stars.dec_rad)
-    fig, both = plt.subplots(1, 2, figsize=(9.2, 3.9), layout="constrained")
-    for ax, roll_deg in zip(both, (0, 30), strict=True):
-        look = star_sources.cam_from_icrs(84.0, 0.0, roll_deg)
-        xy = optics.project(look.apply(toward))
-        shown = (stars.v_mag < 5) & (np.abs(xy - camera.centre_px) < camera.centre_px).all(axis=1)
-        ax.scatter(*xy[shown].T, s=2 + 6 * (5 - stars.v_mag[shown]) ** 1.3, color=INK, linewidths=0)
-        for name, place in zip(ORION, optics.project(look.apply(toward[rows])), strict=True):
+    directions = unit(stars.ra_rad, stars.dec_rad)
+    fig, panels = plt.subplots(1, 2, figsize=(9.2, 3.9), layout="constrained")
+    for ax, roll_deg in zip(panels, (0, 30), strict=True):
+        cam_from_icrs = star_sources.cam_from_icrs(84.0, 0.0, roll_deg)
+        xy = optics.project(cam_from_icrs.apply(directions))
+        bright = (stars.v_mag < 5) & (np.abs(xy - camera.center_px) < camera.center_px).all(axis=1)
+        ax.scatter(*xy[bright].T, s=2 + 6 * (5 - stars.v_mag[bright]) ** 1.3, color=INK, linewidths=0)
+        for name, place in zip(ORION, optics.project(cam_from_icrs.apply(directions[rows])), strict=True):
             if name not in ("Alnilam", "Mintaka"):
                 side = -1 if name in ("Betelgeuse", "Alnitak") else 1  # where no arrow and no star stands
                 ax.annotate(
@@ -188,16 +182,16 @@ def roll(path: Path) -> None:
                     color=INK,
                     ha="left" if side > 0 else "right",
                 )
-        middle = np.array(camera.centre_px)
+        middle = np.array(camera.center_px)
         for name, ra_deg, dec_deg in (("N", 84.0, 7.6), ("E", 91.0, 0.0)):
-            end = optics.project(look.apply(unit(*np.radians([[ra_deg], [dec_deg]]))))[0]
+            end = optics.project(cam_from_icrs.apply(unit(*np.radians([[ra_deg], [dec_deg]]))))[0]
             ax.annotate("", end, middle, arrowprops={"arrowstyle": "->", "color": BODY, "lw": 1.8})
             ax.text(*(middle + 1.15 * (end - middle)), name, color=BODY, ha="center", va="center")
         ax.annotate("", middle - [0, 120], middle, arrowprops={"arrowstyle": "->", "color": CAM, "lw": 1.8})
         ax.text(middle[0] - 12, middle[1] - 100, "up (-y)", color=CAM, ha="right", va="center")
         if roll_deg:
             angles = np.radians(np.linspace(0, roll_deg, 30))
-            north = np.arctan2(*(optics.project(look.apply(unit(*np.radians([[84.0], [7.0]]))))[0] - middle))
+            north = np.arctan2(*(optics.project(cam_from_icrs.apply(unit(*np.radians([[84.0], [7.0]]))))[0] - middle))
             arc = middle + 95 * np.column_stack([np.sin(north + angles), np.cos(north + angles)])
             ax.plot(*arc.T, color=LIGHT, linewidth=2)
         ax.set(
@@ -213,16 +207,14 @@ def roll(path: Path) -> None:
 
 def unit(ra_rad: Floats, dec_rad: Floats) -> Floats:
     """(N, 3) unit vectors of right ascensions and declinations."""
-    return np.column_stack(
-        [np.cos(dec_rad) * np.cos(ra_rad), np.cos(dec_rad) * np.sin(ra_rad), np.sin(dec_rad)]
-    )
+    return np.column_stack([np.cos(dec_rad) * np.cos(ra_rad), np.cos(dec_rad) * np.sin(ra_rad), np.sin(dec_rad)])
 
 
 def lever(path: Path) -> None:
     """AFIT's measured dome from the side, the vehicle level and rolled by 20 degrees: why LEDs are no stars."""
     afit = loader.load("afit_simsat")
     dome = surface.build_surface(afit.light.surface)
-    mount = multibody.mount(multibody.build(afit.vehicle))
+    mount = multibody.camera_mount(multibody.build(afit.vehicle))
     fig, ax = plt.subplots(figsize=(9.0, 4.6))
     tilts = np.radians(np.linspace(-60, 60, 241))
     along = np.column_stack([0 * tilts, np.sin(tilts), np.cos(tilts)])
@@ -231,37 +223,37 @@ def lever(path: Path) -> None:
     led = wall[np.argmin(np.abs(tilts - np.radians(8)))]
     ax.plot(*led[1:], "o", color=LIGHT, markersize=8)
     ax.annotate("LED P", led[1:], (6, 8), textcoords="offset points", color=LIGHT)
-    for roll_deg, colour, at_pt, side in ((0.0, BODY, 14, "left"), (20.0, CAM, -14, "right")):
+    for roll_deg, color, at_pt, side in ((0.0, BODY, 14, "left"), (20.0, CAM, -14, "right")):
         lab_from_body = Rotation.from_euler("x", roll_deg, degrees=True)
         camera = lab_from_body.apply(mount.camera_body_m)
         bore = lab_from_body.apply([0.0, 0.0, 1.0])
         ax.plot(
             *np.transpose([np.zeros(3), camera])[1:],
-            color=colour,
+            color=color,
             linewidth=5,
             alpha=0.5,
             solid_capstyle="round",
         )
         ax.plot(
             *np.transpose([camera, dome.meet(camera, bore[None])[0]])[1:],
-            color=colour,
+            color=color,
             linestyle="--",
             linewidth=1,
         )
-        ax.plot(*np.transpose([camera, led])[1:], color=colour, linewidth=1.6)
-        seen = np.degrees(np.arccos((led - camera) @ bore / np.linalg.norm(led - camera)))
-        told = f"roll {roll_deg:.0f}°: the LED {seen:.2f}° off the boresight"
-        ax.annotate(told, camera[1:], (at_pt, -12), textcoords="offset points", color=colour, ha=side)
-    far = np.degrees(np.arctan2(led[1], led[2]))
+        ax.plot(*np.transpose([camera, led])[1:], color=color, linewidth=1.6)
+        angle_deg = np.degrees(np.arccos((led - camera) @ bore / np.linalg.norm(led - camera)))
+        label = f"roll {roll_deg:.0f}°: the LED {angle_deg:.2f}° off the boresight"
+        ax.annotate(label, camera[1:], (at_pt, -12), textcoords="offset points", color=color, ha=side)
+    bearing_angle_deg = np.degrees(np.arctan2(led[1], led[2]))
     ax.plot(*np.transpose([np.zeros(3), led])[1:], color=LAB, linestyle=":", linewidth=1.2)
-    ax.text(0.05, -0.11, f"bearing's centre O: from here it stands at {far:.2f}°", color=LAB)
+    ax.text(0.05, -0.11, f"bearing's center O: from here it stands at {bearing_angle_deg:.2f}°", color=LAB)
     ax.plot(0, 0, "o", color=INK)
     ax.set(aspect="equal", xlabel="lab y (m)", ylabel="lab z (m)", ylim=(-0.2, 1.32), xlim=(-1.35, 1.7))
     save(fig, path)
 
 
 def save(fig: plt.Figure, path: Path) -> None:
-    """The same figure, the same bytes."""
+    """Save a figure without a date, so that equal figures have equal bytes."""
     fig.savefig(path, metadata={"Date": None}, bbox_inches="tight")
     plt.close(fig)
 

@@ -1,4 +1,4 @@
-"""What the site needs beyond Markdown: equations as MathML, and what pages link to outside of docs/.
+"""MkDocs hook: equations as MathML, and pages for files outside of docs/ that pages link to.
 
 Pages are written so that a code host shows them too: equations in ```math fences or $`x`$, links relative to the file.
 """
@@ -20,73 +20,73 @@ BLOCK = re.compile(r'<div class="math">(.*?)</div>', re.DOTALL)
 INLINE = re.compile(r"\$<code>(.*?)</code>\$", re.DOTALL)
 LANGUAGES = {".py": "python", ".yaml": "yaml", ".xml": "xml", ".json": "json", ".csv": "text"}
 
-pages: dict[str, str] = {}  # where a page of Markdown lies in the repository, by its place in the site
+repository_paths: dict[str, str] = {}  # path in the repository of each Markdown page, by its path in the site
 
 
 def on_files(files: Any, config: Any) -> Any:
-    """Whatever a page links to outside of docs/ becomes a page: Markdown as it is, a file's text, a folder's list."""
-    pages.clear()
-    pages.update({file.src_uri: f"docs/{file.src_uri}" for file in files.documentation_pages()})
-    waiting = ["README.md", "CONTRIBUTING.md", "CHANGELOG.md", *pages.values()]
-    seen = set(pages.values())
-    while waiting:
-        path = waiting.pop()
-        if path not in seen:
-            seen.add(path)
-            files.append(File.generated(config, place(path), content=text_of(path)))
+    """Add a page for every linked file or folder outside of docs/: its Markdown, its text or its list of files."""
+    repository_paths.clear()
+    repository_paths.update({file.src_uri: f"docs/{file.src_uri}" for file in files.documentation_pages()})
+    queue = ["README.md", "CONTRIBUTING.md", "CHANGELOG.md", *repository_paths.values()]
+    visited = set(repository_paths.values())
+    while queue:
+        path = queue.pop()
+        if path not in visited:
+            visited.add(path)
+            files.append(File.generated(config, site_path(path), content=page_text(path)))
             if (ROOT / path).suffix == ".md":
-                pages[place(path)] = path
+                repository_paths[site_path(path)] = path
         if (ROOT / path).suffix == ".md":
-            waiting += [there for there in links(path) if there not in seen and not in_site(there)]
+            queue += [linked for linked in linked_paths(path) if linked not in visited and not in_site(linked)]
     return files
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
-    """Links as they are in the repository become links in the site."""
-    here = pages.get(page.file.src_uri)
-    if here is None:
+    """Rewrite links within the repository as links within the site."""
+    page_path = repository_paths.get(page.file.src_uri)
+    if page_path is None:
         return markdown
 
-    def moved(found: re.Match[str]) -> str:
-        there = target(here, found[1])
-        if there is None:
-            return found[0]
-        return f"]({os.path.relpath(place(there), os.path.dirname(page.file.src_uri))}{found[2] or ''})"
+    def rewrite_link(match: re.Match[str]) -> str:
+        linked = link_target(page_path, match[1])
+        if linked is None:
+            return match[0]
+        return f"]({os.path.relpath(site_path(linked), os.path.dirname(page.file.src_uri))}{match[2] or ''})"
 
-    return LINK.sub(moved, markdown)
+    return LINK.sub(rewrite_link, markdown)
 
 
 def on_page_content(html_text: str, **_: Any) -> str:
-    """LaTeX becomes MathML, which browsers draw without a script."""
-    html_text = BLOCK.sub(lambda found: mathml(found[1], "block"), html_text)
-    return INLINE.sub(lambda found: mathml(found[1], "inline"), html_text)
+    """Convert LaTeX to MathML, which browsers draw without a script."""
+    html_text = BLOCK.sub(lambda match: mathml(match[1], "block"), html_text)
+    return INLINE.sub(lambda match: mathml(match[1], "inline"), html_text)
 
 
 def mathml(escaped: str, display: str) -> str:
-    """One equation, as Markdown left it in HTML."""
+    """MathML of one equation from its escaped LaTeX."""
     return convert(html.unescape(escaped).strip(), display=display)
 
 
-def links(path: str) -> list[str]:
-    """What a page links to in the repository."""
+def linked_paths(path: str) -> list[str]:
+    """Paths in the repository that a page links to."""
     text = (ROOT / path).read_text(encoding="utf-8")
-    found = [target(path, link[1]) for link in LINK.finditer(text)]
-    return [there for there in found if there is not None]
+    targets = [link_target(path, link[1]) for link in LINK.finditer(text)]
+    return [linked for linked in targets if linked is not None]
 
 
-def target(here: str, link: str) -> str | None:
-    """A link's file or folder as a path in the repository; None where it is none."""
-    there = os.path.normpath(os.path.join(os.path.dirname(here), link))
-    return there if not there.startswith("..") and (ROOT / there).exists() else None
+def link_target(page_path: str, link: str) -> str | None:
+    """Path in the repository of a link's target; None if it does not exist there."""
+    linked = os.path.normpath(os.path.join(os.path.dirname(page_path), link))
+    return linked if not linked.startswith("..") and (ROOT / linked).exists() else None
 
 
 def in_site(path: str) -> bool:
-    """Whether the site has a file as it is."""
+    """Return True if the site holds the file itself."""
     return path.startswith("docs/") and not path.endswith(".py")
 
 
-def place(path: str) -> str:
-    """Where a file of the repository is in the site."""
+def site_path(path: str) -> str:
+    """Path in the site of a file of the repository."""
     if in_site(path):
         return path.removeprefix("docs/")
     if (ROOT / path).is_dir():
@@ -94,14 +94,14 @@ def place(path: str) -> str:
     return f"source/{path}" if path.endswith(".md") else f"source/{path}.md"
 
 
-def text_of(path: str) -> str:
-    """The page of something outside of docs/."""
-    there = ROOT / path
+def page_text(path: str) -> str:
+    """Markdown text of the page for a file or folder outside of docs/."""
+    source = ROOT / path
     if path.endswith(".md"):
-        return there.read_text(encoding="utf-8")
-    head = f"---\nsearch: {{exclude: true}}\ntitle: {there.name}\n---\n# `{path}`\n\n"
-    if there.is_dir():
-        return head + "\n".join(
-            f"- `{name}`" for name in sorted(part.name for part in there.iterdir() if part.suffix)
+        return source.read_text(encoding="utf-8")
+    heading = f"---\nsearch: {{exclude: true}}\ntitle: {source.name}\n---\n# `{path}`\n\n"
+    if source.is_dir():
+        return heading + "\n".join(
+            f"- `{name}`" for name in sorted(entry.name for entry in source.iterdir() if entry.suffix)
         )
-    return f"{head}`````{LANGUAGES.get(there.suffix, 'text')}\n{there.read_text(encoding='utf-8')}\n`````\n"
+    return f"{heading}`````{LANGUAGES.get(source.suffix, 'text')}\n{source.read_text(encoding='utf-8')}\n`````\n"

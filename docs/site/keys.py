@@ -1,4 +1,4 @@
-"""Tables of a file's keys, from the models that check it: what a key takes, and what stands for it if left out."""
+"""Tables of the keys of scene and study files, from the models that check them: allowed values and defaults."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from skysim.apps.gui.page.forms import in_yaml, plain, unit_of
+from skysim.apps.gui.page.forms import file_value, si_unit, yaml_line
 from skysim.core.units import ConfigModel
-from skysim.experiments.study.plan import Study  # noqa: F401  the other kind of file, whose sections are Parts too
-from skysim.scene.scene import STEM
+from skysim.experiments.study.plan import Study  # noqa: F401  so that `subclasses` finds its sections
+from skysim.scene.scene import NAME_ALIAS
 
 BOUNDS = {"ge": "≥", "minimum": "≥", "gt": ">", "exclusiveMinimum": ">", "le": "≤", "maximum": "≤", "lt": "<"}
 BOUNDS["exclusiveMaximum"] = "<"
@@ -20,70 +20,68 @@ WORDS |= {"null": "null", "object": "a section", "array": "list"}
 
 def sections() -> dict[str, type[BaseModel]]:
     """Every section of scene and study files by its full name."""
-    return {f"{one.__module__}.{one.__qualname__}": one for one in beneath(ConfigModel)}
+    return {f"{section.__module__}.{section.__qualname__}": section for section in subclasses(ConfigModel)}
 
 
-def beneath(model: type[BaseModel]) -> Iterator[type[BaseModel]]:
-    for one in model.__subclasses__():
-        yield one
-        yield from beneath(one)
+def subclasses(model: type[BaseModel]) -> Iterator[type[BaseModel]]:
+    for subclass in model.__subclasses__():
+        yield subclass
+        yield from subclasses(subclass)
 
 
 def table(model: type[BaseModel]) -> str:
-    """A section's keys as a table of Markdown; nothing for a section without any of its own."""
+    """Markdown table of a section's keys; "" for a section without keys."""
     schema = model.model_json_schema(by_alias=True)
-    names = {one.__name__: name for name, one in sections().items()}
+    names = {section.__name__: name for name, section in sections().items()}
     rows = []
     for name, field in model.model_fields.items():
         key = field.alias or name
-        if key == STEM:
+        if key == NAME_ALIAS:
             continue
-        unit = unit_of(name)
-        default = "needed" if field.is_required() else f"`{in_yaml(plain(stood_in(field), unit))}`"
-        taken = words(schema["properties"][key], unit, names).replace("|", "\\|")
-        rows.append(f"| `{key}` | {taken} | {default} |")
-    return "\n".join(["| key | takes | if left out |", "|---|---|---|", *rows]) if rows else ""
+        unit = si_unit(name)
+        default = "required" if field.is_required() else f"`{yaml_line(file_value(default_in_file(field), unit))}`"
+        description = describe(schema["properties"][key], unit, names).replace("|", "\\|")
+        rows.append(f"| `{key}` | {description} | {default} |")
+    return "\n".join(["| key | allowed | default |", "|---|---|---|", *rows]) if rows else ""
 
 
-def stood_in(field: Any) -> Any:
-    """A field's default as the file would have it; of a section what tells its kind."""
+def default_in_file(field: Any) -> Any:
+    """A field's default as written in a file; of a section only what differs from its defaults."""
     value = field.get_default(call_default_factory=True)
     return (
-        value.model_dump(mode="json", by_alias=True, exclude_defaults=True)
-        if isinstance(value, BaseModel)
-        else value
+        value.model_dump(mode="json", by_alias=True, exclude_defaults=True) if isinstance(value, BaseModel) else value
     )
 
 
-def words(node: dict[str, Any], unit: str, names: dict[str, str]) -> str:
-    """What a key takes, in words."""
+def describe(node: dict[str, Any], unit: str, names: dict[str, str]) -> str:
+    """Describe the values that a key allows."""
     choice = node.get("anyOf") or node.get("oneOf") or node.get("allOf")
     if choice:
-        return " or ".join(dict.fromkeys(words(one, unit, names) for one in choice))
+        return " or ".join(dict.fromkeys(describe(option, unit, names) for option in choice))
     if "$ref" in node:
         name = node["$ref"].rpartition("/")[2]
         return f"[{name}][{names[name]}]" if name in names else name
     if "const" in node or "enum" in node:
-        return ", ".join(f"`{one}`" for one in node.get("enum", [node.get("const")]))
+        return ", ".join(f"`{option}`" for option in node.get("enum", [node.get("const")]))
     if node.get("type") == "array":
-        return listed(node, unit, names)
-    told = node.get("description") or WORDS[node.get("type", "object")]
-    return ", ".join([told, *bounds(node, unit)])
+        return describe_list(node, unit, names)
+    description = node.get("description") or WORDS[node.get("type", "object")]
+    return ", ".join([description, *bounds(node, unit)])
 
 
-def listed(node: dict[str, Any], unit: str, names: dict[str, str]) -> str:
-    """A list in words: of so many alike, or of any number."""
-    each = list(dict.fromkeys(words(one, unit, names) for one in node.get("prefixItems", [])))
-    if len(each) == 1:
-        return f"list of {len(node['prefixItems'])}: {each[0]}"
-    if each:
-        return f"list: {'; '.join(each)}"
-    return f"list of any length: {words(node['items'], unit, names)}" if node.get("items") else "list"
+def describe_list(node: dict[str, Any], unit: str, names: dict[str, str]) -> str:
+    """Describe a list of fixed or of any length."""
+    items = list(dict.fromkeys(describe(item, unit, names) for item in node.get("prefixItems", [])))
+    if len(items) == 1:
+        return f"list of {len(node['prefixItems'])}: {items[0]}"
+    if items:
+        return f"list: {'; '.join(items)}"
+    return f"list of any length: {describe(node['items'], unit, names)}" if node.get("items") else "list"
 
 
 def bounds(node: dict[str, Any], unit: str) -> Iterator[str]:
-    """Its limits, in the unit that the value is kept in."""
-    after = f" {unit}" if unit and node.get("type") == "string" else ""
-    for word, sign in BOUNDS.items():
-        if word in node:
-            yield f"{sign} {node[word]:g}{after}"
+    """The limits of a value, in its stored unit."""
+    suffix = f" {unit}" if unit and node.get("type") == "string" else ""
+    for keyword, symbol in BOUNDS.items():
+        if keyword in node:
+            yield f"{symbol} {node[keyword]:g}{suffix}"

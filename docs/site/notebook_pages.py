@@ -13,23 +13,23 @@ from mkdocs.structure.files import File, Files
 def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Add the pages: notebooks/NAME.md from notebooks/NAME.ipynb."""
     for path in sorted(Path(config.docs_dir, "notebooks").glob("*.ipynb")):
-        files.append(File.generated(config, f"notebooks/{path.stem}.md", content=markdown(path)))
+        files.append(File.generated(config, f"notebooks/{path.stem}.md", content=notebook_markdown(path)))
     return files
 
 
-def markdown(path: Path) -> str:
+def notebook_markdown(path: Path) -> str:
     """A notebook as Markdown: text cells as they are, code in fences, outputs below their cell."""
     notebook = json.loads(path.read_text(encoding="utf-8"))
     parts = []
     for cell in notebook["cells"]:
         source = "".join(cell["source"])
         parts.append(source if cell["cell_type"] == "markdown" else f"```python\n{source}\n```")
-        parts += [shown(output) for output in cell.get("outputs", ())]
+        parts += [output_markdown(output) for output in cell.get("outputs", ())]
     parts.insert(1, f"[Download the notebook]({path.name})")
     return "\n\n".join(part for part in parts if part)
 
 
-def shown(output: dict[str, Any]) -> str:
+def output_markdown(output: dict[str, Any]) -> str:
     """One output: HTML, a picture or text."""
     data = output.get("data", {})
     if "text/html" in data:

@@ -1,4 +1,4 @@
-"""The pages' pictures, from what `make demo` left in out/ and from frames of its own. `make pictures` runs it."""
+"""Make the pictures of the pages from the output of `make demo` and from new frames. `make pictures` runs it."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ from skysim.core import files
 from skysim.dynamics.multibody.view.picture import picture
 from skysim.results import report, telemetry_report
 from skysim.scene import loader
-from skysim.simulation import exposure, run, testbed
+from skysim.simulation import exposure, run
+from skysim.simulation.testbed import export_mjcf
 
 IMAGES = Path(__file__).parents[1] / "images"
 OUT = Path(__file__).parents[2] / "out"
@@ -20,7 +21,7 @@ WINDOW = (slice(196, 296), slice(279, 379))  # the middle hundred pixels
 
 
 def frame(rate_deg_s: float):  # type: ignore[no-untyped-def]
-    """One 50 ms exposure whose middle looks at the Pleiades, turning about the image's vertical."""
+    """One 50 ms exposure of the Pleiades, rotating about the image's vertical axis."""
     overrides = {
         "motion.start": "{ra_deg: 56.87, dec_deg: 24.1, roll_deg: 0}",
         "motion.rate_deg_s": f"[0, {rate_deg_s}, 0]",
@@ -36,32 +37,32 @@ def main() -> None:
         width = 1200
         size = (width, round(width * annotated.shape[0] / annotated.shape[1]))
         files.write_image(IMAGES / f"{name}.jpg", cv2.resize(annotated, size, interpolation=cv2.INTER_AREA))
-    lab = run.prepare(loader.load("simsat_slew"))
-    drawn = picture(testbed.export_mjcf(lab), lab.log.joints[700])
-    files.write_image(IMAGES / "lab.jpg", drawn[:, :, ::-1])
+    testbed = run.prepare(loader.load("simsat_slew"))
+    rendered = picture(export_mjcf(testbed), testbed.log.joints[700])
+    files.write_image(IMAGES / "lab.jpg", rendered[:, :, ::-1])
     (IMAGES / "bump.png").write_bytes(telemetry_report.figure(run.prepare(loader.load("simsat_bump")).log))
-    shots = [frame(rate) for rate in RATES_DEG_S]
+    exposures = [frame(rate) for rate in RATES_DEG_S]
     captions = [
-        f"{rate} deg/s, {truth.seen.streak_px.max():.1f} px"
-        for rate, (_, truth) in zip(RATES_DEG_S, shots, strict=True)
+        f"{rate} deg/s, {truth.sources.streak_px.max():.1f} px"
+        for rate, (_, truth) in zip(RATES_DEG_S, exposures, strict=True)
     ]
-    sheet = report.contact_sheet([shot.image_dn[WINDOW] for shot, _ in shots], captions, scale=3)
+    sheet = report.contact_sheet([image.image_dn[WINDOW] for image, _ in exposures], captions, scale=3)
     files.write_image(IMAGES / "smear.png", sheet)
-    pages()
+    screenshots()
 
 
-def pages() -> None:
-    """The lab's page under the sky, and a slew under the dome as it is played."""
+def screenshots() -> None:
+    """Screenshots of the GUI: a sky scene, and the playback of a slew under the dome."""
     from playwright.sync_api import sync_playwright
 
-    from benchmarks.lab import chromium, served
+    from benchmarks.gui import chromium, served
 
     with served("shefex2") as url, sync_playwright() as driver:
         browser = driver.chromium.launch(executable_path=chromium(), args=["--no-sandbox"])
         page = browser.new_page(viewport={"width": 1440, "height": 860})
         page.goto(url)
         page.locator(".lab-card .good").wait_for(timeout=90_000)
-        page.wait_for_timeout(3000)  # the first look clears what was clicked before
+        page.wait_for_timeout(3000)  # the first frame clears earlier clicks
         box = page.locator(".lab-frame canvas").bounding_box()
         page.mouse.click(box["x"] + 0.71 * box["width"], box["y"] + 0.186 * box["height"])  # Bellatrix
         page.wait_for_timeout(3000)
@@ -70,7 +71,7 @@ def pages() -> None:
         page.get_by_role("option", name="simsat_slew").click()
         page.get_by_text("SimSat slews on its reaction wheels").wait_for(timeout=90_000)
         page.get_by_role("tab", name="Run").click()
-        page.get_by_role("button", name="Fly").click()
+        page.get_by_role("button", name="Simulate").click()
         page.get_by_text(re.compile(r"^2\d\.\d\d s$")).wait_for(timeout=180_000)
         page.screenshot(path=IMAGES / "lab_run.jpg", quality=85)
         browser.close()

@@ -9,10 +9,10 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-from skysim.apps.cli.commands.study import total
+from skysim.apps.cli.study_summary import trial_count
 from skysim.experiments.study import store
 from skysim.experiments.study.analysis import search, sensitivity, table
-from skysim.experiments.study.analysis.table import Line
+from skysim.experiments.study.analysis.table import PointRow
 from skysim.experiments.study.loader import load
 from skysim.experiments.study.plan import STUDIES, Curve, Figure, Plan
 from skysim.experiments.study.report import figures as study_figures
@@ -20,129 +20,133 @@ from skysim.experiments.study.report import layout
 from skysim.experiments.study.store import STORE, Store
 
 PAGES = Path(__file__).parents[1] / "findings" / "studies"
-MOST = 72  # lines of a table that is printed whole
+MAX_TABLE_ROWS = 72  # longer tables are left out
 
 
 def main(folder: Path) -> None:
-    """A page for every study that is there."""
+    """Write a page for every study with a complete store."""
     PAGES.mkdir(exist_ok=True)
     for path in sorted(STUDIES.glob("*.yaml")):
-        told = load(path)
-        where = folder / told.name / STORE
-        if not where.is_file():
-            print(f"{where}: not there; left as it was")
+        plan = load(path)
+        store_path = folder / plan.name / STORE
+        if not store_path.is_file():
+            print(f"{store_path}: no such store; page not changed")
             continue
-        with store.open_store(where) as kept:
-            unfinished = kept.counts()["done"] < total(told)
-            if kept.meta("digest") != told.digest or unfinished:
-                print(f"{where}: not finished, or of another version of the study; left as it was")
+        with store.open_store(store_path) as trial_store:
+            unfinished = trial_store.counts()["done"] < trial_count(plan)
+            if trial_store.meta("digest") != plan.digest or unfinished:
+                print(f"{store_path}: not finished, or of another version of the study; page not changed")
                 continue
-            (PAGES / f"{told.name}.md").write_text("\n".join(page(told, kept)) + "\n", encoding="utf-8")
-        print(PAGES / f"{told.name}.md")
+            (PAGES / f"{plan.name}.md").write_text("\n".join(page(plan, trial_store)) + "\n", encoding="utf-8")
+        print(PAGES / f"{plan.name}.md")
 
 
-def page(told: Plan, kept: Store) -> Iterator[str]:
-    """A study's page, line by line; its pictures are written beside it."""
-    study, name, counts = told.study, told.name, kept.counts()
-    verb = "optimise" if study.optimise else "run"
-    question = [line[2:] for line in told.path.read_text("utf-8").splitlines() if line.startswith("# ")]
+def page(plan: Plan, trial_store: Store) -> Iterator[str]:
+    """Yield a study's page line by line; write its figures beside it."""
+    study, name, counts = plan.study, plan.name, trial_store.counts()
+    verb = "optimize" if study.optimize else "run"
+    question = [line[2:] for line in plan.path.read_text("utf-8").splitlines() if line.startswith("# ")]
     yield f"# {study.title}\n\n" + " ".join(question)
     yield f"\n```sh\nskysim study {verb} {name}\n```\n"
-    seconds, cores = sum(run["seconds"] for run in kept.runs()), max(run["workers"] for run in kept.runs())
+    runs = trial_store.runs()
+    seconds, cores = sum(run["seconds"] for run in runs), max(run["workers"] for run in runs)
     effort = f"{seconds:.0f} s on {cores} {'core' if cores == 1 else 'cores'}"
     yield (
         f"{counts['done']} trials, {counts['failed']} failed, in {effort}; scene"
         f" `{study.scene}`, seed {study.seed}. What is varied:"
-        f" [`{told.path.name}`](../../../scenes/studies/{told.path.name}). Intervals are of 95 %.\n"
+        f" [`{plan.path.name}`](../../../scenes/studies/{plan.path.name}). Intervals are of 95 %.\n"
     )
-    lines = table.table(kept, study.responses)
-    if study.optimise:
-        yield from searched(told, kept, lines)
+    lines = table.table(trial_store, study.responses)
+    if study.optimize:
+        yield from search_section(plan, trial_store, lines)
     elif study.design.kind == "saltelli":
-        yield from budgeted(told, kept)
+        yield from sobol_section(plan, trial_store)
     for n, figure in enumerate(study.figures):
         picture = f"{name}_{n + 1}.png"
         (PAGES / picture).write_bytes(study_figures.figure_png(lines, figure, study))
         yield f"![{figure.kind}]({picture})\n\n*{layout.caption(figure, study, lines)}*\n"
-        yield from pivot(figure, lines, told)
-    if len(lines) <= MOST and study.design.kind != "saltelli" and not study.optimise:
-        yield from whole(lines)
+        yield from pivot_table(figure, lines, plan)
+    if len(lines) <= MAX_TABLE_ROWS and study.design.kind != "saltelli" and not study.optimize:
+        yield from full_table(lines)
 
 
-def pivot(figure: Figure, lines: list[Line], told: Plan) -> Iterator[str]:
+def pivot_table(figure: Figure, lines: list[PointRow], plan: Plan) -> Iterator[str]:
     """A figure's numbers: its x across, the other factor down."""
-    across = layout.axis(told.study, lines, figure.x)
+    across = layout.axis(plan.study, lines, figure.x)
     other = figure.by if isinstance(figure, Curve) else figure.y
     name = figure.y if isinstance(figure, Curve) else figure.value
-    chosen = layout.kept(lines, figure, told.study)
-    down = layout.axis(told.study, lines, other) if other else None
-    yield markdown([f"{name}: {across.label}", *(across.told(one) for one in across.levels)])
-    yield markdown(["---"] * (1 + len(across.levels)))
+    chosen = layout.shown_points(lines, figure, plan.study)
+    down = layout.axis(plan.study, lines, other) if other else None
+    yield markdown_row([f"{name}: {across.label}", *(across.tick_label(x) for x in across.levels)])
+    yield markdown_row(["---"] * (1 + len(across.levels)))
     for level in down.levels if down else [None]:
         row = [line for line in chosen if other is None or layout.same(line.levels[other], level)]
         cells = [
-            next(
-                table.figure(line.responses[name]) for line in row if layout.same(line.levels[figure.x], one)
-            )
-            for one in across.levels
+            next(table.format_summary(line.responses[name]) for line in row if layout.same(line.levels[figure.x], x))
+            for x in across.levels
         ]
-        yield markdown([down.told(level) if down else "", *cells])
+        yield markdown_row([down.tick_label(level) if down else "", *cells])
     yield ""
 
 
-def whole(lines: list[Line]) -> Iterator[str]:
+def full_table(lines: list[PointRow]) -> Iterator[str]:
     """The table of all points."""
     heads, cells = table.cells(lines)
-    yield markdown(heads[1:])
-    yield markdown(["---"] * (len(heads) - 1))
-    yield from (markdown(line[1:]) for line in cells[:MOST])
+    yield markdown_row(heads[1:])
+    yield markdown_row(["---"] * (len(heads) - 1))
+    yield from (markdown_row(line[1:]) for line in cells[:MAX_TABLE_ROWS])
     yield ""
 
 
-def budgeted(told: Plan, kept: Store) -> Iterator[str]:
-    """Sobol indices as pictures and as a table, the worst offender first."""
-    found = sensitivity.indices(told, kept)
+def sobol_section(plan: Plan, trial_store: Store) -> Iterator[str]:
+    """Figures and tables of the Sobol indices, largest total index first."""
+    indices = sensitivity.indices(plan, trial_store)
     for response in sensitivity.AXES:
-        picture = f"{told.name}_{response}.png"
-        (PAGES / picture).write_bytes(study_figures.indices_png(found, response))
+        picture = f"{plan.name}_{response}.png"
+        (PAGES / picture).write_bytes(study_figures.indices_png(indices, response))
         yield f"![Sobol indices]({picture})\n"
-        yield markdown([response, "alone, rms ″", "first-order index", "total index"])
-        yield markdown(["---"] * 4)
-        own = sorted((one for one in found if one.response == response), key=lambda one: -one.total.value)
-        for one in own:
-            figures = [table.figure(one.first), table.figure(one.total)]
-            yield markdown([one.factor, f"{one.rms_arcsec:.3g}", *figures])
+        yield markdown_row([response, "alone, rms ″", "first-order index", "total index"])
+        yield markdown_row(["---"] * 4)
+        ranked = sorted(
+            (index for index in indices if index.response == response), key=lambda index: -index.total.value
+        )
+        for index in ranked:
+            figures = [table.format_summary(index.first), table.format_summary(index.total)]
+            yield markdown_row([index.factor, f"{index.rms_arcsec:.3g}", *figures])
         yield ""
 
 
-def searched(told: Plan, kept: Store, lines: list[Line]) -> Iterator[str]:
+def search_section(plan: Plan, trial_store: Store, lines: list[PointRow]) -> Iterator[str]:
     """The front of a search, and a picture of it."""
-    assert told.study.optimise is not None
-    found = search.found(told, kept)
-    costs = {one.number: one.cost for one in found.candidates}
-    panels = layout.panels(lines, told.study.optimise, costs)
-    names = [one.response for one in told.study.optimise.objectives]
-    picture = f"{told.name}.png"
-    points, front = [line.point for line in lines], [one.number for one in found.front]
-    drawn = study_figures.pareto_png(panels[names[0]], panels[names[-1]], points, front)
-    (PAGES / picture).write_bytes(drawn)
+    assert plan.study.optimize is not None
+    result = search.collect_result(plan, trial_store)
+    costs = {candidate.number: candidate.cost for candidate in result.candidates}
+    panels = layout.panels(lines, plan.study.optimize, costs)
+    names = [candidate.response for candidate in plan.study.optimize.objectives]
+    picture = f"{plan.name}.png"
+    points, front = [line.point for line in lines], [candidate.number for candidate in result.front]
+    png = study_figures.pareto_png(panels[names[0]], panels[names[-1]], points, front)
+    (PAGES / picture).write_bytes(png)
     yield f"![Pareto front]({picture})\n"
-    feasible = sum(one.feasible for one in found.candidates)
-    yield f"{len(found.candidates)} candidates, {feasible} of them feasible; the front:\n"
-    rest = [name for name in found.front[0].figures if name not in names] if found.front else []
-    yield markdown(["candidate", *told.study.factors, *names, *rest])
-    yield markdown(["---"] * (1 + len(told.study.factors) + len(names) + len(rest)))
-    for one in found.front:
+    feasible = sum(candidate.feasible for candidate in result.candidates)
+    yield f"{len(result.candidates)} candidates, {feasible} of them feasible; the front:\n"
+    other_figures = [name for name in result.front[0].figures if name not in names] if result.front else []
+    yield markdown_row(["candidate", *plan.study.factors, *names, *other_figures])
+    yield markdown_row(["---"] * (1 + len(plan.study.factors) + len(names) + len(other_figures)))
+    for candidate in result.front:
         cells = [
-            table.figure(one.figures[name]) if name in one.figures else f"{one.cost:.4g}" for name in names
+            table.format_summary(candidate.figures[name]) if name in candidate.figures else f"{candidate.cost:.4g}"
+            for name in names
         ]
-        more = [table.figure(one.figures[name]) for name in rest]
-        yield markdown([str(one.number), *map(table.level, one.levels.values()), *cells, *more])
+        other_cells = [table.format_summary(candidate.figures[name]) for name in other_figures]
+        yield markdown_row(
+            [str(candidate.number), *map(table.format_level, candidate.levels.values()), *cells, *other_cells]
+        )
     yield ""
 
 
-def markdown(cells: list[str]) -> str:
-    """A line of a table."""
+def markdown_row(cells: list[str]) -> str:
+    """A row of a Markdown table."""
     return "| " + " | ".join(cells) + " |"
 
 

@@ -23,14 +23,14 @@ class LedMap:
 
     id         : (N,)
     position_m : (N, 3)
-    centre_m, semi_axes_m : (3,) the ellipsoid |(x - centre) / semi_axes| = 1 that the LEDs are on
+    center_m, semi_axes_m : (3,) the ellipsoid |(x - center) / semi_axes| = 1 that the LEDs are on
     board      : (N,) label of the patch board of each LED, as all boards have the same pattern; None without boards
     sigma_m    : standard deviation of an LED's position along each axis
     """
 
     id: Ints
     position_m: Floats
-    centre_m: Floats
+    center_m: Floats
     semi_axes_m: Floats
     board: Ints | None = None
     sigma_m: float = 0.0
@@ -56,25 +56,25 @@ def on_sphere(rays_body: Floats, camera_body_m: Floats, radius_m: float) -> Floa
     attitude. Raises ValueError if the camera is outside the sphere.
     """
     along = rays_body @ camera_body_m
-    under_root = along**2 - camera_body_m @ camera_body_m + radius_m**2
+    discriminant = along**2 - camera_body_m @ camera_body_m + radius_m**2
     if radius_m <= np.linalg.norm(camera_body_m):
         raise ValueError(
-            f"the camera, {np.linalg.norm(camera_body_m)} m out, is not inside radius {radius_m} m"
+            f"camera {np.linalg.norm(camera_body_m)} m from the bearing; allowed: inside the sphere of {radius_m} m"
         )
-    return camera_body_m + (-along + np.sqrt(under_root))[:, None] * rays_body
+    return camera_body_m + (-along + np.sqrt(discriminant))[:, None] * rays_body
 
 
 def on_surface(rays_lab: Floats, origin_lab_m: Floats, leds: LedMap) -> Floats:
     """Return (N, 3) intersections of rays from inside with the believed ellipsoid, in the lab frame; NaN if none.
 
-    In scaled coordinates w = (x - centre) / semi_axes the surface is |w| = 1: a quadratic equation for the distance.
+    In scaled coordinates w = (x - center) / semi_axes the surface is |w| = 1: a quadratic equation for the distance.
     """
-    start = (origin_lab_m - leds.centre_m) / leds.semi_axes_m
+    start = (origin_lab_m - leds.center_m) / leds.semi_axes_m
     along = rays_lab / leds.semi_axes_m
     a = np.sum(along**2, axis=1)
     b = along @ start
-    root = b**2 - a * (start @ start - 1)
-    distance = np.where(root >= 0, (-b + np.sqrt(np.maximum(root, 0))) / a, np.nan)
+    discriminant = b**2 - a * (start @ start - 1)
+    distance = np.where(discriminant >= 0, (-b + np.sqrt(np.maximum(discriminant, 0))) / a, np.nan)
     return origin_lab_m + distance[:, None] * rays_lab
 
 
@@ -87,8 +87,8 @@ def project(body_from_lab: Rotation, position_m: Floats, lever: Lever, camera: C
 def check_lever(leds: LedMap, lever: Lever) -> None:
     """Raise ImageError unless the lever arm is shorter than the distance of the nearest LED."""
     nearest = np.linalg.norm(leds.position_m, axis=1).min()
-    reach = np.linalg.norm(lever.camera_body_m)
-    if reach >= nearest:
+    lever_m = np.linalg.norm(lever.camera_body_m)
+    if lever_m >= nearest:
         raise ImageError(
-            f"the camera is believed {reach:.3f} m from the bearing, the nearest LED {nearest:.3f} m"
+            f"camera {lever_m:.3f} m from the bearing; allowed: less than the nearest LED's {nearest:.3f} m"
         )

@@ -13,7 +13,7 @@ position in the lab frame and c the camera's position in the body frame. The met
 All have the same signature. Each takes
 
 rays_cam      : (N, 3) unit vectors in camera axes
-sigma_rad     : (N,) their standard deviation per axis; for the methods of OF_TANGENTS, that of their tangents
+sigma_rad     : (N,) their standard deviation per axis; for the methods in TANGENT_SOLVERS, that of their tangents
 position_m    : (N, 3) position of each ray's LED in the lab frame
 leds, lever   : the believed surface and the believed position of the camera
 body_from_lab : the initial attitude; not used by infinity and thesis
@@ -47,6 +47,11 @@ __all__ = [
 ]
 
 
+# Largest number of iterations of tappe and ray_on_surface, and the rotation below which they stop.
+MAX_UPDATES = 20
+CONVERGED_RAD = 1e-13
+
+
 def rotation_only(
     rays_cam: Floats,
     sigma_rad: Floats,
@@ -74,17 +79,19 @@ def rotation_only(
         step, _, rank, _ = np.linalg.lstsq(jacobian, residual, rcond=None)
         # Rank 2: the LEDs lie in one direction from the bearing, about which any rotation fits.
         if rank < 3:
-            raise ValueError(f"{len(rays_cam)} lights leave a turn unknown; two apart are needed")
+            raise ValueError(
+                f"{len(rays_cam)} rays do not determine a rotation; two LEDs in different directions are needed"
+            )
         body_from_lab = cam_from_body.inv() * Rotation.from_rotvec(step) * cam_from_body * body_from_lab
         if np.linalg.norm(step) < 1e-15:
             break
     if not np.linalg.norm(step) < 1e-9:
-        raise ValueError(f"the rotation-only solve still moved by {np.linalg.norm(step):.1e} rad")
+        raise ValueError(f"rotation_only: not converged, last step {np.linalg.norm(step):.1e} rad")
     covariance_cam = np.linalg.inv(jacobian.T @ jacobian)
     return body_from_lab, _in_body_axes(covariance_cam, lever)
 
 
-def _tangent_slopes(q: Floats) -> Floats:
+def _tangent_gradients(q: Floats) -> Floats:
     """Return the (N, 2, 3) derivative of the tangents (q_x / q_z, q_y / q_z) with respect to q."""
     inverse_z = 1 / q[:, 2]
     zero = np.zeros_like(inverse_z)
@@ -96,7 +103,7 @@ def _tangent_slopes(q: Floats) -> Floats:
 def _jacobian(b: Floats, q: Floats) -> Floats:
     """Return the (2 N, 3) derivative of the tangents of q = b - r by a small rotation w of b: dq = w x b."""
     # d . (w x b) = w . (b x d)
-    return np.cross(b[:, None, :], _tangent_slopes(q)).reshape(-1, 3)
+    return np.cross(b[:, None, :], _tangent_gradients(q)).reshape(-1, 3)
 
 
 def _in_body_axes(covariance_cam: np.ndarray, lever: Lever) -> Floats:
@@ -104,52 +111,52 @@ def _in_body_axes(covariance_cam: np.ndarray, lever: Lever) -> Floats:
     return R_body_from_cam @ covariance_cam @ R_body_from_cam.T
 
 
-def _wahba(point_body_m: Floats, reach_m: Floats, sigma_rad: Floats, position_m: Floats) -> Rotation:
+def _wahba(point_body_m: Floats, distance_m: Floats, sigma_rad: Floats, position_m: Floats) -> Rotation:
     """Solve body_from_lab from points in body axes and in the lab, by their directions from the bearing center.
 
-    reach_m : (N,) distance of each point from the camera
-    A ray error of sigma at the camera displaces the point by sigma * reach, and its direction from the center by
-    sigma * reach / radius, which sets the weights.
+    distance_m : (N,) distance of each point from the camera
+    A ray error of sigma at the camera displaces the point by sigma * distance, and its direction from the center by
+    sigma * distance / radius, which sets the weights.
     """
     radius = np.linalg.norm(point_body_m, axis=1)
     target = position_m / np.linalg.norm(position_m, axis=1, keepdims=True)
-    return quest(point_body_m / radius[:, None], target, sigma_rad * reach_m / radius)
+    return quest(point_body_m / radius[:, None], target, sigma_rad * distance_m / radius)
 
 
-def _wahba_covariance(
+def _with_covariance(
     body_from_lab: Rotation,
     point_body_m: Floats,
-    reach_m: Floats,
+    distance_m: Floats,
     sigma_rad: Floats,
     position_m: Floats,
     rays_body: Floats,
-    slope_m: Floats,
-    gain_m: Floats | float = 0.0,
-) -> Floats:
-    """Return the (3, 3) covariance in body axes of the solution of _wahba, from the noise of the rays.
+    by_ray_m: Floats,
+    by_rotation_m: Floats | float = 0.0,
+) -> tuple[Rotation, Floats]:
+    """Return a solution of _wahba with its (3, 3) covariance in body axes, from the noise of the rays.
 
-    slope_m : (N, 3, 3) dp/du, the derivative of a point p with respect to its ray u
-    gain_m  : (N, 3) derivative of the point's distance along u with respect to the attitude; 0 where the method does
-        not use the attitude to place the point
+    by_ray_m      : (N, 3, 3) dp/du, the derivative of a point p with respect to its ray u
+    by_rotation_m : (N, 3) derivative of the point's distance along u with respect to the attitude; 0 where the method
+        does not use the attitude to place the point
 
     At the minimum of Wahba's loss the gradient vanishes, sum(k a x d) = 0 with a = A P / |P|, d = p / |p| and weight k.
     To first order, ray noise du causes a rotation w that keeps it zero:
-    sum(k [(a.d) I - a d']) w = sum(k a x (I - d d') dp / |p|), dp = slope du + u (gain . w). Derived here.
+    sum(k [(a.d) I - a d']) w = sum(k a x (I - d d') dp / |p|), dp = by_ray du + u (by_rotation . w). Derived here.
     """
     radius = np.linalg.norm(point_body_m, axis=1)
     d = point_body_m / radius[:, None]
     a = body_from_lab.apply(position_m / np.linalg.norm(position_m, axis=1, keepdims=True))
-    weight = (radius / (sigma_rad * reach_m)) ** 2
-    sideways = np.eye(3) - np.einsum("ni,nj->nij", d, d)
-    # Columns: the change of a point's term k a x d by a shift along each axis.
-    torque = np.cross(a[:, None, :], np.swapaxes(sideways, 1, 2)).swapaxes(1, 2)
-    torque *= (weight / radius)[:, None, None]
-    pull = np.einsum("nij,nj->ni", torque, rays_body)
-    stiffness = np.eye(3) * (weight * np.sum(a * d, axis=1)).sum() - (weight[:, None] * a).T @ d
-    stiffness -= pull.T @ (gain_m * np.ones_like(pull))
+    weight = (radius / (sigma_rad * distance_m)) ** 2
+    across_point = np.eye(3) - np.einsum("ni,nj->nij", d, d)
+    # Columns: derivative of a point's term k a x d, of the loss's gradient, by a shift along each axis.
+    gradient = np.cross(a[:, None, :], np.swapaxes(across_point, 1, 2)).swapaxes(1, 2)
+    gradient *= (weight / radius)[:, None, None]
+    gradient_along_ray = np.einsum("nij,nj->ni", gradient, rays_body)
+    hessian = np.eye(3) * (weight * np.sum(a * d, axis=1)).sum() - (weight[:, None] * a).T @ d
+    hessian -= gradient_along_ray.T @ (by_rotation_m * np.ones_like(gradient_along_ray))
     across_ray = np.eye(3) - np.einsum("ni,nj->nij", rays_body, rays_body)
-    turn = np.linalg.solve(stiffness, torque @ slope_m @ across_ray) * sigma_rad[:, None, None]
-    return np.einsum("nij,nkj->ik", turn, turn)
+    response = np.linalg.solve(hessian, gradient @ by_ray_m @ across_ray) * sigma_rad[:, None, None]
+    return body_from_lab, np.einsum("nij,nkj->ik", response, response)
 
 
 def infinity(
@@ -170,10 +177,8 @@ def infinity(
     rays = lever.cam_from_body.inv().apply(rays_cam)
     at_infinity = np.ones(len(rays))
     body_from_lab = _wahba(rays, at_infinity, sigma_rad, position_m)
-    slope = np.tile(np.eye(3), (len(rays), 1, 1))
-    return body_from_lab, _wahba_covariance(
-        body_from_lab, rays, at_infinity, sigma_rad, position_m, rays, slope
-    )
+    by_ray_m = np.tile(np.eye(3), (len(rays), 1, 1))
+    return _with_covariance(body_from_lab, rays, at_infinity, sigma_rad, position_m, rays, by_ray_m)
 
 
 def thesis_points(rays_cam: Floats, leds: LedMap, lever: Lever, sine: bool = False) -> tuple[Floats, float]:
@@ -181,19 +186,17 @@ def thesis_points(rays_cam: Floats, leds: LedMap, lever: Lever, sine: bool = Fal
 
     R is the height of the believed surface above the bearing, M the camera's distance from the bearing along the
     boresight.
-    sine : correct the error in eq. 43, (x, y) = (R - M) sin a: the point is then on its ray, R - M from the camera
+    sine    : correct the error in eq. 43, (x, y) = (R - M) sin a: the point is then on its ray, R - M from the camera
     Raises ValueError if eq. 44 has no root.
     """
     boresight_body = lever.cam_from_body.inv().apply([0.0, 0.0, 1.0])
     height_m = on_surface(np.array([[0.0, 0.0, 1.0]]), np.zeros(3), leds)[0, 2]
-    reach_m = float(height_m - lever.camera_body_m @ boresight_body)
-    across_m = reach_m * (rays_cam[:, :2] if sine else rays_cam[:, :2] / rays_cam[:, 2:])
-    along2_m2 = reach_m**2 - np.sum(across_m**2, axis=1)
-    if not (reach_m > 0 and np.all(along2_m2 > 0)):
-        raise ValueError(
-            f"eq. 44 has no root: a ray is 45 deg off the boresight, or R - M is {reach_m:.3f} m"
-        )
-    return np.column_stack([across_m, np.sqrt(along2_m2)]), reach_m
+    distance_m = float(height_m - lever.camera_body_m @ boresight_body)
+    across_m = distance_m * (rays_cam[:, :2] if sine else rays_cam[:, :2] / rays_cam[:, 2:])
+    along2_m2 = distance_m**2 - np.sum(across_m**2, axis=1)
+    if not (distance_m > 0 and np.all(along2_m2 > 0)):
+        raise ValueError(f"eq. 44 has no root: a ray is 45 deg off the boresight, or R - M is {distance_m:.3f} m")
+    return np.column_stack([across_m, np.sqrt(along2_m2)]), distance_m
 
 
 def thesis(
@@ -212,19 +215,19 @@ def thesis(
     his error (reference 1.2, item 11). It causes the bias: .0036 degrees cross-boresight on AFIT's dome, .07 under a
     flat ceiling at 30 degrees.
     """
-    point_cam, reach_m = thesis_points(rays_cam, leds, lever)
+    point_cam, distance_m = thesis_points(rays_cam, leds, lever)
     across_m = point_cam[:, :2]
     # Chain rule: the point's derivative by the tangents, then the tangents' by the ray.
     by_tangent = np.zeros((len(rays_cam), 3, 2))
-    by_tangent[:, [0, 1], [0, 1]] = reach_m
-    by_tangent[:, 2, :] = -reach_m * across_m / point_cam[:, 2:]
+    by_tangent[:, [0, 1], [0, 1]] = distance_m
+    by_tangent[:, 2, :] = -distance_m * across_m / point_cam[:, 2:]
     R_body_from_cam = lever.cam_from_body.inv().as_matrix()
-    slope = R_body_from_cam @ by_tangent @ _tangent_slopes(rays_cam) @ R_body_from_cam.T
+    by_ray_m = R_body_from_cam @ by_tangent @ _tangent_gradients(rays_cam) @ R_body_from_cam.T
     point = point_cam @ R_body_from_cam.T + lever.camera_body_m
-    reach = np.full(len(rays_cam), reach_m)
-    body_from_lab = _wahba(point, reach, sigma_rad, position_m)
+    distances_m = np.full(len(rays_cam), distance_m)
+    body_from_lab = _wahba(point, distances_m, sigma_rad, position_m)
     rays = rays_cam @ R_body_from_cam.T
-    return body_from_lab, _wahba_covariance(body_from_lab, point, reach, sigma_rad, position_m, rays, slope)
+    return _with_covariance(body_from_lab, point, distances_m, sigma_rad, position_m, rays, by_ray_m)
 
 
 def tappe(
@@ -243,25 +246,16 @@ def tappe(
     the square of the field's half-angle. The true attitude is the fixed point: there is no bias.
     """
     rays = lever.cam_from_body.inv().apply(rays_cam)
-    for _ in range(UPDATES):
+    for _ in range(MAX_UPDATES):
         # The distances change little with the attitude, so a few updates converge.
-        reach = np.linalg.norm(body_from_lab.apply(position_m) - lever.camera_body_m, axis=1)
-        point = lever.camera_body_m + reach[:, None] * rays
-        better = _wahba(point, reach, sigma_rad, position_m)
-        moved = (better * body_from_lab.inv()).magnitude()
-        body_from_lab = better
-        if moved < STILL_RAD:
+        distance_m = np.linalg.norm(body_from_lab.apply(position_m) - lever.camera_body_m, axis=1)
+        point = lever.camera_body_m + distance_m[:, None] * rays
+        previous, body_from_lab = body_from_lab, _wahba(point, distance_m, sigma_rad, position_m)
+        if (body_from_lab * previous.inv()).magnitude() < CONVERGED_RAD:
             break
-    slope = reach[:, None, None] * np.eye(3)
-    gain = np.cross(point, rays)
-    return body_from_lab, _wahba_covariance(
-        body_from_lab, point, reach, sigma_rad, position_m, rays, slope, gain
-    )
-
-
-# Iterations of tappe and ray_on_surface at most, and the rotation below which they stop.
-UPDATES = 20
-STILL_RAD = 1e-13
+    by_ray_m = distance_m[:, None, None] * np.eye(3)
+    by_rotation_m = np.cross(point, rays)
+    return _with_covariance(body_from_lab, point, distance_m, sigma_rad, position_m, rays, by_ray_m, by_rotation_m)
 
 
 def ray_on_surface(
@@ -278,23 +272,23 @@ def ray_on_surface(
     obliquely.
     """
     rays = lever.cam_from_body.inv().apply(rays_cam)
-    for _ in range(UPDATES):
+    for _ in range(MAX_UPDATES):
         origin = body_from_lab.inv().apply(lever.camera_body_m)
-        met = on_surface(body_from_lab.inv().apply(rays), origin, leds)
-        if np.isnan(met).any():
+        intersection_m = on_surface(body_from_lab.inv().apply(rays), origin, leds)
+        if np.isnan(intersection_m).any():
             raise ValueError("a ray misses the believed surface")
-        point = body_from_lab.apply(met)
-        reach = np.linalg.norm(point - lever.camera_body_m, axis=1)
-        placed_by, body_from_lab = body_from_lab, _wahba(point, reach, sigma_rad, position_m)
-        if (body_from_lab * placed_by.inv()).magnitude() < STILL_RAD:
+        point = body_from_lab.apply(intersection_m)
+        distance_m = np.linalg.norm(point - lever.camera_body_m, axis=1)
+        previous, body_from_lab = body_from_lab, _wahba(point, distance_m, sigma_rad, position_m)
+        if (body_from_lab * previous.inv()).magnitude() < CONVERGED_RAD:
             break
-    normal = placed_by.apply((met - leds.centre_m) / leds.semi_axes_m**2)  # not normalized
-    slant = normal / np.sum(normal * rays, axis=1, keepdims=True)
-    # On the surface p moves by reach (du - u slant.du); rotating the surface by w moves p along u by slant.(w x p).
-    slope = reach[:, None, None] * (np.eye(3) - np.einsum("ni,nj->nij", rays, slant))
-    return body_from_lab, _wahba_covariance(
-        body_from_lab, point, reach, sigma_rad, position_m, rays, slope, np.cross(point, slant)
-    )
+    normal = previous.apply((intersection_m - leds.center_m) / leds.semi_axes_m**2)  # not normalized
+    scaled_normal = normal / np.sum(normal * rays, axis=1, keepdims=True)
+    # With n the scaled normal, p moves on the surface by distance (du - u n.du); rotating the surface by w moves p
+    # along u by n.(w x p).
+    by_ray_m = distance_m[:, None, None] * (np.eye(3) - np.einsum("ni,nj->nij", rays, scaled_normal))
+    by_rotation_m = np.cross(point, scaled_normal)
+    return _with_covariance(body_from_lab, point, distance_m, sigma_rad, position_m, rays, by_ray_m, by_rotation_m)
 
 
 def pnp(
@@ -318,74 +312,68 @@ def pnp(
     Raises ValueError for LEDs in a line and if it does not converge.
     """
     if len(rays_cam) < 4:
-        raise ValueError(f"{len(rays_cam)} lights leave the camera's place unknown; 4 are needed")
+        raise ValueError(f"pnp: {len(rays_cam)} rays do not determine the camera's position; 4 are needed")
     measured = rays_cam[:, :2] / rays_cam[:, 2:]
     # With the pattern's centroid as origin, rotation and translation are nearly uncorrelated.
-    middle_m = position_m.mean(axis=0)
-    pattern_m = position_m - middle_m
-    believed_shift_m = lever.cam_from_body.apply(body_from_lab.apply(middle_m) - lever.camera_body_m)
-    cam_from_lab, shift_m = _opencv_pnp(
-        pattern_m, measured, lever.cam_from_body * body_from_lab, believed_shift_m
-    )
+    centroid_m = position_m.mean(axis=0)
+    pattern_m = position_m - centroid_m
+    start_shift_m = lever.cam_from_body.apply(body_from_lab.apply(centroid_m) - lever.camera_body_m)
+    cam_from_lab, shift_m = _opencv_pnp(pattern_m, measured, lever.cam_from_body * body_from_lab, start_shift_m)
     weight = np.repeat(1 / sigma_rad, 2)
-    cam_from_lab, covariance_cam = _weighed(pattern_m, measured, cam_from_lab, shift_m, weight)
+    cam_from_lab, covariance_cam = _gauss_newton(pattern_m, measured, cam_from_lab, shift_m, weight)
     return lever.cam_from_body.inv() * cam_from_lab, _in_body_axes(covariance_cam, lever)
 
 
-def _weighed(
+def _gauss_newton(
     pattern_m: Floats, measured: Floats, cam_from_lab: Rotation, shift_m: Floats, weight: Floats
 ) -> tuple[Rotation, np.ndarray]:
     """Gauss-Newton with step halving on the weighted residual; returns cam_from_lab and its (3, 3) covariance."""
-    residual, jacobian = _six_slopes(pattern_m, measured, cam_from_lab, shift_m, weight)
+    residual, jacobian = _six_dof_residual(pattern_m, measured, cam_from_lab, shift_m, weight)
     for _ in range(100):
         step, _, rank, _ = np.linalg.lstsq(jacobian, residual, rcond=None)
         if rank < 6:
-            raise ValueError(
-                "the lights leave the camera's place unknown: they are in a line or at one point"
-            )
+            raise ValueError("pnp: the LEDs do not determine the camera's position: they are collinear")
         before = residual @ residual
         for _ in range(12):
-            better = Rotation.from_rotvec(step[:3]) * cam_from_lab, shift_m + step[3:]
-            residual, jacobian = _six_slopes(pattern_m, measured, *better, weight)
+            updated = Rotation.from_rotvec(step[:3]) * cam_from_lab, shift_m + step[3:]
+            residual, jacobian = _six_dof_residual(pattern_m, measured, *updated, weight)
             if residual @ residual <= before:
                 break
             step = step / 2
-        cam_from_lab, shift_m = better
+        cam_from_lab, shift_m = updated
         if np.linalg.norm(step) < 1e-12:
             break
     if not np.linalg.norm(step) < 1e-6:
-        raise ValueError(f"the 6-DoF solve still moved by {np.linalg.norm(step):.1e} rad and m")
+        raise ValueError(f"pnp: not converged, last step {np.linalg.norm(step):.1e} rad and m")
     return cam_from_lab, np.linalg.inv(jacobian.T @ jacobian)[:3, :3]
 
 
-def _six_slopes(
+def _six_dof_residual(
     pattern_m: Floats, measured: Floats, cam_from_lab: Rotation, shift_m: Floats, weight: Floats
 ) -> tuple[Floats, Floats]:
     """Return the tangents' weighted residual (2 N,) and its Jacobian (2 N, 6) by a small rotation and a shift."""
     b = cam_from_lab.apply(pattern_m)
     q = b + shift_m
-    jacobian = np.hstack([_jacobian(b, q), _tangent_slopes(q).reshape(-1, 3)])
+    jacobian = np.hstack([_jacobian(b, q), _tangent_gradients(q).reshape(-1, 3)])
     return (measured - q[:, :2] / q[:, 2:]).ravel() * weight, jacobian * weight[:, None]
 
 
-def _opencv_pnp(
-    pattern_m: Floats, tangent: Floats, cam_from_lab: Rotation, shift_m: Floats
-) -> tuple[Rotation, Floats]:
+def _opencv_pnp(pattern_m: Floats, tangent: Floats, cam_from_lab: Rotation, shift_m: Floats) -> tuple[Rotation, Floats]:
     """Return cam_from_lab and the shift in camera axes, (3,), by OpenCV's iterative PnP from an initial guess."""
     start = cam_from_lab.as_rotvec()[:, None], np.array(shift_m)[:, None]
     try:
-        found, rotvec, shift = cv2.solvePnP(
+        converged, rotvec, shift = cv2.solvePnP(
             pattern_m, tangent, np.eye(3), None, *start, True, cv2.SOLVEPNP_ITERATIVE
         )
     except cv2.error as error:
-        raise ValueError(f"OpenCV finds no place for the camera: {error.err}") from None
-    if not found:
-        raise ValueError("OpenCV finds no place for the camera")
+        raise ValueError(f"pnp: OpenCV found no camera position: {error.err}") from None
+    if not converged:
+        raise ValueError("pnp: OpenCV found no camera position")
     return Rotation.from_rotvec(np.ravel(rotvec)), np.ravel(shift)
 
 
-NearSolver = Callable[..., tuple[Rotation, Floats]]
-SOLVERS: dict[str, NearSolver] = {
+NearFieldSolver = Callable[..., tuple[Rotation, Floats]]
+SOLVERS: dict[str, NearFieldSolver] = {
     "rotation_only": rotation_only,
     "ray_on_surface": ray_on_surface,
     "infinity": infinity,
@@ -394,7 +382,7 @@ SOLVERS: dict[str, NearSolver] = {
     "pnp": pnp,
 }
 # These fit tangents (x/z, y/z), in which a pixel has the same size everywhere.
-OF_TANGENTS = ("rotation_only", "pnp")
+TANGENT_SOLVERS = ("rotation_only", "pnp")
 
 
 def fitted_sigma_rad(solver: str, rays_cam: Floats, pixel_rad: Floats) -> Floats:
@@ -404,7 +392,7 @@ def fitted_sigma_rad(solver: str, rays_cam: Floats, pixel_rad: Floats) -> Floats
     At an angle a off the boresight a change of the tangent rotates the ray by cos^2 a of it in the radial direction
     and by cos a of it in the tangential one. The ray's error is the rms of both.
     """
-    if solver in OF_TANGENTS:
+    if solver in TANGENT_SOLVERS:
         return pixel_rad
     cosine = rays_cam[:, 2]
     return pixel_rad * np.sqrt((cosine**2 + cosine**4) / 2)

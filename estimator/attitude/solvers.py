@@ -1,7 +1,7 @@
 """Solvers of Wahba's problem: the rotation that best maps reference vectors to observed ones, with its covariance.
 
 Six classical methods, each as published, based on the compiled kernels in `estimator.attitude.wahba`. All but TRIAD
-minimize sum(w |cam - A ref|^2), w = 1 / sigma^2, over all stars. Gauss-Newton steps on the vectors (`polish`) refine
+minimize sum(w |cam - A ref|^2), w = 1 / sigma^2, over all stars. Gauss-Newton steps on the vectors (`refine`) refine
 their results, so that they agree to the last digits.
 """
 
@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from estimator.attitude import wahba as kernel
 from estimator.core.arrays import Floats
-from estimator.core.vectors import xyzw_of
+from estimator.core.vectors import quaternion_xyzw
 
 Solver = Callable[..., Rotation]
 
@@ -25,41 +25,41 @@ def triad(vectors_cam: Floats, vectors_ref: Floats, sigma_rad: Floats) -> Rotati
     Of more than two stars it uses the pair with the smallest variance about the worst axis: accurate ones, far apart.
     Its covariance is that of the pair: covariance(..., solver="triad"). Arguments and errors are those of `quest`.
     """
-    cam, ref, weight = _vectors(vectors_cam, vectors_ref, sigma_rad)
+    cam, ref, weight = _checked_arrays(vectors_cam, vectors_ref, sigma_rad)
     kernel.profile(cam, ref, weight)  # raises ValueError for unusable or parallel directions
     return rotation(kernel.raw_triad(cam, ref, weight))
 
 
 def davenport(vectors_cam: Floats, vectors_ref: Floats, sigma_rad: Floats) -> Rotation:
     """Davenport's q-method: the eigenvector of the largest eigenvalue, refined. Arguments and errors as `quest`."""
-    return _solved(kernel.raw_davenport, vectors_cam, vectors_ref, sigma_rad)
+    return _solve_profile(kernel.raw_davenport, vectors_cam, vectors_ref, sigma_rad)
 
 
 def quest(vectors_cam: Floats, vectors_ref: Floats, sigma_rad: Floats) -> Rotation:
     """QUEST (Shuster & Oh 1981): cam_from_ref from (N, 3) unit vectors, N >= 2, with errors (N,) sigma_rad.
 
-    Refined by `polish`. Raises ValueError for fewer than two directions and for unusable numbers.
+    Refined by Gauss-Newton. Raises ValueError for fewer than two directions and for unusable numbers.
     """
-    return _solved(kernel.raw_quest, vectors_cam, vectors_ref, sigma_rad)
+    return _solve_profile(kernel.raw_quest, vectors_cam, vectors_ref, sigma_rad)
 
 
 def esoq2(vectors_cam: Floats, vectors_ref: Floats, sigma_rad: Floats) -> Rotation:
     """ESOQ2 (Mortari 1997): the rotation axis from a singular matrix, refined. Arguments and errors as `quest`."""
-    return _solved(kernel.raw_esoq2, vectors_cam, vectors_ref, sigma_rad)
+    return _solve_profile(kernel.raw_esoq2, vectors_cam, vectors_ref, sigma_rad)
 
 
 def svd(vectors_cam: Floats, vectors_ref: Floats, sigma_rad: Floats) -> Rotation:
     """Singular value decomposition (Markley 1988), refined. Arguments and errors as `quest`."""
-    return _solved(kernel.raw_svd, vectors_cam, vectors_ref, sigma_rad)
+    return _solve_profile(kernel.raw_svd, vectors_cam, vectors_ref, sigma_rad)
 
 
 def least_squares(vectors_cam: Floats, vectors_ref: Floats, sigma_rad: Floats) -> Rotation:
     """Least squares on the vectors: Gauss-Newton from TRIAD's solution. Arguments and errors as `quest`."""
-    cam, ref, weight = _vectors(vectors_cam, vectors_ref, sigma_rad)
+    cam, ref, weight = _checked_arrays(vectors_cam, vectors_ref, sigma_rad)
     kernel.profile(cam, ref, weight)
-    answer = kernel.raw_triad(cam, ref, weight)
-    kernel.polish(answer, cam, ref, weight)
-    return rotation(answer)
+    R_cam_from_ref = kernel.raw_triad(cam, ref, weight)
+    kernel.refine(R_cam_from_ref, cam, ref, weight)
+    return rotation(R_cam_from_ref)
 
 
 SOLVERS: dict[str, Solver] = {
@@ -73,17 +73,17 @@ SOLVERS: dict[str, Solver] = {
 }
 
 
-def _solved(
+def _solve_profile(
     raw: Callable[[Floats], Floats], vectors_cam: Floats, vectors_ref: Floats, sigma_rad: Floats
 ) -> Rotation:
     """Solve the attitude profile with the method `raw`, then refine the solution on the vectors."""
-    cam, ref, weight = _vectors(vectors_cam, vectors_ref, sigma_rad)
-    answer = raw(kernel.profile(cam, ref, weight))
-    kernel.polish(answer, cam, ref, weight)
-    return rotation(answer)
+    cam, ref, weight = _checked_arrays(vectors_cam, vectors_ref, sigma_rad)
+    R_cam_from_ref = raw(kernel.profile(cam, ref, weight))
+    kernel.refine(R_cam_from_ref, cam, ref, weight)
+    return rotation(R_cam_from_ref)
 
 
-def _vectors(vectors_cam: Floats, vectors_ref: Floats, sigma_rad: Floats) -> tuple[Floats, Floats, Floats]:
+def _checked_arrays(vectors_cam: Floats, vectors_ref: Floats, sigma_rad: Floats) -> tuple[Floats, Floats, Floats]:
     """Prepare the kernels' arguments: two (N, 3) arrays, (N,) weights in rad^-2. Raises ValueError for other shapes."""
     cam, ref = np.ascontiguousarray(vectors_cam, dtype=float), np.ascontiguousarray(vectors_ref, dtype=float)
     sigma = np.asarray(sigma_rad, dtype=float)
@@ -98,7 +98,7 @@ def rotation(R_a_from_b: Floats) -> Rotation:
 
     It goes through the quaternion, as Rotation.from_matrix orthogonalizes any matrix and takes four times as long.
     """
-    return Rotation.from_quat(xyzw_of(R_a_from_b))
+    return Rotation.from_quat(quaternion_xyzw(R_a_from_b))
 
 
 def covariance(vectors_cam: Floats, sigma_rad: Floats, solver: str = "quest") -> Floats:
@@ -107,7 +107,7 @@ def covariance(vectors_cam: Floats, sigma_rad: Floats, solver: str = "quest") ->
     QUEST's measurement model (Shuster & Oh 1981, eq. 97). It holds for all methods that use all stars; for TRIAD the
     sum is over its pair. Confirmed by Monte Carlo in the tests. Raises ValueError if the roll is unobservable.
     """
-    cam, _, weight = _vectors(vectors_cam, vectors_cam, sigma_rad)
+    cam, _, weight = _checked_arrays(vectors_cam, vectors_cam, sigma_rad)
     if solver == "triad" and len(cam) > 2:
         pair = list(kernel.best_pair(cam, weight))
         cam, weight = cam[pair], weight[pair]

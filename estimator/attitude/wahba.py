@@ -7,7 +7,7 @@ the optimal q is the eigenvector of K's largest eigenvalue. The methods differ i
 q-method by an eigensolver, QUEST and ESOQ2 from the characteristic polynomial, SVD from the singular vectors of B.
 TRIAD uses two stars only.
 
-The elements of B lose the small differences between vectors of a narrow field, so `polish` refines the solution by
+The elements of B lose the small differences between vectors of a narrow field, so `refine` improves the solution by
 Gauss-Newton on the vectors themselves. The covariance is the inverse of the Fisher information, sum(w (I - b b^T)).
 
 All kernels take unit vectors as C-ordered (N, 3) arrays; `weight` is (N,), in rad^-2 where a covariance is computed.
@@ -19,29 +19,30 @@ from math import isfinite, sqrt
 
 import numpy as np
 
+from estimator.core import least_squares
 from estimator.core.arrays import Floats
 from estimator.core.jit import jit
-from estimator.core.vectors import turn
+from estimator.core.vectors import rotate_in_place
 
 Quaternion = tuple[float, float, float, float]
 
 # Smallest accepted squared sine of the largest angle to the first direction: 13 arcsec.
-PARALLEL = 4e-9
-UNIT = 1e-2  # largest deviation of a unit vector's squared length from 1
-POLISHES = 30
-RESTING = 1e-26  # squared radians: a step below double precision
+MIN_SINE2 = 4e-9
+LENGTH_TOLERANCE = 1e-2  # largest deviation of a unit vector's squared length from 1
+MAX_STEPS = 30  # of the refinement
+MIN_STEP2_RAD2 = 1e-26  # squared length of a step below double precision
 
 
 @jit
 def wahba(cam: Floats, ref: Floats, weight: Floats) -> tuple[Floats, Floats]:
     """Return R_cam_from_ref (3, 3) that minimizes sum(w |cam - A ref|^2), and its (3, 3) camera-axes covariance, rad^2.
 
-    QUEST and `polish`; a few microseconds for twenty stars. Raises ValueError if the directions do not determine the
+    QUEST and `refine`; a few microseconds for twenty stars. Raises ValueError if the directions do not determine the
     rotation.
     """
-    answer = raw_quest(profile(cam, ref, weight))
-    polish(answer, cam, ref, weight)
-    return answer, attitude_covariance(cam, weight)
+    R_cam_from_ref = raw_quest(profile(cam, ref, weight))
+    refine(R_cam_from_ref, cam, ref, weight)
+    return R_cam_from_ref, attitude_covariance(cam, weight)
 
 
 @jit
@@ -64,13 +65,13 @@ def profile(cam: Floats, ref: Floats, weight: Floats) -> Floats:
     if len(cam) < 2:
         raise ValueError("all vectors are parallel: fewer than two directions leave the roll unknown")
     B = np.zeros((3, 3))
-    apart, total, off = 0.0, 0.0, 0.0
+    max_sine2, total, length_error = 0.0, 0.0, 0.0
     for n in range(len(cam)):
         total += weight[n]
-        off = max(off, abs(cam[n, 0] ** 2 + cam[n, 1] ** 2 + cam[n, 2] ** 2 - 1))
-        off = max(off, abs(ref[n, 0] ** 2 + ref[n, 1] ** 2 + ref[n, 2] ** 2 - 1))
+        length_error = max(length_error, abs(cam[n, 0] ** 2 + cam[n, 1] ** 2 + cam[n, 2] ** 2 - 1))
+        length_error = max(length_error, abs(ref[n, 0] ** 2 + ref[n, 1] ** 2 + ref[n, 2] ** 2 - 1))
         # The directions must differ from the first one in both frames.
-        apart = max(apart, min(_sine2(cam, 0, n), _sine2(ref, 0, n)))
+        max_sine2 = max(max_sine2, min(_sine2(cam, 0, n), _sine2(ref, 0, n)))
         for i in range(3):
             for j in range(3):
                 B[i, j] += weight[n] * cam[n, i] * ref[n, j]
@@ -82,12 +83,10 @@ def profile(cam: Floats, ref: Floats, weight: Floats) -> Floats:
             entries += B[i, j]
     if not isfinite(entries):
         raise ValueError("a direction is NaN or infinite; allowed: unit vectors")
-    if off > UNIT:
+    if length_error > LENGTH_TOLERANCE:
         raise ValueError("a direction is not of unit length; allowed: unit vectors")
-    if apart < PARALLEL:
-        raise ValueError(
-            "all vectors are parallel: the roll about them is unknown; two directions are needed"
-        )
+    if max_sine2 < MIN_SINE2:
+        raise ValueError("all vectors are parallel: the roll about them is unknown; two directions are needed")
     return B
 
 
@@ -137,7 +136,7 @@ def _cofactor(matrix: Floats, i: int, j: int) -> float:
 
 
 @jit
-def _turned(B: Floats, axis: int) -> Floats:
+def _rotated_profile(B: Floats, axis: int) -> Floats:
     """Return the profile for a reference frame rotated by 180 degrees about axis 0, 1 or 2; unchanged for 3."""
     out = B.copy()
     if axis < 3:
@@ -149,8 +148,8 @@ def _turned(B: Floats, axis: int) -> Floats:
 
 
 @jit
-def _turned_back(q: Quaternion, axis: int) -> Quaternion:
-    """Undo `_turned`: Hamilton product of a quaternion (x, y, z, w) and a 180-degree rotation about an axis."""
+def _undo_rotation(q: Quaternion, axis: int) -> Quaternion:
+    """Undo `_rotated_profile`: Hamilton product of a quaternion (x, y, z, w) and a 180-degree rotation."""
     x, y, z, w = q
     if axis == 0:
         return w, z, -y, -x
@@ -183,10 +182,10 @@ def raw_quest(B: Floats) -> Floats:
     x = largest_eigenvalue(B)
     best, frame = (0.0, 0.0, 0.0, 0.0), 3
     for axis in (3, 0, 1, 2):
-        found = _quest_once(_turned(B, axis), x)
-        if abs(found[3]) > abs(best[3]):
-            best, frame = found, axis
-    return matrix_of(_turned_back(best, frame))
+        q = _quest_once(_rotated_profile(B, axis), x)
+        if abs(q[3]) > abs(best[3]):
+            best, frame = q, axis
+    return matrix_of(_undo_rotation(best, frame))
 
 
 @jit
@@ -199,14 +198,14 @@ def _quest_once(B: Floats, x: float) -> Quaternion:
         kappa += _cofactor(S, j, j)
     alpha = x * x - trace * trace + kappa
     gamma = (x + trace) * alpha - det
-    Sz = _times(S, z)
-    SSz = _times(S, Sz)
+    Sz = _matrix_vector(S, z)
+    SSz = _matrix_vector(S, Sz)
     v = alpha * z + (x - trace) * Sz + SSz
     return v[0], v[1], v[2], gamma
 
 
 @jit
-def _times(matrix: Floats, v: Floats) -> Floats:
+def _matrix_vector(matrix: Floats, v: Floats) -> Floats:
     out = np.zeros(3)
     for i in range(3):
         for j in range(3):
@@ -228,7 +227,7 @@ def raw_esoq2(B: Floats) -> Floats:
         trace = 2 * B[axis, axis] - (B[0, 0] + B[1, 1] + B[2, 2])
         if trace < least:
             frame, least = axis, trace
-    S, z, trace = _symmetric(_turned(B, frame))
+    S, z, trace = _symmetric(_rotated_profile(B, frame))
     M = np.empty((3, 3))
     for i in range(3):
         for j in range(3):
@@ -243,7 +242,7 @@ def raw_esoq2(B: Floats) -> Floats:
             e[:] = u, v, w
     scalar = z[0] * e[0] + z[1] * e[1] + z[2] * e[2]
     q = (x - trace) * e[0], (x - trace) * e[1], (x - trace) * e[2], scalar
-    return matrix_of(_turned_back(q, frame))
+    return matrix_of(_undo_rotation(q, frame))
 
 
 @jit
@@ -263,12 +262,12 @@ def raw_davenport(B: Floats) -> Floats:
 def raw_svd(B: Floats) -> Floats:
     """SVD method (Markley 1988, J. Astronautical Sciences 36, 245): B = U S V^T, A = U diag(1, 1, det U det V) V^T."""
     U, _, Vt = np.linalg.svd(B)
-    handed = np.linalg.det(U) * np.linalg.det(Vt)
-    answer = np.zeros((3, 3))
+    determinant = np.linalg.det(U) * np.linalg.det(Vt)
+    R = np.zeros((3, 3))
     for i in range(3):
         for j in range(3):
-            answer[i, j] = U[i, 0] * Vt[0, j] + U[i, 1] * Vt[1, j] + handed * U[i, 2] * Vt[2, j]
-    return answer
+            R[i, j] = U[i, 0] * Vt[0, j] + U[i, 1] * Vt[1, j] + determinant * U[i, 2] * Vt[2, j]
+    return R
 
 
 @jit
@@ -306,10 +305,10 @@ def raw_triad(cam: Floats, ref: Floats, weight: Floats) -> Floats:
     along = np.zeros((3, 3))
     for k in range(2):
         c, s = np.cross(b[k], b3), np.cross(r[k], r3)
-        share = weight[m] if k == 0 else weight[n]
+        weight_k = weight[m] if k == 0 else weight[n]
         for i in range(3):
             for j in range(3):
-                along[i, j] += share * (b[k, i] * r[k, j] + c[i] * s[j])
+                along[i, j] += weight_k * (b[k, i] * r[k, j] + c[i] * s[j])
     # `along` is l times a rotation of the plane: the sum of its squared entries is 2 l^2.
     scale = sqrt(2 / (along**2).sum())
     for i in range(3):
@@ -325,30 +324,32 @@ def _normal(u: Floats, v: Floats) -> Floats:
 
 
 @jit
-def polish(answer: Floats, cam: Floats, ref: Floats, weight: Floats) -> None:
-    """Refine `answer` in place by Gauss-Newton on sum(w |cam - A ref|^2).
+def refine(R_cam_from_ref: Floats, cam: Floats, ref: Floats, weight: Floats) -> None:
+    """Refine `R_cam_from_ref` in place by Gauss-Newton on sum(w |cam - A ref|^2).
 
-    Each step solves sum(w (I - a a^T)) turn = sum(w a x cam), a = A ref. If the directions are close together, the two
+    Each step solves sum(w (I - a a^T)) step = sum(w a x cam), a = A ref. If the directions are close together, the two
     largest eigenvalues of Davenport's matrix are nearly equal, and methods based on the profile lose precision as the
     inverse square of the directions' spread. Here the small differences a x cam are computed star by star, which keeps
     the precision. Wahba's problem has no other local minimum, so the iteration cannot converge to a wrong one.
     """
-    a, pull, normal, step = np.empty(3), np.empty(3), np.empty((3, 3)), np.empty(3)
-    for _ in range(POLISHES):
-        pull.fill(0.0)
+    R = R_cam_from_ref
+    a, gradient, normal, step = np.empty(3), np.empty(3), np.empty((3, 3)), np.empty(3)
+    for _ in range(MAX_STEPS):
+        gradient.fill(0.0)
         normal.fill(0.0)
         for n in range(len(cam)):
             w = weight[n]
             for i in range(3):
-                a[i] = answer[i, 0] * ref[n, 0] + answer[i, 1] * ref[n, 1] + answer[i, 2] * ref[n, 2]
-            pull[0] += w * (a[1] * cam[n, 2] - a[2] * cam[n, 1])
-            pull[1] += w * (a[2] * cam[n, 0] - a[0] * cam[n, 2])
-            pull[2] += w * (a[0] * cam[n, 1] - a[1] * cam[n, 0])
+                a[i] = R[i, 0] * ref[n, 0] + R[i, 1] * ref[n, 1] + R[i, 2] * ref[n, 2]
+            gradient[0] += w * (a[1] * cam[n, 2] - a[2] * cam[n, 1])
+            gradient[1] += w * (a[2] * cam[n, 0] - a[0] * cam[n, 2])
+            gradient[2] += w * (a[0] * cam[n, 1] - a[1] * cam[n, 0])
             _add_information(normal, a, w)
-        cholesky(normal)
-        solve(normal, pull, step)
-        turn(step, answer)
-        if step[0] ** 2 + step[1] ** 2 + step[2] ** 2 < RESTING:
+        _factorize(normal)
+        step[:] = gradient
+        least_squares.cholesky_solve(normal, step)
+        rotate_in_place(step, R)
+        if step[0] ** 2 + step[1] ** 2 + step[2] ** 2 < MIN_STEP2_RAD2:
             break
 
 
@@ -366,14 +367,12 @@ def _add_information(matrix: Floats, v: Floats, w: float) -> None:
 @jit
 def attitude_covariance(cam: Floats, weight: Floats) -> Floats:
     """Return the (3, 3) covariance: the inverse of sum(w (I - b b^T)). Raises ValueError if that is singular."""
-    factor, out, unit = np.zeros((3, 3)), np.empty((3, 3)), np.empty(3)
+    factor, out = np.zeros((3, 3)), np.eye(3)
     for n in range(len(cam)):
         _add_information(factor, cam[n], weight[n])
-    cholesky(factor)
+    _factorize(factor)
     for j in range(3):
-        unit.fill(0.0)
-        unit[j] = 1.0
-        solve(factor, unit, out[j])
+        least_squares.cholesky_solve(factor, out[j])
     for i in range(3):
         for j in range(i):
             out[i, j] = out[j, i] = (out[i, j] + out[j, i]) / 2
@@ -381,36 +380,10 @@ def attitude_covariance(cam: Floats, weight: Floats) -> Floats:
 
 
 @jit
-def cholesky(matrix: Floats) -> None:
-    """Replace the lower triangle of a (3, 3) matrix by its Cholesky factor L, L L^T = matrix.
-
-    Raises ValueError unless the matrix is positive definite.
-    """
-    for j in range(3):
-        for i in range(j, 3):
-            total = matrix[i, j]
-            for k in range(j):
-                total -= matrix[i, k] * matrix[j, k]
-            if i == j:
-                if not total > 0:
-                    raise ValueError("all vectors are parallel: the roll about them is unknown")
-                matrix[j, j] = sqrt(total)
-            else:
-                matrix[i, j] = total / matrix[j, j]
-
-
-@jit
-def solve(factor: Floats, right: Floats, out: Floats) -> None:
-    """Compute out = (L L^T)^-1 right by forward and back substitution."""
-    for i in range(3):
-        out[i] = right[i]
-        for k in range(i):
-            out[i] -= factor[i, k] * out[k]
-        out[i] /= factor[i, i]
-    for i in range(2, -1, -1):
-        for k in range(i + 1, 3):
-            out[i] -= factor[k, i] * out[k]
-        out[i] /= factor[i, i]
+def _factorize(information: Floats) -> None:
+    """Replace the lower triangle by its Cholesky factor. Raises ValueError unless the matrix is positive definite."""
+    if not least_squares.cholesky(information, 0.0):
+        raise ValueError("all vectors are parallel: the roll about them is unknown")
 
 
 @jit

@@ -7,8 +7,8 @@ positions x_i, small rotations of the A_k, the lever r and the lens; C is fixed.
 Each step solves the damped normal equations (Levenberg-Marquardt). Lights are coupled to one another only through
 frames, so each light's 3 x 3 block is eliminated by the Schur complement, and a dense system of frames, lever and lens
 remains (Triggs et al. 2000, Bundle adjustment: a modern synthesis, section 6). Wrong identifications are
-down-weighted with Cauchy's loss. Moves that change no pixel (`freedoms`) are held by a penalty, and the covariance is
-transformed to the requested gauge afterwards (Baarda's S-transformation).
+down-weighted with Cauchy's loss. Moves that change no pixel (`gauge_freedoms`) are held by a penalty, and the
+covariance is transformed to the requested gauge afterwards (Baarda's S-transformation).
 
 Measured on AFIT's dome (892 lights, 600 frames): 14 such steps converge to a cost of 1.1e4. scipy's least_squares
 with the same sparse Jacobian and lsmr, whose steps are inexact, had only reduced the cost from 5.4e8 to 4.1e8 after
@@ -31,6 +31,7 @@ from estimator.core.arrays import Floats, Ints
 # accuracy of 1e-9 in lengths.
 DECREMENT = 1e-12
 STEPS = 100
+MEDIAN_RADIUS = np.sqrt(2 * np.log(2))  # median distance of a two-dimensional unit Gaussian from its mean
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,88 +70,93 @@ class Bundle:
     map_m: Floats
     map_sigma_m: float = np.inf
 
-    def cost(self, seen: Sightings, width: float) -> tuple[float, Floats]:
+    def cost(self, sightings: Sightings, width: float) -> tuple[float, Floats]:
         """Total loss of the pixels and the prior map, and the (M,) robust weights of the sightings."""
-        loss, weight = cauchy(np.sum(residuals(self, seen) ** 2, axis=1), width)
+        loss, weight = cauchy(np.sum(residuals(self, sightings) ** 2, axis=1), width)
         return loss + float(np.sum(((self.map_m - self.position_m) / self.map_sigma_m) ** 2)), weight
 
-    def moved(self, led: Floats, rest: Floats) -> Bundle:
+    def apply_step(self, led: Floats, rest: Floats) -> Bundle:
         """The bundle after a step.
 
         led  : (3 N,) changes of the positions, m
         rest : 3 F small rotations in body axes (rad), 3 changes of the lever (m), changes of the free lens elements
         """
-        turns = 3 * len(self.R_body_from_lab)
+        rotation_size = 3 * len(self.R_body_from_lab)
         lens = self.lens.copy()
-        lens[: self.free_lens] += rest[turns + 3 :]
-        turned = Rotation.from_rotvec(rest[:turns].reshape(-1, 3)).as_matrix() @ self.R_body_from_lab
+        lens[: self.free_lens] += rest[rotation_size + 3 :]
+        rotated = Rotation.from_rotvec(rest[:rotation_size].reshape(-1, 3)).as_matrix() @ self.R_body_from_lab
         return replace(
             self,
             position_m=self.position_m + led.reshape(-1, 3),
-            R_body_from_lab=turned,
-            camera_body_m=self.camera_body_m + rest[turns : turns + 3],
+            R_body_from_lab=rotated,
+            camera_body_m=self.camera_body_m + rest[rotation_size : rotation_size + 3],
             lens=lens,
         )
 
 
-class Rows(NamedTuple):
+class Linearization(NamedTuple):
     """Weighted residuals and Jacobian: both divided by sigma_px.
 
-    residual : (M, 2);  by_led, by_turn : (M, 2, 3) derivatives of the pixel with respect to position and rotation
+    residual : (M, 2);  by_led, by_rotation : (M, 2, 3) derivatives of the pixel with respect to position and rotation
     by_shared : (M, 2, 3 + free_lens) with respect to the lever and the free lens elements
     """
 
     residual: Floats
     by_led: Floats
-    by_turn: Floats
+    by_rotation: Floats
     by_shared: Floats
 
 
-def residuals(bundle: Bundle, seen: Sightings) -> Floats:
+def residuals(bundle: Bundle, sightings: Sightings) -> Floats:
     """(M, 2) measured minus predicted pixel, divided by sigma_px; inf for a light behind the camera."""
-    q = _in_camera(bundle, seen)[1]
-    ahead = q[:, 2] > 0
-    tangent = q[:, :2] / np.where(ahead, q[:, 2], 1.0)[:, None]
-    pixel = bundle.lens[1:3] + bundle.lens[0] * _distorted(tangent, bundle.lens[3:])
-    return np.where(ahead[:, None], (seen.xy_px - pixel) / seen.sigma_px[:, None], np.inf)
+    q = _in_camera(bundle, sightings)[1]
+    in_front = q[:, 2] > 0
+    tangent = q[:, :2] / np.where(in_front, q[:, 2], 1.0)[:, None]
+    pixel = bundle.lens[1:3] + bundle.lens[0] * _distort(tangent, bundle.lens[3:])
+    return np.where(in_front[:, None], (sightings.xy_px - pixel) / sightings.sigma_px[:, None], np.inf)
 
 
-def rows(bundle: Bundle, seen: Sightings) -> Rows:
+def linearize(bundle: Bundle, sightings: Sightings) -> Linearization:
     """Residuals and analytic derivatives; every light must be in front of the camera."""
-    b, q = _in_camera(bundle, seen)
+    b, q = _in_camera(bundle, sightings)
     tangent = q[:, :2] / q[:, 2:]
     focal, coefficients = bundle.lens[0], bundle.lens[3:]
-    distorted = _distorted(tangent, coefficients)
+    distorted_tangent = _distort(tangent, coefficients)
     pinhole = np.zeros((len(q), 2, 3))
     pinhole[:, 0, 0] = pinhole[:, 1, 1] = 1 / q[:, 2]
     pinhole[:, :, 2] = -tangent / q[:, 2:]
-    weight = 1 / seen.sigma_px[:, None, None]
+    weight = 1 / sightings.sigma_px[:, None, None]
     by_body = focal * weight * (_by_tangent(tangent, coefficients) @ pinhole @ bundle.R_cam_from_body)
     by_lens = np.concatenate(
-        [distorted[:, :, None], np.tile(np.eye(2), (len(q), 1, 1)), focal * _by_coefficients(tangent)], axis=2
+        [
+            distorted_tangent[:, :, None],
+            np.tile(np.eye(2), (len(q), 1, 1)),
+            focal * _by_coefficients(tangent),
+        ],
+        axis=2,
     )
-    residual = (seen.xy_px - bundle.lens[1:3] - focal * distorted) / seen.sigma_px[:, None]
-    return Rows(
+    residual = (sightings.xy_px - bundle.lens[1:3] - focal * distorted_tangent) / sightings.sigma_px[:, None]
+    return Linearization(
         residual,
-        by_body @ bundle.R_body_from_lab[seen.frame],
+        by_body @ bundle.R_body_from_lab[sightings.frame],
         np.cross(b[:, None, :], by_body),  # d . (w x b) = w . (b x d)
         np.concatenate([-by_body, weight * by_lens[:, :, : bundle.free_lens]], axis=2),
     )
 
 
-def _in_camera(bundle: Bundle, seen: Sightings) -> tuple[Floats, Floats]:
+def _in_camera(bundle: Bundle, sightings: Sightings) -> tuple[Floats, Floats]:
     """(M, 3) lights from the bearing center in body axes, and (M, 3) from the camera's pupil in camera axes."""
-    b = np.einsum("mij,mj->mi", bundle.R_body_from_lab[seen.frame], bundle.position_m[seen.led])
+    b = np.einsum("mij,mj->mi", bundle.R_body_from_lab[sightings.frame], bundle.position_m[sightings.led])
     return b, (b - bundle.camera_body_m) @ bundle.R_cam_from_body.T
 
 
-def _distorted(tangent: Floats, coefficients: Floats) -> Floats:
+def _distort(tangent: Floats, coefficients: Floats) -> Floats:
     k1, k2, p1, p2, k3 = coefficients
     x, y = tangent.T
     r2 = x * x + y * y
     radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    across = 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
-    return np.column_stack([x * radial + across, y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y])
+    tangential = 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+    return np.column_stack([x * radial + tangential, y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y])
 
 
 def _by_tangent(tangent: Floats, coefficients: Floats) -> Floats:
@@ -183,35 +189,35 @@ def _by_coefficients(tangent: Floats) -> Floats:
     )
 
 
-class Normal(NamedTuple):
+class NormalEquations(NamedTuple):
     """The normal equations, with lights and the R other unknowns (rotations, lever, lens) in separate blocks.
 
-    by_led : (N, 3, 3);  coupling : (R, 3 N) sparse;  rest : (R, R);  pull_led, pull_rest : right-hand sides
+    by_led : (N, 3, 3);  coupling : (R, 3 N) sparse;  rest : (R, R);  rhs_led, rhs_rest : right-hand sides
     """
 
     by_led: Floats
     coupling: csr_array
     rest: Floats
-    pull_led: Floats
-    pull_rest: Floats
+    rhs_led: Floats
+    rhs_rest: Floats
 
 
-def normal(bundle: Bundle, seen: Sightings, weight: Floats) -> Normal:
+def normal_equations(bundle: Bundle, sightings: Sightings, weight: Floats) -> NormalEquations:
     """The normal equations J'WJ and J'W residual, with one weight per sighting and the prior map added."""
-    terms = rows(bundle, seen)
+    terms = linearize(bundle, sightings)
     root = np.sqrt(weight)[:, None, None]
     count, frames, lights = len(weight), len(bundle.R_body_from_lab), len(bundle.position_m)
-    by_led = _spread(terms.by_led * root, seen.led, 3 * lights)
-    by_turn = _spread(terms.by_turn * root, seen.frame, 3 * frames)
+    by_led = _block_matrix(terms.by_led * root, sightings.led, 3 * lights)
+    by_rotation = _block_matrix(terms.by_rotation * root, sightings.frame, 3 * frames)
     shared = (terms.by_shared * root).reshape(2 * count, -1)
     residual = (terms.residual * root[:, 0]).ravel()
     # The lights' own normal matrix is block diagonal, so that only its blocks are accumulated.
     blocks = np.zeros((lights, 3, 3))
-    np.add.at(blocks, seen.led, np.einsum("mai,maj->mij", terms.by_led, terms.by_led) * root**2)
-    by_rest = _beside(by_turn, shared)
+    np.add.at(blocks, sightings.led, np.einsum("mai,maj->mij", terms.by_led, terms.by_led) * root**2)
+    by_rest = _append_dense(by_rotation, shared)
     blocks += np.eye(3) / bundle.map_sigma_m**2
     from_map = (bundle.map_m - bundle.position_m).ravel() / bundle.map_sigma_m**2
-    return Normal(
+    return NormalEquations(
         blocks,
         csr_array(by_rest.T @ by_led),
         (by_rest.T @ by_rest).toarray(),
@@ -220,13 +226,13 @@ def normal(bundle: Bundle, seen: Sightings, weight: Floats) -> Normal:
     )
 
 
-def _spread(blocks: Floats, column: Ints, width: int) -> csr_array:
+def _block_matrix(blocks: Floats, column: Ints, width: int) -> csr_array:
     """Sparse (2 M, width) matrix of (M, 2, 3) blocks: block m is in rows 2 m, columns 3 * column[m]."""
     start = np.arange(len(blocks) + 1)
     return csr_array(bsr_array((blocks, column, start), shape=(2 * len(blocks), width)))
 
 
-def _beside(left: csr_array, right: Floats) -> csr_array:
+def _append_dense(left: csr_array, right: Floats) -> csr_array:
     """The sparse matrix `left` and the dense matrix `right` side by side; rows of `left` have equal lengths."""
     width = right.shape[1]
     columns = np.tile(np.arange(width), len(right)) + left.shape[1]
@@ -237,7 +243,7 @@ def _beside(left: csr_array, right: Floats) -> csr_array:
     return csr_array((data.ravel(), index.ravel(), start), shape=(len(right), left.shape[1] + width))
 
 
-def freedoms(bundle: Bundle) -> tuple[Floats, Floats]:
+def gauge_freedoms(bundle: Bundle) -> tuple[Floats, Floats]:
     """Gauge freedoms: the four moves that change no pixel, three rotations of the lab frame and the scale.
 
     Returns their (3 N, 4) parts in the positions and (R, 4) in the other unknowns. A rotation by e of the lab changes x
@@ -254,51 +260,50 @@ def freedoms(bundle: Bundle) -> tuple[Floats, Floats]:
     return led.reshape(-1, 4), rest
 
 
-def _unresisted(bundle: Bundle) -> Floats:
+def _free_gauge(bundle: Bundle) -> Floats:
     """(R, 4) part of the gauge freedoms in the rest of the unknowns, or (R, 0) if a prior map fixes them."""
-    rest = freedoms(bundle)[1]
+    rest = gauge_freedoms(bundle)[1]
     return rest if np.isinf(bundle.map_sigma_m) else rest[:, :0]
 
 
-class Reduced(NamedTuple):
+class ReducedSystem(NamedTuple):
     """The reduced system after elimination of the lights.
 
-    inverse_led : inverse blocks of the lights;  spread : (3 N, R) their product with the transposed coupling
+    inverse_led : inverse blocks of the lights;  elimination : (3 N, R) their product with the transposed coupling
     factor      : Cholesky factor of the scaled (R, R) Schur complement;  scale : (R,) its scaling to a unit diagonal
     """
 
     inverse_led: bsr_array
-    spread: csr_array
+    elimination: csr_array
     factor: tuple[Floats, bool]
     scale: Floats
 
 
-def reduce(terms: Normal, still: Floats, damping: float) -> Reduced:
+def eliminate_lights(terms: NormalEquations, gauge: Floats, damping: float) -> ReducedSystem:
     """Eliminate the lights (Schur complement), with Marquardt's damping and the gauge freedoms held.
 
-    still : (R, 4 or 0) gauge freedoms without a constraint. Their outer product is added as a penalty, which makes the
+    gauge : (R, 4 or 0) gauge freedoms without a constraint. Their outer product is added as a penalty, which makes the
         matrix regular and changes no other move
     Raises LinAlgError if the lever or the lens is undetermined as well.
     """
-    swell = 1 + damping
-    blocks = terms.by_led * np.where(np.eye(3, dtype=bool), swell, 1.0)
+    blocks = terms.by_led * np.where(np.eye(3, dtype=bool), 1 + damping, 1.0)
     lights = len(blocks)
     inverse = bsr_array((np.linalg.inv(blocks), np.arange(lights), np.arange(lights + 1)))
-    spread = csr_array(inverse @ terms.coupling.T)
-    matrix = terms.rest - (terms.coupling @ spread).toarray()
+    elimination = csr_array(inverse @ terms.coupling.T)
+    matrix = terms.rest - (terms.coupling @ elimination).toarray()
     matrix[np.diag_indices_from(matrix)] += damping * terms.rest.diagonal()
     # Scaling to a unit diagonal: the unknowns have different units (rad, m, px).
     scale = 1 / np.sqrt(terms.rest.diagonal())
-    held, _ = np.linalg.qr(still / scale[:, None])
-    matrix = matrix * scale * scale[:, None] + held @ held.T
-    return Reduced(inverse, spread, cho_factor(matrix, lower=True), scale)
+    gauge_basis, _ = np.linalg.qr(gauge / scale[:, None])
+    matrix = matrix * scale * scale[:, None] + gauge_basis @ gauge_basis.T
+    return ReducedSystem(inverse, elimination, cho_factor(matrix, lower=True), scale)
 
 
-def step(terms: Normal, part: Reduced) -> tuple[Floats, Floats]:
+def step(terms: NormalEquations, reduced: ReducedSystem) -> tuple[Floats, Floats]:
     """Solve the reduced system and back-substitute: (3 N,) step of the positions and (R,) of the rest."""
-    pull = terms.pull_rest - part.spread.T @ terms.pull_led
-    rest = part.scale * cho_solve(part.factor, part.scale * pull)
-    return part.inverse_led @ terms.pull_led - part.spread @ rest, rest
+    rhs = terms.rhs_rest - reduced.elimination.T @ terms.rhs_led
+    rest = reduced.scale * cho_solve(reduced.factor, reduced.scale * rhs)
+    return reduced.inverse_led @ terms.rhs_led - reduced.elimination @ rest, rest
 
 
 def cauchy(squared: Floats, width: float) -> tuple[float, Floats]:
@@ -308,9 +313,13 @@ def cauchy(squared: Floats, width: float) -> tuple[float, Floats]:
     return float(width**2 * np.log1p(squared / width**2).sum()), 1 / (1 + squared / width**2)
 
 
-def adjust(
-    bundle: Bundle, seen: Sightings, width: float, decrement: float = DECREMENT
-) -> tuple[Bundle, bool]:
+def robust_scale(bundle: Bundle, sightings: Sightings) -> float:
+    """Robust scale of the residuals in sigmas, at least 1: their median length over that of unit noise."""
+    length = np.linalg.norm(residuals(bundle, sightings), axis=1)
+    return max(1.0, float(np.median(length) / MEDIAN_RADIUS))
+
+
+def adjust(bundle: Bundle, sightings: Sightings, width: float, decrement: float = DECREMENT) -> tuple[Bundle, bool]:
     """Minimize the loss over all unknowns by Levenberg-Marquardt; returns the bundle and whether it converged.
 
     width     : of Cauchy's loss in sigmas; inf for least squares
@@ -318,25 +327,25 @@ def adjust(
     Raises LinAlgError if an unknown is undetermined.
     """
     damping = 1e-4
-    cost, weight = bundle.cost(seen, width)
-    terms = normal(bundle, seen, weight)
+    cost, weight = bundle.cost(sightings, width)
+    terms = normal_equations(bundle, sightings, weight)
     for _ in range(STEPS):
         try:
-            led, rest = step(terms, reduce(terms, _unresisted(bundle), damping))
+            led, rest = step(terms, eliminate_lights(terms, _free_gauge(bundle), damping))
         except LinAlgError:
             if damping > 1e6:
                 raise
             damping *= 10
             continue
-        slope = terms.pull_led @ led + terms.pull_rest @ rest  # g' times the step: the Newton decrement
-        trial = bundle.moved(led, rest)
-        new_cost, new_weight = trial.cost(seen, width)
+        slope = terms.rhs_led @ led + terms.rhs_rest @ rest  # g' times the step: the Newton decrement
+        trial = bundle.apply_step(led, rest)
+        new_cost, new_weight = trial.cost(sightings, width)
         # Near the minimum the costs differ only by rounding, so that a step is accepted within that.
         if new_cost <= cost * (1 + 1e-13) + 1e-20:
             bundle, cost, damping = trial, new_cost, max(damping / 10, 1e-12)
             if slope < decrement:
                 return bundle, True
-            terms = normal(bundle, seen, new_weight)
+            terms = normal_equations(bundle, sightings, new_weight)
         else:
             damping *= 10
             if damping > 1e12:
@@ -344,30 +353,30 @@ def adjust(
     return bundle, False
 
 
-def turn_frames(bundle: Bundle, seen: Sightings, rounds: int) -> Bundle:
+def fit_attitudes(bundle: Bundle, sightings: Sightings, rounds: int) -> Bundle:
     """Starting values: Gauss-Newton on each frame's attitude alone, with all other unknowns fixed.
 
     Uses Cauchy's weights with the median residual as width, for `rounds` iterations.
     """
-    turns = 3 * len(bundle.R_body_from_lab)
-    still = np.zeros(3 * len(bundle.position_m))
-    rest = np.zeros(turns + 3 + bundle.free_lens)
+    rotation_size = 3 * len(bundle.R_body_from_lab)
+    no_step = np.zeros(3 * len(bundle.position_m))
+    rest = np.zeros(rotation_size + 3 + bundle.free_lens)
     for _ in range(rounds):
-        terms = rows(bundle, seen)
+        terms = linearize(bundle, sightings)
         squared = np.sum(terms.residual**2, axis=1)
         _, weight = cauchy(squared, max(1.0, float(np.sqrt(np.median(squared)))))
-        matrix = np.zeros((turns // 3, 3, 3))
-        pull = np.zeros((turns // 3, 3))
-        by = terms.by_turn
-        np.add.at(matrix, seen.frame, weight[:, None, None] * np.einsum("mai,maj->mij", by, by))
-        np.add.at(pull, seen.frame, weight[:, None] * np.einsum("mai,ma->mi", by, terms.residual))
-        rest[:turns] = np.linalg.solve(matrix, pull[:, :, None]).ravel()
-        bundle = bundle.moved(still, rest)
+        matrix = np.zeros((rotation_size // 3, 3, 3))
+        rhs = np.zeros((rotation_size // 3, 3))
+        by = terms.by_rotation
+        np.add.at(matrix, sightings.frame, weight[:, None, None] * np.einsum("mai,maj->mij", by, by))
+        np.add.at(rhs, sightings.frame, weight[:, None] * np.einsum("mai,ma->mi", by, terms.residual))
+        rest[:rotation_size] = np.linalg.solve(matrix, rhs[:, :, None]).ravel()
+        bundle = bundle.apply_step(no_step, rest)
     return bundle
 
 
 def covariance(
-    terms: Normal, bundle: Bundle, fixed_led: Floats, fixed_rest: Floats
+    terms: NormalEquations, bundle: Bundle, fixed_led: Floats, fixed_rest: Floats
 ) -> tuple[Floats, Floats, Floats]:
     """Covariances in a given gauge: (N, 3, 3) of positions, (F, 3, 3) of rotations, and of lever and free lens.
 
@@ -376,36 +385,41 @@ def covariance(
     (Baarda's S-transformation). Only the diagonal blocks are computed. Raises LinAlgError if an unknown is
     undetermined.
     """
-    led_free, rest_free = freedoms(bundle)
-    part = reduce(terms, _unresisted(bundle), 0.0)
-    size = len(part.scale)
+    led_free, rest_free = gauge_freedoms(bundle)
+    reduced = eliminate_lights(terms, _free_gauge(bundle), 0.0)
+    size = len(reduced.scale)
     # Inverse of the Schur complement: covariance Q of the rest before the transformation to the gauge.
-    rest = cho_solve(part.factor, np.eye(size)) * part.scale * part.scale[:, None]
+    rest = cho_solve(reduced.factor, np.eye(size)) * reduced.scale * reduced.scale[:, None]
     lights = len(bundle.position_m)
-    spread = part.spread.toarray()
+    elimination = reduced.elimination.toarray()
     # Q H: covariance of all unknowns with the four gauge constraints.
-    through = fixed_rest - part.spread.T @ fixed_led
+    through = fixed_rest - reduced.elimination.T @ fixed_led
     rest_fixed = rest @ through
-    led_fixed = part.inverse_led @ fixed_led - part.spread @ rest_fixed
-    back = np.linalg.inv(led_free.T @ fixed_led + rest_free.T @ fixed_rest)  # (H'Z)^-T
-    k_led, k_rest = led_fixed @ back, rest_fixed @ back
-    spare = back.T @ (fixed_led.T @ led_fixed + fixed_rest.T @ rest_fixed) @ back
+    led_fixed = reduced.inverse_led @ fixed_led - reduced.elimination @ rest_fixed
+    transform = np.linalg.inv(led_free.T @ fixed_led + rest_free.T @ fixed_rest)  # (H'Z)^-T
+    k_led, k_rest = led_fixed @ transform, rest_fixed @ transform
+    outer = transform.T @ (fixed_led.T @ led_fixed + fixed_rest.T @ rest_fixed) @ transform
 
-    # Covariance of the lights by block inversion: A^-1 + S Q S', S = A^-1 C' the spread.
+    # Covariance of the lights by block inversion: A^-1 + S Q S', S = A^-1 C' the elimination matrix.
     by_led = np.einsum(
-        "nik,njk->nij", (spread @ rest).reshape(lights, 3, size), spread.reshape(lights, 3, size)
+        "nik,njk->nij", (elimination @ rest).reshape(lights, 3, size), elimination.reshape(lights, 3, size)
     )
-    by_led += part.inverse_led.data
-    by_led += _transformed(k_led.reshape(lights, 3, 4), led_free.reshape(lights, 3, 4), spare)
-    turns = 3 * len(bundle.R_body_from_lab)
-    frames = turns // 3
-    by_turn = np.array([rest[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] for k in range(frames)])
-    by_turn += _transformed(k_rest[:turns].reshape(-1, 3, 4), rest_free[:turns].reshape(-1, 3, 4), spare)
-    shared = rest[turns:, turns:] + _transformed(k_rest[None, turns:], rest_free[None, turns:], spare)[0]
-    return by_led, by_turn, shared
+    by_led += reduced.inverse_led.data
+    by_led += _gauge_terms(k_led.reshape(lights, 3, 4), led_free.reshape(lights, 3, 4), outer)
+    rotation_size = 3 * len(bundle.R_body_from_lab)
+    frames = rotation_size // 3
+    by_rotation = np.array([rest[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] for k in range(frames)])
+    by_rotation += _gauge_terms(
+        k_rest[:rotation_size].reshape(-1, 3, 4), rest_free[:rotation_size].reshape(-1, 3, 4), outer
+    )
+    shared = (
+        rest[rotation_size:, rotation_size:]
+        + _gauge_terms(k_rest[None, rotation_size:], rest_free[None, rotation_size:], outer)[0]
+    )
+    return by_led, by_rotation, shared
 
 
-def _transformed(with_gauge: Floats, free: Floats, spare: Floats) -> Floats:
+def _gauge_terms(with_gauge: Floats, free: Floats, outer: Floats) -> Floats:
     """The terms that the S-transformation adds to the diagonal blocks: -K Z' - Z K' + Z P Z'."""
     cross = with_gauge @ free.transpose(0, 2, 1)
-    return free @ spare @ free.transpose(0, 2, 1) - cross - cross.transpose(0, 2, 1)
+    return free @ outer @ free.transpose(0, 2, 1) - cross - cross.transpose(0, 2, 1)

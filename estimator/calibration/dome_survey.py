@@ -9,7 +9,7 @@ Gauge freedoms, which no pixel can determine, and the constraints that fix them 
   survey is rotated onto it in the least-squares sense), or by the attitude of one reference frame.
 * rotation of the body frame against the camera (3): body_from_lab <- B body_from_lab, lever <- B lever,
   cam_from_body <- cam_from_body B^-1. cam_from_body is therefore fixed at its start value. External attitudes, such as
-  an IMU's, define both frames: `gauge.common_turns` computes B and G between two sets of attitudes.
+  an IMU's, define both frames: `gauge.align_attitudes` computes B and G between two sets of attitudes.
 * scale (1): lights and lever scale together. A known lens does not help, because a camera that rotates about the
   bearing measures only directions. One known distance between two lights fixes it, or else the mean size of the start
   map. The attitude does not depend on it.
@@ -37,7 +37,7 @@ from scipy.spatial.transform import Rotation
 from estimator.attitude.dome_map import LedMap, Lever
 from estimator.calibration import bundle_adjustment as ba
 from estimator.calibration.bundle_adjustment import Bundle, Sightings
-from estimator.calibration.gauge import Gauge, Part
+from estimator.calibration.gauge import Gauge, Subset
 from estimator.core.arrays import Floats, Ints
 from estimator.core.camera import Camera
 
@@ -47,7 +47,6 @@ LOSSES: dict[str, float] = {"linear": np.inf, "cauchy": CAUCHY}
 GATE = 5.0  # residuals above this many robust sigmas are outliers in the final fit
 GROSS_GATE = 6.0  # the same for the first rejection, after only the attitudes are fitted
 CROSSING_RAD = 0.005  # least rms angle between the rays to one light; below, its distance is undetermined
-MEDIAN_RADIUS = np.sqrt(2 * np.log(2))  # median distance of a two-dimensional unit Gaussian from its mean
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +64,7 @@ class DomeFrame:
 
 
 @dataclass(frozen=True, slots=True)
-class Survey:
+class DomeSurvey:
     """Result of a dome survey. The covariances are relative to the gauge and do not include its error.
 
     status         : "converged", or "stopped ..." if the iteration did not converge
@@ -105,8 +104,8 @@ class Survey:
     def surveyed_leds(self) -> LedMap:
         """The map of the surveyed lights only."""
         board = None if self.leds.board is None else self.leds.board[self.surveyed]
-        kept = self.leds.id[self.surveyed], self.leds.position_m[self.surveyed]
-        return LedMap(*kept, self.leds.centre_m, self.leds.semi_axes_m, board)
+        selected = self.leds.id[self.surveyed], self.leds.position_m[self.surveyed]
+        return LedMap(*selected, self.leds.center_m, self.leds.semi_axes_m, board)
 
 
 def survey(
@@ -119,7 +118,7 @@ def survey(
     loss: str = "linear",
     reference_frame: int | None = None,
     leds_sigma_m: float = np.inf,
-) -> Survey:
+) -> DomeSurvey:
     """Survey the dome: least squares over all lights and attitudes, the lever and the lens.
 
     known_length    : rows of two lights and the distance between them in m; fixes the scale
@@ -135,56 +134,64 @@ def survey(
     Raises ValueError in one line if the frames are malformed or do not determine the unknowns.
     """
     if loss not in LOSSES:
-        raise ValueError(f"survey: loss {loss!r} is none of {', '.join(LOSSES)}")
+        raise ValueError(f"survey: unknown loss {loss!r}; allowed: {', '.join(LOSSES)}")
     if not leds_sigma_m > 0:
         raise ValueError(f"survey: leds_sigma_m is {leds_sigma_m}; allowed: above 0, inf for a start only")
-    seen = _gathered(frames, len(leds_start.position_m))
-    start = _start(frames, leds_start, lever_start, camera_start, 7 if fit_distortion else 3)
+    sightings = _collect(frames, len(leds_start.position_m))
+    start = _start_bundle(frames, leds_start, lever_start, camera_start, 7 if fit_distortion else 3)
     start = replace(start, map_sigma_m=leds_sigma_m)
-    gauge = Gauge.of(known_length, reference_frame, start.map_m, start.R_body_from_lab)
-    part, keep, at_rest, spread = _settled(start, seen, gauge, LOSSES[loss])
-    status = "converged" if at_rest else f"stopped after {ba.STEPS} steps, not at rest"
+    gauge = Gauge(known_length, reference_frame, start.map_m, start.R_body_from_lab)
+    subset, keep, converged, covariances = _fit(start, sightings, gauge, LOSSES[loss])
+    status = "converged" if converged else f"stopped after {ba.STEPS} steps without convergence"
     row = np.concatenate([np.arange(len(frame.led)) for frame in frames])
-    outliers = np.column_stack([seen.frame, row])[~keep]
-    return _report(status, part, part.into(start, part.bundle), spread, outliers, leds_start, camera_start)
+    outliers = np.column_stack([sightings.frame, row])[~keep]
+    return _report(
+        status,
+        subset,
+        subset.insert_into(start, subset.bundle),
+        covariances,
+        outliers,
+        leds_start,
+        camera_start,
+    )
 
 
-def _settled(
-    start: Bundle, seen: Sightings, gauge: Gauge, width: float
-) -> tuple[Part, np.ndarray, bool, tuple[Floats, Floats, Floats]]:
+def _fit(
+    start: Bundle, sightings: Sightings, gauge: Gauge, width: float
+) -> tuple[Subset, np.ndarray, bool, tuple[Floats, Floats, Floats]]:
     """Fit the connected subset of the observations in the given gauge.
 
     Returns the fitted subset, the (M,) mask of sightings kept, whether it converged, and the covariances. Raises
     ValueError if the lever or the lens is undetermined.
     """
-    spread = None
+    covariances = None
     try:
-        near, keep = _without_strangers(start, seen, width)
-        part = _tied(near, seen, keep)
-        gauge.check(part)
-        found, at_rest = ba.adjust(part.bundle, part.seen, np.inf)
-        found = gauge.onto(found, part)
-        part = replace(part, bundle=found)
-        terms = ba.normal(found, part.seen, np.ones(len(part.index)))
-        spread = ba.covariance(terms, found, *gauge.held(found, part))
+        start, keep = _reject_misidentified(start, sightings, width)
+        subset = _connected_subset(start, sightings, keep)
+        gauge.check(subset)
+        fitted, converged = ba.adjust(subset.bundle, subset.sightings, np.inf)
+        fitted = gauge.transform(fitted, subset)
+        subset = replace(subset, bundle=fitted)
+        terms = ba.normal_equations(fitted, subset.sightings, np.ones(len(subset.index)))
+        covariances = ba.covariance(terms, fitted, *gauge.constraints(fitted, subset))
     except LinAlgError:
         pass  # a singular matrix raises the same ValueError below as a nearly singular one
-    if spread is None or not _determined(found, spread[2]):
-        raise ValueError("survey: the frames leave the lever or the lens unknown; take more tilts and yaws")
-    return part, keep, at_rest, spread
+    if covariances is None or not _determined(fitted, covariances[2]):
+        raise ValueError("survey: the frames do not determine the lever or the lens; take more tilts and yaws")
+    return subset, keep, converged, covariances
 
 
-def _gathered(frames: Sequence[DomeFrame], lights: int) -> Sightings:
+def _collect(frames: Sequence[DomeFrame], lights: int) -> Sightings:
     """The sightings of all frames in one table. Raises ValueError for the first malformed frame."""
     if not frames:
-        raise ValueError("survey: no frames; a dome needs some tens")
+        raise ValueError("survey: no frames; allowed: 1 or more, typically tens")
     for k, frame in enumerate(frames):
         count = len(frame.led)
         if frame.xy_px.shape != (count, 2) or frame.sigma_px.shape != (count,):
             shapes = f"{frame.xy_px.shape} and {frame.sigma_px.shape}"
             raise ValueError(f"survey: frame {k} has {count} LEDs, but xy_px and sigma_px are {shapes}")
         if count and not (frame.led.min() >= 0 and frame.led.max() < lights):
-            raise ValueError(f"survey: frame {k} names LED rows outside of 0 to {lights - 1}")
+            raise ValueError(f"survey: frame {k} has LED rows outside of 0 to {lights - 1}")
         if not (np.isfinite(frame.xy_px).all() and np.all((frame.sigma_px > 0) & (frame.sigma_px < np.inf))):
             raise ValueError(f"survey: frame {k} has a pixel that is not finite or a sigma_px not above 0")
     return Sightings(
@@ -195,13 +202,13 @@ def _gathered(frames: Sequence[DomeFrame], lights: int) -> Sightings:
     )
 
 
-def _start(frames: Sequence[DomeFrame], leds: LedMap, lever: Lever, camera: Camera, free_lens: int) -> Bundle:
-    lens = np.array([camera.focal_px, *camera.centre_px, *camera.distortion])
-    turned = Rotation.concatenate([frame.body_from_lab for frame in frames]).as_matrix()
+def _start_bundle(frames: Sequence[DomeFrame], leds: LedMap, lever: Lever, camera: Camera, free_lens: int) -> Bundle:
+    lens = np.array([camera.focal_px, *camera.center_px, *camera.distortion])
+    rotated = Rotation.concatenate([frame.body_from_lab for frame in frames]).as_matrix()
     R_cam_from_body = lever.cam_from_body.as_matrix()
     return Bundle(
         leds.position_m,
-        turned,
+        rotated,
         np.array(lever.camera_body_m),
         R_cam_from_body,
         lens,
@@ -210,88 +217,81 @@ def _start(frames: Sequence[DomeFrame], leds: LedMap, lever: Lever, camera: Came
     )
 
 
-def _without_strangers(whole: Bundle, seen: Sightings, width: float) -> tuple[Bundle, np.ndarray]:
+def _reject_misidentified(full: Bundle, sightings: Sightings, width: float) -> tuple[Bundle, np.ndarray]:
     """Improve the start values and reject wrong identifications.
 
     First only the attitudes are fitted. For a finite width, gross outliers are rejected, the whole bundle is fitted
     with Cauchy's loss, whose width shrinks with the noise until it settles, and residuals beyond GATE are rejected.
     Returns the bundle and the (M,) mask of sightings kept.
     """
-    keep = np.ones(len(seen.led), dtype=bool)
-    part = _tied(whole, seen, keep)
-    found = ba.turn_frames(part.bundle, part.seen, 12)
-    whole = part.into(whole, found)
+    keep = np.ones(len(sightings.led), dtype=bool)
+    subset = _connected_subset(full, sightings, keep)
+    fitted = ba.fit_attitudes(subset.bundle, subset.sightings, 12)
+    full = subset.insert_into(full, fitted)
     if np.isinf(width):
-        return whole, keep
-    keep[part.index] = _inside(found, part.seen, GROSS_GATE)
-    part = _tied(whole, seen, keep)
+        return full, keep
+    keep[subset.index] = _inliers(fitted, subset.sightings, GROSS_GATE)
+    subset = _connected_subset(full, sightings, keep)
     # Graduated robust fit: each round shrinks the width with the residuals, until it shrinks by less than 10 %.
-    found, before = part.bundle, np.inf
-    while (now := width * _noise(found, part.seen)) < 0.9 * before:
-        found, before = ba.adjust(found, part.seen, now, decrement=0.1)[0], now
-    keep[part.index] = _inside(found, part.seen, GATE)
-    return part.into(whole, found), keep
+    fitted, previous = subset.bundle, np.inf
+    while (current := width * ba.robust_scale(fitted, subset.sightings)) < 0.9 * previous:
+        fitted, previous = ba.adjust(fitted, subset.sightings, current, decrement=0.1)[0], current
+    keep[subset.index] = _inliers(fitted, subset.sightings, GATE)
+    return subset.insert_into(full, fitted), keep
 
 
-def _noise(bundle: Bundle, seen: Sightings) -> float:
-    """Robust scale of the residuals in sigmas, at least 1: their median distance over that of unit noise."""
-    distance = np.linalg.norm(ba.residuals(bundle, seen), axis=1)
-    return max(1.0, float(np.median(distance) / MEDIAN_RADIUS))
+def _inliers(bundle: Bundle, sightings: Sightings, gate: float) -> np.ndarray:
+    """(M,) whether each residual is below `gate` robust sigmas."""
+    length = np.linalg.norm(ba.residuals(bundle, sightings), axis=1)
+    return length < gate * ba.robust_scale(bundle, sightings)
 
 
-def _inside(bundle: Bundle, seen: Sightings, gate: float) -> np.ndarray:
-    distance = np.linalg.norm(ba.residuals(bundle, seen), axis=1)
-    return distance < gate * _noise(bundle, seen)
-
-
-def _tied(whole: Bundle, seen: Sightings, keep: np.ndarray) -> Part:
+def _connected_subset(full: Bundle, sightings: Sightings, keep: np.ndarray) -> Subset:
     """The subset that the sightings determine.
 
     It holds lights seen in two or more frames with crossing rays, and frames that see two or more such lights. Raises
     ValueError if too few sightings remain, or if they form groups of frames that are not connected.
     """
-    ahead = np.isfinite(ba.residuals(whole, seen)).all(axis=1)
-    index = np.flatnonzero(keep & ahead)
-    lights, frames = len(whole.position_m), len(whole.R_body_from_lab)
+    in_front = np.isfinite(ba.residuals(full, sightings)).all(axis=1)
+    index = np.flatnonzero(keep & in_front)
+    lights, frames = len(full.position_m), len(full.R_body_from_lab)
     # Removing a light can leave its frames with too few lights, and the reverse: repeat until nothing changes.
     while True:
-        led, frame = seen.led[index], seen.frame[index]
+        led, frame = sightings.led[index], sightings.frame[index]
         incidence = csr_array((np.ones(len(index)), (frame, led)), shape=(frames, lights)) > 0
-        good_led = (incidence.sum(axis=0) >= 2) & _crossing(whole, seen.take(index))
+        good_led = (incidence.sum(axis=0) >= 2) & _crossing(full, sightings.take(index))
         good_frame = incidence @ good_led.astype(float) >= 2
-        stays = good_led[led] & good_frame[frame]
-        if stays.all():
+        valid = good_led[led] & good_frame[frame]
+        if valid.all():
             break
-        index = index[stays]
+        index = index[valid]
     led_rows, frame_rows = np.unique(led), np.unique(frame)
-    unknowns = 3 * len(led_rows) + 3 * len(frame_rows) + 3 + whole.free_lens - 4
+    unknowns = 3 * len(led_rows) + 3 * len(frame_rows) + 3 + full.free_lens - 4
     if 2 * len(index) < unknowns or not len(index):
-        raise ValueError(
-            f"survey: {2 * len(index)} usable coordinates for {unknowns} unknowns; take more frames"
-        )
+        raise ValueError(f"survey: {2 * len(index)} usable coordinates for {unknowns} unknowns; take more frames")
     _check_one_group(incidence, frame_rows)
-    seen = seen.take(index)
-    numbered = replace(seen, frame=np.searchsorted(frame_rows, frame), led=np.searchsorted(led_rows, led))
+    sightings = sightings.take(index)
+    numbered = replace(sightings, frame=np.searchsorted(frame_rows, frame), led=np.searchsorted(led_rows, led))
     bundle = replace(
-        whole,
-        position_m=whole.position_m[led_rows],
-        R_body_from_lab=whole.R_body_from_lab[frame_rows],
-        map_m=whole.map_m[led_rows],
+        full,
+        position_m=full.position_m[led_rows],
+        R_body_from_lab=full.R_body_from_lab[frame_rows],
+        map_m=full.map_m[led_rows],
     )
-    return Part(bundle, numbered, led_rows, frame_rows, index)
+    return Subset(bundle, numbered, led_rows, frame_rows, index)
 
 
-def _crossing(whole: Bundle, seen: Sightings) -> np.ndarray:
+def _crossing(full: Bundle, sightings: Sightings) -> np.ndarray:
     """(N,) whether each light's rays differ enough in direction to determine its distance.
 
     1 minus the largest eigenvalue of the mean of u u' is the mean sin^2 of the rays' angles from their main direction.
     """
-    camera_lab = np.einsum("kji,j->ki", whole.R_body_from_lab, whole.camera_body_m)
-    ray = whole.position_m[seen.led] - camera_lab[seen.frame]
+    camera_lab = np.einsum("kji,j->ki", full.R_body_from_lab, full.camera_body_m)
+    ray = full.position_m[sightings.led] - camera_lab[sightings.frame]
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)
-    lights = len(whole.position_m)
-    scatter, count = np.zeros((lights, 3, 3)), np.maximum(np.bincount(seen.led, minlength=lights), 1)
-    np.add.at(scatter, seen.led, ray[:, :, None] * ray[:, None, :])
+    lights = len(full.position_m)
+    scatter, count = np.zeros((lights, 3, 3)), np.maximum(np.bincount(sightings.led, minlength=lights), 1)
+    np.add.at(scatter, sightings.led, ray[:, :, None] * ray[:, None, :])
     largest = np.linalg.eigvalsh(scatter / count[:, None, None])[:, 2]
     return 1 - largest > CROSSING_RAD**2
 
@@ -306,62 +306,62 @@ def _check_one_group(incidence: csr_array, frame_rows: Ints) -> None:
     member = np.zeros(len(frame_rows), dtype=bool)
     member[np.argmax(table.sum(axis=1))] = True
     while True:
-        known = (table.T @ member.astype(float)) > 0
-        grown = member | (table @ known.astype(float) >= 2)
+        leds_in_group = (table.T @ member.astype(float)) > 0
+        grown = member | (table @ leds_in_group.astype(float) >= 2)
         if (grown == member).all():
             break
         member = grown
     if not member.all():
         first, second = frame_rows[member][0], frame_rows[~member][0]
         raise ValueError(
-            f"survey: the frames fall apart; {np.sum(~member)} of {len(member)}, frame {second} first, share fewer "
-            f"than two LEDs with the group of frame {first}: take frames between them"
+            f"survey: the frames are not connected; {np.sum(~member)} of {len(member)}, frame {second} first, share "
+            f"fewer than two LEDs with the group of frame {first}: take frames between them"
         )
 
 
-def _determined(found: Bundle, shared: Floats) -> bool:
+def _determined(fitted: Bundle, shared: Floats) -> bool:
     """Whether the lever is determined to 10 % of the least LED distance, and the focal length to 10 %."""
     sigma = np.sqrt(np.maximum(np.diag(shared), 0))
-    reach = np.linalg.norm(found.position_m, axis=1).min()
-    return bool(np.isfinite(sigma).all() and sigma[:3].max() < 0.1 * reach and sigma[3] < 0.1 * found.lens[0])
+    nearest_m = np.linalg.norm(fitted.position_m, axis=1).min()
+    return bool(np.isfinite(sigma).all() and sigma[:3].max() < 0.1 * nearest_m and sigma[3] < 0.1 * fitted.lens[0])
 
 
 def _report(
     status: str,
-    part: Part,
-    whole: Bundle,
-    spread: tuple[Floats, Floats, Floats],
+    subset: Subset,
+    full: Bundle,
+    covariances: tuple[Floats, Floats, Floats],
     outliers: Ints,
     leds: LedMap,
     camera: Camera,
-) -> Survey:
-    lights, frames = len(whole.position_m), len(whole.R_body_from_lab)
+) -> DomeSurvey:
+    lights, frames = len(full.position_m), len(full.R_body_from_lab)
     surveyed, tied = np.zeros(lights, dtype=bool), np.zeros(frames, dtype=bool)
-    surveyed[part.led] = tied[part.frame] = True
-    by_led, by_turn = np.full((lights, 3, 3), np.nan), np.full((frames, 3, 3), np.nan)
-    by_led[part.led], by_turn[part.frame], shared = spread
-    seen = part.seen
-    left_over = ba.residuals(part.bundle, seen)
-    lens = [float(value) for value in whole.lens]
-    unknowns = 3 * len(part.led) + 3 * len(part.frame) + 3 + whole.free_lens - 4
-    return Survey(
+    surveyed[subset.led] = tied[subset.frame] = True
+    by_led, by_rotation = np.full((lights, 3, 3), np.nan), np.full((frames, 3, 3), np.nan)
+    by_led[subset.led], by_rotation[subset.frame], shared = covariances
+    sightings = subset.sightings
+    residual = ba.residuals(subset.bundle, sightings)
+    lens = [float(value) for value in full.lens]
+    unknowns = 3 * len(subset.led) + 3 * len(subset.frame) + 3 + full.free_lens - 4
+    return DomeSurvey(
         status,
-        replace(leds, position_m=whole.position_m),
+        replace(leds, position_m=full.position_m),
         surveyed,
-        Lever(whole.camera_body_m, Rotation.from_matrix(whole.R_cam_from_body)),
+        Lever(full.camera_body_m, Rotation.from_matrix(full.R_cam_from_body)),
         replace(
             camera,
             focal_px=lens[0],
-            centre_px=(lens[1], lens[2]),
+            center_px=(lens[1], lens[2]),
             distortion=(lens[3], lens[4], lens[5], lens[6], lens[7]),
         ),
-        Rotation.from_matrix(whole.R_body_from_lab),
+        Rotation.from_matrix(full.R_body_from_lab),
         tied,
         outliers,
         by_led,
-        by_turn,
+        by_rotation,
         shared[:3, :3],
         shared[3:, 3:],
-        rms_px=float(np.sqrt(np.mean((left_over * seen.sigma_px[:, None]) ** 2))),
-        misfit=float(np.sqrt(np.sum(left_over**2) / max(2 * len(seen.led) - unknowns, 1))),
+        rms_px=float(np.sqrt(np.mean((residual * sightings.sigma_px[:, None]) ** 2))),
+        misfit=float(np.sqrt(np.sum(residual**2) / max(2 * len(sightings.led) - unknowns, 1))),
     )

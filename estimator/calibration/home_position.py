@@ -28,34 +28,34 @@ from estimator.core.errors import ImageError
 class Sighting:
     """One frame with identified lights.
 
-    position      : number of the vehicle's stop; the stop of the first sighting is home
+    stop          : number of the vehicle's stop; the stop of the first sighting is home
     body_from_lab : attitude from the IMU, which is zeroed at home: there the body axes are those of the lab frame
-    led           : (K,) ids, each once;  xy_px : (K, 2) centroids;  magnitude : (K,) see `instrument_magnitude`
+    led           : (K,) ids, each once;  xy_px : (K, 2) centroids;  brightness : (K,) see `instrument_brightness`
     """
 
-    position: int
+    stop: int
     body_from_lab: Rotation
     led: Ints
     xy_px: Floats
-    magnitude: Floats
+    brightness: Floats
 
 
 @dataclass(frozen=True, slots=True)
-class HomeCatalogue:
+class HomeCatalog:
     """LED catalog about the bearing, in the lab frame, brightest first (section 3.6.4).
 
-    id, magnitude  : (N,); a greater magnitude is a brighter light
+    id, brightness : (N,)
     vectors        : (N, 3) unit, from the bearing
     position_m     : (N, 3) positions by eqs 43-44: near the dome, not on it
     covariance_m2  : (N, 3, 3) of one frame's position about its mean, over all frames; NaN for a single frame
-    samples        : (N,) number of frames averaged for position and magnitude
-    epsilon_mag, epsilon_pos_m, epsilon_sep_rad : standard deviations of a magnitude, of a coordinate of a position
+    samples        : (N,) number of frames averaged for position and brightness
+    epsilon_mag, epsilon_pos_m, epsilon_sep_rad : standard deviations of a brightness, of a coordinate of a position
         and of the angle between two lights: the greatest over all lights, coordinates and pairs
     """
 
     id: Ints
     vectors: Floats
-    magnitude: Floats
+    brightness: Floats
     position_m: Floats
     covariance_m2: Floats
     samples: Ints
@@ -72,60 +72,59 @@ class HomeCatalogue:
         return self.epsilon_pos_m / float(np.linalg.norm(self.position_m, axis=1).mean())
 
 
-def instrument_magnitude(mean_dn: Floats, area_px: Floats) -> Floats:
+def instrument_brightness(mean_dn: Floats, area_px: Floats) -> Floats:
     """(N,) brightness of each blob of a frame: mean brightness times its area over the frame's median area.
 
-    Section 3.6.2.1 says only that the mean brightness is "normalised against the median LED area"; his dim means of
+    Section 3.6.2.1 says only that the mean brightness is "normalized against the median LED area"; his dim means of
     7 are below his own threshold of 10.2, so that the area must be a factor (reference 1.2, item 13: inferred). A
     change common to all blobs, such as defocus, changes the result in the same ratio as the mean brightness.
     """
     return mean_dn * area_px / np.median(area_px)
 
 
-def pooled(value: Floats, group: Ints, position: Ints) -> Floats:
+def pooled(value: Floats, group: Ints, stop: Ints) -> Floats:
     """(G,) sample standard deviation (n - 1) of each group's values over all frames; differences between stops count.
 
     Section 3.6.3: "across the total number of recorded observations". NaN for a single value.
     """
     count = np.bincount(group)
-    off_mean = value - (np.bincount(group, value) / np.maximum(count, 1))[group]
-    squares = np.bincount(group, off_mean**2)
+    difference = value - (np.bincount(group, value) / np.maximum(count, 1))[group]
+    squares = np.bincount(group, difference**2)
     return np.where(count > 1, np.sqrt(squares / np.maximum(count - 1, 1)), np.nan)
 
 
-def averaged(value: Floats, group: Ints, position: Ints) -> Floats:
+def averaged(value: Floats, group: Ints, stop: Ints) -> Floats:
     """(G,) mean over the stops of the standard deviation at each stop.
 
     Differences between stops, such as errors of the IMU's angles, have no effect. Section 4.4.1: "the averaged
     multi-positional standard deviation values". NaN if no stop has two frames.
     """
-    _, stop = np.unique(position, return_inverse=True)
-    stops = stop.max() + 1
+    _, row = np.unique(stop, return_inverse=True)
+    stops = row.max() + 1
     at_stop = np.full((group.max() + 1) * stops, np.nan)
-    spread = pooled(value, group * stops + stop, position)
-    at_stop[: len(spread)] = spread
+    deviation = pooled(value, group * stops + row, stop)
+    at_stop[: len(deviation)] = deviation
     table = at_stop.reshape(-1, stops)
-    known = np.isfinite(table)
-    some = known.any(axis=1)
-    total = np.where(known, table, 0.0).sum(axis=1)
-    return np.where(some, total / np.maximum(known.sum(axis=1), 1), np.nan)
+    finite = np.isfinite(table)
+    total = np.where(finite, table, 0.0).sum(axis=1)
+    return np.where(finite.any(axis=1), total / np.maximum(finite.sum(axis=1), 1), np.nan)
 
 
 # The thesis describes both. Table 4 has a pooled value under "Avg"; the position value of Table 9 is too small for a
 # pooled one if the IMU's angles were those of Tables 10-14 (reference 1.2, items 3 and 15).
-Spread = Callable[[Floats, Ints, Ints], Floats]
-SPREADS: dict[str, Spread] = {"pooled": pooled, "averaged": averaged}
+Deviation = Callable[[Floats, Ints, Ints], Floats]
+DEVIATIONS: dict[str, Deviation] = {"pooled": pooled, "averaged": averaged}
 
 
 class _Samples(NamedTuple):
-    """Every light of every frame: row of its id, frame, stop, position in body and in lab axes, magnitude."""
+    """Every light of every frame: row of its id, frame, stop, position in body and in lab axes, brightness."""
 
     led: Ints
     frame: Ints
-    position: Ints
+    stop: Ints
     body_m: Floats
     lab_m: Floats
-    magnitude: Floats
+    brightness: Floats
 
 
 def calibrate(
@@ -134,77 +133,77 @@ def calibrate(
     surface: LedMap,
     lever: Lever,
     sine: bool = False,
-    spread: str = "pooled",
+    statistic: str = "pooled",
     home_only: bool = True,
-) -> HomeCatalogue:
+) -> HomeCatalog:
     """The catalog and its epsilons by AFIT's procedure (Padro 2012, sections 3.6.3-3.6.4 and 4.4.1).
 
     surface   : dome model, which gives R; its LEDs are not used
     sine      : correct eq. 44, which has tan instead of sin (reference 1.2, item 11)
-    spread    : a name in SPREADS: the standard deviation whose maximum is an epsilon
+    statistic : a name in DEVIATIONS: the standard deviation whose maximum is an epsilon
     home_only : take the catalog from the frames at home, as in the thesis, with every epsilon from all frames; else
         from the mean over all frames (the black marks of his Fig. 79), which keeps the IMU's errors at the stops
-    Raises ImageError for inconsistent sightings, or if a spread is unknown.
+    Raises ImageError for inconsistent sightings, or if a standard deviation is undetermined.
     """
-    id_, samples = _placed(sightings, camera, surface, lever, sine)
-    deviation = SPREADS[spread]
-    coordinates = [deviation(column, samples.led, samples.position) for column in samples.lab_m.T]
+    id_, samples = _lab_positions(sightings, camera, surface, lever, sine)
+    deviation = DEVIATIONS[statistic]
+    coordinates = [deviation(column, samples.led, samples.stop) for column in samples.lab_m.T]
     angle, pair, stop = _separations(samples)
     epsilons = (
-        _greatest(deviation(samples.magnitude, samples.led, samples.position), "light"),
-        _greatest(np.concatenate(coordinates), "light"),
-        _greatest(deviation(angle, pair, stop), "pair of lights"),
+        _maximum(deviation(samples.brightness, samples.led, samples.stop), "light"),
+        _maximum(np.concatenate(coordinates), "light"),
+        _maximum(deviation(angle, pair, stop), "pair of lights"),
     )
-    used = samples.position == sightings[0].position if home_only else np.ones(len(samples.led), bool)
-    order, place_m, magnitude, count = _brightest_first(samples, used)
+    selected = samples.stop == sightings[0].stop if home_only else np.ones(len(samples.led), bool)
+    order, mean_m, brightness, count = _brightest_first(samples, selected)
     covariance = _covariance(samples.lab_m, samples.led)[order]
-    return HomeCatalogue(id_[order], unit(place_m), magnitude, place_m, covariance, count, *epsilons)
+    return HomeCatalog(id_[order], unit(mean_m), brightness, mean_m, covariance, count, *epsilons)
 
 
-def _brightest_first(samples: _Samples, used: NDArray[np.bool_]) -> tuple[Ints, Floats, Floats, Ints]:
-    """Lights seen in the frames used, brightest first: rows, mean positions (N, 3), magnitudes, numbers of frames."""
-    led = samples.led[used]
+def _brightest_first(samples: _Samples, selected: NDArray[np.bool_]) -> tuple[Ints, Floats, Floats, Ints]:
+    """Lights seen in the frames used, brightest first: rows, mean positions (N, 3), brightness, numbers of frames."""
+    led = samples.led[selected]
     count = np.bincount(led)
-    total = [np.bincount(led, column) for column in (*samples.lab_m[used].T, samples.magnitude[used])]
+    total = [np.bincount(led, column) for column in (*samples.lab_m[selected].T, samples.brightness[selected])]
     mean = np.column_stack(total) / np.maximum(count, 1)[:, None]
     order = np.argsort(-mean[:, 3], kind="stable")
     order = order[count[order] > 0]
     return order, mean[order, :3], mean[order, 3], count[order]
 
 
-def _placed(
+def _lab_positions(
     sightings: Sequence[Sighting], camera: Camera, surface: LedMap, lever: Lever, sine: bool
 ) -> tuple[Ints, _Samples]:
     """The ids seen, and each light of each frame transformed to the lab frame with the IMU's attitude."""
     if not len(sightings):
-        raise ImageError("no sightings: a calibration needs at least two frames")
-    for number, seen in enumerate(sightings):
-        _check(number, seen)
+        raise ImageError("no sightings; allowed: at least two frames")
+    for index, sighting in enumerate(sightings):
+        _check(index, sighting)
     body_m, lab_m = [], []
-    for seen in sightings:
-        point_cam, _ = thesis_points(camera.rays(seen.xy_px), surface, lever, sine)
+    for sighting in sightings:
+        point_cam, _ = thesis_points(camera.rays(sighting.xy_px), surface, lever, sine)
         point_body = lever.cam_from_body.inv().apply(point_cam) + lever.camera_body_m
         body_m.append(point_body)
-        lab_m.append(seen.body_from_lab.inv().apply(point_body))
-    lights = [len(seen.led) for seen in sightings]
-    id_, led = np.unique(np.concatenate([seen.led for seen in sightings]), return_inverse=True)
+        lab_m.append(sighting.body_from_lab.inv().apply(point_body))
+    lights = [len(sighting.led) for sighting in sightings]
+    id_, led = np.unique(np.concatenate([sighting.led for sighting in sightings]), return_inverse=True)
     frame = np.repeat(np.arange(len(sightings)), lights)
-    position = np.repeat([seen.position for seen in sightings], lights)
-    magnitude = np.concatenate([seen.magnitude for seen in sightings])
-    return id_, _Samples(led, frame, position, np.vstack(body_m), np.vstack(lab_m), magnitude)
+    stop = np.repeat([sighting.stop for sighting in sightings], lights)
+    brightness = np.concatenate([sighting.brightness for sighting in sightings])
+    return id_, _Samples(led, frame, stop, np.vstack(body_m), np.vstack(lab_m), brightness)
 
 
-def _check(number: int, seen: Sighting) -> None:
-    lights = len(seen.led)
-    if not lights or seen.xy_px.shape != (lights, 2) or seen.magnitude.shape != (lights,):
+def _check(index: int, sighting: Sighting) -> None:
+    lights = len(sighting.led)
+    if not lights or sighting.xy_px.shape != (lights, 2) or sighting.brightness.shape != (lights,):
         raise ImageError(
-            f"sighting {number}: {lights} names, centroids {seen.xy_px.shape}, magnitudes "
-            f"{seen.magnitude.shape}; allowed: K names, (K, 2) and (K,), K from 1"
+            f"sighting {index}: {lights} ids, centroids {sighting.xy_px.shape}, brightness "
+            f"{sighting.brightness.shape}; allowed: K ids, (K, 2) and (K,), K from 1"
         )
-    if len(np.unique(seen.led)) < lights:
-        raise ImageError(f"sighting {number}: a light has two centroids; each id may stand once")
-    if not (np.isfinite(seen.xy_px).all() and np.isfinite(seen.magnitude).all()):
-        raise ImageError(f"sighting {number}: a centroid or a magnitude is not finite")
+    if len(np.unique(sighting.led)) < lights:
+        raise ImageError(f"sighting {index}: an id occurs twice; allowed: each id once")
+    if not (np.isfinite(sighting.xy_px).all() and np.isfinite(sighting.brightness).all()):
+        raise ImageError(f"sighting {index}: a centroid or a brightness is not finite")
 
 
 def _separations(samples: _Samples) -> tuple[Floats, Ints, Ints]:
@@ -220,38 +219,38 @@ def _separations(samples: _Samples) -> tuple[Floats, Ints, Ints]:
         second.append(rows[j])
     a, b = np.concatenate(first), np.concatenate(second)
     if not len(a):
-        raise ImageError("no frame shows two lights: no angle between lights to take a spread of")
+        raise ImageError("no frame has two lights; allowed: two or more in a frame, for their separation")
     angle = 2 * np.arcsin(np.linalg.norm(direction[a] - direction[b], axis=1) / 2)
     low, high = np.sort([samples.led[a], samples.led[b]], axis=0)
     _, pair = np.unique(low * (samples.led.max() + 1) + high, return_inverse=True)
-    return angle, pair, samples.position[a]
+    return angle, pair, samples.stop[a]
 
 
-def _greatest(spread: Floats, of: str) -> float:
-    known = spread[np.isfinite(spread)]
-    if not len(known):
-        raise ImageError(f"each {of} has one sample: its spread is unknown; two frames of it are needed")
-    return float(known.max())
+def _maximum(deviation: Floats, source: str) -> float:
+    finite = deviation[np.isfinite(deviation)]
+    if not len(finite):
+        raise ImageError(f"each {source} has one sample; allowed: two frames or more, for a standard deviation")
+    return float(finite.max())
 
 
 def _covariance(lab_m: Floats, led: Ints) -> Floats:
     """(N, 3, 3) sample covariance of each light's positions, m^2."""
     count = np.bincount(led)
     mean_m = np.array([np.bincount(led, column) for column in lab_m.T]) / count
-    off_mean = lab_m - mean_m.T[led]
+    difference_m = lab_m - mean_m.T[led]
     covariance = np.zeros((len(count), 3, 3))
-    np.add.at(covariance, led, np.einsum("si,sj->sij", off_mean, off_mean))
+    np.add.at(covariance, led, np.einsum("si,sj->sij", difference_m, difference_m))
     covariance[count < 2] = np.nan
     return covariance / np.maximum(count - 1, 1)[:, None, None]
 
 
-def led_map(catalogue: HomeCatalogue, surface: LedMap) -> LedMap:
+def led_map(catalog: HomeCatalog, surface: LedMap) -> LedMap:
     """LED map for a tracker: the intersections of the catalog's directions from the bearing with the dome surface.
 
     surface : provides the ellipsoid; its LEDs are not used. Raises ImageError if a direction misses it.
     """
-    position_m = on_surface(catalogue.vectors, np.zeros(3), surface)
-    missed = catalogue.id[np.isnan(position_m).any(axis=1)]
-    if len(missed):
-        raise ImageError(f"LED {missed[0]}: its direction from the bearing misses the believed surface")
-    return LedMap(catalogue.id, position_m, surface.centre_m, surface.semi_axes_m)
+    position_m = on_surface(catalog.vectors, np.zeros(3), surface)
+    outside = catalog.id[np.isnan(position_m).any(axis=1)]
+    if len(outside):
+        raise ImageError(f"LED {outside[0]}: its direction from the bearing does not intersect the surface")
+    return LedMap(catalog.id, position_m, surface.center_m, surface.semi_axes_m)

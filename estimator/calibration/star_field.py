@@ -3,12 +3,12 @@
 Star directions are known to milliarcseconds, so that the unknowns are the eight lens parameters and three attitude
 angles per frame. The projection and its derivatives are those of `bundle_adjustment`, with the stars as lights at
 distance 1 and no lever. Levenberg-Marquardt minimizes the weighted residuals; the attitudes are eliminated (Schur
-complement), so that each step solves an 8 x 8 system whatever the number of frames. `self_calibrated` alternates
+complement), so that each step solves an 8 x 8 system whatever the number of frames. `self_calibrate` alternates
 identification and calibration.
 
 Some lens parameters are weakly observable: a shift of the principal point differs from a rotation of the camera only
 by the square of the field angle, and k2 and k3 resemble k1 over a narrow field. A Gaussian prior on ordinary lenses
-(`Belief`) constrains them. Along such directions errors of the lens and of the attitudes can cancel in the pixels.
+(`LensPrior`) constrains them. Along such directions errors of the lens and of the attitudes can cancel in the pixels.
 """
 
 from __future__ import annotations
@@ -25,17 +25,17 @@ from estimator.attitude import wahba as kernel
 from estimator.attitude.solvers import rotation
 from estimator.calibration import bundle_adjustment as ba
 from estimator.calibration.bundle_adjustment import Bundle, Sightings
-from estimator.calibration.dome_survey import CAUCHY, GATE, MEDIAN_RADIUS
+from estimator.calibration.dome_survey import CAUCHY, GATE
 from estimator.calibration.magnitude_zero import MagnitudeZero, magnitude_zero
 from estimator.catalog.catalog import StarCatalog
 from estimator.core.arrays import Floats, Ints
 from estimator.core.camera import Camera
 from estimator.core.types import Attitude, Centroids
 
-LENS = 8  # focal_px, centre x and y, k1, k2, p1, p2, k3
+LENS = 8  # focal_px, center x and y, k1, k2, p1, p2, k3
 LEAST_STARS = 3  # in a frame: two determine its attitude and leave only one coordinate for the lens
 START_ROUNDS = 30  # iterations of the robust start attitude
-MOST_LOST = 0.9  # self_calibrated stops at a round with fewer than this fraction of the most stars so far
+MIN_STAR_FRACTION = 0.9  # self_calibrate stops at a round with fewer than this fraction of the most stars so far
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,15 +56,15 @@ class StarFrame:
 
 
 @dataclass(frozen=True, slots=True)
-class Belief:
+class LensPrior:
     """Prior standard deviations of the lens parameters about the start camera.
 
-    centre : of the principal point, as a fraction of the chip's width
+    center : of the principal point, as a fraction of the chip's width
     radial, tangential : displacement by each coefficient alone in the farthest corner, as a fraction of the corner's
         distance from the center
     """
 
-    centre: float = 0.05
+    center: float = 0.05
     radial: float = 0.2
     tangential: float = 0.02
 
@@ -72,8 +72,8 @@ class Belief:
         """(8,) standard deviations of focal_px (inf: no prior), center x and y, k1, k2, p1, p2, k3."""
         r = np.tan(camera.diagonal_rad / 2)
         k1, p = self.radial / r**2, self.tangential / (3 * r)
-        centre = self.centre * camera.width_px
-        return np.array([np.inf, centre, centre, k1, k1 / r**2, p, p, k1 / r**4])
+        center = self.center * camera.width_px
+        return np.array([np.inf, center, center, k1, k1 / r**2, p, p, k1 / r**4])
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,37 +110,37 @@ class Calibration(NamedTuple):
     report: FieldReport
 
 
-BELIEF = Belief()
+LENS_PRIOR = LensPrior()
 
 
-def calibrate(frames: Sequence[StarFrame], camera_start: Camera, belief: Belief = BELIEF) -> Calibration:
+def calibrate(frames: Sequence[StarFrame], camera_start: Camera, prior: LensPrior = LENS_PRIOR) -> Calibration:
     """Fit the lens and every frame's attitude by least squares, from a focal length accurate to a few percent.
 
     Wrong identifications are tolerated: the fit first uses Cauchy's loss, its width shrinking with the median residual;
     then residuals beyond 5 sigma are rejected, and the rest is fitted by least squares, whose covariance is returned.
     Raises ValueError in one line if the frames are malformed or do not determine the lens.
     """
-    whole = _gathered(frames)
-    rows = np.concatenate([np.arange(len(frame.xy_px)) for frame in frames])
+    sightings = _collect(frames)
+    row = np.concatenate([np.arange(len(frame.xy_px)) for frame in frames])
     counts = np.array([len(frame.xy_px) for frame in frames])
     vectors = np.concatenate([frame.vectors_ref for frame in frames])
-    problem = _start(whole, vectors, camera_start, belief, len(frames))
-    keep = counts[whole.frame] >= LEAST_STARS
-    _check_enough(whole.take(keep))
-    problem, before = problem._replace(bundle=_turned(problem.bundle, whole.take(keep))), np.inf
+    problem = _start_problem(sightings, vectors, camera_start, prior, len(frames))
+    keep = counts[sightings.frame] >= LEAST_STARS
+    _check_enough(sightings.take(keep))
+    problem, previous = problem._replace(bundle=_fit_attitudes(problem.bundle, sightings.take(keep))), np.inf
     # Graduated robust fit: each round shrinks the width with the residuals, until it shrinks by less than 10 %.
-    while (now := CAUCHY * _noise(problem.bundle, whole.take(keep))) < 0.9 * before:
-        problem, _ = _adjusted(problem, whole.take(keep), now)
-        before = now
-    distance = np.linalg.norm(ba.residuals(problem.bundle, whole), axis=1)
-    keep &= distance < GATE * _noise(problem.bundle, whole.take(keep))
-    outliers = np.column_stack([whole.frame, rows])[~keep & (counts[whole.frame] >= LEAST_STARS)]
-    tied = np.bincount(whole.frame[keep], minlength=len(frames)) >= LEAST_STARS
-    keep &= tied[whole.frame]
-    _check_enough(whole.take(keep))
-    problem, at_rest = _adjusted(problem, whole.take(keep), np.inf)
-    status = "converged" if at_rest else f"stopped after {ba.STEPS} steps, not at rest"
-    return _report(status, problem, whole.take(keep), tied, outliers, keep, frames, camera_start)
+    while (current := CAUCHY * ba.robust_scale(problem.bundle, sightings.take(keep))) < 0.9 * previous:
+        problem, _ = _minimize(problem, sightings.take(keep), current)
+        previous = current
+    distance = np.linalg.norm(ba.residuals(problem.bundle, sightings), axis=1)
+    keep &= distance < GATE * ba.robust_scale(problem.bundle, sightings.take(keep))
+    outliers = np.column_stack([sightings.frame, row])[~keep & (counts[sightings.frame] >= LEAST_STARS)]
+    tied = np.bincount(sightings.frame[keep], minlength=len(frames)) >= LEAST_STARS
+    keep &= tied[sightings.frame]
+    _check_enough(sightings.take(keep))
+    problem, converged = _minimize(problem, sightings.take(keep), np.inf)
+    status = "converged" if converged else f"stopped after {ba.STEPS} steps without convergence"
+    return _report(status, problem, sightings.take(keep), tied, outliers, keep, frames, camera_start)
 
 
 class Tracker(Protocol):
@@ -151,7 +151,7 @@ class Tracker(Protocol):
     def solve_centroids(self, centroids: Centroids) -> Attitude: ...
 
 
-def self_calibrated(
+def self_calibrate(
     frames: Sequence[Centroids],
     tracker: Callable[[Camera, float], Tracker],
     camera: Camera,
@@ -165,19 +165,19 @@ def self_calibrated(
     camera  : prior knowledge: the chip, and the focal length to `focal_uncertainty`
 
     Stops when a round identifies the same stars as the one before (an equal number is not enough), or has lost too
-    many (MOST_LOST). Raises ValueError if no frame is identified.
+    many (MIN_STAR_FRACTION). Raises ValueError if no frame is identified.
     """
-    best, most, stars_before, belief_in = None, 0, np.empty((0, 3)), camera
+    best, most, previous_stars, estimate = None, 0, np.empty((0, 3)), camera
     for _ in range(rounds):
-        named = _named(frames, tracker(belief_in, focal_uncertainty), exposure_s)
-        stars = np.concatenate([np.empty((0, 3)), *(frame.vectors_ref for frame in named)])
+        identified = _identified(frames, tracker(estimate, focal_uncertainty), exposure_s)
+        stars = np.concatenate([np.empty((0, 3)), *(frame.vectors_ref for frame in identified)])
         # Each round identifies with the calibrated camera, but calibrates from the start camera, which is the prior.
-        if np.array_equal(stars, stars_before) or len(stars) < MOST_LOST * most:
+        if np.array_equal(stars, previous_stars) or len(stars) < MIN_STAR_FRACTION * most:
             break
-        best, most, stars_before = calibrate(named, camera), max(most, len(stars)), stars
-        belief_in, focal_uncertainty = best.camera, 0.0
+        best, most, previous_stars = calibrate(identified, camera), max(most, len(stars)), stars
+        estimate, focal_uncertainty = best.camera, 0.0
     if best is None:
-        raise ValueError(f"self_calibrated: none of the {len(frames)} frames is identified; check the camera")
+        raise ValueError(f"self_calibrate: no star identified in any of {len(frames)} frames; check the camera")
     return best
 
 
@@ -190,37 +190,37 @@ def disagreement_px(camera: Camera, other: Camera, nodes: int = 41) -> float:
     y = np.linspace(-0.5, camera.height_px - 0.5, nodes)
     xy = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
     rays = camera.rays(xy)
-    turn, _ = kernel.wahba(other.rays(xy), rays, np.ones(len(xy)))
-    return float(np.sqrt(np.mean(np.sum((other.pixels(rays @ turn.T) - xy) ** 2, axis=1))))
+    R_other_from_camera, _ = kernel.wahba(other.rays(xy), rays, np.ones(len(xy)))
+    return float(np.sqrt(np.mean(np.sum((other.pixels(rays @ R_other_from_camera.T) - xy) ** 2, axis=1))))
 
 
 class _Problem(NamedTuple):
     """The bundle with the stars as lights at distance 1, and the (8,) prior lens with its standard deviations."""
 
     bundle: Bundle
-    believed: Floats
+    prior_lens: Floats
     sigma: Floats
 
-    def cost(self, seen: Sightings, width: float) -> tuple[float, Floats]:
+    def cost(self, sightings: Sightings, width: float) -> tuple[float, Floats]:
         """Total loss of the pixels and the prior, and the (M,) robust weights of the sightings."""
-        loss, weight = ba.cauchy(np.sum(ba.residuals(self.bundle, seen) ** 2, axis=1), width)
-        return loss + float(np.sum(((self.bundle.lens - self.believed) / self.sigma) ** 2)), weight
+        loss, weight = ba.cauchy(np.sum(ba.residuals(self.bundle, sightings) ** 2, axis=1), width)
+        return loss + float(np.sum(((self.bundle.lens - self.prior_lens) / self.sigma) ** 2)), weight
 
 
-class _Normal(NamedTuple):
+class _NormalEquations(NamedTuple):
     """The normal equations: (F, 3, 3) of rotations, (F, 3, 8) coupling, (8, 8) of the lens, right-hand sides."""
 
-    turn: Floats
+    rotation_blocks: Floats
     coupling: Floats
     lens: Floats
-    pull_turn: Floats
-    pull_lens: Floats
+    rhs_rotation: Floats
+    rhs_lens: Floats
 
 
-def _gathered(frames: Sequence[StarFrame]) -> Sightings:
+def _collect(frames: Sequence[StarFrame]) -> Sightings:
     """The stars of all frames in one table, each sighting with its own light. Raises ValueError if malformed."""
     if not frames:
-        raise ValueError("calibrate: no frames; a lens needs some tens")
+        raise ValueError("calibrate: no frames; allowed: 1 or more, typically tens")
     for k, frame in enumerate(frames):
         count = frame.xy_px.shape[0] if frame.xy_px.ndim else 0
         shapes = [frame.xy_px.shape, frame.sigma_px.shape, frame.vectors_ref.shape]
@@ -240,27 +240,27 @@ def _gathered(frames: Sequence[StarFrame]) -> Sightings:
     )
 
 
-def _check_enough(seen: Sightings) -> None:
+def _check_enough(sightings: Sightings) -> None:
     """Raise ValueError if there are fewer coordinates than unknowns."""
-    frames = len(np.unique(seen.frame))
-    if 2 * len(seen.frame) < 3 * frames + LENS:
+    frames = len(np.unique(sightings.frame))
+    if 2 * len(sightings.frame) < 3 * frames + LENS:
         raise ValueError(
-            f"calibrate: {2 * len(seen.frame)} coordinates in frames of {LEAST_STARS} stars or more, for {3 * frames}"
-            f" unknowns of attitude and {LENS} of the lens; take more frames or more stars"
+            f"calibrate: {2 * len(sightings.frame)} coordinates in frames of {LEAST_STARS} stars or more, for "
+            f"{3 * frames} unknowns of attitude and {LENS} of the lens; take more frames or more stars"
         )
 
 
-def _start(whole: Sightings, vectors: Floats, camera: Camera, belief: Belief, count: int) -> _Problem:
+def _start_problem(sightings: Sightings, vectors: Floats, camera: Camera, prior: LensPrior, count: int) -> _Problem:
     """Start values: the start camera, and each frame's robust attitude with it."""
-    lens = np.array([camera.focal_px, *camera.centre_px, *camera.distortion])
-    rays = camera.rays(whole.xy_px)
-    turned = np.tile(np.eye(3), (count, 1, 1))
+    lens = np.array([camera.focal_px, *camera.center_px, *camera.distortion])
+    rays = camera.rays(sightings.xy_px)
+    R_cam_from_ref = np.tile(np.eye(3), (count, 1, 1))
     for k in range(count):
-        mine = whole.frame == k
-        if mine.sum() >= LEAST_STARS:
-            turned[k] = _robust_attitude(rays[mine], vectors[mine])
-    bundle = Bundle(vectors, turned, np.zeros(3), np.eye(3), lens, LENS, vectors)
-    return _Problem(bundle, lens, belief.sigma(camera))
+        selected = sightings.frame == k
+        if selected.sum() >= LEAST_STARS:
+            R_cam_from_ref[k] = _robust_attitude(rays[selected], vectors[selected])
+    bundle = Bundle(vectors, R_cam_from_ref, np.zeros(3), np.eye(3), lens, LENS, vectors)
+    return _Problem(bundle, lens, prior.sigma(camera))
 
 
 def _robust_attitude(rays: Floats, vectors: Floats) -> Floats:
@@ -271,136 +271,134 @@ def _robust_attitude(rays: Floats, vectors: Floats) -> Floats:
     """
     weight = np.ones(len(rays))
     for _ in range(START_ROUNDS):
-        answer, _ = kernel.wahba(rays, vectors, weight)
-        apart = np.linalg.norm(rays - vectors @ answer.T, axis=1)
+        R_cam_from_ref, _ = kernel.wahba(rays, vectors, weight)
+        separation = np.linalg.norm(rays - vectors @ R_cam_from_ref.T, axis=1)
         # Without the floor, one pair of residual 0 would have infinite weight.
-        weight = 1 / np.maximum(apart, 0.1 * np.median(apart) + 1e-9)
-    return answer
+        weight = 1 / np.maximum(separation, 0.1 * np.median(separation) + 1e-9)
+    return R_cam_from_ref
 
 
-def _turned(bundle: Bundle, seen: Sightings) -> Bundle:
+def _fit_attitudes(bundle: Bundle, sightings: Sightings) -> Bundle:
     """The bundle with every frame's attitude fitted under Cauchy's loss, the lens fixed."""
-    frames = np.unique(seen.frame)
-    mine = replace(bundle, R_body_from_lab=bundle.R_body_from_lab[frames])
-    numbered = replace(seen, frame=np.searchsorted(frames, seen.frame))
+    frames = np.unique(sightings.frame)
+    selected = replace(bundle, R_body_from_lab=bundle.R_body_from_lab[frames])
+    numbered = replace(sightings, frame=np.searchsorted(frames, sightings.frame))
     R = bundle.R_body_from_lab.copy()
-    R[frames] = ba.turn_frames(mine, numbered, 12).R_body_from_lab
+    R[frames] = ba.fit_attitudes(selected, numbered, 12).R_body_from_lab
     return replace(bundle, R_body_from_lab=R)
 
 
-def _noise(bundle: Bundle, seen: Sightings) -> float:
-    """Robust scale of the residuals in sigmas, at least 1: their median distance over that of unit noise."""
-    distance = np.linalg.norm(ba.residuals(bundle, seen), axis=1)
-    return max(1.0, float(np.median(distance) / MEDIAN_RADIUS))
-
-
-def _normal(problem: _Problem, seen: Sightings, weight: Floats) -> _Normal:
+def _normal_equations(problem: _Problem, sightings: Sightings, weight: Floats) -> _NormalEquations:
     """The normal equations J'WJ and J'W residual, with one weight per sighting and the prior on the lens added."""
-    terms = ba.rows(problem.bundle, seen)
+    terms = ba.linearize(problem.bundle, sightings)
     frames = len(problem.bundle.R_body_from_lab)
-    by_turn, by_lens = (
-        terms.by_turn,
-        terms.by_shared[:, :, 3:],
-    )  # the first three columns are the lever, which is fixed at zero
-    heavy_turn, heavy_lens = weight[:, None, None] * by_turn, weight[:, None, None] * by_lens
-    turn, coupling, pull = np.zeros((frames, 3, 3)), np.zeros((frames, 3, LENS)), np.zeros((frames, 3))
-    np.add.at(turn, seen.frame, by_turn.transpose(0, 2, 1) @ heavy_turn)
-    np.add.at(coupling, seen.frame, by_turn.transpose(0, 2, 1) @ heavy_lens)
-    np.add.at(pull, seen.frame, np.einsum("mai,ma->mi", heavy_turn, terms.residual))
-    turn[np.bincount(seen.frame, minlength=frames) == 0] = np.eye(3)  # an unused frame gets a zero step
-    lens = np.einsum("mai,maj->ij", heavy_lens, by_lens) + np.diag(problem.sigma**-2)
-    from_belief = (problem.believed - problem.bundle.lens) / problem.sigma**2
-    return _Normal(
-        turn, coupling, lens, pull, np.einsum("mai,ma->i", heavy_lens, terms.residual) + from_belief
+    by_rotation = terms.by_rotation
+    by_lens = terms.by_shared[:, :, 3:]  # the first three columns are the lever, which is fixed at zero
+    weighted_rotation, weighted_lens = weight[:, None, None] * by_rotation, weight[:, None, None] * by_lens
+    rotation_blocks, coupling, rhs = (
+        np.zeros((frames, 3, 3)),
+        np.zeros((frames, 3, LENS)),
+        np.zeros((frames, 3)),
+    )
+    np.add.at(rotation_blocks, sightings.frame, by_rotation.transpose(0, 2, 1) @ weighted_rotation)
+    np.add.at(coupling, sightings.frame, by_rotation.transpose(0, 2, 1) @ weighted_lens)
+    np.add.at(rhs, sightings.frame, np.einsum("mai,ma->mi", weighted_rotation, terms.residual))
+    rotation_blocks[np.bincount(sightings.frame, minlength=frames) == 0] = np.eye(3)  # unused frame: zero step
+    lens = np.einsum("mai,maj->ij", weighted_lens, by_lens) + np.diag(problem.sigma**-2)
+    prior_rhs = (problem.prior_lens - problem.bundle.lens) / problem.sigma**2
+    return _NormalEquations(
+        rotation_blocks,
+        coupling,
+        lens,
+        rhs,
+        np.einsum("mai,ma->i", weighted_lens, terms.residual) + prior_rhs,
     )
 
 
-def _reduced(terms: _Normal, damping: float) -> tuple[Floats, Floats, Floats]:
+def _eliminate_attitudes(terms: _NormalEquations, damping: float) -> tuple[Floats, Floats, Floats]:
     """Eliminate the attitudes, with Marquardt's damping: (F, 3, 8) A^-1 C, (F, 3) A^-1 pull, (8, 8) Schur complement.
 
     A are the blocks of the attitudes, C their coupling with the lens.
     """
-    blocks = terms.turn * np.where(np.eye(3, dtype=bool), 1 + damping, 1.0)
-    both = np.concatenate([terms.coupling, terms.pull_turn[:, :, None]], axis=2)
-    solved = np.asarray(np.linalg.solve(blocks, both), dtype=np.float64)
-    through, alone = solved[:, :, :LENS], solved[:, :, LENS]
+    blocks = terms.rotation_blocks * np.where(np.eye(3, dtype=bool), 1 + damping, 1.0)
+    right_sides = np.concatenate([terms.coupling, terms.rhs_rotation[:, :, None]], axis=2)
+    solved = np.asarray(np.linalg.solve(blocks, right_sides), dtype=np.float64)
+    through, uncoupled = solved[:, :, :LENS], solved[:, :, LENS]
     matrix = terms.lens - np.einsum("fij,fik->jk", terms.coupling, through)
     matrix[np.diag_indices(LENS)] += damping * terms.lens.diagonal()
-    return through, alone, matrix
+    return through, uncoupled, matrix
 
 
-def _adjusted(problem: _Problem, seen: Sightings, width: float) -> tuple[_Problem, bool]:
+def _minimize(problem: _Problem, sightings: Sightings, width: float) -> tuple[_Problem, bool]:
     """Minimize over lens and attitudes by Levenberg-Marquardt; returns the problem and whether it converged.
 
     width : of Cauchy's loss in sigmas; inf for least squares
     Raises ValueError if the lens is undetermined.
     """
     damping = 1e-4
-    cost, weight = problem.cost(seen, width)
-    terms = _normal(problem, seen, weight)
-    still = np.zeros(3 * len(problem.bundle.position_m))
+    cost, weight = problem.cost(sightings, width)
+    terms = _normal_equations(problem, sightings, weight)
+    no_step = np.zeros(3 * len(problem.bundle.position_m))
     for _ in range(ba.STEPS):
-        through, alone, matrix = _reduced(terms, damping)
-        lens = _solved(matrix, terms.pull_lens - np.einsum("fij,fi->j", terms.coupling, alone))
-        turn = alone - through @ lens
-        slope = float(np.sum(terms.pull_turn * turn) + terms.pull_lens @ lens)
-        moved = problem.bundle.moved(still, np.concatenate([turn.ravel(), np.zeros(3), lens]))
-        trial = problem._replace(bundle=moved)
-        new_cost, new_weight = trial.cost(seen, width)
+        through, uncoupled, matrix = _eliminate_attitudes(terms, damping)
+        lens = _solve_scaled(matrix, terms.rhs_lens - np.einsum("fij,fi->j", terms.coupling, uncoupled))
+        rotation = uncoupled - through @ lens
+        slope = float(np.sum(terms.rhs_rotation * rotation) + terms.rhs_lens @ lens)
+        step = np.concatenate([rotation.ravel(), np.zeros(3), lens])
+        trial = problem._replace(bundle=problem.bundle.apply_step(no_step, step))
+        new_cost, new_weight = trial.cost(sightings, width)
         # Near the minimum the costs differ only by rounding, so that a step is accepted within that.
         if new_cost <= cost * (1 + 1e-13) + 1e-20:
             problem, cost, damping = trial, new_cost, max(damping / 10, 1e-12)
             if slope < ba.DECREMENT:
                 return problem, True
-            terms = _normal(problem, seen, new_weight)
+            terms = _normal_equations(problem, sightings, new_weight)
         else:
             damping *= 10
     return problem, False
 
 
-def _solved(matrix: Floats, right: Floats) -> Floats:
+def _solve_scaled(matrix: Floats, right: Floats) -> Floats:
     """matrix^-1 right for a positive definite matrix, scaled to a unit diagonal. Raises ValueError if it is not."""
     try:
         scale = 1 / np.sqrt(np.maximum(matrix.diagonal(), 1e-300))
         factor = cho_factor(matrix * scale * scale[:, None], lower=True)
     except LinAlgError:
-        raise ValueError(
-            "calibrate: the frames leave the lens unknown; take more stars over the field"
-        ) from None
+        raise ValueError("calibrate: the frames do not determine the lens; take more stars over the field") from None
     return (scale * cho_solve(factor, (scale * right.T)).T).T
 
 
 def _report(
     status: str,
     problem: _Problem,
-    seen: Sightings,
+    sightings: Sightings,
     tied: np.ndarray,
     outliers: Ints,
     keep: np.ndarray,
     frames: Sequence[StarFrame],
     camera: Camera,
 ) -> Calibration:
-    terms = _normal(problem, seen, np.ones(len(seen.frame)))
-    through, _, matrix = _reduced(terms, 0.0)
-    covariance = _solved(matrix, np.eye(LENS))
-    spread = np.linalg.inv(terms.turn) + through @ covariance @ through.transpose(0, 2, 1)
-    spread[~tied] = np.nan
-    left_over = ba.residuals(problem.bundle, seen)
+    terms = _normal_equations(problem, sightings, np.ones(len(sightings.frame)))
+    through, _, matrix = _eliminate_attitudes(terms, 0.0)
+    covariance = _solve_scaled(matrix, np.eye(LENS))
+    attitude_covariance = np.linalg.inv(terms.rotation_blocks) + through @ covariance @ through.transpose(0, 2, 1)
+    attitude_covariance[~tied] = np.nan
+    residual = ba.residuals(problem.bundle, sightings)
     R = problem.bundle.R_body_from_lab
     focal, x, y, *rest = (float(value) for value in problem.bundle.lens)
     k1, k2, p1, p2, k3 = rest
     report = FieldReport(
         status,
         Rotation.concatenate([rotation(R[k]) if tied[k] else Rotation.identity() for k in range(len(R))]),
-        spread,
+        attitude_covariance,
         tied,
         outliers,
-        len(seen.frame),
-        float(np.sqrt(np.mean((left_over * seen.sigma_px[:, None]) ** 2))),
-        float(np.sqrt(np.sum(left_over**2) / max(2 * len(seen.frame) - 3 * tied.sum() - LENS, 1))),
+        len(sightings.frame),
+        float(np.sqrt(np.mean((residual * sightings.sigma_px[:, None]) ** 2))),
+        float(np.sqrt(np.sum(residual**2) / max(2 * len(sightings.frame) - 3 * tied.sum() - LENS, 1))),
         _magnitude(frames, keep),
     )
-    lens = replace(camera, focal_px=focal, centre_px=(x, y), distortion=(k1, k2, p1, p2, k3))
+    lens = replace(camera, focal_px=focal, center_px=(x, y), distortion=(k1, k2, p1, p2, k3))
     return Calibration(lens, covariance, report)
 
 
@@ -416,13 +414,13 @@ def _magnitude(frames: Sequence[StarFrame], keep: np.ndarray) -> MagnitudeZero |
     return magnitude_zero(instrumental[keep], np.concatenate(v_mag)[keep], vectors[keep])
 
 
-def _named(frames: Sequence[Centroids], tracker: Tracker, exposure_s: float) -> list[StarFrame]:
+def _identified(frames: Sequence[Centroids], tracker: Tracker, exposure_s: float) -> list[StarFrame]:
     """The frames that the tracker solves, with their identified stars."""
-    named = []
+    identified = []
     for centroids in frames:
         match = tracker.solve_centroids(centroids).match
         if match is not None:
-            mine = centroids.take(match.observed)
+            selected = centroids.take(match.observed)
             vectors, v_mag = tracker.stars.vectors[match.star], tracker.stars.v_mag[match.star]
-            named.append(StarFrame(mine.xy_px, mine.sigma_px, vectors, mine.flux, v_mag, exposure_s))
-    return named
+            identified.append(StarFrame(selected.xy_px, selected.sigma_px, vectors, selected.flux, v_mag, exposure_s))
+    return identified

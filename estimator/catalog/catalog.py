@@ -23,7 +23,7 @@ from estimator.core.errors import ImageError
 SPEED_OF_LIGHT_M_S = 299_792_458.0
 EPOCH_YR = 1991.25
 MAS_RAD = np.pi / 180 / 3.6e6
-SUN_BENDS_RAD = 1.974e-8  # 2 G M_sun / (c^2 1 au)
+SUN_DEFLECTION_RAD = 1.974e-8  # 2 G M_sun / (c^2 1 au)
 TT_MINUS_UTC_DAY = 69.184 / 86400  # since 2017; fewer leap seconds before that are negligible here
 
 
@@ -65,8 +65,8 @@ def on_earth(time_utc: datetime.datetime) -> Observer:
     # epv00 takes TDB; TT is within 2 ms of it.
     days = (time_utc - datetime.datetime(2000, 1, 1, 12)) / datetime.timedelta(days=1) + TT_MINUS_UTC_DAY
     _, barycentric = erfa.epv00(erfa.DJ00, days)
-    metres_per_second = erfa.DAU / erfa.DAYSEC
-    return Observer(2000 + days / 365.25, barycentric["p"], barycentric["v"] * metres_per_second)
+    meters_per_second = erfa.DAU / erfa.DAYSEC
+    return Observer(2000 + days / 365.25, barycentric["p"], barycentric["v"] * meters_per_second)
 
 
 def read(path: str | Path) -> StarCatalog:
@@ -75,8 +75,8 @@ def read(path: str | Path) -> StarCatalog:
     Raises ImageError with one line if it cannot be read.
     """
     hip, ra_deg, dec_deg, pm_ra, pm_dec, parallax, v_mag = columns(path, COLUMNS)
-    place = np.radians(ra_deg), np.radians(dec_deg)
-    stars = from_columns(hip.astype(np.int64), *place, pm_ra, pm_dec, parallax, v_mag)
+    radec_rad = np.radians(ra_deg), np.radians(dec_deg)
+    stars = from_columns(hip.astype(np.int64), *radec_rad, pm_ra, pm_dec, parallax, v_mag)
     return stars.take(np.argsort(v_mag, kind="stable"))
 
 
@@ -86,39 +86,39 @@ COLUMNS = ("hip", "ra_deg", "dec_deg", "pm_ra_mas_yr", "pm_dec_mas_yr", "paralla
 def hipparcos() -> StarCatalog:
     """The Hipparcos-2 subset to Hp 6.5 that comes with the package.
 
-    It lies in data/catalogues beside the package in a checkout, and in skysim/data/catalogues of an installed one.
+    It is in data/catalogs beside the package in a checkout, and in skysim/data/catalogs of an installed one.
     Raises ImageError where neither has it.
     """
     root = Path(__file__).resolve().parents[2]
-    name = "data/catalogues/hipparcos_hp6.5.ecsv"
+    name = "data/catalogs/hipparcos_hp6.5.ecsv"
     return read(next((path for path in (root / name, root / "skysim" / name) if path.is_file()), root / name))
 
 
-def columns(path: str | Path, names: Sequence[str], blank: Sequence[str] = ()) -> Floats:
+def columns(path: str | Path, names: Sequence[str], optional: Sequence[str] = ()) -> Floats:
     """Read columns of a catalog file as (len(names) + len(blank), N) numbers, with rows in the file's order.
 
-    blank : columns in which empty fields are allowed and become NaN. Raises ImageError if the file cannot be read.
+    optional: columns in which empty fields are allowed and become NaN. Raises ImageError if the file cannot be read.
     """
     try:
         lines = Path(path).read_text(encoding="utf-8").splitlines()
         body = [line for line in lines if line and not line.startswith("#")]
         delimiter = "," if "," in body[0] else None
         header = body[0].replace('"', "").split(delimiter)
-        used = [header.index(name) for name in (*names, *blank)]
+        column_numbers = [header.index(name) for name in (*names, *optional)]
         if not body[1:]:
             raise ValueError("it has no rows")
-        gaps: dict[int | str, Callable[[str], Any]] = dict.fromkeys(used[len(names) :], _number_or_gap)
-        table = np.loadtxt(body[1:], delimiter=delimiter, usecols=used, ndmin=2, converters=gaps)
+        converters: dict[int | str, Callable[[str], Any]] = dict.fromkeys(column_numbers[len(names) :], _number_or_nan)
+        table = np.loadtxt(body[1:], delimiter=delimiter, usecols=column_numbers, ndmin=2, converters=converters)
         if not np.isfinite(table[:, : len(names)]).all():
             raise ValueError("some numbers are not finite")
     except (OSError, ValueError, IndexError) as error:
         raise ImageError(
-            f"{path}: not a star catalogue ({error}); allowed: ECSV with {', '.join((*names, *blank))}"
+            f"{path}: not a star catalog ({error}); allowed: ECSV with {', '.join((*names, *optional))}"
         ) from None
     return table.T
 
 
-def _number_or_gap(text: str) -> float:
+def _number_or_nan(text: str) -> float:
     return float(text) if text.strip('" ') else np.nan
 
 
@@ -158,10 +158,10 @@ def apparent(stars: StarCatalog, observer: Observer) -> Floats:
     distance_au = np.linalg.norm(observer.position_au)
     from_sun = observer.position_au / distance_au
     along = vectors @ from_sun
-    # The vector (e - (u.e) u) / (1 + u.e) has length cot(psi / 2). The floor keeps it finite behind the Sun's disc,
+    # The vector (e - (u.e) u) / (1 + u.e) has length cot(psi / 2). The floor keeps it finite behind the Sun's disk,
     # where no star is visible.
-    away = (from_sun - along[:, None] * vectors) / np.maximum(1 + along, 1e-5)[:, None]
-    vectors = unit(vectors + SUN_BENDS_RAD / distance_au * away)
+    deflection = (from_sun - along[:, None] * vectors) / np.maximum(1 + along, 1e-5)[:, None]
+    vectors = unit(vectors + SUN_DEFLECTION_RAD / distance_au * deflection)
     return unit(vectors + observer.velocity_m_s / SPEED_OF_LIGHT_M_S)
 
 
@@ -173,20 +173,20 @@ def unit(vectors: Floats) -> Floats:
 def merge_doubles(stars: StarCatalog, closer_than_rad: float) -> StarCatalog:
     """Replace each group of unresolved stars by one star at their center of light, with their total flux."""
     groups = close_groups(stars.vectors, closer_than_rad)
-    together = np.column_stack([stars.vectors, stars.drift_rad_yr, stars.parallax_rad])
-    middle, v_mag = light_centres(together, stars.v_mag, groups)
+    values = np.column_stack([stars.vectors, stars.drift_rad_yr, stars.parallax_rad])
+    means, v_mag = light_centers(values, stars.v_mag, groups)
     # Stars are sorted by brightness, so the first of each group is its brightest and gives the id.
     _, first = np.unique(groups, return_index=True)
-    result = StarCatalog(stars.id[first], unit(middle[:, :3]), middle[:, 3:6], middle[:, 6], v_mag)
+    result = StarCatalog(stars.id[first], unit(means[:, :3]), means[:, 3:6], means[:, 6], v_mag)
     return result.take(np.argsort(result.v_mag, kind="stable"))
 
 
-def light_centres(values: Floats, magnitude: Floats, group: Ints) -> tuple[Floats, Floats]:
+def light_centers(values: Floats, magnitude: Floats, group: Ints) -> tuple[Floats, Floats]:
     """Return (G, K) flux-weighted means of (N, K) values, and the (G,) magnitudes of the total flux of each group."""
-    light = 10 ** (-0.4 * magnitude)
-    total = np.bincount(group, light)
-    middle = np.column_stack([np.bincount(group, light * column) / total for column in values.T])
-    return middle, -2.5 * np.log10(total)
+    flux = 10 ** (-0.4 * magnitude)
+    total = np.bincount(group, flux)
+    means = np.column_stack([np.bincount(group, flux * column) / total for column in values.T])
+    return means, -2.5 * np.log10(total)
 
 
 def close_groups(vectors: Floats, closer_than_rad: float) -> Ints:
@@ -200,12 +200,12 @@ def close_groups(vectors: Floats, closer_than_rad: float) -> Ints:
     return connected_components(graph, directed=False)[1].astype(np.int64)
 
 
-def brighter(stars: StarCatalog, limit_mag: float) -> StarCatalog:
+def brighter_than(stars: StarCatalog, limit_mag: float) -> StarCatalog:
     """Select the stars down to a limiting V magnitude."""
     return stars.take(stars.v_mag <= limit_mag)
 
 
-def limit_for_density(stars: StarCatalog, field_sr: float, wanted: float) -> float:
-    """Return the limiting magnitude at which a field of `field_sr` steradians holds `wanted` stars on average."""
-    count = int(np.clip(wanted * 4 * np.pi / field_sr, 1, len(stars)))
+def limit_for_density(stars: StarCatalog, field_sr: float, mean_count: float) -> float:
+    """Return the limiting magnitude at which a field of `field_sr` steradians holds `mean_count` stars on average."""
+    count = int(np.clip(mean_count * 4 * np.pi / field_sr, 1, len(stars)))
     return float(np.sort(stars.v_mag)[count - 1])

@@ -21,10 +21,10 @@ from estimator.core.errors import ImageError
 from estimator.core.jit import jit
 
 ARCSEC_RAD = np.pi / 648_000
-WIDTH_RAD = 100 * ARCSEC_RAD  # from the thesis (Padro 2012, section 3.7.3)
+BUCKET_WIDTH_RAD = 100 * ARCSEC_RAD  # from the thesis (Padro 2012, section 3.7.3)
 
 
-class PairCatalogue(NamedTuple):
+class PairCatalog(NamedTuple):
     """Stars, and their pairs in buckets of separation.
 
     vectors   : (N, 3) unit;  magnitude : (N,) any scale
@@ -43,13 +43,13 @@ class PairCatalogue(NamedTuple):
     cells: Cells
 
 
-def bucketed(
+def build_pair_catalog(
     vectors: Floats,
     magnitude: Floats,
-    width_rad: float = WIDTH_RAD,
+    width_rad: float = BUCKET_WIDTH_RAD,
     range_rad: tuple[float, float] | None = None,
     magnitudes: tuple[float, float] = (-np.inf, np.inf),
-) -> PairCatalogue:
+) -> PairCatalog:
     """Build the catalog of pairs of (N, 3) unit vectors whose angle and magnitudes (N,) are in range (section 2.4.6).
 
     range_rad : range of angles, both ends included; if omitted, that of the pairs found
@@ -57,15 +57,15 @@ def bucketed(
     """
     vectors = np.ascontiguousarray(vectors, dtype=float)
     if not width_rad > 0:
-        raise ImageError(f"bucket width {width_rad} rad: allowed is more than 0")
+        raise ImageError(f"bucket width {width_rad} rad; allowed: more than 0")
     low, high = range_rad or (0.0, np.pi)
     # Search slightly beyond the range, then select by the exact angles.
     chord = 2 * np.sin(min(high, np.pi) / 2) + 1e-12
     pair = cKDTree(vectors).query_pairs(chord, output_type="ndarray").astype(np.int32)
     angle = 2 * np.arcsin(np.linalg.norm(vectors[pair[:, 0]] - vectors[pair[:, 1]], axis=1) / 2)
-    shines = (magnitude >= magnitudes[0]) & (magnitude <= magnitudes[1])
-    kept = (angle >= low) & (angle <= high) & shines[pair].all(axis=1)
-    pair, angle = pair[kept], angle[kept]
+    in_magnitude_range = (magnitude >= magnitudes[0]) & (magnitude <= magnitudes[1])
+    selected = (angle >= low) & (angle <= high) & in_magnitude_range[pair].all(axis=1)
+    pair, angle = pair[selected], angle[selected]
     if not len(pair):
         raise ImageError(f"no pair of stars from {np.degrees(low):.3f} to {np.degrees(high):.3f} deg")
     if range_rad is None:
@@ -75,8 +75,8 @@ def bucketed(
     bucket = bucket_of(angle, high, width_rad, buckets)
     table = np.concatenate([[0], np.cumsum(np.bincount(bucket, minlength=buckets))])
     pair = np.ascontiguousarray(pair[np.argsort(bucket, kind="stable")])
-    light = np.ascontiguousarray(magnitude, dtype=float)
-    return PairCatalogue(vectors, light, pair, table, float(high), width_rad, spatial_grid.build(vectors))
+    magnitude = np.ascontiguousarray(magnitude, dtype=float)
+    return PairCatalog(vectors, magnitude, pair, table, float(high), width_rad, spatial_grid.build(vectors))
 
 
 @jit
@@ -91,12 +91,12 @@ def bucket_of(angle_rad: Floats, max_rad: float, width_rad: float, buckets: int)
 
 
 @jit
-def candidates(catalogue: PairCatalogue, low_rad: float, high_rad: float) -> tuple[int, int]:
+def candidates(catalog: PairCatalog, low_rad: float, high_rad: float) -> tuple[int, int]:
     """Return the half-open range of pairs that holds every angle in [low, high], rounded out to whole buckets.
 
     It begins at the last bucket whose lower end is below `low` and ends before the first one above `high` (eq. 12).
     """
-    buckets = len(catalogue.table) - 1
-    ends = np.array([low_rad, high_rad])
-    first, last = bucket_of(ends, catalogue.max_rad, catalogue.width_rad, buckets)
-    return catalogue.table[first], catalogue.table[last + 1]
+    buckets = len(catalog.table) - 1
+    limits = np.array([low_rad, high_rad])
+    first, last = bucket_of(limits, catalog.max_rad, catalog.width_rad, buckets)
+    return catalog.table[first], catalog.table[last + 1]

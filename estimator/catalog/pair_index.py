@@ -32,8 +32,8 @@ class PairIndex(NamedTuple):
     pair      : (P, 2) star rows, by increasing angle;  angle_rad : (P,)
     kvector   : (P + 2,) kvector[k] = number of pairs with angle <= slope k + offset (Mortari 1997)
     slope_rad, offset_rad : the line of the k-vector
-    first     : (N + 1,) first entry of each star in `neighbour`
-    neighbour : rows of the neighbors, by increasing angle;  separation_rad : their angles
+    first     : (N + 1,) first entry of each star in `neighbor`
+    neighbor : rows of the neighbors, by increasing angle;  separation_rad : their angles
     group     : (N,) label of each star's group (patch board); pairs within a group are left out of `pair`, as
         the pattern of a board repeats on every other board
     magnitude : (N,) increasing, in the camera's own scale; NaN if unknown
@@ -47,7 +47,7 @@ class PairIndex(NamedTuple):
     slope_rad: float
     offset_rad: float
     first: NDArray[np.int64]
-    neighbour: NDArray[np.int32]
+    neighbor: NDArray[np.int32]
     separation_rad: Floats
     group: NDArray[np.int64]
     max_angle_rad: float
@@ -70,10 +70,10 @@ def build(
     """
     group = np.arange(len(vectors)) if group is None else np.asarray(group, np.int64)
     vectors = np.ascontiguousarray(vectors, dtype=float)
-    light = np.full(len(vectors), np.nan) if magnitude is None else np.asarray(magnitude, float)
-    if light.shape != (len(vectors),) or (np.diff(light) < 0).any():
+    magnitudes = np.full(len(vectors), np.nan) if magnitude is None else np.asarray(magnitude, float)
+    if magnitudes.shape != (len(vectors),) or (np.diff(magnitudes) < 0).any():
         raise ImageError(
-            f"magnitudes {light.shape} of {len(vectors)} stars; allowed: one for each, the brightest first"
+            f"magnitudes {magnitudes.shape} of {len(vectors)} stars; allowed: one for each, the brightest first"
         )
     chord = 2 * np.sin(min(max_angle_rad, np.pi) / 2)
     pair = cKDTree(vectors).query_pairs(chord, output_type="ndarray").astype(np.int32)
@@ -84,18 +84,18 @@ def build(
     # Each pair appears in the neighbor lists of both its stars. The lists keep pairs within a group.
     owner = np.concatenate([pair[:, 0], pair[:, 1]])
     other = np.concatenate([pair[:, 1], pair[:, 0]])
-    both = np.concatenate([angle, angle])
-    by_owner = np.lexsort((both, owner))
+    both_angles = np.concatenate([angle, angle])
+    by_owner = np.lexsort((both_angles, owner))
     first = np.searchsorted(owner[by_owner], np.arange(len(vectors) + 1))
-    neighbour, separation = other[by_owner], both[by_owner]
-    apart = group[pair[:, 0]] != group[pair[:, 1]]
-    pair, angle = pair[apart], angle[apart]
+    neighbor, separation = other[by_owner], both_angles[by_owner]
+    independent = group[pair[:, 0]] != group[pair[:, 1]]
+    pair, angle = pair[independent], angle[independent]
     if len(pair) < 3:
         raise ImageError(
             f"{len(pair)} pairs within {np.degrees(max_angle_rad):.2f} deg, not counting those of one patch board,"
-            " are no pattern; allowed: 3 or more"
+            " are too few; allowed: 3 or more"
         )
-    kvector, slope, offset = line(angle)
+    kvector, slope, offset = k_vector(angle)
     return PairIndex(
         vectors,
         pair,
@@ -104,16 +104,16 @@ def build(
         slope,
         offset,
         first,
-        neighbour,
+        neighbor,
         separation,
         group,
         max_angle_rad,
-        light,
+        magnitudes,
         spatial_grid.build(vectors),
     )
 
 
-def line(angle_rad: Floats) -> tuple[NDArray[np.int64], float, float]:
+def k_vector(angle_rad: Floats) -> tuple[NDArray[np.int64], float, float]:
     """Return the k-vector of sorted angles, with the slope and the offset of its line.
 
     The line runs from just below the smallest to just above the largest angle: z(k) = slope k + offset with
@@ -128,7 +128,7 @@ def line(angle_rad: Floats) -> tuple[NDArray[np.int64], float, float]:
 
 
 @jit
-def between(index: PairIndex, low_rad: float, high_rad: float) -> tuple[int, int]:
+def pair_range(index: PairIndex, low_rad: float, high_rad: float) -> tuple[int, int]:
     """Return the half-open range of pairs that holds every angle in [low, high].
 
     Mortari's formula, j_b = floor((low - q) / m) and j_t = ceil((high - q) / m), may include one or two pairs
@@ -146,7 +146,7 @@ def between(index: PairIndex, low_rad: float, high_rad: float) -> tuple[int, int
 
 
 @jit
-def alike(index: PairIndex, magnitude: float, gate: float) -> tuple[int, int]:
+def magnitude_range(index: PairIndex, magnitude: float, gate: float) -> tuple[int, int]:
     """Return the half-open range of rows within `gate` of a magnitude; all rows if magnitude or gate is unknown."""
     if not np.isfinite(gate) or np.isnan(magnitude) or np.isnan(index.magnitude[0]):
         return 0, len(index.magnitude)
@@ -155,8 +155,8 @@ def alike(index: PairIndex, magnitude: float, gate: float) -> tuple[int, int]:
 
 
 @jit
-def around(index: PairIndex, star: int, low_rad: float) -> int:
-    """Return the position in `neighbour` of a star's first neighbor at `low_rad` or farther, by bisection."""
+def first_neighbor(index: PairIndex, star: int, low_rad: float) -> int:
+    """Return the position in `neighbor` of a star's first neighbor at `low_rad` or farther, by bisection."""
     begin, end = index.first[star], index.first[star + 1]
     while begin < end:
         middle = (begin + end) // 2

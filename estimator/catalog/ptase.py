@@ -21,10 +21,10 @@ from estimator.core.arrays import Floats, Ints
 from estimator.core.errors import ImageError
 
 SUN_B_V, SUN_V_I = 0.65, 0.72  # of a G2 star, used where the catalog has no color
-BYTES_A_STAR = 20  # two angles and a magnitude of 4 bytes each; id, flags and checksum in 8
+BYTES_PER_ENTRY = 20  # two angles and a magnitude of 4 bytes each; id, flags and checksum in 8
 
 
-class Colour(NamedTuple):
+class Color(NamedTuple):
     """Coefficients of an instrumental magnitude: m = V + constant + b_v (B - V) + v_i (V - I)."""
 
     constant: float = 0.0
@@ -51,27 +51,27 @@ class OnBoard:
 
 
 def read_cat(
-    path: str | Path, limit_v_mag: float, epoch_yr: float = catalog.EPOCH_YR, colour: Colour | None = None
+    path: str | Path, limit_v_mag: float, epoch_yr: float = catalog.EPOCH_YR, color: Color | None = None
 ) -> OnBoard:
     """READCAT: select stars to a limiting V, propagate to the mission epoch, compute instrumental magnitudes.
 
-    colour : coefficients of the instrument; if omitted the magnitude is V, and the file needs no color columns. A
+    color : coefficients of the instrument; if omitted the magnitude is V, and the file needs no color columns. A
         missing color is replaced by that of the Sun
     Keeps the order of the file. Raises ImageError for a file that is not a catalog, and if no star is bright enough.
     """
-    numbers = catalog.columns(path, catalog.COLUMNS, ("b_v", "v_i") if colour else ())
+    numbers = catalog.columns(path, catalog.COLUMNS, ("b_v", "v_i") if color else ())
     numbers = numbers[:, numbers[6] <= limit_v_mag]
     if not numbers.shape[1]:
         raise ImageError(f"{path}: no star of V <= {limit_v_mag:g}; allowed: a fainter limit")
     hip, ra_deg, dec_deg, pm_ra, pm_dec, parallax, v_mag = numbers[:7]
-    place = np.radians(ra_deg), np.radians(dec_deg)
-    stars = catalog.from_columns(hip.astype(np.int64), *place, pm_ra, pm_dec, parallax, v_mag)
+    radec_rad = np.radians(ra_deg), np.radians(dec_deg)
+    stars = catalog.from_columns(hip.astype(np.int64), *radec_rad, pm_ra, pm_dec, parallax, v_mag)
     magnitude = v_mag
-    if colour:
+    if color:
         b_v, v_i = np.where(np.isnan(numbers[7:]), [[SUN_B_V], [SUN_V_I]], numbers[7:])
-        magnitude = v_mag + colour.constant + colour.b_v * b_v + colour.v_i * v_i
-    once = np.ones(len(stars), np.int64)
-    return OnBoard(stars.id, catalog.at_epoch(stars, epoch_yr), magnitude, once, epoch_yr)
+        magnitude = v_mag + color.constant + color.b_v * b_v + color.v_i * v_i
+    single = np.ones(len(stars), np.int64)
+    return OnBoard(stars.id, catalog.at_epoch(stars, epoch_yr), magnitude, single, epoch_yr)
 
 
 def proc_cat(stars: OnBoard, closer_than_rad: float) -> OnBoard:
@@ -83,13 +83,13 @@ def proc_cat(stars: OnBoard, closer_than_rad: float) -> OnBoard:
     order = np.argsort(stars.magnitude, kind="stable")
     vectors, magnitude = stars.vectors[order], stars.magnitude[order]
     groups = catalog.close_groups(vectors, closer_than_rad)
-    middle, merged = catalog.light_centres(vectors, magnitude, groups)
+    means, merged = catalog.light_centers(vectors, magnitude, groups)
     _, first = np.unique(groups, return_index=True)  # the brightest of each group
     components = np.bincount(groups, stars.components[order]).astype(np.int64)
     by_light = np.argsort(merged, kind="stable")
     return OnBoard(
         stars.id[order][first][by_light],
-        catalog.unit(middle)[by_light],
+        catalog.unit(means)[by_light],
         merged[by_light],
         components[by_light],
         stars.epoch_yr,
@@ -106,11 +106,11 @@ def histogram(magnitude: Floats, step_mag: float = 0.5) -> tuple[Floats, Ints]:
 def log(stars: OnBoard, step_mag: float = 0.5) -> str:
     """Return the text of PROC_CAT's log file: a magnitude histogram, the memory needed, and every star."""
     edges, count = histogram(stars.magnitude, step_mag)
-    several = stars.components[stars.components > 1]
+    merged = stars.components[stars.components > 1]
     lines = [
         f"{len(stars)} entries from {stars.components.sum()} stars at J{stars.epoch_yr:.2f}; "
-        f"{len(several)} of them of {several.sum()} stars",
-        f"{BYTES_A_STAR * len(stars)} bytes at {BYTES_A_STAR} bytes an entry",
+        f"{len(merged)} of them of {merged.sum()} stars",
+        f"{BYTES_PER_ENTRY * len(stars)} bytes at {BYTES_PER_ENTRY} bytes an entry",
         "",
         "magnitude        stars   to here",
         *(

@@ -25,7 +25,7 @@ from estimator.core.errors import ImageError
 from estimator.core.jit import jit
 
 NORTH_MAG, SOUTH_MAG = 5.2, 5.4
-KEPT_MAG = 4.5
+BRIGHT_MAG = 4.5
 COUNT = 2023
 
 
@@ -34,49 +34,50 @@ def asymmetric(stars: StarCatalog, north_mag: float = NORTH_MAG, south_mag: floa
     return stars.take(stars.v_mag <= np.where(stars.vectors[:, 2] >= 0, north_mag, south_mag))
 
 
-def spread(stars: StarCatalog, apart_rad: float, kept_mag: float = -np.inf) -> StarCatalog:
-    """Select all stars to `kept_mag`, then, brightest first, each star with no selected one closer than an angle."""
+def thin(stars: StarCatalog, min_separation_rad: float, bright_mag: float = -np.inf) -> StarCatalog:
+    """Select all stars to `bright_mag`, then, brightest first, each star with no selected one closer than an angle."""
     order = np.argsort(stars.v_mag, kind="stable")
     vectors = np.ascontiguousarray(stars.vectors[order])
-    kept = int(np.searchsorted(stars.v_mag[order], kept_mag, side="right"))
-    return stars.take(order[_spread(vectors, spatial_grid.build(vectors), kept, 2 * np.sin(apart_rad / 2))])
+    n_bright = int(np.searchsorted(stars.v_mag[order], bright_mag, side="right"))
+    return stars.take(order[_thin(vectors, spatial_grid.build(vectors), n_bright, 2 * np.sin(min_separation_rad / 2))])
 
 
 @jit
-def _spread(vectors: Floats, known: Cells, kept: int, chord: float) -> NDArray:
+def _thin(vectors: Floats, cells: Cells, n_bright: int, chord: float) -> NDArray:
     """Return (N,) whether each star is selected; stars are visited in order, brightest first."""
-    taken = np.zeros(len(vectors), np.bool_)
-    near = np.empty(len(vectors), np.int64)
+    selected = np.zeros(len(vectors), np.bool_)
+    neighbors = np.empty(len(vectors), np.int64)
     for n in range(len(vectors)):
         x, y, z = vectors[n]
-        taken[n] = n < kept or not taken[near[: within(known, vectors, x, y, z, chord, near)]].any()
-    return taken
+        near = neighbors[: within(cells, vectors, x, y, z, chord, neighbors)]
+        selected[n] = n < n_bright or not selected[near].any()
+    return selected
 
 
-def uniform(stars: StarCatalog, count: int, kept_mag: float = -np.inf) -> StarCatalog:
-    """Select about `count` evenly distributed stars, including all to `kept_mag`.
+def uniform(stars: StarCatalog, count: int, bright_mag: float = -np.inf) -> StarCatalog:
+    """Select about `count` evenly distributed stars, including all to `bright_mag`.
 
     One minimum distance decides for all stars, so the number can differ from the count by about one. Raises ImageError
-    if the list has fewer stars, or more stars to `kept_mag`, than the count.
+    if the list has fewer stars, or more stars to `bright_mag`, than the count.
     """
-    bright = int((stars.v_mag <= kept_mag).sum())
-    if not max(bright, 1) <= count <= len(stars):
-        raise ImageError(f"{count} stars of {len(stars)}; allowed: from the {max(bright, 1)} to be kept on")
+    n_bright = int((stars.v_mag <= bright_mag).sum())
+    if not max(n_bright, 1) <= count <= len(stars):
+        raise ImageError(f"{count} of {len(stars)} stars; allowed: {max(n_bright, 1)} to {len(stars)}")
     # A larger distance selects fewer stars; `low` always gives at least `count`.
     low, high = 0.0, np.pi
     for _ in range(40):
         middle = (low + high) / 2
-        low, high = (middle, high) if len(spread(stars, middle, kept_mag)) >= count else (low, middle)
-    return spread(stars, low, kept_mag)
+        low, high = (middle, high) if len(thin(stars, middle, bright_mag)) >= count else (low, middle)
+    return thin(stars, low, bright_mag)
 
 
 def chosen(stars: StarCatalog) -> StarCatalog:
     """Select the flown catalog: 2,023 stars, all of the asymmetric one to 4.5 and the rest evenly distributed."""
-    return uniform(asymmetric(stars), COUNT, KEPT_MAG)
+    return uniform(asymmetric(stars), COUNT, BRIGHT_MAG)
 
 
 Selection = Callable[[StarCatalog], StarCatalog]
-CATALOGUES: dict[str, Selection] = {
+CATALOGS: dict[str, Selection] = {
     "asymmetric": asymmetric,
     "uniform": lambda stars: uniform(stars.take(stars.v_mag <= 5.75), COUNT),
     "chosen": chosen,

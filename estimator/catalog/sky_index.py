@@ -6,8 +6,8 @@ the maximum chord can form a pair.
 
 Directions are binned on the six faces of a cube about the observer. A star is projected onto a face by the gnomonic
 projection (u, v) = the two other components over the face's component, and each face is a grid of side x side cells.
-The grid extends beyond the face's edges (|u|, |v| = 1) to EDGE, so that a search around any direction needs only the
-cells of one face; stars near an edge are therefore stored on more than one face.
+The grid extends beyond the face's edges (|u|, |v| = 1) to FACE_HALF_WIDTH, so that a search around any direction needs
+only the cells of one face; stars near an edge are therefore stored on more than one face.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ from estimator.core.arrays import Floats
 from estimator.core.errors import ImageError
 from estimator.core.jit import jit
 
-PAIRS_A_BIN = 8
-STARS_A_CELL = 0.5
+PAIRS_PER_BIN = 8
+STARS_PER_CELL = 0.5
 MAG_STEP = 0.1
-MAG_BLUR = 0.25  # standard deviation of the Gaussian that smooths the histogram of magnitudes
+MAG_SMOOTHING = 0.25  # standard deviation of the Gaussian that smooths the histogram of magnitudes
 # Half-width of a face's grid in tangents. It exceeds 1 (45 degrees) so that a gate up to 0.05 rad stays on one face.
-EDGE = 1.2
+FACE_HALF_WIDTH = 1.2
 
 
-class Sky(NamedTuple):
+class SkyIndex(NamedTuple):
     """Stars and pairs in bins. A named tuple, so that compiled code accepts it.
 
     vectors : (N, 3) unit vectors, brightest star first
@@ -47,7 +47,7 @@ class Sky(NamedTuple):
     first: NDArray[np.int32]
     bin_rad: float
     mag: Floats
-    share: Floats
+    density: Floats
     cell_first: NDArray[np.int32]
     cell_star: NDArray[np.int32]
     side: int
@@ -55,15 +55,15 @@ class Sky(NamedTuple):
     @property
     def bytes(self) -> int:
         """Memory of the arrays, bytes."""
-        return sum(part.nbytes for part in self if isinstance(part, np.ndarray))
+        return sum(array.nbytes for array in self if isinstance(array, np.ndarray))
 
 
-def sky_of(vectors: Floats, mag: Floats, max_angle_rad: float) -> Sky:
+def build(vectors: Floats, mag: Floats, max_angle_rad: float) -> SkyIndex:
     """Build the index of (N, 3) unit vectors, brightest first, with all pairs up to an angle.
 
     Raises ImageError for fewer than 3 pairs.
     """
-    sky = unpaired(vectors, mag)
+    sky = build_without_pairs(vectors, mag)
     vectors = sky.vectors
     order = np.argsort(vectors[:, 2])
     max_angle_rad = min(max_angle_rad, np.pi)
@@ -73,9 +73,9 @@ def sky_of(vectors: Floats, mag: Floats, max_angle_rad: float) -> Sky:
     total = int(one_bin[0])
     if total < 3:
         raise ImageError(
-            f"{total} pairs of stars within {np.degrees(max_angle_rad):.2f} deg are no pattern; allowed: 3 or more"
+            f"{total} pairs of stars within {np.degrees(max_angle_rad):.2f} deg are too few; allowed: 3 or more"
         )
-    bins = max(total // PAIRS_A_BIN, 1)
+    bins = max(total // PAIRS_PER_BIN, 1)
     bin_rad = max_angle_rad * (1 + 1e-9) / bins
     count = np.zeros(bins, np.int64)
     _pairs(vectors, order, max_angle_rad, bin_rad, count, np.empty((0, 2), np.int32))
@@ -85,42 +85,37 @@ def sky_of(vectors: Floats, mag: Floats, max_angle_rad: float) -> Sky:
     return sky._replace(pair=pair, first=first.astype(np.int32), bin_rad=bin_rad)
 
 
-def unpaired(vectors: Floats, mag: Floats) -> Sky:
+def build_without_pairs(vectors: Floats, mag: Floats) -> SkyIndex:
     """Build the index of (N, 3) unit vectors, brightest first, without pairs: for lookups by direction only."""
     vectors, mag = np.ascontiguousarray(vectors, dtype=float), np.ascontiguousarray(mag, dtype=float)
-    side = max(int(np.sqrt(len(vectors) / STARS_A_CELL / 6)), 1)
-    no_pairs = np.empty((0, 2), np.int32), np.zeros(2, np.int32), np.pi
-    return Sky(vectors, *no_pairs, mag, _share(mag), *_cells(vectors, side), side)
+    side = max(int(np.sqrt(len(vectors) / STARS_PER_CELL / 6)), 1)
+    empty_pairs = np.empty((0, 2), np.int32), np.zeros(2, np.int32), np.pi
+    return SkyIndex(vectors, *empty_pairs, mag, _magnitude_density(mag), *_cells(vectors, side), side)
 
 
-def _share(mag: Floats) -> Floats:
-    """Return the density of sorted magnitudes per magnitude: a histogram smoothed by MAG_BLUR."""
-    reach = 4 * MAG_BLUR
+def _magnitude_density(mag: Floats) -> Floats:
+    """Return the density of sorted magnitudes per magnitude: a histogram smoothed by MAG_SMOOTHING."""
+    reach = 4 * MAG_SMOOTHING
     edges = np.arange(mag[0] - reach, mag[-1] + reach + MAG_STEP, MAG_STEP)
     count = np.histogram(mag, edges)[0] / len(mag) / MAG_STEP
-    kernel = np.exp(-(np.arange(-reach, reach + MAG_STEP / 2, MAG_STEP) ** 2) / 2 / MAG_BLUR**2)
+    kernel = np.exp(-(np.arange(-reach, reach + MAG_STEP / 2, MAG_STEP) ** 2) / 2 / MAG_SMOOTHING**2)
     smooth = np.convolve(count, kernel / kernel.sum(), mode="same")
     return np.maximum(smooth[round(reach / MAG_STEP) :], 1e-4)
 
 
 @jit
 def _pairs(
-    vectors: Floats,
-    order: NDArray,
-    max_angle_rad: float,
-    bin_rad: float,
-    place: NDArray,
-    pair: NDArray,
+    vectors: Floats, order: NDArray, max_angle_rad: float, bin_rad: float, next_free: NDArray, pair: NDArray
 ) -> None:
-    """Sweep along z over every pair up to an angle: count pairs by bin in `place`, and store them if `pair` has room.
+    """Sweep along z over every pair up to an angle: count pairs by bin in `next_free`; store them if `pair` has room.
 
-    place : (B,) in the counting sweeps zeros, in the storing sweep the first position of each bin
+    next_free: (B,) in the counting sweeps zeros, in the storing sweep the first position of each bin
     """
     reach = 2 * np.sin(max_angle_rad / 2)
-    for one in range(len(order)):
-        i = order[one]
-        for other in range(one + 1, len(order)):
-            j = order[other]
+    for a in range(len(order)):
+        i = order[a]
+        for b in range(a + 1, len(order)):
+            j = order[b]
             dz = vectors[j, 2] - vectors[i, 2]
             if dz > reach:
                 break  # the stars are sorted by z: all further ones are out of reach too
@@ -129,10 +124,10 @@ def _pairs(
             if chord2 > reach * reach:
                 continue
             # The half-chord keeps small angles exact where arccos of a dot product would lose half the digits.
-            number = int(2 * np.arcsin(min(sqrt(chord2) / 2, 1.0)) / bin_rad)
+            bin_number = int(2 * np.arcsin(min(sqrt(chord2) / 2, 1.0)) / bin_rad)
             if len(pair):
-                pair[place[number], 0], pair[place[number], 1] = i, j
-            place[number] += 1
+                pair[next_free[bin_number], 0], pair[next_free[bin_number], 1] = i, j
+            next_free[bin_number] += 1
 
 
 def _cells(vectors: Floats, side: int) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
@@ -141,11 +136,12 @@ def _cells(vectors: Floats, side: int) -> tuple[NDArray[np.int32], NDArray[np.in
     for axis in range(3):
         for sign in (1, -1):
             along = sign * vectors[:, axis]
-            flat = np.roll(vectors, -axis, axis=1)[:, 1:] / np.maximum(along, 1e-9)[:, None]
-            here = np.flatnonzero((along > 0) & (np.abs(flat).max(axis=1) < EDGE))
-            column, row = ((flat[here] + EDGE) * side / (2 * EDGE)).astype(np.int64).T
+            gnomonic = np.roll(vectors, -axis, axis=1)[:, 1:] / np.maximum(along, 1e-9)[:, None]
+            on_face = np.flatnonzero((along > 0) & (np.abs(gnomonic).max(axis=1) < FACE_HALF_WIDTH))
+            cells = (gnomonic[on_face] + FACE_HALF_WIDTH) * side / (2 * FACE_HALF_WIDTH)
+            column, row = cells.astype(np.int64).T
             cell.append(((2 * axis + (sign < 0)) * side + row) * side + column)
-            star.append(here)
+            star.append(on_face)
     number = np.concatenate(cell)
     order = np.argsort(number, kind="stable")
     first = np.searchsorted(number[order], np.arange(6 * side * side + 1))
@@ -166,7 +162,7 @@ def nearest(
     """Return the star nearest to a unit vector and its squared chord; (-1, gate^2) if none is within the gate.
 
     gate : radians, at most 0.05
-    The first four arguments are fields of a Sky: passing the whole tuple would cost more than the search.
+    The first four arguments are fields of a SkyIndex: passing the whole tuple would cost more than the search.
     """
     # The largest component selects the face; the two others over it are the gnomonic coordinates.
     ax, ay, az = abs(x), abs(y), abs(z)
@@ -179,20 +175,22 @@ def nearest(
     else:
         face, inverse = (4 if z > 0 else 5), 1 / az
         u, v = x * inverse, y * inverse
-    scale = side / (2 * EDGE)
+    scale = side / (2 * FACE_HALF_WIDTH)
     # A gnomonic coordinate changes by at most (1 + u^2 + v^2) times the angle, to first order; the last factor bounds
     # the higher orders.
     reach = gate * (1 + u * u + v * v) * (1 + 4 * gate)
-    left, right = cell_of((u - reach + EDGE) * scale, side), cell_of((u + reach + EDGE) * scale, side - 1)
-    top, bottom = cell_of((v - reach + EDGE) * scale, side), cell_of((v + reach + EDGE) * scale, side - 1)
-    best, closest = -1, gate * gate
+    left = cell_of((u - reach + FACE_HALF_WIDTH) * scale, side)
+    right = cell_of((u + reach + FACE_HALF_WIDTH) * scale, side - 1)
+    top = cell_of((v - reach + FACE_HALF_WIDTH) * scale, side)
+    bottom = cell_of((v + reach + FACE_HALF_WIDTH) * scale, side - 1)
+    best, closest2 = -1, gate * gate
     for row in range(top, bottom + 1):
         # The cells of a row are contiguous in `cell_star`: one loop covers them.
-        line = (face * side + row) * side
-        for place in range(cell_first[line + left], cell_first[line + right + 1]):
-            star = cell_star[place]
+        row_start = (face * side + row) * side
+        for entry in range(cell_first[row_start + left], cell_first[row_start + right + 1]):
+            star = cell_star[entry]
             dx, dy, dz = vectors[star, 0] - x, vectors[star, 1] - y, vectors[star, 2] - z
-            off2 = dx * dx + dy * dy + dz * dz
-            if off2 < closest:
-                best, closest = star, off2
-    return best, closest
+            distance2 = dx * dx + dy * dy + dz * dz
+            if distance2 < closest2:
+                best, closest2 = star, distance2
+    return best, closest2

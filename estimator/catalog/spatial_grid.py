@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from estimator.core.arrays import Floats
 from estimator.core.jit import jit
 
-MOST_A_SIDE = 64  # 64^3 cells: a table of a megabyte
+MAX_SIDE = 64  # 64^3 cells: a table of a megabyte
 
 
 class Cells(NamedTuple):
@@ -35,7 +35,7 @@ def build(vectors: Floats) -> Cells:
 
     The sphere intersects about 4 pi / (2 / side)^2 = pi side^2 cells.
     """
-    side = min(max(int(sqrt(len(vectors) / pi)), 2), MOST_A_SIDE)
+    side = min(max(int(sqrt(len(vectors) / pi)), 2), MAX_SIDE)
     return Cells(side, *_sorted(vectors, side))
 
 
@@ -46,30 +46,30 @@ def _sorted(vectors: Floats, side: int) -> tuple[NDArray, NDArray]:
     row, cell = np.empty(len(vectors), np.int32), np.empty(len(vectors), np.int64)
     for n in range(len(vectors)):
         x, y, z = vectors[n]
-        cell[n] = (_spot(x, side) * side + _spot(y, side)) * side + _spot(z, side)
+        cell[n] = (_edge_cell(x, side) * side + _edge_cell(y, side)) * side + _edge_cell(z, side)
         first[cell[n] + 1] += 1
     for c in range(side**3):
         first[c + 1] += first[c]
-    place = first[:-1].copy()
+    next_free = first[:-1].copy()
     for n in range(len(vectors)):
-        row[place[cell[n]]] = n
-        place[cell[n]] += 1
+        row[next_free[cell[n]]] = n
+        next_free[cell[n]] += 1
     return first, row
 
 
 @jit
-def cell_of(place: float, last: int) -> int:
+def cell_of(position: float, last: int) -> int:
     """Return the cell, 0 to last, of a coordinate in units of cells, clamped to the range; 0 for NaN.
 
     The clamp comes before the cast: casting NaN or a number too large for an integer is undefined.
     """
-    if not place > 0:
+    if not position > 0:
         return 0
-    return int(place) if place < last else last
+    return int(position) if position < last else last
 
 
 @jit
-def _spot(x: float, side: int) -> int:
+def _edge_cell(x: float, side: int) -> int:
     """Return the cell along an edge that holds a coordinate in [-1, 1]."""
     return cell_of((x + 1) / 2 * side, side - 1)
 
@@ -78,13 +78,13 @@ def _spot(x: float, side: int) -> int:
 def within(cells: Cells, vectors: Floats, x: float, y: float, z: float, chord: float, out: NDArray) -> int:
     """Count the stars within a straight-line distance `chord` of (x, y, z); writes the first len(out) rows to `out`."""
     count, side = 0, cells.side
-    for i in range(_spot(x - chord, side), _spot(x + chord, side) + 1):
-        for j in range(_spot(y - chord, side), _spot(y + chord, side) + 1):
+    for i in range(_edge_cell(x - chord, side), _edge_cell(x + chord, side) + 1):
+        for j in range(_edge_cell(y - chord, side), _edge_cell(y + chord, side) + 1):
             low = (i * side + j) * side
-            begin = cells.first[low + _spot(z - chord, side)]
-            end = cells.first[low + _spot(z + chord, side) + 1]
-            for place in range(begin, end):
-                s = cells.row[place]
+            begin = cells.first[low + _edge_cell(z - chord, side)]
+            end = cells.first[low + _edge_cell(z + chord, side) + 1]
+            for entry in range(begin, end):
+                s = cells.row[entry]
                 dx, dy, dz = vectors[s, 0] - x, vectors[s, 1] - y, vectors[s, 2] - z
                 if dx * dx + dy * dy + dz * dz <= chord * chord:
                     if count < len(out):
@@ -96,16 +96,16 @@ def within(cells: Cells, vectors: Floats, x: float, y: float, z: float, chord: f
 @jit
 def nearest(cells: Cells, vectors: Floats, x: float, y: float, z: float, chord: float) -> int:
     """Return the row of the star nearest to (x, y, z) within a straight-line distance `chord`; -1 if there is none."""
-    best, least, side = -1, chord * chord, cells.side
-    for i in range(_spot(x - chord, side), _spot(x + chord, side) + 1):
-        for j in range(_spot(y - chord, side), _spot(y + chord, side) + 1):
+    best, least2, side = -1, chord * chord, cells.side
+    for i in range(_edge_cell(x - chord, side), _edge_cell(x + chord, side) + 1):
+        for j in range(_edge_cell(y - chord, side), _edge_cell(y + chord, side) + 1):
             low = (i * side + j) * side
-            begin = cells.first[low + _spot(z - chord, side)]
-            end = cells.first[low + _spot(z + chord, side) + 1]
-            for place in range(begin, end):
-                s = cells.row[place]
+            begin = cells.first[low + _edge_cell(z - chord, side)]
+            end = cells.first[low + _edge_cell(z + chord, side) + 1]
+            for entry in range(begin, end):
+                s = cells.row[entry]
                 dx, dy, dz = vectors[s, 0] - x, vectors[s, 1] - y, vectors[s, 2] - z
-                off = dx * dx + dy * dy + dz * dz
-                if off < least:
-                    best, least = s, off
+                distance2 = dx * dx + dy * dy + dz * dz
+                if distance2 < least2:
+                    best, least2 = s, distance2
     return best

@@ -1,1 +1,11 @@
-"""Blobs to centroids: moments and fits of Gaussians, streaks and discs."""
+"""Blobs to centroids: moments and fits of Gaussians, streaks and disks."""
+
+import lazy_loader
+
+# Loaded on first use: importing one module of the package does not import the others.
+__getattr__, __dir__, __all__ = lazy_loader.attach(
+    __name__,
+    submod_attrs={
+        "centroid": ["CENTROIDERS"],
+    },
+)

@@ -1,7 +1,7 @@
 """Centroiding: the subpixel position of each blob, with its standard deviation.
 
 Each centroider takes the frame and its `Blobs` and returns `Centroids`. The first three are moments of the light (see
-`estimator.centroiding.moments`); the others fit a model by weighted least squares: a Gaussian, a streak, a disc. A
+`estimator.centroiding.moments`); the others fit a model by weighted least squares: a Gaussian, a streak, a disk. A
 blob that the model does not fit keeps its center of gravity.
 """
 
@@ -12,29 +12,26 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.centroiding import disc_fit, moments, streak_fit
+from estimator.centroiding import disk_fit, moments, streak_fit
 from estimator.centroiding import gaussian_fit as gaussian
 from estimator.core.arrays import Floats
 from estimator.core.types import NO_PRIORS, Blobs, Centroids, FramePriors
-from estimator.detection.detect import native
+from estimator.detection.detect import to_native
 
-# (image, blobs, gain_e_dn, hints): the gain, in electrons per unit of the image, determines the photon noise.
+# (image, blobs, gain_e_dn, priors): the gain, in electrons per unit of the image, determines the photon noise.
 Centroider = Callable[..., Centroids]
 
 
-def cog(image: NDArray, blobs: Blobs, gain_e_dn: float = 1.0, hints: FramePriors = NO_PRIORS) -> Centroids:
+def cog(image: NDArray, blobs: Blobs, gain_e_dn: float = 1.0, priors: FramePriors = NO_PRIORS) -> Centroids:
     """Center of gravity of the light above the sky, in the blob's box and a margin around it.
 
     x = sum(I x) / sum(I), with var(x) = sum((I / g + noise^2) (x - x_mean)^2) / sum(I)^2 for a gain of g
     electrons per unit. Pixels closer to another blob's box are excluded.
     """
-    sky = blobs.background
-    return _measured(moments.gravity(native(image), blobs.box_px, sky.level, sky.noise, gain_e_dn))
+    return _to_centroids(_gravity_rows(image, blobs, gain_e_dn))
 
 
-def weighted(
-    image: NDArray, blobs: Blobs, gain_e_dn: float = 1.0, hints: FramePriors = NO_PRIORS
-) -> Centroids:
+def weighted(image: NDArray, blobs: Blobs, gain_e_dn: float = 1.0, priors: FramePriors = NO_PRIORS) -> Centroids:
     """Center of gravity weighted by the light itself: x = sum(I^2 x) / sum(I^2).
 
     The wings, which are mostly noise, get less weight. The variance is
@@ -42,12 +39,11 @@ def weighted(
     of the squared profile, which is narrower by the square root of 2.
     """
     sky = blobs.background
-    return _measured(moments.squared(native(image), blobs.box_px, sky.level, sky.noise, gain_e_dn))
+    rows = moments.squared_light(to_native(image), blobs.box_px, sky.level, sky.noise, gain_e_dn)
+    return _to_centroids(rows)
 
 
-def gaussian_window(
-    image: NDArray, blobs: Blobs, gain_e_dn: float = 1.0, hints: FramePriors = NO_PRIORS
-) -> Centroids:
+def gaussian_window(image: NDArray, blobs: Blobs, gain_e_dn: float = 1.0, priors: FramePriors = NO_PRIORS) -> Centroids:
     """Center of gravity in a Gaussian window w, iterated until it is the center c of the window: sum(w I (x - c)) = 0.
 
     As SExtractor's XWIN (Bertin & Arnouts 1996), but solved by Newton's method, and with a window of twice the star's
@@ -56,13 +52,11 @@ def gaussian_window(
     iteration does not converge keeps its center of gravity.
     """
     sky = blobs.background
-    rows = moments.windowed(native(image), blobs.xy_px, blobs.box_px, sky.level, sky.noise, gain_e_dn)
-    return _measured(_or_gravity(rows, image, blobs, gain_e_dn))
+    rows = moments.gaussian_windowed(to_native(image), blobs.xy_px, blobs.box_px, sky.level, sky.noise, gain_e_dn)
+    return _to_centroids(_with_fallback(rows, image, blobs, gain_e_dn))
 
 
-def gaussian_fit(
-    image: NDArray, blobs: Blobs, gain_e_dn: float = 1.0, hints: FramePriors = NO_PRIORS
-) -> Centroids:
+def gaussian_fit(image: NDArray, blobs: Blobs, gain_e_dn: float = 1.0, priors: FramePriors = NO_PRIORS) -> Centroids:
     """Least-squares fit of a Gaussian integrated over each pixel; free are x, y, flux, sigma and the sky level.
 
     Gauss-Newton on a 7x7 window around the blob's center. The model is I = b + F gx gy with
@@ -71,54 +65,55 @@ def gaussian_fit(
     be 4/3 of the photon-noise limit. Saturated pixels are excluded: the wings determine the position. A blob that the
     model does not fit (no convergence, larger than the window) keeps its center of gravity.
     """
-    return _measured(_or_gravity(_gaussians(image, blobs, gain_e_dn, hints), image, blobs, gain_e_dn))
+    rows = _fit_gaussians(image, blobs, gain_e_dn, priors)
+    return _to_centroids(_with_fallback(rows, image, blobs, gain_e_dn))
 
 
-def streak(image: NDArray, blobs: Blobs, gain_e_dn: float = 1.0, hints: FramePriors = NO_PRIORS) -> Centroids:
+def streak(image: NDArray, blobs: Blobs, gain_e_dn: float = 1.0, priors: FramePriors = NO_PRIORS) -> Centroids:
     """Least-squares fit of a line segment blurred by a Gaussian; its center is the star's position at mid-exposure.
 
-    Center, flux and sky are free. Length, direction and width have Gaussian priors around the streak of the hints, or
+    Center, flux and sky are free. Length, direction and width have Gaussian priors around the streak of `priors`,
     otherwise around the streak that the frame's blobs share. `streak_ends` returns the ends. The covariance is the
     Cramer-Rao bound, larger along than across, plus the error of a faint streak's ends (see `streak_fit`).
 
     A frame that is not smeared is passed to `gaussian_fit`. In a smeared frame, blobs that are not streaks are too;
     but if the streak is longer than half a round star's window, they keep their center of gravity.
     """
-    lines = _streaks(image, blobs, gain_e_dn, hints)
-    lost = np.isnan(lines[:, 0])
-    if lost.all():
-        return gaussian_fit(image, blobs, gain_e_dn, hints)
-    covariance = lines[:, [5, 7, 7, 6]].reshape(-1, 2, 2)
-    rows = lines[:, [0, 1, 5, 2]]
-    rows[:, 2] = np.sqrt((lines[:, 5] + lines[:, 6]) / 2)
-    if lost.any():
-        rows[lost] = np.nan
+    streaks = _fit_streaks(image, blobs, gain_e_dn, priors)
+    failed = np.isnan(streaks[:, 0])
+    if failed.all():
+        return gaussian_fit(image, blobs, gain_e_dn, priors)
+    covariance = streaks[:, [5, 7, 7, 6]].reshape(-1, 2, 2)
+    rows = streaks[:, [0, 1, 5, 2]]
+    rows[:, 2] = np.sqrt((streaks[:, 5] + streaks[:, 6]) / 2)
+    if failed.any():
+        rows[failed] = np.nan
         # A streak longer than half the window of a round star does not fit into it.
-        if np.hypot(*_smear(blobs, hints)) <= gaussian.HALF_PX:
-            rows[lost] = _gaussians(image, blobs.take(lost), gain_e_dn, hints)
-        rows = _or_gravity(rows, image, blobs, gain_e_dn)
-        covariance[lost] = rows[lost, 2, None, None] ** 2 * np.eye(2)
+        if np.hypot(*_frame_streak(blobs, priors)) <= gaussian.HALF_WINDOW_PX:
+            rows[failed] = _fit_gaussians(image, blobs.take(failed), gain_e_dn, priors)
+        rows = _with_fallback(rows, image, blobs, gain_e_dn)
+        covariance[failed] = rows[failed, 2, None, None] ** 2 * np.eye(2)
     return Centroids(rows[:, :2], rows[:, 2], rows[:, 3], covariance)
 
 
 def streak_ends(
-    image: NDArray, blobs: Blobs, gain_e_dn: float = 1.0, hints: FramePriors = NO_PRIORS
+    image: NDArray, blobs: Blobs, gain_e_dn: float = 1.0, priors: FramePriors = NO_PRIORS
 ) -> tuple[Floats, Floats]:
     """Return (N, 2) and (N, 2): the two ends of each streak in arbitrary order; NaN for a blob that is not a streak."""
-    rows = _streaks(image, blobs, gain_e_dn, hints)
+    rows = _fit_streaks(image, blobs, gain_e_dn, priors)
     return rows[:, :2] - rows[:, 3:5] / 2, rows[:, :2] + rows[:, 3:5] / 2
 
 
-def disc(image: NDArray, blobs: Blobs, gain_e_dn: float = 1.0, hints: FramePriors = NO_PRIORS) -> Centroids:
-    """Least-squares fit of a uniform disc with a blurred edge: the image of a nearby LED.
+def disk(image: NDArray, blobs: Blobs, gain_e_dn: float = 1.0, priors: FramePriors = NO_PRIORS) -> Centroids:
+    """Least-squares fit of a uniform disk with a blurred edge: the image of a nearby LED.
 
     Center, radius, edge width, brightness and sky are free. Only the edge carries information about the position, so a
-    saturated disc is measured as accurately as any other; its saturated pixels are excluded. A blob that is too small
-    or not a disc keeps its center of gravity.
+    saturated disk is measured as accurately as any other; its saturated pixels are excluded. A blob that is too small
+    or not a disk keeps its center of gravity.
     """
     sky = blobs.background
-    rows = disc_fit.fit_all(
-        native(image),
+    rows = disk_fit.fit_all(
+        to_native(image),
         blobs.xy_px,
         blobs.flux,
         blobs.area_px,
@@ -126,9 +121,9 @@ def disc(image: NDArray, blobs: Blobs, gain_e_dn: float = 1.0, hints: FramePrior
         sky.level,
         sky.noise,
         gain_e_dn,
-        hints.saturation,
+        priors.saturation,
     )
-    return _measured(_or_gravity(rows[:, :4], image, blobs, gain_e_dn))
+    return _to_centroids(_with_fallback(rows[:, :4], image, blobs, gain_e_dn))
 
 
 CENTROIDERS: dict[str, Centroider] = {
@@ -138,15 +133,15 @@ CENTROIDERS: dict[str, Centroider] = {
     "gaussian_window": gaussian_window,
     "gaussian_fit": gaussian_fit,
     "streak": streak,
-    "disc": disc,
+    "disk": disk,
 }
 
 
-def _gaussians(image: NDArray, blobs: Blobs, gain_e_dn: float, hints: FramePriors) -> Floats:
+def _fit_gaussians(image: NDArray, blobs: Blobs, gain_e_dn: float, priors: FramePriors) -> Floats:
     """Return the rows of `gaussian_fit.fit_all`."""
     sky = blobs.background
     return gaussian.fit_all(
-        native(image),
+        to_native(image),
         blobs.xy_px,
         blobs.flux,
         blobs.box_px,
@@ -154,34 +149,46 @@ def _gaussians(image: NDArray, blobs: Blobs, gain_e_dn: float, hints: FramePrior
         sky.level,
         sky.noise,
         gain_e_dn,
-        hints.saturation,
+        priors.saturation,
     )
 
 
-def _streaks(image: NDArray, blobs: Blobs, gain_e_dn: float, hints: FramePriors) -> Floats:
+def _fit_streaks(image: NDArray, blobs: Blobs, gain_e_dn: float, priors: FramePriors) -> Floats:
     """Return the rows of `streak_fit.fit_all`; all NaN for a frame that is not smeared."""
-    line = _smear(blobs, hints)
-    if np.hypot(*line) < streak_fit.SHORTEST_PX:
+    streak_px = _frame_streak(blobs, priors)
+    if np.hypot(*streak_px) < streak_fit.MIN_STREAK_PX:
         return np.full((len(blobs), 8), np.nan)
     sky = blobs.background
     return streak_fit.fit_all(
-        native(image), blobs.xy_px, blobs.box_px, sky.level, sky.noise, line, gain_e_dn, hints.saturation
+        to_native(image),
+        blobs.xy_px,
+        blobs.box_px,
+        sky.level,
+        sky.noise,
+        streak_px,
+        gain_e_dn,
+        priors.saturation,
     )
 
 
-def _smear(blobs: Blobs, hints: FramePriors) -> tuple[float, float]:
-    """Return (dx, dy) of the frame's streaks, px: from the hints, otherwise from its blobs, otherwise (0, 0)."""
-    return hints.streak_px or blobs.streak_px or (0.0, 0.0)
+def _frame_streak(blobs: Blobs, priors: FramePriors) -> tuple[float, float]:
+    """Return (dx, dy) of the frame's streaks, px: from the priors, otherwise from its blobs, otherwise (0, 0)."""
+    return priors.streak_px or blobs.streak_px or (0.0, 0.0)
 
 
-def _or_gravity(rows: Floats, image: NDArray, blobs: Blobs, gain_e_dn: float) -> Floats:
+def _gravity_rows(image: NDArray, blobs: Blobs, gain_e_dn: float) -> Floats:
+    """Return the rows of `moments.center_of_gravity`."""
+    sky = blobs.background
+    return moments.center_of_gravity(to_native(image), blobs.box_px, sky.level, sky.noise, gain_e_dn)
+
+
+def _with_fallback(rows: Floats, image: NDArray, blobs: Blobs, gain_e_dn: float) -> Floats:
     """Replace the rows that are NaN by those of the center of gravity, in place."""
-    lost = np.isnan(rows[:, 0])
-    if lost.any():
-        sky = blobs.background
-        rows[lost] = moments.gravity(native(image), blobs.box_px, sky.level, sky.noise, gain_e_dn)[lost]
+    failed = np.isnan(rows[:, 0])
+    if failed.any():
+        rows[failed] = _gravity_rows(image, blobs, gain_e_dn)[failed]
     return rows
 
 
-def _measured(rows: Floats) -> Centroids:
+def _to_centroids(rows: Floats) -> Centroids:
     return Centroids(rows[:, :2], rows[:, 2], rows[:, 3])

@@ -18,10 +18,10 @@ from estimator.core.arrays import Floats, Ints
 from estimator.core.jit import jit
 from estimator.detection.background import FILTERED_NOISE, interpolate
 
-HALF_PX, WIDEST_HALF_PX = 3, 10  # half-width of the window: default, and largest for a saturated star
-NARROWEST_PX, WIDEST_PX = 0.2, 3.0  # limits of sigma that a 7x7 window can resolve
-USUAL_PX = 0.8  # initial sigma of the first star
-ROUNDS = 40
+HALF_WINDOW_PX, MAX_HALF_WINDOW_PX = 3, 10  # default, and largest for a saturated star
+MIN_SIGMA_PX, MAX_SIGMA_PX = 0.2, 3.0  # limits of sigma that a 7x7 window can resolve
+INITIAL_SIGMA_PX = 0.8  # initial sigma of the first star
+MAX_ITERATIONS = 40
 # Parameters: center, flux, width, sky.
 X, Y, FLUX, WIDTH, SKY = range(5)
 
@@ -44,15 +44,15 @@ def fit_all(
     """
     height, width = image.shape
     out = np.full((len(xy), 4), np.nan)
-    side = 2 * WIDEST_HALF_PX + 1
+    side = 2 * MAX_HALF_WINDOW_PX + 1
     rows, weight, edges = np.empty((6, side * side)), np.empty(side * side), np.empty((6, side + 1))
     rows[SKY] = 1.0
-    p, usual_px = np.empty(5), USUAL_PX
+    p, start_sigma_px = np.empty(5), INITIAL_SIGMA_PX
     for n in range(len(xy)):
-        half = HALF_PX
+        half = HALF_WINDOW_PX
         if peak[n] >= saturation:  # only the wings are usable: enlarge the window
-            longer = max(boxes[n, 2] - boxes[n, 0], boxes[n, 3] - boxes[n, 1])
-            half = min(max(longer // 2 + 2, HALF_PX), WIDEST_HALF_PX)
+            long_side = max(boxes[n, 2] - boxes[n, 0], boxes[n, 3] - boxes[n, 1])
+            half = min(max(long_side // 2 + 2, HALF_WINDOW_PX), MAX_HALF_WINDOW_PX)
         left, top = round(xy[n, 0]) - half, round(xy[n, 1]) - half
         side = 2 * half + 1
         if left < 0 or top < 0 or left + side > width or top + side > height:
@@ -60,13 +60,13 @@ def fit_all(
         window = image[top : top + side, left : left + side]
         sigma = interpolate(noise, height, width, xy[n, 1], xy[n, 0]) / FILTERED_NOISE
         p[X], p[Y] = xy[n, 0] - left, xy[n, 1] - top
-        p[WIDTH], p[SKY] = usual_px, interpolate(level, height, width, xy[n, 1], xy[n, 0])
+        p[WIDTH], p[SKY] = start_sigma_px, interpolate(level, height, width, xy[n, 1], xy[n, 0])
         if _fit(window, sigma, gain_e_dn, saturation, rows, weight, edges, p, out[n]):
-            usual_px = p[WIDTH]
+            start_sigma_px = p[WIDTH]
             out[n, 0] += left
             out[n, 1] += top
         if not out[n, 3] > flux[n] / 2:
-            out[n] = np.nan  # on the plateau of a disc the fit finds a weak star on a bright sky
+            out[n] = np.nan  # on the plateau of a disk the fit finds a weak star on a bright sky
     return out
 
 
@@ -87,26 +87,26 @@ def _fit(
     Where the model does not fit (two stars in one window) the covariance is inflated by the residuals.
     """
     start_x, start_y = p[X], p[Y]
-    normal, move = np.empty((6, 6)), np.empty(5)
+    normal, step = np.empty((6, 6)), np.empty(5)
     p[FLUX] = max(window.sum() - window.size * p[SKY], 1e-9)
-    for _ in range(ROUNDS):
+    for _ in range(MAX_ITERATIONS):
         pixels = _rows(window, noise, gain_e_dn, saturation, p, rows, weight, edges)
         least_squares.normal_equations(rows, weight, window.size, normal)
-        fall = least_squares.step(normal, move)
+        fall = least_squares.step(normal, step)
         if not fall >= 0:
             return False
-        moved = max(abs(move[X]), abs(move[Y]), abs(move[WIDTH]))
+        largest_step = max(abs(step[X]), abs(step[Y]), abs(step[WIDTH]))
         # Steps of more than half a pixel are shortened: the model is too nonlinear for them.
-        p += min(1.0, 0.5 / max(moved, 1e-300)) * move
+        p += min(1.0, 0.5 / max(largest_step, 1e-300)) * step
         if abs(p[X] - start_x) > 2 or abs(p[Y] - start_y) > 2 or p[FLUX] <= 0:
             return False
-        p[WIDTH] = min(max(p[WIDTH], NARROWEST_PX), WIDEST_PX)
-        if moved < least_squares.SETTLED_PX or fall < least_squares.SETTLED_CHI2:
-            if not NARROWEST_PX < p[WIDTH] < WIDEST_PX:
+        p[WIDTH] = min(max(p[WIDTH], MIN_SIGMA_PX), MAX_SIGMA_PX)
+        if largest_step < least_squares.CONVERGED_PX or fall < least_squares.CONVERGED_CHI2:
+            if not MIN_SIGMA_PX < p[WIDTH] < MAX_SIGMA_PX:
                 return False
-            xx, yy, _ = least_squares.place_covariance(normal, move)
-            grown = least_squares.misfit_factor(normal[5, 5], pixels - 5)
-            out[0], out[1], out[2], out[3] = p[X], p[Y], sqrt((xx + yy) / 2 * grown), p[FLUX]
+            xx, yy, _ = least_squares.position_covariance(normal, step)
+            inflation = least_squares.misfit_factor(normal[5, 5], pixels - 5)
+            out[0], out[1], out[2], out[3] = p[X], p[Y], sqrt((xx + yy) / 2 * inflation), p[FLUX]
             return True
     return False
 
@@ -123,41 +123,41 @@ def _rows(
     edges: Floats,
 ) -> int:
     """Fill the model's derivatives, the residuals and the weights at every pixel; return the number of pixels used."""
-    side, flux, pixels = len(window), p[FLUX], window.size
+    side, flux, used = len(window), p[FLUX], window.size
     gx, dgx, sgx, gy, dgy, sgy = edges
     _cells(side, p[X], p[WIDTH], gx, dgx, sgx)
     _cells(side, p[Y], p[WIDTH], gy, dgy, sgy)
     for j in range(side):
-        part = rows[:, j * side : (j + 1) * side]
-        heavy, line = weight[j * side : (j + 1) * side], window[j]
-        share, slope, widening = flux * gy[j], flux * dgy[j], flux * sgy[j]
+        block = rows[:, j * side : (j + 1) * side]
+        block_weight, pixel_row = weight[j * side : (j + 1) * side], window[j]
+        flux_y, slope_y, widening_y = flux * gy[j], flux * dgy[j], flux * sgy[j]
         for i in range(side):
-            light = share * gx[i]
-            part[X, i], part[Y, i], part[FLUX, i] = share * dgx[i], slope * gx[i], gy[j] * gx[i]
-            part[WIDTH, i] = share * sgx[i] + widening * gx[i]
-            part[5, i] = line[i] - p[SKY] - light
+            model = flux_y * gx[i]
+            block[X, i], block[Y, i], block[FLUX, i] = flux_y * dgx[i], slope_y * gx[i], gy[j] * gx[i]
+            block[WIDTH, i] = flux_y * sgx[i] + widening_y * gx[i]
+            block[5, i] = pixel_row[i] - p[SKY] - model
             # The 1e-9 keeps the weights finite in the sky of a noise-free image.
-            heavy[i] = 1 / (noise * noise + (light + 1e-9 * flux) / gain_e_dn)
+            block_weight[i] = 1 / (noise * noise + (model + 1e-9 * flux) / gain_e_dn)
         for i in range(side):
-            if line[i] >= saturation:
-                heavy[i] = 0.0
-                pixels -= 1
-    return pixels
+            if pixel_row[i] >= saturation:
+                block_weight[i] = 0.0
+                used -= 1
+    return used
 
 
 @jit
-def _cells(count: int, middle: float, sigma: float, share: Floats, slope: Floats, widening: Floats) -> None:
+def _cells(count: int, center: float, sigma: float, fraction: Floats, slope: Floats, widening: Floats) -> None:
     """Integrate a 1-D Gaussian over each pixel; also its derivatives with respect to the center and to sigma.
 
     Adjacent pixels share an edge, so erf and exp are computed once per edge.
     """
     scale = 1 / sigma
-    low = (-0.5 - middle) * scale
+    low = (-0.5 - center) * scale
     low_sum, low_bell = erf(low * sqrt(0.5)) / 2, exp(-low * low / 2) / sqrt(2 * pi)
     for k in range(count):
         high = low + scale
         high_sum, high_bell = erf(high * sqrt(0.5)) / 2, exp(-high * high / 2) / sqrt(2 * pi)
-        share[k] = high_sum - low_sum
+        fraction[k] = high_sum - low_sum
         slope[k] = (low_bell - high_bell) * scale
         widening[k] = (low * low_bell - high * high_bell) * scale
         low, low_sum, low_bell = high, high_sum, high_bell

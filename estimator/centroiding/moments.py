@@ -1,8 +1,9 @@
 """Centroids by moments of the light: center of gravity, light-weighted, and in a Gaussian window.
 
 Each kernel sums the light above the interpolated sky and returns x, y, sigma and flux per blob, or NaN where the
-position is undefined. `gravity` and `squared` use the blob's box and a margin, `windowed` the window. The variance
-propagates photon noise (I / gain) and the sky's noise through the estimator's derivative with respect to each pixel.
+position is undefined. `center_of_gravity` and `squared_light` use the blob's box and a margin, `gaussian_windowed` the
+window. The variance propagates photon noise (I / gain) and the sky's noise through the estimator's derivative with
+respect to each pixel.
 The two weighted estimators also have a systematic error that depends on the position of the star within its pixel
 (the S-curve), since they see the profile at the pixel centers only; `sampling_variance` gives its mean square.
 """
@@ -19,41 +20,40 @@ from estimator.core.jit import jit
 from estimator.detection.background import FILTERED_NOISE, interpolate
 
 MARGIN_PX = 4
-LEAST_WINDOW_PX, MOST_WINDOW_PX = 0.6, 4.0  # limits of the window's sigma
-WINDOW_SHARE = (
-    2.0  # the window's variance over the star's: the error is an eighth above the minimum, see `windowed`
-)
-SIZING, ROUNDS = 4, 60  # iterations that adapt the window's width, and iterations at most
+MIN_WINDOW_PX, MAX_WINDOW_PX = 0.6, 4.0  # limits of the window's sigma
+# The window's variance over the star's: the error is an eighth above the minimum, see `gaussian_windowed`.
+WINDOW_VARIANCE_RATIO = 2.0
+SIZING_ITERATIONS, MAX_ITERATIONS = 4, 60  # iterations that adapt the window's width, and iterations at most
 
 
 @jit
-def gravity(image: NDArray, boxes: Ints, level: Floats, noise: Floats, gain_e_dn: float) -> Floats:
+def center_of_gravity(image: NDArray, boxes: Ints, level: Floats, noise: Floats, gain_e_dn: float) -> Floats:
     """Compute the center of gravity in each box and a margin: (N, 4) x, y, sigma of the position, flux."""
     height, width = image.shape
     out = np.empty((len(boxes), 4))
-    near = np.empty(len(boxes), np.int64)
+    buffer = np.empty(len(boxes), np.int64)
     for n in range(len(boxes)):
         x0, y0 = max(boxes[n, 0] - MARGIN_PX, 0), max(boxes[n, 1] - MARGIN_PX, 0)
         x1, y1 = min(boxes[n, 2] + MARGIN_PX, width - 1), min(boxes[n, 3] + MARGIN_PX, height - 1)
-        others = near[: neighbours(boxes, n, x0, y0, x1, y1, near)]
+        neighbor_rows = buffer[: neighbors(boxes, n, x0, y0, x1, y1, buffer)]
         flux = sx = sy = s_light = light_xx = light_x = light_y = 0.0
         pixels = px = py = pxx = 0.0
-        ox, oy = (x0 + x1) / 2, (y0 + y1) / 2
+        origin_x, origin_y = (x0 + x1) / 2, (y0 + y1) / 2
         for y in range(y0, y1 + 1):
             for x in range(x0, x1 + 1):
-                if foreign(boxes, others, n, x, y):
+                if belongs_to_neighbor(boxes, neighbor_rows, n, x, y):
                     continue
                 light = image[y, x] - interpolate(level, height, width, y, x)
-                u, v = x - ox, y - oy
+                u, v = x - origin_x, y - origin_y
                 flux += light
                 sx += light * u
                 sy += light * v
                 # Photon noise needs the light itself, without the negative noise of the sky.
-                bright = max(light, 0.0)
-                s_light += bright
-                light_x += bright * u
-                light_y += bright * v
-                light_xx += bright * (u * u + v * v)
+                positive = max(light, 0.0)
+                s_light += positive
+                light_x += positive * u
+                light_y += positive * v
+                light_xx += positive * (u * u + v * v)
                 pixels += 1
                 px += u
                 py += v
@@ -65,36 +65,32 @@ def gravity(image: NDArray, boxes: Ints, level: Floats, noise: Floats, gain_e_dn
         # Sums of (x - cx)^2 + (y - cy)^2 over the pixels, and weighted by their light.
         by_light = light_xx - 2 * (cx * light_x + cy * light_y) + (cx * cx + cy * cy) * s_light
         by_pixel = pxx - 2 * (cx * px + cy * py) + (cx * cx + cy * cy) * pixels
-        sigma2 = (interpolate(noise, height, width, cy + oy, cx + ox) / FILTERED_NOISE) ** 2
-        spread = (by_light / gain_e_dn + sigma2 * by_pixel) / 2
-        out[n, 0], out[n, 1], out[n, 2], out[n, 3] = (
-            cx + ox,
-            cy + oy,
-            sqrt(max(spread, 0.0)) / abs(flux),
-            flux,
-        )
+        sigma2 = (interpolate(noise, height, width, cy + origin_y, cx + origin_x) / FILTERED_NOISE) ** 2
+        moment_variance = (by_light / gain_e_dn + sigma2 * by_pixel) / 2
+        out[n, 0], out[n, 1], out[n, 3] = cx + origin_x, cy + origin_y, flux
+        out[n, 2] = sqrt(max(moment_variance, 0.0)) / abs(flux)
     return out
 
 
 @jit
-def squared(image: NDArray, boxes: Ints, level: Floats, noise: Floats, gain_e_dn: float) -> Floats:
+def squared_light(image: NDArray, boxes: Ints, level: Floats, noise: Floats, gain_e_dn: float) -> Floats:
     """Compute the mean position weighted by the squared light: (N, 4) x, y, sigma of the position, flux."""
     height, width = image.shape
     out = np.empty((len(boxes), 4))
-    near = np.empty(len(boxes), np.int64)
+    buffer = np.empty(len(boxes), np.int64)
     for n in range(len(boxes)):
         x0, y0 = max(boxes[n, 0] - 1, 0), max(boxes[n, 1] - 1, 0)
         x1, y1 = min(boxes[n, 2] + 1, width - 1), min(boxes[n, 3] + 1, height - 1)
-        others = near[: neighbours(boxes, n, x0, y0, x1, y1, near)]
-        cx = cy = flux = weight = spread = wide = 0.0
+        neighbor_rows = buffer[: neighbors(boxes, n, x0, y0, x1, y1, buffer)]
+        cx = cy = flux = weight = moment_variance = second_moment = 0.0
         sigma2 = 0.0
-        for turn in range(2):  # first the position, then its variance about it
+        for sweep in range(2):  # first the position, then its variance about it
             for y in range(y0, y1 + 1):
                 for x in range(x0, x1 + 1):
-                    if foreign(boxes, others, n, x, y):
+                    if belongs_to_neighbor(boxes, neighbor_rows, n, x, y):
                         continue
                     light = image[y, x] - interpolate(level, height, width, y, x)
-                    if turn == 0:
+                    if sweep == 0:
                         flux += light
                         light = max(light, 0.0)
                         weight += light * light
@@ -102,10 +98,10 @@ def squared(image: NDArray, boxes: Ints, level: Floats, noise: Floats, gain_e_dn
                         cy += light * light * y
                         continue
                     light = max(light, 0.0)
-                    away2 = ((x - cx) ** 2 + (y - cy) ** 2) / 2
-                    wide += light * light * away2
-                    spread += 4 * light * light * away2 * (light / gain_e_dn + sigma2)
-            if turn == 0:
+                    distance2 = ((x - cx) ** 2 + (y - cy) ** 2) / 2
+                    second_moment += light * light * distance2
+                    moment_variance += 4 * light * light * distance2 * (light / gain_e_dn + sigma2)
+            if sweep == 0:
                 if weight == 0:
                     break
                 cx, cy = cx / weight, cy / weight
@@ -114,19 +110,19 @@ def squared(image: NDArray, boxes: Ints, level: Floats, noise: Floats, gain_e_dn
             out[n] = np.nan, np.nan, np.nan, 0.0
             continue
         out[n, 0], out[n, 1], out[n, 3] = cx, cy, flux
-        out[n, 2] = sqrt(spread / weight**2 + sampling_variance(wide / weight))
+        out[n, 2] = sqrt(moment_variance / weight**2 + sampling_variance(second_moment / weight))
     return out
 
 
 @jit
-def windowed(
+def gaussian_windowed(
     image: NDArray, xy: Floats, boxes: Ints, level: Floats, noise: Floats, gain_e_dn: float
 ) -> Floats:
     """Compute the centroid in an adaptive Gaussian window: (N, 4) x, y, sigma of the position, flux.
 
     The center c solves f(c) = sum(w I (x - c)) = 0 with w = exp(-|x - c|^2 / 2 s^2), by Newton's method with the
-    derivative -sum(w I (1 - (x - c)^2 / s^2)). The first SIZING iterations also set s^2 to WINDOW_SHARE times the
-    star's variance. Rows are NaN where it does not converge.
+    derivative -sum(w I (1 - (x - c)^2 / s^2)). The first SIZING_ITERATIONS iterations also set s^2 to
+    WINDOW_VARIANCE_RATIO times the star's variance. Rows are NaN where it does not converge.
 
     With t the window's variance over the star's, the error exceeds the minimum by a factor (t + 1)^2 / 4 t if the sky's
     noise dominates, and (t + 1)^2 / t (t + 2) if the star's photon noise dominates: 1.125 in both cases at t = 2. A
@@ -134,20 +130,20 @@ def windowed(
     """
     height, width = image.shape
     out = np.full((len(boxes), 4), np.nan)
-    near = np.empty(len(boxes), np.int64)
+    buffer = np.empty(len(boxes), np.int64)
     for n in range(len(boxes)):
         cx, cy = xy[n]
         s2 = 1.0
         sigma2 = (interpolate(noise, height, width, cy, cx) / FILTERED_NOISE) ** 2
-        for turn in range(ROUNDS):
+        for iteration in range(MAX_ITERATIONS):
             reach = 4 * sqrt(s2)
             x0, y0 = max(round(cx - reach), 0), max(round(cy - reach), 0)
             x1, y1 = min(round(cx + reach), width - 1), min(round(cy + reach), height - 1)
-            others = near[: neighbours(boxes, n, x0, y0, x1, y1, near)]
-            total = mx = my = m2 = spread = flux = 0.0
+            neighbor_rows = buffer[: neighbors(boxes, n, x0, y0, x1, y1, buffer)]
+            total = mx = my = second_moment = moment_variance = flux = 0.0
             for y in range(y0, y1 + 1):
                 for x in range(x0, x1 + 1):
-                    if foreign(boxes, others, n, x, y):
+                    if belongs_to_neighbor(boxes, neighbor_rows, n, x, y):
                         continue
                     light = image[y, x] - interpolate(level, height, width, y, x)
                     u, v = x - cx, y - cy
@@ -155,11 +151,12 @@ def windowed(
                     total += w * light
                     mx += w * light * u
                     my += w * light * v
-                    m2 += w * light * (u * u + v * v) / 2
-                    spread += w * w * (u * u + v * v) / 2 * (max(light, 0.0) / gain_e_dn + sigma2)
+                    second_moment += w * light * (u * u + v * v) / 2
+                    pixel_variance = max(light, 0.0) / gain_e_dn + sigma2
+                    moment_variance += w * w * (u * u + v * v) / 2 * pixel_variance
                     flux += light
             # Negative derivative of the first moment: the window moves with c, which subtracts m2 / s2.
-            slope = total - m2 / s2
+            slope = total - second_moment / s2
             if not (total > 0 and slope > 0):
                 break
             dx, dy = mx / slope, my / slope
@@ -167,15 +164,15 @@ def windowed(
             cx, cy = cx + scale * dx, cy + scale * dy
             if abs(cx - xy[n, 0]) > 2 + sqrt(s2) or abs(cy - xy[n, 1]) > 2 + sqrt(s2):
                 break
-            if turn < SIZING:
+            if iteration < SIZING_ITERATIONS:
                 # A star of variance q times the window has the variance 1 / (1/q + 1/s2): solve for q.
-                seen = m2 / total
-                q = 1 / (1 / seen - 1 / s2) if 0 < seen < 0.95 * s2 else MOST_WINDOW_PX**2
-                s2 = min(max(WINDOW_SHARE * q, LEAST_WINDOW_PX**2), MOST_WINDOW_PX**2)
+                apparent = second_moment / total
+                variance = 1 / (1 / apparent - 1 / s2) if 0 < apparent < 0.95 * s2 else MAX_WINDOW_PX**2
+                s2 = min(max(WINDOW_VARIANCE_RATIO * variance, MIN_WINDOW_PX**2), MAX_WINDOW_PX**2)
             elif max(abs(dx), abs(dy)) < 1e-10:
-                aliased = sampling_variance(m2 / total) * (total / slope) ** 2
+                sampling_error2 = sampling_variance(second_moment / total) * (total / slope) ** 2
                 out[n, 0], out[n, 1], out[n, 3] = cx, cy, flux
-                out[n, 2] = sqrt(spread / slope**2 + aliased)
+                out[n, 2] = sqrt(moment_variance / slope**2 + sampling_error2)
                 break
     return out
 
@@ -190,31 +187,31 @@ def sampling_variance(variance_px2: float) -> float:
 
 
 @jit
-def neighbours(boxes: Ints, n: int, x0: int, y0: int, x1: int, y1: int, near: Ints) -> int:
-    """Write to `near` the other blobs whose boxes overlap a window; return their number."""
+def neighbors(boxes: Ints, n: int, x0: int, y0: int, x1: int, y1: int, buffer: Ints) -> int:
+    """Write to `buffer` the other blobs whose boxes overlap a window; return their number."""
     count = 0
     for m in range(len(boxes)):
-        apart = boxes[m, 0] > x1 or boxes[m, 2] < x0 or boxes[m, 1] > y1 or boxes[m, 3] < y0
-        if m != n and not apart:
-            near[count] = m
+        disjoint = boxes[m, 0] > x1 or boxes[m, 2] < x0 or boxes[m, 1] > y1 or boxes[m, 3] < y0
+        if m != n and not disjoint:
+            buffer[count] = m
             count += 1
     return count
 
 
 @jit
-def foreign(boxes: Ints, near: Ints, n: int, x: int, y: int) -> bool:
+def belongs_to_neighbor(boxes: Ints, neighbor_rows: Ints, n: int, x: int, y: int) -> bool:
     """Whether a pixel is closer to the box of another blob than to that of blob n."""
-    if len(near) == 0:
+    if len(neighbor_rows) == 0:
         return False
-    mine = _apart(boxes[n], x, y)
-    nearest = mine
-    for m in near:
-        nearest = min(nearest, _apart(boxes[m], x, y))
-    return nearest < mine
+    own = _distance2_to_box(boxes[n], x, y)
+    nearest = own
+    for m in neighbor_rows:
+        nearest = min(nearest, _distance2_to_box(boxes[m], x, y))
+    return nearest < own
 
 
 @jit
-def _apart(box: Ints, x: int, y: int) -> float:
+def _distance2_to_box(box: Ints, x: int, y: int) -> float:
     """Squared distance of a pixel to a box; 0 inside."""
     dx = max(box[0] - x, 0, x - box[2])
     dy = max(box[1] - y, 0, y - box[3])

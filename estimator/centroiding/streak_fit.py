@@ -4,7 +4,7 @@ The model is a uniform segment of length L and direction a, convolved with a Gau
 equation). Gauss-Newton solves for center, flux, length, direction, width and sky. Length, direction and width have
 Gaussian priors around the streak shared by the frame: without them, the fit of a faint streak would settle on its
 brightest piece. The covariance is the Cramer-Rao bound of the center, inflated by the reduced chi-square where the
-model does not fit, plus the error along the streak of misplacing its ends in noise (`_slip_px2`).
+model does not fit, plus the error along the streak of misplacing its ends in noise (`_end_variance_px2`).
 """
 
 from __future__ import annotations
@@ -14,19 +14,19 @@ from math import cos, erf, exp, hypot, pi, sin, sqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.centroiding.moments import foreign, neighbours
+from estimator.centroiding.moments import belongs_to_neighbor, neighbors
 from estimator.core import least_squares
 from estimator.core.arrays import Floats, Ints
 from estimator.core.jit import jit
 from estimator.detection.background import FILTERED_NOISE, interpolate
 
-MARGIN_PX, WIDEST_PX = 4, 96  # margin of the window about the streak, and its largest half-width
+MARGIN_PX, MAX_HALF_WINDOW_PX = 4, 96  # margin of the window about the streak, and its largest half-width
 REACH_PX = 4.5  # from the initial line: pixels farther away contain only sky and are not used
-SHORTEST_PX = 1.5  # shortest streak whose length and direction can be measured
-ROUNDS = 40
+MIN_STREAK_PX = 1.5  # shortest streak whose length and direction can be measured
+MAX_ITERATIONS = 40
 # Priors (1 sigma): difference of a star's streak from the frame's, as rotation about the boresight and distortion make
 # streaks vary over the field; and of its width from that of the star before.
-LENGTH_SHARE, LENGTH_PX, ANGLE_RAD, WIDTH_SHARE = 0.15, 0.5, 0.15, 0.15
+LENGTH_FRACTION, LENGTH_PX, ANGLE_RAD, WIDTH_FRACTION = 0.15, 0.5, 0.15, 0.15
 FAR_SIGMA = 5.0  # from an end of the line: 3e-7 of the light is beyond
 # Parameters: center, flux, length, direction, width, sky.
 X, Y, FLUX, LENGTH, ANGLE, WIDTH, SKY = range(7)
@@ -46,13 +46,13 @@ def fit_all(
     """Fit every blob: (N, 8) x, y, flux, dx, dy, and xx, yy, xy of the center's covariance; NaN if not a streak."""
     height, width = image.shape
     out = np.full((len(xy), 8), np.nan)
-    near, p = np.empty(len(xy), np.int64), np.empty(7)
+    buffer, p = np.empty(len(xy), np.int64), np.empty(7)
     # The window covers the frame's streak, with a margin, about the blob's center.
     half_x, half_y = int(abs(streak[0]) / 2) + MARGIN_PX, int(abs(streak[1]) / 2) + MARGIN_PX
-    if max(half_x, half_y) > WIDEST_PX:
+    if max(half_x, half_y) > MAX_HALF_WINDOW_PX:
         return out
-    room = (2 * half_x + 1) * (2 * half_y + 1)
-    pixels, rows, weight = np.empty((3, room)), np.empty((8, room)), np.empty(room)
+    capacity = (2 * half_x + 1) * (2 * half_y + 1)
+    pixels, rows, weight = np.empty((3, capacity)), np.empty((8, capacity)), np.empty(capacity)
     rows[SKY] = 1.0
     length, angle, width_px = hypot(streak[0], streak[1]), np.arctan2(streak[1], streak[0]), 0.9
     for n in range(len(xy)):
@@ -60,7 +60,7 @@ def fit_all(
         x1, y1 = x0 + 2 * half_x, y0 + 2 * half_y
         if x0 < 0 or y0 < 0 or x1 >= width or y1 >= height:
             continue
-        others = near[: neighbours(boxes, n, x0, y0, x1, y1, near)]
+        neighbor_rows = buffer[: neighbors(boxes, n, x0, y0, x1, y1, buffer)]
         sky = interpolate(level, height, width, xy[n, 1], xy[n, 0])
         sigma = interpolate(noise, height, width, xy[n, 1], xy[n, 0]) / FILTERED_NOISE
         p[X], p[Y], p[FLUX] = xy[n, 0], xy[n, 1], 0.0
@@ -68,7 +68,7 @@ def fit_all(
         count = 0
         for y in range(y0, y1 + 1):
             for x in range(x0, x1 + 1):
-                if _off_line(p, x, y) > REACH_PX or foreign(boxes, others, n, x, y):
+                if _distance_to_line(p, x, y) > REACH_PX or belongs_to_neighbor(boxes, neighbor_rows, n, x, y):
                     continue
                 p[FLUX] += image[y, x] - sky
                 if image[y, x] < saturation:
@@ -80,7 +80,7 @@ def fit_all(
 
 
 @jit
-def _off_line(p: Floats, x: float, y: float) -> float:
+def _distance_to_line(p: Floats, x: float, y: float) -> float:
     """Distance of a pixel from the line segment."""
     along_x, along_y = cos(p[ANGLE]), sin(p[ANGLE])
     u = (x - p[X]) * along_x + (y - p[Y]) * along_y
@@ -89,9 +89,7 @@ def _off_line(p: Floats, x: float, y: float) -> float:
 
 
 @jit
-def _fit(
-    pixels: Floats, noise: float, gain_e_dn: float, rows: Floats, weight: Floats, p: Floats, out: Floats
-) -> bool:
+def _fit(pixels: Floats, noise: float, gain_e_dn: float, rows: Floats, weight: Floats, p: Floats, out: Floats) -> bool:
     """Fit one streak by Gauss-Newton, starting from `p`; return False if it does not converge near its start.
 
     pixels : (3, K) x, y and value of the pixels used
@@ -101,43 +99,43 @@ def _fit(
     count = pixels.shape[1]
     start_x, start_y = p[X], p[Y]
     start_length, start_angle, start_width = p[LENGTH], p[ANGLE], p[WIDTH]
-    length_sigma = LENGTH_SHARE * start_length + LENGTH_PX
-    normal, move = np.empty((8, 8)), np.empty(7)
-    for _ in range(ROUNDS):
+    length_sigma = LENGTH_FRACTION * start_length + LENGTH_PX
+    normal, step = np.empty((8, 8)), np.empty(7)
+    for _ in range(MAX_ITERATIONS):
         _rows(pixels, noise, gain_e_dn, p, rows, weight)
         least_squares.normal_equations(rows, weight, count, normal)
-        least_squares.expect(normal, LENGTH, start_length - p[LENGTH], length_sigma)
-        least_squares.expect(normal, ANGLE, start_angle - p[ANGLE], ANGLE_RAD)
-        least_squares.expect(normal, WIDTH, start_width - p[WIDTH], WIDTH_SHARE * start_width)
-        fall = least_squares.step(normal, move)
+        least_squares.add_prior(normal, LENGTH, start_length - p[LENGTH], length_sigma)
+        least_squares.add_prior(normal, ANGLE, start_angle - p[ANGLE], ANGLE_RAD)
+        least_squares.add_prior(normal, WIDTH, start_width - p[WIDTH], WIDTH_FRACTION * start_width)
+        fall = least_squares.step(normal, step)
         if not fall >= 0:
             return False
-        moved = max(abs(move[X]), abs(move[Y]), abs(move[LENGTH]))
-        turned = abs(move[ANGLE]) * p[LENGTH] / 2
+        largest_step = max(abs(step[X]), abs(step[Y]), abs(step[LENGTH]))
+        end_shift = abs(step[ANGLE]) * p[LENGTH] / 2
         # The step is shortened so that center, length and direction move an end by about a pixel at most.
-        p += min(1.0, 1 / max(moved, turned, 2 * abs(move[WIDTH]), 1e-300)) * move
+        p += min(1.0, 1 / max(largest_step, end_shift, 2 * abs(step[WIDTH]), 1e-300)) * step
         p[WIDTH] = min(max(p[WIDTH], 0.3), 4.0)
         if abs(p[X] - start_x) + abs(p[Y] - start_y) > 2 + start_length / 2:
             return False
-        if p[FLUX] <= 0 or not SHORTEST_PX < p[LENGTH] < 2 * start_length + 4:
+        if p[FLUX] <= 0 or not MIN_STREAK_PX < p[LENGTH] < 2 * start_length + 4:
             return False
-        if moved < least_squares.SETTLED_PX or fall < least_squares.SETTLED_CHI2:
+        if largest_step < least_squares.CONVERGED_PX or fall < least_squares.CONVERGED_CHI2:
             out[0], out[1], out[2] = p[X], p[Y], p[FLUX]
             out[3], out[4] = p[LENGTH] * cos(p[ANGLE]), p[LENGTH] * sin(p[ANGLE])
-            out[5], out[6], out[7] = least_squares.place_covariance(normal, move)
+            out[5], out[6], out[7] = least_squares.position_covariance(normal, step)
             # Degrees of freedom: seven parameters, three priors.
             out[5:] *= least_squares.misfit_factor(normal[7, 7], count - 4)
             # A scalar variance along the streak becomes a covariance in x and y.
-            lost = _slip_px2(p, noise, gain_e_dn) / p[LENGTH] ** 2
-            out[5] += lost * out[3] ** 2
-            out[6] += lost * out[4] ** 2
-            out[7] += lost * out[3] * out[4]
+            end_variance = _end_variance_px2(p, noise, gain_e_dn) / p[LENGTH] ** 2
+            out[5] += end_variance * out[3] ** 2
+            out[6] += end_variance * out[4] ** 2
+            out[7] += end_variance * out[3] * out[4]
             return True
     return False
 
 
 @jit
-def _slip_px2(p: Floats, noise: float, gain_e_dn: float) -> float:
+def _end_variance_px2(p: Floats, noise: float, gain_e_dn: float) -> float:
     """Variance along the streak that the Cramer-Rao bound omits: the error of locating its ends in noise.
 
     Where light of brightness a per pixel of length begins in noise of deviation n, the maximum-likelihood position of
@@ -163,8 +161,8 @@ def _rows(pixels: Floats, noise: float, gain_e_dn: float, p: Floats, rows: Float
         dx, dy = pixels[0, k] - p[X], pixels[1, k] - p[Y]
         u, v = dx * along_x + dy * along_y, dy * along_x - dx * along_y
         head, tail = (u + length / 2) / w, (u - length / 2) / w
-        head_sum, head_bell = _step(head)
-        tail_sum, tail_bell = _step(tail)
+        head_sum, head_bell = _gaussian_integral(head)
+        tail_sum, tail_bell = _gaussian_integral(tail)
         across = exp(-v * v / (2 * w * w)) / (w * sqrt(2 * pi) * length)
         unit = (head_sum - tail_sum) * across
         by_u, by_v = (head_bell - tail_bell) / w * across, -v / (w * w) * unit
@@ -180,7 +178,7 @@ def _rows(pixels: Floats, noise: float, gain_e_dn: float, p: Floats, rows: Float
 
 
 @jit
-def _step(t: float) -> tuple[float, float]:
+def _gaussian_integral(t: float) -> tuple[float, float]:
     """Return a unit Gaussian's integral from 0 to t and its density at t; the limits beyond FAR_SIGMA, to save time."""
     if abs(t) > FAR_SIGMA:
         return (0.5 if t > 0 else -0.5), 0.0

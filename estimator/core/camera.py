@@ -1,4 +1,4 @@
-"""Camera model of the tracker: converts pixels to unit vectors and back, with the believed calibration.
+"""Camera model of the tracker: converts pixels to unit vectors and back, with the calibration that the tracker assumes.
 
 The model is a pinhole with Brown-Conrady distortion in OpenCV's convention. Projection (`Camera.pixels`) applies
 the distortion in closed form; back-projection (`Camera.rays`) inverts it by fixed-point iteration.
@@ -22,14 +22,14 @@ class Camera:
     """A pinhole with Brown-Conrady distortion, in camera axes +x right, +y down, +z boresight.
 
     focal_px : focal length divided by the pixel pitch
-    centre_px: principal point (x, y); the center of pixel (0, 0) is (0, 0)
+    center_px: principal point (x, y); the center of pixel (0, 0) is (0, 0)
     distortion: k1, k2, p1, p2, k3 in OpenCV's order
     """
 
     width_px: int
     height_px: int
     focal_px: float
-    centre_px: tuple[float, float]
+    center_px: tuple[float, float]
     distortion: Distortion = (0.0, 0.0, 0.0, 0.0, 0.0)
 
     @classmethod
@@ -51,8 +51,8 @@ class Camera:
     @property
     def fov_rad(self) -> float:
         """Horizontal field of view: the angle between the rays of the left and right edge pixels at mid-height."""
-        row = (self.height_px - 1) / 2
-        left, right = self.rays(np.array([[0.0, row], [self.width_px - 1.0, row]]))
+        mid_row = (self.height_px - 1) / 2
+        left, right = self.rays(np.array([[0.0, mid_row], [self.width_px - 1.0, mid_row]]))
         return float(np.arctan2(np.linalg.norm(np.cross(left, right)), left @ right))
 
     @property
@@ -73,7 +73,7 @@ class Camera:
 
     def tangents(self, xy_px: Floats) -> Floats:
         """Convert (N, 2) pixels to (N, 2) tangents (x / z, y / z) in camera axes, without distortion."""
-        return undistorted(np.asarray(xy_px, dtype=float), self.focal_px, *self.centre_px, self.distortion)
+        return undistorted(np.asarray(xy_px, dtype=float), self.focal_px, *self.center_px, self.distortion)
 
     def pixels(self, vectors_cam: Floats) -> Floats:
         """Project (N, 3) vectors in camera axes to (N, 2) pixels.
@@ -83,36 +83,32 @@ class Camera:
         z = np.where(vectors_cam[:, 2] > 0, vectors_cam[:, 2], np.nan)
         tangent = vectors_cam[:, :2] / z[:, None]
         tangent[np.sum(tangent**2, axis=1) >= self._fold()] = np.nan
-        return distorted(tangent, self.distortion) * self.focal_px + self.centre_px
+        return distorted(tangent, self.distortion) * self.focal_px + self.center_px
 
     def contains(self, xy_px: Floats, margin_px: float = 0.0) -> np.ndarray:
         """Return (N,) whether each pixel position is on the sensor, shrunk by the margin on every side."""
         x, y = xy_px[:, 0], xy_px[:, 1]
-        low, right, bottom = (
-            margin_px - 0.5,
-            self.width_px - 0.5 - margin_px,
-            self.height_px - 0.5 - margin_px,
-        )
+        low, right = margin_px - 0.5, self.width_px - 0.5 - margin_px
+        bottom = self.height_px - 0.5 - margin_px
         return (x >= low) & (x <= right) & (y >= low) & (y <= bottom)
 
     def _fold(self) -> float:
-        """Squared tangent at which the radial distortion folds back.
+        """Squared tangent at which the radial distortion folds back; infinite if it does not.
 
-        Beyond it, directions outside the field would project into the field.
-
-        The least positive root of d(r radial)/dr = 1 + 3 k1 r^2 + 5 k2 r^4 + 7 k3 r^6; infinite if there is none.
+        Beyond it, directions outside the field would project into the field. It is the least positive root r^2 of
+        d(r radial)/dr = 1 + 3 k1 r^2 + 5 k2 r^4 + 7 k3 r^6.
         """
         k1, k2, _, _, k3 = self.distortion
         if not (k1 or k2 or k3):
             return np.inf
         # Solve for 1 / r^2: the leading coefficient is then 1, so no tiny coefficient is divided by.
         roots = np.roots([1.0, 3 * k1, 5 * k2, 7 * k3])
-        greatest = float(max(roots.real[(np.abs(roots.imag) < 1e-12) & (roots.real > 0)], default=0.0))
-        return 1 / greatest if greatest else np.inf
+        largest_root = float(max(roots.real[(np.abs(roots.imag) < 1e-12) & (roots.real > 0)], default=0.0))
+        return 1 / largest_root if largest_root else np.inf
 
 
 @jit
-def _bent(x: float, y: float, distortion: Distortion) -> tuple[float, float]:
+def _distort(x: float, y: float, distortion: Distortion) -> tuple[float, float]:
     """Apply the distortion to one tangent (Brown 1966, in OpenCV's form)."""
     k1, k2, p1, p2, k3 = distortion
     r2 = x * x + y * y
@@ -128,13 +124,13 @@ def distorted(tangent: Floats, distortion: Distortion) -> Floats:
     """Apply the distortion to (N, 2) tangents."""
     out = np.empty_like(tangent)
     for n in range(len(tangent)):
-        out[n, 0], out[n, 1] = _bent(tangent[n, 0], tangent[n, 1], distortion)
+        out[n, 0], out[n, 1] = _distort(tangent[n, 0], tangent[n, 1], distortion)
     return out
 
 
 @jit
 def undistorted(
-    xy_px: Floats, focal_px: float, centre_x_px: float, centre_y_px: float, distortion: Distortion
+    xy_px: Floats, focal_px: float, center_x_px: float, center_y_px: float, distortion: Distortion
 ) -> Floats:
     """Convert (N, 2) pixels to (N, 2) tangents without distortion.
 
@@ -143,14 +139,15 @@ def undistorted(
     """
     out = np.empty(xy_px.shape)
     k1, k2, p1, p2, k3 = distortion
-    straight = k1 == 0 and k2 == 0 and p1 == 0 and p2 == 0 and k3 == 0
+    no_distortion = k1 == 0 and k2 == 0 and p1 == 0 and p2 == 0 and k3 == 0
     for n in range(len(out)):
-        seen_x, seen_y = (xy_px[n, 0] - centre_x_px) / focal_px, (xy_px[n, 1] - centre_y_px) / focal_px
-        x, y = seen_x, seen_y
-        for _ in range(0 if straight else 50):
-            bent_x, bent_y = _bent(x, y, distortion)
-            x, y = x + seen_x - bent_x, y + seen_y - bent_y
-            if max(abs(seen_x - bent_x), abs(seen_y - bent_y)) < 1e-15:
+        measured_x = (xy_px[n, 0] - center_x_px) / focal_px
+        measured_y = (xy_px[n, 1] - center_y_px) / focal_px
+        x, y = measured_x, measured_y
+        for _ in range(0 if no_distortion else 50):
+            distorted_x, distorted_y = _distort(x, y, distortion)
+            x, y = x + measured_x - distorted_x, y + measured_y - distorted_y
+            if max(abs(measured_x - distorted_x), abs(measured_y - distorted_y)) < 1e-15:
                 break
         out[n, 0], out[n, 1] = x, y
     return out
@@ -160,6 +157,4 @@ def check_shape(image_shape: tuple[int, ...], camera: Camera) -> None:
     """Raise ImageError unless the image has the camera's width and height."""
     if image_shape != (camera.height_px, camera.width_px):
         size = "x".join(map(str, image_shape[1::-1])) if len(image_shape) >= 2 else image_shape
-        raise ImageError(
-            f"the image is {size} pixels; this camera's are {camera.width_px}x{camera.height_px}"
-        )
+        raise ImageError(f"the image is {size} pixels; this camera's are {camera.width_px}x{camera.height_px}")

@@ -2,7 +2,7 @@
 
 A fit linearizes its model at the current parameters p: with slopes J, residuals r and weights w, the step is
 dp = N^-1 g, N = J^T W J, g = J^T W r. `normal_equations` computes N, g and chi-square r^T W r in one matrix, `step`
-solves for dp by Cholesky factorization, and `place_covariance` reads the position's covariance from N^-1.
+solves for dp by Cholesky factorization, and `position_covariance` reads the position's covariance from N^-1.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from estimator.core.jit import jit
 
 # A fit has converged once a step is below a hundredth of a standard deviation (its square is the fall of chi-square),
 # or below a thousandth of a pixel: convergence is quadratic where the model fits, so the next step is negligible.
-SETTLED_CHI2, SETTLED_PX = 1e-4, 1e-3
+CONVERGED_CHI2, CONVERGED_PX = 1e-4, 1e-3
 
 
 @jit(fastmath={"reassoc", "contract"})
@@ -36,12 +36,12 @@ def normal_equations(rows: Floats, weight: Floats, count: int, normal: Floats) -
 
 
 @jit
-def expect(normal: Floats, n: int, off: float, sigma: float) -> None:
-    """Add a Gaussian prior on parameter n: its mean is `off` from the current value, its standard deviation sigma."""
+def add_prior(normal: Floats, n: int, offset: float, sigma: float) -> None:
+    """Add a Gaussian prior on parameter n: mean at `offset` from the current value, standard deviation sigma."""
     last, weight = len(normal) - 1, 1 / sigma**2
     normal[n, n] += weight
-    normal[last, n] += weight * off
-    normal[last, last] += weight * off**2
+    normal[last, n] += weight * offset
+    normal[last, last] += weight * offset**2
 
 
 @jit
@@ -52,10 +52,10 @@ def step(normal: Floats, out: Floats) -> float:
     length of the step in standard deviations; NaN if N is singular.
     """
     count = len(out)
-    if not factorise(normal[:count, :count]):
+    if not cholesky(normal[:count, :count]):
         return np.nan
     out[:] = normal[count, :count]
-    solve(normal, out)
+    cholesky_solve(normal, out)
     fall = 0.0
     for i in range(count):
         fall += normal[count, i] * out[i]
@@ -63,8 +63,11 @@ def step(normal: Floats, out: Floats) -> float:
 
 
 @jit
-def factorise(normal: Floats) -> bool:
-    """Replace the lower triangle of N = L L^T by its Cholesky factor L; return False if N is numerically singular."""
+def cholesky(normal: Floats, min_pivot: float = 1e-12) -> bool:
+    """Replace the lower triangle of N = L L^T by its Cholesky factor L; return False if N is numerically singular.
+
+    min_pivot : smallest accepted ratio of a squared pivot to the diagonal element of N
+    """
     for i in range(len(normal)):
         diagonal = normal[i, i]
         for j in range(i + 1):
@@ -72,7 +75,7 @@ def factorise(normal: Floats) -> bool:
             for k in range(j):
                 total -= normal[i, k] * normal[j, k]
             if i == j:
-                if not total > 1e-12 * diagonal:
+                if not total > min_pivot * diagonal:
                     return False
                 normal[i, i] = sqrt(total)
             else:
@@ -81,7 +84,7 @@ def factorise(normal: Floats) -> bool:
 
 
 @jit
-def solve(factor: Floats, vector: Floats) -> None:
+def cholesky_solve(factor: Floats, vector: Floats) -> None:
     """Replace v by N^-1 v, given the Cholesky factor of N: forward, then back substitution."""
     count = len(vector)
     for i in range(count):
@@ -95,28 +98,29 @@ def solve(factor: Floats, vector: Floats) -> None:
 
 
 @jit
-def place_covariance(factor: Floats, column: Floats) -> tuple[float, float, float]:
+def position_covariance(factor: Floats, column: Floats) -> tuple[float, float, float]:
     """Return xx, yy and xy of N^-1 for the first two parameters, which are the position.
 
     With weights that are inverse variances this is the Cramer-Rao bound.
     """
     column[:] = 0.0
     column[0] = 1.0
-    solve(factor, column)
+    cholesky_solve(factor, column)
     xx, xy = column[0], column[1]
     column[:] = 0.0
     column[1] = 1.0
-    solve(factor, column)
+    cholesky_solve(factor, column)
     return xx, column[1], xy
 
 
 @jit
-def misfit_factor(chi2: float, freedom: int) -> float:
+def misfit_factor(chi2: float, degrees_of_freedom: int) -> float:
     """Factor that inflates a covariance where the model does not fit the pixels: the reduced chi-square.
 
-    Applied only if the reduced chi-square exceeds 1 + 4 sqrt(2 / freedom), four standard deviations; otherwise 1.
+    Applied only if the reduced chi-square exceeds 1 + 4 sqrt(2 / n) with n degrees of freedom, four standard
+    deviations; otherwise 1.
     """
-    if freedom < 1:
+    if degrees_of_freedom < 1:
         return 1.0
-    each = chi2 / freedom
-    return each if each > 1 + 4 * sqrt(2 / freedom) else 1.0
+    reduced = chi2 / degrees_of_freedom
+    return reduced if reduced > 1 + 4 * sqrt(2 / degrees_of_freedom) else 1.0

@@ -93,7 +93,7 @@ class Centroids:
         return len(self.flux)
 
     @classmethod
-    def none(cls) -> Centroids:
+    def empty(cls) -> Centroids:
         return cls(np.empty((0, 2)), np.empty(0), np.empty(0))
 
     def take(self, which: NDArray[Any]) -> Centroids:
@@ -106,11 +106,11 @@ class Centroids:
 
         The excess of sigma_px over the centroids' own sigma is added to the covariance as isotropic variance.
         """
-        even = 1 / sigma_px**2
+        isotropic = 1 / sigma_px**2
         if self.covariance_px2 is None:
-            return np.stack([even, even, 0 * even], axis=1)
-        more = sigma_px**2 - self.sigma_px**2
-        xx, yy, xy = (self.covariance_px2[:, i, j] + more * (i == j) for i, j in ((0, 0), (1, 1), (0, 1)))
+            return np.stack([isotropic, isotropic, 0 * isotropic], axis=1)
+        excess = sigma_px**2 - self.sigma_px**2
+        xx, yy, xy = (self.covariance_px2[:, i, j] + excess * (i == j) for i, j in ((0, 0), (1, 1), (0, 1)))
         return np.stack([yy, xx, -xy], axis=1) / (xx * yy - xy**2)[:, None]
 
 
@@ -192,9 +192,10 @@ def ra_dec_roll_rad(cam_from_icrs: Rotation) -> tuple[float, float, float]:
 
     The roll is measured at the boresight from north through east; radians, ra in [0, 2 pi), roll in (-pi, pi].
     """
-    _, down, sight = cam_from_icrs.as_matrix()
-    ra = np.arctan2(sight[1], sight[0]) % (2 * np.pi) % (2 * np.pi)  # once more: -1e-17 % 2 pi is 2 pi
-    dec = np.arctan2(sight[2], np.hypot(sight[0], sight[1]))
+    _, down, boresight = cam_from_icrs.as_matrix()
+    # The second modulo is needed because -1e-17 % 2 pi is 2 pi.
+    ra = np.arctan2(boresight[1], boresight[0]) % (2 * np.pi) % (2 * np.pi)
+    dec = np.arctan2(boresight[2], np.hypot(boresight[0], boresight[1]))
     north = np.array([-np.sin(dec) * np.cos(ra), -np.sin(dec) * np.sin(ra), np.cos(dec)])
     east = np.array([-np.sin(ra), np.cos(ra), 0.0])
     # A sine of -0 would make a half turn -pi.

@@ -24,7 +24,17 @@ def chord(u: Vector, v: Vector) -> float:
 
 
 @jit
-def axes(u: Vector, v: Vector, out: Floats) -> None:
+def rotate(matrix: Floats, u: Vector) -> Vector:
+    """Multiply a (3, 3) matrix by a vector."""
+    return (
+        matrix[0, 0] * u[0] + matrix[0, 1] * u[1] + matrix[0, 2] * u[2],
+        matrix[1, 0] * u[0] + matrix[1, 1] * u[1] + matrix[1, 2] * u[2],
+        matrix[2, 0] * u[0] + matrix[2, 1] * u[1] + matrix[2, 2] * u[2],
+    )
+
+
+@jit
+def pair_frame(u: Vector, v: Vector, out: Floats) -> None:
     """Write right-handed axes to the columns of out (3, 3): bisector of two unit vectors, their normal, third axis."""
     out[0, 0], out[1, 0], out[2, 0] = u[0] + v[0], u[1] + v[1], u[2] + v[2]
     out[0, 1] = u[1] * v[2] - u[2] * v[1]
@@ -40,15 +50,15 @@ def axes(u: Vector, v: Vector, out: Floats) -> None:
 
 
 @jit
-def times_transposed(one: Floats, other: Floats, out: Floats) -> None:
-    """Compute out = one other^T for (3, 3) matrices."""
+def multiply_transposed(a: Floats, b: Floats, out: Floats) -> None:
+    """Compute out = a b^T for (3, 3) matrices."""
     for i in range(3):
         for j in range(3):
-            out[i, j] = one[i, 0] * other[j, 0] + one[i, 1] * other[j, 1] + one[i, 2] * other[j, 2]
+            out[i, j] = a[i, 0] * b[j, 0] + a[i, 1] * b[j, 1] + a[i, 2] * b[j, 2]
 
 
 @jit
-def turn(w: Floats, matrix: Floats) -> None:
+def rotate_in_place(w: Floats, matrix: Floats) -> None:
     """Left-multiply a rotation matrix by exp([w]) in place, to second order, then orthonormalize it.
 
     The second-order term makes the error of the small rotation w of order |w|^3; Gram-Schmidt on the rows removes the
@@ -64,9 +74,9 @@ def turn(w: Floats, matrix: Floats) -> None:
     inverse = 1 / sqrt(u[0] ** 2 + u[1] ** 2 + u[2] ** 2)
     for c in range(3):
         matrix[0, c] *= inverse
-    along = matrix[0, 0] * matrix[1, 0] + matrix[0, 1] * matrix[1, 1] + matrix[0, 2] * matrix[1, 2]
+    projection = matrix[0, 0] * matrix[1, 0] + matrix[0, 1] * matrix[1, 1] + matrix[0, 2] * matrix[1, 2]
     for c in range(3):
-        matrix[1, c] -= along * matrix[0, c]
+        matrix[1, c] -= projection * matrix[0, c]
     inverse = 1 / sqrt(matrix[1, 0] ** 2 + matrix[1, 1] ** 2 + matrix[1, 2] ** 2)
     for c in range(3):
         matrix[1, c] *= inverse
@@ -76,7 +86,7 @@ def turn(w: Floats, matrix: Floats) -> None:
 
 
 @jit
-def xyzw_of(R: Floats) -> Floats:
+def quaternion_xyzw(R: Floats) -> Floats:
     """(4,) quaternion (x, y, z, w) of a rotation matrix, by its largest component (Shepperd 1978, J. Guidance 1, 223).
 
     Solving for the largest component first avoids a division by a small number.

@@ -4,7 +4,7 @@ The frame is divided into tiles of about 64x64 pixels. In each tile a few rows a
 [1 2 1] x [1 2 1] / 16, the filter that the detector uses too. The estimate starts from the median and the scaled median
 absolute deviation of a few samples, which stars hardly disturb, and is refined by two rounds of sigma clipping at 3
 sigma over all samples of the tile. The variance of the clipped samples is divided by that of a Gaussian truncated at 3
-sigma. Between the tile centers level and noise are interpolated bilinearly (`at`).
+sigma. Between the tile centers level and noise are interpolated bilinearly (`interpolate`).
 
 The noise is measured on the filtered image. For white noise it is FILTERED_NOISE times the noise of a raw pixel.
 """
@@ -20,7 +20,7 @@ from estimator.core.types import Background
 
 TILE_PX = 64
 SAMPLE_ROWS = 6  # sampled per tile: some 370 filtered pixels, of which about 130 are independent
-STARTERS = 33  # samples of the robust initial estimate; odd, as `_middle` needs
+INITIAL_SAMPLES = 33  # samples of the robust initial estimate; odd, as `_median_by_counting` needs
 CLIP_SIGMA = 3.0
 CLIPPED_VARIANCE = 0.9733  # of a unit Gaussian truncated at 3 sigma: 1 - 6 phi(3) / (2 Phi(3) - 1)
 FILTERED_NOISE = 0.375  # the binomial filter reduces the deviation of white noise to (1 + 4 + 1) / 16
@@ -33,16 +33,16 @@ def estimate_background(image: NDArray, tile_px: int = TILE_PX) -> Background:
     is the quantization noise of an integer image, as a dark JPEG can have tiles without any noise.
     """
     tile_px = min(tile_px, *image.shape)
-    kind = summing(image.dtype)
-    exact = (
-        np.float64 if kind == np.float64 else np.float32
-    )  # which holds 16 pixels of two bytes to the last digit
-    level, noise = _tiles(image, tile_px, np.empty(image.shape[1], kind), np.empty(STARTERS, exact))
+    sum_type = accumulator_type(image.dtype)
+    # float32 holds 16 pixels of two bytes to the last digit.
+    sample_type = np.float64 if sum_type == np.float64 else np.float32
+    samples: NDArray = np.empty(INITIAL_SAMPLES, sample_type)
+    level, noise = _tiles(image, tile_px, np.empty(image.shape[1], sum_type), samples)
     step = 1.0 if image.dtype.kind in "iu" else 0.0
     return Background(level, np.maximum(noise, FILTERED_NOISE * step / np.sqrt(12)), tile_px)
 
 
-def summing(pixel: np.dtype, greatest: float = np.inf) -> type:
+def accumulator_type(pixel: np.dtype, greatest: float = np.inf) -> type:
     """Return the narrowest type that holds 16 times a pixel: narrow types process more pixels per vector instruction.
 
     greatest : largest pixel value, if known: 12-bit pixels stored in 16 bits fit a narrower type than their own dtype
@@ -98,19 +98,17 @@ def interpolate(grid: Floats, height: int, width: int, y: float, x: float) -> fl
 
 
 @jit
-def _tiles(image: NDArray, tile_px: int, smooth: NDArray, starters: NDArray) -> tuple[Floats, Floats]:
+def _tiles(image: NDArray, tile_px: int, smooth: NDArray, samples: NDArray) -> tuple[Floats, Floats]:
     """Compute level and noise of every tile from SAMPLE_ROWS of its rows.
 
-    smooth, starters : buffers; their dtypes select the types of the computation
+    smooth, samples : buffers; their dtypes select the types of the computation
     """
     height, width = image.shape
     rows, columns = max(height // tile_px, 1), max(width // tile_px, 1)
     level, noise = np.empty((rows, columns)), np.empty((rows, columns))
     longest = width // columns + 1
-    values, sums = (
-        np.empty((columns, SAMPLE_ROWS * longest), starters.dtype),
-        np.empty(width + 2, smooth.dtype),
-    )
+    values = np.empty((columns, SAMPLE_ROWS * longest), samples.dtype)
+    sums = np.empty(width + 2, smooth.dtype)
     for row in range(rows):
         y0, y1 = row * height // rows, (row + 1) * height // rows
         for k in range(SAMPLE_ROWS):
@@ -120,10 +118,10 @@ def _tiles(image: NDArray, tile_px: int, smooth: NDArray, starters: NDArray) -> 
                 values[column, k * (x1 - x0) : (k + 1) * (x1 - x0)] = smooth[x0:x1]
         for column in range(columns):
             size = (column + 1) * width // columns - column * width // columns
-            some = values[column, : SAMPLE_ROWS * size]
-            middle, spread = _robust(some, starters)
+            tile_values = values[column, : SAMPLE_ROWS * size]
+            middle, spread = _robust_estimate(tile_values, samples)
             for _ in range(2):
-                middle, spread = _clipped(some, middle, spread)
+                middle, spread = _clip(tile_values, middle, spread)
             level[row, column], noise[row, column] = middle / 16, spread / 16
     return level, noise
 
@@ -135,19 +133,19 @@ def median(values: Floats) -> float:
 
 
 @jit
-def _robust(values: NDArray, starters: NDArray) -> tuple[float, float]:
+def _robust_estimate(values: NDArray, samples: NDArray) -> tuple[float, float]:
     """Return median and 1.4826 MAD (a Gaussian's sigma) of len(starters) values, sampled evenly."""
-    count = len(starters)
+    count = len(samples)
     for k in range(count):
-        starters[k] = values[(2 * k + 1) * len(values) // (2 * count)]
-    middle = _middle(starters)
+        samples[k] = values[(2 * k + 1) * len(values) // (2 * count)]
+    middle = _median_by_counting(samples)
     for k in range(count):
-        starters[k] = abs(starters[k] - middle)
-    return middle, 1.4826 * _middle(starters)
+        samples[k] = abs(samples[k] - middle)
+    return middle, 1.4826 * _median_by_counting(samples)
 
 
 @jit
-def _middle(values: NDArray) -> float:
+def _median_by_counting(values: NDArray) -> float:
     """Median of an odd number of values: the value with at most half below it and more than half up to it.
 
     Counting takes quadratic time but has no branches; for a few tens of values it is faster than sorting.
@@ -164,19 +162,19 @@ def _middle(values: NDArray) -> float:
 
 
 @jit(fastmath={"reassoc", "contract"})
-def _clipped(values: NDArray, middle: float, spread: float) -> tuple[float, float]:
+def _clip(values: NDArray, middle: float, spread: float) -> tuple[float, float]:
     """Mean and standard deviation of the values within 3 sigma; the latter is corrected for the truncated tails."""
-    number = values.dtype.type
-    centre, reach, one = number(middle), number(CLIP_SIGMA * spread), number(1)
-    count = total = squares = number(0)
+    real = values.dtype.type
+    center, reach, one = real(middle), real(CLIP_SIGMA * spread), real(1)
+    count = total = squares = real(0)
     # Rejected values are added with weight 0 instead of skipped: without a branch the loop vectorizes.
     for i in range(len(values)):
-        off = values[i] - centre
-        kept = one if abs(off) <= reach else number(0)
-        count += kept
-        total += kept * off
-        squares += kept * off * off
+        deviation = values[i] - center
+        weight = one if abs(deviation) <= reach else real(0)
+        count += weight
+        total += weight * deviation
+        squares += weight * deviation * deviation
     if count < 1:
         return middle, spread
     mean = float(total) / count
-    return float(centre) + mean, np.sqrt(max(float(squares) / count - mean * mean, 0.0) / CLIPPED_VARIANCE)
+    return float(center) + mean, np.sqrt(max(float(squares) / count - mean * mean, 0.0) / CLIPPED_VARIANCE)

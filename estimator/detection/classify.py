@@ -21,12 +21,12 @@ from estimator.core.types import Blobs, FramePriors
 from estimator.detection.background import FILTERED_NOISE, filtered, interpolate, median
 
 # Sum of the four neighbors over the central pixel: about .5 for a centered Gaussian of sigma 0.4 px, 0 for a spike.
-SHARPEST = 0.25
-LARGEST_SHARE = 0.05  # of the frame's shorter side: no star is that wide; the Moon and trees are
-ROUGHEST = 4.0  # local noise over the frame's median noise
+MIN_NEIGHBOR_RATIO = 0.25
+MAX_SIZE_FRACTION = 0.05  # of the frame's shorter side: no star is that wide; the Moon and trees are
+MAX_NOISE_RATIO = 4.0  # local noise over the frame's median noise
 CLEAR_SIGMA = 10.0  # of a pixel: bright enough for its shape to be significant
-VOTERS = 15  # number of brightest blobs that decide whether the frame is smeared
-STREAK_PX, TRACK_PX = 6.0, 6.0  # shortest lines not explained by noise, a pair of stars or defocus
+VOTING_BLOBS = 15  # number of brightest blobs that decide whether the frame is smeared
+MIN_STREAK_PX, MIN_TRACK_PX = 6.0, 6.0  # shortest lines not explained by noise, a pair of stars or defocus
 
 
 class Flag(IntFlag):
@@ -50,22 +50,22 @@ NO_STAR = Flag.HOT | Flag.TRACK | Flag.HUGE | Flag.TEXTURE
 SATURATED, HOT, TRACK, HUGE, TEXTURE = (int(flag) for flag in Flag)  # plain integers for compiled code
 
 
-def classify(image: NDArray, blobs: Blobs, hints: FramePriors) -> Blobs:
+def classify(image: NDArray, blobs: Blobs, priors: FramePriors) -> Blobs:
     """Return the blobs with their flags, and with the streak (dx, dy) that the frame's stars share, if any.
 
-    The streak is that of the hints if given, otherwise the one that most of the brightest blobs share.
+    The streak is that of the priors if given, otherwise the one that most of the brightest blobs share.
     """
     if not len(blobs):
-        return replace(blobs, streak_px=hints.streak_px)
+        return replace(blobs, streak_px=priors.streak_px)
     background = blobs.background
     shape = _shapes(image, blobs.box_px, background.level, background.noise)
-    streak_px = hints.streak_px
+    streak_px = priors.streak_px
     if streak_px is None:
-        shared = _shared(shape[:, 3:])
-        if shared[0] ** 2 + shared[1] ** 2 > STREAK_PX**4 and len(blobs) >= 3:
-            streak_px = _halved(shared)
+        common_line = _common_line(shape[:, 3:])
+        if common_line[0] ** 2 + common_line[1] ** 2 > MIN_STREAK_PX**4 and len(blobs) >= 3:
+            streak_px = _half_angle(common_line)
     else:
-        shared = _doubled(streak_px)
+        common_line = _double_angle(streak_px)
     flag = _flags(
         shape,
         blobs.box_px,
@@ -73,14 +73,12 @@ def classify(image: NDArray, blobs: Blobs, hints: FramePriors) -> Blobs:
         blobs.peak,
         background.noise,
         image.shape,
-        shared,
+        common_line,
         streak_px is not None,
-        hints.saturation,
+        priors.saturation,
         FILTERED_NOISE * (image.dtype.kind in "iu"),
     )
-    return Blobs(
-        blobs.box_px, blobs.xy_px, blobs.flux, blobs.peak, blobs.area_px, background, flag, streak_px
-    )
+    return replace(blobs, flag=flag, streak_px=streak_px)
 
 
 @jit
@@ -91,59 +89,59 @@ def _flags(
     peak: Floats,
     noise: Floats,
     size: tuple[int, int],
-    shared: tuple[float, float],
+    common_line: tuple[float, float],
     smeared: bool,
     saturation: float,
     step: float,
 ) -> Ints:
     """Return the (N,) flags of each blob, from its row of `_shapes` and the line shared by the blobs.
 
-    shared : shared line as L^2 (cos 2a, sin 2a);  smeared : whether the frame has streaks
+    common_line: shared line as L^2 (cos 2a, sin 2a);  smeared : whether the frame has streaks
     step   : floor of the noise, from quantization
     """
     height, width = size
-    ordinary, narrow = max(median(noise), step), median(shape[:, 2])
-    allowed = max(LARGEST_SHARE * min(height, width) + sqrt(hypot(shared[0], shared[1])), 16.0)
+    typical_noise, typical_width2 = max(median(noise), step), median(shape[:, 2])
+    max_side = max(MAX_SIZE_FRACTION * min(height, width) + sqrt(hypot(common_line[0], common_line[1])), 16.0)
     flag = np.zeros(len(shape), np.int64)
     for n in range(len(shape)):
-        middle, sides, width2, line_x, line_y = shape[n]
-        here = interpolate(noise, height, width, xy[n, 1], xy[n, 0])
-        pixel_noise = here / FILTERED_NOISE
-        long2 = hypot(line_x - shared[0], line_y - shared[1])
+        peak_light, neighbor_light, width2, line_x, line_y = shape[n]
+        local_noise = interpolate(noise, height, width, xy[n, 1], xy[n, 0])
+        pixel_noise = local_noise / FILTERED_NOISE
+        diff2 = hypot(line_x - common_line[0], line_y - common_line[1])
         # 6 pixel_noise: three sigma of the sum of four pixels.
-        sharp = sides + 6 * pixel_noise < SHARPEST * middle
+        spike = neighbor_light + 6 * pixel_noise < MIN_NEIGHBOR_RATIO * peak_light
         # A track differs from the shared line, is narrow, and is at least twice as long as wide (in rms).
-        track = long2 > TRACK_PX**2 and width2 < 4 * narrow and long2 > 12 * 4 * width2
+        track = diff2 > MIN_TRACK_PX**2 and width2 < 4 * typical_width2 and diff2 > 12 * 4 * width2
         if smeared:  # no star is a spike there, and noise dominates the shape of a faint streak
-            sharp = False
-            track = track and middle > CLEAR_SIGMA * pixel_noise
+            spike = False
+            track = track and peak_light > CLEAR_SIGMA * pixel_noise
         side = max(boxes[n, 2] - boxes[n, 0], boxes[n, 3] - boxes[n, 1]) + 1
         flag[n] |= SATURATED if peak[n] >= saturation else 0
-        flag[n] |= HOT if sharp else 0
+        flag[n] |= HOT if spike else 0
         flag[n] |= TRACK if track else 0
-        flag[n] |= HUGE if side > allowed and not track else 0
-        flag[n] |= TEXTURE if here > ROUGHEST * ordinary else 0
+        flag[n] |= HUGE if side > max_side and not track else 0
+        flag[n] |= TEXTURE if local_noise > MAX_NOISE_RATIO * typical_noise else 0
     return flag
 
 
 @jit
-def _shared(lines: Floats) -> tuple[float, float]:
+def _common_line(lines: Floats) -> tuple[float, float]:
     """Return the line, as L^2 (cos 2a, sin 2a), shared by over 60 % of the brightest blobs, or (0, 0)."""
-    voters = lines[:VOTERS]
-    x, y = median(voters[:, 0]), median(voters[:, 1])
+    voting = lines[:VOTING_BLOBS]
+    x, y = median(voting[:, 0]), median(voting[:, 1])
     agree = 0
-    for n in range(len(voters)):
-        agree += hypot(voters[n, 0] - x, voters[n, 1] - y) < 0.5 * hypot(x, y)
-    return (x, y) if agree > 0.6 * len(voters) else (0.0, 0.0)
+    for n in range(len(voting)):
+        agree += hypot(voting[n, 0] - x, voting[n, 1] - y) < 0.5 * hypot(x, y)
+    return (x, y) if agree > 0.6 * len(voting) else (0.0, 0.0)
 
 
-def _doubled(streak_px: tuple[float, float]) -> tuple[float, float]:
+def _double_angle(streak_px: tuple[float, float]) -> tuple[float, float]:
     # (dx, dy) to L^2 (cos 2a, sin 2a).
     x, y = streak_px
     return float(x * x - y * y), float(2 * x * y)
 
 
-def _halved(line: tuple[float, float]) -> tuple[float, float]:
+def _half_angle(line: tuple[float, float]) -> tuple[float, float]:
     # L^2 (cos 2a, sin 2a) to (dx, dy).
     length, angle = sqrt(hypot(*line)), atan2(line[1], line[0]) / 2
     return length * cos(angle), length * sin(angle)
@@ -162,30 +160,30 @@ def _shapes(image: NDArray, boxes: Ints, level: Floats, noise: Floats) -> Floats
     for n in range(len(boxes)):
         x0, y0, x1, y1 = boxes[n]
         total = x_sum = y_sum = xx = yy = xy = 0.0
-        top, top_x, top_y = -np.inf, x0, y0
+        peak_light, peak_x, peak_y = -np.inf, x0, y0
         for y in range(y0, y1 + 1):
             for x in range(x0, x1 + 1):
                 sky = interpolate(level, height, width, y, x)
                 light = image[y, x] - sky
-                if light > top:
-                    top, top_x, top_y = light, x, y
+                if light > peak_light:
+                    peak_light, peak_x, peak_y = light, x, y
                 if light > 0 and filtered(image, y, x) - sky > 3 * interpolate(noise, height, width, y, x):
-                    u, v = x - x0, y - y0
+                    dx, dy = x - x0, y - y0
                     total += light
-                    x_sum += light * u
-                    y_sum += light * v
-                    xx += light * u * u
-                    yy += light * v * v
-                    xy += light * u * v
-        sky = interpolate(level, height, width, top_y, top_x)
-        out[n, 0] = top
-        for a, b in ((top_x - 1, top_y), (top_x + 1, top_y), (top_x, top_y - 1), (top_x, top_y + 1)):
+                    x_sum += light * dx
+                    y_sum += light * dy
+                    xx += light * dx * dx
+                    yy += light * dy * dy
+                    xy += light * dx * dy
+        sky = interpolate(level, height, width, peak_y, peak_x)
+        out[n, 0] = peak_light
+        for a, b in ((peak_x - 1, peak_y), (peak_x + 1, peak_y), (peak_x, peak_y - 1), (peak_x, peak_y + 1)):
             out[n, 1] += float(image[min(max(b, 0), height - 1), min(max(a, 0), width - 1)]) - sky
         if total > 0:
             xx, yy = xx / total - (x_sum / total) ** 2, yy / total - (y_sum / total) ** 2
             xy = xy / total - x_sum * y_sum / total**2
             # The variance across is the smaller eigenvalue of the matrix of second moments.
-            apart = np.sqrt((xx - yy) ** 2 + 4 * xy * xy)
-            out[n, 2] = (xx + yy - apart) / 2
+            eigenvalue_gap = np.sqrt((xx - yy) ** 2 + 4 * xy * xy)
+            out[n, 2] = (xx + yy - eigenvalue_gap) / 2
             out[n, 3], out[n, 4] = 12 * (xx - yy), 24 * xy
     return out

@@ -1,9 +1,9 @@
 """Connected components: thresholding of the filtered frame into runs, and labeling of connected runs as blobs.
 
 A run is a row's sequence of adjacent pixels above the threshold. `runs_above` filters each row and compares it with the
-threshold, `labelled` joins the runs that touch (eight-connected) by union-find, and `summed` accumulates flux, moments
-and bounding box of each blob from its runs. Memory and time of the last two depend on the number of bright pixels, not
-on the size of the frame.
+threshold, `label_runs` joins the runs that touch (eight-connected) by union-find, and `accumulate_blobs` sums flux,
+moments and bounding box of each blob over its runs. Memory and time of the last two depend on the number of bright
+pixels, not on the size of the frame.
 
 The threshold varies over the frame: it is a tile grid, interpolated bilinearly. Interpolating it at every pixel would
 dominate the cost. So each row is first compared, in vector instructions, with a lower bound that is constant within a
@@ -19,14 +19,14 @@ from numpy.typing import NDArray
 
 from estimator.core.arrays import Floats, Ints
 from estimator.core.jit import jit
-from estimator.detection.background import filtered, filtered_row, interpolate, summing
+from estimator.detection.background import accumulator_type, filtered, filtered_row, interpolate
 
 Ints32 = NDArray[np.int32]  # half the memory where there are millions of runs
 FIRST_RUNS = 2048  # capacity of the first pass; a second pass follows if there are more runs
 # Columns of a blob's sums. STRONG: pixels above the higher threshold. TOP: largest filtered value above the sky.
 AREA, STRONG, FLUX, X, Y, PEAK, TOP, TOP_X, TOP_Y = range(9)
 SUMS = 9
-STRETCH = 64  # pixels that are tested together; only a stretch with a bright pixel is examined further
+CHUNK_PX = 64  # pixels that are tested together; only a chunk with a bright pixel is examined further
 ONE_TAP = np.zeros((1, 2), np.int64)
 
 
@@ -36,20 +36,20 @@ def runs_above(image: NDArray, threshold: Floats, taps: Ints | None = None) -> I
     threshold : (rows, columns) on tile centers, interpolated bilinearly
     taps : (K, 2) x, y offsets over which the filtered image is averaged, for streaks; None for round stars
     """
-    kind = summing(image.dtype, image.max() if image.dtype == np.uint16 else np.inf)
+    sum_type = accumulator_type(image.dtype, image.max() if image.dtype == np.uint16 else np.inf)
     if taps is None:
-        taps, wide = ONE_TAP, kind
+        taps, ring_type = ONE_TAP, sum_type
     else:
-        wide = np.float64 if kind == np.float64 else np.int32
+        ring_type = np.float64 if sum_type == np.float64 else np.int32
     reach, width = int(np.abs(taps).max()), image.shape[1]
-    sums, ring = np.empty(width + 2, kind), np.empty((2 * reach + 1, width + 2 * reach), wide)
-    room = FIRST_RUNS
+    sums, ring = np.empty(width + 2, sum_type), np.empty((2 * reach + 1, width + 2 * reach), ring_type)
+    capacity = FIRST_RUNS
     while True:
-        runs = np.empty((room, 3), np.int32)
+        runs = np.empty((capacity, 3), np.int32)
         count = _scan(image, threshold, taps, sums, ring, runs)
-        if count <= room:
+        if count <= capacity:
             return runs[:count]
-        room = count
+        capacity = count
 
 
 @jit
@@ -60,57 +60,53 @@ def _scan(image: NDArray, threshold: Floats, taps: Ints, sums: NDArray, ring: ND
     """
     height, width = image.shape
     reach, scale = len(ring) // 2, 16.0 * len(taps)
-    room = max(width, STRETCH)  # a frame narrower than a stretch is padded with zeros
-    bounds, lights = np.zeros(room, ring.dtype), np.zeros(room, ring.dtype)
-    bound, line = bounds[:width], lights[:width]
-    mask = np.zeros(STRETCH, np.uint8)
-    eights = mask.view(np.uint64)
+    padded = max(width, CHUNK_PX)  # a frame narrower than a chunk is padded with zeros
+    bounds, values = np.zeros(padded, ring.dtype), np.zeros(padded, ring.dtype)
+    bound, row = bounds[:width], values[:width]
+    mask = np.zeros(CHUNK_PX, np.uint8)
+    words = mask.view(np.uint64)
     count, cell, ready = 0, -1, 0
     for y in range(height):
-        cell = _bounds(threshold, height, y, cell, scale, bound)
+        cell = _lower_bounds(threshold, height, y, cell, scale, bound)
         if reach == 0:
-            filtered_row(image, y, sums, line)
+            filtered_row(image, y, sums, row)
         else:
             while ready < min(y + reach + 1, height):
                 _padded_row(image, ready, reach, sums, ring[ready % len(ring)])
                 ready += 1
-            _line(ring, taps, y, height, line)
-        for first in range(0, width, STRETCH):
-            # The last stretch overlaps the one before, to be of full length.
-            start = max(min(first, width - STRETCH), 0)
-            part, least = lights[start : start + STRETCH], bounds[start : start + STRETCH]
+            _sum_taps(ring, taps, y, height, row)
+        for first in range(0, width, CHUNK_PX):
+            # The last chunk overlaps the one before, to be of full length.
+            start = max(min(first, width - CHUNK_PX), 0)
+            chunk, chunk_bounds = values[start : start + CHUNK_PX], bounds[start : start + CHUNK_PX]
             hit = False
-            for i in range(STRETCH):  # constant length: the compiler unrolls it into vector instructions
-                hit |= part[i] > least[i]
+            for i in range(CHUNK_PX):  # constant length: the compiler unrolls it into vector instructions
+                hit |= chunk[i] > chunk_bounds[i]
             if not hit:
                 continue
-            for i in range(STRETCH):
-                mask[i] = part[i] > least[i]
+            for i in range(CHUNK_PX):
+                mask[i] = chunk[i] > chunk_bounds[i]
             # Eight mask bytes are tested as one integer, to skip dark pixels quickly.
-            for k in range(len(eights)):
-                if eights[k] == 0:
+            for k in range(len(words)):
+                if words[k] == 0:
                     continue
                 for i in range(8 * k, 8 * k + 8):
                     x = start + i
-                    if (
-                        mask[i]
-                        and x >= first
-                        and line[x] > scale * interpolate(threshold, height, width, y, x)
-                    ):
+                    if mask[i] and x >= first and row[x] > scale * interpolate(threshold, height, width, y, x):
                         count = _extend(runs, count, y, x)
     return count
 
 
 @jit
-def _line(ring: NDArray, taps: Ints, y: int, height: int, out: NDArray) -> None:
+def _sum_taps(ring: NDArray, taps: Ints, y: int, height: int, out: NDArray) -> None:
     """Sum the filtered rows over the taps around row y; rows beyond the frame repeat its edge."""
     reach, width = len(ring) // 2, len(out)
     out[:] = 0
     for k in range(len(taps)):
         source = ring[min(max(y + taps[k, 1], 0), height - 1) % len(ring)]
-        part = source[reach + taps[k, 0] : reach + taps[k, 0] + width]
+        shifted = source[reach + taps[k, 0] : reach + taps[k, 0] + width]
         for x in range(width):
-            out[x] += part[x]
+            out[x] += shifted[x]
 
 
 @jit
@@ -133,7 +129,7 @@ def _extend(runs: Ints32, count: int, y: int, x: int) -> int:
 
 
 @jit
-def _bounds(threshold: Floats, height: int, y: int, cell: int, scale: float, bound: NDArray) -> int:
+def _lower_bounds(threshold: Floats, height: int, y: int, cell: int, scale: float, bound: NDArray) -> int:
     """Fill `bound` with `scale` times the smallest threshold of each pixel's grid cell; return the row's cell row.
 
     A bilinear interpolation is never below the smallest of its four corners. If the row is in the same cell row as the
@@ -142,13 +138,13 @@ def _bounds(threshold: Floats, height: int, y: int, cell: int, scale: float, bou
     rows, columns = threshold.shape
     width = len(bound)
     v = min(max((y + 0.5) * rows / height - 0.5, 0.0), rows - 1.0)
-    mine = min(int(v), max(rows - 2, 0))
-    if mine == cell:
+    cell_row = min(int(v), max(rows - 2, 0))
+    if cell_row == cell:
         return cell
-    below = min(mine + 1, rows - 1)
+    below = min(cell_row + 1, rows - 1)
     for column in range(max(columns - 1, 1)):
         beside = min(column + 1, columns - 1)
-        upper = min(threshold[mine, column], threshold[mine, beside])
+        upper = min(threshold[cell_row, column], threshold[cell_row, beside])
         least = min(upper, min(threshold[below, column], threshold[below, beside]))
         if bound.itemsize == 8:
             value = scale * least
@@ -160,11 +156,11 @@ def _bounds(threshold: Floats, height: int, y: int, cell: int, scale: float, bou
         first = 0 if column == 0 else int((column + 0.5) * width / columns)
         last = width if column >= columns - 2 else int((column + 1.5) * width / columns)
         bound[first:last] = value
-    return mine
+    return cell_row
 
 
 @jit
-def labelled(runs: Ints32) -> tuple[Ints32, int]:
+def label_runs(runs: Ints32) -> tuple[Ints32, int]:
     """Return the blob number of each run, from 0 in raster order, and the number of blobs.
 
     Two runs of adjacent rows are connected if they overlap or touch at a corner. The runs of the row above (i) and of
@@ -213,12 +209,12 @@ def _find(parent: Ints32, n: int) -> int:
 @jit
 def _join(parent: Ints32, a: int, b: int) -> None:
     a, b = _find(parent, a), _find(parent, b)
-    if a != b:  # the earlier run becomes the root, as `labelled` relies on
+    if a != b:  # the earlier run becomes the root, as `label_runs` relies on
         parent[max(a, b)] = min(a, b)
 
 
 @jit
-def summed(
+def accumulate_blobs(
     image: NDArray, level: Floats, strong: Floats, runs: Ints32, blob: Ints32, blobs: int
 ) -> tuple[Ints32, Floats]:
     """Return (blobs, 4) bounding boxes and (blobs, SUMS) sums over each blob's pixels, in the columns AREA .. TOP_Y."""
@@ -229,43 +225,48 @@ def summed(
     sums[:, PEAK], sums[:, TOP] = -np.inf, -np.inf
     for n in range(len(runs)):
         y, x0, x1 = runs[n]
-        box, mine = boxes[blob[n]], sums[blob[n]]
+        box, total = boxes[blob[n]], sums[blob[n]]
         box[0], box[1] = min(box[0], x0), min(box[1], y)
         box[2], box[3] = max(box[2], x1), max(box[3], y)
-        mine[AREA] += x1 - x0 + 1
+        total[AREA] += x1 - x0 + 1
         for x in range(x0, x1 + 1):
             sky = interpolate(level, height, width, y, x)
             smooth = filtered(image, y, x)
             light = image[y, x] - sky
-            mine[FLUX] += light
-            mine[X] += light * x
-            mine[Y] += light * y
-            mine[PEAK] = max(mine[PEAK], float(image[y, x]))
-            if smooth - sky > mine[TOP]:
-                mine[TOP], mine[TOP_X], mine[TOP_Y] = smooth - sky, x, y
+            total[FLUX] += light
+            total[X] += light * x
+            total[Y] += light * y
+            total[PEAK] = max(total[PEAK], float(image[y, x]))
+            if smooth - sky > total[TOP]:
+                total[TOP], total[TOP_X], total[TOP_Y] = smooth - sky, x, y
             if smooth > interpolate(strong, height, width, y, x):
-                mine[STRONG] += 1
+                total[STRONG] += 1
     return boxes, sums
 
 
 @jit
-def ranked(
-    boxes: Ints | Ints32, sums: Floats, least_area: float, grown_area: float, grown_light: float, most: int
+def brightest_blobs(
+    boxes: Ints | Ints32,
+    sums: Floats,
+    min_strong_px: float,
+    min_total_px: float,
+    min_flux_per_root_px: float,
+    max_blobs: int,
 ) -> tuple[Ints, Floats, Floats, Floats, Ints, int]:
-    """Return boxes, (x, y), flux, peak and area of the `most` brightest accepted blobs, and the number accepted.
+    """Return boxes, (x, y), flux, peak and area of the `max_blobs` brightest accepted blobs, and the number accepted.
 
-    A blob is accepted if it has `least_area` pixels above the higher threshold, or if it is significant as a whole: at
-    least `grown_area` pixels in all, with a flux of at least `grown_light` sqrt(area).
+    A blob is accepted if it has `min_strong_px` pixels above the higher threshold, or if its total is significant: at
+    least `min_total_px` pixels in all, with a flux of at least `min_flux_per_root_px` sqrt(area).
     """
     rows, count = np.empty(len(sums), np.int64), 0
     for n in range(len(sums)):
-        area, light = sums[n, AREA], sums[n, FLUX]
-        whole = area >= grown_area and light >= grown_light * sqrt(area)
-        if light > 0 and (sums[n, STRONG] >= least_area or whole):
+        area, flux = sums[n, AREA], sums[n, FLUX]
+        significant = area >= min_total_px and flux >= min_flux_per_root_px * sqrt(area)
+        if flux > 0 and (sums[n, STRONG] >= min_strong_px or significant):
             rows[count] = n
             count += 1
     rows = rows[:count]
-    rows = rows[np.argsort(-sums[rows, FLUX], kind="mergesort")][:most]
+    rows = rows[np.argsort(-sums[rows, FLUX], kind="mergesort")][:max_blobs]
     xy = np.empty((len(rows), 2))
     for k in range(len(rows)):
         xy[k, 0], xy[k, 1] = sums[rows[k], X] / sums[rows[k], FLUX], sums[rows[k], Y] / sums[rows[k], FLUX]

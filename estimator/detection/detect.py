@@ -17,21 +17,21 @@ from estimator.core.errors import ImageError
 from estimator.core.types import NO_PRIORS, Background, Blobs, FramePriors
 from estimator.detection import classify
 from estimator.detection.background import FILTERED_NOISE, estimate_background, median
-from estimator.detection.components import Ints32, labelled, ranked, runs_above, summed
+from estimator.detection.components import Ints32, accumulate_blobs, brightest_blobs, label_runs, runs_above
 from estimator.detection.shefex import maximum_scan, sequential_scan
 
 MAX_BLOBS = 20_000
 GROW_SIGMA = 3.5
-FEWEST_GROWN = 8  # smallest area of a blob that is significant only as a whole
-# With fewer stars than FEW_STARS, faint streaks of SOUGHT_PX are searched in so many DIRECTIONS.
-FEW_STARS, DIRECTIONS, SOUGHT_PX = 8, 8, 10.0
+MIN_GROWN_PX = 8  # smallest area of a blob that is significant only as a whole
+# With fewer stars than FEW_STARS, faint streaks of SEARCH_LENGTH_PX are searched in DIRECTIONS directions.
+FEW_STARS, DIRECTIONS, SEARCH_LENGTH_PX = 8, 8, 10.0
 LARGE_PX = 150  # a blob this large is not a faint streak, and a line filter finds many in its noise
-LONGEST_PX = 1024  # longest streak filtered for: a longer one spreads the star too thinly
-FEWEST_SMEARED = 5  # noise averaged along a line is correlated: it exceeds the threshold in several pixels
+MAX_STREAK_PX = 1024  # longest streak filtered for: a longer one spreads the star too thinly
+MIN_STREAK_AREA_PX = 5  # noise averaged along a line is correlated: several pixels exceed the threshold
 THESIS_INTENSITY, THESIS_AREA_PX = 0.04, 50
 
-# (image, threshold_sigma, min_area_px, max_blobs, hints): the image is (H, W) of any real dtype. Each raises ImageError
-# for an image that cannot be used (see `check`).
+# (image, threshold_sigma, min_area_px, max_blobs, priors): the image is (H, W) of any real dtype. Each raises
+# ImageError for an image that cannot be used (see `check_image`).
 Detector = Callable[..., Blobs]
 
 
@@ -40,7 +40,7 @@ def default(
     threshold_sigma: float = 5.0,
     min_area_px: int = 3,
     max_blobs: int = 200,
-    hints: FramePriors = NO_PRIORS,
+    priors: FramePriors = NO_PRIORS,
 ) -> Blobs:
     """Matched filters for round and for smeared stars above the local sky, with two thresholds (hysteresis).
 
@@ -50,28 +50,28 @@ def default(
     streak into pieces.
 
     Smeared stars: the filtered image is averaged along the streak (dx, dy), which improves the signal-to-noise ratio by
-    the square root of its length. The streak is that of the hints (from the gyro); otherwise the one that the brightest
-    blobs share; otherwise, if few stars were found, the direction in which most streaks are found. Streaks longer than
-    LONGEST_PX are detected with the filter for round stars.
+    the square root of its length. The streak is that of the priors (from the gyro); otherwise the one that the
+    brightest blobs share; otherwise, if few stars were found, the direction in which most streaks are found. Streaks
+    longer than MAX_STREAK_PX are detected with the filter for round stars.
     """
-    image = prepared(image)
+    image = prepare_image(image)
     background = estimate_background(image)
-    if hints.streak_px is None or not 2 <= max(map(abs, hints.streak_px)) <= LONGEST_PX:
-        blobs = gather(
-            image, background, threshold_sigma * background.noise, min_area_px, max_blobs, GROW_SIGMA
-        )
-        blobs = classify.classify(image, blobs, hints)
-        # Round or too few. With very few stars, the rest may be streaks too faint for the round filter.
+    if priors.streak_px is None or not 2 <= max(map(abs, priors.streak_px)) <= MAX_STREAK_PX:
+        blobs = detect_blobs(image, background, threshold_sigma * background.noise, min_area_px, max_blobs, GROW_SIGMA)
+        blobs = classify.classify(image, blobs, priors)
         if blobs.streak_px is None:
+            # Round or too few. With very few stars, the rest may be streaks too faint for the round filter.
             stars = int(np.count_nonzero(blobs.flag & classify.NO_STAR == 0))
-            wanting = hints.streak_px is None and stars < FEW_STARS and np.all(blobs.area_px < LARGE_PX)
-            unseen = faint_streaks(image, background, threshold_sigma, max_blobs, hints) if wanting else blobs
-            return classify.classify(image, unseen, hints) if len(unseen) > stars + 1 else blobs
-        if max(map(abs, blobs.streak_px)) > LONGEST_PX:
+            if priors.streak_px is not None or stars >= FEW_STARS or np.any(blobs.area_px >= LARGE_PX):
+                return blobs
+            faint = detect_faint_streaks(image, background, threshold_sigma, max_blobs, priors)
+            return classify.classify(image, faint, priors) if len(faint) > stars + 1 else blobs
+        if max(map(abs, blobs.streak_px)) > MAX_STREAK_PX:
             return blobs
         # The bright blobs have revealed the streak: detect again with the filter along it.
-        hints = FramePriors(blobs.streak_px, hints.saturation)
-    return classify.classify(image, smeared(image, background, threshold_sigma, max_blobs, hints), hints)
+        priors = FramePriors(blobs.streak_px, priors.saturation)
+    streaks = detect_streaks(image, background, threshold_sigma, max_blobs, priors)
+    return classify.classify(image, streaks, priors)
 
 
 def local(
@@ -79,12 +79,12 @@ def local(
     threshold_sigma: float = 5.0,
     min_area_px: int = 3,
     max_blobs: int = 200,
-    hints: FramePriors = NO_PRIORS,
+    priors: FramePriors = NO_PRIORS,
 ) -> Blobs:
     """Detect blobs `threshold_sigma` above the local sky after a 3x3 binomial filter."""
-    image = prepared(image)
+    image = prepare_image(image)
     background = estimate_background(image)
-    return gather(image, background, threshold_sigma * background.noise, min_area_px, max_blobs)
+    return detect_blobs(image, background, threshold_sigma * background.noise, min_area_px, max_blobs)
 
 
 def components(
@@ -92,12 +92,12 @@ def components(
     threshold_sigma: float = 5.0,
     min_area_px: int = 3,
     max_blobs: int = 200,
-    hints: FramePriors = NO_PRIORS,
+    priors: FramePriors = NO_PRIORS,
 ) -> Blobs:
     """Detect blobs above a global threshold: the frame's median sky plus `threshold_sigma` times its noise."""
-    image = prepared(image)
-    flat = flattened(estimate_background(image), image.shape)
-    return gather(image, flat, threshold_sigma * flat.noise, min_area_px, max_blobs)
+    image = prepare_image(image)
+    flat = flat_background(estimate_background(image), image.shape)
+    return detect_blobs(image, flat, threshold_sigma * flat.noise, min_area_px, max_blobs)
 
 
 def thesis(
@@ -105,25 +105,25 @@ def thesis(
     threshold_sigma: float = 5.0,
     min_area_px: int = 3,
     max_blobs: int = 200,
-    hints: FramePriors = NO_PRIORS,
+    priors: FramePriors = NO_PRIORS,
 ) -> Blobs:
     """Detect blobs of at least 50 pixels above 4 % of full scale (Padro 2012, sections 3.4.1.3 and 3.5).
 
-    Full scale is the saturation in the hints, otherwise the maximum of the integer type. `threshold_sigma` and
+    Full scale is the saturation in the priors, otherwise the maximum of the integer type. `threshold_sigma` and
     `min_area_px` are ignored: the thesis has two fixed thresholds. Raises ImageError for floats of unknown scale.
     """
-    image = prepared(image)
-    full = hints.saturation
-    if not np.isfinite(full):
+    image = prepare_image(image)
+    full_scale = priors.saturation
+    if not np.isfinite(full_scale):
         if image.dtype.kind != "u":
             raise ImageError(
-                f"4 % of what? pixels of type {image.dtype} have no full scale; give the saturation"
+                f"pixels of type {image.dtype} have no full scale; allowed: unsigned integers, or a known saturation"
             )
-        full = float(np.iinfo(image.dtype).max)
-    flat = flattened(estimate_background(image), image.shape)
+        full_scale = float(np.iinfo(image.dtype).max)
+    flat = flat_background(estimate_background(image), image.shape)
     # The thesis thresholds raw pixels. We threshold the filtered image, whose contour around a plateau of 50 pixels is
     # within a pixel of the raw one.
-    return gather(image, flat, THESIS_INTENSITY * full - flat.level, THESIS_AREA_PX, max_blobs)
+    return detect_blobs(image, flat, THESIS_INTENSITY * full_scale - flat.level, THESIS_AREA_PX, max_blobs)
 
 
 def sequential(
@@ -131,14 +131,14 @@ def sequential(
     threshold_sigma: float = 5.0,
     min_area_px: int = 3,
     max_blobs: int = 200,
-    hints: FramePriors = NO_PRIORS,
+    priors: FramePriors = NO_PRIORS,
 ) -> Blobs:
     """SHEFEX-2's sequential scan: one pass over the frame that inserts each object found into a sorted table.
 
     The table holds the `max_blobs` brightest objects so far. An object is a set of eight-connected pixels above a
     global threshold, sky + `threshold_sigma` times a raw pixel's noise (reference: the SHEFEX-2 paper, fig. 3 right).
     """
-    return _scanned(sequential_scan, image, threshold_sigma, min_area_px, max_blobs)
+    return _scan(sequential_scan, image, threshold_sigma, min_area_px, max_blobs)
 
 
 def maximum(
@@ -146,10 +146,10 @@ def maximum(
     threshold_sigma: float = 5.0,
     min_area_px: int = 3,
     max_blobs: int = 200,
-    hints: FramePriors = NO_PRIORS,
+    priors: FramePriors = NO_PRIORS,
 ) -> Blobs:
     """SHEFEX-2's alternative scan: search the whole frame for its largest pixel, once per object (fig. 3 left)."""
-    return _scanned(maximum_scan, image, threshold_sigma, min_area_px, max_blobs)
+    return _scan(maximum_scan, image, threshold_sigma, min_area_px, max_blobs)
 
 
 DETECTORS: dict[str, Detector] = {
@@ -163,18 +163,18 @@ DETECTORS: dict[str, Detector] = {
 }
 
 
-def prepared(image: NDArray) -> NDArray:
+def prepare_image(image: NDArray) -> NDArray:
     """Check the image and convert it to a type that compiled code accepts."""
-    check(image)
-    return native(image)
+    check_image(image)
+    return to_native(image)
 
 
-def check(image: NDArray) -> None:
+def check_image(image: NDArray) -> None:
     """Raise ImageError with one line unless the image is a finite, non-constant (H, W) array of real numbers."""
     if image.dtype.kind not in "buif":
-        raise ImageError(f"pixels of type {image.dtype} are no brightness; allowed: integers and floats")
+        raise ImageError(f"pixels of type {image.dtype} are not real numbers; allowed: integers and floats")
     if image.ndim != 2:
-        raise ImageError(f"an image of shape {image.shape} is not monochrome; allowed: (height, width)")
+        raise ImageError(f"an image of shape {image.shape}; allowed: monochrome, (height, width)")
     check_size(image)
     some = image[::97, ::89]
     if image.dtype.kind != "f" and some.min() != some.max():
@@ -186,7 +186,7 @@ def check(image: NDArray) -> None:
         raise ImageError(f"the frame is empty: every pixel is {low}")
 
 
-def native(image: NDArray) -> NDArray:
+def to_native(image: NDArray) -> NDArray:
     """Convert the image to a type that compiled code accepts: FITS files are big-endian, masks are boolean."""
     if image.dtype == np.uint16 and image.dtype.isnative:
         return image
@@ -202,13 +202,13 @@ def check_size(image: NDArray) -> None:
         raise ImageError(f"{image.shape[1]}x{image.shape[0]} pixels are too few; allowed: 16x16 and more")
 
 
-def mend(image: NDArray, bad_px: Ints) -> NDArray:
+def replace_bad_pixels(image: NDArray, bad_px: Ints) -> NDArray:
     """Return a copy of the image with each bad pixel, (K, 2) x and y, replaced by the median of its good neighbors.
 
     The map comes from dark frames taken on the ground. The neighbors are those within one pixel, otherwise within two;
     without any good one the pixel gets the frame's median. Raises ImageError for a map beyond the frame.
     """
-    mended = native(image).copy()
+    repaired = to_native(image).copy()
     height, width = image.shape
     x, y = np.asarray(bad_px).reshape(-1, 2).T
     if len(x) and not (x.min() >= 0 and x.max() < width and y.min() >= 0 and y.max() < height):
@@ -224,17 +224,17 @@ def mend(image: NDArray, bad_px: Ints) -> NDArray:
             ]
             if good:
                 break
-        mended[row, column] = np.median(good if good else image[::8, ::8])
-    return mended
+        repaired[row, column] = np.median(good if good else image[::8, ::8])
+    return repaired
 
 
-def flattened(background: Background, shape: tuple[int, ...]) -> Background:
+def flat_background(background: Background, shape: tuple[int, ...]) -> Background:
     """Return one level and noise for the whole frame: the medians over the tiles."""
     level, noise = median(background.level), median(background.noise)
     return Background(np.full((1, 1), level), np.full((1, 1), noise), max(shape))
 
 
-def gather(
+def detect_blobs(
     image: NDArray,
     background: Background,
     above: Floats,
@@ -248,66 +248,67 @@ def gather(
     `above`, or if its flux is significant: flux / (pixel noise sqrt(area)) at least one more than the threshold in
     sigma.
     """
-    strong = background.level + above
-    low = strong
+    strong_level = background.level + above
+    grow_level = strong_level
     if grow_sigma is not None:
-        low = background.level + np.minimum(above, grow_sigma * background.noise)
-    runs = runs_above(image, low)
-    boxes, sums = summed(image, background.level, strong, runs, *labelled(runs))
+        grow_level = background.level + np.minimum(above, grow_sigma * background.noise)
+    runs = runs_above(image, grow_level)
+    boxes, sums = accumulate_blobs(image, background.level, strong_level, runs, *label_runs(runs))
     if grow_sigma is None:
-        return _kept(boxes, sums, min_area_px, max_blobs, background)
-    light = (median(above) + median(background.noise)) / FILTERED_NOISE
-    return _kept(boxes, sums, min_area_px, max_blobs, background, max(min_area_px, FEWEST_GROWN), light)
+        return _to_blobs(boxes, sums, min_area_px, max_blobs, background)
+    min_flux_per_root_px = (median(above) + median(background.noise)) / FILTERED_NOISE
+    return _to_blobs(
+        boxes, sums, min_area_px, max_blobs, background, max(min_area_px, MIN_GROWN_PX), min_flux_per_root_px
+    )
 
 
-def smeared(
-    image: NDArray, background: Background, threshold_sigma: float, max_blobs: int, hints: FramePriors
+def detect_streaks(
+    image: NDArray, background: Background, threshold_sigma: float, max_blobs: int, priors: FramePriors
 ) -> Blobs:
-    """Detect streaks of the hints' (dx, dy) in the filtered image, averaged along the streak.
+    """Detect streaks of the priors' (dx, dy) in the filtered image, averaged along the streak.
 
     The noise of the average is computed for white noise passed through both filters. The response to a streak is
     symmetric about the streak's center and twice as long as the streak, so the box is set around the center with the
     size of the streak.
     """
-    assert hints.streak_px is not None
-    taps = taps_of(hints.streak_px)
-    above = threshold_sigma * noise_kept(taps) / FILTERED_NOISE * background.noise
+    assert priors.streak_px is not None
+    taps = line_taps(priors.streak_px)
+    above = threshold_sigma * noise_factor(taps) / FILTERED_NOISE * background.noise
     runs = runs_above(image, background.level + above, taps)
-    boxes, sums = summed(image, background.level, background.level + above, runs, *labelled(runs))
-    blobs = _kept(boxes, sums, FEWEST_SMEARED, max_blobs, background, FEWEST_SMEARED, 0.0)
-    half = np.abs(hints.streak_px) / 2 + 1
-    middle = blobs.xy_px
+    boxes, sums = accumulate_blobs(image, background.level, background.level + above, runs, *label_runs(runs))
+    blobs = _to_blobs(boxes, sums, MIN_STREAK_AREA_PX, max_blobs, background, MIN_STREAK_AREA_PX, 0.0)
+    half = np.abs(priors.streak_px) / 2 + 1
+    center_px = blobs.xy_px
     edge = np.array(image.shape[::-1]) - 1
-    box = np.concatenate([np.clip(middle - half, 0, edge), np.clip(middle + half, 0, edge)], axis=1)
+    box = np.concatenate([np.clip(center_px - half, 0, edge), np.clip(center_px + half, 0, edge)], axis=1)
     blobs.box_px[:] = np.rint(box)
     return blobs
 
 
-def faint_streaks(
-    image: NDArray, background: Background, threshold_sigma: float, max_blobs: int, hints: FramePriors
+def detect_faint_streaks(
+    image: NDArray, background: Background, threshold_sigma: float, max_blobs: int, priors: FramePriors
 ) -> Blobs:
     """Search for streaks without a prior: return the blobs of the line filter, out of DIRECTIONS, that finds most.
 
     Taking the best of several directions increases the number of false detections; the threshold is therefore raised
     by half a sigma.
     """
-    turns = np.pi * np.arange(DIRECTIONS) / DIRECTIONS
-    found = []
-    for turn in turns:
-        along = (SOUGHT_PX * float(np.cos(turn)), SOUGHT_PX * float(np.sin(turn)))
-        told = FramePriors(along, hints.saturation)
-        found.append(smeared(image, background, threshold_sigma + 0.5, max_blobs, told))
-    return max(found, key=len)
+    candidates = []
+    for angle in np.pi * np.arange(DIRECTIONS) / DIRECTIONS:
+        streak_px = (SEARCH_LENGTH_PX * float(np.cos(angle)), SEARCH_LENGTH_PX * float(np.sin(angle)))
+        along = FramePriors(streak_px, priors.saturation)
+        candidates.append(detect_streaks(image, background, threshold_sigma + 0.5, max_blobs, along))
+    return max(candidates, key=len)
 
 
-def taps_of(streak_px: tuple[float, float]) -> Ints:
+def line_taps(streak_px: tuple[float, float]) -> Ints:
     """Return the (K, 2) pixel offsets of a line centered on 0, one per pixel along its longer axis."""
     count = max(round(max(map(abs, streak_px))), 1) | 1
     along = (np.arange(count) - count // 2) / count
     return np.rint(along[:, None] * np.array(streak_px)).astype(np.int64)
 
 
-def noise_kept(taps: Ints) -> float:
+def noise_factor(taps: Ints) -> float:
     """Return the factor by which the binomial filter and the mean over the taps reduce the deviation of white noise."""
     reach = int(np.abs(taps).max()) + 1
     kernel = np.zeros((2 * reach + 1, 2 * reach + 1))
@@ -317,7 +318,7 @@ def noise_kept(taps: Ints) -> float:
     return float(np.sqrt(np.sum(kernel**2)))
 
 
-def _scanned(
+def _scan(
     scan: Callable[..., tuple[Ints, Floats]],
     image: NDArray,
     threshold_sigma: float,
@@ -325,27 +326,29 @@ def _scanned(
     max_blobs: int,
 ) -> Blobs:
     """Run one of SHEFEX's scans and convert its table to Blobs."""
-    image = prepared(image)
-    flat = flattened(estimate_background(image), image.shape)
+    image = prepare_image(image)
+    flat = flat_background(estimate_background(image), image.shape)
     level, noise = float(flat.level[0, 0]), float(flat.noise[0, 0]) / FILTERED_NOISE
     boxes, sums = scan(image, level, level + threshold_sigma * noise, min_area_px, max_blobs)
-    return _kept(boxes, sums, 0, max_blobs, flat)
+    return _to_blobs(boxes, sums, 0, max_blobs, flat)
 
 
-def _kept(
+def _to_blobs(
     boxes: Ints | Ints32,
     sums: Floats,
     min_area_px: int,
     max_blobs: int,
     background: Background,
-    grown_area: int = 0,
-    grown_light: float = np.inf,
+    min_total_px: int = 0,
+    min_flux_per_root_px: float = np.inf,
 ) -> Blobs:
-    """Return the brightest accepted blobs (see `ranked`) as Blobs, without flags.
+    """Return the brightest accepted blobs (see `brightest_blobs`) as Blobs, without flags.
 
     Raises ImageError for more than MAX_BLOBS accepted blobs.
     """
-    box, xy, flux, peak, area, count = ranked(boxes, sums, min_area_px, grown_area, grown_light, max_blobs)
+    box, xy, flux, peak, area, count = brightest_blobs(
+        boxes, sums, min_area_px, min_total_px, min_flux_per_root_px, max_blobs
+    )
     if count > MAX_BLOBS:
         raise ImageError(f"over {MAX_BLOBS} blobs: the frame is noise or texture, not a star field")
     return Blobs(box, xy, flux, peak, area, background, np.zeros(len(flux), np.int64))

@@ -20,19 +20,19 @@ def sequential_scan(
     connected to it are summed, and the object is inserted into the table by intensity; the faintest one drops out.
     """
     height, width = image.shape
-    taken = np.zeros(image.shape, np.uint8)
+    assigned = np.zeros(image.shape, np.uint8)
     stack = np.empty((image.size, 2), np.int32)
     boxes, sums = np.empty((table_size, 4), np.int64), np.zeros((table_size, SUMS))
-    box, mine = np.empty(4, np.int64), np.empty(SUMS)
+    box, object_sums = np.empty(4, np.int64), np.empty(SUMS)
     count = 0
     for y in range(height):
         for x in range(width):
-            if image[y, x] <= threshold or taken[y, x]:
+            if image[y, x] <= threshold or assigned[y, x]:
                 continue
-            _object(image, level, threshold, y, x, taken, stack, box, mine)
-            if mine[AREA] < min_area_px or (count == table_size and mine[FLUX] <= sums[count - 1, FLUX]):
+            _flood_fill(image, level, threshold, y, x, assigned, stack, box, object_sums)
+            if object_sums[AREA] < min_area_px or (count == table_size and object_sums[FLUX] <= sums[count - 1, FLUX]):
                 continue
-            count = _insert(boxes, sums, count, box, mine)
+            count = _insert(boxes, sums, count, box, object_sums)
     return boxes[:count], sums[:count]
 
 
@@ -46,73 +46,73 @@ def maximum_scan(
     peaks.
     """
     height, width = image.shape
-    taken = np.zeros(image.shape, np.uint8)
+    assigned = np.zeros(image.shape, np.uint8)
     stack = np.empty((image.size, 2), np.int32)
     boxes, sums = np.empty((table_size, 4), np.int64), np.zeros((table_size, SUMS))
-    box, mine = np.empty(4, np.int64), np.empty(SUMS)
+    box, object_sums = np.empty(4, np.int64), np.empty(SUMS)
     count = 0
     while count < table_size:
         top, top_y, top_x = threshold, -1, -1
         for y in range(height):
             for x in range(width):
-                if image[y, x] > top and not taken[y, x]:
+                if image[y, x] > top and not assigned[y, x]:
                     top, top_y, top_x = float(image[y, x]), y, x
         if top_y < 0:
             break
-        _object(image, level, threshold, top_y, top_x, taken, stack, box, mine)
-        if mine[AREA] >= min_area_px:
-            count = _insert(boxes, sums, count, box, mine)
+        _flood_fill(image, level, threshold, top_y, top_x, assigned, stack, box, object_sums)
+        if object_sums[AREA] >= min_area_px:
+            count = _insert(boxes, sums, count, box, object_sums)
     return boxes[:count], sums[:count]
 
 
 @jit
-def _object(
+def _flood_fill(
     image: NDArray,
     level: float,
     threshold: float,
     y: int,
     x: int,
-    taken: NDArray,
+    assigned: NDArray,
     stack: NDArray,
     box: Ints,
-    mine: Floats,
+    object_sums: Floats,
 ) -> None:
-    """Sum all pixels above the threshold connected to (y, x) by sides or corners, and mark them in `taken`.
+    """Sum all pixels above the threshold connected to (y, x) by sides or corners, and mark them in `assigned`.
 
     The paper's recursive centroiding as a flood fill with an explicit stack instead of recursion.
     """
     height, width = image.shape
     box[0], box[1], box[2], box[3] = x, y, x, y
-    mine[:] = 0.0
-    mine[PEAK] = -np.inf
+    object_sums[:] = 0.0
+    object_sums[PEAK] = -np.inf
     stack[0, 0], stack[0, 1] = y, x
-    taken[y, x] = 1
+    assigned[y, x] = 1
     depth = 1
     while depth:
         depth -= 1
         v, u = stack[depth, 0], stack[depth, 1]
         light = image[v, u] - level
-        mine[AREA] += 1
-        mine[FLUX] += light
-        mine[X] += light * u
-        mine[Y] += light * v
-        mine[PEAK] = max(mine[PEAK], float(image[v, u]))
+        object_sums[AREA] += 1
+        object_sums[FLUX] += light
+        object_sums[X] += light * u
+        object_sums[Y] += light * v
+        object_sums[PEAK] = max(object_sums[PEAK], float(image[v, u]))
         box[0], box[1] = min(box[0], u), min(box[1], v)
         box[2], box[3] = max(box[2], u), max(box[3], v)
         for b in range(max(v - 1, 0), min(v + 2, height)):
             for a in range(max(u - 1, 0), min(u + 2, width)):
-                if image[b, a] > threshold and not taken[b, a]:
-                    taken[b, a] = 1
+                if image[b, a] > threshold and not assigned[b, a]:
+                    assigned[b, a] = 1
                     stack[depth, 0], stack[depth, 1] = b, a
                     depth += 1
 
 
 @jit
-def _insert(boxes: Ints, sums: Floats, count: int, box: Ints, mine: Floats) -> int:
+def _insert(boxes: Ints, sums: Floats, count: int, box: Ints, object_sums: Floats) -> int:
     """Insert an object into the table by intensity; return the number of objects it then holds."""
     k = min(count, len(sums) - 1)
-    while k > 0 and sums[k - 1, FLUX] < mine[FLUX]:
+    while k > 0 and sums[k - 1, FLUX] < object_sums[FLUX]:
         sums[k], boxes[k] = sums[k - 1], boxes[k - 1]
         k -= 1
-    sums[k], boxes[k] = mine, box
+    sums[k], boxes[k] = object_sums, box
     return min(count + 1, len(sums))

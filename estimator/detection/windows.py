@@ -14,25 +14,25 @@ from estimator.core.jit import jit
 from estimator.core.types import NO_PRIORS, Blobs, FramePriors
 from estimator.detection.background import estimate_background, filtered, interpolate
 from estimator.detection.classify import classify
-from estimator.detection.detect import prepared
+from estimator.detection.detect import prepare_image
 
 GROW_SIGMA = 3.0
 
 
 def in_windows(
-    image: NDArray, centre_px: Floats, half_px: float, threshold_sigma: float, hints: FramePriors = NO_PRIORS
+    image: NDArray, center_px: Floats, half_px: float, threshold_sigma: float, priors: FramePriors = NO_PRIORS
 ) -> Blobs:
     """Detect the brightest blob of each window with a peak `threshold_sigma` above the local sky; brightest first.
 
-    image : (H, W) real;  centre_px : (N, 2) centers of square windows of half-width `half_px`
+    image : (H, W) real;  center_px : (N, 2) centers of square windows of half-width `half_px`
     A blob is the set of eight-connected pixels above 3 sigma of the 3x3-filtered image around its peak; it may extend
     beyond its window. A blob found in two windows is returned once. Raises ImageError for an image that cannot be used.
     """
-    image = prepared(image)
+    image = prepare_image(image)
     # The background is a sparse sample of the frame; only the windows are read in full.
     background = estimate_background(image)
     level, noise = background.level, background.noise
-    rows = np.ascontiguousarray(centre_px, dtype=float)
+    rows = np.ascontiguousarray(center_px, dtype=float)
     boxes, sums, count = _brightest(image, rows, half_px, level, noise, threshold_sigma)
     boxes, sums = boxes[:count], sums[:count]
     order = np.argsort(-sums[:, 1], kind="stable")
@@ -47,19 +47,19 @@ def in_windows(
         background,
         np.zeros(count, np.int64),
     )
-    return classify(image, blobs, hints)
+    return classify(image, blobs, priors)
 
 
 @jit
 def _brightest(
-    image: NDArray, centre_px: Floats, half_px: float, level: Floats, noise: Floats, threshold_sigma: float
+    image: NDArray, center_px: Floats, half_px: float, level: Floats, noise: Floats, threshold_sigma: float
 ) -> tuple[Ints, Floats, int]:
     """Return boxes (N, 4), sums (N, 5: area, flux, flux x, flux y, peak) and the number of blobs."""
     height, width = image.shape
-    boxes, sums, count = np.empty((len(centre_px), 4), np.int64), np.zeros((len(centre_px), 5)), 0
-    for n in range(len(centre_px)):
-        x0, x1 = _span(centre_px[n, 0], half_px, width)
-        y0, y1 = _span(centre_px[n, 1], half_px, height)
+    boxes, sums, count = np.empty((len(center_px), 4), np.int64), np.zeros((len(center_px), 5)), 0
+    for n in range(len(center_px)):
+        x0, x1 = _span(center_px[n, 0], half_px, width)
+        y0, y1 = _span(center_px[n, 1], half_px, height)
         best, at_x, at_y = threshold_sigma, -1, -1
         for y in range(y0, y1 + 1):
             for x in range(x0, x1 + 1):
@@ -91,10 +91,10 @@ def _span(middle_px: float, half_px: float, size: int) -> tuple[int, int]:
 def _grow(image: NDArray, x: int, y: int, level: Floats, noise: Floats, box: NDArray, total: NDArray) -> None:
     """Sum the pixels connected to a peak by flood fill; stops at 4096 pixels."""
     height, width = image.shape
-    stack, seen = [(x, y)], {(x, y)}
+    stack, visited = [(x, y)], {(x, y)}
     box[0], box[1], box[2], box[3] = x, y, x, y
     total[:] = 0.0
-    while len(stack) > 0 and len(seen) < 4096:
+    while len(stack) > 0 and len(visited) < 4096:
         px, py = stack.pop()
         light = image[py, px] - interpolate(level, height, width, py, px)
         total[0] += 1
@@ -106,9 +106,9 @@ def _grow(image: NDArray, x: int, y: int, level: Floats, noise: Floats, box: NDA
         box[2], box[3] = max(box[2], px), max(box[3], py)
         for qy in range(max(py - 1, 0), min(py + 2, height)):
             for qx in range(max(px - 1, 0), min(px + 2, width)):
-                if (qx, qy) in seen:
+                if (qx, qy) in visited:
                     continue
                 above = filtered(image, qy, qx) - interpolate(level, height, width, qy, qx)
                 if above > GROW_SIGMA * interpolate(noise, height, width, qy, qx):
-                    seen.add((qx, qy))
+                    visited.add((qx, qy))
                     stack.append((qx, qy))

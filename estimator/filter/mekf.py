@@ -3,7 +3,7 @@
 The attitude is a unit quaternion, its error a three-component rotation vector in body axes. Gyro samples propagate the
 attitude, the bias and their covariance (`propagate`); a star tracker's solution corrects them (`update`). After each
 correction the estimated error is multiplied into the quaternion and reset to zero, so the quaternion keeps its unit
-norm and the covariance (6, 6) is not singular. The equations are in the docstring of Mekf.
+norm and the covariance (6, 6) is not singular. The equations are in the docstring of AttitudeFilter.
 
 Solutions arrive late. The filter therefore keeps its recent history: the states after the solutions used, and the gyro
 samples since. A late solution is applied to the state at its own time, and the later samples and solutions are applied
@@ -28,17 +28,17 @@ from scipy.special import chdtrc, chdtri
 
 from estimator.core.arrays import Floats
 from estimator.core.types import FilterState
-from estimator.filter.propagate import advance, transition, turn_on
+from estimator.filter.propagate import advance, rotate_quaternion, transition
 
 USED = "used"
 RESET = "reset"
-OUTSIDE = "refused: outside the gate"
+OUTSIDE_GATE = "refused: outside the gate"
 TOO_OLD = "refused: older than the filter remembers"
 
 # Duration of the history of samples and solutions; at least half of it is kept. `assumed`: some frames.
-MEMORY_S = 10.0
+HISTORY_S = 10.0
 # Number of consecutive refused solutions that must agree before the filter is reset to them.
-AGREEING = 3
+CONFIRMATIONS = 3
 # A solution's time may be ahead of the last gyro sample by this much, for rounding.
 ROUNDING_S = 1e-9
 
@@ -83,13 +83,13 @@ class Update:
 
 
 class _State(NamedTuple):
-    """State of the filter at one time; `missed_rad` is the attitude uncertainty gathered in the current saturation."""
+    """State of the filter at one time; `saturation_rad` is the attitude uncertainty from the current saturation."""
 
     t_s: float
     ref_from_body_wxyz: Floats
     bias_rad_s: Floats
     covariance: Floats
-    missed_rad: float
+    saturation_rad: float
 
     @property
     def body_from_ref(self) -> Rotation:
@@ -97,7 +97,7 @@ class _State(NamedTuple):
 
 
 class _Solution(NamedTuple):
-    """A star tracker's solution, at the time of a _Moment."""
+    """A star tracker's solution, at the time of a _State."""
 
     body_from_ref: Rotation
     covariance_rad2: Floats
@@ -106,15 +106,15 @@ class _Solution(NamedTuple):
 class _Segment(NamedTuple):
     """History from one used solution to the next: the state after it, the gyro samples since, and the solution.
 
-    The solution of the oldest leg is not applied again, and is None if the leg begins between two solutions.
+    The solution of the oldest segment is not applied again, and is None if it begins between two solutions.
     """
 
-    moment: _State
+    state: _State
     samples: Floats
     solution: _Solution | None
 
 
-class Mekf:
+class AttitudeFilter:
     """Attitude filter of a star tracker: the attitude as a quaternion, its error e as a small rotation in body axes.
 
     With ref_from_body = estimate exp(e), a gyro sample of rotation p (with the bias subtracted) in the interval T gives
@@ -166,37 +166,37 @@ class Mekf:
         # The chi-square of 3 degrees of freedom with the tail probability of gate_sigma for a scalar Gaussian.
         self._gate = float(chdtri(3, chdtrc(1, _not_negative("gate_sigma", gate_sigma) ** 2)))
         sigma_attitude = _not_negative("sigma_attitude_rad", sigma_attitude_rad) * np.ones(3)
-        self._start_variance = (_not_negative("sigma_bias_rad_s", sigma_bias_rad_s) * np.ones(3)) ** 2
-        covariance = np.diag(np.concatenate([sigma_attitude**2, self._start_variance]))
-        self._now = _State(float(t_s), _ref_from_body_wxyz(body_from_ref), np.zeros(3), covariance, 0.0)
-        self._legs = [_Segment(self._now, np.empty((0, 5)), None)]  # rows of _checked_samples
+        self._initial_bias_variance = (_not_negative("sigma_bias_rad_s", sigma_bias_rad_s) * np.ones(3)) ** 2
+        covariance = np.diag(np.concatenate([sigma_attitude**2, self._initial_bias_variance]))
+        self._current = _State(float(t_s), _ref_from_body_wxyz(body_from_ref), np.zeros(3), covariance, 0.0)
+        self._segments = [_Segment(self._current, np.empty((0, 5)), None)]  # rows of _checked_samples
         self._refused: list[tuple[_State, _Solution]] = []  # in a row, each agrees with the one before
         self._measured_rad_s = np.zeros(3)
 
     @property
     def state(self) -> FilterState:
         """Attitude, bias and their covariance after the last gyro sample."""
-        now = self._now
-        return FilterState(now.t_s, now.body_from_ref, now.bias_rad_s.copy(), now.covariance.copy())
+        state = self._current
+        return FilterState(state.t_s, state.body_from_ref, state.bias_rad_s.copy(), state.covariance.copy())
 
     @property
     def body_from_ref(self) -> Rotation:
-        return self._now.body_from_ref
+        return self._current.body_from_ref
 
     @property
     def ref_from_body_wxyz(self) -> Floats:
         """(4,) quaternion of the inverse of body_from_ref, scalar first, as stored: for callers in every tick."""
-        return self._now.ref_from_body_wxyz
+        return self._current.ref_from_body_wxyz
 
     @property
     def bias_rad_s(self) -> Floats:
         """(3,) estimated gyro bias in body axes."""
-        return self._now.bias_rad_s.copy()
+        return self._current.bias_rad_s.copy()
 
     @property
     def rate_rad_s(self) -> Floats:
         """(3,) measured rate less the bias, in body axes: the mean over the last call's samples; 0 before the first."""
-        return self._measured_rad_s - self._now.bias_rad_s
+        return self._measured_rad_s - self._current.bias_rad_s
 
     def propagate(self, t_s: ArrayLike, angle_rad: ArrayLike, saturated: ArrayLike) -> None:
         """Propagate the state by gyro samples.
@@ -208,14 +208,14 @@ class Mekf:
         Raises ValueError for other shapes, non-finite numbers, times that do not increase, or intervals that are too
         long.
         """
-        start_s = self._now.t_s
+        start_s = self._current.t_s
         # At most a tenth: the process noise is a series in the ratio of sample interval to bias time.
         samples = _checked_samples(start_s, t_s, angle_rad, saturated, 0.1 * self._gyro.bias_time_s)
-        self._now = self._after(self._now, samples)
+        self._current = self._propagate_state(self._current, samples)
         self._measured_rad_s = samples[:, 1:4].sum(axis=0) / (samples[-1, 0] - start_s)
-        last = self._legs[-1]
-        self._legs[-1] = last._replace(samples=np.concatenate([last.samples, samples]))
-        self._forget(float(samples[-1, 0]) - MEMORY_S)
+        last = self._segments[-1]
+        self._segments[-1] = last._replace(samples=np.concatenate([last.samples, samples]))
+        self._trim_history(float(samples[-1, 0]) - HISTORY_S)
 
     def update(self, t_s: float, body_from_ref_measured: Rotation, covariance_rad2: ArrayLike) -> Update:
         """Apply a star tracker's solution for the current or a past time, then repropagate from there to the present.
@@ -224,124 +224,126 @@ class Mekf:
 
         Raises ValueError for a covariance that is not symmetric and positive definite, or a time after the last sample.
         """
-        spread = _checked_covariance(covariance_rad2) + self._floor_rad2 * np.eye(3)
-        solution, now_s = _Solution(body_from_ref_measured, spread), self._now.t_s
+        covariance = _checked_covariance(covariance_rad2) + self._floor_rad2 * np.eye(3)
+        solution, now_s = _Solution(body_from_ref_measured, covariance), self._current.t_s
         if not t_s <= now_s + ROUNDING_S:
             raise ValueError(f"update: a solution at {t_s} s; allowed: up to the last gyro sample, {now_s} s")
-        if t_s < self._legs[0].moment.t_s:
+        if t_s < self._segments[0].state.t_s:
             return Update(TOO_OLD, np.full(3, np.nan), math.nan)
-        # Find the leg that contains t_s, and propagate its state to that time.
-        k = next(k for k in reversed(range(len(self._legs))) if self._legs[k].moment.t_s <= t_s)
-        leg = self._legs[k]
-        before, after = _split(leg.samples, leg.moment.t_s, min(float(t_s), now_s))
-        then = self._after(leg.moment, before)
-        residual, noise, distance2 = _innovation(then, solution)
+        # Find the segment that contains t_s, and propagate its state to that time.
+        k = next(k for k in reversed(range(len(self._segments))) if self._segments[k].state.t_s <= t_s)
+        segment = self._segments[k]
+        before, after = _split(segment.samples, segment.state.t_s, min(float(t_s), now_s))
+        prior = self._propagate_state(segment.state, before)
+        residual, noise, distance2 = _innovation(prior, solution)
         if distance2 <= self._gate:
-            # Split the leg at the solution, then repeat the later solutions from the corrected state.
-            status, then = USED, _corrected(then, residual, noise)
-            self._legs[k : k + 1] = [leg._replace(samples=before), _Segment(then, after, solution)]
+            # Split the segment at the solution, then repeat the later solutions from the corrected state.
+            status, corrected = USED, _correct(prior, residual, noise)
+            self._segments[k : k + 1] = [
+                segment._replace(samples=before),
+                _Segment(corrected, after, solution),
+            ]
             self._replay(k + 1)
-        elif self._agrees(then, solution):
+        elif self._confirms_refused(prior, solution):
             status = RESET
             # Solutions used later than t_s were judged by a lost filter: only their gyro samples are kept.
-            rest = np.concatenate([after, *(later.samples for later in self._legs[k + 1 :])])
-            self._legs = [_Segment(self._taken(then, solution), rest, None)]
+            rest = np.concatenate([after, *(later.samples for later in self._segments[k + 1 :])])
+            self._segments = [_Segment(self._reset_to(prior, solution), rest, None)]
         else:
-            return Update(OUTSIDE, residual, math.sqrt(distance2))
+            return Update(OUTSIDE_GATE, residual, math.sqrt(distance2))
         self._refused = []
-        self._now = self._after(self._legs[-1].moment, self._legs[-1].samples)
+        self._current = self._propagate_state(self._segments[-1].state, self._segments[-1].samples)
         return Update(status, residual, math.sqrt(distance2))
 
     def _replay(self, k: int) -> None:
-        """Apply again the solutions after leg k, from the new state of leg k; they have passed the gate already."""
-        for j in range(k + 1, len(self._legs)):
-            earlier, leg = self._legs[j - 1], self._legs[j]
-            assert leg.solution is not None
-            then = self._after(earlier.moment, earlier.samples)
-            residual, noise, _ = _innovation(then, leg.solution)
-            self._legs[j] = leg._replace(moment=_corrected(then, residual, noise))
+        """Apply again the solutions after segment k, from its new state; they have passed the gate already."""
+        for j in range(k + 1, len(self._segments)):
+            earlier, segment = self._segments[j - 1], self._segments[j]
+            assert segment.solution is not None
+            prior = self._propagate_state(earlier.state, earlier.samples)
+            residual, noise, _ = _innovation(prior, segment.solution)
+            self._segments[j] = segment._replace(state=_correct(prior, residual, noise))
 
-    def _forget(self, before_s: float) -> None:
-        """Delete history before a time: whole legs, and the first half of the samples of a long leg."""
-        while len(self._legs) > 1 and self._legs[1].moment.t_s < before_s:
-            del self._legs[0]
+    def _trim_history(self, before_s: float) -> None:
+        """Delete history before a time: whole segments, and the first half of the samples of a long one."""
+        while len(self._segments) > 1 and self._segments[1].state.t_s < before_s:
+            del self._segments[0]
         # Half at a time, so that the cost of propagating the first state is spread over many calls.
-        first = self._legs[0]
+        first = self._segments[0]
         if len(first.samples) and first.samples[0, 0] < before_s:
             half = len(first.samples) // 2
-            moment = self._after(first.moment, first.samples[:half])
-            self._legs[0] = _Segment(moment, first.samples[half:], None)
+            state = self._propagate_state(first.state, first.samples[:half])
+            self._segments[0] = _Segment(state, first.samples[half:], None)
 
-    def _after(self, moment: _State, samples: Floats) -> _State:
+    def _propagate_state(self, state: _State, samples: Floats) -> _State:
         """Propagate a state through gyro samples."""
         if not len(samples):
-            return moment
+            return state
         noise = (self._gyro.arw_rad_sqrt_s**2, self._gyro.bias_rad_s**2, 1 / self._gyro.bias_time_s)
-        return _State(float(samples[-1, 0]), *advance(tuple(moment), samples, noise))
+        return _State(float(samples[-1, 0]), *advance(tuple(state), samples, noise))
 
-    def _agrees(self, then: _State, solution: _Solution) -> bool:
+    def _confirms_refused(self, prior: _State, solution: _Solution) -> bool:
         """Whether a refused solution is the third in a row, each in agreement with the one before."""
         if self._refused:
-            moment, earlier = self._refused[-1]
-            turn = (
-                then.body_from_ref * moment.body_from_ref.inv()
-            )  # from the gyro alone: no solution was used in between
-            apart = (turn * earlier.body_from_ref * solution.body_from_ref.inv()).as_rotvec()
+            state, earlier = self._refused[-1]
+            # From the gyro alone: no solution was used in between.
+            later_from_earlier = prior.body_from_ref * state.body_from_ref.inv()
+            difference = (later_from_earlier * earlier.body_from_ref * solution.body_from_ref.inv()).as_rotvec()
             # Both covariances in the later body axes, plus what the gyro's noise and bias add in the gap.
-            gap_s, R = abs(then.t_s - moment.t_s), turn.as_matrix()
-            spread = R @ earlier.covariance_rad2 @ R.T + solution.covariance_rad2
-            spread += gap_s * self._gyro.arw_rad_sqrt_s**2 * np.eye(3) + gap_s**2 * then.covariance[3:, 3:]
-            if apart @ np.linalg.solve(spread, apart) > self._gate:
+            gap_s, R = abs(prior.t_s - state.t_s), later_from_earlier.as_matrix()
+            covariance = R @ earlier.covariance_rad2 @ R.T + solution.covariance_rad2
+            covariance += gap_s * self._gyro.arw_rad_sqrt_s**2 * np.eye(3) + gap_s**2 * prior.covariance[3:, 3:]
+            if difference @ np.linalg.solve(covariance, difference) > self._gate:
                 self._refused = []
-        self._refused.append((then, solution))
-        return len(self._refused) >= AGREEING
+        self._refused.append((prior, solution))
+        return len(self._refused) >= CONFIRMATIONS
 
-    def _taken(self, then: _State, solution: _Solution) -> _State:
+    def _reset_to(self, prior: _State, solution: _Solution) -> _State:
         """Reset to the solution's attitude and covariance; keep the bias and add the initial variance to its own."""
-        bias_covariance = then.covariance[3:, 3:] + np.diag(self._start_variance)
-        return then._replace(
+        bias_covariance = prior.covariance[3:, 3:] + np.diag(self._initial_bias_variance)
+        return prior._replace(
             ref_from_body_wxyz=_ref_from_body_wxyz(solution.body_from_ref),
             covariance=block_diag(solution.covariance_rad2, bias_covariance),
         )
 
 
-def _innovation(then: _State, solution: _Solution) -> tuple[Floats, Floats, float]:
+def _innovation(prior: _State, solution: _Solution) -> tuple[Floats, Floats, float]:
     """Return the residual (3,) in body axes, its noise covariance (3, 3), and the squared Mahalanobis distance."""
-    residual = (then.body_from_ref * solution.body_from_ref.inv()).as_rotvec()
-    noise = _seen_from(residual, solution.covariance_rad2)
-    return residual, noise, float(residual @ np.linalg.solve(then.covariance[:3, :3] + noise, residual))
+    residual = (prior.body_from_ref * solution.body_from_ref.inv()).as_rotvec()
+    noise = _residual_covariance(residual, solution.covariance_rad2)
+    return residual, noise, float(residual @ np.linalg.solve(prior.covariance[:3, :3] + noise, residual))
 
 
-def _corrected(then: _State, residual: Floats, noise: Floats) -> _State:
+def _correct(prior: _State, residual: Floats, noise: Floats) -> _State:
     """Kalman update in Joseph form; the attitude error is then multiplied into the quaternion."""
-    gain = np.linalg.solve(then.covariance[:3, :3] + noise, then.covariance[:3]).T
+    gain = np.linalg.solve(prior.covariance[:3, :3] + noise, prior.covariance[:3]).T
     error = gain @ residual
     # Joseph form, (I - K H) P (I - K H)^T + K R K^T with H = [I 0], stays symmetric and positive.
-    left = np.eye(6)
-    left[:, :3] -= gain
-    # Reset of the error state: exp(error) exp(rest) = exp(error + change) gives rest = J(error) change.
-    moved = np.eye(6)
-    moved[:3, :3] = _smear(error[:3])
-    covariance = moved @ (left @ then.covariance @ left.T + gain @ noise @ gain.T) @ moved.T
-    wxyz, bias = then.ref_from_body_wxyz.copy(), then.bias_rad_s + error[3:]
-    turn_on(wxyz, error[:3])
-    return _State(then.t_s, wxyz, bias, (covariance + covariance.T) / 2, then.missed_rad)
+    joseph = np.eye(6)
+    joseph[:, :3] -= gain
+    # Reset of the error state: exp(error) exp(e) = exp(error + change) gives e = J(error) change.
+    reset_jacobian = np.eye(6)
+    reset_jacobian[:3, :3] = _right_jacobian(error[:3])
+    covariance = reset_jacobian @ (joseph @ prior.covariance @ joseph.T + gain @ noise @ gain.T) @ reset_jacobian.T
+    wxyz, bias = prior.ref_from_body_wxyz.copy(), prior.bias_rad_s + error[3:]
+    rotate_quaternion(wxyz, error[:3])
+    return _State(prior.t_s, wxyz, bias, (covariance + covariance.T) / 2, prior.saturation_rad)
 
 
-def _smear(turn_rad: Floats) -> Floats:
-    """Return (3, 3) J(p) of Mekf's docstring: the right Jacobian of SO(3)."""
+def _right_jacobian(rotation_rad: Floats) -> Floats:
+    """Return (3, 3) J(p) of AttitudeFilter's docstring: the right Jacobian of SO(3)."""
     rows = np.empty((3, 6))
-    transition(turn_rad, -1.0, rows)
+    transition(rotation_rad, -1.0, rows)
     return rows[:, 3:]
 
 
-def _seen_from(residual: Floats, measured_rad2: Floats) -> Floats:
+def _residual_covariance(residual: Floats, measured_rad2: Floats) -> Floats:
     """Return the (3, 3) noise covariance of the residual's rotation vector.
 
     The solution is truth exp(v), so truth = filter exp(residual) exp(-v), and the error of the vector is
     J(residual)^-1 v. For a small residual this is the covariance of the solution itself.
     """
-    inverse = np.linalg.inv(_smear(residual))
+    inverse = np.linalg.inv(_right_jacobian(residual))
     return inverse @ measured_rad2 @ inverse.T
 
 
@@ -391,23 +393,21 @@ def _split(samples: Floats, start_s: float, t_s: float) -> tuple[Floats, Floats]
     begin_s = samples[k - 1, 0] if k else start_s
     if k == len(samples) or begin_s == t_s:
         return samples[:k], samples[k:]
-    share = (t_s - begin_s) / (samples[k, 0] - begin_s)
+    fraction = (t_s - begin_s) / (samples[k, 0] - begin_s)
     before, after = samples[: k + 1].copy(), samples[k:].copy()
     before[-1, 0] = t_s
-    before[-1, 1:4] *= share
-    after[0, 1:4] *= 1 - share
+    before[-1, 1:4] *= fraction
+    after[0, 1:4] *= 1 - fraction
     return before, after
 
 
 def _checked_covariance(covariance_rad2: ArrayLike) -> Floats:
     """Return the covariance as a (3, 3) array. Raises ValueError unless it is symmetric and positive definite."""
     matrix = np.asarray(covariance_rad2, dtype=float)
-    sound = matrix.shape == (3, 3) and bool(np.isfinite(matrix).all())
-    if sound:
-        even = np.abs(matrix - matrix.T).max() <= 1e-9 * np.trace(matrix)
-        sound = even and np.linalg.eigvalsh(matrix)[0] > 0
-    if not sound:
-        raise ValueError(
-            f"update: covariance_rad2 {matrix.tolist()}; allowed: (3, 3), symmetric, positive definite"
-        )
+    valid = matrix.shape == (3, 3) and bool(np.isfinite(matrix).all())
+    if valid:
+        symmetric = np.abs(matrix - matrix.T).max() <= 1e-9 * np.trace(matrix)
+        valid = symmetric and np.linalg.eigvalsh(matrix)[0] > 0
+    if not valid:
+        raise ValueError(f"update: covariance_rad2 {matrix.tolist()}; allowed: (3, 3), symmetric, positive definite")
     return (matrix + matrix.T) / 2

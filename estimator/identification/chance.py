@@ -1,15 +1,25 @@
-"""Significance of a match: binomial probability of as many matches by chance, and the acceptance threshold."""
+"""Significance of a match: binomial probability of as many matches by chance, and common terms of Bayes factors.
+
+The published identifiers accept a match by the binomial tail (`log10_tail`). The searches for stars and for LEDs
+compute a Bayes factor instead, whose common constants and terms are here; "dex" is its power of ten.
+"""
 
 from __future__ import annotations
 
-from math import lgamma, log
+from math import lgamma, log, log10, pi, sqrt
 
 import numpy as np
 
+from estimator.core.arrays import Floats
 from estimator.core.jit import jit
 
 ACCEPT_LOG10_CHANCE = -5.0  # log10 of the expected number of chance matches this good, over all hypotheses
 MIN_MATCHES = 4
+
+# Bayes factors
+GATE_SIGMA = 3.5  # matching radius in standard deviations: it loses one true match in 450
+MIN_EVIDENCE_MATCHES = 3  # matches needed for a solution
+SHORT_PAIR = 0.2  # of the field size: shorter pairs determine the roll poorly and are tried last
 
 
 @jit
@@ -22,3 +32,36 @@ def log10_tail(trials: int, hits: int, p: float) -> float:
         ways = lgamma(trials + 1.0) - lgamma(k + 1.0) - lgamma(trials - k + 1.0)
         total += np.exp(ways + k * log(p) + (trials - k) * log(1 - p))
     return np.log10(max(total, 1e-300))
+
+
+@jit
+def counts_dex(matched: int, missing: int) -> float:
+    """log10 B(matched + 1, missing + 1): likelihood of the counts under a uniform prior of detection probability."""
+    return (lgamma(matched + 1.0) + lgamma(missing + 1.0) - lgamma(matched + missing + 2.0)) / log(10.0)
+
+
+@jit
+def required_matches(sigma: Floats, field_area: float, attitude_dex: float, min_dex: float) -> int:
+    """Least number of matches that can reach min_dex, from an estimate of the greatest evidence.
+
+    The estimate has no residuals and no missing sources: each match contributes the density ratio
+    1 / (2 pi sigma^2 rho) of the least sigma of all detections, the attitude contributes attitude_dex.
+    """
+    total = len(sigma)
+    match_dex = -log10(2 * pi * sigma.min() ** 2 * total / field_area)
+    for count in range(MIN_EVIDENCE_MATCHES, total):
+        if count * match_dex + attitude_dex - log10(count + 1.0) >= min_dex:
+            return count
+    return total
+
+
+@jit
+def squared_separation(tangent: Floats, a: int, b: int) -> float:
+    """Squared distance between two detections, in tangents."""
+    return (tangent[a, 0] - tangent[b, 0]) ** 2 + (tangent[a, 1] - tangent[b, 1]) ** 2
+
+
+@jit
+def separation(tangent: Floats, a: int, b: int) -> float:
+    """Distance between two detections, in tangents."""
+    return sqrt(squared_separation(tangent, a, b))

@@ -8,6 +8,7 @@ chance.
 from __future__ import annotations
 
 from math import pi, sqrt
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,50 +22,59 @@ from estimator.core.jit import jit
 from estimator.core.types import StarMatch
 from estimator.identification.chance import ACCEPT_LOG10_CHANCE, MIN_MATCHES, log10_tail
 
-# Rows of the observed stars, rows of the catalog, R_cam_from_ref, log10 of the expected number of chance matches.
-Found = tuple[NDArray[np.int64], NDArray[np.int64], Floats, float]
+
+class DirectMatch(NamedTuple):
+    """A match of the whole field. A named tuple, because numba can compile functions that return one.
+
+    observed, star : (K,) rows of the observed stars and of the catalog;  R_cam_from_ref : (3, 3)
+    log10_chance   : log10 of the expected number of equally good chance matches
+    """
+
+    observed: NDArray[np.int64]
+    star: NDArray[np.int64]
+    R_cam_from_ref: Floats
+    log10_chance: float
 
 
-def answer(found: Found) -> StarMatch | None:
+def to_star_match(match: DirectMatch) -> StarMatch | None:
     """The match as a StarMatch, or None if it is not significant (ACCEPT_LOG10_CHANCE, MIN_MATCHES)."""
-    observed, star, matrix, chance = found
-    if len(observed) < MIN_MATCHES or chance > ACCEPT_LOG10_CHANCE:
+    if len(match.observed) < MIN_MATCHES or match.log10_chance > ACCEPT_LOG10_CHANCE:
         return None
-    return StarMatch(observed, star, Rotation.from_matrix(matrix), chance)
+    return StarMatch(match.observed, match.star, Rotation.from_matrix(match.R_cam_from_ref), match.log10_chance)
 
 
 @jit
-def settled(
-    seen: Floats,
+def match_field(
+    rays: Floats,
     index: PairIndex,
     corners: NDArray,
     stars: NDArray,
     tolerance: float,
     stretch: float,
-    tried: int,
-) -> Found:
+    hypotheses: int,
+) -> DirectMatch:
     """The direct match: match all observed stars at the attitude of a few, refine it once, and test against chance.
 
     corners, stars : rows of the observed and of the catalog stars of the hypothesis, two or more
-    tried          : number of hypotheses so far, which multiplies the probability
+    hypotheses     : number of hypotheses so far, which multiplies the probability
     """
-    matrix = turned(seen[corners], index.vectors[stars])
+    R_cam_from_ref = fit_rotation(rays[corners], index.vectors[stars])
     # The attitude of a few stars is less accurate than a star's direction: the first match has twice the tolerance.
-    observed, star, _ = match(seen, index, stars[0], matrix, 2 * tolerance, stretch)
+    observed, star, _ = match_nearest(rays, index, stars[0], R_cam_from_ref, 2 * tolerance, stretch)
     if len(observed) < MIN_MATCHES:
-        return nothing()
-    matrix = turned(seen[observed], index.vectors[star])
-    observed, star, expected = match(seen, index, stars[0], matrix, tolerance, stretch)
+        return no_match()
+    R_cam_from_ref = fit_rotation(rays[observed], index.vectors[star])
+    observed, star, expected = match_nearest(rays, index, stars[0], R_cam_from_ref, tolerance, stretch)
     if len(observed) < MIN_MATCHES:
-        return nothing()
-    chance = log10_chance(index.group[star], len(seen), expected) + np.log10(tried)
-    return observed, star, turned(seen[observed], index.vectors[star]), chance
+        return no_match()
+    chance = log10_chance(index.group[star], len(rays), expected) + np.log10(hypotheses)
+    return DirectMatch(observed, star, fit_rotation(rays[observed], index.vectors[star]), chance)
 
 
 @jit
-def nothing() -> Found:
+def no_match() -> DirectMatch:
     """The empty match, with probability 1 by chance."""
-    return np.empty(0, np.int64), np.empty(0, np.int64), np.eye(3), 0.0
+    return DirectMatch(np.empty(0, np.int64), np.empty(0, np.int64), np.eye(3), 0.0)
 
 
 @jit
@@ -77,53 +87,51 @@ def angle(u: Floats, v: Floats) -> float:
 @jit
 def triple(u: Floats, v: Floats, w: Floats) -> float:
     """Triple product u . (v x w); its sign is the handedness of a triangle of directions."""
-    return (
-        u[0] * (v[1] * w[2] - v[2] * w[1])
-        + u[1] * (v[2] * w[0] - v[0] * w[2])
-        + u[2] * (v[0] * w[1] - v[1] * w[0])
-    )
+    return u[0] * (v[1] * w[2] - v[2] * w[1]) + u[1] * (v[2] * w[0] - v[0] * w[2]) + u[2] * (v[0] * w[1] - v[1] * w[0])
 
 
 @jit
-def turned(cam: Floats, ref: Floats) -> Floats:
+def fit_rotation(cam: Floats, ref: Floats) -> Floats:
     """R_cam_from_ref by Wahba's problem with equal weights."""
     return wahba(cam, ref, np.ones(len(cam)))[0]
 
 
 @jit
-def match(
-    seen: Floats, index: PairIndex, centre: int, matrix: Floats, tolerance: float, stretch: float
+def match_nearest(
+    rays: Floats, index: PairIndex, center: int, R_cam_from_ref: Floats, tolerance: float, stretch: float
 ) -> tuple[NDArray, NDArray, float]:
     """Match each observed star to the nearest catalog star within its tolerance; each catalog star is used once.
 
-    centre : row of a catalog star in the field; its neighbors give the local density of the catalog
+    center : row of a catalog star in the field; its neighbors give the local density of the catalog
     Returns the rows of the observed stars, the rows of the catalog, and the probability that a random direction has a
     catalog star within the mean tolerance.
     """
-    observed, star = np.empty(len(seen), np.int64), np.empty(len(seen), np.int64)
+    observed, star = np.empty(len(rays), np.int64), np.empty(len(rays), np.int64)
     cap_sr = 2 * pi * (1 - np.cos(index.max_angle_rad))
-    density = (index.first[centre + 1] - index.first[centre] + 1) / cap_sr
-    count, covered = 0, 0.0
-    for n in range(len(seen)):
-        u, v, w = seen[n]
-        x = matrix[0, 0] * u + matrix[1, 0] * v + matrix[2, 0] * w
-        y = matrix[0, 1] * u + matrix[1, 1] * v + matrix[2, 1] * w
-        z = matrix[0, 2] * u + matrix[1, 2] * v + matrix[2, 2] * w
+    density = (index.first[center + 1] - index.first[center] + 1) / cap_sr
+    count, covered_sr = 0, 0.0
+    for n in range(len(rays)):
+        u, v, w = rays[n]
+        x = R_cam_from_ref[0, 0] * u + R_cam_from_ref[1, 0] * v + R_cam_from_ref[2, 0] * w
+        y = R_cam_from_ref[0, 1] * u + R_cam_from_ref[1, 1] * v + R_cam_from_ref[2, 1] * w
+        z = R_cam_from_ref[0, 2] * u + R_cam_from_ref[1, 2] * v + R_cam_from_ref[2, 2] * w
         radius = tolerance + (stretch * np.arccos(min(max(w, -1.0), 1.0)) if stretch > 0 else 0.0)
-        covered += density * pi * radius**2
+        covered_sr += density * pi * radius**2
         best = nearest(index.cells, index.vectors, x, y, z, 2 * np.sin(min(radius, pi) / 2))
-        taken = False
+        is_used = False
         for m in range(count):
-            taken = taken or star[m] == best
-        if best >= 0 and not taken:
+            is_used = is_used or star[m] == best
+        if best >= 0 and not is_used:
             observed[count], star[count] = n, best
             count += 1
-    return observed[:count], star[:count], 1 - np.exp(-covered / len(seen))
+    return observed[:count], star[:count], 1 - np.exp(-covered_sr / len(rays))
 
 
 @jit
-def log10_chance(groups: NDArray, seen: int, p: float) -> float:
+def log10_chance(groups: NDArray, count: int, p: float) -> float:
     """log10 of the probability that a false attitude gives this match; three independent matches define the attitude.
+
+    groups : (K,) groups of the matched stars;  count : number of observed stars
 
     The first match of each group (patch board) has probability p. All boards have the same pattern, so that further
     matches of a group are not independent: the second counts 1/10 (it fixes the orientation of the lattice), each
@@ -131,11 +139,11 @@ def log10_chance(groups: NDArray, seen: int, p: float) -> float:
     """
     independent, second, further = 0, 0, 0
     for n in range(len(groups)):
-        before = 0
+        earlier = 0
         for m in range(n):
-            before += groups[m] == groups[n]
-        independent += before == 0
-        second += before == 1
-        further += before > 1
-    tail = log10_tail(max(seen - 3 - second - further, 0), independent - 3, p)
+            earlier += groups[m] == groups[n]
+        independent += earlier == 0
+        second += earlier == 1
+        further += earlier > 1
+    tail = log10_tail(max(count - 3 - second - further, 0), independent - 3, p)
     return tail - second - 0.3 * further

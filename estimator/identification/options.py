@@ -15,7 +15,7 @@ class Options:
     """Keyword arguments of an identifier. A method ignores those that it does not use.
 
     stretch       : relative tolerance of an angle: stretch * angle is added to its tolerance
-    zooms         : the stretch is one unknown focal length, which each pattern measures; see `fixed_focal`
+    focal_unknown : the stretch is one unknown focal length, which each pattern measures; see `require_known_focal`
     max_triangles, max_checks : observed patterns tried, and angles compared, before giving up; the latter bounds
         the time, at a few to tens of nanoseconds each
     base_stars    : number of brightest stars from which patterns are formed
@@ -29,7 +29,7 @@ class Options:
     """
 
     stretch: float = 0.0
-    zooms: bool = False
+    focal_unknown: bool = False
     max_triangles: int = 3000
     max_checks: int = 20_000_000
     base_stars: int = 20
@@ -41,18 +41,15 @@ class Options:
     boresight_ref: Floats | None = None
     within_rad: float = np.pi
 
-    def fixed_focal(self, name: str) -> None:
+    def require_known_focal(self, name: str) -> None:
         """Raise ImageError if the focal length is uncertain: method `name` needs calibrated angles."""
-        if self.zooms:
-            raise ImageError(
-                f"{name}: the focal length is uncertain; allowed: a calibrated camera, or pyramid"
-            )
+        if self.focal_unknown:
+            raise ImageError(f"{name}: the focal length is uncertain; allowed: a calibrated camera, or pyramid")
 
-    def light(self, count: int) -> Floats:
+    def magnitudes(self, count: int) -> Floats:
         """(N,) magnitudes of the observed stars, NaN if unknown. Raises ImageError for an array of another shape."""
         if self.magnitude is None:
             return np.full(count, np.nan)
         if np.shape(self.magnitude) != (count,):
-            told = np.shape(self.magnitude)
-            raise ImageError(f"magnitudes {told} of {count} observed stars; allowed: one for each")
+            raise ImageError(f"magnitudes {np.shape(self.magnitude)} of {count} observed stars; allowed: one for each")
         return np.ascontiguousarray(self.magnitude, dtype=float)

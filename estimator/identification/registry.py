@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from estimator.core.types import StarMatch
-from estimator.identification.published.fialho import fialho_1, fialho_2, fialho_3, fialho_4
+from estimator.identification.published.fialho import VERSIONS
 from estimator.identification.published.master_star import master_star
 from estimator.identification.published.pyramid import pyramid
 from estimator.identification.published.saa import saa
@@ -20,8 +20,5 @@ IDENTIFIERS: dict[str, Identifier] = {
     "saa": saa,
     "shefex": shefex,
     "master_star": master_star,
-    "fialho_1": fialho_1,
-    "fialho_2": fialho_2,
-    "fialho_3": fialho_3,
-    "fialho_4": fialho_4,
+    **VERSIONS,
 }

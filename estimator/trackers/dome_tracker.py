@@ -19,43 +19,43 @@ from estimator.catalog import pair_index
 from estimator.core.arrays import Floats
 from estimator.core.camera import Camera
 from estimator.core.types import Attitude, Centroids, StarMatch
+from estimator.identification.chance import MIN_EVIDENCE_MATCHES
 from estimator.identification.leds import search
-from estimator.identification.leds.evidence import LEAST
-from estimator.identification.leds.index import corner_rays, inner_field, sight_of
+from estimator.identification.leds.index import build_dome_index, corner_rays, inner_field
 from estimator.identification.leds.search import NO_MATCH
 from estimator.identification.registry import IDENTIFIERS as STAR_IDENTIFIERS
 from estimator.trackers.pipeline import Clock, Report, Settings, brightest, direction_sigma_rad, process_frame
-from estimator.trackers.star_tracker import NO_STARS, mutual
+from estimator.trackers.star_tracker import NO_STARS, mutual_nearest
 
-LEAST_ERROR_PX = 0.3  # least centroid error of an LED, for effects outside of survey and calibration
+MIN_ERROR_PX = 0.3  # least centroid error of an LED, for effects outside of survey and calibration
 SETTINGS = Settings(identifier="led_pairs", solver="rotation_only")
 Identify = Callable[[Floats, Floats], StarMatch | str]
 
 
 def led_pairs(camera: Camera, leds: LedMap, lever: Lever, settings: Settings) -> Identify:
     """The default LED identifier: pair hypotheses and evidence; see `identification.leds.search.identify`."""
-    sight = sight_of(leds, lever, camera)
-    least_rad = LEAST_ERROR_PX / camera.focal_px
+    sight = build_dome_index(leds, lever, camera)
+    least_rad = MIN_ERROR_PX / camera.focal_px
     return lambda rays_cam, sigma_rad: search.identify(rays_cam, np.hypot(sigma_rad, least_rad), sight)
 
 
-def as_stars(name: str, camera: Camera, leds: LedMap, lever: Lever, settings: Settings) -> Identify:
+def star_identifier(name: str, camera: Camera, leds: LedMap, lever: Lever, settings: Settings) -> Identify:
     """A star identifier applied to directions from the bearing, where the rays meet one sphere of the median radius.
 
     On a dome that is not a sphere this changes the angles; the tolerance therefore has a stretch, from the spread of
     the radii and the lever.
     """
     radius = np.linalg.norm(leds.position_m, axis=1)
-    usual_m, pupil_m = float(np.median(radius)), lever.cam_from_body.apply(lever.camera_body_m)
-    points = on_sphere(corner_rays(camera), pupil_m, usual_m) / usual_m
+    median_radius_m, pupil_m = float(np.median(radius)), lever.cam_from_body.apply(lever.camera_body_m)
+    points = on_sphere(corner_rays(camera), pupil_m, median_radius_m) / median_radius_m
     field_tan, _ = inner_field(points)
     reach_rad = np.arccos(np.clip((points @ points.T).min(), -1, 1))
     pairs = pair_index.build(leds.position_m / radius[:, None], reach_rad * 1.05, leds.board)
-    stretch = 2 * float(np.std(radius)) / (usual_m - float(np.linalg.norm(pupil_m))) + 5e-4
+    stretch = 2 * float(np.std(radius)) / (median_radius_m - float(np.linalg.norm(pupil_m))) + 5e-4
 
     def identify(rays_cam: Floats, sigma_rad: Floats) -> StarMatch | str:
-        found = STAR_IDENTIFIERS[name](
-            on_sphere(rays_cam, pupil_m, usual_m) / usual_m,
+        match = STAR_IDENTIFIERS[name](
+            on_sphere(rays_cam, pupil_m, median_radius_m) / median_radius_m,
             pairs,
             max(1.0, 4 * settings.centroid_sigma_px) / camera.focal_px,
             stretch=stretch,
@@ -63,7 +63,7 @@ def as_stars(name: str, camera: Camera, leds: LedMap, lever: Lever, settings: Se
             missed_dex=settings.missed_dex,
             field_tan=tuple(field_tan),
         )
-        return found or NO_MATCH
+        return match or NO_MATCH
 
     return identify
 
@@ -72,8 +72,8 @@ def as_stars(name: str, camera: Camera, leds: LedMap, lever: Lever, settings: Se
 # match, or the reason for a refusal.
 IDENTIFIERS: dict[str, Callable[[Camera, LedMap, Lever, Settings], Identify]] = {
     "led_pairs": led_pairs,
-    "pyramid": partial(as_stars, "pyramid"),
-    "saa": partial(as_stars, "saa"),
+    "pyramid": partial(star_identifier, "pyramid"),
+    "saa": partial(star_identifier, "saa"),
 }
 
 
@@ -94,8 +94,8 @@ class DomeTracker:
         check_lever(leds, lever)
         self.camera, self.leds, self.lever, self.settings = camera, leds, lever, settings
         self.identify = IDENTIFIERS[settings.identifier](camera, leds, lever, settings)
-        reach_m = np.linalg.norm(leds.position_m, axis=1).min() - np.linalg.norm(lever.camera_body_m)
-        self.led_sigma_rad = float(leds.sigma_m / reach_m)
+        min_range_m = np.linalg.norm(leds.position_m, axis=1).min() - np.linalg.norm(lever.camera_body_m)
+        self.led_sigma_rad = float(leds.sigma_m / min_range_m)
 
     def solve(self, image: NDArray, streak_px: tuple[float, float] | None = None) -> Report:
         """Solve one frame. Raises ImageError for bad input; any other failure is reported in the status.
@@ -107,20 +107,18 @@ class DomeTracker:
     def solve_centroids(self, centroids: Centroids, clock: Clock | None = None) -> Attitude:
         """Identify and solve centroids from any source (the truth included)."""
         clock = clock or Clock()
-        if len(centroids) < LEAST:
+        if len(centroids) < MIN_EVIDENCE_MATCHES:
             return Attitude(NO_STARS)
-        few = brightest(centroids, self.settings)
-        match = self.identify(
-            self.camera.rays(few.xy_px), direction_sigma_rad(few, self.camera, self.settings)
-        )
+        bright = brightest(centroids, self.settings)
+        match = self.identify(self.camera.rays(bright.xy_px), direction_sigma_rad(bright, self.camera, self.settings))
         clock.lap("identify")
         if isinstance(match, str):
             return Attitude(match)
-        attitude = self._refined(centroids, match)
+        attitude = self._refine(centroids, match)
         clock.lap("solve")
         return attitude
 
-    def _refined(self, centroids: Centroids, match: StarMatch) -> Attitude:
+    def _refine(self, centroids: Centroids, match: StarMatch) -> Attitude:
         """Match every centroid with the exact geometry, then solve these matches with the solver of the settings.
 
         The matching always uses the exact solver: an approximate one could lose matches. All solvers are therefore
@@ -132,18 +130,16 @@ class DomeTracker:
         sigma_rad = self._sigma_rad(centroids, rays, "rotation_only")
         radius_px = max(4.0, 4 * float(np.median(sigma_rad)) * self.camera.focal_px)
         try:
-            for widened in (3.0, 1.0):
-                body_from_lab, _ = self._solve(
-                    "rotation_only", rays, sigma_rad, observed, star, body_from_lab
-                )
-                observed, star = self._nearest(centroids, body_from_lab, widened * radius_px)
+            for factor in (3.0, 1.0):
+                body_from_lab, _ = self._solve("rotation_only", rays, sigma_rad, observed, star, body_from_lab)
+                observed, star = self._nearest(centroids, body_from_lab, factor * radius_px)
                 # The exact geometry must confirm as many matches as identification found.
                 if len(observed) < len(match.observed):
                     return Attitude(NO_MATCH)
-            observed, star, misfit = self._without_blends(centroids, sigma_rad, observed, star, body_from_lab)
+            observed, star, misfit = self._reject_blends(centroids, sigma_rad, observed, star, body_from_lab)
             solver = self.settings.solver
             sigma_rad = self._sigma_rad(centroids, rays, solver)
-            body_from_lab, spread = self._solve(solver, rays, sigma_rad, observed, star, body_from_lab)
+            body_from_lab, covariance = self._solve(solver, rays, sigma_rad, observed, star, body_from_lab)
         except (ValueError, np.linalg.LinAlgError) as error:
             return Attitude(f"no attitude: {error}")
         cam_from_lab = self.lever.cam_from_body * body_from_lab
@@ -152,8 +148,7 @@ class DomeTracker:
         return Attitude(
             "solved",
             cam_from_lab,
-            misfit * R_cam_from_body @ spread @ R_cam_from_body.T
-            + self._lever_covariance(cam_from_lab, star),
+            misfit * R_cam_from_body @ covariance @ R_cam_from_body.T + self._lever_covariance(cam_from_lab, star),
             StarMatch(observed, star, cam_from_lab, match.log10_chance),
             float(np.sqrt(np.mean(residual**2))),
             self.camera,
@@ -164,14 +159,12 @@ class DomeTracker:
         pixel_rad = direction_sigma_rad(centroids, self.camera, self.settings)
         return np.hypot(fitted_sigma_rad(solver, rays, pixel_rad), self.led_sigma_rad)
 
-    def _residual_px(
-        self, centroids: Centroids, observed: NDArray, star: NDArray, body_from_lab: Rotation
-    ) -> Floats:
+    def _residual_px(self, centroids: Centroids, observed: NDArray, star: NDArray, body_from_lab: Rotation) -> Floats:
         """(K, 2) predicted minus observed pixels."""
         predicted = project(body_from_lab, self.leds.position_m[star], self.lever, self.camera)
         return predicted - centroids.xy_px[observed]
 
-    def _without_blends(
+    def _reject_blends(
         self,
         centroids: Centroids,
         sigma_rad: Floats,
@@ -187,23 +180,23 @@ class DomeTracker:
         """
         residual = self._residual_px(centroids, observed, star, body_from_lab)
         length = np.linalg.norm(residual, axis=1) / (sigma_rad[observed] * self.camera.focal_px)
-        kept = length <= 5 * max(float(np.median(length)), 1.0)
-        if kept.sum() < max(LEAST, len(kept) / 2):
-            kept[:] = True
-        freedom = 2 * int(kept.sum()) - 3
-        excess = float(np.sum(length[kept] ** 2)) / freedom
-        by_chance = 1 + 3 * np.sqrt(2 / freedom)
-        return observed[kept], star[kept], excess if excess > by_chance else 1.0
+        inlier = length <= 5 * max(float(np.median(length)), 1.0)
+        if inlier.sum() < max(MIN_EVIDENCE_MATCHES, len(inlier) / 2):
+            inlier[:] = True
+        dof = 2 * int(inlier.sum()) - 3
+        reduced_chi2 = float(np.sum(length[inlier] ** 2)) / dof
+        threshold = 1 + 3 * np.sqrt(2 / dof)
+        return observed[inlier], star[inlier], reduced_chi2 if reduced_chi2 > threshold else 1.0
 
     def _lever_covariance(self, cam_from_lab: Rotation, star: NDArray) -> Floats:
         """(3, 3) covariance in camera axes from the error of the pupil's position, which is common to all frames.
 
         A shift of the pupil has the same effect on a light at p from the bearing as a rotation by p x shift / |p|^2.
         """
-        middle_m = cam_from_lab.apply(self.leds.position_m[star].mean(axis=0))
-        along = middle_m / np.linalg.norm(middle_m)
-        sigma_rad = self.lever.sigma_m / np.linalg.norm(middle_m)
-        return sigma_rad**2 * (np.eye(3) - np.outer(along, along))
+        mean_m = cam_from_lab.apply(self.leds.position_m[star].mean(axis=0))
+        direction = mean_m / np.linalg.norm(mean_m)
+        sigma_rad = self.lever.sigma_m / np.linalg.norm(mean_m)
+        return sigma_rad**2 * (np.eye(3) - np.outer(direction, direction))
 
     def _solve(
         self,
@@ -215,16 +208,12 @@ class DomeTracker:
         body_from_lab: Rotation,
     ) -> tuple[Rotation, Floats]:
         """body_from_lab and its covariance in body axes, from the matched rays."""
-        place_m = self.leds.position_m[star]
-        return SOLVERS[solver](
-            rays[observed], sigma_rad[observed], place_m, self.leds, self.lever, body_from_lab
-        )
+        position_m = self.leds.position_m[star]
+        return SOLVERS[solver](rays[observed], sigma_rad[observed], position_m, self.leds, self.lever, body_from_lab)
 
-    def _nearest(
-        self, centroids: Centroids, body_from_lab: Rotation, radius_px: float
-    ) -> tuple[NDArray, NDArray]:
+    def _nearest(self, centroids: Centroids, body_from_lab: Rotation, radius_px: float) -> tuple[NDArray, NDArray]:
         """Mutual nearest neighbors of centroids and LEDs within a radius: rows of both."""
         xy = project(body_from_lab, self.leds.position_m, self.lever, self.camera)
         # An LED whose center is just off the chip may still have light on it.
         inside = np.flatnonzero(self.camera.contains(np.nan_to_num(xy, nan=-1e9), -30.0))
-        return mutual(centroids.xy_px, xy[inside], radius_px, inside)
+        return mutual_nearest(centroids.xy_px, xy[inside], radius_px, inside)

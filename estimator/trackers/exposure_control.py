@@ -34,7 +34,7 @@ class Control:
 
     mean_dn     : reference mean; a frame with a greater mean is saturated
     longest_s   : 50 ms is the paper's on-board limit, for a smear of 4.5 px at 2 deg/s
-    least_stars : with fewer objects the flag no_stars is set
+    min_stars : with fewer objects the flag no_stars is set
     overexposed_objects, saturated_px : a frame is saturated if at least overexposed_objects objects have more than
         saturated_px saturated pixels each
 
@@ -45,7 +45,7 @@ class Control:
     shortest_s: float = CAMERA_SHORTEST_S
     longest_s: float = 0.05
     step_s: float = 0.002
-    least_stars: int = 4
+    min_stars: int = 4
     overexposed_objects: int = 4
     saturated_px: int = 1
 
@@ -84,13 +84,13 @@ class Exposure:
     no_stars: bool = False
 
 
-def step(state: Exposure, seen: Observation, control: Control) -> Exposure:
+def step(state: Exposure, observation: Observation, control: Control) -> Exposure:
     """The next exposure from one frame's measurements, within the limits and in whole microseconds."""
-    saturated = seen.mean_dn > control.mean_dn or seen.overexposed >= control.overexposed_objects
-    no_stars = seen.stars < control.least_stars
-    longer = -1 if saturated else int(no_stars)
-    asked_s = INCREMENT_S * round((state.time_s + longer * control.step_s) / INCREMENT_S)
-    time_s = min(max(asked_s, control.shortest_s), control.longest_s)
+    saturated = observation.mean_dn > control.mean_dn or observation.overexposed >= control.overexposed_objects
+    no_stars = observation.stars < control.min_stars
+    direction = -1 if saturated else int(no_stars)
+    target_s = INCREMENT_S * round((state.time_s + direction * control.step_s) / INCREMENT_S)
+    time_s = min(max(target_s, control.shortest_s), control.longest_s)
     return Exposure(time_s, saturated, no_stars)
 
 
@@ -107,12 +107,12 @@ def observe(image: NDArray, box_px: Ints, saturation_dn: float, control: Control
     x0, y0, x1, y1 = boxes.T
     if not ((x0 >= 0) & (y0 >= 0) & (x1 < width) & (y1 < height)).all():
         raise ImageError(f"exposure: an object's box reaches beyond the image of {width}x{height} pixels")
-    mean, overexposed = _counted(image, boxes, float(saturation_dn), control.saturated_px)
+    mean, overexposed = _measure(image, boxes, float(saturation_dn), control.saturated_px)
     return Observation(mean, len(boxes), overexposed)
 
 
 @jit
-def _counted(image: NDArray, box_px: Ints, saturation_dn: float, allowed: int) -> tuple[float, int]:
+def _measure(image: NDArray, box_px: Ints, saturation_dn: float, allowed: int) -> tuple[float, int]:
     """Mean of the frame, and number of boxes with more than `allowed` saturated pixels."""
     total = 0.0
     for y in range(image.shape[0]):

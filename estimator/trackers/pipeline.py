@@ -15,14 +15,14 @@ from estimator.core.camera import Camera, check_shape
 from estimator.core.errors import ImageError
 from estimator.core.types import Attitude, Blobs, Centroids, FramePriors
 from estimator.detection.classify import NO_STAR, Flag
-from estimator.detection.detect import DETECTORS, mend
+from estimator.detection.detect import DETECTORS, replace_bad_pixels
 
 SATURATED = "the frame is saturated"
 # Extra centroid error of a saturated blob, whose plateau has edges at whole pixels. Monte Carlo: 0.01 to 0.07 px, more
 # with deeper saturation.
 SATURATED_SIGMA_PX = 0.05
-VAGUE_PX = 5.0  # a centroid with a greater error could match any star: it costs the search more than it helps
-MENDED_SIGMA_PX = 0.06  # extra error of a centroid on an interpolated bad pixel, from Monte Carlo
+MAX_CENTROID_SIGMA_PX = 5.0  # less accurate centroids are dropped: they could match any star
+BAD_PIXEL_SIGMA_PX = 0.06  # extra error of a centroid on an interpolated bad pixel, from Monte Carlo
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,39 +96,39 @@ def detect_and_centroid(
     """
     check_shape(image.shape, camera)
     if np.isfinite(settings.saturation):
-        some = image[::37]  # a sample of rows is enough to estimate the saturated fraction
-        if np.count_nonzero(some >= settings.saturation) > 0.5 * some.size:
+        sample = image[::37]  # every 37th row is enough to estimate the saturated fraction
+        if np.count_nonzero(sample >= settings.saturation) > 0.5 * sample.size:
             raise ImageError(f"{SATURATED}: over half of its pixels are at {settings.saturation:g}")
     if settings.bad_px is not None:
-        image = mend(image, settings.bad_px)
-    hints = FramePriors(streak_px, settings.saturation)
+        image = replace_bad_pixels(image, settings.bad_px)
+    priors = FramePriors(streak_px, settings.saturation)
     blobs = DETECTORS[settings.detector](
-        image, settings.threshold_sigma, settings.min_area_px, settings.max_blobs, hints
+        image, settings.threshold_sigma, settings.min_area_px, settings.max_blobs, priors
     )
     stars = away_from_border(blobs.box_px, camera) & (blobs.flag & settings.reject == 0)
     if not stars.all():
         blobs = blobs.take(stars)
     clock.lap("detect")
-    centroids = CENTROIDERS[settings.centroider](image, blobs, settings.gain_e_dn, hints)
+    centroids = CENTROIDERS[settings.centroider](image, blobs, settings.gain_e_dn, priors)
     centroids = inflate_uncertainty(centroids, blobs, settings)
     clock.lap("centroid")
-    sound = camera.contains(centroids.xy_px) & (centroids.sigma_px < VAGUE_PX) & (centroids.flux > 0)
-    return centroids if sound.all() else centroids.take(sound)
+    valid = camera.contains(centroids.xy_px) & (centroids.sigma_px < MAX_CENTROID_SIGMA_PX) & (centroids.flux > 0)
+    return centroids if valid.all() else centroids.take(valid)
 
 
 def inflate_uncertainty(centroids: Centroids, blobs: Blobs, settings: Settings) -> Centroids:
     """The centroids with increased errors for saturated blobs and for blobs that touch bad pixels."""
     extra = SATURATED_SIGMA_PX * (blobs.flag & int(Flag.SATURATED) != 0)
     if settings.bad_px is not None and len(blobs):
-        bad = np.asarray(settings.bad_px)[:, None]
-        inside = np.all((bad >= blobs.box_px[:, :2] - 1) & (bad <= blobs.box_px[:, 2:] + 1), axis=2)
-        extra = np.where(inside.any(axis=0), np.hypot(extra, MENDED_SIGMA_PX), extra)
+        bad_px = np.asarray(settings.bad_px)[:, None]
+        inside = np.all((bad_px >= blobs.box_px[:, :2] - 1) & (bad_px <= blobs.box_px[:, 2:] + 1), axis=2)
+        extra = np.where(inside.any(axis=0), np.hypot(extra, BAD_PIXEL_SIGMA_PX), extra)
     if not extra.any():
         return centroids
-    spread = centroids.covariance_px2
-    if spread is not None:
-        spread = spread + (extra**2)[:, None, None] * np.eye(2)
-    return replace(centroids, sigma_px=np.hypot(centroids.sigma_px, extra), covariance_px2=spread)
+    covariance_px2 = centroids.covariance_px2
+    if covariance_px2 is not None:
+        covariance_px2 = covariance_px2 + (extra**2)[:, None, None] * np.eye(2)
+    return replace(centroids, sigma_px=np.hypot(centroids.sigma_px, extra), covariance_px2=covariance_px2)
 
 
 def process_frame(

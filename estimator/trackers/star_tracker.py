@@ -11,6 +11,7 @@ from __future__ import annotations
 import datetime
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,20 +25,41 @@ from estimator.core.arrays import Floats, Ints
 from estimator.core.camera import Camera
 from estimator.core.errors import ImageError
 from estimator.core.types import Attitude, Centroids, StarMatch
-from estimator.identification.chance import ACCEPT_LOG10_CHANCE, MIN_MATCHES, log10_tail
+from estimator.identification.chance import (
+    ACCEPT_LOG10_CHANCE,
+    MIN_EVIDENCE_MATCHES,
+    MIN_MATCHES,
+    log10_tail,
+)
 from estimator.identification.registry import IDENTIFIERS
 from estimator.identification.stars import search
-from estimator.identification.stars.evidence import LEAST, Detections, Solution
+from estimator.identification.stars.evidence import Detections, Solution
 from estimator.trackers.pipeline import Clock, Report, Settings, brightest, direction_sigma_rad, process_frame
 
 NO_STARS = "too few stars detected"
 NO_MATCH = "no identification beyond chance"
-LEAST_ERROR_PX = 0.02  # least centroid error of a star, for uncalibrated effects
-# Error model and effort of one search: extra centroid error in px, error as a fraction of the distance from the
-# principal point, and greatest number of star look-ups: 400,000 take about 0.02 s.
-Lens = tuple[float, float, int]
-KNOWN_LENS: tuple[Lens, ...] = ((LEAST_ERROR_PX, 0.0, 400_000),)
-UNKNOWN_LENS: tuple[Lens, ...] = ((0.5, 0.0, 200_000), (1.0, 0.005, 600_000), (2.0, 0.01, 300_000))
+MIN_ERROR_PX = 0.02  # least centroid error of a star, for uncalibrated effects
+
+
+class SearchModel(NamedTuple):
+    """Error model and effort of one search.
+
+    min_error_px   : least centroid error
+    relative_error : additional error, as a fraction of the distance from the principal point
+    max_checks     : greatest number of star look-ups; 400,000 take about 0.02 s
+    """
+
+    min_error_px: float
+    relative_error: float
+    max_checks: int
+
+
+CALIBRATED_SEARCHES = (SearchModel(MIN_ERROR_PX, 0.0, 400_000),)
+UNCALIBRATED_SEARCHES = (
+    SearchModel(0.5, 0.0, 200_000),
+    SearchModel(1.0, 0.005, 600_000),
+    SearchModel(2.0, 0.01, 300_000),
+)
 # A detection brighter than its star by this much is a mismatch: more than colors, variables and doubles explain.
 TOO_BRIGHT_MAG = 2.0
 CORNERS = np.array([[0, 0], [1, 0], [0, 1], [1, 1]])
@@ -64,28 +86,26 @@ class StarTracker:
     ) -> None:
         self.camera, self.settings = camera, settings
         self.focal_uncertainty = focal_uncertainty
-        self.lenses = UNKNOWN_LENS if focal_uncertainty else KNOWN_LENS
-        listed = replace(stars, vectors=vectors)
-        self.stars = catalog.merge_doubles(listed, settings.merge_px / camera.focal_px)
+        self.searches: tuple[SearchModel, ...] = UNCALIBRATED_SEARCHES if focal_uncertainty else CALIBRATED_SEARCHES
+        apparent_stars = replace(stars, vectors=vectors)
+        self.stars = catalog.merge_doubles(apparent_stars, settings.merge_px / camera.focal_px)
         self.tree = cKDTree(self.stars.vectors)
         field_sr = camera.width_px * camera.height_px / camera.focal_px**2
-        bright = self.stars.take(
+        index_stars = self.stars.take(
             self.stars.v_mag <= catalog.limit_for_density(self.stars, field_sr, settings.field_stars)
         )
         widest_rad = camera.zoomed(1 - focal_uncertainty).diagonal_rad
-        self.sky = sky_index.unpaired(self.stars.vectors, self.stars.v_mag)
-        self.patterns: sky_index.Sky | None = None
+        self.sky = sky_index.build_without_pairs(self.stars.vectors, self.stars.v_mag)
+        self.patterns: sky_index.SkyIndex | None = None
         self.index: pair_index.PairIndex | None = None
         if settings.identifier == "default":
-            self.patterns = sky_index.sky_of(bright.vectors, bright.v_mag, widest_rad * 1.02)
+            self.patterns = sky_index.build(index_stars.vectors, index_stars.v_mag, widest_rad * 1.02)
             self.pairs = len(self.patterns.pair)
         else:
-            self.index = pair_index.build(bright.vectors, widest_rad * 1.02)
+            self.index = pair_index.build(index_stars.vectors, widest_rad * 1.02)
             self.pairs = len(self.index.pair)
         corners = camera.tangents(CORNERS * [camera.width_px, camera.height_px] - 0.5)
-        self.field = np.array(
-            [corners[:, 0].min(), corners[:, 0].max(), corners[:, 1].min(), corners[:, 1].max()]
-        )
+        self.field = np.array([corners[:, 0].min(), corners[:, 0].max(), corners[:, 1].min(), corners[:, 1].max()])
 
     @classmethod
     def for_sky(
@@ -110,10 +130,8 @@ class StarTracker:
             try:
                 date = datetime.datetime.fromisoformat(date)
             except ValueError:
-                raise ImageError(
-                    f"date: {date!r} is not ISO 8601; allowed: such as 2012-06-22T21:00"
-                ) from None
-        stars = catalog.brighter(stars or catalog.hipparcos(), limit_mag)
+                raise ImageError(f"date: {date!r} is not ISO 8601; allowed: for example 2012-06-22T21:00") from None
+        stars = catalog.brighter_than(stars or catalog.hipparcos(), limit_mag)
         vectors = catalog.apparent(stars, catalog.on_earth(date))
         return cls(camera, stars, vectors, settings, focal_uncertainty)
 
@@ -127,31 +145,29 @@ class StarTracker:
     @property
     def efforts(self) -> int:
         """Number of searches, with different error models and efforts, that are made before a frame is given up."""
-        return len(self.lenses) if self.patterns is not None else 1
+        return len(self.searches) if self.patterns is not None else 1
 
-    def solve_centroids(
-        self, centroids: Centroids, clock: Clock | None = None, effort: int | None = None
-    ) -> Attitude:
+    def solve_centroids(self, centroids: Centroids, clock: Clock | None = None, effort: int | None = None) -> Attitude:
         """Identify and solve centroids from any source (the truth included).
 
         effort : run only this one of the `efforts` searches, from 0; None: all of them in turn
         """
         clock = clock or Clock()
-        if len(centroids) < LEAST:
+        if len(centroids) < MIN_EVIDENCE_MATCHES:
             return Attitude(NO_STARS)
         if self.patterns is not None:
-            lenses = self.lenses if effort is None else self.lenses[effort : effort + 1]
-            return self._by_evidence(centroids, self.patterns, lenses, clock)
-        for camera, cam_from_ref in self._lost_in_space(centroids):
+            searches = self.searches if effort is None else self.searches[effort : effort + 1]
+            return self._identify_by_evidence(centroids, self.patterns, searches, clock)
+        for camera, cam_from_ref in self._candidates(centroids):
             clock.lap("identify")
-            attitude = self._refined(centroids, camera, cam_from_ref)
+            attitude = self._refine(centroids, camera, cam_from_ref)
             clock.lap("solve")
             if attitude.solved:
                 return attitude
         clock.lap("identify")
         return Attitude(NO_MATCH)
 
-    def solve_named(self, centroids: Centroids, observed: Ints, star: Ints) -> Attitude:
+    def solve_matches(self, centroids: Centroids, observed: Ints, star: Ints) -> Attitude:
         """Solve the attitude for given matches from any source (the truth included), without identification.
 
         observed, star : (K,) rows of the centroids and of `self.stars`, K >= 2
@@ -174,15 +190,15 @@ class StarTracker:
             self.camera,
         )
 
-    def sigma_px(self, centroids: Centroids, loose_px: float = LEAST_ERROR_PX, slack: float = 0.0) -> Floats:
-        """(N,) total centroid error: its own, a floor, and slack times the distance from the principal point."""
-        sigma_px = np.hypot(centroids.sigma_px, max(self.settings.centroid_sigma_px, loose_px))
-        if slack == 0:
+    def sigma_px(self, centroids: Centroids, min_error_px: float = MIN_ERROR_PX, relative_error: float = 0.0) -> Floats:
+        """(N,) total centroid error: its own, a floor, and relative_error times the distance from the image center."""
+        sigma_px = np.hypot(centroids.sigma_px, max(self.settings.centroid_sigma_px, min_error_px))
+        if relative_error == 0:
             return sigma_px
-        from_middle_px = np.linalg.norm(centroids.xy_px - self.camera.centre_px, axis=1)
-        return np.hypot(sigma_px, slack * from_middle_px)
+        radius_px = np.linalg.norm(centroids.xy_px - self.camera.center_px, axis=1)
+        return np.hypot(sigma_px, relative_error * radius_px)
 
-    def lights(self, centroids: Centroids, sigma_px: Floats) -> Detections:
+    def detections(self, centroids: Centroids, sigma_px: Floats) -> Detections:
         """The centroids as input of the search, with magnitudes if the zero point is known.
 
         sigma_px : (N,) total errors
@@ -204,46 +220,53 @@ class StarTracker:
             self.focal_uncertainty,
         )
 
-    def _by_evidence(
-        self, centroids: Centroids, patterns: sky_index.Sky, lenses: tuple[Lens, ...], clock: Clock
+    def _identify_by_evidence(
+        self,
+        centroids: Centroids,
+        patterns: sky_index.SkyIndex,
+        searches: tuple[SearchModel, ...],
+        clock: Clock,
     ) -> Attitude:
         """Solve by the default identifier; if the focal length is uncertain, then fit the lens to all stars.
 
-        If that fit fails, the fix itself is returned for a search without slack; with slack the next search follows.
+        If that fit fails, a search without relative_error returns the solution; otherwise the next search follows.
         """
-        for loose_px, slack, checks in lenses:
-            sigma_px = self.sigma_px(centroids, loose_px, slack)
+        for min_error_px, relative_error, checks in searches:
+            sigma_px = self.sigma_px(centroids, min_error_px, relative_error)
             base = self.settings.base_stars
-            fix = search.lost_in_space(self.lights(centroids, sigma_px), patterns, self.sky, base, checks)
+            solution = search.lost_in_space(self.detections(centroids, sigma_px), patterns, self.sky, base, checks)
             clock.lap("identify")
-            if not len(fix.star):
+            if not len(solution.star):
                 continue
-            found = self.attitude_of(centroids, fix, sigma_px)
+            attitude = self.attitude_of(centroids, solution, sigma_px)
             if self.focal_uncertainty:
-                fitted = self._refined(
-                    centroids, self.camera.zoomed(fix.zoom), Rotation.from_quat(fix.cam_from_ref_xyzw)
+                fitted = self._refine(
+                    centroids,
+                    self.camera.zoomed(solution.focal_ratio),
+                    Rotation.from_quat(solution.cam_from_ref_xyzw),
                 )
-                found = found if not (fitted.solved or slack) else fitted
+                attitude = attitude if not (fitted.solved or relative_error) else fitted
             clock.lap("solve")
-            if found.solved:
-                return found
+            if attitude.solved:
+                return attitude
         return Attitude(NO_MATCH)
 
-    def attitude_of(self, centroids: Centroids, fix: Solution, sigma_px: Floats) -> Attitude:
-        """The attitude of a fix; solved again from its matches if the settings name another solver."""
-        camera = self.camera.zoomed(fix.zoom) if self.focal_uncertainty else self.camera
-        cam_from_ref, covariance_rad2 = Rotation.from_quat(fix.cam_from_ref_xyzw), fix.covariance_rad2
+    def attitude_of(self, centroids: Centroids, solution: Solution, sigma_px: Floats) -> Attitude:
+        """The attitude of a solution; solved again from its matches if the settings name another solver."""
+        camera = self.camera.zoomed(solution.focal_ratio) if self.focal_uncertainty else self.camera
+        cam_from_ref = Rotation.from_quat(solution.cam_from_ref_xyzw)
+        covariance_rad2 = solution.covariance_rad2
         solver = self.settings.solver
         if solver != "default":
-            rays, vectors = camera.rays(centroids.xy_px[fix.observed]), self.stars.vectors[fix.star]
-            sigma_rad = sigma_px[fix.observed] / camera.focal_px
+            rays, vectors = camera.rays(centroids.xy_px[solution.observed]), self.stars.vectors[solution.star]
+            sigma_rad = sigma_px[solution.observed] / camera.focal_px
             cam_from_ref = SOLVERS[solver](rays, vectors, sigma_rad)
             covariance_rad2 = covariance(rays, sigma_rad, solver)
-        match = StarMatch(fix.observed, fix.star, cam_from_ref, -fix.dex)
-        rms_px = fix.rms * self.camera.focal_px
+        match = StarMatch(solution.observed, solution.star, cam_from_ref, -solution.dex)
+        rms_px = solution.rms * self.camera.focal_px
         return Attitude("solved", cam_from_ref, covariance_rad2, match, rms_px, camera)
 
-    def _lost_in_space(self, centroids: Centroids) -> Iterator[tuple[Camera, Rotation]]:
+    def _candidates(self, centroids: Centroids) -> Iterator[tuple[Camera, Rotation]]:
         """Candidate attitudes and cameras by the published identifier that the settings name.
 
         If the focal length is uncertain, its interval is searched in steps of 2 %, first with little effort at all
@@ -251,21 +274,19 @@ class StarTracker:
         """
         identify = IDENTIFIERS[self.settings.identifier]
         step, stretch = 0.02, 0.011 if self.focal_uncertainty else 5e-4
-        reach = int(np.ceil(self.focal_uncertainty / step - 0.5))
-        zooms = sorted((n * step for n in range(-reach, reach + 1)), key=abs)
-        few = brightest(centroids, self.settings)
+        steps = int(np.ceil(self.focal_uncertainty / step - 0.5))
+        zooms = sorted((n * step for n in range(-steps, steps + 1)), key=abs)
+        bright_centroids = brightest(centroids, self.settings)
         for triangles, checks in ((60, 1_500_000), (600, 3_000_000), (3000, 4_000_000)):
             for zoom in zooms:
                 camera = self.camera.zoomed(1 + zoom)
-                tolerance_rad = (
-                    max(1.5 if reach else 1.0, 4 * self.settings.centroid_sigma_px) / camera.focal_px
-                )
+                tolerance_rad = max(1.5 if steps else 1.0, 4 * self.settings.centroid_sigma_px) / camera.focal_px
                 match = identify(
-                    camera.rays(few.xy_px),
+                    camera.rays(bright_centroids.xy_px),
                     self.index,
                     tolerance_rad,
                     stretch=stretch,
-                    zooms=reach > 0,
+                    focal_unknown=steps > 0,
                     max_triangles=triangles,
                     max_checks=checks,
                     base_stars=self.settings.base_stars,
@@ -273,22 +294,22 @@ class StarTracker:
                 if match:
                     yield camera, match.cam_from_ref
 
-    def _refined(self, centroids: Centroids, camera: Camera, cam_from_ref: Rotation) -> Attitude:
+    def _refine(self, centroids: Centroids, camera: Camera, cam_from_ref: Rotation) -> Attitude:
         """Refine an attitude: match the field to the full catalog and fit, with decreasing radii; test against chance.
 
         If the focal length is uncertain, each round also fits the camera (`fit_camera`), and the result must be within
         1.2 times the uncertainty.
         """
-        fits = self.focal_uncertainty > 0
+        fit_lens = self.focal_uncertainty > 0
         reach_px = np.hypot(camera.width_px, camera.height_px) / 2
         # With an uncertain lens the first radii allow for its error at the corner; each fit permits a smaller radius.
-        radii_px = [0.008 * reach_px + 2, 0.004 * reach_px + 2, 4, 3, 2.5, 2.5] if fits else [3, 2.5, 2.5]
+        radii_px = [0.008 * reach_px + 2, 0.004 * reach_px + 2, 4, 3, 2.5, 2.5] if fit_lens else [3, 2.5, 2.5]
         for radius_px in radii_px:
             observed, star = self._nearest(centroids, camera, cam_from_ref, radius_px)
             if len(observed) < MIN_MATCHES:
                 return Attitude(NO_MATCH)
             xy, vectors = centroids.xy_px[observed], self.stars.vectors[star]
-            if fits:
+            if fit_lens:
                 camera, cam_from_ref = fit_camera(camera, cam_from_ref, xy, vectors)
             sigma_rad = direction_sigma_rad(centroids.take(observed), camera, self.settings)
             rays = camera.rays(xy)
@@ -322,9 +343,7 @@ class StarTracker:
     def in_field(self, camera: Camera, cam_from_ref: Rotation) -> tuple[NDArray, Floats]:
         """Rows and pixels of the catalog stars on the sensor, brightest first."""
         boresight = cam_from_ref.inv().apply([0.0, 0.0, 1.0])
-        rows = np.array(
-            self.tree.query_ball_point(boresight, 2 * np.sin(camera.diagonal_rad / 4) * 1.05), int
-        )
+        rows = np.array(self.tree.query_ball_point(boresight, 2 * np.sin(camera.diagonal_rad / 4) * 1.05), int)
         rows.sort()
         xy = camera.pixels(cam_from_ref.apply(self.stars.vectors[rows])) if len(rows) else np.empty((0, 2))
         inside = camera.contains(xy, -2.0)
@@ -335,15 +354,15 @@ class StarTracker:
     ) -> tuple[NDArray, NDArray]:
         """Mutual nearest neighbors of centroids and catalog stars within a radius, without much too bright ones."""
         rows, xy = self.in_field(camera, cam_from_ref)
-        observed, star = mutual(centroids.xy_px, xy, radius_px, rows)
+        observed, star = mutual_nearest(centroids.xy_px, xy, radius_px, rows)
         if len(star) < MIN_MATCHES:
             return observed, star
         # The zero point from each match is about the same for all stars; saturation loses flux and makes it smaller.
         # One far above the median is a planet, a lamp or a reflection near a faint star.
         zero_mag = self.stars.v_mag[star] + 2.5 * np.log10(centroids.flux[observed])
-        off = zero_mag - np.median(zero_mag)
-        own = off < max(TOO_BRIGHT_MAG, 4 * float(np.median(np.abs(off))))
-        return observed[own], star[own]
+        excess_mag = zero_mag - np.median(zero_mag)
+        plausible = excess_mag < max(TOO_BRIGHT_MAG, 4 * float(np.median(np.abs(excess_mag))))
+        return observed[plausible], star[plausible]
 
 
 def log10_chance(
@@ -357,25 +376,25 @@ def log10_chance(
     choices.
     """
     p = 1 - np.exp(-predicted * np.pi * radius_px**2 / (camera.width_px * camera.height_px))
-    heads = [head for head in (15, 30, 60) if head < blobs] + [blobs]
-    tails = [log10_tail(max(head - 2, 0), int((observed < head).sum()) - 2, p) for head in heads]
-    return float(min(tails) + np.log10(len(heads)) + np.log10(patterns))
+    counts = [count for count in (15, 30, 60) if count < blobs] + [blobs]
+    tails = [log10_tail(max(count - 2, 0), int((observed < count).sum()) - 2, p) for count in counts]
+    return float(min(tails) + np.log10(len(counts)) + np.log10(patterns))
 
 
-def mutual(seen_px: Floats, predicted_px: Floats, radius_px: float, rows: NDArray) -> tuple[NDArray, NDArray]:
-    """Mutual nearest neighbors within a radius: indices of seen_px, and `rows` of the predictions."""
-    if not len(predicted_px) or not len(seen_px):
+def mutual_nearest(
+    observed_px: Floats, predicted_px: Floats, radius_px: float, rows: NDArray
+) -> tuple[NDArray, NDArray]:
+    """Mutual nearest neighbors within a radius: indices of observed_px, and `rows` of the predictions."""
+    if not len(predicted_px) or not len(observed_px):
         return np.empty(0, int), np.empty(0, int)
-    apart, nearest = cKDTree(predicted_px).query(seen_px, distance_upper_bound=radius_px)
-    _, back = cKDTree(seen_px).query(predicted_px)
-    hit = np.flatnonzero(np.isfinite(apart))
-    hit = hit[back[nearest[hit]] == hit]
-    return hit, rows[nearest[hit]]
+    distance, nearest = cKDTree(predicted_px).query(observed_px, distance_upper_bound=radius_px)
+    _, back = cKDTree(observed_px).query(predicted_px)
+    match = np.flatnonzero(np.isfinite(distance))
+    match = match[back[nearest[match]] == match]
+    return match, rows[nearest[match]]
 
 
-def fit_camera(
-    camera: Camera, cam_from_ref: Rotation, xy_px: Floats, vectors_ref: Floats
-) -> tuple[Camera, Rotation]:
+def fit_camera(camera: Camera, cam_from_ref: Rotation, xy_px: Floats, vectors_ref: Floats) -> tuple[Camera, Rotation]:
     """Fit attitude, focal length and (with 12 stars or more) the first radial distortion coefficient to the pixels.
 
     Robust least squares (soft L1 loss beyond one pixel), so that a wrong match has little effect on the lens.
@@ -390,8 +409,8 @@ def fit_camera(
         return lens, Rotation.from_rotvec(p[:3]) * cam_from_ref
 
     def residual(p: Floats) -> Floats:
-        lens, turned = model(p)
-        return np.nan_to_num(lens.pixels(turned.apply(vectors_ref)) - xy_px, nan=1e3).ravel()
+        lens, rotation = model(p)
+        return np.nan_to_num(lens.pixels(rotation.apply(vectors_ref)) - xy_px, nan=1e3).ravel()
 
     scale = np.array([1e-3, 1e-3, 1e-3, 1e-2, 0.3])[: len(start)]
     return model(least_squares(residual, start, loss="soft_l1", x_scale=scale, max_nfev=40).x)

@@ -22,6 +22,7 @@ from estimator.core.camera import check_shape
 from estimator.core.types import Attitude, Centroids, FramePriors, StarMatch
 from estimator.detection.classify import Flag
 from estimator.detection.windows import in_windows
+from estimator.identification.chance import MIN_EVIDENCE_MATCHES
 from estimator.identification.stars import evidence
 from estimator.identification.stars.search import ACCEPT_DEX
 from estimator.trackers.pipeline import Clock, Report, detect_and_centroid, inflate_uncertainty
@@ -62,7 +63,7 @@ class TrackedReport(Report):
 
 
 @dataclass(frozen=True, slots=True)
-class Memory:
+class LastSolution:
     """The last attitude, with its time and angular rate (camera axes at that time)."""
 
     t_s: float
@@ -75,17 +76,18 @@ class TrackingMode:
 
     tracker  : lost-in-space tracker with a calibrated camera; ValueError if its focal length is uncertain
     reach_px : half the side of a window: greatest error of the prediction
-    most     : greatest number of windows, for the brightest stars
-    stale_s  : greatest age of the last attitude for a prediction
+    max_windows : greatest number of windows, for the brightest stars
+    max_age_s   : greatest age of the last attitude for a prediction
     """
 
     def __init__(
-        self, tracker: StarTracker, reach_px: float = 8.0, most: int = 25, stale_s: float = 5.0
+        self, tracker: StarTracker, reach_px: float = 8.0, max_windows: int = 25, max_age_s: float = 5.0
     ) -> None:
         if tracker.focal_uncertainty:
-            raise ValueError("a Follower's tracker must know its camera; allowed: focal_uncertainty 0")
-        self.tracker, self.reach_px, self.most, self.stale_s = tracker, reach_px, most, stale_s
-        self.memory: Memory | None = None
+            raise ValueError(f"TrackingMode: focal_uncertainty is {tracker.focal_uncertainty}; allowed: 0")
+        self.tracker, self.reach_px = tracker, reach_px
+        self.max_windows, self.max_age_s = max_windows, max_age_s
+        self.last: LastSolution | None = None
 
     def solve(
         self,
@@ -99,31 +101,31 @@ class TrackingMode:
         now_from_then : cam(t_s) from cam at the last solved frame, from the gyros; None: the last rate is extrapolated
         streak_px     : (dx, dy) that stars move during the exposure, from the gyros
         """
-        predicted = self._predicted(t_s, now_from_then)
+        predicted = self._predict(t_s, now_from_then)
         clock = Clock()
         report = self._track(image, predicted, streak_px, clock) if predicted is not None else None
         if report is None:
             report = self._search(image, streak_px, clock)
-        self._remember(t_s, report.attitude.cam_from_ref)
+        self._store(t_s, report.attitude.cam_from_ref)
         return report
 
-    def _predicted(self, t_s: float, now_from_then: Rotation | None) -> Rotation | None:
+    def _predict(self, t_s: float, now_from_then: Rotation | None) -> Rotation | None:
         """Predicted cam_from_ref, or None without a recent attitude."""
-        memory = self.memory
-        if memory is None or not 0 <= t_s - memory.t_s <= self.stale_s:
+        last = self.last
+        if last is None or not 0 <= t_s - last.t_s <= self.max_age_s:
             return None
         if now_from_then is None:
-            now_from_then = Rotation.from_rotvec(memory.rate_rad_s * (t_s - memory.t_s))
-        return now_from_then * memory.cam_from_ref
+            now_from_then = Rotation.from_rotvec(last.rate_rad_s * (t_s - last.t_s))
+        return now_from_then * last.cam_from_ref
 
-    def _remember(self, t_s: float, cam_from_ref: Rotation | None) -> None:
+    def _store(self, t_s: float, cam_from_ref: Rotation | None) -> None:
         """Store the attitude and its rate. A frame without an attitude leaves the memory unchanged."""
         if cam_from_ref is None:
             return
-        last, rate_rad_s = self.memory, np.zeros(3)
-        if last is not None and 0 < t_s - last.t_s <= self.stale_s:
+        last, rate_rad_s = self.last, np.zeros(3)
+        if last is not None and 0 < t_s - last.t_s <= self.max_age_s:
             rate_rad_s = (cam_from_ref * last.cam_from_ref.inv()).as_rotvec() / (t_s - last.t_s)
-        self.memory = Memory(t_s, cam_from_ref, rate_rad_s)
+        self.last = LastSolution(t_s, cam_from_ref, rate_rad_s)
 
     def _track(
         self, image: NDArray, predicted: Rotation, streak_px: tuple[float, float] | None, clock: Clock
@@ -131,36 +133,36 @@ class TrackingMode:
         """Solve from the detections in windows; None if the evidence is below ACCEPT_DEX."""
         tracker = self.tracker
         check_shape(image.shape, tracker.camera)
-        expected_px = self.expected_px(predicted)
-        if len(expected_px) < evidence.LEAST:
+        window_centers_px = self.window_centers_px(predicted)
+        if len(window_centers_px) < MIN_EVIDENCE_MATCHES:
             return None
-        centroids, saturated = self._in_windows(image, expected_px, streak_px, clock)
-        if len(centroids) < evidence.LEAST:
+        centroids, saturated = self._in_windows(image, window_centers_px, streak_px, clock)
+        if len(centroids) < MIN_EVIDENCE_MATCHES:
             return None
         sigma_px = tracker.sigma_px(centroids)
-        lights = tracker.lights(centroids, sigma_px)
+        detections = tracker.detections(centroids, sigma_px)
         reach_rad = self.reach_px / tracker.camera.focal_px
         gates = np.full(len(centroids), 1.5 * reach_rad)  # covers a window's corner
-        guess = evidence.evaluate(lights, tracker.sky, predicted.as_matrix(), 1.0, gates, -np.inf)
+        hypothesis = evidence.evaluate(detections, tracker.sky, predicted.as_matrix(), 1.0, gates, -np.inf)
         # The prior volume of attitudes is not 8 pi^2 but that of the prediction: the boresight in a square of side
         # 2 reach_rad, the roll in an interval of 2 reach_rad over the half field.
         half = float(np.min(tracker.field[1::2] - tracker.field[::2])) / 2
-        spared = log10(8 * pi**2 / ((2 * reach_rad) ** 2 * min(2 * reach_rad / half, 2 * pi)))
-        if guess.dex + spared < ACCEPT_DEX:
+        prior_gain_dex = log10(8 * pi**2 / ((2 * reach_rad) ** 2 * min(2 * reach_rad / half, 2 * pi)))
+        if hypothesis.dex + prior_gain_dex < ACCEPT_DEX:
             return None
-        fix = evidence.fixed(lights, tracker.sky, guess)
-        attitude = tracker.attitude_of(centroids, fix._replace(dex=guess.dex + spared), sigma_px)
+        solution = evidence.build_solution(detections, tracker.sky, hypothesis)
+        attitude = tracker.attitude_of(centroids, solution._replace(dex=hypothesis.dex + prior_gain_dex), sigma_px)
         clock.lap("solve")
-        return self._told(attitude, centroids, sigma_px, clock, len(expected_px), saturated, streak_px)
+        return self._report(attitude, centroids, sigma_px, clock, len(window_centers_px), saturated, streak_px)
 
     def _search(self, image: NDArray, streak_px: tuple[float, float] | None, clock: Clock) -> TrackedReport:
         """Solve the whole frame lost in space."""
         tracker = self.tracker
         centroids = detect_and_centroid(image, tracker.camera, tracker.settings, clock, streak_px)
         attitude = tracker.solve_centroids(centroids, clock)
-        return self._told(attitude, centroids, tracker.sigma_px(centroids), clock, 0, False, streak_px)
+        return self._report(attitude, centroids, tracker.sigma_px(centroids), clock, 0, False, streak_px)
 
-    def expected_px(self, cam_from_ref: Rotation) -> Floats:
+    def window_centers_px(self, cam_from_ref: Rotation) -> Floats:
         """(N, 2) predicted pixels of the brightest stars whose windows are on the sensor.
 
         Of stars closer than reach_px only the brightest is kept.
@@ -168,30 +170,30 @@ class TrackingMode:
         tracker = self.tracker
         rows, xy = tracker.in_field(tracker.camera, cam_from_ref)
         inside = tracker.camera.contains(xy, self.reach_px)
-        xy = xy[inside][np.argsort(rows[inside])][: 2 * self.most]
-        apart = np.abs(xy[:, None] - xy).max(axis=2) < self.reach_px
-        shadowed = np.tril(apart, -1).any(axis=1)
-        return xy[~shadowed][: self.most]
+        xy = xy[inside][np.argsort(rows[inside])][: 2 * self.max_windows]
+        close = np.abs(xy[:, None] - xy).max(axis=2) < self.reach_px
+        shadowed = np.tril(close, -1).any(axis=1)
+        return xy[~shadowed][: self.max_windows]
 
     def _in_windows(
-        self, image: NDArray, expected_px: Floats, streak_px: tuple[float, float] | None, clock: Clock
+        self, image: NDArray, window_centers_px: Floats, streak_px: tuple[float, float] | None, clock: Clock
     ) -> tuple[Centroids, bool]:
         """Centroids of the detections in windows, and whether any of them is saturated."""
-        settings, hints = self.tracker.settings, FramePriors(streak_px, self.tracker.settings.saturation)
+        settings, priors = self.tracker.settings, FramePriors(streak_px, self.tracker.settings.saturation)
         if streak_px is not None and np.hypot(*streak_px) > LONGEST_STREAK_PX:
             centroids = detect_and_centroid(image, self.tracker.camera, settings, clock, streak_px)
-            near = np.abs(centroids.xy_px[:, None] - expected_px).max(axis=2) < self.reach_px
+            near = np.abs(centroids.xy_px[:, None] - window_centers_px).max(axis=2) < self.reach_px
             return centroids.take(near.any(axis=1)), False
-        blobs = in_windows(image, expected_px, self.reach_px, WINDOW_SIGMA, hints)
+        blobs = in_windows(image, window_centers_px, self.reach_px, WINDOW_SIGMA, priors)
         blobs = blobs.take(blobs.flag & settings.reject == 0)
         clock.lap("detect")
-        centroids = CENTROIDERS[settings.centroider](image, blobs, settings.gain_e_dn, hints)
+        centroids = CENTROIDERS[settings.centroider](image, blobs, settings.gain_e_dn, priors)
         centroids = inflate_uncertainty(centroids, blobs, settings)
         clock.lap("centroid")
-        sound = np.isfinite(centroids.sigma_px) & (centroids.flux > 0)
-        return centroids.take(sound), bool(np.any(blobs.flag & Flag.SATURATED))
+        valid = np.isfinite(centroids.sigma_px) & (centroids.flux > 0)
+        return centroids.take(valid), bool(np.any(blobs.flag & Flag.SATURATED))
 
-    def _told(
+    def _report(
         self,
         attitude: Attitude,
         centroids: Centroids,
@@ -206,8 +208,8 @@ class TrackingMode:
             return TrackedReport(attitude, centroids, clock.seconds)
         match: StarMatch = attitude.match
         vectors_cam = attitude.cam_from_ref.apply(self.tracker.stars.vectors[match.star])
-        off_px = self.tracker.camera.pixels(vectors_cam) - centroids.xy_px[match.observed]
-        chi2 = float(np.sum((off_px / sigma_px[match.observed][:, None]) ** 2))
+        residual_px = self.tracker.camera.pixels(vectors_cam) - centroids.xy_px[match.observed]
+        chi2 = float(np.sum((residual_px / sigma_px[match.observed][:, None]) ** 2))
         chi2_per_dof = chi2 / max(2 * len(match.star) - 3, 1)
         streak = float(np.hypot(*streak_px)) if streak_px is not None else 0.0
         health = Health.GOOD

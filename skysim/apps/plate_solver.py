@@ -1,11 +1,13 @@
 """Plate solver: right ascension, declination and roll of image files from any camera, lost in space.
 
 If the field of view is known (a camera file, an OpenCV calibration or `--fov`), one `StarTracker` solves the image.
-If it is unknown, 5 to 40 degrees are split into TRACKERS overlapping ranges of focal length in geometric
-progression, each searched by a tracker that fits the focal length within its range. The image's stars are detected
-once; all trackers are tried with little effort before any is tried with more. The solution with the lowest
-probability of being due to chance is accepted only if it is significant after division of the significance level by
-the number of trackers (Bonferroni), and if it beats every solution elsewhere on the sky by MARGIN_DEX.
+Otherwise 5 to 40 degrees are split into N overlapping ranges of focal length in geometric progression, each searched
+by a tracker that fits the focal length within its range. The image's stars are detected once; all trackers are tried
+with little effort before any is tried with more.
+
+Every tracker is one more opportunity for a false match. With P the probability that the best match is due to chance,
+it is accepted if P <= P_accept / N (Bonferroni), and if no solution elsewhere on the sky has a P less than 1000 times
+as large (`FieldSearch.margin_dex`).
 """
 
 from __future__ import annotations
@@ -14,7 +16,7 @@ import datetime
 import math
 import time
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.attitude.solvers import SOLVERS
-from estimator.catalog import catalog
+from estimator.catalog import catalog as star_catalog
 from estimator.centroiding.centroid import CENTROIDERS
 from estimator.core.camera import Camera
 from estimator.core.errors import ImageError
@@ -34,30 +36,45 @@ from estimator.trackers.pipeline import Clock, Report, Settings, detect_and_cent
 from estimator.trackers.star_tracker import NO_MATCH, StarTracker
 from skysim.camera.detector.detector import saturation_dn
 from skysim.core import files, images
-from skysim.core.errors import InputError
-from skysim.core.paths import CATALOGUES
-from skysim.core.units import require_member
-from skysim.results import report
+from skysim.core.errors import InputError, unknown_name
+from skysim.core.paths import CATALOGS
+from skysim.results.report import annotate
 from skysim.scene import loader, scene
 from skysim.scene import opencv_calibration as opencv
-from skysim.scene.camera import CameraConfig as CameraPart
+from skysim.scene.camera import CameraConfig
 from skysim.tracking.onboard_model import calibration
 
-CALIBRATED_UNCERTAINTY = (
-    0.003  # relative; an OpenCV chessboard calibration gives the focal length to about 0.1 %
-)
-FOV_UNCERTAINTY = 0.055  # relative; the 5 % that the user is asked for, plus 0.5 % for how it was measured
-PHOTO_EPOCH = datetime.datetime(2020, 1, 1, 12)
+# Relative uncertainty of the focal length. An OpenCV chessboard calibration gives it to about 0.1 %.
+CALIBRATED_UNCERTAINTY = 0.003
+FOV_UNCERTAINTY = 0.055  # 5 % that --fov allows, plus 0.5 % for the definition of the field of view
+DEFAULT_EPOCH = datetime.datetime(2020, 1, 1, 12)
 
-# Horizontal fields of view searched if none is given, and the number of trackers that share the range. The ranges are
-# wide because one index of star pairs serves fields 1.5 times as wide, and a search takes as long for a narrow range.
-WIDEST_DEG, NARROWEST_DEG = 40.0, 5.0
-TRACKERS = 5
-OVERLAP = 0.01  # of the focal length
-DECISIVE_LOG10_CHANCE = -10.0  # a solution below this ends the search without trying other fields of view
-MARGIN_DEX = 3.0  # by which a solution must beat those with another attitude
-SAME_RAD = math.radians(0.2)
 
+@dataclass(frozen=True, slots=True)
+class FieldSearch:
+    """Options of the search over unknown horizontal fields of view.
+
+    The ranges are wide because one index of star pairs serves fields 1.5 times as wide, and a search takes as long
+    for a narrow range.
+
+    widest_deg, narrowest_deg : limits of the fields of view
+    trackers   : number of trackers that share this range
+    overlap    : of neighboring ranges, as a fraction of the focal length
+    decisive_log10_chance : a solution below this ends the search without trying other fields of view
+    margin_dex : by which a solution must beat those with another attitude
+    same_attitude_rad : solutions that differ by less than this are the same
+    """
+
+    widest_deg: float = 40.0
+    narrowest_deg: float = 5.0
+    trackers: int = 5
+    overlap: float = 0.01
+    decisive_log10_chance: float = -10.0
+    margin_dex: float = 3.0
+    same_attitude_rad: float = math.radians(0.2)
+
+
+FIELD_SEARCH = FieldSearch()
 STAGES: dict[str, Mapping[str, object]] = {
     "detector": DETECTORS,
     "centroider": CENTROIDERS,
@@ -73,70 +90,63 @@ class Solver:
 
     time_utc : when the images were taken; None takes the date of each FITS header. Without any date the epoch is
         2020, and stellar aberration (20") is left out because its direction depends on the season.
-    built    : cache of the trackers for the last image size and time
+    tracker_cache : the trackers for the last image size and date
     """
 
     fov_deg: float | None
-    camera: CameraPart | None
-    stars: catalog.StarCatalog
+    camera: CameraConfig | None
+    stars: star_catalog.StarCatalog
     settings: Settings
     time_utc: datetime.datetime | None = None
-    calibrated: opencv.Calibration | None = None
-    built: dict[Any, dict[Camera, StarTracker]] = field(default_factory=dict, compare=False, repr=False)
+    opencv_calibration: opencv.Calibration | None = None
+    tracker_cache: dict[Any, dict[Camera, StarTracker]] = field(default_factory=dict, compare=False, repr=False)
 
-    def beliefs(self, width_px: int, height_px: int) -> list[tuple[Camera, float]]:
+    def candidate_cameras(self, width_px: int, height_px: int) -> list[tuple[Camera, float]]:
         """Cameras to try for this image size, each with its relative focal-length uncertainty, the likeliest first."""
         if self.camera:
             return [(calibration(self.camera), 0.0)]
-        if self.calibrated:
-            told = self.calibrated
-            camera = Camera(told.width_px, told.height_px, told.focal_px, told.centre_px, told.distortion)
+        if lens := self.opencv_calibration:
+            camera = Camera(lens.width_px, lens.height_px, lens.focal_px, lens.center_px, lens.distortion)
             return [(camera, CALIBRATED_UNCERTAINTY)]
         if self.fov_deg:
             return [(Camera.from_fov(width_px, height_px, math.radians(self.fov_deg)), FOV_UNCERTAINTY)]
-        widest, narrowest = (math.tan(math.radians(deg) / 2) for deg in (WIDEST_DEG, NARROWEST_DEG))
-        ratio = (widest / narrowest) ** (1 / TRACKERS)
-        from_middle_out = sorted(range(TRACKERS), key=lambda n: abs(n - (TRACKERS - 1) / 2))
+        limits_deg, count = (FIELD_SEARCH.widest_deg, FIELD_SEARCH.narrowest_deg), FIELD_SEARCH.trackers
+        widest, narrowest = (math.tan(math.radians(deg) / 2) for deg in limits_deg)
+        ratio = (widest / narrowest) ** (1 / count)
+        from_middle_out = sorted(range(count), key=lambda n: abs(n - (count - 1) / 2))
         # A tracker of focal length f covers f (1 - u) to f (1 + u): u = (ratio - 1) / (ratio + 1) makes neighbors meet.
         uncertainty = (ratio - 1) / (ratio + 1)
         # Half-field tangents: range n begins at widest / ratio^n, where the focal length is f (1 - u).
         tangents = [widest / ratio**n * (1 - uncertainty) for n in from_middle_out]
         return [
-            (Camera.from_fov(width_px, height_px, 2 * math.atan(tangent)), uncertainty + OVERLAP)
+            (Camera.from_fov(width_px, height_px, 2 * math.atan(tangent)), uncertainty + FIELD_SEARCH.overlap)
             for tangent in tangents
         ]
 
-    def trackers(
-        self, width_px: int, height_px: int, taken: datetime.datetime | None
-    ) -> Iterator[StarTracker]:
+    def trackers(self, width_px: int, height_px: int, date_utc: datetime.datetime | None) -> Iterator[StarTracker]:
         """Yield the trackers for an image of this size and date: one, or one per range of fields of view.
 
         Trackers are built when first needed and cached until an image of another size or date comes.
         """
-        taken = self.time_utc or taken
-        if (width_px, height_px, taken) not in self.built:
-            self.built.clear()  # keep the trackers of one image size and date only
-        ready = self.built.setdefault((width_px, height_px, taken), {})
-        for believed, uncertainty in self.beliefs(width_px, height_px):
-            if believed not in ready:
+        date_utc = self.time_utc or date_utc
+        if (width_px, height_px, date_utc) not in self.tracker_cache:
+            self.tracker_cache.clear()  # keep the trackers of one image size and date only
+        cached = self.tracker_cache.setdefault((width_px, height_px, date_utc), {})
+        for camera, uncertainty in self.candidate_cameras(width_px, height_px):
+            if camera not in cached:
                 vectors = (
-                    catalog.apparent(self.stars, catalog.on_earth(taken))
-                    if taken
-                    else catalog.at_epoch(self.stars, PHOTO_EPOCH.year)
+                    star_catalog.apparent(self.stars, star_catalog.on_earth(date_utc))
+                    if date_utc
+                    else star_catalog.at_epoch(self.stars, DEFAULT_EPOCH.year)
                 )
-                ready[believed] = StarTracker(believed, self.stars, vectors, self.settings, uncertainty)
-            yield ready[believed]
-
-
-def named_scene(path: Path) -> Path:
-    """Return the file's path, or that of the shipped scene of this name. Raises InputError with the allowed names."""
-    return path if path.suffix or path.exists() else loader.find(str(path))
+                cached[camera] = StarTracker(camera, self.stars, vectors, self.settings, uncertainty)
+            yield cached[camera]
 
 
 def make_solver(
     fov_deg: float | None,
     camera_file: Path | None,
-    catalogue: str = "hipparcos_hp6.5",
+    catalog: str = "hipparcos_hp6.5",
     time_utc: datetime.datetime | None = None,
     stages: Mapping[str, str] | None = None,
 ) -> Solver:
@@ -148,37 +158,41 @@ def make_solver(
         raise InputError("give either --fov DEG or --camera FILE")
     if fov_deg is not None and not 1 <= fov_deg <= 120:
         raise InputError(f"--fov {fov_deg:g}: allowed: the horizontal field of view, 1 to 120 degrees")
-    time_utc, doubt = believable(time_utc)
-    if doubt:
-        raise InputError(f"--time: {doubt}")
-    named = {stage: known(stage, name) for stage, name in (stages or {}).items()}
-    calibrated = opencv.read(camera_file) if camera_file and opencv.is_one(camera_file) else None
-    camera = loader.load_camera(named_scene(camera_file)) if camera_file and not calibrated else None
+    time_utc, warning = validated_date(time_utc)
+    if warning:
+        raise InputError(f"--time: {warning}")
+    algorithms = {stage: require_algorithm(stage, name) for stage, name in (stages or {}).items()}
+    opencv_calibration = (
+        opencv.read(camera_file) if camera_file and opencv.looks_like_calibration(camera_file) else None
+    )
+    camera = None
+    if camera_file and not opencv_calibration:
+        is_file = camera_file.suffix or camera_file.exists()  # else the name of a shipped scene
+        camera = loader.load_camera(camera_file if is_file else loader.find(str(camera_file)))
     settings = Settings()
     if camera:
         settings = Settings(gain_e_dn=camera.detector.gain_e_dn, saturation=saturation_dn(camera.detector))
-    settings = replace(settings, **named)  # type: ignore[arg-type]
+    settings = replace(settings, **algorithms)  # type: ignore[arg-type]
     try:
-        stars = catalog.read(CATALOGUES / f"{catalogue}.ecsv")
+        stars = star_catalog.read(CATALOGS / f"{catalog}.ecsv")
     except ImageError as error:
         raise InputError(f"{error}; make it with: skysim catalog build") from None
-    return Solver(fov_deg, camera, stars, settings, time_utc, calibrated)
+    return Solver(fov_deg, camera, stars, settings, time_utc, opencv_calibration)
 
 
-def believable(taken: datetime.datetime | None) -> tuple[datetime.datetime | None, str]:
+def validated_date(date_utc: datetime.datetime | None) -> tuple[datetime.datetime | None, str]:
     """Return (date in UTC, ""), or (None, reason) for a date outside the supported range; (None, "") without a date."""
     try:
-        return (scene.in_our_time(taken) if taken else None), ""
+        return (scene.check_year(date_utc) if date_utc else None), ""
     except ValueError as error:
         return None, str(error)
 
 
-def known(stage: str, name: str) -> str:
+def require_algorithm(stage: str, name: str) -> str:
     """Return the name if the stage has such an algorithm. Raises InputError with the allowed names."""
-    try:
-        return require_member(name, STAGES[stage])
-    except ValueError as error:
-        raise InputError(f"--{stage}: {error}") from None
+    if name not in STAGES[stage]:
+        raise InputError(f"--{stage}: {unknown_name(stage, name, STAGES[stage])}")
+    return name
 
 
 @dataclass(frozen=True, slots=True)
@@ -190,16 +204,16 @@ class PlateSolution:
     matches         : number of identified stars;  rms_arcsec : rms of their residuals
     """
 
-    status: str
-    ra_deg: float | None
-    dec_deg: float | None
-    roll_deg: float | None
-    fov_deg: float | None
-    matches: int
-    rms_arcsec: float | None
+    status: str = ""
+    ra_deg: float | None = None
+    dec_deg: float | None = None
+    roll_deg: float | None = None
+    fov_deg: float | None = None
+    matches: int = 0
+    rms_arcsec: float | None = None
 
 
-def solve_image(
+def solve(
     path: str | Path,
     *,
     fov_deg: float | None = None,
@@ -214,95 +228,82 @@ def solve_image(
 
     Raises InputError with one line for an image that cannot be read.
     """
-    answer = solve(
-        Path(path), make_solver(fov_deg, Path(camera) if camera else None, time_utc=time_utc), None
-    )
-    if answer["bad_input"]:
-        raise InputError(answer["status"])
-    return PlateSolution(**{name.name: answer[name.name] for name in fields(PlateSolution)})
+    solver = make_solver(fov_deg, Path(camera) if camera else None, time_utc=time_utc)
+    result = solve_file(Path(path), solver, None)
+    if result["bad_input"]:
+        raise InputError(result["status"])
+    return PlateSolution(**{name.name: result[name.name] for name in fields(PlateSolution)})
 
 
-def solve(path: Path, solver: Solver, annotated: Path | None) -> dict[str, Any]:
+def solve_file(path: Path, solver: Solver, annotated: Path | None) -> dict[str, Any]:
     """Solve one file and return the fields of `skysim solve --json`. Writes the annotated PNG if `annotated` is given.
 
     An unreadable image does not raise, so that the files after it are still solved: its error line becomes `status`,
-    and `bad_input` is true (for the exit code). `doubt` says why the header's date was ignored, if it was.
+    and `bad_input` is true (for the exit code). `warning` says why the header's date was ignored, if it was.
     """
-    answer: dict[str, Any] = {
-        "file": str(path),
-        "status": "",
-        "ra_deg": None,
-        "dec_deg": None,
-        "roll_deg": None,
-        "fov_deg": None,
-        "matches": 0,
-        "rms_arcsec": None,
-        "time_ms": None,
-        "doubt": "",
-    }
+    result: dict[str, Any] = {"file": str(path), **asdict(PlateSolution()), "time_ms": None, "warning": ""}
     begin = time.perf_counter()
     try:
         image = images.read_image(path)
-        check(path, image, solver)
+        check_image(path, image, solver)
         image = images.monochrome(image)
         check_size(image)
-        taken, doubt = believable(images.date_of(path))
-        if doubt and not solver.time_utc:
-            answer["doubt"] = f"{path}: DATE-OBS {doubt}: left out"
-        found, tracker = look(image, solver, taken)
+        date_utc, warning = validated_date(images.read_date_obs(path))
+        if warning and not solver.time_utc:
+            result["warning"] = f"{path}: DATE-OBS {warning}: ignored"
+        report, tracker = solve_array(image, solver, date_utc)
     except (InputError, ImageError) as error:
         message = str(error)
-        answer["status"] = message if message.startswith(str(path)) else f"{path}: {message}"
-        return answer | {"bad_input": True}
-    answer["time_ms"] = 1e3 * (time.perf_counter() - begin)
-    answer |= {"status": found.attitude.status, "bad_input": False}
-    if found.attitude.solved:
-        answer |= solution(found)
+        result["status"] = message if message.startswith(str(path)) else f"{path}: {message}"
+        return result | {"bad_input": True}
+    result["time_ms"] = 1e3 * (time.perf_counter() - begin)
+    result |= {"status": report.attitude.status, "bad_input": False}
+    if report.attitude.solved:
+        result |= solution_fields(report)
     if annotated:
-        files.write_image(annotated, picture(image, found, tracker))
-    return answer
+        files.write_image(annotated, annotated_image(image, report, tracker))
+    return result
 
 
-def look(image: NDArray, solver: Solver, taken: datetime.datetime | None) -> tuple[Report, StarTracker]:
-    """Solve one monochrome image and return the report and the tracker that made it. taken : UTC, if known."""
+def solve_array(image: NDArray, solver: Solver, date_utc: datetime.datetime | None) -> tuple[Report, StarTracker]:
+    """Solve one monochrome image and return the report and the tracker that made it. date_utc : None if unknown."""
     height_px, width_px = image.shape
-    first = next(solver.trackers(width_px, height_px, taken))
-    if solver.camera or solver.calibrated or solver.fov_deg:
+    first = next(solver.trackers(width_px, height_px, date_utc))
+    if solver.camera or solver.opencv_calibration or solver.fov_deg:
         return first.solve(image), first
     clock = Clock()
-    centroids = detect_and_centroid(
-        image, first.camera, solver.settings, clock
-    )  # detection uses the camera's size only
+    centroids = detect_and_centroid(image, first.camera, solver.settings, clock)  # of the camera only the size is used
     for effort in range(first.efforts):  # try all fields of view quickly before trying any thoroughly
-        attitude, tracker = sought(centroids, solver.trackers(width_px, height_px, taken), clock, effort)
+        trackers = solver.trackers(width_px, height_px, date_utc)
+        attitude, tracker = best_attitude(centroids, trackers, clock, effort)
         if attitude.solved:
             break
     return Report(attitude, centroids, clock.seconds), tracker
 
 
-def sought(
+def best_attitude(
     centroids: Centroids, trackers: Iterator[StarTracker], clock: Clock, effort: int
 ) -> tuple[Attitude, StarTracker]:
     """Return the most significant attitude among those of trackers with different fields of view, and its tracker.
 
-    Each tracker is one more opportunity for a false match, so the accepted probability of chance is divided by
-    TRACKERS. The best attitude must also beat every different attitude by MARGIN_DEX; otherwise the result is NO_MATCH.
+    The accepted probability of chance is divided by the number of trackers. The best attitude must also beat every
+    different attitude by `margin_dex`; otherwise the result is NO_MATCH.
     """
-    found: list[tuple[Attitude, StarTracker]] = []
+    solutions: list[tuple[Attitude, StarTracker]] = []
     for tracker in trackers:
         attitude = tracker.solve_centroids(centroids, clock, effort)
-        if log10_chance(attitude) <= DECISIVE_LOG10_CHANCE:
+        if log10_chance(attitude) <= FIELD_SEARCH.decisive_log10_chance:
             return attitude, tracker
         if attitude.solved:
-            found.append((attitude, tracker))
-    if not found:
+            solutions.append((attitude, tracker))
+    if not solutions:
         return attitude, tracker
-    best, its = min(found, key=lambda one: log10_chance(one[0]))
-    # The same attitude found by neighboring trackers, whose ranges overlap, is no rival.
-    rivals = [log10_chance(one) for one, _ in found if not alike(one, best)]
-    share = ACCEPT_LOG10_CHANCE - math.log10(TRACKERS)  # Bonferroni correction for TRACKERS searches
-    beyond = log10_chance(best) <= min(share, min(rivals, default=0.0) - MARGIN_DEX)
-    return (best if beyond else Attitude(NO_MATCH)), its
+    best, best_tracker = min(solutions, key=lambda solution: log10_chance(solution[0]))
+    # The same attitude from neighboring trackers, whose ranges overlap, is no rival.
+    rivals = [log10_chance(other) for other, _ in solutions if not same_attitude(other, best)]
+    threshold = ACCEPT_LOG10_CHANCE - math.log10(FIELD_SEARCH.trackers)  # Bonferroni correction
+    significant = log10_chance(best) <= min(threshold, min(rivals, default=0.0) - FIELD_SEARCH.margin_dex)
+    return (best if significant else Attitude(NO_MATCH)), best_tracker
 
 
 def log10_chance(attitude: Attitude) -> float:
@@ -310,42 +311,38 @@ def log10_chance(attitude: Attitude) -> float:
     return attitude.match.log10_chance if attitude.match else 0.0
 
 
-def alike(one: Attitude, other: Attitude) -> bool:
-    """Return True if two solved attitudes differ by less than SAME_RAD."""
-    assert one.cam_from_ref is not None
-    assert other.cam_from_ref is not None
-    return bool((one.cam_from_ref * other.cam_from_ref.inv()).magnitude() < SAME_RAD)
+def same_attitude(first: Attitude, second: Attitude) -> bool:
+    """Return True if two solved attitudes differ by less than `same_attitude_rad`."""
+    assert first.cam_from_ref is not None
+    assert second.cam_from_ref is not None
+    return bool((first.cam_from_ref * second.cam_from_ref.inv()).magnitude() < FIELD_SEARCH.same_attitude_rad)
 
 
-def check(path: Path, image: NDArray, solver: Solver) -> None:
+def check_image(path: Path, image: NDArray, solver: Solver) -> None:
     """Check the image's size against the known camera, and for a scene's camera also its channels and bit depth.
 
     Raises InputError if the image cannot come from this camera.
     """
     camera = solver.camera
     if camera and image.ndim != 2:
-        raise InputError(f"{path}: a colour image of shape {image.shape}; this camera's are monochrome")
+        raise InputError(f"{path}: a color image of shape {image.shape}; this camera's are monochrome")
     if camera and image.dtype == np.uint8 and camera.detector.bits > 8:
         bits = camera.detector.bits
-        raise InputError(
-            f"{path}: an 8-bit image; this camera's have {bits} bits, in 16-bit FITS, PNG or TIFF"
-        )
-    known_size = camera or solver.calibrated
-    if known_size and image.shape[:2] != (known_size.height_px, known_size.width_px):
+        raise InputError(f"{path}: an 8-bit image; this camera's have {bits} bits, in 16-bit FITS, PNG or TIFF")
+    sensor = camera or solver.opencv_calibration
+    if sensor and image.shape[:2] != (sensor.height_px, sensor.width_px):
         size = f"{image.shape[1]}x{image.shape[0]}"
-        raise InputError(
-            f"{path}: {size} pixels; this camera's are {known_size.width_px}x{known_size.height_px}"
-        )
+        raise InputError(f"{path}: {size} pixels; this camera's are {sensor.width_px}x{sensor.height_px}")
 
 
-def solution(found: Report) -> dict[str, Any]:
+def solution_fields(report: Report) -> dict[str, Any]:
     """Fields of a solved image for the JSON output; the angles are those of the image center."""
-    attitude = found.attitude
+    attitude = report.attitude
     assert attitude.cam_from_ref is not None
     assert attitude.match is not None
     camera = attitude.camera
     assert camera is not None
-    ra, dec, roll = np.degrees(ra_dec_roll_rad(at_middle(camera) * attitude.cam_from_ref))
+    ra, dec, roll = np.degrees(ra_dec_roll_rad(center_from_cam(camera) * attitude.cam_from_ref))
     return {
         "ra_deg": float(ra),
         "dec_deg": float(dec),
@@ -356,26 +353,25 @@ def solution(found: Report) -> dict[str, Any]:
     }
 
 
-def at_middle(camera: Camera) -> Any:
-    """Rotation middle_from_cam into a frame with z along the ray of the image center and y along the image's down.
+def center_from_cam(camera: Camera) -> Any:
+    """Rotation from the camera frame into a frame with z along the ray of the image center and y along image down.
 
     The principal point need not be the image center, so the camera's own boresight is not used. The down direction
     comes from the ray of the pixel one row below, made orthogonal to z.
     """
     from scipy.spatial.transform import Rotation
 
-    middle = np.array([(camera.width_px - 1) / 2, (camera.height_px - 1) / 2])
-    sight, below = camera.rays(np.array([middle, [middle[0], middle[1] + 1]]))
-    across = np.cross(below - sight, sight)
-    across /= np.linalg.norm(across)
-    return Rotation.from_matrix(np.array([across, np.cross(sight, across), sight]))
+    center = np.array([(camera.width_px - 1) / 2, (camera.height_px - 1) / 2])
+    z, below = camera.rays(np.array([center, [center[0], center[1] + 1]]))
+    x = np.cross(below - z, z)
+    x /= np.linalg.norm(x)
+    return Rotation.from_matrix(np.array([x, np.cross(z, x), z]))
 
 
-def picture(image: NDArray, found: Report, tracker: StarTracker) -> NDArray[np.uint8]:
+def annotated_image(image: NDArray, report: Report, tracker: StarTracker) -> NDArray[np.uint8]:
     """The image annotated with detections, matched stars and their Hipparcos numbers."""
-    match = found.attitude.match
-    seen = found.centroids.xy_px
+    match, detected_px = report.attitude.match, report.centroids.xy_px
     if match is None:
-        return report.annotate(image, seen, np.empty((0, 2)))
+        return annotate(image, detected_px, np.empty((0, 2)))
     names = [f"HIP {tracker.stars.id[star]}" for star in match.star]
-    return report.annotate(image, seen, seen[match.observed], names)
+    return annotate(image, detected_px, detected_px[match.observed], names)

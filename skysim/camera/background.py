@@ -24,15 +24,15 @@ from skysim.scene.camera import CameraConfig
 from skysim.scene.light import Glow, MoonGlowConfig, SkyGlowConfig, StrayLightConfig, UniformGlowConfig
 from skysim.sources.photometry import SUN, Band, sky_radiance_e_s_m2_sr, star_flux_e_s_m2
 
-NODE_PX = 32.0
-NODE_RAD = 1 / 40  # largest node spacing: linear interpolation of cos^4 is within 1e-3
+MAX_NODE_SPACING_PX = 32.0
+MAX_NODE_SPACING_RAD = 1 / 40  # largest node spacing: linear interpolation of cos^4 is within 1e-3
 NANOLAMBERT_V0 = 34.08 * math.exp(20.7233)  # brightness of V = 0 mag arcsec^-2 (KS91 eq. 1)
 MOON_RADIUS_DEG = 0.26
-LEAST_PST = 1e-30  # stands for a transmittance of 0 in the logarithm: gives no electrons
+MIN_PST = 1e-30  # replaces a transmittance of 0 in the logarithm; gives no electrons
 
 
 @dataclass(frozen=True, slots=True)
-class View:
+class ViewingGeometry:
     """Viewing directions of M nodes of the chip.
 
     toward_cam, toward_lab : (M, 3) unit vectors in camera and in lab axes (in star scenes those of the ICRS)
@@ -49,45 +49,45 @@ class View:
     optics: Optics
     band: Band
 
-    def gathered_m2_sr(self) -> Floats:
+    def etendue_m2_sr(self) -> Floats:
         """(M,) étendue of each node's pixel: electrons per second = radiance times this.
 
         The pupil is foreshortened by cos(field), and a pixel's solid angle falls as cos^3: its distance grows as
         1/cos, squared, and it is inclined. Together with vignetting this is the cos^4 law of illumination.
         Distortion changes the solid angle of the pixels, which pixel_sr includes.
         """
-        return self.optics.collecting_m2 * self.optics.passed(np.cos(self.field_rad)) * self.pixel_sr
+        return self.optics.collecting_m2 * self.optics.throughput(np.cos(self.field_rad)) * self.pixel_sr
 
 
-def uniform(part: UniformGlowConfig, view: View) -> Floats:
+def uniform_glow(config: UniformGlowConfig, view: ViewingGeometry) -> Floats:
     """Light that reaches the chip past the lens (a leak): the same in every pixel."""
-    return np.full(len(view.field_rad), float(part.e_s))
+    return np.full(len(view.field_rad), float(config.e_s))
 
 
-def sky(part: SkyGlowConfig, view: View) -> Floats:
+def sky_glow(config: SkyGlowConfig, view: ViewingGeometry) -> Floats:
     """Radiance of the night sky, linear in the angles along the image axes, and never below zero."""
     x, y, z = view.toward_cam.T
-    slope = np.degrees(np.arctan2(x, z)) * part.gradient_per_deg[0]
-    slope = slope + np.degrees(np.arctan2(y, z)) * part.gradient_per_deg[1]
-    radiance = float(sky_radiance_e_s_m2_sr(part.mag_arcsec2, view.band))
-    return radiance * np.maximum(1 + slope, 0.0) * view.gathered_m2_sr()
+    slope = np.degrees(np.arctan2(x, z)) * config.gradient_per_deg[0]
+    slope = slope + np.degrees(np.arctan2(y, z)) * config.gradient_per_deg[1]
+    radiance = float(sky_radiance_e_s_m2_sr(config.mag_arcsec2, view.band))
+    return radiance * np.maximum(1 + slope, 0.0) * view.etendue_m2_sr()
 
 
-def moon(part: MoonGlowConfig, view: View) -> Floats:
+def moon_glow(config: MoonGlowConfig, view: ViewingGeometry) -> Floats:
     """Moonlight scattered by the air. Each node has its own angle to the Moon; the air mass is that of the boresight.
 
     The model is accurate to 8-23 % (its authors), more than the air mass varies over a camera's field.
     """
-    separation_deg = apart_deg(view.toward_lab, direction(part.ra_deg, part.dec_deg))
+    to_moon_deg = angular_separation_deg(view.toward_lab, direction(config.ra_deg, config.dec_deg))
     nanolamberts = moonlight_nl(
-        separation_deg,
-        part.phase_angle_deg,
-        part.extinction_mag,
-        part.moon_zenith_deg,
-        part.field_zenith_deg,
+        to_moon_deg,
+        config.phase_angle_deg,
+        config.extinction_mag,
+        config.moon_zenith_deg,
+        config.field_zenith_deg,
     )
     radiance = float(sky_radiance_e_s_m2_sr(0.0, view.band)) / NANOLAMBERT_V0
-    return radiance * nanolamberts * view.gathered_m2_sr()
+    return radiance * nanolamberts * view.etendue_m2_sr()
 
 
 def moonlight_nl(
@@ -103,9 +103,9 @@ def moonlight_nl(
     X = (1 - 0.96 sin^2 Z)^-1/2 (Krisciunas & Schaefer 1991, PASP 103, 1033: eqs 3, 15, 20).
     """
     illuminance = 10 ** (-0.4 * (3.84 + 0.026 * abs(phase_angle_deg) + 4e-9 * phase_angle_deg**4))
-    arrives = 10 ** (-0.4 * extinction_mag * air_mass(moon_zenith_deg))
+    transmitted = 10 ** (-0.4 * extinction_mag * air_mass(moon_zenith_deg))
     scattered = 1 - 10 ** (-0.4 * extinction_mag * air_mass(field_zenith_deg))
-    return np.asarray(scattering(separation_deg) * illuminance * arrives * scattered)
+    return np.asarray(scattering(separation_deg) * illuminance * transmitted * scattered)
 
 
 def scattering(separation_deg: float | Floats) -> Floats:
@@ -113,7 +113,7 @@ def scattering(separation_deg: float | Floats) -> Floats:
 
     f = 10^5.36 (1.06 + cos^2 rho) + the greater of 10^(6.15 - rho / 40) and 6.2e7 / rho^2. The paper switches
     between the two aerosol laws at 10 degrees, where they differ by a quarter; the greater is continuous (they
-    cross at 8.6). Within the Moon's disc the value at its edge is used.
+    cross at 8.6). Within the Moon's disk the value at its edge is used.
     """
     rho = np.maximum(np.asarray(separation_deg, dtype=float), MOON_RADIUS_DEG)
     molecules = 10**5.36 * (1.06 + np.cos(np.radians(rho)) ** 2)
@@ -125,29 +125,29 @@ def air_mass(zenith_deg: float) -> float:
     return float((1 - 0.96 * math.sin(math.radians(zenith_deg)) ** 2) ** -0.5)
 
 
-def stray(part: StrayLightConfig, view: View) -> Floats:
+def stray_light(config: StrayLightConfig, view: ViewingGeometry) -> Floats:
     """Stray light of a bright body: its irradiance before the lens times the point source transmittance, uniform.
 
     The transmittance is that of lens and baffle together: irradiance on the chip over irradiance before the lens at
     the body's angle from the boresight (`transmittance`). The body has the Sun's color.
     """
-    angle_deg = float(apart_deg(view.boresight_lab[None, :], direction(part.ra_deg, part.dec_deg))[0])
-    irradiance = float(star_flux_e_s_m2(part.v_mag, *SUN, view.band))
-    share = transmittance(angle_deg, part.angle_deg, part.pst)
-    return np.full(len(view.field_rad), irradiance * share * view.optics.camera.pixel_m**2)
+    angle_deg = float(angular_separation_deg(view.boresight_lab[None, :], direction(config.ra_deg, config.dec_deg))[0])
+    irradiance = float(star_flux_e_s_m2(config.v_mag, *SUN, view.band))
+    point_source_transmittance = transmittance(angle_deg, config.angle_deg, config.pst)
+    return np.full(len(view.field_rad), irradiance * point_source_transmittance * view.optics.camera.pixel_m**2)
 
 
 def transmittance(angle_deg: float, table_deg: Sequence[float], pst: Sequence[float]) -> float:
     """Interpolate the logarithm of a table linearly; constant beyond its ends."""
-    return float(np.exp(np.interp(angle_deg, table_deg, np.log(np.maximum(pst, LEAST_PST)))))
+    return float(np.exp(np.interp(angle_deg, table_deg, np.log(np.maximum(pst, MIN_PST)))))
 
 
 # Radiance models by kind. To add one, add a class to scene/light.py and a function here.
-BACKGROUNDS: dict[str, Callable[[Any, View], Floats]] = {
-    "uniform": uniform,
-    "sky": sky,
-    "moon": moon,
-    "stray": stray,
+BACKGROUNDS: dict[str, Callable[[Any, ViewingGeometry], Floats]] = {
+    "uniform": uniform_glow,
+    "sky": sky_glow,
+    "moon": moon_glow,
+    "stray": stray_light,
 }
 
 
@@ -157,59 +157,59 @@ def direction(ra_deg: float, dec_deg: float) -> Floats:
     return np.array([math.cos(dec) * math.cos(ra), math.cos(dec) * math.sin(ra), math.sin(dec)])
 
 
-def apart_deg(many: Floats, one: Floats) -> Floats:
+def angular_separation_deg(vectors: Floats, vector: Floats) -> Floats:
     """(M,) angles between (M, 3) unit vectors and one, accurate for small angles too (atan2)."""
-    return np.degrees(np.arctan2(np.linalg.norm(np.cross(many, one), axis=-1), many @ one))
+    return np.degrees(np.arctan2(np.linalg.norm(np.cross(vectors, vector), axis=-1), vectors @ vector))
 
 
-def glow_map(parts: Sequence[Glow], optics: Optics, cam_from_lab: Rotation, band: Band) -> Floats:
+def glow_map(glows: Sequence[Glow], optics: Optics, cam_from_lab: Rotation, band: Band) -> Floats:
     """(h, w) electrons s^-1 px^-1 of all extended light, at nodes evenly spread over the chip up to its edges.
 
     `fill` interpolates the frame from it, to 1e-3 for maps as smooth as these (test_background). Cusps are smoothed:
     that of two_stops on the axis by up to 2 % within a node of it, and that at the Moon if it is in the field.
     One node is enough where no light depends on the position, or there is none.
     """
-    if all(part.kind in ("uniform", "stray") for part in parts):
-        (toward, pixel_sr), shape = look(np.array([optics.camera.centre_px]), optics), (1, 1)
+    if all(glow.kind in ("uniform", "stray") for glow in glows):
+        (toward, pixel_sr), shape = pixel_directions(np.array([optics.camera.center_px]), optics), (1, 1)
     else:
-        toward, pixel_sr, shape = look_of_nodes(optics)
-    seen = view_of(toward, pixel_sr, optics, cam_from_lab, band)
+        toward, pixel_sr, shape = node_directions(optics)
+    view = viewing_geometry(toward, pixel_sr, optics, cam_from_lab, band)
     total = np.zeros(len(toward))
-    for part in parts:
-        total += BACKGROUNDS[part.kind](part, seen)
+    for glow in glows:
+        total += BACKGROUNDS[glow.kind](glow, view)
     return total.reshape(shape)
 
 
 @lru_cache(maxsize=8)
-def look_of_nodes(optics: Optics) -> tuple[Floats, Floats, tuple[int, int]]:
-    """`look` at the nodes, and their (h, w); cached, since it depends only on the camera."""
+def node_directions(optics: Optics) -> tuple[Floats, Floats, tuple[int, int]]:
+    """`pixel_directions` at the nodes, and their (h, w); cached, since it depends only on the camera."""
     xy_px, shape = nodes_px(optics.camera)
-    return *look(xy_px, optics), shape
+    return *pixel_directions(xy_px, optics), shape
 
 
 def nodes_px(camera: CameraConfig) -> tuple[Floats, tuple[int, int]]:
     """(h * w, 2) pixel positions of the nodes, row by row, and (h, w)."""
-    spacing = min(NODE_PX, max(NODE_RAD * camera.focal_px, 1.0))
+    spacing = min(MAX_NODE_SPACING_PX, max(MAX_NODE_SPACING_RAD * camera.focal_px, 1.0))
     w, h = (math.ceil((size - 1) / spacing) + 1 for size in (camera.width_px, camera.height_px))
     x, y = np.meshgrid(np.linspace(0, camera.width_px - 1, w), np.linspace(0, camera.height_px - 1, h))
     return np.column_stack([x.ravel(), y.ravel()]), (h, w)
 
 
-def look(xy_px: Floats, optics: Optics) -> tuple[Floats, Floats]:
+def pixel_directions(xy_px: Floats, optics: Optics) -> tuple[Floats, Floats]:
     """Viewing directions (M, 3) in camera axes of pixels at (M, 2), and (M,) their solid angles.
 
     The solid angle is spanned by central differences of the directions one pixel to either side: error 1e-6.
     """
-    across, down = (
-        (unproject(xy_px + step, optics) - unproject(xy_px - step, optics)) / 2 for step in np.eye(2)
-    )
+    across, down = ((unproject(xy_px + step, optics) - unproject(xy_px - step, optics)) / 2 for step in np.eye(2))
     return unproject(xy_px, optics), np.linalg.norm(np.cross(across, down), axis=1)
 
 
-def view_of(toward: Floats, pixel_sr: Floats, optics: Optics, cam_from_lab: Rotation, band: Band) -> View:
-    """The View of these directions for a camera in this attitude."""
+def viewing_geometry(
+    toward: Floats, pixel_sr: Floats, optics: Optics, cam_from_lab: Rotation, band: Band
+) -> ViewingGeometry:
+    """The geometry of these directions for a camera in this attitude."""
     lab_from_cam = cam_from_lab.inv()
-    return View(
+    return ViewingGeometry(
         toward_cam=toward,
         toward_lab=lab_from_cam.apply(toward),
         boresight_lab=lab_from_cam.apply([0.0, 0.0, 1.0]),
@@ -227,17 +227,17 @@ def unproject(xy_px: Floats, optics: Optics) -> Floats:
     distortion leaves without light all map to its fold, and so have no solid angle.
     """
     camera = optics.camera
-    plane = (xy_px - np.array(camera.centre_px)) / camera.focal_px
+    plane = (xy_px - np.array(camera.center_px)) / camera.focal_px
     if any(camera.distortion):
         r = np.linspace(0, min(optics.fold_r, 1.1 * math.tan(optics.field_rad) + 1e-3), 4001)
         image_r = r * radial(camera.distortion, r**2)
-        wanted, aslant = plane, np.zeros_like(plane)
+        measured, decentering = plane, np.zeros_like(plane)
         for _ in range(10 if any(camera.distortion[2:4]) else 1):
             # Remove the last estimate of the tangential part, then invert the radial part by the table.
-            straight = wanted - aslant
-            length = np.hypot(*straight.T)
-            plane = straight * (np.interp(length, image_r, r) / np.maximum(length, 1e-300))[:, None]
-            aslant = np.column_stack(tangential(camera.distortion, *plane.T))
+            centered = measured - decentering
+            distorted_r = np.hypot(*centered.T)
+            plane = centered * (np.interp(distorted_r, image_r, r) / np.maximum(distorted_r, 1e-300))[:, None]
+            decentering = np.column_stack(tangential(camera.distortion, *plane.T))
     toward = np.column_stack([plane, np.ones(len(plane))])
     return np.asarray(toward / np.linalg.norm(toward, axis=1, keepdims=True))
 
@@ -246,12 +246,12 @@ def fill(image: NDArray[Any], coarse: Floats, factor: float) -> None:
     """Set an (H, W) frame, whatever it held, to coarse * factor, bilinear between the nodes (in place).
 
     coarse : (h, w) evenly spaced from the first pixel's center to the last one's, from `glow_map`; a single node
-             stands for the whole frame. image is float32 or float64; factor is the exposure in s for electrons.
+             holds for all of the frame. image is float32 or float64; factor is the exposure in s for electrons.
     """
     if coarse.max() == coarse.min():
         _fill_flat(image, float(coarse[0, 0]) * factor)
     else:
-        _fill_between(image, coarse * factor)
+        _fill_bilinear(image, coarse * factor)
 
 
 @jit(parallel=True)
@@ -261,21 +261,21 @@ def _fill_flat(image: NDArray[Any], value: float) -> None:
 
 
 @jit(parallel=True)
-def _fill_between(image: NDArray[Any], coarse: Floats) -> None:
+def _fill_bilinear(image: NDArray[Any], coarse: Floats) -> None:
     """Interpolate along y for the nodes of each row of pixels, then linearly along x from node to node."""
     (height, width), (h, w) = image.shape, coarse.shape
-    place = np.arange(width) * ((w - 1) / (width - 1))
-    cell = np.minimum(place.astype(np.int64), w - 2)
-    within = (place - cell).astype(image.dtype)
+    position = np.arange(width) * ((w - 1) / (width - 1))
+    cell = np.minimum(position.astype(np.int64), w - 2)
+    offset = (position - cell).astype(image.dtype)
     # First pixel of each cell, and the end. Unsigned: numba's check for negative indices prevents vectorization.
     begin = np.searchsorted(cell, np.arange(w)).astype(np.uint64)
     for y in numba.prange(height):
         j = min(int(y * ((h - 1) / (height - 1))), h - 2)
-        share = y * ((h - 1) / (height - 1)) - j
+        fraction = y * ((h - 1) / (height - 1)) - j
         row = image[y]
         for i in range(w - 1):
-            left = coarse[j, i] + share * (coarse[j + 1, i] - coarse[j, i])
-            right = coarse[j, i + 1] + share * (coarse[j + 1, i + 1] - coarse[j, i + 1])
+            left = coarse[j, i] + fraction * (coarse[j + 1, i] - coarse[j, i])
+            right = coarse[j, i + 1] + fraction * (coarse[j + 1, i + 1] - coarse[j, i + 1])
             start, rise = image.dtype.type(left), image.dtype.type(right - left)
             for x in range(begin[i], begin[i + 1]):
-                row[x] = start + rise * within[x]
+                row[x] = start + rise * offset[x]

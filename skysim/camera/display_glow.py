@@ -7,18 +7,18 @@ from functools import lru_cache
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from skysim.camera.background import look, view_of
+from skysim.camera.background import pixel_directions, viewing_geometry
 from skysim.camera.optics import Optics
 from skysim.core.types import Floats
 from skysim.scene import leds, light
-from skysim.sources.dome.display import black, glass
-from skysim.sources.dome.led import LOBES, full_e_s_sr
+from skysim.sources.dome.display import black_transmission, panel_surface
+from skysim.sources.dome.led import LOBES, full_strength_e_s_sr
 from skysim.sources.dome.surface import build_surface
 from skysim.sources.photometry import SUN, Band, star_flux_e_s_m2
 
 
 def black_glow(
-    part: light.DomeConfig | light.StarsConfig | light.BenchConfig,
+    config: light.DomeConfig | light.StarsConfig | light.CollimatedDisplayConfig,
     optics: Optics,
     cam_from_lab: Rotation,
     camera_m: Floats,
@@ -30,49 +30,47 @@ def black_glow(
     A chip pixel sees the display or not, by the direction of its center. So the edge is sharp, and motion during the
     exposure and the row times of a rolling shutter are left out.
     """
-    screen = part.layout if isinstance(part, light.DomeConfig) else part
+    screen = config.layout if isinstance(config, light.DomeConfig) else config
     if not isinstance(screen, leds.PixelsConfig) or not screen.contrast:
         return None
-    view = view_of(*look_of_all(optics), optics, cam_from_lab, band)
-    if isinstance(part, light.BenchConfig):
-        white = bench_radiance_e_s_m2_sr(part, view.toward_lab, band)
+    view = viewing_geometry(*chip_directions(optics), optics, cam_from_lab, band)
+    if isinstance(config, light.CollimatedDisplayConfig):
+        white = collimated_radiance_e_s_m2_sr(config, view.toward_lab, band)
     else:
-        assert isinstance(part, light.DomeConfig)  # the screen is its layout
-        white = panel_radiance_e_s_m2_sr(part, view.toward_lab, camera_m, band)
-    glow = black(screen) * white * view.gathered_m2_sr()
+        assert isinstance(config, light.DomeConfig)  # the screen is its layout
+        white = panel_radiance_e_s_m2_sr(config, view.toward_lab, camera_m, band)
+    glow = black_transmission(screen) * white * view.etendue_m2_sr()
     return glow.reshape(optics.camera.height_px, optics.camera.width_px)
 
 
 @lru_cache(maxsize=2)
-def look_of_all(optics: Optics) -> tuple[Floats, Floats]:
+def chip_directions(optics: Optics) -> tuple[Floats, Floats]:
     """Viewing directions of all pixels of the chip, (H * W, 3) in camera axes, and their solid angles."""
     y, x = np.indices((optics.camera.height_px, optics.camera.width_px), dtype=float)
-    return look(np.column_stack([x.ravel(), y.ravel()]), optics)
+    return pixel_directions(np.column_stack([x.ravel(), y.ravel()]), optics)
 
 
-def panel_radiance_e_s_m2_sr(
-    part: light.DomeConfig, toward_lab: Floats, camera_m: Floats, band: Band
-) -> Floats:
+def panel_radiance_e_s_m2_sr(config: light.DomeConfig, toward_lab: Floats, camera_m: Floats, band: Band) -> Floats:
     """(N,) radiance of a white panel, mean over a frame, towards the camera: L = I(theta) / (p^2 cos theta).
 
     0 for directions (N, 3) that miss it. p is the pitch, I a white pixel's intensity from the LED's lobe.
     """
-    assert isinstance(part.layout, leds.LcdConfig)
-    panel = glass(part.layout, build_surface(part.surface))
-    on_it = np.isfinite(panel.meet(camera_m, toward_lab)[:, 0])
-    cos_emission = np.where(on_it, -toward_lab @ panel.inward(panel.centre_m[None])[0], 1.0)
-    emitted = LOBES[part.led.lobe.kind](part.led.lobe, cos_emission) / cos_emission
-    lit = part.led.drive.duty if isinstance(part.led.drive, leds.RefreshConfig) else 1.0
-    return np.asarray(on_it * emitted * lit * full_e_s_sr(part.led, band) / part.layout.pitch_m**2)
+    assert isinstance(config.layout, leds.LcdConfig)
+    panel = panel_surface(config.layout, build_surface(config.surface))
+    hits_panel = np.isfinite(panel.meet(camera_m, toward_lab)[:, 0])
+    cos_emission = np.where(hits_panel, -toward_lab @ panel.inward(panel.center_m[None])[0], 1.0)
+    emitted = LOBES[config.led.lobe.kind](config.led.lobe, cos_emission) / cos_emission
+    duty = config.led.drive.duty if isinstance(config.led.drive, leds.RefreshConfig) else 1.0
+    return np.asarray(hits_panel * emitted * duty * full_strength_e_s_sr(config.led, band) / config.layout.pitch_m**2)
 
 
-def bench_radiance_e_s_m2_sr(part: light.BenchConfig, toward_lab: Floats, band: Band) -> Floats:
+def collimated_radiance_e_s_m2_sr(config: light.CollimatedDisplayConfig, toward_lab: Floats, band: Band) -> Floats:
     """(N,) radiance behind the collimator of a white display; each pixel spans (p / f)^2 cos^3 steradian.
 
     0 for directions (N, 3) that miss it.
     """
-    white_e_s_m2 = float(star_flux_e_s_m2(part.brightest_mag, *SUN, band)) / part.block**2
-    up = np.maximum(toward_lab[:, 2], 1e-9)
-    half = np.array(part.pixels) * part.pitch_m / 2 / part.focal_length_m
-    within = np.all(np.abs(toward_lab[:, :2]) <= half * up[:, None], axis=1) & (toward_lab[:, 2] > 0)
-    return np.asarray(within * white_e_s_m2 / ((part.pitch_m / part.focal_length_m) ** 2 * up**3))
+    white_e_s_m2 = float(star_flux_e_s_m2(config.brightest_mag, *SUN, band)) / config.block**2
+    cos_field = np.maximum(toward_lab[:, 2], 1e-9)
+    half_extent = np.array(config.pixels) * config.pitch_m / 2 / config.focal_length_m
+    on_display = np.all(np.abs(toward_lab[:, :2]) <= half_extent * cos_field[:, None], axis=1) & (toward_lab[:, 2] > 0)
+    return np.asarray(on_display * white_e_s_m2 / ((config.pitch_m / config.focal_length_m) ** 2 * cos_field**3))

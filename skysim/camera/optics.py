@@ -12,19 +12,19 @@ from skysim.core.types import Floats
 from skysim.scene.camera import CameraConfig, TwoStopsConfig, VignettingTableConfig
 
 
-def two_stops(part: TwoStopsConfig, field_rad: Floats) -> Floats:
+def two_stops(config: TwoStopsConfig, field_rad: Floats) -> Floats:
     """Fraction of the light that passes two equal round stops: the overlap area of two circles, over a circle's.
 
     V = (2 / pi) (acos u - u sqrt(1 - u^2)), u = tan(field) / tan(cutoff): seen obliquely, one stop is displaced
     against the other by u diameters.
     """
-    u = np.clip(np.tan(np.minimum(field_rad, 1.57)) / np.tan(np.radians(part.cutoff_deg)), 0, 1)
+    u = np.clip(np.tan(np.minimum(field_rad, 1.57)) / np.tan(np.radians(config.cutoff_deg)), 0, 1)
     return np.asarray(2 / np.pi * (np.arccos(u) - u * np.sqrt(1 - u**2)))
 
 
-def table(part: VignettingTableConfig, field_rad: Floats) -> Floats:
+def table(config: VignettingTableConfig, field_rad: Floats) -> Floats:
     """Measured transmission, linear between the angles and constant beyond them."""
-    return np.interp(np.degrees(field_rad), part.angle_deg, part.transmission)
+    return np.interp(np.degrees(field_rad), config.angle_deg, config.transmission)
 
 
 VIGNETTING: dict[str, Callable[[Any, Floats], Floats]] = {"two_stops": two_stops, "table": table}
@@ -46,10 +46,10 @@ class Optics:
     field_rad: float
 
     @classmethod
-    def of(cls, camera: CameraConfig) -> Optics:
+    def from_camera(cls, camera: CameraConfig) -> Optics:
         """The optics of a scene's camera."""
-        area_m2, turn = np.pi / 4 * camera.pupil_m**2, fold_r(camera.distortion)
-        return cls(camera, float(area_m2 * camera.transmission), turn, field_rad(camera, turn))
+        area_m2, fold = np.pi / 4 * camera.pupil_m**2, fold_r(camera.distortion)
+        return cls(camera, float(area_m2 * camera.transmission), fold, field_rad(camera, fold))
 
     def project(self, vectors_cam: Floats) -> Floats:
         """(..., 3) vectors in camera axes to (..., 2) pixels; NaN behind the camera and beyond the fold.
@@ -58,26 +58,26 @@ class Optics:
         """
         z = np.where(vectors_cam[..., 2] > 0, vectors_cam[..., 2], np.nan)
         x, y = vectors_cam[..., 0] / z, vectors_cam[..., 1] / z
-        focal, centre = self.camera.focal_px, self.camera.centre_px
+        focal, center = self.camera.focal_px, self.camera.center_px
         if any(self.camera.distortion):
             x, y = self._distort(x, y)
-        return np.stack([x * focal + centre[0], y * focal + centre[1]], axis=-1)
+        return np.stack([x * focal + center[0], y * focal + center[1]], axis=-1)
 
     def _distort(self, x: Floats, y: Floats) -> tuple[Floats, Floats]:
         r2 = x**2 + y**2
-        stretch = np.where(r2 < self.fold_r**2, radial(self.camera.distortion, r2), np.nan)
-        across, down = tangential(self.camera.distortion, x, y)
-        return x * stretch + across, y * stretch + down
+        scale = np.where(r2 < self.fold_r**2, radial(self.camera.distortion, r2), np.nan)
+        shift_x, shift_y = tangential(self.camera.distortion, x, y)
+        return x * scale + shift_x, y * scale + shift_y
 
-    def passed(self, cos_field: Floats) -> Floats:
+    def throughput(self, cos_field: Floats) -> Floats:
         """Cosine of the field angle (foreshortening of the pupil) times vignetting. Zero behind the
         camera. Any shape.
         """
         cosine = np.maximum(cos_field, 0)
-        part = self.camera.vignetting
-        if part is None:
+        config = self.camera.vignetting
+        if config is None:
             return cosine
-        return cosine * VIGNETTING[part.kind](part, np.arccos(np.minimum(cosine, 1)))
+        return cosine * VIGNETTING[config.kind](config, np.arccos(np.minimum(cosine, 1)))
 
 
 def radial(distortion: tuple[float, ...], r2: Floats) -> Floats:
@@ -95,14 +95,14 @@ def tangential(distortion: tuple[float, ...], x: Floats, y: Floats) -> tuple[Flo
 
 def field_rad(camera: CameraConfig, fold_r: float) -> float:
     """Field angle of the chip's farthest corner, with the radial distortion inverted."""
-    corner = camera.corner_px / camera.focal_px
-    r = np.linspace(0, min(fold_r, 20 * corner), 4001)
-    return float(np.arctan(np.interp(corner, r * radial(camera.distortion, r**2), r)))
+    corner_r = camera.corner_px / camera.focal_px
+    r = np.linspace(0, min(fold_r, 20 * corner_r), 4001)
+    return float(np.arctan(np.interp(corner_r, r * radial(camera.distortion, r**2), r)))
 
 
 def fold_r(distortion: tuple[float, ...]) -> float:
     """The least r at which r (1 + k1 r^2 + k2 r^4 + k3 r^6) stops growing; infinity if it always grows."""
     k1, k2, _, _, k3 = distortion
-    s = np.roots([1.0, 3 * k1, 5 * k2, 7 * k3])  # polynomial in 1 / r^2: its leading coefficient is never 0
-    turns = s.real[(abs(s.imag) < 1e-9 * (1 + abs(s.real))) & (s.real > 1e-12)]
-    return float(1 / np.sqrt(turns.max())) if len(turns) else float("inf")
+    roots = np.roots([1.0, 3 * k1, 5 * k2, 7 * k3])  # polynomial in 1 / r^2: its leading coefficient is never 0
+    extrema = roots.real[(abs(roots.imag) < 1e-9 * (1 + abs(roots.real))) & (roots.real > 1e-12)]
+    return float(1 / np.sqrt(extrema.max())) if len(extrema) else float("inf")

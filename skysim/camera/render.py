@@ -3,8 +3,9 @@
 A source's contribution to a pixel is a time integral over the exposure of its rate times its pixel-integrated image
 at its moving position. Smear by body rate, jitter, pulsed LEDs and rolling shutters are all part of this integral.
 
-1. `follow` projects every source at K even times of the exposure: positions in pixels and rates, as `Paths`.
-2. `images` (psf/kernel_cache.py) gives each source its pixel-integrated image and that image's sharpest feature.
+1. `image_tracks` projects every source at K even times of the exposure: positions in pixels and rates.
+2. `source_kernels` (psf/kernel_cache.py) gives each source its pixel-integrated image and the size of that image's
+   sharpest feature.
 3. `draw` integrates each source on a patch of its own (`_integrate`): the exposure is cut into pieces in which the
    image moves by less than STEP times that feature, and each piece is replaced by two points of light (a two-point
    Gauss rule for steady light), added by psf/splat.py. The patches are then added to the frame.
@@ -21,21 +22,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skysim.camera.optics import Optics
-from skysim.camera.psf.kernel_cache import GAUSS, ROUND, Images, images
+from skysim.camera.psf.kernel_cache import GAUSS, ROUND, Kernels, source_kernels
 from skysim.camera.psf.splat import add_gaussian, add_grid, add_round
 from skysim.core.errors import InputError
 from skysim.core.jit import jit
 from skysim.core.types import Floats, Mount, Sources, SourceTruth, Trajectory
 from skysim.sources.dome.led import Emitter, irradiance_e_s_m2, lit_moments_s
 
-STEP = 1.3  # largest motion in one piece of the exposure, over the image's sharpest feature (sigma)
+STEP = 1.3  # largest motion in one piece of the exposure, in units of the image's sharpest feature (sigma)
 MAX_PIECES = 100_000
-FEWEST, MOST = 9, 32_769  # number of poses in an exposure
-SHORT = 0.4  # path length, in steps, up to which one piece is enough: error 1e-4 of the peak
+MIN_POSES, MAX_POSES = 9, 32_769  # number of poses in an exposure
+SINGLE_PIECE_STEPS = 0.4  # path length, in steps, up to which one piece is enough: error 1e-4 of the peak
 STILL_PX = 1e-3  # an image that moves less is drawn as one point
-AT_ONCE = 1 << 20  # pixels of patches held in memory at once, or as many as the frame has
+MAX_PATCH_PIXELS = 1 << 20  # pixels of patches held in memory at once, or as many as the frame has
 
-Hides = Callable[[Sources], NDArray[np.bool_]]  # (N,) which of N sources are occluded
+OcclusionTest = Callable[[Sources], NDArray[np.bool_]]  # (N,) which of N sources are occluded
 
 
 class Window(NamedTuple):
@@ -65,7 +66,7 @@ class Poses(NamedTuple):
     camera_m: Floats
 
 
-class Paths(NamedTuple):
+class Tracks(NamedTuple):
     """Image position and rate of every source at K even times of the exposure, as arrays for numba.
 
     first_s, step_s : the times
@@ -89,7 +90,7 @@ def render(
     mount: Mount,
     window: Window,
     emitter: Emitter | None = None,
-    hides: Hides | None = None,
+    occluded: OcclusionTest | None = None,
 ) -> SourceTruth:
     """Add the mean photo-electrons of every source to the (H, W) image, in place; return the truth of those that
     gave any.
@@ -100,45 +101,44 @@ def render(
     profile converges with the fourth power of the piece. In a rolling shutter every row has its own exposure.
     """
     rows = image.shape[0]
-    t_s = moments(window.open_s, window.close_s(rows), trajectory)
-    during = poses(trajectory, mount, t_s)
+    t_s = sample_times(window.open_s, window.close_s(rows), trajectory)
+    all_poses = poses(trajectory, mount, t_s)
     # Coarse selection with a few poses, before the sources are projected at all of them.
-    near = sources.take(in_view(sources, optics, Poses(*(part[:: len(t_s) // 8] for part in during))))
-    if hides:
-        near = near.take(~hides(near))
-    paths, distance_m, cos_in = follow(near, optics, during, t_s, emitter or Emitter())
-    middle_px = paths.xy_px[len(t_s) // 2]
-    shapes = images(optics.camera, middle_px, near.radius_m, near.place[:, 3] > 0, distance_m, cos_in)
-    # From here on sharp_px is the longest motion allowed in one piece.
-    stride = shapes._replace(sharp_px=STEP * shapes.sharp_px)
-    table = draw(image, paths, stride, window)
+    few_poses = Poses(*(samples[:: len(t_s) // 8] for samples in all_poses))
+    candidates = sources.take(in_view(sources, optics, few_poses))
+    if occluded:
+        candidates = candidates.take(~occluded(candidates))
+    tracks, distance_m, cos_in = image_tracks(candidates, optics, all_poses, t_s, emitter or Emitter())
+    mid_px = tracks.xy_px[len(t_s) // 2]
+    kernels = source_kernels(optics.camera, mid_px, candidates.radius_m, candidates.place[:, 3] > 0, distance_m, cos_in)
+    table = draw(image, tracks, kernels, STEP * kernels.sharp_px, window)
     # Only sources that gave light to the chip are reported.
-    kept = table[:, 0] > 0
-    electrons, peak, x, y, squares, length = table[kept, :6].T
+    on_chip = table[:, 0] > 0
+    electrons, peak, x, y, squares, length = table[on_chip, :6].T
     return SourceTruth(
-        id=near.id[kept],
-        xy_px=middle_px[kept],
+        id=candidates.id[on_chip],
+        xy_px=mid_px[on_chip],
         flux_xy_px=np.column_stack([x, y]),
         electrons=electrons,
         peak_e=peak,
         streak_px=length,
         area_px=electrons**2 / squares,
-        peak_xy=table[kept, 6:8].astype(np.int64),
-        saturated=np.zeros(len(electrons), bool),  # the detector's to judge
+        peak_xy=table[on_chip, 6:8].astype(np.int64),
+        saturated=np.zeros(len(electrons), bool),  # set by the detector
         snr=np.full(len(electrons), np.nan),
     )
 
 
-def moments(open_s: float, close_s: float, trajectory: Trajectory) -> Floats:
+def sample_times(open_s: float, close_s: float, trajectory: Trajectory) -> Floats:
     """K even times over the exposure, as dense as the attitude's samples; K is odd, so that one is in the middle.
 
     Raises InputError for more samples than memory should hold: dropping samples could drop the jitter.
     """
     first, last = np.searchsorted(trajectory.t_s, (open_s, close_s))
-    count = max(int(last - first) + 1, FEWEST) | 1
-    if count > MOST:
+    count = max(int(last - first) + 1, MIN_POSES) | 1
+    if count > MAX_POSES:
         raise InputError(
-            f"exposure.time: {close_s - open_s:g} s holds {count} samples of the attitude; allowed: {MOST},"
+            f"exposure.time: {close_s - open_s:g} s holds {count} samples of the attitude; allowed: {MAX_POSES},"
             " a shorter exposure or slower jitter"
         )
     return np.linspace(open_s, close_s, count)
@@ -146,28 +146,28 @@ def moments(open_s: float, close_s: float, trajectory: Trajectory) -> Floats:
 
 def poses(trajectory: Trajectory, mount: Mount, t_s: Floats) -> Poses:
     """The camera's poses at K times."""
-    lab_from_body = trajectory.at(t_s).as_matrix()
+    lab_from_body = trajectory.attitude_at(t_s).as_matrix()
     cam_from_lab = mount.cam_from_body.as_matrix() @ lab_from_body.transpose(0, 2, 1)
     return Poses(cam_from_lab, lab_from_body @ mount.camera_body_m)
 
 
-def follow(
+def image_tracks(
     sources: Sources, optics: Optics, poses: Poses, t_s: Floats, emitter: Emitter
-) -> tuple[Paths, Floats, Floats]:
-    """The paths of N sources, their mean distances (N,) in m (1 for stars) and mean field-angle cosines (N,)."""
-    xy, distance_m, cos_out, cos_in = look(sources, optics, poses)
-    passed = optics.passed(cos_in)
+) -> tuple[Tracks, Floats, Floats]:
+    """The tracks of N sources, their mean distances (N,) in m (1 for stars) and mean field-angle cosines (N,)."""
+    xy, distance_m, cos_out, cos_in = project(sources, optics, poses)
+    throughput = optics.throughput(cos_in)
     rate = np.where(
         sources.place[:, 3] > 0,
-        irradiance_e_s_m2(sources.strength, emitter, cos_out, passed, distance_m),
-        sources.strength * passed,
+        irradiance_e_s_m2(sources.strength, emitter, cos_out, throughput, distance_m),
+        sources.strength * throughput,
     )
     pulse_s = np.column_stack([sources.period_s, sources.start_s, sources.on_s])
-    paths = Paths(float(t_s[0]), float(t_s[1] - t_s[0]), xy, rate * optics.collecting_m2, pulse_s)
-    return paths, distance_m.mean(axis=0), cos_in.mean(axis=0)
+    tracks = Tracks(float(t_s[0]), float(t_s[1] - t_s[0]), xy, rate * optics.collecting_m2, pulse_s)
+    return tracks, distance_m.mean(axis=0), cos_in.mean(axis=0)
 
 
-def look(sources: Sources, optics: Optics, poses: Poses) -> tuple[Floats, Floats, Floats, Floats]:
+def project(sources: Sources, optics: Optics, poses: Poses) -> tuple[Floats, Floats, Floats, Floats]:
     """Project N sources at each of K poses.
 
     Returns (K, N, 2) pixels, (K, N) distances in m (1 for stars), (K, N) cosines at the emitter and at the aperture.
@@ -176,8 +176,8 @@ def look(sources: Sources, optics: Optics, poses: Poses) -> tuple[Floats, Floats
     distance = np.sqrt(np.einsum("knj,knj->kn", offset, offset))
     offset /= distance[:, :, None]
     cos_out = -np.einsum("knj,nj->kn", offset, sources.normal)
-    toward = offset @ poses.cam_from_lab.transpose(0, 2, 1)
-    return optics.project(toward), distance, cos_out, toward[:, :, 2]
+    direction_cam = offset @ poses.cam_from_lab.transpose(0, 2, 1)
+    return optics.project(direction_cam), distance, cos_out, direction_cam[:, :, 2]
 
 
 def in_view(sources: Sources, optics: Optics, poses: Poses) -> NDArray[np.int64]:
@@ -186,49 +186,51 @@ def in_view(sources: Sources, optics: Optics, poses: Poses) -> NDArray[np.int64]
     The cone's half-angle is the field's circle, a quarter more for images that reach in from outside, and half of
     the largest rotation between two poses for sources that cross the field between them.
     """
-    sight = np.ascontiguousarray(poses.cam_from_lab[:, 2])
-    turn = np.arccos(np.clip(np.sum(sight[1:] * sight[:-1], axis=1), -1, 1)).max(initial=0.0)
-    edge = math.cos(min(1.25 * optics.field_rad + 0.02 + turn / 2, math.pi))
-    return np.flatnonzero(_in_cone(sources.place, sight, np.ascontiguousarray(poses.camera_m), edge))
+    boresight = np.ascontiguousarray(poses.cam_from_lab[:, 2])
+    rotation_rad = np.arccos(np.clip(np.sum(boresight[1:] * boresight[:-1], axis=1), -1, 1)).max(initial=0.0)
+    cos_limit = math.cos(min(1.25 * optics.field_rad + 0.02 + rotation_rad / 2, math.pi))
+    return np.flatnonzero(_in_cone(sources.place, boresight, np.ascontiguousarray(poses.camera_m), cos_limit))
 
 
 @jit
-def _in_cone(place: Floats, sight: Floats, camera_m: Floats, edge: float) -> Any:
+def _in_cone(place: Floats, boresight: Floats, camera_m: Floats, cos_limit: float) -> Any:
     """(N,) whether a source's direction from any of K cameras is within the cone: cosine with the boresight
-    above `edge`.
+    above `cos_limit`.
     """
-    out = np.zeros(len(place), np.bool_)
+    inside = np.zeros(len(place), np.bool_)
     for n in range(len(place)):
-        for k in range(len(sight)):
+        for k in range(len(boresight)):
             along, square = 0.0, 0.0
             for i in range(3):
                 offset = place[n, i] - place[n, 3] * camera_m[k, i]
-                along += offset * sight[k, i]
+                along += offset * boresight[k, i]
                 square += offset * offset
-            if along > edge * math.sqrt(square):
-                out[n] = True
+            if along > cos_limit * math.sqrt(square):
+                inside[n] = True
                 break
-    return out
+    return inside
 
 
-def draw(image: NDArray[Any], paths: Paths, shapes: Images, window: Window) -> Floats:
+def draw(image: NDArray[Any], tracks: Tracks, kernels: Kernels, step_px: Floats, window: Window) -> Floats:
     """Draw every source on a patch of its own and add the patches to the image, as many at a time as memory allows.
+
+    step_px : (N,) largest motion of each image in one piece of the exposure
 
     Returns (N, 8): electrons on the chip, those of the brightest pixel, flux-weighted mean x and y, sum of the
     squared pixels, path length in pixels, and the brightest pixel's x and y. The mean is that of the whole image,
     but in a rolling shutter of the part on the chip, since there each row has its own time.
     """
-    boxes = patches(paths.xy_px, shapes.reach_px, image.shape)
+    boxes = patches(tracks.xy_px, kernels.reach_px, image.shape)
     areas = (boxes[:, 1] - boxes[:, 0]) * (boxes[:, 3] - boxes[:, 2])
     out = np.zeros((len(boxes), 8))
-    at_once = max(image.size, AT_ONCE)
+    budget = max(image.size, MAX_PATCH_PIXELS)
     first = 0
     while first < len(boxes):
         total = np.cumsum(areas[first:])
-        last = first + max(1, int(np.searchsorted(total, at_once, side="right")))
+        last = first + max(1, int(np.searchsorted(total, budget, side="right")))
         starts = np.concatenate([[0], total[: last - first]])
         buffer = np.zeros(starts[-1])
-        _draw(buffer, starts, boxes[first:last], first, paths, shapes, window, out)
+        _draw(buffer, starts, boxes[first:last], first, tracks, kernels, step_px, window, out)
         _deposit(image, buffer, starts, boxes[first:last])
         first = last
     return out
@@ -253,33 +255,49 @@ def patches(xy_px: Floats, reach_px: Floats, shape: tuple[int, ...]) -> NDArray[
 
 @jit(parallel=True)
 def _draw(
-    buffer: Any, starts: Any, boxes: Any, first: int, paths: Paths, shapes: Images, window: Window, out: Any
+    buffer: Any,
+    starts: Any,
+    boxes: Any,
+    first: int,
+    tracks: Tracks,
+    kernels: Kernels,
+    step_px: Floats,
+    window: Window,
+    out: Any,
 ) -> None:
     for i in numba.prange(len(boxes)):
         x0, x1, y0, y1 = boxes[i]
         if x1 > x0 and y1 > y0:
             patch = buffer[starts[i] : starts[i + 1]].reshape(y1 - y0, x1 - x0)
-            _expose(patch, x0, y0, first + i, paths, shapes, window, out[first + i])
-            _measure(patch, x0, y0, out[first + i])
+            _expose_source(patch, x0, y0, first + i, tracks, kernels, step_px[first + i], window, out[first + i])
+            _patch_statistics(patch, x0, y0, out[first + i])
 
 
 @jit
-def _expose(
-    patch: Any, x0: int, y0: int, n: int, paths: Paths, shapes: Images, window: Window, row: Any
+def _expose_source(
+    patch: Any,
+    x0: int,
+    y0: int,
+    n: int,
+    tracks: Tracks,
+    kernels: Kernels,
+    step_px: float,
+    window: Window,
+    row: Any,
 ) -> None:
     """Integrate one source on its patch; write the light's mean position and the path length into row[2:6]."""
     # Without a rolling shutter all rows share one integral; with it each row needs its own interval.
-    whole = window.open_s + window.exposure_s
-    row[5] = _length(paths, n, window.open_s, whole)
+    end_s = window.open_s + window.exposure_s
+    row[5] = _length(tracks, n, window.open_s, end_s)
     if window.row_time_s == 0:
-        sums = _integrate(patch, 0, patch.shape[0], x0, y0, n, paths, shapes, window.open_s, whole)
+        sums = _integrate(patch, 0, patch.shape[0], x0, y0, n, tracks, kernels, step_px, window.open_s, end_s)
         if sums[0] > 0:
             row[2], row[3] = sums[1] / sums[0], sums[2] / sums[0]
         return
     for j in range(patch.shape[0]):
-        late = (y0 + j) * window.row_time_s
-        _integrate(patch, j, j + 1, x0, y0, n, paths, shapes, window.open_s + late, whole + late)
-    row[2], row[3] = _mean_place(patch, x0, y0)
+        delay_s = (y0 + j) * window.row_time_s
+        _integrate(patch, j, j + 1, x0, y0, n, tracks, kernels, step_px, window.open_s + delay_s, end_s + delay_s)
+    row[2], row[3] = _centroid(patch, x0, y0)
 
 
 @jit
@@ -290,8 +308,9 @@ def _integrate(
     x0: int,
     y0: int,
     n: int,
-    paths: Paths,
-    shapes: Images,
+    tracks: Tracks,
+    kernels: Kernels,
+    step_px: float,
     begin_s: float,
     end_s: float,
 ) -> Any:
@@ -306,53 +325,53 @@ def _integrate(
     Returns the electrons of the whole image and their first moments in x and y.
     """
     total, total_x, total_y = 0.0, 0.0, 0.0
-    speed = _speed(paths, n, begin_s, end_s)
-    strides = speed * (end_s - begin_s) / shapes.sharp_px[n]
+    speed = _speed(tracks, n, begin_s, end_s)
+    steps = speed * (end_s - begin_s) / step_px
     # One piece more than the motion needs: in a short path the ends, where the error is largest, weigh more.
-    pieces = 1 if strides < SHORT else int(min(np.ceil(strides) + 1, MAX_PIECES))
+    pieces = 1 if steps < SINGLE_PIECE_STEPS else int(min(np.ceil(steps) + 1, MAX_PIECES))
     for k in range(pieces):
         a = begin_s + (end_s - begin_s) * k / pieces
         b = begin_s + (end_s - begin_s) * (k + 1) / pieces
-        lit, mean, spread = lit_moments_s(a, b, paths.pulse_s[n, 0], paths.pulse_s[n, 1], paths.pulse_s[n, 2])
+        lit, mean, spread = lit_moments_s(a, b, tracks.pulse_s[n, 0], tracks.pulse_s[n, 1], tracks.pulse_s[n, 2])
         if lit <= 0:  # no pulse in this piece
             continue
         points = 1 if speed * spread < STILL_PX else 2
         for p in range(points):
-            x, y, rate = _at(paths, n, mean + spread * (2 * p - points + 1))
+            x, y, rate = _interpolate(tracks, n, mean + spread * (2 * p - points + 1))
             electrons = rate * lit / points
-            if not electrons > 0:  # no image here (NaN position), or faces away
+            if not electrons > 0:  # no image at this time (NaN position), or the LED faces away
                 continue
-            _stamp(patch, row0, row1, x - x0, y - y0, electrons, n, shapes)
+            _splat_point(patch, row0, row1, x - x0, y - y0, electrons, n, kernels)
             total, total_x, total_y = total + electrons, total_x + electrons * x, total_y + electrons * y
     return total, total_x, total_y
 
 
 @jit
-def _stamp(
-    patch: Any, row0: int, row1: int, x: float, y: float, electrons: float, n: int, shapes: Images
+def _splat_point(
+    patch: Any, row0: int, row1: int, x: float, y: float, electrons: float, n: int, kernels: Kernels
 ) -> None:
     """Add the image of a point of light to the patch, by its kind of kernel."""
-    begin, end, p, q = shapes.table[n]
-    if shapes.kind[n] == GAUSS:
-        add_gaussian(patch, row0, row1, x, y, electrons, shapes.sigma_px[n])
-    elif shapes.kind[n] == ROUND:
-        add_round(patch, row0, row1, x, y, electrons, shapes.tables[begin:end].reshape(p, q))
+    begin, end, p, q = kernels.table[n]
+    if kernels.kind[n] == GAUSS:
+        add_gaussian(patch, row0, row1, x, y, electrons, kernels.sigma_px[n])
+    elif kernels.kind[n] == ROUND:
+        add_round(patch, row0, row1, x, y, electrons, kernels.tables[begin:end].reshape(p, q))
     else:
-        add_grid(patch, row0, row1, x, y, electrons, shapes.tables[begin:end].reshape(p, p, q, q))
+        add_grid(patch, row0, row1, x, y, electrons, kernels.tables[begin:end].reshape(p, p, q, q))
 
 
 @jit
-def _at(paths: Paths, n: int, t_s: float) -> Any:
+def _interpolate(tracks: Tracks, n: int, t_s: float) -> Any:
     """Position and rate of a source at any time, by the cubic (Lagrange) through the four nearest samples."""
-    last = paths.xy_px.shape[0] - 4
-    u = (t_s - paths.first_s) / paths.step_s
+    last = tracks.xy_px.shape[0] - 4
+    u = (t_s - tracks.first_s) / tracks.step_s
     k = min(max(int(u) - 1, 0), last)
     u -= k
     w0 = (u - 1) * (u - 2) * (u - 3) / -6
     w1 = u * (u - 2) * (u - 3) / 2
     w2 = u * (u - 1) * (u - 3) / -2
     w3 = u * (u - 1) * (u - 2) / 6
-    xy, rate = paths.xy_px, paths.rate_e_s
+    xy, rate = tracks.xy_px, tracks.rate_e_s
     x = w0 * xy[k, n, 0] + w1 * xy[k + 1, n, 0] + w2 * xy[k + 2, n, 0] + w3 * xy[k + 3, n, 0]
     y = w0 * xy[k, n, 1] + w1 * xy[k + 1, n, 1] + w2 * xy[k + 2, n, 1] + w3 * xy[k + 3, n, 1]
     e = w0 * rate[k, n] + w1 * rate[k + 1, n] + w2 * rate[k + 2, n] + w3 * rate[k + 3, n]
@@ -360,26 +379,26 @@ def _at(paths: Paths, n: int, t_s: float) -> Any:
 
 
 @jit
-def _speed(paths: Paths, n: int, begin_s: float, end_s: float) -> float:
+def _speed(tracks: Tracks, n: int, begin_s: float, end_s: float) -> float:
     """The greatest speed of a source's image between two times, pixels a second."""
-    first = max(int((begin_s - paths.first_s) / paths.step_s), 0)
-    last = min(int(np.ceil((end_s - paths.first_s) / paths.step_s)), paths.xy_px.shape[0] - 1)
+    first = max(int((begin_s - tracks.first_s) / tracks.step_s), 0)
+    last = min(int(np.ceil((end_s - tracks.first_s) / tracks.step_s)), tracks.xy_px.shape[0] - 1)
     fastest = 0.0
     for k in range(first, last):
-        dx = paths.xy_px[k + 1, n, 0] - paths.xy_px[k, n, 0]
-        dy = paths.xy_px[k + 1, n, 1] - paths.xy_px[k, n, 1]
-        fastest = max(fastest, np.hypot(dx, dy) / paths.step_s)  # a NaN is no greater
+        dx = tracks.xy_px[k + 1, n, 0] - tracks.xy_px[k, n, 0]
+        dy = tracks.xy_px[k + 1, n, 1] - tracks.xy_px[k, n, 1]
+        fastest = max(fastest, np.hypot(dx, dy) / tracks.step_s)  # a NaN is no greater
     return fastest
 
 
 @jit
-def _length(paths: Paths, n: int, begin_s: float, end_s: float) -> float:
+def _length(tracks: Tracks, n: int, begin_s: float, end_s: float) -> float:
     """Path length of a source's image between two times, pixels, as a sum of chords."""
-    chords = max(int(np.ceil((end_s - begin_s) / paths.step_s)), 8)
+    chords = max(int(np.ceil((end_s - begin_s) / tracks.step_s)), 8)
     total = 0.0
-    x, y, _ = _at(paths, n, begin_s)
+    x, y, _ = _interpolate(tracks, n, begin_s)
     for k in range(chords):
-        x1, y1, _ = _at(paths, n, begin_s + (end_s - begin_s) * (k + 1) / chords)
+        x1, y1, _ = _interpolate(tracks, n, begin_s + (end_s - begin_s) * (k + 1) / chords)
         chord = np.hypot(x1 - x, y1 - y)
         total += chord if np.isfinite(chord) else 0.0
         x, y = x1, y1
@@ -387,7 +406,7 @@ def _length(paths: Paths, n: int, begin_s: float, end_s: float) -> float:
 
 
 @jit
-def _measure(patch: Any, x0: int, y0: int, row: Any) -> None:
+def _patch_statistics(patch: Any, x0: int, y0: int, row: Any) -> None:
     """Sum, peak, sum of squares and brightest pixel of a finished patch."""
     for j in range(patch.shape[0]):
         for i in range(patch.shape[1]):
@@ -399,7 +418,7 @@ def _measure(patch: Any, x0: int, y0: int, row: Any) -> None:
 
 
 @jit
-def _mean_place(patch: Any, x0: int, y0: int) -> Any:
+def _centroid(patch: Any, x0: int, y0: int) -> Any:
     """Center of gravity of a patch; its corner if it is empty."""
     total, x, y = 0.0, 0.0, 0.0
     for j in range(patch.shape[0]):
@@ -416,7 +435,7 @@ def _deposit(image: Any, buffer: Any, starts: Any, boxes: Any) -> None:
         x0, x1, y0, y1 = boxes[i]
         k, width = starts[i], x1 - x0
         for j in range(y0, y1):
-            row, part = image[j, x0:x1], buffer[k : k + width]
+            row, pixels = image[j, x0:x1], buffer[k : k + width]
             for x in range(width):
-                row[x] += part[x]
+                row[x] += pixels[x]
             k += width

@@ -15,9 +15,9 @@ from skysim.core.types import Floats
 from skysim.scene.camera import CameraConfig
 
 MAX_ORDER = 9  # the highest that SIP allows
-ENOUGH_PX = 1e-4  # error at which the order is high enough
-GOOD_PX = 0.01  # error above which a warning is given
-SIDE = 41  # points along each side of the field that the polynomials are fitted to; checked at three times as many
+TARGET_ERROR_PX = 1e-4  # error at which the order is high enough
+MAX_ERROR_PX = 0.01  # error above which a warning is given
+GRID_SIDE = 41  # points along each side of the field that the polynomials are fitted to; checked at three times as many
 MARGIN = 0.02  # of the chip's sides: the fit extends beyond the edges by this
 
 Coefficients = dict[tuple[int, int], float]
@@ -46,81 +46,81 @@ def header(camera: CameraConfig, cam_from_icrs: Rotation) -> dict[str, Any]:
     matrix are the camera's axes in the ICRS, so its products with the local east and north are the CD's columns.
     Axes are the ICRS's; directions are apparent, aberration included (`sky.apparent`).
     """
-    right, down, sight = cam_from_icrs.as_matrix()
-    ra, dec = np.arctan2(sight[1], sight[0]), np.arcsin(np.clip(sight[2], -1, 1))
+    right, down, boresight = cam_from_icrs.as_matrix()
+    ra, dec = np.arctan2(boresight[1], boresight[0]), np.arcsin(np.clip(boresight[2], -1, 1))
     east = np.array([-np.sin(ra), np.cos(ra), 0.0])
     north = np.array([-np.sin(dec) * np.cos(ra), -np.sin(dec) * np.sin(ra), np.cos(dec)])
     scale = np.degrees(1 / camera.focal_px)
-    lens = sip(camera)
-    kind = "-SIP" if lens else ""
+    distortion = fit_sip(camera)
+    suffix = "-SIP" if distortion else ""
     return {
-        "CTYPE1": f"RA---TAN{kind}",
-        "CTYPE2": f"DEC--TAN{kind}",
+        "CTYPE1": f"RA---TAN{suffix}",
+        "CTYPE2": f"DEC--TAN{suffix}",
         "CUNIT1": "deg",
         "CUNIT2": "deg",
         "RADESYS": "ICRS",
         "CRVAL1": np.degrees(ra) % 360,
         "CRVAL2": np.degrees(dec),
-        "CRPIX1": camera.centre_px[0] + 1,  # FITS counts pixels from 1
-        "CRPIX2": camera.centre_px[1] + 1,
+        "CRPIX1": camera.center_px[0] + 1,  # FITS counts pixels from 1
+        "CRPIX2": camera.center_px[1] + 1,
         "CD1_1": scale * (right @ east),
         "CD1_2": scale * (down @ east),
         "CD2_1": scale * (right @ north),
         "CD2_2": scale * (down @ north),
-    } | (keywords(lens) if lens else {})
+    } | (keywords(distortion) if distortion else {})
 
 
-def keywords(lens: Sip) -> dict[str, Any]:
+def keywords(distortion: Sip) -> dict[str, Any]:
     """The polynomials as FITS keywords, with SIPERR (not in the standard), their greatest error in pixels."""
-    told: dict[str, Any] = {"SIPERR": lens.worst_px}
+    cards: dict[str, Any] = {"SIPERR": distortion.worst_px}
     for name in ("A", "B", "AP", "BP"):
-        table: Coefficients = getattr(lens, name.lower())
-        told[f"{name}_ORDER"] = max((p + q for p, q in table), default=0)
-        told |= {f"{name}_{p}_{q}": value for (p, q), value in sorted(table.items())}
-    return told
+        table: Coefficients = getattr(distortion, name.lower())
+        cards[f"{name}_ORDER"] = max((p + q for p, q in table), default=0)
+        cards |= {f"{name}_{p}_{q}": value for (p, q), value in sorted(table.items())}
+    return cards
 
 
-def doubt(camera: CameraConfig) -> str:
+def accuracy_warning(camera: CameraConfig) -> str:
     """A warning if the WCS of this camera's frames is inaccurate; else empty."""
-    lens = sip(camera)
-    if lens is None or lens.worst_px <= GOOD_PX:
+    distortion = fit_sip(camera)
+    if distortion is None or distortion.worst_px <= MAX_ERROR_PX:
         return ""
     return (
-        f"camera.distortion: too much for SIP polynomials: the frames' WCS is wrong by up to {lens.worst_px:.2g} px"
-        " (keyword SIPERR)"
+        f"camera.distortion: too much for SIP polynomials: the frames' WCS is wrong by up to"
+        f" {distortion.worst_px:.2g} px (keyword SIPERR)"
     )
 
 
-def sip(camera: CameraConfig) -> Sip | None:
-    """The camera's distortion as SIP; None without distortion, or if distortion keeps all light off the chip."""
-    return fitted(camera) if any(camera.distortion) else None
-
-
 @lru_cache(maxsize=8)
-def fitted(camera: CameraConfig) -> Sip | None:
-    """Fit polynomials of increasing order until one is within ENOUGH_PX; else return the most accurate.
+def fit_sip(camera: CameraConfig) -> Sip | None:
+    """The camera's distortion as SIP; None without distortion, or if distortion keeps all light off the chip.
 
+    Polynomials of increasing order are fitted until one is within TARGET_ERROR_PX, else the most accurate is taken.
     The error is checked by a round trip on the chip: undistort by the polynomials, distort by the lens.
     """
-    straight, bent, lit = lattice(camera, SIDE)
-    _, everywhere, on_chip = lattice(camera, 3 * SIDE)
-    chip = everywhere[on_chip]
-    if not lit.any():
+    if not any(camera.distortion):
+        return None
+    undistorted_px, distorted_px, on_chip = fit_grid(camera, GRID_SIDE)
+    _, checked_px, checked_on_chip = fit_grid(camera, 3 * GRID_SIDE)
+    chip_px = checked_px[checked_on_chip]
+    if not on_chip.any():
         return None
     # Offsets are scaled to 1, or the high powers would make the least squares ill-conditioned.
-    scale, found = np.abs(bent).max(), []
+    scale, fits = np.abs(distorted_px).max(), []
     for order in range(2, MAX_ORDER + 1):
         powers = [(p, n - p) for n in range(2, order + 1) for p in range(n, -1, -1)]
-        added = np.linalg.lstsq(monomials(bent / scale, powers), straight - bent, rcond=None)[0]
+        solution = np.linalg.lstsq(monomials(distorted_px / scale, powers), undistorted_px - distorted_px, rcond=None)[
+            0
+        ]
         a, b = (
             {(p, q): float(value) / scale ** (p + q) for (p, q), value in zip(powers, column, strict=True)}
-            for column in added.T
+            for column in solution.T
         )
-        back = distorted(chip + monomials(chip / scale, powers) @ added, camera)
-        found.append(Sip(a, b, *brown(camera), float(np.linalg.norm(back - chip, axis=1).max())))
-        if found[-1].worst_px <= ENOUGH_PX:
+        round_trip = distorted(chip_px + monomials(chip_px / scale, powers) @ solution, camera)
+        fits.append(Sip(a, b, *brown(camera), float(np.linalg.norm(round_trip - chip_px, axis=1).max())))
+        if fits[-1].worst_px <= TARGET_ERROR_PX:
             break
-    return min(found, key=lambda one: one.worst_px)
+    return min(fits, key=lambda fit: fit.worst_px)
 
 
 def monomials(xy: Floats, powers: list[tuple[int, int]]) -> Floats:
@@ -129,36 +129,36 @@ def monomials(xy: Floats, powers: list[tuple[int, int]]) -> Floats:
     return np.column_stack([x[:, p] * y[:, q] for p, q in powers])
 
 
-def lattice(camera: CameraConfig, side: int) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+def fit_grid(camera: CameraConfig, side: int) -> tuple[Floats, Floats, NDArray[np.bool_]]:
     """Offsets (N, 2) from the principal point, px, without and with distortion; (N,) which are on the chip.
 
     The others are slightly beyond its edges, so that the fit does not extrapolate at an edge.
     """
-    centre, size = np.array(camera.centre_px), np.array([camera.width_px, camera.height_px])
-    corner = camera.focal_px * np.tan(Optics.of(camera).field_rad)
-    wider = max(corner / camera.corner_px, 1.0) * (1 + 2 * MARGIN)
-    ends = np.array([-0.5 - centre, size - 0.5 - centre])
-    low, high = ends * np.where((ends < 0) == [[True], [False]], wider, 1 / wider)
+    center, size = np.array(camera.center_px), np.array([camera.width_px, camera.height_px])
+    corner = camera.focal_px * np.tan(Optics.from_camera(camera).field_rad)
+    widening = max(corner / camera.corner_px, 1.0) * (1 + 2 * MARGIN)
+    edges = np.array([-0.5 - center, size - 0.5 - center])
+    low, high = edges * np.where((edges < 0) == [[True], [False]], widening, 1 / widening)
     steps = [np.linspace(*pair, side) for pair in zip(low, high, strict=True)]
-    straight = np.stack(np.meshgrid(*steps), axis=-1).reshape(-1, 2)
-    bent = distorted(straight, camera)
-    pixels = bent + centre
+    undistorted_px = np.stack(np.meshgrid(*steps), axis=-1).reshape(-1, 2)
+    distorted_px = distorted(undistorted_px, camera)
+    pixels = distorted_px + center
 
-    def within(out: float) -> NDArray[np.bool_]:
+    def inside(out: float) -> NDArray[np.bool_]:
         return np.asarray(((pixels >= -0.5 - out * size) & (pixels <= size - 0.5 + out * size)).all(axis=1))
 
-    near = within(MARGIN)
-    return straight[near], bent[near], within(0)[near]
+    on_fit_area = inside(MARGIN)
+    return undistorted_px[on_fit_area], distorted_px[on_fit_area], inside(0)[on_fit_area]
 
 
-def distorted(straight: Floats, camera: CameraConfig) -> Floats:
+def distorted(undistorted_px: Floats, camera: CameraConfig) -> Floats:
     """Apply the lens's distortion to (N, 2) undistorted offsets from the principal point, px.
 
     Points beyond the distortion's fold, which have no image, get a large offset.
     """
-    rays = np.column_stack([straight / camera.focal_px, np.ones(len(straight))])
-    bent = Optics.of(camera).project(rays) - np.array(camera.centre_px)
-    return np.where(np.isfinite(bent), bent, 1e9)
+    rays = np.column_stack([undistorted_px / camera.focal_px, np.ones(len(undistorted_px))])
+    distorted_px = Optics.from_camera(camera).project(rays) - np.array(camera.center_px)
+    return np.where(np.isfinite(distorted_px), distorted_px, 1e9)
 
 
 def brown(camera: CameraConfig) -> tuple[Coefficients, Coefficients]:
@@ -177,6 +177,5 @@ def brown(camera: CameraConfig) -> tuple[Coefficients, Coefficients]:
             down[p, q + 1] = k * times
     focal = camera.focal_px
     return tuple(  # type: ignore[return-value]
-        {(p, q): value * focal ** (1 - p - q) for (p, q), value in table.items() if value}
-        for table in (across, down)
+        {(p, q): value * focal ** (1 - p - q) for (p, q), value in table.items() if value} for table in (across, down)
     )

@@ -1,1 +1,12 @@
 """Array types, errors, units, paths, compiled loops, and safe file access. Imports nothing else of skysim."""
+
+import lazy_loader
+
+# Loaded on first use: importing one module of the package does not import the others.
+__getattr__, __dir__, __all__ = lazy_loader.attach(
+    __name__,
+    submod_attrs={
+        "errors": ["InputError"],
+        "types": ["Frame", "FrameRow", "Mount", "Sources", "Telemetry", "Trajectory", "Truth"],
+    },
+)

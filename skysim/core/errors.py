@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterable
 
-attended = False  # whether skysim runs as a command, with a user at the terminal
+running_as_command = False  # whether skysim runs as a command, with a user at the terminal
 
 
 def note(message: str) -> None:
@@ -15,7 +16,12 @@ def note(message: str) -> None:
 
 def printable(text: object) -> str:
     """Text from outside on one line, with ? for control characters and others that a terminal cannot show."""
-    return "".join(one if one.isprintable() else "?" for one in " ".join(str(text).split()))
+    return "".join(character if character.isprintable() else "?" for character in " ".join(str(text).split()))
+
+
+def unknown_name(kind: str, name: object, allowed: Iterable[object]) -> str:
+    """Message for a name that is not allowed: `unknown solver 'magic'; allowed: quest, svd`."""
+    return f"unknown {kind} {name!r}; allowed: {', '.join(map(str, allowed))}"
 
 
 class InputError(ValueError):

@@ -23,36 +23,36 @@ from skysim.core.errors import InputError
 
 HOST = f"{zlib.crc32(platform.node().encode()):08x}"  # distinguishes machines that share a folder
 
-NAME = re.compile(rf"\..+\.skysim-{HOST}-(\d{{1,9}})(\.\w+)?")
+TEMPORARY_NAME = re.compile(rf"\..+\.skysim-{HOST}-(\d{{1,9}})(\.\w+)?")
 
-WRITING: set[Path] = set()  # temporary paths in use by this process
+ACTIVE_PATHS: set[Path] = set()  # temporary paths in use by this process
 
 
 @contextlib.contextmanager
-def being_written(path: Path) -> Iterator[Path]:
-    """A hidden name beside `path` with the host and process in it, for a file or a folder; removed at the end."""
+def temporary_path(path: Path) -> Iterator[Path]:
+    """Yield a hidden name beside `path` with host and process id, for a file or a folder; removed at the end."""
     temporary = path.with_name(f".{path.stem}.skysim-{HOST}-{os.getpid()}{path.suffix}")
-    WRITING.add(temporary.absolute())
+    ACTIVE_PATHS.add(temporary.absolute())
     try:
         yield temporary
     finally:
         remove(temporary)
-        WRITING.discard(temporary.absolute())
+        ACTIVE_PATHS.discard(temporary.absolute())
 
 
-def sweep(folder: Path) -> None:
-    """Remove temporary files in the folder that processes of this machine left and that no longer run."""
+def remove_stale_temporaries(folder: Path) -> None:
+    """Remove temporary files that processes of this machine left in the folder and that no longer run."""
     for path in folder.glob(".*.skysim-*"):
-        told = NAME.fullmatch(path.name)
-        if told and not lives(int(told[1]), path):
+        match = TEMPORARY_NAME.fullmatch(path.name)
+        if match and not writer_is_running(int(match[1]), path):
             with contextlib.suppress(OSError):  # a permission error will surface at the next write
                 remove(path)
 
 
-def lives(pid: int, path: Path) -> bool:
+def writer_is_running(pid: int, path: Path) -> bool:
     """Whether the process that was writing a file still runs. Our own process number may be a reused one."""
     if pid == os.getpid():
-        return path.absolute() in WRITING
+        return path.absolute() in ACTIVE_PATHS
     if os.name != "posix":  # signal 0 is not available
         return True
     try:
@@ -95,16 +95,16 @@ def atomic_file(path: Path) -> Iterator[Path]:
 
     If the body raises an exception, the temporary file is removed and `path` is unchanged.
     """
-    with being_written(path) as temporary, name_in_errors(path):
+    with temporary_path(path) as temporary, name_in_errors(path):
         yield temporary
         os.replace(temporary, path)
 
 
 @contextmanager
 def atomic_folder(path: Path) -> Iterator[Path]:
-    """`whole` for a folder: yields a temporary one beside `path` that replaces it, with any previous content."""
-    aside = path.with_name(f"{path.stem}.old{path.suffix}")
-    with being_written(path) as temporary, being_written(aside) as old, name_in_errors(path):
+    """As `atomic_file`, for a folder: yields a temporary one that replaces `path` and any previous content."""
+    backup = path.with_name(f"{path.stem}.old{path.suffix}")
+    with temporary_path(path) as temporary, temporary_path(backup) as old, name_in_errors(path):
         yield temporary
         # Two renames are fast; the old folder is removed afterward. So an interruption leaves one of the two complete.
         if path.exists():
@@ -120,8 +120,8 @@ def make_folder(path: Path) -> Path:
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(f"{path}: cannot be made a folder: {error.strerror}") from error
-    sweep(path)
+        raise InputError(f"{path}: cannot be created as a folder: {error.strerror}") from error
+    remove_stale_temporaries(path)
     return path
 
 
@@ -131,7 +131,10 @@ def write_png16(path: Path, image_dn: NDArray) -> None:
     write_image(path, numbers)
 
 
-PLAIN = (cv2.IMWRITE_TIFF_COMPRESSION, cv2.IMWRITE_TIFF_COMPRESSION_NONE)  # some readers support no other
+UNCOMPRESSED_TIFF = (
+    cv2.IMWRITE_TIFF_COMPRESSION,
+    cv2.IMWRITE_TIFF_COMPRESSION_NONE,
+)  # some readers support no other
 
 
 def write_image(path: Path, image: NDArray) -> None:
@@ -141,19 +144,29 @@ def write_image(path: Path, image: NDArray) -> None:
     would not report why a file cannot be written.
     """
     try:
-        done, coded = cv2.imencode(path.suffix, image, PLAIN if path.suffix == ".tif" else ())
+        encoded, data = cv2.imencode(path.suffix, image, UNCOMPRESSED_TIFF if path.suffix == ".tif" else ())
     except cv2.error:
-        done = False
-    if not done:
-        raise InputError(f"{path}: an image of {image.dtype} and shape {image.shape} cannot be encoded so")
+        encoded = False
+    if not encoded:
+        raise InputError(f"{path}: an image of {image.dtype} and shape {image.shape} cannot be encoded in this format")
     with atomic_file(path) as temporary:
-        temporary.write_bytes(coded.data)
+        temporary.write_bytes(data.data)
 
 
 def write_table(path: Path, table: Any) -> None:
     """An astropy table as ECSV."""
     with atomic_file(path) as temporary:
         table.write(temporary, format="ascii.ecsv", overwrite=True)
+
+
+def read_table(path: Path) -> Any:
+    """Read an ECSV file as an astropy table. Raises InputError (one line) if the file is not valid ECSV."""
+    from astropy.table import Table
+
+    try:
+        return Table.read(path, format="ascii.ecsv")
+    except Exception as error:  # astropy's parsers raise many types of exception for a file that is not ECSV
+        raise InputError(f"{path}: not an ECSV table: {' '.join(str(error).split())[:120]}") from None
 
 
 def header_numbers(path: Path, meta: dict[str, Any], key: str, count: int) -> list[float]:
@@ -182,13 +195,13 @@ def write_bytes(path: Path, data: bytes) -> None:
 def to_json(data: Any) -> str:
     """JSON with null for NaN and infinity."""
 
-    def plain(value: Any) -> Any:
+    def without_nan(value: Any) -> Any:
         if isinstance(value, dict):
-            return {key: plain(item) for key, item in value.items()}
+            return {key: without_nan(item) for key, item in value.items()}
         if isinstance(value, list | tuple):
-            return [plain(item) for item in value]
+            return [without_nan(item) for item in value]
         if isinstance(value, np.generic):
             value = value.item()
         return None if isinstance(value, float) and not np.isfinite(value) else value
 
-    return json.dumps(plain(data), indent=1, allow_nan=False)
+    return json.dumps(without_nan(data), indent=1, allow_nan=False)

@@ -1,13 +1,16 @@
 """Image files (FITS, PNG, TIFF, JPEG, BMP) and frames of a live camera, read with limits on their size.
 
 A few bytes of a damaged or hostile file can declare an image that exceeds the memory. The declared size is therefore
-read from the header here, and checked, before astropy or OpenCV decodes the file.
+read from the header, and checked, before astropy or OpenCV decodes the file: by astropy for FITS and by Pillow for JPEG
+and BMP. PNG and TIFF headers are parsed here, because a PNG chunk can be as harmful as its size, and because Pillow
+does not open TIFF files of 64-bit floats, or uses the last of a repeated tag where libtiff uses the first.
 """
 
 from __future__ import annotations
 
 import contextlib
 import datetime
+import io
 import os
 import struct
 import sys
@@ -26,21 +29,19 @@ from numpy.typing import NDArray
 from skysim.core.errors import InputError
 
 FITS_SUFFIXES = (".fits", ".fit", ".fts")
-BEGINS = b"SIMPLE  ="  # start of every FITS file; a compressed one differs, which astropy would unpack
-MOST_HDUS = 1000  # that are searched for an image
+FITS_MAGIC = b"SIMPLE  ="  # start of every FITS file; a compressed one differs, which astropy would unpack
+MAX_HDUS = 1000  # that are searched for an image
 
 
 @contextmanager
-def opened(path: Path) -> Iterator[BinaryIO]:
+def open_fits(path: Path) -> Iterator[BinaryIO]:
     """The file for astropy, with its warnings as errors: past a warning it may read a damaged file endlessly."""
     from astropy.utils.exceptions import AstropyWarning
 
     with path.open("rb") as file, warnings.catch_warnings():
         warnings.simplefilter("error", AstropyWarning)  # "file may have been truncated" is one
-        if file.read(len(BEGINS)) != BEGINS:
-            raise InputError(
-                f"{path}: not a whole FITS file: allowed: one that begins with SIMPLE, not packed"
-            )
+        if file.read(len(FITS_MAGIC)) != FITS_MAGIC:
+            raise InputError(f"{path}: not a complete FITS file; allowed: one that begins with SIMPLE, not compressed")
         file.seek(0)
         yield file
 
@@ -50,8 +51,8 @@ def read_fits(path: Path) -> NDArray:
     from astropy.io import fits
 
     try:
-        with opened(path) as file, fits.open(file, memmap=False) as hdus:
-            for hdu in islice(hdus, MOST_HDUS):
+        with open_fits(path) as file, fits.open(file, memmap=False) as hdus:
+            for hdu in islice(hdus, MAX_HDUS):
                 # From the header, before the data is read or skipped.
                 check_pixels(path, *map(int, getattr(hdu, "shape", ()) or ()))
                 check_pixels(path, int(hdu.size) // 8)
@@ -60,18 +61,18 @@ def read_fits(path: Path) -> NDArray:
     except InputError:
         raise
     except Exception as error:  # a damaged header makes astropy raise exceptions of many types, KeyError too
-        raise InputError(f"{path}: not a whole FITS file: {' '.join(str(error).split())}") from None
+        raise InputError(f"{path}: not a complete FITS file: {' '.join(str(error).split())}") from None
     raise InputError(f"{path}: a FITS file without an image")
 
 
-def date_of(path: Path) -> datetime.datetime | None:
+def read_date_obs(path: Path) -> datetime.datetime | None:
     """DATE-OBS of a FITS file; None for other files and for headers without a valid one."""
     if path.suffix.lower() not in FITS_SUFFIXES:
         return None
     from astropy.io import fits
 
     try:
-        with opened(path) as file:
+        with open_fits(path) as file:
             return datetime.datetime.fromisoformat(str(fits.getheader(file).get("DATE-OBS")))
     except Exception:  # of many types, as in `read_fits`, which reports the fault
         return None
@@ -81,7 +82,7 @@ class LiveCamera:
     """An open camera or video stream, read frame by frame."""
 
     def __init__(self, source: str) -> None:
-        self.source, self.taken = source, 0
+        self.source, self.frame_count = source, 0
         with silent_opencv():
             self.capture = cv2.VideoCapture(int(source) if source.isdigit() else source)
             self.capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # the newest frame, not a buffered one
@@ -89,14 +90,12 @@ class LiveCamera:
     def frame(self) -> NDArray:
         """The next frame, (H, W) or (H, W, 3). Raises InputError if there is none."""
         with silent_opencv():
-            there, frame = self.capture.read()
-        if not there or frame is None:
-            if self.taken:
-                raise InputError(f"{self.source}: ends after {self.taken} frames")
-            raise InputError(
-                f"{self.source}: no camera answers there; allowed: an index such as 0, a video file, an address"
-            )
-        self.taken += 1
+            ok, frame = self.capture.read()
+        if not ok or frame is None:
+            if self.frame_count:
+                raise InputError(f"{self.source}: ends after {self.frame_count} frames")
+            raise InputError(f"{self.source}: no camera found; allowed: an index such as 0, a video file, a URL")
+        self.frame_count += 1
         return np.asarray(frame)
 
     def close(self) -> None:
@@ -104,7 +103,7 @@ class LiveCamera:
         self.capture.release()
 
 
-def grab(source: str) -> NDArray:
+def grab_frame(source: str) -> NDArray:
     """One frame of a camera, (H, W) or (H, W, 3). Raises InputError if there is none."""
     with contextlib.closing(LiveCamera(source)) as camera:
         return camera.frame()
@@ -113,30 +112,28 @@ def grab(source: str) -> NDArray:
 @contextlib.contextmanager
 def silent_opencv() -> Iterator[None]:
     """Suppress OpenCV's own messages, for example about a missing camera."""
-    before = cv2.utils.logging.getLogLevel()
+    level = cv2.utils.logging.getLogLevel()
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:
         yield
     finally:
-        cv2.utils.logging.setLogLevel(before)
+        cv2.utils.logging.setLogLevel(level)
 
 
-MOST_PX = 1 << 28
-MOST_BYTES = 8 * MOST_PX  # of a file: each pixel a double
-DEFLATE = 1032  # greatest compression ratio of deflate (zlib's technical details)
-SEGMENTS = 1000  # of a JPEG before its image
-ALONE = (0x01, *range(0xD0, 0xD8))  # TEM and RST: markers without a length
+MAX_PIXELS = 1 << 28
+MAX_BYTES = 8 * MAX_PIXELS  # of a file: each pixel a double
+MAX_DEFLATE_RATIO = 1032  # greatest compression ratio of deflate (zlib's technical details)
 
 # TIFF: integer types of 8, 16, 32 and 64 bits. libtiff accepts signed types for a size too. All are read as unsigned,
 # so a negative size, which libtiff rejects, is a huge one here. Tags of width, height and samples per pixel.
-WHOLE = {1: "B", 3: "H", 4: "I", 16: "Q", 6: "B", 8: "H", 9: "I", 17: "Q"}
+INTEGER_TYPES = {1: "B", 3: "H", 4: "I", 16: "Q", 6: "B", 8: "H", 9: "I", 17: "Q"}
 WIDTH_TAG, HEIGHT_TAG, SAMPLES_TAG = 256, 257, 277
 
 
-def read_picture(path: Path) -> NDArray:
+def decode_image(path: Path) -> NDArray:
     """The pixels as stored, (H, W) or (H, W, channels). Raises InputError with one line."""
     data = path.read_bytes()
-    check_picture(path, data)
+    check_encoded_size(path, data)
     try:
         with silent_stderr():
             image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
@@ -151,36 +148,36 @@ def read_picture(path: Path) -> NDArray:
 def silent_stderr() -> Iterator[None]:
     """Suppress output of C libraries: libpng and OpenCV write their messages directly to file descriptor 2."""
     sys.stderr.flush()
-    kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    saved, devnull = os.dup(2), os.open(os.devnull, os.O_WRONLY)
     try:
-        os.dup2(nowhere, 2)
+        os.dup2(devnull, 2)
         yield
     finally:
-        os.dup2(kept, 2)
-        os.close(kept)
-        os.close(nowhere)
+        os.dup2(saved, 2)
+        os.close(saved)
+        os.close(devnull)
 
 
 def check_pixels(path: Path, *sides: int) -> None:
-    """Raise InputError for more pixels than MOST_PX."""
-    if prod(sides) > MOST_PX:
+    """Raise InputError for more pixels than MAX_PIXELS."""
+    if prod(sides) > MAX_PIXELS:
         size = "x".join(map(str, sides)) if len(sides) < 5 else f"{prod(sides):.3g}"
-        raise InputError(f"{path}: {size} pixels by its header; allowed: up to {MOST_PX}")
+        raise InputError(f"{path}: {size} pixels by its header; allowed: up to {MAX_PIXELS}")
 
 
 def check_bytes(path: Path) -> None:
     """Raise InputError for a file larger than the largest allowed image."""
-    held = path.stat().st_size
-    if held > MOST_BYTES:
-        raise InputError(f"{path}: {held} bytes; allowed: up to {MOST_BYTES}")
+    size = path.stat().st_size
+    if size > MAX_BYTES:
+        raise InputError(f"{path}: {size} bytes; allowed: up to {MAX_BYTES}")
 
 
-def check_picture(path: Path, data: bytes) -> None:
-    """Raise InputError unless these are the bytes of a PNG, TIFF, JPEG or BMP file with at most MOST_PX pixels."""
-    read = next((told for magic, told in FORMATS.items() if data.startswith(magic)), None)
+def check_encoded_size(path: Path, data: bytes) -> None:
+    """Raise InputError unless these are the bytes of a PNG, TIFF, JPEG or BMP file with at most MAX_PIXELS pixels."""
+    reader = next((reader for magic, reader in FORMATS.items() if data.startswith(magic)), None)
     try:
-        sizes = list(read(data)) if read else []
-    except (struct.error, OverflowError):  # truncated header, or an offset beyond the address space
+        sizes = list(reader(data)) if reader else []
+    except Exception:  # of many types, from Pillow or struct, for a truncated or damaged header
         sizes = []
     if not sizes:
         raise InputError(f"{path}: cannot be decoded; it may be truncated or not an image")
@@ -191,7 +188,7 @@ def check_picture(path: Path, data: bytes) -> None:
 Sizes = Iterator[tuple[int, ...]]
 
 
-def png(data: bytes) -> Sizes:
+def png_size(data: bytes) -> Sizes:
     """Size from IHDR, the first chunk (PNG, section 11.2.2); nothing if a chunk or the rows exceed the file.
 
     OpenCV allocates memory for a chunk before it reads it, so every chunk must end within the file, and the rows must
@@ -202,40 +199,21 @@ def png(data: bytes) -> Sizes:
     while kind != b"IEND" and at < len(data):
         length, kind = struct.unpack_from(">I4s", data, at)
         at += 12 + length
-    held = at <= len(data) and height * (1 + width * bits // 8) <= DEFLATE * len(data)
-    if held or width * height > MOST_PX:  # the caller reports an excessive size
+    complete = at <= len(data) and height * (1 + width * bits // 8) <= MAX_DEFLATE_RATIO * len(data)
+    if complete or width * height > MAX_PIXELS:  # the caller reports an excessive size
         yield width, height
 
 
-def bmp(data: bytes) -> Sizes:
-    """The old 12-byte header has 16-bit sizes; a negative height means that rows are stored from the top."""
-    old = struct.unpack_from("<I", data, 14)[0] == 12
-    width, height = struct.unpack_from("<HH" if old else "<ii", data, 18)
-    yield abs(width), abs(height)
+def pillow_size(data: bytes) -> Sizes:
+    """Size of a JPEG or BMP file by Pillow, which reads the header only."""
+    from PIL import BmpImagePlugin, JpegImagePlugin
+
+    plugin = BmpImagePlugin.BmpImageFile if data.startswith(b"BM") else JpegImagePlugin.JpegImageFile
+    with plugin(io.BytesIO(data)) as image:  # the class, not Image.open: that has a limit of its own
+        yield image.size
 
 
-def jpeg(data: bytes) -> Sizes:
-    """Size of every start of frame (SOF, ITU-T T.81, B.2.2) before the first scan.
-
-    libjpeg skips invalid bytes between segments; here they end the search.
-    """
-    at = 2
-    for _ in range(SEGMENTS):
-        while data[at : at + 2] == b"\xff\xff":  # fill bytes
-            at += 1
-        mark, kind, length = struct.unpack_from(">BBH", data, at)
-        if mark != 0xFF or kind in (0x00, 0xDA):
-            return
-        if kind in ALONE:
-            at += 2
-            continue
-        if 0xC0 <= kind <= 0xCF and kind not in (0xC4, 0xC8, 0xCC):
-            height, width = struct.unpack_from(">HH", data, at + 5)
-            yield width, height
-        at += 2 + length
-
-
-def tiff(data: bytes) -> Sizes:
+def tiff_size(data: bytes) -> Sizes:
     """Size from the first directory (TIFF 6.0, section 2), or BigTIFF's; the greatest value of a repeated tag.
 
     Only here are samples counted as well, because a TIFF sample may have eight bytes, as many as a whole pixel of the
@@ -250,19 +228,18 @@ def tiff(data: bytes) -> Sizes:
     for n in range(min(count, 1 << 16)):
         begin = at + head + n * entry
         tag, kind = struct.unpack_from(order + "HH", data, begin)
-        if tag in sides and kind in WHOLE:
-            told = struct.unpack_from(order + WHOLE[kind], data, begin + value)[0]
-            sides[tag] = max(sides[tag], told)
+        if tag in sides and kind in INTEGER_TYPES:
+            number = struct.unpack_from(order + INTEGER_TYPES[kind], data, begin + value)[0]
+            sides[tag] = max(sides[tag], number)
     if all(sides.values()):
         width, height, samples = sides.values()
         yield (width, height, samples) if samples > 1 else (width, height)
 
 
 FORMATS: dict[bytes, Callable[[bytes], Sizes]] = {
-    b"\x89PNG\r\n\x1a\n": png,
-    b"\xff\xd8\xff": jpeg,
-    b"BM": bmp,
-    **dict.fromkeys((b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"), tiff),
+    b"\x89PNG\r\n\x1a\n": png_size,
+    **dict.fromkeys((b"\xff\xd8\xff", b"BM"), pillow_size),
+    **dict.fromkeys((b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"), tiff_size),
 }
 
 IMAGE_SUFFIXES = (*FITS_SUFFIXES, ".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp")
@@ -276,9 +253,9 @@ def read_image(path: Path) -> NDArray:
     if not path.is_file():
         raise InputError(f"{path}: no such file")
     if path.suffix.lower() not in IMAGE_SUFFIXES:
-        raise InputError(f"{path}: not an image by its name; allowed: {', '.join(IMAGE_SUFFIXES)}")
+        raise InputError(f"{path}: unknown image suffix; allowed: {', '.join(IMAGE_SUFFIXES)}")
     check_bytes(path)
-    image = read_fits(path) if path.suffix.lower() in FITS_SUFFIXES else read_picture(path)
+    image = read_fits(path) if path.suffix.lower() in FITS_SUFFIXES else decode_image(path)
     if image.dtype.kind not in "uif":
         raise InputError(f"{path}: pixels of type {image.dtype}; allowed: integers and floats")
     return image
@@ -289,9 +266,7 @@ def monochrome(image: NDArray) -> NDArray:
     if image.ndim == 2:
         return image
     if image.ndim != 3 or image.shape[2] not in (1, 3, 4):
-        raise InputError(
-            f"an image of shape {image.shape}; allowed: (height, width) and colour with 3 or 4 channels"
-        )
+        raise InputError(f"an image of shape {image.shape}; allowed: (height, width) and color with 3 or 4 channels")
     if image.shape[2] == 1:
         return np.ascontiguousarray(image[:, :, 0])
     return cv2.cvtColor(np.ascontiguousarray(image[:, :, :3]), cv2.COLOR_BGR2GRAY)

@@ -17,16 +17,16 @@ from skysim.core import errors
 jit = partial(numba.njit, cache=True, error_model="numpy", fastmath=False)
 
 
-class Listener(event.Listener):
+class CompilationNotice(event.Listener):
     """Prints a note at the first compilation; functions loaded from numba's cache do not compile."""
 
     def on_start(self, _: event.Event) -> None:
         event.unregister("numba:compile", self)
-        errors.note("compiling its loops, once after an installation or a change: a minute or so")
+        errors.note("compiling numba functions (once after an installation or update): about a minute")
 
     def on_end(self, _: event.Event) -> None:
         """Required by the interface; prints nothing."""
 
 
-if errors.attended:
-    event.register("numba:compile", Listener())
+if errors.running_as_command:
+    event.register("numba:compile", CompilationNotice())

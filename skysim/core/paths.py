@@ -10,4 +10,4 @@ ROOT = Path(__file__).resolve().parents[2]
 SHIPPED = ROOT if (ROOT / "pyproject.toml").is_file() else ROOT / "skysim"
 DATA = SHIPPED / "data"
 SCENES = SHIPPED / "scenes"
-CATALOGUES = DATA / "catalogues"
+CATALOGS = DATA / "catalogs"

@@ -17,13 +17,13 @@ from skysim.core.jit import jit
 Floats = NDArray[np.float64]
 
 
-def of(a_from_b: Rotation) -> Floats:
+def from_rotation(a_from_b: Rotation) -> Floats:
     """(4,) wxyz of one Rotation, reordered here: SciPy's scalar_first takes 30 us."""
     x, y, z, w = a_from_b.as_quat()
     return np.array([w, x, y, z])
 
 
-def rotation(a_from_b: Floats) -> Rotation:
+def to_rotation(a_from_b: Floats) -> Rotation:
     """One Rotation from (4,) wxyz."""
     w, x, y, z = a_from_b.tolist()
     return Rotation.from_quat([x, y, z, w])
@@ -60,11 +60,11 @@ def apply(a_from_b: Floats, v_b: Floats) -> Floats:
 
 
 @jit
-def from_rotvec(turn_rad: Floats) -> Floats:
+def from_rotvec(rotvec_rad: Floats) -> Floats:
     """The rotation by |turn_rad| about turn_rad (3,): (cos(a / 2), sin(a / 2) axis)."""
-    angle = math.sqrt(turn_rad[0] ** 2 + turn_rad[1] ** 2 + turn_rad[2] ** 2)
+    angle = math.sqrt(rotvec_rad[0] ** 2 + rotvec_rad[1] ** 2 + rotvec_rad[2] ** 2)
     scale = math.sin(angle / 2) / angle if angle > 1e-9 else 0.5  # the limit for small angles
-    return np.array([math.cos(angle / 2), scale * turn_rad[0], scale * turn_rad[1], scale * turn_rad[2]])
+    return np.array([math.cos(angle / 2), scale * rotvec_rad[0], scale * rotvec_rad[1], scale * rotvec_rad[2]])
 
 
 @jit
@@ -85,7 +85,7 @@ def cross(a: Floats, b: Floats) -> Floats:
 
 
 @jit
-def times(matrix: Floats, v: Floats) -> Floats:
+def matrix_vector(matrix: Floats, v: Floats) -> Floats:
     """matrix (3, 3) times v (3,)."""
     p, q, r = v[0], v[1], v[2]
     return np.array(
@@ -98,17 +98,17 @@ def times(matrix: Floats, v: Floats) -> Floats:
 
 
 @jit
-def along(knots_wxyz: Floats, hermite_rad: Floats, knot: NDArray[np.int64], share: Floats) -> Floats:
+def interpolate(knots_wxyz: Floats, hermite_rad: Floats, knot: NDArray[np.int64], fraction: Floats) -> Floats:
     """(M, 4) attitudes between knots (N, 4): cubic Hermite in the rotation vector from the previous knot.
 
     hermite_rad : (N - 1, 3, 3) rotation vector to the next knot, and its derivatives at both ends times the step
-    knot, share : (M,) index of the knot before each time, and the elapsed fraction of the step
+    knot, fraction : (M,) index of the knot before each time, and the elapsed fraction of the step
     """
     out = np.empty((len(knot), 4))
     for m in range(len(knot)):
-        k, s = knot[m], share[m]
+        k, s = knot[m], fraction[m]
         # Hermite basis: value at the end, slope at the beginning, slope at the end. The value at the beginning is zero.
         a, b, c = s * s * (3 - 2 * s), s * (1 - s) ** 2, -s * s * (1 - s)
-        turn, begin, end = hermite_rad[k]
-        out[m] = multiply(knots_wxyz[k], from_rotvec(a * turn + b * begin + c * end))
+        rotvec, begin, end = hermite_rad[k]
+        out[m] = multiply(knots_wxyz[k], from_rotvec(a * rotvec + b * begin + c * end))
     return out

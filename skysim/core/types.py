@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from skysim.core.quaternion import along
+from skysim.core.quaternion import interpolate
 
 Floats = NDArray[np.float64]
 
@@ -38,27 +38,27 @@ class Trajectory:
     t_s: Floats
     lab_from_body: Rotation
     rate_body_rad_s: Floats
-    _between: list[tuple[Floats, Floats]] = field(init=False, repr=False, default_factory=list)
+    _segments: list[tuple[Floats, Floats]] = field(init=False, repr=False, default_factory=list)
 
     @classmethod
     def at_rest(cls, lab_from_body: Rotation, end_s: float) -> Trajectory:
         """A constant attitude from 0 to end_s."""
-        both = Rotation.concatenate([lab_from_body, lab_from_body])
-        return cls(np.array([0.0, end_s]), both, np.zeros((2, 3)))
+        ends = Rotation.concatenate([lab_from_body, lab_from_body])
+        return cls(np.array([0.0, end_s]), ends, np.zeros((2, 3)))
 
-    def between(self) -> tuple[Floats, Floats]:
-        """Attitudes (N, 4) as wxyz and hermite_rad (N - 1, 3, 3) for `quaternion.along`; computed at the first call."""
-        if not self._between:
+    def hermite_segments(self) -> tuple[Floats, Floats]:
+        """Attitudes (N, 4) as wxyz and hermite_rad (N - 1, 3, 3) for `quaternion.interpolate`; computed once."""
+        if not self._segments:
             step = np.diff(self.t_s)[:, None]
-            turn = (self.lab_from_body[:-1].inv() * self.lab_from_body[1:]).as_rotvec()
+            rotvec = (self.lab_from_body[:-1].inv() * self.lab_from_body[1:]).as_rotvec()
             begin, end = self.rate_body_rad_s[:-1] * step, self.rate_body_rad_s[1:] * step
             # d(rotvec)/dt = omega + rotvec x omega / 2 + ...: the rotation vector is from the previous sample.
-            end = end + np.cross(turn, end) / 2
+            end = end + np.cross(rotvec, end) / 2
             wxyz = self.lab_from_body.as_quat(scalar_first=True)
-            self._between.append((wxyz, np.stack([turn, begin, end], axis=1)))
-        return self._between[0]
+            self._segments.append((wxyz, np.stack([rotvec, begin, end], axis=1)))
+        return self._segments[0]
 
-    def at(self, t_s: float | Floats) -> Rotation:
+    def attitude_at(self, t_s: float | Floats) -> Rotation:
         """lab_from_body at any time within the history.
 
         Cubic Hermite in the rotation vector from the previous sample, with the rates at both ends: exact to fourth
@@ -66,13 +66,11 @@ class Trajectory:
         """
         t = np.atleast_1d(np.asarray(t_s, dtype=float))
         if t.min() < self.t_s[0] - 1e-9 or t.max() > self.t_s[-1] + 1e-9:
-            raise ValueError(
-                f"time {t.min():.6f}..{t.max():.6f} s is outside {self.t_s[0]}..{self.t_s[-1]} s"
-            )
+            raise ValueError(f"time {t.min():.6f}..{t.max():.6f} s is outside {self.t_s[0]}..{self.t_s[-1]} s")
         k = np.minimum(np.maximum(np.searchsorted(self.t_s, t, side="right") - 1, 0), len(self.t_s) - 2)
-        share = (t - self.t_s[k]) / (self.t_s[k + 1] - self.t_s[k])
-        here = Rotation.from_quat(along(*self.between(), k, share), scalar_first=True)
-        return here if np.ndim(t_s) else here[0]
+        fraction = (t - self.t_s[k]) / (self.t_s[k + 1] - self.t_s[k])
+        lab_from_body = Rotation.from_quat(interpolate(*self.hermite_segments(), k, fraction), scalar_first=True)
+        return lab_from_body if np.ndim(t_s) else lab_from_body[0]
 
     def rate_at(self, t_s: float) -> Floats:
         """(3,) angular velocity in body axes, interpolated linearly."""
@@ -96,7 +94,7 @@ class Telemetry:
     saturated       : (K,) whether the gyros were at their limit in the previous tick
     bias_rad_s      : (K, 3) rate error of the gyros: bias, scale, misalignment, and the Earth rate if not compensated
     lab_from_filter : K, the filter's attitude; sigma_attitude_rad (K, 3) its standard deviation about the body's
-                      axes; believed_bias_rad_s (K, 3) its bias estimate, sigma_bias_rad_s (K, 3) the bias's standard
+                      axes; assumed_bias_rad_s (K, 3) its bias estimate, sigma_bias_rad_s (K, 3) the bias's standard
                       deviation
     """
 
@@ -117,7 +115,7 @@ class Telemetry:
     bias_rad_s: Floats | None = None
     lab_from_filter: Rotation | None = None
     sigma_attitude_rad: Floats | None = None
-    believed_bias_rad_s: Floats | None = None
+    assumed_bias_rad_s: Floats | None = None
     sigma_bias_rad_s: Floats | None = None
 
 
@@ -127,12 +125,11 @@ class Sources:
 
     id         : (N,) Hipparcos number or LED number
     place      : (N, 4) homogeneous: (direction, 0) for a star at infinity, (x, y, z in m, 1) for an LED
-    normal     : (N, 3) unit normal of the emitting disc; zeros for a star
-    radius_m   : (N,) radius of the emitting disc; 0 for a star
+    normal     : (N, 3) unit normal of the emitting disk; zeros for a star
+    radius_m   : (N,) radius of the emitting disk; 0 for a star
     strength   : (N,) in photo-electrons, that is photons weighted with the chip's quantum efficiency at each
                  wavelength: star: e- s^-1 m^-2 at the aperture; LED: e- s^-1 sr^-1 along its normal. Its decrease
-                     with
-                 angle and distance is given by `led.Emitter`
+                 with angle and distance is given by `led.Emitter`
     period_s, start_s, on_s : (N,) pulse train: lit from start_s for on_s in every period_s
     magnitude  : (N,) V magnitude of a star; NaN for an LED
     """
@@ -191,7 +188,7 @@ class Truth:
     lab_from_body : attitude at mid-exposure
     cam_from_lab  : the camera's attitude at mid-exposure
     rate_cam_rad_s: (3,) angular velocity in camera axes
-    seen          : the sources on the frame
+    sources       : the sources on the frame
     hidden        : (M,) ids of sources that are occluded and would otherwise be on the frame at mid-exposure
     """
 
@@ -199,7 +196,7 @@ class Truth:
     lab_from_body: Rotation
     cam_from_lab: Rotation
     rate_cam_rad_s: Floats
-    seen: SourceTruth
+    sources: SourceTruth
     hidden: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
 
 
@@ -215,7 +212,7 @@ class Frame:
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class FrameRow:
     """One frame of a run for the report: angles in degrees, errors in arcseconds, times in ms.
 
     truth_deg, estimate_deg : (RA, Dec, roll) of the camera under the stars, (roll, pitch, yaw) of the vehicle

@@ -11,13 +11,13 @@ import datetime
 import itertools
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Annotated, Any
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
 
-LONGEST = 80  # characters of a quantity
-UNIT_FOLLOWS = r"^\s*[-+.]?\d.*[a-zA-Z]"  # pattern of a quantity in the JSON schema, for editors
+MAX_CHARACTERS = 80  # of a quantity
+QUANTITY_PATTERN = r"^\s*[-+.]?\d.*[a-zA-Z]"  # pattern of a quantity in the JSON schema, for editors
 
 # Suffixes that the YAML key lacks, of fields that `quantity` parses. `dark_e_s` and `rate_deg_s` are bare numbers and
 # keep theirs.
@@ -47,8 +47,8 @@ def quantity(si_unit: str, what: str, examples: str) -> Callable[[Any], float]:
 
 def with_unit(si_unit: str, what: str, examples: str) -> BeforeValidator:
     """`quantity` as the validator of a key; the JSON schema declares the value as a string."""
-    told = Field(description=f"a {what} such as {examples}", pattern=UNIT_FOLLOWS)
-    return BeforeValidator(quantity(si_unit, what, examples), json_schema_input_type=Annotated[str, told])
+    schema = Field(description=f"a {what} such as {examples}", pattern=QUANTITY_PATTERN)
+    return BeforeValidator(quantity(si_unit, what, examples), json_schema_input_type=Annotated[str, schema])
 
 
 def in_si(value: str, si_unit: str | None = None) -> float:
@@ -57,12 +57,12 @@ def in_si(value: str, si_unit: str | None = None) -> float:
 
     # astropy spells it `inch`; scenes write `in`.
     inch = units.def_unit("in", units.imperial.inch)
-    if len(value) > LONGEST:
-        raise ValueError(f"{len(value)} characters are no quantity")
+    if len(value) > MAX_CHARACTERS:
+        raise ValueError(f"{len(value)} characters; allowed: up to {MAX_CHARACTERS}")
     with units.add_enabled_units([inch, units.imperial]):
         try:
-            told = units.Quantity(value)
-            return float(told.to_value(si_unit) if si_unit else told.si.value)
+            number = units.Quantity(value)
+            return float(number.to_value(si_unit) if si_unit else number.si.value)
         except ArithmeticError as error:  # "3 m(1/0)", "3 m(9e9)"
             raise ValueError(str(error)) from None
 
@@ -94,7 +94,7 @@ SemiAxis = Annotated[Length, Field(gt=0)]
 Spin = Annotated[Number, Field(ge=-360, le=360)]
 Triple = tuple[Number, Number, Number]
 Angles = tuple[Number, Number, Number]
-Share = Annotated[Number, Field(ge=0, le=1)]
+Fraction = Annotated[Number, Field(ge=0, le=1)]
 Positive = Annotated[Number, Field(gt=0)]
 NotNegative = Annotated[Number, Field(ge=0)]
 Ascending = Annotated[tuple[Number, ...], Field(min_length=2)]
@@ -112,16 +112,9 @@ class ConfigModel(BaseModel):
     )
 
 
-def require_member(value: str, allowed: Mapping[str, Any]) -> str:
-    """The value, if it is a key of `allowed`. Raises ValueError."""
-    if value not in allowed:
-        raise ValueError(f"{value!r} is none of {', '.join(allowed)}")
-    return value
-
-
 def check_table(angle_deg: Sequence[float], values: Sequence[float], name: str) -> None:
     """Raise ValueError unless two columns have equal length and the angle ascends."""
     if len(angle_deg) != len(values):
-        raise ValueError(f"angle_deg has {len(angle_deg)} numbers, {name} {len(values)}")
+        raise ValueError(f"angle_deg has {len(angle_deg)} numbers, {name} has {len(values)}")
     if any(b <= a for a, b in itertools.pairwise(angle_deg)):
-        raise ValueError("angle_deg does not ascend")
+        raise ValueError("angle_deg is not strictly ascending")

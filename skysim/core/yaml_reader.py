@@ -1,8 +1,9 @@
 """Read YAML files safely, and turn a pydantic validation error into a one-line message with file and line.
 
-Input files may come from untrusted sources, so their size, depth and number of values are limited (`Careful`), and
-duplicate keys are rejected (`once`). `explain` takes the first error that pydantic reports, translates its location
-to the keys of the YAML tree, and `place_of` finds the line of that key in the file that defines it.
+Input files may come from untrusted sources, so their size, depth and number of values are limited (`StrictLoader`),
+and duplicate keys are rejected (`reject_duplicate_keys`). `explain` takes the first error that pydantic reports,
+translates its location to the keys of the YAML tree, and `location_of` finds the line of that key in the file that
+defines it.
 """
 
 from __future__ import annotations
@@ -18,16 +19,16 @@ import yaml
 from pydantic import BaseModel, ValidationError
 
 from skysim import __version__
-from skysim.core.errors import InputError, printable
+from skysim.core.errors import InputError, printable, unknown_name
 
 Files = list[tuple[Path, str]]  # paths and texts
 VERSION = 1  # of scene and study files; raised by an incompatible change, with a conversion of old files here
 
 
-MOST_BYTES = 1 << 20  # of a file: a minute of reading
-MOST_NODES = 100_000  # of a document, counting the content of an alias each time
-LONGEST = 200  # characters of a value in a message
-DEEPEST = 40  # levels of nesting
+MAX_BYTES = 1 << 20  # of a file: a minute of reading
+MAX_NODES = 100_000  # of a document, counting the content of an alias each time
+MAX_EXCERPT = 200  # characters of a value in a message
+MAX_DEPTH = 40  # levels of nesting
 
 
 class StrictLoader(yaml.SafeLoader):
@@ -43,17 +44,17 @@ class StrictLoader(yaml.SafeLoader):
         aliased = self.check_event(yaml.AliasEvent)
         # Limits are checked while composing, before any value is constructed from an expanding alias.
         self.depth += 1
-        if self.depth > DEEPEST:
-            raise yaml.composer.ComposerError(None, None, f"more than {DEEPEST} sections deep", mark)
+        if self.depth > MAX_DEPTH:
+            raise yaml.composer.ComposerError(None, None, f"more than {MAX_DEPTH} sections deep", mark)
         node = super().compose_node(parent, index)
         self.depth -= 1
         # An alias of a node that is not yet complete lies within that node: it is recursive.
         if aliased and id(node) not in self.size:
-            raise yaml.composer.ComposerError(None, None, "an alias of what it stands in", mark)
+            raise yaml.composer.ComposerError(None, None, "an alias within its own anchor", mark)
         self.nodes += self.size[id(node)] if aliased else 1
         self.size[id(node)] = self.nodes - before
-        if self.nodes > MOST_NODES:
-            raise yaml.composer.ComposerError(None, None, f"more than {MOST_NODES} values", mark)
+        if self.nodes > MAX_NODES:
+            raise yaml.composer.ComposerError(None, None, f"more than {MAX_NODES} values", mark)
         return node
 
     def construct_object(self, node: yaml.Node, deep: bool = False) -> Any:
@@ -61,7 +62,7 @@ class StrictLoader(yaml.SafeLoader):
         try:
             return super().construct_object(node, deep)
         except (ValueError, TypeError, LookupError, OverflowError, AttributeError) as error:
-            problem = f"{str(node.value)[:40]!r} is no {node.tag.rpartition(':')[2]} ({error})"
+            problem = f"{str(node.value)[:40]!r} is not a valid {node.tag.rpartition(':')[2]} ({error})"
             raise yaml.constructor.ConstructorError(None, None, problem, node.start_mark) from None
 
 
@@ -83,21 +84,21 @@ def is_file(path: Path) -> bool:
         return False
 
 
-def find(name: str, folder: Path, what: str) -> Path:
+def find_file(name: str, folder: Path, what: str) -> Path:
     """The path of a file given by path, or by its name in a folder. Raises InputError."""
     path, shipped = Path(name), folder / f"{name}.yaml"
     if path.suffix in {".yaml", ".yml"} and is_file(path):
         return path
     if not path.suffix and is_file(shipped):
         return shipped
-    known = sorted(one.stem for one in folder.glob("*.yaml"))
-    raise InputError(f"{shown(name)}: no such {what}; allowed: a .yaml file or one of {', '.join(known)}")
+    names = sorted(file.stem for file in folder.glob("*.yaml"))
+    raise InputError(f"{excerpt(name)}: no such {what}; allowed: a .yaml file or one of {', '.join(names)}")
 
 
-def shown(value: object) -> str:
+def excerpt(value: object) -> str:
     """A value for a message: on one line, truncated to LONGEST characters."""
     text = printable(value)
-    return text if len(text) <= LONGEST else f"{text[:LONGEST]}…"
+    return text if len(text) <= MAX_EXCERPT else f"{text[:MAX_EXCERPT]}…"
 
 
 def parse_overrides(sets: list[str] | None) -> dict[str, str]:
@@ -106,21 +107,21 @@ def parse_overrides(sets: list[str] | None) -> dict[str, str]:
     for item in sets or []:
         key, equals, value = item.partition("=")
         if not equals or not key:
-            raise InputError(f"--set {shown(item)}: allowed: path.to.key=value")
+            raise InputError(f"--set {excerpt(item)}: allowed: path.to.key=value")
         overrides[key] = value
     return overrides
 
 
 def override_texts(overrides: Mapping[str, Any] | None) -> dict[str, str]:
-    """Overrides given in Python as the YAML texts of `--set`: strings as they are, other values as JSON."""
-    return {key: one if isinstance(one, str) else json.dumps(one) for key, one in (overrides or {}).items()}
+    """The values of overrides as YAML text, as `--set` takes them: strings unchanged, other values as JSON."""
+    return {key: value if isinstance(value, str) else json.dumps(value) for key, value in (overrides or {}).items()}
 
 
 def read_yaml(path: Path) -> tuple[dict[str, Any], str]:
     """A YAML mapping and its text. Raises InputError."""
     try:
-        if path.stat().st_size > MOST_BYTES:
-            raise InputError(f"{path}: {path.stat().st_size} bytes; allowed: up to {MOST_BYTES}")
+        if path.stat().st_size > MAX_BYTES:
+            raise InputError(f"{path}: {path.stat().st_size} bytes; allowed: up to {MAX_BYTES}")
         text = path.read_text(encoding="utf-8")
         node, tree = parse_yaml(text)
     except (OSError, UnicodeDecodeError) as error:
@@ -142,13 +143,11 @@ def reject_duplicate_keys(node: yaml.Node | None, path: Path) -> None:
         for item in node.value:
             reject_duplicate_keys(item, path)
     if isinstance(node, yaml.MappingNode):
-        seen: set[str] = set()
+        names: set[str] = set()
         for key, value in node.value:
-            if str(key.value) in seen:
-                raise InputError(
-                    f"{shown(key.value)}: stands twice in one section ({path}, line {key.start_mark.line + 1})"
-                )
-            seen.add(str(key.value))
+            if str(key.value) in names:
+                raise InputError(f"{excerpt(key.value)}: duplicate key ({path}, line {key.start_mark.line + 1})")
+            names.add(str(key.value))
             reject_duplicate_keys(value, path)
 
 
@@ -156,42 +155,41 @@ def check_version(tree: Mapping[str, Any], path: Path, text: str) -> None:
     """Raise InputError for a file of another schema version, before its unknown keys are reported as mistakes."""
     if "schema" not in tree:
         raise InputError(f"schema: missing; add the line schema: {VERSION} ({path})")
-    told = tree["schema"]
-    if type(told) is int and told == VERSION:
+    version = tree["schema"]
+    if type(version) is int and version == VERSION:
         return
-    what = f"{shown(repr(told))} is not known"
-    if type(told) is int:
-        what = f"{told} is " + (
-            f"of a newer skysim than {__version__}" if told > VERSION else "older than this skysim reads"
+    problem = f"unknown version {excerpt(repr(version))}"
+    if type(version) is int:
+        problem = f"version {version} is " + (
+            f"newer than skysim {__version__} supports" if version > VERSION else "no longer supported"
         )
-    raise InputError(f"schema: {what}; allowed: {VERSION} {place_of(['schema'], [(path, text)], {})}")
+    raise InputError(f"schema: {problem}; allowed: {VERSION} {location_of(['schema'], [(path, text)], {})}")
 
 
 def set_key(tree: dict[str, Any], key: str, value: str) -> None:
     """Set one dotted key of the raw scene; the value is YAML. A number is an index into a list: `camera_body.2`."""
     *parents, last = key.split(".")
     if not all((*parents, last)):
-        raise InputError(f"--set {shown(key)}={shown(value)}: allowed: path.to.key=value")
+        raise InputError(f"--set {excerpt(key)}={excerpt(value)}: allowed: path.to.key=value")
     node: Any = tree
     for depth, parent in enumerate(parents):
-        node = node.setdefault(parent, {}) if isinstance(node, dict) else node[place_in(node, parent, key)]
+        node = node.setdefault(parent, {}) if isinstance(node, dict) else node[list_index(node, parent, key)]
         if not isinstance(node, dict | list):
-            raise InputError(
-                f"--set {shown(key)}: {shown('.'.join(parents[: depth + 1]))} holds a value, not keys"
-            )
+            raise InputError(f"--set {excerpt(key)}: {excerpt('.'.join(parents[: depth + 1]))} holds a value, not keys")
     try:
-        node[last if isinstance(node, dict) else place_in(node, last, key)] = parse_yaml(value)[1]
+        node[last if isinstance(node, dict) else list_index(node, last, key)] = parse_yaml(value)[1]
     except yaml.YAMLError as error:
-        raise InputError(f"--set {shown(key)}: {shown(repr(value))} is not YAML") from error
+        raise InputError(f"--set {excerpt(key)}: {excerpt(repr(value))} is not YAML") from error
 
 
-def place_in(values: list[Any], place: str, key: str) -> int:
+def list_index(values: list[Any], component: str, key: str) -> int:
     """The list index that a component of a dotted key gives. Raises InputError."""
-    if not (place.isascii() and place.isdigit() and len(place) < 10) or int(place) >= len(values):
+    digits = component.isascii() and component.isdigit() and len(component) < 10
+    if not digits or int(component) >= len(values):
         raise InputError(
-            f"--set {shown(key)}: {shown(place)} is no place in a list; allowed: 0 to {len(values) - 1}"
+            f"--set {excerpt(key)}: {excerpt(component)} is not a list index; allowed: 0 to {len(values) - 1}"
         )
-    return int(place)
+    return int(component)
 
 
 def explain(
@@ -201,51 +199,48 @@ def explain(
     files: Files,
     overrides: Mapping[str, str],
 ) -> str:
-    """One-line message of the first validation error: `led.falloff: 'cubic' is none of … (scenes/x.yaml, line 31)`.
+    """One-line message of the first error: `light.kind: unknown kind 'domes'; allowed: … (scenes/x.yaml, line 31)`.
 
     tree is the merged content of the files; files are their paths and texts, the one with the highest priority first.
     """
     # A misspelled key causes two errors, unknown and missing. Report the unknown one.
-    first = min(error.errors(), key=lambda fault: fault["type"] == "missing")
-    keys = [str(key) for key in in_tree(first["loc"], tree, first["type"] == "missing")]
+    first = min(error.errors(), key=lambda item: item["type"] == "missing")
+    keys = [str(key) for key in yaml_keys(first["loc"], tree, first["type"] == "missing")]
     message = re.sub(r"^(Value error, |\w+ should )", "", first["msg"])
     if first["type"] == "extra_forbidden":
-        message = "unknown key" + hint(keys[-1], allowed_keys(model, first["loc"][:-1]))
+        message = "unknown key" + suggestion(keys[-1], allowed_keys(model, first["loc"][:-1]))
     elif first["type"] == "missing":
         message = "missing"
     elif first["type"] == "union_tag_invalid":
         keys, context = [*keys, "kind"], first["ctx"]
-        message = f"{context['tag']!r} is none of {context['expected_tags'].replace(chr(39), '')}"
+        message = unknown_name("kind", context["tag"], [context["expected_tags"].replace("'", "")])
     elif first["type"] == "union_tag_not_found":
         message = "kind is missing"
     elif first["type"] in ("model_type", "model_attributes_type"):
-        message = f"{shown(repr(first['input']))} is not allowed; it should be a mapping of keys to values"
-    elif (
-        first["type"] == "value_error" and not keys
-    ):  # validator of the whole scene: its message begins with the key
+        message = f"{excerpt(repr(first['input']))} is not allowed; it should be a mapping of keys to values"
+    elif first["type"] == "value_error" and not keys:  # validator of the whole scene: its message begins with the key
         dotted, _, message = message.partition(": ")
         keys = dotted.split(".")
     elif not first["type"].startswith("value_error"):
-        message = f"{shown(repr(first['input']))} is not allowed; it should {message}"
+        message = f"{excerpt(repr(first['input']))} is not allowed; it should {message}"
     dotted = ".".join(keys)
     # A missing key has no line of its own, so its section's is given. (A file may have it in a section or list that
     # another file replaces.)
-    given = keys[:-1] if first["type"] == "missing" else keys
-    return f"{shown(dotted) + ': ' if dotted else ''}{message} {place_of(given, files, overrides)}"
+    located = keys[:-1] if first["type"] == "missing" else keys
+    return f"{excerpt(dotted) + ': ' if dotted else ''}{message} {location_of(located, files, overrides)}"
 
 
-def place_of(keys: list[str], files: Files, overrides: Mapping[str, str]) -> str:
+def location_of(keys: list[str], files: Files, overrides: Mapping[str, str]) -> str:
     """Where a key was given: `(--set)`, or `(scenes/x.yaml, line 31)` in the file that has most of its components."""
     dotted = ".".join(keys)
     if any(k == dotted or dotted.startswith(k + ".") for k in overrides):
         return "(--set)"
-    found = [(*line_of(text, keys), path) for path, text in files]
-    depth = max(found, key=lambda one: one[0])[0]
-    line, path = next((line, path) for deep, line, path in found if deep == depth)
+    matches = [(*line_of(text, keys), path) for path, text in files]
+    _, line, path = max(matches, key=lambda match: match[0])  # the first of equal depth
     return f"({path}{f', line {line}' if line else ''})"
 
 
-def in_tree(loc: tuple[int | str, ...], tree: Any, missing: bool) -> list[int | str]:
+def yaml_keys(loc: tuple[int | str, ...], tree: Any, missing: bool) -> list[int | str]:
     """The error's location as keys of the tree, without pydantic's names of union branches; the last may be missing."""
     keys: list[int | str] = []
     for n, key in enumerate(loc):
@@ -267,7 +262,7 @@ def allowed_keys(model: type[BaseModel], loc: tuple[int | str, ...]) -> list[str
         node = resolve(node, schema)
         # Branches of a union; an optional section has its union nested one level deeper.
         options = [resolve(option, schema) for option in node.get("anyOf", []) + node.get("oneOf", [])]
-        options += [resolve(option, schema) for one in options for option in one.get("oneOf", [])]
+        options += [resolve(option, schema) for outer in options for option in outer.get("oneOf", [])]
         if key in node.get("properties", {}):
             node = node["properties"][key]
         elif isinstance(key, int):
@@ -290,10 +285,10 @@ def kind_of(node: dict[str, Any]) -> str | None:
     return node.get("properties", {}).get("kind", {}).get("const")
 
 
-def hint(word: str, allowed: list[str]) -> str:
+def suggestion(word: str, allowed: list[str]) -> str:
     close = difflib.get_close_matches(word, allowed, 1)
-    meant = f"; did you mean {close[0]}?" if close else ""
-    return f"{meant}; allowed: {', '.join(k for k in allowed if k.isidentifier())}" if allowed else meant
+    guess = f"; did you mean {close[0]}?" if close else ""
+    return f"{guess}; allowed: {', '.join(k for k in allowed if k.isidentifier())}" if allowed else guess
 
 
 def line_of(text: str, keys: list[str]) -> tuple[int, int | None]:
@@ -301,17 +296,12 @@ def line_of(text: str, keys: list[str]) -> tuple[int, int | None]:
     node = yaml.compose(text, yaml.SafeLoader)
     depth, line = 0, None
     for key in keys:
-        found = None
+        entry = None
         if isinstance(node, yaml.MappingNode):
-            found = next(((k, v) for k, v in node.value if k.value == key), None)
-        elif (
-            isinstance(node, yaml.SequenceNode)
-            and key.isascii()
-            and key.isdigit()
-            and int(key) < len(node.value)
-        ):
-            found = (node.value[int(key)],) * 2
-        if not found:
+            entry = next(((k, v) for k, v in node.value if k.value == key), None)
+        elif isinstance(node, yaml.SequenceNode) and key.isascii() and key.isdigit() and int(key) < len(node.value):
+            entry = (node.value[int(key)],) * 2
+        if not entry:
             break
-        depth, line, node = depth + 1, found[0].start_mark.line + 1, found[1]
+        depth, line, node = depth + 1, entry[0].start_mark.line + 1, entry[1]
     return depth, line

@@ -1,4 +1,4 @@
-"""The attitude control law: the torque wanted on the vehicle. Independent of the simulator and the actuators."""
+"""The attitude control law (PID with feed-forward). Independent of the simulator and the actuators."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from skysim.core.jit import jit
-from skysim.core.quaternion import apply, cross, inverse, multiply, times, to_rotvec
+from skysim.core.quaternion import apply, cross, inverse, matrix_vector, multiply, to_rotvec
 from skysim.core.types import Floats
 from skysim.dynamics.guidance import Reference
 from skysim.scene.motion import ControlConfig
 
-SHORT = 0.01  # relative torque deficit that counts as a limit; damped steering gives smaller ones
+TORQUE_DEFICIT = 0.01  # relative torque deficit that counts as a limit; damped steering gives smaller ones
 
 
 @dataclass(slots=True)
@@ -51,10 +51,10 @@ class Pid:
     def torque_nm(
         self, t_s: float, lab_from_body_wxyz: Floats, rate_body_rad_s: Floats, momentum_nms: Floats
     ) -> Floats:
-        """(3,) the torque wanted at t_s, to be held until the next call."""
+        """(3,) the commanded torque at t_s, to be held until the next call."""
         gains = self.kp, self.ki, self.kd, self.authority_nm, self.rate_limit_rad_s
-        self.error_rad, torque_nm, self.limited = law(
-            self.reference.at(t_s),
+        self.error_rad, torque_nm, self.limited = pid_torque(
+            self.reference.state_at(t_s),
             (lab_from_body_wxyz, rate_body_rad_s),
             self.error_sum_rad_s,
             self.inertia_kg_m2,
@@ -63,20 +63,20 @@ class Pid:
         )
         return torque_nm
 
-    def learn(self, wanted_nm: Floats, given_nm: Floats, period_s: float) -> None:
-        """Integrate the error, except on axes that got less torque than wanted (anti-windup), and not while limited.
+    def integrate(self, commanded_nm: Floats, achieved_nm: Floats, period_s: float) -> None:
+        """Integrate the error, except on axes that got less torque than commanded (anti-windup), and not while limited.
 
-        A positive error asks for a negative torque, so on an axis stuck at the positive limit a positive
-        error still counts.
+        A positive error commands a negative torque, so on an axis at the positive torque limit a positive error is
+        still integrated.
         """
         if not self.limited:
-            add_unless_short(self.error_sum_rad_s, self.error_rad, wanted_nm, given_nm, period_s)
+            integrate_error(self.error_sum_rad_s, self.error_rad, commanded_nm, achieved_nm, period_s)
 
 
 @jit
-def law(
+def pid_torque(
     reference: tuple[Floats, Floats, Floats],
-    present: tuple[Floats, Floats],
+    state: tuple[Floats, Floats],
     error_sum: Floats,
     inertia: Floats,
     momentum: Floats,
@@ -84,38 +84,44 @@ def law(
 ) -> tuple[Floats, Floats, bool]:
     """Error and torque, (3,) each, of Pid's equation, and whether it was limited; compiled, called every period."""
     lab_from_ref, rate_ref, accel_ref = reference
-    lab_from_body, rate = present
-    kp, ki, kd, authority, fastest = gains
+    lab_from_body, rate = state
+    kp, ki, kd, authority, rate_limit = gains
     body_from_ref = multiply(inverse(lab_from_body), lab_from_ref)
     # e is the rotation vector of ref_from_body, the inverse of body_from_ref.
     error = -to_rotvec(body_from_ref)
-    lag = rate - apply(body_from_ref, rate_ref)
-    pull = kp * error + ki * error_sum
-    size = math.sqrt((pull**2).sum())
-    far = math.sqrt((error**2).sum())
-    most = kd * min(fastest, math.sqrt(authority / max(inertia[0, 0], inertia[1, 1], inertia[2, 2]) * far))
+    rate_error = rate - apply(body_from_ref, rate_ref)
+    feedback = kp * error + ki * error_sum
+    feedback_size = math.sqrt((feedback**2).sum())
+    error_angle = math.sqrt((error**2).sum())
+    feedback_limit = kd * min(
+        rate_limit, math.sqrt(authority / max(inertia[0, 0], inertia[1, 1], inertia[2, 2]) * error_angle)
+    )
     # Small errors are not limited: there the integral must be free to balance a constant torque.
-    limited = size > most and kp * far > most
+    limited = feedback_size > feedback_limit and kp * error_angle > feedback_limit
     if limited:
-        pull = pull * (most / size)
-    wanted = apply(body_from_ref, accel_ref) - pull - kd * lag
-    return error, times(inertia, wanted) + cross(rate, times(inertia, rate) + momentum), limited
+        feedback = feedback * (feedback_limit / feedback_size)
+    acceleration = apply(body_from_ref, accel_ref) - feedback - kd * rate_error
+    return (
+        error,
+        matrix_vector(inertia, acceleration) + cross(rate, matrix_vector(inertia, rate) + momentum),
+        limited,
+    )
 
 
 @jit
-def add_unless_short(total: Floats, error: Floats, wanted: Floats, given: Floats, period_s: float) -> None:
-    """`Pid.learn`, in place."""
+def integrate_error(error_sum: Floats, error: Floats, commanded: Floats, achieved: Floats, period_s: float) -> None:
+    """`Pid.integrate` on one error sum (3,), in place."""
     for i in range(3):
         # Anti-windup: do not integrate further into a limit, but do integrate out of it.
-        short = abs(given[i]) < abs(wanted[i]) * (1 - SHORT)
-        if not short or error[i] * wanted[i] > 0:
-            total[i] += error[i] * period_s
+        saturated = abs(achieved[i]) < abs(commanded[i]) * (1 - TORQUE_DEFICIT)
+        if not saturated or error[i] * commanded[i] > 0:
+            error_sum[i] += error[i] * period_s
 
 
-def controller(
+def build_controller(
     reference: Reference,
     inertia_kg_m2: ArrayLike,
-    part: ControlConfig | None = None,
+    config: ControlConfig | None = None,
     authority_nm: float = math.inf,
     rate_limit_rad_s: float = math.inf,
 ) -> Pid:
@@ -127,9 +133,9 @@ def controller(
     error of a constant torque, such as an unbalanced bearing's; law pd is p = 0, and leaves torque / (J b^2). The
     defaults settle in some 5 s, slow enough for a control period of 10 ms (b x period = 0.03).
     """
-    part = part or ControlConfig()
+    config = config or ControlConfig()
     inertia = np.asarray(inertia_kg_m2, dtype=float)
-    b, z, p = part.bandwidth_rad_s, part.damping, part.integral_rad_s if part.law == "pid" else 0.0
+    b, z, p = config.bandwidth_rad_s, config.damping, config.integral_rad_s if config.law == "pid" else 0.0
     return Pid(
         reference,
         inertia if inertia.ndim == 2 else np.diag(inertia).copy(),

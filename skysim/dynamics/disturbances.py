@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skysim.core.jit import jit
-from skysim.core.quaternion import apply, cross, inverse, times
+from skysim.core.quaternion import apply, cross, inverse, matrix_vector
 from skysim.core.types import Floats
-from skysim.dynamics.guidance import Knock
-from skysim.scene.vehicle import DisturbancesConfig, DraughtConfig
+from skysim.dynamics.guidance import Impulse
+from skysim.scene.vehicle import AirCurrentConfig, DisturbancesConfig
 
 
 @jit
@@ -34,52 +34,52 @@ def earth_torque_nm(
 
     All in body axes, (3,) and (3, 3). Gravity is along the plumb line.
     """
-    turning = times(inertia_kg_m2, earth_body_rad_s)
-    whole = times(inertia_kg_m2, rate_body_rad_s) + turning + momentum_nms
+    earth_momentum = matrix_vector(inertia_kg_m2, earth_body_rad_s)
+    total_momentum = matrix_vector(inertia_kg_m2, rate_body_rad_s) + earth_momentum + momentum_nms
     return (
-        times(inertia_kg_m2, cross(rate_body_rad_s, earth_body_rad_s))
-        - cross(rate_body_rad_s, turning)
-        - cross(earth_body_rad_s, whole)
+        matrix_vector(inertia_kg_m2, cross(rate_body_rad_s, earth_body_rad_s))
+        - cross(rate_body_rad_s, earth_momentum)
+        - cross(earth_body_rad_s, total_momentum)
     )
 
 
 @jit
-def steady(
+def lab_and_earth_torque(
     torque_lab_nm: Floats,
     earth_lab_rad_s: Floats,
     inertia_kg_m2: Floats,
-    present: tuple[Floats, Floats, Floats],
+    state: tuple[Floats, Floats, Floats],
 ) -> Floats:
     """(3,) body torque of a torque constant in the lab plus the Earth's rotation; compiled, called every control
     period.
 
     present : lab_from_body_wxyz (4,), the body's rate (3,) and the rotors' momentum (3,)
     """
-    lab_from_body, rate, momentum = present
+    lab_from_body, rate, momentum = state
     body_from_lab = inverse(lab_from_body)
     earth = apply(body_from_lab, earth_lab_rad_s)
     return apply(body_from_lab, torque_lab_nm) + earth_torque_nm(inertia_kg_m2, momentum, rate, earth)
 
 
-class Gusts:
+class AirCurrent:
     """Air currents: an Ornstein-Uhlenbeck torque about each lab axis, (3,) at every control period.
 
     Exact for samples a period apart: T' = a T + sqrt(1 - a^2) rms N(0, 1), a = exp(-period / correlation time),
     started in its stationary distribution. Its autocorrelation is rms^2 exp(-|lag| / correlation time).
     """
 
-    def __init__(self, part: DraughtConfig, period_s: float, rng: np.random.Generator) -> None:
-        self.rms_nm = np.array(part.rms_nm)
-        self.keeps = math.exp(-period_s / part.correlation_s)
+    def __init__(self, config: AirCurrentConfig, period_s: float, rng: np.random.Generator) -> None:
+        self.rms_nm = np.array(config.rms_nm)
+        self.decay = math.exp(-period_s / config.correlation_s)
         self.rng = rng
         self.torque_nm = self.rms_nm * rng.standard_normal(3)
 
-    def next(self) -> Floats:
+    def sample(self) -> Floats:
         """The torque of this control period, in lab axes; draw the next."""
-        now = self.torque_nm
-        fresh = math.sqrt(1 - self.keeps**2) * self.rms_nm * self.rng.standard_normal(3)
-        self.torque_nm = self.keeps * now + fresh
-        return now
+        current = self.torque_nm
+        innovation = math.sqrt(1 - self.decay**2) * self.rms_nm * self.rng.standard_normal(3)
+        self.torque_nm = self.decay * current + innovation
+        return current
 
 
 @dataclass(slots=True)
@@ -88,40 +88,39 @@ class DisturbanceModel:
 
     turbine_lab_nm   : (3,) constant
     earth_lab_rad_s  : (3,) the Earth's rate, zeros where it is off
-    gusts            : air currents, or None
-    knocks           : impulses
+    air_current      : None if it is off
     inertia_kg_m2    : (3, 3) about the bearing, in body axes
     """
 
     turbine_lab_nm: Floats
     earth_lab_rad_s: Floats
-    gusts: Gusts | None
-    knocks: tuple[Knock, ...]
+    air_current: AirCurrent | None
+    impulses: tuple[Impulse, ...]
     inertia_kg_m2: Floats
 
     @classmethod
-    def of(
+    def from_config(
         cls,
-        part: DisturbancesConfig,
+        config: DisturbancesConfig,
         earth_lab_rad_s: Floats,
-        knocks: tuple[Knock, ...],
+        impulses: tuple[Impulse, ...],
         inertia_kg_m2: Floats,
         period_s: float,
         rng: np.random.Generator,
     ) -> DisturbanceModel:
         """The disturbances that the scene switches on; period_s is the control period."""
         return cls(
-            np.array(part.turbine_nm),
-            earth_lab_rad_s if part.earth_rotation else np.zeros(3),
-            Gusts(part.draught, period_s, rng) if part.draught else None,
-            knocks,
+            np.array(config.turbine_nm),
+            earth_lab_rad_s if config.earth_rotation else np.zeros(3),
+            AirCurrent(config.air_current, period_s, rng) if config.air_current else None,
+            impulses,
             inertia_kg_m2,
         )
 
     @property
-    def quiet(self) -> bool:
+    def inactive(self) -> bool:
         """Whether there is no disturbance."""
-        return not (self.turbine_lab_nm.any() or self.earth_lab_rad_s.any() or self.gusts or self.knocks)
+        return not (self.turbine_lab_nm.any() or self.earth_lab_rad_s.any() or self.air_current or self.impulses)
 
     def torque_nm(
         self,
@@ -133,21 +132,21 @@ class DisturbanceModel:
         """(K, 3) body torque in each of K steps between the (K + 1,) times of a control period.
 
         Attitude, rate and the rotors' momentum (3,) are those at its start, held over it: in 10 ms they change by a
-        thousandth. A knock is a half-sine whose impulse is J times its change of rate; each step gets its
-        exact share.
+        thousandth. An impulse is a half-sine of torque whose integral is J times its change of rate; each step gets
+        the mean torque of its part.
         """
-        blown = self.turbine_lab_nm + self.gusts.next() if self.gusts else self.turbine_lab_nm
-        every = np.empty((len(times_s) - 1, 3))
-        every[:] = steady(
-            blown,
+        torque_lab_nm = self.turbine_lab_nm + self.air_current.sample() if self.air_current else self.turbine_lab_nm
+        torque_nm = np.empty((len(times_s) - 1, 3))
+        torque_nm[:] = lab_and_earth_torque(
+            torque_lab_nm,
             self.earth_lab_rad_s,
             self.inertia_kg_m2,
             (lab_from_body_wxyz, rate_body_rad_s, momentum_nms),
         )
-        for knock in self.knocks:
-            if knock.begin_s < times_s[-1] and times_s[0] < knock.begin_s + knock.duration_s:
+        for impulse in self.impulses:
+            if impulse.begin_s < times_s[-1] and times_s[0] < impulse.begin_s + impulse.duration_s:
                 # Impulse fraction of each step over its length: the mean torque of the step for a unit
                 # impulse.
-                share = [knock.share(a, b) / (b - a) for a, b in itertools.pairwise(times_s)]
-                every += np.outer(share, self.inertia_kg_m2 @ knock.rate_rad_s)
-        return every
+                mean_per_impulse = [impulse.fraction(a, b) / (b - a) for a, b in itertools.pairwise(times_s)]
+                torque_nm += np.outer(mean_per_impulse, self.inertia_kg_m2 @ impulse.rate_rad_s)
+        return torque_nm

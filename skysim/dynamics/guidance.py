@@ -13,7 +13,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -35,11 +35,11 @@ from skysim.scene.motion import (
 )
 
 State = tuple[Floats, Floats, Floats]  # lab_from_ref_wxyz, rate_rad_s, acceleration_rad_s2
-Law = Callable[[float], tuple[float, float, float]]  # time to angle, rate and acceleration about one axis
+AngleProfile = Callable[[float], tuple[float, float, float]]  # time to angle, rate and acceleration about one axis
 
 KNOT_RAD = 0.01  # a change of rate is integrated in steps of at most this rotation ...
-FEWEST_KNOTS = 128  # ... and at least this many: error 2e-10 rad, see `Change`
-MOST_KNOTS = 5_000_000
+MIN_KNOTS = 128  # ... and at least this many: error 2e-10 rad, see `RateChangeLeg`
+MAX_KNOTS = 5_000_000
 
 
 def attitude(angles: AttitudeConfig) -> Rotation:
@@ -47,14 +47,9 @@ def attitude(angles: AttitudeConfig) -> Rotation:
     return Rotation.from_euler("ZYX", [angles.yaw_deg, angles.pitch_deg, angles.roll_deg], degrees=True)
 
 
-def start(motion: MotionConfig) -> Rotation:
+def start_attitude(motion: MotionConfig) -> Rotation:
     """lab_from_body at the start: the identity for a pointing, since then the lab is defined by the body."""
     return attitude(motion.start) if isinstance(motion.start, AttitudeConfig) else Rotation.identity()
-
-
-def wxyz(rotation: Rotation) -> Floats:
-    """(4,) quaternion of one rotation, contiguous for the compiled functions."""
-    return np.ascontiguousarray(rotation.as_quat(scalar_first=True))
 
 
 # Profiles of one angle over time: rotation about a fixed axis.
@@ -80,9 +75,9 @@ def rest_to_rest(
     """
     # Symmetric profile: the braking half is the first half in reversed time.
     braking = t_s > duration_s / 2  # the second half mirrors the first
-    since_s = duration_s - t_s if braking else t_s
-    x = min(since_s / ramp_s, 1.0)
-    angle = rate_rad_s * (ramp_s * x**3 * (1 - x / 2) + max(since_s - ramp_s, 0.0))
+    ramp_time_s = duration_s - t_s if braking else t_s
+    x = min(ramp_time_s / ramp_s, 1.0)
+    angle = rate_rad_s * (ramp_s * x**3 * (1 - x / 2) + max(ramp_time_s - ramp_s, 0.0))
     rate, acceleration = rate_rad_s * x**2 * (3 - 2 * x), rate_rad_s / ramp_s * 6 * x * (1 - x)
     return (angle_rad - angle, rate, -acceleration) if braking else (angle, rate, acceleration)
 
@@ -94,27 +89,27 @@ def envelope(t_s: float, duration_s: float, growth_s: float) -> tuple[float, flo
     It rises along 10x^3 - 15x^4 + 6x^5 (x = t / growth_s) and falls likewise; growth_s is at most half of
     duration_s.
     """
-    dying = t_s > duration_s / 2
-    x = min(max((duration_s - t_s if dying else t_s) / growth_s, 0.0), 1.0)
+    falling = t_s > duration_s / 2
+    x = min(max((duration_s - t_s if falling else t_s) / growth_s, 0.0), 1.0)
     slope = 30 * x**2 * (1 - x) ** 2 / growth_s
-    bend = 60 * x * (1 - x) * (1 - 2 * x) / growth_s**2
-    return x**3 * (10 - 15 * x + 6 * x**2), -slope if dying else slope, bend
+    curvature = 60 * x * (1 - x) * (1 - 2 * x) / growth_s**2
+    return x**3 * (10 - 15 * x + 6 * x**2), -slope if falling else slope, curvature
 
 
 @jit
-def sway(
+def oscillation(
     amplitude_rad: float, omega_rad_s: float, duration_s: float, growth_s: float, t_s: float
 ) -> tuple[float, float, float]:
     """amplitude envelope(t) sin(omega t), and its two derivatives by the product rule."""
-    e, slope, bend = envelope(t_s, duration_s, growth_s)
+    e, slope, curvature = envelope(t_s, duration_s, growth_s)
     s, c = math.sin(omega_rad_s * t_s), math.cos(omega_rad_s * t_s)
     rate = slope * s + e * omega_rad_s * c
-    acceleration = (bend - e * omega_rad_s**2) * s + 2 * slope * omega_rad_s * c
+    acceleration = (curvature - e * omega_rad_s**2) * s + 2 * slope * omega_rad_s * c
     return amplitude_rad * e * s, amplitude_rad * rate, amplitude_rad * acceleration
 
 
 @jit
-def turned(
+def rotated_state(
     lab_from_start_wxyz: Floats, axis: Floats, angle_rad: float, rate_rad_s: float, acceleration_rad_s2: float
 ) -> tuple[Floats, Floats, Floats]:
     """The state after a rotation by an angle about a unit axis, which is the same in lab and body axes."""
@@ -133,9 +128,7 @@ def rate_at(t_s: float, duration_s: float, rate_rad_s: Floats, change_rad_s: Flo
 
 
 @jit
-def turn_between(
-    begin_s: float, step_s: float, duration_s: float, rate_rad_s: Floats, change_rad_s: Floats
-) -> Floats:
+def magnus_rotvec(begin_s: float, step_s: float, duration_s: float, rate_rad_s: Floats, change_rad_s: Floats) -> Floats:
     """(3,) rotation vector of the motion in a short step: Magnus' expansion to fourth order, two Gauss points.
 
         phi = h (w1 + w2) / 2 + sqrt(3) / 12 h^2 w1 x w2
@@ -143,70 +136,61 @@ def turn_between(
     (Iserles & Norsett 1999, `assumed`; the sign is that of rates in moving axes). The first term is exact here, the
     rate being a cubic of time; if the axis is fixed, the second term is zero for any step.
     """
-    middle, apart = begin_s + step_s / 2, step_s / math.sqrt(12.0)
-    early = rate_at(middle - apart, duration_s, rate_rad_s, change_rad_s)
-    late = rate_at(middle + apart, duration_s, rate_rad_s, change_rad_s)
+    middle, offset = begin_s + step_s / 2, step_s / math.sqrt(12.0)
+    early = rate_at(middle - offset, duration_s, rate_rad_s, change_rad_s)
+    late = rate_at(middle + offset, duration_s, rate_rad_s, change_rad_s)
     return step_s / 2 * (early + late) + math.sqrt(3.0) / 12 * step_s**2 * quaternion.cross(early, late)
 
 
 @jit
-def knots(
+def integrate_knots(
     lab_from_start_wxyz: Floats, count: int, duration_s: float, rate_rad_s: Floats, change_rad_s: Floats
 ) -> Floats:
     """(count, 4) attitudes at 0, 1, ... count - 1 times duration / count."""
     lab_from_knot_wxyz = np.empty((count, 4))
-    here, step_s = lab_from_start_wxyz, duration_s / count
+    attitude, step_s = lab_from_start_wxyz, duration_s / count
     for k in range(count):
-        lab_from_knot_wxyz[k] = here
-        turn = turn_between(k * step_s, step_s, duration_s, rate_rad_s, change_rad_s)
-        here = quaternion.multiply(here, quaternion.from_rotvec(turn))
-        here = here / math.sqrt((here**2).sum())  # prevents drift of the norm, 1e-16 a step
+        lab_from_knot_wxyz[k] = attitude
+        rotvec = magnus_rotvec(k * step_s, step_s, duration_s, rate_rad_s, change_rad_s)
+        attitude = quaternion.multiply(attitude, quaternion.from_rotvec(rotvec))
+        attitude = attitude / math.sqrt((attitude**2).sum())  # prevents drift of the norm, 1e-16 a step
     return lab_from_knot_wxyz
 
 
 @jit
-def changing(
+def rate_change_state(
     lab_from_knot_wxyz: Floats, duration_s: float, rate_rad_s: Floats, change_rad_s: Floats, t_s: float
 ) -> tuple[Floats, Floats, Floats]:
     """The state within a change of rate, integrated from the previous knot by the rule that made the knots."""
     step_s = duration_s / len(lab_from_knot_wxyz)
     k = min(int(t_s / step_s), len(lab_from_knot_wxyz) - 1)
-    turn = turn_between(k * step_s, t_s - k * step_s, duration_s, rate_rad_s, change_rad_s)
+    rotvec = magnus_rotvec(k * step_s, t_s - k * step_s, duration_s, rate_rad_s, change_rad_s)
     x = t_s / duration_s
     return (
-        quaternion.multiply(lab_from_knot_wxyz[k], quaternion.from_rotvec(turn)),
+        quaternion.multiply(lab_from_knot_wxyz[k], quaternion.from_rotvec(rotvec)),
         rate_at(t_s, duration_s, rate_rad_s, change_rad_s),
         6 * x * (1 - x) / duration_s * change_rad_s,
     )
 
 
-# Legs: one for each maneuver of the list.
-
-
-class Leg(Protocol):
-    """A part of the reference: its duration, and the state 0 <= t_s <= duration_s after its start."""
-
-    @property
-    def duration_s(self) -> float: ...
-
-    def at(self, t_s: float) -> State: ...
+# Legs: one for each maneuver of the list, with a duration and the state at 0 <= t_s <= duration_s after its start.
 
 
 @dataclass(frozen=True, slots=True)
-class Turn:
+class FixedAxisLeg:
     """A rotation about one fixed axis (3,) with a profile of its angle; a zero axis is no rotation."""
 
     lab_from_start_wxyz: Floats
     axis: Floats
     duration_s: float
-    law: Law
+    profile: AngleProfile
 
-    def at(self, t_s: float) -> State:
-        return turned(self.lab_from_start_wxyz, self.axis, *self.law(t_s))
+    def state_at(self, t_s: float) -> State:
+        return rotated_state(self.lab_from_start_wxyz, self.axis, *self.profile(t_s))
 
 
 @dataclass(frozen=True, slots=True)
-class Change:
+class RateChangeLeg:
     """A smooth change of the rate: rate_rad_s + change_rad_s (3x^2 - 2x^3), x = t / duration.
 
     lab_from_knot_wxyz : (K, 4) attitudes at K even steps. The error of Magnus' expansion in n steps of a change that
@@ -218,11 +202,14 @@ class Change:
     rate_rad_s: Floats
     change_rad_s: Floats
 
-    def at(self, t_s: float) -> State:
-        return changing(self.lab_from_knot_wxyz, self.duration_s, self.rate_rad_s, self.change_rad_s, t_s)
+    def state_at(self, t_s: float) -> State:
+        return rate_change_state(self.lab_from_knot_wxyz, self.duration_s, self.rate_rad_s, self.change_rad_s, t_s)
 
 
-class Here(NamedTuple):
+Leg = FixedAxisLeg | RateChangeLeg
+
+
+class LegStart(NamedTuple):
     """Start of a leg: attitude and rate of the reference, and the frame of its Euler angles."""
 
     lab_from_ref_wxyz: Floats
@@ -230,81 +217,88 @@ class Here(NamedTuple):
     lab_from_home: Rotation
 
 
-def split(vector: Floats) -> tuple[float, Floats]:
+def length_and_direction(vector: Floats) -> tuple[float, Floats]:
     """Length and (3,) unit direction of a vector; the direction of zeros is zeros."""
-    size = float(np.linalg.norm(vector))
-    return size, vector / size if size else np.zeros(3)
+    length = float(np.linalg.norm(vector))
+    return length, vector / length if length else np.zeros(3)
 
 
-def hold(element: Any, here: Here) -> Leg:
+def hold(element: Any, start: LegStart) -> Leg:
     """Rest at the present attitude; a preceding rate drops to zero at once."""
     caught_s = element.caught_after_s if isinstance(element, BumpConfig) else None
-    return Turn(here.lab_from_ref_wxyz, np.zeros(3), element.duration_s + (caught_s or 0.0), still)
+    return FixedAxisLeg(start.lab_from_ref_wxyz, np.zeros(3), element.duration_s + (caught_s or 0.0), still)
 
 
-def step(element: StepConfig, here: Here) -> Leg:
+def step(element: StepConfig, start: LegStart) -> Leg:
     """Jump to another attitude and rest there."""
-    there = wxyz(here.lab_from_home * attitude(element))
-    return Turn(there, np.zeros(3), element.duration_s, still)
+    lab_from_there = quaternion.from_rotation(start.lab_from_home * attitude(element))
+    return FixedAxisLeg(lab_from_there, np.zeros(3), element.duration_s, still)
 
 
-def slew(element: SlewConfig, here: Here) -> Leg:
+def slew(element: SlewConfig, start: LegStart) -> Leg:
     """The shortest eigen-axis rotation from rest to rest, as fast as the two limits allow.
 
     A ramp to the rate v takes 1.5 v / a and 0.75 v^2 / a of angle; a rotation too short for two of them peaks at
     v = sqrt(a angle / 1.5) and never cruises.
     """
-    lab_from_there = wxyz(here.lab_from_home * attitude(element))
-    back_wxyz = quaternion.inverse(here.lab_from_ref_wxyz)
-    angle, axis = split(quaternion.to_rotvec(quaternion.multiply(back_wxyz, lab_from_there)))
+    lab_from_there = quaternion.from_rotation(start.lab_from_home * attitude(element))
+    back_wxyz = quaternion.inverse(start.lab_from_ref_wxyz)
+    angle, axis = length_and_direction(quaternion.to_rotvec(quaternion.multiply(back_wxyz, lab_from_there)))
     if angle < 1e-12:
-        return Turn(here.lab_from_ref_wxyz, np.zeros(3), 0.0, still)
+        return FixedAxisLeg(start.lab_from_ref_wxyz, np.zeros(3), 0.0, still)
     accel = math.radians(element.acceleration_deg_s2)
     rate = min(math.radians(element.rate_deg_s), math.sqrt(accel * angle / 1.5))
     ramp = 1.5 * rate / accel
-    lasts_s = ramp + angle / rate
-    return Turn(here.lab_from_ref_wxyz, axis, lasts_s, partial(rest_to_rest, angle, rate, ramp, lasts_s))
+    duration_s = ramp + angle / rate
+    return FixedAxisLeg(start.lab_from_ref_wxyz, axis, duration_s, partial(rest_to_rest, angle, rate, ramp, duration_s))
 
 
-def rate(element: RateConfig, here: Here) -> Leg:
+def rate(element: RateConfig, start: LegStart) -> Leg:
     """A constant rate, start exp(w t), from the first moment on: the rate jumps."""
-    size, axis = split(np.radians(element.rate_deg_s))
-    return Turn(here.lab_from_ref_wxyz, axis, element.duration_s, partial(steady, size))
+    size, axis = length_and_direction(np.radians(element.rate_deg_s))
+    return FixedAxisLeg(start.lab_from_ref_wxyz, axis, element.duration_s, partial(steady, size))
 
 
-def spin_up(element: SpinUpConfig, here: Here) -> Leg:
+def spin_up(element: SpinUpConfig, start: LegStart) -> Leg:
     """Change the present rate to another, each component along a smoothstep; the axis may move.
 
     Raises InputError (one line) where more than five million knots would be needed.
     """
-    lasts_s, begin = element.duration_s, here.rate_rad_s
-    change = np.radians(element.rate_deg_s) - begin
-    fastest = max(float(np.linalg.norm(begin)), float(np.linalg.norm(begin + change)))
-    moves = np.linalg.norm(np.cross(begin, change)) > 1e-12 * fastest**2
-    count = max(FEWEST_KNOTS, math.ceil(fastest * lasts_s / KNOT_RAD)) if moves else 1
-    if count > MOST_KNOTS:
+    duration_s, start_rate = element.duration_s, start.rate_rad_s
+    change = np.radians(element.rate_deg_s) - start_rate
+    fastest = max(float(np.linalg.norm(start_rate)), float(np.linalg.norm(start_rate + change)))
+    axis_moves = np.linalg.norm(np.cross(start_rate, change)) > 1e-12 * fastest**2
+    count = max(MIN_KNOTS, math.ceil(fastest * duration_s / KNOT_RAD)) if axis_moves else 1
+    if count > MAX_KNOTS:
         raise InputError(
-            f"motion.manoeuvre: a spin_up of {lasts_s:g} s at up to {math.degrees(fastest):g} deg/s whose axis moves "
-            f"turns by {math.degrees(fastest * lasts_s):.3g} deg; "
-            f"allowed: {math.degrees(MOST_KNOTS * KNOT_RAD):.3g} deg"
+            f"motion.maneuver: a spin_up of {duration_s:g} s at up to {math.degrees(fastest):g} deg/s whose axis moves "
+            f"rotates by {math.degrees(fastest * duration_s):.3g} deg; "
+            f"allowed: {math.degrees(MAX_KNOTS * KNOT_RAD):.3g} deg"
         )
-    return Change(knots(here.lab_from_ref_wxyz, count, lasts_s, begin, change), lasts_s, begin, change)
+    return RateChangeLeg(
+        integrate_knots(start.lab_from_ref_wxyz, count, duration_s, start_rate, change),
+        duration_s,
+        start_rate,
+        change,
+    )
 
 
-def sine(element: SineConfig, here: Here) -> Leg:
+def sine(element: SineConfig, start: LegStart) -> Leg:
     """Oscillate about the attitude: rotation vector amplitude envelope(t) sin(2 pi f t) in body axes.
 
     The three axes have the same phase, so that the axis of rotation is fixed. The envelope rises and falls within a
     period, or half of the duration if that is shorter.
     """
-    lasts_s, omega = element.duration_s, 2 * math.pi * element.frequency_hz
-    growth_s = min(1 / element.frequency_hz, lasts_s / 2)
-    size, axis = split(np.radians(element.amplitude_deg))
-    return Turn(here.lab_from_ref_wxyz, axis, lasts_s, partial(sway, size, omega, lasts_s, growth_s))
+    duration_s, omega = element.duration_s, 2 * math.pi * element.frequency_hz
+    growth_s = min(1 / element.frequency_hz, duration_s / 2)
+    size, axis = length_and_direction(np.radians(element.amplitude_deg))
+    return FixedAxisLeg(
+        start.lab_from_ref_wxyz, axis, duration_s, partial(oscillation, size, omega, duration_s, growth_s)
+    )
 
 
 # The leg of each kind of maneuver. To add one, add a class to scene/motion.py and a function here.
-LEGS: dict[str, Callable[[Any, Here], Leg]] = {
+LEGS: dict[str, Callable[[Any, LegStart], Leg]] = {
     "hold": hold,
     "step": step,
     "slew": slew,
@@ -331,18 +325,18 @@ class Reference:
         """Duration of the list, after which the last leg begins."""
         return self.start_s[-1]
 
-    def at(self, t_s: float) -> State:
+    def state_at(self, t_s: float) -> State:
         """lab_from_ref_wxyz (4,), rate (rad/s) and acceleration (rad/s2), each (3,) in the reference's own axes.
 
         At the time where two legs meet, the later one applies. Before 0 the state is that at 0.
         """
         k = max(bisect.bisect_right(self.start_s, t_s) - 1, 0)
         leg = self.legs[k]
-        return leg.at(min(max(t_s - self.start_s[k], 0.0), leg.duration_s))
+        return leg.state_at(min(max(t_s - self.start_s[k], 0.0), leg.duration_s))
 
     def attitudes(self, t_s: Floats) -> Rotation:
         """lab_from_ref at (N,) times."""
-        return Rotation.from_quat(np.array([self.at(float(t))[0] for t in t_s]), scalar_first=True)
+        return Rotation.from_quat(np.array([self.state_at(float(t))[0] for t in t_s]), scalar_first=True)
 
 
 def plan(motion: MotionConfig, lab_from_start: Rotation | None = None) -> Reference:
@@ -358,25 +352,25 @@ def plan(motion: MotionConfig, lab_from_start: Rotation | None = None) -> Refere
     maneuvers only a step lets the attitude jump. The rate jumps at the start of a rate, and where anything but a
     spin_up follows a rate or spin_up.
     """
-    first = lab_from_start if lab_from_start is not None else start(motion)
+    first = lab_from_start if lab_from_start is not None else start_attitude(motion)
     home = Rotation.identity() if isinstance(motion.start, AttitudeConfig) else first
-    here = Here(wxyz(first), np.radians(motion.rate_deg_s), home)
+    leg_start = LegStart(quaternion.from_rotation(first), np.radians(motion.rate_deg_s), home)
     legs: list[Leg] = []
-    for element in motion.manoeuvre:
-        legs.append(LEGS[element.kind](element, here))
-        lab_from_ref_wxyz, rate_rad_s, _ = legs[-1].at(legs[-1].duration_s)
-        here = Here(lab_from_ref_wxyz, rate_rad_s, home)
-    size, axis = split(here.rate_rad_s if legs else np.zeros(3))
-    onward = Turn(here.lab_from_ref_wxyz, axis, math.inf, partial(steady, size))
-    starts = itertools.accumulate((leg.duration_s for leg in legs), initial=0.0)
-    return Reference((*legs, onward), tuple(starts))
+    for element in motion.maneuver:
+        legs.append(LEGS[element.kind](element, leg_start))
+        lab_from_ref_wxyz, rate_rad_s, _ = legs[-1].state_at(legs[-1].duration_s)
+        leg_start = LegStart(lab_from_ref_wxyz, rate_rad_s, home)
+    size, axis = length_and_direction(leg_start.rate_rad_s if legs else np.zeros(3))
+    final_leg = FixedAxisLeg(leg_start.lab_from_ref_wxyz, axis, math.inf, partial(steady, size))
+    start_times_s = itertools.accumulate((leg.duration_s for leg in legs), initial=0.0)
+    return Reference((*legs, final_leg), tuple(start_times_s))
 
 
 # Impulses and vibration that are scheduled in the list.
 
 
 @dataclass(frozen=True, slots=True)
-class Knock:
+class Impulse:
     """An impulse: a half-sine of torque that alone would change the vehicle's rate by rate_rad_s, (3,) in body axes.
 
     Its impulse is the inertia times that.
@@ -386,25 +380,29 @@ class Knock:
     duration_s: float
     rate_rad_s: Floats
 
-    def share(self, from_s: float, to_s: float) -> float:
+    def fraction(self, from_s: float, to_s: float) -> float:
         """The fraction of the impulse between two times: (cos(pi a) - cos(pi b)) / 2, a, b in durations."""
         a, b = (min(max((t_s - self.begin_s) / self.duration_s, 0.0), 1.0) for t_s in (from_s, to_s))
         return (math.cos(math.pi * a) - math.cos(math.pi * b)) / 2
 
 
-def knocks(motion: MotionConfig) -> tuple[Knock, ...]:
+def impulses(motion: MotionConfig) -> tuple[Impulse, ...]:
     """The impulses of the list's bumps in order of time; a caught bump is two, equal and opposite."""
-    made: list[Knock] = []
-    for begin_s, bump in zip(plan(motion).start_s, motion.manoeuvre, strict=False):
+    result: list[Impulse] = []
+    for begin_s, bump in zip(plan(motion).start_s, motion.maneuver, strict=False):
         if isinstance(bump, BumpConfig):
             rate_rad_s = np.radians(bump.rate_deg_s)
-            made.append(Knock(begin_s, bump.duration_s, rate_rad_s))
+            result.append(Impulse(begin_s, bump.duration_s, rate_rad_s))
             if bump.caught_after_s is not None:
-                made.append(Knock(begin_s + bump.caught_after_s, bump.duration_s, -rate_rad_s))
-    return tuple(made)
+                result.append(Impulse(begin_s + bump.caught_after_s, bump.duration_s, -rate_rad_s))
+    return tuple(result)
 
 
-def shakes(motion: MotionConfig) -> tuple[tuple[float, float, tuple[JitterPart, ...]], ...]:
+def vibration_intervals(motion: MotionConfig) -> tuple[tuple[float, float, tuple[JitterPart, ...]], ...]:
     """(begin_s, end_s, parts) of the list's vibrations in order of time."""
-    timed = zip(plan(motion).start_s, motion.manoeuvre, strict=False)
-    return tuple((begin_s, begin_s + el.duration_s, el.parts) for begin_s, el in timed if el.kind == "jitter")
+    start_times = zip(plan(motion).start_s, motion.maneuver, strict=False)
+    return tuple(
+        (begin_s, begin_s + element.duration_s, element.components)
+        for begin_s, element in start_times
+        if element.kind == "jitter"
+    )

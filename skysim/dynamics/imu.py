@@ -1,7 +1,8 @@
 """Inertial measurement unit: ideal increments, sensor errors, and the inertial navigator that integrates the gyros.
 
-1. `felt` integrates the ideal angular rate and specific force over each sample interval from the simulated motion.
-2. `Unit.measure` adds scale factor, misalignment, bias (constant and Gauss-Markov), white noise, limits and
+1. `ideal_increments` integrates the ideal angular rate and specific force of the simulated motion over each sample
+   interval.
+2. `Imu.measure` adds scale factor, misalignment, bias (constant and Gauss-Markov), white noise, limits and
    quantization.
 3. `Navigator.add` integrates the gyro increments to an attitude.
 
@@ -25,10 +26,10 @@ from skysim.scene.vehicle import AccelerometerConfig, GyroConfig, ImuConfig, Sit
 
 EARTH_RATE_RAD_S = 7.2921150e-5  # sidereal rate, 15.041 deg/h (WGS 84)
 STANDARD_GRAVITY_M_S2 = 9.80665  # unit of the accelerometers' g and ug, independent of the lab's gravity
-POINTS = 4  # knots per polynomial: a cubic, with an error of the fourth order in their spacing
-GAUSS = 0.5 / math.sqrt(3)  # the two Gauss-Legendre points, at +-this from the middle: exact for a cubic
-SLACK_S = 1e-9  # tolerance for rounding of sample times
-STILL = np.zeros(3)
+CUBIC_POINTS = 4  # knots per polynomial: a cubic, with an error of the fourth order in their spacing
+GAUSS_OFFSET = 0.5 / math.sqrt(3)  # the two Gauss-Legendre points, at +-this from the middle: exact for a cubic
+TIME_TOLERANCE_S = 1e-9  # tolerance for rounding of sample times
+NO_RATE = np.zeros(3)
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,20 +59,18 @@ def earth_rate_lab_rad_s(site: SiteConfig) -> Floats:
     """
     latitude, azimuth = math.radians(site.latitude_deg), math.radians(site.x_azimuth_deg)
     north = math.cos(latitude)
-    return EARTH_RATE_RAD_S * np.array(
-        [north * math.cos(azimuth), north * math.sin(azimuth), math.sin(latitude)]
-    )
+    return EARTH_RATE_RAD_S * np.array([north * math.cos(azimuth), north * math.sin(azimuth), math.sin(latitude)])
 
 
-def felt(
+def ideal_increments(
     t_s: Floats,
     lab_from_body_wxyz: Floats,
     rate_body_rad_s: Floats,
     ends_s: Floats,
     step_s: float,
-    place_body_m: ArrayLike,
+    position_body_m: ArrayLike,
     gravity_m_s2: float,
-    earth_rate_lab_rad_s: Floats = STILL,
+    earth_rate_lab_rad_s: Floats = NO_RATE,
 ) -> Increments:
     """Increments of an ideal unit (without errors) on a body that rotates about the lab's origin.
 
@@ -87,7 +86,7 @@ def felt(
     lab_from_body_wxyz : (K, 4) attitudes there
     rate_body_rad_s    : (K, 3) rates of the body in the lab, in body axes
     ends_s, step_s     : (N,) ends of the sample intervals and their length; they need not coincide with knots
-    place_body_m       : (3,) r, the unit's position on the body
+    position_body_m    : (3,) r, the unit's position on the body
     earth_rate_lab_rad_s : (3,) zeros for a unit that does not sense the Earth rate
 
     Between knots every component is the cubic through the four nearest, integrated exactly: fourth order in the
@@ -95,31 +94,35 @@ def felt(
     Raises InputError for fewer than two knots or an interval outside them.
     """
     if len(t_s) < 2:
-        raise InputError(f"imu: {len(t_s)} knots of the flight; allowed: two or more")
+        raise InputError(f"imu: {len(t_s)} samples of the motion; allowed: two or more")
     first_s, last_s = np.min(ends_s, initial=np.inf) - step_s, np.max(ends_s, initial=-np.inf)
-    if len(ends_s) and not (t_s[0] - SLACK_S <= first_s and last_s <= t_s[-1] + SLACK_S):  # also rejects NaN
+    if len(ends_s) and not (
+        t_s[0] - TIME_TOLERANCE_S <= first_s and last_s <= t_s[-1] + TIME_TOLERANCE_S
+    ):  # also rejects NaN
         raise InputError(
-            f"imu: samples from {first_s:.6f} to {last_s:.6f} s; allowed: within the flight,"
+            f"imu: samples from {first_s:.6f} to {last_s:.6f} s; allowed: within the motion,"
             f" {t_s[0]:.6f} to {t_s[-1]:.6f} s"
         )
-    place = np.asarray(place_body_m, dtype=float)
-    knots = sensed(
+    position = np.asarray(position_body_m, dtype=float)
+    knots = inertial_knots(
         np.ascontiguousarray(lab_from_body_wxyz),
         np.ascontiguousarray(rate_body_rad_s),
-        place,
+        position,
         gravity_m_s2,
         earth_rate_lab_rad_s,
     )
-    angle, velocity = integrals(np.ascontiguousarray(t_s), knots, np.ascontiguousarray(ends_s), step_s, place)
-    fine = np.zeros(len(ends_s), dtype=bool)
-    return Increments(ends_s, step_s, angle, velocity, fine, fine)
+    angle, velocity = integrate_intervals(
+        np.ascontiguousarray(t_s), knots, np.ascontiguousarray(ends_s), step_s, position
+    )
+    in_range = np.zeros(len(ends_s), dtype=bool)
+    return Increments(ends_s, step_s, angle, velocity, in_range, in_range)
 
 
 @jit
-def sensed(
+def inertial_knots(
     lab_from_body_wxyz: Floats,
     rate_body_rad_s: Floats,
-    place_m: Floats,
+    position_m: Floats,
     gravity_m_s2: float,
     earth_rate: Floats,
 ) -> Floats:
@@ -130,16 +133,16 @@ def sensed(
         body_from_lab = quaternion.inverse(lab_from_body_wxyz[k])
         rate = rate_body_rad_s[k] + quaternion.apply(body_from_lab, earth_rate)
         knots[k, :3] = rate
-        centripetal = quaternion.cross(rate, quaternion.cross(rate, place_m))
+        centripetal = quaternion.cross(rate, quaternion.cross(rate, position_m))
         knots[k, 3:] = centripetal + quaternion.apply(body_from_lab, up)
     return knots
 
 
 @jit
-def integrals(
-    t_s: Floats, knots: Floats, ends_s: Floats, step_s: float, place_m: Floats
+def integrate_intervals(
+    t_s: Floats, knots: Floats, ends_s: Floats, step_s: float, position_m: Floats
 ) -> tuple[Floats, Floats]:
-    """(N, 3) angle and (N, 3) velocity of every sample interval from the knots of `sensed`.
+    """(N, 3) angle and (N, 3) velocity of every sample interval from the knots of `inertial_knots`.
 
     An interval is split at the knots; each part is one cubic, which two Gauss points integrate exactly.
     """
@@ -154,14 +157,14 @@ def integrals(
         for k in range(first, last + 1):
             stop = end if k == last else min(end, t_s[k + 1])
             middle, length = (begin + stop) / 2, stop - begin
-            add_cubic(t_s, knots, k, middle - GAUSS * length, length / 2, total)
-            add_cubic(t_s, knots, k, middle + GAUSS * length, length / 2, total)
+            add_cubic(t_s, knots, k, middle - GAUSS_OFFSET * length, length / 2, total)
+            add_cubic(t_s, knots, k, middle + GAUSS_OFFSET * length, length / 2, total)
             begin = stop
             if stop >= end:
                 break
         add_cubic(t_s, knots, k, end, 1.0, change)
         angle[n] = total[:3]
-        velocity[n] = total[3:] + quaternion.cross(change[:3], place_m)
+        velocity[n] = total[3:] + quaternion.cross(change[:3], position_m)
     return angle, velocity
 
 
@@ -171,7 +174,7 @@ def add_cubic(t_s: Floats, knots: Floats, k: int, at_s: float, factor: float, ou
 
     If there are fewer than four knots, the polynomial goes through all of them.
     """
-    count = min(POINTS, len(t_s))
+    count = min(CUBIC_POINTS, len(t_s))
     first = min(max(k - 1, 0), len(t_s) - count)
     for i in range(first, first + count):
         weight = factor
@@ -188,37 +191,37 @@ class Triad:
 
     matrix    : (3, 3) response of each sensor to motion along each body axis: 1 + scale error on the diagonal, the
                 misalignment of sensor i towards axis j off it
-    turn_on   : (3,) constant bias, x/s
-    markov    : (3,) wandering bias (Gauss-Markov), x/s: a state
+    turn_on_bias : (3,) constant bias, x/s
+    markov_bias  : (3,) Gauss-Markov bias (bias instability), x/s: a state
     markov_sd, markov_time_s : its standard deviation and correlation time
     white     : random walk of the integral, x/sqrt(s)
     limit     : x/s at which the output saturates
     quantum   : x of one count; 0 for none
-    residue   : (3,) x not yet counted: a state
+    remainder : (3,) x not yet counted: a state
     """
 
     matrix: Floats
-    turn_on: Floats
-    markov: Floats
+    turn_on_bias: Floats
+    markov_bias: Floats
     markov_sd: float
     markov_time_s: float
     white: float
     limit: float
     quantum: float
-    residue: Floats = field(default_factory=lambda: np.zeros(3))
+    remainder: Floats = field(default_factory=lambda: np.zeros(3))
 
     def measure(self, ideal: Floats, step_s: float, normal: Floats) -> tuple[Floats, NDArray[np.bool_]]:
         """(N, 3) measured increments, and (N,) whether one was limited; see `corrupt`. normal : (N, 6) draws."""
-        keep = math.exp(-step_s / self.markov_time_s)
-        stir = self.markov_sd * math.sqrt(-math.expm1(-2 * step_s / self.markov_time_s))
+        decay = math.exp(-step_s / self.markov_time_s)
+        innovation = self.markov_sd * math.sqrt(-math.expm1(-2 * step_s / self.markov_time_s))
         counted, limited = corrupt(
             ideal,
             self.matrix,
-            self.turn_on,
-            self.markov,
-            self.residue,
+            self.turn_on_bias,
+            self.markov_bias,
+            self.remainder,
             normal,
-            (step_s, keep, stir, self.white * math.sqrt(step_s), self.limit * step_s, self.quantum),
+            (step_s, decay, innovation, self.white * math.sqrt(step_s), self.limit * step_s, self.quantum),
         )
         return counted, limited
 
@@ -227,78 +230,78 @@ class Triad:
 def corrupt(
     ideal: Floats,
     matrix: Floats,
-    turn_on: Floats,
-    markov: Floats,
-    residue: Floats,
+    turn_on_bias: Floats,
+    markov_bias: Floats,
+    remainder: Floats,
     normal: Floats,
-    law: tuple[float, float, float, float, float, float],
+    parameters: tuple[float, float, float, float, float, float],
 ) -> tuple[Floats, NDArray[np.bool_]]:
-    """Apply the sensor errors to increments (N, 3); markov and residue (3,) are updated in place.
+    """Apply the sensor errors to increments (N, 3); markov_bias and remainder (3,) are updated in place.
 
-        b_n = keep b_(n-1) + stir z        exact for a Gauss-Markov process (Gelb 1974, ch. 3; `assumed`)
-        x_n = matrix ideal_n + (turn_on + b_n) step + white z',   clipped to +-top, quantized
+        b_n = decay b_(n-1) + innovation z      exact for a Gauss-Markov process (Gelb 1974, ch. 3; `assumed`)
+        x_n = matrix ideal_n + (turn_on_bias + b_n) step + white z',   clipped to +-limit, quantized
 
     The clipped part is lost; the quantization remainder is carried to the next sample.
     """
-    step, keep, stir, white, top, quantum = law
+    step, decay, innovation, white, limit, quantum = parameters
     counted, limited = np.empty(ideal.shape), np.zeros(len(ideal), dtype=np.bool_)
     for n in range(len(ideal)):
         for i in range(3):
-            markov[i] = keep * markov[i] + stir * normal[n, 3 + i]
+            markov_bias[i] = decay * markov_bias[i] + innovation * normal[n, 3 + i]
             x = matrix[i, 0] * ideal[n, 0] + matrix[i, 1] * ideal[n, 1] + matrix[i, 2] * ideal[n, 2]
-            x += (turn_on[i] + markov[i]) * step + white * normal[n, i]
-            if abs(x) > top:
-                x = math.copysign(top, x)
+            x += (turn_on_bias[i] + markov_bias[i]) * step + white * normal[n, i]
+            if abs(x) > limit:
+                x = math.copysign(limit, x)
                 limited[n] = True
             if quantum > 0:
-                residue[i] += x
-                x = quantum * np.rint(residue[i] / quantum)
-                residue[i] -= x
+                remainder[i] += x
+                x = quantum * np.rint(remainder[i] / quantum)
+                remainder[i] -= x
             counted[n, i] = x
     return counted, limited
 
 
-def gyros(part: GyroConfig, hardware: Floats, start: Floats) -> Triad:
-    """The gyro triad from standard normal draws: hardware (4, 3), start (3,) of the wandering bias."""
+def gyro_triad(config: GyroConfig, hardware: Floats, start: Floats) -> Triad:
+    """The gyro triad from standard normal draws: hardware (4, 3), start (3,) of the Gauss-Markov bias."""
     per_hour = math.radians(1) / 3600
     return Triad(
-        matrix=errors_of_axes(part.scale_ppm, part.misalignment_arcsec, hardware[1:]),
-        turn_on=part.turn_on_bias_deg_h * per_hour * hardware[0],
-        markov=part.bias_deg_h * per_hour * start,
-        markov_sd=part.bias_deg_h * per_hour,
-        markov_time_s=part.bias_time_s,
-        white=math.radians(part.arw_deg_sqrt_h) / 60,
-        limit=math.radians(part.rate_limit_deg_s),
-        quantum=math.radians(part.quantum_arcsec / 3600),
+        matrix=response_matrix(config.scale_ppm, config.misalignment_arcsec, hardware[1:]),
+        turn_on_bias=config.turn_on_bias_deg_h * per_hour * hardware[0],
+        markov_bias=config.bias_deg_h * per_hour * start,
+        markov_sd=config.bias_deg_h * per_hour,
+        markov_time_s=config.bias_time_s,
+        white=math.radians(config.arw_deg_sqrt_h) / 60,
+        limit=math.radians(config.rate_limit_deg_s),
+        quantum=math.radians(config.quantum_arcsec / 3600),
     )
 
 
-def accelerometers(part: AccelerometerConfig, hardware: Floats, start: Floats) -> Triad:
+def accelerometer_triad(config: AccelerometerConfig, hardware: Floats, start: Floats) -> Triad:
     """The accelerometer triad, as `gyros`. Its noise density in ug/sqrt(Hz), squared, is the variance of a mean
     over 1 s.
     """
     ug = 1e-6 * STANDARD_GRAVITY_M_S2
     return Triad(
-        matrix=errors_of_axes(part.scale_ppm, part.misalignment_arcsec, hardware[1:]),
-        turn_on=part.turn_on_bias_ug * ug * hardware[0],
-        markov=part.bias_ug * ug * start,
-        markov_sd=part.bias_ug * ug,
-        markov_time_s=part.bias_time_s,
-        white=part.vrw_ug_sqrt_hz * ug,
-        limit=part.limit_g * STANDARD_GRAVITY_M_S2,
-        quantum=1e-6 * part.quantum_um_s,
+        matrix=response_matrix(config.scale_ppm, config.misalignment_arcsec, hardware[1:]),
+        turn_on_bias=config.turn_on_bias_ug * ug * hardware[0],
+        markov_bias=config.bias_ug * ug * start,
+        markov_sd=config.bias_ug * ug,
+        markov_time_s=config.bias_time_s,
+        white=config.vrw_ug_sqrt_hz * ug,
+        limit=config.limit_g * STANDARD_GRAVITY_M_S2,
+        quantum=1e-6 * config.quantum_um_s,
     )
 
 
-def errors_of_axes(scale_ppm: float, misalignment_arcsec: float, normal: Floats) -> Floats:
+def response_matrix(scale_ppm: float, misalignment_arcsec: float, normal: Floats) -> Floats:
     """(3, 3) identity plus the scale errors on its diagonal and every sensor's misalignment off it."""
     tilt = math.radians(misalignment_arcsec / 3600)
     return np.eye(3) + np.where(np.eye(3) > 0, 1e-6 * scale_ppm, tilt) * normal
 
 
 @dataclass(slots=True)
-class Unit:
-    """One inertial measurement unit: fixed hardware errors, wandering biases, quantization remainders.
+class Imu:
+    """One inertial measurement unit: fixed hardware errors, Gauss-Markov biases, quantization remainders.
 
     Twelve numbers are drawn per sample, whichever errors are on: a run split into pieces equals one run bit for bit,
     and switching one error does not change the others.
@@ -309,34 +312,27 @@ class Unit:
     rng: np.random.Generator
 
     @classmethod
-    def of(cls, part: ImuConfig, rng: np.random.Generator) -> Unit:
-        """The unit of hardware_seed, switched on: the wandering biases start in their stationary distribution."""
-        hardware = np.random.default_rng(np.random.SeedSequence(part.hardware_seed)).standard_normal(
-            (2, 4, 3)
-        )
+    def from_config(cls, config: ImuConfig, rng: np.random.Generator) -> Imu:
+        """The unit of hardware_seed at turn-on: the Gauss-Markov biases start in their stationary distribution."""
+        hardware = np.random.default_rng(np.random.SeedSequence(config.hardware_seed)).standard_normal((2, 4, 3))
         start = rng.standard_normal((2, 3))
         return cls(
-            gyros(part.gyro, hardware[0], start[0]),
-            accelerometers(part.accelerometer, hardware[1], start[1]),
+            gyro_triad(config.gyro, hardware[0], start[0]),
+            accelerometer_triad(config.accelerometer, hardware[1], start[1]),
             rng,
         )
 
     def measure(self, ideal: Increments) -> Increments:
-        """The unit's output for the next samples of `felt`."""
+        """The unit's output for the next samples of `ideal_increments`."""
         normal = self.rng.standard_normal((len(ideal.t_s), 2, 6))
-        angle, fast = self.gyro.measure(ideal.angle_rad, ideal.step_s, normal[:, 0])
-        velocity, hard = self.accelerometer.measure(ideal.velocity_m_s, ideal.step_s, normal[:, 1])
-        return Increments(ideal.t_s, ideal.step_s, angle, velocity, fast, hard)
+        angle, saturated = self.gyro.measure(ideal.angle_rad, ideal.step_s, normal[:, 0])
+        velocity, overloaded = self.accelerometer.measure(ideal.velocity_m_s, ideal.step_s, normal[:, 1])
+        return Increments(ideal.t_s, ideal.step_s, angle, velocity, saturated, overloaded)
 
     @property
     def gyro_bias_rad_s(self) -> Floats:
-        """(3,) bias at the last sample, turn-on plus wandering part; before the first, that of the start."""
-        return self.gyro.turn_on + self.gyro.markov
-
-    @property
-    def accelerometer_bias_m_s2(self) -> Floats:
-        """(3,) bias at the last sample, as `gyro_bias_rad_s`."""
-        return self.accelerometer.turn_on + self.accelerometer.markov
+        """(3,) bias at the last sample, turn-on plus Gauss-Markov part; before the first sample, the initial one."""
+        return self.gyro.turn_on_bias + self.gyro.markov_bias
 
 
 @dataclass(slots=True)
@@ -355,23 +351,14 @@ class Navigator:
         self.lab_from_body_wxyz = start / np.linalg.norm(start)
 
     def add(self, increments: Increments) -> None:
-        """Integrate the next samples, in order; see `turned`."""
-        self.lab_from_body_wxyz = turned(
+        """Integrate the next samples, in order; see `integrate_attitude`."""
+        self.lab_from_body_wxyz = integrate_attitude(
             self.lab_from_body_wxyz, increments.angle_rad, self.earth_rate_lab_rad_s, increments.step_s
         )
 
-    @property
-    def euler_deg(self) -> tuple[float, float, float]:
-        """(roll, pitch, yaw), 3-2-1: lab_from_body = Rz(yaw) Ry(pitch) Rx(roll); pitch within 90 deg."""
-        w, x, y, z = map(float, self.lab_from_body_wxyz)
-        roll = math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
-        pitch = math.asin(min(max(2 * (w * y - z * x), -1.0), 1.0))
-        yaw = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-        return math.degrees(roll), math.degrees(pitch), math.degrees(yaw)
-
 
 @jit
-def turned(lab_from_body_wxyz: Floats, angle_rad: Floats, earth_rate: Floats, step_s: float) -> Floats:
+def integrate_attitude(lab_from_body_wxyz: Floats, angle_rad: Floats, earth_rate: Floats, step_s: float) -> Floats:
     """The attitude after (N, 3) increments: lab_from_body <- exp(-earth_rate step) lab_from_body exp(angle).
 
     The left factor is the rotation of the lab, in lab axes, so that the Earth rate is compensated continuously and
@@ -379,13 +366,13 @@ def turned(lab_from_body_wxyz: Floats, angle_rad: Floats, earth_rate: Floats, st
     within a sample, this has an error of half the integral of angle x rate (coning; `assumed`).
     """
     lab_now_from_before = quaternion.from_rotvec(-step_s * earth_rate)
-    here = lab_from_body_wxyz
+    attitude = lab_from_body_wxyz
     for n in range(len(angle_rad)):
-        here = quaternion.multiply(
-            lab_now_from_before, quaternion.multiply(here, quaternion.from_rotvec(angle_rad[n]))
+        attitude = quaternion.multiply(
+            lab_now_from_before, quaternion.multiply(attitude, quaternion.from_rotvec(angle_rad[n]))
         )
-        here = here / math.sqrt(here[0] ** 2 + here[1] ** 2 + here[2] ** 2 + here[3] ** 2)
-    return here
+        attitude = attitude / math.sqrt(attitude[0] ** 2 + attitude[1] ** 2 + attitude[2] ** 2 + attitude[3] ** 2)
+    return attitude
 
 
 def tilt_rad(velocity_m_s: Floats) -> tuple[float, float]:

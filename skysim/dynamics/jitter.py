@@ -1,8 +1,8 @@
 """Vibration: small rotations about the body axes added to the simulated attitude, always or for an interval.
 
 A vibration is a sum of sines of the rotation vector in body axes: single frequencies (`line`) or a random spectrum
-(`band`). It is kinematic: MuJoCo does not simulate it, but the IMU senses it (`closed_loop.felt`) and it smears the
-images.
+(`band`). It is kinematic: MuJoCo does not simulate it, but the IMU senses it (`closed_loop.recent_motion`) and it
+smears the images.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ from scipy.spatial.transform import Rotation
 from skysim.core.errors import InputError
 from skysim.core.jit import jit
 from skysim.core.types import Floats, Trajectory
-from skysim.dynamics.guidance import envelope, shakes
+from skysim.dynamics.guidance import envelope, vibration_intervals
 from skysim.scene.motion import JitterBandConfig, JitterLineConfig, JitterPart, MotionConfig
 
-SINES = 128  # sines in a band; even a steep spectrum has tens of similar amplitude
-PER_PERIOD = (
+SINES_PER_BAND = 128  # sines in a band; even a steep spectrum has tens of similar amplitude
+SAMPLES_PER_PERIOD = (
     16  # samples per shortest period: cubic Hermite interpolation has an error of (2 pi / 16)^4 / 384 = 6e-5
 )
-MOST_SAMPLES = 5_000_000
-RISE = 0.1  # of an interval of vibration is its rise, and as much its fall ...
-LONGEST_RISE_S = 1.0  # ... but no longer
+MAX_SAMPLES = 5_000_000
+RISE_FRACTION = 0.1  # duration of the rise and of the fall, as a fraction of the interval ...
+MAX_RISE_S = 1.0  # ... at most
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,12 +45,12 @@ class Sines:
     cosine_rad: Floats
 
 
-def line(part: JitterLineConfig, rng: np.random.Generator) -> Sines:
+def line(config: JitterLineConfig, rng: np.random.Generator) -> Sines:
     """One frequency: sqrt(2) rms sin(2 pi f t + phase) about each axis, with random phases."""
-    return with_phases(np.array([part.frequency_hz]), np.ones(1), part.rms_arcsec, rng)
+    return with_phases(np.array([config.frequency_hz]), np.ones(1), config.rms_arcsec, rng)
 
 
-def band(part: JitterBandConfig, rng: np.random.Generator) -> Sines:
+def band(config: JitterBandConfig, rng: np.random.Generator) -> Sines:
     """Power spectral density proportional to f^slope from from_hz to to_hz, the sum of many sines.
 
     The band is split into pieces of equal frequency ratio. Each has one sine with the piece's whole power, so that
@@ -58,24 +58,24 @@ def band(part: JitterBandConfig, rng: np.random.Generator) -> Sines:
     exact in expectation (Shinozuka & Deodatis 1991, ASME Appl. Mech. Rev. 44, 191, whose frequencies are fixed;
     `assumed`).
     """
-    edges = np.linspace(0, math.log(part.to_hz / part.from_hz), SINES + 1)  # logarithm of f / from_hz
-    rise = part.slope + 1  # power up to f goes as f^rise, of which only ratios count
+    edges = np.linspace(0, math.log(config.to_hz / config.from_hz), SINES_PER_BAND + 1)  # logarithm of f / from_hz
+    exponent = config.slope + 1  # power up to f is proportional to f^exponent
     low, high = edges[:-1], edges[1:]
-    drawn = rng.uniform(size=SINES)
-    if abs(rise) < 1e-6:
-        share, middle = high - low, low + drawn * (high - low)
+    uniform = rng.uniform(size=SINES_PER_BAND)
+    if abs(exponent) < 1e-6:
+        power, middle = high - low, low + uniform * (high - low)
     else:
         # Power of each piece, and a frequency drawn from it by inverting its cumulative power.
-        share = np.exp(rise * low) * np.expm1(rise * (high - low)) / rise
-        middle = low + np.log1p(drawn * np.expm1(rise * (high - low))) / rise
-    return with_phases(part.from_hz * np.exp(middle), share / share.sum(), part.rms_arcsec, rng)
+        power = np.exp(exponent * low) * np.expm1(exponent * (high - low)) / exponent
+        middle = low + np.log1p(uniform * np.expm1(exponent * (high - low))) / exponent
+    return with_phases(config.from_hz * np.exp(middle), power / power.sum(), config.rms_arcsec, rng)
 
 
 def with_phases(
-    frequency_hz: Floats, share: Floats, rms_arcsec: Sequence[float], rng: np.random.Generator
+    frequency_hz: Floats, power_fraction: Floats, rms_arcsec: Sequence[float], rng: np.random.Generator
 ) -> Sines:
     """Sines of (K,) frequencies and fractions of the power, with independent random phases for each axis."""
-    amplitude = np.sqrt(2 * share)[:, None] * np.radians(np.array(rms_arcsec) / 3600)
+    amplitude = np.sqrt(2 * power_fraction)[:, None] * np.radians(np.array(rms_arcsec) / 3600)
     phase = rng.uniform(0, 2 * np.pi, amplitude.shape)
     return Sines(2 * np.pi * frequency_hz, amplitude * np.cos(phase), amplitude * np.sin(phase))
 
@@ -85,7 +85,7 @@ SPECTRA: dict[str, Callable[[Any, np.random.Generator], Sines]] = {"line": line,
 
 
 @dataclass(frozen=True, slots=True)
-class Voice:
+class VibrationComponent:
     """Sines and their interval: phi(t) = envelope(t) sines(t), from begin_s to end_s.
 
     The envelope is 1 except for a rise and a fall of a tenth of the interval each, a second at most, along
@@ -101,7 +101,7 @@ class Voice:
 
     @property
     def rise_s(self) -> float:
-        return min(RISE * (self.end_s - self.begin_s), LONGEST_RISE_S)
+        return min(RISE_FRACTION * (self.end_s - self.begin_s), MAX_RISE_S)
 
     @property
     def highest_hz(self) -> float:
@@ -114,44 +114,44 @@ class Voice:
         edge_hz = 1 / self.rise_s if math.isfinite(self.begin_s) else 0.0
         return float(self.sines.omega_rad_s.max()) / (2 * np.pi) + edge_hz
 
-    def sounds(self, t_s: Floats) -> NDArray[np.bool_]:
+    def active(self, t_s: Floats) -> NDArray[np.bool_]:
         """(N - 1,) whether it is active between each of (N,) times and the next."""
         return np.asarray((t_s[:-1] < self.end_s) & (self.begin_s < t_s[1:]))
 
-    def swing(self, t_s: Floats) -> tuple[Floats, Floats]:
+    def evaluate(self, t_s: Floats) -> tuple[Floats, Floats]:
         """(N, 3) phi and (N, 3) its derivative at (N,) times within the interval."""
-        phi, rate = swing(t_s, self.sines.omega_rad_s, self.sines.sine_rad, self.sines.cosine_rad)
+        phi, rate = evaluate_sines(t_s, self.sines.omega_rad_s, self.sines.sine_rad, self.sines.cosine_rad)
         if not math.isfinite(self.begin_s):
             return phi, rate
-        gain, slope = gains(t_s - self.begin_s, self.end_s - self.begin_s, self.rise_s)
+        gain, slope = envelopes(t_s - self.begin_s, self.end_s - self.begin_s, self.rise_s)
         return gain * phi, gain * rate + slope * phi
 
 
 @dataclass(frozen=True, slots=True)
 class Vibration:
-    """All vibration of one run. Its phases are drawn once, so that evaluation in pieces equals that of the whole."""
+    """All vibration of one run. Its phases are drawn once, so that evaluation piece by piece equals one evaluation."""
 
-    voices: tuple[Voice, ...]
+    components: tuple[VibrationComponent, ...]
 
     @classmethod
-    def of(cls, motion: MotionConfig, rng: np.random.Generator) -> Vibration:
+    def draw(cls, motion: MotionConfig, rng: np.random.Generator) -> Vibration:
         """The vibration of `motion.jitter`, always on, and of each jitter maneuver during its interval."""
-        drawn = [voice(motion.jitter, rng, "motion.jitter")]
-        for begin_s, end_s, parts in shakes(motion):
-            drawn.append(voice(parts, rng, f"motion.manoeuvre jitter at {begin_s:g} s", begin_s, end_s))
-        return cls(tuple(one for one in drawn if one))
+        components = [draw_component(motion.jitter, rng, "motion.jitter")]
+        for begin_s, end_s, configs in vibration_intervals(motion):
+            components.append(draw_component(configs, rng, f"motion.maneuver jitter at {begin_s:g} s", begin_s, end_s))
+        return cls(tuple(component for component in components if component))
 
-    def swing(self, t_s: Floats) -> tuple[Floats, Floats]:
+    def evaluate(self, t_s: Floats) -> tuple[Floats, Floats]:
         """(N, 3) rotation vector phi and (N, 3) its derivative (rad/s), body axes, at (N,) ascending times."""
         phi, rate = np.zeros((len(t_s), 3)), np.zeros((len(t_s), 3))
-        for one in self.voices:
-            now = slice(*np.searchsorted(t_s, [one.begin_s, one.end_s]))
-            more, faster = one.swing(t_s[now])
-            phi[now] += more
-            rate[now] += faster
+        for component in self.components:
+            active = slice(*np.searchsorted(t_s, [component.begin_s, component.end_s]))
+            component_phi, component_rate = component.evaluate(t_s[active])
+            phi[active] += component_phi
+            rate[active] += component_rate
         return phi, rate
 
-    def lay_over(self, trajectory: Trajectory) -> Trajectory:
+    def add_to(self, trajectory: Trajectory) -> Trajectory:
         """Add the vibration to a trajectory, or to a part of one: lab_from_body exp(phi(t)), phi in body axes.
 
         Where vibration is active the trajectory is resampled so finely that `Trajectory.at` between two samples
@@ -160,72 +160,74 @@ class Vibration:
         vibration the same object is returned. Raises InputError (one line) where more than five million samples
         would be needed.
         """
-        if not any(one.sounds(trajectory.t_s).any() for one in self.voices):
+        if not any(component.active(trajectory.t_s).any() for component in self.components):
             return trajectory
-        t_s = finer(trajectory.t_s, self.pieces(trajectory.t_s))
-        phi, phi_rate = self.swing(t_s)
-        turn = Rotation.from_rotvec(phi)
-        rate = np.column_stack(
-            [np.interp(t_s, trajectory.t_s, axis) for axis in trajectory.rate_body_rad_s.T]
+        t_s = subdivide(trajectory.t_s, self.subdivisions(trajectory.t_s))
+        phi, phi_rate = self.evaluate(t_s)
+        vibration = Rotation.from_rotvec(phi)
+        rate = np.column_stack([np.interp(t_s, trajectory.t_s, axis) for axis in trajectory.rate_body_rad_s.T])
+        return Trajectory(
+            t_s,
+            trajectory.attitude_at(t_s) * vibration,
+            vibration.inv().apply(rate) + rotvec_body_rate(phi, phi_rate),
         )
-        return Trajectory(t_s, trajectory.at(t_s) * turn, turn.inv().apply(rate) + own_rate(phi, phi_rate))
 
-    def pieces(self, t_s: Floats) -> NDArray[np.int64]:
+    def subdivisions(self, t_s: Floats) -> NDArray[np.int64]:
         """(N - 1,) number of pieces of each step, so that every period has PER_PERIOD samples.
 
         Raises InputError if there are too many samples. Before applying vibration piece by piece, call this
         with all times.
         """
         highest_hz = np.zeros(len(t_s) - 1)
-        for one in self.voices:
-            np.maximum(highest_hz, one.highest_hz, out=highest_hz, where=one.sounds(t_s))
-        pieces = np.ceil(np.maximum(np.diff(t_s) * highest_hz * PER_PERIOD * (1 - 1e-12), 1))
-        needed = int(pieces.sum()) + 1
-        if self.voices and needed > MOST_SAMPLES:
-            worst = max(self.voices, key=lambda one: one.highest_hz * np.diff(t_s)[one.sounds(t_s)].sum())
-            raise InputError(
-                f"{worst.name}: {worst.highest_hz:g} Hz over {np.diff(t_s)[worst.sounds(t_s)].sum():g} s needs "
-                f"{needed:,} attitude samples; allowed: {MOST_SAMPLES:,}, {PER_PERIOD} a period"
+        for component in self.components:
+            np.maximum(highest_hz, component.highest_hz, out=highest_hz, where=component.active(t_s))
+        count = np.ceil(np.maximum(np.diff(t_s) * highest_hz * SAMPLES_PER_PERIOD * (1 - 1e-12), 1))
+        needed = int(count.sum()) + 1
+        if self.components and needed > MAX_SAMPLES:
+            densest = max(
+                self.components,
+                key=lambda component: component.highest_hz * np.diff(t_s)[component.active(t_s)].sum(),
             )
-        return pieces.astype(np.int64)
+            raise InputError(
+                f"{densest.name}: {densest.highest_hz:g} Hz over {np.diff(t_s)[densest.active(t_s)].sum():g} s needs "
+                f"{needed:,} attitude samples; allowed: {MAX_SAMPLES:,}, {SAMPLES_PER_PERIOD} a period"
+            )
+        return count.astype(np.int64)
 
 
-def voice(
-    parts: Sequence[JitterPart],
+def draw_component(
+    configs: Sequence[JitterPart],
     rng: np.random.Generator,
     name: str,
     begin_s: float = -math.inf,
     end_s: float = math.inf,
-) -> Voice | None:
+) -> VibrationComponent | None:
     """Draw a vibration's parts; None if all have zero rms."""
-    loud = [part for part in parts if any(part.rms_arcsec)]
-    if not loud:
+    active = [config for config in configs if any(config.rms_arcsec)]
+    if not active:
         return None
-    return Voice(joined([SPECTRA[part.kind](part, rng) for part in loud]), name, begin_s, end_s)
-
-
-def shake(trajectory: Trajectory, parts: Sequence[JitterPart], rng: np.random.Generator) -> Trajectory:
-    """The whole trajectory with a vibration that is always active, see `Vibration.lay_over`."""
-    return Vibration.of(MotionConfig(jitter=tuple(parts)), rng).lay_over(trajectory)
-
-
-def joined(many: Sequence[Sines]) -> Sines:
-    """All sines in one set."""
-    return Sines(
-        np.concatenate([one.omega_rad_s for one in many]),
-        np.concatenate([one.sine_rad for one in many]),
-        np.concatenate([one.cosine_rad for one in many]),
+    return VibrationComponent(
+        concatenate([SPECTRA[config.kind](config, rng) for config in active]), name, begin_s, end_s
     )
 
 
-def finer(t_s: Floats, pieces: NDArray[np.int64]) -> Floats:
+def concatenate(sets: Sequence[Sines]) -> Sines:
+    """Join several sets of sines."""
+    return Sines(
+        np.concatenate([sines.omega_rad_s for sines in sets]),
+        np.concatenate([sines.sine_rad for sines in sets]),
+        np.concatenate([sines.cosine_rad for sines in sets]),
+    )
+
+
+def subdivide(t_s: Floats, counts: NDArray[np.int64]) -> Floats:
     """The sample times with each step divided evenly into its pieces."""
-    begin = np.repeat(np.cumsum(pieces) - pieces, pieces)  # the first sample of each one's own step
-    within = (np.arange(len(begin)) - begin) / np.repeat(pieces, pieces)
-    return np.append(np.repeat(t_s[:-1], pieces) + within * np.repeat(np.diff(t_s), pieces), t_s[-1])
+    begin = np.repeat(np.cumsum(counts) - counts, counts)  # the first sample of the step of each
+    within = (np.arange(len(begin)) - begin) / np.repeat(counts, counts)
+    return np.append(np.repeat(t_s[:-1], counts) + within * np.repeat(np.diff(t_s), counts), t_s[-1])
 
 
-def own_rate(phi: Floats, phi_rate: Floats) -> Floats:
+def rotvec_body_rate(phi: Floats, phi_rate: Floats) -> Floats:
     """(N, 3) angular velocity of exp(phi) in its own axes, by the rotations' right Jacobian:
 
         dphi/dt - (1 - cos a) / a^2 phi x dphi/dt + (a - sin a) / a^3 phi x (phi x dphi/dt),  a = |phi|
@@ -241,7 +243,7 @@ def own_rate(phi: Floats, phi_rate: Floats) -> Floats:
 
 
 @jit
-def gains(t_s: Floats, duration_s: float, rise_s: float) -> tuple[Floats, Floats]:
+def envelopes(t_s: Floats, duration_s: float, rise_s: float) -> tuple[Floats, Floats]:
     """(N, 1) envelope and (N, 1) its derivative."""
     gain, slope = np.empty((len(t_s), 1)), np.empty((len(t_s), 1))
     for n in range(len(t_s)):
@@ -250,7 +252,7 @@ def gains(t_s: Floats, duration_s: float, rise_s: float) -> tuple[Floats, Floats
 
 
 @jit(parallel=True)
-def swing(t_s: Floats, omega_rad_s: Floats, sine_rad: Floats, cosine_rad: Floats) -> tuple[Floats, Floats]:
+def evaluate_sines(t_s: Floats, omega_rad_s: Floats, sine_rad: Floats, cosine_rad: Floats) -> tuple[Floats, Floats]:
     """(N, 3) phi and (N, 3) its derivative at every time."""
     phi, rate = np.empty((len(t_s), 3)), np.empty((len(t_s), 3))
     for n in numba.prange(len(t_s)):

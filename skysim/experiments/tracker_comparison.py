@@ -12,18 +12,18 @@ import numpy as np
 
 from skysim.core import files
 from skysim.core.errors import InputError
-from skysim.core.types import Frame, Row, Truth
+from skysim.core.types import Frame, FrameRow, Truth
 from skysim.results import metrics, scoring
 from skysim.scene.scene import Scene
-from skysim.simulation import run, testbed
+from skysim.simulation import run
 from skysim.simulation.run import FrameResult
-from skysim.simulation.testbed import Testbed
+from skysim.simulation.testbed import Testbed, build_tracker
 from skysim.tracking import factory
 from skysim.tracking.external.interface import FAILED, SOLVED
 
 
 @dataclass(frozen=True, slots=True)
-class Line:
+class TrackerScore:
     """Statistics of one tracker.
 
     right    : fraction of all frames solved within ten arcminutes, with its 95% interval
@@ -48,43 +48,43 @@ class Line:
     refusals: dict[str, int]
 
 
-def entrants(lab: Testbed, names: Sequence[str]) -> dict[str, factory.Estimator]:
+def build_trackers(testbed: Testbed, names: Sequence[str]) -> dict[str, factory.Estimator]:
     """Set up the trackers by name, all with the scene's tracker options and onboard model. Raises InputError."""
-    twice = [name for name, count in Counter(names).items() if count > 1]
-    if twice:
-        raise InputError(f"--tracker {twice[0]}: is told twice; allowed: once")
-    return {name: testbed.tracker(with_tracker(lab, name)) for name in names}
+    repeated = [name for name, count in Counter(names).items() if count > 1]
+    if repeated:
+        raise InputError(f"--tracker {repeated[0]}: given twice; allowed: once")
+    return {name: build_tracker(with_tracker(testbed, name)) for name in names}
 
 
-def with_tracker(lab: Testbed, name: str) -> Testbed:
+def with_tracker(testbed: Testbed, name: str) -> Testbed:
     """The same test bed with another tracker."""
-    told = lab.scene.tracker.model_copy(update={"name": name})
-    return replace(lab, scene=lab.scene.model_copy(update={"tracker": told}))
+    config = testbed.scene.tracker.model_copy(update={"name": name})
+    return replace(testbed, scene=testbed.scene.model_copy(update={"tracker": config}))
 
 
-def shots(
-    lab: Testbed, estimators: Mapping[str, factory.Estimator]
-) -> Iterator[tuple[Frame, Truth, dict[str, Row]]]:
+def compare_frames(
+    testbed: Testbed, estimators: Mapping[str, factory.Estimator]
+) -> Iterator[tuple[Frame, Truth, dict[str, FrameRow]]]:
     """Yield each frame with its truth and the row of each tracker.
 
     The order of the trackers rotates from frame to frame, so that none always runs first (with cold caches). Frames
     that the first tracker solved for the attitude filter during the motion simulation are not solved again.
     """
     order = list(estimators)
-    flown = order[0]  # the tracker whose solutions updated the attitude filter
+    closed_loop_tracker = order[0]  # the tracker whose solutions updated the attitude filter
     for name in order:
-        run.warm_up(lab, estimators[name])
-    for frame, truth, seconds in run.render_frames(lab):
-        answers = {}
+        run.warm_up(testbed, estimators[name])
+    for frame, truth, seconds in run.render_frames(testbed):
+        rows = {}
         for name in order:
-            report = lab.reports.get(frame.index) if name == flown else None
+            report = testbed.reports.get(frame.index) if name == closed_loop_tracker else None
             report = report or factory.solve_frame(estimators[name], frame)
-            answers[name] = scoring.row(FrameResult(frame, truth, report, seconds), lab.scene, lab.mount)
-        yield frame, truth, answers
+            rows[name] = scoring.row(FrameResult(frame, truth, report, seconds), testbed.scene, testbed.mount)
+        yield frame, truth, rows
         order.append(order.pop(0))
 
 
-def line(tracker: str, rows: Sequence[Row]) -> Line:
+def score_tracker(tracker: str, rows: Sequence[FrameRow]) -> TrackerScore:
     """Statistics of a tracker over its rows."""
     right = [row for row in rows if row.status == SOLVED and not row.wrong]
     unsolved = Counter(row.status for row in rows if row.status != SOLVED)
@@ -93,10 +93,10 @@ def line(tracker: str, rows: Sequence[Row]) -> Line:
     roll = np.abs([row.roll_arcsec for row in right] or [np.nan])
     # Frames on which it failed are left out of the times: the time to a solution is unknown there.
     ms = np.array([row.time_ms for row in rows if not row.status.startswith(FAILED)] or [np.nan])
-    return Line(
+    return TrackerScore(
         tracker,
         len(rows),
-        metrics.share(len(right), len(rows)),
+        metrics.proportion(len(right), len(rows)),
         sum(row.wrong for row in rows),
         sum(unsolved.values()) - failed,
         failed,
@@ -110,26 +110,26 @@ def line(tracker: str, rows: Sequence[Row]) -> Line:
     )
 
 
-def write(folder: Path, rows: Mapping[str, list[Row]], scene: Scene) -> list[Line]:
+def write_scores(folder: Path, rows: Mapping[str, list[FrameRow]], scene: Scene) -> list[TrackerScore]:
     """Write solutions.NAME.ecsv of every tracker and scoreboard.ecsv. Returns the statistics of each tracker."""
-    lines = [line(name, told) for name, told in rows.items()]
-    for name, told in rows.items():
-        files.write_table(folder / f"solutions.{name}.ecsv", scoring.table(told, scoring.angle_names(scene)))
-    files.write_table(folder / "scoreboard.ecsv", table(lines))
-    return lines
+    scores = [score_tracker(name, tracker_rows) for name, tracker_rows in rows.items()]
+    for name, tracker_rows in rows.items():
+        files.write_table(folder / f"solutions.{name}.ecsv", scoring.table(tracker_rows, scoring.angle_names(scene)))
+    files.write_table(folder / "scoreboard.ecsv", score_table(scores))
+    return scores
 
 
-def as_dicts(lines: Sequence[Line]) -> list[dict[str, Any]]:
+def as_dicts(scores: Sequence[TrackerScore]) -> list[dict[str, Any]]:
     """The statistics as dictionaries for JSON; `right` becomes three numbers."""
     return [
-        asdict(one) | {"right": one.right.value, "right_low": one.right.low, "right_high": one.right.high}
-        for one in lines
+        asdict(score) | {"right": score.right.value, "right_low": score.right.low, "right_high": score.right.high}
+        for score in scores
     ]
 
 
-def table(lines: Sequence[Line]) -> Any:
+def score_table(scores: Sequence[TrackerScore]) -> Any:
     """One row per tracker as an astropy table, without `refusals`; the status of each frame is in the solutions."""
     from astropy.table import Table
 
-    rows = as_dicts(lines)
+    rows = as_dicts(scores)
     return Table({name: [row[name] for row in rows] for name in rows[0] if name != "refusals"})

@@ -16,7 +16,7 @@ import scipy
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from skysim.core.errors import InputError
+from skysim.core.errors import InputError, unknown_name
 from skysim.core.types import Floats
 
 WRONG_RAD = np.radians(10 / 60)  # limit of PTASE for a wrong attitude: ten arcminutes
@@ -37,7 +37,7 @@ def is_wrong(cam_from_ref_estimate: Rotation, cam_from_ref_truth: Rotation) -> b
     return bool((cam_from_ref_estimate * cam_from_ref_truth.inv()).magnitude() > WRONG_RAD)
 
 
-def normalised_error_squared(
+def normalized_error_squared(
     cam_from_ref_estimate: Rotation, cam_from_ref_truth: Rotation, covariance_rad2: Floats
 ) -> float:
     """NEES: e^T P^-1 e, with e the error rotation vector in camera axes.
@@ -53,8 +53,10 @@ def normalised_error_squared(
 Columns = Mapping[str, NDArray[Any]]
 CONFIDENCE = 0.95
 RESAMPLES = 999
-BEYOND = 1e-8  # probability with which a correct covariance allows an error counted as overconfident
-FEWEST_STARS = 5  # "5 stars everywhere" (Padro 2012)
+OVERCONFIDENCE_PROBABILITY = (
+    1e-8  # probability with which a correct covariance allows an error counted as overconfident
+)
+DEFAULT_COVERAGE = 5  # "5 stars everywhere" (Padro 2012)
 
 
 class Summary(NamedTuple):
@@ -66,7 +68,7 @@ class Summary(NamedTuple):
     trials: int
 
 
-NOTHING = Summary(float("nan"), float("nan"), float("nan"), 0)
+NO_VALUE = Summary(float("nan"), float("nan"), float("nan"), 0)
 Response = Callable[[Columns], Summary]
 
 
@@ -75,12 +77,12 @@ def exact(value: float) -> Summary:
     return Summary(float(value), float(value), float(value), 1)
 
 
-def share(hits: Any, of: Any) -> Summary:
-    """The proportion hits / of with Wilson's interval (Wilson 1927), which is valid at 0 and at 1 too."""
-    if of < 1:
-        return NOTHING
-    found = scipy.stats.binomtest(int(hits), int(of)).proportion_ci(CONFIDENCE, "wilson")
-    return Summary(float(hits / of), float(found.low), float(found.high), int(of))
+def proportion(hits: Any, total: Any) -> Summary:
+    """The proportion hits / total with Wilson's interval (Wilson 1927), which is valid at 0 and at 1 too."""
+    if total < 1:
+        return NO_VALUE
+    interval = scipy.stats.binomtest(int(hits), int(total)).proportion_ci(CONFIDENCE, "wilson")
+    return Summary(float(hits / total), float(interval.low), float(interval.high), int(total))
 
 
 def resampled(values: Floats, statistic: Callable[..., Any]) -> Summary:
@@ -90,11 +92,10 @@ def resampled(values: Floats, statistic: Callable[..., Any]) -> Summary:
     """
     value = float(statistic(values))
     if len(values) < 2 or np.ptp(values) == 0:
-        return Summary(
-            value, value if len(values) > 1 else np.nan, value if len(values) > 1 else np.nan, len(values)
-        )
+        bound = value if len(values) > 1 else np.nan
+        return Summary(value, bound, bound, len(values))
     batch = max(1, 2_000_000 // len(values))  # limits the memory of a batch to two million values
-    found = scipy.stats.bootstrap(
+    result = scipy.stats.bootstrap(
         (values,),
         statistic,
         n_resamples=RESAMPLES,
@@ -103,24 +104,24 @@ def resampled(values: Floats, statistic: Callable[..., Any]) -> Summary:
         method="percentile",
         rng=np.random.default_rng(1),
     )
-    low, high = map(float, found.confidence_interval)
+    low, high = map(float, result.confidence_interval)
     return Summary(value, low, high, len(values))
 
 
-def quantile(values: Floats, part: float) -> Summary:
-    """The quantile at probability `part` with a distribution-free interval.
+def quantile(values: Floats, probability: float) -> Summary:
+    """The quantile at the given probability with a distribution-free interval.
 
     The interval is between two order statistics whose ranks follow from the binomial distribution (Conover 1999,
     section 3.2). A bound is infinite where there are too few values for it.
     """
-    low, high = scipy.stats.quantile_test(values, p=part).confidence_interval(CONFIDENCE)
-    ends = (float(low) if np.isfinite(low) else -np.inf, float(high) if np.isfinite(high) else np.inf)
-    return Summary(float(np.quantile(values, part)), *ends, len(values))
+    low, high = scipy.stats.quantile_test(values, p=probability).confidence_interval(CONFIDENCE)
+    bounds = (float(low) if np.isfinite(low) else -np.inf, float(high) if np.isfinite(high) else np.inf)
+    return Summary(float(np.quantile(values, probability)), *bounds, len(values))
 
 
-def extreme(values: Floats, which: Callable[[Floats], Any]) -> Summary:
+def extremum(values: Floats, reduce: Callable[[Floats], Any]) -> Summary:
     """The largest or smallest value of these trials, without an interval."""
-    return Summary(float(which(values)), float("nan"), float("nan"), len(values))
+    return Summary(float(reduce(values)), float("nan"), float("nan"), len(values))
 
 
 def rms(values: Floats, axis: int = -1) -> Any:
@@ -136,11 +137,11 @@ STATISTICS: dict[str, Callable[[Floats], Summary]] = {
     "p90": lambda values: quantile(values, 0.9),
     "p95": lambda values: quantile(values, 0.95),
     "p99": lambda values: quantile(values, 0.99),
-    "worst": lambda values: extreme(values, np.max),
-    "least": lambda values: extreme(values, np.min),
+    "worst": lambda values: extremum(values, np.max),
+    "least": lambda values: extremum(values, np.min),
 }
 # The beginning of a response name. Errors are taken as magnitudes.
-FIGURES: dict[str, Callable[[Columns], NDArray[Any]]] = {
+QUANTITIES: dict[str, Callable[[Columns], NDArray[Any]]] = {
     "cross_arcsec": lambda c: np.hypot(c["x_arcsec"], c["y_arcsec"]),
     "roll_arcsec": lambda c: np.abs(c["roll_arcsec"]),
     "angle_arcsec": lambda c: np.sqrt(c["x_arcsec"] ** 2 + c["y_arcsec"] ** 2 + c["roll_arcsec"] ** 2),
@@ -155,35 +156,36 @@ FIGURES: dict[str, Callable[[Columns], NDArray[Any]]] = {
 
 
 def overconfident(c: Columns) -> Summary:
-    """Proportion of the solutions whose NEES exceeds the chi-square limit at probability BEYOND (1e-8).
+    """Proportion of the solutions whose NEES exceeds the chi-square limit at probability 1e-8.
 
     Causes are wrong identifications and errors that the covariance does not model.
     """
     # For a trial of many frames the column holds a mean NEES, which has another distribution.
-    answered = np.isfinite(c["nees"]) & (c["frames"] == 1)
-    return share(np.sum(c["nees"][answered] > scipy.stats.chi2.isf(BEYOND, 3)), np.sum(answered))
+    solved = np.isfinite(c["nees"]) & (c["frames"] == 1)
+    return proportion(np.sum(c["nees"][solved] > scipy.stats.chi2.isf(OVERCONFIDENCE_PROBABILITY, 3)), np.sum(solved))
 
 
-def of_frames(hits: NDArray[Any], frames: NDArray[Any]) -> Summary:
+def proportion_of_frames(hits: NDArray[Any], frames: NDArray[Any]) -> Summary:
     """A proportion of all frames.
 
     The frames of one simulated run are correlated. Where trials have many frames, the interval is therefore that of
     as many independent samples as there are runs, widened if necessary to include the value.
     """
-    told = share(np.sum(hits), np.sum(frames))
+    summary = proportion(np.sum(hits), np.sum(frames))
     if not len(frames) or np.max(frames) <= 1:
-        return told
-    flights = int(np.sum(frames > 0))
-    alike = share(round(told.value * flights), flights)
-    return told._replace(low=min(alike.low, told.value), high=max(alike.high, told.value), trials=flights)
+        return summary
+    runs = int(np.sum(frames > 0))
+    of_runs = proportion(round(summary.value * runs), runs)
+    low, high = min(of_runs.low, summary.value), max(of_runs.high, summary.value)
+    return summary._replace(low=low, high=high, trials=runs)
 
 
-SHARES: dict[str, Response] = {
+PROPORTIONS: dict[str, Response] = {
     "overconfident": overconfident,
-    "identified": lambda c: of_frames(c["solved"] - c["wrong"], c["frames"]),
-    "wrong": lambda c: of_frames(c["wrong"], c["frames"]),
-    "refused": lambda c: of_frames(c["frames"] - c["solved"], c["frames"]),
-    "failed": lambda c: share(np.sum(c["frames"] == 0), len(c["frames"])),
+    "identified": lambda c: proportion_of_frames(c["solved"] - c["wrong"], c["frames"]),
+    "wrong": lambda c: proportion_of_frames(c["wrong"], c["frames"]),
+    "refused": lambda c: proportion_of_frames(c["frames"] - c["solved"], c["frames"]),
+    "failed": lambda c: proportion(np.sum(c["frames"] == 0), len(c["frames"])),
 }
 COVERAGE = re.compile(r"coverage(?:_(\d+))?$")
 
@@ -197,21 +199,21 @@ def response(name: str, where: str = "response") -> Response:
     coverage_N : proportion of the trials with at least N sources in the field of view; N is 5 if omitted
     otherwise a quantity and a statistic: stars_least, cross_arcsec_p95 (over all solutions, wrong ones included)
     """
-    if name in SHARES:
-        return SHARES[name]
-    if told := COVERAGE.match(name):
-        least = int(told[1] or FEWEST_STARS)
-        return lambda c: share(np.sum(c["stars"][c["frames"] > 0] >= least), np.sum(c["frames"] > 0))
-    figure, _, statistic = name.rpartition("_")
-    if figure not in FIGURES or statistic not in STATISTICS:
+    if name in PROPORTIONS:
+        return PROPORTIONS[name]
+    if match := COVERAGE.match(name):
+        least = int(match[1] or DEFAULT_COVERAGE)
+        return lambda c: proportion(np.sum(c["stars"][c["frames"] > 0] >= least), np.sum(c["frames"] > 0))
+    quantity, _, statistic = name.rpartition("_")
+    if quantity not in QUANTITIES or statistic not in STATISTICS:
         raise InputError(
-            f"{where}: {name!r} is none of {', '.join(SHARES)}, coverage, coverage_N, or one of {', '.join(FIGURES)}"
-            f" with _{', _'.join(STATISTICS)}"
+            f"{where}: {unknown_name('response', name, PROPORTIONS)}, coverage, coverage_N, or one of"
+            f" {', '.join(QUANTITIES)} with _{', _'.join(STATISTICS)}"
         )
 
-    def summarised(columns: Columns) -> Summary:
-        values = FIGURES[figure](columns)
+    def summarize(columns: Columns) -> Summary:
+        values = QUANTITIES[quantity](columns)
         values = values[np.isfinite(values)].astype(float)
-        return STATISTICS[statistic](values) if len(values) else NOTHING
+        return STATISTICS[statistic](values) if len(values) else NO_VALUE
 
-    return summarised
+    return summarize

@@ -19,14 +19,14 @@ from numpy.typing import NDArray
 from estimator.core.types import Attitude
 from skysim.core.errors import InputError
 from skysim.core.files import make_folder, write_image, write_table
-from skysim.core.types import Frame, Row, Telemetry, Truth
+from skysim.core.types import Frame, FrameRow, Telemetry, Truth
 from skysim.core.units import ARCSEC_RAD
 from skysim.results import report, scoring, telemetry_report
-from skysim.results.files.frames import clear, write_frame
+from skysim.results.files.frames import remove_results, write_frame
 from skysim.scene.scene import Scene
 from skysim.simulation import exposure
 from skysim.simulation import run as simulation
-from skysim.simulation.testbed import Testbed, build_testbed, tracker
+from skysim.simulation.testbed import Testbed, build_testbed, build_tracker
 from skysim.tracking.factory import NO_PROGRAMS
 
 if TYPE_CHECKING:
@@ -45,7 +45,7 @@ class ScoredFrame:
     """
 
     result: simulation.FrameResult
-    row: Row
+    row: FrameRow
 
     @property
     def image(self) -> NDArray[Any]:
@@ -75,11 +75,11 @@ class ScoredFrame:
         return scoring.annotated(self.result)
 
     def __repr__(self) -> str:
-        found = f"{self.row.matched} of {self.row.detected} detections identified"
-        return f"<frame {self.row.frame}: {self.row.status}, error {self.error_arcsec:.3g} arcsec, {found}>"
+        identified = f"{self.row.matched} of {self.row.detected} detections identified"
+        return f"<frame {self.row.frame}: {self.row.status}, error {self.error_arcsec:.3g} arcsec, {identified}>"
 
     def _repr_html_(self) -> str:
-        return f"{_picture(self.annotated())}<p>{html.escape(repr(self)[1:-1])}</p>"
+        return f"{_image_tag(self.annotated())}<p>{html.escape(repr(self)[1:-1])}</p>"
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,7 +104,7 @@ class Run(Sequence[ScoredFrame]):
         return self.testbed.log
 
     @property
-    def rows(self) -> list[Row]:
+    def rows(self) -> list[FrameRow]:
         """One row of numbers per frame."""
         return [frame.row for frame in self.frames]
 
@@ -136,7 +136,7 @@ class Run(Sequence[ScoredFrame]):
 
     def _repr_html_(self) -> str:
         title = f"{self.scene.title} ({len(self)} frames)"
-        return f"<h4>{html.escape(title)}</h4>{_picture(self.frames[-1].annotated())}{self.table()._repr_html_()}"
+        return f"<h4>{html.escape(title)}</h4>{_image_tag(self.frames[-1].annotated())}{self.table()._repr_html_()}"
 
 
 @dataclass(slots=True)
@@ -148,18 +148,29 @@ class Recorder:
 
     folder: Path
     testbed: Testbed
-    rows: list[Row] = field(default_factory=list)
-    tally: scoring.Tally = field(default_factory=scoring.Tally)
+    rows: list[FrameRow] = field(default_factory=list)
+    accumulator: scoring.RunAccumulator = field(default_factory=scoring.RunAccumulator)
 
     def __post_init__(self) -> None:
         make_folder(self.folder)
-        clear(self.folder)
+        remove_results(self.folder)
 
     def add(self, frame: ScoredFrame) -> None:
-        """Write one frame with its truth."""
-        write_frame(self.folder, frame.result.frame, frame.truth, self.testbed.scene)
+        """Write one solved frame with its truth and add it to the tables."""
+        self.write(frame.result.frame, frame.truth)
         self.rows.append(frame.row)
-        self.tally.add(frame.result)
+        self.accumulator.add(frame.result)
+
+    def write(self, frame: Frame, truth: Truth, preview: bool = False) -> Path:
+        """Write one frame with its truth; return the path of its FITS file.
+
+        preview : also write frame_NNNN.preview.png, an 8-bit image with the truth marked
+        """
+        write_frame(self.folder, frame, truth, self.testbed.scene)
+        path = self.folder / f"frame_{frame.index:04d}.fits"
+        if preview:
+            write_image(path.with_suffix(".preview.png"), report.annotate_truth(frame.image_dn, truth.sources))
+        return path
 
     def finish(self, command: str, pictures: Sequence[Path] = ()) -> dict[str, Any]:
         """Write tables, annotated image and report. Returns the statistics that `skysim run --json` prints."""
@@ -167,27 +178,28 @@ class Recorder:
         names = scoring.angle_names(scene)
         write_table(self.folder / "solutions.ecsv", scoring.table(self.rows, names))
         write_table(self.folder / "telemetry.ecsv", telemetry_report.table(log))
-        if self.testbed.record:
-            write_table(self.folder / "imu.ecsv", telemetry_report.imu_table(self.testbed.record))
-        annotated, page = self.tally.picture(), self.folder / "report.html"
+        if self.testbed.imu_samples:
+            write_table(self.folder / "imu.ecsv", telemetry_report.imu_table(self.testbed.imu_samples))
+        annotated, page = self.accumulator.picture(), self.folder / "report.html"
         write_image(self.folder / "annotated.png", annotated)
         images = report.Images(annotated, telemetry_report.figure(log), list(pictures))
-        report.write_page(page, scene.title, command, names, self.rows, self.tally.median_ms(), images)
-        figures = report.summary(self.rows) | {"stages_ms": self.tally.median_ms(), "report": str(page)}
-        figures |= {"flight": telemetry_report.summary(log), "pictures": [str(path) for path in pictures]}
-        return figures | {"exposures_ms": [1e3 * row.exposure_s for row in self.rows]}
+        report.write_page(page, scene.title, command, names, self.rows, self.accumulator.median_ms(), images)
+        statistics = report.summary(self.rows) | {
+            "stages_ms": self.accumulator.median_ms(),
+            "report": str(page),
+        }
+        statistics |= {"flight": telemetry_report.summary(log), "pictures": [str(path) for path in pictures]}
+        return statistics | {"exposures_ms": [1e3 * row.exposure_s for row in self.rows]}
 
 
 def score_frames(testbed: Testbed) -> Iterator[ScoredFrame]:
     """Render, solve and score the frames of a test bed one after another; its motion must be simulated already."""
-    for result in simulation.run(testbed, tracker(testbed)):
-        verdict = testbed.verdicts.get(result.frame.index, "")
+    for result in simulation.run(testbed, build_tracker(testbed)):
+        verdict = testbed.update_statuses.get(result.frame.index, "")
         yield ScoredFrame(result, scoring.row(result, testbed.scene, testbed.mount, verdict))
 
 
-def simulate(
-    scene: Scene, *, programs: Mapping[str, str] = NO_PROGRAMS, progress: Progress | None = None
-) -> Run:
+def simulate(scene: Scene, *, programs: Mapping[str, str] = NO_PROGRAMS, progress: Progress | None = None) -> Run:
     """Simulate a scene's motion, render every frame, solve it and score the solution against the truth.
 
     programs : commands of external trackers by name, for scenes whose `tracker.name` is one of these
@@ -196,7 +208,7 @@ def simulate(
     All frames are kept in memory; `skysim run` writes them one by one. Raises InputError.
     """
     testbed = simulation.simulate_motion(build_testbed(scene, programs), progress)
-    return Run(testbed, tuple(_kept(frame) for frame in score_frames(testbed)))
+    return Run(testbed, tuple(_with_own_image(frame) for frame in score_frames(testbed)))
 
 
 def render(scene: Scene, index: int = 0) -> tuple[Frame, Truth]:
@@ -211,19 +223,17 @@ def render(scene: Scene, index: int = 0) -> tuple[Frame, Truth]:
     testbed = simulation.prepare(scene)
     if scene.tracker.exposure_control is None and index not in testbed.exposures_s:
         return exposure.render_frame(testbed, index)
-    return next(
-        (frame, truth) for frame, truth, _ in simulation.render_frames(testbed) if frame.index == index
-    )
+    return next((frame, truth) for frame, truth, _ in simulation.render_frames(testbed) if frame.index == index)
 
 
-def _kept(frame: ScoredFrame) -> ScoredFrame:
+def _with_own_image(frame: ScoredFrame) -> ScoredFrame:
     """The frame with a copy of its image, because the next frame may be rendered into the same memory."""
     image = frame.result.frame
     owned = replace(image, image_dn=np.array(image.image_dn))
     return replace(frame, result=replace(frame.result, frame=owned))
 
 
-def _picture(image: NDArray[np.uint8]) -> str:
+def _image_tag(image: NDArray[np.uint8]) -> str:
     """An HTML <img> element of an image, reduced to at most 800 pixels in width."""
     height, width = image.shape[:2]
     if width > 800:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from estimator.core.types import ra_dec_roll_rad
-from skysim.core.types import Mount, Row
+from skysim.core.types import FrameRow, Mount
 from skysim.core.units import ARCSEC_RAD
 from skysim.results import metrics
 from skysim.results.report import annotate
@@ -33,28 +33,26 @@ def angles_deg(cam_from_lab: Rotation, scene: Scene, mount: Mount) -> tuple[floa
     return float(roll), float(pitch), float(yaw)
 
 
-def row(shot: FrameResult, scene: Scene, mount: Mount, verdict: str = "") -> Row:
+def row(result: FrameResult, scene: Scene, mount: Mount, verdict: str = "") -> FrameRow:
     """Truth, solution and errors of one frame; `verdict` is how the attitude filter used the solution.
 
     Errors and standard deviations are in arcseconds, NaN without a solution.
     """
-    truth, answer = shot.truth, shot.report.attitude
+    truth, attitude = result.truth, result.report.attitude
     cross = roll = cross_sigma = roll_sigma = chance = float("nan")
     estimate, wrong = None, False
-    if answer.cam_from_ref is not None:
-        cross, roll = metrics.cross_and_roll_rad(answer.cam_from_ref, truth.cam_from_lab)
-        estimate = angles_deg(answer.cam_from_ref, scene, mount)
-        wrong = metrics.is_wrong(answer.cam_from_ref, truth.cam_from_lab)
-        variance = (
-            np.diag(answer.covariance_rad2) if answer.covariance_rad2 is not None else np.full(3, np.nan)
-        )
+    if attitude.cam_from_ref is not None:
+        cross, roll = metrics.cross_and_roll_rad(attitude.cam_from_ref, truth.cam_from_lab)
+        estimate = angles_deg(attitude.cam_from_ref, scene, mount)
+        wrong = metrics.is_wrong(attitude.cam_from_ref, truth.cam_from_lab)
+        variance = np.diag(attitude.covariance_rad2) if attitude.covariance_rad2 is not None else np.full(3, np.nan)
         cross_sigma, roll_sigma = float(np.sqrt(variance[:2].sum())), float(np.sqrt(variance[2]))
-        chance = answer.match.log10_chance if answer.match else chance
-    return Row(
-        frame=shot.frame.index,
+        chance = attitude.match.log10_chance if attitude.match else chance
+    return FrameRow(
+        frame=result.frame.index,
         t_s=truth.t_s,
         rate_deg_s=float(np.degrees(np.linalg.norm(truth.rate_cam_rad_s))),
-        status=answer.status,
+        status=attitude.status,
         truth_deg=angles_deg(truth.cam_from_lab, scene, mount),
         estimate_deg=estimate,
         cross_arcsec=cross / ARCSEC_RAD,
@@ -62,27 +60,27 @@ def row(shot: FrameResult, scene: Scene, mount: Mount, verdict: str = "") -> Row
         cross_sigma_arcsec=cross_sigma / ARCSEC_RAD,
         roll_sigma_arcsec=roll_sigma / ARCSEC_RAD,
         log10_chance=chance,
-        detected=len(shot.report.centroids),
-        matched=len(answer.match.observed) if answer.match else 0,
-        rms_px=answer.rms_px,
-        time_ms=1e3 * sum(shot.report.seconds.values()),
+        detected=len(result.report.centroids),
+        matched=len(attitude.match.observed) if attitude.match else 0,
+        rms_px=attitude.rms_px,
+        time_ms=1e3 * sum(result.report.seconds.values()),
         wrong=wrong,
         filter=verdict,
-        exposure_s=shot.frame.exposure_s,
+        exposure_s=result.frame.exposure_s,
     )
 
 
-def table(rows: list[Row], names: tuple[str, str, str]) -> Any:
+def table(rows: list[FrameRow], names: tuple[str, str, str]) -> Any:
     """The rows as an astropy table, one column per quantity."""
     from astropy.table import Table
 
-    nothing = (float("nan"),) * 3
+    missing = (float("nan"),) * 3
     columns: dict[str, Any] = {
         name: [getattr(row, name) for row in rows] for name in ("frame", "t_s", "rate_deg_s", "status")
     }
     for n, name in enumerate(names):
         columns[f"true_{name.lower()}_deg"] = [row.truth_deg[n] for row in rows]
-        columns[f"{name.lower()}_deg"] = [(row.estimate_deg or nothing)[n] for row in rows]
+        columns[f"{name.lower()}_deg"] = [(row.estimate_deg or missing)[n] for row in rows]
     for name in (
         "cross_arcsec",
         "roll_arcsec",
@@ -101,23 +99,23 @@ def table(rows: list[Row], names: tuple[str, str, str]) -> Any:
     return Table(columns)
 
 
-class Tally:
+class RunAccumulator:
     """Accumulates, in addition to a run's rows, the seconds by stage and the last solved frame for the image."""
 
     def __init__(self) -> None:
         self._seconds: dict[str, list[float]] = {}
         self._last: FrameResult | None = None
 
-    def add(self, shot: FrameResult) -> None:
+    def add(self, result: FrameResult) -> None:
         """Add the times of a frame, and keep the frame if it is solved or the first."""
-        for stage, spent in (shot.seconds | shot.report.seconds).items():
-            self._seconds.setdefault(stage, []).append(spent)
-        if self._last is None or shot.report.attitude.solved:
-            self._last = shot
+        for stage, seconds in (result.seconds | result.report.seconds).items():
+            self._seconds.setdefault(stage, []).append(seconds)
+        if self._last is None or result.report.attitude.solved:
+            self._last = result
 
     def median_ms(self) -> dict[str, float]:
         """Median milliseconds per frame, by stage."""
-        return {stage: 1e3 * float(np.median(spent)) for stage, spent in self._seconds.items()}
+        return {stage: 1e3 * float(np.median(seconds)) for stage, seconds in self._seconds.items()}
 
     def picture(self) -> NDArray[np.uint8]:
         """The last solved frame, annotated; the first frame if none was solved."""
@@ -127,6 +125,6 @@ class Tally:
 
 def annotated(result: FrameResult) -> NDArray[np.uint8]:
     """The stretched frame with true sources, detections and identified detections marked."""
-    seen, match = result.report.centroids.xy_px, result.report.attitude.match
-    matched = seen[match.observed] if match else np.empty((0, 2))
-    return annotate(result.frame.image_dn, seen, matched, truth_px=result.truth.seen.xy_px)
+    detected, match = result.report.centroids.xy_px, result.report.attitude.match
+    matched = detected[match.observed] if match else np.empty((0, 2))
+    return annotate(result.frame.image_dn, detected, matched, truth_px=result.truth.sources.xy_px)

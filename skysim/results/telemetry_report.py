@@ -23,9 +23,9 @@ def euler_deg(lab_from_body: Rotation) -> Floats:
     return np.asarray(lab_from_body.as_euler("ZYX", degrees=True)[:, ::-1])
 
 
-def off_deg(believed: Rotation | None, truth: Rotation) -> Floats | None:
+def attitude_error_deg(attitude: Rotation | None, truth: Rotation) -> Floats | None:
     """(K,) rotation angle between an estimated or commanded attitude and the truth, degrees; None for None."""
-    return None if believed is None else np.degrees((believed.inv() * truth).magnitude())
+    return None if attitude is None else np.degrees((attitude.inv() * truth).magnitude())
 
 
 def per_hour(rate_rad_s: Floats) -> Floats:
@@ -39,26 +39,28 @@ def summary(log: Telemetry) -> dict[str, float]:
     Only the entries that the telemetry supports are present: pointing error with a reference attitude, wheel speed
     with wheels, and so on.
     """
-    told, imu = off_deg(log.lab_from_ref, log.lab_from_body), off_deg(log.lab_from_imu, log.lab_from_body)
-    by_filter = off_deg(log.lab_from_filter, log.lab_from_body)
-    figures: dict[str, float] = {}
-    if told is not None:
-        figures |= {"pointing_deg_worst": told.max(), "pointing_deg_end": told[-1]}
-        figures["torque_nm_worst"] = np.abs(log.torque_nm).max()
+    pointing, imu, by_filter = (
+        attitude_error_deg(attitude, log.lab_from_body)
+        for attitude in (log.lab_from_ref, log.lab_from_imu, log.lab_from_filter)
+    )
+    statistics: dict[str, float] = {}
+    if pointing is not None:
+        statistics |= {"pointing_deg_worst": pointing.max(), "pointing_deg_end": pointing[-1]}
+        statistics["torque_nm_worst"] = np.abs(log.torque_nm).max()
     if log.wheel_rad_s.size or log.gimbal_rad.size:
-        figures["momentum_nms_worst"] = np.linalg.norm(log.momentum_nms, axis=1).max()
+        statistics["momentum_nms_worst"] = np.linalg.norm(log.momentum_nms, axis=1).max()
     if log.wheel_rad_s.size:
-        figures["wheel_rpm_worst"] = np.abs(log.wheel_rad_s).max() / RPM_RAD_S
+        statistics["wheel_rpm_worst"] = np.abs(log.wheel_rad_s).max() / RPM_RAD_S
     if log.manipulability is not None:
-        figures["manipulability_least"] = log.manipulability.min()
+        statistics["manipulability_least"] = log.manipulability.min()
     if imu is not None and log.saturated is not None:
-        figures |= {"imu_deg_worst": imu.max(), "imu_deg_end": imu[-1]}
-        figures["gyro_saturated_s"] = log.saturated.sum() * log.period_s
-    if by_filter is not None and log.believed_bias_rad_s is not None and log.bias_rad_s is not None:
-        wrong = per_hour(log.believed_bias_rad_s - log.bias_rad_s)[-1]
-        figures |= {"filter_deg_worst": by_filter.max(), "filter_arcsec_end": by_filter[-1] / ARCSEC_DEG}
-        figures["filter_bias_deg_h_end"] = float(np.linalg.norm(wrong))
-    return {name: float(value) for name, value in figures.items()}
+        statistics |= {"imu_deg_worst": imu.max(), "imu_deg_end": imu[-1]}
+        statistics["gyro_saturated_s"] = log.saturated.sum() * log.period_s
+    if by_filter is not None and log.assumed_bias_rad_s is not None and log.bias_rad_s is not None:
+        bias_error = per_hour(log.assumed_bias_rad_s - log.bias_rad_s)[-1]
+        statistics |= {"filter_deg_worst": by_filter.max(), "filter_arcsec_end": by_filter[-1] / ARCSEC_DEG}
+        statistics["filter_bias_deg_h_end"] = float(np.linalg.norm(bias_error))
+    return {name: float(value) for name, value in statistics.items()}
 
 
 def table(log: Telemetry) -> Any:
@@ -67,8 +69,8 @@ def table(log: Telemetry) -> Any:
 
     columns: dict[str, Any] = {"t_s": log.t_s}
 
-    def add(name: str, values: Floats, ends: tuple[str, ...], unit: str) -> None:
-        columns.update({f"{name}_{end}_{unit}": values[:, n] for n, end in enumerate(ends)})
+    def add(name: str, values: Floats, components: tuple[str, ...], unit: str) -> None:
+        columns.update({f"{name}_{component}_{unit}": values[:, n] for n, component in enumerate(components)})
 
     for name, attitude in (
         ("true", log.lab_from_body),
@@ -91,7 +93,7 @@ def table(log: Telemetry) -> Any:
         columns["gyro_saturated"] = log.saturated
     for name, rates in (
         ("bias", log.bias_rad_s),
-        ("believed_bias", log.believed_bias_rad_s),
+        ("assumed_bias", log.assumed_bias_rad_s),
         ("sigma_bias", log.sigma_bias_rad_s),
     ):
         if rates is not None:
@@ -123,47 +125,47 @@ def attitude_panel(log: Telemetry, axes: Any) -> None:
         axes.plot(log.t_s, true_deg[:, n], color=f"C{n}", label=name)
         if log.lab_from_ref is not None:
             axes.plot(log.t_s, euler_deg(log.lab_from_ref)[:, n], "--", color=f"C{n}", alpha=0.6, lw=1)
-    axes.set_ylabel("attitude [deg]\n(dashed: told)")
+    axes.set_ylabel("attitude [deg]\n(dashed: commanded)")
 
 
-def belief_panel(log: Telemetry, axes: Any) -> None:
-    for name, believed, colour in (
-        ("told", log.lab_from_ref, "0.6"),
+def attitude_error_panel(log: Telemetry, axes: Any) -> None:
+    for name, attitude, color in (
+        ("command", log.lab_from_ref, "0.6"),
         ("IMU alone", log.lab_from_imu, "tab:red"),
         ("filter", log.lab_from_filter, "tab:green"),
     ):
-        wrong_deg = off_deg(believed, log.lab_from_body)
-        if wrong_deg is not None:
-            axes.semilogy(log.t_s, np.maximum(wrong_deg, 1e-7), color=colour, label=name)
+        error_deg = attitude_error_deg(attitude, log.lab_from_body)
+        if error_deg is not None:
+            axes.semilogy(log.t_s, np.maximum(error_deg, 1e-7), color=color, label=name)
     if log.sigma_attitude_rad is not None:
         sigma_deg = np.degrees(np.linalg.norm(log.sigma_attitude_rad, axis=1))
-        axes.semilogy(log.t_s, 3 * sigma_deg, ":", color="tab:green", label="filter's own 3σ")
+        axes.semilogy(log.t_s, 3 * sigma_deg, ":", color="tab:green", label="filter 3σ")
     if log.saturated is not None and log.saturated.any():
         low, high = axes.get_ylim()
         axes.fill_between(log.t_s, low, high, where=log.saturated, color="tab:red", alpha=0.25, lw=0)
         axes.set_ylim(low, high)
-    axes.set_ylabel("off the truth [deg]")
+    axes.set_ylabel("error [deg]")
 
 
 def bias_panel(log: Telemetry, axes: Any) -> None:
     assert log.bias_rad_s is not None
-    assert log.believed_bias_rad_s is not None
+    assert log.assumed_bias_rad_s is not None
     assert log.sigma_bias_rad_s is not None
-    true, believed, sigma = map(per_hour, (log.bias_rad_s, log.believed_bias_rad_s, log.sigma_bias_rad_s))
+    true, estimate, sigma = map(per_hour, (log.bias_rad_s, log.assumed_bias_rad_s, log.sigma_bias_rad_s))
     for n, name in enumerate(AXES):
         axes.plot(log.t_s, true[:, n], "--", color=f"C{n}", lw=1)
-        axes.plot(log.t_s, believed[:, n], color=f"C{n}", label=name)
-        band = believed[:, n] - 3 * sigma[:, n], believed[:, n] + 3 * sigma[:, n]
+        axes.plot(log.t_s, estimate[:, n], color=f"C{n}", label=name)
+        band = estimate[:, n] - 3 * sigma[:, n], estimate[:, n] + 3 * sigma[:, n]
         axes.fill_between(log.t_s, *band, color=f"C{n}", alpha=0.12, lw=0)
-    reach = max(np.abs(true).max(), np.abs(believed).max()) + 3 * sigma[len(sigma) // 4 :].max()
-    axes.set_ylim(-reach, reach)
+    limit = max(np.abs(true).max(), np.abs(estimate).max()) + 3 * sigma[len(sigma) // 4 :].max()
+    axes.set_ylim(-limit, limit)
     axes.set_ylabel("gyro bias [deg/h]\n(dashed: true, band: 3σ)")
 
 
 def torque_panel(log: Telemetry, axes: Any) -> None:
     for n, name in enumerate(AXES):
         axes.plot(log.t_s, log.torque_nm[:, n], color=f"C{n}", label=name)
-    axes.set_ylabel("torque asked for\n[N m]")
+    axes.set_ylabel("commanded torque\n[N m]")
 
 
 def wheels_panel(log: Telemetry, axes: Any) -> None:
@@ -186,24 +188,24 @@ def gimbals_panel(log: Telemetry, axes: Any) -> None:
 def momentum_panel(log: Telemetry, axes: Any) -> None:
     for n, name in enumerate(AXES):
         axes.plot(log.t_s, log.momentum_nms[:, n], color=f"C{n}", label=name)
-    axes.plot(log.t_s, np.linalg.norm(log.momentum_nms, axis=1), color="k", lw=1, label="size")
+    axes.plot(log.t_s, np.linalg.norm(log.momentum_nms, axis=1), color="k", lw=1, label="norm")
     axes.set_ylabel("stored momentum\n[N m s]")
 
 
 def panels(log: Telemetry) -> list[Callable[[Telemetry, Any], None]]:
     """The panels for which the telemetry has data."""
-    stores = bool(log.wheel_rad_s.size or log.gimbal_rad.size)
-    believes = log.lab_from_imu is not None or log.lab_from_ref is not None
-    chosen = {
+    has_momentum = bool(log.wheel_rad_s.size or log.gimbal_rad.size)
+    has_estimate = log.lab_from_imu is not None or log.lab_from_ref is not None
+    available = {
         attitude_panel: True,
-        belief_panel: believes,
+        attitude_error_panel: has_estimate,
         bias_panel: log.lab_from_filter is not None,
         torque_panel: log.lab_from_ref is not None,
         wheels_panel: bool(log.wheel_rad_s.size),
         gimbals_panel: bool(log.gimbal_rad.size),
-        momentum_panel: stores,
+        momentum_panel: has_momentum,
     }
-    return [panel for panel, wanted in chosen.items() if wanted]
+    return [panel for panel, present in available.items() if present]
 
 
 def figure(log: Telemetry) -> bytes:

@@ -8,21 +8,22 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, field_validator, model_validator
 
+from skysim.core.errors import unknown_name
 from skysim.core.paths import DATA
 from skysim.core.units import (
     Ascending,
     ConfigModel,
+    Fraction,
     Length,
     NotNegative,
     Number,
-    Share,
     Time,
     check_table,
     quantity,
 )
 from skysim.scene.opencv_calibration import Calibration
 
-FOCUS = Annotated[
+FocusText = Annotated[
     str, Field(description='a length such as "33 in", or infinity')
 ]  # shown by editors, from the JSON schema
 
@@ -71,10 +72,10 @@ class AiryPsfConfig(PsfConfig):
     sigma_px: Annotated[Number, Field(ge=0, le=20)] = 0.0
 
 
-class DiscPsfConfig(PsfConfig):
-    """A uniform disc, the geometric image of a defocused lens, convolved with a Gaussian blur of sigma_px."""
+class DiskPsfConfig(PsfConfig):
+    """A uniform disk, the geometric image of a defocused lens, convolved with a Gaussian blur of sigma_px."""
 
-    kind: Literal["disc"]
+    kind: Literal["disk"]
     radius_px: Annotated[Number, Field(gt=0, le=200)]
     sigma_px: Annotated[Number, Field(ge=0.2, le=20)] = 0.7
 
@@ -88,7 +89,7 @@ class MeasuredPsfConfig(PsfConfig):
 
 
 Psf = Annotated[
-    GaussianPsfConfig | MoffatPsfConfig | AiryPsfConfig | DiscPsfConfig | MeasuredPsfConfig,
+    GaussianPsfConfig | MoffatPsfConfig | AiryPsfConfig | DiskPsfConfig | MeasuredPsfConfig,
     Field(discriminator="kind"),
 ]
 
@@ -105,10 +106,10 @@ class VignettingTableConfig(ConfigModel):
 
     kind: Literal["table"]
     angle_deg: Ascending
-    transmission: Annotated[tuple[Share, ...], Field(min_length=2)]
+    transmission: Annotated[tuple[Fraction, ...], Field(min_length=2)]
 
     @model_validator(mode="after")
-    def a_table(self) -> VignettingTableConfig:
+    def check_columns(self) -> VignettingTableConfig:
         check_table(self.angle_deg, self.transmission, "transmission")
         return self
 
@@ -134,11 +135,11 @@ class FrameTransferConfig(ConfigModel):
 
 
 class InterlineConfig(ConfigModel):
-    """The covered register leaks: it takes the share `leak` of the light of every row it passes, row_time per row."""
+    """The covered register leaks: it collects the fraction `leak` of each passed row's light, row_time per row."""
 
     kind: Literal["interline"]
     row_time_s: Annotated[Time, Field(gt=0)]
-    leak: Share = 1e-4
+    leak: Fraction = 1e-4
 
 
 Shutter = Annotated[
@@ -171,12 +172,12 @@ class DetectorConfig(ConfigModel):
     prnu               : standard deviation of the pixels' relative sensitivity
     dark_e_s           : mean dark current at dark_temperature_c; it doubles every dark_doubling_c
     dsnu               : standard deviation of the pixels' relative dark current
-    hot_pixels         : share of the pixels that are hot, with exponentially distributed dark current of mean hot_e_s
-    blooming           : column: charge beyond a full well flows along its column; anti_blooming is the share drained
-    cti_parallel, cti_serial : share of the charge left behind in each transfer
+    hot_pixels         : fraction of hot pixels, whose dark current is exponentially distributed with mean hot_e_s
+    blooming           : column: charge beyond a full well flows along its column; anti_blooming: the drained fraction
+    cti_parallel, cti_serial : fraction of the charge left behind in each transfer
     read_noise_e, reset_noise_e : Gaussian, every pixel, every frame
     column_offset_e    : standard deviation of the columns' fixed offsets
-    nonlinearity       : share of the signal missing at full well: e (1 - nonlinearity e / full_well)
+    nonlinearity       : fraction of the signal missing at full well: e (1 - nonlinearity e / full_well)
     noise              : false gives the expected value, not rounded: with fixed pattern and transfer loss, but
                          without particles, full-well limit, nonlinearity and converter range
     """
@@ -189,12 +190,12 @@ class DetectorConfig(ConfigModel):
     dark_doubling_c: Annotated[Number, Field(ge=1, le=50)] = 7.0
     temperature_c: Annotated[Number, Field(ge=-150, le=150)] | None = None
     dsnu: Annotated[Number, Field(ge=0, le=2)] = 0.0
-    hot_pixels: Share = 0.0
+    hot_pixels: Fraction = 0.0
     hot_e_s: Electrons = 0.0
     particles: tuple[ParticlesConfig, ...] = ()
     full_well_e: Annotated[Number, Field(ge=1, le=1e9)]
     blooming: Literal["none", "column"] = "none"
-    anti_blooming: Share = 0.0
+    anti_blooming: Fraction = 0.0
     cti_parallel: Annotated[Number, Field(ge=0, le=1e-2)] = 0.0
     cti_serial: Annotated[Number, Field(ge=0, le=1e-2)] = 0.0
     read_noise_e: Electrons = 0.0
@@ -208,43 +209,42 @@ class DetectorConfig(ConfigModel):
 
     @field_validator("quantum_efficiency")
     @classmethod
-    def known_curve(cls, value: float | str) -> float | str:
+    def check_curve(cls, value: float | str) -> float | str:
         if isinstance(value, str):
             curve_file(value)
         return value
 
     @model_validator(mode="after")
-    def no_furnace(self) -> DetectorConfig:
+    def check_temperature(self) -> DetectorConfig:
         if self.temperature_c is not None and self.doublings > 40:
             raise ValueError(
-                f"temperature_c {self.temperature_c:g} doubles the dark current {self.doublings:.0f} times"
+                f"temperature_c {self.temperature_c:g} doubles the dark current {self.doublings:.0f} times;"
+                " allowed: up to 40"
             )
         return self
 
     @property
     def doublings(self) -> float:
         """How many times the dark current doubles from dark_temperature_c to the chip's temperature."""
-        warm_c = 0.0 if self.temperature_c is None else self.temperature_c - self.dark_temperature_c
-        return warm_c / self.dark_doubling_c
+        difference_c = 0.0 if self.temperature_c is None else self.temperature_c - self.dark_temperature_c
+        return difference_c / self.dark_doubling_c
 
     @model_validator(mode="after")
-    def offset_within_the_converter(self) -> DetectorConfig:
+    def check_offset(self) -> DetectorConfig:
         if self.offset_dn >= 2**self.bits:
-            raise ValueError(f"offset_dn {self.offset_dn:g} is beyond a converter of {self.bits} bits")
+            raise ValueError(f"offset_dn {self.offset_dn:g} is beyond the range of {self.bits} bits")
         return self
 
 
 class CameraConfig(ConfigModel):
-    """Lens and chip as the hardware is. What the tracker believes of them is in `tracker`."""
+    """Lens and chip as the hardware is. What the tracker assumes about them is in `tracker`."""
 
     width_px: Annotated[int, Field(ge=16, le=20000)]
     height_px: Annotated[int, Field(ge=16, le=20000)]
     pixel_m: Annotated[Length, Field(ge=1e-7, le=1e-2)]
     focal_length_m: Annotated[Length, Field(ge=1e-5, le=1e3)]
     f_number: Annotated[Number, Field(ge=0.3, le=1e6)]
-    focus_m: Annotated[float, BeforeValidator(focus_distance, json_schema_input_type=FOCUS), Field(gt=0)] = (
-        math.inf
-    )
+    focus_m: Annotated[float, BeforeValidator(focus_distance, json_schema_input_type=FocusText), Field(gt=0)] = math.inf
     transmission: Annotated[Number, Field(gt=0, le=1)] = 1.0
     vignetting: Annotated[TwoStopsConfig | VignettingTableConfig, Field(discriminator="kind")] | None = None
     distortion: tuple[Radial, Radial, Tangential, Tangential, Radial] = (0.0, 0.0, 0.0, 0.0, 0.0)
@@ -254,11 +254,9 @@ class CameraConfig(ConfigModel):
     detector: DetectorConfig
 
     @model_validator(mode="after")
-    def focused_before_the_lens(self) -> CameraConfig:
+    def check_focus(self) -> CameraConfig:
         if self.focus_m <= 2 * self.focal_length_m:
-            raise ValueError(
-                f"focus {self.focus_m:g} m is nearer than twice the focal length {self.focal_length_m:g} m"
-            )
+            raise ValueError(f"focus {self.focus_m:g} m is less than twice the focal length {self.focal_length_m:g} m")
         return self
 
     @property
@@ -277,32 +275,32 @@ class CameraConfig(ConfigModel):
         return self.image_distance_m / self.pixel_m
 
     @property
-    def centre_px(self) -> tuple[float, float]:
-        """The principal point; the chip's center if none is given."""
+    def center_px(self) -> tuple[float, float]:
+        """The principal point; the chip's center by default."""
         return self.principal_point_px or ((self.width_px - 1) / 2, (self.height_px - 1) / 2)
 
     def calibration(self) -> Calibration:
         """The result of a perfect calibration of this camera."""
-        return Calibration(self.width_px, self.height_px, self.focal_px, self.centre_px, self.distortion)
+        return Calibration(self.width_px, self.height_px, self.focal_px, self.center_px, self.distortion)
 
     @property
     def corner_px(self) -> float:
         """Distance from the principal point to the farthest corner of the chip."""
-        x, y = self.centre_px
+        x, y = self.center_px
         return math.hypot(max(x + 0.5, self.width_px - 0.5 - x), max(y + 0.5, self.height_px - 0.5 - y))
 
 
-CURVES = DATA / "qe"
+CURVE_FOLDER = DATA / "qe"
 
 
 def curve_file(name: str) -> Path:
     """The file of a quantum efficiency: a name in data/qe, or a path that ends in .csv.
 
-    Raises ValueError, with the known names, if it is neither.
+    Raises ValueError, with the names of data/qe, if it is neither.
     """
-    known = {path.stem: path for path in sorted(CURVES.glob("*.csv"))}
-    if name in known:
-        return known[name]
+    curves = {path.stem: path for path in sorted(CURVE_FOLDER.glob("*.csv"))}
+    if name in curves:
+        return curves[name]
     if name.endswith(".csv") and Path(name).is_file():
         return Path(name)
-    raise ValueError(f"{name!r} is none of {', '.join(known)}")
+    raise ValueError(unknown_name("curve", name, curves))

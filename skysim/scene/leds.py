@@ -30,29 +30,29 @@ Seed = Annotated[int, Field(ge=0)]
 FieldOfView = Annotated[Number, Field(ge=1, le=90)]
 
 
-def levels_of(magnitudes: Sequence[float]) -> tuple[float, ...]:
+def relative_levels(magnitudes: Sequence[float]) -> tuple[float, ...]:
     """Levels by Pogson's law, 10^(-0.4 m), relative to the brightest of the list, which has level 1."""
-    return tuple(10.0 ** (-0.4 * (float(one) - float(min(magnitudes)))) for one in magnitudes)
+    return tuple(10.0 ** (-0.4 * (float(magnitude) - float(min(magnitudes)))) for magnitude in magnitudes)
 
 
 class BoardConfig(ConfigModel):
     """One patch board, glued with its center in this direction from the bearing's center.
 
     azimuth_deg, tilt_deg : from the lab's +x toward +y, and from the zenith
-    turn_deg : rotation of its columns about its normal
+    rotation_deg : rotation of its columns about its normal
     leds     : the holes that hold an LED, 0 to 8, row by row;  levels : one per LED, full brightness if left out
     """
 
     azimuth_deg: Number
     tilt_deg: Annotated[Number, Field(ge=0, le=90)]
-    turn_deg: Number = 0.0
+    rotation_deg: Number = 0.0
     leds: Annotated[tuple[Annotated[int, Field(ge=0, lt=HOLES)], ...], Field(min_length=1)]
     levels: Levels | None = None
 
     @model_validator(mode="after")
-    def one_led_a_hole(self) -> BoardConfig:
+    def check_leds(self) -> BoardConfig:
         if len(set(self.leds)) < len(self.leds):
-            raise ValueError(f"leds: {list(self.leds)} has a hole twice")
+            raise ValueError(f"leds: {list(self.leds)} has a duplicate hole")
         if self.levels is not None and len(self.levels) != len(self.leds):
             raise ValueError(f"leds has {len(self.leds)} holes, levels {len(self.levels)}")
         return self
@@ -83,24 +83,22 @@ class PatchBoardsConfig(ConfigModel):
 
     @field_validator("lit")
     @classmethod
-    def within_board(cls, value: tuple[int, int]) -> tuple[int, int]:
+    def check_lit(cls, value: tuple[int, int]) -> tuple[int, int]:
         if not 1 <= value[0] <= value[1] <= HOLES:
-            raise ValueError(f"{value} is no range of LEDs on a 3x3 board; allowed: 1 <= least <= most <= 9")
+            raise ValueError(f"{value} is not a range of LEDs on a 3x3 board; allowed: 1 <= least <= most <= 9")
         return value
 
     @model_validator(mode="after")
-    def boards_fit_beside_each_other(self) -> PatchBoardsConfig:
+    def check_spacing(self) -> PatchBoardsConfig:
         if self.spacing_m is None and not self.boards:
             raise ValueError("patch_boards takes spacing, or boards by list")
         if self.spacing_m is not None and self.spacing_m < 3 * self.pitch_m:
-            raise ValueError(
-                f"spacing {self.spacing_m:g} m: boards of three LEDs at {self.pitch_m:g} m would overlap"
-            )
+            raise ValueError(f"spacing {self.spacing_m:g} m: boards of three LEDs at {self.pitch_m:g} m would overlap")
         return self
 
 
 class DimmedConfig(ConfigModel):
-    """Base of the layouts of single LEDs: their brightness, as shares of full brightness or as magnitudes.
+    """Base of the layouts of single LEDs: their brightness, as fractions of full brightness or as magnitudes.
 
     Each LED's brightness is drawn from the list (in `listed`, the list has one value per LED). The smallest magnitude
     is full brightness.
@@ -114,10 +112,10 @@ class DimmedConfig(ConfigModel):
     @property
     def dimming(self) -> tuple[float, ...]:
         """The levels, given as levels or as magnitudes."""
-        return levels_of(self.magnitudes) if self.magnitudes else self.levels or (1.0,)
+        return relative_levels(self.magnitudes) if self.magnitudes else self.levels or (1.0,)
 
     @model_validator(mode="after")
-    def one_way_to_say_it(self) -> Self:
+    def check_brightness(self) -> Self:
         if self.levels is not None and self.magnitudes is not None:
             raise ValueError("a layout takes either levels or magnitudes")
         return self
@@ -130,17 +128,17 @@ class FibonacciConfig(DimmedConfig):
     count: Count
 
 
-class PoissonDiscConfig(DimmedConfig):
+class PoissonDiskConfig(DimmedConfig):
     """LEDs at random with a least spacing: as many as fit at `spacing`, or `count` of them as far apart as they fit."""
 
-    kind: Literal["poisson_disc"]
+    kind: Literal["poisson_disk"]
     spacing_m: Annotated[Length, Field(gt=0)] | None = None
     count: Annotated[int, Field(ge=1, le=20_000)] | None = None
 
     @model_validator(mode="after")
-    def one_measure(self) -> Self:
+    def check_density(self) -> Self:
         if (self.spacing_m is None) == (self.count is None):
-            raise ValueError("poisson_disc takes either spacing or count")
+            raise ValueError("poisson_disk takes either spacing or count")
         return self
 
 
@@ -151,31 +149,31 @@ class RandomPlacesConfig(DimmedConfig):
     count: Count
 
 
-class OptimisedConfig(DimmedConfig):
+class OptimizedConfig(DimmedConfig):
     """`count` LEDs placed for one camera's best accuracy at its worst attitudes: tilts to tilt_deg, any yaw.
 
     field_deg : the camera's field of view along body x and y
     camera    : its entrance pupil on the body; it looks along body z
     spacing   : least distance between two LEDs
-    alike     : LEDs of two fields coincide if they are nearer than this when one field is laid on the other: a few
+    coincidence : LEDs of two fields coincide if they are closer than this when one field is laid on the other: a few
         times the survey's error
-    wanted    : LEDs that every field should hold; fewer are penalized
-    rounds    : how often each LED is offered another place
+    min_leds  : LEDs that every field should hold; fewer are penalized
+    rounds    : how often each LED is offered another position
     """
 
-    kind: Literal["optimised"]
+    kind: Literal["optimized"]
     count: Annotated[int, Field(ge=3, le=2000)]
     tilt_deg: Annotated[Number, Field(ge=0, le=60)]
     field_deg: tuple[FieldOfView, FieldOfView]
     camera_m: tuple[Length, Length, Length]
     spacing_m: Annotated[Length, Field(gt=0)]
-    alike_m: Annotated[Length, Field(gt=0)] = 1e-3
-    wanted: Annotated[int, Field(ge=2, le=50)] = 5
+    coincidence_m: Annotated[Length, Field(gt=0)] = 1e-3
+    min_leds: Annotated[int, Field(ge=2, le=50)] = 5
     rounds: Annotated[int, Field(ge=1, le=5000)] = 100
 
 
 class CelestialConfig(ConfigModel):
-    """The real sky: an LED for each of the brightest stars, where the camera at its nominal place sees it.
+    """The real sky: an LED for each of the brightest stars, where the camera at its nominal position sees it.
 
     count or limit_mag : number of LEDs for the brightest stars on the dome, or all stars to this V
     camera : the entrance pupil in the lab when the vehicle is level
@@ -188,7 +186,7 @@ class CelestialConfig(ConfigModel):
 
     kind: Literal["celestial"]
     cap_deg: Cap
-    catalogue: str = "hipparcos_hp6.5"
+    catalog: str = "hipparcos_hp6.5"
     count: Count | None = None
     limit_mag: Annotated[Number, Field(ge=-2, le=15)] | None = None
     brightness: Literal["v", "band"] = "band"
@@ -201,11 +199,11 @@ class CelestialConfig(ConfigModel):
     hardware_seed: Seed = 0
 
     @model_validator(mode="after")
-    def one_choice_of_stars(self) -> CelestialConfig:
+    def check_star_selection(self) -> CelestialConfig:
         if (self.count is None) == (self.limit_mag is None):
             raise ValueError("celestial takes either count or limit_mag")
         if not 1900 <= self.epoch.year <= 2100:
-            raise ValueError(f"epoch: {self.epoch.isoformat()} is outside of 1900 to 2100")
+            raise ValueError(f"epoch: {self.epoch.isoformat()} is outside 1900 to 2100")
         return self
 
 
@@ -222,37 +220,32 @@ class ListedConfig(DimmedConfig):
     file: str | None = None
 
     @model_validator(mode="after")
-    def one_list(self) -> ListedConfig:
-        given = [one for one in (self.positions_m, self.directions_deg, self.file) if one is not None]
-        if len(given) != 1:
+    def check_positions(self) -> ListedConfig:
+        lists = [each for each in (self.positions_m, self.directions_deg, self.file) if each is not None]
+        if len(lists) != 1:
             raise ValueError("listed takes one of positions, directions_deg, file")
         dimmed = len(self.levels or self.magnitudes or ())
         if dimmed and self.file is not None:
-            raise ValueError("levels and magnitudes of a file are its own columns")
-        if dimmed and dimmed != len(given[0]):
-            raise ValueError(f"{len(given[0])} LEDs, but {dimmed} levels or magnitudes")
+            raise ValueError("levels and magnitudes of a file belong in its columns")
+        if dimmed and dimmed != len(lists[0]):
+            raise ValueError(f"{len(lists[0])} LEDs, but {dimmed} levels or magnitudes")
         return self
 
 
 Points = Annotated[
-    FibonacciConfig
-    | PoissonDiscConfig
-    | RandomPlacesConfig
-    | OptimisedConfig
-    | CelestialConfig
-    | ListedConfig,
+    FibonacciConfig | PoissonDiskConfig | RandomPlacesConfig | OptimizedConfig | CelestialConfig | ListedConfig,
     Field(discriminator="kind"),
 ]
 
 
-class FibresConfig(ConfigModel):
+class FibersConfig(ConfigModel):
     """Ends of optical fibers through the shell (JHU/APL's dome), at the points of any layout of single LEDs.
 
-    radius_variation : greatest error of the dome's radius at a fiber, as a share of the distance from the bearing,
+    radius_variation : greatest error of the dome's radius at a fiber, as a fraction of the distance from the bearing,
         uniformly distributed: the end is displaced along the surface's normal, inward or outward
     """
 
-    kind: Literal["fibres"]
+    kind: Literal["fibers"]
     points: Points
     radius_variation: Annotated[Number, Field(ge=0, le=0.1)] = 0.0
 
@@ -267,23 +260,21 @@ class PixelsConfig(ConfigModel):
 
     pixels : columns and rows;  pitch : from one pixel to the next, along both
     block  : a star is drawn as a square of this many pixels a side, all of one gray
-    grey_levels, gamma : gray g = 0, 1, ... transmits (g / (grey_levels - 1))^gamma of white
+    gray_levels, gamma : gray g = 0, 1, ... transmits (g / (gray_levels - 1))^gamma of white
     contrast : white over black, which glows all over the display; none: black is dark
     """
 
     pixels: tuple[Annotated[int, Field(ge=1, le=20_000)], Annotated[int, Field(ge=1, le=20_000)]]
     pitch_m: Annotated[Length, Field(gt=0)]
     block: Annotated[int, Field(ge=1)] = 1
-    grey_levels: Annotated[int, Field(ge=2, le=65536)] = 256
+    gray_levels: Annotated[int, Field(ge=2, le=65536)] = 256
     gamma: Annotated[Number, Field(gt=0, le=10)] = 2.2
     contrast: Annotated[Number, Field(ge=2)] | None = None
 
     @model_validator(mode="after")
-    def block_fits(self) -> Self:
+    def check_block(self) -> Self:
         if self.block > min(self.pixels):
-            raise ValueError(
-                f"block {self.block} is wider than the display; allowed: to {min(self.pixels)} pixels"
-            )
+            raise ValueError(f"block {self.block} is wider than the display; allowed: up to {min(self.pixels)} pixels")
         return self
 
 
@@ -292,7 +283,7 @@ class LcdConfig(PixelsConfig):
 
     It is centered on the flat surface and ends where its pixels end, with columns along the surface's own x and rows
     along its y, which a level camera sees as right and down. `led` is one white pixel while its backlight is lit; its
-    disc_diameter is that of a disc of the pixel's area.
+    disk_diameter is that of a disk of the pixel's area.
     """
 
     kind: Literal["lcd"]
@@ -307,12 +298,12 @@ class LcdConfig(PixelsConfig):
 Layout = Annotated[
     PatchBoardsConfig
     | FibonacciConfig
-    | PoissonDiscConfig
+    | PoissonDiskConfig
     | RandomPlacesConfig
-    | OptimisedConfig
+    | OptimizedConfig
     | CelestialConfig
     | ListedConfig
-    | FibresConfig
+    | FibersConfig
     | LcdConfig,
     Field(discriminator="kind"),
 ]
@@ -333,7 +324,7 @@ class LobeTableConfig(ConfigModel):
     intensity: Annotated[tuple[NotNegative, ...], Field(min_length=2)]
 
     @model_validator(mode="after")
-    def a_table(self) -> LobeTableConfig:
+    def check_columns(self) -> LobeTableConfig:
         check_table(self.angle_deg, self.intensity, "intensity")
         if self.angle_deg[0] != 0 or abs(self.intensity[0] - 1) > 1e-6:
             raise ValueError("the table does not begin with an intensity of 1 at 0 deg")
@@ -385,7 +376,7 @@ class LedConfig(ConfigModel):
 
     intensity_cd: Annotated[Intensity, Field(gt=0)] | None = None
     radiant_intensity_w_sr: Annotated[RadiantIntensity, Field(gt=0)] | None = None
-    disc_diameter_m: Annotated[Length, Field(gt=0, le=0.1)]
+    disk_diameter_m: Annotated[Length, Field(gt=0, le=0.1)]
     falloff: Literal["inverse_square"] = "inverse_square"
     lobe: Lobe = CosineLobeConfig()
     spectrum: Literal["white"] | Annotated[Length, Field(ge=300e-9, le=1100e-9)] = "white"
@@ -394,7 +385,7 @@ class LedConfig(ConfigModel):
     pwm_period_s: Annotated[Time, Field(gt=0)] = 1e-3
 
     @model_validator(mode="after")
-    def one_brightness(self) -> LedConfig:
+    def check_intensity(self) -> LedConfig:
         if (self.intensity_cd is None) == (self.radiant_intensity_w_sr is None):
             raise ValueError("an LED takes either intensity or radiant_intensity")
         return self

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import BeforeValidator, Field, ModelWrapValidatorHandler, field_validator, model_validator
 
-from skysim.core.units import Ascending, ConfigModel, Length, Number, SemiAxis, Share, check_table
+from skysim.core.units import Ascending, ConfigModel, Fraction, Length, Number, SemiAxis, check_table
 from skysim.scene.leds import Layout, LedConfig, PixelsConfig
 
 Tilt = Annotated[Number, Field(ge=-45, le=45)]
@@ -32,10 +32,10 @@ class SurfaceConfig(ConfigModel):
 
     @model_validator(mode="wrap")
     @classmethod
-    def of_its_kind(cls, value: Any, handler: ModelWrapValidatorHandler[SurfaceConfig]) -> SurfaceConfig:
+    def validate_by_kind(cls, value: Any, handler: ModelWrapValidatorHandler[SurfaceConfig]) -> SurfaceConfig:
         """Validate a section with the class of its `kind` when called on the base class."""
         kind = value.get("kind") if cls is SurfaceConfig and isinstance(value, dict) else None
-        return PARTS[kind].model_validate(value) if kind in list(PARTS) else handler(value)
+        return SURFACE_CONFIGS[kind].model_validate(value) if kind in list(SURFACE_CONFIGS) else handler(value)
 
 
 class RimmedConfig(SurfaceConfig):
@@ -45,13 +45,11 @@ class RimmedConfig(SurfaceConfig):
     rim_deg: Annotated[Number, Field(gt=0, lt=180)] | None = None
 
     @model_validator(mode="after")
-    def one_rim(self) -> Self:
+    def check_rim(self) -> Self:
         if self.rim_height_m is not None and self.rim_deg is not None:
-            raise ValueError("a rim is told once; allowed: rim_height or rim_deg")
+            raise ValueError("rim_height and rim_deg conflict; allowed: one of the two")
         if self.rim_height_m is not None and self.rim_height_m >= getattr(self, "apex_m", math.inf):
-            raise ValueError(
-                f"rim_height {self.rim_height_m:g} m is not below the apex; allowed: less than apex"
-            )
+            raise ValueError(f"rim_height {self.rim_height_m:g} m is not below the apex; allowed: less than apex")
         return self
 
 
@@ -77,10 +75,10 @@ class SphereSurfaceConfig(RimmedConfig):
     wall: WallConfig | None = None
 
     @model_validator(mode="after")
-    def thin(self) -> Self:
+    def check_wall(self) -> Self:
         thickest = max(self.wall.thickness_apex_m, self.wall.thickness_base_m) if self.wall else 0.0
         if thickest > 0.1 * self.radius_m:
-            raise ValueError(f"a wall of {thickest:g} m is no shell's; allowed: to a tenth of the radius")
+            raise ValueError(f"a wall of {thickest:g} m is too thick; allowed: up to a tenth of the radius")
         return self
 
 
@@ -112,13 +110,11 @@ class CylinderSurfaceConfig(SurfaceConfig):
     rim_height_m: Length | None = None
 
     @model_validator(mode="after")
-    def ends(self) -> Self:
+    def check_extent(self) -> Self:
         if self.axis == "z" and self.length_m is None:
-            raise ValueError("a cylinder about z takes its length, from apex down")
+            raise ValueError("a cylinder about z requires length, from apex down")
         if self.rim_height_m is not None and self.rim_height_m >= self.apex_m:
-            raise ValueError(
-                f"rim_height {self.rim_height_m:g} m is not below the apex; allowed: less than apex"
-            )
+            raise ValueError(f"rim_height {self.rim_height_m:g} m is not below the apex; allowed: less than apex")
         return self
 
 
@@ -137,13 +133,13 @@ class SurveyedSurfaceConfig(RimmedConfig):
 
     @field_validator("file")
     @classmethod
-    def is_there(cls, value: str) -> str:
+    def check_file(cls, value: str) -> str:
         if not value.endswith(".csv") or not Path(value).is_file():
-            raise ValueError(f"{value!r} is no file; allowed: a .csv file of x, y, z")
+            raise ValueError(f"{value!r} is not a file; allowed: a .csv file of x, y, z")
         return value
 
 
-PARTS: dict[Any, type[SurfaceConfig]] = {
+SURFACE_CONFIGS: dict[Any, type[SurfaceConfig]] = {
     "sphere": SphereSurfaceConfig,
     "ellipsoid": EllipsoidSurfaceConfig,
     "flat": FlatSurfaceConfig,
@@ -152,21 +148,17 @@ PARTS: dict[Any, type[SurfaceConfig]] = {
 }
 
 
-def of_a_known_kind(value: Any) -> Any:
-    """The value; an unknown kind raises an error at the key `kind`, with the known kinds."""
-    if isinstance(value, dict) and "kind" in value and value["kind"] not in list(PARTS):
+def check_surface_kind(value: Any) -> Any:
+    """The value; an unknown kind raises an error at the key `kind`, with the allowed kinds."""
+    if isinstance(value, dict) and "kind" in value and value["kind"] not in list(SURFACE_CONFIGS):
         SurfaceConfig.model_validate({"kind": value["kind"]})
     return value
 
 
 AnySurface = Annotated[
-    SphereSurfaceConfig
-    | EllipsoidSurfaceConfig
-    | FlatSurfaceConfig
-    | CylinderSurfaceConfig
-    | SurveyedSurfaceConfig,
+    SphereSurfaceConfig | EllipsoidSurfaceConfig | FlatSurfaceConfig | CylinderSurfaceConfig | SurveyedSurfaceConfig,
     Field(discriminator="kind"),
-    BeforeValidator(of_a_known_kind),
+    BeforeValidator(check_surface_kind),
 ]
 
 
@@ -183,7 +175,7 @@ class DomeConfig(ConfigModel):
     occlusion: bool = True
 
     @model_validator(mode="after")
-    def boards_have_controllers(self) -> DomeConfig:
+    def check_controller(self) -> DomeConfig:
         if getattr(self.led.drive, "controller", None) == "board" and self.layout.kind != "patch_boards":
             raise ValueError(
                 f"led.drive.controller: {self.layout.kind} has no boards; allowed: dome, or a number of LEDs"
@@ -191,14 +183,14 @@ class DomeConfig(ConfigModel):
         return self
 
     @model_validator(mode="after")
-    def panels_have_pixels(self) -> DomeConfig:
+    def check_panel(self) -> DomeConfig:
         panel, drive = self.layout.kind == "lcd", self.led.drive.kind
         if panel and self.surface.kind != "flat":
-            raise ValueError(f"layout: an lcd is no {self.surface.kind}; allowed: surface of kind flat")
+            raise ValueError(f"layout: lcd does not fit a surface of kind {self.surface.kind}; allowed: flat")
         if panel and drive not in ("direct", "refresh"):
-            raise ValueError(f"led.drive: {drive} dims no pixel; allowed for an lcd: direct, refresh")
+            raise ValueError(f"led.drive: {drive} cannot drive an lcd; allowed: direct, refresh")
         if not panel and drive == "refresh":
-            raise ValueError(f"led.drive: {self.layout.kind} has no rows; allowed: refresh for an lcd")
+            raise ValueError(f"led.drive: refresh requires a layout of kind lcd, not {self.layout.kind}")
         return self
 
 
@@ -209,12 +201,12 @@ class StarsConfig(ConfigModel):
     """
 
     kind: Literal["stars"]
-    catalogue: str = "hipparcos_hp6.5"
+    catalog: str = "hipparcos_hp6.5"
     limit_mag: Annotated[Number, Field(ge=0, le=15)] = 6.5
     occlusion: bool = True
 
 
-class BenchConfig(PixelsConfig):
+class CollimatedDisplayConfig(PixelsConfig):
     """A star simulator: a micro-display in the focus of a collimator, above the level camera.
 
     Its axis is the lab's zenith; the display's columns run along the lab's x and its rows along y. The exit pupil
@@ -222,16 +214,16 @@ class BenchConfig(PixelsConfig):
     neglected.
 
     focal_length : of the collimator
-    catalogue, limit_mag : the stars shown, to this V, at the scene's start_time
+    catalog, limit_mag : the stars shown, to this V, at the scene's start_time
     axis_ra_deg, axis_dec_deg, roll_deg : the direction at the display's center, and the position angle there of the
         lab's -y (a level camera's up), as `ra_deg`, `dec_deg`, `roll_deg` of a camera that looks up
     brightest_mag : V of a white block for the camera, in the Sun's color; brighter stars are limited to it
     conjugate : distance of the stars from the bearing's center, from an error of collimation; none: infinite
     """
 
-    kind: Literal["bench"]
+    kind: Literal["collimated_display"]
     focal_length_m: Annotated[Length, Field(gt=0)]
-    catalogue: str = "hipparcos_hp6.5"
+    catalog: str = "hipparcos_hp6.5"
     limit_mag: Annotated[Number, Field(ge=-2, le=15)] = 6.5
     axis_ra_deg: Annotated[Number, Field(ge=0, lt=360)]
     axis_dec_deg: Annotated[Number, Field(ge=-90, le=90)]
@@ -285,14 +277,12 @@ class StrayLightConfig(ConfigModel):
     dec_deg: Annotated[Number, Field(ge=-90, le=90)]
     v_mag: Number = -26.74
     angle_deg: Ascending
-    pst: Annotated[tuple[Share, ...], Field(min_length=2)]
+    pst: Annotated[tuple[Fraction, ...], Field(min_length=2)]
 
     @model_validator(mode="after")
-    def a_table(self) -> StrayLightConfig:
+    def check_columns(self) -> StrayLightConfig:
         check_table(self.angle_deg, self.pst, "pst")
         return self
 
 
-Glow = Annotated[
-    UniformGlowConfig | SkyGlowConfig | MoonGlowConfig | StrayLightConfig, Field(discriminator="kind")
-]
+Glow = Annotated[UniformGlowConfig | SkyGlowConfig | MoonGlowConfig | StrayLightConfig, Field(discriminator="kind")]

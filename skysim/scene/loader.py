@@ -1,8 +1,8 @@
 """Load a scene: presets, calibration files, `base` scenes and overrides, then validation.
 
 The raw YAML tree is built in layers, the later ones over the earlier: the `base` scene (recursively), the scene's own
-keys, then the overrides of `--set`. Next, the camera's preset is put beneath the camera section and a calibration
-file's values over it (`with_preset`). Only then does pydantic validate the tree. Every error becomes an InputError of
+keys, then the overrides of `--set`. Next, the camera section is merged over its preset, and a calibration file's
+values over both (`with_preset`). Only then does pydantic validate the tree. Every error becomes an InputError of
 one line with key, file and line.
 """
 
@@ -16,22 +16,22 @@ from typing import Any
 from pydantic import ValidationError
 
 from skysim.core import yaml_reader
-from skysim.core.errors import InputError
+from skysim.core.errors import InputError, unknown_name
 from skysim.core.paths import DATA, SCENES
 from skysim.core.units import ConfigModel, quantity
-from skysim.core.yaml_reader import Files, check_version, explain, is_file, place_of, read_yaml, set_key
+from skysim.core.yaml_reader import Files, check_version, explain, is_file, location_of, read_yaml, set_key
 from skysim.scene.camera import CameraConfig, focus_distance
 from skysim.scene.opencv_calibration import read as read_calibration
-from skysim.scene.scene import STEM, Scene
+from skysim.scene.scene import NAME_ALIAS, Scene
 
 PRESETS = DATA / "cameras"
 
 
 def preset(name: str, where: str) -> dict[str, Any]:
     """The `camera` section of data/cameras/NAME.yaml. Raises InputError for an unknown name."""
-    known = sorted(path.stem for path in PRESETS.glob("*.yaml"))
-    if name not in known:
-        raise InputError(f"{where}: {name!r} is none of {', '.join(known)}")
+    allowed = sorted(path.stem for path in PRESETS.glob("*.yaml"))
+    if name not in allowed:
+        raise InputError(f"{where}: {unknown_name('preset', name, allowed)}")
     tree: dict[str, Any] = read_yaml(Path(PRESETS / f"{name}.yaml"))[0]["camera"]
     return tree
 
@@ -42,65 +42,66 @@ def with_preset(tree: dict[str, Any]) -> dict[str, Any]:
     The camera's own keys override the preset's; the calibration's values are added to both. Raises InputError; its
     message begins with the key.
     """
-    part = tree.get("camera")
-    if not isinstance(part, dict) or not {"preset", "calibration"} & set(part):
+    camera = tree.get("camera")
+    if not isinstance(camera, dict) or not {"preset", "calibration"} & set(camera):
         return tree
-    own = {key: value for key, value in part.items() if key not in ("preset", "calibration")}
-    below = preset(str(part["preset"]), "camera.preset") if part.get("preset") is not None else {}
-    if part.get("calibration") is None:
-        return tree | {"camera": merge(below, own)}
-    for key in CALIBRATED:
+    own = {key: value for key, value in camera.items() if key not in ("preset", "calibration")}
+    base = preset(str(camera["preset"]), "camera.preset") if camera.get("preset") is not None else {}
+    if camera.get("calibration") is None:
+        return tree | {"camera": merge(base, own)}
+    for key in CALIBRATED_KEYS:
         if own.pop(key, None) is not None:
             raise InputError(
-                f"camera.{key}: the file of camera.calibration tells it; allowed: one of the two (null for a base's)"
+                f"camera.{key}: conflicts with camera.calibration; allowed: one of the two (null removes a base's)"
             )
-    whole = merge(below, own)
-    return tree | {"camera": whole | calibrated(Path(str(part["calibration"])), whole)}
+    merged = merge(base, own)
+    return tree | {"camera": merged | calibrated_keys(Path(str(camera["calibration"])), merged)}
 
 
-CALIBRATED = ("width_px", "height_px", "focal_length", "principal_point_px", "distortion")
+CALIBRATED_KEYS = ("width_px", "height_px", "focal_length", "principal_point_px", "distortion")
 
 
-def calibrated(path: Path, part: dict[str, Any]) -> dict[str, Any]:
+def calibrated_keys(path: Path, camera: dict[str, Any]) -> dict[str, Any]:
     """The camera keys that an OpenCV calibration defines: size, focal length, principal point, distortion.
 
     The focal length in meters follows from the camera's pixel pitch and focus, which the file does not contain.
     Raises InputError.
     """
     try:
-        told = read_calibration(path)
-        pixel_m = quantity("m", "length", '"5.5 um"')(part.get("pixel"))
-        focus_m = focus_distance(part.get("focus", "infinity"))
+        calibration = read_calibration(path)
+        pixel_m = quantity("m", "length", '"5.5 um"')(camera.get("pixel"))
+        focus_m = focus_distance(camera.get("focus", "infinity"))
     except InputError as error:
         raise InputError(f"camera.calibration: {error}") from None
     except ValueError as error:
-        raise InputError(f"camera.pixel: {error}; camera.calibration takes it, and focus") from None
-    size = (part.get("width_px", told.width_px), part.get("height_px", told.height_px))
-    if size != (told.width_px, told.height_px):
+        raise InputError(f"camera.pixel: {error}; camera.calibration requires it, and focus") from None
+    calibrated_px = calibration.width_px, calibration.height_px
+    size_px = camera.get("width_px", calibrated_px[0]), camera.get("height_px", calibrated_px[1])
+    if size_px != calibrated_px:
         raise InputError(
-            f"camera.calibration: {path}: of frames of {told.width_px}x{told.height_px}; the preset's are"
-            f" {size[0]}x{size[1]}"
+            f"camera.calibration: {path}: for frames of {calibrated_px[0]}x{calibrated_px[1]}; the preset's are"
+            f" {size_px[0]}x{size_px[1]}"
         )
     # Thin lens: a calibration measures the image distance v, and 1/f = 1/v + 1/u, as in CameraConfig.image_distance_m.
-    focal_m = 1 / (1 / (told.focal_px * pixel_m) + 1 / focus_m)
+    focal_m = 1 / (1 / (calibration.focal_px * pixel_m) + 1 / focus_m)
     return {
-        "width_px": told.width_px,
-        "height_px": told.height_px,
+        "width_px": calibration.width_px,
+        "height_px": calibration.height_px,
         "focal_length": f"{focal_m!r} m",
-        "principal_point_px": list(told.centre_px),
-        "distortion": list(told.distortion),
+        "principal_point_px": list(calibration.center_px),
+        "distortion": list(calibration.distortion),
     }
 
 
-def merge(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
-    """Merge two mappings, `above` over `below`, recursively; sections of different kinds are replaced, not merged."""
-    merged = below | above
-    for key, value in above.items():
-        ground = below.get(key)
-        if not isinstance(value, dict) or not isinstance(ground, dict):
+def merge(base: dict[str, Any], override: dict[str, Any]) -> dict[str, Any]:
+    """Merge two mappings, `override` over `base`, recursively; sections of different kinds are replaced."""
+    merged = base | override
+    for key, value in override.items():
+        section = base.get(key)
+        if not isinstance(value, dict) or not isinstance(section, dict):
             continue
-        if value.get("kind") in (None, ground.get("kind")):
-            merged[key] = merge(ground, value)
+        if value.get("kind") in (None, section.get("kind")):
+            merged[key] = merge(section, value)
     return merged
 
 
@@ -112,7 +113,7 @@ class CameraFileConfig(ConfigModel):
 
 def find(name: str) -> Path:
     """The path of a scene given by path or by its name in scenes/. Raises InputError."""
-    return yaml_reader.find(name, SCENES, "scene")
+    return yaml_reader.find_file(name, SCENES, "scene")
 
 
 def load(name: str | Path, overrides: Mapping[str, str] | None = None) -> Scene:
@@ -126,7 +127,7 @@ def load(name: str | Path, overrides: Mapping[str, str] | None = None) -> Scene:
         set_key(tree, key, value)
     try:
         raw = apply_preset(tree, files, overrides or {})
-        return Scene.model_validate(raw | {STEM: path.stem})
+        return Scene.model_validate(raw | {NAME_ALIAS: path.stem})
     except ValidationError as error:
         raise InputError(explain(error, Scene, tree, files, overrides or {})) from None
 
@@ -149,35 +150,37 @@ def list_scenes() -> list[str]:
 def with_location(message: str, name: str, overrides: Mapping[str, str]) -> str:
     """A message that begins with a scene's key, with file and line appended; any other message unchanged."""
     key = message.partition(":")[0]
-    # Unchanged: messages that do not begin with a key of the scene, or that already end with a place.
-    told = re.fullmatch(r"[a-z_]+(\.\w+)*", key)
+    # Unchanged: messages that do not begin with a key of the scene, or that already end with a location.
     if (
-        not told
+        not re.fullmatch(r"[a-z_]+(\.\w+)*", key)
         or key.partition(".")[0] not in Scene.model_fields
         or re.search(r"\((--set|.*, line \d+)\)$", message)
     ):
         return message
-    return f"{message} {place_of(key.split('.'), read(find(name))[1], overrides)}"
+    return f"{message} {location_of(key.split('.'), read(find(name))[1], overrides)}"
 
 
-def read(path: Path, above: tuple[Path, ...] = ()) -> tuple[dict[str, Any], Files]:
-    """A scene's keys merged over those of its `base` scene, and the files read, this one first. Raises InputError."""
+def read(path: Path, derived: tuple[Path, ...] = ()) -> tuple[dict[str, Any], Files]:
+    """A scene's keys merged over those of its `base` scene, and the files read, this one first. Raises InputError.
+
+    derived : scenes that have this one as their base, to detect a cycle
+    """
     tree, text = read_yaml(path)
-    if above or tree.keys() != {"camera"}:  # a file with a camera only has no schema version
+    if derived or tree.keys() != {"camera"}:  # a file with a camera only has no schema version
         check_version(tree, path, text)
     tree = resolve_files(path, tree)
     if "base" not in tree:
         return tree, [(path, text)]
     base = tree.pop("base")
-    place = place_of(["base"], [(path, text)], {})
+    location = location_of(["base"], [(path, text)], {})
     try:
-        below = find(str(path.parent / base) if is_file(path.parent / str(base)) else str(base))
+        base_path = find(str(path.parent / base) if is_file(path.parent / str(base)) else str(base))
     except InputError as error:
-        raise InputError(f"base: {error} {place}") from None
-    if below.resolve() in above or below.resolve() == path.resolve():
-        raise InputError(f"base: {base} is this scene itself, or has it for its base {place}")
-    beneath_it, files = read(below, (*above, path.resolve()))
-    return merge(beneath_it, tree), [(path, text), *files]
+        raise InputError(f"base: {error} {location}") from None
+    if base_path.resolve() in (*derived, path.resolve()):
+        raise InputError(f"base: {base} leads back to this scene {location}")
+    base_tree, files = read(base_path, (*derived, path.resolve()))
+    return merge(base_tree, tree), [(path, text), *files]
 
 
 def apply_preset(tree: dict[str, Any], files: Files, overrides: Mapping[str, str]) -> dict[str, Any]:
@@ -186,11 +189,11 @@ def apply_preset(tree: dict[str, Any], files: Files, overrides: Mapping[str, str
         return with_preset(tree)
     except InputError as error:
         key = str(error).partition(":")[0]
-        raise InputError(f"{error} {place_of(key.split('.'), files, overrides)}") from None
+        raise InputError(f"{error} {location_of(key.split('.'), files, overrides)}") from None
 
 
 # Keys whose value may be a file in the scene's folder.
-FILES = (
+FILE_KEYS = (
     ("vehicle", "model"),
     ("camera", "psf", "file"),
     ("camera", "calibration"),
@@ -203,7 +206,7 @@ FILES = (
 
 def resolve_files(path: Path, tree: dict[str, Any]) -> dict[str, Any]:
     """The scene with file names made absolute if such a file exists in the scene's folder."""
-    for keys in FILES:
+    for keys in FILE_KEYS:
         tree = resolve_file(path.resolve().parent, tree, *keys)
     return tree
 

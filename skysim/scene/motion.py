@@ -30,7 +30,7 @@ class PointingConfig(ConfigModel):
     roll_deg: Number = 0.0
 
 
-def where_it_starts(value: Any) -> str:
+def start_tag(value: Any) -> str:
     """Tag of the kind of start, so that an error in one kind is not reported with the keys of the other."""
     keys = value if isinstance(value, dict) else ()
     sky = isinstance(value, PointingConfig) or any(key in keys for key in ("ra_deg", "dec_deg"))
@@ -39,7 +39,7 @@ def where_it_starts(value: Any) -> str:
 
 Start = Annotated[
     Annotated[AttitudeConfig, Tag("AttitudeConfig")] | Annotated[PointingConfig, Tag("PointingConfig")],
-    Discriminator(where_it_starts),
+    Discriminator(start_tag),
 ]
 
 
@@ -61,7 +61,7 @@ class JitterBandConfig(ConfigModel):
     slope: Annotated[Number, Field(ge=-6, le=6)] = 0.0
 
     @model_validator(mode="after")
-    def a_band(self) -> JitterBandConfig:
+    def check_frequencies(self) -> JitterBandConfig:
         if self.from_hz >= self.to_hz:
             raise ValueError(f"from_hz {self.from_hz:g} is not below to_hz {self.to_hz:g}")
         return self
@@ -122,7 +122,7 @@ class ShakeConfig(ConfigModel):
 
     kind: Literal["jitter"]
     duration_s: Duration
-    parts: Annotated[tuple[JitterPart, ...], Field(min_length=1)]
+    components: Annotated[tuple[JitterPart, ...], Field(min_length=1)]
 
 
 class BumpConfig(ConfigModel):
@@ -139,13 +139,13 @@ class BumpConfig(ConfigModel):
     caught_after_s: Duration | None = None
 
     @model_validator(mode="after")
-    def one_after_the_other(self) -> BumpConfig:
+    def check_catch_time(self) -> BumpConfig:
         if self.caught_after_s is not None and self.caught_after_s < self.duration_s:
-            raise ValueError(f"caught_after {self.caught_after_s:g} s is before the knock is over")
+            raise ValueError(f"caught_after {self.caught_after_s:g} s is before the impulse ends")
         return self
 
 
-Manoeuvre = Annotated[
+Maneuver = Annotated[
     HoldConfig | StepConfig | SlewConfig | RateConfig | SpinUpConfig | SineConfig | ShakeConfig | BumpConfig,
     Field(discriminator="kind"),
 ]
@@ -162,7 +162,7 @@ class DesaturationConfig(ConfigModel):
     time_s: Duration = 10.0
 
     @model_validator(mode="after")
-    def hysteresis(self) -> DesaturationConfig:
+    def check_thresholds(self) -> DesaturationConfig:
         if self.stop_nms >= self.start_nms:
             raise ValueError(f"stop {self.stop_nms:g} N m s is not below start {self.start_nms:g} N m s")
         return self
@@ -188,7 +188,7 @@ class ControlConfig(ConfigModel):
     desaturation: DesaturationConfig | None = None
 
 
-def spelt_out(value: Any) -> Any:
+def expand_control(value: Any) -> Any:
     """`control: pid` is short for {law: pid}, `none` for no controller."""
     if value == "none":
         return None
@@ -202,14 +202,14 @@ class MotionConfig(ConfigModel):
     rate_deg_s: RatesDegS = (0.0, 0.0, 0.0)
     control: Annotated[
         ControlConfig | None,
-        BeforeValidator(spelt_out, json_schema_input_type=ControlConfig | Law | Literal["none"] | None),
+        BeforeValidator(expand_control, json_schema_input_type=ControlConfig | Law | Literal["none"] | None),
     ] = None
-    manoeuvre: tuple[Manoeuvre, ...] = ()
+    maneuver: tuple[Maneuver, ...] = ()
     jitter: tuple[JitterPart, ...] = ()
 
     @model_validator(mode="after")
-    def somebody_flies_it(self) -> MotionConfig:
-        driven = any(part.kind not in ("bump", "hold", "jitter") for part in self.manoeuvre)
+    def check_controller(self) -> MotionConfig:
+        driven = any(leg.kind not in ("bump", "hold", "jitter") for leg in self.maneuver)
         if driven and self.control is None:
-            raise ValueError("a manoeuvre needs a controller; allowed: control: pid")
+            raise ValueError("a maneuver requires a controller, such as control: pid")
         return self

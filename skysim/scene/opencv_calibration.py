@@ -10,14 +10,14 @@ from typing import Any
 import yaml
 
 from skysim.core.errors import InputError
-from skysim.core.yaml_reader import StrictLoader, parse_yaml, shown
+from skysim.core.yaml_reader import StrictLoader, excerpt, parse_yaml
 
-MOST_BYTES = 1 << 20  # enough for a calibration with the points of all its views
-SQUARE = (
+MAX_BYTES = 1 << 20  # enough for a calibration with the points of all its views
+MAX_ASPECT_ERROR = (
     1e-3  # allowed relative difference of fx and fy, the calibration's own error: a chip's pixels are square
 )
-MOST_PX = 20000  # a side of the chip, as in a scene's camera
-FIVE = ("k1", "k2", "p1", "p2", "k3")
+MAX_SIDE_PX = 20000  # a side of the chip, as in a scene's camera
+COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3")
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,35 +25,35 @@ class Calibration:
     """A pinhole with square pixels and the distortion of Brown (1971); camera axes +x right, +y down, +z boresight.
 
     focal_px   : focal length (strictly, the image distance) over the pixel pitch
-    centre_px  : principal point (x, y); the center of pixel (0, 0) is (0, 0), as in OpenCV
+    center_px  : principal point (x, y); the center of pixel (0, 0) is (0, 0), as in OpenCV
     distortion : k1, k2, p1, p2, k3 in OpenCV's order
     """
 
     width_px: int
     height_px: int
     focal_px: float
-    centre_px: tuple[float, float]
+    center_px: tuple[float, float]
     distortion: tuple[float, float, float, float, float]
 
 
 class Loader(StrictLoader):
-    """`Careful`, with OpenCV's matrices as mappings."""
+    """`StrictLoader`, with OpenCV's matrices as mappings."""
 
 
 def matrix_node(loader: yaml.SafeLoader, node: yaml.Node) -> Any:
     if not isinstance(node, yaml.MappingNode):
-        raise yaml.constructor.ConstructorError(None, None, "a matrix that is no mapping", node.start_mark)
+        raise yaml.constructor.ConstructorError(None, None, "a matrix that is not a mapping", node.start_mark)
     return loader.construct_mapping(node, deep=True)
 
 
 Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", matrix_node)
 
 
-def is_one(path: Path) -> bool:
+def looks_like_calibration(path: Path) -> bool:
     """Whether a file looks like OpenCV's: it has a camera_matrix, or OpenCV's first line."""
     try:
         with path.open("rb") as file:
-            head = file.read(MOST_BYTES)
+            head = file.read(MAX_BYTES)
     except OSError:
         return False
     return head.startswith(b"%YAML") or b"\ncamera_matrix:" in head or head.startswith(b"camera_matrix:")
@@ -65,40 +65,36 @@ def read(path: Path) -> Calibration:
     Keys: image_width, image_height, camera_matrix, distortion_coefficients; others are ignored. Raises InputError
     with one line for another file, and for another lens model: fisheye, rational, skewed.
     """
-    tree = parsed(path)
+    tree = parse_file(path)
     for key, allowed in (("fisheye_model", (0, False)), ("distortion_model", ("plumb_bob",))):
         if key in tree and tree[key] not in allowed:
-            raise InputError(
-                f"{path}: {key}: {shown(repr(tree[key]))} is none of {', '.join(map(str, allowed))}"
-            )
-    width, height = (side(path, tree, key) for key in ("image_width", "image_height"))
+            raise InputError(f"{path}: {key}: {excerpt(repr(tree[key]))}; allowed: {', '.join(map(str, allowed))}")
+    width, height = (image_side(path, tree, key) for key in ("image_width", "image_height"))
     fx, skew, cx, zero, fy, cy, *last = matrix(path, tree, "camera_matrix", ((3, 3),))
     if min(fx, fy) <= 0 or skew or zero or last != [0, 0, 1]:
-        raise InputError(
-            f"{path}: camera_matrix: allowed: [fx, 0, cx, 0, fy, cy, 0, 0, 1], fx and fy above 0"
-        )
-    if abs(fx / fy - 1) > SQUARE:
+        raise InputError(f"{path}: camera_matrix: allowed: [fx, 0, cx, 0, fy, cy, 0, 0, 1], fx and fy above 0")
+    if abs(fx / fy - 1) > MAX_ASPECT_ERROR:
         raise InputError(
             f"{path}: camera_matrix: fx {fx:g} and fy {fy:g} differ by {100 * abs(fx / fy - 1):.2g} %; allowed:"
-            f" square pixels, to {100 * SQUARE:g} % (calibrate with CALIB_FIX_ASPECT_RATIO)"
+            f" square pixels, to {100 * MAX_ASPECT_ERROR:g} % (calibrate with CALIB_FIX_ASPECT_RATIO)"
         )
     shapes = tuple(shape for n in (4, 5, 8, 12, 14) for shape in ((1, n), (n, 1)))
-    told = matrix(path, tree, "distortion_coefficients", shapes)
-    if any(told[5:]):
+    coefficients = matrix(path, tree, "distortion_coefficients", shapes)
+    if any(coefficients[5:]):
         raise InputError(
-            f"{path}: distortion_coefficients: {len(told)} of them; allowed: {', '.join(FIVE)} alone"
+            f"{path}: distortion_coefficients: {len(coefficients)} terms; allowed: {', '.join(COEFFICIENTS)}"
         )
-    k1, k2, p1, p2, k3 = [*told, 0.0][:5]
+    k1, k2, p1, p2, k3 = [*coefficients, 0.0][:5]
     return Calibration(width, height, math.sqrt(fx * fy), (cx, cy), (k1, k2, p1, p2, k3))
 
 
-def parsed(path: Path) -> dict[str, Any]:
+def parse_file(path: Path) -> dict[str, Any]:
     """The file's mapping. OpenCV before 5 begins it with %YAML:1.0, which is invalid YAML. Raises InputError."""
     try:
         with path.open("rb") as file:
-            data = file.read(MOST_BYTES + 1)
-        if len(data) > MOST_BYTES:
-            raise InputError(f"{path}: more than {MOST_BYTES >> 20} MiB; allowed: a calibration of OpenCV")
+            data = file.read(MAX_BYTES + 1)
+        if len(data) > MAX_BYTES:
+            raise InputError(f"{path}: more than {MAX_BYTES >> 20} MiB; allowed: a calibration of OpenCV")
         text = data.decode("utf-8")
         first, _, rest = text.partition("\n")
         _, tree = parse_yaml(rest if first.startswith("%YAML") else text, Loader)
@@ -112,12 +108,12 @@ def parsed(path: Path) -> dict[str, Any]:
     return tree
 
 
-def side(path: Path, tree: dict[str, Any], key: str) -> int:
+def image_side(path: Path, tree: dict[str, Any], key: str) -> int:
     """The width or height of the image, px. Raises InputError."""
     value = tree.get(key)
-    if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= MOST_PX:
+    if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= MAX_SIDE_PX:
         raise InputError(
-            f"{path}: {key}: {shown(repr(value))} is not allowed; it should be a whole number from 1 to {MOST_PX}"
+            f"{path}: {key}: {excerpt(repr(value))} is not allowed; it should be a whole number from 1 to {MAX_SIDE_PX}"
         )
     return value
 
@@ -130,13 +126,13 @@ def matrix(path: Path, tree: dict[str, Any], key: str, shapes: tuple[tuple[int, 
     shape, data = (node.get("rows"), node.get("cols")), node.get("data")
     if shape not in shapes:
         raise InputError(
-            f"{path}: {key}: {shown(shape[0])} rows and {shown(shape[1])} cols; allowed:"
+            f"{path}: {key}: {excerpt(shape[0])} rows and {excerpt(shape[1])} cols; allowed:"
             f" {', '.join(f'{rows}x{cols}' for rows, cols in shapes)}"
         )
     count = shape[0] * shape[1]
-    if not isinstance(data, list) or len(data) != count or not all(is_number(one) for one in data):
+    if not isinstance(data, list) or len(data) != count or not all(is_number(value) for value in data):
         raise InputError(f"{path}: {key}: data: allowed: {count} finite numbers")
-    return [float(one) for one in data]
+    return [float(value) for value in data]
 
 
 def is_number(value: Any) -> bool:
@@ -144,24 +140,24 @@ def is_number(value: Any) -> bool:
     return type(value) in (int, float) and abs(value) < 1e12
 
 
-def text(told: Calibration) -> str:
+def text(calibration: Calibration) -> str:
     """The calibration as YAML that `read` and OpenCV's FileStorage (4 and 5) read."""
-    fx, (cx, cy) = told.focal_px, told.centre_px
+    fx, (cx, cy) = calibration.focal_px, calibration.center_px
     return (
         "%YAML:1.0\n---\n"
-        f"image_width: {told.width_px}\nimage_height: {told.height_px}\n"
-        + layout("camera_matrix", 3, 3, [fx, 0.0, cx, 0.0, fx, cy, 0.0, 0.0, 1.0])
-        + layout("distortion_coefficients", 1, 5, list(told.distortion))
+        f"image_width: {calibration.width_px}\nimage_height: {calibration.height_px}\n"
+        + matrix_text("camera_matrix", 3, 3, [fx, 0.0, cx, 0.0, fx, cy, 0.0, 0.0, 1.0])
+        + matrix_text("distortion_coefficients", 1, 5, list(calibration.distortion))
     )
 
 
-def layout(key: str, rows: int, cols: int, data: list[float]) -> str:
+def matrix_text(key: str, rows: int, cols: int, data: list[float]) -> str:
     """A matrix of 64-bit floats, with all digits."""
-    numbers = ", ".join(number(one) for one in data)
+    numbers = ", ".join(number_text(value) for value in data)
     return f"{key}: !!opencv-matrix\n   rows: {rows}\n   cols: {cols}\n   dt: d\n   data: [ {numbers} ]\n"
 
 
-def number(value: float) -> str:
+def number_text(value: float) -> str:
     """The number with a decimal point, without which YAML reads 1e-07 as a string."""
     mantissa, e, exponent = repr(float(value)).partition("e")
     return f"{mantissa if '.' in mantissa else mantissa + '.0'}{e}{exponent}"

@@ -14,7 +14,7 @@ from skysim.core.yaml_reader import is_file
 def existing_file(value: str) -> str:
     """A path that exists. Raises ValueError."""
     if not is_file(Path(value)):
-        raise ValueError(f"{value!r} is no file; allowed: one beside the scene, or a path")
+        raise ValueError(f"{value!r} is not a file; allowed: a path, or a file in the scene's folder")
     return value
 
 
@@ -23,12 +23,12 @@ class SurveyErrorsConfig(ConfigModel):
 
     led_sigma    : standard deviation of every LED's surveyed place, about each axis of the lab
     lever_sigma  : of the camera's surveyed place, about each axis of the body
-    turn_deg     : rotation vector of the survey's axes relative to the lab's: the error of the level or IMU that it
+    rotation_deg     : rotation vector of the survey's axes relative to the lab's: the error of the level or IMU that it
         was referenced to. All surveyed LEDs are rotated by it
     surface_seed : draws `light.surface.error`; `seed` if left out
     """
 
-    turn_deg: tuple[Spin, Spin, Spin] = (0.0, 0.0, 0.0)
+    rotation_deg: tuple[Spin, Spin, Spin] = (0.0, 0.0, 0.0)
     surface_seed: Annotated[int, Field(ge=0)] | None = None
     led_sigma_m: Annotated[Length, Field(ge=0, le=0.1)] = 0.0
     lever_sigma_m: Annotated[Length, Field(ge=0, le=0.1)] = 0.0
@@ -43,7 +43,7 @@ class ExposureControlConfig(ConfigModel):
     exposure control a frame cannot be rendered on its own. See `estimator.trackers.exposure_control`.
 
     mean_dn             : mean of a frame above which it is overexposed: twice its bias and sky, for example
-    least_stars         : fewer cannot be identified
+    min_stars         : fewer cannot be identified
     overexposed_objects : number of objects with more than saturated_px full pixels each that is too many
     """
 
@@ -51,26 +51,26 @@ class ExposureControlConfig(ConfigModel):
     shortest_s: Annotated[Time, Field(ge=10e-6)] = 10e-6
     longest_s: Annotated[Time, Field(le=10.0)] = 50e-3
     step_s: Annotated[Time, Field(ge=1e-6)] = 2e-3
-    least_stars: Annotated[int, Field(ge=1)] = 4
+    min_stars: Annotated[int, Field(ge=1)] = 4
     overexposed_objects: Annotated[int, Field(ge=1)] = 4
     saturated_px: Annotated[int, Field(ge=0)] = 1
 
     @model_validator(mode="after")
-    def in_order(self) -> ExposureControlConfig:
+    def check_limits(self) -> ExposureControlConfig:
         if self.shortest_s > self.longest_s:
             raise ValueError(f"shortest {self.shortest_s:g} s is above longest {self.longest_s:g} s")
         return self
 
 
 class TrackerConfig(ConfigModel):
-    """What the star tracker's computer does and believes. `null` in a believed value means the true one.
+    """Settings of the star tracker and its assumed values of the hardware; `null` for an assumed value is the true one.
 
     name : own, or an external tracker: an entry point, or a program given on the command line (`--program`)
     options, time_limit : options of an external tracker, and its time limit per frame
     map : a file that `skysim survey` wrote: LEDs, lever, focal length and distortion as measured
     detector, centroider, identifier, solver : if left out, under a dome local, cog, led_pairs and rotation_only, and
         under the stars all of them `default`
-    believed_distortion : k1, k2, p1, p2, k3 of the lens; as it is if left out
+    assumed_distortion : k1, k2, p1, p2, k3 of the lens; as it is if left out
     brightest : only this many of the brightest detections of a frame are used
     exposure_control : every frame is exposed for `exposure.time` if left out
     """
@@ -86,34 +86,32 @@ class TrackerConfig(ConfigModel):
     min_area_px: Annotated[int, Field(ge=1)] = 3
     limit_mag: Number = 6.0
     centroid_sigma_px: Annotated[Number, Field(gt=0)] = 0.2
-    believed_focal_length_m: Annotated[Length, Field(gt=0)] | None = None
-    believed_distortion: tuple[Number, Number, Number, Number, Number] | None = None
+    assumed_focal_length_m: Annotated[Length, Field(gt=0)] | None = None
+    assumed_distortion: tuple[Number, Number, Number, Number, Number] | None = None
     brightest: Annotated[int, Field(ge=3, le=1000)] | None = None
-    believed_camera_body_m: tuple[Length, Length, Length] | None = None
+    assumed_camera_body_m: tuple[Length, Length, Length] | None = None
     survey: SurveyErrorsConfig = SurveyErrorsConfig()
     exposure_control: ExposureControlConfig | None = None
     map: Annotated[str, AfterValidator(existing_file)] | None = None
 
     @model_validator(mode="after")
-    def one_lever(self) -> TrackerConfig:
-        if self.believed_camera_body_m is not None and self.survey.lever_sigma_m:
-            raise ValueError(
-                "survey.lever_sigma: believed_camera_body tells the place; allowed: one of the two"
-            )
+    def check_lever(self) -> TrackerConfig:
+        if self.assumed_camera_body_m is not None and self.survey.lever_sigma_m:
+            raise ValueError("survey.lever_sigma: conflicts with assumed_camera_body; allowed: one of the two")
         return self
 
     @model_validator(mode="after")
-    def one_map(self) -> TrackerConfig:
-        told = {
-            "believed_focal_length": self.believed_focal_length_m,
-            "believed_camera_body": self.believed_camera_body_m,
-            "believed_distortion": self.believed_distortion,
+    def check_map(self) -> TrackerConfig:
+        values = {
+            "assumed_focal_length": self.assumed_focal_length_m,
+            "assumed_camera_body": self.assumed_camera_body_m,
+            "assumed_distortion": self.assumed_distortion,
             "survey.led_sigma": self.survey.led_sigma_m,
             "survey.lever_sigma": self.survey.lever_sigma_m,
         }
-        beside = [key for key, value in told.items() if value]
-        if self.map and beside:
-            raise ValueError(f"{beside[0]}: the file of tracker.map tells it; allowed: one of the two")
+        conflicts = [key for key, value in values.items() if value]
+        if self.map and conflicts:
+            raise ValueError(f"{conflicts[0]}: conflicts with tracker.map, which contains it; allowed: one of the two")
         return self
 
 
@@ -128,7 +126,7 @@ class FilterConfig(ConfigModel):
     arw_deg_sqrt_h, bias_deg_h, bias_time : of the gyro; the bias a Gauss-Markov process
     start_deg, start_bias_deg_h           : standard deviation of attitude and bias about each axis at the start
     floor_arcsec : systematic error of a star tracker's solution, the same in every frame, added to its covariance
-    gate_sigma   : a solution farther off than this is rejected
+    gate_sigma   : a solution with a larger innovation is rejected
     latency      : from the end of an exposure to its solution
     """
 

@@ -47,7 +47,7 @@ class WheelsConfig(ConfigModel):
     start_rpm: tuple[Number, ...] = ()
 
     @model_validator(mode="after")
-    def within_limits(self) -> WheelsConfig:
+    def check_speeds(self) -> WheelsConfig:
         if any(abs(rpm) > self.speed_limit_rpm for rpm in self.start_rpm):
             raise ValueError(f"start_rpm: beyond speed_limit_rpm {self.speed_limit_rpm:g}")
         return self
@@ -87,12 +87,12 @@ class DragConfig(ConfigModel):
 
 
 class CableConfig(ConfigModel):
-    """A cable attached to the vehicle: a torsional spring that turns it back to (0, 0, 0) by the shorter way."""
+    """A cable attached to the vehicle: a torsional spring that turns it back to (0, 0, 0) by the shorter rotation."""
 
     stiffness_nm_rad: Annotated[Stiffness, Field(gt=0)]
 
 
-class DraughtConfig(ConfigModel):
+class AirCurrentConfig(ConfigModel):
     """Air currents: a random torque about each lab axis, correlated over the correlation time."""
 
     rms_nm: tuple[TorqueLevel, TorqueLevel, TorqueLevel]
@@ -103,13 +103,13 @@ class DisturbancesConfig(ConfigModel):
     """Disturbance torques; each is off if it is left out.
 
     turbine        : turbine torque of the bearing's air jets, constant about the lab's axes
-    earth_rotation : the lab rotates with the Earth (`lab` gives the site), the vehicle's momentum does not
+    earth_rotation : the lab rotates with the Earth (`site` gives its latitude), the vehicle's momentum does not
     """
 
     turbine_nm: tuple[Torque, Torque, Torque] = (0.0, 0.0, 0.0)
     earth_rotation: bool = False
     cable: CableConfig | None = None
-    draught: DraughtConfig | None = None
+    air_current: AirCurrentConfig | None = None
 
 
 class GyroConfig(ConfigModel):
@@ -175,7 +175,7 @@ class VehicleConfig(ConfigModel):
     mount: Literal["air_bearing", "free"] = "air_bearing"
     mass_kg: Annotated[Mass, Field(gt=0)] | None = None
     inertia_kg_m2: tuple[Inertia, Inertia, Inertia] | None = None
-    centre_of_mass_m: tuple[Length, Length, Length] = (0.0, 0.0, 0.0)
+    center_of_mass_m: tuple[Length, Length, Length] = (0.0, 0.0, 0.0)
     camera_m: tuple[Length, Length, Length] | None = None
     tilt_stop_deg: Annotated[Number, Field(gt=0, lt=90)] = 30.0
     torque_limit_nm: TorqueLimit = 1.0
@@ -188,17 +188,16 @@ class VehicleConfig(ConfigModel):
 
     @field_validator("inertia_kg_m2")
     @classmethod
-    def principal_moments(cls, value: Triple | None) -> Triple | None:
+    def check_inertia(cls, value: Triple | None) -> Triple | None:
         if value and (min(value) <= 0 or 2 * max(value) > sum(value)):
-            raise ValueError(f"{value} is no rigid body's: each positive, none above the sum of the others")
+            raise ValueError(
+                f"{value} is not possible for a rigid body; allowed: positive, none above the sum of the others"
+            )
         return value
 
     @model_validator(mode="after")
-    def in_the_room(self) -> VehicleConfig:
-        room = self.disturbances
-        if self.mount == "free" and (
-            any(room.turbine_nm) or room.earth_rotation or room.cable or room.draught
-        ):
+    def check_free_mount(self) -> VehicleConfig:
+        if self.mount == "free" and self.disturbances != DisturbancesConfig():
             raise ValueError("disturbances: a free vehicle has none; allowed: mount: air_bearing")
         if self.mount == "free" and self.imu and self.imu.earth_rate != "none":
             raise ValueError("imu.earth_rate: a free vehicle is not on the Earth; allowed: none")

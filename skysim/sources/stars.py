@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from skysim.core.types import Floats, Sources
 from skysim.core.units import in_utc
-from skysim.sources.catalog import Catalogue
+from skysim.sources.catalog import Catalog
 from skysim.sources.photometry import Band, star_flux_e_s_m2
 
 J2000_TT = datetime.datetime(2000, 1, 1, 12)
@@ -25,7 +25,7 @@ AT_REST = (0.0, 0.0, 0.0)
 
 
 def apparent(
-    catalogue: Catalogue, time: datetime.datetime, observer_velocity_m_s: Floats | tuple[float, ...] = AT_REST
+    catalog: Catalog, time: datetime.datetime, observer_velocity_m_s: Floats | tuple[float, ...] = AT_REST
 ) -> Floats:
     """Apparent directions of stars: proper motion, annual parallax, light deflection and aberration.
 
@@ -42,22 +42,22 @@ def apparent(
     """
     tt_day = days_since_j2000_tt(time)
     heliocentric, barycentric = erfa.epv00(erfa.DJ00, tt_day)  # au, au/day; TT for TDB is 2 ms off
-    years = tt_day / erfa.DJY + 2000.0 - catalogue.epoch_jyear
+    years = tt_day / erfa.DJY + 2000.0 - catalog.epoch_jyear
     geometric = erfa.pmpx(
-        catalogue.ra_rad,
-        catalogue.dec_rad,
-        catalogue.pm_ra_rad_yr / np.cos(catalogue.dec_rad),  # SOFA takes the rate of right ascension itself
-        catalogue.pm_dec_rad_yr,
-        catalogue.parallax_rad / ARCSEC_RAD,
+        catalog.ra_rad,
+        catalog.dec_rad,
+        catalog.pm_ra_rad_yr / np.cos(catalog.dec_rad),  # SOFA takes the rate of right ascension itself
+        catalog.pm_dec_rad_yr,
+        catalog.parallax_rad / ARCSEC_RAD,
         0.0,
         years,
         barycentric["p"],
     )
     sun_au = float(np.linalg.norm(heliocentric["p"]))
-    bent = erfa.ldsun(geometric, heliocentric["p"] / sun_au, sun_au)
+    deflected = erfa.ldsun(geometric, heliocentric["p"] / sun_au, sun_au)
     beta = barycentric["v"] / C_AU_DAY + np.asarray(observer_velocity_m_s, dtype=float) / C_M_S
-    seen = erfa.ab(bent, beta, sun_au, np.sqrt(1.0 - beta @ beta))
-    return np.asarray(seen / np.linalg.norm(seen, axis=-1, keepdims=True))
+    apparent_direction = erfa.ab(deflected, beta, sun_au, np.sqrt(1.0 - beta @ beta))
+    return np.asarray(apparent_direction / np.linalg.norm(apparent_direction, axis=-1, keepdims=True))
 
 
 def days_since_j2000_tt(time: datetime.datetime) -> float:
@@ -65,9 +65,7 @@ def days_since_j2000_tt(time: datetime.datetime) -> float:
     return (in_utc(time) + TT_MINUS_UTC - J2000_TT) / DAY
 
 
-def sources(
-    stars: Catalogue, time: datetime.datetime, limit_mag: float, lab_from_icrs: Rotation, band: Band
-) -> Sources:
+def sources(stars: Catalog, time: datetime.datetime, limit_mag: float, lab_from_icrs: Rotation, band: Band) -> Sources:
     """The stars to a limiting magnitude as steady points at infinity.
 
     limit_mag     : faintest Johnson V kept
@@ -75,20 +73,20 @@ def sources(
     band          : quantum efficiency of the chip
     Returns Sources in lab axes: place is (direction, 0), strength photo-electrons s^-1 m^-2 from V and both colors.
     """
-    kept = stars.take(stars.v_mag <= limit_mag)
-    count = len(kept)
-    direction = lab_from_icrs.apply(apparent(kept, time)) if count else np.zeros((0, 3))
-    zero, one = np.zeros(count), np.ones(count)
+    selected = stars.take(stars.v_mag <= limit_mag)
+    count = len(selected)
+    direction = lab_from_icrs.apply(apparent(selected, time)) if count else np.zeros((0, 3))
+    zeros, ones = np.zeros(count), np.ones(count)
     return Sources(
-        id=kept.hip,
-        place=np.column_stack([direction, zero]),
+        id=selected.hip,
+        place=np.column_stack([direction, zeros]),
         normal=np.zeros((count, 3)),
-        radius_m=zero,
-        strength=star_flux_e_s_m2(kept.v_mag, kept.b_v, kept.v_i, band),
-        period_s=one,
-        start_s=zero,
-        on_s=one,
-        magnitude=kept.v_mag,
+        radius_m=zeros,
+        strength=star_flux_e_s_m2(selected.v_mag, selected.b_v, selected.v_i, band),
+        period_s=ones,
+        start_s=zeros,
+        on_s=ones,
+        magnitude=selected.v_mag,
     )
 
 

@@ -23,7 +23,7 @@ class DomeMap:
     camera_body_m  : (3,) the entrance pupil in the body frame, m
     lever_sigma_m  : its standard deviation, rms of the three axes, m
     size_px        : width and height of the chip
-    focal_px, centre_px, distortion (k1, k2, p1, p2, k3), and the standard deviation of each number; 0 where
+    focal_px, center_px, distortion (k1, k2, p1, p2, k3), and the standard deviation of each number; 0 where
     it was held
     """
 
@@ -35,8 +35,8 @@ class DomeMap:
     size_px: tuple[int, int]
     focal_px: float
     focal_sigma_px: float
-    centre_px: tuple[float, float]
-    centre_sigma_px: tuple[float, float]
+    center_px: tuple[float, float]
+    center_sigma_px: tuple[float, float]
     distortion: tuple[float, float, float, float, float]
     distortion_sigma: tuple[float, float, float, float, float]
 
@@ -45,7 +45,7 @@ MAP_COLUMNS = ("id", "x_m", "y_m", "z_m", "sigma_m")
 
 # Keys in the header of a dome map, and how many numbers each holds.
 MAP_META = {
-    **{"size_px": 2, "focal_px": 1, "focal_sigma_px": 1, "centre_px": 2, "centre_sigma_px": 2},
+    **{"size_px": 2, "focal_px": 1, "focal_sigma_px": 1, "center_px": 2, "center_sigma_px": 2},
     **{"distortion": 5, "distortion_sigma": 5, "camera_body_m": 3, "lever_sigma_m": 1},
 }
 
@@ -70,25 +70,23 @@ def read_dome_map(path: Path) -> DomeMap:
             warnings.simplefilter("ignore")
             table = Table.read(path, format="ascii.ecsv")
     except Exception as error:  # astropy's parsers raise many types of error
-        raise InputError(f"{path}: no ECSV table: {' '.join(str(error).split())[:120]}") from None
+        raise InputError(f"{path}: not an ECSV table: {' '.join(str(error).split())[:120]}") from None
     missing = [name for name in MAP_COLUMNS if name not in table.colnames]
     if missing or not len(table):
-        what = f"no column {missing[0]}" if missing else "no LED"
-        raise InputError(f"{path}: {what}; allowed: a map that skysim survey wrote")
+        fault = f"no column {missing[0]}" if missing else "no LED"
+        raise InputError(f"{path}: {fault}; allowed: a map written by skysim survey")
     try:
         numbers = np.column_stack([np.ma.filled(table[name].astype(float), np.nan) for name in MAP_COLUMNS])
     except (TypeError, ValueError):
         raise InputError(f"{path}: allowed: numbers in the columns {', '.join(MAP_COLUMNS)}") from None
-    wrong = np.flatnonzero(~np.isfinite(numbers).all(axis=1) | (numbers[:, 4] <= 0))
-    if len(wrong):
-        raise InputError(f"{path}: row {wrong[0] + 1}: allowed: finite numbers, and a sigma_m above 0")
+    invalid = np.flatnonzero(~np.isfinite(numbers).all(axis=1) | (numbers[:, 4] <= 0))
+    if len(invalid):
+        raise InputError(f"{path}: row {invalid[0] + 1}: allowed: finite numbers, and a sigma_m above 0")
     id_, count = np.unique(numbers[:, 0].astype(np.int64), return_counts=True)
     if count.max() > 1:
-        raise InputError(f"{path}: LED {id_[count > 1][0]} stands {count.max()} times; allowed: once")
+        raise InputError(f"{path}: LED {id_[count > 1][0]} occurs {count.max()} times; allowed: once")
     meta = {key: header_numbers(path, table.meta, key, count) for key, count in MAP_META.items()}
-    told: dict[str, Any] = {key: value[0] if len(value) == 1 else tuple(value) for key, value in meta.items()}
-    told["size_px"] = tuple(round(side) for side in meta["size_px"])
-    told["camera_body_m"] = np.array(meta["camera_body_m"])
-    return DomeMap(
-        id=numbers[:, 0].astype(np.int64), position_m=numbers[:, 1:4], sigma_m=numbers[:, 4], **told
-    )
+    fields: dict[str, Any] = {key: value[0] if len(value) == 1 else tuple(value) for key, value in meta.items()}
+    fields["size_px"] = tuple(round(side) for side in meta["size_px"])
+    fields["camera_body_m"] = np.array(meta["camera_body_m"])
+    return DomeMap(id=numbers[:, 0].astype(np.int64), position_m=numbers[:, 1:4], sigma_m=numbers[:, 4], **fields)

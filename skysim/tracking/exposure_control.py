@@ -11,7 +11,7 @@ from estimator.trackers.exposure_control import Control, Exposure, Observation, 
 from estimator.trackers.pipeline import Settings
 from skysim.core.types import Frame
 from skysim.scene.scene import Scene
-from skysim.tracking.settings import believed_settings
+from skysim.tracking.settings import assumed_settings
 
 
 class ExposureController:
@@ -21,23 +21,23 @@ class ExposureController:
     """
 
     def __init__(self, scene: Scene) -> None:
-        self.control, self.settings = exposure_control(scene), believed_settings(scene)
+        self.control, self.settings = control_settings(scene), assumed_settings(scene)
         self.exposure_s = scene.exposure.time_s
 
-    def see(self, frame: Frame) -> None:
+    def update(self, frame: Frame) -> None:
         """Update the exposure time from a frame, which was exposed for `frame.exposure_s`."""
         if self.control:
             state = Exposure(frame.exposure_s)
-            self.exposure_s = step(state, observed(self.settings, self.control, frame), self.control).time_s
+            self.exposure_s = step(state, observe_frame(self.settings, self.control, frame), self.control).time_s
 
 
-def exposure_control(scene: Scene) -> Control | None:
+def control_settings(scene: Scene) -> Control | None:
     """The constants of the control law from the scene; None where exposure times are fixed."""
-    part = scene.tracker.exposure_control
-    return Control(**dict(part)) if part else None
+    config = scene.tracker.exposure_control
+    return Control(**dict(config)) if config else None
 
 
-def observed(settings: Settings, control: Control, frame: Frame) -> Observation:
+def observe_frame(settings: Settings, control: Control, frame: Frame) -> Observation:
     """What the control law needs from a frame: brightness statistics of the detected blobs.
 
     Blobs that are not stars (defects, tracks, the Moon) are left out. A pixel counts as saturated near the camera's

@@ -1,6 +1,6 @@
 """Build the star tracker of a scene, and solve frames with it.
 
-`tracker` chooses the class by scene: DomeTracker under LEDs, StarTracker under stars, ExternalTracker for another
+`build_tracker` chooses the class by scene: DomeTracker under LEDs, StarTracker under stars, ExternalTracker for another
 program. All get the camera, map and settings that the tracker assumes (onboard_model.py, settings.py), which may
 differ from the simulated hardware.
 """
@@ -16,50 +16,48 @@ from estimator.trackers.dome_tracker import DomeTracker
 from estimator.trackers.pipeline import Report
 from estimator.trackers.star_tracker import StarTracker
 from skysim.core.errors import InputError
-from skysim.core.paths import CATALOGUES
+from skysim.core.paths import CATALOGS
 from skysim.core.types import Frame, Mount, Sources
-from skysim.scene.light import BenchConfig, DomeConfig
+from skysim.scene.light import CollimatedDisplayConfig, DomeConfig
 from skysim.scene.scene import Scene
 from skysim.sources.dome import display
 from skysim.tracking.external import adapter
 from skysim.tracking.external.adapter import ExternalTracker
 from skysim.tracking.external.interface import OWN
-from skysim.tracking.onboard_model import believed_camera, believed_dome, believed_lever, surveyed_dome
-from skysim.tracking.settings import believed_settings
+from skysim.tracking.onboard_model import assumed_camera, assumed_dome, assumed_lever, surveyed_dome
+from skysim.tracking.settings import assumed_settings
 
 Estimator = StarTracker | DomeTracker | ExternalTracker
 
 NO_PROGRAMS: Mapping[str, str] = {}
 
 
-def tracker(
-    scene: Scene, mount: Mount, sources: Sources, programs: Mapping[str, str] = NO_PROGRAMS
-) -> Estimator:
+def build_tracker(scene: Scene, mount: Mount, sources: Sources, programs: Mapping[str, str] = NO_PROGRAMS) -> Estimator:
     """The star tracker with the hardware parameters that it assumes: those of the scene's `tracker` section,
     else the true ones.
 
-    programs : commands by name, any of which `tracker.name` may be
-    Raises InputError for a dome that the tracker cannot work with.
+    programs : commands of external trackers by name, for `tracker.name`
+    Raises InputError for a dome that the tracker cannot use.
     """
-    camera, settings = believed_camera(scene), believed_settings(scene)
+    camera, settings = assumed_camera(scene), assumed_settings(scene)
     if isinstance(scene.light, DomeConfig):
-        leds, lever = believed_dome(scene, scene.light, sources), believed_lever(scene, mount)
+        leds, lever = assumed_dome(scene, scene.light, sources), assumed_lever(scene, mount)
         if scene.tracker.map:
             camera, leds, lever = surveyed_dome(scene, scene.tracker.map, leds, lever)
         if scene.tracker.name != OWN:
-            return ExternalTracker.of(scene, camera, settings, adapter.leds(leds, lever), programs)
+            return ExternalTracker.start(scene, camera, settings, adapter.led_map(leds, lever), programs)
         try:
             return DomeTracker(camera, leds, lever, settings)
         except ImageError as error:
-            raise InputError(f"light: the star tracker cannot work under this dome: {error}") from None
-    stars = catalog.read(CATALOGUES / f"{scene.light.catalogue}.ecsv")
-    stars = catalog.brighter(stars, scene.tracker.limit_mag)
+            raise InputError(f"light: the star tracker cannot use this dome: {error}") from None
+    stars = catalog.read(CATALOGS / f"{scene.light.catalog}.ecsv")
+    stars = catalog.brighter_than(stars, scene.tracker.limit_mag)
     directions = catalog.apparent(stars, catalog.on_earth(scene.start_time))
-    if isinstance(scene.light, BenchConfig):
+    if isinstance(scene.light, CollimatedDisplayConfig):
         # The display's mounting defines where the stars are in the lab frame.
         directions = display.lab_from_icrs(scene.light).apply(directions)
     if scene.tracker.name != OWN:
-        return ExternalTracker.of(scene, camera, settings, adapter.stars(stars, directions), programs)
+        return ExternalTracker.start(scene, camera, settings, adapter.star_map(stars, directions), programs)
     return StarTracker(camera, stars, directions, settings)
 
 
@@ -69,8 +67,8 @@ def solve_frame(estimator: Estimator, frame: Frame, streak_px: tuple[float, floa
     streak_px : (dx, dy) that lights move in the exposure, if a gyro measures it
     """
     if isinstance(estimator, ExternalTracker):
-        return estimator.look(frame, streak_px)
+        return estimator.solve_frame(frame, streak_px)
     try:
         return estimator.solve(frame.image_dn, streak_px)
     except ImageError as error:
-        return Report(Attitude(str(error)), Centroids.none())
+        return Report(Attitude(str(error)), Centroids.empty())

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from estimator.core.types import Attitude
-from estimator.filter.mekf import GyroModel, Mekf
+from estimator.filter.mekf import AttitudeFilter, GyroModel
 from skysim.core import quaternion
 from skysim.core.types import Floats, Mount
 from skysim.core.units import ARCSEC_RAD
@@ -26,8 +26,8 @@ class Navigation:
 
     scene : with `vehicle.imu`, and optionally `filter`
     lab_from_body_wxyz : (4,) the true attitude at the start, when the navigator is zeroed
-    place_body_m, gravity_m_s2 : of the accelerometers
-    records : whether all IMU samples are kept, for `record`
+    position_body_m, gravity_m_s2 : of the accelerometers
+    keeps_samples : whether all IMU samples are kept, for `imu_samples`
     """
 
     def __init__(
@@ -35,29 +35,29 @@ class Navigation:
         scene: Scene,
         mount: Mount,
         lab_from_body: Rotation,
-        place_body_m: Floats,
+        position_body_m: Floats,
         gravity_m_s2: float,
         rng: np.random.Generator,
-        records: bool = True,
+        keeps_samples: bool = True,
     ) -> None:
-        part = scene.vehicle.imu
-        assert part is not None
-        self.unit = imu.Unit.of(part, rng)
-        self.place_body_m, self.gravity_m_s2 = place_body_m, gravity_m_s2
+        config = scene.vehicle.imu
+        assert config is not None
+        self.imu = imu.Imu.from_config(config, rng)
+        self.position_body_m, self.gravity_m_s2 = position_body_m, gravity_m_s2
         self.body_from_cam = mount.cam_from_body.inv()
-        self.step_s = 1 / part.rate_hz
+        self.step_s = 1 / config.rate_hz
         self.samples = 0
-        earth = imu.earth_rate_lab_rad_s(scene.lab)
-        self.earth_felt_rad_s = earth * (part.earth_rate != "none")
-        self.earth_known_rad_s = earth * (part.earth_rate == "compensated")
-        believed = at_home(lab_from_body, part.home_error_deg)
-        self.navigator = imu.Navigator(believed.as_quat(scalar_first=True), self.earth_known_rad_s)
-        self.filter = mekf(scene.filter, believed) if scene.filter else None
-        self.records, self.measured = records, list[imu.Increments]()
+        earth = imu.earth_rate_lab_rad_s(scene.site)
+        self.earth_sensed_rad_s = earth * (config.earth_rate != "none")
+        self.earth_compensated_rad_s = earth * (config.earth_rate == "compensated")
+        assumed = zeroed_attitude(lab_from_body, config.home_error_deg)
+        self.navigator = imu.Navigator(assumed.as_quat(scalar_first=True), self.earth_compensated_rad_s)
+        self.filter = build_filter(scene.filter, assumed) if scene.filter else None
+        self.keeps_samples, self.measured = keeps_samples, list[imu.Increments]()
         self.rate_rad_s = np.zeros(3)
         self.saturated = False
 
-    def feel(self, now_s: float, t_s: Floats, lab_from_body_wxyz: Floats, rate_body_rad_s: Floats) -> None:
+    def sample_imu(self, now_s: float, t_s: Floats, lab_from_body_wxyz: Floats, rate_body_rad_s: Floats) -> None:
         """Take the IMU samples due up to now_s; update navigator and filter with them.
 
         t_s (K,), lab_from_body_wxyz (K, 4), rate_body_rad_s (K, 3) : knots of the motion since the last call
@@ -68,29 +68,29 @@ class Navigation:
             return
         ends_s = (self.samples + 1 + np.arange(due)) * np.float64(self.step_s)
         self.samples += due
-        ideal = imu.felt(
+        ideal = imu.ideal_increments(
             t_s,
             lab_from_body_wxyz,
             rate_body_rad_s,
             ends_s,
             self.step_s,
-            self.place_body_m,
+            self.position_body_m,
             self.gravity_m_s2,
-            self.earth_felt_rad_s,
+            self.earth_sensed_rad_s,
         )
-        measured = self.unit.measure(ideal)
-        if self.records:
+        measured = self.imu.measure(ideal)
+        if self.keeps_samples:
             self.measured.append(measured)
         self.navigator.add(measured)
         self.saturated = bool(measured.saturated.any())
-        known = self.earth_body_rad_s(self.navigator.lab_from_body_wxyz)
-        self.rate_rad_s = measured.angle_rad.mean(axis=0) / self.step_s - known
+        compensation = self.earth_body_rad_s(self.navigator.lab_from_body_wxyz)
+        self.rate_rad_s = measured.angle_rad.mean(axis=0) / self.step_s - compensation
         if self.filter:
             # The filter's reference is the lab, so the Earth rate is removed at its own attitude estimate.
-            known = self.earth_body_rad_s(self.attitude_wxyz("filter"))
-            self.filter.propagate(ends_s, measured.angle_rad - known * self.step_s, measured.saturated)
+            compensation = self.earth_body_rad_s(self.attitude_wxyz("filter"))
+            self.filter.propagate(ends_s, measured.angle_rad - compensation * self.step_s, measured.saturated)
 
-    def record(self) -> imu.Increments:
+    def imu_samples(self) -> imu.Increments:
         """All IMU samples so far."""
         columns = zip(
             *((m.t_s, m.angle_rad, m.velocity_m_s, m.saturated, m.overloaded) for m in self.measured),
@@ -105,24 +105,24 @@ class Navigation:
         The sum of the gyro bias, of scale factor and misalignment errors times the rate, and of the Earth rate if
         it is not compensated.
         """
-        unknown = self.earth_felt_rad_s - self.earth_known_rad_s
-        earth = quaternion.apply(quaternion.inverse(lab_from_body_wxyz), unknown)
-        return self.unit.gyro_bias_rad_s + self.unit.gyro.matrix @ rate_body_rad_s - rate_body_rad_s + earth
+        uncompensated = self.earth_sensed_rad_s - self.earth_compensated_rad_s
+        earth = quaternion.apply(quaternion.inverse(lab_from_body_wxyz), uncompensated)
+        return self.imu.gyro_bias_rad_s + self.imu.gyro.matrix @ rate_body_rad_s - rate_body_rad_s + earth
 
     def earth_body_rad_s(self, lab_from_body_wxyz: Floats) -> Floats:
         """(3,) Earth rate to subtract, in body axes; zeros if it is not compensated."""
-        return quaternion.apply(quaternion.inverse(lab_from_body_wxyz), self.earth_known_rad_s)
+        return quaternion.apply(quaternion.inverse(lab_from_body_wxyz), self.earth_compensated_rad_s)
 
-    def see(self, t_s: float, answer: Attitude) -> str:
+    def update_filter(self, t_s: float, solution: Attitude) -> str:
         """Update the filter with a star tracker's attitude at mid-exposure t_s; return the status of the update.
 
         Without filter, attitude or covariance the tracker's own status is returned.
         """
-        if self.filter is None or answer.cam_from_ref is None or answer.covariance_rad2 is None:
-            return answer.status
+        if self.filter is None or solution.cam_from_ref is None or solution.covariance_rad2 is None:
+            return solution.status
         body_from_cam = self.body_from_cam.as_matrix()
-        covariance = body_from_cam @ answer.covariance_rad2 @ body_from_cam.T
-        return self.filter.update(t_s, self.body_from_cam * answer.cam_from_ref, covariance).status
+        covariance = body_from_cam @ solution.covariance_rad2 @ body_from_cam.T
+        return self.filter.update(t_s, self.body_from_cam * solution.cam_from_ref, covariance).status
 
     def attitude_wxyz(self, feedback: str) -> Floats:
         """(4,) lab_from_body from the inertial navigator ("imu") or the filter."""
@@ -130,32 +130,32 @@ class Navigation:
             return self.navigator.lab_from_body_wxyz
         return self.filter.ref_from_body_wxyz
 
-    def rate(self, feedback: str) -> Floats:
+    def body_rate_rad_s(self, feedback: str) -> Floats:
         """(3,) body rate in the lab from the same source: the mean over the last control period for the IMU."""
         return self.rate_rad_s if feedback == "imu" or self.filter is None else self.filter.rate_rad_s
 
 
-def at_home(lab_from_body: Rotation, error_deg: tuple[float, float, float]) -> Rotation:
+def zeroed_attitude(lab_from_body: Rotation, error_deg: tuple[float, float, float]) -> Rotation:
     """The attitude to which the navigator is zeroed: the true one less the error in roll, pitch, yaw."""
     yaw, pitch, roll = lab_from_body.as_euler("ZYX", degrees=True)
-    wrong = [yaw - error_deg[2], pitch - error_deg[1], roll - error_deg[0]]
-    return Rotation.from_euler("ZYX", wrong, degrees=True)
+    angles_deg = [yaw - error_deg[2], pitch - error_deg[1], roll - error_deg[0]]
+    return Rotation.from_euler("ZYX", angles_deg, degrees=True)
 
 
-def mekf(part: FilterConfig, lab_from_body: Rotation) -> Mekf:
+def build_filter(config: FilterConfig, lab_from_body: Rotation) -> AttitudeFilter:
     """The attitude filter at the start; its reference frame is the lab."""
     hour_s = 3600.0
     gyro = GyroModel(
-        math.radians(part.arw_deg_sqrt_h) / math.sqrt(hour_s),
-        math.radians(part.bias_deg_h) / hour_s,
-        part.bias_time_s,
+        math.radians(config.arw_deg_sqrt_h) / math.sqrt(hour_s),
+        math.radians(config.bias_deg_h) / hour_s,
+        config.bias_time_s,
     )
-    return Mekf(
+    return AttitudeFilter(
         gyro,
         0.0,
         lab_from_body.inv(),
-        math.radians(part.start_deg),
-        math.radians(part.start_bias_deg_h) / hour_s,
-        part.floor_arcsec * ARCSEC_RAD,
-        part.gate_sigma,
+        math.radians(config.start_deg),
+        math.radians(config.start_bias_deg_h) / hour_s,
+        config.floor_arcsec * ARCSEC_RAD,
+        config.gate_sigma,
     )

@@ -1,4 +1,4 @@
-"""Pictures whose field of view nobody tells: the range is covered, chance is shared out, rivals are a refusal."""
+"""Images of unknown field of view: the range is covered, the significance level is divided, rivals cause a refusal."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ from skysim.simulation import exposure, run
 from skysim.simulation.testbed import Testbed
 from skysim.sources import stars
 
-HERE = Rotation.from_rotvec([0.1, 0.2, 0.3])
-THERE = Rotation.from_rotvec([0.1, 0.2, 0.4])
+ATTITUDE = Rotation.from_rotvec([0.1, 0.2, 0.3])
+OTHER_ATTITUDE = Rotation.from_rotvec([0.1, 0.2, 0.4])
 
 
 # What is tried
@@ -31,43 +31,41 @@ THERE = Rotation.from_rotvec([0.1, 0.2, 0.4])
 
 @pytest.mark.parametrize(("width_px", "height_px"), [(1024, 768), (600, 900), (3000, 500)])
 def test_every_field_from_five_to_forty_degrees_is_some_tracker_s(width_px: int, height_px: int) -> None:
-    beliefs = plate_solver.make_solver(None, None).beliefs(width_px, height_px)
-    assert len(beliefs) == plate_solver.TRACKERS
+    cameras = plate_solver.make_solver(None, None).candidate_cameras(width_px, height_px)
+    assert len(cameras) == plate_solver.FIELD_SEARCH.trackers
     for fov_deg in np.linspace(5, 40, 200):
         focal_px = (width_px - 1) / 2 / np.tan(np.radians(fov_deg / 2))
-        assert any(abs(focal_px / camera.focal_px - 1) <= share for camera, share in beliefs), fov_deg
+        assert any(abs(focal_px / camera.focal_px - 1) <= uncertainty for camera, uncertainty in cameras), fov_deg
 
 
 def test_a_field_that_is_told_is_the_only_one_tried() -> None:
-    ((camera, share),) = plate_solver.make_solver(12.0, None).beliefs(640, 480)
+    ((camera, uncertainty),) = plate_solver.make_solver(12.0, None).candidate_cameras(640, 480)
     assert np.degrees(camera.fov_rad) == pytest.approx(12.0, abs=1e-9)
-    assert 0.05 < share < 0.06
-    ((known, none),) = plate_solver.make_solver(None, SCENES / "shefex2.yaml").beliefs(659, 493)
+    assert 0.05 < uncertainty < 0.06
+    ((known, none),) = plate_solver.make_solver(None, SCENES / "shefex2.yaml").candidate_cameras(659, 493)
     assert (known.focal_px, none) == (pytest.approx(25 / 9.9e-3, rel=1e-12), 0.0)
 
 
 def test_trackers_are_kept_for_images_of_one_size_and_time() -> None:
     solver = plate_solver.make_solver(20.0, None)
-    first, again, other = (
-        next(solver.trackers(*size, None)) for size in ((640, 480), (640, 480), (640, 400))
-    )
+    first, again, other = (next(solver.trackers(*size, None)) for size in ((640, 480), (640, 480), (640, 400)))
     assert first is again
     assert other is not first
-    assert len(solver.built) == 1  # one size at a time: an index is megabytes
+    assert len(solver.tracker_cache) == 1  # one size at a time: an index is megabytes
 
 
 # Which answer counts
 
 
-class Says:
-    """A tracker that has its answer ready."""
+class FixedTracker:
+    """A tracker that returns a given attitude and counts its calls."""
 
     def __init__(self, attitude: Attitude) -> None:
         self.attitude = attitude
-        self.asked = 0
+        self.calls = 0
 
     def solve_centroids(self, centroids: Centroids, clock: Clock, effort: int) -> Attitude:
-        self.asked += 1
+        self.calls += 1
         return self.attitude
 
 
@@ -76,41 +74,41 @@ def answer(where: Rotation, log10_chance: float) -> Attitude:
     return Attitude("solved", where, np.eye(3), StarMatch(nothing, nothing, where, log10_chance))
 
 
-def outcome(*said: Attitude) -> tuple[Attitude, list[int]]:
-    trackers = [Says(one) for one in said]
-    attitude, _ = plate_solver.sought(Centroids.none(), iter(trackers), Clock(), 0)  # type: ignore[arg-type]
-    return attitude, [one.asked for one in trackers]
+def outcome(*solution: Attitude) -> tuple[Attitude, list[int]]:
+    trackers = [FixedTracker(one) for one in solution]
+    attitude, _ = plate_solver.best_attitude(Centroids.empty(), iter(trackers), Clock(), 0)  # type: ignore[arg-type]
+    return attitude, [one.calls for one in trackers]
 
 
 REFUSED = Attitude(NO_MATCH)
 
 
 def test_a_decisive_answer_is_taken_at_once() -> None:
-    attitude, asked = outcome(REFUSED, answer(HERE, -20.0), answer(THERE, -30.0))
-    assert attitude.cam_from_ref is HERE
-    assert asked == [1, 1, 0]
+    attitude, calls = outcome(REFUSED, answer(ATTITUDE, -20.0), answer(OTHER_ATTITUDE, -30.0))
+    assert attitude.cam_from_ref is ATTITUDE
+    assert calls == [1, 1, 0]
 
 
 def test_as_many_tries_are_allowed_as_much_chance_as_one() -> None:
-    share = ACCEPT_LOG10_CHANCE - np.log10(plate_solver.TRACKERS)
-    assert outcome(REFUSED, answer(HERE, share - 0.01), REFUSED)[0].solved
-    refused, asked = outcome(REFUSED, answer(HERE, share + 0.01), REFUSED)
+    threshold = ACCEPT_LOG10_CHANCE - np.log10(plate_solver.FIELD_SEARCH.trackers)
+    assert outcome(REFUSED, answer(ATTITUDE, threshold - 0.01), REFUSED)[0].solved
+    refused, calls = outcome(REFUSED, answer(ATTITUDE, threshold + 0.01), REFUSED)
     assert (refused.status, refused.cam_from_ref) == (NO_MATCH, None)
-    assert asked == [1, 1, 1]
+    assert calls == [1, 1, 1]
 
 
 def test_of_two_answers_neither_is_taken_unless_it_is_far_better() -> None:
-    for one, other in itertools.permutations([answer(HERE, -9.0), answer(THERE, -7.0)]):
+    for one, other in itertools.permutations([answer(ATTITUDE, -9.0), answer(OTHER_ATTITUDE, -7.0)]):
         assert not outcome(one, other)[0].solved
-    for one, other in itertools.permutations([answer(HERE, -9.8), answer(THERE, -6.0)]):
-        assert outcome(one, other)[0].cam_from_ref is HERE
+    for one, other in itertools.permutations([answer(ATTITUDE, -9.8), answer(OTHER_ATTITUDE, -6.0)]):
+        assert outcome(one, other)[0].cam_from_ref is ATTITUDE
     # One that is not beyond chance itself speaks against another all the same.
-    assert not outcome(answer(HERE, -6.0), answer(THERE, -4.5))[0].solved
+    assert not outcome(answer(ATTITUDE, -6.0), answer(OTHER_ATTITUDE, -4.5))[0].solved
 
 
-def test_neighbours_that_agree_are_no_rivals() -> None:
-    near = Rotation.from_rotvec([1e-4, 0, 0]) * HERE
-    assert outcome(answer(HERE, -7.0), answer(near, -8.0))[0].cam_from_ref is near
+def test_neighbors_that_agree_are_no_rivals() -> None:
+    near = Rotation.from_rotvec([1e-4, 0, 0]) * ATTITUDE
+    assert outcome(answer(ATTITUDE, -7.0), answer(near, -8.0))[0].cam_from_ref is near
 
 
 def test_a_refusal_says_why() -> None:
@@ -122,7 +120,7 @@ def test_a_refusal_says_why() -> None:
 
 @pytest.fixture(scope="module")
 def blind() -> plate_solver.Solver:
-    """Told nothing; it keeps its trackers for frames of one size."""
+    """A solver for unknown fields of view; it caches its trackers for frames of one size."""
     return plate_solver.make_solver(None, None)
 
 
@@ -133,38 +131,36 @@ def photographed(focal: str) -> Testbed:
 
 
 @pytest.mark.parametrize(("focal", "fov_deg"), [("10 mm", 36.12), ("25 mm", 14.84), ("45 mm", 8.28)])
-def test_a_rendered_field_is_solved_with_nothing_told(
-    blind: plate_solver.Solver, focal: str, fov_deg: float
-) -> None:
+def test_a_rendered_field_is_solved_with_nothing_told(blind: plate_solver.Solver, focal: str, fov_deg: float) -> None:
     """2 atan(658 x 9.9 um / 2 f) between the middles of the edge columns, to half a per cent; three arc-minutes."""
     frame, truth = exposure.render_frame(photographed(focal), 0)
-    found, _ = plate_solver.look(frame.image_dn, blind, None)
-    said = plate_solver.solution(found)
-    ours = stars.cam_from_icrs(said["ra_deg"], said["dec_deg"], said["roll_deg"])
+    found, _ = plate_solver.solve_array(frame.image_dn, blind, None)
+    solution = plate_solver.solution_fields(found)
+    ours = stars.cam_from_icrs(solution["ra_deg"], solution["dec_deg"], solution["roll_deg"])
     x, y, _ = np.degrees((ours * truth.cam_from_lab.inv()).as_rotvec())
     assert np.hypot(x, y) < 0.05
-    assert said["fov_deg"] == pytest.approx(fov_deg, rel=5e-3)
+    assert solution["fov_deg"] == pytest.approx(fov_deg, rel=5e-3)
 
 
 def test_smeared_frames_of_a_known_camera_are_placed_by_their_streaks() -> None:
-    """14 px of smear, of which nobody tells: within 100" and what is claimed; fits of round stars roll 400" off."""
+    """14 px of unmodeled smear: error below 100" and consistent with the covariance; round-star fits roll 400" off."""
     fast = {"exposure.frames": "16", "motion.rate_deg_s": "[4.8, 6.4, 0]"}
-    lab = run.prepare(loader.load("scoreboard", fast))
+    testbed = run.prepare(loader.load("scoreboard", fast))
     camera = plate_solver.make_solver(None, SCENES / "shefex2.yaml")
     for n in (5, 15):
-        frame, truth = exposure.render_frame(lab, n)
-        found = plate_solver.look(frame.image_dn, camera, lab.scene.start_time)[0].attitude
+        frame, truth = exposure.render_frame(testbed, n)
+        found = plate_solver.solve_array(frame.image_dn, camera, testbed.scene.start_time)[0].attitude
         assert found.cam_from_ref is not None
-        off = (found.cam_from_ref * truth.cam_from_lab.inv()).as_rotvec()
-        assert np.abs(off).max() < 100 * ARCSEC_RAD
-        assert off @ np.linalg.solve(found.covariance_rad2, off) < stats.chi2.ppf(0.999, 3)
+        error_rad = (found.cam_from_ref * truth.cam_from_lab.inv()).as_rotvec()
+        assert np.abs(error_rad).max() < 100 * ARCSEC_RAD
+        assert error_rad @ np.linalg.solve(found.covariance_rad2, error_rad) < stats.chi2.ppf(0.999, 3)
 
 
 @pytest.mark.long
 def test_a_sky_seen_in_a_mirror_is_refused(blind: plate_solver.Solver) -> None:
-    """No turn of the sky is its mirror image, so whatever were answered would be wrong."""
+    """No rotation maps the sky to its mirror image, so every solution would be wrong."""
     frame, _ = exposure.render_frame(photographed("25 mm"), 0)
-    found, _ = plate_solver.look(np.ascontiguousarray(frame.image_dn[:, ::-1]), blind, None)
+    found, _ = plate_solver.solve_array(np.ascontiguousarray(frame.image_dn[:, ::-1]), blind, None)
     assert not found.attitude.solved
     assert len(found.centroids) >= 4
 
@@ -174,13 +170,13 @@ def test_a_sky_seen_in_a_mirror_is_refused(blind: plate_solver.Solver) -> None:
 
 @pytest.mark.parametrize("stage", list(plate_solver.STAGES))
 def test_a_stage_s_wrong_name_is_answered_with_the_allowed_ones(stage: str) -> None:
-    with pytest.raises(InputError, match=rf"^--{stage}: 'magic' is none of \w+, \w+"):
+    with pytest.raises(InputError, match=rf"^--{stage}: unknown {stage} 'magic'; allowed: \w+, \w+"):
         plate_solver.make_solver(None, None, stages={stage: "magic"})
 
 
 def test_names_stand_above_what_a_camera_tells() -> None:
     camera = SCENES / "shefex2.yaml"
-    plain = plate_solver.make_solver(None, camera).settings
-    told = plate_solver.make_solver(None, camera, stages={"centroider": "cog", "solver": "quest"}).settings
-    assert (plain.centroider, plain.solver) == ("default", "default")
-    assert (told.centroider, told.solver, told.gain_e_dn) == ("cog", "quest", plain.gain_e_dn)
+    defaults = plate_solver.make_solver(None, camera).settings
+    settings = plate_solver.make_solver(None, camera, stages={"centroider": "cog", "solver": "quest"}).settings
+    assert (defaults.centroider, defaults.solver) == ("default", "default")
+    assert (settings.centroider, settings.solver, settings.gain_e_dn) == ("cog", "quest", defaults.gain_e_dn)

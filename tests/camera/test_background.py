@@ -15,20 +15,20 @@ from skysim.camera.background import (
     NANOLAMBERT_V0,
     fill,
     glow_map,
-    look,
     moonlight_nl,
     nodes_px,
+    pixel_directions,
     scattering,
     transmittance,
     unproject,
-    view_of,
+    viewing_geometry,
 )
 from skysim.camera.optics import Optics
 from skysim.scene import light
 from skysim.scene.camera import CameraConfig
 from skysim.sources.photometry import SUN, Band, star_flux_e_s_m2
 
-BAND = Band.of(0.5)
+BAND = Band.from_efficiency(0.5)
 CAMERA = {
     "width_px": 801,
     "height_px": 601,
@@ -52,7 +52,7 @@ MOON = {
 
 
 def optics(**camera: object) -> Optics:
-    return Optics.of(CameraConfig.model_validate(CAMERA | camera))
+    return Optics.from_camera(CameraConfig.model_validate(CAMERA | camera))
 
 
 def glow(**part: object) -> light.Glow:
@@ -67,18 +67,18 @@ def lab_place(right_deg: float) -> tuple[float, float]:
     return float(np.degrees(np.arctan2(y, x)) % 360), float(np.degrees(np.arcsin(z)))
 
 
-def whole_map(part: light.Glow, lens: Optics) -> np.ndarray:
+def whole_map(config: light.Glow, lens: Optics) -> np.ndarray:
     """Worked out at every third pixel itself, for comparison."""
     camera = lens.camera
     x, y = np.meshgrid(np.arange(0, camera.width_px, 3), np.arange(0, camera.height_px, 3))
-    toward, pixel_sr = look(np.column_stack([x.ravel(), y.ravel()]).astype(float), lens)
-    view = view_of(toward, pixel_sr, lens, POINTING, BAND)
-    return BACKGROUNDS[part.kind](part, view).reshape(x.shape)
+    toward, pixel_sr = pixel_directions(np.column_stack([x.ravel(), y.ravel()]).astype(float), lens)
+    view = viewing_geometry(toward, pixel_sr, lens, POINTING, BAND)
+    return BACKGROUNDS[config.kind](config, view).reshape(x.shape)
 
 
-def drawn(part: light.Glow, lens: Optics, exposure_s: float = 1.0) -> np.ndarray:
+def drawn(config: light.Glow, lens: Optics, exposure_s: float = 1.0) -> np.ndarray:
     image = np.full((lens.camera.height_px, lens.camera.width_px), np.nan, np.float32)
-    fill(image, glow_map((part,), lens, POINTING, BAND), exposure_s)
+    fill(image, glow_map((config,), lens, POINTING, BAND), exposure_s)
     return image
 
 
@@ -120,7 +120,7 @@ def test_the_pixels_share_out_the_whole_field(camera: dict[str, object]) -> None
     """Their solid angles add up to that inside of the frame's edge, a polygon of great circles (Girard)."""
     lens = optics(**camera)
     x, y = np.meshgrid(np.arange(801.0), np.arange(601.0))
-    pixels = look(np.column_stack([x.ravel(), y.ravel()]), lens)[1].sum()
+    pixels = pixel_directions(np.column_stack([x.ravel(), y.ravel()]), lens)[1].sum()
     along_x, along_y = np.linspace(-0.5, 800.5, 1602), np.linspace(-0.5, 600.5, 1202)
     edge = np.concatenate(
         [
@@ -207,7 +207,7 @@ def test_moonlight_on_the_frame_comes_from_the_moon_s_side() -> None:
 
 
 def test_stray_light_of_the_sun() -> None:
-    """Irradiance by Planck: 5772 K over the solar disc's 6.794e-5 sr, 400-1000 nm, half of it made electrons."""
+    """Irradiance by Planck: 5772 K over the solar disk's 6.794e-5 sr, 400-1000 nm, half of it made electrons."""
     ra_deg, dec_deg = lab_place(110.0)
     sun = glow(kind="stray", ra_deg=ra_deg, dec_deg=dec_deg, angle_deg=(20, 200), pst=(1e-4, 1e-12))
     wavelength = np.linspace(400e-9, 1000e-9, 6001)
@@ -241,9 +241,7 @@ FAR_MOON = MOON | dict(zip(("ra_deg", "dec_deg"), lab_place(60.0), strict=True))
 
 @pytest.mark.parametrize("part", [SLOPED, FAR_MOON])
 @pytest.mark.parametrize("camera", [{}, BENT, {"focal_length": "3 mm"}])
-def test_frames_drawn_between_nodes_are_within_a_thousandth(
-    part: dict[str, object], camera: dict[str, object]
-) -> None:
+def test_frames_drawn_between_nodes_are_within_a_thousandth(part: dict[str, object], camera: dict[str, object]) -> None:
     lens = optics(**camera)
     np.testing.assert_allclose(drawn(glow(**part), lens)[::3, ::3], whole_map(glow(**part), lens), rtol=1e-3)
 
@@ -257,9 +255,7 @@ def test_the_cusp_of_two_stops_is_rounded_off_within_a_node_of_the_axis() -> Non
 
 
 @pytest.mark.parametrize("kind", [np.float32, np.float64])
-@pytest.mark.parametrize(
-    ("shape", "nodes"), [((601, 801), (20, 27)), ((97, 33), (2, 3)), ((50, 64), (50, 64))]
-)
+@pytest.mark.parametrize(("shape", "nodes"), [((601, 801), (20, 27)), ((97, 33), (2, 3)), ((50, 64), (50, 64))])
 def test_fill_is_bilinear_interpolation(kind: type, shape: tuple[int, int], nodes: tuple[int, int]) -> None:
     coarse = np.random.default_rng(1).uniform(1, 2, nodes)
     image = np.full(shape, np.nan, kind)

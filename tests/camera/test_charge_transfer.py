@@ -7,9 +7,9 @@ import pytest
 
 from skysim.camera.detector.charge_transfer import (
     bloom,
+    delayed_fractions,
     frame_transfer_smear,
     interline_smear,
-    late_shares,
     transfer_loss,
 )
 
@@ -24,7 +24,7 @@ def frame(column: np.ndarray, width: int = 3) -> np.ndarray:
 
 
 def halve_till_it_fits(column: np.ndarray) -> np.ndarray:
-    """Every over-full pixel gives its excess in halves to its neighbours, all at once, over and over."""
+    """Every over-full pixel gives its excess in halves to its neighbors, all at once, over and over."""
     charge = np.concatenate([[0.0], column, [0.0]])  # the two outer places swallow
     while (excess := np.maximum(charge[1:-1] - WELL, 0)).max() > 1e-7 * WELL:
         charge[1:-1] -= excess
@@ -44,7 +44,7 @@ def test_blooming_ends_where_endless_halving_does(seed: int) -> None:
     np.testing.assert_allclose(image[:, 1], halve_till_it_fits(column), rtol=0, atol=1e-3 * WELL)
 
 
-def test_blooming_keeps_the_charge_and_its_centre() -> None:
+def test_blooming_keeps_the_charge_and_its_center() -> None:
     rng = np.random.default_rng(2)
     image = rng.uniform(0, 0.5 * WELL, (400, 30)).astype(np.float32)
     image[150:250:30, ::3] += np.float32(20 * WELL)
@@ -120,7 +120,7 @@ def test_columns_that_hold_their_charge_stay_bit_by_bit() -> None:
 
 
 def clocked_out(line_e: np.ndarray, cti: float, clocks: int) -> np.ndarray:
-    """A register moved place by place: each clock all charge but the share cti goes on towards place 0 and out."""
+    """A register moved place by place: each clock all charge but the fraction cti goes on towards place 0 and out."""
     charge, out = line_e.astype(float), np.zeros(clocks)
     for clock in range(clocks):
         moved = (1 - cti) * charge
@@ -163,7 +163,7 @@ def test_deferred_charge_of_a_flat_field_is_transfers_times_inefficiency() -> No
 
 def test_no_charge_is_lost_in_late_packets() -> None:
     for cti in (1e-9, 1e-6, 1e-4, 1e-2):
-        share = late_shares(2000, cti)
+        share = delayed_fractions(2000, cti)
         np.testing.assert_allclose(share.sum(axis=0), 1, rtol=1e-12)
         assert share.min() >= 0
     image = np.random.default_rng(6).uniform(0, 100, (20, 30))

@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from skysim.camera.detector.cosmic_rays import MOST_ASLANT, STEP_PX, TRACK, deposit, hit, tracks_of
+from skysim.camera.detector.cosmic_rays import (
+    MAX_TANGENT,
+    STEP_PX,
+    TRACK,
+    add_particles,
+    deposit,
+    draw_tracks,
+)
 from skysim.core.errors import InputError
 from skysim.scene.camera import ParticlesConfig
 
@@ -21,14 +28,14 @@ def protons(**part: object) -> ParticlesConfig:
 def many(count: int = 100_000, **part: object) -> np.ndarray:
     """Tracks, about so many, of a chip without margins worth mentioning: 0.06 cm2 and a depth of 1 nm."""
     thin = protons(per_cm2_s=count / 0.06, depth="1 nm", **part)
-    return tracks_of(thin, SHAPE, 1.0, PIXEL_M, np.random.default_rng(1))
+    return draw_tracks(thin, SHAPE, 1.0, PIXEL_M, np.random.default_rng(1))
 
 
 def test_the_count_is_flux_times_area_times_time() -> None:
     """What goes in within the frame is Poisson: mean and variance of 400 exposures."""
     rng, counts = np.random.default_rng(2), []
     for _ in range(400):
-        tracks = tracks_of(protons(), SHAPE, 0.1, PIXEL_M, rng)
+        tracks = draw_tracks(protons(), SHAPE, 0.1, PIXEL_M, rng)
         inside = (np.abs(tracks["x_px"] - 149.5) < 150) & (np.abs(tracks["y_px"] - 99.5) < 100)
         counts.append(inside.sum())
     wanted = 1e4 * 0.06 * 0.1  # 60
@@ -55,17 +62,15 @@ def test_directions_are_those_of_an_isotropic_flux_through_a_plate() -> None:
 def test_mean_way_through_a_plate_is_twice_its_depth() -> None:
     """Cauchy's mean chord 4 V / S of a wide plate. The variance of 1 / cos grows as the logarithm of the cut."""
     length = many()["length_m"] / 1e-9
-    sigma = np.sqrt((2 * np.log(MOST_ASLANT) - 4) / len(length))
-    assert length.mean() == pytest.approx(2 * (1 - 1 / MOST_ASLANT), abs=4 * sigma)
+    sigma = np.sqrt((2 * np.log(MAX_TANGENT) - 4) / len(length))
+    assert length.mean() == pytest.approx(2 * (1 - 1 / MAX_TANGENT), abs=4 * sigma)
 
 
 def test_an_image_of_a_track_is_as_long_as_its_tangent_says() -> None:
-    tracks = tracks_of(protons(), SHAPE, 1.0, PIXEL_M, np.random.default_rng(3))
+    tracks = draw_tracks(protons(), SHAPE, 1.0, PIXEL_M, np.random.default_rng(3))
     along = np.hypot(tracks["end_x_px"] - tracks["x_px"], tracks["end_y_px"] - tracks["y_px"])
     np.testing.assert_allclose(np.hypot(along * PIXEL_M, 10e-6), tracks["length_m"], rtol=1e-12)
-    assert np.median(along) == pytest.approx(
-        1.0, abs=4 * 1.0 / np.sqrt(len(tracks))
-    )  # 45 degrees, 10 um, 10 um
+    assert np.median(along) == pytest.approx(1.0, abs=4 * 1.0 / np.sqrt(len(tracks)))  # 45 degrees, 10 um, 10 um
 
 
 def test_most_probable_charge_is_that_of_the_length() -> None:
@@ -77,9 +82,7 @@ def test_most_probable_charge_is_that_of_the_length() -> None:
     mode = np.polyfit((edges[peak - 3 : peak + 4] + 0.01) - edges[peak], counts[peak - 3 : peak + 4], 2)
     assert edges[peak] - mode[1] / (2 * mode[0]) == pytest.approx(1.0, abs=0.02)
     sigma = 0.06 * np.pi / np.sqrt(2)
-    assert ratio.mean() == pytest.approx(
-        1 + 0.06 * (np.euler_gamma + np.log(2)), abs=4 * sigma / np.sqrt(len(ratio))
-    )
+    assert ratio.mean() == pytest.approx(1 + 0.06 * (np.euler_gamma + np.log(2)), abs=4 * sigma / np.sqrt(len(ratio)))
     assert ratio.std() == pytest.approx(sigma, rel=0.03)
     assert ratio.min() > 0
 
@@ -112,23 +115,21 @@ def test_diffusion_widens_the_cloud() -> None:
         image = np.zeros((61, 61))
         deposit(image, np.array([[30.0, 30.0, 30.0, 30.0]]), np.array([1.0]), sigma_px)
         spots.append(image.sum(axis=0) @ (np.arange(61) - 30.0) ** 2)
-    np.testing.assert_allclose(
-        spots, [0.49 + 1 / 12, 2.25 + 1 / 12], rtol=1e-3
-    )  # Sheppard: the pixel's own 1/12
+    np.testing.assert_allclose(spots, [0.49 + 1 / 12, 2.25 + 1 / 12], rtol=1e-3)  # Sheppard: the pixel's own 1/12
 
 
 def test_tracks_come_in_from_beside_the_frame_and_run_off_it() -> None:
     thick = protons(depth="100 um", per_cm2_s=1e5)
     image = np.zeros((50, 50))
-    tracks = hit(image, 1.0, PIXEL_M, (thick,), np.random.default_rng(4))
+    tracks = add_particles(image, 1.0, PIXEL_M, (thick,), np.random.default_rng(4))
     outside = (tracks["x_px"] < -2.5) | (tracks["x_px"] > 51.5)
     assert outside.sum() > 20
-    assert (tracks["kept_e"] <= tracks["electrons"] * (1 + 1e-6)).all()
-    assert (tracks["kept_e"] < 0.9 * tracks["electrons"]).sum() > 20
-    assert image.sum() == pytest.approx(tracks["kept_e"].sum(), rel=1e-9)
+    assert (tracks["deposited_e"] <= tracks["electrons"] * (1 + 1e-6)).all()
+    assert (tracks["deposited_e"] < 0.9 * tracks["electrons"]).sum() > 20
+    assert image.sum() == pytest.approx(tracks["deposited_e"].sum(), rel=1e-9)
     # As many electrons a volume as flux x mean way x charge: the layer's edges neither gain nor lose.
     wanted = 1e5 * 0.0025 * 80.0 * 200.0 * (1 + 0.06 * (np.euler_gamma + np.log(2)))
-    relative = np.sqrt(2 * np.log(MOST_ASLANT)) / 2 / np.sqrt(250)
+    relative = np.sqrt(2 * np.log(MAX_TANGENT)) / 2 / np.sqrt(250)
     assert image.sum() == pytest.approx(wanted, rel=4 * relative)
 
 
@@ -136,25 +137,25 @@ def test_frames_gain_the_tracks_and_keep_what_they_had() -> None:
     sky = np.random.default_rng(5).uniform(50, 60, SHAPE).astype(np.float32)
     image = sky.copy()
     parts = (protons(), protons(electrons_um=800.0))
-    tracks = hit(image, 0.1, PIXEL_M, parts, np.random.default_rng(6))
+    tracks = add_particles(image, 0.1, PIXEL_M, parts, np.random.default_rng(6))
     assert tracks.dtype == TRACK
     gained = (image - sky).sum(dtype=float)
-    assert gained == pytest.approx(tracks["kept_e"].sum(), rel=1e-4)
+    assert gained == pytest.approx(tracks["deposited_e"].sum(), rel=1e-4)
     assert (image >= sky).all()
     assert np.median(image - sky) == 0
 
 
 def test_nothing_flies_nothing_changes() -> None:
     image = np.zeros(SHAPE, np.float32)
-    assert len(hit(image, 1.0, PIXEL_M, (), np.random.default_rng(7))) == 0
-    assert len(hit(image, 1.0, PIXEL_M, (protons(per_cm2_s=0.0),), np.random.default_rng(7))) == 0
+    assert len(add_particles(image, 1.0, PIXEL_M, (), np.random.default_rng(7))) == 0
+    assert len(add_particles(image, 1.0, PIXEL_M, (protons(per_cm2_s=0.0),), np.random.default_rng(7))) == 0
     assert not image.any()
 
 
 def test_the_same_stream_draws_the_same_tracks() -> None:
     first, again, other = np.zeros(SHAPE), np.zeros(SHAPE), np.zeros(SHAPE)
     for image, seed in ((first, 1), (again, 1), (other, 2)):
-        hit(image, 0.1, PIXEL_M, (protons(),), np.random.default_rng(seed))
+        add_particles(image, 0.1, PIXEL_M, (protons(),), np.random.default_rng(seed))
     np.testing.assert_array_equal(first, again)
     assert not np.array_equal(first, other)
 
@@ -162,4 +163,4 @@ def test_the_same_stream_draws_the_same_tracks() -> None:
 def test_more_tracks_than_memory_should_hold_are_refused() -> None:
     image = np.zeros((64, 64), np.float32)
     with pytest.raises(InputError, match=r"camera\.detector\.particles: .* tracks .*; allowed: 1,000,000"):
-        hit(image, 1e6, PIXEL_M, (protons(per_cm2_s=1e6),), np.random.default_rng(1))
+        add_particles(image, 1e6, PIXEL_M, (protons(per_cm2_s=1e6),), np.random.default_rng(1))

@@ -28,18 +28,18 @@ CLEAN = {
 LENS = {"pixel": "5 um", "focal_length": "25 mm", "f_number": 2}
 
 
-def chip(shape: tuple[int, int] = SHAPE, shutter: dict[str, Any] | None = None, **changes: Any) -> Detector:
+def detector_with(shape: tuple[int, int] = SHAPE, shutter: dict[str, Any] | None = None, **changes: Any) -> Detector:
     part = LENS | {"height_px": shape[0], "width_px": shape[1], "detector": CLEAN | changes}
-    return Detector.of(CameraConfig.model_validate(part | ({"shutter": shutter} if shutter else {})))
+    return Detector.from_camera(CameraConfig.model_validate(part | ({"shutter": shutter} if shutter else {})))
 
 
 def expose(light_e: np.ndarray, made: Detector, seed: int = 1, exposure_s: float = 0.05) -> np.ndarray:
-    kind = np.float32 if made.part.noise else np.float64
+    kind = np.float32 if made.config.noise else np.float64
     return detector.expose(light_e.astype(kind), exposure_s, made, np.random.default_rng(seed)).astype(float)
 
 
 def frame(mean_e: float, seed: int = 1, exposure_s: float = 0.05, **changes: Any) -> np.ndarray:
-    return expose(np.full(SHAPE, mean_e), chip(**changes), seed, exposure_s)
+    return expose(np.full(SHAPE, mean_e), detector_with(**changes), seed, exposure_s)
 
 
 # The numbers as a whole
@@ -71,14 +71,12 @@ def test_the_histogram_is_the_law_s(
     mean_e: float, read_e: float, gain: float, offset: float, bits: int, well_e: float
 ) -> None:
     settings = {"gain_e_dn": gain, "offset_dn": offset, "bits": bits, "full_well_e": well_e}
-    made = chip((1000, 1000), read_noise_e=read_e, **settings)
+    made = detector_with((1000, 1000), read_noise_e=read_e, **settings)
     numbers = expose(np.full((1000, 1000), mean_e), made, seed=int(100 * mean_e)).astype(np.int64).ravel()
     wanted = law(float(np.float32(mean_e)), read_e, gain, offset, bits, well_e) * 1e6
     found = np.bincount(numbers, minlength=len(wanted))
     common = wanted >= 10
-    assert found[~common].sum() == pytest.approx(
-        wanted[~common].sum(), abs=4 * np.sqrt(wanted[~common].sum()) + 1
-    )
+    assert found[~common].sum() == pytest.approx(wanted[~common].sum(), abs=4 * np.sqrt(wanted[~common].sum()) + 1)
     chi2 = ((found - wanted)[common] ** 2 / wanted[common]).sum()
     assert stats.chi2.sf(chi2, common.sum() - 1) > 1e-4
 
@@ -89,7 +87,7 @@ def test_photon_transfer_slope_is_one_over_the_gain() -> None:
     fixed pattern stays out of the variance, and the columns' offsets are taken from the mean as a bias frame is."""
     gain, read_e, frames = 4.0, 20.0, 10_000
     levels = np.repeat(np.geomspace(30, 30000, 16), 2)
-    made = chip((16, 32), gain_e_dn=gain, read_noise_e=read_e, prnu=0.03, column_offset_e=9, full_well_e=2e5)
+    made = detector_with((16, 32), gain_e_dn=gain, read_noise_e=read_e, prnu=0.03, column_offset_e=9, full_well_e=2e5)
     light_e, rng = np.tile(levels, (16, 1)).astype(np.float32), np.random.default_rng(7)
     numbers = np.array([detector.expose(light_e.copy(), 0.01, made, rng) for _ in range(frames)], dtype=float)
     mean, variance = numbers.mean(axis=0) - 1000, numbers.var(axis=0, ddof=1).ravel()
@@ -115,10 +113,8 @@ def test_shot_noise_has_the_variance_of_its_mean(mean_e: float) -> None:
 
 
 def test_sensitivity_spreads_the_light_by_its_share_and_the_dark_not_at_all() -> None:
-    made = chip(prnu=0.02, dark_e_s=1e5)
-    lit, dark = (
-        np.mean([expose(np.full(SHAPE, e), made, n) - 1000 for n in range(30)], axis=0) for e in (2e4, 0)
-    )
+    made = detector_with(prnu=0.02, dark_e_s=1e5)
+    lit, dark = (np.mean([expose(np.full(SHAPE, e), made, n) - 1000 for n in range(30)], axis=0) for e in (2e4, 0))
     spread, error = lit - dark, np.sqrt((2e4 + 2 * 5e3) / 30)
     assert spread.std() == pytest.approx(np.hypot(0.02 * 2e4, error), rel=4 / np.sqrt(2 * N))
     assert spread.mean() == pytest.approx(2e4, abs=4 * np.hypot(0.02 * 2e4, error) / np.sqrt(N))
@@ -134,14 +130,14 @@ def test_dark_current_doubles_with_its_temperature() -> None:
 
 
 def test_dark_current_is_lognormal_with_its_own_mean_and_spread() -> None:
-    dark = chip((1000, 1000), dark_e_s=100, dsnu=0.4).dark_e_s.astype(float)
+    dark = detector_with((1000, 1000), dark_e_s=100, dsnu=0.4).dark_e_s.astype(float)
     assert dark.mean() == pytest.approx(100, abs=4 * 40 / 1e3)
     s = np.sqrt(np.log(1 + 0.4**2))
     assert stats.kstest(np.log(dark.ravel() / 100) / s + s / 2, "norm").pvalue > 1e-4
 
 
 def test_hot_pixels_are_so_many_and_so_hot() -> None:
-    dark = chip((1000, 1000), dark_e_s=5, hot_pixels=0.01, hot_e_s=3000).dark_e_s.astype(float) - 5
+    dark = detector_with((1000, 1000), dark_e_s=5, hot_pixels=0.01, hot_e_s=3000).dark_e_s.astype(float) - 5
     hot = dark[dark > 0]
     assert len(hot) == pytest.approx(1e4, abs=4 * 1e2)
     assert stats.kstest(hot / 3000, "expon").pvalue > 1e-4
@@ -156,7 +152,7 @@ def test_the_fixed_pattern_is_the_chip_s_own() -> None:
         "hot_e_s": 100,
         "column_offset_e": 3,
     }
-    same, again, other = (chip(hardware_seed=seed, **spread) for seed in (4, 4, 5))
+    same, again, other = (detector_with(hardware_seed=seed, **spread) for seed in (4, 4, 5))
     for name in ("sensitivity", "dark_e_s", "column_offset_e"):
         np.testing.assert_array_equal(getattr(same, name), getattr(again, name))
         assert np.mean(getattr(same, name) == getattr(other, name)) < 0.01
@@ -173,7 +169,7 @@ def test_read_and_reset_noise_add_their_variances_and_the_rounding_a_twelfth() -
 
 
 def test_columns_have_offsets_that_stay() -> None:
-    made = chip(column_offset_e=6.0, read_noise_e=2.0)
+    made = detector_with(column_offset_e=6.0, read_noise_e=2.0)
     columns = expose(np.zeros(SHAPE), made).mean(axis=0) - 1000
     np.testing.assert_allclose(columns, made.column_offset_e, rtol=0, atol=5 * 2.1 / np.sqrt(SHAPE[0]))
     assert columns.std() == pytest.approx(6.0, rel=4 / np.sqrt(2 * SHAPE[1]))
@@ -195,7 +191,7 @@ def test_the_amplifier_bends_by_so_much_at_full_well() -> None:
 
 @pytest.mark.parametrize(("bits", "top"), [(8, 255), (12, 4095), (16, 65535)])
 def test_the_converter_ends_at_zero_and_at_all_ones(bits: int, top: int) -> None:
-    made = chip((16, 16), offset_dn=100, bits=bits, read_noise_e=500.0)
+    made = detector_with((16, 16), offset_dn=100, bits=bits, read_noise_e=500.0)
     dark = expose(np.zeros((16, 16)), made)
     assert dark.min() == 0
     assert dark.dtype == float
@@ -220,8 +216,8 @@ def test_read_noise_comes_after_the_well_and_so_shows_above_it() -> None:
 
 @pytest.mark.parametrize(("bits", "ends_at"), [(16, 4064.0), (12, 4064.0), (10, 1023.0)])
 def test_saturation_is_the_lower_of_well_and_converter(bits: int, ends_at: float) -> None:
-    made = chip((16, 16), full_well_e=40000, gain_e_dn=10, offset_dn=64, bits=bits)
-    assert detector.saturation_dn(made.part) == ends_at
+    made = detector_with((16, 16), full_well_e=40000, gain_e_dn=10, offset_dn=64, bits=bits)
+    assert detector.saturation_dn(made.config) == ends_at
     np.testing.assert_array_equal(expose(np.full((16, 16), 1e6), made), ends_at)
 
 
@@ -232,37 +228,33 @@ def spot(electrons: float) -> np.ndarray:
 
 
 def test_a_well_overflows_along_its_column_and_loses_nothing() -> None:
-    made = expose(spot(2e5), chip((64, 32), full_well_e=20000, blooming="column")) - 1000
+    made = expose(spot(2e5), detector_with((64, 32), full_well_e=20000, blooming="column")) - 1000
     assert made[:, 10].max() == 20000
     assert (made[:, 10] == 20000).sum() in (9, 10, 11)
     assert made.sum() == pytest.approx(2e5, abs=4 * np.sqrt(2e5))
     assert not made[:, np.arange(32) != 10].any()
-    drained = (
-        expose(spot(2e5), chip((64, 32), full_well_e=20000, blooming="column", anti_blooming=1.0)) - 1000
-    )
+    drained = expose(spot(2e5), detector_with((64, 32), full_well_e=20000, blooming="column", anti_blooming=1.0)) - 1000
     assert drained.sum() == 20000
 
 
 def test_transfers_leave_charge_behind_the_star() -> None:
     """31 parallel transfers of 1e-3 leave 3 % in the pixel that is read after it (away from the register)."""
-    made = (
-        np.mean([expose(spot(1e4), chip((64, 32), cti_parallel=1e-3), n) for n in range(60)], axis=0) - 1000
-    )
+    made = np.mean([expose(spot(1e4), detector_with((64, 32), cti_parallel=1e-3), n) for n in range(60)], axis=0) - 1000
     lost, error = 31 * 1e-3 * (1 - 1e-3) ** 31, np.sqrt(1e4 / 60)
     assert made[31, 10] == pytest.approx(1e4 * lost, abs=4 * error * lost + 0.3)
     assert made[30, 10] == pytest.approx(1e4 * (1 - 1e-3) ** 31, abs=4 * error)
     assert made.sum() == pytest.approx(1e4, abs=4 * error + 5)
-    quiet = expose(spot(1e4), chip((64, 32), cti_parallel=1e-3, noise=False)) - 1000
+    quiet = expose(spot(1e4), detector_with((64, 32), cti_parallel=1e-3, noise=False)) - 1000
     assert quiet[31, 10] == pytest.approx(1e4 * lost, rel=1e-9)  # the expectation knows of it
 
 
 def test_particles_add_their_tracks() -> None:
     shower = {"per_cm2_s": 4e4, "depth": "10 um"}
-    made = expose(np.zeros((64, 32)), chip((64, 32), particles=[shower])) - 1000
+    made = expose(np.zeros((64, 32)), detector_with((64, 32), particles=[shower])) - 1000
     struck = 4e4 * 0.05 * 64 * 32 * (5e-4) ** 2  # about one a frame of 64 x 32 pixels of 5 um
     assert struck == pytest.approx(1.0, abs=0.1)
     sums = [
-        (expose(np.zeros((64, 32)), chip((64, 32), particles=[shower]), n) - 1000).sum() for n in range(200)
+        (expose(np.zeros((64, 32)), detector_with((64, 32), particles=[shower]), n) - 1000).sum() for n in range(200)
     ]
     assert np.mean(np.array(sums) == 0) == pytest.approx(np.exp(-struck), abs=4 * np.sqrt(0.25 / 200) + 0.05)
     assert made.min() >= 0
@@ -279,7 +271,7 @@ def test_particles_add_their_tracks() -> None:
     ],
 )
 def test_a_shifted_frame_smears_its_columns(shutter: dict[str, Any], share: float) -> None:
-    quiet = chip((64, 32), shutter=shutter, noise=False, offset_dn=0)
+    quiet = detector_with((64, 32), shutter=shutter, noise=False, offset_dn=0)
     light_e = spot(1e6)
     detector.smear(light_e, 0.05, quiet.shutter)
     made = expose(light_e, quiet)
@@ -301,7 +293,7 @@ def test_without_noise_the_frame_is_the_expectation() -> None:
         "bits": 8,
         "full_well_e": 10,
     }
-    made = expose(mean_e, chip(**quiet), exposure_s=0.5)
+    made = expose(mean_e, detector_with(**quiet), exposure_s=0.5)
     np.testing.assert_allclose(made, (mean_e + 50) / 7 + 64, rtol=1e-15, atol=0)
 
 
@@ -317,9 +309,7 @@ def test_the_mean_of_many_frames_is_the_frame_without_noise() -> None:
     quiet = frame(1234.5, noise=False, **settings)
     mean = np.mean([frame(1234.5, seed, **settings) for seed in range(40)], axis=0)
     sigma = np.sqrt((1234.5 + 10 + 100) / 25 + 1 / 12) / np.sqrt(40)
-    assert ((mean - quiet) / sigma).std() == pytest.approx(
-        1, abs=0.15
-    )  # hot pixels and PRNU change sigma a little
+    assert ((mean - quiet) / sigma).std() == pytest.approx(1, abs=0.15)  # hot pixels and PRNU change sigma a little
     assert (mean - quiet).mean() == pytest.approx(0, abs=4 * sigma / np.sqrt(N))
 
 
@@ -328,16 +318,14 @@ import sys, numba, numpy as np
 from skysim.scene.camera import CameraConfig
 from skysim.camera.detector.detector import Detector, expose
 numba.set_num_threads(int(sys.argv[1]))
-made = Detector.of(CameraConfig.model_validate(eval(sys.argv[2])))
+made = Detector.from_camera(CameraConfig.model_validate(eval(sys.argv[2])))
 frames = [expose(np.full((64, 48), 100, np.float32), 0.05, made, np.random.default_rng(s)) for s in (4, 5)]
 sys.stdout.buffer.write(np.array(frames).tobytes())
 """
 
 
 def test_the_same_stream_gives_the_same_frame_on_any_number_of_threads() -> None:
-    part = repr(
-        LENS | {"height_px": 64, "width_px": 48, "detector": CLEAN | {"read_noise_e": 5, "prnu": 0.01}}
-    )
+    part = repr(LENS | {"height_px": 64, "width_px": 48, "detector": CLEAN | {"read_noise_e": 5, "prnu": 0.01}})
     alone, many = (
         np.frombuffer(
             subprocess.run(
@@ -358,11 +346,11 @@ def test_row_by_row_is_the_same_as_step_by_step() -> None:
     """A threshold of blooming that nothing reaches sends the frame the longer way."""
     light_e = np.random.default_rng(1).uniform(0, 3000, SHAPE)
     spread = {"read_noise_e": 5, "prnu": 0.01, "dark_e_s": 200, "dsnu": 0.3, "column_offset_e": 3}
-    short, long = (expose(light_e, chip(blooming=kind, **spread), 4) for kind in ("none", "column"))
+    short, long = (expose(light_e, detector_with(blooming=kind, **spread), 4) for kind in ("none", "column"))
     np.testing.assert_array_equal(short, long)
 
 
-def test_pixels_know_nothing_of_their_neighbours() -> None:
+def test_pixels_know_nothing_of_their_neighbors() -> None:
     made = frame(400.0, read_noise_e=10) - 1400
     for shifted in (made[:, 1:] * made[:, :-1], made[1:] * made[:-1]):
         assert shifted.mean() == pytest.approx(0, abs=4 * 500 / np.sqrt(N))
@@ -381,7 +369,7 @@ def test_signal_to_noise_is_what_repeated_photometry_scatters() -> None:
     """A flat image of 25 pixels, 40 e- each on a sky of 30: its sum over them in 400 frames."""
     light_e = np.full((64, 32), 30.0)
     light_e[28:33, 8:13] += 40
-    made = chip((64, 32), read_noise_e=10.0, gain_e_dn=12.0, offset_dn=20.0)
+    made = detector_with((64, 32), read_noise_e=10.0, gain_e_dn=12.0, offset_dn=20.0)
     told = detector.add_snr_and_saturation(seen(1000.0, 25.0, 40.0), light_e.astype(np.float32), 0.05, made)
     sums = [(expose(light_e, made, n)[28:33, 8:13]).sum() * 12.0 for n in range(400)]
     assert told.snr[0] == pytest.approx(1000 / np.std(sums), rel=4 / np.sqrt(2 * 400))
@@ -390,8 +378,6 @@ def test_signal_to_noise_is_what_repeated_photometry_scatters() -> None:
 
 @pytest.mark.parametrize(("peak_e", "full"), [(39000.0, False), (41000.0, True)])
 def test_a_source_is_saturated_where_its_brightest_pixel_is(peak_e: float, full: bool) -> None:
-    made = chip((64, 32), full_well_e=40000.0, gain_e_dn=10.0, offset_dn=64.0)
-    told = detector.add_snr_and_saturation(
-        seen(peak_e, 1.0, peak_e), spot(peak_e).astype(np.float32), 0.05, made
-    )
+    made = detector_with((64, 32), full_well_e=40000.0, gain_e_dn=10.0, offset_dn=64.0)
+    told = detector.add_snr_and_saturation(seen(peak_e, 1.0, peak_e), spot(peak_e).astype(np.float32), 0.05, made)
     assert told.saturated[0] == full

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from skysim.camera.psf.kernel import kernel
-from skysim.camera.psf.kernel_cache import GAUSS, GRID, ROUND, images, sharpness_px
+from skysim.camera.psf.kernel import build_kernel
+from skysim.camera.psf.kernel_cache import GAUSS, GRID, ROUND, sharpness_px, source_kernels
 from skysim.core.errors import InputError
 from skysim.scene.camera import CameraConfig
 
@@ -23,17 +23,17 @@ def camera(**changes: Any) -> CameraConfig:
 
 def shapes(lens: CameraConfig, radius_m: list[float], near: list[bool], distance_m: list[float]) -> Any:
     count = len(radius_m)
-    return images(
-        lens, np.tile(lens.centre_px, (count, 1)), np.array(radius_m), np.array(near), np.array(distance_m),
+    return source_kernels(
+        lens, np.tile(lens.center_px, (count, 1)), np.array(radius_m), np.array(near), np.array(distance_m),
         np.ones(count),
     )  # fmt: skip
 
 
-def test_a_star_in_focus_is_a_gaussian_and_a_lamp_a_disc() -> None:
+def test_a_star_in_focus_is_a_gaussian_and_a_lamp_a_disk() -> None:
     sharp = shapes(camera(focus="infinity"), [0.0], [False], [1.0])
     assert sharp.kind.tolist() == [GAUSS]
     both = shapes(camera(), [0.0, 1e-3], [False, True], [1.0, 1.0])
-    assert both.kind.tolist() == [ROUND, ROUND]  # focused on the lamp, the star is a disc of confusion
+    assert both.kind.tolist() == [ROUND, ROUND]  # focused on the lamp, the star is a disk of confusion
     assert both.reach_px[0] != both.reach_px[1]
 
 
@@ -53,15 +53,15 @@ def test_a_far_lamp_is_smaller() -> None:
 
 def test_a_gaussian_widens_towards_the_corner_and_keeps_its_reach() -> None:
     lens = camera(focus="infinity", psf={"kind": "gaussian", "sigma_px": 0.7, "corner_sigma_px": 2.4})
-    place = np.array([lens.centre_px, (-0.5, -0.5)])
-    made = images(lens, place, np.zeros(2), np.zeros(2, bool), np.ones(2), np.ones(2))
+    place = np.array([lens.center_px, (-0.5, -0.5)])
+    made = source_kernels(lens, place, np.zeros(2), np.zeros(2, bool), np.ones(2), np.ones(2))
     np.testing.assert_allclose(made.sigma_px, [0.7, 2.5], rtol=1e-12, atol=0)
     assert made.reach_px[1] >= 6.5 * 2.5
 
 
 def test_sharpness_is_a_gaussian_s_own_sigma_and_an_edge_s() -> None:
-    assert sharpness_px(kernel(camera().psf, camera())) == pytest.approx(np.sqrt(0.49 + 1 / 12), rel=1e-12)
-    edge = sharpness_px(kernel(camera().psf, camera(), emitter_radius_px=12.0))
+    assert sharpness_px(build_kernel(camera().psf, camera())) == pytest.approx(np.sqrt(0.49 + 1 / 12), rel=1e-12)
+    edge = sharpness_px(build_kernel(camera().psf, camera(), emitter_radius_px=12.0))
     assert edge == pytest.approx(1.25 * np.sqrt(0.49 + 1 / 12), rel=0.03)
 
 
@@ -72,10 +72,10 @@ def test_a_measured_image_is_a_grid(tmp_path: Any) -> None:
     assert shapes(lens, [0.0], [False], [1.0]).kind.tolist() == [GRID]
 
 
-def test_a_full_shelf_is_cleared_and_gives_the_same_images(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_cache_is_cleared_and_gives_the_same_images(monkeypatch: pytest.MonkeyPatch) -> None:
     first = shapes(camera(), [1e-3], [True], [1.0])
     table = first.tables[slice(*first.table[0, :2])].copy()
-    monkeypatch.setattr("skysim.camera.psf.kernel_cache.SHELF_BYTES", first.tables.nbytes - 1)
+    monkeypatch.setattr("skysim.camera.psf.kernel_cache.CACHE_BYTES", first.tables.nbytes - 1)
     again = shapes(camera(), [1e-3], [True], [1.0])
     np.testing.assert_array_equal(again.tables[slice(*again.table[0, :2])], table)
 

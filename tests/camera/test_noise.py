@@ -37,9 +37,7 @@ def chi_square(numbers: np.ndarray, probability: np.ndarray) -> float:
 
 
 # On both sides of the change of method at 16, in the middle and at the very edge of a guide's step.
-@pytest.mark.parametrize(
-    "mean", [0.0, 0.004, 0.25, 1.0, 2.9921875, 7.77, 15.999, 16.0, 17.3, 32.2, 100, 1e3, 4e4]
-)
+@pytest.mark.parametrize("mean", [0.0, 0.004, 0.25, 1.0, 2.9921875, 7.77, 15.999, 16.0, 17.3, 32.2, 100, 1e3, 4e4])
 def test_counts_are_poisson(mean: float) -> None:
     numbers = drawn_counts(mean, seed=int(mean * 1000)).astype(np.int64).ravel()
     law = stats.poisson.pmf(np.arange(int(mean + 12 * np.sqrt(mean)) + 12), np.float32(mean))
@@ -63,7 +61,7 @@ def test_the_ziggurat_s_layers_have_one_area() -> None:
     assert x[0] * height[1] == pytest.approx(tail, rel=1e-12)
 
 
-def test_neighbours_and_rows_know_nothing_of_each_other() -> None:
+def test_neighbors_and_rows_know_nothing_of_each_other() -> None:
     made = drawn_normals(3)
     for a, b in ((made[:, 1:], made[:, :-1]), (made[1:], made[:-1]), (made[:, 7:], made[:, :-7])):
         for power in (1, 2):

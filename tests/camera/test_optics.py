@@ -26,7 +26,7 @@ CAMERA = {
 
 
 def optics(**camera: object) -> Optics:
-    return Optics.of(CameraConfig.model_validate(CAMERA | camera))
+    return Optics.from_camera(CameraConfig.model_validate(CAMERA | camera))
 
 
 def rays(count: int, half_angle_deg: float, seed: int) -> np.ndarray:
@@ -36,7 +36,7 @@ def rays(count: int, half_angle_deg: float, seed: int) -> np.ndarray:
 
 def matrix(lens: Optics) -> np.ndarray:
     """OpenCV's camera matrix."""
-    focal, (x, y) = lens.camera.focal_px, lens.camera.centre_px
+    focal, (x, y) = lens.camera.focal_px, lens.camera.center_px
     return np.array([[focal, 0, x], [0, focal, y], [0, 0, 1]])
 
 
@@ -91,7 +91,7 @@ def test_strong_barrel_distortion_has_no_image_beyond_its_fold() -> None:
     assert (np.diff(x[inside]) > 0).all()
     assert np.isnan(x[~inside]).all()
     reach = lens.camera.focal_px * np.sqrt(1 / 0.9) * (1 - 0.3 / 0.9)
-    assert np.nanmax(x) - lens.camera.centre_px[0] == pytest.approx(reach, rel=1e-6)
+    assert np.nanmax(x) - lens.camera.center_px[0] == pytest.approx(reach, rel=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -142,9 +142,7 @@ def test_the_field_undoes_distortion(k1: float) -> None:
     aside = (corner - [300.0, 250.0]) / np.hypot(*(corner - [300.0, 250.0])) * np.tan(lens.field_rad)
     edge = np.array([[*aside, 1.0]])
     found, _ = cv2.projectPoints(edge, np.zeros(3), np.zeros(3), matrix(lens), np.array([k1, 0, 0, 0, 0.0]))
-    np.testing.assert_allclose(
-        found[0, 0], corner, rtol=0, atol=2e-3
-    )  # a table of 4,001 rows, linear between
+    np.testing.assert_allclose(found[0, 0], corner, rtol=0, atol=2e-3)  # a table of 4,001 rows, linear between
 
 
 def test_a_field_that_ends_before_the_corner_ends_at_the_fold() -> None:
@@ -187,7 +185,7 @@ def test_focus_obeys_newton_s_law(focus_m: float) -> None:
     lens = optics(focus=f"{focus_m} m")
     image_m = lens.camera.image_distance_m
     assert (focus_m - 0.025) * (image_m - 0.025) == pytest.approx(0.025**2, rel=1e-9)
-    x, _ = lens.project(np.array([0.01, 0, focus_m])) - lens.camera.centre_px
+    x, _ = lens.project(np.array([0.01, 0, focus_m])) - lens.camera.center_px
     assert x * 9.9e-6 == pytest.approx(0.01 * image_m / focus_m, rel=1e-12)
 
 
@@ -202,7 +200,7 @@ def test_a_point_s_light_falls_with_the_cosine_of_its_foreshortened_pupil() -> N
     """And not with cos^4, which is an extended source's."""
     angle = np.radians([0, 30, 60, 89, 90, 91, 180])
     wanted = [1, np.sqrt(0.75), 0.5, np.cos(np.radians(89)), 0, 0, 0]
-    np.testing.assert_allclose(optics().passed(np.cos(angle)), wanted, rtol=0, atol=1e-15)
+    np.testing.assert_allclose(optics().throughput(np.cos(angle)), wanted, rtol=0, atol=1e-15)
 
 
 def traced(field_rad: float, cutoff_rad: float) -> float:
@@ -222,24 +220,24 @@ def traced(field_rad: float, cutoff_rad: float) -> float:
 def test_two_stops_pass_the_rays_that_fit_through_both(share: float, cutoff_deg: float) -> None:
     field = np.arctan(share * np.tan(np.radians(cutoff_deg)))
     lens = optics(vignetting={"kind": "two_stops", "cutoff_deg": cutoff_deg})
-    passed = lens.passed(np.cos(field)) / np.cos(field)
+    throughput = lens.throughput(np.cos(field)) / np.cos(field)
     # 3.1 million rays; the rim's coarseness is worth a thousandth of a diameter.
-    assert passed == pytest.approx(traced(field, np.radians(cutoff_deg)), abs=5e-4)
+    assert throughput == pytest.approx(traced(field, np.radians(cutoff_deg)), abs=5e-4)
 
 
 def test_two_stops_by_hand() -> None:
-    """Discs a radius apart overlap by 2 / 3 - sqrt(3) / (2 pi) = .3910 of a disc; a whole diameter apart by nothing."""
+    """Disks a radius apart overlap by 2 / 3 - sqrt(3) / (2 pi) = .3910 of a disk; a whole diameter apart by nothing."""
     lens = optics(vignetting={"kind": "two_stops", "cutoff_deg": 45})
     field = np.array([0, np.arctan(0.5), np.pi / 4, 1.5, np.pi / 2, 3.0])
     wanted = [1, np.cos(field[1]) * (2 / 3 - np.sqrt(3) / (2 * np.pi)), 0, 0, 0, 0]
-    np.testing.assert_allclose(lens.passed(np.cos(field)), wanted, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(lens.throughput(np.cos(field)), wanted, rtol=0, atol=1e-12)
 
 
 def test_vignetting_starts_with_the_slope_of_two_circles() -> None:
-    """Near the axis a displacement of u diameters cuts off two lunes, 4 u / pi of the disc."""
-    part = optics(vignetting={"kind": "two_stops", "cutoff_deg": 45}).camera.vignetting
+    """Near the axis a displacement of u diameters cuts off two lunes, 4 u / pi of the disk."""
+    config = optics(vignetting={"kind": "two_stops", "cutoff_deg": 45}).camera.vignetting
     u = 1e-4
-    lost = 1 - VIGNETTING["two_stops"](part, np.array([np.arctan(u)]))[0]
+    lost = 1 - VIGNETTING["two_stops"](config, np.array([np.arctan(u)]))[0]
     assert lost == pytest.approx(4 * u / np.pi, rel=1e-6)
 
 
@@ -247,8 +245,8 @@ def test_a_table_of_transmission_is_linear_between_its_angles_and_level_beyond()
     measured = {"kind": "table", "angle_deg": [0, 5, 10], "transmission": [1.0, 0.9, 0.5]}
     angle_deg = np.array([0, 2, 5, 9, 10, 40])
     cosine = np.cos(np.radians(angle_deg))
-    passed = optics(vignetting=measured).passed(cosine) / cosine
-    np.testing.assert_allclose(passed, [1, 0.96, 0.9, 0.58, 0.5, 0.5], rtol=0, atol=1e-12)
+    throughput = optics(vignetting=measured).throughput(cosine) / cosine
+    np.testing.assert_allclose(throughput, [1, 0.96, 0.9, 0.58, 0.5, 0.5], rtol=0, atol=1e-12)
 
 
 def test_a_star_gives_the_light_that_passes() -> None:
@@ -257,9 +255,7 @@ def test_a_star_gives_the_light_that_passes() -> None:
     angle = np.radians([0.0, 8.0])
     place = np.column_stack([np.sin(angle), 0 * angle, np.cos(angle), 0 * angle])
     one, zero = np.ones(2), np.zeros(2)
-    stars = Sources(
-        np.arange(2), place, np.zeros((2, 3)), zero, 1e8 * one, one, zero, one, np.full(2, np.nan)
-    )
+    stars = Sources(np.arange(2), place, np.zeros((2, 3)), zero, 1e8 * one, one, zero, one, np.full(2, np.nan))
     still = Trajectory(np.array([0.0, 1.0]), Rotation.identity(2), np.zeros((2, 3)))
     image = np.zeros((493, 659))
     seen = render(image, stars, lens, still, Mount(np.zeros(3), Rotation.identity()), Window(0.0, 0.5))

@@ -1,4 +1,4 @@
-"""The lens's transfer functions, the defocus disc and the kernels, against theory and brute force."""
+"""The lens's transfer functions, the defocus disk and the kernels, against theory and brute force."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ import numpy as np
 import pytest
 from scipy import special
 from scipy.signal import fftconvolve
+from splatting import add_kernel
 
-from skysim.camera.psf import splat
-from skysim.camera.psf.kernel import Kernel, kernel, round_kernel
+from skysim.camera.psf.kernel import Kernel, build_kernel, round_kernel
 from skysim.camera.psf.otf import EXTENT, PSFS, airy_unit_px, blur_radius_px, cell_response, field_sigma_px
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
 from skysim.scene.camera import (
     AiryPsfConfig,
     CameraConfig,
-    DiscPsfConfig,
+    DiskPsfConfig,
     GaussianPsfConfig,
     MeasuredPsfConfig,
     MoffatPsfConfig,
@@ -44,24 +44,20 @@ def camera(**own: Any) -> CameraConfig:
 
 def draw(image: Kernel, x: float, y: float, size: int) -> Floats:
     patch = np.zeros((size, size))
-    splat.add(patch, 0, size, float(x), float(y), 1.0, image.sigma_px, image.radial, image.grid)
+    add_kernel(patch, 0, size, float(x), float(y), 1.0, image)
     return patch
 
 
 def profile(image: Kernel, radii: Floats) -> Floats:
     """The image along the x axis."""
-    return np.array(
-        [draw(image, 0.0, 0.0, 1)[0, 0] if r == 0 else draw(image, -r, 0.0, 1)[0, 0] for r in radii]
-    )
+    return np.array([draw(image, 0.0, 0.0, 1)[0, 0] if r == 0 else draw(image, -r, 0.0, 1)[0, 0] for r in radii])
 
 
 # --- defocus ---
 
 
 @pytest.mark.parametrize(("f_number", "diameter_px"), [(1.4, 249), (2.8, 124), (8, 43), (16, 22)])
-def test_reference_blur_of_an_led_under_a_lens_focused_at_infinity(
-    f_number: float, diameter_px: float
-) -> None:
+def test_reference_blur_of_an_led_under_a_lens_focused_at_infinity(f_number: float, diameter_px: float) -> None:
     lens = camera(f_number=f_number)
     assert 2 * blur_radius_px(lens, 33 * INCH_M) == pytest.approx(diameter_px, abs=0.5)
 
@@ -72,7 +68,7 @@ def test_reference_blur_of_an_led_a_little_farther_than_the_focus(f_number: floa
     assert 2 * blur_radius_px(lens, 33.287 * INCH_M) * 4.2 == pytest.approx(blur_um, abs=0.05)
 
 
-def test_reference_blur_of_a_star_a_tenth_of_a_millimetre_out_of_focus() -> None:
+def test_reference_blur_of_a_star_a_tenth_of_a_millimeter_out_of_focus() -> None:
     """Reference H11: chip 0.1 mm behind the focus of 25 mm f/1.4: 71 um, 7.2 px of 9.9 um."""
     focus_m = 1 / (1 / 0.025 - 1 / 0.0251)
     lens = camera(focal_length="25 mm", f_number=1.4, pixel="9.9 um", focus=f"{focus_m} m")
@@ -90,7 +86,7 @@ def test_the_blur_is_the_cone_s_section_at_the_chip() -> None:
     assert blur_radius_px(lens, 1.0) == pytest.approx(0, abs=1e-12)
 
 
-def test_the_field_blur_grows_from_the_centre_to_the_far_corner() -> None:
+def test_the_field_blur_grows_from_the_center_to_the_far_corner() -> None:
     lens, psf = camera(principal_point_px=[500.0, 700.0]), GaussianPsfConfig(corner_sigma_px=1.5)
     corner = np.array([1599.5, -0.5])  # the farthest of the four
     at = np.array([[500.0, 700.0], (corner + np.array([500, 700])) / 2, corner])
@@ -103,12 +99,12 @@ KINDS: dict[str, Psf] = {
     "gaussian": GaussianPsfConfig(sigma_px=0.8),
     "moffat": MoffatPsfConfig(kind="moffat", fwhm_px=2.0, beta=4.0),
     "airy": AiryPsfConfig(kind="airy"),
-    "disc": DiscPsfConfig(kind="disc", radius_px=3.0, sigma_px=0.6),
+    "disk": DiskPsfConfig(kind="disk", radius_px=3.0, sigma_px=0.6),
 }
 
 
 def density(psf: Psf, r: Floats) -> Floats:
-    """Textbook profiles, not normalised."""
+    """Textbook profiles, not normalized."""
     x = np.maximum(np.pi * r / airy_unit_px(KINDS["airy"], camera()), 1e-9)  # type: ignore[arg-type]
     alpha = 1 / np.sqrt(2**0.25 - 1)
     laws: dict[str, Floats] = {
@@ -156,7 +152,7 @@ def test_diffraction_is_that_of_the_working_f_number() -> None:
 def test_airy_s_first_dark_ring_and_what_is_in_it() -> None:
     """1.22 lambda N, and 83.8 % of the light (Born & Wolf 8.5), on pixels so small that they blur nothing."""
     lens, psf = camera(pixel="0.4 um"), AiryPsfConfig(kind="airy")
-    image = kernel(psf, lens)
+    image = build_kernel(psf, lens)
     unit = 0.55 * 8 / 0.4
     radii = np.linspace(0.9, 1.6, 281) * unit
     assert radii[np.argmin(profile(image, radii))] == pytest.approx(1.2197 * unit, abs=0.005 * unit)
@@ -168,11 +164,11 @@ def test_airy_s_first_dark_ring_and_what_is_in_it() -> None:
 
 
 def test_moffat_s_full_width_at_half_maximum() -> None:
-    image = kernel(MoffatPsfConfig(kind="moffat", fwhm_px=24.0, beta=3.0), camera())
-    centre, half, out = profile(image, np.array([0.0, 12.0, 36.0]))
+    image = build_kernel(MoffatPsfConfig(kind="moffat", fwhm_px=24.0, beta=3.0), camera())
+    center, half, out = profile(image, np.array([0.0, 12.0, 36.0]))
     # The pixel widens it by 1/12 px^2 of some 100.
-    assert half / centre == pytest.approx(0.5, abs=1e-3)
-    assert out / centre == pytest.approx((1 + 9 * (2 ** (1 / 3) - 1)) ** -3, abs=1e-3)
+    assert half / center == pytest.approx(0.5, abs=1e-3)
+    assert out / center == pytest.approx((1 + 9 * (2 ** (1 / 3) - 1)) ** -3, abs=1e-3)
 
 
 def brute(parts: list[Floats], fine: int, x: float, y: float, size: int) -> Floats:
@@ -191,8 +187,8 @@ def fine_grid(size: int, fine: int) -> tuple[Floats, Floats]:
     return np.meshgrid(at, at)
 
 
-def covered_disc(radius: float, size: int, fine: int) -> Floats:
-    """A uniform disc by the share of each cell that it covers, 8 x 8 points a cell."""
+def covered_disk(radius: float, size: int, fine: int) -> Floats:
+    """A uniform disk by the share of each cell that it covers, 8 x 8 points a cell."""
     x, y = fine_grid(size, fine)
     dots = (np.arange(8) - 3.5) / 8 / fine
     return np.asarray(sum(np.hypot(x + u, y + v) <= radius for u in dots for v in dots)) / 64
@@ -200,13 +196,13 @@ def covered_disc(radius: float, size: int, fine: int) -> Floats:
 
 @pytest.mark.parametrize("radii", [(4.3, 2.6), (3.0, 0.0), (6.0, 1.37)])
 @pytest.mark.parametrize("sigma_px", [0.25, 0.7])
-def test_discs_against_brute_force(radii: tuple[float, float], sigma_px: float) -> None:
+def test_disks_against_brute_force(radii: tuple[float, float], sigma_px: float) -> None:
     """Emitter x defocus x Gaussian x pixel, summed on a grid of 1/21 px, within 5e-4 of the peak."""
     size, fine = 25, 21  # odd: the middle cell is in the middle of the middle pixel
     grid_x, grid_y = fine_grid(size, fine)
     parts = [np.exp(-(grid_x**2 + grid_y**2) / (2 * sigma_px**2))]
-    parts += [covered_disc(radius, size, fine) for radius in radii if radius]
-    image = kernel(GaussianPsfConfig(sigma_px=sigma_px), camera(), 0, *radii)
+    parts += [covered_disk(radius, size, fine) for radius in radii if radius]
+    image = build_kernel(GaussianPsfConfig(sigma_px=sigma_px), camera(), 0, *radii)
     for x, y in ((0, 0), (8 / 21, -3 / 21), (-10 / 21, 10 / 21)):
         wanted = brute(parts, fine, x, y, size)
         made = draw(image, size // 2 + x, size // 2 + y, size)
@@ -215,9 +211,9 @@ def test_discs_against_brute_force(radii: tuple[float, float], sigma_px: float) 
 
 def test_blurs_add_in_quadrature() -> None:
     lens, half = camera(), 12
-    apart = kernel(DiscPsfConfig(kind="disc", radius_px=3.0, sigma_px=0.3), lens, extra_sigma_px=0.4)
-    together = kernel(DiscPsfConfig(kind="disc", radius_px=3.0, sigma_px=0.5), lens)
-    emitter = kernel(GaussianPsfConfig(sigma_px=0.3), lens, 0.4, 3.0)
+    apart = build_kernel(DiskPsfConfig(kind="disk", radius_px=3.0, sigma_px=0.3), lens, extra_sigma_px=0.4)
+    together = build_kernel(DiskPsfConfig(kind="disk", radius_px=3.0, sigma_px=0.5), lens)
+    emitter = build_kernel(GaussianPsfConfig(sigma_px=0.3), lens, 0.4, 3.0)
     for x, y in PLACES + half:
         wanted = draw(together, x, y, 25)
         for image in (apart, emitter):
@@ -226,15 +222,15 @@ def test_blurs_add_in_quadrature() -> None:
 
 def test_a_kernel_is_made_once_for_sizes_that_are_all_but_equal() -> None:
     lens, psf = camera(), GaussianPsfConfig(sigma_px=0.7)
-    assert kernel(psf, lens, 0.1, 5.001, 2.0) is kernel(psf, lens, 0.1, 5.004, 2.0)
-    assert kernel(psf, lens, 0.1, 5.001, 2.0) is not kernel(psf, lens, 0.1, 5.02, 2.0)
+    assert build_kernel(psf, lens, 0.1, 5.001, 2.0) is build_kernel(psf, lens, 0.1, 5.004, 2.0)
+    assert build_kernel(psf, lens, 0.1, 5.001, 2.0) is not build_kernel(psf, lens, 0.1, 5.02, 2.0)
 
 
 def test_a_sharp_point_gets_a_grid_and_a_soft_one_tables() -> None:
     lens = camera(f_number=1.4, pixel="9.9 um")
     assert round_kernel(AiryPsfConfig(kind="airy"), lens, 0, 0, 0) is None
-    assert len(kernel(AiryPsfConfig(kind="airy"), lens).grid)
-    assert len(kernel(AiryPsfConfig(kind="airy", sigma_px=0.6), lens).radial)
+    assert len(build_kernel(AiryPsfConfig(kind="airy"), lens).grid)
+    assert len(build_kernel(AiryPsfConfig(kind="airy", sigma_px=0.6), lens).radial)
 
 
 # --- a measured lens ---
@@ -246,9 +242,7 @@ def cells(tmp_path: Path, table: Floats, name: str = "psf.csv") -> str:
     return str(path)
 
 
-def gaussian_cells(
-    sigma_px: float, oversampling: int, half_px: int, x: float = 0.0, y: float = 0.0
-) -> Floats:
+def gaussian_cells(sigma_px: float, oversampling: int, half_px: int, x: float = 0.0, y: float = 0.0) -> Floats:
     """The light of a Gaussian on cells of 1 / oversampling px."""
     edges = np.linspace(-half_px, half_px, 2 * half_px * oversampling + 1)
     across, down = (np.diff(special.erf((edges - at) / (sigma_px * np.sqrt(2)))) / 2 for at in (x, y))
@@ -262,30 +256,30 @@ def test_a_measured_gaussian_is_that_gaussian(tmp_path: Path, sigma_px: float, o
         file=cells(tmp_path, gaussian_cells(sigma_px, oversampling, 7)),
         oversampling=oversampling,
     )
-    image, wanted = kernel(psf, camera()), kernel(GaussianPsfConfig(sigma_px=sigma_px), camera())
+    image, wanted = build_kernel(psf, camera()), build_kernel(GaussianPsfConfig(sigma_px=sigma_px), camera())
     for x, y in PLACES + 10:
         peak = draw(wanted, x, y, 21)
         np.testing.assert_allclose(draw(image, x, y, 21), peak, rtol=0, atol=5e-4 * peak.max())
 
 
 def test_a_star_measured_in_whole_pixels_gives_its_image_back(tmp_path: Path) -> None:
-    """Oversampling 1: the image itself where it was measured, centred on its centre of gravity."""
+    """Oversampling 1: the image itself where it was measured, centered on its center of gravity."""
     table = np.array([[0, 1, 1, 0, 0], [1, 6, 9, 2, 0], [1, 9, 20, 8, 1], [0, 3, 7, 4, 1], [0, 0, 1, 1, 0.0]])
     table /= table.sum()
     x, y = table.sum(axis=0) @ np.arange(5), table.sum(axis=1) @ np.arange(5)
-    image = kernel(MeasuredPsfConfig(kind="measured", file=cells(tmp_path, table)), camera())
+    image = build_kernel(MeasuredPsfConfig(kind="measured", file=cells(tmp_path, table)), camera())
     patch = draw(image, 10 + x, 10 + y, 25)
     np.testing.assert_allclose(patch[10:15, 10:15], table, rtol=0, atol=5e-3 * table.max())
     assert patch.sum() == pytest.approx(1, abs=1e-5)
 
 
-def test_a_measured_image_keeps_its_handedness_and_its_centre(tmp_path: Path) -> None:
-    """A core and a fainter blob to its lower right, drawn with its centre of gravity at (x, y)."""
+def test_a_measured_image_keeps_its_handedness_and_its_center(tmp_path: Path) -> None:
+    """A core and a fainter blob to its lower right, drawn with its center of gravity at (x, y)."""
     table = gaussian_cells(0.8, 4, 8) + 0.25 * gaussian_cells(0.8, 4, 8, x=3.0, y=2.0)
     psf = MeasuredPsfConfig(kind="measured", file=cells(tmp_path, table), oversampling=4)
     index = np.arange(41)
     for x, y in PLACES + 20:
-        patch = draw(kernel(psf, camera()), x, y, 41)
+        patch = draw(build_kernel(psf, camera()), x, y, 41)
         np.testing.assert_allclose([(patch @ index).sum(), (index @ patch).sum()], [x, y], rtol=0, atol=2e-3)
         third = (((index - x) ** 3) @ patch.sum(axis=0), ((index - y) ** 3) @ patch.sum(axis=1))
         assert third[0] > third[1] > 0.5
@@ -294,7 +288,7 @@ def test_a_measured_image_keeps_its_handedness_and_its_centre(tmp_path: Path) ->
 def test_mirroring_a_measured_lens_mirrors_its_image(tmp_path: Path) -> None:
     table = gaussian_cells(0.8, 4, 8) + 0.25 * gaussian_cells(0.8, 4, 8, x=3.0, y=2.0)
     there, back = (
-        kernel(
+        build_kernel(
             MeasuredPsfConfig(kind="measured", file=cells(tmp_path, t, name), oversampling=4),
             camera(),
             0,
@@ -327,7 +321,12 @@ def test_a_measured_lens_is_read_from_fits_and_png_too(tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "psf.png"), table)
     files = [cells(tmp_path, table.astype(float)), str(tmp_path / "psf.fits"), str(tmp_path / "psf.png")]
     csv, *others = (
-        draw(kernel(MeasuredPsfConfig(kind="measured", file=file, oversampling=4), camera()), 10.2, 9.9, 21)
+        draw(
+            build_kernel(MeasuredPsfConfig(kind="measured", file=file, oversampling=4), camera()),
+            10.2,
+            9.9,
+            21,
+        )
         for file in files
     )
     for other in others:
@@ -342,19 +341,17 @@ def test_a_measured_lens_is_read_from_fits_and_png_too(tmp_path: Path) -> None:
         ("oblong.csv", "1,2,3\n4,5,6\n", "shape (2, 3); allowed: a square"),
         ("dark.csv", "0,0,0\n0,0,0\n0,0,0\n", "add up to 0; allowed"),
         ("hole.csv", "1,2,3\n4,nan,6\n7,8,9\n", "add up to nan; allowed"),
-        ("cut.fits", "SIMPLE  =", "not a whole FITS file"),
+        ("cut.fits", "SIMPLE  =", "not a complete FITS file"),
         ("cut.png", "no picture", "cannot be decoded"),
-        ("psf.docx", "x", "not an image by its name"),
+        ("psf.docx", "x", "unknown image suffix"),
     ],
 )
-def test_a_file_that_is_no_psf_is_told_in_one_line(
-    tmp_path: Path, name: str, text: str | None, said: str
-) -> None:
+def test_a_file_that_is_no_psf_is_told_in_one_line(tmp_path: Path, name: str, text: str | None, said: str) -> None:
     path = tmp_path / name
     written = [path.write_text(line) for line in ([] if text is None else [text])]
     assert len(written) == (text is not None)
     with pytest.raises(InputError) as caught:
-        kernel(MeasuredPsfConfig(kind="measured", file=str(path)), camera())
+        build_kernel(MeasuredPsfConfig(kind="measured", file=str(path)), camera())
     message = str(caught.value)
     assert message.startswith("camera.psf.file: ")
     assert said in message

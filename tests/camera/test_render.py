@@ -18,19 +18,19 @@ from skysim.camera.optics import Optics
 from skysim.camera.render import Window, render
 from skysim.core.errors import InputError
 from skysim.core.types import Floats, Mount, Sources, SourceTruth, Trajectory
-from skysim.dynamics import jitter
+from skysim.dynamics.jitter import Vibration
 from skysim.scene import loader
 from skysim.scene.camera import CameraConfig
 from skysim.scene.leds import CosineLobeConfig
-from skysim.scene.motion import JitterLineConfig
+from skysim.scene.motion import JitterLineConfig, MotionConfig
 from skysim.sources.dome.led import Emitter
 from skysim.sources.photometry import SUN, Band, led_strength_e_s_sr, star_flux_e_s_m2
 
-FLAT = Band.of(1.0)
+FLAT = Band.from_efficiency(1.0)
 
 
 def lens_of(collecting_m2: float = 1.0, **changes: Any) -> Optics:
-    """A camera of 64 x 48 pixels, 2,500 px of focal length, sigma .7 px, its pupil taken for a square metre."""
+    """A camera of 64 x 48 pixels, 2,500 px of focal length, sigma .7 px, its pupil taken for a square meter."""
     part = {
         "width_px": 64,
         "height_px": 48,
@@ -40,17 +40,17 @@ def lens_of(collecting_m2: float = 1.0, **changes: Any) -> Optics:
         "psf": {"kind": "gaussian", "sigma_px": 0.7},
         "detector": {"quantum_efficiency": 0.5, "full_well_e": 4e4, "gain_e_dn": 10, "bits": 12},
     }
-    return replace(Optics.of(CameraConfig.model_validate(part | changes)), collecting_m2=collecting_m2)
+    return replace(Optics.from_camera(CameraConfig.model_validate(part | changes)), collecting_m2=collecting_m2)
 
 
 def blurred(sigma_px: float, radius_px: float = 0.0) -> Optics:
-    """The same with another Gaussian, or a disc with a Gaussian edge."""
-    kind = {"kind": "disc", "radius_px": radius_px} if radius_px else {"kind": "gaussian"}
+    """The same with another Gaussian, or a disk with a Gaussian edge."""
+    kind = {"kind": "disk", "radius_px": radius_px} if radius_px else {"kind": "gaussian"}
     return lens_of(psf=kind | {"sigma_px": sigma_px})
 
 
 LENS = lens_of()
-AT_CENTRE = Mount(np.zeros(3), Rotation.identity())  # camera axes are the body's: it looks along lab z
+AT_CENTER = Mount(np.zeros(3), Rotation.identity())  # camera axes are the body's: it looks along lab z
 
 
 def turning(rate_rad_s: Floats | list[float], start: Rotation | None = None) -> Trajectory:
@@ -64,7 +64,7 @@ STILL = turning([0, 0, 0])
 
 
 def light(**fields: object) -> Sources:
-    """One star on the boresight of one photon per second and square metre, but for what is given."""
+    """One star on the boresight of one photon per second and square meter, but for what is given."""
     made = {
         "id": np.array([7]),
         "place": np.array([[0.0, 0.0, 1.0, 0.0]]),
@@ -79,8 +79,8 @@ def light(**fields: object) -> Sources:
 
 
 def star_at(x_px: float, y_px: float, electrons: float = 1.0, lens: Optics = LENS) -> Sources:
-    """A star whose light through a square metre, in a second, is `electrons`."""
-    place = np.array([*(np.array([x_px, y_px]) - lens.camera.centre_px) / lens.camera.focal_px, 1])
+    """A star whose light through a square meter, in a second, is `electrons`."""
+    place = np.array([*(np.array([x_px, y_px]) - lens.camera.center_px) / lens.camera.focal_px, 1])
     place /= np.linalg.norm(place)
     return light(place=[[*place, 0.0]], strength=[electrons / place[2]])
 
@@ -100,7 +100,7 @@ def draw(
     window: Window,
     trajectory: Trajectory | None = None,
     lens: Optics = LENS,
-    mount: Mount = AT_CENTRE,
+    mount: Mount = AT_CENTER,
     emitter: Emitter | None = None,
 ) -> tuple[Floats, SourceTruth]:
     image = np.zeros((lens.camera.height_px, lens.camera.width_px))
@@ -111,7 +111,7 @@ def shot(
     source: Sources,
     trajectory: Trajectory | None = None,
     lens: Optics = LENS,
-    mount: Mount = AT_CENTRE,
+    mount: Mount = AT_CENTER,
     exposure_s: float = 1.0,
 ) -> tuple[Floats, SourceTruth]:
     """An exposure whose middle is at 0.5 s."""
@@ -140,7 +140,7 @@ def test_a_still_star_keeps_every_electron(xy: tuple[float, float], sigma_px: fl
 
 @pytest.mark.parametrize("radius_px", [0.05, 0.3, 0.7, 1.5, 2.0, 2.2, 3.0, 6.0, 12.0])
 @pytest.mark.parametrize("sigma_px", [0.6, 1.0])
-def test_a_disc_of_any_size_keeps_every_electron(radius_px: float, sigma_px: float) -> None:
+def test_a_disk_of_any_size_keeps_every_electron(radius_px: float, sigma_px: float) -> None:
     lens = blurred(sigma_px, radius_px)
     image, _ = shot(star_at(30.83, 23.37, 1e4), lens=lens)
     assert image.sum() == pytest.approx(1e4, rel=1e-5)
@@ -153,7 +153,7 @@ def test_a_smeared_star_keeps_every_electron() -> None:
     assert image.sum() == pytest.approx(1e4, rel=1.5e-5)
 
 
-def test_a_smeared_disc_keeps_every_electron() -> None:
+def test_a_smeared_disk_keeps_every_electron() -> None:
     lens = blurred(0.7, 5.0)
     image, _ = shot(star_at(31.5, 23.5, 1e4), turning([8 / 2500, 12 / 2500, 0]), lens)
     assert image.sum() == pytest.approx(1e4, rel=1e-4)
@@ -224,7 +224,7 @@ def test_a_star_is_a_gaussian_integrated_over_each_pixel(sigma_px: float, fine: 
     )
 
 
-def disc_image(x_px: float, y_px: float, radius_px: float, sigma_px: float) -> Floats:
+def disk_image(x_px: float, y_px: float, radius_px: float, sigma_px: float) -> Floats:
     """The true convolution: a bivariate normal's probability of falling in a circle is a non-central chi-square's;
     its mean over a pixel from 5 x 5 places by Gauss-Legendre."""
     node, weight = np.polynomial.legendre.leggauss(5)
@@ -238,15 +238,15 @@ def disc_image(x_px: float, y_px: float, radius_px: float, sigma_px: float) -> F
 
 
 @pytest.mark.parametrize("radius_px", [0.3, 1.0, 2.0, 2.9, 3.3, 5.0, 10.4])
-def test_a_disc_is_the_convolution_of_disc_and_gaussian(radius_px: float) -> None:
+def test_a_disk_is_the_convolution_of_disk_and_gaussian(radius_px: float) -> None:
     lens = blurred(1.0, radius_px)
     image, _ = shot(star_at(30.83, 23.37), lens=lens)
-    true = disc_image(30.83, 23.37, radius_px, 1.0)
+    true = disk_image(30.83, 23.37, radius_px, 1.0)
     assert np.abs(image - true).max() < 5e-4 * true.max()
 
 
 @pytest.mark.parametrize("radius_px", [1.5, 2.9, 3.3, 10.4])
-def test_a_disc_s_centroid_is_its_projected_pixel(radius_px: float) -> None:
+def test_a_disk_s_centroid_is_its_projected_pixel(radius_px: float) -> None:
     lens = blurred(1.0, radius_px)
     image, _ = shot(star_at(30.83, 23.37), lens=lens)
     np.testing.assert_allclose(moments(image)[0], [30.83, 23.37], rtol=0, atol=1e-5)
@@ -255,7 +255,7 @@ def test_a_disc_s_centroid_is_its_projected_pixel(radius_px: float) -> None:
 @pytest.mark.parametrize(("pixel_um", "distance_in"), [(4.0, 33), (4.2, 33), (4.2, 66)])
 def test_an_led_s_image_has_the_diameter_of_thin_geometry(pixel_um: float, distance_in: float) -> None:
     """2 mm through 35 mm: 2 mm x f / (u - f) / pixel, in focus. Read off the image's second moments: the variance of
-    a disc is a quarter of its radius squared, the blur's and the pixel's are added."""
+    a disk is a quarter of its radius squared, the blur's and the pixel's are added."""
     distance_m = distance_in * 0.0254
     psf = {"kind": "gaussian", "sigma_px": 1.0}
     lens = lens_of(pixel=f"{pixel_um} um", focal_length="35 mm", focus=f"{distance_in} in", psf=psf)
@@ -286,9 +286,7 @@ def test_a_smeared_star_is_as_long_as_its_path_and_stands_at_mid_exposure(length
     np.testing.assert_allclose(seen.flux_xy_px, [[31.5, 23.5]], rtol=0, atol=1e-9)
     np.testing.assert_allclose(mean, [31.5, 23.5], rtol=0, atol=1e-4)  # the S-curve of sigma .7 is 2e-5
     along = 0.7**2 + 1 / 12 + length_px**2 / 12
-    np.testing.assert_allclose(
-        variance, [along, 0.7**2 + 1 / 12], rtol=0, atol=2e-4
-    )  # the same of the second moment
+    np.testing.assert_allclose(variance, [along, 0.7**2 + 1 / 12], rtol=0, atol=2e-4)  # the same of the second moment
 
 
 def test_stars_move_against_the_camera() -> None:
@@ -306,9 +304,7 @@ def test_a_roll_leaves_the_boresight_and_swings_the_rest_by_radius_times_angle()
     assert aside.streak_px[0] == pytest.approx(20 * 0.2, rel=1e-3)
 
 
-@pytest.mark.parametrize(
-    ("length_px", "ratio"), [(2, 0.78), (3, 0.61), (4.41, 0.43), (8.8, 0.22), (15, 0.13)]
-)
+@pytest.mark.parametrize(("length_px", "ratio"), [(2, 0.78), (3, 0.61), (4.41, 0.43), (8.8, 0.22), (15, 0.13)])
 def test_the_peak_of_a_smeared_star_is_that_of_the_line_integral(length_px: float, ratio: float) -> None:
     # Reference §3, sigma .7: peak relative to the still star's.
     def share(x: float) -> float:
@@ -318,9 +314,7 @@ def test_the_peak_of_a_smeared_star_is_that_of_the_line_integral(length_px: floa
     _, still = shot(star_at(31.0, 23.0))
     _, smeared = shot(star_at(31.0, 23.0), turning([0, length_px / 2500, 0]))
     measured = float(smeared.peak_e[0] / still.peak_e[0])
-    assert measured == pytest.approx(
-        exact, rel=2e-3
-    )  # parts of a quarter pixel: (0.25 / 0.7)^2 / 24 at the ends
+    assert measured == pytest.approx(exact, rel=2e-3)  # parts of a quarter pixel: (0.25 / 0.7)^2 / 24 at the ends
     assert measured == pytest.approx(ratio, abs=0.03)
 
 
@@ -343,9 +337,7 @@ def test_a_streak_is_the_integral_of_its_moments(angle_deg: float) -> None:
 
 @pytest.mark.parametrize("length_px", [0.9, 3.0, 9.0, 21.0])
 @pytest.mark.parametrize("radius_px", [1.0, 2.5, 10.0])
-def test_a_smeared_disc_has_converged(
-    monkeypatch: pytest.MonkeyPatch, radius_px: float, length_px: float
-) -> None:
+def test_a_smeared_disk_has_converged(monkeypatch: pytest.MonkeyPatch, radius_px: float, length_px: float) -> None:
     """In pieces of a twentieth the image is no other one."""
     path = turning([0.6 * length_px / 2500, 0.8 * length_px / 2500, 0])
     usual, _ = shot(star_at(31.3, 23.1), path, blurred(0.8, radius_px))
@@ -384,9 +376,7 @@ def test_stars_that_cross_the_field_between_two_looks_are_not_missed() -> None:
     stars = [light(place=[[np.sin(a), 0, np.cos(a), 0]]) for a in around]
     ring = Sources(*(np.concatenate([getattr(s, f) for s in stars]) for f in Sources.__slots__))
     t = np.linspace(0, 3, 3001)
-    spin = Trajectory(
-        t, Rotation.from_rotvec(np.outer(t, [0, 2 * np.pi, 0])), np.tile([0, 2 * np.pi, 0], (len(t), 1))
-    )
+    spin = Trajectory(t, Rotation.from_rotvec(np.outer(t, [0, 2 * np.pi, 0])), np.tile([0, 2 * np.pi, 0], (len(t), 1)))
     lens = lens_of(pixel="250 um", psf={"kind": "gaussian", "sigma_px": 0.7})
     _, seen = draw(ring, Window(1.0, 1.0), spin, lens)
     assert len(seen.id) == len(around)
@@ -400,7 +390,7 @@ def test_an_led_s_electrons_are_those_of_the_reference() -> None:
     # Reference §2: 0.6 cd, 33 in, 35 mm at f/8, T .85, QE .30: 3.1e7 electrons a millisecond.
     pupil_m2 = np.pi / 4 * (0.035 / 8) ** 2 * 0.85
     lens = lens_of(pupil_m2, pixel="4.2 um", focal_length="35 mm", focus="33 in")
-    source = led_at(0, 0, 33 * 0.0254, strength=[float(led_strength_e_s_sr(0.6, "white", Band.of(0.30)))])
+    source = led_at(0, 0, 33 * 0.0254, strength=[float(led_strength_e_s_sr(0.6, "white", Band.from_efficiency(0.30)))])
     image, _ = draw(source, Window(0.1, 1e-3), lens=lens)
     assert image.sum() == pytest.approx(3.1e7, rel=0.02)  # two digits
 
@@ -491,9 +481,7 @@ def test_a_rolling_shutter_sees_still_light_as_a_global_one_does() -> None:
 def test_a_rolling_shutter_shears_what_moves() -> None:
     """Every row sees the star where it is at its own time: the speed times the rows' time, to the left."""
     speed_px_s, row_time_s = 200.0, 2e-3
-    image, seen = draw(
-        star_at(31.5, 23.5), Window(0.45, 1e-3, row_time_s), turning([0, speed_px_s / 2500, 0])
-    )
+    image, seen = draw(star_at(31.5, 23.5), Window(0.45, 1e-3, row_time_s), turning([0, speed_px_s / 2500, 0]))
     rows = np.arange(21, 27)
     middle = (image[rows] @ np.arange(64)) / image[rows].sum(axis=1)
     np.testing.assert_allclose(np.diff(middle), -speed_px_s * row_time_s, rtol=0, atol=2e-3)
@@ -521,8 +509,8 @@ def test_a_rolling_shutter_bands_a_pulsed_led() -> None:
 
 
 def test_jitter_widens_a_star_by_its_own_variance() -> None:
-    shake = JitterLineConfig(kind="line", frequency_hz=40.0, rms_arcsec=(60.0, 120.0, 0.0))
-    shaken = jitter.shake(STILL, [shake], np.random.default_rng(4))
+    line = JitterLineConfig(kind="line", frequency_hz=40.0, rms_arcsec=(60.0, 120.0, 0.0))
+    shaken = Vibration.draw(MotionConfig(jitter=(line,)), np.random.default_rng(4)).add_to(STILL)
     image, seen = shot(star_at(31.5, 23.5), shaken)  # forty whole periods
     wide = (np.radians([120 / 3600, 60 / 3600]) * 2500) ** 2  # about y it swings along x
     np.testing.assert_allclose(moments(image)[1], 0.7**2 + 1 / 12 + wide, rtol=2e-3, atol=0)
@@ -543,9 +531,7 @@ def test_a_step_of_the_attitude_draws_two_stars() -> None:
 def test_an_exposure_of_too_many_attitude_samples_is_refused() -> None:
     t = np.linspace(0, 3, 60_000)
     fine = Trajectory(t, Rotation.identity(len(t)), np.zeros((len(t), 3)))
-    with pytest.raises(
-        InputError, match=r"exposure\.time: 2 s holds \d+ samples of the attitude; allowed: 32769"
-    ):
+    with pytest.raises(InputError, match=r"exposure\.time: 2 s holds \d+ samples of the attitude; allowed: 32769"):
         draw(light(), Window(0.1, 2.0), fine)
 
 
@@ -553,10 +539,8 @@ def test_an_exposure_of_too_many_attitude_samples_is_refused() -> None:
 
 
 @pytest.mark.parametrize(("focus", "radius_px"), [("33 in", 0.0), ("infinity", None)])
-def test_an_led_out_of_focus_is_blurred_by_the_circle_of_confusion(
-    focus: str, radius_px: float | None
-) -> None:
-    """A (v - f) / v of a lens focused at infinity; variances of discs, a quarter of the radii squared, add."""
+def test_an_led_out_of_focus_is_blurred_by_the_circle_of_confusion(focus: str, radius_px: float | None) -> None:
+    """A (v - f) / v of a lens focused at infinity; variances of disks, a quarter of the radii squared, add."""
     lens = lens_of(pixel="40 um", focal_length="35 mm", focus=focus)
     image, _ = shot(led_at(0, 0, 33 * 0.0254, 1e-3), lens=lens)
     v = 1 / (1 / 35e-3 - 1 / (33 * 0.0254))
@@ -578,9 +562,7 @@ def test_blur_grows_to_its_value_in_the_corner() -> None:
 
 
 def test_vignetting_dims_a_star_and_an_led_alike() -> None:
-    lens = lens_of(
-        pixel="250 um", vignetting={"kind": "table", "angle_deg": [0, 20], "transmission": [1, 0.6]}
-    )
+    lens = lens_of(pixel="250 um", vignetting={"kind": "table", "angle_deg": [0, 20], "transmission": [1, 0.6]})
     plain = lens_of(pixel="250 um")
     for source in (star_at(41.5, 23.5, lens=plain), led_at(0.1, 0, 1.0, 1e-5)):
         ratio = shot(source, lens=lens)[1].electrons[0] / shot(source, lens=plain)[1].electrons[0]
@@ -591,9 +573,7 @@ def test_a_lobe_dims_an_led_seen_aslant() -> None:
     source = led_at(0.2, 0, 1.0, 1e-5)
     lens = lens_of(pixel="250 um")
     lambert, narrow = (
-        draw(source, Window(0.1, 0.1), lens=lens, emitter=Emitter(lobe=CosineLobeConfig(exponent=n)))[
-            1
-        ].electrons[0]
+        draw(source, Window(0.1, 0.1), lens=lens, emitter=Emitter(lobe=CosineLobeConfig(exponent=n)))[1].electrons[0]
         for n in (1.0, 7.0)
     )
     assert narrow / lambert == pytest.approx(np.cos(np.arctan(0.2)) ** 6, rel=1e-6)
@@ -624,9 +604,9 @@ def fitted(frames: Floats, x_px: float, y_px: float, electrons: float, read_nois
 
     def edge(at: Floats) -> tuple[Floats, Floats]:
         u = (grid[:, None] + np.array([-0.5, 0.5]) - at[:, None, None]) / 0.7
-        return np.diff(erf(u / np.sqrt(2)))[..., 0] / 2, -np.diff(np.exp(-(u**2) / 2))[
-            ..., 0
-        ] / 0.7 / np.sqrt(2 * np.pi)
+        return np.diff(erf(u / np.sqrt(2)))[..., 0] / 2, -np.diff(np.exp(-(u**2) / 2))[..., 0] / 0.7 / np.sqrt(
+            2 * np.pi
+        )
 
     for _ in range(12):
         (px, dx), (py, dy) = edge(x), edge(y)
@@ -650,12 +630,10 @@ def fitted(frames: Floats, x_px: float, y_px: float, electrons: float, read_nois
         (50, 1e3, 0.148), (50, 3e3, 0.051), (50, 1e4, 0.017), (50, 1e5, 0.0031),
     ],
 )  # fmt: skip
-def test_centroids_follow_the_cramer_rao_bound(
-    read_noise_e: float, electrons: float, bound_px: float
-) -> None:
+def test_centroids_follow_the_cramer_rao_bound(read_noise_e: float, electrons: float, bound_px: float) -> None:
     """Reference §3, sigma .7: within a tenth, 600 stars at 30 places within a pixel, through optics and detector."""
     rng, errors = np.random.default_rng(int(electrons + read_noise_e)), []
-    chip = Detector.of(
+    detector = Detector.from_camera(
         lens_of(
             width_px=16, height_px=16,
             detector={"quantum_efficiency": 0.5, "full_well_e": 1e6, "gain_e_dn": 1, "bits": 16,
@@ -665,7 +643,7 @@ def test_centroids_follow_the_cramer_rao_bound(
     lens = lens_of(width_px=16, height_px=16)
     for x, y in rng.uniform(7, 8, (30, 2)):
         image, _ = shot(star_at(x, y, electrons, lens), lens=lens)
-        frames = np.array([expose(image.astype(np.float32), 1.0, chip, rng) for _ in range(20)]) - 500.0
+        frames = np.array([expose(image.astype(np.float32), 1.0, detector, rng) for _ in range(20)]) - 500.0
         errors.append(fitted(frames, x, y, electrons, np.hypot(read_noise_e, np.sqrt(1 / 12))) - [x, y])
     assert np.std(np.concatenate(errors)) == pytest.approx(bound_px, rel=0.1)
 
@@ -675,7 +653,7 @@ def test_centroids_follow_the_cramer_rao_bound(
 
 def test_a_star_of_magnitude_zero_gives_liebe_s_electrons() -> None:
     # Reference §2: 19,100 e-/s/mm2 with QE x T = .34.
-    source = light(strength=[float(star_flux_e_s_m2(0.0, *SUN, Band.of(0.34)))])
+    source = light(strength=[float(star_flux_e_s_m2(0.0, *SUN, Band.from_efficiency(0.34)))])
     image, _ = draw(source, Window(0.0, 1.0), lens=lens_of(1e-6))
     assert image.sum() == pytest.approx(19_100, rel=2e-3)
 
@@ -684,10 +662,10 @@ def test_a_star_of_magnitude_zero_gives_liebe_s_electrons() -> None:
 def test_reference_electrons_of_stars_in_the_ec655(v_mag: float, electrons: float) -> None:
     # Reference §2: f/1.4, 50 ms, Liebe's rate.
     camera = loader.load("shefex2", {"camera.detector.quantum_efficiency": "0.40"}).camera
-    band = Band.of(camera.detector.quantum_efficiency)
+    band = Band.from_efficiency(camera.detector.quantum_efficiency)
     source = light(strength=[float(star_flux_e_s_m2(v_mag, *SUN, band))])
     image = np.zeros((camera.height_px, camera.width_px))
-    render(image, source, Optics.of(camera), STILL, AT_CENTRE, Window(0.0, 0.05))
+    render(image, source, Optics.from_camera(camera), STILL, AT_CENTER, Window(0.0, 0.05))
     assert image.sum() == pytest.approx(electrons, rel=2e-3)
 
 
@@ -702,7 +680,7 @@ def test_work_is_shared_in_goes_without_a_seam(monkeypatch: pytest.MonkeyPatch) 
     many = [star_at(*xy, 1e3) for xy in rng.uniform((5, 5), (58, 42), (40, 2))]
     stars = Sources(*(np.concatenate([getattr(s, f) for s in many]) for f in Sources.__slots__))
     whole, seen = shot(stars)
-    monkeypatch.setattr(rendering, "AT_ONCE", 500)
+    monkeypatch.setattr(rendering, "MAX_PATCH_PIXELS", 500)
     parts, again = shot(stars)
     np.testing.assert_allclose(parts, whole, rtol=0, atol=1e-9)
     np.testing.assert_array_equal(seen.electrons, again.electrons)

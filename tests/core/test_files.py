@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 
 from skysim.core import files, images
 from skysim.core.errors import InputError
-from skysim.core.files import HOST, NAME
+from skysim.core.files import HOST, TEMPORARY_NAME
 from skysim.core.types import Frame, Truth
 from skysim.results.files import ccsds_aem, frames
 from skysim.scene import loader, scene
@@ -100,7 +100,7 @@ def test_the_header_tells_when_how_long_and_from_what(sky: Shot, written: Path) 
     # 0.1 s after the start the shutter opens, 20 ms later is the middle.
     middle = datetime.datetime(2012, 6, 22, 21, 0, 0, 120_000)
     assert datetime.datetime.fromisoformat(header["DATE-OBS"]) == middle
-    assert images.date_of(written / "frame_0000.fits") == middle
+    assert images.read_date_obs(written / "frame_0000.fits") == middle
     assert (header["SCENE"], header["SEED"], header["FRAME"], header["SATURATE"]) == (
         "shefex2",
         2,
@@ -120,7 +120,7 @@ def test_a_scene_s_time_with_a_zone_is_told_as_utc(sky: Shot, start: str) -> Non
 
 
 def test_a_png_has_no_date(written: Path) -> None:
-    assert images.date_of(written / "frame_0000.png") is None
+    assert images.read_date_obs(written / "frame_0000.png") is None
 
 
 def test_a_fits_file_is_standard(written: Path) -> None:
@@ -131,7 +131,7 @@ def test_a_fits_file_is_standard(written: Path) -> None:
 
 
 def test_truth_comes_back(sky: Shot, written: Path) -> None:
-    truth, seen = sky[2], sky[2].seen
+    truth, seen = sky[2], sky[2].sources
     table = Table.read(written / "frame_0000.ecsv", format="ascii.ecsv")
     np.testing.assert_array_equal(table["id"], seen.id)
     columns = {
@@ -160,8 +160,8 @@ def test_truth_comes_back(sky: Shot, written: Path) -> None:
 
 def test_which_sources_are_saturated_comes_back(sky: Shot, tmp_path: Path) -> None:
     loaded, frame, truth = sky
-    every_third = np.arange(len(truth.seen.id)) % 3 == 0
-    truth = replace(truth, seen=replace(truth.seen, saturated=every_third))
+    every_third = np.arange(len(truth.sources.id)) % 3 == 0
+    truth = replace(truth, sources=replace(truth.sources, saturated=every_third))
     frames.write_truth(tmp_path / "truth.ecsv", frame, truth, loaded)
     table = Table.read(tmp_path / "truth.ecsv", format="ascii.ecsv")
     np.testing.assert_array_equal(table["saturated"], every_third)
@@ -171,7 +171,7 @@ def test_a_shorter_run_leaves_no_frames_of_a_longer_one(tmp_path: Path, sky: Sho
     frames.write_frame(tmp_path, sky[1], sky[2], sky[0])
     mine = tmp_path / "frame_of_mine.png"
     mine.write_bytes(b"")
-    frames.clear(tmp_path)
+    frames.remove_results(tmp_path)
     assert list(tmp_path.iterdir()) == [mine]
 
 
@@ -187,21 +187,21 @@ def test_a_shorter_run_leaves_no_frames_of_a_longer_one(tmp_path: Path, sky: Sho
         {"camera__principal_point_px": "[100, 400]"},
         {"camera__focus": "10 m"},
     ],
-    ids=["orion", "through RA 0", "near the pole", "off-centre lens", "focused nearby"],
+    ids=["orion", "through RA 0", "near the pole", "off-center lens", "focused nearby"],
 )
 @pytest.mark.filterwarnings("ignore:.*datfix")
 def test_astropy_puts_the_true_stars_on_their_true_pixels(tmp_path: Path, pointing: dict[str, str]) -> None:
     """Directions from the scene's own sources, pixels by astropy's WCS of the header alone."""
     loaded = loader.load("shefex2", {k.replace("__", "."): v for k, v in pointing.items()})
-    lab = run.prepare(loaded)
-    frame, truth = exposure.render_frame(lab, 0)
+    testbed = run.prepare(loaded)
+    frame, truth = exposure.render_frame(testbed, 0)
     frames.write_fits(tmp_path / "f.fits", frame, truth, loaded)
-    rows = {hip: n for n, hip in enumerate(lab.sources.id)}
-    direction = lab.sources.place[[rows[hip] for hip in truth.seen.id], :3]
+    rows = {hip: n for n, hip in enumerate(testbed.sources.id)}
+    direction = testbed.sources.place[[rows[hip] for hip in truth.sources.id], :3]
     ra, dec = np.degrees([np.arctan2(direction[:, 1], direction[:, 0]), np.arcsin(direction[:, 2])])
     x, y = WCS(fits.getheader(tmp_path / "f.fits")).all_world2pix(ra, dec, 0)
     assert len(x) > 20
-    np.testing.assert_allclose(np.column_stack([x, y]), truth.seen.xy_px, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(np.column_stack([x, y]), truth.sources.xy_px, rtol=0, atol=1e-6)
 
 
 def test_under_the_dome_there_is_no_wcs(tmp_path: Path, dome: Shot) -> None:
@@ -234,15 +234,13 @@ def test_an_interrupted_file_leaves_the_old_one(tmp_path: Path) -> None:
 
 def test_a_picture_that_cannot_be_encoded_leaves_nothing(tmp_path: Path) -> None:
     with pytest.raises(
-        InputError, match=r"x\.png: an image of uint8 and shape \(4, 4, 2\) cannot be encoded so"
+        InputError, match=r"x\.png: an image of uint8 and shape \(4, 4, 2\) cannot be encoded in this format"
     ):
         files.write_image(tmp_path / "x.png", np.zeros((4, 4, 2), np.uint8))
     assert not list(tmp_path.iterdir())
 
 
-def test_an_interrupt_leaves_the_old_folder_or_the_new(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_interrupt_leaves_the_old_folder_or_the_new(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def interrupted(folder: Path, **_: object) -> None:
         next(Path(folder).iterdir()).unlink()
         raise KeyboardInterrupt
@@ -279,7 +277,7 @@ def test_what_a_killed_process_left_is_swept_and_nothing_else(tmp_path: Path) ->
     left = {path.name for path in tmp_path.iterdir()}
     assert len(left) == 2
     (name,) = (name for name in left if name.endswith(".ecsv"))
-    pid = NAME.fullmatch(name)[1]  # type: ignore[index]
+    pid = TEMPORARY_NAME.fullmatch(name)[1]  # type: ignore[index]
     others = {
         name.replace(f"-{pid}.", f"-{os.getppid()}."),
         name.replace(HOST, "0badcafe"),
@@ -289,9 +287,7 @@ def test_what_a_killed_process_left_is_swept_and_nothing_else(tmp_path: Path) ->
     }
     for other in others:
         (tmp_path / other).write_text("mine")
-    ours_before = tmp_path / name.replace(
-        f"-{pid}.", f"-{os.getpid()}."
-    )  # of an earlier process by our number
+    ours_before = tmp_path / name.replace(f"-{pid}.", f"-{os.getpid()}.")  # of an earlier process by our number
     ours_before.write_text("half")
     with files.atomic_file(tmp_path / "truth.ecsv") as temporary:
         temporary.write_text("whole")
@@ -301,7 +297,7 @@ def test_what_a_killed_process_left_is_swept_and_nothing_else(tmp_path: Path) ->
 
 def test_a_folder_under_a_file_is_refused(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    with pytest.raises(InputError, match="cannot be made a folder"):
+    with pytest.raises(InputError, match="cannot be created as a folder"):
         files.make_folder(tmp_path / "file" / "out")
 
 
@@ -381,21 +377,21 @@ def test_a_few_flipped_bytes_give_an_image_or_one_line(written: Path, tmp_path: 
     outcome = []
     try:
         outcome.append(images.read_image(path))
-        images.date_of(path)
+        images.read_date_obs(path)
     except InputError as refusal:
         outcome.append(str(refusal))
     assert "\n" not in str(outcome[0]) or isinstance(outcome[0], np.ndarray)
 
 
-# Colour and JSON
+# Color and JSON
 
 
-def test_colour_becomes_luminance_and_monochrome_stays() -> None:
-    grey = np.random.default_rng(2).integers(0, 65535, (5, 7), np.uint16)
-    np.testing.assert_array_equal(images.monochrome(grey), grey)
-    np.testing.assert_array_equal(images.monochrome(grey[:, :, None]), grey)
-    np.testing.assert_array_equal(images.monochrome(np.dstack([grey] * 3)), grey)
-    np.testing.assert_array_equal(images.monochrome(np.dstack([grey] * 4)), grey)
+def test_color_becomes_luminance_and_monochrome_stays() -> None:
+    gray = np.random.default_rng(2).integers(0, 65535, (5, 7), np.uint16)
+    np.testing.assert_array_equal(images.monochrome(gray), gray)
+    np.testing.assert_array_equal(images.monochrome(gray[:, :, None]), gray)
+    np.testing.assert_array_equal(images.monochrome(np.dstack([gray] * 3)), gray)
+    np.testing.assert_array_equal(images.monochrome(np.dstack([gray] * 4)), gray)
     blue_green_red = np.full((2, 2, 3), (10.0, 20.0, 30.0), np.float32)
     # ITU-R BT.601: .299 R + .587 G + .114 B.
     np.testing.assert_allclose(images.monochrome(blue_green_red), 0.299 * 30 + 0.587 * 20 + 1.14, rtol=1e-6)
@@ -419,9 +415,9 @@ def test_a_camera_s_frame_is_taken_as_opencv_opens_it_and_none_is_told(tmp_path:
     video = cv2.VideoWriter(str(tmp_path / "camera.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 10, (64, 48))
     video.write(frame)
     video.release()
-    grabbed = images.grab(str(tmp_path / "camera.avi"))
+    grabbed = images.grab_frame(str(tmp_path / "camera.avi"))
     assert grabbed.shape == frame.shape
     assert np.abs(grabbed.astype(int) - frame).max() < 30
     for nowhere in (str(tmp_path / "none.avi"), "99"):
-        with pytest.raises(InputError, match="no camera answers there; allowed: an index such as 0"):
-            images.grab(nowhere)
+        with pytest.raises(InputError, match="no camera found; allowed: an index such as 0"):
+            images.grab_frame(nowhere)

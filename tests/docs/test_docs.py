@@ -78,9 +78,7 @@ def test_the_page_s_survey_prints_what_the_page_shows(tmp_path: Path) -> None:
         command, cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(ROOT)}, capture_output=True, text=True
     )
     assert done.returncode == 0, done.stderr
-    (after,) = re.findall(
-        r"^after: (\d+) of \d+.*?cross median ([\d.]+)°.*?roll median ([\d.]+)°", done.stdout, re.M
-    )
+    (after,) = re.findall(r"^after: (\d+) of \d+.*?cross median ([\d.]+)°.*?roll median ([\d.]+)°", done.stdout, re.M)
     rows = dict(re.findall(r"^\| (new attitudes|cross|roll).*\| ([\d.]+)[^|]*\|$", DOME, re.M))
     shown = [float(rows[name]) for name in ("new attitudes", "cross", "roll")]
     assert [float(one) for one in after] == pytest.approx(shown, rel=0.1)
@@ -109,15 +107,13 @@ STUDIES = (ROOT / "docs/findings/studies.md").read_text(encoding="utf-8")
 
 def test_every_study_that_comes_along_has_its_page_and_its_command() -> None:
     shipped = {path.stem for path in plan.STUDIES.glob("*.yaml")}
-    told = re.findall(r"\[(\w+)\]\(studies/(\w+)\.md\) \| `skysim study (run|optimise) (\w+)`", STUDIES)
+    told = re.findall(r"\[(\w+)\]\(studies/(\w+)\.md\) \| `skysim study (run|optimize) (\w+)`", STUDIES)
     assert {name for name, page, _, command in told if name == page == command} == shipped
     for name, _, verb, _ in told:
-        assert (verb == "optimise") == (loader.load(name).study.optimise is not None)
+        assert (verb == "optimize") == (loader.load(name).study.optimize is not None)
 
 
-@pytest.mark.parametrize(
-    "path", sorted((ROOT / "docs/findings/studies").glob("*.md")), ids=lambda path: path.stem
-)
+@pytest.mark.parametrize("path", sorted((ROOT / "docs/findings/studies").glob("*.md")), ids=lambda path: path.stem)
 def test_a_study_s_page_is_of_its_study_and_shows_what_is_there(path: Path) -> None:
     text, told = path.read_text(encoding="utf-8"), loader.load(path.stem)
     assert text.startswith(f"# {told.study.title}\n")
@@ -125,7 +121,7 @@ def test_a_study_s_page_is_of_its_study_and_shows_what_is_there(path: Path) -> N
     counted = re.search(r"(\d+) trials, (\d+) failed", text)
     assert counted is not None
     assert int(counted[2]) == 0
-    if told.study.optimise is None:
+    if told.study.optimize is None:
         assert int(counted[1]) == told.trials
     pictures = re.findall(r"!\[[^]]*\]\((\w+\.png)\)", text)
     assert len(pictures) >= len(told.study.figures)

@@ -84,9 +84,7 @@ def all_pages() -> list[Path]:
 def walked() -> list[Any]:
     """The pages that have something to run and no test of their own."""
     pages = [path for path in all_pages() if path.relative_to(ROOT).as_posix() not in ELSEWHERE]
-    running = [
-        path for path in pages if {"sh", "python", "yaml"} & {block.language for block in blocks(path)}
-    ]
+    running = [path for path in pages if {"sh", "python", "yaml"} & {block.language for block in blocks(path)}]
     names = [os.path.relpath(path, DOCS) for path in running if "studies" not in path.parts]
     return [pytest.param(name, marks=[pytest.mark.long] if name in LONG else []) for name in names]
 
@@ -125,9 +123,7 @@ def test_a_page_s_blocks_run_in_their_order(name: str, folder: Path, monkeypatch
         if block.language != "sh":
             printed = ""
     commands = "\n".join(block.text for block in blocks(DOCS / name) if block.language in ("sh", "yaml"))
-    assert [
-        file for file in files if len(re.findall(rf"\b{file}\b", commands)) < (1 + file.endswith(".yaml"))
-    ] == []
+    assert [file for file in files if len(re.findall(rf"\b{file}\b", commands)) < (1 + file.endswith(".yaml"))] == []
 
 
 def ran(line: str) -> str:
@@ -144,9 +140,7 @@ def ran(line: str) -> str:
     assert printed.getvalue(), line
     assert "failed:" not in printed.getvalue(), line
     if words[0] == "run":
-        assert re.search(r"^[1-9]\d* of \d+ frames solved, 0 wrong", printed.getvalue(), re.M), (
-            printed.getvalue()
-        )
+        assert re.search(r"^[1-9]\d* of \d+ frames solved, 0 wrong", printed.getvalue(), re.M), printed.getvalue()
     return printed.getvalue()
 
 
@@ -171,7 +165,7 @@ def test_the_study_pages_show_commands_that_are_there() -> None:
     """Written by `make studies`, one command each."""
     for path in sorted((DOCS / "findings/studies").glob("*.md")):
         (only,) = blocks(path)
-        assert re.fullmatch(rf"skysim study (run|optimise) {path.stem}\n", only.text)
+        assert re.fullmatch(rf"skysim study (run|optimize) {path.stem}\n", only.text)
 
 
 # --- the site ------------------------------------------------------------------------------------------------
@@ -206,9 +200,7 @@ def test_what_the_reference_names_is_a_module() -> None:
     ]
     assert len(named) > 40
     files = [ROOT / name.replace(".", "/") for name in named]
-    assert [
-        path for path in files if not (path.with_suffix(".py").is_file() or (path / "__init__.py").is_file())
-    ] == []
+    assert [path for path in files if not (path.with_suffix(".py").is_file() or (path / "__init__.py").is_file())] == []
 
 
 def test_the_reference_holds_every_module_that_a_page_names() -> None:

@@ -30,8 +30,8 @@ def of_the_site(name: str) -> ModuleType:
 
 
 commands, keys = of_the_site("commands"), of_the_site("keys")
-TOLD = commands.told()
-SECTIONS = dict(re.findall(r"^##+ `skysim ?([^`]*)`\n(.*?)(?=^##|\Z)", TOLD, re.DOTALL | re.MULTILINE))
+COMMANDS_MARKDOWN = commands.commands_markdown()
+SECTIONS = dict(re.findall(r"^##+ `skysim ?([^`]*)`\n(.*?)(?=^##|\Z)", COMMANDS_MARKDOWN, re.DOTALL | re.MULTILINE))
 
 
 def helped(*words: str) -> str:
@@ -51,23 +51,21 @@ def test_every_command_that_help_names_has_its_section() -> None:
 @pytest.mark.parametrize("name", SECTIONS)
 def test_a_section_has_the_options_that_help_shows(name: str) -> None:
     """And each of them, and every argument, with a word on what it is for."""
-    starts = re.findall(r"^│[ *]+((?:--[a-z-]+ +)+)", helped(*name.split()), re.MULTILINE)
+    starts = re.findall(r"^│[ *]+((?:--[a-z0-9-]+ +)+)", helped(*name.split()), re.MULTILINE)
     shown = {option for start in starts for option in start.split()}
     rows = dict(re.findall(r"^\| `([^`]+)` \| (.*) \|$", SECTIONS[name], re.MULTILINE))
-    listed = {option for what in rows for option in re.findall(r"--[a-z-]+", what)}
+    listed = {option for what in rows for option in re.findall(r"--[a-z0-9-]+", what)}
     assert listed | {"--help"} == shown
     assert [what for what, meaning in rows.items() if not re.match(r"\w", meaning)] == []
 
 
 def test_a_key_s_row_says_what_it_takes_and_what_stands_for_it() -> None:
     exposure, survey = keys.table(ExposureConfig), keys.table(SurveyErrorsConfig)
-    assert '| `time` | a time such as "40 ms" or "1000 us", ≥ 1e-06 s | needed |' in exposure
-    assert "| `rate_hz` | number, > 0 | needed |" in exposure
+    assert '| `time` | a time such as "40 ms" or "1000 us", ≥ 1e-06 s | required |' in exposure
+    assert "| `rate_hz` | number, > 0 | required |" in exposure
     assert '| `led_sigma` | a length such as "35 mm" or "48 in", ≥ 0 m, ≤ 0.1 m | `0 m` |' in survey
     assert "| `surface_seed` | whole number, ≥ 0 or null | `null` |" in survey
-    assert "| `exposure` | [ExposureConfig][skysim.scene.scene.ExposureConfig] | needed |" in keys.table(
-        Scene
-    )
+    assert "| `exposure` | [ExposureConfig][skysim.scene.scene.ExposureConfig] | required |" in keys.table(Scene)
 
 
 def test_every_section_of_a_file_has_a_page_to_stand_on() -> None:
@@ -75,9 +73,7 @@ def test_every_section_of_a_file_has_a_page_to_stand_on() -> None:
     pages = "".join(path.read_text(encoding="utf-8") for path in (ROOT / "docs/reference").glob("*.md"))
     held = set(re.findall(r"^::: (\S+)$", pages, re.MULTILINE))
     linked = {
-        target
-        for model in keys.sections().values()
-        for target in re.findall(r"\]\[([\w.]+)\]", keys.table(model))
+        target for model in keys.sections().values() for target in re.findall(r"\]\[([\w.]+)\]", keys.table(model))
     }
     assert len(linked) > 60
     assert {target.rpartition(".")[0] for target in linked} <= held

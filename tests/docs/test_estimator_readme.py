@@ -21,9 +21,9 @@ BLOCKS = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
 
 
 def picture(cam_from_icrs: Rotation) -> np.ndarray:
-    """A grey 8-bit photograph of a field of 0.26 rad, a focal length of 2 % more, stars of one pixel's blur."""
+    """A gray 8-bit photograph of a field of 0.26 rad, a focal length of 2 % more, stars of one pixel's blur."""
     camera = Camera.from_fov(1000, 800, 0.26).zoomed(1.02)
-    stars = catalog.read(ROOT / "data/catalogues/hipparcos_hp6.5.ecsv")
+    stars = catalog.read(ROOT / "data/catalogs/hipparcos_hp6.5.ecsv")
     xy = camera.pixels(cam_from_icrs.apply(stars.vectors))
     inside = camera.contains(np.nan_to_num(xy, nan=-1e9))
     light = np.zeros((800, 1000))

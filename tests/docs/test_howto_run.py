@@ -7,6 +7,7 @@ import mujoco
 import pytest
 
 PAGE = "docs/howto/run.md"
+pytestmark = pytest.mark.long  # every command of the page, each in a process of its own
 
 
 @pytest.fixture(scope="module")
@@ -32,11 +33,11 @@ def test_every_file_of_a_run_is_in_the_table(folder):
     assert [name for name in left if f"`{name}`" not in page and not name.startswith("frame_")] == []
 
 
-def test_the_picture_of_the_lab_is_there_or_the_reason_is_told(folder):
-    """`--picture`: with OpenGL both files, without it the run's report all the same."""
+def test_the_3d_views_are_written_or_the_reason_is_printed(folder):
+    """`--scene-3d`: with OpenGL both files, without it the run's report all the same."""
     left = {path.name for path in (folder / "out" / "simsat_slew").iterdir()}
     assert "report.html" in left
-    assert ("lab.png" in left) == ("lab.gif" in left)
+    assert ("scene_3d.png" in left) == ("scene_3d.gif" in left)
 
 
 def test_the_exported_scene_steps_in_mujoco(folder):

@@ -40,9 +40,7 @@ def test_the_camera_block_is_a_camera_that_sees(folder):
     assert set(mine) == {"camera", "background", "motion"}
     assert not set(mine["motion"]) & set(tree["motion"])
     path = folder / "mine.yaml"
-    path.write_text(
-        yaml.safe_dump(tree | mine | {"motion": tree["motion"] | mine["motion"]}, sort_keys=False)
-    )
+    path.write_text(yaml.safe_dump(tree | mine | {"motion": tree["motion"] | mine["motion"]}, sort_keys=False))
     told = pages.answer(folder, "run", str(path), "--frames", "2")
     assert (told["frames"], told["solved"], told["wrong"]) == (2, 2, 0)
 
@@ -78,12 +76,9 @@ def test_the_vehicle_block_flies_and_is_told_where_it_is(folder):
 
 
 def test_every_choice_that_the_vehicle_block_names_is_one():
-    """`# or ...` beside a choice lists the others, all of them; and every kind of manoeuvre is shown."""
+    """`# or ...` beside a choice lists the others, all of them; and every kind of maneuver is shown."""
     block = pages.yaml_block(PAGE, "base")
-    told = {
-        key: {one, *others.split(", ")}
-        for key, one, others in re.findall(r"(\w+): (\w+) +# or ([\w, ]+)", block)
-    }
+    told = {key: {one, *others.split(", ")} for key, one, others in re.findall(r"(\w+): (\w+) +# or ([\w, ]+)", block)}
     choices = {
         key: set(get_args(part.model_fields[key].annotation))
         for part, keys in (
@@ -93,15 +88,13 @@ def test_every_choice_that_the_vehicle_block_names_is_one():
         for key in keys
     }
     assert told == choices
-    shown = {element["kind"] for element in yaml.safe_load(block)["motion"]["manoeuvre"]}
-    kinds = {
-        get_args(part.model_fields["kind"].annotation)[0] for part in get_args(get_args(motion.Manoeuvre)[0])
-    }
+    shown = {element["kind"] for element in yaml.safe_load(block)["motion"]["maneuver"]}
+    kinds = {get_args(part.model_fields["kind"].annotation)[0] for part in get_args(get_args(motion.Maneuver)[0])}
     assert shown == kinds
 
 
 def test_the_controller_of_the_page_damps(folder):
-    """Each rate dies as exp(-5 t / J), the angle is its integral; gravity on tens of micrometres adds 0.1 deg or so."""
+    """Each rate dies as exp(-5 t / J), the angle is its integral; gravity on tens of micrometers adds 0.1 deg or so."""
     (block,) = pages.blocks(PAGE, "python")
     done = subprocess.run([sys.executable, "-c", block], cwd=folder, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
@@ -117,9 +110,7 @@ def test_the_error_message_is_what_a_user_sees(tmp_path, monkeypatch):
     (block,) = pages.blocks(PAGE, "text")
     bad = (ROOT / "scenes/afit_simsat.yaml").read_text(encoding="utf-8")
     (tmp_path / "scenes").mkdir()
-    (tmp_path / "scenes/afit_simsat.yaml").write_text(
-        bad.replace("falloff: inverse_square", "falloff: cubic")
-    )
+    (tmp_path / "scenes/afit_simsat.yaml").write_text(bad.replace("falloff: inverse_square", "falloff: cubic"))
     monkeypatch.chdir(tmp_path)
     with pytest.raises(InputError) as raised:
         load("scenes/afit_simsat.yaml")

@@ -6,6 +6,7 @@ import doc_pages as pages
 import pytest
 
 PAGE = "docs/howto/study.md"
+pytestmark = pytest.mark.long  # every command of the page, each in a process of its own
 
 
 @pytest.fixture(scope="module")

@@ -65,8 +65,6 @@ def test_every_name_in_the_table_of_changes_is_in_its_file():
 
 def test_every_package_is_in_the_table_of_packages():
     page = pages.text(ARCHITECTURE)
-    packages = [
-        path for root in ("skysim", "estimator") for path in sorted((ROOT / root).glob("*/__init__.py"))
-    ]
+    packages = [path for root in ("skysim", "estimator") for path in sorted((ROOT / root).glob("*/__init__.py"))]
     names = [path.parent.relative_to(ROOT).as_posix() for path in packages]
     assert [name for name in names if f"[`{name}`](../../{name})" not in page] == []

@@ -15,9 +15,7 @@ from skysim.core.errors import InputError
 from skysim.dynamics.actuators import STEERING, CmgSet, Desaturator, FanSet, WheelSet
 from skysim.scene.motion import DesaturationConfig
 
-BUS = np.array(
-    [[3.0, 0.2, -0.1], [0.2, 4.0, 0.3], [-0.1, 0.3, 5.0]]
-)  # kg m2, less the rotors about their axles
+BUS = np.array([[3.0, 0.2, -0.1], [0.2, 4.0, 0.3], [-0.1, 0.3, 5.0]])  # kg m2, less the rotors about their axles
 BUS_INVERSE = np.linalg.inv(BUS)
 SKEW = math.acos(1 / math.sqrt(3))  # 54.74 deg: the pyramid with nearly the same momentum in every direction
 SLANT = math.cos(SKEW)
@@ -184,14 +182,14 @@ def test_what_level_wheels_cannot_do_is_left_out(angles_deg):
 
 
 def fans(limit_n: float = 0.5) -> FanSet:
-    """A pair about each axis, a metre apart, whose pushes cancel."""
+    """A pair about each axis, a meter apart, whose pushes cancel."""
     places = 0.5 * np.array([[0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1], [1, 0, 0], [-1, 0, 0]]).T
     pushes = np.array([[0, 0, 1], [0, 0, -1], [1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]], float).T
     return FanSet(pushes, places, limit_n)
 
 
 def test_a_fan_pair_is_a_couple():
-    """A newton from each of a pair a metre apart is a newton metre; by hand: y x z = x, z x x = y, x x y = z."""
+    """A newton from each of a pair a meter apart is a newton meter; by hand: y x z = x, z x x = y, x x y = z."""
     for axis in range(3):
         thrust = np.repeat(np.eye(3)[axis], 2)
         np.testing.assert_array_equal(fans().torque(thrust), np.eye(3)[axis])
@@ -279,9 +277,7 @@ def test_gimbals_at_their_limit_keep_the_direction(steering):
     assert np.abs(rate).max() == pytest.approx(0.1, rel=1e-12)
     given = -set_.jacobian(np.zeros(4), SPEED) @ rate
     # The robust inverse is off by lambda, 5e-8 there, over the smallest eigenvalue 2/3.
-    np.testing.assert_allclose(
-        given / np.linalg.norm(given), torque / np.linalg.norm(torque), rtol=0, atol=1e-6
-    )
+    np.testing.assert_allclose(given / np.linalg.norm(given), torque / np.linalg.norm(torque), rtol=0, atol=1e-6)
     assert np.linalg.norm(given) < 0.5 * np.linalg.norm(torque)
 
 
@@ -326,9 +322,7 @@ def test_the_pseudo_inverse_is_caught_by_the_inner_singularity():
     momentum, rates, angles = pushed_along_x(pyramid_set("pseudo_inverse"), 60)
     reached = 2 * SLANT
     before = round(0.99 * reached / 0.1 / 0.01)
-    grown = 0.001 * np.arange(
-        1, before
-    )  # until then all is well; Euler's steps of 10 ms are good to a percent
+    grown = 0.001 * np.arange(1, before)  # until then all is well; Euler's steps of 10 ms are good to a percent
     np.testing.assert_allclose(momentum[: before - 1, 0], grown, rtol=0, atol=0.01 * reached)
     assert momentum[:, 0].max() <= reached * (1 + 1e-12)
     assert momentum[2000:, 0].min() > 0.999 * reached
@@ -344,9 +338,7 @@ def test_the_robust_inverse_passes_it_and_comes_to_saturation():
     assert np.abs(rates).max() < 0.9
     assert np.abs(momentum[:, 1:]).max() < 0.05 * full
     inside = (momentum[:, 0] > 0.999 * 2 * SLANT) & (momentum[:, 0] < 1.001 * 2 * SLANT)
-    assert (
-        np.linalg.norm(angles[inside] - np.radians([-90, 0, 90, 0]), axis=1).min() < 0.1
-    )  # it went through there
+    assert np.linalg.norm(angles[inside] - np.radians([-90, 0, 90, 0]), axis=1).min() < 0.1  # it went through there
     folded = np.degrees(np.mod(angles[-1] + 0.5, 2 * np.pi) - 0.5)
     np.testing.assert_allclose(folded, [270, 180, 90, 0], rtol=0, atol=5)
 
@@ -377,9 +369,7 @@ def test_rotors_deliver_what_singular_gimbals_cannot():
     assert np.abs(motor).max() < 0.5
     body = Body.start(set_.gimbal_axes, set_.spin_axes, set_.rotor_inertia_kg_m2, angles, THREE, STILL)
     np.testing.assert_allclose(torque_felt(body, rate, motor), torque, rtol=0, atol=3e-7)
-    assert along @ (body.axles(angles) @ motor) == pytest.approx(
-        -along @ torque, rel=1e-12
-    )  # all by the rotors
+    assert along @ (body.axles(angles) @ motor) == pytest.approx(-along @ torque, rel=1e-12)  # all by the rotors
     fixed = CmgSet(set_.gimbal_axes, set_.spin_axes, set_.rotor_inertia_kg_m2, 1.0)
     stuck, _ = fixed.drive(along, STILL, angles, THREE, 0.0)
     assert np.linalg.norm(along @ fixed.jacobian(angles, THREE) * stuck) < 1e-14
@@ -390,9 +380,7 @@ def test_rotors_idle_where_gimbals_can():
     set_, torque = variable(), np.array([0.3, -0.2, 0.1])
     rate, motor = set_.drive(torque, STILL, np.zeros(3), THREE, 0.0)
     axles = set_.spin_axes
-    np.testing.assert_allclose(
-        -set_.jacobian(np.zeros(3), THREE) @ rate - axles @ motor, torque, rtol=1e-12, atol=0
-    )
+    np.testing.assert_allclose(-set_.jacobian(np.zeros(3), THREE) @ rate - axles @ motor, torque, rtol=1e-12, atol=0)
     assert 0 < np.linalg.norm(motor) < 2 * 0.25 * math.exp(-10) * np.linalg.norm(torque)
 
 
@@ -440,9 +428,7 @@ def test_desaturation_has_its_hysteresis():
 
 
 def test_the_torque_is_the_momentum_over_the_time_against_it():
-    np.testing.assert_allclose(
-        Desaturator(PART).torque(np.array([4.0, -8.0, 0])), [-0.5, 1, 0], rtol=1e-15, atol=0
-    )
+    np.testing.assert_allclose(Desaturator(PART).torque(np.array([4.0, -8.0, 0])), [-0.5, 1, 0], rtol=1e-15, atol=0)
 
 
 def test_fans_empty_the_wheels_while_the_controller_holds_the_body():
@@ -465,9 +451,7 @@ def test_fans_empty_the_wheels_while_the_controller_holds_the_body():
     assert stopped * period == pytest.approx(8 * math.log(7.5), abs=1.0)
     assert stored[stopped] < 0.2
     assert stored[stopped + 80] == pytest.approx(stored[-1], abs=0.001)  # stays, once the loop has settled
-    assert (
-        max(turned) < 0.2 / 3 / 4 * 1.2
-    )  # a torque of 1.5 / 8 N m against stiffness 4 BUS, and some overshoot
+    assert max(turned) < 0.2 / 3 / 4 * 1.2  # a torque of 1.5 / 8 N m against stiffness 4 BUS, and some overshoot
     assert turned[-1] < 1e-3 * max(turned)
 
 
@@ -485,11 +469,14 @@ def test_fans_empty_the_wheels_while_the_controller_holds_the_body():
         (lambda: WheelSet(np.zeros((3, 0)), np.ones(0), 1.0, 1.0), r"wheel axes: shape \(3, 0\)"),
         (lambda: WheelSet(np.eye(3), np.array([1.0, 0, 1]), 1.0, 1.0), r"inertia.*allowed: 3 positive"),
         (lambda: WheelSet(np.eye(3), np.ones(2), 1.0, 1.0), r"inertia.*allowed: 3 positive"),
-        (lambda: FanSet(np.eye(3), np.ones((3, 2)), 1.0), r"fan places_m: shape \(3, 2\); allowed: \(3, 3\)"),
+        (
+            lambda: FanSet(np.eye(3), np.ones((3, 2)), 1.0),
+            r"fan positions_m: shape \(3, 2\); allowed: \(3, 3\)",
+        ),
         (lambda: CmgSet(np.eye(3), np.eye(3), np.ones(3), 1.0), "rotor axes: .*at right angles"),
         (
             lambda: CmgSet(*pyramid(1.0, 3), np.ones(3), 1.0, None, "magic"),
-            "'magic' is none of pseudo_inverse, ",
+            "unknown steering law 'magic'; allowed: pseudo_inverse, ",
         ),
     ],
 )

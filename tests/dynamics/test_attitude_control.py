@@ -10,9 +10,9 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
+from skysim.core import quaternion
 from skysim.core.types import Floats
-from skysim.dynamics import guidance
-from skysim.dynamics.attitude_control import Pid, controller
+from skysim.dynamics.attitude_control import Pid, build_controller
 from skysim.dynamics.guidance import Reference, plan
 from skysim.scene import loader
 from skysim.scene.motion import ControlConfig, MotionConfig
@@ -30,12 +30,12 @@ SLEW |= {"rate_deg_s": 20, "acceleration_deg_s2": 15}
 
 
 def told(*elements: object) -> Reference:
-    return plan(MotionConfig.model_validate({"control": "pid", "manoeuvre": elements}))
+    return plan(MotionConfig.model_validate({"control": "pid", "maneuver": elements}))
 
 
 def holding(inertia: Floats = INERTIA, **part: object) -> Pid:
     """A controller that is to keep the attitude (0, 0, 0)."""
-    return controller(told(), inertia, ControlConfig.model_validate(part))
+    return build_controller(told(), inertia, ControlConfig.model_validate(part))
 
 
 def closed(
@@ -55,7 +55,7 @@ def closed(
     def slope(t_s: float, y: Floats) -> Floats:
         R, w = y[:9].reshape(3, 3), y[9:12]
         law.error_sum_rad_s = y[12:].copy()
-        torque = law.torque_nm(t_s, guidance.wxyz(Rotation.from_matrix(R)), w, stored_nms) + disturbance_nm
+        torque = law.torque_nm(t_s, quaternion.from_rotation(Rotation.from_matrix(R)), w, stored_nms) + disturbance_nm
         moves = inverse @ (torque - np.cross(w, law.inertia_kg_m2 @ w + stored_nms))
         return np.concatenate([np.cross(R, w).ravel(), moves, law.error_rad])
 
@@ -93,7 +93,7 @@ def test_poles_are_the_roots_of_what_the_gains_make() -> None:
 def test_error_is_counted_by_the_shorter_way() -> None:
     """At 200 deg of yaw it is wrong by -160: the torque goes on in the positive sense."""
     law = holding(law="pd", **PLACED)
-    torque = law.torque_nm(0.0, guidance.wxyz(Rotation.from_euler("z", 200, degrees=True)), NONE, NONE)
+    torque = law.torque_nm(0.0, quaternion.from_rotation(Rotation.from_euler("z", 200, degrees=True)), NONE, NONE)
     np.testing.assert_allclose(torque, [0, 0, 9.0 * 4.0 * math.radians(160)], rtol=0, atol=1e-12)
 
 
@@ -104,9 +104,9 @@ def late(period_s: float) -> float:
     """
     law, angle, rate = holding(**PLACED), 0.01, 0.0
     for k in range(round(1.6 / period_s)):
-        here = guidance.wxyz(Rotation.from_rotvec([angle, 0, 0]))
+        here = quaternion.from_rotation(Rotation.from_rotvec([angle, 0, 0]))
         torque = law.torque_nm(k * period_s, here, np.array([rate, 0, 0]), NONE)
-        law.learn(torque, torque, period_s)
+        law.integrate(torque, torque, period_s)
         angle += rate * period_s + torque[0] / INERTIA[0] * period_s**2 / 2
         rate += torque[0] / INERTIA[0] * period_s
     companion = np.array([[0, 1, 0], [0, 0, 1], -POLES[:0:-1]])
@@ -125,9 +125,7 @@ def test_a_held_torque_is_late_by_half_a_period() -> None:
 def test_what_a_constant_torque_leaves(law: str) -> None:
     """pd: J^-1 T / b^2, at which the spring holds against it; pid: nothing."""
     push = np.array([0.3, -0.2, 0.1])
-    there, rate = closed(
-        holding(TENSOR, **PLACED, law=law), Rotation.identity(), NONE, np.array([50.0]), push
-    )
+    there, rate = closed(holding(TENSOR, **PLACED, law=law), Rotation.identity(), NONE, np.array([50.0]), push)
     left = {"pd": np.linalg.solve(TENSOR, push) / 2.0**2, "pid": NONE}[law]
     np.testing.assert_allclose(there[0].as_rotvec(), left, rtol=0, atol=1e-8)
     np.testing.assert_allclose(rate[0], NONE, rtol=0, atol=1e-8)
@@ -136,8 +134,8 @@ def test_what_a_constant_torque_leaves(law: str) -> None:
 def test_feed_forward_is_eulers_equation() -> None:
     """On the reference itself the torque is J a + w x (J w + h), of a full inertia tensor and of stored momentum."""
     tour = told(SLEW)
-    lab_from_ref, rate, acceleration = tour.at(1.3)
-    torque = controller(tour, TENSOR).torque_nm(1.3, lab_from_ref, rate, STORED)
+    lab_from_ref, rate, acceleration = tour.state_at(1.3)
+    torque = build_controller(tour, TENSOR).torque_nm(1.3, lab_from_ref, rate, STORED)
     expected = TENSOR @ acceleration + np.cross(rate, TENSOR @ rate + STORED)
     np.testing.assert_allclose(torque, expected, rtol=0, atol=1e-14)
     assert np.abs(np.cross(rate, STORED)).max() > 0.1  # which is not nothing
@@ -147,7 +145,7 @@ def test_a_rigid_body_is_on_the_reference_all_along_a_slew() -> None:
     """By the feed-forward alone: the error that feedback might amend never comes to be."""
     tour = told(SLEW)
     t_s = np.linspace(0.5, tour.duration_s + 1, 15)
-    there, _ = closed(controller(tour, TENSOR), Rotation.identity(), NONE, t_s)
+    there, _ = closed(build_controller(tour, TENSOR), Rotation.identity(), NONE, t_s)
     error = (tour.attitudes(t_s).inv() * there).as_rotvec()
     np.testing.assert_allclose(error, np.zeros((15, 3)), rtol=0, atol=1e-8)
 
@@ -157,19 +155,19 @@ def test_a_rigid_body_is_on_the_reference_all_along_a_slew() -> None:
 
 def test_integral_does_not_wind_up() -> None:
     """Held off its target for a minute at full torque, it lets go at once when the target is crossed."""
-    law, away = holding(), guidance.wxyz(Rotation.from_rotvec([0.2, 0, 0]))
+    law, away = holding(), quaternion.from_rotation(Rotation.from_rotvec([0.2, 0, 0]))
     for k in range(6000):
         wanted = law.torque_nm(k * 0.01, away, NONE, NONE)
-        law.learn(wanted, np.clip(wanted, -0.5, 0.5), 0.01)
-    at_target = law.torque_nm(60.0, guidance.wxyz(Rotation.identity()), NONE, NONE)
+        law.integrate(wanted, np.clip(wanted, -0.5, 0.5), 0.01)
+    at_target = law.torque_nm(60.0, quaternion.from_rotation(Rotation.identity()), NONE, NONE)
     assert np.abs(at_target).max() < 1e-9
 
 
 def test_integral_counts_on_every_axis_that_gets_what_it_wants() -> None:
     """Half of what is wanted about x; all about y; about z a little less than all, as a steering law's rounding."""
     law = holding()
-    wanted = law.torque_nm(0.0, guidance.wxyz(Rotation.from_rotvec([0.2, 0.2, 0.2])), NONE, NONE)
-    law.learn(wanted, wanted * [0.5, 1.0, 0.999], 0.01)
+    wanted = law.torque_nm(0.0, quaternion.from_rotation(Rotation.from_rotvec([0.2, 0.2, 0.2])), NONE, NONE)
+    law.integrate(wanted, wanted * [0.5, 1.0, 0.999], 0.01)
     np.testing.assert_allclose(law.error_sum_rad_s, [0, 2e-3, 2e-3], rtol=1e-12, atol=0)
 
 
@@ -177,9 +175,9 @@ def test_integral_lets_go_of_a_limit() -> None:
     """Stuck at the positive limit for what it has summed up, with a positive error, which asks for less: it counts."""
     law = holding()
     law.error_sum_rad_s = np.array([-5.0, 0, 0])
-    wanted = law.torque_nm(0.0, guidance.wxyz(Rotation.from_rotvec([0.1, 0, 0])), NONE, NONE)
+    wanted = law.torque_nm(0.0, quaternion.from_rotation(Rotation.from_rotvec([0.1, 0, 0])), NONE, NONE)
     assert wanted[0] > 0.5
-    law.learn(wanted, np.clip(wanted, -0.5, 0.5), 0.01)
+    law.integrate(wanted, np.clip(wanted, -0.5, 0.5), 0.01)
     assert law.error_sum_rad_s[0] == pytest.approx(-5.0 + 1e-3, abs=1e-12)
 
 
@@ -189,14 +187,14 @@ def test_integral_lets_go_of_a_limit() -> None:
 @pytest.mark.parametrize(("fastest", "expected"), [(math.inf, math.sqrt(0.9 / 9.0)), (0.2, 0.2)])
 def test_a_far_error_asks_for_no_more_than_a_rate_that_can_be_braked(fastest: float, expected: float) -> None:
     """A radian off and at rest, kd J w_most; at that rate towards the reference, nothing: w = min(limit, sqrt(a e))."""
-    part = ControlConfig.model_validate(PLACED)
-    law = controller(told(), INERTIA, part, authority_nm=0.9, rate_limit_rad_s=fastest)
-    here = guidance.wxyz(Rotation.from_rotvec([0, 0, 1.0]))
+    config = ControlConfig.model_validate(PLACED)
+    law = build_controller(told(), INERTIA, config, authority_nm=0.9, rate_limit_rad_s=fastest)
+    here = quaternion.from_rotation(Rotation.from_rotvec([0, 0, 1.0]))
     torque = law.torque_nm(0.0, here, NONE, NONE)
     np.testing.assert_allclose(torque, [0, 0, -9.0 * law.kd * expected], rtol=1e-12, atol=1e-15)
     coasting = law.torque_nm(0.0, here, np.array([0, 0, -expected]), NONE)
     np.testing.assert_allclose(coasting, NONE, rtol=0, atol=1e-12)
-    law.learn(torque, torque, 0.01)
+    law.integrate(torque, torque, 0.01)
     np.testing.assert_array_equal(law.error_sum_rad_s, NONE)
 
 
@@ -206,8 +204,8 @@ def test_a_great_step_is_taken_without_swinging() -> None:
     It overshoots by less than half a degree, and comes to rest.
     """
     step = {
-        "motion.manoeuvre": '[{kind: step, yaw_deg: 60, duration: "40 s"}]',
-        "vehicle.centre_of_mass": "[0 m, 0 m, 0 m]",
+        "motion.maneuver": '[{kind: step, yaw_deg: 60, duration: "40 s"}]',
+        "vehicle.center_of_mass": "[0 m, 0 m, 0 m]",
         "exposure": "{time: 10 ms, rate_hz: 1, frames: 1, first: 25 s}",
     }
     flown = run.prepare(loader.load("afit_simsat", step)).telemetry
@@ -228,23 +226,23 @@ SOFT_RAD_S = math.sqrt(WEIGHT_N * OFFSET_M / (6.0 * math.radians(1.03)))  # 0.60
 
 @pytest.mark.parametrize("law", ["pd", "pid"])
 def test_an_unbalanced_bearing_needs_the_integral(law: str) -> None:
-    """80 kg whose centre is 0.05 mm aside pull with 0.039 N m, at every attitude the same but for cos(tilt).
+    """80 kg whose center is 0.05 mm aside pull with 0.039 N m, at every attitude the same but for cos(tilt).
 
     The spring J b^2 of a PD controller holds against them 1.03 deg off, where its bandwidth is 0.60 rad/s (J = 6
     kg m2): J b^2 e = m g r cos e. The integral leaves none.
     """
     control = f"{{law: {law}, bandwidth_rad_s: {SOFT_RAD_S}, damping: 0.8, integral_rad_s: 0.6}}"
     out_of_balance = {
-        "vehicle.centre_of_mass": "[0 m, 0.05 mm, 0 m]",
+        "vehicle.center_of_mass": "[0 m, 0.05 mm, 0 m]",
         "motion.control": control,
-        "motion.manoeuvre": "[]",
+        "motion.maneuver": "[]",
         "exposure": "{time: 10 ms, rate_hz: 1, frames: 1, first: 25 s}",
     }
-    lab = run.prepare(loader.load("afit_simsat", out_of_balance))
-    assert lab.telemetry is not None
-    left_deg = np.degrees(lab.telemetry.lab_from_body[-1].as_rotvec())
+    testbed = run.prepare(loader.load("afit_simsat", out_of_balance))
+    assert testbed.telemetry is not None
+    left_deg = np.degrees(testbed.telemetry.lab_from_body[-1].as_rotvec())
     tilt = math.radians(1.03)
     expected = {"pd": -1.03 * math.cos(tilt), "pid": 0.0}[law]  # towards the heavy side
     np.testing.assert_allclose(left_deg, [expected, 0, 0], rtol=0, atol=1e-4)
-    torque = lab.telemetry.torque_nm[-1]
+    torque = testbed.telemetry.torque_nm[-1]
     np.testing.assert_allclose(torque, [WEIGHT_N * OFFSET_M * math.cos(expected * tilt), 0, 0], atol=1e-5)

@@ -9,19 +9,20 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
+from skysim.core import quaternion
 from skysim.core.types import Floats
-from skysim.dynamics.disturbances import DisturbanceModel, Gusts, earth_torque_nm
-from skysim.dynamics.guidance import Knock, wxyz
+from skysim.dynamics.disturbances import AirCurrent, DisturbanceModel, earth_torque_nm
+from skysim.dynamics.guidance import Impulse
 from skysim.dynamics.imu import earth_rate_lab_rad_s
 from skysim.scene import loader
-from skysim.scene.vehicle import DisturbancesConfig, DraughtConfig, SiteConfig
+from skysim.scene.vehicle import AirCurrentConfig, DisturbancesConfig, SiteConfig
 from skysim.simulation import run
 from skysim.simulation.testbed import Testbed
 
 AXES = Rotation.from_rotvec([0.2, -0.4, 0.3]).as_matrix()
 TENSOR = AXES @ np.diag([6.0, 6.5, 9.0]) @ AXES.T  # of a vehicle whose principal axes are not the body's
 NONE = np.zeros(3)
-BALANCED = {"vehicle.centre_of_mass": "[0 m, 0 m, 0 m]", "motion.control": "none", "motion.manoeuvre": "[]"}
+BALANCED = {"vehicle.center_of_mass": "[0 m, 0 m, 0 m]", "motion.control": "none", "motion.maneuver": "[]"}
 QUIET = DisturbancesConfig()
 
 
@@ -33,23 +34,23 @@ def flown(duration_s: float, **changes: str) -> Testbed:
 
 
 def room(
-    part: DisturbancesConfig = QUIET, earth: Floats = NONE, knocks: tuple[Knock, ...] = ()
+    config: DisturbancesConfig = QUIET, earth: Floats = NONE, knocks: tuple[Impulse, ...] = ()
 ) -> DisturbanceModel:
-    return DisturbanceModel.of(part, earth, knocks, TENSOR, 0.01, np.random.default_rng(1))
+    return DisturbanceModel.from_config(config, earth, knocks, TENSOR, 0.01, np.random.default_rng(1))
 
 
 # --- the air ------------------------------------------------------------------------------------------------
 
 RMS_NM = np.array([1e-3, 2e-3, 5e-4])
-DRAUGHT = DraughtConfig.model_validate({"rms": ["1 mN m", "2 mN m", "0.5 mN m"], "correlation": "50 ms"})
+AIR_CURRENT = AirCurrentConfig.model_validate({"rms": ["1 mN m", "2 mN m", "0.5 mN m"], "correlation": "50 ms"})
 PERIOD_S = 0.01
 
 
 @pytest.fixture(scope="module")
 def gusts() -> Floats:
     """(100,000, 3) a thousand seconds of it."""
-    air = Gusts(DRAUGHT, PERIOD_S, np.random.default_rng(5))
-    return np.array([air.next() for _ in range(100_000)])
+    air = AirCurrent(AIR_CURRENT, PERIOD_S, np.random.default_rng(5))
+    return np.array([air.sample() for _ in range(100_000)])
 
 
 def test_gusts_have_their_rms_and_no_mean(gusts: Floats) -> None:
@@ -76,19 +77,19 @@ def test_gusts_forget_themselves_with_their_correlation_time(gusts: Floats, lag:
 
 def test_gusts_begin_as_they_go_on() -> None:
     """The first torque of 4,000 flights has the rms already: 4 sigma of a variance, sqrt(2 / 4000)."""
-    first = np.array([Gusts(DRAUGHT, PERIOD_S, np.random.default_rng(k)).next() for k in range(4000)])
+    first = np.array([AirCurrent(AIR_CURRENT, PERIOD_S, np.random.default_rng(k)).sample() for k in range(4000)])
     np.testing.assert_allclose((first**2).mean(axis=0) / RMS_NM**2, 1, rtol=0, atol=4 * math.sqrt(2 / 4000))
 
 
 def test_a_steady_wind_and_the_turbine_blow_along_the_lab_s_axes() -> None:
     """Turned by 90 deg of yaw, what twists about lab x twists about body -y."""
-    part = DisturbancesConfig.model_validate({"turbine": ["1 mN m", "0 N m", "2 mN m"]})
+    config = DisturbancesConfig.model_validate({"turbine": ["1 mN m", "0 N m", "2 mN m"]})
     times = np.arange(11) * 1e-3
-    here = wxyz(Rotation.from_euler("z", 90, degrees=True))
-    torque = room(part).torque_nm(times, here, np.array([0.1, 0.2, 0.3]), NONE)
+    here = quaternion.from_rotation(Rotation.from_euler("z", 90, degrees=True))
+    torque = room(config).torque_nm(times, here, np.array([0.1, 0.2, 0.3]), NONE)
     np.testing.assert_allclose(torque, np.tile([0, -1e-3, 2e-3], (10, 1)), rtol=0, atol=1e-17)
-    blown = DisturbancesConfig.model_validate({"draught": {"rms": ["1 mN m"] * 3}})
-    level = room(blown).torque_nm(times, wxyz(Rotation.identity()), NONE, NONE)
+    blown = DisturbancesConfig.model_validate({"air_current": {"rms": ["1 mN m"] * 3}})
+    level = room(blown).torque_nm(times, quaternion.from_rotation(Rotation.identity()), NONE, NONE)
     turned = room(blown).torque_nm(times, here, NONE, NONE)
     np.testing.assert_allclose(turned, level[:, [1, 0, 2]] * [1, -1, 1], rtol=0, atol=1e-17)
     assert np.ptp(level, axis=0).max() == 0  # held over the tick
@@ -96,12 +97,14 @@ def test_a_steady_wind_and_the_turbine_blow_along_the_lab_s_axes() -> None:
 
 def test_turbine_spins_a_vehicle_up() -> None:
     """w = T t / J about z: 2e-3 N m for 4 s on 9 kg m2."""
-    lab = flown(4.0, vehicle__disturbances="{turbine: [0 N m, 0 N m, 2 mN m]}")
-    expected = 2e-3 / 9 * lab.trajectory.t_s[-1]
-    np.testing.assert_allclose(lab.trajectory.rate_body_rad_s[-1], [0, 0, expected], rtol=1e-9, atol=1e-12)
-    assert lab.telemetry is not None
+    testbed = flown(4.0, vehicle__disturbances="{turbine: [0 N m, 0 N m, 2 mN m]}")
+    expected = 2e-3 / 9 * testbed.trajectory.t_s[-1]
+    np.testing.assert_allclose(testbed.trajectory.rate_body_rad_s[-1], [0, 0, expected], rtol=1e-9, atol=1e-12)
+    assert testbed.telemetry is not None
     np.testing.assert_allclose(
-        lab.telemetry.disturbance_nm, np.tile([0, 0, 2e-3], (400, 1))[: len(lab.telemetry.t_s)], atol=1e-12
+        testbed.telemetry.disturbance_nm,
+        np.tile([0, 0, 2e-3], (400, 1))[: len(testbed.telemetry.t_s)],
+        atol=1e-12,
     )
 
 
@@ -169,9 +172,9 @@ def test_a_flown_vehicle_feels_the_earth_turn() -> None:
     """Let go with no turn among the stars, it turns in the lab with -15.04 deg/h about the Earth's axis."""
     earth = earth_rate_lab_rad_s(SiteConfig(latitude_deg=39.8, x_azimuth_deg=90))
     rate = str((-np.degrees(earth)).tolist())
-    lab = flown(20.0, vehicle__disturbances="{earth_rotation: true}", motion__rate_deg_s=rate)
-    t_s = lab.trajectory.t_s[-1]
-    turned = lab.trajectory.lab_from_body[-1].as_rotvec()
+    testbed = flown(20.0, vehicle__disturbances="{earth_rotation: true}", motion__rate_deg_s=rate)
+    t_s = testbed.trajectory.t_s[-1]
+    turned = testbed.trajectory.lab_from_body[-1].as_rotvec()
     np.testing.assert_allclose(turned, -earth * t_s, rtol=0, atol=1e-6 * np.linalg.norm(earth) * t_s)
     spinning = '{start_rpm: [3000, 0, 0], torque_limit: "0.5 N m"}'
     pushed = flown(2.0, vehicle__disturbances="{earth_rotation: true}", vehicle__wheels=spinning)
@@ -195,10 +198,10 @@ def bump(**more: str) -> str:
 
 def test_a_knock_changes_the_rate_by_what_the_scene_says() -> None:
     """On a sphere about three axes at once, beginning and ending within steps and ticks."""
-    lab = flown(0.5, motion__manoeuvre=f"[{HOLD}, {bump()}]", **SPHERE)
-    rate = np.degrees(lab.trajectory.rate_body_rad_s)
+    testbed = flown(0.5, motion__maneuver=f"[{HOLD}, {bump()}]", **SPHERE)
+    rate = np.degrees(testbed.trajectory.rate_body_rad_s)
     np.testing.assert_allclose(rate[-1], [3, -2, 14], rtol=1e-6, atol=0)
-    t_s = lab.trajectory.t_s
+    t_s = testbed.trajectory.t_s
     assert (rate[t_s < 0.1234] == 0).all()
     # A half-sine: its integral is (1 - cos(pi x)) / 2 of the whole. Every step has its exact share.
     x = np.clip((t_s - 0.1234) / 0.040, 0, 1)
@@ -209,15 +212,15 @@ def test_a_knock_changes_the_rate_by_what_the_scene_says() -> None:
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_a_knock_is_felt_by_each_moment_of_inertia(axis: int) -> None:
     rate = (5.0 * np.eye(3)[axis]).tolist()
-    lab = flown(0.3, motion__manoeuvre=f'[{{kind: bump, rate_deg_s: {rate}, duration: "30 ms"}}]')
-    np.testing.assert_allclose(np.degrees(lab.trajectory.rate_body_rad_s[-1]), rate, rtol=1e-6, atol=1e-12)
+    testbed = flown(0.3, motion__maneuver=f'[{{kind: bump, rate_deg_s: {rate}, duration: "30 ms"}}]')
+    np.testing.assert_allclose(np.degrees(testbed.trajectory.rate_body_rad_s[-1]), rate, rtol=1e-6, atol=1e-12)
 
 
 def test_a_caught_vehicle_is_at_rest_again_and_somewhere_else() -> None:
     """Turned by rate times the time between the knocks: 14.5 deg/s for 0.2 s, 2.9 deg."""
-    lab = flown(0.6, motion__manoeuvre=f"[{HOLD}, {bump(caught_after='0.2 s')}]", **SPHERE)
-    assert np.degrees(np.abs(lab.trajectory.rate_body_rad_s[-1])).max() < 1e-6
-    turned = np.degrees(lab.trajectory.lab_from_body[-1].as_rotvec())
+    testbed = flown(0.6, motion__maneuver=f"[{HOLD}, {bump(caught_after='0.2 s')}]", **SPHERE)
+    assert np.degrees(np.abs(testbed.trajectory.rate_body_rad_s[-1])).max() < 1e-6
+    turned = np.degrees(testbed.trajectory.lab_from_body[-1].as_rotvec())
     np.testing.assert_allclose(turned, np.array([3, -2, 14]) * 0.2, rtol=1e-6, atol=0)
 
 
@@ -226,18 +229,18 @@ def test_a_caught_vehicle_is_at_rest_again_and_somewhere_else() -> None:
 
 def test_a_room_is_quiet_where_nothing_is_switched_on() -> None:
     earth = np.array([0.0, 0.0, 7e-5])
-    knock = Knock(1.0, 0.1, np.array([0.1, 0, 0]))
-    assert room().quiet
-    assert room(earth=earth).quiet  # which does not count unless the scene says so
-    assert not room(DisturbancesConfig(earth_rotation=True), earth).quiet
-    assert not room(knocks=(knock,)).quiet
-    for part in ({"turbine": ["0 N m", "1 uN m", "0 N m"]}, {"draught": {"rms": ["1 uN m"] * 3}}):
-        assert not room(DisturbancesConfig.model_validate(part)).quiet
-    assert room(
-        DisturbancesConfig.model_validate({"cable": {"stiffness": "1 N m / rad"}})
-    ).quiet  # it is MuJoCo's
+    knock = Impulse(1.0, 0.1, np.array([0.1, 0, 0]))
+    assert room().inactive
+    assert room(earth=earth).inactive  # which does not count unless the scene says so
+    assert not room(DisturbancesConfig(earth_rotation=True), earth).inactive
+    assert not room(knocks=(knock,)).inactive
+    for part in ({"turbine": ["0 N m", "1 uN m", "0 N m"]}, {"air_current": {"rms": ["1 uN m"] * 3}}):
+        assert not room(DisturbancesConfig.model_validate(part)).inactive
+    assert room(DisturbancesConfig.model_validate({"cable": {"stiffness": "1 N m / rad"}})).inactive  # it is MuJoCo's
 
 
 def test_a_quiet_room_gives_nothing() -> None:
-    torque = room().torque_nm(np.arange(11) * 1e-3, wxyz(Rotation.identity()), np.ones(3), np.ones(3))
+    torque = room().torque_nm(
+        np.arange(11) * 1e-3, quaternion.from_rotation(Rotation.identity()), np.ones(3), np.ones(3)
+    )
     np.testing.assert_array_equal(torque, np.zeros((10, 3)))

@@ -11,18 +11,19 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
+from skysim.core import quaternion
 from skysim.core.types import Floats, Telemetry
 from skysim.dynamics import multibody
-from skysim.dynamics.flight_computer import FlightComputer, Now
-from skysim.dynamics.guidance import plan, wxyz
+from skysim.dynamics.flight_computer import ControlInput, FlightComputer
+from skysim.dynamics.guidance import plan
 from skysim.scene import loader
 from skysim.simulation import run
 
 FREE = {
     "vehicle.mount": "free",
-    "vehicle.centre_of_mass": "[0 m, 0 m, 0 m]",
+    "vehicle.center_of_mass": "[0 m, 0 m, 0 m]",
     "vehicle.torque_limit": "0.6 N m",
-    "motion.manoeuvre": "[]",
+    "motion.maneuver": "[]",
 }
 WHEELS = {"vehicle.wheels": '{torque_limit: "0.6 N m", start_rpm: [300, -500, 800]}'}
 CMGS = {"vehicle.cmgs": "{}"}
@@ -52,32 +53,34 @@ class Asks:
     def torque_nm(self, _t: float, _a: Floats, rate: Floats, momentum_nms: Floats) -> Floats:
         return self.torque + np.cross(rate, momentum_nms)
 
-    def learn(self, wanted_nm: Floats, given_nm: Floats, _period_s: float) -> None:
+    def integrate(self, wanted_nm: Floats, given_nm: Floats, _period_s: float) -> None:
         self.given.append((wanted_nm, given_nm))
 
 
-def manned(name: str, **more: str) -> tuple[FlightComputer, multibody.Flight]:
+def manned(name: str, **more: str) -> tuple[FlightComputer, multibody.Simulation]:
     """A free SimSat or TAS-2 at rest, and who flies it."""
     actuators, parts = SETS[name]
     changes = FREE | parts | {"motion.control": f"{{actuators: {actuators}}}"} | more
     loaded = loader.load("afit_simsat", changes)
-    ship = multibody.build(loaded.vehicle)
-    return FlightComputer(loaded, ship, plan(loaded.motion)), multibody.Flight(
-        ship, Rotation.identity(), np.zeros(3), 2.0
+    vehicle = multibody.build(loaded.vehicle)
+    return FlightComputer(loaded, vehicle, plan(loaded.motion)), multibody.Simulation(
+        vehicle, Rotation.identity(), np.zeros(3), 2.0
     )
 
 
-def told(pilot: FlightComputer, flight: multibody.Flight) -> Floats:
+def told(flight_computer: FlightComputer, flight: multibody.Simulation) -> Floats:
     """(nu,) controls of the present tick."""
-    stored = pilot.momentum_nms(flight.angles_rad, flight.speeds_rad_s)
-    now = Now(flight.now_s, pilot.period_s, flight.rate_body_rad_s, flight.angles_rad, flight.speeds_rad_s)
-    return pilot.steer(now, flight.lab_from_body_wxyz, stored)
+    stored = flight_computer.momentum_nms(flight.angles_rad, flight.speeds_rad_s)
+    now = ControlInput(
+        flight.now_s, flight_computer.period_s, flight.rate_body_rad_s, flight.angles_rad, flight.speeds_rad_s
+    )
+    return flight_computer.compute_controls(now, flight.lab_from_body_wxyz, stored)
 
 
-def bodys_inertia(ship: multibody.World) -> Floats:
+def bodys_inertia(vehicle: multibody.VehicleModel) -> Floats:
     """(3, 3) of what turns with the body about its own axes: a wheel does not about its axle, which is free."""
-    wheels = ship.wheels
-    return ship.inertia_kg_m2 - (wheels.axes * wheels.inertia_kg_m2) @ wheels.axes.T
+    wheels = vehicle.wheels
+    return vehicle.inertia_kg_m2 - (wheels.axes * wheels.inertia_kg_m2) @ wheels.axes.T
 
 
 # --- what is delivered --------------------------------------------------------------------------------------
@@ -93,14 +96,14 @@ def test_the_body_gets_the_torque_that_was_wanted(name: str, within: float) -> N
     In axes that stand still. Fans and the servos of gimbals are late, by less and less; and a servo gives way to what
     the vehicle's own turn does to its rotor, which is some tenths of a percent.
     """
-    pilot, flight = manned(name)
+    flight_computer, flight = manned(name)
     wanted = np.array([0.15, -0.1, 0.12])
-    pilot.law = Asks(wanted)  # type: ignore[assignment]
-    inertia, held = bodys_inertia(flight.world), []
+    flight_computer.law = Asks(wanted)  # type: ignore[assignment]
+    inertia, held = bodys_inertia(flight.vehicle), []
     for _ in range(40):
         turn = Rotation.from_quat(flight.lab_from_body_wxyz, scalar_first=True)
         held.append(turn.apply(inertia @ flight.rate_body_rad_s))
-        flight.advance(np.tile(told(pilot, flight), (10, 1)))
+        flight.advance(np.tile(told(flight_computer, flight), (10, 1)))
     torque = (held[-1] - held[-21]) / 0.2
     turned_by = Rotation.from_quat(flight.lab_from_body_wxyz, scalar_first=True).magnitude()
     assert np.linalg.norm(torque - wanted) < (within + turned_by) * np.linalg.norm(wanted)
@@ -110,12 +113,12 @@ def test_the_body_gets_the_torque_that_was_wanted(name: str, within: float) -> N
 @pytest.mark.parametrize("name", SETS)
 def test_what_it_says_is_given_is_given(name: str) -> None:
     """With all that is wanted within the limits, the controller hears that it got it."""
-    pilot, flight = manned(name)
+    flight_computer, flight = manned(name)
     law = Asks(np.array([0.15, -0.1, 0.12]))
-    pilot.law = law  # type: ignore[assignment]
-    told(pilot, flight)
+    flight_computer.law = law  # type: ignore[assignment]
+    told(flight_computer, flight)
     ((wanted, given),) = law.given
-    np.testing.assert_array_equal(wanted, pilot.wanted_nm)
+    np.testing.assert_array_equal(wanted, flight_computer.control_torque_nm)
     np.testing.assert_allclose(given, wanted, rtol=0, atol=1e-3 * np.linalg.norm(wanted))
 
 
@@ -125,29 +128,29 @@ def test_limits_are_known_to_the_anti_windup(name: str) -> None:
 
     Ideal torques have a limit for each axis, the other sets one for all, beyond which the direction is kept.
     """
-    pilot, flight = manned(name)
-    flight.states[0, 1:5] = wxyz(Rotation.from_rotvec([1e-4, 1e-4, 0.0]))
+    flight_computer, flight = manned(name)
+    flight.states[0, 1:5] = quaternion.from_rotation(Rotation.from_rotvec([1e-4, 1e-4, 0.0]))
     flight.rate_body_rad_s[:] = [0.5, 0, 0]
-    control = told(pilot, flight)
-    ship = flight.world
+    control = told(flight_computer, flight)
+    vehicle = flight.vehicle
     motors = {
-        "ideal": ship.torques,
-        "wheels": ship.wheels.motor,
-        "cmgs": ship.gimbals.motor,
-        "cmgs of variable speed": ship.gimbals.motor,
-        "fans": ship.fans.motor,
+        "ideal": vehicle.torques,
+        "wheels": vehicle.wheels.motor,
+        "cmgs": vehicle.gimbals.motor,
+        "cmgs of variable speed": vehicle.gimbals.motor,
+        "fans": vehicle.fans.motor,
     }[name]
     largest = {"ideal": 0.6, "wheels": 0.6, "cmgs": math.radians(60), "fans": 0.8}
     largest["cmgs of variable speed"] = math.radians(60)
     assert np.abs(control[motors]).max() == pytest.approx(largest[name], rel=1e-9)
     about_y = {"ideal": 1e-4 * 0.01}.get(name, 0.0)
-    np.testing.assert_allclose(pilot.law.error_sum_rad_s, [0, about_y, 0], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(flight_computer.law.error_sum_rad_s, [0, about_y, 0], rtol=0, atol=1e-12)
 
 
 def test_controls_of_nobody_are_zeros() -> None:
-    pilot, flight = manned("wheels", **{"motion.control": "none"})
-    np.testing.assert_array_equal(told(pilot, flight), np.zeros(flight.model.nu))
-    np.testing.assert_array_equal(pilot.wanted_nm, np.zeros(3))
+    flight_computer, flight = manned("wheels", **{"motion.control": "none"})
+    np.testing.assert_array_equal(told(flight_computer, flight), np.zeros(flight.model.nu))
+    np.testing.assert_array_equal(flight_computer.control_torque_nm, np.zeros(3))
 
 
 def test_constant_torque_leaves_no_error_on_cmgs_either() -> None:
@@ -157,9 +160,9 @@ def test_constant_torque_leaves_no_error_on_cmgs_either() -> None:
     singularity; what is left after 6 s is what the integral's pole leaves, exp(-0.6 t) of it.
     """
     changes = {
-        "vehicle.centre_of_mass": "[0 m, 0.05 mm, 0 m]",
+        "vehicle.center_of_mass": "[0 m, 0.05 mm, 0 m]",
         "vehicle.cmgs.start_deg": "[75, 75, 75, 75]",
-        "motion.manoeuvre": "[]",
+        "motion.maneuver": "[]",
         "exposure": "{time: 10 ms, rate_hz: 1, frames: 1, first: 6 s}",
     }
     flown = run.prepare(loader.load("simsat_cmg", changes)).telemetry
@@ -177,18 +180,18 @@ def test_constant_torque_leaves_no_error_on_cmgs_either() -> None:
 @pytest.mark.parametrize("name", ["wheels", "cmgs", "cmgs of variable speed"])
 def test_momentum_is_mujocos_own(name: str) -> None:
     """`mj_subtreeVel` of a body at rest in any attitude, its gimbals at any angle, its rotors at any speed."""
-    pilot, flight = manned(name)
-    ship, data, rng = flight.world, flight.data, np.random.default_rng(3)
+    flight_computer, flight = manned(name)
+    vehicle, data, rng = flight.vehicle, flight.data, np.random.default_rng(3)
     there = Rotation.from_rotvec([0.3, -0.7, 1.1])
     data.qpos[:4] = there.as_quat(scalar_first=True)
-    data.qpos[ship.gimbals.qpos] = rng.uniform(-2, 2, len(ship.gimbals))
+    data.qpos[vehicle.gimbals.qpos] = rng.uniform(-2, 2, len(vehicle.gimbals))
     data.qvel[:] = 0
-    for spinning in (ship.wheels, ship.rotors):
+    for spinning in (vehicle.wheels, vehicle.rotors):
         data.qvel[spinning.dof] = rng.uniform(-300, 300, len(spinning))
-    mujoco.mj_forward(ship.model, data)
-    mujoco.mj_subtreeVel(ship.model, data)
-    expected = there.inv().apply(data.subtree_angmom[ship.model.body("bus").id])
-    found = pilot.momentum_nms(data.qpos, data.qvel)
+    mujoco.mj_forward(vehicle.model, data)
+    mujoco.mj_subtreeVel(vehicle.model, data)
+    expected = there.inv().apply(data.subtree_angmom[vehicle.model.body("bus").id])
+    found = flight_computer.momentum_nms(data.qpos, data.qvel)
     assert np.linalg.norm(expected) > 0.5
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
 
@@ -211,9 +214,9 @@ def relieved() -> Telemetry:
     """SimSat holds its attitude while the fans take the momentum out of its wheel z, at 1800 rpm at first."""
     changes = {
         "vehicle.wheels": '{torque_limit: "0.6 N m", start_rpm: [0, 0, 1800]}',
-        "vehicle.centre_of_mass": "[0 m, 0 m, 0 m]",
+        "vehicle.center_of_mass": "[0 m, 0 m, 0 m]",
         "motion.control.desaturation": "{start: 1.7 N m s, stop: 0.8 N m s, time: 5 s}",
-        "motion.manoeuvre": "[]",
+        "motion.maneuver": "[]",
         "exposure": "{time: 10 ms, rate_hz: 1, frames: 1, first: 8 s}",
         "vehicle.disturbances": "{}",
     }
@@ -225,9 +228,7 @@ def relieved() -> Telemetry:
 def test_desaturation_follows_the_fans_lag(relieved: Telemetry) -> None:
     """dh/dt = T, dT/dt = (-h / time - T) / lag: the wheels hold against the fans' torque, and slow down."""
     h0 = 0.010125 * 1800 * math.pi / 30
-    run = solve_ivp(
-        lambda _, y: [y[1], (-y[0] / 5 - y[1]) / 0.2], (0, 4), [h0, 0], rtol=1e-9, dense_output=True
-    )
+    run = solve_ivp(lambda _, y: [y[1], (-y[0] / 5 - y[1]) / 0.2], (0, 4), [h0, 0], rtol=1e-9, dense_output=True)
     t_s = np.arange(0.5, 4, 0.5)
     held = np.interp(t_s, relieved.t_s, relieved.momentum_nms[:, 2])
     np.testing.assert_allclose(held, run.sol(t_s)[0], rtol=2e-3, atol=0)

@@ -12,7 +12,16 @@ from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError
-from skysim.dynamics.guidance import LEGS, Knock, Reference, attitude, envelope, knocks, plan, shakes
+from skysim.dynamics.guidance import (
+    LEGS,
+    Impulse,
+    Reference,
+    attitude,
+    envelope,
+    impulses,
+    plan,
+    vibration_intervals,
+)
 from skysim.scene.motion import AttitudeConfig, MotionConfig, SlewConfig, StepConfig
 
 HOLD = {"kind": "hold", "duration": "2 s"}
@@ -25,7 +34,7 @@ SINE = {"kind": "sine", "amplitude_deg": [4, -2, 1], "frequency_hz": 0.7, "durat
 SHAKE = {
     "kind": "jitter",
     "duration": "3 s",
-    "parts": [{"kind": "line", "frequency_hz": 30, "rms_arcsec": [9, 9, 9]}],
+    "components": [{"kind": "line", "frequency_hz": 30, "rms_arcsec": [9, 9, 9]}],
 }
 BUMP = {"kind": "bump", "rate_deg_s": [30, -60, 10], "duration": "50 ms"}
 
@@ -34,12 +43,12 @@ def turn_to(roll: float, pitch: float, yaw: float, **limits: float) -> dict[str,
     return {"kind": "slew", "roll_deg": roll, "pitch_deg": pitch, "yaw_deg": yaw} | LIMITS | limits
 
 
-def told(*manoeuvre: object, **motion: object) -> MotionConfig:
-    return MotionConfig.model_validate({"control": "pid", "manoeuvre": manoeuvre, "start": START} | motion)
+def told(*maneuver: object, **motion: object) -> MotionConfig:
+    return MotionConfig.model_validate({"control": "pid", "maneuver": maneuver, "start": START} | motion)
 
 
-def reference(*manoeuvre: object, **motion: object) -> Reference:
-    return plan(told(*manoeuvre, **motion))
+def reference(*maneuver: object, **motion: object) -> Reference:
+    return plan(told(*maneuver, **motion))
 
 
 EVERY = {
@@ -65,7 +74,7 @@ def tour() -> Reference:
 
 
 def sampled(ref: Reference, t_s: np.ndarray) -> tuple[Rotation, np.ndarray, np.ndarray]:
-    _, rates, accelerations = zip(*(ref.at(t) for t in t_s), strict=True)
+    _, rates, accelerations = zip(*(ref.state_at(t) for t in t_s), strict=True)
     return ref.attitudes(t_s), np.array(rates), np.array(accelerations)
 
 
@@ -123,7 +132,7 @@ def test_reference_visits_every_attitude_of_the_list(tour: Reference) -> None:
     for t, angles in zip(tour.start_s, wanted, strict=True):
         assert between(there(tour, t), euler(*angles)) < 1e-14
         # The sums of durations round; the rate leaves zero with their square.
-        np.testing.assert_allclose(tour.at(t)[1], np.zeros(3), rtol=0, atol=1e-20)
+        np.testing.assert_allclose(tour.state_at(t)[1], np.zeros(3), rtol=0, atol=1e-20)
 
 
 def test_slews_keep_their_limits_and_use_them(tour: Reference) -> None:
@@ -160,7 +169,7 @@ def test_step_jumps_and_asks_for_no_rate() -> None:
     for t in (2.0, 3.0, 4.0, 1e3):
         assert between(there(ref, t), euler(5, -9, 30)) < 1e-15
     for t in (2.0 - 1e-9, 2.0, 2.0 + 1e-9, 3.0):
-        np.testing.assert_array_equal(ref.at(t)[1:], np.zeros((2, 3)))
+        np.testing.assert_array_equal(ref.state_at(t)[1:], np.zeros((2, 3)))
 
 
 def test_rate_is_the_exponential_of_the_time() -> None:
@@ -169,8 +178,8 @@ def test_rate_is_the_exponential_of_the_time() -> None:
     for t in (0.0, 1.234, 4.0, 50.0):
         wanted = euler(*START.values()) * Rotation.from_rotvec(w * t)
         assert between(there(ref, t), wanted) < 2e-14
-        np.testing.assert_allclose(ref.at(t)[1], w, rtol=1e-15, atol=0)
-        np.testing.assert_array_equal(ref.at(t)[2], np.zeros(3))
+        np.testing.assert_allclose(ref.state_at(t)[1], w, rtol=1e-15, atol=0)
+        np.testing.assert_array_equal(ref.state_at(t)[2], np.zeros(3))
 
 
 CHANGES = [
@@ -199,10 +208,10 @@ def test_spin_up_is_the_integral_of_its_rate(begin: tuple, end: tuple, lasts_s: 
         return 0.5 * np.array([[-x, -y, -z], [w, -z, y], [z, w, -x], [-y, x, w]]) @ rate(t_s)
 
     at = np.append(np.sort(np.random.default_rng(2).uniform(0, lasts_s, 30)), lasts_s)
-    run = solve_ivp(slope, (0, lasts_s), ref.at(1.0)[0], "DOP853", at, rtol=1e-13, atol=1e-13)
+    run = solve_ivp(slope, (0, lasts_s), ref.state_at(1.0)[0], "DOP853", at, rtol=1e-13, atol=1e-13)
     wanted = Rotation.from_quat(run.y.T, scalar_first=True)
     assert between(ref.attitudes(1.0 + at), wanted).max() < 1e-9
-    np.testing.assert_allclose([ref.at(1.0 + t)[1] for t in at], [rate(t) for t in at], rtol=0, atol=1e-12)
+    np.testing.assert_allclose([ref.state_at(1.0 + t)[1] for t in at], [rate(t) for t in at], rtol=0, atol=1e-12)
 
 
 def test_spin_up_from_rest_and_to_rest_again_turns_by_half_of_rate_times_time() -> None:
@@ -212,22 +221,20 @@ def test_spin_up_from_rest_and_to_rest_again_turns_by_half_of_rate_times_time() 
     for t, turned_s in ((12.0, 5.0), (22.0, 10.0), (99.0, 10.0)):
         wanted = euler(*START.values()) * Rotation.from_rotvec(np.radians([6, 0, -12]) * turned_s)
         assert between(there(ref, t), wanted) < 1e-14
-    np.testing.assert_array_equal(ref.at(30.0)[1:], np.zeros((2, 3)))
+    np.testing.assert_array_equal(ref.state_at(30.0)[1:], np.zeros((2, 3)))
 
 
 def test_first_spin_up_begins_at_the_vehicles_own_rate() -> None:
     ref = reference(SPIN, rate_deg_s=(1.0, 2.0, -3.0))
-    np.testing.assert_allclose(np.degrees(ref.at(0.0)[1]), [1, 2, -3], rtol=1e-14)
-    np.testing.assert_allclose(np.degrees(ref.at(3.0)[1]), [-10, 4, 30], rtol=1e-14)
+    np.testing.assert_allclose(np.degrees(ref.state_at(0.0)[1]), [1, 2, -3], rtol=1e-14)
+    np.testing.assert_allclose(np.degrees(ref.state_at(3.0)[1]), [-10, 4, 30], rtol=1e-14)
     held = reference(HOLD, SPIN, rate_deg_s=(1.0, 2.0, -3.0))
-    np.testing.assert_array_equal(held.at(2.0)[1], np.zeros(3))
+    np.testing.assert_array_equal(held.state_at(2.0)[1], np.zeros(3))
 
 
 def test_a_spin_up_of_too_many_knots_is_refused_in_one_line() -> None:
     fast = {"kind": "spin_up", "rate_deg_s": [0, 360, 0], "duration": "1 h"}
-    with pytest.raises(
-        InputError, match=r"^motion\.manoeuvre: a spin_up of 36000 s .*; allowed: 2\.86e\+06 deg$"
-    ):
+    with pytest.raises(InputError, match=r"^motion\.maneuver: a spin_up of 36000 s .*; allowed: 2\.86e\+06 deg$"):
         reference(RATE, fast | {"duration": "10 h"})
     reference(HOLD, fast | {"duration": "10 h"})  # one axis needs no knots
 
@@ -248,7 +255,7 @@ def test_sine_begins_and_ends_at_rest_without_a_jump_of_the_torque(duration_s: f
     for t in ref.start_s[1:3]:
         assert between(there(ref, t), euler(*START.values())) < 1e-15
         for near in (t - 1e-9, t, t + 1e-9):  # a ns of jerk, up to 60 amplitude / growth^3 = 1e3 rad/s3
-            np.testing.assert_allclose(ref.at(near)[1:], np.zeros((2, 3)), rtol=0, atol=2e-6)
+            np.testing.assert_allclose(ref.state_at(near)[1:], np.zeros((2, 3)), rtol=0, atol=2e-6)
     inside = np.linspace(2.0, 2.0 + duration_s, 100)
     assert between(ref.attitudes(inside), euler(*START.values())).max() <= np.radians(math.sqrt(21)) + 1e-15
 
@@ -269,7 +276,7 @@ def test_a_vehicle_that_is_shaken_or_knocked_is_told_to_hold(element: dict[str, 
     ref = reference(turn_to(1, 2, 3), element)
     t = np.linspace(*ref.start_s[1:], 20)
     assert between(ref.attitudes(t), euler(1, 2, 3)).max() < 1e-14
-    np.testing.assert_array_equal([ref.at(s)[1:] for s in t], 0.0)
+    np.testing.assert_array_equal([ref.state_at(s)[1:] for s in t], 0.0)
 
 
 # The chain
@@ -296,8 +303,8 @@ def test_attitude_is_continuous_over_every_joint_but_a_steps(first: str, second:
 def test_slews_join_without_a_jump_of_rate_or_torque(tour: Reference) -> None:
     for joint in tour.start_s[1:]:
         (_, rate_before, accel_before), (_, rate_after, accel_after) = (
-            tour.at(joint - 1e-9),
-            tour.at(joint + 1e-9),
+            tour.state_at(joint - 1e-9),
+            tour.state_at(joint + 1e-9),
         )
         assert between(there(tour, joint - 1e-9), there(tour, joint + 1e-9)) < 1e-12
         np.testing.assert_allclose(rate_before, rate_after, rtol=0, atol=1e-12)
@@ -307,7 +314,7 @@ def test_slews_join_without_a_jump_of_rate_or_torque(tour: Reference) -> None:
 def test_spin_ups_join_without_a_jump_of_rate() -> None:
     ref = reference(HOLD, SPIN, SPIN | {"rate_deg_s": [50, 0, -40]}, RATE | {"rate_deg_s": [50, 0, -40]})
     for joint in ref.start_s[1:]:
-        np.testing.assert_allclose(ref.at(joint - 1e-9)[1:], ref.at(joint + 1e-9)[1:], rtol=0, atol=1e-8)
+        np.testing.assert_allclose(ref.state_at(joint - 1e-9)[1:], ref.state_at(joint + 1e-9)[1:], rtol=0, atol=1e-8)
 
 
 @pytest.mark.parametrize("kind", ["rate", "spin_up", "spin_up of a moving axis"])
@@ -317,26 +324,26 @@ def test_a_vehicle_that_was_spun_up_keeps_spinning(kind: str) -> None:
     for later in (0.0, 1.0, 77.0):
         wanted = there(ref, end) * Rotation.from_rotvec(rate * later)
         assert between(there(ref, end + later), wanted) < 1e-13
-        np.testing.assert_allclose(ref.at(end + later)[1], rate, rtol=1e-14)
-        np.testing.assert_array_equal(ref.at(end + later)[2], np.zeros(3))
+        np.testing.assert_allclose(ref.state_at(end + later)[1], rate, rtol=1e-14)
+        np.testing.assert_array_equal(ref.state_at(end + later)[2], np.zeros(3))
 
 
 def test_a_hold_after_a_rate_stops_it_at_once() -> None:
     ref = reference(RATE, HOLD)
-    np.testing.assert_allclose(ref.at(4.0 - 1e-9)[1], np.radians([3, -5, 20]), rtol=1e-14)
+    np.testing.assert_allclose(ref.state_at(4.0 - 1e-9)[1], np.radians([3, -5, 20]), rtol=1e-14)
     stopped = euler(*START.values()) * Rotation.from_rotvec(np.radians([12, -20, 80]))
     for t in (4.0, 5.0, 6.0, 60.0):
-        np.testing.assert_array_equal(ref.at(t)[1], np.zeros(3))
+        np.testing.assert_array_equal(ref.state_at(t)[1], np.zeros(3))
         assert between(there(ref, t), stopped) < 1e-14
 
 
-def test_reference_holds_after_its_end_and_without_a_manoeuvre(tour: Reference) -> None:
+def test_reference_holds_after_its_end_and_without_a_maneuver(tour: Reference) -> None:
     assert between(there(tour, tour.duration_s + 1e3), euler(-2, 14, 80)) < 1e-14
-    np.testing.assert_array_equal(tour.at(tour.duration_s + 1e3)[1:], np.zeros((2, 3)))
+    np.testing.assert_array_equal(tour.state_at(tour.duration_s + 1e3)[1:], np.zeros((2, 3)))
     idle = reference(start={"yaw_deg": 40}, rate_deg_s=(1.0, 2.0, 3.0))
     assert idle.duration_s == 0
     assert between(there(idle, 7.0), euler(0, 0, 40)) < 1e-15
-    np.testing.assert_array_equal(idle.at(7.0)[1], np.zeros(3))
+    np.testing.assert_array_equal(idle.state_at(7.0)[1], np.zeros(3))
     assert between(there(idle, -1.0), euler(0, 0, 40)) < 1e-15
 
 
@@ -363,13 +370,13 @@ def test_reference_gives_unit_quaternions_of_its_own(name: str) -> None:
     """A caller that writes into what it was given does not change what the next one is given."""
     ref = reference(*EVERY[name])
     for t in np.linspace(0, ref.duration_s + 1, 9):
-        state = ref.at(t)
+        state = ref.state_at(t)
         assert [part.shape for part in state] == [(4,), (3,), (3,)]
         assert np.linalg.norm(state[0]) == pytest.approx(1, abs=1e-14)
         kept = [part.copy() for part in state]
         for part in state:
             part[:] = np.nan
-        for again, first in zip(ref.at(t), kept, strict=True):
+        for again, first in zip(ref.state_at(t), kept, strict=True):
             np.testing.assert_array_equal(again, first)
 
 
@@ -378,7 +385,7 @@ def test_reference_is_quick_enough_for_every_control_tick() -> None:
     for name in EVERY:
         ref = reference(*EVERY[name])
         t = ref.start_s[-2] + 0.3 * (ref.duration_s - ref.start_s[-2])
-        assert min(timeit.repeat(lambda ref=ref, t=t: ref.at(t), number=20, repeat=200)) / 20 < 12e-6
+        assert min(timeit.repeat(lambda ref=ref, t=t: ref.state_at(t), number=20, repeat=200)) / 20 < 12e-6
 
 
 # Knocks and vibration
@@ -386,34 +393,34 @@ def test_reference_is_quick_enough_for_every_control_tick() -> None:
 
 def test_a_knock_is_a_half_sine_of_torque() -> None:
     """Shares against the integral of sin(pi x) pi / 2 by scipy's quadrature, cut at the knock's ends."""
-    knock = Knock(2.0, 0.05, np.zeros(3))
+    knock = Impulse(2.0, 0.05, np.zeros(3))
     x = np.linspace(0, 1, 20_001)
     impulse = np.concatenate([[0], np.cumsum(np.sin(np.pi * (x[1:] + x[:-1]) / 2)) * np.pi / 2 / 20_000])
     for a, b in np.random.default_rng(4).uniform(1.97, 2.08, (50, 2)):
         wanted = np.interp([a, b], 2.0 + 0.05 * x, impulse)
-        assert knock.share(a, b) == pytest.approx(wanted[1] - wanted[0], abs=1e-8)
-    assert knock.share(0.0, 2.0) == knock.share(2.05, 9.0) == 0
+        assert knock.fraction(a, b) == pytest.approx(wanted[1] - wanted[0], abs=1e-8)
+    assert knock.fraction(0.0, 2.0) == knock.fraction(2.05, 9.0) == 0
     ticks = np.arange(1.9, 2.2, 1e-3)
-    assert sum(knock.share(a, b) for a, b in itertools.pairwise(ticks)) == pytest.approx(1, abs=1e-14)
+    assert sum(knock.fraction(a, b) for a, b in itertools.pairwise(ticks)) == pytest.approx(1, abs=1e-14)
 
 
 def test_bumps_knock_at_their_times_and_a_caught_one_leaves_no_impulse() -> None:
     motion = told(HOLD, BUMP, SPIN, BUMP | {"caught_after": "80 ms"}, HOLD)
-    first, second, third = knocks(motion)
+    first, second, third = impulses(motion)
     assert [k.begin_s for k in (first, second, third)] == pytest.approx([2.0, 5.05, 5.13], abs=1e-12)
     assert [k.duration_s for k in (first, second, third)] == [0.05] * 3
     for knock in (first, second):
         np.testing.assert_allclose(np.degrees(knock.rate_rad_s), [30, -60, 10], rtol=1e-14)
-    left = sum(k.share(5.0, 9.0) * k.rate_rad_s for k in (second, third))
+    left = sum(k.fraction(5.0, 9.0) * k.rate_rad_s for k in (second, third))
     np.testing.assert_allclose(left, np.zeros(3), rtol=0, atol=1e-15)
     assert plan(motion).start_s[4] == pytest.approx(5.18, abs=1e-12)  # caught_after + duration
-    assert knocks(told(HOLD, SPIN)) == ()
+    assert impulses(told(HOLD, SPIN)) == ()
 
 
 def test_vibration_sounds_while_its_element_lasts() -> None:
     motion = told(HOLD, SHAKE, turn_to(3, -4, 176), SHAKE | {"duration": "1 s"})
-    (begin, end, parts), (later, last, _) = shakes(motion)
+    (begin, end, parts), (later, last, _) = vibration_intervals(motion)
     assert (begin, end) == (2.0, 5.0)
     assert parts[0].frequency_hz == 30
     assert (later, last) == pytest.approx((plan(motion).start_s[3], plan(motion).duration_s), abs=1e-12)
-    assert shakes(told(HOLD, BUMP)) == ()
+    assert vibration_intervals(told(HOLD, BUMP)) == ()

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError
 from skysim.core.types import Trajectory
-from skysim.dynamics.jitter import SPECTRA, Vibration, joined, own_rate, shake, swing
+from skysim.dynamics.jitter import SPECTRA, Vibration, concatenate, evaluate_sines, rotvec_body_rate
 from skysim.scene.motion import JitterBandConfig, JitterLineConfig, MotionConfig
 
 ARCSEC = np.radians(1 / 3600)
@@ -31,14 +31,17 @@ def turning(end_s: float, rate: tuple[float, float, float] = (0.0, 0.0, 0.0), sa
     """A body that turns evenly about one axis."""
     t, rate_rad_s = np.linspace(0, end_s, samples), np.array(rate)
     start = Rotation.from_rotvec([0.3, -1.0, 2.0])
-    return Trajectory(
-        t, start * Rotation.from_rotvec(t[:, None] * rate_rad_s), np.tile(rate_rad_s, (samples, 1))
-    )
+    return Trajectory(t, start * Rotation.from_rotvec(t[:, None] * rate_rad_s), np.tile(rate_rad_s, (samples, 1)))
+
+
+def shake(calm: Trajectory, parts: tuple, rng: np.random.Generator) -> Trajectory:
+    """The trajectory with a vibration that is always active."""
+    return Vibration.draw(MotionConfig(jitter=parts), rng).add_to(calm)
 
 
 def shaken_by(calm: Trajectory, shaken: Trajectory, t_s: np.ndarray) -> np.ndarray:
     """(N, 3) rotation vectors from the calm body to the shaken one, in arcseconds."""
-    return (calm.at(t_s).inv() * shaken.at(t_s)).as_rotvec() / ARCSEC
+    return (calm.attitude_at(t_s).inv() * shaken.attitude_at(t_s)).as_rotvec() / ARCSEC
 
 
 def test_nothing_that_shakes_is_the_same_history() -> None:
@@ -86,15 +89,13 @@ def test_periodogram_of_a_band_rises_with_its_slope(slope: float) -> None:
     shares = []
     for _ in range(40):
         sines = SPECTRA["band"](band(4.0, 64.0, slope), rng)
-        phi = swing(t, sines.omega_rad_s, sines.sine_rad, sines.cosine_rad)[0] / ARCSEC / np.array(RMS)
+        phi = evaluate_sines(t, sines.omega_rad_s, sines.sine_rad, sines.cosine_rad)[0] / ARCSEC / np.array(RMS)
         power = (np.abs(np.fft.rfft(phi * window, axis=0)) ** 2).sum(axis=1)
         frequency = np.fft.rfftfreq(len(t), 1 / rate_hz)
         outside = (frequency < 4.0 - 0.5) | (frequency > 64.0 + 0.5)  # four bins: Hann leaks 1e-3 beyond
         assert power[outside].sum() < 2e-3 * power.sum()
         shares.append(np.histogram(frequency, edges, weights=power)[0] / power.sum())
-    octave = np.exp2(
-        (slope + 1) * np.arange(4)
-    )  # power of an octave over that of the one below is 2^(slope + 1)
+    octave = np.exp2((slope + 1) * np.arange(4))  # power of an octave over that of the one below is 2^(slope + 1)
     scatter = np.std(shares, axis=0) / np.sqrt(len(shares))
     # Within 4 sigma, and 1 % that the window carries over an octave's edge.
     assert np.all(np.abs(np.mean(shares, axis=0) - octave / octave.sum()) < 4 * scatter + 0.01)
@@ -104,7 +105,7 @@ def test_many_sines_look_like_noise() -> None:
     """The sum of so many sines is nearly normal: kurtosis 3 less 1.5 over the number of equal sines."""
     sines = SPECTRA["band"](band(1.0, 100.0), np.random.default_rng(6))
     t = np.sort(np.random.default_rng(7).uniform(0, 5000, 40_000))
-    phi = swing(t, sines.omega_rad_s, sines.sine_rad, sines.cosine_rad)[0]
+    phi = evaluate_sines(t, sines.omega_rad_s, sines.sine_rad, sines.cosine_rad)[0]
     kurtosis = np.mean(phi**4, axis=0) / np.mean(phi**2, axis=0) ** 2
     np.testing.assert_allclose(kurtosis, 3, rtol=0, atol=0.2)
 
@@ -114,9 +115,9 @@ def test_between_the_samples_the_history_follows_the_sum() -> None:
     calm = turning(2.0, rate=(0.02, -0.01, 0.03))
     shaken = shake(calm, parts, np.random.default_rng(8))
     rng = np.random.default_rng(8)
-    sines = joined([SPECTRA[part.kind](part, rng) for part in parts])
+    sines = concatenate([SPECTRA[part.kind](part, rng) for part in parts])
     t = np.random.default_rng(9).uniform(0, 2, 5000)
-    wanted = swing(t, sines.omega_rad_s, sines.sine_rad, sines.cosine_rad)[0] / ARCSEC
+    wanted = evaluate_sines(t, sines.omega_rad_s, sines.sine_rad, sines.cosine_rad)[0] / ARCSEC
     error = np.abs(shaken_by(calm, shaken, t) - wanted)
     assert (error.max(axis=0) < 1e-3 * np.abs(wanted).max(axis=0)).all()
     highest_hz = sines.omega_rad_s.max() / (2 * np.pi)
@@ -140,8 +141,8 @@ def test_rates_are_the_derivative_of_the_attitude() -> None:
     sines = SPECTRA["line"](line(10.0, rms=(3600.0, 2000.0, 1000.0)), np.random.default_rng(11))
 
     def attitude(t_s: np.ndarray) -> Rotation:
-        phi = swing(t_s, sines.omega_rad_s, sines.sine_rad, sines.cosine_rad)[0]
-        return calm.at(t_s) * Rotation.from_rotvec(phi)
+        phi = evaluate_sines(t_s, sines.omega_rad_s, sines.sine_rad, sines.cosine_rad)[0]
+        return calm.attitude_at(t_s) * Rotation.from_rotvec(phi)
 
     h = 1e-6
     turn = (attitude(at - h).inv() * attitude(at + h)).as_rotvec() / (2 * h)
@@ -157,13 +158,13 @@ def test_own_rate_is_that_of_the_rotation_at_any_angle(angle_rad: float) -> None
     phi, phi_rate, h = angle_rad * np.array([[0.6, 0.0, 0.8]]), np.array([[0.3, -1.0, 0.2]]), 1e-5
     before, after = (Rotation.from_rotvec(phi + side * h * phi_rate) for side in (-1, 1))
     turned = (before.inv() * after).as_rotvec() / (2 * h)
-    np.testing.assert_allclose(own_rate(phi, phi_rate), turned, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(rotvec_body_rate(phi, phi_rate), turned, rtol=0, atol=1e-9)
 
 
 def test_cross_term_of_the_rate_is_needed() -> None:
     """Coning: two axes a quarter period apart turn the body steadily at (1 - cos a) dphi/dt / a about the third."""
     phi, phi_rate = np.array([[0.01, 0.0, 0.0]]), np.array([[0.0, 0.01, 0.0]])
-    np.testing.assert_allclose(own_rate(phi, phi_rate)[0, 2], -(1 - np.cos(0.01)), rtol=1e-11)
+    np.testing.assert_allclose(rotvec_body_rate(phi, phi_rate)[0, 2], -(1 - np.cos(0.01)), rtol=1e-11)
 
 
 def test_the_mean_attitude_is_that_of_the_calm_body() -> None:
@@ -195,8 +196,8 @@ def shaking(*while_s: float, parts: object = None, always: object = ()) -> Motio
     parts = parts or [{"kind": "line", "frequency_hz": 40, "rms_arcsec": RMS}]
     told: list[object] = [hold]
     for one_s in while_s:
-        told += [{"kind": "jitter", "duration": f"{one_s} s", "parts": parts}, hold]
-    return MotionConfig.model_validate({"manoeuvre": told, "jitter": always})
+        told += [{"kind": "jitter", "duration": f"{one_s} s", "components": parts}, hold]
+    return MotionConfig.model_validate({"maneuver": told, "jitter": always})
 
 
 LOUD = [{"kind": "line", "frequency_hz": 7, "rms_arcsec": [3600, 1800, 900]}]
@@ -206,7 +207,7 @@ NOISE = [{"kind": "band", "from_hz": 5, "to_hz": 60, "rms_arcsec": RMS}]
 def test_a_while_of_vibration_has_its_rms_between_rise_and_fall() -> None:
     """Four seconds from 1 s: a rise of 0.4 s, then 128 whole periods of 40 Hz."""
     calm = turning(6.0, samples=601)
-    shaken = Vibration.of(shaking(4.0), np.random.default_rng(13)).lay_over(calm)
+    shaken = Vibration.draw(shaking(4.0), np.random.default_rng(13)).add_to(calm)
     phi = shaken_by(calm, shaken, 1.4 + np.arange(6400) / 2000)
     np.testing.assert_allclose(np.sqrt(np.mean(phi**2, axis=0)), RMS, rtol=1e-3)
     for begin, end in ((1.0, 1.4), (4.6, 5.0)):
@@ -218,7 +219,7 @@ def test_a_while_of_vibration_has_its_rms_between_rise_and_fall() -> None:
 
 def test_a_long_while_rises_within_a_second() -> None:
     calm = turning(32.0, samples=3201)
-    shaken = Vibration.of(shaking(30.0), np.random.default_rng(14)).lay_over(calm)
+    shaken = Vibration.draw(shaking(30.0), np.random.default_rng(14)).add_to(calm)
     for begin in (2.0, 29.0):
         phi = shaken_by(calm, shaken, begin + np.arange(2000) / 2000)
         np.testing.assert_allclose(np.sqrt(np.mean(phi**2, axis=0)), RMS, rtol=1e-3)
@@ -226,35 +227,33 @@ def test_a_long_while_rises_within_a_second() -> None:
 
 def test_nothing_shakes_outside_of_its_while() -> None:
     calm, rng = turning(8.0, rate=(0.1, 0.2, -0.1), samples=801), np.random.default_rng(15)
-    vibration = Vibration.of(shaking(2.0, 3.0), rng)
-    shaken = vibration.lay_over(calm)
+    vibration = Vibration.draw(shaking(2.0, 3.0), rng)
+    shaken = vibration.add_to(calm)
     t = np.random.default_rng(16).uniform(0, 8, 4000)
     outside = (t < 1) | ((t > 3) & (t < 4)) | (t > 7)
-    phi, rate = vibration.swing(np.sort(t[outside]))
+    phi, rate = vibration.evaluate(np.sort(t[outside]))
     np.testing.assert_array_equal([phi, rate], np.zeros((2, outside.sum(), 3)))
     assert np.abs(shaken_by(calm, shaken, t[outside])).max() < 1e-9  # rounding: 1e-15 rad is 2e-10 arcsec
     assert (np.abs(shaken_by(calm, shaken, t[~outside])).max(axis=0) > RMS).all()
     silent = (shaken.t_s <= 1) | ((shaken.t_s >= 3) & (shaken.t_s <= 4)) | (shaken.t_s >= 7)
     np.testing.assert_allclose(shaken.rate_body_rad_s[silent], [[0.1, 0.2, -0.1]] * silent.sum(), rtol=1e-14)
-    np.testing.assert_allclose(
-        np.diff(shaken.t_s[shaken.t_s <= 1]), 0.01, rtol=1e-9
-    )  # no finer where it is calm
+    np.testing.assert_allclose(np.diff(shaken.t_s[shaken.t_s <= 1]), 0.01, rtol=1e-9)  # no finer where it is calm
 
 
 def test_two_whiles_of_the_same_vibration_have_their_own_phases() -> None:
-    vibration = Vibration.of(shaking(2.0, 2.0), np.random.default_rng(17))
+    vibration = Vibration.draw(shaking(2.0, 2.0), np.random.default_rng(17))
     t = np.linspace(1.5, 2.5, 1000, endpoint=False)
-    first, second = vibration.swing(t)[0], vibration.swing(t + 3.0)[0]  # 120 periods later
+    first, second = vibration.evaluate(t)[0], vibration.evaluate(t + 3.0)[0]  # 120 periods later
     assert (np.sqrt(np.mean((first - second) ** 2, axis=0)) > 0.05 * ARCSEC * np.array(RMS)).any()
 
 
 @pytest.mark.parametrize("always", [(), LOUD])
 def test_swing_within_a_while_has_the_derivative_it_says(always: list[object]) -> None:
     """The envelope's own slope included: central differences of phi over the rise, the middle and the fall."""
-    vibration, h = Vibration.of(shaking(2.0, parts=LOUD, always=always), np.random.default_rng(18)), 1e-6
+    vibration, h = Vibration.draw(shaking(2.0, parts=LOUD, always=always), np.random.default_rng(18)), 1e-6
     t = np.sort(np.random.default_rng(19).uniform(0.9, 3.1, 3000))
-    before, after = vibration.swing(t - h)[0], vibration.swing(t + h)[0]
-    rate = vibration.swing(t)[1]
+    before, after = vibration.evaluate(t - h)[0], vibration.evaluate(t + h)[0]
+    rate = vibration.evaluate(t)[1]
     # h^2 / 6 times a third derivative of some (2 pi 7 + 4 / 0.2)^3 * 0.05 rad = 1e4 rad/s3 at the most
     np.testing.assert_allclose((after - before) / (2 * h), rate, rtol=0, atol=4e-9)
     assert np.abs(rate).max() > 0.5
@@ -263,18 +262,18 @@ def test_swing_within_a_while_has_the_derivative_it_says(always: list[object]) -
 def test_the_shaken_rate_is_the_derivative_of_the_attitude_through_a_while() -> None:
     """At its samples by central differences of lab_from_body exp(phi); between them it follows that too."""
     calm = turning(4.0, rate=(0.2, -0.1, 0.25), samples=4001)
-    vibration = Vibration.of(shaking(2.0, parts=LOUD), np.random.default_rng(20))
-    shaken, h = vibration.lay_over(calm), 1e-6
+    vibration = Vibration.draw(shaking(2.0, parts=LOUD), np.random.default_rng(20))
+    shaken, h = vibration.add_to(calm), 1e-6
     at = shaken.t_s[(shaken.t_s > 0.9) & (shaken.t_s < 3.1)][::7]
 
     def body(t_s: np.ndarray) -> Rotation:
-        return calm.at(t_s) * Rotation.from_rotvec(vibration.swing(t_s)[0])
+        return calm.attitude_at(t_s) * Rotation.from_rotvec(vibration.evaluate(t_s)[0])
 
     turned = (body(at - h).inv() * body(at + h)).as_rotvec() / (2 * h)
     rate = np.array([shaken.rate_at(t) for t in at])
     np.testing.assert_allclose(rate, turned, rtol=0, atol=4e-9)
     between = np.sort(np.random.default_rng(21).uniform(0.9, 3.1, 3000))
-    error = np.linalg.norm((shaken.at(between).inv() * body(between)).as_rotvec(), axis=1)
+    error = np.linalg.norm((shaken.attitude_at(between).inv() * body(between)).as_rotvec(), axis=1)
     assert error.max() < 1e-4 * np.radians(1.0) * np.sqrt(2)
 
 
@@ -282,9 +281,9 @@ def test_a_short_while_is_sampled_for_its_envelope_too() -> None:
     """A tenth of a period of 0.5 Hz: only the rise and fall, 10 ms each, set the samples."""
     calm = turning(2.2, samples=3)
     slow = [{"kind": "line", "frequency_hz": 0.5, "rms_arcsec": RMS}]
-    vibration = Vibration.of(shaking(0.1, parts=slow), np.random.default_rng(22))
-    shaken, t = vibration.lay_over(calm), np.linspace(0.95, 1.15, 4000)
-    wanted = vibration.swing(t)[0] / ARCSEC
+    vibration = Vibration.draw(shaking(0.1, parts=slow), np.random.default_rng(22))
+    shaken, t = vibration.add_to(calm), np.linspace(0.95, 1.15, 4000)
+    wanted = vibration.evaluate(t)[0] / ARCSEC
     assert (np.abs(shaken_by(calm, shaken, t) - wanted) < 1e-4 * np.sqrt(2) * np.array(RMS)).all()
     assert (np.abs(wanted).max(axis=0) > 0).all()
 
@@ -294,34 +293,32 @@ def test_a_flight_in_pieces_shakes_like_the_whole() -> None:
     t = np.arange(0, 3.0 + 5e-4, 1e-3)
     rate = np.outer(1 + t, [0.1, 0.0, 0.2])
     angle = np.outer(t + t**2 / 2, [0.1, 0.0, 0.2])
-    vibration = Vibration.of(shaking(1.0, parts=NOISE + LOUD, always=NOISE), np.random.default_rng(23))
-    whole = vibration.lay_over(Trajectory(t, Rotation.from_rotvec(angle), rate))
+    vibration = Vibration.draw(shaking(1.0, parts=NOISE + LOUD, always=NOISE), np.random.default_rng(23))
+    whole = vibration.add_to(Trajectory(t, Rotation.from_rotvec(angle), rate))
     cuts = [0, 10, 700, 1003, 1995, len(t) - 1]
     for first, last in itertools.pairwise(cuts):
         now = slice(first, last + 1)
-        piece = vibration.lay_over(Trajectory(t[now], Rotation.from_rotvec(angle[now]), rate[now]))
+        piece = vibration.add_to(Trajectory(t[now], Rotation.from_rotvec(angle[now]), rate[now]))
         same = (whole.t_s >= t[first]) & (whole.t_s <= t[last])
         np.testing.assert_array_equal(piece.t_s, whole.t_s[same])
         np.testing.assert_allclose(piece.rate_body_rad_s, whole.rate_body_rad_s[same], rtol=0, atol=1e-12)
         at = np.random.default_rng(24).uniform(t[first], t[last], 300)
-        assert np.abs((whole.at(at).inv() * piece.at(at)).as_rotvec()).max() < 1e-12
+        assert np.abs((whole.attitude_at(at).inv() * piece.attitude_at(at)).as_rotvec()).max() < 1e-12
 
 
 def test_a_piece_in_which_nothing_sounds_is_the_same_history() -> None:
-    vibration = Vibration.of(shaking(1.0), np.random.default_rng(25))
+    vibration = Vibration.draw(shaking(1.0), np.random.default_rng(25))
     piece = turning(0.9)
-    assert vibration.lay_over(piece) is piece
-    assert Vibration.of(MotionConfig(), np.random.default_rng(25)).voices == ()
+    assert vibration.add_to(piece) is piece
+    assert Vibration.draw(MotionConfig(), np.random.default_rng(25)).components == ()
 
 
 def test_too_many_samples_of_a_while_are_refused_with_its_time() -> None:
     fast = [{"kind": "line", "frequency_hz": 1e6, "rms_arcsec": RMS}]
-    vibration = Vibration.of(shaking(1.0, parts=fast, always=NOISE), np.random.default_rng(26))
+    vibration = Vibration.draw(shaking(1.0, parts=fast, always=NOISE), np.random.default_rng(26))
     flight = turning(3.0, samples=3001)
-    with pytest.raises(
-        InputError, match=r"^motion\.manoeuvre jitter at 1 s: 1.*e\+06 Hz over 1 s needs 16,0.*$"
-    ):
-        vibration.lay_over(flight)
+    with pytest.raises(InputError, match=r"^motion\.maneuver jitter at 1 s: 1.*e\+06 Hz over 1 s needs 16,0.*$"):
+        vibration.add_to(flight)
     with pytest.raises(InputError, match=r"; allowed: 5,000,000, 16 a period$"):
-        vibration.pieces(flight.t_s)
-    vibration.lay_over(turning(0.5))  # before its time
+        vibration.subdivisions(flight.t_s)
+    vibration.add_to(turning(0.5))  # before its time

@@ -15,7 +15,7 @@ from skysim.camera.optics import Optics
 from skysim.core.errors import InputError
 from skysim.core.types import Sources
 from skysim.dynamics import multibody
-from skysim.dynamics.multibody.integrator import Flight
+from skysim.dynamics.multibody.integrator import Simulation
 from skysim.dynamics.multibody.mjcf import mujoco_warnings
 from skysim.dynamics.multibody.view import mjcf_export, picture
 from skysim.scene.loader import load
@@ -41,18 +41,18 @@ STARTS = {  # 3-2-1 Euler angles; the second falls into the tilt stop within the
 LEVEL = Rotation.identity()
 
 
-def dome_lab(overrides: dict[str, str] | None = None) -> tuple[Scene, multibody.World, Sources]:
+def dome_lab(overrides: dict[str, str] | None = None) -> tuple[Scene, multibody.VehicleModel, Sources]:
     scene = load("afit_simsat", overrides or {})
     assert scene.light.kind == "dome"
-    band = Band.of(scene.camera.detector.quantum_efficiency)
+    band = Band.from_efficiency(scene.camera.detector.quantum_efficiency)
     return scene, multibody.build(scene.vehicle), dome.sources(scene.light, band)
 
 
-def star_lab() -> tuple[Scene, multibody.World, Sources, Rotation]:
+def star_lab() -> tuple[Scene, multibody.VehicleModel, Sources, Rotation]:
     scene = load("shefex2")
     assert scene.light.kind == "stars"
-    band = Band.of(scene.camera.detector.quantum_efficiency)
-    stars = catalog.read(scene.light.catalogue)
+    band = Band.from_efficiency(scene.camera.detector.quantum_efficiency)
+    stars = catalog.read(scene.light.catalog)
     sources = star_sources.sources(stars, scene.start_time, scene.light.limit_mag, Rotation.identity(), band)
     lab_from_body = star_sources.cam_from_icrs(83.0, 2.0, 20.0).inv()
     return scene, multibody.build(scene.vehicle), sources, lab_from_body
@@ -87,7 +87,7 @@ def test_the_exported_laboratory_flies_like_the_stepped_model(start: str) -> Non
     scene, vehicle, sources = dome_lab(EVERYTHING | {"motion.rate_deg_s": rate})
     lab_from_body = Rotation.from_euler("ZYX", angles_deg, degrees=True)
     model, data = loaded(mjcf_export.mjcf(vehicle, scene, sources, lab_from_body))
-    flight = Flight(vehicle, lab_from_body, np.radians(scene.motion.rate_deg_s), 1.0)
+    flight = Simulation(vehicle, lab_from_body, np.radians(scene.motion.rate_deg_s), 1.0)
     np.testing.assert_allclose(data.qpos, flight.angles_rad, rtol=0, atol=1e-14)
     np.testing.assert_allclose(data.qvel, flight.speeds_rad_s, rtol=1e-14, atol=1e-14)
     control = 0.2 * np.sin(np.arange(model.nu))
@@ -108,7 +108,7 @@ def test_the_second_start_does_reach_the_stop() -> None:
     angles_deg, rate = STARTS["against the stop"]
     scene, vehicle, _ = dome_lab(EVERYTHING | {"motion.rate_deg_s": rate})
     start = Rotation.from_euler("ZYX", angles_deg, degrees=True)
-    flight = Flight(vehicle, start, np.radians(scene.motion.rate_deg_s), 1.0)
+    flight = Simulation(vehicle, start, np.radians(scene.motion.rate_deg_s), 1.0)
     flight.advance(np.zeros((1000, vehicle.model.nu)))
     up = Rotation.from_quat(flight.states[:, 1:5], scalar_first=True).as_matrix()[:, 2, 2]
     assert 30.0 < np.degrees(np.arccos(up.min())) < 30.5
@@ -117,7 +117,7 @@ def test_the_second_start_does_reach_the_stop() -> None:
 def test_a_free_vehicle_flies_like_the_stepped_model_under_the_stars() -> None:
     scene, vehicle, sources, lab_from_body = star_lab()
     model, data = loaded(mjcf_export.mjcf(vehicle, scene, sources, lab_from_body))
-    flight = Flight(vehicle, lab_from_body, np.radians(scene.motion.rate_deg_s), 1.0)
+    flight = Simulation(vehicle, lab_from_body, np.radians(scene.motion.rate_deg_s), 1.0)
     flight.advance(np.full((1000, 3), 0.3))
     data.ctrl = 0.3
     mujoco.mj_step(model, data, 1000)
@@ -151,7 +151,7 @@ def test_a_vehicle_of_mesh_files_stands_alone(tmp_path: Path) -> None:
         <camera name="star_camera" quat="0 1 0 0"/></body></worldbody></mujoco>"""
     )
     scene, vehicle, sources = dome_lab(
-        {"vehicle.model": str(tmp_path / "v.xml"), "vehicle.centre_of_mass": "[0 m, 0 m, 0 m]"}
+        {"vehicle.model": str(tmp_path / "v.xml"), "vehicle.center_of_mass": "[0 m, 0 m, 0 m]"}
     )
     text = mjcf_export.mjcf(vehicle, scene, sources, LEVEL)
     assert "tetra.obj" not in text
@@ -167,7 +167,7 @@ def test_a_vehicle_that_has_its_own_camera_lab_is_refused(tmp_path: Path) -> Non
         <camera name="star_camera" quat="0 1 0 0"/></body></worldbody></mujoco>"""
     )
     scene, vehicle, sources = dome_lab(
-        {"vehicle.model": str(tmp_path / "v.xml"), "vehicle.centre_of_mass": "[0 m, 0 m, 0 m]"}
+        {"vehicle.model": str(tmp_path / "v.xml"), "vehicle.center_of_mass": "[0 m, 0 m, 0 m]"}
     )
     with pytest.raises(InputError, match="lab") as refused:
         mjcf_export.mjcf(vehicle, scene, sources, LEVEL)
@@ -182,7 +182,7 @@ def test_dome_and_leds_stand_where_the_scene_has_them() -> None:
     model, data = loaded(mjcf_export.mjcf(vehicle, scene, sources, LEVEL))
     inside = surface.build_surface(scene.light.surface)
     shell = vertices_m(model, data, "stage_dome_")
-    on_it = np.sum(((shell - inside.centre_m) / inside.semi_axes_m) ** 2, axis=1)
+    on_it = np.sum(((shell - inside.center_m) / inside.semi_axes_m) ** 2, axis=1)
     np.testing.assert_allclose(on_it, 1.0, rtol=0, atol=1e-5)
     assert shell[:, 2].max() == pytest.approx(48 * 0.0254, abs=1e-5)
     grains = vertices_m(model, data, "stage_leds_")
@@ -193,7 +193,7 @@ def test_dome_and_leds_stand_where_the_scene_has_them() -> None:
     assert sorted(offset.argmin(axis=1)) == list(range(len(sources)))
 
 
-def test_a_flat_panel_is_a_disc_at_its_height_that_covers_its_leds() -> None:
+def test_a_flat_panel_is_a_disk_at_its_height_that_covers_its_leds() -> None:
     flat = {"light.surface": "{kind: flat, apex: 1.2 m}", "light.layout.cap_deg": "20"}
     scene, vehicle, sources = dome_lab(flat)
     shell = vertices_m(*loaded(mjcf_export.mjcf(vehicle, scene, sources, LEVEL)), "stage_dome_")
@@ -205,7 +205,7 @@ def test_the_sheets_look_inwards_and_outwards() -> None:
     """OpenGL draws a triangle whose corners go against the clock's hands as seen by the eye."""
     scene, vehicle, sources = dome_lab()
     model, data = loaded(mjcf_export.mjcf(vehicle, scene, sources, LEVEL))
-    middle = surface.build_surface(scene.light.surface).centre_m
+    middle = surface.build_surface(scene.light.surface).center_m
     for name, sign in (("inside", -1), ("outside", 1)):
         mesh = model.mesh(f"stage_dome_{name}")
         faces = model.mesh_face[mesh.faceadr[0] : mesh.faceadr[0] + mesh.facenum[0]]
@@ -218,18 +218,18 @@ def test_the_field_s_corners_are_those_of_the_chip_and_lie_on_the_dome() -> None
     scene, vehicle, sources = dome_lab()
     lab_from_body = Rotation.from_euler("ZYX", [30.0, 8.0, -5.0], degrees=True)
     model, data = loaded(mjcf_export.mjcf(vehicle, scene, sources, lab_from_body))
-    here = multibody.mount(vehicle)
+    here = multibody.camera_mount(vehicle)
     corner = vertices_m(model, data, "stage_field")
     tip_m = lab_from_body.apply(here.camera_body_m)
     corner = corner[np.linalg.norm(corner - tip_m, axis=1) > 0.1]
     inside = surface.build_surface(scene.light.surface)
-    on_it = np.sum(((corner - inside.centre_m) / inside.semi_axes_m) ** 2, axis=1)
+    on_it = np.sum(((corner - inside.center_m) / inside.semi_axes_m) ** 2, axis=1)
     np.testing.assert_allclose(on_it, 1.0, rtol=0, atol=1e-5)
     cam_from_lab = here.cam_from_body * lab_from_body.inv()
-    seen_px = Optics.of(scene.camera).project(cam_from_lab.apply(corner - tip_m))
+    seen_px = Optics.from_camera(scene.camera).project(cam_from_lab.apply(corner - tip_m))
     wide, high = scene.camera.width_px - 0.5, scene.camera.height_px - 0.5
     wanted = {(-0.5, -0.5), (wide, -0.5), (wide, high), (-0.5, high)}
-    # Vertices are rounded to a micrometre, in front of a camera of 9,131 px at 0.84 m.
+    # Vertices are rounded to a micrometer, in front of a camera of 9,131 px at 0.84 m.
     assert {tuple(np.round(2 * one) / 2) for one in seen_px} == wanted
 
 
@@ -237,9 +237,9 @@ def test_the_brightest_stars_stand_on_a_sphere_where_the_sky_has_them() -> None:
     scene, vehicle, sources, lab_from_body = star_lab()
     grains = vertices_m(*loaded(mjcf_export.mjcf(vehicle, scene, sources, lab_from_body)), "stage_stars_")
     star_m = grains.reshape(-1, 6, 3).mean(axis=1)
-    assert len(star_m) == mjcf_export.MOST_STARS
+    assert len(star_m) == mjcf_export.MAX_STARS
     np.testing.assert_allclose(np.linalg.norm(star_m, axis=1), mjcf_export.SKY_RADIUS_M, rtol=1e-5)
-    brightest = sources.place[np.argsort(-sources.strength)[: mjcf_export.MOST_STARS], :3]
+    brightest = sources.place[np.argsort(-sources.strength)[: mjcf_export.MAX_STARS], :3]
     apart = 1 - star_m / mjcf_export.SKY_RADIUS_M @ brightest.T
     assert apart.min(axis=0).max() < 1e-5
     assert apart.min(axis=1).max() < 1e-5
@@ -259,9 +259,7 @@ def test_the_lab_s_camera_has_all_of_the_dome_and_of_the_vehicle_in_view(surface
     model, data = loaded(mjcf_export.mjcf(vehicle, scene, sources, LEVEL))
     hardware = data.geom_xpos[model.body_rootid[model.geom_bodyid] == model.body("bus").id]
     deck_m = [[0.45 * np.cos(a), 0.45 * np.sin(a), -0.2] for a in np.arange(12) * np.pi / 6]
-    parts = [
-        vertices_m(model, data, name) for name in ("stage_dome", "stage_rim", "stage_leds", "stage_field")
-    ]
+    parts = [vertices_m(model, data, name) for name in ("stage_dome", "stage_rim", "stage_leds", "stage_field")]
     seen = seen_px(model, data, np.concatenate([*parts, hardware, deck_m]))
     assert seen.min() >= 0
     assert (seen < SIZE_PX).all()
@@ -271,7 +269,7 @@ def test_the_lab_s_camera_has_all_of_the_dome_and_of_the_vehicle_in_view(surface
 # Pictures
 
 SIZE_PX = (640, 480)
-Drawn = tuple[Sources, multibody.World, mujoco.MjModel, mujoco.MjData, np.ndarray, np.ndarray]
+Drawn = tuple[Sources, multibody.VehicleModel, mujoco.MjModel, mujoco.MjData, np.ndarray, np.ndarray]
 TILTED = Rotation.from_euler("ZYX", [0.0, 0.0, 20.0], degrees=True)
 NOTHING = "<mujoco><worldbody><camera name='lab'/></worldbody></mujoco>"
 
@@ -325,7 +323,7 @@ def test_the_leds_glow_where_they_are_projected_and_nowhere_else(drawn: Drawn) -
 def test_the_field_of_the_camera_is_seen_and_tilts_with_the_vehicle(drawn: Drawn) -> None:
     """Half-way up, level and tilted by 20 degrees, the pyramid is 0.15 m from where it was, itself 0.08 m wide."""
     _, vehicle, model, data, lit, _ = drawn
-    here = multibody.mount(vehicle)
+    here = multibody.camera_mount(vehicle)
     half_body_m = here.camera_body_m + here.cam_from_body.inv().apply([0.0, 0.0, 0.45])
     places = [seen_px(model, data, one.apply(half_body_m))[0] for one in (LEVEL, TILTED)]
     blue = lit[..., 2] - lit[..., 0]
@@ -350,7 +348,7 @@ def test_stars_are_drawn_around_a_free_vehicle(opengl: None) -> None:
     drawn = picture.picture(text, states(lab_from_body), SIZE_PX)
     count, _, boxes, _ = cv2.connectedComponentsWithStats((drawn.min(axis=2) > 90).astype(np.uint8))
     small = boxes[1:, cv2.CC_STAT_AREA] < 100
-    assert 20 < small.sum() < mjcf_export.MOST_STARS
+    assert 20 < small.sum() < mjcf_export.MAX_STARS
     assert count - 1 - small.sum() >= 1  # the vehicle
 
 
@@ -365,9 +363,9 @@ def test_without_opengl_one_line_says_what_to_do(opengl_name: str, monkeypatch: 
 
 def test_a_driver_that_takes_the_painter_with_it_is_named(tmp_path: Path) -> None:
     with (tmp_path / "stderr").open("w+b") as complaints:
-        assert "SIGSEGV" in picture.why(-11, complaints)
+        assert "SIGSEGV" in picture.failure_reason(-11, complaints)
         complaints.write(b"warning\nImportError: no libEGL\n")
-        assert picture.why(1, complaints) == "ImportError: no libEGL"
+        assert picture.failure_reason(1, complaints) == "ImportError: no libEGL"
 
 
 # Films
@@ -376,7 +374,7 @@ RED_TO_GREEN = [np.full((48, 64, 3), (250 - 20 * k, 20 * k, 0), np.uint8) for k 
 
 
 @pytest.mark.parametrize("suffix", picture.ANIMATED)
-def test_a_film_comes_back_in_its_colours_and_its_time(suffix: str, tmp_path: Path) -> None:
+def test_a_film_comes_back_in_its_colors_and_its_time(suffix: str, tmp_path: Path) -> None:
     path = tmp_path / f"film{suffix}"
     picture.write_film(iter(RED_TO_GREEN), path, fps=10.0)
     assert os.listdir(tmp_path) == [path.name]
@@ -384,15 +382,13 @@ def test_a_film_comes_back_in_its_colours_and_its_time(suffix: str, tmp_path: Pa
     assert done
     assert list(film.durations) == [100] * 10
     back = np.array([cv2.cvtColor(one[:, :, :3], cv2.COLOR_BGR2RGB) for one in film.frames], float)
-    # A GIF has few colours, WebP halves the resolution of colour: 16 of 255 is a step of the former.
+    # A GIF has few colors, WebP halves the resolution of color: 16 of 255 is a step of the former.
     np.testing.assert_allclose(back, RED_TO_GREEN, rtol=0, atol=20)
 
 
 def test_a_film_of_ten_seconds_fits_into_a_page(drawn: Drawn, tmp_path: Path) -> None:
     """One hundred frames of the lab at the film's size, the vehicle in two poses by turns."""
-    lit = [
-        cv2.resize(one.astype(np.uint8), picture.FILM_PX, interpolation=cv2.INTER_AREA) for one in drawn[4]
-    ]
+    lit = [cv2.resize(one.astype(np.uint8), picture.FILM_PX, interpolation=cv2.INTER_AREA) for one in drawn[4]]
     picture.write_film((lit[k % 2] for k in range(100)), tmp_path / "film.gif", fps=10.0)
     assert (tmp_path / "film.gif").stat().st_size < 2.5e6
 
@@ -400,6 +396,6 @@ def test_a_film_of_ten_seconds_fits_into_a_page(drawn: Drawn, tmp_path: Path) ->
 def test_a_film_that_cannot_be_written_says_so(tmp_path: Path) -> None:
     with pytest.raises(OSError, match="nowhere"):
         picture.write_film(RED_TO_GREEN, tmp_path / "nowhere" / "film.gif", fps=10.0)
-    with pytest.raises(InputError, match=r"film\.avi: a film is none of \.gif, \.webp"):
+    with pytest.raises(InputError, match=r"film\.avi: unknown animation format '\.avi'; allowed: \.gif, \.webp"):
         picture.write_film(RED_TO_GREEN, tmp_path / "film.avi", fps=10.0)
     assert not list(tmp_path.iterdir())

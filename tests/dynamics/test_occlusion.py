@@ -12,11 +12,11 @@ from scipy.spatial.transform import Rotation
 from skysim.core.paths import SCENES
 from skysim.core.types import Floats
 from skysim.dynamics import multibody
-from skysim.dynamics.multibody.integrator import Flight
+from skysim.dynamics.multibody.integrator import Simulation
 from skysim.dynamics.multibody.occlusion import behind_wall
 from skysim.scene import light, loader
-from skysim.simulation import exposure, testbed
-from skysim.simulation.testbed import Testbed
+from skysim.simulation import exposure
+from skysim.simulation.testbed import Testbed, build_testbed
 from skysim.sources.dome import surface
 from skysim.sources.dome.surface import Surface
 
@@ -48,9 +48,7 @@ def furnished(folder: Path, mjcf: str, **changes: str) -> Testbed:
     """The lab of afit_simsat with another vehicle, whose body stands at its start throughout."""
     (folder / "vehicle.xml").write_text(mjcf, encoding="utf-8")
     given = QUIET | {"vehicle.model": str(folder / "vehicle.xml")}
-    return testbed.build_testbed(
-        loader.load("afit_simsat", given | {k.replace("__", "."): v for k, v in changes.items()})
-    )
+    return build_testbed(loader.load("afit_simsat", given | {k.replace("__", "."): v for k, v in changes.items()}))
 
 
 def on_bus(geom: str) -> str:
@@ -66,20 +64,20 @@ def crosses(begin_m: Floats, end_m: Floats, middle_m: Floats) -> np.ndarray:
     return np.asarray((enters < leaves) & (leaves > 0) & (enters < 1))
 
 
-def picture(lab: Testbed) -> tuple[bytes, set[int], Any]:
-    frame, truth = exposure.render_frame(lab, 0)
-    return frame.image_dn.tobytes(), set(truth.seen.id.tolist()), truth
+def picture(testbed: Testbed) -> tuple[bytes, set[int], Any]:
+    frame, truth = exposure.render_frame(testbed, 0)
+    return frame.image_dn.tobytes(), set(truth.sources.id.tolist()), truth
 
 
 @pytest.mark.parametrize("start", STARTS)
 def test_a_mast_on_the_vehicle_hides_just_the_leds_behind_it(start: str, tmp_path: Path) -> None:
-    lab = furnished(tmp_path, on_bus(mast(MAST_M)), motion__start=start)
+    testbed = furnished(tmp_path, on_bus(mast(MAST_M)), motion__start=start)
     bare = furnished(tmp_path, on_bus(mast(MAST_M)), motion__start=start, light__occlusion="false")
-    _, seen, truth = picture(lab)
+    _, seen, truth = picture(testbed)
     everything = picture(bare)[1]
     to_body = truth.lab_from_body.inv()
-    behind = crosses(lab.mount.camera_body_m, to_body.apply(lab.sources.place[:, :3]), MAST_M)
-    gone = set(lab.sources.id[behind].tolist())
+    behind = crosses(testbed.mount.camera_body_m, to_body.apply(testbed.sources.place[:, :3]), MAST_M)
+    gone = set(testbed.sources.id[behind].tolist())
     assert seen == everything - gone
     # Those beyond the border whose blur reaches in are on the frame, but not on the chip.
     assert set(truth.hidden.tolist()) <= gone & everything
@@ -87,20 +85,20 @@ def test_a_mast_on_the_vehicle_hides_just_the_leds_behind_it(start: str, tmp_pat
     assert len(picture(bare)[2].hidden) == 0
     assert len(everything & gone) >= 4
     assert len(seen) >= 10
-    assert lab.obstacles is not None
-    np.testing.assert_array_equal(multibody.hidden(lab.obstacles, truth.lab_from_body, lab.sources), behind)
+    assert testbed.obstacles is not None
+    np.testing.assert_array_equal(multibody.occluded(testbed.obstacles, truth.lab_from_body, testbed.sources), behind)
 
 
 def test_a_beam_of_the_lab_stays_while_the_vehicle_turns(tmp_path: Path) -> None:
     beam = SIMSAT.replace("<worldbody>", f"<worldbody>{mast(MAST_M)}", 1)
     counts = []
     for start in ["{yaw_deg: 0}", "{roll_deg: 3, yaw_deg: 60}", "{roll_deg: 20}"]:
-        lab = furnished(tmp_path, beam, motion__start=start)
-        lab_from_body = lab.trajectory.lab_from_body[0]
-        assert lab.obstacles is not None
-        found = multibody.hidden(lab.obstacles, lab_from_body, lab.sources)
-        camera_m = lab_from_body.apply(lab.mount.camera_body_m)
-        behind = crosses(camera_m, lab.sources.place[:, :3], MAST_M)
+        testbed = furnished(tmp_path, beam, motion__start=start)
+        lab_from_body = testbed.trajectory.lab_from_body[0]
+        assert testbed.obstacles is not None
+        found = multibody.occluded(testbed.obstacles, lab_from_body, testbed.sources)
+        camera_m = lab_from_body.apply(testbed.mount.camera_body_m)
+        behind = crosses(camera_m, testbed.sources.place[:, :3], MAST_M)
         np.testing.assert_array_equal(found, behind)
         counts.append(int(behind.sum()))
     assert min(counts) >= 4
@@ -111,8 +109,7 @@ def test_where_nothing_is_in_the_way_the_frame_is_the_same_bit_for_bit(tmp_path:
     on, off = (picture(furnished(tmp_path, SIMSAT, light__occlusion=word)) for word in ("true", "false"))
     assert on[:2] == off[:2]
     masted = {
-        word: picture(furnished(tmp_path, on_bus(mast(MAST_M)), light__occlusion=word))
-        for word in ("true", "false")
+        word: picture(furnished(tmp_path, on_bus(mast(MAST_M)), light__occlusion=word)) for word in ("true", "false")
     }
     assert masted["false"][:2] == off[:2]
     assert masted["true"][0] != off[0]
@@ -120,8 +117,8 @@ def test_where_nothing_is_in_the_way_the_frame_is_the_same_bit_for_bit(tmp_path:
 
 
 def test_it_is_on_unless_the_scene_says_otherwise() -> None:
-    assert testbed.build_testbed(loader.load("afit_simsat")).obstacles is not None
-    assert testbed.build_testbed(loader.load("afit_simsat", {"light.occlusion": "false"})).obstacles is None
+    assert build_testbed(loader.load("afit_simsat")).obstacles is not None
+    assert build_testbed(loader.load("afit_simsat", {"light.occlusion": "false"})).obstacles is None
 
 
 LENS = '<geom type="cylinder" size="0.022 0.015" pos="0 0 0.065" mass="0.2" rgba="0.05 0.05 0.06 1"/>'
@@ -151,39 +148,39 @@ def test_stars_are_hidden_by_the_body_that_they_are_behind() -> None:
 
     A ray u from the origin meets it where the discriminant of |(s u - c) / a|^2 = 1 is not negative, ahead.
     """
-    lab = testbed.build_testbed(loader.load("shefex2"))
-    centre, axes = np.array([0.0, 0.0, -0.8]), np.array([0.25, 0.25, 0.6])
-    assert lab.obstacles is not None
-    turn = lab.trajectory.lab_from_body[0]
-    rays = turn.inv().apply(lab.sources.place[:, :3]) / axes
-    along = rays @ (centre / axes)
-    root = along**2 - np.sum(rays**2, axis=1) * (np.sum((centre / axes) ** 2) - 1)
+    testbed = build_testbed(loader.load("shefex2"))
+    center, axes = np.array([0.0, 0.0, -0.8]), np.array([0.25, 0.25, 0.6])
+    assert testbed.obstacles is not None
+    turn = testbed.trajectory.lab_from_body[0]
+    rays = turn.inv().apply(testbed.sources.place[:, :3]) / axes
+    along = rays @ (center / axes)
+    root = along**2 - np.sum(rays**2, axis=1) * (np.sum((center / axes) ** 2) - 1)
     behind = (root >= 0) & (along > 0)
-    np.testing.assert_array_equal(multibody.hidden(lab.obstacles, turn, lab.sources), behind)
+    np.testing.assert_array_equal(multibody.occluded(testbed.obstacles, turn, testbed.sources), behind)
     assert 100 < behind.sum() < len(behind) / 4
 
 
 def test_gimbals_stand_where_they_are_at_the_start() -> None:
     """Every geom, by its place, as in the model that is flown."""
     given = loader.load("simsat_cmg", {"vehicle.cmgs.start_deg": "[10, 25, -30, 70]"})
-    ship = multibody.build(given.vehicle)
-    flown = Flight(ship, Rotation.identity(), np.zeros(3), 0.1).data
-    things = multibody.obstacles(ship, None)
+    vehicle = multibody.build(given.vehicle)
+    flown = Simulation(vehicle, Rotation.identity(), np.zeros(3), 0.1).data
+    things = multibody.build_obstacles(vehicle, None)
 
     def placed(data: Any) -> Floats:
         pose = np.hstack([data.geom_xpos, np.abs(data.geom_xmat)])
         return pose[np.lexsort(np.round(pose, 9).T)]
 
     np.testing.assert_allclose(placed(things.data), placed(flown), rtol=0, atol=1e-9)
-    level = multibody.obstacles(multibody.build(loader.load("simsat_cmg").vehicle), None)
+    level = multibody.build_obstacles(multibody.build(loader.load("simsat_cmg").vehicle), None)
     assert np.abs(placed(things.data) - placed(level.data)).max() > 0.1
 
 
 def test_no_source_is_no_question() -> None:
-    lab = testbed.build_testbed(loader.load("afit_simsat"))
-    assert lab.obstacles is not None
-    nobody = lab.sources.take(np.zeros(0, np.int64))
-    assert multibody.hidden(lab.obstacles, Rotation.identity(), nobody).shape == (0,)
+    testbed = build_testbed(loader.load("afit_simsat"))
+    assert testbed.obstacles is not None
+    no_sources = testbed.sources.take(np.zeros(0, np.int64))
+    assert multibody.occluded(testbed.obstacles, Rotation.identity(), no_sources).shape == (0,)
 
 
 # --- the dome's wall ----------------------------------------------------------------------------------------
@@ -206,10 +203,10 @@ BOWL = {"kind": "sphere", "apex": "1.5 m", "radius": "1 m", "rim_height": "0.5 m
 
 def test_the_wall_hides_leds_from_a_camera_beside_the_dome_unless_it_looks_beneath_the_rim() -> None:
     """A half-sphere open at 0.5 m: a sight enters it through the wall or beneath, by the lesser root of a quadratic."""
-    inside, centre = made(BOWL), np.array([0.0, 0.0, 0.5])
+    inside, center = made(BOWL), np.array([0.0, 0.0, 0.5])
     leds = places(inside, 60)
     for camera_m in ([1.3, 0.0, 0.3], [0.4, -1.1, 0.45], [1.05, 0.2, 0.1]):
-        way, start = leds - camera_m, np.array(camera_m) - centre
+        way, start = leds - camera_m, np.array(camera_m) - center
         a, b, c = np.sum(way**2, axis=1), way @ start, start @ start - 1
         entry = (-b - np.sqrt(np.maximum(b**2 - a * c, 0))) / a
         height_m = camera_m[2] + entry * way[:, 2]
@@ -240,21 +237,21 @@ def test_a_wall_hides_what_its_scene_says(tmp_path: Path) -> None:
     beside = SIMSAT.replace('name="star_camera" pos="0 0 0.081"', 'name="star_camera" pos="0.5 0 0.0"')
     drum = "{kind: cylinder, axis: z, apex: 3 m, radius: 0.4 m, length: 2.4 m}"
     layout = "{kind: listed, cap_deg: 40, positions: [[-0.4 m, 0 m, 0.8 m], [-0.4 m, 0 m, 2.8 m]]}"
-    lab = furnished_drum(tmp_path, beside, drum, layout)
-    assert lab.obstacles is not None
+    testbed = furnished_drum(tmp_path, beside, drum, layout)
+    assert testbed.obstacles is not None
     # At the near wall, 1/9 of the way over, the sights are 0.36 m and 0.58 m high; the wall begins at 0.6 m.
-    level = multibody.hidden(lab.obstacles, Rotation.identity(), lab.sources)
+    level = multibody.occluded(testbed.obstacles, Rotation.identity(), testbed.sources)
     np.testing.assert_array_equal(level, [False, False])
     # Farther out, at 1 m, half of the way: 0.55 m and 1.55 m.
     far = SIMSAT.replace('name="star_camera" pos="0 0 0.081"', 'name="star_camera" pos="1.2 0 0.0"')
-    lab = furnished_drum(tmp_path, far, drum, layout)
-    assert lab.obstacles is not None
+    testbed = furnished_drum(tmp_path, far, drum, layout)
+    assert testbed.obstacles is not None
     np.testing.assert_array_equal(
-        multibody.hidden(lab.obstacles, Rotation.identity(), lab.sources), [False, True]
+        multibody.occluded(testbed.obstacles, Rotation.identity(), testbed.sources), [False, True]
     )
 
 
 def furnished_drum(folder: Path, mjcf: str, drum: str, layout: str) -> Testbed:
     (folder / "vehicle.xml").write_text(mjcf, encoding="utf-8")
     given = {"vehicle.model": str(folder / "vehicle.xml"), "light.surface": drum, "light.layout": layout}
-    return testbed.build_testbed(loader.load("afit_simsat", given))
+    return build_testbed(loader.load("afit_simsat", given))

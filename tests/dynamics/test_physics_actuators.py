@@ -23,35 +23,35 @@ WHEEL_KG_M2 = 2.5 * 0.09**2 / 2  # simsat.xml's wheels: cylinders of 2.5 kg and 
 RPM = math.pi / 30
 
 
-def vehicle(**changes: object) -> VehicleConfig:
+def vehicle_config(**changes: object) -> VehicleConfig:
     return VehicleConfig.model_validate(SIMSAT | changes)
 
 
-def flown(ship: multibody.World, rate: Floats, control: Floats) -> multibody.Flight:
+def flown(vehicle: multibody.VehicleModel, rate: Floats, control: Floats) -> multibody.Simulation:
     """A whole flight, level at first, with a control (K, nu) for each step."""
-    flight = multibody.Flight(ship, LEVEL, rate, len(control) * ship.model.opt.timestep)
+    flight = multibody.Simulation(vehicle, LEVEL, rate, len(control) * vehicle.model.opt.timestep)
     flight.advance(control)
     return flight
 
 
-def still(ship: multibody.World, duration_s: float) -> Floats:
+def still(vehicle: multibody.VehicleModel, duration_s: float) -> Floats:
     """Nobody at the controls: (K, nu) zeros."""
-    return np.zeros((round(duration_s / ship.model.opt.timestep), ship.model.nu))
+    return np.zeros((round(duration_s / vehicle.model.opt.timestep), vehicle.model.nu))
 
 
-def held(ship: multibody.World, motor: int, control: float, duration_s: float) -> Floats:
+def held(vehicle: multibody.VehicleModel, motor: int, control: float, duration_s: float) -> Floats:
     """One control held, all others zero: (K, nu)."""
-    controls = still(ship, duration_s)
+    controls = still(vehicle, duration_s)
     controls[:, motor] = control
     return controls
 
 
-def angles(flight: multibody.Flight) -> Floats:
+def angles(flight: multibody.Simulation) -> Floats:
     """(K + 1, nq)"""
     return flight.states[:, 1 : 1 + flight.model.nq]
 
 
-def speeds(flight: multibody.Flight) -> Floats:
+def speeds(flight: multibody.Simulation) -> Floats:
     """(K + 1, nv)"""
     return flight.states[:, 1 + flight.model.nq :][:, : flight.model.nv]
 
@@ -62,20 +62,18 @@ def speeds(flight: multibody.Flight) -> Floats:
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_wheel_motor_turns_the_body_the_other_way_and_stops_at_its_limit(axis: int) -> None:
     """Ask for 5 N m of a motor that has 0.2: the body goes with -0.2 t / (I - I_wheel), the total is nothing."""
-    ship = multibody.build(vehicle(mount="free", wheels={"torque_limit": "0.2 N m"}))
-    flight = flown(ship, STILL, held(ship, ship.wheels.motor[axis], 5.0, 2.0))
+    vehicle = multibody.build(vehicle_config(mount="free", wheels={"torque_limit": "0.2 N m"}))
+    flight = flown(vehicle, STILL, held(vehicle, vehicle.wheels.motor[axis], 5.0, 2.0))
     body = -0.2 * 2.0 / (INERTIA[axis] - WHEEL_KG_M2)
     np.testing.assert_allclose(flight.rate_body_rad_s, body * np.eye(3)[axis], rtol=0, atol=1e-12)
-    wheel = flight.speeds_rad_s[ship.wheels.dof[axis]]
+    wheel = flight.speeds_rad_s[vehicle.wheels.dof[axis]]
     assert WHEEL_KG_M2 * (wheel + body) == pytest.approx(0.2 * 2.0, rel=1e-9)
 
 
 def test_wheel_starts_at_its_speed_relative_to_the_body() -> None:
-    ship = multibody.build(vehicle(mount="free", wheels={"start_rpm": [300, -200, 100]}))
-    flight = multibody.Flight(ship, LEVEL, np.array([0.1, 0.2, 0.3]), 1.0)
-    np.testing.assert_allclose(
-        flight.speeds_rad_s, [0.1, 0.2, 0.3, 300 * RPM, -200 * RPM, 100 * RPM], rtol=1e-15
-    )
+    vehicle = multibody.build(vehicle_config(mount="free", wheels={"start_rpm": [300, -200, 100]}))
+    flight = multibody.Simulation(vehicle, LEVEL, np.array([0.1, 0.2, 0.3]), 1.0)
+    np.testing.assert_allclose(flight.speeds_rad_s, [0.1, 0.2, 0.3, 300 * RPM, -200 * RPM, 100 * RPM], rtol=1e-15)
 
 
 def test_friction_brings_a_wheel_to_rest_and_the_body_takes_its_momentum() -> None:
@@ -84,9 +82,9 @@ def test_friction_brings_a_wheel_to_rest_and_the_body_takes_its_momentum() -> No
     I is that of wheel and body against each other. Then the two turn together with what the wheel brought.
     """
     friction = {"coulomb": "0.1 N m", "viscous": "1e-3 N m s", "start_rpm": [500, 0, 0]}
-    ship = multibody.build(vehicle(mount="free", wheels=friction))
-    flight = flown(ship, STILL, still(ship, 6.0))
-    t, speed = np.arange(6001) * 1e-3, speeds(flight)[:, ship.wheels.dof[0]]
+    vehicle = multibody.build(vehicle_config(mount="free", wheels=friction))
+    flight = flown(vehicle, STILL, still(vehicle, 6.0))
+    t, speed = np.arange(6001) * 1e-3, speeds(flight)[:, vehicle.wheels.dof[0]]
     start, both = 500 * RPM, WHEEL_KG_M2 * (6 - WHEEL_KG_M2) / 6
     stops_s = both / 1e-3 * math.log(1 + start * 1e-3 / 0.1)
     assert 4 < stops_s < 5
@@ -101,15 +99,15 @@ def test_friction_brings_a_wheel_to_rest_and_the_body_takes_its_momentum() -> No
 @pytest.mark.parametrize(("torque_nm", "expected"), [(0.019, 0.0), (0.03, 0.01 / WHEEL_KG_M2)])
 def test_wheel_sticks_until_its_motor_beats_coulombs_friction(torque_nm: float, expected: float) -> None:
     """Speed after a second of a motor against 0.02 N m; MuJoCo's friction creeps, by 2e-3 rad/s here."""
-    ship = multibody.build(vehicle(mount="free", wheels={"coulomb": "0.02 N m"}, **HEAVY))
-    flight = flown(ship, STILL, held(ship, ship.wheels.motor[2], torque_nm, 1.0))
-    assert flight.speeds_rad_s[ship.wheels.dof[2]] == pytest.approx(expected, abs=5e-3)
+    vehicle = multibody.build(vehicle_config(mount="free", wheels={"coulomb": "0.02 N m"}, **HEAVY))
+    flight = flown(vehicle, STILL, held(vehicle, vehicle.wheels.motor[2], torque_nm, 1.0))
+    assert flight.speeds_rad_s[vehicle.wheels.dof[2]] == pytest.approx(expected, abs=5e-3)
 
 
-def shaking_rad(ship: multibody.World, rad_s: float) -> Floats:
+def shaking_rad(vehicle: multibody.VehicleModel, rad_s: float) -> Floats:
     """(3,) amplitude at a frequency, about the body's axes, of what is no slow drift in 0.2 s of flight."""
-    flight = flown(ship, STILL, still(ship, 0.2))
-    t = np.arange(len(flight.states)) * ship.model.opt.timestep
+    flight = flown(vehicle, STILL, still(vehicle, 0.2))
+    t = np.arange(len(flight.states)) * vehicle.model.opt.timestep
     turn = Rotation.from_quat(angles(flight)[:, :4], scalar_first=True).as_rotvec()
     laws = np.stack([np.ones_like(t), t, t**2, t**3, np.cos(rad_s * t), np.sin(rad_s * t)], axis=1)
     found, *_ = np.linalg.lstsq(laws, turn, rcond=None)
@@ -133,15 +131,15 @@ def test_unbalanced_wheel_shakes_the_body(axis: int, static_g_cm: float, dynamic
     """
     turned_by: dict[str, object] = {"static_imbalance": f"{static_g_cm} g cm"}
     turned_by |= {"dynamic_imbalance": f"{dynamic_g_cm2} g cm2", "start_rpm": list(3000 * np.eye(3)[axis])}
-    ship, w = multibody.build(vehicle(mount="free", wheels=turned_by)), 3000 * RPM
+    vehicle, w = multibody.build(vehicle_config(mount="free", wheels=turned_by)), 3000 * RPM
     h = WHEEL_KG_M2 * w * np.eye(3)[axis]
     inertia = np.diag(INERTIA - WHEEL_KG_M2)
     across = np.cross(np.eye(3), h).T  # across @ rate = rate x h
     torque = torque_of_imbalance(axis, static_g_cm * 1e-5, dynamic_g_cm2 * 1e-7) * w**2
     expected = np.abs(np.linalg.solve(1j * w * inertia + across, torque) / w)
-    coarse = shaking_rad(ship, w)
-    ship.model.opt.timestep = 1e-4
-    fine = shaking_rad(ship, w)
+    coarse = shaking_rad(vehicle, w)
+    vehicle.model.opt.timestep = 1e-4
+    fine = shaking_rad(vehicle, w)
     largest = expected.max()
     assert largest > 1e-7
     np.testing.assert_allclose(coarse, expected, rtol=0, atol=2e-5 * largest)
@@ -151,7 +149,7 @@ def test_unbalanced_wheel_shakes_the_body(axis: int, static_g_cm: float, dynamic
 def test_shaking_by_hand() -> None:
     """Wheel z, dynamic 10 g cm2: 1e-6 / 6 rad about x and 1e-6 / 6.5 rad about y, whatever its speed; none about z."""
     wheels = {"dynamic_imbalance": "10 g cm2", "start_rpm": [0, 0, 3000]}
-    found = shaking_rad(multibody.build(vehicle(mount="free", wheels=wheels)), 3000 * RPM)
+    found = shaking_rad(multibody.build(vehicle_config(mount="free", wheels=wheels)), 3000 * RPM)
     np.testing.assert_allclose(found, [1e-6 / 6, 1e-6 / 6.5, 0], rtol=0.01, atol=1e-10)
 
 
@@ -160,13 +158,13 @@ def test_shaking_by_hand() -> None:
 
 def test_gimbal_reaches_its_commanded_rate_with_the_time_constant() -> None:
     """A critically damped spring after a ramp: d(angle)/dt = r (1 - (1 + t / tau) exp(-t / tau))."""
-    ship = multibody.build(
-        vehicle(mount="free", cmgs={"gimbal_time_constant": "20 ms", "rotor_rpm": 1e-6}, **HEAVY)
+    vehicle = multibody.build(
+        vehicle_config(mount="free", cmgs={"gimbal_time_constant": "20 ms", "rotor_rpm": 1e-6}, **HEAVY)
     )
-    flight = flown(ship, STILL, held(ship, ship.gimbals.motor[1], 0.5, 0.2))
+    flight = flown(vehicle, STILL, held(vehicle, vehicle.gimbals.motor[1], 0.5, 0.2))
     x = np.arange(201) * 1e-3 / 0.02
     expected = 0.5 * (1 - (1 + x) * np.exp(-x))
-    found = speeds(flight)[:, ship.gimbals.dof[1]]
+    found = speeds(flight)[:, vehicle.gimbals.dof[1]]
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-5)
 
 
@@ -177,26 +175,26 @@ def test_gimbal_keeps_its_rate_while_the_vehicle_turns() -> None:
     what was asked for. A damper alone would slip by w h tau / 2 I = 50 deg/s.
     """
     cmgs = {"rotor_rpm": 2600, "gimbal_time_constant": "10 ms"}
-    ship = multibody.build(vehicle(mount="free", cmgs=cmgs, **HEAVY))
+    vehicle = multibody.build(vehicle_config(mount="free", cmgs=cmgs, **HEAVY))
     t, rate = np.arange(5001) * 1e-3, np.radians([10.0, -10.0, 5.0, 0.0])
-    control = still(ship, 5.0)
-    control[:, ship.gimbals.motor] = rate
-    flight = flown(ship, np.array([0.0, 0.0, 1.0]), control)
-    own = ship.gimbals.inertia_kg_m2[0]
+    control = still(vehicle, 5.0)
+    control[:, vehicle.gimbals.motor] = rate
+    flight = flown(vehicle, np.array([0.0, 0.0, 1.0]), control)
+    own = vehicle.gimbals.inertia_kg_m2[0]
     given_way = 1.0 * 1.8 * 0.05**2 / 2 * 2600 * RPM / (own / 0.01**2)
-    late = angles(flight)[:, ship.gimbals.qpos] - t[:, None] * rate
+    late = angles(flight)[:, vehicle.gimbals.qpos] - t[:, None] * rate
     assert np.abs(late[t > 0.1] + 2 * 0.01 * rate).max() < given_way
     assert np.abs(late[t > 0.1] + 2 * 0.01 * rate).max() > given_way / 4  # it was pressed indeed
 
 
 def test_rotor_keeps_its_speed_or_is_driven_where_it_has_a_motor() -> None:
     """2600 rpm kept to a part in 1e12 by nothing at all; with a motor of 0.1 N m, 0.1 t / I more."""
-    free = multibody.build(vehicle(mount="free", cmgs={"rotor_rpm": 2600}, **HEAVY))
+    free = multibody.build(vehicle_config(mount="free", cmgs={"rotor_rpm": 2600}, **HEAVY))
     assert (free.rotors.motor == -1).all()
     flight = flown(free, STILL, still(free, 1.0))
     np.testing.assert_allclose(flight.speeds_rad_s[free.rotors.dof], 2600 * RPM, rtol=1e-12)
     driven = multibody.build(
-        vehicle(mount="free", cmgs={"rotor_rpm": 2600, "rotor_torque_limit": "0.1 N m"}, **HEAVY)
+        vehicle_config(mount="free", cmgs={"rotor_rpm": 2600, "rotor_torque_limit": "0.1 N m"}, **HEAVY)
     )
     flight = flown(driven, STILL, held(driven, driven.rotors.motor[2], 7.0, 1.0))
     expected = 2600 * RPM + np.array([0, 0, 0.1, 0]) / (1.8 * 0.05**2 / 2)
@@ -205,10 +203,10 @@ def test_rotor_keeps_its_speed_or_is_driven_where_it_has_a_motor() -> None:
 
 def test_gimbals_start_where_the_scene_has_them() -> None:
     """And stay there: the servo aims at the same angle."""
-    ship = multibody.build(vehicle(mount="free", cmgs={"start_deg": [10, -20, 30, 90]}, **HEAVY))
-    flight = flown(ship, STILL, still(ship, 1.0))
+    vehicle = multibody.build(vehicle_config(mount="free", cmgs={"start_deg": [10, -20, 30, 90]}, **HEAVY))
+    flight = flown(vehicle, STILL, still(vehicle, 1.0))
     np.testing.assert_allclose(
-        np.degrees(angles(flight)[:, ship.gimbals.qpos]), np.tile([10, -20, 30, 90], (1001, 1)), atol=1e-6
+        np.degrees(angles(flight)[:, vehicle.gimbals.qpos]), np.tile([10, -20, 30, 90], (1001, 1)), atol=1e-6
     )
 
 
@@ -220,10 +218,10 @@ def test_fans_thrust_follows_with_a_lag_and_stops_at_its_limit() -> None:
 
     A pair at 0.46 m, told 5 N each of which it has 0.3, for a second.
     """
-    ship = multibody.build(vehicle(mount="free", fans={"time_constant": "200 ms", "thrust_limit": "0.3 N"}))
-    control = still(ship, 3.0)
-    control[:1000, ship.fans.motor[:2]] = 5.0
-    rate = speeds(flown(ship, STILL, control))[:, 0]
+    vehicle = multibody.build(vehicle_config(mount="free", fans={"time_constant": "200 ms", "thrust_limit": "0.3 N"}))
+    control = still(vehicle, 3.0)
+    control[:1000, vehicle.fans.motor[:2]] = 5.0
+    rate = speeds(flown(vehicle, STILL, control))[:, 0]
     t, torque, tau = np.arange(3001) * 1e-3, 2 * 0.3 * 0.46, 0.2
     pushed = torque / 6 * (t - tau * (1 - np.exp(-t / tau)))
     np.testing.assert_allclose(rate[:1001], pushed[:1001], rtol=0, atol=1e-10)
@@ -234,10 +232,10 @@ def test_fans_thrust_follows_with_a_lag_and_stops_at_its_limit() -> None:
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_pair_of_fans_turns_about_its_axis_alone(axis: int) -> None:
     """simsat.xml's fan_x_1 and fan_x_2 push 0.46 m from the axis, fan_z_* sqrt(2) 0.33 m."""
-    ship = multibody.build(vehicle(mount="free", fans={"time_constant": "5 ms"}))
-    control = still(ship, 1.0)
-    control[:, ship.fans.motor[2 * axis : 2 * axis + 2]] = 0.25
-    rate = flown(ship, STILL, control).rate_body_rad_s
+    vehicle = multibody.build(vehicle_config(mount="free", fans={"time_constant": "5 ms"}))
+    control = still(vehicle, 1.0)
+    control[:, vehicle.fans.motor[2 * axis : 2 * axis + 2]] = 0.25
+    rate = flown(vehicle, STILL, control).rate_body_rad_s
     arm = [0.46, 0.46, 0.33 * math.sqrt(2)][axis]
     expected = 2 * 0.25 * arm * (1 - 5e-3) / INERTIA[axis] * np.eye(3)[axis]
     np.testing.assert_allclose(rate, expected, rtol=0, atol=1e-5 * expected.max())
@@ -254,8 +252,8 @@ def test_drag_slows_a_spin(begin: float, viscous: float, quadratic: float) -> No
     w = w0 exp(-c t / J) / (1 + q |w0| (1 - exp(-c t / J)) / c), or w0 / (1 + q |w0| t / J) where c is zero.
     """
     drag = {"viscous": f"{viscous} N m s", "quadratic": f"{quadratic} N m s2"}
-    ship = multibody.build(vehicle(drag=drag))
-    flight = flown(ship, np.array([0, 0, begin]), still(ship, 8.0))
+    vehicle = multibody.build(vehicle_config(drag=drag))
+    flight = flown(vehicle, np.array([0, 0, begin]), still(vehicle, 8.0))
     t = np.arange(8001) * 1e-3
     fades = np.exp(-viscous * t / 9)
     over = -np.expm1(-viscous * t / 9) / viscous if viscous else t / 9
@@ -266,10 +264,10 @@ def test_drag_slows_a_spin(begin: float, viscous: float, quadratic: float) -> No
 
 def test_drag_is_felt_about_each_axis_by_its_own_rate() -> None:
     """T = -(0.01 + 0.02 |w_i|) w_i at (0.1, -0.2, 0.3) rad/s, by hand."""
-    ship = multibody.build(vehicle(drag={"viscous": "0.01 N m s", "quadratic": "0.02 N m s2"}))
-    data = mujoco.MjData(ship.model)
+    vehicle = multibody.build(vehicle_config(drag={"viscous": "0.01 N m s", "quadratic": "0.02 N m s2"}))
+    data = mujoco.MjData(vehicle.model)
     data.qvel[:] = [0.1, -0.2, 0.3]
-    mujoco.mj_forward(ship.model, data)
+    mujoco.mj_forward(vehicle.model, data)
     np.testing.assert_allclose(data.qfrc_passive, [-0.0012, 0.0028, -0.0048], rtol=0, atol=1e-15)
 
 
@@ -277,13 +275,13 @@ def test_drag_is_felt_about_each_axis_by_its_own_rate() -> None:
 def test_cable_swings_the_vehicle_like_a_spring(axis: int, amplitude_deg: float) -> None:
     """T = 2 pi sqrt(J / k) about each axis, whatever the amplitude: the torque goes with the angle."""
     stiffness = 2.0
-    ship = multibody.build(vehicle(disturbances={"cable": {"stiffness": f"{stiffness} N m / rad"}}))
+    vehicle = multibody.build(vehicle_config(disturbances={"cable": {"stiffness": f"{stiffness} N m / rad"}}))
     period = 2 * math.pi * math.sqrt(INERTIA[axis] / stiffness)
     begin = Rotation.from_rotvec(math.radians(amplitude_deg) * np.eye(3)[axis])
-    flight = multibody.fly(ship, begin, STILL, 0.8 * period)
+    flight = multibody.simulate(vehicle, begin, STILL, 0.8 * period)
 
     def angle(t_s: float) -> float:
-        return flight.at(t_s).as_rotvec()[axis]
+        return flight.attitude_at(t_s).as_rotvec()[axis]
 
     down = brentq(angle, 0.0, 0.5 * period, xtol=1e-12)
     up = brentq(angle, 0.5 * period, 0.8 * period, xtol=1e-12)
@@ -293,8 +291,8 @@ def test_cable_swings_the_vehicle_like_a_spring(axis: int, amplitude_deg: float)
 
 def test_cable_turns_the_vehicle_back_by_the_shorter_way() -> None:
     """At 200 deg of yaw it is wound by 160 the other way: 0.1 N m/rad pull with +0.279 N m."""
-    ship = multibody.build(vehicle(disturbances={"cable": {"stiffness": "0.1 N m / rad"}}))
-    data = mujoco.MjData(ship.model)
+    vehicle = multibody.build(vehicle_config(disturbances={"cable": {"stiffness": "0.1 N m / rad"}}))
+    data = mujoco.MjData(vehicle.model)
     data.qpos[:4] = Rotation.from_euler("z", 200, degrees=True).as_quat(scalar_first=True)
-    mujoco.mj_forward(ship.model, data)
+    mujoco.mj_forward(vehicle.model, data)
     np.testing.assert_allclose(data.qfrc_passive, [0, 0, 0.1 * math.radians(160)], rtol=0, atol=1e-12)

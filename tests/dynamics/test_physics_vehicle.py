@@ -1,6 +1,6 @@
 """The vehicle against the great laws: what is kept is kept, what theory solves comes out as solved.
 
-MuJoCo knows no spin-stabilised body, no gyroscope and no elliptic function; every number here is worked out beside it.
+MuJoCo knows no spin-stabilized body, no gyroscope and no elliptic function; every number here is worked out beside it.
 """
 
 from __future__ import annotations
@@ -26,23 +26,25 @@ SIMSAT = {"model": "vehicles/simsat.xml", "mass": "80 kg", "inertia": ["6 kg m2"
 SPINNING: dict[str, object] = {"mount": "free", "wheels": {"start_rpm": [3000, 2000, -1000]}, "cmgs": {}}
 
 
-def vehicle(**changes: object) -> VehicleConfig:
+def vehicle_config(**changes: object) -> VehicleConfig:
     return VehicleConfig.model_validate(SIMSAT | changes)
 
 
-def flown(ship: multibody.World, lab_from_body: Rotation, rate: Floats, control: Floats) -> multibody.Flight:
+def flown(
+    vehicle: multibody.VehicleModel, lab_from_body: Rotation, rate: Floats, control: Floats
+) -> multibody.Simulation:
     """A whole flight with a control (K, nu) for each step."""
-    flight = multibody.Flight(ship, lab_from_body, rate, len(control) * ship.model.opt.timestep)
+    flight = multibody.Simulation(vehicle, lab_from_body, rate, len(control) * vehicle.model.opt.timestep)
     flight.advance(control)
     return flight
 
 
-def still(ship: multibody.World, duration_s: float) -> Floats:
+def still(vehicle: multibody.VehicleModel, duration_s: float) -> Floats:
     """Nobody at the controls: (K, nu) zeros."""
-    return np.zeros((round(duration_s / ship.model.opt.timestep), ship.model.nu))
+    return np.zeros((round(duration_s / vehicle.model.opt.timestep), vehicle.model.nu))
 
 
-def carried(flight: multibody.Flight, step: int) -> tuple[Floats, float]:
+def carried(flight: multibody.Simulation, step: int) -> tuple[Floats, float]:
     """Angular momentum (3,) about the lab's origin and kinetic energy, a sum over the bodies one by one.
 
     Of MuJoCo only each body's own velocity, place, mass and principal inertia: L = sum m r x v + J w.
@@ -69,11 +71,11 @@ def test_angular_momentum_is_kept_for_a_minute_while_wheels_and_gimbals_are_driv
 
     For 40 s of the 60 random rates of up to 1 rad/s at the gimbals and 0.3 N m at the wheels, another each 0.1 s.
     """
-    ship, rng = multibody.build(vehicle(**SPINNING)), np.random.default_rng(4)
-    control = still(ship, 60.0)
-    control[:40_000, ship.gimbals.motor] = np.repeat(rng.uniform(-1, 1, (400, 4)), 100, axis=0)
-    control[:40_000, ship.wheels.motor] = np.repeat(rng.uniform(-0.3, 0.3, (400, 3)), 100, axis=0)
-    flight = flown(ship, Rotation.from_rotvec([0.3, -0.2, 0.5]), np.array([0.1, 0.2, -0.15]), control)
+    vehicle, rng = multibody.build(vehicle_config(**SPINNING)), np.random.default_rng(4)
+    control = still(vehicle, 60.0)
+    control[:40_000, vehicle.gimbals.motor] = np.repeat(rng.uniform(-1, 1, (400, 4)), 100, axis=0)
+    control[:40_000, vehicle.wheels.motor] = np.repeat(rng.uniform(-0.3, 0.3, (400, 3)), 100, axis=0)
+    flight = flown(vehicle, Rotation.from_rotvec([0.3, -0.2, 0.5]), np.array([0.1, 0.2, -0.15]), control)
     kept = np.array([carried(flight, step) for step in range(0, 60_001, 2000)], dtype=object)
     momentum = np.stack(kept[:, 0])
     assert np.abs(momentum - momentum[0]).max() < 1e-8
@@ -83,22 +85,22 @@ def test_angular_momentum_is_kept_for_a_minute_while_wheels_and_gimbals_are_driv
 
 def test_energy_and_momentum_are_kept_for_a_minute_where_nobody_drives() -> None:
     """The bars, 1e-8 J (of 1112) and 1e-8 N m s (of 5.6): every wheel, rotor and gimbal swings freely."""
-    ship = multibody.build(vehicle(**SPINNING))
-    ship.model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_ACTUATION)  # no servo holds the gimbals
-    flight = multibody.Flight(ship, Rotation.from_rotvec([0.3, -0.2, 0.5]), np.array([0.1, 0.2, -0.15]), 60.0)
-    flight.states[0, 1 + ship.model.nq + ship.gimbals.dof] = [0.5, -0.3, 0.2, 0.1]
-    flight.advance(still(ship, 60.0))
+    vehicle = multibody.build(vehicle_config(**SPINNING))
+    vehicle.model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_ACTUATION)  # no servo holds the gimbals
+    flight = multibody.Simulation(vehicle, Rotation.from_rotvec([0.3, -0.2, 0.5]), np.array([0.1, 0.2, -0.15]), 60.0)
+    flight.states[0, 1 + vehicle.model.nq + vehicle.gimbals.dof] = [0.5, -0.3, 0.2, 0.1]
+    flight.advance(still(vehicle, 60.0))
     kept = [carried(flight, step) for step in range(0, 60_001, 2000)]
     assert np.ptp([energy for _, energy in kept]) < 1e-8
     assert np.ptp([momentum for momentum, _ in kept], axis=0).max() < 1e-8
     assert kept[0][1] > 1000
-    assert np.ptp(flight.angles_rad[ship.gimbals.qpos]) > 1  # rad: they did swing
+    assert np.ptp(flight.angles_rad[vehicle.gimbals.qpos]) > 1  # rad: they did swing
 
 
 def test_torque_free_motion_keeps_momentum_and_energy() -> None:
     """A tumble about the middle axis, a minute long: L in the lab and w.Jw/2 stay to 1e-11 of themselves."""
-    ship = multibody.build(vehicle(mount="free"))
-    flight = multibody.fly(ship, Rotation.from_rotvec([0.3, 0.2, -1.0]), np.array([0.02, 1.0, 0.01]), 60.0)
+    vehicle = multibody.build(vehicle_config(mount="free"))
+    flight = multibody.simulate(vehicle, Rotation.from_rotvec([0.3, 0.2, -1.0]), np.array([0.02, 1.0, 0.01]), 60.0)
     rate = flight.rate_body_rad_s
     momentum = flight.lab_from_body.apply(rate * INERTIA)
     assert np.abs(momentum - momentum[0]).max() < 1e-11 * np.linalg.norm(momentum[0])
@@ -114,12 +116,12 @@ def test_torque_free_motion_keeps_momentum_and_energy() -> None:
 def test_bottom_heavy_vehicle_is_a_pendulum(axis: int, name: str) -> None:
     """T = 4 sqrt(I / m g d) K(sin^2(amplitude / 2)), from rest at 20 deg. The bar is 1e-6; 1e-9 is a root finder's."""
     below_m, amplitude = 5e-3, math.radians(20)
-    ship = multibody.build(vehicle(centre_of_mass=["0 m", "0 m", "-5 mm"]))
+    vehicle = multibody.build(vehicle_config(center_of_mass=["0 m", "0 m", "-5 mm"]))
     period = 4 * math.sqrt(INERTIA[axis] / (80 * 9.80665 * below_m)) * ellipk(math.sin(amplitude / 2) ** 2)
-    flight = multibody.fly(ship, Rotation.from_rotvec(amplitude * np.eye(3)[axis]), STILL, 1.3 * period)
+    flight = multibody.simulate(vehicle, Rotation.from_rotvec(amplitude * np.eye(3)[axis]), STILL, 1.3 * period)
 
     def angle(t_s: float) -> float:
-        return flight.at(t_s).as_rotvec()[axis]
+        return flight.attitude_at(t_s).as_rotvec()[axis]
 
     down, up = brentq(angle, 0.0, 0.5 * period, xtol=1e-12), brentq(angle, 0.5 * period, period, xtol=1e-12)
     assert 4 * down == pytest.approx(period, rel=1e-9), name
@@ -175,9 +177,9 @@ def test_asymmetric_top_turns_as_jacobi_solved_it(
     inertia: tuple[float, float, float], first: float, third: float
 ) -> None:
     """The issue's bar: 1e-6 rad within 60 s. It comes out below 1e-12, rounding's own size."""
-    ship = multibody.build(vehicle(mount="free", inertia=[f"{moment} kg m2" for moment in inertia]))
+    vehicle = multibody.build(vehicle_config(mount="free", inertia=[f"{moment} kg m2" for moment in inertia]))
     lab_from_start = Rotation.from_rotvec([0.4, -1.1, 0.7])
-    flight = multibody.fly(ship, lab_from_start, np.array([first, 0.0, third]), 60.0)
+    flight = multibody.simulate(vehicle, lab_from_start, np.array([first, 0.0, third]), 60.0)
     some = np.arange(0, 60_001, 500)
     rate, start_from_body = asymmetric_top(np.array(inertia), first, third, flight.t_s[some])
     apart = (lab_from_start * start_from_body).inv() * flight.lab_from_body[some]
@@ -187,23 +189,21 @@ def test_asymmetric_top_turns_as_jacobi_solved_it(
 
 def test_heavy_top_against_an_integrator_of_its_own() -> None:
     """Euler's equation with gravity's torque, c x m g, by scipy's DOP853: a fast, unbalanced tumble."""
-    centre = np.array([3e-3, -2e-3, 5e-3])
-    ship = multibody.build(vehicle(centre_of_mass=["3 mm", "-2 mm", "5 mm"], tilt_stop_deg=89))
+    center = np.array([3e-3, -2e-3, 5e-3])
+    vehicle = multibody.build(vehicle_config(center_of_mass=["3 mm", "-2 mm", "5 mm"], tilt_stop_deg=89))
     begin, rate = Rotation.from_rotvec([0.2, 0.1, 0.5]), np.array([0.1, -0.2, 2.0])
 
     def law(_: float, state: Floats) -> Floats:
         (x, y, z, w), spin = state[:4], state[4:]
         down_body = Rotation.from_quat(state[:4]).apply([0, 0, -9.80665], inverse=True)
-        torque = np.cross(centre, 80 * down_body) - np.cross(spin, INERTIA * spin)
+        torque = np.cross(center, 80 * down_body) - np.cross(spin, INERTIA * spin)
         turn = np.array([[w, -z, y], [z, w, -x], [-y, x, w], [-x, -y, -z]]) @ spin / 2
         return np.concatenate([turn, torque / INERTIA])
 
     run = solve_ivp(law, (0, 5), [*begin.as_quat(), *rate], method="DOP853", rtol=1e-12, atol=1e-13)
-    flight = multibody.fly(ship, begin, rate, 5.0)
-    assert (
-        flight.lab_from_body.as_matrix()[:, 2, 2] > math.cos(math.radians(85))
-    ).all()  # the stop had no part
-    assert (Rotation.from_quat(run.y[:4, -1]).inv() * flight.at(5.0)).magnitude() < 1e-9
+    flight = multibody.simulate(vehicle, begin, rate, 5.0)
+    assert (flight.lab_from_body.as_matrix()[:, 2, 2] > math.cos(math.radians(85))).all()  # the stop had no part
+    assert (Rotation.from_quat(run.y[:4, -1]).inv() * flight.attitude_at(5.0)).magnitude() < 1e-9
     np.testing.assert_allclose(flight.rate_body_rad_s[-1], run.y[4:, -1], rtol=0, atol=1e-9)
 
 
@@ -226,14 +226,12 @@ def test_torque_of_a_cmg_is_gimbal_rate_times_momentum(k: int) -> None:
 
     By MuJoCo's inverse dynamics, no part accelerating; h by hand, 2600 rpm of a rotor at an angle of 0.6 rad.
     """
-    ship = multibody.build(vehicle(mount="free", cmgs={}))
-    data, rate_rad_s, h = mujoco.MjData(ship.model), 0.7, ROTOR_KG_M2 * 2600 * math.pi / 30
-    data.qpos[ship.gimbals.qpos[k]], data.qvel[ship.gimbals.dof[k]] = 0.6, rate_rad_s
-    data.qvel[ship.rotors.dof] = 2600 * math.pi / 30
-    mujoco.mj_inverse(ship.model, data)
-    gimbal = Rotation.from_euler("z", 90 * k, degrees=True).apply([0.81650, 0, 0.57735]) / math.hypot(
-        0.81650, 0.57735
-    )
+    vehicle = multibody.build(vehicle_config(mount="free", cmgs={}))
+    data, rate_rad_s, h = mujoco.MjData(vehicle.model), 0.7, ROTOR_KG_M2 * 2600 * math.pi / 30
+    data.qpos[vehicle.gimbals.qpos[k]], data.qvel[vehicle.gimbals.dof[k]] = 0.6, rate_rad_s
+    data.qvel[vehicle.rotors.dof] = 2600 * math.pi / 30
+    mujoco.mj_inverse(vehicle.model, data)
+    gimbal = Rotation.from_euler("z", 90 * k, degrees=True).apply([0.81650, 0, 0.57735]) / math.hypot(0.81650, 0.57735)
     expected = h * np.cross(rate_rad_s * gimbal, axle(k, 0.6))
     np.testing.assert_allclose(data.qfrc_inverse[:3], expected, rtol=0, atol=1e-6 * h * rate_rad_s)
     assert np.linalg.norm(expected) == pytest.approx(h * rate_rad_s, rel=1e-12)
@@ -245,20 +243,20 @@ def test_gimbals_give_a_free_vehicle_what_the_rotors_momentum_lost() -> None:
     Each rotor keeps I (its own spin + the body's about its axle), for it has no motor and no friction; by hand all
     but the inertia of the vehicle with its gimbals as they then stand.
     """
-    ship = multibody.build(vehicle(mount="free", cmgs={"rotor_rpm": 2600}))
-    control = still(ship, 1.5)
-    control[:500, ship.gimbals.motor] = [1.0, -0.8, 0.6, 1.0]
-    flight = flown(ship, LEVEL, STILL, control)
-    angles = flight.angles_rad[ship.gimbals.qpos]
+    vehicle = multibody.build(vehicle_config(mount="free", cmgs={"rotor_rpm": 2600}))
+    control = still(vehicle, 1.5)
+    control[:500, vehicle.gimbals.motor] = [1.0, -0.8, 0.6, 1.0]
+    flight = flown(vehicle, LEVEL, STILL, control)
+    angles = flight.angles_rad[vehicle.gimbals.qpos]
     np.testing.assert_allclose(angles, [0.5, -0.4, 0.3, 0.5], rtol=0, atol=1e-2)
     h = ROTOR_KG_M2 * 2600 * math.pi / 30
     before = h * sum(axle(k, 0.0) for k in range(4))
     axles = np.stack([axle(k, angles[k]) for k in range(4)], axis=1)
-    data = mujoco.MjData(ship.model)
+    data = mujoco.MjData(vehicle.model)
     data.qpos[:] = flight.angles_rad
-    mujoco.mj_forward(ship.model, data)
-    everything = np.zeros((ship.model.nv, ship.model.nv))
-    mujoco.mj_fullM(ship.model, data, everything)
+    mujoco.mj_forward(vehicle.model, data)
+    everything = np.zeros((vehicle.model.nv, vehicle.model.nv))
+    mujoco.mj_fullM(vehicle.model, data, everything)
     without_spin = everything[:3, :3] - ROTOR_KG_M2 * axles @ axles.T
     body_from_lab = Rotation.from_quat(flight.lab_from_body_wxyz, scalar_first=True).inv()
     given = body_from_lab.apply(before) - h * axles.sum(axis=1)
@@ -270,26 +268,26 @@ def test_gimbals_give_a_free_vehicle_what_the_rotors_momentum_lost() -> None:
 # --- poses inside an exposure -------------------------------------------------------------------------------
 
 
-def apart_from_a_finer_run_rad(ship: multibody.World, rate: Floats, control: Floats) -> Floats:
+def apart_from_a_finer_run_rad(vehicle: multibody.VehicleModel, rate: Floats, control: Floats) -> Floats:
     """(N,) poses asked for between the steps of a flight, against the samples of one stepped ten times finer.
 
     Nine times in each step; ship's step is changed.
     """
     begin = Rotation.from_rotvec([0.1, -0.2, 0.1])
-    coarse = flown(ship, begin, rate, control).trajectory()
-    ship.model.opt.timestep /= 10
-    fine = flown(ship, begin, rate, np.repeat(control, 10, axis=0)).trajectory()
+    coarse = flown(vehicle, begin, rate, control).trajectory()
+    vehicle.model.opt.timestep /= 10
+    fine = flown(vehicle, begin, rate, np.repeat(control, 10, axis=0)).trajectory()
     inside = np.arange(len(fine.t_s))[np.arange(len(fine.t_s)) % 10 > 0]
-    return (fine.lab_from_body[inside].inv() * coarse.at(fine.t_s[inside])).magnitude()
+    return (fine.lab_from_body[inside].inv() * coarse.attitude_at(fine.t_s[inside])).magnitude()
 
 
 def test_pose_inside_an_exposure_of_a_tumbling_vehicle() -> None:
     """2 rad/s under torques of up to 1 N m that change each 10 ms: within 1e-11 rad of the finer run."""
-    ship = multibody.build(vehicle(mount="free"))
-    control = still(ship, 2.0)
+    vehicle = multibody.build(vehicle_config(mount="free"))
+    control = still(vehicle, 2.0)
     t = np.repeat(np.arange(200), 10) * 0.01
-    control[:, ship.torques] = np.sin(7 * t[:, None] + np.array([0.0, 1.0, 2.0]))
-    assert apart_from_a_finer_run_rad(ship, np.array([1.0, 1.5, -1.0]), control).max() < 1e-11
+    control[:, vehicle.torques] = np.sin(7 * t[:, None] + np.array([0.0, 1.0, 2.0]))
+    assert apart_from_a_finer_run_rad(vehicle, np.array([1.0, 1.5, -1.0]), control).max() < 1e-11
 
 
 def test_pose_inside_an_exposure_of_a_vehicle_shaken_by_its_wheels() -> None:
@@ -300,15 +298,15 @@ def test_pose_inside_an_exposure_of_a_vehicle_shaken_by_its_wheels() -> None:
     """
     shaking: dict[str, object] = {"static_imbalance": "1 g cm", "dynamic_imbalance": "1e-7 kg m2"}
     shaking |= {"start_rpm": [3000, -2900, 2800]}
-    ship = multibody.build(vehicle(wheels=shaking, centre_of_mass=["20 um", "-10 um", "-50 um"]))
-    apart = apart_from_a_finer_run_rad(ship, np.array([0.05, 0.1, -0.2]), still(ship, 2.0))
+    vehicle = multibody.build(vehicle_config(wheels=shaking, center_of_mass=["20 um", "-10 um", "-50 um"]))
+    apart = apart_from_a_finer_run_rad(vehicle, np.array([0.05, 0.1, -0.2]), still(vehicle, 2.0))
     assert apart.max() < 3e-9
 
 
 def test_pose_inside_an_exposure_while_gimbals_are_driven() -> None:
     """CMGs at 2600 rpm whose gimbals are told another rate each 10 ms: within 1e-9 rad."""
-    ship, rng = multibody.build(vehicle(cmgs={})), np.random.default_rng(6)
-    control = still(ship, 2.0)
-    control[:, ship.gimbals.motor] = np.repeat(rng.uniform(-1, 1, (200, 4)), 10, axis=0)
-    apart = apart_from_a_finer_run_rad(ship, np.array([0.05, 0.1, -0.2]), control)
+    vehicle, rng = multibody.build(vehicle_config(cmgs={})), np.random.default_rng(6)
+    control = still(vehicle, 2.0)
+    control[:, vehicle.gimbals.motor] = np.repeat(rng.uniform(-1, 1, (200, 4)), 10, axis=0)
+    apart = apart_from_a_finer_run_rad(vehicle, np.array([0.05, 0.1, -0.2]), control)
     assert apart.max() < 1e-9

@@ -19,10 +19,9 @@ from scipy.stats import chi2
 from estimator.trackers.dome_tracker import DomeTracker
 from skysim.apps.cli import main
 from skysim.core.errors import InputError
-from skysim.experiments import dome_survey
+from skysim.experiments import dome_survey, dome_survey_naming
 from skysim.scene import loader
-from skysim.simulation import testbed
-from skysim.simulation.testbed import Testbed
+from skysim.simulation.testbed import Testbed, build_testbed, build_tracker
 from skysim.tracking import dome_map_file, factory
 
 RARE = 1e-6  # the seeds are fixed: it fails for a wrong law alone
@@ -31,12 +30,12 @@ schema: 1
 base: afit_simsat
 title: a small dome seen by a wide lens
 light:
-  layout: {kind: poisson_disc, cap_deg: 24, spacing: "38 mm", hardware_seed: 3}
-  led: {intensity: "0.5 mcd", disc_diameter: "4 mm"}
+  layout: {kind: poisson_disk, cap_deg: 24, spacing: "38 mm", hardware_seed: 3}
+  led: {intensity: "0.5 mcd", disk_diameter: "4 mm"}
 camera: {width_px: 640, height_px: 480, pixel: "10.5 um", focal_length: "18 mm"}
 tracker: {min_area_px: 9}
 """
-DOUBT = dome_survey.doubt("0.5 deg", "2 mm", "5 mm", "1%")
+UNCERTAINTY = dome_survey.survey_uncertainty("0.5 deg", "2 mm", "5 mm", "1%")
 
 
 def command(*words: object) -> tuple[int, str, str]:
@@ -70,7 +69,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def told(folder: Path) -> dict[str, Any]:
+def statistics(folder: Path) -> dict[str, Any]:
     """The figures of a survey of the small dome: 40 stops within 18 deg."""
     words = ["survey", folder / "small.yaml", "--frames", 40, "--tilt", 18, "--checks", 8, "--out", folder]
     code, out, err = command(*words, "--json")
@@ -79,19 +78,19 @@ def told(folder: Path) -> dict[str, Any]:
 
 
 @pytest.fixture(scope="module")
-def lab(folder: Path) -> Testbed:
+def testbed(folder: Path) -> Testbed:
     """The small dome as it is believed before the survey."""
-    return testbed.build_testbed(dome_survey.with_survey_errors(loader.load(folder / "small.yaml"), DOUBT))
+    return build_testbed(dome_survey.with_survey_errors(loader.load(folder / "small.yaml"), UNCERTAINTY))
 
 
 # --- end to end ---------------------------------------------------------------------------------------------
 
 
-def test_the_survey_makes_the_tracker_s_error_smaller_by_much(told: dict[str, Any]) -> None:
+def test_the_survey_makes_the_tracker_s_error_smaller_by_much(statistics: dict[str, Any]) -> None:
     """0.3 deg before. After: what one frame's lights are off, 0.2 mm at 0.8 m over the root of some twenty, and the
     turn of the lab, which the map of 2 mm before holds to 2 mm / (0.3 m sqrt(240)) = 0.025 deg.
     """
-    before, after = told["before"], told["after"]
+    before, after = statistics["before"], statistics["after"]
     assert after["solved"] == after["stops"] == 8
     assert before["solved"] > 4  # the comparison is of something
     assert before["cross_deg_median"] > 0.1
@@ -101,11 +100,11 @@ def test_the_survey_makes_the_tracker_s_error_smaller_by_much(told: dict[str, An
 
 
 def test_lens_and_lever_are_the_true_ones_within_their_errors_and_better_than_before(
-    told: dict[str, Any],
+    statistics: dict[str, Any],
 ) -> None:
-    fitted = [row for row in told["values"] if row["sigma"]]
+    fitted = [row for row in statistics["values"] if row["sigma"]]
     assert [row["what"] for row in fitted] == [
-        *("focal length px", "centre x px", "centre y px", "lever x mm", "lever y mm", "lever z mm"),
+        *("focal length px", "center x px", "center y px", "lever x mm", "lever y mm", "lever z mm"),
     ]
     for row in fitted:
         assert abs(row["found"] - row["truth"]) < 4.5 * row["sigma"], row
@@ -113,34 +112,34 @@ def test_lens_and_lever_are_the_true_ones_within_their_errors_and_better_than_be
         assert abs(row["found"] - row["truth"]) < abs(row["believed"] - row["truth"]) / 2, row
 
 
-def test_the_leds_are_off_by_what_their_sigmas_say(told: dict[str, Any], folder: Path) -> None:
+def test_the_leds_are_off_by_what_their_sigmas_say(statistics: dict[str, Any], folder: Path) -> None:
     """The moves that all LEDs share keep the mean square from settling at 1: a factor of 2 either way."""
     table = Table.read(folder / "leds.ecsv", format="ascii.ecsv")
-    assert len(table) == told["surveyed"] < told["leds"]
+    assert len(table) == statistics["surveyed"] < statistics["leds"]
     sigma_mm = 1e3 * float(np.sqrt(np.mean(table["sigma_m"] ** 2)))
-    assert told["led_mm_before"] == pytest.approx(2.0, rel=0.1)  # 700 numbers: 3 %
-    assert sigma_mm / 2 < told["led_mm_after"] < 2 * sigma_mm
+    assert statistics["led_mm_before"] == pytest.approx(2.0, rel=0.1)  # 700 numbers: 3 %
+    assert sigma_mm / 2 < statistics["led_mm_after"] < 2 * sigma_mm
     assert sigma_mm < 0.5
     assert (folder / "survey.png").stat().st_size > 10_000
 
 
-def test_a_scene_beside_the_file_believes_it(told: dict[str, Any], folder: Path) -> None:
+def test_a_scene_beside_the_file_believes_it(statistics: dict[str, Any], folder: Path) -> None:
     """Places, sigma, lever and lens as measured; LEDs not surveyed are left out; frames of the scene are solved."""
     (folder / "mapped.yaml").write_text("schema: 1\nbase: small.yaml\ntracker: {map: leds.ecsv}\n")
-    lab = testbed.build_testbed(loader.load(folder / "mapped.yaml"))
-    eyes = testbed.tracker(lab)
-    assert isinstance(eyes, DomeTracker)
+    testbed = build_testbed(loader.load(folder / "mapped.yaml"))
+    tracker = build_tracker(testbed)
+    assert isinstance(tracker, DomeTracker)
     measured = dome_map_file.read_dome_map(folder / "leds.ecsv")
-    np.testing.assert_array_equal(eyes.leds.id, measured.id)
-    np.testing.assert_array_equal(eyes.leds.position_m, measured.position_m)
-    assert len(eyes.leds.id) == told["surveyed"] < len(lab.sources.id)
-    assert eyes.leds.sigma_m == np.median(measured.sigma_m)
-    np.testing.assert_array_equal(eyes.lever.camera_body_m, measured.camera_body_m)
-    assert eyes.lever.sigma_m == measured.lever_sigma_m
-    found = {row["what"]: row["found"] for row in told["values"]}
-    assert eyes.camera.focal_px == pytest.approx(found["focal length px"], rel=1e-12)
-    ((frame, truth),) = dome_survey.frames(lab, dome_survey.attitudes(lab.scene, "checks", 1, 10.0))
-    answer = factory.solve_frame(eyes, frame).attitude
+    np.testing.assert_array_equal(tracker.leds.id, measured.id)
+    np.testing.assert_array_equal(tracker.leds.position_m, measured.position_m)
+    assert len(tracker.leds.id) == statistics["surveyed"] < len(testbed.sources.id)
+    assert tracker.leds.sigma_m == np.median(measured.sigma_m)
+    np.testing.assert_array_equal(tracker.lever.camera_body_m, measured.camera_body_m)
+    assert tracker.lever.sigma_m == measured.lever_sigma_m
+    found = {row["what"]: row["found"] for row in statistics["values"]}
+    assert tracker.camera.focal_px == pytest.approx(found["focal length px"], rel=1e-12)
+    ((frame, truth),) = dome_survey.render_stops(testbed, dome_survey.stop_attitudes(testbed.scene, "checks", 1, 10.0))
+    answer = factory.solve_frame(tracker, frame).attitude
     assert answer.cam_from_ref is not None
     assert np.degrees((answer.cam_from_ref * truth.cam_from_lab.inv()).magnitude()) < 0.1
 
@@ -151,21 +150,21 @@ def test_afit_s_dome_is_measured_to_a_hundredth_of_a_degree(tmp_path: Path) -> N
     words = ("survey", "afit_simsat", "--frames", 200, "--checks", 30, "--json", "--out", tmp_path)
     code, out, err = command(*words)
     assert (code, err) == (0, "")
-    told = json.loads(out)
+    statistics = json.loads(out)
     # Some 870 of 1465 LEDs: at the rim stand those that one frame saw, or that no other frame ties to the rest.
-    assert told["surveyed"] > told["leds"] / 2
-    assert told["after"]["solved"] >= 15
-    assert told["after"]["solved"] > 2 * told["before"]["solved"]
-    assert told["after"]["cross_deg_median"] < 0.01
-    assert told["after"]["roll_deg_median"] < 0.03
-    assert told["led_mm_after"] < 0.3
+    assert statistics["surveyed"] > statistics["leds"] / 2
+    assert statistics["after"]["solved"] >= 15
+    assert statistics["after"]["solved"] > 2 * statistics["before"]["solved"]
+    assert statistics["after"]["cross_deg_median"] < 0.01
+    assert statistics["after"]["roll_deg_median"] < 0.03
+    assert statistics["led_mm_after"] < 0.3
 
 
 # --- stops and names ----------------------------------------------------------------------------------------
 
 
-def test_stops_lean_evenly_over_the_cap_and_turn_any_way(lab: Testbed) -> None:
-    stops = dome_survey.attitudes(lab.scene, "attitudes", 2000, 25.0)
+def test_stops_lean_evenly_over_the_cap_and_turn_any_way(testbed: Testbed) -> None:
+    stops = dome_survey.stop_attitudes(testbed.scene, "attitudes", 2000, 25.0)
     up = stops.apply([0.0, 0.0, 1.0])
     least = np.cos(np.radians(25))
     # The height of the body's axis is uniform from cos 25 deg to 1; its azimuth and the heading are uniform too.
@@ -177,49 +176,49 @@ def test_stops_lean_evenly_over_the_cap_and_turn_any_way(lab: Testbed) -> None:
         assert np.mean(uniform**2) == pytest.approx(1 / 3, abs=5 * np.sqrt(4 / 45 / 2000))
 
 
-def test_the_imu_errs_by_its_sigma_about_each_axis(lab: Testbed) -> None:
-    stops = dome_survey.attitudes(lab.scene, "attitudes", 500, 25.0)
-    off = (dome_survey.hints(lab.scene, stops, 0.01) * stops).as_rotvec() / 0.01
+def test_the_imu_errs_by_its_sigma_about_each_axis(testbed: Testbed) -> None:
+    stops = dome_survey.stop_attitudes(testbed.scene, "attitudes", 500, 25.0)
+    off = (dome_survey.imu_attitudes(testbed.scene, stops, 0.01) * stops).as_rotvec() / 0.01
     for axis in off.T:
         low, high = chi2.ppf([RARE / 2, 1 - RARE / 2], 500)
         assert low < np.sum(axis**2) < high
 
 
-def test_a_frame_of_a_stop_shows_a_vehicle_that_stands_there(lab: Testbed) -> None:
-    stops = dome_survey.attitudes(lab.scene, "attitudes", 3, 18.0)
-    ((_, first), *_, (frame, last)) = dome_survey.frames(lab, stops, 7)
+def test_a_frame_of_a_stop_shows_a_vehicle_that_stands_there(testbed: Testbed) -> None:
+    stops = dome_survey.stop_attitudes(testbed.scene, "attitudes", 3, 18.0)
+    ((_, first), *_, (frame, last)) = dome_survey.render_stops(testbed, stops, 7)
     assert frame.index == 9
     assert (last.lab_from_body * stops[2].inv()).magnitude() < 1e-12
     assert np.abs(last.rate_cam_rad_s).max() == 0
     assert (first.lab_from_body * stops[0].inv()).magnitude() < 1e-12
 
 
-def test_lights_get_their_true_names_by_the_imu(lab: Testbed) -> None:
+def test_lights_get_their_true_names_by_the_imu(testbed: Testbed) -> None:
     """Of ten stops' lights, 25 px aside each and 60 px all together where LEDs are some 75 px apart: 19 in 20."""
-    belief = dome_survey.belief_of(lab)
-    stops = dome_survey.attitudes(lab.scene, "attitudes", 10, 18.0)
-    looks = dome_survey.looks(lab, belief, DOUBT, 10, 18.0)
+    prior = dome_survey.calibration_prior(testbed)
+    stops = dome_survey.stop_attitudes(testbed.scene, "attitudes", 10, 18.0)
+    take_survey_frames = dome_survey.take_survey_frames(testbed, prior, UNCERTAINTY, 10, 18.0)
     named = right = lights = 0
-    for look, (_, truth) in zip(looks, dome_survey.frames(lab, stops), strict=True):
-        names = dome_survey.by_hint(look, belief, DOUBT)
-        apart_px, nearest = cKDTree(truth.seen.flux_xy_px).query(look.lights.xy_px[names.light])
-        true = np.where(apart_px < 2, truth.seen.id[nearest], -1)
-        right += int(np.sum(belief.leds.id[names.led] == true))
+    for survey_frame, (_, truth) in zip(take_survey_frames, dome_survey.render_stops(testbed, stops), strict=True):
+        names = dome_survey_naming.match_by_imu(survey_frame, prior, UNCERTAINTY)
+        apart_px, nearest = cKDTree(truth.sources.flux_xy_px).query(survey_frame.lights.xy_px[names.light])
+        true = np.where(apart_px < 2, truth.sources.id[nearest], -1)
+        right += int(np.sum(prior.leds.id[names.led] == true))
         named += len(true)
-        lights += len(look.lights)
+        lights += len(survey_frame.lights)
     assert lights > 150
     assert named > 0.95 * lights
     assert right > 0.95 * named
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_a_common_shift_is_found_though_neighbours_are_nearer_than_it(seed: int) -> None:
+def test_a_common_shift_is_found_though_neighbors_are_nearer_than_it(seed: int) -> None:
     rng = np.random.default_rng(seed)
     predicted = rng.uniform(0, 1000, (60, 2))
     shift = rng.normal(0, 100, 2)
     seen = predicted[10:45] + shift + rng.normal(0, 5, (35, 2))
     seen = np.vstack([seen, rng.uniform(0, 1000, (5, 2))])  # reflections
-    found = dome_survey.shift_px(seen, predicted, 100.0, 5.0, (500.0, 500.0))
+    found = dome_survey_naming.common_shift_px(seen, predicted, 100.0, 5.0, (500.0, 500.0))
     # The mean of 35 lights, 5 px each, and of strangers that stand within the gate.
     assert np.linalg.norm(found - shift) < 5 * 5 / np.sqrt(35)
 
@@ -232,7 +231,12 @@ def test_pairs_are_the_cheapest_of_all_that_there_are() -> None:
         best = min(itertools.permutations(range(5), 4), key=lambda p: cost[range(4), p].sum())
         expected = [(i, j) for i, j in enumerate(best) if cost[i, j] < 1]
         assert (
-            list(zip(*(rows.tolist() for rows in dome_survey.paired(seen, predicted, gate)), strict=True))
+            list(
+                zip(
+                    *(rows.tolist() for rows in dome_survey_naming.assign_lights(seen, predicted, gate)),
+                    strict=True,
+                )
+            )
             == expected
         )
 
@@ -250,7 +254,7 @@ def test_frames_that_hang_on_no_others_are_left_out() -> None:
 # --- the file -----------------------------------------------------------------------------------------------
 
 
-def test_a_map_is_read_as_it_was_written(told: dict[str, Any], folder: Path, tmp_path: Path) -> None:
+def test_a_map_is_read_as_it_was_written(statistics: dict[str, Any], folder: Path, tmp_path: Path) -> None:
     first = dome_map_file.read_dome_map(folder / "leds.ecsv")
     dome_map_file.write_dome_map(tmp_path / "again.ecsv", first)
     assert (tmp_path / "again.ecsv").read_bytes() == (folder / "leds.ecsv").read_bytes()
@@ -261,19 +265,19 @@ def test_a_map_is_read_as_it_was_written(told: dict[str, Any], folder: Path, tmp
 @pytest.mark.parametrize(
     ("right", "wrong", "says"),
     [
-        ("z_m", "zz", "no column z_m; allowed: a map that skysim survey wrote"),
+        ("z_m", "zz", "no column z_m; allowed: a map written by skysim survey"),
         ("focal_px: 17", "focal_px: -17", "focal_px in the header is -17"),
         ("focal_px: 17", "focal: 17", "focal_px in the header is None; allowed: 1 finite number above 0"),
         (
             "size_px: [640",
             "size_px: [641",
-            "is of a camera of (641, 480) px; allowed: this one's, (640, 480) px",
+            "surveyed with a camera of (641, 480) px; allowed: (640, 480) px",
         ),
-        ("# %ECSV", "# ECSW", "no ECSV table"),
+        ("# %ECSV", "# ECSW", "not an ECSV table"),
     ],
 )
 def test_a_map_with_a_slip_is_one_line(
-    told: dict[str, Any], folder: Path, tmp_path: Path, right: str, wrong: str, says: str
+    statistics: dict[str, Any], folder: Path, tmp_path: Path, right: str, wrong: str, says: str
 ) -> None:
     text = (folder / "leds.ecsv").read_text()
     assert right in text
@@ -285,12 +289,12 @@ def test_a_map_with_a_slip_is_one_line(
     [
         ("sigma_m", 0.0, "row 3: allowed: finite numbers, and a sigma_m above 0"),
         ("x_m", np.nan, "row 3: allowed: finite numbers"),
-        ("id", 99999, "LED 99999 is none of this dome's"),
-        ("id", None, "stands 2 times; allowed: once"),
+        ("id", 99999, "unknown LED 99999"),
+        ("id", None, "occurs 2 times; allowed: once"),
     ],
 )
 def test_a_map_with_a_wrong_led_is_one_line(
-    told: dict[str, Any], folder: Path, tmp_path: Path, column: str, value: float | None, says: str
+    statistics: dict[str, Any], folder: Path, tmp_path: Path, column: str, value: float | None, says: str
 ) -> None:
     table = Table.read(folder / "leds.ecsv", format="ascii.ecsv")
     table[column][2] = table[column][3] if value is None else value
@@ -302,9 +306,9 @@ def refusal(folder: Path, tmp_path: Path, text: str) -> str:
     """What the tracker of the small scene says of a map of that text."""
     path = tmp_path / "leds.ecsv"
     path.write_text(text)
-    lab = testbed.build_testbed(loader.load(folder / "small.yaml", {"tracker.map": str(path)}))
+    testbed = build_testbed(loader.load(folder / "small.yaml", {"tracker.map": str(path)}))
     with pytest.raises(InputError) as refused:
-        testbed.tracker(lab)
+        build_tracker(testbed)
     assert "\n" not in str(refused.value)
     assert str(path) in str(refused.value)
     return str(refused.value)
@@ -318,15 +322,15 @@ def refusal(folder: Path, tmp_path: Path, text: str) -> str:
     [
         (
             {"tracker.map": "nowhere.ecsv"},
-            r"tracker\.map: 'nowhere\.ecsv' is no file; allowed: one beside the scene",
+            r"tracker\.map: 'nowhere\.ecsv' is not a file; allowed: a path, or a file in the scene's folder",
         ),
         (
             {"tracker.map": "FILE", "tracker.survey.led_sigma": "1 mm"},
-            r"survey\.led_sigma: the file of tracker\.map",
+            r"survey\.led_sigma: conflicts with tracker\.map, which contains it",
         ),
         (
-            {"tracker.map": "FILE", "tracker.believed_focal_length": "18 mm"},
-            r"believed_focal_length: the file of",
+            {"tracker.map": "FILE", "tracker.assumed_focal_length": "18 mm"},
+            r"assumed_focal_length: conflicts with tracker\.map",
         ),
     ],
 )
@@ -334,16 +338,16 @@ def test_a_map_that_is_not_there_or_not_alone_is_one_line(
     folder: Path, tmp_path: Path, changes: dict[str, str], says: str
 ) -> None:
     (tmp_path / "leds.ecsv").write_text("")
-    told = {key: value.replace("FILE", str(tmp_path / "leds.ecsv")) for key, value in changes.items()}
+    statistics = {key: value.replace("FILE", str(tmp_path / "leds.ecsv")) for key, value in changes.items()}
     with pytest.raises(InputError, match=says) as refused:
-        loader.load(folder / "small.yaml", told)
+        loader.load(folder / "small.yaml", statistics)
     assert "\n" not in str(refused.value)
 
 
 @pytest.mark.parametrize(
     ("words", "says"),
     [
-        (["shefex2"], "light.kind: stars has nothing to survey; allowed: dome"),
+        (["shefex2"], "light.kind: a survey needs LEDs, not stars; allowed: dome"),
         (
             ["afit_simsat", "--tilt", "31"],
             "--tilt 31: allowed: above 0, up to 30 degrees, the vehicle's stop",
@@ -351,7 +355,7 @@ def test_a_map_that_is_not_there_or_not_alone_is_one_line(
         (["afit_simsat", "--imu-sigma", "2 mm"], "--imu-sigma: '2 mm' is not a plane angle"),
         (["afit_simsat", "--imu-sigma", "20 deg"], "--imu-sigma 20 deg: allowed: 0 to 0.1 rad"),
         (["afit_simsat", "--led-sigma", "0 mm"], "--led-sigma 0 mm: allowed: 1e-06 to 0.1 m"),
-        (["afit_simsat", "--focal-error", "50%"], "--focal-error 50%: allowed: -0.1 to 0.1 of it"),
+        (["afit_simsat", "--focal-error", "50%"], "--focal-error 50%: allowed: -0.1 to 0.1"),
         (["afit_simsat", "--frames", "3"], "survey: "),
     ],
 )

@@ -69,9 +69,7 @@ def test_the_page_s_code_reads_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     page = (ROOT / "docs/howto/export.md").read_text(encoding="utf-8")
-    (block,) = [
-        block for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "ccsds_ndm" in block
-    ]
+    (block,) = [block for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "ccsds_ndm" in block]
     (tmp_path / "out/shefex2").mkdir(parents=True)
     meant = Rotation.from_euler("y", [[90]], degrees=True)  # the camera's boresight along the ICRF's x
     text = ccsds_aem.message("shefex2", [], (ccsds_aem.ICRF, ccsds_aem.CAMERA), utc(1), meant)

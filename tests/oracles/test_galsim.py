@@ -7,14 +7,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from splatting import add_kernel
 
-from skysim.camera.psf import splat
-from skysim.camera.psf.kernel import Kernel, kernel
+from skysim.camera.psf.kernel import Kernel, build_kernel
 from skysim.core.types import Floats
 from skysim.scene.camera import (
     AiryPsfConfig,
     CameraConfig,
-    DiscPsfConfig,
+    DiskPsfConfig,
     GaussianPsfConfig,
     MeasuredPsfConfig,
     MoffatPsfConfig,
@@ -59,9 +59,9 @@ def airy(sigma_px: float, camera: CameraConfig) -> tuple[Psf, CameraConfig, list
     return AiryPsfConfig(kind="airy", sigma_px=sigma_px), camera, theirs
 
 
-def disc(radius_px: float, sigma_px: float) -> tuple[Psf, CameraConfig, list[Any]]:
+def disk(radius_px: float, sigma_px: float) -> tuple[Psf, CameraConfig, list[Any]]:
     theirs = [galsim.TopHat(radius_px, gsparams=ACCURATE), galsim.Gaussian(sigma=sigma_px, gsparams=ACCURATE)]
-    return DiscPsfConfig(kind="disc", radius_px=radius_px, sigma_px=sigma_px), CAMERA, theirs
+    return DiskPsfConfig(kind="disk", radius_px=radius_px, sigma_px=sigma_px), CAMERA, theirs
 
 
 LENSES = {
@@ -74,12 +74,12 @@ LENSES = {
     "airy f/8, 0.3": airy(0.3, CAMERA),
     "airy f/1.4": airy(0.0, FAST),
     "airy f/1.4, 0.3": airy(0.3, FAST),
-    "disc 0.2": disc(3.0, 0.2),
-    "disc 0.7": disc(6.5, 0.7),
+    "disk 0.2": disk(3.0, 0.2),
+    "disk 0.7": disk(6.5, 0.7),
 }
 
 
-# A wide disc's edge 0.08 px sharp has a twelfth harmonic, which the radial tables leave out.
+# A wide disk's edge 0.08 px sharp has a twelfth harmonic, which the radial tables leave out.
 TOLERANCE = {("airy f/1.4", 4.3): 2e-3}
 
 
@@ -92,7 +92,7 @@ def theirs_px(parts: list[Any], x: float, y: float, size: int) -> Floats:
 
 def ours_px(image: Kernel, x: float, y: float, size: int) -> Floats:
     patch = np.zeros((size, size))
-    splat.add(patch, 0, size, float(x), float(y), 1.0, image.sigma_px, image.radial, image.grid)
+    add_kernel(patch, 0, size, float(x), float(y), 1.0, image)
     return patch
 
 
@@ -114,23 +114,23 @@ def worst(image: Kernel, parts: list[Any], seed: int) -> float:
 
 @pytest.mark.parametrize("radius_px", [0.0, 1.2, 4.3])
 @pytest.mark.parametrize("name", LENSES)
-def test_every_kind_of_lens_and_an_emitting_disc_behind_it(name: str, radius_px: float) -> None:
+def test_every_kind_of_lens_and_an_emitting_disk_behind_it(name: str, radius_px: float) -> None:
     psf, camera, parts = LENSES[name]
     emitter = [galsim.TopHat(radius_px, gsparams=ACCURATE)] if radius_px else []
-    error = worst(kernel(psf, camera, 0, radius_px), [*parts, *emitter], seed=round(10 * radius_px))
+    error = worst(build_kernel(psf, camera, 0, radius_px), [*parts, *emitter], seed=round(10 * radius_px))
     assert error < TOLERANCE.get((name, radius_px), 5e-4)
 
 
 def test_emitter_and_defocus_together() -> None:
     psf, camera, parts = LENSES["gaussian 0.7"]
-    discs = [galsim.TopHat(radius, gsparams=ACCURATE) for radius in (10.0, 3.5)]
-    assert worst(kernel(psf, camera, 0, 10.0, 3.5), [*parts, *discs], seed=5) < 5e-4
+    disks = [galsim.TopHat(radius, gsparams=ACCURATE) for radius in (10.0, 3.5)]
+    assert worst(build_kernel(psf, camera, 0, 10.0, 3.5), [*parts, *disks], seed=5) < 5e-4
 
 
 def test_the_wings_put_back_are_those_that_are_missing() -> None:
     """Unscaled, an Airy image is brighter than the whole one by the light beyond its reach: 2 / (pi z)."""
     psf, camera, parts = LENSES["airy f/8"]
-    image = kernel(psf, camera)
+    image = build_kernel(psf, camera)
     size = 2 * int(np.ceil(image.reach_px)) + 3
     ratio = ours_px(image, 20.0, 20.0, size).max() / theirs_px(parts, 20.0, 20.0, size).max()
     z = np.pi * (image.reach_px - 1) / (550e-9 * 8 / 4.2e-6)
@@ -147,4 +147,4 @@ def test_a_measured_lens_of_no_symmetry(tmp_path: Path, radius_px: float) -> Non
     np.savetxt(tmp_path / "psf.csv", table, delimiter=",")
     psf = MeasuredPsfConfig(kind="measured", file=str(tmp_path / "psf.csv"), oversampling=8)
     emitter = [galsim.TopHat(radius_px, gsparams=ACCURATE)] if radius_px else []
-    assert worst(kernel(psf, CAMERA, 0, radius_px), [lens, *emitter], seed=7) < 5e-4
+    assert worst(build_kernel(psf, CAMERA, 0, radius_px), [lens, *emitter], seed=7) < 5e-4

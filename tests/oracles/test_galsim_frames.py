@@ -12,12 +12,12 @@ from benchmarks import galsim_sky
 
 
 def held(name: str, frames: int, mirrors: int, seed: int) -> list[galsim_sky.Outcome]:
-    sight = galsim_sky.SIGHTS[name]
+    sight = galsim_sky.SETUPS[name]
     ways = [way(sight) for way in galsim_sky.WAYS.values()]
-    return galsim_sky.confront(sight, ways, frames, seed, mirrors)
+    return galsim_sky.compare(sight, ways, frames, seed, mirrors)
 
 
-@pytest.mark.parametrize("name", galsim_sky.SIGHTS)
+@pytest.mark.parametrize("name", galsim_sky.SETUPS)
 def test_we_solve_them_and_refuse_them_in_a_mirror(name: str) -> None:
     """As a photograph with its field some per cent wrong, and as a calibrated tracker."""
     for outcome in held(name, 5, 1, 7):
@@ -27,7 +27,7 @@ def test_we_solve_them_and_refuse_them_in_a_mirror(name: str) -> None:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("name", galsim_sky.SIGHTS)
+@pytest.mark.parametrize("name", galsim_sky.SETUPS)
 def test_seventy_of_each_are_as_good_as_we_claim(name: str) -> None:
     """NEES is chi-square of three degrees of freedom where a covariance is true: 65 of them have a mean of 3 +- 0.3.
     Ours claims no less than the truth, and more for its floors: 0.03 px of a star, 0.1 px in a photograph."""

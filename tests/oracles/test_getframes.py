@@ -1,4 +1,4 @@
-"""The noise chain's mean and variance against getframes', the same chip in both (extra `oracle`)."""
+"""The noise chain's mean and variance against getframes', the same built in both (extra `oracle`)."""
 
 from __future__ import annotations
 
@@ -35,10 +35,10 @@ def both(mean_e: float, exposure_s: float = 0.5, **part: Any) -> tuple[np.ndarra
         "focal_length": "25 mm",
         "f_number": 2,
     }
-    chip = Detector.of(CameraConfig.model_validate(lens | {"detector": ours}))
+    built = Detector.from_camera(CameraConfig.model_validate(lens | {"detector": ours}))
     rng = np.random.default_rng(1)
     light = np.full(SHAPE, mean_e, np.float32)
-    mine = np.array([detector.expose(light.copy(), exposure_s, chip, rng) for _ in range(FRAMES)], float)
+    mine = np.array([detector.expose(light.copy(), exposure_s, built, rng) for _ in range(FRAMES)], float)
     config = gf.CameraConfig(
         name="oracle",
         sensor_type=gf.SensorType.CCD,

@@ -13,7 +13,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from skysim.camera.optics import Optics
-from skysim.dynamics.multibody import CAM_FROM_MJCAM
+from skysim.dynamics.multibody.model import CAM_FROM_MJCAM
 from skysim.scene.camera import CameraConfig
 
 WIDTH, HEIGHT = 640, 480
@@ -120,7 +120,7 @@ def test_mujoco_draws_the_ball_where_our_optics_project_it(pose: str, tmp_path: 
     lab_from_cam = lab_from_mjcam * CAM_FROM_MJCAM.inv()
     balls_m = np.array(place_m) + lab_from_cam.apply(TOWARD_CAM_M)
     found = middles(drawn(world_xml(quaternion_wxyz, place_m), balls_m, tmp_path / "balls.npy"))
-    wanted = Optics.of(CAMERA).project(lab_from_cam.inv().apply(balls_m - np.array(place_m)))
+    wanted = Optics.from_camera(CAMERA).project(lab_from_cam.inv().apply(balls_m - np.array(place_m)))
     # A ball's outline is an ellipse whose middle is off by (r / z)^2 of the offset, and OpenGL draws it as facets.
     np.testing.assert_allclose(found, wanted, rtol=0, atol=0.25)
 

@@ -28,7 +28,7 @@ def stars() -> dict[str, Any]:
     """A still frame of bright stars, background off, and the truth of those that stand alone and inside."""
     loaded = loader.load("shefex2", CLEAN)
     frame, truth = exposure.render_frame(run.prepare(loaded), 0)
-    part, seen = loaded.camera.detector, truth.seen
+    part, seen = loaded.camera.detector, truth.sources
     image_e = (frame.image_dn.astype(float) - part.offset_dn) * part.gain_e_dn
     image_e -= part.dark_e_s * frame.exposure_s
     apart = np.linalg.norm(seen.xy_px[:, None] - seen.xy_px, axis=2) + 1e9 * np.eye(len(seen.id))

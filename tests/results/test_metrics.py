@@ -57,17 +57,17 @@ def test_wrong_begins_at_ten_arc_minutes_about_any_axis(axis: tuple[float, ...])
     assert metrics.is_wrong(turned(*(10.01 * ARCMIN_RAD * np.array(axis))), TRUTH)
 
 
-def test_normalised_error_by_hand() -> None:
+def test_normalized_error_by_hand() -> None:
     covariance = np.diag([1e-8, 4e-8, 9e-8])
-    nees = metrics.normalised_error_squared(turned(1e-4, 2e-4, 3e-4), TRUTH, covariance)
+    nees = metrics.normalized_error_squared(turned(1e-4, 2e-4, 3e-4), TRUTH, covariance)
     assert nees == pytest.approx(1 + 1 + 1, rel=1e-10)
 
 
-def test_normalised_error_is_chi_square_of_three_for_a_true_covariance() -> None:
+def test_normalized_error_is_chi_square_of_three_for_a_true_covariance() -> None:
     rng = np.random.default_rng(6)
     root = 1e-5 * np.array([[1, 0, 0], [0.3, 2, 0], [-0.5, 0.4, 8]])
     draws = rng.standard_normal((3000, 3)) @ root.T
-    nees = [metrics.normalised_error_squared(turned(*e), TRUTH, root @ root.T) for e in draws]
+    nees = [metrics.normalized_error_squared(turned(*e), TRUTH, root @ root.T) for e in draws]
     # Mean 3 and variance 6 of chi-square, to four sigmas of 3,000 draws.
     assert np.mean(nees) == pytest.approx(3, abs=4 * np.sqrt(6 / 3000))
     assert np.var(nees) == pytest.approx(6, abs=4 * np.sqrt(252 / 3000))

@@ -17,29 +17,25 @@ def seen(xy_px: list[tuple[float, float]], saturated: list[bool]) -> SourceTruth
     )  # fmt: skip
 
 
-def coloured(picture: np.ndarray, bgr: tuple[int, int, int]) -> np.ndarray:
-    """(N, 2) x and y of the pixels of exactly this colour."""
+def colored(picture: np.ndarray, bgr: tuple[int, int, int]) -> np.ndarray:
+    """(N, 2) x and y of the pixels of exactly this color."""
     return np.argwhere((picture == bgr).all(axis=2))[:, ::-1]
 
 
 def test_ticks_stand_around_the_true_places_and_leave_them_open() -> None:
     image = np.random.default_rng(1).normal(100, 5, (1000, 1200))
-    picture = report.preview(image, seen([(300.2, 400.7), (900.0, 650.0)], [False, True]))
-    for place, bgr in (((300, 401), report.TRUTH_BGR), ((900, 650), report.FOUND_BGR)):
-        away = np.abs(coloured(picture, bgr) - place).max(axis=1)
+    picture = report.annotate_truth(image, seen([(300.2, 400.7), (900.0, 650.0)], [False, True]))
+    for place, bgr in (((300, 401), report.TRUTH_BGR), ((900, 650), report.DETECTED_BGR)):
+        away = np.abs(colored(picture, bgr) - place).max(axis=1)
         assert away.min() >= 8
         assert np.sort(away)[:40].max() < 40
 
 
 def test_a_small_frame_is_doubled_and_its_marks_with_it() -> None:
-    picture = report.preview(
-        np.random.default_rng(1).normal(100, 5, (200, 300)), seen([(100.0, 50.0)], [False])
-    )
+    picture = report.annotate_truth(np.random.default_rng(1).normal(100, 5, (200, 300)), seen([(100.0, 50.0)], [False]))
     assert picture.shape == (400, 600, 3)
-    ticks = coloured(picture, report.TRUTH_BGR)
-    assert (
-        np.abs(ticks.min(axis=0) + ticks.max(axis=0) - [401, 201]).max() < 80
-    )  # the label leans to one side
+    ticks = colored(picture, report.TRUTH_BGR)
+    assert np.abs(ticks.min(axis=0) + ticks.max(axis=0) - [401, 201]).max() < 80  # the label leans to one side
 
 
 def test_a_contact_sheet_stretches_all_frames_alike() -> None:

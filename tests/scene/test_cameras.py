@@ -75,9 +75,9 @@ def test_without_a_lens_the_lens_is_missing(name: str) -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_the_converter_ends_a_little_above_the_full_well(name: str) -> None:
-    chip = camera(name).detector
-    full_dn = chip.full_well_e / chip.gain_e_dn + chip.offset_dn
-    assert 0.95 * (2**chip.bits - 1) < full_dn <= 2**chip.bits - 1
+    detector = camera(name).detector
+    full_dn = detector.full_well_e / detector.gain_e_dn + detector.offset_dn
+    assert 0.95 * (2**detector.bits - 1) < full_dn <= 2**detector.bits - 1
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -104,7 +104,7 @@ def test_another_kind_of_shutter_replaces_the_preset_s() -> None:
 def test_an_unknown_preset_is_answered_with_the_known_ones_in_one_line() -> None:
     with pytest.raises(InputError) as caught:
         tree("lu250c")
-    assert str(caught.value) == f"camera.preset: 'lu250c' is none of {', '.join(NAMES)}"
+    assert str(caught.value) == f"camera.preset: unknown preset 'lu250c'; allowed: {', '.join(NAMES)}"
 
 
 def test_a_preset_of_the_base_is_switched_off_by_null() -> None:
@@ -127,7 +127,7 @@ def test_lu205c_sees_what_the_thesis_says() -> None:
 def test_lu205c_is_52_per_cent_efficient_in_the_green() -> None:
     from skysim.sources.photometry import Band
 
-    band = Band.of(camera("lu205c").detector.quantum_efficiency)
+    band = Band.from_efficiency(camera("lu205c").detector.quantum_efficiency)
     assert band.response.max() == pytest.approx(0.52, abs=1e-12)
     assert 500e-9 <= band.wavelength_m[band.response.argmax()] <= 570e-9
 
@@ -138,10 +138,10 @@ def test_ec655_has_the_reference_s_field_and_dynamic_range() -> None:
     assert field_deg(made) == pytest.approx((14.868, 11.150), abs=0.001)
     diagonal_m = math.hypot(made.width_px, made.height_px) * made.pixel_m
     assert 2 * math.degrees(math.atan(diagonal_m / 2 / 0.025)) == pytest.approx(18.51, abs=0.005)
-    chip = made.detector
-    assert 20 * math.log10(chip.full_well_e / chip.read_noise_e) == pytest.approx(68.7, abs=0.05)
-    assert chip.full_well_e / 255 == pytest.approx(157, abs=0.5)
-    assert chip.full_well_e / 255 / math.sqrt(12) == pytest.approx(45, abs=0.5)
+    detector = made.detector
+    assert 20 * math.log10(detector.full_well_e / detector.read_noise_e) == pytest.approx(68.7, abs=0.05)
+    assert detector.full_well_e / 255 == pytest.approx(157, abs=0.5)
+    assert detector.full_well_e / 255 / math.sqrt(12) == pytest.approx(45, abs=0.5)
     assert 1 / (made.height_px * made.shutter.row_time_s) == pytest.approx(90, rel=0.01)
 
 

@@ -27,33 +27,33 @@ def test_what_carries_a_unit_comes_out_in_si() -> None:
         vehicle__cmgs="{gimbal_time_constant: 12 ms, rotor_torque_limit: 0.4 N m}",
         vehicle__drag="{viscous: 1 mN m s, quadratic: 7 mN m s2}",
         vehicle__disturbances="{turbine: [0 N m, 0 N m, 0.2 mN m], cable: {stiffness: 2 mN m / deg},"
-        " draught: {rms: [1 mN m, 2 mN m, 3 mN m], correlation: 900 ms}}",
+        " air_current: {rms: [1 mN m, 2 mN m, 3 mN m], correlation: 900 ms}}",
         motion__control="{law: pd, actuators: wheels, desaturation: {start: 1.7 N m s, stop: 800 mN m s, time: 5 s}}",
     )
-    ship, told = given.vehicle, given.motion.control
-    assert ship.wheels is not None
-    assert ship.fans is not None
-    assert ship.cmgs is not None
-    assert ship.disturbances.cable is not None
-    assert ship.disturbances.draught is not None
+    vehicle, told = given.vehicle, given.motion.control
+    assert vehicle.wheels is not None
+    assert vehicle.fans is not None
+    assert vehicle.cmgs is not None
+    assert vehicle.disturbances.cable is not None
+    assert vehicle.disturbances.air_current is not None
     assert told is not None
     assert told.desaturation is not None
     figures = {
-        0.6: ship.wheels.torque_limit_nm,
-        2e-3: ship.wheels.coulomb_nm,
-        2e-5: ship.wheels.viscous_nms,
-        0.5e-5: ship.wheels.static_imbalance_kg_m,
-        1e-6: ship.wheels.dynamic_imbalance_kg_m2,
-        0.5: ship.fans.thrust_limit_n,
-        0.2: ship.fans.time_constant_s,
-        0.012: ship.cmgs.gimbal_time_constant_s,
-        0.4: ship.cmgs.rotor_torque_limit_nm,
-        1e-3: ship.drag.viscous_nms,
-        7e-3: ship.drag.quadratic_nms2,
-        2e-4: ship.disturbances.turbine_nm[2],
-        2e-3 * 57.29577951308232: ship.disturbances.cable.stiffness_nm_rad,
-        3e-3: ship.disturbances.draught.rms_nm[2],
-        0.9: ship.disturbances.draught.correlation_s,
+        0.6: vehicle.wheels.torque_limit_nm,
+        2e-3: vehicle.wheels.coulomb_nm,
+        2e-5: vehicle.wheels.viscous_nms,
+        0.5e-5: vehicle.wheels.static_imbalance_kg_m,
+        1e-6: vehicle.wheels.dynamic_imbalance_kg_m2,
+        0.5: vehicle.fans.thrust_limit_n,
+        0.2: vehicle.fans.time_constant_s,
+        0.012: vehicle.cmgs.gimbal_time_constant_s,
+        0.4: vehicle.cmgs.rotor_torque_limit_nm,
+        1e-3: vehicle.drag.viscous_nms,
+        7e-3: vehicle.drag.quadratic_nms2,
+        2e-4: vehicle.disturbances.turbine_nm[2],
+        2e-3 * 57.29577951308232: vehicle.disturbances.cable.stiffness_nm_rad,
+        3e-3: vehicle.disturbances.air_current.rms_nm[2],
+        0.9: vehicle.disturbances.air_current.correlation_s,
         1.7: told.desaturation.start_nms,
         0.8: told.desaturation.stop_nms,
         5.0: told.desaturation.time_s,
@@ -65,28 +65,28 @@ def test_a_controller_s_name_is_short_for_its_section() -> None:
     law = loaded(motion__control="pd").motion.control
     assert law is not None
     assert (law.law, law.actuators, law.feedback, law.rate_hz) == ("pd", "ideal", "truth", 100)
-    assert loaded(motion__control="none", motion__manoeuvre="[]").motion.control is None
+    assert loaded(motion__control="none", motion__maneuver="[]").motion.control is None
 
 
 # --- what goes together -------------------------------------------------------------------------------------
 
 WRONG = [
-    ({"filter": "{}"}, "filter: takes a gyro; allowed beside vehicle.imu"),
+    ({"filter": "{}"}, "filter: requires the section vehicle.imu"),
     (
         {"motion.control": "{actuators: wheels}"},
-        "motion.control.actuators: vehicle.wheels is not switched on",
+        "motion.control.actuators: requires the section vehicle.wheels",
     ),
-    ({"motion.control": "{feedback: imu}"}, "motion.control.feedback: imu takes the section vehicle.imu"),
+    ({"motion.control": "{feedback: imu}"}, "motion.control.feedback: imu requires the section vehicle.imu"),
     (
         {"motion.control": "{feedback: filter}", "vehicle.imu": "{}"},
-        "motion.control.feedback: filter takes the section filter",
+        "motion.control.feedback: filter requires the section filter",
     ),
     (
         {
             "vehicle.wheels": "{}",
             "motion.control": "{actuators: wheels, desaturation: {start: 2 N m s, stop: 1 N m s}}",
         },
-        "motion.control.desaturation: takes vehicle.fans, and actuators: wheels or cmgs",
+        "motion.control.desaturation: requires vehicle.fans, and actuators wheels or cmgs",
     ),
     (
         {"motion.control": "{desaturation: {start: 1 N m s, stop: 1 N m s}}"},
@@ -94,16 +94,16 @@ WRONG = [
     ),
     (
         {"motion.control": "{rate_hz: 300}"},
-        "motion.control.rate_hz: 300 Hz is no whole number of milliseconds",
+        "motion.control.rate_hz: 300 Hz has a period that is not a whole number of milliseconds",
     ),
     (
         {"vehicle.imu": "{rate_hz: 250}"},
-        "vehicle.imu.rate_hz: 250 Hz is no multiple of motion.control.rate_hz 100 Hz",
+        "vehicle.imu.rate_hz: 250 Hz is not a multiple of motion.control.rate_hz 100 Hz",
     ),
     (
         {
             "vehicle.mount": "free",
-            "vehicle.centre_of_mass": "[0 m, 0 m, 0 m]",
+            "vehicle.center_of_mass": "[0 m, 0 m, 0 m]",
             "vehicle.disturbances": "{earth_rotation: true}",
         },
         "disturbances: a free vehicle has none; allowed: mount: air_bearing",
@@ -112,16 +112,16 @@ WRONG = [
         {"vehicle.mount": "free", "vehicle.imu": "{earth_rate: compensated}"},
         "imu.earth_rate: a free vehicle is not on the Earth; allowed: none",
     ),
-    ({"motion.control": "none"}, "a manoeuvre needs a controller; allowed: control: pid"),
+    ({"motion.control": "none"}, "a maneuver requires a controller, such as control: pid"),
     (
-        {"motion.manoeuvre": "[{kind: bump, rate_deg_s: [1, 0, 0], duration: 50 ms, caught_after: 40 ms}]"},
-        "caught_after 0.04 s is before the knock is over",
+        {"motion.maneuver": "[{kind: bump, rate_deg_s: [1, 0, 0], duration: 50 ms, caught_after: 40 ms}]"},
+        "caught_after 0.04 s is before the impulse ends",
     ),
     ({"vehicle.wheels": "{coulomb: 2 mN}"}, "'2 mN' is not a torque"),
     ({"vehicle.drag": "{viscous: 0.1}"}, "0.1 has no unit"),
     ({"vehicle.cmgs": "{steering: moore_penrose}"}, "'pseudo_inverse' or 'singularity_robust'"),
     ({"vehicle.wheels": "{speed_limit: 3000}"}, "did you mean speed_limit_rpm?"),
-    ({"vehicle.disturbances": "{draught: {rms: [0 N m, 0 N m, -1 N m]}}"}, "greater than or equal to 0"),
+    ({"vehicle.disturbances": "{air_current: {rms: [0 N m, 0 N m, -1 N m]}}"}, "greater than or equal to 0"),
 ]
 
 
@@ -136,7 +136,7 @@ def test_what_does_not_go_together_is_told_in_one_line(sets: dict[str, str], say
 def test_a_vehicle_that_nobody_flies_may_be_knocked() -> None:
     told = loaded(
         motion__control="none",
-        motion__manoeuvre="[{kind: hold, duration: 1 s}, {kind: bump, rate_deg_s: [1, 0, 0], duration: 50 ms}]",
+        motion__maneuver="[{kind: hold, duration: 1 s}, {kind: bump, rate_deg_s: [1, 0, 0], duration: 50 ms}]",
     )
     assert told.motion.control is None
 
@@ -153,9 +153,7 @@ def written(folder: Path, name: str, **tree: object) -> Path:
 def test_a_scene_says_only_what_differs_from_its_base(tmp_path: Path) -> None:
     below = loader.load("afit_simsat")
     mine = loader.load(
-        written(
-            tmp_path, "mine", base="afit_simsat", seed=77, vehicle={"mass": "90 kg"}, camera={"f_number": 11}
-        )
+        written(tmp_path, "mine", base="afit_simsat", seed=77, vehicle={"mass": "90 kg"}, camera={"f_number": 11})
     )
     assert (mine.seed, mine.vehicle.mass_kg, mine.camera.f_number, mine.name) == (77, 90, 11, "mine")
     assert mine.vehicle.inertia_kg_m2 == below.vehicle.inertia_kg_m2
@@ -169,47 +167,43 @@ def test_a_section_of_another_kind_and_a_list_replace_and_null_switches_off(tmp_
         "mine",
         base="simsat_bump",
         camera={"psf": {"kind": "airy", "wavelength": "550 nm"}},
-        motion={"manoeuvre": [], "control": "pid"},
+        motion={"maneuver": [], "control": "pid"},
         filter=None,
     )
     mine = loader.load(path)
-    assert (mine.camera.psf.kind, mine.motion.manoeuvre, mine.filter) == ("airy", (), None)
+    assert (mine.camera.psf.kind, mine.motion.maneuver, mine.filter) == ("airy", (), None)
     assert mine.vehicle.imu == loader.load("simsat_bump").vehicle.imu
 
 
 def test_a_base_stands_beside_the_scene_and_brings_its_own_files(tmp_path: Path) -> None:
     """The base's vehicle is beside the base, though the scene is elsewhere."""
-    lab, campaign = tmp_path / "lab", tmp_path / "campaign"
-    lab.mkdir()
+    testbed, campaign = tmp_path / "lab", tmp_path / "campaign"
+    testbed.mkdir()
     campaign.mkdir()
     model = (SCENES / "vehicles" / "simsat.xml").read_text(encoding="utf-8")
-    (lab / "ours.xml").write_text(model, encoding="utf-8")
-    written(lab, "ours", base="afit_simsat", vehicle={"model": "ours.xml"})
+    (testbed / "ours.xml").write_text(model, encoding="utf-8")
+    written(testbed, "ours", base="afit_simsat", vehicle={"model": "ours.xml"})
     mine = loader.load(written(campaign, "mine", base="../lab/ours.yaml", seed=5))
-    assert Path(mine.vehicle.model) == lab / "ours.xml"
+    assert Path(mine.vehicle.model) == testbed / "ours.xml"
 
 
 def test_a_base_that_is_none_is_told_with_its_place(tmp_path: Path) -> None:
     path = written(tmp_path, "mine", title="mine", base="nothing")
-    with pytest.raises(
-        InputError, match=r"^base: nothing: no such scene; allowed: .* \(.*mine.yaml, line 3\)$"
-    ):
+    with pytest.raises(InputError, match=r"^base: nothing: no such scene; allowed: .* \(.*mine.yaml, line 3\)$"):
         loader.load(path)
 
 
 def test_a_scene_is_not_its_own_base(tmp_path: Path) -> None:
     written(tmp_path, "one", base="two.yaml")
     two = written(tmp_path, "two", base="one.yaml")
-    with pytest.raises(InputError, match=r"^base: .* is this scene itself, or has it for its base"):
+    with pytest.raises(InputError, match=r"^base: .* leads back to this scene"):
         loader.load(two)
 
 
 def test_a_slip_is_found_in_the_file_where_it_stands(tmp_path: Path) -> None:
     written(tmp_path, "below", base="afit_simsat", exposure={"time": "3 kg"})
     above = written(tmp_path, "above", base="below.yaml", vehicle={"wheels": {"coulomb": "1 m"}})
-    with pytest.raises(
-        InputError, match=r"vehicle.wheels.coulomb: '1 m' is not a torque.*above.yaml, line 5\)"
-    ):
+    with pytest.raises(InputError, match=r"vehicle.wheels.coulomb: '1 m' is not a torque.*above.yaml, line 5\)"):
         loader.load(above)
     above = written(tmp_path, "above", base="below.yaml", vehicle={"wheels": {}})
     with pytest.raises(InputError, match=r"exposure.time: '3 kg' is not a time.*below.yaml, line 4\)"):

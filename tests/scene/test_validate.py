@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 
 from skysim.apps.cli import main
 from skysim.apps.cli.commands import json_schema
-from skysim.apps.cli.commands.validate import checked
+from skysim.apps.cli.commands.validate import check_file
 from skysim.core import yaml_reader
 from skysim.core.errors import InputError
 from skysim.core.paths import DATA, ROOT, SCENES
@@ -48,9 +48,7 @@ def faults(kind: str, tree: Any) -> list[str]:
 @pytest.mark.parametrize("kind", SHIPPED)
 def test_the_published_schema_is_the_newest_and_takes_every_file_that_ships(kind: str) -> None:
     published = json.loads((DATA / "schema" / f"{kind}.json").read_text())
-    assert published == json_schema.json_schema(kind), (
-        f"skysim validate --schema {kind} > data/schema/{kind}.json"
-    )
+    assert published == json_schema.json_schema(kind), f"skysim validate --schema {kind} > data/schema/{kind}.json"
     jsonschema.Draft202012Validator.check_schema(published)
     for path in SHIPPED[kind]:
         tree = yaml.load(path.read_text(), Plain)
@@ -85,13 +83,11 @@ def test_another_version_is_refused_by_name_wherever_it_stands(tmp_path: Path) -
     newer.write_text("schema: 3\nbase: shefex2\nfuture: 1\n")
     mine.write_text("schema: 1\nbase: newer.yaml\n")
     for path in (newer, mine):
-        with pytest.raises(
-            InputError, match=r"^schema: 3 is of a newer skysim than .*newer\.yaml, line 1\)$"
-        ):
+        with pytest.raises(InputError, match=r"^schema: version 3 is newer than skysim .*newer\.yaml, line 1\)$"):
             load(path)
     study.write_text("title: T\nschema: 0\n")
     with pytest.raises(
-        InputError, match=r"^schema: 0 is older than this skysim reads; allowed: 1 \(.*study\.yaml, line 2\)$"
+        InputError, match=r"^schema: version 0 is no longer supported; allowed: 1 \(.*study\.yaml, line 2\)$"
     ):
         loader.load(study)
 
@@ -120,12 +116,12 @@ def test_each_kind_of_file_is_told_and_each_fault_is_a_line(tmp_path: Path) -> N
         (SCENES / "shefex2.yaml", "a scene of 7955 lights and 40 frames"),
         (SCENES / "studies" / "end_to_end.yaml", "a study of 6 trials"),
         (DATA / "cameras" / "aps.yaml", "a camera of "),
-        (DATA / "catalogues" / "hipparcos_hp6.5.ecsv", "a catalogue of 7996 stars"),
+        (DATA / "catalogs" / "hipparcos_hp6.5.ecsv", "a catalog of 7996 stars"),
     ):
-        told = checked(path)
+        told = check_file(path)
         assert (told.fault, told.what[: len(what)]) == ("", what)
     for path in (broken, xml, tmp_path / "none.yaml", ROOT / "data/published/afit.yaml"):
-        fault = checked(path).fault
+        fault = check_file(path).fault
         assert fault
         assert "\n" not in fault
 
@@ -139,9 +135,9 @@ def test_whatever_skysim_reads_is_taken(tmp_path: Path) -> None:
         (Path("end_to_end"), "a study of 6 trials"),
         (SCENES / "vehicles/simsat.xml", "a vehicle of 73.35 kg"),
     ):
-        told = checked(path)
+        told = check_file(path)
         assert (told.fault, told.what[: len(what)]) == ("", what)
-    assert "allowed: a .yaml file or one of afit_simsat" in checked(Path("nosuch")).fault
+    assert "allowed: a .yaml file or one of afit_simsat" in check_file(Path("nosuch")).fault
 
 
 def test_what_has_no_end_is_not_waited_for(tmp_path: Path) -> None:
@@ -149,21 +145,21 @@ def test_what_has_no_end_is_not_waited_for(tmp_path: Path) -> None:
         os.mkfifo(tmp_path / f"pipe.{suffix}")
         (tmp_path / f"zero.{suffix}").symlink_to("/dev/zero")
         for name in ("pipe", "zero"):
-            assert checked(tmp_path / f"{name}.{suffix}").fault.endswith("is no plain file")
+            assert check_file(tmp_path / f"{name}.{suffix}").fault.endswith("not a regular file")
 
 
 def test_a_wrong_key_of_a_trial_is_told_with_those_that_are_allowed(tmp_path: Path) -> None:
     path, text = tmp_path / "mine.yaml", (SCENES / "studies/false_stars.yaml").read_text()
     path.write_text(text.replace("trial.false_lights", "trial.false_light"))
     says = r"trial\.false_light: unknown key; did you mean false_lights\?; allowed: .*noise_px.*"
-    assert re.fullmatch(rf"factors\.strays: 0: {says} \(.*mine\.yaml, line 9\)", checked(path).fault)
+    assert re.fullmatch(rf"factors\.strays: 0: {says} \(.*mine\.yaml, line 9\)", check_file(path).fault)
 
 
 def test_what_only_the_setup_finds_has_its_line(tmp_path: Path) -> None:
     path = tmp_path / "mine.yaml"
     path.write_text("schema: 1\nbase: afit_simsat\ntracker:\n  map: nothing.ecsv\n")
-    assert "nothing.ecsv" in checked(path).fault
-    assert "mine.yaml, line 4" in checked(path).fault
+    assert "nothing.ecsv" in check_file(path).fault
+    assert "mine.yaml, line 4" in check_file(path).fault
 
 
 def test_the_command_refuses_with_2_and_prints_a_schema() -> None:

@@ -12,12 +12,12 @@ import pytest
 
 from skysim.core.types import Floats, Telemetry
 from skysim.scene import loader
-from skysim.simulation import run, testbed
-from skysim.simulation.testbed import Testbed
+from skysim.simulation import run
+from skysim.simulation.testbed import Testbed, build_tracker
 
 BUMP = 'kind: bump, rate_deg_s: [3, -2, 14], duration: "40 ms", caught_after: "0.2 s"'
 EARLY = {
-    "motion.manoeuvre": f'[{{kind: hold, duration: "1.5 s"}}, {{{BUMP}}}, {{kind: hold, duration: "30 s"}}]',
+    "motion.maneuver": f'[{{kind: hold, duration: "1.5 s"}}, {{{BUMP}}}, {{kind: hold, duration: "30 s"}}]',
     "exposure": '{time: "10 ms", rate_hz: 1, frames: 8, first: "0.4 s"}',
 }
 AFTER_S = 1.75  # the bump and the catch are over
@@ -38,9 +38,9 @@ def bumped() -> Testbed:
     return prepared(**EARLY)
 
 
-def told(lab: Testbed) -> Telemetry:
-    assert lab.telemetry is not None
-    return lab.telemetry
+def told(testbed: Testbed) -> Telemetry:
+    assert testbed.telemetry is not None
+    return testbed.telemetry
 
 
 def off_deg(telemetry: Telemetry) -> Floats:
@@ -66,7 +66,7 @@ def in_sigma(telemetry: Telemetry) -> Floats:
 
 
 def test_every_frame_is_solved_and_used(bumped: Testbed) -> None:
-    assert bumped.verdicts == dict.fromkeys(range(8), "used")
+    assert bumped.update_statuses == dict.fromkeys(range(8), "used")
     assert {report.attitude.status for report in bumped.reports.values()} == {"solved"}
 
 
@@ -103,12 +103,12 @@ def test_the_filter_knows_what_it_does_not_know(bumped: Testbed) -> None:
 def test_the_star_tracker_brings_attitude_and_bias_back(bumped: Testbed) -> None:
     telemetry = told(bumped)
     assert telemetry.lab_from_filter is not None
-    assert telemetry.believed_bias_rad_s is not None
+    assert telemetry.assumed_bias_rad_s is not None
     assert telemetry.bias_rad_s is not None
     error_deg = np.degrees((telemetry.lab_from_filter.inv() * telemetry.lab_from_body).magnitude())
     assert error_deg[telemetry.t_s < 2.4].max() > 0.3  # it was lost too
     assert error_deg[telemetry.t_s > 2.45].max() < 0.005
-    bias_error = np.abs(telemetry.believed_bias_rad_s - telemetry.bias_rad_s)[-1]
+    bias_error = np.abs(telemetry.assumed_bias_rad_s - telemetry.bias_rad_s)[-1]
     assert (bias_error < 4 * telemetry.sigma_bias_rad_s[-1]).all()  # type: ignore[index]
     deg_h = np.degrees(bias_error) * 3600
     assert deg_h.max() < 5  # of 15, the Earth's turning, that it had to find
@@ -134,9 +134,9 @@ def test_steered_by_the_imu_it_stays_where_the_imu_is_wrong() -> None:
 
 def test_what_was_solved_in_flight_is_what_the_frames_say_afterwards(bumped: Testbed) -> None:
     """Rendered from a piece of the flight when its time came, and from the whole: the same photons, one answer."""
-    kept = [shot.report.attitude for shot in run.run(bumped, testbed.tracker(bumped))]
+    kept = [shot.report.attitude for shot in run.run(bumped, build_tracker(bumped))]
     forgotten = replace(bumped, reports={})
-    again = [shot.report.attitude for shot in run.run(forgotten, testbed.tracker(forgotten))]
+    again = [shot.report.attitude for shot in run.run(forgotten, build_tracker(forgotten))]
     assert kept == [bumped.reports[index].attitude for index in range(8)]
     assert [one.status for one in kept] == [one.status for one in again]
     for one, other in zip(kept, again, strict=True):
@@ -146,43 +146,43 @@ def test_what_was_solved_in_flight_is_what_the_frames_say_afterwards(bumped: Tes
 @pytest.mark.parametrize("latency_s", [0.0, 0.2])
 def test_a_solution_comes_after_its_latency(latency_s: float) -> None:
     """The filter is sure of itself at the first tick after the exposure's end and the latency, and right."""
-    lab = prepared(
+    testbed = prepared(
         filter=f'{{start_deg: 0.5, latency: "{latency_s} s"}}',
-        motion__manoeuvre="[{kind: sine, amplitude_deg: [2, 1, 3], frequency_hz: 0.5, duration: 5 s}]",
+        motion__maneuver="[{kind: sine, amplitude_deg: [2, 1, 3], frequency_hz: 0.5, duration: 5 s}]",
         exposure='{time: "10 ms", rate_hz: 2, frames: 4, first: "0.4 s"}',
     )
-    telemetry = told(lab)
+    telemetry = told(testbed)
     knows = telemetry.t_s[(telemetry.sigma_attitude_rad < np.radians(0.1)).all(axis=1)]
     assert knows[0] == pytest.approx(0.41 + latency_s, abs=0.0101)
     assert in_sigma(telemetry)[1:].max() < 4
     # What comes too late for the flight is no longer told the filter, but solved after all.
-    assert sorted(lab.reports) == list(range(4 if latency_s == 0 else 3))
-    shots = list(run.run(lab, testbed.tracker(lab)))
+    assert sorted(testbed.reports) == list(range(4 if latency_s == 0 else 3))
+    shots = list(run.run(testbed, build_tracker(testbed)))
     assert [shot.report.attitude.status for shot in shots] == ["solved"] * 4
 
 
 def test_the_loop_with_latency_survives_the_accident() -> None:
-    lab = prepared(**EARLY, filter__latency="0.2 s")
-    assert set(lab.verdicts.values()) == {"used"}
-    assert in_sigma(told(lab))[1:].max() < 4
-    assert off_deg(told(lab))[told(lab).t_s > 7].max() < 0.06
+    testbed = prepared(**EARLY, filter__latency="0.2 s")
+    assert set(testbed.update_statuses.values()) == {"used"}
+    assert in_sigma(told(testbed))[1:].max() < 4
+    assert off_deg(told(testbed))[told(testbed).t_s > 7].max() < 0.06
 
 
 def test_a_frame_without_an_answer_leaves_the_filter_alone() -> None:
     """The lens is capped: no LEDs, no solution; the filter goes on with the gyros and is less and less sure."""
-    lab = prepared(light__led__intensity="1 ucd", exposure='{time: "10 ms", rate_hz: 2, frames: 2}')
-    assert "used" not in lab.verdicts.values()
-    assert [lab.verdicts[k] for k in range(2)] == [lab.reports[k].attitude.status for k in range(2)]
-    sigma = told(lab).sigma_attitude_rad
+    testbed = prepared(light__led__intensity="1 ucd", exposure='{time: "10 ms", rate_hz: 2, frames: 2}')
+    assert "used" not in testbed.update_statuses.values()
+    assert [testbed.update_statuses[k] for k in range(2)] == [testbed.reports[k].attitude.status for k in range(2)]
+    sigma = told(testbed).sigma_attitude_rad
     assert sigma is not None
     assert (np.diff(sigma, axis=0) > 0).all()
 
 
 def test_under_the_stars_the_filter_s_lab_is_the_sky() -> None:
     """The same loop with the other tracker: a free vehicle, its attitude among the stars."""
-    lab = prepared("shefex2", vehicle__imu="{}", filter="{start_deg: 0.5}", exposure__frames="4")
-    assert lab.verdicts == dict.fromkeys(range(4), "used")
-    telemetry = told(lab)
+    testbed = prepared("shefex2", vehicle__imu="{}", filter="{start_deg: 0.5}", exposure__frames="4")
+    assert testbed.update_statuses == dict.fromkeys(range(4), "used")
+    telemetry = told(testbed)
     assert in_sigma(telemetry)[1:].max() < 4
     assert telemetry.sigma_attitude_rad is not None
     assert np.degrees(telemetry.sigma_attitude_rad[-1]).max() < 0.02
@@ -193,11 +193,11 @@ def test_under_the_stars_the_filter_s_lab_is_the_sky() -> None:
 
 def test_the_same_seed_flies_the_same_flight_bit_for_bit() -> None:
     short = EARLY | {"exposure": '{time: "10 ms", rate_hz: 1, frames: 2, first: "1.4 s"}'}
-    short["motion.manoeuvre"] = short["motion.manoeuvre"].replace("1.5 s", "1.6 s")
+    short["motion.maneuver"] = short["motion.maneuver"].replace("1.5 s", "1.6 s")
     one, same, other = (prepared(**short, seed=seed) for seed in ("6", "6", "7"))
-    for name in ("torque_nm", "rate_body_rad_s", "believed_bias_rad_s", "sigma_attitude_rad"):
+    for name in ("torque_nm", "rate_body_rad_s", "assumed_bias_rad_s", "sigma_attitude_rad"):
         assert getattr(told(one), name).tobytes() == getattr(told(same), name).tobytes()
         assert getattr(told(one), name).tobytes() != getattr(told(other), name).tobytes()
     for telemetry in ("lab_from_body", "lab_from_imu", "lab_from_filter"):
-        quaternions = [getattr(told(lab), telemetry).as_quat().tobytes() for lab in (one, same, other)]
+        quaternions = [getattr(told(testbed), telemetry).as_quat().tobytes() for testbed in (one, same, other)]
         assert quaternions[0] == quaternions[1] != quaternions[2]

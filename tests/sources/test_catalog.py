@@ -1,4 +1,4 @@
-"""The catalogue files: known stars, known counts, the missing stars supplied, damage refused."""
+"""The catalog files: known stars, known counts, the missing stars supplied, damage refused."""
 
 from pathlib import Path
 
@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from skysim.core.errors import InputError
-from skysim.core.paths import CATALOGUES
+from skysim.core.paths import CATALOGS
 from skysim.sources import catalog
-from skysim.sources.catalog import Catalogue
+from skysim.sources.catalog import Catalog
 
-COMMITTED = CATALOGUES / "hipparcos_hp6.5.ecsv"
+COMMITTED = CATALOGS / "hipparcos_hp6.5.ecsv"
 
 # Johnson V of famous stars: Bright Star Catalogue, 5th edition; Canopus from Hipparcos-1 (there it is -0.72).
 FAMOUS_V = {
@@ -42,17 +42,17 @@ J2000 = {
 
 
 @pytest.fixture(scope="module")
-def stars() -> Catalogue:
+def stars() -> Catalog:
     return catalog.read("hipparcos_hp6.5")
 
 
-def index(stars: Catalogue, hip: int) -> int:
+def index(stars: Catalog, hip: int) -> int:
     (where,) = np.flatnonzero(stars.hip == hip)
     return int(where)
 
 
 @pytest.mark.parametrize("hip", list(J2000))
-def test_famous_stars_stand_where_the_almanac_puts_them(stars: Catalogue, hip: int) -> None:
+def test_famous_stars_stand_where_the_almanac_puts_them(stars: Catalog, hip: int) -> None:
     _name, (hour, minute, second), (sign, degree, arcmin, arcsec) = J2000[hip]
     n = index(stars, hip)
     years = 2000.0 - stars.epoch_jyear
@@ -65,19 +65,17 @@ def test_famous_stars_stand_where_the_almanac_puts_them(stars: Catalogue, hip: i
 
 
 @pytest.mark.parametrize(("hip", "v_mag"), [(hip, v) for hip, (_name, v) in FAMOUS_V.items()])
-def test_famous_stars_are_as_bright_as_the_bright_star_catalogue_says(
-    stars: Catalogue, hip: int, v_mag: float
-) -> None:
+def test_famous_stars_are_as_bright_as_the_bright_star_catalog_says(stars: Catalog, hip: int, v_mag: float) -> None:
     assert stars.v_mag[index(stars, hip)] == pytest.approx(v_mag, abs=0.05)
 
 
-def test_counts_are_the_reference_s(stars: Catalogue) -> None:
+def test_counts_are_the_reference_s(stars: Catalog) -> None:
     # Reference §2, hip2 alone: V<5 1618, V<6 5025. Nineteen stars are supplied, five left out.
     assert abs(np.sum(stars.v_mag < 5) - 1618) <= 24
     assert abs(np.sum(stars.v_mag < 6) - 5025) <= 24
 
 
-def test_stars_are_unique_sorted_and_within_the_limit(stars: Catalogue) -> None:
+def test_stars_are_unique_sorted_and_within_the_limit(stars: Catalog) -> None:
     assert np.all(np.diff(stars.hip) > 0)
     assert stars.hp_mag.max() <= 6.5
     assert stars.epoch_jyear == 1991.25
@@ -85,7 +83,7 @@ def test_stars_are_unique_sorted_and_within_the_limit(stars: Catalogue) -> None:
     assert np.all(np.abs(stars.dec_rad) < np.pi / 2)
 
 
-def test_61_cygni_is_the_fastest(stars: Catalogue) -> None:
+def test_61_cygni_is_the_fastest(stars: Catalog) -> None:
     # 61 Cyg A moves 5.28"/yr (every textbook), the most of the stars seen with the naked eye.
     speed_arcsec_yr = np.degrees(np.hypot(stars.pm_ra_rad_yr, stars.pm_dec_rad_yr)) * 3600
     assert speed_arcsec_yr[index(stars, 104214)] == pytest.approx(5.28, abs=0.02)
@@ -103,7 +101,7 @@ def test_61_cygni_is_the_fastest(stars: Catalogue) -> None:
     ],
 )
 def test_what_hipparcos_2_lacks_is_supplied(
-    stars: Catalogue, hip: int, v_mag: float, ra_deg: float, dec_deg: float
+    stars: Catalog, hip: int, v_mag: float, ra_deg: float, dec_deg: float
 ) -> None:
     n = index(stars, hip)
     years = 2000.0 - stars.epoch_jyear
@@ -114,7 +112,7 @@ def test_what_hipparcos_2_lacks_is_supplied(
     assert stars.v_mag[n] == pytest.approx(v_mag, abs=0.13)  # Gaia saturates on the two of xi UMa
 
 
-def test_no_star_shines_twice(stars: Catalogue) -> None:
+def test_no_star_shines_twice(stars: Catalog) -> None:
     # The Trapezium and sigma Orionis have one entry each, not one for each number that sees all their light.
     assert not set(catalog.DOUBLE_COUNTED) & set(stars.hip)
     assert set(catalog.DOUBLE_COUNTED.values()) <= set(stars.hip)
@@ -142,7 +140,7 @@ def test_a_shallow_build_holds_the_brightest(tmp_path: Path) -> None:
     assert {32349, 30438, 91262} <= set(bright.hip)
 
 
-def test_astropy_reads_the_file_too(stars: Catalogue) -> None:
+def test_astropy_reads_the_file_too(stars: Catalog) -> None:
     from astropy.table import Table
 
     table = Table.read(COMMITTED, format="ascii.ecsv")
@@ -152,7 +150,7 @@ def test_astropy_reads_the_file_too(stars: Catalogue) -> None:
     np.testing.assert_array_equal(table["v_mag"], stars.v_mag)
 
 
-def test_info_counts_and_tells_where_it_comes_from(stars: Catalogue) -> None:
+def test_info_counts_and_tells_where_it_comes_from(stars: Catalog) -> None:
     told = catalog.info("hipparcos_hp6.5")
     assert told["stars"] == len(stars)
     assert (
@@ -162,10 +160,10 @@ def test_info_counts_and_tells_where_it_comes_from(stars: Catalogue) -> None:
     )
     assert told["brighter_than"][5] == np.sum(stars.v_mag < 5)
     assert told["meta"]["limit_hp_mag"] == 6.5
-    assert "I/311" in told["meta"]["catalogue"]
+    assert "I/311" in told["meta"]["catalog"]
 
 
-def test_take_keeps_the_epoch(stars: Catalogue) -> None:
+def test_take_keeps_the_epoch(stars: Catalog) -> None:
     few = stars.take(stars.v_mag < 0)
     assert set(few.hip) == {30438, 32349, 69673}  # Canopus, Sirius, Arcturus
     assert few.epoch_jyear == stars.epoch_jyear
@@ -209,8 +207,6 @@ def test_a_damaged_file_is_refused_in_one_line(tmp_path: Path, how: str) -> None
     assert "skysim catalog build" in message
 
 
-def test_a_missing_catalogue_is_named() -> None:
-    with pytest.raises(
-        InputError, match=r"hipparcos_hp99\.ecsv: there is no such catalogue; .*catalog build"
-    ):
+def test_a_missing_catalog_is_named() -> None:
+    with pytest.raises(InputError, match=r"hipparcos_hp99\.ecsv: not found; build it with .*catalog build"):
         catalog.read("hipparcos_hp99")

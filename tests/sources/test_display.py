@@ -1,4 +1,4 @@
-"""Fibres, panels and benches against rulers, spherical trigonometry, and the laws of rounding and of flicker."""
+"""Fibers, panels and benches against rulers, spherical trigonometry, and the laws of rounding and of flicker."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from skysim.camera import display_glow
 from skysim.core.errors import InputError
 from skysim.core.types import Sources
 from skysim.scene import leds, loader
-from skysim.scene.light import BenchConfig, DomeConfig
-from skysim.simulation import exposure, testbed
-from skysim.simulation.testbed import Testbed
+from skysim.scene.light import CollimatedDisplayConfig, DomeConfig
+from skysim.simulation import exposure
+from skysim.simulation.testbed import Testbed, build_testbed, exposure_window, light_sources
 from skysim.sources import catalog, dome
 from skysim.sources import stars as star_sources
 from skysim.sources.dome import display
@@ -23,15 +23,15 @@ from skysim.sources.dome.led import lit_moments_s
 from skysim.sources.photometry import SUN, Band, led_strength_e_s_sr, star_flux_e_s_m2
 
 FOOT_M = 0.3048
-BAND = Band.of("interline")
+BAND = Band.from_efficiency("interline")
 TIME = datetime.datetime(2012, 6, 22, 21)
-LED = {"intensity": "13 ucd", "disc_diameter": "0.3 mm", "drive": {"kind": "direct"}}
+LED = {"intensity": "13 ucd", "disk_diameter": "0.3 mm", "drive": {"kind": "direct"}}
 FLAT = {"kind": "flat", "apex": "1.4 m", "offset": ["50 mm", "-20 mm", "0 m"], "tilt_deg": [4, -3]}
 APL = {"kind": "sphere", "apex": "4 ft", "radius": "4 ft"}
 EVERYWHERE = {"kind": "random", "cap_deg": 4, "count": 2000}
 PANEL = {"kind": "lcd", "pixels": [1680, 1050], "pitch": "0.258 mm", "points": EVERYWHERE}
 BENCH = {
-    "kind": "bench",
+    "kind": "collimated_display",
     "pixels": [1920, 1200],
     "pitch": "8.1 um",
     "focal_length": "45 mm",
@@ -48,8 +48,8 @@ def lit(layout: dict[str, Any], surface: dict[str, Any] = FLAT, **led: Any) -> S
 
 
 def shown(**more: Any) -> Sources:
-    part = BenchConfig.model_validate(BENCH | more)
-    return display.bench(part, catalog.read(part.catalogue), TIME, BAND)
+    config = CollimatedDisplayConfig.model_validate(BENCH | more)
+    return display.display_sources(config, catalog.read(config.catalog), TIME, BAND)
 
 
 def own_m(place_m: np.ndarray) -> np.ndarray:
@@ -64,44 +64,42 @@ def unit(vectors: np.ndarray) -> np.ndarray:
     return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
 
 
-# Fibres
+# Fibers
 
 
-def fibres(variation: float, **points: Any) -> Sources:
+def fibers(variation: float, **points: Any) -> Sources:
     ends = {"kind": "random", "cap_deg": 88, "count": 4000, "hardware_seed": 3} | points
-    return lit({"kind": "fibres", "points": ends, "radius_variation": variation}, APL)
+    return lit({"kind": "fibers", "points": ends, "radius_variation": variation}, APL)
 
 
-def test_fibres_stand_off_along_the_normal_evenly_by_the_declared_share_of_the_radius() -> None:
+def test_fibers_stand_off_along_the_normal_evenly_by_the_declared_share_of_the_radius() -> None:
     """Uniform over +-.4 % of 4 ft, which is 4.9 mm: mean and variance to four of their sigmas."""
-    ideal, real = fibres(0.0), fibres(0.004)
+    ideal, real = fibers(0.0), fibers(0.004)
     np.testing.assert_allclose(unit(real.place[:, :3]), unit(ideal.place[:, :3]), rtol=0, atol=1e-14)
     share = (np.linalg.norm(real.place[:, :3], axis=1) / (4 * FOOT_M) - 1) / 0.004
     n = len(share)
     assert np.abs(share).max() <= 1 + 1e-9
     assert abs(share.mean()) < 4 / np.sqrt(3 * n)
-    assert share.var() == pytest.approx(
-        1 / 3, abs=4 * np.sqrt(4 / 45 / n)
-    )  # (1/5 - 1/9) of the fourth moment
+    assert share.var() == pytest.approx(1 / 3, abs=4 * np.sqrt(4 / 45 / n))  # (1/5 - 1/9) of the fourth moment
     for name in ("id", "strength", "normal", "radius_m", "start_s"):
         np.testing.assert_array_equal(getattr(real, name), getattr(ideal, name))
 
 
-def test_a_camera_off_the_centre_of_apl_s_dome_errs_as_the_reference_says() -> None:
-    """(r / R)(dR / R) at most: 34 arcsec at 50 mm, and no more than its square beside it; none in the centre."""
+def test_a_camera_off_the_center_of_apl_s_dome_errs_as_the_reference_says() -> None:
+    """(r / R)(dR / R) at most: 34 arcsec at 50 mm, and no more than its square beside it; none in the center."""
     camera_m = np.array([0.05, 0, 0])
-    ideal, real = fibres(0.0).place[:, :3], fibres(0.004).place[:, :3]
+    ideal, real = fibers(0.0).place[:, :3], fibers(0.004).place[:, :3]
     apart = np.linalg.norm(np.cross(unit(real - camera_m), unit(ideal - camera_m)), axis=1)
     bound = 0.05 / (4 * FOOT_M) * 0.004
     assert np.degrees(bound) * 3600 == pytest.approx(34, abs=0.5)
     assert 0.9 * bound < apart.max() < bound * (1 + 0.05 / (4 * FOOT_M) + 0.004)
 
 
-def test_fibres_carry_the_stars_that_another_layout_projects() -> None:
-    """Marked by a laser from the centre: in its direction whatever the radius, Hipparcos' number on each."""
+def test_fibers_carry_the_stars_that_another_layout_projects() -> None:
+    """Marked by a laser from the center: in its direction whatever the radius, Hipparcos' number on each."""
     stars = {"kind": "celestial", "cap_deg": 80, "count": 100, "camera": ["0 m"] * 3}
     stars |= {"zenith_ra_deg": 0, "zenith_dec_deg": 90}
-    ends = lit({"kind": "fibres", "points": stars, "radius_variation": 0.004}, APL)
+    ends = lit({"kind": "fibers", "points": stars, "radius_variation": 0.004}, APL)
     known = catalog.read("hipparcos_hp6.5")
     known = known.take(np.array([np.flatnonzero(known.hip == hip)[0] for hip in ends.id]))
     seen = star_sources.apparent(known, datetime.datetime(2000, 1, 1, 12))
@@ -146,17 +144,19 @@ def test_rounding_to_pixels_is_an_even_error_over_a_pitch() -> None:
     assert abs(np.mean(off[:, 0] * off[:, 1])) < 4 / (12 * np.sqrt(n))
 
 
-@pytest.mark.parametrize(("greys", "gamma"), [(4, 1.0), (256, 2.2), (2, 1.8)])
-def test_levels_are_the_nearest_greys(greys: int, gamma: float) -> None:
+@pytest.mark.parametrize(("grays", "gamma"), [(4, 1.0), (256, 2.2), (2, 1.8)])
+def test_levels_are_the_nearest_grays(grays: int, gamma: float) -> None:
     """Against a search through all of them in the picture's own numbers."""
     level = (np.arange(1, 400) - 0.3) / 399
-    part = leds.LcdConfig.model_validate(PANEL | {"grey_levels": greys, "gamma": gamma})
-    number = np.arange(greys) / (greys - 1)
+    config = leds.LcdConfig.model_validate(PANEL | {"gray_levels": grays, "gamma": gamma})
+    number = np.arange(grays) / (grays - 1)
     nearest = np.abs(level[:, None] ** (1 / gamma) - number).argmin(axis=1)
-    np.testing.assert_allclose(display.grey(part, level), number[nearest] ** gamma, rtol=1e-12, atol=0)
-    low = display.faintest(part)
+    np.testing.assert_allclose(display.gray_transmission(config, level), number[nearest] ** gamma, rtol=1e-12, atol=0)
+    low = display.min_level(config)
     assert (
-        display.grey(part, np.array([low * 0.999]))[0] == 0 < display.grey(part, np.array([low * 1.001]))[0]
+        display.gray_transmission(config, np.array([low * 0.999]))[0]
+        == 0
+        < display.gray_transmission(config, np.array([low * 1.001]))[0]
     )
 
 
@@ -164,7 +164,7 @@ def test_stars_on_one_pixel_add_up_to_white() -> None:
     """The brightest's number stands for them."""
     points = {"kind": "listed", "cap_deg": 5, "levels": [0.25, 0.5, 0.8, 0.9]}
     points["directions_deg"] = [[0, 1], [0, 1.0001], [90, 2], [90, 2.0001]]
-    drawn = lit(PANEL | {"points": points, "grey_levels": 65536, "gamma": 1})
+    drawn = lit(PANEL | {"points": points, "gray_levels": 65536, "gamma": 1})
     of = dict(zip(drawn.id.tolist(), drawn.strength / led_e_s_sr(), strict=True))
     assert of == {1: pytest.approx(0.75, rel=1e-4), 3: pytest.approx(1, rel=1e-12)}
 
@@ -241,14 +241,14 @@ def light_s(drawn: Sources, exposure_s: float) -> np.ndarray:
 def test_on_the_frame_rows_are_dark_whose_turn_is_not_in_the_exposure() -> None:
     """NPS's stars lit for a quarter of a frame, in an exposure of a quarter: by each row's own turn, or not at all."""
     changes = {"light.led.drive.duty": "0.25", "exposure.time": f"{1000 / 240} ms", "light.led.scatter": "0"}
-    dark = testbed.build_testbed(loader.load("nps_tas2", changes))
-    steady = testbed.build_testbed(loader.load("nps_tas2", changes | {"light.led.drive": "{kind: direct}"}))
-    window = testbed.window(dark.scene, 0)
+    dark = build_testbed(loader.load("nps_tas2", changes))
+    steady = build_testbed(loader.load("nps_tas2", changes | {"light.led.drive": "{kind: direct}"}))
+    window = exposure_window(dark.scene, 0)
     looks = window.open_s + (np.arange(20_000) + 0.5) / 20_000 * window.exposure_s
     (_, flickering), (_, full) = exposure.render_frame(dark, 0), exposure.render_frame(steady, 0)
-    all_e = dict(zip(full.seen.id.tolist(), full.seen.electrons, strict=True))
+    all_e = dict(zip(full.sources.id.tolist(), full.sources.electrons, strict=True))
     got = dict.fromkeys(all_e, 0.0) | dict(
-        zip(flickering.seen.id.tolist(), flickering.seen.electrons, strict=True)
+        zip(flickering.sources.id.tolist(), flickering.sources.electrons, strict=True)
     )
     for n, number in enumerate(dark.sources.id.tolist()):
         phase = (looks - dark.sources.start_s[n]) * 60 % 1
@@ -290,14 +290,14 @@ def test_the_field_ends_where_the_display_does() -> None:
     assert len(narrow) < len(wide)
 
 
-def test_a_bench_s_stars_follow_pogson_to_half_a_grey() -> None:
-    """Strength of a G2 star of that V; brighter than white is white; a grey's step is gamma / g of its light."""
+def test_a_bench_s_stars_follow_pogson_to_half_a_gray() -> None:
+    """Strength of a G2 star of that V; brighter than white is white; a gray's step is gamma / g of its light."""
     made = shown(brightest_mag=2)
     white = float(star_flux_e_s_m2(2.0, *SUN, BAND))
     level = np.minimum(10 ** (-0.4 * (made.magnitude - 2)), 1)
     assert 3 <= np.sum(made.magnitude < 2) < len(made) / 2
-    got, greys = made.strength / white, 255 * level ** (1 / 2.2)
-    alone = np.abs(255 * got ** (1 / 2.2) - greys) <= 0.5 + 1e-9
+    got, grays = made.strength / white, 255 * level ** (1 / 2.2)
+    alone = np.abs(255 * got ** (1 / 2.2) - grays) <= 0.5 + 1e-9
     assert np.mean(alone) > 0.95  # the rest share a pixel with another
     np.testing.assert_allclose(got[made.magnitude < 2], 1, rtol=1e-12, atol=0)
 
@@ -306,30 +306,31 @@ def test_a_bench_s_stars_follow_pogson_to_half_a_grey() -> None:
 def test_a_camera_on_a_lever_sees_no_parallax_but_that_of_the_collimation(conjugate_m: float | None) -> None:
     """Stars at D are seen along D d - r, in the light of 1 / |D d - r|^2; r is SimSat's camera, tilted."""
     told = {} if conjugate_m is None else {"light.conjugate": f"{conjugate_m} m"}
-    lab = testbed.build_testbed(
+    testbed = build_testbed(
         loader.load(
-            "bench_collimated", told | {"vehicle.model": "vehicles/simsat.xml", "motion.start.roll_deg": "6"}
+            "collimated_display",
+            told | {"vehicle.model": "vehicles/simsat.xml", "motion.start.roll_deg": "6"},
         )
     )
-    central = testbed.build_testbed(loader.load("bench_collimated", {"motion.start.roll_deg": "6"}))
-    _, moved = exposure.render_frame(lab, 0)
+    central = build_testbed(loader.load("collimated_display", {"motion.start.roll_deg": "6"}))
+    _, moved = exposure.render_frame(testbed, 0)
     _, still = exposure.render_frame(central, 0)
-    both, ours, theirs = np.intersect1d(moved.seen.id, still.seen.id, return_indices=True)
-    camera_m = moved.lab_from_body.apply(lab.mount.camera_body_m)
+    both, ours, theirs = np.intersect1d(moved.sources.id, still.sources.id, return_indices=True)
+    camera_m = moved.lab_from_body.apply(testbed.mount.camera_body_m)
     direction = central.sources.place[[np.flatnonzero(central.sources.id == n)[0] for n in both], :3]
     ray = direction if conjugate_m is None else conjugate_m * direction - camera_m
     xyz = moved.cam_from_lab.apply(ray)
-    camera = lab.scene.camera
-    wanted = np.array(camera.centre_px) + camera.focal_px * xyz[:, :2] / xyz[:, 2:]
-    np.testing.assert_allclose(moved.seen.xy_px[ours], wanted, rtol=0, atol=1e-6)
-    shift_px = np.abs(moved.seen.xy_px[ours] - still.seen.xy_px[theirs]).max()
+    camera = testbed.scene.camera
+    wanted = np.array(camera.center_px) + camera.focal_px * xyz[:, :2] / xyz[:, 2:]
+    np.testing.assert_allclose(moved.sources.xy_px[ours], wanted, rtol=0, atol=1e-6)
+    shift_px = np.abs(moved.sources.xy_px[ours] - still.sources.xy_px[theirs]).max()
     lever_px = 0.0 if conjugate_m is None else 0.381 / conjugate_m * camera.focal_px
     assert shift_px <= lever_px + 1e-6
     assert (shift_px > lever_px * 0.05) == (conjugate_m is not None)
-    inside = still.seen.electrons[theirs] > 300
+    inside = still.sources.electrons[theirs] > 300
     np.testing.assert_allclose(
-        moved.seen.electrons[ours][inside],
-        still.seen.electrons[theirs][inside],
+        moved.sources.electrons[ours][inside],
+        still.sources.electrons[theirs][inside],
         rtol=1e-3 if conjugate_m is None else 3 * 0.381 / conjugate_m + 1e-3,
         atol=0,
     )
@@ -338,11 +339,11 @@ def test_a_camera_on_a_lever_sees_no_parallax_but_that_of_the_collimation(conjug
 # Black that glows
 
 
-def glow_e_s(lab: Testbed) -> np.ndarray:
-    lab_from_body = lab.trajectory.at(0.5)
-    camera_m = lab_from_body.apply(lab.mount.camera_body_m)
-    cam_from_lab = lab.mount.cam_from_body * lab_from_body.inv()
-    glow = display_glow.black_glow(lab.scene.light, lab.optics, cam_from_lab, camera_m, lab.band)
+def glow_e_s(testbed: Testbed) -> np.ndarray:
+    lab_from_body = testbed.trajectory.attitude_at(0.5)
+    camera_m = lab_from_body.apply(testbed.mount.camera_body_m)
+    cam_from_lab = testbed.mount.cam_from_body * lab_from_body.inv()
+    glow = display_glow.black_glow(testbed.scene.light, testbed.optics, cam_from_lab, camera_m, testbed.band)
     assert glow is not None
     return glow
 
@@ -364,31 +365,29 @@ def test_a_black_panel_s_glow_is_that_of_all_its_pixels_by_the_contrast() -> Non
         "exposure.time": "100 ms",
         "motion.start": "{roll_deg: 4, pitch_deg: -3, yaw_deg: 10}",
     }
-    white = testbed.build_testbed(loader.load("nps_tas2", changes))
-    seen = exposure.render_frame(white, 0)[1].seen
+    white = build_testbed(loader.load("nps_tas2", changes))
+    seen = exposure.render_frame(white, 0)[1].sources
     assert len(seen.id) == 300
-    grey = testbed.build_testbed(loader.load("nps_tas2", changes | {"light.layout.contrast": "500"}))
-    glow = glow_e_s(grey)
+    gray = build_testbed(loader.load("nps_tas2", changes | {"light.layout.contrast": "500"}))
+    glow = glow_e_s(gray)
     assert glow.sum() == pytest.approx(seen.electrons.sum() / 0.1 / 500, rel=0.01)
     assert 0.05 < np.mean(glow > 0) < 0.2
     # And white is as bright as without: black and what is above it.
-    np.testing.assert_allclose(
-        grey.sources.strength, white.sources.strength * (1 - 1 / 500), rtol=1e-12, atol=0
-    )
+    np.testing.assert_allclose(gray.sources.strength, white.sources.strength * (1 - 1 / 500), rtol=1e-12, atol=0)
 
 
 def test_a_black_bench_s_glow_is_that_of_its_pixels_in_the_chip_s() -> None:
     """A pixel of the chip holds (81.7 / 37.1)^2 of the display's, each 1 / contrast of a white star; none beside it."""
     changes = {"light.contrast": "400", "motion.start": "{roll_deg: 0, pitch_deg: 0, yaw_deg: 0}"}
-    lab = testbed.build_testbed(loader.load("bench_collimated", changes))
-    glow, camera = glow_e_s(lab), lab.scene.camera
-    white_e_s = float(star_flux_e_s_m2(0.0, *SUN, lab.band)) * lab.optics.collecting_m2
+    testbed = build_testbed(loader.load("collimated_display", changes))
+    glow, camera = glow_e_s(testbed), testbed.scene.camera
+    white_e_s = float(star_flux_e_s_m2(0.0, *SUN, testbed.band)) * testbed.optics.collecting_m2
     pixels = (45e-3 / 8.1e-6 / camera.focal_px) ** 2
     assert glow[246, 329] == pytest.approx(white_e_s * pixels / 400, rel=1e-3)
     rows = np.flatnonzero(glow[:, 329] > 0)
     assert len(rows) == 493  # 11.1 of 12.3 deg
     tilted = changes | {"motion.start": "{roll_deg: 4, pitch_deg: 0, yaw_deg: 0}"}
-    seen = np.sum(glow_e_s(testbed.build_testbed(loader.load("bench_collimated", tilted)))[:, 329] > 0)
+    seen = np.sum(glow_e_s(build_testbed(loader.load("collimated_display", tilted)))[:, 329] > 0)
     half_deg = np.degrees(np.arctan(600 * 8.1e-6 / 45e-3))
     wanted = 246.5 + camera.focal_px * np.tan(np.radians(half_deg - 4))
     assert seen == pytest.approx(wanted, abs=1)
@@ -397,8 +396,8 @@ def test_a_black_bench_s_glow_is_that_of_its_pixels_in_the_chip_s() -> None:
 def test_the_glow_is_on_the_frame_and_nothing_glows_without_a_contrast() -> None:
     """A noise-free frame with it less one without is the glow by the exposure, but for what is taken off the stars."""
     silent = {"camera.detector.noise": "false"}
-    plain = testbed.build_testbed(loader.load("bench_collimated", silent))
-    glowing = testbed.build_testbed(loader.load("bench_collimated", silent | {"light.contrast": "200"}))
+    plain = build_testbed(loader.load("collimated_display", silent))
+    glowing = build_testbed(loader.load("collimated_display", silent | {"light.contrast": "200"}))
     more = exposure.render_frame(glowing, 0)[0].image_dn - exposure.render_frame(plain, 0)[0].image_dn
     gain, time_s = plain.scene.camera.detector.gain_e_dn, plain.scene.exposure.time_s
     wanted = np.median(glow_e_s(glowing)) * time_s / gain
@@ -417,24 +416,30 @@ def test_the_glow_is_on_the_frame_and_nothing_glows_without_a_contrast() -> None
 @pytest.mark.parametrize(
     ("overrides", "says"),
     [
-        ({"light.surface": "{kind: sphere, apex: 1.4 m, radius: 1.4 m}"}, "an lcd is no sphere"),
+        (
+            {"light.surface": "{kind: sphere, apex: 1.4 m, radius: 1.4 m}"},
+            "lcd does not fit a surface of kind sphere",
+        ),
         (
             {"light.led.drive": "{kind: pwm}"},
-            "light: led.drive: pwm dims no pixel; allowed for an lcd: direct",
+            "light: led.drive: pwm cannot drive an lcd; allowed: direct",
         ),
         ({"light.led.drive.duty": "0"}, "light.led.drive.duty: 0 is not allowed"),
-        ({"light.layout.block": "2000"}, "block 2000 is wider than the display; allowed: to 1050 pixels"),
-        ({"light.layout.grey_levels": "1"}, "light.layout.grey_levels: 1 is not allowed"),
-        ({"light.layout.points.kind": "patch_boards"}, "light.layout.points.kind: 'patch_boards' is none of"),
+        ({"light.layout.block": "2000"}, "block 2000 is wider than the display; allowed: up to 1050 pixels"),
+        ({"light.layout.gray_levels": "1"}, "light.layout.gray_levels: 1 is not allowed"),
+        (
+            {"light.layout.points.kind": "patch_boards"},
+            "points.kind: unknown kind 'patch_boards'; allowed:",
+        ),
         ({"light.layout.points.cap_deg": "0"}, "light.layout.points.cap_deg: 0 is not allowed"),
         (
             {"light.surface.width": "0.4 m"},
-            "light.layout.pixels: take 0.4334 m by 0.2709 m; allowed: the surface",
+            "light.layout.pixels: need 0.4334 m by 0.2709 m; allowed: the surface",
         ),
-        ({"light.layout.pitch": "0.1 mm"}, "light.layout: the surface ends within it"),
+        ({"light.layout.pitch": "0.1 mm"}, "light.layout: exceeds the surface"),
         (
-            {"light.layout.points.levels": "[1, 1, 1, 1, 1, 1, 1, 1, 0.01]", "light.layout.grey_levels": "4"},
-            "a star of level 0.01 is black on 4 grey levels; allowed: 0.019 or more",
+            {"light.layout.points.levels": "[1, 1, 1, 1, 1, 1, 1, 1, 0.01]", "light.layout.gray_levels": "4"},
+            "a star of level 0.01 is black on 4 gray levels; allowed: 0.019 or more",
         ),
     ],
 )
@@ -445,22 +450,26 @@ def test_a_wrong_panel_is_told_in_one_line(overrides: dict[str, str], says: str)
 @pytest.mark.parametrize(
     ("name", "overrides", "says"),
     [
-        ("apl_dome", {"light.led.drive": "{kind: refresh, rate_hz: 60}"}, "fibres has no rows"),
+        (
+            "apl_dome",
+            {"light.led.drive": "{kind: refresh, rate_hz: 60}"},
+            "refresh requires a layout of kind lcd",
+        ),
         (
             "apl_dome",
             {"light.layout.radius_variation": "4"},
             "light.layout.radius_variation: 4 is not allowed",
         ),
         (
-            "bench_collimated",
+            "collimated_display",
             {"light.limit_mag": "-2"},
-            "light.limit_mag: no star on the display is so bright",
+            "light.limit_mag: no star to -2 mag on the display",
         ),
-        ("bench_collimated", {"light.grey_levels": "8"}, "are black on 8 grey levels; allowed: to 6.3"),
-        ("bench_collimated", {"light.catalogue": "gaia"}, "light.catalogue: 'gaia' is none of"),
-        ("bench_collimated", {"light.conjugate": "1 m"}, "light.conjugate: '1 m' is not allowed"),
+        ("collimated_display", {"light.gray_levels": "8"}, "are black on 8 gray levels; allowed: to 6.3"),
+        ("collimated_display", {"light.catalog": "gaia"}, "light.catalog: unknown catalog 'gaia'; allowed:"),
+        ("collimated_display", {"light.conjugate": "1 m"}, "light.conjugate: '1 m' is not allowed"),
         (
-            "bench_collimated",
+            "collimated_display",
             {"motion.start": "{ra_deg: 0, dec_deg: 0, roll_deg: 0}"},
             "motion.start: light of kind",
         ),
@@ -472,6 +481,6 @@ def test_a_wrong_display_is_told_in_one_line(name: str, overrides: dict[str, str
 
 def assert_refused(name: str, overrides: dict[str, str], says: str) -> None:
     with pytest.raises(InputError) as caught:
-        testbed.light_sources(loader.load(name, overrides), BAND)
+        light_sources(loader.load(name, overrides), BAND)
     assert says in str(caught.value)
     assert "\n" not in str(caught.value)

@@ -22,8 +22,8 @@ INCH_M = 0.0254
 MEASURED = {"kind": "ellipsoid", "apex": "48 in", "semi_axes": ["38.88 in", "38.88 in", "28.60 in"]}
 SPHERE = {"kind": "sphere", "apex": "48 in", "radius": "45 in", "offset": ["1 in", "-2 in", "0.5 in"]}
 BOARDS = {"kind": "patch_boards", "cap_deg": 27, "spacing": "2.6 in", "pitch": "8 mm", "lit": [3, 6]}
-LED = {"intensity": "16 mcd", "disc_diameter": "2 mm", "pwm_period": "1 ms"}
-BAND = Band.of("cmos")
+LED = {"intensity": "16 mcd", "disk_diameter": "2 mm", "pwm_period": "1 ms"}
+BAND = Band.from_efficiency("cmos")
 
 
 def surface(part: dict[str, Any]) -> Any:
@@ -51,7 +51,7 @@ def upward_rays(count: int, seed: int) -> np.ndarray:
 def test_rays_meet_the_surface_on_its_equation_and_on_themselves(part: dict, origin_in: tuple) -> None:
     made, rays, origin = surface(part), upward_rays(200, 1), INCH_M * np.array(origin_in, float)
     met = made.meet(origin, rays)
-    quadric = np.sum(((met - made.centre_m) / made.semi_axes_m) ** 2, axis=1)
+    quadric = np.sum(((met - made.center_m) / made.semi_axes_m) ** 2, axis=1)
     np.testing.assert_allclose(quadric, 1, rtol=0, atol=1e-13)  # rounding of a root
     along = met - origin
     assert np.all(np.einsum("nj,nj->n", along, rays) > 0)
@@ -72,7 +72,7 @@ def test_measured_dome_at_the_rim_height_has_the_reference_s_radius() -> None:
     # Reference A4: rim at z = 36.66 in, 48.011 in from the bearing.
     made = surface(MEASURED)
     z = 36.66 * INCH_M
-    half_width = made.semi_axes_m[0] * np.sqrt(1 - ((z - made.centre_m[2]) / made.semi_axes_m[2]) ** 2)
+    half_width = made.semi_axes_m[0] * np.sqrt(1 - ((z - made.center_m[2]) / made.semi_axes_m[2]) ** 2)
     met = made.meet(np.zeros(3), np.array([[half_width, 0, z]]))
     assert np.linalg.norm(met) / INCH_M == pytest.approx(48.011, abs=0.01)
 
@@ -95,7 +95,7 @@ def test_the_apex_is_where_it_is_declared(part: dict) -> None:
 
 @pytest.mark.parametrize("part", [MEASURED, SPHERE])
 def test_normals_are_perpendicular_and_point_inside(part: dict) -> None:
-    """Against chords between neighbouring points of the surface, found by rays alone."""
+    """Against chords between neighboring points of the surface, found by rays alone."""
     made, rays = surface(part), upward_rays(60, 3)
     here = made.meet(np.zeros(3), rays)
     normal = made.inward(here)
@@ -104,7 +104,7 @@ def test_normals_are_perpendicular_and_point_inside(part: dict) -> None:
         chord = made.meet(np.zeros(3), rays + 1e-5 * axis) - made.meet(np.zeros(3), rays - 1e-5 * axis)
         # A symmetric chord is off the tangent by the third power of its length only.
         assert np.abs(np.einsum("nj,nj->n", chord, normal)).max() < 1e-13
-    assert np.all(np.einsum("nj,nj->n", normal, made.centre_m - here) > 0)
+    assert np.all(np.einsum("nj,nj->n", normal, made.center_m - here) > 0)
 
 
 def test_a_flat_panel_is_flat_and_shines_down() -> None:
@@ -140,7 +140,7 @@ def board_of(leds: Sources) -> np.ndarray:
     return leds.id // 9
 
 
-def test_neighbours_on_a_board_are_a_pitch_apart(afit: Sources) -> None:
+def test_neighbors_on_a_board_are_a_pitch_apart(afit: Sources) -> None:
     """Holes r and c rows and columns apart are hypot(r, c) pitches apart, for every pair on every board."""
     board, hole = board_of(afit), afit.id % 9
     first, second = np.nonzero(np.triu(board[:, None] == board[None, :], 1))
@@ -154,7 +154,7 @@ def test_boards_are_flat_tangent_and_touch_the_surface_at_their_middle(afit: Sou
     made, holes = surface(MEASURED), afit.id % 9
     middle = afit.take(holes == 4)
     assert len(middle) > 50
-    quadric = np.sum(((middle.place[:, :3] - made.centre_m) / made.semi_axes_m) ** 2, axis=1)
+    quadric = np.sum(((middle.place[:, :3] - made.center_m) / made.semi_axes_m) ** 2, axis=1)
     np.testing.assert_allclose(quadric, 1, rtol=0, atol=1e-13)
     np.testing.assert_allclose(middle.normal, made.inward(middle.place[:, :3]), rtol=0, atol=1e-14)
     height = np.einsum("nj,nj->n", afit.place[:, :3], afit.normal)
@@ -239,7 +239,7 @@ def test_without_scatter_all_leds_are_equal() -> None:
     np.testing.assert_array_equal(logs(lit_dome()), 0)
 
 
-def test_neighbours_scatter_on_their_own() -> None:
+def test_neighbors_scatter_on_their_own() -> None:
     drawn = logs(lit_dome(led=LED | {"scatter": 0.08}, lit=[9, 9], spacing="1.5 in")) / 0.08
     assert abs(np.mean(drawn[1:] * drawn[:-1])) < 4 / np.sqrt(len(drawn))
 
@@ -293,7 +293,7 @@ def test_table_2_is_a_board_of_nine_per_cent_and_not_of_three_or_thirty() -> Non
 
 def test_strength_is_in_the_chip_s_own_electrons() -> None:
     light = {"kind": "dome", "surface": MEASURED, "layout": BOARDS, "led": LED | {"spectrum": "640 nm"}}
-    red = dome.sources(DomeConfig.model_validate(light), Band.of(0.5)).strength
+    red = dome.sources(DomeConfig.model_validate(light), Band.from_efficiency(0.5)).strength
     # By hand: 16 mcd of V(640 nm) = .175 in photons of 3.1038e-19 J, half of them electrons.
     np.testing.assert_allclose(red, 0.016 / (683 * 0.175) / 3.1038e-19 * 0.5, rtol=1e-4, atol=0)
 

@@ -26,7 +26,7 @@ INCH_M = 0.0254
 MEASURED = {"kind": "ellipsoid", "apex": "48 in", "semi_axes": ["38.88 in", "38.88 in", "28.60 in"]}
 SPHERE = {"kind": "sphere", "apex": "48 in", "radius": "48 in"}
 FLAT = {"kind": "flat", "apex": "48 in"}
-LED = {"intensity": "16 mcd", "disc_diameter": "2 mm"}
+LED = {"intensity": "16 mcd", "disk_diameter": "2 mm"}
 BOARDS = {"kind": "patch_boards", "cap_deg": 27, "spacing": "2.6 in", "pitch": "8 mm", "lit": [9, 9]}
 SKY = {
     "kind": "celestial",
@@ -38,11 +38,11 @@ SKY = {
     "epoch": "2012-03-01T12:00:00",
     "brightness": "v",
 }
-BAND = Band.of("cmos")
+BAND = Band.from_efficiency("cmos")
 SPREADS = [
     {"kind": "fibonacci", "count": 1400},
     {"kind": "random", "count": 1400},
-    {"kind": "poisson_disc", "spacing": "1.3 in"},
+    {"kind": "poisson_disk", "spacing": "1.3 in"},
 ]
 
 
@@ -78,9 +78,7 @@ def unit(vectors: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("surface", [SPHERE, MEASURED, FLAT])
 @pytest.mark.parametrize("layout", SPREADS, ids=lambda part: part["kind"])
-def test_every_led_is_on_the_surface_faces_along_its_normal_and_is_within_the_cap(
-    layout: dict, surface: dict
-) -> None:
+def test_every_led_is_on_the_surface_faces_along_its_normal_and_is_within_the_cap(layout: dict, surface: dict) -> None:
     leds, made = lit(layout, surface), inside(surface)
     place = leds.place[:, :3]
     np.testing.assert_allclose(made.meet(np.zeros(3), unit(place)), place, rtol=0, atol=1e-14)
@@ -100,24 +98,24 @@ def test_fibonacci_has_its_share_in_every_cap() -> None:
 
 
 @pytest.mark.parametrize("surface", [SPHERE, MEASURED, FLAT])
-def test_poisson_disc_leaves_none_too_near_and_no_room(surface: dict) -> None:
+def test_poisson_disk_leaves_none_too_near_and_no_room(surface: dict) -> None:
     """No pair nearer than the spacing; and no place, but one in a thousand, has every LED farther than that."""
-    leds = lit({"kind": "poisson_disc", "spacing": "1.3 in"}, surface)
+    leds = lit({"kind": "poisson_disk", "spacing": "1.3 in"}, surface)
     tree = cKDTree(leds.place[:, :3])
     assert tree.query(leds.place[:, :3], k=2)[0][:, 1].min() > 1.3 * INCH_M
     somewhere = lit({"kind": "random", "count": 20_000, "hardware_seed": 77}, surface)
     assert np.mean(tree.query(somewhere.place[:, :3])[0] > 1.3 * INCH_M) < 1e-3
 
 
-def test_poisson_disc_covers_as_random_sequential_adsorption_does(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Discs of the spacing's diameter jam at a cover of .547, which t darts miss by some c / sqrt(t) (Feder's law).
+def test_poisson_disk_covers_as_random_sequential_adsorption_does(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Disks of the spacing's diameter jam at a cover of .547, which t darts miss by some c / sqrt(t) (Feder's law).
 
     So the jam is at twice the cover by 4 t darts less that by t. Away from the rim, which has more of them.
     """
     cover = []
     for tries in (25, 100):
-        monkeypatch.setattr(layout, "TRIES", tries)
-        domes = [lit({"kind": "poisson_disc", "spacing": "1.3 in", "hardware_seed": s}) for s in range(3)]
+        monkeypatch.setattr(layout, "DARTS_PER_SPACING2", tries)
+        domes = [lit({"kind": "poisson_disk", "spacing": "1.3 in", "hardware_seed": s}) for s in range(3)]
         inner = np.mean([np.sum(unit(leds.place[:, :3])[:, 2] > np.cos(np.radians(37))) for leds in domes])
         cover.append(inner * 0.65**2 / (2 * 48**2 * (1 - np.cos(np.radians(37)))))
     assert cover[0] < cover[1]
@@ -126,7 +124,7 @@ def test_poisson_disc_covers_as_random_sequential_adsorption_does(monkeypatch: p
 
 
 def test_random_leds_are_a_poisson_field() -> None:
-    """Nearest neighbours of density n are .5 / sqrt(n) away, sd .2614 / sqrt(n); tenths of the area hold a tenth."""
+    """Nearest neighbors of density n are .5 / sqrt(n) away, sd .2614 / sqrt(n); tenths of the area hold a tenth."""
     leds = lit({"kind": "random", "count": 4000, "hardware_seed": 3})
     place_in = leds.place[:, :3] / INCH_M
     tilt_deg = np.degrees(np.arccos(unit(place_in)[:, 2]))
@@ -141,7 +139,7 @@ def test_random_leds_are_a_poisson_field() -> None:
 
 # 1,000 attitudes: an even dome's own error is that of its LEDs at the field's border, a random one's of the .53 of
 # 1,400 LEDs that tilts to 25 deg look at, 2.5 % conditioned on all: three of either.
-# Poisson-disc's LEDs stand denser along the rim, as if the cap were wider by half of their spacing.
+# Poisson-disk's LEDs stand denser along the rim, as if the cap were wider by half of their spacing.
 @pytest.mark.parametrize(
     ("layout", "rim_in", "within"), [(SPREADS[0], 0, 0.02), (SPREADS[1], 0, 0.08), (SPREADS[2], 0.65, 0.03)]
 )
@@ -200,9 +198,7 @@ def test_boards_on_a_grid_have_equal_areas_and_straight_rows() -> None:
     row = made[np.abs(made[:, 1]) < 1e-12]
     # Equal steps of 2 sin(t / 2) along the row through the zenith.
     out = np.sort(np.sign(row[:, 0]) * 2 * np.sin(np.arccos(np.clip(row[:, 2], -1, 1)) / 2))
-    np.testing.assert_allclose(
-        np.diff(out), 0.04, rtol=0, atol=1e-9
-    )  # the arc cosine's rounding at the zenith
+    np.testing.assert_allclose(np.diff(out), 0.04, rtol=0, atol=1e-9)  # the arc cosine's rounding at the zenith
     np.testing.assert_allclose(np.linalg.norm(made, axis=1), 1, rtol=0, atol=1e-15)
 
 
@@ -210,7 +206,7 @@ def test_grid_boards_lie_along_their_rows() -> None:
     leds = lit(GRID_BOARDS)
     place = leds.place[np.argsort(leds.id), :3].reshape(-1, layout.HOLES, 3)
     step_m = place[:, 1] - place[:, 0]
-    # Holes 0 and 1 are neighbours along the board's first axis, which has no part along the lab's x.
+    # Holes 0 and 1 are neighbors along the board's first axis, which has no part along the lab's x.
     np.testing.assert_allclose(np.linalg.norm(step_m, axis=1), 0.008, rtol=0, atol=1e-15)
     np.testing.assert_allclose(step_m[:, 0], 0, rtol=0, atol=1e-15)
 
@@ -232,7 +228,7 @@ def test_boards_stand_where_the_list_says_with_their_leds_and_levels() -> None:
 
 def test_a_listed_board_turns_about_its_normal() -> None:
     where = {"azimuth_deg": 75, "tilt_deg": 18, "leds": list(range(9))}
-    flat, turned = listed_boards(where), listed_boards(where | {"turn_deg": 35})
+    flat, turned = listed_boards(where), listed_boards(where | {"rotation_deg": 35})
     middle = flat.place[4, :3]
     about = Rotation.from_rotvec(np.radians(35) * flat.normal[0])
     expected = about.apply(flat.place[:, :3] - middle) + middle
@@ -304,10 +300,8 @@ def test_from_its_nominal_place_the_camera_sees_the_stars_where_they_are(surface
     leds = lit(SKY | {"count": 60}, surface)
     stars = catalog.read("hipparcos_hp6.5")
     stars = stars.take(np.array([np.flatnonzero(stars.hip == hip)[0] for hip in leds.id]))
-    part = DomeConfig.model_validate(
-        {"kind": "dome", "surface": surface, "layout": SKY | {"count": 60}, "led": LED}
-    )
-    x, y, z = star_sources.apparent(stars, part.layout.epoch).T
+    config = DomeConfig.model_validate({"kind": "dome", "surface": surface, "layout": SKY | {"count": 60}, "led": LED})
+    x, y, z = star_sources.apparent(stars, config.layout.epoch).T
     ra, dec, zenith = np.arctan2(y, x) - np.radians(84), np.arcsin(z), np.radians(5)
     cosine = np.sin(dec) * np.sin(zenith) + np.cos(dec) * np.cos(zenith) * np.cos(ra)
     east, north = (
@@ -361,8 +355,8 @@ def test_count_and_limit_choose_the_brightest_that_are_on_the_dome() -> None:
     assert {27989, 24436, 25336, 25930, 26311, 26727} <= set(to_limit.id)
 
 
-def test_a_millimetre_off_the_nominal_place_costs_what_the_apl_dome_says() -> None:
-    """Reference 5: on a sphere of 4 ft a camera 1 mm off its centre is wrong by 169 arcsec, d/R sin of the angle."""
+def test_a_millimeter_off_the_nominal_place_costs_what_the_apl_dome_says() -> None:
+    """Reference 5: on a sphere of 4 ft a camera 1 mm off its center is wrong by 169 arcsec, d/R sin of the angle."""
     dome_4ft = {"kind": "sphere", "apex": "4 ft", "radius": "4 ft"}
     leds = lit(SKY | {"limit_mag": 6.0, "cap_deg": 80, "camera": ["0 m", "0 m", "0 m"]}, dome_4ft)
     moved = unit(leds.place[:, :3] - np.array([1e-3, 0, 0]))
@@ -377,9 +371,7 @@ def test_a_millimetre_off_the_nominal_place_costs_what_the_apl_dome_says() -> No
 
 def test_listed_directions_are_on_the_surface_and_positions_as_they_are() -> None:
     leds = lit({"kind": "listed", "directions_deg": [[0, 0], [90, 30]], "levels": [1.0, 0.3]}, MEASURED)
-    np.testing.assert_allclose(
-        unit(leds.place[:, :3]), [[0, 0, 1], [0, 0.5, np.sqrt(0.75)]], rtol=0, atol=1e-15
-    )
+    np.testing.assert_allclose(unit(leds.place[:, :3]), [[0, 0, 1], [0, 0.5, np.sqrt(0.75)]], rtol=0, atol=1e-15)
     np.testing.assert_allclose(leds.place[0, 2], 48 * INCH_M, rtol=0, atol=1e-15)
     np.testing.assert_allclose(leds.on_s, [1e-3, 0.3e-3], rtol=1e-15, atol=0)
     places = [["0.1 m", "0.2 m", "1.2 m"], ["0 m", "0 m", "47.5 in"]]
@@ -405,15 +397,15 @@ def test_a_file_says_what_a_list_says(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        ("x_m,y_m\n1,2\n", "is no list of LEDs; allowed: columns x_m, y_m, z_m or azimuth_deg, tilt_deg"),
-        ("azimuth_deg,tilt_deg\n", "is no list of LEDs"),
-        ("", "is no list of LEDs"),
-        ("azimuth_deg,tilt_deg\n0,0\n# half\n1\n", ", line 4: '1' is no LED; allowed: 2 numbers"),
-        ("azimuth_deg,tilt_deg,level\n0,0,1.5\n", ", line 2: '0,0,1.5' is no LED"),
-        ("azimuth_deg,tilt_deg,level\n0,nan,1\n", ", line 2: '0,nan,1' is no LED"),
-        ("azimuth_deg,tilt_deg\n0,0\n10,50\n", ".1: is 50 deg from the zenith"),
-        ("x_m,y_m,z_m\n0,0,48\n", ".0: is 46.8 m off the surface; allowed: 0.05 m"),
-        ("x_m,y_m,z_m\n0,0,0\n", ".0: is 0 deg from the zenith"),
+        ("x_m,y_m\n1,2\n", "not a list of LEDs; allowed: columns x_m, y_m, z_m or azimuth_deg, tilt_deg"),
+        ("azimuth_deg,tilt_deg\n", "not a list of LEDs"),
+        ("", "not a list of LEDs"),
+        ("azimuth_deg,tilt_deg\n0,0\n# half\n1\n", ", line 4: '1' is not an LED; allowed: 2 numbers"),
+        ("azimuth_deg,tilt_deg,level\n0,0,1.5\n", ", line 2: '0,0,1.5' is not an LED"),
+        ("azimuth_deg,tilt_deg,level\n0,nan,1\n", ", line 2: '0,nan,1' is not an LED"),
+        ("azimuth_deg,tilt_deg\n0,0\n10,50\n", ".1: 50 deg from the zenith"),
+        ("x_m,y_m,z_m\n0,0,48\n", ".0: 46.8 m from the surface; allowed: 0.05 m"),
+        ("x_m,y_m,z_m\n0,0,0\n", ".0: 0 deg from the zenith"),
     ],
 )
 def test_a_bad_file_is_told_in_one_line(tmp_path: Path, text: str, says: str) -> None:
@@ -435,7 +427,7 @@ def test_a_bad_file_is_told_in_one_line(tmp_path: Path, text: str, says: str) ->
     [
         (
             "{kind: spiral}",
-            "light.layout.kind: 'spiral' is none of patch_boards, fibonacci, poisson_disc, random,",
+            "light.layout.kind: unknown kind 'spiral'; allowed: patch_boards, fibonacci, poisson_disk, random,",
         ),
         ("{kind: fibonacci, cap_deg: 30}", "light.layout.count: missing"),
         ("{kind: fibonacci, cap_deg: 30, count: 0}", "light.layout.count: 0 is not allowed"),
@@ -449,13 +441,13 @@ def test_a_bad_file_is_told_in_one_line(tmp_path: Path, text: str, says: str) ->
             "either levels or magnitudes",
         ),
         (
-            "{kind: poisson_disc, cap_deg: 30, spacing: 1 um}",
-            "light.layout.spacing: 1e-06 m makes too many LEDs",
+            "{kind: poisson_disk, cap_deg: 30, spacing: 1 um}",
+            "light.layout.spacing: 1e-06 m gives too many LEDs",
         ),
         ("{kind: patch_boards, cap_deg: 30, pitch: 8 mm}", "patch_boards takes spacing, or boards by list"),
         (
             "{kind: patch_boards, cap_deg: 30, pitch: 8 mm, boards: [{azimuth_deg: 0, tilt_deg: 0, leds: [1, 1]}]}",
-            "light.layout.boards.0: leds: [1, 1] has a hole twice",
+            "light.layout.boards.0: leds: [1, 1] has a duplicate hole",
         ),
         (
             "{kind: patch_boards, cap_deg: 30, pitch: 8 mm, boards: [{azimuth_deg: 0, tilt_deg: 0, leds: [9]}]}",
@@ -473,18 +465,18 @@ def test_a_bad_file_is_told_in_one_line(tmp_path: Path, text: str, says: str) ->
         ),
         (
             "{kind: patch_boards, cap_deg: 30, pitch: 8 mm, boards: [{azimuth_deg: 0, tilt_deg: 31, leds: [1]}]}",
-            "light.layout.boards.0: is 31 deg from the zenith",
+            "light.layout.boards.0: 31 deg from the zenith",
         ),
         ("{kind: listed, cap_deg: 30}", "listed takes one of positions, directions_deg, file"),
         (
             "{kind: listed, cap_deg: 30, directions_deg: [[0, 1]], levels: [1, 1]}",
             "1 LEDs, but 2 levels or magnitudes",
         ),
-        ("{kind: listed, cap_deg: 30, file: x.csv, levels: [1]}", "of a file are its own columns"),
+        ("{kind: listed, cap_deg: 30, file: x.csv, levels: [1]}", "of a file belong in its columns"),
         ("{kind: listed, cap_deg: 30, file: nowhere.csv}", "light.layout.file: nowhere.csv cannot be read"),
         (
             "{kind: listed, cap_deg: 30, directions_deg: [[0, 1], [5, 40]]}",
-            "light.layout.directions_deg.1: is 40 deg from the zenith",
+            "light.layout.directions_deg.1: 40 deg from the zenith",
         ),
     ],
 )
@@ -497,13 +489,13 @@ def test_a_wrong_layout_is_told_in_one_line(layout: str, says: str) -> None:
     [
         ("", "celestial takes either count or limit_mag"),
         ("count: 5, limit_mag: 3", "celestial takes either count or limit_mag"),
-        ("limit_mag: -2", "light.layout.limit_mag: no star on the dome is so bright"),
-        ("count: 90000", "light.layout.count: 90000 stars, where the catalogue has "),
-        ("count: 5, catalogue: gaia", "light.layout.catalogue: 'gaia' is none of hipparcos_hp6.5"),
-        ("count: 5, epoch: 1700-01-01T00:00:00", "epoch: 1700-01-01T00:00:00 is outside of 1900 to 2100"),
+        ("limit_mag: -2", "light.layout.limit_mag: no star to -2 mag on the dome"),
+        ("count: 90000", "light.layout.count: 90000 LEDs, but the catalog gives "),
+        ("count: 5, catalog: gaia", "light.layout.catalog: unknown catalog 'gaia'; allowed: hipparcos_hp6.5"),
+        ("count: 5, epoch: 1700-01-01T00:00:00", "epoch: 1700-01-01T00:00:00 is outside 1900 to 2100"),
         (
             "count: 5, camera: [0 m, 0 m, 2 m]",
-            "light.layout.camera: 2 m from the bearing's centre is outside",
+            "light.layout.camera: 2 m from the bearing's center, outside",
         ),
     ],
 )
@@ -521,9 +513,9 @@ def assert_refused(overrides: dict[str, str], says: str) -> None:
 
 
 def test_boards_can_be_told_apart_where_there_are_any() -> None:
-    part = loader.load("afit_simsat").light
-    leds = dome.sources(part, BAND)
-    boards = layout.board_of(part.layout, leds.id)
+    config = loader.load("afit_simsat").light
+    leds = dome.sources(config, BAND)
+    boards = layout.board_of(config.layout, leds.id)
     assert boards is not None
     middle = np.array([leds.place[boards == b, :3].mean(axis=0) for b in np.unique(boards)])
     assert np.linalg.norm(middle[boards] - leds.place[:, :3], axis=1).max() < 0.0227  # corner to corner
@@ -535,14 +527,10 @@ def test_boards_can_be_told_apart_where_there_are_any() -> None:
 
 
 def test_direct_current_never_goes_out_and_dims_in_strength() -> None:
-    leds = lit(
-        {"kind": "listed", "directions_deg": [[0, 1], [0, 2]], "levels": [1.0, 0.2]}, drive={"kind": "direct"}
-    )
+    leds = lit({"kind": "listed", "directions_deg": [[0, 1], [0, 2]], "levels": [1.0, 0.2]}, drive={"kind": "direct"})
     assert np.all(leds.on_s >= leds.period_s)
     np.testing.assert_allclose(leds.strength, np.array([1, 0.2]) * full_e_s_sr(), rtol=1e-15, atol=0)
-    assert lit_moments_s(0.3, 0.30001, leds.period_s[1], leds.start_s[1], leds.on_s[1])[0] == pytest.approx(
-        1e-5
-    )
+    assert lit_moments_s(0.3, 0.30001, leds.period_s[1], leds.start_s[1], leds.on_s[1])[0] == pytest.approx(1e-5)
 
 
 def light_s(leds: Sources, which: int, begin_s: float, length_s: float) -> float:
@@ -597,11 +585,10 @@ def test_a_layout_without_boards_needs_to_be_told_its_controllers() -> None:
         "light.layout": "{kind: fibonacci, cap_deg: 30, count: 9}",
         "light.led.drive": "{kind: sequential}",
     }
+    assert_refused(spread, "light: led.drive.controller: fibonacci has no boards; allowed: dome, or a number of LEDs")
     assert_refused(
-        spread, "light: led.drive.controller: fibonacci has no boards; allowed: dome, or a number of LEDs"
-    )
-    assert_refused(
-        {"light.led.drive": "{kind: fm}"}, "light.led.drive.kind: 'fm' is none of direct, pwm, sequential"
+        {"light.led.drive": "{kind: fm}"},
+        "light.led.drive.kind: unknown kind 'fm'; allowed: direct, pwm, sequential",
     )
     assert_refused({"light.led.drive": "{kind: sequential, slot: 1}"}, "light.led.drive.slot: 1 has no unit")
 
@@ -656,8 +643,6 @@ def test_table_7_s_levels_come_in_its_order_and_in_proportion_to_their_time() ->
     leds = lit(sequential(5, levels=levels), drive={"kind": "sequential"})
     ours = np.array([light_s(leds, which, 0.0123, 40e-3) for which in range(5)])
     np.testing.assert_array_equal(np.argsort(-ours), np.argsort(-np.array(list(TABLE_7.values()))))
-    np.testing.assert_allclose(
-        ours, 8e-6 * np.array(list(TABLE_7)), rtol=1e-9, atol=0
-    )  # eight cycles of 5 ms
+    np.testing.assert_allclose(ours, 8e-6 * np.array(list(TABLE_7)), rtol=1e-9, atol=0)  # eight cycles of 5 ms
     slopes = np.array([TABLE_7[on_us] / ours[n] for n, on_us in enumerate(TABLE_7) if 200 <= on_us <= 500])
     np.testing.assert_allclose(slopes / slopes.mean(), 1, rtol=0, atol=0.05)

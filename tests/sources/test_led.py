@@ -15,9 +15,7 @@ ONE = np.ones(1)
 LAMBERT = Emitter()
 
 
-def irradiance(
-    cos_out: float = 1.0, cos_in: float = 1.0, distance_m: float = 1.0, emitter: Emitter = LAMBERT
-) -> float:
+def irradiance(cos_out: float = 1.0, cos_in: float = 1.0, distance_m: float = 1.0, emitter: Emitter = LAMBERT) -> float:
     return float(irradiance_e_s_m2(5e12 * ONE, emitter, cos_out * ONE, cos_in * ONE, distance_m * ONE)[0])
 
 
@@ -30,15 +28,13 @@ def measured(angle_deg: list[float], intensity: list[float]) -> Emitter:
     return Emitter(lobe=LobeTableConfig.model_validate(table))
 
 
-def test_on_its_normal_at_a_metre_the_irradiance_is_the_strength() -> None:
+def test_on_its_normal_at_a_meter_the_irradiance_is_the_strength() -> None:
     assert irradiance() == pytest.approx(5e12, rel=1e-15)
 
 
 @pytest.mark.parametrize("distance_m", [0.1, 0.8382, 1.0, 3.0])
 def test_twice_as_far_is_a_quarter_as_bright(distance_m: float) -> None:
-    assert irradiance(distance_m=2 * distance_m) == pytest.approx(
-        irradiance(distance_m=distance_m) / 4, rel=1e-14
-    )
+    assert irradiance(distance_m=2 * distance_m) == pytest.approx(irradiance(distance_m=distance_m) / 4, rel=1e-14)
 
 
 def test_lambert_s_emitter_and_the_aperture_each_cost_a_cosine() -> None:
@@ -84,15 +80,13 @@ def test_a_measured_lobe_that_falls_falls_in_between(seed: int) -> None:
     assert made.max() <= intensity[0]
 
 
-@pytest.mark.parametrize(
-    ("cos_out", "cos_in"), [(-0.1, 1.0), (0.0, 1.0), (1.0, -0.1), (1.0, 0.0), (-0.5, -0.5)]
-)
+@pytest.mark.parametrize(("cos_out", "cos_in"), [(-0.1, 1.0), (0.0, 1.0), (1.0, -0.1), (1.0, 0.0), (-0.5, -0.5)])
 @pytest.mark.parametrize("emitter", [cosine(0.0), cosine(1.0), cosine(2.5), measured([0, 180], [1.0, 1.0])])
 def test_nothing_goes_backwards_or_comes_from_behind(cos_out: float, cos_in: float, emitter: Emitter) -> None:
     assert irradiance(cos_out, cos_in, emitter=emitter) == 0.0
 
 
-def test_a_lambertian_disc_sends_pi_times_its_strength_into_the_half_space() -> None:
+def test_a_lambertian_disk_sends_pi_times_its_strength_into_the_half_space() -> None:
     """Integrating I cos over the hemisphere gives pi I: Gauss-Legendre in the cosine, exact for a line."""
     node, weight = np.polynomial.legendre.leggauss(4)
     flat = np.ones(4)
@@ -101,10 +95,10 @@ def test_a_lambertian_disc_sends_pi_times_its_strength_into_the_half_space() -> 
 
 
 def test_a_scene_s_led_names_its_laws() -> None:
-    part = {"intensity": "16 mcd", "disc_diameter": "2 mm", "lobe": {"kind": "cosine", "exponent": 3}}
-    assert Emitter.of(LedConfig.model_validate(part)) == cosine(3.0)
+    part = {"intensity": "16 mcd", "disk_diameter": "2 mm", "lobe": {"kind": "cosine", "exponent": 3}}
+    assert Emitter.from_config(LedConfig.model_validate(part)) == cosine(3.0)
     del part["lobe"]
-    assert Emitter.of(LedConfig.model_validate(part)) == LAMBERT
+    assert Emitter.from_config(LedConfig.model_validate(part)) == LAMBERT
 
 
 def test_every_lobe_of_a_scene_is_known_here() -> None:
@@ -125,7 +119,7 @@ def test_every_falloff_falls() -> None:
 
 def test_reference_electrons_of_a_bright_led() -> None:
     # Reference §2: 0.6 cd at 33 in, 35 mm at f/8, T .85, QE .30: 3.1e7 electrons a millisecond.
-    strength = led_strength_e_s_sr(0.6, "white", Band.of(0.30))
+    strength = led_strength_e_s_sr(0.6, "white", Band.from_efficiency(0.30))
     at_camera = irradiance_e_s_m2(strength, LAMBERT, ONE, ONE, 33 * 0.0254 * ONE)
     pupil_m2 = np.pi / 4 * (0.035 / 8) ** 2
     assert float(at_camera[0] * pupil_m2 * 0.85 * 1e-3) == pytest.approx(3.1e7, rel=0.02)  # two digits

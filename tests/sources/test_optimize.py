@@ -1,6 +1,8 @@
-"""Optimised places against other layouts, at attitudes they were not made for; stars' LEDs in the chip's own band."""
+"""Optimized places against other layouts, at attitudes they were not made for; stars' LEDs in the chip's own band."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -19,11 +21,11 @@ from skysim.sources.dome.placement.ambiguity import field_ambiguity
 from skysim.sources.photometry import Band, star_flux_e_s_m2
 
 MEASURED = {"kind": "ellipsoid", "apex": "48 in", "semi_axes": ["38.88 in", "38.88 in", "28.60 in"]}
-LED = {"intensity": "16 mcd", "disc_diameter": "2 mm"}
-BAND = Band.of("cmos")
+LED = {"intensity": "16 mcd", "disk_diameter": "2 mm"}
+BAND = Band.from_efficiency("cmos")
 COUNT, TILT_DEG, CAP_DEG = 120, 8.0, 13.0
 WANTED = {
-    "kind": "optimised",
+    "kind": "optimized",
     "cap_deg": CAP_DEG,
     "count": COUNT,
     "tilt_deg": TILT_DEG,
@@ -41,8 +43,8 @@ def lit(layout: dict) -> Sources:
 
 
 def spread(kind: str, count: int, cap_deg: float) -> Sources:
-    """As many LEDs of another layout; poisson_disc fills the cap, and those too many are left out."""
-    if kind != "poisson_disc":
+    """As many LEDs of another layout; poisson_disk fills the cap, and those too many are left out."""
+    if kind != "poisson_disk":
         return lit({"kind": kind, "count": count, "cap_deg": cap_deg})
     spacing_m = 1.22 * np.sqrt(0.66 * 2 * np.pi * (1 - np.cos(np.radians(cap_deg))) / count)
     leds = lit({"kind": kind, "spacing": f"{spacing_m:.6f} m", "cap_deg": cap_deg})
@@ -61,9 +63,7 @@ def variances(place_m: Floats, tilt_deg: float = TILT_DEG, count: int = 2000) ->
     tilt = np.arccos(1 - rng.random(count) * (1 - np.cos(np.radians(tilt_deg))))
     turns = rng.uniform(0, 7, (2, count))
     out = []
-    for R_body_from_lab in Rotation.from_euler(
-        "ZYZ", np.column_stack([turns[0], tilt, turns[1]])
-    ).as_matrix():
+    for R_body_from_lab in Rotation.from_euler("ZYZ", np.column_stack([turns[0], tilt, turns[1]])).as_matrix():
         b = place_m @ R_body_from_lab.T
         x = (b[:, :2] / (b[:, 2:] - 0.381)) / np.tan(np.radians([5, 3.75]))
         b = b[np.all(np.abs(x) <= 1, axis=1)]
@@ -80,7 +80,7 @@ def variances(place_m: Floats, tilt_deg: float = TILT_DEG, count: int = 2000) ->
 def test_its_worst_attitudes_are_better_than_any_other_layout_s(best: Sources) -> None:
     """At 2,000 attitudes drawn apart from those it was made for: the worst, and the mean of the worst hundredth."""
     mine = variances(best.place[:, :3])
-    for kind in ("fibonacci", "random", "poisson_disc"):
+    for kind in ("fibonacci", "random", "poisson_disk"):
         other = variances(spread(kind, COUNT, CAP_DEG).place[:, :3])
         assert mine[-20:].mean() < 0.8 * other[-20:].mean()
         assert mine[-1] < 0.8 * other[-1]
@@ -89,15 +89,15 @@ def test_its_worst_attitudes_are_better_than_any_other_layout_s(best: Sources) -
 def sparse_is_not_worse(seed: int, **more: int) -> None:
     """Worst hundredth of 100,000 attitudes: the one in thousands that sees a single LED is not to be met by luck."""
     wanted = WANTED | SPARSE | {"hardware_seed": seed} | more
-    part = led_schema.OptimisedConfig.model_validate(wanted)
-    unseen = optimize.attitudes(part, 100_000, np.random.default_rng(77))
+    config = led_schema.OptimizedConfig.model_validate(wanted)
+    unseen = optimize.sample_attitudes(config, 100_000, np.random.default_rng(77))
 
     def worst(leds: Sources) -> float:
-        each = fisher.variances(fisher.total_information(leds.place[:, :3], unseen, *optimize.camera(part)))
+        each = fisher.variances(fisher.total_information(leds.place[:, :3], unseen, *optimize.camera_geometry(config)))
         return float(np.sort(each)[-1000:].mean())
 
     mine = worst(lit(wanted))
-    for kind in ("fibonacci", "poisson_disc"):
+    for kind in ("fibonacci", "poisson_disk"):
         assert mine <= worst(spread(kind, COUNT, 20.0))
 
 
@@ -113,7 +113,7 @@ def test_with_any_seed_it_is_not_worse(seed: int) -> None:
     sparse_is_not_worse(seed, rounds=100)
     shipped = {"count": 400, "tilt_deg": 20.0, "cap_deg": 25.0, "hardware_seed": seed, "rounds": 100}
     mine = variances(lit(WANTED | shipped).place[:, :3], 20.0, 5000)
-    for kind in ("fibonacci", "poisson_disc"):
+    for kind in ("fibonacci", "poisson_disk"):
         other = variances(spread(kind, 400, 25.0).place[:, :3], 20.0, 5000)
         assert mine[-50:].mean() <= 0.95 * other[-50:].mean()
 
@@ -123,14 +123,14 @@ def test_it_keeps_to_cap_surface_and_spacing(best: Sources) -> None:
     assert len(best) == COUNT
     assert np.degrees(np.arccos(place_m[:, 2] / np.linalg.norm(place_m, axis=1))).max() <= CAP_DEG + 1e-9
     assert cKDTree(place_m).query(place_m, k=2)[0][:, 1].min() >= 0.012
-    centre_in = np.array([0, 0, 48 - 28.60])
-    level = np.sum(((place_m / 0.0254 - centre_in) / [38.88, 38.88, 28.60]) ** 2, axis=1)
+    center_in = np.array([0, 0, 48 - 28.60])
+    level = np.sum(((place_m / 0.0254 - center_in) / [38.88, 38.88, 28.60]) ** 2, axis=1)
     np.testing.assert_allclose(level, 1, rtol=0, atol=1e-12)
 
 
 def test_the_seed_decides(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(optimize, "EXAMINED", 2000)
-    monkeypatch.setattr(optimize, "DRAWN", 1000)
+    quick = replace(optimize.OPTIONS, score_attitudes=2000, fresh_attitudes=1000)
+    monkeypatch.setattr(optimize, "OPTIONS", quick)
     few = WANTED | {"count": 20, "tilt_deg": 2, "rounds": 5}
     first, again, other = (lit(few | {"hardware_seed": seed}) for seed in (3, 3, 4))
     np.testing.assert_array_equal(first.place, again.place)
@@ -139,7 +139,7 @@ def test_the_seed_decides(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_its_information_is_the_estimator_s(best: Sources) -> None:
     """The same law in two pieces of code: sum J'J against the covariance of the exact solve at the truth, level."""
-    part, place_m = led_schema.OptimisedConfig.model_validate(WANTED), best.place[:, :3]
+    part, place_m = led_schema.OptimizedConfig.model_validate(WANTED), best.place[:, :3]
     judged = [np.eye(3)[None], np.array(part.camera_m), optimize.tan_half(part)]
     seen = fisher.Visibility(*fisher.visible_from(place_m, *judged))
     total = fisher.total_information(place_m, *judged)[0]
@@ -149,20 +149,18 @@ def test_its_information_is_the_estimator_s(best: Sources) -> None:
     lever = Lever(np.array(part.camera_m), Rotation.identity())
     leds = LedMap(np.arange(len(q)), q + part.camera_m, np.zeros(3), np.ones(3))
     _, covariance = rotation_only(rays, np.ones(len(q)), leds.position_m, leds, lever, Rotation.identity())
-    assert fisher.variance(total) == pytest.approx(np.trace(covariance), rel=1e-3)  # UNKNOWN's share
+    assert fisher.variance(total) == pytest.approx(np.trace(covariance), rel=1e-3)  # the prior's part
 
 
 def on_sphere(tilt_deg: Floats, azimuth_deg: Floats) -> Floats:
-    """(N, 3) on a dome of one metre."""
+    """(N, 3) on a dome of one meter."""
     angles = np.column_stack([azimuth_deg, tilt_deg, np.zeros(len(tilt_deg))])
     return Rotation.from_euler("ZYZ", angles, degrees=True).apply([0.0, 0.0, 1.0])
 
 
 def test_a_field_that_is_turned_about_the_bearing_is_wholly_alike_and_its_mirror_is_not() -> None:
     """Seven LEDs, and the same rigidly turned by 30 deg: share 1, LED on LED; two left out: 5 of 7."""
-    pattern = on_sphere(
-        np.array([0, 1.2, 2.1, 2.6, 3.1, 3.5, 3.8]), np.array([0, 20, 250, 110, 305, 170, 60])
-    )
+    pattern = on_sphere(np.array([0, 1.2, 2.1, 2.6, 3.1, 3.5, 3.8]), np.array([0, 20, 250, 110, 305, 170, 60]))
     turned = Rotation.from_euler("ZYZ", [40, 30, 75], degrees=True).apply(pattern)
     seen = (
         0.3,
@@ -171,39 +169,35 @@ def test_a_field_that_is_turned_about_the_bearing_is_wholly_alike_and_its_mirror
         1e-4,
     )  # each LED in the middle of its pattern has all others about it
     whole = field_ambiguity(np.concatenate([pattern, turned]), *seen)
-    assert whole.share[0] == 1
+    assert whole.fraction[0] == 1
     np.testing.assert_array_equal(whole.other[[0, 7]], [7, 0])
-    assert field_ambiguity(np.concatenate([pattern, turned[:5]]), *seen).share[0] == pytest.approx(
-        5 / 7, abs=1e-12
-    )
+    assert field_ambiguity(np.concatenate([pattern, turned[:5]]), *seen).fraction[0] == pytest.approx(5 / 7, abs=1e-12)
     mirrored = turned.copy() @ np.diag([1.0, -1.0, 1.0])
-    assert field_ambiguity(np.concatenate([pattern, mirrored]), *seen).share[0] < 0.5
+    assert field_ambiguity(np.concatenate([pattern, mirrored]), *seen).fraction[0] < 0.5
 
 
 def test_leds_that_are_off_by_more_than_the_tolerance_do_not_coincide() -> None:
     pattern = on_sphere(np.array([0, 1.2, 2.1, 2.6, 3.1, 3.5]), np.array([0, 20, 250, 110, 305, 170]))
     turned = Rotation.from_euler("ZYZ", [40, 30, 75], degrees=True).apply(pattern)
     turned[4] += [0.0, 2e-3, 0.0]
-    for alike_m, coincide in ((1e-4, 5), (3e-3, 6)):
-        found = field_ambiguity(
-            np.concatenate([pattern, turned]), 0.3, np.radians(60), np.radians(6), alike_m
-        )
-        assert found.share[0] == pytest.approx(coincide / 6, abs=1e-12)
+    for coincidence_m, coincide in ((1e-4, 5), (3e-3, 6)):
+        found = field_ambiguity(np.concatenate([pattern, turned]), 0.3, np.radians(60), np.radians(6), coincidence_m)
+        assert found.fraction[0] == pytest.approx(coincide / 6, abs=1e-12)
 
 
 def test_no_field_is_half_another_s_where_nearly_all_of_a_spiral_s_are_whole(best: Sources) -> None:
     """A Fibonacci spiral is itself again a step along: benchmarks/dome_identify.py refuses 89 frames of a hundred."""
-    part = led_schema.OptimisedConfig.model_validate(WANTED)
-    assert optimize.alike(part, best.place[:, :3]).share.max() <= 0.5
-    afit = led_schema.OptimisedConfig.model_validate(WANTED | {"tilt_deg": 30, "cap_deg": 40, "count": 1400})
-    spiral = optimize.alike(afit, spread("fibonacci", 1400, 40.0).place[:, :3])
-    assert np.mean(spiral.share > 0.8) > 0.85
-    darts = optimize.alike(afit, spread("poisson_disc", 1400, 40.0).place[:, :3])
-    assert np.mean(darts.share > 0.5) < 0.01  # these are identified
+    config = led_schema.OptimizedConfig.model_validate(WANTED)
+    assert optimize.layout_ambiguity(config, best.place[:, :3]).fraction.max() <= 0.5
+    afit = led_schema.OptimizedConfig.model_validate(WANTED | {"tilt_deg": 30, "cap_deg": 40, "count": 1400})
+    spiral = optimize.layout_ambiguity(afit, spread("fibonacci", 1400, 40.0).place[:, :3])
+    assert np.mean(spiral.fraction > 0.8) > 0.85
+    darts = optimize.layout_ambiguity(afit, spread("poisson_disk", 1400, 40.0).place[:, :3])
+    assert np.mean(darts.fraction > 0.5) < 0.01  # these are identified
 
 
 def test_too_many_for_their_spacing_are_refused() -> None:
-    with pytest.raises(InputError, match=r"light.layout.spacing: \d+ of 120 LEDs find room 0.2 m apart"):
+    with pytest.raises(InputError, match=r"light.layout.spacing: \d+ of 120 LEDs fit 0.2 m apart"):
         lit(WANTED | {"spacing": "200 mm"})
 
 
@@ -226,22 +220,22 @@ def test_an_led_is_as_bright_as_the_chip_finds_its_star() -> None:
     distance_m = np.linalg.norm(to_camera, axis=1)
     cosine = np.einsum("nj,nj->n", to_camera, leds.normal) / distance_m
     reaches = leds.strength * leds.on_s / leds.period_s * cosine / distance_m**2
-    stars = catalog.read(catalog.known_catalogue("light.layout.catalogue", "hipparcos_hp6.5"))
+    stars = catalog.read(catalog.require_catalog("light.layout.catalog", "hipparcos_hp6.5"))
     stars = stars.take(np.array([np.flatnonzero(stars.hip == hip)[0] for hip in leds.id]))
     alone = stars.v_mag == leds.magnitude
     assert 0 < np.sum(~alone) < 0.2 * len(leds)  # the others are doubles
     ratio = (reaches / star_flux_e_s_m2(stars.v_mag, stars.b_v, stars.v_i, BAND))[alone]
     np.testing.assert_allclose(ratio / ratio[0], 1, rtol=1e-9, atol=0)
-    assert np.ptp(stars.v_i) > 1  # colours did differ
+    assert np.ptp(stars.v_i) > 1  # colors did differ
 
 
-def test_doubles_within_a_disc_are_one_led_of_their_light() -> None:
-    """No light is lost, and no two are nearer than a disc, though merged ones stand between their stars' places."""
+def test_doubles_within_a_disk_are_one_led_of_their_light() -> None:
+    """No light is lost, and no two are nearer than a disk, though merged ones stand between their stars' places."""
     wide, fine = (
         lit(SKY),
         dome.sources(
             DomeConfig.model_validate(
-                {"kind": "dome", "surface": MEASURED, "layout": SKY, "led": LED | {"disc_diameter": "1 um"}}
+                {"kind": "dome", "surface": MEASURED, "layout": SKY, "led": LED | {"disk_diameter": "1 um"}}
             ),
             BAND,
         ),

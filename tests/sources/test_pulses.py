@@ -90,9 +90,7 @@ def test_lit_time_is_that_of_brute_force_sampling(
 
 @settings(max_examples=100, derandomize=True, deadline=None)
 @given(st.floats(0, 1000), st.integers(1, 40), st.floats(0, 1e-3), st.floats(0.01, 1))
-def test_whole_periods_shine_for_exactly_their_duty(
-    begin: float, periods: int, start: float, duty: float
-) -> None:
+def test_whole_periods_shine_for_exactly_their_duty(begin: float, periods: int, start: float, duty: float) -> None:
     on = duty * 1e-3
     lit = float(lit_s(begin, begin + periods * 1e-3, 1e-3, start, on))
     assert lit == pytest.approx(periods * on, abs=1e-12)  # t of 1000 s is held to 1e-13 s

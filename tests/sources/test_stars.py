@@ -1,4 +1,4 @@
-"""Catalogue stars -> apparent directions, against astropy's SkyCoord and against hand-made numbers."""
+"""Catalog stars -> apparent directions, against astropy's SkyCoord and against hand-made numbers."""
 
 import datetime
 
@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from skysim.sources import catalog
 from skysim.sources import stars as star_sources
-from skysim.sources.catalog import Catalogue
+from skysim.sources.catalog import Catalog
 from skysim.sources.photometry import Band, star_flux_e_s_m2
 
 MAS_RAD = np.pi / 180 / 3.6e6
@@ -21,16 +21,16 @@ DATES = [datetime.datetime(1995, 1, 3), datetime.datetime(2016, 6, 21, 7, 30), d
 
 
 @pytest.fixture(scope="module")
-def stars() -> Catalogue:
+def stars() -> Catalog:
     return catalog.read("hipparcos_hp6.5")
 
 
-def star(**fields: float) -> Catalogue:
+def star(**fields: float) -> Catalog:
     """One made-up star; angles in radians, at 2000.0."""
     zero = np.zeros(1)
-    names = [name for name in Catalogue.__slots__ if name not in ("hip", "epoch_jyear")]
+    names = [name for name in Catalog.__slots__ if name not in ("hip", "epoch_jyear")]
     arrays = {name: zero + fields.get(name, 0.0) for name in names}
-    return Catalogue(hip=np.array([1]), **arrays, epoch_jyear=2000.0)
+    return Catalog(hip=np.array([1]), **arrays, epoch_jyear=2000.0)
 
 
 def separation_rad(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -38,7 +38,7 @@ def separation_rad(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("date", DATES)
-def test_apparent_places_are_skycoord_s(stars: Catalogue, date: datetime.datetime) -> None:
+def test_apparent_places_are_skycoord_s(stars: Catalog, date: datetime.datetime) -> None:
     # Stars whose parallax is known: SkyCoord needs a distance for space motion.
     near = stars.take(stars.parallax_rad > 1 * MAS_RAD)
     with iers.conf.set_temp("auto_download", False), iers.conf.set_temp("iers_degraded_accuracy", "ignore"):
@@ -66,12 +66,8 @@ def test_aberration_is_a_year_s_ellipse_of_20_5_arcsec() -> None:
     # The constant of aberration is 20.4955"; perihelion and the Sun's own motion add or take 0.35" and 0.01".
     pole = star(ra_rad=np.radians(270.0), dec_rad=np.radians(66.56))  # the pole of the ecliptic
     days = [datetime.datetime(2021, 1, 1) + datetime.timedelta(days=5 * n) for n in range(73)]
-    straight = np.array(
-        [np.cos(np.radians(66.56)) * np.array([0, -1, 0]) + [0, 0, np.sin(np.radians(66.56))]]
-    )
-    off = (
-        np.array([separation_rad(star_sources.apparent(pole, day), straight)[0] for day in days]) / ARCSEC_RAD
-    )
+    straight = np.array([np.cos(np.radians(66.56)) * np.array([0, -1, 0]) + [0, 0, np.sin(np.radians(66.56))]])
+    off = np.array([separation_rad(star_sources.apparent(pole, day), straight)[0] for day in days]) / ARCSEC_RAD
     assert off.max() == pytest.approx(20.4955 + 0.34, abs=0.03)
     assert off.min() == pytest.approx(20.4955 - 0.34, abs=0.03)
 
@@ -109,9 +105,7 @@ def test_proper_motion_is_along_the_parallel_and_the_meridian() -> None:
     north = star_sources.apparent(star(**place, pm_dec_rad_yr=ARCSEC_RAD), date)[0] - still
     # 0.01": aberration itself changes by 1e-4 of the 20", and 20 years of 365.25 days end half a day off.
     np.testing.assert_allclose(east / ARCSEC_RAD, [0, 20, 0], rtol=0, atol=0.01)
-    np.testing.assert_allclose(
-        north / ARCSEC_RAD, [-20 * np.sin(np.radians(60)), 0, 20 * 0.5], rtol=0, atol=0.01
-    )
+    np.testing.assert_allclose(north / ARCSEC_RAD, [-20 * np.sin(np.radians(60)), 0, 20 * 0.5], rtol=0, atol=0.01)
 
 
 def test_the_sun_bends_light_outward() -> None:
@@ -130,9 +124,7 @@ def test_time_zones_and_naive_times_are_one() -> None:
     zoned = datetime.datetime(2024, 2, 29, 17, 30, tzinfo=datetime.timezone(datetime.timedelta(hours=5.5)))
     assert star_sources.days_since_j2000_tt(naive) == star_sources.days_since_j2000_tt(zoned)
     # JD 2460370.0 is 2024-02-29 12:00; TT is 69.184 s ahead of UTC.
-    assert star_sources.days_since_j2000_tt(naive) == pytest.approx(
-        2460370.0 - 2451545.0 + 69.184 / 86400, abs=1e-9
-    )
+    assert star_sources.days_since_j2000_tt(naive) == pytest.approx(2460370.0 - 2451545.0 + 69.184 / 86400, abs=1e-9)
 
 
 def test_a_camera_at_the_vernal_equinox_by_hand() -> None:
@@ -167,16 +159,16 @@ def test_north_is_up_and_east_is_left(ra_deg: float, dec_deg: float) -> None:
 def test_roll_is_the_position_angle_of_up(roll_deg: float) -> None:
     ra_deg, dec_deg = 150.0, 35.0
     up_icrs = star_sources.cam_from_icrs(ra_deg, dec_deg, roll_deg).inv().apply([0.0, -1e-6, 1.0])
-    centre = SkyCoord(ra_deg, dec_deg, unit="deg")
+    center = SkyCoord(ra_deg, dec_deg, unit="deg")
     toward = SkyCoord(*up_icrs, representation_type="cartesian").represent_as("unitspherical")
-    angle = centre.position_angle(SkyCoord(toward.lon, toward.lat)).deg
+    angle = center.position_angle(SkyCoord(toward.lon, toward.lat)).deg
     # 1e-5 degree: the position angle of an arc 1e-6 rad long.
     assert (angle - roll_deg + 180) % 360 - 180 == pytest.approx(0, abs=1e-5)
 
 
-def test_sources_are_lit_points_at_infinity_in_lab_axes(stars: Catalogue) -> None:
+def test_sources_are_lit_points_at_infinity_in_lab_axes(stars: Catalog) -> None:
     lab_from_icrs = Rotation.from_euler("zyx", [0.3, -1.1, 2.0])
-    seen = star_sources.sources(stars, DATES[1], 2.0, lab_from_icrs, Band.of(0.5))
+    seen = star_sources.sources(stars, DATES[1], 2.0, lab_from_icrs, Band.from_efficiency(0.5))
     kept = stars.take(stars.v_mag <= 2.0)
     assert len(seen) == len(kept) > 40
     np.testing.assert_array_equal(seen.id, kept.hip)
@@ -190,13 +182,13 @@ def test_sources_are_lit_points_at_infinity_in_lab_axes(stars: Catalogue) -> Non
     )
     np.testing.assert_array_equal(seen.period_s, seen.on_s)
     np.testing.assert_array_equal(seen.magnitude, kept.v_mag)
-    strength = star_flux_e_s_m2(kept.v_mag, kept.b_v, kept.v_i, Band.of(0.5))
+    strength = star_flux_e_s_m2(kept.v_mag, kept.b_v, kept.v_i, Band.from_efficiency(0.5))
     np.testing.assert_array_equal(seen.strength, strength)
 
 
-def test_sources_are_as_bright_as_their_magnitude_and_colour(stars: Catalogue) -> None:
+def test_sources_are_as_bright_as_their_magnitude_and_color(stars: Catalog) -> None:
     """In half of all photons of 400-1000 nm, against the reference's 5.62e10 photons/s/m² of a G2 star at V = 0."""
-    seen = star_sources.sources(stars, DATES[1], 2.0, Rotation.identity(), Band.of(0.5))
+    seen = star_sources.sources(stars, DATES[1], 2.0, Rotation.identity(), Band.from_efficiency(0.5))
     relative = {
         int(hip): strength / (0.5 * 5.62e10 * 10 ** (-0.4 * v_mag))
         for hip, strength, v_mag in zip(seen.id, seen.strength, seen.magnitude, strict=True)
@@ -206,5 +198,5 @@ def test_sources_are_as_bright_as_their_magnitude_and_colour(stars: Catalogue) -
     assert relative[27989] > 1.5  # Betelgeuse
 
 
-def test_no_star_so_bright_gives_no_source(stars: Catalogue) -> None:
-    assert len(star_sources.sources(stars, DATES[0], -5.0, Rotation.identity(), Band.of(0.5))) == 0
+def test_no_star_so_bright_gives_no_source(stars: Catalog) -> None:
+    assert len(star_sources.sources(stars, DATES[0], -5.0, Rotation.identity(), Band.from_efficiency(0.5))) == 0

@@ -14,8 +14,8 @@ from skysim.core.types import Floats
 from skysim.scene import light, loader
 from skysim.scene.scene import Scene
 from skysim.scene.tracker import SurveyErrorsConfig
-from skysim.simulation import exposure, testbed
-from skysim.simulation.testbed import Testbed
+from skysim.simulation import exposure
+from skysim.simulation.testbed import Testbed, build_testbed, build_tracker
 from skysim.sources.dome import surface, survey_errors
 from skysim.sources.dome.surface import Surface
 from skysim.tracking import factory
@@ -39,10 +39,10 @@ def loaded(name: str = "afit_simsat", **changes: str) -> Scene:
 
 def believing(**changes: str) -> tuple[DomeTracker, Testbed]:
     """The tracker of afit_simsat with these changes, and its lab."""
-    lab = testbed.build_testbed(loaded(**changes))
-    eyes = testbed.tracker(lab)
+    testbed = build_testbed(loaded(**changes))
+    eyes = build_tracker(testbed)
     assert isinstance(eyes, DomeTracker)
-    return eyes, lab
+    return eyes, testbed
 
 
 def is_chi_square(normal: Floats) -> None:
@@ -61,26 +61,26 @@ def inside_of(**more: Any) -> Surface:
 
 
 def test_every_led_is_believed_off_by_its_own_error_about_each_axis() -> None:
-    eyes, lab = believing(tracker__survey="{led_sigma: 0.2 mm, seed: 3}")
-    error = (eyes.leds.position_m - lab.sources.place[:, :3]) / 0.2e-3
+    eyes, testbed = believing(tracker__survey="{led_sigma: 0.2 mm, seed: 3}")
+    error = (eyes.leds.position_m - testbed.sources.place[:, :3]) / 0.2e-3
     assert len(error) > 1000
     for axis in error.T:
         is_chi_square(axis)
-    # The mean is zero, and no two axes or neighbours go together: sums of N independent numbers of variance 1.
+    # The mean is zero, and no two axes or neighbors go together: sums of N independent numbers of variance 1.
     for products in (error, error * np.roll(error, 1, axis=1), error * np.roll(error, 1, axis=0)):
         assert np.abs(products.mean(axis=0)).max() < 5 / np.sqrt(len(error))
-    np.testing.assert_array_equal(eyes.leds.id, lab.sources.id)
+    np.testing.assert_array_equal(eyes.leds.id, testbed.sources.id)
 
 
 def test_over_the_seeds_the_camera_s_place_errs_by_lever_sigma() -> None:
     true_m = np.array([0.0, 0.01, 0.381])
-    error = [survey_errors.believed_m(true_m, 1e-4, seed, "lever") - true_m for seed in range(400)]
+    error = [survey_errors.assumed_m(true_m, 1e-4, seed, "lever") - true_m for seed in range(400)]
     is_chi_square(np.array(error) / 1e-4)
 
 
 def test_over_the_seeds_the_surface_is_raised_by_its_declared_error() -> None:
     inside = inside_of(error="0.3 mm")
-    is_chi_square(np.array([survey_errors.raised_m(inside, seed) for seed in range(500)]) / 3e-4)
+    is_chi_square(np.array([survey_errors.surface_offset_m(inside, seed) for seed in range(500)]) / 3e-4)
 
 
 def test_a_raised_sphere_is_a_greater_sphere_with_its_leds_on_it() -> None:
@@ -88,16 +88,14 @@ def test_a_raised_sphere_is_a_greater_sphere_with_its_leds_on_it() -> None:
     inside = inside_of(error="2 mm", offset=["1 cm", "0 m", "0 m"])
     directions = np.random.default_rng(1).normal(size=(50, 3)) * [0.3, 0.3, 0.0] + [0, 0, 1]
     place_m = inside.meet(np.zeros(3), directions)
-    believed_m = survey_errors.believed_leds_m(inside, place_m, SurveyErrorsConfig(seed=9))
-    centre_m, semi_axes_m = survey_errors.believed_ellipsoid(inside, SurveyErrorsConfig(seed=9))
-    raised_m = survey_errors.raised_m(inside, 9)
+    assumed_m = survey_errors.assumed_leds_m(inside, place_m, SurveyErrorsConfig(seed=9))
+    center_m, semi_axes_m = survey_errors.assumed_ellipsoid(inside, SurveyErrorsConfig(seed=9))
+    raised_m = survey_errors.surface_offset_m(inside, 9)
     assert 1e-4 < abs(raised_m) < 1e-2
     np.testing.assert_allclose(semi_axes_m, 1 + raised_m, rtol=0, atol=1e-15)
+    np.testing.assert_allclose(np.linalg.norm(assumed_m - center_m, axis=1), semi_axes_m[0], rtol=0, atol=1e-14)
     np.testing.assert_allclose(
-        np.linalg.norm(believed_m - centre_m, axis=1), semi_axes_m[0], rtol=0, atol=1e-14
-    )
-    np.testing.assert_allclose(
-        (believed_m - place_m) @ np.array([0, 0, 1]),
+        (assumed_m - place_m) @ np.array([0, 0, 1]),
         -raised_m * inside.inward(place_m)[:, 2],
         rtol=0,
         atol=1e-15,
@@ -106,22 +104,20 @@ def test_a_raised_sphere_is_a_greater_sphere_with_its_leds_on_it() -> None:
 
 def test_a_raised_ellipsoid_bears_its_leds_to_within_kantorovich_s_bound() -> None:
     """The LEDs' own believed height is all of the draw, the ellipsoid's at least 2 sqrt(a b) / (a + b) of it."""
-    eyes, lab = believing(light__surface__error="2 mm", tracker__survey="{seed: 4}")
-    assert lab.scene.light.kind == "dome"
-    raised_m = survey_errors.raised_m(surface.build_surface(lab.scene.light.surface), 4)
+    eyes, testbed = believing(light__surface__error="2 mm", tracker__survey="{seed: 4}")
+    assert testbed.scene.light.kind == "dome"
+    raised_m = survey_errors.surface_offset_m(surface.build_surface(testbed.scene.light.surface), 4)
     leds = eyes.leds
-    directions = (lab.sources.place[:, :3] - leds.centre_m) / leds.semi_axes_m**2
+    directions = (testbed.sources.place[:, :3] - leds.center_m) / leds.semi_axes_m**2
     normals = directions / np.linalg.norm(directions, axis=1, keepdims=True)
-    support = np.linalg.norm(
-        normals * leds.semi_axes_m, axis=1
-    )  # of the plane that touches it with that normal
+    support = np.linalg.norm(normals * leds.semi_axes_m, axis=1)  # of the plane that touches it with that normal
     true_axes_m = leds.semi_axes_m - raised_m
     share = (support - np.linalg.norm(normals * true_axes_m, axis=1)) / raised_m
     longest, shortest = true_axes_m.max(), true_axes_m.min()
     assert share.min() > 2 * np.sqrt(longest * shortest) / (longest + shortest) - 1e-3
     assert share.max() < 1 + 1e-3
     # Patch boards are flat and stand a little off the surface, where the normal is nearly the same.
-    moved_m = np.sum((leds.position_m - lab.sources.place[:, :3]) * normals, axis=1)
+    moved_m = np.sum((leds.position_m - testbed.sources.place[:, :3]) * normals, axis=1)
     np.testing.assert_allclose(moved_m, raised_m, rtol=1e-4, atol=0)
 
 
@@ -129,13 +125,13 @@ def test_a_raised_ellipsoid_bears_its_leds_to_within_kantorovich_s_bound() -> No
 
 
 def test_without_errors_the_map_is_the_truth_bit_for_bit() -> None:
-    eyes, lab = believing(tracker__survey="{seed: 11}")
-    assert lab.scene.light.kind == "dome"
-    centre_m, semi_axes_m = surface.build_surface(lab.scene.light.surface).as_ellipsoid()
-    assert eyes.leds.position_m.tobytes() == lab.sources.place[:, :3].tobytes()
-    assert eyes.leds.centre_m.tobytes() == centre_m.tobytes()
+    eyes, testbed = believing(tracker__survey="{seed: 11}")
+    assert testbed.scene.light.kind == "dome"
+    center_m, semi_axes_m = surface.build_surface(testbed.scene.light.surface).as_ellipsoid()
+    assert eyes.leds.position_m.tobytes() == testbed.sources.place[:, :3].tobytes()
+    assert eyes.leds.center_m.tobytes() == center_m.tobytes()
     assert eyes.leds.semi_axes_m.tobytes() == semi_axes_m.tobytes()
-    assert eyes.lever.camera_body_m.tobytes() == lab.mount.camera_body_m.tobytes()
+    assert eyes.lever.camera_body_m.tobytes() == testbed.mount.camera_body_m.tobytes()
 
 
 ALL = "{{led_sigma: 0.2 mm, lever_sigma: {lever}, seed: {seed}}}"
@@ -145,9 +141,7 @@ def test_the_survey_is_hardware_the_frames_seed_does_not_touch_it_and_its_own_do
     def places(seed: int, own: int) -> tuple[bytes, ...]:
         told = ALL.format(lever="0.1 mm", seed=own)
         eyes, _ = believing(seed=str(seed), tracker__survey=told, light__surface__error="0.1 mm")
-        return tuple(
-            one.tobytes() for one in (eyes.leds.position_m, eyes.lever.camera_body_m, eyes.leds.semi_axes_m)
-        )
+        return tuple(one.tobytes() for one in (eyes.leds.position_m, eyes.lever.camera_body_m, eyes.leds.semi_axes_m))
 
     first = places(1, 5)
     assert places(2, 5) == first
@@ -156,18 +150,18 @@ def test_the_survey_is_hardware_the_frames_seed_does_not_touch_it_and_its_own_do
 
 def test_one_error_more_leaves_the_others_as_they_were() -> None:
     alone, _ = believing(tracker__survey=ALL.format(lever="0 m", seed=5))
-    both, lab = believing(tracker__survey=ALL.format(lever="0.1 mm", seed=5))
+    both, testbed = believing(tracker__survey=ALL.format(lever="0.1 mm", seed=5))
     assert alone.leds.position_m.tobytes() == both.leds.position_m.tobytes()
-    assert alone.lever.camera_body_m.tobytes() == lab.mount.camera_body_m.tobytes()
-    assert both.lever.camera_body_m.tobytes() != lab.mount.camera_body_m.tobytes()
+    assert alone.lever.camera_body_m.tobytes() == testbed.mount.camera_body_m.tobytes()
+    assert both.lever.camera_body_m.tobytes() != testbed.mount.camera_body_m.tobytes()
 
 
 def test_the_hardware_does_not_know_how_it_is_surveyed() -> None:
     """Frames are the same whatever is believed."""
     frames = []
     for told in ("{}", ALL.format(lever="5 mm", seed=1)):
-        lab = testbed.build_testbed(loaded(tracker__survey=told, exposure=BARE_CAMERA["exposure"]))
-        frames.append(exposure.render_frame(lab, 0)[0].image_dn.tobytes())
+        testbed = build_testbed(loaded(tracker__survey=told, exposure=BARE_CAMERA["exposure"]))
+        frames.append(exposure.render_frame(testbed, 0)[0].image_dn.tobytes())
     assert frames[0] == frames[1]
 
 
@@ -181,15 +175,15 @@ def test_a_pupil_believed_aside_turns_the_attitude_by_its_shift_over_the_led_s_d
     Across the boresight, to 5 %: LEDs 4 deg aside, about as many as the field is wide, are not at p.
     """
     told = f"{{lever_sigma: 2 mm, seed: {seed}}}"
-    eyes, lab = believing(tracker__survey=told, motion__start="{roll_deg: 7}", **BARE_CAMERA)
-    frame, truth = exposure.render_frame(lab, 0)
+    eyes, testbed = believing(tracker__survey=told, motion__start="{roll_deg: 7}", **BARE_CAMERA)
+    frame, truth = exposure.render_frame(testbed, 0)
     answer = factory.solve_frame(eyes, frame).attitude
     assert answer.status == "solved"
     assert answer.cam_from_ref is not None
-    shift = eyes.lever.camera_body_m - lab.mount.camera_body_m
+    shift = eyes.lever.camera_body_m - testbed.mount.camera_body_m
     to_body = truth.lab_from_body.inv()
-    middle = to_body.apply(lab.sources.place[np.isin(lab.sources.id, truth.seen.id), :3]).mean(axis=0)
-    expected = lab.mount.cam_from_body.apply(np.cross(middle, shift) / (middle @ middle))
+    middle = to_body.apply(testbed.sources.place[np.isin(testbed.sources.id, truth.sources.id), :3]).mean(axis=0)
+    expected = testbed.mount.cam_from_body.apply(np.cross(middle, shift) / (middle @ middle))
     found = (answer.cam_from_ref * truth.cam_from_lab.inv()).as_rotvec()
     assert np.linalg.norm(expected[:2]) > 1e-3
     np.testing.assert_allclose(found[:2], expected[:2], rtol=0, atol=0.05 * np.linalg.norm(expected[:2]))
@@ -210,18 +204,16 @@ def test_a_pupil_believed_aside_turns_the_attitude_by_its_shift_over_the_led_s_d
         (
             "shefex2",
             {"tracker.survey": "{led_sigma: 1 mm}"},
-            r"kind stars has nothing to survey; allowed: dome",
+            r"kind stars has no LEDs to survey; allowed: dome",
         ),
         (
             "afit_simsat",
-            {"tracker.survey": "{lever_sigma: 1 mm}", "tracker.believed_camera_body": "[0 m, 0 m, 0.4 m]"},
-            r"believed_camera_body tells the place; allowed: one of the two",
+            {"tracker.survey": "{lever_sigma: 1 mm}", "tracker.assumed_camera_body": "[0 m, 0 m, 0.4 m]"},
+            r"conflicts with assumed_camera_body; allowed: one of the two",
         ),
     ],
 )
-def test_what_cannot_be_surveyed_is_told_in_one_line(
-    name: str, changes: dict[str, str], complaint: str
-) -> None:
+def test_what_cannot_be_surveyed_is_told_in_one_line(name: str, changes: dict[str, str], complaint: str) -> None:
     with pytest.raises(InputError, match=complaint) as refused:
         loader.load(name, changes)
     assert "\n" not in str(refused.value)
@@ -229,8 +221,6 @@ def test_what_cannot_be_surveyed_is_told_in_one_line(
 
 def test_a_survey_that_leaves_no_dome_is_refused() -> None:
     inside = inside_of(error="1 m")
-    seed = next(seed for seed in range(100) if survey_errors.raised_m(inside, seed) < -1.0)
-    with pytest.raises(
-        InputError, match=r"light\.surface\.error: 1 m makes an ellipsoid of -.* m; allowed: far less"
-    ):
-        survey_errors.believed_ellipsoid(inside, SurveyErrorsConfig(seed=seed))
+    seed = next(seed for seed in range(100) if survey_errors.surface_offset_m(inside, seed) < -1.0)
+    with pytest.raises(InputError, match=r"light\.surface\.error: 1 m makes an ellipsoid of -.* m; allowed: far less"):
+        survey_errors.assumed_ellipsoid(inside, SurveyErrorsConfig(seed=seed))

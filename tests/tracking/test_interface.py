@@ -26,16 +26,17 @@ from skysim.core.paths import ROOT
 from skysim.core.units import ARCSEC_RAD
 from skysim.experiments import tracker_comparison
 from skysim.experiments.study import loader as study_loader
-from skysim.experiments.study import setups, store
-from skysim.experiments.study.execution import runner
+from skysim.experiments.study import store
+from skysim.experiments.study.execution import runner, setups
 from skysim.experiments.study.execution.engines import Serial
 from skysim.results import metrics
 from skysim.scene import loader
-from skysim.simulation import run, testbed
+from skysim.simulation import run
+from skysim.simulation.testbed import build_testbed
 from skysim.sources import stars
 from skysim.tracking.external import interface, process
-from skysim.tracking.external.interface import Answer, Leds, Picture, Setup, Stars, checked
-from skysim.tracking.external.process import Fault, Program
+from skysim.tracking.external.interface import Answer, Leds, Picture, Setup, Stars, check_answer
+from skysim.tracking.external.process import Program, ProgramError
 
 PAGE = (ROOT / "docs/howto/external_tracker.md").read_text(encoding="utf-8")
 SETUP = Setup("icrs", "2012-06-22T21:00:00", 8, 6, 100.0, (3.5, 2.5), (0.0,) * 5, 1.0, 4095.0, 1)
@@ -55,29 +56,29 @@ UNIT = [0.5, -0.5, 0.5, 0.5]
         (Answer("solved", [0, 0, 0, np.nan]), "not finite"),
         (Answer("solved", [0, 0, 0, 1.01]), "norm 1.01"),
         (Answer("solved", [0, 0, 1]), r"shape \(3,\)"),
-        (Answer("solved", "north"), "other things than numbers"),
-        (Answer("solved", [[1, 2], [3]]), "other things than numbers"),
+        (Answer("solved", "north"), "not an array of numbers"),
+        (Answer("solved", [[1, 2], [3]]), "not an array of numbers"),
         (Answer("solved", UNIT, np.zeros((3, 3))), "eigenvalues"),
         (Answer("solved", UNIT, [[1, 1, 0], [0, 1, 0], [0, 0, 1]]), "not symmetric"),
         (Answer("solved", UNIT, np.diag([1e-9, -1e-9, 1e-9])), "eigenvalues"),
         (Answer("solved", UNIT, None, [[1, 2, 3]]), "centroids_px has shape"),
         (Answer("solved", UNIT, None, 3.0), "centroids_px"),
-        (Answer("solved", UNIT, None, None, -1.0), "below 0"),
-        (Answer(""), "no text"),
-        (Answer(5), "no text"),
-        (None, "no Answer"),
+        (Answer("solved", UNIT, None, None, -1.0), "allowed: 0 or more"),
+        (Answer(""), "allowed: text"),
+        (Answer(5), "allowed: text"),
+        (None, "allowed: Answer"),
     ],
 )
 def test_what_is_no_answer_is_told_in_one_line(answer: object, told: str) -> None:
-    with pytest.raises(ValueError, match=told if isinstance(answer, Answer) else "no Answer") as raised:
-        checked(answer)
+    with pytest.raises(ValueError, match=told if isinstance(answer, Answer) else "allowed: Answer") as raised:
+        check_answer(answer)
     assert "\n" not in str(raised.value)
 
 
 def test_an_answer_of_single_precision_is_made_a_unit() -> None:
-    told = checked(Answer("solved", np.array(UNIT, np.float32) * np.float32(1.0005), np.eye(3) * 1e-9))
+    told = check_answer(Answer("solved", np.array(UNIT, np.float32) * np.float32(1.0005), np.eye(3) * 1e-9))
     np.testing.assert_allclose(told.cam_from_ref_xyzw, UNIT, rtol=0, atol=1e-15)
-    assert checked(Answer("no\nstars")).status == "no stars"
+    assert check_answer(Answer("no\nstars")).status == "no stars"
 
 
 def test_a_set_up_comes_through_json_as_it_was() -> None:
@@ -86,16 +87,12 @@ def test_a_set_up_comes_through_json_as_it_was() -> None:
     for told in (replace(SETUP, stars=stars, options={"a": 1.5}), replace(SETUP, reference="lab", leds=leds)):
         again = Setup.of_tree(json.loads(json.dumps(told.as_tree())))
         assert again.as_tree() == told.as_tree()
-    np.testing.assert_array_equal(
-        Setup.of_tree(replace(SETUP, stars=stars).as_tree()).stars.direction, np.eye(3)[:2]
-    )
+    np.testing.assert_array_equal(Setup.of_tree(replace(SETUP, stars=stars).as_tree()).stars.direction, np.eye(3)[:2])
 
 
 # --- programs -----------------------------------------------------------------------------------------------
 
-READY = (
-    "import json, sys, os, time; g = sys.stdin.buffer; g.readline(); print('{\"ready\": true}', flush=True)\n"
-)
+READY = "import json, sys, os, time; g = sys.stdin.buffer; g.readline(); print('{\"ready\": true}', flush=True)\n"
 FRAMES = READY + "for line in g:\n    h = json.loads(line); p = g.read(h['bytes'])\n    "
 
 
@@ -141,12 +138,15 @@ def test_a_folder_has_the_frame_and_goes_with_the_program(kind: str) -> None:
             r"ended \(code 3\): bad star \| out of luck",
         ),
         ("os.abort()", r"ended \(SIGABRT\)"),
-        ("print('hello', flush=True)", "'hello' is no JSON"),
-        ("print('[' * 100000, flush=True)", "is no JSON"),
+        ("print('hello', flush=True)", "'hello' is not JSON"),
+        ("print('[' * 100000, flush=True)", "is not JSON"),
         ('print(\'{"frame": 6, "status": "x"}\', flush=True)', "no answer to frame 7"),
         ("print('[]', flush=True)", "no answer to frame 7"),
-        ("print('{\"frame\": 7}', flush=True)", "an object with a status"),
-        ('print(\'{"frame": 7, "status": "solved", "quat": 1}\', flush=True)', "'quat' is none of status"),
+        ("print('{\"frame\": 7}', flush=True)", "a JSON object with a status"),
+        (
+            'print(\'{"frame": 7, "status": "solved", "quat": 1}\', flush=True)',
+            "unknown key 'quat'; allowed: status",
+        ),
         (
             'print(\'{"frame": 7, "status": "solved", "cam_from_ref_xyzw": [NaN,0,0,1]}\', flush=True)',
             "finite",
@@ -156,7 +156,7 @@ def test_a_folder_has_the_frame_and_goes_with_the_program(kind: str) -> None:
 )
 def test_whatever_a_program_does_is_told_in_one_line_and_in_time(text: str, told: str) -> None:
     runs, begin_s = program(FRAMES + text, 0.5 if "sleep" in text else 5.0), time.monotonic()
-    with pytest.raises(Fault, match=told) as raised:
+    with pytest.raises(ProgramError, match=told) as raised:
         runs.solve(PICTURE)
     assert "\n" not in str(raised.value)
     assert time.monotonic() - begin_s < 4
@@ -166,7 +166,7 @@ def test_whatever_a_program_does_is_told_in_one_line_and_in_time(text: str, told
 def test_a_program_that_does_not_read_is_not_waited_for() -> None:
     """A frame larger than any pipe's buffer."""
     large = replace(PICTURE, image_dn=np.zeros((2000, 2000), np.uint16))
-    with pytest.raises(Fault, match=r"no answer within 0\.5 s"):
+    with pytest.raises(ProgramError, match=r"no answer within 0\.5 s"):
         program(READY + "time.sleep(60)", 0.5).solve(large)
 
 
@@ -175,24 +175,22 @@ def test_it_is_begun_anew_and_given_up_after_three_failures_in_a_row(tmp_path: P
     mark, answer = str(tmp_path / "mark"), 'print(\'{"frame": 7, "status": "fine"}\', flush=True)'
     once = f"if not os.path.exists({mark!r}): open({mark!r}, 'x'); sys.exit(1)\n    "
     flaky = program(FRAMES + once + answer)
-    with pytest.raises(Fault, match="code 1"):
+    with pytest.raises(ProgramError, match="code 1"):
         flaky.solve(PICTURE)
     assert [flaky.solve(PICTURE).status for _ in range(2)] == ["fine", "fine"]
-    assert flaky.failed == 0
+    assert flaky.failures == 0
     hopeless = program(FRAMES + "sys.exit(1)")
     for _ in range(3):
-        with pytest.raises(Fault, match="code 1"):
+        with pytest.raises(ProgramError, match="code 1"):
             hopeless.solve(PICTURE)
-    with pytest.raises(Fault, match="given up after 3 failures in a row"):
+    with pytest.raises(ProgramError, match="given up after 3 failures in a row"):
         hopeless.solve(PICTURE)
 
 
 def test_all_that_a_program_started_ends_with_it(tmp_path: Path) -> None:
     beat = tmp_path / "beat"
     child = f"import time\nwhile True:\n    open({str(beat)!r}, 'a').write('x'); time.sleep(0.02)"
-    runs = program(
-        f"import subprocess, sys; subprocess.Popen([sys.executable, '-c', {child!r}])\n" + FRAMES + "pass"
-    )
+    runs = program(f"import subprocess, sys; subprocess.Popen([sys.executable, '-c', {child!r}])\n" + FRAMES + "pass")
     until_s = time.monotonic() + 5
     while not (beat.exists() and beat.stat().st_size) and time.monotonic() < until_s:
         time.sleep(0.01)
@@ -215,12 +213,10 @@ def test_a_program_that_will_not_begin_says_why(text: str, told: str) -> None:
         program(text)
 
 
-@pytest.mark.parametrize(
-    "told", ["mine", "=x", "own=x", "Mine=x", "a b=x", "mine=", "mine='x", "mine=x {folder:bmp}"]
-)
+@pytest.mark.parametrize("told", ["mine", "=x", "own=x", "Mine=x", "a b=x", "mine=", "mine='x", "mine=x {folder:bmp}"])
 def test_a_program_s_name_and_command_are_checked(told: str) -> None:
     with pytest.raises(InputError, match="--program"):
-        process.named([told])
+        process.program_commands([told])
 
 
 # --- runs ---------------------------------------------------------------------------------------------------
@@ -263,23 +259,21 @@ def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_trial_of_another_release_of_a_tracker_is_another(installed: None, tmp_path: Path) -> None:
     told = loader.load("shefex2", {"tracker.name": "offset"})
     before = setups.scene_hash(told)
-    assert interface.release("offset") == "offset 1.0"
-    (tmp_path / "offset-1.0.dist-info" / "METADATA").write_text(
-        "Metadata-Version: 2.1\nName: offset\nVersion: 1.1\n"
-    )
-    assert interface.release("offset") == "offset 1.1"
+    assert interface.package_release("offset") == "offset 1.0"
+    (tmp_path / "offset-1.0.dist-info" / "METADATA").write_text("Metadata-Version: 2.1\nName: offset\nVersion: 1.1\n")
+    assert interface.package_release("offset") == "offset 1.1"
     assert setups.scene_hash(told) != before
 
 
 def test_a_package_s_tracker_is_scored_by_the_error_that_it_makes(installed: None) -> None:
     """36 arcsec across in frame 0; raised in 1; in 2 a roll of 0.2 deg as well, which is wrong."""
     told = loader.load("shefex2", {"exposure.frames": "3"})
-    lab = run.prepare(told)
-    truths = [truth.cam_from_lab for _, truth, _ in run.render_frames(lab)]
+    testbed = run.prepare(told)
+    truths = [truth.cam_from_lab for _, truth, _ in run.render_frames(testbed)]
     options = {f"q{n}_{i}": float(x) for n, t in enumerate(truths) for i, x in enumerate(t.as_quat())}
-    part = told.tracker.model_copy(update={"name": "offset", "options": options | {"roll_deg": 0.2}})
-    lab = replace(lab, scene=told.model_copy(update={"tracker": part}))
-    shots = tracker_comparison.shots(lab, tracker_comparison.entrants(lab, ["offset", "own"]))
+    config = told.tracker.model_copy(update={"name": "offset", "options": options | {"roll_deg": 0.2}})
+    testbed = replace(testbed, scene=told.model_copy(update={"tracker": config}))
+    shots = tracker_comparison.compare_frames(testbed, tracker_comparison.build_trackers(testbed, ["offset", "own"]))
     both = [answers for _, _, answers in shots]
     rows, own = [answers["offset"] for answers in both], [answers["own"] for answers in both]
     assert [(row.status, row.wrong, row.matched > 5) for row in own] == [("solved", False, True)] * 3
@@ -290,9 +284,9 @@ def test_a_package_s_tracker_is_scored_by_the_error_that_it_makes(installed: Non
     assert rows[2].roll_arcsec == pytest.approx(720, abs=1e-3)
     assert rows[0].roll_sigma_arcsec == pytest.approx(1e-4 / ARCSEC_RAD, rel=1e-9)
     assert [row.detected for row in rows] == [1, 0, 1]
-    summed = tracker_comparison.line("offset", rows)
+    summed = tracker_comparison.score_tracker("offset", rows)
     assert (summed.frames, summed.wrong, summed.refused, summed.failed) == (3, 1, 0, 1)
-    assert summed.right == metrics.share(1, 3)
+    assert summed.right == metrics.proportion(1, 3)
     assert summed.cross_arcsec_worst == pytest.approx(36, abs=1e-6)  # of the right ones
 
 
@@ -306,8 +300,8 @@ def test_the_list_tells_what_an_entry_needs(monkeypatch: pytest.MonkeyPatch) -> 
 
 def test_a_scene_names_a_tracker_and_never_a_command() -> None:
     told = loader.load("shefex2", {"tracker.name": "mine", "tracker.options": "{command: rm}"})
-    with pytest.raises(InputError, match=r"tracker\.name: 'mine' is none of own.*--program mine=COMMAND"):
-        testbed.build_testbed(told)
+    with pytest.raises(InputError, match=r"tracker\.name: unknown tracker 'mine'; .*--program mine=COMMAND"):
+        build_testbed(told)
     for key in ("tracker.command", "tracker.program"):
         with pytest.raises(InputError, match="unknown key"):
             loader.load("shefex2", {key: "x"})
@@ -327,15 +321,15 @@ responses: [identified, refused]
 def test_a_study_s_factor_is_a_tracker(tmp_path: Path) -> None:
     path = tmp_path / "who.yaml"
     path.write_text(STUDY)
-    with pytest.raises(InputError, match=r"factors\.who: 'mine': tracker\.name: 'mine' is none of"):
+    with pytest.raises(InputError, match=r"factors\.who: 'mine': tracker\.name: unknown tracker 'mine'; allowed:"):
         study_loader.load(path, programs={})
     (tmp_path / "mine.py").write_text(FRAMES + 'print(\'{"frame": 0, "status": "cloudy"}\', flush=True)')
-    commands = process.named([f"mine={shlex.join([sys.executable, str(tmp_path / 'mine.py')])}"])
-    with pytest.raises(InputError, match="takes frames; allowed: own"):
+    commands = process.program_commands([f"mine={shlex.join([sys.executable, str(tmp_path / 'mine.py')])}"])
+    with pytest.raises(InputError, match="needs frames; allowed: own"):
         study_loader.load(path, {"trial.kind": "centroids"}, commands)
     told = study_loader.load(path, programs=commands)
     with store.writing(tmp_path / "study.sqlite") as kept:
-        runner.begin(told, kept, resume=False)
+        runner.prepare_store(told, kept, resume=False)
         runner.run(told, kept, Serial())
         assert [kept.trial(n)["status"] for n in range(2)] == ["solved", "cloudy"]
 
@@ -394,11 +388,11 @@ def test_the_page_s_commands_do_what_it_says(folder: Path, words: list[str]) -> 
 
 def test_the_page_s_json_is_of_the_protocol() -> None:
     header, *answers = [json.loads(block) for block in blocks("json")]
-    said = json.loads(program(FRAMES + "pass").message(PICTURE)[0])
+    said = json.loads(program(FRAMES + "pass").frame_message(PICTURE)[0])
     assert list(header) == list(said)
     assert header["bytes"] == header["width_px"] * header["height_px"] * 2
     for answer in answers:
-        checked(Answer.of_tree({key: value for key, value in answer.items() if key != "frame"}))
+        check_answer(Answer.of_tree({key: value for key, value in answer.items() if key != "frame"}))
 
 
 # What stands where the page has LOST: of the frame it sees one pixel, which says what it is to print.
@@ -453,7 +447,7 @@ def test_the_page_s_adapter_reads_lost_s_axes_and_quaternion(tmp_path: Path) -> 
     words = [sys.executable, str(adapter), str(lost), "{folder}"]
     runs = Program("lost", words, "png", replace(SETUP, saturation_dn=255.0), 20.0)
     answers = [
-        checked(runs.solve(replace(PICTURE, frame=n, image_dn=np.full((6, 8), n, np.uint16))))
+        check_answer(runs.solve(replace(PICTURE, frame=n, image_dn=np.full((6, 8), n, np.uint16))))
         for n in range(len(POINTED) + 1)
     ]
     runs.close()
@@ -463,7 +457,7 @@ def test_the_page_s_adapter_reads_lost_s_axes_and_quaternion(tmp_path: Path) -> 
         assert (turn * stars.cam_from_icrs(*pointed).inv()).magnitude() < 5e-6  # six digits
         for ray in ([0, 0, 1], [0.03, 0, 1], [-0.02, 0.025, 1]):
             star = turn.inv().apply(ray / np.linalg.norm(ray))
-            seen = 100 * np.array(ray[:2]) + SETUP.centre_px + 0.5
+            seen = 100 * np.array(ray[:2]) + SETUP.center_px + 0.5
             np.testing.assert_allclose(pixel_of_lost(of_lost(*pointed), star), seen, rtol=0, atol=1e-3)
 
 

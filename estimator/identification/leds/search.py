@@ -6,7 +6,7 @@ hypothetical LED's own radius about the bearing, which gives the direction from 
 without knowledge of the attitude. A pair of detections and a pair of LEDs must then agree in one angle about the
 bearing, and determine an attitude. A quick check counts the other detections that have an LED at the predicted
 direction; if enough do, the candidate is fitted to the whole field and its Bayes factor is computed
-(`evidence.prove`).
+(`evidence.evaluate`).
 """
 
 from __future__ import annotations
@@ -18,49 +18,55 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from estimator.attitude.dome_map import on_sphere
-from estimator.catalog.pair_index import between
+from estimator.catalog.pair_index import pair_range
 from estimator.catalog.spatial_grid import cell_of
 from estimator.core import vectors
 from estimator.core.arrays import Floats
 from estimator.core.jit import jit
 from estimator.core.types import StarMatch
 from estimator.core.vectors import Vector
-from estimator.identification.leds.evidence import GATE, LEAST, Guess, Lights, alike, apart, prove
-from estimator.identification.leds.index import Grid, Sight
+from estimator.identification.chance import (
+    GATE_SIGMA,
+    MIN_EVIDENCE_MATCHES,
+    SHORT_PAIR,
+    required_matches,
+    separation,
+)
+from estimator.identification.leds.evidence import LedDetections, LedHypothesis, evaluate, same_identification
+from estimator.identification.leds.index import DirectionGrid, DomeIndex
 
 ACCEPT_DEX = 5.0  # least log10 Bayes factor of an accepted attitude, over detections at random positions
 MARGIN_DEX = 5.0  # by which the best attitude must beat every other one
-TWIN_DEX = 2.0  # least evidence of the best attitude for a near rival to be reported as an ambiguity
-SAME = 1e-9  # least separation of a pair, in tangents: closer detections have no direction between them
-LONG = 0.2  # of the field size: shorter pairs determine the roll poorly and are tried last
+AMBIGUOUS_DEX = 2.0  # least evidence of the best attitude for a near rival to be reported as an ambiguity
+MIN_SEPARATION = 1e-9  # of a pair, in tangents: closer detections have no direction between them
 AMBIGUOUS = "ambiguous: another attitude fits the lights as well"
 NO_MATCH = "no identification beyond chance"
 
 
-def identify(
-    rays_cam: Floats, sigma_rad: Floats, sight: Sight, max_checks: int = 4_000_000
-) -> StarMatch | str:
+def identify(rays_cam: Floats, sigma_rad: Floats, dome: DomeIndex, max_checks: int = 4_000_000) -> StarMatch | str:
     """Identify the LEDs of (N, 3) rays in camera axes: the matches and the attitude, or the reason for a refusal.
 
-    sigma_rad  : (N,) standard deviation of a ray about each axis; `sight` holds the survey's own errors
+    sigma_rad  : (N,) standard deviation of a ray about each axis; `dome` holds the survey's own errors
     max_checks : LED pairs tested, plus detections times LEDs compared, before giving up
 
-    Detection pairs are tested against all LED pairs of the same angle (`_attempt`), in the order of how few these are.
+    Detection pairs are tested against all LED pairs of the same angle (`_test_pair`), the pairs with the fewest first.
     After an attitude reaches ACCEPT_DEX, rivals are searched for with a second, disjoint pair of its detections: a
     rival that explains almost as much must contain one of the two pairs. If a rival comes within MARGIN_DEX, the
     pattern is ambiguous and no attitude is returned. Brightness is not used, because all LEDs may be equally bright.
     """
-    if len(rays_cam) < LEAST:
+    if len(rays_cam) < MIN_EVIDENCE_MATCHES:
         return NO_MATCH
-    guess, rival_dex = _search(lights_of(rays_cam, sigma_rad, sight), sight, max_checks)
-    if guess.dex > TWIN_DEX and guess.dex - rival_dex < MARGIN_DEX:
+    hypothesis, rival_dex = _search(build_detections(rays_cam, sigma_rad, dome), dome, max_checks)
+    if hypothesis.dex > AMBIGUOUS_DEX and hypothesis.dex - rival_dex < MARGIN_DEX:
         return AMBIGUOUS
-    if guess.dex < ACCEPT_DEX:
+    if hypothesis.dex < ACCEPT_DEX:
         return NO_MATCH
-    return StarMatch(guess.observed, guess.star, Rotation.from_matrix(guess.matrix), -guess.dex)
+    return StarMatch(
+        hypothesis.observed, hypothesis.star, Rotation.from_matrix(hypothesis.R_cam_from_lab), -hypothesis.dex
+    )
 
 
-def lights_of(rays_cam: Floats, sigma_rad: Floats, sight: Sight) -> Lights:
+def build_detections(rays_cam: Floats, sigma_rad: Floats, dome: DomeIndex) -> LedDetections:
     """Detections for the search: rays with their total errors, which include those of the LED map and of the lever.
 
     A lateral error of the pupil shifts all LEDs alike and is absorbed by the attitude; an axial one scales the
@@ -69,235 +75,230 @@ def lights_of(rays_cam: Floats, sigma_rad: Floats, sight: Sight) -> Lights:
     With p = r + s u on the sphere |p| = R, ds/dR = R / (u . p), so that d(p / R)/dR = u / (u . p) - p / R^2.
     """
     tangent = np.ascontiguousarray(rays_cam[:, :2] / rays_cam[:, 2:])
-    nearer = sight.lever_sigma * np.linalg.norm(tangent, axis=1)
-    seen = np.hypot(sigma_rad, sight.led_sigma) / rays_cam[:, 2] ** 2
-    point_m = on_sphere(rays_cam, sight.pupil_m, sight.usual_m)
+    pupil_sigma = dome.lever_sigma * np.linalg.norm(tangent, axis=1)
+    ray_sigma = np.hypot(sigma_rad, dome.led_sigma) / rays_cam[:, 2] ** 2
+    point_m = on_sphere(rays_cam, dome.pupil_m, dome.median_radius_m)
     along_m = np.sum(rays_cam * point_m, axis=1)[:, None]
-    return Lights(
+    return LedDetections(
         np.ascontiguousarray(rays_cam),
         tangent,
-        np.hypot(seen, nearer),
-        point_m / sight.usual_m,
-        rays_cam / along_m - point_m / sight.usual_m**2,
+        np.hypot(ray_sigma, pupil_sigma),
+        point_m / dome.median_radius_m,
+        rays_cam / along_m - point_m / dome.median_radius_m**2,
     )
 
 
 @jit
-def _search(lights: Lights, sight: Sight, max_checks: int) -> tuple[Guess, float]:
+def _search(detections: LedDetections, dome: DomeIndex, max_checks: int) -> tuple[LedHypothesis, float]:
     """The best hypothesis, and the evidence of the best one with another attitude."""
-    best = Guess(np.empty(0, np.int64), np.empty(0, np.int64), np.eye(3), -np.inf)
+    best = LedHypothesis(np.empty(0, np.int64), np.empty(0, np.int64), np.eye(3), -np.inf)
     rival_dex, checks = -np.inf, np.zeros(1, np.int64)
-    order = _pairs(lights, sight)
+    order = _ordered_pairs(detections, dome)
     for rank in range(len(order)):
         a, b = order[rank]
-        best, rival_dex = _attempt(lights, sight, a, b, ACCEPT_DEX, best, rival_dex, checks)
+        best, rival_dex = _test_pair(detections, dome, a, b, ACCEPT_DEX, best, rival_dex, checks)
         if best.dex >= ACCEPT_DEX:
-            # A rival below this floor cannot matter. If the floor is below ACCEPT_DEX, `_attempt` has skipped such
+            # A rival below this floor cannot matter. If the floor is below ACCEPT_DEX, `_test_pair` has skipped such
             # rivals so far, and the same pair is tested again; then a second pair is tested.
-            rival_floor = best.dex - MARGIN_DEX
-            if rival_floor < ACCEPT_DEX:
-                best, rival_dex = _attempt(lights, sight, a, b, rival_floor, best, rival_dex, checks)
-            a, b = order[_second(order, rank, best)]
-            return _attempt(lights, sight, a, b, rival_floor, best, rival_dex, checks)
+            min_rival_dex = best.dex - MARGIN_DEX
+            if min_rival_dex < ACCEPT_DEX:
+                best, rival_dex = _test_pair(detections, dome, a, b, min_rival_dex, best, rival_dex, checks)
+            a, b = order[_disjoint_pair(order, rank, best)]
+            return _test_pair(detections, dome, a, b, min_rival_dex, best, rival_dex, checks)
         if checks[0] > max_checks:
             break
     return best, rival_dex
 
 
 @jit
-def _pairs(lights: Lights, sight: Sight) -> NDArray[np.int64]:
+def _ordered_pairs(detections: LedDetections, dome: DomeIndex) -> NDArray[np.int64]:
     """(P, 2) pairs of detections, sorted by the number of LED pairs they may be; short pairs come last.
 
     Short pairs also match few LED pairs, but determine the roll about the boresight poorly. Coincident detections are
     left out.
     """
-    total, long = len(lights.ray), LONG * sqrt(sight.area)
+    total, min_length = len(detections.ray), SHORT_PAIR * sqrt(dome.field_area)
     pair, cost = np.empty((total * (total - 1) // 2, 2), np.int64), np.empty(total * (total - 1) // 2)
-    place = 0
+    count = 0
     for a in range(total):
         for b in range(a + 1, total):
-            length = apart(lights.tangent, a, b)
-            if not length > SAME:
+            length = separation(detections.tangent, a, b)
+            if not length > MIN_SEPARATION:
                 continue
-            begin, end, _ = _window(lights, sight, a, b)
-            pair[place, 0], pair[place, 1] = a, b
-            cost[place] = end - begin if length >= long else 1e9 - length
-            place += 1
-    return pair[:place][np.argsort(cost[:place])]
+            begin, end, _ = _pair_range(detections, dome, a, b)
+            pair[count, 0], pair[count, 1] = a, b
+            cost[count] = end - begin if length >= min_length else 1e9 - length
+            count += 1
+    return pair[:count][np.argsort(cost[:count])]
 
 
 @jit
-def _window(lights: Lights, sight: Sight, a: int, b: int) -> tuple[int, int, float]:
+def _pair_range(detections: LedDetections, dome: DomeIndex, a: int, b: int) -> tuple[int, int, float]:
     """Half-open range of index pairs that two detections may be, and the gate of their angle about the bearing, rad."""
-    gate = GATE * sqrt(lights.sigma[a] ** 2 + lights.sigma[b] ** 2) * _to_bearing(sight)
-    at_a, at_b = vectors.row(lights.usual, a), vectors.row(lights.usual, b)
-    angle = 2 * np.arcsin(min(vectors.chord(at_a, at_b) / 2, 1.0))
-    begin, end = between(sight.pairs, angle - gate - sight.slack_rad, angle + gate + sight.slack_rad)
+    gate = GATE_SIGMA * sqrt(detections.sigma[a] ** 2 + detections.sigma[b] ** 2) * _bearing_angle_ratio(dome)
+    direction_a, direction_b = vectors.row(detections.direction, a), vectors.row(detections.direction, b)
+    angle = 2 * np.arcsin(min(vectors.chord(direction_a, direction_b) / 2, 1.0))
+    begin, end = pair_range(dome.pairs, angle - gate - dome.scaling_error_rad, angle + gate + dome.scaling_error_rad)
     return begin, end, gate
 
 
 @jit
-def _to_bearing(sight: Sight) -> float:
+def _bearing_angle_ratio(dome: DomeIndex) -> float:
     """Ratio of an angle about the bearing to the angle seen by the camera: (R - M) / R."""
-    return 1 - sqrt(sight.pupil_m[0] ** 2 + sight.pupil_m[1] ** 2 + sight.pupil_m[2] ** 2) / sight.usual_m
+    return 1 - sqrt(dome.pupil_m[0] ** 2 + dome.pupil_m[1] ** 2 + dome.pupil_m[2] ** 2) / dome.median_radius_m
 
 
 @jit
-def _second(pairs: NDArray, rank: int, best: Guess) -> int:
+def _disjoint_pair(pairs: NDArray, rank: int, best: LedHypothesis) -> int:
     """Rank of the first pair of two matched detections that shares none with pair `rank`, or as few as possible."""
-    kept, cost = rank, 9
+    best_rank, cost = rank, 9
     for other in range(len(pairs)):
-        stale = 0
+        penalty = 0
         for end in range(2):
-            known = False
+            is_matched = False
             for n in best.observed:
-                known = known or n == pairs[other, end]
-            stale += 3 * (not known)  # an unmatched detection is worse than two shared ones
-            stale += pairs[other, end] == pairs[rank, 0] or pairs[other, end] == pairs[rank, 1]
-        if stale < cost:
-            kept, cost = other, stale
-    return kept
+                is_matched = is_matched or n == pairs[other, end]
+            penalty += 3 * (not is_matched)  # an unmatched detection is worse than two shared ones
+            penalty += pairs[other, end] == pairs[rank, 0] or pairs[other, end] == pairs[rank, 1]
+        if penalty < cost:
+            best_rank, cost = other, penalty
+    return best_rank
 
 
 @jit
-def _attempt(
-    lights: Lights,
-    sight: Sight,
+def _test_pair(
+    detections: LedDetections,
+    dome: DomeIndex,
     a: int,
     b: int,
-    floor_dex: float,
-    best: Guess,
+    min_dex: float,
+    best: LedHypothesis,
     rival_dex: float,
     checks: NDArray,
-) -> tuple[Guess, float]:
+) -> tuple[LedHypothesis, float]:
     """Test two detections against every LED pair of the same angle, in both orders.
 
-    Candidates that cannot reach floor_dex are skipped. Returns the updated best hypothesis and the evidence of its best
-    rival. checks : (1,) effort so far, increased in place.
+    Candidates that cannot reach min_dex are skipped. Returns the updated best hypothesis and the evidence of its best
+    rival.
+    checks : (1,) effort so far, increased in place
     """
-    index, radius = sight.pairs, sight.radius_m
-    begin, end, gate = _window(lights, sight, a, b)
-    wanted, gates = _wanted(lights, sight, a, b, floor_dex), _first_gates(lights, sight, a, b)
-    in_cam, in_lab, matrix = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-    grid_from_cam = np.empty((3, 3))
+    index, radius = dome.pairs, dome.radius_m
+    begin, end, gate = _pair_range(detections, dome, a, b)
+    attitude_dex = _attitude_dex(detections, dome, a, b)
+    required = required_matches(detections.sigma, dome.field_area, attitude_dex, min_dex)
+    gates = _pair_gates(detections, dome, a, b)
+    in_cam, in_lab, R_cam_from_lab = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    R_grid_from_cam = np.empty((3, 3))
     checks[0] += 2 * (end - begin)
     for p in range(begin, end):
         for flip in range(2):
             i, j = index.pair[p, flip], index.pair[p, 1 - flip]
-            at_i, at_j = _carried(lights.ray[a], sight, radius[i]), _carried(lights.ray[b], sight, radius[j])
+            direction_a = _direction_from_bearing(detections.ray[a], dome, radius[i])
+            direction_b = _direction_from_bearing(detections.ray[b], dome, radius[j])
             led_i, led_j = vectors.row(index.vectors, i), vectors.row(index.vectors, j)
             # The index holds angles scaled to the median radius; here each ray meets the LED's own radius.
-            if abs(vectors.chord(at_i, at_j) - vectors.chord(led_i, led_j)) > gate:
+            if abs(vectors.chord(direction_a, direction_b) - vectors.chord(led_i, led_j)) > gate:
                 continue
-            vectors.axes(at_i, at_j, in_cam)
-            vectors.axes(led_i, led_j, in_lab)
-            vectors.times_transposed(in_cam, in_lab, matrix)
-            vectors.times_transposed(sight.grid.R_grid_from_lab, matrix, grid_from_cam)
-            if _glance(lights, sight, grid_from_cam, radius[i], a, b, gates, wanted) < wanted:
+            vectors.pair_frame(direction_a, direction_b, in_cam)
+            vectors.pair_frame(led_i, led_j, in_lab)
+            vectors.multiply_transposed(in_cam, in_lab, R_cam_from_lab)
+            vectors.multiply_transposed(dome.grid.R_grid_from_lab, R_cam_from_lab, R_grid_from_cam)
+            if _quick_check(detections, dome, R_grid_from_cam, radius[i], a, b, gates, required) < required:
                 continue
-            checks[0] += len(lights.ray) * (index.first[i + 1] - index.first[i]) // 4
-            guess = prove(lights, sight, matrix.copy(), i, a, b)
-            same = alike(guess, best)
-            if guess.dex > best.dex:
+            checks[0] += len(detections.ray) * (index.first[i + 1] - index.first[i]) // 4
+            hypothesis = evaluate(detections, dome, R_cam_from_lab.copy(), i, a, b)
+            same = same_identification(hypothesis, best)
+            if hypothesis.dex > best.dex:
                 rival_dex = rival_dex if same else max(rival_dex, best.dex)
-                best = guess
+                best = hypothesis
             elif not same:
-                rival_dex = max(rival_dex, guess.dex)
+                rival_dex = max(rival_dex, hypothesis.dex)
     return best, rival_dex
 
 
 @jit
-def _carried(ray: Floats, sight: Sight, radius_m: float) -> Vector:
+def _direction_from_bearing(ray: Floats, dome: DomeIndex, radius_m: float) -> Vector:
     """Unit vector from the bearing to the point where a camera ray meets the sphere of radius_m, in camera axes."""
-    px, py, pz = sight.pupil_m
+    px, py, pz = dome.pupil_m
     along = ray[0] * px + ray[1] * py + ray[2] * pz
-    reach = -along + sqrt(max(along * along - px * px - py * py - pz * pz + radius_m * radius_m, 0.0))
+    distance = -along + sqrt(max(along * along - px * px - py * py - pz * pz + radius_m * radius_m, 0.0))
     inverse = 1 / radius_m
-    return (px + reach * ray[0]) * inverse, (py + reach * ray[1]) * inverse, (pz + reach * ray[2]) * inverse
+    return (
+        (px + distance * ray[0]) * inverse,
+        (py + distance * ray[1]) * inverse,
+        (pz + distance * ray[2]) * inverse,
+    )
 
 
 @jit
-def _wanted(lights: Lights, sight: Sight, a: int, b: int, floor_dex: float) -> int:
-    """Least number of matches that can reach floor_dex, from an upper bound of `_evidence`.
+def _attitude_dex(detections: LedDetections, dome: DomeIndex, a: int, b: int) -> float:
+    """Contribution of a pair's attitude alone to the evidence, for `required_matches`.
 
-    The bound has no residuals, no missing LEDs, and the attitude uncertainty of the pair alone: sqrt(2) sigma /
-    separation about the boresight, sigma / sqrt(2) across it.
+    The uncertainty is sqrt(2) sigma / separation about the boresight, sigma / sqrt(2) across it.
     """
-    sigma = lights.sigma.min()
-    each = -log10(2 * pi * sigma**2 * len(lights.ray) / sight.area)
-    loose = 1.5 * log10(2 * pi) - log10(sight.volume)
-    loose += log10(sigma**3 / sqrt(2.0) / apart(lights.tangent, a, b))
-    for count in range(LEAST, len(lights.ray)):
-        if count * each + loose - log10(count + 1.0) >= floor_dex:
-            return count
-    return len(lights.ray)
+    sigma_volume = detections.sigma.min() ** 3 / sqrt(2.0) / separation(detections.tangent, a, b)
+    return 1.5 * log10(2 * pi) - log10(dome.prior_volume) + log10(sigma_volume)
 
 
 @jit
-def _first_gates(lights: Lights, sight: Sight, a: int, b: int) -> Floats:
+def _pair_gates(detections: LedDetections, dome: DomeIndex, a: int, b: int) -> Floats:
     """(N,) matching radius of each detection at a pair's attitude, as an angle about the bearing, rad.
 
     The pair's own error adds a shift with half of a detection's variance and a rotation with 2 sigma^2 / separation^2.
     """
-    x, y = (lights.tangent[a] + lights.tangent[b]) / 2
-    turning = 2 / apart(lights.tangent, a, b) ** 2
-    out = np.empty(len(lights.ray))
+    x, y = (detections.tangent[a] + detections.tangent[b]) / 2
+    direction_variance = 2 / separation(detections.tangent, a, b) ** 2
+    out = np.empty(len(detections.ray))
     for n in range(len(out)):
-        off2 = (lights.tangent[n, 0] - x) ** 2 + (lights.tangent[n, 1] - y) ** 2
-        out[n] = GATE * lights.sigma[n] * sqrt(1.5 + turning * off2) * _to_bearing(sight) + sight.slack_rad
+        distance2 = (detections.tangent[n, 0] - x) ** 2 + (detections.tangent[n, 1] - y) ** 2
+        gate = GATE_SIGMA * detections.sigma[n] * sqrt(1.5 + direction_variance * distance2)
+        out[n] = gate * _bearing_angle_ratio(dome) + dome.scaling_error_rad
     return out
 
 
 @jit
-def _glance(
-    lights: Lights,
-    sight: Sight,
-    grid_from_cam: Floats,
+def _quick_check(
+    detections: LedDetections,
+    dome: DomeIndex,
+    R_grid_from_cam: Floats,
     radius_m: float,
     a: int,
     b: int,
     gates: Floats,
-    wanted: int,
+    required: int,
 ) -> int:
     """Quick check: number of detections with an LED at the predicted direction, the pair included.
 
-    Stops as soon as `wanted` is reached or out of reach. Every ray is taken to the radius of the hypothetical LED
+    Stops as soon as `required` is reached or out of reach. Every ray is taken to the radius of the hypothetical LED
     (radius_m) by a first-order step from the median radius.
     """
-    count, total, higher_m = 2, len(lights.ray), radius_m - sight.usual_m
+    count, total, radius_offset_m = 2, len(detections.ray), radius_m - dome.median_radius_m
     for n in range(total):
-        if count >= wanted or count + total - n < wanted:
+        if count >= required or count + total - n < required:
             break
         if n in (a, b):
             continue
-        x = lights.usual[n, 0] + higher_m * lights.rise[n, 0]
-        y = lights.usual[n, 1] + higher_m * lights.rise[n, 1]
-        z = lights.usual[n, 2] + higher_m * lights.rise[n, 2]
-        where = (
-            grid_from_cam[0, 0] * x + grid_from_cam[0, 1] * y + grid_from_cam[0, 2] * z,
-            grid_from_cam[1, 0] * x + grid_from_cam[1, 1] * y + grid_from_cam[1, 2] * z,
-            grid_from_cam[2, 0] * x + grid_from_cam[2, 1] * y + grid_from_cam[2, 2] * z,
-        )
-        count += _anything(sight.grid, where, gates[n])
+        x = detections.direction[n, 0] + radius_offset_m * detections.direction_per_m[n, 0]
+        y = detections.direction[n, 1] + radius_offset_m * detections.direction_per_m[n, 1]
+        z = detections.direction[n, 2] + radius_offset_m * detections.direction_per_m[n, 2]
+        count += _has_led_near(dome.grid, vectors.rotate(R_grid_from_cam, (x, y, z)), gates[n])
     return count
 
 
 @jit
-def _anything(grid: Grid, where: Vector, gate: float) -> bool:
+def _has_led_near(grid: DirectionGrid, direction: Vector, gate: float) -> bool:
     """Whether any LED is within `gate` (rad) of a direction in grid axes."""
     inverse, half, reach = 1 / grid.cell, grid.side / 2, gate / grid.cell
-    x, y = where[0] * inverse + half, where[1] * inverse + half
+    x, y = direction[0] * inverse + half, direction[1] * inverse + half
     for line in range(cell_of(y - reach, grid.side), cell_of(y + reach, grid.side - 1) + 1):
         left = line * grid.side + cell_of(x - reach, grid.side)
         right = line * grid.side + cell_of(x + reach, grid.side - 1)
         if left > right:
             continue
         for place in range(grid.first[left], grid.first[right + 1]):
-            off = (
-                grid.direction[place, 0] - where[0],
-                grid.direction[place, 1] - where[1],
-                grid.direction[place, 2] - where[2],
-            )
-            if off[0] * off[0] + off[1] * off[1] + off[2] * off[2] < gate * gate:
+            dx = grid.direction[place, 0] - direction[0]
+            dy = grid.direction[place, 1] - direction[1]
+            dz = grid.direction[place, 2] - direction[2]
+            if dx * dx + dy * dy + dz * dz < gate * gate:
                 return True
     return False

@@ -1,7 +1,7 @@
 """Fialho's triangle method, PTASE's identifier in its four versions: candidate lists, a triplet, the direct match.
 
 Fialho & Saotome 2005, section 3.5: "In the first step it tries to match a triangle of observed stars (the three
-brightest stars above a minimum magnitude and with a minimum angular distance) with a triangle of catalogued stars"
+brightest stars above a minimum magnitude and with a minimum angular distance) with a triangle of cataloged stars"
 from a list of candidates for each; then the rest are matched at the attitude that the triplet gives, and it counts if
 "greater than a minimum threshold (e.g, half the number of observed stars)"; else the search goes on. The paper names
 four improvements since alg_ide_mf1_1 of 2003 and says what mf1_2 has; mf1_3 is inferred to lie between 2 and 4:
@@ -20,25 +20,33 @@ paper, the first triplet that passes is the solution; for a repetitive catalog, 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import sqrt
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.catalog.pair_index import PairIndex, alike, around
+from estimator.catalog.pair_index import PairIndex, first_neighbor, magnitude_range
 from estimator.core.arrays import Floats
 from estimator.core.errors import ImageError
 from estimator.core.jit import jit
 from estimator.core.types import StarMatch
 from estimator.identification.chance import ACCEPT_LOG10_CHANCE, MIN_MATCHES
-from estimator.identification.direct_match import Found, angle, answer, nothing, settled, triple
+from estimator.identification.direct_match import (
+    DirectMatch,
+    angle,
+    match_field,
+    no_match,
+    to_star_match,
+    triple,
+)
 from estimator.identification.options import Options
 
-GATE_SIGMAS = 3.0  # of a magnitude: three stars pass with 0.9973^3 = 99.2 %, the paper's 99.12 +- 0.25 %
-LEAST_ANGLE = 0.1  # of the field's diagonal, between the stars of a triangle; the paper gives no value
-SHARE_BASIC, SHARE_FALSE_STARS = 0.5, 0.3  # fraction of stars that must match: basic, with false stars
+MAG_GATE_SIGMA = 3.0  # of a magnitude: three stars pass with 0.9973^3 = 99.2 %, the paper's 99.12 +- 0.25 %
+MIN_SIDE_FRACTION = 0.1  # of the field's diagonal, between the stars of a triangle; the paper gives no value
+# Least fraction of the observed stars that must match: basic, and with false stars.
+MIN_FRACTION_BASIC, MIN_FRACTION_FALSE_STARS = 0.5, 0.3
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,15 +60,15 @@ class MagnitudeMatch(StarMatch):
     variance_mag2: float = float("nan")
 
 
-class Rules(NamedTuple):
+class SearchOptions(NamedTuple):
     """Search parameters. A named tuple, because numba can compile functions that take one.
 
     tolerance_rad, stretch : tolerance of a direction; that of an angle is sqrt(2) times it plus stretch times the angle
     gate_mag     : tolerance of a magnitude
     triangles, checks, base : as in `Options`: limits of observed triangles and of angles compared, number of stars
-    share        : fraction of the observed stars that must match
-    optimised    : assemble the lists from neighbors
-    x, y, z, chord : prior boresight, and the greatest squared chord of a candidate from it
+    min_fraction : fraction of the observed stars that must match
+    optimized    : assemble the lists from neighbors
+    x, y, z, chord2 : prior boresight, and the greatest squared chord of a candidate from it
     """
 
     tolerance_rad: float
@@ -69,75 +77,63 @@ class Rules(NamedTuple):
     triangles: int
     checks: int
     base: int
-    share: float
-    optimised: bool
+    min_fraction: float
+    optimized: bool
     x: float
     y: float
     z: float
-    chord: float
+    chord2: float
 
 
-def rules(tolerance_rad: float, asked: Options, share: float, optimised: bool, falls_back: bool) -> Rules:
-    """Search parameters from options. Raises ImageError unless the tolerance and the magnitude error are positive."""
-    if not min(tolerance_rad, asked.epsilon_mag) > 0:
+def search_options(
+    tolerance_rad: float, settings: Options, min_fraction: float, optimized: bool, retries: bool
+) -> SearchOptions:
+    """Search parameters from options. Raises ImageError unless the tolerance and the magnitude error are positive.
+
+    retries : try other observed triangles if the first fails
+    """
+    if not min(tolerance_rad, settings.epsilon_mag) > 0:
         raise ImageError(
-            f"fialho: tolerance {tolerance_rad} rad, magnitude error {asked.epsilon_mag}; allowed: more than 0"
+            f"fialho: tolerance {tolerance_rad} rad, magnitude error {settings.epsilon_mag}; allowed: more than 0"
         )
-    hinted = asked.boresight_ref is not None
-    x, y, z = asked.boresight_ref if asked.boresight_ref is not None else (0.0, 0.0, 1.0)
-    chord = 4 * np.sin(min(asked.within_rad, np.pi) / 2) ** 2 if hinted else 5.0
-    return Rules(
+    x, y, z, chord2 = 0.0, 0.0, 1.0, 5.0
+    if settings.boresight_ref is not None:
+        x, y, z = settings.boresight_ref
+        chord2 = 4 * np.sin(min(settings.within_rad, np.pi) / 2) ** 2
+    return SearchOptions(
         tolerance_rad,
-        asked.stretch,
-        GATE_SIGMAS * asked.epsilon_mag,
-        asked.max_triangles if falls_back else 1,
-        asked.max_checks,
-        asked.base_stars,
-        share,
-        optimised,
+        settings.stretch,
+        MAG_GATE_SIGMA * settings.epsilon_mag,
+        settings.max_triangles if retries else 1,
+        settings.max_checks,
+        settings.base_stars,
+        min_fraction,
+        optimized,
         float(x),
         float(y),
         float(z),
-        float(chord),
+        float(chord2),
     )
 
 
 def fialho_1(vectors_cam: Floats, index: PairIndex, tolerance_rad: float, **options: Any) -> StarMatch | None:
     """The basic algorithm: one triangle, each list from the whole catalog, no boresight prior. See `fialho_4`."""
-    asked = Options(**options)
-    bare = rules(tolerance_rad, asked, SHARE_BASIC, False, False)
-    return answer(_found(vectors_cam, index, asked, bare._replace(chord=5.0)))
+    settings = replace(Options(**options), boresight_ref=None)
+    return _identify(vectors_cam, index, tolerance_rad, settings, MIN_FRACTION_BASIC, False, False)
 
 
 def fialho_2(vectors_cam: Floats, index: PairIndex, tolerance_rad: float, **options: Any) -> StarMatch | None:
     """One triangle with optimized lists, near the prior boresight if there is one. See `fialho_4`."""
-    asked = Options(**options)
-    return answer(
-        _found(
-            vectors_cam,
-            index,
-            asked,
-            rules(tolerance_rad, asked, SHARE_BASIC, True, False),
-        )
-    )
+    return _identify(vectors_cam, index, tolerance_rad, Options(**options), MIN_FRACTION_BASIC, True, False)
 
 
 def fialho_3(vectors_cam: Floats, index: PairIndex, tolerance_rad: float, **options: Any) -> StarMatch | None:
     """Several triangles with optimized lists, near the prior boresight if there is one. See `fialho_4`."""
-    asked = Options(**options)
-    return answer(
-        _found(
-            vectors_cam,
-            index,
-            asked,
-            rules(tolerance_rad, asked, SHARE_FALSE_STARS, True, True),
-        )
-    )
+    settings = Options(**options)
+    return _identify(vectors_cam, index, tolerance_rad, settings, MIN_FRACTION_FALSE_STARS, True, True)
 
 
-def fialho_4(
-    vectors_cam: Floats, index: PairIndex, tolerance_rad: float, **options: Any
-) -> MagnitudeMatch | None:
+def fialho_4(vectors_cam: Floats, index: PairIndex, tolerance_rad: float, **options: Any) -> MagnitudeMatch | None:
     """Fialho's triangle method, latest version: as the third, and returns the errors of the magnitudes.
 
     vectors_cam   : (N, 3) observed unit vectors, brightest first
@@ -147,25 +143,22 @@ def fialho_4(
         therefore include half the field's diagonal beside the error of the prior
     Returns None if too few stars match, or if the match is not significant (1e-5 expected by chance).
     """
-    asked = Options(**options)
-    found = _found(
-        vectors_cam,
-        index,
-        asked,
-        rules(tolerance_rad, asked, SHARE_FALSE_STARS, True, True),
-    )
-    match = answer(found)
+    match = fialho_3(vectors_cam, index, tolerance_rad, **options)
     if match is None:
         return None
-    off = asked.light(len(vectors_cam))[match.observed] - index.magnitude[match.star]
-    variance = float(np.var(off, ddof=1))
+    magnitudes = Options(**options).magnitudes(len(vectors_cam))
+    offset_mag = magnitudes[match.observed] - index.magnitude[match.star]
     return MagnitudeMatch(
-        match.observed, match.star, match.cam_from_ref, match.log10_chance, float(off.mean()), variance
+        match.observed,
+        match.star,
+        match.cam_from_ref,
+        match.log10_chance,
+        float(offset_mag.mean()),
+        float(np.var(offset_mag, ddof=1)),
     )
 
 
-Fialho = Callable[..., StarMatch | None]
-VERSIONS: dict[str, Fialho] = {
+VERSIONS: dict[str, Callable[..., StarMatch | None]] = {
     "fialho_1": fialho_1,
     "fialho_2": fialho_2,
     "fialho_3": fialho_3,
@@ -173,205 +166,214 @@ VERSIONS: dict[str, Fialho] = {
 }
 
 
-def _found(vectors_cam: Floats, index: PairIndex, asked: Options, by: Rules) -> Found:
-    asked.fixed_focal("fialho")
-    if len(vectors_cam) < MIN_MATCHES:
-        return nothing()
-    return search(np.ascontiguousarray(vectors_cam), asked.light(len(vectors_cam)), index, by)
+def _identify(
+    vectors_cam: Floats,
+    index: PairIndex,
+    tolerance_rad: float,
+    settings: Options,
+    min_fraction: float,
+    optimized: bool,
+    retries: bool,
+) -> StarMatch | None:
+    parameters = search_options(tolerance_rad, settings, min_fraction, optimized, retries)
+    settings.require_known_focal("fialho")
+    count = len(vectors_cam)
+    if count < MIN_MATCHES:
+        return None
+    rays = np.ascontiguousarray(vectors_cam)
+    return to_star_match(search(rays, settings.magnitudes(count), index, parameters))
 
 
 @jit
-def search(seen: Floats, light: Floats, index: PairIndex, by: Rules) -> Found:
+def search(rays: Floats, magnitudes: Floats, index: PairIndex, options: SearchOptions) -> DirectMatch:
     """Compiled search over observed triangles: the brightest first, then others, with all stars changing soon.
 
-    seen, light : (N, 3) unit vectors, brightest first, and their (N,) magnitudes, NaN if unknown
+    rays, magnitudes : (N, 3) unit vectors, brightest first, and their (N,) magnitudes, NaN if unknown
     Returns the rows of the observed stars and of the catalog, R_cam_from_ref, and log10 of the expected number of
     chance matches; it is a solution only if that is at most ACCEPT_LOG10_CHANCE.
     """
     tried = np.zeros(2, np.int64)  # triplets, angles compared
-    least, base = LEAST_ANGLE * index.max_angle_rad, min(by.base, len(seen))
-    corners = _brightest(seen, base, least)
+    min_side_rad, base = MIN_SIDE_FRACTION * index.max_angle_rad, min(options.base, len(rays))
+    corners = _brightest(rays, base, min_side_rad)
     if corners[0] < 0:
-        return nothing()
-    found = triplets(seen, light, index, corners, by, tried)
-    if found[3] <= ACCEPT_LOG10_CHANCE:
-        return found
+        return no_match()
+    match = triplets(rays, magnitudes, index, corners, options, tried)
+    if match.log10_chance <= ACCEPT_LOG10_CHANCE:
+        return match
     count = 1
     for dj in range(1, base - 1):
         for dk in range(1, base - dj):
             for i in range(base - dj - dk):
-                if count >= by.triangles or tried[1] >= by.checks:
-                    return nothing()
-                another = np.array([i, i + dj, i + dj + dk])
-                if (another == corners).all() or _closest(seen, another) < least:
+                if count >= options.triangles or tried[1] >= options.checks:
+                    return no_match()
+                next_corners = np.array([i, i + dj, i + dj + dk])
+                if (next_corners == corners).all() or _shortest_side(rays, next_corners) < min_side_rad:
                     continue
-                found = triplets(seen, light, index, another, by, tried)
-                if found[3] <= ACCEPT_LOG10_CHANCE:
-                    return found
+                match = triplets(rays, magnitudes, index, next_corners, options, tried)
+                if match.log10_chance <= ACCEPT_LOG10_CHANCE:
+                    return match
                 count += 1
-    return nothing()
+    return no_match()
 
 
 @jit
-def _closest(seen: Floats, corners: NDArray) -> float:
+def _shortest_side(rays: Floats, corners: NDArray) -> float:
     """The least angle between any two of three stars."""
     i, j, k = corners
-    return min(angle(seen[i], seen[j]), angle(seen[i], seen[k]), angle(seen[j], seen[k]))
+    return min(angle(rays[i], rays[j]), angle(rays[i], rays[k]), angle(rays[j], rays[k]))
 
 
 @jit
-def _brightest(seen: Floats, base: int, least_rad: float) -> NDArray:
-    """Rows of the three brightest stars that are at least least_rad apart; -1 if there are none."""
+def _brightest(rays: Floats, base: int, min_side_rad: float) -> NDArray:
+    """Rows of the three brightest stars that are at least min_side_rad apart; -1 if there are none."""
     for i in range(base):
         for j in range(i + 1, base):
-            if angle(seen[i], seen[j]) < least_rad:
+            if angle(rays[i], rays[j]) < min_side_rad:
                 continue
             for k in range(j + 1, base):
                 corners = np.array([i, j, k])
-                if _closest(seen, corners) >= least_rad:
+                if _shortest_side(rays, corners) >= min_side_rad:
                     return corners
     return np.full(3, -1)
 
 
 @jit
 def triplets(
-    seen: Floats, light: Floats, index: PairIndex, corners: NDArray, by: Rules, tried: NDArray
-) -> Found:
+    rays: Floats,
+    magnitudes: Floats,
+    index: PairIndex,
+    corners: NDArray,
+    options: SearchOptions,
+    tried: NDArray,
+) -> DirectMatch:
     """Test every triplet of candidates that fits an observed triangle by direct match, until one is accepted."""
-    sides = np.array(
-        [
-            angle(seen[corners[0]], seen[corners[1]]),
-            angle(seen[corners[0]], seen[corners[2]]),
-            angle(seen[corners[1]], seen[corners[2]]),
-        ]
-    )
+    i, j, k = corners
+    sides = np.array([angle(rays[i], rays[j]), angle(rays[i], rays[k]), angle(rays[j], rays[k])])
     if sides.max() > index.max_angle_rad:
-        return nothing()
-    slack = sqrt(2.0) * by.tolerance_rad + by.stretch * sides
-    if by.optimised:
-        return _by_neighbours(seen, light, index, corners, sides, slack, by, tried)
-    return _by_lists(seen, light, index, corners, sides, slack, by, tried)
+        return no_match()
+    tolerance = sqrt(2.0) * options.tolerance_rad + options.stretch * sides
+    if options.optimized:
+        return _test_neighbors(rays, magnitudes, index, corners, sides, tolerance, options, tried)
+    return _test_lists(rays, magnitudes, index, corners, sides, tolerance, options, tried)
 
 
 @jit
-def _accepted(
-    seen: Floats, index: PairIndex, corners: NDArray, stars: NDArray, by: Rules, tried: int
-) -> Found:
+def _direct_match(
+    rays: Floats, index: PairIndex, corners: NDArray, stars: NDArray, options: SearchOptions, tried: int
+) -> DirectMatch:
     """The second step: the direct match of one triplet; empty if too few stars match or it is not significant."""
-    found = settled(seen, index, corners, stars, by.tolerance_rad, by.stretch, tried)
-    if len(found[0]) <= by.share * len(seen) or found[3] > ACCEPT_LOG10_CHANCE:
-        return nothing()
-    return found
+    match = match_field(rays, index, corners, stars, options.tolerance_rad, options.stretch, tried)
+    if len(match.observed) <= options.min_fraction * len(rays) or match.log10_chance > ACCEPT_LOG10_CHANCE:
+        return no_match()
+    return match
 
 
 @jit
-def _candidate(index: PairIndex, star: int, magnitude: float, by: Rules) -> bool:
+def _candidate(index: PairIndex, star: int, magnitude: float, options: SearchOptions) -> bool:
     """Whether a star is within the magnitude gate and near enough to the prior boresight."""
-    if abs(index.magnitude[star] - magnitude) > by.gate_mag:  # False for NaN: an unknown magnitude passes
+    if abs(index.magnitude[star] - magnitude) > options.gate_mag:  # False for NaN: an unknown magnitude passes
         return False
     x, y, z = index.vectors[star]
-    return (x - by.x) ** 2 + (y - by.y) ** 2 + (z - by.z) ** 2 <= by.chord
+    return (x - options.x) ** 2 + (y - options.y) ** 2 + (z - options.z) ** 2 <= options.chord2
 
 
 @jit
-def _by_neighbours(
-    seen: Floats,
-    light: Floats,
+def _test_neighbors(
+    rays: Floats,
+    magnitudes: Floats,
     index: PairIndex,
     corners: NDArray,
     sides: Floats,
-    slack: Floats,
-    by: Rules,
+    tolerance: Floats,
+    options: SearchOptions,
     tried: NDArray,
-) -> Found:
+) -> DirectMatch:
     """The optimized assembly: the first list is a range of the sorted catalog, the others its stars' neighbors."""
     # For each candidate a of the first star: collect candidates b of the second at the angle of side 0, then test each
     # candidate c of the third at the angle of side 1 against all of them.
-    handed = triple(seen[corners[0]], seen[corners[1]], seen[corners[2]])
+    handedness = triple(rays[corners[0]], rays[corners[1]], rays[corners[2]])
     second = np.empty(len(index.vectors), np.int64)
-    begin, end = alike(index, light[corners[0]], by.gate_mag)
+    begin, end = magnitude_range(index, magnitudes[corners[0]], options.gate_mag)
     for a in range(begin, end):
-        if tried[1] >= by.checks:
+        if tried[1] >= options.checks:
             break
         tried[1] += 1
-        if not _candidate(index, a, light[corners[0]], by):
+        if not _candidate(index, a, magnitudes[corners[0]], options):
             continue
         count = 0
-        place = around(index, a, sides[0] - slack[0])
-        while place < index.first[a + 1] and index.separation_rad[place] <= sides[0] + slack[0]:
-            if _candidate(index, index.neighbour[place], light[corners[1]], by):
-                second[count] = index.neighbour[place]
+        place = first_neighbor(index, a, sides[0] - tolerance[0])
+        while place < index.first[a + 1] and index.separation_rad[place] <= sides[0] + tolerance[0]:
+            if _candidate(index, index.neighbor[place], magnitudes[corners[1]], options):
+                second[count] = index.neighbor[place]
                 count += 1
             place += 1
             tried[1] += 1
         if count == 0:
             continue
-        place = around(index, a, sides[1] - slack[1])
-        while place < index.first[a + 1] and index.separation_rad[place] <= sides[1] + slack[1]:
-            c = index.neighbour[place]
+        place = first_neighbor(index, a, sides[1] - tolerance[1])
+        while place < index.first[a + 1] and index.separation_rad[place] <= sides[1] + tolerance[1]:
+            c = index.neighbor[place]
             place += 1
             tried[1] += count
-            if not _candidate(index, c, light[corners[2]], by):
+            if not _candidate(index, c, magnitudes[corners[2]], options):
                 continue
             for b in second[:count]:
-                if abs(angle(index.vectors[b], index.vectors[c]) - sides[2]) > slack[2]:
+                if abs(angle(index.vectors[b], index.vectors[c]) - sides[2]) > tolerance[2]:
                     continue
-                if handed * triple(index.vectors[a], index.vectors[b], index.vectors[c]) <= 0:
+                if handedness * triple(index.vectors[a], index.vectors[b], index.vectors[c]) <= 0:
                     continue
                 tried[0] += 1
-                found = _accepted(seen, index, corners, np.array([a, b, c]), by, tried[0])
-                if found[3] <= ACCEPT_LOG10_CHANCE:
-                    return found
-    return nothing()
+                match = _direct_match(rays, index, corners, np.array([a, b, c]), options, tried[0])
+                if match.log10_chance <= ACCEPT_LOG10_CHANCE:
+                    return match
+    return no_match()
 
 
 @jit
-def _list(index: PairIndex, magnitude: float, by: Rules) -> NDArray:
+def _all_candidates(index: PairIndex, magnitude: float, options: SearchOptions) -> NDArray:
     """Candidates for one star, from the whole catalog."""
     out, count = np.empty(len(index.vectors), np.int64), 0
     for star in range(len(index.vectors)):
-        if _candidate(index, star, magnitude, by):
+        if _candidate(index, star, magnitude, options):
             out[count] = star
             count += 1
     return out[:count]
 
 
 @jit
-def _by_lists(
-    seen: Floats,
-    light: Floats,
+def _test_lists(
+    rays: Floats,
+    magnitudes: Floats,
     index: PairIndex,
     corners: NDArray,
     sides: Floats,
-    slack: Floats,
-    by: Rules,
+    tolerance: Floats,
+    options: SearchOptions,
     tried: NDArray,
-) -> Found:
+) -> DirectMatch:
     """The basic assembly: three lists, each from the whole catalog, and every triplet of them."""
-    first, second, third = (
-        _list(index, light[corners[0]], by),
-        _list(index, light[corners[1]], by),
-        _list(index, light[corners[2]], by),
-    )
-    handed = triple(seen[corners[0]], seen[corners[1]], seen[corners[2]])
+    first = _all_candidates(index, magnitudes[corners[0]], options)
+    second = _all_candidates(index, magnitudes[corners[1]], options)
+    third = _all_candidates(index, magnitudes[corners[2]], options)
+    handedness = triple(rays[corners[0]], rays[corners[1]], rays[corners[2]])
     vectors = index.vectors
     for a in first:
-        if tried[1] >= by.checks:
+        if tried[1] >= options.checks:
             break
         for b in second:
             tried[1] += 1
-            if abs(angle(vectors[a], vectors[b]) - sides[0]) > slack[0]:
+            if abs(angle(vectors[a], vectors[b]) - sides[0]) > tolerance[0]:
                 continue
             for c in third:
                 tried[1] += 1
-                if abs(angle(vectors[a], vectors[c]) - sides[1]) > slack[1]:
+                if abs(angle(vectors[a], vectors[c]) - sides[1]) > tolerance[1]:
                     continue
-                if abs(angle(vectors[b], vectors[c]) - sides[2]) > slack[2]:
+                if abs(angle(vectors[b], vectors[c]) - sides[2]) > tolerance[2]:
                     continue
-                if handed * triple(vectors[a], vectors[b], vectors[c]) <= 0:
+                if handedness * triple(vectors[a], vectors[b], vectors[c]) <= 0:
                     continue
                 tried[0] += 1
-                found = _accepted(seen, index, corners, np.array([a, b, c]), by, tried[0])
-                if found[3] <= ACCEPT_LOG10_CHANCE:
-                    return found
-    return nothing()
+                match = _direct_match(rays, index, corners, np.array([a, b, c]), options, tried[0])
+                if match.log10_chance <= ACCEPT_LOG10_CHANCE:
+                    return match
+    return no_match()

@@ -15,17 +15,17 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.catalog.pair_index import PairIndex, alike, around
+from estimator.catalog.pair_index import PairIndex, first_neighbor, magnitude_range
 from estimator.core.arrays import Floats
 from estimator.core.errors import ImageError
 from estimator.core.jit import jit
 from estimator.core.types import StarMatch
 from estimator.identification.chance import ACCEPT_LOG10_CHANCE, MIN_MATCHES
-from estimator.identification.direct_match import Found, angle, answer, nothing, settled
+from estimator.identification.direct_match import DirectMatch, angle, match_field, no_match, to_star_match
 from estimator.identification.options import Options
 
 
-class Rules(NamedTuple):
+class SearchOptions(NamedTuple):
     """Search parameters: tolerances as in `Options`, magnitude gate, number of masters, limit of angles compared."""
 
     tolerance_rad: float
@@ -48,95 +48,99 @@ def master_star(
     one less, is tested by direct match: its angle to a second star determines an attitude. Returns None if the match
     is not significant, or if a contradicting match is nearly as good, as on a lattice.
     """
-    asked = Options(**options)
-    asked.fixed_focal("master_star")
+    settings = Options(**options)
+    settings.require_known_focal("master_star")
     if not tolerance_rad > 0:
         raise ImageError(f"master_star: tolerance {tolerance_rad} rad; allowed: more than 0")
     count = len(vectors_cam)
     if count < MIN_MATCHES:
         return None
-    gate_mag = 3 * asked.epsilon_mag
-    by = Rules(tolerance_rad, asked.stretch, gate_mag, min(masters, count), asked.max_checks)
-    return answer(search(np.ascontiguousarray(vectors_cam), asked.light(count), index, by))
+    parameters = SearchOptions(
+        tolerance_rad, settings.stretch, 3 * settings.epsilon_mag, min(masters, count), settings.max_checks
+    )
+    rays = np.ascontiguousarray(vectors_cam)
+    return to_star_match(search(rays, settings.magnitudes(count), index, parameters))
 
 
 @jit
-def search(seen: Floats, light: Floats, index: PairIndex, by: Rules) -> Found:
+def search(rays: Floats, magnitudes: Floats, index: PairIndex, options: SearchOptions) -> DirectMatch:
     """Compiled search: rows of the observed stars and of the catalog, R_cam_from_ref, log10 of the chance."""
     tried = np.zeros(2, np.int64)  # assumed pairs, angles compared
-    for master in range(by.masters):
-        begin, end = alike(index, light[master], by.gate_mag)
-        repeated = np.zeros(end - begin, np.int64)
+    for master in range(options.masters):
+        begin, end = magnitude_range(index, magnitudes[master], options.gate_mag)
+        angle_counts = np.zeros(end - begin, np.int64)
         for candidate in range(begin, end):
-            repeated[candidate - begin] = _repeated(seen, index, master, candidate, by, tried)
-        if len(repeated) == 0 or repeated.max() < MIN_MATCHES - 1:
+            angle_counts[candidate - begin] = _count_angles(rays, index, master, candidate, options, tried)
+        if len(angle_counts) == 0 or angle_counts.max() < MIN_MATCHES - 1:
             continue
-        best, rival = nothing(), np.zeros(1)
+        best, rival = no_match(), np.zeros(1)
         # One angle less than the best is allowed: a false candidate can have an additional angle by chance.
-        for candidate in np.flatnonzero(repeated >= repeated.max() - 1) + begin:
-            best = _proved(seen, index, master, candidate, by, tried, best, rival)
-            if tried[1] >= by.checks:
+        for candidate in np.flatnonzero(angle_counts >= angle_counts.max() - 1) + begin:
+            best = _best_match(rays, index, master, candidate, options, tried, best, rival)
+            if tried[1] >= options.checks:
                 break
-        if best[3] <= ACCEPT_LOG10_CHANCE:
+        if best.log10_chance <= ACCEPT_LOG10_CHANCE:
             # A repetitive pattern has another match as good. The best must be 1e5 times less likely by chance.
-            return best if rival[0] > best[3] - ACCEPT_LOG10_CHANCE else nothing()
-    return nothing()
+            return best if rival[0] > best.log10_chance - ACCEPT_LOG10_CHANCE else no_match()
+    return no_match()
 
 
 @jit
-def _contradict(one: Found, other: Found) -> bool:
+def _contradict(first: DirectMatch, second: DirectMatch) -> bool:
     """Whether two matches identify an observed star differently."""
-    for n in range(len(one[0])):
-        for m in range(len(other[0])):
-            if one[0][n] == other[0][m] and one[1][n] != other[1][m]:
+    for n in range(len(first.observed)):
+        for m in range(len(second.observed)):
+            if first.observed[n] == second.observed[m] and first.star[n] != second.star[m]:
                 return True
     return False
 
 
 @jit
-def _repeated(seen: Floats, index: PairIndex, master: int, candidate: int, by: Rules, tried: NDArray) -> int:
+def _count_angles(
+    rays: Floats, index: PairIndex, master: int, candidate: int, options: SearchOptions, tried: NDArray
+) -> int:
     """Number of the master's angles that the candidate has to any of its neighbors."""
     count = 0
-    for n in range(len(seen)):
+    for n in range(len(rays)):
         if n == master:
             continue
-        side = angle(seen[master], seen[n])
-        slack = sqrt(2.0) * by.tolerance_rad + by.stretch * side
-        place = around(index, candidate, side - slack)
+        side = angle(rays[master], rays[n])
+        tolerance = sqrt(2.0) * options.tolerance_rad + options.stretch * side
+        place = first_neighbor(index, candidate, side - tolerance)
         tried[1] += 1
-        count += place < index.first[candidate + 1] and index.separation_rad[place] <= side + slack
+        count += place < index.first[candidate + 1] and index.separation_rad[place] <= side + tolerance
     return count
 
 
 @jit
-def _proved(
-    seen: Floats,
+def _best_match(
+    rays: Floats,
     index: PairIndex,
     master: int,
     candidate: int,
-    by: Rules,
+    options: SearchOptions,
     tried: NDArray,
-    best: Found,
+    best: DirectMatch,
     rival: Floats,
-) -> Found:
+) -> DirectMatch:
     """The better of `best` and the direct matches at the attitudes from the master and a second star.
 
     The second star is the farthest from the master, for its leverage, and each of the next three, in case it is false
     or not in the catalog. rival : (1,) least chance of a match that contradicts the best, updated in place.
     """
-    sides = np.array([angle(seen[master], seen[n]) for n in range(len(seen))])
-    for n in np.argsort(-sides)[: min(4, len(seen) - 1)]:
-        slack = sqrt(2.0) * by.tolerance_rad + by.stretch * sides[n]
-        place = around(index, candidate, sides[n] - slack)
-        while place < index.first[candidate + 1] and index.separation_rad[place] <= sides[n] + slack:
-            stars = np.array([candidate, index.neighbour[place]], np.int64)
+    sides = np.array([angle(rays[master], rays[n]) for n in range(len(rays))])
+    for n in np.argsort(-sides)[: min(4, len(rays) - 1)]:
+        tolerance = sqrt(2.0) * options.tolerance_rad + options.stretch * sides[n]
+        place = first_neighbor(index, candidate, sides[n] - tolerance)
+        while place < index.first[candidate + 1] and index.separation_rad[place] <= sides[n] + tolerance:
+            stars = np.array([candidate, index.neighbor[place]], np.int64)
             place += 1
             tried[0] += 1
-            tried[1] += len(seen)
+            tried[1] += len(rays)
             pair = np.array([master, n])
-            found = settled(seen, index, pair, stars, by.tolerance_rad, by.stretch, tried[0])
-            if len(found[0]) and _contradict(best, found):
-                rival[0] = min(rival[0], max(best[3], found[3]))
-            if found[3] < best[3]:
-                best = found
+            match = match_field(rays, index, pair, stars, options.tolerance_rad, options.stretch, tried[0])
+            if len(match.observed) and _contradict(best, match):
+                rival[0] = min(rival[0], max(best.log10_chance, match.log10_chance))
+            if match.log10_chance < best.log10_chance:
+                best = match
     return best

@@ -13,25 +13,32 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.catalog.pair_index import PairIndex, around, between
+from estimator.catalog.pair_index import PairIndex, first_neighbor, pair_range
 from estimator.core.arrays import Floats
 from estimator.core.jit import jit
 from estimator.core.types import StarMatch
 from estimator.identification.chance import ACCEPT_LOG10_CHANCE, MIN_MATCHES
-from estimator.identification.direct_match import Found, angle, answer, nothing, settled, triple
+from estimator.identification.direct_match import (
+    DirectMatch,
+    angle,
+    match_field,
+    no_match,
+    to_star_match,
+    triple,
+)
 from estimator.identification.options import Options
 
 
-class Rules(NamedTuple):
+class SearchOptions(NamedTuple):
     """Search parameters. A named tuple, because numba can compile functions that take one.
 
-    tolerance, stretch, zooms, triangles, checks, base, missed_dex : as in `Options`
+    tolerance, stretch, focal_unknown, triangles, checks, base, missed_dex : as in `Options`
     left, right, top, bottom : tangents of the sensor's edges from the boresight
     """
 
     tolerance: float
     stretch: float
-    zooms: bool
+    focal_unknown: bool
     triangles: int
     checks: int
     base: int
@@ -53,160 +60,160 @@ def pyramid(vectors_cam: Floats, index: PairIndex, tolerance_rad: float, **optio
     hypothesis: its attitude must match so many observed stars that, over all hypotheses tried, less than 1e-5 matches
     this good are expected by chance. Otherwise returns None.
     """
-    asked = Options(**options)
+    settings = Options(**options)
     if len(vectors_cam) < MIN_MATCHES:
         return None
-    rules = Rules(
+    parameters = SearchOptions(
         tolerance_rad,
-        asked.stretch,
-        asked.zooms,
-        asked.max_triangles,
-        asked.max_checks,
-        min(asked.base_stars, len(vectors_cam)),
-        asked.missed_dex,
-        *asked.field_tan,
+        settings.stretch,
+        settings.focal_unknown,
+        settings.max_triangles,
+        settings.max_checks,
+        min(settings.base_stars, len(vectors_cam)),
+        settings.missed_dex,
+        *settings.field_tan,
     )
-    return answer(_search(np.ascontiguousarray(vectors_cam), index, rules))
+    return to_star_match(_search(np.ascontiguousarray(vectors_cam), index, parameters))
 
 
 @jit
-def _search(seen: Floats, index: PairIndex, rules: Rules) -> Found:
+def _search(rays: Floats, index: PairIndex, options: SearchOptions) -> DirectMatch:
     """Try the triangles (i, i + dj, i + dj + dk) in the smart order; return the first significant match."""
     tried = np.zeros(3, np.int64)  # observed triangles, hypotheses, checks
-    for dj in range(1, rules.base - 1):
-        for dk in range(1, rules.base - dj):
-            for i in range(rules.base - dj - dk):
+    for dj in range(1, options.base - 1):
+        for dk in range(1, options.base - dj):
+            for i in range(options.base - dj - dk):
                 corners = np.array([i, i + dj, i + dj + dk])
-                found = _triangle(seen, index, corners, rules, tried)
-                if found[3] < ACCEPT_LOG10_CHANCE:
-                    return found
+                match = _triangle(rays, index, corners, options, tried)
+                if match.log10_chance < ACCEPT_LOG10_CHANCE:
+                    return match
                 tried[0] += 1
-                if tried[0] >= rules.triangles or tried[2] >= rules.checks:
-                    return nothing()
-    return nothing()
+                if tried[0] >= options.triangles or tried[2] >= options.checks:
+                    return no_match()
+    return no_match()
 
 
 @jit
-def _triangle(seen: Floats, index: PairIndex, corners: NDArray, rules: Rules, tried: NDArray) -> Found:
+def _triangle(rays: Floats, index: PairIndex, corners: NDArray, options: SearchOptions, tried: NDArray) -> DirectMatch:
     """Test every catalog triangle that fits an observed one in its sides and its handedness; needs a fourth star."""
     i, j, k = corners
-    ij, ik, jk = angle(seen[i], seen[j]), angle(seen[i], seen[k]), angle(seen[j], seen[k])
-    t_ij, t_ik, t_jk = sqrt(2.0) * rules.tolerance + rules.stretch * np.array([ij, ik, jk])
+    ij, ik, jk = angle(rays[i], rays[j]), angle(rays[i], rays[k]), angle(rays[j], rays[k])
+    t_ij, t_ik, t_jk = sqrt(2.0) * options.tolerance + options.stretch * np.array([ij, ik, jk])
     if min(ij, ik, jk) < 4 * t_ij or max(ij, ik, jk) > index.max_angle_rad:
-        return nothing()
+        return no_match()
     # If the three sides agree on one focal length, only the lens distortion remains of the stretch.
-    tight = rules.stretch / 3 if rules.zooms else rules.stretch
-    handed = triple(seen[i], seen[j], seen[k])
+    residual_stretch = options.stretch / 3 if options.focal_unknown else options.stretch
+    handedness = triple(rays[i], rays[j], rays[k])
     # Catalog pairs (a, b) for side ij, in both orders; then neighbors c of a for side ik; then side jk is tested.
-    begin, end = between(index, ij - t_ij, ij + t_ij)
+    begin, end = pair_range(index, ij - t_ij, ij + t_ij)
     for p in range(begin, end):
-        if tried[2] >= rules.checks:
+        if tried[2] >= options.checks:
             break
         side = index.angle_rad[p]
         if abs(side - ij) > t_ij:
             continue
         for flip in range(2):
             a, b = index.pair[p, flip], index.pair[p, 1 - flip]
-            place = around(index, a, ik - t_ik)
+            place = first_neighbor(index, a, ik - t_ik)
             while place < index.first[a + 1] and index.separation_rad[place] <= ik + t_ik:
-                c, near = index.neighbour[place], index.separation_rad[place]
+                c, side_ac = index.neighbor[place], index.separation_rad[place]
                 place += 1
                 tried[2] += 1
                 if index.group[c] == index.group[a] or index.group[c] == index.group[b]:
                     continue
-                far = angle(index.vectors[b], index.vectors[c])
-                if abs(far - jk) > t_jk:
+                side_bc = angle(index.vectors[b], index.vectors[c])
+                if abs(side_bc - jk) > t_jk:
                     continue
-                if handed * triple(index.vectors[a], index.vectors[b], index.vectors[c]) <= 0:
+                if handedness * triple(index.vectors[a], index.vectors[b], index.vectors[c]) <= 0:
                     continue
-                # One zoom for all three sides: here the assumed over the true focal length.
-                zoom = (side + near + far) / (ij + ik + jk) if rules.zooms else 1.0
-                slip = max(
-                    abs(side - zoom * ij) - tight * ij,
-                    abs(near - zoom * ik) - tight * ik,
-                    abs(far - zoom * jk) - tight * jk,
+                # One factor for all three sides: the assumed over the true focal length.
+                tangent_scale = (side + side_ac + side_bc) / (ij + ik + jk) if options.focal_unknown else 1.0
+                misfit = max(
+                    abs(side - tangent_scale * ij) - residual_stretch * ij,
+                    abs(side_ac - tangent_scale * ik) - residual_stretch * ik,
+                    abs(side_bc - tangent_scale * jk) - residual_stretch * jk,
                 )
-                if slip > sqrt(2.0) * rules.tolerance:
+                if misfit > sqrt(2.0) * options.tolerance:
                     continue
                 tried[1] += 1
-                zoomed = _zoomed(seen, zoom) if rules.zooms else seen
-                found = _pyramid(zoomed, index, corners, np.array([a, b, c]), rules, tight, tried)
-                if found[3] < ACCEPT_LOG10_CHANCE:
-                    return found
-    return nothing()
+                scaled = _scale_tangents(rays, tangent_scale) if options.focal_unknown else rays
+                match = _pyramid(scaled, index, corners, np.array([a, b, c]), options, residual_stretch, tried)
+                if match.log10_chance < ACCEPT_LOG10_CHANCE:
+                    return match
+    return no_match()
 
 
 @jit
 def _pyramid(
-    seen: Floats,
+    rays: Floats,
     index: PairIndex,
     corners: NDArray,
     stars: NDArray,
-    rules: Rules,
+    options: SearchOptions,
     stretch: float,
     tried: NDArray,
-) -> Found:
+) -> DirectMatch:
     """Find a fourth star that fits a triangle; if there is one, return the direct match."""
-    for r in range(rules.base):
+    for r in range(options.base):
         tried[2] += 1
         if r == corners[0] or r == corners[1] or r == corners[2]:
             continue
-        reach = angle(seen[corners[0]], seen[r])
-        slack = sqrt(2.0) * rules.tolerance + stretch * reach
-        place = around(index, stars[0], reach - slack)
-        while place < index.first[stars[0] + 1] and index.separation_rad[place] <= reach + slack:
-            d = index.neighbour[place]
+        reach = angle(rays[corners[0]], rays[r])
+        tolerance = sqrt(2.0) * options.tolerance + stretch * reach
+        place = first_neighbor(index, stars[0], reach - tolerance)
+        while place < index.first[stars[0] + 1] and index.separation_rad[place] <= reach + tolerance:
+            d = index.neighbor[place]
             place += 1
             fits = True
             for corner in range(1, 3):
-                side = angle(seen[corners[corner]], seen[r])
-                slip = abs(angle(index.vectors[stars[corner]], index.vectors[d]) - side)
-                fits = fits and slip <= sqrt(2.0) * rules.tolerance + stretch * side
+                side = angle(rays[corners[corner]], rays[r])
+                misfit = abs(angle(index.vectors[stars[corner]], index.vectors[d]) - side)
+                fits = fits and misfit <= sqrt(2.0) * options.tolerance + stretch * side
             if fits:
-                tried[2] += len(seen) * (index.first[stars[0] + 1] - index.first[stars[0]])
-                return _prove(seen, index, corners, stars, rules, stretch, tried[1])
-    return nothing()
+                tried[2] += len(rays) * (index.first[stars[0] + 1] - index.first[stars[0]])
+                return _match_with_penalty(rays, index, corners, stars, options, stretch, tried[1])
+    return no_match()
 
 
 @jit
-def _zoomed(seen: Floats, zoom: float) -> Floats:
-    """The directions with their tangents multiplied by zoom: those for a focal length shorter by that factor."""
-    out = np.empty_like(seen)
-    for n in range(len(seen)):
-        x, y = seen[n, 0] / seen[n, 2] * zoom, seen[n, 1] / seen[n, 2] * zoom
+def _scale_tangents(rays: Floats, factor: float) -> Floats:
+    """The directions with their tangents multiplied by a factor, by which the focal length is then shorter."""
+    out = np.empty_like(rays)
+    for n in range(len(rays)):
+        z = rays[n, 2]
+        x, y = rays[n, 0] / z * factor, rays[n, 1] / z * factor
         length = sqrt(x * x + y * y + 1)
         out[n, 0], out[n, 1], out[n, 2] = x / length, y / length, 1 / length
     return out
 
 
 @jit
-def _prove(
-    seen: Floats,
+def _match_with_penalty(
+    rays: Floats,
     index: PairIndex,
     corners: NDArray,
     stars: NDArray,
-    rules: Rules,
+    options: SearchOptions,
     stretch: float,
     hypotheses: int,
-) -> Found:
+) -> DirectMatch:
     """The direct match of the whole field, with a penalty of missed_dex for each catalog star that is missing."""
-    observed, star, matrix, chance = settled(
-        seen, index, corners, stars, rules.tolerance, stretch, hypotheses
-    )
-    if len(observed) and rules.missed_dex > 0:
-        missed = max(_expected(index, stars[0], matrix, rules) - len(observed), 0)
-        chance += rules.missed_dex * missed
-    return observed, star, matrix, chance
+    match = match_field(rays, index, corners, stars, options.tolerance, stretch, hypotheses)
+    if len(match.observed) == 0 or options.missed_dex <= 0:
+        return match
+    missing = max(_count_in_field(index, stars[0], match.R_cam_from_ref, options) - len(match.observed), 0)
+    chance = match.log10_chance + options.missed_dex * missing
+    return DirectMatch(match.observed, match.star, match.R_cam_from_ref, chance)
 
 
 @jit
-def _expected(index: PairIndex, centre: int, matrix: Floats, rules: Rules) -> int:
-    """Number of catalog stars in the field at an attitude; `centre` is a star whose neighbors are tested."""
+def _count_in_field(index: PairIndex, center: int, R_cam_from_ref: Floats, options: SearchOptions) -> int:
+    """Number of catalog stars in the field at an attitude; `center` is a star whose neighbors are tested."""
     count = 0
-    begin, end = index.first[centre], index.first[centre + 1]
+    begin, end = index.first[center], index.first[center + 1]
     for place in range(begin - 1, end):
-        s = centre if place < begin else index.neighbour[place]
-        x, y, z = matrix @ index.vectors[s]
-        inside = z > 0 and rules.left * z < x < rules.right * z and rules.top * z < y < rules.bottom * z
-        count += inside
+        s = center if place < begin else index.neighbor[place]
+        x, y, z = R_cam_from_ref @ index.vectors[s]
+        inside = options.left * z < x < options.right * z and options.top * z < y < options.bottom * z
+        count += z > 0 and inside
     return count

@@ -14,7 +14,7 @@ from estimator.identification.direct_match import angle
 
 # Cost of an observed star without a partner, in squared standard deviations; a bad partner costs no more. 16 is four
 # standard deviations: it corresponds to a probability of one in three thousand that a star has no partner.
-UNMATCHED = 16.0
+UNMATCHED_COST = 16.0
 
 
 class Gates(NamedTuple):
@@ -29,16 +29,16 @@ class Gates(NamedTuple):
     stretch: float
 
 
-class Sky(NamedTuple):
+class SearchInput(NamedTuple):
     """The observed stars, brightest first, the catalog, and the gates.
 
-    seen, vectors    : (N, 3) observed unit vectors, camera axes;  (M, 3) catalog unit vectors, reference axes
-    light, magnitude : (N,), (M,) their magnitudes, NaN if unknown
-    cells            : spatial grid of the catalog's directions
+    vectors_cam, vectors     : (N, 3) observed unit vectors, camera axes;  (M, 3) of the catalog, reference axes
+    magnitude_cam, magnitude : (N,), (M,) their magnitudes, NaN if unknown
+    cells                    : spatial grid of the catalog's directions
     """
 
-    seen: Floats
-    light: Floats
+    vectors_cam: Floats
+    magnitude_cam: Floats
     vectors: Floats
     magnitude: Floats
     cells: Cells
@@ -48,16 +48,16 @@ class Sky(NamedTuple):
 class Primary(NamedTuple):
     """The primary pair A, B, and the geometry of the X other stars about it.
 
-    rows, triad : (2,) rows of the observed stars;  (3, 3) see `triad`;  middle : (3,) unit vector halfway
+    rows, triad : (2,) rows of the observed stars;  (3, 3) see `triad`;  midpoint : (3,) unit vector halfway
     others      : (X,) rows;  corner_rad, gate_rad : (2, X) their angles from A and from B, and the gates of these
     sigma_rad, radius_rad : (X,) standard deviation of the predicted position and its gate
     area_sr     : (X,) area inside all gates
-    reach_rad   : greatest angle of an observed star from the middle, with a gate added
+    reach_rad   : greatest angle of an observed star from the midpoint, with a gate added
     """
 
     rows: Ints
     triad: Floats
-    middle: Floats
+    midpoint: Floats
     others: Ints
     corner_rad: Floats
     gate_rad: Floats
@@ -89,31 +89,31 @@ def triad(a: Floats, b: Floats) -> Floats:
 
 
 @jit
-def primary_of(sky: Sky, row_a: int, row_b: int) -> Primary:
+def build_primary(stars: SearchInput, row_a: int, row_b: int) -> Primary:
     """The geometry that the direct match needs of an observed pair; it is the same for all its assumptions.
 
     The thesis's position gate is 3 epsilon_position everywhere. Needelman's epsilon_position(S) includes the error of
     the pair's attitude: with noise sigma, a pair of separation b rotates by sqrt(2) sigma / b and shifts by
     sigma / sqrt(2). At distance d from its middle the variance is sigma^2 (1 + 1/2 + 2 d^2 / b^2), which is used here.
     """
-    gates, seen = sky.gates, sky.seen
-    a, b, count = seen[row_a], seen[row_b], len(seen) - 2
-    middle = (a + b) / np.sqrt(np.sum((a + b) ** 2))
+    gates, vectors_cam = stars.gates, stars.vectors_cam
+    a, b, count = vectors_cam[row_a], vectors_cam[row_b], len(vectors_cam) - 2
+    midpoint = (a + b) / np.sqrt(np.sum((a + b) ** 2))
     base_rad, reach_rad = angle(a, b), 0.0
     others, corner, gate = np.empty(count, np.int64), np.empty((2, count)), np.empty((2, count))
     sigma, radius, area = np.empty(count), np.empty(count), np.empty(count)
     k = 0
-    for n in range(len(seen)):
-        x = seen[n]
-        from_middle = angle(x, middle)
-        reach_rad = max(reach_rad, from_middle)
+    for n in range(len(vectors_cam)):
+        x = vectors_cam[n]
+        from_midpoint_rad = angle(x, midpoint)
+        reach_rad = max(reach_rad, from_midpoint_rad)
         if n in (row_a, row_b):
             continue
         others[k] = n
         corner[0, k], corner[1, k] = angle(x, a), angle(x, b)
         gate[0, k], gate[1, k] = gate_rad(gates, corner[0, k]), gate_rad(gates, corner[1, k])
-        sigma[k] = gates.position_rad * np.sqrt(1.5 + 2 * (from_middle / base_rad) ** 2)
-        radius[k] = 3 * sigma[k] + gates.stretch * from_middle
+        sigma[k] = gates.position_rad * np.sqrt(1.5 + 2 * (from_midpoint_rad / base_rad) ** 2)
+        radius[k] = 3 * sigma[k] + gates.stretch * from_midpoint_rad
         # The rings about A and B, of the gates' widths, cross at X in a rhombus; its angle is that of A and B seen
         # from X.
         sides = max(corner[0, k] * corner[1, k], 1e-20)
@@ -123,98 +123,104 @@ def primary_of(sky: Sky, row_a: int, row_b: int) -> Primary:
         k += 1
     rows = np.array([row_a, row_b])
     reach_rad += gate_rad(gates, 0.0)
-    return Primary(rows, triad(a, b), middle, others, corner, gate, sigma, radius, area, reach_rad)
+    return Primary(rows, triad(a, b), midpoint, others, corner, gate, sigma, radius, area, reach_rad)
 
 
 @jit
-def magnitude_cost(sky: Sky, observed: int, star: int) -> float:
+def magnitude_cost(stars: SearchInput, observed: int, star: int) -> float:
     """Squared deviation of a magnitude in standard deviations, inf beyond three; 0 if it is unknown."""
-    off = (sky.light[observed] - sky.magnitude[star]) / sky.gates.magnitude
-    if np.isnan(off):
+    deviation = (stars.magnitude_cam[observed] - stars.magnitude[star]) / stars.gates.magnitude
+    if np.isnan(deviation):
         return 0.0
-    return off * off if abs(off) <= 3 else np.inf
+    return deviation * deviation if abs(deviation) <= 3 else np.inf
 
 
 @jit
-def matched(sky: Sky, primary: Primary, pairs: NDArray) -> tuple[NDArray, Floats, Ints]:
+def match_assumptions(stars: SearchInput, primary: Primary, pairs: NDArray) -> tuple[NDArray, Floats, Ints]:
     """Steps 3 to 7: every assumption from the catalog's (K, 2) pairs, in both orders.
 
     Returns for each assumption (N,) catalog rows of the observed stars (-1: none), the cost, and the number of matches
     beside the pair. Pairs outside the gate, at the ends of a bucket or of a k-vector step, are skipped.
     """
     a, b = primary.rows
-    apart = angle(sky.seen[a], sky.seen[b])
-    gate, count = gate_rad(sky.gates, apart), 0
-    star = np.empty((2 * len(pairs), len(sky.seen)), np.int32)
-    cost, hits = np.empty(2 * len(pairs)), np.empty(2 * len(pairs), np.int64)
-    near = np.empty(len(sky.vectors), np.int64)
-    partner, spent = np.empty(len(primary.others), np.int64), np.empty(len(primary.others))
+    separation_rad = angle(stars.vectors_cam[a], stars.vectors_cam[b])
+    gate, count = gate_rad(stars.gates, separation_rad), 0
+    star = np.empty((2 * len(pairs), len(stars.vectors_cam)), np.int32)
+    cost, matches = np.empty(2 * len(pairs)), np.empty(2 * len(pairs), np.int64)
+    nearby = np.empty(len(stars.vectors), np.int64)
+    partner, partner_cost = np.empty(len(primary.others), np.int64), np.empty(len(primary.others))
     for p in range(len(pairs)):
-        slip = abs(angle(sky.vectors[pairs[p, 0]], sky.vectors[pairs[p, 1]]) - apart)
-        if slip > gate:
+        misfit = abs(angle(stars.vectors[pairs[p, 0]], stars.vectors[pairs[p, 1]]) - separation_rad)
+        if misfit > gate:
             continue
         for flip in range(2):
             first, second = pairs[p, flip], pairs[p, 1 - flip]
-            light_a, light_b = magnitude_cost(sky, a, first), magnitude_cost(sky, b, second)
-            if not np.isfinite(light_a + light_b):
+            cost_a, cost_b = magnitude_cost(stars, a, first), magnitude_cost(stars, b, second)
+            if not np.isfinite(cost_a + cost_b):
                 continue
             star[count] = -1
             star[count, a], star[count, b] = first, second
-            total = (slip / sky.gates.separation_rad) ** 2 + light_a + light_b
-            _partners(sky, primary, first, second, near, partner, spent)
-            hits[count] = _each_once(partner, spent)
+            total = (misfit / stars.gates.separation_rad) ** 2 + cost_a + cost_b
+            _partners(stars, primary, first, second, nearby, partner, partner_cost)
+            matches[count] = _remove_duplicates(partner, partner_cost)
             for k in range(len(partner)):
                 star[count, primary.others[k]] = partner[k]
-                total += min(spent[k], UNMATCHED)
+                total += min(partner_cost[k], UNMATCHED_COST)
             cost[count] = total
             count += 1
-    return star[:count], cost[:count], hits[:count]
+    return star[:count], cost[:count], matches[:count]
 
 
 @jit
 def _partners(
-    sky: Sky, primary: Primary, first: int, second: int, near: NDArray, partner: NDArray, spent: Floats
+    stars: SearchInput,
+    primary: Primary,
+    first: int,
+    second: int,
+    nearby: NDArray,
+    partner: NDArray,
+    partner_cost: Floats,
 ) -> None:
     """Steps 5 and 6: the pair's attitude, and for each other star its partner (-1: none) and its cost, in place.
 
     Section 2.4.5's four conditions: magnitude, position, and the angles to A and to B. The position distinguishes a
     star from its mirror image about the line A B, which the two angles cannot.
     """
-    stars = triad(sky.vectors[first], sky.vectors[second])
+    triad_ref = triad(stars.vectors[first], stars.vectors[second])
     R = np.empty((3, 3))  # R_ref_from_cam
     for i in range(3):
         for j in range(3):
             R[i, j] = (
-                stars[0, i] * primary.triad[0, j]
-                + stars[1, i] * primary.triad[1, j]
-                + stars[2, i] * primary.triad[2, j]
+                triad_ref[0, i] * primary.triad[0, j]
+                + triad_ref[1, i] * primary.triad[1, j]
+                + triad_ref[2, i] * primary.triad[2, j]
             )
     for k in range(len(primary.others)):
-        u, v, w = sky.seen[primary.others[k]]
+        u, v, w = stars.vectors_cam[primary.others[k]]
         x = R[0, 0] * u + R[0, 1] * v + R[0, 2] * w
         y = R[1, 0] * u + R[1, 1] * v + R[1, 2] * w
         z = R[2, 0] * u + R[2, 1] * v + R[2, 2] * w
-        reach = 2 * np.sin(min(primary.radius_rad[k], np.pi) / 2)
-        partner[k], spent[k] = -1, UNMATCHED
+        chord = 2 * np.sin(min(primary.radius_rad[k], np.pi) / 2)
+        partner[k], partner_cost[k] = -1, UNMATCHED_COST
         least = np.inf
-        for s in near[: within(sky.cells, sky.vectors, x, y, z, reach, near)]:
+        for s in nearby[: within(stars.cells, stars.vectors, x, y, z, chord, nearby)]:
             if s in (first, second):
                 continue
-            cost = magnitude_cost(sky, primary.others[k], s)
-            slip_a = abs(primary.corner_rad[0, k] - angle(sky.vectors[s], sky.vectors[first]))
-            slip_b = abs(primary.corner_rad[1, k] - angle(sky.vectors[s], sky.vectors[second]))
-            if slip_a > primary.gate_rad[0, k] or slip_b > primary.gate_rad[1, k]:
+            cost = magnitude_cost(stars, primary.others[k], s)
+            misfit_a = abs(primary.corner_rad[0, k] - angle(stars.vectors[s], stars.vectors[first]))
+            misfit_b = abs(primary.corner_rad[1, k] - angle(stars.vectors[s], stars.vectors[second]))
+            if misfit_a > primary.gate_rad[0, k] or misfit_b > primary.gate_rad[1, k]:
                 continue
-            cost += (slip_a**2 + slip_b**2) / sky.gates.separation_rad**2
-            dx, dy, dz = sky.vectors[s, 0] - x, sky.vectors[s, 1] - y, sky.vectors[s, 2] - z
+            cost += (misfit_a**2 + misfit_b**2) / stars.gates.separation_rad**2
+            dx, dy, dz = stars.vectors[s, 0] - x, stars.vectors[s, 1] - y, stars.vectors[s, 2] - z
             # The position decides between several partners, but is not part of the assumption's cost.
-            place = (dx * dx + dy * dy + dz * dz) / primary.sigma_rad[k] ** 2
-            if cost + place < least:
-                least, partner[k], spent[k] = cost + place, s, cost
+            position_cost = (dx * dx + dy * dy + dz * dz) / primary.sigma_rad[k] ** 2
+            if cost + position_cost < least:
+                least, partner[k], partner_cost[k] = cost + position_cost, s, cost
 
 
 @jit
-def _each_once(partner: NDArray, spent: Floats) -> int:
+def _remove_duplicates(partner: NDArray, partner_cost: Floats) -> int:
     """If two observed stars have the same partner, the one of less cost keeps it; returns the number of matches."""
     count = 0
     for k in range(len(partner)):
@@ -223,23 +229,23 @@ def _each_once(partner: NDArray, spent: Floats) -> int:
         count += 1
         for m in range(k):
             if partner[m] == partner[k]:
-                loser = k if spent[m] <= spent[k] else m
-                partner[loser], spent[loser] = -1, UNMATCHED
+                loser = k if partner_cost[m] <= partner_cost[k] else m
+                partner[loser], partner_cost[loser] = -1, UNMATCHED_COST
                 count -= 1
                 break
     return count
 
 
 @jit
-def contradicting(star: NDArray, cost: Floats, hits: NDArray, best: NDArray, doubts: Floats) -> None:
+def add_contradictions(star: NDArray, cost: Floats, matches: NDArray, best: NDArray, contradictions: Floats) -> None:
     """Accumulate the assumptions that identify an observed star differently from the best one.
 
-    doubts : (3,) their number, the sum of their matches and their least cost, updated in place
+    contradictions: (3,) their number, the sum of their matches and their least cost, updated in place
     """
     for n in range(len(cost)):
         for m in range(len(best)):
             if star[n, m] >= 0 and best[m] >= 0 and star[n, m] != best[m]:
-                doubts[0] += 1
-                doubts[1] += hits[n]
-                doubts[2] = min(doubts[2], cost[n])
+                contradictions[0] += 1
+                contradictions[1] += matches[n]
+                contradictions[2] = min(contradictions[2], cost[n])
                 break

@@ -11,20 +11,28 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.catalog.pair_index import PairIndex, around, between
+from estimator.catalog.pair_index import PairIndex, first_neighbor, pair_range
 from estimator.core.arrays import Floats
 from estimator.core.errors import ImageError
 from estimator.core.jit import jit
 from estimator.core.types import StarMatch
 from estimator.identification.chance import ACCEPT_LOG10_CHANCE, MIN_MATCHES, log10_tail
-from estimator.identification.direct_match import Found, angle, answer, nothing, triple, turned
+from estimator.identification.direct_match import (
+    DirectMatch,
+    angle,
+    fit_rotation,
+    no_match,
+    to_star_match,
+    triple,
+)
 from estimator.identification.options import Options
 
 FOURTH_STAR = 1e300  # the paper's own rule: "it is already certain that a success will occur"
-APART = 6.0  # least angle between base stars, and from them, in tolerances: smaller angles carry little information
+# Least angle between base stars, and from them, in tolerances: smaller angles carry little information.
+MIN_SIDE_TOLERANCES = 6.0
 
 
-class Rules(NamedTuple):
+class SearchOptions(NamedTuple):
     """Search parameters: cosError, a direction's tolerance, and the limits of the effort (see `Options`).
 
     accept : log10 of the chance at which a match is accepted; FOURTH_STAR accepts any match with a fourth star
@@ -44,7 +52,7 @@ def cos_error(fov_rad: float, centroid_error_rad: float, factor: float = 1.0) ->
 
 
 @jit
-def gate(angle_rad: float, cos_error: float) -> tuple[float, float]:
+def angle_interval(angle_rad: float, cos_error: float) -> tuple[float, float]:
     """Interval of angles whose cosines differ by at most cosError from that of an angle: eqs 4, 5 with correct signs.
 
     Computed with cos a = 1 - 2 sin^2(a / 2), which is accurate for small angles.
@@ -64,137 +72,133 @@ def shefex(vectors_cam: Floats, index: PairIndex, tolerance_rad: float, **option
     the triangle, the positions at the attitude found, and significance. The paper accepts any fourth star; here a
     match this good must be expected less than 1e-5 times by chance over all triangles tried. Otherwise returns None.
     """
-    asked = Options(**options)
-    asked.fixed_focal("shefex")
+    settings = Options(**options)
+    settings.require_known_focal("shefex")
     if not tolerance_rad > 0:
         raise ImageError(f"shefex: tolerance {tolerance_rad} rad; allowed: more than 0")
     if len(vectors_cam) < MIN_MATCHES:
         return None
-    slack_rad = tolerance_rad + asked.stretch * index.max_angle_rad
-    error = cos_error(index.max_angle_rad, slack_rad)
-    base = min(asked.base_stars, len(vectors_cam))
-    by = Rules(error, slack_rad, asked.max_triangles, asked.max_checks, base)
-    return answer(search(np.ascontiguousarray(vectors_cam), index, by))
+    tolerance_rad += settings.stretch * index.max_angle_rad
+    error = cos_error(index.max_angle_rad, tolerance_rad)
+    base = min(settings.base_stars, len(vectors_cam))
+    parameters = SearchOptions(error, tolerance_rad, settings.max_triangles, settings.max_checks, base)
+    tried = np.zeros(3, np.int64)
+    return to_star_match(search(np.ascontiguousarray(vectors_cam), index, parameters, tried))
 
 
 @jit
-def search(seen: Floats, index: PairIndex, by: Rules) -> Found:
-    """Compiled search: rows of the observed stars and of the catalog, R_cam_from_ref, log10 of the chance."""
-    return sought(seen, index, by, np.zeros(3, np.int64))
-
-
-@jit
-def sought(seen: Floats, index: PairIndex, by: Rules, tried: NDArray) -> Found:
-    """As `search`; adds its effort to (3,) tried: base triangles found, angles compared, observed triangles."""
-    for i in range(by.base - 2):
-        for j in range(i + 1, by.base - 1):
-            for k in range(j + 1, by.base):
-                if tried[2] >= by.triangles or tried[1] >= by.checks:
-                    return nothing()
+def search(rays: Floats, index: PairIndex, options: SearchOptions, tried: NDArray) -> DirectMatch:
+    """Compiled search. Adds its effort to (3,) tried: base triangles found, angles compared, observed triangles."""
+    for i in range(options.base - 2):
+        for j in range(i + 1, options.base - 1):
+            for k in range(j + 1, options.base):
+                if tried[2] >= options.triangles or tried[1] >= options.checks:
+                    return no_match()
                 tried[2] += 1
-                found = _triangle(seen, index, np.array([i, j, k]), by, tried)
-                if len(found[0]) and found[3] <= by.accept:
-                    return found
-    return nothing()
+                match = _triangle(rays, index, np.array([i, j, k]), options, tried)
+                if len(match.observed) and match.log10_chance <= options.accept:
+                    return match
+    return no_match()
 
 
 @jit
-def _triangle(seen: Floats, index: PairIndex, corners: NDArray, by: Rules, tried: NDArray) -> Found:
+def _triangle(rays: Floats, index: PairIndex, corners: NDArray, options: SearchOptions, tried: NDArray) -> DirectMatch:
     """Test every catalog triangle that fits an observed one; other stars are identified by their angles to it."""
     i, j, k = corners
-    ij, ik, jk = angle(seen[i], seen[j]), angle(seen[i], seen[k]), angle(seen[j], seen[k])
-    if min(ij, ik, jk) < APART * by.tolerance_rad or max(ij, ik, jk) > index.max_angle_rad:
-        return nothing()
-    handed = triple(seen[i], seen[j], seen[k])
-    low, high = gate(ij, by.cos_error)
-    near_low, near_high = gate(ik, by.cos_error)
-    far_low, far_high = gate(jk, by.cos_error)
-    rings = _rings(seen, corners, by)
+    ij, ik, jk = angle(rays[i], rays[j]), angle(rays[i], rays[k]), angle(rays[j], rays[k])
+    if min(ij, ik, jk) < MIN_SIDE_TOLERANCES * options.tolerance_rad or max(ij, ik, jk) > index.max_angle_rad:
+        return no_match()
+    handedness = triple(rays[i], rays[j], rays[k])
+    low, high = angle_interval(ij, options.cos_error)
+    low_ik, high_ik = angle_interval(ik, options.cos_error)
+    low_jk, high_jk = angle_interval(jk, options.cos_error)
+    gates = _angle_gates(rays, corners, options)
     # Catalog pairs (a, b) for side ij, in both orders; then neighbors c of a for side ik; then side jk is tested.
-    begin, end = between(index, low, high)
+    begin, end = pair_range(index, low, high)
     for p in range(begin, end):
-        if tried[1] >= by.checks:
+        if tried[1] >= options.checks:
             break
         if not low <= index.angle_rad[p] <= high:
             continue
         for flip in range(2):
             a, b = index.pair[p, flip], index.pair[p, 1 - flip]
-            place = around(index, a, near_low)
-            while place < index.first[a + 1] and index.separation_rad[place] <= near_high:
-                c = index.neighbour[place]
+            place = first_neighbor(index, a, low_ik)
+            while place < index.first[a + 1] and index.separation_rad[place] <= high_ik:
+                c = index.neighbor[place]
                 place += 1
                 tried[1] += 1
-                if not far_low <= angle(index.vectors[b], index.vectors[c]) <= far_high:
+                if not low_jk <= angle(index.vectors[b], index.vectors[c]) <= high_jk:
                     continue
-                if handed * triple(index.vectors[a], index.vectors[b], index.vectors[c]) <= 0:
+                if handedness * triple(index.vectors[a], index.vectors[b], index.vectors[c]) <= 0:
                     continue
                 tried[0] += 1
-                found = _rest(seen, index, corners, np.array([a, b, c], np.int64), rings, by, tried)
-                if len(found[0]) and found[3] <= by.accept:
-                    return found
-    return nothing()
+                match = _match_others(rays, index, corners, np.array([a, b, c], np.int64), gates, options, tried)
+                if len(match.observed) and match.log10_chance <= options.accept:
+                    return match
+    return no_match()
 
 
 @jit
-def _rings(seen: Floats, corners: NDArray, by: Rules) -> Floats:
+def _angle_gates(rays: Floats, corners: NDArray, options: SearchOptions) -> Floats:
     """(N, 10) gates of each observed star's three angles to the base: lower ends, upper ends, cosines, and the area.
 
     The area inside the gates is 0 for base stars and for stars too close to one; these are not identified.
     """
-    rings, side = np.zeros((len(seen), 10)), np.empty(3)
-    for n in range(len(seen)):
+    gates, side = np.zeros((len(rays), 10)), np.empty(3)
+    for n in range(len(rays)):
         for m in range(3):
-            side[m] = angle(seen[corners[m]], seen[n])
-            rings[n, m], rings[n, 3 + m] = gate(side[m], by.cos_error)
-            rings[n, 6 + m] = np.cos(side[m])
-        if side.min() >= APART * by.tolerance_rad:
-            rings[n, 9] = _crossing(seen, corners, n, side, rings[n, 3:6] - rings[n, :3])
-    return rings
+            side[m] = angle(rays[corners[m]], rays[n])
+            gates[n, m], gates[n, 3 + m] = angle_interval(side[m], options.cos_error)
+            gates[n, 6 + m] = np.cos(side[m])
+        if side.min() >= MIN_SIDE_TOLERANCES * options.tolerance_rad:
+            gates[n, 9] = _gate_area(rays, corners, n, side, gates[n, 3:6] - gates[n, :3])
+    return gates
 
 
 @jit
-def _rest(
-    seen: Floats,
+def _match_others(
+    rays: Floats,
     index: PairIndex,
     corners: NDArray,
     stars: NDArray,
-    rings: Floats,
-    by: Rules,
+    gates: Floats,
+    options: SearchOptions,
     tried: NDArray,
-) -> Found:
+) -> DirectMatch:
     """Identify the other stars by their angles to the base triangle, then keep those near their predicted positions.
 
     The second test rejects mirror images, which a slim base, or stars in line with it, cannot distinguish by angles.
     """
-    observed, star = np.empty(len(seen), np.int64), np.empty(len(seen), np.int64)
+    observed, star = np.empty(len(rays), np.int64), np.empty(len(rays), np.int64)
     observed[:3], star[:3] = corners, stars
     count = 3
-    for n in range(len(seen)):
-        s = _partner(seen, index, corners, stars, n, rings[n], tried) if rings[n, 9] > 0 else -1
+    for n in range(len(rays)):
+        s = _partner(rays, index, corners, stars, n, gates[n], tried) if gates[n, 9] > 0 else -1
         if s >= 0 and not (star[:count] == s).any():
             observed[count], star[count] = n, s
             count += 1
     if count < MIN_MATCHES:
-        return nothing()
+        return no_match()
     observed, star = observed[:count], star[:count]
-    matrix = turned(seen[observed], index.vectors[star])
-    kept = np.empty(count, np.bool_)
+    R_cam_from_ref = fit_rotation(rays[observed], index.vectors[star])
+    is_near = np.empty(count, np.bool_)
     for n in range(count):
-        kept[n] = angle(matrix @ index.vectors[star[n]], seen[observed[n]]) <= 2 * by.tolerance_rad
-    observed, star, count = observed[kept], star[kept], kept.sum()
+        predicted = R_cam_from_ref @ index.vectors[star[n]]
+        is_near[n] = angle(predicted, rays[observed[n]]) <= 2 * options.tolerance_rad
+    observed, star, count = observed[is_near], star[is_near], is_near.sum()
     if count < MIN_MATCHES:
-        return nothing()
+        return no_match()
     # Probability that a random direction falls into the gates of an observed star, from the local catalog density.
     cap_sr = 2 * np.pi * (1 - np.cos(index.max_angle_rad))
     density = (index.first[stars[0] + 1] - index.first[stars[0]] + 1) / cap_sr
-    p = 1 - np.exp(-density * rings[:, 9].sum() / (len(seen) - 3))
-    chance = log10_tail(len(seen) - 3, count - 3, p) + np.log10(tried[0])
-    return observed, star, turned(seen[observed], index.vectors[star]), chance
+    p = 1 - np.exp(-density * gates[:, 9].sum() / (len(rays) - 3))
+    chance = log10_tail(len(rays) - 3, count - 3, p) + np.log10(tried[0])
+    return DirectMatch(observed, star, fit_rotation(rays[observed], index.vectors[star]), chance)
 
 
 @jit
 def _partner(
-    seen: Floats, index: PairIndex, corners: NDArray, stars: NDArray, n: int, ring: Floats, tried: NDArray
+    rays: Floats, index: PairIndex, corners: NDArray, stars: NDArray, n: int, gate: Floats, tried: NDArray
 ) -> int:
     """The catalog star whose three angles to the base fit those of observed star n, or -1.
 
@@ -202,40 +206,40 @@ def _partner(
     position from its mirror image, so that the side of the base line is tested too.
     """
     best, least = -1, np.inf
-    place = around(index, stars[0], ring[0])
+    place = first_neighbor(index, stars[0], gate[0])
     tried[1] += 3
-    while place < index.first[stars[0] + 1] and index.separation_rad[place] <= ring[3]:
-        d = index.neighbour[place]
-        off = abs(np.cos(index.separation_rad[place]) - ring[6])
+    while place < index.first[stars[0] + 1] and index.separation_rad[place] <= gate[3]:
+        d = index.neighbor[place]
+        difference = abs(np.cos(index.separation_rad[place]) - gate[6])
         place += 1
         tried[1] += 1
         fits = d != stars[1] and d != stars[2]
         for m in range(1, 3):
             if not fits:
                 break
-            apart = angle(index.vectors[stars[m]], index.vectors[d])
-            fits = ring[m] <= apart <= ring[3 + m]
-            off += abs(np.cos(apart) - ring[6 + m])
-        if fits and off < least and _same_side(seen, index, corners, stars, n, d):
-            best, least = d, off
+            side = angle(index.vectors[stars[m]], index.vectors[d])
+            fits = gate[m] <= side <= gate[3 + m]
+            difference += abs(np.cos(side) - gate[6 + m])
+        if fits and difference < least and _same_side(rays, index, corners, stars, n, d):
+            best, least = d, difference
     return best
 
 
 @jit
-def _same_side(seen: Floats, index: PairIndex, corners: NDArray, stars: NDArray, n: int, d: int) -> bool:
+def _same_side(rays: Floats, index: PairIndex, corners: NDArray, stars: NDArray, n: int, d: int) -> bool:
     """Whether observed star n and catalog star d are on the same side of the base line farthest from the star."""
     best, product = 0.0, 1.0
     for m in range(3):
         a, b = m, (m + 1) % 3
-        here = triple(seen[corners[a]], seen[corners[b]], seen[n])
-        if abs(here) > best:
-            best = abs(here)
-            product = here * triple(index.vectors[stars[a]], index.vectors[stars[b]], index.vectors[d])
+        volume = triple(rays[corners[a]], rays[corners[b]], rays[n])
+        if abs(volume) > best:
+            best = abs(volume)
+            product = volume * triple(index.vectors[stars[a]], index.vectors[stars[b]], index.vectors[d])
     return product > 0
 
 
 @jit
-def _crossing(seen: Floats, corners: NDArray, n: int, side: Floats, width: Floats) -> float:
+def _gate_area(rays: Floats, corners: NDArray, n: int, side: Floats, width: Floats) -> float:
     """The least area of the three rhombi in which two rings about base stars cross at a star, in steradians.
 
     The rings cross at the angle between the two base stars as seen from the star; its sine is the triple product of the
@@ -244,7 +248,7 @@ def _crossing(seen: Floats, corners: NDArray, n: int, side: Floats, width: Float
     least = np.inf
     for m in range(3):
         a, b = m, (m + 1) % 3
-        volume = abs(triple(seen[corners[a]], seen[corners[b]], seen[n]))
+        volume = abs(triple(rays[corners[a]], rays[corners[b]], rays[n]))
         sine = max(volume / (np.sin(side[a]) * np.sin(side[b])), 1e-9)
         least = min(least, width[a] * width[b] / sine)
     return least

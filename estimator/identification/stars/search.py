@@ -2,7 +2,7 @@
 
 A pair of detections and a pair of catalog stars with the same angular separation determine a candidate attitude. A
 quick check counts how many of the other detections have a star at the predicted position; if enough do, the candidate
-is fitted to the whole field and its Bayes factor is computed (`evidence.weigh`). Pairs that few catalog pairs can
+is fitted to the whole field and its Bayes factor is computed (`evidence.evaluate`). Pairs that few catalog pairs can
 match are tried first. The search ends at DECISIVE_DEX; a weaker candidate must have ACCEPT_DEX and beat every other
 attitude by MARGIN_DEX.
 
@@ -17,25 +17,29 @@ from math import log10, pi, sqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.catalog.sky_index import Sky, nearest
+from estimator.catalog.sky_index import SkyIndex, nearest
 from estimator.catalog.spatial_grid import cell_of
 from estimator.core import vectors
 from estimator.core.arrays import Floats
 from estimator.core.jit import jit
+from estimator.identification.chance import (
+    GATE_SIGMA,
+    SHORT_PAIR,
+    required_matches,
+    separation,
+    squared_separation,
+)
 from estimator.identification.stars.evidence import (
-    GATE,
-    LEAST,
     Detections,
     Hypothesis,
     Solution,
-    area,
+    build_solution,
     evaluate,
-    fixed,
+    field_area,
+    magnitude_density,
     no_hypothesis,
+    prior_volume_dex,
     ray,
-    share_at,
-    turned,
-    volume_dex,
 )
 
 # Least log10 Bayes factor of an accepted attitude. By Markov's inequality, random detections reach it in at most one of
@@ -47,208 +51,215 @@ DECISIVE_DEX = 10.0  # evidence at which the search stops without looking for ri
 MARGIN_DEX = 3.0  # by which the solution must beat every other attitude
 NO_RIVAL_DEX = ACCEPT_DEX - MARGIN_DEX  # below this an attitude is neither acceptable nor a rival
 # Extra effort for finding rivals of an accepted attitude: multiple of the effort so far, plus a number of look-ups.
-AGAIN, AGAIN_LEAST = 2, 2000
-LONG = 0.2  # of the field size: shorter pairs determine the roll poorly and are tried last
-MAG_GATE = 4.0  # greatest difference of magnitudes in the first round, in standard deviations
-WEIGH_CHECKS = 6  # cost of one evaluation in units of one star look-up, so that frames without a solution end
-PATIENCE = 4  # detections without a star after which the first round drops a candidate
+RIVAL_EFFORT, MIN_RIVAL_EFFORT = 2, 2000
+MAG_GATE_SIGMA = 4.0  # greatest difference of magnitudes in the first round, in standard deviations
+EVALUATION_COST = 6  # of one evaluation in units of one star look-up, so that frames without a solution end
+MAX_MISSES = 4  # detections without a star after which the first round drops a candidate
 
 
 @jit
 def lost_in_space(
-    lights: Detections, patterns: Sky, stars: Sky, base_lights: int, max_checks: int
+    detections: Detections, patterns: SkyIndex, stars: SkyIndex, max_detections: int, max_checks: int
 ) -> Solution:
     """Identify the detections and solve the attitude.
 
-    The search uses the `base_lights` brightest detections and the pairs of `patterns`; the attitude found is then
+    The search uses the `max_detections` brightest detections and the pairs of `patterns`; the attitude found is then
     fitted to all detections and all `stars`. Returns an empty solution if the search finds nothing beyond chance, or
     if the full field keeps no more than half of its matches. max_checks bounds the effort (see `search`).
     """
-    few = min(base_lights, len(lights.sigma))
-    head = Detections(
-        lights.tangent[:few],
-        lights.sigma[:few],
-        lights.weight[:few],
-        lights.mag[:few],
-        lights.mag_sigma,
-        lights.field,
-        lights.zoom,
+    count = min(max_detections, len(detections.sigma))
+    brightest = Detections(
+        detections.tangent[:count],
+        detections.sigma[:count],
+        detections.weight[:count],
+        detections.mag[:count],
+        detections.mag_sigma,
+        detections.field,
+        detections.focal_uncertainty,
     )
-    found = search(head, patterns, max_checks)
-    if found.dex < ACCEPT_DEX:
-        return fixed(lights, stars, no_hypothesis())
-    gates = 1.5 * GATE * lights.sigma
-    whole = evaluate(lights, stars, found.R_cam_from_ref.copy(), found.zoom, gates, -np.inf)
-    if 2 * len(whole.observed) <= len(found.observed):
-        return fixed(lights, stars, no_hypothesis())
+    candidate = search(brightest, patterns, max_checks)
+    if candidate.dex < ACCEPT_DEX:
+        return build_solution(detections, stars, no_hypothesis())
+    gates = 1.5 * GATE_SIGMA * detections.sigma
+    full = evaluate(detections, stars, candidate.R_cam_from_ref.copy(), candidate.focal_ratio, gates, -np.inf)
+    if 2 * len(full.observed) <= len(candidate.observed):
+        return build_solution(detections, stars, no_hypothesis())
     best = Hypothesis(
-        whole.observed, whole.star, whole.R_cam_from_ref, whole.zoom, whole.info, max(whole.dex, found.dex)
+        full.observed,
+        full.star,
+        full.R_cam_from_ref,
+        full.focal_ratio,
+        full.info,
+        max(full.dex, candidate.dex),
     )
-    return fixed(lights, stars, best)
+    return build_solution(detections, stars, best)
 
 
 @jit
-def search(lights: Detections, sky: Sky, max_checks: int) -> Hypothesis:
+def search(detections: Detections, sky: SkyIndex, max_checks: int) -> Hypothesis:
     """The first attitude with DECISIVE_DEX of evidence; else the best one, if it passes ACCEPT_DEX and MARGIN_DEX.
 
-    Detection pairs are tried in the order of the expected number of matching catalog pairs: short pairs (above LONG)
-    and rare magnitudes first. Each attempt doubles the cost of its two detections, so that a false detection does not
-    hold up the search. The first round drops a candidate after PATIENCE detections without a star and skips stars
-    outside of the magnitude gate; the second round has neither limit, and is skipped if there are so few detections
-    that PATIENCE covers them. After an attitude reaches ACCEPT_DEX the search continues for rivals, with AGAIN times
-    the effort so far.
-    max_checks : bound on the effort: star look-ups, plus WEIGH_CHECKS for each candidate evaluated
+    Detection pairs are tried in the order of the expected number of matching catalog pairs: short pairs (above
+    SHORT_PAIR) and rare magnitudes first. Each attempt doubles the cost of its two detections, so that a false
+    detection does not hold up the search. The first round drops a candidate after MAX_MISSES detections without a star
+    and skips stars outside of the magnitude gate; the second round has neither limit, and is skipped if there are so
+    few detections that MAX_MISSES covers them. After an attitude reaches ACCEPT_DEX the search continues for rivals,
+    with RIVAL_EFFORT times the effort so far.
+    max_checks : bound on the effort: star look-ups, plus EVALUATION_COST for each candidate evaluated
     """
-    total = len(lights.sigma)
-    length, rare = _lengths(lights), _rarity(lights, sky)
+    total = len(detections.sigma)
+    length, rarity = _pair_lengths(detections), _rarity(detections, sky)
     best, rival_dex, checks, limit = no_hypothesis(), -np.inf, np.zeros(1, np.int64), max_checks
-    for patience in (PATIENCE, total):
+    for max_misses in (MAX_MISSES, total):
         tried = np.zeros((total, total), np.bool_)
-        cost = rare.copy()
+        cost = rarity.copy()
         for _ in range(total * (total - 1) // 2):
-            a, b = _next(length, tried, cost)
+            a, b = _next_pair(length, tried, cost)
             tried[a, b] = True
-            guess = _attempt(lights, sky, a, b, patience, best, checks)
-            same = _alike(guess, best)
-            if guess.dex > best.dex:
+            candidate = _test_pair(detections, sky, a, b, max_misses, best, checks)
+            same = _same_attitude(candidate, best)
+            if candidate.dex > best.dex:
                 # The previous best becomes a rival unless it is the same attitude.
                 rival_dex = rival_dex if same else max(rival_dex, best.dex)
-                if best.dex < ACCEPT_DEX <= guess.dex:
-                    limit = min(max_checks, (1 + AGAIN) * checks[0] + AGAIN_LEAST)
-                best = guess
+                if best.dex < ACCEPT_DEX <= candidate.dex:
+                    limit = min(max_checks, (1 + RIVAL_EFFORT) * checks[0] + MIN_RIVAL_EFFORT)
+                best = candidate
             elif not same:
-                rival_dex = max(rival_dex, guess.dex)
+                rival_dex = max(rival_dex, candidate.dex)
             if best.dex >= DECISIVE_DEX:
                 return best
             cost[a] *= 2
             cost[b] *= 2
             if checks[0] > limit:
                 break
-        if checks[0] > limit or total - 2 <= PATIENCE:
+        if checks[0] > limit or total - 2 <= MAX_MISSES:
             break
     return best if best.dex >= ACCEPT_DEX and best.dex - rival_dex >= MARGIN_DEX else no_hypothesis()
 
 
 @jit
-def _alike(one: Hypothesis, other: Hypothesis) -> bool:
-    """Whether two hypotheses are the same attitude within 5.7 degrees (trace > 2.99); False if `other` is empty."""
-    return other.dex > -np.inf and bool(np.sum(one.R_cam_from_ref * other.R_cam_from_ref) > 2.99)
+def _same_attitude(first: Hypothesis, second: Hypothesis) -> bool:
+    """Whether two hypotheses are the same attitude within 5.7 degrees (trace > 2.99); False if `second` is empty."""
+    return second.dex > -np.inf and bool(np.sum(first.R_cam_from_ref * second.R_cam_from_ref) > 2.99)
 
 
 @jit
-def _lengths(lights: Detections) -> Floats:
+def _pair_lengths(detections: Detections) -> Floats:
     """(N, N) length in tangents of every pair a < b; pairs too short to determine the roll count as very long."""
-    total, field = len(lights.sigma), lights.field
-    long = LONG * sqrt((field[1] - field[0]) * (field[3] - field[2]))
+    total, field = len(detections.sigma), detections.field
+    min_length = SHORT_PAIR * sqrt((field[1] - field[0]) * (field[3] - field[2]))
     out = np.empty((total, total))
     for a in range(total):
         for b in range(a + 1, total):
-            apart = sqrt(_apart2(lights.tangent, a, b))
-            out[a, b] = apart if apart >= long else 1e3 * long * long / max(apart, 1e-9)
+            length = separation(detections.tangent, a, b)
+            out[a, b] = length if length >= min_length else 1e3 * min_length * min_length / max(length, 1e-9)
     return out
 
 
 @jit
-def _rarity(lights: Detections, sky: Sky) -> Floats:
+def _rarity(detections: Detections, sky: SkyIndex) -> Floats:
     """(N,) fraction of the stars inside the magnitude gate of each detection; 1 if its magnitude is unknown."""
-    out = np.ones(len(lights.sigma))
+    out = np.ones(len(detections.sigma))
     for n in range(len(out)):
-        if np.isfinite(lights.mag[n]):
-            out[n] = min(2 * MAG_GATE * lights.mag_sigma * share_at(sky, lights.mag[n]) + 1e-3, 1.0)
+        if np.isfinite(detections.mag[n]):
+            density = magnitude_density(sky, detections.mag[n])
+            out[n] = min(2 * MAG_GATE_SIGMA * detections.mag_sigma * density + 1e-3, 1.0)
     return out
 
 
 @jit
-def _apart2(tangent: Floats, a: int, b: int) -> float:
-    return (tangent[a, 0] - tangent[b, 0]) ** 2 + (tangent[a, 1] - tangent[b, 1]) ** 2
-
-
-@jit
-def _next(length: Floats, tried: NDArray, vain: Floats) -> tuple[int, int]:
-    """The untried pair a < b of the least cost length[a, b] * vain[a] * vain[b]."""
-    best, at_a, at_b = np.inf, 0, 1
-    for a in range(len(vain)):
-        for b in range(a + 1, len(vain)):
-            cost = length[a, b] * vain[a] * vain[b]
+def _next_pair(length: Floats, tried: NDArray, weight: Floats) -> tuple[int, int]:
+    """The untried pair a < b of the least cost length[a, b] * weight[a] * weight[b]."""
+    best, best_a, best_b = np.inf, 0, 1
+    for a in range(len(weight)):
+        for b in range(a + 1, len(weight)):
+            cost = length[a, b] * weight[a] * weight[b]
             if cost < best and not tried[a, b]:
-                best, at_a, at_b = cost, a, b
-    return at_a, at_b
+                best, best_a, best_b = cost, a, b
+    return best_a, best_b
 
 
 @jit
-def _attempt(
-    lights: Detections, sky: Sky, a: int, b: int, patience: int, known: Hypothesis, checks: NDArray
+def _test_pair(
+    detections: Detections,
+    sky: SkyIndex,
+    a: int,
+    b: int,
+    max_misses: int,
+    previous: Hypothesis,
+    checks: NDArray,
 ) -> Hypothesis:
     """Test two detections against every catalog pair of the same separation, in both orders.
 
-    Returns the first hypothesis with ACCEPT_DEX that is another attitude than `known`, else the best one. checks : (1,)
-    effort so far, increased in place.
+    Returns the first hypothesis with ACCEPT_DEX that is another attitude than `previous`, else the best one.
+    checks : (1,) effort so far, increased in place
     """
-    gates, order = _gates(lights, a, b), _others(len(lights.sigma), a, b)
-    wanted = _wanted(lights, a, b)
-    in_cam, in_ref, R_ref_from_cam = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-    best, zoom = no_hypothesis(), 1.0
-    at_a, at_b = ray(lights.tangent, a, 1.0), ray(lights.tangent, b, 1.0)
-    chord = vectors.chord(at_a, at_b)
-    vectors.axes(at_a, at_b, in_cam)
-    gate = GATE * sqrt(lights.sigma[a] ** 2 + lights.sigma[b] ** 2)
-    angle = 2 * np.arcsin(min(chord / 2, 1.0))
-    last = len(sky.first) - 2
-    low = cell_of((angle / (1 + lights.zoom) - gate) / sky.bin_rad, last + 1)
-    high = cell_of((angle / (1 - lights.zoom) + gate) / sky.bin_rad, last)
+    gates, order = _pair_gates(detections, a, b), _other_detections(len(detections.sigma), a, b)
+    attitude_dex = _attitude_dex(detections, a, b)
+    required = required_matches(detections.sigma, field_area(detections), attitude_dex, ACCEPT_DEX)
+    in_cam, in_ref = np.empty((3, 3)), np.empty((3, 3))
+    R = np.empty((3, 3))  # R_ref_from_cam
+    best, focal_ratio = no_hypothesis(), 1.0
+    begin, end, chord, gate = _pair_range(detections, sky, a, b)
     # Tuple members are unpacked here: in the loop each access would cost two updates of a reference count.
-    tangent, first, pair, star, mag = lights.tangent, sky.first, sky.pair, sky.vectors, sky.mag
-    cell_first, cell_star, side, zooms = sky.cell_first, sky.cell_star, sky.side, lights.zoom
-    mag_a, mag_b = lights.mag[a], lights.mag[b]
-    mag_gate = MAG_GATE * lights.mag_sigma if patience == PATIENCE else np.inf
-    for p in range(first[low], first[high + 1]):
+    tangent, focal_uncertainty = detections.tangent, detections.focal_uncertainty
+    pair, star, mag = sky.pair, sky.vectors, sky.mag
+    cell_first, cell_star, side = sky.cell_first, sky.cell_star, sky.side
+    vectors.pair_frame(ray(tangent, a, 1.0), ray(tangent, b, 1.0), in_cam)
+    mag_a, mag_b = detections.mag[a], detections.mag[b]
+    mag_gate = MAG_GATE_SIGMA * detections.mag_sigma if max_misses == MAX_MISSES else np.inf
+    for p in range(begin, end):
         i, j = pair[p, 0], pair[p, 1]
         # Written with `not ... >`, so that an unknown magnitude (NaN) passes.
         forward = not (abs(mag_a - mag[i]) > mag_gate or abs(mag_b - mag[j]) > mag_gate)
         backward = not (abs(mag_a - mag[j]) > mag_gate or abs(mag_b - mag[i]) > mag_gate)
         if not (forward or backward):
             continue
-        one, other = vectors.row(star, i), vectors.row(star, j)
-        wide = vectors.chord(one, other)
-        if zooms > 0:
-            zoom = _zoom(tangent, a, b, chord, wide)
-            if abs(zoom - 1) > zooms:
+        star_i, star_j = vectors.row(star, i), vectors.row(star, j)
+        catalog_chord = vectors.chord(star_i, star_j)
+        if focal_uncertainty > 0:
+            focal_ratio = _fit_focal_ratio(tangent, a, b, chord, catalog_chord)
+            if abs(focal_ratio - 1) > focal_uncertainty:
                 continue
-            vectors.axes(ray(tangent, a, zoom), ray(tangent, b, zoom), in_cam)
-        elif abs(wide - chord) > gate:
+            vectors.pair_frame(ray(tangent, a, focal_ratio), ray(tangent, b, focal_ratio), in_cam)
+        elif abs(catalog_chord - chord) > gate:
             continue
-        vectors.axes(one, other, in_ref)
+        vectors.pair_frame(star_i, star_j, in_ref)
         for flip in range(2):
-            if backward if flip else forward:
-                vectors.times_transposed(in_ref, in_cam, R_ref_from_cam)
-                looked, fits = _glance(
-                    tangent,
-                    star,
-                    cell_first,
-                    cell_star,
-                    side,
-                    R_ref_from_cam,
-                    zoom,
-                    gates,
-                    order,
-                    wanted,
-                    patience,
-                )
-                checks[0] += 1 + looked
-                if fits:
-                    checks[0] += WEIGH_CHECKS
-                    guess = evaluate(lights, sky, R_ref_from_cam.T.copy(), zoom, gates, NO_RIVAL_DEX)
-                    if guess.dex >= ACCEPT_DEX and not _alike(guess, known):
-                        return guess
-                    if guess.dex > best.dex:
-                        best = guess
-            for k in range(3):  # the star pair in reverse order: a half turn about its first axis
-                in_ref[k, 1], in_ref[k, 2] = -in_ref[k, 1], -in_ref[k, 2]
+            if flip:  # the star pair in reverse order: a half turn about its first axis
+                for k in range(3):
+                    in_ref[k, 1], in_ref[k, 2] = -in_ref[k, 1], -in_ref[k, 2]
+            if not (backward if flip else forward):
+                continue
+            vectors.multiply_transposed(in_ref, in_cam, R)
+            lookups, fits = _quick_check(
+                tangent, star, cell_first, cell_star, side, R, focal_ratio, gates, order, required, max_misses
+            )
+            checks[0] += 1 + lookups
+            if fits:
+                checks[0] += EVALUATION_COST
+                candidate = evaluate(detections, sky, R.T.copy(), focal_ratio, gates, NO_RIVAL_DEX)
+                if candidate.dex >= ACCEPT_DEX and not _same_attitude(candidate, previous):
+                    return candidate
+                if candidate.dex > best.dex:
+                    best = candidate
     return best
 
 
 @jit
-def _others(total: int, a: int, b: int) -> NDArray[np.int64]:
+def _pair_range(detections: Detections, sky: SkyIndex, a: int, b: int) -> tuple[int, int, float, float]:
+    """Half-open range of catalog pairs that two detections may be; their chord, and the gate of their angle, rad."""
+    chord = vectors.chord(ray(detections.tangent, a, 1.0), ray(detections.tangent, b, 1.0))
+    gate = GATE_SIGMA * sqrt(detections.sigma[a] ** 2 + detections.sigma[b] ** 2)
+    angle = 2 * np.arcsin(min(chord / 2, 1.0))
+    last = len(sky.first) - 2
+    low = cell_of((angle / (1 + detections.focal_uncertainty) - gate) / sky.bin_rad, last + 1)
+    high = cell_of((angle / (1 - detections.focal_uncertainty) + gate) / sky.bin_rad, last)
+    return sky.first[low], sky.first[high + 1], chord, gate
+
+
+@jit
+def _other_detections(total: int, a: int, b: int) -> NDArray[np.int64]:
     out, count = np.empty(total, np.int64), 0
     for n in range(total):
         if n not in (a, b):
@@ -258,77 +269,72 @@ def _others(total: int, a: int, b: int) -> NDArray[np.int64]:
 
 
 @jit
-def _zoom(tangent: Floats, a: int, b: int, chord: float, wanted: float) -> float:
-    """The zoom at which the chord between two detections is `wanted`: two fixed-point iterations from its ratio."""
-    zoom = chord / wanted
+def _fit_focal_ratio(tangent: Floats, a: int, b: int, chord: float, target: float) -> float:
+    """The focal ratio at which the chord between two detections is `target`, by two fixed-point iterations."""
+    focal_ratio = chord / target
     for _ in range(2):
-        zoom *= vectors.chord(ray(tangent, a, zoom), ray(tangent, b, zoom)) / wanted
-    return zoom
+        focal_ratio *= vectors.chord(ray(tangent, a, focal_ratio), ray(tangent, b, focal_ratio)) / target
+    return focal_ratio
 
 
 @jit
-def _gates(lights: Detections, a: int, b: int) -> Floats:
+def _pair_gates(detections: Detections, a: int, b: int) -> Floats:
     """(N,) matching radius of each detection at a pair's attitude: its own error and that of the attitude.
 
     The variance of the pair's midpoint is (sa^2 + sb^2) / 4; that of its direction, and of its relative length, is
     (sa^2 + sb^2) / separation^2 and grows with the squared distance from the midpoint.
     """
-    tangent = lights.tangent
+    tangent = detections.tangent
     x, y = (tangent[a, 0] + tangent[b, 0]) / 2, (tangent[a, 1] + tangent[b, 1]) / 2
-    pair2 = lights.sigma[a] ** 2 + lights.sigma[b] ** 2
-    turning = pair2 / _apart2(tangent, a, b)
-    out = np.empty(len(lights.sigma))
+    pair_variance = detections.sigma[a] ** 2 + detections.sigma[b] ** 2
+    direction_variance = pair_variance / squared_separation(tangent, a, b)
+    out = np.empty(len(detections.sigma))
     for n in range(len(out)):
-        off2 = (tangent[n, 0] - x) ** 2 + (tangent[n, 1] - y) ** 2
-        out[n] = GATE * sqrt(lights.sigma[n] ** 2 + pair2 / 4 + turning * off2)
+        distance2 = (tangent[n, 0] - x) ** 2 + (tangent[n, 1] - y) ** 2
+        out[n] = GATE_SIGMA * sqrt(detections.sigma[n] ** 2 + pair_variance / 4 + direction_variance * distance2)
     return out
 
 
 @jit
-def _wanted(lights: Detections, a: int, b: int) -> int:
-    """Least number of matches that can reach ACCEPT_DEX, from an estimate of the greatest `_evidence`.
+def _attitude_dex(detections: Detections, a: int, b: int) -> float:
+    """Contribution of a pair's attitude alone to the evidence, for `required_matches`.
 
-    The estimate has no residuals, no missing stars, and the attitude uncertainty of the pair alone: sqrt(2) sigma /
-    separation about the boresight (and of the zoom), sigma / sqrt(2) across it. It takes the least sigma of all
-    detections, isotropic errors, a constant density of detections and no magnitudes.
+    The uncertainty is sqrt(2) sigma / separation about the boresight (and of the focal ratio), sigma / sqrt(2) across
+    it, with the least sigma of all detections and isotropic errors.
     """
-    total, sigma = len(lights.sigma), lights.sigma.min()
-    each = -log10(2 * pi * sigma**2 * total / area(lights))
-    turn = sqrt(2.0) * sigma / sqrt(_apart2(lights.tangent, a, b))
-    loose = 1.5 * log10(2 * pi) + log10(sigma**2 / 2 * turn) - volume_dex(lights)
-    if lights.zoom > 0:
-        loose += log10(sqrt(2 * pi) * turn)
-    for count in range(LEAST, total):
-        if count * each + loose - log10(count + 1.0) >= ACCEPT_DEX:
-            return count
-    return total
+    sigma = detections.sigma.min()
+    direction_sigma = sqrt(2.0) * sigma / separation(detections.tangent, a, b)
+    dex = 1.5 * log10(2 * pi) + log10(sigma**2 / 2 * direction_sigma) - prior_volume_dex(detections)
+    if detections.focal_uncertainty > 0:
+        dex += log10(sqrt(2 * pi) * direction_sigma)
+    return dex
 
 
 @jit
-def _glance(
+def _quick_check(
     tangent: Floats,
     vectors_ref: Floats,
     cell_first: NDArray,
     cell_star: NDArray,
     side: int,
     R_ref_from_cam: Floats,
-    zoom: float,
+    focal_ratio: float,
     gates: Floats,
     order: NDArray,
-    wanted: int,
-    patience: int,
+    required: int,
+    max_misses: int,
 ) -> tuple[int, bool]:
-    """Quick check of an attitude: how many detections were looked up, and whether `wanted` of them have a star nearby.
+    """Quick check of an attitude: number of detections looked up, and whether `required` of them have a star nearby.
 
     The two detections of the pair count as matched. Stops as soon as the count is reached or out of reach, or after
-    `patience` detections without any match.
+    `max_misses` detections without any match.
     """
-    count, left = 2, len(order)
-    for step in range(left):
-        if count + left - step < wanted or (step >= patience and count == 2):
+    count, remaining = 2, len(order)
+    for step in range(remaining):
+        if count + remaining - step < required or (step >= max_misses and count == 2):
             return step, False
-        x, y, z = turned(R_ref_from_cam, ray(tangent, order[step], zoom))
+        x, y, z = vectors.rotate(R_ref_from_cam, ray(tangent, order[step], focal_ratio))
         count += nearest(vectors_ref, cell_first, cell_star, side, x, y, z, gates[order[step]])[0] >= 0
-        if count >= wanted:
+        if count >= required:
             return step + 1, True
-    return left, False
+    return remaining, False

@@ -11,7 +11,7 @@ import typer
 from estimator.core.errors import ImageError
 from skysim import __version__
 from skysim.apps.cli.commands.files import camera, catalog_app, export, scenes_app
-from skysim.apps.cli.commands.lab import lab
+from skysim.apps.cli.commands.gui import gui
 from skysim.apps.cli.commands.reproduce import reproduce
 from skysim.apps.cli.commands.run import compare, render, run, trackers
 from skysim.apps.cli.commands.solve import solve, survey
@@ -34,7 +34,7 @@ for command in (
     survey,
     camera,
     reproduce,
-    lab,
+    gui,
     validate,
     export,
 ):
@@ -44,22 +44,27 @@ app.add_typer(catalog_app, name="catalog")
 app.add_typer(studies, name="study")
 
 
-def version(asked: bool) -> None:
+def version(requested: bool) -> None:
     """Print the versions that a bug report should contain."""
-    if asked:
+    if requested:
         import platform
-        from importlib.metadata import version as of
+        from importlib.metadata import version as version_of
 
-        print(
-            f"skysim {__version__}, MuJoCo {of('mujoco')}, numpy {of('numpy')}, Python {platform.python_version()}"
-        )
+        libraries = f"MuJoCo {version_of('mujoco')}, numpy {version_of('numpy')}"
+        print(f"skysim {__version__}, {libraries}, Python {platform.python_version()}")
         raise typer.Exit
 
 
 @app.callback()
 def options(
     version: Annotated[
-        bool, typer.Option("--version", callback=version, is_eager=True, help="Print versions.")
+        bool,
+        typer.Option(
+            "--version",
+            callback=version,
+            is_eager=True,
+            help="Print the versions to state in a bug report.",
+        ),
     ] = False,
 ) -> None:
     """Simulate a star-tracker laboratory: motion, light sources, camera, attitude determination, scoring."""
@@ -67,7 +72,7 @@ def options(
 
 def main() -> None:
     """Run the command. A user error prints one line and exits with code 2; Ctrl-C and SIGTERM exit with 130."""
-    errors.attended = True
+    errors.running_as_command = True
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # clean up after SIGTERM as after Ctrl-C
     try:
         code = app(standalone_mode=False)
@@ -76,9 +81,7 @@ def main() -> None:
     except OSError as error:
         code = print_error(f"{error.filename}: {error.strerror}" if error.filename else str(error))
     except (MemoryError, OverflowError) as error:
-        code = print_error(
-            f"a value of the scene is too large for this machine: {' '.join(str(error).split())}"
-        )
+        code = print_error(f"a value of the scene is too large for this machine: {' '.join(str(error).split())}")
     except (typer.Abort, KeyboardInterrupt):
         code = 130
     except Exception as error:

@@ -13,64 +13,57 @@ from skysim.core.errors import InputError
 if TYPE_CHECKING:
     from skysim.scene.scene import Scene
 
-LOADED: list[
-    tuple[str, dict[str, str]]
-] = []  # loaded scenes: name and command-line overrides, for error locations
+# Loaded scenes: name and command-line overrides, for the locations in error messages.
+LOADED: list[tuple[str, dict[str, str]]] = []
 
-SceneArg = Annotated[
-    str, typer.Argument(metavar="SCENE", help="A scene file (.yaml) or the name of one in scenes/.")
-]
-Frames = Annotated[int | None, typer.Option(help="How many frames; the scene's own number if left out.")]
-Seed = Annotated[int | None, typer.Option(help="Seed of all random streams; the scene's own if left out.")]
-Out = Annotated[Path | None, typer.Option(help="Folder for what is written; out/NAME if left out.")]
-Sets = Annotated[
+SceneArg = Annotated[str, typer.Argument(metavar="SCENE", help="Scene file (.yaml), or name of a scene in scenes/.")]
+Frames = Annotated[int | None, typer.Option(help="Number of frames; default: the scene's.")]
+Seed = Annotated[int | None, typer.Option(help="Seed of all random streams; default: the scene's.")]
+Out = Annotated[Path | None, typer.Option(help="Output folder; default: out/NAME.")]
+Overrides = Annotated[
     list[str] | None,
-    typer.Option(
-        "--set", metavar="KEY=VALUE", help="Override a key: camera.detector.bits=8; may be given again."
-    ),
+    typer.Option("--set", metavar="KEY=VALUE", help="Override a key of the file: exposure.rate_hz=10; repeatable."),
 ]
-Detector = Annotated[str | None, typer.Option(help="How lights are found, e.g. local.")]
-Centroider = Annotated[str | None, typer.Option(help="How they are centred, e.g. gaussian_fit.")]
-Identifier = Annotated[str | None, typer.Option(help="How they are named, e.g. pyramid.")]
-SolverName = Annotated[str | None, typer.Option("--solver", help="How the attitude follows, e.g. quest.")]
+Detector = Annotated[str | None, typer.Option(help="Detection algorithm, e.g. local.")]
+Centroider = Annotated[str | None, typer.Option(help="Centroiding algorithm, e.g. gaussian_fit.")]
+Identifier = Annotated[str | None, typer.Option(help="Identification algorithm, e.g. pyramid.")]
+SolverName = Annotated[str | None, typer.Option("--solver", help="Attitude algorithm, e.g. quest.")]
+TRACKER_HELP = "Tracker: own, or a name from `skysim trackers` or --program."
 Programs = Annotated[
     list[str] | None,
     typer.Option(
-        "--program", metavar="NAME=COMMAND", help="A tracker of your own: a program that is told frames."
+        "--program", metavar="NAME=COMMAND", help="External tracker: a program that reads frames; repeatable."
     ),
 ]
-Json = Annotated[bool, typer.Option("--json", help="Print JSON for machines instead of a table.")]
+Json = Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")]
 
 
-def load(name: str, frames: int | None, seed: int | None, sets: list[str] | None) -> Scene:
+def load(name: str, frames: int | None, seed: int | None, overrides: list[str] | None) -> Scene:
     """Load the scene with the command line's overrides. Raises InputError."""
     from skysim.core.yaml_reader import parse_overrides
     from skysim.scene.loader import load as load_scene
 
-    overrides = parse_overrides(sets)
+    values = parse_overrides(overrides)
     if frames is not None:
-        overrides["exposure.frames"] = str(frames)
+        values["exposure.frames"] = str(frames)
     if seed is not None:
-        overrides["seed"] = str(seed)
-    LOADED.append((name, overrides))
-    return load_scene(name, overrides)
+        values["seed"] = str(seed)
+    LOADED.append((name, values))
+    return load_scene(name, values)
 
 
-def given_stages(**stages: str | None) -> dict[str, str]:
+def output_folder(out: Path | None, name: str) -> Path:
+    """The folder of --out, by default out/NAME."""
+    return out or Path("out") / name
+
+
+def selected_stages(**stages: str | None) -> dict[str, str]:
     """The tracker stages for which the command line names an algorithm."""
     return {stage: name for stage, name in stages.items() if name is not None}
 
 
-def clean_folder(folder: Path) -> Path:
-    """Make the folder and remove the frames and results of an earlier run; return it."""
-    from skysim.core import files
-    from skysim.results.files import frames
-
-    frames.clear(files.make_folder(folder))
-    return folder
-
-
-def moment(text: str | None) -> datetime.datetime | None:
+def datetime_from_iso(text: str | None) -> datetime.datetime | None:
+    """The value of --time. Raises InputError."""
     if text is None:
         return None
     try:

@@ -16,20 +16,20 @@ if TYPE_CHECKING:
     from rich.progress import ProgressColumn
     from rich.text import Text
 
-    from skysim.core.types import Row
+    from skysim.core.types import FrameRow
     from skysim.experiments.study.execution.runner import Progress
-    from skysim.experiments.tracker_comparison import Line
+    from skysim.experiments.tracker_comparison import TrackerScore
     from skysim.simulation.testbed import Testbed
 
 T = TypeVar("T")
-FILM_FRAMES = 60
-SURVEY = ("believed", "found", "sigma", "truth")
+ANIMATION_FRAMES = 60
+SURVEY_COLUMNS = ("believed", "found", "sigma", "truth")
 
 
 def eager_first(items: Iterable[T]) -> Iterator[T]:
     """Return the same items, the first computed at once: its errors then appear before old results are cleared."""
-    rest = iter(items)
-    return itertools.chain([next(rest)], rest)
+    iterator = iter(items)
+    return itertools.chain([next(iterator)], iterator)
 
 
 def progress(items: Iterable[T], total: int, what: str, quiet: bool = False) -> Iterator[T]:
@@ -50,14 +50,14 @@ def bar(*columns: ProgressColumn, quiet: bool = False) -> Bar:
     return Progress(what, *columns, console=console, transient=True, disable=quiet or not console.is_terminal)
 
 
-def colored(text: str, ink: str) -> Text:
+def colored(text: str, color: str) -> Text:
     """Colored text for a table cell."""
     from rich.text import Text
 
-    return Text(text, ink)
+    return Text(text, color)
 
 
-def print_table(title: str, heads: Sequence[str], lines: Sequence[Sequence[str | Text]]) -> None:
+def print_table(title: str, headers: Sequence[str], lines: Sequence[Sequence[str | Text]]) -> None:
     """Print a table. Strings are printed literally: rich's markup in them has no effect."""
     from rich.console import Console
     from rich.table import Table
@@ -65,7 +65,7 @@ def print_table(title: str, heads: Sequence[str], lines: Sequence[Sequence[str |
 
     table = Table(box=None, header_style="bold", pad_edge=False)
     table.title = Text(printable(title), "table.title", justify="left")
-    for head in heads:
+    for head in headers:
         table.add_column(
             Text(printable(head)),
             justify="left" if head in ("what", "file", "status", "peer", "verdict") else "right",
@@ -77,10 +77,10 @@ def print_table(title: str, heads: Sequence[str], lines: Sequence[Sequence[str |
     Console(width=max(console.width, 240) if not console.is_terminal else None).print(table)
 
 
-def print_rows(rows: list[Row], names: tuple[str, str, str], exposures_ms: list[float]) -> None:
+def print_rows(rows: list[FrameRow], names: tuple[str, str, str], exposures_ms: list[float]) -> None:
     """Print one line per frame of a run. exposures_ms : exposure time of each frame;  names : of the three angles."""
     triple = "/".join(names)
-    heads = [
+    headers = [
         "frame",
         "t s",
         "exp ms",
@@ -99,8 +99,8 @@ def print_rows(rows: list[Row], names: tuple[str, str, str], exposures_ms: list[
             f"{row.t_s:.2f}",
             f"{exposure_ms:.5g}",
             f"{row.rate_deg_s:.2f}",
-            degrees(row.truth_deg),
-            degrees(row.estimate_deg),
+            format_angles(row.truth_deg),
+            format_angles(row.estimate_deg),
             f"{row.cross_arcsec:.3f}" if row.estimate_deg else "",
             f"{row.roll_arcsec:+.3f}" if row.estimate_deg else "",
             f"{row.matched}/{row.detected}",
@@ -109,10 +109,10 @@ def print_rows(rows: list[Row], names: tuple[str, str, str], exposures_ms: list[
         ]
         for row, exposure_ms in zip(rows, exposures_ms, strict=True)
     ]
-    print_table("", heads, lines)
+    print_table("", headers, lines)
 
 
-def degrees(angles_deg: tuple[float, float, float] | None) -> str:
+def format_angles(angles_deg: tuple[float, float, float] | None) -> str:
     return " ".join(f"{angle:9.4f}" for angle in angles_deg) if angles_deg else ""
 
 
@@ -139,11 +139,11 @@ def trial_progress(what: str, total: int) -> Iterator[Callable[[Progress], None]
     text = "{task.completed:.0f}/{task.total:.0f}  {task.fields[rate]:.0f}/s  {task.fields[faults]}"
     tenth = [0]
 
-    def line(done: Progress, told: str) -> None:
+    def print_line(done: Progress, faults: str) -> None:
         if not console.is_terminal and 10 * done.done // total > tenth[0]:
             tenth[0] = 10 * done.done // total
             print(
-                f"{what}: {done.done} of {total}, {done.rate:.0f} a second, {told}",
+                f"{what}: {done.done} of {total}, {done.rate:.0f} trials/s, {faults}",
                 file=sys.stderr,
                 flush=True,
             )
@@ -152,47 +152,46 @@ def trial_progress(what: str, total: int) -> Iterator[Callable[[Progress], None]
         task = shown.add_task(what, total=total, rate=0.0, faults="")
 
         def update(done: Progress) -> None:
-            told = f"{done.failed} failed" + (f", {done.wrong} wrong" if done.wrong else "")
-            shown.update(task, completed=done.done, rate=done.rate, faults=told)
-            line(done, told)
+            faults = f"{done.failed} failed" + (f", {done.wrong} wrong" if done.wrong else "")
+            shown.update(task, completed=done.done, rate=done.rate, faults=faults)
+            print_line(done, faults)
 
         yield update
 
 
-def print_flight(figures: dict[str, float]) -> None:
+def print_motion(run: dict[str, float]) -> None:
     """Print the metrics of the motion; those that a scene does not have are skipped."""
-    lines = {
+    templates = {
         "pointing_deg_worst": "pointing: worst {pointing_deg_worst:.3g}°, at the end {pointing_deg_end:.2g}°; "
-        "torque asked for up to {torque_nm_worst:.3g} N m",
-        "momentum_nms_worst": "stored momentum up to {momentum_nms_worst:.3g} N m s",
-        "wheel_rpm_worst": "wheels up to {wheel_rpm_worst:.0f} rpm",
-        "manipulability_least": "CMGs' manipulability down to {manipulability_least:.2g}",
-        "imu_deg_worst": "IMU alone: off by {imu_deg_end:.3g}° at the end; "
-        "gyros saturated for {gyro_saturated_s:.2g} s",
+        "maximum commanded torque {torque_nm_worst:.3g} N m",
+        "momentum_nms_worst": "maximum stored momentum {momentum_nms_worst:.3g} N m s",
+        "wheel_rpm_worst": "maximum wheel speed {wheel_rpm_worst:.0f} rpm",
+        "manipulability_least": "minimum CMG manipulability {manipulability_least:.2g}",
+        "imu_deg_worst": "IMU alone: error {imu_deg_end:.3g}° at the end; gyros saturated for {gyro_saturated_s:.2g} s",
         "filter_deg_worst": "filter: worst {filter_deg_worst:.3g}°, at the end {filter_arcsec_end:.3g}″, "
-        "its bias off by {filter_bias_deg_h_end:.2g}°/h",
+        "bias error {filter_bias_deg_h_end:.2g}°/h",
     }
-    told = [text.format(**figures) for key, text in lines.items() if key in figures]
-    if told:
-        print("flight: " + "\n        ".join(told))
+    lines = [text.format(**run) for key, text in templates.items() if key in run]
+    if lines:
+        print("motion: " + "\n        ".join(lines))
 
 
-def print_summary(figures: dict[str, Any]) -> None:
+def print_summary(run: dict[str, Any]) -> None:
     print(
-        f"\n{figures['solved']} of {figures['frames']} frames solved, {figures['wrong']} wrong; "
-        f"cross-boresight median {figures['cross_arcsec_median']:.3g}″ worst {figures['cross_arcsec_worst']:.3g}″, "
-        f"roll median {figures['roll_arcsec_median']:.3g}″ worst {figures['roll_arcsec_worst']:.3g}″"
+        f"\n{run['solved']} of {run['frames']} frames solved, {run['wrong']} wrong; "
+        f"cross-boresight median {run['cross_arcsec_median']:.3g}″ worst {run['cross_arcsec_worst']:.3g}″, "
+        f"roll median {run['roll_arcsec_median']:.3g}″ worst {run['roll_arcsec_worst']:.3g}″"
     )
-    stages = ", ".join(f"{name} {ms:.2f}" for name, ms in figures["stages_ms"].items())
-    print(f"median ms a frame: {stages}")
-    print_flight(figures["flight"])
-    print(f"report: {figures['report']}")
+    stages = ", ".join(f"{name} {ms:.2f}" for name, ms in run["stages_ms"].items())
+    print(f"median ms per frame: {stages}")
+    print_motion(run["flight"])
+    print(f"report: {run['report']}")
 
 
-def print_scores(lines: list[Line], folder: Path) -> None:
+def print_scores(lines: list[TrackerScore], folder: Path) -> None:
     """Print the scoreboard of a comparison, and the reasons for unsolved frames."""
-    heads = ["what", "frames", "right %", "(95 %)", "wrong", "refused", "failed"]
-    heads += ["cross ″", "worst ″", "roll ″", "worst ″", "ms", "95 % ms"]
+    headers = ["what", "frames", "right %", "(95 %)", "wrong", "refused", "failed"]
+    headers += ["cross ″", "worst ″", "roll ″", "worst ″", "ms", "95 % ms"]
     rows = [
         [
             line.tracker,
@@ -208,70 +207,71 @@ def print_scores(lines: list[Line], folder: Path) -> None:
         ]
         for line in lines
     ]
-    print_table("", heads, rows)
+    print_table("", headers, rows)
     for line in lines:
         for status, count in line.refusals.items():
             print(f"{line.tracker}: {count} × {status}")
     print(f"scoreboard.ecsv, solutions.NAME.ecsv and the frames are in {folder}")
 
 
-def print_survey(figures: dict[str, Any]) -> None:
+def print_survey(survey: dict[str, Any]) -> None:
     lines = [
-        [row["what"], *(f"{row[key]:.5g}" if row["what"][0] in "kp" else f"{row[key]:.3f}" for key in SURVEY)]
-        for row in figures["values"]
+        [
+            row["what"],
+            *(f"{row[key]:.5g}" if row["what"][0] in "kp" else f"{row[key]:.3f}" for key in SURVEY_COLUMNS),
+        ]
+        for row in survey["values"]
         if row["sigma"]
     ]
-    print_table("", ["what", *SURVEY], lines)
+    print_table("", ["what", *SURVEY_COLUMNS], lines)
     print(
-        f"\n{figures['surveyed']} of {figures['leds']} LEDs surveyed in {figures['tied']} of {figures['frames']} "
-        f"frames, {figures['renamed']} under a neighbour's name; {figures['status']}, {figures['outliers']} outliers, "
-        f"{figures['rms_px']:.2g} px rms, misfit {figures['misfit']:.2g}\n"
-        f"LEDs: sigma median {figures['led_sigma_mm_median']:.2g} mm worst {figures['led_sigma_mm_worst']:.2g} mm; "
-        f"off the truth by {figures['led_mm_before']:.2g} mm rms before, {figures['led_mm_after']:.2g} mm after"
+        f"\n{survey['surveyed']} of {survey['leds']} LEDs surveyed in {survey['tied']} of {survey['frames']} "
+        f"frames, {survey['renamed']} with a corrected identity; {survey['status']}, {survey['outliers']} outliers, "
+        f"{survey['rms_px']:.2g} px rms, misfit {survey['misfit']:.2g}\n"
+        f"LEDs: sigma median {survey['led_sigma_mm_median']:.2g} mm worst {survey['led_sigma_mm_worst']:.2g} mm; "
+        f"true error {survey['led_mm_before']:.2g} mm rms before, {survey['led_mm_after']:.2g} mm after"
     )
     for when in ("before", "after"):
-        told = figures[when]
+        result = survey[when]
         errors = [
-            f"{name} median {told[f'{name}_deg_median']:.2g}° worst {told[f'{name}_deg_worst']:.2g}°"
+            f"{name} median {result[f'{name}_deg_median']:.2g}° worst {result[f'{name}_deg_worst']:.2g}°"
             for name in ("cross", "roll")
-            if told["solved"]
+            if result["solved"]
         ]
-        print(f"{when}: " + ", ".join([f"{told['solved']} of {told['stops']} new stops solved", *errors]))
-    print(f"{figures['map']}: for tracker.map; errors drawn in {figures['picture']}")
+        print(f"{when}: " + ", ".join([f"{result['solved']} of {result['stops']} test attitudes solved", *errors]))
+    print(f"{survey['map']}: for tracker.map; plot of the errors: {survey['picture']}")
 
 
-def print_answers(answers: list[dict[str, Any]], out: Path) -> None:
-    heads = ["file", "status", "RA °", "Dec °", "roll °", "fov °", "stars", "rms ″", "ms"]
+def print_solutions(solutions: list[dict[str, Any]], out: Path) -> None:
+    headers = ["file", "status", "RA °", "Dec °", "roll °", "fov °", "stars", "rms ″", "ms"]
     lines = [
         [
             a["file"],
             a["status"] if a["time_ms"] is not None else "bad input",
-            *(number(a[key], 4) for key in ("ra_deg", "dec_deg", "roll_deg", "fov_deg")),
+            *(format_number(a[key], 4) for key in ("ra_deg", "dec_deg", "roll_deg", "fov_deg")),
             str(a["matches"]),
-            number(a["rms_arcsec"], 1),
-            number(a["time_ms"], 0),
+            format_number(a["rms_arcsec"], 1),
+            format_number(a["time_ms"], 0),
         ]
-        for a in answers
+        for a in solutions
     ]
-    print_table("", heads, lines)
-    print(f"annotated pictures and solutions.json in {out}")
+    print_table("", headers, lines)
+    print(f"annotated images and solutions.json in {out}")
 
 
-def print_catalogue(figures: dict[str, Any], json: bool, to_json: Any) -> None:
+def print_catalog(catalog: dict[str, Any], json: bool, to_json: Any) -> None:
     if json:
-        print(to_json(figures))
+        print(to_json(catalog))
         return
-    print(f"{figures['path']}: {figures['stars']} stars, {figures['supplied']} of them supplied")
-    print("  ".join(f"V<{limit}: {count}" for limit, count in figures["brighter_than"].items()))
-    for key, value in figures["meta"].items():
+    print(f"{catalog['path']}: {catalog['stars']} stars, {catalog['supplied']} of them added from other sources")
+    print("  ".join(f"V<{limit}: {count}" for limit, count in catalog["brighter_than"].items()))
+    for key, value in catalog["meta"].items():
         print(f"  {key}: {printable(value)}")
 
 
 def print_titles(folder: Path, title: Callable[[Path], str], json: bool, to_json: Any) -> None:
     """Print names and titles of the YAML files in a folder."""
-    listed = [
-        {"name": path.stem, "title": title(path), "file": str(path)} for path in sorted(folder.glob("*.yaml"))
-    ]
+    listed = [{"name": path.stem, "title": title(path), "file": str(path)} for path in sorted(folder.glob("*.yaml"))]
     if json:
         print(to_json(listed))
         return
@@ -279,7 +279,7 @@ def print_titles(folder: Path, title: Callable[[Path], str], json: bool, to_json
         print(f"{entry['name']:20s} {printable(entry['title'])}")
 
 
-def number(value: float | None, digits: int | None = None) -> str:
+def format_number(value: float | None, digits: int | None = None) -> str:
     if value is None:
         return ""
     return f"{value:.3g}" if digits is None else f"{value:.{digits}f}"
@@ -291,24 +291,24 @@ def print_error(message: str, code: int = 2) -> int:
     return code
 
 
-def write_3d_views(lab: Testbed, folder: Path) -> list[Path]:
+def write_3d_views(testbed: Testbed, folder: Path) -> list[Path]:
     """Write a still and an animation of the laboratory in 3-D; return their paths.
 
     Without OpenGL print a message and return an empty list, so that the run continues.
     """
     from skysim.core import files
     from skysim.dynamics.multibody.view import picture
-    from skysim.simulation import testbed
+    from skysim.simulation.testbed import export_mjcf
 
-    mjcf, joints = testbed.export_mjcf(lab), lab.log.joints
-    still, film = folder / "lab.png", folder / "lab.gif"
-    steps = max(len(joints) // FILM_FRAMES, 1)
-    moments = joints[::steps]
+    mjcf, joints = export_mjcf(testbed), testbed.log.joints
+    image_path, animation_path = folder / "scene_3d.png", folder / "scene_3d.gif"
+    steps = max(len(joints) // ANIMATION_FRAMES, 1)
+    states = joints[::steps]
     try:
-        files.write_image(still, picture.picture(mjcf, joints[len(joints) // 2])[:, :, ::-1])
-        shown = progress(picture.film(mjcf, moments), len(moments), "filming")
-        picture.write_film(shown, film, len(moments) / float(lab.log.t_s[-1] + 1e-9))
+        files.write_image(image_path, picture.picture(mjcf, joints[len(joints) // 2])[:, :, ::-1])
+        shown = progress(picture.film(mjcf, states), len(states), "rendering the animation")
+        picture.write_film(shown, animation_path, len(states) / float(testbed.log.t_s[-1] + 1e-9))
     except picture.NoPicture as error:
         print_error(str(error))
         return []
-    return [still, film]
+    return [image_path, animation_path]

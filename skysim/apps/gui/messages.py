@@ -34,7 +34,7 @@ class Detection:
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
+class TrackerResult:
     """The tracker's solution of a frame, and its error if the truth is known.
 
     status : "solved", or the reason why not;  angles_deg : in the order of the scene's angle names
@@ -43,7 +43,7 @@ class Answer:
     """
 
     status: str
-    spots: tuple[Detection, ...]
+    detections: tuple[Detection, ...]
     ms: float
     angles_deg: Triple | None = None
     cross_arcsec: float = NAN
@@ -58,7 +58,7 @@ class Answer:
 
     @property
     def identified(self) -> int:
-        return sum(spot.id >= 0 for spot in self.spots)
+        return sum(detection.id >= 0 for detection in self.detections)
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,9 +75,9 @@ class FrameView:
     angles_deg: Triple
     body_wxyz: tuple[float, ...]
     exposure_s: float
-    facts: stretch.Facts
+    statistics: stretch.FrameStatistics
     lights: tuple[Light, ...]
-    answer: Answer | None
+    result: TrackerResult | None
     ms: float
     t_s: float = 0.0
     filter_arcsec: float = NAN
@@ -85,7 +85,7 @@ class FrameView:
 
 
 @dataclass(frozen=True, slots=True)
-class Zoom:
+class PixelWindow:
     """A small window of pixels: x, y of its first pixel and the digital numbers row by row."""
 
     x: int
@@ -99,7 +99,7 @@ class SceneInfo:
 
     names : of its three angles;  prefix : of its lights' numbers (HIP or LED)
     field_deg : horizontal field of view;  stages : the tracker's algorithm by stage;  choices : all algorithms by stage
-    flies : whether it has a motion;  duration_s : of the motion
+    duration_s : of its motion
     """
 
     scene: str
@@ -110,19 +110,18 @@ class SceneInfo:
     field_deg: float
     stages: dict[str, str]
     choices: dict[str, tuple[str, ...]]
-    flies: bool
     duration_s: float
-    stage: Stage
+    geometry: LabGeometry
 
 
 @dataclass(frozen=True, slots=True)
-class Stage:
+class LabGeometry:
     """3-D geometry of the laboratory; meters in the lab frame unless stated otherwise.
 
     shapes  : the vehicle's, in body axes (kind, size, position, wxyz, rgb)
     ids, lights_m, size : the lights and their drawn sizes, 0 to 1; stars are placed on a sphere
     camera_m : its pupil in body axes;  corners_m : where the four corners of its field meet the surface, in body axes
-    shell_m : lines on the dome, each a list of points
+    dome_lines_m: lines on the dome, each a list of points
     """
 
     shapes: tuple[tuple[str, Triple, Triple, tuple[float, float, float, float], Triple], ...]
@@ -131,13 +130,12 @@ class Stage:
     size: tuple[float, ...]
     camera_m: Triple
     corners_m: tuple[Triple, ...]
-    shell_m: tuple[tuple[Triple, ...], ...] = ()
+    dome_lines_m: tuple[tuple[Triple, ...], ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
-class FlightLog:
-    """A simulated motion for playback: curves against time, decimated for display; frame_s : times of the frames."""
+class MotionLog:
+    """A simulated motion for playback: curves against time, decimated for display."""
 
     t_s: tuple[float, ...]
     curves: dict[str, tuple[float, ...]] = field(default_factory=dict)
-    frame_s: tuple[float, ...] = ()

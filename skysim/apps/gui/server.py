@@ -19,8 +19,8 @@ from skysim.apps.gui.worker.session import SpareWorker
 from skysim.scene.loader import find
 
 LOOPBACK = ("127.0.0.1", "localhost", "::1", "[::1]")
-COOKIE = "skysim_lab"
-PATIENCE_S = 50.0  # for a browser to load the page
+COOKIE = "skysim_gui"
+CONNECT_TIMEOUT_S = 50.0  # for a browser to load the page
 RECONNECT_S = 6.0  # for a lost browser to reconnect, before its work ends
 
 
@@ -41,38 +41,38 @@ class Guard:
             return
         headers = {name.decode().lower(): value.decode("latin-1") for name, value in scope["headers"]}
         query = parse_qs(scope.get("query_string", b"").decode("latin-1"))
-        answer = self.refusal(headers, query)
-        if answer is None:
+        response = self.refusal(headers, query)
+        if response is None:
             await self.app(scope, limited(receive), send)
         elif scope["type"] == "http":
-            await answer(scope, receive, send)
+            await response(scope, receive, send)
         else:
             await send({"type": "websocket.close", "code": 1008})
 
     def refusal(self, headers: dict[str, str], query: dict[str, list[str]]) -> Response | None:
         """The response to a refused request; None if it is allowed."""
         if "*" not in self.hosts and host_of(headers.get("host", "")) not in self.hosts:
-            return PlainTextResponse("this host name is not served", 403)
+            return PlainTextResponse("host name not allowed", 403)
         origin = headers.get("origin", "")
         if origin and origin.partition("://")[2] != headers.get("host", ""):
-            return PlainTextResponse("a page of another site may not", 403)
+            return PlainTextResponse("request of another site refused", 403)
         if int(headers.get("content-length") or 0) > LIMIT_BYTES + 2**16:
-            return PlainTextResponse("too large: at most 64 MB", 413)
+            return PlainTextResponse("request too large; allowed: 64 MB", 413)
         if not self.token:
             return None
-        told = SimpleCookie(headers.get("cookie", "")).get(COOKIE)
-        if told and same(told.value, self.token):
+        cookie = SimpleCookie(headers.get("cookie", "")).get(COOKIE)
+        if cookie and token_matches(cookie.value, self.token):
             return None
-        if same((query.get("token") or [""])[0], self.token):
+        if token_matches((query.get("token") or [""])[0], self.token):
             response = RedirectResponse("/", 303)
             response.set_cookie(COOKIE, self.token, httponly=True, samesite="strict")
             return response
-        return PlainTextResponse("give the token that the server printed: /?token=...", 401)
+        return PlainTextResponse("token missing or wrong; open the address that the server printed: /?token=...", 401)
 
 
-def same(told: str, token: str) -> bool:
+def token_matches(candidate: str, token: str) -> bool:
     """Compare with the token in constant time, so that timing reveals nothing about it."""
-    return hmac.compare_digest(told.encode(), token.encode())
+    return hmac.compare_digest(candidate.encode(), token.encode())
 
 
 def host_of(header: str) -> str:
@@ -82,25 +82,25 @@ def host_of(header: str) -> str:
 
 def limited(receive: Any) -> Any:
     """Wrap `receive` so that a body beyond the limit ends the request, whatever its Content-Length says."""
-    came = 0
+    received = 0
 
-    async def some() -> Any:
-        nonlocal came
+    async def receive_limited() -> Any:
+        nonlocal received
         message = await receive()
         if message["type"] == "http.request":
-            came += len(message.get("body", b""))
-            if came > LIMIT_BYTES + 2**16:
+            received += len(message.get("body", b""))
+            if received > LIMIT_BYTES + 2**16:
                 return {"type": "http.disconnect"}
         return message
 
-    return some
+    return receive_limited
 
 
 def routes(scene: str, folder: Path, out: Path) -> None:
     """Register all routes, with a spare worker ready for the next tab."""
     spare = SpareWorker(str(find(scene).resolve()))
-    app.on_startup(spare.begin)
-    app.on_shutdown(spare.end)
+    app.on_startup(spare.start)
+    app.on_shutdown(spare.close)
 
     @app.get("/frame/{tab}/{number}")
     def frame(tab: str, number: int) -> Response:
@@ -118,20 +118,20 @@ def routes(scene: str, folder: Path, out: Path) -> None:
             return Response(status_code=404)
         return FileResponse(path, media_type="text/html")
 
-    @ui.page("/", title="skysim lab", dark=True)
+    @ui.page("/", title="skysim gui", dark=True)
     async def index() -> None:
         tab = Tab(scene, folder, out)
         tab.build()
         client = ui.context.client
         try:
-            await client.connected(timeout=PATIENCE_S)
+            await client.connected(timeout=CONNECT_TIMEOUT_S)
         except TimeoutError:  # no browser has connected: start no worker
             return
         tab.session = spare.take()
         client.on_delete(tab.close)
         await tab.open(scene)
-        await tab.space.suit()
-        spare.begin()
+        await tab.scene_3d.adapt_frame_rate()
+        spare.start()
 
 
 def serve(scene: str, host: str, port: int, token: str, folder: Path, out: Path, show: bool) -> None:
@@ -139,8 +139,8 @@ def serve(scene: str, host: str, port: int, token: str, folder: Path, out: Path,
     hosts = LOOPBACK if host in LOOPBACK else ("*",)
     app.add_middleware(Guard, hosts=hosts, token=token)
     routes(scene, folder, out)
-    where = f"http://{host}:{port}/" + (f"?token={token}" if token else "")
-    print(f"skysim lab: {where}   (Ctrl-C ends it)", flush=True)
+    address = f"http://{host}:{port}/" + (f"?token={token}" if token else "")
+    print(f"skysim gui: {address}   (Ctrl-C ends it)", flush=True)
     ui.run(
         host=host,
         port=port,

@@ -31,12 +31,12 @@ class Pace:
         """Delay: wall-clock seconds since scene time t_s; negative if t_s is still to come."""
         return time.monotonic() - self.due_s(t_s)
 
-    def in_time(self, _: int, t_s: float) -> bool:
+    def is_on_time(self, _: int, t_s: float) -> bool:
         """Return True if a frame whose exposure ends at t_s is less than one frame period late, so worth rendering."""
         return self.zero_s is None or not self.speed or self.late_s(t_s) < 1 / (self.rate_hz * self.speed)
 
     def wait(self, t_s: float) -> None:
         """Sleep until scene time t_s."""
-        left_s = -self.late_s(t_s)
-        if left_s > 0:
-            time.sleep(left_s)
+        remaining_s = -self.late_s(t_s)
+        if remaining_s > 0:
+            time.sleep(remaining_s)

@@ -20,34 +20,34 @@ from skysim.apps.stream.packet import Packet
 from skysim.core import files
 from skysim.core.errors import InputError, printable
 
-WAITING = 2  # length of a sink's queue, packets
-GRACE_S = 5.0  # for a sink to write its queued packets at the end
-GONE = "its reader is gone"
+QUEUE_LENGTH = 2  # length of a sink's queue, packets
+CLOSE_TIMEOUT_S = 5.0  # for a sink to write its queued packets at the end
+READER_GONE = "the reader has closed the pipe"
 
 
 class Sink:
-    """A thread that passes packets to `take`, the oldest first.
+    """A thread that passes packets to `write`, the oldest first.
 
     sent, dropped : packets so far;  fault : the error that stopped it, or ""
     """
 
-    def __init__(self, name: str, take: Callable[[Packet], None]) -> None:
-        self.name, self.take = name, take
+    def __init__(self, name: str, write: Callable[[Packet], None]) -> None:
+        self.name, self.write = name, write
         self.sent = self.dropped = 0
         self.busy = False  # writing a packet that is counted neither as sent nor as dropped yet
         self.fault = ""
-        self.waiting: queue.Queue[Packet | None] = queue.Queue(WAITING)
-        self.thread = threading.Thread(target=self.work, name=f"sink {name}", daemon=True)
+        self.packets: queue.Queue[Packet | None] = queue.Queue(QUEUE_LENGTH)
+        self.thread = threading.Thread(target=self.run, name=f"sink {name}", daemon=True)
         self.thread.start()
 
-    def work(self) -> None:
-        """Body of the thread: pass packets on until None arrives or `take` fails."""
-        while (packet := self.waiting.get()) is not None:
+    def run(self) -> None:
+        """Body of the thread: pass packets on until None arrives or `write` fails."""
+        while (packet := self.packets.get()) is not None:
             self.busy = True
             try:
-                self.take(packet)
+                self.write(packet)
             except BrokenPipeError:
-                self.fault = GONE
+                self.fault = READER_GONE
             except OSError as error:
                 file = f"{error.filename}: " if error.filename else ""
                 self.fault = file + (error.strerror or str(error))
@@ -63,10 +63,10 @@ class Sink:
 
     def offer(self, packet: Packet, patient: bool) -> None:
         """Queue a packet. If the queue is full, wait if `patient`, else drop the packet."""
-        packet = packet.after(self.dropped)  # the header's count includes frames dropped by this sink
+        packet = packet.plus_dropped(self.dropped)  # the header's count includes frames dropped by this sink
         while not self.fault:
             try:
-                self.waiting.put(packet, timeout=0.1 if patient else 0.0001)
+                self.packets.put(packet, timeout=0.1 if patient else 0.0001)
                 return
             except queue.Full:
                 if not patient:
@@ -74,59 +74,59 @@ class Sink:
         self.dropped += 1
 
     def close(self) -> None:
-        """End the thread after its queued packets, within GRACE_S; count what is left as dropped."""
-        until = time.monotonic() + GRACE_S
-        while self.thread.is_alive() and time.monotonic() < until:
+        """End the thread after its queued packets, within CLOSE_TIMEOUT_S; count what is left as dropped."""
+        deadline = time.monotonic() + CLOSE_TIMEOUT_S
+        while self.thread.is_alive() and time.monotonic() < deadline:
             with contextlib.suppress(queue.Full):
-                self.waiting.put(None, timeout=0.1)
+                self.packets.put(None, timeout=0.1)
                 break
-        self.thread.join(max(until - time.monotonic(), 0.0))
+        self.thread.join(max(deadline - time.monotonic(), 0.0))
         with contextlib.suppress(queue.Empty):  # what is still queued is lost
             while True:
-                self.dropped += self.waiting.get_nowait() is not None
+                self.dropped += self.packets.get_nowait() is not None
         self.dropped += self.busy  # the packet that a blocked thread still holds
 
 
-def folder(path: Path) -> Callable[[Packet], None]:
-    """Return a `take` that writes frame_NNNNNN.png (16 bits; else .raw) and frame_NNNNNN.json with header and truth.
+def folder_writer(path: Path) -> Callable[[Packet], None]:
+    """Return a function that writes frame_NNNNNN.png (16 bits; else .raw) and frame_NNNNNN.json with header and truth.
 
     The .json is written last and atomically, so that a reader may wait for it. Raises InputError if the folder holds
     frames of an earlier stream.
     """
     files.make_folder(path)
     if any(path.glob("frame_*.json")):
-        raise InputError(f"{path}: frames of an earlier stream are there; allowed: an empty folder")
+        raise InputError(f"{path}: holds frames of an earlier stream; allowed: an empty folder")
 
-    def take(packet: Packet) -> None:
+    def write(packet: Packet) -> None:
         stem = path / f"frame_{packet.header['index']:06d}"
         if packet.pixels.dtype == np.uint16:
-            files.write_bytes(stem.with_suffix(".png"), png(packet))
+            files.write_bytes(stem.with_suffix(".png"), encode_png(packet))
         else:
             files.write_bytes(stem.with_suffix(".raw"), packet.pixels.tobytes())
         files.write_text(stem.with_suffix(".json"), files.to_json({**packet.header, "truth": packet.truth}))
 
-    return take
+    return write
 
 
-def png(packet: Packet) -> bytes:
+def encode_png(packet: Packet) -> bytes:
     """Encode the pixels as PNG at the lowest compression level, for speed."""
     return bytes(cv2.imencode(".png", packet.pixels, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1])
 
 
-def pipe(path: str) -> Callable[[Packet], None]:
-    """Return a `take` that writes packets, as `packet.unpack` reads them, to standard output (-) or a named pipe.
+def pipe_writer(path: str) -> Callable[[Packet], None]:
+    """Return a function that writes packets, as `packet.unpack` reads them, to standard output (-) or a named pipe.
 
     The pipe is opened at the first packet, which blocks until a reader opens it. Raises InputError if it is no pipe.
     """
     if path != "-" and not Path(path).is_fifo():
-        raise InputError(f"--pipe {path}: no named pipe; allowed: - or what mkfifo made")
+        raise InputError(f"--pipe {path}: not a named pipe; allowed: - or a pipe made by mkfifo")
 
     @functools.cache
-    def end() -> BinaryIO:
+    def stream() -> BinaryIO:
         return sys.stdout.buffer if path == "-" else Path(path).open("wb")
 
-    def take(packet: Packet) -> None:
-        end().write(packet.pack())
-        end().flush()
+    def write(packet: Packet) -> None:
+        stream().write(packet.pack())
+        stream().flush()
 
-    return take
+    return write

@@ -18,7 +18,7 @@ from skysim.core.jit import jit
 from skysim.core.types import Floats
 
 BLOCK = 64  # columns processed together: a few cache lines of every row
-TAIL = 1e-6  # fraction of a packet that the table of late shares does not resolve
+TAIL = 1e-6  # fraction of a packet that the table of delays does not resolve
 
 
 def bloom(electrons: NDArray[Any], full_well_e: float, anti_blooming: float = 0.0) -> None:
@@ -30,66 +30,64 @@ def bloom(electrons: NDArray[Any], full_well_e: float, anti_blooming: float = 0.
     (the divisible sandpile in one dimension: Levine & Peres 2009, Potential Anal. 30, 1; `assumed`). These two
     conserved numbers give the ends of the streak directly, see `_settle`. Columns without excess are skipped.
     """
-    over = np.flatnonzero(electrons.max(axis=0) > full_well_e)
-    if len(over):
-        _bloom(electrons, over, float(full_well_e), float(anti_blooming))
+    columns = np.flatnonzero(electrons.max(axis=0) > full_well_e)
+    if len(columns):
+        _bloom(electrons, columns, float(full_well_e), float(anti_blooming))
 
 
 @jit(parallel=True)
-def _bloom(
-    electrons: NDArray[Any], over: NDArray[np.int64], full_well_e: float, anti_blooming: float
-) -> None:
+def _bloom(electrons: NDArray[Any], columns: NDArray[np.int64], full_well_e: float, anti_blooming: float) -> None:
     height = electrons.shape[0]
-    for k in numba.prange(len(over)):
-        x = over[k]
-        room = np.empty(height)  # remaining capacity; negative: excess
+    for k in numba.prange(len(columns)):
+        x = columns[k]
+        headroom = np.empty(height)  # remaining capacity; negative: excess
         first, last = height, -1
         for y in range(height):
-            room[y] = full_well_e - electrons[y, x]
-            if room[y] < 0:
+            headroom[y] = full_well_e - electrons[y, x]
+            if headroom[y] < 0:
                 # The drain takes its fraction of the excess before the rest spreads.
-                room[y] *= 1 - anti_blooming
+                headroom[y] *= 1 - anti_blooming
                 first, last = min(first, y), max(last, y)
         for y in range(height):
-            if room[y] < 0:
-                a, b = _settle(room, y)
+            if headroom[y] < 0:
+                a, b = _settle(headroom, y)
                 first, last = min(first, a), max(last, b)
         for y in range(max(first, 0), min(last, height - 1) + 1):
             # Back from remaining capacity to charge, only where something changed.
-            electrons[y, x] = full_well_e - room[y]
+            electrons[y, x] = full_well_e - headroom[y]
 
 
 @jit
-def _settle(room: Floats, y: int) -> tuple[int, int]:
+def _settle(headroom: Floats, y: int) -> tuple[int, int]:
     """Spread the excess of pixel y until it fits; return the two ends of the streak, which are filled partly.
 
-    All pixels between the ends a and b are full. The charge that is left over, `left` with its first moment `moment`
+    All pixels between the ends a and b are full. The charge that is left over, `excess` with its first moment `moment`
     about y, is split between a and b so that sum and first moment are conserved (the lever rule). An end pixel that
     cannot hold its part is filled and the end moves on; if that pixel has excess itself (negative room), its excess
     joins the charge to spread. Beyond the column's ends any amount fits, and is lost.
     """
-    height = len(room)
-    left, moment = -room[y], 0.0  # moment about y
-    room[y] = 0.0
+    height = len(headroom)
+    excess, moment = -headroom[y], 0.0  # moment about y
+    headroom[y] = 0.0
     a, b = y - 1, y + 1
     while True:
         # Lever rule: the charge left over is split so that its sum and its moment about y are conserved.
-        to_b = (moment + left * (y - a)) / (b - a)
-        to_a = left - to_b
-        if a >= 0 and to_a > room[a]:
-            left, moment = left - room[a], moment - room[a] * (a - y)
-            room[a] = 0.0
+        to_b = (moment + excess * (y - a)) / (b - a)
+        to_a = excess - to_b
+        if a >= 0 and to_a > headroom[a]:
+            excess, moment = excess - headroom[a], moment - headroom[a] * (a - y)
+            headroom[a] = 0.0
             a -= 1
-        elif b < height and to_b > room[b]:
-            left, moment = left - room[b], moment - room[b] * (b - y)
-            room[b] = 0.0
+        elif b < height and to_b > headroom[b]:
+            excess, moment = excess - headroom[b], moment - headroom[b] * (b - y)
+            headroom[b] = 0.0
             b += 1
         else:
             break
     if a >= 0:
-        room[a] -= to_a
+        headroom[a] -= to_a
     if b < height:
-        room[b] -= to_b
+        headroom[b] -= to_b
     return a, b
 
 
@@ -104,27 +102,27 @@ def transfer_loss(electrons: NDArray[Any], cti_parallel: float, cti_serial: floa
     """
     height, width = electrons.shape
     if cti_parallel > 0:
-        _late_rows(electrons, late_shares(height, cti_parallel))
+        _delay_rows(electrons, delayed_fractions(height, cti_parallel))
     if cti_serial > 0:
-        _late_columns(electrons, late_shares(width, cti_serial))
+        _delay_columns(electrons, delayed_fractions(width, cti_serial))
 
 
 @functools.lru_cache(maxsize=8)
-def late_shares(transfers: int, cti: float) -> Floats:
+def delayed_fractions(transfers: int, cti: float) -> Floats:
     """(K + 1, transfers) fraction of the packet of n + 1 transfers that arrives k pixels late; columns add up to 1.
 
     K is where less than 1e-6 of the charge with the most transfers is later still; that is counted as K pixels late.
     """
-    last = int(scipy.stats.nbinom.ppf(1 - TAIL, transfers, 1 - cti))
-    late, n = np.arange(last + 1)[:, None], np.arange(1, transfers + 1)
-    share = scipy.stats.nbinom.pmf(late, n, 1 - cti)
-    share[-1] = scipy.stats.nbinom.sf(last - 1, n, 1 - cti)
-    share.flags.writeable = False
-    return np.asarray(share)
+    longest = int(scipy.stats.nbinom.ppf(1 - TAIL, transfers, 1 - cti))
+    delay, n = np.arange(longest + 1)[:, None], np.arange(1, transfers + 1)
+    fraction = scipy.stats.nbinom.pmf(delay, n, 1 - cti)
+    fraction[-1] = scipy.stats.nbinom.sf(longest - 1, n, 1 - cti)
+    fraction.flags.writeable = False
+    return np.asarray(fraction)
 
 
 @jit(parallel=True)
-def _late_rows(electrons: NDArray[Any], share: Floats) -> None:
+def _delay_rows(electrons: NDArray[Any], fraction: Floats) -> None:
     """Apply the parallel loss from the last row to the first: each row gathers from rows that are not yet changed."""
     height, width = electrons.shape
     for block in numba.prange((width + BLOCK - 1) // BLOCK):
@@ -133,22 +131,22 @@ def _late_rows(electrons: NDArray[Any], share: Floats) -> None:
         # Backwards, so that the rows that row y gathers from still hold the charge before transfer.
         for y in range(height - 1, -1, -1):
             gathered[:] = 0
-            for k in range(min(len(share), y + 1)):
-                part = electrons.dtype.type(share[k, y - k])
+            for k in range(min(len(fraction), y + 1)):
+                weight = electrons.dtype.type(fraction[k, y - k])
                 for x in range(x0, x1):
-                    gathered[x - x0] += part * electrons[y - k, x]
+                    gathered[x - x0] += weight * electrons[y - k, x]
             for x in range(x0, x1):
                 electrons[y, x] = gathered[x - x0]
 
 
 @jit(parallel=True)
-def _late_columns(electrons: NDArray[Any], share: Floats) -> None:
+def _delay_columns(electrons: NDArray[Any], fraction: Floats) -> None:
     height, width = electrons.shape
     for y in numba.prange(height):
         gathered = np.zeros(width)
-        for k in range(min(len(share), width)):
+        for k in range(min(len(fraction), width)):
             for x in range(k, width):
-                gathered[x] += share[k, x - k] * electrons[y, x - k]
+                gathered[x] += fraction[k, x - k] * electrons[y, x - k]
         for x in range(width):
             electrons[y, x] = gathered[x]
 
@@ -176,7 +174,7 @@ def interline_smear(light_e: NDArray[Any], exposure_s: float, row_time_s: float,
 
 
 @jit(parallel=True)
-def _smear(light_e: NDArray[Any], share: float) -> None:
+def _smear(light_e: NDArray[Any], fraction: float) -> None:
     """Add to every pixel a fraction of the sum of the other pixels in its column."""
     height, width = light_e.shape
     for block in numba.prange((width + BLOCK - 1) // BLOCK):
@@ -185,7 +183,7 @@ def _smear(light_e: NDArray[Any], share: float) -> None:
         for y in range(height):
             for x in range(x0, x1):
                 column[x - x0] += light_e[y, x]
-        column *= share
+        column *= fraction
         for y in range(height):
             for x in range(x0, x1):
-                light_e[y, x] = (1 - share) * light_e[y, x] + column[x - x0]
+                light_e[y, x] = (1 - fraction) * light_e[y, x] + column[x - x0]

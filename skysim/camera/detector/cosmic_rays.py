@@ -17,11 +17,11 @@ from skysim.core.types import Floats
 from skysim.scene.camera import ParticlesConfig
 
 STEP_PX = 0.25
-# Landau's scale 0.1535 MeV cm^2/g x Z/A 0.498 x 2.33 g/cm^3 = 17.8 eV a micrometre, 4.9 electrons of 3.65 eV, over
-# 80 most probable ones (`assumed`, for a fast singly charged particle). Layers of a few micrometres straggle more.
-WIDTH = 0.06
-MOST_ASLANT = 100.0  # tangent of the largest angle from the normal; 1e-4 of an isotropic flux is beyond
-MOST_TRACKS = 1_000_000
+# Landau's scale 0.1535 MeV cm^2/g x Z/A 0.498 x 2.33 g/cm^3 = 17.8 eV a micrometer, 4.9 electrons of 3.65 eV, over
+# 80 most probable ones (`assumed`, for a fast singly charged particle). Layers of a few micrometers straggle more.
+MOYAL_WIDTH = 0.06
+MAX_TANGENT = 100.0  # tangent of the largest angle from the normal; 1e-4 of an isotropic flux is beyond
+MAX_TRACKS = 1_000_000
 
 TRACK = np.dtype(
     [
@@ -31,12 +31,12 @@ TRACK = np.dtype(
         ("end_y_px", "f8"),
         ("length_m", "f8"),
         ("electrons", "f8"),
-        ("kept_e", "f8"),
+        ("deposited_e", "f8"),
     ]
 )
 
 
-def hit(
+def add_particles(
     electrons: NDArray[Any],
     exposure_s: float,
     pixel_m: float,
@@ -49,52 +49,56 @@ def hit(
     front and exit at the back (pixels, also outside of the frame), path length through the layer, charge released,
     and the charge that fell on the frame.
     """
-    tracks = [tracks_of(part, electrons.shape, exposure_s, pixel_m, rng) for part in particles]
-    for part, some in zip(particles, tracks, strict=True):
-        ends = np.column_stack([some["x_px"], some["y_px"], some["end_x_px"], some["end_y_px"]])
-        some["kept_e"] = deposit(electrons, ends, some["electrons"], max(part.diffusion_px, 1e-3))
-    every = np.concatenate(tracks) if tracks else np.empty(0, TRACK)
-    return every[every["kept_e"] > 0]
+    tracks = [draw_tracks(config, electrons.shape, exposure_s, pixel_m, rng) for config in particles]
+    for config, track in zip(particles, tracks, strict=True):
+        ends_px = np.column_stack([track["x_px"], track["y_px"], track["end_x_px"], track["end_y_px"]])
+        track["deposited_e"] = deposit(electrons, ends_px, track["electrons"], max(config.diffusion_px, 1e-3))
+    all_tracks = np.concatenate(tracks) if tracks else np.empty(0, TRACK)
+    return all_tracks[all_tracks["deposited_e"] > 0]
 
 
-def tracks_of(
-    part: ParticlesConfig, shape: tuple[int, ...], exposure_s: float, pixel_m: float, rng: np.random.Generator
+def draw_tracks(
+    config: ParticlesConfig,
+    shape: tuple[int, ...],
+    exposure_s: float,
+    pixel_m: float,
+    rng: np.random.Generator,
 ) -> NDArray[Any]:
     """Draw every track that could reach a chip of this shape (H, W): its ends, length and charge.
 
     per_cm2_s counts the particles that cross a square centimeter of the chip's plane in a second, from either
     side; an isotropic flux of J through a sphere of 1 cm^2 section gives J / 2. Directions are isotropic, but
-    the chip is
-    foreshortened: p(theta) = 2 sin(theta) cos(theta) = sin(2 theta) from its normal, so cos^2(theta) is uniform.
+    the chip is foreshortened: p(theta) = 2 sin(theta) cos(theta) = sin(2 theta) from its normal, so cos^2(theta) is
+    uniform.
     The path length is depth / cos(theta). The charge follows Moyal's law (1955, Phil. Mag. 46, 263) about the most
-    probable value, electrons_um times the length, with a scale of WIDTH times that. More than MOST_TRACKS raise
+    probable value, electrons_um times the length, with a scale of MOYAL_WIDTH times that. More than MAX_TRACKS raise
     InputError.
     """
     height, width = shape
-    margin = MOST_ASLANT * part.depth_m / pixel_m  # also tracks that enter beside the frame
+    margin = MAX_TANGENT * config.depth_m / pixel_m  # also tracks that enter beside the frame
     area_cm2 = (width + 2 * margin) * (height + 2 * margin) * pixel_m**2 * 1e4
-    expected = part.per_cm2_s * area_cm2 * exposure_s
-    if expected > MOST_TRACKS:
+    expected = config.per_cm2_s * area_cm2 * exposure_s
+    if expected > MAX_TRACKS:
         raise InputError(
             f"camera.detector.particles: {expected:.3g} tracks come near the chip in an exposure;"
-            f" allowed: {MOST_TRACKS:,}"
+            f" allowed: {MAX_TRACKS:,}"
         )
     count = rng.poisson(expected)
-    made = np.zeros(count, TRACK)
-    # cos^2(theta) is uniform; its lower end bounds the tangent by MOST_ASLANT.
-    cosine = np.sqrt(rng.uniform(1 / (1 + MOST_ASLANT**2), 1, count))
+    tracks = np.zeros(count, TRACK)
+    # cos^2(theta) is uniform; its lower end bounds the tangent by MAX_TANGENT.
+    cos_theta = np.sqrt(rng.uniform(1 / (1 + MAX_TANGENT**2), 1, count))
     azimuth = rng.uniform(0, 2 * np.pi, count)
-    reach_px = part.depth_m / pixel_m * np.sqrt(1 / cosine**2 - 1)
-    made["x_px"] = rng.uniform(-0.5 - margin, width - 0.5 + margin, count)
-    made["y_px"] = rng.uniform(-0.5 - margin, height - 0.5 + margin, count)
-    made["end_x_px"] = made["x_px"] + reach_px * np.cos(azimuth)
-    made["end_y_px"] = made["y_px"] + reach_px * np.sin(azimuth)
-    made["length_m"] = part.depth_m / cosine
-    probable = part.electrons_um * 1e6 * made["length_m"]
-    made["electrons"] = probable * np.maximum(
-        1 + WIDTH * scipy.stats.moyal.rvs(size=count, random_state=rng), 0
+    lateral_px = config.depth_m / pixel_m * np.sqrt(1 / cos_theta**2 - 1)
+    tracks["x_px"] = rng.uniform(-0.5 - margin, width - 0.5 + margin, count)
+    tracks["y_px"] = rng.uniform(-0.5 - margin, height - 0.5 + margin, count)
+    tracks["end_x_px"] = tracks["x_px"] + lateral_px * np.cos(azimuth)
+    tracks["end_y_px"] = tracks["y_px"] + lateral_px * np.sin(azimuth)
+    tracks["length_m"] = config.depth_m / cos_theta
+    probable_e = config.electrons_um * 1e6 * tracks["length_m"]
+    tracks["electrons"] = probable_e * np.maximum(
+        1 + MOYAL_WIDTH * scipy.stats.moyal.rvs(size=count, random_state=rng), 0
     )
-    return made
+    return tracks
 
 
 @jit
@@ -105,20 +109,21 @@ def deposit(image: NDArray[Any], ends_px: Floats, electrons: Floats, sigma_px: f
     ends_px (N, 4): x, y of entry and of exit. Returns (N,) charge that fell on the frame.
     """
     height, width = image.shape
-    kept = np.zeros(len(electrons))
+    deposited = np.zeros(len(electrons))
     for n in range(len(electrons)):
         x, y, end_x, end_y = ends_px[n]
         steps = int(np.ceil(sqrt((end_x - x) ** 2 + (end_y - y) ** 2) / STEP_PX)) + 1
         for k in range(steps):
-            way, part = (k + 0.5) / steps, electrons[n] / steps
-            at_x, at_y = x + way * (end_x - x), y + way * (end_y - y)
-            add_gaussian(image, 0, height, at_x, at_y, part, sigma_px)
-            kept[n] += part * _share(at_x, width, sigma_px) * _share(at_y, height, sigma_px)
-    return kept
+            along, charge = (k + 0.5) / steps, electrons[n] / steps
+            center_x, center_y = x + along * (end_x - x), y + along * (end_y - y)
+            add_gaussian(image, 0, height, center_x, center_y, charge, sigma_px)
+            inside_x = _fraction_inside(center_x, width, sigma_px)
+            deposited[n] += charge * inside_x * _fraction_inside(center_y, height, sigma_px)
+    return deposited
 
 
 @jit
-def _share(place: float, size: int, sigma_px: float) -> float:
-    """Fraction of a Gaussian centered at `place` that is within an axis of so many pixels."""
+def _fraction_inside(center: float, size: int, sigma_px: float) -> float:
+    """Fraction of a Gaussian centered at `center` that is within an axis of so many pixels."""
     scale = 1 / (sigma_px * sqrt(2.0))
-    return (erf((size - 0.5 - place) * scale) - erf((-0.5 - place) * scale)) / 2
+    return (erf((size - 0.5 - center) * scale) - erf((-0.5 - center) * scale)) / 2

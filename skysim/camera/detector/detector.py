@@ -32,7 +32,7 @@ class Detector:
     column_offset_e : (W,) offsets of the column amplifiers
     """
 
-    part: DetectorConfig
+    config: DetectorConfig
     shutter: Shutter
     pixel_m: float
     sensitivity: NDArray[np.float32]
@@ -40,81 +40,85 @@ class Detector:
     column_offset_e: NDArray[np.float32]
 
     @classmethod
-    def of(cls, camera: CameraConfig) -> Detector:
+    def from_camera(cls, camera: CameraConfig) -> Detector:
         """Draw the fixed pattern."""
-        part, shape = camera.detector, (camera.height_px, camera.width_px)
-        streams = np.random.SeedSequence(part.hardware_seed).spawn(3)
+        config, shape = camera.detector, (camera.height_px, camera.width_px)
+        streams = np.random.SeedSequence(config.hardware_seed).spawn(3)
         prnu, dark, column = (np.random.default_rng(stream) for stream in streams)
         return cls(
-            part,
+            config,
             camera.shutter,
             camera.pixel_m,
-            sensitivity(part, shape, prnu),
-            dark_current_e_s(part, shape, dark),
-            (part.column_offset_e * column.standard_normal(shape[1])).astype(np.float32),
+            sensitivity(config, shape, prnu),
+            dark_current_e_s(config, shape, dark),
+            (config.column_offset_e * column.standard_normal(shape[1])).astype(np.float32),
         )
 
 
-def sensitivity(part: DetectorConfig, shape: tuple[int, int], rng: Generator) -> NDArray[np.float32]:
+def sensitivity(config: DetectorConfig, shape: tuple[int, int], rng: Generator) -> NDArray[np.float32]:
     """Photo-response non-uniformity (PRNU): Gaussian about 1, independent in each pixel, not below 0."""
-    if part.prnu == 0:
+    if config.prnu == 0:
         return np.ones(shape, np.float32)
-    spread = rng.standard_normal(shape, np.float32)
-    spread *= part.prnu
-    spread += 1
-    return np.maximum(spread, 0, out=spread)
+    prnu = rng.standard_normal(shape, np.float32)
+    prnu *= config.prnu
+    prnu += 1
+    return np.maximum(prnu, 0, out=prnu)
 
 
-def dark_current_e_s(part: DetectorConfig, shape: tuple[int, int], rng: Generator) -> NDArray[np.float32]:
+def dark_current_e_s(config: DetectorConfig, shape: tuple[int, int], rng: Generator) -> NDArray[np.float32]:
     """Dark current of every pixel: D = D_ref 2^((T - T_ref) / T_double), D_ref lognormal over the pixels.
 
     A lognormal of mean 1 and standard deviation dsnu has s^2 = ln(1 + dsnu^2) and median exp(-s^2 / 2). Hot pixels
     add an exponential of mean hot_e_s. Generation in the depletion region doubles every 6 to 8 K near room
     temperature (Janesick 2001, Scientific Charge-Coupled Devices, ch. 7).
     """
-    dark = np.full(shape, part.dark_e_s, np.float32)
-    if part.dsnu > 0 and part.dark_e_s > 0:
-        s2 = np.log1p(part.dsnu**2)
-        spread = rng.standard_normal(shape, np.float32)
-        dark *= np.exp(np.float32(np.sqrt(s2)) * spread - np.float32(s2 / 2))
-    hot = rng.choice(dark.size, rng.binomial(dark.size, part.hot_pixels), replace=False)
-    dark.reshape(-1)[hot] += rng.exponential(part.hot_e_s, len(hot)).astype(np.float32)
-    dark *= np.float32(2.0**part.doublings)
+    dark = np.full(shape, config.dark_e_s, np.float32)
+    if config.dsnu > 0 and config.dark_e_s > 0:
+        s2 = np.log1p(config.dsnu**2)
+        normal = rng.standard_normal(shape, np.float32)
+        dark *= np.exp(np.float32(np.sqrt(s2)) * normal - np.float32(s2 / 2))
+    hot = rng.choice(dark.size, rng.binomial(dark.size, config.hot_pixels), replace=False)
+    dark.reshape(-1)[hot] += rng.exponential(config.hot_e_s, len(hot)).astype(np.float32)
+    dark *= np.float32(2.0**config.doublings)
     return dark
 
 
-def expose(light_e: NDArray[Any], exposure_s: float, chip: Detector, rng: Generator) -> NDArray[Any]:
+def expose(light_e: NDArray[Any], exposure_s: float, detector: Detector, rng: Generator) -> NDArray[Any]:
     """Convert a frame's light to digital numbers. Returns (H, W) uint16.
 
     light_e : (H, W) float32 mean photo-electrons of a perfect pixel, including the shutter's `smear`; overwritten
     With noise off the frame is the expected value in digital numbers, of light_e's own type, neither rounded nor
     clipped, for tests of the steps that follow.
     """
-    part = chip.part
-    if not part.noise:
-        return expectation(light_e, exposure_s, chip)
-    counting, reading = noise.seeds(rng, len(light_e)), noise.seeds(rng, len(light_e))
+    config = detector.config
+    if not config.noise:
+        return expectation(light_e, exposure_s, detector)
+    count_seeds, read_seeds = noise.seeds(rng, len(light_e)), noise.seeds(rng, len(light_e))
+    constants, tables = readout_constants(config, exposure_s), noise.tables()
+    pattern, frame = (detector.sensitivity, detector.dark_e_s), np.empty(light_e.shape, np.uint16)
     # With no step between counting and read-out, one fused loop does both, with the same numbers.
-    if not (part.particles or part.blooming == "column" or part.cti_parallel or part.cti_serial):
-        return count_and_read(light_e, exposure_s, chip, counting, reading)
-    count(light_e, exposure_s, chip, counting)
-    if part.particles:
-        cosmic_rays.hit(light_e, exposure_s, chip.pixel_m, part.particles, rng)
-    if part.blooming == "column":
-        charge_transfer.bloom(light_e, part.full_well_e, part.anti_blooming)
+    if not (config.particles or config.blooming == "column" or config.cti_parallel or config.cti_serial):
+        _count_and_read(light_e, *pattern, detector.column_offset_e, constants, count_seeds, read_seeds, tables, frame)
+        return frame
+    _count(light_e, *pattern, constants, count_seeds, tables)
+    if config.particles:
+        cosmic_rays.add_particles(light_e, exposure_s, detector.pixel_m, config.particles, rng)
+    if config.blooming == "column":
+        charge_transfer.bloom(light_e, config.full_well_e, config.anti_blooming)
     else:
-        np.minimum(light_e, part.full_well_e, out=light_e)
-    if part.cti_parallel or part.cti_serial:
-        charge_transfer.transfer_loss(light_e, part.cti_parallel, part.cti_serial)
-    return read_out(light_e, chip, reading)
+        np.minimum(light_e, config.full_well_e, out=light_e)
+    if config.cti_parallel or config.cti_serial:
+        charge_transfer.transfer_loss(light_e, config.cti_parallel, config.cti_serial)
+    _read_out(light_e, detector.column_offset_e, constants, read_seeds, tables, frame)
+    return frame
 
 
-def expectation(light_e: NDArray[Any], exposure_s: float, chip: Detector) -> NDArray[Any]:
+def expectation(light_e: NDArray[Any], exposure_s: float, detector: Detector) -> NDArray[Any]:
     """Expected digital numbers without full well, nonlinearity and particles."""
-    part = chip.part
-    mean_e = light_e * chip.sensitivity + chip.dark_e_s * exposure_s
-    charge_transfer.transfer_loss(mean_e, part.cti_parallel, part.cti_serial)
-    return (mean_e + chip.column_offset_e) / part.gain_e_dn + part.offset_dn
+    config = detector.config
+    mean_e = light_e * detector.sensitivity + detector.dark_e_s * exposure_s
+    charge_transfer.transfer_loss(mean_e, config.cti_parallel, config.cti_serial)
+    return (mean_e + detector.column_offset_e) / config.gain_e_dn + config.offset_dn
 
 
 def smear(light_e: NDArray[Any], exposure_s: float, shutter: Shutter) -> None:
@@ -129,34 +133,34 @@ def smear(light_e: NDArray[Any], exposure_s: float, shutter: Shutter) -> None:
 
 
 class ReadoutConstants(NamedTuple):
-    """Detector parameters for the compiled loops, in single precision."""
+    """Detector parameters for the compiled loops."""
 
     exposure_s: np.float32
     well_e: np.float32
     noise_e: np.float32
-    bend: np.float32
-    per_e: np.float32
+    nonlinearity_per_e: np.float32
+    dn_per_e: np.float32
     offset_dn: np.float32
     top_dn: np.float32
 
 
-def rules(part: DetectorConfig, exposure_s: float) -> ReadoutConstants:
-    """The parameters that _gather and _convert need."""
-    numbers = (
+def readout_constants(config: DetectorConfig, exposure_s: float) -> ReadoutConstants:
+    """The parameters that `_count_row` and `_read_row` need, in single precision."""
+    values = (
         exposure_s,
-        np.inf if part.blooming == "column" else part.full_well_e,
-        hypot(part.read_noise_e, part.reset_noise_e),
-        part.nonlinearity / part.full_well_e,
-        1 / part.gain_e_dn,
-        part.offset_dn + 0.5,  # truncation after adding 0.5 rounds
-        2**part.bits - 1,
+        np.inf if config.blooming == "column" else config.full_well_e,
+        hypot(config.read_noise_e, config.reset_noise_e),
+        config.nonlinearity / config.full_well_e,
+        1 / config.gain_e_dn,
+        config.offset_dn + 0.5,  # truncation after adding 0.5 rounds
+        2**config.bits - 1,
     )
-    return ReadoutConstants(*map(np.float32, numbers))
+    return ReadoutConstants(*map(np.float32, values))
 
 
 @jit
-def _gather(
-    row: Any, sensitivity: Any, dark_e_s: Any, rules: ReadoutConstants, seed: Any, tables: noise.Tables
+def _count_row(
+    row: Any, sensitivity: Any, dark_e_s: Any, constants: ReadoutConstants, seed: Any, tables: noise.Tables
 ) -> None:
     """Count electrons, light and dark together: Poisson, variance equal to the mean. One row, in place.
 
@@ -164,69 +168,48 @@ def _gather(
     """
     for x in range(row.size):
         # Interpolated images may be slightly negative (about 1e-6).
-        row[x] = max(row[x], float32(0)) * sensitivity[x] + dark_e_s[x] * rules.exposure_s
+        row[x] = max(row[x], float32(0)) * sensitivity[x] + dark_e_s[x] * constants.exposure_s
     noise.count(row, seed, tables)
 
 
 @jit
-def _convert(
-    row: Any, offset_e: Any, rules: ReadoutConstants, seed: Any, tables: noise.Tables, numbers: Any
+def _read_row(
+    row: Any, offset_e: Any, constants: ReadoutConstants, seed: Any, tables: noise.Tables, dn_row: Any
 ) -> None:
     """Convert charge to numbers: full well, column offset and read noise, nonlinearity, gain, rounding, clipping.
 
     Without blooming a well holds at most its capacity. The amplifier gives e (1 - nonlinearity e / full_well);
     DN = round(that / gain + offset), clipped to the converter's bits.
     """
-    random = np.empty(row.size, np.float32)
-    noise.normal(random, seed, tables)
+    noise_row = np.empty(row.size, np.float32)
+    noise.normal(noise_row, seed, tables)
     for x in range(row.size):
-        e = min(row[x], rules.well_e) + offset_e[x] + rules.noise_e * random[x]
-        dn = e * (float32(1) - rules.bend * e) * rules.per_e + rules.offset_dn
-        numbers[x] = np.uint16(int32(min(max(dn, float32(0)), rules.top_dn)))
-
-
-def count(light_e: NDArray[Any], exposure_s: float, chip: Detector, seeds: NDArray[np.uint64]) -> None:
-    """Light to electrons, in place; see _gather."""
-    _count(light_e, chip.sensitivity, chip.dark_e_s, rules(chip.part, exposure_s), seeds, noise.tables())
+        e = min(row[x], constants.well_e) + offset_e[x] + constants.noise_e * noise_row[x]
+        dn = e * (float32(1) - constants.nonlinearity_per_e * e) * constants.dn_per_e + constants.offset_dn
+        dn_row[x] = np.uint16(int32(min(max(dn, float32(0)), constants.top_dn)))
 
 
 @jit(parallel=True)
 def _count(
-    light_e: Any, sensitivity: Any, dark_e_s: Any, rules: ReadoutConstants, seeds: Any, tables: noise.Tables
+    light_e: Any,
+    sensitivity: Any,
+    dark_e_s: Any,
+    constants: ReadoutConstants,
+    seeds: Any,
+    tables: noise.Tables,
 ) -> None:
+    """Light to electrons, in place; see `_count_row`."""
     for y in numba.prange(light_e.shape[0]):
-        _gather(light_e[y], sensitivity[y], dark_e_s[y], rules, seeds[y], tables)
-
-
-def read_out(electrons: NDArray[Any], chip: Detector, seeds: NDArray[np.uint64]) -> NDArray[np.uint16]:
-    """Electrons to digital numbers; see _convert."""
-    frame = np.empty(electrons.shape, np.uint16)
-    _read_out(electrons, chip.column_offset_e, rules(chip.part, 0.0), seeds, noise.tables(), frame)
-    return frame
+        _count_row(light_e[y], sensitivity[y], dark_e_s[y], constants, seeds[y], tables)
 
 
 @jit(parallel=True)
 def _read_out(
-    electrons: Any, offset_e: Any, rules: ReadoutConstants, seeds: Any, tables: noise.Tables, frame: Any
+    electrons: Any, offset_e: Any, constants: ReadoutConstants, seeds: Any, tables: noise.Tables, frame: Any
 ) -> None:
+    """Electrons to digital numbers; see `_read_row`."""
     for y in numba.prange(electrons.shape[0]):
-        _convert(electrons[y], offset_e, rules, seeds[y], tables, frame[y])
-
-
-def count_and_read(
-    light_e: NDArray[Any],
-    exposure_s: float,
-    chip: Detector,
-    counting: NDArray[np.uint64],
-    reading: NDArray[np.uint64],
-) -> NDArray[np.uint16]:
-    """`count` and `read_out` fused row by row: the same numbers, faster. Only if no charge leaves its
-    row in between.
-    """
-    frame = np.empty(light_e.shape, np.uint16)
-    pattern = (chip.sensitivity, chip.dark_e_s, chip.column_offset_e)
-    _count_and_read(light_e, *pattern, rules(chip.part, exposure_s), counting, reading, noise.tables(), frame)
-    return frame
+        _read_row(electrons[y], offset_e, constants, seeds[y], tables, frame[y])
 
 
 @jit(parallel=True)
@@ -235,44 +218,45 @@ def _count_and_read(
     sensitivity: Any,
     dark_e_s: Any,
     offset_e: Any,
-    rules: ReadoutConstants,
-    counting: Any,
-    reading: Any,
+    constants: ReadoutConstants,
+    count_seeds: Any,
+    read_seeds: Any,
     tables: noise.Tables,
     frame: Any,
 ) -> None:
+    """`_count` and `_read_out` fused row by row: the same numbers, faster. Only if no charge leaves its row between."""
     for y in numba.prange(light_e.shape[0]):
-        _gather(light_e[y], sensitivity[y], dark_e_s[y], rules, counting[y], tables)
-        _convert(light_e[y], offset_e, rules, reading[y], tables, frame[y])
+        _count_row(light_e[y], sensitivity[y], dark_e_s[y], constants, count_seeds[y], tables)
+        _read_row(light_e[y], offset_e, constants, read_seeds[y], tables, frame[y])
 
 
-def saturation_dn(part: DetectorConfig) -> float:
+def saturation_dn(config: DetectorConfig) -> float:
     """The digital number from which a pixel counts as saturated: full well less three sigma of the read-out noise,
     or the converter's maximum.
     """
-    well_e = part.full_well_e - 3 * hypot(part.read_noise_e, part.reset_noise_e)
-    well_dn = well_e * (1 - part.nonlinearity * well_e / part.full_well_e) / part.gain_e_dn + part.offset_dn
-    return float(min(max(well_dn, 0.0), 2**part.bits - 1))
+    well_e = config.full_well_e - 3 * hypot(config.read_noise_e, config.reset_noise_e)
+    well_dn = well_e * (1 - config.nonlinearity * well_e / config.full_well_e) / config.gain_e_dn + config.offset_dn
+    return float(min(max(well_dn, 0.0), 2**config.bits - 1))
 
 
 def add_snr_and_saturation(
-    seen: SourceTruth, light_e: NDArray[Any], exposure_s: float, chip: Detector
+    sources: SourceTruth, light_e: NDArray[Any], exposure_s: float, detector: Detector
 ) -> SourceTruth:
     """Which sources are expected to saturate, and the signal-to-noise ratio of each.
 
     light_e : (H, W) mean photo-electrons of the whole frame, smear included, before `expose` overwrites it
     Both use the incident light: losses by full well or nonlinearity are not subtracted. A source is saturated if the
-    expected value in its brightest pixel reaches `saturation_dn`. The ratio is that of the CCD equation over the
+    expected value in its brightest pixel reaches `saturation_dn`. The SNR is that of the CCD equation over the
     noise-equivalent area of its image, with all other charge in its brightest pixel as background, and with the
     converter's rounding added to the read noise.
     """
-    part = chip.part
-    x, y = seen.peak_xy.T
-    own_e = seen.peak_e * chip.sensitivity[y, x]
-    mean_e = light_e[y, x] * chip.sensitivity[y, x] + chip.dark_e_s[y, x] * exposure_s
-    bent = mean_e * (1 - part.nonlinearity * np.minimum(mean_e / part.full_well_e, 1))
+    config = detector.config
+    x, y = sources.peak_xy.T
+    own_e = sources.peak_e * detector.sensitivity[y, x]
+    mean_e = light_e[y, x] * detector.sensitivity[y, x] + detector.dark_e_s[y, x] * exposure_s
+    read_e = mean_e * (1 - config.nonlinearity * np.minimum(mean_e / config.full_well_e, 1))
     # The relative nonlinearity is held at its value at full well, since beyond it the parabola turns down.
-    full = bent / part.gain_e_dn + part.offset_dn >= saturation_dn(part)
-    noise_e = np.sqrt(part.read_noise_e**2 + part.reset_noise_e**2 + part.gain_e_dn**2 / 12)
-    ratio = snr(seen.electrons, seen.area_px, np.maximum(mean_e - own_e, 0), noise_e)
-    return replace(seen, saturated=full, snr=ratio)
+    is_saturated = read_e / config.gain_e_dn + config.offset_dn >= saturation_dn(config)
+    noise_e = np.sqrt(config.read_noise_e**2 + config.reset_noise_e**2 + config.gain_e_dn**2 / 12)
+    sources_snr = snr(sources.electrons, sources.area_px, np.maximum(mean_e - own_e, 0), noise_e)
+    return replace(sources, saturated=is_saturated, snr=sources_snr)

@@ -1,9 +1,9 @@
 """Fast exact random numbers for millions of pixels: Poisson counts and Gaussian read noise.
 
 Photo-electrons follow a Poisson law of the expected number in each pixel; read noise is normal. `count` draws the
-Poisson numbers: below FEW_E electrons by inversion of the distribution function with a guide table, above by the PD
-algorithm of Ahrens & Dieter (1982), which corrects a rounded normal number so that the law is exact. `normal` uses
-the ziggurat of Marsaglia & Tsang (2000). Both take less than one 64-bit draw per pixel on average.
+Poisson numbers: below INVERSION_MAX_E electrons by inversion of the distribution function with a guide table, above
+by the PD algorithm of Ahrens & Dieter (1982), which corrects a rounded normal number so that the law is exact. `normal`
+uses the ziggurat of Marsaglia & Tsang (2000). Both take less than one 64-bit draw per pixel on average.
 
 Every row of a frame has its own SplitMix64 stream (Steele, Lea & Flood 2014) from a seed that the frame's generator
 drew, so the result does not depend on the order of the rows or the number of threads. A stream's state is one
@@ -24,11 +24,11 @@ from numpy.typing import NDArray
 from skysim.core.jit import jit
 
 BUCKETS = 1024  # ten bits, six pixels per draw; the rows of a dark frame's means then fit the L1 cache
-PER_E = 128  # guide tables per electron of mean
-FEW_E = 16.0  # means above it use the PD algorithm
-UNSURE = 255  # entry of the guide table for buckets that more than one count shares
+GUIDES_PER_E = 128  # guide tables per electron of mean
+INVERSION_MAX_E = 16.0  # means above it use the PD algorithm
+AMBIGUOUS = 255  # entry of the guide table for buckets that more than one count shares
 LAYERS = 512  # nine bits for the layer and 23 for the position in it: two numbers per draw
-HALF = 2.0**22
+POSITION_STEPS = 2.0**22
 
 GAMMA = 0x9E3779B97F4A7C15
 MIX1, MIX2 = 0xBF58476D1CE4E5B9, 0x94D049BB133111EB
@@ -37,26 +37,26 @@ MIX1, MIX2 = 0xBF58476D1CE4E5B9, 0x94D049BB133111EB
 class Tables(NamedTuple):
     """Lookup tables of the draws.
 
-    guide : (FEW_E * PER_E, BUCKETS) counts: row k is for means from k / PER_E to (k + 1) / PER_E, bucket b holds the
-            count of every uniform number in [b, b + 1) / BUCKETS, or UNSURE
+    guide : (INVERSION_MAX_E * GUIDES_PER_E, BUCKETS) counts: row k is for means from k to k + 1 over GUIDES_PER_E,
+            bucket b holds the count of every uniform number in [b, b + 1) / BUCKETS, or AMBIGUOUS
     edge, height : (LAYERS + 1,) the ziggurat's corners x and exp(-x^2 / 2)
-    width, sure  : (LAYERS,) x and the next x over x, in steps of the signed 23-bit position in a layer
+    width, accept : (LAYERS,) x and the next x over x, in steps of the signed 23-bit position in a layer
     """
 
     guide: NDArray[np.uint8]
     edge: NDArray[np.float64]
     height: NDArray[np.float64]
     width: NDArray[np.float32]
-    sure: NDArray[np.int32]
+    accept: NDArray[np.int32]
 
 
 @lru_cache(maxsize=1)
 def tables() -> Tables:
     """The tables, made once per process in 20 ms."""
     edge = ziggurat()
-    width = (edge[:LAYERS] / HALF).astype(np.float32)
-    sure = (edge[1:] / edge[:LAYERS] * HALF).astype(np.int32)
-    return Tables(_guide(), edge, np.exp(-(edge**2) / 2), width, sure)
+    width = (edge[:LAYERS] / POSITION_STEPS).astype(np.float32)
+    accept = (edge[1:] / edge[:LAYERS] * POSITION_STEPS).astype(np.int32)
+    return Tables(_guide(), edge, np.exp(-(edge**2) / 2), width, accept)
 
 
 def seeds(rng: Generator, rows: int) -> NDArray[np.uint64]:
@@ -71,22 +71,22 @@ def ziggurat() -> NDArray[np.float64]:
     peak for only one r, found by bisection.
     """
 
-    def tower(r: float) -> tuple[NDArray[np.float64], bool]:
+    def stack(r: float) -> tuple[NDArray[np.float64], bool]:
         area = r * exp(-(r**2) / 2) + sqrt(pi / 2) * erfc(r / sqrt(2))
         x = np.zeros(LAYERS + 1)
         x[0], x[1] = area * exp(r**2 / 2), r
         for n in range(2, LAYERS + 1):
-            top = area / x[n - 1] + exp(-(x[n - 1] ** 2) / 2)
-            if top >= 1:
+            next_height = area / x[n - 1] + exp(-(x[n - 1] ** 2) / 2)
+            if next_height >= 1:
                 return x, True
-            x[n] = sqrt(-2 * log(top))
+            x[n] = sqrt(-2 * log(next_height))
         return x, False
 
     low, high = 3.0, 5.0
     for _ in range(60):
         middle = (low + high) / 2
-        low, high = (middle, high) if tower(middle)[1] else (low, middle)  # an r too small passes the peak
-    x = tower(high)[0]
+        low, high = (middle, high) if stack(middle)[1] else (low, middle)  # an r too small passes the peak
+    x = stack(high)[0]
     x[LAYERS] = 0.0
     return x
 
@@ -96,22 +96,22 @@ def _guide() -> Any:
     """The guide table of the Poisson law for small means.
 
     A count n is certain where the whole bucket is above F(n - 1) of the smallest mean and below F(n) of the greatest
-    mean of the row, since F falls with the mean. The other buckets, one at each step of F and 1/PER_E of the
-    numbers, are UNSURE.
+    mean of the row, since F falls with the mean. The other buckets, one at each step of F and 1/GUIDES_PER_E of the
+    numbers, are AMBIGUOUS.
     """
-    rows = int(FEW_E * PER_E)
+    rows = int(INVERSION_MAX_E * GUIDES_PER_E)
     guide = np.empty((rows, BUCKETS), np.uint8)
     for k in range(rows):
-        low, high = k / PER_E, (k + 1) / PER_E
+        low, high = k / GUIDES_PER_E, (k + 1) / GUIDES_PER_E
         p_low, p_high, n, below = exp(-low), exp(-high), 0, 0.0
         f_low, f_high = p_low, p_high
         for b in range(BUCKETS):
-            while b / BUCKETS >= f_low and n < UNSURE - 1:
+            while b / BUCKETS >= f_low and n < AMBIGUOUS - 1:
                 n += 1
                 below = f_low
                 p_low, p_high = p_low * low / n, p_high * high / n
                 f_low, f_high = f_low + p_low, f_high + p_high
-            guide[k, b] = n if b / BUCKETS >= below and (b + 1) / BUCKETS <= f_high else UNSURE
+            guide[k, b] = n if b / BUCKETS >= below and (b + 1) / BUCKETS <= f_high else AMBIGUOUS
     return guide
 
 
@@ -137,9 +137,9 @@ def count(row: Any, state: Any, tables: Tables) -> Any:
 
     Small means use inversion: ten bits choose the guide's bucket, and only where the count is not certain more bits
     are drawn and the law is summed at the exact mean. Large means use Ahrens & Dieter's PD (1982), see
-    `_count_many`.
+    `_count_large`.
     """
-    later, many = np.empty(row.size, np.int32), 0
+    large, n_large = np.empty(row.size, np.int32), 0
     bits = uint64(0)
     for x in range(row.size):
         # One draw of 64 bits serves six pixels of ten bits each.
@@ -148,17 +148,17 @@ def count(row: Any, state: Any, tables: Tables) -> Any:
         bucket = bits & uint64(BUCKETS - 1)  # unsigned: saves numba's check for negative indices
         bits >>= uint64(10)
         mean = row[x]
-        if mean < float32(FEW_E):
-            found = tables.guide[uint64(int64(mean * float32(PER_E))), bucket]
-            row[x] = float32(found)
-            if found == UNSURE:
-                rest, state = _uniform(state)
-                row[x] = _invert(float64(mean), (float64(int64(bucket)) + rest) / BUCKETS)
+        if mean < float32(INVERSION_MAX_E):
+            drawn = tables.guide[uint64(int64(mean * float32(GUIDES_PER_E))), bucket]
+            row[x] = float32(drawn)
+            if drawn == AMBIGUOUS:
+                remainder, state = _uniform(state)
+                row[x] = _invert(float64(mean), (float64(int64(bucket)) + remainder) / BUCKETS)
         else:
-            later[many] = x
-            many += 1
-    if many > 0:
-        state = _count_many(row, later[:many], state, tables.edge, tables.height, tables.width, tables.sure)
+            large[n_large] = x
+            n_large += 1
+    if n_large > 0:
+        state = _count_large(row, large[:n_large], state, tables.edge, tables.height, tables.width, tables.accept)
     return state
 
 
@@ -175,34 +175,34 @@ def _invert(mean: Any, u: Any) -> Any:
 
 
 @jit
-def _count_many(row: Any, which: Any, state: Any, edge: Any, height: Any, width: Any, sure: Any) -> Any:
+def _count_large(row: Any, rows_large: Any, state: Any, edge: Any, height: Any, width: Any, accept: Any) -> Any:
     """Poisson counts for the chosen pixels of a row, with means of at least ten.
 
     PD: the floor of a normal number of the same mean and variance has the Poisson law but for an error of order
     mean^-1/2. A squeeze accepts most numbers without computing the law: u >= (mean - k)^3 / (6 mean^2). The rest go
-    to `_mend`, which accepts or replaces them so that the law is exact.
+    to `_correct`, which accepts or replaces them so that the law is exact.
     """
-    for x in which:
+    for x in rows_large:
         mean = float64(row[x])
         sigma = sqrt(mean)
         bits, state = draw(state)
-        layer, across = uint32(bits) & uint32(LAYERS - 1), int32(uint32(bits)) >> int32(9)
-        g = float32(across) * width[layer]
+        layer, position = uint32(bits) & uint32(LAYERS - 1), int32(uint32(bits)) >> int32(9)
+        g = float32(position) * width[layer]
         # Inside the next, narrower layer the position is accepted; about 1 in 160 is not.
-        if abs(across) >= sure[layer]:
-            g, state = _edge(int64(across), int64(layer), state, edge, height)
+        if abs(position) >= accept[layer]:
+            g, state = _ziggurat_edge(int64(position), int64(layer), state, edge, height)
         k = np.floor(mean + sigma * g)
         u = float64(int64(bits >> uint64(32))) * 2.0**-32
-        short = mean - k
+        deficit = mean - k
         # PD accepts every k above mean - 1.1484 at once, and the squeeze most of the others.
-        if min(short, short * short * short - 6 * mean * mean * u) > 1.1484:
-            k, state = _mend(mean, sigma, k, u, state)
+        if min(deficit, deficit * deficit * deficit - 6 * mean * mean * u) > 1.1484:
+            k, state = _correct(mean, sigma, k, u, state)
         row[x] = k
     return state
 
 
 @jit
-def _mend(mean: float, sigma: float, k: float, u: float, state: Any) -> Any:
+def _correct(mean: float, sigma: float, k: float, u: float, state: Any) -> Any:
     """PD's steps P to H: quotient acceptance, then rejection from a double exponential."""
     if k >= 0:
         px, py, fx, fy = _densities(mean, sigma, k)
@@ -253,44 +253,44 @@ def _densities(mean: float, sigma: float, k: float) -> Any:
 def normal(row: Any, state: Any, tables: Tables) -> Any:
     """Fill a row with standard normal numbers by the ziggurat. Returns the stream's next state.
 
-    Of 32 bits nine choose the layer and 23, signed, the position in it; 99.4 % need no more. (`_count_many` repeats
+    Of 32 bits nine choose the layer and 23, signed, the position in it; 99.4 % need no more. (`_count_large` repeats
     these lines: a function that takes the Tables tuple would count references to its arrays, ten times the work.)
     """
     for x in range(0, row.size, 2):
         bits, state = draw(state)
         for k in range(2):
             if x + k < row.size:
-                layer, across = uint32(bits) & uint32(LAYERS - 1), int32(uint32(bits)) >> int32(9)
-                row[x + k] = float32(across) * tables.width[layer]
-                if abs(across) >= tables.sure[layer]:
-                    row[x + k], state = _edge(int64(across), int64(layer), state, tables.edge, tables.height)
+                layer, position = uint32(bits) & uint32(LAYERS - 1), int32(uint32(bits)) >> int32(9)
+                row[x + k] = float32(position) * tables.width[layer]
+                if abs(position) >= tables.accept[layer]:
+                    row[x + k], state = _ziggurat_edge(int64(position), int64(layer), state, tables.edge, tables.height)
                 bits >>= uint64(32)
     return state
 
 
 @jit
-def _edge(across: Any, layer: Any, state: Any, edge: Any, height: Any) -> Any:
+def _ziggurat_edge(position: Any, layer: Any, state: Any, edge: Any, height: Any) -> Any:
     """The ziggurat's slow path: test the position against the density, or draw from the tail in the lowest layer."""
     while True:
-        x = across * (edge[layer] / HALF)
+        x = position * (edge[layer] / POSITION_STEPS)
         if abs(x) < edge[layer + 1]:
             return float32(x), state
         if layer == 0:
-            return _tail(across, state, edge[1])
+            return _ziggurat_tail(position, state, edge[1])
         u, state = _uniform(state)
         low, high = height[layer], height[layer + 1]
         if low + u * (high - low) < exp(-x * x / 2):
             return float32(x), state
         bits, state = draw(state)
-        layer, across = int64(bits & uint64(LAYERS - 1)), int64(int32(bits) >> int32(9))
+        layer, position = int64(bits & uint64(LAYERS - 1)), int64(int32(bits) >> int32(9))
 
 
 @jit
-def _tail(sign: Any, state: Any, begin: float) -> Any:
-    """A normal number beyond `begin`, with the given sign (Marsaglia 1964)."""
+def _ziggurat_tail(sign: Any, state: Any, start: float) -> Any:
+    """A normal number beyond `start`, with the given sign (Marsaglia 1964)."""
     while True:
         u, state = _uniform(state)
         v, state = _uniform(state)
-        a = -log(u) / begin
+        a = -log(u) / start
         if -2 * log(v) > a * a:
-            return float32(begin + a if sign > 0 else -begin - a), state
+            return float32(start + a if sign > 0 else -start - a), state

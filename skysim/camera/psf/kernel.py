@@ -1,6 +1,6 @@
 """Pixel-integrated images (kernels) of sources, as tables that `skysim.camera.psf.splat` adds to a frame.
 
-The image's spectrum is the product of the transfer functions of lens, blur, emitter disc, defocus disc and square
+The image's spectrum is the product of the transfer functions of lens, blur, emitter disk, defocus disk and square
 pixel (psf/otf.py). It is transformed to a table once, after which an image costs one table look-up per pixel at any
 sub-pixel position.
 
@@ -19,7 +19,7 @@ import numpy as np
 from scipy import fft, special
 from scipy.interpolate import CubicSpline
 
-from skysim.camera.psf.otf import EXTENT, PSFS, SQUARE, WINGED, Otf, blur, uniform_disc
+from skysim.camera.psf.otf import EXTENT, NOT_ROUND, PSFS, WINGED, Otf, blur, uniform_disk
 from skysim.camera.psf.splat import PER_PX, REACH_SIGMA, Singles
 from skysim.core.types import Floats
 from skysim.scene.camera import CameraConfig, Psf
@@ -27,20 +27,20 @@ from skysim.scene.camera import CameraConfig, Psf
 QUANTUM_PX = 0.01  # sizes are rounded to this, so that LEDs of nearly one size share a kernel
 CUT_SIGMA = 5.0  # a Gaussian's image ends here: 4e-6 of its light is beyond
 FADE_PX = 2.0  # width over which infinite wings are faded to zero
-FAINT = 1e-6  # a transfer function below this is taken as zero
+OTF_FLOOR = 1e-6  # a transfer function below this is taken as zero
 HARMONICS = (0, 4, 8)  # a square has only multiples of four
-NOTHING = 5e-5  # a harmonic below this fraction of the peak is left out
-SHARP = 1e-2, 1e-4  # largest T8, over the peak and over the total light, for which T0 to T8 are enough
-TERMS = 1024  # most terms of a Fourier-Bessel series
+HARMONIC_FLOOR = 5e-5  # a harmonic below this fraction of the peak is left out
+MAX_T8 = 1e-2, 1e-4  # largest T8, over the peak and over the total light, for which T0 to T8 are enough
+MAX_TERMS = 1024  # most terms of a Fourier-Bessel series
 NO_RADIAL, NO_GRID = np.empty((0, 3), np.float32), np.empty((0, 0, 0, 0), np.float32)
 
 
 @dataclass(frozen=True, slots=True)
 class Kernel:
-    """A source's image integrated over the pixels, as `splat.add` draws it; its light adds up to 1.
+    """A source's image integrated over the pixels, as compiled code adds it to a patch; its light adds up to 1.
 
-    One of three: sigma_px > 0, an exact Gaussian; radial (R, 3, 5 or 7), see `splat.add_round`; grid (P, P, N, N),
-    see `splat.add_grid`. Tables that are not used are empty.
+    One of three: sigma_px > 0, an exact Gaussian, see `splat.add_gaussian`; radial (R, 3, 5 or 7), see
+    `splat.add_round`; grid (P, P, N, N), see `splat.add_grid`. Tables that are not used are empty.
     """
 
     sigma_px: float
@@ -55,34 +55,34 @@ class Kernel:
         return (len(self.radial) - 2) / PER_PX if len(self.radial) else REACH_SIGMA * self.sigma_px + 0.5
 
 
-def kernel(
+def build_kernel(
     psf: Psf,
     camera: CameraConfig,
     extra_sigma_px: float = 0.0,
     emitter_radius_px: float = 0.0,
     blur_radius_px: float = 0.0,
 ) -> Kernel:
-    """The kernel of a uniform disc (a star has radius 0) seen through this lens with this defocus.
+    """The kernel of a uniform disk (a star has radius 0) seen through this lens with this defocus.
 
     extra_sigma_px    : Gaussian blur added to the lens's own, see `otf.field_sigma_px`
-    emitter_radius_px : of the emitting disc's geometric image
-    blur_radius_px    : of the defocus disc
+    emitter_radius_px : of the emitting disk's geometric image
+    blur_radius_px    : of the defocus disk
     All three are rounded to QUANTUM_PX, except that a Gaussian lens's image of a point is exact. A round image gets
     up to three harmonics of the pixel's shape, which leave out 1e-4 of the peak at a blur of 0.2 px and 1e-3 on the
-    edge of a disc as sharp as 0.08 px; a sharper point, or a lens that is not round, gets a grid. The light of
+    edge of a disk as sharp as 0.08 px; a sharper point, or a lens that is not round, gets a grid. The light of
     power-law wings beyond their reach is added to the image by normalization, so that its total is 1. Raises
     InputError for an unreadable file of a measured PSF.
     """
     steps = tuple(round(value / QUANTUM_PX) for value in (extra_sigma_px, emitter_radius_px, blur_radius_px))
     if psf.kind == "gaussian" and not (steps[1] or steps[2]):
         return Kernel(float(np.hypot(psf.sigma_px, extra_sigma_px)), NO_RADIAL, NO_GRID)
-    made = None if psf.kind in SQUARE else round_kernel(psf, camera, *steps)
-    return made or grid_kernel(psf, camera, *steps)
+    round_image = None if psf.kind in NOT_ROUND else round_kernel(psf, camera, *steps)
+    return round_image or grid_kernel(psf, camera, *steps)
 
 
 @dataclass(frozen=True, slots=True)
-class Blend:
-    """The factors of the convolution: a lens, an extra Gaussian, and discs."""
+class PsfModel:
+    """The factors of the image's convolution: a lens, an extra Gaussian, and disks."""
 
     psf: Psf
     camera: CameraConfig
@@ -90,17 +90,17 @@ class Blend:
     radii_px: tuple[float, ...]
 
     @classmethod
-    def of(cls, psf: Psf, camera: CameraConfig, sigma: int, *radii: int) -> Blend:
+    def from_steps(cls, psf: Psf, camera: CameraConfig, sigma: int, *radii: int) -> PsfModel:
         """From sizes in steps of QUANTUM_PX."""
         return cls(psf, camera, sigma * QUANTUM_PX, tuple(radius * QUANTUM_PX for radius in radii if radius))
 
-    def otf(self, fx: Floats, fy: Floats, softening_px: float) -> Otf:
-        """The product of the transfer functions without the pixel's, times that of a softening Gaussian."""
+    def otf(self, fx: Floats, fy: Floats, extra_sigma_px: float) -> Otf:
+        """The product of the transfer functions without the pixel's, times that of an extra Gaussian."""
         product = PSFS[self.psf.kind](self.psf, self.camera, fx, fy)
-        sigma_px = float(np.hypot(self.sigma_px, softening_px))
+        sigma_px = float(np.hypot(self.sigma_px, extra_sigma_px))
         product = product * blur(sigma_px, fx, fy) if sigma_px else product
         for radius in self.radii_px:
-            product = product * uniform_disc(radius, fx, fy)
+            product = product * uniform_disk(radius, fx, fy)
         return product
 
     def reach_px(self) -> float:
@@ -110,29 +110,29 @@ class Blend:
         sigma_px = float(np.hypot(sigma, self.sigma_px))
         return radius + fade + sum(self.radii_px) + CUT_SIGMA * sigma_px + float(np.sqrt(0.5))
 
-    def beyond_px(self) -> float:
+    def wing_margin_px(self) -> float:
         """How much farther wings must be followed so that aliasing is below 1e-4 of the peak."""
         return 2 * EXTENT[self.psf.kind](self.psf, self.camera)[0] if self.psf.kind in WINGED else 0.0
 
 
 @lru_cache(maxsize=1024)
-def cutoff(psf: Psf, camera: CameraConfig, sigma_px: float, level: float) -> float:
+def bandwidth(psf: Psf, camera: CameraConfig, sigma_px: float, level: float) -> float:
     """The frequency above which lens and Gaussian pass less than `level`, in steps of a half from 1 to 64."""
     f = np.linspace(0, 64, 1025)
-    along = (PSFS[psf.kind](psf, camera, *axes) for axes in ((f, 0 * f), (0 * f, f)))
-    passed = np.maximum(*map(np.abs, along)) * blur(sigma_px, f, 0 * f)
-    return float(max(np.ceil(2 * f[np.flatnonzero(passed >= level)[-1]]) / 2, 1.0))
+    transfer = (PSFS[psf.kind](psf, camera, *axes) for axes in ((f, 0 * f), (0 * f, f)))
+    combined = np.maximum(*map(np.abs, transfer)) * blur(sigma_px, f, 0 * f)
+    return float(max(np.ceil(2 * f[np.flatnonzero(combined >= level)[-1]]) / 2, 1.0))
 
 
-def softening_px(wanted: float, held: float) -> float:
-    """Sigma of the Gaussian that passes only FAINT at the highest frequency of a table; 0 if no
+def softening_sigma_px(bandwidth: float, highest: float) -> float:
+    """Sigma of the Gaussian that passes only OTF_FLOOR at the highest frequency of a table; 0 if no
     softening is needed.
     """
-    return 0.0 if wanted <= held else float(np.sqrt(-np.log(FAINT) / 2) / (np.pi * held))
+    return 0.0 if bandwidth <= highest else float(np.sqrt(-np.log(OTF_FLOOR) / 2) / (np.pi * highest))
 
 
 @dataclass(frozen=True, slots=True)
-class Series:
+class FourierBesselSeries:
     """Fourier-Bessel series of the HARMONICS on a circle of radius B.
 
     f      : (3, K) frequencies j / (2 pi B), j the zeros of J_n
@@ -146,7 +146,7 @@ class Series:
 
 
 @lru_cache(maxsize=8)
-def series(box_px: float, reach_px: float, highest: float, per_px: int) -> Series:
+def fourier_bessel_series(box_px: float, reach_px: float, highest: float, per_px: int) -> FourierBesselSeries:
     """The series up to a frequency; it does not depend on the image.
 
     T_n(r) = 2 pi integral of OTF(f) P_n(f) J_n(2 pi f r) f df; a function that vanishes beyond B is the sum
@@ -164,70 +164,74 @@ def series(box_px: float, reach_px: float, highest: float, per_px: int) -> Serie
         weight[k] = harmonic / (np.pi * (box_px * special.jv(n + 1, zeros[k])) ** 2)
         # A spline of this step is within 2e-8 of J_n and ten times as fast.
         matrix[k] = CubicSpline(x, special.jv(n, x))(np.outer(r, 2 * np.pi * f[k]))
-    return Series(f, weight, matrix)
+    return FourierBesselSeries(f, weight, matrix)
 
 
 @lru_cache(maxsize=4096)
 def round_kernel(psf: Psf, camera: CameraConfig, *steps: int) -> Kernel | None:
     """A kernel of radial tables; None where three harmonics cannot represent the pixel's corners.
 
-    A series holds at most 16 cycles a pixel and TERMS terms; a sharper image is softened to that: one of 130 px
+    A series holds at most 16 cycles a pixel and MAX_TERMS terms; a sharper image is softened to that: one of 130 px
     radius by 0.2 px.
     """
-    blend = Blend.of(psf, camera, *steps)
-    reach, wanted = blend.reach_px(), cutoff(psf, camera, blend.sigma_px, FAINT)
+    model = PsfModel.from_steps(psf, camera, *steps)
+    reach, highest_passed = model.reach_px(), bandwidth(psf, camera, model.sigma_px, OTF_FLOOR)
     # Radii in coarse steps, so that images of similar size share a cached series.
     step = 4.0 if reach < 64 else 16.0
-    shown, box = (float(np.ceil(size / step)) * step for size in (reach, reach + blend.beyond_px()))
-    highest = min(wanted, 16.0, max(TERMS / 2 / box, 0.5))
+    sizes = reach, reach + model.wing_margin_px()
+    table_px, box_px = (float(np.ceil(size / step)) * step for size in sizes)
+    highest = min(highest_passed, 16.0, max(MAX_TERMS / 2 / box_px, 0.5))
     coarse = 4 if highest <= 4 else 1  # a series of low frequencies is summed at every fourth radius
-    terms = series(box, shown, highest, PER_PX // coarse)
-    passed = blend.otf(terms.f, np.zeros(1), softening_px(wanted, highest)) * terms.weight
+    terms = fourier_bessel_series(box_px, table_px, highest, PER_PX // coarse)
+    spectrum = model.otf(terms.f, np.zeros(1), softening_sigma_px(highest_passed, highest)) * terms.weight
     rows, count = int(reach * PER_PX / coarse) + 2, int(reach * PER_PX) + 1
-    pairs = zip(terms.matrix[:, :rows], passed.astype(np.float32), strict=True)
-    t = refined(np.array([matrix @ amount for matrix, amount in pairs], dtype=float), coarse)[:, :count]
+    products = zip(terms.matrix[:, :rows], spectrum.astype(np.float32), strict=True)
+    harmonics = interpolate_cubic(
+        np.array([matrix @ spectrum_n for matrix, spectrum_n in products], dtype=float), coarse
+    )[:, :count]
     # A strong eighth harmonic means that the higher ones, which are left out, matter too.
-    if np.abs(t[2]).max() > min(SHARP[0] * t[0].max(), SHARP[1]):
+    if np.abs(harmonics[2]).max() > min(MAX_T8[0] * harmonics[0].max(), MAX_T8[1]):
         return None
     if psf.kind in WINGED:
         s = np.clip((reach - np.arange(count) / PER_PX) / FADE_PX, 0, 1)
-        t *= s**2 * (3 - 2 * s)  # a sharp end would alias with the pixel grid
-    return Kernel(0.0, packed(t), NO_GRID)
+        harmonics *= s**2 * (3 - 2 * s)  # a sharp end would alias with the pixel grid
+    return Kernel(0.0, pack_table(harmonics), NO_GRID)
 
 
-def refined(coarse: Floats, times: int) -> Floats:
+def interpolate_cubic(samples: Floats, factor: int) -> Floats:
     """Interpolate even functions of r from (n, R) to (n, times R) samples, by Lagrange's cubic."""
-    if times == 1:
-        return coarse
-    s = np.arange(times) / times
+    if factor == 1:
+        return samples
+    s = np.arange(factor) / factor
     a, b, c, d = s + 1, s, s - 1, s - 2
     weights = np.array([-b * c * d / 6, a * c * d / 2, -a * b * d / 2, a * b * c / 6])
-    count, rows = coarse.shape
+    count, rows = samples.shape
     padded = np.zeros((count, rows + 3))
-    padded[:, 0], padded[:, 1:-2] = coarse[:, 1], coarse
+    padded[:, 0], padded[:, 1:-2] = samples[:, 1], samples
     return np.asarray(sum(padded[:, k : k + rows, None] * weights[k] for k in range(4))).reshape(count, -1)
 
 
-def packed(t: Floats) -> Singles:
+def pack_table(harmonics: Floats) -> Singles:
     """(R + 1, 3, 5 or 7) table for `splat.add_round` from (3, R) harmonics: normalized to 1, nowhere negative."""
-    sizes = np.abs(t).max(axis=1)
-    t = t[: 1 + np.count_nonzero(sizes[1:] > NOTHING * sizes[0])]
+    largest = np.abs(harmonics).max(axis=1)
+    harmonics = harmonics[: 1 + np.count_nonzero(largest[1:] > HARMONIC_FLOOR * largest[0])]
     # Raise T0 where the other harmonics would make the image negative.
-    t[0] = np.maximum(t[0], np.abs(t[1:]).sum(axis=0))
-    r = np.arange(t.shape[1]) / PER_PX
+    harmonics[0] = np.maximum(harmonics[0], np.abs(harmonics[1:]).sum(axis=0))
+    r = np.arange(harmonics.shape[1]) / PER_PX
     # Total light 2 pi int r T0 dr by the trapezoid rule, with its end correction at r = 0 (Euler-Maclaurin).
-    t /= 2 * np.pi / PER_PX * (r @ t[0] + t[0, 0] / 12 / PER_PX)
-    out = np.zeros((len(r) + 1, 1 + 2 * len(t)), np.float32)
-    bend = np.zeros(len(r) + 1)
-    bend[0], bend[1:-2] = 2 * (t[0, 1] - t[0, 0]), t[0, 2:] - 2 * t[0, 1:-1] + t[0, :-2]
+    harmonics /= 2 * np.pi / PER_PX * (r @ harmonics[0] + harmonics[0, 0] / 12 / PER_PX)
+    table = np.zeros((len(r) + 1, 1 + 2 * len(harmonics)), np.float32)
+    second_difference = np.zeros(len(r) + 1)
+    second_difference[0] = 2 * (harmonics[0, 1] - harmonics[0, 0])
+    second_difference[1:-2] = harmonics[0, 2:] - 2 * harmonics[0, 1:-1] + harmonics[0, :-2]
     # Bessel's interpolation uses the mean of the second differences at both ends, over 2.
-    out[:-1, 2] = (bend[:-1] + bend[1:]) / 4
-    for value, n, harmonic in zip((0, 3, 5), HARMONICS, t, strict=False):
-        harmonic[1:] /= r[1:] ** n
-        harmonic[0] *= n == 0
-        out[:-1, value] = harmonic
-        out[:-1, value + 1] = np.append(harmonic[1:], 0) - harmonic
-    return out
+    table[:-1, 2] = (second_difference[:-1] + second_difference[1:]) / 4
+    for column, n, values in zip((0, 3, 5), HARMONICS, harmonics, strict=False):
+        values[1:] /= r[1:] ** n
+        values[0] *= n == 0
+        table[:-1, column] = values
+        table[:-1, column + 1] = np.append(values[1:], 0) - values
+    return table
 
 
 @lru_cache(maxsize=64)
@@ -236,21 +240,21 @@ def grid_kernel(psf: Psf, camera: CameraConfig, *steps: int) -> Kernel:
 
     S is a power of two from 4 to 128: more than seven times the highest frequency, but less for a large image.
     """
-    blend = Blend.of(psf, camera, *steps)
-    half = int(np.ceil(blend.reach_px()))
-    wanted, size = cutoff(psf, camera, blend.sigma_px, 1e-3), 2 * half + 1
-    places = 128
-    while places > 4 and (places >= 14 * wanted or places * size > 3072):
-        places //= 2
+    model = PsfModel.from_steps(psf, camera, *steps)
+    half = int(np.ceil(model.reach_px()))
+    highest_passed, size = bandwidth(psf, camera, model.sigma_px, 1e-3), 2 * half + 1
+    samples = 128
+    while samples > 4 and (samples >= 14 * highest_passed or samples * size > 3072):
+        samples //= 2
     # The transform is periodic: wings need room beyond the image, or they fold back into it.
-    room = min(size + 2 * int(np.ceil(blend.beyond_px())), 3072 // places)
-    box = fft.next_fast_len(max(size, room), real=True)
-    fx = fft.rfftfreq(places * box, 1 / places)[None, :]
-    fy = fft.fftfreq(places * box, 1 / places)[:, None]
-    otf = blend.otf(fx, fy, softening_px(wanted, 0.4 * places)) * np.sinc(fx) * np.sinc(fy)
-    image = fft.irfft2(otf, s=(places * box,) * 2)
-    pixel, place = np.arange(size) - half, np.arange(-1, places + 2)
+    with_wings = min(size + 2 * int(np.ceil(model.wing_margin_px())), 3072 // samples)
+    box = fft.next_fast_len(max(size, with_wings), real=True)
+    fx = fft.rfftfreq(samples * box, 1 / samples)[None, :]
+    fy = fft.fftfreq(samples * box, 1 / samples)[:, None]
+    otf = model.otf(fx, fy, softening_sigma_px(highest_passed, 0.4 * samples)) * np.sinc(fx) * np.sinc(fy)
+    image = fft.irfft2(otf, s=(samples * box,) * 2)
+    pixel, position = np.arange(size) - half, np.arange(-1, samples + 2)
     # Sub-pixel sample of each pixel and position; the modulo wraps negative indices of the periodic image.
-    pick = (pixel * places + places // 2 - place[:, None]) % (places * box)
-    tables = np.maximum(image[pick[:, None, :, None], pick[None, :, None, :]], 0)  # clip the negative ringing
+    index = (pixel * samples + samples // 2 - position[:, None]) % (samples * box)
+    tables = np.maximum(image[index[:, None, :, None], index[None, :, None, :]], 0)  # clip the negative ringing
     return Kernel(0.0, NO_RADIAL, (tables / tables.sum(axis=(2, 3), keepdims=True)).astype(np.float32))

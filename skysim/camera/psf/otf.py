@@ -1,6 +1,6 @@
-"""Optical transfer functions of lenses, how far they scatter light, and the defocus disc.
+"""Optical transfer functions of lenses, how far they scatter light, and the defocus disk.
 
-The image of a source is a convolution: lens x Gaussian blur x emitter's disc x defocus disc x pixel. At a spatial
+The image of a source is a convolution: lens x Gaussian blur x emitter's disk x defocus disk x pixel. At a spatial
 frequency (fx, fy) in cycles a pixel its spectrum is the product of their transfer functions (Goodman, Introduction
 to Fourier Optics, ch. 6). Those of the lens are here; `skysim.camera.psf.kernel` multiplies them into an image that
 `skysim.camera.psf.splat` adds to a frame.
@@ -22,7 +22,7 @@ from skysim.core.types import Floats
 from skysim.scene.camera import (
     AiryPsfConfig,
     CameraConfig,
-    DiscPsfConfig,
+    DiskPsfConfig,
     GaussianPsfConfig,
     MeasuredPsfConfig,
     MoffatPsfConfig,
@@ -31,24 +31,24 @@ from skysim.scene.camera import (
 
 Otf = NDArray[Any]  # real, or complex where the PSF is not symmetric
 
-WINGS = 1e-5  # power-law wings are cut where they fall below this fraction of the peak
+WING_LEVEL = 1e-5  # power-law wings are cut where they fall below this fraction of the peak
 
 
 def blur_radius_px(camera: CameraConfig, distance_m: Any) -> Any:
-    """Radius of the defocus disc of a point, in pixels, by the thin lens.
+    """Radius of the defocus disk of a point, in pixels, by the thin lens.
 
-    The cone from a pupil A to the image at v(u) meets the chip at v0 in a disc of diameter A |v - v0| / v =
+    The cone from a pupil A to the image at v(u) meets the chip at v0 in a disk of diameter A |v - v0| / v =
     A v0 |1/u - 1/u0|, u0 the distance in focus. This form has no pole and holds for stars (u infinite) as well.
     distance_m: scalar or array of axial distances, infinity allowed.
     """
     distance = np.asarray(distance_m, dtype=float)
-    spread = camera.pupil_m * camera.image_distance_m * np.abs(1 / distance - 1 / camera.focus_m)
-    return spread / (2 * camera.pixel_m)
+    diameter_m = camera.pupil_m * camera.image_distance_m * np.abs(1 / distance - 1 / camera.focus_m)
+    return diameter_m / (2 * camera.pixel_m)
 
 
 def field_sigma_px(psf: Psf, camera: CameraConfig, xy_px: Floats) -> Floats:
     """(...,) extra blur at pixels (..., 2): proportional to the field radius, corner_sigma_px at the far corner."""
-    radius_px = np.linalg.norm(xy_px - np.array(camera.centre_px), axis=-1)
+    radius_px = np.linalg.norm(xy_px - np.array(camera.center_px), axis=-1)
     return np.asarray(psf.corner_sigma_px * radius_px / camera.corner_px)
 
 
@@ -57,8 +57,8 @@ def blur(sigma_px: float, fx: Floats, fy: Floats) -> Floats:
     return np.asarray(np.exp(-2 * (np.pi * sigma_px) ** 2 * (fx**2 + fy**2)))
 
 
-def uniform_disc(radius_px: float, fx: Floats, fy: Floats) -> Floats:
-    """Transfer function of a uniform disc: 2 J1(z) / z, z = 2 pi a f."""
+def uniform_disk(radius_px: float, fx: Floats, fy: Floats) -> Floats:
+    """Transfer function of a uniform disk: 2 J1(z) / z, z = 2 pi a f."""
     z = np.maximum(2 * np.pi * radius_px * np.hypot(fx, fy), 1e-9)
     return np.asarray(2 * special.j1(z) / z)
 
@@ -95,9 +95,9 @@ def airy_unit_px(psf: AiryPsfConfig, camera: CameraConfig) -> float:
     return psf.wavelength_m * camera.image_distance_m / camera.pupil_m / camera.pixel_m
 
 
-def disc(psf: DiscPsfConfig, camera: CameraConfig, fx: Floats, fy: Floats) -> Floats:
-    """A uniform disc with a Gaussian edge."""
-    return uniform_disc(psf.radius_px, fx, fy) * blur(psf.sigma_px, fx, fy)
+def disk(psf: DiskPsfConfig, camera: CameraConfig, fx: Floats, fy: Floats) -> Floats:
+    """A uniform disk with a Gaussian edge."""
+    return uniform_disk(psf.radius_px, fx, fy) * blur(psf.sigma_px, fx, fy)
 
 
 def measured(psf: MeasuredPsfConfig, camera: CameraConfig, fx: Floats, fy: Floats) -> Otf:
@@ -109,26 +109,26 @@ def measured(psf: MeasuredPsfConfig, camera: CameraConfig, fx: Floats, fy: Float
     ASSP 29, 1153) interpolates. A table that already includes the pixel's blur at an oversampling above 1 (an
     "effective" PSF) is widened by that blur again.
     """
-    cells = cells_of(psf.file)
-    x_px, y_px = cell_places_px(psf)
+    cells = read_cells(psf.file)
+    x_px, y_px = cell_positions_px(psf)
     # The transform is separable: compute it on the distinct fx and fy, then spread it to all pairs.
-    across, i = np.unique(fx, return_inverse=True)
-    down, j = np.unique(fy, return_inverse=True)
-    wave_x = np.exp(-2j * np.pi * np.outer(x_px, across)) * cell_response(across / psf.oversampling)
-    wave_y = np.exp(-2j * np.pi * np.outer(y_px, down)) * cell_response(down / psf.oversampling)
+    distinct_fx, i = np.unique(fx, return_inverse=True)
+    distinct_fy, j = np.unique(fy, return_inverse=True)
+    wave_x = np.exp(-2j * np.pi * np.outer(x_px, distinct_fx)) * cell_response(distinct_fx / psf.oversampling)
+    wave_y = np.exp(-2j * np.pi * np.outer(y_px, distinct_fy)) * cell_response(distinct_fy / psf.oversampling)
     product = wave_y.T @ cells @ wave_x
     return np.asarray(product[j.reshape(np.shape(fy)), i.reshape(np.shape(fx))])
 
 
-def cell_places_px(psf: MeasuredPsfConfig) -> tuple[Floats, Floats]:
+def cell_positions_px(psf: MeasuredPsfConfig) -> tuple[Floats, Floats]:
     """x of a measured table's columns and y of its rows, from its center of gravity."""
-    cells = cells_of(psf.file)
-    place = np.arange(len(cells)) / psf.oversampling
-    return place - cells.sum(axis=0) @ place, place - cells.sum(axis=1) @ place
+    cells = read_cells(psf.file)
+    position_px = np.arange(len(cells)) / psf.oversampling
+    return position_px - cells.sum(axis=0) @ position_px, position_px - cells.sum(axis=1) @ position_px
 
 
 @lru_cache(maxsize=16)
-def cells_of(file: str) -> Floats:
+def read_cells(file: str) -> Floats:
     """(n, n) numbers of a measured PSF from CSV or an image (FITS, PNG, TIFF), scaled to a sum of 1.
 
     Raises InputError with one line, `camera.psf.file: ...`, for an unreadable file or an unusable table.
@@ -142,17 +142,13 @@ def cells_of(file: str) -> Floats:
         else:
             cells = monochrome(read_image(path)).astype(float)
     except (InputError, OSError, ValueError) as error:
-        said = str(error) if str(path) in str(error) else f"{path}: {error}"
-        raise InputError(f"camera.psf.file: {' '.join(said.split())}") from None
+        message = str(error) if str(path) in str(error) else f"{path}: {error}"
+        raise InputError(f"camera.psf.file: {' '.join(message.split())}") from None
     if cells.ndim != 2 or cells.shape[0] != cells.shape[1] or not 3 <= len(cells) <= 1024:
-        raise InputError(
-            f"camera.psf.file: {path}: shape {cells.shape}; allowed: a square of 3 to 1024 numbers a side"
-        )
+        raise InputError(f"camera.psf.file: {path}: shape {cells.shape}; allowed: a square of 3 to 1024 numbers a side")
     total = cells.sum()
     if not (np.isfinite(total) and total > 0):
-        raise InputError(
-            f"camera.psf.file: {path}: its numbers add up to {total:g}; allowed: a finite sum above 0"
-        )
+        raise InputError(f"camera.psf.file: {path}: its numbers add up to {total:g}; allowed: a finite sum above 0")
     return np.asarray(cells / total)
 
 
@@ -171,31 +167,31 @@ PSFS: dict[str, Callable[[Any, CameraConfig, Floats, Floats], Otf]] = {
     "gaussian": gaussian,
     "moffat": moffat,
     "airy": airy,
-    "disc": disc,
+    "disk": disk,
     "measured": measured,
 }
 
 
 def moffat_reach_px(psf: MoffatPsfConfig, camera: CameraConfig) -> float:
-    """Radius where a Moffat profile falls below WINGS of its image's brightest pixel; at most 64 px or four alpha."""
+    """Radius where a Moffat profile falls below WING_LEVEL of its image's peak pixel; at most 64 px or four alpha."""
     alpha = moffat_alpha_px(psf)
-    level = WINGS / max(1.0, (psf.beta - 1) / (np.pi * alpha**2))
+    level = WING_LEVEL / max(1.0, (psf.beta - 1) / (np.pi * alpha**2))
     return float(min(alpha * np.sqrt(level ** (-1 / psf.beta) - 1), max(64.0, 4 * alpha)))
 
 
 def airy_reach_px(psf: AiryPsfConfig, camera: CameraConfig) -> float:
-    """Radius where the mean of Airy's rings, 4 / (pi z^3) of its peak at z = pi r / (lambda N), falls below WINGS.
+    """Radius where the mean of Airy's rings, 4 / (pi z^3) of its peak at z = pi r / (lambda N), falls below WING_LEVEL.
 
     At most 64 px or eight lambda N. The light beyond, 2 / (pi z), is within 2 %.
     """
     unit = airy_unit_px(psf, camera)
-    z = (4 / np.pi / WINGS * max(1.0, np.pi / 4 / unit**2)) ** (1 / 3)
+    z = (4 / np.pi / WING_LEVEL * max(1.0, np.pi / 4 / unit**2)) ** (1 / 3)
     return float(min(z * unit / np.pi, max(64.0, 8 * unit)))
 
 
 def measured_reach_px(psf: MeasuredPsfConfig, camera: CameraConfig) -> float:
     """The farthest cell's distance in x or y, plus the two cells that interpolation adds."""
-    return float(np.abs(cell_places_px(psf)).max() + 2 / psf.oversampling)
+    return float(np.abs(cell_positions_px(psf)).max() + 2 / psf.oversampling)
 
 
 # By kind: radius that holds the light of a point, and sigma of the Gaussian that widens it.
@@ -203,8 +199,8 @@ EXTENT: dict[str, Callable[[Any, CameraConfig], tuple[float, float]]] = {
     "gaussian": lambda psf, camera: (0.0, psf.sigma_px),
     "moffat": lambda psf, camera: (moffat_reach_px(psf, camera), 0.0),
     "airy": lambda psf, camera: (airy_reach_px(psf, camera), psf.sigma_px),
-    "disc": lambda psf, camera: (psf.radius_px, psf.sigma_px),
+    "disk": lambda psf, camera: (psf.radius_px, psf.sigma_px),
     "measured": lambda psf, camera: (measured_reach_px(psf, camera), 0.0),
 }
 WINGED = ("moffat", "airy")  # kinds with infinite wings
-SQUARE = ("measured",)  # kinds that may not be round
+NOT_ROUND = ("measured",)  # kinds that may not be round

@@ -1,8 +1,8 @@
-"""Add images of points and discs to a patch of pixels (compiled; most of the rendering time).
+"""Add images of points and disks to a patch of pixels (compiled; most of the rendering time).
 
 Every `add_*` adds `electrons` spread as an image centered on (x, y), in pixels of the patch (0-based, the integer is
 the pixel's center), to the rows row0 <= j < row1 of a C-ordered float64 patch. Light outside of these rows or of
-the patch is left out; the rows of a rolling shutter add up to the whole. The tables come from
+the patch is left out; the rows of a rolling shutter add up to the total. The tables come from
 `skysim.camera.psf.kernel`.
 """
 
@@ -24,31 +24,8 @@ LANES = 32  # buffers are multiples of this (four registers of eight), so that S
 
 
 @jit
-def add(
-    patch: Floats,
-    row0: int,
-    row1: int,
-    x: float,
-    y: float,
-    electrons: float,
-    sigma_px: float,
-    radial: Singles,
-    grid: Singles,
-) -> None:
-    """Add the image of a `kernel.Kernel`, whichever it holds: grid, radial table or Gaussian."""
-    if grid.shape[0] > 0:
-        add_grid(patch, row0, row1, x, y, electrons, grid)
-    elif radial.shape[0] > 0:
-        add_round(patch, row0, row1, x, y, electrons, radial)
-    else:
-        add_gaussian(patch, row0, row1, x, y, electrons, sigma_px)
-
-
-@jit
-def add_gaussian(
-    patch: Floats, row0: int, row1: int, x: float, y: float, electrons: float, sigma_px: float
-) -> None:
-    """Add a Gaussian's exact share of each pixel: the product of two differences of the error function."""
+def add_gaussian(patch: Floats, row0: int, row1: int, x: float, y: float, electrons: float, sigma_px: float) -> None:
+    """Add a Gaussian's exact fraction in each pixel: the product of two differences of the error function."""
     height, width = patch.shape
     reach = REACH_SIGMA * sigma_px + 0.5
     left, right = max(ceil(x - reach), 0), min(floor(x + reach) + 1, width)
@@ -65,17 +42,15 @@ def add_gaussian(
     low = erf((top - 0.5 - y) * scale)
     for j in range(top, bottom):
         high = erf((j + 0.5 - y) * scale)
-        share = high - low
+        fraction = high - low
         low = high
         row = patch[j, left:right]
         for i in range(columns.size):
-            row[i] += share * columns[i]
+            row[i] += fraction * columns[i]
 
 
 @jit(fastmath=True)
-def add_round(
-    patch: Floats, row0: int, row1: int, x: float, y: float, electrons: float, radial: Singles
-) -> None:
+def add_round(patch: Floats, row0: int, row1: int, x: float, y: float, electrons: float, radial: Singles) -> None:
     """Add a round image seen by square pixels: T0(r) + T4(r) cos 4 theta + T8(r) cos 8 theta.
 
     radial (R, 3, 5 or 7): at r = i / PER_PX of T0 the value, the step to the next entry and Bessel's second
@@ -106,26 +81,26 @@ def add_round(
         first = np.uint64(max(ceil(x - half) - left, 0))
         last = np.uint64(max(min(floor(x + half) + 1, right) - left, 0))
         row = patch[j, left:]
-        radii(u, v, entry, f)
+        table_entries(u, v, entry, f)
         if radial.shape[1] > 3:
-            cosines(u, v, c4, c8)
+            angular_factors(u, v, c4, c8)
         if radial.shape[1] == 3:
             for i in range(first, last):
-                row[i] += electrons * along(radial, entry[i], f[i])
+                row[i] += electrons * interpolate_t0(radial, entry[i], f[i])
         elif radial.shape[1] == 5:
             for i in range(first, last):
                 k = np.uint64(entry[i])
                 t4 = radial[k, 3] + f[i] * radial[k, 4]
-                row[i] += electrons * (along(radial, entry[i], f[i]) + c4[i] * t4)
+                row[i] += electrons * (interpolate_t0(radial, entry[i], f[i]) + c4[i] * t4)
         else:
             for i in range(first, last):
                 k = np.uint64(entry[i])
                 t4, t8 = radial[k, 3] + f[i] * radial[k, 4], radial[k, 5] + f[i] * radial[k, 6]
-                row[i] += electrons * (along(radial, entry[i], f[i]) + c4[i] * t4 + c8[i] * t8)
+                row[i] += electrons * (interpolate_t0(radial, entry[i], f[i]) + c4[i] * t4 + c8[i] * t8)
 
 
 @jit(fastmath=True)
-def radii(u: Singles, v: float, entry: NDArray[np.int32], fraction: Singles) -> None:
+def table_entries(u: Singles, v: float, entry: NDArray[np.int32], fraction: Singles) -> None:
     """Entry of the radial table for each pixel of a row, and the fraction past it."""
     for i in range(u.size):
         r = np.sqrt(u[i] + v) * np.float32(PER_PX)
@@ -134,7 +109,7 @@ def radii(u: Singles, v: float, entry: NDArray[np.int32], fraction: Singles) -> 
 
 
 @jit(fastmath=True)
-def cosines(u: Singles, v: float, c4: Singles, c8: Singles) -> None:
+def angular_factors(u: Singles, v: float, c4: Singles, c8: Singles) -> None:
     """r^4 cos 4 theta and r^8 cos 8 theta of each pixel of a row."""
     for i in range(u.size):
         r4 = (u[i] + v) * (u[i] + v)
@@ -143,7 +118,7 @@ def cosines(u: Singles, v: float, c4: Singles, c8: Singles) -> None:
 
 
 @jit(fastmath=True)
-def along(radial: Singles, entry: int, f: float) -> float:
+def interpolate_t0(radial: Singles, entry: int, f: float) -> float:
     """T0 at a fraction f past an entry, by a parabola."""
     k = np.uint64(entry)
     return radial[k, 0] + f * (radial[k, 1] + (f - np.float32(1)) * radial[k, 2])
@@ -157,40 +132,34 @@ def cubic(t: float) -> tuple[float, float, float, float]:
 
 
 @jit(fastmath=True)
-def add_grid(
-    patch: Floats, row0: int, row1: int, x: float, y: float, electrons: float, grid: Singles
-) -> None:
+def add_grid(patch: Floats, row0: int, row1: int, x: float, y: float, electrons: float, grid: Singles) -> None:
     """Add an image of any shape from its tables at S x S sub-pixel positions, with cubic interpolation between them.
 
-    grid (S + 3, S + 3, N, N): grid[q, p, j, i] is the share of pixel (i, j) of an image centered at
+    grid (S + 3, S + 3, N, N): grid[q, p, j, i] is the fraction in pixel (i, j) of an image centered at
     ((p - 1) / S - 1/2, (q - 1) / S - 1/2) from the middle pixel. All pixels of one image use the same sixteen
     weights, so the inner loop runs over contiguous pixels of a row. Each table adds up to 1, and so does
     every mixture.
     """
     height, width = patch.shape
     steps, size = grid.shape[0] - 3, grid.shape[2]
-    middle_x, middle_y = floor(x + 0.5), floor(y + 0.5)
-    along, down = (x - middle_x + 0.5) * steps, (y - middle_y + 0.5) * steps
-    p, q = min(int(along), steps - 1), min(int(down), steps - 1)
-    wx0, wx1, wx2, wx3 = cubic(along - p)
-    wy = cubic(down - q)
-    corner_x, corner_y = middle_x - size // 2, middle_y - size // 2
+    center_x, center_y = floor(x + 0.5), floor(y + 0.5)
+    phase_x, phase_y = (x - center_x + 0.5) * steps, (y - center_y + 0.5) * steps
+    p, q = min(int(phase_x), steps - 1), min(int(phase_y), steps - 1)
+    wx0, wx1, wx2, wx3 = cubic(phase_x - p)
+    wy = cubic(phase_y - q)
+    corner_x, corner_y = center_x - size // 2, center_y - size // 2
     left, right = max(corner_x, 0), min(corner_x + size, width)
     top, bottom = max(corner_y, row0, 0), min(corner_y + size, row1, height)
     if right <= left or bottom <= top:
         return
     sums = np.empty(right - left, np.float32)
-    a, b = left - corner_x, right - corner_x
+    first, last = left - corner_x, right - corner_x
     for j in range(top, bottom):
         sums[:] = 0
         for s in range(4):
-            tables = grid[q + s, p : p + 4, j - corner_y, a:b]
-            w0, w1, w2, w3 = (
-                np.float32(wy[s] * wx0),
-                np.float32(wy[s] * wx1),
-                np.float32(wy[s] * wx2),
-                np.float32(wy[s] * wx3),
-            )
+            tables = grid[q + s, p : p + 4, j - corner_y, first:last]
+            w0, w1 = np.float32(wy[s] * wx0), np.float32(wy[s] * wx1)
+            w2, w3 = np.float32(wy[s] * wx2), np.float32(wy[s] * wx3)
             for i in range(sums.size):
                 sums[i] += w0 * tables[0, i] + w1 * tables[1, i] + w2 * tables[2, i] + w3 * tables[3, i]
         row = patch[j, left:right]

@@ -17,16 +17,16 @@ from skysim.core.errors import InputError
 from skysim.core.types import Floats, Trajectory
 from skysim.core.units import RPM_RAD_S
 from skysim.dynamics.multibody.mjcf import mujoco_warnings
-from skysim.dynamics.multibody.model import World
+from skysim.dynamics.multibody.model import VehicleModel
 
 STATE = mujoco.mjtState.mjSTATE_FULLPHYSICS
 CONTROL = mujoco.mjtState.mjSTATE_CTRL
-FOREVER = 2**62  # steps
+MAX_STEPS = 2**62  # steps
 
 Controller = Callable[[float, Rotation, Floats], Floats]
 
 
-class Flight:
+class Simulation:
     """A simulated motion in progress. `advance` integrates some steps with given controls and keeps all states.
 
     MuJoCo's rollout steps in C and writes every state directly into `states`, so that there is no overhead per step.
@@ -34,50 +34,50 @@ class Flight:
     MuJoCo's full physics state: time, qpos (its first four lab_from_body), qvel, actuator states.
 
     lab_from_body : at the start; rate_body_rad_s : (3,) likewise
-    duration_s    : the longest that this motion can last, which sets the memory. With kept_s it may be inf
-    kept_s        : keep only states of this age or younger; memory is for twice as many
+    duration_s    : the longest that this motion can last, which sets the memory. With history_s it may be inf
+    history_s     : keep only states of this age or younger; memory is for twice as many
     """
 
     def __init__(
         self,
-        world: World,
+        vehicle: VehicleModel,
         lab_from_body: Rotation,
         rate_body_rad_s: Floats,
         duration_s: float,
-        kept_s: float | None = None,
+        history_s: float | None = None,
     ) -> None:
-        check_tilt(world, lab_from_body)
-        self.world, self.model = world, world.model
+        check_tilt(vehicle, lab_from_body)
+        self.vehicle, self.model = vehicle, vehicle.model
         self.step_s = float(self.model.opt.timestep)
-        self.last = max(1, int(np.ceil(min(duration_s / self.step_s, FOREVER) - 1e-6)))
-        self.kept = self.last if kept_s is None else int(np.ceil(kept_s / self.step_s))
-        rows = min(self.last, 2 * self.kept) + 1
+        self.last_step = max(1, int(np.ceil(min(duration_s / self.step_s, MAX_STEPS) - 1e-6)))
+        self.history_steps = self.last_step if history_s is None else int(np.ceil(history_s / self.step_s))
+        rows = min(self.last_step, 2 * self.history_steps) + 1
         self.states = np.empty((rows, mujoco.mj_stateSize(self.model, int(STATE))))
-        self.step = self.first = 0  # step number of the present, and of the first row of `states`
+        self.step = self.first_step = 0  # step number of the present, and of the first row of `states`
         self.data = mujoco.MjData(self.model)
         self.rollout = Rollout(nthread=0)
-        self.start(lab_from_body, rate_body_rad_s)
+        self.set_initial_state(lab_from_body, rate_body_rad_s)
 
-    def start(self, lab_from_body: Rotation, rate_body_rad_s: Floats) -> None:
-        """Set the first state: wheels, rotors and gimbals as the scene has them."""
-        world, data = self.world, self.data
-        vehicle = world.vehicle
+    def set_initial_state(self, lab_from_body: Rotation, rate_body_rad_s: Floats) -> None:
+        """Set the initial state; speeds and gimbal angles are those of the scene."""
+        vehicle, data = self.vehicle, self.data
+        config = vehicle.config
         data.qpos[:4] = lab_from_body.as_quat(scalar_first=True)
         data.qvel[:3] = rate_body_rad_s
-        if vehicle.wheels:
-            rpm = as_many(vehicle.wheels.start_rpm, len(world.wheels), "vehicle.wheels.start_rpm")
-            data.qvel[world.wheels.dof] = rpm * RPM_RAD_S
-        if vehicle.cmgs:
-            angles = np.radians(as_many(vehicle.cmgs.start_deg, len(world.gimbals), "vehicle.cmgs.start_deg"))
-            data.qpos[world.gimbals.qpos] = angles
-            data.act[self.model.actuator_actadr[world.gimbals.motor]] = angles  # servo set-points
-            data.qvel[world.rotors.dof] = vehicle.cmgs.rotor_rpm * RPM_RAD_S
+        if config.wheels:
+            rpm = member_values(config.wheels.start_rpm, len(vehicle.wheels), "vehicle.wheels.start_rpm")
+            data.qvel[vehicle.wheels.dof] = rpm * RPM_RAD_S
+        if config.cmgs:
+            angles = np.radians(member_values(config.cmgs.start_deg, len(vehicle.gimbals), "vehicle.cmgs.start_deg"))
+            data.qpos[vehicle.gimbals.qpos] = angles
+            data.act[self.model.actuator_actadr[vehicle.gimbals.motor]] = angles  # servo set-points
+            data.qvel[vehicle.rotors.dof] = config.cmgs.rotor_rpm * RPM_RAD_S
         mujoco.mj_getState(self.model, data, self.states[0], int(STATE))
         mujoco.mj_forward(self.model, data)
 
     @property
     def steps_left(self) -> int:
-        return self.last - self.step
+        return self.last_step - self.step
 
     @property
     def now_s(self) -> float:
@@ -106,15 +106,15 @@ class Flight:
     @property
     def row(self) -> int:
         """Row of the present state in `states`."""
-        return self.step - self.first
+        return self.step - self.first_step
 
-    def forget(self, steps: int) -> None:
-        """If there is no room for so many steps, drop states older than `kept` steps."""
+    def discard_old(self, steps: int) -> None:
+        """If there is no room for so many steps, drop states older than `history_steps`."""
         if self.row + steps < len(self.states):
             return
-        old = max(self.row - self.kept, 0)
+        old = max(self.row - self.history_steps, 0)
         self.states[: self.row - old + 1] = self.states[old : self.row + 1]
-        self.first += old
+        self.first_step += old
 
     def advance(self, control: Floats) -> None:
         """Integrate one step for each row of control (K, nu). Raises InputError if MuJoCo warned.
@@ -122,7 +122,7 @@ class Flight:
         MuJoCo resets an unstable model to its start and continues, and clears its warnings with the next call, so
         they are checked after every call.
         """
-        self.forget(len(control))
+        self.discard_old(len(control))
         row, end = self.row, self.row + len(control)
         with mujoco_warnings():
             self.rollout.rollout(
@@ -137,21 +137,21 @@ class Flight:
                 state=self.states[None, row + 1 : end + 1],
             )
         self.step += len(control)
-        self.check()
+        self.check_warnings()
 
-    def check(self) -> None:
+    def check_warnings(self) -> None:
         if self.data.warning.number.any():
             raise InputError(
-                f"the flight cannot be stepped at {1e3 * self.step_s:g} ms: MuJoCo warned before {self.now_s:.3f} s"
-                f" ({self.warned()}); something in vehicle or motion.control is too stiff, too fast or not a number"
+                f"motion: not integrable at a step of {1e3 * self.step_s:g} ms: MuJoCo warned before {self.now_s:.3f} s"
+                f" ({self.warning_names()}); check vehicle and motion.control for stiff, fast or NaN values"
             )
 
-    def warned(self) -> str:
+    def warning_names(self) -> str:
         """Names of MuJoCo's warnings."""
-        kinds = [
-            kind for kind in mujoco.mjtWarning.__members__.values() if int(kind) < len(self.data.warning)
+        warnings = [
+            warning for warning in mujoco.mjtWarning.__members__.values() if int(warning) < len(self.data.warning)
         ]
-        return ", ".join(str(kind.name) for kind in kinds if self.data.warning[int(kind)].number)
+        return ", ".join(str(warning.name) for warning in warnings if self.data.warning[int(warning)].number)
 
     def times_s(self, begin: int, end: int) -> Floats:
         """Times of the steps from begin to before end."""
@@ -159,8 +159,8 @@ class Flight:
 
     def knots(self, begin: int = 0) -> tuple[Floats, Floats, Floats]:
         """Times (K,), lab_from_body (K, 4) as wxyz and rates (K, 3) from a step on."""
-        flown, nq = self.states[begin - self.first : self.row + 1], self.model.nq
-        return self.times_s(begin, self.step + 1), flown[:, 1:5], flown[:, 1 + nq : 4 + nq]
+        states, nq = self.states[begin - self.first_step : self.row + 1], self.model.nq
+        return self.times_s(begin, self.step + 1), states[:, 1:5], states[:, 1 + nq : 4 + nq]
 
     def trajectory(self, begin: int = 0) -> Trajectory:
         """The motion from a step on, as a Trajectory."""
@@ -168,15 +168,15 @@ class Flight:
         return Trajectory(t_s, Rotation.from_quat(lab_from_body_wxyz, scalar_first=True), rate.copy())
 
 
-def as_many(values: tuple[float, ...], count: int, key: str) -> Floats:
-    """One value for each of `count` members; zeros if none are given. Raises InputError for another number."""
+def member_values(values: tuple[float, ...], count: int, key: str) -> Floats:
+    """One value for each of `count` members; zeros if none are given. Raises InputError for another count."""
     if values and len(values) != count:
-        raise InputError(f"{key}: {len(values)} values for {count} of them")
+        raise InputError(f"{key}: {len(values)} values; allowed: {count}, one for each, or none")
     return np.array(values or (0.0,) * count)
 
 
-def fly(
-    world: World,
+def simulate(
+    vehicle: VehicleModel,
     lab_from_body_start: Rotation,
     rate_body_rad_s: Floats,
     duration_s: float,
@@ -189,17 +189,17 @@ def fly(
     the start and every control period (whole steps); its torque, clipped to the limit, is held in between.
     rate_body_rad_s : (3,) at the start. Raises InputError for a start beyond the tilt stop, and if MuJoCo warned.
     """
-    flight = Flight(world, lab_from_body_start, rate_body_rad_s, duration_s)
-    every = max(1, round(control_period_s / flight.step_s)) if controller else flight.steps_left
-    limit = world.vehicle.torque_limit_nm
-    while flight.steps_left:
-        control = np.zeros((min(every, flight.steps_left), world.model.nu))
+    simulation = Simulation(vehicle, lab_from_body_start, rate_body_rad_s, duration_s)
+    steps = max(1, round(control_period_s / simulation.step_s)) if controller else simulation.steps_left
+    limit = vehicle.config.torque_limit_nm
+    while simulation.steps_left:
+        control = np.zeros((min(steps, simulation.steps_left), vehicle.model.nu))
         if controller:
-            here = Rotation.from_quat(flight.lab_from_body_wxyz, scalar_first=True)
-            torque = controller(flight.now_s, here, flight.rate_body_rad_s.copy())
-            control[:, world.torques] = np.clip(torque, -limit, limit)
-        flight.advance(control)
-    return flight.trajectory()
+            attitude = Rotation.from_quat(simulation.lab_from_body_wxyz, scalar_first=True)
+            torque = controller(simulation.now_s, attitude, simulation.rate_body_rad_s.copy())
+            control[:, vehicle.torques] = np.clip(torque, -limit, limit)
+        simulation.advance(control)
+    return simulation.trajectory()
 
 
 def tilt_deg(lab_from_body: Rotation) -> Floats:
@@ -207,11 +207,11 @@ def tilt_deg(lab_from_body: Rotation) -> Floats:
     return np.degrees(np.arccos(np.clip(lab_from_body.as_matrix()[..., 2, 2], -1, 1)))
 
 
-def check_tilt(world: World, lab_from_body: Rotation) -> None:
+def check_tilt(vehicle: VehicleModel, lab_from_body: Rotation) -> None:
     """Raise InputError for a start beyond the tilt stop."""
     tilt = float(tilt_deg(lab_from_body))
-    if world.vehicle.mount == "air_bearing" and tilt > world.vehicle.tilt_stop_deg:
+    if vehicle.config.mount == "air_bearing" and tilt > vehicle.config.tilt_stop_deg:
         raise InputError(
-            f"motion.start: tilted by {tilt:.1f} deg, beyond vehicle.tilt_stop_deg"
-            f" {world.vehicle.tilt_stop_deg:g}"
+            f"motion.start: tilt of {tilt:.1f} deg; allowed: up to vehicle.tilt_stop_deg"
+            f" {vehicle.config.tilt_stop_deg:g}"
         )

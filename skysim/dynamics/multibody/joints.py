@@ -6,6 +6,7 @@ joint `rotor_*` with the same suffix; sites `fan_*`, which push along their own 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,10 +17,10 @@ from numpy.typing import NDArray
 
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
-from skysim.scene.vehicle import CmgsConfig, VehicleConfig, WheelsConfig
-from skysim.scene.vehicle import FansConfig as FansPart
+from skysim.scene.vehicle import CmgsConfig, FansConfig, VehicleConfig, WheelsConfig
 
 TORQUES = ("torque_x", "torque_y", "torque_z")
+UNIT_GEAR = (1, 0, 0, 0, 0, 0)
 WHEEL, GIMBAL, ROTOR, FAN = "wheel_", "gimbal_", "rotor_", "fan_"
 
 
@@ -42,7 +43,7 @@ class Hinges:
     motor: NDArray[np.int64]
 
     @classmethod
-    def of(cls, model: Any, prefix: str) -> Hinges:
+    def from_model(cls, model: Any, prefix: str) -> Hinges:
         """All joints whose name begins with prefix."""
         data = mujoco.MjData(model)
         mujoco.mj_forward(model, data)
@@ -72,11 +73,11 @@ class Fans:
 
     names: tuple[str, ...]
     axes: Floats
-    places_m: Floats
+    positions_m: Floats
     motor: NDArray[np.int64]
 
     @classmethod
-    def of(cls, model: Any) -> Fans:
+    def from_model(cls, model: Any) -> Fans:
         """The fans that have an actuator."""
         data = mujoco.MjData(model)
         mujoco.mj_forward(model, data)
@@ -107,47 +108,47 @@ def lock_unused(spec: Any, vehicle: VehicleConfig, path: Path) -> dict[str, str]
     """
     locked: dict[str, str] = {}
     check_names(spec, path)
-    for part, key, prefixes in (
+    for config, key, prefixes in (
         (vehicle.wheels, "wheels", (WHEEL,)),
         (vehicle.cmgs, "cmgs", (GIMBAL, ROTOR)),
     ):
         for prefix in prefixes:
-            found = joints(spec, prefix)
-            if part is None:
-                locked |= dict.fromkeys((joint.name for joint in found), f"vehicle.{key}")
-                for joint in found:
+            hinges = joints(spec, prefix)
+            if config is None:
+                locked |= dict.fromkeys((joint.name for joint in hinges), f"vehicle.{key}")
+                for joint in hinges:
                     spec.delete(joint)
-            elif not found:
-                raise InputError(f"{path}: has no joint {prefix}*, which vehicle.{key} switches on")
-            elif any(joint.type != mujoco.mjtJoint.mjJNT_HINGE for joint in found):
+            elif not hinges:
+                raise InputError(f"{path}: no joint {prefix}*, which vehicle.{key} needs")
+            elif any(joint.type != mujoco.mjtJoint.mjJNT_HINGE for joint in hinges):
                 raise InputError(f"{path}: joints {prefix}* must be hinges")
-            for joint in found if part else ():
+            for joint in hinges if config else ():
                 check_bare(joint, path)
     if vehicle.cmgs:
-        pair_up(spec, path)
-    if vehicle.fans and not fans(spec):
-        raise InputError(f"{path}: has no site {FAN}*, which vehicle.fans switches on")
+        check_rotor_pairs(spec, path)
+    if vehicle.fans and not fan_sites(spec):
+        raise InputError(f"{path}: no site {FAN}*, which vehicle.fans needs")
     for actuator in spec.actuators:
         if actuator.name in TORQUES or actuator.name.startswith((WHEEL, GIMBAL, ROTOR, FAN)):
             raise InputError(
-                f"{path}: actuator {actuator.name}: skysim makes its own of this name; leave it out"
+                f"{path}: actuator {actuator.name}: skysim adds an actuator of this name; remove it from the file"
             )
     return locked
 
 
-def why_locked(complaint: str, locked: dict[str, str]) -> str:
+def locked_joint_hint(message: str, locked: dict[str, str]) -> str:
     """An addition to MuJoCo's message about an unknown joint, if that joint was deleted."""
-    named = [name for name in locked if f"'{name}'" in complaint]
-    return f"; {locked[named[0]]} is off, which locks joint {named[0]}" if named else ""
+    names = [name for name in locked if f"'{name}'" in message]
+    return f"; {locked[names[0]]} is off, which locks joint {names[0]}" if names else ""
 
 
 def check_names(spec: Any, path: Path) -> None:
     """Raise InputError for a joint or site whose name nearly matches an actuator's: it would silently not be one."""
     for element in (*spec.joints, *spec.sites):
-        word = next((p for p in (WHEEL, GIMBAL, ROTOR, FAN) if element.name.startswith(p[:-1])), None)
-        if word and not element.name.startswith(word):
+        prefix = next((p for p in (WHEEL, GIMBAL, ROTOR, FAN) if element.name.startswith(p[:-1])), None)
+        if prefix and not element.name.startswith(prefix):
             raise InputError(
-                f"{path}: {element.name}: allowed: {word}{element.name[len(word) - 1 :]}, or another word"
+                f"{path}: {element.name}: allowed: {prefix}{element.name[len(prefix) - 1 :]}, or another word"
             )
 
 
@@ -155,7 +156,7 @@ def check_bare(joint: Any, path: Path) -> None:
     """Raise InputError for limits, springs, damping or drives of an actuator's joint in the file: the
     scene sets them.
     """
-    given = {
+    attributes = {
         "range": joint.range,
         "stiffness": joint.stiffness,
         "damping": joint.damping,
@@ -163,25 +164,23 @@ def check_bare(joint: Any, path: Path) -> None:
         "armature": joint.armature,
         "actuatorfrcrange": joint.actfrcrange,
     }
-    for name, value in given.items():
+    for name, value in attributes.items():
         if np.any(value):
-            raise InputError(f"{path}: joint {joint.name}: {name} is not the file's to say; leave it out")
+            raise InputError(f"{path}: joint {joint.name}: {name} is set by the scene; remove it from the file")
 
 
-def pair_up(spec: Any, path: Path) -> None:
+def check_rotor_pairs(spec: Any, path: Path) -> None:
     """Check that each rotor is on the gimbal with the same suffix. Raises InputError."""
     for gimbal in joints(spec, GIMBAL):
-        ending = gimbal.name.removeprefix(GIMBAL)
-        rotor = spec.joint(ROTOR + ending)
+        suffix = gimbal.name.removeprefix(GIMBAL)
+        rotor = spec.joint(ROTOR + suffix)
         if rotor is None or rotor.parent.parent != gimbal.parent:
-            raise InputError(
-                f"{path}: joint {gimbal.name} has no joint {ROTOR}{ending} on a body of its own beneath it"
-            )
+            raise InputError(f"{path}: joint {gimbal.name} has no joint {ROTOR}{suffix} on a child body of its own")
     if len(joints(spec, ROTOR)) != len(joints(spec, GIMBAL)):
-        raise InputError(f"{path}: a joint {ROTOR}* has no joint {GIMBAL}* of the same ending")
+        raise InputError(f"{path}: a joint {ROTOR}* has no joint {GIMBAL}* of the same suffix")
 
 
-def fans(spec: Any) -> list[Any]:
+def fan_sites(spec: Any) -> list[Any]:
     return sorted((site for site in spec.sites if site.name.startswith(FAN)), key=lambda site: site.name)
 
 
@@ -198,10 +197,20 @@ def add_actuators(spec: Any, model: Any, vehicle: VehicleConfig) -> None:
         add_fans(spec, vehicle.fans)
 
 
-def add_motor(spec: Any, name: str, kind: Any, target: str, **more: Any) -> Any:
-    """Add a motor of that name: force = control."""
-    motor = spec.add_actuator(name=name, trntype=kind, target=target, **more)
+def add_motor(
+    spec: Any,
+    name: str,
+    kind: Any,
+    target: str,
+    limit: float | None = None,
+    gear: Sequence[float] = UNIT_GEAR,
+) -> Any:
+    """Add a motor: force = control, which is limited to +-limit if one is given."""
+    motor = spec.add_actuator(name=name, trntype=kind, target=target, gear=gear)
     motor.set_to_motor()
+    if limit is not None:
+        motor.ctrllimited = mujoco.mjtLimited.mjLIMITED_TRUE
+        motor.ctrlrange = [-limit, limit]
     return motor
 
 
@@ -209,8 +218,7 @@ def add_wheels(spec: Any, wheels: WheelsConfig) -> None:
     """A motor at each wheel, and its axle's friction; Coulomb friction is MuJoCo's, which holds at rest."""
     for joint in joints(spec, WHEEL):
         joint.frictionloss, joint.damping = wheels.coulomb_nm, [wheels.viscous_nms, 0.0, 0.0]
-        motor = add_motor(spec, joint.name, mujoco.mjtTrn.mjTRN_JOINT, joint.name)
-        limit(motor, wheels.torque_limit_nm)
+        add_motor(spec, joint.name, mujoco.mjtTrn.mjTRN_JOINT, joint.name, wheels.torque_limit_nm)
 
 
 def add_cmgs(spec: Any, model: Any, cmgs: CmgsConfig) -> None:
@@ -221,26 +229,19 @@ def add_cmgs(spec: Any, model: Any, cmgs: CmgsConfig) -> None:
     a damper alone would not hold it.
     """
     tau_s = cmgs.gimbal_time_constant_s
-    for joint, inertia in zip(joints(spec, GIMBAL), Hinges.of(model, GIMBAL).inertia_kg_m2, strict=True):
+    for joint, inertia in zip(joints(spec, GIMBAL), Hinges.from_model(model, GIMBAL).inertia_kg_m2, strict=True):
         servo = spec.add_actuator(name=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT, target=joint.name)
         servo.set_to_intvelocity(kp=inertia / tau_s**2, kv=2 * inertia / tau_s)
     for joint in joints(spec, ROTOR):
         if cmgs.rotor_torque_limit_nm:
-            limit(
-                add_motor(spec, joint.name, mujoco.mjtTrn.mjTRN_JOINT, joint.name), cmgs.rotor_torque_limit_nm
-            )
+            add_motor(spec, joint.name, mujoco.mjtTrn.mjTRN_JOINT, joint.name, cmgs.rotor_torque_limit_nm)
 
 
-def add_fans(spec: Any, part: FansPart) -> None:
+def add_fans(spec: Any, config: FansConfig) -> None:
     """A force at each fan, along its site's z, which follows the command with a first-order lag."""
-    for site in fans(spec):
-        fan = add_motor(spec, site.name, mujoco.mjtTrn.mjTRN_SITE, site.name, gear=[0, 0, 1, 0, 0, 0])
+    for site in fan_sites(spec):
+        limit = config.thrust_limit_n
+        fan = add_motor(spec, site.name, mujoco.mjtTrn.mjTRN_SITE, site.name, limit, [0, 0, 1, 0, 0, 0])
         # Not FILTEREXACT, which is exact for Euler steps only: with Runge-Kutta it adds half a step of lag.
         fan.dyntype = mujoco.mjtDyn.mjDYN_FILTER
-        fan.dynprm[0] = part.time_constant_s
-        limit(fan, part.thrust_limit_n)
-
-
-def limit(motor: Any, most: float) -> None:
-    motor.ctrllimited = mujoco.mjtLimited.mjLIMITED_TRUE
-    motor.ctrlrange = [-most, most]
+        fan.dynprm[0] = config.time_constant_s

@@ -17,10 +17,10 @@ from skysim.scene.vehicle import VehicleConfig, WheelsConfig
 
 @dataclass(frozen=True, slots=True)
 class MassProperties:
-    """Of the whole vehicle, in body axes: mass, center of mass (3,), inertia (3, 3) about the body's origin."""
+    """Of the vehicle, in body axes: mass, center of mass (3,), inertia (3, 3) about the body's origin."""
 
     mass_kg: float
-    centre_m: Floats
+    center_m: Floats
     inertia_kg_m2: Floats
 
 
@@ -31,43 +31,43 @@ def tree_mass(model: Any, without_bus: bool = False) -> MassProperties:
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     bus = model.body("bus").id
-    rides = model.body_rootid == bus
-    rides[bus] &= not without_bus
-    mass, centre = model.body_mass[rides], data.xipos[rides]
-    axes = data.ximat[rides].reshape(-1, 3, 3)
-    inertia = np.einsum("nij,nj,nkj->ik", axes, model.body_inertia[rides], axes)
-    inertia += sum((parallel_axis(m, p) for m, p in zip(mass, centre, strict=True)), np.zeros((3, 3)))
-    return MassProperties(float(mass.sum()), mass @ centre / max(mass.sum(), 1e-300), inertia)
+    counted = model.body_rootid == bus
+    counted[bus] &= not without_bus
+    mass, center = model.body_mass[counted], data.xipos[counted]
+    axes = data.ximat[counted].reshape(-1, 3, 3)
+    inertia = np.einsum("nij,nj,nkj->ik", axes, model.body_inertia[counted], axes)
+    inertia += sum((parallel_axis(m, p) for m, p in zip(mass, center, strict=True)), np.zeros((3, 3)))
+    return MassProperties(float(mass.sum()), mass @ center / max(mass.sum(), 1e-300), inertia)
 
 
-def parallel_axis(mass_kg: float, place_m: Floats) -> Floats:
+def parallel_axis(mass_kg: float, position_m: Floats) -> Floats:
     """(3, 3) inertia of a point mass about the origin: m (r.r E - r r^T) (Steiner)."""
-    return mass_kg * (place_m @ place_m * np.eye(3) - np.outer(place_m, place_m))
+    return mass_kg * (position_m @ position_m * np.eye(3) - np.outer(position_m, position_m))
 
 
 def declare_mass(bus: Any, model: Any, vehicle: VehicleConfig, path: Path) -> MassProperties:
-    """Set the bus's inertial so that the whole vehicle has the declared mass properties: declared minus what it
+    """Set the bus's inertial so that the vehicle has the declared mass properties: declared minus what it
     carries.
 
     Mass and inertia that the scene leaves out stay as in the file; the center of mass is always the scene's.
     The inertia is that about the bearing's center, with principal axes along the body's. No part is moved: only the
     bus's inertial changes (in place of a lab's balance masses), and the camera keeps its position.
     """
-    own, carried = tree_mass(model), tree_mass(model, without_bus=True)
-    centre = np.array(vehicle.centre_of_mass_m)
-    inertia = own.inertia_kg_m2 if vehicle.inertia_kg_m2 is None else np.diag(vehicle.inertia_kg_m2)
-    wanted = MassProperties(vehicle.mass_kg or own.mass_kg, centre, inertia)
-    mass = wanted.mass_kg - carried.mass_kg
+    total, carried = tree_mass(model), tree_mass(model, without_bus=True)
+    center = np.array(vehicle.center_of_mass_m)
+    inertia = total.inertia_kg_m2 if vehicle.inertia_kg_m2 is None else np.diag(vehicle.inertia_kg_m2)
+    declared = MassProperties(vehicle.mass_kg or total.mass_kg, center, inertia)
+    mass = declared.mass_kg - carried.mass_kg
     if mass <= 0:
         raise InputError(
-            f"vehicle.mass: {wanted.mass_kg:g} kg leaves nothing for the bus, which carries"
-            f" {carried.mass_kg:g} kg ({path})"
+            f"vehicle.mass: {declared.mass_kg:g} kg; allowed: more than the {carried.mass_kg:g} kg that the bus"
+            f" carries ({path})"
         )
     # The bus's own center follows from the first moments: total minus carried, over the bus's mass.
-    place = (wanted.mass_kg * wanted.centre_m - carried.mass_kg * carried.centre_m) / mass
-    whose = f"vehicle.inertia: less what the bus carries ({path}), its"
-    give_inertial(bus, mass, place, inertia - carried.inertia_kg_m2 - parallel_axis(mass, place), whose)
-    return wanted
+    center_bus = (declared.mass_kg * declared.center_m - carried.mass_kg * carried.center_m) / mass
+    subject = f"vehicle.inertia: less what the bus carries ({path}), its"
+    set_inertial(bus, mass, center_bus, inertia - carried.inertia_kg_m2 - parallel_axis(mass, center_bus), subject)
+    return declared
 
 
 def unbalance(model: Any, joints: list[Any], wheels: WheelsConfig, path: Path) -> None:
@@ -87,10 +87,8 @@ def unbalance(model: Any, joints: list[Any], wheels: WheelsConfig, path: Path) -
         across /= np.linalg.norm(across)
         product = np.outer(axle, np.cross(axle, across))
         axes = Rotation.from_quat(own.iquat, scalar_first=True).as_matrix()
-        inertia = axes @ np.diag(own.inertia) @ axes.T + wheels.dynamic_imbalance_kg_m2 * (
-            product + product.T
-        )
-        give_inertial(
+        inertia = axes @ np.diag(own.inertia) @ axes.T + wheels.dynamic_imbalance_kg_m2 * (product + product.T)
+        set_inertial(
             rotor,
             own.mass[0],
             own.ipos + wheels.static_imbalance_kg_m / own.mass[0] * across,
@@ -99,17 +97,17 @@ def unbalance(model: Any, joints: list[Any], wheels: WheelsConfig, path: Path) -
         )
 
 
-def give_inertial(body: Any, mass_kg: float, place_m: Floats, inertia_kg_m2: Floats, whose: str) -> None:
+def set_inertial(body: Any, mass_kg: float, center_m: Floats, inertia_kg_m2: Floats, subject: str) -> None:
     """Set mass, center and inertia (3, 3) about it in a body of a spec. Raises InputError for impossible inertia."""
     moments, axes = np.linalg.eigh(inertia_kg_m2)
     if moments[0] <= 0 or moments[2] > (moments[0] + moments[1]) * (1 + 1e-12):
         raise InputError(
-            f"{whose} principal moments about its centre of mass are"
-            f" {', '.join(f'{m:.3g}' for m in moments)} kg m2, which no rigid body has"
+            f"{subject} principal moments about its center of mass are"
+            f" {', '.join(f'{m:.3g}' for m in moments)} kg m2, impossible for a rigid body"
         )
     body.explicitinertial = True
     # MuJoCo silently takes a NaN ipos as the body's pos: always set it.
-    body.mass, body.ipos, body.inertia = mass_kg, place_m, moments
+    body.mass, body.ipos, body.inertia = mass_kg, center_m, moments
     body.iquat = Rotation.from_matrix(axes * np.linalg.det(axes)).as_quat(scalar_first=True)
     # An orientation or full inertia that the file gives in another form would override these.
     body.ialt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT

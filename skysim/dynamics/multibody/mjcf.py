@@ -10,21 +10,21 @@ from typing import Any
 import mujoco
 
 from skysim.core.errors import InputError
-from skysim.dynamics.multibody.mjcf_sandbox import confined
+from skysim.dynamics.multibody.mjcf_sandbox import check_confined
 
 
 def load(path: Path) -> Any:
     """The MJCF file as an MjSpec."""
     if not path.is_file():
-        raise InputError(f"{path}: no such file; vehicle.model is a path beside the scene or in scenes/")
-    confined(path)
+        raise InputError(f"{path}: no such file; vehicle.model is a path relative to the scene or to scenes/")
+    check_confined(path)
     try:
         return mujoco.MjSpec.from_file(str(path))
     except (ValueError, mujoco.FatalError) as error:
         raise InputError(f"{path}: not a MuJoCo model: {one_line(error)}") from error
 
 
-def compiled(spec: Any, path: Path) -> Any:
+def compile_spec(spec: Any, path: Path) -> Any:
     try:
         return spec.compile()
     except (ValueError, mujoco.FatalError) as error:

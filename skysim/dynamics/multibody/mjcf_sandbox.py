@@ -1,9 +1,8 @@
 """Check that an untrusted MJCF file and all it includes name only files within its own folder.
 
 MuJoCo itself would read any file. The check must see the same names as MuJoCo's parser, so XML that two
-parsers could
-read differently is refused: encodings other than UTF-8, a DOCTYPE, namespaces. Of each name all places are checked
-where MuJoCo may look for it.
+parsers could read differently is refused: encodings other than UTF-8, a DOCTYPE, namespaces. All paths where MuJoCo
+may look for a name are checked.
 """
 
 from __future__ import annotations
@@ -16,140 +15,140 @@ from typing import NamedTuple
 from xml.etree import ElementTree
 
 from skysim.core.errors import InputError
-from skysim.core.yaml_reader import is_file, shown
+from skysim.core.yaml_reader import excerpt, is_file
 
 # In lower case: MuJoCo finds <INCLUDE> too.
-READ_AS_XML = {"include", "model"}
-SIDES = ("right", "left", "up", "down", "front", "back")
-FOLDERS = {"meshdir", "texturedir", "assetdir"}
-FILES = {"file", *(f"file{side}" for side in SIDES)}
-MOST_BYTES = 1 << 24  # of an XML file
-MOST_PLACES = 100_000  # candidate paths of a model's files
+XML_ELEMENTS = {"include", "model"}
+CUBE_SIDES = ("right", "left", "up", "down", "front", "back")
+FOLDER_ATTRIBUTES = {"meshdir", "texturedir", "assetdir"}
+FILE_ATTRIBUTES = {"file", *(f"file{side}" for side in CUBE_SIDES)}
+MAX_BYTES = 1 << 24  # of an XML file
+MAX_CANDIDATES = 100_000  # candidate paths of a model's files
 
 
-class Named(NamedTuple):
+class FileReference(NamedTuple):
     """A file or folder as a model names it."""
 
     value: str
-    told: str  # which element names it, for the error message
-    xml: bool
+    source: str  # which element names it, for the error message
+    is_xml: bool
 
 
 @dataclass
-class Names:
-    """Names found so far. A setting in one file affects the paths of another, so all files are collected together.
+class References:
+    """References found so far. A setting in one file affects the paths of another, so all files are collected together.
 
     bases : folders that a relative name may start from;  folders : values of meshdir and the like
     """
 
     folder: Path
     bases: set[str]
-    folders: set[Named] = field(default_factory=set)
-    files: set[Named] = field(default_factory=set)
+    folders: set[FileReference] = field(default_factory=set)
+    files: set[FileReference] = field(default_factory=set)
 
     def add(self, path: Path) -> None:
         """Add the names in an XML file."""
         # Normalized, since a file that includes itself through `..` would otherwise give new folders without end.
         # The other two cover how the system resolves `..` after a link.
         self.bases |= {os.path.normpath(path.parent), str(path.parent.resolve()), str(path.resolve().parent)}
-        for element in parsed(path).iter():
+        for element in xml_root(path).iter():
             tag = element.tag.lower()
             for key, value in element.attrib.items():
-                if key.lower() in FOLDERS | FILES:
-                    into = self.files if key.lower() in FILES else self.folders
-                    into.add(
-                        Named(value, f"{path}: {element.tag} {key}={shown(repr(value))}", tag in READ_AS_XML)
+                if key.lower() in FOLDER_ATTRIBUTES | FILE_ATTRIBUTES:
+                    target = self.files if key.lower() in FILE_ATTRIBUTES else self.folders
+                    target.add(
+                        FileReference(value, f"{path}: {element.tag} {key}={excerpt(repr(value))}", tag in XML_ELEMENTS)
                     )
 
-    def places(self) -> Iterator[tuple[Named, Path]]:
+    def candidates(self) -> Iterator[tuple[FileReference, Path]]:
         """All paths where MuJoCo may look for each name. Some versions remove `..` before they follow links,
         some after.
         """
-        between = {"", *(one.value for one in self.folders)}
-        if len(self.bases) * len(between) * len(self.files) > MOST_PLACES:
+        subfolders = {"", *(reference.value for reference in self.folders)}
+        if len(self.bases) * len(subfolders) * len(self.files) > MAX_CANDIDATES:
             raise InputError(
-                f"{self.folder}: the model names too many files; allowed: {MOST_PLACES} places of them"
+                f"{self.folder}: the model names too many files; allowed: {MAX_CANDIDATES} candidate paths"
             )
         for base in self.bases:
-            for one in self.folders:
-                yield from ((one, place) for place in both(base, one.value))
-            for one in self.files:
-                for name in {one.value, os.path.basename(one.value)}:  # strippath
-                    for folder in between:
-                        yield from ((one, place) for place in both(base, folder, name))
+            for reference in self.folders:
+                yield from ((reference, candidate) for candidate in path_variants(base, reference.value))
+            for reference in self.files:
+                for name in {reference.value, os.path.basename(reference.value)}:  # strippath
+                    for folder in subfolders:
+                        yield from ((reference, candidate) for candidate in path_variants(base, folder, name))
 
 
-def both(*parts: str) -> tuple[Path, Path]:
+def path_variants(*parts: str) -> tuple[Path, Path]:
     """A joined path as it is, and normalized (each `..` removed with the part before it)."""
     path = os.path.join(*parts)
     return Path(path), Path(os.path.normpath(path))
 
 
-def confined(path: Path) -> None:
+def check_confined(path: Path) -> None:
     """Raise InputError (one line) for a model that names files outside of its folder."""
-    names, looked = Names(path.resolve().parent, set()), set[tuple[Named, Path]]()
-    waiting, seen = [path], {same(path)}
-    while waiting:
-        for one in waiting:
-            names.add(one)
-        waiting = []
-        for name, place in names.places():
-            if (name, place) in looked:
+    references, checked = References(path.resolve().parent, set()), set[tuple[FileReference, Path]]()
+    pending, visited = [path], {file_identity(path)}
+    while pending:
+        for file in pending:
+            references.add(file)
+        pending = []
+        for reference, candidate in references.candidates():
+            if (reference, candidate) in checked:
                 continue
-            looked.add((name, place))
-            check_place(name, place, names.folder)
-            if name.xml and same(place) not in seen and is_file(place):
-                waiting.append(place)
-                seen.add(same(place))
+            checked.add((reference, candidate))
+            check_candidate(reference, candidate, references.folder)
+            if reference.is_xml and file_identity(candidate) not in visited and is_file(candidate):
+                pending.append(candidate)
+                visited.add(file_identity(candidate))
 
 
-def check_place(name: Named, place: Path, folder: Path) -> None:
+def check_candidate(reference: FileReference, candidate: Path, folder: Path) -> None:
     """Raise InputError (one line) for a path outside of the folder, and for one that is not a plain file."""
-    if "\\" in name.value or not resolved(place).is_relative_to(folder):
-        raise InputError(f"{name.told} leaves {folder}; allowed: files in it")
-    if os.path.exists(place) and not (os.path.isfile(place) or os.path.isdir(place)):
-        raise InputError(f"{name.told} is no plain file; allowed: files in {folder}")
+    if "\\" in reference.value or not resolved(candidate).is_relative_to(folder):
+        raise InputError(f"{reference.source} is outside {folder}; allowed: files in it")
+    if os.path.exists(candidate) and not (os.path.isfile(candidate) or os.path.isdir(candidate)):
+        raise InputError(f"{reference.source} is not a regular file; allowed: files in {folder}")
 
 
-def same(place: Path) -> tuple[str, Path, Path]:
+def file_identity(path: Path) -> tuple[str, Path, Path]:
     """Identity of a file: equal for two paths only if they are one file and relative names resolve alike."""
-    return os.path.normpath(place), resolved(place.parent), resolved(place)
+    return os.path.normpath(path), resolved(path.parent), resolved(path)
 
 
-def resolved(place: Path) -> Path:
+def resolved(path: Path) -> Path:
     """The path with all links followed; the root, which is in no folder, if links form a circle."""
     try:
-        return place.resolve()
+        return path.resolve()
     except (OSError, RuntimeError):
         return Path("/")
 
 
-def parsed(path: Path) -> ElementTree.Element:
+def xml_root(path: Path) -> ElementTree.Element:
     """The parsed XML, if MuJoCo's parser reads it the same way. Raises InputError with one line."""
     try:
         with path.open("rb") as file:
-            data = file.read(MOST_BYTES + 1)
+            data = file.read(MAX_BYTES + 1)
     except (OSError, ValueError) as error:
-        raise unread(path, error) from None
-    check(path, len(data) <= MOST_BYTES, f"up to {MOST_BYTES} bytes")
-    check(path, b"<!DOCTYPE" not in data, "XML without DOCTYPE")
+        raise unreadable(path, error) from None
+    require(path, len(data) <= MAX_BYTES, f"up to {MAX_BYTES} bytes")
+    require(path, b"<!DOCTYPE" not in data, "XML without DOCTYPE")
     try:
         # UTF-8 whatever the XML declaration says, as in MuJoCo.
         root = ElementTree.fromstring(data.decode("utf-8"))
     except (ElementTree.ParseError, ValueError) as error:
-        raise unread(path, error) from None
-    named = [name for element in root.iter() for name in (element.tag, *element.attrib)]
-    check(path, not any("{" in name for name in named), "XML without namespaces")
-    check(path, root.tag.lower() != "robot", "MJCF, no URDF")
+        raise unreadable(path, error) from None
+    names = [name for element in root.iter() for name in (element.tag, *element.attrib)]
+    require(path, not any("{" in name for name in names), "XML without namespaces")
+    require(path, root.tag.lower() != "robot", "MJCF, not URDF")
     return root
 
 
-def unread(path: Path, error: Exception) -> InputError:
+def unreadable(path: Path, error: Exception) -> InputError:
     """The error for a file that cannot be read, or is not UTF-8 or not XML."""
     return InputError(f"{path}: not a MuJoCo model: {' '.join(str(error).split())}")
 
 
-def check(path: Path, holds: bool, allowed: str) -> None:
+def require(path: Path, condition: bool, allowed: str) -> None:
     """Raise InputError (one line) where a rule for model files is violated."""
-    if not holds:
+    if not condition:
         raise InputError(f"{path}: not a MuJoCo model that skysim reads; allowed: {allowed}")

@@ -32,17 +32,17 @@ from skysim.dynamics.multibody.joints import (
     add_actuators,
     joints,
     lock_unused,
-    why_locked,
+    locked_joint_hint,
 )
 from skysim.dynamics.multibody.mass import MassProperties, declare_mass, tree_mass, unbalance
-from skysim.dynamics.multibody.mjcf import compiled, load, mujoco_warnings, one_line
+from skysim.dynamics.multibody.mjcf import compile_spec, load, mujoco_warnings, one_line
 from skysim.scene.vehicle import VehicleConfig
 
 GRAVITY_M_S2 = 9.80665
 STEP_S = 1e-3
 CAMERA = "star_camera"
 IMU = "imu"
-NEEDED = f"body bus and camera {CAMERA}"
+REQUIRED = f"body bus and camera {CAMERA}"
 
 # MuJoCo's camera has +y up and looks along -z; ours has +y down and looks along +z.
 CAM_FROM_MJCAM = Rotation.from_matrix(np.diag([1.0, -1.0, -1.0]))
@@ -53,7 +53,7 @@ STOP_LAB_M, STOP_BODY_M = 1.0, 0.5
 
 
 @dataclass(frozen=True, slots=True)
-class World:
+class VehicleModel:
     """A vehicle on its bearing, ready to simulate. Simulation does not change the model.
 
     spec    : mujoco.MjSpec that the model was made from
@@ -65,7 +65,7 @@ class World:
 
     spec: Any
     model: Any
-    vehicle: VehicleConfig
+    config: VehicleConfig
     mass: MassProperties
     torques: NDArray[np.int64]
     wheels: Hinges
@@ -75,7 +75,7 @@ class World:
 
     @property
     def inertia_kg_m2(self) -> Floats:
-        """(3, 3) inertia tensor about the bearing's center, in body axes, as if every joint were locked."""
+        """(3, 3) inertia tensor about the bearing's center, in body axes, with every joint locked."""
         return self.mass.inertia_kg_m2
 
     @property
@@ -84,22 +84,22 @@ class World:
         return float(-self.model.opt.gravity[2])
 
 
-def build(vehicle: VehicleConfig) -> World:
+def build(vehicle: VehicleConfig) -> VehicleModel:
     """Compose and compile the vehicle, and look up its actuators. Raises InputError with one line."""
     path = SCENES / vehicle.model
     with mujoco_warnings():
         spec, mass = compose(vehicle, path)
-        model = compiled(spec, path)
-    return World(
+        model = compile_spec(spec, path)
+    return VehicleModel(
         spec,
         model,
         vehicle,
         mass,
         np.array([model.actuator(name).id for name in TORQUES]),
-        Hinges.of(model, WHEEL),
-        Hinges.of(model, GIMBAL),
-        Hinges.of(model, ROTOR),
-        Fans.of(model),
+        Hinges.from_model(model, WHEEL),
+        Hinges.from_model(model, GIMBAL),
+        Hinges.from_model(model, ROTOR),
+        Fans.from_model(model),
     )
 
 
@@ -110,9 +110,9 @@ def compose(vehicle: VehicleConfig, path: Path) -> tuple[Any, MassProperties]:
     about its center of mass, which must be the body's origin. Joints of actuators that the scene does not switch
     on are locked. Raises InputError with one line.
     """
-    if vehicle.mount == "free" and any(vehicle.centre_of_mass_m):
+    if vehicle.mount == "free" and any(vehicle.center_of_mass_m):
         raise InputError(
-            "vehicle.centre_of_mass: a free vehicle turns about it, so it is the body's origin; leave it out"
+            "vehicle.center_of_mass: a free vehicle rotates about it, so it must be the body's origin; allowed: 0"
         )
     spec = load(path)
     spec.compiler.fusestatic = False  # keep bodies separate until the bearing is added
@@ -121,17 +121,17 @@ def compose(vehicle: VehicleConfig, path: Path) -> tuple[Any, MassProperties]:
     # Locking comes before the mass: a locked rotor is part of the rigid vehicle.
     locked = lock_unused(spec, vehicle, path)
     try:
-        bare = compiled(spec, path)
+        bare = compile_spec(spec, path)
     except InputError as error:
-        raise InputError(f"{error}{why_locked(str(error), locked)}") from None
+        raise InputError(f"{error}{locked_joint_hint(str(error), locked)}") from None
     mass = declare_mass(bus, bare, vehicle, path)
     try:
         add_bearing(spec, bus, vehicle)
     except ValueError as error:  # a name is taken
-        raise InputError(f"{path}: skysim adds its bearing under this name: {one_line(error)}") from error
-    balanced = compiled(spec, path)
+        raise InputError(f"{path}: a name is reserved for skysim's bearing: {one_line(error)}") from error
+    balanced = compile_spec(spec, path)
     # Checked while the wheels are balanced, since `unbalance` changes the mass properties on purpose.
-    check(balanced, mass, path)
+    check_compiled(balanced, mass, path)
     if vehicle.wheels:
         unbalance(balanced, joints(spec, WHEEL), vehicle.wheels, path)
     add_actuators(spec, balanced, vehicle)
@@ -140,16 +140,16 @@ def compose(vehicle: VehicleConfig, path: Path) -> tuple[Any, MassProperties]:
 
 def put_at_origin(spec: Any, path: Path) -> Any:
     """Return body bus, moved to the origin without joints of its own: the bearing defines both."""
-    has = {"body bus": spec.body("bus"), f"camera {CAMERA}": spec.camera(CAMERA)}
-    missing = [name for name, element in has.items() if element is None]
+    required = {"body bus": spec.body("bus"), f"camera {CAMERA}": spec.camera(CAMERA)}
+    missing = [name for name, element in required.items() if element is None]
     if missing:
-        raise InputError(f"{path}: has no {', no '.join(missing)}; a vehicle needs {NEEDED}")
+        raise InputError(f"{path}: no {', no '.join(missing)}; a vehicle needs {REQUIRED}")
     bus = spec.body("bus")
     if bus.parent.name != "world" or bus.frame is not None:
-        raise InputError(f"{path}: body bus must stand directly in the worldbody, in no other body or frame")
+        raise InputError(f"{path}: body bus must be a direct child of worldbody, not of another body or frame")
     for joint in list(bus.joints):
         if joint.name.startswith((WHEEL, GIMBAL, ROTOR)):
-            raise InputError(f"{path}: joint {joint.name} must stand on a body of its own beneath bus")
+            raise InputError(f"{path}: joint {joint.name} must be on a child body of bus")
         spec.delete(joint)
     for key in list(spec.keys):  # keyframes are lists of joint positions, which no longer fit
         spec.delete(key)
@@ -171,8 +171,8 @@ def place_camera(spec: Any, vehicle: VehicleConfig) -> None:
     carrier = camera if camera.parent.name == "bus" else camera.parent
     R_lab_from_parent = data.body(carrier.parent.name).xmat.reshape(3, 3)
     mujoco.mj_camlight(model, data)
-    off_m = np.array(vehicle.camera_m) - data.camera(CAMERA).xpos
-    carrier.pos = carrier.pos + R_lab_from_parent.T @ off_m
+    offset_m = np.array(vehicle.camera_m) - data.camera(CAMERA).xpos
+    carrier.pos = carrier.pos + R_lab_from_parent.T @ offset_m
 
 
 def add_bearing(spec: Any, bus: Any, vehicle: VehicleConfig) -> None:
@@ -189,8 +189,8 @@ def add_bearing(spec: Any, bus: Any, vehicle: VehicleConfig) -> None:
         damping=[drag.viscous_nms, drag.quadratic_nms2, 0.0],
         stiffness=[cable.stiffness_nm_rad if cable else 0.0, 0.0, 0.0],
     )
-    lab = vehicle.mount == "air_bearing"
-    spec.option.gravity = [0.0, 0.0, -GRAVITY_M_S2 if lab else 0.0]
+    on_bearing = vehicle.mount == "air_bearing"
+    spec.option.gravity = [0.0, 0.0, -GRAVITY_M_S2 if on_bearing else 0.0]
     spec.option.timestep = STEP_S
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_RK4
     # In units of the mean inertia: MuJoCo's 1e-8 would hide a small wheel's friction in a heavy vehicle. No cost.
@@ -200,7 +200,7 @@ def add_bearing(spec: Any, bus: Any, vehicle: VehicleConfig) -> None:
     spec.option.solver = mujoco.mjtSolver.mjSOL_PGS
     spec.option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
     spec.compiler.fusestatic = True  # one rigid body instead of ten: 14 us a step instead of 20
-    if lab:
+    if on_bearing:
         add_tilt_stop(spec, bus, vehicle.tilt_stop_deg)
 
 
@@ -216,55 +216,55 @@ def add_tilt_stop(spec: Any, bus: Any, stop_deg: float) -> None:
     bus.add_site(name="tilt_stop_body", pos=[0.0, 0.0, STOP_BODY_M])
     cosine = np.cos(np.radians(stop_deg))
     length = np.sqrt(STOP_LAB_M**2 + STOP_BODY_M**2 - 2 * STOP_LAB_M * STOP_BODY_M * cosine)
-    rope = spec.add_tendon(
+    tendon = spec.add_tendon(
         name="tilt_stop",
         limited=mujoco.mjtLimited.mjLIMITED_TRUE,
         range=[0.0, length],
         solref_limit=[2 * STEP_S, 2.0],
         solimp_limit=[0.99, 0.999, 1e-3, 0.5, 2.0],
     )
-    rope.wrap_site("tilt_stop_lab")
-    rope.wrap_site("tilt_stop_body")
+    tendon.wrap_site("tilt_stop_lab")
+    tendon.wrap_site("tilt_stop_body")
 
 
-def check(model: Any, wanted: MassProperties, path: Path) -> None:
+def check_compiled(model: Any, declared: MassProperties, path: Path) -> None:
     """Check that the compiled model is as declared; MuJoCo may change it silently. Raises InputError."""
     bus = model.body("bus").id
     mass = tree_mass(model)
     fans = [model.site(k).bodyid[0] for k in range(model.nsite) if model.site(k).name.startswith(FAN)]
     if any(model.body_rootid[body] != bus for body in fans):
-        raise InputError(f"{path}: sites {FAN}* must ride on body bus")
+        raise InputError(f"{path}: sites {FAN}* must be on body bus or its children")
     if (model.body_rootid[model.jnt_bodyid] != bus).any():
-        raise InputError(f"{path}: only bus and what it carries may have joints")
+        raise InputError(f"{path}: a joint outside body bus; allowed: joints of bus and its children")
     if model.body_rootid[model.cam_bodyid[model.camera(CAMERA).id]] != bus:
-        raise InputError(f"{path}: camera {CAMERA} must ride on body bus")
-    same = (
-        abs(mass.mass_kg - wanted.mass_kg) < 1e-9 * wanted.mass_kg
-        and np.abs(mass.centre_m - wanted.centre_m).max() < 1e-9
-        and np.abs(mass.inertia_kg_m2 - wanted.inertia_kg_m2).max() < 1e-7 * wanted.inertia_kg_m2.max()
+        raise InputError(f"{path}: camera {CAMERA} must be on body bus or its children")
+    matches = (
+        abs(mass.mass_kg - declared.mass_kg) < 1e-9 * declared.mass_kg
+        and np.abs(mass.center_m - declared.center_m).max() < 1e-9
+        and np.abs(mass.inertia_kg_m2 - declared.inertia_kg_m2).max() < 1e-7 * declared.inertia_kg_m2.max()
     )
-    if not same:
+    if not matches:
         raise InputError(
-            f"{path}: the mass comes out as {mass.mass_kg:g} kg at {mass.centre_m} m, not as declared;"
-            " leave inertiafromgeom, settotalmass and the like out of <compiler>"
+            f"{path}: the compiled mass is {mass.mass_kg:g} kg at {mass.center_m} m, not as declared;"
+            " remove inertiafromgeom, settotalmass and the like from <compiler>"
         )
 
 
-def mount(world: World) -> Mount:
+def camera_mount(vehicle: VehicleModel) -> Mount:
     """Position and attitude of the camera on the body. The only place where MuJoCo's camera axes are
     converted to ours.
     """
-    data = mujoco.MjData(world.model)
-    mujoco.mj_forward(world.model, data)  # at qpos0 the body frame is the lab frame
+    data = mujoco.MjData(vehicle.model)
+    mujoco.mj_forward(vehicle.model, data)  # at qpos0 the body frame is the lab frame
     camera = data.camera(CAMERA)
     body_from_mjcam = Rotation.from_matrix(camera.xmat.reshape(3, 3))
     return Mount(np.array(camera.xpos), CAM_FROM_MJCAM * body_from_mjcam.inv())
 
 
-def imu_place_m(world: World) -> Floats:
+def imu_position_m(vehicle: VehicleModel) -> Floats:
     """(3,) position of the accelerometers on the body: site `imu`, else the bearing's center."""
-    if IMU not in [world.model.site(k).name for k in range(world.model.nsite)]:
+    if IMU not in [vehicle.model.site(k).name for k in range(vehicle.model.nsite)]:
         return np.zeros(3)
-    data = mujoco.MjData(world.model)
-    mujoco.mj_forward(world.model, data)
+    data = mujoco.MjData(vehicle.model)
+    mujoco.mj_forward(vehicle.model, data)
     return np.array(data.site(IMU).xpos)

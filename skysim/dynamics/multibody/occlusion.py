@@ -17,15 +17,15 @@ from scipy.spatial.transform import Rotation
 from skysim.core import quaternion
 from skysim.core.paths import SCENES
 from skysim.core.types import Floats, Sources
-from skysim.dynamics.multibody.integrator import as_many
+from skysim.dynamics.multibody.integrator import member_values
 from skysim.dynamics.multibody.joints import lock_unused
-from skysim.dynamics.multibody.mjcf import compiled, load, mujoco_warnings
-from skysim.dynamics.multibody.model import CAMERA, World, mount, place_camera, put_at_origin
+from skysim.dynamics.multibody.mjcf import compile_spec, load, mujoco_warnings
+from skysim.dynamics.multibody.model import CAMERA, VehicleModel, camera_mount, place_camera, put_at_origin
 from skysim.sources.dome.surface import Surface
 
-BLOCKS, PASSES = 0, 5  # groups of geoms: those that block light, and the camera's own housing
+OPAQUE, TRANSPARENT = 0, 5  # groups of geoms: those that block light, and the camera's own housing
 GROUPS = np.array([1, 0, 0, 0, 0, 0], dtype=np.uint8)  # rays are tested against the first only
-INWARDS = 1e-6  # an LED is moved off its wall by this fraction of its distance from the bearing
+INWARD_FRACTION = 1e-6  # an LED is moved off its wall by this fraction of its distance from the bearing
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,83 +43,83 @@ class Obstacles:
     wall: Surface | None
 
 
-def obstacles(world: World, wall: Surface | None) -> Obstacles:
+def build_obstacles(vehicle: VehicleModel, wall: Surface | None) -> Obstacles:
     """Compile the vehicle's file again with separate bodies: the simulated model has all rigid ones fused into bus.
 
     The camera's housing lets light through: all geoms of the body that carries the camera, if it is not bus, and any
     geom that surrounds the pupil, since the camera then looks out through a hole in it. MuJoCo's rays ignore geoms
     with an alpha of 0.
     """
-    path = SCENES / world.vehicle.model
+    path = SCENES / vehicle.config.model
     with mujoco_warnings():
         spec = load(path)
         spec.compiler.fusestatic = False
         bus = put_at_origin(spec, path)
-        place_camera(spec, world.vehicle)
+        place_camera(spec, vehicle.config)
         bus.mocap = True  # its pose is set, not simulated
-        lock_unused(spec, world.vehicle, path)
-        model = compiled(spec, path)
+        lock_unused(spec, vehicle.config, path)
+        model = compile_spec(spec, path)
     data = mujoco.MjData(model)
-    if world.vehicle.cmgs:
-        start_deg = as_many(world.vehicle.cmgs.start_deg, len(world.gimbals), "vehicle.cmgs.start_deg")
-        for name, angle_deg in zip(world.gimbals.names, start_deg, strict=True):
+    if vehicle.config.cmgs:
+        start_deg = member_values(vehicle.config.cmgs.start_deg, len(vehicle.gimbals), "vehicle.cmgs.start_deg")
+        for name, angle_deg in zip(vehicle.gimbals.names, start_deg, strict=True):
             data.joint(name).qpos[:] = np.radians(angle_deg)
     mujoco.mj_kinematics(model, data)
-    camera_body_m = mount(world).camera_body_m
-    model.geom_group[:] = np.where(housing(model, data, camera_body_m), PASSES, BLOCKS)
+    camera_body_m = camera_mount(vehicle).camera_body_m
+    model.geom_group[:] = np.where(camera_housing(model, data, camera_body_m), TRANSPARENT, OPAQUE)
     return Obstacles(model, data, camera_body_m, wall)
 
 
-def housing(model: Any, data: Any, camera_body_m: Floats) -> NDArray[np.bool_]:
+def camera_housing(model: Any, data: Any, camera_body_m: Floats) -> NDArray[np.bool_]:
     """(ngeom,) which geoms belong to the camera's housing. Overwrites the geoms' groups."""
     body = model.cam_bodyid[model.camera(CAMERA).id]
-    own = (model.geom_bodyid == body) & (body != model.body("bus").id)
-    six_ways = np.vstack([np.eye(3), -np.eye(3)])
-    for geom in np.flatnonzero(~own):
-        model.geom_group[:], model.geom_group[geom] = PASSES, BLOCKS
-        own[geom] = np.isfinite(clear_m(model, data, camera_body_m, six_ways)).all()
-    return np.asarray(own)
+    is_housing = (model.geom_bodyid == body) & (body != model.body("bus").id)
+    six_directions = np.vstack([np.eye(3), -np.eye(3)])
+    for geom in np.flatnonzero(~is_housing):
+        model.geom_group[:], model.geom_group[geom] = TRANSPARENT, OPAQUE
+        is_housing[geom] = np.isfinite(free_distance_m(model, data, camera_body_m, six_directions)).all()
+    return np.asarray(is_housing)
 
 
-def hidden(things: Obstacles, lab_from_body: Rotation, sources: Sources) -> NDArray[np.bool_]:
+def occluded(obstacles: Obstacles, lab_from_body: Rotation, sources: Sources) -> NDArray[np.bool_]:
     """(N,) whether an obstacle is on the line from the pupil to each source, LED or star, at that attitude."""
-    turn = quaternion.of(lab_from_body)
-    camera_m = quaternion.apply(turn, things.camera_body_m)
-    place_m, near = sources.place[:, :3], sources.place[:, 3] > 0
-    rays = place_m - sources.place[:, 3:] * camera_m
+    lab_from_body_wxyz = quaternion.from_rotation(lab_from_body)
+    camera_m = quaternion.apply(lab_from_body_wxyz, obstacles.camera_body_m)
+    position_m, near = sources.place[:, :3], sources.place[:, 3] > 0
+    rays = position_m - sources.place[:, 3:] * camera_m
     far_m = np.linalg.norm(rays, axis=1)
-    things.data.mocap_quat[things.model.body("bus").mocapid[0]] = turn
-    mujoco.mj_kinematics(things.model, things.data)
-    clear = clear_m(things.model, things.data, camera_m, rays / far_m[:, None])
-    out = clear < np.where(near, far_m, np.inf)
-    if things.wall is not None:
-        out[near] |= behind_wall(things.wall, camera_m, place_m[near])
-    return np.asarray(out)
+    obstacles.data.mocap_quat[obstacles.model.body("bus").mocapid[0]] = lab_from_body_wxyz
+    mujoco.mj_kinematics(obstacles.model, obstacles.data)
+    free_m = free_distance_m(obstacles.model, obstacles.data, camera_m, rays / far_m[:, None])
+    blocked = free_m < np.where(near, far_m, np.inf)
+    if obstacles.wall is not None:
+        blocked[near] |= behind_wall(obstacles.wall, camera_m, position_m[near])
+    return np.asarray(blocked)
 
 
-def clear_m(model: Any, data: Any, from_m: Floats, rays: Floats) -> Floats:
+def free_distance_m(model: Any, data: Any, from_m: Floats, rays: Floats) -> Floats:
     """(N,) distance from a point of the lab along unit vectors (N, 3) to the next geom that blocks; inf if none."""
     count = len(rays)
     geom, distance_m = np.empty(count, np.int32), np.empty(count)
     if count:
-        along = np.ascontiguousarray(rays).ravel()
+        directions = np.ascontiguousarray(rays).ravel()
         mujoco.mj_multiRay(
-            model, data, from_m, along, GROUPS, True, -1, geom, distance_m, None, count, mujoco.mjMAXVAL
+            model, data, from_m, directions, GROUPS, True, -1, geom, distance_m, None, count, mujoco.mjMAXVAL
         )
     return np.where(distance_m >= 0, distance_m, np.inf)
 
 
-def behind_wall(wall: Surface, camera_m: Floats, place_m: Floats) -> NDArray[np.bool_]:
+def behind_wall(wall: Surface, camera_m: Floats, position_m: Floats) -> NDArray[np.bool_]:
     """(N,) whether the line from LEDs at (N, 3) to the camera passes through the dome's wall (not beneath its rim).
 
     A camera inside sees no LED through the wall, as convex surfaces cannot hide their inside; all surfaces here are
     convex, except for the millimeters of a surveyed one.
     """
-    out = np.zeros(len(place_m), dtype=bool)
+    behind = np.zeros(len(position_m), dtype=bool)
     if wall.inside(camera_m):
-        return out
-    for n, here_m in enumerate(place_m * (1 - INWARDS)):
-        way = (camera_m - here_m)[None]
-        through_m = wall.meet(here_m, way)[0]
-        out[n] = np.linalg.norm(through_m - here_m) < np.linalg.norm(way)  # NaN, beneath the rim, is not
-    return out
+        return behind
+    for n, led_m in enumerate(position_m * (1 - INWARD_FRACTION)):
+        ray = (camera_m - led_m)[None]
+        wall_m = wall.meet(led_m, ray)[0]
+        behind[n] = np.linalg.norm(wall_m - led_m) < np.linalg.norm(ray)  # NaN, beneath the rim, is not
+    return behind

@@ -20,18 +20,19 @@ VERDICTS: tuple[Verdict, ...] = ("agrees", "explained", "disagrees")
 
 
 @dataclass(frozen=True, slots=True)
-class Ask:
+class ExperimentOptions:
     """Options of an experiment.
 
     quick: fewer trials, wider intervals;  seed: of all its random streams
-    watch: progress callback, called with (done, total)
+    watch: progress callback, called with (completed, total)
     """
 
     quick: bool = False
     seed: int = 1
-    watch: Callable[[float, float], None] = lambda done, everything: None
+    watch: Callable[[float, float], None] = lambda completed, total: None
 
     def trials(self, full: int, quick: int) -> int:
+        """Number of trials: `full`, or `quick` with the option quick."""
         return quick if self.quick else full
 
 
@@ -42,12 +43,17 @@ class Cause(NamedTuple):
     ours: Summary
 
 
-class Answer(NamedTuple):
-    """Our number for a published one; a cause if the baseline alone does not reproduce it."""
+class RowResult(NamedTuple):
+    """Our number for a published row; a cause if the baseline alone does not reproduce it."""
 
     ours: Summary
     note: str = ""
     cause: Cause | None = None
+
+
+def with_cause(cause: str, statistic: Callable[[Any], Summary], ours: Any, theirs: Any) -> RowResult:
+    """A statistic of our baseline's values, and of the values that were simulated with a cause too."""
+    return RowResult(statistic(ours), cause=Cause(cause, statistic(theirs)))
 
 
 class Drawing(NamedTuple):
@@ -59,10 +65,10 @@ class Drawing(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
-    """Results of an experiment: an answer to every published row, by key, and figures."""
+class ExperimentResult:
+    """Results of an experiment: one for every published row, by key, and figures."""
 
-    answers: Mapping[str, Answer]
+    results: Mapping[str, RowResult]
     drawings: tuple[Drawing, ...] = ()
 
 
@@ -71,31 +77,32 @@ class Comparison(NamedTuple):
 
     id: str
     row: Row
-    answer: Answer
+    result: RowResult
     verdict: Verdict
 
     @property
     def note(self) -> str:
         """Remarks: our number with the cause, the weakness of the comparison, and notes of experiment and data."""
-        cause = self.answer.cause
-        told = f"with {cause.name}: {number(cause.ours)}" if cause else ""
-        return "; ".join(part for part in (told, self.weakness, self.answer.note, self.row.note) if part)
+        cause = self.result.cause
+        with_cause = f"with {cause.name}: {format_summary(cause.ours)}" if cause else ""
+        notes = (with_cause, self.weakness, self.result.note, self.row.note)
+        return "; ".join(note for note in notes if note)
 
     @property
     def weakness(self) -> str:
         """Why the interval leaves the verdict open, or "": it is wider than the band, or contains a one-sided bound."""
-        cause, (low, high) = self.answer.cause, self.row.band
+        cause, (low, high) = self.result.cause, self.row.band
         if self.verdict == "disagrees":
             return ""
-        ours = cause.ours if cause and self.verdict == "explained" else self.answer.ours
+        ours = cause.ours if cause and self.verdict == "explained" else self.result.ours
         if low > -math.inf and high < math.inf:
             return "interval wider than the tolerance" if ours.high - ours.low > high - low else ""
         bound = low if low > -math.inf else high
-        return "the bound lies within the interval" if ours.low < bound < ours.high else ""
+        return "the bound is within the interval" if ours.low < bound < ours.high else ""
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON. A bound is published as [least, most], an open end as null."""
-        row, ours = self.row, self.answer.ours
+        row, ours = self.row, self.result.ours
         bounds = [row.at_least, row.at_most]
         return {
             "id": self.id,
@@ -115,69 +122,68 @@ class Reproduction:
 
     id: str
     published: Experiment
-    lines: tuple[Comparison, ...]
+    comparisons: tuple[Comparison, ...]
     drawings: tuple[Drawing, ...]
     seconds: float = field(compare=False)
 
     @property
     def counts(self) -> dict[str, int]:
         """Number of rows by verdict, of rows with a derived number (`derived`), and of open verdicts (`open`)."""
-        told: dict[str, int] = {
-            verdict: sum(line.verdict == verdict for line in self.lines) for verdict in VERDICTS
+        counts: dict[str, int] = {
+            verdict: sum(comparison.verdict == verdict for comparison in self.comparisons) for verdict in VERDICTS
         }
-        told["derived"] = sum(line.row.derived for line in self.lines)
-        told["open"] = sum(bool(line.weakness) for line in self.lines)
-        return told
+        counts["derived"] = sum(comparison.row.derived for comparison in self.comparisons)
+        counts["open"] = sum(bool(comparison.weakness) for comparison in self.comparisons)
+        return counts
 
 
-def compare(id: str, published: Experiment, found: Found, seconds: float) -> Reproduction:
-    """Compare every published row with its answer.
+def compare(id: str, published: Experiment, experiment: ExperimentResult, seconds: float) -> Reproduction:
+    """Compare every published row with our result.
 
-    Raises ValueError if an experiment leaves a row unanswered or answers one that is not published.
+    Raises ValueError if the experiment has no result for a row, or a result for a row that is not published.
     """
-    if missed := published.rows.keys() ^ found.answers.keys():
-        raise ValueError(f"{id}: published or answered, but not both: {', '.join(sorted(missed))}")
-    lines = tuple(
-        Comparison(id, row, found.answers[key], verdict(row, found.answers[key]))
+    if unmatched := published.rows.keys() ^ experiment.results.keys():
+        raise ValueError(f"{id}: rows that are only published or only computed: {', '.join(sorted(unmatched))}")
+    comparisons = tuple(
+        Comparison(id, row, experiment.results[key], verdict(row, experiment.results[key]))
         for key, row in published.rows.items()
     )
-    return Reproduction(id, published, lines, found.drawings, seconds)
+    return Reproduction(id, published, comparisons, experiment.drawings, seconds)
 
 
-def verdict(row: Row, answer: Answer) -> Verdict:
+def verdict(row: Row, result: RowResult) -> Verdict:
     """agrees: our interval overlaps the published number's band; explained: it does so only with the cause."""
-    if meets(row, answer.ours):
+    if intervals_overlap(row, result.ours):
         return "agrees"
-    return "explained" if answer.cause and meets(row, answer.cause.ours) else "disagrees"
+    return "explained" if result.cause and intervals_overlap(row, result.cause.ours) else "disagrees"
 
 
-def meets(row: Row, ours: Summary) -> bool:
+def intervals_overlap(row: Row, ours: Summary) -> bool:
     """Return True if our interval (the number itself if it has none) and the row's band overlap."""
     low, high = row.band
-    ends = (ours.value if end != end else end for end in (ours.low, ours.high))  # NaN: no interval
-    least, most = ends
-    return least <= high and most >= low
+    our_low, our_high = (ours.value if math.isnan(end) else end for end in (ours.low, ours.high))
+    return our_low <= high and our_high >= low
 
 
-def printed(row: Row) -> str:
+def format_with_source(row: Row) -> str:
     """Format the published number with its source; `derived` if the paper does not print it."""
-    where = "; ".join(part for part in ("derived" if row.derived else "", row.source) if part)
-    return f"{stated(row)} ({where})" if where else stated(row)
+    source = "; ".join(part for part in ("derived" if row.derived else "", row.source) if part)
+    return f"{format_published(row)} ({source})" if source else format_published(row)
 
 
-def number(told: Summary) -> str:
+def format_summary(summary: Summary) -> str:
     """Format a number, with its interval if it has one."""
-    if told.low == told.high or told.low != told.low:
-        return f"{told.value:.4g}"
-    return f"{told.value:.4g} ({told.low:.4g}..{told.high:.4g})"
+    if summary.low == summary.high or math.isnan(summary.low):
+        return f"{summary.value:.4g}"
+    return f"{summary.value:.4g} ({summary.low:.4g}..{summary.high:.4g})"
 
 
-def stated(row: Row) -> str:
+def format_published(row: Row) -> str:
     """Format the published number or its bounds, with the tolerance."""
     if row.published is not None:
-        told = f"{row.published:.6g}"
+        text = f"{row.published:.6g}"
     elif row.at_least is None:
-        told = f"≤ {row.at_most:.6g}"
+        text = f"≤ {row.at_most:.6g}"
     else:
-        told = f"≥ {row.at_least:.6g}" if row.at_most is None else f"{row.at_least:.6g}..{row.at_most:.6g}"
-    return f"{told} ± {row.tolerance:.3g}" if row.tolerance else told
+        text = f"≥ {row.at_least:.6g}" if row.at_most is None else f"{row.at_least:.6g}..{row.at_most:.6g}"
+    return f"{text} ± {row.tolerance:.3g}" if row.tolerance else text

@@ -6,10 +6,12 @@ from functools import cache
 from pathlib import Path
 from typing import Annotated, Self
 
+import numpy as np
 from pydantic import Field, ValidationError, model_validator
 
 from skysim.core.errors import InputError
 from skysim.core.paths import DATA
+from skysim.core.types import Floats
 from skysim.core.units import ConfigModel, NotNegative, Number
 from skysim.core.yaml_reader import explain, read_yaml
 
@@ -37,10 +39,10 @@ class Row(ConfigModel):
     note: str = ""
 
     @model_validator(mode="after")
-    def one_or_the_other(self) -> Self:
+    def check_number_or_bounds(self) -> Self:
         bounded = self.at_least is not None or self.at_most is not None
         if bounded == (self.published is not None):
-            raise ValueError("either published, or at_least and at_most")
+            raise ValueError("give either published, or at_least or at_most or both")
         return self
 
     @property
@@ -81,14 +83,20 @@ class Paper(ConfigModel):
 @cache
 def experiments() -> dict[str, Experiment]:
     """All published experiments by id, in the order of the files and within them. Raises InputError."""
-    found: dict[str, Experiment] = {}
+    by_id: dict[str, Experiment] = {}
     for path in sorted(FOLDER.glob("*.yaml")):
-        told = read(path)
-        for name, one in told.experiments.items():
-            if name in found:
-                raise InputError(f"experiments.{name}: stands in two files ({path})")
-            found[name] = one.model_copy(update={"paper": told.paper})
-    return found
+        paper = read(path)
+        for id, experiment in paper.experiments.items():
+            if id in by_id:
+                raise InputError(f"{path}: experiments.{id} is defined in two files")
+            by_id[id] = experiment.model_copy(update={"paper": paper.paper})
+    return by_id
+
+
+def published_values(id: str, *keys: str) -> Floats:
+    """(N,) published numbers of an experiment's rows; NaN for a row with bounds only."""
+    rows = experiments()[id].rows
+    return np.array([rows[key].published for key in keys], dtype=float)
 
 
 def read(path: Path) -> Paper:

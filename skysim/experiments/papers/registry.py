@@ -6,48 +6,48 @@ import time
 from collections.abc import Callable
 
 from skysim.core.errors import InputError
-from skysim.experiments.papers.afit import attitude, bump, leds, surface, test1, test2, test3
-from skysim.experiments.papers.compare import Ask, Found, Reproduction, compare
+from skysim.experiments.papers.afit import attitude, bump, led_tests, surface, test1, test2, test3
+from skysim.experiments.papers.compare import ExperimentOptions, ExperimentResult, Reproduction, compare
 from skysim.experiments.papers.other_domes import apl, nps, oled
 from skysim.experiments.papers.ptase import ground, monte_carlo
 from skysim.experiments.papers.published import experiments
 from skysim.experiments.papers.shefex import camera, catalog, identification, nights
 
-Run = Callable[[Ask], Found]
+ExperimentFunction = Callable[[ExperimentOptions], ExperimentResult]
 
-EXPERIMENTS: dict[str, Run] = {
-    "afit-table-1": surface.flat,
-    "afit-figs-30-46": leds.leds,
-    "afit-table-2": test1.nine,
-    "afit-table-3-5": test2.dome,
-    "afit-table-6-9": test3.calibration,
-    "afit-table-10-15": attitude.attitudes,
+EXPERIMENTS: dict[str, ExperimentFunction] = {
+    "afit-table-1": surface.table_1,
+    "afit-figs-30-46": led_tests.led_tests,
+    "afit-table-2": test1.table_2,
+    "afit-table-3-5": test2.tables_3_to_5,
+    "afit-table-6-9": test3.tables_6_to_9,
+    "afit-table-10-15": attitude.tables_10_to_15,
     "afit-bump": bump.bump,
-    "nps": nps.trials,
-    "apl": apl.fibres,
-    "oled": oled.dome,
+    "nps": nps.initial_error_trials,
+    "apl": apl.discrepancies_and_counts,
+    "oled": oled.noise_and_absolute_error,
     "ptase-table-1": monte_carlo.table_1,
-    "ptase-table-2": ground.ground,
-    "shefex-fig-2": camera.control,
-    "shefex-fig-3": camera.scans,
-    "shefex-figs-4-5": catalog.catalogues,
-    "shefex-figs-7-10": identification.figures,
-    "shefex-nights": nights.nights,
+    "ptase-table-2": ground.table_2,
+    "shefex-fig-2": camera.exposure_control,
+    "shefex-fig-3": camera.scan_times,
+    "shefex-figs-4-5": catalog.catalog_statistics,
+    "shefex-figs-7-10": identification.figs_7_to_10,
+    "shefex-nights": nights.night_results,
 }
 
 
-def named(ids: list[str]) -> list[str]:
+def check_ids(ids: list[str]) -> list[str]:
     """The requested ids without repeats; `all` for every experiment. Raises InputError for an unknown id."""
     if ids == ["all"]:
         return list(experiments())
     for id in ids:
         if id not in EXPERIMENTS:
-            raise InputError(f"{id}: no such experiment; allowed: all, or any of {', '.join(EXPERIMENTS)}")
+            raise InputError(f"unknown experiment '{id}'; allowed: all, {', '.join(EXPERIMENTS)}")
     return list(dict.fromkeys(ids))
 
 
-def reproduce(id: str, ask: Ask) -> Reproduction:
+def reproduce(id: str, options: ExperimentOptions) -> Reproduction:
     """Run one experiment and compare it with the published numbers."""
     begin = time.perf_counter()
-    found = EXPERIMENTS[id](ask)
-    return compare(id, experiments()[id], found, time.perf_counter() - begin)
+    result = EXPERIMENTS[id](options)
+    return compare(id, experiments()[id], result, time.perf_counter() - begin)

@@ -31,14 +31,14 @@ class StudyResult:
         from astropy.table import Table
 
         with store.open_store(self.path) as kept:
-            return Table(tables.flat(tables.table(kept, self.plan.study.responses)))
+            return Table(tables.to_columns(tables.table(kept, self.plan.study.responses)))
 
     def trials(self) -> Table:
         """One row per trial: design point, factors and every measured quantity."""
         from astropy.table import Table
 
         with store.open_store(self.path) as kept:
-            return Table(tables.everything(kept))
+            return Table(tables.trial_columns(kept))
 
     def to_pandas(self) -> pd.DataFrame:
         """`table` as a data frame; needs pandas."""
@@ -68,7 +68,7 @@ def run_study(
     path = folder / store.STORE
     try:
         with store.writing(path) as kept:
-            runner.begin(plan, kept, resume=kept.counts()["done"] > 0, overrides=texts)
+            runner.prepare_store(plan, kept, resume=kept.counts()["done"] > 0, overrides=texts)
             progress = runner.run(plan, kept, engine)
     finally:
         engine.close()

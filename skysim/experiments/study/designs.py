@@ -1,7 +1,7 @@
 """Experimental designs: full factorial, one factor at a time, and samples of the unit cube of the factors.
 
 The sampled designs (Latin hypercube, Sobol sequence, Saltelli) generate points in [0, 1]^D, one coordinate per
-factor, and `Factor.at` maps each coordinate to a value.
+factor, and `value_at` of a factor maps each coordinate to a value.
 """
 
 from __future__ import annotations
@@ -45,79 +45,71 @@ Factors = Mapping[str, Factor]
 
 def points(design: Design, factors: Factors, seed: int) -> list[Point]:
     """All points of a design, in order. Raises InputError if factors and design are incompatible."""
-    drawn = design.kind in ("lhs", "sobol", "saltelli")
-    if drawn != (design.points is not None):
-        wanted = "takes how many" if drawn else "has as many as its levels make"
-        raise InputError(f"design.points: {design.kind} {wanted}")
-    if (
-        design.kind in ("sobol", "saltelli")
-        and design.points is not None
-        and design.points & (design.points - 1)
-    ):
-        raise InputError(f"design.points: {design.points} is no power of two, as {design.kind} wants")
+    sampled = design.kind in ("lhs", "sobol", "saltelli")
+    if sampled != (design.points is not None):
+        allowed = "a number of points" if sampled else "none (the levels define the points)"
+        raise InputError(f"design.points: {design.points} for {design.kind}; allowed: {allowed}")
+    if design.kind in ("sobol", "saltelli") and design.points is not None and design.points & (design.points - 1):
+        raise InputError(f"design.points: {design.points} for {design.kind}; allowed: a power of two")
     for name, factor in factors.items():
-        if not drawn and not factor.options():
-            raise InputError(
-                f"factors.{name}: a distribution has no levels; allowed: design of kind lhs, sobol, saltelli"
-            )
+        if not sampled and not factor.options():
+            raise InputError(f"factors.{name}: a distribution has no levels; allowed: design.kind lhs, sobol, saltelli")
     return list(DESIGNS[design.kind](design, factors, seed))
 
 
-def merged(chosen: Mapping[str, tuple[Value, Settings]]) -> Point:
+def make_point(chosen: Mapping[str, tuple[Value, Settings]]) -> Point:
     """The point with these levels and settings of each factor."""
     settings: Settings = {}
-    for _, sets in chosen.values():
-        settings |= sets
+    for _, level_settings in chosen.values():
+        settings |= level_settings
     return Point({name: level for name, (level, _) in chosen.items()}, settings)
 
 
 def factorial(design: Design, factors: Factors, seed: int) -> Iterator[Point]:
     """Every combination; the last factor changes fastest."""
     for levels in itertools.product(*(factor.options() for factor in factors.values())):
-        yield merged(dict(zip(factors, levels, strict=True)))
+        yield make_point(dict(zip(factors, levels, strict=True)))
 
 
 def one_at_a_time(design: Design, factors: Factors, seed: int) -> Iterator[Point]:
     """The first level of every factor; then each other level of each factor alone."""
     first = {name: factor.options()[0] for name, factor in factors.items()}
-    yield merged(first)
+    yield make_point(first)
     for name, factor in factors.items():
         for level in factor.options()[1:]:
-            yield merged(first | {name: level})
+            yield make_point(first | {name: level})
 
 
-def at_shares(factors: Factors, shares: Floats) -> Iterator[Point]:
+def points_at(factors: Factors, coordinates: Floats) -> Iterator[Point]:
     """The points at (P, D) coordinates in the unit cube."""
-    for row in shares:
-        yield merged(
-            {name: factor.at(float(u)) for (name, factor), u in zip(factors.items(), row, strict=True)}
+    for row in coordinates:
+        yield make_point(
+            {name: factor.value_at(float(u)) for (name, factor), u in zip(factors.items(), row, strict=True)}
         )
 
 
 def lhs(design: Design, factors: Factors, seed: int) -> Iterator[Point]:
     """A Latin hypercube: each factor's range is divided into as many strips as points, with one point in each."""
-    yield from at_shares(
-        factors, scipy.stats.qmc.LatinHypercube(len(factors), rng=seed).random(design.points or 0)
-    )
+    yield from points_at(factors, scipy.stats.qmc.LatinHypercube(len(factors), rng=seed).random(design.points or 0))
 
 
 def sobol(design: Design, factors: Factors, seed: int) -> Iterator[Point]:
     """A Sobol sequence, scrambled by the seed."""
-    yield from at_shares(factors, scipy.stats.qmc.Sobol(len(factors), rng=seed).random(design.points or 0))
+    yield from points_at(factors, scipy.stats.qmc.Sobol(len(factors), rng=seed).random(design.points or 0))
 
 
 def saltelli(design: Design, factors: Factors, seed: int) -> Iterator[Point]:
-    """A, B, then for each factor A with that column taken from B. `sensitivity.outputs` relies on this order.
+    """A, B, then for each factor A with that column taken from B. `sensitivity.sample_outputs` relies on this order.
 
     A and B are the two halves of the columns of one scrambled Sobol sequence of dimension 2 D.
     """
     count, width = design.points or 0, len(factors)
-    both = scipy.stats.qmc.Sobol(2 * width, rng=seed).random(count)
-    a, b = both[:, :width], both[:, width:]
-    yield from at_shares(factors, a)
-    yield from at_shares(factors, b)
+    coordinates = scipy.stats.qmc.Sobol(2 * width, rng=seed).random(count)
+    a, b = coordinates[:, :width], coordinates[:, width:]
+    yield from points_at(factors, a)
+    yield from points_at(factors, b)
     for n in range(width):
-        yield from at_shares(factors, np.where(np.arange(width) == n, b, a))
+        yield from points_at(factors, np.where(np.arange(width) == n, b, a))
 
 
 DESIGNS: dict[str, Callable[[Design, Factors, int], Iterator[Point]]] = {

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
-from skysim.core.errors import InputError
+from skysim.core.errors import InputError, unknown_name
 from skysim.core.yaml_reader import check_version, explain, line_of, read_yaml, set_key
 from skysim.experiments.study.factors import Factor, Settings, Value
 from skysim.experiments.study.plan import (
@@ -18,13 +18,13 @@ from skysim.experiments.study.plan import (
     Plan,
     Study,
     find,
-    planned,
-    resolved,
+    make_plan,
+    resolve_point,
 )
 from skysim.results import metrics
-from skysim.scene.light import BenchConfig
+from skysim.scene.light import CollimatedDisplayConfig
 from skysim.scene.scene import Scene
-from skysim.tracking.external.interface import OWN, known
+from skysim.tracking.external.interface import OWN, check_tracker_name
 
 
 def load(
@@ -46,10 +46,10 @@ def load(
     except ValidationError as error:
         raise InputError(explain(error, Study, tree, [(path, text)], overrides or {})) from None
     try:
-        plan = planned(path, study, tree["trial"], programs or {})
+        plan = make_plan(path, study, tree["trial"], programs or {})
         check(plan, to_run=programs is not None)
     except InputError as error:
-        raise InputError(located(str(error), path, text)) from None
+        raise InputError(add_location(str(error), path, text)) from None
     return plan
 
 
@@ -59,7 +59,7 @@ def check(plan: Plan, to_run: bool) -> None:
     to_run : whether the trackers must be installed
     """
     from skysim.experiments.study.analysis import search
-    from skysim.experiments.study.analysis.table import Line
+    from skysim.experiments.study.analysis.table import PointRow
     from skysim.experiments.study.report import layout
     from skysim.experiments.study.store import COLUMNS
 
@@ -70,52 +70,54 @@ def check(plan: Plan, to_run: bool) -> None:
         for key in ("x", "by") if isinstance(figure, Curve) else ("x", "y"):
             axis = getattr(figure, key)
             if axis is not None and axis not in study.factors:
-                raise InputError(f"figures.{n}.{key}: {axis!r} is none of {', '.join(study.factors)}")
+                raise InputError(f"figures.{n}.{key}: {unknown_name('factor', axis, study.factors)}")
         metrics.response(figure.y if isinstance(figure, Curve) else figure.value, f"figures.{n}")
         if plan.points:
-            layout.held(figure, study, [Line(k, point.levels, {}) for k, point in enumerate(plan.points)])
-    if study.optimise:
+            layout.fixed_levels(figure, study, [PointRow(k, point.levels, {}) for k, point in enumerate(plan.points)])
+    if study.optimize:
         search.check(study)
     if study.budget.trials is not None and plan.trials > study.budget.trials:
-        raise InputError(f"budget.trials: {study.budget.trials} are fewer than the study's {plan.trials}")
+        raise InputError(
+            f"budget.trials: {study.budget.trials}; allowed: at least {plan.trials}, the trials of the study"
+        )
     for name in study.factors:
         if name in COLUMNS or name in study.responses:
-            raise InputError(f"factors.{name}: is a column of every trial; allowed: another name")
+            raise InputError(f"factors.{name}: the name is that of a column of the trials; allowed: another name")
     for name, level, settings in each_level(study.factors):
         try:
-            scene, trial = resolved(plan.recipe, settings)
-            if isinstance(scene.light, BenchConfig) and not isinstance(trial, FlightTrial):
-                raise InputError("trial.kind: a bench has no sky around it; allowed: flight")
+            scene, trial = resolve_point(plan.spec, settings)
+            if isinstance(scene.light, CollimatedDisplayConfig) and not isinstance(trial, FlightTrial):
+                raise InputError(f"trial.kind: {trial.kind} with a collimated display; allowed: flight")
             if to_run:
                 check_tracker(plan, scene, trial)
         except InputError as error:
             key = str(error).partition(":")[0]
-            owners = [other for other, factor in study.factors.items() if key in dict(factor.at(0.5)[1])]
+            owners = [other for other, factor in study.factors.items() if key in dict(factor.value_at(0.5)[1])]
             owner = name if name in owners or not owners else owners[0]
-            told = level if owner == name else study.factors[owner].at(0.5)[0]
-            raise InputError(f"factors.{owner}: {told!r}: {error}") from None
+            value = level if owner == name else study.factors[owner].value_at(0.5)[0]
+            raise InputError(f"factors.{owner}: {value!r}: {error}") from None
 
 
 def check_tracker(plan: Plan, scene: Scene, trial: CentroidTrial | FrameTrial | FlightTrial) -> None:
     """Raise InputError for an unknown tracker, and for an external tracker in a centroid trial (it takes images)."""
     name = scene.tracker.name
-    known(name, plan.recipe.programs)
+    check_tracker_name(name, plan.spec.programs)
     if name != OWN and isinstance(trial, CentroidTrial):
-        raise InputError(f"tracker.name: {name} takes frames; allowed: {OWN}, or another trial.kind")
+        raise InputError(f"tracker.name: {name} needs frames; allowed: {OWN}, or another trial.kind")
 
 
 def each_level(factors: Mapping[str, Factor]) -> Iterator[tuple[str, Value, Settings]]:
     """Every level of every factor with the other factors at their middle: factor, level, all settings."""
-    middle = {name: factor.at(0.5)[1] for name, factor in factors.items()}
+    middle = {name: factor.value_at(0.5)[1] for name, factor in factors.items()}
     for name, factor in factors.items():
-        for level, settings in factor.options() or [factor.at(0.5)]:
+        for level, settings in factor.options() or [factor.value_at(0.5)]:
             others: Settings = {}
-            for other, sets in middle.items():
-                others |= sets if other != name else {}
+            for other, level_settings in middle.items():
+                others |= level_settings if other != name else {}
             yield name, level, others | settings
 
 
-def located(message: str, path: Path, text: str) -> str:
+def add_location(message: str, path: Path, text: str) -> str:
     """An error message about a key of a study, with file and line added."""
     line = line_of(text, message.partition(":")[0].split("."))[1]
     return f"{message.removesuffix(' (--set)')} ({path}{f', line {line}' if line else ''})"

@@ -15,7 +15,7 @@ from pydantic import Field, ValidationError
 from skysim.core import yaml_reader
 from skysim.core.errors import InputError
 from skysim.core.paths import SCENES
-from skysim.core.units import ConfigModel, NotNegative, Number, Share, Time
+from skysim.core.units import ConfigModel, Fraction, NotNegative, Number, Time
 from skysim.core.yaml_reader import explain, is_file, read_yaml, set_key
 from skysim.experiments.study.designs import Design, Point, points
 from skysim.experiments.study.factors import Factor, Settings, Value
@@ -55,7 +55,7 @@ class CentroidTrial(RandomAttitude):
     noise_px: NotNegative = 0.1
     magnitude_sigma: NotNegative = 0.25
     lights: Annotated[int, Field(ge=1)] | None = None
-    missing: Share = 0.0
+    missing: Fraction = 0.0
     false_lights: Annotated[int, Field(ge=0, le=10_000)] = 0
     false_share: Annotated[Number, Field(ge=0, le=0.95)] = 0.0
 
@@ -142,7 +142,7 @@ class Constraint(ConfigModel):
 
 
 class Search(ConfigModel):
-    """The optimization of `skysim study optimise`: one objective, or the Pareto front of two.
+    """The optimization of `skysim study optimize`: one objective, or the Pareto front of two.
 
     candidates : number of points evaluated, each with all replicates
     """
@@ -174,7 +174,7 @@ class Study(ConfigModel):
     responses: Annotated[tuple[str, ...], Field(min_length=1)]
     budget: Budget = Budget()
     figures: tuple[Figure, ...] = ()
-    optimise: Search | None = None
+    optimize: Search | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -200,7 +200,7 @@ class Plan:
 
     path: Path
     study: Study
-    recipe: TrialSpec
+    spec: TrialSpec
     points: list[Point]
 
     @property
@@ -216,20 +216,20 @@ class Plan:
     @property
     def digest(self) -> str:
         """Hash of everything that affects a trial's outcome; title, figures, responses and budget may change."""
-        told = self.study.model_dump(mode="json", by_alias=True)
-        kept = ("scene", "seed", "set", "trial", "factors", "design", "replicates", "paired", "optimise")
-        return digest({key: told[key] for key in kept})
+        tree = self.study.model_dump(mode="json", by_alias=True)
+        keys = ("scene", "seed", "set", "trial", "factors", "design", "replicates", "paired", "optimize")
+        return digest({key: tree[key] for key in keys})
 
 
-def digest(told: Any) -> str:
+def digest(value: Any) -> str:
     """First 16 hexadecimal digits of the SHA-256 of a JSON value."""
-    text = json.dumps(told, sort_keys=True, separators=(",", ":"), default=str)
+    text = json.dumps(value, sort_keys=True, separators=(",", ":"), default=str)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 def find(name: str) -> Path:
     """Path of a study that is given by path or by its name in scenes/studies/."""
-    return yaml_reader.find(name, STUDIES, "study")
+    return yaml_reader.find_file(name, STUDIES, "study")
 
 
 def title_of(path: Path) -> str:
@@ -237,31 +237,31 @@ def title_of(path: Path) -> str:
     return str(read_yaml(path)[0].get("title", ""))
 
 
-def planned(path: Path, study: Study, trial: dict[str, Any], programs: Mapping[str, str]) -> Plan:
+def make_plan(path: Path, study: Study, trial: dict[str, Any], programs: Mapping[str, str]) -> Plan:
     """The plan of a study; `trial` is the section as written in the file, with units."""
-    chosen = [] if study.optimise else points(study.design, study.factors, study.seed)
+    chosen = [] if study.optimize else points(study.design, study.factors, study.seed)
     folder = str(path.resolve().parent)
-    told = TrialSpec(study.scene, folder, study.seed, study.set, trial, study.paired, dict(programs))
-    return Plan(path, study, told, chosen)
+    spec = TrialSpec(study.scene, folder, study.seed, study.set, trial, study.paired, dict(programs))
+    return Plan(path, study, spec, chosen)
 
 
-def resolved(recipe: TrialSpec, settings: Settings) -> tuple[Scene, CentroidTrial | FrameTrial | FlightTrial]:
+def resolve_point(spec: TrialSpec, settings: Settings) -> tuple[Scene, CentroidTrial | FrameTrial | FlightTrial]:
     """The scene and the trial at a point, with its settings applied. Raises InputError with one line."""
-    told = recipe.base | settings
-    name = str(told.get("scene", recipe.scene))
-    tree: dict[str, Any] = {"trial": dict(recipe.trial)}
+    values = spec.base | settings
+    name = str(values.get("scene", spec.scene))
+    tree: dict[str, Any] = {"trial": dict(spec.trial)}
     scene_keys = {}
-    for key, value in told.items():
+    for key, value in values.items():
         if key.startswith(TRIAL):
-            set_key(tree, key, as_yaml(value))
+            set_key(tree, key, to_yaml(value))
         elif key != "scene":
-            scene_keys[key] = as_yaml(value)
+            scene_keys[key] = to_yaml(value)
     try:
         trial = TrialSection.model_validate(tree).trial
     except ValidationError as error:
         raise InputError(error_text(error, tree)) from None
-    beside = Path(recipe.folder) / name
-    path = beside if beside.suffix in {".yaml", ".yml"} and is_file(beside) else find_scene(name)
+    local = Path(spec.folder) / name
+    path = local if local.suffix in {".yaml", ".yml"} and is_file(local) else find_scene(name)
     return load_scene(path, scene_keys), trial
 
 
@@ -276,6 +276,6 @@ class TrialSection(ConfigModel):
     trial: Trial
 
 
-def as_yaml(value: Value) -> str:
+def to_yaml(value: Value) -> str:
     """A value as YAML on one line."""
     return yaml.safe_dump(value, default_flow_style=True, width=1_000_000).removesuffix("\n...\n")

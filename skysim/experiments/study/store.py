@@ -23,13 +23,12 @@ from numpy.typing import NDArray
 from skysim.core.errors import InputError
 from skysim.core.files import make_folder
 from skysim.experiments.study.designs import Point
-from skysim.experiments.study.trials import FIELDS, Row
+from skysim.experiments.study.execution.trials import FIELDS, Row
 
+STORE = "study.sqlite"  # file name in a study's results folder
 FORMAT = 1
-
-TEXT = {"status"}
-
-WHOLE = {"frames", "solved", "wrong"}
+TEXT_FIELDS = {"status"}
+INTEGER_FIELDS = {"frames", "solved", "wrong"}
 
 COLUMNS = (
     "trial",
@@ -43,13 +42,16 @@ COLUMNS = (
     "time_ms",
 )  # of `Store.columns`
 
+SQL_TYPES = dict.fromkeys(TEXT_FIELDS, "TEXT") | dict.fromkeys(INTEGER_FIELDS, "INTEGER")
+OUTCOME_COLUMNS = ", ".join(f"{name} {SQL_TYPES.get(name, 'REAL')}" for name in FIELDS)
+
 TABLES = f"""
 CREATE TABLE IF NOT EXISTS meta (key TEXT PRIMARY KEY, value TEXT NOT NULL);
 CREATE TABLE IF NOT EXISTS points (point INTEGER PRIMARY KEY, levels TEXT NOT NULL, settings TEXT NOT NULL);
 CREATE TABLE IF NOT EXISTS trials (
   trial INTEGER PRIMARY KEY, point INTEGER NOT NULL, replicate INTEGER NOT NULL, seed INTEGER NOT NULL,
   scene TEXT NOT NULL, code TEXT NOT NULL,
-  {", ".join(f"{name} {'TEXT' if name in TEXT else 'INTEGER' if name in WHOLE else 'REAL'}" for name in FIELDS)},
+  {OUTCOME_COLUMNS},
   error TEXT);
 CREATE INDEX IF NOT EXISTS trials_of_point ON trials (point);
 CREATE TABLE IF NOT EXISTS timings (trial INTEGER PRIMARY KEY, time_ms REAL NOT NULL);
@@ -69,67 +71,61 @@ class Store:
 
     def meta(self, key: str) -> str:
         """The value of a metadata key; empty if it is not set."""
-        found = self.db.execute("SELECT value FROM meta WHERE key = ?", (key,)).fetchone()
-        return found[0] if found else ""
-
-    def note(self, **values: str) -> None:
-        """Set metadata keys."""
-        with self.db:
-            self.db.executemany("INSERT OR REPLACE INTO meta VALUES (?, ?)", values.items())
+        row = self.db.execute("SELECT value FROM meta WHERE key = ?", (key,)).fetchone()
+        return row[0] if row else ""
 
     def overrides(self) -> dict[str, str]:
         """Overrides of study keys from the run's command line: YAML text by key. Raises InputError."""
-        with self.sound():
-            told = json.loads(self.meta("overrides") or "{}")
-            if not isinstance(told, dict) or not all(isinstance(value, str) for value in told.values()):
-                raise ValueError("overrides that are no texts by key")
-            return told
+        with self.corruption_as_input_error():
+            overrides = json.loads(self.meta("overrides") or "{}")
+            if not isinstance(overrides, dict) or not all(isinstance(v, str) for v in overrides.values()):
+                raise ValueError("overrides are not text values by key")
+            return overrides
 
     def begin(self, points: Iterable[Point], **values: str) -> None:
         """Initialize the store with a study's points and metadata, in one transaction."""
-        rows = (
-            (n, json.dumps(one.levels, default=str), json.dumps(one.settings, default=str))
-            for n, one in enumerate(points)
-        )
         with self.db:
             self.db.execute("DELETE FROM points")
-            self.db.executemany("INSERT INTO points VALUES (?, ?, ?)", rows)
+            self._insert_points(points)
             self.db.executemany("INSERT OR REPLACE INTO meta VALUES (?, ?)", values.items())
 
     def scenes(self) -> list[tuple[int, str]]:
         """Point and scene hash of the first and the last trial that did not fail."""
-        told = "SELECT point, scene FROM trials WHERE scene != '' AND error IS NULL ORDER BY trial {} LIMIT 1"
-        return [row for order in ("ASC", "DESC") for row in self.db.execute(told.format(order))]
+        query = "SELECT point, scene FROM trials WHERE scene != '' AND error IS NULL ORDER BY trial {} LIMIT 1"
+        return [row for order in ("ASC", "DESC") for row in self.db.execute(query.format(order))]
 
-    def forget_failed(self) -> None:
+    def delete_failed(self) -> None:
         """Delete the failed trials, so that they are run again."""
         with self.db:
             self.db.execute("DELETE FROM trials WHERE error IS NOT NULL")
 
     def set_points(self, points: Iterable[Point], first: int = 0) -> None:
         """Insert or replace points, numbered from `first`."""
-        rows = (
-            (first + n, json.dumps(point.levels, default=str), json.dumps(point.settings, default=str))
-            for n, point in enumerate(points)
-        )
         with self.db:
-            self.db.executemany("INSERT OR REPLACE INTO points VALUES (?, ?, ?)", rows)
+            self._insert_points(points, first)
+
+    def _insert_points(self, points: Iterable[Point], first: int = 0) -> None:
+        rows = (
+            (n, json.dumps(point.levels, default=str), json.dumps(point.settings, default=str))
+            for n, point in enumerate(points, first)
+        )
+        self.db.executemany("INSERT OR REPLACE INTO points VALUES (?, ?, ?)", rows)
 
     def points(self) -> list[Point]:
         """All points, in order. Raises InputError."""
         rows = self.db.execute("SELECT levels, settings FROM points ORDER BY point")
-        with self.sound():
+        with self.corruption_as_input_error():
             return [Point(json.loads(levels), json.loads(settings)) for levels, settings in rows]
 
     def add(self, rows: list[Row]) -> None:
         """Store rows in one transaction."""
-        values = [(*row[:6], *map(plain, astuple(row.outcome)), row.error) for row in rows]
+        values = [(*row[:6], *map(to_sql, astuple(row.outcome)), row.error) for row in rows]
         with self.db:
             self.db.executemany(INSERT, values)
             times = [(row.trial, 1e3 * row.seconds) for row in rows]
             self.db.executemany("INSERT OR REPLACE INTO timings VALUES (?, ?)", times)
 
-    def ran(self, engine: str, workers: int, trials: int, seconds: float) -> None:
+    def record_run(self, engine: str, workers: int, trials: int, seconds: float) -> None:
         """Record a finished run."""
         with self.db:
             row = (None, time.time() - seconds, engine, workers, trials, seconds)
@@ -149,71 +145,69 @@ class Store:
 
     def counts(self) -> dict[str, int]:
         """Number of trials in the store, of failed trials, and of wrong attitudes."""
-        told = "SELECT COUNT(*), COALESCE(SUM(error IS NOT NULL), 0), COALESCE(SUM(wrong), 0) FROM trials"
-        return dict(zip(("done", "failed", "wrong"), self.db.execute(told).fetchone(), strict=True))
+        query = "SELECT COUNT(*), COALESCE(SUM(error IS NOT NULL), 0), COALESCE(SUM(wrong), 0) FROM trials"
+        return dict(zip(("done", "failed", "wrong"), self.db.execute(query).fetchone(), strict=True))
 
     def failures(self) -> list[tuple[int, str]]:
         """Number of each failed trial and the last line of its traceback. Raises InputError."""
         rows = self.db.execute("SELECT trial, error FROM trials WHERE error IS NOT NULL ORDER BY trial")
-        with self.sound():
+        with self.corruption_as_input_error():
             return [(trial, error.strip().splitlines()[-1]) for trial, error in rows]
 
     def trial(self, number: int) -> dict[str, Any]:
         """One row by column name. Raises InputError if the trial is not in the store."""
-        found = self.db.execute("SELECT * FROM trials WHERE trial = ?", (number,))
-        row = found.fetchone()
+        cursor = self.db.execute("SELECT * FROM trials WHERE trial = ?", (number,))
+        row = cursor.fetchone()
         if row is None:
-            raise InputError(f"trial {number}: is not in {self.path}; allowed: {self.span()}")
-        return dict(zip((column[0] for column in found.description), row, strict=True))
+            raise InputError(f"trial {number}: not in {self.path}; allowed: {self.trial_range()}")
+        return dict(zip((column[0] for column in cursor.description), row, strict=True))
 
-    def span(self) -> str:
+    def trial_range(self) -> str:
         """Range of the trial numbers in the store, as text for messages."""
         low, high = self.db.execute("SELECT MIN(trial), MAX(trial) FROM trials").fetchone()
         return "none yet" if low is None else f"{low} to {high}"
 
     def columns(self, where: str = "1", values: tuple[Any, ...] = ()) -> dict[str, NDArray[Any]]:
         """Every column of `trials`, and `timings.time_ms`, as arrays in trial order; NaN for missing values."""
-        told = f"SELECT trials.*, time_ms FROM trials LEFT JOIN timings USING (trial) WHERE {where} ORDER BY trial"
-        found = self.db.execute(told, values)
-        names = [column[0] for column in found.description]
+        query = f"SELECT trials.*, time_ms FROM trials LEFT JOIN timings USING (trial) WHERE {where} ORDER BY trial"
+        cursor = self.db.execute(query, values)
+        names = [column[0] for column in cursor.description]
         lists: list[list[Any]] = [[] for _ in names]
-        while batch := found.fetchmany(10_000):
+        while batch := cursor.fetchmany(10_000):
             for column, more in zip(lists, zip(*batch, strict=True), strict=True):
                 column.extend(more)
-        with self.sound():
-            return {name: as_array(name, column) for name, column in zip(names, lists, strict=True)}
+        with self.corruption_as_input_error():
+            return {name: to_array(name, column) for name, column in zip(names, lists, strict=True)}
 
-    def of_point(self, point: int) -> dict[str, NDArray[Any]]:
+    def point_columns(self, point: int) -> dict[str, NDArray[Any]]:
         """The columns of the trials of one point."""
         return self.columns("point = ?", (point,))
 
     @contextmanager
-    def sound(self) -> Iterator[None]:
+    def corruption_as_input_error(self) -> Iterator[None]:
         """Raise InputError, instead of a decoding error, for values that skysim cannot have written."""
         try:
             yield
         except (ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError) as error:
-            raise InputError(
-                f"{self.path}: no store of a study: {' '.join(str(error).split())[:120]}"
-            ) from None
+            raise InputError(f"{self.path}: not a valid study store: {' '.join(str(error).split())[:120]}") from None
 
     def check(self) -> bool:
         """Whether SQLite's integrity check passes."""
         return bool(self.db.execute("PRAGMA integrity_check").fetchone()[0] == "ok")
 
 
-def plain(value: Any) -> Any:
+def to_sql(value: Any) -> Any:
     """A value as stored in SQLite: None for NaN, a Python float for a NumPy float."""
     if isinstance(value, float):
         return None if math.isnan(value) else float(value)
     return value
 
 
-def as_array(name: str, column: list[Any]) -> NDArray[Any]:
+def to_array(name: str, column: list[Any]) -> NDArray[Any]:
     """A column as an array: objects for text, int64 for integers, otherwise floats with NaN for null."""
-    if name in TEXT or name in ("scene", "code", "error"):
+    if name in TEXT_FIELDS or name in ("scene", "code", "error"):
         return np.array(column, dtype=object)
-    if name in WHOLE or name in ("trial", "point", "replicate", "seed"):
+    if name in INTEGER_FIELDS or name in ("trial", "point", "replicate", "seed"):
         return np.array(column, dtype=np.int64)
     return np.array([math.nan if value is None else value for value in column], dtype=float)
 
@@ -222,8 +216,8 @@ def as_array(name: str, column: list[Any]) -> NDArray[Any]:
 def open_store(path: Path) -> Iterator[Store]:
     """Open a store for reading; a run may write it at the same time. Raises InputError if it is missing or damaged."""
     if not path.is_file():
-        raise InputError(f"{path}: no store; allowed: one that skysim study run made")
-    with legible(path, "no store of a study: "), connected(path) as db:
+        raise InputError(f"{path}: no such store; allowed: a store written by skysim study run")
+    with sqlite_errors_as_input_error(path, "not a valid study store: "), open_connection(path) as db:
         store = Store(path, db)
         if store.meta("format") != str(FORMAT):
             raise InputError(f"{path}: format {store.meta('format')!r}; allowed: {FORMAT}")
@@ -231,14 +225,14 @@ def open_store(path: Path) -> Iterator[Store]:
 
 
 @contextmanager
-def legible(path: Path, what: str = "") -> Iterator[None]:
+def sqlite_errors_as_input_error(path: Path, what: str = "") -> Iterator[None]:
     """Raise InputError instead of the errors of SQLite for a damaged file: not a database, invalid text, or a declared
     size that exceeds memory."""
     try:
         yield
     except (sqlite3.DatabaseError, UnicodeDecodeError, MemoryError) as error:
-        said = " ".join(str(error).split()) or "it asks for more memory than there is"
-        raise InputError(f"{path}: {what}{said}") from None
+        message = " ".join(str(error).split()) or "not enough memory"
+        raise InputError(f"{path}: {what}{message}") from None
 
 
 @contextmanager
@@ -250,9 +244,12 @@ def writing(path: Path) -> Iterator[Store]:
     """
     make_folder(path.parent)
     lock_file = path.with_suffix(".lock")
-    with legible(path), closing(sqlite3.connect(lock_file, timeout=0, isolation_level=None)) as lock:
-        hold(lock, path)
-        with connected(path) as db:
+    with (
+        sqlite_errors_as_input_error(path),
+        closing(sqlite3.connect(lock_file, timeout=0, isolation_level=None)) as lock,
+    ):
+        acquire_lock(lock, path)
+        with open_connection(path) as db:
             db.execute("PRAGMA journal_mode = WAL")
             db.execute("PRAGMA synchronous = NORMAL")
             store = Store(path, db)
@@ -265,27 +262,21 @@ def writing(path: Path) -> Iterator[Store]:
             yield store
 
 
-def hold(lock: sqlite3.Connection, path: Path) -> None:
+def acquire_lock(lock: sqlite3.Connection, path: Path) -> None:
     """Hold the lock until its connection is closed. Raises InputError if another run holds it."""
     try:
         lock.execute("BEGIN EXCLUSIVE")
     except sqlite3.OperationalError as error:
         if error.sqlite_errorcode != sqlite3.SQLITE_BUSY:
             raise
-        told = f"{path}: another run is writing it; allowed: one at a time, or another --out"
-        raise InputError(told) from None
+        raise InputError(f"{path}: in use by another run; allowed: one run at a time, or another --out") from None
 
 
 @contextmanager
-def connected(path: Path) -> Iterator[sqlite3.Connection]:
+def open_connection(path: Path) -> Iterator[sqlite3.Connection]:
     """A database connection that is closed on exit."""
     db = sqlite3.connect(os.fspath(path), timeout=30)
     try:
         yield db
     finally:
         db.close()
-
-
-# File name of the store in a study's results folder.
-
-STORE = "study.sqlite"

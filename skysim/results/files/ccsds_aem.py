@@ -17,7 +17,7 @@ ORIGINATOR = "SKYSIM"  # not in the SANA registry; the standard leaves that to t
 ICRF, LAB, CAMERA, BODY = "ICRF", "LAB", "STARTRACKER_1", "SC_BODY_1"
 MEANING = {
     ICRF: "axes of the ICRS",
-    LAB: "the laboratory: origin in the bearing's centre, z up; known to this file's users only",
+    LAB: "the laboratory: origin in the bearing's center, z up; known to this file's users only",
     CAMERA: "the camera: +x right and +y down in the image, +z along the boresight",
     BODY: "the vehicle's body as its MJCF has it",
 }
@@ -25,7 +25,7 @@ MEANING = {
 
 def message(
     name: str,
-    told: Sequence[str],
+    notes: Sequence[str],
     frames: tuple[str, str],
     utc: Sequence[datetime.datetime],
     a_from_b: Rotation,
@@ -33,7 +33,7 @@ def message(
     """The text of an AEM file with one segment of type QUATERNION.
 
     name     : object name
-    told     : comments
+    notes    : comments
     frames   : (A, B), keys of MEANING
     utc      : K epochs, ascending
     a_from_b : K rotations
@@ -62,8 +62,8 @@ def message(
         "STOP_TIME": epoch(utc[-1]),
         "ATTITUDE_TYPE": "QUATERNION",
     }
-    comments = [*told, *(f"{frame} = {MEANING[frame]}" for frame in frames)]
-    rows = zip(utc, unbroken(a_from_b.as_quat()), strict=True)
+    comments = [*notes, *(f"{frame} = {MEANING[frame]}" for frame in frames)]
+    rows = zip(utc, continuous_quaternions(a_from_b.as_quat()), strict=True)
     lines = [
         *(f"{key} = {value}" for key, value in head.items()),
         "META_START",
@@ -71,21 +71,21 @@ def message(
         *(f"{key} = {value}" for key, value in meta.items()),
         "META_STOP",
         "DATA_START",
-        *(f"{epoch(when)} " + " ".join(f"{part:.15f}" for part in xyzw) for when, xyzw in rows),
+        *(f"{epoch(when)} " + " ".join(f"{component:.15f}" for component in xyzw) for when, xyzw in rows),
         "DATA_STOP",
     ]
-    return "".join(f"{plain(line)}\n" for line in lines)
+    return "".join(f"{ascii_line(line)}\n" for line in lines)
 
 
-def unbroken(xyzw: Floats) -> Floats:
+def continuous_quaternions(xyzw: Floats) -> Floats:
     """(K, 4) the same attitudes as a continuous sequence of quaternions; the first has a scalar part >= 0.
 
     q and -q are the same attitude. Each quaternion takes the sign that makes its dot product with the previous one
     positive, so that other tools can interpolate between them.
     """
-    along = np.sign(np.sum(xyzw[1:] * xyzw[:-1], axis=1))
+    dot = np.sum(xyzw[1:] * xyzw[:-1], axis=1)
     first = -1.0 if xyzw[0, 3] < 0 else 1.0
-    sign = first * np.concatenate([[1.0], np.cumprod(np.where(along < 0, -1.0, 1.0))])
+    sign = first * np.concatenate([[1.0], np.cumprod(np.where(dot < 0, -1.0, 1.0))])
     return np.asarray(xyzw * sign[:, None] + 0.0)  # + 0.0 turns -0.0 into 0.0
 
 
@@ -94,7 +94,7 @@ def epoch(utc: datetime.datetime) -> str:
     return in_utc(utc).isoformat(timespec="microseconds")
 
 
-def plain(line: str) -> str:
+def ascii_line(line: str) -> str:
     """The line cut to the allowed length, with characters outside printable ASCII replaced by "?"."""
-    printable = "".join(one if " " <= one <= "~" else "?" for one in line)
+    printable = "".join(character if " " <= character <= "~" else "?" for character in line)
     return printable[:MOST_CHARACTERS]

@@ -15,18 +15,18 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from skysim.core import files, images
-from skysim.core.errors import InputError
+from skysim.core.errors import InputError, unknown_name
 from skysim.core.images import silent_stderr
 from skysim.results import stretch
 from skysim.results.files import ccsds_aem
 from skysim.results.files import frames as frame_files
-from skysim.results.files.recording import Recording, Told
+from skysim.results.files.recording import FrameTruth, Recording
 
-EXTRA = "takes more packages; install them: pip install 'skysim[export]'"
+EXTRA = "needs optional packages: pip install 'skysim[export]'"
 BATCH_ROWS = 1 << 16  # rows buffered before a Parquet row group is written
 SAMPLED_FRAMES = 9  # about this many frames determine the black and white levels of a video
 FOURCC = "mp4v"  # MPEG-4 part 2, which every wheel of OpenCV can write
-MORE_BYTES = 1 << 20
+PROBE_BYTES = 1 << 20
 
 Bar = Callable[[Iterable[Any], int, str], Iterator[Any]]  # progress bar over items: items, count, label
 
@@ -51,38 +51,38 @@ def to_aem(run: Recording, out: Path, bar: Bar) -> list[Path]:
     Attitudes are those of the camera in the ICRF under the stars, and of the body in the laboratory under a dome.
     Raises InputError if a solution has no truth.
     """
-    stars = run.under_the_stars
+    stars = run.is_celestial
     frames = (ccsds_aem.ICRF, ccsds_aem.CAMERA) if stars else (ccsds_aem.LAB, ccsds_aem.BODY)
-    told = [(truth.frame, truth.mid_utc, attitude(truth, stars)) for truth in truths(run, bar)]
+    true = [(truth.frame, truth.mid_utc, attitude(truth, stars)) for truth in truths(run, bar)]
     name, seed = str(run.meta["scene"]), run.meta["seed"]
-    when = {frame: utc for frame, utc, _ in told}
+    epochs = {frame: utc for frame, utc, _ in true}
 
-    def write(what: str, says: str, utc: list[datetime.datetime], a_from_b: Rotation) -> Path:
-        comments = [f"{says} of skysim, scene {name}, seed {seed}; epochs are mid-exposure"]
-        path = out / f"{what}.aem"
+    def write(stem: str, content: str, utc: list[datetime.datetime], a_from_b: Rotation) -> Path:
+        comments = [f"{content} of skysim, scene {name}, seed {seed}; epochs are mid-exposure"]
+        path = out / f"{stem}.aem"
         files.write_text(path, ccsds_aem.message(name, comments, frames, utc, a_from_b))
         return path
 
-    truth_is = Rotation.concatenate([one for _, _, one in told])
-    written = [write("truth", "True attitude", list(when.values()), truth_is)]
-    found = run.solved()
-    if found is not None:
-        strange = [frame for frame in found[0].tolist() if frame not in when]
-        if strange:
-            raise InputError(f"{run.folder / 'solutions.ecsv'}: frame {strange[0]} is none of this folder's")
-        utc = [when[frame] for frame in found[0].tolist()]
-        written.append(write("solutions", "Attitude found by the star tracker", utc, found[1]))
+    a_from_b = Rotation.concatenate([rotation for _, _, rotation in true])
+    written = [write("truth", "True attitude", list(epochs.values()), a_from_b)]
+    solved = run.solved()
+    if solved is not None:
+        unknown = [frame for frame in solved[0].tolist() if frame not in epochs]
+        if unknown:
+            raise InputError(f"{run.folder / 'solutions.ecsv'}: unknown frame {unknown[0]}; allowed: frames with truth")
+        utc = [epochs[frame] for frame in solved[0].tolist()]
+        written.append(write("solutions", "Attitude found by the star tracker", utc, solved[1]))
     return written
 
 
-def attitude(truth: Told, stars: bool) -> Rotation:
+def attitude(truth: FrameTruth, stars: bool) -> Rotation:
     """lab_from_cam under the stars, lab_from_body in a laboratory; the same convention as `Recording.solved`."""
     if stars:
         return Rotation.from_quat(truth.cam_from_lab_xyzw).inv()
     return Rotation.from_quat(truth.lab_from_body_xyzw)
 
 
-def truths(run: Recording, bar: Bar) -> Iterator[Told]:
+def truths(run: Recording, bar: Bar) -> Iterator[FrameTruth]:
     return bar(run.truths(), len(run.stems), "reading truths")
 
 
@@ -94,15 +94,13 @@ def truth_table(run: Recording, bar: Bar) -> Any:
     return Table({name: [row[name] for row in rows] for name in rows[0]}, meta=run.meta)
 
 
-def truth_row(truth: Told) -> dict[str, Any]:
+def truth_row(truth: FrameTruth) -> dict[str, Any]:
     row: dict[str, Any] = {"frame": truth.frame, "mid_utc": truth.mid_utc.isoformat(timespec="microseconds")}
     row |= {"t_mid_s": truth.t_mid_s, "exposure_s": truth.exposure_s}
     for name in ("lab_from_body", "cam_from_lab"):
         quaternion = getattr(truth, f"{name}_xyzw")
-        row |= {f"{name}_q{end}": float(part) for end, part in zip("xyzw", quaternion, strict=True)}
-    return row | {
-        f"rate_cam_{end}_rad_s": float(rate) for end, rate in zip("xyz", truth.rate_cam_rad_s, strict=True)
-    }
+        row |= {f"{name}_q{end}": float(component) for end, component in zip("xyzw", quaternion, strict=True)}
+    return row | {f"rate_cam_{end}_rad_s": float(rate) for end, rate in zip("xyz", truth.rate_cam_rad_s, strict=True)}
 
 
 def to_ecsv(run: Recording, out: Path, bar: Bar) -> list[Path]:
@@ -121,14 +119,12 @@ def to_parquet(run: Recording, out: Path, bar: Bar) -> list[Path]:
     except ImportError:
         raise InputError(f"--to parquet: {EXTRA}") from None
     tables = {"truth": truth_table(run, bar)}
-    tables |= {
-        name: found for name in ("solutions", "telemetry", "imu") if (found := run.table(name)) is not None
-    }
+    tables |= {name: table for name in ("solutions", "telemetry", "imu") if (table := run.table(name)) is not None}
     written = []
-    for name, found in tables.items():
+    for name, table in tables.items():
         path = out / f"{name}.parquet"
         with files.atomic_file(path) as temporary:
-            pyarrow.parquet.write_table(arrow(found, run), temporary)
+            pyarrow.parquet.write_table(to_arrow(table, run), temporary)
         written.append(path)
     return [*written, sources_parquet(run, out / "sources.parquet", bar)]
 
@@ -139,46 +135,44 @@ def sources_parquet(run: Recording, path: Path, bar: Bar) -> Path:
     import pyarrow.parquet
 
     with files.atomic_file(path) as temporary:
-        writer, waiting = None, []
+        writer, batch = None, []
         try:
             for truth in truths(run, bar):
                 truth.sources.add_column(np.full(len(truth.sources), truth.frame), name="frame", index=0)
-                waiting.append(arrow(truth.sources, run))
-                writer = writer or pyarrow.parquet.ParquetWriter(temporary, waiting[0].schema)
-                if sum(len(one) for one in waiting) >= BATCH_ROWS:
-                    writer.write_table(pyarrow.concat_tables(waiting))
-                    waiting = []
+                batch.append(to_arrow(truth.sources, run))
+                writer = writer or pyarrow.parquet.ParquetWriter(temporary, batch[0].schema)
+                if sum(len(table) for table in batch) >= BATCH_ROWS:
+                    writer.write_table(pyarrow.concat_tables(batch))
+                    batch = []
             assert writer is not None
-            if waiting:
-                writer.write_table(pyarrow.concat_tables(waiting))
+            if batch:
+                writer.write_table(pyarrow.concat_tables(batch))
         finally:
             if writer is not None:
                 writer.close()
     return path
 
 
-def arrow(found: Any, run: Recording) -> Any:
+def to_arrow(table: Any, run: Recording) -> Any:
     """Convert an astropy table to an Arrow table; masked values become null. Units and run metadata are kept."""
     import pyarrow
 
     fields, columns = [], []
-    for name in found.colnames:
+    for name in table.colnames:
         values = pyarrow.array(
-            found[name].tolist(),
-            type=pyarrow.from_numpy_dtype(found[name].dtype)
-            if found[name].dtype.kind in "biuf"
-            else pyarrow.string(),
+            table[name].tolist(),
+            type=pyarrow.from_numpy_dtype(table[name].dtype) if table[name].dtype.kind in "biuf" else pyarrow.string(),
         )
         unit = unit_of(name)
         fields.append(pyarrow.field(name, values.type, metadata={"unit": unit} if unit else None))
         columns.append(values)
-    told = {f"skysim.{key}": str(value) for key, value in run.meta.items()}
-    return pyarrow.table(columns, schema=pyarrow.schema(fields, metadata=told))
+    metadata = {f"skysim.{key}": str(value) for key, value in run.meta.items()}
+    return pyarrow.table(columns, schema=pyarrow.schema(fields, metadata=metadata))
 
 
 def unit_of(name: str) -> str:
     """Unit of a column from the ending of its name; empty if it has none."""
-    ending = max((one for one in UNITS if name.endswith(one)), key=len, default="")
+    ending = max((suffix for suffix in UNITS if name.endswith(suffix)), key=len, default="")
     return UNITS.get(ending, "")
 
 
@@ -201,7 +195,7 @@ def to_zarr(run: Recording, out: Path, bar: Bar) -> list[Path]:
     except ImportError:
         raise InputError(f"--to zarr: {EXTRA}") from None
     path, count = out / frame_files.ZARR, len(run.stems)
-    told = [replace(truth, sources=None) for truth in truths(run, bar)]
+    frame_truths = [replace(truth, sources=None) for truth in truths(run, bar)]
     first = run.image(run.stems[0])
     with files.atomic_folder(path) as temporary:
         group = zarr.create_group(temporary, zarr_format=3, attributes=run.meta | {"made_by": "skysim"})
@@ -214,8 +208,8 @@ def to_zarr(run: Recording, out: Path, bar: Bar) -> list[Path]:
             attributes={"units": "DN"},
         )
         for n, stem in enumerate(bar(run.stems, count, "Zarr")):
-            frames[n] = like(run.image(stem), first, stem)
-        for name, values, axis, unit in beside(told):
+            frames[n] = check_same_format(run.image(stem), first, stem)
+        for name, values, axis, unit in frame_arrays(frame_truths):
             dimensions = ("frame", axis) if axis else ("frame",)
             group.create_array(
                 name, data=values, dimension_names=dimensions, attributes={"units": unit} if unit else {}
@@ -223,10 +217,10 @@ def to_zarr(run: Recording, out: Path, bar: Bar) -> list[Path]:
     return [path]
 
 
-def beside(told: list[Told]) -> Iterator[tuple[str, Any, str, str]]:
+def frame_arrays(frame_truths: list[FrameTruth]) -> Iterator[tuple[str, Any, str, str]]:
     """Arrays stored with the frames of a sequence: name, array, name of its second axis, unit."""
-    utc = [one.mid_utc.isoformat(timespec="microseconds") for one in told]
-    yield "frame", np.array([one.frame for one in told]), "", ""
+    utc = [truth.mid_utc.isoformat(timespec="microseconds") for truth in frame_truths]
+    yield "frame", np.array([truth.frame for truth in frame_truths]), "", ""
     yield (
         "mid_utc",
         np.array(utc, dtype="datetime64[us]").astype(np.int64),
@@ -237,10 +231,10 @@ def beside(told: list[Told]) -> Iterator[tuple[str, Any, str, str]]:
         *(("t_mid_s", ""), ("exposure_s", ""), ("rate_cam_rad_s", "xyz")),
         *(("lab_from_body_xyzw", "xyzw"), ("cam_from_lab_xyzw", "xyzw")),
     ):
-        yield name, np.array([getattr(one, name) for one in told]), axis, unit_of(name)
+        yield name, np.array([getattr(truth, name) for truth in frame_truths]), axis, unit_of(name)
 
 
-def like(image: Any, first: Any, stem: Path) -> Any:
+def check_same_format(image: Any, first: Any, stem: Path) -> Any:
     """The image itself. Raises InputError if its size or type differs from the first one's."""
     if image.shape != first.shape or image.dtype != first.dtype:
         raise InputError(
@@ -258,48 +252,46 @@ def to_video(run: Recording, out: Path, bar: Bar) -> list[Path]:
     """
     path, first = out / "frames.mp4", run.image(run.stems[0])
     seconds = [truth.t_mid_s for truth in truths(run, bar)]
-    pace_hz = 1 / float(np.median(np.diff(seconds))) if len(seconds) > 1 else 1.0
-    some = run.stems[:: max(len(run.stems) // SAMPLED_FRAMES, 1)]
-    low, high = np.median([stretch.span(run.image(stem)) for stem in some], axis=0)
+    rate_hz = 1 / float(np.median(np.diff(seconds))) if len(seconds) > 1 else 1.0
+    sampled = run.stems[:: max(len(run.stems) // SAMPLED_FRAMES, 1)]
+    low, high = np.median([stretch.display_levels(run.image(stem)) for stem in sampled], axis=0)
     height, width = (side // 2 * 2 for side in first.shape)  # color subsampling needs even sides
     with files.atomic_file(path) as temporary:
-        film = cv2.VideoWriter(
-            str(temporary), cv2.VideoWriter.fourcc(*FOURCC), pace_hz, (width, height), False
-        )
+        film = cv2.VideoWriter(str(temporary), cv2.VideoWriter.fourcc(*FOURCC), rate_hz, (width, height), False)
         try:
             if not film.isOpened():
-                more_room(temporary)
+                check_disk_space(temporary)
                 raise InputError(
-                    f"{path}: this OpenCV cannot write {FOURCC} video of {width}x{height} at {pace_hz:g} Hz"
+                    f"{path}: this OpenCV cannot write {FOURCC} video of {width}x{height} at {rate_hz:g} Hz"
                 )
             for stem in bar(run.stems, len(run.stems), "video"):
-                image = like(run.image(stem), first, stem)
-                grey = stretch.stretched(image, "square root", between=(float(low), float(high)))
+                image = check_same_format(run.image(stem), first, stem)
+                gray = stretch.to_8bit(image, "square root", levels_dn=(float(low), float(high)))
                 with silent_stderr():
-                    film.write(np.ascontiguousarray(grey[:height, :width]))
+                    film.write(np.ascontiguousarray(gray[:height, :width]))
         finally:
             film.release()
-        there, count = frames_of(temporary), len(run.stems)
+        readable, count = count_frames(temporary), len(run.stems)
         # OpenCV reports no write errors, so count the frames that can be read back.
-        if there != count:
-            more_room(temporary)
-            raise InputError(f"{path}: OpenCV wrote {there} of {count} frames and does not tell why")
+        if readable != count:
+            check_disk_space(temporary)
+            raise InputError(f"{path}: OpenCV wrote {readable} of {count} frames, without an error message")
     return [path]
 
 
-def frames_of(film: Path) -> int:
+def count_frames(film: Path) -> int:
     """Number of readable frames in a video file."""
     with silent_stderr(), closing(images.LiveCamera(str(film))) as reader:
         return sum(1 for _ in iter(reader.capture.grab, False))
 
 
-def more_room(path: Path) -> None:
+def check_disk_space(path: Path) -> None:
     """Append MORE_BYTES to a file, more than a video index needs, to raise the OSError that OpenCV did not report.
 
     A full disk then raises "no space left on device" rather than an unexplained failure of OpenCV.
     """
     with path.open("ab") as file:
-        file.write(bytes(MORE_BYTES))
+        file.write(bytes(PROBE_BYTES))
         os.fsync(file.fileno())
 
 
@@ -318,9 +310,9 @@ def export(run: Recording, formats: Iterable[str], out: Path, bar: Bar) -> list[
 
     Raises InputError for an unknown format before anything is written.
     """
-    wanted = list(dict.fromkeys(formats))
-    for name in wanted:
+    names = list(dict.fromkeys(formats))
+    for name in names:
         if name not in EXPORTS:
-            raise InputError(f"--to: {name!r} is none of {', '.join(EXPORTS)}")
+            raise InputError(f"--to: {unknown_name('format', name, EXPORTS)}")
     files.make_folder(out)
-    return [path for name in wanted for path in EXPORTS[name](run, out, bar)]
+    return [path for name in names for path in EXPORTS[name](run, out, bar)]

@@ -12,12 +12,12 @@ from skysim.core.types import Frame, Truth
 from skysim.scene.light import StarsConfig
 from skysim.scene.scene import Scene
 
-RESULTS = (
+RESULT_FILES = (
     *("solutions.ecsv", "telemetry.ecsv", "imu.ecsv"),
-    *("annotated.png", "lab.png", "lab.gif", "report.html", "scoreboard.ecsv"),
+    *("annotated.png", "scene_3d.png", "scene_3d.gif", "report.html", "scoreboard.ecsv"),
 )
 
-EXPORTED = (
+EXPORT_FILES = (
     *("truth.aem", "solutions.aem", "truth.ecsv"),
     *(f"{name}.parquet" for name in ("truth", "sources", "solutions", "telemetry", "imu")),
     "frames.mp4",
@@ -26,27 +26,26 @@ EXPORTED = (
 ZARR = "frames.zarr"
 
 
-def clear(folder: Path) -> None:
+def remove_results(folder: Path) -> None:
     """Remove the files of an earlier run: its frames, solutions, reports, and the files of `skysim export`."""
     for suffix in ("fits", "png", "ecsv", "tif"):
         for path in folder.glob(f"frame_[0-9][0-9][0-9][0-9]*.{suffix}"):
             path.unlink()
     for path in folder.glob("solutions.*.ecsv"):
         path.unlink()
-    for name in RESULTS + EXPORTED:
+    for name in RESULT_FILES + EXPORT_FILES:
         (folder / name).unlink(missing_ok=True)
     shutil.rmtree(folder / ZARR, ignore_errors=True)
 
 
-def unlike(paths: list[Path]) -> list[Path]:
+def unique_paths(paths: list[Path]) -> list[Path]:
     """The paths, with a number appended to every repeated one so that no file overwrites another."""
-    seen: dict[Path, int] = {}
-    named = []
+    counts: dict[Path, int] = {}
+    unique = []
     for path in paths:
-        seen[path] = seen.get(path, 0) + 1
-        again = seen[path] > 1
-        named.append(path.with_name(f"{path.stem}-{seen[path]}{path.suffix}") if again else path)
-    return named
+        number = counts[path] = counts.get(path, 0) + 1
+        unique.append(path.with_name(f"{path.stem}-{number}{path.suffix}") if number > 1 else path)
+    return unique
 
 
 def write_frame(folder: Path, frame: Frame, truth: Truth, scene: Scene) -> None:
@@ -86,20 +85,20 @@ def write_truth(path: Path, frame: Frame, truth: Truth, scene: Scene) -> None:
     """Write the truth of a frame as ECSV: attitude and rates in the header, one row per source."""
     from astropy.table import Table
 
-    seen = truth.seen
+    sources = truth.sources
     table = Table(
         {
-            "id": seen.id,
-            "x_px": seen.xy_px[:, 0],
-            "y_px": seen.xy_px[:, 1],
-            "flux_x_px": seen.flux_xy_px[:, 0],
-            "flux_y_px": seen.flux_xy_px[:, 1],
-            "electrons": seen.electrons,
-            "peak_e": seen.peak_e,
-            "streak_px": seen.streak_px,
-            "area_px": seen.area_px,
-            "snr": seen.snr,
-            "saturated": seen.saturated,
+            "id": sources.id,
+            "x_px": sources.xy_px[:, 0],
+            "y_px": sources.xy_px[:, 1],
+            "flux_x_px": sources.flux_xy_px[:, 0],
+            "flux_y_px": sources.flux_xy_px[:, 1],
+            "electrons": sources.electrons,
+            "peak_e": sources.peak_e,
+            "streak_px": sources.streak_px,
+            "area_px": sources.area_px,
+            "snr": sources.snr,
+            "saturated": sources.saturated,
         }
     )
     for name in table.colnames[1:-1]:
@@ -115,6 +114,6 @@ def write_truth(path: Path, frame: Frame, truth: Truth, scene: Scene) -> None:
         "cam_from_lab_xyzw": truth.cam_from_lab.as_quat().tolist(),
         "rate_cam_rad_s": truth.rate_cam_rad_s.tolist(),
         "hidden": truth.hidden.tolist(),
-        "lab": "ICRS axes" if isinstance(scene.light, StarsConfig) else "bearing centre, z up",
+        "lab": "ICRS axes" if isinstance(scene.light, StarsConfig) else "bearing center, z up",
     }
     write_table(path, table)

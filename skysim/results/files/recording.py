@@ -25,7 +25,7 @@ SKY_ANGLES, LAB_ANGLES = ("ra_deg", "dec_deg", "roll_deg"), ("roll_deg", "pitch_
 
 
 @dataclass(frozen=True, slots=True)
-class Told:
+class FrameTruth:
     """The truth of one frame, as read from its file: attitudes (4,) as xyzw, rate (3,), and the table of sources."""
 
     frame: int
@@ -48,22 +48,22 @@ class Recording:
     @cached_property
     def meta(self) -> dict[str, Any]:
         """Scene, seed and definition of the lab axes, from the truth of the first frame. Raises InputError."""
-        told = table(self.stems[0].with_suffix(".ecsv")).meta
-        missing = [key for key in ("scene", "seed", "lab") if key not in told]
+        header = files.read_table(self.stems[0].with_suffix(".ecsv")).meta
+        missing = [key for key in ("scene", "seed", "lab") if key not in header]
         if missing:
             raise InputError(
-                f"{self.stems[0]}.ecsv: no {missing[0]} in the header; allowed: a truth of skysim run"
+                f"{self.stems[0]}.ecsv: no {missing[0]} in the header; allowed: a truth file of skysim run"
             )
-        return {key: told[key] for key in ("scene", "seed", "lab")}
+        return {key: header[key] for key in ("scene", "seed", "lab")}
 
     @property
-    def under_the_stars(self) -> bool:
+    def is_celestial(self) -> bool:
         """Whether the lab axes are those of the ICRS."""
         return bool(self.meta["lab"] == STARS)
 
-    def truths(self) -> Iterator[Told]:
+    def truths(self) -> Iterator[FrameTruth]:
         """The truth of every frame."""
-        return (truth(stem.with_suffix(".ecsv")) for stem in self.stems)
+        return (read_truth(stem.with_suffix(".ecsv")) for stem in self.stems)
 
     def image(self, stem: Path) -> NDArray[Any]:
         """A frame's digital numbers: (H, W) uint16, or float64 from a noise-free camera. Raises InputError."""
@@ -75,73 +75,61 @@ class Recording:
     def table(self, name: str) -> Any:
         """The table `solutions`, `telemetry` or `imu` as an astropy table; None if the run wrote none."""
         path = self.folder / f"{name}.ecsv"
-        return table(path) if path.is_file() else None
+        return files.read_table(path) if path.is_file() else None
 
     def solved(self) -> tuple[NDArray[np.int64], Rotation] | None:
-        """(K,) indices of the solved frames and the attitudes found.
+        """(K,) indices of the solved frames and their attitudes.
 
         Attitudes are lab_from_cam under the stars and lab_from_body in a laboratory. Returns None if there is no
         table of solutions or no frame was solved. Raises InputError if a column is missing.
         """
-        found = self.table("solutions")
-        if found is None:
+        solutions = self.table("solutions")
+        if solutions is None:
             return None
-        names = SKY_ANGLES if self.under_the_stars else LAB_ANGLES
-        missing = [name for name in ("frame", *names) if name not in found.colnames]
+        names = SKY_ANGLES if self.is_celestial else LAB_ANGLES
+        missing = [name for name in ("frame", *names) if name not in solutions.colnames]
         if missing:
             raise InputError(
-                f"{self.folder / 'solutions.ecsv'}: no column {missing[0]}; allowed: that of skysim run"
+                f"{self.folder / 'solutions.ecsv'}: missing column {missing[0]}; allowed: a table of skysim run"
             )
-        angles = np.column_stack([np.ma.filled(found[name].astype(float), np.nan) for name in names])
-        good = np.isfinite(angles).all(axis=1)
-        if not good.any():
+        angles = np.column_stack([np.ma.filled(solutions[name].astype(float), np.nan) for name in names])
+        valid = np.isfinite(angles).all(axis=1)
+        if not valid.any():
             return None
-        return np.asarray(found["frame"], np.int64)[good], attitudes(angles[good], self.under_the_stars)
+        return np.asarray(solutions["frame"], np.int64)[valid], attitudes(angles[valid], self.is_celestial)
 
 
-def attitudes(angles_deg: Floats, under_the_stars: bool) -> Rotation:
+def attitudes(angles_deg: Floats, is_celestial: bool) -> Rotation:
     """Rotations from (K, 3) angles in the convention of `scoring.angles_deg`.
 
     Under the stars: lab_from_cam from RA, Dec, roll. Otherwise: lab_from_body from the roll, pitch, yaw of the 3-2-1
     sequence.
     """
-    if under_the_stars:
+    if is_celestial:
         return Rotation.concatenate([stars.cam_from_icrs(*row).inv() for row in angles_deg])
     return Rotation.from_euler("ZYX", angles_deg[:, ::-1], degrees=True)
 
 
-def recording(folder: Path) -> Recording:
+def open_recording(folder: Path) -> Recording:
     """The run in a folder. Raises InputError if the folder holds no frame with its truth."""
-    found = {}
+    stems = {}
     for path in folder.glob("frame_*.fits"):
         number = re.fullmatch(r"frame_(\d{4,})", path.stem)
         if number and path.with_suffix(".ecsv").is_file():
-            found[int(number[1])] = path.with_suffix("")
-    if not found:
-        raise InputError(
-            f"{folder}: no frames with their truth; allowed: a folder of skysim run or skysim render"
-        )
-    return Recording(folder, [found[index] for index in sorted(found)])
+            stems[int(number[1])] = path.with_suffix("")
+    if not stems:
+        raise InputError(f"{folder}: no frames with truth files; allowed: a folder of skysim run or skysim render")
+    return Recording(folder, [stems[index] for index in sorted(stems)])
 
 
-def table(path: Path) -> Any:
-    """Read an ECSV file as an astropy table. Raises InputError (one line) if the file is not valid ECSV."""
-    from astropy.table import Table
-
-    try:
-        return Table.read(path, format="ascii.ecsv")
-    except Exception as error:  # astropy's parsers raise many types of exception for a file that is not ECSV
-        raise InputError(f"{path}: no ECSV table: {' '.join(str(error).split())[:120]}") from None
-
-
-def truth(path: Path) -> Told:
+def read_truth(path: Path) -> FrameTruth:
     """Read the truth of a frame.
 
     Raises InputError (one line) for a file that is not a truth file or that an older skysim wrote.
     """
-    found = table(path)
+    sources = files.read_table(path)
     numbers = {
-        key: np.array(files.header_numbers(path, found.meta, key, count))
+        key: np.array(files.header_numbers(path, sources.meta, key, count))
         for key, count in {
             **{"frame": 1, "t_mid_s": 1, "exposure_s": 1},
             **{"lab_from_body_xyzw": 4, "cam_from_lab_xyzw": 4, "rate_cam_rad_s": 3},
@@ -149,18 +137,18 @@ def truth(path: Path) -> Told:
     }
     for key in ("lab_from_body_xyzw", "cam_from_lab_xyzw"):
         if abs(np.linalg.norm(numbers[key]) - 1) > UNIT_NORM:
-            raise InputError(f"{path}: {key} in the header is {found.meta[key]}; allowed: a unit quaternion")
+            raise InputError(f"{path}: {key} in the header is {sources.meta[key]}; allowed: a unit quaternion")
     try:
-        utc = datetime.datetime.fromisoformat(str(found.meta.get("mid_utc")))
+        utc = datetime.datetime.fromisoformat(str(sources.meta.get("mid_utc")))
     except ValueError:
         raise InputError(
-            f"{path}: mid_utc in the header is {found.meta.get('mid_utc')!r}; allowed: a time; run the scene again"
+            f"{path}: mid_utc in the header is {sources.meta.get('mid_utc')!r}; allowed: a time; run the scene again"
         ) from None
-    return Told(
+    return FrameTruth(
         frame=int(numbers.pop("frame")[0]),
         mid_utc=utc,
         t_mid_s=float(numbers.pop("t_mid_s")[0]),
         exposure_s=float(numbers.pop("exposure_s")[0]),
-        sources=found,
+        sources=sources,
         **numbers,
     )

@@ -17,6 +17,6 @@ from skysim.sources.dome.surface import build_surface
 from skysim.sources.photometry import Band
 
 
-def sources(part: light.DomeConfig, band: Band) -> Sources:
+def sources(config: light.DomeConfig, band: Band) -> Sources:
     """All LEDs of the dome; strength is in photo-electrons s^-1 sr^-1 in the chip's band."""
-    return LAYOUTS[part.layout.kind](part.layout, build_surface(part.surface), part.led, band)
+    return LAYOUTS[config.layout.kind](config.layout, build_surface(config.surface), config.led, band)

@@ -18,13 +18,13 @@ from skysim.core.types import Floats
 from skysim.scene import leds
 from skysim.sources import catalog
 from skysim.sources import stars as star_sources
-from skysim.sources.catalog import known_catalogue
+from skysim.sources.catalog import require_catalog
 from skysim.sources.dome.led import Emitter, irradiance_e_s_m2
-from skysim.sources.dome.surface import Inside
+from skysim.sources.dome.surface import Surface
 from skysim.sources.photometry import Band, synthetic_mag
 
 
-class Projected(NamedTuple):
+class ProjectedStars(NamedTuple):
     """Stars on the dome, brightest first: hip, v_mag, shown_mag (N,), place_m (N, 3) in the lab.
 
     shown_mag : magnitude that the LED has to show: V, or the instrumental magnitude in the chip's band
@@ -36,124 +36,122 @@ class Projected(NamedTuple):
     place_m: Floats
 
 
-def projected(part: leds.CelestialConfig, inside: Inside, led: leds.LedConfig, band: Band) -> Projected:
-    """Stars as LED places: apparent directions at part.epoch, traced from the camera's nominal place to the surface.
+def project_stars(config: leds.CelestialConfig, surface: Surface, led: leds.LedConfig, band: Band) -> ProjectedStars:
+    """Stars as LED places: apparent directions at config.epoch, traced from the camera's nominal place to the surface.
 
     The lab's +z is the zenith at RA, Dec; roll is the position angle of the lab's -y there. Of the stars on the
-    dome's cap the brightest are taken; those that one LED's disc would cover are merged, see `lights`.
+    dome's cap the brightest are taken; those that one LED's disk would cover are merged, see `merge_close_stars`.
     Raises InputError for a camera outside the dome, and if there are no stars or too few.
     """
-    camera_m = np.array(part.camera_m)
-    if not inside.inside(camera_m):
-        out_m = np.linalg.norm(camera_m)
+    camera_m = np.array(config.camera_m)
+    if not surface.inside(camera_m):
+        distance_m = np.linalg.norm(camera_m)
         raise InputError(
-            f"light.layout.camera: {out_m:g} m from the bearing's centre is outside of the dome; allowed: inside"
+            f"light.layout.camera: {distance_m:g} m from the bearing's center, outside of the dome; allowed: inside"
         )
-    stars = catalog.read(known_catalogue("light.layout.catalogue", part.catalogue))
-    lab_from_icrs = star_sources.cam_from_icrs(part.zenith_ra_deg, part.zenith_dec_deg, part.roll_deg)
-    direction = lab_from_icrs.apply(star_sources.apparent(stars, part.epoch))
-    above = direction[:, 2] > 0
-    stars, place_m = stars.take(above), inside.meet(camera_m, direction[above])
-    within = place_m[:, 2] >= np.cos(np.radians(part.cap_deg)) * np.linalg.norm(place_m, axis=1)
+    stars = catalog.read(require_catalog("light.layout.catalog", config.catalog))
+    lab_from_icrs = star_sources.cam_from_icrs(config.zenith_ra_deg, config.zenith_dec_deg, config.roll_deg)
+    direction = lab_from_icrs.apply(star_sources.apparent(stars, config.epoch))
+    above_horizon = direction[:, 2] > 0
+    stars, place_m = stars.take(above_horizon), surface.meet(camera_m, direction[above_horizon])
+    within = place_m[:, 2] >= np.cos(np.radians(config.cap_deg)) * np.linalg.norm(place_m, axis=1)
     stars, place_m = stars.take(within), place_m[within]
     order = np.argsort(stars.v_mag, kind="stable")
     stars, place_m = stars.take(order), place_m[order]
-    mag = synthetic_mag(stars.v_mag, stars.b_v, stars.v_i, band) if part.brightness == "band" else stars.v_mag
-    together = brightest(Projected(stars.hip, stars.v_mag, mag, place_m), part, led.disc_diameter_m)
-    rays = together.place_m - camera_m
+    mag = synthetic_mag(stars.v_mag, stars.b_v, stars.v_i, band) if config.brightness == "band" else stars.v_mag
+    selected = select_brightest(ProjectedStars(stars.hip, stars.v_mag, mag, place_m), config, led.disk_diameter_m)
+    rays = selected.place_m - camera_m
     # A merged place is a mean of points on the surface and so lies inside it: trace it back onto the surface.
-    return together._replace(
-        place_m=inside.meet(camera_m, rays / np.linalg.norm(rays, axis=1, keepdims=True))
-    )
+    return selected._replace(place_m=surface.meet(camera_m, rays / np.linalg.norm(rays, axis=1, keepdims=True)))
 
 
-def leaders(place_m: Floats, apart_m: float) -> NDArray[np.int64]:
-    """(N,) index of the star into whose LED each star is merged: itself, unless a brighter leader is within apart_m.
+def merge_targets(place_m: Floats, separation_m: float) -> NDArray[np.int64]:
+    """(N,) index of the star with which each star is merged: itself, unless a brighter target is within separation_m.
 
-    place_m : (N, 3), brightest first, so that a star's leader does not depend on fainter stars.
+    place_m : (N, 3), brightest first, so that a star's target does not depend on fainter stars.
     """
-    leader = np.arange(len(place_m))
-    # Sorted pairs: when a pair is reached, its brighter star is known to be a leader or not.
-    for bright, faint in sorted(cKDTree(place_m).query_pairs(apart_m * (1 - 1e-9))):
-        if leader[bright] == bright and leader[faint] == faint:
-            leader[faint] = bright
-    return leader
+    target = np.arange(len(place_m))
+    # Sorted pairs: when a pair is reached, it is decided whether its brighter star is a target.
+    for bright, faint in sorted(cKDTree(place_m).query_pairs(separation_m * (1 - 1e-9))):
+        if target[bright] == bright and target[faint] == faint:
+            target[faint] = bright
+    return target
 
 
-def merged(stars: Projected, leader: NDArray[np.int64]) -> Projected:
-    """The stars with the light of each added to its leader's, at their center of light.
+def merge_stars(stars: ProjectedStars, target: NDArray[np.int64]) -> ProjectedStars:
+    """The stars with the light of each added to its target's, at their center of light.
 
-    The numbers are the leaders'; the order is by combined V.
+    The numbers are the targets'; the order is by combined V.
     """
-    first, group = np.unique(leader, return_inverse=True)
+    first, group = np.unique(target, return_inverse=True)
 
-    def together(mag: Floats) -> Floats:
-        alone = np.bincount(group, minlength=len(first)) == 1
+    def combined_mag(mag: Floats) -> Floats:
+        single = np.bincount(group, minlength=len(first)) == 1
         sum_mag = -2.5 * np.log10(np.bincount(group, 10 ** (-0.4 * mag)))
-        return np.where(alone, mag[first], sum_mag)
+        return np.where(single, mag[first], sum_mag)
 
     light = 10 ** (-0.4 * stars.shown_mag)
     weight = light / np.bincount(group, light)[group]
     place_m = np.array([np.bincount(group, weight * axis) for axis in stars.place_m.T], dtype=float).T
-    v_mag = together(stars.v_mag)
+    v_mag = combined_mag(stars.v_mag)
     order = np.argsort(v_mag, kind="stable")
-    return Projected(stars.hip[first][order], v_mag[order], together(stars.shown_mag)[order], place_m[order])
+    return ProjectedStars(stars.hip[first][order], v_mag[order], combined_mag(stars.shown_mag)[order], place_m[order])
 
 
-def lights(stars: Projected, shown: int, apart_m: float) -> Projected:
-    """The first `shown` stars as LEDs, no two nearer to each other than apart_m.
+def merge_close_stars(stars: ProjectedStars, count: int, separation_m: float) -> ProjectedStars:
+    """The first `count` stars as LEDs, no two nearer to each other than separation_m.
 
     A merged LED is between the places of its stars and may be too near a third, so merging repeats until none is.
     """
-    leds = Projected(stars.hip[:shown], stars.v_mag[:shown], stars.shown_mag[:shown], stars.place_m[:shown])
+    selected = ProjectedStars(stars.hip[:count], stars.v_mag[:count], stars.shown_mag[:count], stars.place_m[:count])
     while True:
-        leader = leaders(leds.place_m, apart_m)
-        if np.all(leader == np.arange(len(leader))):
-            return leds
-        leds = merged(leds, leader)
+        target = merge_targets(selected.place_m, separation_m)
+        if np.all(target == np.arange(len(target))):
+            return selected
+        selected = merge_stars(selected, target)
 
 
-def brightest(stars: Projected, part: leds.CelestialConfig, apart_m: float) -> Projected:
-    """The brightest stars, merged into part.count LEDs, or all stars to part.limit_mag. Raises InputError."""
-    if part.limit_mag is not None:
-        shown = int(np.sum(stars.v_mag <= part.limit_mag))
-        if not shown:
+def select_brightest(stars: ProjectedStars, config: leds.CelestialConfig, separation_m: float) -> ProjectedStars:
+    """The brightest stars, merged into config.count LEDs, or all stars to config.limit_mag. Raises InputError."""
+    if config.limit_mag is not None:
+        count = int(np.sum(stars.v_mag <= config.limit_mag))
+        if not count:
             raise InputError(
-                "light.layout.limit_mag: no star on the dome is so bright; allowed: a fainter limit"
+                f"light.layout.limit_mag: no star to {config.limit_mag:g} mag on the dome; allowed: a fainter limit"
             )
-        return lights(stars, shown, apart_m)
-    count = part.count or 1
-    shown = min(count, len(stars.hip))
-    leds = lights(stars, shown, apart_m)
-    while len(leds.hip) < count and shown < len(stars.hip):
-        shown = min(shown + count - len(leds.hip), len(stars.hip))  # each star adds one LED at most
-        leds = lights(stars, shown, apart_m)
-    if len(leds.hip) < count:
+        return merge_close_stars(stars, count, separation_m)
+    wanted = config.count or 1
+    count = min(wanted, len(stars.hip))
+    merged = merge_close_stars(stars, count, separation_m)
+    while len(merged.hip) < wanted and count < len(stars.hip):
+        count = min(count + wanted - len(merged.hip), len(stars.hip))  # each star adds one LED at most
+        merged = merge_close_stars(stars, count, separation_m)
+    if len(merged.hip) < wanted:
         raise InputError(
-            f"light.layout.count: {count} stars, where the catalogue has {len(leds.hip)} on the dome; allowed: no more"
-            " than that"
+            f"light.layout.count: {wanted} LEDs, but the catalog gives {len(merged.hip)} on the dome; allowed: at most"
+            " that"
         )
-    return leds
+    return merged
 
 
-def levels(part: leds.CelestialConfig, stars: Projected, normal: Floats, led: leds.LedConfig) -> Floats:
+def led_levels(config: leds.CelestialConfig, stars: ProjectedStars, normal: Floats, led: leds.LedConfig) -> Floats:
     """(N,) levels for which the irradiance at the camera's nominal place follows Pogson's law, 10^(-0.4 m).
 
     m is stars.shown_mag. All LEDs have one color, so the magnitudes hold for this chip only, where m should be its
     instrumental magnitude. The level compensates for the LED's distance and emission angle; the LED that needs most
-    has level 1. No star is shown brighter than part.brightest_mag. normal : (N, 3) of the LEDs.
+    has level 1. No star is shown brighter than config.brightest_mag. normal : (N, 3) of the LEDs.
     Raises InputError for an LED whose lobe does not reach the camera.
     """
-    to_camera = np.array(part.camera_m) - stars.place_m
+    to_camera = np.array(config.camera_m) - stars.place_m
     distance_m = np.linalg.norm(to_camera, axis=1)
     cos_emission = np.einsum("nj,nj->n", normal, to_camera) / distance_m
-    one = np.ones(len(distance_m))
+    ones = np.ones(len(distance_m))
     # Irradiance per unit strength on an aperture that faces the LED, as stars at infinity are measured.
-    gain = irradiance_e_s_m2(one, Emitter.of(led), cos_emission, one, distance_m)
+    gain = irradiance_e_s_m2(ones, Emitter.from_config(led), cos_emission, ones, distance_m)
     if not np.all(gain > 0):
         raise InputError(
-            f"light.led.lobe: the LED of HIP {stars.hip[gain <= 0][0]} sends the camera nothing; allowed: a wider lobe"
+            f"light.led.lobe: the LED of HIP {stars.hip[gain <= 0][0]} does not reach the camera; allowed: a wider lobe"
         )
-    shown_mag = np.maximum(stars.shown_mag, -np.inf if part.brightest_mag is None else part.brightest_mag)
+    shown_mag = np.maximum(stars.shown_mag, -np.inf if config.brightest_mag is None else config.brightest_mag)
     needed = 10 ** (-0.4 * shown_mag) / gain
     return np.asarray(needed / needed.max())

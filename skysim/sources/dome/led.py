@@ -1,6 +1,6 @@
 """Light of an LED toward the camera: emission lobe, falloff with distance, drive, and on-time within an exposure.
 
-A drive turns the level of each LED into a pulse train (`DRIVES`). `lit_moments_s` integrates such a train over an
+A drive converts the level of each LED to a pulse train (`DRIVES`). `lit_moments_s` integrates such a train over an
 exposure.
 """
 
@@ -37,27 +37,27 @@ def inverse_square(distance_m: Floats) -> Floats:
 FALLOFF: dict[str, Falloff] = {"inverse_square": inverse_square}
 
 
-def cosine_lobe(part: CosineLobeConfig, cos_emission: Floats) -> Floats:
-    """Relative radiant intensity cos^m of the emission angle; m = 1 is a Lambertian disc."""
-    return np.asarray(np.maximum(cos_emission, 0.0) ** part.exponent)
+def cosine_lobe(config: CosineLobeConfig, cos_emission: Floats) -> Floats:
+    """Relative radiant intensity cos^m of the emission angle; m = 1 is a Lambertian disk."""
+    return np.asarray(np.maximum(cos_emission, 0.0) ** config.exponent)
 
 
-def table_lobe(part: LobeTableConfig, cos_emission: Floats) -> Floats:
+def table_lobe(config: LobeTableConfig, cos_emission: Floats) -> Floats:
     """Measured lobe: relative intensity, interpolated linearly in angle, which neither overshoots nor oscillates.
 
     Constant within the first angle, zero beyond the last.
     """
     angle_deg = np.degrees(np.arccos(np.clip(cos_emission, -1.0, 1.0)))
-    return np.asarray(np.interp(angle_deg, part.angle_deg, part.intensity, right=0.0))
+    return np.asarray(np.interp(angle_deg, config.angle_deg, config.intensity, right=0.0))
 
 
-# Each takes (its section of the scene, cosine of the angle from the LED's normal); intensity is 1 on the normal.
+# Arguments: its section of the scene, cosine of the angle from the LED's normal. Intensity is 1 on the normal.
 LOBES: dict[str, Callable[[Any, Floats], Floats]] = {"cosine": cosine_lobe, "table": table_lobe}
 
 
 @dataclass(frozen=True, slots=True)
 class Emitter:
-    """Emission of a dome's LEDs: falloff with distance and lobe over angle. The default is a Lambertian disc.
+    """Emission of a dome's LEDs: falloff with distance and lobe over angle. The default is a Lambertian disk.
 
     falloff : a key of FALLOFF
     lobe    : its kind is a key of LOBES
@@ -67,7 +67,7 @@ class Emitter:
     lobe: Lobe = field(default_factory=CosineLobeConfig)
 
     @classmethod
-    def of(cls, led: LedConfig) -> Emitter:
+    def from_config(cls, led: LedConfig) -> Emitter:
         """The emitter of a scene's LED section."""
         return cls(led.falloff, led.lobe)
 
@@ -83,24 +83,22 @@ def irradiance_e_s_m2(
     distance_m      : f is the emitter's falloff
     The arrays broadcast. Returns photo-electrons s^-1 m^-2.
     """
-    lit = (np.asarray(cos_emission) > 0) & (np.asarray(cos_incidence) > 0)
+    facing = (np.asarray(cos_emission) > 0) & (np.asarray(cos_incidence) > 0)
     emitted = LOBES[emitter.lobe.kind](emitter.lobe, cos_emission)
-    return np.where(
-        lit, strength_e_s_sr * emitted * cos_incidence * FALLOFF[emitter.falloff](distance_m), 0.0
-    )
+    return np.where(facing, strength_e_s_sr * emitted * cos_incidence * FALLOFF[emitter.falloff](distance_m), 0.0)
 
 
-def full_e_s_sr(led: LedConfig, band: Band) -> float:
+def full_strength_e_s_sr(led: LedConfig, band: Band) -> float:
     """Strength of an LED at full brightness in the chip's band: photo-electrons s^-1 sr^-1 along its normal."""
     if led.intensity_cd is not None:
         return float(led_strength_e_s_sr(led.intensity_cd, led.spectrum, band))
     return float(radiant_strength_e_s_sr(led.radiant_intensity_w_sr or 0.0, led.spectrum, band))
 
 
-class Lamps(NamedTuple):
+class DriveInput(NamedTuple):
     """Input of a drive, (N,) each.
 
-    level : share of full brightness
+    level : fraction of full brightness
     board : number of the board that carries the LED
     row   : of a pixel on its panel, from 0 at the top to below 1; 0 for LEDs
     """
@@ -110,7 +108,7 @@ class Lamps(NamedTuple):
     row: Floats | float = 0.0
 
 
-class Pulses(NamedTuple):
+class PulseTrains(NamedTuple):
     """Output of a drive per LED, (N,): lit from start_s for on_s in every period_s; relative strength while lit."""
 
     period_s: Floats
@@ -119,61 +117,64 @@ class Pulses(NamedTuple):
     strength: Floats
 
 
-def direct(_led: LedConfig, lamps: Lamps, _rng: np.random.Generator) -> Pulses:
+def direct(_led: LedConfig, inputs: DriveInput, _rng: np.random.Generator) -> PulseTrains:
     """Direct current: the LED is always lit, and its level scales its strength."""
-    one = np.ones(len(lamps.level))
-    return Pulses(one, 0 * one, one, lamps.level)
+    ones = np.ones(len(inputs.level))
+    return PulseTrains(ones, 0 * ones, ones, inputs.level)
 
 
-def pwm(led: LedConfig, lamps: Lamps, rng: np.random.Generator) -> Pulses:
+def pwm(led: LedConfig, inputs: DriveInput, rng: np.random.Generator) -> PulseTrains:
     """Hardware PWM: V_avg = D V_max, D = t_on / T (thesis, eqs 35 and 36); random phases, T is led.pwm_period_s."""
-    count = len(lamps.level)
+    count = len(inputs.level)
     start_s = rng.uniform(0, led.pwm_period_s, count)
-    return Pulses(np.full(count, led.pwm_period_s), start_s, lamps.level * led.pwm_period_s, np.ones(count))
+    return PulseTrains(np.full(count, led.pwm_period_s), start_s, inputs.level * led.pwm_period_s, np.ones(count))
 
 
-def sequential(led: LedConfig, lamps: Lamps, rng: np.random.Generator) -> Pulses:
+def sequential(led: LedConfig, inputs: DriveInput, rng: np.random.Generator) -> PulseTrains:
     """Software PWM of a controller that lights its LEDs one after another: D_i = t_on,i / sum T (thesis, eq. 37).
 
     Each LED of a controller has a slot T and is lit for its level of it; the controller's cycle is the sum of its
     slots. The controllers' phases are random. The microcontroller's own delays are neglected, as in the thesis.
     """
-    part, count = led.drive, len(lamps.level)
-    assert isinstance(part, SequentialConfig)
-    if part.controller == "board":
-        group = lamps.board
-    elif part.controller == "dome":
+    drive, count = led.drive, len(inputs.level)
+    assert isinstance(drive, SequentialConfig)
+    if drive.controller == "board":
+        group = inputs.board
+    elif drive.controller == "dome":
         group = np.zeros(count, dtype=np.int64)
     else:
-        group = np.arange(count) // part.controller
-    _, controller, sharing = np.unique(group, return_inverse=True, return_counts=True)
+        group = np.arange(count) // drive.controller
+    _, controller, led_count = np.unique(group, return_inverse=True, return_counts=True)
     # Number the LEDs of each controller: in the stable order they are consecutive, minus the index of its first.
     order = np.argsort(controller, kind="stable")
-    turn = np.empty(count)  # index of the LED's slot on its controller: 0, 1, ...
-    turn[order] = np.arange(count) - np.repeat(np.cumsum(sharing) - sharing, sharing)
-    cycle_s = sharing * np.float64(part.slot_s)
-    start_s = rng.uniform(0, cycle_s)[controller] + turn * part.slot_s
-    return Pulses(cycle_s[controller], start_s, lamps.level * part.slot_s, np.ones(count))
+    slot = np.empty(count)  # index of the LED's slot on its controller: 0, 1, ...
+    slot[order] = np.arange(count) - np.repeat(np.cumsum(led_count) - led_count, led_count)
+    cycle_s = led_count * np.float64(drive.slot_s)
+    start_s = rng.uniform(0, cycle_s)[controller] + slot * drive.slot_s
+    return PulseTrains(cycle_s[controller], start_s, inputs.level * drive.slot_s, np.ones(count))
 
 
-def refresh(led: LedConfig, lamps: Lamps, rng: np.random.Generator) -> Pulses:
+def refresh(led: LedConfig, inputs: DriveInput, rng: np.random.Generator) -> PulseTrains:
     """A panel whose rows are lit one after another once a frame, each for duty / rate.
 
     A row is delayed by its position on the panel, `row` / rate. A gray level is in the strength, because the liquid
     crystal keeps its state. All pixels of a row are lit together; the panel's phase is random. The mean light is
-    level * duty. Over an exposure of n + f frames, n whole, the relative flicker is
+    level * duty. Over an exposure of n + f frames, n complete, the relative flicker is
     sqrt(f (1 - f) - duty / 3) / (n + f) where duty <= f <= 1 - duty, and zero for f = 0 (reference 1.3).
     """
-    part, one = led.drive, np.ones(len(lamps.level))
-    assert isinstance(part, RefreshConfig)
-    period_s = 1 / part.rate_hz
-    return Pulses(
-        one * period_s, one * (rng.random() + lamps.row) * period_s, one * part.duty * period_s, lamps.level
+    drive, ones = led.drive, np.ones(len(inputs.level))
+    assert isinstance(drive, RefreshConfig)
+    period_s = 1 / drive.rate_hz
+    return PulseTrains(
+        ones * period_s,
+        ones * (rng.random() + inputs.row) * period_s,
+        ones * drive.duty * period_s,
+        inputs.level,
     )
 
 
-# Each takes (the LED section, the LEDs' levels and places, the hardware's random stream) and returns the pulses.
-DRIVES: dict[str, Callable[[LedConfig, Lamps, np.random.Generator], Pulses]] = {
+# Each takes (the LED section, the drive's input, the hardware's random stream) and returns the pulse trains.
+DRIVES: dict[str, Callable[[LedConfig, DriveInput, np.random.Generator], PulseTrains]] = {
     "direct": direct,
     "pwm": pwm,
     "sequential": sequential,
@@ -186,7 +187,7 @@ def lit_moments_s(begin_s: float, end_s: float, period_s: float, start_s: float,
     """On-time of a pulse train within [begin, end], s, its mean time and the standard deviation about it.
 
     The train is lit from start_s for on_s in every period_s, before and after. The result is exact for any interval:
-    the first and the last pulse are clipped to it; the n whole pulses between them have the moments of a comb, whose
+    the first and the last pulse are clipped to it; the n complete pulses between them have the moments of a comb, whose
     centers have the variance period^2 (n^2 - 1) / 12, each pulse adding on^2 / 12. Returns (0, the middle, 0) if it
     is dark.
     """
@@ -195,21 +196,25 @@ def lit_moments_s(begin_s: float, end_s: float, period_s: float, start_s: float,
         return end_s - begin_s, middle, (end_s - begin_s) / sqrt(12.0)
     first = floor((begin_s - start_s - on_s) / period_s) + 1
     last = ceil((end_s - start_s) / period_s) - 1
-    lit, sum1, sum2 = 0.0, 0.0, 0.0
+    lit_s, sum1, sum2 = 0.0, 0.0, 0.0
     # Times are taken from the middle of the interval, where the squares lose the fewest digits.
     for j in range(first, last + 1, max(last - first, 1)):  # the two pulses at the ends, or the only one
-        up = max(start_s + j * period_s, begin_s)
-        width = min(start_s + j * period_s + on_s, end_s) - up
+        edge = max(start_s + j * period_s, begin_s)
+        width = min(start_s + j * period_s + on_s, end_s) - edge
         if width > 0:
-            centre = up + width / 2 - middle
-            lit, sum1, sum2 = lit + width, sum1 + width * centre, sum2 + width * (centre**2 + width**2 / 12)
+            center = edge + width / 2 - middle
+            lit_s, sum1, sum2 = (
+                lit_s + width,
+                sum1 + width * center,
+                sum2 + width * (center**2 + width**2 / 12),
+            )
     n = last - first - 1
     if n > 0:
-        centre = start_s + (first + 1) * period_s + on_s / 2 + (n - 1) * period_s / 2 - middle
-        lit += n * on_s
-        sum1 += n * on_s * centre
-        sum2 += n * on_s * (centre**2 + (period_s**2 * (n * n - 1) + on_s**2) / 12)
-    if lit <= 0:
+        center = start_s + (first + 1) * period_s + on_s / 2 + (n - 1) * period_s / 2 - middle
+        lit_s += n * on_s
+        sum1 += n * on_s * center
+        sum2 += n * on_s * (center**2 + (period_s**2 * (n * n - 1) + on_s**2) / 12)
+    if lit_s <= 0:
         return 0.0, middle, 0.0
-    mean = sum1 / lit
-    return lit, middle + mean, sqrt(max(sum2 / lit - mean**2, 0.0))
+    mean = sum1 / lit_s
+    return lit_s, middle + mean, sqrt(max(sum2 / lit_s - mean**2, 0.0))

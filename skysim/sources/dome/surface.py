@@ -2,7 +2,8 @@
 
 Every surface is a level set f(x) = 0 in its own frame, f < 0 inside. The frame's origin is the surface's center; its
 axes are the lab's unless the surface is tilted. A ray from the inside meets the surface where f first becomes zero:
-in closed form for planes and quadrics (`leaves`), by safeguarded Newton steps for a radius over direction (`Radial`).
+in closed form for planes and quadrics (`exit_distance`), by safeguarded Newton steps for a radius over
+direction (`Radial`).
 SURFACES maps the scene's `light.surface.kind` to the function that builds the surface.
 """
 
@@ -12,7 +13,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,11 +23,11 @@ from skysim.core.errors import InputError
 from skysim.core.types import Floats
 from skysim.scene import light
 from skysim.sources.dome import point_cloud
-from skysim.sources.dome.point_cloud import Believed, fit_ellipsoid
+from skysim.sources.dome.point_cloud import FittedEllipsoid, fit_ellipsoid
 
 FLAT_RADIUS_M = 1e6  # of a sphere that is flat to a micrometer within a meter
 RINGS, SECTORS = 60, 72  # of the samples to which an ellipsoid is fitted
-MOST_STEPS = 200  # of the ray intersection
+MAX_STEPS = 200  # of the ray intersection
 SLACK_M = 1e-12  # rounding tolerance that keeps points on the rim within it
 
 
@@ -34,38 +35,38 @@ SLACK_M = 1e-12  # rounding tolerance that keeps points on the rim within it
 class Rim:
     """Where a surface ends, in its own frame.
 
-    eye_m    : (3,) the bearing's center before the surface was displaced
-    lowest_m : height of the lowest point
-    half_rad : greatest angle from the upright axis, seen from the eye
+    bearing_m : (3,) the bearing's center before the surface was displaced
+    lowest_m  : height of the lowest point
+    half_rad  : greatest angle from the upright axis, seen from the bearing
     """
 
-    eye_m: Floats = field(default_factory=lambda: np.zeros(3))
+    bearing_m: Floats = field(default_factory=lambda: np.zeros(3))
     lowest_m: float = -math.inf
     half_rad: float = math.pi
 
     @property
-    def nowhere(self) -> bool:
+    def unbounded(self) -> bool:
         """Whether the surface has no end."""
         return self.lowest_m == -math.inf and self.half_rad == math.pi
 
-    def holds(self, own_m: Floats) -> NDArray[np.bool_]:
+    def contains(self, own_m: Floats) -> NDArray[np.bool_]:
         """(N,) whether (N, 3) points in the surface's own frame are within the rim; False for NaN."""
-        seen = own_m - self.eye_m
-        slack = SLACK_M - np.cos(self.half_rad) * np.linalg.norm(seen, axis=1)
-        return np.asarray((own_m[:, 2] >= self.lowest_m - SLACK_M) & (seen[:, 2] + slack >= 0))
+        from_bearing_m = own_m - self.bearing_m
+        slack = SLACK_M - np.cos(self.half_rad) * np.linalg.norm(from_bearing_m, axis=1)
+        return np.asarray((own_m[:, 2] >= self.lowest_m - SLACK_M) & (from_bearing_m[:, 2] + slack >= 0))
 
 
 @dataclass(frozen=True, slots=True)
 class Surface(ABC):
     """A surface seen from inside: a level set, negative inside, in its own displaced and tilted frame.
 
-    centre_m       : (3,) origin of its own frame, in the lab
+    center_m       : (3,) origin of its own frame, in the lab
     rim            : where it ends
     lab_from_own   : its tilt
     survey_sigma_m : standard deviation, along the normal, of the lab's survey of it
     """
 
-    centre_m: Floats
+    center_m: Floats
     rim: Rim = field(default_factory=Rim, kw_only=True)
     lab_from_own: Rotation = field(default_factory=Rotation.identity, kw_only=True)
     survey_sigma_m: float = field(default=0.0, kw_only=True)
@@ -84,61 +85,61 @@ class Surface(ABC):
 
     def within(self, own_m: Floats) -> NDArray[np.bool_]:
         """(N,) whether points of the level set belong to the surface."""
-        return self.rim.holds(own_m)
+        return self.rim.contains(own_m)
 
     def meet(self, origin_m: Floats, rays: Floats) -> Floats:
         """(N, 3) points where rays (N, 3) of any length leave the inside; NaN where they miss or pass below the rim."""
-        turn = self.lab_from_own.as_matrix()
+        R_lab_from_own = self.lab_from_own.as_matrix()
         # A rotation keeps lengths, so the distance along the ray is the same in both frames.
-        start, along = (origin_m - self.centre_m) @ turn, rays @ turn
+        start, along = (origin_m - self.center_m) @ R_lab_from_own, rays @ R_lab_from_own
         distance = self.distance(start, along)
-        on_it = self.within(start + distance[:, None] * along)
-        return np.asarray(origin_m + np.where(on_it, distance, np.nan)[:, None] * rays)
+        within = self.within(start + distance[:, None] * along)
+        return np.asarray(origin_m + np.where(within, distance, np.nan)[:, None] * rays)
 
     def inward(self, points_m: Floats) -> Floats:
         """(N, 3) unit normals toward the inside, at points of the surface: minus the level's gradient."""
-        turn = self.lab_from_own.as_matrix()
-        gradient = self.gradient((points_m - self.centre_m) @ turn) @ turn.T
+        R_lab_from_own = self.lab_from_own.as_matrix()
+        gradient = self.gradient((points_m - self.center_m) @ R_lab_from_own) @ R_lab_from_own.T
         return np.asarray(-gradient / np.linalg.norm(gradient, axis=1, keepdims=True))
 
     def inside(self, point_m: Floats) -> bool:
         """Whether a point of the lab, (3,), is inside; the rim is ignored."""
-        own = (point_m - self.centre_m) @ self.lab_from_own.as_matrix()
+        own = (point_m - self.center_m) @ self.lab_from_own.as_matrix()
         return bool(self.level(own[None])[0] < 0)
 
     def samples_m(self) -> Floats:
         """(N, 3) points of the surface within its rim, on rings of equal solid angle as seen from the bearing."""
-        lowest = np.cos(min(self.rim.half_rad, np.pi / 2))
-        up = 1 - (np.arange(RINGS) + 0.5) / RINGS * (1 - lowest)
-        azimuth = np.arange(SECTORS) * (2 * np.pi / SECTORS)
-        level, turn = (one.ravel() for one in np.meshgrid(up, azimuth, indexing="ij"))
-        out = np.sqrt(1 - level**2)
-        rays = self.lab_from_own.apply(np.column_stack([out * np.cos(turn), out * np.sin(turn), level]))
+        min_z = np.cos(min(self.rim.half_rad, np.pi / 2))
+        ring_z = 1 - (np.arange(RINGS) + 0.5) / RINGS * (1 - min_z)
+        sectors = np.arange(SECTORS) * (2 * np.pi / SECTORS)
+        z, azimuth = (grid.ravel() for grid in np.meshgrid(ring_z, sectors, indexing="ij"))
+        ring = np.sqrt(1 - z**2)
+        rays = self.lab_from_own.apply(np.column_stack([ring * np.cos(azimuth), ring * np.sin(azimuth), z]))
         met = self.meet(np.zeros(3), rays)
         return met[np.isfinite(met[:, 0])]
 
-    def believed(self) -> Believed:
+    def nearest_ellipsoid(self) -> FittedEllipsoid:
         """The nearest ellipsoid: a least-squares fit to `samples_m`."""
         return fit_ellipsoid(self.samples_m())
 
     def as_ellipsoid(self) -> tuple[Floats, Floats]:
-        """Center and semi-axes, (3,) each, m, of the ellipsoid that estimators use; `believed` adds its rms error."""
-        nearest = self.believed()
-        return nearest.centre_m, nearest.semi_axes_m
+        """Center and semi-axes, (3,) each, m, of the ellipsoid that estimators use, see `nearest_ellipsoid`."""
+        nearest = self.nearest_ellipsoid()
+        return nearest.center_m, nearest.semi_axes_m
 
 
-def leaves(start: Floats, along: Floats) -> Floats:
+def exit_distance(start: Floats, along: Floats) -> Floats:
     """(N,) the greater root s > 0 of |start + s along| = 1; NaN where there is none.
 
     With q = |b| + sqrt(b^2 - a c) the greater root is -c / q for b > 0 and q / a otherwise, free of cancellation.
     """
     # a s^2 + 2 b s + c = 0
     a, b, c = np.sum(along**2, axis=1), along @ start, start @ start - 1
-    under = b**2 - a * c
-    reach = np.abs(b) + np.sqrt(np.where((under >= 0) & (a > 0), under, np.nan))
-    reach = np.where(reach > 0, reach, np.nan)
-    far = np.where(b > 0, -c / reach, reach / np.where(a > 0, a, np.nan))
-    return np.where(far > 0, far, np.nan)
+    discriminant = b**2 - a * c
+    q = np.abs(b) + np.sqrt(np.where((discriminant >= 0) & (a > 0), discriminant, np.nan))
+    q = np.where(q > 0, q, np.nan)
+    root = np.where(b > 0, -c / q, q / np.where(a > 0, a, np.nan))
+    return np.where(root > 0, root, np.nan)
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,13 +155,13 @@ class Ellipsoid(Surface):
         return np.asarray(own_m / self.semi_axes_m**2)
 
     def distance(self, start_m: Floats, along: Floats) -> Floats:
-        return leaves(start_m / self.semi_axes_m, along / self.semi_axes_m)
+        return exit_distance(start_m / self.semi_axes_m, along / self.semi_axes_m)
 
-    def believed(self) -> Believed:
+    def nearest_ellipsoid(self) -> FittedEllipsoid:
         """The ellipsoid itself; a fit if it is tilted and not a sphere."""
         if self.lab_from_own.magnitude() > 0 and np.ptp(self.semi_axes_m) > 0:
             return fit_ellipsoid(self.samples_m())
-        return Believed(self.centre_m, self.semi_axes_m, 0.0)
+        return FittedEllipsoid(self.center_m, self.semi_axes_m, 0.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,7 +176,7 @@ class Plane(Surface):
     @property
     def height_m(self) -> float:
         """Height of its center above the bearing."""
-        return float(self.centre_m[2])
+        return float(self.center_m[2])
 
     def level(self, own_m: Floats) -> Floats:
         return own_m[:, 2]
@@ -191,10 +192,10 @@ class Plane(Surface):
     def within(self, own_m: Floats) -> NDArray[np.bool_]:
         return np.asarray(np.all(np.abs(own_m[:, :2]) <= self.half_m + SLACK_M, axis=1))
 
-    def believed(self) -> Believed:
+    def nearest_ellipsoid(self) -> FittedEllipsoid:
         """A sphere so large that it is flat to a micrometer within a meter."""
         up = self.lab_from_own.apply([0.0, 0.0, 1.0])
-        return Believed(self.centre_m - FLAT_RADIUS_M * up, np.full(3, FLAT_RADIUS_M), 0.0)
+        return FittedEllipsoid(self.center_m - FLAT_RADIUS_M * up, np.full(3, FLAT_RADIUS_M), 0.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -219,70 +220,55 @@ class Cylinder(Surface):
         return np.asarray(own_m / self.semi_axes_m() ** 2)
 
     def distance(self, start_m: Floats, along: Floats) -> Floats:
-        return leaves(start_m / self.semi_axes_m(), along / self.semi_axes_m())
+        return exit_distance(start_m / self.semi_axes_m(), along / self.semi_axes_m())
 
     def within(self, own_m: Floats) -> NDArray[np.bool_]:
-        ends = np.abs(own_m[:, self.axis]) <= self.half_length_m + SLACK_M
-        return np.asarray(self.rim.holds(own_m) & ends)
+        inside_ends = np.abs(own_m[:, self.axis]) <= self.half_length_m + SLACK_M
+        return np.asarray(self.rim.contains(own_m) & inside_ends)
 
-    def believed(self) -> Believed:
+    def nearest_ellipsoid(self) -> FittedEllipsoid:
         """An ellipsoid so long that it is straight; a fit if the cylinder is tilted."""
         if self.lab_from_own.magnitude() > 0:
             return fit_ellipsoid(self.samples_m())
-        return Believed(self.centre_m, self.semi_axes_m(FLAT_RADIUS_M), 0.0)
-
-
-class RadiusLaw(Protocol):
-    """Distance of a surface from its center as a function of direction.
-
-    It is at most most_m, and known out to the angle cover_rad from the axis.
-    """
-
-    @property
-    def most_m(self) -> float: ...
-
-    @property
-    def cover_rad(self) -> float: ...
-
-    def at(self, unit: Floats) -> tuple[Floats, Floats]:
-        """(N,) radius over (N, 3) unit vectors, and (N, 3) its gradient, whose radial component is ignored."""
+        return FittedEllipsoid(self.center_m, self.semi_axes_m(FLAT_RADIUS_M), 0.0)
 
 
 @dataclass(frozen=True, slots=True)
 class Shell:
-    """Inner radius of a formed wall: r = R - share t(angle), t linear from apex to base and constant beyond.
+    """Inner radius of a formed wall: r = R - f t(angle), t linear from apex to base and constant beyond.
 
-    share : fraction of the wall's thickness that is inside R: 1 if R is the outer radius, 1/2 if it is the mid-wall's
+    max_m          : R, the upper bound of the radius;  cover_rad : angle from the axis to which the radius is defined
+    inner_fraction : f, the part of the wall's thickness inside R: 1 if R is the outer radius, 1/2 if the mid-wall's
     AFIT's design contour, 48.033 in at the apex and 48.010 in at 40 deg (Padro 2012, sec. 3.7), follows from its
     0.2036 in and 0.25 in of acrylic about R = 48.135 in as the mid-wall radius. With R as the outer radius it does
     not.
     """
 
-    most_m: float
-    share: float
+    max_m: float
+    inner_fraction: float
     thickness_m: tuple[float, float]
     base_rad: float
     cover_rad: float = math.pi
 
-    def at(self, unit: Floats) -> tuple[Floats, Floats]:
-        out = np.hypot(unit[:, 0], unit[:, 1])
-        angle = np.arctan2(out, unit[:, 2])
-        slope = -self.share * (self.thickness_m[1] - self.thickness_m[0]) / self.base_rad
-        radius = self.most_m - self.share * self.thickness_m[0] + slope * np.minimum(angle, self.base_rad)
+    def evaluate(self, unit: Floats) -> tuple[Floats, Floats]:
+        ring = np.hypot(unit[:, 0], unit[:, 1])
+        angle = np.arctan2(ring, unit[:, 2])
+        slope = -self.inner_fraction * (self.thickness_m[1] - self.thickness_m[0]) / self.base_rad
+        radius = self.max_m - self.inner_fraction * self.thickness_m[0] + slope * np.minimum(angle, self.base_rad)
         # Unit vector toward greater angles; zero at the apex, where the law has no tangent.
-        around = np.column_stack([unit[:, :2] * (unit[:, 2] / np.where(out > 0, out, np.inf))[:, None], -out])
-        return radius, np.where(angle < self.base_rad, slope, 0.0)[:, None] * around
+        tangent = np.column_stack([unit[:, :2] * (unit[:, 2] / np.where(ring > 0, ring, np.inf))[:, None], -ring])
+        return radius, np.where(angle < self.base_rad, slope, 0.0)[:, None] * tangent
 
 
 @dataclass(frozen=True, slots=True)
 class Radial(Surface):
     """|x| = r(x / |x|) in its own frame: one radius in every direction from its center.
 
-    survey : the measured points that it was fitted to, if any
+    fit : the measured points that it was fitted to, if any
     """
 
-    radius: RadiusLaw
-    survey: point_cloud.Survey | None = None
+    radius: Shell | point_cloud.Zernike
+    fit: point_cloud.SurfaceFit | None = None
 
     def level(self, own_m: Floats) -> Floats:
         return self.level_and_gradient(own_m)[0]
@@ -292,16 +278,16 @@ class Radial(Surface):
 
     def level_and_gradient(self, own_m: Floats) -> tuple[Floats, Floats]:
         """(N,) level |x| - r and (N, 3) its gradient x/|x| - (grad r - its part along x) / |x|."""
-        far = np.linalg.norm(own_m, axis=1, keepdims=True)
-        far = np.where(far > 0, far, np.finfo(float).tiny)  # avoids 0 / 0 at the center
-        unit = own_m / far
-        radius, slope = self.radius.at(unit)
+        distance_m = np.linalg.norm(own_m, axis=1, keepdims=True)
+        distance_m = np.where(distance_m > 0, distance_m, np.finfo(float).tiny)  # avoids 0 / 0 at the center
+        unit = own_m / distance_m
+        radius, slope = self.radius.evaluate(unit)
         across = slope - np.sum(slope * unit, axis=1, keepdims=True) * unit
-        return far[:, 0] - radius, unit - across / far
+        return distance_m[:, 0] - radius, unit - across / distance_m
 
     def within(self, own_m: Floats) -> NDArray[np.bool_]:
         cosine = own_m[:, 2] - np.cos(self.radius.cover_rad) * np.linalg.norm(own_m, axis=1)
-        return np.asarray(self.rim.holds(own_m) & (cosine >= -SLACK_M))
+        return np.asarray(self.rim.contains(own_m) & (cosine >= -SLACK_M))
 
     def distance(self, start_m: Floats, along: Floats) -> Floats:
         """Newton's method within a bracket: the level is negative at its low end and not negative at its high end.
@@ -311,87 +297,96 @@ class Radial(Surface):
         level larger than a few roundings remains. A ray leaves a convex inside only once; otherwise one of several
         crossings is found.
         """
-        low, high = np.zeros(len(along)), leaves(start_m / self.radius.most_m, along / self.radius.most_m)
+        low, high = (
+            np.zeros(len(along)),
+            exit_distance(start_m / self.radius.max_m, along / self.radius.max_m),
+        )
         if self.level(start_m[None])[0] >= 0:
             return np.full(len(along), np.nan)
         distance, before = high.copy(), np.full(len(along), np.inf)
-        for _ in range(MOST_STEPS):
+        for _ in range(MAX_STEPS):
             level, gradient = self.level_and_gradient(start_m + distance[:, None] * along)
             # Rays that have not converged; those that have keep their distance.
-            open_ = np.abs(level) > 16 * np.finfo(float).eps * self.radius.most_m
-            if not open_.any():
+            unconverged = np.abs(level) > 16 * np.finfo(float).eps * self.radius.max_m
+            if not unconverged.any():
                 return distance
             low, high = np.where(level < 0, distance, low), np.where(level > 0, distance, high)
             slope = np.sum(gradient * along, axis=1)
             step = distance - level / np.where(slope > 0, slope, np.nan)
             newton = (step > low) & (step < high) & (np.abs(level) <= before / 2)
             before = np.abs(level)
-            distance = np.where(open_, np.where(newton, step, (low + high) / 2), distance)
-        raise ArithmeticError(f"{open_.sum()} rays do not settle on the surface in {MOST_STEPS} steps")
+            distance = np.where(unconverged, np.where(newton, step, (low + high) / 2), distance)
+        raise ArithmeticError(f"no convergence on the surface for {unconverged.sum()} rays in {MAX_STEPS} steps")
 
 
-def placed(part: light.SurfaceConfig, centre_m: float) -> dict[str, Any]:
-    """What every Surface takes: center, rim, tilt and survey error, for a center at this height above the bearing."""
-    height_m, half_deg = getattr(part, "rim_height_m", None), getattr(part, "rim_deg", None)
-    lowest_m = -math.inf if height_m is None else height_m - centre_m
+def pose_and_rim(config: light.SurfaceConfig, center_m: float) -> dict[str, Any]:
+    """Arguments common to all surfaces: center, rim, tilt, survey error. center_m is the height above the bearing."""
+    height_m, half_deg = getattr(config, "rim_height_m", None), getattr(config, "rim_deg", None)
+    lowest_m = -math.inf if height_m is None else height_m - center_m
     half_rad = math.pi if half_deg is None else math.radians(half_deg)
     return {
-        "centre_m": np.array([0.0, 0.0, centre_m]) + part.offset_m,
-        "rim": Rim(np.array([0.0, 0.0, -centre_m]), lowest_m, half_rad),
-        "lab_from_own": Rotation.from_euler("xy", part.tilt_deg, degrees=True),
-        "survey_sigma_m": part.error_m,
+        "center_m": np.array([0.0, 0.0, center_m]) + config.offset_m,
+        "rim": Rim(np.array([0.0, 0.0, -center_m]), lowest_m, half_rad),
+        "lab_from_own": Rotation.from_euler("xy", config.tilt_deg, degrees=True),
+        "survey_sigma_m": config.error_m,
     }
 
 
-def sphere(part: light.SphereSurfaceConfig) -> Surface:
+def sphere(config: light.SphereSurfaceConfig) -> Surface:
     """A sphere with its top at part.apex_m above the bearing, or the inner face of a formed wall."""
-    if part.wall is None:
-        return Ellipsoid(semi_axes_m=np.full(3, part.radius_m), **placed(part, part.apex_m - part.radius_m))
-    thickness_m = (part.wall.thickness_apex_m, part.wall.thickness_base_m)
-    share = {"outside": 1.0, "mid_wall": 0.5}[part.wall.radius_of]
-    law = Shell(part.radius_m, share, thickness_m, math.radians(part.wall.base_deg))
-    return Radial(radius=law, **placed(part, part.apex_m - part.radius_m + share * thickness_m[0]))
+    if config.wall is None:
+        return Ellipsoid(
+            semi_axes_m=np.full(3, config.radius_m), **pose_and_rim(config, config.apex_m - config.radius_m)
+        )
+    thickness_m = (config.wall.thickness_apex_m, config.wall.thickness_base_m)
+    inner_fraction = {"outside": 1.0, "mid_wall": 0.5}[config.wall.radius_of]
+    shell = Shell(config.radius_m, inner_fraction, thickness_m, math.radians(config.wall.base_deg))
+    return Radial(
+        radius=shell,
+        **pose_and_rim(config, config.apex_m - config.radius_m + inner_fraction * thickness_m[0]),
+    )
 
 
-def ellipsoid(part: light.EllipsoidSurfaceConfig) -> Surface:
+def ellipsoid(config: light.EllipsoidSurfaceConfig) -> Surface:
     """An ellipsoid with its top at part.apex_m above the bearing."""
-    axes_m = np.array(part.semi_axes_m)
-    return Ellipsoid(semi_axes_m=axes_m, **placed(part, part.apex_m - axes_m[2]))
+    axes_m = np.array(config.semi_axes_m)
+    return Ellipsoid(semi_axes_m=axes_m, **pose_and_rim(config, config.apex_m - axes_m[2]))
 
 
-def flat(part: light.FlatSurfaceConfig) -> Surface:
+def flat(config: light.FlatSurfaceConfig) -> Surface:
     """A panel with its center at part.apex_m above the bearing."""
-    size_m = [math.inf if one is None else one for one in (part.width_m, part.height_m)]
-    return Plane(half_m=np.array(size_m) / 2, **placed(part, part.apex_m))
+    size_m = [math.inf if side_m is None else side_m for side_m in (config.width_m, config.height_m)]
+    return Plane(half_m=np.array(size_m) / 2, **pose_and_rim(config, config.apex_m))
 
 
-def cylinder(part: light.CylinderSurfaceConfig) -> Surface:
+def cylinder(config: light.CylinderSurfaceConfig) -> Surface:
     """A vault with its top line, or a drum with its upper edge, at part.apex_m above the bearing."""
-    half_m = math.inf if part.length_m is None else part.length_m / 2
-    below_m = half_m if part.axis == "z" else part.radius_m
-    where = placed(part, part.apex_m - below_m)
-    return Cylinder(radius_m=part.radius_m, axis="xyz".index(part.axis), half_length_m=half_m, **where)
+    half_m = math.inf if config.length_m is None else config.length_m / 2
+    below_m = half_m if config.axis == "z" else config.radius_m
+    pose = pose_and_rim(config, config.apex_m - below_m)
+    return Cylinder(radius_m=config.radius_m, axis="xyz".index(config.axis), half_length_m=half_m, **pose)
 
 
-def surveyed(part: light.SurveyedSurfaceConfig) -> Surface:
+def surveyed(config: light.SurveyedSurfaceConfig) -> Surface:
     """A smooth surface fitted to measured points; tilted about the origin of the points. Raises InputError."""
-    found = point_cloud.fit(point_cloud.read(part.file, part.unit), part.degree, part.file)
-    if found.rms_m > part.rms_limit_m:
+    fit = point_cloud.fit(point_cloud.read(config.file, config.unit), config.degree, config.file)
+    if fit.rms_m > config.rms_limit_m:
         raise InputError(
-            f"light.surface.file: {part.file}: the points lie {found.rms_m:.3g} m rms off a smooth surface"
-            f" (worst {found.worst_m:.3g} m); allowed: rms_limit {part.rms_limit_m:g} m, a greater degree, another unit"
+            f"light.surface.file: {config.file}: the points are {fit.rms_m:.3g} m rms off a smooth surface"
+            f" (worst {fit.max_residual_m:.3g} m); allowed: rms_limit {config.rms_limit_m:g} m, a higher degree,"
+            " another unit"
         )
-    where = placed(part, 0.0)
+    pose = pose_and_rim(config, 0.0)
     # The surface's frame has its origin at the best sphere's center; the scene's tilt and rim refer to the points'.
-    where["centre_m"] = part.offset_m + where["lab_from_own"].apply(found.centre_m)
-    where["rim"] = Rim(-found.centre_m, where["rim"].lowest_m - found.centre_m[2], where["rim"].half_rad)
-    told = part.rim_height_m is not None or part.rim_deg is not None
-    if told and where["rim"].holds(found.edge_m()).any():
+    pose["center_m"] = config.offset_m + pose["lab_from_own"].apply(fit.center_m)
+    pose["rim"] = Rim(-fit.center_m, pose["rim"].lowest_m - fit.center_m[2], pose["rim"].half_rad)
+    has_rim = config.rim_height_m is not None or config.rim_deg is not None
+    if has_rim and pose["rim"].contains(fit.edge_m()).any():
         raise InputError(
-            f"light.surface: the points of {part.file} do not reach the rim; allowed: a rim within"
-            f" {np.degrees(found.law.cover_rad):.2f} deg about their best sphere's centre"
+            f"light.surface: the points of {config.file} do not reach the rim; allowed: a rim within"
+            f" {np.degrees(fit.radius.cover_rad):.2f} deg about their best sphere's center"
         )
-    return Radial(radius=found.law, survey=found, **where)
+    return Radial(radius=fit.radius, fit=fit, **pose)
 
 
 SURFACES: dict[str, Callable[[Any], Surface]] = {
@@ -403,31 +398,16 @@ SURFACES: dict[str, Callable[[Any], Surface]] = {
 }
 
 
-def build_surface(part: light.SurfaceConfig) -> Surface:
+def build_surface(config: light.SurfaceConfig) -> Surface:
     """The surface that a scene describes.
 
     Raises InputError unless the bearing's center is inside the surface and sees a part of it.
     """
-    made = SURFACES[part.kind](part)
-    if not made.inside(np.zeros(3)):
-        check = "file, unit, offset" if part.kind == "surveyed" else "apex, sizes and offset"
-        where = "not below the panel" if isinstance(made, Plane) else "outside of the dome"
-        raise InputError(f"light.surface: the bearing's centre is {where}; check {check}")
-    if not len(made.samples_m()):
-        raise InputError(
-            "light.surface: none of it is left above the bearing; check rim, width, height, length"
-        )
-    return made
-
-
-class Inside(Protocol):
-    """The part of a surface's interface that the LED layouts use."""
-
-    def meet(self, origin_m: Floats, rays: Floats) -> Floats:
-        """(N, 3) points where rays from the inside leave it."""
-
-    def inward(self, points_m: Floats) -> Floats:
-        """(N, 3) unit normals toward the inside."""
-
-    def inside(self, point_m: Floats) -> bool:
-        """Whether a point is inside."""
+    surface = SURFACES[config.kind](config)
+    if not surface.inside(np.zeros(3)):
+        check = "file, unit, offset" if config.kind == "surveyed" else "apex, sizes and offset"
+        place = "not below the panel" if isinstance(surface, Plane) else "outside of the dome"
+        raise InputError(f"light.surface: the bearing's center is {place}; check {check}")
+    if not len(surface.samples_m()):
+        raise InputError("light.surface: no part of it is above the bearing; check rim, width, height, length")
+    return surface

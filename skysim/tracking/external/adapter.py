@@ -29,7 +29,7 @@ class ExternalTracker:
         self.program = program
 
     @classmethod
-    def of(
+    def start(
         cls,
         scene: scenes.Scene,
         camera: Camera,
@@ -37,33 +37,33 @@ class ExternalTracker:
         lights: Stars | Leds,
         commands: Mapping[str, str],
     ) -> ExternalTracker:
-        """Start the tracker that the scene names. Raises InputError if there is none, or if it refuses the set-up."""
-        told, name = scene.tracker, scene.tracker.name
-        interface.known(name, commands)
-        setup = set_up(scene, camera, settings, lights)
+        """Start the tracker that the scene names. Raises InputError if it is unknown or refuses the set-up."""
+        config, name = scene.tracker, scene.tracker.name
+        interface.check_tracker_name(name, commands)
+        setup = build_setup(scene, camera, settings, lights)
         if name in commands:
-            parts, kind = process.words(name, commands[name])
-            return cls(process.Program(name, parts, kind, setup, told.time_limit_s))
+            arguments, image_format = process.split_command(name, commands[name])
+            return cls(process.Program(name, arguments, image_format, setup, config.time_limit_s))
         host = [sys.executable, "-m", "skysim.tracking.external.host", name]
         # The child gets this process's import path, so that it finds the same entry points.
-        path = os.pathsep.join(part or os.getcwd() for part in sys.path)
+        path = os.pathsep.join(folder or os.getcwd() for folder in sys.path)
         environment = {**os.environ, "PYTHONPATH": path}
-        return cls(process.Program(name, host, None, setup, told.time_limit_s, environment))
+        return cls(process.Program(name, host, None, setup, config.time_limit_s, environment))
 
-    def look(self, frame: Frame, streak_px: tuple[float, float] | None = None) -> Report:
+    def solve_frame(self, frame: Frame, streak_px: tuple[float, float] | None = None) -> Report:
         """Send a frame; return the tracker's report."""
         picture = Picture(frame.image_dn, frame.index, frame.t_mid_s, frame.exposure_s, streak_px)
         try:
-            return report(self.program.solve(picture))
-        except process.Fault as fault:
-            return Report(Attitude(f"{FAILED}{fault}"), Centroids.none())
+            return to_report(self.program.solve(picture))
+        except process.ProgramError as error:
+            return Report(Attitude(f"{FAILED}{error}"), Centroids.empty())
 
     def solve_centroids(self, centroids: Centroids) -> Attitude:
         """Not supported by external trackers. Raises InputError."""
-        raise InputError(f"tracker.name: {self.program.name} takes frames; allowed under centroids: {OWN}")
+        raise InputError(f"tracker.name: {self.program.name} solves frames, not centroids; allowed: {OWN}")
 
 
-def set_up(scene: scenes.Scene, camera: Camera, settings: Settings, lights: Stars | Leds) -> Setup:
+def build_setup(scene: scenes.Scene, camera: Camera, settings: Settings, lights: Stars | Leds) -> Setup:
     """The set-up sent to the tracker: the same assumed hardware as skysim's own tracker gets."""
     return Setup(
         "icrs" if isinstance(scene.light, StarsConfig) else "lab",
@@ -71,7 +71,7 @@ def set_up(scene: scenes.Scene, camera: Camera, settings: Settings, lights: Star
         camera.width_px,
         camera.height_px,
         camera.focal_px,
-        camera.centre_px,
+        camera.center_px,
         camera.distortion,
         settings.gain_e_dn,
         settings.saturation,
@@ -82,20 +82,20 @@ def set_up(scene: scenes.Scene, camera: Camera, settings: Settings, lights: Star
     )
 
 
-def stars(catalogue: StarCatalog, direction: Floats) -> Stars:
+def star_map(catalog: StarCatalog, direction: Floats) -> Stars:
     """The on-board catalog."""
-    return Stars(catalogue.id, direction, catalogue.v_mag)
+    return Stars(catalog.id, direction, catalog.v_mag)
 
 
-def leds(believed: LedMap, lever: Lever) -> Leds:
+def led_map(leds: LedMap, lever: Lever) -> Leds:
     """The dome map and the camera's mounting."""
-    return Leds(believed.id, believed.position_m, lever.camera_body_m, lever.cam_from_body.as_quat())
+    return Leds(leds.id, leds.position_m, lever.camera_body_m, lever.cam_from_body.as_quat())
 
 
-def report(answer: Answer) -> Report:
+def to_report(answer: Answer) -> Report:
     """Convert a checked answer to a Report. External trackers do not say which star is which."""
     xy_px = answer.centroids_px
-    unknown = np.full(len(xy_px), np.nan)
+    unmeasured = np.full(len(xy_px), np.nan)
     seconds = {} if answer.seconds is None else {"solve": answer.seconds}
     quaternion = answer.cam_from_ref_xyzw
     attitude = Attitude(
@@ -103,4 +103,4 @@ def report(answer: Answer) -> Report:
         None if quaternion is None else Rotation.from_quat(quaternion),
         answer.covariance_rad2,
     )
-    return Report(attitude, Centroids(xy_px, unknown, unknown), seconds)
+    return Report(attitude, Centroids(xy_px, unmeasured, unmeasured), seconds)

@@ -10,47 +10,53 @@ import json
 import os
 import sys
 import time
+from dataclasses import replace
 from typing import IO, Any
 
 import numpy as np
 
 from skysim.core.errors import printable
-from skysim.tracking.external.interface import FAILED, Answer, Picture, Setup, Tracker, checked, entry_points
+from skysim.tracking.external.interface import (
+    FAILED,
+    Answer,
+    Picture,
+    Setup,
+    Tracker,
+    check_answer,
+    entry_points,
+)
 
 
-def picture(header: dict[str, Any], frames: IO[bytes]) -> Picture:
-    """Read a frame: its header is given, its pixels follow on the stream."""
+def receive_picture(header: dict[str, Any], frames: IO[bytes]) -> Picture:
+    """Read the pixels of a frame whose header has been read."""
     count = header["bytes"]
-    image = np.frombuffer(frames.read(count), header["dtype"]).reshape(
-        header["height_px"], header["width_px"]
-    )
+    image = np.frombuffer(frames.read(count), header["dtype"]).reshape(header["height_px"], header["width_px"])
     streak = header["streak_px"]
-    told = (header["frame"], header["t_s"], header["exposure_s"])
-    return Picture(image, *told, None if streak is None else tuple(streak))
+    fields = (header["frame"], header["t_s"], header["exposure_s"])
+    return Picture(image, *fields, None if streak is None else tuple(streak))
 
 
-def why(error: Exception) -> str:
+def describe_error(error: Exception) -> str:
     """An exception as one line."""
     return printable(f"{type(error).__name__}: {error}")
 
 
-def solved(tracker: Tracker, sight: Picture) -> Answer:
+def solve_picture(tracker: Tracker, picture: Picture) -> Answer:
     """The tracker's answer; an exception or an invalid answer becomes an answer with status "failed: ..."."""
     begin_s = time.perf_counter()
     try:
-        answer = tracker.solve(sight)
+        answer = tracker.solve(picture)
         spent_s = time.perf_counter() - begin_s
-        told = checked(answer)
+        return replace(check_answer(answer), seconds=spent_s)
     except Exception as error:
-        return Answer(checked(Answer(FAILED + why(error))).status)
-    return Answer(told.status, told.cam_from_ref_xyzw, told.covariance_rad2, told.centroids_px, spent_s)
+        return Answer(check_answer(Answer(FAILED + describe_error(error))).status)
 
 
-def made(name: str, setup: Setup) -> Tracker:
+def create_tracker(name: str, setup: Setup) -> Tracker:
     """Load an entry point and build its tracker."""
     tracker = entry_points()[name].load()(setup)
     if not callable(getattr(tracker, "solve", None)):
-        raise TypeError(f"a {type(tracker).__name__} has no method solve")
+        raise TypeError(f"{type(tracker).__name__} has no method solve")
     return tracker
 
 
@@ -59,20 +65,20 @@ def main(name: str) -> None:
     frames, answers = sys.stdin.buffer, os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
 
-    def say(told: dict[str, Any]) -> None:
-        answers.write(json.dumps(told) + "\n")
+    def send(reply: dict[str, Any]) -> None:
+        answers.write(json.dumps(reply) + "\n")
         answers.flush()
 
     try:
-        tracker = made(name, Setup.of_tree(json.loads(frames.readline())))
+        tracker = create_tracker(name, Setup.of_tree(json.loads(frames.readline())))
     except Exception as error:
-        say({"ready": False, "status": why(error)})
+        send({"ready": False, "status": describe_error(error)})
         return
-    say({"ready": True})
+    send({"ready": True})
     while line := frames.readline():
         header = json.loads(line)
-        answer = solved(tracker, picture(header, frames))
-        say({"frame": header["frame"], **answer.as_tree()})
+        answer = solve_picture(tracker, receive_picture(header, frames))
+        send({"frame": header["frame"], **answer.as_tree()})
 
 
 if __name__ == "__main__":

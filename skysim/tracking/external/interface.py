@@ -15,7 +15,7 @@ from typing import Any, Literal, Protocol, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from skysim.core.errors import InputError, printable
+from skysim.core.errors import InputError, printable, unknown_name
 
 GROUP = "skysim.trackers"
 OWN = "own"  # the name of skysim's own estimator
@@ -23,13 +23,13 @@ SOLVED = "solved"
 FAILED = "failed: "  # start of the status after an exception, hang, crash or invalid answer
 PROTOCOL = 1  # version, the first key of the set-up
 UNIT_TOLERANCE = 1e-3  # of a quaternion's norm: single precision passes and is normalized
-LARGEST_RAD2 = (2 * np.pi) ** 2  # largest eigenvalue of a covariance: no information
+MAX_RAD2 = (2 * np.pi) ** 2  # largest eigenvalue of a covariance: no information
 EXTRAS = {
     "skysim.tracking.external.tetra3rs:Tetra3rs": ("tetra3rs", "oracle")
 }  # module and extra of the trackers in our own package
-LEAST_RAD2 = 1e-24  # smallest eigenvalue: (0.2 micro-arcseconds)^2
-MOST_CENTROIDS = 100_000
-MOST_TEXT = 300  # characters of a status
+MIN_RAD2 = 1e-24  # smallest eigenvalue: (0.2 micro-arcseconds)^2
+MAX_CENTROIDS = 100_000
+MAX_STATUS_CHARS = 300  # characters of a status
 
 Floats = NDArray[np.float64]
 
@@ -67,7 +67,7 @@ class Setup:
 
     reference  : frame of the attitudes: "icrs" under the stars, "lab" under a dome or on a bench
     time_utc   : ISO 8601, when t_s is 0
-    width_px, height_px, focal_px, centre_px : a pinhole in camera axes, +x right, +y down, +z boresight;
+    width_px, height_px, focal_px, center_px : a pinhole in camera axes, +x right, +y down, +z boresight;
         the center of the first pixel is (0, 0)
     distortion : k1, k2, p1, p2, k3 of Brown and Conrady, in OpenCV's order
     stars, leds: the map; one of them is None
@@ -80,7 +80,7 @@ class Setup:
     width_px: int
     height_px: int
     focal_px: float
-    centre_px: tuple[float, float]
+    center_px: tuple[float, float]
     distortion: tuple[float, float, float, float, float]
     gain_e_dn: float
     saturation_dn: float
@@ -91,18 +91,18 @@ class Setup:
 
     def as_tree(self) -> dict[str, Any]:
         """As a JSON object; arrays become lists."""
-        told: dict[str, Any] = plain(asdict(self))
-        return {"skysim_tracker": PROTOCOL, **told}
+        tree: dict[str, Any] = to_lists(asdict(self))
+        return {"skysim_tracker": PROTOCOL, **tree}
 
     @classmethod
     def of_tree(cls, tree: Mapping[str, Any]) -> Self:
         """The inverse of `as_tree`."""
-        told = {name: value for name, value in tree.items() if name != "skysim_tracker"}
-        for name, part in (("stars", Stars), ("leds", Leds)):
-            if told[name] is not None:
-                told[name] = part(**{key: np.array(value) for key, value in told[name].items()})
-        told["centre_px"], told["distortion"] = tuple(told["centre_px"]), tuple(told["distortion"])
-        return cls(**told)
+        values = {name: value for name, value in tree.items() if name != "skysim_tracker"}
+        for name, map_type in (("stars", Stars), ("leds", Leds)):
+            if values[name] is not None:
+                values[name] = map_type(**{key: np.array(value) for key, value in values[name].items()})
+        values["center_px"], values["distortion"] = tuple(values["center_px"]), tuple(values["distortion"])
+        return cls(**values)
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,18 +140,18 @@ class Answer:
 
     def as_tree(self) -> dict[str, Any]:
         """As a JSON object; entries that are None are left out."""
-        told = {part.name: getattr(self, part.name) for part in fields(self)}
-        return {name: plain(value) for name, value in told.items() if value is not None}
+        values = {item.name: getattr(self, item.name) for item in fields(self)}
+        return {name: to_lists(value) for name, value in values.items() if value is not None}
 
     @classmethod
     def of_tree(cls, tree: Any) -> Self:
         """The inverse of `as_tree`. Raises ValueError for unknown keys or a missing status."""
         if not isinstance(tree, dict) or "status" not in tree:
-            raise ValueError("an answer is an object with a status")
-        known = [part.name for part in fields(cls)]
-        strange = [name for name in tree if name not in known]
-        if strange:
-            raise ValueError(f"{strange[0]!r} is none of {', '.join(known)}")
+            raise ValueError("status: missing; allowed: a JSON object with a status")
+        names = [item.name for item in fields(cls)]
+        unknown = [name for name in tree if name not in names]
+        if unknown:
+            raise ValueError(f"unknown key {unknown[0]!r}; allowed: {', '.join(names)}")
         return cls(**tree)
 
 
@@ -163,50 +163,50 @@ class Tracker(Protocol):
         ...
 
 
-def plain(value: Any) -> Any:
+def to_lists(value: Any) -> Any:
     """Convert arrays to lists, in mappings and sequences at any depth."""
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
     if isinstance(value, Mapping):
-        return {name: plain(inner) for name, inner in value.items()}
-    return [plain(inner) for inner in value] if isinstance(value, list | tuple) else value
+        return {name: to_lists(inner) for name, inner in value.items()}
+    return [to_lists(inner) for inner in value] if isinstance(value, list | tuple) else value
 
 
-def checked(answer: Any) -> Answer:
+def check_answer(answer: Any) -> Answer:
     """Check an answer (shapes of arrays, quaternion, covariance) and normalize its quaternion. Raises ValueError."""
     if not isinstance(answer, Answer):
-        raise ValueError(f"a {type(answer).__name__} is no Answer")
-    status = printable(answer.status)[:MOST_TEXT] if isinstance(answer.status, str) else ""
+        raise ValueError(f"the tracker returned {type(answer).__name__}; allowed: Answer")
+    status = printable(answer.status)[:MAX_STATUS_CHARS] if isinstance(answer.status, str) else ""
     if not status:
-        raise ValueError(f"status {answer.status!r} is no text")
+        raise ValueError(f"status {answer.status!r}; allowed: text")
     quaternion = None
     if answer.cam_from_ref_xyzw is not None:
-        quaternion = unit(numbers(answer.cam_from_ref_xyzw, "cam_from_ref_xyzw", (4,)))
+        quaternion = normalize_quaternion(finite_array(answer.cam_from_ref_xyzw, "cam_from_ref_xyzw", (4,)))
     if (status == SOLVED) != (quaternion is not None):
         raise ValueError(f"status {status!r} {'without' if quaternion is None else 'with'} cam_from_ref_xyzw")
     covariance = answer.covariance_rad2
     if covariance is not None:
-        covariance = spread(numbers(covariance, "covariance_rad2", (3, 3)))
-    seconds = None if answer.seconds is None else float(numbers(answer.seconds, "seconds", ()))
+        covariance = check_covariance(finite_array(covariance, "covariance_rad2", (3, 3)))
+    seconds = None if answer.seconds is None else float(finite_array(answer.seconds, "seconds", ()))
     if seconds is not None and seconds < 0:
-        raise ValueError(f"seconds {seconds:g} is below 0")
-    return Answer(status, quaternion, covariance, places(answer.centroids_px), seconds)
+        raise ValueError(f"seconds {seconds:g}; allowed: 0 or more")
+    return Answer(status, quaternion, covariance, check_centroids(answer.centroids_px), seconds)
 
 
-def numbers(value: Any, name: str, shape: tuple[int, ...]) -> Floats:
+def finite_array(value: Any, name: str, shape: tuple[int, ...]) -> Floats:
     """An array of finite numbers of the given shape. Raises ValueError."""
     try:
         array = np.array(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
-        raise ValueError(f"{name} has other things than numbers") from None
+        raise ValueError(f"{name} is not an array of numbers") from None
     if array.shape != shape:
         raise ValueError(f"{name} has shape {array.shape}; allowed: {shape}")
     if not np.isfinite(array).all():
-        raise ValueError(f"{name} has a number that is not finite")
+        raise ValueError(f"{name} has a value that is not finite")
     return array
 
 
-def unit(quaternion: Floats) -> Floats:
+def normalize_quaternion(quaternion: Floats) -> Floats:
     """Normalize a quaternion whose norm is within UNIT_TOLERANCE of 1. Raises ValueError for others."""
     norm = float(np.linalg.norm(quaternion))
     if abs(norm - 1) > UNIT_TOLERANCE:
@@ -214,25 +214,25 @@ def unit(quaternion: Floats) -> Floats:
     return quaternion / norm
 
 
-def spread(covariance: Floats) -> Floats:
+def check_covariance(covariance: Floats) -> Floats:
     """Check that a covariance is symmetric and positive definite within plausible limits. Raises ValueError."""
     if not np.allclose(covariance, covariance.T, rtol=1e-6, atol=0):
         raise ValueError("covariance_rad2 is not symmetric")
-    axes = np.linalg.eigvalsh(covariance)
-    if axes[0] < LEAST_RAD2 or axes[-1] > LARGEST_RAD2:
+    eigenvalues = np.linalg.eigvalsh(covariance)
+    if eigenvalues[0] < MIN_RAD2 or eigenvalues[-1] > MAX_RAD2:
         raise ValueError(
-            f"covariance_rad2 has eigenvalues {axes[0]:.3g} to {axes[-1]:.3g};"
-            f" allowed: {LEAST_RAD2:g} to {LARGEST_RAD2:.3g}"
+            f"covariance_rad2 has eigenvalues {eigenvalues[0]:.3g} to {eigenvalues[-1]:.3g};"
+            f" allowed: {MIN_RAD2:g} to {MAX_RAD2:.3g}"
         )
     return (covariance + covariance.T) / 2
 
 
-def places(centroids: Any) -> Floats:
+def check_centroids(centroids: Any) -> Floats:
     """(N, 2) centroids as finite numbers; empty for None. Raises ValueError."""
     count = 0 if centroids is None else np.shape(centroids)[0] if np.ndim(centroids) else -1
-    if count > MOST_CENTROIDS:
-        raise ValueError(f"centroids_px has {count} rows; allowed: up to {MOST_CENTROIDS}")
-    return numbers(centroids, "centroids_px", (count, 2)) if count else np.empty((0, 2))
+    if count > MAX_CENTROIDS:
+        raise ValueError(f"centroids_px has {count} rows; allowed: up to {MAX_CENTROIDS}")
+    return finite_array(centroids, "centroids_px", (count, 2)) if count else np.empty((0, 2))
 
 
 def entry_points() -> dict[str, metadata.EntryPoint]:
@@ -240,22 +240,22 @@ def entry_points() -> dict[str, metadata.EntryPoint]:
     return {point.name: point for point in metadata.entry_points(group=GROUP) if point.name != OWN}
 
 
-def release(name: str) -> str:
+def package_release(name: str) -> str:
     """Name and version of the package that offers a tracker; empty for skysim's own and for programs."""
     point = entry_points().get(name) if name != OWN else None
     return f"{point.dist.name} {point.dist.version}" if point and point.dist else ""
 
 
-def needs(point: metadata.EntryPoint) -> str:
+def missing_extra(point: metadata.EntryPoint) -> str:
     """The extra to install for one of skysim's own plug-ins, if it is missing; else empty. Imports nothing."""
-    package = EXTRAS.get(point.value)
-    return f"skysim[{package[1]}]" if package and find_spec(package[0]) is None else ""
+    plugin = EXTRAS.get(point.value)
+    return f"skysim[{plugin[1]}]" if plugin and find_spec(plugin[0]) is None else ""
 
 
-def known(name: str, commands: Mapping[str, str]) -> None:
+def check_tracker_name(name: str, commands: Mapping[str, str]) -> None:
     """Raise InputError for an unknown tracker name."""
     allowed = [OWN, *entry_points(), *commands]
     if name not in allowed:
         raise InputError(
-            f"tracker.name: {name!r} is none of {', '.join(allowed)}; a program takes --program {name}=COMMAND"
+            f"tracker.name: {unknown_name('tracker', name, allowed)}; a program takes --program {name}=COMMAND"
         )

@@ -15,7 +15,7 @@ import numpy as np
 from skysim.core.units import in_utc
 from skysim.tracking.external.interface import SOLVED, Answer, Picture, Setup
 
-WIDER = 1.1  # field of the pattern database over that of the camera
+FIELD_MARGIN = 1.1  # field of the pattern database over that of the camera
 OPTIONS = ("fast", "sigma", "brightest", "limit_mag")
 
 
@@ -25,10 +25,10 @@ class Tetra3rs:
     def __init__(self, setup: Setup) -> None:
         """Raises ValueError for a set-up that it cannot work with, ImportError where tetra3rs is not installed."""
         if setup.reference != "icrs":
-            raise ValueError("tetra3rs knows the stars alone; allowed: scenes with light.kind: stars")
-        strange = [name for name in setup.options if name not in OPTIONS]
-        if strange:
-            raise ValueError(f"tracker.options: {strange[0]!r} is none of {', '.join(OPTIONS)}")
+            raise ValueError("tetra3rs solves star fields only; allowed: scenes with light.kind: stars")
+        unknown = [name for name in setup.options if name not in OPTIONS]
+        if unknown:
+            raise ValueError(f"tracker.options: unknown option {unknown[0]!r}; allowed: {', '.join(OPTIONS)}")
         try:
             import tetra3rs
         except ImportError:
@@ -36,12 +36,12 @@ class Tetra3rs:
         self.options = setup.options
         fast = setup.options.get("fast", False)
         self.extract = tetra3rs.extract_centroids_fast if fast else tetra3rs.extract_centroids
-        self.camera = camera(tetra3rs, setup)
-        self.middle_px = middle_px(setup)
+        self.camera = camera_model(tetra3rs, setup)
+        self.image_center_px = image_center_px(setup)
         moment = in_utc(datetime.datetime.fromisoformat(setup.time_utc))
         self.velocity_km_s = tetra3rs.earth_barycentric_velocity(moment)
         self.database: Any = tetra3rs.SolverDatabase.generate_from_gaia(
-            max_fov_deg=self.camera.fov_deg * WIDER,
+            max_fov_deg=self.camera.fov_deg * FIELD_MARGIN,
             star_max_magnitude=setup.options.get("limit_mag"),
             epoch_proper_motion_year=moment.year + moment.timetuple().tm_yday / 365.25,
         )
@@ -50,37 +50,40 @@ class Tetra3rs:
         """Solve one frame. The quaternion is scalar first, ICRS to camera; the covariance uses other
         angles: left out.
         """
-        found = self.extract(
+        extraction = self.extract(
             picture.image_dn,
             sigma_threshold=self.options.get("sigma", 5.0),
             max_centroids=self.options.get("brightest", 40),
             threads=1,
         )
-        told = self.database.solve_from_centroids(
-            found.centroids, camera_model=self.camera, observer_velocity_km_s=self.velocity_km_s
+        solution = self.database.solve_from_centroids(
+            extraction.centroids, camera_model=self.camera, observer_velocity_km_s=self.velocity_km_s
         )
-        xy_px = np.array([(one.x, one.y) for one in found.centroids]).reshape(-1, 2) + self.middle_px
-        if not told:
-            return Answer(str(told.status).replace("_", " "), centroids_px=xy_px)
-        w, x, y, z = told.quaternion
+        xy_px = (
+            np.array([(centroid.x, centroid.y) for centroid in extraction.centroids]).reshape(-1, 2)
+            + self.image_center_px
+        )
+        if not solution:
+            return Answer(str(solution.status).replace("_", " "), centroids_px=xy_px)
+        w, x, y, z = solution.quaternion
         return Answer(SOLVED, [x, y, z, w], centroids_px=xy_px)
 
 
-def middle_px(setup: Setup) -> Any:
+def image_center_px(setup: Setup) -> Any:
     """(2,) center of the image, the origin of tetra3rs's pixel coordinates."""
     return np.array([(setup.width_px - 1) / 2, (setup.height_px - 1) / 2])
 
 
-def camera(tetra3rs: Any, setup: Setup) -> Any:
+def camera_model(tetra3rs: Any, setup: Setup) -> Any:
     """tetra3rs's camera model: the same distortion polynomial in pixels, so coefficients are divided by powers
     of the focal length.
     """
     f, (k1, k2, p1, p2, k3) = setup.focal_px, setup.distortion
-    bent = tetra3rs.RadialDistortion(k1=k1 / f**2, k2=k2 / f**4, k3=k3 / f**6, p1=p1 / f, p2=p2 / f)
+    distortion = tetra3rs.RadialDistortion(k1=k1 / f**2, k2=k2 / f**4, k3=k3 / f**6, p1=p1 / f, p2=p2 / f)
     return tetra3rs.CameraModel(
         f,
         setup.width_px,
         setup.height_px,
-        crpix=(np.array(setup.centre_px) - middle_px(setup)).tolist(),
-        distortion=bent if any(setup.distortion) else None,
+        crpix=(np.array(setup.center_px) - image_center_px(setup)).tolist(),
+        distortion=distortion if any(setup.distortion) else None,
     )

@@ -23,19 +23,19 @@ from estimator.core.types import ra_dec_roll_rad
 from estimator.identification.published.fialho import VERSIONS, MagnitudeMatch, fialho_2, fialho_4
 from estimator.identification.registry import IDENTIFIERS
 from skysim.core import files, images
-from skysim.core.paths import CATALOGUES, ROOT
+from skysim.core.paths import CATALOGS, ROOT
 from skysim.core.types import Floats
 from skysim.core.units import ARCSEC_RAD
 from skysim.experiments.papers.ptase.monte_carlo import (
     SIGMA_MAG,
     TOLERANCE_RAD,
-    catalogue,
+    catalog,
     drawings,
-    runs_of,
+    run_version,
     version,
 )
 from skysim.results.plots import png
-from skysim.results.report import stretch
+from skysim.results.stretch import to_8bit
 
 SCENE = ("shefex2", "--frames", "1", "--set", "motion.rate_deg_s=[0,0,0]")
 STUDY = """schema: 1
@@ -92,7 +92,7 @@ def looks(row: Any, ra_deg: float, dec_deg: float, roll_deg: float) -> bool:
 
 
 class Field(NamedTuple):
-    """Stars of the catalogue about a direction as PTASE's sensor sees them, brightest first, and their rows."""
+    """Stars of the catalog about a direction as PTASE's sensor sees them, brightest first, and their rows."""
 
     seen: Floats
     magnitude: Floats
@@ -101,8 +101,8 @@ class Field(NamedTuple):
 
 @cache
 def field() -> Field:
-    """Twenty degrees about Orion's belt; camera axes are the catalogue's."""
-    known = catalogue(5.1)
+    """Twenty degrees about Orion's belt; camera axes are the catalog's."""
+    known = catalog(5.1)
     middle = known.vectors[np.argmax(known.vectors @ ORION)]
     rows = np.flatnonzero(known.vectors @ middle > np.cos(np.radians(10)))
     return Field(known.vectors[rows], known.magnitude[rows], rows)
@@ -123,11 +123,9 @@ def identified(found: Any, one: Field) -> bool:
 # The program: what its keys do.
 
 
-def chosen_catalogue(folder: Path) -> bool:
+def chosen_catalog(folder: Path) -> bool:
     count = asked("catalog", "info", "hipparcos_hp6.5")["stars"]
-    return count > 5000 and bool(
-        np.abs(drawn_at(folder, "light.catalogue=hipparcos_hp6.5") - [83, 2, 20]).max() < 1e-3
-    )
+    return count > 5000 and bool(np.abs(drawn_at(folder, "light.catalog=hipparcos_hp6.5") - [83, 2, 20]).max() < 1e-3)
 
 
 def screen(folder: Path) -> bool:
@@ -138,11 +136,7 @@ def screen(folder: Path) -> bool:
 def drawn_at(folder: Path, *sets: str) -> Floats:
     """(3,) right ascension, declination, roll of what is drawn, deg, from the frame's truth."""
     asked("render", *SCENE, "--out", str(folder), *(word for one in sets for word in ("--set", one)))
-    told = [
-        line
-        for line in (folder / "frame_0000.ecsv").read_text("utf-8").splitlines()
-        if "cam_from_lab" in line
-    ]
+    told = [line for line in (folder / "frame_0000.ecsv").read_text("utf-8").splitlines() if "cam_from_lab" in line]
     xyzw = np.array(json.loads(told[0][told[0].index("[") : told[0].index("]") + 1]))
     return np.degrees(ra_dec_roll_rad(Rotation.from_quat(xyzw)))
 
@@ -163,9 +157,7 @@ def coordinates(folder: Path) -> bool:
 
 
 def image_processing(folder: Path) -> bool:
-    row = flown(
-        folder, *("--detector", "local", "--centroider", "gaussian_fit"), "--set", "tracker.threshold_sigma=7"
-    )
+    row = flown(folder, *("--detector", "local", "--centroider", "gaussian_fit"), "--set", "tracker.threshold_sigma=7")
     return looks(row, 83, 2, 20)
 
 
@@ -230,7 +222,7 @@ def log_file(folder: Path) -> bool:
 
 
 def histogram(folder: Path) -> bool:
-    done = {name: runs_of(catalogue(5.1), version(name), 50, 1) for name in ("fialho_2",)}
+    done = {name: run_version(catalog(5.1), version(name), 50, 1) for name in ("fialho_2",)}
     first = drawings(done)[0]
     return len(png(first.draw, first.size_in)) > 1000
 
@@ -252,14 +244,14 @@ def stopped(folder: Path) -> bool:
     return done.returncode == 128 + signal.SIGINT and "stopped" in done.stderr
 
 
-# The catalogue's programs, and what the identifier can do.
+# The catalog's programs, and what the identifier can do.
 
 
 def readcat(folder: Path) -> bool:
     """A limit, the mission's epoch, and instrumental magnitudes; the order is the file's."""
-    path = CATALOGUES / "hipparcos_hp6.5.ecsv"
+    path = CATALOGS / "hipparcos_hp6.5.ecsv"
     plain = ptase.read_cat(path, 5.0)
-    later = ptase.read_cat(path, 5.0, 2010.0, ptase.Colour(0.1, 0.2, 0.0))
+    later = ptase.read_cat(path, 5.0, 2010.0, ptase.Color(0.1, 0.2, 0.0))
     shift = np.linalg.norm(later.vectors - plain.vectors, axis=1) / ARCSEC_RAD
     return bool(
         plain.magnitude.max() <= 5.0
@@ -272,7 +264,7 @@ def readcat(folder: Path) -> bool:
 
 def proc_cat(folder: Path) -> bool:
     """Doubles merged, growing magnitude, the log with its histogram and every star."""
-    plain = ptase.read_cat(CATALOGUES / "hipparcos_hp6.5.ecsv", 5.0)
+    plain = ptase.read_cat(CATALOGS / "hipparcos_hp6.5.ecsv", 5.0)
     done = ptase.proc_cat(plain, 60 * ARCSEC_RAD)
     told = ptase.log(done)
     return bool(
@@ -293,9 +285,7 @@ def attitudes(folder: Path) -> bool:
 
 def true_sky(folder: Path) -> bool:
     asked("render", *SCENE, "--out", str(folder))
-    told = asked("solve", str(folder / "frame_0000.png"), "--fov", "14.87", "--out", str(folder / "solved"))[
-        0
-    ]
+    told = asked("solve", str(folder / "frame_0000.png"), "--fov", "14.87", "--out", str(folder / "solved"))[0]
     return told["status"] == "solved" and abs(told["ra_deg"] - 83) < 0.2 and abs(told["dec_deg"] - 2) < 0.2
 
 
@@ -304,9 +294,9 @@ def from_a_camera(folder: Path) -> bool:
     import cv2
 
     asked("render", *SCENE, "--out", str(folder))
-    grey = stretch(images.read_image(folder / "frame_0000.png"))
-    video = cv2.VideoWriter(str(folder / "camera.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 10, grey.shape[::-1])
-    video.write(cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR))
+    gray = to_8bit(images.read_image(folder / "frame_0000.png"), "square root")
+    video = cv2.VideoWriter(str(folder / "camera.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 10, gray.shape[::-1])
+    video.write(cv2.cvtColor(gray, cv2.COLOR_GRAY2BGR))
     video.release()
     told = asked("solve", "--live", str(folder / "camera.avi"), "--fov", "14.87", "--out", str(folder))[0]
     return told["status"] == "solved" and abs(told["ra_deg"] - 83) < 0.2 and abs(told["dec_deg"] - 2) < 0.2
@@ -314,25 +304,18 @@ def from_a_camera(folder: Path) -> bool:
 
 def estimate(folder: Path) -> bool:
     """With a hint near the axis the stars are named; with a wrong one there is nothing to be named from."""
-    one, known = field(), catalogue(5.1)
+    one, known = field(), catalog(5.1)
     axis = one.seen.mean(axis=0) / np.linalg.norm(one.seen.mean(axis=0))
     told = {"magnitude": one.magnitude, "epsilon_mag": SIGMA_MAG, "within_rad": np.radians(15)}
     right = fialho_2(one.seen, known, TOLERANCE_RAD, boresight_ref=axis, **told)
-    return (
-        identified(right, one)
-        and fialho_2(one.seen, known, TOLERANCE_RAD, boresight_ref=-axis, **told) is None
-    )
+    return identified(right, one) and fialho_2(one.seen, known, TOLERANCE_RAD, boresight_ref=-axis, **told) is None
 
 
 def false_stars(folder: Path) -> bool:
     """Three false lights, brighter than all stars: the first triangle is none."""
-    one, known = field(), catalogue(5.1)
+    one, known = field(), catalog(5.1)
     side = np.cross(one.seen[0], [0.0, 0.0, 1.0])
-    false = (
-        one.seen.mean(axis=0)
-        + np.outer([0.05, -0.07, 0.11], side)
-        + [[0.0, 0.0, z] for z in (0.06, 0.02, -0.09)]
-    )
+    false = one.seen.mean(axis=0) + np.outer([0.05, -0.07, 0.11], side) + [[0.0, 0.0, z] for z in (0.06, 0.02, -0.09)]
     seen = np.vstack([false / np.linalg.norm(false, axis=1, keepdims=True), one.seen])
     light = np.append([-1.5, -1.4, -1.3], one.magnitude)
     told = {"magnitude": light, "epsilon_mag": SIGMA_MAG}
@@ -344,7 +327,7 @@ def false_stars(folder: Path) -> bool:
 
 def magnitude_errors(folder: Path) -> bool:
     """Mean and variance come back: magnitudes off by .1 with an alternating .05 about it."""
-    one, known = field(), catalogue(5.1)
+    one, known = field(), catalog(5.1)
     off = 0.1 + 0.05 * (-1.0) ** np.arange(len(one.rows))
     told = {"magnitude": one.magnitude + off, "epsilon_mag": SIGMA_MAG}
     found = fialho_4(one.seen, known, TOLERANCE_RAD, **told)
@@ -354,7 +337,7 @@ def magnitude_errors(folder: Path) -> bool:
 
 
 CHECKS: dict[str, Check] = {
-    "catalogue": chosen_catalogue,
+    "catalog": chosen_catalog,
     "screen": screen,
     "arrows": moved,
     "roll": rolled,

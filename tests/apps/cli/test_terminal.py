@@ -9,7 +9,7 @@ import pytest
 
 from skysim.apps.cli import terminal
 from skysim.experiments.study.execution.runner import Progress
-from skysim.tracking.external.interface import Answer, checked
+from skysim.tracking.external.interface import Answer, check_answer
 
 HOSTILE = "m[red].png [/b] no match [/tmp/x] :bug: \\"
 
@@ -43,6 +43,6 @@ def test_bars_show_a_title_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_what_a_tracker_says_moves_no_cursor(capsys: pytest.CaptureFixture[str]) -> None:
-    assert checked(Answer("lost \x1b[2J\x07\ud800 in\u202e space")).status == "lost ?[2J?? in? space"
+    assert check_answer(Answer("lost \x1b[2J\x07\ud800 in\u202e space")).status == "lost ?[2J?? in? space"
     terminal.print_error("a\x1b[31m.png: no such\nfile")
     assert capsys.readouterr().err == "skysim: a?[31m.png: no such file\n"

@@ -40,13 +40,11 @@ class Server:
             free.bind(("127.0.0.1", 0))
             self.port = free.getsockname()[1]
         self.folder, self.out = folder, folder / "out"
-        command = [sys.executable, "-m", "skysim", "lab", "shefex2", "--no-open", "--port", str(self.port)]
+        command = [sys.executable, "-m", "skysim", "gui", "shefex2", "--no-open", "--port", str(self.port)]
         place = ["--host", host, "--folder", str(folder), "--out", str(self.out)]
         # With pytest's own variable NiceGUI takes the server for a test of itself.
         environment = {name: value for name, value in os.environ.items() if name != "PYTEST_CURRENT_TEST"}
-        self.process = subprocess.Popen(
-            [*command, *place, *told], cwd=ROOT, env=environment, start_new_session=True
-        )
+        self.process = subprocess.Popen([*command, *place, *told], cwd=ROOT, env=environment, start_new_session=True)
         self.url = f"http://127.0.0.1:{self.port}/"
 
     def __enter__(self) -> Server:
@@ -88,7 +86,7 @@ class Server:
 @pytest.fixture(scope="session")
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
     """The server of most tests."""
-    pytest.importorskip("nicegui", reason="the extra `lab` is not installed")
+    pytest.importorskip("nicegui", reason="the extra `gui` is not installed")
     with Server(tmp_path_factory.mktemp("lab")) as found:
         yield found
 
@@ -98,9 +96,7 @@ def browser() -> Iterator[Any]:
     """Chromium without a screen."""
     playwright = pytest.importorskip("playwright.sync_api", reason="the extra `browser` is not installed")
     with playwright.sync_playwright() as driver:
-        found = driver.chromium.launch(
-            executable_path=CHROMIUM, args=["--no-sandbox", "--enable-unsafe-swiftshader"]
-        )
+        found = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox", "--enable-unsafe-swiftshader"])
         yield found
         found.close()
 
@@ -173,9 +169,7 @@ def source(page: Any) -> str:
 
 def changed(page: Any, before: str) -> None:
     """Wait for another frame."""
-    page.wait_for_function(
-        "before => document.querySelector('.lab-frame canvas').dataset.frame !== before", arg=before
-    )
+    page.wait_for_function("before => document.querySelector('.lab-frame canvas').dataset.frame !== before", arg=before)
 
 
 def come(true: Callable[[], bool], within_s: float = QUICK_MS / 1000) -> bool:

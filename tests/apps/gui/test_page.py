@@ -52,7 +52,7 @@ pytestmark = [pytest.mark.browser, pytest.mark.skipif(not CHROMIUM, reason="Chro
 
 
 def test_it_shows_a_solved_frame_with_names_and_a_map_of_keys(page: Any) -> None:
-    assert re.match(r"solved; \d+ of \d+ lights named", status(page, "solved"))
+    assert re.match(r"solved; \d+ of \d+ lights identified", status(page, "solved"))
     page.get_by_role("img", name="Mintaka").wait_for()  # of Orion's belt
     shown = page.locator(".lab-keys").first.inner_text()
     assert all(name in shown for name in ("F1", "F5", "F6", "F7", "F8", "F10", "E R", "1", "2"))
@@ -133,15 +133,13 @@ def test_an_attitude_is_typed_and_1_identifies_it(page: Any) -> None:
 def test_every_export_reads_back(page: Any, tmp_path: Path) -> None:
     kept = {name: exported(page, name, tmp_path) for name in ("truth", "solution", "figure", "scene")}
     frame = fits.getdata(exported(page, "frame, FITS", tmp_path))
-    grey = cv2.imread(str(exported(page, "frame, PNG", tmp_path)), cv2.IMREAD_UNCHANGED)
-    np.testing.assert_array_equal(grey, frame)
+    gray = cv2.imread(str(exported(page, "frame, PNG", tmp_path)), cv2.IMREAD_UNCHANGED)
+    np.testing.assert_array_equal(gray, frame)
     truth, told = Table.read(kept["truth"]), json.loads(kept["solution"].read_text())
     assert f"{len(truth)} true lights" in page.locator(".lab-frame canvas").get_attribute("aria-label")
     np.testing.assert_allclose(told["angles_deg"], angles(page), rtol=0, atol=0.01)
     assert cv2.imread(str(kept["figure"])).shape[2] == 3
-    assert loader.load(kept["scene"]).model_dump() | {"stem": ""} == loader.load("shefex2").model_dump() | {
-        "stem": ""
-    }
+    assert loader.load(kept["scene"]).model_dump() | {"stem": ""} == loader.load("shefex2").model_dump() | {"stem": ""}
     with zipfile.ZipFile(exported(page, "all of them", tmp_path)) as archive:
         assert set(archive.namelist()) == {path.name for path in tmp_path.iterdir() if path.suffix != ".zip"}
         assert archive.read("frame.png") == (tmp_path / "frame.png").read_bytes()
@@ -275,9 +273,7 @@ def test_a_dropped_picture_is_solved_shown_or_refused(page: Any, tmp_path: Path)
     page.mouse.click(*screen(page, photo.shape[::-1], 600, 400))
     for x, y, dn in pixels(page):  # the picture's, not the scene's
         assert abs(dn - int(photo[y, x])) <= 2
-    noise, broken, program, large = (
-        tmp_path / f"{name}" for name in ("noise.png", "broken.png", "a.exe", "large.png")
-    )
+    noise, broken, program, large = (tmp_path / f"{name}" for name in ("noise.png", "broken.png", "a.exe", "large.png"))
     cv2.imwrite(str(noise), np.random.default_rng(1).integers(90, 110, (480, 640), dtype=np.uint8))
     page.set_input_files("input[type=file]", noise)
     page.get_by_text(re.compile(r"noise\.png: (?!solved|solving)")).wait_for()
@@ -287,9 +283,9 @@ def test_a_dropped_picture_is_solved_shown_or_refused(page: Any, tmp_path: Path)
         file.truncate(65 * 2**20)
     for path, why in (
         (broken, "cannot be decoded"),
-        (program, "not taken"),
+        (program, "refused; allowed"),
         (broken, "cannot be decoded"),
-        (large, "not taken"),
+        (large, "refused; allowed"),
     ):
         page.set_input_files("input[type=file]", path)
         page.get_by_role("status").filter(has_text=why).wait_for()
@@ -323,13 +319,11 @@ def test_a_live_camera_is_followed_to_its_end(page: Any, tmp_path: Path) -> None
     page.set_input_files("input[type=file]", ROOT / "docs" / "images" / "sky.jpg")
     still = rolled(page, "sky.jpg")
     page.get_by_label("live camera").fill(str(tmp_path / "clip.avi"))
-    page.get_by_role("button", name="Look").click()
+    page.get_by_role("button", name="Watch").click()
     page.get_by_role("status").filter(has_text="ends after 2 frames").wait_for()
     turned = rolled(page, "camera")
-    np.testing.assert_allclose(
-        still - turned, 10, rtol=0, atol=0.05
-    )  # the last frame's; the sky turns the other way
-    page.get_by_role("button", name="Look").wait_for()
+    np.testing.assert_allclose(still - turned, 10, rtol=0, atol=0.05)  # the last frame's; the sky turns the other way
+    page.get_by_role("button", name="Watch").wait_for()
     identified(page)
 
 
@@ -352,7 +346,7 @@ def test_a_scene_is_saved_opened_again_and_not_overwritten(page: Any, server: Se
     panel(page, "Scene")
     page.get_by_placeholder("find a key").fill("focal_length")
     set_to(page, "camera.focal_length", "45 mm")
-    for told in ("saved as mine.yaml", "mine.yaml: is there already"):
+    for told in ("saved as mine.yaml", "mine.yaml: file exists"):
         page.get_by_placeholder("new-name").fill("mine")
         page.get_by_role("button", name="Save as").click()
         page.get_by_role("status").filter(has_text=told).wait_for()

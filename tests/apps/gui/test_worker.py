@@ -34,7 +34,7 @@ def test_a_dome_is_flown_played_sought_and_its_loop_opened(page: Any) -> None:
     page.get_by_text("SimSat slews on its reaction wheels").wait_for()
     status(page, "solved")
     panel(page, "Run")
-    page.get_by_role("button", name="Fly").click()
+    page.get_by_role("button", name="Simulate").click()
     page.get_by_text(re.compile(r"^[1-9]\.\d\d s$")).wait_for()  # plays by itself
     assert status(page, "solved")
     play, clock = page.get_by_role("button", name="Play"), page.get_by_text(re.compile(r"^\d+\.\d\d s$"))
@@ -67,7 +67,7 @@ def test_a_dome_is_flown_played_sought_and_its_loop_opened(page: Any) -> None:
         panel(page, "Run")
         feedback.filter(has_text=loop).wait_for()
     chosen(page, "Feedback", "closed by the filter")
-    page.get_by_role("status").filter(has_text="filter takes the section filter").wait_for()
+    page.get_by_role("status").filter(has_text="filter requires the section filter").wait_for()
 
 
 def test_monte_carlo_is_stopped_goes_on_and_a_failed_trial_is_seen_again(second: Any, server: Server) -> None:
@@ -78,7 +78,7 @@ def test_monte_carlo_is_stopped_goes_on_and_a_failed_trial_is_seen_again(second:
     grows = second.get_by_text(re.compile(r"^[1-9]\d* of 5000 trials"))
     grows.wait_for()
     second.get_by_role("button", name="Stop").click()
-    stopped = second.get_by_text("trials: stopped, Start goes on").inner_text()
+    stopped = second.get_by_text("trials; stopped, Start continues").inner_text()
     assert server.come_to("study", 0) == 0
     folders = sorted(server.out.iterdir())
     second.get_by_role("button", name="Start").click()
@@ -123,13 +123,9 @@ def test_a_page_for_others_takes_its_token_and_no_other_site_s_word(
     browser: Any, server: Server, tmp_path: Path
 ) -> None:
     assert server.status(Host="evil.example") == 403
-    assert (
-        server.status("_nicegui_ws/socket.io/?EIO=4&transport=polling", Origin="http://evil.example") == 403
-    )
+    assert server.status("_nicegui_ws/socket.io/?EIO=4&transport=polling", Origin="http://evil.example") == 403
     with Server(tmp_path, "--token", "right", host="0.0.0.0") as others:
-        assert [others.status(path) for path in ("", "?token=wrong", "?token=%C3%A9", "frame/x/1")] == [
-            401
-        ] * 4
+        assert [others.status(path) for path in ("", "?token=wrong", "?token=%C3%A9", "frame/x/1")] == [401] * 4
         with opened(browser, others.url + "?token=right", NARROW) as page:
             assert "token" not in page.url
             status(page, "solved")

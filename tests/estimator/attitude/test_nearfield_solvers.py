@@ -65,7 +65,7 @@ def agrees(squares: np.ndarray, published: float) -> bool:
 
 def compare(method: str, surface: str, tilts: tuple[int, ...], trials: int) -> None:
     for tilt in tilts:
-        errors = bench.errors_deg(method, bench.BENCHES[surface], tilt, trials, seed=70 + tilt)
+        errors = bench.errors_deg(method, bench.GEOMETRIES[surface], tilt, trials, seed=70 + tilt)
         square = errors**2
         for published, squares in (
             (PUBLISHED.get((method, surface), {}).get(tilt), square[:, 0] + square[:, 1]),
@@ -86,17 +86,17 @@ def test_the_reference_s_whole_table(method: str, surface: str) -> None:
     compare(method, surface, (0, 10, 20, 30), 500)
 
 
-@pytest.mark.parametrize("surface", bench.BENCHES)
+@pytest.mark.parametrize("surface", bench.GEOMETRIES)
 @pytest.mark.parametrize("method", EXACT)
 def test_an_exact_method_is_exact_under_every_surface(method: str, surface: str) -> None:
-    one = bench.BENCHES[surface]
+    one = bench.GEOMETRIES[surface]
     worst = max(np.abs(bench.errors_deg(method, one, tilt, 8, seed=71)).max() for tilt in one.tilts_deg[1::2])
     # The issue's bar, degrees; a pattern's two fits close together cost the six-DoF solve some digits.
     assert worst < 1e-9
 
 
 def test_rays_on_the_true_sphere_are_exact_too() -> None:
-    assert np.abs(bench.errors_deg("ray_on_surface", bench.BENCHES["sphere"], 30, 30, seed=72)).max() < 1e-11
+    assert np.abs(bench.errors_deg("ray_on_surface", bench.GEOMETRIES["sphere"], 30, 30, seed=72)).max() < 1e-11
 
 
 def test_stars_at_infinity_err_by_the_pattern_s_middle() -> None:
@@ -105,7 +105,7 @@ def test_stars_at_infinity_err_by_the_pattern_s_middle() -> None:
     With N lights over a field of half-tangents (h, v) its rms is sqrt((h^2 + v^2) / 3 N).
     """
     for surface in ("sphere", "NPS flat at 1 m"):
-        one = bench.BENCHES[surface]
+        one = bench.GEOMETRIES[surface]
         half = np.array([one.camera.width_px, one.camera.height_px]) / 2 / one.camera.focal_px
         middle = np.sqrt(half @ half / 3 / one.lights)
         law_deg = np.degrees(middle * one.lever_m / one.radius_m)
@@ -117,7 +117,7 @@ def test_stars_at_infinity_err_by_the_pattern_s_middle() -> None:
 
 def test_nine_lights_under_the_nps_panel_err_as_the_reference_says() -> None:
     """Reference section 5: infinity 1.48-1.54, rays on a sphere .05 at 0 to .16 at 15 deg. NPS lit nine."""
-    one = bench.BENCHES["NPS flat at 1 m"]
+    one = bench.GEOMETRIES["NPS flat at 1 m"]
     for method, tilt, low, high in (
         ("infinity", 0, 1.475, 1.545),
         ("ray_on_surface", 15, 0.155, 0.165),
@@ -134,7 +134,7 @@ def noise_alone(
 
     The errors are counted from what the method says without noise; for an exact one that is the truth.
     """
-    rng, one = np.random.default_rng(seed), bench.BENCHES[surface]
+    rng, one = np.random.default_rng(seed), bench.GEOMETRIES[surface]
     errors, claimed = np.empty((trials, 3)), np.empty((trials, 3, 3))
     for n in range(trials):
         clean = bench.trial(one, tilt, rng)
@@ -169,7 +169,7 @@ def test_every_covariance_is_that_of_the_noise(method: str, surface: str) -> Non
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("surface", bench.BENCHES)
+@pytest.mark.parametrize("surface", bench.GEOMETRIES)
 @pytest.mark.parametrize("method", ["infinity", "thesis", "tappe", "ray_on_surface"])
 def test_every_covariance_holds_within_ten_per_cent(method: str, surface: str) -> None:
     errors, claimed = noise_alone(method, surface, 15, 2000, seed=77)
@@ -181,7 +181,7 @@ def test_the_place_unknown_costs_a_thousand_in_cross() -> None:
     """Reference section 5: .206 deg against .00021, the median sigma on one axis, five lights, .1 px, 15 deg."""
     sigma_deg = {}
     for method in ("pnp", "rotation_only"):
-        rng, one = np.random.default_rng(78), bench.BENCHES["measured ellipsoid"]
+        rng, one = np.random.default_rng(78), bench.GEOMETRIES["measured ellipsoid"]
         claimed = [bench.solved(method, one, bench.trial(one, 15, rng))[1] for _ in range(100)]
         sigma_deg[method] = np.degrees(np.median([np.sqrt(np.trace(c[:2, :2]) / 2) for c in claimed]))
     # 100 patterns, whose sigmas spread by half: the median to 1.25 * .5 / sqrt(100) = 6 %; the exact one's by a tenth.
@@ -199,21 +199,21 @@ def test_an_update_of_the_distances_leaves_a_small_share_of_the_error(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """The share that Tappe's first update leaves: the off-axis angle of a light times M / R times the same again."""
-    one = bench.BENCHES["sphere"]
-    monkeypatch.setattr(nearfield, "UPDATES", 1)
+    one = bench.GEOMETRIES["sphere"]
+    monkeypatch.setattr(nearfield, "MAX_UPDATES", 1)
     off_deg = np.linalg.norm(bench.errors_deg("tappe", one, 20, 50, seed=80), axis=1)
     start_deg = np.degrees(bench.START_OFF_RAD)
     corner = np.hypot(800, 600) / one.camera.focal_px
     # The roll alone is found from the pattern's breadth, which is as small as the lever's share: hence its factor.
     assert 1e-6 < np.median(off_deg) / start_deg < corner
-    monkeypatch.setattr(nearfield, "UPDATES", 5)
+    monkeypatch.setattr(nearfield, "MAX_UPDATES", 5)
     assert np.abs(bench.errors_deg("tappe", one, 20, 50, seed=80)).max() < np.median(off_deg) * 1e-3
 
 
 @pytest.mark.parametrize("method", SOLVERS)
 def test_an_askew_camera_and_its_body_axes(method: str) -> None:
     """A camera turned on its mount sees the same: its body is the straight one's, turned, and so is the covariance."""
-    rng, one = np.random.default_rng(81), bench.BENCHES["measured ellipsoid"]
+    rng, one = np.random.default_rng(81), bench.GEOMETRIES["measured ellipsoid"]
     mount = Rotation.from_euler("xyz", [0.4, -0.7, 1.1])  # cam_from_body
     straight = bench.trial(one, 20, rng, 0.1)
     rays, sigma = one.camera.rays(straight.pixels), np.full(5, 1e-5)
@@ -223,18 +223,18 @@ def test_an_askew_camera_and_its_body_axes(method: str) -> None:
     body_from_lab, spread_body = SOLVERS[method](*here, askew, mount.inv() * straight.start)
     # A sum of squares tells rounding to 1e-8 of a deviation; the six-DoF solve stops by it, in a flat valley.
     assert (mount * body_from_lab * cam_from_lab.inv()).magnitude() < 1e-5 * np.sqrt(np.trace(spread_cam))
-    turned = mount.as_matrix() @ spread_body @ mount.as_matrix().T
-    np.testing.assert_allclose(turned, spread_cam, rtol=0, atol=1e-5 * np.abs(spread_cam).max())
+    in_camera = mount.as_matrix() @ spread_body @ mount.as_matrix().T
+    np.testing.assert_allclose(in_camera, spread_cam, rtol=0, atol=1e-5 * np.abs(spread_cam).max())
 
 
 def test_what_a_method_cannot_do_is_refused() -> None:
-    one = bench.BENCHES["sphere"]
+    one = bench.GEOMETRIES["sphere"]
     clean = bench.trial(one, 10, np.random.default_rng(82))
     rays, sigma, place = one.camera.rays(clean.pixels), np.full(5, 1e-5), clean.leds.position_m
-    with pytest.raises(ValueError, match="3 lights leave the camera's place unknown; 4 are needed"):
+    with pytest.raises(ValueError, match="3 rays do not determine the camera's position; 4 are needed"):
         nearfield.pnp(rays[:3], sigma[:3], place[:3], clean.leds, one.lever, clean.truth)
     same = np.tile(place[0], (5, 1))
-    with pytest.raises(ValueError, match=r"place|parallel"):
+    with pytest.raises(ValueError, match=r"position|parallel"):
         nearfield.pnp(np.tile(rays[0], (5, 1)), sigma, same, clean.leds, one.lever, clean.truth)
     wide = np.array([[0.8, 0, 0.6], [0, 0.1, 1], [0.1, 0, 1], [0, 0, 1], [0.1, 0.1, 1]])
     with pytest.raises(ValueError, match=r"eq\. 44 has no root: a ray is 45 deg off"):

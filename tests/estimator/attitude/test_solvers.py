@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 from estimator.attitude import wahba as kernel
 from estimator.attitude.solvers import SOLVERS, Solver, covariance, quest
 from estimator.core.types import ra_dec_roll_rad
-from estimator.core.vectors import xyzw_of
+from estimator.core.vectors import quaternion_xyzw
 
 ARCSEC_RAD = np.pi / 180 / 3600
 FOV_RAD, WIDTH_PX = np.radians(14.87), 659
@@ -29,7 +29,7 @@ every_optimal = pytest.mark.parametrize("solve", OPTIMAL.values(), ids=OPTIMAL)
 every_solver = pytest.mark.parametrize("solve", SOLVERS.values(), ids=SOLVERS)
 
 
-def apart_rad(a: Rotation, b: Rotation) -> float:
+def error_rad(a: Rotation, b: Rotation) -> float:
     return (a * b.inv()).magnitude()
 
 
@@ -43,7 +43,7 @@ def test_each_is_the_svd_s_rotation(count: int, solve: Solver) -> None:
         cam = unit(truth.apply(ref) + sigma[:, None] * rng.normal(size=(count, 3)))
         oracle, _ = Rotation.align_vectors(cam, ref, weights=1 / sigma**2)
         # 1e-10: the SVD of two directions a few degrees apart has lost some digits itself.
-        assert apart_rad(solve(cam, ref, sigma), oracle) < 1e-10
+        assert error_rad(solve(cam, ref, sigma), oracle) < 1e-10
 
 
 @pytest.mark.parametrize("count", [2, 5, 15])
@@ -55,7 +55,7 @@ def test_quest_is_the_svd_s_rotation_in_a_star_tracker_s_field(count: int) -> No
         ref = truth.inv().apply(seen)
         oracle, _ = Rotation.align_vectors(cam, ref)
         # Stars 0.1 rad apart cost the SVD a factor of 1e4 (their spread squared) and two of them more.
-        assert apart_rad(quest(cam, ref, np.ones(count)), oracle) < 1e-8
+        assert error_rad(quest(cam, ref, np.ones(count)), oracle) < 1e-8
 
 
 @every_solver
@@ -67,7 +67,7 @@ def test_directions_close_together_keep_their_digits(half_rad: float, solve: Sol
         truth = Rotation.random(rng=rng)
         cam = half_rad * np.array([[1, 0], [-0.5, 0.9], [-0.5, -0.9]]) * rng.uniform(0.5, 1, (3, 1))
         cam = unit(np.column_stack([cam, np.ones(3)]))
-        assert apart_rad(solve(cam, truth.inv().apply(cam), np.ones(3)), truth) < 20 * 2.2e-16 / half_rad
+        assert error_rad(solve(cam, truth.inv().apply(cam), np.ones(3)), truth) < 20 * 2.2e-16 / half_rad
 
 
 @every_solver
@@ -78,7 +78,7 @@ def test_directions_on_one_great_circle_are_enough(solve: Solver) -> None:
         cam = np.column_stack([np.sin(angle), 1e-9 * rng.normal(size=6), np.cos(angle)])
         cam = unit(cam)
         # 1e-13: rounding over a spread of 0.06 rad.
-        assert apart_rad(solve(cam, truth.inv().apply(cam), np.ones(6)), truth) < 1e-13
+        assert error_rad(solve(cam, truth.inv().apply(cam), np.ones(6)), truth) < 1e-13
 
 
 AXES = {
@@ -104,7 +104,7 @@ def test_half_turns_about_any_axis(axis: str, short_of_rad: float, solve: Solver
             ref = in_field(rng, count) if count == 8 else unit(rng.normal(size=(count, 3)))
             cross = np.linalg.norm(np.cross(ref[0], ref[1]))
             # Rounding over the angle between the directions.
-            assert apart_rad(solve(truth.apply(ref), ref, np.ones(count)), truth) < 1e-14 / min(cross, 0.1)
+            assert error_rad(solve(truth.apply(ref), ref, np.ones(count)), truth) < 1e-14 / min(cross, 0.1)
 
 
 QUARTER_TURNS = list(Rotation.create_group("O"))
@@ -113,12 +113,10 @@ QUARTER_TURNS = list(Rotation.create_group("O"))
 @every_solver
 @pytest.mark.parametrize("truth", QUARTER_TURNS, ids=range(24))
 @pytest.mark.parametrize("count", [2, 3])
-def test_the_axes_themselves_in_all_24_orientations_of_a_cube(
-    truth: Rotation, count: int, solve: Solver
-) -> None:
+def test_the_axes_themselves_in_all_24_orientations_of_a_cube(truth: Rotation, count: int, solve: Solver) -> None:
     # Exact zeros and ones: where a quaternion's parts vanish altogether.
     ref = np.eye(3)[:count]
-    assert apart_rad(solve(truth.apply(ref), ref, np.ones(count)), truth) < 1e-14  # rounding
+    assert error_rad(solve(truth.apply(ref), ref, np.ones(count)), truth) < 1e-14  # rounding
 
 
 @every_optimal
@@ -126,8 +124,8 @@ def test_a_better_star_weighs_more(solve: Solver) -> None:
     # Of two pairs of directions that disagree by 0.1 rad of roll, the hundred times better decides but for 1e-4.
     ref = np.array([[1.0, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]])
     cam = np.vstack([ref[:2], Rotation.from_rotvec([0, 0, 0.1]).apply(ref[2:])])
-    turned = solve(cam, ref, np.array([1.0, 1, 100, 100])).as_rotvec()
-    assert turned[2] == pytest.approx(0.1e-4, rel=1e-2)
+    rotated = solve(cam, ref, np.array([1.0, 1, 100, 100])).as_rotvec()
+    assert rotated[2] == pytest.approx(0.1e-4, rel=1e-2)
 
 
 @every_solver
@@ -147,9 +145,9 @@ def test_parallel_directions_are_refused(vectors: np.ndarray, solve: Solver) -> 
 
 
 @every_solver
-def test_stars_that_are_one_in_the_camera_or_one_in_the_catalogue_are_refused(solve: Solver) -> None:
-    apart, alike = np.eye(3)[:2], np.eye(3)[[0, 0]]
-    for cam, ref in ((apart, alike), (alike, apart)):
+def test_stars_that_are_one_in_the_camera_or_one_in_the_catalog_are_refused(solve: Solver) -> None:
+    distinct, identical = np.eye(3)[:2], np.eye(3)[[0, 0]]
+    for cam, ref in ((distinct, identical), (identical, distinct)):
         with pytest.raises(ValueError, match="all vectors are parallel"):
             solve(cam, ref, np.ones(2))
 
@@ -184,7 +182,7 @@ def test_bad_directions_are_one_clear_line(
 
 
 def same_data(case: str, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Noisy directions in camera axes and their catalogue's, and sigmas that differ by a factor of three."""
+    """Noisy directions in camera axes and their catalog's, and sigmas that differ by a factor of three."""
     count = {"two stars": 2, "two close stars": 2, "a few stars": 5}.get(case, 15)
     seen = in_field(rng, count)
     if case == "two close stars":
@@ -220,8 +218,8 @@ def test_all_methods_give_the_same_optimum_on_the_same_data(case: str) -> None:
         answers = Rotation.concatenate([solve(cam, ref, sigma) for solve in solvers.values()])
         assert (answers * answers[0].inv()).magnitude().max() < 1e-10
         # An optimum: the gradient of Wahba's loss, sum(w a x cam), vanishes to the rounding of its terms.
-        turned, weight = answers[0].apply(ref), sigma**-2 / np.sum(sigma**-2)
-        assert np.abs(weight @ np.cross(turned, cam)).max() < 4e-16
+        rotated, weight = answers[0].apply(ref), sigma**-2 / np.sum(sigma**-2)
+        assert np.abs(weight @ np.cross(rotated, cam)).max() < 4e-16
 
 
 RAW = {
@@ -242,7 +240,7 @@ def davenport_matrix(B: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("name", RAW)
 @pytest.mark.parametrize("half_turn", [False, True])
 def test_each_bare_method_solves_davenport_s_equation_itself(name: str, half_turn: bool) -> None:
-    # Over the whole sky the bare methods need no polish: K q = x q, x the greatest eigenvalue (numpy's).
+    # Over the whole sky the bare methods need no refinement: K q = x q, x the greatest eigenvalue (numpy's).
     rng = np.random.default_rng(51)
     for _ in range(200):
         ref, sigma = unit(rng.normal(size=(6, 3))), rng.uniform(1e-4, 1e-2, 6)
@@ -275,7 +273,7 @@ def test_the_bare_quest_loses_in_a_narrow_field_what_the_polish_brings_back() ->
     for _ in range(50):
         cam, ref, sigma = same_data("two close stars", rng)
         B = np.einsum("n,ni,nj->ij", sigma**-2 / np.sum(sigma**-2), cam, ref)
-        worst = max(worst, apart_rad(Rotation.from_matrix(kernel.raw_quest(B)), quest(cam, ref, sigma)))
+        worst = max(worst, error_rad(Rotation.from_matrix(kernel.raw_quest(B)), quest(cam, ref, sigma)))
     assert worst > 1e-10  # what the methods are to agree to
 
 
@@ -295,7 +293,7 @@ def test_triad_of_a_perfect_star_and_another_is_black_s_triad() -> None:
 
         black = Rotation.from_matrix(triad_of(cam) @ triad_of(ref).T)
         # The second star's weight of 1e-14 turns it by 1e-14 of the 0.01 rad by which they disagree.
-        assert apart_rad(SOLVERS["triad"](cam, ref, np.array([1.0, 1e7])), black) < 1e-14
+        assert error_rad(SOLVERS["triad"](cam, ref, np.array([1.0, 1e7])), black) < 1e-14
 
 
 def test_triad_rests_on_the_pair_with_the_least_worst_variance() -> None:
@@ -310,13 +308,13 @@ def test_triad_rests_on_the_pair_with_the_least_worst_variance() -> None:
         pairs = [(m, n) for m in range(8) for n in range(m + 1, 8)]
         best = min(pairs, key=worst)
         assert kernel.best_pair(cam, sigma**-2) == best
-        told = covariance(cam, sigma, solver="triad")
-        assert np.abs(told - covariance(cam[list(best)], sigma[list(best)])).max() == 0
+        predicted = covariance(cam, sigma, solver="triad")
+        assert np.abs(predicted - covariance(cam[list(best)], sigma[list(best)])).max() == 0
         # Another star moved changes nothing.
         other = next(n for n in range(8) if n not in best)
         ref = cam.copy()
         ref[other] = unit(ref[other] + [1e-4, 0, 0])
-        assert apart_rad(SOLVERS["triad"](cam, ref, sigma), Rotation.identity()) < 1e-13
+        assert error_rad(SOLVERS["triad"](cam, ref, sigma), Rotation.identity()) < 1e-13
 
 
 # ---- The covariance ----
@@ -327,9 +325,7 @@ def test_the_compiled_core_gives_the_optimum_and_its_covariance() -> None:
     for _ in range(50):
         cam, ref, sigma = same_data("many stars", rng)
         found, spread = kernel.wahba(cam, ref, sigma**-2)
-        assert (
-            apart_rad(Rotation.from_matrix(found), quest(cam, ref, sigma)) < 1e-13
-        )  # rounding over the field
+        assert error_rad(Rotation.from_matrix(found), quest(cam, ref, sigma)) < 1e-13  # rounding over the field
         assert np.abs(found @ found.T - np.eye(3)).max() < 1e-15
         information = np.einsum("n,nij->ij", sigma**-2, np.eye(3) - cam[:, :, None] * cam[:, None, :])
         assert np.abs(spread @ information - np.eye(3)).max() < 1e-11  # rounding over its condition, 300
@@ -338,16 +334,14 @@ def test_the_compiled_core_gives_the_optimum_and_its_covariance() -> None:
 @pytest.mark.parametrize("axis", AXES)
 @pytest.mark.parametrize("angle_rad", [0.0, 1e-9, 1.0, np.pi - 1e-9, np.pi])
 def test_quaternions_and_matrices_are_scipy_s(axis: str, angle_rad: float) -> None:
-    turn = Rotation.from_rotvec(angle_rad * unit(np.array(AXES[axis], dtype=float)))
-    found = xyzw_of(turn.as_matrix())
+    rotation = Rotation.from_rotvec(angle_rad * unit(np.array(AXES[axis], dtype=float)))
+    found = quaternion_xyzw(rotation.as_matrix())
     # Either sign is the same turn.
-    assert min(np.abs(found - turn.as_quat()).max(), np.abs(found + turn.as_quat()).max()) < 1e-15
-    assert np.abs(kernel.matrix_of(tuple(3 * turn.as_quat())) - turn.as_matrix()).max() < 1e-15
+    assert min(np.abs(found - rotation.as_quat()).max(), np.abs(found + rotation.as_quat()).max()) < 1e-15
+    assert np.abs(kernel.matrix_of(tuple(3 * rotation.as_quat())) - rotation.as_matrix()).max() < 1e-15
 
 
-def monte_carlo(
-    count: int, half: float, trials: int, seed: int, name: str = "quest"
-) -> tuple[np.ndarray, np.ndarray]:
+def monte_carlo(count: int, half: float, trials: int, seed: int, name: str = "quest") -> tuple[np.ndarray, np.ndarray]:
     """Errors (trials, 3) in camera axes and the covariances claimed, at 0.1 px a star and axis."""
     rng = np.random.default_rng(seed)
     sigma = np.full(count, 0.1 / FOCAL_PX)
@@ -367,8 +361,8 @@ def test_fifteen_stars_err_as_the_reference_says() -> None:
     # Reference section 3 (14.87 deg, 659 px, 0.1 px): 2.17" an axis and 21.1" rms; 1,500 trials give 1.3 and 1.8 %.
     assert cross == pytest.approx(2.17, rel=0.05)
     assert roll == pytest.approx(21.1, rel=0.06)
-    told = np.sqrt(np.mean(claimed, axis=0).diagonal()) / ARCSEC_RAD
-    assert told == pytest.approx([cross, cross, roll], rel=0.05)
+    predicted = np.sqrt(np.mean(claimed, axis=0).diagonal()) / ARCSEC_RAD
+    assert predicted == pytest.approx([cross, cross, roll], rel=0.05)
 
 
 @pytest.mark.parametrize("name", SOLVERS)

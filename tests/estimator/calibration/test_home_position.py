@@ -1,4 +1,4 @@
-"""The thesis's calibration: its epsilons against the noise put in, its catalogue against the dome it came from."""
+"""The thesis's calibration: its epsilons against the noise put in, its catalog against the dome it came from."""
 
 from dataclasses import replace
 
@@ -10,11 +10,11 @@ from scipy.spatial.transform import Rotation
 from estimator.attitude import nearfield
 from estimator.attitude.dome_map import LedMap, Lever, on_sphere, project
 from estimator.calibration.home_position import (
-    SPREADS,
-    HomeCatalogue,
+    DEVIATIONS,
+    HomeCatalog,
     Sighting,
     calibrate,
-    instrument_magnitude,
+    instrument_brightness,
     led_map,
 )
 from estimator.catalog.catalog import unit
@@ -52,7 +52,7 @@ RARE = 1e-4
 
 
 def dome() -> LedMap:
-    """Twelve LEDs about the apex of a sphere centred on the bearing."""
+    """Twelve LEDs about the apex of a sphere centered on the bearing."""
     across = PLACES_MM * 1e-3
     place = np.column_stack([across, np.sqrt(R_M**2 - np.sum(across**2, axis=1))])
     return replace(SPHERE, id=np.arange(100, 112), position_m=place)
@@ -89,7 +89,7 @@ def greatest_sd(count: int, freedom: int) -> tuple[float, float]:
 
 
 def pair_error_arcsec(wide_rad: float, sine: bool) -> float:
-    """How much too wide a pair astride the boresight reads about the bearing, on a perfect centred sphere."""
+    """How much too wide a pair astride the boresight reads about the bearing, on a perfect centered sphere."""
     half = wide_rad / 2
     rays = np.array([[np.sin(half), 0, np.cos(half)], [-np.sin(half), 0, np.cos(half)]])
     point, reach_m = nearfield.thesis_points(rays, SPHERE, LEVER, sine)
@@ -153,9 +153,7 @@ def test_an_imu_s_error_between_stops_is_r_sigma_in_the_pooled_spread(stops: lis
     # All LEDs share the IMU's 300 errors of x and of y; their yaw moves an LED 13 mm out by a hundredth of that.
     low, high = greatest_sd(2, 299)
     assert low < found.epsilon_pos_m / np.hypot(R_M * IMU_RAD, SIGMA_M) < high
-    np.testing.assert_allclose(
-        found.epsilon_pos_rad, found.epsilon_pos_m / R_M, rtol=1e-3
-    )  # places are off by .2 mm
+    np.testing.assert_allclose(found.epsilon_pos_rad, found.epsilon_pos_m / R_M, rtol=1e-3)  # places are off by .2 mm
     # An angle between LEDs needs no IMU: as at one place.
     sigma = np.sqrt(2) * SIGMA_M / R_M
     assert greatest_sd(1, 599)[0] < found.epsilon_sep_rad / sigma < greatest_sd(66, 599)[1]
@@ -163,7 +161,7 @@ def test_an_imu_s_error_between_stops_is_r_sigma_in_the_pooled_spread(stops: lis
 
 def test_the_averaged_spread_does_not_see_an_imu_s_error_between_stops(stops: list[Sighting]) -> None:
     # This is how .72 degree of Table 15 and 1.99 mm of Table 9 can both be (reference 1.2, item 15).
-    found = calibrate(stops, CAMERA, SPHERE, LEVER, spread="averaged")
+    found = calibrate(stops, CAMERA, SPHERE, LEVER, statistic="averaged")
     # The deviation of two frames has the mean sqrt(2 / pi) and, by that, the spread sqrt(pi / 2 - 1); 24 coordinates.
     scatter = np.sqrt((np.pi / 2 - 1) / 300)
     low, high = 1 + scatter * stats.norm.ppf(np.array([RARE / 2, 1 - RARE / 2]) ** (1 / 24))
@@ -172,9 +170,7 @@ def test_the_averaged_spread_does_not_see_an_imu_s_error_between_stops(stops: li
 
 def test_stops_apart_show_the_geometry_s_own_error_without_noise() -> None:
     # Five of AFIT's stops (Table 6) and no noise: what spread is left is eq. 44's on a dome seen from M.
-    stops = np.radians(
-        [[0, 0, 0], [-0.009, 2.3, 0.007], [0.25, -2.1, 0.004], [3.3, -0.14, -0.028], [-1.9, 0.28, 0.19]]
-    )
+    stops = np.radians([[0, 0, 0], [-0.009, 2.3, 0.007], [0.25, -2.1, 0.004], [3.3, -0.14, -0.028], [-1.9, 0.28, 0.19]])
     rng, spread = np.random.default_rng(63), {}
     for sine in (False, True):
         seen = [
@@ -201,10 +197,10 @@ def test_the_spreads_by_hand() -> None:
     # 1, 3, 11, 13: mean 7, squares 36 + 16 + 16 + 36 over 3; at either stop sqrt(2).
     by_hand = {"pooled": [np.sqrt(104 / 3), np.nan, 0], "averaged": [root, np.nan, np.nan]}
     for name, expected in by_hand.items():
-        np.testing.assert_allclose(SPREADS[name](value, group, stop), expected, rtol=1e-15, atol=0)
+        np.testing.assert_allclose(DEVIATIONS[name](value, group, stop), expected, rtol=1e-15, atol=0)
 
 
-# ---- the catalogue -------------------------------------------------------------------------------------------------
+# ---- the catalog -------------------------------------------------------------------------------------------------
 
 
 def angles(vectors: Floats) -> Floats:
@@ -213,11 +209,11 @@ def angles(vectors: Floats) -> Floats:
 
 
 @pytest.fixture(scope="module")
-def home() -> HomeCatalogue:
+def home() -> HomeCatalog:
     return calibrate(at_home(np.random.default_rng(64), 50), CAMERA, SPHERE, LEVER)
 
 
-def test_the_home_catalogue_has_the_dome_s_angles_within_noise(home: HomeCatalogue) -> None:
+def test_the_home_catalog_has_the_dome_s_angles_within_noise(home: HomeCatalog) -> None:
     leds = dome()
     truth = {led: place for led, place in zip(leds.id, leds.position_m, strict=True)}
     true = angles(unit(np.array([truth[led] for led in home.id])))
@@ -228,15 +224,15 @@ def test_the_home_catalogue_has_the_dome_s_angles_within_noise(home: HomeCatalog
     assert 0.3 < np.mean(z**2) < 2.5
 
 
-def test_the_catalogue_is_brightest_first_and_carries_its_samples(home: HomeCatalogue) -> None:
+def test_the_catalog_is_brightest_first_and_carries_its_samples(home: HomeCatalog) -> None:
     assert home.id.tolist() == list(range(100, 112))  # the dome's were made in this order
     assert (home.samples == 50).all()
-    z = (home.magnitude - MAGNITUDE) / (NOISE_MAG / np.sqrt(50))
+    z = (home.brightness - MAGNITUDE) / (NOISE_MAG / np.sqrt(50))
     assert np.abs(z).max() < stats.norm.isf(RARE / 12 / 2)
     np.testing.assert_allclose(np.linalg.norm(home.vectors, axis=1), 1, rtol=0, atol=1e-15)
 
 
-def test_the_covariance_is_the_noise_s(home: HomeCatalogue) -> None:
+def test_the_covariance_is_the_noise_s(home: HomeCatalog) -> None:
     # n - 1 times the sum of 24 sample variances of x and y over sigma^2 is chi-squared with 24 * 49 degrees.
     variances = home.covariance_m2[:, [0, 1], [0, 1]].sum() * 49 / SIGMA_M**2
     assert stats.chi2.ppf(RARE, 24 * 49) < variances < stats.chi2.isf(RARE, 24 * 49)
@@ -257,7 +253,7 @@ def test_the_mean_over_all_stops_keeps_their_imu_error_and_home_does_not() -> No
     assert abs(moved - R_M * 1e-3) < stats.norm.isf(RARE / 2) * sigma + R_M * 1e-3 * 1e-4
 
 
-def test_leds_unseen_at_home_are_left_out_of_its_catalogue() -> None:
+def test_leds_unseen_at_home_are_left_out_of_its_catalog() -> None:
     rng, level = np.random.default_rng(66), Rotation.identity()
     few = replace(dome(), id=dome().id[:4], position_m=dome().position_m[:4])
     seen = [sighting(rng, few, level, level, 0), *(sighting(rng, dome(), level, level, 1) for _ in range(3))]
@@ -276,12 +272,10 @@ def test_a_camera_mounted_askew_gives_the_same_places() -> None:
     assert np.abs(off[:, :2]).max() < 0.12e-3 * 0.02 * 1.3
 
 
-def test_the_map_for_a_tracker_lies_on_the_surface_in_the_catalogue_s_directions(home: HomeCatalogue) -> None:
-    oval = LedMap(
-        np.arange(0), np.zeros((0, 3)), np.array([0.0, 0.003, 0.492]), np.array([0.9876, 0.9876, 0.7264])
-    )
+def test_the_map_for_a_tracker_lies_on_the_surface_in_the_catalog_s_directions(home: HomeCatalog) -> None:
+    oval = LedMap(np.arange(0), np.zeros((0, 3)), np.array([0.0, 0.003, 0.492]), np.array([0.9876, 0.9876, 0.7264]))
     leds = led_map(home, oval)
-    scaled = (leds.position_m - oval.centre_m) / oval.semi_axes_m
+    scaled = (leds.position_m - oval.center_m) / oval.semi_axes_m
     np.testing.assert_allclose(np.sum(scaled**2, axis=1), 1, rtol=0, atol=1e-14)  # a quadratic's rounding
     np.testing.assert_allclose(unit(leds.position_m), home.vectors, rtol=0, atol=1e-15)
     assert (leds.id == home.id).all()
@@ -289,7 +283,7 @@ def test_the_map_for_a_tracker_lies_on_the_surface_in_the_catalogue_s_directions
 
 def test_the_thesis_s_magnitude_by_hand() -> None:
     # Areas 60, 80 and 100: the median is 80.
-    found = instrument_magnitude(np.array([120.0, 100, 20]), np.array([100.0, 80, 60]))
+    found = instrument_brightness(np.array([120.0, 100, 20]), np.array([100.0, 80, 60]))
     np.testing.assert_allclose(found, [150, 100, 15], rtol=1e-15, atol=0)
 
 
@@ -299,22 +293,22 @@ def test_the_thesis_s_magnitude_by_hand() -> None:
 def test_what_cannot_be_calibrated_is_refused_in_one_line() -> None:
     seen = at_home(np.random.default_rng(68), 2)
     twice = replace(seen[0], led=np.full(12, 100))
-    short = replace(seen[0], magnitude=np.ones(3))
+    short = replace(seen[0], brightness=np.ones(3))
     blind = replace(seen[0], xy_px=np.full((12, 2), np.nan))
     one = Sighting(0, Rotation.identity(), np.array([1]), np.array([[800.0, 600]]), np.array([9.0]))
     for sightings, message in [
         ([], "no sightings"),
-        ([seen[0], twice], "sighting 1: a light has two centroids"),
-        ([short], "sighting 0: 12 names, centroids .*; allowed: K names"),
-        ([blind], "sighting 0: a centroid or a magnitude is not finite"),
+        ([seen[0], twice], "sighting 1: an id occurs twice"),
+        ([short], "sighting 0: 12 ids, centroids .*; allowed: K ids"),
+        ([blind], "sighting 0: a centroid or a brightness is not finite"),
         (seen[:1], "each light has one sample"),
-        ([one, one], "no frame shows two lights"),
+        ([one, one], "no frame has two lights"),
     ]:
         with pytest.raises(ImageError, match=message):
             calibrate(sightings, CAMERA, SPHERE, LEVER)
 
 
-def test_a_direction_that_misses_the_surface_is_named(home: HomeCatalogue) -> None:
+def test_a_direction_that_misses_the_surface_is_named(home: HomeCatalog) -> None:
     beside = LedMap(np.arange(0), np.zeros((0, 3)), np.array([5.0, 0, 0]), np.ones(3))
-    with pytest.raises(ImageError, match="LED 100: its direction from the bearing misses"):
+    with pytest.raises(ImageError, match="LED 100: its direction from the bearing does not intersect"):
         led_map(home, beside)

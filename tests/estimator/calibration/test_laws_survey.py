@@ -17,9 +17,9 @@ from estimator.attitude.dome_map import LedMap, Lever, project
 from estimator.calibration import bundle_adjustment as ba
 from estimator.calibration import star_field
 from estimator.calibration.bundle_adjustment import Bundle, Sightings
-from estimator.calibration.dome_survey import DomeFrame, Survey, survey
-from estimator.calibration.gauge import Gauge, Part, common_turns
-from estimator.calibration.star_field import Belief, StarFrame
+from estimator.calibration.dome_survey import DomeFrame, DomeSurvey, survey
+from estimator.calibration.gauge import Gauge, Subset, align_attitudes
+from estimator.calibration.star_field import LensPrior, StarFrame
 from estimator.catalog.catalog import StarCatalog
 from estimator.core.arrays import Floats
 from estimator.core.camera import Camera
@@ -28,7 +28,7 @@ from estimator.core.types import Attitude, Centroids, StarMatch
 pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning")
 LIGHTS, FRAMES = 14, 6
 CAMERA = Camera(640, 480, 400.0, (318.0, 241.0), (-0.05, 0.01, 1e-3, -1e-3, 0.0))
-LENS = np.array([CAMERA.focal_px, *CAMERA.centre_px, *CAMERA.distortion])
+LENS = np.array([CAMERA.focal_px, *CAMERA.center_px, *CAMERA.distortion])
 
 
 def dome(rng: np.random.Generator, noise_px: float = 0.0) -> tuple[Bundle, Sightings]:
@@ -56,38 +56,42 @@ def dome(rng: np.random.Generator, noise_px: float = 0.0) -> tuple[Bundle, Sight
 
 def nudged(rng: np.random.Generator, true: Bundle, by: float) -> Bundle:
     """Everything a little off."""
-    return true.moved(rng.normal(0, by, 3 * LIGHTS), rng.normal(0, by, 3 * FRAMES + 3 + 3))
+    return true.apply_step(rng.normal(0, by, 3 * LIGHTS), rng.normal(0, by, 3 * FRAMES + 3 + 3))
 
 
 # Bundle adjustment
 
 
-@law(ba.rows, ba.residuals, Bundle.moved, Sightings.take)
+@law(ba.linearize, ba.residuals, Bundle.apply_step, Sightings.take)
 @given(rng=SEEDS)
 def test_the_rows_are_the_residuals_slopes(rng: np.random.Generator) -> None:
     true, seen = dome(rng)
     seen = seen.take(rng.permutation(len(seen.led))[:20])
-    rows, step = ba.rows(true, seen), 1e-6
+    rows, step = ba.linearize(true, seen), 1e-6
     led, rest = rng.normal(size=3 * LIGHTS), rng.normal(size=3 * FRAMES + 6)
-    moved = [ba.residuals(true.moved(sign * step * led, sign * step * rest), seen) for sign in (-1, 1)]
+    moved = [ba.residuals(true.apply_step(sign * step * led, sign * step * rest), seen) for sign in (-1, 1)]
     by_led = np.einsum("mai,mi->ma", rows.by_led, led.reshape(-1, 3)[seen.led])
-    by_turn = np.einsum("mai,mi->ma", rows.by_turn, rest[: 3 * FRAMES].reshape(-1, 3)[seen.frame])
-    slope = by_led + by_turn + rows.by_shared @ rest[3 * FRAMES :]
-    np.testing.assert_allclose(
-        (moved[0] - moved[1]) / (2 * step), slope, rtol=1e-4, atol=1e-4 * np.abs(slope).max()
-    )
+    by_rotation = np.einsum("mai,mi->ma", rows.by_rotation, rest[: 3 * FRAMES].reshape(-1, 3)[seen.frame])
+    slope = by_led + by_rotation + rows.by_shared @ rest[3 * FRAMES :]
+    np.testing.assert_allclose((moved[0] - moved[1]) / (2 * step), slope, rtol=1e-4, atol=1e-4 * np.abs(slope).max())
     np.testing.assert_allclose(rows.residual, ba.residuals(true, seen), rtol=0, atol=1e-9)
 
 
-@law(ba.normal, ba.reduce, ba.step, ba.freedoms, ba.cauchy, Bundle.cost)
+@law(
+    ba.normal_equations,
+    ba.eliminate_lights,
+    ba.step,
+    ba.gauge_freedoms,
+    ba.cauchy,
+    ba.robust_scale,
+    Bundle.cost,
+)
 @given(rng=SEEDS, damping=some.floats(1e-6, 1), width=some.floats(0.5, 9))
-def test_lights_eliminated_are_the_whole_system_solved(
-    rng: np.random.Generator, damping: float, width: float
-) -> None:
+def test_lights_eliminated_are_the_whole_system_solved(rng: np.random.Generator, damping: float, width: float) -> None:
     true, seen = dome(rng, 0.1)
     bundle = nudged(rng, true, 1e-3)
     weight = rng.uniform(0.1, 1, len(seen.led))
-    terms, (led_free, rest_free) = ba.normal(bundle, seen, weight), ba.freedoms(bundle)
+    terms, (led_free, rest_free) = ba.normal_equations(bundle, seen, weight), ba.gauge_freedoms(bundle)
     n = 3 * LIGHTS
     whole = np.zeros((n + len(terms.rest),) * 2)
     for k in range(LIGHTS):
@@ -100,8 +104,8 @@ def test_lights_eliminated_are_the_whole_system_solved(
     assert_covariance(whole)
     still = whole @ np.concatenate([led_free, rest_free])  # they change no pixel
     np.testing.assert_allclose(still, 0, rtol=0, atol=1e-9 * np.abs(whole).max())
-    led, rest = ba.step(terms, ba.reduce(terms, rest_free[:, :0], damping))
-    pull = np.concatenate([terms.pull_led, terms.pull_rest])
+    led, rest = ba.step(terms, ba.eliminate_lights(terms, rest_free[:, :0], damping))
+    pull = np.concatenate([terms.rhs_led, terms.rhs_rest])
     whole[np.diag_indices_from(whole)] *= 1 + damping
     left_over = whole @ np.concatenate([led, rest]) - pull
     np.testing.assert_allclose(left_over, 0, rtol=0, atol=1e-5 * np.abs(pull).max())
@@ -110,27 +114,28 @@ def test_lights_eliminated_are_the_whole_system_solved(
     assert 0 <= cost <= ba.cauchy(squared, np.inf)[0] * (1 + 1e-12)
     assert ((lighter > 0) & (lighter <= 1)).all()
     np.testing.assert_allclose(bundle.cost(seen, width)[0], cost, rtol=1e-12, atol=0)
+    assert ba.robust_scale(bundle, seen) == max(1.0, np.median(np.sqrt(squared)) / ba.MEDIAN_RADIUS)
 
 
-@law(ba.adjust, ba.turn_frames, ba.covariance)
+@law(ba.adjust, ba.fit_attitudes, ba.covariance)
 @given(rng=SEEDS, by=some.floats(0, 3e-3))
 def test_an_adjustment_comes_to_rest_where_the_pixels_are(rng: np.random.Generator, by: float) -> None:
     true, seen = dome(rng)
     start = nudged(rng, true, by)
-    turned = ba.turn_frames(start, seen, 3)
+    turned = ba.fit_attitudes(start, seen, 3)
     assert turned.cost(seen, np.inf)[0] <= start.cost(seen, np.inf)[0] * (1 + 1e-9) + 1e-9
     found, at_rest = ba.adjust(turned, seen, np.inf)
     assert at_rest
     assert np.abs(ba.residuals(found, seen)).max() < 1e-5
-    gauge = Gauge.of(None, None, true.position_m, true.R_body_from_lab)
-    part = Part(found, seen, np.arange(LIGHTS), np.arange(FRAMES), np.arange(len(seen.led)))
-    terms = ba.normal(found, seen, np.ones(len(seen.led)))
-    by_led, by_turn, shared = ba.covariance(terms, found, *gauge.held(found, part))
-    for matrix in (*by_led, *by_turn, shared):
+    gauge = Gauge(None, None, true.position_m, true.R_body_from_lab)
+    part = Subset(found, seen, np.arange(LIGHTS), np.arange(FRAMES), np.arange(len(seen.led)))
+    terms = ba.normal_equations(found, seen, np.ones(len(seen.led)))
+    by_led, by_rotation, shared = ba.covariance(terms, found, *gauge.constraints(found, part))
+    for matrix in (*by_led, *by_rotation, shared):
         assert_covariance(matrix)
 
 
-@law(Gauge.of, Gauge.check, Gauge.onto, Gauge.held, Part.into)
+@law(Gauge.check, Gauge.transform, Gauge.constraints, Subset.insert_into)
 @given(
     rng=SEEDS,
     length=some.none() | some.tuples(some.integers(-1, 15), some.integers(-1, 15), some.floats(0.1, 2)),
@@ -140,37 +145,37 @@ def test_a_gauge_moves_no_pixel(
     rng: np.random.Generator, length: tuple[int, int, float] | None, frame: int | None
 ) -> None:
     true, seen = dome(rng)
-    asked = answered(lambda: Gauge.of(length, frame, true.position_m, true.R_body_from_lab))
+    asked = answered(lambda: Gauge(length, frame, true.position_m, true.R_body_from_lab))
     rows = length is None or (length[0] != length[1] and all(0 <= end < LIGHTS for end in length[:2]))
     assert (asked is not None) == (rows and (frame is None or 0 <= frame < FRAMES))
-    gauge = asked or Gauge.of((0, 1, 0.5), 2, true.position_m, true.R_body_from_lab)
-    part = Part(true, seen, np.arange(LIGHTS), np.arange(FRAMES), np.arange(len(seen.led)))
+    gauge = asked or Gauge((0, 1, 0.5), 2, true.position_m, true.R_body_from_lab)
+    part = Subset(true, seen, np.arange(LIGHTS), np.arange(FRAMES), np.arange(len(seen.led)))
     gauge.check(part)
     found = nudged(rng, true, 0.01)
-    once = gauge.onto(found, part)
+    once = gauge.transform(found, part)
     np.testing.assert_allclose(ba.residuals(once, seen), ba.residuals(found, seen), rtol=0, atol=1e-6)
-    np.testing.assert_allclose(gauge.onto(once, part).position_m, once.position_m, rtol=0, atol=1e-9)
-    np.testing.assert_array_equal(part.into(true, once).position_m, once.position_m)
-    by_led, by_rest = gauge.held(once, part)
+    np.testing.assert_allclose(gauge.transform(once, part).position_m, once.position_m, rtol=0, atol=1e-9)
+    np.testing.assert_array_equal(part.insert_into(true, once).position_m, once.position_m)
+    by_led, by_rest = gauge.constraints(once, part)
     assert by_led.shape == (3 * LIGHTS, 4)
-    led_free, rest_free = ba.freedoms(once)
+    led_free, rest_free = ba.gauge_freedoms(once)
     assert np.linalg.matrix_rank(led_free.T @ by_led + rest_free.T @ by_rest) == 4  # it leaves nothing free
 
 
-@law(common_turns)
+@law(align_attitudes)
 @given(rng=SEEDS, count=some.integers(3, 12))
 def test_two_turns_between_attitudes_are_found(rng: np.random.Generator, count: int) -> None:
     ours = Rotation.random(count, rng=rng)
     left, right = turn(rng, 0.5), turn(rng, 3)
     theirs = left * ours * right
-    found_left, found_right = common_turns(ours, theirs)
+    found_left, found_right = align_attitudes(ours, theirs)
     assert ((found_left * ours * found_right) * theirs.inv()).magnitude().max() < 1e-9
 
 
 # The dome's survey
 
 
-@law(survey, Survey.focal_sigma_px, Survey.surveyed_leds, slow=True)
+@law(survey, DomeSurvey.focal_sigma_px, DomeSurvey.surveyed_leds, slow=True)
 @given(rng=SEEDS)
 def test_a_survey_of_a_dome_is_at_rest_and_knows_its_errors(rng: np.random.Generator) -> None:
     true, _seen = dome(rng, 0.1)
@@ -196,17 +201,17 @@ def test_a_survey_of_a_dome_is_at_rest_and_knows_its_errors(rng: np.random.Gener
     led=arrays("i8", 5),
     xy=NUMBERS | arrays("f8", (5, 2), elements=ANY),
     sigma=NUMBERS | arrays("f8", 5, elements=ANY),
-    believed_m=ANY,
+    assumed_m=ANY,
 )
 def test_any_frames_are_a_survey_or_refused(
-    rng: np.random.Generator, led: NDArray, xy: Floats, sigma: Floats, believed_m: float
+    rng: np.random.Generator, led: NDArray, xy: Floats, sigma: Floats, assumed_m: float
 ) -> None:
     true, _ = dome(rng)
     arm = Lever(true.camera_body_m, Rotation.from_matrix(true.R_cam_from_body))
     leds = LedMap(np.arange(LIGHTS), true.position_m, np.zeros(3), np.full(3, 1.2))
     for rows in (led, np.arange(5)):
         frames = [DomeFrame(rows, xy, sigma, turn(rng, 0.2)) for _ in range(3)]
-        answered(lambda: survey(frames, leds, arm, CAMERA, leds_sigma_m=believed_m))  # noqa: B023
+        answered(lambda: survey(frames, leds, arm, CAMERA, leds_sigma_m=assumed_m))  # noqa: B023
     with pytest.raises(ValueError, match="no frames"):
         survey([], leds, arm, CAMERA)
 
@@ -224,18 +229,18 @@ def filmed(rng: np.random.Generator, count: int) -> tuple[list[StarFrame], Rotat
     return frames, truths
 
 
-@law(star_field.calibrate, star_field.disagreement_px, Belief.sigma)
+@law(star_field.calibrate, star_field.disagreement_px, LensPrior.sigma)
 @given(rng=SEEDS, longer=some.floats(-0.03, 0.03))
 def test_star_fields_give_the_lens(rng: np.random.Generator, longer: float) -> None:
     frames, truths = filmed(rng, 8)
-    sheet = replace(CAMERA.zoomed(1 + longer), centre_px=(319.5, 239.5), distortion=(0.0,) * 5)
+    sheet = replace(CAMERA.zoomed(1 + longer), center_px=(319.5, 239.5), distortion=(0.0,) * 5)
     told = star_field.calibrate(frames, sheet)
     assert told.report.status == "converged"
     assert_covariance(told.covariance)
     assert star_field.disagreement_px(CAMERA, CAMERA) < 1e-9
     assert star_field.disagreement_px(told.camera, CAMERA) < 0.3
     assert (told.report.cam_from_ref * truths.inv()).magnitude().max() < 0.01
-    assert (Belief().sigma(sheet) > 0).all()
+    assert (LensPrior().sigma(sheet) > 0).all()
 
 
 @law(star_field.calibrate)
@@ -264,12 +269,12 @@ class Namer:
         return Attitude("solved", Rotation.identity(), match=match) if self.seen else Attitude("no")
 
 
-@law(star_field.self_calibrated)
+@law(star_field.self_calibrate)
 @given(rng=SEEDS, seen=some.booleans())
 def test_a_camera_calibrates_itself_by_the_stars_that_are_named(rng: np.random.Generator, seen: bool) -> None:
     frames, _ = filmed(rng, 5)
     lights = [Centroids(one.xy_px, one.sigma_px, np.arange(25.0) + 25 * k) for k, one in enumerate(frames)]
     namer = Namer(frames, seen)
-    told = answered(lambda: star_field.self_calibrated(lights, lambda *_: namer, CAMERA.zoomed(1.01)))
+    told = answered(lambda: star_field.self_calibrate(lights, lambda *_: namer, CAMERA.zoomed(1.01)))
     assert (told is not None) == seen
     assert told is None or star_field.disagreement_px(told.camera, CAMERA) < 0.5

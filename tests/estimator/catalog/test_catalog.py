@@ -1,4 +1,4 @@
-"""The on-board catalogue: apparent places against astropy, doubles and magnitudes worked by hand."""
+"""The on-board catalog: apparent places against astropy, doubles and magnitudes worked by hand."""
 
 import datetime
 from pathlib import Path
@@ -15,7 +15,7 @@ from estimator.catalog import catalog
 from estimator.catalog.catalog import Observer, StarCatalog
 from estimator.core.errors import ImageError
 
-FILE = Path(__file__).parents[3] / "data/catalogues/hipparcos_hp6.5.ecsv"
+FILE = Path(__file__).parents[3] / "data/catalogs/hipparcos_hp6.5.ecsv"
 ARCSEC_RAD = np.pi / 180 / 3600
 MAS_RAD = ARCSEC_RAD / 1000
 DATES = [datetime.datetime(1995, 1, 3), datetime.datetime(2016, 6, 21, 7, 30), datetime.datetime(2027, 10, 9)]
@@ -61,9 +61,7 @@ def oracle() -> SkyCoord:
 
 @pytest.mark.filterwarnings("ignore:ERFA function")  # negative parallaxes, set aside below
 @pytest.mark.parametrize("date", DATES)
-def test_apparent_places_are_skycoord_s(
-    stars: StarCatalog, oracle: SkyCoord, date: datetime.datetime
-) -> None:
+def test_apparent_places_are_skycoord_s(stars: StarCatalog, oracle: SkyCoord, date: datetime.datetime) -> None:
     with iers.conf.set_temp("auto_download", False), iers.conf.set_temp("iers_degraded_accuracy", "ignore"):
         time = Time(date, scale="utc")
         wanted = oracle.apply_space_motion(new_obstime=time).transform_to(GCRS(obstime=time))
@@ -75,7 +73,7 @@ def test_apparent_places_are_skycoord_s(
     in_file_s_order[order] = catalog.apparent(stars, here)
     off_mas = separation_rad(in_file_s_order, wanted) / MAS_RAD
     assert np.mean(off_mas < 2) > 0.99
-    # A negative parallax has no place in SkyCoord. Near the Sun its own 0.005 au from the barycentre shows.
+    # A negative parallax has no place in SkyCoord. Near the Sun its own 0.005 au from the barycenter shows.
     far = in_file_s_order @ here.position_au > -np.cos(np.radians(15)) * np.linalg.norm(here.position_au)
     fair = far & (columns_of_the_file()["parallax_mas"] > 0)
     assert fair.sum() > 7500
@@ -94,9 +92,7 @@ def test_the_classical_aberration_differs_by_half_a_thousandth_at_most() -> None
         np.zeros(37),
     )
     beta = 29_800 / 299_792_458
-    far = Observer(
-        1991.25, np.array([0.0, 0.0, 1e9]), np.array([29_800.0, 0.0, 0.0])
-    )  # where no Sun bends light
+    far = Observer(1991.25, np.array([0.0, 0.0, 1e9]), np.array([29_800.0, 0.0, 0.0]))  # where no Sun bends light
     seen = catalog.apparent(star, far)
     relativistic = np.arccos((np.cos(angle) + beta) / (1 + beta * np.cos(angle)))
     off_mas = np.abs(np.arctan2(seen[:, 1], seen[:, 0]) - relativistic) / MAS_RAD
@@ -146,7 +142,7 @@ def test_naive_and_zoned_times_are_one() -> None:
     assert naive.epoch_yr == pytest.approx(2000 + (8892.125 + 69.184 / 86400) / 365.25, abs=1e-9)
 
 
-def test_the_earth_moves_thirty_kilometres_a_second_about_a_sun_one_au_away() -> None:
+def test_the_earth_moves_thirty_kilometers_a_second_about_a_sun_one_au_away() -> None:
     for month in range(1, 13):
         here = catalog.on_earth(datetime.datetime(2023, month, 4))
         # 0.0167 of eccentricity, and 0.009 au and 16 m/s of the Sun's own motion at most.
@@ -167,7 +163,7 @@ def test_two_equal_stars_ten_arcseconds_apart_merge_half_way_and_0_753_brighter(
     assert one.parallax_rad[0] / MAS_RAD == pytest.approx(12, abs=1e-9)
 
 
-def test_the_centre_of_light_leans_toward_the_brighter_star() -> None:
+def test_the_center_of_light_leans_toward_the_brighter_star() -> None:
     # A magnitude of 2.5 is a tenth of the light: the middle stands 1/11 of the way from the bright one.
     pair = made_up((1, 50, 0, 0, 0, 0, 4.0), (2, 50, 11 / 3600, 0, 0, 0, 6.5))
     one = catalog.merge_doubles(pair, 20 * ARCSEC_RAD)
@@ -196,7 +192,7 @@ def test_merging_keeps_all_the_light_brightest_first(stars: StarCatalog) -> None
 
 def test_brighter_keeps_the_limit_itself() -> None:
     stars = made_up((1, 0, 0, 0, 0, 0, 4.0), (2, 9, 0, 0, 0, 0, 5.0), (3, 20, 0, 0, 0, 0, 5.01))
-    assert catalog.brighter(stars, 5.0).id.tolist() == [1, 2]
+    assert catalog.brighter_than(stars, 5.0).id.tolist() == [1, 2]
 
 
 def test_the_limit_for_a_density_gives_that_density(stars: StarCatalog) -> None:
@@ -204,7 +200,7 @@ def test_the_limit_for_a_density_gives_that_density(stars: StarCatalog) -> None:
     field_sr = np.radians(14.87) * np.radians(11.15)
     limit = catalog.limit_for_density(stars, field_sr, 12)
     wanted = 12 * 4 * np.pi / field_sr
-    count = len(catalog.brighter(stars, limit))
+    count = len(catalog.brighter_than(stars, limit))
     # Stars of the same thousandth of a magnitude come together.
     assert wanted - 1 <= count <= wanted + 10
     assert catalog.limit_for_density(stars, field_sr, 1e9) == stars.v_mag.max()
@@ -217,9 +213,7 @@ def test_the_file_is_read_whole_brightest_first(stars: StarCatalog) -> None:
     assert stars.v_mag[0] == -1.46
     ra, dec = np.radians([(6 + 45 / 60 + 8.9 / 3600) * 15, -(16 + 42 / 60 + 58 / 3600)])
     sirius = [np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)]
-    assert (
-        separation_rad(stars.vectors[0], np.array(sirius)) < 15 * ARCSEC_RAD
-    )  # J2000, 8.75 years at 1.34"/yr
+    assert separation_rad(stars.vectors[0], np.array(sirius)) < 15 * ARCSEC_RAD  # J2000, 8.75 years at 1.34"/yr
     assert np.all(np.diff(stars.v_mag) >= 0)
     np.testing.assert_allclose(np.linalg.norm(stars.vectors, axis=1), 1, rtol=0, atol=1e-15)
     # A drift is tangent; 1e-20 is rounding of some 1e-5 rad/yr at most.
@@ -247,15 +241,15 @@ UNREADABLE = {
 
 
 @pytest.mark.parametrize("name", UNREADABLE)
-def test_what_is_no_catalogue_is_refused_in_one_line(tmp_path: Path, name: str) -> None:
+def test_what_is_no_catalog_is_refused_in_one_line(tmp_path: Path, name: str) -> None:
     path = tmp_path / name
     path.write_bytes(UNREADABLE[name])
-    with pytest.raises(ImageError, match=r"not a star catalogue .*allowed: ECSV with hip, ra_deg") as refusal:
+    with pytest.raises(ImageError, match=r"not a star catalog .*allowed: ECSV with hip, ra_deg") as refusal:
         catalog.read(path)
     assert "\n" not in str(refusal.value)
 
 
 @pytest.mark.parametrize("name", [".", "no_such_file.ecsv"])
 def test_what_is_no_file_is_refused_alike(tmp_path: Path, name: str) -> None:
-    with pytest.raises(ImageError, match="not a star catalogue"):
+    with pytest.raises(ImageError, match="not a star catalog"):
         catalog.read(tmp_path / name)

@@ -1,4 +1,4 @@
-"""Pairs of stars: the k-vector against brute force, neighbours in order, counts against geometry."""
+"""Pairs of stars: the k-vector against brute force, neighbors in order, counts against geometry."""
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ def angles(vectors: np.ndarray) -> np.ndarray:
 
 def of_angles(angle_rad: np.ndarray) -> pair_index.PairIndex:
     """An index whose sorted angles are these; its stars are no matter."""
-    count, slope, offset = pair_index.line(angle_rad)
+    count, slope, offset = pair_index.k_vector(angle_rad)
     any_sky = pair_index.build(np.eye(3), 2.0)
     return any_sky._replace(angle_rad=angle_rad, kvector=count, slope_rad=slope, offset_rad=offset)
 
@@ -44,25 +44,23 @@ def test_the_pairs_come_by_growing_angle(sky: pair_index.PairIndex) -> None:
     assert np.all(np.diff(sky.angle_rad) >= 0)
 
 
-def test_every_star_s_neighbours_are_all_of_them_by_growing_angle(sky: pair_index.PairIndex) -> None:
+def test_every_star_s_neighbors_are_all_of_them_by_growing_angle(sky: pair_index.PairIndex) -> None:
     every = angles(sky.vectors)
     np.fill_diagonal(every, np.inf)
     for star in range(len(sky.vectors)):
         mine = slice(sky.first[star], sky.first[star + 1])
         near = np.flatnonzero(every[star] <= np.radians(18.0))
-        assert sorted(sky.neighbour[mine].tolist()) == near.tolist()
+        assert sorted(sky.neighbor[mine].tolist()) == near.tolist()
         assert np.all(np.diff(sky.separation_rad[mine]) >= 0)
         # 1e-15: rounding of two formulas of the same angle.
-        np.testing.assert_allclose(
-            sky.separation_rad[mine], every[star, sky.neighbour[mine]], rtol=0, atol=1e-15
-        )
+        np.testing.assert_allclose(sky.separation_rad[mine], every[star, sky.neighbor[mine]], rtol=0, atol=1e-15)
 
 
-def test_bisection_finds_the_first_neighbour_beyond_an_angle(sky: pair_index.PairIndex) -> None:
+def test_bisection_finds_the_first_neighbor_beyond_an_angle(sky: pair_index.PairIndex) -> None:
     rng = np.random.default_rng(31)
     for star, low in zip(rng.integers(0, 600, 300), rng.uniform(-0.01, 0.33, 300), strict=True):
         mine = sky.separation_rad[sky.first[star] : sky.first[star + 1]]
-        assert pair_index.around(sky, star, low) - sky.first[star] == np.searchsorted(mine, low)
+        assert pair_index.first_neighbor(sky, star, low) - sky.first[star] == np.searchsorted(mine, low)
 
 
 # Sixty-fourths are exact in binary, so that angles fall on one another, on the query's ends and on the line's nodes.
@@ -76,7 +74,7 @@ def test_the_k_vector_never_misses_and_takes_in_little(given_rad: list, one: flo
     low, high = min(one, other), max(one, other)
     angle = np.array(given_rad)
     known = of_angles(angle)
-    begin, end = pair_index.between(known, low, high)
+    begin, end = pair_index.pair_range(known, low, high)
     inside = np.flatnonzero((angle >= low) & (angle <= high))
     assert 0 <= begin <= end <= len(angle)
     assert set(inside) <= set(range(begin, end))
@@ -89,15 +87,15 @@ def test_an_angle_on_a_node_of_the_line_is_found() -> None:
     # Three angles evenly apart: the middle one lies on the middle node, and is the query's own end.
     angle = np.array([0.25, 0.5, 0.75])
     known = of_angles(angle)
-    assert pair_index.between(known, 0.5, 0.6)[0] <= 1
-    assert pair_index.between(known, 0.4, 0.5)[1] >= 2
+    assert pair_index.pair_range(known, 0.5, 0.6)[0] <= 1
+    assert pair_index.pair_range(known, 0.4, 0.5)[1] >= 2
 
 
 def test_a_range_of_the_real_index_is_brute_force_s_with_a_few_more(sky: pair_index.PairIndex) -> None:
     rng = np.random.default_rng(32)
     extra = []
     for middle, half in zip(rng.uniform(0, 0.33, 500), rng.uniform(1e-5, 1e-3, 500), strict=True):
-        begin, end = pair_index.between(sky, middle - half, middle + half)
+        begin, end = pair_index.pair_range(sky, middle - half, middle + half)
         first, last = np.searchsorted(sky.angle_rad, [middle - half, middle + half])
         assert set(range(first, last)) <= set(range(begin, end))
         extra.append((end - begin) - (last - first))
@@ -107,9 +105,9 @@ def test_a_range_of_the_real_index_is_brute_force_s_with_a_few_more(sky: pair_in
 
 def test_ranges_off_either_end_are_empty_or_all(sky: pair_index.PairIndex) -> None:
     count = len(sky.angle_rad)
-    empty = [pair_index.between(sky, *ends) for ends in [(-2.0, -1.0), (1.0, 2.0)]]
+    empty = [pair_index.pair_range(sky, *ends) for ends in [(-2.0, -1.0), (1.0, 2.0)]]
     assert [end - begin for begin, end in empty] == [0, 0]
-    assert pair_index.between(sky, -1.0, 2.0) == (0, count)
+    assert pair_index.pair_range(sky, -1.0, 2.0) == (0, count)
 
 
 def test_the_count_of_pairs_is_geometry_s() -> None:
@@ -124,7 +122,7 @@ def test_the_candidates_of_one_angle_are_reference_s_f2(theta_deg: float) -> Non
     # Reference section 4: f2 = N (N - 1) / 2 sin(theta) sin(eps).
     known = pair_index.build(uniform_sky(2000, seed=34), np.radians(10.0))
     eps = np.radians(0.1)
-    begin, end = pair_index.between(known, np.radians(theta_deg) - eps, np.radians(theta_deg) + eps)
+    begin, end = pair_index.pair_range(known, np.radians(theta_deg) - eps, np.radians(theta_deg) + eps)
     expected = 2000 * 1999 / 2 * np.sin(np.radians(theta_deg)) * np.sin(eps)
     assert end - begin == pytest.approx(expected, abs=4 * np.sqrt(expected))
 
@@ -133,9 +131,7 @@ def test_small_angles_keep_their_digits() -> None:
     # Stars 1e-8 rad apart, where arccos of the dot product would read 0 or 1.5e-8.
     vectors = np.array([[0.0, 0, 1], [1e-8, 0, 1], [0, 3e-8, 1]])
     known = pair_index.build(vectors, 1e-3)
-    np.testing.assert_allclose(
-        known.angle_rad, [1e-8, 3e-8, np.sqrt(10) * 1e-8], rtol=1e-8, atol=0
-    )  # rounding of 1
+    np.testing.assert_allclose(known.angle_rad, [1e-8, 3e-8, np.sqrt(10) * 1e-8], rtol=1e-8, atol=0)  # rounding of 1
 
 
 def test_a_sky_without_patterns_is_refused() -> None:
@@ -149,15 +145,15 @@ def test_a_range_of_magnitudes_is_brute_force_s() -> None:
     known = pair_index.build(uniform_sky(300, seed=36), np.radians(20.0), magnitude=magnitude)
     for middle, gate in zip(rng.uniform(-1, 7, 100), rng.uniform(0, 1, 100), strict=True):
         inside = np.flatnonzero((magnitude >= middle - gate) & (magnitude <= middle + gate))
-        begin, end = pair_index.alike(known, middle, gate)
+        begin, end = pair_index.magnitude_range(known, middle, gate)
         assert list(range(begin, end)) == inside.tolist()
 
 
 def test_without_magnitudes_or_a_gate_all_stars_are_alike(sky: pair_index.PairIndex) -> None:
     known = pair_index.build(uniform_sky(50, seed=37), np.radians(60.0), magnitude=np.linspace(0, 5, 50))
-    assert pair_index.alike(sky, 3.0, 0.1) == (0, 600)
-    assert pair_index.alike(known, np.nan, 0.1) == (0, 50)
-    assert pair_index.alike(known, 3.0, np.inf) == (0, 50)
+    assert pair_index.magnitude_range(sky, 3.0, 0.1) == (0, 600)
+    assert pair_index.magnitude_range(known, np.nan, 0.1) == (0, 50)
+    assert pair_index.magnitude_range(known, 3.0, np.inf) == (0, 50)
 
 
 @pytest.mark.parametrize("magnitude", [np.linspace(5, 0, 600), np.zeros(3)])

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from estimator.catalog.ptase import BYTES_A_STAR, Colour, OnBoard, histogram, log, proc_cat, read_cat
+from estimator.catalog.ptase import BYTES_PER_ENTRY, Color, OnBoard, histogram, log, proc_cat, read_cat
 from estimator.core.errors import ImageError
 
-FILE = Path(__file__).parents[3] / "data/catalogues/hipparcos_hp6.5.ecsv"
+FILE = Path(__file__).parents[3] / "data/catalogs/hipparcos_hp6.5.ecsv"
 ARCSEC_RAD = np.pi / 648_000
 HEADER = "hip,ra_deg,dec_deg,pm_ra_mas_yr,pm_dec_mas_yr,parallax_mas,v_mag,b_v,v_i\n"
 
@@ -28,7 +28,7 @@ def test_the_counts_are_the_published_ones(limit: float, published: int) -> None
     assert len(read_cat(FILE, limit)) == pytest.approx(published, rel=0.005)
 
 
-def test_the_file_s_order_stays_until_the_catalogue_is_processed() -> None:
+def test_the_file_s_order_stays_until_the_catalog_is_processed() -> None:
     raw = read_cat(FILE, 5.0)
     numbers = [int(line.split(",")[0]) for line in FILE.read_text().splitlines() if line[:1].isdigit()]
     place = {hip: n for n, hip in enumerate(numbers)}
@@ -52,19 +52,19 @@ def test_the_mission_s_epoch_is_erfa_s_space_motion() -> None:
     assert np.linalg.norm(raw.vectors - still.vectors, axis=1).max() > 60 * ARCSEC_RAD
 
 
-def test_an_instrument_s_magnitudes_follow_the_formula_and_a_missing_colour_is_the_sun_s(
+def test_an_instrument_s_magnitudes_follow_the_formula_and_a_missing_color_is_the_sun_s(
     tmp_path: Path,
 ) -> None:
     path = tmp_path / "three.ecsv"
     path.write_text(HEADER + "1,0,0,0,0,0,4.0,0.0,0.0\n2,9,0,0,0,0,5.0,1.5,1.0\n3,20,0,0,0,0,5.0,,\n")
-    seen = read_cat(path, 6.0, colour=Colour(0.1, -0.2, 0.3))
+    seen = read_cat(path, 6.0, color=Color(0.1, -0.2, 0.3))
     # By hand: 4 + .1; 5 + .1 - .3 + .3; 5 + .1 - .2 * .65 + .3 * .72.
     np.testing.assert_allclose(seen.magnitude, [4.1, 5.1, 5.186], rtol=0, atol=1e-12)  # rounding
     # The limit is a visual one, whatever the instrument sees.
-    assert read_cat(path, 4.5, colour=Colour(3.0)).id.tolist() == [1]
+    assert read_cat(path, 4.5, color=Color(3.0)).id.tolist() == [1]
 
 
-def test_a_double_is_one_star_of_all_the_light_at_its_centre() -> None:
+def test_a_double_is_one_star_of_all_the_light_at_its_center() -> None:
     # 5 and 7.5: a tenth of the light, so 1/11 of the way, and -2.5 log10(1.1) brighter.
     one = proc_cat(made_up([0, 110, 4000], [7.5, 5.0, 6.0]), 120 * ARCSEC_RAD)
     assert one.id.tolist() == [1, 2]
@@ -107,18 +107,18 @@ def test_the_log_has_the_histogram_the_memory_and_every_star() -> None:
     stars = proc_cat(made_up([0, 110, 4000, 3600 * 90], [7.5, 5.0, 6.0, -1.0]), 120 * ARCSEC_RAD)
     lines = log(stars).splitlines()
     assert lines[0] == "3 entries from 4 stars at J2000.00; 1 of them of 2 stars"
-    assert lines[1].startswith(f"{3 * BYTES_A_STAR} bytes")
+    assert lines[1].startswith(f"{3 * BYTES_PER_ENTRY} bytes")
     assert lines[-3].split() == ["3", "90.000000", "+0.000000", "-1.000", "1"]
     assert lines[-2].split() == ["1", "0.027778", "+0.000000", "4.897", "2"]  # 100", 5 - .1035
     counts = [int(line.split()[3]) for line in lines if ".." in line]
     assert sum(counts) == 3
 
 
-def test_what_is_no_catalogue_and_a_limit_without_stars_are_refused(tmp_path: Path) -> None:
-    path = tmp_path / "no_colours.ecsv"
+def test_what_is_no_catalog_and_a_limit_without_stars_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "no_colors.ecsv"
     path.write_text("hip,ra_deg,dec_deg,pm_ra_mas_yr,pm_dec_mas_yr,parallax_mas,v_mag\n1,0,0,0,0,0,4\n")
     assert len(read_cat(path, 6.0)) == 1
-    with pytest.raises(ImageError, match=r"not a star catalogue .*v_mag, b_v, v_i"):
-        read_cat(path, 6.0, colour=Colour(0.1))
+    with pytest.raises(ImageError, match=r"not a star catalog .*v_mag, b_v, v_i"):
+        read_cat(path, 6.0, color=Color(0.1))
     with pytest.raises(ImageError, match="no star of V <= -3; allowed: a fainter limit"):
         read_cat(FILE, -3.0)

@@ -1,4 +1,4 @@
-"""SHEFEX-2's catalogues: the published counts, and that thinned stars are spread evenly."""
+"""SHEFEX-2's catalogs: the published counts, and that thinned stars are spread evenly."""
 
 from pathlib import Path
 
@@ -8,10 +8,10 @@ from scipy.spatial import cKDTree
 
 from estimator.catalog import catalog, pair_index
 from estimator.catalog.catalog import StarCatalog
-from estimator.catalog.shefex import CATALOGUES, COUNT, KEPT_MAG, asymmetric, chosen, spread, uniform
+from estimator.catalog.shefex import BRIGHT_MAG, CATALOGS, COUNT, asymmetric, chosen, thin, uniform
 from estimator.core.errors import ImageError
 
-FILE = Path(__file__).parents[3] / "data/catalogues/hipparcos_hp6.5.ecsv"
+FILE = Path(__file__).parents[3] / "data/catalogs/hipparcos_hp6.5.ecsv"
 
 
 @pytest.fixture(scope="module")
@@ -23,7 +23,7 @@ def chord(angle_rad: float) -> float:
     return 2 * np.sin(angle_rad / 2)
 
 
-def test_the_chosen_catalogue_has_the_published_stars_and_pairs(stars: StarCatalog) -> None:
+def test_the_chosen_catalog_has_the_published_stars_and_pairs(stars: StarCatalog) -> None:
     # Reference H3: 2,023 stars, 54,804 pairs within 18.57 deg, +-15 %.
     flown = chosen(stars)
     assert len(flown) == pytest.approx(2023, abs=1)
@@ -38,19 +38,19 @@ def test_the_chosen_catalogue_has_the_published_stars_and_pairs(stars: StarCatal
 
 def test_a_uniform_sky_of_as_many_stars_has_the_expected_pairs(stars: StarCatalog) -> None:
     # Reference H3: N (N - 1) / 2 (1 - cos theta) / 2 = 53,243; thinning leaves less clumping than the flown one has.
-    even = CATALOGUES["uniform"](stars)
+    even = CATALOGS["uniform"](stars)
     expected = len(even) * (len(even) - 1) / 4 * (1 - np.cos(np.radians(18.57)))
     assert len(even) == pytest.approx(COUNT, abs=1)
     assert expected == pytest.approx(53_243, rel=0.002)
     assert len(pair_index.build(even.vectors, np.radians(18.57)).pair) == pytest.approx(expected, rel=0.02)
-    clumped = catalog.brighter(stars, float(np.sort(stars.v_mag)[len(even) - 1]))
+    clumped = catalog.brighter_than(stars, float(np.sort(stars.v_mag)[len(even) - 1]))
     assert len(pair_index.build(clumped.vectors, np.radians(18.57)).pair) > 1.1 * expected
 
 
-def test_fewer_fields_are_too_poor_in_the_uniform_catalogue(stars: StarCatalog) -> None:
-    # What the uniform catalogue is for: a field needs four stars. 2000 random fields as large as SHEFEX's, round.
-    even = CATALOGUES["uniform"](stars)
-    bright = catalog.brighter(stars, float(np.sort(stars.v_mag)[len(even) - 1]))
+def test_fewer_fields_are_too_poor_in_the_uniform_catalog(stars: StarCatalog) -> None:
+    # What the uniform catalog is for: a field needs four stars. 2000 random fields as large as SHEFEX's, round.
+    even = CATALOGS["uniform"](stars)
+    bright = catalog.brighter_than(stars, float(np.sort(stars.v_mag)[len(even) - 1]))
     sights = np.random.default_rng(5).normal(size=(2000, 3))
     sights /= np.linalg.norm(sights, axis=1, keepdims=True)
     radius = np.sqrt(np.radians(14.87) * np.radians(11.15) / np.pi)
@@ -71,12 +71,12 @@ def test_the_hemispheres_have_their_own_limits(stars: StarCatalog) -> None:
 
 def test_thinned_stars_are_apart_none_is_left_out_needlessly_and_the_bright_stay(stars: StarCatalog) -> None:
     apart = np.radians(3.0)
-    kept = spread(stars, apart, KEPT_MAG)
-    bright = stars.v_mag <= KEPT_MAG
+    kept = thin(stars, apart, BRIGHT_MAG)
+    bright = stars.v_mag <= BRIGHT_MAG
     assert np.isin(stars.id[bright], kept.id).all()
     close = cKDTree(kept.vectors).query_pairs(chord(apart), output_type="ndarray")
     # Of two that are close both were to stay.
-    assert np.all(kept.v_mag[close] <= KEPT_MAG)
+    assert np.all(kept.v_mag[close] <= BRIGHT_MAG)
     left_out = ~np.isin(stars.id, kept.id)
     off, nearest = cKDTree(kept.vectors).query(stars.vectors[left_out], k=len(kept.id))
     within = off <= chord(apart)
@@ -86,7 +86,7 @@ def test_thinned_stars_are_apart_none_is_left_out_needlessly_and_the_bright_stay
 
 
 def test_a_count_that_cannot_be_is_refused(stars: StarCatalog) -> None:
-    with pytest.raises(ImageError, match="9000 stars of 7996; allowed"):
+    with pytest.raises(ImageError, match="9000 of 7996 stars; allowed"):
         uniform(stars, 9000)
-    with pytest.raises(ImageError, match="100 stars of 7996; allowed: from the 9"):
+    with pytest.raises(ImageError, match="100 of 7996 stars; allowed: 9"):
         uniform(stars, 100, 4.5)

@@ -6,7 +6,7 @@ from scipy import ndimage
 from scipy.special import erf, j1
 
 from estimator.centroiding.centroid import CENTROIDERS, cog, gaussian_fit
-from estimator.core.least_squares import SETTLED_PX
+from estimator.core.least_squares import CONVERGED_PX
 from estimator.core.types import Centroids, FramePriors
 from estimator.detection import detect
 
@@ -23,8 +23,8 @@ def gaussian(shape: tuple[int, int], x: float, y: float, flux: float, sigma: flo
     return flux * np.outer(share(shape[0], y), share(shape[1], x))
 
 
-def disc(shape: tuple[int, int], x: float, y: float, radius: float) -> np.ndarray:
-    """A uniform disc: 200 chords a row of pixels, each cut exactly into pixels."""
+def disk(shape: tuple[int, int], x: float, y: float, radius: float) -> np.ndarray:
+    """A uniform disk: 200 chords a row of pixels, each cut exactly into pixels."""
     chords = np.add.outer(np.arange(shape[0]), (np.arange(200) + 0.5) / 200 - 0.5).ravel()
     half = np.sqrt(np.maximum(radius**2 - (chords - y) ** 2, 0))[:, None]
     edges = np.arange(shape[1] + 1) - 0.5
@@ -89,8 +89,8 @@ def test_the_fit_recovers_a_noise_free_gaussian(sigma: float) -> None:
         image = 100 + gaussian((64, 64), x, y, 1e4, sigma)
         found = gaussian_fit(image, detect.local(image, min_area_px=1))
         # Newton's last step is below a thousandth of a pixel, and what it leaves is its square.
-        np.testing.assert_allclose(found.xy_px, [[x, y]], rtol=0, atol=SETTLED_PX**2)
-        assert found.flux[0] == pytest.approx(1e4, rel=SETTLED_PX**2)
+        np.testing.assert_allclose(found.xy_px, [[x, y]], rtol=0, atol=CONVERGED_PX**2)
+        assert found.flux[0] == pytest.approx(1e4, rel=CONVERGED_PX**2)
 
 
 @pytest.mark.parametrize("name", list(CENTROIDERS))
@@ -106,16 +106,16 @@ def test_a_centroid_follows_its_star_by_whole_pixels_and_across_the_diagonal(nam
 
 
 @pytest.mark.parametrize("radius", [2.0, 5.0, 10.4])
-def test_the_centre_of_gravity_of_a_disc_is_its_middle(radius: float) -> None:
-    # Reference section 2: an LED of 2 mm is a disc of 20.8 px. Larger than the fit's window, it falls back.
+def test_the_center_of_gravity_of_a_disk_is_its_middle(radius: float) -> None:
+    # Reference section 2: an LED of 2 mm is a disk of 20.8 px. Larger than the fit's window, it falls back.
     x, y = 60.37, 58.81
-    image = 10 + 200 * disc((128, 128), x, y, radius)
+    image = 10 + 200 * disk((128, 128), x, y, radius)
     found = cog(image, detect.local(image, min_area_px=1))
     light = image - 10
     moments = [(light.sum(axis) @ np.arange(128)) / light.sum() for axis in (0, 1)]
     # Rounding.
     np.testing.assert_allclose(found.xy_px, [moments], rtol=0, atol=1e-9)
-    # Pixels sample the disc: its transform 2 J1(z) / z at n cycles a pixel aliases to an S-curve (reference
+    # Pixels sample the disk: its transform 2 J1(z) / z at n cycles a pixel aliases to an S-curve (reference
     # section 3 has the Gaussian's). The harmonics at their worst, and 1e-4 for the rendering by chords.
     n = np.arange(1, 50)
     z = 2 * np.pi * radius * n
@@ -125,23 +125,20 @@ def test_the_centre_of_gravity_of_a_disc_is_its_middle(radius: float) -> None:
 
 
 @pytest.mark.parametrize("sigma", [0.3, 0.4, 0.5])
-def test_the_centre_of_gravity_has_the_s_curve_of_theory(sigma: float) -> None:
-    # Reference section 3: the centre of gravity errs by exp(-2 pi^2 sigma^2) / pi sin(2 pi x), wide window.
+def test_the_center_of_gravity_has_the_s_curve_of_theory(sigma: float) -> None:
+    # Reference section 3: the center of gravity errs by exp(-2 pi^2 sigma^2) / pi sin(2 pi x), wide window.
     phases = np.linspace(-0.5, 0.5, 21)
     images = [100 + gaussian((40, 40), 20 + x, 20.0, 1e4, sigma) for x in phases]
     off = np.array(
-        [
-            cog(im, detect.local(im, min_area_px=1)).xy_px[0, 0] - 20 - x
-            for im, x in zip(images, phases, strict=True)
-        ]
+        [cog(im, detect.local(im, min_area_px=1)).xy_px[0, 0] - 20 - x for im, x in zip(images, phases, strict=True)]
     )
     curve = -np.exp(-2 * (np.pi * sigma) ** 2) / np.pi * np.sin(2 * np.pi * phases)
     # The second harmonic is exp(-8 pi^2 sigma^2) / (2 pi), .0001 at sigma .3.
     np.testing.assert_allclose(off, curve, rtol=0, atol=2e-4)
 
 
-def test_what_the_fit_cannot_fit_keeps_its_centre_of_gravity() -> None:
-    image = 10 + 200 * disc((128, 128), 60.37, 58.81, 10.4)
+def test_what_the_fit_cannot_fit_keeps_its_center_of_gravity() -> None:
+    image = 10 + 200 * disk((128, 128), 60.37, 58.81, 10.4)
     image += gaussian((128, 128), 2.0, 100.2, 2e4)  # too near the border for a window of 7x7
     blobs = detect.local(image, min_area_px=1)
     assert len(blobs) == 2
@@ -232,18 +229,16 @@ def test_a_frame_without_blobs_gives_no_centroids(name: str) -> None:
 
 
 @pytest.mark.parametrize(("radius", "bright_e"), [(5.0, 400.0), (10.4, 400.0), (10.4, 4000.0)])
-def test_the_disc_fit_is_true_and_better_than_gravity_where_noise_rules(
-    radius: float, bright_e: float
-) -> None:
+def test_the_disk_fit_is_true_and_better_than_gravity_where_noise_rules(radius: float, bright_e: float) -> None:
     # An edge blurred by optics of 0.8 px; the reference's LED of 20.8 px, and a smaller one.
     rng = np.random.default_rng(27)
     off, sigma, by_gravity = [], [], []
     for _ in range(80):
         x, y = rng.uniform(63, 64, 2)
-        light = ndimage.gaussian_filter(bright_e * disc((128, 128), x, y, radius), 0.8)
+        light = ndimage.gaussian_filter(bright_e * disk((128, 128), x, y, radius), 0.8)
         image = rng.poisson(light) + rng.normal(300, 30, light.shape)
         blobs = detect.default(image)
-        found = CENTROIDERS["disc"](image, blobs)
+        found = CENTROIDERS["disk"](image, blobs)
         off.append(found.xy_px[0] - (x, y))
         sigma.append(found.sigma_px[0])
         by_gravity.append(cog(image, blobs).xy_px[0] - (x, y))
@@ -253,14 +248,14 @@ def test_the_disc_fit_is_true_and_better_than_gravity_where_noise_rules(
     assert np.std(off) < 1.1 * np.std(by_gravity)
 
 
-def test_a_saturated_disc_is_placed_by_its_edge() -> None:
+def test_a_saturated_disk_is_placed_by_its_edge() -> None:
     rng = np.random.default_rng(28)
     off, sigma = [], []
     for _ in range(60):
         x, y = rng.uniform(63, 64, 2)
-        light = ndimage.gaussian_filter(3000 * disc((128, 128), x, y, 10.4), 0.8)
+        light = ndimage.gaussian_filter(3000 * disk((128, 128), x, y, 10.4), 0.8)
         image = (rng.poisson(light) + rng.normal(300, 20, light.shape)).clip(0, 2000)
-        found = CENTROIDERS["disc"](image, detect.default(image), 1.0, FramePriors(saturation=2000))
+        found = CENTROIDERS["disk"](image, detect.default(image), 1.0, FramePriors(saturation=2000))
         off.append(found.xy_px[0] - (x, y))
         sigma.append(found.sigma_px[0])
     # 120 numbers give it to 13 %. Which pixels at the edge are full is left to the noise, and they are not weighed:

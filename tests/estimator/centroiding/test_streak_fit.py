@@ -71,7 +71,7 @@ def cramer_rao_px(length: float, flux_e: float, noise_e: float) -> tuple[float, 
 def test_the_line_filter_is_scipy_s_mean_along_the_line(streak_px, dtype: str) -> None:
     rng = np.random.default_rng(60)
     image = rng.integers(0, 200, (90, 120)).astype(dtype)
-    taps = detect.taps_of(streak_px)
+    taps = detect.line_taps(streak_px)
     reach = np.abs(taps).max()
     kernel = np.zeros((2 * reach + 1, 2 * reach + 1))
     kernel[taps[:, 1] + reach, taps[:, 0] + reach] = 1 / len(taps)
@@ -86,12 +86,12 @@ def test_the_line_filter_is_scipy_s_mean_along_the_line(streak_px, dtype: str) -
 
 @pytest.mark.parametrize("streak_px", [(9.0, 0.0), (8.0, -6.0)])
 def test_white_noise_keeps_so_much_through_the_line_filter(streak_px) -> None:
-    taps = detect.taps_of(streak_px)
+    taps = detect.line_taps(streak_px)
     noise = np.random.default_rng(61).normal(0, 1, (600, 600))
     smooth = ndimage.correlate(noise, BINOMIAL)
     line = np.mean([np.roll(smooth, tuple(tap[::-1]), (0, 1)) for tap in taps], axis=0)
     # Some 15,000 independent patches: 0.6 % of a deviation.
-    assert detect.noise_kept(taps) == pytest.approx(line.std(), rel=0.025)
+    assert detect.noise_factor(taps) == pytest.approx(line.std(), rel=0.025)
 
 
 @pytest.mark.parametrize("told", [True, False])
@@ -103,7 +103,7 @@ def test_smears_of_12_px_are_found_by_the_gyro_s_streak_and_without(told: bool) 
     for angle in rng.uniform(0, np.pi, 6):
         dx, dy = 12 * np.cos(angle), 12 * np.sin(angle)
         image, xy = field(rng, dx, dy, fluxes)
-        blobs = detect.default(image, hints=FramePriors((dx, dy) if told else None))
+        blobs = detect.default(image, priors=FramePriors((dx, dy) if told else None))
         found += near(blobs.xy_px, xy)
         strangers += len(blobs) - near(blobs.xy_px, xy)
     assert found >= 0.98 * 6 * 36
@@ -114,16 +114,16 @@ def test_of_noise_alone_the_line_filter_keeps_what_is_five_pixels_and_bright() -
     # At two sigma noise itself makes blobs: they are scipy's labels of the filtered frame, by the rule.
     image, streak_px = np.random.default_rng(69).normal(1000, 9, (256, 256)), (9.0, 0.0)
     background = frame_background.estimate_background(image)
-    blobs = detect.smeared(image, background, 2.0, 1000, FramePriors(streak_px))
-    taps = detect.taps_of(streak_px)
-    above = 2.0 * detect.noise_kept(taps) / frame_background.FILTERED_NOISE * background.noise
+    blobs = detect.detect_streaks(image, background, 2.0, 1000, FramePriors(streak_px))
+    taps = detect.line_taps(streak_px)
+    above = 2.0 * detect.noise_factor(taps) / frame_background.FILTERED_NOISE * background.noise
     mask = np.zeros(image.shape, bool)
     for y, x0, x1 in runs_above(image, background.level + above, taps):
         mask[y, x0 : x1 + 1] = True
     labels, count = ndimage.label(mask, np.ones((3, 3)))
     area = ndimage.sum(mask, labels, np.arange(1, count + 1)).astype(int)
     # Some of a few pixels may hold less light than the sky: none of eight.
-    assert len(blobs) <= (area >= detect.FEWEST_SMEARED).sum()
+    assert len(blobs) <= (area >= detect.MIN_STREAK_AREA_PX).sum()
     assert sorted(blobs.area_px[blobs.area_px >= 8]) == sorted(area[area >= 8])
     assert (area >= 8).sum() > 20
 
@@ -132,7 +132,7 @@ def test_a_line_filter_gains_over_a_round_one() -> None:
     # Reference section 3: a streak of 15 px loses 2.2 magnitudes; the mean over it gains most of it back.
     rng = np.random.default_rng(63)
     image, xy = field(rng, 12.0, 9.0, np.full(36, 900.0))
-    blobs = detect.default(image, hints=FramePriors((12.0, 9.0)))
+    blobs = detect.default(image, priors=FramePriors((12.0, 9.0)))
     with_line, without = (near(found.xy_px, xy) for found in (blobs, detect.local(image)))
     assert with_line >= 34
     assert without < with_line / 2
@@ -146,14 +146,14 @@ def test_the_middle_is_mid_exposure_within_a_true_covariance(length: float) -> N
     for angle in rng.uniform(0, np.pi, 10):
         dx, dy = length * np.cos(angle), length * np.sin(angle)
         image, xy = field(rng, dx, dy, np.full(36, 8000.0))
-        hints = FramePriors((dx, dy))
-        blobs = detect.default(image, hints=hints)
-        found = streak(image, blobs, 1.0, hints)
+        priors = FramePriors((dx, dy))
+        blobs = detect.default(image, priors=priors)
+        found = streak(image, blobs, 1.0, priors)
         rows = nearest(found.xy_px, xy)
         error, spread = found.xy_px[rows] - xy, found.covariance_px2[rows]
         scaled.append(np.einsum("ni,nij,nj->n", error, np.linalg.inv(spread), error))
         off.append(error @ np.array([[dx, -dy], [dy, dx]]) / length)
-        begin, end = streak_ends(image, blobs, 1.0, hints)
+        begin, end = streak_ends(image, blobs, 1.0, priors)
         flipped = np.sum((end - begin)[rows] * [dx, dy], axis=1) < 0
         begin = np.where(flipped[:, None], end[rows], begin[rows])
         ends_off.append(begin - (xy - [dx / 2, dy / 2]))
@@ -179,8 +179,8 @@ def test_the_fit_reaches_the_bound_along_and_across() -> None:
     off = []
     for _ in range(16):
         image, xy = field(rng, length, 0.0, np.full(36, 6000.0))
-        hints = FramePriors((length, 0.0))
-        found = streak(image, detect.default(image, hints=hints), 1.0, hints)
+        priors = FramePriors((length, 0.0))
+        found = streak(image, detect.default(image, priors=priors), 1.0, priors)
         off.append(found.xy_px[nearest(found.xy_px, xy)] - xy)
     rms = np.concatenate(off).std(axis=0)
     # 576 errors give a deviation to 3 %. Length, width and direction are free in the fit, but they are even or turn
@@ -191,10 +191,10 @@ def test_the_fit_reaches_the_bound_along_and_across() -> None:
 
 def test_a_faint_streak_does_not_call_a_piece_of_itself_the_whole() -> None:
     rng = np.random.default_rng(71)
-    hints, scaled = FramePriors((14.0, 10.0)), []
+    priors, scaled = FramePriors((14.0, 10.0)), []
     for _ in range(8):
         image, xy = field(rng, 14.0, 10.0, np.full(36, 1000.0))  # signal to noise of 7
-        found = streak(image, detect.default(image, hints=hints), 1.0, hints)
+        found = streak(image, detect.default(image, priors=priors), 1.0, priors)
         off = found.xy_px[:, None] - xy
         row = np.linalg.norm(off, axis=2).argmin(axis=1)
         error = off[np.arange(len(found)), row]
@@ -206,12 +206,12 @@ def test_a_faint_streak_does_not_call_a_piece_of_itself_the_whole() -> None:
     assert np.mean(chi2 > 16) < 0.01  # of two numbers: beyond four standard deviations, 3e-4
 
 
-def test_the_line_fit_beats_the_centre_of_gravity() -> None:
+def test_the_line_fit_beats_the_center_of_gravity() -> None:
     rng = np.random.default_rng(66)
     image, xy = field(rng, 9.0, 7.0, np.full(36, 4000.0))
-    hints = FramePriors((9.0, 7.0))
-    blobs = detect.default(image, hints=hints)
-    fitted, by_gravity = streak(image, blobs, 1.0, hints), cog(image, blobs, 1.0)
+    priors = FramePriors((9.0, 7.0))
+    blobs = detect.default(image, priors=priors)
+    fitted, by_gravity = streak(image, blobs, 1.0, priors), cog(image, blobs, 1.0)
     errors = [found.xy_px[nearest(found.xy_px, xy)] - xy for found in (fitted, by_gravity)]
     assert errors[0].std() < errors[1].std() / 2
 
@@ -233,7 +233,7 @@ def test_false_streaks_of_white_noise_are_rare() -> None:
     found = 0
     for _ in range(6):
         image = rng.normal(1000, 9, (1024, 1024))
-        found += len(detect.default(image, hints=FramePriors((10.0, 6.0))))
+        found += len(detect.default(image, priors=FramePriors((10.0, 6.0))))
     expected = 6 * 2**20 / 5 * stats.norm.sf(5)
     assert found <= 3 + 4 * expected
     assert frame_background.estimate_background(image).noise.mean() == pytest.approx(9 * 0.375, rel=0.03)
@@ -248,11 +248,9 @@ def test_streaks_too_faint_to_be_seen_are_found_by_their_direction() -> None:
     for middle in middles:
         for step in np.linspace(-0.5, 0.5, 60):
             x, y = middle + step * along
-            light += (
-                500 / 60 / (2 * np.pi * 0.64) * np.exp(-((columns - x) ** 2 + (rows - y) ** 2) / 2 / 0.64)
-            )
+            light += 500 / 60 / (2 * np.pi * 0.64) * np.exp(-((columns - x) ** 2 + (rows - y) ** 2) / 2 / 0.64)
     image = 100 + light + rng.normal(0, 10, light.shape)
-    told = detect.default(image, hints=FramePriors(tuple(along)))
+    told = detect.default(image, priors=FramePriors(tuple(along)))
     unaided = detect.default(image)
     assert len(detect.local(image)) <= 2
     assert len(told) == 5

@@ -22,9 +22,7 @@ def test_a_distorted_pixel_by_hand() -> None:
     # y' = -.0996 + p1 (.05 + .02) + 2 p2 (-.02) = -.0996 + .0007 + .0008 = -.0981.
     camera = Camera(640, 480, 1000.0, (300.0, 200.0), (-0.1, 0.4, 0.01, -0.02, 0.0))
     # 1e-10: rounding of numbers of a few hundred.
-    np.testing.assert_allclose(
-        camera.pixels(np.array([[0.4, -0.2, 2.0]])), [[496.2, 101.9]], rtol=0, atol=1e-10
-    )
+    np.testing.assert_allclose(camera.pixels(np.array([[0.4, -0.2, 2.0]])), [[496.2, 101.9]], rtol=0, atol=1e-10)
 
 
 def test_the_boresight_lands_on_the_principal_point() -> None:
@@ -100,18 +98,14 @@ def test_the_diagonal_is_the_angle_between_opposite_corners() -> None:
 def test_a_zoomed_camera_magnifies_angles_from_the_axis() -> None:
     plain = Camera(640, 480, 1000.0, (320.0, 240.0))
     vector = np.array([[0.1, -0.05, 1.0]])
-    off = plain.pixels(vector) - plain.centre_px
+    off = plain.pixels(vector) - plain.center_px
     zoomed = plain.zoomed(1.5)
-    np.testing.assert_allclose(
-        zoomed.pixels(vector) - zoomed.centre_px, 1.5 * off, rtol=0, atol=1e-12
-    )  # rounding
+    np.testing.assert_allclose(zoomed.pixels(vector) - zoomed.center_px, 1.5 * off, rtol=0, atol=1e-12)  # rounding
 
 
 def test_a_sensor_ends_half_a_pixel_beyond_its_outermost_middles() -> None:
     camera = Camera(10, 8, 10.0, (4.5, 3.5))
-    inside = camera.contains(
-        np.array([[-0.5, -0.5], [9.5, 7.5], [-0.51, 0], [9.51, 0], [0, 7.51], [0, -0.51]])
-    )
+    inside = camera.contains(np.array([[-0.5, -0.5], [9.5, 7.5], [-0.51, 0], [9.51, 0], [0, 7.51], [0, -0.51]]))
     assert inside.tolist() == [True, True, False, False, False, False]
     shrunk = camera.contains(np.array([[0.4, 4.0], [0.5, 4.0], [4.0, 6.5], [4.0, 6.6]]), margin_px=1.0)
     assert shrunk.tolist() == [False, True, True, False]

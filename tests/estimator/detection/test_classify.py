@@ -18,8 +18,7 @@ CAMERA = Camera.from_fov(659, 493, np.radians(14.87))
 def star(x: float, y: float, flux: float, sigma: float, shape: tuple[int, int] = SHAPE) -> np.ndarray:
     """A Gaussian integrated over each pixel."""
     down, across = (
-        np.diff(erf((np.arange(n + 1) - 0.5 - at) / (sigma * 2**0.5))) / 2
-        for n, at in zip(shape, (y, x), strict=True)
+        np.diff(erf((np.arange(n + 1) - 0.5 - at) / (sigma * 2**0.5))) / 2 for n, at in zip(shape, (y, x), strict=True)
     )
     return flux * np.outer(down, across)
 
@@ -87,8 +86,8 @@ def test_a_track_among_round_stars_is_flagged(angle_deg: float) -> None:
     assert np.count_nonzero(blobs.flag) == 1
 
 
-def test_the_moon_is_flagged_and_is_no_texture_of_its_neighbourhood() -> None:
-    # 0.52 deg at 14.87 deg a row of 659 is a disc of 23 px, blurred by its own glare.
+def test_the_moon_is_flagged_and_is_no_texture_of_its_neighborhood() -> None:
+    # 0.52 deg at 14.87 deg a row of 659 is a disk of 23 px, blurred by its own glare.
     rng = np.random.default_rng(43)
     light, xy = sky_frame(rng, 15, 0.7)
     y, x = np.mgrid[: SHAPE[0], : SHAPE[1]]
@@ -101,7 +100,7 @@ def test_the_moon_is_flagged_and_is_no_texture_of_its_neighbourhood() -> None:
 
 
 def test_an_led_is_no_moon() -> None:
-    # Reference section 2: a 2 mm LED is a disc of 20.8 px on the 1600x1200 camera; all discs are alike.
+    # Reference section 2: a 2 mm LED is a disk of 20.8 px on the 1600x1200 camera; all disks are alike.
     rng = np.random.default_rng(44)
     light = np.zeros((1200, 1600))
     y, x = np.mgrid[-20:21, -20:21]
@@ -154,7 +153,7 @@ def test_saturated_stars_are_kept_with_a_sigma_that_covers_them(centroider: str,
         xy = sky_frame(rng, 15, 1.0)[1]
         light = sum(star(x, y, over * full * 2 * np.pi, 1.0) for x, y in xy)
         image = exposed(rng, light).clip(0, full)
-        flags.append(detect.default(image, hints=FramePriors(saturation=full)).flag)
+        flags.append(detect.default(image, priors=FramePriors(saturation=full)).flag)
         found = detect_and_centroid(image, CAMERA, settings, Clock())
         assert len(found) == 15
         scaled.append(off_px(found, xy) / found.sigma_px.mean())
@@ -188,7 +187,7 @@ def test_a_bad_pixel_far_from_any_star_is_no_light() -> None:
     image = exposed(rng, light)
     bad = np.array([(20, 20), (21, 20), (20, 21), (650, 5), (0, 0)])
     image[bad[:, 1], bad[:, 0]] = 65535
-    mended = detect.mend(image, bad)
+    mended = detect.replace_bad_pixels(image, bad)
     assert mended[bad[:, 1], bad[:, 0]].max() < 300 + 5 * 12
     assert image[20, 20] == 65535
     assert len(detect.default(mended)) == 10
@@ -196,7 +195,7 @@ def test_a_bad_pixel_far_from_any_star_is_no_light() -> None:
 
 def test_a_bad_pixel_off_the_sensor_is_refused() -> None:
     with pytest.raises(ImageError, match="the bad-pixel map reaches beyond the frame of 659x493 pixels"):
-        detect.mend(np.eye(493, 659), np.array([(659, 3)]))
+        detect.replace_bad_pixels(np.eye(493, 659), np.array([(659, 3)]))
 
 
 def test_a_frame_without_blobs_has_no_flags() -> None:

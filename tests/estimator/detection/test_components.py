@@ -8,7 +8,7 @@ from scipy.special import erf
 from estimator.core.errors import ImageError
 from estimator.core.types import FramePriors
 from estimator.detection import detect
-from estimator.detection.components import FIRST_RUNS, labelled, runs_above
+from estimator.detection.components import FIRST_RUNS, label_runs, runs_above
 from estimator.detection.shefex import maximum_scan, sequential_scan
 
 BINOMIAL = np.outer([1, 2, 1], [1, 2, 1]) / 16
@@ -16,8 +16,7 @@ BINOMIAL = np.outer([1, 2, 1], [1, 2, 1]) / 16
 
 def star(shape: tuple[int, int], x: float, y: float, flux: float, sigma: float) -> np.ndarray:
     down, across = (
-        np.diff(erf((np.arange(n + 1) - 0.5 - at) / (sigma * 2**0.5))) / 2
-        for n, at in zip(shape, (y, x), strict=True)
+        np.diff(erf((np.arange(n + 1) - 0.5 - at) / (sigma * 2**0.5))) / 2 for n, at in zip(shape, (y, x), strict=True)
     )
     return flux * np.outer(down, across)
 
@@ -91,8 +90,8 @@ def test_the_thesis_keeps_fifty_pixels_above_four_per_cent() -> None:
 def test_the_thesis_takes_full_scale_from_the_saturation() -> None:
     image = np.random.default_rng(15).normal(0, 1, (120, 160))
     image[40:50, 40:50] += 60
-    assert len(detect.thesis(image, hints=FramePriors(saturation=1000))) == 1
-    assert len(detect.thesis(image, hints=FramePriors(saturation=4000))) == 0
+    assert len(detect.thesis(image, priors=FramePriors(saturation=1000))) == 1
+    assert len(detect.thesis(image, priors=FramePriors(saturation=4000))) == 0
     with pytest.raises(ImageError, match="pixels of type float64 have no full scale"):
         detect.thesis(image)
 
@@ -130,7 +129,7 @@ def test_labels_are_scipy_s(seed: int) -> None:
     rng = np.random.default_rng(200 + seed)
     image = ndimage.gaussian_filter(rng.normal(0, 1, (120, 150)), 1.2)
     runs = runs_above(image, np.full((1, 1), 0.1 * seed - 0.1))
-    blob, count = labelled(runs)
+    blob, count = label_runs(runs)
     labels = np.zeros(image.shape, int)
     for (y, x0, x1), mine in zip(runs, blob, strict=True):
         labels[y, x0 : x1 + 1] = mine + 1

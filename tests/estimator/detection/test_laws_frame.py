@@ -32,9 +32,7 @@ WIDTH, HEIGHT = 90, 70
 CAMERA = Camera.from_fov(WIDTH, HEIGHT, 0.3)
 # Those that compiled code is compiled for once, and any other.
 KINDS = some.sampled_from(["u2", "f8", ">f8"])
-EVERY_KIND = some.sampled_from(
-    ["?", "u1", "i1", "<u2", ">u2", ">i4", "u8", "f2", ">f4", "f8", "c8", "S3", "O"]
-)
+EVERY_KIND = some.sampled_from(["?", "u1", "i1", "<u2", ">u2", ">i4", "u8", "f2", ">f4", "f8", "c8", "S3", "O"])
 FRAMES = KINDS.flatmap(lambda kind: arrays(kind, (HEIGHT, WIDTH), fill=some.just(0)))
 STREAKS = some.none() | some.tuples(some.floats(-15, 15), some.floats(-15, 15))
 BINOMIAL = np.outer([1, 2, 1], [1, 2, 1]) / 16
@@ -64,10 +62,10 @@ def assert_inside(blobs: Blobs, most: int) -> None:
 # Detection
 
 
-@law(detect.prepared, detect.check, detect.check_size, detect.native)
+@law(detect.prepare_image, detect.check_image, detect.check_size, detect.to_native)
 @given(image=EVERY_KIND.flatmap(lambda kind: arrays(kind, array_shapes(max_dims=3, min_side=0, max_side=20))))
 def test_any_array_is_an_image_of_its_values_or_none(image: NDArray) -> None:
-    told = answered(lambda: detect.prepared(image), ImageError)
+    told = answered(lambda: detect.prepare_image(image), ImageError)
     assert told is None or (told.ndim == 2 and told.dtype.isnative and min(told.shape) >= 16)
     assert told is None or (np.isfinite(told).all() and (told == image).all())
 
@@ -100,10 +98,10 @@ def test_a_brighter_sky_hides_no_star(rng: np.random.Generator, up: int, name: s
 
 
 @law(
-    detect.gather,
-    detect.smeared,
-    detect.faint_streaks,
-    detect.flattened,
+    detect.detect_blobs,
+    detect.detect_streaks,
+    detect.detect_faint_streaks,
+    detect.flat_background,
     background.estimate_background,
     slow=True,
 )
@@ -113,17 +111,17 @@ def test_what_stands_out_less_is_found_with_less(
 ) -> None:
     frame, _ = starry(rng)
     sky = background.estimate_background(frame)
-    flat = detect.flattened(sky, frame.shape)
+    flat = detect.flat_background(sky, frame.shape)
     assert sky.level.min() <= flat.level.item() <= sky.level.max()
-    found = [detect.gather(frame, flat, more * flat.noise, 1, 99) for more in (sigma, sigma + 1)]
+    found = [detect.detect_blobs(frame, flat, more * flat.noise, 1, 99) for more in (sigma, sigma + 1)]
     for blobs in found:
         assert_inside(blobs, 99)
     assert found[0].area_px.sum() >= found[1].area_px.sum()
-    assert_inside(detect.smeared(frame, sky, sigma, 99, FramePriors(streak_px)), 99)
-    assert_inside(detect.faint_streaks(frame, sky, sigma, 99, FramePriors()), 99)
+    assert_inside(detect.detect_streaks(frame, sky, sigma, 99, FramePriors(streak_px)), 99)
+    assert_inside(detect.detect_faint_streaks(frame, sky, sigma, 99, FramePriors()), 99)
 
 
-@law(components.runs_above, background.estimate_background, background.summing)
+@law(components.runs_above, background.estimate_background, background.accumulator_type)
 @given(rng=SEEDS, threshold=some.floats(90, 300), kind=some.sampled_from(["u2", "f8"]))
 def test_runs_are_the_pixels_that_a_plain_filter_has_above(
     rng: np.random.Generator, threshold: float, kind: str
@@ -137,27 +135,27 @@ def test_runs_are_the_pixels_that_a_plain_filter_has_above(
     lower, higher = (background.estimate_background(frame + np.array(more, kind)) for more in (0, 50))
     np.testing.assert_allclose(higher.level - lower.level, 50, rtol=0, atol=0.3)  # by the median's own steps
     for pixel in ("u1", "i1", "u2", "i2"):
-        assert np.iinfo(background.summing(np.dtype(pixel))).max >= 16 * np.iinfo(pixel).max
+        assert np.iinfo(background.accumulator_type(np.dtype(pixel))).max >= 16 * np.iinfo(pixel).max
 
 
-@law(detect.taps_of, detect.noise_kept)
+@law(detect.line_taps, detect.noise_factor)
 @given(some.tuples(some.floats(-60, 60), some.floats(-60, 60)))
 def test_a_line_filter_keeps_less_noise_and_has_no_direction(streak_px: tuple[float, float]) -> None:
-    taps = detect.taps_of(streak_px)
+    taps = detect.line_taps(streak_px)
     assert sorted(map(tuple, taps)) == sorted(map(tuple, -taps))
     assert (np.abs(taps) <= np.abs(streak_px) / 2 + 0.5).all()
-    kept = detect.noise_kept(taps)
+    kept = detect.noise_factor(taps)
     assert 0.375 / np.sqrt(len(taps)) - 1e-12 <= kept <= 0.375 + 1e-12
 
 
-@law(detect.mend)
+@law(detect.replace_bad_pixels)
 @given(
     rng=SEEDS,
     bad=arrays("i8", some.tuples(some.integers(0, 9), some.just(2)), elements=some.integers(-2, 95)),
 )
 def test_mending_changes_bad_pixels_alone(rng: np.random.Generator, bad: NDArray) -> None:
     frame, _ = starry(rng)
-    told = answered(lambda: detect.mend(frame, bad), ImageError)
+    told = answered(lambda: detect.replace_bad_pixels(frame, bad), ImageError)
     assert (told is not None) == bool(((bad >= 0) & (bad < [WIDTH, HEIGHT])).all())
     mended = frame if told is None else told
     changed = set(map(tuple, np.argwhere(mended != frame)[:, ::-1].tolist()))
@@ -183,9 +181,7 @@ def test_a_verdict_changes_flags_alone(
 
 @law(windows.in_windows)
 @given(rng=SEEDS, strange=arrays("f8", (4, 2), elements=ANY), half_px=some.floats(0, 20))
-def test_windows_anywhere_hold_blobs_of_the_frame(
-    rng: np.random.Generator, strange: NDArray, half_px: float
-) -> None:
+def test_windows_anywhere_hold_blobs_of_the_frame(rng: np.random.Generator, strange: NDArray, half_px: float) -> None:
     frame, places = starry(rng)
     assert_inside(windows.in_windows(frame, np.concatenate([strange, places]), half_px, 6.0), 13)
     found = windows.in_windows(frame, places, 3.0, 6.0)
@@ -201,13 +197,11 @@ def test_windows_anywhere_hold_blobs_of_the_frame(
     centroid.cog,
     centroid.weighted,
     centroid.gaussian_window,
-    centroid.disc,
+    centroid.disk,
     centroid.streak,
 )
 @given(rng=SEEDS, name=some.sampled_from(sorted(CENTROIDERS)), hostile=FRAMES)
-def test_a_centroid_is_its_star_s_whatever_the_order(
-    rng: np.random.Generator, name: str, hostile: NDArray
-) -> None:
+def test_a_centroid_is_its_star_s_whatever_the_order(rng: np.random.Generator, name: str, hostile: NDArray) -> None:
     frame, places = starry(rng)
     blobs = DETECTORS["local"](frame, 5.0, 3, 9, FramePriors())
     seen = CENTROIDERS[name](frame, blobs, 1.0, FramePriors())
@@ -226,21 +220,21 @@ def test_a_centroid_is_its_star_s_whatever_the_order(
 @given(rng=SEEDS, long_px=some.floats(7, 11))
 def test_a_streak_s_middle_is_between_its_ends(rng: np.random.Generator, long_px: float) -> None:
     frame, _places = starry(rng, smear_px=long_px)
-    hints = FramePriors((long_px, 0.0))
-    blobs = DETECTORS["default"](frame, 5.0, 3, 9, hints)
-    begin, end = centroid.streak_ends(frame, blobs, 1.0, hints)
-    seen = centroid.streak(frame, blobs, 1.0, hints)
+    priors = FramePriors((long_px, 0.0))
+    blobs = DETECTORS["default"](frame, 5.0, 3, 9, priors)
+    begin, end = centroid.streak_ends(frame, blobs, 1.0, priors)
+    seen = centroid.streak(frame, blobs, 1.0, priors)
     line = ~np.isnan(begin[:, 0])
     assert line.any()
     np.testing.assert_allclose(((begin + end) / 2)[line], seen.xy_px[line], rtol=0, atol=1e-9)
     assert (np.abs(np.linalg.norm(end - begin, axis=1) - long_px)[line] < 3).all()
     assert_covariance(seen.covariance_px2)
-    assert len(centroid.gaussian_fit(frame, blobs, 1.0, hints)) == len(blobs)
+    assert len(centroid.gaussian_fit(frame, blobs, 1.0, priors)) == len(blobs)
 
 
 @law(
     Centroids.take,
-    Centroids.none,
+    Centroids.empty,
     pipeline.brightest,
     pipeline.direction_sigma_rad,
     pipeline.away_from_border,
@@ -254,7 +248,7 @@ def test_lights_are_chosen_and_doubted_as_told(
     settings = Settings(base_stars=base, centroid_sigma_px=floor_px, bad_px=np.array([[44, 35]]))
     few = pipeline.brightest(lights, settings)
     np.testing.assert_array_equal(few.xy_px, lights.xy_px[: 2 * base])
-    assert len(lights.take(np.zeros(count, bool))) == len(Centroids.none()) == 0
+    assert len(lights.take(np.zeros(count, bool))) == len(Centroids.empty()) == 0
     sigma = pipeline.direction_sigma_rad(lights, CAMERA, settings) * CAMERA.focal_px
     assert (sigma >= np.maximum(lights.sigma_px, floor_px) - 1e-12).all()
     frame, _ = starry(rng)
@@ -293,9 +287,7 @@ def test_a_look_gives_lights_on_the_chip_and_the_time_it_took(
     fits = answered(lambda: camera.check_shape(hostile.shape, CAMERA) or True, ImageError)
     assert bool(fits) == (hostile.shape == (HEIGHT, WIDTH))
     nothing = Attitude("nobody asked")
-    answered(
-        lambda: pipeline.process_frame(hostile, CAMERA, Settings(), lambda *_: nothing, streak_px), ImageError
-    )
+    answered(lambda: pipeline.process_frame(hostile, CAMERA, Settings(), lambda *_: nothing, streak_px), ImageError)
     frame, _ = starry(rng)
     clock = Clock()
     seen = pipeline.detect_and_centroid(frame, CAMERA, Settings(), clock, streak_px)
@@ -330,21 +322,15 @@ def test_a_longer_lens_has_a_smaller_field(fov_rad: float, factor: float) -> Non
     lens = Camera.from_fov(WIDTH, HEIGHT, fov_rad)
     np.testing.assert_allclose(lens.fov_rad, fov_rad, rtol=1e-9, atol=0)
     assert lens.diagonal_rad > lens.fov_rad > lens.zoomed(factor).fov_rad
-    np.testing.assert_allclose(
-        lens.zoomed(factor).zoomed(1 / factor).focal_px, lens.focal_px, rtol=1e-12, atol=0
-    )
+    np.testing.assert_allclose(lens.zoomed(factor).zoomed(1 / factor).focal_px, lens.focal_px, rtol=1e-12, atol=0)
 
 
 # Attitude
 
 
 @law(*SOLVERS.values(), solvers.rotation)
-@given(
-    rng=SEEDS, count=some.integers(2, 12), noise=some.floats(0, 0.01), name=some.sampled_from(sorted(SOLVERS))
-)
-def test_a_solver_finds_the_turn_in_any_order(
-    rng: np.random.Generator, count: int, noise: float, name: str
-) -> None:
+@given(rng=SEEDS, count=some.integers(2, 12), noise=some.floats(0, 0.01), name=some.sampled_from(sorted(SOLVERS)))
+def test_a_solver_finds_the_turn_in_any_order(rng: np.random.Generator, count: int, noise: float, name: str) -> None:
     truth, ref, sigma = turn(rng), units(rng, count), rng.uniform(1e-5, 1e-3, count)
     cam = truth.apply(ref) + noise * sigma[:, None] * rng.normal(size=(count, 3))
     cam /= np.linalg.norm(cam, axis=1, keepdims=True)
@@ -381,9 +367,7 @@ def test_any_directions_are_solved_or_refused(
     seen = units(rng, 5)
     spread = solvers.covariance(seen, np.full(5, 1e-4), name)
     assert_covariance(spread)
-    np.testing.assert_allclose(
-        solvers.covariance(seen, np.full(5, scale * 1e-4), name), scale**2 * spread, rtol=1e-6
-    )
+    np.testing.assert_allclose(solvers.covariance(seen, np.full(5, scale * 1e-4), name), scale**2 * spread, rtol=1e-6)
 
 
 @law(ra_dec_roll_rad, Attitude.ra_dec_roll_deg)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from estimator.core.types import FilterState
-from estimator.filter.mekf import USED, GyroModel, Mekf
+from estimator.filter.mekf import USED, AttitudeFilter, GyroModel
 from estimator.trackers import exposure_control
 from estimator.trackers.exposure_control import Control, Exposure, Observation
 
@@ -21,8 +21,8 @@ pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning")
 GYRO = GyroModel(1e-5, 1e-4, 1000.0)
 
 
-def filtering(rng: np.random.Generator) -> Mekf:
-    return Mekf(GYRO, 0.0, turn(rng), 10 ** rng.uniform(-5, 0), 10 ** rng.uniform(-6, -2))
+def filtering(rng: np.random.Generator) -> AttitudeFilter:
+    return AttitudeFilter(GYRO, 0.0, turn(rng), 10 ** rng.uniform(-5, 0), 10 ** rng.uniform(-6, -2))
 
 
 def assert_sound(told: FilterState) -> None:
@@ -31,7 +31,13 @@ def assert_sound(told: FilterState) -> None:
     np.testing.assert_allclose(told.sigma_bias_rad_s**2, np.diag(told.covariance)[3:], rtol=1e-12, atol=0)
 
 
-@law(Mekf.propagate, Mekf.state, Mekf.ref_from_body_wxyz, Mekf.body_from_ref, Mekf.bias_rad_s)
+@law(
+    AttitudeFilter.propagate,
+    AttitudeFilter.state,
+    AttitudeFilter.ref_from_body_wxyz,
+    AttitudeFilter.body_from_ref,
+    AttitudeFilter.bias_rad_s,
+)
 @given(rng=SEEDS, angle=arrays("f8", (7, 3), elements=some.floats(-10, 10)), full=arrays(bool, 7))
 def test_any_finite_turns_leave_a_unit_attitude_and_a_covariance(
     rng: np.random.Generator, angle: NDArray, full: NDArray
@@ -45,7 +51,7 @@ def test_any_finite_turns_leave_a_unit_attitude_and_a_covariance(
     np.testing.assert_array_equal(mekf.bias_rad_s, np.zeros(3))  # a gyro alone tells nothing of its bias
 
 
-@law(Mekf.propagate, FilterState.sigma_attitude_rad, FilterState.sigma_bias_rad_s)
+@law(AttitudeFilter.propagate, FilterState.sigma_attitude_rad, FilterState.sigma_bias_rad_s)
 @given(rng=SEEDS, cut=some.integers(1, 9))
 def test_how_samples_are_cut_into_calls_is_no_matter(rng: np.random.Generator, cut: int) -> None:
     t_s, angle = np.cumsum(rng.uniform(1e-3, 0.1, 10)), rng.normal(0, 0.1, (10, 3))
@@ -58,7 +64,7 @@ def test_how_samples_are_cut_into_calls_is_no_matter(rng: np.random.Generator, c
     np.testing.assert_array_equal(once.ref_from_body_wxyz, twice.ref_from_body_wxyz)
 
 
-@law(Mekf.propagate, Mekf.rate_rad_s)
+@law(AttitudeFilter.propagate, AttitudeFilter.rate_rad_s)
 @given(t_s=NUMBERS, angle=NUMBERS, full=NUMBERS, rng=SEEDS)
 def test_what_is_no_gyro_is_refused_and_changes_nothing(
     t_s: NDArray, angle: NDArray, full: NDArray, rng: np.random.Generator
@@ -74,7 +80,7 @@ def test_what_is_no_gyro_is_refused_and_changes_nothing(
     np.testing.assert_allclose(mekf.rate_rad_s, [0.2, 0.4, -0.6], rtol=1e-9, atol=0)
 
 
-@law(Mekf.update)
+@law(AttitudeFilter.update)
 @given(rng=SEEDS, off_rad=some.floats(0, np.pi), sigma_rad=some.floats(1e-7, 1))
 def test_a_solution_that_is_used_makes_the_filter_surer(
     rng: np.random.Generator, off_rad: float, sigma_rad: float
@@ -92,7 +98,7 @@ def test_a_solution_that_is_used_makes_the_filter_surer(
     assert shrunk if told.status == USED else unchanged
 
 
-@law(Mekf.update)
+@law(AttitudeFilter.update)
 @given(rng=SEEDS, t_s=ANY, covariance=NUMBERS | arrays("f8", (3, 3), elements=ANY))
 def test_any_solution_is_taken_or_refused(rng: np.random.Generator, t_s: float, covariance: NDArray) -> None:
     mekf = filtering(rng)
@@ -118,7 +124,7 @@ def test_an_exposure_stays_within_the_camera_s(
 ) -> None:
     asked = exposure_control.step(Exposure(time_s), Observation(mean_dn, stars, overexposed), control)
     assert control.shortest_s <= asked.time_s <= control.longest_s
-    assert asked.no_stars == (stars < control.least_stars)
+    assert asked.no_stars == (stars < control.min_stars)
     assert asked.time_s <= max(time_s, control.shortest_s) + 1e-6 or (asked.no_stars and not asked.saturated)
 
 

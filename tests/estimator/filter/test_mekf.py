@@ -9,7 +9,16 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2, kstest
 
 from estimator.core.types import FilterState
-from estimator.filter.mekf import MEMORY_S, OUTSIDE, RESET, TOO_OLD, USED, GyroModel, Mekf, Update
+from estimator.filter.mekf import (
+    HISTORY_S,
+    OUTSIDE_GATE,
+    RESET,
+    TOO_OLD,
+    USED,
+    AttitudeFilter,
+    GyroModel,
+    Update,
+)
 
 ARCSEC_RAD = np.pi / 180 / 3600
 DEG_H_RAD_S = np.pi / 180 / 3600
@@ -24,9 +33,7 @@ def error_rad(state: FilterState, body_from_ref: Rotation) -> np.ndarray:
     return (state.body_from_ref * body_from_ref.inv()).as_rotvec()
 
 
-def measured(
-    body_from_ref: Rotation, covariance_rad2: np.ndarray, rng: np.random.Generator | None
-) -> Rotation:
+def measured(body_from_ref: Rotation, covariance_rad2: np.ndarray, rng: np.random.Generator | None) -> Rotation:
     """A solution whose small turn in body axes has that covariance; exact without a generator."""
     if rng is None:
         return body_from_ref
@@ -44,9 +51,7 @@ def tumble_rad_s(t_s: np.ndarray) -> np.ndarray:
 
 def tumble_angle_rad(t_s: np.ndarray) -> np.ndarray:
     """The gyro's perfect increments: the integral of each rate between the times."""
-    integral = np.stack(
-        [-0.4 * np.cos(0.5 * t_s), 0.25 * np.sin(0.4 * t_s), 0.05 * t_s - np.cos(0.3 * t_s) / 3], -1
-    )
+    integral = np.stack([-0.4 * np.cos(0.5 * t_s), 0.25 * np.sin(0.4 * t_s), 0.05 * t_s - np.cos(0.3 * t_s) / 3], -1)
     return np.diff(integral, axis=0)
 
 
@@ -62,7 +67,7 @@ def tumble_body_from_ref(t_s: np.ndarray) -> Rotation:
 
 def test_the_gyro_is_followed() -> None:
     t_s = np.arange(4001) / 400
-    mekf = Mekf(QUIET, 0.0, HOME, 0.0, 0.0)
+    mekf = AttitudeFilter(QUIET, 0.0, HOME, 0.0, 0.0)
     mekf.propagate(t_s[1:], tumble_angle_rad(t_s), np.zeros(4000, bool))
     # Increments are no rotation vectors: coning, (w x w') T^3 / 12 a sample at most, 10 s of w w' = 0.02.
     assert np.abs(error_rad(mekf.state, tumble_body_from_ref(t_s)[-1])).max() < 0.02 * 10 / 400**2 / 12
@@ -70,7 +75,7 @@ def test_the_gyro_is_followed() -> None:
 
 
 def test_the_rate_is_the_last_call_s_less_the_bias() -> None:
-    mekf = Mekf(QUIET, 0.0, HOME, 1e-3, 1e-3)
+    mekf = AttitudeFilter(QUIET, 0.0, HOME, 1e-3, 1e-3)
     assert not mekf.rate_rad_s.any()
     mekf.propagate([1.0], [[0.0, 0.0, 0.5]], [False])
     mekf.propagate([1.1, 1.2], [[0.01, 0.0, 0.0], [0.03, 0.0, 0.0]], [False, False])
@@ -97,7 +102,7 @@ def test_the_covariance_obeys_riccati_s_equation_while_turning() -> None:
         return (half + half.T + noise).ravel()
 
     oracle = solve_ivp(slope, (0, 3), start.ravel(), "DOP853", rtol=1e-11, atol=1e-16).y[:, -1].reshape(6, 6)
-    mekf = Mekf(gyro, 0.0, HOME, np.sqrt(np.diag(start)[:3]), np.sqrt(np.diag(start)[3:]))
+    mekf = AttitudeFilter(gyro, 0.0, HOME, np.sqrt(np.diag(start)[:3]), np.sqrt(np.diag(start)[3:]))
     t_s = np.arange(1, 1201) / 400
     mekf.propagate(t_s, np.tile(rate / 400, (1200, 1)), np.zeros(1200, bool))
     scale = np.sqrt(np.outer(np.diag(oracle), np.diag(oracle)))
@@ -105,9 +110,7 @@ def test_the_covariance_obeys_riccati_s_equation_while_turning() -> None:
     assert np.abs((mekf.state.covariance - oracle) / scale).max() < 1e-6
 
 
-def farrenkopf(
-    arw: float, walk: float, sigma_rad: float, period_s: float
-) -> tuple[float, float, float, float]:
+def farrenkopf(arw: float, walk: float, sigma_rad: float, period_s: float) -> tuple[float, float, float, float]:
     """Steady sigmas before and after a solution: attitude, attitude, bias, bias (Farrenkopf 1978, in closed form).
 
     With s = p/R + 1 = x^2 the Riccati equation of one axis becomes quadratic in z = x + 1/x:
@@ -131,7 +134,7 @@ def test_farrenkopf_s_steady_state(s_u: float, s_v: float, period_s: float) -> N
     sigma_rad = 20 * ARCSEC_RAD
     arw, walk = s_v * sigma_rad / period_s**0.5, s_u * sigma_rad / period_s**1.5
     time_s = 1e9  # a random walk is the limit of a long correlation time
-    mekf = Mekf(GyroModel(arw, walk * np.sqrt(time_s / 2), time_s), 0.0, HOME, 1e-3, 10 * walk)
+    mekf = AttitudeFilter(GyroModel(arw, walk * np.sqrt(time_s / 2), time_s), 0.0, HOME, 1e-3, 10 * walk)
     share = np.arange(1, 51) / 50
     for k in range(300):
         mekf.propagate((k + share) * period_s, np.zeros((50, 3)), np.zeros(50, bool))
@@ -147,7 +150,7 @@ def test_farrenkopf_s_steady_state(s_u: float, s_v: float, period_s: float) -> N
 
 def test_a_large_correction_leaves_the_solution_s_covariance() -> None:
     spread = np.diag([1.0, 4.0, 30.0]) ** 2 * 1e-8
-    mekf = Mekf(QUIET, 0.0, HOME, 1e3, 0.0, floor_rad=3e-4)
+    mekf = AttitudeFilter(QUIET, 0.0, HOME, 1e3, 0.0, floor_rad=3e-4)
     attitude = Rotation.from_rotvec([1.0, -0.6, 0.8])
     assert mekf.update(0.0, attitude, spread).status == USED
     # In the axes of the body where it now is, not where it was thought to be a radian away.
@@ -194,7 +197,7 @@ def test_the_errors_are_what_the_covariance_says() -> None:
     for run in range(runs):
         world = drawn(gyro, sigma_bias, t_s, rng)
         start = Rotation.from_rotvec(sigma_attitude * rng.normal(size=3)) * truth[0]
-        mekf = Mekf(gyro, 0.0, start, sigma_attitude, sigma_bias, floor_rad)
+        mekf = AttitudeFilter(gyro, 0.0, start, sigma_attitude, sigma_bias, floor_rad)
         for k in range(seconds):
             rows = slice(k * rate_hz, (k + 1) * rate_hz)
             mekf.propagate(t_s[1:][rows], world.angle_rad[rows], np.zeros(rate_hz, bool))
@@ -224,7 +227,7 @@ def test_200_runs_are_within_their_bands_at_many_rates_with_frames_lost_and_out_
     for run in range(runs):
         world = drawn(gyro, sigma_bias, t_s, rng)
         start = Rotation.from_rotvec(sigma_attitude * rng.normal(size=3)) * truth[0]
-        mekf = Mekf(gyro, 0.0, start, sigma_attitude, sigma_bias)
+        mekf = AttitudeFilter(gyro, 0.0, start, sigma_attitude, sigma_bias)
         arrives_s = seen_s + rng.uniform(0.05, 0.5, len(seen_s))
         arrives_s[rng.random(len(seen_s)) < 1 / 3] = np.inf
         waiting = [int(k) for k in np.argsort(arrives_s) if arrives_s[k] < np.inf]
@@ -252,7 +255,7 @@ def test_a_constant_bias_is_found_to_its_sigma() -> None:
     rng, runs, bias = np.random.default_rng(62), 12, 5 * DEG_H_RAD_S
     z, found, samples = np.empty((runs, 3)), np.empty((runs, 3)), np.arange(1, 11) / 10
     for run in range(runs):
-        mekf = Mekf(QUIET, 0.0, HOME, 1e-3, 10 * DEG_H_RAD_S)
+        mekf = AttitudeFilter(QUIET, 0.0, HOME, 1e-3, 10 * DEG_H_RAD_S)
         for k in range(200):
             noise = ARW_RAD_SQRT_S * np.sqrt(0.1) * rng.normal(size=(10, 3))
             mekf.propagate(k + samples, bias * 0.1 + noise, np.zeros(10, bool))
@@ -269,7 +272,7 @@ def test_a_constant_bias_is_found_to_its_sigma() -> None:
 def test_a_bias_that_is_no_longer_seen_is_forgotten_with_its_time() -> None:
     # E[b(t)] = b(0) exp(-t / time), and the attitude is corrected by its integral.
     time_s, bias = 20.0, 1e-4
-    mekf = Mekf(GyroModel(ARW_RAD_SQRT_S, 1e-4, time_s), 0.0, HOME, 1e-3, 1e-4)
+    mekf = AttitudeFilter(GyroModel(ARW_RAD_SQRT_S, 1e-4, time_s), 0.0, HOME, 1e-3, 1e-4)
     samples = np.arange(1, 101) / 100
     for k in range(10):
         mekf.propagate(k + samples, np.full((100, 3), bias / 100), np.zeros(100, bool))
@@ -303,7 +306,7 @@ def test_a_late_solution_is_as_good_as_one_in_order(seen_s: float) -> None:
     saturated = (t_s[1:] > 0.6) & (t_s[1:] < 0.8)
     wrong = Rotation.from_rotvec([0.002, 0.01, -0.004])
     seen, end = tumble_body_from_ref(np.array([seen_s, 1.001]))
-    late, ordered = (Mekf(gyro, 0.0, wrong, 0.01, 1e-3) for _ in range(2))
+    late, ordered = (AttitudeFilter(gyro, 0.0, wrong, 0.01, 1e-3) for _ in range(2))
     for k in range(100):
         rows = slice(4 * k, 4 * k + 4)
         late.propagate(t_s[1:][rows], angle[rows], saturated[rows])
@@ -328,7 +331,7 @@ def test_a_late_solution_is_as_good_as_one_in_order(seen_s: float) -> None:
 
 
 def test_a_solution_from_before_the_memory_is_refused() -> None:
-    mekf = Mekf(QUIET, 0.0, HOME, 1e-3, 1e-5)
+    mekf = AttitudeFilter(QUIET, 0.0, HOME, 1e-3, 1e-5)
     t_s = np.arange(1, 2501) / 100
     for rows in np.arange(2500).reshape(-1, 10):
         mekf.propagate(t_s[rows], np.zeros((10, 3)), np.zeros(10, bool))
@@ -341,16 +344,16 @@ def test_a_solution_from_before_the_memory_is_refused() -> None:
 
 
 def test_memory_does_not_grow_and_reaches_half_of_its_span_at_least() -> None:
-    mekf = Mekf(QUIET, 0.0, HOME, 1e-3, 1e-5)
+    mekf = AttitudeFilter(QUIET, 0.0, HOME, 1e-3, 1e-5)
     for k in range(60):
         mekf.propagate(k + np.arange(1, 11) / 10, np.zeros((10, 3)), np.zeros(10, bool))
         if k % 3:
             assert mekf.update(k + 0.95, HOME, TRACKER_RAD2).status == USED
-        kept_s = 60 if k < 10 else MEMORY_S / 2
+        kept_s = 60 if k < 10 else HISTORY_S / 2
         assert mekf.update(max(k + 1.0 - kept_s, 0.0) + 0.01, HOME, TRACKER_RAD2).status == USED
     assert mekf.update(45.0, HOME, TRACKER_RAD2).status == TOO_OLD
-    assert sum(len(leg.samples) for leg in mekf._legs) < 10 * (MEMORY_S + 3) + 3 * len(mekf._legs)
-    assert len(mekf._legs) < 3 * MEMORY_S
+    assert sum(len(segment.samples) for segment in mekf._segments) < 10 * (HISTORY_S + 3) + 3 * len(mekf._segments)
+    assert len(mekf._segments) < 3 * HISTORY_S
 
 
 @pytest.mark.parametrize("order", [(1, 0, 2, 3), (3, 2, 1, 0), (2, 3, 0, 1)])
@@ -359,14 +362,14 @@ def test_solutions_in_any_order_end_where_the_right_order_ends(order: tuple[int,
     t_s = np.arange(401) / 400
     angle, seen_s = tumble_angle_rad(t_s), np.array([0.2, 0.45125, 0.4513, 0.9])
     solutions = [measured(truth, TRACKER_RAD2, rng) for truth in tumble_body_from_ref(np.append(seen_s, 1.0))]
-    shuffled, ordered = (Mekf(gyro, 0.0, HOME, 0.01, 1e-3) for _ in range(2))
+    shuffled, ordered = (AttitudeFilter(gyro, 0.0, HOME, 0.01, 1e-3) for _ in range(2))
     for mekf, rows in ((shuffled, order), (ordered, range(4))):
         mekf.propagate(t_s[1:], angle, np.zeros(400, bool))
         for k in rows:
             assert mekf.update(seen_s[k], solutions[k], TRACKER_RAD2).status == USED
     # Each is as informative as its own noise, so that leaving one out would show.
     same(shuffled.state, ordered.state)
-    lacking = Mekf(gyro, 0.0, HOME, 0.01, 1e-3)
+    lacking = AttitudeFilter(gyro, 0.0, HOME, 0.01, 1e-3)
     lacking.propagate(t_s[1:], angle, np.zeros(400, bool))
     for k in order[1:]:
         lacking.update(seen_s[k], solutions[k], TRACKER_RAD2)
@@ -395,7 +398,7 @@ class Blow:
             attitude = Rotation.from_rotvec(-rate * np.clip(t_s - a, 0, b - a)) * attitude
         return attitude
 
-    def fly(self, mekf: Mekf, from_s: int, to_s: int, flagged: bool, rng: np.random.Generator) -> list[str]:
+    def fly(self, mekf: AttitudeFilter, from_s: int, to_s: int, flagged: bool, rng: np.random.Generator) -> list[str]:
         """A second at a time, with a solution at the end of each; what became of them."""
         statuses = []
         for k in range(from_s, to_s):
@@ -413,7 +416,7 @@ class Blow:
 @pytest.mark.parametrize("limit_deg_s", [10.0, 100.0])
 def test_after_a_blow_the_filter_comes_back_and_its_bias_is_not_spoiled(limit_deg_s: float) -> None:
     blow, rng = Blow(np.radians(limit_deg_s)), np.random.default_rng(67)
-    mekf = Mekf(QUIET, 0.0, HOME, 1e-3, 10 * DEG_H_RAD_S)
+    mekf = AttitudeFilter(QUIET, 0.0, HOME, 1e-3, 10 * DEG_H_RAD_S)
     assert set(blow.fly(mekf, 0, 20, True, rng)) == {USED}
     before = mekf.state
     assert blow.fly(mekf, 20, 22, True, rng) == [USED, USED]
@@ -426,35 +429,33 @@ def test_after_a_blow_the_filter_comes_back_and_its_bias_is_not_spoiled(limit_de
 
 def test_without_the_flag_the_blow_is_laid_to_the_bias() -> None:
     blow, rng = Blow(np.radians(10.0)), np.random.default_rng(67)
-    trusting = Mekf(QUIET, 0.0, HOME, 1e-3, 10 * DEG_H_RAD_S, gate_sigma=np.inf)
+    trusting = AttitudeFilter(QUIET, 0.0, HOME, 1e-3, 10 * DEG_H_RAD_S, gate_sigma=np.inf)
     assert set(blow.fly(trusting, 0, 22, False, rng)) == {USED}
     state = trusting.state
     assert np.abs((state.bias_rad_s - blow.bias_rad_s) / state.sigma_bias_rad_s).max() > 100
     # With the gate it is lost for two frames and found at the third.
-    gated, rng = Mekf(QUIET, 0.0, HOME, 1e-3, 10 * DEG_H_RAD_S), np.random.default_rng(67)
-    assert blow.fly(gated, 0, 24, False, rng)[20:] == [OUTSIDE, OUTSIDE, RESET, USED]
+    gated, rng = AttitudeFilter(QUIET, 0.0, HOME, 1e-3, 10 * DEG_H_RAD_S), np.random.default_rng(67)
+    assert blow.fly(gated, 0, 24, False, rng)[20:] == [OUTSIDE_GATE, OUTSIDE_GATE, RESET, USED]
     state = gated.state
     assert (np.abs(state.bias_rad_s - blow.bias_rad_s) < 4 * state.sigma_bias_rad_s).all()
 
 
 def test_plain_integration_is_wrong_by_the_missed_angle_for_good() -> None:
     blow = Blow(np.radians(10.0), bias_rad_s=0.0)
-    plain = Mekf(QUIET, 0.0, HOME, 0.0, 0.0)
+    plain = AttitudeFilter(QUIET, 0.0, HOME, 0.0, 0.0)
     missed_rad = 0.2 * 2 * blow.limit_rad_s
     for to_s, from_s in ((21, 0), (40, 21)):
         middle_s = from_s + (np.arange(400 * (to_s - from_s)) + 0.5) / 400
         rate = np.clip(blow.rate_rad_s(middle_s), -blow.limit_rad_s, blow.limit_rad_s)
         plain.propagate(middle_s + 0.5 / 400, rate / 400, np.zeros(len(rate), bool))
         # 1 %: about the other axes the vehicle turned 0.2 s x 0.036 rad/s while the gyro was lost.
-        assert np.linalg.norm(error_rad(plain.state, blow.body_from_ref(to_s))) == pytest.approx(
-            missed_rad, rel=0.01
-        )
+        assert np.linalg.norm(error_rad(plain.state, blow.body_from_ref(to_s))) == pytest.approx(missed_rad, rel=0.01)
 
 
 @pytest.mark.parametrize("rate_hz", [100, 400])
 def test_saturation_spreads_in_proportion_to_its_time(rate_hz: int) -> None:
     # 0.3 s at 2 rad/s, twice: a sigma of 0.6 rad each, independent; whatever the sample rate.
-    mekf = Mekf(GyroModel(0.0, 0.0, np.inf), 0.0, HOME, 0.0, 0.0)
+    mekf = AttitudeFilter(GyroModel(0.0, 0.0, np.inf), 0.0, HOME, 0.0, 0.0)
     t_s = np.arange(1, rate_hz + 1) / rate_hz
     middle_s = t_s - 0.5 / rate_hz
     saturated = ((middle_s > 0.1) & (middle_s < 0.4)) | ((middle_s > 0.5) & (middle_s < 0.8))
@@ -467,15 +468,15 @@ def test_saturation_spreads_in_proportion_to_its_time(rate_hz: int) -> None:
 # ---- The gate ----
 
 
-def turning() -> Mekf:
+def turning() -> AttitudeFilter:
     """A filter that has had three solutions of a steady turn of 0.1 rad/s about z."""
-    mekf = Mekf(QUIET, 0.0, HOME, 1e-3, 10 * DEG_H_RAD_S)
+    mekf = AttitudeFilter(QUIET, 0.0, HOME, 1e-3, 10 * DEG_H_RAD_S)
     for k in range(3):
         assert after_turning(mekf, k).status == USED
     return mekf
 
 
-def after_turning(mekf: Mekf, second: int, jump: Rotation = HOME) -> Update:
+def after_turning(mekf: AttitudeFilter, second: int, jump: Rotation = HOME) -> Update:
     """One second on, and an exact solution; jump * the vehicle's true body_from_ref."""
     t_s = second + np.arange(1, 101) / 100
     mekf.propagate(t_s, np.tile([0.0, 0.0, 1e-3], (100, 1)), np.zeros(100, bool))
@@ -496,15 +497,15 @@ def test_the_gate_is_as_rare_as_so_many_sigma() -> None:
     rng, count, outside = np.random.default_rng(64), 500, 0
     spread = 1e-6 * np.eye(3) + TRACKER_RAD2
     for _ in range(count):
-        mekf = Mekf(QUIET, 0.0, HOME, 1e-3, 0.0, gate_sigma=1.5)
-        outside += mekf.update(0.0, measured(HOME, spread, rng), TRACKER_RAD2).status == OUTSIDE
+        mekf = AttitudeFilter(QUIET, 0.0, HOME, 1e-3, 0.0, gate_sigma=1.5)
+        outside += mekf.update(0.0, measured(HOME, spread, rng), TRACKER_RAD2).status == OUTSIDE_GATE
     assert abs(outside / count - 0.1336) < 4 * np.sqrt(0.1336 * 0.8664 / count)
 
 
 def test_a_single_wild_solution_is_refused_and_harmless() -> None:
     mekf, untouched = turning(), turning()
     update = after_turning(mekf, 3, wild(0.5, 0, 0))
-    assert update.status == OUTSIDE
+    assert update.status == OUTSIDE_GATE
     # From the filter to the solution, in body axes; body_from_ref turns the other way.
     assert update.residual_rad == pytest.approx(true(3 + 1).apply([-0.5, 0, 0]), abs=1e-3)
     assert update.distance > 100
@@ -519,7 +520,7 @@ def test_a_single_wild_solution_is_refused_and_harmless() -> None:
 def test_wild_solutions_that_disagree_are_refused_for_ever() -> None:
     mekf, rng = turning(), np.random.default_rng(65)
     for k in range(3, 15):
-        assert after_turning(mekf, k, Rotation.random(rng=rng)).status == OUTSIDE
+        assert after_turning(mekf, k, Rotation.random(rng=rng)).status == OUTSIDE_GATE
     assert after_turning(mekf, 15).status == USED
 
 
@@ -527,12 +528,12 @@ def test_solutions_that_stand_still_while_the_vehicle_turns_do_not_agree() -> No
     mekf = turning()
     for k in range(3, 9):
         still = true(k + 1).inv() * wild(0.5, 0, 0)
-        assert after_turning(mekf, k, still).status == OUTSIDE
+        assert after_turning(mekf, k, still).status == OUTSIDE_GATE
 
 
 def test_a_true_jump_is_taken_at_the_third_solution() -> None:
     mekf, jump = turning(), wild(0.3, -0.2, 0.6)
-    assert [after_turning(mekf, k, jump).status for k in (3, 4)] == [OUTSIDE, OUTSIDE]
+    assert [after_turning(mekf, k, jump).status for k in (3, 4)] == [OUTSIDE_GATE, OUTSIDE_GATE]
     before = mekf.state
     assert after_turning(mekf, 5, jump).status == RESET
     state = mekf.state
@@ -549,7 +550,7 @@ def test_a_true_jump_is_taken_at_the_third_solution() -> None:
 def test_a_good_solution_between_ends_the_row() -> None:
     mekf, jump = turning(), wild(0.3, -0.2, 0.6)
     got = [after_turning(mekf, 3 + k, turn).status for k, turn in enumerate([jump, jump, HOME, jump, jump])]
-    assert got == [OUTSIDE, OUTSIDE, USED, OUTSIDE, OUTSIDE]
+    assert got == [OUTSIDE_GATE, OUTSIDE_GATE, USED, OUTSIDE_GATE, OUTSIDE_GATE]
 
 
 # ---- Bad input ----
@@ -567,7 +568,7 @@ def test_a_good_solution_between_ends_the_row() -> None:
 )
 def test_a_bad_covariance_is_one_clear_line(covariance: np.ndarray, what: str) -> None:
     with pytest.raises(ValueError, match=f"update: covariance_rad2 .*{what}") as caught:
-        Mekf(QUIET, 0.0, HOME, 1e-3, 1e-5).update(0.0, HOME, covariance)
+        AttitudeFilter(QUIET, 0.0, HOME, 1e-3, 1e-5).update(0.0, HOME, covariance)
     assert "\n" not in str(caught.value)
 
 
@@ -585,7 +586,7 @@ def test_a_bad_covariance_is_one_clear_line(covariance: np.ndarray, what: str) -
     ],
 )
 def test_bad_samples_are_one_clear_line(t_s: list, angle: np.ndarray, saturated: list, what: str) -> None:
-    mekf = Mekf(GyroModel(1e-5, 1e-6, 20.0), 1.0, HOME, 1e-3, 1e-5)
+    mekf = AttitudeFilter(GyroModel(1e-5, 1e-6, 20.0), 1.0, HOME, 1e-3, 1e-5)
     with pytest.raises(ValueError, match=f"propagate: .*{what}") as caught:
         mekf.propagate(t_s, angle, saturated)
     assert "\n" not in str(caught.value)
@@ -593,13 +594,13 @@ def test_bad_samples_are_one_clear_line(t_s: list, angle: np.ndarray, saturated:
 
 
 def test_bad_settings_and_a_solution_from_the_future_are_named() -> None:
-    mekf = Mekf(QUIET, 0.0, HOME, 1e-3, 1e-5)
+    mekf = AttitudeFilter(QUIET, 0.0, HOME, 1e-3, 1e-5)
     with pytest.raises(ValueError, match=r"a solution at 1.0 s; allowed: up to the last gyro sample, 0.0 s"):
         mekf.update(1.0, HOME, TRACKER_RAD2)
     with pytest.raises(ValueError, match=r"sigma_attitude_rad is -1\.0"):
-        Mekf(QUIET, 0.0, HOME, -1.0, 1e-5)
+        AttitudeFilter(QUIET, 0.0, HOME, -1.0, 1e-5)
     with pytest.raises(ValueError, match="floor_rad is nan"):
-        Mekf(QUIET, 0.0, HOME, 1.0, 1e-5, floor_rad=np.nan)
+        AttitudeFilter(QUIET, 0.0, HOME, 1.0, 1e-5, floor_rad=np.nan)
     with pytest.raises(ValueError, match="arw_rad_sqrt_s is -1"):
         GyroModel(-1.0, 0.0, 1.0)
     with pytest.raises(ValueError, match="bias_time_s is 0"):

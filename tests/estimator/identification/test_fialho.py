@@ -9,13 +9,13 @@ from estimator.core.arrays import Floats
 from estimator.core.errors import ImageError
 from estimator.identification.options import Options
 from estimator.identification.published.fialho import (
-    GATE_SIGMAS,
-    LEAST_ANGLE,
+    MAG_GATE_SIGMA,
+    MIN_SIDE_FRACTION,
     fialho_1,
     fialho_2,
     fialho_3,
     fialho_4,
-    rules,
+    search_options,
     triplets,
 )
 
@@ -29,9 +29,7 @@ def uniform_sky(count: int, seed: int) -> pair_index.PairIndex:
     """Stars anywhere, their magnitudes as real ones are: three times as many for each magnitude."""
     rng = np.random.default_rng(seed)
     vectors = catalog.unit(rng.normal(size=(count, 3)))
-    return pair_index.build(
-        vectors, DIAGONAL_RAD, magnitude=np.sort(5 + np.log(rng.random(count)) / np.log(3))
-    )
+    return pair_index.build(vectors, DIAGONAL_RAD, magnitude=np.sort(5 + np.log(rng.random(count)) / np.log(3)))
 
 
 @pytest.fixture(scope="module")
@@ -52,19 +50,17 @@ def field(
     return seen[order], light[order], row[order], truth
 
 
-def counted(
-    seen: Floats, light: Floats, sky: pair_index.PairIndex, eps: float, gate: float, optimised: bool
-) -> int:
-    """How many catalogue triplets are like a triangle of three stars, by the module's own search."""
-    asked = Options(epsilon_mag=gate / GATE_SIGMAS, max_checks=10**12)
-    by = rules(eps / np.sqrt(2), asked, NEVER, optimised, False)
+def counted(seen: Floats, light: Floats, sky: pair_index.PairIndex, eps: float, gate: float, optimized: bool) -> int:
+    """How many catalog triplets are like a triangle of three stars, by the module's own search."""
+    settings = Options(epsilon_mag=gate / MAG_GATE_SIGMA, max_checks=10**12)
+    parameters = search_options(eps / np.sqrt(2), settings, NEVER, optimized, False)
     tried = np.zeros(2, np.int64)
-    triplets(seen, light, sky, np.arange(3), by, tried)
+    triplets(seen, light, sky, np.arange(3), parameters, tried)
     return int(tried[0])
 
 
 def triangle(rng: np.random.Generator) -> Floats:
-    """Three directions 5 to 9 degrees apart, in no catalogue."""
+    """Three directions 5 to 9 degrees apart, in no catalog."""
     while True:
         tangents = rng.uniform(-0.12, 0.12, (3, 2))
         seen = catalog.unit(np.column_stack([tangents, np.ones(3)]))
@@ -76,14 +72,14 @@ def triangle(rng: np.random.Generator) -> Floats:
 def by_brute_force(seen: Floats, light: Floats, sky: pair_index.PairIndex, eps: float, gate: float) -> int:
     """Every ordered triplet of stars by angles from arctan2, magnitudes and handedness."""
     cross = np.linalg.norm(np.cross(sky.vectors[:, None], sky.vectors), axis=2)
-    apart = np.arctan2(cross, sky.vectors @ sky.vectors.T)
-    alike = np.abs(sky.magnitude - light[:, None]) <= gate
+    separation = np.arctan2(cross, sky.vectors @ sky.vectors.T)
+    similar = np.abs(sky.magnitude - light[:, None]) <= gate
     side = [np.arctan2(np.linalg.norm(np.cross(seen[i], seen[j])), seen[i] @ seen[j]) for i, j in PAIRS]
-    ab, ac, bc = (np.abs(apart - one) <= eps for one in side)
+    ab, ac, bc = (np.abs(separation - one) <= eps for one in side)
     handed, count = np.linalg.det(seen), 0
-    for a in np.flatnonzero(alike[0]):
-        for b in np.flatnonzero(ab[a] & alike[1]):
-            for c in np.flatnonzero(ac[a] & bc[b] & alike[2]):
+    for a in np.flatnonzero(similar[0]):
+        for b in np.flatnonzero(ab[a] & similar[1]):
+            for c in np.flatnonzero(ac[a] & bc[b] & similar[2]):
                 count += handed * np.linalg.det(sky.vectors[[a, b, c]]) > 0
     return count
 
@@ -91,15 +87,15 @@ def by_brute_force(seen: Floats, light: Floats, sky: pair_index.PairIndex, eps: 
 PAIRS = [(0, 1), (0, 2), (1, 2)]
 
 
-@pytest.mark.parametrize("optimised", [False, True])
+@pytest.mark.parametrize("optimized", [False, True])
 @pytest.mark.parametrize("gate", [1.0, np.inf])
-def test_the_triplets_are_brute_force_s(gate: float, optimised: bool) -> None:
+def test_the_triplets_are_brute_force_s(gate: float, optimized: bool) -> None:
     rng, known, total = np.random.default_rng(101), uniform_sky(250, 102), 0
     for _ in range(12):
         seen, light = triangle(rng), np.sort(rng.uniform(2, 5, 3))
-        wanted = by_brute_force(seen, light, known, np.radians(1.2), gate)
-        assert counted(seen, light, known, np.radians(1.2), gate, optimised) == wanted
-        total += wanted
+        expected = by_brute_force(seen, light, known, np.radians(1.2), gate)
+        assert counted(seen, light, known, np.radians(1.2), gate, optimized) == expected
+        total += expected
     assert total > 5
 
 
@@ -120,7 +116,7 @@ def test_the_number_of_triplets_is_theory_s(sky: pair_index.PairIndex) -> None:
     assert found == pytest.approx(expected, abs=5 * np.sqrt(expected) + 0.03 * expected)
 
 
-def test_lists_from_neighbours_answer_as_lists_from_the_whole_catalogue(sky: pair_index.PairIndex) -> None:
+def test_lists_from_neighbors_answer_as_lists_from_the_whole_catalog(sky: pair_index.PairIndex) -> None:
     rng = np.random.default_rng(104)
     for _ in range(60):
         seen, light, _, _ = field(rng, sky)
@@ -171,8 +167,8 @@ def test_a_hint_lets_only_stars_near_the_boresight_be_candidates(sky: pair_index
         near = {"boresight_ref": boresight, "within_rad": DIAGONAL_RAD / 2 + 0.02}
         wrong = {"boresight_ref": -boresight, "within_rad": np.radians(60)}
         for method in (fialho_2, fialho_3, fialho_4):
-            plain, told = (method(seen, sky, 5 * SIGMA_RAD, **known, **more) for more in ({}, near))
-            np.testing.assert_array_equal(plain.star, told.star)
+            plain, hinted = (method(seen, sky, 5 * SIGMA_RAD, **known, **more) for more in ({}, near))
+            np.testing.assert_array_equal(plain.star, hinted.star)
             assert method(seen, sky, 5 * SIGMA_RAD, **known, **wrong) is None
         # The first version takes no hint, not even a wrong one.
         assert fialho_1(seen, sky, 5 * SIGMA_RAD, **known, **wrong) is not None
@@ -206,22 +202,16 @@ def test_stars_too_close_for_a_triangle_are_passed_over_or_refused(sky: pair_ind
     rng = np.random.default_rng(111)
     seen, light, row, _ = field(rng, sky)
     # A companion of the brightest, nearly as bright, a quarter of the least angle away.
-    close = catalog.unit(seen[:1] + np.array([0.25 * LEAST_ANGLE * DIAGONAL_RAD, 0, 0]))
+    close = catalog.unit(seen[:1] + np.array([0.25 * MIN_SIDE_FRACTION * DIAGONAL_RAD, 0, 0]))
     both = np.vstack([seen[:1], close, seen[1:]])
-    match = fialho_2(
-        both, sky, 5 * SIGMA_RAD, magnitude=np.insert(light, 1, light[0]), epsilon_mag=EPSILON_MAG
-    )
+    match = fialho_2(both, sky, 5 * SIGMA_RAD, magnitude=np.insert(light, 1, light[0]), epsilon_mag=EPSILON_MAG)
     assert match is not None
     assert row[0] in match.star
-    cluster = catalog.unit(
-        np.array([0, 0, 1.0]) + rng.normal(0, 0.2 * LEAST_ANGLE * DIAGONAL_RAD / 3, (8, 3))
-    )
+    cluster = catalog.unit(np.array([0, 0, 1.0]) + rng.normal(0, 0.2 * MIN_SIDE_FRACTION * DIAGONAL_RAD / 3, (8, 3)))
     assert fialho_3(cluster, sky, 5 * SIGMA_RAD) is None
 
 
 def test_an_error_of_magnitude_that_is_none_is_refused(sky: pair_index.PairIndex) -> None:
     seen, light, _, _ = field(np.random.default_rng(112), sky)
-    with pytest.raises(
-        ImageError, match=r"fialho: tolerance 0\.1 rad, magnitude error 0; allowed: more than 0"
-    ):
+    with pytest.raises(ImageError, match=r"fialho: tolerance 0\.1 rad, magnitude error 0; allowed: more than 0"):
         fialho_2(seen, sky, 0.1, magnitude=light, epsilon_mag=0)

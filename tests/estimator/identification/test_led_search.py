@@ -12,7 +12,7 @@ from estimator.core.arrays import Floats
 from estimator.core.camera import Camera
 from estimator.core.types import Centroids, StarMatch
 from estimator.identification.leds import search
-from estimator.identification.leds.index import Sight, sight_of, sky_of
+from estimator.identification.leds.index import DomeIndex, build_dome_index
 from estimator.trackers.dome_tracker import DomeTracker
 
 # AFIT's SimSat focused on its LEDs at 33 in; the camera is a little askew.
@@ -33,26 +33,26 @@ def spread(count: int, surface: tuple[Floats, Floats], seed: int, cap_deg: float
     rays = np.column_stack([across * np.cos(azimuth), across * np.sin(azimuth), z])
     darts = on_surface(rays, np.zeros(3), nowhere)
     spacing = 1.22 * np.sqrt(2 * np.pi * (1 - np.cos(np.radians(cap_deg))) / count) * 0.7
-    tree, free, kept = cKDTree(darts), np.ones(len(darts), bool), []
+    tree, free, chosen = cKDTree(darts), np.ones(len(darts), bool), []
     for n, dart in enumerate(darts):
-        if free[n] and len(kept) < count:
-            kept.append(n)
+        if free[n] and len(chosen) < count:
+            chosen.append(n)
             free[tree.query_ball_point(dart, spacing)] = False
-    return LedMap(np.arange(len(kept)), darts[kept], *surface)
+    return LedMap(np.arange(len(chosen)), darts[chosen], *surface)
 
 
 def surveyed(leds: LedMap, seed: int) -> LedMap:
     """The map in the tracker's head: every LED out of place by ERROR_M along each axis."""
-    wrong = ERROR_M * np.random.default_rng(seed).standard_normal(leds.position_m.shape)
-    return LedMap(leds.id, leds.position_m + wrong, leds.centre_m, leds.semi_axes_m, leds.board, ERROR_M)
+    error_m = ERROR_M * np.random.default_rng(seed).standard_normal(leds.position_m.shape)
+    return LedMap(leds.id, leds.position_m + error_m, leds.center_m, leds.semi_axes_m, leds.board, ERROR_M)
 
 
 def pose(rng: np.random.Generator, tilt_deg: float = 28.0) -> Rotation:
     """body_from_lab: any yaw, tilts to tilt_deg."""
     tilt = np.arccos(1 - rng.random() * (1 - np.cos(np.radians(tilt_deg))))
     about, yaw = rng.uniform(0, 2 * np.pi, 2)
-    lean = Rotation.from_rotvec(tilt * np.array([np.cos(about), np.sin(about), 0]))
-    return Rotation.from_euler("z", yaw) * lean
+    tilt_rotation = Rotation.from_rotvec(tilt * np.array([np.cos(about), np.sin(about), 0]))
+    return Rotation.from_euler("z", yaw) * tilt_rotation
 
 
 def lights(
@@ -68,9 +68,9 @@ def lights(
     return pixels[order], np.concatenate([seen, np.full(false, -1)])[order]
 
 
-def identified(pixels: Floats, sight: Sight) -> StarMatch | str:
+def identified(pixels: Floats, dome: DomeIndex) -> StarMatch | str:
     sigma = np.full(len(pixels), NOISE_PX / CAMERA.focal_px)
-    return search.identify(CAMERA.rays(pixels), sigma, sight)
+    return search.identify(CAMERA.rays(pixels), sigma, dome)
 
 
 def names_right(match: StarMatch, names: Floats) -> bool:
@@ -80,17 +80,15 @@ def names_right(match: StarMatch, names: Floats) -> bool:
 
 
 @pytest.mark.parametrize("surface", [OVAL, FLAT], ids=["ellipsoid", "flat"])
-@pytest.mark.parametrize(
-    ("dead", "false", "least"), [(0.0, 0, 0.98), (0.0, 5, 0.98), (0.2, 5, 0.8), (0.5, 5, 0.15)]
-)
+@pytest.mark.parametrize(("dead", "false", "least"), [(0.0, 0, 0.98), (0.0, 5, 0.98), (0.2, 5, 0.8), (0.5, 5, 0.15)])
 def test_equal_leds_are_told_apart_and_never_wrongly(surface, dead, false, least):
     truth = spread(1400, surface, 1)
     leds = surveyed(truth, 2)
-    sight, rng = sight_of(leds, LEVER, CAMERA), np.random.default_rng(3)
+    dome, rng = build_dome_index(leds, LEVER, CAMERA), np.random.default_rng(3)
     found = 0
     for _ in range(80):
         pixels, names = lights(truth, pose(rng, 25), rng, dead, false)
-        match = identified(pixels, sight)
+        match = identified(pixels, dome)
         if not isinstance(match, str):
             found += 1
             assert names_right(match, names)
@@ -100,10 +98,10 @@ def test_equal_leds_are_told_apart_and_never_wrongly(surface, dead, false, least
 def test_a_better_survey_finds_leds_of_which_half_are_dead():
     """What limits that is how many false attitudes fit: the square of an LED's error for each light."""
     truth = spread(1400, OVAL, 4)
-    sight, rng = sight_of(truth, LEVER, CAMERA), np.random.default_rng(5)
+    dome, rng = build_dome_index(truth, LEVER, CAMERA), np.random.default_rng(5)
     tries = [lights(truth, pose(rng), rng, 0.5, 5) for _ in range(80)]
     enough = [(pixels, names) for pixels, names in tries if np.sum(names >= 0) >= 4]
-    came = [(identified(pixels, sight), names) for pixels, names in enough]
+    came = [(identified(pixels, dome), names) for pixels, names in enough]
     right = [names_right(match, names) for match, names in came if not isinstance(match, str)]
     assert all(right)
     assert len(right) >= 0.9 * len(enough)
@@ -112,12 +110,12 @@ def test_a_better_survey_finds_leds_of_which_half_are_dead():
 def test_lights_that_fell_anywhere_are_no_attitude():
     """And evidence of x powers of ten is met in one such frame of 10^x at most (Markov): x = 1, 200 frames."""
     leds = surveyed(spread(1400, OVAL, 6), 7)
-    sight, rng = sight_of(leds, LEVER, CAMERA), np.random.default_rng(8)
+    dome, rng = build_dome_index(leds, LEVER, CAMERA), np.random.default_rng(8)
     dex = []
     for _ in range(200):
         rays = CAMERA.rays(rng.uniform(0, [1599, 1199], (8, 2)))
-        fallen = search.lights_of(rays, np.full(8, NOISE_PX / CAMERA.focal_px), sight)
-        best, _ = search._search(fallen, sight, 10**7)
+        fallen = search.build_detections(rays, np.full(8, NOISE_PX / CAMERA.focal_px), dome)
+        best, _ = search._search(fallen, dome, 10**7)
         dex.append(best.dex)
     # At most .1 of them, and three deviations of a binomial count.
     assert np.mean(np.array(dex) > 1) <= 0.1 + 3 * np.sqrt(0.09 / 200)
@@ -128,18 +126,18 @@ def test_lights_that_fell_anywhere_are_no_attitude():
 def test_a_pair_s_angle_at_the_usual_radius_is_within_the_slack(surface):
     """By which a pair is looked up: both rays carried to the one sphere, against the index's angle."""
     leds = spread(600, surface, 9)
-    sight, rng = sight_of(leds, LEVER, CAMERA), np.random.default_rng(10)
-    keys = dict(zip(map(frozenset, sight.pairs.pair.tolist()), sight.pairs.angle_rad, strict=True))
+    dome, rng = build_dome_index(leds, LEVER, CAMERA), np.random.default_rng(10)
+    keys = dict(zip(map(frozenset, dome.pairs.pair.tolist()), dome.pairs.angle_rad, strict=True))
     checked = 0
     for _ in range(60):
-        turned = pose(rng)
-        xy = project(turned, leds.position_m, LEVER, CAMERA)
+        body_from_lab = pose(rng)
+        xy = project(body_from_lab, leds.position_m, LEVER, CAMERA)
         seen = np.flatnonzero(CAMERA.contains(np.nan_to_num(xy, nan=-1e9)))
-        usual = on_sphere(CAMERA.rays(xy[seen]), sight.pupil_m, sight.usual_m) / sight.usual_m
+        direction = on_sphere(CAMERA.rays(xy[seen]), dome.pupil_m, dome.median_radius_m) / dome.median_radius_m
         for a in range(len(seen)):
             for b in range(a):
-                angle = 2 * np.arcsin(np.linalg.norm(usual[a] - usual[b]) / 2)
-                assert abs(angle - keys[frozenset((seen[a], seen[b]))]) < sight.slack_rad + 1e-9
+                angle = 2 * np.arcsin(np.linalg.norm(direction[a] - direction[b]) / 2)
+                assert abs(angle - keys[frozenset((seen[a], seen[b]))]) < dome.scaling_error_rad + 1e-9
                 checked += 1
     assert checked > 300
 
@@ -148,8 +146,7 @@ def boards(turns_deg: tuple[float, ...], extra: bool) -> LedMap:
     """Patch boards of 3x3 LEDs around the apex, one at each azimuth, all alike; and perhaps one LED more."""
     lattice = 0.008 * np.array([[x, y, 0] for y in (-1, 0, 1) for x in (-1, 0, 1)])
     places = [
-        Rotation.from_euler("z", turn, degrees=True).apply(lattice + np.array([0.045, 0, 1.219]))
-        for turn in turns_deg
+        Rotation.from_euler("z", turn, degrees=True).apply(lattice + np.array([0.045, 0, 1.219])) for turn in turns_deg
     ]
     place = np.concatenate([*places, *([[[0.02, -0.036, 1.219]]] if extra else [])])
     board = np.repeat(np.arange(len(turns_deg)), 9)
@@ -183,10 +180,10 @@ def test_one_light_that_breaks_the_symmetry_is_enough():
 
 def test_too_few_lights_are_no_attitude():
     leds = spread(300, OVAL, 12)
-    sight = sight_of(leds, LEVER, CAMERA)
+    dome = build_dome_index(leds, LEVER, CAMERA)
     for count in range(3):
         pixels = np.random.default_rng(13).uniform(0, [1599, 1199], (count, 2))
-        assert identified(pixels.reshape(-1, 2), sight) == search.NO_MATCH
+        assert identified(pixels.reshape(-1, 2), dome) == search.NO_MATCH
 
 
 def test_the_covariance_holds_the_map_s_own_errors():
@@ -197,9 +194,7 @@ def test_the_covariance_holds_the_map_s_own_errors():
         body_from_lab = pose(rng)
         pixels, _ = lights(truth, body_from_lab, rng)
         tracker = DomeTracker(CAMERA, surveyed(truth, 100 + n), LEVER)
-        answer = tracker.solve_centroids(
-            Centroids(pixels, np.full(len(pixels), NOISE_PX), np.ones(len(pixels)))
-        )
+        answer = tracker.solve_centroids(Centroids(pixels, np.full(len(pixels), NOISE_PX), np.ones(len(pixels))))
         if answer.solved:
             error = (answer.cam_from_ref * (LEVER.cam_from_body * body_from_lab).inv()).as_rotvec()
             nees.append(error @ np.linalg.inv(answer.covariance_rad2) @ error)
@@ -243,23 +238,3 @@ def test_the_covariance_holds_a_lever_s_error():
         nees.append(error[:2] @ np.linalg.inv(answer.covariance_rad2[:2, :2]) @ error[:2])
     # Chi-square of two: mean 2, deviation sqrt(4 / 60).
     assert np.mean(nees) == pytest.approx(2, abs=3 * np.sqrt(4 / 60))
-
-
-def test_stars_are_lights_about_a_camera_at_the_centre():
-    """Of a sky of 6,000 stars, brightest first, only the brighter third is seen: the others are not missed."""
-    rng = np.random.default_rng(20)
-    sky = rng.standard_normal((6000, 3))
-    sky /= np.linalg.norm(sky, axis=1, keepdims=True)
-    camera = Camera.from_fov(1024, 1024, np.radians(20))
-    sight, found = sky_of(sky, camera), 0
-    for _ in range(60):
-        cam_from_sky = Rotation.random(rng=rng)
-        xy = camera.pixels(cam_from_sky.apply(sky[:2000]))
-        xy = xy[camera.contains(np.nan_to_num(xy, nan=-1e9))]
-        pixels = np.concatenate([xy + 0.1 * rng.standard_normal(xy.shape), rng.uniform(0, 1023, (3, 2))])
-        match = search.identify(camera.rays(pixels), np.full(len(pixels), 0.1 / camera.focal_px), sight)
-        assert not isinstance(match, str)
-        # .1 px of 2,800 about each axis across, and of some 300 about the boresight, by ten stars.
-        assert (match.cam_from_ref * cam_from_sky.inv()).magnitude() < 2e-3
-        found += np.all(match.star < 2000)
-    assert found == 60

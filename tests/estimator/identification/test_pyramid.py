@@ -14,7 +14,7 @@ from estimator.core.types import StarMatch
 from estimator.identification.chance import ACCEPT_LOG10_CHANCE, MIN_MATCHES, log10_tail
 from estimator.identification.published.pyramid import pyramid
 
-FILE = Path(__file__).parents[3] / "data/catalogues/hipparcos_hp6.5.ecsv"
+FILE = Path(__file__).parents[3] / "data/catalogs/hipparcos_hp6.5.ecsv"
 CAMERA = Camera.from_fov(659, 493, np.radians(14.87))  # SHEFEX-2's 14.87 x 11.15 degrees
 FIELD_SR = 659 * 493 / CAMERA.focal_px**2
 UPSIDE_DOWN = np.array([-1.0, 1.0, 1.0])
@@ -23,7 +23,7 @@ UPSIDE_DOWN = np.array([-1.0, 1.0, 1.0])
 def sky_index(stars_a_field: float) -> pair_index.PairIndex:
     """The real sky's brightest, so many a field on average, doubles merged."""
     stars = catalog.read(FILE)
-    bright = catalog.brighter(stars, catalog.limit_for_density(stars, FIELD_SR, stars_a_field))
+    bright = catalog.brighter_than(stars, catalog.limit_for_density(stars, FIELD_SR, stars_a_field))
     merged = catalog.merge_doubles(bright, 3 / CAMERA.focal_px)
     return pair_index.build(merged.vectors, CAMERA.diagonal_rad * 1.02)
 
@@ -39,7 +39,7 @@ def bright_sky() -> pair_index.PairIndex:
 
 
 class Field:
-    """What a camera sees: pixels, brightest first, and the catalogue row of each (-1: a false star)."""
+    """What a camera sees: pixels, brightest first, and the catalog row of each (-1: a false star)."""
 
     def __init__(self, rng: np.random.Generator, vectors: Floats, noise_px: float, false: float) -> None:
         self.cam_from_icrs = Rotation.random(rng=rng)
@@ -66,11 +66,9 @@ class Field:
 
 
 def solved(
-    xy: Floats, known: pair_index.PairIndex, tolerance_px: float = 1.0, triangles: int = 3000
+    xy: Floats, index: pair_index.PairIndex, tolerance_px: float = 1.0, triangles: int = 3000
 ) -> StarMatch | None:
-    return pyramid(
-        CAMERA.rays(xy), known, tolerance_px / CAMERA.focal_px, stretch=5e-4, max_triangles=triangles
-    )
+    return pyramid(CAMERA.rays(xy), index, tolerance_px / CAMERA.focal_px, stretch=5e-4, max_triangles=triangles)
 
 
 @pytest.mark.parametrize(
@@ -184,7 +182,7 @@ def test_an_unknown_focal_length_is_measured_by_the_triangles(sky: pair_index.Pa
     for _ in range(20):
         field = Field(rng, sky.vectors, 0.1, 0.0)
         rays = CAMERA.zoomed(zoom).rays(field.xy)
-        match = pyramid(rays, sky, 1.5 / CAMERA.focal_px, stretch=0.02, zooms=True)
+        match = pyramid(rays, sky, 1.5 / CAMERA.focal_px, stretch=0.02, focal_unknown=True)
         found += match is not None and field.off_px(match) < 5
     assert found >= 18
 

@@ -11,7 +11,7 @@ from estimator.attitude.nearfield import thesis_points
 from estimator.calibration.home_position import Sighting, calibrate
 from estimator.catalog import pair_index
 from estimator.catalog.catalog import unit
-from estimator.catalog.pair_buckets import ARCSEC_RAD, PairCatalogue, bucket_of, bucketed, candidates
+from estimator.catalog.pair_buckets import ARCSEC_RAD, PairCatalog, bucket_of, build_pair_catalog, candidates
 from estimator.core.arrays import Floats
 from estimator.core.camera import Camera
 from estimator.core.errors import ImageError
@@ -51,12 +51,12 @@ def crowd() -> Floats:
 
 
 @pytest.fixture(scope="module")
-def published(crowd: Floats) -> PairCatalogue:
+def published(crowd: Floats) -> PairCatalog:
     """Angles from 1.5 to 8 degrees in buckets of 5 arcsec (Padro 2012, section 2.4.6)."""
-    return bucketed(crowd, np.zeros(500), 5 * ARCSEC_RAD, (np.radians(1.5), np.radians(8)))
+    return build_pair_catalog(crowd, np.zeros(500), 5 * ARCSEC_RAD, (np.radians(1.5), np.radians(8)))
 
 
-def test_the_published_range_has_4680_buckets(published: PairCatalogue) -> None:
+def test_the_published_range_has_4680_buckets(published: PairCatalog) -> None:
     assert len(published.table) - 1 == 4680  # A13
     assert published.table[0] == 0
     assert published.table[-1] == len(published.pair)
@@ -66,16 +66,16 @@ def test_the_published_range_has_4680_buckets(published: PairCatalogue) -> None:
 def test_eq_12_s_example_takes_the_third_and_second_bucket_from_the_end() -> None:
     # theta_max - 1.7 D with 3 epsilon = .6 D: PC range [theta_max - 2.3 D, theta_max - 1.1 D] (A14), of M = 40.
     top, width = 0.1, 2e-3
-    ends = np.array([top - 1.7 * width - 0.6 * width, top - 1.7 * width + 0.6 * width])
-    np.testing.assert_allclose((top - ends) / width, [2.3, 1.1], rtol=1e-12)  # rounding
+    angles = np.array([top - 1.7 * width - 0.6 * width, top - 1.7 * width + 0.6 * width])
+    np.testing.assert_allclose((top - angles) / width, [2.3, 1.1], rtol=1e-12)  # rounding
     # From the first entry of bucket M - 2 to before that of bucket M, counted from 1; from 0: M - 3 and M - 2.
-    assert bucket_of(ends, top, width, 40).tolist() == [37, 38]
+    assert bucket_of(angles, top, width, 40).tolist() == [37, 38]
     # Stars on an arc, each bucket one pair with the first star: the entries are those two buckets' pairs.
     # The first star only pairs with the others if those are out of range of one another: range from 60 mrad.
     arc = np.concatenate([[0.0], top - width * (np.arange(20) + 0.5)])
     stars = np.column_stack([np.sin(arc), np.zeros(21), np.cos(arc)])
-    known = bucketed(stars, np.zeros(21), width, (top - 20 * width, top))
-    begin, end = candidates(known, *ends)
+    known = build_pair_catalog(stars, np.zeros(21), width, (top - 20 * width, top))
+    begin, end = candidates(known, *angles)
     assert names(known.pair[begin:end]).tolist() == [2, 3]  # with star 0, at theta_max - 2.5 D and - 1.5 D
 
 
@@ -83,7 +83,7 @@ def test_eq_12_s_example_takes_the_third_and_second_bucket_from_the_end() -> Non
 def test_nothing_within_the_gate_is_missed(crowd: Floats, width_arcsec: float) -> None:
     rng = np.random.default_rng(71)
     crowd = crowd[:200]
-    known = bucketed(crowd, np.zeros(200), width_arcsec * ARCSEC_RAD)
+    known = build_pair_catalog(crowd, np.zeros(200), width_arcsec * ARCSEC_RAD)
     pair, angle = all_pairs(crowd)
     np.testing.assert_array_equal(names(known.pair), names(pair))
     gate, slack = 29 * ARCSEC_RAD, 1e-12  # the two formulae differ by rounding
@@ -98,7 +98,7 @@ def test_nothing_within_the_gate_is_missed(crowd: Floats, width_arcsec: float) -
 
 def test_an_angle_that_ends_a_gate_exactly_is_not_missed(crowd: Floats) -> None:
     # Gates whose ends are the angles themselves and buckets whose ends are too: rounding must not lose them.
-    known = bucketed(crowd[:60], np.zeros(60), 100 * ARCSEC_RAD)
+    known = build_pair_catalog(crowd[:60], np.zeros(60), 100 * ARCSEC_RAD)
     buckets = len(known.table) - 1
     for number in range(buckets):
         edge = known.max_rad - (buckets - number) * known.width_rad
@@ -113,38 +113,36 @@ def test_an_angle_that_ends_a_gate_exactly_is_not_missed(crowd: Floats) -> None:
         assert (p, q) in {(int(a), int(b)) for a, b in known.pair[begin:end]}
 
 
-def test_buckets_of_a_quarter_gate_look_at_an_eighth_too_many(
-    published: PairCatalogue, crowd: Floats
-) -> None:
+def test_buckets_of_a_quarter_gate_look_at_an_eighth_too_many(published: PairCatalog, crowd: Floats) -> None:
     # Half a bucket at either end of a 40 arcsec gate: 5 / 40 = 12.5 % (A13).
     rng, gate = np.random.default_rng(72), 20 * ARCSEC_RAD
     angle = np.sort(all_pairs(crowd)[1])
-    looked = wanted = 0
+    looked = expected = 0
     thetas = rng.uniform(np.radians(1.6), np.radians(7.9), 4000)
     for theta in thetas:
         begin, end = candidates(published, theta - gate, theta + gate)
         looked += end - begin
-        wanted += np.searchsorted(angle, theta + gate) - np.searchsorted(angle, theta - gate)
+        expected += np.searchsorted(angle, theta + gate) - np.searchsorted(angle, theta - gate)
     # Of N wanted an eighth is Poisson, and less is repeated as the gates overlap: five deviations of that eighth.
     pairs_once = len(published.pair)
-    assert abs(looked / wanted - 1.125) < 5 * np.sqrt(0.125 / pairs_once)
+    assert abs(looked / expected - 1.125) < 5 * np.sqrt(0.125 / pairs_once)
 
 
 def test_pairs_are_limited_by_magnitude_and_angle(crowd: Floats) -> None:
     magnitude = np.random.default_rng(73).uniform(0, 100, 500)
     limits = np.radians(2), np.radians(5)
-    known = bucketed(crowd, magnitude, range_rad=limits, magnitudes=(20, 90))
+    known = build_pair_catalog(crowd, magnitude, range_rad=limits, magnitudes=(20, 90))
     pair, angle = all_pairs(crowd)
     shines = (magnitude >= 20) & (magnitude <= 90)
-    kept = (angle >= limits[0]) & (angle <= limits[1]) & shines[pair].all(axis=1)
-    np.testing.assert_array_equal(names(known.pair), names(pair[kept]))
+    in_range = (angle >= limits[0]) & (angle <= limits[1]) & shines[pair].all(axis=1)
+    np.testing.assert_array_equal(names(known.pair), names(pair[in_range]))
 
 
-def test_what_gives_no_catalogue_is_refused(crowd: Floats) -> None:
+def test_what_gives_no_catalog_is_refused(crowd: Floats) -> None:
     with pytest.raises(ImageError, match=r"no pair of stars from 20\.000 to 30\.000 deg"):
-        bucketed(crowd, np.zeros(500), range_rad=(np.radians(20), np.radians(30)))
-    with pytest.raises(ImageError, match="bucket width 0 rad: allowed is more than 0"):
-        bucketed(crowd, np.zeros(500), 0)
+        build_pair_catalog(crowd, np.zeros(500), range_rad=(np.radians(20), np.radians(30)))
+    with pytest.raises(ImageError, match="bucket width 0 rad; allowed: more than 0"):
+        build_pair_catalog(crowd, np.zeros(500), 0)
 
 
 # ---- identification ------------------------------------------------------------------------------------------------
@@ -180,25 +178,19 @@ def observed(
     seen, truth = upright.apply(seen), upright * truth
     if mirrored:
         seen = seen * [-1, 1, 1]
-    light = np.concatenate(
-        [magnitude + rng.normal(0, EPSILON_MAG, len(vectors)), rng.uniform(20, 150, false)]
-    )
+    light = np.concatenate([magnitude + rng.normal(0, EPSILON_MAG, len(vectors)), rng.uniform(20, 150, false)])
     row = np.concatenate([np.arange(len(vectors)), np.full(false, -1)])
     order = np.argsort(-light)
     return seen[order], light[order], row[order], truth
 
 
-def found(
-    seen: Floats, light: Floats, known: PairCatalogue, epsilon_mag: float = EPSILON_MAG
-) -> StarMatch | None:
-    return saa(
-        seen, known, 3 * SIGMA_RAD, magnitude=light, epsilon_mag=epsilon_mag, epsilon_sep_rad=EPSILON_SEP
-    )
+def found(seen: Floats, light: Floats, known: PairCatalog, epsilon_mag: float = EPSILON_MAG) -> StarMatch | None:
+    return saa(seen, known, 3 * SIGMA_RAD, magnitude=light, epsilon_mag=epsilon_mag, epsilon_sep_rad=EPSILON_SEP)
 
 
 @pytest.mark.parametrize("false", [0, 4])
 def test_a_patch_of_unequal_leds_is_identified_and_never_wrongly(false: int) -> None:
-    rng, known = np.random.default_rng(74), bucketed(patch(LATTICE), MAGNITUDE)
+    rng, known = np.random.default_rng(74), build_pair_catalog(patch(LATTICE), MAGNITUDE)
     right, z2 = 0, []
     for _ in range(100):
         seen, light, row, truth = observed(rng, patch(LATTICE), MAGNITUDE, false)
@@ -223,7 +215,7 @@ SQUARE = np.array([[x, y] for x in (-1, 0, 1) for y in (-1, 0, 1)])
 @pytest.mark.parametrize("places", [SQUARE, SQUARE[[1, 3, 4, 5, 7]], SQUARE[[0, 2, 6, 8]]])
 def test_a_symmetric_pattern_of_equal_leds_is_refused(places: Floats) -> None:
     rng, equal = np.random.default_rng(75), np.full(len(places), 100.0)
-    known = bucketed(patch(places), equal)
+    known = build_pair_catalog(patch(places), equal)
     for _ in range(3):
         seen, light, _, _ = observed(rng, patch(places), equal)
         assert found(seen, light, known) is None
@@ -233,7 +225,7 @@ def test_the_same_square_of_unequal_leds_is_told_apart() -> None:
     # So that the refusal above is the symmetry's, not a gate's. Magnitudes 20 epsilons apart: at two to
     # four a full square, on which false assumptions find partners too, is mostly refused.
     rng, magnitude = np.random.default_rng(76), 100.0 * np.random.default_rng(80).permutation(9) + 100
-    known, named = bucketed(patch(SQUARE), magnitude), 0
+    known, named = build_pair_catalog(patch(SQUARE), magnitude), 0
     for _ in range(30):
         seen, light, row, _ = observed(rng, patch(SQUARE), magnitude)
         match = found(seen, light, known)
@@ -246,7 +238,7 @@ def test_the_same_square_of_unequal_leds_is_told_apart() -> None:
 def test_without_magnitudes_an_irregular_pattern_is_enough_and_a_k_vector_will_do() -> None:
     rng = np.random.default_rng(77)
     places = rng.uniform(-3, 3, (14, 2))
-    known, kvector = bucketed(patch(places), np.zeros(14)), pair_index.build(patch(places), 0.1)
+    known, kvector = build_pair_catalog(patch(places), np.zeros(14)), pair_index.build(patch(places), 0.1)
     right = 0
     for _ in range(15):
         seen, _, row, _ = observed(rng, patch(places), np.full(14, 100.0))
@@ -262,7 +254,7 @@ def test_a_mirror_image_and_mere_noise_are_refused() -> None:
     rng = np.random.default_rng(78)
     # Off the lattice: a lattice's mirror image has most of its places.
     places = LATTICE + rng.uniform(-0.3, 0.3, (12, 2))
-    known = bucketed(patch(places), MAGNITUDE)
+    known = build_pair_catalog(patch(places), MAGNITUDE)
     for _ in range(5):
         seen, light, _, _ = observed(rng, patch(places), MAGNITUDE, mirrored=True)
         assert found(seen, light, known) is None
@@ -271,10 +263,10 @@ def test_a_mirror_image_and_mere_noise_are_refused() -> None:
 
 
 def test_three_stars_and_an_uncertain_focal_length_are_not_its_business() -> None:
-    known = bucketed(patch(LATTICE), MAGNITUDE)
+    known = build_pair_catalog(patch(LATTICE), MAGNITUDE)
     assert saa(patch(LATTICE[:3]), known, SIGMA_RAD) is None
     with pytest.raises(ImageError, match="saa: the focal length is uncertain; allowed: a calibrated camera"):
-        saa(patch(LATTICE), known, SIGMA_RAD, zooms=True)
+        saa(patch(LATTICE), known, SIGMA_RAD, focal_unknown=True)
     with pytest.raises(ImageError, match="saa: tolerance 0"):
         saa(patch(LATTICE), known, 0.0)
 
@@ -283,16 +275,14 @@ def test_three_stars_and_an_uncertain_focal_length_are_not_its_business() -> Non
 
 
 def test_a_dome_calibrated_from_its_frames_is_identified_at_the_thesis_s_stops() -> None:
-    # Table 6's stops, centroids of .3 px, the IMU exact: catalogue, epsilons and pairs all from the frames.
+    # Table 6's stops, centroids of .3 px, the IMU exact: catalog, epsilons and pairs all from the frames.
     camera, lever = (
         Camera(1600, 1200, 8750.0, (799.5, 599.5)),
         Lever(np.array([0.0, 0.0, 0.381]), Rotation.identity()),
     )
     ball = LedMap(np.arange(0), np.zeros((0, 3)), np.zeros(3), np.full(3, 1.2192))
     leds = replace(ball, id=np.arange(12), position_m=1.2192 * patch(LATTICE))
-    stops = np.radians(
-        [[0, 0, 0], [-0.009, 2.3, 0.007], [0.25, -2.1, 0.004], [3.3, -0.14, -0.028], [-1.9, 0.28, 0.19]]
-    )
+    stops = np.radians([[0, 0, 0], [-0.009, 2.3, 0.007], [0.25, -2.1, 0.004], [3.3, -0.14, -0.028], [-1.9, 0.28, 0.19]])
     rng, attitudes = np.random.default_rng(79), Rotation.from_euler("ZYX", stops[:, ::-1])
 
     def frame(stop: int) -> Sighting:
@@ -300,18 +290,18 @@ def test_a_dome_calibrated_from_its_frames_is_identified_at_the_thesis_s_stops()
         return Sighting(stop, attitudes[stop], leds.id, xy, MAGNITUDE + rng.normal(0, EPSILON_MAG, 12))
 
     home = calibrate([frame(stop) for stop in range(5) for _ in range(20)], camera, ball, lever, sine=True)
-    known = bucketed(home.vectors, home.magnitude)
+    known = build_pair_catalog(home.vectors, home.brightness)
     named = 0
     for stop in np.repeat(np.arange(5), 8):
         seen = frame(stop)
-        order = np.argsort(-seen.magnitude)
+        order = np.argsort(-seen.brightness)
         point, _ = thesis_points(camera.rays(seen.xy_px[order]), ball, lever, sine=True)
         rays = unit(point + lever.camera_body_m)
         match = saa(
             rays,
             known,
             3 * home.epsilon_pos_rad,
-            magnitude=seen.magnitude[order],
+            magnitude=seen.brightness[order],
             epsilon_mag=home.epsilon_mag,
             epsilon_sep_rad=home.epsilon_sep_rad,
         )

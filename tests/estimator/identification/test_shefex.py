@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 from estimator.catalog import catalog, pair_index
 from estimator.core.arrays import Floats
 from estimator.identification.published.master_star import master_star
-from estimator.identification.published.shefex import cos_error, gate
+from estimator.identification.published.shefex import angle_interval, cos_error
 
 ARCSEC_RAD = np.pi / 648_000
 PIXEL_RAD = np.radians(0.02)  # "the angle per pixel, computed from the FOV and the CCD size (0.02 deg)"
@@ -20,25 +20,23 @@ def test_eq_3_gives_the_published_cos_error(centroid_px: float, factor: float) -
     assert error == pytest.approx(5.5e-5, rel=0.01)
 
 
-@pytest.mark.parametrize(
-    ("angle_deg", "tolerance_deg"), [(2, 0.090), (5, 0.036), (10, 0.018), (18.57, 0.010)]
-)
+@pytest.mark.parametrize(("angle_deg", "tolerance_deg"), [(2, 0.090), (5, 0.036), (10, 0.018), (18.57, 0.010)])
 def test_cos_error_is_reference_h5_s_tolerance_of_angles(angle_deg: float, tolerance_deg: float) -> None:
-    low, high = np.degrees(gate(np.radians(angle_deg), 5.5e-5))
+    low, high = np.degrees(angle_interval(np.radians(angle_deg), 5.5e-5))
     assert (high - low) / 2 == pytest.approx(tolerance_deg, abs=6e-4)  # its last digit
 
 
 def test_the_gate_s_ends_are_off_by_cos_error_in_the_cosine() -> None:
     for angle in np.radians([0.9, 3, 10, 40]):
-        low, high = gate(angle, 5.5e-5)
+        low, high = angle_interval(angle, 5.5e-5)
         # 1e-15: rounding of 1.
         np.testing.assert_allclose(np.cos(low) - np.cos(angle), 5.5e-5, rtol=0, atol=1e-15)
         np.testing.assert_allclose(np.cos(angle) - np.cos(high), 5.5e-5, rtol=0, atol=1e-15)
     # Closer than that to zero every smaller angle is alike.
-    assert gate(0.001, 5.5e-5)[0] == 0
+    assert angle_interval(0.001, 5.5e-5)[0] == 0
 
 
-# ---- the master star: nine stars on a screen of .30 x .22 m a metre away (reference section 5) -----------------------
+# ---- the master star: nine stars on a screen of .30 x .22 m a meter away (reference section 5) -----------------------
 
 
 def screen(rng: np.random.Generator) -> Floats:
@@ -46,7 +44,7 @@ def screen(rng: np.random.Generator) -> Floats:
     return catalog.unit(np.column_stack([rng.uniform([-0.15, -0.11], [0.15, 0.11], (9, 2)), np.ones(9)]))
 
 
-def turned(rng: np.random.Generator, stars: Floats, noise_rad: float) -> tuple[Floats, Rotation]:
+def observe(rng: np.random.Generator, stars: Floats, noise_rad: float) -> tuple[Floats, Rotation]:
     truth = Rotation.from_rotvec(rng.normal(0, 0.1, 3))
     return catalog.unit(truth.apply(stars) + rng.normal(0, noise_rad, stars.shape)), truth
 
@@ -58,7 +56,7 @@ def test_nine_stars_on_a_screen_are_told_by_their_master() -> None:
     rng, found = np.random.default_rng(120), 0
     for _ in range(40):
         stars = screen(rng)
-        seen, truth = turned(rng, stars, 60 * ARCSEC_RAD)
+        seen, truth = observe(rng, stars, 60 * ARCSEC_RAD)
         match = master_star(seen, pair_index.build(stars, 0.5), TOLERANCE_RAD)
         if match is not None:
             np.testing.assert_array_equal(match.star, match.observed)
@@ -73,14 +71,14 @@ def test_six_of_the_nine_are_enough_but_not_without_the_master() -> None:
     rng, found = np.random.default_rng(121), np.zeros(3)
     for _ in range(40):
         stars = screen(rng)
-        seen, _ = turned(rng, stars, 20 * ARCSEC_RAD)
-        known = pair_index.build(stars, 0.5)
-        strays = turned(rng, screen(rng), 0.0)[0]
+        seen, _ = observe(rng, stars, 20 * ARCSEC_RAD)
+        index = pair_index.build(stars, 0.5)
+        strays = observe(rng, screen(rng), 0.0)[0]
         few = np.vstack([seen[:6], strays[:3]])
         headless = np.vstack([strays[:1], seen[1:]])
-        found[0] += master_star(few, known, TOLERANCE_RAD) is not None
-        found[1] += master_star(headless, known, TOLERANCE_RAD) is not None
-        found[2] += master_star(headless, known, TOLERANCE_RAD, masters=2) is not None
+        found[0] += master_star(few, index, TOLERANCE_RAD) is not None
+        found[1] += master_star(headless, index, TOLERANCE_RAD) is not None
+        found[2] += master_star(headless, index, TOLERANCE_RAD, masters=2) is not None
     assert found[0] >= 30
     assert found[1] <= 4
     assert found[2] >= 34
@@ -90,9 +88,9 @@ def test_nine_stars_of_another_screen_or_a_mirror_are_refused() -> None:
     rng = np.random.default_rng(122)
     for _ in range(60):
         stars, other = screen(rng), screen(rng)
-        known = pair_index.build(stars, 0.5)
-        assert master_star(other, known, TOLERANCE_RAD) is None
-        assert master_star(stars * [-1, 1, 1], known, TOLERANCE_RAD) is None
+        index = pair_index.build(stars, 0.5)
+        assert master_star(other, index, TOLERANCE_RAD) is None
+        assert master_star(stars * [-1, 1, 1], index, TOLERANCE_RAD) is None
 
 
 def test_a_square_of_equal_angles_is_no_answer() -> None:

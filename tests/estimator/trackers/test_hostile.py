@@ -23,7 +23,8 @@ from estimator.detection.detect import DETECTORS
 from estimator.trackers.pipeline import Settings
 from estimator.trackers.star_tracker import StarTracker
 from estimator.trackers.tracking_mode import TrackingMode
-from skysim.core.paths import CATALOGUES
+from skysim.core.paths import CATALOGS
+from skysim.results import metrics
 
 BRIEF = settings(max_examples=25, deadline=None)
 CAMERA = Camera.from_fov(40, 30, 0.5)
@@ -40,7 +41,7 @@ def one_line(error: Exception) -> None:
 
 @pytest.fixture(scope="module")
 def stars() -> catalog.StarCatalog:
-    return catalog.read(CATALOGUES / "hipparcos_hp6.5.ecsv")
+    return catalog.read(CATALOGS / "hipparcos_hp6.5.ecsv")
 
 
 @pytest.fixture(scope="module")
@@ -75,9 +76,7 @@ def test_no_image_of_noise_has_an_attitude(tracker: StarTracker, image: NDArray)
 @pytest.mark.long
 @BRIEF
 @given(xy_px=PIXELS, data=some.data())
-def test_no_lights_of_noise_have_an_attitude(
-    tracker: StarTracker, xy_px: NDArray, data: some.DataObject
-) -> None:
+def test_no_lights_of_noise_have_an_attitude(tracker: StarTracker, xy_px: NDArray, data: some.DataObject) -> None:
     sigma_px, flux = (data.draw(arrays("f8", len(xy_px), elements=ANY)) for _ in range(2))
     assert not tracker.solve_centroids(Centroids(xy_px, sigma_px, flux)).solved
 
@@ -126,7 +125,7 @@ def test_hostile_pictures_are_refused(monkeypatch: pytest.MonkeyPatch, count: in
 
 @pytest.mark.parametrize("frames", [10, pytest.param(1000, marks=pytest.mark.long)])
 def test_a_mirrored_sky_is_refused(stars: catalog.StarCatalog, frames: int) -> None:
-    """The true sky of each is recognised, so that the mirror alone is what is refused."""
+    """The true sky of each is recognized, so that the mirror alone is what is refused."""
     camera = hostile.camera()
     eye = StarTracker(camera, stars, stars.vectors)
     right = 0
@@ -135,7 +134,7 @@ def test_a_mirrored_sky_is_refused(stars: catalog.StarCatalog, frames: int) -> N
         for seen in (picture[:, ::-1], picture[::-1]):
             assert not eye.solve(np.ascontiguousarray(seen)).attitude.solved
         told = eye.solve(picture).attitude.cam_from_ref or Rotation.identity()
-        right += (told * there.inv()).magnitude() < hostile.WRONG_RAD
+        right += (told * there.inv()).magnitude() < metrics.WRONG_RAD
     assert right >= 0.9 * frames
 
 

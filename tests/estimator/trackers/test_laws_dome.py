@@ -1,4 +1,4 @@
-"""Laws of lights at a finite distance: surfaces, exact and thesis's solves, identification, the home catalogue."""
+"""Laws of lights at a finite distance: surfaces, exact and thesis's solves, identification, the home catalog."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from estimator.attitude import dome_map, nearfield
 from estimator.attitude.dome_map import LedMap, Lever
 from estimator.attitude.nearfield import SOLVERS
 from estimator.calibration import home_position
-from estimator.calibration.home_position import HomeCatalogue, Sighting
+from estimator.calibration.home_position import HomeCatalog, Sighting
 from estimator.catalog import pair_index
 from estimator.core.arrays import Floats
 from estimator.core.camera import Camera
@@ -58,12 +58,8 @@ def even(count: int) -> LedMap:
     z = 1 - (np.arange(count) + 0.5) / count * 0.4
     azimuth = np.arange(count) * np.pi * (3 - np.sqrt(5))
     across = np.sqrt(1 - z**2)
-    along = np.column_stack([across * np.cos(azimuth), across * np.sin(azimuth), z]) + rng.normal(
-        0, 0.01, (count, 3)
-    )
-    return replace(
-        SPHERE, id=np.arange(count), position_m=1.2 * along / np.linalg.norm(along, axis=1, keepdims=True)
-    )
+    along = np.column_stack([across * np.cos(azimuth), across * np.sin(azimuth), z]) + rng.normal(0, 0.01, (count, 3))
+    return replace(SPHERE, id=np.arange(count), position_m=1.2 * along / np.linalg.norm(along, axis=1, keepdims=True))
 
 
 # Surfaces
@@ -71,9 +67,7 @@ def even(count: int) -> LedMap:
 
 @law(dome_map.on_sphere, dome_map.on_surface, dome_map.project, dome_map.check_lever)
 @given(rng=SEEDS, radius_m=some.floats(0.1, 3), place_m=arrays("f8", 3, elements=some.floats(-2, 2)))
-def test_rays_meet_the_surface_on_their_way(
-    rng: np.random.Generator, radius_m: float, place_m: Floats
-) -> None:
+def test_rays_meet_the_surface_on_their_way(rng: np.random.Generator, radius_m: float, place_m: Floats) -> None:
     rays = units(rng, 9)
     met = answered(lambda: dome_map.on_sphere(rays, place_m, radius_m))
     assert (met is not None) == (np.linalg.norm(place_m) < radius_m)
@@ -82,13 +76,11 @@ def test_rays_meet_the_surface_on_their_way(
     np.testing.assert_allclose(same if met is None else met, same, rtol=0, atol=1e-6)
     arm, body_from_lab = lever(rng), turn(rng)
     leds, seen = seen_through(rng, OVAL, arm, body_from_lab, 9)
-    on_it = np.sum(((leds.position_m - OVAL.centre_m) / OVAL.semi_axes_m) ** 2, axis=1)
+    on_it = np.sum(((leds.position_m - OVAL.center_m) / OVAL.semi_axes_m) ** 2, axis=1)
     np.testing.assert_allclose(on_it, 1, rtol=0, atol=1e-9)
     pixels = dome_map.project(body_from_lab, leds.position_m, arm, CAMERA)
     np.testing.assert_allclose(CAMERA.rays(pixels), seen, rtol=0, atol=1e-9)
-    far = answered(
-        lambda: dome_map.check_lever(leds, Lever(place_m, Rotation.identity())) or True, ImageError
-    )
+    far = answered(lambda: dome_map.check_lever(leds, Lever(place_m, Rotation.identity())) or True, ImageError)
     assert bool(far) == (np.linalg.norm(place_m) < np.linalg.norm(leds.position_m, axis=1).min())
 
 
@@ -161,32 +153,28 @@ def eye() -> DomeTracker:
     return DomeTracker(CAMERA, even(150), Lever(np.array([0.01, 0.0, 0.3]), Rotation.identity()))
 
 
-@law(DomeTracker.solve_centroids, search.identify, search.lights_of, dome_tracker.led_pairs)
+@law(DomeTracker.solve_centroids, search.identify, search.build_detections, dome_tracker.led_pairs)
 @given(rng=SEEDS, false=some.integers(0, 4))
-def test_lights_are_named_as_they_are_or_not_at_all(
-    eye: DomeTracker, rng: np.random.Generator, false: int
-) -> None:
+def test_lights_are_named_as_they_are_or_not_at_all(eye: DomeTracker, rng: np.random.Generator, false: int) -> None:
     truth = turn(rng, 0.3)
     px = np.nan_to_num(dome_map.project(truth, eye.leds.position_m, eye.lever, CAMERA), nan=-1e9)
     star = np.flatnonzero(CAMERA.contains(px, 3))
-    xy = np.concatenate(
-        [px[star] + rng.normal(0, 0.1, (len(star), 2)), rng.uniform(0, [639, 479], (false, 2))]
-    )
+    xy = np.concatenate([px[star] + rng.normal(0, 0.1, (len(star), 2)), rng.uniform(0, [639, 479], (false, 2))])
     star = np.concatenate([star, np.full(false, -1)])
     told = eye.solve_centroids(Centroids(xy, np.full(len(xy), 0.1), np.linspace(2, 1, len(xy))))
     truth_cam = eye.lever.cam_from_body * truth
     assert not told.solved or (told.cam_from_ref * truth_cam.inv()).magnitude() < 0.01
     assert not told.solved or (star[told.match.observed] >= 0).sum() >= len(told.match.observed) - false
     rays, sigma = CAMERA.rays(xy), np.full(len(xy), 1e-4)
-    sight = index.sight_of(eye.leds, eye.lever, CAMERA)
-    lights = search.lights_of(rays, sigma, sight)
-    np.testing.assert_allclose(np.linalg.norm(lights.usual, axis=1), 1, rtol=0, atol=1e-9)
-    for match in (search.identify(rays, sigma, sight), eye.identify(rays, sigma)):
+    dome = index.build_dome_index(eye.leds, eye.lever, CAMERA)
+    lights = search.build_detections(rays, sigma, dome)
+    np.testing.assert_allclose(np.linalg.norm(lights.direction, axis=1), 1, rtol=0, atol=1e-9)
+    for match in (search.identify(rays, sigma, dome), eye.identify(rays, sigma)):
         named = [] if isinstance(match, str) else match.observed.tolist()
         assert len(set(named)) == len(named)
 
 
-@law(DomeTracker.solve_centroids, DomeTracker.solve, dome_tracker.as_stars, slow=True)
+@law(DomeTracker.solve_centroids, DomeTracker.solve, dome_tracker.star_identifier, slow=True)
 @given(
     xy_px=arrays("f8", (8, 2), elements=ANY),
     sigma=arrays("f8", 8, elements=ANY),
@@ -199,23 +187,21 @@ def test_no_lights_of_noise_have_an_attitude_under_a_dome(
     assert not eye.solve_centroids(Centroids(xy_px, sigma, np.ones(8))).solved
     assert not eye.solve(noise.normal(100, 5, (480, 640))).attitude.solved
     answered(lambda: eye.solve(xy_px), ImageError)
-    identify = dome_tracker.as_stars(name, CAMERA, eye.leds, eye.lever, eye.settings)
+    identify = dome_tracker.star_identifier(name, CAMERA, eye.leds, eye.lever, eye.settings)
     assert isinstance(answered(lambda: identify(CAMERA.rays(xy_px), sigma)) or "refused", str)
 
 
-@law(index.sight_of, index.sky_of, index.grid_of, index.at_usual)
+@law(index.build_dome_index, index.build_grid, index.scale_pair_angles)
 @given(rng=SEEDS, count=some.integers(20, 60))
 def test_a_dome_is_laid_out_whole(rng: np.random.Generator, count: int) -> None:
     leds = even(count)
-    sight = index.sight_of(leds, lever(rng), CAMERA)
-    grid = index.grid_of(leds.position_m / 1.2)
+    dome = index.build_dome_index(leds, lever(rng), CAMERA)
+    grid = index.build_grid(leds.position_m / 1.2)
     assert grid.first[-1] == len(grid.direction) == count
-    np.testing.assert_allclose(np.sort(sight.radius_m), 1.2, rtol=1e-12, atol=0)
-    assert (np.diff(sight.pairs.angle_rad) >= 0).all()
-    sky = index.sky_of(units(rng, count), CAMERA.zoomed(0.5))
-    assert sky.usual_m == pytest.approx(1, abs=1e-12)
+    np.testing.assert_allclose(np.sort(dome.radius_m), 1.2, rtol=1e-12, atol=0)
+    assert (np.diff(dome.pairs.angle_rad) >= 0).all()
     known = pair_index.build(units(rng, count), 1.0)
-    scaled = index.at_usual(known, np.full(count, 1.5))
+    scaled = index.scale_pair_angles(known, np.full(count, 1.5))
     np.testing.assert_allclose(scaled.angle_rad, 1.5 * known.angle_rad, rtol=1e-12, atol=0)
 
 
@@ -230,10 +216,10 @@ def test_a_field_holds_its_inner_one(rng: np.random.Generator, factor: float, ma
     assert 0 <= index.cap_height(directions, 0.0) <= index.cap_height(directions, margin_rad) <= 2
 
 
-# The thesis's catalogue
+# The thesis's catalog
 
 
-@law(home_position.pooled, home_position.averaged, home_position.instrument_magnitude)
+@law(home_position.pooled, home_position.averaged, home_position.instrument_brightness)
 @given(
     rng=SEEDS,
     shift=some.floats(-100, 100),
@@ -248,20 +234,20 @@ def test_a_spread_knows_scale_and_no_shift(
     np.testing.assert_allclose(other, scale * one, rtol=1e-6, atol=0)
     by_numpy = [np.std(value[group == g], ddof=1) for g in range(5)]
     assert deviation is home_position.averaged or np.allclose(one, by_numpy, rtol=1e-9, atol=0)
-    light = home_position.instrument_magnitude(np.abs(value), 1.0 + group)
+    light = home_position.instrument_brightness(np.abs(value), 1.0 + group)
     np.testing.assert_allclose(
-        home_position.instrument_magnitude(np.abs(value), scale * (1.0 + group)), light, rtol=1e-9
+        home_position.instrument_brightness(np.abs(value), scale * (1.0 + group)), light, rtol=1e-9
     )
 
 
-@law(home_position.calibrate, home_position.led_map, HomeCatalogue.epsilon_pos_rad)
+@law(home_position.calibrate, home_position.led_map, HomeCatalog.epsilon_pos_rad)
 @given(
     rng=SEEDS,
     frames=some.integers(2, 6),
     spread=some.sampled_from(["pooled", "averaged"]),
     sine=some.booleans(),
 )
-def test_a_home_catalogue_is_of_the_lights_that_were_shown(
+def test_a_home_catalog_is_of_the_lights_that_were_shown(
     rng: np.random.Generator, frames: int, spread: str, sine: bool
 ) -> None:
     arm = Lever(np.array([0, 0, 0.3]), Rotation.identity())
@@ -269,14 +255,12 @@ def test_a_home_catalogue_is_of_the_lights_that_were_shown(
     px = dome_map.project(Rotation.identity(), leds.position_m, arm, CAMERA)
     light = rng.uniform(10, 99, 8)
     shown = [
-        Sighting(
-            0, Rotation.identity(), leds.id, px + rng.normal(0, 0.2, px.shape), light + rng.normal(0, 1, 8)
-        )
+        Sighting(0, Rotation.identity(), leds.id, px + rng.normal(0, 0.2, px.shape), light + rng.normal(0, 1, 8))
         for _ in range(frames)
     ]
     told = home_position.calibrate(shown, CAMERA, SPHERE, arm, sine, spread)
     assert sorted(told.id) == sorted(leds.id)
-    assert (np.diff(told.magnitude) <= 0).all()
+    assert (np.diff(told.brightness) <= 0).all()
     assert (told.samples == frames).all()
     for covariance in told.covariance_m2:
         assert_covariance(covariance)
@@ -293,9 +277,7 @@ def test_a_home_catalogue_is_of_the_lights_that_were_shown(
     magnitude=NUMBERS,
     position=some.integers(0, 2),
 )
-def test_any_sightings_are_a_catalogue_or_refused(
-    led: NDArray, xy: NDArray, magnitude: NDArray, position: int
-) -> None:
+def test_any_sightings_are_a_catalog_or_refused(led: NDArray, xy: NDArray, magnitude: NDArray, position: int) -> None:
     arm = Lever(np.array([0, 0, 0.3]), Rotation.identity())
     for names in (np.arange(2), np.ravel(np.nan_to_num(led)).clip(-9, 9).astype(np.int64)):
         sighting = Sighting(position, Rotation.identity(), names, xy, magnitude)

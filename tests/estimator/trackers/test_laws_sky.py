@@ -19,14 +19,14 @@ from estimator.catalog import catalog, pair_index
 from estimator.core.camera import Camera
 from estimator.core.errors import ImageError
 from estimator.core.types import Attitude, Centroids, StarMatch
-from estimator.identification.direct_match import answer
+from estimator.identification.direct_match import to_star_match
 from estimator.identification.options import Options
 from estimator.identification.published import saa_search, shefex
 from estimator.identification.published.fialho import fialho_1, fialho_2, fialho_3, fialho_4
-from estimator.identification.published.fialho import rules as fialho_rules
+from estimator.identification.published.fialho import search_options as fialho_options
 from estimator.identification.published.master_star import master_star
 from estimator.identification.published.pyramid import pyramid
-from estimator.identification.published.saa import Pool, saa
+from estimator.identification.published.saa import AssumptionPool, saa
 from estimator.identification.registry import IDENTIFIERS
 from estimator.trackers import star_tracker
 from estimator.trackers.pipeline import Settings
@@ -63,16 +63,12 @@ class World:
     fialho_3,
     fialho_4,
     pyramid,
-    answer,
-    fialho_rules,
-    Pool.add,
+    to_star_match,
+    fialho_options,
+    AssumptionPool.add,
 )
-@given(
-    rng=SEEDS, name=some.sampled_from(sorted(IDENTIFIERS)), false=some.integers(0, 6), told=some.booleans()
-)
-def test_what_is_identified_is_what_is_there(
-    rng: np.random.Generator, name: str, false: int, told: bool
-) -> None:
+@given(rng=SEEDS, name=some.sampled_from(sorted(IDENTIFIERS)), false=some.integers(0, 6), told=some.booleans())
+def test_what_is_identified_is_what_is_there(rng: np.random.Generator, name: str, false: int, told: bool) -> None:
     """Each star once, none of the false ones, the attitude that the stars have: or nothing."""
     world, tolerance_rad = World(rng), 2e-4
     seen = np.concatenate([world.seen, CAMERA.rays(rng.uniform(0, [639, 479], (false, 2)))])
@@ -91,7 +87,7 @@ def test_what_is_identified_is_what_is_there(
     assert (match.star == star[match.observed])[true].all()
 
 
-@law(pyramid, saa, shefex.shefex, master_star, fialho_1, fialho_2, fialho_3, fialho_4, answer)
+@law(pyramid, saa, shefex.shefex, master_star, fialho_1, fialho_2, fialho_3, fialho_4, to_star_match)
 @given(
     rng=SEEDS,
     rays=RAYS,
@@ -108,29 +104,29 @@ def test_directions_of_nothing_are_no_stars(
         told = answered(lambda: IDENTIFIERS[name](rays, world.index, tolerance, **more))  # noqa: B023
         assert told is None or (len(set(told.observed.tolist())) == len(told.observed) <= count)
     with pytest.raises(ImageError, match="focal length is uncertain"):
-        Options(zooms=True).fixed_focal(name)
+        Options(focal_unknown=True).require_known_focal(name)
 
 
-@law(Options.light, Options.fixed_focal)
+@law(Options.magnitudes, Options.require_known_focal)
 @given(mag=NUMBERS, count=some.integers(0, 6))
 @example(mag=np.array(3.0), count=1)
 def test_magnitudes_are_one_a_star_or_unknown(mag: NDArray, count: int) -> None:
-    told = answered(lambda: Options(magnitude=mag).light(count), ImageError)
+    told = answered(lambda: Options(magnitude=mag).magnitudes(count), ImageError)
     assert (told is not None) == (mag.shape == (count,))
-    assert np.isnan(Options().light(count)).tolist() == [True] * count
-    Options().fixed_focal("any")
+    assert np.isnan(Options().magnitudes(count)).tolist() == [True] * count
+    Options().require_known_focal("any")
 
 
-@law(Pool.log10_chance, Pool.answer)
+@law(AssumptionPool.log10_chance, AssumptionPool.best_match)
 @given(rng=SEEDS)
 def test_a_pool_without_assumptions_answers_nothing(rng: np.random.Generator) -> None:
     world = World(rng, 60)
     known, unknown = world.index, np.full(len(world.seen), np.nan)
     gates = saa_search.Gates(1e-4, 1e-4, np.inf, 0.0)
-    seen = saa_search.Sky(world.seen, unknown, known.vectors, known.magnitude, known.cells, gates)
-    pool = Pool(seen, (-1.0, 1.0, -1.0, 1.0), 0.0)
+    seen = saa_search.SearchInput(world.seen, unknown, known.vectors, known.magnitude, known.cells, gates)
+    pool = AssumptionPool(seen, (-1.0, 1.0, -1.0, 1.0), 0.0)
     assert pool.log10_chance == 0
-    assert pool.answer() is None
+    assert pool.best_match() is None
 
 
 @law(shefex.cos_error)
@@ -181,7 +177,7 @@ def seen_by(eye: StarTracker, rng: np.random.Generator, truth: Rotation) -> tupl
 @law(
     StarTracker.in_field,
     StarTracker.solve_centroids,
-    StarTracker.solve_named,
+    StarTracker.solve_matches,
     StarTracker.attitude_of,
     Attitude.solved,
 )
@@ -190,10 +186,8 @@ def test_an_attitude_is_the_sky_s_or_none(eye: StarTracker, rng: np.random.Gener
     truth = turn(rng)
     centroids, rows = seen_by(eye, rng, truth)
     everywhere = np.nan_to_num(CAMERA.pixels(truth.apply(eye.stars.vectors)), nan=-1e9)
-    assert set(np.flatnonzero(CAMERA.contains(everywhere)).tolist()) <= set(
-        eye.in_field(CAMERA, truth)[0].tolist()
-    )
-    named = eye.solve_named(centroids, np.arange(len(rows)), rows)
+    assert set(np.flatnonzero(CAMERA.contains(everywhere)).tolist()) <= set(eye.in_field(CAMERA, truth)[0].tolist())
+    named = eye.solve_matches(centroids, np.arange(len(rows)), rows)
     assert named.solved == (len(rows) >= 2)
     assert not named.solved or (named.cam_from_ref * truth.inv()).magnitude() < 0.02
     xy = np.concatenate([centroids.xy_px, rng.uniform(0, [639, 479], (false, 2))])
@@ -204,7 +198,7 @@ def test_an_attitude_is_the_sky_s_or_none(eye: StarTracker, rng: np.random.Gener
     assert not told.solved or set(told.match.observed.tolist()) <= set(range(len(xy)))
 
 
-@law(StarTracker.solve_centroids, StarTracker.sigma_px, StarTracker.lights, StarTracker.efforts)
+@law(StarTracker.solve_centroids, StarTracker.sigma_px, StarTracker.detections, StarTracker.efforts)
 @given(
     xy_px=arrays("f8", (9, 2), elements=ANY),
     sigma_px=arrays("f8", 9, elements=ANY),
@@ -218,13 +212,11 @@ def test_any_lights_are_told_apart_from_a_sky(
     assert not any(eye.solve_centroids(lights, effort=n).solved for n in range(eye.efforts))
     sigma = eye.sigma_px(lights, 0.5, 0.01)
     assert (sigma >= np.abs(sigma_px))[np.isfinite(sigma)].all()
-    assert eye.lights(lights, sigma).tangent.shape == (9, 2)
+    assert eye.detections(lights, sigma).tangent.shape == (9, 2)
 
 
-@law(StarTracker.solve, TrackingMode.solve, TrackingMode.expected_px)
-@given(
-    rng=SEEDS, t_s=some.lists(ANY, min_size=3, max_size=3), image=arrays("u2", (48, 64), fill=some.just(0))
-)
+@law(StarTracker.solve, TrackingMode.solve, TrackingMode.window_centers_px)
+@given(rng=SEEDS, t_s=some.lists(ANY, min_size=3, max_size=3), image=arrays("u2", (48, 64), fill=some.just(0)))
 def test_no_picture_of_noise_has_an_attitude_at_any_time(
     eye: StarTracker, rng: np.random.Generator, t_s: list[float], image: NDArray
 ) -> None:
@@ -235,20 +227,20 @@ def test_no_picture_of_noise_has_an_attitude_at_any_time(
     assert not eye.solve(frame).attitude.solved
     for when_s in t_s:
         assert not follower.solve(frame, when_s).attitude.solved
-    expected = follower.expected_px(turn(rng))
+    expected = follower.window_centers_px(turn(rng))
     assert CAMERA.contains(expected, follower.reach_px).all()
     off = np.abs(expected[:, None] - expected).max(axis=2)[np.triu_indices(len(expected), 1)]
     assert (off >= follower.reach_px).all()
 
 
-@law(star_tracker.mutual)
+@law(star_tracker.mutual_nearest)
 @given(rng=SEEDS, radius_px=some.floats(0, 50), counts=some.tuples(some.integers(0, 9), some.integers(0, 9)))
-def test_mutual_neighbours_are_each_other_s_nearest(
+def test_mutual_neighbors_are_each_other_s_nearest(
     rng: np.random.Generator, radius_px: float, counts: tuple[int, int]
 ) -> None:
     seen, there = (rng.uniform(0, 100, (count, 2)) for count in counts)
     rows = rng.permutation(100)[: len(there)]
-    hit, row = star_tracker.mutual(seen, there, radius_px, rows)
+    hit, row = star_tracker.mutual_nearest(seen, there, radius_px, rows)
     between = np.linalg.norm(seen[:, None] - there, axis=2)
     told = {(int(a), int(np.flatnonzero(rows == b)[0])) for a, b in zip(hit, row, strict=True)}
     least = [(a, int(np.argmin(between[a]))) for a in range(len(seen)) if len(there)]
@@ -259,8 +251,7 @@ def test_mutual_neighbours_are_each_other_s_nearest(
 @given(blobs=some.integers(4, 100), predicted=some.integers(1, 100), radius_px=some.floats(0.5, 5))
 def test_more_matches_are_less_of_a_chance(blobs: int, predicted: int, radius_px: float) -> None:
     chances = [
-        star_tracker.log10_chance(np.arange(n), blobs, predicted, radius_px, CAMERA, 1000)
-        for n in range(2, blobs + 1)
+        star_tracker.log10_chance(np.arange(n), blobs, predicted, radius_px, CAMERA, 1000) for n in range(2, blobs + 1)
     ]
     assert all(b <= a + 1e-9 for a, b in pairwise(chances))
 
@@ -293,9 +284,7 @@ def test_a_tracker_s_answer_has_a_covariance(settings_: Settings) -> None:
 
 @law(StarTracker.for_sky, catalog.hipparcos)
 @given(limit_mag=some.floats(3, 6.5), year=some.integers(1950, 2049))
-def test_a_tracker_for_the_sky_has_the_stars_to_its_limit_as_seen_at_the_date(
-    limit_mag: float, year: int
-) -> None:
+def test_a_tracker_for_the_sky_has_the_stars_to_its_limit_as_seen_at_the_date(limit_mag: float, year: int) -> None:
     """No star is fainter than the limit (merged doubles are brighter); aberration is 20.5" at most."""
     tracker = StarTracker.for_sky(CAMERA, limit_mag, f"{year}-06-22")
     assert tracker.stars.v_mag.max() <= limit_mag + 1e-12  # a merged magnitude is rounded

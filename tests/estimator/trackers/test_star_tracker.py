@@ -17,9 +17,9 @@ from estimator.core.errors import ImageError
 from estimator.core.types import Attitude, Centroids
 from estimator.trackers.dome_tracker import SETTINGS, DomeTracker
 from estimator.trackers.pipeline import SATURATED, Clock, Settings, detect_and_centroid
-from estimator.trackers.star_tracker import NO_MATCH, NO_STARS, StarTracker, mutual
+from estimator.trackers.star_tracker import NO_MATCH, NO_STARS, StarTracker, mutual_nearest
 
-FILE = Path(__file__).parents[3] / "data/catalogues/hipparcos_hp6.5.ecsv"
+FILE = Path(__file__).parents[3] / "data/catalogs/hipparcos_hp6.5.ecsv"
 CAMERA = Camera.from_fov(659, 493, np.radians(14.87))
 OBSERVER = catalog.Observer(2025.0, np.array([0.3, 0.9, 0.4]), np.array([-25e3, 12e3, 5e3]))
 NOISE_PX = 0.1
@@ -44,7 +44,7 @@ def starfield(
 ) -> tuple[Rotation, Floats, Floats]:
     """A random attitude, the pixels of the stars to a magnitude, brightest first, and their light."""
     truth = Rotation.random(rng=rng)
-    bright = catalog.brighter(tracker.stars, limit_mag)
+    bright = catalog.brighter_than(tracker.stars, limit_mag)
     pixels = np.nan_to_num(lens.pixels(truth.apply(bright.vectors)), nan=-1e9)
     inside = np.flatnonzero(lens.contains(pixels, 5.0))
     return truth, pixels[inside], 10 ** (-0.4 * bright.v_mag[inside])
@@ -112,9 +112,7 @@ def test_false_centroids_do_not_spoil_the_answer(tracker: StarTracker) -> None:
     for _ in range(25):
         truth, pixels, _ = starfield(tracker, rng, CAMERA)
         spots = rng.uniform(0, [658, 492], (len(pixels) // 4 + 2, 2))
-        seen = np.vstack([spots[:2], pixels, spots[2:]]) + rng.normal(
-            0, NOISE_PX, (len(spots) + len(pixels), 2)
-        )
+        seen = np.vstack([spots[:2], pixels, spots[2:]]) + rng.normal(0, NOISE_PX, (len(spots) + len(pixels), 2))
         answer = tracker.solve_centroids(centroids(seen))
         assert answer.solved
         # Roll of some stars at .1 px is 20"; 2e-3 rad is 400", a wrong attitude far more.
@@ -189,7 +187,7 @@ def test_a_light_cut_off_by_the_border_is_left_out(tracker: StarTracker) -> None
     image = frame(CAMERA, places, np.full(4, 2e4), seed=90)
     found = detect_and_centroid(image, CAMERA, Settings(), Clock())
     assert len(found) == 2
-    # .1 px: centre of gravity of 2e4 electrons under read noise 12 (reference section 3).
+    # .1 px: center of gravity of 2e4 electrons under read noise 12 (reference section 3).
     np.testing.assert_allclose(np.sort(found.xy_px[:, 0]), [100, 400], rtol=0, atol=0.3)
 
 
@@ -212,7 +210,7 @@ def test_a_lamp_beside_a_faint_star_does_not_turn_the_field(uncertain: StarTrack
     for _ in range(5):
         truth, pixels, light = starfield(uncertain, rng, CAMERA)
         alone = np.array([np.partition(np.linalg.norm(pixels - one, axis=1), 1)[1] > 12 for one in pixels])
-        outer = np.linalg.norm(pixels - CAMERA.centre_px, axis=1) * alone * (light < np.median(light))
+        outer = np.linalg.norm(pixels - CAMERA.center_px, axis=1) * alone * (light < np.median(light))
         pixels[outer.argmax()] += 1.5
         light[outer.argmax()] = 10 * light.max()
         order = np.argsort(-light)
@@ -248,9 +246,9 @@ def test_pairs_are_each_other_s_nearest_within_the_radius() -> None:
     # Two seen points by one prediction: the nearer has it. A third is out of reach.
     seen = np.array([[0.0, 0], [1.0, 0], [50.0, 0]])
     predicted = np.array([[0.8, 0], [54.0, 0]])
-    hit, rows = mutual(seen, predicted, 3.0, np.array([7, 9]))
+    hit, rows = mutual_nearest(seen, predicted, 3.0, np.array([7, 9]))
     assert (hit.tolist(), rows.tolist()) == ([1], [7])
-    empty = mutual(seen, np.empty((0, 2)), 3.0, np.empty(0, int))
+    empty = mutual_nearest(seen, np.empty((0, 2)), 3.0, np.empty(0, int))
     assert [len(part) for part in empty] == [0, 0]
 
 
@@ -277,9 +275,7 @@ def dome(shape: str, count: int = 2500) -> LedMap:
     leds = LedMap(np.arange(count), np.zeros((count, 3)), *SHAPES[shape])
     places = dome_map.on_surface(rays, np.array([0.0, 0.0, 0.0]), leds)
     apart = np.linalg.norm(places[:, None] - places[None], axis=2) + 9 * np.eye(count)
-    return replace(
-        leds, position_m=places[apart.min(axis=1) > 0.005], id=np.flatnonzero(apart.min(axis=1) > 0.005)
-    )
+    return replace(leds, position_m=places[apart.min(axis=1) > 0.005], id=np.flatnonzero(apart.min(axis=1) > 0.005))
 
 
 def under_the_dome(
@@ -336,7 +332,7 @@ def test_the_dome_tracker_refuses_too_few_and_unknown_lights() -> None:
     assert {answer.status for answer in spots} == {NO_MATCH}
 
 
-def test_a_dome_seen_as_stars_at_infinity_is_not_believed(tracker: StarTracker) -> None:
+def test_a_dome_seen_as_stars_at_infinity_is_not_assumed(tracker: StarTracker) -> None:
     leds = dome("sphere")
     rng = np.random.default_rng(98)
     fields = [under_the_dome(rng, leds, LEVERS["axial"], 0.1)[1] * 0.41 for _ in range(2)]

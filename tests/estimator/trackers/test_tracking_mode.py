@@ -15,7 +15,7 @@ from estimator.trackers.pipeline import Settings
 from estimator.trackers.star_tracker import StarTracker
 from estimator.trackers.tracking_mode import Health, TrackingMode
 
-FILE = Path(__file__).parents[3] / "data/catalogues/hipparcos_hp6.5.ecsv"
+FILE = Path(__file__).parents[3] / "data/catalogs/hipparcos_hp6.5.ecsv"
 CAMERA = Camera.from_fov(659, 493, np.radians(14.87))
 START = Rotation.from_euler("xyz", [20, 50, 130], degrees=True)
 RATE_RAD_S = np.radians([0.3, -0.4, 0.2])
@@ -25,7 +25,7 @@ PSF_PX = 0.8
 
 @pytest.fixture(scope="module")
 def tracker() -> StarTracker:
-    stars = catalog.brighter(catalog.read(FILE), 6.0)
+    stars = catalog.brighter_than(catalog.read(FILE), 6.0)
     settings = Settings(centroider="gaussian_fit", centroid_sigma_px=0.02, saturation=60_000)
     return StarTracker(CAMERA, stars, stars.vectors, settings)
 
@@ -40,9 +40,7 @@ def photograph(tracker: StarTracker, cam_from_ref: Rotation, seed: int = 0, ligh
     rows, pixels = tracker.in_field(CAMERA, cam_from_ref)
     edges_x, edges_y = np.arange(CAMERA.width_px + 1) - 0.5, np.arange(CAMERA.height_px + 1) - 0.5
     for (x, y), mag in zip(pixels, tracker.stars.v_mag[rows], strict=True):
-        across, down = (
-            np.diff(erf((e - at) / (PSF_PX * 2**0.5))) / 2 for e, at in ((edges_x, x), (edges_y, y))
-        )
+        across, down = (np.diff(erf((e - at) / (PSF_PX * 2**0.5))) / 2 for e, at in ((edges_x, x), (edges_y, y)))
         image += light * 10 ** (-0.4 * mag) * np.outer(down, across)
     rng = np.random.default_rng(seed)
     return np.clip(rng.poisson(image) + rng.normal(300, 12, image.shape), 0, 65535).astype(np.uint16)
@@ -54,9 +52,7 @@ def off_rad(report, truth: Rotation) -> float:
 
 def test_it_searches_once_and_follows_then(tracker: StarTracker) -> None:
     follower = TrackingMode(tracker)
-    reports = [
-        follower.solve(photograph(tracker, attitude(t), n), t) for n, t in enumerate(np.arange(8) * STEP_S)
-    ]
+    reports = [follower.solve(photograph(tracker, attitude(t), n), t) for n, t in enumerate(np.arange(8) * STEP_S)]
     # Ten stars of a hundredth of a pixel: roll of 20".
     assert max(off_rad(r, attitude(n * STEP_S)) for n, r in enumerate(reports)) < 2e-4
     assert reports[0].expected == 0
@@ -102,7 +98,7 @@ def test_a_frame_without_stars_is_lost_and_the_next_one_followed(tracker: StarTr
 
 
 def test_a_memory_that_is_stale_is_none(tracker: StarTracker) -> None:
-    follower = TrackingMode(tracker, stale_s=1.0)
+    follower = TrackingMode(tracker, max_age_s=1.0)
     follower.solve(photograph(tracker, START), 0.0)
     assert follower.solve(photograph(tracker, START, 1), 1.5).health & Health.SEARCHED
     assert not follower.solve(photograph(tracker, START, 2), 2.0).health & Health.SEARCHED
@@ -139,8 +135,8 @@ def shifted(x_px: float) -> Rotation:
 
 
 def test_an_uncertain_camera_cannot_be_followed() -> None:
-    stars = catalog.brighter(catalog.read(FILE), 5.0)
-    with pytest.raises(ValueError, match="must know its camera; allowed: focal_uncertainty 0"):
+    stars = catalog.brighter_than(catalog.read(FILE), 5.0)
+    with pytest.raises(ValueError, match=r"focal_uncertainty is 0\.05; allowed: 0"):
         TrackingMode(StarTracker(CAMERA, stars, stars.vectors, focal_uncertainty=0.05))
 
 

@@ -7,9 +7,15 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from skysim.core.units import INCH_M
-from skysim.experiments.papers.afit import bench, leds, surface, test1, test2
-from skysim.experiments.papers.afit.bench import furnished, grey, measured, separations_arcsec, shot
-from skysim.experiments.papers.afit.test2 import PAIR_M, Place, geometric
+from skysim.experiments.papers.afit import led_tests, surface, test1, test2, test_stand
+from skysim.experiments.papers.afit.test2 import PAIR_M, Place, geometric_angle_arcsec
+from skysim.experiments.papers.afit.test_stand import (
+    build_test_stand,
+    gray_levels,
+    measure_lights,
+    render_at_attitude,
+    separations_arcsec,
+)
 from skysim.scene.loader import load
 from skysim.simulation.testbed import Testbed
 
@@ -18,23 +24,23 @@ R_M, M_M = 48 * INCH_M, 15 * INCH_M
 
 @pytest.fixture(scope="module")
 def pair() -> Testbed:
-    return furnished(test2.scene(0.3))
+    return build_test_stand(test2.scene(0.3))
 
 
 def test_the_angle_of_a_pair_at_the_apex_is_eq_45s_own(pair: Testbed) -> None:
     """y is half the pair, x the root of (R - M)^2 - y^2; the camera's M is added: an angle about the bearing."""
     y = PAIR_M / 2
     angle = 2 * np.arctan(y / (np.sqrt((R_M - M_M) ** 2 - y**2) + M_M))
-    assert geometric(pair, Place(0.0)) == pytest.approx(np.degrees(angle) * 3600, abs=1e-3)
+    assert geometric_angle_arcsec(pair, Place(0.0)) == pytest.approx(np.degrees(angle) * 3600, abs=1e-3)
 
 
 def test_a_board_that_leans_shows_the_cosine_of_its_angle(pair: Testbed) -> None:
     """One LED comes nearer and the other farther, which cancels but for the square of half the pair's angle."""
-    share = geometric(pair, Place(28.0, 5.0)) / geometric(pair, Place(28.0))
+    share = geometric_angle_arcsec(pair, Place(28.0, 5.0)) / geometric_angle_arcsec(pair, Place(28.0))
     # The dome's own normal leans there by a little, so that five degrees are added to it.
-    normal = test2.glued(pair, Place(28.0)).sources.normal[0]
-    middle = np.array([-np.sin(np.radians(28)), 0, -np.cos(np.radians(28))])
-    own = np.arctan2(np.cross(middle, normal)[1], middle @ normal)
+    normal = test2.place_pair(pair, Place(28.0)).sources.normal[0]
+    crop_board = np.array([-np.sin(np.radians(28)), 0, -np.cos(np.radians(28))])
+    own = np.arctan2(np.cross(crop_board, normal)[1], crop_board @ normal)
     assert share == pytest.approx(np.cos(own + np.radians(5)) / np.cos(own), abs=2e-5)
 
 
@@ -43,24 +49,25 @@ def test_a_dome_that_is_moved_away_shows_less_by_the_longer_way(pair: Testbed) -
     places = [Place(28.0), Place(28.0, 0.0, 0.125)]
     camera_m = M_M * np.array([np.sin(np.radians(28)), 0, np.cos(np.radians(28))])
     range_m = [
-        np.linalg.norm(test2.glued(pair, place).sources.place[:, :3].mean(axis=0) - camera_m)
-        for place in places
+        np.linalg.norm(test2.place_pair(pair, place).sources.place[:, :3].mean(axis=0) - camera_m) for place in places
     ]
-    angle = [geometric(pair, place) for place in places]
+    angle = [geometric_angle_arcsec(pair, place) for place in places]
     assert angle[1] / angle[0] == pytest.approx(range_m[0] / range_m[1], abs=5e-5)
     assert angle[1] < angle[0] - 4
 
 
 def test_images_have_the_angle_of_the_geometry(pair: Testbed) -> None:
-    board = test2.glued(pair, Place(28.0))
-    frame, truth = shot(board, test2.towards(Place(28.0)), np.random.default_rng(1))
-    lights = measured(grey(frame, board))
-    assert separations_arcsec(lights.xy_px, board)[0] == pytest.approx(geometric(pair, Place(28.0)), abs=1.0)
-    assert len(truth.seen.id) == 2
+    board = test2.place_pair(pair, Place(28.0))
+    frame, truth = render_at_attitude(board, test2.point_at(Place(28.0)), np.random.default_rng(1))
+    lights = measure_lights(gray_levels(frame, board))
+    assert separations_arcsec(lights.xy_px, board)[0] == pytest.approx(
+        geometric_angle_arcsec(pair, Place(28.0)), abs=1.0
+    )
+    assert len(truth.sources.id) == 2
 
 
 def test_the_rim_of_the_measured_dome_is_its_ellipse_where_it_is_62_in_wide() -> None:
-    found = surface.contour(test2.dome_of(load("afit_test2")))
+    found = surface.contour(test2.measured_dome(load("afit_test2")))
     rim = 48 - 28.60 + 28.60 * np.sqrt(1 - (31 / 38.88) ** 2)
     assert found["rim_z"].ours.value == pytest.approx(rim, abs=1e-9)
     assert found["rim_rho"].ours.value == pytest.approx(np.hypot(31, rim), abs=1e-9)
@@ -69,15 +76,15 @@ def test_the_rim_of_the_measured_dome_is_its_ellipse_where_it_is_62_in_wide() ->
 
 def test_an_led_that_is_not_seen_is_in_no_order() -> None:
     """Of three images one has all LEDs, falling; one lacks the last; one has two in the wrong order."""
-    told = leds.ordered(np.array([[3.0, 2.0, 1.0], [3.0, 2.0, 0.0], [2.0, 3.0, 1.0]]))
+    told = led_tests.fraction_in_order(np.array([[3.0, 2.0, 1.0], [3.0, 2.0, 0.0], [2.0, 3.0, 1.0]]))
     assert told.value == pytest.approx(1 / 3)
 
 
 def test_a_magnitude_is_light_over_the_median_area() -> None:
-    """Squares of one grey: four times the light has four times the magnitude, whatever the threshold adds at edges."""
+    """Squares of one gray: four times the light has four times the magnitude, whatever the threshold adds at edges."""
     image = np.zeros((200, 300), np.uint8)
     image[20:40, 20:40] = image[20:40, 100:120] = image[100:140, 150:190] = 100
-    lights = measured(image)
+    lights = measure_lights(image)
     assert lights.magnitude / lights.magnitude[-1] == pytest.approx([4, 1, 1])
     assert lights.magnitude * np.median(lights.area_px) == pytest.approx([160_000, 40_000, 40_000])
 
@@ -87,8 +94,8 @@ def test_a_threshold_parts_leds_glare_and_noise() -> None:
     image[195:206, 195:206] = 100  # an LED of 121 px
     image[200, 225:228] = 6  # glare beside it
     image[10, 10] = image[390, 390] = 6  # noise far away
-    at = [leds.passed(image, np.array([[200.0, 200.0]]), share) for share in (0.02, 0.10, 0.5)]
-    assert [(one.area_px.tolist(), one.beside_px, one.dark_px) for one in at] == [
+    at = [led_tests.count_above(image, np.array([[200.0, 200.0]]), share) for share in (0.02, 0.10, 0.5)]
+    assert [(one.area_px.tolist(), one.glare_px, one.dark_px) for one in at] == [
         ([121.0], 3, 2),
         ([121.0], 0, 0),
         ([0.0], 0, 0),
@@ -99,11 +106,12 @@ def test_one_led_of_nine_is_lit_at_any_time() -> None:
     """Whatever the phase: the nine share 100 ms, and each has eleven pulses of 1 ms or a twelfth or a part of it."""
     rng, level = np.random.default_rng(2), Rotation.identity()
     whole, frame = (
-        furnished(bench.changed(test1.exposed(0.1), "exposure", time_s=time_s)) for time_s in (36e-3, 100e-3)
+        build_test_stand(test_stand.with_config(test1.scene_with_exposure(0.1), "exposure", time_s=time_s))
+        for time_s in (36e-3, 100e-3)
     )
-    each_e = shot(whole, level, rng)[1].seen.electrons  # of four pulses, 4 ms
+    each_e = render_at_attitude(whole, level, rng)[1].sources.electrons  # of four pulses, 4 ms
     for _ in range(3):
-        lit_ms = 4 * shot(frame, level, rng)[1].seen.electrons / each_e
+        lit_ms = 4 * render_at_attitude(frame, level, rng)[1].sources.electrons / each_e
         assert lit_ms.sum() == pytest.approx(100, abs=1e-3)
         assert lit_ms.min() > 11 - 1e-3
         assert lit_ms.max() < 12 + 1e-3

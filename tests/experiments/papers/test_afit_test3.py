@@ -8,38 +8,44 @@ from scipy import stats
 
 from estimator.calibration.home_position import Sighting, calibrate
 from skysim.experiments.papers.afit import attitude, bump, test3
-from skysim.experiments.papers.afit.still import IMU_DEG, bench, lab_from_body, measured, photographed
-from skysim.experiments.papers.intervals import another
+from skysim.experiments.papers.afit.test3_images import (
+    IMU_DEG,
+    build_test3,
+    lab_from_body,
+    measure,
+    photograph,
+)
+from skysim.experiments.papers.intervals import prediction_interval
 from skysim.experiments.papers.published import experiments
 from skysim.simulation.testbed import Testbed
 from skysim.tracking import onboard_model
 
 
 @pytest.fixture(scope="module")
-def lab() -> Testbed:
-    return bench()
+def testbed() -> Testbed:
+    return build_test3()
 
 
 @pytest.fixture(scope="module")
-def sightings(lab: Testbed) -> list[Sighting]:
+def sightings(testbed: Testbed) -> list[Sighting]:
     """Two images at each position, the IMU a little wrong at the last."""
-    seen = test3.every_position(lab, 2, np.random.default_rng(70))
-    return test3.Run(lab, seen).sightings
+    seen = test3.photograph_positions(testbed, 2, np.random.default_rng(70))
+    return test3.ImageSeries(testbed, seen).sightings
 
 
 def test_every_position_shows_all_five(sightings: list[Sighting]) -> None:
-    assert [one.position for one in sightings] == [0, 0, 1, 1, 2, 2, 3, 3, 4, 4]
+    assert [one.stop for one in sightings] == [0, 0, 1, 1, 2, 2, 3, 3, 4, 4]
 
 
-def test_the_epsilons_are_those_of_the_thesis_s_calibration(lab: Testbed, sightings: list[Sighting]) -> None:
-    sights = measured(lab, sightings)
-    believed = onboard_model.believed_dome(lab.scene, lab.scene.light, lab.sources)  # type: ignore[arg-type]
-    lever = onboard_model.believed_lever(lab.scene, lab.mount)
-    told = calibrate(sightings, onboard_model.calibration(lab.scene.camera), believed, lever)
+def test_the_epsilons_are_those_of_the_thesis_s_calibration(testbed: Testbed, sightings: list[Sighting]) -> None:
+    measurements = measure(testbed, sightings)
+    believed = onboard_model.assumed_dome(testbed.scene, testbed.scene.light, testbed.sources)  # type: ignore[arg-type]
+    lever = onboard_model.assumed_lever(testbed.scene, testbed.mount)
+    told = calibrate(sightings, onboard_model.calibration(testbed.scene.camera), believed, lever)
     found = [
-        test3.spread(sights.magnitude),
-        test3.spread(sights.lab_m.reshape(len(sightings), -1)),
-        np.radians(test3.spread(sights.separation_arcsec) / 3600),
+        test3.largest_std(measurements.magnitude),
+        test3.largest_std(measurements.lab_m.reshape(len(sightings), -1)),
+        np.radians(test3.largest_std(measurements.separation_arcsec) / 3600),
     ]
     # The thesis divides by n - 1, ours by n: most of the spread is what differs between positions.
     theirs = np.array([told.epsilon_mag, told.epsilon_pos_m, told.epsilon_sep_rad])
@@ -47,33 +53,33 @@ def test_the_epsilons_are_those_of_the_thesis_s_calibration(lab: Testbed, sighti
 
 
 def test_an_imu_that_is_wrong_at_one_of_five_spreads_a_place_by_two_fifths(
-    lab: Testbed, sightings: list[Sighting]
+    testbed: Testbed, sightings: list[Sighting]
 ) -> None:
     """A shift d of one in five: sd = d sqrt(1/5 4/5), 48 in times the IMU's .239 deg (Table 14); n - 1 aside."""
     shift_mm = 48 * 25.4 * np.radians(0.239)
     expected = shift_mm * np.sqrt(0.2 * 0.8) * np.sqrt(10 / 9)
-    bumped = test3.Run(lab, sightings).bumped(test3.BUMPED)
+    bumped = test3.ImageSeries(testbed, sightings).bumped(test3.BUMPED_POSITION)
     x_mm = bumped.lab_m[:, :, 0] * 1e3
     # What eq. 44 leaves between the positions without a bump, 0.1 mm, is in it.
     np.testing.assert_allclose(x_mm.std(axis=0, ddof=1).mean(), expected, rtol=0.05)
 
 
-def test_the_places_fitted_are_table_8_and_a_cross_of_eight_millimetres(lab: Testbed) -> None:
-    place_m = test3.fitted_places(lab)
+def test_the_places_fitted_are_table_8_and_a_cross_of_eight_millimeters(testbed: Testbed) -> None:
+    place_m = test3.fit_positions(testbed)
     rows = experiments()["afit-table-6-9"].rows
     published = [rows[f"separation_{n}"].published for n in range(1, 11)]
-    assert np.abs(np.sort(test3.seen_arcsec(lab, place_m)) - published).max() < 1
+    assert np.abs(np.sort(test3.expected_angles_arcsec(testbed, place_m)) - published).max() < 1
     arms_mm = np.linalg.norm(place_m[1:, :2], axis=1) * 1e3
     assert np.abs(arms_mm - 8).max() < 0.25  # set by hand
 
 
 def test_intervals_draw_the_images_of_a_position_and_not_the_positions(
-    lab: Testbed, sightings: list[Sighting]
+    testbed: Testbed, sightings: list[Sighting]
 ) -> None:
     """What differs between positions alone has no interval."""
-    sights = measured(lab, sightings)
-    values = sights.position[:, None].astype(float)
-    found = test3.of_images(sights, values, test3.mean)
+    measurements = measure(testbed, sightings)
+    values = measurements.position[:, None].astype(float)
+    found = test3.stratified_bootstrap(measurements, values, test3.mean)
     assert found[:3] == (2.0, 2.0, 2.0)
 
 
@@ -81,45 +87,43 @@ def test_another_draw_is_in_its_interval_as_often_as_it_says() -> None:
     draws = np.random.default_rng(71).standard_normal((4000, 5))
     inside = 0
     for row in draws:
-        one = another(row[:-1])
+        one = prediction_interval(row[:-1])
         inside += one.low < row[-1] < one.high
     low, high = stats.binom.ppf([5e-5, 1 - 5e-5], len(draws), 0.95)
     assert low <= inside <= high
 
 
-def test_an_image_against_the_catalogue_of_itself_is_not_turned_at_all(lab: Testbed) -> None:
+def test_an_image_against_the_catalog_of_itself_is_not_turned_at_all(testbed: Testbed) -> None:
     """Reference 1.2, item 14: the thesis has .0335 deg there."""
-    found = attitude.solved(lab, 1, 2, np.random.default_rng(72))
-    assert np.abs(found.off_deg[:, 0]).max() < 1e-9
+    found = attitude.algorithm_errors(testbed, 1, 2, np.random.default_rng(72))
+    assert np.abs(found.error_deg[:, 0]).max() < 1e-9
     assert found.named == (5, 5)
-    assert np.abs(found.off_deg[:, 1:, :2]).max() < 0.02  # the slip of eq. 44
+    assert np.abs(found.error_deg[:, 1:, :2]).max() < 0.02  # the slip of eq. 44
 
 
 def test_an_imu_drifts_by_the_earth_s_rate() -> None:
     """15.04 deg/h: north by the cosine of 39.8 deg of latitude along x, up by its sine along z; t from home."""
     units = 40
-    off = attitude.drifted(1.0, units, np.random.default_rng(73))
+    off = attitude.imu_drift(1.0, units, np.random.default_rng(73))
     latitude = np.radians(39.8)
     hours = np.arange(1, 5) / 60
     expected = 15.041 * np.outer(hours, [np.cos(latitude), 0, np.sin(latitude)])
     # The way between positions takes some seconds more, a twentieth; the lean of 3 deg mixes axes by as much.
     error = off.std(axis=0, ddof=1)[1:] / np.sqrt(units)
-    assert np.all(
-        np.abs(off.mean(axis=0)[1:] - expected) < 4 * error + 0.1 * np.abs(expected).max(axis=1)[:, None]
-    )
+    assert np.all(np.abs(off.mean(axis=0)[1:] - expected) < 4 * error + 0.1 * np.abs(expected).max(axis=1)[:, None])
     assert np.abs(off[:, 0]).max() < 1e-12
 
 
 def test_gyros_miss_what_is_beyond_their_limit_and_nothing_else() -> None:
-    calm, knocked = bump.flown(None, 74), bump.flown(bump.FITTED, 74)
-    assert calm.limited_s == 0
-    assert 0.15 < knocked.limited_s < 0.25  # caught after 0.2 s
+    calm, knocked = bump.simulate_bump(None, 74), bump.simulate_bump(bump.FITTED_BUMP, 74)
+    assert calm.saturated_s == 0
+    assert 0.15 < knocked.saturated_s < 0.25  # caught after 0.2 s
     lost = np.abs(knocked.imu_deg[-1] - calm.imu_deg[-1])
     assert lost[0] < 0.03 < lost[1] < lost[2]
     # No more than the excess of (12.1, 15) deg/s over 10 for as long as it stood at the limit.
-    assert lost[1] < 2.1 * knocked.limited_s
-    assert lost[2] < 5.0 * knocked.limited_s
-    assert bump.after(knocked).max() < 0.01
+    assert lost[1] < 2.1 * knocked.saturated_s
+    assert lost[2] < 5.0 * knocked.saturated_s
+    assert bump.filter_errors_after(knocked).max() < 0.01
 
 
 def test_the_vehicle_stands_where_the_tables_say() -> None:
@@ -129,9 +133,8 @@ def test_the_vehicle_stands_where_the_tables_say() -> None:
         )
 
 
-def test_images_are_the_same_by_the_same_seed(lab: Testbed) -> None:
+def test_images_are_the_same_by_the_same_seed(testbed: Testbed) -> None:
     first, again = (
-        photographed(lab, 0, lab_from_body(IMU_DEG[0]), 1, np.random.default_rng(75))[0].xy_px
-        for _ in range(2)
+        photograph(testbed, 0, lab_from_body(IMU_DEG[0]), 1, np.random.default_rng(75))[0].xy_px for _ in range(2)
     )
     np.testing.assert_array_equal(first, again)

@@ -8,53 +8,55 @@ from scipy.spatial.transform import Rotation
 
 from skysim.core.units import ARCSEC_RAD
 from skysim.experiments.papers.other_domes import apl, nps, oled
-from skysim.simulation import testbed
+from skysim.simulation.testbed import build_testbed
 
 
 @pytest.fixture(scope="module")
-def level() -> nps.Known:
-    return nps.at(None, 3, 3)
+def level() -> nps.OnboardModel:
+    return nps.build_model(None, 3, 3)
 
 
-def test_with_the_true_attitude_the_distances_are_true(level: nps.Known) -> None:
+def test_with_the_true_attitude_the_distances_are_true(level: nps.OnboardModel) -> None:
     """R_0 + alpha b is the star's place: within a pitch of the panel and the noise, a few tenths of a px."""
-    place = level.lab.sources.place[:, :3]
+    place = level.testbed.sources.place[:, :3]
     wanted = place / np.linalg.norm(place, axis=1, keepdims=True)
     apart = np.array([np.linalg.norm(wanted - one, axis=1).min() for one in level.vectors])
     assert len(apart) == 9
     assert apart.max() < 0.5 * 243 * ARCSEC_RAD  # half a pixel
 
 
-def test_an_update_leaves_a_small_share_of_the_error(level: nps.Known) -> None:
+def test_an_update_leaves_a_small_share_of_the_error(level: nps.OnboardModel) -> None:
     """A wrong distance moves a point almost along its direction: two degrees become less than a tenth of that."""
-    rays = nps.rays_body(level.lab, 11)
-    found = nps.solve(level, rays, nps.wrong_by(2.0))
-    again = nps.iterated(level, rays, nps.wrong_by(2.0))
+    rays = nps.rays_body(level.testbed, 11)
+    found = nps.solve(level, rays, nps.initial_error(2.0))
+    again = nps.solve_iteratively(level, rays, nps.initial_error(2.0))
     exact = nps.solve(level, rays, Rotation.identity())
-    assert found.off_deg < 0.2
-    assert abs(again.off_deg - exact.off_deg) < 1e-3
+    assert found.error_deg < 0.2
+    assert abs(again.error_deg - exact.error_deg) < 1e-3
 
 
-def test_a_camera_in_the_centre_sees_no_shell() -> None:
+def test_a_camera_in_the_center_sees_no_shell() -> None:
     """(r / R)(dR / R) is nothing for r = 0, and proportional to r."""
-    told = apl.shell(0.004, 5)
-    lab = testbed.build_testbed(told)
-    poses = apl.attitudes(8, np.random.default_rng(1))
-    worst = [apl.worst_arcsec(told, lab, off_m, True, poses).max() for off_m in (0.0, 0.001, 0.01)]
+    scene = apl.shell_scene(0.004, 5)
+    testbed = build_testbed(scene)
+    poses = apl.random_attitudes(8, np.random.default_rng(1))
+    worst = [
+        apl.largest_discrepancies_arcsec(scene, testbed, offset_m, True, poses).max() for offset_m in (0.0, 0.001, 0.01)
+    ]
     assert worst[0] < 1e-6
     assert worst[2] == pytest.approx(10 * worst[1], rel=0.02)
 
 
 def test_a_circle_about_the_zenith_holds_its_share_of_evenly_spread_stars() -> None:
     """n (1 - cos(d / 2)) of n on a hemisphere."""
-    lab = testbed.build_testbed(apl.shell(0.0, 1))
+    testbed = build_testbed(apl.shell_scene(0.0, 1))
     rng = np.random.default_rng(2)
-    mean = apl.counts(lab, 10.0, apl.anywhere(50_000, rng)).mean()
+    mean = apl.count_fibers(testbed, 10.0, apl.random_boresights(50_000, rng)).mean()
     assert mean == pytest.approx(100 * (1 - np.cos(np.radians(5))), rel=0.05)
 
 
 def test_noise_falls_with_the_root_of_the_lights() -> None:
     """Twice the lights, 1 / sqrt(2) of the noise, to four sigmas of 150 trials."""
-    few, many = (oled.spread(oled.bench(lights), range(150)) for lights in (20, 40))
+    few, many = (oled.solve_random_attitudes(oled.build_setup(lights), range(150)) for lights in (20, 40))
     ratio = few.error_arcsec.std(axis=0) / many.error_arcsec.std(axis=0)
     assert np.abs(ratio / np.sqrt(2) - 1).max() < 4 / np.sqrt(150)

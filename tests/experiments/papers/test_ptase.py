@@ -42,7 +42,7 @@ def test_near_a_pole_an_error_of_the_axis_turns_north() -> None:
 
 @pytest.fixture(scope="module")
 def sky() -> PairIndex:
-    return monte_carlo.catalogue(monte_carlo.FITTED_LIMIT_MAG)
+    return monte_carlo.catalog(monte_carlo.FITTED_LIMIT_MAG)
 
 
 def test_errors_are_those_of_the_covariance(sky: PairIndex) -> None:
@@ -57,9 +57,7 @@ def test_errors_are_those_of_the_covariance(sky: PairIndex) -> None:
     across, about = (
         1 / 2 * one / (3 * ARCSEC_RAD) * np.sqrt(n) for one in (np.concatenate([x, y]).reshape(2, -1), roll)
     )
-    assert rms(across.ravel()) == pytest.approx(
-        1, abs=0.12
-    )  # the roll's part through a lopsided field comes on top
+    assert rms(across.ravel()) == pytest.approx(1, abs=0.12)  # the roll's part through a lopsided field comes on top
     assert rms(about * np.sqrt(a2)) == pytest.approx(1, rel=0.2)
 
 
@@ -85,11 +83,11 @@ def test_the_paper_s_angles_are_those_of_its_matrix() -> None:
         ]
     )
     ours = np.diag([-1.0, -1.0, 1.0]) @ theirs
-    told = ground.their_angles_deg(Rotation.from_matrix(ours))
+    told = ground.paper_angles_deg(Rotation.from_matrix(ours))
     np.testing.assert_allclose(told, [-49.3924, -41.2645, -27.7198], rtol=0, atol=1e-9)
 
 
-def test_a_catalogue_tells_machines_of_itself() -> None:
+def test_a_catalog_tells_machines_of_itself() -> None:
     """It raised: its path is none of JSON's kinds."""
     done = CliRunner().invoke(app, ["catalog", "info", "--json"])
     assert done.exit_code == 0

@@ -27,5 +27,5 @@ def done(
 ) -> runner.Progress:
     """Do a study's missing trials, in this process if no engine is named."""
     with store.writing(path) as kept:
-        runner.begin(told, kept, resume)
+        runner.prepare_store(told, kept, resume)
         return runner.run(told, kept, engine or engines.Serial(), watch)

@@ -14,8 +14,8 @@ from skysim.core.paths import SCENES
 from skysim.experiments.study import loader, store
 from skysim.experiments.study.analysis import sensitivity, table
 from skysim.experiments.study.execution import engines, replay, runner
+from skysim.experiments.study.execution.trials import FIELDS
 from skysim.experiments.study.report import export
-from skysim.experiments.study.trials import FIELDS
 from skysim.results import metrics
 
 STUDY = """schema: 1
@@ -45,7 +45,7 @@ def test_a_share_has_wilsons_interval(hits, of):
     z2 = stats.norm.ppf(0.975) ** 2
     p = hits / of
     roots = np.sort(np.roots([1 + z2 / of, -(2 * p + z2 / of), p**2]).real)
-    told = metrics.share(hits, of)
+    told = metrics.proportion(hits, of)
     assert (told.low, told.high) == pytest.approx(tuple(roots), abs=1e-9)
     assert (told.value, told.trials) == (p, of)
 
@@ -95,21 +95,19 @@ def test_responses_are_of_what_their_names_say():
     }
     for name, value in said.items():
         assert metrics.response(name)(c).value == pytest.approx(value, rel=1e-12), name
-    assert metrics.response("filter_arcsec_rms")(c) == metrics.NOTHING
+    assert metrics.response("filter_arcsec_rms")(c) == metrics.NO_VALUE
 
 
 def test_honest_answers_are_not_called_overconfident():
     nees = stats.chi2.rvs(3, size=100_000, random_state=4)
     told = metrics.response("overconfident")(columns(nees=nees, frames=np.ones(len(nees))))
     assert told.value == 0
-    assert stats.chi2.sf(stats.chi2.isf(metrics.BEYOND, 3), 3) == pytest.approx(1e-8, rel=1e-6)
+    assert stats.chi2.sf(stats.chi2.isf(metrics.OVERCONFIDENCE_PROBABILITY, 3), 3) == pytest.approx(1e-8, rel=1e-6)
 
 
-@pytest.mark.parametrize(
-    "name", ["identify", "cross_arcsec", "cross_p95", "stars_p91", "coverage_", "_p95", ""]
-)
+@pytest.mark.parametrize("name", ["identify", "cross_arcsec", "cross_p95", "stars_p91", "coverage_", "_p95", ""])
 def test_a_response_that_is_none_is_refused_with_those_that_are(name):
-    with pytest.raises(InputError, match=r"responses.2: .* is none of overconfident, identified"):
+    with pytest.raises(InputError, match=r"responses.2: unknown response .*; allowed: overconfident, identified"):
         metrics.response(name, "responses.2")
 
 
@@ -122,7 +120,7 @@ def test_sobol_indices_of_two_outputs_are_those_worked_out_by_hand():
         return np.stack([2 * u[:, 0] + u[:, 1], 3 * u[:, 2] + u[:, 0] * u[:, 1]])
 
     mixed = np.stack([f(np.where(np.arange(3) == n, b, a)) for n in range(3)])
-    first, total = sensitivity.generalised(f(a), f(b), mixed)
+    first, total = sensitivity.generalized(f(a), f(b), mixed)
     assert first == pytest.approx(np.array([51, 15, 108]) / 175, abs=5e-3)
     assert total == pytest.approx(np.array([52, 16, 108]) / 175, abs=5e-3)
 
@@ -132,15 +130,15 @@ title: an error budget
 scene: afit_simsat
 seed: 1
 set:
-  tracker.believed_camera_body: ["0 mm", "0 mm", "381 mm"]
-  tracker.survey: {turn_deg: [0, 0, 0]}
+  tracker.assumed_camera_body: ["0 mm", "0 mm", "381 mm"]
+  tracker.survey: {rotation_deg: [0, 0, 0]}
   light.layout: {kind: random, count: 1400, cap_deg: 30}
   tracker.centroid_sigma_px: 0.2
 trial: {kind: centroids, noise_px: 0.0, tilt_deg: [0, 10]}
 factors:
-  lever_x: {key: tracker.believed_camera_body.0, distribution: normal, mean: "0 mm", sigma: "0.2 mm"}
-  turn_x: {key: tracker.survey.turn_deg.0, distribution: normal, mean: 0, sigma: 0.01}
-  turn_z: {key: tracker.survey.turn_deg.2, distribution: normal, mean: 0, sigma: 0.02}
+  lever_x: {key: tracker.assumed_camera_body.0, distribution: normal, mean: "0 mm", sigma: "0.2 mm"}
+  turn_x: {key: tracker.survey.rotation_deg.0, distribution: normal, mean: 0, sigma: 0.01}
+  turn_z: {key: tracker.survey.rotation_deg.2, distribution: normal, mean: 0, sigma: 0.02}
 design: {kind: saltelli, points: 8}
 replicates: 3
 responses: [identified]
@@ -166,7 +164,7 @@ def test_a_budget_that_is_not_known_yet_is_no_fault(tmp_path):
     path.write_text(ERRORS)
     told = loader.load(path)
     with store.writing(tmp_path / "study.sqlite") as rows:
-        runner.begin(told, rows, resume=False)
+        runner.prepare_store(told, rows, resume=False)
         found = sensitivity.indices(told, rows)
     assert len(found) == 6
     assert all(math.isnan(one.total.value) for one in found)
@@ -178,7 +176,7 @@ def done(folder, text):
     path.write_text(text)
     told = loader.load(path) if "-1 mm" not in text else loaded_with_a_fault(path)
     with store.writing(folder / "study.sqlite") as kept:
-        runner.begin(told, kept, resume=False)
+        runner.prepare_store(told, kept, resume=False)
         runner.run(told, kept, engines.Serial())
     return told, store.open_store(folder / "study.sqlite")
 
@@ -189,9 +187,7 @@ def loaded_with_a_fault(path):
     good.write_text(path.read_text().replace("-1 mm", "30 mm"))
     told = loader.load(good)
     bad = [
-        point._replace(
-            settings={key: "-1 mm" if value == "30 mm" else value for key, value in point.settings.items()}
-        )
+        point._replace(settings={key: "-1 mm" if value == "30 mm" else value for key, value in point.settings.items()})
         for point in told.points
     ]
     told.points[:] = bad
@@ -206,7 +202,7 @@ def test_exports_say_what_the_store_says(tmp_path):
         for suffix in ("csv", "parquet", "zarr"):
             export.export(rows, told.study.responses, tmp_path / f"trials.{suffix}")
         columns, lines = rows.columns(), table.table(rows, told.study.responses)
-        with pytest.raises(InputError, match=r"'.xlsx' is none of .csv, .parquet, .zarr"):
+        with pytest.raises(InputError, match=r"unknown file format '.xlsx'; allowed: .csv, .parquet, .zarr"):
             export.export(rows, told.study.responses, tmp_path / "trials.xlsx")
     with (tmp_path / "trials.csv").open() as file:
         written = list(csv.DictReader(file))
@@ -235,7 +231,7 @@ def test_a_trial_is_replayed_with_its_frames(tmp_path):
         failed = replay.replay(told, rows, 5, tmp_path / "trial_5")
         assert "camera.focal_length" in failed.row.error
         assert failed.files == []
-        with pytest.raises(InputError, match="trial 16: is none of the study's; allowed: 0 to 15"):
+        with pytest.raises(InputError, match="trial 16: not in the study; allowed: 0 to 15"):
             replay.replay(told, rows, 16, tmp_path)
 
 
@@ -250,7 +246,7 @@ def test_a_trial_is_replayed_with_its_frames(tmp_path):
     ],
 )
 def test_a_level_is_told_shortly(value, told):
-    assert table.level(value) == told
+    assert table.format_level(value) == told
 
 
 def test_a_trial_that_raises_in_its_tracker_is_replayed_with_its_frame(tmp_path, monkeypatch):
@@ -270,24 +266,22 @@ def test_a_trial_that_raises_in_its_tracker_is_replayed_with_its_frame(tmp_path,
 
 def test_a_store_of_a_scene_that_was_changed_is_not_gone_on_with(tmp_path):
     (tmp_path / "mine.yaml").write_text("schema: 1\nbase: shefex2\n")
-    told, _ = done(
-        tmp_path, STUDY.replace("scene: shefex2", "scene: mine.yaml").replace('"-1 mm"', '"30 mm"')
-    )
+    told, _ = done(tmp_path, STUDY.replace("scene: shefex2", "scene: mine.yaml").replace('"-1 mm"', '"30 mm"'))
     with store.writing(tmp_path / "study.sqlite") as kept:
-        runner.begin(told, kept, resume=True)
+        runner.prepare_store(told, kept, resume=True)
     (tmp_path / "mine.yaml").write_text("schema: 1\nbase: shefex2\ncamera: {f_number: 2.0}\n")
     with (
         store.writing(tmp_path / "study.sqlite") as kept,
-        pytest.raises(InputError, match="the scene of point 0 was changed since"),
+        pytest.raises(InputError, match="the scene of point 0 has changed"),
     ):
-        runner.begin(told, kept, resume=True)
+        runner.prepare_store(told, kept, resume=True)
 
 
 def test_failed_trials_can_be_forgotten(tmp_path):
     told, _ = done(tmp_path, STUDY)
     with store.writing(tmp_path / "study.sqlite") as kept:
         assert kept.counts() == {"done": 16, "failed": 8, "wrong": 0}
-        kept.forget_failed()
+        kept.delete_failed()
         assert kept.done(16).sum() == 8
         runner.run(told, kept, engines.Serial())
         assert kept.counts()["done"] == 16
@@ -298,7 +292,7 @@ def test_frames_of_a_flight_are_counted_as_one_another_s_like():
     c = columns(frames=[100, 100], solved=[100, 100], wrong=[0, 0], nees=[500, 500])
     told = metrics.response("identified")(c)
     assert (told.value, told.trials) == (1.0, 2)
-    assert told.low == pytest.approx(metrics.share(2, 2).low)
+    assert told.low == pytest.approx(metrics.proportion(2, 2).low)
     assert metrics.response("overconfident")(c).trials == 0  # a flight's NEES is a mean
 
 

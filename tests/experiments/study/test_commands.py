@@ -56,14 +56,12 @@ def test_a_study_from_its_run_to_its_replay(typed, tmp_path):
 
 
 def test_a_study_that_ran_out_of_its_budget_is_resumed(typed):
-    code, _, err = typed(
-        "study", "run", "question.yaml", "--engine", "serial", "--set", "budget={time: 1 us}"
-    )
+    code, _, err = typed("study", "run", "question.yaml", "--engine", "serial", "--set", "budget={time: 1 us}")
     assert code == 0
-    assert "within the budget; skysim study resume question.yaml goes on" in err
+    assert "within the budget; continue: skysim study resume question.yaml" in err
     code, _, err = typed("study", "run", "question.yaml", "--engine", "serial")
     assert code == 2
-    assert "trials are in; allowed: skysim study resume" in err
+    assert "trials; allowed: skysim study resume" in err
     code, out, _ = typed("study", "resume", "question.yaml", "--engine", "serial")
     assert code == 0
     assert "of 60 trials" in out
@@ -78,17 +76,23 @@ def test_what_was_overridden_is_remembered(typed):
 @pytest.mark.parametrize(
     ("words", "complaint"),
     [
-        (("run", "question.yaml", "--engine", "ray"), "--engine: 'ray' is none of pool, serial, dask"),
-        (("run", "question.yaml", "--engine", "dask"), "--scheduler: goes with --engine dask"),
+        (
+            ("run", "question.yaml", "--engine", "ray"),
+            "--engine: unknown engine 'ray'; allowed: pool, serial, dask",
+        ),
+        (("run", "question.yaml", "--engine", "dask"), "--scheduler: required with --engine dask"),
         (("run", "question.yaml", "--set", "replicates"), "--set replicates: allowed: path.to.key=value"),
         (("run", "question.yaml", "--set", "replicates=0"), "replicates: 0 is not allowed"),
         (("run", "nothing"), "nothing: no such study; allowed: a .yaml file or one of dome_"),
         (
             ("status", "question.yaml"),
-            "out/question/study.sqlite: no store; allowed: one that skysim study run made",
+            "out/question/study.sqlite: no such store; allowed: a store written by skysim study run",
         ),
-        (("resume", "question.yaml", "--engine", "serial"), "no store"),
-        (("optimise", "question.yaml", "--engine", "serial"), "optimise: missing; allowed: skysim study run"),
+        (("resume", "question.yaml", "--engine", "serial"), "no such store"),
+        (
+            ("optimize", "question.yaml", "--engine", "serial"),
+            "has no key optimize; allowed: skysim study run",
+        ),
     ],
 )
 def test_a_slip_is_told_in_one_line(typed, words, complaint):

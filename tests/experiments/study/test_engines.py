@@ -20,8 +20,8 @@ from study_stores import contents, done
 
 import skysim.experiments.study.execution
 from skysim.core.errors import InputError
-from skysim.experiments.study import loader, plan, setups, store, trials
-from skysim.experiments.study.execution import engines, runner, workers
+from skysim.experiments.study import loader, plan, store
+from skysim.experiments.study.execution import engines, runner, setups, trials, workers
 from skysim.experiments.study.execution.engines import Engine
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -46,11 +46,11 @@ from skysim.experiments.study import loader, store
 from skysim.experiments.study.execution import engines, runner
 told = loader.load(sys.argv[1])
 with store.writing(Path(sys.argv[2])) as kept:
-    runner.begin(told, kept, kept.counts()["done"] > 0)
+    runner.prepare_store(told, kept, kept.counts()["done"] > 0)
     runner.run(told, kept, engines.Pool(int(sys.argv[3])), lambda progress: print(progress.done, flush=True))
 """
 ONE_THREAD = dict.fromkeys(workers.ONE_THREAD, "1")
-HERE = os.environ | ONE_THREAD | {"PYTHONPATH": os.pathsep.join([str(ROOT), str(Path(__file__).parent)])}
+ENVIRONMENT = os.environ | ONE_THREAD | {"PYTHONPATH": os.pathsep.join([str(ROOT), str(Path(__file__).parent)])}
 
 
 def study(folder: Path, text: str = STUDY) -> plan.Plan:
@@ -60,15 +60,15 @@ def study(folder: Path, text: str = STUDY) -> plan.Plan:
 
 
 @pytest.fixture(scope="module")
-def told(tmp_path_factory: pytest.TempPathFactory) -> plan.Plan:
+def plan_(tmp_path_factory: pytest.TempPathFactory) -> plan.Plan:
     return study(tmp_path_factory.mktemp("study"))
 
 
 @pytest.fixture(scope="module")
-def whole(told: plan.Plan) -> str:
+def serial_contents(plan_: plan.Plan) -> str:
     """What one process leaves that nobody disturbs."""
-    path = told.path.with_name("whole.sqlite")
-    assert done(told, path, engines.Serial()).failed == 0
+    path = plan_.path.with_name("whole.sqlite")
+    assert done(plan_, path, engines.Serial()).failed == 0
     return contents(path)
 
 
@@ -79,19 +79,17 @@ def test_what_raises_is_told_with_seed_and_traceback_and_the_rest_is_done(tmp_pa
     """One level's scene file vanishes after the study was checked: its trials fail, in a pool as in one process."""
     lost = tmp_path / "lost.yaml"
     lost.write_text((ROOT / "scenes" / "shefex2.yaml").read_text())
-    told = study(
-        tmp_path, STUDY.replace("trial.false_lights, values: [0, 5]", "scene, values: [lost.yaml, shefex2]")
-    )
+    plan_ = study(tmp_path, STUDY.replace("trial.false_lights, values: [0, 5]", "scene, values: [lost.yaml, shefex2]"))
     lost.unlink()
     paths = [tmp_path / f"{n}.sqlite" for n in range(2)]
     both: list[Engine] = [engines.Serial(), engines.Pool(2)]
     for path, engine in zip(paths, both, strict=True):
-        progress = done(told, path, engine)
+        progress = done(plan_, path, engine)
         assert (progress.done, progress.failed) == (300, 150)
-    with store.open_store(paths[1]) as kept:
-        assert {trial for trial, _ in kept.failures()} == set(range(150))
-        row = kept.trial(7)
-    assert row["seed"] == setups.seed_of(told.recipe, 0, 7)
+    with store.open_store(paths[1]) as stored:
+        assert {trial for trial, _ in stored.failures()} == set(range(150))
+        row = stored.trial(7)
+    assert row["seed"] == setups.seed_of(plan_.spec, 0, 7)
     assert row["error"].startswith("Traceback")
     assert "lost.yaml" in row["error"].splitlines()[-1]
     assert contents(paths[0]) == contents(paths[1])
@@ -100,10 +98,10 @@ def test_what_raises_is_told_with_seed_and_traceback_and_the_rest_is_done(tmp_pa
 # A module for workers to import: trials that do nothing, or now and then kill their worker.
 STUBS = """
 import os
-from skysim.experiments.study import trials
+from skysim.experiments.study.execution import trials
 from skysim.experiments.study.execution import engines
-from skysim.experiments.study.trials import Outcome
-BEGIN = engines.begin
+from skysim.experiments.study.execution.trials import Outcome
+BEGIN = engines.initialize_worker
 def deadly(ready, seed):
     if seed % 200 == 5:
         os._exit(3)
@@ -112,11 +110,11 @@ def trivial(ready, seed):
     return Outcome("solved", 1, 1)
 def make_deadly():
     trials.TRIALS["centroids"] = deadly
-def begin_deadly(recipe):
-    BEGIN(recipe)
+def begin_deadly(spec):
+    BEGIN(spec)
     make_deadly()
-def begin_trivial(recipe):
-    BEGIN(recipe)
+def begin_trivial(spec):
+    BEGIN(spec)
     trials.TRIALS["centroids"] = trivial
 """
 
@@ -130,24 +128,24 @@ def stubs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
     return importlib.import_module("study_stubs")
 
 
-def deaths(told: plan.Plan) -> list[int]:
+def deaths(plan_: plan.Plan) -> list[int]:
     """The trials that `deadly` dies of."""
-    bad = [n for n in range(told.trials) if setups.seed_of(told.recipe, *divmod(n, 150)) % 200 == 5]
+    bad = [n for n in range(plan_.trials) if setups.seed_of(plan_.spec, *divmod(n, 150)) % 200 == 5]
     assert 1 <= len(bad) <= 3
     return bad
 
 
 def test_a_trial_that_kills_its_worker_fails_and_no_other(
-    told: plan.Plan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stubs: Any
+    plan_: plan.Plan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stubs: Any
 ) -> None:
-    monkeypatch.setattr(engines, "begin", stubs.begin_deadly)
-    bad = deaths(told)
+    monkeypatch.setattr(engines, "initialize_worker", stubs.begin_deadly)
+    bad = deaths(plan_)
     path = tmp_path / "deadly.sqlite"
-    progress = done(told, path, engines.Pool(2))
-    assert (progress.done, progress.failed) == (told.trials, len(bad))
-    with store.open_store(path) as kept:
-        assert kept.failures() == [(n, "its worker process died, 3 times") for n in bad]
-        columns = kept.columns()
+    progress = done(plan_, path, engines.Pool(2))
+    assert (progress.done, progress.failed) == (plan_.trials, len(bad))
+    with store.open_store(path) as stored:
+        assert stored.failures() == [(n, "its worker process died, 3 times") for n in bad]
+        columns = stored.columns()
     failed = np.isin(columns["trial"], bad)
     assert set(columns["status"][failed]) == {"failed"}
     assert np.array_equal(columns["stars"][~failed], columns["seed"][~failed] % 100)
@@ -156,11 +154,11 @@ def test_a_trial_that_kills_its_worker_fails_and_no_other(
 class Run:
     """A pool's run in a process of its own, with a process group of its own as a shell would make it."""
 
-    def __init__(self, told: plan.Plan, path: Path, workers: int) -> None:
-        told_to = [sys.executable, "-c", DRIVER, str(told.path), str(path), str(workers)]
+    def __init__(self, plan_: plan.Plan, path: Path, workers: int) -> None:
+        told_to = [sys.executable, "-c", DRIVER, str(plan_.path), str(path), str(workers)]
         self.process = subprocess.Popen(
             told_to,
-            env=HERE,
+            env=ENVIRONMENT,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
@@ -190,46 +188,44 @@ class Run:
 
 @pytest.mark.parametrize("kills", [1, pytest.param(6, marks=pytest.mark.long)])
 def test_a_pool_killed_at_any_instant_resumes_with_any_number_of_workers(
-    told: plan.Plan, whole: str, tmp_path: Path, kills: int
+    plan_: plan.Plan, serial_contents: str, tmp_path: Path, kills: int
 ) -> None:
     path, draw, before = tmp_path / "killed.sqlite", np.random.default_rng(kills), 0
     for n in range(kills):
-        run = Run(told, path, 2 + n % 2)
+        run = Run(plan_, path, 2 + n % 2)
         assert run.reach(before + 1)
         time.sleep(draw.uniform(0, 0.02))
         assert run.end(signal.SIGKILL) in (-signal.SIGKILL, 0)
-        with store.writing(path) as kept:
-            assert kept.check()
-            before = kept.counts()["done"]
+        with store.writing(path) as stored:
+            assert stored.check()
+            before = stored.counts()["done"]
         assert before > 0
-        if before == told.trials:
+        if before == plan_.trials:
             break
-    assert done(told, path, engines.Pool(1), resume=True).done == told.trials
-    assert contents(path) == whole
+    assert done(plan_, path, engines.Pool(1), resume=True).done == plan_.trials
+    assert contents(path) == serial_contents
 
 
 @pytest.mark.long
-def test_a_pool_interrupted_by_the_keyboard_resumes(told: plan.Plan, whole: str, tmp_path: Path) -> None:
+def test_a_pool_interrupted_by_the_keyboard_resumes(plan_: plan.Plan, serial_contents: str, tmp_path: Path) -> None:
     path = tmp_path / "interrupted.sqlite"
-    run = Run(told, path, 2)
+    run = Run(plan_, path, 2)
     assert run.reach(1)
     assert run.end(signal.SIGINT) != 0
-    with store.open_store(path) as kept:
-        (ended,) = kept.runs()
-        assert 0 < ended["trials"] == kept.counts()["done"] < told.trials
-    done(told, path, engines.Serial(), resume=True)
-    assert contents(path) == whole
+    with store.open_store(path) as stored:
+        (ended,) = stored.runs()
+        assert 0 < ended["trials"] == stored.counts()["done"] < plan_.trials
+    done(plan_, path, engines.Serial(), resume=True)
+    assert contents(path) == serial_contents
 
 
 @pytest.mark.long
-def test_memory_stays_flat_over_many_trials(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stubs: Any
-) -> None:
+def test_memory_stays_flat_over_many_trials(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stubs: Any) -> None:
     """100,000 trials of a pool: between a fifth and the end the coordinator grows by less than 20 MB."""
-    monkeypatch.setattr(engines, "begin", stubs.begin_trivial)
-    told, me, seen = study(tmp_path, STUDY.replace("150", "50000")), psutil.Process(), []
+    monkeypatch.setattr(engines, "initialize_worker", stubs.begin_trivial)
+    plan_, me, seen = study(tmp_path, STUDY.replace("150", "50000")), psutil.Process(), []
     done(
-        told,
+        plan_,
         tmp_path / "many.sqlite",
         engines.Pool(2),
         watch=lambda progress: seen.append((progress.done, me.memory_info().rss)),
@@ -243,7 +239,7 @@ def test_memory_stays_flat_over_many_trials(
 # A Dask cluster.
 
 
-class Lab(NamedTuple):
+class Cluster(NamedTuple):
     """A scheduler and its workers on loopback."""
 
     address: str
@@ -252,7 +248,7 @@ class Lab(NamedTuple):
 
 def cluster_of(
     folder: Path, *worker: str, count: int = 1, environment: dict[str, str] | None = None
-) -> Iterator[Lab]:
+) -> Iterator[Cluster]:
     """A real scheduler and `count` real worker processes; all end with the test."""
     pytest.importorskip("distributed")
     with socket.socket() as free:
@@ -262,26 +258,24 @@ def cluster_of(
     everyone = [*("--host", "127.0.0.1"), "--no-dashboard"]
     dask = [sys.executable, "-m"]
     commands = [[*dask, "distributed.cli.dask_scheduler", "--port", str(port), *everyone]]
-    told = [*dask, "distributed.cli.dask_worker", address, *everyone, "--nthreads", "1", *worker]
-    commands += [[*told, "--local-directory", str(folder)]] * count
+    plan_ = [*dask, "distributed.cli.dask_worker", address, *everyone, "--nthreads", "1", *worker]
+    commands += [[*plan_, "--local-directory", str(folder)]] * count
     with (folder / "log").open("wb") as log:
-        begun = [
-            subprocess.Popen(one, env=HERE | (environment or {}), stdout=log, stderr=log) for one in commands
+        processes = [
+            subprocess.Popen(one, env=ENVIRONMENT | (environment or {}), stdout=log, stderr=log) for one in commands
         ]
         try:
-            yield Lab(address, begun[1:])
+            yield Cluster(address, processes[1:])
         finally:
-            for process in reversed(begun):
-                for one in (
-                    psutil.Process(process.pid).children(recursive=True) if process.poll() is None else ()
-                ):
+            for process in reversed(processes):
+                for one in psutil.Process(process.pid).children(recursive=True) if process.poll() is None else ():
                     one.kill()
                 process.kill()
                 process.wait(10)
 
 
 @pytest.fixture(scope="module")
-def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lab]:
+def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
     yield from cluster_of(tmp_path_factory.mktemp("dask"), "--no-nanny", count=2)
 
 
@@ -292,9 +286,9 @@ def dask(address: str) -> Any:
     return Dask(address)
 
 
-def on_dask(lab: Lab, workers: int) -> Any:
+def on_dask(cluster: Cluster, workers: int) -> Any:
     """The engine, once so many workers are there."""
-    engine = dask(lab.address)
+    engine = dask(cluster.address)
     engine.client.wait_for_workers(workers, 20)
     return engine
 
@@ -308,18 +302,18 @@ def test_a_chunk_travels_as_text_and_comes_back_bit_for_bit() -> None:
         "camera.focus": None,
     }
     chunk = (trials.Segment(3, settings, 41, range(7, 12)), trials.Segment(4, {}, 46, range(0, 1)))
-    assert dask_engine.unpacked(dask_engine.packed(chunk)) == chunk
+    assert dask_engine.decode_chunk(dask_engine.encode_chunk(chunk)) == chunk
 
 
-def test_a_run_that_is_stopped_leaves_nothing_on_the_cluster(lab: Lab, told: plan.Plan) -> None:
-    engine = on_dask(lab, 2)
-    rows = engine.run(told.recipe, runner.Todo(told.points, 150, np.arange(told.trials)))
+def test_a_run_that_is_stopped_leaves_nothing_on_the_cluster(cluster: Cluster, plan_: plan.Plan) -> None:
+    engine = on_dask(cluster, 2)
+    rows = engine.run(plan_.spec, runner.ChunkQueue(plan_.points, 150, np.arange(plan_.trials)))
     assert next(rows)[0].error is None
     assert {len(state) for state in engine.client.run(recipes).values()} == {1}
     assert isinstance(rows, Generator)
     rows.close()
     assert engine.client.status == "closed"
-    engine = on_dask(lab, 2)
+    engine = on_dask(cluster, 2)
     for _ in range(100):
         if not engine.client.run_on_scheduler(tasks):
             break
@@ -333,24 +327,22 @@ def recipes() -> list[str]:
     """The runs that a worker was told of."""
     from skysim.experiments.study.execution import dask_engine
 
-    return list(dask_engine.RECIPES)
+    return list(dask_engine.SPECS)
 
 
 def tasks(dask_scheduler: Any) -> int:
     return len(dask_scheduler.tasks)
 
 
-def test_other_code_on_the_cluster_is_refused(lab: Lab) -> None:
-    on_dask(lab, 2).client.run(change_code, "0123456789abcdef")
+def test_other_code_on_the_cluster_is_refused(cluster: Cluster) -> None:
+    on_dask(cluster, 2).client.run(change_code, "0123456789abcdef")
     try:
-        with pytest.raises(
-            InputError, match=rf"has skysim 0123456789abcdef, this is {setups.code_version()}; allowed"
-        ):
-            dask(lab.address)
+        with pytest.raises(InputError, match=rf"has skysim 0123456789abcdef; allowed: {setups.code_version()}"):
+            dask(cluster.address)
     finally:
         from distributed import Client
 
-        with Client(lab.address, set_as_default=False) as client:
+        with Client(cluster.address, set_as_default=False) as client:
             client.run(change_code, setups.code_version())
 
 
@@ -360,27 +352,25 @@ def change_code(version: str) -> None:
 
 
 def test_dask_loses_a_worker_and_makes_the_same_rows(
-    lab: Lab, told: plan.Plan, whole: str, tmp_path: Path
+    cluster: Cluster, plan_: plan.Plan, serial_contents: str, tmp_path: Path
 ) -> None:
-    engine, victims, path = on_dask(lab, 2), lab.workers[:1], tmp_path / "dask.sqlite"
+    engine, victims, path = on_dask(cluster, 2), cluster.workers[:1], tmp_path / "dask.sqlite"
     assert engine.workers >= 1
 
     def kill(progress: runner.Progress) -> None:
         if progress.now >= 30 and victims:
             victims.pop().kill()
 
-    assert done(told, path, engine, watch=kill).done == told.trials
+    assert done(plan_, path, engine, watch=kill).done == plan_.trials
     assert not victims
-    assert lab.workers[0].wait(10) == -signal.SIGKILL
-    assert contents(path) == whole
+    assert cluster.workers[0].wait(10) == -signal.SIGKILL
+    assert contents(path) == serial_contents
     again = tmp_path / "again.sqlite"  # by the same engine, and by who is left
-    done(told, again, engine)
-    assert contents(again) == whole
+    done(plan_, again, engine)
+    assert contents(again) == serial_contents
 
 
-@pytest.mark.parametrize(
-    "scheduler", ["", "nonsense", "tcp://127.0.0.1", "tcp://127.0.0.1:99999", "foo://1.2.3.4:5"]
-)
+@pytest.mark.parametrize("scheduler", ["", "nonsense", "tcp://127.0.0.1", "tcp://127.0.0.1:99999", "foo://1.2.3.4:5"])
 def test_an_address_that_is_none_is_told_in_one_line(scheduler: str) -> None:
     pytest.importorskip("distributed")
     with pytest.raises(InputError, match=r"scheduler: .*such as tcp://10\.0\.0\.1:8786") as refused:
@@ -393,7 +383,7 @@ def test_where_nobody_answers_it_says_so(monkeypatch: pytest.MonkeyPatch) -> Non
     from skysim.experiments.study.execution import dask_engine
 
     monkeypatch.setattr(dask_engine, "WAIT_S", 0.3)
-    with pytest.raises(InputError, match=r"nobody answers at tcp://127\.0\.0\.1:1 "):
+    with pytest.raises(InputError, match=r"no reply from tcp://127\.0\.0\.1:1 "):
         dask("tcp://127.0.0.1:1")
 
 
@@ -406,32 +396,30 @@ def test_without_the_extra_it_says_what_to_install(monkeypatch: pytest.MonkeyPat
 
 
 @pytest.mark.long
-def test_a_trial_that_kills_dask_workers_fails_and_no_other(
-    told: plan.Plan, tmp_path: Path, stubs: Any
-) -> None:
-    bad, found = deaths(told), os.pathsep.join([str(ROOT), str(Path(__file__).parent), str(tmp_path)])
+def test_a_trial_that_kills_dask_workers_fails_and_no_other(plan_: plan.Plan, tmp_path: Path, stubs: Any) -> None:
+    bad, found = deaths(plan_), os.pathsep.join([str(ROOT), str(Path(__file__).parent), str(tmp_path)])
     dask = {"DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "0", "PYTHONPATH": found}
-    for lab in cluster_of(tmp_path, "--nworkers", "2", environment=dask):
-        engine, path = on_dask(lab, 2), tmp_path / "deadly.sqlite"
+    for cluster in cluster_of(tmp_path, "--nworkers", "2", environment=dask):
+        engine, path = on_dask(cluster, 2), tmp_path / "deadly.sqlite"
         engine.client.register_worker_callbacks(stubs.make_deadly)
-        done(told, path, engine)
-        with store.open_store(path) as kept:
-            assert kept.failures() == [(n, "its worker process died, 3 times") for n in bad]
-            assert kept.counts()["done"] == told.trials
+        done(plan_, path, engine)
+        with store.open_store(path) as stored:
+            assert stored.failures() == [(n, "its worker process died, 3 times") for n in bad]
+            assert stored.counts()["done"] == plan_.trials
 
 
 @pytest.mark.long
-def test_a_lost_scheduler_is_told_and_what_came_is_kept(told: plan.Plan, whole: str, tmp_path: Path) -> None:
+def test_a_lost_scheduler_is_told_and_what_came_is_kept(plan_: plan.Plan, serial_contents: str, tmp_path: Path) -> None:
     path = tmp_path / "lost.sqlite"
-    for lab in cluster_of(tmp_path, "--no-nanny"):
-        engine = on_dask(lab, 1)
+    for cluster in cluster_of(tmp_path, "--no-nanny"):
+        engine = on_dask(cluster, 1)
         scheduler = psutil.Process(int(engine.client.run_on_scheduler(os.getpid)))
 
         def kill(progress: runner.Progress, scheduler: psutil.Process = scheduler) -> None:
             if progress.now >= 30 and scheduler.is_running():
                 scheduler.kill()
 
-        with pytest.raises(InputError, match=r"scheduler: it was lost"):
-            done(told, path, engine, watch=kill)
-    done(told, path, engines.Serial(), resume=True)
-    assert contents(path) == whole
+        with pytest.raises(InputError, match=r"scheduler: connection lost"):
+            done(plan_, path, engine, watch=kill)
+    done(plan_, path, engines.Serial(), resume=True)
+    assert contents(path) == serial_contents

@@ -9,7 +9,7 @@ from scipy import stats
 
 from skysim.core.errors import InputError
 from skysim.experiments.study.designs import Design, points
-from skysim.experiments.study.factors import Factor, joined, split
+from skysim.experiments.study.factors import Factor, join_quantity, split_quantity
 
 READ = TypeAdapter(Factor).validate_python
 
@@ -19,12 +19,12 @@ READ = TypeAdapter(Factor).validate_python
     [(3, 3.0, ""), ("48 in", 48.0, "in"), ("-1.5e-3 N m", -1.5e-3, "N m"), (".5", 0.5, "")],
 )
 def test_a_quantity_comes_apart(value, number, unit):
-    assert split(value) == (number, unit)
+    assert split_quantity(value) == (number, unit)
 
 
 @given(some.floats(-1e9, 1e9, allow_nan=False), some.sampled_from(["", "mm", "N m", "deg"]))
 def test_a_quantity_comes_together_to_twelve_digits(number, unit):
-    again, its_unit = split(joined(number, unit))
+    again, its_unit = split_quantity(join_quantity(number, unit))
     assert its_unit == unit
     assert again == pytest.approx(number, rel=1e-11, abs=1e-300)
 
@@ -34,8 +34,8 @@ def test_a_range_ends_at_its_ends_and_is_even_in_ratio_where_that_is_wanted():
     assert [value for value, _ in even.options()] == ["1 m", "2 m", "3 m"]
     ratios = READ({"key": "a.b", "from": 1, "to": 100, "steps": 3, "scale": "log"})
     assert [sets for _, sets in ratios.options()] == [{"a.b": 1}, {"a.b": 10}, {"a.b": 100}]
-    whole = READ({"key": "a.b", "from": 1, "to": 2, "steps": 4, "whole": True})
-    assert [value for value, _ in whole.options()] == [1, 1, 2, 2]
+    integer = READ({"key": "a.b", "from": 1, "to": 2, "steps": 4, "integer": True})
+    assert [value for value, _ in integer.options()] == [1, 1, 2, 2]
 
 
 @pytest.mark.parametrize(
@@ -51,7 +51,7 @@ def test_a_range_ends_at_its_ends_and_is_even_in_ratio_where_that_is_wanted():
 )
 def test_a_factor_drawn_is_distributed_as_told(told, law):
     """Even shares through `at` against SciPy's law: mean and spread to the grid's own error."""
-    drawn = np.array([READ(told | {"key": "x"}).at(share)[0] for share in (np.arange(20_000) + 0.5) / 20_000])
+    drawn = np.array([READ(told | {"key": "x"}).value_at(share)[0] for share in (np.arange(20_000) + 0.5) / 20_000])
     assert np.mean(drawn) == pytest.approx(law.mean(), rel=2e-3)
     assert np.std(drawn) == pytest.approx(law.std(), rel=5e-3)
 
@@ -59,14 +59,17 @@ def test_a_factor_drawn_is_distributed_as_told(told, law):
 @pytest.mark.parametrize(
     ("told", "complaint"),
     [
-        ({"key": "x", "from": "1 m", "to": "2 in"}, "differ in their unit"),
-        ({"key": "x", "from": 3, "to": 2}, "is not below"),
-        ({"key": "x", "from": 0, "to": 2, "scale": "log"}, "not positive"),
-        ({"key": "x", "distribution": "normal", "mean": 1}, "normal takes mean, sigma"),
-        ({"key": "x", "distribution": "normal", "mean": "1 m", "sigma": "1 mm"}, "differ"),
-        ({"key": "x", "distribution": "normal", "mean": 1, "sigma": 0}, "not positive"),
-        ({"key": "x", "distribution": "triangular", "low": 0, "mode": 5, "high": 4}, "do not ascend"),
-        ({"key": "x", "from": "wide", "to": 2}, "is no number"),
+        ({"key": "x", "from": "1 m", "to": "2 in"}, "have different units"),
+        ({"key": "x", "from": 3, "to": 2}, "allowed: below to"),
+        ({"key": "x", "from": 0, "to": 2, "scale": "log"}, "allowed: above 0 with"),
+        ({"key": "x", "distribution": "normal", "mean": 1}, "normal: parameters mean; allowed: mean, sigma"),
+        ({"key": "x", "distribution": "normal", "mean": "1 m", "sigma": "1 mm"}, "different units"),
+        ({"key": "x", "distribution": "normal", "mean": 1, "sigma": 0}, "sigma is 0; allowed"),
+        (
+            {"key": "x", "distribution": "triangular", "low": 0, "mode": 5, "high": 4},
+            "not in ascending order",
+        ),
+        ({"key": "x", "from": "wide", "to": 2}, "is not a number"),
         ({"key": "X y", "values": [1]}, "pattern"),
         ({"levels": {}}, "at least 1"),
         ({"values": [1, 2]}, "key"),
@@ -144,9 +147,9 @@ def test_a_drawn_design_is_its_seeds(kind):
 @pytest.mark.parametrize(
     ("design", "factors", "complaint"),
     [
-        (Design(kind="sobol", points=12), THREE, "12 is no power of two"),
-        (Design(kind="lhs"), THREE, "lhs takes how many"),
-        (Design(kind="factorial", points=4), THREE, "as many as its levels make"),
+        (Design(kind="sobol", points=12), THREE, "12 for sobol; allowed: a power of two"),
+        (Design(kind="lhs"), THREE, "None for lhs; allowed: a number"),
+        (Design(kind="factorial", points=4), THREE, "4 for factorial; allowed: none"),
         (
             Design(kind="factorial"),
             {"n": READ({"key": "x", "distribution": "normal", "mean": 0, "sigma": 1})},

@@ -16,11 +16,11 @@ import pytest
 from skysim.core.errors import InputError
 from skysim.experiments.study import designs, store
 from skysim.experiments.study.analysis.sensitivity import Index
-from skysim.experiments.study.analysis.table import Line, cells, table
+from skysim.experiments.study.analysis.table import PointRow, cells, table
 from skysim.experiments.study.designs import Point
+from skysim.experiments.study.execution.trials import Outcome, Row
 from skysim.experiments.study.plan import Curve, Heat, Study
 from skysim.experiments.study.report import figures, layout, page
-from skysim.experiments.study.trials import Outcome, Row
 from skysim.results.metrics import Summary
 from skysim.results.plots import INK
 
@@ -59,14 +59,14 @@ def filled(
         told = Outcome("failed") if error else outcome(point, replicate)
         rows.append(Row(trial, point, replicate, trial, "scene", "cafe", told, error, 0.001))
     with store.writing(path) as kept:
-        kept.note(study="title: Which <dome>?", code="cafe0123")
+        kept.begin(kept.points(), study="title: Which <dome>?", code="cafe0123")
         kept.set_points(tried)
         kept.add(rows)
-        kept.ran("pool", 2, len(rows), 4.0)
+        kept.record_run("pool", 2, len(rows), 4.0)
     return path
 
 
-def lines_of(path: Path, asked: Study) -> list[Line]:
+def lines_of(path: Path, asked: Study) -> list[PointRow]:
     with store.open_store(path) as kept:
         return table(kept, page.responses(asked))
 
@@ -135,7 +135,7 @@ def written(path: Path, asked: Study, **more: Any) -> tuple[str, Html]:
 @pytest.fixture
 def bare(monkeypatch: pytest.MonkeyPatch) -> None:
     """Pages without figures, which take the time."""
-    monkeypatch.setattr(page, "illustrated", lambda lines, study: [])
+    monkeypatch.setattr(page, "figure_images", lambda lines, study: [])
 
 
 # The page.
@@ -149,9 +149,7 @@ def test_every_fact_is_the_stores(tmp_path: Path) -> None:
     with store.open_store(path) as kept:
         counts, heads, rows = kept.counts(), *cells(table(kept, asked.responses))
     assert html.ids["done"] == f"{counts['done']} / {9 * 20}"
-    assert (
-        (html.ids["failed"], html.ids["wrong"]) == (str(counts["failed"]), str(counts["wrong"])) == ("3", "0")
-    )
+    assert (html.ids["failed"], html.ids["wrong"]) == (str(counts["failed"]), str(counts["wrong"])) == ("3", "0")
     assert (html.ids["scene"], html.ids["seed"], html.ids["code"]) == ("afit_simsat", "11", "cafe0123")
     assert html.tables["points"] == [heads, *rows]
     assert html.tables["runs"][1:] == [["pool", "2", "180", "4.0", "45.0"]]
@@ -243,8 +241,8 @@ def test_indices_and_a_search_have_theirs(tmp_path: Path) -> None:
     assert html.tables["indices"][1] == ["cross_arcsec", "tilt", "0.4 (0.3..0.5)", "0.4 (0.3..0.5)"]
     objectives = [{"response": "cross_arcsec_median"}, {"response": "cost"}]
     search = {"objectives": objectives, "constraints": [{"response": "stars_least", "at_least": 5}]}
-    asked = study(factors=factors, optimise=search | {"candidates": 4}, responses=["identified"])
-    tried = [designs.merged({"tilt": (n, {"a": n})}) for n in range(3)]
+    asked = study(factors=factors, optimize=search | {"candidates": 4}, responses=["identified"])
+    tried = [designs.make_point({"tilt": (n, {"a": n})}) for n in range(3)]
     path = filled(tmp_path / "b.sqlite", asked, tried)
     html = written(path, asked, front=[1], costs={0: 7.0, 1: 2.5})[1]
     assert len(html.images) == 2 + 1
@@ -295,9 +293,7 @@ def test_an_interval_without_an_end_leaves_the_picture_and_stretches_nothing() -
 
     nan, inf = math.nan, math.inf
     levels = zip([20, 0, 10], [(5, 4, inf), (3, -inf, 6), (8, nan, nan)], strict=True)
-    lines = [
-        Line(n, {"tilt": one}, {"roll_arcsec_p95": Summary(*told, 9)}) for n, (one, told) in enumerate(levels)
-    ]
+    lines = [PointRow(n, {"tilt": one}, {"roll_arcsec_p95": Summary(*told, 9)}) for n, (one, told) in enumerate(levels)]
     for log in (False, True):
         fig = Canvas()
         curve = Curve(kind="curve", x="tilt", y="roll_arcsec_p95", log=log)
@@ -327,14 +323,14 @@ def test_a_heat_map_has_its_cells_in_order_and_nan_where_nothing_is(tmp_path: Pa
 def test_axes_know_numbers_quantities_names_and_lists() -> None:
     def axis(factor: dict[str, Any], levels: list[Any]) -> layout.Axis:
         return layout.axis(
-            study(factors={"a": factor}), [Line(n, {"a": one}, {}) for n, one in enumerate(levels)], "a"
+            study(factors={"a": factor}), [PointRow(n, {"a": one}, {}) for n, one in enumerate(levels)], "a"
         )
 
     quantity = axis(RADIUS, ["96 in", "24 in", "48 in"])
     assert quantity[:3] == ("a [in]", ["24 in", "48 in", "96 in"], True)
     rings = axis(RING, [[0, 10], [10, 20]])
     assert rings[:3] == ("a [deg]", [[10, 20], [0, 10]], False)
-    assert rings.place([0, 10]) == 1
+    assert rings.coordinate([0, 10]) == 1
     assert axis({"key": "x", "values": [True, False]}, [False, True])[1:3] == ([True, False], False)
     assert axis({"key": "x", "values": ["1 m", "1 ft"]}, ["1 ft", "1 m"])[1:3] == (["1 m", "1 ft"], False)
     steps = {"key": "x", "from": 1, "to": 1000}
@@ -342,9 +338,7 @@ def test_axes_know_numbers_quantities_names_and_lists() -> None:
         False,
         True,
     ]
-    assert [
-        axis({"key": "x", "values": v}, v).log for v in ([50, 100, 200, 800], [0, 1, 10, 100], [1, 5, 9, 13])
-    ] == [
+    assert [axis({"key": "x", "values": v}, v).log for v in ([50, 100, 200, 800], [0, 1, 10, 100], [1, 5, 9, 13])] == [
         True,
         False,
         False,
@@ -360,13 +354,13 @@ def test_two_levels_said_in_two_ways_are_one() -> None:
 
 def test_where_names_what_is_there() -> None:
     asked = study(factors={"dome": DOME, "tilt": TILT})
-    lines = [Line(n, point.levels, {}) for n, point in enumerate(points(asked))]
+    lines = [PointRow(n, point.levels, {}) for n, point in enumerate(points(asked))]
     for where, said in (
-        ({"dome": "bowl"}, "'bowl' is none of sphere, flat, cube"),
-        ({"x": 1}, "none of dome, tilt"),
+        ({"dome": "bowl"}, "unknown level 'bowl'; allowed: sphere, flat, cube"),
+        ({"x": 1}, "allowed: dome, tilt"),
     ):
         with pytest.raises(InputError, match=said):
-            layout.kept(lines, Curve(kind="curve", x="tilt", y="wrong", where=where), asked)
+            layout.shown_points(lines, Curve(kind="curve", x="tilt", y="wrong", where=where), asked)
 
 
 def test_figures_that_nobody_named_follow_from_the_factors() -> None:
@@ -375,10 +369,8 @@ def test_figures_that_nobody_named_follow_from_the_factors() -> None:
     def chosen(**keys: Any) -> list[tuple[Any, ...]]:
         asked = study(responses=["wrong"], **keys)
         tried = points(asked)
-        lines = [Line(n, one.levels, {"wrong": Summary(0.0, 0.0, 0.1, 9)}) for n, one in enumerate(tried)]
-        return [
-            tuple(one.model_dump(exclude={"where", "log"}).values()) for one in layout.figures(asked, lines)
-        ]
+        lines = [PointRow(n, one.levels, {"wrong": Summary(0.0, 0.0, 0.1, 9)}) for n, one in enumerate(tried)]
+        return [tuple(one.model_dump(exclude={"where", "log"}).values()) for one in layout.figures(asked, lines)]
 
     assert chosen() == [("curve", "tilt", "wrong", None)]
     assert chosen(factors={"dome": DOME, "tilt": TILT}) == [("curve", "tilt", "wrong", "dome")]
@@ -396,7 +388,7 @@ def test_drawn_factors_part_points_into_equal_bands() -> None:
         design={"kind": "lhs", "points": 40},
     )
     lines = [
-        Line(n, {"x": float(x), "b": float(b)}, {"nees_mean": Summary(float(b), 0, 1, 5)})
+        PointRow(n, {"x": float(x), "b": float(b)}, {"nees_mean": Summary(float(b), 0, 1, 5)})
         for n, (x, b) in enumerate(rng.random((40, 2)))
     ]
     shown = layout.series(lines, Curve(kind="curve", x="x", y="nees_mean", by="b"), asked)
@@ -407,12 +399,10 @@ def test_drawn_factors_part_points_into_equal_bands() -> None:
 
 def test_a_search_is_shown_by_candidate_with_its_bounds() -> None:
     constraints = [{"response": "cost", "at_most": 9}, {"response": "wrong", "at_least": 0, "at_most": 0.1}]
-    asked = study(
-        optimise={"objectives": [{"response": "identified", "better": "more"}], "constraints": constraints}
-    )
-    assert asked.optimise is not None
+    asked = study(optimize={"objectives": [{"response": "identified", "better": "more"}], "constraints": constraints})
+    assert asked.optimize is not None
     responses = {"identified": Summary(0.5, 0.4, 0.6, 9), "wrong": Summary(0.2, 0.1, 0.3, 9)}
-    panels = layout.panels([Line(n, {"tilt": n}, responses) for n in (0, 1)], asked.optimise, {1: 4.0})
+    panels = layout.panels([PointRow(n, {"tilt": n}, responses) for n in (0, 1)], asked.optimize, {1: 4.0})
     assert list(panels) == ["identified", "cost", "wrong"]
     assert panels["identified"].label == "identified [share], more is better"
     assert panels["cost"].value == pytest.approx([np.nan, 4.0], nan_ok=True)

@@ -28,7 +28,7 @@ def written(folder, text):
 def test_a_plan_has_every_trial_of_every_point(tmp_path):
     told = loader.load(written(tmp_path, STUDY))
     assert (told.name, len(told.points), told.trials) == ("question", 6, 24)
-    scene, trial = plan.resolved(told.recipe, told.points[4].settings)
+    scene, trial = plan.resolve_point(told.spec, told.points[4].settings)
     assert trial.false_lights == 5
     assert trial.noise_px == 0.1
     assert scene.camera.focal_length_m == pytest.approx(0.025, rel=1e-12)
@@ -37,9 +37,7 @@ def test_a_plan_has_every_trial_of_every_point(tmp_path):
 
 def test_the_digest_is_of_what_decides_on_trials_and_of_nothing_else(tmp_path):
     told = loader.load(written(tmp_path, STUDY))
-    same = loader.load(
-        written(tmp_path, STUDY.replace("a question", "another").replace(", cross_arcsec_p95", ""))
-    )
+    same = loader.load(written(tmp_path, STUDY.replace("a question", "another").replace(", cross_arcsec_p95", "")))
     assert same.digest == told.digest
     for change in (
         ("seed: 1", "seed: 2"),
@@ -60,27 +58,30 @@ def test_an_override_changes_the_study(tmp_path):
         (("replicates: 4", "replicas: 4"), r"replicas: unknown key; did you mean replicates\?.*line 10\)"),
         (
             ("cross_arcsec_p95", "cross_arcsec_p96"),
-            r"responses.1: 'cross_arcsec_p96' is none of over.*line 11\)",
+            r"responses.1: unknown response 'cross_arcsec_p96'; allowed: over.*line 11\)",
         ),
         (("trial.false_lights", "trial.falselights"), r"factors.strays: 0: trial.falselights.*line 8\)"),
         (("camera.focal_length", "camera.focal"), r"factors.focal: '25 mm': camera.focal: unknown key"),
-        (('"30 mm"', '"30 in"'), r"factors.focal: from '20 mm' and to '30 in' differ.*line 9\)"),
+        (
+            ('"30 mm"', '"30 in"'),
+            r"factors.focal: from '20 mm' and to '30 in' have different units.*line 9\)",
+        ),
         (('"20 mm"', '"0 mm"'), r"factors.focal: '0 mm': camera.focal_length: '0 mm' is not allowed"),
         (("noise_px: 0.1", "noise_px: -1"), r"trial.*noise_px.*line 6\)"),
-        (("kind: centroids", "kind: guesses"), r"trial.kind: 'guesses' is none of"),
+        (("kind: centroids", "kind: guesses"), r"trial.kind: unknown kind 'guesses'; allowed:"),
         (
             ("  strays:", "  stars:"),
-            r"factors.stars: is a column of every trial; allowed: another name.*line 8\)",
+            r"factors.stars: the name is that of a column of the trials; allowed: another name.*line 8\)",
         ),
-        (("scene: shefex2", "scene: bench_collimated"), r"trial.kind: a bench has no sky around it"),
+        (("scene: shefex2", "scene: collimated_display"), r"trial.kind: centroids with a collimated display"),
         (("scene: shefex2", "scene: shefex3"), r"shefex3: no such scene; allowed:"),
         (
             ("replicates: 4", "replicates: 4\nbudget: {trials: 23}"),
-            r"budget.trials: 23 are fewer than the study's 24",
+            r"budget.trials: 23; allowed: at least 24",
         ),
         (
             ("replicates: 4", "replicates: 4\nfigures: [{kind: curve, x: rate, y: identified}]"),
-            r"figures.0.x: 'rate' is none of strays, focal",
+            r"figures.0.x: unknown factor 'rate'; allowed: strays, focal",
         ),
         (
             ("values: [0, 5]", "distribution: normal, mean: 0, sigma: 1"),
@@ -98,7 +99,7 @@ def test_a_slip_is_told_in_one_line_with_its_place(tmp_path, change, complaint):
 def test_a_scene_beside_the_study_is_found_from_anywhere(tmp_path):
     (tmp_path / "mine.yaml").write_text("schema: 1\nbase: shefex2\ntitle: mine\n")
     told = loader.load(written(tmp_path, STUDY.replace("scene: shefex2", "scene: mine.yaml")))
-    assert plan.resolved(told.recipe, {})[0].title == "mine"
+    assert plan.resolve_point(told.spec, {})[0].title == "mine"
 
 
 def test_there_is_no_such_study():
@@ -111,4 +112,4 @@ def test_every_study_that_comes_along_can_be_asked(path):
     """Every level of every factor makes a scene; `load` has tried them all."""
     told = loader.load(path)
     assert told.study.title
-    assert told.trials or told.study.optimise
+    assert told.trials or told.study.optimize

@@ -18,9 +18,9 @@ from skysim.experiments.study import loader, plan, store
 from skysim.experiments.study.analysis import search
 from skysim.experiments.study.designs import Point
 from skysim.experiments.study.execution import engines, runner
+from skysim.experiments.study.execution.setups import code_version, seed_of
+from skysim.experiments.study.execution.trials import FAILED, Outcome, Row
 from skysim.experiments.study.factors import Settings
-from skysim.experiments.study.setups import code_version, seed_of
-from skysim.experiments.study.trials import FAILED, Outcome, Row
 
 pytest.importorskip("optuna")
 
@@ -36,7 +36,7 @@ STUDY: dict[str, Any] = {
     },
     "replicates": 4,
     "responses": ["angle_arcsec_p95"],
-    "optimise": {
+    "optimize": {
         "candidates": 30,
         "objectives": [{"response": "angle_arcsec_median"}],
     },
@@ -51,17 +51,17 @@ class Law:
     def __init__(self, law: Callable[[Settings], Outcome]) -> None:
         self.law = law
 
-    def run(self, recipe: plan.TrialSpec, chunks: engines.Chunks) -> Iterator[list[Row]]:
+    def run(self, spec: plan.TrialSpec, chunks: engines.Chunks) -> Iterator[list[Row]]:
         while chunk := chunks.next():
             yield [
-                self.row(recipe, segment, segment.first + n, k)
+                self.row(spec, segment, segment.first + n, k)
                 for segment in chunk
                 for n, k in enumerate(segment.replicates)
             ]
-            chunks.took(chunk, 0.1)
+            chunks.report_time(chunk, 0.1)
 
-    def row(self, recipe: plan.TrialSpec, segment: Any, trial: int, k: int) -> Row:
-        seed, code = seed_of(recipe, segment.point, k), code_version()
+    def row(self, spec: plan.TrialSpec, segment: Any, trial: int, k: int) -> Row:
+        seed, code = seed_of(spec, segment.point, k), code_version()
         try:
             return Row(trial, segment.point, k, seed, "s", code, self.law(segment.settings), None, 0.0)
         except InputError as error:
@@ -96,9 +96,9 @@ def loaded(folder: Path, told: dict[str, Any]) -> plan.Plan:
     return made
 
 
-def searched(told: plan.Plan, out: Path, engine: engines.Engine, watch: Any = None) -> search.Found:
+def searched(told: plan.Plan, out: Path, engine: engines.Engine, watch: Any = None) -> search.SearchResult:
     with store.writing(out) as kept:
-        runner.begin(told, kept, bool(kept.meta("digest")))
+        runner.prepare_store(told, kept, bool(kept.meta("digest")))
         return search.search(told, kept, engine, watch)
 
 
@@ -110,8 +110,8 @@ def held(out: Path) -> tuple[list[Any], list[Any]]:
 
 
 def changed(**keys: Any) -> dict[str, Any]:
-    """STUDY with other keys of `optimise`."""
-    return STUDY | {"optimise": STUDY["optimise"] | keys}
+    """STUDY with other keys of `optimize`."""
+    return STUDY | {"optimize": STUDY["optimize"] | keys}
 
 
 def test_one_objective_comes_near_to_its_least(tmp_path: Path) -> None:
@@ -134,9 +134,7 @@ def test_more_is_better_where_the_study_says_so(tmp_path: Path) -> None:
 def test_front_is_what_no_other_candidate_dominates(tmp_path: Path) -> None:
     """angle = 1 / x against a price of x: every x at y = 0 is on the true front, and its law is angle * price = 1."""
     cost = {"per": {"x": 1, "y": 1}}
-    told = changed(
-        objectives=[{"response": "angle_arcsec_median"}, {"response": "cost"}], cost=cost, candidates=40
-    )
+    told = changed(objectives=[{"response": "angle_arcsec_median"}, {"response": "cost"}], cost=cost, candidates=40)
     found = searched(loaded(tmp_path, told), tmp_path / "s.db", Law(lambda s: angle(1 / s["trial.noise_px"])))
     on = {one.number for one in found.front}
     assert len(on) >= 5
@@ -149,9 +147,7 @@ def test_front_is_what_no_other_candidate_dominates(tmp_path: Path) -> None:
         assert beaten == (one.number not in on)
     assert [one.objectives[0] for one in found.front] == sorted(one.objectives[0] for one in found.front)
     tightness = [math.prod(one.objectives) for one in found.candidates]
-    assert np.median(tightness[-15:]) < np.median(
-        tightness[:10]
-    )  # it has learnt that y costs and brings nothing
+    assert np.median(tightness[-15:]) < np.median(tightness[:10])  # it has learnt that y costs and brings nothing
 
 
 def test_constraints_rule_out_what_would_be_best(tmp_path: Path) -> None:
@@ -160,9 +156,7 @@ def test_constraints_rule_out_what_would_be_best(tmp_path: Path) -> None:
     def law(settings: Settings) -> Outcome:
         return bowl(settings) if settings["trial.noise_px"] <= 0.5 else angle(0, solved=False)
 
-    told = changed(
-        constraints=[{"response": "identified", "at_least": 0.9}, {"response": "cost", "at_most": 10}]
-    )
+    told = changed(constraints=[{"response": "identified", "at_least": 0.9}, {"response": "cost", "at_most": 10}])
     found = searched(loaded(tmp_path, told), tmp_path / "s.db", Law(law))
     (best,) = found.front
     assert 1.04 <= best.objectives[0] < 1.14
@@ -191,8 +185,8 @@ def test_a_refused_candidate_is_infeasible_and_the_rest_goes_on(tmp_path: Path) 
     assert sum(x > 0.8 for x in asked) == len(refused)  # one trial each was tried
     with store.open_store(tmp_path / "s.db") as kept:
         assert kept.counts() == {"done": 120, "failed": 4 * len(refused), "wrong": 0}
-        seeds = kept.of_point(refused[0].number)["seed"]
-        again = [seed_of(told.recipe, refused[0].number, k) for k in range(4)]
+        seeds = kept.point_columns(refused[0].number)["seed"]
+        again = [seed_of(told.spec, refused[0].number, k) for k in range(4)]
         assert seeds.tolist() == again
 
 
@@ -274,7 +268,7 @@ def test_killed_and_resumed_it_leaves_the_same_store(tmp_path: Path, every: int)
     assert killed_and_resumed(made, tmp_path / "killed.db", Law(law), every) > 2
     assert held(tmp_path / "killed.db") == held(tmp_path / "whole.db")
     with store.open_store(tmp_path / "killed.db") as kept:
-        assert repr(search.found(made, kept)) == repr(whole)
+        assert repr(search.collect_result(made, kept)) == repr(whole)
 
 
 def test_killed_and_resumed_with_a_real_scene(tmp_path: Path) -> None:
@@ -294,7 +288,7 @@ def test_another_question_than_the_store_has_is_refused(tmp_path: Path) -> None:
     searched(made, tmp_path / "s.db", Law(bowl))
     with store.writing(tmp_path / "s.db") as kept:
         kept.set_points([Point({"x": 1, "y": 1}, {"trial.noise_px": 1, "trial.magnitude_sigma": 1})], first=1)
-        with pytest.raises(InputError, match=r"candidate 1 was .*version of optuna"):
+        with pytest.raises(InputError, match=r"candidate 1 is .*version of optuna"):
             search.search(made, kept, Law(bowl))
 
 
@@ -323,7 +317,7 @@ def test_watch_is_told_of_the_whole_search(tmp_path: Path) -> None:
 
 
 def test_cost_is_in_si_units(tmp_path: Path) -> None:
-    """base 1 + 2 a metre of 48 in + 0.01 of each of 300 + the level's 5."""
+    """base 1 + 2 a meter of 48 in + 0.01 of each of 300 + the level's 5."""
     wanted = plan.Search.model_validate(
         {
             "objectives": [{"response": "cost"}],
@@ -344,22 +338,31 @@ LEVELS = {"levels": {"cheap": {"trial.missing": 0.1}, "precise": {"trial.missing
 @pytest.mark.parametrize(
     ("told", "says"),
     [
-        ({"cost": {"per": {"radius": 1}}}, r"optimise\.cost\.per\.radius: 'radius' is none of x, y, z"),
-        ({"cost": {"per": {"z": 1}}}, r"optimise\.cost\.per\.z: 'cheap' is no number"),
-        ({"cost": {"levels": {"lens": {}}}}, r"optimise\.cost\.levels\.lens: 'lens' is none of x, y, z"),
+        (
+            {"cost": {"per": {"radius": 1}}},
+            r"optimize\.cost\.per\.radius: unknown factor 'radius'; allowed: x, y, z",
+        ),
+        ({"cost": {"per": {"z": 1}}}, r"optimize\.cost\.per\.z: 'cheap' is not a number"),
+        (
+            {"cost": {"levels": {"lens": {}}}},
+            r"optimize\.cost\.levels\.lens: unknown factor 'lens'; allowed: x, y, z",
+        ),
         (
             {"cost": {"levels": {"z": {"dear": 5, "cheap": 1}}}},
             r"levels\.z: .*allowed: a price of each of cheap, precise",
         ),
-        ({"cost": {"levels": {"x": {"a": 1}}}}, r"levels\.x: .*optimise\.cost\.per, as it is a range"),
+        ({"cost": {"levels": {"x": {"a": 1}}}}, r"levels\.x: .*optimize\.cost\.per, as it is a range"),
         (
             {"objectives": [{"response": "beauty"}]},
-            r"objectives\.0\.response: 'beauty' is none of .*, or cost",
+            r"objectives\.0\.response: unknown response 'beauty'; allowed: .*, or cost",
         ),
-        ({"objectives": [{"response": "time_ms_mean"}]}, r"time_ms_mean is another every time"),
-        ({"objectives": [{"response": "cost"}, {"response": "cost"}]}, r"objectives: cost twice"),
-        ({"constraints": [{"response": "identified"}]}, r"constraints\.0: allowed: at_least, at_most"),
-        ({"candidates": 300}, r"budget\.trials: 1000 are fewer than the search's 1200"),
+        ({"objectives": [{"response": "time_ms_mean"}]}, r"time_ms_mean is not reproducible"),
+        ({"objectives": [{"response": "cost"}, {"response": "cost"}]}, r"objectives: cost occurs twice"),
+        (
+            {"constraints": [{"response": "identified"}]},
+            r"constraints\.0: no bound; allowed: at_least, at_most",
+        ),
+        ({"candidates": 300}, r"budget\.trials: 1000; allowed: at least 1200"),
     ],
 )
 def test_wrong_names_are_answered_with_the_allowed_ones(told: dict[str, Any], says: str) -> None:
@@ -370,14 +373,14 @@ def test_wrong_names_are_answered_with_the_allowed_ones(told: dict[str, Any], sa
 
 def test_a_distribution_is_not_chosen() -> None:
     drawn = {"key": "trial.noise_px", "distribution": "normal", "mean": 0.5, "sigma": 0.1}
-    with pytest.raises(InputError, match=r"factors\.x: nobody chooses"):
+    with pytest.raises(InputError, match=r"factors\.x: a distribution cannot be optimized"):
         search.check(plan.Study.model_validate(STUDY | {"factors": {"x": drawn}}))
 
 
 def test_without_optuna_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "optuna", None)
     with pytest.raises(InputError, match=r"^[^\n]*pip install 'skysim\[optuna\]'$"):
-        search.begun(plan.Study.model_validate(STUDY))
+        search.create_sampler(plan.Study.model_validate(STUDY))
 
 
 @pytest.mark.parametrize(
@@ -392,22 +395,22 @@ def test_a_factor_sets_several_keys_alike(factor: dict[str, Any]) -> None:
     """Apex and radius of a dome about the bearing."""
     keys = ["light.surface.apex", "light.surface.radius"]
     study = plan.Study.model_validate(STUDY | {"factors": {"size": factor | {"keys": keys}}})
-    value, settings = study.factors["size"].at(0.75)
+    value, settings = study.factors["size"].value_at(0.75)
     assert settings == dict.fromkeys(keys, value)
     assert 1 < search.si(value) <= 2
     for wrong in ({}, {"key": "a", "keys": ["b"]}):
-        with pytest.raises(ValueError, match="takes either key or keys"):
+        with pytest.raises(ValueError, match="needs either key or keys"):
             plan.Study.model_validate(STUDY | {"factors": {"size": factor | wrong}})
 
 
 def test_the_shipped_study_is_what_it_says(tmp_path: Path) -> None:
     made = loader.load("dome_for_the_money")
     search.check(made.study)
-    first = {name: factor.at(0.5) for name, factor in made.study.factors.items()}
+    first = {name: factor.value_at(0.5) for name, factor in made.study.factors.items()}
     settings: Settings = {}
     for _, sets in first.values():
         settings |= sets
-    scene, _ = plan.resolved(made.recipe, settings)
+    scene, _ = plan.resolve_point(made.spec, settings)
     surface: Any = scene.light.surface  # type: ignore[union-attr]
     assert surface.apex_m == surface.radius_m == search.si(first["radius"][0])
     assert scene.vehicle.camera_m == (0.0, 0.0, search.si(first["lever"][0]))

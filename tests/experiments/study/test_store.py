@@ -18,11 +18,11 @@ from hypothesis import strategies as st
 from study_stores import contents, done
 
 from skysim.core.errors import InputError
-from skysim.experiments.study import loader, plan, setups, store, trials
+from skysim.experiments.study import loader, plan, store
 from skysim.experiments.study.designs import Point
-from skysim.experiments.study.execution import runner
-from skysim.experiments.study.setups import Setup
-from skysim.experiments.study.trials import Outcome, Row
+from skysim.experiments.study.execution import runner, setups, trials
+from skysim.experiments.study.execution.setups import Setup
+from skysim.experiments.study.execution.trials import Outcome, Row
 
 STUDY = """
 schema: 1
@@ -91,9 +91,7 @@ def until(path: Path, count: int) -> None:
 # One writer, however it ends.
 
 
-def test_a_writer_killed_at_any_instant_leaves_whole_batches(
-    told: plan.Plan, whole: str, tmp_path: Path
-) -> None:
+def test_a_writer_killed_at_any_instant_leaves_whole_batches(told: plan.Plan, whole: str, tmp_path: Path) -> None:
     """And a run that goes on after each of its deaths ends with the store of a run that nobody disturbed."""
     often, draw, left = tmp_path / "often.sqlite", random.Random(1), [0]
     for _ in range(6):
@@ -116,7 +114,7 @@ def test_one_run_at_a_time(told: plan.Plan, tmp_path: Path) -> None:
     pid = child(lambda: done(told, path, watch=lambda progress: time.sleep(0.05)))
     try:
         until(path, 1)
-        with pytest.raises(InputError, match="another run is writing it; allowed: one at a time") as refused:
+        with pytest.raises(InputError, match="in use by another run; allowed: one run at a time") as refused:
             done(told, path, resume=True)
         assert "\n" not in str(refused.value)
         with store.open_store(path) as kept:  # who only reads is welcome
@@ -148,7 +146,7 @@ def test_another_study_or_other_code_is_refused(
 ) -> None:
     path = tmp_path / "kept.sqlite"
     done(told, path)
-    with pytest.raises(InputError, match="120 trials are in; allowed: skysim study resume"):
+    with pytest.raises(InputError, match="contains 120 trials; allowed: skysim study resume"):
         done(told, path)
     for key, value in {"seed": "2", "replicates": "41", "set": "{light.limit_mag: 5.5}"}.items():
         with pytest.raises(InputError, match="another study"):
@@ -156,9 +154,9 @@ def test_another_study_or_other_code_is_refused(
     for key, value in {"title": "another", "responses": "[wrong]", "budget": "{time: 1 h}"}.items():
         assert done(other(told, **{key: value}), path, resume=True).now == 0
     monkeypatch.setattr(runner, "code_version", lambda: "0123456789abcdef")
-    with pytest.raises(InputError, match=r"trials were made by skysim .*, this is 0123456789abcdef"):
+    with pytest.raises(InputError, match=r"trials are of skysim .*; allowed: 0123456789abcdef"):
         done(told, path, resume=True)
-    with pytest.raises(InputError, match="nothing to resume"):
+    with pytest.raises(InputError, match="no trials to resume"):
         done(told, tmp_path / "new.sqlite", resume=True)
 
 
@@ -168,7 +166,7 @@ def test_what_is_no_store_is_refused(tmp_path: Path) -> None:
     for opened in (store.open_store, store.writing):
         with pytest.raises(InputError, match=r"text\.sqlite: .*not a database"), opened(path):
             pass
-    with pytest.raises(InputError, match="no store"), store.open_store(tmp_path / "none.sqlite"):
+    with pytest.raises(InputError, match="no such store"), store.open_store(tmp_path / "none.sqlite"):
         pass
     with pytest.raises(InputError, match="unable to open"), store.writing(taken(tmp_path)):
         pass
@@ -205,7 +203,7 @@ def test_trials_that_raise_are_rows_until_they_are_too_many(
     monkeypatch.setattr(runner, "CHUNK_S", 0.0)  # one trial a chunk
     path = tmp_path / "fragile.sqlite"
     told = other(told, paired="false")
-    seeds = [setups.seed_of(told.recipe, *divmod(trial, 40)) for trial in range(told.trials)]
+    seeds = [setups.seed_of(told.spec, *divmod(trial, 40)) for trial in range(told.trials)]
     bad = [trial for trial, seed in enumerate(seeds) if seed % 4 == 0]
     stopped = done(other(told, paired="false", budget="{failures: 3}"), path)
     assert (stopped.failed, stopped.done) == (3, bad[2] + 1)
@@ -259,7 +257,7 @@ def test_chunks_hold_every_missing_trial_once_and_in_order(data: st.DataObject) 
     points = [Point({"n": n}, {"trial.lights": n}) for n in range(first, first + count)]
     span = range(first * replicates, (first + count) * replicates)
     missing = sorted(data.draw(st.sets(st.sampled_from(span))))
-    todo, came, size = runner.Todo(points, replicates, np.array(missing, np.int64), first), [], 1
+    todo, came, size = runner.ChunkQueue(points, replicates, np.array(missing, np.int64), first), [], 1
     while chunk := todo.next():
         for point, told, number, which in chunk:
             assert told == {"trial.lights": point}
@@ -269,7 +267,7 @@ def test_chunks_hold_every_missing_trial_once_and_in_order(data: st.DataObject) 
         trials_in = sum(len(segment.replicates) for segment in chunk)
         # No more than was allowed for, but to the end of a point where points are smaller than chunks.
         assert trials_in <= size or size >= replicates > trials_in - size
-        todo.took(chunk, data.draw(st.sampled_from([1e-6, 1e-3, 0.1, 10.0])))
+        todo.report_time(chunk, data.draw(st.sampled_from([1e-6, 1e-3, 0.1, 10.0])))
         assert 1 <= todo.size <= max(2 * size, 2 * trials_in, 1)
         size = todo.size
     assert came == missing
@@ -279,11 +277,11 @@ def test_chunks_hold_every_missing_trial_once_and_in_order(data: st.DataObject) 
 def test_chunks_are_sized_by_time() -> None:
     """Trials of 10 ms: chunks double until they take CHUNK_S, and shrink as trials take longer."""
     point = [Point({}, {})]
-    todo, sizes = runner.Todo(point, 10_000, np.arange(10_000)), []
+    todo, sizes = runner.ChunkQueue(point, 10_000, np.arange(10_000)), []
     for trial_s in [0.01] * 8 + [0.1] * 2:
         chunk = todo.next()
         sizes.append(sum(len(segment.replicates) for segment in chunk))
-        todo.took(chunk, sizes[-1] * trial_s)
+        todo.report_time(chunk, sizes[-1] * trial_s)
     wanted = int(runner.CHUNK_S / 0.01)
     assert sizes[:8] == [min(2**n, wanted) for n in range(8)]
     assert sizes[9] == int(runner.CHUNK_S / 0.1)

@@ -10,7 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from skysim.core.paths import SCENES
 from skysim.core.types import Trajectory
-from skysim.experiments.study import plan, setups, trials
+from skysim.experiments.study import plan
+from skysim.experiments.study.execution import setups, trials
 from skysim.experiments.study.plan import CentroidTrial, FrameTrial, TrialSpec
 from skysim.simulation import exposure
 
@@ -20,8 +21,8 @@ DOME = TrialSpec("afit_simsat", ".", 1, {}, {"kind": "centroids"}, True)
 
 def test_a_trial_is_the_same_whatever_was_tried_before():
     settings = {"trial.false_lights": 3}
-    first = trials.work(SKY, (trials.Segment(5, settings, 500, range(0, 20)),))
-    again = trials.work(
+    first = trials.run_segments(SKY, (trials.Segment(5, settings, 500, range(0, 20)),))
+    again = trials.run_segments(
         SKY, (trials.Segment(5, settings, 513, range(13, 14)), trials.Segment(5, settings, 500, range(1)))
     )
     assert [row[:8] for row in again] == [row[:8] for row in (first[13], first[0])]
@@ -34,22 +35,22 @@ def test_pairs_of_points_share_attitude_and_noise_unless_told_otherwise():
 
 
 def test_what_a_trial_raises_is_in_its_row_with_its_seed():
-    row = trials.work(SKY, (trials.Segment(0, {"camera.focal_length": "-1 mm"}, 0, range(1)),))[0]
+    row = trials.run_segments(SKY, (trials.Segment(0, {"camera.focal_length": "-1 mm"}, 0, range(1)),))[0]
     assert row.outcome.status == "failed"
     assert row.outcome.frames == 0
     assert "camera.focal_length" in row.error
     assert row.seed == setups.seed_of(SKY, 0, 0)
 
 
-@pytest.mark.parametrize(("recipe", "key"), [(SKY, "trial.dec_deg"), (DOME, "trial.tilt_deg")])
-def test_attitudes_are_even_over_what_is_allowed(recipe, key):
+@pytest.mark.parametrize(("spec", "key"), [(SKY, "trial.dec_deg"), (DOME, "trial.tilt_deg")])
+def test_attitudes_are_even_over_what_is_allowed(spec, key):
     """Boresights by area, turns about them evenly: Kolmogorov and Smirnov's test, one in 10^4."""
-    low, high = (-60.0, 30.0) if recipe is SKY else (10.0, 30.0)
-    ready = setups.prepared_setup(recipe, {key: [low, high]})
+    low, high = (-60.0, 30.0) if spec is SKY else (10.0, 30.0)
+    ready = setups.prepared_setup(spec, {key: [low, high]})
     rng = np.random.default_rng(3)
-    drawn = Rotation.concatenate([trials.attitude(ready, rng) for _ in range(2000)])
-    if recipe is SKY:
-        boresight = drawn.apply(ready.lab.mount.cam_from_body.inv().apply([0, 0, 1]))
+    drawn = Rotation.concatenate([trials.random_attitude(ready, rng) for _ in range(2000)])
+    if spec is SKY:
+        boresight = drawn.apply(ready.testbed.mount.cam_from_body.inv().apply([0, 0, 1]))
         ends = np.sin(np.radians([low, high]))
     else:
         boresight = drawn.apply([0, 0, 1])
@@ -66,7 +67,7 @@ def test_any_turn_about_the_boresight_is_as_likely_as_another():
     """The body's x axis against the meridian through the boresight; under the dome against its own lean."""
     ready = setups.prepared_setup(DOME, {"trial.tilt_deg": 20})
     rng = np.random.default_rng(4)
-    drawn = Rotation.concatenate([trials.attitude(ready, rng) for _ in range(2000)])
+    drawn = Rotation.concatenate([trials.random_attitude(ready, rng) for _ in range(2000)])
     seen = drawn.inv().apply([0, 0, 1])
     assert np.degrees(np.arccos(seen[:, 2])) == pytest.approx(20, abs=1e-9)
     assert stats.kstest(np.arctan2(seen[:, 1], seen[:, 0]) / (2 * np.pi) % 1, "uniform").pvalue > 1e-4
@@ -74,31 +75,27 @@ def test_any_turn_about_the_boresight_is_as_likely_as_another():
 
 @pytest.mark.parametrize("angles", [(0.3, 1.1, -2.0), (3.0, 0.0, 1.0), (-1.0, math.pi, 0.2)])
 def test_three_turns_are_scipys(angles):
-    off = (
-        Rotation.from_quat(trials.zyz(*angles), scalar_first=True) * Rotation.from_euler("ZYZ", angles).inv()
-    )
+    off = Rotation.from_quat(trials.zyz(*angles), scalar_first=True) * Rotation.from_euler("ZYZ", angles).inv()
     assert off.magnitude() < 1e-14
 
 
-@pytest.mark.parametrize("recipe", [SKY, DOME])
-def test_lights_are_where_the_renderer_puts_them_and_as_bright(recipe):
+@pytest.mark.parametrize("spec", [SKY, DOME])
+def test_lights_are_where_the_renderer_puts_them_and_as_bright(spec):
     """Pixel and electrons against the truth of a rendered frame, of those lights whose whole image is on the chip."""
-    ready = setups.prepared_setup(recipe, {"background": []})
-    lab = ready.lab
-    lab_from_body = trials.attitude(ready, np.random.default_rng(5))
+    ready = setups.prepared_setup(spec, {"background": []})
+    testbed = ready.testbed
+    lab_from_body = trials.random_attitude(ready, np.random.default_rng(5))
     still = Trajectory(np.array([-1.0, 9.0]), Rotation.concatenate([lab_from_body] * 2), np.zeros((2, 3)))
-    _, truth = exposure.render_frame(replace(lab, trajectory=still), 0)
-    xy_px, electrons = trials.lights(lab, lab_from_body)
-    size_px = np.array(lab.canvas.shape[::-1])
-    inner = np.flatnonzero(((truth.seen.xy_px > 40) & (truth.seen.xy_px < size_px - 41)).all(axis=1))
+    _, truth = exposure.render_frame(replace(testbed, trajectory=still), 0)
+    xy_px, electrons = trials.visible_sources(testbed, lab_from_body)
+    size_px = np.array(testbed.canvas.shape[::-1])
+    inner = np.flatnonzero(((truth.sources.xy_px > 40) & (truth.sources.xy_px < size_px - 41)).all(axis=1))
     assert len(inner) >= 5
     for n in inner:
-        off = np.hypot(*(xy_px - truth.seen.xy_px[n]).T)
+        off = np.hypot(*(xy_px - truth.sources.xy_px[n]).T)
         assert off.min() < 1e-9
         # Patches are cut where an image is spent; PWM is lit for whole pulses or parts of one.
-        assert electrons[off.argmin()] == pytest.approx(
-            truth.seen.electrons[n], rel=0.11 if recipe is DOME else 0.01
-        )
+        assert electrons[off.argmin()] == pytest.approx(truth.sources.electrons[n], rel=0.11 if spec is DOME else 0.01)
 
 
 def test_what_is_spoilt_is_spoilt_as_told():
@@ -107,7 +104,7 @@ def test_what_is_spoilt_is_spoilt_as_told():
     trial = CentroidTrial(kind="centroids", noise_px=0.3, missing=0.25, false_share=0.5, magnitude_sigma=0.0)
     xy_px, electrons = np.full((40, 2), 300.0), np.linspace(1e5, 2e5, 40)
     rng = np.random.default_rng(6)
-    seen = [trials.spoilt(trial, xy_px, electrons, ready.lab.scene, rng) for _ in range(400)]
+    seen = [trials.simulate_detections(trial, xy_px, electrons, ready.testbed.scene, rng) for _ in range(400)]
     true = [np.hypot(*(one.xy_px - 300).T) < 3 for one in seen]
     kept = sum(int(one.sum()) for one in true)
     assert kept / (400 * 40) == pytest.approx(0.75, abs=4 * math.sqrt(0.75 * 0.25 / 16_000))
@@ -121,13 +118,15 @@ def test_what_is_spoilt_is_spoilt_as_told():
 def test_the_brightest_are_kept_where_only_so_many_may_be():
     ready = setups.prepared_setup(SKY, {})
     trial = CentroidTrial(kind="centroids", noise_px=0.0, lights=3, magnitude_sigma=0.0)
-    seen = trials.spoilt(trial, np.zeros((9, 2)), np.arange(9.0), ready.lab.scene, np.random.default_rng(1))
+    seen = trials.simulate_detections(
+        trial, np.zeros((9, 2)), np.arange(9.0), ready.testbed.scene, np.random.default_rng(1)
+    )
     assert seen.flux.tolist() == [8, 7, 6]
 
 
 def test_other_noise_leaves_the_attitude():
     told = [setups.prepared_setup(SKY, {"trial.noise_seed": n}) for n in (0, 1)]
-    (first, xy_px, seen), (again, its_px, other) = (trials.sight(ready, 12) for ready in told)
+    (first, xy_px, seen), (again, its_px, other) = (trials.simulate_centroids(ready, 12) for ready in told)
     assert (first * again.inv()).magnitude() == 0
     assert (xy_px == its_px).all()
     assert not np.array_equal(seen.xy_px, other.xy_px)
@@ -135,10 +134,8 @@ def test_other_noise_leaves_the_attitude():
 
 def test_centroid_trials_err_as_much_as_theory_says():
     """QUEST's covariance holds: mean NEES of three degrees of freedom, to five standard errors."""
-    recipe = replace(
-        SKY, base={"tracker.centroid_sigma_px": 1e-3, "light.limit_mag": 5.5, "tracker.limit_mag": 5.5}
-    )
-    rows = trials.work(recipe, (trials.Segment(0, {"trial.noise_px": 0.2}, 0, range(400)),))
+    spec = replace(SKY, base={"tracker.centroid_sigma_px": 1e-3, "light.limit_mag": 5.5, "tracker.limit_mag": 5.5})
+    rows = trials.run_segments(spec, (trials.Segment(0, {"trial.noise_px": 0.2}, 0, range(400)),))
     nees = np.array([row.outcome.nees for row in rows if row.outcome.solved and not row.outcome.wrong])
     assert len(nees) > 350
     assert nees.mean() == pytest.approx(3, abs=5 * math.sqrt(6 / len(nees)))
@@ -146,22 +143,22 @@ def test_centroid_trials_err_as_much_as_theory_says():
 
 def test_a_frame_that_turns_is_smeared_by_what_the_gyro_tells():
     """Streak length in the truth against rate times exposure, at the middle of the field."""
-    recipe = replace(SKY, trial={"kind": "frames", "rate_deg_s": 4.0, "gyro": True})
-    ready = setups.prepared_setup(recipe, {})
+    spec = replace(SKY, trial={"kind": "frames", "rate_deg_s": 4.0, "gyro": True})
+    ready = setups.prepared_setup(spec, {})
     assert isinstance(ready.trial, FrameTrial)
-    _, truth, told_px = trials.shot(ready, 77)
-    wanted = math.radians(4.0) * ready.lab.scene.exposure.time_s * ready.lab.scene.camera.focal_px
+    _, truth, told_px = trials.render_trial_frame(ready, 77)
+    wanted = math.radians(4.0) * ready.testbed.scene.exposure.time_s * ready.testbed.scene.camera.focal_px
     assert math.hypot(*told_px) == pytest.approx(wanted, rel=1e-12)
-    middle = np.argmin(np.hypot(*(truth.seen.xy_px - np.array(ready.lab.canvas.shape[::-1]) / 2).T))
-    assert truth.seen.streak_px[middle] == pytest.approx(wanted, rel=0.03)
-    came = trials.frames(ready, 77)
+    middle = np.argmin(np.hypot(*(truth.sources.xy_px - np.array(ready.testbed.canvas.shape[::-1]) / 2).T))
+    assert truth.sources.streak_px[middle] == pytest.approx(wanted, rel=0.03)
+    came = trials.run_frame_trial(ready, 77)
     assert came.frames == 1
 
 
 def test_a_flight_counts_its_frames_after_it_settled():
-    recipe = replace(DOME, base={"exposure.frames": 6}, trial={"kind": "flight", "settle": "2.1 s"})
-    ready = setups.prepared_setup(recipe, {})
-    came = trials.flight(ready, 5)
+    spec = replace(DOME, base={"exposure.frames": 6}, trial={"kind": "flight", "settle": "2.1 s"})
+    ready = setups.prepared_setup(spec, {})
+    came = trials.run_flight_trial(ready, 5)
     # 2 Hz from 1 s on: 1, 1.5 and 2 s are before.
     assert came.frames == 3
     assert came.solved == 3
@@ -174,9 +171,9 @@ def test_a_flights_filter_is_scored_at_every_tick():
         **{"vehicle.imu": {}, "filter": {"start_deg": 0.1}, "exposure.frames": 4},
         "motion.control": {"law": "pid", "feedback": "filter"},
     }
-    recipe = replace(DOME, base=told, trial={"kind": "flight"})
-    ready = setups.prepared_setup(recipe, {})
-    came = trials.flight(ready, 5)
+    spec = replace(DOME, base=told, trial={"kind": "flight"})
+    ready = setups.prepared_setup(spec, {})
+    came = trials.run_flight_trial(ready, 5)
     assert came.frames == came.solved == 4
     assert 0 < came.filter_arcsec < came.filter_worst_arcsec < 600
     assert came.availability == 1
@@ -186,10 +183,10 @@ def test_a_flights_filter_is_scored_at_every_tick():
 def test_a_bench_is_kept_and_shared_where_only_the_trial_differs():
     first = setups.prepared_setup(SKY, {"trial.noise_px": 0.1})
     other = setups.prepared_setup(SKY, {"trial.noise_px": 0.2})
-    assert first.lab is other.lab
+    assert first.testbed is other.testbed
     assert setups.prepared_setup(SKY, {"trial.noise_px": 0.1}) is first
     assert other.trial.noise_px == 0.2
-    for n in range(setups.KEPT):
+    for n in range(setups.CACHE_SIZE):
         setups.prepared_setup(SKY, {"camera.focal_length": f"{20 + n} mm"})
     assert setups.prepared_setup(SKY, {"trial.noise_px": 0.1}) is not first
 
@@ -198,12 +195,12 @@ def test_the_scenes_hash_is_of_its_values_and_of_its_files(tmp_path):
     model = tmp_path / "ship.xml"
     text = (SCENES / "vehicles" / "shefex2.xml").read_text()
     model.write_text(text)
-    told = [setups.scene_hash(plan.resolved(SKY, sets)[0]) for sets in ({}, {"camera.f_number": 1.5}, {})]
+    told = [setups.scene_hash(plan.resolve_point(SKY, sets)[0]) for sets in ({}, {"camera.f_number": 1.5}, {})]
     assert told[0] == told[2] != told[1]
     own = {"vehicle.model": str(model)}
-    first = setups.scene_hash(plan.resolved(SKY, own)[0])
+    first = setups.scene_hash(plan.resolve_point(SKY, own)[0])
     model.write_text(text.replace("<mujoco", "<!-- other --><mujoco", 1))
-    assert setups.scene_hash(plan.resolved(SKY, own)[0]) != first
+    assert setups.scene_hash(plan.resolve_point(SKY, own)[0]) != first
 
 
 def test_an_outcome_is_what_a_row_keeps():

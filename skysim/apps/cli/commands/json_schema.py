@@ -1,7 +1,7 @@
 """JSON Schema of scene and study files, for editors.
 
 The schema tells an editor which keys exist and what values they may hold. It requires only the key `schema` (the
-(version), because an editor does not know which keys come from a `base` or a preset; `skysim validate` also reports
+version), because an editor does not know which keys come from a `base` or a preset; `skysim validate` also reports
 missing keys.
 """
 
@@ -14,51 +14,51 @@ from pydantic import BaseModel
 
 from skysim.experiments.study.plan import Study
 from skysim.scene.camera import CameraConfig
-from skysim.scene.scene import STEM, Scene
+from skysim.scene.scene import NAME_ALIAS, Scene
 
 KINDS: Mapping[str, type[BaseModel]] = {"scene": Scene, "study": Study}
-BESIDE: Mapping[str, dict[str, Any]] = {  # keys that are taken out before a file is checked
-    Scene.__name__: {"base": {"type": "string", "description": "another scene, by name or beside this one"}},
+EXTRA_KEYS: Mapping[str, dict[str, Any]] = {  # keys that the loader resolves before validation
+    Scene.__name__: {"base": {"type": "string", "description": "another scene: its name, or a file beside this one"}},
     CameraConfig.__name__: {
-        "preset": {"type": "string", "description": "a file of data/cameras: what is left out is from there"},
+        "preset": {"type": "string", "description": "a file of data/cameras that supplies the missing keys"},
         "calibration": {
             "type": "string",
-            "description": "a file of OpenCV's: focal length, centre, distortion",
+            "description": "an OpenCV calibration file: focal length, center, distortion",
         },
     },
 }
-STANDARD = "https://json-schema.org/draft/2020-12/schema"
-DROPPED = ("required", "discriminator", "default")
-BOUNDS = {"ge": "minimum", "gt": "exclusiveMinimum", "le": "maximum", "lt": "exclusiveMaximum"}
+DIALECT = "https://json-schema.org/draft/2020-12/schema"
+DROPPED_KEYWORDS = ("required", "discriminator", "default")
+BOUND_KEYWORDS = {"ge": "minimum", "gt": "exclusiveMinimum", "le": "maximum", "lt": "exclusiveMaximum"}
 
 
 def json_schema(kind: str) -> dict[str, Any]:
     """The JSON Schema (draft 2020-12) of a kind of file."""
     model = KINDS[kind]
-    told = loosened(model.model_json_schema(by_alias=True), model.__name__)
-    return {"$schema": STANDARD, "title": f"A {kind} of skysim", "required": ["schema"]} | {
-        k: v for k, v in told.items() if k != "title"
+    schema = relaxed(model.model_json_schema(by_alias=True), model.__name__)
+    return {"$schema": DIALECT, "title": f"A {kind} of skysim", "required": ["schema"]} | {
+        key: value for key, value in schema.items() if key != "title"
     }
 
 
-def loosened(node: Any, name: str = "") -> Any:
+def relaxed(node: Any, name: str = "") -> Any:
     """Return the schema without required keys, defaults and discriminators; `oneOf` becomes `anyOf`.
 
-    name : of the definition that `node` is, for which BESIDE may add keys
+    name : of the definition that `node` is, for which EXTRA_KEYS may add keys
     """
     if isinstance(node, list):
-        return [loosened(one) for one in node]
+        return [relaxed(item) for item in node]
     if not isinstance(node, dict):
         return node
-    kept: dict[str, Any] = {}
+    relaxed_node: dict[str, Any] = {}
     for key, value in node.items():
         if key == "properties":
-            told = {one: loosened(of) for one, of in value.items() if one != STEM}
-            kept[key] = told | BESIDE.get(name, {})
+            properties = {key_name: relaxed(child) for key_name, child in value.items() if key_name != NAME_ALIAS}
+            relaxed_node[key] = properties | EXTRA_KEYS.get(name, {})
         elif key == "$defs":
-            kept[key] = {one: loosened(of, one) for one, of in value.items()}
-        elif key in BOUNDS:  # pydantic's keyword remains where a validator precedes the bound
-            kept |= {BOUNDS[key]: value} if node.get("type") in ("number", "integer") else {}
-        elif key not in DROPPED and (key != "title" or name):
-            kept["anyOf" if key == "oneOf" else key] = loosened(value)
-    return kept
+            relaxed_node[key] = {key_name: relaxed(child, key_name) for key_name, child in value.items()}
+        elif key in BOUND_KEYWORDS:  # pydantic's keyword remains where a validator precedes the bound
+            relaxed_node |= {BOUND_KEYWORDS[key]: value} if node.get("type") in ("number", "integer") else {}
+        elif key not in DROPPED_KEYWORDS and (key != "title" or name):
+            relaxed_node["anyOf" if key == "oneOf" else key] = relaxed(value)
+    return relaxed_node

@@ -7,61 +7,65 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from skysim.apps.cli.options import Json
 from skysim.apps.cli.terminal import colored, print_table, progress_callback
 
 if TYPE_CHECKING:
     from rich.text import Text
 
     from skysim.experiments.papers.compare import Reproduction
-    from skysim.experiments.papers.page import Told
+    from skysim.experiments.papers.page import CommandArguments
 
-INK = {"agrees": "green", "explained": "yellow", "disagrees": "bold red"}
+VERDICT_COLORS = {"agrees": "green", "explained": "yellow", "disagrees": "bold red"}
 
 
 def reproduce(
     ids: Annotated[
-        list[str] | None, typer.Argument(metavar="ID|all", help="Experiments; lists them if left out.")
+        list[str] | None, typer.Argument(metavar="ID|all", help="Experiments, or all; default: list them.")
     ] = None,
-    quick: Annotated[bool, typer.Option("--quick", help="Fewer trials, wider intervals.")] = False,
-    seed: Annotated[int, typer.Option(help="Of all random streams: the same seed, the same numbers.")] = 1,
-    report: Annotated[
-        bool, typer.Option("--report", help="Also one HTML page with the papers' figures.")
-    ] = False,
+    quick: Annotated[bool, typer.Option("--quick", help="Run fewer trials; the intervals are wider.")] = False,
+    seed: Annotated[int, typer.Option(help="Seed of all random streams.")] = 1,
+    report: Annotated[bool, typer.Option("--report", help="Also write an HTML page with the papers' figures.")] = False,
     out: Annotated[Path, typer.Option(help="Folder for the report.")] = Path("out/reproduce"),
     markdown: Annotated[
         Path | None,
-        typer.Option(help="Also a page of Markdown with its pictures beside it, as docs/findings/papers.md."),
+        typer.Option(help="Also write a Markdown page with its images beside it, as docs/findings/papers.md."),
     ] = None,
-    json: Annotated[bool, typer.Option("--json", help="Print JSON for machines instead of tables.")] = False,
+    json: Json = False,
 ) -> None:
     """Repeat the experiments of papers and compare the published numbers with ours."""
     from skysim.core import files
 
     if not ids:
-        listing(json)
+        print_list(json)
         return
     from skysim.experiments.papers import page
-    from skysim.experiments.papers.compare import Ask
-    from skysim.experiments.papers.registry import named
-    from skysim.experiments.papers.registry import reproduce as do
+    from skysim.experiments.papers.compare import ExperimentOptions
+    from skysim.experiments.papers.registry import check_ids
+    from skysim.experiments.papers.registry import reproduce as reproduce_one
 
-    done = []
-    for id in named(ids):
+    reproductions = []
+    for id in check_ids(ids):
         with progress_callback(id, quiet=json) as watch:
-            done.append(do(id, Ask(quick, seed, watch)))
+            reproductions.append(reproduce_one(id, ExperimentOptions(quick, seed, watch)))
         if not json:
-            show(done[-1])
-    told = page.Told(tuple(ids), quick, seed)
-    written = pages(done, told, out if report else None, markdown)
+            print_reproduction(reproductions[-1])
+    command_options = page.CommandArguments(tuple(ids), quick, seed)
+    written = write_pages(reproductions, command_options, out if report else None, markdown)
     if json:
-        print(files.to_json([line.as_dict() for one in done for line in one.lines]))
+        print(files.to_json([line.as_dict() for result in reproductions for line in result.comparisons]))
         return
-    summed(done)
+    print_verdict_counts(reproductions)
     for path in written:
         print(path)
 
 
-def pages(done: list[Reproduction], told: Told, out: Path | None, markdown: Path | None) -> list[Path]:
+def write_pages(
+    reproductions: list[Reproduction],
+    command_options: CommandArguments,
+    out: Path | None,
+    markdown: Path | None,
+) -> list[Path]:
     """Write the requested pages (HTML in folder `out`, Markdown to a file) and return their paths."""
     from skysim.core import files
     from skysim.experiments.papers import page
@@ -69,52 +73,54 @@ def pages(done: list[Reproduction], told: Told, out: Path | None, markdown: Path
     written = []
     if out:
         written.append(files.make_folder(out) / "report.html")
-        page.write_html(written[-1], done, told)
+        page.write_html(written[-1], reproductions, command_options)
     if markdown:
         files.make_folder(markdown.parent)
         written.append(markdown)
-        page.write_markdown(markdown, done, told)
+        page.write_markdown(markdown, reproductions, command_options)
     return written
 
 
-def listing(json: bool) -> None:
+def print_list(json: bool) -> None:
     """Print the identifiers and titles of all experiments."""
     from skysim.core import files
     from skysim.experiments.papers.published import experiments
 
-    listed = [{"id": id, "title": one.title, "source": one.source} for id, one in experiments().items()]
+    entries = [
+        {"id": id, "title": published.title, "source": published.source} for id, published in experiments().items()
+    ]
     if json:
-        print(files.to_json(listed))
+        print(files.to_json(entries))
         return
-    for entry in listed:
+    for entry in entries:
         print(f"{entry['id']:20s} {entry['title']}")
 
 
-def show(one: Reproduction) -> None:
+def print_reproduction(reproduction: Reproduction) -> None:
     """Print an experiment's table, with notes on the rows that disagree or have a weakness."""
-    from skysim.experiments.papers.compare import number, stated
+    from skysim.experiments.papers.compare import format_published, format_summary
 
-    heads = ["what", "published", "ours", "verdict"]
+    headers = ["what", "published", "ours", "verdict"]
     lines: list[list[str | Text]] = [
         [
             line.row.quantity,
-            stated(line.row),
-            number(line.answer.ours),
-            colored(line.verdict, INK[line.verdict]),
+            format_published(line.row),
+            format_summary(line.result.ours),
+            colored(line.verdict, VERDICT_COLORS[line.verdict]),
         ]
-        for line in one.lines
+        for line in reproduction.comparisons
     ]
-    print_table(
-        f"{one.id}: {one.published.title} ({one.published.source}), {one.seconds:.1f} s", heads, lines
-    )
-    for line in one.lines:
+    published = reproduction.published
+    title = f"{reproduction.id}: {published.title} ({published.source}), {reproduction.seconds:.1f} s"
+    print_table(title, headers, lines)
+    for line in reproduction.comparisons:
         if line.verdict != "agrees" or line.weakness:
-            print(f"  {line.row.quantity}: {line.note or 'no cause found'}")
+            print(f"  {line.row.quantity}: {line.note or 'cause unknown'}")
     print()
 
 
-def summed(done: list[Reproduction]) -> None:
+def print_verdict_counts(reproductions: list[Reproduction]) -> None:
     """Print the number of rows with each verdict."""
-    from skysim.experiments.papers.page import counts
+    from skysim.experiments.papers.page import total_counts
 
-    print(", ".join(f"{count} {kind}" for kind, count in counts(done).items()))
+    print(", ".join(f"{count} {kind}" for kind, count in total_counts(reproductions).items()))

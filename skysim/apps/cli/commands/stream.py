@@ -4,123 +4,124 @@ from __future__ import annotations
 
 import signal
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from skysim.apps.cli.options import Frames, Json, Overrides, SceneArg, Seed, load
 from skysim.core.errors import InputError
 
 if TYPE_CHECKING:
+    from skysim.apps.stream.http import FrameHub
     from skysim.apps.stream.sinks import Sink
 
 
 def stream(
-    scene: Annotated[
-        str, typer.Argument(metavar="SCENE", help="A scene file (.yaml) or the name of one in scenes/.")
-    ],
+    scene: SceneArg,
     folder: Annotated[
-        Path | None, typer.Option(help="Into a folder: PNG of 16 bits and JSON a frame.")
+        Path | None, typer.Option(help="Write frames to a folder: a 16-bit PNG and a JSON file per frame.")
     ] = None,
     http: Annotated[
         int | None,
-        typer.Option(min=0, max=65535, help="Serve MJPEG and packets on this port; 0 takes a free one."),
+        typer.Option(min=0, max=65535, help="Serve MJPEG and packets on this port; 0: any free port."),
     ] = None,
-    host: Annotated[
-        str, typer.Option(help="Address to serve on; anybody who reaches it may watch.")
-    ] = "127.0.0.1",
+    host: Annotated[str, typer.Option(help="Address to serve on, without access control.")] = "127.0.0.1",
     pipe: Annotated[
         str | None,
-        typer.Option(help="Packets (a line of JSON, then pixels) to a named pipe, or - for standard output."),
+        typer.Option(help="Write packets (a line of JSON, then pixels) to a named pipe; -: to standard output."),
     ] = None,
-    frames: Annotated[
-        int | None, typer.Option(min=1, help="How many; the scene's own number if left out.")
-    ] = None,
+    frames: Frames = None,
     endless: Annotated[
-        bool,
-        typer.Option("--endless", help="Until Ctrl-C, however long; without it a day at most."),
+        bool, typer.Option("--endless", help="Stream until Ctrl-C. Otherwise a stream lasts one day at most.")
     ] = False,
-    speed: Annotated[
-        float,
-        typer.Option(min=0, max=1000, help="So many times real time; 0: as fast as frames can be made."),
-    ] = 1.0,
-    seed: Annotated[
-        int | None, typer.Option(help="Of all random streams; the scene's own if left out.")
-    ] = None,
-    set_: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="KEY=VALUE", help="Override a key: exposure.rate_hz=10."),
-    ] = None,
-    json: Annotated[bool, typer.Option("--json", help="Print the tallies as JSON.")] = False,
+    speed: Annotated[float, typer.Option(min=0, max=1000, help="Multiple of real time; 0: as fast as possible.")] = 1.0,
+    seed: Seed = None,
+    set_: Overrides = None,
+    json: Json = False,
 ) -> None:
     """Stream a scene's frames in real time, for hardware or a processor in the loop."""
-    from skysim.apps.stream import http as http_server
-    from skysim.apps.stream import sender, sinks
+    from skysim.apps.stream import sender
     from skysim.apps.stream.pacing import Pace
-    from skysim.apps.stream.sinks import GONE
+    from skysim.apps.stream.sinks import READER_GONE
     from skysim.core import files
-    from skysim.core.yaml_reader import parse_overrides
-    from skysim.scene.loader import load
-    from skysim.simulation import testbed
+    from skysim.simulation.testbed import build_testbed
 
     if folder is None and http is None and pipe is None:
-        raise InputError("skysim stream: give where to: --folder DIR, --http PORT or --pipe PATH")
+        raise InputError("skysim stream: no output; give --folder DIR, --http PORT or --pipe PATH")
     if endless and frames is not None:
         raise InputError("skysim stream: give either --frames N or --endless")
-    told = parse_overrides(set_) | ({"seed": str(seed)} if seed is not None else {})
-    told |= {"exposure.frames": str(frames)} if frames is not None else {}
-    lab = replace(testbed.build_testbed(load(scene, told)), endless=endless)
-    takers: list[Sink] = []
+    testbed = replace(build_testbed(load(scene, frames, seed, set_)), endless=endless)
+    sinks = open_sinks(folder, pipe)
+    stats, pace = sender.SenderStats(), Pace(speed, testbed.scene.exposure.rate_hz)
+    with serving(http, host, lambda: stats.statistics(sinks)) as hub:
+        before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+        try:
+            sender.send(testbed, pace, sinks, stats, hub.publish if hub else None)
+        except KeyboardInterrupt:
+            print(file=sys.stderr)
+        finally:
+            signal.signal(signal.SIGTERM, before)
+            for sink in sinks:
+                sink.close()
+    statistics = stats.statistics(sinks) | (hub.counters() if hub else {})
+    output = sys.stderr if pipe == "-" else sys.stdout
+    print(files.to_json(statistics) if json else summary(statistics), file=output)
+    for sink in sinks:
+        if sink.fault not in ("", READER_GONE):
+            raise InputError(f"--{sink.name}: {sink.fault}")
+
+
+def open_sinks(folder: Path | None, pipe: str | None) -> list[Sink]:
+    """The sinks for --folder and --pipe. Raises InputError."""
+    from skysim.apps.stream import sinks
+
+    opened = []
     if folder is not None:
-        takers.append(sinks.Sink("folder", sinks.folder(folder)))
+        opened.append(sinks.Sink("folder", sinks.folder_writer(folder)))
     if pipe is not None:
-        takers.append(sinks.Sink("pipe", sinks.pipe(pipe)))
-    tally, pace = sender.Tally(), Pace(speed, lab.scene.exposure.rate_hz)
-    board = http_server.Board(lambda: tally.figures(takers)) if http is not None else None
-    server = http_server.served(board, host, http) if board and http is not None else None
-    if server:
-        print(
-            f"skysim stream: http://{host}:{server.server_port}/   (Ctrl-C ends it)",
-            file=sys.stderr,
-            flush=True,
-        )
-    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+        opened.append(sinks.Sink("pipe", sinks.pipe_writer(pipe)))
+    return opened
+
+
+@contextmanager
+def serving(port: int | None, host: str, status: Any) -> Iterator[FrameHub | None]:
+    """Serve a frame hub over HTTP within this context; yields None without a port. Raises InputError."""
+    from skysim.apps.stream.http import FrameHub, start_server
+
+    if port is None:
+        yield None
+        return
+    hub = FrameHub(status)
+    server = start_server(hub, host, port)
+    address = f"http://{host}:{server.server_port}/"
+    print(f"skysim stream: {address}   (Ctrl-C ends it)", file=sys.stderr, flush=True)
     try:
-        sender.send(lab, pace, takers, tally, board.post if board else None)
-    except KeyboardInterrupt:
-        print(file=sys.stderr)
+        yield hub
     finally:
-        signal.signal(signal.SIGTERM, before)
-        for taker in takers:
-            taker.close()
-        if board and server:
-            board.end()
-            server.shutdown()
-    figures = tally.figures(takers) | (board.tallies() if board else {})
-    where = sys.stderr if pipe == "-" else sys.stdout
-    print(files.to_json(figures) if json else summary(figures), file=where)
-    for taker in takers:
-        if taker.fault not in ("", GONE):
-            raise InputError(f"--{taker.name}: {taker.fault}")
+        hub.finish()
+        server.shutdown()
 
 
-def summary(figures: dict[str, Any]) -> str:
-    """Text summary of the frames made, sent and dropped."""
+def summary(statistics: dict[str, Any]) -> str:
+    """Text summary of the frames rendered, sent and dropped."""
     lines = [
-        f"{figures['made']} frames, {figures['dropped']} left out for want of time; late by a median of"
-        f" {figures['late_ms_median']:.1f} ms, p99 {figures['late_ms_p99']:.1f}, worst {figures['late_ms_worst']:.1f}"
+        f"{statistics['made']} frames rendered, {statistics['dropped']} dropped; delay: median"
+        f" {statistics['late_ms_median']:.1f} ms, p99 {statistics['late_ms_p99']:.1f} ms,"
+        f" worst {statistics['late_ms_worst']:.1f} ms"
     ]
-    for name, one in figures["sinks"].items():
-        lines.append(
-            f"{name}: {one['sent']} sent, {one['dropped']} left out"
-            + (f"; {one['fault']}" if one["fault"] else "")
-        )
-    before = figures.get("earlier_clients", {"clients": 0})
-    if before["clients"]:
-        lines.append(
-            f"{before['clients']} earlier clients: {before['sent']} sent, {before['dropped']} left out"
-        )
-    for n, one in enumerate(figures.get("clients", [])):
-        lines.append(f"client {before['clients'] + n + 1}: {one['sent']} sent, {one['dropped']} left out")
+    for name, sink in statistics["sinks"].items():
+        lines.append(counts(name, sink) + (f"; {sink['fault']}" if sink["fault"] else ""))
+    earlier = statistics.get("earlier_clients", {"clients": 0})
+    if earlier["clients"]:
+        lines.append(counts(f"{earlier['clients']} earlier clients", earlier))
+    for number, client in enumerate(statistics.get("clients", []), earlier["clients"] + 1):
+        lines.append(counts(f"client {number}", client))
     return "\n".join(lines)
+
+
+def counts(receiver: str, counters: dict[str, Any]) -> str:
+    return f"{receiver}: {counters['sent']} sent, {counters['dropped']} dropped"

@@ -5,48 +5,36 @@ from __future__ import annotations
 import shlex
 import signal
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import AbstractContextManager, closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from skysim.apps.cli.terminal import print_error, print_table, print_titles, trial_progress
-from skysim.core.errors import InputError, printable
+from skysim.apps.cli.options import Json, Out, Overrides, Programs, output_folder
+from skysim.apps.cli.study_summary import (
+    print_points,
+    print_replay,
+    print_study_status,
+    study_status,
+    trial_count,
+)
+from skysim.apps.cli.terminal import print_error, print_titles, trial_progress
+from skysim.core.errors import InputError, printable, unknown_name
 
 if TYPE_CHECKING:
     from skysim.experiments.study.execution.engines import Engine
     from skysim.experiments.study.plan import Plan
     from skysim.experiments.study.store import Store
 
-app = typer.Typer(
-    invoke_without_command=True, help="Many trials of a scene whose fields vary, answered with error bars."
-)
+app = typer.Typer(invoke_without_command=True, help="Run Monte Carlo studies: many trials of a scene with varied keys.")
 
 StudyArg = Annotated[
-    str, typer.Argument(metavar="STUDY", help="A study file (.yaml) or the name of one in scenes/studies/.")
+    str, typer.Argument(metavar="STUDY", help="Study file (.yaml), or name of a study in scenes/studies/.")
 ]
-
-Out = Annotated[Path | None, typer.Option(help="Folder of the store and the report; out/NAME if left out.")]
-
-Workers = Annotated[
-    int | None, typer.Option(min=1, help="Processes; as many as there are cores if left out.")
-]
-
-EngineName = Annotated[str, typer.Option("--engine", help="pool, serial or dask.")]
-
-Scheduler = Annotated[str, typer.Option(help="Address of a Dask scheduler, tcp://HOST:PORT.")]
-
-Sets = Annotated[
-    list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override a key: replicates=100.")
-]
-
-Programs = Annotated[
-    list[str] | None,
-    typer.Option("--program", metavar="NAME=COMMAND", help="A tracker that the study may name."),
-]
-
-Json = Annotated[bool, typer.Option("--json", help="Print JSON for machines instead of a table.")]
+Workers = Annotated[int | None, typer.Option(min=1, help="Number of worker processes; default: number of cores.")]
+EngineName = Annotated[str, typer.Option("--engine", help="How trials are run: pool, serial or dask.")]
+Scheduler = Annotated[str, typer.Option(help="Address of the Dask scheduler, tcp://HOST:PORT.")]
 
 
 @app.callback()
@@ -67,21 +55,12 @@ def run(
     workers: Workers = None,
     engine: EngineName = "pool",
     scheduler: Scheduler = "",
-    set_: Sets = None,
+    set_: Overrides = None,
     program: Programs = None,
     json: Json = False,
 ) -> None:
     """Run all trials of a study and write its report. After Ctrl-C, `resume` continues."""
-    warmed(engine)
-    from skysim.core.yaml_reader import parse_overrides
-    from skysim.experiments.study import loader
-    from skysim.tracking.external import process
-
-    overrides = parse_overrides(set_)
-    told = loader.load(study, overrides, process.named(program))
-    if told.study.optimise is not None:
-        raise InputError(f"{told.path}: optimise: has no design to run; allowed: skysim study optimise")
-    done(told, study, out, engine_of(engine, workers, scheduler), overrides, json)
+    run_new(study, out, engine, workers, scheduler, set_, program, json, search=False)
 
 
 @app.command()
@@ -91,30 +70,30 @@ def resume(
     workers: Workers = None,
     engine: EngineName = "pool",
     scheduler: Scheduler = "",
-    failed: Annotated[bool, typer.Option("--failed", help="Also do again the trials that failed.")] = False,
+    failed: Annotated[bool, typer.Option("--failed", help="Repeat failed trials too.")] = False,
     program: Programs = None,
     json: Json = False,
 ) -> None:
     """Continue a study or a search that was stopped or killed, or that used up its budget."""
-    warmed(engine)
-    told, overrides = planned(study, out, program or [])
-    done(told, study, out, engine_of(engine, workers, scheduler), overrides, json, again=True, failed=failed)
+    start_workers(engine)
+    plan, overrides = load_stored_plan(study, out, program or [])
+    trial_engine = create_engine(engine, workers, scheduler)
+    run_and_report(plan, study, out, trial_engine, overrides, json, resumed=True, repeat_failed=failed)
 
 
 @app.command()
 def status(study: StudyArg, out: Out = None, json: Json = False) -> None:
     """Show the progress of a study, while it runs or after."""
     from skysim.core import files
-    from skysim.experiments.study import store
 
-    (told, _), folder = planned(study, out), folder_of(study, out)
-    with store.open_store(folder / store.STORE) as kept:
-        figures = facts(told, kept)
-        failures = [{"trial": trial, "error": error} for trial, error in kept.failures()[:10]]
+    plan, _ = load_stored_plan(study, out)
+    with open_store(study, out) as stored:
+        progress = study_status(plan, stored)
+        failures = [{"trial": trial, "error": error} for trial, error in stored.failures()[:10]]
     if json:
-        print(files.to_json(figures | {"failures": failures}))
+        print(files.to_json(progress | {"failures": failures}))
         return
-    print_facts(figures)
+    print_study_status(progress)
     for failure in failures:
         print(f"  trial {failure['trial']}: {printable(failure['error'])}")
 
@@ -122,8 +101,8 @@ def status(study: StudyArg, out: Out = None, json: Json = False) -> None:
 @app.command()
 def report(study: StudyArg, out: Out = None, json: Json = False) -> None:
     """Write the report of a study, finished or not, and print its table."""
-    told, overrides = planned(study, out)
-    reported(told, study, out, overrides, json)
+    plan, overrides = load_stored_plan(study, out)
+    write_report(plan, study, out, overrides, json)
 
 
 @app.command()
@@ -131,18 +110,19 @@ def export(
     study: StudyArg,
     to: Annotated[
         list[Path],
-        typer.Argument(metavar="FILES", help="Files: .csv, .parquet (a row a trial), .zarr (the responses)."),
+        typer.Argument(
+            metavar="FILES", help="Output files: .csv or .parquet (a row per trial), .zarr (the responses)."
+        ),
     ],
     out: Out = None,
 ) -> None:
     """Write a study's results for other tools."""
-    from skysim.experiments.study import store
-    from skysim.experiments.study.report import export as exporting
+    from skysim.experiments.study.report import export as study_export
 
-    (told, _), folder = planned(study, out), folder_of(study, out)
-    with store.open_store(folder / store.STORE) as kept:
+    plan, _ = load_stored_plan(study, out)
+    with open_store(study, out) as stored:
         for path in to:
-            exporting.export(kept, told.study.responses, path)
+            study_export.export(stored, plan.study.responses, path)
             print(path)
 
 
@@ -150,256 +130,213 @@ def export(
 def replay(
     study: StudyArg,
     trial: Annotated[
-        int, typer.Argument(metavar="TRIAL", help="The trial's number, as report and status give it.")
+        int, typer.Argument(metavar="TRIAL", help="Number of the trial, as in the report and in `status`.")
     ],
     out: Out = None,
-    show: Annotated[bool, typer.Option("--open/--no-open", help="Open the first picture.")] = False,
+    show: Annotated[bool, typer.Option("--open/--no-open", help="Open the first image.")] = False,
     program: Programs = None,
     json: Json = False,
 ) -> None:
-    """Repeat one trial alone and write its frames."""
+    """Repeat one trial and write its frames."""
     from skysim.core import files
-    from skysim.experiments.study import store
-    from skysim.experiments.study.execution import replay as replaying
+    from skysim.experiments.study.execution import replay as execution
 
-    (told, _), folder = planned(study, out, program or []), folder_of(study, out)
-    with store.open_store(folder / store.STORE) as kept:
-        again = replaying.replay(told, kept, trial, folder / f"trial_{trial}")
-    row = again.row
-    figures: dict[str, Any] = {
+    plan, _ = load_stored_plan(study, out, program or [])
+    with open_store(study, out) as stored:
+        repeated = execution.replay(plan, stored, trial, folder_of(study, out) / f"trial_{trial}")
+    row = repeated.row
+    result: dict[str, Any] = {
         "trial": trial,
         "point": row.point,
         "replicate": row.replicate,
         "seed": row.seed,
+        **{name: getattr(row.outcome, name) for name in row.outcome.__slots__},
+        "changed": repeated.changed,
+        "error": row.error,
+        "files": list(map(str, repeated.files)),
+        "pictures": list(map(str, repeated.pictures)),
     }
-    figures |= {name: getattr(row.outcome, name) for name in row.outcome.__slots__}
-    figures |= {"changed": again.changed, "error": row.error}
-    figures |= {"files": list(map(str, again.files)), "pictures": list(map(str, again.pictures))}
     if json:
-        print(files.to_json(figures))
+        print(files.to_json(result))
     else:
-        print_replay(figures)
-    if show and again.pictures:
-        typer.launch(str(again.pictures[0]))
+        print_replay(result)
+    if show and repeated.pictures:
+        typer.launch(str(repeated.pictures[0]))
 
 
 @app.command()
-def optimise(
+def optimize(
     study: StudyArg,
     out: Out = None,
     workers: Workers = None,
     engine: EngineName = "pool",
     scheduler: Scheduler = "",
-    set_: Sets = None,
+    set_: Overrides = None,
     program: Programs = None,
     json: Json = False,
 ) -> None:
     """Search a study's factors for the best point, or the Pareto front of two objectives. `resume` continues it."""
-    warmed(engine)
+    run_new(study, out, engine, workers, scheduler, set_, program, json, search=True)
+
+
+def run_new(
+    study: str,
+    out: Path | None,
+    engine: str,
+    workers: int | None,
+    scheduler: str,
+    set_: list[str] | None,
+    program: list[str] | None,
+    json: bool,
+    *,
+    search: bool,
+) -> None:
+    """Run a study, or a search if `search`, that has no store yet. Raises InputError if it is of the other kind."""
+    start_workers(engine)
     from skysim.core.yaml_reader import parse_overrides
     from skysim.experiments.study import loader
     from skysim.tracking.external import process
 
     overrides = parse_overrides(set_)
-    told = loader.load(study, overrides, process.named(program))
-    if told.study.optimise is None:
-        raise InputError(
-            f"{told.path}: optimise: missing; allowed: skysim study run, for a study with a design"
-        )
-    done(told, study, out, engine_of(engine, workers, scheduler), overrides, json)
+    plan = loader.load(study, overrides, process.program_commands(program))
+    if search and plan.study.optimize is None:
+        raise InputError(f"{plan.path}: has no key optimize; allowed: skysim study run")
+    if not search and plan.study.optimize is not None:
+        raise InputError(f"{plan.path}: has the key optimize; allowed: skysim study optimize")
+    run_and_report(plan, study, out, create_engine(engine, workers, scheduler), overrides, json)
 
 
-def done(
-    told: Plan,
+def run_and_report(
+    plan: Plan,
     study: str,
     out: Path | None,
     engine: Engine,
     overrides: dict[str, str],
     json: bool,
-    again: bool = False,
-    failed: bool = False,
+    resumed: bool = False,
+    repeat_failed: bool = False,
 ) -> None:
     """Run the missing trials of a study or a search with a progress bar, then report.
 
-    again  : the store may hold trials already
-    failed : repeat the failed trials too
+    resumed       : the store may hold trials already
+    repeat_failed : repeat the failed trials too
     """
     from skysim.experiments.study import store
     from skysim.experiments.study.analysis import search
     from skysim.experiments.study.execution import runner
 
-    on = command(study, out, "resume")
-    with store.writing(folder_of(study, out) / store.STORE) as kept, stoppable(on, kept), closing(engine):
-        runner.begin(told, kept, again, overrides)
-        if failed:
-            kept.forget_failed()
-        with trial_progress(told.study.title, total(told)) as watch:
-            if told.study.optimise is not None:
-                whole = search.search(told, kept, engine, watch).finished
+    path, total = folder_of(study, out) / store.STORE, trial_count(plan)
+    resume_command = command(study, out, "resume")
+    with store.writing(path) as stored, interruptible(resume_command, stored), closing(engine):
+        runner.prepare_store(plan, stored, resumed, overrides)
+        if repeat_failed:
+            stored.delete_failed()
+        with trial_progress(plan.study.title, total) as update:
+            if plan.study.optimize is not None:
+                finished = search.search(plan, stored, engine, update).finished
             else:
-                progress = runner.run(told, kept, engine, watch)
-                whole = progress.done == progress.trials
-        counts = kept.counts()
-    if not whole:
-        print_error(f"{counts['done']} of {total(told)} trials done within the budget; {on} goes on")
+                progress = runner.run(plan, stored, engine, update)
+                finished = progress.done == progress.trials
+        counts = stored.counts()
+    if not finished:
+        print_error(f"{counts['done']} of {total} trials done within the budget; continue: {resume_command}")
     if counts["failed"]:
-        print_error(f"{counts['failed']} trials failed; {command(study, out, 'status')} names them")
-    reported(told, study, out, overrides, json)
-
-
-def total(told: Plan) -> int:
-    """Total number of trials of a study or a search."""
-    return told.study.replicates * (
-        told.study.optimise.candidates if told.study.optimise else len(told.points)
-    )
+        print_error(f"{counts['failed']} trials failed; list them: {command(study, out, 'status')}")
+    write_report(plan, study, out, overrides, json)
 
 
 @contextmanager
-def stoppable(on: str, kept: Store) -> Iterator[None]:
-    """Within this context Ctrl-C and SIGTERM print `on`, the command that continues the run, and end it."""
-
-    def stop(*_: Any) -> None:
-        raise KeyboardInterrupt
-
-    before = signal.signal(signal.SIGTERM, stop)
+def interruptible(resume_command: str, stored: Store) -> Iterator[None]:
+    """Within this context Ctrl-C and SIGTERM print the command that continues the run, and end it."""
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         yield
     except KeyboardInterrupt:
-        print_error(f"{kept.counts()['done']} trials are in; {on} goes on")
+        print_error(f"{stored.counts()['done']} trials are stored; continue: {resume_command}")
         raise
     finally:
         signal.signal(signal.SIGTERM, before)
 
 
-def reported(told: Plan, study: str, out: Path | None, overrides: dict[str, str], json: bool) -> None:
+def write_report(plan: Plan, study: str, out: Path | None, overrides: dict[str, str], json: bool) -> None:
     """Write the HTML report and print the table of results."""
     from skysim.core import files
-    from skysim.experiments.study import store
     from skysim.experiments.study.analysis import table
     from skysim.experiments.study.report import page
 
-    folder = folder_of(study, out)
-    path, verb = folder / "report.html", "optimise" if told.study.optimise else "run"
-    with store.open_store(folder / store.STORE) as kept:
-        repeat = command(study, out, verb, overrides)
-        lines = table.table(kept, page.responses(told.study))
-        page.write_page(path, kept, told.study, repeat, lines, **findings(told, kept))
-        lines = table.asked(lines, told.study.responses)
-        figures = facts(told, kept)
+    path = folder_of(study, out) / "report.html"
+    with open_store(study, out) as stored:
+        repeat = command(study, out, "optimize" if plan.study.optimize else "run", overrides)
+        lines = table.table(stored, page.responses(plan.study))
+        page.write_page(path, stored, plan.study, repeat, lines, **analysis(plan, stored))
+        lines = table.select_responses(lines, plan.study.responses)
+        progress = study_status(plan, stored)
     if json:
-        print(files.to_json(figures | {"report": str(path), "points": table.flat(lines)}))
+        print(files.to_json(progress | {"report": str(path), "points": table.to_columns(lines)}))
         return
-    heads, cells = table.cells(lines)
-    print_table("", heads, cells[:MOST_LINES])
-    if len(cells) > MOST_LINES:
-        print(f"and {len(cells) - MOST_LINES} points more, in the report")
-    print_facts(figures)
+    print_points(*table.cells(lines))
+    print_study_status(progress)
     print(f"report: {path}")
 
 
-def findings(told: Plan, kept: Store) -> dict[str, Any]:
+def analysis(plan: Plan, stored: Store) -> dict[str, Any]:
     """Extra content of the report: Sobol indices, or a search's Pareto front and the cost of each candidate."""
     from skysim.experiments.study.analysis import search, sensitivity
 
-    if told.study.optimise is not None:
-        found = search.found(told, kept)
-        costs = {one.number: one.cost for one in found.candidates}
-        return {"front": [one.number for one in found.front], "costs": costs}
-    return {"indices": sensitivity.indices(told, kept)} if told.study.design.kind == "saltelli" else {}
+    if plan.study.optimize is not None:
+        result = search.collect_result(plan, stored)
+        costs = {candidate.number: candidate.cost for candidate in result.candidates}
+        return {"front": [candidate.number for candidate in result.front], "costs": costs}
+    return {"indices": sensitivity.indices(plan, stored)} if plan.study.design.kind == "saltelli" else {}
 
 
-MOST_LINES = 60  # printed of a table; the report has all
-
-
-def facts(told: Plan, kept: Store) -> dict[str, Any]:
-    """Progress and provenance of a study: trial counts, code version, run time and store."""
-    counts, trials = kept.counts(), total(told)
-    return {
-        "study": told.name,
-        "title": told.study.title,
-        "trials": trials,
-        **counts,
-        "code": kept.meta("code"),
-        "seconds": sum(run["seconds"] for run in kept.runs()),
-        "store": str(kept.path),
-    }
-
-
-def print_facts(figures: dict[str, Any]) -> None:
-    rate = figures["done"] / figures["seconds"] if figures["seconds"] else 0.0
-    print(
-        f"{printable(figures['title'])}: {figures['done']} of {figures['trials']} trials, {figures['failed']} failed,"
-        f" {figures['wrong']} wrong attitudes; {figures['seconds']:.1f} s, {rate:.0f} a second\n"
-        f"store: {figures['store']} (code {figures['code']})"
-    )
-
-
-def print_replay(figures: dict[str, Any]) -> None:
-    for name in (
-        "trial",
-        "point",
-        "replicate",
-        "seed",
-        "status",
-        "x_arcsec",
-        "y_arcsec",
-        "roll_arcsec",
-        "stars",
-        "matched",
-    ):
-        print(f"{name:12s} {figures[name]}")
-    if figures["changed"]:
-        print_error(f"differs from the store in {', '.join(figures['changed'])}: made with other code")
-    if figures["error"]:
-        print(figures["error"])
-    for path in figures["pictures"][:10]:
-        print(path)
-
-
-def planned(study: str, out: Path | None, program: list[str] | None = None) -> tuple[Plan, dict[str, str]]:
+def load_stored_plan(study: str, out: Path | None, program: list[str] | None = None) -> tuple[Plan, dict[str, str]]:
     """Load the study with the overrides saved in its store; return the plan and the overrides.
 
     program : external trackers of the command line; None if no trial will be run
 
     Raises InputError if the store holds another study, or this one before it was changed.
     """
-    from skysim.experiments.study import loader, store
+    from skysim.experiments.study import loader
     from skysim.tracking.external import process
 
-    path = folder_of(study, out) / store.STORE
-    with store.open_store(path) as kept:
-        overrides = kept.overrides()
-        held = kept.meta("digest")
-    told = loader.load(study, overrides, None if program is None else process.named(program))
-    if told.digest != held:
-        raise InputError(
-            f"{path}: holds another study, or this one before it was changed; allowed: another --out"
-        )
-    return told, overrides
+    with open_store(study, out) as stored:
+        overrides, digest, path = stored.overrides(), stored.meta("digest"), stored.path
+    plan = loader.load(study, overrides, None if program is None else process.program_commands(program))
+    if plan.digest != digest:
+        raise InputError(f"{path}: contains another study or an earlier version of this one; allowed: another --out")
+    return plan, overrides
 
 
-def warmed(engine: str) -> None:
+def start_workers(engine: str) -> None:
     """Start the worker processes first, so that their imports run in parallel with ours."""
     if engine == "pool":
         from skysim.experiments.study.execution import workers
 
-        workers.warm()
+        workers.start_fork_server()
 
 
-def engine_of(name: str, workers: int | None, scheduler: str) -> Engine:
+def create_engine(name: str, workers: int | None, scheduler: str) -> Engine:
     """Create the engine that runs the trials. Raises InputError for an unknown name or a missing scheduler."""
     from skysim.experiments.study.execution.runner import ENGINES
 
     if name not in ENGINES:
-        raise InputError(f"--engine: {name!r} is none of {', '.join(ENGINES)}")
+        raise InputError(f"--engine: {unknown_name('engine', name, ENGINES)}")
     if (name == "dask") != bool(scheduler):
-        raise InputError("--scheduler: goes with --engine dask, and takes tcp://HOST:PORT")
+        raise InputError("--scheduler: required with --engine dask and only then; allowed: tcp://HOST:PORT")
     return ENGINES[name](workers, scheduler)
 
 
 def folder_of(study: str, out: Path | None) -> Path:
-    """The folder of a study's store and report: `out`, or out/NAME."""
-    return out or Path("out") / Path(study).stem
+    """The folder of a study's store and report."""
+    return output_folder(out, Path(study).stem)
+
+
+def open_store(study: str, out: Path | None) -> AbstractContextManager[Store]:
+    """The study's store, opened for reading. Raises InputError if there is none."""
+    from skysim.experiments.study import store
+
+    return store.open_store(folder_of(study, out) / store.STORE)
 
 
 def command(study: str, out: Path | None, verb: str, overrides: dict[str, str] | None = None) -> str:

@@ -7,11 +7,12 @@ from typing import Annotated, NamedTuple
 
 import typer
 
+from skysim.apps.cli.options import Json
 from skysim.apps.cli.terminal import print_error
 from skysim.core.errors import InputError
 
 KINDS = ("scene", "study")
-LENS = {"focal_length": "1 m", "f_number": 1.0}  # placeholder values: a camera preset has no lens
+PLACEHOLDER_LENS = {"focal_length": "1 m", "f_number": 1.0}  # because a camera preset has no lens
 
 
 class Verdict(NamedTuple):
@@ -28,14 +29,12 @@ def validate(
         list[Path] | None,
         typer.Argument(
             metavar="FILES",
-            help="Scenes and studies (YAML, or by name), cameras (YAML, OpenCV's too), vehicles (MJCF),"
-            " catalogues and LED maps (ECSV).",
+            help="Scenes and studies (YAML files or names), cameras (YAML, also of OpenCV), vehicles (MJCF),"
+            " catalogs and LED maps (ECSV).",
         ),
     ] = None,
-    schema: Annotated[
-        str | None, typer.Option(help="Print the JSON Schema of a kind of file instead: scene or study.")
-    ] = None,
-    json: Annotated[bool, typer.Option("--json", help="Print JSON for machines.")] = False,
+    schema: Annotated[str | None, typer.Option(help="Print the JSON Schema of a kind of file: scene or study.")] = None,
+    json: Json = False,
 ) -> None:
     """Check files: keys, units, consistency, and whether a scene can be set up. Exit code 2 if one is invalid."""
     from skysim.apps.cli.commands import json_schema
@@ -47,59 +46,59 @@ def validate(
         print(file_io.to_json(json_schema.json_schema(schema)))
         return
     if not files:
-        raise InputError("give files, or --schema scene")
-    told = [checked(path) for path in files]
+        raise InputError("no files; give files, or --schema scene")
+    verdicts = [check_file(path) for path in files]
     if json:
-        print(file_io.to_json([one._asdict() for one in told]))
-    for one in told if not json else []:
-        if one.fault:
-            print_error(one.fault)
+        print(file_io.to_json([verdict._asdict() for verdict in verdicts]))
+    for verdict in verdicts if not json else []:
+        if verdict.fault:
+            print_error(verdict.fault)
         else:
-            print(f"{one.file}: {one.what}", *one.doubts, sep="\n  ")
-    if any(one.fault for one in told):
+            print(f"{verdict.file}: {verdict.what}", *verdict.doubts, sep="\n  ")
+    if any(verdict.fault for verdict in verdicts):
         raise typer.Exit(2)
 
 
-def checked(path: Path) -> Verdict:
+def check_file(path: Path) -> Verdict:
     """Check one file; errors become the verdict's `fault`."""
     try:
-        return Verdict(str(path), *looked_at(path))
+        return Verdict(str(path), *describe_file(path))
     except (InputError, OSError) as error:
         return Verdict(str(path), fault=str(error))
 
 
-def looked_at(path: Path) -> tuple[str, tuple[str, ...]]:
+def describe_file(path: Path) -> tuple[str, tuple[str, ...]]:
     """Return a description of the file and warnings. Raises InputError with one line."""
     from skysim.core.yaml_reader import is_file, read_yaml
     from skysim.scene import opencv_calibration
 
-    path = path if path.suffix else named(path)
+    path = path if path.suffix else find_shipped(path)
     if path.suffix not in (".yaml", ".yml", ".ecsv", ".xml"):
         raise InputError(f"{path}: allowed: .yaml, .ecsv, .xml or the name of a scene or a study")
     if not is_file(path):  # reading a named pipe would block
-        raise InputError(f"{path}: is no plain file")
+        raise InputError(f"{path}: not a regular file")
     if path.suffix == ".ecsv":
-        return table(path), ()
+        return describe_table(path), ()
     if path.suffix == ".xml":
-        return vehicle(path), ()
-    if opencv_calibration.is_one(path):
+        return describe_vehicle(path), ()
+    if opencv_calibration.looks_like_calibration(path):
         lens = opencv_calibration.read(path)
         return f"a calibration of {lens.width_px} x {lens.height_px} pixels", ()
     keys = read_yaml(path)[0].keys()
     if keys & {"factors", "trial", "responses"}:
         from skysim.experiments.study import loader
 
-        told = loader.load(path)
-        return f"a study of {told.trials} trials" if told.trials else "a search", ()
+        plan = loader.load(path)
+        return f"a study of {plan.trials} trials" if plan.trials else "a search", ()
     if "camera" in keys and keys <= {"camera", "schema"}:
         from skysim.scene.loader import load_camera
 
-        camera = load_camera(path, LENS)
+        camera = load_camera(path, PLACEHOLDER_LENS)
         return f"a camera of {camera.width_px} x {camera.height_px} pixels", ()
-    return scene(path)
+    return check_scene(path)
 
 
-def named(path: Path) -> Path:
+def find_shipped(path: Path) -> Path:
     """Path of the shipped study or scene of this name. Raises InputError with the allowed names."""
     from skysim.experiments.study import plan
     from skysim.scene import loader
@@ -110,33 +109,34 @@ def named(path: Path) -> Path:
         return loader.find(str(path))
 
 
-def vehicle(path: Path) -> str:
+def describe_vehicle(path: Path) -> str:
     """Build the multibody model of an MJCF file and describe it."""
     from skysim.dynamics import multibody
     from skysim.scene.vehicle import VehicleConfig
 
-    built = multibody.build(VehicleConfig.model_validate({"model": str(path.resolve())}))
-    return f"a vehicle of {built.mass.mass_kg:g} kg"
+    model = multibody.build(VehicleConfig.model_validate({"model": str(path.resolve())}))
+    return f"a vehicle of {model.mass.mass_kg:g} kg"
 
 
-def scene(path: Path) -> tuple[str, tuple[str, ...]]:
+def check_scene(path: Path) -> tuple[str, tuple[str, ...]]:
     """Set up a scene without simulating its motion: vehicle, lights, tracker. Returns a description and warnings."""
     from skysim.scene.loader import load, with_location
-    from skysim.simulation import checks, testbed
+    from skysim.simulation import checks
+    from skysim.simulation.testbed import build_testbed, build_tracker
 
-    told = load(path)
+    scene = load(path)
     try:
-        lab = testbed.build_testbed(told)
-        testbed.tracker(lab)
+        testbed = build_testbed(scene)
+        build_tracker(testbed)
     except InputError as error:
         raise InputError(with_location(str(error), str(path), {})) from None
-    count, frames = len(lab.sources.id), told.exposure.frames
+    count, frames = len(testbed.sources.id), scene.exposure.frames
     return f"a scene of {count} lights and {frames} frames", tuple(
-        checks.doubts(told, lab.sources, lab.mount)
+        checks.warnings(scene, testbed.sources, testbed.mount)
     )
 
 
-def table(path: Path) -> str:
+def describe_table(path: Path) -> str:
     """Describe an ECSV table: a star catalog if its header has a column `hip`, else an LED map."""
     from skysim.sources import catalog
     from skysim.tracking import dome_map_file
@@ -147,5 +147,5 @@ def table(path: Path) -> str:
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from error
     if "{name: hip," in first:
-        return f"a catalogue of {len(catalog.read(path).hip)} stars"
+        return f"a catalog of {len(catalog.read(path).hip)} stars"
     return f"a map of {len(dome_map_file.read_dome_map(path).id)} LEDs"

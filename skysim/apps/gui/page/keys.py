@@ -9,9 +9,9 @@ class Key(NamedTuple):
     """Keys as the browser names them, their action, and their label and description on the screen."""
 
     keys: tuple[str, ...]
-    shown: str
+    label: str
     action: str
-    told: str
+    description: str
 
 
 MOVES = {  # right, up, roll clockwise, in steps of a key press
@@ -36,20 +36,18 @@ KEYS = (
     Key(("F1",), "F1", "help", "help"),
     Key(("Escape",), "Esc", "close", "close"),
 )
-ACTION = {key: one.action for one in KEYS for key in one.keys}
+ACTION_BY_KEY = {name: key.action for key in KEYS for name in key.keys}
 
 # A list or tab keeps the keyboard focus after a choice, so the focus is removed from it.
-LEAVE = (
-    "() => document.activeElement.closest('.q-select__focus-target, .q-tab') && document.activeElement.blur()"
-)
+BLUR_JS = "() => document.activeElement.closest('.q-select__focus-target, .q-tab') && document.activeElement.blur()"
 
 # Suppress the browser's own actions for these keys unless the user types in a field. F keys and Esc remove the focus
 # from a field first, in the capture phase, because the page's own listener ignores events from fields.
-TAKEN = """
+SUPPRESS_DEFAULTS_JS = """
 document.addEventListener("keydown", event => {
   const typing = event.target.closest && event.target.closest("input, textarea, [contenteditable], .q-menu, .q-tab");
   const ours = %s, named = /^F\\d/.test(event.key);
   if (typing && ((named && ours.includes(event.key)) || event.key === "Escape")) document.activeElement.blur();
   if (ours.includes(event.key) && (named || !typing)) event.preventDefault();
 }, true);
-""" % [key for one in KEYS for key in one.keys if key.startswith(("F", "Arrow"))]
+""" % [name for key in KEYS for name in key.keys if name.startswith(("F", "Arrow"))]

@@ -16,12 +16,12 @@ from nicegui.events import KeyEventArguments
 from skysim.apps.gui.messages import FrameView, SceneInfo
 from skysim.apps.gui.page import forms, keys, style
 from skysim.apps.gui.page.panels.attitude import AttitudeCard
-from skysim.apps.gui.page.panels.monte_carlo import TrialPanel
+from skysim.apps.gui.page.panels.monte_carlo import MonteCarloPanel
 from skysim.apps.gui.page.panels.photo import PhotoPanel
 from skysim.apps.gui.page.panels.run import RunPanel
 from skysim.apps.gui.page.panels.scene import ScenePanel
 from skysim.apps.gui.page.panels.sensor import FRAMES, Sensor
-from skysim.apps.gui.page.scene_3d import Space
+from skysim.apps.gui.page.scene_3d import Scene3D
 from skysim.apps.gui.worker import export, pointing
 from skysim.apps.gui.worker.session import Session, WorkerLost
 from skysim.core.errors import InputError
@@ -29,7 +29,7 @@ from skysim.core.paths import SCENES
 from skysim.scene.loader import find, load
 
 PANELS = ("Lab", "Scene", "Run", "Monte Carlo", "Image", "Log")
-LOGGED = 500
+MAX_LOG_LINES = 500
 
 
 class Tab:
@@ -39,7 +39,7 @@ class Tab:
     folder : where scenes are saved;  out : where studies are
     overrides : keys of the scene that differ from its file
     solving : whether every frame is solved
-    steps : (3,) right, up, roll: movements asked for by keys that no frame shows yet
+    steps : (3,) right, up, roll: movements requested by keys that no frame shows yet
     """
 
     session: Session
@@ -48,19 +48,19 @@ class Tab:
         self.id = secrets.token_hex(8)
         self.scene, self.folder, self.out = scene, folder, out
         self.overrides: dict[str, str] = {}
-        self.setting: SceneInfo | None = None
+        self.scene_info: SceneInfo | None = None
         self.view: FrameView | None = None
         self.feedback: str | None = None
-        self.solving, self.open_still = True, True
+        self.solving, self.is_open = True, True
         self.steps, self.moving = np.zeros(3), False
-        self.said = ""
+        self.message_text = ""
         self.lines: list[str] = []
 
     def close(self) -> None:
         """Release the tab's resources after its browser has gone: frames, study and worker."""
-        self.open_still = False
+        self.is_open = False
         FRAMES.pop(self.id, None)
-        self.trials.trials.kill()
+        self.study_panel.process.kill()
         self.session.close()
 
     # Page elements.
@@ -68,42 +68,40 @@ class Tab:
     def build(self) -> None:
         """Build all page elements."""
         ui.add_css(style.CSS)
-        ui.add_body_html(f"<script>{keys.TAKEN}</script>")
+        ui.add_body_html(f"<script>{keys.SUPPRESS_DEFAULTS_JS}</script>")
         ui.colors(
-            primary=style.INK["accent"],
-            negative=style.INK["bad"],
-            dark=style.INK["panel"],
-            dark_page=style.INK["ground"],
+            primary=style.COLORS["accent"],
+            negative=style.COLORS["bad"],
+            dark=style.COLORS["panel"],
+            dark_page=style.COLORS["ground"],
         )
         with ui.element("div").classes("lab"):
-            self.head()
+            self.build_header()
             self.sensor = Sensor(self)
             with ui.element("div").classes("lab-side"):
                 self.attitude = AttitudeCard(self)
-                self.side()
+                self.build_panels()
             with ui.element("div").classes("lab-keys").mark("keys"):
                 for key in keys.KEYS:
-                    ui.html(f"<span><kbd>{key.shown}</kbd>{key.told}</span>", sanitize=False)
-        self.help = self.dialog()
+                    ui.html(f"<span><kbd>{key.label}</kbd>{key.description}</span>", sanitize=False)
+        self.help = self.build_help()
         ui.keyboard(on_key=self.key, ignore=["input", "textarea"])
 
-    def head(self) -> None:
+    def build_header(self) -> None:
         """Build the head: scene list, title, message, progress, frame rate, export menu."""
         with ui.element("div").classes("lab-head"):
-            ui.label("skysim lab").classes("lab-name")
-            self.picker = ui.select(self.scenes(), value=self.scene, on_change=self.pick)
-            self.picker.props('dense borderless options-dense aria-label="Scene"').classes("w-44").mark(
-                "scene"
-            )
-            self.picker.on("popup-hide", js_handler=keys.LEAVE)
+            ui.label("skysim gui").classes("lab-name")
+            self.picker = ui.select(self.scenes(), value=self.scene, on_change=self.scene_picked)
+            self.picker.props('dense borderless options-dense aria-label="Scene"').classes("w-44").mark("scene")
+            self.picker.on("popup-hide", js_handler=keys.BLUR_JS)
             self.title = ui.label().classes("lab-title quiet ellipsis")
             self.message = ui.label().classes("lab-said").props('role="status"').mark("message")
-            self.busy = ui.spinner(size="16px").classes("lab-busy").mark("busy")
-            self.rate = ui.label().classes("lab-rate mono quiet").mark("rate")
-            self.rate.props('title="from asking for the newest frame to having it here"')
-            self.every = ui.switch("identify", value=True, on_change=self.solve_every).props("dense size=xs")
+            self.spinner = ui.spinner(size="16px").classes("lab-busy").mark("busy")
+            self.latency = ui.label().classes("lab-rate mono quiet").mark("rate")
+            self.latency.props('title="latency: from the request for a frame to its arrival"')
+            self.solve_switch = ui.switch("identify", value=True, on_change=self.solve_switched).props("dense size=xs")
             with ui.button("Export").props("dense flat size=sm").mark("export"), ui.menu():
-                for name in export.KINDS:
+                for name in export.FILE_BY_ITEM:
                     item = ui.menu_item(name, on_click=lambda name=name: self.export(name))
                     item.props("dense").style("white-space: nowrap")
 
@@ -116,99 +114,97 @@ class Tab:
             | {self.scene: Path(self.scene).name}
         )
 
-    def side(self) -> None:
+    def build_panels(self) -> None:
         """Build the panels below the attitude card."""
         with ui.element("div").style(
             "display: grid; grid-template: 34px minmax(0, 1fr) / minmax(0, 1fr); min-height: 0"
         ):
             with ui.tabs().props("dense align=left no-caps indicator-color=primary") as self.tabs:
                 # Otherwise the arrow keys would select tabs.
-                self.tabs.on("click", js_handler=keys.LEAVE)
+                self.tabs.on("click", js_handler=keys.BLUR_JS)
                 for name in PANELS:
                     ui.tab(name).mark(f"tab-{name}")
             with ui.tab_panels(self.tabs, value="Lab", animated=False, keep_alive=True).classes("lab-panels"):
                 with ui.tab_panel("Lab").classes("relative-position"):
-                    self.space = Space()
-                    ui.label("drag turns · right drag shifts · wheel nears").classes("lab-turn quiet")
+                    self.scene_3d = Scene3D()
+                    ui.label("drag: rotate · right drag: pan · wheel: zoom").classes("lab-turn quiet")
                 with ui.tab_panel("Scene"):
-                    self.form = ScenePanel(self)
+                    self.scene_panel = ScenePanel(self)
                 with ui.tab_panel("Run").classes("lab-run"):
-                    self.flight = RunPanel(self)
+                    self.run_panel = RunPanel(self)
                 with ui.tab_panel("Monte Carlo"):
-                    self.trials = TrialPanel(self)
+                    self.study_panel = MonteCarloPanel(self)
                 with ui.tab_panel("Image"):
                     self.photo = PhotoPanel(self)
                 with ui.tab_panel("Log"):
-                    self.told = ui.label("Nothing yet.").classes("mono lab-log").mark("log")
+                    self.log_label = ui.label("Nothing yet.").classes("mono lab-log").mark("log")
 
-    def dialog(self) -> ui.dialog:
+    def build_help(self) -> ui.dialog:
         """Build the help dialog: purpose and keys."""
         with ui.dialog() as dialog, ui.card().style("max-width: 600px; padding: 20px 24px; gap: 12px"):
-            ui.label("skysim lab").style("font-weight: 600; font-size: 15px")
+            ui.label("skysim gui").style("font-weight: 600; font-size: 15px")
             ui.label(
-                "You are the star sensor. Move it, see what it sees, let the tracker say where it looks, and how wrong"
-                " it is. Under a dome the angles are the vehicle's; under the stars the camera's."
+                "Point the star sensor, view its frame, and compare the tracker's attitude with the true one. Under a"
+                " dome the angles are the vehicle's (roll, pitch, yaw); under the stars the camera's (RA, Dec, roll)."
             )
             with ui.element("div").style("display: grid; grid-template-columns: 110px 1fr; gap: 4px 12px"):
                 for key in keys.KEYS:
                     ui.html(
-                        f'<span class="lab-keys" style="padding: 0; border: 0"><kbd>{key.shown}</kbd></span>',
+                        f'<span class="lab-keys" style="padding: 0; border: 0"><kbd>{key.label}</kbd></span>',
                         sanitize=False,
                     )
-                    ui.label(HELP[key.action if key.action != "move" else key.told])
+                    ui.label(HELP[key.action if key.action != "move" else key.description])
         return dialog
 
     # Actions.
 
-    async def pick(self) -> None:
+    async def scene_picked(self) -> None:
         """Open the scene that was chosen in the list."""
         if self.picker.value != self.scene:
             await self.open(str(self.picker.value))
 
     async def open(self, scene: str, overrides: Mapping[str, str] | None = None) -> None:
         """Set up a scene and show a first frame; keep the old scene if that fails."""
-        self.rest()
+        self.stop_playback()
         before = self.scene, self.overrides
         self.scene, self.overrides = scene, dict(overrides or {})
-        doing = (
+        activity = (
             f"setting up {Path(scene).name} …" if self.view else ""
-        )  # the first time the sensor view says so
-        answer = await self.ask("open", self.scene_path, self.overrides, self.solving, doing=doing)
-        if answer is None:
+        )  # at first the sensor view shows this message
+        result = await self.run_task("open", self.scene_path, self.overrides, self.solving, activity=activity)
+        if result is None:
             self.scene, self.overrides = before
             self.picker.set_value(self.scene)
             if self.view is None:
-                self.sensor.waiting(f"{Path(scene).name} could not be set up:", self.said)
+                self.sensor.show_waiting(f"{Path(scene).name} cannot be set up:", self.message_text)
             return
-        self.setting, view = answer
-        self.feedback = await self.fed_back()
-        self.title.props["title"] = self.setting.title  # tooltip with the full title
-        self.title.set_text(self.setting.title)
-        self.attitude.set(self.setting)
-        self.space.set(self.setting)
-        self.sensor.rest()
-        self.flight.set()
-        self.trials.set()
-        self.display(view)
-        await self.form.set()
-        self.log(
-            f"opened {Path(scene).name}" + (f" with {', '.join(self.overrides)}" if self.overrides else "")
-        )
+        self.scene_info, view = result
+        self.feedback = await self.current_feedback()
+        self.title.props["title"] = self.scene_info.title  # tooltip with the full title
+        self.title.set_text(self.scene_info.title)
+        self.attitude.set_scene(self.scene_info)
+        self.scene_3d.set_scene(self.scene_info)
+        self.sensor.clear_zoom()
+        self.run_panel.set_scene()
+        self.study_panel.set_scene()
+        self.display_frame(view)
+        await self.scene_panel.set_scene()
+        self.log(f"opened {Path(scene).name}" + (f" with {', '.join(self.overrides)}" if self.overrides else ""))
 
-    async def change(self, keys_: Mapping[str, str]) -> None:
+    async def apply_overrides(self, overrides: Mapping[str, str]) -> None:
         """Reopen the scene with further overrides."""
-        await self.open(self.scene, {**self.overrides, **keys_})
+        await self.open(self.scene, {**self.overrides, **overrides})
 
-    async def refield(self, field_deg: float) -> None:
+    async def set_field_of_view(self, field_deg: float) -> None:
         """Change the field of view by the focal length: f' = f tan(field / 2) / tan(field' / 2)."""
-        if self.setting is None or not 0.5 <= field_deg <= 120:
-            self.say("field: allowed: 0.5 to 120 deg")
+        if self.scene_info is None or not 0.5 <= field_deg <= 120:
+            self.show_message("field: allowed: 0.5 to 120 deg")
             return
         camera = load(self.scene_path, self.overrides).camera
-        longer = math.tan(math.radians(self.setting.field_deg / 2)) / math.tan(math.radians(field_deg / 2))
-        await self.change({"camera.focal_length": f"{1e3 * camera.focal_length_m * longer:.5g} mm"})
+        factor = math.tan(math.radians(self.scene_info.field_deg / 2)) / math.tan(math.radians(field_deg / 2))
+        await self.apply_overrides({"camera.focal_length": f"{1e3 * camera.focal_length_m * factor:.5g} mm"})
 
-    async def fed_back(self) -> str | None:
+    async def current_feedback(self) -> str | None:
         """The feedback of the scene's controller; None without a controller."""
         control = load(self.scene_path, self.overrides).motion.control
         return control.feedback if control else None
@@ -218,107 +214,107 @@ class Tab:
         """Absolute path of the scene file, since study files are written to other folders."""
         return str(find(self.scene).resolve())
 
-    async def show(self, asked: Awaitable[Any]) -> FrameView | None:
+    async def show_frame(self, pending: Awaitable[Any]) -> FrameView | None:
         """Wait for a frame and display it; None if the request failed or the tab has closed."""
         begin = time.perf_counter()
-        view = await self.wait(asked)
+        view = await self.await_result(pending)
         if view is not None:
-            self.display(view)
-            self.rate.set_text(f"{1e3 * (time.perf_counter() - begin):.0f} ms")
+            self.display_frame(view)
+            self.latency.set_text(f"{1e3 * (time.perf_counter() - begin):.0f} ms")
         return view
 
-    def display(self, view: FrameView) -> None:
+    def display_frame(self, view: FrameView) -> None:
         """Display a frame in the sensor view, the attitude card and the 3-D view."""
         self.view = view
         self.sensor.show(view)
         self.attitude.show(view)
-        self.space.show(view)
+        self.scene_3d.show(view)
 
-    def rest(self) -> None:
+    def stop_playback(self) -> None:
         """Stop playback and the live camera, because the sensor view is needed for something else."""
-        self.flight.pause()
+        self.run_panel.pause()
         self.photo.stop()
 
-    async def ask(self, task: str, *arguments: Any, doing: str = "") -> Any:
+    async def run_task(self, task: str, *arguments: Any, activity: str = "") -> Any:
         """Run a task in the worker and return its result, or None after an error, which is displayed.
 
-        doing : message shown until the task ends
+        activity : message shown until the task ends
         """
-        self.say(doing, "quiet")
-        self.busy.set_visibility(True)
+        self.show_message(activity, "quiet")
+        self.spinner.set_visibility(True)
         try:
-            return await self.wait(self.session.ask(task, *arguments))
+            return await self.await_result(self.session.run(task, *arguments))
         finally:
-            if self.open_still:
-                self.busy.set_visibility(False)
-                if doing and self.said == doing:
-                    self.say("")
+            if self.is_open:
+                self.spinner.set_visibility(False)
+                if activity and self.message_text == activity:
+                    self.show_message("")
 
-    async def wait(self, asked: Awaitable[Any]) -> Any:
+    async def await_result(self, pending: Awaitable[Any]) -> Any:
         """Await a result; display an error in one line and return None."""
         try:
-            answer = await asked
+            result = await pending
         except (InputError, WorkerLost) as error:
-            if self.open_still:
-                self.say(str(error))
+            if self.is_open:
+                self.show_message(str(error))
             return None
-        return answer if self.open_still else None
+        return result if self.is_open else None
 
-    def say(self, text: str, ink: str = "warn") -> None:
+    def show_message(self, text: str, color: str = "warn") -> None:
         """Show a message in the head until the next action; warnings are also logged."""
-        if text == self.said:
+        if text == self.message_text:
             return
-        self.said = text
+        self.message_text = text
         self.message.props["title"] = text  # tooltip with the full text
         self.message.set_text(text)
-        self.message.classes(remove="good warn quiet", add=ink)
-        if text and ink == "warn":
+        self.message.classes(remove="good warn quiet", add=color)
+        if text and color == "warn":
             self.log(text)
 
     def log(self, text: str) -> None:
         """Add a line to the log, the newest first."""
-        self.lines = [f"{time.strftime('%H:%M:%S')}  {text}", *self.lines[: LOGGED - 1]]
-        self.told.set_text("\n".join(self.lines))
+        self.lines = [f"{time.strftime('%H:%M:%S')}  {text}", *self.lines[: MAX_LOG_LINES - 1]]
+        self.log_label.set_text("\n".join(self.lines))
 
-    async def solve_every(self) -> None:
+    async def solve_switched(self) -> None:
         """Take over the switch that solves every frame."""
-        self.solving = bool(self.every.value)
+        self.solving = bool(self.solve_switch.value)
 
     async def export(self, kind: str) -> None:
         """Download files of the newest frame."""
-        found = await self.ask("export")
-        if not found:
+        files = await self.run_task("export")
+        if not files:
             return
-        name = export.KINDS[kind]
+        name = export.FILE_BY_ITEM[kind]
         if not name:
-            ui.download(export.packed(found), f"{Path(self.scene).stem}.zip")
-        elif name in found:
-            ui.download(found[name], name)
+            ui.download(export.zip_archive(files), f"{Path(self.scene).stem}.zip")
+        elif name in files:
+            ui.download(files[name], name)
         else:
-            self.say("no solution yet: press 1")
+            self.show_message("no solution yet: press 1")
 
     # Keys.
 
     async def key(self, event: KeyEventArguments) -> None:
         """Handle a key press."""
         name = event.key.name.lower() if len(event.key.name) == 1 else event.key.name
-        action = keys.ACTION.get(name)
+        action = keys.ACTION_BY_KEY.get(name)
         if not event.action.keydown or action is None or event.modifiers.ctrl or event.modifiers.meta:
             return
         if self.help.value and action not in ("help", "close"):
             return
         if action == "move":
-            right, up, turn = keys.MOVES[name]
+            right, up, roll_sign = keys.MOVES[name]
             step = pointing.COARSE if event.modifiers.shift else pointing.FINE
             roll = pointing.ROLL_COARSE_DEG if event.modifiers.shift else pointing.ROLL_FINE_DEG
-            await self.move(right * step, up * step, turn * roll)
+            await self.move(right * step, up * step, roll_sign * roll)
         elif not event.action.repeat:
-            await self.act(action)
+            await self.perform(action)
 
     async def move(self, right: float, up: float, roll_deg: float) -> None:
-        """Move the camera by these steps; steps asked for while a frame is rendered are summed for the next frame."""
-        self.rest()
-        self.say("")
+        """Move the camera; steps requested while a frame is rendered are summed for the next frame."""
+        self.stop_playback()
+        self.show_message("")
         self.steps += (right, up, roll_deg)
         if self.moving:
             return
@@ -326,23 +322,21 @@ class Tab:
         try:
             while self.steps.any():
                 steps, self.steps = self.steps.tolist(), np.zeros(3)
-                await self.show(self.session.ask("move", *steps, self.solving))
-                await self.sensor.ready()
+                await self.show_frame(self.session.run("move", *steps, self.solving))
+                await self.sensor.wait_drawn()
         finally:
             self.moving = False
 
-    async def act(self, action: str) -> None:
+    async def perform(self, action: str) -> None:
         """Perform the action of a key other than a movement."""
-        self.say("")
+        self.show_message("")
         if action == "identify":
-            self.rest()
-            await self.show(self.session.ask("look", True))
-            self.log(
-                f"identify: {self.view.answer.status if self.view and self.view.answer else 'no answer'}"
-            )
+            self.stop_playback()
+            await self.show_frame(self.session.run("render", True))
+            self.log(f"identify: {self.view.result.status if self.view and self.view.result else 'no result'}")
         elif action == "monte_carlo":
             self.tabs.set_value("Monte Carlo")
-            await self.trials.start()
+            await self.study_panel.start()
         elif action == "attitude":
             self.attitude.inputs[0].run_method("focus")
             self.attitude.inputs[0].run_method("select")
@@ -350,7 +344,7 @@ class Tab:
             self.attitude.stages["detector" if action == "sensor" else "identifier"].run_method("showPopup")
         elif action == "runs":
             self.tabs.set_value("Monte Carlo")
-            self.trials.count.run_method("focus")
+            self.study_panel.count.run_method("focus")
         elif action == "log":
             self.tabs.set_value("Log")
         elif action == "help":
@@ -360,16 +354,16 @@ class Tab:
 
 
 HELP = {
-    "move": "move the boresight by a fiftieth of the field",
-    "roll": "roll the camera by a degree: E one way, R clockwise",
-    "coarse": "with an arrow, E or R: ten times as far",
-    "identify": "a new frame, identified",
-    "monte_carlo": "as many random attitudes as F8 says, identified",
-    "attitude": "type an attitude; Enter looks there",
-    "sensor": "the image processing: how lights are detected and centred",
-    "identifier": "the star identification algorithm",
-    "runs": "how many runs, and the field of view",
-    "log": "what was done",
-    "help": "this",
-    "close": "close what is open",
+    "move": "move the boresight by a fiftieth of the field of view",
+    "roll": "roll the camera by a degree: E counterclockwise, R clockwise",
+    "coarse": "with an arrow, E or R: steps ten times as large",
+    "identify": "render a new frame and solve it",
+    "monte_carlo": "start a Monte Carlo study; F8 sets its number of trials",
+    "attitude": "type an attitude; Enter points the camera there",
+    "sensor": "select the detection algorithm",
+    "identifier": "select the star identification algorithm",
+    "runs": "set the number of runs and the field of view",
+    "log": "show the log of this session",
+    "help": "show this help",
+    "close": "close the help",
 }

@@ -2,33 +2,34 @@
 
 from __future__ import annotations
 
-INK = {
+COLORS = {
     **{"ground": "#0d1015", "panel": "#141922", "line": "#252c38", "text": "#d7dce4", "quiet": "#8b95a5"},
     **{"accent": "#5aa9ff", "good": "#63c174", "warn": "#f0b429", "bad": "#ff6b6b"},
 }
-CURVES = ["#5aa9ff", "#f0b429", "#63c174", "#ff6b6b", "#b48ead", "#88c0d0", "#b48ead", "#88c0d0"]
+CURVE_COLORS = ["#5aa9ff", "#f0b429", "#63c174", "#ff6b6b", "#b48ead", "#88c0d0", "#b48ead", "#88c0d0"]
 TOOLTIP = {
-    **{"trigger": "axis", "confine": True, "backgroundColor": INK["line"], "borderWidth": 0},
-    "textStyle": {"color": INK["text"], "fontSize": 11},
+    **{"trigger": "axis", "confine": True, "backgroundColor": COLORS["line"], "borderWidth": 0},
+    "textStyle": {"color": COLORS["text"], "fontSize": 11},
 }
 
 
-def digits(value: float) -> str:
+def format_number(value: float) -> str:
     """Format with three significant digits, from 100 up as an integer."""
     return f"{value:.0f}" if value >= 100 else f"{value:.3g}"
 
 
 CSS = f"""
 :root {{ --nicegui-default-padding: 0; --nicegui-default-gap: 0 }}
-body {{ background: {INK["ground"]} !important; color: {INK["text"]}; font: 13px/1.45 Inter, system-ui, sans-serif }}
+body {{ background: {COLORS["ground"]} !important; color: {COLORS["text"]};
+  font: 13px/1.45 Inter, system-ui, sans-serif }}
 .nicegui-content {{ padding: 0; gap: 0; height: 100vh; overflow: hidden }}
 .lab {{ display: grid; width: 100vw; height: 100vh; grid-template-rows: 44px minmax(0, 1fr) 30px;
   grid-template-columns: minmax(0, 1fr) clamp(430px, 36vw, 660px);
   grid-template-areas: "head head" "sensor side" "keys keys" }}
 .lab-head {{ grid-area: head }} .lab-sensor {{ grid-area: sensor }} .lab-side {{ grid-area: side }}
 .lab-keys {{ grid-area: keys }}
-.lab-head, .lab-keys {{ display: flex; align-items: center; gap: 14px; padding: 0 14px; background: {INK["panel"]};
-  border: 0 solid {INK["line"]} }}
+.lab-head, .lab-keys {{ display: flex; align-items: center; gap: 14px; padding: 0 14px; background: {COLORS["panel"]};
+  border: 0 solid {COLORS["line"]} }}
 .lab-name {{ font-weight: 600; letter-spacing: .02em; white-space: nowrap }}
 .lab-title {{ flex: 0 1 auto; min-width: 0; max-width: 32% }} .lab-rate {{ width: 56px; text-align: right }}
 .lab-said {{ flex: 1 1 0; min-width: 0; text-align: right; line-height: 1.3; max-height: 2.6em; overflow: hidden;
@@ -36,18 +37,18 @@ body {{ background: {INK["ground"]} !important; color: {INK["text"]}; font: 13px
 .lab-busy, .lab-rate, .lab-head .q-btn, .lab-head .q-toggle {{ flex: none }}
 .lab-busy.hidden {{ display: inline-flex; visibility: hidden }}
 .lab-head {{ border-bottom-width: 1px }} .lab-keys {{ border-top-width: 1px; gap: 18px; overflow: hidden;
-  white-space: nowrap; color: {INK["quiet"]}; font-size: 12px }}
-.lab-keys kbd {{ background: {INK["line"]}; color: {INK["text"]}; border-radius: 3px; padding: 1px 5px;
+  white-space: nowrap; color: {COLORS["quiet"]}; font-size: 12px }}
+.lab-keys kbd {{ background: {COLORS["line"]}; color: {COLORS["text"]}; border-radius: 3px; padding: 1px 5px;
   font: 11px ui-monospace, monospace; margin-right: 5px }}
 .lab-sensor {{ display: grid; grid-template-rows: 40px minmax(0, 1fr) 176px; min-width: 0; min-height: 0 }}
 .lab-bar {{ display: flex; align-items: center; gap: 14px; padding: 0 14px; min-width: 0; overflow: hidden }}
 .lab-frame {{ display: flex; align-items: center; justify-content: center; min-height: 0; min-width: 0; padding: 0 14px;
   container-type: size }}
-.lab-frame > canvas {{ background: #000; outline: 1px solid {INK["line"]} }}
+.lab-frame > canvas {{ background: #000; outline: 1px solid {COLORS["line"]} }}
 .lab-wait {{ display: flex; flex-direction: column; align-items: center; gap: 16px; white-space: pre-line;
-  text-align: center; line-height: 1.8; color: {INK["quiet"]} }}
+  text-align: center; line-height: 1.8; color: {COLORS["quiet"]} }}
 .lab-under {{ display: grid; grid-template-columns: 252px minmax(0, 1fr); gap: 14px; padding: 8px 14px; min-height: 0 }}
-.lab-zoom {{ width: 252px; height: 160px; border: 1px dashed {INK["line"]}; display: flex; align-items: center;
+.lab-zoom {{ width: 252px; height: 160px; border: 1px dashed {COLORS["line"]}; display: flex; align-items: center;
   justify-content: center }}
 .lab-run {{ display: flex; flex-direction: column; gap: 2px }}
 .lab-run .lab-strips {{ flex: 1 1 0; margin-top: 8px; min-height: 380px }}
@@ -56,14 +57,14 @@ body {{ background: {INK["ground"]} !important; color: {INK["text"]}; font: 13px
 .lab-turn {{ position: absolute; left: 24px; bottom: 16px; font-size: 11px; pointer-events: none }}
 .stale {{ opacity: .45 }}
 .lab-side {{ display: grid; grid-template: auto auto minmax(0, 1fr) / minmax(0, 1fr);
-  border-left: 1px solid {INK["line"]}; min-height: 0; min-width: 0; background: {INK["panel"]} }}
-.lab-card {{ padding: 10px 14px; border-bottom: 1px solid {INK["line"]}; width: 100% }}
+  border-left: 1px solid {COLORS["line"]}; min-height: 0; min-width: 0; background: {COLORS["panel"]} }}
+.lab-card {{ padding: 10px 14px; border-bottom: 1px solid {COLORS["line"]}; width: 100% }}
 .lab-panels {{ min-height: 0; overflow: hidden; background: transparent !important }}
 .lab-panels .q-tab-panel {{ padding: 10px 14px; height: 100%; overflow: auto }}
 .mono {{ font: 12.5px/1.6 ui-monospace, SFMono-Regular, Menlo, monospace; font-variant-numeric: tabular-nums;
   white-space: pre }}
-.quiet {{ color: {INK["quiet"]} }} .good {{ color: {INK["good"]} }} .bad {{ color: {INK["bad"]} }}
-.warn {{ color: {INK["warn"]} }}
+.quiet {{ color: {COLORS["quiet"]} }} .good {{ color: {COLORS["good"]} }} .bad {{ color: {COLORS["bad"]} }}
+.warn {{ color: {COLORS["warn"]} }}
 .lab-grid {{ display: grid; grid-template-columns: 84px repeat(3, minmax(0, 1fr)); gap: 2px 10px; align-items: center }}
 .lab-grid .num {{ text-align: right; min-height: 20px }}
 .q-field--dense .q-field__control, .q-field--dense .q-field__marginal {{ height: 32px; min-height: 32px }}
@@ -85,12 +86,12 @@ body {{ background: {INK["ground"]} !important; color: {INK["text"]}; font: 13px
 .lab-stages .q-field__control {{ padding: 0 2px 0 8px }} .lab-stages .q-field__append {{ padding: 0 }}
 .q-select.q-field--dense.q-field--labeled .q-field__native > span {{ margin-top: -12px }}
 .lab-trial .q-field__control {{ padding: 0 4px 0 8px }} .lab-panels .q-btn {{ padding: 2px 8px }}
-.lab-panels .q-uploader__header {{ background: {INK["line"]} }}
+.lab-panels .q-uploader__header {{ background: {COLORS["line"]} }}
 .q-field--dense .q-field__suffix {{ align-self: center; padding: 0 }}
 .lab-trial {{ display: grid; width: 100%; grid-template-columns: 1fr 1.5fr 1fr .8fr 1.2fr; gap: 8px; margin: 8px 0 }}
 .q-tab {{ min-height: 34px; padding: 0 12px; text-transform: none }} .q-tabs {{ min-height: 34px }}
 .q-btn {{ text-transform: none }} .q-btn .q-btn__content {{ font-size: 12px; line-height: 1.5 }}
 .lab-sections .q-item {{ padding: 2px 0 }}
-.q-field--borderless.q-field--focused, :focus-visible {{ outline: 2px solid {INK["accent"]}; outline-offset: 1px }}
-.empty {{ color: {INK["quiet"]}; padding: 28px 8px; text-align: center; line-height: 1.6 }}
+.q-field--borderless.q-field--focused, :focus-visible {{ outline: 2px solid {COLORS["accent"]}; outline-offset: 1px }}
+.empty {{ color: {COLORS["quiet"]}; padding: 28px 8px; text-align: center; line-height: 1.6 }}
 """

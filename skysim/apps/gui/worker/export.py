@@ -20,7 +20,7 @@ from skysim.results.files import frames
 from skysim.results.report import annotate
 from skysim.scene.loader import find
 
-KINDS = {  # file by menu entry
+FILE_BY_ITEM = {  # file by menu entry
     "frame, FITS": "frame.fits",
     "frame, PNG": "frame.png",
     "truth": "frame.ecsv",
@@ -31,40 +31,39 @@ KINDS = {  # file by menu entry
 }
 
 
-def files(desk: Workbench, base: str, overrides: dict[str, str]) -> dict[str, bytes]:
+def frame_files(workbench: Workbench, base: str, overrides: dict[str, str]) -> dict[str, bytes]:
     """All files by name. Raises InputError if no frame has been rendered."""
-    if desk.frame is None or desk.truth is None:
-        raise InputError("nothing to export yet")
+    if workbench.frame is None or workbench.truth is None:
+        raise InputError("no frame has been rendered yet")
     with tempfile.TemporaryDirectory() as folder:
-        frames.write_frame(Path(folder), desk.frame, desk.truth, desk.scene)
-        found = {
-            path.name.replace("frame_0000", "frame"): path.read_bytes()
-            for path in sorted(Path(folder).iterdir())
+        frames.write_frame(Path(folder), workbench.frame, workbench.truth, workbench.scene)
+        contents = {
+            path.name.replace("frame_0000", "frame"): path.read_bytes() for path in sorted(Path(folder).iterdir())
         }
-    found["figure.png"] = figure(desk)
-    if answer := desk.answer:
-        told = {
-            name: getattr(answer, name) for name in answer.__slots__ if name not in ("spots", "windows_px")
-        }
-        told["spots"] = [{name: getattr(spot, name) for name in spot.__slots__} for spot in answer.spots]
-        found["solution.json"] = file_io.to_json(told).encode()
-    found["scene.yaml"] = scene_yaml(base_of(base), overrides).encode()
-    return found
+    contents["figure.png"] = annotated_png(workbench)
+    if result := workbench.result:
+        record = {name: getattr(result, name) for name in result.__slots__ if name not in ("detections", "windows_px")}
+        record["spots"] = [
+            {name: getattr(detection, name) for name in detection.__slots__} for detection in result.detections
+        ]
+        contents["solution.json"] = file_io.to_json(record).encode()
+    contents["scene.yaml"] = scene_yaml(base_reference(base), overrides).encode()
+    return contents
 
 
-def figure(desk: Workbench) -> bytes:
+def annotated_png(workbench: Workbench) -> bytes:
     """PNG of the frame with true lights, detections and identified lights marked."""
-    assert desk.frame is not None
-    assert desk.truth is not None
+    assert workbench.frame is not None
+    assert workbench.truth is not None
     empty = np.empty((0, 2))
-    match = desk.report.attitude.match if desk.report else None
-    xy_px = desk.report.centroids.xy_px if desk.report else empty
+    match = workbench.report.attitude.match if workbench.report else None
+    xy_px = workbench.report.centroids.xy_px if workbench.report else empty
     matched_px = xy_px[match.observed] if match else empty
-    drawn = annotate(desk.frame.image_dn, xy_px, matched_px, truth_px=desk.truth.seen.xy_px)
-    return bytes(cv2.imencode(".png", drawn)[1])
+    annotated = annotate(workbench.frame.image_dn, xy_px, matched_px, truth_px=workbench.truth.sources.xy_px)
+    return bytes(cv2.imencode(".png", annotated)[1])
 
 
-def base_of(scene: str, folder: Path | None = None) -> str:
+def base_reference(scene: str, folder: Path | None = None) -> str:
     """The value of `base` by which a file in `folder` refers to a scene: a shipped scene's name, else a path."""
     path = find(scene).resolve()
     if path.parent == SCENES.resolve():
@@ -82,10 +81,10 @@ def scene_yaml(base: str, overrides: dict[str, str], title: str = "") -> str:
     return yaml.safe_dump(tree, sort_keys=False, allow_unicode=True)
 
 
-def packed(found: dict[str, bytes]) -> bytes:
+def zip_archive(contents: dict[str, bytes]) -> bytes:
     """Pack all files into a ZIP archive."""
     buffer = BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
-        for name, data in found.items():
+        for name, data in contents.items():
             archive.writestr(name, data)
     return buffer.getvalue()

@@ -13,16 +13,23 @@ from numpy.typing import NDArray
 
 from estimator.detection.detect import check_size
 from skysim.apps import plate_solver
-from skysim.apps.gui.messages import Answer, Light, Triple
-from skysim.apps.gui.worker.workbench import answered, lights_of, magnitudes, named, prefix_of, spots_of
+from skysim.apps.gui.messages import Light, TrackerResult, Triple
+from skysim.apps.gui.worker.workbench import (
+    detection_views,
+    id_prefix,
+    magnitude_by_id,
+    matches_by_row,
+    tracker_result,
+    true_lights,
+)
 from skysim.core import images
 from skysim.core.errors import InputError
 from skysim.core.images import LiveCamera
 from skysim.experiments.study import loader, store
 from skysim.experiments.study.execution import replay
-from skysim.experiments.study.setups import prepared_setup
+from skysim.experiments.study.execution.setups import prepared_setup
+from skysim.experiments.study.execution.trials import run_trial
 from skysim.experiments.study.store import STORE
-from skysim.experiments.study.trials import one
 from skysim.results import scoring, stretch
 
 SUFFIXES = (".fits", ".fit", ".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
@@ -37,9 +44,9 @@ class Photo:
     """
 
     size_px: tuple[int, int]
-    answer: Answer
+    result: TrackerResult
     solution: dict[str, Any]
-    facts: stretch.Facts
+    statistics: stretch.FrameStatistics
     jpeg: bytes = b""
     names: tuple[str, str, str] = ("RA", "Dec", "roll")
     true_deg: Triple | None = None
@@ -47,10 +54,10 @@ class Photo:
     prefix: str = "HIP"
 
 
-Seen = tuple[Photo, NDArray]  # with the image's pixels
+PhotoPixels = tuple[Photo, NDArray]  # with the image's pixels
 
 
-def of_file(name: str, data: bytes, fov_deg: float | None, stages: dict[str, str]) -> Seen:
+def photo_from_file(name: str, data: bytes, fov_deg: float | None, stages: dict[str, str]) -> PhotoPixels:
     """Solve an uploaded file. Raises InputError if it is no readable image."""
     suffix = Path(name).suffix.lower()
     if suffix not in SUFFIXES:
@@ -59,57 +66,53 @@ def of_file(name: str, data: bytes, fov_deg: float | None, stages: dict[str, str
         path = Path(folder) / f"upload{suffix}"
         path.write_bytes(data)
         try:
-            image, (taken, _) = (
-                images.monochrome(images.read_image(path)),
-                plate_solver.believable(images.date_of(path)),
-            )
+            image = images.monochrome(images.read_image(path))
+            date_utc, _ = plate_solver.validated_date(images.read_date_obs(path))
         except InputError as error:
             raise InputError(str(error).replace(str(path), Path(name).name)) from None
-    return solved(image, fov_deg, stages, taken)
+    return solve_photo(image, fov_deg, stages, date_utc)
 
 
-def of_camera(camera: LiveCamera, fov_deg: float | None, stages: dict[str, str]) -> Seen:
+def photo_from_camera(camera: LiveCamera, fov_deg: float | None, stages: dict[str, str]) -> PhotoPixels:
     """Solve the next frame of a live camera. Raises InputError."""
-    return solved(images.monochrome(camera.frame()), fov_deg, stages, None)
+    return solve_photo(images.monochrome(camera.frame()), fov_deg, stages, None)
 
 
-def of_trial(study: str, folder: Path, trial: int) -> Seen:
+def photo_from_trial(study: str, folder: Path, trial: int) -> PhotoPixels:
     """Repeat a study's trial: its first frame with the tracker's solution."""
-    planned = loader.load(study)
-    with store.open_store(folder / STORE) as kept:
-        segment = replay.segment_of(planned, kept, trial)
-    row = one(planned.recipe, segment, trial, segment.replicates[0])
-    ready = prepared_setup(planned.recipe, segment.settings)
-    frame, truth, report = next(replay.seen(ready, row.seed))
-    answer = answered(ready.lab, ready.estimator, report, truth)
+    plan = loader.load(study)
+    with store.open_store(folder / STORE) as stored:
+        segment = replay.segment_of(plan, stored, trial)
+    row = run_trial(plan.spec, segment, trial, segment.replicates[0])
+    setup = prepared_setup(plan.spec, segment.settings)
+    frame, truth, report = next(replay.replayed_frames(setup, row.seed))
+    result = tracker_result(setup.testbed, setup.estimator, report, truth)
     if row.error:
-        answer = Answer(row.error.strip().splitlines()[-1], answer.spots, answer.ms)
-    scene, (height, width) = ready.lab.scene, frame.image_dn.shape
-    told = Photo(
+        result = TrackerResult(row.error.strip().splitlines()[-1], result.detections, result.ms)
+    scene, (height, width) = setup.testbed.scene, frame.image_dn.shape
+    photo = Photo(
         (width, height),
-        answer,
+        result,
         {},
-        stretch.facts(frame.image_dn, frame.saturation_dn),
+        stretch.frame_statistics(frame.image_dn, frame.saturation_dn),
         names=scoring.angle_names(scene),
-        true_deg=scoring.angles_deg(truth.cam_from_lab, scene, ready.lab.mount),
-        lights=lights_of(truth, magnitudes(ready.lab)),
-        prefix=prefix_of(ready.lab),
+        true_deg=scoring.angles_deg(truth.cam_from_lab, scene, setup.testbed.mount),
+        lights=true_lights(truth, magnitude_by_id(setup.testbed)),
+        prefix=id_prefix(setup.testbed),
     )
-    return told, frame.image_dn
+    return photo, frame.image_dn
 
 
-def solved(image: NDArray, fov_deg: float | None, stages: dict[str, str], taken: Any) -> Seen:
-    """Solve an image; the result's status says why if there is no solution. taken : UTC, if known."""
+def solve_photo(image: NDArray, fov_deg: float | None, stages: dict[str, str], date_utc: Any) -> PhotoPixels:
+    """Solve an image; the result's status says why if there is no solution. date_utc : None if unknown."""
     check_size(image)
-    how = plate_solver.make_solver(fov_deg, None, stages=stages)
-    found, tracker = plate_solver.look(image, how, taken)
-    told = found.attitude
-    spots = spots_of(found, named(tracker, told, found.centroids.xy_px))
-    solution = plate_solver.solution(found) if told.solved else {}
-    angles: Triple | None = (
-        (solution["ra_deg"], solution["dec_deg"], solution["roll_deg"]) if solution else None
-    )
-    answer = Answer(told.status, spots, 1e3 * sum(found.seconds.values()), angles)
+    solver = plate_solver.make_solver(fov_deg, None, stages=stages)
+    report, tracker = plate_solver.solve_array(image, solver, date_utc)
+    attitude = report.attitude
+    detections = detection_views(report, matches_by_row(tracker, attitude, report.centroids.xy_px))
+    solution = plate_solver.solution_fields(report) if attitude.solved else {}
+    angles: Triple | None = (solution["ra_deg"], solution["dec_deg"], solution["roll_deg"]) if solution else None
+    result = TrackerResult(attitude.status, detections, 1e3 * sum(report.seconds.values()), angles)
     height, width = image.shape
-    full = float(np.iinfo(image.dtype).max) if image.dtype.kind == "u" else math.inf
-    return Photo((width, height), answer, solution, stretch.facts(image, full)), image
+    saturation_dn = float(np.iinfo(image.dtype).max) if image.dtype.kind == "u" else math.inf
+    return Photo((width, height), result, solution, stretch.frame_statistics(image, saturation_dn)), image

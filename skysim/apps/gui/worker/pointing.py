@@ -39,22 +39,20 @@ def from_angles(scene: Scene, mount: Mount, angles_deg: tuple[float, float, floa
     if isinstance(scene.light, StarsConfig):
         return stars.cam_from_icrs(*angles_deg).inv() * mount.cam_from_body
     roll, pitch, yaw = angles_deg
-    told = AttitudeConfig.model_validate({"roll_deg": roll, "pitch_deg": pitch, "yaw_deg": yaw})
-    return within_stop(scene, guidance.attitude(told))
+    start = AttitudeConfig.model_validate({"roll_deg": roll, "pitch_deg": pitch, "yaw_deg": yaw})
+    return within_stop(scene, guidance.attitude(start))
 
 
-def moved(
-    scene: Scene, mount: Mount, lab_from_body: Rotation, right: float, up: float, roll_deg: float
-) -> Rotation:
+def moved(scene: Scene, mount: Mount, lab_from_body: Rotation, right: float, up: float, roll_deg: float) -> Rotation:
     """lab_from_body after moving the boresight right and up (in fields of view) and rolling the camera clockwise.
 
     The three form one rotation vector about the camera's axes (x right, y down, z boresight). Raises InputError
     beyond the tilt stop.
     """
     camera = scene.camera
-    across_rad = 2 * math.atan(camera.width_px / 2 / camera.focal_px)
-    turn = np.array([up * across_rad, right * across_rad, math.radians(roll_deg)])
-    new_from_cam = Rotation.from_rotvec(turn).inv()
+    field_rad = 2 * math.atan(camera.width_px / 2 / camera.focal_px)
+    rotation_vector = np.array([up * field_rad, right * field_rad, math.radians(roll_deg)])
+    new_from_cam = Rotation.from_rotvec(rotation_vector).inv()
     cam_from_lab = new_from_cam * mount.cam_from_body * lab_from_body.inv()
     return within_stop(scene, cam_from_lab.inv() * mount.cam_from_body)
 

@@ -13,7 +13,7 @@ from estimator.core.errors import ImageError
 from skysim.core.errors import InputError
 from skysim.experiments.study.execution.workers import environment, one_thread
 
-CAREFUL = {"OPENCV_IO_MAX_IMAGE_PIXELS": str(2**27)}  # most pixels that OpenCV decodes
+OPENCV_LIMITS = {"OPENCV_IO_MAX_IMAGE_PIXELS": str(2**27)}  # environment: OpenCV refuses larger images
 
 
 class WorkerLost(Exception):
@@ -21,21 +21,21 @@ class WorkerLost(Exception):
 
 
 def serve(pipe: Connection, progress: Any, stop: Any) -> None:
-    """Main loop of the worker: receives (task, arguments), sends ("ok", result) or ("bad", message), until the pipe
+    """Main loop of the worker: receives (task, arguments), sends ("ok", result) or ("error", message), until the pipe
     closes.
 
     progress : shared (done, total) of the current task;  stop : shared flag; not 0 asks the task to end
     """
-    from skysim.apps.gui.worker.tasks import TASKS, Kept, Stopped
+    from skysim.apps.gui.worker.tasks import TASKS, Stopped, WorkerState
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the server, which closes the pipe
 
-    def watch(done: float, everything: float) -> None:
-        progress[:] = done, everything
+    def report_progress(done: float, total: float) -> None:
+        progress[:] = done, total
         if stop.value:
             raise Stopped
 
-    kept = Kept(watch)
+    state = WorkerState(report_progress)
     while True:
         try:
             task, arguments = pipe.recv()
@@ -43,15 +43,15 @@ def serve(pipe: Connection, progress: Any, stop: Any) -> None:
             return
         progress[:] = 0.0, 0.0
         try:
-            pipe.send(("ok", TASKS[task](kept, *arguments)))
+            pipe.send(("ok", TASKS[task](state, *arguments)))
         except Stopped:
-            pipe.send(("bad", "stopped"))
+            pipe.send(("error", "stopped"))
         except (InputError, ImageError) as error:
-            pipe.send(("bad", str(error)))
+            pipe.send(("error", str(error)))
         except MemoryError:
-            pipe.send(("bad", "not enough memory for this"))
+            pipe.send(("error", "not enough memory"))
         except Exception as error:  # a bug in one task must not end the tab
-            pipe.send(("bad", f"{type(error).__name__}: {error}"))
+            pipe.send(("error", f"{type(error).__name__}: {error}"))
 
 
 class Session:
@@ -59,16 +59,16 @@ class Session:
 
     def __init__(self) -> None:
         context = multiprocessing.get_context("spawn")
-        self.pipe, theirs = context.Pipe()
+        self.pipe, worker_pipe = context.Pipe()
         self.progress, self.stop = context.RawArray("d", 2), context.RawValue("b")
-        self.process = context.Process(target=serve, args=(theirs, self.progress, self.stop), daemon=True)
-        with one_thread(), environment(CAREFUL):
+        self.process = context.Process(target=serve, args=(worker_pipe, self.progress, self.stop), daemon=True)
+        with one_thread(), environment(OPENCV_LIMITS):
             self.process.start()
-        theirs.close()
-        self.thread = ThreadPoolExecutor(1, "lab")
+        worker_pipe.close()
+        self.thread = ThreadPoolExecutor(1, "session")
 
-    async def ask(self, task: str, *arguments: Any) -> Any:
-        """Run a task and return its result. Raises InputError for a user error, Gone if the worker has ended."""
+    async def run(self, task: str, *arguments: Any) -> Any:
+        """Run a task and return its result. Raises InputError for a user error, WorkerLost if the worker has ended."""
         return await asyncio.get_running_loop().run_in_executor(self.thread, self.call, task, arguments)
 
     def call(self, task: str, arguments: tuple[Any, ...]) -> Any:
@@ -76,22 +76,22 @@ class Session:
         self.stop.value = 0
         try:
             self.pipe.send((task, arguments))
-            verdict, answer = self.pipe.recv()
+            status, reply = self.pipe.recv()
         except (EOFError, OSError) as error:
             raise WorkerLost("this tab's worker has stopped: reload the page") from error
-        if verdict == "bad":
-            raise InputError(answer)
-        return answer
+        if status == "error":
+            raise InputError(reply)
+        return reply
 
     def halt(self) -> None:
         """Ask the current task to end; only tasks that report progress do."""
         self.stop.value = 1
 
     @property
-    def share(self) -> float:
+    def progress_fraction(self) -> float:
         """Completed fraction of the current task."""
-        done, everything = self.progress[:]
-        return done / everything if everything else 0.0
+        done, total = self.progress[:]
+        return done / total if total else 0.0
 
     def close(self) -> None:
         """End the worker process."""
@@ -112,18 +112,18 @@ class SpareWorker:
         self.scene = scene
         self.next: Session | None = None
 
-    def begin(self) -> None:
+    def start(self) -> None:
         """Start a spare worker if there is none."""
         if self.next is None:
             self.next = Session()
-            self.next.thread.submit(self.next.call, "warm", (self.scene,))
+            self.next.thread.submit(self.next.call, "warm_up", (self.scene,))
 
     def take(self) -> Session:
         """Return the spare worker, or else a new one."""
-        found, self.next = self.next, None
-        return found if found and found.process.is_alive() else Session()
+        session, self.next = self.next, None
+        return session if session and session.process.is_alive() else Session()
 
-    def end(self) -> None:
+    def close(self) -> None:
         """Close the spare worker as the server ends."""
         if self.next:
             self.next.close()

@@ -28,27 +28,25 @@ RESPONSES = (
     "time_ms_median",
 )
 BINS = 28
-SHOWN = 20  # most failed trials in a tally
+MAX_FAILED = 20  # maximum number of failed trials in the results
 
 
-class Tally(NamedTuple):
+class StudyResults(NamedTuple):
     """Results of a study so far.
 
-    figures : (value, low, high) by response;  bins, counts : histogram of the error angle, arcsec
-    failed  : (number, reason) of trials that raised, then of wrong ones, then of unsolved ones; the first SHOWN
+    statistics: (value, low, high) by response;  bins, counts : histogram of the error angle, arcsec
+    failed  : (number, reason) of trials that raised, then of wrong ones, then of unsolved ones; the first MAX_FAILED
     """
 
     done: int
     wrong: int
-    figures: dict[str, tuple[float, float, float]]
+    statistics: dict[str, tuple[float, float, float]]
     bins: tuple[float, ...]
     counts: tuple[int, ...]
     failed: tuple[tuple[int, str], ...]
 
 
-def monte_carlo(
-    scene: str, overrides: Mapping[str, str], trial: Mapping[str, Any], count: int, seed: int
-) -> str:
+def monte_carlo(scene: str, overrides: Mapping[str, str], trial: Mapping[str, Any], count: int, seed: int) -> str:
     """YAML of a study with `count` random attitudes of a scene."""
     tree = {
         "schema": 1,
@@ -64,21 +62,20 @@ def monte_carlo(
     return yaml.safe_dump(tree, sort_keys=False)
 
 
-class Trials:
+class StudyProcess:
     """One study's process, which ends with its tab."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.process: asyncio.subprocess.Process | None = None
         self.total = 0
-        self.words = ""
 
     @property
     def running(self) -> bool:
         return self.process is not None and self.process.returncode is None
 
-    async def begin(self, study: Path, verb: str = "run") -> None:
-        """Start the process; its standard error is kept for `end`. verb : run or resume"""
+    async def start(self, study: Path, verb: str = "run") -> None:
+        """Start the process; its standard error is kept for `wait`. verb : run or resume"""
         command = ["-m", "skysim", "study", verb, str(study), "--out", str(self.folder), "--workers", "1"]
         self.process = await asyncio.create_subprocess_exec(
             sys.executable,
@@ -88,12 +85,12 @@ class Trials:
             start_new_session=True,
         )
 
-    async def end(self) -> str:
+    async def wait(self) -> str:
         """Wait for the process; return the last line of its standard error if it failed, else ""."""
         if self.process is None:
             return ""
-        _, told = await self.process.communicate()
-        lines = told.decode(errors="replace").strip().splitlines()
+        _, stderr = await self.process.communicate()
+        lines = stderr.decode(errors="replace").strip().splitlines()
         return lines[-1] if self.process.returncode and lines else ""
 
     def stop(self) -> None:
@@ -108,47 +105,47 @@ class Trials:
             with contextlib.suppress(ProcessLookupError):
                 self.process.terminate()
 
-    def tally(self) -> Tally | None:
+    def results(self) -> StudyResults | None:
         """Results in the store so far; None before the first trial is done."""
         path = self.folder / STORE
         if not path.is_file():
             return None
         try:
-            with store.open_store(path) as kept:
-                counts, columns, raised = kept.counts(), kept.columns("error IS NULL"), kept.failures()
+            with store.open_store(path) as stored:
+                counts, columns, raised = stored.counts(), stored.columns("error IS NULL"), stored.failures()
         except InputError:
             return None
         if not counts["done"]:
             return None
-        figures = {}
+        statistics = {}
         for name in RESPONSES:
-            told = metrics.response(name)(columns)
-            figures[name] = (told.value, told.low, told.high)
-        off = metrics.FIGURES["angle_arcsec"](columns)
-        bins, heights = histogram(off[np.isfinite(off)])
-        failed = (*raised, *unsolved(columns))[:SHOWN]
-        return Tally(counts["done"], counts["wrong"], figures, bins, heights, failed)
+            summary = metrics.response(name)(columns)
+            statistics[name] = (summary.value, summary.low, summary.high)
+        error_arcsec = metrics.QUANTITIES["angle_arcsec"](columns)
+        bins, heights = histogram(error_arcsec[np.isfinite(error_arcsec)])
+        failed = (*raised, *unsolved(columns))[:MAX_FAILED]
+        return StudyResults(counts["done"], counts["wrong"], statistics, bins, heights, failed)
 
 
 def unsolved(columns: Mapping[str, Any]) -> list[tuple[int, str]]:
     """(number, reason) of trials with a wrong frame, then of those with an unsolved one."""
     wrong = columns["wrong"] > 0
     refused = (columns["solved"] < columns["frames"]) & ~wrong
-    told = zip(columns["trial"][refused].tolist(), columns["status"][refused].tolist(), strict=True)
-    return [*((trial, "wrong") for trial in columns["trial"][wrong].tolist()), *told]
+    unsolved_trials = zip(columns["trial"][refused].tolist(), columns["status"][refused].tolist(), strict=True)
+    return [*((trial, "wrong") for trial in columns["trial"][wrong].tolist()), *unsolved_trials]
 
 
-def histogram(off_arcsec: Any) -> tuple[tuple[float, ...], tuple[int, ...]]:
+def histogram(error_arcsec: Any) -> tuple[tuple[float, ...], tuple[int, ...]]:
     """Bin centers and counts with logarithmic bins, because errors range from arc-seconds to degrees."""
-    if not len(off_arcsec):
+    if not len(error_arcsec):
         return (), ()
-    low, high = max(float(off_arcsec.min()), 1e-3), max(float(off_arcsec.max()), 2e-3)
+    low, high = max(float(error_arcsec.min()), 1e-3), max(float(error_arcsec.max()), 2e-3)
     edges = np.geomspace(low / 1.05, high * 1.05, BINS + 1)
-    counts, _ = np.histogram(off_arcsec, edges)
+    counts, _ = np.histogram(error_arcsec, edges)
     return tuple(np.sqrt(edges[1:] * edges[:-1]).tolist()), tuple(counts.tolist())
 
 
 def finished(folder: Path) -> list[Path]:
     """Folders of the studies that have a report, the newest first."""
-    found = [path.parent for path in folder.glob("*/report.html") if (path.parent / STORE).is_file()]
-    return sorted(found, key=lambda path: -(path / "report.html").stat().st_mtime)
+    folders = [path.parent for path in folder.glob("*/report.html") if (path.parent / STORE).is_file()]
+    return sorted(folders, key=lambda path: -(path / "report.html").stat().st_mtime)

@@ -9,161 +9,161 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from skysim.apps.gui.messages import FlightLog, FrameView, SceneInfo, Triple, Zoom
+from skysim.apps.gui.messages import FrameView, MotionLog, PixelWindow, SceneInfo, Triple
 from skysim.apps.gui.worker import export, photo
-from skysim.apps.gui.worker.flight import Flown
-from skysim.apps.gui.worker.workbench import Workbench, zoomed
+from skysim.apps.gui.worker.playback import MotionPlayback
+from skysim.apps.gui.worker.workbench import Workbench, pixel_window
 from skysim.core.errors import InputError
 from skysim.core.images import LiveCamera
 
-Watch = Callable[[float, float], None]
+Progress = Callable[[float, float], None]
 
 
 @dataclass
-class Kept:
+class WorkerState:
     """State between tasks: the workbench, its simulated motion, and the other image if the page shows one.
 
-    watch : reports progress(done, total) of a long task; raises Stopped if the task shall end
+    report_progress : reports progress (done, total) of a long task; raises Stopped if the task shall end
     image : (H, W) pixels of an image that is not of the scene;  camera : an open live camera
     """
 
-    watch: Watch
-    desk: Workbench | None = None
-    flown: Flown | None = None
+    report_progress: Progress
+    workbench: Workbench | None = None
+    playback: MotionPlayback | None = None
     image: NDArray | None = None
     scene: str = ""
     overrides: Mapping[str, str] | None = None
     camera: LiveCamera | None = None
 
-    def ready(self) -> Workbench:
+    def require_workbench(self) -> Workbench:
         """Return the workbench. Raises InputError if no scene is set up."""
-        if self.desk is None:
+        if self.workbench is None:
             raise InputError("no scene is set up")
-        return self.desk
+        return self.workbench
 
-    def seen(self, view: FrameView) -> FrameView:
+    def show_frame(self, view: FrameView) -> FrameView:
         """Return the view, and forget the other image, because the page now shows the scene."""
         self.image = None
         return view
 
-    def pictured(self, seen: photo.Seen) -> photo.Photo:
+    def show_photo(self, photo_pixels: photo.PhotoPixels) -> photo.Photo:
         """Keep an image that is not of the scene, and return it with its JPEG."""
-        told, self.image = seen
-        return replace(told, jpeg=self.packed())
+        shown, self.image = photo_pixels
+        return replace(shown, jpeg=self.jpeg())
 
-    def packed(self) -> bytes:
+    def jpeg(self) -> bytes:
         """JPEG of the shown image, with the workbench's stretch."""
-        desk = self.ready()
+        workbench = self.require_workbench()
         if self.image is not None:
-            return desk.packed(self.image)
-        assert desk.frame is not None
-        return desk.packed(desk.frame.image_dn)
+            return workbench.to_jpeg(self.image)
+        assert workbench.frame is not None
+        return workbench.to_jpeg(workbench.frame.image_dn)
 
 
 class Stopped(Exception):
     """Raised in a task that the user has stopped."""
 
 
-def warm(_: Kept, scene: str) -> None:
+def warm_up(_: WorkerState, scene: str) -> None:
     """Warm up: set up a scene and solve one frame, so that code is imported and compiled."""
-    Workbench.of(scene, {}).look(solve=True)
+    Workbench.open(scene, {}).render_at_rest(solve=True)
 
 
 def open_scene(
-    kept: Kept, scene: str, overrides: Mapping[str, str], solve: bool
+    state: WorkerState, scene: str, overrides: Mapping[str, str], solve: bool
 ) -> tuple[SceneInfo, FrameView]:
     """Set up a scene and render a first frame."""
-    kept.desk = Workbench.of(scene, overrides, kept.desk)
-    kept.scene, kept.overrides, kept.flown = scene, dict(overrides), None
-    return kept.desk.setting, look(kept, solve)
+    state.workbench = Workbench.open(scene, overrides, state.workbench)
+    state.scene, state.overrides, state.playback = scene, dict(overrides), None
+    return state.workbench.scene_info, render(state, solve)
 
 
-def look(kept: Kept, solve: bool) -> FrameView:
-    return kept.seen(kept.ready().look(solve))
+def render(state: WorkerState, solve: bool) -> FrameView:
+    return state.show_frame(state.require_workbench().render_at_rest(solve))
 
 
-def point(kept: Kept, angles_deg: Triple, solve: bool) -> FrameView:
-    kept.ready().point(angles_deg)
-    return look(kept, solve)
+def point(state: WorkerState, angles_deg: Triple, solve: bool) -> FrameView:
+    state.require_workbench().point(angles_deg)
+    return render(state, solve)
 
 
-def move(kept: Kept, right: float, up: float, roll_deg: float, solve: bool) -> FrameView:
-    kept.ready().move(right, up, roll_deg)
-    return look(kept, solve)
+def move(state: WorkerState, right: float, up: float, roll_deg: float, solve: bool) -> FrameView:
+    state.require_workbench().move(right, up, roll_deg)
+    return render(state, solve)
 
 
-def show(kept: Kept, stretch: str, bright: float) -> bytes:
+def show(state: WorkerState, stretch: str, brightness: float) -> bytes:
     """Change stretch and brightness; return the shown image as JPEG."""
-    desk = kept.ready()
-    desk.stretch, desk.bright = stretch, bright
-    return kept.packed()
+    workbench = state.require_workbench()
+    workbench.stretch, workbench.brightness = stretch, brightness
+    return state.jpeg()
 
 
-def fit(kept: Kept, widest_px: int) -> bytes:
+def fit(state: WorkerState, widest_px: int) -> bytes:
     """Limit the image's width to the pixels that the screen has for it; return the shown image as JPEG."""
-    kept.ready().widest_px = widest_px
-    return kept.packed()
+    state.require_workbench().widest_px = widest_px
+    return state.jpeg()
 
 
-def zoom(kept: Kept, x: float, y: float) -> Zoom:
+def zoom(state: WorkerState, x: float, y: float) -> PixelWindow:
     """The pixels of the shown image around (x, y)."""
-    frame = kept.ready().frame
+    frame = state.require_workbench().frame
     assert frame is not None
-    return zoomed(frame.image_dn if kept.image is None else kept.image, x, y)
+    return pixel_window(frame.image_dn if state.image is None else state.image, x, y)
 
 
-def fly(kept: Kept) -> FlightLog:
+def simulate(state: WorkerState) -> MotionLog:
     """Simulate the whole motion, for playback."""
-    kept.flown = Flown.of(kept.ready(), kept.watch)
-    return kept.flown.curves
+    state.playback = MotionPlayback.simulate(state.require_workbench(), state.report_progress)
+    return state.playback.curves
 
 
-def play(kept: Kept, t_s: float, solve: bool) -> FrameView:
+def play(state: WorkerState, t_s: float, solve: bool) -> FrameView:
     """Render the frame at time t_s of the motion. Raises InputError if none was simulated."""
-    if kept.flown is None:
-        raise InputError("nothing was flown yet")
-    return kept.seen(kept.flown.at(kept.ready(), t_s, solve))
+    if state.playback is None:
+        raise InputError("no motion has been simulated yet")
+    return state.show_frame(state.playback.render_at(state.require_workbench(), t_s, solve))
 
 
-def replay(kept: Kept, study: str, folder: str, trial: int) -> photo.Photo:
+def replay(state: WorkerState, study: str, folder: str, trial: int) -> photo.Photo:
     """Repeat a study's trial; the page shows its frame."""
-    return kept.pictured(photo.of_trial(study, Path(folder), trial))
+    return state.show_photo(photo.photo_from_trial(study, Path(folder), trial))
 
 
-def export_files(kept: Kept) -> dict[str, bytes]:
-    return export.files(kept.ready(), kept.scene, dict(kept.overrides or {}))
+def export_files(state: WorkerState) -> dict[str, bytes]:
+    return export.frame_files(state.require_workbench(), state.scene, dict(state.overrides or {}))
 
 
 def solve_file(
-    kept: Kept, name: str, data: bytes, fov_deg: float | None, stages: dict[str, str]
+    state: WorkerState, name: str, data: bytes, fov_deg: float | None, stages: dict[str, str]
 ) -> photo.Photo:
-    return kept.pictured(photo.of_file(name, data, fov_deg, stages))
+    return state.show_photo(photo.photo_from_file(name, data, fov_deg, stages))
 
 
-def solve_camera(kept: Kept, source: str, fov_deg: float | None, stages: dict[str, str]) -> photo.Photo:
+def solve_camera(state: WorkerState, source: str, fov_deg: float | None, stages: dict[str, str]) -> photo.Photo:
     """Solve the next frame of a live camera, which stays open."""
-    if kept.camera is None:
-        kept.camera = LiveCamera(source)
-    return kept.pictured(photo.of_camera(kept.camera, fov_deg, stages))
+    if state.camera is None:
+        state.camera = LiveCamera(source)
+    return state.show_photo(photo.photo_from_camera(state.camera, fov_deg, stages))
 
 
-def release(kept: Kept) -> None:
+def release(state: WorkerState) -> None:
     """Close the live camera."""
-    if kept.camera:
-        kept.camera.close()
-    kept.camera = None
+    if state.camera:
+        state.camera.close()
+    state.camera = None
 
 
 TASKS: dict[str, Callable[..., Any]] = {
-    "warm": warm,
+    "warm_up": warm_up,
     "open": open_scene,
-    "look": look,
+    "render": render,
     "point": point,
     "move": move,
     "show": show,
     "fit": fit,
     "zoom": zoom,
-    "fly": fly,
+    "simulate": simulate,
     "play": play,
     "replay": replay,
     "export": export_files,

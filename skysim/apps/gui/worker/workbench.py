@@ -15,7 +15,15 @@ from estimator.core.types import Attitude
 from estimator.trackers.dome_tracker import DomeTracker
 from estimator.trackers.pipeline import Clock, Report
 from estimator.trackers.star_tracker import StarTracker
-from skysim.apps.gui.messages import Answer, Detection, FrameView, Light, SceneInfo, Triple, Zoom
+from skysim.apps.gui.messages import (
+    Detection,
+    FrameView,
+    Light,
+    PixelWindow,
+    SceneInfo,
+    TrackerResult,
+    Triple,
+)
 from skysim.apps.gui.worker import geometry, pointing
 from skysim.core import quaternion
 from skysim.core.types import Floats, Frame, Trajectory, Truth
@@ -25,13 +33,13 @@ from skysim.results import stretch as contrast
 from skysim.scene.light import StarsConfig
 from skysim.scene.loader import load
 from skysim.scene.scene import Scene
-from skysim.simulation import exposure, testbed
-from skysim.simulation.testbed import SPARE_S, Testbed
+from skysim.simulation import exposure
+from skysim.simulation.testbed import MARGIN_S, Testbed, build_testbed, build_tracker, exposure_window
 from skysim.tracking import factory
 from skysim.tracking import settings as tracker_settings
 from skysim.tracking.external.adapter import ExternalTracker
 
-ZOOMED = (11, 7)  # enlarged pixels across and down; their values remain readable
+WINDOW_PX = (11, 7)  # enlarged pixels across and down; their values remain readable
 STAGES = ("detector", "centroider", "identifier", "solver")
 
 
@@ -39,207 +47,205 @@ STAGES = ("detector", "centroider", "identifier", "solver")
 class Workbench:
     """A scene that is set up, with the current attitude and the newest frame.
 
-    stretch, bright, widest_px : how frames are displayed
-    shots : number of frames rendered; it changes the seed, so that each frame has independent noise
+    stretch, brightness, widest_px : how frames are displayed
+    rendered_count : number of frames rendered; it changes the seed, so that each frame has independent noise
     magnitude : V magnitude by a light's number
     """
 
     scene: Scene
-    lab: Testbed
+    testbed: Testbed
     estimator: factory.Estimator
     lab_from_body: Rotation
     stretch: str = "square root"
-    bright: float = 1.0
+    brightness: float = 1.0
     widest_px: int = 1400
-    shots: int = 0
+    rendered_count: int = 0
     frame: Frame | None = None
     truth: Truth | None = None
     report: Report | None = None
     magnitude: dict[int, float] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, name: str, overrides: Mapping[str, str], before: Workbench | None = None) -> Workbench:
+    def open(cls, name: str, overrides: Mapping[str, str], before: Workbench | None = None) -> Workbench:
         """Set up a scene. If only the tracker differs from `before`, its testbed and attitude are kept.
 
         Raises InputError.
         """
         scene = load(name, overrides)
         if before and before.scene.model_copy(update={"tracker": scene.tracker}) == scene:
-            lab = replace(before.lab, scene=scene)
-            return replace(before, scene=scene, lab=lab, estimator=testbed.tracker(lab))
-        lab = testbed.build_testbed(scene)
-        here = lab.trajectory.lab_from_body[0]
-        desk = cls(scene, lab, testbed.tracker(lab), here, magnitude=magnitudes(lab))
+            testbed = replace(before.testbed, scene=scene)
+            return replace(before, scene=scene, testbed=testbed, estimator=build_tracker(testbed))
+        testbed = build_testbed(scene)
+        lab_from_body = testbed.trajectory.lab_from_body[0]
+        workbench = cls(scene, testbed, build_tracker(testbed), lab_from_body, magnitude=magnitude_by_id(testbed))
         if before:
-            return replace(desk, stretch=before.stretch, bright=before.bright, widest_px=before.widest_px)
-        return desk
+            return replace(workbench, stretch=before.stretch, brightness=before.brightness, widest_px=before.widest_px)
+        return workbench
 
-    def packed(self, image: NDArray) -> bytes:
+    def to_jpeg(self, image: NDArray) -> bytes:
         """JPEG of an image: stretched, and reduced to the width on the screen."""
         return contrast.jpeg(
-            contrast.fitted(contrast.stretched(image, self.stretch, self.bright), self.widest_px)
+            contrast.reduce_width(contrast.to_8bit(image, self.stretch, self.brightness), self.widest_px)
         )
 
     @property
-    def setting(self) -> SceneInfo:
-        """Facts about the scene for the page."""
-        scene, settings = self.scene, tracker_settings.believed_settings(self.scene)
+    def scene_info(self) -> SceneInfo:
+        """Properties of the scene for the page."""
+        scene, settings = self.scene, tracker_settings.assumed_settings(self.scene)
         camera = scene.camera
         return SceneInfo(
             scene.name,
             scene.title,
             isinstance(scene.light, StarsConfig),
             scoring.angle_names(scene),
-            prefix_of(self.lab),
+            id_prefix(self.testbed),
             2 * math.degrees(math.atan(camera.width_px / 2 / camera.focal_px)),
             {name: getattr(settings, name) for name in STAGES},
-            tracker_settings.choices(scene),
-            bool(scene.motion.manoeuvre or any(scene.motion.rate_deg_s)),
-            self.lab.flown_s,
-            geometry.of(self.lab),
+            tracker_settings.algorithm_names(scene),
+            self.testbed.duration_s,
+            geometry.lab_geometry(self.testbed),
         )
 
     def point(self, angles_deg: Triple) -> None:
         """Set the attitude. Raises InputError."""
-        self.lab_from_body = pointing.from_angles(self.scene, self.lab.mount, angles_deg)
+        self.lab_from_body = pointing.from_angles(self.scene, self.testbed.mount, angles_deg)
 
     def move(self, right: float, up: float, roll_deg: float) -> None:
         """Change the attitude by a step. Raises InputError."""
-        self.lab_from_body = pointing.moved(
-            self.scene, self.lab.mount, self.lab_from_body, right, up, roll_deg
-        )
+        self.lab_from_body = pointing.moved(self.scene, self.testbed.mount, self.lab_from_body, right, up, roll_deg)
 
-    def look(self, solve: bool = False) -> FrameView:
-        """Render a frame at the current attitude at rest, with independent noise; solve it if asked."""
-        self.shots += 1
-        scene = self.scene.model_copy(update={"seed": self.scene.seed + self.shots})
-        when = testbed.window(scene, 0)
-        end_s = when.close_s(scene.camera.height_px) + SPARE_S
-        still = Trajectory.at_rest(self.lab_from_body, end_s)
-        return self.shown(replace(self.lab, scene=scene, trajectory=still), solve)
+    def render_at_rest(self, solve: bool = False) -> FrameView:
+        """Render a frame at the current attitude at rest, with independent noise; solve it if `solve`."""
+        self.rendered_count += 1
+        scene = self.scene.model_copy(update={"seed": self.scene.seed + self.rendered_count})
+        end_s = exposure_window(scene, 0).close_s(scene.camera.height_px) + MARGIN_S
+        at_rest = Trajectory.at_rest(self.lab_from_body, end_s)
+        return self.render(replace(self.testbed, scene=scene, trajectory=at_rest), solve)
 
     @property
-    def answer(self) -> Answer | None:
+    def result(self) -> TrackerResult | None:
         """The tracker's solution of the newest frame; None if it was not solved."""
         if self.report is None or self.truth is None:
             return None
-        return answered(self.lab, self.estimator, self.report, self.truth)
+        return tracker_result(self.testbed, self.estimator, self.report, self.truth)
 
-    def shown(self, lab: Testbed, solve: bool) -> FrameView:
-        """Render frame 0 of a testbed, solve it if asked, and return the view for the page."""
+    def render(self, testbed: Testbed, solve: bool) -> FrameView:
+        """Render frame 0 of a testbed, solve it if `solve`, and return the view for the page."""
         clock = Clock()
-        self.frame, self.truth = exposure.render_frame(lab, 0)
+        self.frame, self.truth = exposure.render_frame(testbed, 0)
         self.report = factory.solve_frame(self.estimator, self.frame) if solve else None
-        packed, (height, width) = self.packed(self.frame.image_dn), self.frame.image_dn.shape
+        jpeg, (height, width) = self.to_jpeg(self.frame.image_dn), self.frame.image_dn.shape
         clock.lap("all")
         return FrameView(
-            packed,
+            jpeg,
             (width, height),
-            scoring.angles_deg(self.truth.cam_from_lab, self.scene, self.lab.mount),
-            tuple(quaternion.of(self.truth.lab_from_body).tolist()),
+            scoring.angles_deg(self.truth.cam_from_lab, self.scene, self.testbed.mount),
+            tuple(quaternion.from_rotation(self.truth.lab_from_body).tolist()),
             self.frame.exposure_s,
-            contrast.facts(self.frame.image_dn, self.frame.saturation_dn),
-            lights_of(self.truth, self.magnitude),
-            self.answer,
+            contrast.frame_statistics(self.frame.image_dn, self.frame.saturation_dn),
+            true_lights(self.truth, self.magnitude),
+            self.result,
             1e3 * clock.seconds["all"],
         )
 
 
-def prefix_of(lab: Testbed) -> str:
+def id_prefix(testbed: Testbed) -> str:
     """Catalog of the lights' numbers: LED if no light has a magnitude, else HIP."""
-    return "LED" if np.isnan(lab.sources.magnitude).all() else "HIP"
+    return "LED" if np.isnan(testbed.sources.magnitude).all() else "HIP"
 
 
-def lights_of(truth: Truth, magnitude: Mapping[int, float]) -> tuple[Light, ...]:
+def true_lights(truth: Truth, magnitude: Mapping[int, float]) -> tuple[Light, ...]:
     """The true lights of a frame, the brightest first."""
-    seen = truth.seen
-    rows = np.argsort(-seen.electrons)
-    told = zip(
-        seen.id[rows].tolist(), seen.flux_xy_px[rows].tolist(), seen.electrons[rows].tolist(), strict=True
+    sources = truth.sources
+    rows = np.argsort(-sources.electrons)
+    columns = zip(
+        sources.id[rows].tolist(),
+        sources.flux_xy_px[rows].tolist(),
+        sources.electrons[rows].tolist(),
+        strict=True,
     )
-    return tuple(Light(id, x, y, e, magnitude.get(id, math.nan)) for id, (x, y), e in told)
+    return tuple(Light(id, x, y, e, magnitude.get(id, math.nan)) for id, (x, y), e in columns)
 
 
-def magnitudes(lab: Testbed) -> dict[int, float]:
+def magnitude_by_id(testbed: Testbed) -> dict[int, float]:
     """V magnitude by a light's number; NaN for an LED."""
-    return dict(zip(lab.sources.id.tolist(), lab.sources.magnitude.tolist(), strict=True))
+    return dict(zip(testbed.sources.id.tolist(), testbed.sources.magnitude.tolist(), strict=True))
 
 
-def answered(lab: Testbed, estimator: factory.Estimator, report: Report, truth: Truth) -> Answer:
+def tracker_result(testbed: Testbed, estimator: factory.Estimator, report: Report, truth: Truth) -> TrackerResult:
     """The tracker's report with its errors relative to the truth."""
-    told, ms = report.attitude, 1e3 * sum(report.seconds.values())
-    spots = spots_of(report, named(estimator, told, report.centroids.xy_px))
-    if told.cam_from_ref is None:
-        return Answer(told.status, spots, ms)
-    cross, roll = metrics.cross_and_roll_rad(told.cam_from_ref, truth.cam_from_lab)
-    return Answer(
-        told.status,
-        spots,
+    attitude, ms = report.attitude, 1e3 * sum(report.seconds.values())
+    detections = detection_views(report, matches_by_row(estimator, attitude, report.centroids.xy_px))
+    if attitude.cam_from_ref is None:
+        return TrackerResult(attitude.status, detections, ms)
+    cross, roll = metrics.cross_and_roll_rad(attitude.cam_from_ref, truth.cam_from_lab)
+    return TrackerResult(
+        attitude.status,
+        detections,
         ms,
-        scoring.angles_deg(told.cam_from_ref, lab.scene, lab.mount),
+        scoring.angles_deg(attitude.cam_from_ref, testbed.scene, testbed.mount),
         cross / ARCSEC_RAD,
         roll / ARCSEC_RAD,
-        claimed_arcsec(told),
-        metrics.is_wrong(told.cam_from_ref, truth.cam_from_lab),
-        windows(estimator, told),
+        estimated_sigma_arcsec(attitude),
+        metrics.is_wrong(attitude.cam_from_ref, truth.cam_from_lab),
+        search_windows_px(estimator, attitude),
     )
 
 
-def spots_of(report: Report, names: Mapping[int, tuple[int, float]]) -> tuple[Detection, ...]:
+def detection_views(report: Report, names: Mapping[int, tuple[int, float]]) -> tuple[Detection, ...]:
     """Detections with id and residual of their matched lights. names : (id, residual in pixels) by centroid row"""
-    seen = report.centroids
-    rows = zip(seen.xy_px.tolist(), seen.sigma_px.tolist(), seen.flux.tolist(), strict=True)
+    centroids = report.centroids
+    rows = zip(centroids.xy_px.tolist(), centroids.sigma_px.tolist(), centroids.flux.tolist(), strict=True)
     return tuple(
-        Detection(x, y, sigma, flux, *names.get(n, (-1, math.nan)))
-        for n, ((x, y), sigma, flux) in enumerate(rows)
+        Detection(x, y, sigma, flux, *names.get(n, (-1, math.nan))) for n, ((x, y), sigma, flux) in enumerate(rows)
     )
 
 
-def zoomed(image: NDArray, x: float, y: float) -> Zoom:
-    """The window of ZOOMED pixels around (x, y), moved inside the image at its border."""
-    (height, width), (across, down) = image.shape, ZOOMED
+def pixel_window(image: NDArray, x: float, y: float) -> PixelWindow:
+    """The window of WINDOW_PX pixels around (x, y), moved inside the image at its border."""
+    (height, width), (across, down) = image.shape, WINDOW_PX
     x0 = min(max(round(x) - across // 2, 0), max(width - across, 0))
     y0 = min(max(round(y) - down // 2, 0), max(height - down, 0))
-    part = np.rint(image[y0 : y0 + down, x0 : x0 + across]).astype(int)
-    return Zoom(x0, y0, tuple(map(tuple, part.tolist())))
+    values = np.rint(image[y0 : y0 + down, x0 : x0 + across]).astype(int)
+    return PixelWindow(x0, y0, tuple(map(tuple, values.tolist())))
 
 
-def claimed_arcsec(told: Attitude) -> tuple[float, float]:
+def estimated_sigma_arcsec(attitude: Attitude) -> tuple[float, float]:
     """Estimated standard errors across the boresight (both axes) and about it, arcsec; NaN without a covariance."""
-    if told.covariance_rad2 is None:
+    if attitude.covariance_rad2 is None:
         return math.nan, math.nan
-    variance = np.diag(told.covariance_rad2)
+    variance = np.diag(attitude.covariance_rad2)
     return float(np.sqrt(variance[:2].sum())) / ARCSEC_RAD, float(np.sqrt(variance[2])) / ARCSEC_RAD
 
 
-def predicted(estimator: DomeTracker | StarTracker, told: Attitude) -> tuple[NDArray[np.int64], Floats]:
+def predicted_lights(estimator: DomeTracker | StarTracker, attitude: Attitude) -> tuple[NDArray[np.int64], Floats]:
     """(N,) ids and (N, 2) predicted pixels of all lights on the tracker's map, for its attitude and camera model.
 
     If the solution has its own camera (the field of view was fitted), that camera is used.
     """
-    assert told.cam_from_ref is not None
+    assert attitude.cam_from_ref is not None
     if isinstance(estimator, DomeTracker):
-        body_from_lab = estimator.lever.cam_from_body.inv() * told.cam_from_ref
+        body_from_lab = estimator.lever.cam_from_body.inv() * attitude.cam_from_ref
         places = estimator.leds.position_m
         return estimator.leds.id, project(body_from_lab, places, estimator.lever, estimator.camera)
-    camera = told.camera or estimator.camera
-    return estimator.stars.id, camera.pixels(told.cam_from_ref.apply(estimator.stars.vectors))
+    camera = attitude.camera or estimator.camera
+    return estimator.stars.id, camera.pixels(attitude.cam_from_ref.apply(estimator.stars.vectors))
 
 
-def named(estimator: factory.Estimator, told: Attitude, xy_px: Floats) -> dict[int, tuple[int, float]]:
+def matches_by_row(estimator: factory.Estimator, attitude: Attitude, xy_px: Floats) -> dict[int, tuple[int, float]]:
     """By centroid row: (id of the matched light, distance from its predicted position in pixels)."""
-    if told.match is None or told.cam_from_ref is None or isinstance(estimator, ExternalTracker):
+    if attitude.match is None or attitude.cam_from_ref is None or isinstance(estimator, ExternalTracker):
         return {}
-    ids, where = predicted(estimator, told)
-    rows, star = told.match.observed, told.match.star
-    off = np.hypot(*(where[star] - xy_px[rows]).T)
-    return dict(zip(rows.tolist(), zip(ids[star].tolist(), off.tolist(), strict=True), strict=True))
+    ids, predicted_px = predicted_lights(estimator, attitude)
+    rows, star = attitude.match.observed, attitude.match.star
+    residual_px = np.hypot(*(predicted_px[star] - xy_px[rows]).T)
+    return dict(zip(rows.tolist(), zip(ids[star].tolist(), residual_px.tolist(), strict=True), strict=True))
 
 
-def windows(estimator: factory.Estimator, told: Attitude) -> tuple[tuple[float, float], ...]:
+def search_windows_px(estimator: factory.Estimator, attitude: Attitude) -> tuple[tuple[float, float], ...]:
     """Predicted pixels of up to 200 lights in the field: where tracking mode would search in the next frame."""
     if isinstance(estimator, ExternalTracker):
         return ()
-    _, xy_px = predicted(estimator, told)
+    _, xy_px = predicted_lights(estimator, attitude)
     inside = estimator.camera.contains(np.nan_to_num(xy_px, nan=-1e9))
     return tuple((float(x), float(y)) for x, y in xy_px[inside][:200])

@@ -1,4 +1,4 @@
-"""Export the whole laboratory as one MJCF file, for MuJoCo's viewer and for `picture`.
+"""Export the laboratory as one MJCF file, for MuJoCo's viewer and for `picture`.
 
 What is added to the vehicle is for display only: no mass, no contacts, no constraints. Groups of the viewer:
 0 vehicle, floor and pedestal, 1 dome and LEDs or stars, 2 the star camera's field of view; 4, hidden, the tilt stop.
@@ -21,9 +21,9 @@ from scipy.spatial.transform import Rotation
 from skysim.core.errors import InputError
 from skysim.core.paths import SCENES
 from skysim.core.types import Floats, Mount, Sources
-from skysim.dynamics.multibody.integrator import Flight
-from skysim.dynamics.multibody.mjcf import compiled, mujoco_warnings
-from skysim.dynamics.multibody.model import World, mount
+from skysim.dynamics.multibody.integrator import Simulation
+from skysim.dynamics.multibody.mjcf import compile_spec, mujoco_warnings
+from skysim.dynamics.multibody.model import VehicleModel, camera_mount
 from skysim.dynamics.multibody.view.picture import LAB_CAMERA
 from skysim.scene.camera import CameraConfig
 from skysim.scene.light import DomeConfig
@@ -32,13 +32,13 @@ from skysim.sources.dome import surface
 from skysim.sources.dome.surface import Ellipsoid, Plane, Surface
 
 GROUP_LIGHTS, GROUP_FIELD, GROUP_HIDDEN = 1, 2, 4
-MOST_PX = (1920, 1440)  # width, height of the largest picture
+MAX_PX = (1920, 1440)  # width, height of the largest picture
 FOVY_DEG = 38.0
 
 SKY_RADIUS_M = 5.0
 SKY = Ellipsoid(np.zeros(3), np.full(3, SKY_RADIUS_M))
-MOST_STARS = 300
-LED_RADIUS_M = 5e-3  # larger than the true disc, which would be less than a pixel
+MAX_STARS = 300
+LED_RADIUS_M = 5e-3  # larger than the true disk, which would be less than a pixel
 LEVELS, DIM = 12, 0.15  # steps of brightness, and the darkest over the brightest
 RIM_M = 0.03
 SECTORS, RINGS = 72, 24  # of the dome's mesh
@@ -46,23 +46,23 @@ FLOOR_BELOW_M, VEHICLE_BELOW_M = 0.95, 0.6
 LIT_RGB, FIELD_RGB = np.array([1.0, 0.93, 0.78]), np.array([0.25, 0.75, 1.0])
 
 
-def mjcf(world: World, scene: Scene, sources: Sources, lab_from_body: Rotation) -> str:
-    """The whole laboratory as the text of one MJCF file, which MuJoCo's own viewer can open and simulate.
+def mjcf(vehicle: VehicleModel, scene: Scene, sources: Sources, lab_from_body: Rotation) -> str:
+    """The laboratory as the text of one MJCF file, which MuJoCo's own viewer can open and simulate.
 
     sources       : LEDs in lab coordinates (m), or stars, of which the brightest are put on a sphere
     lab_from_body : attitude in the keyframe `start`, which also has the speeds and gimbal angles of the scene
     The simulated model is not changed. Raises InputError for a start beyond the tilt stop, and for a vehicle that
     has a camera named `lab`.
     """
-    spec, here = world.spec.copy(), mount(world)
+    spec, mount = vehicle.spec.copy(), camera_mount(vehicle)
     if spec.camera(LAB_CAMERA):
         raise InputError(
-            f"{scene.vehicle.model}: has a camera {LAB_CAMERA}, which is the laboratory's; rename it"
+            f"{scene.vehicle.model}: camera name {LAB_CAMERA!r} is reserved for the view of the laboratory; rename it"
         )
-    on_earth = world.vehicle.mount == "air_bearing"
+    on_earth = vehicle.config.mount == "air_bearing"
     inside = surface.build_surface(scene.light.surface) if isinstance(scene.light, DomeConfig) else SKY
     hide_tilt_stop(spec)
-    inline_meshes(spec, world.model)
+    inline_meshes(spec, vehicle.model)
     add_backdrop(spec, on_earth)
     if on_earth:
         add_room(spec)
@@ -71,18 +71,18 @@ def mjcf(world: World, scene: Scene, sources: Sources, lab_from_body: Rotation) 
         add_dome(spec, rings_m)
         look_at(spec, *dome_view(rings_m))
     else:
-        boresight = lab_from_body.apply(here.cam_from_body.inv().apply([0.0, 0.0, 1.0]))
-        look_at(spec, *sky_view(world, boresight))
+        boresight = lab_from_body.apply(mount.cam_from_body.inv().apply([0.0, 0.0, 1.0]))
+        look_at(spec, *sky_view(vehicle, boresight))
     add_lights(spec, sources)
-    add_field(spec, here, field_corners(scene.camera, here, lab_from_body, inside))
-    add_start(spec, world, scene, lab_from_body)
-    with mujoco_warnings(), every_digit():
-        compiled(spec, SCENES / scene.vehicle.model)
-        return short_colours(spec.to_xml())
+    add_field(spec, mount, field_corners(scene.camera, mount, lab_from_body, inside))
+    add_start_keyframe(spec, vehicle, scene, lab_from_body)
+    with mujoco_warnings(), full_precision():
+        compile_spec(spec, SCENES / scene.vehicle.model)
+        return shorten_colors(spec.to_xml())
 
 
 def hide_tilt_stop(spec: Any) -> None:
-    """Put the tilt stop's tendon and its ends, which are no hardware, into the hidden group."""
+    """Put the tilt stop's tendon and its ends, which are not hardware, into the hidden group."""
     for element in (*spec.tendons, *spec.sites):
         if element.name.startswith("tilt_stop"):
             element.group = GROUP_HIDDEN
@@ -96,14 +96,14 @@ def inline_meshes(spec: Any, model: Any) -> None:
     for mesh in spec.meshes:
         if not mesh.file:
             continue
-        found = model.mesh(mesh.name or Path(mesh.file).stem)
-        first, count = int(found.vertadr[0]), int(found.vertnum[0])
-        begin, faces = int(found.faceadr[0]), int(found.facenum[0])
-        back = Rotation.from_quat(model.mesh_quat[found.id], scalar_first=True)
-        mesh.name, mesh.file, mesh.scale = found.name, "", [1.0, 1.0, 1.0]
+        compiled_mesh = model.mesh(mesh.name or Path(mesh.file).stem)
+        first, count = int(compiled_mesh.vertadr[0]), int(compiled_mesh.vertnum[0])
+        begin, faces = int(compiled_mesh.faceadr[0]), int(compiled_mesh.facenum[0])
+        file_from_compiled = Rotation.from_quat(model.mesh_quat[compiled_mesh.id], scalar_first=True)
+        mesh.name, mesh.file, mesh.scale = compiled_mesh.name, "", [1.0, 1.0, 1.0]
         mesh.refpos, mesh.refquat = [0.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0]
         mesh.uservert = (
-            back.apply(model.mesh_vert[first : first + count]) + model.mesh_pos[found.id]
+            file_from_compiled.apply(model.mesh_vert[first : first + count]) + model.mesh_pos[compiled_mesh.id]
         ).ravel()
         mesh.userface = model.mesh_face[begin : begin + faces].ravel()
 
@@ -123,7 +123,7 @@ def add_backdrop(spec: Any, on_earth: bool) -> None:
     spec.visual.headlight.ambient = [0.22] * 3
     spec.visual.headlight.diffuse = [0.35] * 3
     spec.visual.headlight.specular = [0.1] * 3
-    spec.visual.global_.offwidth, spec.visual.global_.offheight = MOST_PX
+    spec.visual.global_.offwidth, spec.visual.global_.offheight = MAX_PX
     spec.visual.quality.shadowsize = 2048
     spec.worldbody.add_light(
         name="stage_lamp",
@@ -150,24 +150,24 @@ def add_room(spec: Any) -> None:
     tiles.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "stage_tiles"
     plane, cylinder = mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_CYLINDER
     bottom = -FLOOR_BELOW_M
-    show(spec.worldbody, "stage_floor", plane, size=[6, 6, 0.1], pos=[0, 0, bottom], material="stage_tiles")
+    add_visual_geom(spec.worldbody, "stage_floor", plane, size=[6, 6, 0.1], pos=[0, 0, bottom], material="stage_tiles")
     for name, radius, low, high in (
         ("foot", 0.30, bottom, bottom + 0.04),
         ("column", 0.10, bottom, -0.35),
         ("neck", 0.05, -0.35, -0.06),
     ):
-        ends = [0.0, 0.0, low, 0.0, 0.0, high]
-        show(
+        fromto = [0.0, 0.0, low, 0.0, 0.0, high]
+        add_visual_geom(
             spec.worldbody,
             f"stage_{name}",
             cylinder,
             size=[radius, 0, 0],
-            fromto=ends,
+            fromto=fromto,
             rgba=[0.36, 0.39, 0.44, 1],
         )
 
 
-def show(body: Any, name: str, kind: Any, **more: Any) -> Any:
+def add_visual_geom(body: Any, name: str, kind: Any, **more: Any) -> Any:
     """A geom for display only: no mass, no contact."""
     return body.add_geom(name=name, type=kind, mass=0.0, contype=0, conaffinity=0, **more)
 
@@ -192,18 +192,18 @@ def shell_m(inside: Surface, cap_rad: float) -> Floats:
         radius = np.linspace(1e-3, inside.height_m * np.tan(min(cap_rad + 0.1, 1.3)), RINGS)[:, None, None]
         half_m = np.append(inside.half_m, np.inf)
         return np.asarray(
-            inside.centre_m + np.clip(radius * around, -half_m, half_m) @ inside.lab_from_own.as_matrix().T
+            inside.center_m + np.clip(radius * around, -half_m, half_m) @ inside.lab_from_own.as_matrix().T
         )
     upright = inside.lab_from_own.magnitude() == 0
-    if not (isinstance(inside, Ellipsoid) and upright and inside.rim.nowhere):
-        return seen_shell_m(inside, around)
-    middle, half = inside.centre_m[2], inside.semi_axes_m[2]
+    if not (isinstance(inside, Ellipsoid) and upright and inside.rim.unbounded):
+        return visible_shell_m(inside, around)
+    middle, half = inside.center_m[2], inside.semi_axes_m[2]
     lowest = max(middle, 0.35 * (middle + half))
     polar = np.linspace(1e-3, np.arccos((lowest - middle) / half), RINGS)[:, None, None]
-    return np.asarray(inside.centre_m + inside.semi_axes_m * (np.sin(polar) * around + np.cos(polar) * up))
+    return np.asarray(inside.center_m + inside.semi_axes_m * (np.sin(polar) * around + np.cos(polar) * up))
 
 
-def seen_shell_m(inside: Surface, around: Floats) -> Floats:
+def visible_shell_m(inside: Surface, around: Floats) -> Floats:
     """(RINGS, SECTORS, 3) points where rays from the bearing meet a surface, from its upper edge to its rim.
 
     around : (SECTORS, 3) horizontal unit vectors. Edge and rim are found to a fifth of a degree, between 0 and
@@ -211,28 +211,26 @@ def seen_shell_m(inside: Surface, around: Floats) -> Floats:
     """
     up = np.array([0.0, 0.0, 1.0])
 
-    def at(polar: Floats) -> Floats:
+    def points_at(polar: Floats) -> Floats:
         rays = np.sin(polar)[..., None] * around + np.cos(polar)[..., None] * up
         return inside.meet(np.zeros(3), rays.reshape(-1, 3)).reshape(rays.shape)
 
     polar = np.broadcast_to(np.linspace(1e-3, np.radians(80), 400)[:, None], (400, len(around)))
-    height_m = np.nan_to_num(at(polar)[..., 2], nan=-np.inf)
-    there = height_m > 0.35 * height_m.max()
-    first, last = there.argmax(axis=0), 399 - there[::-1].argmax(axis=0)
-    share = np.linspace(0, 1, RINGS)[:, None]
-    return at(polar[first, 0] * (1 - share) + polar[last, 0] * share)
+    height_m = np.nan_to_num(points_at(polar)[..., 2], nan=-np.inf)
+    on_surface = height_m > 0.35 * height_m.max()
+    first, last = on_surface.argmax(axis=0), 399 - on_surface[::-1].argmax(axis=0)
+    fraction = np.linspace(0, 1, RINGS)[:, None]
+    return points_at(polar[first, 0] * (1 - fraction) + polar[last, 0] * fraction)
 
 
-def add_sheet(
-    spec: Any, name: str, rings_m: Floats, inside_rgba: list[float], outside_rgba: list[float]
-) -> None:
+def add_sheet(spec: Any, name: str, rings_m: Floats, inside_rgba: list[float], outside_rgba: list[float]) -> None:
     """A surface with a color for each side; OpenGL does not draw the back of a triangle, so it is two meshes.
 
     rings_m : (K, n, 3) each counterclockwise seen from above, every one beneath or around the previous one
     """
-    here = np.arange(rings_m.shape[0] * rings_m.shape[1]).reshape(rings_m.shape[:2])
-    a, d = here[:-1].ravel(), here[1:].ravel()
-    b, c = np.roll(here, -1, axis=1)[:-1].ravel(), np.roll(here, -1, axis=1)[1:].ravel()
+    index = np.arange(rings_m.shape[0] * rings_m.shape[1]).reshape(rings_m.shape[:2])
+    a, d = index[:-1].ravel(), index[1:].ravel()
+    b, c = np.roll(index, -1, axis=1)[:-1].ravel(), np.roll(index, -1, axis=1)[1:].ravel()
     inwards = np.concatenate([np.column_stack([a, b, c]), np.column_stack([a, c, d])])
     for side, faces, rgba in (
         ("inside", inwards, inside_rgba),
@@ -252,64 +250,61 @@ def add_mesh(
     **more: Any,
 ) -> None:
     """A mesh, open or closed, and its geom; its inertia is that of a shell, which needs no volume."""
-    mesh = spec.add_mesh(
-        name=name, uservert=np.round(vertices_m, 6).ravel(), userface=faces.astype(np.int32).ravel()
-    )
+    mesh = spec.add_mesh(name=name, uservert=np.round(vertices_m, 6).ravel(), userface=faces.astype(np.int32).ravel())
     mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
-    show(body, name, mujoco.mjtGeom.mjGEOM_MESH, meshname=name, rgba=rgba, group=group, **more)
+    add_visual_geom(body, name, mujoco.mjtGeom.mjGEOM_MESH, meshname=name, rgba=rgba, group=group, **more)
 
 
 def add_lights(spec: Any, sources: Sources) -> None:
-    """A glowing grain for each LED, and for each of the brightest stars; brightness from its mean strength.
+    """A glowing octahedron for each LED, and for each of the brightest stars; brightness from its mean strength.
 
-    An LED's color shows its strength; a star's size does, by the square root. Grains of similar color share
-    one mesh: as
-    many sites would make a step eight times as slow, and a picture seconds.
+    An LED's color shows its strength; a star's size does, by the square root. Markers of similar color share
+    one mesh: as many sites would make a step eight times as slow, and a picture take seconds.
     """
     glow = spec.add_material(name="stage_glow", emission=0.8, specular=0.0)
     mean = sources.strength * sources.on_s / sources.period_s
     stars = bool((sources.place[:, 3] == 0).any())
-    shown = np.argsort(-mean, kind="stable")[: MOST_STARS if stars else len(mean)]
-    share = mean[shown] / mean.max(initial=1e-300)
-    place_m = sources.place[shown, :3] * (SKY_RADIUS_M if stars else 1.0)
-    radius_m = 0.006 + 0.04 * np.sqrt(share) if stars else np.full(len(shown), LED_RADIUS_M)
-    level = np.full(len(shown), LEVELS) if stars else np.ceil(share * LEVELS).astype(int)
-    for one in np.unique(level):
-        vertices, faces = grains(place_m[level == one], radius_m[level == one])
-        rgba = [*(LIT_RGB * (DIM + (1 - DIM) * one / LEVELS)), 1.0]
-        name = f"stage_{'stars' if stars else 'leds'}_{one}"
+    shown = np.argsort(-mean, kind="stable")[: MAX_STARS if stars else len(mean)]
+    fraction = mean[shown] / mean.max(initial=1e-300)
+    position_m = sources.place[shown, :3] * (SKY_RADIUS_M if stars else 1.0)
+    radius_m = 0.006 + 0.04 * np.sqrt(fraction) if stars else np.full(len(shown), LED_RADIUS_M)
+    level = np.full(len(shown), LEVELS) if stars else np.ceil(fraction * LEVELS).astype(int)
+    for step in np.unique(level):
+        vertices, faces = octahedra(position_m[level == step], radius_m[level == step])
+        rgba = [*(LIT_RGB * (DIM + (1 - DIM) * step / LEVELS)), 1.0]
+        name = f"stage_{'stars' if stars else 'leds'}_{step}"
         add_mesh(spec, spec.worldbody, name, vertices, faces, rgba, GROUP_LIGHTS, material=glow.name)
 
 
-def grains(place_m: Floats, radius_m: Floats) -> tuple[Floats, NDArray[np.int64]]:
+def octahedra(position_m: Floats, radius_m: Floats) -> tuple[Floats, NDArray[np.int64]]:
     """(6 N, 3) vertices and (8 N, 3) faces of N octahedra: corners on the axes, a face in every octant."""
     corners = np.concatenate([np.eye(3), -np.eye(3)])
     signs = np.array([[x, y, z] for x in (0, 3) for y in (0, 3) for z in (0, 3)])
     faces = signs + np.arange(3)
     odd = (signs > 0).sum(axis=1) % 2 == 1  # mirrored: reverse the order, to face outwards
     faces[odd] = faces[odd][:, ::-1]
-    vertices = place_m[:, None, :] + radius_m[:, None, None] * corners
-    return vertices.reshape(-1, 3), (6 * np.arange(len(place_m))[:, None, None] + faces).reshape(-1, 3)
+    vertices = position_m[:, None, :] + radius_m[:, None, None] * corners
+    return vertices.reshape(-1, 3), (6 * np.arange(len(position_m))[:, None, None] + faces).reshape(-1, 3)
 
 
-def field_corners(camera: CameraConfig, here: Mount, lab_from_body: Rotation, inside: Surface) -> Floats:
+def field_corners(camera: CameraConfig, mount: Mount, lab_from_body: Rotation, inside: Surface) -> Floats:
     """(4, 3) in body axes: where a pinhole's rays of the chip's corners meet dome or sky, at a given attitude.
 
     A ray that misses a flat panel, or meets it far away, ends at the distance of the sky.
     """
-    x = np.array([-0.5, camera.width_px - 0.5, camera.width_px - 0.5, -0.5]) - camera.centre_px[0]
-    y = np.array([-0.5, -0.5, camera.height_px - 0.5, camera.height_px - 0.5]) - camera.centre_px[1]
+    x = np.array([-0.5, camera.width_px - 0.5, camera.width_px - 0.5, -0.5]) - camera.center_px[0]
+    y = np.array([-0.5, -0.5, camera.height_px - 0.5, camera.height_px - 0.5]) - camera.center_px[1]
     rays_cam = np.column_stack([x, y, np.full(4, camera.focal_px)])
-    lab_from_cam = lab_from_body * here.cam_from_body.inv()
+    lab_from_cam = lab_from_body * mount.cam_from_body.inv()
     rays = lab_from_cam.apply(rays_cam / np.linalg.norm(rays_cam, axis=1, keepdims=True))
-    tip_m = lab_from_body.apply(here.camera_body_m)
+    tip_m = lab_from_body.apply(mount.camera_body_m)
     length_m = np.linalg.norm(inside.meet(tip_m, rays) - tip_m, axis=1)
     return lab_from_body.inv().apply(tip_m + np.fmin(length_m, SKY_RADIUS_M)[:, None] * rays)
 
 
-def add_field(spec: Any, here: Mount, corners_m: Floats) -> None:
+def add_field(spec: Any, mount: Mount, corners_m: Floats) -> None:
     """The star camera's field of view as a translucent pyramid on the vehicle, with its edges."""
-    bus, tip = spec.body("bus"), here.camera_body_m
+    bus, tip = spec.body("bus"), mount.camera_body_m
     sides = np.array(
         [[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 4, 1]]
     )  # open, so that it does not block the camera's own view
@@ -320,7 +315,7 @@ def add_field(spec: Any, here: Mount, corners_m: Floats) -> None:
     length_m = np.linalg.norm(corners_m - tip, axis=1).min()
     for k, corner in enumerate(corners_m):
         for kind, end in (("ray", tip), ("edge", corners_m[k - 1])):
-            show(
+            add_visual_geom(
                 bus,
                 f"stage_{kind}_{k}",
                 mujoco.mjtGeom.mjGEOM_CAPSULE,
@@ -339,14 +334,14 @@ def dome_view(rings_m: Floats) -> tuple[Floats, Floats, Floats, float]:
     wide, top = np.hypot(*rings_m[-1, :, :2].T).max(), rings_m[..., 2].max()
     size = (top + VEHICLE_BELOW_M) / 2
     tangent = np.tan(np.radians(FOVY_DEG / 2))
-    away = max(1.25 * size / tangent, wide * (1.05 / (4 / 3 * tangent) + 0.35))
+    distance = max(1.25 * size / tangent, wide * (1.05 / (4 / 3 * tangent) + 0.35))
     middle = np.array([0.0, 0.0, top - size])
-    return middle + away * direction(-62.0, 8.0), middle, np.array([0.0, 0.0, 1.0]), 0.55 * away
+    return middle + distance * direction(-62.0, 8.0), middle, np.array([0.0, 0.0, 1.0]), 0.55 * distance
 
 
-def sky_view(world: World, boresight: Floats) -> tuple[Floats, Floats, Floats, float]:
+def sky_view(vehicle: VehicleModel, boresight: Floats) -> tuple[Floats, Floats, Floats, float]:
     """As `dome_view`, from beside and behind the vehicle, with the camera's field along the picture's diagonal."""
-    size = float(world.model.stat.extent) / 2 + SKY_RADIUS_M / 2
+    size = float(vehicle.model.stat.extent) / 2 + SKY_RADIUS_M / 2
     beside = np.cross(boresight, np.eye(3)[np.argmin(np.abs(boresight))])
     back = beside / np.linalg.norm(beside) - 0.5 * boresight
     up = Rotation.from_rotvec(np.radians(-40.0) * back / np.linalg.norm(back)).apply(boresight)
@@ -363,23 +358,23 @@ def look_at(spec: Any, eye_m: Floats, middle_m: Floats, up: Floats, size_m: floa
     """Add the camera `lab` and set the viewer's initial view: MuJoCo's cameras look along -z, y is up."""
     back = (eye_m - middle_m) / np.linalg.norm(eye_m - middle_m)
     right = np.cross(up, back) / np.linalg.norm(np.cross(up, back))
-    turn = Rotation.from_matrix(np.column_stack([right, np.cross(back, right), back]))
-    spec.worldbody.add_camera(name=LAB_CAMERA, pos=eye_m, quat=turn.as_quat(scalar_first=True), fovy=FOVY_DEG)
+    lab_from_view = Rotation.from_matrix(np.column_stack([right, np.cross(back, right), back]))
+    spec.worldbody.add_camera(name=LAB_CAMERA, pos=eye_m, quat=lab_from_view.as_quat(scalar_first=True), fovy=FOVY_DEG)
     spec.stat.center, spec.stat.extent = middle_m, size_m
     spec.visual.map.znear, spec.visual.map.zfar = 0.01, 50.0
     spec.visual.global_.azimuth = float(np.degrees(np.arctan2(-back[1], -back[0])))
     spec.visual.global_.elevation = float(-np.degrees(np.arcsin(back[2])))
 
 
-def add_start(spec: Any, world: World, scene: Scene, lab_from_body: Rotation) -> None:
+def add_start_keyframe(spec: Any, vehicle: VehicleModel, scene: Scene, lab_from_body: Rotation) -> None:
     """The keyframe `start`: attitude and rate, wheel and rotor speeds, gimbal angles and servo set-points."""
-    flight = Flight(world, lab_from_body, np.radians(scene.motion.rate_deg_s), 0.0)
-    data = flight.data
+    simulation = Simulation(vehicle, lab_from_body, np.radians(scene.motion.rate_deg_s), 0.0)
+    data = simulation.data
     spec.add_key(name="start", qpos=data.qpos, qvel=data.qvel, act=data.act, ctrl=data.ctrl)
 
 
 @contextmanager
-def every_digit() -> Iterator[None]:
+def full_precision() -> Iterator[None]:
     """Write MJCF with fifteen digits; MuJoCo's six would shift a balanced vehicle's center of mass.
 
     MuJoCo's switch for it is private; if a version lacks it, six digits are written.
@@ -393,7 +388,7 @@ def every_digit() -> Iterator[None]:
         switch(6)
 
 
-def short_colours(text: str) -> str:
+def shorten_colors(text: str) -> str:
     """Write colors with four digits: they are single precision, so fifteen digits make 0.1 into 0.100000001490116."""
     return re.sub(
         r'(rgba|rgb1|rgb2)="([^"]*)"',

@@ -18,7 +18,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from skysim.core.errors import InputError
+from skysim.core.errors import InputError, unknown_name
 from skysim.core.files import atomic_file
 from skysim.core.types import Floats
 from skysim.dynamics.multibody.mjcf import mujoco_warnings, one_line
@@ -45,7 +45,7 @@ def picture(mjcf: str, qpos: Floats, size_px: tuple[int, int] = PICTURE_PX) -> P
     """(H, W, 3) RGB: the laboratory from its camera `lab`, in the state qpos (nq,). Raises NoPicture.
 
     mjcf    : from `mjcf_export.mjcf`
-    size_px : width and height, at most `mjcf_export.MOST_PX`
+    size_px : width and height, at most `mjcf_export.MAX_PX`
     """
     return next(film(mjcf, np.atleast_2d(qpos), size_px))
 
@@ -57,24 +57,24 @@ def film(mjcf: str, qpos: Floats, size_px: tuple[int, int] = FILM_PX) -> Iterato
     default), and a graphics driver may crash the whole process.
     """
     width, height = size_px
-    with tempfile.TemporaryFile() as task, tempfile.TemporaryFile() as complaints:
+    with tempfile.TemporaryFile() as task, tempfile.TemporaryFile() as errors:
         np.savez(task, mjcf=np.array(mjcf), qpos=qpos, size_px=np.array(size_px))
         task.seek(0)
         with subprocess.Popen(
             [sys.executable, "-m", "skysim.dynamics.multibody.view.picture"],
             stdin=task,
             stdout=subprocess.PIPE,
-            stderr=complaints,
+            stderr=errors,
             env={"MUJOCO_GL": "egl"} | dict(os.environ),
-        ) as painter:
+        ) as renderer:
             try:
                 for _ in range(len(qpos)):
-                    raw = painter.stdout.read(height * width * 3) if painter.stdout else b""
+                    raw = renderer.stdout.read(height * width * 3) if renderer.stdout else b""
                     if len(raw) < height * width * 3:
-                        raise NoPicture(NO_OPENGL.format(why=why(painter.wait(), complaints)))
+                        raise NoPicture(NO_OPENGL.format(why=failure_reason(renderer.wait(), errors)))
                     yield np.frombuffer(raw, np.uint8).reshape(height, width, 3)
             finally:
-                painter.kill()  # a caller may stop before the last picture
+                renderer.kill()  # a caller may stop before the last picture
 
 
 def write_film(pictures: Iterable[Picture], path: Path, fps: float) -> None:
@@ -84,9 +84,9 @@ def write_film(pictures: Iterable[Picture], path: Path, fps: float) -> None:
     fps : pictures a second; a GIF counts in hundredths of a second, and browsers show 50 at most
     """
     if path.suffix not in ANIMATED:
-        raise InputError(f"{path}: a film is none of {', '.join(ANIMATED)}")
+        raise InputError(f"{path}: {unknown_name('animation format', path.suffix, ANIMATED)}")
     animation = cv2.Animation()
-    animation.frames = [cv2.cvtColor(one, cv2.COLOR_RGB2BGR) for one in pictures]
+    animation.frames = [cv2.cvtColor(picture, cv2.COLOR_RGB2BGR) for picture in pictures]
     animation.durations = [round(1000 / fps)] * len(animation.frames)
     done, coded = cv2.imencodeanimation(path.suffix, animation, ANIMATED[path.suffix])
     if not done:
@@ -95,16 +95,16 @@ def write_film(pictures: Iterable[Picture], path: Path, fps: float) -> None:
         temporary.write_bytes(coded.tobytes())
 
 
-def why(code: int, complaints: IO[bytes]) -> str:
+def failure_reason(code: int, errors: IO[bytes]) -> str:
     """The last line that the rendering process wrote to standard error, or how it ended."""
-    complaints.seek(0)
-    lines = complaints.read().decode(errors="replace").strip().splitlines()
+    errors.seek(0)
+    lines = errors.read().decode(errors="replace").strip().splitlines()
     if code < 0:
-        return f"the driver ended it by {signal.Signals(-code).name}"
-    return one_line(RuntimeError(lines[-1])) if lines else f"it ended with {code}"
+        return f"the renderer was ended by {signal.Signals(-code).name}"
+    return one_line(RuntimeError(lines[-1])) if lines else f"the renderer exited with code {code}"
 
 
-def paint() -> None:
+def render_task() -> None:
     """The rendering process: task as npz on stdin, raw pictures on stdout, errors on stderr."""
     with os.fdopen(os.dup(1), "wb") as out:
         os.dup2(2, 1)  # a driver's output must not reach the pictures
@@ -122,6 +122,6 @@ def paint() -> None:
 
 if __name__ == "__main__":
     try:
-        paint()
+        render_task()
     except Exception as error:
         sys.exit(f"{type(error).__name__}: {one_line(error)}")

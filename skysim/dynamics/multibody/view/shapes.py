@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from skysim.dynamics.multibody.model import World
+from skysim.dynamics.multibody.model import VehicleModel
 
 KINDS = {
     mujoco.mjtGeom.mjGEOM_BOX: "box",
@@ -28,24 +28,24 @@ class Shape(NamedTuple):
 
     kind: str
     size_m: tuple[float, float, float]
-    place_m: tuple[float, float, float]
+    position_m: tuple[float, float, float]
     body_from_shape_wxyz: tuple[float, float, float, float]
     rgba: tuple[float, float, float, float]
 
 
-def shapes(world: World) -> list[Shape]:
+def shapes(vehicle: VehicleModel) -> list[Shape]:
     """All shapes of the vehicle's file, without those of the bearing."""
-    model = world.model
+    model = vehicle.model
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
-    found = []
+    result = []
     for n in range(model.ngeom):
         kind = KINDS.get(mujoco.mjtGeom(model.geom_type[n]))
         if kind is None or model.geom_bodyid[n] == 0:
             continue
         mesh = model.geom_type[n] == mujoco.mjtGeom.mjGEOM_MESH
         size = model.geom_aabb[n, 3:] if mesh else model.geom_size[n]
-        turn = Rotation.from_matrix(data.geom_xmat[n].reshape(3, 3)).as_quat(scalar_first=True)
-        told = (size, data.geom_xpos[n], turn, model.geom_rgba[n])
-        found.append(Shape(kind, *(tuple(np.asarray(one, float).tolist()) for one in told)))
-    return found
+        body_from_shape_wxyz = Rotation.from_matrix(data.geom_xmat[n].reshape(3, 3)).as_quat(scalar_first=True)
+        fields = (size, data.geom_xpos[n], body_from_shape_wxyz, model.geom_rgba[n])
+        result.append(Shape(kind, *(tuple(np.asarray(value, float).tolist()) for value in fields)))
+    return result

@@ -12,145 +12,135 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from skysim.core.types import Floats
-from skysim.experiments.papers.afit.still import angles_deg
-from skysim.experiments.papers.compare import Answer, Ask, Cause, Drawing, Found
-from skysim.experiments.papers.intervals import another
+from skysim.experiments.papers.afit.test3_images import angles_deg
+from skysim.experiments.papers.compare import (
+    Drawing,
+    ExperimentOptions,
+    ExperimentResult,
+    RowResult,
+    with_cause,
+)
+from skysim.experiments.papers.intervals import prediction_interval
 from skysim.experiments.papers.published import experiments
 from skysim.results.plots import INK
 from skysim.scene import loader
-from skysim.simulation import run, testbed
-from skysim.simulation.testbed import Testbed
+from skysim.simulation import run
+from skysim.simulation.testbed import Testbed, exposure_window
 
-Knock = tuple[float, float, float]
-FITTED: Knock = (
-    0.0,
-    -12.1,
-    -15.0,
-)  # deg/s about the body axes, fitted to Table 14's theta_2 and theta_3
-ASSUMED: Knock = (3.0, -2.0, 14.0)  # the scene's own
-BEGIN_S, OVER_S, SEEN_S = 1.5, 2.0, 2.5
-CAUSE = f"a knock of {FITTED} deg/s, gyros that stop at 10"
+BumpRate = tuple[float, float, float]
+# deg/s about the body axes: fitted to Table 14's theta_2 and theta_3, and the scene's own.
+FITTED_BUMP: BumpRate = (0.0, -12.1, -15.0)
+ASSUMED_BUMP: BumpRate = (3.0, -2.0, 14.0)
+BUMP_START_S, BUMP_END_S, NEXT_IMAGE_S = 1.5, 2.0, 2.5
+CAUSE = f"a bump of {FITTED_BUMP} deg/s, gyros saturated at 10"
 
 
-class Flight(NamedTuple):
+class BumpRun(NamedTuple):
     """A simulated motion of `simsat_bump`.
 
     t_s, imu_deg, filter_deg : (K,), (K, 3) roll, pitch and yaw of the IMU minus the true ones, (K,) the filter's error
-    limited_s : how long a gyro was saturated;  tracker_deg : the star tracker's worst error after the bump
+    saturated_s : how long a gyro was saturated;  tracker_error_deg : the star tracker's worst error after the bump
     """
 
     t_s: Floats
     imu_deg: Floats
     filter_deg: Floats
-    limited_s: float
-    tracker_deg: float
+    saturated_s: float
+    tracker_error_deg: float
 
 
-def bump(ask: Ask) -> Found:
+def bump(options: ExperimentOptions) -> ExperimentResult:
     """Errors without a bump, with the fitted bump and with the scene's bump, each with several IMUs."""
-    found = []
-    for n, knock in enumerate((None, FITTED, ASSUMED)):
-        ask.watch(n, 3)
-        found.append(flights(knock, ask.trials(10, 2), ask.seed))
-    calm, fitted, assumed = found
+    runs = []
+    for n, bump_deg_s in enumerate((None, FITTED_BUMP, ASSUMED_BUMP)):
+        options.watch(n, 3)
+        runs.append(simulate_bumps(bump_deg_s, options.trials(10, 2), options.seed))
+    without_bump, with_fitted, with_assumed = runs
 
-    def answer(
-        figure: Callable[[Flight], float], knocked: list[Flight] = fitted, cause: str = CAUSE
-    ) -> Answer:
-        ours, bumped = (another(np.array([figure(one) for one in flights])) for flights in (calm, knocked))
-        return Answer(ours, cause=Cause(cause, bumped))
+    def row_result(
+        statistic: Callable[[BumpRun], float], bumped_runs: list[BumpRun] = with_fitted, cause: str = CAUSE
+    ) -> RowResult:
+        ours, theirs = ([statistic(one) for one in runs] for runs in (without_bump, bumped_runs))
+        return with_cause(cause, prediction_interval, ours, theirs)
 
-    answers = {
-        f"theta_{axis + 1}": answer(lambda one, axis=axis: lost_deg(one, axis))  # type: ignore[misc]
+    results = {
+        f"theta_{axis + 1}": row_result(lambda run, axis=axis: lost_angle_deg(run, axis))  # type: ignore[misc]
         for axis in range(3)
     }
-    answers["order"] = answer(lambda one: lost_deg(one, 2), assumed, f"the scene's knock of {ASSUMED} deg/s")
-    answers["limited"] = answer(lambda one: one.limited_s)
-    answers["tracker"] = Answer(another(np.array([one.tracker_deg for one in fitted])))
-    answers["filter"] = Answer(another(np.array([after(one).max() for one in fitted])))
-    return Found(
-        answers,
-        (
-            Drawing(
-                "The IMU loses 0.8 deg in the bump; the filter has it back with the next image.",
-                lambda fig: draw(fig, fitted[0]),
-            ),
-        ),
+    results["order"] = row_result(
+        lambda run: lost_angle_deg(run, 2), with_assumed, f"the scene's bump of {ASSUMED_BUMP} deg/s"
     )
+    results["limited"] = row_result(lambda run: run.saturated_s)
+    results["tracker"] = RowResult(prediction_interval([run.tracker_error_deg for run in with_fitted]))
+    results["filter"] = RowResult(prediction_interval([filter_errors_after(run).max() for run in with_fitted]))
+    caption = "The IMU loses 0.8 deg in the bump; the filter corrects it with the next image."
+    return ExperimentResult(results, (Drawing(caption, lambda fig: draw(fig, with_fitted[0])),))
 
 
-def flights(knock_deg_s: Knock | None, units: int, seed: int) -> list[Flight]:
-    """Simulate the same motion with `units` IMUs of random hardware seeds."""
-    seeds = np.random.default_rng([seed, 14]).integers(2**31, size=units)
-    return [flown(knock_deg_s, int(one)) for one in seeds]
+def simulate_bumps(bump_deg_s: BumpRate | None, imus: int, seed: int) -> list[BumpRun]:
+    """Simulate the same motion with `imus` IMUs of random hardware seeds."""
+    seeds = np.random.default_rng([seed, 14]).integers(2**31, size=imus)
+    return [simulate_bump(bump_deg_s, int(imu_seed)) for imu_seed in seeds]
 
 
-def lost_deg(one: Flight, axis: int) -> float:
+def lost_angle_deg(run: BumpRun, axis: int) -> float:
     """Absolute error of one of the IMU's angles at the end."""
-    return float(abs(one.imu_deg[-1, axis]))
+    return float(abs(run.imu_deg[-1, axis]))
 
 
-def after(one: Flight) -> Floats:
+def filter_errors_after(run: BumpRun) -> Floats:
     """(K,) the filter's errors after the first image that follows the bump."""
-    return one.filter_deg[one.t_s > SEEN_S]
+    return run.filter_deg[run.t_s > NEXT_IMAGE_S]
 
 
-def flown(knock_deg_s: Knock | None, seed: int) -> Flight:
+def simulate_bump(bump_deg_s: BumpRate | None, seed: int) -> BumpRun:
     """Simulate six seconds around a bump, with one image per second."""
-    kind = (
-        f'{{kind: bump, rate_deg_s: {list(knock_deg_s or ())}, duration: "40 ms", caught_after: "0.2 s"}}, '
-    )
-    lab = run.prepare(
-        loader.load(
-            "simsat_bump",
-            {
-                "seed": str(seed),
-                "vehicle.imu.hardware_seed": str(seed),
-                "motion.manoeuvre": f'[{{kind: hold, duration: "{BEGIN_S} s"}}, {kind if knock_deg_s else ""}'
-                '{kind: hold, duration: "30 s"}]',
-                "exposure": '{time: "10 ms", rate_hz: 1, frames: 6, first: "0.4 s"}',
-            },
-        )
-    )
-    log = lab.log
+    bump_leg = f'{{kind: bump, rate_deg_s: {list(bump_deg_s or ())}, duration: "40 ms", caught_after: "0.2 s"}}, '
+    hold_leg = f'{{kind: hold, duration: "{BUMP_START_S} s"}}, '
+    overrides = {
+        "seed": str(seed),
+        "vehicle.imu.hardware_seed": str(seed),
+        "motion.maneuver": f'[{hold_leg}{bump_leg if bump_deg_s else ""}{{kind: hold, duration: "30 s"}}]',
+        "exposure": '{time: "10 ms", rate_hz: 1, frames: 6, first: "0.4 s"}',
+    }
+    testbed = run.prepare(loader.load("simsat_bump", overrides))
+    log = testbed.log
     assert log.lab_from_imu is not None
     assert log.lab_from_filter is not None
     assert log.saturated is not None
-    return Flight(
+    return BumpRun(
         log.t_s,
         angles_deg(log.lab_from_imu) - angles_deg(log.lab_from_body),
         np.degrees((log.lab_from_filter * log.lab_from_body.inv()).magnitude()),
         float(log.saturated.sum() * log.period_s),
-        tracker_deg(lab),
+        tracker_error_deg(testbed),
     )
 
 
-def tracker_deg(lab: Testbed) -> float:
+def tracker_error_deg(testbed: Testbed) -> float:
     """The star tracker's worst error after the bump; infinite if an image was not solved."""
-    off = []
-    for index, report in lab.reports.items():
-        t_s = testbed.window(lab.scene, index).middle_s(lab.scene.camera.height_px)
-        if t_s > OVER_S:
+    errors_deg = []
+    for index, report in testbed.reports.items():
+        t_s = exposure_window(testbed.scene, index).middle_s(testbed.scene.camera.height_px)
+        if t_s > BUMP_END_S:
             estimate = report.attitude.cam_from_ref
-            truly = lab.mount.cam_from_body * lab.trajectory.at(t_s).inv()
-            off.append(np.inf if estimate is None else np.degrees((estimate * truly.inv()).magnitude()))
-    return float(max(off))
+            true_attitude = testbed.mount.cam_from_body * testbed.trajectory.attitude_at(t_s).inv()
+            errors_deg.append(np.inf if estimate is None else np.degrees((estimate * true_attitude.inv()).magnitude()))
+    return float(max(errors_deg))
 
 
-def draw(fig: Any, one: Flight) -> None:
+def draw(fig: Any, run: BumpRun) -> None:
     """Errors against time."""
     axes, rows = fig.subplots(), experiments()["afit-bump"].rows
     for axis in range(3):
+        axes.plot(run.t_s, np.abs(run.imu_deg[:, axis]), color=INK[(0, 2, 5)[axis]], label=f"IMU, theta_{axis + 1}")
         axes.plot(
-            one.t_s, np.abs(one.imu_deg[:, axis]), color=INK[(0, 2, 5)[axis]], label=f"IMU, theta_{axis + 1}"
-        )
-        axes.plot(
-            one.t_s[-1] + 0.15,
+            run.t_s[-1] + 0.15,
             rows[f"theta_{axis + 1}"].published,
             "os^"[axis],
             color=INK[1],
             label=f"published, theta_{axis + 1}",
         )
-    axes.plot(one.t_s, one.filter_deg, color=INK[6], ls="--", label="filter with star tracker")
+    axes.plot(run.t_s, run.filter_deg, color=INK[6], ls="--", label="filter with star tracker")
     axes.set(xlabel="time (s)", ylabel="error (deg)")
     axes.legend(ncols=2)

@@ -1,4 +1,4 @@
-"""AFIT's Test 2: one pair of LEDs at three places of the dome (Padro 2012, sections 3.5.3, 3.7.2 and 4.3).
+"""AFIT's Test 2: one pair of LEDs at three positions on the dome (Padro 2012, sections 3.5.3, 3.7.2 and 4.3).
 
 The pair's separation should be the same at every place; the thesis finds a smaller one towards the edge. Causes that
 are simulated: camera noise, a board that is not parallel to the dome, a dome off its center, and glare of the lens.
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,18 +17,28 @@ from scipy.spatial.transform import Rotation
 from estimator.attitude.dome_map import project
 from skysim.core.types import Floats
 from skysim.core.units import INCH_M
-from skysim.experiments.papers.afit.bench import (
-    GREY_E,
-    changed,
-    furnished,
-    grey,
-    measured,
-    separations_arcsec,
-    shot,
-)
 from skysim.experiments.papers.afit.surface import contour
-from skysim.experiments.papers.compare import Answer, Ask, Cause, Drawing, Found
-from skysim.experiments.papers.intervals import mean_of, resampled
+from skysim.experiments.papers.afit.test_stand import (
+    E_PER_GRAY,
+    build_test_stand,
+    measure_frame,
+    separations_arcsec,
+    with_config,
+)
+from skysim.experiments.papers.compare import (
+    Cause,
+    Drawing,
+    ExperimentOptions,
+    ExperimentResult,
+    RowResult,
+    with_cause,
+)
+from skysim.experiments.papers.intervals import (
+    bootstrap_interval,
+    confidence_interval,
+    sample_std,
+    symmetric_interval,
+)
 from skysim.experiments.papers.published import experiments
 from skysim.results.metrics import Summary, exact
 from skysim.results.plots import INK, MARKS
@@ -40,19 +51,19 @@ from skysim.sources.dome.surface import Surface, build_surface
 from skysim.tracking import onboard_model
 
 PLACES_DEG = (0.0, 14.0, 28.0)  # tilts of the scene's places: apex, halfway, edge within the tilt stop
-HALF_WAY_DEG, LEAN_DEG, LEAN_TOO_DEG, DECENTRE_IN = 23.6, 5.5, 4.0, 0.125
+HALFWAY_DEG, BOARD_TILT_DEG, SMALLER_BOARD_TILT_DEG, DECENTER_IN = 23.6, 5.5, 4.0, 0.125
 PAIR_M = 16.119e-3  # gives Table 5's 2727" at the apex; 16 mm gives 2706.9"
-EXPOSURE_S, INTENSITY_CD, ON_SHARE, NOISE_E = 0.1, 2.85e-3, 0.0594, 700.0
+EXPOSURE_S, INTENSITY_CD, ON_FRACTION, NOISE_E = 0.1, 2.85e-3, 0.0594, 700.0
 BRIGHT, DIM = 0, 1
-NOISY = f"noise of {NOISE_E / GREY_E:.1f} grey levels"
+CAUSE_NOISE = f"noise of {NOISE_E / E_PER_GRAY:.1f} gray levels"
 
 
 class Place(NamedTuple):
-    """Place of the board: tilt from the vertical at the bearing, lean off the dome's surface, dome offset in x."""
+    """Place of the board: tilt from the vertical at the bearing, tilt off the tangent plane, dome offset in x."""
 
     tilt_deg: float
-    lean_deg: float = 0.0
-    decentre_in: float = 0.0
+    board_tilt_deg: float = 0.0
+    decenter_in: float = 0.0
 
 
 class Series(NamedTuple):
@@ -62,259 +73,254 @@ class Series(NamedTuple):
     angle_arcsec: Floats
 
 
-def scene(dim_share: float) -> Scene:
+class NoiseRuns(NamedTuple):
+    """Series of all places, with the camera's own noise and with more noise as the cause."""
+
+    own: list[Series]
+    more: list[Series]
+
+
+def scene(dim_fraction: float) -> Scene:
     """The scene with intensities that give Table 3's bright LED; the dim LED is on for a fraction of its slot."""
-    told = changed(load("afit_test2"), "exposure", time_s=EXPOSURE_S)
-    told = changed(told, "light.layout", levels=(1.0, dim_share) * len(PLACES_DEG))
-    return changed(told, "light.led", intensity_cd=INTENSITY_CD, scatter=0.0)
+    scene = with_config(load("afit_test2"), "exposure", time_s=EXPOSURE_S)
+    scene = with_config(scene, "light.layout", levels=(1.0, dim_fraction) * len(PLACES_DEG))
+    return with_config(scene, "light.led", intensity_cd=INTENSITY_CD, scatter=0.0)
 
 
-def noisy() -> Scene:
+def noisy_scene() -> Scene:
     """The same scene with the read noise that gives Table 5's standard deviations."""
-    return changed(scene(ON_SHARE), "camera.detector", read_noise_e=NOISE_E)
+    return with_config(scene(ON_FRACTION), "camera.detector", read_noise_e=NOISE_E)
 
 
-def dome_of(told: Scene, decentre_in: float = 0.0) -> Surface:
+def measured_dome(scene: Scene, decenter_in: float = 0.0) -> Surface:
     """The measured dome, displaced along x."""
-    assert isinstance(told.light, DomeConfig)
-    return build_surface(told.light.surface.model_copy(update={"offset_m": (decentre_in * INCH_M, 0.0, 0.0)}))
+    assert isinstance(scene.light, DomeConfig)
+    return build_surface(scene.light.surface.model_copy(update={"offset_m": (decenter_in * INCH_M, 0.0, 0.0)}))
 
 
-def glued(lab: Testbed, place: Place) -> Testbed:
-    """The pair on a board tangent to the dome, or leaning off it, with its LEDs along the meridian."""
-    inside, tilt = dome_of(lab.scene, place.decentre_in), np.radians(place.tilt_deg)
-    middle_m = inside.meet(np.zeros(3), np.array([[np.sin(tilt), 0.0, np.cos(tilt)]]))[0]
-    lean = Rotation.from_euler("y", place.lean_deg, degrees=True)
-    normal = lean.apply(inside.inward(middle_m[None])[0])
-    along = np.cross(normal, [0.0, 1.0, 0.0])
-    spots_m = middle_m + np.outer([-PAIR_M / 2, PAIR_M / 2], along / np.linalg.norm(along))
-    pair = lab.sources.take(np.arange(2))
+def place_pair(testbed: Testbed, place: Place) -> Testbed:
+    """The pair on a board tangent to the dome, or tilted from it, with its LEDs along the meridian."""
+    dome, tilt = measured_dome(testbed.scene, place.decenter_in), np.radians(place.tilt_deg)
+    center_m = dome.meet(np.zeros(3), np.array([[np.sin(tilt), 0.0, np.cos(tilt)]]))[0]
+    board_tilt = Rotation.from_euler("y", place.board_tilt_deg, degrees=True)
+    normal = board_tilt.apply(dome.inward(center_m[None])[0])
+    meridian = np.cross(normal, [0.0, 1.0, 0.0])
+    positions_m = center_m + np.outer([-PAIR_M / 2, PAIR_M / 2], meridian / np.linalg.norm(meridian))
+    pair = testbed.sources.take(np.arange(2))
     return replace(
-        lab,
-        sources=replace(pair, place=np.column_stack([spots_m, np.ones(2)]), normal=np.tile(normal, (2, 1))),
+        testbed,
+        sources=replace(pair, place=np.column_stack([positions_m, np.ones(2)]), normal=np.tile(normal, (2, 1))),
     )
 
 
-def towards(place: Place) -> Rotation:
+def point_at(place: Place) -> Rotation:
     """lab_from_body that points the boresight at the board."""
     return Rotation.from_euler("y", place.tilt_deg, degrees=True)
 
 
-def series(lab: Testbed, place: Place, count: int, rng: np.random.Generator) -> Series:
+def series(testbed: Testbed, place: Place, images: int, rng: np.random.Generator) -> Series:
     """Measure images of a place; those that do not show two lights are left out."""
-    board, attitude = glued(lab, place), towards(place)
+    testbed_at_place, attitude = place_pair(testbed, place), point_at(place)
     magnitudes, angles = [], []
-    for _ in range(count):
-        lights = measured(grey(shot(board, attitude, rng)[0], board))
+    for _ in range(images):
+        lights = measure_frame(testbed_at_place, attitude, rng)
         if len(lights.magnitude) == 2:
             magnitudes.append(lights.magnitude)
-            angles.append(separations_arcsec(lights.xy_px, board)[0])
+            angles.append(separations_arcsec(lights.xy_px, testbed_at_place)[0])
     return Series(np.array(magnitudes), np.array(angles))
 
 
-def dome(ask: Ask) -> Found:
+def tables_3_to_5(options: ExperimentOptions) -> ExperimentResult:
     """Tables 3 to 5 and the dome's contour: with the camera's own noise, and with more noise as the cause."""
-    count, quiet, faint = ask.trials(50, 10), furnished(scene(ON_SHARE)), furnished(noisy())
-    rng = [np.random.default_rng([ask.seed, stage]) for stage in range(3)]
-    own, wild = [], []
+    images = options.trials(50, 10)
+    quiet_stand, noisy_stand = build_test_stand(scene(ON_FRACTION)), build_test_stand(noisy_scene())
+    rng = [np.random.default_rng([options.seed, stage]) for stage in range(3)]
+    runs = NoiseRuns([], [])
     for n, tilt_deg in enumerate(PLACES_DEG):
-        ask.watch(n, 4)
-        own.append(series(quiet, Place(tilt_deg), count, rng[0]))
-        wild.append(series(faint, Place(tilt_deg), count, rng[1]))
-    answers = magnitudes(own, wild, count) | spreads(own, wild)
-    ask.watch(3, 4)
-    answers |= angles(quiet, own, wild, ask.trials(12, 2), rng[2]) | contour(dome_of(load("afit_test2")))
-    return Found(answers, drawings(quiet, own, wild))
+        options.watch(n, 4)
+        runs.own.append(series(quiet_stand, Place(tilt_deg), images, rng[0]))
+        runs.more.append(series(noisy_stand, Place(tilt_deg), images, rng[1]))
+    results = magnitudes(runs, images) | standard_deviations(runs)
+    options.watch(3, 4)
+    results |= angles(quiet_stand, runs, options.trials(12, 2), rng[2])
+    results |= contour(measured_dome(load("afit_test2")))
+    return ExperimentResult(results, drawings(quiet_stand, runs))
 
 
-def magnitudes(own: Sequence[Series], wild: Sequence[Series], count: int) -> dict[str, Answer]:
+def magnitudes(runs: NoiseRuns, images: int) -> dict[str, RowResult]:
     """Table 3, and the relative change of the bright LED's magnitude from the first place to the last."""
-    answers: dict[str, Answer] = {}
-    seen = [f"{len(one.magnitude)} and {len(two.magnitude)}" for one, two in zip(own, wild, strict=True)]
+    results: dict[str, RowResult] = {}
+    counts = [f"{len(own.magnitude)} and {len(more.magnitude)}" for own, more in zip(*runs, strict=True)]
     for led, name in enumerate(("bright", "dim")):
-        ours, cause = ([mean_of(one.magnitude[:, led]) for one in runs] for runs in (own, wild))
-        for n, pair in enumerate(zip(ours, cause, strict=True)):
-            told = f"the pair is seen in {seen[n]} of {count} images"
-            answers[f"{name}_{n + 1}"] = Answer(pair[0], told, Cause(NOISY, pair[1]))
-        answers[f"{name}_avg"] = Answer(averaged(ours), cause=Cause(NOISY, averaged(cause)))
+        ours, theirs = ([confidence_interval(one.magnitude[:, led]) for one in places] for places in runs)
+        for n, (own, more) in enumerate(zip(ours, theirs, strict=True)):
+            note = f"the pair is detected in {counts[n]} of {images} images"
+            results[f"{name}_{n + 1}"] = RowResult(own, note, Cause(CAUSE_NOISE, more))
+        results[f"{name}_avg"] = with_cause(CAUSE_NOISE, mean_of_places, ours, theirs)
         if led == BRIGHT:
-            answers["gain"] = Answer(gained(ours), cause=Cause(NOISY, gained(cause)))
-    return answers
+            results["gain"] = with_cause(CAUSE_NOISE, relative_gain, ours, theirs)
+    return results
 
 
-def gained(places: Sequence[Summary]) -> Summary:
+def relative_gain(places: Sequence[Summary]) -> Summary:
     """Increase of the mean from the first place to the last in percent; independent errors add in quadrature."""
     first, last = places[0], places[-1]
     value = 100 * (last.value / first.value - 1)
     half = 100 * float(np.hypot(last.high - last.value, first.high - first.value)) / first.value
-    return Summary(value, value - half, value + half, first.trials + last.trials)
+    return symmetric_interval(value, half, first.trials + last.trials)
 
 
-def averaged(places: Sequence[Summary]) -> Summary:
+def mean_of_places(places: Sequence[Summary]) -> Summary:
     """Mean of the places' means; independent errors add in quadrature."""
-    value = float(np.mean([one.value for one in places]))
-    half = float(np.sqrt(sum((one.high - one.value) ** 2 for one in places)) / len(places))
-    return Summary(value, value - half, value + half, sum(one.trials for one in places))
+    value = float(np.mean([place.value for place in places]))
+    half = float(np.sqrt(sum((place.high - place.value) ** 2 for place in places)) / len(places))
+    return symmetric_interval(value, half, sum(place.trials for place in places))
 
 
-def spreads(own: Sequence[Series], wild: Sequence[Series]) -> dict[str, Answer]:
+def standard_deviations(runs: NoiseRuns) -> dict[str, RowResult]:
     """Table 4, and the standard deviations of Table 5."""
-    answers: dict[str, Answer] = {}
+    values: dict[str, tuple[Floats, ...]] = {}
     for led, name in enumerate(("bright", "dim")):
-        columns = [[one.magnitude[:, led] for one in runs] for runs in (own, wild)]
-        answers |= {f"sd_{name}_{n}": spread(*pair) for n, pair in enumerate(zip(*columns, strict=True), 1)}
-        answers[f"sd_{name}_all"] = spread(*(np.concatenate(column) for column in columns))
-    pairs = enumerate(zip(own, wild, strict=True), 1)
-    return answers | {f"sd_angle_{n}": spread(one.angle_arcsec, two.angle_arcsec) for n, (one, two) in pairs}
+        columns = [[one.magnitude[:, led] for one in places] for places in runs]
+        values |= {f"{name}_{n}": pair for n, pair in enumerate(zip(*columns, strict=True), 1)}
+        values[f"{name}_all"] = tuple(np.concatenate(column) for column in columns)
+    for n, (own, more) in enumerate(zip(*runs, strict=True), 1):
+        values[f"angle_{n}"] = own.angle_arcsec, more.angle_arcsec
+    return {f"sd_{key}": with_cause(CAUSE_NOISE, std_interval, *pair) for key, pair in values.items()}
 
 
-def spread(own: Floats, wild: Floats) -> Answer:
-    """Standard deviation with the camera's own noise, and with more noise as the cause."""
-    return Answer(deviation(own), cause=Cause(NOISY, deviation(wild)))
-
-
-def deviation(values: Floats) -> Summary:
+def std_interval(values: Floats) -> Summary:
     """Standard deviation (n - 1) with its bootstrap interval."""
-    return resampled(values, lambda x, axis=-1: np.std(x, ddof=1, axis=axis))
+    return bootstrap_interval(values, sample_std)
 
 
-def angles(
-    lab: Testbed, own: Sequence[Series], wild: Sequence[Series], count: int, rng: np.random.Generator
-) -> dict[str, Answer]:
+def angles(testbed: Testbed, runs: NoiseRuns, images: int, rng: np.random.Generator) -> dict[str, RowResult]:
     """Table 5's means, with the effect of each cause on the last two."""
     edge = PLACES_DEG[2]
-    half_way, decentred, leaning, both, more = (
-        mean_of(series(lab, place, count, rng).angle_arcsec)
+    halfway, decentered, tilted, tilted_decentered, more_tilted_decentered = (
+        confidence_interval(series(testbed, place, images, rng).angle_arcsec)
         for place in (
-            Place(HALF_WAY_DEG),
-            Place(edge, 0.0, DECENTRE_IN),
-            Place(edge, LEAN_DEG),
-            Place(edge, LEAN_TOO_DEG, DECENTRE_IN),
-            Place(edge, LEAN_DEG, DECENTRE_IN),
+            Place(HALFWAY_DEG),
+            Place(edge, 0.0, DECENTER_IN),
+            Place(edge, BOARD_TILT_DEG),
+            Place(edge, SMALLER_BOARD_TILT_DEG, DECENTER_IN),
+            Place(edge, BOARD_TILT_DEG, DECENTER_IN),
         )
     )
-    glaring = glare(lab, count, rng)
-    faint = [
-        float(two.angle_arcsec.mean() - one.angle_arcsec.mean()) for one, two in zip(own, wild, strict=True)
+    glare_arcsec = glare_bias_arcsec(testbed, images, rng)
+    noise_bias_arcsec = [
+        float(more.angle_arcsec.mean() - own.angle_arcsec.mean()) for own, more in zip(*runs, strict=True)
     ]
-    means = [mean_of(one.angle_arcsec) for one in own]
-    others = (
-        f'the dome {DECENTRE_IN} in off centre alone: {decentred.value:.1f}"; with that, leaning {LEAN_TOO_DEG:g} deg:'
-        f' {both.value:.1f}", leaning {LEAN_DEG:g} deg: {more.value:.1f}"; centroid bias of the dim LED, in the noise:'
-        f' {faint[2] - faint[0]:+.1f}" from apex to edge, by glare of a lens with wide wings: {glaring:+.1f}"'
+    means = [confidence_interval(own.angle_arcsec) for own in runs.own]
+    note = (
+        f'the dome {DECENTER_IN} in off center alone: {decentered.value:.1f}"; with that, tilted by'
+        f' {SMALLER_BOARD_TILT_DEG:g} deg: {tilted_decentered.value:.1f}", tilted by {BOARD_TILT_DEG:g} deg:'
+        f' {more_tilted_decentered.value:.1f}"; centroid bias of the dim LED, in the noise:'
+        f' {noise_bias_arcsec[2] - noise_bias_arcsec[0]:+.1f}" from apex to edge, by glare of a lens with wide'
+        f' wings: {glare_arcsec:+.1f}"'
     )
-    leans = f"a board that leans {LEAN_DEG:g} deg"
-    fall = [fallen(one, means[0].value) for one in (means[2], leaning)]
-    least = min(geometric(lab, Place(float(tilt_deg))) for tilt_deg in np.linspace(20, 34, 29))
+    cause = f"a board tilted by {BOARD_TILT_DEG:g} deg"
+    smallest = min(geometric_angle_arcsec(testbed, Place(float(tilt))) for tilt in np.linspace(20, 34, 29))
     return {
-        "angle_1": Answer(means[0]),
-        "angle_2": Answer(means[1], cause=Cause(f"the board at {HALF_WAY_DEG} deg", half_way)),
-        "angle_3": Answer(means[2], others, Cause(leans, leaning)),
-        "fall": Answer(fall[0], cause=Cause(leans, fall[1])),
-        "least": Answer(exact(least)),
+        "angle_1": RowResult(means[0]),
+        "angle_2": RowResult(means[1], cause=Cause(f"the board at {HALFWAY_DEG} deg", halfway)),
+        "angle_3": RowResult(means[2], note, Cause(cause, tilted)),
+        "fall": with_cause(cause, partial(relative_decrease, means[0].value), means[2], tilted),
+        "least": RowResult(exact(smallest)),
     }
 
 
-def fallen(angle: Summary, before: float) -> Summary:
-    """Decrease of an angle relative to `before` in percent; the error of `before` is neglected."""
-    value, high, low = (100 * (1 - one / before) for one in (angle.value, angle.low, angle.high))
+def relative_decrease(reference: float, angle: Summary) -> Summary:
+    """Decrease of an angle relative to `reference` in percent; the error of `reference` is neglected."""
+    value, high, low = (100 * (1 - one / reference) for one in (angle.value, angle.low, angle.high))
     return Summary(value, low, high, angle.trials)
 
 
-def glare(lab: Testbed, count: int, rng: np.random.Generator) -> float:
+def glare_bias_arcsec(testbed: Testbed, images: int, rng: np.random.Generator) -> float:
     """Change of the angle from apex to edge in arcsec, beyond geometry, due to a PSF with wide wings.
 
     The wings add light of one LED below the other, which biases the centroids.
     """
-    wide = furnished(
-        changed(scene(2 * ON_SHARE), "camera", psf=MoffatPsfConfig(kind="moffat", fwhm_px=2.5, beta=1.5))
-    )
+    psf = MoffatPsfConfig(kind="moffat", fwhm_px=2.5, beta=1.5)
+    stand = build_test_stand(with_config(scene(2 * ON_FRACTION), "camera", psf=psf))
     edge, apex = Place(PLACES_DEG[2]), Place(0.0)
-    there, here = (series(wide, place, count, rng).angle_arcsec.mean() for place in (edge, apex))
-    return float(there - here - geometric(lab, edge) + geometric(lab, apex))
+    at_edge, at_apex = (series(stand, place, images, rng).angle_arcsec.mean() for place in (edge, apex))
+    expected_edge, expected_apex = (geometric_angle_arcsec(testbed, place) for place in (edge, apex))
+    return float(at_edge - at_apex - expected_edge + expected_apex)
 
 
-def geometric(lab: Testbed, place: Place) -> float:
+def geometric_angle_arcsec(testbed: Testbed, place: Place) -> float:
     """The pair's angle by eqs 43-45 from its LEDs' projected positions, without rendering."""
-    lever, camera = (
-        onboard_model.believed_lever(lab.scene, lab.mount),
-        onboard_model.believed_camera(lab.scene),
-    )
-    xy_px = project(towards(place).inv(), glued(lab, place).sources.place[:, :3], lever, camera)
-    return float(separations_arcsec(xy_px, lab)[0])
+    lever = onboard_model.assumed_lever(testbed.scene, testbed.mount)
+    camera = onboard_model.assumed_camera(testbed.scene)
+    xy_px = project(point_at(place).inv(), place_pair(testbed, place).sources.place[:, :3], lever, camera)
+    return float(separations_arcsec(xy_px, testbed)[0])
 
 
-def drawings(lab: Testbed, own: Sequence[Series], wild: Sequence[Series]) -> tuple[Drawing, ...]:
+def drawings(testbed: Testbed, runs: NoiseRuns) -> tuple[Drawing, ...]:
     return (
         Drawing(
-            f"Figs 69 and 70: magnitudes of the two LEDs at three places, ours with {NOISY}; published as mean and"
-            " standard deviation.",
-            lambda fig: draw_magnitudes(fig, wild),
+            f"Figs 69 and 70: magnitudes of the two LEDs at three positions, ours with {CAUSE_NOISE}; published as"
+            " mean and standard deviation.",
+            lambda fig: draw_magnitudes(fig, runs.more),
         ),
         Drawing(
             "Fig. 71 and Table 5: the pair's angle over the tilt of its board; the published bars are standard"
             " deviations, their tilts 0 deg, as fitted and as assumed.",
-            lambda fig: draw_angles(fig, lab, own),
+            lambda fig: draw_angles(fig, testbed, runs.own),
         ),
     )
 
 
-def draw_magnitudes(fig: Any, wild: Sequence[Series]) -> None:
+def draw_magnitudes(fig: Any, places: Sequence[Series]) -> None:
     """Histograms of our magnitudes, with the published means and deviations."""
     rows = experiments()["afit-table-3-5"].rows
-    both = fig.subplots(1, 2)
-    for column, name, axes in zip((DIM, BRIGHT), ("dim", "bright"), both, strict=True):
-        everything = np.concatenate([one.magnitude[:, column] for one in wild])
-        bins = np.linspace(everything.min(), everything.max(), 25)
+    panels = fig.subplots(1, 2)
+    for column, name, axes in zip((DIM, BRIGHT), ("dim", "bright"), panels, strict=True):
+        magnitudes = [one.magnitude[:, column] for one in places]
+        bins = np.linspace(np.concatenate(magnitudes).min(), np.concatenate(magnitudes).max(), 25)
         top = 1.0
-        for n, one in enumerate(wild):
-            counts, _, _ = axes.hist(
-                one.magnitude[:, column],
-                bins,
-                histtype="step",
-                color=INK[(0, 2, 4)[n]],
-                label=f"ours, place {n + 1}",
-            )
+        for n, values in enumerate(magnitudes):
+            style = {"color": INK[(0, 2, 4)[n]], "label": f"ours, place {n + 1}"}
+            counts, _, _ = axes.hist(values, bins, histtype="step", **style)
             top = max(top, counts.max())
         for n in range(3):
             mean, sd = rows[f"{name}_{n + 1}"].published, rows[f"sd_{name}_{n + 1}"].published
-            axes.errorbar(
-                mean,
-                top * (1.1 + 0.1 * n),
-                xerr=sd,
-                color=INK[1],
-                marker=MARKS[n],
-                label=f"published, {n + 1}",
-            )
+            style = {"color": INK[1], "marker": MARKS[n], "label": f"published, {n + 1}"}
+            axes.errorbar(mean, top * (1.1 + 0.1 * n), xerr=sd, **style)
         axes.set(xlabel=f"magnitude of the {name} LED", ylabel="images", ylim=(0, top * 1.4))
-    fig.legend(*both[0].get_legend_handles_labels(), loc="outside lower center", ncols=6, fontsize=8)
+    fig.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=6, fontsize=8)
 
 
-def draw_angles(fig: Any, lab: Testbed, own: Sequence[Series]) -> None:
+def draw_angles(fig: Any, testbed: Testbed, places: Sequence[Series]) -> None:
     """Angles against the tilt: geometric curves, ours from images, and the published ones."""
     rows, axes = experiments()["afit-table-3-5"].rows, fig.subplots()
     tilt_deg = np.linspace(0, 32, 33)
     curves = (
         ("measured dome", Place(0)),
-        (f"{DECENTRE_IN} in off centre", Place(0, 0, DECENTRE_IN)),
-        (f"leaning {LEAN_DEG:g} deg", Place(0, LEAN_DEG)),
+        (f"{DECENTER_IN} in off center", Place(0, 0, DECENTER_IN)),
+        (f"leaning {BOARD_TILT_DEG:g} deg", Place(0, BOARD_TILT_DEG)),
     )
     for ink, style, (name, place) in zip((INK[0], INK[2], INK[4]), ("-", "--", "-."), curves, strict=True):
         axes.plot(
             tilt_deg,
-            [geometric(lab, place._replace(tilt_deg=float(tilt))) for tilt in tilt_deg],
+            [geometric_angle_arcsec(testbed, place._replace(tilt_deg=float(tilt))) for tilt in tilt_deg],
             style,
             color=ink,
             label=name,
         )
     axes.plot(
-        PLACES_DEG, [one.angle_arcsec.mean() for one in own], "s", color=INK[0], label="ours, from images"
+        PLACES_DEG,
+        [one.angle_arcsec.mean() for one in places],
+        "s",
+        color=INK[0],
+        label="ours, from images",
     )
-    told = [(rows[f"angle_{n}"].published, rows[f"sd_angle_{n}"].published) for n in (1, 2, 3)]
+    published = [(rows[f"angle_{n}"].published, rows[f"sd_angle_{n}"].published) for n in (1, 2, 3)]
     axes.errorbar(
-        (0, HALF_WAY_DEG, PLACES_DEG[2]),
-        [mean for mean, _ in told],
-        [sd for _, sd in told],
+        (0, HALFWAY_DEG, PLACES_DEG[2]),
+        [mean for mean, _ in published],
+        [sd for _, sd in published],
         fmt="o",
         capsize=3,
         color=INK[1],

@@ -1,7 +1,7 @@
 """NPS's TAS-2 under nine stars on a flat panel (Tappe 2009, cited by Padro 2012, section 2.7.2).
 
 The stars are near, so their directions from the bearing depend on the attitude. The tracker computes the distances
-from a believed attitude (eq. 33), identifies the stars and solves; the solution can be the next believed attitude. The
+from an assumed attitude (eq. 33), identifies the stars and solves; the solution can be the next assumed attitude. The
 experiment shows how large the initial attitude error may be.
 """
 
@@ -22,15 +22,15 @@ from estimator.identification.published.master_star import master_star
 from skysim.core.types import Floats
 from skysim.core.units import ARCSEC_RAD
 from skysim.experiments import dome_survey
-from skysim.experiments.papers.compare import Answer, Ask, Cause, Drawing, Found
-from skysim.experiments.papers.intervals import resampled
-from skysim.experiments.study.trials import reseeded
-from skysim.results.metrics import Summary, share
+from skysim.experiments.papers.compare import Cause, Drawing, ExperimentOptions, ExperimentResult, RowResult
+from skysim.experiments.papers.intervals import bootstrap_interval
+from skysim.experiments.study.execution.trials import reseeded
+from skysim.results.metrics import Summary, proportion
 from skysim.results.plots import INK, MARKS
 from skysim.scene import loader
 from skysim.scene.light import DomeConfig, FlatSurfaceConfig
-from skysim.simulation import exposure, testbed
-from skysim.simulation.testbed import Testbed
+from skysim.simulation import exposure
+from skysim.simulation.testbed import Testbed, build_testbed
 from skysim.tracking import onboard_model, settings
 
 INITIAL_DEG = (-6, -3, 0, 3, 6)
@@ -40,13 +40,13 @@ APPROXIMATE_DEG = 1.0  # a solution with a smaller error counts as approximating
 FITTED_CAMERA_M = np.array([0.30, 0.0, 0.20])
 
 
-class Known(NamedTuple):
-    """What the tracker knows: the true panel and lever arm, and the nine stars as seen from the level vehicle.
+class OnboardModel(NamedTuple):
+    """The tracker's model: the true panel and lever arm, and the nine stars as seen from the level vehicle.
 
-    lab : the true testbed;  panel : the plane;  vectors : (9, 3) unit, from the bearing;  pairs : their index
+    testbed: the true testbed;  panel : the plane;  vectors : (9, 3) unit, from the bearing;  pairs : their index
     """
 
-    lab: Testbed
+    testbed: Testbed
     panel: LedMap
     vectors: Floats
     pairs: PairIndex
@@ -59,157 +59,164 @@ class Solution(NamedTuple):
     body_from_lab: Rotation | None
 
     @property
-    def off_deg(self) -> float:
+    def error_deg(self) -> float:
         """Error of the attitude; the true one is level. NaN without a solution."""
         return float(np.degrees(self.body_from_lab.magnitude())) if self.body_from_lab else np.nan
 
 
-def at(camera_m: Floats | None, seed: int, frames: int) -> Known:
+def build_model(camera_m: Floats | None, seed: int, frames: int) -> OnboardModel:
     """The scene with the camera moved to camera_m on the vehicle (None: not moved), and the panel moved along with it.
 
     The catalog is the mean of `frames` frames from the level vehicle.
     """
-    told = loader.load("nps_tas2")
-    lab = testbed.build_testbed(told)
-    assert isinstance(told.light, DomeConfig)
-    assert isinstance(told.light.surface, FlatSurfaceConfig)
-    height_m = told.light.surface.apex_m
+    scene = loader.load("nps_tas2")
+    testbed = build_testbed(scene)
+    assert isinstance(scene.light, DomeConfig)
+    assert isinstance(scene.light.surface, FlatSurfaceConfig)
+    height_m = scene.light.surface.apex_m
     if camera_m is not None:
-        shift_m = camera_m - lab.mount.camera_body_m
-        place = lab.sources.place + np.append(shift_m, 0.0)
+        shift_m = camera_m - testbed.mount.camera_body_m
+        position = testbed.sources.place + np.append(shift_m, 0.0)
         height_m += shift_m[2]
-        lab = replace(
-            lab,
-            sources=replace(lab.sources, place=place),
-            mount=replace(lab.mount, camera_body_m=np.asarray(camera_m)),
+        testbed = replace(
+            testbed,
+            sources=replace(testbed.sources, place=position),
+            mount=replace(testbed.mount, camera_body_m=np.asarray(camera_m)),
         )
-    nowhere = np.empty(0, np.int64), np.empty((0, 3))
-    panel = LedMap(*nowhere, np.zeros(3), np.array([np.inf, np.inf, height_m]))
-    shots = [rays_body(lab, seed + n) for n in range(frames)]
+    no_leds = np.empty(0, np.int64), np.empty((0, 3))
+    panel = LedMap(*no_leds, np.zeros(3), np.array([np.inf, np.inf, height_m]))
+    rays_of_frames = [rays_body(testbed, seed + n) for n in range(frames)]
     # Noise changes the order of brightness between frames, so sort by position before averaging.
-    by_place = [rays[np.lexsort((rays[:, 1], rays[:, 0]))] for rays in shots]
-    mean = np.mean([one for one in by_place if len(one) == len(lab.sources)], axis=0)
-    vectors = directions(lab, panel, mean, Rotation.identity())
-    return Known(lab, panel, vectors, pair_index.build(vectors, 1.0))
+    sorted_rays = [rays[np.lexsort((rays[:, 1], rays[:, 0]))] for rays in rays_of_frames]
+    mean = np.mean([rays for rays in sorted_rays if len(rays) == len(testbed.sources)], axis=0)
+    vectors = directions(testbed, panel, mean, Rotation.identity())
+    return OnboardModel(testbed, panel, vectors, pair_index.build(vectors, 1.0))
 
 
-def rays_body(lab: Testbed, seed: int) -> Floats:
+def rays_body(testbed: Testbed, seed: int) -> Floats:
     """(N, 3) unit vectors in body axes to the stars of one frame from the level vehicle, brightest first."""
-    frame, _ = exposure.render_frame(reseeded(lab, seed), 0)
-    camera = onboard_model.believed_camera(lab.scene)
-    seen = dome_survey.detect_lights(settings.believed_settings(lab.scene), camera, frame)
-    return lab.mount.cam_from_body.inv().apply(camera.rays(seen.xy_px))
+    frame, _ = exposure.render_frame(reseeded(testbed, seed), 0)
+    camera = onboard_model.assumed_camera(testbed.scene)
+    lights = dome_survey.detect_lights(settings.assumed_settings(testbed.scene), camera, frame)
+    return testbed.mount.cam_from_body.inv().apply(camera.rays(lights.xy_px))
 
 
-def directions(lab: Testbed, panel: LedMap, rays: Floats, body_from_lab: Rotation) -> Floats:
-    """(N, 3) unit vectors along R_0 + alpha_i b_i in body axes, distances alpha_i from the believed attitude (eq. 33).
+def directions(testbed: Testbed, panel: LedMap, rays: Floats, body_from_lab: Rotation) -> Floats:
+    """(N, 3) unit vectors along R_0 + alpha_i b_i in body axes, distances alpha_i from the assumed attitude (eq. 33).
 
     R_0 is the camera's position and b_i the ray of light i; alpha_i is the distance to the panel along the ray.
     """
-    camera_m, lab_from_body = lab.mount.camera_body_m, body_from_lab.inv()
+    camera_m, lab_from_body = testbed.mount.camera_body_m, body_from_lab.inv()
     origin_m = lab_from_body.apply(camera_m)
-    met_m = on_surface(lab_from_body.apply(rays), origin_m, panel)
-    point_m = camera_m + np.linalg.norm(met_m - origin_m, axis=1)[:, None] * rays
+    intersection_m = on_surface(lab_from_body.apply(rays), origin_m, panel)
+    point_m = camera_m + np.linalg.norm(intersection_m - origin_m, axis=1)[:, None] * rays
     return point_m / np.linalg.norm(point_m, axis=1, keepdims=True)
 
 
-def solve(known: Known, rays: Floats, believed: Rotation) -> Solution:
-    """Solve once: distances from the believed attitude, master-star identification within 500 arcsec, QUEST."""
-    seen = directions(known.lab, known.panel, rays, believed)
+def solve(model: OnboardModel, rays: Floats, assumed: Rotation) -> Solution:
+    """Solve once: distances from the assumed attitude, master-star identification within 500 arcsec, QUEST."""
+    observed = directions(model.testbed, model.panel, rays, assumed)
     # master_star takes the error of a direction; an angle's is sqrt(2) times that.
-    match = master_star(seen, known.pairs, SEPARATION_RAD / np.sqrt(2))
+    match = master_star(observed, model.pairs, SEPARATION_RAD / np.sqrt(2))
     if match is None:
         return Solution(0, None)
     sigma_rad = np.full(len(match.observed), SEPARATION_RAD)
-    return Solution(len(sigma_rad), quest(seen[match.observed], known.vectors[match.star], sigma_rad))
+    return Solution(len(sigma_rad), quest(observed[match.observed], model.vectors[match.star], sigma_rad))
 
 
-def iterated(known: Known, rays: Floats, believed: Rotation) -> Solution:
-    """Solve UPDATES times, each time with the last solution as the believed attitude."""
+def solve_iteratively(model: OnboardModel, rays: Floats, assumed: Rotation) -> Solution:
+    """Solve UPDATES times, each time with the last solution as the assumed attitude."""
     for _ in range(UPDATES):
-        found = solve(known, rays, believed)
-        if found.body_from_lab is None:
-            return found
-        believed = found.body_from_lab
-    return found
+        solution = solve(model, rays, assumed)
+        if solution.body_from_lab is None:
+            return solution
+        assumed = solution.body_from_lab
+    return solution
 
 
-def wrong_by(error_deg: float) -> Rotation:
+def initial_error(error_deg: float) -> Rotation:
     """Rotation of the initial error: the same error in all three Euler angles."""
     return Rotation.from_euler("ZYX", [error_deg] * 3, degrees=True)
 
 
-class Course(NamedTuple):
+class SolutionSeries(NamedTuple):
     """Solutions of all trials by initial error in degrees, and the iterated solutions."""
 
-    trials: dict[float, list[Solution]]
+    solutions: dict[float, list[Solution]]
     iterated: list[Solution]
 
     @property
     def matched(self) -> Summary:
         """Mean number of matched stars over the five trials."""
-        count = [[one.matched for one in self.trials[error]] for error in INITIAL_DEG]
-        return resampled(np.mean(count, axis=0), np.mean)  # mean per frame: its trials are not independent
+        counts = [[solution.matched for solution in self.solutions[error]] for error in INITIAL_DEG]
+        mean_of_frame = np.mean(counts, axis=0)  # the trials of a frame are not independent
+        return bootstrap_interval(mean_of_frame, np.mean)
 
-    def near(self, error_deg: float) -> Summary:
+    def fraction_near(self, error_deg: float) -> Summary:
         """Fraction of a trial's solutions with an error below APPROXIMATE_DEG."""
-        off = np.array([one.off_deg for one in self.trials[error_deg]])
-        return share(int(np.sum(off < APPROXIMATE_DEG)), len(off))
+        errors_deg = np.array([solution.error_deg for solution in self.solutions[error_deg]])
+        return proportion(int(np.sum(errors_deg < APPROXIMATE_DEG)), len(errors_deg))
 
     @property
-    def euler(self) -> Summary:
+    def mean_euler_angle(self) -> Summary:
         """Mean absolute Euler angle after the updates, deg; the true angles are zero."""
         angles = [
-            np.abs(one.body_from_lab.as_euler("ZYX", degrees=True)).mean()
-            for one in self.iterated
-            if one.body_from_lab
+            np.abs(solution.body_from_lab.as_euler("ZYX", degrees=True)).mean()
+            for solution in self.iterated
+            if solution.body_from_lab
         ]
-        return resampled(np.array(angles), np.mean)
+        return bootstrap_interval(np.array(angles), np.mean)
 
 
-def course(known: Known, errors_deg: Sequence[float], frames: int, seed: int, ask: Ask) -> Course:
+def solve_series(
+    model: OnboardModel, errors_deg: Sequence[float], frames: int, seed: int, options: ExperimentOptions
+) -> SolutionSeries:
     """Solve frames from the level vehicle, each from every initial error, and iterated from ITERATED_DEG."""
-    trials: dict[float, list[Solution]] = {error: [] for error in errors_deg}
-    last = []
+    solutions: dict[float, list[Solution]] = {error: [] for error in errors_deg}
+    iterated_solutions = []
     for n in range(frames):
-        rays = rays_body(known.lab, seed + n)
+        rays = rays_body(model.testbed, seed + n)
         for error in errors_deg:
-            trials[error].append(solve(known, rays, wrong_by(error)))
-        last.append(iterated(known, rays, wrong_by(ITERATED_DEG)))
-        ask.watch(n + 1, frames)
-    return Course(trials, last)
+            solutions[error].append(solve(model, rays, initial_error(error)))
+        iterated_solutions.append(solve_iteratively(model, rays, initial_error(ITERATED_DEG)))
+        options.watch(n + 1, frames)
+    return SolutionSeries(solutions, iterated_solutions)
 
 
-def trials(ask: Ask) -> Found:
+def initial_error_trials(options: ExperimentOptions) -> ExperimentResult:
     """Solutions for each initial error (five tests of 50 frames), with the scene's and a fitted camera position."""
-    errors = INITIAL_DEG if ask.quick else (*INITIAL_DEG, -10, -8, -4.5, 4.5, 8, 10)
-    frames, sky = ask.trials(250, 40), ask.trials(50, 10)
-    seeds = np.random.default_rng([ask.seed, 2009]).integers(2**31, size=4).tolist()
-    scene_s, fitted = (
-        course(at(camera_m, seeds[n], sky), errors, frames, seeds[n + 2], ask)
+    errors_deg = INITIAL_DEG if options.quick else (*INITIAL_DEG, -10, -8, -4.5, 4.5, 8, 10)
+    frames, catalog_frames = options.trials(250, 40), options.trials(50, 10)
+    seeds = np.random.default_rng([options.seed, 2009]).integers(2**31, size=4).tolist()
+    scene_camera, fitted_camera = (
+        solve_series(build_model(camera_m, seeds[n], catalog_frames), errors_deg, frames, seeds[n + 2], options)
         for n, camera_m in enumerate((None, FITTED_CAMERA_M))
     )
     name = "the camera 0.30 m to the side and 0.20 m up, fitted"
-    answers = {"matched": Answer(scene_s.matched, cause=Cause(name, fitted.matched))}
+    results = {"matched": RowResult(scene_camera.matched, cause=Cause(name, fitted_camera.matched))}
     for error in INITIAL_DEG:
-        answers[f"from_{error}"] = Answer(scene_s.near(error), cause=Cause(name, fitted.near(error)))
-    answers["iterated"] = Answer(scene_s.euler, cause=Cause(name, fitted.euler))
+        results[f"from_{error}"] = RowResult(
+            scene_camera.fraction_near(error), cause=Cause(name, fitted_camera.fraction_near(error))
+        )
+    results["iterated"] = RowResult(scene_camera.mean_euler_angle, cause=Cause(name, fitted_camera.mean_euler_angle))
     caption = "Stars matched, and the solutions' error, by the initial attitude's error; shaded where NPS succeeded."
-    courses = {"scene's camera": scene_s, "0.30 m to the side": fitted}
-    return Found(answers, (Drawing(caption, lambda fig: draw(fig, courses), (7.4, 4.6)),))
+    series = {"scene's camera": scene_camera, "0.30 m to the side": fitted_camera}
+    return ExperimentResult(results, (Drawing(caption, lambda fig: draw(fig, series), (7.4, 4.6)),))
 
 
-def draw(fig: Any, courses: dict[str, Course]) -> None:
+def draw(fig: Any, series_by_camera: dict[str, SolutionSeries]) -> None:
     """Matched stars above, errors below."""
     above, below = fig.subplots(2, 1, sharex=True)
-    for n, (name, one) in enumerate(courses.items()):
-        errors = sorted(one.trials)
-        counts = [np.mean([each.matched for each in one.trials[error]]) for error in errors]
-        found = [[each.off_deg for each in one.trials[error] if each.body_from_lab] for error in errors]
-        off = [np.mean(each) if each else np.nan for each in found]
+    for n, (name, series) in enumerate(series_by_camera.items()):
+        errors = sorted(series.solutions)
+        counts = [np.mean([solution.matched for solution in series.solutions[error]]) for error in errors]
+        error_lists = [
+            [solution.error_deg for solution in series.solutions[error] if solution.body_from_lab] for error in errors
+        ]
+        mean_error_deg = [np.mean(errors_deg) if errors_deg else np.nan for errors_deg in error_lists]
         style = {"color": INK[(0, 2)[n]], "marker": MARKS[n], "label": f"ours, {name}"}
         above.plot(errors, counts, **style)
-        below.plot(errors, off, **style | {"label": None})
+        below.plot(errors, mean_error_deg, **style | {"label": None})
     for axes in (above, below):
         axes.axvspan(-6, 3, color=INK[1], alpha=0.12, lw=0)
     above.axhline(6, color=INK[1], ls="--", label="published: about 6 on average")

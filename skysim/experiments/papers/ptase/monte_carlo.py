@@ -17,21 +17,21 @@ from estimator.core.arrays import Ints
 from estimator.identification.chance import ACCEPT_LOG10_CHANCE
 from estimator.identification.options import Options
 from estimator.identification.published.fialho import (
-    SHARE_BASIC,
-    SHARE_FALSE_STARS,
+    MIN_FRACTION_BASIC,
+    MIN_FRACTION_FALSE_STARS,
     VERSIONS,
-    Rules,
-    rules,
+    SearchOptions,
     search,
+    search_options,
 )
 from skysim.core.jit import jit
-from skysim.core.paths import CATALOGUES
+from skysim.core.paths import CATALOGS
 from skysim.core.types import Floats
 from skysim.core.units import ARCSEC_RAD
-from skysim.experiments.papers.compare import Answer, Ask, Cause, Drawing, Found
-from skysim.experiments.papers.intervals import resampled
+from skysim.experiments.papers.compare import Cause, Drawing, ExperimentOptions, ExperimentResult, RowResult
+from skysim.experiments.papers.intervals import bootstrap_interval, percent, sample_std
 from skysim.experiments.papers.published import experiments
-from skysim.results.metrics import WRONG_RAD, Summary, share
+from skysim.results.metrics import WRONG_RAD, Summary, proportion
 from skysim.results.plots import INK, MARKS
 
 HALF_FIELD_TAN = float(np.tan(np.radians(10)))
@@ -45,39 +45,39 @@ SIMULATION_RUNS = 1000
 TABLE_1 = np.array(experiments()["ptase-table-1"].data["simulations"])
 
 
-def catalogue(limit_mag: float) -> PairIndex:
+def catalog(limit_mag: float) -> PairIndex:
     """Hipparcos by READCAT and PROC_CAT to a limiting magnitude, doubles within 30 arcsec merged, with a pair index."""
-    stars = ptase.proc_cat(ptase.read_cat(CATALOGUES / "hipparcos_hp6.5.ecsv", limit_mag), DOUBLES_RAD)
+    stars = ptase.proc_cat(ptase.read_cat(CATALOGS / "hipparcos_hp6.5.ecsv", limit_mag), DOUBLES_RAD)
     return pair_index.build(stars.vectors, float(DIAGONAL_RAD), magnitude=stars.magnitude)
 
 
-def version(name: str) -> Rules:
+def version(name: str) -> SearchOptions:
     """Parameters of one of the paper's versions, as in estimator.identification.published.fialho."""
-    asked = Options(epsilon_mag=SIGMA_MAG)
+    options = Options(epsilon_mag=SIGMA_MAG)
     falls_back = name in ("fialho_3", "fialho_4")
-    part = SHARE_FALSE_STARS if falls_back else SHARE_BASIC
-    return rules(TOLERANCE_RAD, asked, part, name != "fialho_1", falls_back)
+    fraction = MIN_FRACTION_FALSE_STARS if falls_back else MIN_FRACTION_BASIC
+    return search_options(TOLERANCE_RAD, options, fraction, name != "fialho_1", falls_back)
 
 
 @jit
-def simulate(known: PairIndex, by: Rules, runs: int, seed: int) -> tuple[Floats, Floats, Ints]:
+def simulate(index: PairIndex, parameters: SearchOptions, runs: int, seed: int) -> tuple[Floats, Floats, Ints]:
     """True and estimated R_cam_from_icrs (runs, 3, 3), the latter NaN if unsolved; (runs,) number of stars in view.
 
     Attitudes are uniform over all rotations (see `_attitude`).
     """
     np.random.seed(seed)  # noqa: NPY002  (numba has no other generator that is seeded inside)
-    truly, told = np.empty((runs, 3, 3)), np.full((runs, 3, 3), np.nan)
+    true, estimated = np.empty((runs, 3, 3)), np.full((runs, 3, 3), np.nan)
     stars = np.zeros(runs, np.int64)
     for run in range(runs):
-        truly[run] = _attitude()
-        seen, light = _field(truly[run], known)
-        stars[run] = len(seen)
-        if len(seen) < 4:
+        true[run] = _attitude()
+        directions, magnitudes = _field(true[run], index)
+        stars[run] = len(directions)
+        if len(directions) < 4:
             continue
-        found = search(seen, light, known, by)
-        if found[3] <= ACCEPT_LOG10_CHANCE:
-            told[run] = found[2]
-    return truly, told, stars
+        solution = search(directions, magnitudes, index, parameters)
+        if solution[3] <= ACCEPT_LOG10_CHANCE:
+            estimated[run] = solution[2]
+    return true, estimated, stars
 
 
 @jit
@@ -94,17 +94,16 @@ def _attitude() -> Floats:
 
 
 @jit
-def _field(R: Floats, known: PairIndex) -> tuple[Floats, Floats]:
+def _field(R: Floats, index: PairIndex) -> tuple[Floats, Floats]:
     """PTASE's gen_sia_input2: noisy directions and magnitudes of the stars in the field, brightest first."""
-    seen, light = np.empty((len(known.vectors), 3)), np.empty(len(known.vectors))
-    least = 1 / np.sqrt(
-        1 + 2 * HALF_FIELD_TAN**2
-    )  # cosine to the field's corner: rejects most stars by their z alone
+    directions, magnitudes = np.empty((len(index.vectors), 3)), np.empty(len(index.vectors))
+    # Cosine of the angle to the field's corner: rejects most stars by their z alone.
+    min_cos = 1 / np.sqrt(1 + 2 * HALF_FIELD_TAN**2)
     count = 0
-    for star in range(len(known.vectors)):
-        u, v, w = known.vectors[star]
+    for star in range(len(index.vectors)):
+        u, v, w = index.vectors[star]
         z = R[2, 0] * u + R[2, 1] * v + R[2, 2] * w
-        if z < least:
+        if z < min_cos:
             continue
         x, y = R[0, 0] * u + R[0, 1] * v + R[0, 2] * w, R[1, 0] * u + R[1, 1] * v + R[1, 2] * w
         if abs(x) > HALF_FIELD_TAN * z or abs(y) > HALF_FIELD_TAN * z:
@@ -113,11 +112,11 @@ def _field(R: Floats, known: PairIndex) -> tuple[Floats, Floats]:
         y += SIGMA_RAD * np.random.standard_normal()  # noqa: NPY002
         z += SIGMA_RAD * np.random.standard_normal()  # noqa: NPY002
         length = np.sqrt(x * x + y * y + z * z)
-        seen[count, 0], seen[count, 1], seen[count, 2] = x / length, y / length, z / length
-        light[count] = known.magnitude[star] + SIGMA_MAG * np.random.standard_normal()  # noqa: NPY002
+        directions[count, 0], directions[count, 1], directions[count, 2] = x / length, y / length, z / length
+        magnitudes[count] = index.magnitude[star] + SIGMA_MAG * np.random.standard_normal()  # noqa: NPY002
         count += 1
-    order = np.argsort(light[:count])
-    return seen[:count][order], light[:count][order]
+    order = np.argsort(magnitudes[:count])
+    return directions[:count][order], magnitudes[:count][order]
 
 
 class Errors(NamedTuple):
@@ -135,91 +134,94 @@ class Errors(NamedTuple):
     axis: Floats
 
 
-def errors(truly: Floats, told: Floats) -> Errors:
+def errors(true: Floats, estimated: Floats) -> Errors:
     """Errors of (N, 3, 3) attitude matrices.
 
     The rotation angle is 2 arcsin(|M_est - M_true| / sqrt(8)). Our image axes differ from those of eq. 5 by a constant
     rotation, which cancels in the roll error.
     """
-    norm = np.linalg.norm(told - truly, axis=(1, 2))
-    turn = 2 * np.arcsin(np.minimum(norm / np.sqrt(8), 1))
-    phi = [np.arctan2(R[:, 0, 2], R[:, 1, 2]) for R in (truly, told)]
+    norm = np.linalg.norm(estimated - true, axis=(1, 2))
+    angle = 2 * np.arcsin(np.minimum(norm / np.sqrt(8), 1))
+    phi = [np.arctan2(R[:, 0, 2], R[:, 1, 2]) for R in (true, estimated)]
     roll = np.abs(np.mod(phi[1] - phi[0] + np.pi, 2 * np.pi) - np.pi)
-    axis = np.linalg.norm(told[:, 2] - truly[:, 2], axis=1)
-    return Errors(*(one / ARCSEC_RAD for one in (norm, turn, roll, axis)))
+    axis = np.linalg.norm(estimated[:, 2] - true[:, 2], axis=1)
+    return Errors(*(error / ARCSEC_RAD for error in (norm, angle, roll, axis)))
 
 
 # Table 1.
 
 
-class Done(NamedTuple):
+class VersionRuns(NamedTuple):
     """Runs of one version: number of runs, of solved ones, of wrong ones, and the errors of the correct solutions."""
 
     runs: int
-    answered: int
+    solved: int
     wrong: int
     right: Errors
 
 
-def runs_of(known: PairIndex, by: Rules, runs: int, seed: int) -> Done:
+def run_version(index: PairIndex, parameters: SearchOptions, runs: int, seed: int) -> VersionRuns:
     """Simulate and count. As in the paper, a wrong solution counts as solved."""
-    truly, told, _ = simulate(known, by, runs, seed)
-    answered = np.isfinite(told[:, 0, 0])
-    all_of_them = errors(truly[answered], told[answered])
-    wrong = all_of_them.angle > WRONG_RAD / ARCSEC_RAD
-    return Done(runs, int(answered.sum()), int(wrong.sum()), Errors(*(one[~wrong] for one in all_of_them)))
-
-
-def table_1(ask: Ask) -> Found:
-    """Table 1: all four versions, and the second with a wider magnitude gate as the cause."""
-    known, done = catalogue(FITTED_LIMIT_MAG), {}
-    seeds = np.random.default_rng([ask.seed, 1]).integers(2**31, size=len(VERSIONS) + 1)
-    for n, (name, seed) in enumerate(zip(VERSIONS, seeds, strict=False)):
-        runs = ask.trials(5000 if name == "fialho_1" else 10_000, 300 if name == "fialho_1" else 1000)
-        done[name] = runs_of(known, version(name), runs, int(seed))
-        ask.watch(n + 1, len(VERSIONS) + 1)
-    wider = version("fialho_2")._replace(gate_mag=FITTED_GATE_SIGMAS * SIGMA_MAG)
-    gate = runs_of(known, wider, ask.trials(10_000, 1000), int(seeds[-1]))
-    cause = Cause(f"a gate for magnitudes of {FITTED_GATE_SIGMAS} sigma, fitted", per_cent(gate))
-    answers = {}
-    for name, one in done.items():
-        what = name[-1]
-        answers[f"success_{what}"] = Answer(per_cent(one), cause=cause if what in "12" else None)
-        for figure, values in one.right._asdict().items():
-            answers[f"{figure}_{what}"] = Answer(resampled(values, np.mean))
-    answers["wrong"] = Answer(
-        share(sum(one.wrong for one in done.values()), sum(one.runs for one in done.values()))
+    true, estimated, _ = simulate(index, parameters, runs, seed)
+    is_solved = np.isfinite(estimated[:, 0, 0])
+    all_errors = errors(true[is_solved], estimated[is_solved])
+    is_wrong = all_errors.angle > WRONG_RAD / ARCSEC_RAD
+    return VersionRuns(
+        runs, int(is_solved.sum()), int(is_wrong.sum()), Errors(*(values[~is_wrong] for values in all_errors))
     )
-    answers |= scatter(done["fialho_2"])
-    return Found(answers, drawings(done))
 
 
-def per_cent(done: Done) -> Summary:
+def table_1(options: ExperimentOptions) -> ExperimentResult:
+    """Table 1: all four versions, and the second with a wider magnitude gate as the cause."""
+    index, by_version = catalog(FITTED_LIMIT_MAG), {}
+    seeds = np.random.default_rng([options.seed, 1]).integers(2**31, size=len(VERSIONS) + 1)
+    for n, (name, seed) in enumerate(zip(VERSIONS, seeds, strict=False)):
+        runs = options.trials(5000 if name == "fialho_1" else 10_000, 300 if name == "fialho_1" else 1000)
+        by_version[name] = run_version(index, version(name), runs, int(seed))
+        options.watch(n + 1, len(VERSIONS) + 1)
+    wider_parameters = version("fialho_2")._replace(gate_mag=FITTED_GATE_SIGMAS * SIGMA_MAG)
+    wider_gate = run_version(index, wider_parameters, options.trials(10_000, 1000), int(seeds[-1]))
+    cause = Cause(f"a gate for magnitudes of {FITTED_GATE_SIGMAS} sigma, fitted", success_percent(wider_gate))
+    results = {}
+    for name, runs_of_version in by_version.items():
+        number = name[-1]
+        results[f"success_{number}"] = RowResult(
+            success_percent(runs_of_version), cause=cause if number in "12" else None
+        )
+        for statistic, values in runs_of_version.right._asdict().items():
+            results[f"{statistic}_{number}"] = RowResult(bootstrap_interval(values, np.mean))
+    wrong, total = (sum(getattr(one, name) for one in by_version.values()) for name in ("wrong", "runs"))
+    results["wrong"] = RowResult(proportion(wrong, total))
+    results |= scatter(by_version["fialho_2"])
+    return ExperimentResult(results, drawings(by_version))
+
+
+def success_percent(runs_of_version: VersionRuns) -> Summary:
     """Success rate in percent."""
-    value, low, high, runs = share(done.answered, done.runs)
-    return Summary(100 * value, 100 * low, 100 * high, runs)
+    return percent(proportion(runs_of_version.solved, runs_of_version.runs))
 
 
-def scatter(done: Done) -> dict[str, Answer]:
+def scatter(runs_of_version: VersionRuns) -> dict[str, RowResult]:
     """Standard deviation of a simulation's mean over 1000 runs: that of one run divided by sqrt(1000)."""
-    right, found = done.right, np.where(np.arange(done.runs) < done.answered, 100.0, 0.0)
+    right = runs_of_version.right
+    success = np.where(np.arange(runs_of_version.runs) < runs_of_version.solved, 100.0, 0.0)
     values: dict[str, Floats] = {
-        "success": found,
+        "success": success,
         "attitude": right.attitude,
         "roll": right.roll,
         "axis": right.axis,
     }
-    return {f"{name}_sd": Answer(resampled(one, of_a_thousand)) for name, one in values.items()}
+    return {f"{name}_sd": RowResult(bootstrap_interval(samples, std_of_mean)) for name, samples in values.items()}
 
 
-def of_a_thousand(values: Floats, axis: int = -1) -> Any:
+def std_of_mean(values: Floats, axis: int = -1) -> Any:
     """Standard deviation of the mean of SIMULATION_RUNS values."""
-    return np.std(values, axis=axis, ddof=1) / np.sqrt(SIMULATION_RUNS)
+    return sample_std(values, axis) / np.sqrt(SIMULATION_RUNS)
 
 
-def drawings(done: dict[str, Done]) -> tuple[Drawing, ...]:
+def drawings(by_version: dict[str, VersionRuns]) -> tuple[Drawing, ...]:
     """Figures: histogram of the attitude error, and the simulations' means."""
-    second = done["fialho_2"].right
+    second = by_version["fialho_2"].right
     return (
         Drawing(
             "Histogram of the attitude error of alg_ide_mf1_2, which PTASE writes into its log file.",
@@ -227,7 +229,7 @@ def drawings(done: dict[str, Done]) -> tuple[Drawing, ...]:
         ),
         Drawing(
             "Every simulation of a thousand runs: the paper's five, and ours of all versions.",
-            lambda fig: draw_simulations(fig, done),
+            lambda fig: draw_simulations(fig, by_version),
         ),
     )
 
@@ -237,20 +239,20 @@ def draw_histogram(fig: Any, right: Errors) -> None:
     axes, bins = fig.subplots(), np.arange(0, 25.5, 0.5)
     axes.hist(np.minimum(right.attitude, bins[-1]), bins, color=INK[0], alpha=0.5, label="ours")
     axes.axvline(right.attitude.mean(), color=INK[0], label=f"ours, mean {right.attitude.mean():.2f}")
-    told = experiments()["ptase-table-1"].rows["attitude_2"].published
-    axes.axvline(told, color=INK[1], ls="--", label=f"published mean {told:.2f}")
+    published = experiments()["ptase-table-1"].rows["attitude_2"].published
+    axes.axvline(published, color=INK[1], ls="--", label=f"published mean {published:.2f}")
     axes.set(xlabel="attitude error |M true - M est| (arcsec; the last bin is all beyond)", ylabel="runs")
     axes.legend()
 
 
-def draw_simulations(fig: Any, done: dict[str, Done]) -> None:
+def draw_simulations(fig: Any, by_version: dict[str, VersionRuns]) -> None:
     """Mean attitude error against mean roll error of each simulation."""
     axes = fig.subplots()
-    for n, (name, one) in enumerate(done.items()):
-        parts = max(1, one.runs // SIMULATION_RUNS)
+    for n, (name, runs_of_version) in enumerate(by_version.items()):
+        batches = max(1, runs_of_version.runs // SIMULATION_RUNS)
         means = [
-            [part.mean() for part in np.array_split(values, parts)]
-            for values in (one.right.roll, one.right.attitude)
+            [batch.mean() for batch in np.array_split(values, batches)]
+            for values in (runs_of_version.right.roll, runs_of_version.right.attitude)
         ]
         axes.plot(*means, MARKS[n], color=INK[(0, 2, 3, 4)[n]], alpha=0.7, label=f"ours, {name}")
     axes.plot(TABLE_1[:, 2], TABLE_1[:, 1], "*", color=INK[1], ms=9, label="published")

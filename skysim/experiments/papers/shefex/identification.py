@@ -15,162 +15,169 @@ import numpy as np
 from estimator.attitude.solvers import SOLVERS
 from estimator.catalog import pair_index
 from estimator.identification.chance import ACCEPT_LOG10_CHANCE
-from estimator.identification.published.shefex import FOURTH_STAR, Rules, cos_error, gate, sought
+from estimator.identification.published.shefex import FOURTH_STAR, angle_interval, cos_error, search
 from skysim.core.types import Floats
-from skysim.experiments.papers.compare import Answer, Ask, Cause, Drawing, Found
-from skysim.experiments.papers.intervals import of_means
+from skysim.experiments.papers.compare import Cause, Drawing, ExperimentOptions, ExperimentResult, RowResult
+from skysim.experiments.papers.intervals import bootstrap_of_means
 from skysim.experiments.papers.shefex.setup import (
-    CHOSEN,
-    MOST,
+    CHOSEN_COS_ERROR,
+    MAX_CENTROIDS,
     PIXEL_RAD,
     PRINTED_FIELD_RAD,
     PUBLISHED,
-    UNLIMITED,
     Field,
-    fields,
-    lab,
-    line,
     pairs,
-    slack_rad,
+    plot_curve,
+    random_fields,
+    search_options,
+    shefex_testbed,
 )
 from skysim.experiments.study.report.figures import logarithmic
-from skysim.results.metrics import Summary, exact, extreme, share
+from skysim.results.metrics import Summary, exact, extremum, proportion
 from skysim.tracking import onboard_model
 
 COS_ERRORS = np.array([5e-6, 1e-5, 1.5e-5, 2e-5, 3e-5, 4e-5, 5.5e-5, 8e-5, 1.2e-4, 2e-4])
-AT = {float(one): n for n, one in enumerate(COS_ERRORS)}
+INDEX_OF = {float(one): n for n, one in enumerate(COS_ERRORS)}
 CENTROID_PX = (0.1, 0.2, 0.3)
-SPIKES, SPIKED = (0, 2, 4, 6, 8, 10), (4e-5, CHOSEN, 8e-5, 1.2e-4)
+SPIKES, SPIKE_COS_ERRORS = (0, 2, 4, 6, 8, 10), (4e-5, CHOSEN_COS_ERROR, 8e-5, 1.2e-4)
 ERRORS_PX = np.array([0.1, 0.2, 0.3, 0.45, 0.6, 0.8, 1.0])
-AT_LIMIT = 3  # index of 0.45 px
+LIMIT_INDEX = 3  # index of 0.45 px
 LIMIT_DEG = 0.1
-EQ3 = 2.47  # c of eq. 3 that gives the chosen cosError for 0.2 px
-ASTRAY_RAD = np.radians(1.0)  # a larger error is a false identification, not an inaccurate attitude
+EQ3_FACTOR = 2.47  # c of eq. 3 that gives the chosen cosError for 0.2 px
+WRONG_RAD = np.radians(1.0)  # a larger error is a false identification, not an inaccurate attitude
 
 
-class Tried(NamedTuple):
+class Identification(NamedTuple):
     """One identification: work, 1 or 0 for right and for wrong, (3,) errors about camera x, y, z in degrees or NaN."""
 
     work: float
     right: float
     wrong: float
-    off_deg: Floats
+    error_deg: Floats
 
 
-def attempt(
-    field: Field, centroid_px: float, error: float, spikes: int, accept: float, rng: np.random.Generator
-) -> Tried:
+def identify(
+    field: Field,
+    centroid_px: float,
+    cosine_error: float,
+    spikes: int,
+    accept_log10_chance: float,
+    rng: np.random.Generator,
+) -> Identification:
     """Identify noisy stars of a field among spikes, and solve with ESOQ2.
 
     At most 15 lights are used: stars in the order of brightness, with spikes inserted at random ranks. Work is the
     number of compared angles: those of candidates, and three for each triangle tested.
     """
-    camera = onboard_model.calibration(lab().scene.camera)
+    camera = onboard_model.calibration(shefex_testbed().scene.camera)
     xy_px = field.xy_px + centroid_px * rng.standard_normal(field.xy_px.shape)
     if spikes:
-        strays_px = rng.random((spikes, 2)) * [camera.width_px, camera.height_px] - 0.5
-        place = np.sort(rng.integers(0, len(xy_px) + 1, spikes))
-        xy_px = np.insert(xy_px, place, strays_px, axis=0)
-    xy_px = xy_px[:MOST]
+        spikes_px = rng.random((spikes, 2)) * [camera.width_px, camera.height_px] - 0.5
+        ranks = np.sort(rng.integers(0, len(xy_px) + 1, spikes))
+        xy_px = np.insert(xy_px, ranks, spikes_px, axis=0)
+    xy_px = xy_px[:MAX_CENTROIDS]
     if len(xy_px) < 4:
-        return Tried(np.nan, 0.0, 0.0, np.full(3, np.nan))
-    known, rays, tried = pairs(), camera.rays(xy_px), np.zeros(3, np.int64)
-    by = Rules(error, slack_rad(known, error), UNLIMITED, UNLIMITED, len(xy_px), accept)
-    observed, star, _, _ = sought(rays, known, by, tried)
-    work = float(tried[1] + 3 * tried[2])
+        return Identification(np.nan, 0.0, 0.0, np.full(3, np.nan))
+    index, rays, counters = pairs(), camera.rays(xy_px), np.zeros(3, np.int64)
+    search_limits = search_options(index, cosine_error, len(xy_px), accept_log10_chance)
+    observed, star, _, _ = search(rays, index, search_limits, counters)
+    work = float(counters[1] + 3 * counters[2])
     if not len(observed):
-        return Tried(work, 0.0, 0.0, np.full(3, np.nan))
+        return Identification(work, 0.0, 0.0, np.full(3, np.nan))
     sigma_rad = np.full(len(observed), centroid_px / camera.focal_px)
-    found = SOLVERS["esoq2"](rays[observed], known.vectors[star], sigma_rad)
-    off_rad = (found * field.cam_from_ref.inv()).as_rotvec()
-    if np.linalg.norm(off_rad) > ASTRAY_RAD:
-        return Tried(work, 0.0, 1.0, np.full(3, np.nan))
-    return Tried(work, 1.0, 0.0, np.degrees(off_rad))
+    cam_from_ref = SOLVERS["esoq2"](rays[observed], index.vectors[star], sigma_rad)
+    error_rad = (cam_from_ref * field.cam_from_ref.inv()).as_rotvec()
+    if np.linalg.norm(error_rad) > WRONG_RAD:
+        return Identification(work, 0.0, 1.0, np.full(3, np.nan))
+    return Identification(work, 1.0, 0.0, np.degrees(error_rad))
 
 
 class Curves(NamedTuple):
     """Results for N attitudes. The paper accepts a match with a fourth star; our rule requires significance.
 
-    work, right : (centroid errors, cosErrors, N) by the paper's rule; careful : right by our rule at 0.2 px
-    wrong, strict : (spikes, cosErrors of SPIKED, N) by the paper's rule, (spikes, N) by ours, both at 0.2 px
-    off_deg     : (centroid errors of ERRORS_PX, N, 3);  enough : (N,) whether four stars are on the detector
+    work, right       : (centroid errors, cosErrors, N) by the paper's rule
+    right_significant : (cosErrors, N) by our rule, at 0.2 px
+    wrong             : (spikes, cosErrors of SPIKE_COS_ERRORS, N) by the paper's rule, at 0.2 px
+    wrong_significant : (spikes, N) by our rule, at 0.2 px
+    error_deg         : (centroid errors of ERRORS_PX, N, 3)
+    has_four_stars    : (N,) whether four stars are on the detector
     """
 
     work: Floats
     right: Floats
-    careful: Floats
+    right_significant: Floats
     wrong: Floats
-    strict: Floats
-    off_deg: Floats
-    enough: Floats
+    wrong_significant: Floats
+    error_deg: Floats
+    has_four_stars: Floats
 
 
-class Sky:
+class TrialSet:
     """The attitudes of an experiment. Each has its own noise seed, the same at every point of a curve, so that points
     differ by their parameters only."""
 
-    def __init__(self, ask: Ask, count: int, points: int) -> None:
-        self.seen, self.seed = fields(count, ask.seed), ask.seed
-        self.watch, self.points, self.done = ask.watch, points, 0
+    def __init__(self, options: ExperimentOptions, count: int, points: int) -> None:
+        self.fields, self.seed = random_fields(count, options.seed), options.seed
+        self.watch, self.points, self.completed = options.watch, points, 0
 
-    def through(
-        self, centroid_px: float, error: float, spikes: int = 0, accept: float = FOURTH_STAR
+    def results_at(
+        self, centroid_px: float, cosine_error: float, spikes: int = 0, accept: float = FOURTH_STAR
     ) -> dict[str, Floats]:
-        """Results of all attitudes at one point of a curve, as arrays by the field names of `Tried`."""
-        told = [
-            attempt(field, centroid_px, error, spikes, accept, np.random.default_rng([self.seed, 1, n]))
-            for n, field in enumerate(self.seen)
+        """Results of all attitudes at one point of a curve, as arrays by the field names of `Identification`."""
+        results = [
+            identify(field, centroid_px, cosine_error, spikes, accept, np.random.default_rng([self.seed, 1, n]))
+            for n, field in enumerate(self.fields)
         ]
-        self.done += 1
-        self.watch(self.done, self.points)
-        return {name: np.array([getattr(one, name) for one in told]) for name in Tried._fields}
+        self.completed += 1
+        self.watch(self.completed, self.points)
+        return {name: np.array([getattr(one, name) for one in results]) for name in Identification._fields}
 
 
-def run(ask: Ask) -> Curves:
+def compute_curves(options: ExperimentOptions) -> Curves:
     """Compute all curves."""
-    careful = ACCEPT_LOG10_CHANCE
-    points = 4 * len(COS_ERRORS) + len(SPIKES) * (len(SPIKED) + 1) + len(ERRORS_PX)
-    sky = Sky(ask, ask.trials(1000, 60), points)
-    plain = [[sky.through(one, error) for error in COS_ERRORS] for one in CENTROID_PX]
+    significant = ACCEPT_LOG10_CHANCE
+    points = 4 * len(COS_ERRORS) + len(SPIKES) * (len(SPIKE_COS_ERRORS) + 1) + len(ERRORS_PX)
+    trials = TrialSet(options, options.trials(1000, 60), points)
+    curves = [[trials.results_at(px, error) for error in COS_ERRORS] for px in CENTROID_PX]
+    right = [trials.results_at(0.2, error, 0, significant)["right"] for error in COS_ERRORS]
+    wrong = [[trials.results_at(0.2, error, n)["wrong"] for error in SPIKE_COS_ERRORS] for n in SPIKES]
+    wrong_significant = [trials.results_at(0.2, CHOSEN_COS_ERROR, n, significant)["wrong"] for n in SPIKES]
+    error_deg = [trials.results_at(px, eq3_cos_error(px, EQ3_FACTOR))["error_deg"] for px in ERRORS_PX]
     return Curves(
-        work=np.array([[at["work"] for at in row] for row in plain]),
-        right=np.array([[at["right"] for at in row] for row in plain]),
-        careful=np.array([sky.through(0.2, error, 0, careful)["right"] for error in COS_ERRORS]),
-        wrong=np.array([[sky.through(0.2, error, n)["wrong"] for error in SPIKED] for n in SPIKES]),
-        strict=np.array([sky.through(0.2, CHOSEN, n, careful)["wrong"] for n in SPIKES]),
-        off_deg=np.array([sky.through(one, eq3(one, EQ3))["off_deg"] for one in ERRORS_PX]),
-        enough=np.array([len(field.xy_px) >= 4 for field in sky.seen]),
+        work=np.array([[point["work"] for point in row] for row in curves]),
+        right=np.array([[point["right"] for point in row] for row in curves]),
+        right_significant=np.array(right),
+        wrong=np.array(wrong),
+        wrong_significant=np.array(wrong_significant),
+        error_deg=np.array(error_deg),
+        has_four_stars=np.array([len(field.xy_px) >= 4 for field in trials.fields]),
     )
 
 
-def eq3(centroid_px: float, factor: float) -> float:
+def eq3_cos_error(centroid_px: float, factor: float) -> float:
     """cosError by eq. 3 for a centroid error, with the paper's field of view and angle per pixel."""
     return cos_error(PRINTED_FIELD_RAD, centroid_px * PIXEL_RAD, factor)
 
 
-def figures(ask: Ask) -> Found:
+def figs_7_to_10(options: ExperimentOptions) -> ExperimentResult:
     """Figs 7 to 10, the choice of cosError, and the equations it is based on."""
-    curves = run(ask)
-    answers = of_time(curves) | of_success(curves) | of_wrong(curves) | of_attitude(curves)
-    answers |= of_equations(np.random.default_rng([ask.seed, 2]))
+    curves = compute_curves(options)
+    results = time_results(curves) | success_results(curves) | wrong_results(curves) | attitude_results(curves)
+    results |= equation_results(np.random.default_rng([options.seed, 2]))
     drawings = (
-        Drawing(
-            "Fig. 7: angles compared by an identification, against cosError.", partial(draw_time, curves)
-        ),
+        Drawing("Fig. 7: angles compared by an identification, against cosError.", partial(draw_time, curves)),
         Drawing("Fig. 8: success rate against cosError.", partial(draw_success, curves)),
-        Drawing(
-            "Fig. 9: wrong recognitions against the spikes among the stars.", partial(draw_wrong, curves)
-        ),
+        Drawing("Fig. 9: wrong recognitions against the spikes among the stars.", partial(draw_wrong, curves)),
         Drawing("Fig. 10: attitude error against the centroid error.", partial(draw_attitude, curves)),
     )
-    return Found(answers, drawings)
+    return ExperimentResult(results, drawings)
 
 
-def of_time(curves: Curves) -> dict[str, Answer]:
+def time_results(curves: Curves) -> dict[str, RowResult]:
     """Fig. 7: the ends of the curves relative to their minimum, and how far the minimum moves with centroid error."""
-    low = [of_means(work.T, lambda m: m[..., 0] / m.min(axis=-1)) for work in curves.work]
-    high = [of_means(work.T, lambda m: m[..., -1] / m.min(axis=-1)) for work in curves.work]
-    sharp, blurred = curves.work[0].T, curves.work[-1].T
+    low = [bootstrap_of_means(work.T, lambda m: m[..., 0] / m.min(axis=-1)) for work in curves.work]
+    high = [bootstrap_of_means(work.T, lambda m: m[..., -1] / m.min(axis=-1)) for work in curves.work]
+    low_noise, high_noise = curves.work[0].T, curves.work[-1].T
     count = len(COS_ERRORS)
 
     def moved(means: Floats) -> Floats:
@@ -178,121 +185,131 @@ def of_time(curves: Curves) -> dict[str, Answer]:
         return np.asarray(COS_ERRORS[last] / COS_ERRORS[first])
 
     return {
-        "least_low": Answer(min(low), "least of the three centroid errors"),
-        "least_high": Answer(min(high), "least of the three centroid errors"),
-        "optimum": Answer(of_means(np.hstack([sharp, blurred]), moved)),
+        "least_low": RowResult(min(low), "smallest of the three centroid errors"),
+        "least_high": RowResult(min(high), "smallest of the three centroid errors"),
+        "optimum": RowResult(bootstrap_of_means(np.hstack([low_noise, high_noise]), moved)),
     }
 
 
-def of_success(curves: Curves) -> dict[str, Answer]:
+def success_results(curves: Curves) -> dict[str, RowResult]:
     """Fig. 8: rise with cosError, order of the curves, and the success rate at the chosen cosError."""
-    chosen, four = curves.right[1, AT[CHOSEN]], curves.enough
-    rise = chosen - curves.right[1, AT[1e-5]]
-    above = curves.right[0, AT[2e-5]] - curves.right[2, AT[2e-5]]
+    chosen, has_four_stars = curves.right[1, INDEX_OF[CHOSEN_COS_ERROR]], curves.has_four_stars
+    increase = chosen - curves.right[1, INDEX_OF[1e-5]]
+    difference = curves.right[0, INDEX_OF[2e-5]] - curves.right[2, INDEX_OF[2e-5]]
     return {
-        "success_rises": Answer(of_means(rise[:, None], lambda m: m[..., 0])),
-        "success_sharper": Answer(of_means(above[:, None], lambda m: m[..., 0])),
-        "success_chosen": Answer(
-            share(chosen[four].sum(), four.sum()),
-            f"of all attitudes, {1 - four.mean():.0%} with fewer than four stars: {chosen.mean():.3f}",
+        "success_rises": RowResult(bootstrap_of_means(increase[:, None], lambda m: m[..., 0])),
+        "success_sharper": RowResult(bootstrap_of_means(difference[:, None], lambda m: m[..., 0])),
+        "success_chosen": RowResult(
+            proportion(chosen[has_four_stars].sum(), has_four_stars.sum()),
+            f"over all attitudes, {1 - has_four_stars.mean():.0%} with fewer than four stars: {chosen.mean():.3f}",
         ),
     }
 
 
-def of_wrong(curves: Curves) -> dict[str, Answer]:
+def wrong_results(curves: Curves) -> dict[str, RowResult]:
     """Fig. 9: rise with the number of spikes and with cosError, and the rate at the chosen cosError."""
-    more = curves.wrong[-1, -1] - curves.wrong[0, -1]
-    wider = curves.wrong[-1, -1] - curves.wrong[-1, 0]
-    at = SPIKED.index(CHOSEN)
-    ours = f"by our rule, which weighs a match against chance: {int(curves.strict.sum())} wrong at any"
+    by_spikes = curves.wrong[-1, -1] - curves.wrong[0, -1]
+    by_cos_error = curves.wrong[-1, -1] - curves.wrong[-1, 0]
+    chosen = SPIKE_COS_ERRORS.index(CHOSEN_COS_ERROR)
+    wrong_by_our_rule = int(curves.wrong_significant.sum())
+    note = f"our rule, which requires significance: {wrong_by_our_rule} wrong at any number of spikes"
     return {
-        "wrong_spikes": Answer(of_means(more[:, None], lambda m: m[..., 0]), ours),
-        "wrong_cos_error": Answer(of_means(wider[:, None], lambda m: m[..., 0])),
-        "wrong_chosen": Answer(share(curves.wrong[SPIKES.index(4), at].sum(), len(curves.enough))),
+        "wrong_spikes": RowResult(bootstrap_of_means(by_spikes[:, None], lambda m: m[..., 0]), note),
+        "wrong_cos_error": RowResult(bootstrap_of_means(by_cos_error[:, None], lambda m: m[..., 0])),
+        "wrong_chosen": RowResult(proportion(curves.wrong[SPIKES.index(4), chosen].sum(), len(curves.has_four_stars))),
     }
 
 
-def of_attitude(curves: Curves) -> dict[str, Answer]:
+def attitude_results(curves: Curves) -> dict[str, RowResult]:
     """Fig. 10: errors at 0.45 px, and the centroid error at which yaw exceeds the limit, as rms and as 2 sigma."""
-    yaw, cross = curves.off_deg[:, :, 2].T, np.hypot(curves.off_deg[:, :, 0], curves.off_deg[:, :, 1]).T
-    here, square = yaw[:, [AT_LIMIT]], yaw**2
+    yaw, cross = curves.error_deg[:, :, 2].T, np.hypot(curves.error_deg[:, :, 0], curves.error_deg[:, :, 1]).T
+    yaw_at_limit, yaw_squared = yaw[:, [LIMIT_INDEX]], yaw**2
 
     def steps(means: Floats) -> Floats:
         return np.asarray(np.diff(np.sqrt(means), axis=-1).min(axis=-1))
 
-    both = np.hstack([square[:, [AT_LIMIT]], cross[:, [AT_LIMIT]] ** 2 / 2])
-    twice = of_means(square, partial(passes, 2.0))
+    yaw_and_cross = np.hstack([yaw_squared[:, [LIMIT_INDEX]], cross[:, [LIMIT_INDEX]] ** 2 / 2])
+    two_sigma = bootstrap_of_means(yaw_squared, partial(error_at_limit, 2.0))
     return {
-        "yaw_mean": Answer(of_means(np.abs(here), lambda m: m[..., 0])),
-        "yaw_rms": Answer(of_means(here**2, partial(sigmas, 1.0))),
-        "yaw_2_sigma": Answer(of_means(here**2, partial(sigmas, 2.0))),
-        "passes": Answer(
-            of_means(square, partial(passes, 1.0)), cause=Cause("2 sigma drawn, not rms", twice)
+        "yaw_mean": RowResult(bootstrap_of_means(np.abs(yaw_at_limit), lambda m: m[..., 0])),
+        "yaw_rms": RowResult(bootstrap_of_means(yaw_at_limit**2, partial(scaled_rms, 1.0))),
+        "yaw_2_sigma": RowResult(bootstrap_of_means(yaw_at_limit**2, partial(scaled_rms, 2.0))),
+        "passes": RowResult(
+            bootstrap_of_means(yaw_squared, partial(error_at_limit, 1.0)),
+            cause=Cause("2 sigma drawn, not rms", two_sigma),
         ),
-        "increasing": Answer(of_means(square, steps)),
-        "yaw_over_pitch": Answer(of_means(both, lambda m: np.sqrt(m[..., 0] / m[..., 1]))),
-        "pitch": Answer(of_means(both[:, 1:], partial(sigmas, 1.0))),
+        "increasing": RowResult(bootstrap_of_means(yaw_squared, steps)),
+        "yaw_over_pitch": RowResult(bootstrap_of_means(yaw_and_cross, lambda m: np.sqrt(m[..., 0] / m[..., 1]))),
+        "pitch": RowResult(bootstrap_of_means(yaw_and_cross[:, 1:], partial(scaled_rms, 1.0))),
     }
 
 
-def passes(times: float, squares: Floats) -> Floats:
+def error_at_limit(times: float, squares: Floats) -> Floats:
     """Centroid error in px at which `times` times the rms reaches the limit; the largest one if it never does."""
     yaw_deg = times * np.sqrt(squares)
     rows = yaw_deg.reshape(-1, yaw_deg.shape[-1])
-    found = [np.interp(LIMIT_DEG, row, ERRORS_PX) for row in rows]
-    return np.reshape(found, yaw_deg.shape[:-1])
+    crossings_px = [np.interp(LIMIT_DEG, row, ERRORS_PX) for row in rows]
+    return np.reshape(crossings_px, yaw_deg.shape[:-1])
 
 
-def of_equations(rng: np.random.Generator) -> dict[str, Answer]:
+def equation_results(rng: np.random.Generator) -> dict[str, RowResult]:
     """Eq. 1 by a search that finds nothing, eqs 3 and 4 by our k-vector's ranges, eq. 5 as printed and corrected."""
-    answers = {f"c_{n}": Answer(exact(CHOSEN / eq3(one, 1.0))) for n, one in enumerate(CENTROID_PX, 1)}
-    answers |= {f"gate_{name}": Answer(exact(gate_deg(angle))) for name, angle in GATES.items()}
-    answers["triangles"] = Answer(exact(triangles(rng)))
-    beyond, missed = eq5(rng)
-    answers["eq5_printed"] = Answer(extreme(np.array([beyond]), np.max))
-    answers["eq5_mended"] = Answer(extreme(np.array([missed]), np.max))
-    return answers
+    results = {
+        f"c_{n}": RowResult(exact(CHOSEN_COS_ERROR / eq3_cos_error(centroid_px, 1.0)))
+        for n, centroid_px in enumerate(CENTROID_PX, 1)
+    }
+    results |= {f"gate_{name}": RowResult(exact(gate_half_width_deg(angle))) for name, angle in GATE_ANGLES_DEG.items()}
+    results["triangles"] = RowResult(exact(count_triangles(rng)))
+    outside_kvector, missed = eq5_failures(rng)
+    results["eq5_printed"] = RowResult(extremum(np.array([outside_kvector]), np.max))
+    results["eq5_mended"] = RowResult(extremum(np.array([missed]), np.max))
+    return results
 
 
-GATES = {"2": 2.0, "5": 5.0, "10": 10.0, "18": 18.4}
+GATE_ANGLES_DEG = {"2": 2.0, "5": 5.0, "10": 10.0, "18": 18.4}
 
 
-def gate_deg(angle_deg: float) -> float:
+def gate_half_width_deg(angle_deg: float) -> float:
     """Half the range of catalog angles that a k-vector search returns for an angle, degrees (eqs 4, 5 corrected)."""
-    known = pairs()
-    low, high = pair_index.between(known, *gate(np.radians(angle_deg), CHOSEN))
-    return float(np.degrees(known.angle_rad[high - 1] - known.angle_rad[low]) / 2)
+    index = pairs()
+    low, high = pair_index.pair_range(index, *angle_interval(np.radians(angle_deg), CHOSEN_COS_ERROR))
+    return float(np.degrees(index.angle_rad[high - 1] - index.angle_rad[low]) / 2)
 
 
-def triangles(rng: np.random.Generator) -> int:
+def count_triangles(rng: np.random.Generator) -> int:
     """Number of base triangles that a search tests for 15 spikes."""
-    camera, tried = onboard_model.calibration(lab().scene.camera), np.zeros(3, np.int64)
-    rays = camera.rays(rng.random((MOST, 2)) * [camera.width_px, camera.height_px] - 0.5)
-    none = Rules(CHOSEN, slack_rad(pairs(), CHOSEN), UNLIMITED, UNLIMITED, MOST, -np.inf)
-    sought(rays, pairs(), none, tried)
-    return int(tried[2])
+    camera, counters = onboard_model.calibration(shefex_testbed().scene.camera), np.zeros(3, np.int64)
+    rays = camera.rays(rng.random((MAX_CENTROIDS, 2)) * [camera.width_px, camera.height_px] - 0.5)
+    search_limits = search_options(pairs(), CHOSEN_COS_ERROR, MAX_CENTROIDS, -np.inf)
+    search(rays, pairs(), search_limits, counters)
+    return int(counters[2])
 
 
-def eq5(rng: np.random.Generator, count: int = 2000) -> tuple[int, int]:
+def eq5_failures(rng: np.random.Generator, count: int = 2000) -> tuple[int, int]:
     """Test eq. 5 on `count` measured pairs: number of upper indices outside the k-vector with the printed equation, and
     number of true pairs outside the range with the corrected one."""
     cosines = np.sort(np.cos(pairs().angle_rad))
-    kvector, slope, offset = pair_index.line(cosines)
-    true = rng.integers(0, len(cosines), count)
-    seen = cosines[true] + CHOSEN * rng.uniform(-1, 1, count)
+    kvector, slope, offset = pair_index.k_vector(cosines)
+    true_pair = rng.integers(0, len(cosines), count)
+    measured = cosines[true_pair] + CHOSEN_COS_ERROR * rng.uniform(-1, 1, count)
     last = len(kvector) - 1
-    printed = np.ceil((seen - CHOSEN) / slope + offset / slope)
-    low, high = np.floor((seen - CHOSEN - offset) / slope), np.ceil((seen + CHOSEN - offset) / slope)
+    printed_upper = np.ceil((measured - CHOSEN_COS_ERROR) / slope + offset / slope)
+    low, high = (
+        np.floor((measured - CHOSEN_COS_ERROR - offset) / slope),
+        np.ceil((measured + CHOSEN_COS_ERROR - offset) / slope),
+    )
     begin = np.where(low < 0, 0, kvector[np.clip(low, 0, last).astype(int)])
     end = kvector[np.clip(high, 0, last).astype(int)]
-    return int(np.sum((printed < 0) | (printed > last))), int(np.sum((true < begin) | (true >= end)))
+    return int(np.sum((printed_upper < 0) | (printed_upper > last))), int(
+        np.sum((true_pair < begin) | (true_pair >= end))
+    )
 
 
 def draw_time(curves: Curves, fig: Any) -> None:
     axes = fig.subplots()
-    for n, one in enumerate(CENTROID_PX):
-        told = [of_means(row[:, None], lambda m: m[..., 0]) for row in curves.work[n]]
-        line(axes, COS_ERRORS, told, n, f"ours, centroid error {one} px")
+    for n, centroid_px in enumerate(CENTROID_PX):
+        summaries = [bootstrap_of_means(row[:, None], lambda m: m[..., 0]) for row in curves.work[n]]
+        plot_curve(axes, COS_ERRORS, summaries, n, f"ours, centroid error {centroid_px} px")
     axes.axvspan(5e-5, 6e-5, color=PUBLISHED, alpha=0.25, lw=0, label="published choice")
     logarithmic(axes, "x", 4e-6, 2.5e-4)
     logarithmic(axes, "y", 20, 1000)
@@ -302,9 +319,9 @@ def draw_time(curves: Curves, fig: Any) -> None:
 
 def draw_success(curves: Curves, fig: Any) -> None:
     axes = fig.subplots()
-    for n, one in enumerate(CENTROID_PX):
-        line(axes, COS_ERRORS, shares(curves.right[n]), n, f"ours, fourth star, {one} px")
-    line(axes, COS_ERRORS, shares(curves.careful), 4, "ours, beyond chance, 0.2 px")
+    for n, centroid_px in enumerate(CENTROID_PX):
+        plot_curve(axes, COS_ERRORS, fractions(curves.right[n]), n, f"ours, fourth star, {centroid_px} px")
+    plot_curve(axes, COS_ERRORS, fractions(curves.right_significant), 4, "ours, beyond chance, 0.2 px")
     axes.axvspan(5e-5, 6e-5, color=PUBLISHED, alpha=0.25, lw=0, label="published choice")
     logarithmic(axes, "x", 4e-6, 2.5e-4)
     axes.set(xlabel="cosError", ylabel="success rate", ylim=(0, 1.02))
@@ -313,9 +330,9 @@ def draw_success(curves: Curves, fig: Any) -> None:
 
 def draw_wrong(curves: Curves, fig: Any) -> None:
     axes = fig.subplots()
-    for n, error in enumerate(SPIKED):
-        line(axes, SPIKES, shares(curves.wrong[:, n]), n, f"ours, fourth star, cosError {error:g}")
-    line(axes, SPIKES, shares(curves.strict), 4, f"ours, beyond chance, {CHOSEN:g}")
+    for n, cosine_error in enumerate(SPIKE_COS_ERRORS):
+        plot_curve(axes, SPIKES, fractions(curves.wrong[:, n]), n, f"ours, fourth star, cosError {cosine_error:g}")
+    plot_curve(axes, SPIKES, fractions(curves.wrong_significant), 4, f"ours, beyond chance, {CHOSEN_COS_ERROR:g}")
     axes.set(xlabel="spikes", ylabel="wrong recognition rate")
     axes.legend()
 
@@ -324,8 +341,10 @@ def draw_attitude(curves: Curves, fig: Any) -> None:
     axes = fig.subplots()
     for n, name in ((0, "roll or pitch"), (2, "yaw, about the boresight")):
         for times, style in ((2, "2 sigma"), (1, "rms")):
-            told = [of_means(row[:, None] ** 2, partial(sigmas, times)) for row in curves.off_deg[:, :, n]]
-            line(axes, ERRORS_PX, told, n + 2 - times, f"ours, {style}, {name}")
+            summaries = [
+                bootstrap_of_means(row[:, None] ** 2, partial(scaled_rms, times)) for row in curves.error_deg[:, :, n]
+            ]
+            plot_curve(axes, ERRORS_PX, summaries, n + 2 - times, f"ours, {style}, {name}")
     axes.axhline(LIMIT_DEG, color="#888888", lw=0.8, ls="--")
     axes.plot(
         [0.45],
@@ -340,11 +359,11 @@ def draw_attitude(curves: Curves, fig: Any) -> None:
     axes.legend()
 
 
-def sigmas(times: float, squares: Floats) -> Floats:
+def scaled_rms(times: float, squares: Floats) -> Floats:
     """`times` times the root of the mean square in the first column."""
     return np.asarray(times * np.sqrt(squares[..., 0]))
 
 
-def shares(rows: Floats) -> list[Summary]:
+def fractions(rows: Floats) -> list[Summary]:
     """Fraction of ones with its interval, for each row."""
-    return [share(row.sum(), len(row)) for row in rows]
+    return [proportion(row.sum(), len(row)) for row in rows]

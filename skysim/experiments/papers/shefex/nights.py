@@ -15,159 +15,169 @@ from scipy.spatial.transform import Rotation
 
 from skysim.camera import background
 from skysim.core.types import Floats, Frame, Truth
-from skysim.experiments.papers.compare import Answer, Ask, Cause, Drawing, Found
-from skysim.experiments.papers.intervals import resampled
-from skysim.experiments.papers.shefex.optics import DEFOCUS_M, answers, out_of_focus
-from skysim.experiments.papers.shefex.setup import PUBLISHED, chain, line
-from skysim.experiments.study import trials
+from skysim.experiments.papers.compare import Cause, Drawing, ExperimentOptions, ExperimentResult, RowResult
+from skysim.experiments.papers.intervals import bootstrap_interval
+from skysim.experiments.papers.shefex.optics import DEFOCUS_M, optics_results, out_of_focus
+from skysim.experiments.papers.shefex.setup import PUBLISHED, plot_curve, processing_chain
+from skysim.experiments.study.execution import trials
+from skysim.experiments.study.execution.setups import Setup
 from skysim.experiments.study.plan import FrameTrial
-from skysim.experiments.study.setups import Setup
 from skysim.results import metrics
-from skysim.results.metrics import Summary, share
+from skysim.results.metrics import Summary, proportion
 from skysim.scene.loader import load
-from skysim.simulation import testbed
+from skysim.simulation.testbed import build_testbed, build_tracker
 from skysim.tracking import factory
 
 MOON_DEG = (90.0, 20.0)  # right ascension, declination
 FROM_MOON_DEG = 30.0
 SKY = "{kind: sky, mag_arcsec2: 20}"
 MOON = "{kind: moon, ra_deg: 90, dec_deg: 20, phase_angle_deg: 0, moon_zenith_deg: 40, field_zenith_deg: 30}"
-ONE = {"exposure.first": "10 ms", "exposure.frames": "1"}
-AIR = {"camera.transmission": "0.595"}  # 30 % less than the scene's 0.85
-MOONLESS, FULL_MOON = AIR | {"background": f"[{SKY}]"}, AIR | {"background": f"[{SKY}, {MOON}]"}
+ONE_FRAME = {"exposure.first": "10 ms", "exposure.frames": "1"}
+ATMOSPHERE = {"camera.transmission": "0.595"}  # 30 % less than the scene's 0.85
+MOONLESS, FULL_MOON = ATMOSPHERE | {"background": f"[{SKY}]"}, ATMOSPHERE | {"background": f"[{SKY}, {MOON}]"}
 NORTH_DEG = (8.0, 90.0)  # declinations that culminate above 45 deg at Bremen
 RATES, QUICK_RATES = (0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0), (0.0, 2.0, 4.0, 5.0)
 SPACE_RATES = (0.0, 2.0, 4.0, 6.0)
 SIGMA, LOW_SIGMA = 5.0, 4.0
-CATALOGUE = "uniform"  # "processed using the uniform Hipparcos catalog"
+CATALOG = "uniform"  # "processed using the uniform Hipparcos catalog"
 
 
-class Tally(NamedTuple):
+class NightResults(NamedTuple):
     """Results of N frames, each (N,): solved correctly, solved wrongly, number of centroids, by the paper's chain.
 
-    low : solved correctly by it with a threshold of LOW_SIGMA in place of SIGMA;  ours : by our default chain
+    right_low_threshold : solved correctly by it with a threshold of LOW_SIGMA in place of SIGMA
+    ours : solved correctly by our default chain
     """
 
     right: Floats
     wrong: Floats
     centroids: Floats
-    low: Floats
+    right_low_threshold: Floats
     ours: Floats
 
     @property
-    def share(self) -> Summary:
-        return share(self.right.sum(), len(self.right))
+    def success(self) -> Summary:
+        """Success rate of the paper's chain."""
+        return proportion(self.right.sum(), len(self.right))
 
     @property
-    def told(self) -> str:
-        wrong = f"{int(self.wrong.sum())} of {len(self.wrong)} named wrongly"
+    def note(self) -> str:
+        """Wrong solutions, and the success rate of our default chain."""
+        wrong = f"{int(self.wrong.sum())} of {len(self.wrong)} solved wrongly"
         return f"{wrong}; our default chain {self.ours.mean():.2f}"
 
 
-def shots(
-    told: dict[str, str], rate_deg_s: float, count: int, seed: int
+def render_frames(
+    overrides: dict[str, str], rate_deg_s: float, count: int, seed: int
 ) -> Iterator[tuple[Setup, Frame, Truth]]:
     """Yield frames at random attitudes of the northern sky, not near the Moon; the same attitudes for every rate."""
-    where = testbed.build_testbed(load("shefex2", ONE | told))
-    ready = Setup(
-        where,
-        testbed.tracker(where),
-        FrameTrial(kind="frames", rate_deg_s=rate_deg_s, dec_deg=NORTH_DEG),
-        "",
-    )
-    moon, draw, done = background.direction(*MOON_DEG), 1_000_000 * seed, 0
-    while done < count:
-        draw += 1
-        boresight = trials.attitude(ready, trials.streams(ready, draw)[0]) * where.mount.cam_from_body.inv()
-        if background.apart_deg(boresight.apply([[0.0, 0.0, 1.0]]), moon)[0] < FROM_MOON_DEG:
+    testbed = build_testbed(load("shefex2", ONE_FRAME | overrides))
+    trial = FrameTrial(kind="frames", rate_deg_s=rate_deg_s, dec_deg=NORTH_DEG)
+    setup = Setup(testbed, build_tracker(testbed), trial, "")
+    moon_direction, trial_seed, rendered = background.direction(*MOON_DEG), 1_000_000 * seed, 0
+    while rendered < count:
+        trial_seed += 1
+        boresight = (
+            trials.random_attitude(setup, trials.streams(setup, trial_seed)[0]) * testbed.mount.cam_from_body.inv()
+        )
+        if background.angular_separation_deg(boresight.apply([[0.0, 0.0, 1.0]]), moon_direction)[0] < FROM_MOON_DEG:
             continue
-        frame, truth, _ = trials.shot(ready, draw)
-        done += 1
-        yield ready, frame, truth
+        frame, truth, _ = trials.render_trial_frame(setup, trial_seed)
+        rendered += 1
+        yield setup, frame, truth
 
 
-def tally(told: dict[str, str], rate_deg_s: float, count: int, seed: int) -> Tally:
+def process_frames(overrides: dict[str, str], rate_deg_s: float, count: int, seed: int) -> NightResults:
     """Process frames with all chains."""
     rows = []
-    for ready, frame, truth in shots(told, rate_deg_s, count, seed):
-        theirs, lower = (
-            chain(CATALOGUE, sigma, ready.lab.scene.camera.focal_px).solve(frame.image_dn)
+    for setup, frame, truth in render_frames(overrides, rate_deg_s, count, seed):
+        paper_result, low_threshold_result = (
+            processing_chain(CATALOG, sigma, setup.testbed.scene.camera.focal_px).solve(frame.image_dn)
             for sigma in (SIGMA, LOW_SIGMA)
         )
-        found = theirs.cam_from_ref
-        right, low = rightly(found, truth), rightly(lower.cam_from_ref, truth)
-        ours = rightly(factory.solve_frame(ready.estimator, frame).attitude.cam_from_ref, truth)
-        rows.append((right, found is not None and not right, len(theirs.centroids), low, ours))
-    return Tally(*np.array(rows, float).T)
+        cam_from_ref = paper_result.cam_from_ref
+        right = is_right(cam_from_ref, truth)
+        wrong = cam_from_ref is not None and not right
+        right_low_threshold = is_right(low_threshold_result.cam_from_ref, truth)
+        ours = is_right(factory.solve_frame(setup.estimator, frame).attitude.cam_from_ref, truth)
+        rows.append((right, wrong, len(paper_result.centroids), right_low_threshold, ours))
+    return NightResults(*np.array(rows, float).T)
 
 
-def rightly(found: Rotation | None, truth: Truth) -> bool:
+def is_right(cam_from_ref: Rotation | None, truth: Truth) -> bool:
     """Return True if a frame is solved with an error below ten arc-minutes."""
-    return found is not None and not metrics.is_wrong(found, truth.cam_from_lab)
+    return cam_from_ref is not None and not metrics.is_wrong(cam_from_ref, truth.cam_from_lab)
 
 
-def nights(ask: Ask) -> Found:
+def night_results(options: ExperimentOptions) -> ExperimentResult:
     """Success rates at rest (35 to 50 ms, in space), against the rate, and out of focus; and the camera's optics."""
-    rates, space = (QUICK_RATES, QUICK_RATES[:1]) if ask.quick else (RATES, SPACE_RATES)
-    wanted: dict[str, tuple[dict[str, str], float]] = {
-        **{f"ground {rate:g}": (FULL_MOON | at(50), rate) for rate in rates},
-        **{f"space {rate:g}": (at(50), rate) for rate in space},
-        "35 ms": (FULL_MOON | at(35), 0.0),
-        "40 ms": (FULL_MOON | at(40), 0.0),
-        "moonless": (MOONLESS | at(50), 0.0),
-        "defocus": (FULL_MOON | at(50) | out_of_focus(DEFOCUS_M), 0.0),
-        "half defocus": (FULL_MOON | at(50) | out_of_focus(DEFOCUS_M / 2), 0.0),
+    rates, space_rates = (QUICK_RATES, QUICK_RATES[:1]) if options.quick else (RATES, SPACE_RATES)
+    conditions: dict[str, tuple[dict[str, str], float]] = {
+        **{f"ground {rate:g}": (FULL_MOON | exposure_override(50), rate) for rate in rates},
+        **{f"space {rate:g}": (exposure_override(50), rate) for rate in space_rates},
+        "35 ms": (FULL_MOON | exposure_override(35), 0.0),
+        "40 ms": (FULL_MOON | exposure_override(40), 0.0),
+        "moonless": (MOONLESS | exposure_override(50), 0.0),
+        "defocus": (FULL_MOON | exposure_override(50) | out_of_focus(DEFOCUS_M), 0.0),
+        "half defocus": (FULL_MOON | exposure_override(50) | out_of_focus(DEFOCUS_M / 2), 0.0),
     }
-    came: dict[str, Tally] = {}
-    for key, (told, rate) in wanted.items():
-        came[key] = tally(told, rate, ask.trials(150, 10), ask.seed)
-        ask.watch(len(came), len(wanted))
-    pictures = (
-        Drawing("Frames identified against the turning rate.", partial(draw_rates, came)),
+    results: dict[str, NightResults] = {}
+    for key, (overrides, rate) in conditions.items():
+        results[key] = process_frames(overrides, rate, options.trials(150, 10), options.seed)
+        options.watch(len(results), len(conditions))
+    drawings = (
+        Drawing("Frames identified against the turning rate.", partial(draw_rates, results)),
         Drawing(
-            "Fig. 11: a frame of 40 ms, its centroids and those identified.", partial(draw_frame, ask.seed)
+            "Fig. 11: a frame of 40 ms, its centroids and those identified.",
+            partial(draw_frame, options.seed),
         ),
     )
-    return Found(of_nights(came) | answers(ask), pictures)
+    return ExperimentResult(frame_results(results) | optics_results(options), drawings)
 
 
-def of_nights(came: dict[str, Tally]) -> dict[str, Answer]:
+def frame_results(results: dict[str, NightResults]) -> dict[str, RowResult]:
     """Answers from the frames to the statements of sections 4 and 5."""
-    blurred, half, still = came["defocus"], came["half defocus"], came["ground 0"]
-    dark = f"without the Moon {came['moonless'].share.value:.2f}"
-    seen = came["40 ms"].centroids
-    fewest, middle, most = np.quantile(seen, [0.025, 0.5, 0.975], method="nearest")
-    working = {"35 ms": came["35 ms"], "40 ms": came["40 ms"], "50 ms": still}
-    each = ", ".join(f"{one.share.value:.2f} at {name}" for name, one in working.items())
-    together, lower = (
-        resampled(np.mean([getattr(one, name) for one in working.values()], axis=0), np.mean)
-        for name in ("right", "low")
+    defocused, half_defocused, at_rest = results["defocus"], results["half defocus"], results["ground 0"]
+    moonless_note = f"without the Moon {results['moonless'].success.value:.2f}"
+    centroids = results["40 ms"].centroids
+    fewest, median, most = np.quantile(centroids, [0.025, 0.5, 0.975], method="nearest")
+    by_exposure = {"35 ms": results["35 ms"], "40 ms": results["40 ms"], "50 ms": at_rest}
+    by_exposure_note = ", ".join(f"{result.success.value:.2f} at {name}" for name, result in by_exposure.items())
+    combined, combined_low_threshold = (
+        bootstrap_interval(np.mean([getattr(result, name) for result in by_exposure.values()], axis=0), np.mean)
+        for name in ("right", "right_low_threshold")
     )
     return {
-        "ground_50": Answer(still.share, f"{dark}; {still.told}"),
-        "ground": Answer(together, each, Cause(f"a threshold of {LOW_SIGMA:g} sigma", lower)),
-        "space": Answer(came["space 0"].share, came["space 0"].told),
-        "rate_2": Answer(came["ground 2"].share, came["ground 2"].told),
-        "rate_5": Answer(
-            came["ground 5"].share, f"at 4 deg/s {came['ground 4'].share.value:.2f}; {came['ground 5'].told}"
+        "ground_50": RowResult(at_rest.success, f"{moonless_note}; {at_rest.note}"),
+        "ground": RowResult(
+            combined, by_exposure_note, Cause(f"a threshold of {LOW_SIGMA:g} sigma", combined_low_threshold)
         ),
-        "defocus": Answer(blurred.share, f"at 0.05 mm {half.share.value:.2f}; {blurred.told}"),
-        "centroids": Answer(Summary(float(middle), float(fewest), float(most), len(seen))),
+        "space": RowResult(results["space 0"].success, results["space 0"].note),
+        "rate_2": RowResult(results["ground 2"].success, results["ground 2"].note),
+        "rate_5": RowResult(
+            results["ground 5"].success,
+            f"at 4 deg/s {results['ground 4'].success.value:.2f}; {results['ground 5'].note}",
+        ),
+        "defocus": RowResult(defocused.success, f"at 0.05 mm {half_defocused.success.value:.2f}; {defocused.note}"),
+        "centroids": RowResult(Summary(float(median), float(fewest), float(most), len(centroids))),
     }
 
 
-def at(exposure_ms: int) -> dict[str, str]:
+def exposure_override(exposure_ms: int) -> dict[str, str]:
+    """Override of the exposure time."""
     return {"exposure.time": f"{exposure_ms} ms"}
 
 
-def draw_rates(came: dict[str, Tally], fig: Any) -> None:
+def draw_rates(results: dict[str, NightResults], fig: Any) -> None:
     axes = fig.subplots()
-    for n, (where, label) in enumerate((("ground", "ours, under air and Moon"), ("space", "ours, in space"))):
-        found = {float(key.split()[1]): one for key, one in came.items() if key.startswith(where)}
-        line(axes, list(found), [one.share for one in found.values()], n, f"{label}, the paper's chain")
+    labels = {"ground": "ours, under air and Moon", "space": "ours, in space"}
+    for n, (condition, label) in enumerate(labels.items()):
+        by_rate = {float(key.split()[1]): result for key, result in results.items() if key.startswith(condition)}
+        successes = [result.success for result in by_rate.values()]
+        plot_curve(axes, list(by_rate), successes, n, f"{label}, the paper's chain")
         if n == 0:
-            ours = [share(one.ours.sum(), len(one.ours)) for one in found.values()]
-            line(axes, list(found), ours, 2, f"{label}, our default chain")
+            ours = [proportion(result.ours.sum(), len(result.ours)) for result in by_rate.values()]
+            plot_curve(axes, list(by_rate), ours, 2, f"{label}, our default chain")
     axes.axvspan(0, 2, color=PUBLISHED, alpha=0.25, lw=0, label="published: mostly identified")
     axes.axvspan(4, 8, color=PUBLISHED, alpha=0.1, lw=0, label="published: rarely identified")
     axes.set(xlabel="turning rate (deg/s)", ylabel="frames identified", ylim=(0, 1.03), xlim=(-0.1, 8.1))
@@ -177,16 +187,16 @@ def draw_rates(came: dict[str, Tally], fig: Any) -> None:
 def draw_frame(seed: int, fig: Any) -> None:
     """Draw the first frame in which the paper's chain identifies at least eight stars, or the last of forty."""
     axes = fig.subplots()
-    for ready, frame, _ in shots(FULL_MOON | at(40), 0.0, 40, seed):
-        found = chain(CATALOGUE, SIGMA, ready.lab.scene.camera.focal_px).solve(frame.image_dn)
-        if len(found.observed) >= 8:
+    for setup, frame, _ in render_frames(FULL_MOON | exposure_override(40), 0.0, 40, seed):
+        result = processing_chain(CATALOG, SIGMA, setup.testbed.scene.camera.focal_px).solve(frame.image_dn)
+        if len(result.observed) >= 8:
             break
     low, high = np.percentile(frame.image_dn, [50, 99.95])
     axes.imshow(frame.image_dn, cmap="gray_r", vmin=low, vmax=high, interpolation="none")
-    xy_px = found.centroids.xy_px
+    xy_px = result.centroids.xy_px
     axes.scatter(*xy_px.T, s=130, facecolors="none", edgecolors="blue", label=f"{len(xy_px)} centroids")
-    named = xy_px[found.observed]
-    axes.scatter(*named.T, s=45, facecolors="none", edgecolors="red", label=f"{len(named)} identified")
+    identified_px = xy_px[result.observed]
+    axes.scatter(*identified_px.T, s=45, facecolors="none", edgecolors="red", label=f"{len(identified_px)} identified")
     axes.set(xlabel="x (px)", ylabel="y (px)")
     axes.grid(visible=False)
     fig.legend(*axes.get_legend_handles_labels(), loc="outside right upper")

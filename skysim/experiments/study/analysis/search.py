@@ -16,24 +16,24 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from skysim.core.errors import InputError
+from skysim.core.errors import InputError, unknown_name
 from skysim.core.units import in_si
-from skysim.experiments.study.designs import Point, merged
+from skysim.experiments.study.designs import Point, make_point
 from skysim.experiments.study.execution.engines import Engine
 from skysim.experiments.study.execution.runner import Progress, Watch, run_points
-from skysim.experiments.study.factors import Distribution, Factor, Levels, Range, Value, split
+from skysim.experiments.study.execution.setups import code_version, seed_of
+from skysim.experiments.study.execution.trials import FAILED, Row
+from skysim.experiments.study.factors import Distribution, Factor, Levels, Range, Value, split_quantity
 from skysim.experiments.study.plan import Constraint, Plan, Search, Study
-from skysim.experiments.study.setups import code_version, seed_of
 from skysim.experiments.study.store import Store
-from skysim.experiments.study.trials import FAILED, Row
 from skysim.results import metrics
 from skysim.results.metrics import Columns, Summary
 
 COST = "cost"
-START = 10  # random candidates before the sampler uses earlier results
-REPEATS = 50  # repeated proposals in succession after which all points count as tried
-UNANSWERED = 1e3  # violation of a candidate without a value; larger than usual relative violations
-LEAST = 1e-9  # scale of the relative violation of a bound of zero
+STARTUP_CANDIDATES = 10  # random candidates before the sampler uses earlier results
+MAX_REPEATS = 50  # repeated proposals in succession after which all points count as evaluated
+MISSING_VIOLATION = 1e3  # violation of a candidate without a value; larger than usual relative violations
+MIN_SCALE = 1e-9  # scale of the relative violation of a bound of zero
 
 
 class Candidate(NamedTuple):
@@ -55,7 +55,7 @@ class Candidate(NamedTuple):
     why: str
 
 
-class Found(NamedTuple):
+class SearchResult(NamedTuple):
     """Result of a search.
 
     front    : the Pareto-optimal feasible candidates, best in the first objective first; with one objective, the best
@@ -67,7 +67,7 @@ class Found(NamedTuple):
     finished: bool
 
 
-class Refused(Exception):
+class InvalidScene(Exception):
     """Raised when a candidate's scene is invalid, so that none of its trials can run."""
 
 
@@ -75,32 +75,32 @@ class Refused(Exception):
 
 
 def check(study: Study) -> None:
-    """Validate section `optimise` of a study. Raises InputError with the key at fault."""
-    wanted = study.optimise
-    if wanted is None:
+    """Validate section `optimize` of a study. Raises InputError with the key at fault."""
+    config = study.optimize
+    if config is None:
         return
-    for n, objective in enumerate(wanted.objectives):
-        known(objective.response, f"optimise.objectives.{n}.response")
-    if len({one.response for one in wanted.objectives}) < len(wanted.objectives):
+    for n, objective in enumerate(config.objectives):
+        check_response(objective.response, f"optimize.objectives.{n}.response")
+    if len({one.response for one in config.objectives}) < len(config.objectives):
         raise InputError(
-            f"optimise.objectives: {wanted.objectives[0].response} twice; allowed: two that differ"
+            f"optimize.objectives: {config.objectives[0].response} occurs twice; allowed: different responses"
         )
-    for n, limit in enumerate(wanted.constraints):
-        known(limit.response, f"optimise.constraints.{n}.response")
+    for n, limit in enumerate(config.constraints):
+        check_response(limit.response, f"optimize.constraints.{n}.response")
         if limit.at_least is None and limit.at_most is None:
-            raise InputError(f"optimise.constraints.{n}: allowed: at_least, at_most or both")
+            raise InputError(f"optimize.constraints.{n}: no bound; allowed: at_least, at_most or both")
     for name, factor in study.factors.items():
         if isinstance(factor, Distribution):
             raise InputError(
-                f"factors.{name}: nobody chooses a distribution; allowed: levels, values, from and to"
+                f"factors.{name}: a distribution cannot be optimized; allowed: levels, values, from and to"
             )
-    check_cost(study, wanted)
-    asked, most = wanted.candidates * study.replicates, study.budget.trials
-    if most is not None and asked > most:
-        raise InputError(f"budget.trials: {most} are fewer than the search's {asked}")
+    check_cost(study, config)
+    trials, budget = config.candidates * study.replicates, study.budget.trials
+    if budget is not None and trials > budget:
+        raise InputError(f"budget.trials: {budget}; allowed: at least {trials}, the trials of the search")
 
 
-def known(response: str, where: str) -> None:
+def check_response(response: str, where: str) -> None:
     """Raise InputError for an unknown response and for one that is not reproducible (time_ms)."""
     if response == COST:
         return
@@ -110,84 +110,80 @@ def known(response: str, where: str) -> None:
         raise InputError(f"{error}, or {COST}") from None
     if response.startswith("time_ms"):
         raise InputError(
-            f"{where}: {response} is another every time; allowed: what a resumed search finds again"
+            f"{where}: {response} is not reproducible; allowed: responses that a resumed search reproduces"
         )
 
 
-def check_cost(study: Study, wanted: Search) -> None:
+def check_cost(study: Study, config: Search) -> None:
     """Raise InputError for prices of unknown factors or levels, and for prices per unit of a factor without numbers."""
-    priced: dict[str, Factor] = dict(study.factors)
-    for name in wanted.cost.per:
-        where = f"optimise.cost.per.{name}"
-        factor = one_of(name, priced, where)
+    factors: dict[str, Factor] = dict(study.factors)
+    for name in config.cost.per:
+        where = f"optimize.cost.per.{name}"
+        factor = require_factor(name, factors, where)
         values = [value for value, _ in factor.options()]
         try:
             for value in values if not isinstance(factor, Levels) else [values[0]]:
                 si(value)
         except ValueError as error:
-            raise InputError(
-                f"{where}: {error}; a named level has its price in optimise.cost.levels"
-            ) from None
-    for name, prices in wanted.cost.levels.items():
-        where = f"optimise.cost.levels.{name}"
-        factor = one_of(name, priced, where)
+            raise InputError(f"{where}: {error}; prices of named levels: optimize.cost.levels") from None
+    for name, prices in config.cost.levels.items():
+        where = f"optimize.cost.levels.{name}"
+        factor = require_factor(name, factors, where)
         named = [str(level) for level, _ in factor.options()] if not isinstance(factor, Range) else []
         if sorted(named) != sorted(prices):
-            allowed = (
-                f"a price of each of {', '.join(named)}" if named else "optimise.cost.per, as it is a range"
-            )
+            allowed = f"a price of each of {', '.join(named)}" if named else "optimize.cost.per, as it is a range"
             raise InputError(f"{where}: prices {', '.join(prices) or 'nothing'}; allowed: {allowed}")
 
 
-def one_of(name: str, factors: dict[str, Factor], where: str) -> Factor:
+def require_factor(name: str, factors: dict[str, Factor], where: str) -> Factor:
     """The factor with a name. Raises InputError if there is none."""
     if name not in factors:
-        raise InputError(f"{where}: {name!r} is none of {', '.join(factors)}")
+        raise InputError(f"{where}: {unknown_name('factor', name, factors)}")
     return factors[name]
 
 
 def si(value: Value) -> float:
     """A plain number unchanged, or a quantity in SI units: "48 in" is 1.2192. Raises ValueError."""
-    number, unit = split(value)
+    number, unit = split_quantity(value)
     return in_si(value) if unit else number
 
 
-def cost(wanted: Search, levels: dict[str, Value]) -> float:
+def cost(config: Search, levels: dict[str, Value]) -> float:
     """Cost of a point: base + sum of per[factor] * value + prices of the named levels, with values in SI units."""
-    told = wanted.cost
-    linear = sum(price * si(levels[name]) for name, price in told.per.items())
-    return told.base + linear + sum(prices[str(levels[name])] for name, prices in told.levels.items())
+    prices = config.cost
+    linear = sum(price * si(levels[name]) for name, price in prices.per.items())
+    return prices.base + linear + sum(price[str(levels[name])] for name, price in prices.levels.items())
 
 
 # Evaluation of a candidate.
 
 
-def judged(study: Study, number: int, point: Point, columns: Columns) -> Candidate:
+def evaluate_candidate(study: Study, number: int, point: Point, columns: Columns) -> Candidate:
     """The candidate computed from the columns of all its trials."""
-    wanted = study.optimise
-    assert wanted is not None
-    asked = [one.response for one in wanted.objectives] + [one.response for one in wanted.constraints]
-    figures = {name: metrics.response(name)(columns) for name in dict.fromkeys(asked) if name != COST}
-    price = cost(wanted, point.levels)
-    worth = {name: figure.value for name, figure in figures.items()} | {COST: price}
-    objectives = tuple(worth[one.response] for one in wanted.objectives)
-    missed = [one.response for one in wanted.constraints if misses(one, worth[one.response]) > 0]
-    missed += [f"no {one.response}" for one in wanted.objectives if math.isnan(worth[one.response])]
-    refused = refusal(columns)
-    why = told(refused) or ", ".join(missed)
+    config = study.optimize
+    assert config is not None
+    responses = [one.response for one in config.objectives] + [one.response for one in config.constraints]
+    figures = {name: metrics.response(name)(columns) for name in dict.fromkeys(responses) if name != COST}
+    price = cost(config, point.levels)
+    values = {name: figure.value for name, figure in figures.items()} | {COST: price}
+    objectives = tuple(values[one.response] for one in config.objectives)
+    violated = [one.response for one in config.constraints if violation(one, values[one.response]) > 0]
+    violated += [f"no {one.response}" for one in config.objectives if math.isnan(values[one.response])]
+    refused = scene_error(columns)
+    why = error_message(refused) or ", ".join(violated)
     return Candidate(number, point.levels, objectives, figures, price, not why, bool(refused), why)
 
 
-def misses(limit: Constraint, value: float) -> float:
-    """Relative violation of a constraint, (value - bound) / |bound|; <= 0 if it holds, UNANSWERED for NaN."""
+def violation(limit: Constraint, value: float) -> float:
+    """Relative violation of a constraint, (value - bound) / |bound|; <= 0 if it holds, MISSING_VIOLATION for NaN."""
     if math.isnan(value):
-        return UNANSWERED
-    over = [] if limit.at_most is None else [(value - limit.at_most) / max(abs(limit.at_most), LEAST)]
-    under = [] if limit.at_least is None else [(limit.at_least - value) / max(abs(limit.at_least), LEAST)]
+        return MISSING_VIOLATION
+    over = [] if limit.at_most is None else [(value - limit.at_most) / max(abs(limit.at_most), MIN_SCALE)]
+    under = [] if limit.at_least is None else [(limit.at_least - value) / max(abs(limit.at_least), MIN_SCALE)]
     return max(over + under)
 
 
-def refusal(columns: Columns) -> str:
+def scene_error(columns: Columns) -> str:
     """Traceback of the InputError with which a candidate's scene was rejected; empty if the scene is valid.
 
     Trials of an invalid scene have an empty scene hash.
@@ -200,69 +196,71 @@ def refusal(columns: Columns) -> str:
     return refused[0] if refused else ""
 
 
-def told(error: str) -> str:
+def error_message(error: str) -> str:
     """Last line of a traceback without the exception's name."""
     return error.strip().splitlines()[-1].partition(f"{InputError.__name__}: ")[2] if error else ""
 
 
-def front(wanted: Search, candidates: Sequence[Candidate]) -> list[Candidate]:
+def front(config: Search, candidates: Sequence[Candidate]) -> list[Candidate]:
     """The Pareto front: feasible candidates that no other dominates.
 
     One candidate dominates another if it is at least as good in every objective and better in one.
     """
     feasible = [one for one in candidates if one.feasible]
-    sign = np.array([1.0 if one.better == "less" else -1.0 for one in wanted.objectives])
+    sign = np.array([1.0 if one.better == "less" else -1.0 for one in config.objectives])
     values = np.array([one.objectives for one in feasible]).reshape(-1, len(sign)) * sign
     best = [
-        n
-        for n, one in enumerate(values)
-        if not np.any(np.all(values <= one, axis=1) & np.any(values < one, axis=1))
+        n for n, one in enumerate(values) if not np.any(np.all(values <= one, axis=1) & np.any(values < one, axis=1))
     ]
     return [feasible[n] for n in sorted(best, key=lambda n: tuple(values[n]))]
 
 
-def found(plan: Plan, store: Store) -> Found:
+def collect_result(plan: Plan, store: Store) -> SearchResult:
     """The candidates in a store whose trials are complete, and their front; the search may be unfinished."""
     study, replicates = plan.study, plan.study.replicates
-    assert study.optimise is not None
-    columns = ((n, point, store.of_point(n)) for n, point in enumerate(store.points()))
-    tried = [judged(study, n, point, own) for n, point, own in columns if len(own["trial"]) == replicates]
-    return Found(tried, front(study.optimise, tried), len(tried) == study.optimise.candidates)
+    assert study.optimize is not None
+    columns = ((n, point, store.point_columns(n)) for n, point in enumerate(store.points()))
+    evaluated = [
+        evaluate_candidate(study, n, point, trials)
+        for n, point, trials in columns
+        if len(trials["trial"]) == replicates
+    ]
+    return SearchResult(evaluated, front(study.optimize, evaluated), len(evaluated) == study.optimize.candidates)
 
 
 # The search.
 
 
-def search(plan: Plan, store: Store, engine: Engine, watch: Watch | None = None) -> Found:
-    """Evaluate candidates until `candidates` of them are complete, all points are tried, or the budget is spent.
+def search(plan: Plan, store: Store, engine: Engine, watch: Watch | None = None) -> SearchResult:
+    """Evaluate candidates until `candidates` of them are complete, all points are evaluated, or the budget is spent.
 
     Raises InputError, also if optuna is not installed or proposes other candidates than those in the store.
     """
-    study, wanted = plan.study, plan.study.optimise
-    assert wanted is not None
-    sampler, stored = begun(study), store.points()
-    whole = Progress(wanted.candidates * study.replicates, **store.counts())
-    tried: dict[str, Candidate] = {}
-    for n in range(wanted.candidates):
-        asked, point = question(sampler, study, tried)
+    study, config = plan.study, plan.study.optimize
+    assert config is not None
+    sampler, stored = create_sampler(study), store.points()
+    total = Progress(config.candidates * study.replicates, **store.counts())
+    evaluated: dict[str, Candidate] = {}
+    for n in range(config.candidates):
+        proposal, point = propose(sampler, study, evaluated)
         if point is None:
-            return found(plan, store)._replace(finished=True)
+            return collect_result(plan, store)._replace(finished=True)
         if n >= len(stored):
             store.set_points([point], first=n)
         elif key_of(stored[n]) != key_of(point):
             raise InputError(
-                f"{store.path}: candidate {n} was {stored[n].levels}, now the sampler asks for {point.levels};"
-                " allowed: the version of optuna that began it, or another --out"
+                f"{store.path}: candidate {n} is {stored[n].levels}, the sampler now proposes {point.levels};"
+                " allowed: the version of optuna that started the search, or another --out"
             )
-        refused = study.replicates * sum(one.refused for one in tried.values())
-        if not answered(plan, store, engine, n, point, whole, refused, watch):
-            return found(plan, store)
-        tried[key_of(point)] = judged(study, n, point, store.of_point(n))
-        tell(sampler, asked, wanted, tried[key_of(point)])
-    return found(plan, store)
+        refused = study.replicates * sum(one.refused for one in evaluated.values())
+        if not run_candidate(plan, store, engine, n, point, total, refused, watch):
+            return collect_result(plan, store)
+        evaluated[key_of(point)] = evaluate_candidate(study, n, point, store.point_columns(n))
+        report_to_sampler(sampler, proposal, config, evaluated[key_of(point)])
+    return collect_result(plan, store)
 
 
-def begun(study: Study) -> Any:
+def create_sampler(study: Study) -> Any:
     """An optuna study with the tree-structured Parzen estimator (TPE), which handles one or two objectives.
 
     The first candidate is the middle of all factors. TPE learns after START candidates; NSGA-II would need a
@@ -271,22 +269,21 @@ def begun(study: Study) -> Any:
     try:
         import optuna
     except ImportError:
-        raise InputError("optimise: takes optuna; allowed: after pip install 'skysim[optuna]'") from None
-    assert study.optimise is not None
+        raise InputError("optimize: optuna is not installed; allowed: after pip install 'skysim[optuna]'") from None
+    assert study.optimize is not None
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     seed = int(np.random.SeedSequence(study.seed).generate_state(1)[0])
-    sampler = optuna.samplers.TPESampler(seed=seed, n_startup_trials=START)
-    directions = ["minimize" if one.better == "less" else "maximize" for one in study.optimise.objectives]
-    made = optuna.create_study(sampler=sampler, directions=directions)
+    sampler = optuna.samplers.TPESampler(seed=seed, n_startup_trials=STARTUP_CANDIDATES)
+    directions = ["minimize" if one.better == "less" else "maximize" for one in study.optimize.objectives]
+    optuna_study = optuna.create_study(sampler=sampler, directions=directions)
     middle = {
-        name: 0.5 if isinstance(factor, Range) else len(factor.options()) // 2
-        for name, factor in study.factors.items()
+        name: 0.5 if isinstance(factor, Range) else len(factor.options()) // 2 for name, factor in study.factors.items()
     }
-    made.enqueue_trial(middle)
-    return made
+    optuna_study.enqueue_trial(middle)
+    return optuna_study
 
 
-def asked_of(study: Study) -> dict[str, Any]:
+def search_space(study: Study) -> dict[str, Any]:
     """Search space of the sampler: a number in [0, 1] for a range, an index for levels or values."""
     from optuna.distributions import CategoricalDistribution, FloatDistribution
 
@@ -298,24 +295,24 @@ def asked_of(study: Study) -> dict[str, Any]:
     }
 
 
-def question(sampler: Any, study: Study, tried: dict[str, Candidate]) -> tuple[Any, Point | None]:
+def propose(sampler: Any, study: Study, evaluated: dict[str, Candidate]) -> tuple[Any, Point | None]:
     """The sampler's next proposal that was not evaluated yet: optuna trial and point; (None, None) if there is none.
 
-    A repeated proposal is answered with the known result, so that the sampler moves on.
+    A repeated proposal gets the known result, so that the sampler moves on.
     """
-    assert study.optimise is not None
-    for _ in range(REPEATS):
-        asked = sampler.ask(asked_of(study))
+    assert study.optimize is not None
+    for _ in range(MAX_REPEATS):
+        proposal = sampler.ask(search_space(study))
         chosen = {
-            name: factor.at(asked.params[name])
+            name: factor.value_at(proposal.params[name])
             if isinstance(factor, Range)
-            else factor.options()[asked.params[name]]
+            else factor.options()[proposal.params[name]]
             for name, factor in study.factors.items()
         }
-        point = merged(chosen)
-        if key_of(point) not in tried:
-            return asked, point
-        tell(sampler, asked, study.optimise, tried[key_of(point)])
+        point = make_point(chosen)
+        if key_of(point) not in evaluated:
+            return proposal, point
+        report_to_sampler(sampler, proposal, study.optimize, evaluated[key_of(point)])
     return None, None
 
 
@@ -324,38 +321,38 @@ def key_of(point: Point) -> str:
     return json.dumps(point.settings, sort_keys=True)
 
 
-def tell(sampler: Any, asked: Any, wanted: Search, candidate: Candidate) -> None:
+def report_to_sampler(sampler: Any, proposal: Any, config: Search, candidate: Candidate) -> None:
     """Report a candidate's objectives and constraint violations to the sampler.
 
     A candidate without values gets infinitely bad objectives and an extra violated constraint.
     """
-    worth = {name: figure.value for name, figure in candidate.figures.items()} | {COST: candidate.cost}
-    for n, limit in enumerate(wanted.constraints):
-        asked.set_constraint(str(n), misses(limit, worth[limit.response]))
-    there = not candidate.refused and not any(math.isnan(one) for one in candidate.objectives)
-    asked.set_constraint("answered", 0.0 if there else UNANSWERED)
-    worst = [math.inf if one.better == "less" else -math.inf for one in wanted.objectives]
-    sampler.tell(asked, list(candidate.objectives) if there else worst)
+    values = {name: figure.value for name, figure in candidate.figures.items()} | {COST: candidate.cost}
+    for n, limit in enumerate(config.constraints):
+        proposal.set_constraint(str(n), violation(limit, values[limit.response]))
+    valid = not candidate.refused and not any(math.isnan(one) for one in candidate.objectives)
+    proposal.set_constraint("answered", 0.0 if valid else MISSING_VIOLATION)
+    worst = [math.inf if one.better == "less" else -math.inf for one in config.objectives]
+    sampler.tell(proposal, list(candidate.objectives) if valid else worst)
 
 
-def answered(
+def run_candidate(
     plan: Plan,
     store: Store,
     engine: Engine,
     number: int,
     point: Point,
-    whole: Progress,
+    total: Progress,
     refused: int,
     watch: Watch | None,
 ) -> bool:
     """Run the missing replicates of a candidate. Returns False if the budget is spent before all are in the store.
 
-    whole   : progress of the whole search, passed to `watch`
+    total   : progress of the whole search, passed to `watch`
     refused : number of failed trials of invalid scenes, which the budget does not count
     """
     # Budgets are for the whole search: subtract the time spent, and the failures of earlier candidates.
-    before, budget = replace(whole), plan.study.budget
-    left_s = None if budget.time_s is None else budget.time_s - (time.perf_counter() - whole.began)
+    before, budget = replace(total), plan.study.budget
+    left_s = None if budget.time_s is None else budget.time_s - (time.perf_counter() - total.began)
     if left_s is not None and left_s <= 0:
         return False
     budget = budget.model_copy(
@@ -363,34 +360,34 @@ def answered(
     )
     limited = replace(plan, study=plan.study.model_copy(update={"budget": budget}))
 
-    def look(progress: Progress) -> None:
-        whole.now, whole.done = before.now + progress.now, before.done + progress.now
-        whole.failed, whole.wrong = progress.failed, before.wrong + progress.wrong
+    def watch_candidate(progress: Progress) -> None:
+        total.now, total.done = before.now + progress.now, before.done + progress.now
+        total.failed, total.wrong = progress.failed, before.wrong + progress.wrong
         if watch:
-            watch(whole)
-        if progress.failed > refused and refusal(store.of_point(number)):
-            raise Refused
+            watch(total)
+        if progress.failed > refused and scene_error(store.point_columns(number)):
+            raise InvalidScene
 
     try:
-        progress = run_points(limited, store, engine, [point], number, look)
-    except Refused:
-        rows = none_of(plan, store, number)
+        progress = run_points(limited, store, engine, [point], number, watch_candidate)
+    except InvalidScene:
+        rows = failed_rows(plan, store, number)
         store.add(rows)
-        whole.add(rows)
+        total.add(rows)
         return True
     return progress.done == progress.trials
 
 
-def none_of(plan: Plan, store: Store, number: int) -> list[Row]:
+def failed_rows(plan: Plan, store: Store, number: int) -> list[Row]:
     """Rows for the remaining trials of a candidate with an invalid scene: failed, with the error of the first one."""
-    columns, replicates = store.of_point(number), plan.study.replicates
-    why, there = refusal(columns), set(columns["replicate"].tolist())
+    columns, replicates = store.point_columns(number), plan.study.replicates
+    why, stored = scene_error(columns), set(columns["replicate"].tolist())
     return [
         Row(
             number * replicates + k,
             number,
             k,
-            seed_of(plan.recipe, number, k),
+            seed_of(plan.spec, number, k),
             "",
             code_version(),
             FAILED,
@@ -398,5 +395,5 @@ def none_of(plan: Plan, store: Store, number: int) -> list[Row]:
             0.0,
         )
         for k in range(replicates)
-        if k not in there
+        if k not in stored
     ]

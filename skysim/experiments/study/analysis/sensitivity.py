@@ -42,41 +42,49 @@ class Index(NamedTuple):
 
 def indices(plan: Plan, store: Store) -> list[Index]:
     """Indices of every factor for the cross-boresight and roll errors. Raises InputError for another design."""
-    if plan.study.design.kind != "saltelli" or plan.study.optimise:
-        raise InputError("design.kind: indices take a study of kind saltelli")
-    return [index for response in AXES for index in of_response(plan, store, response)]
+    if plan.study.design.kind != "saltelli" or plan.study.optimize:
+        raise InputError(
+            f"design.kind: {plan.study.design.kind}; allowed: saltelli, without optimize, for Sobol indices"
+        )
+    return [index for response in AXES for index in response_indices(plan, store, response)]
 
 
-def of_response(plan: Plan, store: Store, response: str) -> list[Index]:
+def response_indices(plan: Plan, store: Store, response: str) -> list[Index]:
     """Indices of every factor for one error; NaN if no replicate is complete."""
-    a, b, ab = outputs(plan, store, AXES[response])
+    a, b, ab = sample_outputs(plan, store, AXES[response])
     names, count = list(plan.study.factors), a.shape[1]
     if not len(a):
-        nothing = Summary(np.nan, np.nan, np.nan, 0)
-        return [Index(name, response, nothing, nothing, np.nan) for name in names]
-    found = generalised(a, b, ab)
+        no_index = Summary(np.nan, np.nan, np.nan, 0)
+        return [Index(name, response, no_index, no_index, np.nan) for name in names]
+    estimate = generalized(a, b, ab)
     rng = np.random.default_rng(1)
     # Resample rows of A, B and AB together, so that each resample is a valid Saltelli sample.
-    drawn = np.array(
+    resampled = np.array(
         [
-            generalised(a[:, pick], b[:, pick], ab[:, :, pick])
-            for pick in rng.integers(count, size=(RESAMPLES, count))
+            generalized(a[:, selection], b[:, selection], ab[:, :, selection])
+            for selection in rng.integers(count, size=(RESAMPLES, count))
         ]
     )
-    low, high = np.quantile(drawn, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2], axis=0)
+    low, high = np.quantile(resampled, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2], axis=0)
     first, total = (
-        [Summary(float(v), float(lo), float(hi), count) for v, lo, hi in zip(*part, strict=True)]
-        for part in zip(found, low, high, strict=True)
+        [Summary(float(v), float(lo), float(hi), count) for v, lo, hi in zip(*index, strict=True)]
+        for index in zip(estimate, low, high, strict=True)
     )
     # The variance of the cross-boresight error is the sum of the variances about its two axes.
-    size = float(np.sqrt(np.var(np.concatenate([a, b], axis=1), axis=1).mean() * len(AXES[response])))
+    sigma_arcsec = float(np.sqrt(np.var(np.concatenate([a, b], axis=1), axis=1).mean() * len(AXES[response])))
     return [
-        Index(name, response, alone, all_told, size * float(np.sqrt(max(alone.value, 0.0))))
-        for name, alone, all_told in zip(names, first, total, strict=True)
+        Index(
+            name,
+            response,
+            first_index,
+            total_index,
+            sigma_arcsec * float(np.sqrt(max(first_index.value, 0.0))),
+        )
+        for name, first_index, total_index in zip(names, first, total, strict=True)
     ]
 
 
-def outputs(plan: Plan, store: Store, axes: tuple[str, ...]) -> tuple[Floats, Floats, Floats]:
+def sample_outputs(plan: Plan, store: Store, axes: tuple[str, ...]) -> tuple[Floats, Floats, Floats]:
     """(S, N), (S, N) and (D, S, N) errors at A, at B, and at A with one column of B.
 
     There are N sample rows, D factors and S outputs, one per axis and replicate. A replicate is left out if any of its
@@ -88,21 +96,21 @@ def outputs(plan: Plan, store: Store, axes: tuple[str, ...]) -> tuple[Floats, Fl
     values = np.full((len(axes), plan.trials), np.nan)
     values[:, columns["trial"]] = [columns[name] for name in axes]
     grid = values.reshape(len(axes), -1, each).transpose(0, 2, 1).reshape(len(axes) * each, -1)
-    whole = np.isfinite(grid).all(axis=1)
-    blocks = grid[whole].reshape(int(whole.sum()), width + 2, len(plan.points) // (width + 2))
+    complete = np.isfinite(grid).all(axis=1)
+    blocks = grid[complete].reshape(int(complete.sum()), width + 2, len(plan.points) // (width + 2))
     return blocks[:, 0], blocks[:, 1], blocks[:, 2:].transpose(1, 0, 2)
 
 
-def generalised(a: Floats, b: Floats, ab: Floats) -> NDArray[np.float64]:
+def generalized(a: Floats, b: Floats, ab: Floats) -> NDArray[np.float64]:
     """(2, D) first-order and total indices, averaged over the outputs with their variances as weights.
 
     The estimators are those of Saltelli et al. (2010), from SciPy. Outputs without variance have weight zero.
     """
-    found = scipy.stats.sobol_indices(func={"f_A": a, "f_B": b, "f_AB": ab}, n=a.shape[1])
+    estimate = scipy.stats.sobol_indices(func={"f_A": a, "f_B": b, "f_AB": ab}, n=a.shape[1])
     weight = np.var(np.concatenate([a, b], axis=1), axis=1)
     if weight.sum() == 0:
         return np.zeros((2, len(ab)))
-    moving = weight > 0
+    varying = weight > 0
     return np.stack(
-        [weight[moving] @ part[moving] / weight.sum() for part in (found.first_order, found.total_order)]
+        [weight[varying] @ index[varying] / weight.sum() for index in (estimate.first_order, estimate.total_order)]
     )

@@ -18,22 +18,22 @@ from typing import Protocol
 
 from skysim.core.errors import InputError
 from skysim.experiments.study.execution import workers
+from skysim.experiments.study.execution.setups import code_version, seed_of
+from skysim.experiments.study.execution.trials import FAILED, Row, Segment, run_segments
 from skysim.experiments.study.plan import TrialSpec
-from skysim.experiments.study.setups import code_version, seed_of
-from skysim.experiments.study.trials import FAILED, Row, Segment, work
 
 AHEAD = 1  # chunks queued for each worker in addition to the one it runs
 
-TRIES = 3  # attempts of a trial whose worker dies
+MAX_ATTEMPTS = 3  # attempts of a trial whose worker dies
 
 Chunk = tuple[Segment, ...]
 
 
 class Chunks(Protocol):
-    """Source of work: `next` returns the next chunk (empty at the end); `took` reports run times, to size chunks."""
+    """Source of work: `next` returns the next chunk (empty at the end); `report_time` takes run times, to size it."""
 
     def next(self) -> Chunk: ...
-    def took(self, chunk: Chunk, seconds: float) -> None: ...
+    def report_time(self, chunk: Chunk, seconds: float) -> None: ...
 
 
 class Engine(Protocol):
@@ -42,7 +42,7 @@ class Engine(Protocol):
     name: str
     workers: int
 
-    def run(self, recipe: TrialSpec, chunks: Chunks) -> Iterator[list[Row]]: ...
+    def run(self, spec: TrialSpec, chunks: Chunks) -> Iterator[list[Row]]: ...
 
     def close(self) -> None:
         """Release the resources kept between runs."""
@@ -53,11 +53,11 @@ class Serial:
 
     name, workers = "serial", 1
 
-    def run(self, recipe: TrialSpec, chunks: Chunks) -> Iterator[list[Row]]:
+    def run(self, spec: TrialSpec, chunks: Chunks) -> Iterator[list[Row]]:
         """See `Engine`."""
         while chunk := chunks.next():
-            rows, seconds = timed(recipe, chunk)
-            chunks.took(chunk, seconds)
+            rows, seconds = run_timed(spec, chunk)
+            chunks.report_time(chunk, seconds)
             yield rows
 
     def close(self) -> None:
@@ -68,7 +68,8 @@ class Pool:
     """Pool of processes on this machine. Each caches the scenes and indices it has built, also between runs.
 
     If a worker dies, the pool is restarted and the trials in flight are retried one at a time, because it is not known
-    which of them killed it. A trial that is alone in flight when its worker dies, TRIES times, is recorded as failed.
+    which of them killed it. A trial that is alone in flight when its worker dies, MAX_ATTEMPTS times, is recorded
+    as failed.
     """
 
     name = "pool"
@@ -76,27 +77,27 @@ class Pool:
     def __init__(self, count: int | None = None) -> None:
         self.workers = count or cores()
         self._pool: ProcessPoolExecutor | None = None
-        self._recipe: TrialSpec | None = None
+        self._spec: TrialSpec | None = None
 
-    def run(self, recipe: TrialSpec, chunks: Chunks) -> Iterator[list[Row]]:
+    def run(self, spec: TrialSpec, chunks: Chunks) -> Iterator[list[Row]]:
         """See `Engine`."""
-        suspects: deque[Chunk] = deque()
+        retries: deque[Chunk] = deque()
         deaths: Counter[int] = Counter()  # by trial
         done = False
         while not done:
-            flying: dict[Future[tuple[list[Row], float]], Chunk] = {}
+            in_flight: dict[Future[tuple[list[Row], float]], Chunk] = {}
             try:
-                yield from self._until_one_dies(self._ready(recipe), chunks, suspects, flying)
+                yield from self._run_until_death(self._pool_for(spec), chunks, retries, in_flight)
                 done = True
             except BrokenProcessPool:
                 # Count a death only for a trial that was alone in flight; otherwise the culprit is unknown.
-                at_hand = [one for chunk in flying.values() for one in split_chunk(chunk)]
-                deaths.update(one[0].first for one in at_hand if len(at_hand) == 1)
-                for one in at_hand:
-                    if deaths[one[0].first] == TRIES:
-                        yield [failed_row(recipe, one[0])]
+                lost = [single for chunk in in_flight.values() for single in split_chunk(chunk)]
+                deaths.update(single[0].first for single in lost if len(lost) == 1)
+                for single in lost:
+                    if deaths[single[0].first] == MAX_ATTEMPTS:
+                        yield [failed_row(spec, single[0])]
                     else:
-                        suspects.append(one)
+                        retries.append(single)
             finally:
                 if not done:
                     self._kill()
@@ -107,12 +108,12 @@ class Pool:
             self._pool.shutdown()
         self._pool = None
 
-    def _ready(self, recipe: TrialSpec) -> ProcessPoolExecutor:
-        """The pool of the previous run if it was started with this recipe, otherwise a new one."""
-        if recipe != self._recipe:
+    def _pool_for(self, spec: TrialSpec) -> ProcessPoolExecutor:
+        """The pool of the previous run if it was started with this specification, otherwise a new one."""
+        if spec != self._spec:
             self.close()
         if self._pool is None:
-            self._pool, self._recipe = started(self.workers, recipe), recipe
+            self._pool, self._spec = start_pool(self.workers, spec), spec
         return self._pool
 
     def _kill(self) -> None:
@@ -123,54 +124,54 @@ class Pool:
             self._pool.shutdown(cancel_futures=True)
         self._pool = None
 
-    def _until_one_dies(
+    def _run_until_death(
         self,
         pool: ProcessPoolExecutor,
         chunks: Chunks,
-        suspects: deque[Chunk],
-        flying: dict[Future[tuple[list[Row], float]], Chunk],
+        retries: deque[Chunk],
+        in_flight: dict[Future[tuple[list[Row], float]], Chunk],
     ) -> Iterator[list[Row]]:
-        """Yield rows as chunks complete; suspects first, each alone in flight. `flying` maps futures to their chunks.
+        """Yield rows as chunks complete; retries first, each alone in flight. `in_flight` maps futures to their chunks.
 
-        Raises BrokenProcessPool if a worker dies; `flying` then holds the chunks that were lost.
+        Raises BrokenProcessPool if a worker dies; `in_flight` then holds the chunks that were lost.
         """
         while True:
-            # A suspect runs with nothing else in flight, so that a worker's death can be attributed to it.
-            room = self.workers * (1 + AHEAD) if not suspects else 1
-            while len(flying) < room and (chunk := suspects.popleft() if suspects else chunks.next()):
+            # A retried trial runs with nothing else in flight, so that a worker's death can be attributed to it.
+            capacity = self.workers * (1 + AHEAD) if not retries else 1
+            while len(in_flight) < capacity and (chunk := retries.popleft() if retries else chunks.next()):
                 try:
-                    flying[pool.submit(run_chunk, chunk)] = chunk
+                    in_flight[pool.submit(run_chunk, chunk)] = chunk
                 except BrokenProcessPool:  # a worker died while the caller stored rows
-                    suspects.appendleft(chunk)
+                    retries.appendleft(chunk)
                     raise
-                room = room if not suspects else 1
-            if not flying:
+                capacity = capacity if not retries else 1
+            if not in_flight:
                 return
-            for future in wait(flying, return_when=FIRST_COMPLETED).done:
+            for future in wait(in_flight, return_when=FIRST_COMPLETED).done:
                 rows, seconds = future.result()
-                chunks.took(flying.pop(future), seconds)
+                chunks.report_time(in_flight.pop(future), seconds)
                 yield rows
 
 
-def timed(recipe: TrialSpec, chunk: Chunk) -> tuple[list[Row], float]:
+def run_timed(spec: TrialSpec, chunk: Chunk) -> tuple[list[Row], float]:
     """Rows of a chunk and the seconds it took on the worker."""
-    begin_s = time.perf_counter()
-    return work(recipe, chunk), time.perf_counter() - begin_s
+    start_s = time.perf_counter()
+    return run_segments(spec, chunk), time.perf_counter() - start_s
 
 
 def split_chunk(chunk: Chunk) -> Iterator[Chunk]:
     """Split a chunk into chunks of one trial each."""
     for segment in chunk:
         for n, replicate in enumerate(segment.replicates):
-            alone = range(replicate, replicate + 1)
-            yield (segment._replace(first=segment.first + n, replicates=alone),)
+            single = range(replicate, replicate + 1)
+            yield (segment._replace(first=segment.first + n, replicates=single),)
 
 
-def failed_row(recipe: TrialSpec, segment: Segment) -> Row:
+def failed_row(spec: TrialSpec, segment: Segment) -> Row:
     """The row of a trial that repeatedly killed its worker."""
     replicate = segment.replicates[0]
-    seed, why = seed_of(recipe, segment.point, replicate), f"its worker process died, {TRIES} times"
-    return Row(segment.first, segment.point, replicate, seed, "", code_version(), FAILED, why, 0.0)
+    seed, error = seed_of(spec, segment.point, replicate), f"its worker process died, {MAX_ATTEMPTS} times"
+    return Row(segment.first, segment.point, replicate, seed, "", code_version(), FAILED, error, 0.0)
 
 
 def cores() -> int:
@@ -180,33 +181,31 @@ def cores() -> int:
 
 # Worker processes.
 
-RECIPE: list[TrialSpec] = []  # the recipe of this worker process
+SPEC: list[TrialSpec] = []  # the trial specification of this worker process
 
 
-def started(count: int, recipe: TrialSpec) -> ProcessPoolExecutor:
+def start_pool(count: int, spec: TrialSpec) -> ProcessPoolExecutor:
     """Start a pool of single-threaded processes that have imported everything a trial needs. Raises InputError."""
-    pool = ProcessPoolExecutor(count, workers.warm(), begin, (recipe,))
+    pool = ProcessPoolExecutor(count, workers.start_fork_server(), initialize_worker, (spec,))
     try:
-        for one in [pool.submit(code_version) for _ in range(count)]:
-            one.result()
+        for future in [pool.submit(code_version) for _ in range(count)]:
+            future.result()
     except BrokenProcessPool:
-        raise InputError(
-            f"--workers: {count} processes cannot start; allowed: fewer, or --engine serial"
-        ) from None
+        raise InputError(f"--workers: {count} processes do not start; allowed: fewer, or --engine serial") from None
     return pool
 
 
-def begin(recipe: TrialSpec) -> None:
+def initialize_worker(spec: TrialSpec) -> None:
     """Initialize a worker: ignore Ctrl-C, which the parent handles, and exit when the parent ends, even by kill -9."""
     import cv2
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     cv2.setNumThreads(1)
-    RECIPE[:] = [recipe]
-    threading.Thread(target=end_with_parent, daemon=True).start()
+    SPEC[:] = [spec]
+    threading.Thread(target=exit_with_parent, daemon=True).start()
 
 
-def end_with_parent() -> None:
+def exit_with_parent() -> None:
     """Wait until the parent process ends, then exit."""
     parent = multiprocessing.parent_process()
     if parent is not None:
@@ -215,5 +214,5 @@ def end_with_parent() -> None:
 
 
 def run_chunk(chunk: Chunk) -> tuple[list[Row], float]:
-    """`timed` with the recipe with which this worker was started."""
-    return timed(RECIPE[0], chunk)
+    """`run_timed` with the trial specification with which this worker was started."""
+    return run_timed(SPEC[0], chunk)

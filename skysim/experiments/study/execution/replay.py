@@ -14,16 +14,23 @@ from estimator.trackers.pipeline import Report
 from skysim.core import files as file_io
 from skysim.core.errors import InputError
 from skysim.core.types import Frame, Truth
+from skysim.experiments.study.execution.setups import Setup, prepared_setup
+from skysim.experiments.study.execution.trials import (
+    Row,
+    Segment,
+    render_trial_frame,
+    reseeded,
+    run_trial,
+    simulate_centroids,
+)
 from skysim.experiments.study.plan import CentroidTrial, FlightTrial, FrameTrial, Plan
-from skysim.experiments.study.setups import Setup, prepared_setup
-from skysim.experiments.study.store import Store, plain
-from skysim.experiments.study.trials import Row, Segment, one, reseeded, shot, sight
+from skysim.experiments.study.store import Store, to_sql
 from skysim.results.files import frames
 from skysim.results.report import annotate
 from skysim.simulation import run
 from skysim.tracking import factory
 
-MOST = 100  # maximum number of frames written for a flight
+MAX_FRAMES = 100  # maximum number of frames written for a flight
 
 
 class Replay(NamedTuple):
@@ -39,7 +46,7 @@ def segment_of(plan: Plan, store: Store, trial: int) -> Segment:
     """The segment with this trial alone. Raises InputError if the study has no such trial."""
     points, each = store.points(), plan.study.replicates
     if not 0 <= trial < len(points) * each:
-        raise InputError(f"trial {trial}: is none of the study's; allowed: 0 to {len(points) * each - 1}")
+        raise InputError(f"trial {trial}: not in the study; allowed: 0 to {len(points) * each - 1}")
     point, replicate = divmod(trial, each)
     return Segment(point, points[point].settings, trial, range(replicate, replicate + 1))
 
@@ -47,60 +54,64 @@ def segment_of(plan: Plan, store: Store, trial: int) -> Segment:
 def replay(plan: Plan, store: Store, trial: int, folder: Path) -> Replay:
     """Repeat a trial with its seed, and write each of its frames with an annotated image.
 
-    Only the first MOST frames of a flight are written. An exception of the trial is in its row; frames rendered
+    Only the first MAX_FRAMES frames of a flight are written. An exception of the trial is in its row; frames rendered
     before it are written too.
     """
     segment = segment_of(plan, store, trial)
-    row = one(plan.recipe, segment, trial, segment.replicates[0])
-    kept = store.trial(trial) if store.done(trial + 1)[trial] else {}
-    now = {name: plain(getattr(row.outcome, name)) for name in row.outcome.__slots__}
-    changed = [name for name, value in now.items() if kept and kept[name] != value]
+    row = run_trial(plan.spec, segment, trial, segment.replicates[0])
+    stored = store.trial(trial) if store.done(trial + 1)[trial] else {}
+    now = {name: to_sql(getattr(row.outcome, name)) for name in row.outcome.__slots__}
+    changed = [name for name, value in now.items() if stored and stored[name] != value]
     files, pictures = [], []
     if row.scene:  # an invalid scene has no test bed
-        ready = prepared_setup(plan.recipe, segment.settings)
-        frames.clear(file_io.make_folder(folder))
+        setup = prepared_setup(plan.spec, segment.settings)
+        frames.remove_results(file_io.make_folder(folder))
         try:
-            for frame, truth, report in islice(seen(ready, row.seed), MOST):
-                frames.write_frame(folder, frame, truth, ready.lab.scene)
+            for frame, truth, report in islice(replayed_frames(setup, row.seed), MAX_FRAMES):
+                frames.write_frame(folder, frame, truth, setup.testbed.scene)
                 files.append(folder / f"frame_{frame.index:04d}.fits")
                 pictures.append(folder / f"frame_{frame.index:04d}.annotated.png")
-                file_io.write_image(pictures[-1], picture(frame, truth, report))
+                file_io.write_image(pictures[-1], annotated_image(frame, truth, report))
         except Exception:
             if row.error is None:
                 raise
     return Replay(row, changed, files, pictures)
 
 
-def picture(frame: Frame, truth: Truth, report: Report) -> Any:
+def annotated_image(frame: Frame, truth: Truth, report: Report) -> Any:
     """The annotated frame: truth, detections and identified detections."""
     match, xy_px = report.attitude.match, report.centroids.xy_px
     matched_px = xy_px[match.observed] if match else np.empty((0, 2))
-    return annotate(frame.image_dn, xy_px, matched_px, truth_px=truth.seen.xy_px)
+    return annotate(frame.image_dn, xy_px, matched_px, truth_px=truth.sources.xy_px)
 
 
-def seen(ready: Setup, seed: int) -> Iterator[tuple[Frame, Truth, Report]]:
+def replayed_frames(setup: Setup, seed: int) -> Iterator[tuple[Frame, Truth, Report]]:
     """Frames of a trial with truth and report.
 
     A centroid trial has no frame, so one is rendered at its attitude and shown with the trial's own centroids.
     """
-    trial = ready.trial
+    trial = setup.trial
     if isinstance(trial, CentroidTrial):
-        _, _, centroids = sight(ready, seed)
-        still = FrameTrial(kind="frames", **{name: getattr(trial, name) for name in ("tilt_deg", "dec_deg")})
-        frame, truth, _ = shot(ready._replace(trial=still), seed)
-        yield frame, truth, tried(lambda: Report(ready.estimator.solve_centroids(centroids), centroids))
+        _, _, centroids = simulate_centroids(setup, seed)
+        frame_trial = FrameTrial(kind="frames", **{name: getattr(trial, name) for name in ("tilt_deg", "dec_deg")})
+        frame, truth, _ = render_trial_frame(setup._replace(trial=frame_trial), seed)
+        yield (
+            frame,
+            truth,
+            solve_or_failed(lambda: Report(setup.estimator.solve_centroids(centroids), centroids)),
+        )
     elif isinstance(trial, FlightTrial):
-        lab = run.simulate_motion(reseeded(ready.lab, seed))
-        for taken in run.run(lab, ready.estimator):
-            yield taken.frame, taken.truth, taken.report
+        testbed = run.simulate_motion(reseeded(setup.testbed, seed))
+        for result in run.run(testbed, setup.estimator):
+            yield result.frame, result.truth, result.report
     else:
-        frame, truth, streak_px = shot(ready, seed)
-        yield frame, truth, tried(lambda: factory.solve_frame(ready.estimator, frame, streak_px))
+        frame, truth, streak_px = render_trial_frame(setup, seed)
+        yield frame, truth, solve_or_failed(lambda: factory.solve_frame(setup.estimator, frame, streak_px))
 
 
-def tried(solve: Callable[[], Report]) -> Report:
+def solve_or_failed(solve: Callable[[], Report]) -> Report:
     """The tracker's report, or an empty one if it raises; the trial's row holds the exception."""
     try:
         return solve()
     except Exception as error:
-        return Report(Attitude(f"failed: {error}"), Centroids.none())
+        return Report(Attitude(f"failed: {error}"), Centroids.empty())

@@ -14,14 +14,14 @@ from numpy.typing import NDArray
 from skysim.core.errors import InputError
 from skysim.experiments.study.designs import Point
 from skysim.experiments.study.execution.engines import Chunk, Engine, Pool, Serial
-from skysim.experiments.study.plan import Plan, resolved
-from skysim.experiments.study.setups import code_version, scene_hash
+from skysim.experiments.study.execution.setups import code_version, scene_hash
+from skysim.experiments.study.execution.trials import Row, Segment
+from skysim.experiments.study.plan import Plan, resolve_point
 from skysim.experiments.study.store import Store
-from skysim.experiments.study.trials import Row, Segment
 
 CHUNK_S = 0.25  # run time of a chunk: long relative to its overhead, short in case a worker dies
 
-MOST = 5000  # maximum number of trials in a chunk
+MAX_CHUNK = 5000  # maximum number of trials in a chunk
 
 
 @dataclass(slots=True)
@@ -54,44 +54,42 @@ class Progress:
 Watch = Callable[[Progress], Any]
 
 
-class Todo:
+class ChunkQueue:
     """Divides the missing trials of some points into chunks of about CHUNK_S seconds.
 
-    Chunks larger than a point are extended to complete points, so that a point's bench is set up on one worker only.
+    Chunks larger than a point are extended to complete points, so that a point's setup is built on one worker only.
 
     missing : (M,) trial numbers, ascending
     """
 
-    def __init__(
-        self, points: Sequence[Point], replicates: int, missing: NDArray[np.int64], first: int = 0
-    ) -> None:
+    def __init__(self, points: Sequence[Point], replicates: int, missing: NDArray[np.int64], first: int = 0) -> None:
         self.points, self.replicates, self.missing, self.first = points, replicates, missing, first
-        self.at, self.size = 0, 1
+        self.position, self.size = 0, 1
 
     def next(self) -> Chunk:
         """The next chunk; empty if nothing is left."""
-        end = min(self.at + self.size, len(self.missing))
+        end = min(self.position + self.size, len(self.missing))
         if self.size >= self.replicates and end < len(self.missing):
             last = self.missing[end - 1] // self.replicates
             end = int(np.searchsorted(self.missing, (last + 1) * self.replicates))
-        chosen, self.at = self.missing[self.at : end], end
+        chosen, self.position = self.missing[self.position : end], end
         # A segment ends where the trial numbers are not consecutive or the next point begins.
         breaks = np.flatnonzero((np.diff(chosen) != 1) | (chosen[1:] % self.replicates == 0)) + 1
-        return tuple(self._segment(part) for part in np.split(chosen, breaks) if len(part))
+        return tuple(self._segment(trials) for trials in np.split(chosen, breaks) if len(trials))
 
-    def _segment(self, part: NDArray[np.int64]) -> Segment:
-        point, begin = divmod(int(part[0]), self.replicates)
+    def _segment(self, trials: NDArray[np.int64]) -> Segment:
+        point, replicate = divmod(int(trials[0]), self.replicates)
         settings = self.points[point - self.first].settings
-        return Segment(point, settings, int(part[0]), range(begin, begin + len(part)))
+        return Segment(point, settings, int(trials[0]), range(replicate, replicate + len(trials)))
 
-    def took(self, chunk: Chunk, seconds: float) -> None:
+    def report_time(self, chunk: Chunk, seconds: float) -> None:
         """Set the size of the next chunks from the run time of this one; the size at most doubles."""
         count = sum(len(segment.replicates) for segment in chunk)
-        wanted = int(CHUNK_S * count / max(seconds, 1e-6))
-        self.size = int(np.clip(wanted, 1, min(2 * max(count, self.size), MOST)))
+        size = int(CHUNK_S * count / max(seconds, 1e-6))
+        self.size = int(np.clip(size, 1, min(2 * max(count, self.size), MAX_CHUNK)))
 
 
-def begin(plan: Plan, store: Store, resume: bool, overrides: Mapping[str, str] | None = None) -> None:
+def prepare_store(plan: Plan, store: Store, resume: bool, overrides: Mapping[str, str] | None = None) -> None:
     """Initialize a store for a plan, or check that it belongs to the plan.
 
     resume    : whether to continue a store that already has trials
@@ -99,39 +97,39 @@ def begin(plan: Plan, store: Store, resume: bool, overrides: Mapping[str, str] |
 
     Raises InputError if the store holds another study or rows of another code version, or if `resume` does not fit.
     """
-    held, done = store.meta("digest"), store.counts()["done"]
-    if held and held != plan.digest:
+    stored, done = store.meta("digest"), store.counts()["done"]
+    if stored and stored != plan.digest:
         raise InputError(
-            f"{store.path}: holds another study, or this one before it was changed; allowed: another --out"
+            f"{store.path}: contains another study, or an earlier version of this one; allowed: another --out"
         )
-    if resume and not held:
-        raise InputError(f"{store.path}: holds nothing to resume; allowed: skysim study run")
+    if resume and not stored:
+        raise InputError(f"{store.path}: contains no trials to resume; allowed: skysim study run")
     if done and not resume:
         raise InputError(
-            f"{store.path}: {done} trials are in; allowed: skysim study resume, or another --out"
+            f"{store.path}: already contains {done} trials; allowed: skysim study resume, or another --out"
         )
     if done and store.meta("code") != code_version():
         raise InputError(
-            f"{store.path}: its {done} trials were made by skysim {store.meta('code')}, this is {code_version()};"
-            " allowed: the same code, or another --out"
+            f"{store.path}: its {done} trials are of skysim {store.meta('code')}; allowed: {code_version()}, the"
+            " version here, or another --out"
         )
     if done:
         check_scene(plan, store)
     else:
         text = plan.path.read_text(encoding="utf-8")
-        told = {"study": text, "title": plan.study.title, "code": code_version(), "digest": plan.digest}
-        store.begin(plan.points, overrides=json.dumps(dict(overrides or {})), **told)
+        meta = {"study": text, "title": plan.study.title, "code": code_version(), "digest": plan.digest}
+        store.begin(plan.points, overrides=json.dumps(dict(overrides or {})), **meta)
 
 
 def check_scene(plan: Plan, store: Store) -> None:
     """Raise InputError if the scene of the first or the last stored point, or a file it names, has changed."""
     points = store.points()
-    for point, told in store.scenes():
-        now = scene_hash(resolved(plan.recipe, points[point].settings)[0])
-        if now != told:
+    for point, stored in store.scenes():
+        now = scene_hash(resolve_point(plan.spec, points[point].settings)[0])
+        if now != stored:
             raise InputError(
-                f"{store.path}: the scene of point {point} was changed since (then {told}, now {now}); allowed: another"
-                " --out, or the scene as it was"
+                f"{store.path}: the scene of point {point} has changed (hash {stored} then, {now} now); allowed:"
+                " another --out, or the original scene"
             )
 
 
@@ -148,26 +146,26 @@ def run_points(
     Rows are stored before they are counted, so a killed run loses at most the chunks in flight.
     """
     replicates = plan.study.replicates
-    span = np.arange(first * replicates, (first + len(points)) * replicates)
-    missing = span[~store.done(int(span[-1]) + 1)[span]]
-    before = store.counts()["failed"]
-    progress = Progress(len(span), len(span) - len(missing), before)
+    numbers = np.arange(first * replicates, (first + len(points)) * replicates)
+    missing = numbers[~store.done(int(numbers[-1]) + 1)[numbers]]
+    failed_before = store.counts()["failed"]
+    progress = Progress(len(numbers), len(numbers) - len(missing), failed_before)
     budget = plan.study.budget
-    rows = engine.run(plan.recipe, Todo(points, replicates, missing, first)) if len(missing) else iter(())
+    rows = engine.run(plan.spec, ChunkQueue(points, replicates, missing, first)) if len(missing) else iter(())
     try:
         for batch in rows:
             store.add(batch)
             progress.add(batch)
             if watch:
                 watch(progress)
-            over = budget.time_s is not None and time.perf_counter() - progress.began > budget.time_s
-            if over or (budget.failures is not None and progress.failed - before >= budget.failures):
+            out_of_time = budget.time_s is not None and time.perf_counter() - progress.began > budget.time_s
+            if out_of_time or (budget.failures is not None and progress.failed - failed_before >= budget.failures):
                 break
     finally:
         if hasattr(rows, "close"):
             rows.close()
         if progress.now:
-            store.ran(engine.name, engine.workers, progress.now, time.perf_counter() - progress.began)
+            store.record_run(engine.name, engine.workers, progress.now, time.perf_counter() - progress.began)
     return progress
 
 

@@ -12,10 +12,10 @@ from multiprocessing.context import ForkServerContext
 ONE_THREAD = ("NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 
 
-def warm() -> ForkServerContext:
+def start_fork_server() -> ForkServerContext:
     """Start the fork server, with one numerical thread per worker. Returns at once; the imports run in parallel."""
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["skysim.experiments.study.trials"])
+    context.set_forkserver_preload(["skysim.experiments.study.execution.trials"])
     with one_thread():
         forkserver.ensure_running()
     return context
@@ -29,12 +29,12 @@ def one_thread() -> AbstractContextManager[None]:
 @contextmanager
 def environment(values: Mapping[str, str]) -> Iterator[None]:
     """Context with these environment variables set; processes started in it inherit them."""
-    before = {name: os.environ.get(name) for name in values}
+    previous = {name: os.environ.get(name) for name in values}
     os.environ.update(values)
     try:
         yield
     finally:
-        for name, value in before.items():
+        for name, value in previous.items():
             del os.environ[name]
             if value is not None:
                 os.environ[name] = value

@@ -10,15 +10,15 @@ from typing import Any
 import numpy as np
 
 from skysim.core import files
-from skysim.core.errors import InputError
-from skysim.experiments.study.analysis.table import everything, flat, table
+from skysim.core.errors import InputError, unknown_name
+from skysim.experiments.study.analysis.table import table, to_columns, trial_columns
 from skysim.experiments.study.store import Store
 from skysim.results.files.export import EXTRA
 
 
 def to_csv(store: Store, responses: tuple[str, ...], path: Path) -> None:
     """Write one line per trial, missing values empty; numbers in Python's shortest form, which reads back exactly."""
-    columns = everything(store)
+    columns = trial_columns(store)
     with files.atomic_file(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(columns)
@@ -36,10 +36,10 @@ def to_parquet(store: Store, responses: tuple[str, ...], path: Path) -> None:
         import pyarrow.parquet
     except ImportError:
         raise InputError(f"{path}: Parquet {EXTRA}") from None
-    columns = {name: pyarrow.array(column.tolist()) for name, column in everything(store).items()}
-    told = {key: store.meta(key) for key in ("title", "code", "study")}
+    columns = {name: pyarrow.array(column.tolist()) for name, column in trial_columns(store).items()}
+    meta = {key: store.meta(key) for key in ("title", "code", "study")}
     with files.atomic_file(path) as temporary:
-        pyarrow.parquet.write_table(pyarrow.table(columns).replace_schema_metadata(told), temporary)
+        pyarrow.parquet.write_table(pyarrow.table(columns).replace_schema_metadata(meta), temporary)
 
 
 def dataset(store: Store, responses: tuple[str, ...], path: Path) -> Any:
@@ -54,23 +54,23 @@ def dataset(store: Store, responses: tuple[str, ...], path: Path) -> Any:
     except ImportError:
         raise InputError(f"{path}: xarray {EXTRA}") from None
     lines = table(store, responses)
-    frame = pandas.DataFrame(flat(lines))
+    frame = pandas.DataFrame(to_columns(lines))
     factors = list(lines[0].levels) if lines else []
     for name in factors:
         if frame[name].map(type).isin([list, dict]).any():
             frame[name] = frame[name].map(str)
     sizes = [frame[name].nunique() for name in factors]
     full = factors and int(np.prod(sizes)) == len(frame) and not frame.duplicated(factors).any()
-    told = {key: store.meta(key) for key in ("title", "code", "study")}
+    meta = {key: store.meta(key) for key in ("title", "code", "study")}
     indexed = frame.set_index(factors if full else ["point"])
-    return xarray.Dataset.from_dataframe(indexed).assign_attrs(told)
+    return xarray.Dataset.from_dataframe(indexed).assign_attrs(meta)
 
 
 def to_zarr(store: Store, responses: tuple[str, ...], path: Path) -> None:
     """Write `dataset` as a Zarr folder."""
-    made = dataset(store, responses, path)
+    tables = dataset(store, responses, path)
     with files.atomic_folder(path) as temporary:
-        made.to_zarr(temporary, mode="w", consolidated=False)
+        tables.to_zarr(temporary, mode="w", consolidated=False)
 
 
 EXPORTS: dict[str, Callable[[Store, tuple[str, ...], Path], None]] = {
@@ -83,6 +83,6 @@ EXPORTS: dict[str, Callable[[Store, tuple[str, ...], Path], None]] = {
 def export(store: Store, responses: tuple[str, ...], path: Path) -> None:
     """Write a study's results in the format given by the path's suffix. Raises InputError for an unknown suffix."""
     if path.suffix not in EXPORTS:
-        raise InputError(f"{path}: {path.suffix or 'no suffix'!r} is none of {', '.join(EXPORTS)}")
+        raise InputError(f"{path}: {unknown_name('file format', path.suffix, EXPORTS)}")
     files.make_folder(path.parent)
     EXPORTS[path.suffix](store, responses, path)

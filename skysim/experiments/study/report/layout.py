@@ -1,7 +1,7 @@
 """Contents of a study's figures: which figures to draw, their axes, series, grid cells and captions.
 
-`figures` draws what this module selects. Points of the designs in DRAWN and of optimizations are scattered: no two
-share a level, so they are not grouped by level but shown as points, with running medians where there are many.
+`figures` draws what this module selects. Points of the designs in SAMPLED_DESIGNS and of optimizations are scattered:
+no two share a level, so they are not grouped by level but shown as points, with running medians where there are many.
 """
 
 from __future__ import annotations
@@ -14,20 +14,20 @@ import numpy as np
 
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
-from skysim.experiments.study.analysis.table import Line, level
-from skysim.experiments.study.factors import Distribution, Levels, Range, Value, split
+from skysim.experiments.study.analysis.table import PointRow, format_level
+from skysim.experiments.study.factors import Distribution, Levels, Range, Value, split_quantity
 from skysim.experiments.study.plan import Curve, Figure, Heat, Search, Study
 from skysim.results import metrics
 
-DRAWN = ("lhs", "sobol", "saltelli")  # sampled designs: no two points share a level
-BARS = 12  # maximum number of x values for error bars; with more, intervals are drawn as a band
-CROWD = 60  # maximum number of sampled points with error bars; with more, a running median is drawn
-BANDS = 4  # number of groups into which a sampled factor `by` is divided
+SAMPLED_DESIGNS = ("lhs", "sobol", "saltelli")  # sampled designs: no two points share a level
+MAX_X_WITH_BARS = 12  # maximum number of x values for error bars; with more, intervals are drawn as a band
+MAX_POINTS_WITH_BARS = 60  # sampled points with error bars; with more, a running median is drawn
+GROUPS = 4  # number of groups into which a sampled factor `by` is divided
 MOST_LINES = 7  # maximum number of lines in an automatic curve; with more levels it becomes a heat map
 MOST_FIGURES = 24  # maximum number of automatic figures
-RATIO = 10  # minimum ratio of last to first level for a logarithmic factor axis
-SPAN = 30  # minimum ratio of largest to smallest response for a logarithmic axis of an automatic figure
-FAR = 30  # interval bounds below the smallest value / FAR do not extend a logarithmic axis
+LOG_FACTOR_RATIO = 10  # minimum ratio of last to first level for a logarithmic factor axis
+LOG_RESPONSE_RATIO = 30  # minimum ratio of largest to smallest response for an automatic logarithmic axis
+FAR_RATIO = 30  # interval bounds below the smallest value / FAR_RATIO do not extend a logarithmic axis
 UNITS = {"_deg_s": "deg/s", "_arcsec": "arcsec", "_deg": "deg", "_mag": "mag", "_px": "px", "_um": "um"}
 UNITS |= {"_mm": "mm", "_ms": "ms", "_hz": "Hz", "_m": "m", "_s": "s"}
 
@@ -40,17 +40,17 @@ class Axis(NamedTuple):
     numeric: bool
     log: bool
 
-    def place(self, one: Value) -> float:
+    def coordinate(self, one: Value) -> float:
         """Coordinate of a level on the axis: its numeric value, or its index if levels are not numeric."""
         if self.numeric:
-            return split(one)[0]
+            return split_quantity(one)[0]
         return float(next(n for n, other in enumerate(self.levels) if same(one, other)))
 
-    def told(self, one: Value) -> str:
+    def tick_label(self, one: Value) -> str:
         """Tick text of a level; a number is written without its unit, which is in the axis label."""
         if not self.numeric:
-            return level(one)
-        number = self.place(one)
+            return format_level(one)
+        number = self.coordinate(one)
         return f"{number:.6g}" if number == int(number) else f"{number:.3g}"
 
 
@@ -85,15 +85,15 @@ class Panel(NamedTuple):
 # Names and axes.
 
 
-def is_drawn(study: Study) -> bool:
-    """Whether the points are sampled, so that no two share a level: a design in DRAWN, or an optimization."""
-    return study.optimise is not None or study.design.kind in DRAWN
+def is_sampled(study: Study) -> bool:
+    """Whether the points are sampled, so that no two share a level: a design in SAMPLED_DESIGNS, or an optimization."""
+    return study.optimize is not None or study.design.kind in SAMPLED_DESIGNS
 
 
 def same(one: Value, other: Value) -> bool:
     """Whether two levels are equal, as numbers where possible: 5 equals 5.0, and "5 m" equals "5.0 m"."""
     try:
-        return split(one) == split(other)
+        return split_quantity(one) == split_quantity(other)
     except ValueError:
         return bool(one == other)
 
@@ -109,38 +109,43 @@ def label(name: str, unit: str = "") -> str:
     stem, tail = (figure, f" {statistic}") if statistic in metrics.STATISTICS else (name, "")
     ending = next((ending for ending in UNITS if stem.endswith(ending)), "")
     unit = unit or UNITS.get(ending, "")
-    told = stem.removesuffix(ending).replace("_", " ") + tail
-    return told + (f" [{unit}]" if unit else " [share]" if is_share(name) else "")
+    text = stem.removesuffix(ending).replace("_", " ") + tail
+    return text + (f" [{unit}]" if unit else " [share]" if is_share(name) else "")
 
 
 def is_share(name: str) -> bool:
     """Whether a response is a proportion between 0 and 1."""
-    return name in metrics.SHARES or bool(metrics.COVERAGE.match(name)) or name.startswith("availability_")
+    return name in metrics.PROPORTIONS or bool(metrics.COVERAGE.match(name)) or name.startswith("availability_")
 
 
-def axis(study: Study, lines: Sequence[Line], name: str) -> Axis:
+def axis(study: Study, lines: Sequence[PointRow], name: str) -> Axis:
     """The axis of a factor, with the levels at which there are points."""
     factor, levels = study.factors[name], distinct(line.levels[name] for line in lines)
     key = "" if isinstance(factor, Levels) else factor.key or ""
     unit = next((unit for ending, unit in UNITS.items() if key.endswith(ending)), "")
-    numbers, own = numbers_of(levels)
+    numbers, own_unit = as_numbers(levels)
     if numbers is not None:
         levels = [levels[n] for n in np.argsort(numbers)]
-        told = isinstance(factor, Range) and factor.scale == "log"
-        told |= isinstance(factor, Distribution) and factor.distribution == "lognormal"
+        log = isinstance(factor, Range) and factor.scale == "log"
+        log |= isinstance(factor, Distribution) and factor.distribution == "lognormal"
         # A range or distribution declares its own scale; explicit values are judged by their spacing.
-        even = isinstance(factor, Range | Distribution)
-        return Axis(label(name, own or unit), levels, True, told or (not even and by_ratio(np.sort(numbers))))
+        declares_scale = isinstance(factor, Range | Distribution)
+        return Axis(
+            label(name, own_unit or unit),
+            levels,
+            True,
+            log or (not declares_scale and suits_log_scale(np.sort(numbers))),
+        )
     order = [one for one, _ in factor.options()]
     levels.sort(key=lambda one: next((n for n, other in enumerate(order) if same(one, other)), len(order)))
-    worded = any(isinstance(one, str | bool) for one in levels)
-    return Axis(label(name, "" if worded else unit), levels, False, False)
+    has_text = any(isinstance(one, str | bool) for one in levels)
+    return Axis(label(name, "" if has_text else unit), levels, False, False)
 
 
-def numbers_of(levels: Sequence[Value]) -> tuple[Floats | None, str]:
+def as_numbers(levels: Sequence[Value]) -> tuple[Floats | None, str]:
     """(N,) levels as numbers, and their unit. None unless all are numbers of the same unit and distinct."""
     try:
-        parts = [split(one) for one in levels]
+        parts = [split_quantity(one) for one in levels]
     except ValueError:
         return None, ""
     numbers, units = np.array([number for number, _ in parts]), {unit for _, unit in parts}
@@ -149,32 +154,32 @@ def numbers_of(levels: Sequence[Value]) -> tuple[Floats | None, str]:
     return numbers, units.pop()
 
 
-def in_bands(across: Axis) -> bool:
-    """Whether intervals are drawn as a band: a numeric axis with more than BARS levels."""
-    return across.numeric and len(across.levels) > BARS
+def draws_bands(x_axis: Axis) -> bool:
+    """Whether intervals are drawn as a band: a numeric axis with more than MAX_X_WITH_BARS levels."""
+    return x_axis.numeric and len(x_axis.levels) > MAX_X_WITH_BARS
 
 
-def in_dots(study: Study, across: Axis, count: int) -> bool:
+def draws_medians(study: Study, x_axis: Axis, count: int) -> bool:
     """Whether medians are drawn instead of intervals: sampled points that are many or share a non-numeric axis."""
-    return is_drawn(study) and (count > CROWD or not across.numeric)
+    return is_sampled(study) and (count > MAX_POINTS_WITH_BARS or not x_axis.numeric)
 
 
-def by_ratio(numbers: Floats) -> bool:
+def suits_log_scale(numbers: Floats) -> bool:
     """Whether ascending numbers suit a logarithmic axis.
 
-    True if they are positive, extend over a ratio of at least RATIO, and their steps vary less as ratios than as
-    differences (compared by the coefficient of variation).
+    True if they are positive, extend over a ratio of at least LOG_FACTOR_RATIO, and their steps vary less as ratios
+    than as differences (compared by the coefficient of variation).
     """
-    if len(numbers) < 4 or numbers[0] <= 0 or numbers[-1] < RATIO * numbers[0]:
+    if len(numbers) < 4 or numbers[0] <= 0 or numbers[-1] < LOG_FACTOR_RATIO * numbers[0]:
         return False
-    uneven = [np.std(steps) / np.mean(steps) for steps in (np.diff(np.log(numbers)), np.diff(numbers))]
-    return bool(uneven[0] < uneven[1])
+    variation = [np.std(steps) / np.mean(steps) for steps in (np.diff(np.log(numbers)), np.diff(numbers))]
+    return bool(variation[0] < variation[1])
 
 
 # Selection of figures and of their points.
 
 
-def figures(study: Study, lines: Sequence[Line]) -> list[Figure]:
+def figures(study: Study, lines: Sequence[PointRow]) -> list[Figure]:
     """The figures of the study file; if it has none, automatic figures of the responses, about MOST_FIGURES at most.
 
     With sampled points and with one factor at a time, each response is drawn against each factor. Otherwise it is
@@ -188,7 +193,7 @@ def figures(study: Study, lines: Sequence[Line]) -> list[Figure]:
     if not varied:
         return []
     pairs: list[tuple[str, str | None, str]]
-    if is_drawn(study) or study.design.kind == "one_at_a_time":
+    if is_sampled(study) or study.design.kind == "one_at_a_time":
         pairs = [(one, None, y) for y in study.responses for one in varied]
     else:
         x = next((name for name in varied if axes[name].numeric), varied[0])
@@ -196,35 +201,34 @@ def figures(study: Study, lines: Sequence[Line]) -> list[Figure]:
         pairs = [(x, by, y) for y in study.responses]
     # If there are too many figures, show fewer responses, each with all of its figures.
     most = max(MOST_FIGURES * len(study.responses) // len(pairs), 1)  # responses to show
-    return [sensible(x, by, y, axes, lines) for x, by, y in pairs if y in study.responses[:most]]
+    return [automatic_figure(x, by, y, axes, lines) for x, by, y in pairs if y in study.responses[:most]]
 
 
-def sensible(x: str, by: str | None, y: str, axes: Mapping[str, Axis], lines: Sequence[Line]) -> Figure:
+def automatic_figure(x: str, by: str | None, y: str, axes: Mapping[str, Axis], lines: Sequence[PointRow]) -> Figure:
     """An automatic figure: a curve, or a heat map if `by` has more than MOST_LINES levels."""
     values = np.array([line.responses[y].value for line in lines])
     values = values[np.isfinite(values)]
-    log = bool(len(values) and values.min() > 0 and values.max() > SPAN * values.min())
+    log = bool(len(values) and values.min() > 0 and values.max() > LOG_RESPONSE_RATIO * values.min())
     if by is not None and len(axes[by].levels) > MOST_LINES:
         return Heat(kind="heat", x=x, y=by, value=y, log=log)
     return Curve(kind="curve", x=x, y=y, by=by, log=log)
 
 
-def held(figure: Figure, study: Study, lines: Sequence[Line]) -> dict[str, Value]:
+def fixed_levels(figure: Figure, study: Study, lines: Sequence[PointRow]) -> dict[str, Value]:
     """The levels at which a figure keeps factors fixed: those of its `where`, and the first level of other factors
     that it does not show.
 
     Sampled points share no levels, so only `where` applies to them. Raises InputError if `where` names an unknown
     factor or level.
     """
-    for name, wanted in figure.where.items():
+    for name, level in figure.where.items():
         if name not in study.factors:
-            raise InputError(f"figures.where: {name!r} is none of {', '.join(study.factors)}")
-        there = distinct(line.levels[name] for line in lines)
-        if not any(same(wanted, one) for one in there):
-            raise InputError(
-                f"figures.where.{name}: {wanted!r} is none of {', '.join(map(level, there[:20]))}"
-            )
-    if is_drawn(study):
+            raise InputError(f"figures.where: unknown factor {name!r}; allowed: {', '.join(study.factors)}")
+        available = distinct(line.levels[name] for line in lines)
+        if not any(same(level, one) for one in available):
+            allowed = ", ".join(map(format_level, available[:20]))
+            raise InputError(f"figures.where.{name}: unknown level {level!r}; allowed: {allowed}")
+    if is_sampled(study):
         return dict(figure.where)
     shown = {figure.x, figure.by if isinstance(figure, Curve) else figure.y}
     return {
@@ -234,65 +238,68 @@ def held(figure: Figure, study: Study, lines: Sequence[Line]) -> dict[str, Value
     }
 
 
-def kept(lines: Sequence[Line], figure: Figure, study: Study) -> list[Line]:
+def shown_points(lines: Sequence[PointRow], figure: Figure, study: Study) -> list[PointRow]:
     """The table lines (points) that a figure shows."""
-    levels = held(figure, study, lines)
+    levels = fixed_levels(figure, study, lines)
     return [line for line in lines if all(same(line.levels[name], one) for name, one in levels.items())]
 
 
-def series(lines: Sequence[Line], figure: Curve, study: Study) -> list[Series]:
-    """The series of a curve, one for each level of `by`; for a sampled `by`, one for each of BANDS equal groups."""
-    across, chosen = axis(study, lines, figure.x), kept(lines, figure, study)
+def series(lines: Sequence[PointRow], figure: Curve, study: Study) -> list[Series]:
+    """The series of a curve, one for each level of `by`; for a sampled `by`, one for each of GROUPS equal groups."""
+    x_axis, chosen = axis(study, lines, figure.x), shown_points(lines, figure, study)
     groups = {"": chosen}
     if figure.by is not None:
-        groups = grouped(chosen, axis(study, lines, figure.by), figure.by, study)
-    return [one_series(name, group, figure, across) for name, group in groups.items() if group]
+        groups = group_points(chosen, axis(study, lines, figure.by), figure.by, study)
+    return [one_series(name, group, figure, x_axis) for name, group in groups.items() if group]
 
 
-def one_series(name: str, lines: Sequence[Line], figure: Curve, across: Axis) -> Series:
+def one_series(name: str, lines: Sequence[PointRow], figure: Curve, x_axis: Axis) -> Series:
     """Some table lines as one series, ascending in x."""
-    told = [(across.place(line.levels[figure.x]), *line.responses[figure.y][:3]) for line in lines]
-    return Series(name, *np.array(sorted(told, key=lambda one: one[0]), dtype=float).T)
+    rows = [(x_axis.coordinate(line.levels[figure.x]), *line.responses[figure.y][:3]) for line in lines]
+    return Series(name, *np.array(sorted(rows, key=lambda row: row[0]), dtype=float).T)
 
 
-def grouped(lines: Sequence[Line], apart: Axis, name: str, study: Study) -> dict[str, list[Line]]:
-    """Table lines grouped by the level of factor `name`, in the order of its axis `apart`."""
-    # A sampled factor has about as many levels as points: divide the sorted points into BANDS groups of equal size.
-    if is_drawn(study) and apart.numeric and len(apart.levels) > 2 * BANDS:
-        ordered = sorted(lines, key=lambda line: apart.place(line.levels[name]))
-        ends = [round(n * len(ordered) / BANDS) for n in range(BANDS + 1)]
-        parts = [ordered[a:b] for a, b in itertools.pairwise(ends) if b > a]
-        spans = [[apart.place(part[n].levels[name]) for n in (0, -1)] for part in parts]
+def group_points(lines: Sequence[PointRow], group_axis: Axis, name: str, study: Study) -> dict[str, list[PointRow]]:
+    """Table lines grouped by the level of factor `name`, in the order of its axis `group_axis`."""
+    # A sampled factor has about as many levels as points: divide the sorted points into GROUPS groups of equal size.
+    if is_sampled(study) and group_axis.numeric and len(group_axis.levels) > 2 * GROUPS:
+        ordered = sorted(lines, key=lambda line: group_axis.coordinate(line.levels[name]))
+        bounds = [round(n * len(ordered) / GROUPS) for n in range(GROUPS + 1)]
+        parts = [ordered[a:b] for a, b in itertools.pairwise(bounds) if b > a]
+        spans = [[group_axis.coordinate(part[n].levels[name]) for n in (0, -1)] for part in parts]
         return {f"{low:.3g} to {high:.3g}": part for (low, high), part in zip(spans, parts, strict=True)}
-    return {apart.told(one): [line for line in lines if same(line.levels[name], one)] for one in apart.levels}
+    return {
+        group_axis.tick_label(one): [line for line in lines if same(line.levels[name], one)]
+        for one in group_axis.levels
+    }
 
 
-def grid(lines: Sequence[Line], figure: Heat, study: Study) -> Grid:
+def grid(lines: Sequence[PointRow], figure: Heat, study: Study) -> Grid:
     """The axes and cell values of a heat map."""
     x, y = axis(study, lines, figure.x), axis(study, lines, figure.y)
-    columns = {x.place(one): n for n, one in enumerate(x.levels)}
-    rows = {y.place(one): n for n, one in enumerate(y.levels)}
+    columns = {x.coordinate(one): n for n, one in enumerate(x.levels)}
+    rows = {y.coordinate(one): n for n, one in enumerate(y.levels)}
     value = np.full((len(rows), len(columns)), np.nan)
-    for line in kept(lines, figure, study):
-        place = rows[y.place(line.levels[figure.y])], columns[x.place(line.levels[figure.x])]
-        value[place] = line.responses[figure.value].value
+    for line in shown_points(lines, figure, study):
+        coordinate = rows[y.coordinate(line.levels[figure.y])], columns[x.coordinate(line.levels[figure.x])]
+        value[coordinate] = line.responses[figure.value].value
     return Grid(x, y, value)
 
 
-def limits(values: Sequence[Floats], ends: Sequence[Floats], log: bool, share: bool) -> tuple[float, float]:
+def limits(values: Sequence[Floats], bounds: Sequence[Floats], log: bool, share: bool) -> tuple[float, float]:
     """Axis limits that include all values and all finite interval bounds, with padding.
 
-    On a logarithmic axis nonpositive numbers, and bounds far below the smallest value (FAR), are left out.
+    On a logarithmic axis nonpositive numbers, and bounds far below the smallest value (FAR_RATIO), are left out.
     """
-    inner, outer = (np.concatenate([*arrays, np.empty(0)]) for arrays in (values, ends))
+    inner, outer = (np.concatenate([*arrays, np.empty(0)]) for arrays in (values, bounds))
     inner, outer = inner[np.isfinite(inner)], outer[np.isfinite(outer)]
     if log:
         inner, outer = inner[inner > 0], outer[outer > 0]
-        outer = outer[outer > (inner.min() if len(inner) else outer.max(initial=0.0)) / FAR]
-    told = np.concatenate([inner, outer])
-    if not len(told):
+        outer = outer[outer > (inner.min() if len(inner) else outer.max(initial=0.0)) / FAR_RATIO]
+    numbers = np.concatenate([inner, outer])
+    if not len(numbers):
         return (0.1, 1.0) if log else (0.0, 1.0)
-    low, high = float(told.min()), float(told.max())
+    low, high = float(numbers.min()), float(numbers.max())
     if log:
         pad = max((high / low) ** 0.06, 1.15 if high > 2 * low else 1.5)
         return low / pad, high * pad
@@ -306,20 +313,20 @@ def limits(values: Sequence[Floats], ends: Sequence[Floats], log: bool, share: b
 # Candidates of an optimization.
 
 
-def panels(lines: Sequence[Line], search: Search, costs: Mapping[int, float] | None) -> dict[str, Panel]:
+def panels(lines: Sequence[PointRow], search: Search, costs: Mapping[int, float] | None) -> dict[str, Panel]:
     """One panel per objective, constrained response and, if costs are given, cost; by name."""
     names = [one.response for one in search.objectives] + [one.response for one in search.constraints]
     names += ["cost"] * (costs is not None)
     return {name: panel(name, lines, search, costs or {}) for name in dict.fromkeys(names)}
 
 
-def panel(name: str, lines: Sequence[Line], search: Search, costs: Mapping[int, float]) -> Panel:
+def panel(name: str, lines: Sequence[PointRow], search: Search, costs: Mapping[int, float]) -> Panel:
     """The panel of one response, or of `cost`, over the candidates."""
-    nothing = float("nan")
+    nan = float("nan")
     if name == "cost":
-        told: list[Any] = [(costs.get(line.point, nothing), nothing, nothing) for line in lines]
+        summaries: list[Any] = [(costs.get(line.point, nan), nan, nan) for line in lines]
     else:
-        told = [line.responses[name][:3] for line in lines]
+        summaries = [line.responses[name][:3] for line in lines]
     bounds = [
         bound
         for one in search.constraints
@@ -328,45 +335,42 @@ def panel(name: str, lines: Sequence[Line], search: Search, costs: Mapping[int, 
         if bound is not None
     ]
     better = next((f", {one.better} is better" for one in search.objectives if one.response == name), "")
-    value, low, high = np.array(told, dtype=float).reshape(-1, 3).T
+    value, low, high = np.array(summaries, dtype=float).reshape(-1, 3).T
     return Panel(label(name) + better, value, low, high, bounds)
 
 
 # Captions.
 
 
-def caption(figure: Figure, study: Study, lines: Sequence[Line]) -> str:
+def caption(figure: Figure, study: Study, lines: Sequence[PointRow]) -> str:
     """Caption of a figure: its axes, the fixed levels, the number of trials per point, and the markers used."""
     curve = isinstance(figure, Curve)
     value = figure.y if isinstance(figure, Curve) else figure.value
     other = (figure.by, "by") if isinstance(figure, Curve) else (figure.y, "and")
-    told = f"{value} against {figure.x}" + (f" {other[1]} {other[0]}" if other[0] else "")
-    levels = {name: one for name, one in held(figure, study, lines).items() if varies(lines, name)}
-    told += f", at {', '.join(f'{name} = {level(one)}' for name, one in levels.items())}" if levels else ""
-    shown = [line.responses[value] for line in kept(lines, figure, study)]
+    text = f"{value} against {figure.x}" + (f" {other[1]} {other[0]}" if other[0] else "")
+    levels = {name: one for name, one in fixed_levels(figure, study, lines).items() if varies(lines, name)}
+    text += f", at {', '.join(f'{name} = {format_level(one)}' for name, one in levels.items())}" if levels else ""
+    shown = [line.responses[value] for line in shown_points(lines, figure, study)]
     counts = [one.trials for one in shown if one.trials]
     if not counts:
-        return f"{told}. No trial of it is in yet."
-    told += f". n = {min(counts)}" + (f" to {max(counts)}" if max(counts) > min(counts) else "") + " a point"
-    ends = np.array([(one.low, one.high) for one in shown])
-    if not curve or np.isnan(ends).all():
-        return told + "."
-    told += f"; intervals of {100 * metrics.CONFIDENCE:g} %."
-    across = axis(study, lines, figure.x)
-    if in_dots(study, across, len(shown)):
-        return (
-            told.partition(";")[0]
-            + f"; lines: {'running medians' if across.numeric else 'medians'} of the points."
-        )
-    if np.isinf(ends).any():
-        bands = in_bands(across) and not is_drawn(study)
+        return f"{text}. No trial of it is in yet."
+    text += f". n = {min(counts)}" + (f" to {max(counts)}" if max(counts) > min(counts) else "") + " a point"
+    bounds = np.array([(one.low, one.high) for one in shown])
+    if not curve or np.isnan(bounds).all():
+        return text + "."
+    text += f"; intervals of {100 * metrics.CONFIDENCE:g} %."
+    x_axis = axis(study, lines, figure.x)
+    if draws_medians(study, x_axis, len(shown)):
+        return text.partition(";")[0] + f"; lines: {'running medians' if x_axis.numeric else 'medians'} of the points."
+    if np.isinf(bounds).any():
+        bands = draws_bands(x_axis) and not is_sampled(study)
         mark = "band that stops at its line" if bands else "bar that leaves the picture"
-        told += f" A {mark} has no end there: too few trials."
+        text += f" A {mark} has no end there: too few trials."
     if figure.log and any(one.value <= 0 < one.high for one in shown):
-        told += " Triangles: none was seen, and so much at most."
-    return told
+        text += " Triangles: none was seen, and so much at most."
+    return text
 
 
-def varies(lines: Sequence[Line], name: str) -> bool:
+def varies(lines: Sequence[PointRow], name: str) -> bool:
     """Whether a factor has more than one level among the points."""
     return len(distinct(line.levels[name] for line in lines)) > 1

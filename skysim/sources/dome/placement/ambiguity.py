@@ -8,9 +8,9 @@ For each LED that a boresight can reach, the other LEDs of its field are stored 
 of the angle from the center and the azimuth. For every pair of fields (i, j) one field is laid on the other, center on
 center. Every rotation about the center that makes a second LED coincide is tried, and the LEDs that then lie within
 the tolerance are counted. The ambiguity of field i is the maximum over j and over the rotations of
-    share = (1 + coincident LEDs) / (1 + LEDs of the fuller field),
-where the 1 is the center LED. A field is also compared with itself, rotated. A cheap upper bound (`reach`) skips most
-pairs.
+    fraction = (1 + coincident LEDs) / (1 + LEDs of the larger field),
+where the 1 is the center LED. A field is also compared with itself, rotated. A cheap upper bound (`upper_bound`) skips
+most pairs.
 """
 
 from __future__ import annotations
@@ -30,102 +30,100 @@ Ints = NDArray[np.int64]
 class Fields(NamedTuple):
     """The neighbors of each of C center LEDs, in polar image coordinates about it, nearest first.
 
-    centre : (C,) the LED;  first : (C + 1,) neighbor n belongs to centre[c] where first[c] <= n < first[c + 1]
-    radius, angle_rad : (M,) tangent of the angle from the center, and the azimuth;  alike : (C,) tolerance, a tangent
+    center : (C,) the LED;  first : (C + 1,) neighbor n belongs to center[c] where first[c] <= n < first[c + 1]
+    radius, angle_rad : (M,) tangent of the angle from the center, and the azimuth;  tolerance : (C,) a tangent
     """
 
-    centre: Ints
+    center: Ints
     first: Ints
     radius: Floats
     angle_rad: Floats
-    alike: Floats
+    tolerance: Floats
 
 
 class Ambiguity(NamedTuple):
     """For the field about each of C LEDs, the most similar other field.
 
     led, other : (C,) numbers of the LEDs at the centers of the field and of its most similar one
-    share      : (C,) fraction of LEDs that coincide, of those in the fuller of the two fields; the center LEDs count
+    fraction   : (C,) fraction of LEDs that coincide, of those in the larger of the two fields; the center LEDs count
     """
 
     led: Ints
     other: Ints
-    share: Floats
+    fraction: Floats
 
 
 def field_ambiguity(
-    place_m: Floats, height_m: float, tilt_rad: float, radius_rad: float, alike_m: float
+    place_m: Floats, height_m: float, tilt_rad: float, radius_rad: float, coincidence_m: float
 ) -> Ambiguity:
     """For every LED that the boresight can reach, the largest fraction of its field that another attitude also shows.
 
     place_m    : (N, 3) in the lab, origin at the bearing's center
     height_m   : of the entrance pupil above the bearing, along the boresight (its lateral offset is neglected)
     tilt_rad   : fields are centered on the LEDs within this angle from the zenith;  radius_rad : of the field, round
-    alike_m    : two LEDs coincide if they are nearer than this after one field is laid on the other
+    coincidence_m : two LEDs coincide if they are nearer than this after one field is laid on the other
     One center LED is laid on another and the field is rotated about it. For a camera on its lever arm that is a
     rotation about the bearing. The rotations tried are those that bring a second LED to coincide. A field is also
     laid on itself, rotated. Coincidence is judged in the camera's perspective, so on a dome that is not a sphere the
     fields differ.
     """
-    fields = fields_about(place_m, height_m, tilt_rad, radius_rad, alike_m)
-    share, other = most_similar(fields)
-    return Ambiguity(fields.centre, fields.centre[other], share)
+    fields = fields_about(place_m, height_m, tilt_rad, radius_rad, coincidence_m)
+    fraction, other = most_similar(fields)
+    return Ambiguity(fields.center, fields.center[other], fraction)
 
 
-def fields_about(
-    place_m: Floats, height_m: float, tilt_rad: float, radius_rad: float, alike_m: float
-) -> Fields:
+def fields_about(place_m: Floats, height_m: float, tilt_rad: float, radius_rad: float, coincidence_m: float) -> Fields:
     """The neighbors of every LED within the tilt, as seen with that LED on the boresight."""
     range_m = np.linalg.norm(place_m, axis=1)
     up = place_m / range_m[:, None]
-    centre = np.flatnonzero(up[:, 2] >= math.cos(tilt_rad))
+    center = np.flatnonzero(up[:, 2] >= math.cos(tilt_rad))
     # Image axes: x = y_lab x boresight, which is defined because the tilt stays below 90 deg.
-    across = np.cross([0.0, 1.0, 0.0], up[centre])
+    across = np.cross([0.0, 1.0, 0.0], up[center])
     across /= np.linalg.norm(across, axis=1, keepdims=True)
-    x_m, y_m = across @ place_m.T, np.cross(up[centre], across) @ place_m.T
-    ahead_m = up[centre] @ place_m.T - height_m
+    x_m, y_m = across @ place_m.T, np.cross(up[center], across) @ place_m.T
+    ahead_m = up[center] @ place_m.T - height_m
     radius = np.hypot(x_m, y_m) / np.where(ahead_m > 0, ahead_m, np.nan)
-    radius[np.arange(len(centre)), centre] = np.nan  # the center LED is not its own neighbor
+    radius[np.arange(len(center)), center] = np.nan  # the center LED is not its own neighbor
     row, led = np.nonzero(radius <= math.tan(radius_rad))
     radius, angle_rad = radius[row, led], np.arctan2(y_m[row, led], x_m[row, led])
     order = np.lexsort((radius, row))
-    first = np.concatenate([[0], np.cumsum(np.bincount(row, minlength=len(centre)))])
-    alike = alike_m / (range_m[centre] - height_m)
-    return Fields(centre, first, radius[order], angle_rad[order], alike)
+    first = np.concatenate([[0], np.cumsum(np.bincount(row, minlength=len(center)))])
+    tolerance = coincidence_m / (range_m[center] - height_m)
+    return Fields(center, first, radius[order], angle_rad[order], tolerance)
 
 
 @jit
 def most_similar(fields: Fields) -> tuple[Floats, Ints]:
-    """(C,) greatest share of each field that another field has, and (C,) the index of that field."""
-    count = len(fields.centre)
-    share, other = np.zeros(count), np.arange(count)
+    """(C,) greatest fraction of each field that another field shows too, and (C,) the index of that field."""
+    count = len(fields.center)
+    fraction, other = np.zeros(count), np.arange(count)
     for i in range(count):
         for j in range(i, count):
-            fuller = 1 + max(fields.first[i + 1] - fields.first[i], fields.first[j + 1] - fields.first[j])
+            larger = 1 + max(fields.first[i + 1] - fields.first[i], fields.first[j + 1] - fields.first[j])
             # The exact search is needed only if the pair can raise the maximum of one of its two fields.
-            enough = min(share[i], share[j]) * fuller
-            alike = (1 + coincide(fields, i, j, enough - 1)) / fuller
-            if alike > share[i]:
-                share[i], other[i] = alike, j
-            if alike > share[j]:
-                share[j], other[j] = alike, i
-    return share, other
+            threshold = min(fraction[i], fraction[j]) * larger
+            overlap = (1 + max_coincident(fields, i, j, threshold - 1)) / larger
+            if overlap > fraction[i]:
+                fraction[i], other[i] = overlap, j
+            if overlap > fraction[j]:
+                fraction[j], other[j] = overlap, i
+    return fraction, other
 
 
 @jit
-def coincide(fields: Fields, i: int, j: int, enough: float) -> int:
-    """The most neighbors of i that coincide with ones of j at any rotation; 0 if no more than `enough` can."""
-    first, radius, angle, alike = fields.first, fields.radius, fields.angle_rad, fields.alike[i]
-    if upper_bound(fields, i, j) <= enough:
+def max_coincident(fields: Fields, i: int, j: int, threshold: float) -> int:
+    """The most neighbors of i that coincide with ones of j at any rotation; 0 if no more than `threshold` can."""
+    first, radius, angle, tolerance = fields.first, fields.radius, fields.angle_rad, fields.tolerance[i]
+    if upper_bound(fields, i, j) <= threshold:
         return 0
     most, begin = 0, first[j]
     for k in range(first[i], first[i + 1]):
         # Radii ascend, so the window of equal radii in field j only moves forward.
-        while begin < first[j + 1] and radius[begin] < radius[k] - alike:
+        while begin < first[j + 1] and radius[begin] < radius[k] - tolerance:
             begin += 1
         n = begin
-        while n < first[j + 1] and radius[n] <= radius[k] + alike:
-            # The identity, which lays a field on itself unrotated, is no ambiguity.
+        while n < first[j + 1] and radius[n] <= radius[k] + tolerance:
+            # The identity, a field laid on itself without rotation, is no ambiguity.
             if i != j or n != k:
                 most = max(most, count_coincident(fields, i, j, angle[n] - angle[k]))
             n += 1
@@ -134,29 +132,29 @@ def coincide(fields: Fields, i: int, j: int, enough: float) -> int:
 
 @jit
 def upper_bound(fields: Fields, i: int, j: int) -> int:
-    """Upper bound of `met` over all rotations: neighbors of i that have a neighbor of j at an equal radius."""
-    first, radius, alike = fields.first, fields.radius, fields.alike[i]
+    """Upper bound of `count_coincident` over all rotations: neighbors of i with a neighbor of j at an equal radius."""
+    first, radius, tolerance = fields.first, fields.radius, fields.tolerance[i]
     total, n = 0, first[j]
     for k in range(first[i], first[i + 1]):
-        while n < first[j + 1] and radius[n] < radius[k] - alike:
+        while n < first[j + 1] and radius[n] < radius[k] - tolerance:
             n += 1
-        total += n < first[j + 1] and radius[n] <= radius[k] + alike
+        total += n < first[j + 1] and radius[n] <= radius[k] + tolerance
     return total
 
 
 @jit
-def count_coincident(fields: Fields, i: int, j: int, turn_rad: float) -> int:
+def count_coincident(fields: Fields, i: int, j: int, rotation_rad: float) -> int:
     """Number of neighbors of i that coincide with a neighbor of j after field i is rotated by turn_rad."""
-    first, radius, angle, alike = fields.first, fields.radius, fields.angle_rad, fields.alike[i]
+    first, radius, angle, tolerance = fields.first, fields.radius, fields.angle_rad, fields.tolerance[i]
     total, begin = 0, first[j]
     for k in range(first[i], first[i + 1]):
-        while begin < first[j + 1] and radius[begin] < radius[k] - alike:
+        while begin < first[j + 1] and radius[begin] < radius[k] - tolerance:
             begin += 1
         n = begin
-        while n < first[j + 1] and radius[n] <= radius[k] + alike:
-            off_rad = angle[n] - angle[k] - turn_rad
-            chord = 2 * radius[k] * math.sin(off_rad / 2)
-            if (radius[n] - radius[k]) ** 2 + chord**2 <= alike**2:
+        while n < first[j + 1] and radius[n] <= radius[k] + tolerance:
+            difference_rad = angle[n] - angle[k] - rotation_rad
+            chord = 2 * radius[k] * math.sin(difference_rad / 2)
+            if (radius[n] - radius[k]) ** 2 + chord**2 <= tolerance**2:
                 total += 1
                 break
             n += 1

@@ -8,8 +8,8 @@ so that b x d is a row of the Jacobian J_i (2, 3) of LED i. With independent err
 tangent, the rotation has the covariance sigma^2 M^-1, with the information M = sum_i J_i'J_i over the LEDs in view, and
 the total variance sigma^2 tr(M^-1). `optimize` minimizes tr(M^-1), summed over attitudes with a high power.
 
-J_i'J_i is computed once per round for every pair of a site and an attitude that sees it (`look`). Moving an LED then
-only adds and subtracts terms in the sums of the attitudes concerned.
+J_i'J_i is computed once per round for every pair of a site and an attitude that sees it (`visible_from`). Moving an
+LED then only adds and subtracts terms in the sums of the attitudes concerned.
 """
 
 from __future__ import annotations
@@ -28,19 +28,19 @@ Ints = NDArray[np.int64]
 PRIOR_INFORMATION = 1e-6  # prior information, rad^-2, that keeps M invertible when too few LEDs are in view
 HARDNESS = 10  # power of the variance in the soft maximum: 1 is the mean, infinity the worst case
 COLUMNS = 4  # columns of the attitude index per half width of the search window
-MISSING_LED_FACTOR = 1.5  # factor on the variance for each LED that a field has too few
+MISSING_LED_FACTOR = 1.5  # factor on the variance for each LED that a field lacks of the minimum
 
 
 class Visibility(NamedTuple):
     """Which attitudes see each of K sites: those of site k are attitude[start[k]:start[k + 1]].
 
-    told : (M, 7) information J'J of one LED at the site for unit variance of the tangents: xx, yy, zz, xy, xz, yz in
+    information : (M, 7) J'J of one LED at the site for unit variance of the tangents: xx, yy, zz, xy, xz, yz in
         body axes, rad^-2; and a 1, which counts LEDs when rows are added
     """
 
     start: Ints
     attitude: Ints
-    told: Floats
+    information: Floats
 
 
 @jit
@@ -73,14 +73,14 @@ def led_information(b: Floats, camera_m: Floats, out: Floats) -> None:
 
 
 @jit
-def widest(sites_m: Floats, camera_m: Floats, tan_half: Floats) -> float:
+def max_chord(sites_m: Floats, camera_m: Floats, tan_half: Floats) -> float:
     """Upper bound of the chord between the unit vectors from the bearing to a boresight and to a site in its field."""
-    aside_m = math.hypot(camera_m[0], camera_m[1])
+    lateral_m = math.hypot(camera_m[0], camera_m[1])
     chord = 0.0
     for k in range(len(sites_m)):
         range_m = math.sqrt(np.sum(sites_m[k] ** 2))
         ahead_m = max(range_m - camera_m[2], 0.0)
-        sine = (aside_m + math.hypot(tan_half[0], tan_half[1]) * ahead_m) / range_m
+        sine = (lateral_m + math.hypot(tan_half[0], tan_half[1]) * ahead_m) / range_m
         chord = max(chord, 2 * math.sin(math.asin(sine) / 2) if sine < 1 else 2.0)
     return chord
 
@@ -89,13 +89,13 @@ def widest(sites_m: Floats, camera_m: Floats, tan_half: Floats) -> float:
 def visible_from(
     sites_m: Floats, R_body_from_lab: Floats, camera_m: Floats, tan_half: Floats
 ) -> tuple[Ints, Ints, Floats]:
-    """Start, attitude and information as in `Seen`, for every site.
+    """Start, attitude and information as in `Visibility`, for every site.
 
-    Only attitudes whose boresight is within the chord `widest` of the site are tested. To find them, the boresights
+    Only attitudes whose boresight is within the chord `max_chord` of the site are tested. To find them, the boresights
     are sorted into columns of lab x, and by lab y within each column.
     """
-    b, wide = np.empty(3), widest(sites_m, camera_m, tan_half)
-    columns = max(int(2 * COLUMNS / wide), 1)
+    b, chord = np.empty(3), max_chord(sites_m, camera_m, tan_half)
+    columns = max(int(2 * COLUMNS / chord), 1)
     column = np.minimum(((R_body_from_lab[:, 2, 0] + 1) / 2 * columns).astype(np.int64), columns - 1)
     # |y| <= 1, so the factor 4 keeps the columns apart in one sort key.
     order = np.argsort(4.0 * column + R_body_from_lab[:, 2, 1])
@@ -105,14 +105,14 @@ def visible_from(
     attitude, information = np.empty(1024, dtype=np.int64), np.empty((1024, 7))
     m = 0
     for k in range(len(sites_m)):
-        up = sites_m[k] / math.sqrt(np.sum(sites_m[k] ** 2))
-        left = max(int((up[0] - wide + 1) / 2 * columns), 0)
-        right = min(int((up[0] + wide + 1) / 2 * columns), columns - 1)
+        direction = sites_m[k] / math.sqrt(np.sum(sites_m[k] ** 2))
+        left = max(int((direction[0] - chord + 1) / 2 * columns), 0)
+        right = min(int((direction[0] + chord + 1) / 2 * columns), columns - 1)
         for c in range(left, right + 1):
-            those = y[first[c] : first[c + 1]]
+            column_y = y[first[c] : first[c + 1]]
             for q in range(
-                first[c] + np.searchsorted(those, up[1] - wide),
-                first[c] + np.searchsorted(those, up[1] + wide),
+                first[c] + np.searchsorted(column_y, direction[1] - chord),
+                first[c] + np.searchsorted(column_y, direction[1] + chord),
             ):
                 if not in_field(R[q], sites_m[k], camera_m, tan_half, b):
                     continue
@@ -127,16 +127,16 @@ def visible_from(
 
 
 def total_information(place_m: Floats, R_body_from_lab: Floats, camera_m: Floats, tan_half: Floats) -> Floats:
-    """(A, 7) information of all LEDs in the field of each attitude, as in `Seen`; the last column is their number."""
-    seen = Visibility(*visible_from(place_m, R_body_from_lab, camera_m, tan_half))
-    return sum_information(np.arange(len(place_m)), seen, len(R_body_from_lab))
+    """(A, 7) information of all LEDs in the field of each attitude; the last column is their number."""
+    visibility = Visibility(*visible_from(place_m, R_body_from_lab, camera_m, tan_half))
+    return sum_information(np.arange(len(place_m)), visibility, len(R_body_from_lab))
 
 
 @jit
 def variance(m: Floats) -> float:
     """tr(M^-1) of a symmetric (3, 3) matrix given as (6,): the rotation's variance for tangents of unit variance.
 
-    Principal minors over the determinant, with UNKNOWN added to the diagonal.
+    Principal minors over the determinant, with PRIOR_INFORMATION added to the diagonal.
     """
     a, b, c, d, e, f = (
         m[0] + PRIOR_INFORMATION,
@@ -147,8 +147,8 @@ def variance(m: Floats) -> float:
         m[5],
     )
     minors = (a * b - d * d) + (a * c - e * e) + (b * c - f * f)
-    whole = a * (b * c - f * f) - d * (d * c - e * f) + e * (d * f - b * e)
-    return minors / max(whole, 1e-30)
+    determinant = a * (b * c - f * f) - d * (d * c - e * f) + e * (d * f - b * e)
+    return minors / max(determinant, 1e-30)
 
 
 @jit
@@ -161,48 +161,48 @@ def variances(total: Floats) -> Floats:
 
 
 @jit
-def cost(m: Floats, wanted: int) -> float:
-    """One attitude's term of the soft maximum: (SHORT^missing tr(M^-1))^HARDNESS, missing = max(wanted - LEDs, 0)."""
-    each = variance(m)
-    for _ in range(wanted - round(m[6])):
-        each *= MISSING_LED_FACTOR
-    return each**HARDNESS
+def cost(m: Floats, min_leds: int) -> float:
+    """One attitude's term of the soft maximum: (MISSING_LED_FACTOR^missing tr(M^-1))^HARDNESS."""
+    effective = variance(m)
+    for _ in range(min_leds - round(m[6])):  # LEDs missing from the field
+        effective *= MISSING_LED_FACTOR
+    return effective**HARDNESS
 
 
 @jit
-def costs(total: Floats, wanted: int) -> Floats:
+def costs(total: Floats, min_leds: int) -> Floats:
     """(A,) `cost` of every attitude."""
     out = np.empty(len(total))
     for a in range(len(total)):
-        out[a] = cost(total[a], wanted)
+        out[a] = cost(total[a], min_leds)
     return out
 
 
 @jit
-def sum_information(chosen: Ints, seen: Visibility, attitude_count: int) -> Floats:
-    """(A, 7) information of every attitude, as `told`, summed from the stored terms of the chosen sites."""
+def sum_information(chosen: Ints, visibility: Visibility, attitude_count: int) -> Floats:
+    """(A, 7) information of every attitude, summed from the stored terms of the chosen sites."""
     total = np.zeros((attitude_count, 7))
     for site in chosen:
-        add(site, 1, seen, total)
+        add_led(site, 1, visibility, total)
     return total
 
 
 @jit
-def add(site: int, sign: int, seen: Visibility, total: Floats) -> None:
+def add_led(site: int, sign: int, visibility: Visibility, total: Floats) -> None:
     """Add (sign 1) or remove (-1) an LED at a site in the sums of the attitudes that see it. In place."""
-    for m in range(seen.start[site], seen.start[site + 1]):
-        a = seen.attitude[m]
+    for m in range(visibility.start[site], visibility.start[site + 1]):
+        a = visibility.attitude[m]
         for i in range(7):
-            total[a, i] += sign * seen.told[m, i]
+            total[a, i] += sign * visibility.information[m, i]
 
 
 @jit
-def update_costs(site: int, seen: Visibility, total: Floats, each: Floats, wanted: int) -> float:
-    """Recompute the cost of the attitudes that see a site, in place in `each`, and return the change of its sum."""
+def update_costs(site: int, visibility: Visibility, total: Floats, attitude_cost: Floats, min_leds: int) -> float:
+    """Recompute the cost of the attitudes that see a site, in place, and return the change of the sum."""
     change = 0.0
-    for m in range(seen.start[site], seen.start[site + 1]):
-        a = seen.attitude[m]
-        fresh = cost(total[a], wanted)
-        change += fresh - each[a]
-        each[a] = fresh
+    for m in range(visibility.start[site], visibility.start[site + 1]):
+        a = visibility.attitude[m]
+        new_cost = cost(total[a], min_leds)
+        change += new_cost - attitude_cost[a]
+        attitude_cost[a] = new_cost
     return change

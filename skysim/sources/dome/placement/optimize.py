@@ -2,22 +2,23 @@
 
 What a camera on its lever arm can learn about the attitude a from the LEDs in its field is the Fisher information of
 the rotation-only solution, M_a = sum_i J_i'J_i (`fisher`). It does not depend on any estimator. The search minimizes
-    sum_a (SHORT^missing_a tr(M_a^-1))^HARDNESS,
+    sum_a (MISSING_LED_FACTOR^missing_a tr(M_a^-1))^HARDNESS,
 a smooth substitute for the worst case over all attitudes to the greatest tilt, in which missing_a is the number of
-LEDs that the field lacks of `wanted`. It is a local search: LEDs take turns, each is offered a random site nearby,
-and a move is kept if it lowers the sum and respects the least spacing. Because no finite set of attitudes contains
-the worst one, the hardest attitudes of a fresh random sample join the set between generations (`hardest`).
+LEDs that the field lacks of `min_leds`. It is a local search: each LED in turn is tried at a random site nearby, and
+the move is kept if it lowers the sum and respects the least spacing. Because no finite set of attitudes contains the
+worst one, the hardest attitudes of a fresh random sample join the set between generations (`hardest_attitudes`).
 
-The search starts from even layouts: Fibonacci spirals and a Poisson-disc sample of the sites, the best of them also
-contracted toward the zenith. A final stage nudges LEDs whose fields of view are too similar to another field
-(`set_apart`). Layouts are compared by the mean variance of the worst 1 % of independent attitudes (`Exam`). By this
-measure the result is never worse than the even layouts; at a single attitude it can be.
+The search starts from even layouts: Fibonacci spirals and a Poisson-disk sample of the sites, the best of them also
+contracted toward the zenith. A final stage moves LEDs whose fields of view are too similar to another field
+(`reduce_ambiguity`). Layouts are compared by the mean variance of the worst 1 % of independent attitudes
+(`PlacementScore`). By this measure the result is never worse than the even layouts; at a single attitude it can be.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -32,7 +33,7 @@ from skysim.scene import leds
 from skysim.sources.dome.placement.ambiguity import Ambiguity, field_ambiguity
 from skysim.sources.dome.placement.fisher import (
     Visibility,
-    add,
+    add_led,
     costs,
     sum_information,
     total_information,
@@ -40,307 +41,390 @@ from skysim.sources.dome.placement.fisher import (
     variances,
     visible_from,
 )
-from skysim.sources.dome.surface import Inside
+from skysim.sources.dome.surface import Surface
 
 Ints = NDArray[np.int64]
 
-SITES_AN_LED = 500  # candidate sites per LED: their spacing is a twentieth of the LEDs' own
-EVEN = 10  # sites per LED that suffice for an even layout
-HALVINGS = 12  # bisection steps of its spacing, which starts between the least spacing and the sites' extent
-# Step sizes (least, greatest) in units of the LEDs' spacing, and the fraction of the field that the search uses. The
-# smaller field keeps a margin, because attitudes between the sampled ones lose LEDs at the edge. Where a field holds
-# few LEDs, evenness matters most and steps must be small; where it holds many, larger steps gain more.
-FEW = 8.0  # LEDs in a field, on average, below which the search is CAREFUL
-CAREFUL, BOLD = ((0.02, 0.06), 0.93), ((0.01, 0.3), 0.97)
-SEERS = 400  # attitudes that see a site: a field's border passes it in steps of a twentieth of the field
-FEWEST, MOST = 2000, 20_000  # limits of the number of attitudes in the cost
 GOLDEN = 1.2207440846057596  # g^4 = g + 1: base of the R3 low-discrepancy sequence (Roberts 2018; assumed)
-EXAMINED = 40_000  # attitudes by which layouts are compared
-TAIL = 0.01  # fraction of them, the worst, whose mean variance is compared
-DRAWN_IN = (0.98, 0.96, 0.94, 0.92, 0.9, 0.88, 0.86, 0.84)  # of the solid angle, for contracted layouts
-GENERATIONS = 15  # of attitudes: after each the hardest of fresh ones join the cost
-KEPT = 3  # every so many generations the layout is kept as a candidate
-DRAWN, HARDEST = 20_000, 600  # fresh attitudes, and how many of them are kept
-SHAKES, SHAKE = 6, 0.1  # random perturbations of each of the hardest attitudes, and their size in half fields
-HALF = 0.5  # fraction of a field's LEDs that may coincide with another field's
-NUDGES = 100  # tries to make a field differ
-BESIDE = 60  # nearest sites that a nudged LED may take: a fifth of the LEDs' own spacing
-ABOUT = 4  # LEDs nearest to the center of a field, one of which is nudged
-SLACK = 0.02  # relative rise of the worst variance that the nudges may cost
-BLIND = 0.95  # part of the field in which nudges must not leave more attitudes with fewer than two LEDs
 
 
-class Exam(NamedTuple):
-    """Comparison of layouts on (A, 3, 3) attitudes that no search uses.
+@dataclass(frozen=True, slots=True)
+class PlacementOptions:
+    """Settings of the placement search; `OPTIONS` holds the defaults.
 
-    limit : mean variance of the worst TAIL of attitudes, for the best of the even layouts
+    Sites and starting layouts
+    sites_per_led      : candidate sites per LED; their spacing is then a twentieth of the LEDs' own
+    even_sites_per_led : sites per LED that suffice for an even layout
+    bisections         : steps that find its spacing, between the least spacing and the sites' extent
+    contractions       : fractions of the solid angle to which the best even layout is contracted
+
+    Local search
+    sparse_below    : mean number of LEDs in a field below which the sparse settings apply, else the dense ones. With
+                      few LEDs in a field evenness matters most and steps must be small; with many, larger steps gain
+                      more.
+    sparse_steps, dense_steps : (least, greatest) step in units of the LEDs' spacing
+    sparse_field, dense_field : fraction of the field that the search uses. The margin is for attitudes between the
+                      sampled ones, which lose LEDs at the edge.
+    views_per_site  : sampled attitudes that see a site; a field's border passes it in steps of a twentieth of the field
+    min_attitudes, max_attitudes : limits of the number of sampled attitudes
+    generations     : rounds are divided into so many; after each the hardest of fresh attitudes join the sample
+    keep_every      : generations from one candidate layout to the next
+
+    Hardest attitudes
+    fresh_attitudes, hardest_attitudes : size of a fresh sample, and how many of it are kept
+    perturbations, perturbation_size   : random rotations tried for each of these, and their size in half fields
+
+    Comparison of layouts
+    score_attitudes : number of independent attitudes
+    tail_fraction   : fraction of them, the worst, whose mean variance is compared
+    inner_field     : part of the field in which fewer than two LEDs count as too few
+
+    Ambiguity
+    max_overlap      : fraction of a field's LEDs that may coincide with another field's
+    ambiguity_trials : tries to move one LED of an ambiguous field
+    central_leds     : LEDs nearest to the field's center, one of which is moved
+    nearby_sites     : nearest sites that it may take; they reach a fifth of the LEDs' own spacing
+    variance_slack   : relative rise of the worst variances that the moves may cost in total
     """
 
-    part: leds.OptimisedConfig
-    R_body_from_lab: Floats
-    limit: float
+    sites_per_led: int = 500
+    even_sites_per_led: int = 10
+    bisections: int = 12
+    contractions: tuple[float, ...] = (0.98, 0.96, 0.94, 0.92, 0.9, 0.88, 0.86, 0.84)
 
-    def mark(self, place_m: Floats) -> float:
-        """Mean variance of the worst TAIL of attitudes over the limit: 1 or less is as good as any even layout.
+    sparse_below: float = 8.0
+    sparse_steps: tuple[float, float] = (0.02, 0.06)
+    sparse_field: float = 0.93
+    dense_steps: tuple[float, float] = (0.01, 0.3)
+    dense_field: float = 0.97
+    views_per_site: int = 400
+    min_attitudes: int = 2000
+    max_attitudes: int = 20_000
+    generations: int = 15
+    keep_every: int = 3
+
+    fresh_attitudes: int = 20_000
+    hardest_attitudes: int = 600
+    perturbations: int = 6
+    perturbation_size: float = 0.1
+
+    score_attitudes: int = 40_000
+    tail_fraction: float = 0.01
+    inner_field: float = 0.95
+
+    max_overlap: float = 0.5
+    ambiguity_trials: int = 100
+    central_leds: int = 4
+    nearby_sites: int = 60
+    variance_slack: float = 0.02
+
+
+OPTIONS = PlacementOptions()
+
+
+class PlacementScore(NamedTuple):
+    """Comparison of layouts on (A, 3, 3) attitudes that no search uses.
+
+    reference : tail variance of the best even layout, the unit of `tail_variance`
+    """
+
+    config: leds.OptimizedConfig
+    options: PlacementOptions
+    R_body_from_lab: Floats
+    reference: float = 1.0
+
+    def tail_variance(self, place_m: Floats) -> float:
+        """Mean variance of the worst attitudes over the reference: 1 or less is as good as any even layout.
 
         The single worst attitude is unstable: it depends on one LED at the field's edge and on the sampling.
         """
-        each = np.sort(variances(total_information(place_m, self.R_body_from_lab, *camera(self.part))))
-        return float(each[-math.ceil(TAIL * len(each)) :].mean()) / self.limit
+        variance = np.sort(variances(total_information(place_m, self.R_body_from_lab, *camera_geometry(self.config))))
+        tail = math.ceil(self.options.tail_fraction * len(variance))
+        return float(variance[-tail:].mean()) / self.reference
 
-    def blind(self, place_m: Floats) -> int:
-        """Number of attitudes with fewer than two LEDs in the BLIND part of the field; two fix an attitude."""
-        return int(
-            np.sum(total_information(place_m, self.R_body_from_lab, *camera(self.part, BLIND))[:, 6] < 2)
-        )
+    def under_two(self, place_m: Floats) -> int:
+        """Number of attitudes with fewer than two LEDs in the inner part of the field; two fix an attitude."""
+        geometry = camera_geometry(self.config, self.options.inner_field)
+        return int(np.sum(total_information(place_m, self.R_body_from_lab, *geometry)[:, 6] < 2))
+
+    def score(self, place_m: Floats, rng: np.random.Generator) -> tuple[bool, bool, float]:
+        """Sort key of layouts, less is better.
+
+        In this order: whether an even layout is better in the worst attitudes; whether an attitude was found that
+        sees fewer than two LEDs; the tail variance, times 1 + the fraction of ambiguous fields.
+        """
+        tail, ambiguity = self.tail_variance(place_m), layout_ambiguity(self.config, place_m)
+        hardest = hardest_attitudes(self.config, self.options, place_m, 1.0, rng)
+        fewest = total_information(place_m, hardest, *camera_geometry(self.config))[:, 6].min()
+        ambiguous = float(np.mean(ambiguity.fraction > self.options.max_overlap))
+        return tail > 1, bool(fewest < 2), tail * (1 + ambiguous)
 
 
-def places(
-    part: leds.OptimisedConfig, sites_m: Floats, begin_m: Sequence[Floats], rng: np.random.Generator
+def optimize_places(
+    config: leds.OptimizedConfig,
+    sites_m: Floats,
+    starts_m: Sequence[Floats],
+    rng: np.random.Generator,
+    options: PlacementOptions,
 ) -> Floats:
-    """(N, 3) sites, m, at which part.count LEDs make the worst attitudes within the tilt as good as possible.
+    """(N, 3) sites, m, at which config.count LEDs make the worst attitudes within the tilt as good as possible.
 
-    sites_m : (K, 3) allowed places in the lab, on the surface within its rim and cap; K = SITES_AN_LED times the
-        count
-    begin_m : (N, 3) each, layouts to start from; a Poisson-disc sample of the sites, as even as possible, is added
-    1. The best even layout by `Exam.mark` sets the limit. It is also contracted toward the zenith by DRAWN_IN.
-    2. From the best of these `searched` descends sum_a c_a^HARDNESS, c_a = SHORT^missing tr((sum_i J_i'J_i)^-1),
-       over attitudes a to the tilt. The Jacobian J_i of LED i is with respect to a rotation about the bearing. Steps
-       are small, because evenness once lost is not regained, but they suffice to make one field differ from others.
-    3. The best by `worth` of all layouts reached is kept, so no even layout is better in the worst attitudes.
-    4. `set_apart` reduces the ambiguity between fields; its result is kept if `worth` prefers it.
+    sites_m  : (K, 3) allowed places in the lab, on the surface within its rim and cap; options.sites_per_led times
+               the count
+    starts_m : (N, 3) each, layouts to start from; a Poisson-disk sample of the sites, as even as possible, is added
+    1. The best even layout by `PlacementScore.tail_variance` sets the reference. It is also contracted toward the
+       zenith.
+    2. From the best of these `descend` lowers sum_a c_a^HARDNESS, c_a = MISSING_LED_FACTOR^missing
+       tr((sum_i J_i'J_i)^-1), over attitudes a to the tilt. The Jacobian J_i of LED i is with respect to a rotation
+       about the bearing. Steps are small, because evenness once lost is not regained, but they suffice to make one
+       field differ from others.
+    3. The best by `PlacementScore.score` of all layouts reached is kept, so no even layout is better in the worst
+       attitudes.
+    4. `reduce_ambiguity` changes ambiguous fields; its result is kept if `score` prefers it.
     Raises InputError if not all LEDs find room at the spacing.
     """
-    beginnings = [one for one in begin_m if roomy(one, part.spacing_m)]
-    chosen = evenly(sites_m[: EVEN * part.count], part.spacing_m, part.count)
-    if len(chosen) == part.count:
-        beginnings.append(sites_m[chosen])
-    if not beginnings:
+    few_sites_m = sites_m[: options.even_sites_per_led * config.count]
+    even = [start_m for start_m in starts_m if spacing_ok(start_m, config.spacing_m)]
+    chosen = spread(few_sites_m, config.spacing_m, config.count, options.bisections)
+    if len(chosen) == config.count:
+        even.append(sites_m[chosen])
+    if not even:
         raise InputError(
-            f"light.layout.spacing: {len(chosen)} of {part.count} LEDs find room {part.spacing_m:.3g} m apart where a"
-            f" tilt of {part.tilt_deg:g} deg looks; allowed: fewer, nearer to each other, or a greater cap_deg"
+            f"light.layout.spacing: {len(chosen)} of {config.count} LEDs fit {config.spacing_m:.3g} m apart where the"
+            f" field reaches at a tilt of {config.tilt_deg:g} deg; allowed: fewer LEDs, less spacing, or a greater"
+            " cap_deg"
         )
-    share = seen_share(part, sites_m[: EVEN * part.count], rng)
-    exam = Exam(part, attitudes(part, EXAMINED, rng), 1.0)
-    even_m = min(beginnings, key=exam.mark)
-    exam = exam._replace(limit=exam.mark(even_m))
-    drawn = [drawn_in(even_m, sites_m, share) for share in DRAWN_IN]
-    begun_m = min([even_m, *(one for one in drawn if roomy(one, part.spacing_m))], key=exam.mark)
-    best_m = min([even_m, begun_m], key=lambda one: worth(exam, one, rng))
-    steps, edge = CAREFUL if share * part.count < FEW else BOLD
-    judged = int(np.clip(SEERS / max(share, 1e-9), FEWEST, MOST))
-    found = searched(Search(part, sites_m, cKDTree(sites_m), steps, edge), begun_m, judged, rng)
-    best_m = min([best_m, *found], key=lambda one: worth(exam, one, rng))
-    return min([set_apart(exam, best_m, sites_m, rng), best_m], key=lambda one: worth(exam, one, rng))
+    visible = visible_fraction(config, few_sites_m, rng)
+    scorer = PlacementScore(config, options, sample_attitudes(config, options.score_attitudes, rng))
+    even_m = min(even, key=scorer.tail_variance)
+    scorer = scorer._replace(reference=scorer.tail_variance(even_m))
+    contracted = [contract(even_m, sites_m, fraction) for fraction in options.contractions]
+    start_m = min(
+        [even_m, *(layout_m for layout_m in contracted if spacing_ok(layout_m, config.spacing_m))],
+        key=scorer.tail_variance,
+    )
+
+    def best(layouts_m: Sequence[Floats]) -> Floats:
+        return min(layouts_m, key=lambda layout_m: scorer.score(layout_m, rng))
+
+    best_m = best([even_m, start_m])
+    steps, field_fraction = (
+        (options.sparse_steps, options.sparse_field)
+        if visible * config.count < options.sparse_below
+        else (options.dense_steps, options.dense_field)
+    )
+    search = Search(config, options, sites_m, cKDTree(sites_m), steps, field_fraction)
+    count = np.clip(options.views_per_site / max(visible, 1e-9), options.min_attitudes, options.max_attitudes)
+    best_m = best([best_m, *descend(search, start_m, int(count), rng)])
+    return best([reduce_ambiguity(scorer, best_m, sites_m, rng), best_m])
 
 
-def worth(exam: Exam, place_m: Floats, rng: np.random.Generator) -> tuple[bool, bool, float]:
-    """Sort key of layouts, less is better.
-
-    In this order: whether an even layout is better in the worst attitudes; whether an attitude was found that sees
-    fewer than two LEDs; the worst variances, times 1 + the share of fields of which more than HALF coincides with
-    another field.
-    """
-    mark, like = exam.mark(place_m), alike(exam.part, place_m)
-    whole = Search(exam.part, place_m, cKDTree(place_m), CAREFUL[0], 1.0)
-    fewest = total_information(place_m, hardest(whole, place_m, rng), *whole.camera())[:, 6].min()
-    return mark > 1, bool(fewest < 2), mark * (1 + float(np.mean(like.share > HALF)))
-
-
-def roomy(place_m: Floats, spacing_m: float) -> bool:
+def spacing_ok(place_m: Floats, spacing_m: float) -> bool:
     """Whether no two LEDs are nearer to each other than the spacing."""
     return bool(cKDTree(place_m).query(place_m, k=2)[0][:, 1].min() >= spacing_m)
 
 
-def drawn_in(place_m: Floats, sites_m: Floats, share: float) -> Floats:
-    """(N, 3) sites nearest to a layout that is contracted to this share of its solid angle about the zenith.
+def contract(place_m: Floats, sites_m: Floats, fraction: float) -> Floats:
+    """(N, 3) sites nearest to a layout that is contracted to this fraction of its solid angle about the zenith.
 
     Few attitudes see the rim, so its LEDs help more where more fields overlap. With z = cos(zenith angle) the
-    contraction is 1 - z' = share (1 - z), which scales every solid angle alike.
+    contraction is 1 - z' = fraction (1 - z), which scales every solid angle alike.
     """
-    up = place_m / np.linalg.norm(place_m, axis=1, keepdims=True)
-    z = 1 - share * (1 - up[:, 2])
-    aside = up[:, :2] * np.sqrt((1 - z**2) / np.maximum(1 - up[:, 2] ** 2, 1e-12))[:, None]
-    site_up = sites_m / np.linalg.norm(sites_m, axis=1, keepdims=True)
-    return sites_m[cKDTree(site_up).query(np.column_stack([aside, z]))[1]]
+    direction = place_m / np.linalg.norm(place_m, axis=1, keepdims=True)
+    z = 1 - fraction * (1 - direction[:, 2])
+    xy = direction[:, :2] * np.sqrt((1 - z**2) / np.maximum(1 - direction[:, 2] ** 2, 1e-12))[:, None]
+    site_direction = sites_m / np.linalg.norm(sites_m, axis=1, keepdims=True)
+    return sites_m[cKDTree(site_direction).query(np.column_stack([xy, z]))[1]]
 
 
 class Search(NamedTuple):
-    """Settings of the local search: (K, 3) candidate sites, m, a k-d tree of them, and steps and edge as in CAREFUL."""
+    """Local search: (K, 3) candidate sites, m, a k-d tree of them, the step sizes and the part of the field used."""
 
-    part: leds.OptimisedConfig
+    config: leds.OptimizedConfig
+    options: PlacementOptions
     sites_m: Floats
     tree: cKDTree
     steps: tuple[float, float]
-    edge: float
+    field_fraction: float
 
-    def offers(self, place_m: Floats, rng: np.random.Generator) -> Floats:
+    def propose(self, place_m: Floats, rng: np.random.Generator) -> Floats:
         """(N, 3) one site per LED, a random step away; step lengths are log-uniform between the limits in `steps`."""
-        usual_m = np.median(cKDTree(place_m).query(place_m, k=2)[0][:, 1])
-        least, most = np.log(self.steps)
-        step_m = usual_m * np.exp(rng.uniform(least, most, (len(place_m), 1)))
+        spacing_m = np.median(cKDTree(place_m).query(place_m, k=2)[0][:, 1])
+        low, high = np.log(self.steps)
+        step_m = spacing_m * np.exp(rng.uniform(low, high, (len(place_m), 1)))
         return self.sites_m[self.tree.query(place_m + step_m * rng.standard_normal(place_m.shape))[1]]
 
-    def camera(self) -> tuple[Floats, Floats]:
-        """As `camera`, with the part of the field that the search uses."""
-        return camera(self.part, self.edge)
 
+def descend(search: Search, place_m: Floats, attitude_count: int, rng: np.random.Generator) -> list[Floats]:
+    """Layouts, (N, 3) sites each, reached by descent from place_m: one per `keep_every` generations, and the last.
 
-def searched(search: Search, place_m: Floats, judged: int, rng: np.random.Generator) -> list[Floats]:
-    """Layouts, (N, 3) sites each, that the descent from place_m reaches: one every KEPT generations, and the last.
-
-    judged : number of attitudes in the first generation's cost
+    attitude_count : number of attitudes in the first generation's cost
     """
-    part, found, R_body_from_lab = search.part, [], attitudes(search.part, judged, rng)
-    ends = np.linspace(0, part.rounds, GENERATIONS + 1).round().astype(int)[1:-1]
-    for n in range(part.rounds):
-        if n in ends[KEPT - 1 :: KEPT]:
-            found.append(place_m)
+    config, options, field_fraction = search.config, search.options, search.field_fraction
+    candidates, R_body_from_lab = [], sample_attitudes(config, attitude_count, rng)
+    last_rounds = np.linspace(0, config.rounds, options.generations + 1).round().astype(int)[1:-1]
+    for n in range(config.rounds):
+        if n in last_rounds[options.keep_every - 1 :: options.keep_every]:
+            candidates.append(place_m)
         # The descent improves the sampled attitudes at the expense of those between them. Adding the worst of a fresh
         # sample closes these gaps.
-        if n in ends:
-            R_body_from_lab = np.concatenate([R_body_from_lab, hardest(search, place_m, rng)])
-        # Sites 0 to count - 1 are the present places, site count + n is the offer to LED n.
-        both_m = np.concatenate([place_m, search.offers(place_m, rng)])
-        seen = Visibility(*visible_from(both_m, R_body_from_lab, *search.camera()))
-        chosen, who = np.arange(part.count), rng.permutation(part.count)
-        exchange(
-            chosen, both_m, seen, len(R_body_from_lab), part.wanted, part.spacing_m, who, who + part.count
+        if n in last_rounds:
+            hardest = hardest_attitudes(config, options, place_m, field_fraction, rng)
+            R_body_from_lab = np.concatenate([R_body_from_lab, hardest])
+        # Sites 0 to count - 1 are the present places, site count + n is the one proposed to LED n.
+        both_m = np.concatenate([place_m, search.propose(place_m, rng)])
+        visibility = Visibility(*visible_from(both_m, R_body_from_lab, *camera_geometry(config, field_fraction)))
+        chosen, order = np.arange(config.count), rng.permutation(config.count)
+        try_moves(
+            chosen,
+            both_m,
+            visibility,
+            len(R_body_from_lab),
+            config.min_leds,
+            config.spacing_m,
+            order,
+            order + config.count,
         )
         place_m = both_m[chosen]
-    return [*found, place_m]
+    return [*candidates, place_m]
 
 
-def seen_share(part: leds.OptimisedConfig, sites_m: Floats, rng: np.random.Generator) -> float:
+def visible_fraction(config: leds.OptimizedConfig, sites_m: Floats, rng: np.random.Generator) -> float:
     """Mean fraction of the sites that an attitude sees; times the number of LEDs it is the mean number in a field."""
-    return float(total_information(sites_m, attitudes(part, 200, rng), *camera(part))[:, 6].mean()) / len(
-        sites_m
-    )
+    total = total_information(sites_m, sample_attitudes(config, 200, rng), *camera_geometry(config))
+    return float(total[:, 6].mean()) / len(sites_m)
 
 
-def hardest(search: Search, place_m: Floats, rng: np.random.Generator) -> Floats:
+def hardest_attitudes(
+    config: leds.OptimizedConfig,
+    options: PlacementOptions,
+    place_m: Floats,
+    field_fraction: float,
+    rng: np.random.Generator,
+) -> Floats:
     """(H, 3, 3) R_body_from_lab with the highest cost for these LEDs: the worst of a fresh sample, then perturbed.
 
     Each perturbation is kept if the cost rises. Rotations about the boresight are larger, because they move an LED
     less than rotations across it do: by the tangent of its field angle, at most that of the field's corner.
     """
-    drawn = attitudes(search.part, DRAWN, rng)
-    each = served(search, place_m, drawn)
-    kept = np.argsort(each)[-HARDEST:]
-    worst, each = drawn[kept], each[kept]
-    half = tan_half(search.part)
-    step_rad = SHAKE * half.min() * np.array([1, 1, 1 / math.hypot(*half)])
-    for _ in range(SHAKES):
-        turn = Rotation.from_rotvec(step_rad * rng.standard_normal((len(worst), 3)))
-        beside = turn.as_matrix() @ worst
-        fresh = served(search, place_m, beside)
-        harder = (fresh > each) & (beside[:, 2, 2] >= math.cos(math.radians(search.part.tilt_deg)))
-        worst[harder], each[harder] = beside[harder], fresh[harder]
-    return worst
+
+    def attitude_costs(R_body_from_lab: Floats) -> Floats:
+        geometry = camera_geometry(config, field_fraction)
+        return costs(total_information(place_m, R_body_from_lab, *geometry), config.min_leds)
+
+    sample = sample_attitudes(config, options.fresh_attitudes, rng)
+    sample_cost = attitude_costs(sample)
+    worst = np.argsort(sample_cost)[-options.hardest_attitudes :]
+    hardest, cost = sample[worst], sample_cost[worst]
+    half = tan_half(config)
+    step_rad = options.perturbation_size * half.min() * np.array([1, 1, 1 / math.hypot(*half)])
+    for _ in range(options.perturbations):
+        perturbation = Rotation.from_rotvec(step_rad * rng.standard_normal((len(hardest), 3)))
+        perturbed = perturbation.as_matrix() @ hardest
+        new_cost = attitude_costs(perturbed)
+        harder = (new_cost > cost) & (perturbed[:, 2, 2] >= math.cos(math.radians(config.tilt_deg)))
+        hardest[harder], cost[harder] = perturbed[harder], new_cost[harder]
+    return hardest
 
 
-def served(search: Search, place_m: Floats, R_body_from_lab: Floats) -> Floats:
-    """(A,) cost of every attitude in the search's field."""
-    return costs(total_information(place_m, R_body_from_lab, *search.camera()), search.part.wanted)
-
-
-def attitudes(part: leds.OptimisedConfig, count: int, rng: np.random.Generator) -> Floats:
+def sample_attitudes(config: leds.OptimizedConfig, count: int, rng: np.random.Generator) -> Floats:
     """(A, 3, 3) R_body_from_lab: boresights uniform over the cap of the tilt, yaw uniform; a shifted R3 lattice."""
     # R3 sequence: the multiples of 1/g, 1/g^2 and 1/g^3 modulo 1 fill the unit cube evenly.
-    turn = (rng.random(3) + np.arange(count)[:, None] / GOLDEN ** np.arange(1, 4)) % 1
-    tilt = np.arccos(1 - turn[:, 0] * (1 - math.cos(math.radians(part.tilt_deg))))
-    angles = np.column_stack([2 * math.pi * turn[:, 1], tilt, 2 * math.pi * turn[:, 2]])
+    unit = (rng.random(3) + np.arange(count)[:, None] / GOLDEN ** np.arange(1, 4)) % 1
+    tilt = np.arccos(1 - unit[:, 0] * (1 - math.cos(math.radians(config.tilt_deg))))
+    angles = np.column_stack([2 * math.pi * unit[:, 1], tilt, 2 * math.pi * unit[:, 2]])
     return Rotation.from_euler("ZYZ", angles).inv().as_matrix()
 
 
-def camera(part: leds.OptimisedConfig, edge: float = 1.0) -> tuple[Floats, Floats]:
-    """(3,) entrance pupil on the body, m, and (2,) tangents of half the field, scaled by `edge`."""
-    return np.array(part.camera_m), edge * tan_half(part)
+def camera_geometry(config: leds.OptimizedConfig, field_fraction: float = 1.0) -> tuple[Floats, Floats]:
+    """(3,) entrance pupil on the body, m, and (2,) tangents of half the field, scaled by `field_fraction`."""
+    return np.array(config.camera_m), field_fraction * tan_half(config)
 
 
-def tan_half(part: leds.OptimisedConfig) -> Floats:
+def tan_half(config: leds.OptimizedConfig) -> Floats:
     """(2,) tangents of half the field's width and height."""
-    return np.tan(np.radians(part.field_deg) / 2)
+    return np.tan(np.radians(config.field_deg) / 2)
 
 
-def reach_rad(part: leds.OptimisedConfig, inside: Inside) -> float:
+def field_reach_rad(config: leds.OptimizedConfig, surface: Surface) -> float:
     """Greatest angle from the zenith, at the bearing, that the field of any attitude reaches; at most the cap.
 
     Rays around the cone that encloses the field are intersected with the surface, for boresights at the greatest tilt
     in all azimuths and at every yaw.
     """
-    half_diagonal, around = np.hypot(*tan_half(part)), np.linspace(0, 2 * np.pi, 24, endpoint=False)
-    rim = np.column_stack([half_diagonal * np.cos(around), half_diagonal * np.sin(around), np.ones(24)])
-    angles = [(a, math.radians(part.tilt_deg), yaw) for a in around for yaw in around[::2]]
-    most = 0.0
+    half_diagonal, azimuth = np.hypot(*tan_half(config)), np.linspace(0, 2 * np.pi, 24, endpoint=False)
+    cone = np.column_stack([half_diagonal * np.cos(azimuth), half_diagonal * np.sin(azimuth), np.ones(24)])
+    angles = [(a, math.radians(config.tilt_deg), yaw) for a in azimuth for yaw in azimuth[::2]]
+    reach = 0.0
     for lab_from_body in Rotation.from_euler("ZYZ", angles):
-        met_m = inside.meet(lab_from_body.apply(np.array(part.camera_m)), lab_from_body.apply(rim))
+        met_m = surface.meet(lab_from_body.apply(np.array(config.camera_m)), lab_from_body.apply(cone))
         met_m = met_m[np.isfinite(met_m[:, 0])]
-        most = max(most, *np.arctan2(np.hypot(*met_m.T[:2]), met_m[:, 2]), 0.0)
-    return min(most, math.radians(part.cap_deg)) or math.radians(part.cap_deg)
+        reach = max(reach, *np.arctan2(np.hypot(*met_m.T[:2]), met_m[:, 2]), 0.0)
+    return min(reach, math.radians(config.cap_deg)) or math.radians(config.cap_deg)
 
 
 @jit
-def room_at(site: int, without: int, chosen: Ints, sites_m: Floats, spacing_m: float) -> bool:
+def has_room(site: int, without: int, chosen: Ints, sites_m: Floats, spacing_m: float) -> bool:
     """Whether a site keeps the spacing to every LED except `without`."""
     for n in range(len(chosen)):
-        away2 = 0.0
+        distance2 = 0.0
         for i in range(3):
-            away2 += (sites_m[chosen[n], i] - sites_m[site, i]) ** 2
-        if n != without and away2 < spacing_m**2:
+            distance2 += (sites_m[chosen[n], i] - sites_m[site, i]) ** 2
+        if n != without and distance2 < spacing_m**2:
             return False
     return True
 
 
 @jit
-def exchange(
+def try_moves(
     chosen: Ints,
     sites_m: Floats,
-    seen: Visibility,
+    visibility: Visibility,
     attitude_count: int,
-    wanted: int,
+    min_leds: int,
     spacing_m: float,
-    who: Ints,
-    where: Ints,
+    moved: Ints,
+    target: Ints,
 ) -> None:
-    """One offer per LED: who[n] moves to where[n] if there is room and the cost falls. Changes `chosen` in place."""
-    total = sum_information(chosen, seen, attitude_count)
-    each = costs(total, wanted)
-    for n in range(len(who)):
-        old, new = chosen[who[n]], where[n]
-        if old == new or not room_at(new, who[n], chosen, sites_m, spacing_m):
+    """One trial per LED: moved[n] goes to site target[n] if there is room and the cost falls. In place in `chosen`."""
+    total = sum_information(chosen, visibility, attitude_count)
+    attitude_cost = costs(total, min_leds)
+    for n in range(len(moved)):
+        old, new = chosen[moved[n]], target[n]
+        if old == new or not has_room(new, moved[n], chosen, sites_m, spacing_m):
             continue
         # Only attitudes that see the old or the new site change. The cost is a sum over attitudes, so the changes at
         # the two sites add up: the second call finds attitudes that see both already up to date.
-        add(old, -1, seen, total)
-        add(new, 1, seen, total)
-        if update_costs(old, seen, total, each, wanted) + update_costs(new, seen, total, each, wanted) < 0:
-            chosen[who[n]] = new
+        add_led(old, -1, visibility, total)
+        add_led(new, 1, visibility, total)
+        change_old = update_costs(old, visibility, total, attitude_cost, min_leds)
+        if change_old + update_costs(new, visibility, total, attitude_cost, min_leds) < 0:
+            chosen[moved[n]] = new
         else:  # undo the move
-            add(new, -1, seen, total)
-            add(old, 1, seen, total)
-            update_costs(old, seen, total, each, wanted)
-            update_costs(new, seen, total, each, wanted)
+            add_led(new, -1, visibility, total)
+            add_led(old, 1, visibility, total)
+            update_costs(old, visibility, total, attitude_cost, min_leds)
+            update_costs(new, visibility, total, attitude_cost, min_leds)
 
 
-def evenly(sites_m: Floats, spacing_m: float, count: int, halvings: int = HALVINGS) -> Ints:
-    """Indices of `count` sites at the widest spacing at which `apart` finds that many, by bisection.
+def spread(sites_m: Floats, spacing_m: float, count: int, bisections: int) -> Ints:
+    """Indices of `count` sites at the widest spacing at which `thin` finds that many, by bisection.
 
     Fewer than `count` if even spacing_m does not leave room for them.
     """
-    chosen = apart(sites_m, spacing_m, count)
-    near_m, far_m = spacing_m, float(np.ptp(sites_m, axis=0).max())
-    for _ in range(halvings):
-        middle_m = (near_m + far_m) / 2
-        wider = apart(sites_m, middle_m, count)
+    chosen = thin(sites_m, spacing_m, count)
+    low_m, high_m = spacing_m, float(np.ptp(sites_m, axis=0).max())
+    for _ in range(bisections):
+        middle_m = (low_m + high_m) / 2
+        wider = thin(sites_m, middle_m, count)
         if len(wider) < count:
-            far_m = middle_m
+            high_m = middle_m
         else:
-            near_m, chosen = middle_m, wider
+            low_m, chosen = middle_m, wider
     return chosen
 
 
-def apart(sites_m: Floats, spacing_m: float, count: int | None = None) -> Ints:
+def thin(sites_m: Floats, spacing_m: float, count: int | None = None) -> Ints:
     """Indices of sites taken in order, each if none taken before is within the spacing, to `count`.
 
     This is random sequential adsorption where the sites are in random order.
@@ -357,41 +441,46 @@ def apart(sites_m: Floats, spacing_m: float, count: int | None = None) -> Ints:
 # Reduce the ambiguity between fields of view.
 
 
-def alike(part: leds.OptimisedConfig, place_m: Floats) -> Ambiguity:
-    """Ambiguity of the layout (`likeness`), for a round field of the same area as the camera's."""
-    radius_rad = math.atan(math.sqrt(4 * float(np.prod(tan_half(part))) / math.pi))
-    return field_ambiguity(place_m, part.camera_m[2], math.radians(part.tilt_deg), radius_rad, part.alike_m)
+def layout_ambiguity(config: leds.OptimizedConfig, place_m: Floats) -> Ambiguity:
+    """Ambiguity of the layout (`ambiguity`), for a round field of the same area as the camera's."""
+    radius_rad = math.atan(math.sqrt(4 * float(np.prod(tan_half(config))) / math.pi))
+    return field_ambiguity(place_m, config.camera_m[2], math.radians(config.tilt_deg), radius_rad, config.coincidence_m)
 
 
-def set_apart(exam: Exam, place_m: Floats, sites_m: Floats, rng: np.random.Generator) -> Floats:
-    """The layout after LEDs in ambiguous fields are moved to free sites nearby, where that reduces `excess`.
+def reduce_ambiguity(scorer: PlacementScore, place_m: Floats, sites_m: Floats, rng: np.random.Generator) -> Floats:
+    """The layout after LEDs in ambiguous fields are moved to free sites nearby, where that reduces `excess_overlap`.
 
-    A field is ambiguous if more than HALF of its LEDs coincide with another field's. The worst variances may rise by
-    SLACK in total, but not beyond those of the best even layout. Ambiguity that remains after NUDGES tries is
-    accepted: with three LEDs in a field, two of them have a similar pair almost anywhere.
+    A field is ambiguous if more than `max_overlap` of its LEDs coincide with another field's. The worst variances may
+    rise by `variance_slack` in total, but not beyond those of the best even layout. Ambiguity that remains after
+    `ambiguity_trials` is accepted: with three LEDs in a field, two of them have a similar pair almost anywhere.
     """
-    part, tree = exam.part, cKDTree(sites_m)
-    like, mark, blind = alike(part, place_m), exam.mark(place_m), exam.blind(place_m)
-    most = max(mark, min(1.0, mark * (1 + SLACK)))
-    for _ in range(NUDGES):
-        bad = np.flatnonzero(like.share > HALF)
-        if not len(bad):
+    config, options, tree = scorer.config, scorer.options, cKDTree(sites_m)
+    ambiguity = layout_ambiguity(config, place_m)
+    tail, under_two = scorer.tail_variance(place_m), scorer.under_two(place_m)
+    max_tail = max(tail, min(1.0, tail * (1 + options.variance_slack)))
+    for _ in range(options.ambiguity_trials):
+        ambiguous = np.flatnonzero(ambiguity.fraction > options.max_overlap)
+        if not len(ambiguous):
             break
-        middle_m = place_m[like.led[rng.choice(bad)]]
-        who = rng.choice(cKDTree(place_m).query(middle_m, k=min(ABOUT, part.count))[1])
-        tried_m = place_m.copy()
-        tried_m[who] = sites_m[rng.choice(tree.query(place_m[who], k=min(BESIDE, len(sites_m)))[1])]
-        if np.delete(np.linalg.norm(place_m - tried_m[who], axis=1), who).min() < part.spacing_m:
+        center_m = place_m[ambiguity.led[rng.choice(ambiguous)]]
+        central = cKDTree(place_m).query(center_m, k=min(options.central_leds, config.count))[1]
+        moved = rng.choice(central)
+        nearby = tree.query(place_m[moved], k=min(options.nearby_sites, len(sites_m)))[1]
+        trial_m = place_m.copy()
+        trial_m[moved] = sites_m[rng.choice(nearby)]
+        distance_m = np.linalg.norm(place_m - trial_m[moved], axis=1)
+        if np.delete(distance_m, moved).min() < config.spacing_m:
             continue
-        # The nudge must reduce the ambiguity and must not leave more attitudes with fewer than two LEDs.
-        nudged = alike(part, tried_m)
-        if excess(nudged) >= excess(like) or exam.blind(tried_m) > blind:
+        # The move must reduce the ambiguity and must not leave more attitudes with fewer than two LEDs.
+        trial_ambiguity = layout_ambiguity(config, trial_m)
+        less_excess = excess_overlap(trial_ambiguity, options) < excess_overlap(ambiguity, options)
+        if not less_excess or scorer.under_two(trial_m) > under_two:
             continue
-        if exam.mark(tried_m) <= most:
-            place_m, like = tried_m, nudged
+        if scorer.tail_variance(trial_m) <= max_tail:
+            place_m, ambiguity = trial_m, trial_ambiguity
     return place_m
 
 
-def excess(like: Ambiguity) -> float:
-    """Sum over the fields of the ambiguity in excess of HALF."""
-    return float(np.maximum(like.share - HALF, 0).sum())
+def excess_overlap(ambiguity: Ambiguity, options: PlacementOptions) -> float:
+    """Sum over the fields of the overlap in excess of `max_overlap`."""
+    return float(np.maximum(ambiguity.fraction - options.max_overlap, 0).sum())

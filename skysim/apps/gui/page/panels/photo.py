@@ -26,40 +26,34 @@ class PhotoPanel:
             label="Drop a FITS, PNG, JPEG, TIFF or BMP here",
             auto_upload=True,
             max_file_size=LIMIT_BYTES,
-            on_upload=self.dropped,
-            on_rejected=lambda: tab.say(f"not taken: allowed: {', '.join(SUFFIXES)}, at most 64 MB"),
+            on_upload=self.uploaded,
+            on_rejected=lambda: tab.show_message(f"refused; allowed: {', '.join(SUFFIXES)}, at most 64 MB"),
         )
-        self.upload.props(f'flat bordered accept="{",".join(SUFFIXES)}"').classes("w-full").style(
-            "margin: 10px 0"
-        )
+        self.upload.props(f'flat bordered accept="{",".join(SUFFIXES)}"').classes("w-full").style("margin: 10px 0")
         self.upload.mark("upload")
         with ui.row().classes("w-full no-wrap items-center gap-2"):
-            self.source = (
-                ui.input("live camera: index, file or address").props("dense outlined").classes("flex-grow")
-            )
-            self.button = ui.button("Look", on_click=self.watch).props("dense outline size=sm").mark("camera")
-        self.facts = (
-            ui.label(
-                "No picture yet. It is solved without being told where it looks; a wrong answer is worse "
-                "than none, so it may be refused."
-            )
+            self.source = ui.input("live camera: index, file or address").props("dense outlined").classes("flex-grow")
+            self.button = ui.button("Watch", on_click=self.watch).props("dense outline size=sm").mark("camera")
+        self.result_text = (
+            ui.label("No image yet. Images are solved lost in space; uncertain matches are rejected.")
             .classes("mono quiet")
             .style("margin-top: 10px; white-space: pre-wrap")
         )
-        self.facts.mark("facts")
+        self.result_text.mark("facts")
 
-    async def dropped(self, event: Any) -> None:
+    async def uploaded(self, event: Any) -> None:
         """Solve an uploaded file."""
         data = await event.file.read()
         name = str(event.file.name)
         self.upload.reset()
         if len(data) > LIMIT_BYTES:
-            self.tab.say(f"{name}: larger than 64 MB")
+            self.tab.show_message(f"{name}: larger than 64 MB")
             return
-        self.tab.rest()
-        self.say(f"solving {name} …", "quiet")
+        self.tab.stop_playback()
+        self.show_text(f"solving {name} …", "quiet")
         self.show(
-            name, await self.tab.ask("solve_file", name, data, self.fov.value, {}, doing=f"solving {name} …")
+            name,
+            await self.tab.run_task("solve_file", name, data, self.fov.value, {}, activity=f"solving {name} …"),
         )
 
     def stop(self) -> None:
@@ -73,42 +67,45 @@ class PhotoPanel:
         if self.live:
             self.stop()
             return
-        self.tab.rest()
-        self.live, seen, source = True, 0, (self.source.value or "0").strip()
+        self.tab.stop_playback()
+        self.live, solved_count, source = True, 0, (self.source.value or "0").strip()
         self.button.set_text("Stop")
         while self.live:
-            photo = await self.tab.ask("solve_camera", source, self.fov.value, {})
-            if not self.tab.open_still:
+            photo = await self.tab.run_task("solve_camera", source, self.fov.value, {})
+            if not self.tab.is_open:
                 return
-            if photo or not seen:  # a camera that ends keeps its last result on the page
+            if photo or not solved_count:  # a camera that ends keeps its last result on the page
                 self.show("camera", photo)
-            seen += 1
+            solved_count += 1
             self.live = self.live and photo is not None
         self.button.disable()
-        await self.tab.wait(self.tab.session.ask("release"))
-        self.button.set_text("Look")
+        await self.tab.await_result(self.tab.session.run("release"))
+        self.button.set_text("Watch")
         self.button.enable()
 
     def show(self, name: str, photo: Photo | None) -> None:
         """Display the image with its marks, and the solution."""
         if photo is None:
-            self.say(self.tab.said if self.tab.said.startswith(name) else f"{name}: {self.tab.said}", "warn")
+            self.show_text(
+                self.tab.message_text if self.tab.message_text.startswith(name) else f"{name}: {self.tab.message_text}",
+                "warn",
+            )
             return
         self.tab.sensor.show_photo(photo)
         self.tab.attitude.show_photo(photo)
-        told = f"{name}: {photo.answer.status}"
-        if told != self.logged:  # log the repeated status of a live camera once
-            self.logged = told
-            self.tab.log(told)
-        found = photo.solution
-        if not found:
-            self.say(f"{told}\nRefused: a wrong attitude is worse than none.", "warn")
+        status_text = f"{name}: {photo.result.status}"
+        if status_text != self.logged:  # log the repeated status of a live camera once
+            self.logged = status_text
+            self.tab.log(status_text)
+        solution = photo.solution
+        if not solution:
+            self.show_text(f"{status_text}\nRejected: the match is not significant.", "warn")
             return
-        where = f"RA {found['ra_deg']:.4f}°  Dec {found['dec_deg']:+.4f}°  roll {found['roll_deg']:.3f}°"
-        how = f"field {found['fov_deg']:.3f}°  {found['matches']} stars  rms {found['rms_arcsec']:.1f}″"
-        self.say(f"{told}\n{where}\n{how}", "good")
+        pointing = f"RA {solution['ra_deg']:.4f}°  Dec {solution['dec_deg']:+.4f}°  roll {solution['roll_deg']:.3f}°"
+        quality = f"field {solution['fov_deg']:.3f}°  {solution['matches']} stars  rms {solution['rms_arcsec']:.1f}″"
+        self.show_text(f"{status_text}\n{pointing}\n{quality}", "good")
 
-    def say(self, text: str, ink: str) -> None:
+    def show_text(self, text: str, color: str) -> None:
         """Set the result text."""
-        self.facts.set_text(text)
-        self.facts.classes(remove="quiet good warn", add=ink)
+        self.result_text.set_text(text)
+        self.result_text.classes(remove="quiet good warn", add=color)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from nicegui import ui
 
-from skysim.apps.gui.messages import Answer, Detection, FrameView, Light, SceneInfo
+from skysim.apps.gui.messages import Detection, FrameView, Light, SceneInfo, TrackerResult
 from skysim.apps.gui.page import keys, overlay
 from skysim.apps.gui.page.star_names import NAMES
 from skysim.results import stretch
@@ -20,12 +20,12 @@ if TYPE_CHECKING:
     from skysim.apps.gui.worker.photo import Photo
 
 ZOOM_PX = 160  # height of the enlarged pixels on the screen
-FIRST = "The first look on a machine takes up to a minute: the code is loaded and compiled, once."
+FIRST_START = "The first frame on a machine takes up to a minute, because the code is compiled."
 STRETCHES = list(stretch.CURVES)
-NUMBER = itertools.count(1)  # of frames, so that each has its own address
+FRAME_NUMBERS = itertools.count(1)  # of frames, so that each has its own address
 FRAMES: dict[str, dict[int, bytes]] = {}  # JPEG by tab and number, the newest KEPT
-KEPT = 3
-PATIENCE_S = 1.0  # for the browser to report a drawn frame
+KEPT_FRAMES = 3
+DRAW_TIMEOUT_S = 1.0  # for the browser to report a drawn frame
 
 
 class Canvas(ui.element, component="frame.js"):  # type: ignore[call-arg]
@@ -35,23 +35,23 @@ class Canvas(ui.element, component="frame.js"):  # type: ignore[call-arg]
 class Sensor:
     """The view and its controls. It shows a frame of the scene, or another image such as a user's.
 
-    at : pixel under the mouse, or None;  fresh : whether the enlarged pixels are of the current frame
-    sent, came : number of the last frame sent to the browser, and of the last it reported as drawn
+    mouse_px : pixel under the mouse, or None;  zoom_is_current : whether the enlarged pixels are of the current frame
+    sent_number, drawn_number : number of the last frame sent to the browser, and of the last it reported as drawn
     """
 
     def __init__(self, tab: Tab) -> None:
         self.tab = tab
         self.shown = {"truth", "identified", "false"}
         self.lights: tuple[Light, ...] = ()
-        self.answer: Answer | None = None
+        self.result: TrackerResult | None = None
         self.size_px, self.prefix = (4, 3), "HIP"
-        self.facts = ""  # numbers of the frame, shown while the mouse is outside
-        self.at: tuple[float, float] | None = None
-        self.fresh = False
-        self.sent = self.came = 0
-        self.arrived = asyncio.Event()
+        self.statistics = ""  # numbers of the frame, shown while the mouse is outside
+        self.mouse_px: tuple[float, float] | None = None
+        self.zoom_is_current = False
+        self.sent_number = self.drawn_number = 0
+        self.frame_drawn = asyncio.Event()
         with ui.element("div").classes("lab-sensor"):
-            self.bar()
+            self.build_controls()
             with ui.element("div").classes("lab-frame"):
                 self.canvas = Canvas().mark("sensor")
                 self.canvas.on("mouse", self.mouse, throttle=0.06)
@@ -59,126 +59,127 @@ class Sensor:
                 self.canvas.on("sized", self.sized, throttle=0.5)
                 with ui.element("div").classes("lab-wait") as self.wait:
                     ui.spinner(size="28px")
-                    self.why = ui.label().mark("wait")
+                    self.wait_label = ui.label().mark("wait")
             with ui.element("div").classes("lab-under"):
                 self.magnified = ui.html(sanitize=False).classes("quiet").mark("zoom")
                 self.hover = ui.label().classes("mono").mark("hover")
         self.canvas.set_visibility(False)
-        self.waiting(f"Setting up {Path(tab.scene).name} …", FIRST)
-        self.rest()
+        self.show_waiting(f"Setting up {Path(tab.scene).name} …", FIRST_START)
+        self.clear_zoom()
 
-    def waiting(self, *lines: str) -> None:
-        """Show what the first frame waits for, or why there is none."""
-        self.why.set_text("\n".join(lines))
+    def show_waiting(self, *lines: str) -> None:
+        """Show what the first frame waits for, or the reason for none."""
+        self.wait_label.set_text("\n".join(lines))
 
-    def bar(self) -> None:
+    def build_controls(self) -> None:
         """Build the controls: overlays, stretch, brightness."""
         with ui.element("div").classes("lab-bar"):
             for kind in overlay.KINDS:
                 box = ui.checkbox(kind, value=kind in self.shown).props("dense size=xs")
-                box.style(f"color: {overlay.INK[kind]}").mark(f"overlay-{kind}")
+                box.style(f"color: {overlay.COLORS[kind]}").mark(f"overlay-{kind}")
                 box.on_value_change(lambda event, kind=kind: self.toggle(kind, event.value))
             ui.space()
             self.stretch = ui.select(STRETCHES, value=STRETCHES[0], on_change=self.restretch)
             self.stretch.props('dense borderless options-dense aria-label="Stretch"').classes("w-28")
-            self.stretch.on("popup-hide", js_handler=keys.LEAVE)
-            self.bright = ui.slider(min=-2, max=4, step=0.25, value=0).props('dense aria-label="Brightness"')
-            self.bright.classes("w-24").on("change", self.restretch)
+            self.stretch.on("popup-hide", js_handler=keys.BLUR_JS)
+            self.brightness = ui.slider(min=-2, max=4, step=0.25, value=0).props('dense aria-label="Brightness"')
+            self.brightness.classes("w-24").on("change", self.restretch)
 
-    def rest(self) -> None:
+    def clear_zoom(self) -> None:
         """Clear the enlarged pixels and the mouse position."""
-        self.at, self.fresh = None, False
-        self.magnified.set_content('<div class="lab-zoom">click a star: its pixels</div>')
+        self.mouse_px, self.zoom_is_current = None, False
+        self.magnified.set_content('<div class="lab-zoom">click a star to see its pixels</div>')
         self.magnified.classes(remove="stale")
 
     def toggle(self, kind: str, on: bool) -> None:
         self.shown = self.shown | {kind} if on else self.shown - {kind}
-        self.mark()
+        self.update_marks()
 
     async def restretch(self) -> None:
         """Show the same frame with another stretch or brightness."""
-        data = await self.tab.ask("show", self.stretch.value, 2.0 ** float(self.bright.value))
+        data = await self.tab.run_task("show", self.stretch.value, 2.0 ** float(self.brightness.value))
         if data:
-            self.picture(data, self.size_px)
+            self.display_image(data, self.size_px)
 
-    def picture(self, data: bytes, size_px: tuple[int, int]) -> None:
+    def display_image(self, data: bytes, size_px: tuple[int, int]) -> None:
         """Display an image, as large as the window allows."""
         if size_px != self.size_px:
-            share = size_px[0] / size_px[1]
-            self.canvas.style(f"width: min(100cqw, calc(100cqh * {share:.5f})); aspect-ratio: {share:.5f}")
-        if not self.sent:
+            aspect = size_px[0] / size_px[1]
+            self.canvas.style(f"width: min(100cqw, calc(100cqh * {aspect:.5f})); aspect-ratio: {aspect:.5f}")
+        if not self.sent_number:
             self.wait.set_visibility(False)
             self.canvas.set_visibility(True)
         self.size_px = size_px
-        self.sent = next(NUMBER)
-        kept = FRAMES.setdefault(self.tab.id, {})
-        kept[self.sent] = data
-        kept.pop(min(kept) if len(kept) > KEPT else -1, None)
-        self.mark()
+        self.sent_number = next(FRAME_NUMBERS)
+        frames = FRAMES.setdefault(self.tab.id, {})
+        frames[self.sent_number] = data
+        frames.pop(min(frames) if len(frames) > KEPT_FRAMES else -1, None)
+        self.update_marks()
 
     def drawn(self, event: Any) -> None:
         """The browser reports a drawn frame."""
-        self.came = int(event.args["src"].rpartition("/")[2])
-        self.arrived.set()
+        self.drawn_number = int(event.args["src"].rpartition("/")[2])
+        self.frame_drawn.set()
 
     async def sized(self, event: Any) -> None:
         """The browser reports the width of the image on the screen; fit the image to it."""
-        data = await self.tab.wait(self.tab.session.ask("fit", max(int(event.args["wide"]), 1)))
+        data = await self.tab.await_result(self.tab.session.run("fit", max(int(event.args["wide"]), 1)))
         if data:
-            self.picture(data, self.size_px)
+            self.display_image(data, self.size_px)
 
-    async def ready(self) -> None:
+    async def wait_drawn(self) -> None:
         """Wait until at most one frame is not drawn yet, so that frames do not queue up in the browser."""
-        while self.sent > self.came + 1:
-            self.arrived.clear()
+        while self.sent_number > self.drawn_number + 1:
+            self.frame_drawn.clear()
             try:
-                await asyncio.wait_for(self.arrived.wait(), PATIENCE_S)
+                await asyncio.wait_for(self.frame_drawn.wait(), DRAW_TIMEOUT_S)
             except TimeoutError:
                 return
 
     def show(self, view: FrameView) -> None:
         """Show a frame of the scene."""
-        self.lights, self.answer = view.lights, view.answer
-        self.prefix = self.tab.setting.prefix if self.tab.setting else "HIP"
-        self.facts = facts(view.size_px, view.facts, view.answer, view, self.tab.setting)
-        self.renewed()
-        self.picture(view.jpeg, view.size_px)
+        self.lights, self.result = view.lights, view.result
+        self.prefix = self.tab.scene_info.prefix if self.tab.scene_info else "HIP"
+        self.statistics = statistics_text(view.size_px, view.statistics, view.result, view, self.tab.scene_info)
+        self.frame_changed()
+        self.display_image(view.jpeg, view.size_px)
 
     def show_photo(self, photo: Photo) -> None:
         """Show a user's image or the frame of a study's trial."""
-        self.lights, self.answer, self.prefix = photo.lights, photo.answer, photo.prefix
-        self.facts = facts(photo.size_px, photo.facts, photo.answer)
-        self.renewed()
-        self.picture(photo.jpeg, photo.size_px)
+        self.lights, self.result, self.prefix = photo.lights, photo.result, photo.prefix
+        self.statistics = statistics_text(photo.size_px, photo.statistics, photo.result)
+        self.frame_changed()
+        self.display_image(photo.jpeg, photo.size_px)
 
-    def renewed(self) -> None:
+    def frame_changed(self) -> None:
         """Update the text for a new frame, and mark the enlarged pixels as those of an older one."""
-        self.tell()
-        if self.fresh:
-            self.fresh = False
+        self.update_text()
+        if self.zoom_is_current:
+            self.zoom_is_current = False
             self.magnified.classes("stale")
 
-    def tell(self) -> None:
+    def update_text(self) -> None:
         """Show data on what is under the mouse, or else the frame's numbers."""
-        if self.at is None:
-            self.hover.set_text(self.facts)
+        if self.mouse_px is None:
+            self.hover.set_text(self.statistics)
             return
-        self.hover.set_text(self.told(*self.at, *self.nearest(*self.at)))
+        self.hover.set_text(self.pixel_text(*self.mouse_px, *self.nearest(*self.mouse_px)))
 
-    def mark(self) -> None:
+    def update_marks(self) -> None:
         """Send the frame's address and its marks to the canvas."""
-        self.canvas.props["look"] = {
-            "src": f"/frame/{self.tab.id}/{self.sent}",
+        self.canvas.props["view"] = {
+            "src": f"/frame/{self.tab.id}/{self.sent_number}",
             "size": self.size_px,
-            "marks": overlay.marks(self.lights, self.answer, self.size_px, self.shown, self.name),
-            "label": self.words(),
+            "marks": overlay.marks(self.lights, self.result, self.size_px, self.shown, self.name),
+            "label": self.description(),
         }
         self.canvas.update()
 
-    def words(self) -> str:
+    def description(self) -> str:
         """Text alternative of the view for screen readers."""
-        known = [self.name(spot.id) for spot in self.answer.spots if spot.id >= 0] if self.answer else []
-        return f"Sensor view: {len(self.lights)} true lights; named: {', '.join(known) or 'none'}"
+        detections = self.result.detections if self.result else ()
+        identified = [self.name(detection.id) for detection in detections if detection.id >= 0]
+        return f"Sensor view: {len(self.lights)} true lights; identified: {', '.join(identified) or 'none'}"
 
     def name(self, id: int) -> str:
         """Name of a light by its number."""
@@ -187,71 +188,70 @@ class Sensor:
     async def mouse(self, event: Any) -> None:
         """Handle the mouse: show data on what is under it; a click enlarges the pixels there."""
         x, y = event.args["x"] - 0.5, event.args["y"] - 0.5
-        self.at = None if event.args["kind"] == "mouseleave" else (x, y)
-        self.tell()
-        if event.args["kind"] != "click" or not self.tab.setting:
+        self.mouse_px = None if event.args["kind"] == "mouseleave" else (x, y)
+        self.update_text()
+        if event.args["kind"] != "click" or not self.tab.scene_info:
             return
-        spot, light = self.nearest(x, y)
-        middle = spot or light
-        zoom = await self.tab.ask("zoom", middle.x if middle else x, middle.y if middle else y)
+        detection, light = self.nearest(x, y)
+        target = detection or light
+        zoom = await self.tab.run_task("zoom", target.x if target else x, target.y if target else y)
         if zoom:
-            spots = self.answer.spots if self.answer else ()
-            self.magnified.set_content(overlay.magnified(zoom.dn, spots, zoom.x, zoom.y, ZOOM_PX))
+            detections = self.result.detections if self.result else ()
+            self.magnified.set_content(overlay.pixels_svg(zoom.dn, detections, zoom.x, zoom.y, ZOOM_PX))
             self.magnified.classes(remove="stale")
-            self.fresh = True
+            self.zoom_is_current = True
 
     def nearest(self, x: float, y: float) -> tuple[Detection | None, Light | None]:
         """The nearest detection and the nearest true light within a few marks' width, or None."""
-        reach = max(8.0, self.size_px[0] / 60)
+        radius_px = max(8.0, self.size_px[0] / 60)
 
-        def off(one: Detection | Light) -> float:
-            return math.hypot(one.x - x, one.y - y)
+        def distance_px(item: Detection | Light) -> float:
+            return math.hypot(item.x - x, item.y - y)
 
-        spots = [spot for spot in (self.answer.spots if self.answer else ()) if off(spot) < reach]
-        lights = [light for light in self.lights if off(light) < reach]
-        return min(spots, key=off, default=None), min(lights, key=off, default=None)
+        detections = self.result.detections if self.result else ()
+        detections = tuple(detection for detection in detections if distance_px(detection) < radius_px)
+        lights = [light for light in self.lights if distance_px(light) < radius_px]
+        return min(detections, key=distance_px, default=None), min(lights, key=distance_px, default=None)
 
-    def told(self, x: float, y: float, spot: Detection | None, light: Light | None) -> str:
+    def pixel_text(self, x: float, y: float, detection: Detection | None, light: Light | None) -> str:
         """Text on a pixel: its true light, the detection and its error."""
         lines = [f"pixel      {x:8.1f} {y:8.1f}"]
         if light:
-            bright = "" if math.isnan(light.magnitude) else f"V {light.magnitude:.2f}  "
+            brightness = "" if math.isnan(light.magnitude) else f"V {light.magnitude:.2f}  "
             lines += [f"truth      {light.x:8.2f} {light.y:8.2f}   {self.name(light.id)}"]
-            lines += [f"           {bright}{light.electrons:.4g} e-"]
-        if spot:
-            who = self.name(spot.id) if spot.id >= 0 else "no name"
-            lines += [f"centroid   {spot.x:8.2f} {spot.y:8.2f} ± {spot.sigma_px:.3f} px   {who}"]
-            residual = "" if math.isnan(spot.residual_px) else f"   residual {spot.residual_px:.3f} px"
-            lines += [f"           flux {spot.flux:.4g}{residual}"]
+            lines += [f"           {brightness}{light.electrons:.4g} e-"]
+        if detection:
+            identity = self.name(detection.id) if detection.id >= 0 else "not identified"
+            lines += [f"centroid   {detection.x:8.2f} {detection.y:8.2f} ± {detection.sigma_px:.3f} px   {identity}"]
+            residual = "" if math.isnan(detection.residual_px) else f"   residual {detection.residual_px:.3f} px"
+            lines += [f"           flux {detection.flux:.4g}{residual}"]
             if light:
-                lines += [
-                    f"           off the truth by {math.hypot(spot.x - light.x, spot.y - light.y):.3f} px"
-                ]
+                lines += [f"           error {math.hypot(detection.x - light.x, detection.y - light.y):.3f} px"]
         return "\n".join(lines)
 
 
-def facts(
+def statistics_text(
     size_px: tuple[int, int],
-    told: stretch.Facts,
-    answer: Answer | None,
+    statistics: stretch.FrameStatistics,
+    result: TrackerResult | None,
     view: FrameView | None = None,
-    setting: SceneInfo | None = None,
+    scene_info: SceneInfo | None = None,
 ) -> str:
     """A frame's numbers in two columns; fewer for an image that is not of the scene (view is None)."""
     rows = [
         (
             "frame",
             f"{size_px[0]} × {size_px[1]} px",
-            *(("field", f"{setting.field_deg:.4g}°") if setting else ("", "")),
+            *(("field", f"{scene_info.field_deg:.4g}°") if scene_info else ("", "")),
         )
     ]
     if view:
-        rows += [("exposure", f"{1e3 * view.exposure_s:.4g} ms", "made in", f"{view.ms:.0f} ms")]
+        rows += [("exposure", f"{1e3 * view.exposure_s:.4g} ms", "rendering", f"{view.ms:.0f} ms")]
     rows += [
-        ("sky", f"{told.sky_dn:.5g} DN", "scatter", f"{told.scatter_dn:.3g} DN"),
-        ("brightest", f"{told.peak_dn:.5g} DN", "saturated", f"{told.saturated} px"),
+        ("sky", f"{statistics.sky_dn:.5g} DN", "scatter", f"{statistics.scatter_dn:.3g} DN"),
+        ("brightest", f"{statistics.peak_dn:.5g} DN", "saturated", f"{statistics.saturated} px"),
     ]
     lights = ("lights", f"{len(view.lights)} in the field") if view else ()
-    seen = ("named", f"{answer.identified} of {len(answer.spots)} seen") if answer else ()
-    rows += [(*lights, *seen, "", "", "", "")[:4]]
+    detected = ("identified", f"{result.identified} of {len(result.detections)}") if result else ()
+    rows += [(*lights, *detected, "", "", "", "")[:4]]
     return "\n".join(f"{a:<11s}{b:<20s}{c:<11s}{d}".rstrip() for a, b, c, d in rows)

@@ -1,4 +1,4 @@
-"""AFIT's Test 3 at fixed attitudes (Padro 2012, 3.7.3): five LEDs imaged from five attitudes, measured as he did."""
+"""AFIT's Test 3 at fixed attitudes (Padro 2012, 3.7.3): five LEDs imaged from five attitudes, and his measurements."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from estimator.calibration.home_position import Sighting, instrument_magnitude
+from estimator.calibration.home_position import Sighting, instrument_brightness
 from estimator.centroiding.centroid import CENTROIDERS
 from estimator.core.arrays import Ints
 from estimator.core.types import FramePriors
 from estimator.detection.detect import DETECTORS
 from skysim.core.types import Floats, Mount, Trajectory
 from skysim.dynamics import guidance
-from skysim.experiments.papers.afit.bench import pair_angles_arcsec, vectors_m
+from skysim.experiments.papers.afit.test_stand import light_positions_m, pair_angles_arcsec
 from skysim.experiments.papers.published import experiments
 from skysim.scene import loader
 from skysim.scene.motion import AttitudeConfig
-from skysim.simulation import exposure, testbed
-from skysim.simulation.testbed import Testbed
+from skysim.simulation import exposure
+from skysim.simulation.testbed import Testbed, build_testbed
 from skysim.tracking import onboard_model
 from skysim.tracking import settings as tracker_settings
 
@@ -30,11 +30,11 @@ IMU_DEG = experiments()["afit-table-10-15"].data["imu_deg"]
 ALGORITHM_DEG = experiments()["afit-table-10-15"].data["algorithm_deg"]
 LEDS, HOME = 5, 0
 
-TURN_DEG = 55.0  # of the camera about its boresight: assumed; at 0 deg it misses position 4
+CAMERA_ROTATION_DEG = 55.0  # of the camera about its boresight: assumed; at 0 deg it misses position 4
 EPSILON_MAG, EPSILON_POS_M, EPSILON_SEP_ARCSEC = 10.191, 1.9861e-3, 9.675  # Table 9
 
 # What the thesis states about its images, and assumptions for the rest; see data/published.
-GIVEN = {
+STATED_IMAGING = {
     "camera.detector.bits": "8",
     "camera.detector.gain_e_dn": "164",
     "camera.detector.offset_dn": "2",
@@ -43,21 +43,21 @@ GIVEN = {
     "light.layout.levels": "[1.0, 0.5, 0.4, 0.2, 0.075]",
     "exposure.rate_hz": "0.987",
 }
-LAB = {  # rolling shutter, exposure of a non-integer number of LED cycles, early saturation
+FITTED_IMAGING = {  # rolling shutter, exposure of a non-integer number of LED cycles, early saturation
     "camera.shutter": '{kind: rolling, row_time: "83 us"}',
     "camera.detector.full_well_e": "30500",
     "exposure.time": "16.667 ms",
     "light.led.intensity": "73.5 mcd",
 }
-LATEST = 1_000_000  # frame indices are random up to this, so that the phase of the LEDs' cycle is random
-FOREVER_S = 2e6
+MAX_FRAME_INDEX = 1_000_000  # frame indices are random up to this, for a random phase of the LEDs' cycle
+HOLD_S = 2e6
 
 
-def bench(changes: Mapping[str, str] | None = None) -> Testbed:
+def build_test3(overrides: Mapping[str, str] | None = None) -> Testbed:
     """Test 3's testbed, with the camera turned so that all five positions are on the detector."""
-    lab = testbed.build_testbed(loader.load("afit_test3", GIVEN | dict(changes or {})))
-    turned = Rotation.from_euler("z", TURN_DEG, degrees=True) * lab.mount.cam_from_body
-    return replace(lab, mount=Mount(lab.mount.camera_body_m, turned))
+    testbed = build_testbed(loader.load("afit_test3", STATED_IMAGING | dict(overrides or {})))
+    cam_from_body = Rotation.from_euler("z", CAMERA_ROTATION_DEG, degrees=True) * testbed.mount.cam_from_body
+    return replace(testbed, mount=Mount(testbed.mount.camera_body_m, cam_from_body))
 
 
 def lab_from_body(angles_deg: Sequence[float]) -> Rotation:
@@ -71,41 +71,44 @@ def angles_deg(lab_from_body: Rotation) -> Floats:
     return np.asarray(lab_from_body.as_euler("ZYX", degrees=True)[..., ::-1])
 
 
-def held(lab: Testbed, where: Rotation) -> Testbed:
+def at_rest(testbed: Testbed, lab_from_body: Rotation) -> Testbed:
     """The testbed with the vehicle at rest at an attitude."""
-    return replace(lab, trajectory=Trajectory.at_rest(where, FOREVER_S))
+    return replace(testbed, trajectory=Trajectory.at_rest(lab_from_body, HOLD_S))
 
 
-def photographed(
-    lab: Testbed, position: int, where: Rotation, images: int, rng: np.random.Generator
+def photograph(
+    testbed: Testbed, position: int, lab_from_body: Rotation, images: int, rng: np.random.Generator
 ) -> list[Sighting]:
     """Images from one attitude at random times; lights identified by the truth, in the order of the LEDs.
 
-    The IMU's attitude is the true one; `told` replaces it. Images that do not show all five LEDs are left out.
+    The IMU's attitude is the true one; see `replace_imu_attitude`. Images without all five LEDs are left out.
     """
-    here, camera, seen = held(lab, where), onboard_model.calibration(lab.scene.camera), []
-    settings = tracker_settings.believed_settings(lab.scene)
-    for index in rng.integers(LATEST, size=images):
-        frame, truth = exposure.render_frame(here, int(index))
-        hints = FramePriors(None, frame.saturation_dn)
-        blobs = DETECTORS["thesis"](frame.image_dn, hints=hints)
-        lights = CENTROIDERS["cog"](frame.image_dn, blobs, settings.gain_e_dn, hints)
+    resting, camera = at_rest(testbed, lab_from_body), onboard_model.calibration(testbed.scene.camera)
+    settings = tracker_settings.assumed_settings(testbed.scene)
+    sightings = []
+    for index in rng.integers(MAX_FRAME_INDEX, size=images):
+        frame, truth = exposure.render_frame(resting, int(index))
+        priors = FramePriors(None, frame.saturation_dn)
+        blobs = DETECTORS["thesis"](frame.image_dn, priors=priors)
+        lights = CENTROIDERS["cog"](frame.image_dn, blobs, settings.gain_e_dn, priors)
         inside = camera.contains(lights.xy_px)
-        _, row = cKDTree(truth.seen.xy_px).query(lights.xy_px[inside])
-        magnitude = instrument_magnitude(blobs.flux / blobs.area_px, blobs.area_px.astype(float))[inside]
-        led, first = np.unique(truth.seen.id[row], return_index=True)
+        _, nearest = cKDTree(truth.sources.xy_px).query(lights.xy_px[inside])
+        magnitude = instrument_brightness(blobs.flux / blobs.area_px, blobs.area_px.astype(float))[inside]
+        led, led_row = np.unique(truth.sources.id[nearest], return_index=True)
         if len(led) == LEDS:
-            seen.append(Sighting(position, where.inv(), led, lights.xy_px[inside][first], magnitude[first]))
-    return seen
+            sightings.append(
+                Sighting(position, lab_from_body.inv(), led, lights.xy_px[inside][led_row], magnitude[led_row])
+            )
+    return sightings
 
 
-def told(sightings: Sequence[Sighting], lab_from_body: Rotation) -> list[Sighting]:
+def replace_imu_attitude(sightings: Sequence[Sighting], lab_from_body: Rotation) -> list[Sighting]:
     """The same images with another IMU attitude."""
     return [replace(one, body_from_lab=lab_from_body.inv()) for one in sightings]
 
 
 @dataclass(frozen=True, slots=True)
-class Sights:
+class Measurements:
     """F images of all five LEDs as the thesis measures them (eqs 43-45).
 
     position : (F,) of the vehicle, from 0;  magnitude : (F, 5)
@@ -123,9 +126,11 @@ class Sights:
         return pair_angles_arcsec(self.body_m)
 
 
-def measured(lab: Testbed, sightings: Sequence[Sighting]) -> Sights:
+def measure(testbed: Testbed, sightings: Sequence[Sighting]) -> Measurements:
     """Measure the images as in the thesis."""
-    body_m = np.array([vectors_m(lab, one.xy_px) for one in sightings])
-    lab_m = [one.body_from_lab.inv().apply(place) for one, place in zip(sightings, body_m, strict=True)]
-    position = np.array([one.position for one in sightings])
-    return Sights(position, np.array([one.magnitude for one in sightings]), body_m, np.array(lab_m))
+    body_m = np.array([light_positions_m(testbed, sighting.xy_px) for sighting in sightings])
+    lab_m = [
+        sighting.body_from_lab.inv().apply(position_m) for sighting, position_m in zip(sightings, body_m, strict=True)
+    ]
+    position = np.array([sighting.stop for sighting in sightings])
+    return Measurements(position, np.array([sighting.brightness for sighting in sightings]), body_m, np.array(lab_m))

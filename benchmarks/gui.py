@@ -1,6 +1,6 @@
 """Speed of the browser GUI in Chromium: frames per second while a key is held, and latency from key to image.
 
-`python -m benchmarks.lab [SECONDS]` serves shefex2 with a detector of 1024 x 1024 pixels and prints both numbers for
+`python -m benchmarks.gui [SECONDS]` serves shefex2 with a detector of 1024 x 1024 pixels and prints both numbers for
 screens of 1280 x 800 and 1920 x 1080. Every frame is solved. A browser without a graphics card draws on the same cores
 that render the frames.
 """
@@ -42,7 +42,7 @@ def served(name: str) -> Iterator[str]:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
         free.close()
-        command = [sys.executable, "-m", "skysim", "lab", name, "--no-open", "--port", str(port)]
+        command = [sys.executable, "-m", "skysim", "gui", name, "--no-open", "--port", str(port)]
         server = subprocess.Popen([*command, "--out", folder], start_new_session=True)
         try:
             yield reached(f"http://127.0.0.1:{port}/")

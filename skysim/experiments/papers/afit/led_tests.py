@@ -1,0 +1,429 @@
+"""AFIT's LEDs on the test stand: lobe, pulses, thresholds (Padro 2012, section 3.4, Figs 30-46)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+import scipy.ndimage
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from skysim.core.types import Floats
+from skysim.core.units import INCH_M
+from skysim.experiments.papers.afit.test2 import INTENSITY_CD, NOISE_E, ON_FRACTION
+from skysim.experiments.papers.afit.test_stand import (
+    E_PER_GRAY,
+    WHITE,
+    build_test_stand,
+    gray_levels,
+    measure_lights,
+    render_at_attitude,
+    with_config,
+)
+from skysim.experiments.papers.compare import (
+    Cause,
+    Drawing,
+    ExperimentOptions,
+    ExperimentResult,
+    RowResult,
+    with_cause,
+)
+from skysim.experiments.papers.intervals import confidence_interval
+from skysim.experiments.papers.published import published_values
+from skysim.results import metrics
+from skysim.results.metrics import Summary, exact
+from skysim.results.plots import INK
+from skysim.scene.camera import MoffatPsfConfig
+from skysim.scene.leds import CosineLobeConfig, DirectConfig, ListedConfig
+from skysim.scene.light import FlatSurfaceConfig
+from skysim.scene.loader import load
+from skysim.scene.scene import Scene
+from skysim.simulation.testbed import Testbed
+
+GrayImage = NDArray[np.uint8]
+LEDS, BOARD_DISTANCE_IN, DOME_IN, CAMERA_IN, PITCH_MM = 9, 36.0, 33.0, 15.0, 8.0
+# Red, blue and green by three resistors of 1, 5 and 10 kohm; the dimmest is green, the brightest red (Fig. 36).
+BOARD = (1.0, 0.2, 0.1, 0.7, 0.14, 0.07, 0.4, 0.08, 0.04)
+DIMMEST_LED, BOARD_INTENSITY_CD, BOARD_EXPOSURE_S = 8, 0.05, 20e-3
+WIDE_PSF = MoffatPsfConfig(kind="moffat", fwhm_px=2.5, beta=2.0)
+NARROW_LOBE, MISALIGNMENT_DEG = CosineLobeConfig(exponent=20.0), 10.0  # half intensity at 15 deg
+# Roll and pitch of the positions of Figs 38 and 40.
+VIEW_ANGLES_DEG = ((0.0, 0.0), (1.5, 2.0), (1.5, -2.0), (-1.5, -2.0))
+WHITE_CD = LEDS / 2 * INTENSITY_CD  # light as in Test 2, in a ninth of the cycle
+WHITE_EXPOSURE_S, SLOT_S = 0.1, 1e-3
+PULSES_US = (1000.0, 500.0, 400.0, 200.0, 1.0)
+MIN_AREA_PX, GLARE_RADIUS_PX, DARK_RADIUS_PX = 50, 18, 60  # from an LED's middle; its own radius is 10 px
+SATURATION_FRACTION, CAUSE_SATURATION = 0.72, "pixels full at 0.72 of the converter's range"
+INTERMEDIATE_NOISE_GRAY = 2.5  # between the camera's own and Test 2's; no source states it
+CAUSE_NOISE = f"noise of {NOISE_E / E_PER_GRAY:.1f} gray levels, as in Test 2"
+CAUSE_LONG_PULSE = f"1 us lasting {1e6 * ON_FRACTION * SLOT_S:.0f} us, as in Test 2"
+
+
+class LensSettings(NamedTuple):
+    """Lens settings of one of Fig. 36's images, and read noise if it differs from the camera's own."""
+
+    f_number: float = 8.0
+    focus_in: float = BOARD_DISTANCE_IN
+    noise_e: float | None = None
+
+
+DEFAULT_LENS = LensSettings()
+
+
+def board_scene(
+    levels: Sequence[float],
+    distance_in: float = BOARD_DISTANCE_IN,
+    lens: LensSettings = DEFAULT_LENS,
+    **led_values: Any,
+) -> Scene:
+    """Scene with a board of nine holes, the first len(levels) with LEDs, above the camera of a level vehicle."""
+    height_in, across_mm = CAMERA_IN + distance_in, PITCH_MM * np.array([1.0, 0.0, -1.0])
+    positions = [[f"{x} mm", f"{y} mm", f"{height_in} in"] for x in across_mm for y in across_mm]
+    listed = ListedConfig.model_validate(
+        {"kind": "listed", "cap_deg": 27, "levels": list(levels), "positions": positions[: len(levels)]}
+    )
+    scene = load("afit_test1")
+    panel = FlatSurfaceConfig.model_validate({"kind": "flat", "apex": f"{height_in} in"})
+    scene = with_config(scene, "light", surface=panel, layout=listed, occlusion=False)
+    scene = with_config(scene, "light.led", scatter=0.0, **led_values)
+    lens_values = {"f_number": lens.f_number, "focus_m": lens.focus_in * INCH_M}
+    scene = with_config(scene, "camera", **lens_values)
+    if lens.noise_e is not None:
+        scene = with_config(scene, "camera.detector", read_noise_e=lens.noise_e)
+    return scene
+
+
+def color_board(lens: LensSettings = DEFAULT_LENS, **led_values: Any) -> Testbed:
+    """Test stand with the first board: three colors by three resistors, always on."""
+    scene = board_scene(
+        BOARD,
+        BOARD_DISTANCE_IN,
+        lens,
+        drive=DirectConfig(kind="direct"),
+        intensity_cd=BOARD_INTENSITY_CD,
+        **led_values,
+    )
+    return build_test_stand(
+        with_config(with_config(scene, "camera", psf=WIDE_PSF), "exposure", time_s=BOARD_EXPOSURE_S)
+    )
+
+
+def white_board(pulses_us: Sequence[float], saturation_fraction: float = 1.0) -> Testbed:
+    """The last board under the dome: white LEDs lit one after another, each for its pulse within its slot.
+
+    saturation_fraction : a pixel saturates at this fraction of the converter's range
+    """
+    levels = [pulse * 1e-6 / SLOT_S for pulse in pulses_us]
+    scene = board_scene(levels, DOME_IN, LensSettings(8.0, DOME_IN), intensity_cd=WHITE_CD)
+    scene = with_config(scene, "camera.detector", full_well_e=saturation_fraction * scene.camera.detector.full_well_e)
+    return build_test_stand(with_config(scene, "exposure", time_s=WHITE_EXPOSURE_S))
+
+
+def with_exposure(testbed: Testbed, time_s: float) -> Testbed:
+    """The testbed with another exposure time."""
+    return replace(testbed, scene=with_config(testbed.scene, "exposure", time_s=time_s))
+
+
+def take_image(
+    testbed: Testbed, rng: np.random.Generator, roll_pitch_deg: tuple[float, float] = (0.0, 0.0)
+) -> tuple[GrayImage, Floats]:
+    """An image in gray levels, and the (N, 2) true pixels of its LEDs in the order of their numbers."""
+    frame, truth = render_at_attitude(testbed, Rotation.from_euler("xy", roll_pitch_deg, degrees=True), rng)
+    return gray_levels(frame, testbed), truth.sources.xy_px[np.argsort(truth.sources.id)]
+
+
+class ThresholdCounts(NamedTuple):
+    """Pixels above a threshold: (N,) area of each LED's blob, pixels beside the LEDs, and pixels far from all LEDs."""
+
+    area_px: Floats
+    glare_px: int
+    dark_px: int
+
+
+def count_above(image: GrayImage, xy_px: Floats, threshold: float) -> ThresholdCounts:
+    """Count pixels above a fraction of full scale. Blobs are 8-connected; an LED's blob is the one at its center."""
+    above = image > threshold * WHITE
+    x0, y0 = np.maximum(np.floor(xy_px.min(axis=0)).astype(int) - DARK_RADIUS_PX, 0)
+    x1, y1 = np.ceil(xy_px.max(axis=0)).astype(int) + DARK_RADIUS_PX
+    # Label only the neighborhood of the LEDs: noise elsewhere would give many blobs.
+    label, _ = scipy.ndimage.label(above[y0:y1, x0:x1], np.ones((3, 3)))
+    areas = np.bincount(label.ravel())
+    areas[0] = 0
+    x, y = np.rint(xy_px).astype(int).T
+    lit_px = np.argwhere(above)[:, ::-1]
+    distance_px = np.full(len(lit_px), np.inf)
+    for led_px in xy_px:
+        distance_px = np.minimum(distance_px, np.hypot(*(lit_px - led_px).T))
+    is_dark = distance_px > DARK_RADIUS_PX
+    return ThresholdCounts(
+        areas[label[y - y0, x - x0]].astype(float),
+        int(np.sum(distance_px > GLARE_RADIUS_PX) - is_dark.sum()),
+        int(is_dark.sum()),
+    )
+
+
+def led_tests(options: ExperimentOptions) -> ExperimentResult:
+    """All numbers of section 3.4 that can be simulated."""
+    images = options.trials(12, 2)
+    rng = [np.random.default_rng([options.seed, stage]) for stage in range(5)]
+    results = lobe_fraction(rng[0]) | duty_cycles(rng[1])
+    options.watch(1, 4)
+    results |= thresholds(images, rng[2])
+    options.watch(2, 4)
+    results |= apertures(images, rng[3]) | viewing_angles(images, rng[3])
+    options.watch(3, 4)
+    pulses, magnitude = brightness(images, rng[4])
+    return ExperimentResult(results | pulses, drawings(magnitude, np.random.default_rng([options.seed, 5])))
+
+
+def lobe_fraction(rng: np.random.Generator) -> dict[str, RowResult]:
+    """Light of an LED tilted by 60 deg from the camera relative to one that faces it, in electrons (Fig. 44)."""
+    return {"lobe_60": RowResult(exact(led_electrons(60.0, rng) / led_electrons(0.0, rng)))}
+
+
+def led_electrons(angle_deg: float, rng: np.random.Generator) -> float:
+    """Electrons of the board's central LED, tilted away from the camera by angle_deg."""
+    testbed = white_board([1000.0] * 9)
+    direction = Rotation.from_euler("y", angle_deg, degrees=True).apply([0.0, 0.0, -1.0])
+    single = testbed.sources.take(np.array([4]))
+    testbed = with_exposure(replace(testbed, sources=replace(single, normal=direction[None])), 9 * SLOT_S)
+    return float(render_at_attitude(testbed, Rotation.identity(), rng)[1].sources.electrons[0])
+
+
+def duty_cycles(rng: np.random.Generator) -> dict[str, RowResult]:
+    """Eq. 37: light of each of nine multiplexed LEDs relative to one that is always on."""
+    pulses_us = [1000.0, 500.0, 400.0, 200.0, 1.0, 1000.0, 1000.0, 1000.0, 1000.0]
+    testbed = with_exposure(white_board(pulses_us), 4 * 9 * SLOT_S)
+    always_on = with_exposure(
+        replace(testbed, sources=replace(testbed.sources, on_s=testbed.sources.period_s)), 4 * 9 * SLOT_S
+    )
+    pulsed_e, always_on_e = (
+        truth.sources.electrons[np.argsort(truth.sources.id)]
+        for truth in (render_at_attitude(board, Rotation.identity(), rng)[1] for board in (testbed, always_on))
+    )
+    fraction = pulsed_e / always_on_e
+    return {f"duty_{int(pulses_us[n])}": RowResult(exact(100 * fraction[n])) for n in range(5)}
+
+
+def thresholds(images: int, rng: np.random.Generator) -> dict[str, RowResult]:
+    """Fig. 37: pixels of the first board above thresholds of 2, 10 and 25 %."""
+    own_noise, test2_noise = (
+        [apply_thresholds(*take_image(testbed, rng)) for _ in range(images)]
+        for testbed in (color_board(), color_board(LensSettings(noise_e=NOISE_E)))
+    )
+
+    def both(statistic: Callable[[BoardImage], Any]) -> RowResult:
+        ours, theirs = ([float(statistic(one)) for one in images] for images in (own_noise, test2_noise))
+        return with_cause(CAUSE_NOISE, confidence_interval, ours, theirs)
+
+    lens = LensSettings(noise_e=INTERMEDIATE_NOISE_GRAY * E_PER_GRAY)
+    dark_px = apply_thresholds(*take_image(color_board(lens), rng)).at_2.dark_px
+    return {
+        "glare_2": both(lambda image: image.at_2.glare_px),
+        "noise_2": both(lambda image: image.at_2.dark_px)._replace(
+            note=f"{dark_px} with {INTERMEDIATE_NOISE_GRAY} gray levels"
+        ),
+        "left_10": both(lambda image: 100 * (outside_px(image.at_10) / max(outside_px(image.at_2), 1))),
+        "found_10": both(lambda image: np.sum(image.at_10.area_px >= MIN_AREA_PX)),
+        "fragments_4": both(lambda image: image.lights_4 - len(BOARD)),
+        "dimmest_25": both(lambda image: image.at_25.area_px[DIMMEST_LED]),
+        "lost_25": both(lambda image: np.sum(image.at_25.area_px < MIN_AREA_PX)),
+    }
+
+
+class BoardImage(NamedTuple):
+    """One image at three thresholds, and how many lights the thesis's detector finds in it (at 4 %)."""
+
+    at_2: ThresholdCounts
+    at_10: ThresholdCounts
+    at_25: ThresholdCounts
+    lights_4: int
+
+
+def apply_thresholds(image: GrayImage, xy_px: Floats) -> BoardImage:
+    """Count pixels above 2, 10 and 25 %, and lights above 4 %."""
+    at_2, at_10, at_25 = (count_above(image, xy_px, fraction) for fraction in (0.02, 0.10, 0.25))
+    return BoardImage(at_2, at_10, at_25, len(measure_lights(image).magnitude))
+
+
+def outside_px(counts: ThresholdCounts) -> int:
+    """Number of pixels that belong to no LED."""
+    return counts.glare_px + counts.dark_px
+
+
+def apertures(images: int, rng: np.random.Generator) -> dict[str, RowResult]:
+    """Fig. 36: LEDs found with a wide aperture in focus, a narrow one out of focus, and a balanced one."""
+    results: dict[str, RowResult] = {}
+    for name, lens in APERTURES.items():
+        testbed = color_board(lens)
+        images_taken = [take_image(testbed, rng) for _ in range(images)]
+        detected = [
+            float(np.sum(count_above(*image_and_px, 0.10).area_px >= MIN_AREA_PX)) for image_and_px in images_taken
+        ]
+        results[f"found_{name}"] = RowResult(confidence_interval(detected))
+        if name == "wide":
+            results["full_wide"] = RowResult(
+                confidence_interval([float(np.sum(image == WHITE)) for image, _ in images_taken])
+            )
+    return results
+
+
+APERTURES = {
+    "wide": LensSettings(4.0),
+    "narrow": LensSettings(16.0, 40.0),
+    "balanced": LensSettings(8.0, 38.0),
+}
+
+
+def viewing_angles(images: int, rng: np.random.Generator) -> dict[str, RowResult]:
+    """Figs 38 and 40: how much an LED's area varies between positions, for a directional and a diffuse lobe."""
+    narrow = color_board(lobe=NARROW_LOBE)
+    misalignment = Rotation.from_euler("y", MISALIGNMENT_DEG, degrees=True)
+    misaligned = replace(narrow, sources=replace(narrow.sources, normal=misalignment.apply(narrow.sources.normal)))
+    directional = [area_variation(testbed, 0.10, images, rng)[0][:, DIMMEST_LED] for testbed in (narrow, misaligned)]
+    areas, stray = area_variation(color_board(), 0.04, images, rng)
+    test2_percent, intermediate_percent = (
+        area_variation(color_board(LensSettings(noise_e=noise_e)), 0.04, 1, rng)[1][0]
+        for noise_e in (NOISE_E, INTERMEDIATE_NOISE_GRAY * E_PER_GRAY)
+    )
+    cause = f"LEDs soldered {MISALIGNMENT_DEG:g} deg askew"
+    return {
+        "directional": with_cause(cause, confidence_interval, *directional),
+        "diffuse": RowResult(confidence_interval(areas.min(axis=1))),
+        "outside_4": RowResult(
+            confidence_interval(stray),
+            f"{test2_percent:.2f} with {CAUSE_NOISE}; {intermediate_percent:.4f} with {INTERMEDIATE_NOISE_GRAY}",
+        ),
+    }
+
+
+def area_variation(testbed: Testbed, threshold: float, images: int, rng: np.random.Generator) -> tuple[Floats, Floats]:
+    """(n, 9) smallest over largest area of each LED over the positions; (n,) percent of pixels outside LEDs."""
+    ratio, stray = [], []
+    for _ in range(images):
+        counted = [
+            (image, count_above(image, xy_px, threshold))
+            for image, xy_px in (take_image(testbed, rng, roll_pitch_deg) for roll_pitch_deg in VIEW_ANGLES_DEG)
+        ]
+        area = np.array([counts.area_px for _, counts in counted])
+        ratio.append(np.where(area.any(axis=0), area.min(axis=0) / np.maximum(area.max(axis=0), 1), 1.0))
+        stray.append(np.mean([100 * outside_px(counts) / image.size for image, counts in counted]))
+    return np.array(ratio), np.array(stray)
+
+
+def brightness(images: int, rng: np.random.Generator) -> tuple[dict[str, RowResult], Floats]:
+    """Figs 43 and 46: magnitude of five LEDs against their pulse, and whether LEDs of 1 us are detected."""
+    testbed, long_pulse = white_board(PULSES_US), white_board((*PULSES_US[:-1], 1e6 * ON_FRACTION * SLOT_S))
+    magnitudes = np.array([led_magnitudes(long_pulse, rng) for _ in range(images)])
+    pulses_us = np.array(PULSES_US[:4])
+    per_us = magnitudes[:, :4] / pulses_us
+    saturating = white_board(PULSES_US, SATURATION_FRACTION)
+    saturating_per_us = np.array([led_magnitudes(saturating, rng)[:4] for _ in range(images)]) / pulses_us
+    mean = ", ".join(f"{magnitude:.1f}" for magnitude in magnitudes.mean(axis=0))
+    note = f"ours with Test 2's intensity: {mean}; Table 7: {', '.join(map(str, table_7_magnitudes()))}"
+    board = (1000.0, 500.0, 1.0) * 3
+    long_board = tuple(max(pulse, 1e6 * ON_FRACTION * SLOT_S) for pulse in board)
+    detected, detected_long = (
+        confidence_interval([len(measure_lights(take_image(board_testbed, rng)[0]).magnitude) for _ in range(images)])
+        for board_testbed in (white_board(board), white_board(long_board))
+    )
+    return {
+        "order": RowResult(
+            fraction_in_order([led_magnitudes(testbed, rng) for _ in range(images)]),
+            cause=Cause(CAUSE_LONG_PULSE, fraction_in_order(magnitudes)),
+        ),
+        "linear": RowResult(confidence_interval(per_us[:, 1] / per_us[:, 3]), note),
+        "saturating": with_cause(
+            CAUSE_SATURATION,
+            lambda values: confidence_interval(values[:, 0] / values[:, 3]),
+            per_us,
+            saturating_per_us,
+        ),
+        "found_46": RowResult(detected, cause=Cause(CAUSE_LONG_PULSE, detected_long)),
+    }, magnitudes
+
+
+def fraction_in_order(images: Sequence[Floats] | Floats) -> Summary:
+    """Fraction of images in which all LEDs are detected, with magnitudes in the order of their pulses."""
+    magnitude = np.asarray(images)
+    return metrics.proportion(
+        np.sum(np.all(magnitude > 0, axis=1) & np.all(np.diff(magnitude) < 0, axis=1)), len(magnitude)
+    )
+
+
+def table_7_magnitudes() -> list[float]:
+    """The magnitudes of Test 3 published for PULSES_US."""
+    keys = [f"magnitude_{n}" for n in range(1, len(PULSES_US) + 1)]
+    return published_values("afit-table-6-9", *keys).tolist()
+
+
+def led_magnitudes(testbed: Testbed, rng: np.random.Generator) -> Floats:
+    """(N,) magnitude of each LED; 0 if it is not found."""
+    image, xy_px = take_image(testbed, rng)
+    lights = measure_lights(image)
+    distance_px = np.linalg.norm(xy_px[:, None] - lights.xy_px, axis=2)
+    return np.where(distance_px.min(axis=1) < 10, lights.magnitude[distance_px.argmin(axis=1)], 0.0)
+
+
+def drawings(magnitude: Floats, rng: np.random.Generator) -> tuple[Drawing, ...]:
+    aperture_images = [take_image(color_board(lens), rng)[0] for lens in APERTURES.values()]
+    noise_images = [take_image(color_board(LensSettings(noise_e=noise_e)), rng)[0] for noise_e in (None, NOISE_E)]
+    return (
+        Drawing(
+            "Fig. 36: our board, focused and wide, less focused and narrow, balanced.",
+            lambda fig: draw_apertures(fig, aperture_images),
+            (7.4, 2.8),
+        ),
+        Drawing(
+            "Figs 37 and 40: pixels above four thresholds, with the camera's own noise (top) and with that of Test 2.",
+            lambda fig: draw_thresholds(fig, noise_images),
+            (7.4, 4.0),
+        ),
+        Drawing(
+            "Pulses of five LEDs against their measured magnitude, beside Table 7's.",
+            lambda fig: draw_pulses(fig, magnitude),
+        ),
+    )
+
+
+def crop_board(image: GrayImage) -> GrayImage:
+    """The part of a frame that contains the board."""
+    y, x = np.array(image.shape) // 2
+    return image[y - 200 : y + 200, x - 200 : x + 200]
+
+
+def draw_apertures(fig: Any, images: Sequence[GrayImage]) -> None:
+    for axes, name, lens, image in zip(fig.subplots(1, 3), APERTURES, APERTURES.values(), images, strict=True):
+        axes.imshow(crop_board(image), cmap="gray", vmin=0, vmax=WHITE)
+        axes.set_title(f"{name}: f/{lens.f_number:g}, {lens.focus_in:g} in")
+        axes.set_axis_off()
+
+
+def draw_thresholds(fig: Any, images: Sequence[GrayImage]) -> None:
+    for panels, image, noise in zip(fig.subplots(len(images), 4), images, ("own noise", "Test 2's noise"), strict=True):
+        panels[0].set_ylabel(noise)
+        for axes, threshold in zip(panels, (0.02, 0.04, 0.10, 0.25), strict=True):
+            axes.imshow(crop_board(image) > threshold * WHITE, cmap="Blues", vmin=0, vmax=1, interpolation="nearest")
+            axes.set(title=f"{100 * threshold:.0f} %", xticks=[], yticks=[])
+
+
+def draw_pulses(fig: Any, magnitude: Floats) -> None:
+    """Magnitude against pulse, ours scaled so that the 200 us LED has its published magnitude."""
+    axes, published = fig.subplots(), np.array(table_7_magnitudes())
+    ours = magnitude * published[3] / magnitude[:, 3].mean()
+    axes.errorbar(
+        PULSES_US,
+        ours.mean(axis=0),
+        ours.std(axis=0),
+        fmt="s",
+        color=INK[0],
+        capsize=2,
+        label=f"ours, {CAUSE_LONG_PULSE}",
+    )
+    axes.plot(PULSES_US, published, "o", color=INK[1], label="published")
+    axes.plot([0, 600], [0, 3 * published[3]], "--", color=INK[6], label="proportional")
+    axes.set(xlabel="pulse (us)", ylabel="magnitude, 200 us as published")
+    axes.legend()

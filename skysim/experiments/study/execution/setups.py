@@ -1,0 +1,123 @@
+"""Prepared test beds and trackers for trials, cached per worker; hashes and seeds that record a row's origin."""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from dataclasses import replace
+from functools import cache
+from hashlib import sha256
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from skysim.core.paths import DATA, ROOT
+from skysim.experiments.study.factors import Settings
+from skysim.experiments.study.plan import (
+    CentroidTrial,
+    FlightTrial,
+    FrameTrial,
+    TrialSpec,
+    digest,
+    resolve_point,
+)
+from skysim.scene.loader import FILE_KEYS
+from skysim.scene.scene import Scene
+from skysim.simulation.testbed import Testbed, build_testbed, build_tracker
+from skysim.tracking import factory
+from skysim.tracking.external import interface
+
+CACHE_SIZE = 4  # setups that a worker caches
+
+
+class Setup(NamedTuple):
+    """A scene prepared for trials: hardware without simulated motion, tracker with its index, trial, scene hash."""
+
+    testbed: Testbed
+    estimator: factory.Estimator
+    trial: CentroidTrial | FrameTrial | FlightTrial
+    scene_hash: str
+
+
+class SetupCache(threading.local):
+    """Least-recently-used cache of setups. One per thread, because a test bed's canvas serves one trial at a time."""
+
+    def __init__(self) -> None:
+        self.setups: OrderedDict[str, Setup] = OrderedDict()
+
+
+CACHE = SetupCache()
+
+
+def prepared_setup(spec: TrialSpec, settings: Settings) -> Setup:
+    """The setup of a design point, from the cache if it is there. Raises InputError."""
+    key = digest([spec.scene, spec.folder, spec.base, spec.trial, spec.programs, settings])
+    cached = CACHE.setups
+    if key not in cached:
+        cached[key] = build_setup(spec, settings)
+        while len(cached) > CACHE_SIZE:
+            cached.popitem(last=False)
+    cached.move_to_end(key)
+    return cached[key]
+
+
+def build_setup(spec: TrialSpec, settings: Settings) -> Setup:
+    """Build hardware and tracker of a point, or reuse those of a cached setup that differs only in its trial."""
+    scene, trial = resolve_point(spec, settings)
+    hash_ = scene_hash(scene)
+    for setup in CACHE.setups.values():
+        if setup.scene_hash == hash_ and setup.testbed.programs == spec.programs:
+            return setup._replace(trial=trial)
+    testbed = reuse_hardware(scene) or build_testbed(scene, spec.programs)
+    testbed = replace(testbed, programs=spec.programs)
+    return Setup(testbed, build_tracker(testbed), trial, hash_)
+
+
+def reuse_hardware(scene: Scene) -> Testbed | None:
+    """The test bed of a cached setup whose scene differs only in section `tracker`, so that the hardware is the same.
+
+    Returns None if there is none.
+    """
+    for setup in CACHE.setups.values():
+        if setup.testbed.scene.model_copy(update={"tracker": scene.tracker}) == scene:
+            return replace(setup.testbed, scene=scene)
+    return None
+
+
+def scene_hash(scene: Scene) -> str:
+    """Hash of a scene, of the contents of the files it names, and of the release of an external tracker."""
+    tree = scene.model_dump(mode="json", by_alias=True)
+    contents = [sha256(Path(path).read_bytes()).hexdigest() for path in files_of(tree)]
+    return digest([tree, contents, interface.package_release(scene.tracker.name)])
+
+
+def files_of(tree: dict[str, Any]) -> list[str]:
+    """Paths of the files that a scene names in its keys, if they exist."""
+    paths = []
+    for keys in FILE_KEYS:
+        node: Any = tree
+        for key in keys:
+            node = node.get(key) if isinstance(node, dict) else None
+        if isinstance(node, str) and Path(node).is_file():
+            paths.append(node)
+    return paths
+
+
+@cache
+def code_version() -> str:
+    """Hash of the source code of skysim and estimator and of their data; stored with each trial."""
+    code = sha256()
+    sources = [path for package in ("skysim", "estimator") for path in (ROOT / package).rglob("*.py")]
+    data = [
+        path for folder in ("qe", "led", "bands", "cameras") for path in (DATA / folder).rglob("*") if path.is_file()
+    ]
+    for path in sorted(sources + data):
+        code.update(path.relative_to(ROOT).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
+    return code.hexdigest()[:16]
+
+
+def seed_of(spec: TrialSpec, point: int, replicate: int) -> int:
+    """Seed of a trial, 63 bits, derived from the study's seed; with `paired` it is the same at every point."""
+    key = (replicate,) if spec.paired else (replicate, point)
+    return int(np.random.SeedSequence(spec.seed, spawn_key=key).generate_state(1, np.uint64)[0] >> 1)

@@ -1,0 +1,106 @@
+"""Compile the tracker in a second process while the first one compiles the renderer, which halves the time.
+
+numba compiles one function at a time and keeps the result on disk, where every process finds it. The packages skysim
+and estimator share no compiled function, so two processes can compile them at once. The command
+`python -m skysim.simulation.compilation SCENE [KEY=VALUE ...]` builds the scene's tracker and solves a synthetic
+frame, which needs no renderer.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+
+import numpy as np
+from numba.core import event
+
+from skysim.camera.detector.detector import saturation_dn
+from skysim.core.errors import InputError
+from skysim.core.types import Frame
+from skysim.core.yaml_reader import parse_overrides
+from skysim.scene import loader
+from skysim.simulation.testbed import Testbed, build_testbed, build_tracker, exposure_window
+from skysim.tracking import factory
+from skysim.tracking.external.adapter import ExternalTracker
+from skysim.tracking.onboard_model import assumed_camera
+
+SPOT_SIGMA_PX = 1.0
+NOISE_DN = 3.0
+MAX_SPOTS = 50
+
+
+class TrackerCompilation(event.Listener):
+    """Starts the second process when the first function of `skysim` is compiled.
+
+    Before a function of `estimator` is compiled here it waits for that process, so that all functions but this one then
+    come from numba's cache.
+    """
+
+    def __init__(self, arguments: Sequence[str]) -> None:
+        self.command = [sys.executable, "-m", __name__, *arguments]
+        self.process: subprocess.Popen[bytes] | None = None
+
+    def on_start(self, compilation: event.Event) -> None:
+        module = compilation.data["dispatcher"].py_func.__module__
+        if self.process is None and module.startswith("skysim."):
+            silent = subprocess.DEVNULL
+            self.process = subprocess.Popen(self.command, stdin=silent, stdout=silent, stderr=silent)
+        elif self.process is not None and module.startswith("estimator."):
+            self.process.wait()
+
+    def on_end(self, _: event.Event) -> None:
+        """Required by the interface; does nothing."""
+
+
+@contextmanager
+def on_two_processes(scene: str, overrides: Mapping[str, str]) -> Iterator[None]:
+    """While this context lasts, compile the scene's tracker in a second process, if the renderer must be compiled."""
+    listener = TrackerCompilation([scene, *(f"{key}={value}" for key, value in overrides.items())])
+    event.register("numba:compile", listener)
+    try:
+        yield
+    finally:
+        event.unregister("numba:compile", listener)
+        if listener.process is not None:
+            listener.process.terminate()
+            listener.process.wait()
+
+
+def compile_tracker(scene: str, overrides: Sequence[str] = ()) -> None:
+    """Build a scene's tracker and solve a synthetic frame with it; external trackers are skipped.
+
+    overrides : `KEY=VALUE` as on the command line
+    """
+    testbed = build_testbed(loader.load(scene, parse_overrides(list(overrides))))
+    tracker = build_tracker(testbed)
+    if not isinstance(tracker, ExternalTracker):
+        factory.solve_frame(tracker, synthetic_frame(testbed))
+
+
+def synthetic_frame(testbed: Testbed) -> Frame:
+    """A frame at the initial attitude with equal Gaussian spots at the sources, drawn without the renderer."""
+    camera = assumed_camera(testbed.scene)
+    when = exposure_window(testbed.scene, 0)
+    lab_from_body = testbed.trajectory.attitude_at(when.open_s)
+    toward = testbed.sources.place[:, :3] - testbed.sources.place[:, 3:] * lab_from_body.apply(
+        testbed.mount.camera_body_m
+    )
+    vectors_cam = (testbed.mount.cam_from_body * lab_from_body.inv()).apply(toward)
+    xy_px = camera.pixels(vectors_cam[vectors_cam[:, 2] > 0])
+    xy_px = xy_px[camera.contains(xy_px)][:MAX_SPOTS]
+    full_dn = saturation_dn(testbed.scene.camera.detector)
+    image_dn = np.random.default_rng(0).normal(0.1 * full_dn, NOISE_DN, (camera.height_px, camera.width_px))
+    x, y = np.arange(camera.width_px), np.arange(camera.height_px)
+    for x_px, y_px in xy_px:
+        along, down = (np.exp(-(((axis - at) / SPOT_SIGMA_PX) ** 2) / 2) for axis, at in ((x, x_px), (y, y_px)))
+        image_dn += 0.5 * full_dn * np.outer(down, along)
+    return Frame(0, np.clip(image_dn, 0, full_dn).astype(np.uint16), when.open_s, when.exposure_s, full_dn)
+
+
+if __name__ == "__main__":
+    try:
+        compile_tracker(sys.argv[1], sys.argv[2:])
+    except InputError as error:
+        sys.exit(str(error))
