@@ -21,6 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 from skysim.core import quaternion
 from skysim.core.errors import InputError
 from skysim.core.jit import jit
+from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
 from skysim.scene.vehicle import AccelerometerConfig, GyroConfig, ImuConfig, SiteConfig
 
@@ -314,7 +315,7 @@ class Imu:
     @classmethod
     def from_config(cls, config: ImuConfig, rng: np.random.Generator) -> Imu:
         """The unit of hardware_seed at turn-on: the Gauss-Markov biases start in their stationary distribution."""
-        hardware = np.random.default_rng(np.random.SeedSequence(config.hardware_seed)).standard_normal((2, 4, 3))
+        hardware = random_stream(config.hardware_seed).standard_normal((2, 4, 3))
         start = rng.standard_normal((2, 3))
         return cls(
             gyro_triad(config.gyro, hardware[0], start[0]),

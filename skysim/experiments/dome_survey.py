@@ -25,6 +25,7 @@ from estimator.core.errors import ImageError
 from estimator.core.types import Centroids
 from estimator.trackers.pipeline import Clock, Settings, detect_and_centroid
 from skysim.core.errors import InputError
+from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats, Frame, Trajectory, Truth
 from skysim.core.units import quantity
 from skysim.experiments.dome_survey_naming import (
@@ -43,7 +44,7 @@ from skysim.tracking import onboard_model
 from skysim.tracking import settings as tracker_settings
 from skysim.tracking.dome_map_file import DomeMap
 
-STREAM_KEYS = {"attitudes": 101, "imu": 102, "checks": 103}  # distinct from random_streams.STAGE_ID
+STREAM_KEYS = {"attitudes": 101, "imu": 102, "checks": 103}  # distinct from those in core/random_streams.py
 # Lights that a frame must share with others: two determine its attitude; a misidentified patch board accounts for six.
 MIN_SHARED_LEDS = (3, 8)
 
@@ -121,16 +122,11 @@ def stop_attitudes(scene: Scene, stream_name: str, count: int, tilt_deg: float) 
     stop_deg = scene.vehicle.tilt_stop_deg if scene.vehicle.mount == "air_bearing" else 90.0
     if not 0 < tilt_deg <= stop_deg:
         raise InputError(f"--tilt {tilt_deg:g}: allowed: above 0, up to {stop_deg:g} degrees, the vehicle's stop")
-    rng = random_stream(scene.seed, stream_name)
+    rng = random_stream(scene.seed, STREAM_KEYS[stream_name])
     tilt = np.arccos(rng.uniform(np.cos(np.radians(tilt_deg)), 1, count))
     azimuth, yaw = rng.uniform(0, 2 * np.pi, (2, count))
     rotation_vectors = np.column_stack([tilt * np.cos(azimuth), tilt * np.sin(azimuth), np.zeros(count)])
     return Rotation.from_rotvec(rotation_vectors) * Rotation.from_euler("z", yaw[:, None])
-
-
-def random_stream(seed: int, stream_name: str) -> np.random.Generator:
-    """Random generator for one purpose (a key of STREAM_KEYS), independent of the other streams of the seed."""
-    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(STREAM_KEYS[stream_name],)))
 
 
 def render_stops(testbed: Testbed, lab_from_body: Rotation, first: int = 0) -> Iterator[tuple[Frame, Truth]]:
@@ -156,7 +152,7 @@ def take_survey_frames(
 
 def imu_attitudes(scene: Scene, lab_from_body: Rotation, sigma_rad: float) -> Rotation:
     """body_from_lab at each stop from an IMU with independent Gaussian errors about each body axis."""
-    error_rad = sigma_rad * random_stream(scene.seed, "imu").standard_normal((len(lab_from_body), 3))
+    error_rad = sigma_rad * random_stream(scene.seed, STREAM_KEYS["imu"]).standard_normal((len(lab_from_body), 3))
     return Rotation.from_rotvec(error_rad) * lab_from_body.inv()
 
 

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError, unknown_name
+from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
 
 WRONG_RAD = np.radians(10 / 60)  # limit of PTASE for a wrong attitude: ten arcminutes
@@ -102,7 +103,7 @@ def resampled(values: Floats, statistic: Callable[..., Any]) -> Summary:
         batch=batch,
         confidence_level=CONFIDENCE,
         method="percentile",
-        rng=np.random.default_rng(1),
+        rng=random_stream(1),
     )
     low, high = map(float, result.confidence_interval)
     return Summary(value, low, high, len(values))

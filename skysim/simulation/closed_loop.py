@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from estimator.trackers.pipeline import Clock, Report
 from skysim.core.errors import InputError
+from skysim.core.random_streams import AIR_CURRENT, IMU, JITTER, random_stream
 from skysim.core.types import Floats, Frame, Truth
 from skysim.dynamics import guidance, imu, multibody
 from skysim.dynamics.disturbances import DisturbanceModel
@@ -24,7 +25,6 @@ from skysim.dynamics.flight_computer import ControlInput, FlightComputer
 from skysim.dynamics.jitter import Vibration
 from skysim.scene.scene import Scene
 from skysim.simulation.exposure import render_frame
-from skysim.simulation.random_streams import rng
 from skysim.simulation.telemetry import TelemetryRecorder
 from skysim.simulation.testbed import exposure_window
 from skysim.tracking import factory
@@ -63,7 +63,7 @@ class ClosedLoop:
         self.simulation = multibody.Simulation(
             vehicle, start, np.radians(scene.motion.rate_deg_s), testbed.duration_s, history
         )
-        self.vibration = Vibration.draw(scene.motion, rng(scene.seed, "jitter", 0))
+        self.vibration = Vibration.draw(scene.motion, random_stream(scene.seed, JITTER, 0))
         self.reference = guidance.plan(scene.motion, start)
         self.flight_computer = FlightComputer(scene, vehicle, self.reference)
         self.navigation = build_navigation(testbed, start, not discards_history)
@@ -73,7 +73,7 @@ class ClosedLoop:
             guidance.impulses(scene.motion),
             vehicle.inertia_kg_m2,
             self.flight_computer.period_s,
-            rng(scene.seed, "air_current", 0),
+            random_stream(scene.seed, AIR_CURRENT, 0),
         )
         check_reference(self.reference, testbed)
 
@@ -200,7 +200,7 @@ def build_navigation(testbed: Testbed, start: Rotation, keep_samples: bool) -> N
     if testbed.scene.vehicle.imu is None:
         return None
     position_m = multibody.imu_position_m(testbed.vehicle)
-    stream = rng(testbed.scene.seed, "imu", 0)
+    stream = random_stream(testbed.scene.seed, IMU, 0)
     return Navigation(
         testbed.scene, testbed.mount, start, position_m, testbed.vehicle.gravity_m_s2, stream, keep_samples
     )

@@ -18,6 +18,7 @@ from numba.core import event
 
 from skysim.camera.detector.detector import saturation_dn
 from skysim.core.errors import InputError
+from skysim.core.random_streams import random_stream
 from skysim.core.types import Frame
 from skysim.core.yaml_reader import parse_overrides
 from skysim.scene import loader
@@ -91,7 +92,7 @@ def synthetic_frame(testbed: Testbed) -> Frame:
     xy_px = camera.pixels(vectors_cam[vectors_cam[:, 2] > 0])
     xy_px = xy_px[camera.contains(xy_px)][:MAX_SPOTS]
     full_dn = saturation_dn(testbed.scene.camera.detector)
-    image_dn = np.random.default_rng(0).normal(0.1 * full_dn, NOISE_DN, (camera.height_px, camera.width_px))
+    image_dn = random_stream(0).normal(0.1 * full_dn, NOISE_DN, (camera.height_px, camera.width_px))
     x, y = np.arange(camera.width_px), np.arange(camera.height_px)
     for x_px, y_px in xy_px:
         along, down = (np.exp(-(((axis - at) / SPOT_SIGMA_PX) ** 2) / 2) for axis, at in ((x, x_px), (y, y_px)))

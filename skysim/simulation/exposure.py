@@ -16,9 +16,9 @@ from estimator.trackers.pipeline import Clock
 from skysim.camera import background, display_glow
 from skysim.camera.detector.detector import add_snr_and_saturation, expose, saturation_dn, smear
 from skysim.camera.render import Poses, in_view, project, render
+from skysim.core.random_streams import DETECTOR, random_stream
 from skysim.core.types import Frame, Truth
 from skysim.dynamics import multibody
-from skysim.simulation.random_streams import rng
 from skysim.simulation.testbed import Testbed, exposure_window
 
 
@@ -58,7 +58,7 @@ def render_frame(
     # Saturation and SNR need the light of the whole frame, which `expose` then overwrites.
     sources = add_snr_and_saturation(sources, light_e, window.exposure_s, testbed.detector)
     clock.lap("render")
-    image = expose(light_e, window.exposure_s, testbed.detector, rng(scene.seed, "detector", index))
+    image = expose(light_e, window.exposure_s, testbed.detector, random_stream(scene.seed, DETECTOR, index))
     clock.lap("detector")
     rate_cam = testbed.mount.cam_from_body.apply(testbed.trajectory.rate_at(middle_s))
     truth = Truth(middle_s, lab_from_body, cam_from_lab, rate_cam, sources, occluded_ids(testbed, lab_from_body))

@@ -11,10 +11,11 @@ from scipy.spatial.transform import Rotation
 from estimator.core.types import Attitude, Centroids
 from skysim.camera.optics import Optics
 from skysim.core.errors import InputError
+from skysim.core.random_streams import DETECTOR, random_stream
 from skysim.core.types import Truth
 from skysim.results import metrics
 from skysim.scene import loader
-from skysim.simulation import exposure, random_streams, run
+from skysim.simulation import exposure, run
 from skysim.simulation.closed_loop import ClosedLoop
 from skysim.simulation.testbed import Testbed, build_testbed, build_tracker, exposure_window
 from skysim.tracking import onboard_model
@@ -262,7 +263,7 @@ def test_frames_do_not_depend_on_those_before() -> None:
 
 
 def test_noise_differs_from_frame_to_frame_and_seed_to_seed() -> None:
-    draws = [random_streams.rng(seed, "detector", k).standard_normal(1000) for seed, k in ((1, 0), (1, 1), (2, 0))]
+    draws = [random_stream(seed, DETECTOR, k).standard_normal(1000) for seed, k in ((1, 0), (1, 1), (2, 0))]
     correlation = np.corrcoef(draws)
     assert np.abs(correlation[np.triu_indices(3, 1)]).max() < 4 / np.sqrt(1000)
 

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from skysim.camera.detector import charge_transfer, cosmic_rays, noise
 from skysim.core.jit import jit
+from skysim.core.random_streams import random_stream
 from skysim.core.types import SourceTruth
 from skysim.scene.camera import CameraConfig, DetectorConfig, FrameTransferConfig, InterlineConfig, Shutter
 from skysim.sources.photometry import snr
@@ -43,8 +44,7 @@ class Detector:
     def from_camera(cls, camera: CameraConfig) -> Detector:
         """Draw the fixed pattern."""
         config, shape = camera.detector, (camera.height_px, camera.width_px)
-        streams = np.random.SeedSequence(config.hardware_seed).spawn(3)
-        prnu, dark, column = (np.random.default_rng(stream) for stream in streams)
+        prnu, dark, column = (random_stream(config.hardware_seed, key) for key in range(3))
         return cls(
             config,
             camera.shutter,

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.special import stdtrit
 
+from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
 from skysim.results import metrics
 from skysim.results.metrics import CONFIDENCE, RESAMPLES, Summary
@@ -80,7 +81,7 @@ def bootstrap_of_means(columns: Floats, statistic: Callable[[Floats], Any]) -> S
     filled = np.where(finite, columns, 0.0)
     rows = len(columns)
     # A resample only needs how often it draws each row, so the means of all resamples are one matrix product.
-    weight = np.random.default_rng(1).multinomial(rows, np.full(rows, 1 / rows), RESAMPLES)
+    weight = random_stream(1).multinomial(rows, np.full(rows, 1 / rows), RESAMPLES)
     with np.errstate(invalid="ignore"):
         resampled = statistic((weight @ filled) / (weight @ finite))
     value = float(statistic(filled.sum(axis=0) / finite.sum(axis=0)))

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError
+from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats, Sources
 from skysim.scene import leds, light
 from skysim.sources import stars as star_sources
@@ -35,7 +36,7 @@ def displace_ends(config: leds.FibersConfig, fibers: Sources) -> Sources:
     that is r off the center and assumes a perfect dome sees an end displaced by up to (r / R) v rad (JHU/APL's .4 %
     of 4 ft, 50 mm off: 34"). Normals are unchanged. The random stream is that of config.points.hardware_seed.
     """
-    rng = np.random.default_rng(np.random.SeedSequence(config.points.hardware_seed, spawn_key=(SHELL_STREAM,)))
+    rng = random_stream(config.points.hardware_seed, SHELL_STREAM)
     place_m = fibers.place[:, :3]
     fraction = config.radius_variation * rng.uniform(-1, 1, len(fibers))
     offset_m = fraction * np.linalg.norm(place_m, axis=1)
@@ -134,7 +135,7 @@ def panel_sources(config: leds.LcdConfig, panel: Plane, led: leds.LedConfig, ban
             f"light.layout.points: a star of level {level.min():.2g} is black on {config.gray_levels} gray levels;"
             f" allowed: {min_level(config):.2g} or more"
         )
-    rng = np.random.default_rng(config.points.hardware_seed)
+    rng = random_stream(config.points.hardware_seed)
     count = len(blocks.star)
     # Pixels scatter independently: the mean of n^2 of them scatters by 1 / n as much.
     scatter = np.exp(led.scatter / config.block * rng.standard_normal(count))

@@ -18,6 +18,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError
+from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats, Sources
 from skysim.scene import leds
 from skysim.sources.dome import celestial as celestial_dome
@@ -158,13 +159,13 @@ def patch_boards(config: leds.PatchBoardsConfig, surface: Surface, led: leds.Led
     tilts the board, and each LED is displaced in the board's plane. Everything random here is hardware and is drawn
     from config.hardware_seed: which LEDs are soldered, their levels and strengths, the phases of their pulses.
     """
-    rng = np.random.default_rng(config.hardware_seed)
+    rng = random_stream(config.hardware_seed)
     boards, holes, level = listed_boards(config, surface) if config.boards else spread_boards(config, surface, rng)
     board = np.repeat(np.arange(len(holes)), [len(board_holes) for board_holes in holes])
     hole = np.concatenate(holes)
     if level is None:
         level = rng.choice(config.pwm_levels, len(board))
-    glue = np.random.default_rng(np.random.SeedSequence(config.hardware_seed, spawn_key=(GLUE_STREAM,)))
+    glue = random_stream(config.hardware_seed, GLUE_STREAM)
     if config.glue_tilt_deg:
         boards = tilt_boards(boards, np.radians(config.glue_tilt_deg), glue)
     displacement_m = config.glue_scatter_m * glue.standard_normal((2, len(board)))
@@ -265,14 +266,14 @@ def tilt_boards(boards: Boards, max_rad: float, rng: np.random.Generator) -> Boa
 
 def fibonacci(config: leds.FibonacciConfig, surface: Surface, led: leds.LedConfig, band: Band) -> Sources:
     """LEDs on a Fibonacci spiral: equal solid angles about the bearing hold equal numbers, to within a few."""
-    rng = np.random.default_rng(config.hardware_seed)
+    rng = random_stream(config.hardware_seed)
     place_m = project_from_bearing(surface, cap(config.count, np.radians(config.cap_deg)))
     return dimmed_sources(config.dimming, surface, place_m, led, band, rng)
 
 
 def random_places(config: leds.RandomPlacesConfig, surface: Surface, led: leds.LedConfig, band: Band) -> Sources:
     """Independent LEDs, uniform in solid angle about the bearing: a Poisson field, like that of real stars."""
-    rng = np.random.default_rng(config.hardware_seed)
+    rng = random_stream(config.hardware_seed)
     place_m = project_from_bearing(surface, scattered_cap(config.count, np.radians(config.cap_deg), rng))
     return dimmed_sources(config.dimming, surface, place_m, led, band, rng)
 
@@ -287,7 +288,7 @@ def poisson_disk(config: leds.PoissonDiskConfig, surface: Surface, led: leds.Led
     If a count is given instead, the result is the first `count` points accepted at the widest spacing that has room
     for them. Raises InputError for a spacing that makes more LEDs than fit into memory.
     """
-    rng = np.random.default_rng(config.hardware_seed)
+    rng = random_stream(config.hardware_seed)
     half = np.radians(config.cap_deg)
     if config.spacing_m is None:
         count = config.count or 1
@@ -317,7 +318,7 @@ def optimized(config: leds.OptimizedConfig, surface: Surface, led: leds.LedConfi
     No LED is placed where no attitude's field reaches. In the mean of the worst attitudes the layout is not worse
     than a Fibonacci spiral.
     """
-    rng = np.random.default_rng(config.hardware_seed)
+    rng = random_stream(config.hardware_seed)
     options = optimize.OPTIONS
     reach = optimize.field_reach_rad(config, surface)
     sites = project_from_bearing(surface, scattered_cap(options.sites_per_led * config.count, reach, rng))
@@ -335,7 +336,7 @@ def celestial(config: leds.CelestialConfig, surface: Surface, led: leds.LedConfi
     normal = surface.inward(stars.place_m)
     level = celestial_dome.led_levels(config, stars, normal, led)
     placed = PlacedLeds(stars.hip, stars.place_m, normal, level, stars.v_mag)
-    return led_sources(placed, led, band, np.random.default_rng(config.hardware_seed))
+    return led_sources(placed, led, band, random_stream(config.hardware_seed))
 
 
 def listed(config: leds.ListedConfig, surface: Surface, led: leds.LedConfig, band: Band) -> Sources:
@@ -355,7 +356,7 @@ def listed(config: leds.ListedConfig, surface: Surface, led: leds.LedConfig, ban
     place_m = coordinates if coordinates.shape[1] == 3 else project_from_bearing(surface, directions)
     check_on_surface(key, surface, place_m)
     level = level if level is not None and len(level) else np.ones(len(place_m))
-    return led_sources(on_surface(surface, place_m, level), led, band, np.random.default_rng(config.hardware_seed))
+    return led_sources(on_surface(surface, place_m, level), led, band, random_stream(config.hardware_seed))
 
 
 def check_on_surface(key: str, surface: Surface, place_m: Floats) -> None:

@@ -6,10 +6,10 @@ and not noise of a frame. Each kind of error has its own random stream, so addin
 
 from __future__ import annotations
 
-import numpy as np
 from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError
+from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
 from skysim.scene.tracker import SurveyErrorsConfig
 from skysim.sources.dome.surface import Surface
@@ -19,8 +19,7 @@ STREAM = {"leds": 1, "lever": 2, "surface": 3}
 
 def standard_normals(seed: int, kind: str, shape: tuple[int, ...]) -> Floats:
     """Standard normal numbers of that shape; they depend on the seed and the kind of error only."""
-    stream = np.random.SeedSequence(seed, spawn_key=(STREAM[kind],))
-    return np.random.default_rng(stream).standard_normal(shape)
+    return random_stream(seed, STREAM[kind]).standard_normal(shape)
 
 
 def assumed_m(place_m: Floats, sigma_m: float, seed: int, kind: str) -> Floats:

@@ -26,6 +26,7 @@ from estimator.identification.published.saa_search import (
     gate_rad,
     match_assumptions,
 )
+from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
 from skysim.core.units import ARCSEC_RAD, INCH_M
 from skysim.dynamics import guidance, imu
@@ -97,13 +98,13 @@ class AllCauses(NamedTuple):
 def tables_10_to_15(options: ExperimentOptions) -> ExperimentResult:
     """Tables 10-15: with clean images and a perfect IMU; with camera noise, IMU drift and the bump as the cause."""
     images, units = options.trials(50, 3), options.trials(60, 8)
-    clean = algorithm_errors(build_test3(), images, LEDS, np.random.default_rng([options.seed, 0]))
+    clean = algorithm_errors(build_test3(), images, LEDS, random_stream(options.seed, 0))
     options.watch(1, 4)
-    camera = algorithm_errors(build_test3(FITTED_IMAGING), images, 2, np.random.default_rng([options.seed, 1]))
+    camera = algorithm_errors(build_test3(FITTED_IMAGING), images, 2, random_stream(options.seed, 1))
     options.watch(2, 4)
     holds = (HOLD_MIN,) if options.quick else HOLDS_MIN
-    drift_deg = {hold: imu_drift(hold, units, np.random.default_rng([options.seed, 2])) for hold in holds}
-    drift_without_earth_deg = imu_drift(HOLD_MIN, units, np.random.default_rng([options.seed, 2]), earth=False)
+    drift_deg = {hold: imu_drift(hold, units, random_stream(options.seed, 2)) for hold in holds}
+    drift_without_earth_deg = imu_drift(HOLD_MIN, units, random_stream(options.seed, 2), earth=False)
     options.watch(3, 4)
     bump_runs = bump.simulate_bumps(bump.FITTED_BUMP, options.trials(10, 3), options.seed)
     bump_deg = np.array([run.imu_deg[-1] for run in bump_runs])

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
 from skysim.experiments.papers.afit.test3_images import angles_deg
 from skysim.experiments.papers.compare import (
@@ -79,7 +80,7 @@ def bump(options: ExperimentOptions) -> ExperimentResult:
 
 def simulate_bumps(bump_deg_s: BumpRate | None, imus: int, seed: int) -> list[BumpRun]:
     """Simulate the same motion with `imus` IMUs of random hardware seeds."""
-    seeds = np.random.default_rng([seed, 14]).integers(2**31, size=imus)
+    seeds = random_stream(seed, 14).integers(2**31, size=imus)
     return [simulate_bump(bump_deg_s, int(imu_seed)) for imu_seed in seeds]
 
 

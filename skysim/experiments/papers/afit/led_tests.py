@@ -11,6 +11,7 @@ import scipy.ndimage
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
 from skysim.core.units import INCH_M
 from skysim.experiments.papers.afit.test2 import INTENSITY_CD, NOISE_E, ON_FRACTION
@@ -168,7 +169,7 @@ def count_above(image: GrayImage, xy_px: Floats, threshold: float) -> ThresholdC
 def led_tests(options: ExperimentOptions) -> ExperimentResult:
     """All numbers of section 3.4 that can be simulated."""
     images = options.trials(12, 2)
-    rng = [np.random.default_rng([options.seed, stage]) for stage in range(5)]
+    rng = [random_stream(options.seed, stage) for stage in range(5)]
     results = lobe_fraction(rng[0]) | duty_cycles(rng[1])
     options.watch(1, 4)
     results |= thresholds(images, rng[2])
@@ -176,7 +177,7 @@ def led_tests(options: ExperimentOptions) -> ExperimentResult:
     results |= apertures(images, rng[3]) | viewing_angles(images, rng[3])
     options.watch(3, 4)
     pulses, magnitude = brightness(images, rng[4])
-    return ExperimentResult(results | pulses, drawings(magnitude, np.random.default_rng([options.seed, 5])))
+    return ExperimentResult(results | pulses, drawings(magnitude, random_stream(options.seed, 5)))
 
 
 def lobe_fraction(rng: np.random.Generator) -> dict[str, RowResult]:

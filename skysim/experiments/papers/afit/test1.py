@@ -10,6 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from estimator.calibration.home_position import pooled
+from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
 from skysim.dynamics import guidance
 from skysim.experiments.papers.afit.test_stand import (
@@ -95,12 +96,12 @@ def table_2(options: ExperimentOptions) -> ExperimentResult:
     frame_time: list[Board] = []
     for n in range(boards):
         options.watch(n, boards)
-        hardware_seed = int(np.random.default_rng([options.seed, n]).integers(2**31))
+        hardware_seed = int(random_stream(options.seed, n).integers(2**31))
         for stage, (testbed, runs) in enumerate(zip(stands, (full_cycles, frame_time), strict=True)):
-            rng = np.random.default_rng([options.seed, stage, n])
+            rng = random_stream(options.seed, stage, n)
             runs.append(take_board(with_other_leds(testbed, hardware_seed), images, rng))
     results = ranks(full_cycles, frame_time) | relative_spread(full_cycles)
-    found_arcsec = lattice_angles(stands[0], options.trials(20, 2), np.random.default_rng([options.seed, 2]))
+    found_arcsec = lattice_angles(stands[0], options.trials(20, 2), random_stream(options.seed, 2))
     return ExperimentResult(results | separations(found_arcsec), drawings(full_cycles, frame_time, found_arcsec))
 
 

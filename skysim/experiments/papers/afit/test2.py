@@ -15,6 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from estimator.attitude.dome_map import project
+from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
 from skysim.core.units import INCH_M
 from skysim.experiments.papers.afit.surface import contour
@@ -134,7 +135,7 @@ def tables_3_to_5(options: ExperimentOptions) -> ExperimentResult:
     """Tables 3 to 5 and the dome's contour: with the camera's own noise, and with more noise as the cause."""
     images = options.trials(50, 10)
     quiet_stand, noisy_stand = build_test_stand(scene(ON_FRACTION)), build_test_stand(noisy_scene())
-    rng = [np.random.default_rng([options.seed, stage]) for stage in range(3)]
+    rng = [random_stream(options.seed, stage) for stage in range(3)]
     runs = NoiseRuns([], [])
     for n, tilt_deg in enumerate(PLACES_DEG):
         options.watch(n, 4)

@@ -17,6 +17,7 @@ from estimator.attitude.dome_map import project
 from estimator.calibration.home_position import Sighting
 from estimator.catalog.catalog import unit
 from estimator.catalog.pair_buckets import bucket_of, build_pair_catalog
+from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
 from skysim.core.units import ARCSEC_RAD
 from skysim.experiments.papers.afit.test3_images import (
@@ -68,9 +69,7 @@ def tables_6_to_9(options: ExperimentOptions) -> ExperimentResult:
     for done, (name, (overrides, n_images)) in enumerate(plan.items()):
         options.watch(done, len(plan))
         testbed = build_test3(fitted_overrides | overrides)
-        series[name] = ImageSeries(
-            testbed, photograph_positions(testbed, n_images, np.random.default_rng([options.seed, done]))
-        )
+        series[name] = ImageSeries(testbed, photograph_positions(testbed, n_images, random_stream(options.seed, done)))
     ours, with_faults, nominal = (series[name].measurements for name in ("ours", "camera faults", "nominal"))
     bumped = series["ours"].bumped(BUMPED_POSITION)
     drifted = series["ours"].bumped(*range(len(IMU_DEG)))
@@ -271,7 +270,7 @@ def buckets() -> dict[str, RowResult]:
     """Section 2.4.6: length of the example's bucket table, percentage searched outside the gate, and eq. 12."""
     low, high = np.radians([1.5, 8.0])
     width, gate = 5 * ARCSEC_RAD, 20 * ARCSEC_RAD
-    stars = unit(np.random.default_rng(0).standard_normal((500, 3)))
+    stars = unit(random_stream(0).standard_normal((500, 3)))
     entries = len(build_pair_catalog(stars, np.zeros(len(stars)), width, (low, high)).table) - 1
     # Average over the phase of a pair's angle within a bucket.
     angle = (low + high) / 2 + width * (np.arange(1000) + 0.5) / 1000

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from estimator.attitude.dome_map import Lever
 from skysim.camera.render import Poses, in_view, project
+from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
 from skysim.core.units import ARCSEC_RAD
 from skysim.experiments.papers.compare import Drawing, ExperimentOptions, ExperimentResult, RowResult
@@ -109,7 +110,7 @@ def random_boresights(count: int, rng: np.random.Generator) -> Floats:
 
 def discrepancies_and_counts(options: ExperimentOptions) -> ExperimentResult:
     """Discrepancies over shells and attitudes, and the number of fibers in a field."""
-    rng = np.random.default_rng([options.seed, 2005])
+    rng = random_stream(options.seed, 2005)
     testbed = build_testbed(loader.load("apl_dome"))
     scenes = [shell_scene(0.004, int(seed)) for seed in rng.integers(2**31, size=options.trials(30, 5))]
     attitudes = random_attitudes(options.trials(60, 20), rng)

@@ -19,6 +19,7 @@ from estimator.attitude.solvers import quest
 from estimator.catalog import pair_index
 from estimator.catalog.pair_index import PairIndex
 from estimator.identification.published.master_star import master_star
+from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
 from skysim.core.units import ARCSEC_RAD
 from skysim.experiments import dome_survey
@@ -187,7 +188,7 @@ def initial_error_trials(options: ExperimentOptions) -> ExperimentResult:
     """Solutions for each initial error (five tests of 50 frames), with the scene's and a fitted camera position."""
     errors_deg = INITIAL_DEG if options.quick else (*INITIAL_DEG, -10, -8, -4.5, 4.5, 8, 10)
     frames, catalog_frames = options.trials(250, 40), options.trials(50, 10)
-    seeds = np.random.default_rng([options.seed, 2009]).integers(2**31, size=4).tolist()
+    seeds = random_stream(options.seed, 2009).integers(2**31, size=4).tolist()
     scene_camera, fitted_camera = (
         solve_series(build_model(camera_m, seeds[n], catalog_frames), errors_deg, frames, seeds[n + 2], options)
         for n, camera_m in enumerate((None, FITTED_CAMERA_M))

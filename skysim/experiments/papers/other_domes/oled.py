@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
 from skysim.experiments.papers.compare import Cause, Drawing, ExperimentOptions, ExperimentResult, RowResult
 from skysim.experiments.papers.intervals import bootstrap_interval
@@ -69,7 +70,7 @@ def solve_random_attitudes(setup: Setup, seeds: Sequence[int]) -> AttitudeErrors
 
 def with_surveyed_map(setup: Setup, sigmas: dict[str, str], seed: int) -> Setup:
     """The same dome with a tracker whose map comes from a survey with position errors and slightly rotated axes."""
-    rotation_deg = np.random.default_rng([seed, 2]).normal(0, LEVEL_SIGMA_DEG, 3)
+    rotation_deg = random_stream(seed, 2).normal(0, LEVEL_SIGMA_DEG, 3)
     survey_errors = SurveyErrorsConfig.model_validate(sigmas | {"rotation_deg": rotation_deg.tolist(), "seed": seed})
     config = setup.testbed.scene.tracker.model_copy(update={"survey": survey_errors})
     testbed = replace(setup.testbed, scene=setup.testbed.scene.model_copy(update={"tracker": config}))
@@ -91,7 +92,7 @@ def mean_absolute_error_deg(setup: Setup, sigmas: dict[str, str], seeds: list[li
 
 def noise_and_absolute_error(options: ExperimentOptions) -> ExperimentResult:
     """Noise-equivalent angle with an exact map for several numbers of lights; absolute error with a surveyed map."""
-    rng = np.random.default_rng([options.seed, 76398981])
+    rng = random_stream(options.seed, 76398981)
     counts = [STATED_LIGHTS, MANY_LIGHTS] if options.quick else list(SPACING_MM)
     n_attitudes, errors_by_lights = options.trials(600, 60), {}
     for n, lights in enumerate(counts):

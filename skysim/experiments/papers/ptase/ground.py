@@ -16,6 +16,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from estimator.core.types import ra_dec_roll_rad
+from skysim.core.random_streams import JITTER, random_stream
 from skysim.core.types import Floats, Trajectory
 from skysim.dynamics.jitter import Vibration
 from skysim.experiments.papers.compare import Cause, Drawing, ExperimentOptions, ExperimentResult, RowResult
@@ -25,7 +26,7 @@ from skysim.experiments.study.execution.trials import KNOTS, reseeded
 from skysim.results.metrics import WRONG_RAD, Summary, extremum, proportion, rms
 from skysim.results.plots import INK, MARKS
 from skysim.scene import loader
-from skysim.simulation import exposure, random_streams
+from skysim.simulation import exposure
 from skysim.simulation.testbed import MARGIN_S, Testbed, build_testbed, build_tracker, exposure_window
 from skysim.sources import stars
 from skysim.tracking import factory
@@ -132,13 +133,13 @@ def earth_fixed(testbed: Testbed, cam_from_icrs: Rotation) -> Testbed:
     rate_body = earth_rad_s * body_at_middle.inv().apply([0.0, 0.0, 1.0])
     rotation = Rotation.from_rotvec(np.outer(t_s - window.middle_s(rows), rate_body))
     path = Trajectory(t_s, body_at_middle * rotation, np.tile(rate_body, (KNOTS, 1)))
-    vibration = Vibration.draw(testbed.scene.motion, random_streams.rng(testbed.scene.seed, "jitter", 0))
+    vibration = Vibration.draw(testbed.scene.motion, random_stream(testbed.scene.seed, JITTER, 0))
     return replace(testbed, trajectory=vibration.add_to(path))
 
 
 def table_2(options: ExperimentOptions) -> ExperimentResult:
     """Table 2: eighteen frames with a calibrated camera at rest, and as many with each of several decentered lenses."""
-    rng = np.random.default_rng([options.seed, 2003])
+    rng = random_stream(options.seed, 2003)
     interpolated = [
         LOCAL_TIMES[0] + n / 13 * (LOCAL_TIMES[3] - LOCAL_TIMES[0]) for n in range(ATTEMPTS - len(LOCAL_TIMES))
     ]

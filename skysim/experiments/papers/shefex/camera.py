@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from estimator.detection.detect import DETECTORS
 from estimator.detection.shefex import maximum_scan, sequential_scan
+from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats, Sources, Trajectory
 from skysim.experiments.papers.compare import Cause, Drawing, ExperimentOptions, ExperimentResult, RowResult
 from skysim.experiments.papers.intervals import bootstrap_interval, bootstrap_of_means
@@ -160,7 +161,7 @@ def with_planets(testbed: Testbed, count: int) -> Sources:
 
 def random_attitudes(count: int, seed: int) -> Rotation:
     """Uniform random lab_from_body."""
-    return Rotation.random(count, rng=np.random.default_rng([seed, 3]))
+    return Rotation.random(count, rng=random_stream(seed, 3))
 
 
 def steady_exposures_ms(overrides: dict[str, str], attitudes: Rotation) -> Floats:

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from estimator.catalog import pair_index, shefex
 from estimator.catalog.catalog import StarCatalog
+from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
 from skysim.experiments.papers.compare import Cause, Drawing, ExperimentOptions, ExperimentResult, RowResult
 from skysim.experiments.papers.intervals import bootstrap_of_means
@@ -72,7 +73,7 @@ def count_pairs(star_catalog: StarCatalog) -> int:
 def count_in_fields(catalogs: tuple[StarCatalog, ...], options: ExperimentOptions) -> Floats:
     """(N, K) number of stars of each catalog on the detector at N random attitudes."""
     testbeds = [testbed_with(star_catalog) for star_catalog in catalogs]
-    attitudes = Rotation.random(options.trials(2000, 300), rng=np.random.default_rng([options.seed, 0]))
+    attitudes = Rotation.random(options.trials(2000, 300), rng=random_stream(options.seed, 0))
     counts = [[len(trials.visible_sources(one, attitude)[0]) for one in testbeds] for attitude in attitudes]
     return np.array(counts, float)
 

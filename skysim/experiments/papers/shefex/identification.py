@@ -16,6 +16,7 @@ from estimator.attitude.solvers import SOLVERS
 from estimator.catalog import pair_index
 from estimator.identification.chance import ACCEPT_LOG10_CHANCE
 from estimator.identification.published.shefex import FOURTH_STAR, angle_interval, cos_error, search
+from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
 from skysim.experiments.papers.compare import Cause, Drawing, ExperimentOptions, ExperimentResult, RowResult
 from skysim.experiments.papers.intervals import bootstrap_of_means
@@ -125,7 +126,7 @@ class TrialSet:
     ) -> dict[str, Floats]:
         """Results of all attitudes at one point of a curve, as arrays by the field names of `Identification`."""
         results = [
-            identify(field, centroid_px, cosine_error, spikes, accept, np.random.default_rng([self.seed, 1, n]))
+            identify(field, centroid_px, cosine_error, spikes, accept, random_stream(self.seed, 1, n))
             for n, field in enumerate(self.fields)
         ]
         self.completed += 1
@@ -163,7 +164,7 @@ def figs_7_to_10(options: ExperimentOptions) -> ExperimentResult:
     """Figs 7 to 10, the choice of cosError, and the equations it is based on."""
     curves = compute_curves(options)
     results = time_results(curves) | success_results(curves) | wrong_results(curves) | attitude_results(curves)
-    results |= equation_results(np.random.default_rng([options.seed, 2]))
+    results |= equation_results(random_stream(options.seed, 2))
     drawings = (
         Drawing("Fig. 7: angles compared by an identification, against cosError.", partial(draw_time, curves)),
         Drawing("Fig. 8: success rate against cosError.", partial(draw_success, curves)),

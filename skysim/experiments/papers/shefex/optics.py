@@ -13,6 +13,7 @@ from estimator.trackers.pipeline import Clock, Settings, detect_and_centroid
 from estimator.trackers.star_tracker import StarTracker
 from skysim.camera.detector.detector import saturation_dn
 from skysim.camera.render import Window, render
+from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats, Trajectory
 from skysim.experiments.papers.compare import ExperimentOptions, RowResult, format_summary
 from skysim.experiments.papers.intervals import bootstrap_interval, symmetric_interval
@@ -111,7 +112,7 @@ def peak_loss(rate_deg_s: float, count: int, seed: int) -> RowResult:
 
     The note gives the mean over random positions in the pixel and random directions.
     """
-    rng, pixel_rad = np.random.default_rng([seed, 4]), 1 / shefex_testbed().optics.camera.focal_px
+    rng, pixel_rad = random_stream(seed, 4), 1 / shefex_testbed().optics.camera.focal_px
     places = [((0.0, 0.0), np.pi / 2)]
     places += [(tuple(rng.uniform(-0.5, 0.5, 2) * pixel_rad), rng.uniform(0, 2 * np.pi)) for _ in range(count)]
     loss_mag = []

@@ -20,6 +20,7 @@ from estimator.core.types import Centroids
 from estimator.identification.published.shefex import FOURTH_STAR, SearchOptions, search
 from estimator.trackers.pipeline import Clock, Settings, detect_and_centroid
 from skysim.core.paths import CATALOGS
+from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
 from skysim.experiments.study.execution import trials
 from skysim.results.metrics import Summary
@@ -146,7 +147,7 @@ def random_fields(count: int, seed: int) -> list[Field]:
     """Random attitudes over the whole sky, with the projected stars of the chosen catalog."""
     testbed = testbed_with(paper_catalog("chosen"))
     result = []
-    for lab_from_body in Rotation.random(count, rng=np.random.default_rng([seed, 0])):
+    for lab_from_body in Rotation.random(count, rng=random_stream(seed, 0)):
         xy_px, electrons = trials.visible_sources(testbed, lab_from_body)
         order = np.argsort(-electrons, kind="stable")
         result.append(Field(xy_px[order], testbed.mount.cam_from_body * lab_from_body.inv()))

@@ -18,6 +18,7 @@ import scipy
 from numpy.typing import NDArray
 
 from skysim.core.errors import InputError
+from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
 from skysim.experiments.study.plan import Plan
 from skysim.experiments.study.store import Store
@@ -57,7 +58,7 @@ def response_indices(plan: Plan, store: Store, response: str) -> list[Index]:
         no_index = Summary(np.nan, np.nan, np.nan, 0)
         return [Index(name, response, no_index, no_index, np.nan) for name in names]
     estimate = generalized(a, b, ab)
-    rng = np.random.default_rng(1)
+    rng = random_stream(1)
     # Resample rows of A, B and AB together, so that each resample is a valid Saltelli sample.
     resampled = np.array(
         [

@@ -21,6 +21,7 @@ from estimator.trackers.pipeline import Report
 from skysim.camera.render import Poses, image_tracks, in_view
 from skysim.core import quaternion
 from skysim.core.paths import ROOT
+from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats, Frame, Sources, Trajectory, Truth
 from skysim.core.units import ARCSEC_RAD
 from skysim.dynamics import multibody
@@ -144,7 +145,7 @@ def streams(setup: Setup, seed: int) -> tuple[np.random.Generator, np.random.Gen
     """Random generators of a trial's attitude and of its noise; `noise_seed` changes the noise only."""
     trial = setup.trial
     assert isinstance(trial, CentroidTrial | FrameTrial)
-    return np.random.default_rng([seed, 0]), np.random.default_rng([seed, 1, trial.noise_seed])
+    return random_stream(seed, 0), random_stream(seed, 1, trial.noise_seed)
 
 
 def run_frame_trial(setup: Setup, seed: int) -> Outcome:

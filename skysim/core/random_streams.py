@@ -1,0 +1,19 @@
+"""Random streams: the only place where skysim makes a random generator.
+
+A stream is identified by a seed and a key of integers: what is drawn and, where it applies, of which frame, trial or
+stage. It is NumPy's `SeedSequence(seed, spawn_key=key)`: streams of different keys are independent, and none depends on
+what was drawn before. Any frame therefore renders the same on its own, and a new kind of noise leaves the others as
+they were.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+# First number of the key under a scene's seed; the second is the frame.
+DETECTOR, JITTER, IMU, AIR_CURRENT = 1, 2, 3, 4
+
+
+def random_stream(seed: int, *key: int) -> np.random.Generator:
+    """The random generator of one seed and key."""
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=key))  # noqa: TID251
