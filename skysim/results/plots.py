@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io as std_io
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 DPI = 120
@@ -28,4 +28,37 @@ def png(draw: Callable[[Any], None], size_in: tuple[float, float]) -> bytes:
         fig = Canvas(figsize=size_in, layout="constrained")
         draw(fig)
         fig.savefig(buffer, format="png", dpi=DPI, metadata={"Software": None})
+    return buffer.getvalue()
+
+
+def stacked_axes(heights_in: Sequence[float]) -> tuple[Any, list[Any]]:
+    """A figure with one panel above the other over a common time axis, heights in inches, and its axes from the top.
+
+    The margins are fixed: to measure all labels first (`layout="constrained"`) doubles the time of drawing.
+    """
+    from matplotlib.figure import Figure
+
+    width_in, left_in, right_in, top_in, bottom_in, gap_in = 10, 0.85, 0.15, 0.12, 0.55, 0.15
+    height_in = top_in + sum(heights_in) + gap_in * (len(heights_in) - 1) + bottom_in
+    fig = Figure(figsize=(width_in, height_in))
+    grid = fig.add_gridspec(
+        len(heights_in),
+        height_ratios=heights_in,
+        left=left_in / width_in,
+        right=1 - right_in / width_in,
+        bottom=bottom_in / height_in,
+        top=1 - top_in / height_in,
+        hspace=gap_in * len(heights_in) / sum(heights_in),
+    )
+    stack = list(grid.subplots(sharex=True, squeeze=False)[:, 0])
+    for axes in stack:
+        axes.grid(alpha=0.3)
+    stack[-1].set_xlabel("time [s]")
+    return fig, stack
+
+
+def stack_png(fig: Any) -> bytes:
+    """PNG bytes of a figure of `stacked_axes`."""
+    buffer = std_io.BytesIO()
+    fig.savefig(buffer, format="png", dpi=110)
     return buffer.getvalue()

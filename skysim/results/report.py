@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import io as std_io
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ from numpy.typing import NDArray
 
 from skysim.core.files import write_text
 from skysim.core.types import Floats, FrameRow, SourceTruth
+from skysim.results import plots
 from skysim.results.stretch import to_8bit
 
 TRUTH_BGR, DETECTED_BGR, MATCHED_BGR = (200, 160, 60), (80, 80, 235), (110, 220, 90)
@@ -190,10 +190,7 @@ def embed(image: bytes, kind: str = "png") -> str:
 
 def error_figure(rows: list[FrameRow]) -> bytes:
     """Errors, detected and matched sources, and rate against time, as PNG. Red lines mark unsolved frames."""
-    from matplotlib.figure import Figure
-
-    fig = Figure(figsize=(10, 6.4), layout="constrained")
-    errors, stars, rate = fig.subplots(3, 1, sharex=True, height_ratios=[2, 1, 1])
+    fig, (errors, stars, rate) = plots.stacked_axes([2.9, 1.45, 1.45])
     solved = [row for row in rows if row.status == "solved"]
     t = [row.t_s for row in solved]
     errors.semilogy(t, [max(row.cross_arcsec, 1e-6) for row in solved], ".-", label="cross-boresight")
@@ -211,9 +208,4 @@ def error_figure(rows: list[FrameRow]) -> bytes:
     stars.legend()
     rate.plot(t_all, [row.rate_deg_s for row in rows], color="tab:green")
     rate.set_ylabel("rate [deg/s]")
-    rate.set_xlabel("time [s]")
-    for axes in (errors, stars, rate):
-        axes.grid(alpha=0.3)
-    buffer = std_io.BytesIO()
-    fig.savefig(buffer, format="png", dpi=110)
-    return buffer.getvalue()
+    return plots.stack_png(fig)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io as std_io
 from collections.abc import Callable
 from typing import Any
 
@@ -12,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from skysim.core.types import Floats, Telemetry
 from skysim.core.units import RPM_RAD_S
 from skysim.dynamics.imu import Increments, tilt_rad
+from skysim.results import plots
 
 AXES = ("x", "y", "z")
 EULER = ("roll", "pitch", "yaw")
@@ -210,16 +210,10 @@ def panels(log: Telemetry) -> list[Callable[[Telemetry, Any], None]]:
 
 def figure(log: Telemetry) -> bytes:
     """Telemetry against time, as PNG."""
-    from matplotlib.figure import Figure
-
     shown = panels(log)
-    fig = Figure(figsize=(10, 0.8 + 2.1 * len(shown)), layout="constrained")
-    for panel, axes in zip(shown, fig.subplots(len(shown), 1, sharex=True, squeeze=False)[:, 0], strict=True):
+    fig, stack = plots.stacked_axes([2.1] * len(shown))
+    for panel, axes in zip(shown, stack, strict=True):
         panel(log, axes)
-        axes.grid(alpha=0.3)
         if axes.get_legend_handles_labels()[0]:
             axes.legend(loc="upper right", ncols=4, fontsize="small")
-    fig.axes[len(shown) - 1].set_xlabel("time [s]")
-    buffer = std_io.BytesIO()
-    fig.savefig(buffer, format="png", dpi=110)
-    return buffer.getvalue()
+    return plots.stack_png(fig)

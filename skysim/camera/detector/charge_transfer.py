@@ -11,7 +11,6 @@ from typing import Any
 
 import numba
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 
 from skysim.core.jit import jit
@@ -111,14 +110,18 @@ def transfer_loss(electrons: NDArray[Any], cti_parallel: float, cti_serial: floa
 def delayed_fractions(transfers: int, cti: float) -> Floats:
     """(K + 1, transfers) fraction of the packet of n + 1 transfers that arrives k pixels late; columns add up to 1.
 
-    K is where less than 1e-6 of the charge with the most transfers is later still; that is counted as K pixels late.
+    The terms follow from one another: C(n + k - 1, k) = C(n + k - 2, k - 1) (n + k - 1) / k. K is where less than 1e-6
+    of the charge with the most transfers is later still; that is counted as K pixels late.
     """
-    longest = int(scipy.stats.nbinom.ppf(1 - TAIL, transfers, 1 - cti))
-    delay, n = np.arange(longest + 1)[:, None], np.arange(1, transfers + 1)
-    fraction = scipy.stats.nbinom.pmf(delay, n, 1 - cti)
-    fraction[-1] = scipy.stats.nbinom.sf(longest - 1, n, 1 - cti)
-    fraction.flags.writeable = False
-    return np.asarray(fraction)
+    n = np.arange(1, transfers + 1)
+    fractions = [(1 - cti) ** n]
+    while (later := 1 - np.sum(fractions, axis=0))[-1] > TAIL:
+        k = len(fractions)
+        fractions.append(fractions[-1] * cti * (n + k - 1) / k)
+    fractions[-1] = fractions[-1] + later
+    table = np.array(fractions)
+    table.flags.writeable = False
+    return table
 
 
 @jit(parallel=True)
