@@ -99,6 +99,7 @@ def test_the_same_seed_gives_the_same_bytes_and_another_seed_others(testbed: Tes
     assert np.mean(image != other) > 0.1
 
 
+@pytest.mark.long
 def test_a_frame_alone_is_the_frame_of_a_sequence(testbed: Testbed) -> None:
     sequence = [shot.frame.image_dn for shot in run.run(testbed, build_tracker(testbed))]
     alone, _ = exposure.render_frame(prepared(testbed.scene.name, 2), 1)
@@ -139,6 +140,7 @@ def whole(request: pytest.FixtureRequest) -> Testbed:
     return run.prepare(loader.load(request.param, NO_EYES.get(request.param)))
 
 
+@pytest.mark.long
 def test_the_camera_sees_five_leds_all_along_the_maneuver(whole: Testbed) -> None:
     """In every frame, at geometry alone: what is on the chip, by the tracker's map."""
     eyes, counts = build_tracker(whole), []

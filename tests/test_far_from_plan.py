@@ -22,6 +22,7 @@ def off_deg(believed: Rotation | None, log: Telemetry) -> np.ndarray:
     return np.degrees((believed.inv() * log.lab_from_body).magnitude())
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("actuators", "more"),
     [("ideal", {}), ("wheels", {"vehicle.wheels": "{torque_limit: 1 N m, speed_limit_rpm: 20000}"})],
@@ -44,6 +45,7 @@ def test_a_blow_far_beyond_the_torque_s_reach_is_braked_and_the_vehicle_comes_ba
     assert rate[-1] < 0.01
 
 
+@pytest.mark.long
 def test_steered_by_gyros_at_their_limit_the_vehicle_still_brakes() -> None:
     """Blown to six times what the gyros show, with no star tracker to help: it comes to rest somewhere."""
     overrides = {

@@ -76,6 +76,7 @@ assert two(1) == 3 and two(1.0) == 3.0
 """
 
 
+@pytest.mark.long
 def test_a_command_says_once_that_it_compiles_and_nothing_once_it_has(tmp_path: Path) -> None:
     """Before a terminal: cold, warm, and as a package; into a file never."""
     said = []

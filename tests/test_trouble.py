@@ -62,6 +62,7 @@ def mounted(tmp_path: Path) -> Iterator[Path]:
     subprocess.run(["umount", place], check=True)
 
 
+@pytest.mark.long
 def test_a_full_disk_is_named_and_what_was_written_is_whole(mounted: Path) -> None:
     done = asked("run", "shefex2", "--frames", "20", "--out", str(mounted / "run"), *SMALL)
     assert done.returncode == 2
@@ -173,6 +174,7 @@ def test_a_folder_that_cannot_be_written_is_told_in_a_line(mounted: Path) -> Non
         )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("number", [pytest.param(signal.SIGINT, marks=pytest.mark.long), signal.SIGTERM])
 def test_a_run_that_is_stopped_leaves_whole_frames(tmp_path: Path, number: signal.Signals) -> None:
     command = [*SKYSIM, "run", "shefex2", "--frames", "400", "--out", str(tmp_path), *SMALL]

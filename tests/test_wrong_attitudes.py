@@ -60,6 +60,7 @@ def test_a_dome_is_never_answered_wrongly(afit, missing, false, least_solved, fi
     assert solved >= least_solved * fields
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("missing", [0.0, 0.2])
 def test_a_mirrored_dome_is_refused(afit, missing):
     """What a left-right swapped cable would show: the same distances, the wrong hand."""

@@ -112,14 +112,14 @@ def thesis(
     Full scale is the saturation in the priors, otherwise the maximum of the integer type. `threshold_sigma` and
     `min_area_px` are ignored: the thesis has two fixed thresholds. Raises ImageError for floats of unknown scale.
     """
-    image = prepare_image(image)
+    pixel, image = image.dtype, prepare_image(image)
     full_scale = priors.saturation
     if not np.isfinite(full_scale):
-        if image.dtype.kind != "u":
+        if pixel.kind != "u":
             raise ImageError(
-                f"pixels of type {image.dtype} have no full scale; allowed: unsigned integers, or a known saturation"
+                f"pixels of type {pixel} have no full scale; allowed: unsigned integers, or a known saturation"
             )
-        full_scale = float(np.iinfo(image.dtype).max)
+        full_scale = float(np.iinfo(pixel).max)
     flat = flat_background(estimate_background(image), image.shape)
     # The thesis thresholds raw pixels. We threshold the filtered image, whose contour around a plateau of 50 pixels is
     # within a pixel of the raw one.
@@ -187,13 +187,16 @@ def check_image(image: NDArray) -> None:
 
 
 def to_native(image: NDArray) -> NDArray:
-    """Convert the image to a type that compiled code accepts: FITS files are big-endian, masks are boolean."""
-    if image.dtype == np.uint16 and image.dtype.isnative:
-        return image
-    kind = {"b": "uint8", "f": "float32" if image.itemsize == 2 else "float64"}.get(image.dtype.kind)
-    if kind and image.itemsize not in (4, 8):
-        return image.astype(kind)
-    return image.astype(image.dtype.newbyteorder("="), copy=False)
+    """Convert the image, without loss, to one of the three types for which the loops are compiled.
+
+    uint16 stays as it is; uint8 and masks become uint16, other integers int32 if their values fit, all else float64.
+    Each further type would cost its user half a minute of compilation. FITS files are big-endian, loops are native.
+    """
+    if image.dtype.kind in "bu" and image.itemsize <= 2:
+        return image.astype(np.uint16, copy=False)
+    limits = np.iinfo(np.int32)
+    fits_int32 = image.dtype.kind in "iu" and limits.min <= image.min() and image.max() <= limits.max
+    return image.astype(np.int32 if fits_int32 else np.float64, copy=False)
 
 
 def check_size(image: NDArray) -> None:
@@ -208,7 +211,7 @@ def replace_bad_pixels(image: NDArray, bad_px: Ints) -> NDArray:
     The map comes from dark frames taken on the ground. The neighbors are those within one pixel, otherwise within two;
     without any good one the pixel gets the frame's median. Raises ImageError for a map beyond the frame.
     """
-    repaired = to_native(image).copy()
+    repaired = image.copy()
     height, width = image.shape
     x, y = np.asarray(bad_px).reshape(-1, 2).T
     if len(x) and not (x.min() >= 0 and x.max() < width and y.min() >= 0 and y.max() < height):

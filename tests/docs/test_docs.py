@@ -40,6 +40,7 @@ def test_the_page_s_commands_are_of_this_project() -> None:
 TABLES = [words for words in commands(DOME) + commands(ESTIMATOR) if words[0] == "python"]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "words",
     [
@@ -105,6 +106,7 @@ def test_the_page_s_surveys_are_tests() -> None:
 STUDIES = (ROOT / "docs/findings/studies.md").read_text(encoding="utf-8")
 
 
+@pytest.mark.long
 def test_every_study_that_comes_along_has_its_page_and_its_command() -> None:
     shipped = {path.stem for path in plan.STUDIES.glob("*.yaml")}
     told = re.findall(r"\[(\w+)\]\(studies/(\w+)\.md\) \| `skysim study (run|optimize) (\w+)`", STUDIES)

@@ -31,6 +31,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.long
 def test_the_commands_leave_what_the_table_says(folder: Path) -> None:
     left = {path.name for path in (folder / "out" / "shefex2").iterdir()}
     told = set(frames.EXPORT_FILES) - {"imu.parquet"} | {frames.ZARR}

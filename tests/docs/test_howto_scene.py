@@ -32,6 +32,7 @@ def folder(tmp_path) -> Path:
     return pages.checkout(tmp_path)
 
 
+@pytest.mark.long
 def test_the_camera_block_is_a_camera_that_sees(folder):
     """The block's lines in a copy of the scene that the text names, flown for two frames by the real command."""
     block = pages.yaml_block(PAGE, "camera")
@@ -58,6 +59,7 @@ def test_every_kind_that_the_camera_block_names_is_one():
     }
 
 
+@pytest.mark.long
 def test_the_dome_block_is_a_dome_under_which_the_tracker_finds_itself(folder):
     path = folder / "dome.yaml"
     path.write_text("schema: 1\nbase: afit_simsat\n" + pages.yaml_block(PAGE, "light"))
@@ -65,6 +67,7 @@ def test_the_dome_block_is_a_dome_under_which_the_tracker_finds_itself(folder):
     assert (told["frames"], told["solved"], told["wrong"]) == (3, 3, 0)
 
 
+@pytest.mark.long
 def test_the_vehicle_block_flies_and_is_told_where_it_is(folder):
     """The block as a scene, two seconds of it by the real command: wheels, fans, gyros, filter, all disturbances."""
     path = folder / "flown.yaml"
@@ -93,6 +96,7 @@ def test_every_choice_that_the_vehicle_block_names_is_one():
     assert shown == kinds
 
 
+@pytest.mark.long
 def test_the_controller_of_the_page_damps(folder):
     """Each rate dies as exp(-5 t / J), the angle is its integral; gravity on tens of micrometers adds 0.1 deg or so."""
     (block,) = pages.blocks(PAGE, "python")

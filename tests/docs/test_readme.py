@@ -27,6 +27,7 @@ def test_the_readme_is_short():
     assert len(pages.text(README).splitlines()) <= 60
 
 
+@pytest.mark.long
 def test_the_commands_leave_a_report_and_a_solution(folder):
     left = {path.name for path in (folder / "out" / "shefex2").iterdir()}
     assert {"report.html", "annotated.png", "frame_0004.fits"} <= left

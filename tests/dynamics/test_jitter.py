@@ -79,6 +79,7 @@ def test_a_band_has_its_rms_and_keeps_within_its_edges(slope: float) -> None:
     assert sines.omega_rad_s.max() / (2 * np.pi) <= 50.0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("slope", [-2.0, -1.0, 0.0, 2.0])
 def test_periodogram_of_a_band_rises_with_its_slope(slope: float) -> None:
     """Power by octave of many draws: its integral over f^slope, to 4 sigma of the draws' own scatter."""

@@ -307,6 +307,7 @@ def seen_px(model: mujoco.MjModel, data: mujoco.MjData, place_m: np.ndarray) -> 
     return np.round(middle + focal_px * tangent * [1, -1]).astype(int)
 
 
+@pytest.mark.long
 def test_the_leds_glow_where_they_are_projected_and_nowhere_else(drawn: Drawn) -> None:
     sources, _, model, data, lit, dark = drawn
     x, y = seen_px(model, data, sources.place[:, :3]).T
@@ -341,6 +342,7 @@ def test_the_picture_changes_where_the_vehicle_tilts(drawn: Drawn) -> None:
     assert (y > rim_px.min()).mean() > 0.6  # beneath the dome, the rest is the camera's field in it
 
 
+@pytest.mark.long
 def test_stars_are_drawn_around_a_free_vehicle(opengl: None) -> None:
     """The room is black: whatever is white and small is a star, and half of the sphere or less is in the field."""
     scene, vehicle, sources, lab_from_body = star_lab()
@@ -352,6 +354,7 @@ def test_stars_are_drawn_around_a_free_vehicle(opengl: None) -> None:
     assert count - 1 - small.sum() >= 1  # the vehicle
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("opengl_name", ["disable", "nonsense"])
 def test_without_opengl_one_line_says_what_to_do(opengl_name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MUJOCO_GL", opengl_name)
@@ -386,6 +389,7 @@ def test_a_film_comes_back_in_its_colors_and_its_time(suffix: str, tmp_path: Pat
     np.testing.assert_allclose(back, RED_TO_GREEN, rtol=0, atol=20)
 
 
+@pytest.mark.long
 def test_a_film_of_ten_seconds_fits_into_a_page(drawn: Drawn, tmp_path: Path) -> None:
     """One hundred frames of the lab at the film's size, the vehicle in two poses by turns."""
     lit = [cv2.resize(one.astype(np.uint8), picture.FILM_PX, interpolation=cv2.INTER_AREA) for one in drawn[4]]

@@ -86,6 +86,7 @@ def testbed(folder: Path) -> Testbed:
 # --- end to end ---------------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_the_survey_makes_the_tracker_s_error_smaller_by_much(statistics: dict[str, Any]) -> None:
     """0.3 deg before. After: what one frame's lights are off, 0.2 mm at 0.8 m over the root of some twenty, and the
     turn of the lab, which the map of 2 mm before holds to 2 mm / (0.3 m sqrt(240)) = 0.025 deg.
@@ -284,6 +285,7 @@ def test_a_map_with_a_slip_is_one_line(
     assert says in refusal(folder, tmp_path, text.replace(right, wrong))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("column", "value", "says"),
     [

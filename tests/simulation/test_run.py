@@ -433,6 +433,7 @@ def test_frames_taken_in_flight_are_taken_again_with_the_same_exposures() -> Non
 # As it happens.
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["simsat_bump", "shefex2"])
 def test_frames_as_they_happen_are_those_of_the_whole_flight(name: str) -> None:
     """To the last bit, though the flight before them is forgotten: with the filter in the loop, and flown alone."""

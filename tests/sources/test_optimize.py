@@ -77,6 +77,7 @@ def variances(place_m: Floats, tilt_deg: float = TILT_DEG, count: int = 2000) ->
     return np.sort(out)
 
 
+@pytest.mark.long
 def test_its_worst_attitudes_are_better_than_any_other_layout_s(best: Sources) -> None:
     """At 2,000 attitudes drawn apart from those it was made for: the worst, and the mean of the worst hundredth."""
     mine = variances(best.place[:, :3])

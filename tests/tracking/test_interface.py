@@ -431,6 +431,7 @@ def pixel_of_lost(quaternion: np.ndarray, star: np.ndarray) -> list[float]:
     return [-y / x * 100 + 8 / 2, -z / x * 100 + 6 / 2]
 
 
+@pytest.mark.long
 def test_the_page_s_adapter_reads_lost_s_axes_and_quaternion(tmp_path: Path) -> None:
     """By LOST's own formulas: its stars and ours fall on the same pixels, whose corner is (-0.5, -0.5) for us."""
     lost, adapter = tmp_path / "lost", tmp_path / "lost.py"

@@ -110,6 +110,7 @@ def test_export_writes_a_scene_that_mujoco_s_own_loader_takes(skysim: Skysim, tm
     assert "nothing: no such scene" in skysim("scenes", "export", "nothing").one_line()
 
 
+@pytest.mark.long
 def test_a_picture_without_opengl_is_a_word_and_the_run_goes_on(
     skysim: Skysim, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -124,6 +125,7 @@ def test_a_picture_without_opengl_is_a_word_and_the_run_goes_on(
     assert not (tmp_path / "scene_3d.png").exists()
 
 
+@pytest.mark.long
 def test_render_leaves_frames_with_their_truth_and_nothing_else(rendered: Path) -> None:
     assert {p.name for p in rendered.iterdir()} == {"frame_0000.fits", "frame_0000.png", "frame_0000.ecsv"}
 
@@ -250,6 +252,7 @@ def test_a_stage_of_a_run_is_named_by_its_option(skysim: Skysim, tmp_path: Path,
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.long
 def test_the_stages_of_a_run_are_those_named(skysim: Skysim, tmp_path: Path) -> None:
     """Above the scene's own and above --set; TRIAD takes two stars where the scene's QUEST takes all."""
     words = ["run", "shefex2", "--frames", "1", "--json", "--out", tmp_path, "--set", "tracker.solver=magic"]

@@ -335,6 +335,7 @@ def test_an_endless_stream_continues_beyond_the_scene_s_frames_and_a_day() -> No
     assert rotation.magnitude() == pytest.approx(rate_rad_s * (mids_s[-1] - mids_s[0]), rel=1e-6)
 
 
+@pytest.mark.long
 def test_an_endless_stream_ends_at_sigterm_with_complete_frames_and_counters(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "skysim", "stream", "shefex2", "--set", "light.limit_mag=5", "--endless"]
     stream = subprocess.Popen([*command, "--folder", str(tmp_path), "--json"], stdout=-1)

@@ -204,6 +204,7 @@ def test_the_covariance_is_true(lever: Lever, surface: tuple) -> None:
     assert nees.mean() == pytest.approx(3, abs=0.3)
 
 
+@pytest.mark.long
 def test_five_lights_err_as_the_reference_says() -> None:
     errors, _ = monte_carlo(LEVER, 5, SPHERE, seed=56, trials=1000)
     cross = np.degrees(np.sqrt(np.mean(errors[:, 0] ** 2 + errors[:, 1] ** 2)))

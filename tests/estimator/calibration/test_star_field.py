@@ -133,6 +133,7 @@ def rms(values: list[float]) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
+@pytest.mark.long
 def test_twenty_frames_give_the_field_to_a_fiftieth_of_a_pixel(
     clean: list[tuple[Field, Calibration]],
 ) -> None:

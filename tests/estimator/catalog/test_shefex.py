@@ -69,6 +69,7 @@ def test_the_hemispheres_have_their_own_limits(stars: StarCatalog) -> None:
     np.testing.assert_array_equal(both.id, stars.id[wanted])
 
 
+@pytest.mark.long
 def test_thinned_stars_are_apart_none_is_left_out_needlessly_and_the_bright_stay(stars: StarCatalog) -> None:
     apart = np.radians(3.0)
     kept = thin(stars, apart, BRIGHT_MAG)

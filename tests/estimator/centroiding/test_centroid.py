@@ -228,6 +228,7 @@ def test_a_frame_without_blobs_gives_no_centroids(name: str) -> None:
     assert len(CENTROIDERS[name](image, detect.local(image, 20.0))) == 0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("radius", "bright_e"), [(5.0, 400.0), (10.4, 400.0), (10.4, 4000.0)])
 def test_the_disk_fit_is_true_and_better_than_gravity_where_noise_rules(radius: float, bright_e: float) -> None:
     # An edge blurred by optics of 0.8 px; the reference's LED of 20.8 px, and a smaller one.

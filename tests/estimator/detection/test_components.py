@@ -96,7 +96,7 @@ def test_the_thesis_takes_full_scale_from_the_saturation() -> None:
         detect.thesis(image)
 
 
-@pytest.mark.parametrize("dtype", ["u1", "u2", "i2", "i4", "f4", "f8"])
+@pytest.mark.parametrize("dtype", ["u2", "i4", "f8"])
 def test_runs_are_scipy_s_mask_under_a_bilinear_threshold(dtype: str) -> None:
     rng = np.random.default_rng(16)
     image = rng.integers(0, 120, (101, 133)).astype(dtype)

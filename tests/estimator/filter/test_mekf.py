@@ -181,6 +181,7 @@ def drawn(gyro: GyroModel, sigma_bias: float, t_s: np.ndarray, rng: np.random.Ge
     return World(t_s, angle, bias)
 
 
+@pytest.mark.long
 def test_the_errors_are_what_the_covariance_says() -> None:
     # Solutions once a second, for a moment 0.3025 s ago, in the middle of a sample; 4 sigma of a chi-square's mean.
     runs, seconds, rate_hz, late_s = 300, 5, 200, 0.3025
@@ -212,6 +213,7 @@ def test_the_errors_are_what_the_covariance_says() -> None:
     assert abs(nees[:, 1].mean() - 6) < 4 * np.sqrt(2 * 6 / runs)
 
 
+@pytest.mark.long
 def test_200_runs_are_within_their_bands_at_many_rates_with_frames_lost_and_out_of_order() -> None:
     # Bar-Shalom's tests: NEES at the end, NIS of each solution, both within the 95 % band of their chi-squares.
     # Gyro at 200 Hz, asked for in calls of 1 to 40 samples; solutions at 5 Hz of which a third never comes, and the
@@ -251,6 +253,7 @@ def test_200_runs_are_within_their_bands_at_many_rates_with_frames_lost_and_out_
         assert kstest(squared, chi2(freedom).cdf).pvalue > 0.01
 
 
+@pytest.mark.long
 def test_a_constant_bias_is_found_to_its_sigma() -> None:
     rng, runs, bias = np.random.default_rng(62), 12, 5 * DEG_H_RAD_S
     z, found, samples = np.empty((runs, 3)), np.empty((runs, 3)), np.arange(1, 11) / 10

@@ -158,6 +158,7 @@ def test_a_false_star_among_the_brightest_stops_one_triangle_but_not_the_next(
     assert found[1] == 30
 
 
+@pytest.mark.long
 def test_a_hint_lets_only_stars_near_the_boresight_be_candidates(sky: pair_index.PairIndex) -> None:
     rng = np.random.default_rng(107)
     for _ in range(20):

@@ -95,6 +95,7 @@ def test_a_mirrored_sky_is_refused(sky: pair_index.PairIndex, name: str) -> None
         assert identify(name, one, sky) is None
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", PAPERS)
 def test_directions_at_random_are_refused(sky: pair_index.PairIndex, name: str) -> None:
     rng = np.random.default_rng(92)

@@ -80,7 +80,15 @@ def names_right(match: StarMatch, names: Floats) -> bool:
 
 
 @pytest.mark.parametrize("surface", [OVAL, FLAT], ids=["ellipsoid", "flat"])
-@pytest.mark.parametrize(("dead", "false", "least"), [(0.0, 0, 0.98), (0.0, 5, 0.98), (0.2, 5, 0.8), (0.5, 5, 0.15)])
+@pytest.mark.parametrize(
+    ("dead", "false", "least"),
+    [
+        pytest.param(0.0, 0, 0.98, marks=pytest.mark.long),
+        (0.0, 5, 0.98),
+        pytest.param(0.2, 5, 0.8, marks=pytest.mark.long),
+        pytest.param(0.5, 5, 0.15, marks=pytest.mark.long),
+    ],
+)
 def test_equal_leds_are_told_apart_and_never_wrongly(surface, dead, false, least):
     truth = spread(1400, surface, 1)
     leds = surveyed(truth, 2)
@@ -107,6 +115,7 @@ def test_a_better_survey_finds_leds_of_which_half_are_dead():
     assert len(right) >= 0.9 * len(enough)
 
 
+@pytest.mark.long
 def test_lights_that_fell_anywhere_are_no_attitude():
     """And evidence of x powers of ten is met in one such frame of 10^x at most (Markov): x = 1, 200 frames."""
     leds = surveyed(spread(1400, OVAL, 6), 7)
@@ -186,6 +195,7 @@ def test_too_few_lights_are_no_attitude():
         assert identified(pixels.reshape(-1, 2), dome) == search.NO_MATCH
 
 
+@pytest.mark.long
 def test_the_covariance_holds_the_map_s_own_errors():
     """NEES over maps drawn anew: chi-square of three degrees, mean 3 +- sqrt(6 / 100)."""
     rng, nees = np.random.default_rng(14), []
@@ -223,6 +233,7 @@ def test_two_leds_whose_images_touch_are_left_out_of_the_attitude():
     assert np.mean(pulls) < 3 + 3 * np.sqrt(6 / 30)
 
 
+@pytest.mark.long
 def test_the_covariance_holds_a_lever_s_error():
     """A pupil believed aside by 1 mm: .047 deg at 48 in, far beyond the lights' own noise, and as it is claimed."""
     truth, rng, nees = spread(1400, OVAL, 18), np.random.default_rng(19), []

@@ -118,6 +118,7 @@ def test_each_blob_and_each_star_is_matched_once(sky: pair_index.PairIndex) -> N
         assert len(set(match.observed)) == len(match.observed) == len(set(match.star)) >= MIN_MATCHES
 
 
+@pytest.mark.long
 def test_nothing_but_false_stars_gives_no_attitude(bright_sky: pair_index.PairIndex) -> None:
     # 1e-5 a field is what is promised; 2,000 fields would show 1.5e-3 with 95 %.
     rng = np.random.default_rng(63)

@@ -172,6 +172,7 @@ def zoom_sigma(truth: Rotation, row, zoom: float) -> float:
     return SIGMA * float(np.sqrt(np.linalg.inv(slope.T @ slope)[3, 3]))
 
 
+@pytest.mark.long
 def test_lights_that_fell_anywhere_are_refused() -> None:
     """Evidence beyond 10^x is met in less than one of 10^x frames, and 10^4 is asked for: none of 200."""
     rng = np.random.default_rng(5)

@@ -112,6 +112,7 @@ def test_any_pixels_and_lens_give_directions_of_their_shape(xy_px: NDArray, k1: 
 # Pictures by file, as `skysim solve` takes them
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("count", "seed"), [(30, 1), pytest.param(5000, 3, marks=pytest.mark.long)], ids=["some", "many"]
 )

@@ -198,6 +198,7 @@ def test_an_attitude_is_the_sky_s_or_none(eye: StarTracker, rng: np.random.Gener
     assert not told.solved or set(told.match.observed.tolist()) <= set(range(len(xy)))
 
 
+@pytest.mark.long
 @law(StarTracker.solve_centroids, StarTracker.sigma_px, StarTracker.detections, StarTracker.efforts)
 @given(
     xy_px=arrays("f8", (9, 2), elements=ANY),

@@ -306,6 +306,7 @@ def test_true_centroids_under_a_dome_give_the_true_attitude(lever: str, shape: s
         assert len(answer.match.star) == len(pixels)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("camera", "count", "solver"),
     [(DOME_CAMERA, 2500, "rotation_only"), (WIDE_CAMERA, 60, "rotation_only"), (WIDE_CAMERA, 60, "tappe")],

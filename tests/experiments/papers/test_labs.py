@@ -55,6 +55,7 @@ def test_a_circle_about_the_zenith_holds_its_share_of_evenly_spread_stars() -> N
     assert mean == pytest.approx(100 * (1 - np.cos(np.radians(5))), rel=0.05)
 
 
+@pytest.mark.long
 def test_noise_falls_with_the_root_of_the_lights() -> None:
     """Twice the lights, 1 / sqrt(2) of the noise, to four sigmas of 150 trials."""
     few, many = (oled.solve_random_attitudes(oled.build_setup(lights), range(150)) for lights in (20, 40))

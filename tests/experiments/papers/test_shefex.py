@@ -128,6 +128,7 @@ def test_a_planet_s_light_is_pogson_s() -> None:
     np.testing.assert_allclose(gained_mag, before.magnitude[changed] - camera.PLANET_MAG, rtol=1e-9)
 
 
+@pytest.mark.long
 def test_the_same_seed_gives_the_same_numbers() -> None:
     first, again = (camera.exposure_control(ExperimentOptions(quick=True, seed=2)).results for _ in range(2))
     assert first == again

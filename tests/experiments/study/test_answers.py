@@ -50,6 +50,7 @@ def test_a_share_has_wilsons_interval(hits, of):
     assert (told.value, told.trials) == (p, of)
 
 
+@pytest.mark.long
 def test_intervals_hold_what_they_promise():
     """Of 400 samples of 60 each: how often the truth is inside, within four standard errors of 95 % or above it."""
     rng = np.random.default_rng(2)
@@ -145,6 +146,7 @@ responses: [identified]
 """
 
 
+@pytest.mark.long
 def test_the_error_budget_blames_whom_it_should(tmp_path):
     """A survey turned about z is roll alone, one about x is cross alone; a lever across is mostly cross: 0.2 mm at
     33 in of the camera's sight is 0.2 / 838 rad of a point's direction, of which the bearing's turn takes 1 - 15/48."""

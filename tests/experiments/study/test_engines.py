@@ -186,6 +186,7 @@ class Run:
         return status
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kills", [1, pytest.param(6, marks=pytest.mark.long)])
 def test_a_pool_killed_at_any_instant_resumes_with_any_number_of_workers(
     plan_: plan.Plan, serial_contents: str, tmp_path: Path, kills: int
@@ -351,6 +352,7 @@ def change_code(version: str) -> None:
     setups.code_version = lambda: version  # type: ignore[assignment]
 
 
+@pytest.mark.long
 def test_dask_loses_a_worker_and_makes_the_same_rows(
     cluster: Cluster, plan_: plan.Plan, serial_contents: str, tmp_path: Path
 ) -> None:
@@ -387,6 +389,7 @@ def test_where_nobody_answers_it_says_so(monkeypatch: pytest.MonkeyPatch) -> Non
         dask("tcp://127.0.0.1:1")
 
 
+@pytest.mark.long
 def test_without_the_extra_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
     monkeypatch.delitem(sys.modules, "skysim.experiments.study.execution.dask_engine", raising=False)

@@ -91,6 +91,7 @@ def until(path: Path, count: int) -> None:
 # One writer, however it ends.
 
 
+@pytest.mark.long
 def test_a_writer_killed_at_any_instant_leaves_whole_batches(told: plan.Plan, whole: str, tmp_path: Path) -> None:
     """And a run that goes on after each of its deaths ends with the store of a run that nobody disturbed."""
     often, draw, left = tmp_path / "often.sqlite", random.Random(1), [0]
