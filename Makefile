@@ -22,10 +22,10 @@ demo: $(READY)
 	$(BIN)/skysim run shefex2 --out out/shefex2
 
 test: $(READY)
-	NUMBA_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n 2 -m "not long and not browser"
+	NUMBA_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist loadfile -m "not long and not browser"
 
 test-long: $(READY)
-	NUMBA_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n 2 -m long
+	NUMBA_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist loadfile -m long
 
 # Other people's instruments. astrometry.net is no Python package: docs/findings/oracles.md tells how to get it.
 oracle: $(READY)
@@ -74,7 +74,7 @@ test-lowest:
 	$(PYTHON) -m venv $(LOWEST)
 	$(LOWEST)/bin/pip install --quiet --disable-pip-version-check uv
 	$(LOWEST)/bin/uv pip install --quiet --python $(LOWEST)/bin/python --resolution lowest-direct -e '.[dev,catalog]'
-	NUMBA_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(LOWEST)/bin/python -m pytest -n 2 -m "not long and not browser"
+	NUMBA_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(LOWEST)/bin/python -m pytest -n 2 --dist loadfile -m "not long and not browser"
 
 # Files that nobody wrote by hand, for every parser; findings are kept in out/fuzz. Where the extra cannot be had it goes
 # on by mutation alone, and says so.

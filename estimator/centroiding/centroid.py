@@ -39,7 +39,7 @@ def weighted(image: NDArray, blobs: Blobs, gain_e_dn: float = 1.0, priors: Frame
     of the squared profile, which is narrower by the square root of 2.
     """
     sky = blobs.background
-    rows = moments.squared_light(to_native(image), blobs.box_px, sky.level, sky.noise, gain_e_dn)
+    rows = moments.squared_light(to_native(image), blobs.box_px, sky.level, sky.noise, float(gain_e_dn))
     return _to_centroids(rows)
 
 
@@ -52,7 +52,9 @@ def gaussian_window(image: NDArray, blobs: Blobs, gain_e_dn: float = 1.0, priors
     iteration does not converge keeps its center of gravity.
     """
     sky = blobs.background
-    rows = moments.gaussian_windowed(to_native(image), blobs.xy_px, blobs.box_px, sky.level, sky.noise, gain_e_dn)
+    rows = moments.gaussian_windowed(
+        to_native(image), blobs.xy_px, blobs.box_px, sky.level, sky.noise, float(gain_e_dn)
+    )
     return _to_centroids(_with_fallback(rows, image, blobs, gain_e_dn))
 
 
@@ -120,7 +122,7 @@ def disk(image: NDArray, blobs: Blobs, gain_e_dn: float = 1.0, priors: FramePrio
         blobs.box_px,
         sky.level,
         sky.noise,
-        gain_e_dn,
+        float(gain_e_dn),
         priors.saturation,
     )
     return _to_centroids(_with_fallback(rows[:, :4], image, blobs, gain_e_dn))
@@ -148,7 +150,7 @@ def _fit_gaussians(image: NDArray, blobs: Blobs, gain_e_dn: float, priors: Frame
         blobs.peak,
         sky.level,
         sky.noise,
-        gain_e_dn,
+        float(gain_e_dn),
         priors.saturation,
     )
 
@@ -166,7 +168,7 @@ def _fit_streaks(image: NDArray, blobs: Blobs, gain_e_dn: float, priors: FramePr
         sky.level,
         sky.noise,
         streak_px,
-        gain_e_dn,
+        float(gain_e_dn),
         priors.saturation,
     )
 
@@ -179,7 +181,7 @@ def _frame_streak(blobs: Blobs, priors: FramePriors) -> tuple[float, float]:
 def _gravity_rows(image: NDArray, blobs: Blobs, gain_e_dn: float) -> Floats:
     """Return the rows of `moments.center_of_gravity`."""
     sky = blobs.background
-    return moments.center_of_gravity(to_native(image), blobs.box_px, sky.level, sky.noise, gain_e_dn)
+    return moments.center_of_gravity(to_native(image), blobs.box_px, sky.level, sky.noise, float(gain_e_dn))
 
 
 def _with_fallback(rows: Floats, image: NDArray, blobs: Blobs, gain_e_dn: float) -> Floats:

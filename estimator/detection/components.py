@@ -65,7 +65,8 @@ def _scan(image: NDArray, threshold: Floats, taps: Ints, sums: NDArray, ring: ND
     bound, row = bounds[:width], values[:width]
     mask = np.zeros(CHUNK_PX, np.uint8)
     words = mask.view(np.uint64)
-    count, cell, ready = 0, -1, 0
+    # Plain 0 and -1 would be literal types, for which numba compiles every called function once more.
+    count, cell, ready = np.int64(0), np.int64(-1), np.int64(0)
     for y in range(height):
         cell = _lower_bounds(threshold, height, y, cell, scale, bound)
         if reach == 0:
@@ -94,7 +95,7 @@ def _scan(image: NDArray, threshold: Floats, taps: Ints, sums: NDArray, ring: ND
                     x = start + i
                     if mask[i] and x >= first and row[x] > scale * interpolate(threshold, height, width, y, x):
                         count = _extend(runs, count, y, x)
-    return count
+    return int(count)
 
 
 @jit

@@ -405,7 +405,7 @@ def fit_camera(camera: Camera, cam_from_ref: Rotation, xy_px: Floats, vectors_re
 
     def model(p: Floats) -> tuple[Camera, Rotation]:
         k1 = float(p[4]) if radial else camera.distortion[0]
-        lens = replace(camera, focal_px=camera.focal_px * float(np.exp(p[3])), distortion=(k1, 0, 0, 0, 0))
+        lens = replace(camera, focal_px=camera.focal_px * float(np.exp(p[3])), distortion=(k1, 0.0, 0.0, 0.0, 0.0))
         return lens, Rotation.from_rotvec(p[:3]) * cam_from_ref
 
     def residual(p: Floats) -> Floats:

@@ -286,18 +286,19 @@ def _expose_source(
     row: Any,
 ) -> None:
     """Integrate one source on its patch; write the light's mean position and the path length into row[2:6]."""
-    # Without a rolling shutter all rows share one integral; with it each row needs its own interval.
     end_s = window.open_s + window.exposure_s
     row[5] = _length(tracks, n, window.open_s, end_s)
-    if window.row_time_s == 0:
-        sums = _integrate(patch, 0, patch.shape[0], x0, y0, n, tracks, kernels, step_px, window.open_s, end_s)
-        if sums[0] > 0:
-            row[2], row[3] = sums[1] / sums[0], sums[2] / sums[0]
-        return
-    for j in range(patch.shape[0]):
+    # Without a rolling shutter all rows share one integral; with it each row needs its own interval.
+    rolling = window.row_time_s != 0
+    rows = 1 if rolling else len(patch)
+    for j in range(0, len(patch), rows):
         delay_s = (y0 + j) * window.row_time_s
-        _integrate(patch, j, j + 1, x0, y0, n, tracks, kernels, step_px, window.open_s + delay_s, end_s + delay_s)
-    row[2], row[3] = _centroid(patch, x0, y0)
+        begin_s = window.open_s + delay_s
+        sums = _integrate(patch, j, j + rows, x0, y0, n, tracks, kernels, step_px, begin_s, end_s + delay_s)
+    if rolling:
+        row[2], row[3] = _centroid(patch, x0, y0)
+    elif sums[0] > 0:
+        row[2], row[3] = sums[1] / sums[0], sums[2] / sums[0]
 
 
 @jit

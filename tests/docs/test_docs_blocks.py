@@ -39,6 +39,7 @@ ELSEWHERE = {  # pages whose blocks have a test of their own, which knows what i
 }
 LONG = {
     "tutorial.md",
+    "findings/validation.md",
     "howto/camera.md",
     "howto/cluster.md",
     "howto/dome.md",

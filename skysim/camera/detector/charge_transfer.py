@@ -118,7 +118,7 @@ def delayed_fractions(transfers: int, cti: float) -> Floats:
     while (later := 1 - np.sum(fractions, axis=0))[-1] > TAIL:
         k = len(fractions)
         fractions.append(fractions[-1] * cti * (n + k - 1) / k)
-    fractions[-1] = fractions[-1] + later
+    fractions[-1] = np.maximum(fractions[-1] + later, 0)  # `later` may be minus a rounding error
     table = np.array(fractions)
     table.flags.writeable = False
     return table

@@ -98,7 +98,8 @@ def source_kernels(
     keys = [tuple(key) for key in steps[first].tolist()]
     add_kernels(cache, camera, keys)
     rows = np.array([cache.rows[key] for key in keys], dtype=np.int64)[inverse]
-    kind, sigma, reach, sharp = np.array(cache.kernels).reshape(-1, 4)[rows].T
+    # Contiguous: columns of a table would be another array type, for which the renderer is compiled once more.
+    kind, sigma, reach, sharp = np.ascontiguousarray(np.array(cache.kernels).reshape(-1, 4)[rows].T)
     spans = np.array(cache.spans, dtype=np.int64).reshape(-1, 4)[rows]
     if gaussian and camera.psf.corner_sigma_px:
         point = kind == GAUSS

@@ -17,8 +17,15 @@ FILE = Path(__file__).parents[3] / "data/catalogs/hipparcos_hp6.5.ecsv"
 ARCSEC_RAD = np.pi / 648_000
 SIGMA_RAD, EPSILON_MAG = 10 * ARCSEC_RAD, 0.25
 HALF_TAN = np.tan(np.radians(8))  # a field of 16 x 16 degrees
-PAPERS = ["fialho_1", "fialho_2", "fialho_3", "fialho_4", "shefex", "master_star", "saa"]
-SLOW = {"shefex", "master_star", "saa"}  # ten seconds and more for the 40 fields
+SLOW = {"shefex", "master_star", "saa"}  # ten seconds and more for the 40 fields, or to compile
+
+
+def named(*names: str) -> list:
+    """Algorithms as parameters; the slow ones run with `make test-long`."""
+    return [pytest.param(name, marks=pytest.mark.long if name in SLOW else ()) for name in names]
+
+
+PAPERS = named("fialho_1", "fialho_2", "fialho_3", "fialho_4", "shefex", "master_star", "saa")
 GIVES_UP = 1_000_000  # angles compared: on the real sky each finds within some hundred thousand
 
 
@@ -66,9 +73,7 @@ def fields(sky: pair_index.PairIndex, count: int, seed: int, least: int = 8, fal
 
 # With three stars inside their gates of three sigmas 99.2 % of the time, 40 fields lose 3 once in a hundred times;
 # the rest have no gate that narrow, or try again.
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=pytest.mark.long if name in SLOW else ()) for name in PAPERS]
-)
+@pytest.mark.parametrize("name", PAPERS)
 def test_the_real_sky_is_identified_and_never_wrongly(sky: pair_index.PairIndex, name: str) -> None:
     every = fields(sky, 40, 90)
     answers = [(one, identify(name, one, sky)) for one in every]
@@ -116,7 +121,7 @@ def test_another_sky_is_refused(sky: pair_index.PairIndex, name: str) -> None:
         assert identify(name, Field(rng, other, sky.magnitude), sky, max_triangles=50) is None
 
 
-@pytest.mark.parametrize("name", ["fialho_3", "fialho_4", "shefex", "saa"])
+@pytest.mark.parametrize("name", named("fialho_3", "fialho_4", "shefex", "saa"))
 def test_false_stars_are_withstood(sky: pair_index.PairIndex, name: str) -> None:
     # A third of 18 and more stars is false. A false star may pass for a star near it: once in a thousand.
     found = 0
@@ -154,7 +159,7 @@ def test_what_it_cannot_work_with_is_refused(sky: pair_index.PairIndex, name: st
         method(one.seen, sky, 1e-4, max_triangle=5)
 
 
-@pytest.mark.parametrize("name", ["fialho_4", "master_star", "saa"])
+@pytest.mark.parametrize("name", named("fialho_4", "master_star", "saa"))
 def test_magnitudes_of_another_count_are_refused(sky: pair_index.PairIndex, name: str) -> None:
     one = fields(sky, 1, 97)[0]
     with pytest.raises(ImageError, match=r"magnitudes \(3,\) of \d+ observed stars"):
