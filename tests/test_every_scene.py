@@ -152,6 +152,7 @@ def test_the_camera_sees_five_leds_all_along_the_maneuver(whole: Testbed) -> Non
     assert min(counts) >= 5 or whole.scene.name in NOT_ALL_ALONG
 
 
+@pytest.mark.long
 def test_it_is_steered_to_where_it_is_told_and_off_its_stop(whole: Testbed) -> None:
     telemetry = whole.telemetry
     assert telemetry is not None

@@ -115,6 +115,7 @@ def test_a_pixel_gets_the_light_of_a_star_for_every_square_arcsecond() -> None:
     assert drawn(glow(**SKY), lens, 3.0)[300, 400] == pytest.approx(3 * star * pixel_arcsec**2, rel=1e-3)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("camera", [{}, BENT])
 def test_the_pixels_share_out_the_whole_field(camera: dict[str, object]) -> None:
     """Their solid angles add up to that inside of the frame's edge, a polygon of great circles (Girard)."""

@@ -324,6 +324,7 @@ sys.stdout.buffer.write(np.array(frames).tobytes())
 """
 
 
+@pytest.mark.long
 def test_the_same_stream_gives_the_same_frame_on_any_number_of_threads() -> None:
     part = repr(LENS | {"height_px": 64, "width_px": 48, "detector": CLEAN | {"read_noise_e": 5, "prnu": 0.01}})
     alone, many = (

@@ -226,6 +226,7 @@ def test_a_kernel_is_made_once_for_sizes_that_are_all_but_equal() -> None:
     assert build_kernel(psf, lens, 0.1, 5.001, 2.0) is not build_kernel(psf, lens, 0.1, 5.02, 2.0)
 
 
+@pytest.mark.long
 def test_a_sharp_point_gets_a_grid_and_a_soft_one_tables() -> None:
     lens = camera(f_number=1.4, pixel="9.9 um")
     assert round_kernel(AiryPsfConfig(kind="airy"), lens, 0, 0, 0) is None

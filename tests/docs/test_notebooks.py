@@ -18,6 +18,7 @@ def test_there_are_two() -> None:
     assert [path.stem for path in NOTEBOOKS] == ["error_budget", "own_tracker"]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_every_cell_runs(path, monkeypatch) -> None:
     monkeypatch.setattr(matplotlib, "rcParams", matplotlib.rcParams.copy())

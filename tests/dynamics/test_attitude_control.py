@@ -224,6 +224,7 @@ OFFSET_M, WEIGHT_N = 0.05e-3, 80 * 9.80665
 SOFT_RAD_S = math.sqrt(WEIGHT_N * OFFSET_M / (6.0 * math.radians(1.03)))  # 0.603
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("law", ["pd", "pid"])
 def test_an_unbalanced_bearing_needs_the_integral(law: str) -> None:
     """80 kg whose center is 0.05 mm aside pull with 0.039 N m, at every attitude the same but for cos(tilt).

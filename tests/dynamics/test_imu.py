@@ -500,6 +500,7 @@ def test_white_noise_of_the_rate() -> None:
         assert abs(next_to) < 4 / np.sqrt(300_000)
 
 
+@pytest.mark.long
 def test_the_wandering_bias_starts_as_it_goes_on() -> None:
     """Over 4000 starts: variance sigma^2 at once and 300 s later, and exp(-1) of it between the two."""
     sigma, first, later = DEG_H, [], []
@@ -568,6 +569,7 @@ def test_allan_deviation_of_an_ln200_is_its_random_walk_at_one_second() -> None:
         np.testing.assert_allclose(allan(angle, STEP, tau_s), declared(gyro, tau_s), rtol=4 * scatter)
 
 
+@pytest.mark.long
 def test_allan_deviation_of_the_wandering_bias_peaks_as_theory() -> None:
     """Bias alone, 23 days in steps of 1 s: 0.617 sigma at 567 s (bar: 5 %).
 

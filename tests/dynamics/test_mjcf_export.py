@@ -321,6 +321,7 @@ def test_the_leds_glow_where_they_are_projected_and_nowhere_else(drawn: Drawn) -
     assert np.median(brightest) > 200
 
 
+@pytest.mark.long
 def test_the_field_of_the_camera_is_seen_and_tilts_with_the_vehicle(drawn: Drawn) -> None:
     """Half-way up, level and tilted by 20 degrees, the pyramid is 0.15 m from where it was, itself 0.08 m wide."""
     _, vehicle, model, data, lit, _ = drawn

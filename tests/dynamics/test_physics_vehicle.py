@@ -66,6 +66,7 @@ def carried(flight: multibody.Simulation, step: int) -> tuple[Floats, float]:
 # --- what is kept -------------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_angular_momentum_is_kept_for_a_minute_while_wheels_and_gimbals_are_driven() -> None:
     """The issue's bar, 1e-8 N m s. Whatever the motors do between the vehicle's parts, the whole keeps its own.
 

@@ -100,6 +100,7 @@ def test_the_survey_makes_the_tracker_s_error_smaller_by_much(statistics: dict[s
     assert after["cross_deg_median"] < before["cross_deg_median"] / 5
 
 
+@pytest.mark.long
 def test_lens_and_lever_are_the_true_ones_within_their_errors_and_better_than_before(
     statistics: dict[str, Any],
 ) -> None:

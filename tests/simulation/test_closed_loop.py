@@ -161,6 +161,7 @@ def test_a_solution_comes_after_its_latency(latency_s: float) -> None:
     assert [shot.report.attitude.status for shot in shots] == ["solved"] * 4
 
 
+@pytest.mark.long
 def test_the_loop_with_latency_survives_the_accident() -> None:
     testbed = prepared(**EARLY, filter__latency="0.2 s")
     assert set(testbed.update_statuses.values()) == {"used"}

@@ -392,6 +392,7 @@ def test_a_frame_is_exposed_for_as_long_as_it_was_told() -> None:
         assert np.median(shot.frame.image_dn) == pytest.approx(offset_dn + gathered_dn, abs=1.0)
 
 
+@pytest.mark.long
 def test_a_bright_body_shortens_the_exposure_and_turning_away_restores_the_stars() -> None:
     """A body at the baffle's edge while the camera turns by 6.4 degrees away from it, its light gone after four."""
     body = "[{kind: stray, ra_deg: 190, dec_deg: 5, angle_deg: [0, 23.9, 24, 180], pst: [4e-6, 4e-6, 0, 0]}]"

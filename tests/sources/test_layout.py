@@ -107,6 +107,7 @@ def test_poisson_disk_leaves_none_too_near_and_no_room(surface: dict) -> None:
     assert np.mean(tree.query(somewhere.place[:, :3])[0] > 1.3 * INCH_M) < 1e-3
 
 
+@pytest.mark.long
 def test_poisson_disk_covers_as_random_sequential_adsorption_does(monkeypatch: pytest.MonkeyPatch) -> None:
     """Disks of the spacing's diameter jam at a cover of .547, which t darts miss by some c / sqrt(t) (Feder's law).
 

@@ -119,6 +119,7 @@ def test_with_any_seed_it_is_not_worse(seed: int) -> None:
         assert mine[-50:].mean() <= 0.95 * other[-50:].mean()
 
 
+@pytest.mark.long
 def test_it_keeps_to_cap_surface_and_spacing(best: Sources) -> None:
     place_m = best.place[:, :3]
     assert len(best) == COUNT
@@ -129,6 +130,7 @@ def test_it_keeps_to_cap_surface_and_spacing(best: Sources) -> None:
     np.testing.assert_allclose(level, 1, rtol=0, atol=1e-12)
 
 
+@pytest.mark.long
 def test_the_seed_decides(monkeypatch: pytest.MonkeyPatch) -> None:
     quick = replace(optimize.OPTIONS, score_attitudes=2000, fresh_attitudes=1000)
     monkeypatch.setattr(optimize, "OPTIONS", quick)
@@ -138,6 +140,7 @@ def test_the_seed_decides(monkeypatch: pytest.MonkeyPatch) -> None:
     assert not np.isin(other.place[:, 0], first.place[:, 0]).all()  # some may be the spiral's still
 
 
+@pytest.mark.long
 def test_its_information_is_the_estimator_s(best: Sources) -> None:
     """The same law in two pieces of code: sum J'J against the covariance of the exact solve at the truth, level."""
     part, place_m = led_schema.OptimizedConfig.model_validate(WANTED), best.place[:, :3]
@@ -186,6 +189,7 @@ def test_leds_that_are_off_by_more_than_the_tolerance_do_not_coincide() -> None:
         assert found.fraction[0] == pytest.approx(coincide / 6, abs=1e-12)
 
 
+@pytest.mark.long
 def test_no_field_is_half_another_s_where_nearly_all_of_a_spiral_s_are_whole(best: Sources) -> None:
     """A Fibonacci spiral is itself again a step along: benchmarks/dome_identify.py refuses 89 frames of a hundred."""
     config = led_schema.OptimizedConfig.model_validate(WANTED)

@@ -111,6 +111,7 @@ def test_a_wrong_home_stays_in_the_navigator() -> None:
     np.testing.assert_allclose(believed, np.tile([4.5, 11.0, -42.0], (len(believed), 1)), rtol=0, atol=1e-8)
 
 
+@pytest.mark.long
 def test_steered_by_the_imu_the_vehicle_goes_where_the_navigator_is_wrong() -> None:
     """The navigator is brought to the reference, (0, 0, 0), so the vehicle stands off by the home's error."""
     home = "home_error_deg: [0.5, -1.0, 2.0]"

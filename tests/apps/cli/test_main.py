@@ -151,6 +151,7 @@ def test_a_preview_is_a_picture_beside_the_frame(skysim: Skysim, tmp_path: Path)
     assert not (tmp_path / "frame_0000.preview.png").exists()  # it spoke of an earlier run
 
 
+@pytest.mark.long
 @pytest.mark.filterwarnings("ignore:.*datfix")
 def test_render_then_solve_agrees_with_the_wcs_of_the_true_pointing(
     skysim: Skysim, rendered: Path, tmp_path: Path

@@ -195,8 +195,15 @@ def monte_carlo(lever: Lever, count: int, surface: tuple, seed: int, trials: int
     return np.array(errors), np.array(claimed)
 
 
-@pytest.mark.parametrize("surface", [SPHERE, MEASURED], ids=["sphere", "ellipsoid"])
-@pytest.mark.parametrize("lever", [LEVER, ASKEW], ids=["axial", "askew"])
+@pytest.mark.parametrize(
+    ("lever", "surface"),
+    [
+        pytest.param(LEVER, SPHERE, marks=pytest.mark.long),
+        pytest.param(LEVER, MEASURED, marks=pytest.mark.long),
+        pytest.param(ASKEW, SPHERE, marks=pytest.mark.long),
+        (ASKEW, MEASURED),
+    ],
+)
 def test_the_covariance_is_true(lever: Lever, surface: tuple) -> None:
     errors, claimed = monte_carlo(lever, 5, surface, seed=55, trials=600)
     nees = np.einsum("ni,nij,nj->n", errors, np.linalg.inv(claimed), errors)

@@ -368,11 +368,11 @@ def test_fifteen_stars_err_as_the_reference_says() -> None:
 @pytest.mark.parametrize("name", SOLVERS)
 @pytest.mark.parametrize("count", [2, 3, 5, 30])
 def test_the_covariance_is_true(count: int, name: str) -> None:
-    errors, claimed = monte_carlo(count, np.tan(np.radians(5)), 1500, seed=46, name=name)
+    errors, claimed = monte_carlo(count, np.tan(np.radians(5)), 600, seed=46, name=name)
     nees = np.einsum("ni,nij,nj->n", errors, np.linalg.inv(claimed), errors)
-    # Chi-square of three degrees: mean 3, deviation sqrt(6 / 1500) = 0.063; three of them, and 1 % for the
+    # Chi-square of three degrees: mean 3, deviation sqrt(6 / 600) = 0.1; three of them, and 1 % for the
     # tangent plane's own unevenness within 5 degrees.
-    assert nees.mean() == pytest.approx(3, abs=0.22)
+    assert nees.mean() == pytest.approx(3, abs=0.33)
 
 
 def test_the_covariance_of_three_axes_by_hand() -> None:

@@ -144,6 +144,7 @@ def test_twenty_frames_give_the_field_to_a_fiftieth_of_a_pixel(
     assert {found.report.status for _, found in clean} == {"converged"}
 
 
+@pytest.mark.long
 def test_the_lens_s_covariance_is_true(clean: list[tuple[Field, Calibration]]) -> None:
     nees = []
     for _, found in clean:
@@ -177,6 +178,7 @@ def test_the_misfit_is_that_of_honest_sigmas(clean: list[tuple[Field, Calibratio
     )
 
 
+@pytest.mark.long
 def test_five_in_a_hundred_wrong_names_cost_nearly_nothing() -> None:
     off, missed, lost, total = [], 0, 0, 0
     for run in range(20):

@@ -111,6 +111,7 @@ def test_merged_stars_keep_their_light(rng: np.random.Generator, near_rad: float
     assert (np.diff(merged.v_mag) >= 0).all()
 
 
+@pytest.mark.long
 @law(catalog.read, catalog.columns, ptase.read_cat)
 @given(
     rows=some.lists(some.lists(some.floats() | some.text(max_size=5), min_size=5, max_size=8), max_size=3),

@@ -68,6 +68,7 @@ SIXTY_FOURTHS = st.integers(0, 64).map(lambda n: n / 64)
 ANY_ANGLE = st.floats(0, 1, allow_subnormal=False) | SIXTY_FOURTHS
 
 
+@pytest.mark.long
 @settings(max_examples=400, deadline=None, derandomize=True)
 @given(st.lists(ANY_ANGLE, min_size=3, max_size=40).map(sorted), ANY_ANGLE, ANY_ANGLE)
 def test_the_k_vector_never_misses_and_takes_in_little(given_rad: list, one: float, other: float) -> None:

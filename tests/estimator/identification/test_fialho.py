@@ -127,6 +127,7 @@ def test_lists_from_neighbors_answer_as_lists_from_the_whole_catalog(sky: pair_i
             np.testing.assert_array_equal(one.star, two.star)
 
 
+@pytest.mark.long
 def test_one_triangle_succeeds_as_often_as_its_three_magnitudes_pass(sky: pair_index.PairIndex) -> None:
     # 0.9973^3 = 99.19 %: PTASE's 99.12 +- 0.25 % with mf1_2. Another triangle repairs it.
     rng, runs, found = np.random.default_rng(105), 2000, np.zeros(2)

@@ -71,6 +71,7 @@ def solved(
     return pyramid(CAMERA.rays(xy), index, tolerance_px / CAMERA.focal_px, stretch=5e-4, max_triangles=triangles)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("noise_px", "false", "fields", "wanted"),
     [
@@ -126,6 +127,7 @@ def test_nothing_but_false_stars_gives_no_attitude(bright_sky: pair_index.PairIn
     assert sum(solved(xy, bright_sky) is not None for xy in fields) == 0
 
 
+@pytest.mark.long
 def test_nothing_but_many_false_stars_gives_no_attitude(sky: pair_index.PairIndex) -> None:
     rng = np.random.default_rng(64)
     fields = (rng.uniform(0, [658, 492], (40, 2)) for _ in range(60))

@@ -64,6 +64,7 @@ def test_an_imu_that_is_wrong_at_one_of_five_spreads_a_place_by_two_fifths(
     np.testing.assert_allclose(x_mm.std(axis=0, ddof=1).mean(), expected, rtol=0.05)
 
 
+@pytest.mark.long
 def test_the_places_fitted_are_table_8_and_a_cross_of_eight_millimeters(testbed: Testbed) -> None:
     place_m = test3.fit_positions(testbed)
     rows = experiments()["afit-table-6-9"].rows
@@ -114,6 +115,7 @@ def test_an_imu_drifts_by_the_earth_s_rate() -> None:
     assert np.abs(off[:, 0]).max() < 1e-12
 
 
+@pytest.mark.long
 def test_gyros_miss_what_is_beyond_their_limit_and_nothing_else() -> None:
     calm, knocked = bump.simulate_bump(None, 74), bump.simulate_bump(bump.FITTED_BUMP, 74)
     assert calm.saturated_s == 0

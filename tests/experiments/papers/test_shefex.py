@@ -44,6 +44,7 @@ def test_a_field_s_stars_are_the_catalog_s_where_the_attitude_puts_them() -> Non
         assert apart.max() < 0.01
 
 
+@pytest.mark.long
 def test_without_noise_a_field_is_named_and_its_attitude_found() -> None:
     field = next(one for one in random_fields(20, 4) if len(one.xy_px) >= 6)
     told = identification.identify(field, 1e-6, 1e-5, 0, FOURTH_STAR, np.random.default_rng(1))

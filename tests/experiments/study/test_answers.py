@@ -196,6 +196,7 @@ def loaded_with_a_fault(path):
     return told
 
 
+@pytest.mark.long
 def test_exports_say_what_the_store_says(tmp_path):
     pandas, pyarrow = pytest.importorskip("pandas"), pytest.importorskip("pyarrow.parquet")
     xarray = pytest.importorskip("xarray")

@@ -36,6 +36,7 @@ def typed(tmp_path, monkeypatch, capsys):
     return enter
 
 
+@pytest.mark.long
 def test_a_study_from_its_run_to_its_replay(typed, tmp_path):
     code, out, _ = typed("study", "run", "question.yaml", "--engine", "serial")
     assert code == 0
@@ -55,6 +56,7 @@ def test_a_study_from_its_run_to_its_replay(typed, tmp_path):
     assert (tmp_path / told["pictures"][0]).is_file()
 
 
+@pytest.mark.long
 def test_a_study_that_ran_out_of_its_budget_is_resumed(typed):
     code, _, err = typed("study", "run", "question.yaml", "--engine", "serial", "--set", "budget={time: 1 us}")
     assert code == 0

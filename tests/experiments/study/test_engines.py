@@ -380,6 +380,7 @@ def test_an_address_that_is_none_is_told_in_one_line(scheduler: str) -> None:
     assert "\n" not in str(refused.value)
 
 
+@pytest.mark.long
 def test_where_nobody_answers_it_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("distributed")
     from skysim.experiments.study.execution import dask_engine

@@ -231,6 +231,7 @@ def test_figures_exist_of_every_kind(tmp_path: Path, keys: dict[str, Any], count
     assert len(set(html.images)) == count
 
 
+@pytest.mark.long
 def test_indices_and_a_search_have_theirs(tmp_path: Path) -> None:
     part = Summary(0.4, 0.3, 0.5, 8)
     index = [Index("tilt", name, part, part, 1.0) for name in ("cross_arcsec", "roll_arcsec")]

@@ -247,6 +247,7 @@ def killed_and_resumed(told: plan.Plan, out: Path, engine: engines.Engine, every
     raise AssertionError
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("every", [2, 9])
 def test_killed_and_resumed_it_leaves_the_same_store(tmp_path: Path, every: int) -> None:
     """Two objectives, a constraint, levels and a refusal: all that the sampler hears of comes back from the store."""

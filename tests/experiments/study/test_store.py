@@ -110,6 +110,7 @@ def test_a_writer_killed_at_any_instant_leaves_whole_batches(told: plan.Plan, wh
     assert contents(often) == whole
 
 
+@pytest.mark.long
 def test_one_run_at_a_time(told: plan.Plan, tmp_path: Path) -> None:
     path = tmp_path / "one.sqlite"
     pid = child(lambda: done(told, path, watch=lambda progress: time.sleep(0.05)))
@@ -126,6 +127,7 @@ def test_one_run_at_a_time(told: plan.Plan, tmp_path: Path) -> None:
     assert done(told, path, resume=True).done == told.trials
 
 
+@pytest.mark.long
 def test_interrupted_by_the_keyboard_it_resumes(told: plan.Plan, whole: str, tmp_path: Path) -> None:
     path = tmp_path / "interrupted.sqlite"
     pid = child(lambda: done(told, path, watch=lambda progress: time.sleep(0.02)))
@@ -142,6 +144,7 @@ def test_interrupted_by_the_keyboard_it_resumes(told: plan.Plan, whole: str, tmp
 # What may be resumed.
 
 
+@pytest.mark.long
 def test_another_study_or_other_code_is_refused(
     told: plan.Plan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -182,6 +185,7 @@ def taken(folder: Path) -> Path:
 # Budgets.
 
 
+@pytest.mark.long
 def test_out_of_time_it_stops_and_resumes(told: plan.Plan, whole: str, tmp_path: Path) -> None:
     path = tmp_path / "short.sqlite"
     short = other(told, budget="{time: 1 us}")
@@ -250,6 +254,7 @@ def test_rows_are_kept_all_or_none(tmp_path: Path) -> None:
 # How work is dealt out.
 
 
+@pytest.mark.long
 @settings(max_examples=200, deadline=None)
 @given(st.data())
 def test_chunks_hold_every_missing_trial_once_and_in_order(data: st.DataObject) -> None:
