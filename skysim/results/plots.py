@@ -23,9 +23,14 @@ def png(draw: Callable[[Any], None], size_in: tuple[float, float]) -> bytes:
     import matplotlib
     from matplotlib.figure import Figure as Canvas
 
-    buffer = std_io.BytesIO()
     with matplotlib.rc_context(LOOK):
         fig = Canvas(figsize=size_in, layout="constrained")
         draw(fig)
-        fig.savefig(buffer, format="png", dpi=DPI, metadata={"Software": None})
+        return figure_png(fig, dpi=DPI, metadata={"Software": None})
+
+
+def figure_png(fig: Any, **options: Any) -> bytes:
+    """PNG bytes of a figure. options : of `savefig`"""
+    buffer = std_io.BytesIO()
+    fig.savefig(buffer, format="png", **options)
     return buffer.getvalue()

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import base64
-import io as std_io
-from dataclasses import asdict, dataclass
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +13,7 @@ from numpy.typing import NDArray
 
 from skysim.core.files import write_text
 from skysim.core.types import Floats, FrameRow, SourceTruth
+from skysim.results.plots import figure_png
 from skysim.results.stretch import to_8bit
 
 TRUTH_BGR, DETECTED_BGR, MATCHED_BGR = (200, 160, 60), (80, 80, 235), (110, 220, 90)
@@ -119,8 +119,8 @@ def summary(rows: list[FrameRow]) -> dict[str, Any]:
     Errors are over solved frames, wrong ones included; NaN if no frame was solved.
     """
     solved = [row for row in rows if row.status == "solved"]
-    cross = np.array([row.cross_arcsec for row in solved]) if solved else np.array([np.nan])
-    roll = np.abs([row.roll_arcsec for row in solved]) if solved else np.array([np.nan])
+    cross = np.array([row.cross_arcsec for row in solved] or [np.nan])
+    roll = np.abs([row.roll_arcsec for row in solved] or [np.nan])
     return {
         "frames": len(rows),
         "solved": len(solved),
@@ -133,19 +133,6 @@ def summary(rows: list[FrameRow]) -> dict[str, Any]:
     }
 
 
-def as_dicts(rows: list[FrameRow]) -> list[dict[str, Any]]:
-    return [asdict(row) for row in rows]
-
-
-@dataclass(frozen=True, slots=True)
-class Images:
-    """Images of a page: annotated frame, telemetry plot (PNG bytes), image files of the laboratory (may be empty)."""
-
-    annotated: NDArray[np.uint8]
-    flight: bytes
-    scene_3d: list[Path]
-
-
 def write_page(
     path: Path,
     title: str,
@@ -153,11 +140,14 @@ def write_page(
     angles: tuple[str, str, str],
     rows: list[FrameRow],
     stages_ms: dict[str, float],
-    images: Images,
+    annotated: NDArray[np.uint8],
+    flight: bytes,
+    scene_3d: Sequence[Path],
 ) -> None:
     """Write one HTML file with its images embedded: statistics, plots, an annotated frame, the table, the command.
 
-    angles : names of the three angles of a row; stages_ms : median time by stage.
+    angles : names of the three angles of a row;  stages_ms : median time by stage
+    flight : telemetry plot, PNG;  scene_3d : image files of the laboratory
     """
     text = render_page(
         "run.html",
@@ -167,9 +157,9 @@ def write_page(
         rows=rows,
         summary=summary(rows),
         stages_ms=stages_ms,
-        picture=embed(cv2.imencode(".png", images.annotated)[1].tobytes()),
-        flight=embed(images.flight),
-        scene_3d=[embed(path.read_bytes(), path.suffix[1:]) for path in images.scene_3d],
+        picture=embed(cv2.imencode(".png", annotated)[1].tobytes()),
+        flight=embed(flight),
+        scene_3d=[embed(path.read_bytes(), path.suffix[1:]) for path in scene_3d],
         figure=embed(error_figure(rows)),
     )
     write_text(path, text)
@@ -214,6 +204,4 @@ def error_figure(rows: list[FrameRow]) -> bytes:
     rate.set_xlabel("time [s]")
     for axes in (errors, stars, rate):
         axes.grid(alpha=0.3)
-    buffer = std_io.BytesIO()
-    fig.savefig(buffer, format="png", dpi=110)
-    return buffer.getvalue()
+    return figure_png(fig, dpi=110)

@@ -99,30 +99,6 @@ def table(rows: list[FrameRow], names: tuple[str, str, str]) -> Any:
     return Table(columns)
 
 
-class RunAccumulator:
-    """Accumulates, in addition to a run's rows, the seconds by stage and the last solved frame for the image."""
-
-    def __init__(self) -> None:
-        self._seconds: dict[str, list[float]] = {}
-        self._last: FrameResult | None = None
-
-    def add(self, result: FrameResult) -> None:
-        """Add the times of a frame, and keep the frame if it is solved or the first."""
-        for stage, seconds in (result.seconds | result.report.seconds).items():
-            self._seconds.setdefault(stage, []).append(seconds)
-        if self._last is None or result.report.attitude.solved:
-            self._last = result
-
-    def median_ms(self) -> dict[str, float]:
-        """Median milliseconds per frame, by stage."""
-        return {stage: 1e3 * float(np.median(seconds)) for stage, seconds in self._seconds.items()}
-
-    def picture(self) -> NDArray[np.uint8]:
-        """The last solved frame, annotated; the first frame if none was solved."""
-        assert self._last is not None
-        return annotated(self._last)
-
-
 def annotated(result: FrameResult) -> NDArray[np.uint8]:
     """The stretched frame with true sources, detections and identified detections marked."""
     detected, match = result.report.centroids.xy_px, result.report.attitude.match

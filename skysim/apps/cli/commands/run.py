@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 import sys
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -62,7 +63,6 @@ def run(
     """Simulate a scene: motion, frames, attitude solutions and their scores."""
     from skysim.core.files import to_json
     from skysim.results import scoring
-    from skysim.results.report import as_dicts
     from skysim.results.run import Recorder, score_frames
     from skysim.simulation import checks
     from skysim.simulation.compilation import on_two_processes
@@ -87,7 +87,7 @@ def run(
     views = write_3d_views(testbed, recorder.folder) if scene_3d else []
     statistics = recorder.finish(shlex.join(["skysim", *sys.argv[1:]]), views)
     if json:
-        print(to_json({"scene": loaded.name, **statistics, "rows": as_dicts(recorder.rows)}))
+        print(to_json({"scene": loaded.name, **statistics, "rows": [asdict(row) for row in recorder.rows]}))
     else:
         print_rows(recorder.rows, scoring.angle_names(loaded), statistics["exposures_ms"])
         print_summary(statistics)
