@@ -142,11 +142,7 @@ def trial_progress(what: str, total: int) -> Iterator[Callable[[Progress], None]
     def print_line(done: Progress, faults: str) -> None:
         if not console.is_terminal and 10 * done.done // total > tenth[0]:
             tenth[0] = 10 * done.done // total
-            print(
-                f"{what}: {done.done} of {total}, {done.rate:.0f} trials/s, {faults}",
-                file=sys.stderr,
-                flush=True,
-            )
+            print(f"{what}: {done.done} of {total}, {done.rate:.0f} trials/s, {faults}", file=sys.stderr, flush=True)
 
     with bar(BarColumn(), TextColumn(text), TimeRemainingColumn()) as shown:
         task = shown.add_task(what, total=total, rate=0.0, faults="")
@@ -216,10 +212,7 @@ def print_scores(lines: list[TrackerScore], folder: Path) -> None:
 
 def print_survey(survey: dict[str, Any]) -> None:
     lines = [
-        [
-            row["what"],
-            *(f"{row[key]:.5g}" if row["what"][0] in "kp" else f"{row[key]:.3f}" for key in SURVEY_COLUMNS),
-        ]
+        [row["what"], *(f"{row[key]:.5g}" if row["what"][0] in "kp" else f"{row[key]:.3f}" for key in SURVEY_COLUMNS)]
         for row in survey["values"]
         if row["sigma"]
     ]

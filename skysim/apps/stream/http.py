@@ -117,8 +117,7 @@ class Handler(BaseHTTPRequestHandler):
             self.stream(path.endswith("raw"))
         elif path not in ("/frame.png", "/frame.raw", "/truth.json"):
             self.send_error(
-                404,
-                "allowed: /, /stream.mjpg, /stream.raw, /frame.png, /frame.raw, /truth.json, /status.json",
+                404, "allowed: /, /stream.mjpg, /stream.raw, /frame.png, /frame.raw, /truth.json, /status.json"
             )
         elif newest is None:
             self.send_error(503, "no frame has been rendered yet")

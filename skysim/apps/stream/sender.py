@@ -52,11 +52,7 @@ class SenderStats:
 
 
 def send(
-    testbed: Testbed,
-    pace: Pace,
-    sinks: list[Sink],
-    stats: SenderStats,
-    publish: Callable[[Packet], None] | None = None,
+    testbed: Testbed, pace: Pace, sinks: list[Sink], stats: SenderStats, publish: Callable[[Packet], None] | None = None
 ) -> None:
     """Simulate a testbed and send each frame when it is due, until the last frame or until all sinks have failed.
 

@@ -32,14 +32,7 @@ Bar = Callable[[Iterable[Any], int, str], Iterator[Any]]  # progress bar over it
 
 # Unit by the ending of a column's name; the longest matching ending applies.
 UNITS = {
-    **{
-        "_deg_s": "deg/s",
-        "_deg_h": "deg/h",
-        "_deg": "deg",
-        "_rad_s": "rad/s",
-        "_rad": "rad",
-        "_arcsec": "arcsec",
-    },
+    **{"_deg_s": "deg/s", "_deg_h": "deg/h", "_deg": "deg", "_rad_s": "rad/s", "_rad": "rad", "_arcsec": "arcsec"},
     **{"_px": "px", "_ms": "ms", "_m_s": "m/s", "_s": "s", "_rpm": "rpm", "_nms": "N m s", "_nm": "N m"},
     **{"_e": "electron", "electrons": "electron"},
 }
@@ -221,12 +214,7 @@ def frame_arrays(frame_truths: list[FrameTruth]) -> Iterator[tuple[str, Any, str
     """Arrays stored with the frames of a sequence: name, array, name of its second axis, unit."""
     utc = [truth.mid_utc.isoformat(timespec="microseconds") for truth in frame_truths]
     yield "frame", np.array([truth.frame for truth in frame_truths]), "", ""
-    yield (
-        "mid_utc",
-        np.array(utc, dtype="datetime64[us]").astype(np.int64),
-        "",
-        "microseconds since 1970-01-01",
-    )
+    yield ("mid_utc", np.array(utc, dtype="datetime64[us]").astype(np.int64), "", "microseconds since 1970-01-01")
     for name, axis in (
         *(("t_mid_s", ""), ("exposure_s", ""), ("rate_cam_rad_s", "xyz")),
         *(("lab_from_body_xyzw", "xyzw"), ("cam_from_lab_xyzw", "xyzw")),

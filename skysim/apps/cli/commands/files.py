@@ -77,8 +77,7 @@ def catalog_info(
 def export(
     folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Output folder of `skysim run` or `render`.")],
     to: Annotated[
-        list[str],
-        typer.Option("--to", metavar="FORMAT", help="aem, ecsv, parquet, tiff, zarr or video; repeatable."),
+        list[str], typer.Option("--to", metavar="FORMAT", help="aem, ecsv, parquet, tiff, zarr or video; repeatable.")
     ],
     out: Annotated[Path | None, typer.Option(help="Output folder; default: FOLDER.")] = None,
     json: Json = False,

@@ -20,8 +20,7 @@ def gui(
     ] = "127.0.0.1",
     port: Annotated[int, typer.Option(min=1, max=65535, help="Port to serve on.")] = 8080,
     token: Annotated[
-        str,
-        typer.Option(help="Access token that browsers must send; default: a random one if --host requires it."),
+        str, typer.Option(help="Access token that browsers must send; default: a random one if --host requires it.")
     ] = "",
     folder: Annotated[Path, typer.Option(help="Folder in which new scenes are saved.")] = Path("."),
     out: Annotated[Path, typer.Option(help="Folder of studies and their reports.")] = Path("out"),

@@ -61,10 +61,7 @@ def reproduce(
 
 
 def write_pages(
-    reproductions: list[Reproduction],
-    command_options: CommandArguments,
-    out: Path | None,
-    markdown: Path | None,
+    reproductions: list[Reproduction], command_options: CommandArguments, out: Path | None, markdown: Path | None
 ) -> list[Path]:
     """Write the requested pages (HTML in folder `out`, Markdown to a file) and return their paths."""
     from skysim.core import files

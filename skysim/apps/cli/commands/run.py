@@ -55,8 +55,7 @@ def run(
     tracker: Annotated[str | None, typer.Option(metavar="NAME", help=TRACKER_HELP)] = None,
     program: Programs = None,
     scene_3d: Annotated[
-        bool,
-        typer.Option("--scene-3d", help="Write 3-D views of the laboratory: scene_3d.png and scene_3d.gif."),
+        bool, typer.Option("--scene-3d", help="Write 3-D views of the laboratory: scene_3d.png and scene_3d.gif.")
     ] = False,
     json: Json = False,
 ) -> None:

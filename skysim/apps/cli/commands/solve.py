@@ -31,8 +31,7 @@ def solve(
         list[Path] | None, typer.Argument(metavar="IMAGES", help="FITS, PNG, TIFF, JPEG or BMP files.")
     ] = None,
     fov: Annotated[
-        float | None,
-        typer.Option(help="Horizontal field of view in degrees, to 5 %; default: 5 to 40 are searched."),
+        float | None, typer.Option(help="Horizontal field of view in degrees, to 5 %; default: 5 to 40 are searched.")
     ] = None,
     camera: Annotated[
         Path | None,
@@ -41,12 +40,10 @@ def solve(
         ),
     ] = None,
     live: Annotated[
-        str | None,
-        typer.Option(help="Also solve a frame of a live camera: its index, a video file or an address."),
+        str | None, typer.Option(help="Also solve a frame of a live camera: its index, a video file or an address.")
     ] = None,
     time: Annotated[
-        str | None,
-        typer.Option(help="UTC at which the images were taken, 1900 to 2100, e.g. 2012-06-22T21:00:00."),
+        str | None, typer.Option(help="UTC at which the images were taken, 1900 to 2100, e.g. 2012-06-22T21:00:00.")
     ] = None,
     detector: Detector = None,
     centroider: Centroider = None,
@@ -104,8 +101,7 @@ def survey(
     focal_error: Annotated[str, typer.Option(help="Error of the assumed focal length.")] = "1%",
     distortion: Annotated[bool, typer.Option("--distortion", help="Also fit the distortion k1, k2, p1, p2.")] = False,
     checks: Annotated[
-        int,
-        typer.Option(min=1, help="Number of further attitudes at which the tracker is tested before and after."),
+        int, typer.Option(min=1, help="Number of further attitudes at which the tracker is tested before and after.")
     ] = 40,
     json: Json = False,
 ) -> None:

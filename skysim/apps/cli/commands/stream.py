@@ -26,8 +26,7 @@ def stream(
         Path | None, typer.Option(help="Write frames to a folder: a 16-bit PNG and a JSON file per frame.")
     ] = None,
     http: Annotated[
-        int | None,
-        typer.Option(min=0, max=65535, help="Serve MJPEG and packets on this port; 0: any free port."),
+        int | None, typer.Option(min=0, max=65535, help="Serve MJPEG and packets on this port; 0: any free port.")
     ] = None,
     host: Annotated[str, typer.Option(help="Address to serve on, without access control.")] = "127.0.0.1",
     pipe: Annotated[

@@ -12,13 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from skysim.apps.cli.options import Json, Out, Overrides, Programs, output_folder
-from skysim.apps.cli.study_summary import (
-    print_points,
-    print_replay,
-    print_study_status,
-    study_status,
-    trial_count,
-)
+from skysim.apps.cli.study_summary import print_points, print_replay, print_study_status, study_status, trial_count
 from skysim.apps.cli.terminal import print_error, print_titles, trial_progress
 from skysim.core.errors import InputError, printable, unknown_name
 

@@ -28,12 +28,7 @@ class Scene3D:
 
     def __init__(self) -> None:
         self.scene = ui.scene(
-            width=400,
-            height=300,
-            grid=False,
-            background_color=COLORS["ground"],
-            fps=FPS_SLOW,
-            click_events=[],
+            width=400, height=300, grid=False, background_color=COLORS["ground"], fps=FPS_SLOW, click_events=[]
         )
         self.scene.classes("w-full h-full").mark("space")
         self.fps = FPS_SLOW

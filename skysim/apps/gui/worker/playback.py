@@ -37,11 +37,7 @@ class MotionPlayback:
     def curves(self) -> MotionLog:
         """Curves of true and estimated attitude errors (arcsec), momentum (N m s) and rate (deg/s), decimated."""
         log, every = self.log, max(len(self.log.t_s) // MAX_POINTS, 1)
-        attitudes = {
-            "pointing": log.lab_from_ref,
-            "IMU alone": log.lab_from_imu,
-            "filter": log.lab_from_filter,
-        }
+        attitudes = {"pointing": log.lab_from_ref, "IMU alone": log.lab_from_imu, "filter": log.lab_from_filter}
         curves = {
             name: to_arcsec(telemetry_report.attitude_error_deg(attitude, log.lab_from_body))
             for name, attitude in attitudes.items()

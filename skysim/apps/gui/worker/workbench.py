@@ -15,15 +15,7 @@ from estimator.core.types import Attitude
 from estimator.trackers.dome_tracker import DomeTracker
 from estimator.trackers.pipeline import Clock, Report
 from estimator.trackers.star_tracker import StarTracker
-from skysim.apps.gui.messages import (
-    Detection,
-    FrameView,
-    Light,
-    PixelWindow,
-    SceneInfo,
-    TrackerResult,
-    Triple,
-)
+from skysim.apps.gui.messages import Detection, FrameView, Light, PixelWindow, SceneInfo, TrackerResult, Triple
 from skysim.apps.gui.worker import geometry, pointing
 from skysim.core import quaternion
 from skysim.core.types import Floats, Frame, Trajectory, Truth
@@ -159,10 +151,7 @@ def true_lights(truth: Truth, magnitude: Mapping[int, float]) -> tuple[Light, ..
     sources = truth.sources
     rows = np.argsort(-sources.electrons)
     columns = zip(
-        sources.id[rows].tolist(),
-        sources.flux_xy_px[rows].tolist(),
-        sources.electrons[rows].tolist(),
-        strict=True,
+        sources.id[rows].tolist(), sources.flux_xy_px[rows].tolist(), sources.electrons[rows].tolist(), strict=True
     )
     return tuple(Light(id, x, y, e, magnitude.get(id, math.nan)) for id, (x, y), e in columns)
 

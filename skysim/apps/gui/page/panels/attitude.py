@@ -38,10 +38,7 @@ class AttitudeCard:
                 ui.label("error").classes("quiet")
                 self.errors = [ui.label("–").classes("mono num") for _ in range(3)]
             self.status = ui.label(" ").classes("mono ellipsis").style("margin-top: 6px").mark("status")
-        with (
-            ui.element("div").classes("lab-card"),
-            ui.element("div").classes("lab-stages"),
-        ):
+        with ui.element("div").classes("lab-card"), ui.element("div").classes("lab-stages"):
             self.stages = {
                 stage: self.stage_select(stage) for stage in ("detector", "centroider", "identifier", "solver")
             }

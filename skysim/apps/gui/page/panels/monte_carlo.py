@@ -132,10 +132,7 @@ class MonteCarloPanel:
             return STUDIES / f"{self.study_select.value}.yaml"
         trial: dict[str, Any] = {"kind": self.kind.value}
         if self.kind.value == "centroids":
-            trial |= {
-                "noise_px": float(self.noise.value or 0),
-                "false_lights": int(self.false_lights.value or 0),
-            }
+            trial |= {"noise_px": float(self.noise.value or 0), "false_lights": int(self.false_lights.value or 0)}
         if not (self.count.value and 1 <= self.count.value <= 100_000):
             raise InputError("runs: allowed: 1 to 100000")
         settings = self.tab.scene_path, self.tab.overrides, trial, int(self.count.value)

@@ -52,8 +52,7 @@ class PhotoPanel:
         self.tab.stop_playback()
         self.show_text(f"solving {name} …", "quiet")
         self.show(
-            name,
-            await self.tab.run_task("solve_file", name, data, self.fov.value, {}, activity=f"solving {name} …"),
+            name, await self.tab.run_task("solve_file", name, data, self.fov.value, {}, activity=f"solving {name} …")
         )
 
     def stop(self) -> None:
