@@ -135,8 +135,9 @@ def routes(scene: str, folder: Path, out: Path) -> None:
 
 
 def serve(scene: str, host: str, port: int, token: str, folder: Path, out: Path, show: bool) -> None:
-    """Serve until Ctrl-C."""
+    """Serve until Ctrl-C. token : required of browsers; if empty, a random one unless the host is a loopback address"""
     hosts = LOOPBACK if host in LOOPBACK else ("*",)
+    token = token or ("" if host in LOOPBACK else secrets.token_urlsafe(16))
     app.add_middleware(Guard, hosts=hosts, token=token)
     routes(scene, folder, out)
     address = f"http://{host}:{port}/" + (f"?token={token}" if token else "")
@@ -151,7 +152,3 @@ def serve(scene: str, host: str, port: int, token: str, folder: Path, out: Path,
         uvicorn_logging_level="critical",
         storage_secret=None,
     )
-
-
-def new_token() -> str:
-    return secrets.token_urlsafe(16)

@@ -56,7 +56,6 @@ class FrameHub:
         self.earlier = {"clients": 0, "sent": 0, "dropped": 0}
 
     def connect(self) -> Client:
-        """Register a client."""
         with self.changed:
             self.clients.append(Client())
             return self.clients[-1]
@@ -131,7 +130,6 @@ class Handler(BaseHTTPRequestHandler):
     do_HEAD = do_GET  # the same without a body
 
     def respond(self, data: bytes, content_type: str, header: dict[str, Any] | None = None) -> None:
-        """Send a complete response."""
         self.send_response(200)
         self.send_header("Content-Type", content_type)
         self.send_header("Content-Length", str(len(data)))

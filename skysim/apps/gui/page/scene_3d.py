@@ -47,7 +47,6 @@ class Scene3D:
             self.scene.props(f"fps={self.fps}")
 
     def set_scene(self, scene_info: SceneInfo) -> None:
-        """Build the view of a new scene."""
         self.geometry = geometry = scene_info.geometry
         self.scene.clear()
         with self.scene:
@@ -72,7 +71,6 @@ class Scene3D:
                 self.scene.point_cloud(points, [list(DIM_RGB)] * len(points), POINT_M[n])
 
     def draw_vehicle(self, geometry: LabGeometry) -> None:
-        """Draw the vehicle and the edges of the camera's field of view."""
         for kind, size, position, wxyz, rgb in geometry.shapes:
             rotation = Rotation.from_quat(wxyz, scalar_first=True)
             if kind == "box":
@@ -104,7 +102,6 @@ class Scene3D:
         self.highlighted.set_points(points, [list(HIGHLIGHT_RGB)] * len(points))
 
     def positions(self, ids: Collection[int]) -> list[list[float]]:
-        """Positions of the lights with these ids."""
         assert self.geometry is not None
         pairs = zip(self.geometry.ids, self.geometry.lights_m, strict=True)
         return [list(place) for id, place in pairs if id in ids]

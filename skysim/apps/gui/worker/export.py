@@ -82,7 +82,6 @@ def scene_yaml(base: str, overrides: dict[str, str], title: str = "") -> str:
 
 
 def zip_archive(contents: dict[str, bytes]) -> bytes:
-    """Pack all files into a ZIP archive."""
     buffer = BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, data in contents.items():

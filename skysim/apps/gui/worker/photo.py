@@ -24,13 +24,13 @@ from skysim.apps.gui.worker.workbench import (
 )
 from skysim.core import images
 from skysim.core.errors import InputError
-from skysim.core.images import LiveCamera
 from skysim.experiments.study import loader, store
 from skysim.experiments.study.execution import replay
 from skysim.experiments.study.execution.setups import prepared_setup
 from skysim.experiments.study.execution.trials import run_trial
 from skysim.experiments.study.store import STORE
 from skysim.results import scoring, stretch
+from skysim.simulation.run import FrameResult
 
 SUFFIXES = (".fits", ".fit", ".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
 
@@ -73,11 +73,6 @@ def photo_from_file(name: str, data: bytes, fov_deg: float | None, stages: dict[
     return solve_photo(image, fov_deg, stages, date_utc)
 
 
-def photo_from_camera(camera: LiveCamera, fov_deg: float | None, stages: dict[str, str]) -> PhotoPixels:
-    """Solve the next frame of a live camera. Raises InputError."""
-    return solve_photo(images.monochrome(camera.frame()), fov_deg, stages, None)
-
-
 def photo_from_trial(study: str, folder: Path, trial: int) -> PhotoPixels:
     """Repeat a study's trial: its first frame with the tracker's solution."""
     plan = loader.load(study)
@@ -86,7 +81,7 @@ def photo_from_trial(study: str, folder: Path, trial: int) -> PhotoPixels:
     row = run_trial(plan.spec, segment, trial, segment.replicates[0])
     setup = prepared_setup(plan.spec, segment.settings)
     frame, truth, report = next(replay.replayed_frames(setup, row.seed))
-    result = tracker_result(setup.testbed, setup.estimator, report, truth)
+    result = tracker_result(setup.testbed, setup.estimator, FrameResult(frame, truth, report, {}))
     if row.error:
         result = TrackerResult(row.error.strip().splitlines()[-1], result.detections, result.ms)
     scene, (height, width) = setup.testbed.scene, frame.image_dn.shape

@@ -71,7 +71,6 @@ class MonteCarloPanel:
         self.list_reports()
 
     def set_scene(self) -> None:
-        """Take over a new scene."""
         options = {"": f"Monte Carlo of {Path(self.tab.scene).stem}"}
         options |= {path.stem: f"{path.stem}: {plan.title_of(path)}" for path in sorted(STUDIES.glob("*.yaml"))}
         self.study_select.set_options(options, value=self.study_select.value or "")
@@ -83,13 +82,11 @@ class MonteCarloPanel:
         self.fields.set_visibility(not self.study_select.value)
 
     async def set_field_of_view(self) -> None:
-        """Change the field of view, by the focal length."""
         scene_info = self.tab.scene_info
         if scene_info and self.field.value:
             await self.tab.set_field_of_view(float(self.field.value))
 
     async def start_or_stop(self) -> None:
-        """Handle the button: start a study or stop the running one."""
         if self.process.running:
             self.process.stop()
             self.stopped = True
@@ -151,7 +148,6 @@ class MonteCarloPanel:
         return folder / "monte_carlo.yaml"
 
     def show_end(self, fault: str) -> None:
-        """Display the final result of a study, or its error."""
         self.button.set_text("Start")
         results = self.process.results()
         if results:
@@ -175,7 +171,6 @@ class MonteCarloPanel:
                 self.note.set_text(f"{results.done} of {self.process.total} trials")
 
     def show(self, results: StudyResults) -> None:
-        """Display statistics, histogram and failed trials."""
         self.bar.set_value(results.done / max(self.process.total, 1))
         self.chart.options["xAxis"]["data"] = [format_number(center) for center in results.bins]
         self.chart.options["series"][0]["data"] = list(results.counts)
@@ -213,7 +208,6 @@ class MonteCarloPanel:
             self.tab.log(f"replayed trial {number}: {photo.result.status}")
 
     def list_reports(self) -> None:
-        """List the reports of finished studies."""
         self.reports.clear()
         with self.reports:
             folders = finished(self.tab.out)
@@ -234,7 +228,6 @@ def report_title(folder: Path) -> str:
 
 
 def format_interval(value: float, low: float, high: float) -> str:
-    """Format a value with its interval."""
     if math.isnan(value):
         return "       –"
     text = f"{value:8.4g}"

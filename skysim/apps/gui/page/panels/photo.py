@@ -42,7 +42,6 @@ class PhotoPanel:
         self.result_text.mark("facts")
 
     async def uploaded(self, event: Any) -> None:
-        """Solve an uploaded file."""
         data = await event.file.read()
         name = str(event.file.name)
         self.upload.reset()
@@ -83,7 +82,6 @@ class PhotoPanel:
         self.button.enable()
 
     def show(self, name: str, photo: Photo | None) -> None:
-        """Display the image with its marks, and the solution."""
         if photo is None:
             self.show_text(
                 self.tab.message_text if self.tab.message_text.startswith(name) else f"{name}: {self.tab.message_text}",
@@ -105,6 +103,5 @@ class PhotoPanel:
         self.show_text(f"{status_text}\n{pointing}\n{quality}", "good")
 
     def show_text(self, text: str, color: str) -> None:
-        """Set the result text."""
         self.result_text.set_text(text)
         self.result_text.classes(remove="quiet good warn", add=color)

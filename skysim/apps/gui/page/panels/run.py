@@ -116,7 +116,6 @@ class RunPanel:
         self.start()
 
     def start(self) -> None:
-        """Start or continue playback."""
         self.tab.photo.stop()
         self.playing, self.started_s = True, time.monotonic()
         self.play.props("icon=pause")
@@ -131,7 +130,6 @@ class RunPanel:
         self.start()
 
     def pause(self) -> None:
-        """Pause at the current time."""
         self.from_s, self.playing = self.now_s, False
         self.play.props("icon=play_arrow")
 
@@ -148,7 +146,6 @@ class RunPanel:
         self.factor = SPEEDS[str(self.speed.value)]
 
     async def seek_to(self, event: Any) -> None:
-        """Jump to the slider's time."""
         if not self.log.t_s:
             return
         self.from_s, self.started_s = float(event.args), time.monotonic()
@@ -183,7 +180,6 @@ class RunPanel:
             self.busy = False
 
     def append_frame(self, view: FrameView) -> None:
-        """Append a frame's values to the curves."""
         result = view.result
         error_arcsec = math.hypot(result.cross_arcsec, result.roll_arcsec) if result and result.solved else math.nan
         for name, value in (

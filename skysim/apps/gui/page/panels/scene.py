@@ -57,7 +57,6 @@ class ScenePanel:
         self.filter()
 
     def build(self, fields_by_key: Mapping[str, forms.Field]) -> None:
-        """Rebuild all fields."""
         open_now = {name for name, expansion in self.expansions.items() if expansion.value}
         self.sections.clear()
         for elements in (self.expansions, self.last_typed, self.rows, self.labels, self.inputs):
@@ -72,7 +71,6 @@ class ScenePanel:
                             self.row(field)
 
     def row(self, field: forms.Field) -> None:
-        """Build the row of one key."""
         key_in_section = field.key.removeprefix(f"{field.section}.")
         with ui.row().classes("w-full no-wrap items-start gap-2") as box:
             head = ui.label(key_in_section).classes("mono w-48 flex-none ellipsis").style("padding-top: 6px")
@@ -149,7 +147,6 @@ class ScenePanel:
             first.open()
 
     async def save(self) -> None:
-        """Save the scene as a new file in the tab's folder."""
         name = (self.name.value or "").strip()
         title_before = self.tab.scene_info.title.removesuffix(", changed") if self.tab.scene_info else ""
         title = f"{title_before}, changed" if title_before else name
