@@ -30,6 +30,8 @@ from skysim.apps.cli.options import (
 from skysim.apps.cli.terminal import (
     eager_first,
     print_error,
+    print_json,
+    print_list,
     print_rows,
     print_scores,
     print_summary,
@@ -60,7 +62,6 @@ def run(
     json: Json = False,
 ) -> None:
     """Simulate a scene: motion, frames, attitude solutions and their scores."""
-    from skysim.core.files import to_json
     from skysim.results import scoring
     from skysim.results.run import Recorder, score_frames
     from skysim.simulation import checks
@@ -86,7 +87,7 @@ def run(
     views = write_3d_views(testbed, recorder.folder) if scene_3d else []
     statistics = recorder.finish(shlex.join(["skysim", *sys.argv[1:]]), views)
     if json:
-        print(to_json({"scene": loaded.name, **statistics, "rows": [asdict(row) for row in recorder.rows]}))
+        print_json({"scene": loaded.name, **statistics, "rows": [asdict(row) for row in recorder.rows]})
     else:
         print_rows(recorder.rows, scoring.angle_names(loaded), statistics["exposures_ms"])
         print_summary(statistics)
@@ -104,7 +105,6 @@ def render(
     json: Json = False,
 ) -> None:
     """Simulate a scene and write its frames with their truth, without solving them."""
-    from skysim.core import files
     from skysim.results.run import Recorder
     from skysim.simulation import run as simulation
 
@@ -117,7 +117,10 @@ def render(
         str(recorder.write(frame, truth, preview))
         for frame, truth, _ in progress(rendered, loaded.exposure.frames, loaded.title)
     ]
-    print(files.to_json(paths) if json else f"{len(paths)} frames with their truth in {recorder.folder}")
+    if json:
+        print_json(paths)
+    else:
+        print(f"{len(paths)} frames with their truth in {recorder.folder}")
 
 
 def compare(
@@ -131,7 +134,6 @@ def compare(
     json: Json = False,
 ) -> None:
     """Let trackers solve the same frames and compare their scores. With a filter, the first one closes the loop."""
-    from skysim.core import files
     from skysim.experiments import tracker_comparison
     from skysim.results.run import Recorder
     from skysim.simulation import run as simulation
@@ -152,14 +154,13 @@ def compare(
             rows[name].append(row)
     lines = tracker_comparison.write_scores(recorder.folder, rows, loaded)
     if json:
-        print(files.to_json({"scene": loaded.name, "scoreboard": tracker_comparison.as_dicts(lines)}))
+        print_json({"scene": loaded.name, "scoreboard": tracker_comparison.as_dicts(lines)})
     else:
         print_scores(lines, recorder.folder)
 
 
 def trackers(json: Json = False) -> None:
     """List the available trackers, and what each still needs to be installed."""
-    from skysim.core import files
     from skysim.tracking.external import interface
 
     entries = [{"name": interface.OWN, "from": "skysim", "needs": ""}]
@@ -167,9 +168,9 @@ def trackers(json: Json = False) -> None:
         {"name": name, "from": point.value, "needs": interface.missing_extra(point)}
         for name, point in interface.entry_points().items()
     ]
-    if json:
-        print(files.to_json(entries))
-        return
-    for entry in entries:
+
+    def line(entry: dict[str, str]) -> str:
         needs = f"  needs {entry['needs']}" if entry["needs"] else ""
-        print(f"{entry['name']:20s} {entry['from']}{needs}")
+        return f"{entry['name']:20s} {entry['from']}{needs}"
+
+    print_list(entries, json, line)

@@ -22,7 +22,7 @@ from skysim.apps.cli.options import (
     output_folder,
     selected_stages,
 )
-from skysim.apps.cli.terminal import print_error, print_solutions, print_survey, progress, progress_callback
+from skysim.apps.cli.terminal import print_error, print_json, print_solutions, print_survey, progress, progress_callback
 from skysim.core.errors import InputError
 
 
@@ -77,7 +77,7 @@ def solve(
     warnings = [warning for result in results if (warning := result.pop("warning"))]
     files.write_text(out / "solutions.json", files.to_json(results))
     if json:
-        print(files.to_json(results))
+        print_json(results)
     else:
         print_solutions(results, out)
     for message in warnings + errors:
@@ -132,4 +132,7 @@ def survey(
     )
     statistics = dome_survey_report.survey_statistics(result, prior, testbed, uncertainty) | errors
     statistics |= {"scene": testbed.scene.name, "frames": frames, "map": str(path), "picture": str(figure)}
-    print(files.to_json(statistics)) if json else print_survey(statistics)
+    if json:
+        print_json(statistics)
+    else:
+        print_survey(statistics)

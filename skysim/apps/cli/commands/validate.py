@@ -8,7 +8,7 @@ from typing import Annotated, NamedTuple
 import typer
 
 from skysim.apps.cli.options import Json
-from skysim.apps.cli.terminal import print_error
+from skysim.apps.cli.terminal import print_error, print_json
 from skysim.core.errors import InputError
 
 KINDS = ("scene", "study")
@@ -38,18 +38,17 @@ def validate(
 ) -> None:
     """Check files: keys, units, consistency, and whether a scene can be set up. Exit code 2 if one is invalid."""
     from skysim.apps.cli.commands import json_schema
-    from skysim.core import files as file_io
 
     if schema is not None:
         if schema not in KINDS:
             raise InputError(f"--schema {schema}: allowed: {', '.join(KINDS)}")
-        print(file_io.to_json(json_schema.json_schema(schema)))
+        print_json(json_schema.json_schema(schema))
         return
     if not files:
         raise InputError("no files; give files, or --schema scene")
     verdicts = [check_file(path) for path in files]
     if json:
-        print(file_io.to_json([verdict._asdict() for verdict in verdicts]))
+        print_json([verdict._asdict() for verdict in verdicts])
     for verdict in verdicts if not json else []:
         if verdict.fault:
             print_error(verdict.fault)
