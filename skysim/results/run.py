@@ -71,7 +71,7 @@ class ScoredFrame:
 
     def annotated(self) -> NDArray[np.uint8]:
         """(H, W, 3) stretched frame in BGR: truth in blue, detections in red, identified sources in green."""
-        return scoring.annotated(self.result)
+        return scoring.annotated(self.result.frame, self.truth, self.result.report)
 
     def __repr__(self) -> str:
         identified = f"{self.row.matched} of {self.row.detected} detections identified"

@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from estimator.core.types import ra_dec_roll_rad
-from skysim.core.types import FrameRow, Mount
+from estimator.trackers.pipeline import Report
+from skysim.core.types import Frame, FrameRow, Mount, Truth
 from skysim.core.units import ARCSEC_RAD
 from skysim.results import metrics
 from skysim.results.report import annotate
@@ -99,8 +100,9 @@ def table(rows: list[FrameRow], names: tuple[str, str, str]) -> Any:
     return Table(columns)
 
 
-def annotated(result: FrameResult) -> NDArray[np.uint8]:
-    """The stretched frame with true sources, detections and identified detections marked."""
-    detected, match = result.report.centroids.xy_px, result.report.attitude.match
+def annotated(frame: Frame, truth: Truth, report: Report | None) -> NDArray[np.uint8]:
+    """The stretched frame with true sources and, if it was solved, detections and identified detections marked."""
+    detected = report.centroids.xy_px if report else np.empty((0, 2))
+    match = report.attitude.match if report else None
     matched = detected[match.observed] if match else np.empty((0, 2))
-    return annotate(result.frame.image_dn, detected, matched, truth_px=result.truth.sources.xy_px)
+    return annotate(frame.image_dn, detected, matched, truth_px=truth.sources.xy_px)

@@ -127,22 +127,19 @@ def sources_parquet(run: Recording, path: Path, bar: Bar) -> Path:
     import pyarrow
     import pyarrow.parquet
 
-    with files.atomic_file(path) as temporary:
-        writer, batch = None, []
-        try:
-            for truth in truths(run, bar):
-                truth.sources.add_column(np.full(len(truth.sources), truth.frame), name="frame", index=0)
-                batch.append(to_arrow(truth.sources, run))
-                writer = writer or pyarrow.parquet.ParquetWriter(temporary, batch[0].schema)
-                if sum(len(table) for table in batch) >= BATCH_ROWS:
-                    writer.write_table(pyarrow.concat_tables(batch))
-                    batch = []
-            assert writer is not None
-            if batch:
+    def frame_table(truth: FrameTruth) -> Any:
+        truth.sources.add_column(np.full(len(truth.sources), truth.frame), name="frame", index=0)
+        return to_arrow(truth.sources, run)
+
+    tables = map(frame_table, truths(run, bar))
+    batch = [next(tables)]
+    with files.atomic_file(path) as temporary, pyarrow.parquet.ParquetWriter(temporary, batch[0].schema) as writer:
+        for table in tables:
+            if sum(len(part) for part in batch) >= BATCH_ROWS:
                 writer.write_table(pyarrow.concat_tables(batch))
-        finally:
-            if writer is not None:
-                writer.close()
+                batch = []
+            batch.append(table)
+        writer.write_table(pyarrow.concat_tables(batch))
     return path
 
 
@@ -274,7 +271,7 @@ def count_frames(film: Path) -> int:
 
 
 def check_disk_space(path: Path) -> None:
-    """Append MORE_BYTES to a file, more than a video index needs, to raise the OSError that OpenCV did not report.
+    """Append PROBE_BYTES to a file, more than a video index needs, to raise the OSError that OpenCV did not report.
 
     A full disk then raises "no space left on device" rather than an unexplained failure of OpenCV.
     """

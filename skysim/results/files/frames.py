@@ -93,14 +93,10 @@ def write_truth(path: Path, frame: Frame, truth: Truth, scene: Scene) -> None:
             "y_px": sources.xy_px[:, 1],
             "flux_x_px": sources.flux_xy_px[:, 0],
             "flux_y_px": sources.flux_xy_px[:, 1],
-            "electrons": sources.electrons,
-            "peak_e": sources.peak_e,
-            "streak_px": sources.streak_px,
-            "area_px": sources.area_px,
-            "snr": sources.snr,
-            "saturated": sources.saturated,
         }
     )
+    for name in ("electrons", "peak_e", "streak_px", "area_px", "snr", "saturated"):
+        table[name] = getattr(sources, name)
     for name in table.colnames[1:-1]:
         table[name].info.format = ".9g"
     table.meta = {
