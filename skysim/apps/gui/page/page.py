@@ -115,9 +115,8 @@ class Tab:
         )
 
     def build_panels(self) -> None:
-        with ui.element("div").style(
-            "display: grid; grid-template: 34px minmax(0, 1fr) / minmax(0, 1fr); min-height: 0"
-        ):
+        grid = "display: grid; grid-template: 34px minmax(0, 1fr) / minmax(0, 1fr); min-height: 0"
+        with ui.element("div").style(grid):
             with ui.tabs().props("dense align=left no-caps indicator-color=primary") as self.tabs:
                 # Otherwise the arrow keys would select tabs.
                 self.tabs.on("click", js_handler=keys.BLUR_JS)
@@ -147,10 +146,8 @@ class Tab:
             )
             with ui.element("div").style("display: grid; grid-template-columns: 110px 1fr; gap: 4px 12px"):
                 for key in keys.KEYS:
-                    ui.html(
-                        f'<span class="lab-keys" style="padding: 0; border: 0"><kbd>{key.label}</kbd></span>',
-                        sanitize=False,
-                    )
+                    label = f'<span class="lab-keys" style="padding: 0; border: 0"><kbd>{key.label}</kbd></span>'
+                    ui.html(label, sanitize=False)
                     ui.label(key.help)
         return dialog
 
@@ -165,9 +162,8 @@ class Tab:
         self.stop_playback()
         before = self.scene, self.overrides
         self.scene, self.overrides = scene, dict(overrides or {})
-        activity = (
-            f"setting up {Path(scene).name} …" if self.view else ""
-        )  # at first the sensor view shows this message
+        # At first the sensor view shows this message.
+        activity = f"setting up {Path(scene).name} …" if self.view else ""
         result = await self.run_task("open", self.scene_path, self.overrides, self.solving, activity=activity)
         if result is None:
             self.scene, self.overrides = before

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 import math
 import tempfile
 from dataclasses import dataclass
@@ -57,7 +58,7 @@ class Photo:
 PhotoPixels = tuple[Photo, NDArray]  # with the image's pixels
 
 
-def photo_from_file(name: str, data: bytes, fov_deg: float | None, stages: dict[str, str]) -> PhotoPixels:
+def photo_from_file(name: str, data: bytes, fov_deg: float | None) -> PhotoPixels:
     """Solve an uploaded file. Raises InputError if it is no readable image."""
     suffix = Path(name).suffix.lower()
     if suffix not in SUFFIXES:
@@ -70,7 +71,7 @@ def photo_from_file(name: str, data: bytes, fov_deg: float | None, stages: dict[
             date_utc, _ = plate_solver.validated_date(images.read_date_obs(path))
         except InputError as error:
             raise InputError(str(error).replace(str(path), Path(name).name)) from None
-    return solve_photo(image, fov_deg, stages, date_utc)
+    return solve_photo(image, fov_deg, date_utc)
 
 
 def photo_from_trial(study: str, folder: Path, trial: int) -> PhotoPixels:
@@ -98,10 +99,10 @@ def photo_from_trial(study: str, folder: Path, trial: int) -> PhotoPixels:
     return photo, frame.image_dn
 
 
-def solve_photo(image: NDArray, fov_deg: float | None, stages: dict[str, str], date_utc: Any) -> PhotoPixels:
+def solve_photo(image: NDArray, fov_deg: float | None, date_utc: datetime.datetime | None) -> PhotoPixels:
     """Solve an image; the result's status says why if there is no solution. date_utc : None if unknown."""
     check_size(image)
-    solver = plate_solver.make_solver(fov_deg, None, stages=stages)
+    solver = plate_solver.make_solver(fov_deg, None)
     report, tracker = plate_solver.solve_array(image, solver, date_utc)
     attitude = report.attitude
     detections = detection_views(report, matches_by_row(tracker, attitude, report.centroids.xy_px))

@@ -18,15 +18,15 @@ from skysim.experiments.study import store
 from skysim.experiments.study.store import STORE
 from skysim.results import metrics
 
-RESPONSES = (
-    "identified",
-    "wrong",
-    "refused",
-    "cross_arcsec_rms",
-    "roll_arcsec_rms",
-    "angle_arcsec_mean",
-    "time_ms_median",
-)
+RESPONSES = {  # label on the page by response
+    "identified": "identified",
+    "wrong": "wrong",
+    "refused": "refused",
+    "cross_arcsec_rms": "cross rms, ″",
+    "roll_arcsec_rms": "roll rms, ″",
+    "angle_arcsec_mean": "angle mean, ″",
+    "time_ms_median": "ms per trial",
+}
 BINS = 28
 MAX_FAILED = 20  # maximum number of failed trials in the results
 

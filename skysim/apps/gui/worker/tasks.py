@@ -121,15 +121,14 @@ class Worker:
     def export(self) -> dict[str, bytes]:
         return export.frame_files(self.workbench, self.scene, dict(self.overrides or {}))
 
-    def solve_file(self, name: str, data: bytes, fov_deg: float | None, stages: dict[str, str]) -> photo.Photo:
-        return self.show_photo(photo.photo_from_file(name, data, fov_deg, stages))
+    def solve_file(self, name: str, data: bytes, fov_deg: float | None) -> photo.Photo:
+        return self.show_photo(photo.photo_from_file(name, data, fov_deg))
 
-    def solve_camera(self, source: str, fov_deg: float | None, stages: dict[str, str]) -> photo.Photo:
+    def solve_camera(self, source: str, fov_deg: float | None) -> photo.Photo:
         """Solve the next frame of a live camera, which stays open."""
         if self.camera is None:
             self.camera = images.LiveCamera(source)
-        image = images.monochrome(self.camera.frame())
-        return self.show_photo(photo.solve_photo(image, fov_deg, stages, None))
+        return self.show_photo(photo.solve_photo(images.monochrome(self.camera.frame()), fov_deg, None))
 
     def release(self) -> None:
         """Close the live camera."""

@@ -12,7 +12,7 @@ from nicegui import run, ui
 
 from skysim.apps.gui.page import keys
 from skysim.apps.gui.page.style import COLORS, TOOLTIP, format_number
-from skysim.apps.gui.worker.study_process import StudyProcess, StudyResults, finished, monte_carlo
+from skysim.apps.gui.worker.study_process import RESPONSES, StudyProcess, StudyResults, finished, monte_carlo
 from skysim.core import files
 from skysim.core.errors import InputError
 from skysim.experiments.study import loader, plan
@@ -22,15 +22,6 @@ if TYPE_CHECKING:
     from skysim.apps.gui.page.page import Tab
 
 POLL_S = 0.5
-RESPONSE_LABELS = {
-    "identified": "identified",
-    "wrong": "wrong",
-    "refused": "refused",
-    "cross_arcsec_rms": "cross rms, ″",
-    "roll_arcsec_rms": "roll rms, ″",
-    "angle_arcsec_mean": "angle mean, ″",
-    "time_ms_median": "ms per trial",
-}
 TRIAL_KINDS = {"centroids": "centroids", "frames": "rendered frames"}
 
 
@@ -45,13 +36,11 @@ class MonteCarloPanel:
             self.study_select = ui.select({}, value=None).props('dense outlined options-dense aria-label="Study"')
             self.study_select.classes("flex-grow").mark("study").on_value_change(self.study_chosen)
             self.study_select.on("popup-hide", js_handler=keys.BLUR_JS)
-            self.button = (
-                ui.button("Start", on_click=self.start_or_stop).props("dense outline size=sm").mark("monte-carlo")
-            )
+            self.button = ui.button("Start", on_click=self.start_or_stop).props("dense outline size=sm")
+            self.button.mark("monte-carlo")
         with ui.element("div").classes("lab-trial") as self.fields:
-            self.count = (
-                ui.number("runs, F8", value=200, min=1, max=100_000, precision=0).props("dense outlined").mark("runs")
-            )
+            self.count = ui.number("runs, F8", value=200, min=1, max=100_000, precision=0).props("dense outlined")
+            self.count.mark("runs")
             self.kind = ui.select(TRIAL_KINDS, value="centroids", label="of").props("dense outlined options-dense")
             self.kind.on("popup-hide", js_handler=keys.BLUR_JS)
             self.noise = ui.number("noise, px", value=0.1, min=0, max=10, step=0.05).props("dense outlined")
@@ -134,13 +123,9 @@ class MonteCarloPanel:
             raise InputError("runs: allowed: 1 to 100000")
         settings = self.tab.scene_path, self.tab.overrides, trial, int(self.count.value)
         # A stopped run with unchanged settings is resumed from its own file.
-        stopped_study = self.process.folder / "monte_carlo.yaml"
-        if (
-            self.stopped
-            and stopped_study.is_file()
-            and stopped_study.read_text() == monte_carlo(*settings, self.run_number)
-        ):
-            return stopped_study
+        before = self.process.folder / "monte_carlo.yaml"
+        if self.stopped and before.is_file() and before.read_text() == monte_carlo(*settings, self.run_number):
+            return before
         self.run_number += 1
         text = monte_carlo(*settings, self.run_number)
         folder = files.make_folder(self.tab.out / f"monte_carlo_{self.tab.id}_{self.run_number}")
@@ -179,9 +164,7 @@ class MonteCarloPanel:
         self.table.clear()
         with self.table:
             ui.label(f"{'':16s}{'value':>8s}   95 % interval").classes("mono quiet")
-            lines = [
-                f"{RESPONSE_LABELS[name]:16s}{format_interval(*value)}" for name, value in results.statistics.items()
-            ]
+            lines = [f"{RESPONSES[name]:16s}{format_interval(*value)}" for name, value in results.statistics.items()]
             ui.label("\n".join(lines)).classes("mono")
         if results.failed == self.failed:
             return

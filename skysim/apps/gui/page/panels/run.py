@@ -40,9 +40,8 @@ class RunPanel:
         self.frame_curves: dict[str, list[list[float]]] = {}
         self.dragging, self.closed_scene, self.closed_overrides = False, "", dict[str, str]()
         with ui.row().classes("w-full no-wrap items-center gap-2"):
-            self.simulate_button = (
-                ui.button("Simulate", on_click=self.simulate).props("dense outline size=sm").mark("fly")
-            )
+            self.simulate_button = ui.button("Simulate", on_click=self.simulate).props("dense outline size=sm")
+            self.simulate_button.mark("fly")
             self.play = ui.button(icon="play_arrow", on_click=self.toggle).props('dense flat aria-label="Play"')
             self.play.mark("play").disable()
             self.speed = ui.select(list(SPEEDS), value="real time").props('dense borderless aria-label="Speed"')
@@ -79,15 +78,12 @@ class RunPanel:
         current, feedback = self.tab.feedback or "", str(self.loop.value or "")
         if self.closed_scene != self.tab.scene or feedback == current:
             return
-        other_overrides = {key: value for key, value in self.tab.overrides.items() if not key.startswith(CONTROL_KEYS)}
-        control_overrides = {key: value for key, value in self.closed_overrides.items() if key.startswith(CONTROL_KEYS)}
-        control = loop_overrides(self.tab.scene_path, {**other_overrides, **control_overrides}, feedback)
-        maneuver_key = CONTROL_KEYS[1]
-        maneuver_overrides = {
-            key: value for key, value in control_overrides.items() if key.startswith(maneuver_key) and feedback
-        }
+        others = {key: value for key, value in self.tab.overrides.items() if not key.startswith(CONTROL_KEYS)}
+        controls = {key: value for key, value in self.closed_overrides.items() if key.startswith(CONTROL_KEYS)}
+        maneuver = {key: value for key, value in controls.items() if feedback and key.startswith("motion.maneuver")}
+        control = loop_overrides(self.tab.scene_path, others | controls, feedback)
         self.loop.disable()  # no second change while this one runs
-        await self.tab.open(self.tab.scene, {**other_overrides, **maneuver_overrides, **control})
+        await self.tab.open(self.tab.scene, others | maneuver | control)
         if self.tab.is_open:
             self.loop.set_value(self.tab.feedback or "")  # the old value, if the scene refused the change
             self.loop.enable()

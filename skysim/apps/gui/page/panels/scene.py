@@ -25,10 +25,8 @@ class ScenePanel:
     def __init__(self, tab: Tab) -> None:
         self.tab = tab
         with ui.row().classes("w-full no-wrap items-center gap-2").style("margin-bottom: 8px"):
-            self.find = ui.input(placeholder="find a key", on_change=lambda: self.search()).props(
-                "dense outlined clearable"
-            )
-            self.find.classes("flex-grow").mark("find-key")
+            self.find = ui.input(placeholder="find a key", on_change=lambda: self.search())
+            self.find.props("dense outlined clearable").classes("flex-grow").mark("find-key")
             self.name = ui.input(placeholder="new-name").props('dense outlined aria-label="Name of the new scene"')
             self.name.classes("w-36").mark("save-name")
             ui.button("Save as", on_click=self.save).props("dense outline no-wrap size=sm").mark("save")
@@ -83,10 +81,8 @@ class ScenePanel:
                 entry = ui.input(value=field.text).props(f'dense outlined suffix="{field.unit}"')
                 leave = partial(self.edit, field.key)
                 entry.on("keydown.enter", leave).on("blur", leave)
-            entry.classes("flex-grow").style("width: 0; margin-bottom: 3px").props(
-                f'hide-bottom-space aria-label="{field.key}"'
-            )
-            entry.mark(f"key-{field.key}")
+            entry.classes("flex-grow").style("width: 0; margin-bottom: 3px").mark(f"key-{field.key}")
+            entry.props(f'hide-bottom-space aria-label="{field.key}"')
         self.rows[field.key], self.inputs[field.key], self.labels[field.key] = box, entry, head
 
     def style_class(self, field: forms.Field) -> str:

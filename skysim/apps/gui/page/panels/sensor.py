@@ -157,10 +157,8 @@ class Sensor:
 
     def update_text(self) -> None:
         """Show data on what is under the mouse, or else the frame's numbers."""
-        if self.mouse_px is None:
-            self.hover.set_text(self.statistics)
-            return
-        self.hover.set_text(self.pixel_text(*self.mouse_px, *self.nearest(*self.mouse_px)))
+        at = self.mouse_px
+        self.hover.set_text(self.pixel_text(*at, *self.nearest(*at)) if at else self.statistics)
 
     def update_marks(self) -> None:
         """Send the frame's address and its marks to the canvas."""
@@ -234,13 +232,8 @@ def statistics_text(
     scene_info: SceneInfo | None = None,
 ) -> str:
     """A frame's numbers in two columns; fewer for an image that is not of the scene (view is None)."""
-    rows = [
-        (
-            "frame",
-            f"{size_px[0]} × {size_px[1]} px",
-            *(("field", f"{scene_info.field_deg:.4g}°") if scene_info else ("", "")),
-        )
-    ]
+    field = ("field", f"{scene_info.field_deg:.4g}°") if scene_info else ("", "")
+    rows = [("frame", f"{size_px[0]} × {size_px[1]} px", *field)]
     if view:
         rows += [("exposure", f"{1e3 * view.exposure_s:.4g} ms", "rendering", f"{view.ms:.0f} ms")]
     rows += [
