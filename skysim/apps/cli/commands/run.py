@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from skysim.apps.cli import terminal
 from skysim.apps.cli.options import (
     LOADED,
     TRACKER_HELP,
@@ -26,18 +27,6 @@ from skysim.apps.cli.options import (
     load,
     output_folder,
     selected_stages,
-)
-from skysim.apps.cli.terminal import (
-    eager_first,
-    print_error,
-    print_json,
-    print_list,
-    print_rows,
-    print_scores,
-    print_summary,
-    progress,
-    progress_callback,
-    write_3d_views,
 )
 
 if TYPE_CHECKING:
@@ -76,21 +65,21 @@ def run(
     loaded = load(scene, frames, seed, [*(set_ or []), *(f"tracker.{key}={name}" for key, name in stages.items())])
     testbed = build_testbed(loaded, process.program_commands(program))
     for warning in checks.warnings(loaded, testbed.sources, testbed.mount):
-        print_error(warning)
+        terminal.print_error(warning)
     with on_two_processes(*LOADED[-1]):
-        with progress_callback("simulating the motion") as update:
+        with terminal.progress_callback("simulating the motion") as update:
             testbed = simulate_motion(testbed, update)
-        scored = eager_first(score_frames(testbed))
+        scored = terminal.eager_first(score_frames(testbed))
     recorder = Recorder(output_folder(out, loaded.name), testbed)
-    for frame in progress(scored, loaded.exposure.frames, loaded.title):
+    for frame in terminal.progress(scored, loaded.exposure.frames, loaded.title):
         recorder.add(frame)
-    views = write_3d_views(testbed, recorder.folder) if scene_3d else []
+    views = terminal.write_3d_views(testbed, recorder.folder) if scene_3d else []
     statistics = recorder.finish(shlex.join(["skysim", *sys.argv[1:]]), views)
     if json:
-        print_json({"scene": loaded.name, **statistics, "rows": [asdict(row) for row in recorder.rows]})
+        terminal.print_json({"scene": loaded.name, **statistics, "rows": [asdict(row) for row in recorder.rows]})
     else:
-        print_rows(recorder.rows, scoring.angle_names(loaded), statistics["exposures_ms"])
-        print_summary(statistics)
+        terminal.print_rows(recorder.rows, scoring.angle_names(loaded), statistics["exposures_ms"])
+        terminal.print_summary(statistics)
 
 
 def render(
@@ -109,16 +98,16 @@ def render(
     from skysim.simulation import run as simulation
 
     loaded = load(scene, frames, seed, set_)
-    with progress_callback("simulating the motion") as update:
+    with terminal.progress_callback("simulating the motion") as update:
         testbed = simulation.prepare(loaded, update)
-    rendered = eager_first(simulation.render_frames(testbed))
+    rendered = terminal.eager_first(simulation.render_frames(testbed))
     recorder = Recorder(output_folder(out, loaded.name), testbed)
     paths = [
         str(recorder.write(frame, truth, preview))
-        for frame, truth, _ in progress(rendered, loaded.exposure.frames, loaded.title)
+        for frame, truth, _ in terminal.progress(rendered, loaded.exposure.frames, loaded.title)
     ]
     if json:
-        print_json(paths)
+        terminal.print_json(paths)
     else:
         print(f"{len(paths)} frames with their truth in {recorder.folder}")
 
@@ -143,20 +132,20 @@ def compare(
     loaded = load(scene, frames, seed, [*(set_ or []), f"tracker.name={tracker[0]}"])
     testbed = build_testbed(loaded, process.program_commands(program))
     entrants = tracker_comparison.build_trackers(testbed, tracker)
-    with progress_callback("simulating the motion", quiet=json) as update:
+    with terminal.progress_callback("simulating the motion", quiet=json) as update:
         testbed = simulation.simulate_motion(testbed, update)
-    solved = eager_first(tracker_comparison.compare_frames(testbed, entrants))
+    solved = terminal.eager_first(tracker_comparison.compare_frames(testbed, entrants))
     recorder = Recorder(output_folder(out, loaded.name), testbed)
     rows: dict[str, list[FrameRow]] = {name: [] for name in entrants}
-    for frame, truth, row_by_tracker in progress(solved, loaded.exposure.frames, loaded.title, quiet=json):
+    for frame, truth, row_by_tracker in terminal.progress(solved, loaded.exposure.frames, loaded.title, quiet=json):
         recorder.write(frame, truth)
         for name, row in row_by_tracker.items():
             rows[name].append(row)
     lines = tracker_comparison.write_scores(recorder.folder, rows, loaded)
     if json:
-        print_json({"scene": loaded.name, "scoreboard": tracker_comparison.as_dicts(lines)})
+        terminal.print_json({"scene": loaded.name, "scoreboard": tracker_comparison.as_dicts(lines)})
     else:
-        print_scores(lines, recorder.folder)
+        terminal.print_scores(lines, recorder.folder)
 
 
 def trackers(json: Json = False) -> None:
@@ -173,4 +162,4 @@ def trackers(json: Json = False) -> None:
         needs = f"  needs {entry['needs']}" if entry["needs"] else ""
         return f"{entry['name']:20s} {entry['from']}{needs}"
 
-    print_list(entries, json, line)
+    terminal.print_list(entries, json, line)

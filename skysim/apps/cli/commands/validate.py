@@ -79,7 +79,11 @@ def describe_file(path: Path) -> tuple[str, tuple[str, ...]]:
     if path.suffix == ".ecsv":
         return describe_table(path), ()
     if path.suffix == ".xml":
-        return describe_vehicle(path), ()
+        from skysim.dynamics import multibody
+        from skysim.scene.vehicle import VehicleConfig
+
+        model = multibody.build(VehicleConfig.model_validate({"model": str(path.resolve())}))
+        return f"a vehicle of {model.mass.mass_kg:g} kg", ()
     if opencv_calibration.looks_like_calibration(path):
         lens = opencv_calibration.read(path)
         return f"a calibration of {lens.width_px} x {lens.height_px} pixels", ()
@@ -106,15 +110,6 @@ def find_shipped(path: Path) -> Path:
         return plan.find(str(path))
     except InputError:
         return loader.find(str(path))
-
-
-def describe_vehicle(path: Path) -> str:
-    """Build the multibody model of an MJCF file and describe it."""
-    from skysim.dynamics import multibody
-    from skysim.scene.vehicle import VehicleConfig
-
-    model = multibody.build(VehicleConfig.model_validate({"model": str(path.resolve())}))
-    return f"a vehicle of {model.mass.mass_kg:g} kg"
 
 
 def check_scene(path: Path) -> tuple[str, tuple[str, ...]]:
