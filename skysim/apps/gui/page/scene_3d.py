@@ -55,8 +55,7 @@ class Scene3D:
             self.highlighted = self.scene.point_cloud([], [], 1.6 * POINT_M[-1])
             with self.scene.group() as self.vehicle:
                 self.draw_vehicle(geometry)
-        distance = 1.25 if not scene_info.under_stars else 2.2
-        target_z = 0.0 if scene_info.under_stars else 0.5
+        distance, target_z = (2.2, 0.0) if scene_info.under_stars else (1.25, 0.5)
         self.scene.move_camera(distance, -distance, 0.7 * distance, 0, 0, target_z, duration=0)
 
     def draw_lights(self, geometry: LabGeometry) -> None:

@@ -220,29 +220,15 @@ def format_interval(value: float, low: float, high: float) -> str:
 def options() -> dict[str, Any]:
     """ECharts options of the histogram of the error angle."""
     text = {"color": COLORS["quiet"], "fontSize": 10}
+    title = {"text": "no trials yet", "left": "center", "top": "middle"}
+    axis = {"axisLabel": text, "nameTextStyle": text}
+    x_name = {"name": "error angle, ″", "nameLocation": "middle", "nameGap": 24}
     return {
         "animation": False,
-        "title": {
-            **{"text": "no trials yet", "left": "center", "top": "middle"},
-            "textStyle": text | {"fontWeight": "normal", "fontSize": 11},
-        },
+        "title": title | {"textStyle": text | {"fontWeight": "normal", "fontSize": 11}},
         "grid": {"left": 42, "right": 10, "top": 22, "bottom": 36},
-        "xAxis": {
-            "type": "category",
-            "data": [],
-            "axisLabel": text,
-            "name": "error angle, ″",
-            "nameLocation": "middle",
-            "nameGap": 24,
-            "nameTextStyle": text,
-        },
-        "yAxis": {
-            "type": "value",
-            "axisLabel": text,
-            "splitLine": {"lineStyle": {"color": COLORS["line"]}},
-            "name": "trials",
-            "nameTextStyle": text,
-        },
+        "xAxis": axis | x_name | {"type": "category", "data": []},
+        "yAxis": axis | {"name": "trials", "type": "value", "splitLine": {"lineStyle": {"color": COLORS["line"]}}},
         "tooltip": TOOLTIP,
         "series": [{"type": "bar", "data": [], "barCategoryGap": "8%", "itemStyle": {"color": COLORS["accent"]}}],
     }

@@ -238,61 +238,42 @@ def curve_points(log: MotionLog, name: str) -> list[list[float]]:
 def line_series(name: str, chart_index: int, points: list[list[float]], color: str) -> dict[str, Any]:
     """ECharts series of a curve in one strip; values that exist per frame are drawn as dots."""
     dots = name in ("star tracker", "innovation")
-    return {
-        **{"name": name, "type": "scatter" if dots else "line", "data": points, "xAxisIndex": chart_index},
-        **{"yAxisIndex": chart_index, "showSymbol": dots, "symbolSize": 4, "animation": False},
-        **{"lineStyle": {"width": 1.4, "color": color}, "itemStyle": {"color": color}},
-    }
+    series = {"name": name, "type": "scatter" if dots else "line", "data": points, "animation": False}
+    look = {"lineStyle": {"width": 1.4, "color": color}, "itemStyle": {"color": color}}
+    return series | look | {"showSymbol": dots, "symbolSize": 4} | in_strip(chart_index)
 
 
 def time_marker(chart_index: int, now_s: float) -> dict[str, Any]:
     """ECharts series of a vertical line in a strip at a time."""
     line_style = {"color": COLORS["quiet"], "width": 1, "type": "solid"}
-    mark = {
-        **{"silent": True, "symbol": "none", "animation": False, "label": {"show": False}},
-        **{"lineStyle": line_style, "data": [{"xAxis": now_s}]},
-    }
-    return {
-        **{"type": "line", "data": [], "xAxisIndex": chart_index, "yAxisIndex": chart_index},
-        **{"animation": False, "markLine": mark},
-    }
+    mark = {"silent": True, "symbol": "none", "animation": False, "label": {"show": False}, "lineStyle": line_style}
+    series = {"type": "line", "data": [], "animation": False, "markLine": mark | {"data": [{"xAxis": now_s}]}}
+    return series | in_strip(chart_index)
+
+
+def in_strip(chart_index: int) -> dict[str, int]:
+    return {"xAxisIndex": chart_index, "yAxisIndex": chart_index}
 
 
 def options() -> dict[str, Any]:
     """ECharts options of four stacked strips with a common time axis; each has a title, a legend and an empty text."""
     text, rule = {"color": COLORS["quiet"], "fontSize": 10}, {"lineStyle": {"color": COLORS["line"]}}
-    title_style = text | {"fontWeight": "normal", "fontSize": 11}
-    last, slot = len(CHARTS) - 1, 24.2  # percent of the chart's height
-    tops = [1 + n * slot for n in range(last + 1)]
+    title = {"padding": 0, "textStyle": text | {"fontWeight": "normal", "fontSize": 11}}
+    strips, slot = range(len(CHARTS)), 24.2  # percent of the chart's height
+    tops = [1 + n * slot for n in strips]
+    x_axis = {"type": "value", "min": 0, "splitLine": {"show": False}}
+    y_axis = {"splitNumber": 3, "axisLabel": text, "splitLine": rule}
     legend = {"textStyle": text, "itemWidth": 12, "itemHeight": 6, "itemGap": 8, "right": 10, "padding": 0}
     return {
         "animation": False,
         "title": [
-            *(
-                {"text": name, "left": 0, "top": f"{top}%", "padding": 0, "textStyle": title_style}
-                for name, top in zip(CHARTS, tops, strict=True)
-            ),
-            *(
-                {"text": "", "left": "center", "top": f"{top + 11}%", "padding": 0, "textStyle": title_style}
-                for top in tops
-            ),
+            *(title | {"text": name, "left": 0, "top": f"{top}%"} for name, top in zip(CHARTS, tops, strict=True)),
+            *(title | {"text": "", "left": "center", "top": f"{top + 11}%"} for top in tops),
         ],
         "legend": [legend | {"top": f"{top}%", "data": []} for top in tops],
         "tooltip": TOOLTIP,
         "grid": [{"left": 50, "right": 12, "top": f"{top + 5.4}%", "height": "16.4%"} for top in tops],
-        "xAxis": [
-            {
-                **{"type": "value", "gridIndex": n, "min": 0, "splitLine": {"show": False}},
-                "axisLabel": {**text, "show": n == last},
-            }
-            for n in range(last + 1)
-        ],
-        "yAxis": [
-            {
-                **{"type": "log" if n in LOGARITHMIC else "value", "gridIndex": n, "splitNumber": 3},
-                **{"axisLabel": text, "splitLine": rule},
-            }
-            for n in range(last + 1)
-        ],
+        "xAxis": [x_axis | {"gridIndex": n, "axisLabel": text | {"show": n == strips[-1]}} for n in strips],
+        "yAxis": [y_axis | {"gridIndex": n, "type": "log" if n in LOGARITHMIC else "value"} for n in strips],
         "series": [],
     }
