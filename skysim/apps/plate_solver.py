@@ -165,22 +165,20 @@ def make_solver(
     for stage, name in (stages or {}).items():
         if name not in STAGES[stage]:
             raise InputError(f"--{stage}: {unknown_name(stage, name, STAGES[stage])}")
-    opencv_calibration = (
-        opencv.read(camera_file) if camera_file and opencv.looks_like_calibration(camera_file) else None
-    )
-    camera = None
-    if camera_file and not opencv_calibration:
+    camera = lens = None
+    settings = Settings()
+    if camera_file and opencv.looks_like_calibration(camera_file):
+        lens = opencv.read(camera_file)
+    elif camera_file:
         is_file = camera_file.suffix or camera_file.exists()  # else the name of a shipped scene
         camera = loader.load_camera(camera_file if is_file else loader.find(str(camera_file)))
-    settings = Settings()
-    if camera:
         settings = Settings(gain_e_dn=camera.detector.gain_e_dn, saturation=saturation_dn(camera.detector))
     settings = replace(settings, **(stages or {}))  # type: ignore[arg-type]
     try:
         stars = star_catalog.read(CATALOG)
     except ImageError as error:
         raise InputError(f"{error}; make it with: skysim catalog build") from None
-    return Solver(fov_deg, camera, stars, settings, time_utc, opencv_calibration)
+    return Solver(fov_deg, camera, stars, settings, time_utc, lens)
 
 
 def validated_date(date_utc: datetime.datetime | None) -> tuple[datetime.datetime | None, str]:

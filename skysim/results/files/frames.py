@@ -28,11 +28,10 @@ ZARR = "frames.zarr"
 
 def remove_results(folder: Path) -> None:
     """Remove the files of an earlier run: its frames, solutions, reports, and the files of `skysim export`."""
-    for suffix in ("fits", "png", "ecsv", "tif"):
-        for path in folder.glob(f"frame_[0-9][0-9][0-9][0-9]*.{suffix}"):
+    frames = [f"frame_[0-9][0-9][0-9][0-9]*.{suffix}" for suffix in ("fits", "png", "ecsv", "tif")]
+    for pattern in (*frames, "solutions.*.ecsv"):
+        for path in folder.glob(pattern):
             path.unlink()
-    for path in folder.glob("solutions.*.ecsv"):
-        path.unlink()
     for name in RESULT_FILES + EXPORT_FILES:
         (folder / name).unlink(missing_ok=True)
     shutil.rmtree(folder / ZARR, ignore_errors=True)
