@@ -83,7 +83,7 @@ class FrameHub:
             self.changed.notify_all()
 
     def finish(self) -> None:
-        """End the stream; wait up to GRACE_S for the clients to take the last packet."""
+        """End the stream; wait up to FINISH_TIMEOUT_S for the clients to take the last packet."""
         with self.changed:
             self.ended = True
             self.changed.notify_all()
