@@ -22,6 +22,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from estimator.attitude.solvers import SOLVERS
 from estimator.catalog import catalog as star_catalog
@@ -47,6 +48,7 @@ from skysim.tracking.onboard_model import calibration
 # Relative uncertainty of the focal length. An OpenCV chessboard calibration gives it to about 0.1 %.
 CALIBRATED_UNCERTAINTY = 0.003
 FOV_UNCERTAINTY = 0.055  # 5 % that --fov allows, plus 0.5 % for the definition of the field of view
+CATALOG = CATALOGS / "hipparcos_hp6.5.ecsv"
 DEFAULT_EPOCH = datetime.datetime(2020, 1, 1, 12)
 
 
@@ -146,7 +148,6 @@ class Solver:
 def make_solver(
     fov_deg: float | None,
     camera_file: Path | None,
-    catalog: str = "hipparcos_hp6.5",
     time_utc: datetime.datetime | None = None,
     stages: Mapping[str, str] | None = None,
 ) -> Solver:
@@ -161,23 +162,23 @@ def make_solver(
     time_utc, warning = validated_date(time_utc)
     if warning:
         raise InputError(f"--time: {warning}")
-    algorithms = {stage: require_algorithm(stage, name) for stage, name in (stages or {}).items()}
-    opencv_calibration = (
-        opencv.read(camera_file) if camera_file and opencv.looks_like_calibration(camera_file) else None
-    )
-    camera = None
-    if camera_file and not opencv_calibration:
+    for stage, name in (stages or {}).items():
+        if name not in STAGES[stage]:
+            raise InputError(f"--{stage}: {unknown_name(stage, name, STAGES[stage])}")
+    camera = lens = None
+    settings = Settings()
+    if camera_file and opencv.looks_like_calibration(camera_file):
+        lens = opencv.read(camera_file)
+    elif camera_file:
         is_file = camera_file.suffix or camera_file.exists()  # else the name of a shipped scene
         camera = loader.load_camera(camera_file if is_file else loader.find(str(camera_file)))
-    settings = Settings()
-    if camera:
         settings = Settings(gain_e_dn=camera.detector.gain_e_dn, saturation=saturation_dn(camera.detector))
-    settings = replace(settings, **algorithms)  # type: ignore[arg-type]
+    settings = replace(settings, **(stages or {}))  # type: ignore[arg-type]
     try:
-        stars = star_catalog.read(CATALOGS / f"{catalog}.ecsv")
+        stars = star_catalog.read(CATALOG)
     except ImageError as error:
         raise InputError(f"{error}; make it with: skysim catalog build") from None
-    return Solver(fov_deg, camera, stars, settings, time_utc, opencv_calibration)
+    return Solver(fov_deg, camera, stars, settings, time_utc, lens)
 
 
 def validated_date(date_utc: datetime.datetime | None) -> tuple[datetime.datetime | None, str]:
@@ -186,13 +187,6 @@ def validated_date(date_utc: datetime.datetime | None) -> tuple[datetime.datetim
         return (scene.check_year(date_utc) if date_utc else None), ""
     except ValueError as error:
         return None, str(error)
-
-
-def require_algorithm(stage: str, name: str) -> str:
-    """Return the name if the stage has such an algorithm. Raises InputError with the allowed names."""
-    if name not in STAGES[stage]:
-        raise InputError(f"--{stage}: {unknown_name(stage, name, STAGES[stage])}")
-    return name
 
 
 @dataclass(frozen=True, slots=True)
@@ -353,14 +347,12 @@ def solution_fields(report: Report) -> dict[str, Any]:
     }
 
 
-def center_from_cam(camera: Camera) -> Any:
+def center_from_cam(camera: Camera) -> Rotation:
     """Rotation from the camera frame into a frame with z along the ray of the image center and y along image down.
 
     The principal point need not be the image center, so the camera's own boresight is not used. The down direction
     comes from the ray of the pixel one row below, made orthogonal to z.
     """
-    from scipy.spatial.transform import Rotation
-
     center = np.array([(camera.width_px - 1) / 2, (camera.height_px - 1) / 2])
     z, below = camera.rays(np.array([center, [center[0], center[1] + 1]]))
     x = np.cross(below - z, z)

@@ -54,9 +54,7 @@ def normalized_error_squared(
 Columns = Mapping[str, NDArray[Any]]
 CONFIDENCE = 0.95
 RESAMPLES = 999
-OVERCONFIDENCE_PROBABILITY = (
-    1e-8  # probability with which a correct covariance allows an error counted as overconfident
-)
+OVERCONFIDENCE_PROBABILITY = 1e-8  # with which a correct covariance allows an error counted as overconfident
 DEFAULT_COVERAGE = 5  # "5 stars everywhere" (Padro 2012)
 
 

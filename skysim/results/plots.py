@@ -23,11 +23,16 @@ def png(draw: Callable[[Any], None], size_in: tuple[float, float]) -> bytes:
     import matplotlib
     from matplotlib.figure import Figure as Canvas
 
-    buffer = std_io.BytesIO()
     with matplotlib.rc_context(LOOK):
         fig = Canvas(figsize=size_in, layout="constrained")
         draw(fig)
-        fig.savefig(buffer, format="png", dpi=DPI, metadata={"Software": None})
+        return figure_png(fig, dpi=DPI, metadata={"Software": None})
+
+
+def figure_png(fig: Any, **options: Any) -> bytes:
+    """PNG bytes of a figure. options : of `savefig`"""
+    buffer = std_io.BytesIO()
+    fig.savefig(buffer, format="png", **options)
     return buffer.getvalue()
 
 
@@ -55,10 +60,3 @@ def stacked_axes(heights_in: Sequence[float]) -> tuple[Any, list[Any]]:
         axes.grid(alpha=0.3)
     stack[-1].set_xlabel("time [s]")
     return fig, stack
-
-
-def stack_png(fig: Any) -> bytes:
-    """PNG bytes of a figure of `stacked_axes`."""
-    buffer = std_io.BytesIO()
-    fig.savefig(buffer, format="png", dpi=110)
-    return buffer.getvalue()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import base64
-from dataclasses import asdict, dataclass
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from skysim.core.files import write_text
 from skysim.core.types import Floats, FrameRow, SourceTruth
-from skysim.results import plots
+from skysim.results.plots import figure_png, stacked_axes
 from skysim.results.stretch import to_8bit
 
 TRUTH_BGR, DETECTED_BGR, MATCHED_BGR = (200, 160, 60), (80, 80, 235), (110, 220, 90)
@@ -119,8 +119,8 @@ def summary(rows: list[FrameRow]) -> dict[str, Any]:
     Errors are over solved frames, wrong ones included; NaN if no frame was solved.
     """
     solved = [row for row in rows if row.status == "solved"]
-    cross = np.array([row.cross_arcsec for row in solved]) if solved else np.array([np.nan])
-    roll = np.abs([row.roll_arcsec for row in solved]) if solved else np.array([np.nan])
+    cross = np.array([row.cross_arcsec for row in solved] or [np.nan])
+    roll = np.abs([row.roll_arcsec for row in solved] or [np.nan])
     return {
         "frames": len(rows),
         "solved": len(solved),
@@ -133,19 +133,6 @@ def summary(rows: list[FrameRow]) -> dict[str, Any]:
     }
 
 
-def as_dicts(rows: list[FrameRow]) -> list[dict[str, Any]]:
-    return [asdict(row) for row in rows]
-
-
-@dataclass(frozen=True, slots=True)
-class Images:
-    """Images of a page: annotated frame, telemetry plot (PNG bytes), image files of the laboratory (may be empty)."""
-
-    annotated: NDArray[np.uint8]
-    flight: bytes
-    scene_3d: list[Path]
-
-
 def write_page(
     path: Path,
     title: str,
@@ -153,11 +140,14 @@ def write_page(
     angles: tuple[str, str, str],
     rows: list[FrameRow],
     stages_ms: dict[str, float],
-    images: Images,
+    annotated: NDArray[np.uint8],
+    flight: bytes,
+    scene_3d: Sequence[Path],
 ) -> None:
     """Write one HTML file with its images embedded: statistics, plots, an annotated frame, the table, the command.
 
-    angles : names of the three angles of a row; stages_ms : median time by stage.
+    angles : names of the three angles of a row;  stages_ms : median time by stage
+    flight : telemetry plot, PNG;  scene_3d : image files of the laboratory
     """
     text = render_page(
         "run.html",
@@ -167,9 +157,9 @@ def write_page(
         rows=rows,
         summary=summary(rows),
         stages_ms=stages_ms,
-        picture=embed(cv2.imencode(".png", images.annotated)[1].tobytes()),
-        flight=embed(images.flight),
-        scene_3d=[embed(path.read_bytes(), path.suffix[1:]) for path in images.scene_3d],
+        picture=embed(cv2.imencode(".png", annotated)[1].tobytes()),
+        flight=embed(flight),
+        scene_3d=[embed(path.read_bytes(), path.suffix[1:]) for path in scene_3d],
         figure=embed(error_figure(rows)),
     )
     write_text(path, text)
@@ -190,7 +180,7 @@ def embed(image: bytes, kind: str = "png") -> str:
 
 def error_figure(rows: list[FrameRow]) -> bytes:
     """Errors, detected and matched sources, and rate against time, as PNG. Red lines mark unsolved frames."""
-    fig, (errors, stars, rate) = plots.stacked_axes([2.9, 1.45, 1.45])
+    fig, (errors, stars, rate) = stacked_axes([2.9, 1.45, 1.45])
     solved = [row for row in rows if row.status == "solved"]
     t = [row.t_s for row in solved]
     errors.semilogy(t, [max(row.cross_arcsec, 1e-6) for row in solved], ".-", label="cross-boresight")
@@ -208,4 +198,4 @@ def error_figure(rows: list[FrameRow]) -> bytes:
     stars.legend()
     rate.plot(t_all, [row.rate_deg_s for row in rows], color="tab:green")
     rate.set_ylabel("rate [deg/s]")
-    return plots.stack_png(fig)
+    return figure_png(fig, dpi=110)

@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import base64
 import html
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -21,7 +20,7 @@ from skysim.core.errors import InputError
 from skysim.core.files import make_folder, write_image, write_table
 from skysim.core.types import Frame, FrameRow, Telemetry, Truth
 from skysim.core.units import ARCSEC_RAD
-from skysim.results import report, scoring, telemetry_report
+from skysim.results import report, scoring, stretch, telemetry_report
 from skysim.results.files.frames import remove_results, write_frame
 from skysim.scene.scene import Scene
 from skysim.simulation import exposure
@@ -72,7 +71,7 @@ class ScoredFrame:
 
     def annotated(self) -> NDArray[np.uint8]:
         """(H, W, 3) stretched frame in BGR: truth in blue, detections in red, identified sources in green."""
-        return scoring.annotated(self.result)
+        return scoring.annotated(self.result.frame, self.truth, self.result.report)
 
     def __repr__(self) -> str:
         identified = f"{self.row.matched} of {self.row.detected} detections identified"
@@ -144,12 +143,15 @@ class Recorder:
     """Writes a run to a folder, frame by frame, so that a long run need not be kept in memory.
 
     Files of an earlier run in the folder are removed first.
+
+    seconds : of all frames, by stage;  shown : the last solved frame, or the first if none was solved
     """
 
     folder: Path
     testbed: Testbed
     rows: list[FrameRow] = field(default_factory=list)
-    accumulator: scoring.RunAccumulator = field(default_factory=scoring.RunAccumulator)
+    seconds: dict[str, list[float]] = field(default_factory=dict)
+    shown: ScoredFrame | None = None
 
     def __post_init__(self) -> None:
         make_folder(self.folder)
@@ -159,7 +161,10 @@ class Recorder:
         """Write one solved frame with its truth and add it to the tables."""
         self.write(frame.result.frame, frame.truth)
         self.rows.append(frame.row)
-        self.accumulator.add(frame.result)
+        for stage, seconds in (frame.result.seconds | frame.result.report.seconds).items():
+            self.seconds.setdefault(stage, []).append(seconds)
+        if self.shown is None or frame.attitude.solved:
+            self.shown = frame
 
     def write(self, frame: Frame, truth: Truth, preview: bool = False) -> Path:
         """Write one frame with its truth; return the path of its FITS file.
@@ -180,16 +185,19 @@ class Recorder:
         write_table(self.folder / "telemetry.ecsv", telemetry_report.table(log))
         if self.testbed.imu_samples:
             write_table(self.folder / "imu.ecsv", telemetry_report.imu_table(self.testbed.imu_samples))
-        annotated, page = self.accumulator.picture(), self.folder / "report.html"
+        assert self.shown is not None
+        annotated, page = self.shown.annotated(), self.folder / "report.html"
         write_image(self.folder / "annotated.png", annotated)
-        images = report.Images(annotated, telemetry_report.figure(log), list(pictures))
-        report.write_page(page, scene.title, command, names, self.rows, self.accumulator.median_ms(), images)
-        statistics = report.summary(self.rows) | {
-            "stages_ms": self.accumulator.median_ms(),
+        stages_ms = {stage: 1e3 * float(np.median(seconds)) for stage, seconds in self.seconds.items()}
+        flight = telemetry_report.figure(log)
+        report.write_page(page, scene.title, command, names, self.rows, stages_ms, annotated, flight, pictures)
+        return report.summary(self.rows) | {
+            "stages_ms": stages_ms,
             "report": str(page),
+            "flight": telemetry_report.summary(log),
+            "pictures": [str(path) for path in pictures],
+            "exposures_ms": [1e3 * row.exposure_s for row in self.rows],
         }
-        statistics |= {"flight": telemetry_report.summary(log), "pictures": [str(path) for path in pictures]}
-        return statistics | {"exposures_ms": [1e3 * row.exposure_s for row in self.rows]}
 
 
 def score_frames(testbed: Testbed) -> Iterator[ScoredFrame]:
@@ -235,8 +243,5 @@ def _with_own_image(frame: ScoredFrame) -> ScoredFrame:
 
 def _image_tag(image: NDArray[np.uint8]) -> str:
     """An HTML <img> element of an image, reduced to at most 800 pixels in width."""
-    height, width = image.shape[:2]
-    if width > 800:
-        image = cv2.resize(image, (800, round(height * 800 / width)), interpolation=cv2.INTER_AREA)
-    data = base64.b64encode(cv2.imencode(".jpg", image)[1].tobytes()).decode()
-    return f'<img src="data:image/jpeg;base64,{data}">'
+    data = cv2.imencode(".jpg", stretch.reduce_width(image, 800))[1].tobytes()
+    return f'<img src="{report.embed(data, "jpeg")}">'

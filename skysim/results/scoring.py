@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from estimator.core.types import ra_dec_roll_rad
-from skysim.core.types import FrameRow, Mount
+from estimator.trackers.pipeline import Report
+from skysim.core.types import Frame, FrameRow, Mount, Truth
 from skysim.core.units import ARCSEC_RAD
 from skysim.results import metrics
 from skysim.results.report import annotate
@@ -99,32 +100,9 @@ def table(rows: list[FrameRow], names: tuple[str, str, str]) -> Any:
     return Table(columns)
 
 
-class RunAccumulator:
-    """Accumulates, in addition to a run's rows, the seconds by stage and the last solved frame for the image."""
-
-    def __init__(self) -> None:
-        self._seconds: dict[str, list[float]] = {}
-        self._last: FrameResult | None = None
-
-    def add(self, result: FrameResult) -> None:
-        """Add the times of a frame, and keep the frame if it is solved or the first."""
-        for stage, seconds in (result.seconds | result.report.seconds).items():
-            self._seconds.setdefault(stage, []).append(seconds)
-        if self._last is None or result.report.attitude.solved:
-            self._last = result
-
-    def median_ms(self) -> dict[str, float]:
-        """Median milliseconds per frame, by stage."""
-        return {stage: 1e3 * float(np.median(seconds)) for stage, seconds in self._seconds.items()}
-
-    def picture(self) -> NDArray[np.uint8]:
-        """The last solved frame, annotated; the first frame if none was solved."""
-        assert self._last is not None
-        return annotated(self._last)
-
-
-def annotated(result: FrameResult) -> NDArray[np.uint8]:
-    """The stretched frame with true sources, detections and identified detections marked."""
-    detected, match = result.report.centroids.xy_px, result.report.attitude.match
+def annotated(frame: Frame, truth: Truth, report: Report | None) -> NDArray[np.uint8]:
+    """The stretched frame with true sources and, if it was solved, detections and identified detections marked."""
+    detected = report.centroids.xy_px if report else np.empty((0, 2))
+    match = report.attitude.match if report else None
     matched = detected[match.observed] if match else np.empty((0, 2))
-    return annotate(result.frame.image_dn, detected, matched, truth_px=result.truth.sources.xy_px)
+    return annotate(frame.image_dn, detected, matched, truth_px=truth.sources.xy_px)

@@ -68,13 +68,13 @@ def frame_statistics(image: NDArray, saturation_dn: float) -> FrameStatistics:
     return FrameStatistics(sky, float(background.std()), peak, saturated)
 
 
-def reduce_width(gray: NDArray[np.uint8], max_width_px: int) -> NDArray[np.uint8]:
+def reduce_width(image: NDArray[np.uint8], max_width_px: int) -> NDArray[np.uint8]:
     """The image reduced to at most `max_width_px` columns; area averaging, so that no star is skipped."""
-    height, width = gray.shape
+    height, width = image.shape[:2]
     if width <= max_width_px:
-        return gray
+        return image
     size = max_width_px, max(round(height * max_width_px / width), 1)
-    return np.asarray(cv2.resize(gray, size, interpolation=cv2.INTER_AREA), np.uint8)
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
 
 
 def jpeg(gray: NDArray[np.uint8]) -> bytes:

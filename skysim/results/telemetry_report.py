@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from skysim.core.types import Floats, Telemetry
 from skysim.core.units import RPM_RAD_S
 from skysim.dynamics.imu import Increments, tilt_rad
-from skysim.results import plots
+from skysim.results.plots import figure_png, stacked_axes
 
 AXES = ("x", "y", "z")
 EULER = ("roll", "pitch", "yaw")
@@ -194,16 +194,14 @@ def momentum_panel(log: Telemetry, axes: Any) -> None:
 
 def panels(log: Telemetry) -> list[Callable[[Telemetry, Any], None]]:
     """The panels for which the telemetry has data."""
-    has_momentum = bool(log.wheel_rad_s.size or log.gimbal_rad.size)
-    has_estimate = log.lab_from_imu is not None or log.lab_from_ref is not None
     available = {
         attitude_panel: True,
-        attitude_error_panel: has_estimate,
+        attitude_error_panel: log.lab_from_imu is not None or log.lab_from_ref is not None,
         bias_panel: log.lab_from_filter is not None,
         torque_panel: log.lab_from_ref is not None,
         wheels_panel: bool(log.wheel_rad_s.size),
         gimbals_panel: bool(log.gimbal_rad.size),
-        momentum_panel: has_momentum,
+        momentum_panel: bool(log.wheel_rad_s.size or log.gimbal_rad.size),
     }
     return [panel for panel, present in available.items() if present]
 
@@ -211,9 +209,9 @@ def panels(log: Telemetry) -> list[Callable[[Telemetry, Any], None]]:
 def figure(log: Telemetry) -> bytes:
     """Telemetry against time, as PNG."""
     shown = panels(log)
-    fig, stack = plots.stacked_axes([2.1] * len(shown))
+    fig, stack = stacked_axes([2.1] * len(shown))
     for panel, axes in zip(shown, stack, strict=True):
         panel(log, axes)
         if axes.get_legend_handles_labels()[0]:
             axes.legend(loc="upper right", ncols=4, fontsize="small")
-    return plots.stack_png(fig)
+    return figure_png(fig, dpi=110)

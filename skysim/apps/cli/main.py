@@ -24,20 +24,7 @@ from skysim.core import errors
 from skysim.core.errors import InputError
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
-for command in (
-    run,
-    render,
-    stream,
-    compare,
-    trackers,
-    solve,
-    survey,
-    camera,
-    reproduce,
-    gui,
-    validate,
-    export,
-):
+for command in (run, render, stream, compare, trackers, solve, survey, camera, reproduce, gui, validate, export):
     app.command()(command)
 app.add_typer(scenes_app, name="scenes")
 app.add_typer(catalog_app, name="catalog")
@@ -59,12 +46,7 @@ def version(requested: bool) -> None:
 def options(
     version: Annotated[
         bool,
-        typer.Option(
-            "--version",
-            callback=version,
-            is_eager=True,
-            help="Print the versions to state in a bug report.",
-        ),
+        typer.Option("--version", callback=version, is_eager=True, help="Print the versions to state in a bug report."),
     ] = False,
 ) -> None:
     """Simulate a star-tracker laboratory: motion, light sources, camera, attitude determination, scoring."""

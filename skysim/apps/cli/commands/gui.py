@@ -10,8 +10,6 @@ import typer
 from skysim.apps.cli.options import SceneArg
 from skysim.core.errors import InputError
 
-LOOPBACK = ("127.0.0.1", "localhost", "::1")
-
 
 def gui(
     scene: SceneArg = "shefex2",
@@ -20,8 +18,7 @@ def gui(
     ] = "127.0.0.1",
     port: Annotated[int, typer.Option(min=1, max=65535, help="Port to serve on.")] = 8080,
     token: Annotated[
-        str,
-        typer.Option(help="Access token that browsers must send; default: a random one if --host requires it."),
+        str, typer.Option(help="Access token that browsers must send; default: a random one if --host requires it.")
     ] = "",
     folder: Annotated[Path, typer.Option(help="Folder in which new scenes are saved.")] = Path("."),
     out: Annotated[Path, typer.Option(help="Folder of studies and their reports.")] = Path("out"),
@@ -37,5 +34,4 @@ def gui(
         from skysim.apps.gui import server
     except ModuleNotFoundError as error:
         raise InputError(f"skysim gui needs {error.name}: pip install 'skysim[gui]'") from None
-    required = token or (server.new_token() if host not in LOOPBACK else "")
-    server.serve(scene, host, port, required, folder.resolve(), out.resolve(), show)
+    server.serve(scene, host, port, token, folder.resolve(), out.resolve(), show)

@@ -8,13 +8,12 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from skysim.apps.cli.options import Json
-from skysim.apps.cli.terminal import colored, print_table, progress_callback
+from skysim.apps.cli.terminal import colored, print_json, print_list, print_table, progress_callback
 
 if TYPE_CHECKING:
     from rich.text import Text
 
     from skysim.experiments.papers.compare import Reproduction
-    from skysim.experiments.papers.page import CommandArguments
 
 VERDICT_COLORS = {"agrees": "green", "explained": "yellow", "disagrees": "bold red"}
 
@@ -34,11 +33,15 @@ def reproduce(
     json: Json = False,
 ) -> None:
     """Repeat the experiments of papers and compare the published numbers with ours."""
-    from skysim.core import files
-
     if not ids:
-        print_list(json)
+        from skysim.experiments.papers.published import experiments
+
+        listed = [
+            {"id": id, "title": published.title, "source": published.source} for id, published in experiments().items()
+        ]
+        print_list(listed, json, lambda entry: f"{entry['id']:20s} {entry['title']}")
         return
+    from skysim.core import files
     from skysim.experiments.papers import page
     from skysim.experiments.papers.compare import ExperimentOptions
     from skysim.experiments.papers.registry import check_ids
@@ -50,50 +53,21 @@ def reproduce(
             reproductions.append(reproduce_one(id, ExperimentOptions(quick, seed, watch)))
         if not json:
             print_reproduction(reproductions[-1])
-    command_options = page.CommandArguments(tuple(ids), quick, seed)
-    written = write_pages(reproductions, command_options, out if report else None, markdown)
-    if json:
-        print(files.to_json([line.as_dict() for result in reproductions for line in result.comparisons]))
-        return
-    print_verdict_counts(reproductions)
-    for path in written:
-        print(path)
-
-
-def write_pages(
-    reproductions: list[Reproduction],
-    command_options: CommandArguments,
-    out: Path | None,
-    markdown: Path | None,
-) -> list[Path]:
-    """Write the requested pages (HTML in folder `out`, Markdown to a file) and return their paths."""
-    from skysim.core import files
-    from skysim.experiments.papers import page
-
-    written = []
-    if out:
+    arguments = page.CommandArguments(tuple(ids), quick, seed)
+    written: list[Path] = []
+    if report:
         written.append(files.make_folder(out) / "report.html")
-        page.write_html(written[-1], reproductions, command_options)
+        page.write_html(written[-1], reproductions, arguments)
     if markdown:
         files.make_folder(markdown.parent)
         written.append(markdown)
-        page.write_markdown(markdown, reproductions, command_options)
-    return written
-
-
-def print_list(json: bool) -> None:
-    """Print the identifiers and titles of all experiments."""
-    from skysim.core import files
-    from skysim.experiments.papers.published import experiments
-
-    entries = [
-        {"id": id, "title": published.title, "source": published.source} for id, published in experiments().items()
-    ]
+        page.write_markdown(markdown, reproductions, arguments)
     if json:
-        print(files.to_json(entries))
+        print_json([line.as_dict() for result in reproductions for line in result.comparisons])
         return
-    for entry in entries:
-        print(f"{entry['id']:20s} {entry['title']}")
+    print(", ".join(f"{count} {kind}" for kind, count in page.total_counts(reproductions).items()))
+    for path in written:
+        print(path)
 
 
 def print_reproduction(reproduction: Reproduction) -> None:
@@ -117,10 +91,3 @@ def print_reproduction(reproduction: Reproduction) -> None:
         if line.verdict != "agrees" or line.weakness:
             print(f"  {line.row.quantity}: {line.note or 'cause unknown'}")
     print()
-
-
-def print_verdict_counts(reproductions: list[Reproduction]) -> None:
-    """Print the number of rows with each verdict."""
-    from skysim.experiments.papers.page import total_counts
-
-    print(", ".join(f"{count} {kind}" for kind, count in total_counts(reproductions).items()))

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import shlex
 import sys
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from skysim.apps.cli import terminal
 from skysim.apps.cli.options import (
     LOADED,
     TRACKER_HELP,
@@ -25,16 +27,6 @@ from skysim.apps.cli.options import (
     load,
     output_folder,
     selected_stages,
-)
-from skysim.apps.cli.terminal import (
-    eager_first,
-    print_error,
-    print_rows,
-    print_scores,
-    print_summary,
-    progress,
-    progress_callback,
-    write_3d_views,
 )
 
 if TYPE_CHECKING:
@@ -54,15 +46,12 @@ def run(
     tracker: Annotated[str | None, typer.Option(metavar="NAME", help=TRACKER_HELP)] = None,
     program: Programs = None,
     scene_3d: Annotated[
-        bool,
-        typer.Option("--scene-3d", help="Write 3-D views of the laboratory: scene_3d.png and scene_3d.gif."),
+        bool, typer.Option("--scene-3d", help="Write 3-D views of the laboratory: scene_3d.png and scene_3d.gif.")
     ] = False,
     json: Json = False,
 ) -> None:
     """Simulate a scene: motion, frames, attitude solutions and their scores."""
-    from skysim.core.files import to_json
     from skysim.results import scoring
-    from skysim.results.report import as_dicts
     from skysim.results.run import Recorder, score_frames
     from skysim.simulation import checks
     from skysim.simulation.compilation import on_two_processes
@@ -76,21 +65,21 @@ def run(
     loaded = load(scene, frames, seed, [*(set_ or []), *(f"tracker.{key}={name}" for key, name in stages.items())])
     testbed = build_testbed(loaded, process.program_commands(program))
     for warning in checks.warnings(loaded, testbed.sources, testbed.mount):
-        print_error(warning)
+        terminal.print_error(warning)
     with on_two_processes(*LOADED[-1]):
-        with progress_callback("simulating the motion") as update:
+        with terminal.progress_callback("simulating the motion") as update:
             testbed = simulate_motion(testbed, update)
-        scored = eager_first(score_frames(testbed))
+        scored = terminal.eager_first(score_frames(testbed))
     recorder = Recorder(output_folder(out, loaded.name), testbed)
-    for frame in progress(scored, loaded.exposure.frames, loaded.title):
+    for frame in terminal.progress(scored, loaded.exposure.frames, loaded.title):
         recorder.add(frame)
-    views = write_3d_views(testbed, recorder.folder) if scene_3d else []
+    views = terminal.write_3d_views(testbed, recorder.folder) if scene_3d else []
     statistics = recorder.finish(shlex.join(["skysim", *sys.argv[1:]]), views)
     if json:
-        print(to_json({"scene": loaded.name, **statistics, "rows": as_dicts(recorder.rows)}))
+        terminal.print_json({"scene": loaded.name, **statistics, "rows": [asdict(row) for row in recorder.rows]})
     else:
-        print_rows(recorder.rows, scoring.angle_names(loaded), statistics["exposures_ms"])
-        print_summary(statistics)
+        terminal.print_rows(recorder.rows, scoring.angle_names(loaded), statistics["exposures_ms"])
+        terminal.print_summary(statistics)
 
 
 def render(
@@ -105,20 +94,22 @@ def render(
     json: Json = False,
 ) -> None:
     """Simulate a scene and write its frames with their truth, without solving them."""
-    from skysim.core import files
     from skysim.results.run import Recorder
     from skysim.simulation import run as simulation
 
     loaded = load(scene, frames, seed, set_)
-    with progress_callback("simulating the motion") as update:
+    with terminal.progress_callback("simulating the motion") as update:
         testbed = simulation.prepare(loaded, update)
-    rendered = eager_first(simulation.render_frames(testbed))
+    rendered = terminal.eager_first(simulation.render_frames(testbed))
     recorder = Recorder(output_folder(out, loaded.name), testbed)
     paths = [
         str(recorder.write(frame, truth, preview))
-        for frame, truth, _ in progress(rendered, loaded.exposure.frames, loaded.title)
+        for frame, truth, _ in terminal.progress(rendered, loaded.exposure.frames, loaded.title)
     ]
-    print(files.to_json(paths) if json else f"{len(paths)} frames with their truth in {recorder.folder}")
+    if json:
+        terminal.print_json(paths)
+    else:
+        print(f"{len(paths)} frames with their truth in {recorder.folder}")
 
 
 def compare(
@@ -132,7 +123,6 @@ def compare(
     json: Json = False,
 ) -> None:
     """Let trackers solve the same frames and compare their scores. With a filter, the first one closes the loop."""
-    from skysim.core import files
     from skysim.experiments import tracker_comparison
     from skysim.results.run import Recorder
     from skysim.simulation import run as simulation
@@ -142,25 +132,24 @@ def compare(
     loaded = load(scene, frames, seed, [*(set_ or []), f"tracker.name={tracker[0]}"])
     testbed = build_testbed(loaded, process.program_commands(program))
     entrants = tracker_comparison.build_trackers(testbed, tracker)
-    with progress_callback("simulating the motion", quiet=json) as update:
+    with terminal.progress_callback("simulating the motion", quiet=json) as update:
         testbed = simulation.simulate_motion(testbed, update)
-    solved = eager_first(tracker_comparison.compare_frames(testbed, entrants))
+    solved = terminal.eager_first(tracker_comparison.compare_frames(testbed, entrants))
     recorder = Recorder(output_folder(out, loaded.name), testbed)
     rows: dict[str, list[FrameRow]] = {name: [] for name in entrants}
-    for frame, truth, row_by_tracker in progress(solved, loaded.exposure.frames, loaded.title, quiet=json):
+    for frame, truth, row_by_tracker in terminal.progress(solved, loaded.exposure.frames, loaded.title, quiet=json):
         recorder.write(frame, truth)
         for name, row in row_by_tracker.items():
             rows[name].append(row)
     lines = tracker_comparison.write_scores(recorder.folder, rows, loaded)
     if json:
-        print(files.to_json({"scene": loaded.name, "scoreboard": tracker_comparison.as_dicts(lines)}))
+        terminal.print_json({"scene": loaded.name, "scoreboard": tracker_comparison.as_dicts(lines)})
     else:
-        print_scores(lines, recorder.folder)
+        terminal.print_scores(lines, recorder.folder)
 
 
 def trackers(json: Json = False) -> None:
     """List the available trackers, and what each still needs to be installed."""
-    from skysim.core import files
     from skysim.tracking.external import interface
 
     entries = [{"name": interface.OWN, "from": "skysim", "needs": ""}]
@@ -168,9 +157,9 @@ def trackers(json: Json = False) -> None:
         {"name": name, "from": point.value, "needs": interface.missing_extra(point)}
         for name, point in interface.entry_points().items()
     ]
-    if json:
-        print(files.to_json(entries))
-        return
-    for entry in entries:
+
+    def line(entry: dict[str, str]) -> str:
         needs = f"  needs {entry['needs']}" if entry["needs"] else ""
-        print(f"{entry['name']:20s} {entry['from']}{needs}")
+        return f"{entry['name']:20s} {entry['from']}{needs}"
+
+    terminal.print_list(entries, json, line)

@@ -22,7 +22,7 @@ from skysim.apps.cli.options import (
     output_folder,
     selected_stages,
 )
-from skysim.apps.cli.terminal import print_error, print_solutions, print_survey, progress, progress_callback
+from skysim.apps.cli.terminal import print_error, print_json, print_solutions, print_survey, progress, progress_callback
 from skysim.core.errors import InputError
 
 
@@ -31,8 +31,7 @@ def solve(
         list[Path] | None, typer.Argument(metavar="IMAGES", help="FITS, PNG, TIFF, JPEG or BMP files.")
     ] = None,
     fov: Annotated[
-        float | None,
-        typer.Option(help="Horizontal field of view in degrees, to 5 %; default: 5 to 40 are searched."),
+        float | None, typer.Option(help="Horizontal field of view in degrees, to 5 %; default: 5 to 40 are searched.")
     ] = None,
     camera: Annotated[
         Path | None,
@@ -41,12 +40,10 @@ def solve(
         ),
     ] = None,
     live: Annotated[
-        str | None,
-        typer.Option(help="Also solve a frame of a live camera: its index, a video file or an address."),
+        str | None, typer.Option(help="Also solve a frame of a live camera: its index, a video file or an address.")
     ] = None,
     time: Annotated[
-        str | None,
-        typer.Option(help="UTC at which the images were taken, 1900 to 2100, e.g. 2012-06-22T21:00:00."),
+        str | None, typer.Option(help="UTC at which the images were taken, 1900 to 2100, e.g. 2012-06-22T21:00:00.")
     ] = None,
     detector: Detector = None,
     centroider: Centroider = None,
@@ -80,7 +77,7 @@ def solve(
     warnings = [warning for result in results if (warning := result.pop("warning"))]
     files.write_text(out / "solutions.json", files.to_json(results))
     if json:
-        print(files.to_json(results))
+        print_json(results)
     else:
         print_solutions(results, out)
     for message in warnings + errors:
@@ -104,8 +101,7 @@ def survey(
     focal_error: Annotated[str, typer.Option(help="Error of the assumed focal length.")] = "1%",
     distortion: Annotated[bool, typer.Option("--distortion", help="Also fit the distortion k1, k2, p1, p2.")] = False,
     checks: Annotated[
-        int,
-        typer.Option(min=1, help="Number of further attitudes at which the tracker is tested before and after."),
+        int, typer.Option(min=1, help="Number of further attitudes at which the tracker is tested before and after.")
     ] = 40,
     json: Json = False,
 ) -> None:
@@ -136,4 +132,7 @@ def survey(
     )
     statistics = dome_survey_report.survey_statistics(result, prior, testbed, uncertainty) | errors
     statistics |= {"scene": testbed.scene.name, "frames": frames, "map": str(path), "picture": str(figure)}
-    print(files.to_json(statistics)) if json else print_survey(statistics)
+    if json:
+        print_json(statistics)
+    else:
+        print_survey(statistics)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import signal
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -17,7 +16,6 @@ from skysim.core.errors import InputError
 
 if TYPE_CHECKING:
     from skysim.apps.stream.http import FrameHub
-    from skysim.apps.stream.sinks import Sink
 
 
 def stream(
@@ -26,8 +24,7 @@ def stream(
         Path | None, typer.Option(help="Write frames to a folder: a 16-bit PNG and a JSON file per frame.")
     ] = None,
     http: Annotated[
-        int | None,
-        typer.Option(min=0, max=65535, help="Serve MJPEG and packets on this port; 0: any free port."),
+        int | None, typer.Option(min=0, max=65535, help="Serve MJPEG and packets on this port; 0: any free port.")
     ] = None,
     host: Annotated[str, typer.Option(help="Address to serve on, without access control.")] = "127.0.0.1",
     pipe: Annotated[
@@ -46,7 +43,7 @@ def stream(
     """Stream a scene's frames in real time, for hardware or a processor in the loop."""
     from skysim.apps.stream import sender
     from skysim.apps.stream.pacing import Pace
-    from skysim.apps.stream.sinks import READER_GONE
+    from skysim.apps.stream.sinks import READER_GONE, Sink, folder_writer, pipe_writer
     from skysim.core import files
     from skysim.simulation.testbed import build_testbed
 
@@ -55,16 +52,18 @@ def stream(
     if endless and frames is not None:
         raise InputError("skysim stream: give either --frames N or --endless")
     testbed = replace(build_testbed(load(scene, frames, seed, set_)), endless=endless)
-    sinks = open_sinks(folder, pipe)
+    sinks = []
+    if folder is not None:
+        sinks.append(Sink("folder", folder_writer(folder)))
+    if pipe is not None:
+        sinks.append(Sink("pipe", pipe_writer(pipe)))
     stats, pace = sender.SenderStats(), Pace(speed, testbed.scene.exposure.rate_hz)
     with serving(http, host, lambda: stats.statistics(sinks)) as hub:
-        before = signal.signal(signal.SIGTERM, signal.default_int_handler)
         try:
             sender.send(testbed, pace, sinks, stats, hub.publish if hub else None)
         except KeyboardInterrupt:
             print(file=sys.stderr)
         finally:
-            signal.signal(signal.SIGTERM, before)
             for sink in sinks:
                 sink.close()
     statistics = stats.statistics(sinks) | (hub.counters() if hub else {})
@@ -73,18 +72,6 @@ def stream(
     for sink in sinks:
         if sink.fault not in ("", READER_GONE):
             raise InputError(f"--{sink.name}: {sink.fault}")
-
-
-def open_sinks(folder: Path | None, pipe: str | None) -> list[Sink]:
-    """The sinks for --folder and --pipe. Raises InputError."""
-    from skysim.apps.stream import sinks
-
-    opened = []
-    if folder is not None:
-        opened.append(sinks.Sink("folder", sinks.folder_writer(folder)))
-    if pipe is not None:
-        opened.append(sinks.Sink("pipe", sinks.pipe_writer(pipe)))
-    return opened
 
 
 @contextmanager

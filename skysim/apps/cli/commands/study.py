@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shlex
-import signal
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, closing, contextmanager
 from pathlib import Path
@@ -12,14 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from skysim.apps.cli.options import Json, Out, Overrides, Programs, output_folder
-from skysim.apps.cli.study_summary import (
-    print_points,
-    print_replay,
-    print_study_status,
-    study_status,
-    trial_count,
-)
-from skysim.apps.cli.terminal import print_error, print_titles, trial_progress
+from skysim.apps.cli.study_summary import print_points, print_replay, print_study_status, study_status, trial_count
+from skysim.apps.cli.terminal import print_error, print_json, print_titles, trial_progress
 from skysim.core.errors import InputError, printable, unknown_name
 
 if TYPE_CHECKING:
@@ -42,14 +35,14 @@ def studies(context: typer.Context, json: Json = False) -> None:
     """List the studies that come with skysim."""
     if context.invoked_subcommand:
         return
-    from skysim.core import files
     from skysim.experiments.study import plan
 
-    print_titles(plan.STUDIES, plan.title_of, json, files.to_json)
+    print_titles(plan.STUDIES, plan.title_of, json)
 
 
-@app.command()
+@app.command(help="Run all trials of a study and write its report. After Ctrl-C, `resume` continues.")
 def run(
+    context: typer.Context,
     study: StudyArg,
     out: Out = None,
     workers: Workers = None,
@@ -59,8 +52,20 @@ def run(
     program: Programs = None,
     json: Json = False,
 ) -> None:
-    """Run all trials of a study and write its report. After Ctrl-C, `resume` continues."""
-    run_new(study, out, engine, workers, scheduler, set_, program, json, search=False)
+    """Run a study, or a search if called as `optimize`, that has no store yet."""
+    start_workers(engine)
+    from skysim.core.yaml_reader import parse_overrides
+    from skysim.experiments.study import loader
+    from skysim.tracking.external import process
+
+    overrides = parse_overrides(set_)
+    plan = loader.load(study, overrides, process.program_commands(program))
+    search = context.info_name == "optimize"
+    if search and plan.study.optimize is None:
+        raise InputError(f"{plan.path}: has no key optimize; allowed: skysim study run")
+    if not search and plan.study.optimize is not None:
+        raise InputError(f"{plan.path}: has the key optimize; allowed: skysim study optimize")
+    run_and_report(plan, study, out, create_engine(engine, workers, scheduler), overrides, json)
 
 
 @app.command()
@@ -84,14 +89,12 @@ def resume(
 @app.command()
 def status(study: StudyArg, out: Out = None, json: Json = False) -> None:
     """Show the progress of a study, while it runs or after."""
-    from skysim.core import files
-
     plan, _ = load_stored_plan(study, out)
     with open_store(study, out) as stored:
         progress = study_status(plan, stored)
         failures = [{"trial": trial, "error": error} for trial, error in stored.failures()[:10]]
     if json:
-        print(files.to_json(progress | {"failures": failures}))
+        print_json(progress | {"failures": failures})
         return
     print_study_status(progress)
     for failure in failures:
@@ -138,7 +141,6 @@ def replay(
     json: Json = False,
 ) -> None:
     """Repeat one trial and write its frames."""
-    from skysim.core import files
     from skysim.experiments.study.execution import replay as execution
 
     plan, _ = load_stored_plan(study, out, program or [])
@@ -157,53 +159,18 @@ def replay(
         "pictures": list(map(str, repeated.pictures)),
     }
     if json:
-        print(files.to_json(result))
+        print_json(result)
     else:
         print_replay(result)
     if show and repeated.pictures:
         typer.launch(str(repeated.pictures[0]))
 
 
-@app.command()
-def optimize(
-    study: StudyArg,
-    out: Out = None,
-    workers: Workers = None,
-    engine: EngineName = "pool",
-    scheduler: Scheduler = "",
-    set_: Overrides = None,
-    program: Programs = None,
-    json: Json = False,
-) -> None:
-    """Search a study's factors for the best point, or the Pareto front of two objectives. `resume` continues it."""
-    run_new(study, out, engine, workers, scheduler, set_, program, json, search=True)
-
-
-def run_new(
-    study: str,
-    out: Path | None,
-    engine: str,
-    workers: int | None,
-    scheduler: str,
-    set_: list[str] | None,
-    program: list[str] | None,
-    json: bool,
-    *,
-    search: bool,
-) -> None:
-    """Run a study, or a search if `search`, that has no store yet. Raises InputError if it is of the other kind."""
-    start_workers(engine)
-    from skysim.core.yaml_reader import parse_overrides
-    from skysim.experiments.study import loader
-    from skysim.tracking.external import process
-
-    overrides = parse_overrides(set_)
-    plan = loader.load(study, overrides, process.program_commands(program))
-    if search and plan.study.optimize is None:
-        raise InputError(f"{plan.path}: has no key optimize; allowed: skysim study run")
-    if not search and plan.study.optimize is not None:
-        raise InputError(f"{plan.path}: has the key optimize; allowed: skysim study optimize")
-    run_and_report(plan, study, out, create_engine(engine, workers, scheduler), overrides, json)
+# Registered last, so that it is the last in `skysim study --help`.
+SEARCH_HELP = (
+    "Search a study's factors for the best point, or the Pareto front of two objectives. `resume` continues it."
+)
+app.command("optimize", help=SEARCH_HELP)(run)
 
 
 def run_and_report(
@@ -248,19 +215,15 @@ def run_and_report(
 @contextmanager
 def interruptible(resume_command: str, stored: Store) -> Iterator[None]:
     """Within this context Ctrl-C and SIGTERM print the command that continues the run, and end it."""
-    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         yield
     except KeyboardInterrupt:
         print_error(f"{stored.counts()['done']} trials are stored; continue: {resume_command}")
         raise
-    finally:
-        signal.signal(signal.SIGTERM, before)
 
 
 def write_report(plan: Plan, study: str, out: Path | None, overrides: dict[str, str], json: bool) -> None:
     """Write the HTML report and print the table of results."""
-    from skysim.core import files
     from skysim.experiments.study.analysis import table
     from skysim.experiments.study.report import page
 
@@ -272,7 +235,7 @@ def write_report(plan: Plan, study: str, out: Path | None, overrides: dict[str, 
         lines = table.select_responses(lines, plan.study.responses)
         progress = study_status(plan, stored)
     if json:
-        print(files.to_json(progress | {"report": str(path), "points": table.to_columns(lines)}))
+        print_json(progress | {"report": str(path), "points": table.to_columns(lines)})
         return
     print_points(*table.cells(lines))
     print_study_status(progress)

@@ -8,7 +8,7 @@ from typing import Annotated, NamedTuple
 import typer
 
 from skysim.apps.cli.options import Json
-from skysim.apps.cli.terminal import print_error
+from skysim.apps.cli.terminal import print_error, print_json
 from skysim.core.errors import InputError
 
 KINDS = ("scene", "study")
@@ -38,18 +38,17 @@ def validate(
 ) -> None:
     """Check files: keys, units, consistency, and whether a scene can be set up. Exit code 2 if one is invalid."""
     from skysim.apps.cli.commands import json_schema
-    from skysim.core import files as file_io
 
     if schema is not None:
         if schema not in KINDS:
             raise InputError(f"--schema {schema}: allowed: {', '.join(KINDS)}")
-        print(file_io.to_json(json_schema.json_schema(schema)))
+        print_json(json_schema.json_schema(schema))
         return
     if not files:
         raise InputError("no files; give files, or --schema scene")
     verdicts = [check_file(path) for path in files]
     if json:
-        print(file_io.to_json([verdict._asdict() for verdict in verdicts]))
+        print_json([verdict._asdict() for verdict in verdicts])
     for verdict in verdicts if not json else []:
         if verdict.fault:
             print_error(verdict.fault)
@@ -80,7 +79,11 @@ def describe_file(path: Path) -> tuple[str, tuple[str, ...]]:
     if path.suffix == ".ecsv":
         return describe_table(path), ()
     if path.suffix == ".xml":
-        return describe_vehicle(path), ()
+        from skysim.dynamics import multibody
+        from skysim.scene.vehicle import VehicleConfig
+
+        model = multibody.build(VehicleConfig.model_validate({"model": str(path.resolve())}))
+        return f"a vehicle of {model.mass.mass_kg:g} kg", ()
     if opencv_calibration.looks_like_calibration(path):
         lens = opencv_calibration.read(path)
         return f"a calibration of {lens.width_px} x {lens.height_px} pixels", ()
@@ -107,15 +110,6 @@ def find_shipped(path: Path) -> Path:
         return plan.find(str(path))
     except InputError:
         return loader.find(str(path))
-
-
-def describe_vehicle(path: Path) -> str:
-    """Build the multibody model of an MJCF file and describe it."""
-    from skysim.dynamics import multibody
-    from skysim.scene.vehicle import VehicleConfig
-
-    model = multibody.build(VehicleConfig.model_validate({"model": str(path.resolve())}))
-    return f"a vehicle of {model.mass.mass_kg:g} kg"
 
 
 def check_scene(path: Path) -> tuple[str, tuple[str, ...]]:

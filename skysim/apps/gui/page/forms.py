@@ -21,16 +21,7 @@ from skysim.scene.scene import NAME_ALIAS, Scene
 
 # SI units by suffix of a model's field, as the loader accepts them, and units of bare numbers by suffix of a key.
 SI_UNITS = {
-    **{
-        "m": "m",
-        "s": "s",
-        "n": "N",
-        "kg": "kg",
-        "kg_m": "kg m",
-        "kg_m2": "kg m2",
-        "cd": "cd",
-        "w_sr": "W/sr",
-    },
+    **{"m": "m", "s": "s", "n": "N", "kg": "kg", "kg_m": "kg m", "kg_m2": "kg m2", "cd": "cd", "w_sr": "W/sr"},
     **{"nm": "N m", "nm_rad": "N m/rad", "nms": "N m s", "nms2": "N m s2"},
 }
 DISPLAY_UNITS = {

@@ -6,12 +6,13 @@ from typing import NamedTuple
 
 
 class Key(NamedTuple):
-    """Keys as the browser names them, their action, and their label and description on the screen."""
+    """Keys as the browser names them, their action, and their label and description on the screen and in the help."""
 
     keys: tuple[str, ...]
     label: str
     action: str
     description: str
+    help: str
 
 
 MOVES = {  # right, up, roll clockwise, in steps of a key press
@@ -23,18 +24,18 @@ MOVES = {  # right, up, roll clockwise, in steps of a key press
     "r": (0, 0, 1),
 }
 KEYS = (
-    Key(tuple(MOVES)[:4], "← ↑ ↓ →", "move", "move"),
-    Key(("e", "r"), "E R", "move", "roll"),
-    Key(("Shift",), "⇧", "coarse", "coarse"),
-    Key(("1",), "1", "identify", "identify"),
-    Key(("2",), "2", "monte_carlo", "Monte Carlo"),
-    Key(("F5",), "F5", "attitude", "attitude"),
-    Key(("F6",), "F6", "sensor", "sensor"),
-    Key(("F7",), "F7", "identifier", "identifier"),
-    Key(("F8",), "F8", "runs", "runs, field"),
-    Key(("F10",), "F10", "log", "log"),
-    Key(("F1",), "F1", "help", "help"),
-    Key(("Escape",), "Esc", "close", "close"),
+    Key(tuple(MOVES)[:4], "← ↑ ↓ →", "move", "move", "move the boresight by a fiftieth of the field of view"),
+    Key(("e", "r"), "E R", "move", "roll", "roll the camera by a degree: E counterclockwise, R clockwise"),
+    Key(("Shift",), "⇧", "coarse", "coarse", "with an arrow, E or R: steps ten times as large"),
+    Key(("1",), "1", "identify", "identify", "render a new frame and solve it"),
+    Key(("2",), "2", "monte_carlo", "Monte Carlo", "start a Monte Carlo study; F8 sets its number of trials"),
+    Key(("F5",), "F5", "attitude", "attitude", "type an attitude; Enter points the camera there"),
+    Key(("F6",), "F6", "sensor", "sensor", "select the detection algorithm"),
+    Key(("F7",), "F7", "identifier", "identifier", "select the star identification algorithm"),
+    Key(("F8",), "F8", "runs", "runs, field", "set the number of runs and the field of view"),
+    Key(("F10",), "F10", "log", "log", "show the log of this session"),
+    Key(("F1",), "F1", "help", "help", "show this help"),
+    Key(("Escape",), "Esc", "close", "close", "close the help"),
 )
 ACTION_BY_KEY = {name: key.action for key in KEYS for name in key.keys}
 

@@ -94,11 +94,7 @@ def cross(x: float, y: float, size: float) -> str:
 
 
 def labels(
-    detections: Collection[Detection],
-    size: float,
-    font: float,
-    size_px: tuple[int, int],
-    name: Callable[[int], str],
+    detections: Collection[Detection], size: float, font: float, size_px: tuple[int, int], name: Callable[[int], str]
 ) -> list[tuple[float, float, str]]:
     """Place labels without overlap: (x, y, name) to the right or left of a detection, above or below it, or none.
 

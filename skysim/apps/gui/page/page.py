@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import secrets
+import signal
 import time
 from collections.abc import Awaitable, Mapping
 from pathlib import Path
@@ -38,6 +39,7 @@ class Tab:
     session : its worker; set when a browser has connected
     folder : where scenes are saved;  out : where studies are
     overrides : keys of the scene that differ from its file
+    feedback : of the scene's controller; None without a controller
     solving : whether every frame is solved
     steps : (3,) right, up, roll: movements requested by keys that no frame shows yet
     """
@@ -60,13 +62,12 @@ class Tab:
         """Release the tab's resources after its browser has gone: frames, study and worker."""
         self.is_open = False
         FRAMES.pop(self.id, None)
-        self.study_panel.process.kill()
+        self.study_panel.process.stop(signal.SIGTERM)
         self.session.close()
 
     # Page elements.
 
     def build(self) -> None:
-        """Build all page elements."""
         ui.add_css(style.CSS)
         ui.add_body_html(f"<script>{keys.SUPPRESS_DEFAULTS_JS}</script>")
         ui.colors(
@@ -88,7 +89,6 @@ class Tab:
         ui.keyboard(on_key=self.key, ignore=["input", "textarea"])
 
     def build_header(self) -> None:
-        """Build the head: scene list, title, message, progress, frame rate, export menu."""
         with ui.element("div").classes("lab-head"):
             ui.label("skysim gui").classes("lab-name")
             self.picker = ui.select(self.scenes(), value=self.scene, on_change=self.scene_picked)
@@ -99,7 +99,7 @@ class Tab:
             self.spinner = ui.spinner(size="16px").classes("lab-busy").mark("busy")
             self.latency = ui.label().classes("lab-rate mono quiet").mark("rate")
             self.latency.props('title="latency: from the request for a frame to its arrival"')
-            self.solve_switch = ui.switch("identify", value=True, on_change=self.solve_switched).props("dense size=xs")
+            ui.switch("identify", value=True).bind_value_to(self, "solving").props("dense size=xs")
             with ui.button("Export").props("dense flat size=sm").mark("export"), ui.menu():
                 for name in export.FILE_BY_ITEM:
                     item = ui.menu_item(name, on_click=lambda name=name: self.export(name))
@@ -115,10 +115,8 @@ class Tab:
         )
 
     def build_panels(self) -> None:
-        """Build the panels below the attitude card."""
-        with ui.element("div").style(
-            "display: grid; grid-template: 34px minmax(0, 1fr) / minmax(0, 1fr); min-height: 0"
-        ):
+        grid = "display: grid; grid-template: 34px minmax(0, 1fr) / minmax(0, 1fr); min-height: 0"
+        with ui.element("div").style(grid):
             with ui.tabs().props("dense align=left no-caps indicator-color=primary") as self.tabs:
                 # Otherwise the arrow keys would select tabs.
                 self.tabs.on("click", js_handler=keys.BLUR_JS)
@@ -140,7 +138,6 @@ class Tab:
                     self.log_label = ui.label("Nothing yet.").classes("mono lab-log").mark("log")
 
     def build_help(self) -> ui.dialog:
-        """Build the help dialog: purpose and keys."""
         with ui.dialog() as dialog, ui.card().style("max-width: 600px; padding: 20px 24px; gap: 12px"):
             ui.label("skysim gui").style("font-weight: 600; font-size: 15px")
             ui.label(
@@ -149,17 +146,14 @@ class Tab:
             )
             with ui.element("div").style("display: grid; grid-template-columns: 110px 1fr; gap: 4px 12px"):
                 for key in keys.KEYS:
-                    ui.html(
-                        f'<span class="lab-keys" style="padding: 0; border: 0"><kbd>{key.label}</kbd></span>',
-                        sanitize=False,
-                    )
-                    ui.label(HELP[key.action if key.action != "move" else key.description])
+                    label = f'<span class="lab-keys" style="padding: 0; border: 0"><kbd>{key.label}</kbd></span>'
+                    ui.html(label, sanitize=False)
+                    ui.label(key.help)
         return dialog
 
     # Actions.
 
     async def scene_picked(self) -> None:
-        """Open the scene that was chosen in the list."""
         if self.picker.value != self.scene:
             await self.open(str(self.picker.value))
 
@@ -168,9 +162,8 @@ class Tab:
         self.stop_playback()
         before = self.scene, self.overrides
         self.scene, self.overrides = scene, dict(overrides or {})
-        activity = (
-            f"setting up {Path(scene).name} …" if self.view else ""
-        )  # at first the sensor view shows this message
+        # At first the sensor view shows this message.
+        activity = f"setting up {Path(scene).name} …" if self.view else ""
         result = await self.run_task("open", self.scene_path, self.overrides, self.solving, activity=activity)
         if result is None:
             self.scene, self.overrides = before
@@ -179,7 +172,8 @@ class Tab:
                 self.sensor.show_waiting(f"{Path(scene).name} cannot be set up:", self.message_text)
             return
         self.scene_info, view = result
-        self.feedback = await self.current_feedback()
+        control = load(self.scene_path, self.overrides).motion.control
+        self.feedback = control.feedback if control else None
         self.title.props["title"] = self.scene_info.title  # tooltip with the full title
         self.title.set_text(self.scene_info.title)
         self.attitude.set_scene(self.scene_info)
@@ -204,11 +198,6 @@ class Tab:
         factor = math.tan(math.radians(self.scene_info.field_deg / 2)) / math.tan(math.radians(field_deg / 2))
         await self.apply_overrides({"camera.focal_length": f"{1e3 * camera.focal_length_m * factor:.5g} mm"})
 
-    async def current_feedback(self) -> str | None:
-        """The feedback of the scene's controller; None without a controller."""
-        control = load(self.scene_path, self.overrides).motion.control
-        return control.feedback if control else None
-
     @property
     def scene_path(self) -> str:
         """Absolute path of the scene file, since study files are written to other folders."""
@@ -224,7 +213,6 @@ class Tab:
         return view
 
     def display_frame(self, view: FrameView) -> None:
-        """Display a frame in the sensor view, the attitude card and the 3-D view."""
         self.view = view
         self.sensor.show(view)
         self.attitude.show(view)
@@ -276,12 +264,7 @@ class Tab:
         self.lines = [f"{time.strftime('%H:%M:%S')}  {text}", *self.lines[: MAX_LOG_LINES - 1]]
         self.log_label.set_text("\n".join(self.lines))
 
-    async def solve_switched(self) -> None:
-        """Take over the switch that solves every frame."""
-        self.solving = bool(self.solve_switch.value)
-
     async def export(self, kind: str) -> None:
-        """Download files of the newest frame."""
         files = await self.run_task("export")
         if not files:
             return
@@ -296,7 +279,6 @@ class Tab:
     # Keys.
 
     async def key(self, event: KeyEventArguments) -> None:
-        """Handle a key press."""
         name = event.key.name.lower() if len(event.key.name) == 1 else event.key.name
         action = keys.ACTION_BY_KEY.get(name)
         if not event.action.keydown or action is None or event.modifiers.ctrl or event.modifiers.meta:
@@ -328,7 +310,6 @@ class Tab:
             self.moving = False
 
     async def perform(self, action: str) -> None:
-        """Perform the action of a key other than a movement."""
         self.show_message("")
         if action == "identify":
             self.stop_playback()
@@ -351,19 +332,3 @@ class Tab:
             self.help.open()
         elif action == "close":
             self.help.close()
-
-
-HELP = {
-    "move": "move the boresight by a fiftieth of the field of view",
-    "roll": "roll the camera by a degree: E counterclockwise, R clockwise",
-    "coarse": "with an arrow, E or R: steps ten times as large",
-    "identify": "render a new frame and solve it",
-    "monte_carlo": "start a Monte Carlo study; F8 sets its number of trials",
-    "attitude": "type an attitude; Enter points the camera there",
-    "sensor": "select the detection algorithm",
-    "identifier": "select the star identification algorithm",
-    "runs": "set the number of runs and the field of view",
-    "log": "show the log of this session",
-    "help": "show this help",
-    "close": "close the help",
-}

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
 from typing import Any
 
 import numpy as np
 from nicegui import ui
 from scipy.spatial.transform import Rotation
 
-from skysim.apps.gui.messages import FrameView, LabGeometry, SceneInfo
+from skysim.apps.gui.messages import FrameView, LabGeometry, SceneInfo, Triple
 from skysim.apps.gui.page.style import COLORS
+from skysim.core.types import Floats
 
 BRIGHTNESS_CLASSES = 3  # each with its own point size
 POINT_M = (0.008, 0.013, 0.02)
@@ -28,12 +28,7 @@ class Scene3D:
 
     def __init__(self) -> None:
         self.scene = ui.scene(
-            width=400,
-            height=300,
-            grid=False,
-            background_color=COLORS["ground"],
-            fps=FPS_SLOW,
-            click_events=[],
+            width=400, height=300, grid=False, background_color=COLORS["ground"], fps=FPS_SLOW, click_events=[]
         )
         self.scene.classes("w-full h-full").mark("space")
         self.fps = FPS_SLOW
@@ -52,32 +47,29 @@ class Scene3D:
             self.scene.props(f"fps={self.fps}")
 
     def set_scene(self, scene_info: SceneInfo) -> None:
-        """Build the view of a new scene."""
         self.geometry = geometry = scene_info.geometry
         self.scene.clear()
         with self.scene:
-            dome_points = [list(point) for line in geometry.dome_lines_m for point in line]
-            self.scene.point_cloud(dome_points, [list(DOME_RGB)] * len(dome_points), POINT_M[0] / 2)
+            self.draw_points(geometry.dome_m, DOME_RGB, POINT_M[0] / 2)
             self.draw_lights(geometry)
             self.highlighted = self.scene.point_cloud([], [], 1.6 * POINT_M[-1])
             with self.scene.group() as self.vehicle:
                 self.draw_vehicle(geometry)
-        distance = 1.25 if not scene_info.under_stars else 2.2
-        target_z = 0.0 if scene_info.under_stars else 0.5
+        distance, target_z = (2.2, 0.0) if scene_info.under_stars else (1.25, 0.5)
         self.scene.move_camera(distance, -distance, 0.7 * distance, 0, 0, target_z, duration=0)
 
     def draw_lights(self, geometry: LabGeometry) -> None:
         """Draw the lights in BRIGHTNESS_CLASSES classes, brighter ones larger."""
-        size, positions = np.array(geometry.size), np.array(geometry.lights_m).reshape(-1, 3)
-        edges = np.quantile(size, [1 / 3, 2 / 3]) if len(size) else np.zeros(2)
-        kind = np.digitize(size, edges)
+        edges = np.quantile(geometry.size, [1 / 3, 2 / 3]) if len(geometry.size) else np.zeros(2)
+        kind = np.digitize(geometry.size, edges)
         for n in range(BRIGHTNESS_CLASSES):
-            points = positions[kind == n].tolist()
-            if points:
-                self.scene.point_cloud(points, [list(DIM_RGB)] * len(points), POINT_M[n])
+            if (kind == n).any():
+                self.draw_points(geometry.lights_m[kind == n], DIM_RGB, POINT_M[n])
+
+    def draw_points(self, points_m: Floats, rgb: Triple, size_m: float) -> None:
+        self.scene.point_cloud(points_m.tolist(), [list(rgb)] * len(points_m), size_m)
 
     def draw_vehicle(self, geometry: LabGeometry) -> None:
-        """Draw the vehicle and the edges of the camera's field of view."""
         for kind, size, position, wxyz, rgb in geometry.shapes:
             rotation = Rotation.from_quat(wxyz, scalar_first=True)
             if kind == "box":
@@ -89,7 +81,7 @@ class Scene3D:
                 rotation = rotation * Rotation.from_euler("x", 90, degrees=True)
             shape.move(*position).rotate_R(rotation.as_matrix().tolist())
             shape.material("#" + "".join(f"{round(255 * min(max(value, 0.12), 1)):02x}" for value in rgb))
-        pupil, corners = list(geometry.camera_m), [list(corner) for corner in geometry.corners_m]
+        pupil, corners = geometry.camera_m.tolist(), geometry.corners_m.tolist()
         for n, corner in enumerate(corners):
             self.scene.line(pupil, corner).material(COLORS["accent"])
             self.scene.line(corner, corners[(n + 1) % 4]).material(COLORS["accent"])
@@ -105,11 +97,6 @@ class Scene3D:
             return
         rotation = Rotation.from_quat(view.body_wxyz, scalar_first=True)
         self.vehicle.rotate_R(rotation.as_matrix().tolist())
-        points = self.positions({light.id for light in view.lights})
+        in_view = np.isin(self.geometry.ids, [light.id for light in view.lights])
+        points = self.geometry.lights_m[in_view].tolist()
         self.highlighted.set_points(points, [list(HIGHLIGHT_RGB)] * len(points))
-
-    def positions(self, ids: Collection[int]) -> list[list[float]]:
-        """Positions of the lights with these ids."""
-        assert self.geometry is not None
-        pairs = zip(self.geometry.ids, self.geometry.lights_m, strict=True)
-        return [list(place) for id, place in pairs if id in ids]

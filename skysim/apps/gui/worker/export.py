@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import tempfile
 import zipfile
+from dataclasses import asdict
 from io import BytesIO
 from pathlib import Path
 
 import cv2
-import numpy as np
 import yaml
 
 from skysim.apps.gui.worker.workbench import Workbench
@@ -16,8 +16,8 @@ from skysim.core import files as file_io
 from skysim.core.errors import InputError
 from skysim.core.paths import SCENES
 from skysim.core.yaml_reader import VERSION, set_key
+from skysim.results import scoring
 from skysim.results.files import frames
-from skysim.results.report import annotate
 from skysim.scene.loader import find
 
 FILE_BY_ITEM = {  # file by menu entry
@@ -40,27 +40,15 @@ def frame_files(workbench: Workbench, base: str, overrides: dict[str, str]) -> d
         contents = {
             path.name.replace("frame_0000", "frame"): path.read_bytes() for path in sorted(Path(folder).iterdir())
         }
-    contents["figure.png"] = annotated_png(workbench)
+    annotated = scoring.annotated(workbench.frame, workbench.truth, workbench.report)
+    contents["figure.png"] = bytes(cv2.imencode(".png", annotated)[1])
     if result := workbench.result:
-        record = {name: getattr(result, name) for name in result.__slots__ if name not in ("detections", "windows_px")}
-        record["spots"] = [
-            {name: getattr(detection, name) for name in detection.__slots__} for detection in result.detections
-        ]
+        record = asdict(result)
+        record["spots"] = record.pop("detections")
+        del record["windows_px"]
         contents["solution.json"] = file_io.to_json(record).encode()
     contents["scene.yaml"] = scene_yaml(base_reference(base), overrides).encode()
     return contents
-
-
-def annotated_png(workbench: Workbench) -> bytes:
-    """PNG of the frame with true lights, detections and identified lights marked."""
-    assert workbench.frame is not None
-    assert workbench.truth is not None
-    empty = np.empty((0, 2))
-    match = workbench.report.attitude.match if workbench.report else None
-    xy_px = workbench.report.centroids.xy_px if workbench.report else empty
-    matched_px = xy_px[match.observed] if match else empty
-    annotated = annotate(workbench.frame.image_dn, xy_px, matched_px, truth_px=workbench.truth.sources.xy_px)
-    return bytes(cv2.imencode(".png", annotated)[1])
 
 
 def base_reference(scene: str, folder: Path | None = None) -> str:
@@ -82,7 +70,6 @@ def scene_yaml(base: str, overrides: dict[str, str], title: str = "") -> str:
 
 
 def zip_archive(contents: dict[str, bytes]) -> bytes:
-    """Pack all files into a ZIP archive."""
     buffer = BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, data in contents.items():

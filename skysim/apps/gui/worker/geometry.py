@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from skysim.apps.gui.messages import LabGeometry, Triple
+from skysim.apps.gui.messages import LabGeometry
 from skysim.core.types import Floats
 from skysim.dynamics import multibody
 from skysim.scene.light import DomeConfig
@@ -22,19 +22,16 @@ RINGS, SECTORS, DOTS = 4, 12, 144  # of the dotted lines on a dome
 def lab_geometry(testbed: Testbed) -> LabGeometry:
     """Geometry of a testbed: vehicle, lights, camera and dome."""
     under_dome = isinstance(testbed.scene.light, DomeConfig)
-    ids, position, size = lights(testbed, under_dome)
     shapes = tuple(
         (shape.kind, shape.size_m, shape.position_m, shape.body_from_shape_wxyz, shape.rgba[:3])
         for shape in multibody.shapes(testbed.vehicle)
     )
     return LabGeometry(
         shapes,
-        tuple(ids.tolist()),
-        triples(position),
-        tuple(size.tolist()),
-        triples(testbed.mount.camera_body_m[None])[0],
-        triples(corners_m(testbed)),
-        dome_lines(testbed) if under_dome else (),
+        *lights(testbed, under_dome),
+        testbed.mount.camera_body_m,
+        corners_m(testbed),
+        dome_points(testbed) if under_dome else np.empty((0, 3)),
     )
 
 
@@ -65,15 +62,15 @@ def corners_m(testbed: Testbed) -> Floats:
     return np.where(np.isfinite(points), points, far_points)
 
 
-def dome_lines(testbed: Testbed) -> tuple[tuple[Triple, ...], ...]:
-    """Circles of equal polar angle and meridians on the dome's inside, as lists of points."""
+def dome_points(testbed: Testbed) -> Floats:
+    """(K, 3) points of circles of equal polar angle and of meridians on the dome's inside."""
     assert isinstance(testbed.scene.light, DomeConfig)
     dome = surface.build_surface(testbed.scene.light.surface)
     cap = np.radians(testbed.scene.light.layout.cap_deg)
     azimuths = np.linspace(0, 2 * np.pi, 49)
     lines = [points_on_dome(dome, np.full(49, cap * n / RINGS), azimuths) for n in range(1, RINGS + 1)]
     lines += [points_on_dome(dome, np.linspace(0, cap, 13), np.full(13, a)) for a in azimuths[: 48 : 48 // SECTORS]]
-    return tuple(triples(line) for line in lines if len(line) > 1)
+    return np.concatenate([np.empty((0, 3)), *(line for line in lines if len(line) > 1)])
 
 
 def points_on_dome(dome: Surface, polar: Floats, azimuth: Floats) -> Floats:
@@ -81,7 +78,3 @@ def points_on_dome(dome: Surface, polar: Floats, azimuth: Floats) -> Floats:
     rays = np.column_stack([np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)])
     points = dome.meet(np.zeros(3), rays)
     return points[np.isfinite(points).all(axis=1)]
-
-
-def triples(rows: Floats) -> tuple[Triple, ...]:
-    return tuple((float(x), float(y), float(z)) for x, y, z in rows)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 import math
 import tempfile
 from dataclasses import dataclass
@@ -24,13 +25,13 @@ from skysim.apps.gui.worker.workbench import (
 )
 from skysim.core import images
 from skysim.core.errors import InputError
-from skysim.core.images import LiveCamera
 from skysim.experiments.study import loader, store
 from skysim.experiments.study.execution import replay
 from skysim.experiments.study.execution.setups import prepared_setup
 from skysim.experiments.study.execution.trials import run_trial
 from skysim.experiments.study.store import STORE
 from skysim.results import scoring, stretch
+from skysim.simulation.run import FrameResult
 
 SUFFIXES = (".fits", ".fit", ".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
 
@@ -57,7 +58,7 @@ class Photo:
 PhotoPixels = tuple[Photo, NDArray]  # with the image's pixels
 
 
-def photo_from_file(name: str, data: bytes, fov_deg: float | None, stages: dict[str, str]) -> PhotoPixels:
+def photo_from_file(name: str, data: bytes, fov_deg: float | None) -> PhotoPixels:
     """Solve an uploaded file. Raises InputError if it is no readable image."""
     suffix = Path(name).suffix.lower()
     if suffix not in SUFFIXES:
@@ -70,12 +71,7 @@ def photo_from_file(name: str, data: bytes, fov_deg: float | None, stages: dict[
             date_utc, _ = plate_solver.validated_date(images.read_date_obs(path))
         except InputError as error:
             raise InputError(str(error).replace(str(path), Path(name).name)) from None
-    return solve_photo(image, fov_deg, stages, date_utc)
-
-
-def photo_from_camera(camera: LiveCamera, fov_deg: float | None, stages: dict[str, str]) -> PhotoPixels:
-    """Solve the next frame of a live camera. Raises InputError."""
-    return solve_photo(images.monochrome(camera.frame()), fov_deg, stages, None)
+    return solve_photo(image, fov_deg, date_utc)
 
 
 def photo_from_trial(study: str, folder: Path, trial: int) -> PhotoPixels:
@@ -86,7 +82,7 @@ def photo_from_trial(study: str, folder: Path, trial: int) -> PhotoPixels:
     row = run_trial(plan.spec, segment, trial, segment.replicates[0])
     setup = prepared_setup(plan.spec, segment.settings)
     frame, truth, report = next(replay.replayed_frames(setup, row.seed))
-    result = tracker_result(setup.testbed, setup.estimator, report, truth)
+    result = tracker_result(setup.testbed, setup.estimator, FrameResult(frame, truth, report, {}))
     if row.error:
         result = TrackerResult(row.error.strip().splitlines()[-1], result.detections, result.ms)
     scene, (height, width) = setup.testbed.scene, frame.image_dn.shape
@@ -103,10 +99,10 @@ def photo_from_trial(study: str, folder: Path, trial: int) -> PhotoPixels:
     return photo, frame.image_dn
 
 
-def solve_photo(image: NDArray, fov_deg: float | None, stages: dict[str, str], date_utc: Any) -> PhotoPixels:
+def solve_photo(image: NDArray, fov_deg: float | None, date_utc: datetime.datetime | None) -> PhotoPixels:
     """Solve an image; the result's status says why if there is no solution. date_utc : None if unknown."""
     check_size(image)
-    solver = plate_solver.make_solver(fov_deg, None, stages=stages)
+    solver = plate_solver.make_solver(fov_deg, None)
     report, tracker = plate_solver.solve_array(image, solver, date_utc)
     attitude = report.attitude
     detections = detection_views(report, matches_by_row(tracker, attitude, report.centroids.xy_px))

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from skysim.core.errors import InputError
 from skysim.core.types import Mount
 from skysim.dynamics import guidance, multibody
+from skysim.results import scoring
 from skysim.scene.light import StarsConfig
 from skysim.scene.motion import AttitudeConfig
 from skysim.scene.scene import Scene
@@ -31,8 +32,7 @@ def from_angles(scene: Scene, mount: Mount, angles_deg: tuple[float, float, floa
 
     Raises InputError for an angle out of range, or a tilt beyond the vehicle's stop.
     """
-    names = ("RA", "Dec", "roll") if isinstance(scene.light, StarsConfig) else ("roll", "pitch", "yaw")
-    for name, angle in zip(names, angles_deg, strict=True):
+    for name, angle in zip(scoring.angle_names(scene), angles_deg, strict=True):
         low, high = RANGES[name]
         if not (math.isfinite(angle) and low <= angle <= high):
             raise InputError(f"{name}: {angle:g} deg is not allowed; allowed: {low:g} to {high:g}")

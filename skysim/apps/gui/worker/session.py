@@ -26,7 +26,7 @@ def serve(pipe: Connection, progress: Any, stop: Any) -> None:
 
     progress : shared (done, total) of the current task;  stop : shared flag; not 0 asks the task to end
     """
-    from skysim.apps.gui.worker.tasks import TASKS, Stopped, WorkerState
+    from skysim.apps.gui.worker.tasks import Stopped, Worker
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the server, which closes the pipe
 
@@ -35,7 +35,7 @@ def serve(pipe: Connection, progress: Any, stop: Any) -> None:
         if stop.value:
             raise Stopped
 
-    state = WorkerState(report_progress)
+    worker = Worker(report_progress)
     while True:
         try:
             task, arguments = pipe.recv()
@@ -43,7 +43,7 @@ def serve(pipe: Connection, progress: Any, stop: Any) -> None:
             return
         progress[:] = 0.0, 0.0
         try:
-            pipe.send(("ok", TASKS[task](state, *arguments)))
+            pipe.send(("ok", getattr(worker, task)(*arguments)))
         except Stopped:
             pipe.send(("error", "stopped"))
         except (InputError, ImageError) as error:
@@ -94,7 +94,6 @@ class Session:
         return done / total if total else 0.0
 
     def close(self) -> None:
-        """End the worker process."""
         self.halt()
         self.process.terminate()
         self.process.join(2.0)
@@ -113,7 +112,6 @@ class SpareWorker:
         self.next: Session | None = None
 
     def start(self) -> None:
-        """Start a spare worker if there is none."""
         if self.next is None:
             self.next = Session()
             self.next.thread.submit(self.next.call, "warm_up", (self.scene,))
@@ -124,6 +122,5 @@ class SpareWorker:
         return session if session and session.process.is_alive() else Session()
 
     def close(self) -> None:
-        """Close the spare worker as the server ends."""
         if self.next:
             self.next.close()

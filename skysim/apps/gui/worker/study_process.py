@@ -18,15 +18,15 @@ from skysim.experiments.study import store
 from skysim.experiments.study.store import STORE
 from skysim.results import metrics
 
-RESPONSES = (
-    "identified",
-    "wrong",
-    "refused",
-    "cross_arcsec_rms",
-    "roll_arcsec_rms",
-    "angle_arcsec_mean",
-    "time_ms_median",
-)
+RESPONSES = {  # label on the page by response
+    "identified": "identified",
+    "wrong": "wrong",
+    "refused": "refused",
+    "cross_arcsec_rms": "cross rms, ″",
+    "roll_arcsec_rms": "roll rms, ″",
+    "angle_arcsec_mean": "angle mean, ″",
+    "time_ms_median": "ms per trial",
+}
 BINS = 28
 MAX_FAILED = 20  # maximum number of failed trials in the results
 
@@ -93,17 +93,11 @@ class StudyProcess:
         lines = stderr.decode(errors="replace").strip().splitlines()
         return lines[-1] if self.process.returncode and lines else ""
 
-    def stop(self) -> None:
-        """Interrupt the process as Ctrl-C does: finished trials are kept."""
+    def stop(self, how: signal.Signals = signal.SIGINT) -> None:
+        """Interrupt the process as Ctrl-C does, or terminate it with SIGTERM; finished trials are kept."""
         if self.process and self.process.returncode is None:
             with contextlib.suppress(ProcessLookupError):
-                self.process.send_signal(signal.SIGINT)
-
-    def kill(self) -> None:
-        """Terminate the process when its tab has closed."""
-        if self.process and self.process.returncode is None:
-            with contextlib.suppress(ProcessLookupError):
-                self.process.terminate()
+                self.process.send_signal(how)
 
     def results(self) -> StudyResults | None:
         """Results in the store so far; None before the first trial is done."""
@@ -117,10 +111,7 @@ class StudyProcess:
             return None
         if not counts["done"]:
             return None
-        statistics = {}
-        for name in RESPONSES:
-            summary = metrics.response(name)(columns)
-            statistics[name] = (summary.value, summary.low, summary.high)
+        statistics = {name: metrics.response(name)(columns)[:3] for name in RESPONSES}
         error_arcsec = metrics.QUANTITIES["angle_arcsec"](columns)
         bins, heights = histogram(error_arcsec[np.isfinite(error_arcsec)])
         failed = (*raised, *unsolved(columns))[:MAX_FAILED]

@@ -1,45 +1,49 @@
-"""Tasks of a worker, by name in TASKS. Each takes the state that the worker keeps between tasks, and its arguments."""
+"""Tasks of a worker process: methods of `Worker`, called by name, which keeps its state between them."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from numpy.typing import NDArray
 
 from skysim.apps.gui.messages import FrameView, MotionLog, PixelWindow, SceneInfo, Triple
-from skysim.apps.gui.worker import export, photo
-from skysim.apps.gui.worker.playback import MotionPlayback
+from skysim.apps.gui.worker import export, photo, playback, pointing
 from skysim.apps.gui.worker.workbench import Workbench, pixel_window
+from skysim.core import images
 from skysim.core.errors import InputError
-from skysim.core.images import LiveCamera
+from skysim.simulation import run
+from skysim.simulation.testbed import Testbed
 
-Progress = Callable[[float, float], None]
+
+class Stopped(Exception):
+    """Raised in a task that the user has stopped."""
 
 
 @dataclass
-class WorkerState:
+class Worker:
     """State between tasks: the workbench, its simulated motion, and the other image if the page shows one.
 
     report_progress : reports progress (done, total) of a long task; raises Stopped if the task shall end
+    moved : the testbed after the simulation of its motion
     image : (H, W) pixels of an image that is not of the scene;  camera : an open live camera
     """
 
-    report_progress: Progress
-    workbench: Workbench | None = None
-    playback: MotionPlayback | None = None
+    report_progress: Callable[[float, float], None]
+    current: Workbench | None = None
+    moved: Testbed | None = None
     image: NDArray | None = None
     scene: str = ""
     overrides: Mapping[str, str] | None = None
-    camera: LiveCamera | None = None
+    camera: images.LiveCamera | None = None
 
-    def require_workbench(self) -> Workbench:
-        """Return the workbench. Raises InputError if no scene is set up."""
-        if self.workbench is None:
+    @property
+    def workbench(self) -> Workbench:
+        """The current workbench. Raises InputError if no scene is set up."""
+        if self.current is None:
             raise InputError("no scene is set up")
-        return self.workbench
+        return self.current
 
     def show_frame(self, view: FrameView) -> FrameView:
         """Return the view, and forget the other image, because the page now shows the scene."""
@@ -51,123 +55,83 @@ class WorkerState:
         shown, self.image = photo_pixels
         return replace(shown, jpeg=self.jpeg())
 
-    def jpeg(self) -> bytes:
-        """JPEG of the shown image, with the workbench's stretch."""
-        workbench = self.require_workbench()
+    def shown_image(self) -> NDArray:
+        """(H, W) pixels of the image on the page."""
         if self.image is not None:
-            return workbench.to_jpeg(self.image)
-        assert workbench.frame is not None
-        return workbench.to_jpeg(workbench.frame.image_dn)
+            return self.image
+        assert self.workbench.frame is not None
+        return self.workbench.frame.image_dn
 
+    def jpeg(self) -> bytes:
+        return self.workbench.to_jpeg(self.shown_image())
 
-class Stopped(Exception):
-    """Raised in a task that the user has stopped."""
+    # Tasks.
 
+    def warm_up(self, scene: str) -> None:
+        """Set up a scene and solve one frame, so that code is imported and compiled."""
+        Workbench.open(scene, {}).render_at_rest(solve=True)
 
-def warm_up(_: WorkerState, scene: str) -> None:
-    """Warm up: set up a scene and solve one frame, so that code is imported and compiled."""
-    Workbench.open(scene, {}).render_at_rest(solve=True)
+    def open(self, scene: str, overrides: Mapping[str, str], solve: bool) -> tuple[SceneInfo, FrameView]:
+        """Set up a scene and render a first frame."""
+        self.current = Workbench.open(scene, overrides, self.current)
+        self.scene, self.overrides, self.moved = scene, dict(overrides), None
+        return self.current.scene_info, self.render(solve)
 
+    def render(self, solve: bool) -> FrameView:
+        return self.show_frame(self.workbench.render_at_rest(solve))
 
-def open_scene(
-    state: WorkerState, scene: str, overrides: Mapping[str, str], solve: bool
-) -> tuple[SceneInfo, FrameView]:
-    """Set up a scene and render a first frame."""
-    state.workbench = Workbench.open(scene, overrides, state.workbench)
-    state.scene, state.overrides, state.playback = scene, dict(overrides), None
-    return state.workbench.scene_info, render(state, solve)
+    def point(self, angles_deg: Triple, solve: bool) -> FrameView:
+        bench = self.workbench
+        bench.lab_from_body = pointing.from_angles(bench.scene, bench.testbed.mount, angles_deg)
+        return self.render(solve)
 
+    def move(self, right: float, up: float, roll_deg: float, solve: bool) -> FrameView:
+        bench = self.workbench
+        bench.lab_from_body = pointing.moved(bench.scene, bench.testbed.mount, bench.lab_from_body, right, up, roll_deg)
+        return self.render(solve)
 
-def render(state: WorkerState, solve: bool) -> FrameView:
-    return state.show_frame(state.require_workbench().render_at_rest(solve))
+    def show(self, stretch: str, brightness: float) -> bytes:
+        """Change stretch and brightness; return the shown image as JPEG."""
+        self.workbench.stretch, self.workbench.brightness = stretch, brightness
+        return self.jpeg()
 
+    def fit(self, widest_px: int) -> bytes:
+        """Limit the image's width to the pixels that the screen has for it; return the shown image as JPEG."""
+        self.workbench.widest_px = widest_px
+        return self.jpeg()
 
-def point(state: WorkerState, angles_deg: Triple, solve: bool) -> FrameView:
-    state.require_workbench().point(angles_deg)
-    return render(state, solve)
+    def zoom(self, x: float, y: float) -> PixelWindow:
+        return pixel_window(self.shown_image(), x, y)
 
+    def simulate(self) -> MotionLog:
+        """Simulate the whole motion, for playback."""
+        self.moved = run.simulate_motion(self.workbench.testbed, self.report_progress)
+        return playback.curves(self.moved.log)
 
-def move(state: WorkerState, right: float, up: float, roll_deg: float, solve: bool) -> FrameView:
-    state.require_workbench().move(right, up, roll_deg)
-    return render(state, solve)
+    def play(self, t_s: float, solve: bool) -> FrameView:
+        """Render the frame at time t_s of the motion. Raises InputError if none was simulated."""
+        if self.moved is None:
+            raise InputError("no motion has been simulated yet")
+        return self.show_frame(playback.render_at(self.workbench, self.moved, t_s, solve))
 
+    def replay(self, study: str, folder: str, trial: int) -> photo.Photo:
+        """Repeat a study's trial; the page shows its frame."""
+        return self.show_photo(photo.photo_from_trial(study, Path(folder), trial))
 
-def show(state: WorkerState, stretch: str, brightness: float) -> bytes:
-    """Change stretch and brightness; return the shown image as JPEG."""
-    workbench = state.require_workbench()
-    workbench.stretch, workbench.brightness = stretch, brightness
-    return state.jpeg()
+    def export(self) -> dict[str, bytes]:
+        return export.frame_files(self.workbench, self.scene, dict(self.overrides or {}))
 
+    def solve_file(self, name: str, data: bytes, fov_deg: float | None) -> photo.Photo:
+        return self.show_photo(photo.photo_from_file(name, data, fov_deg))
 
-def fit(state: WorkerState, widest_px: int) -> bytes:
-    """Limit the image's width to the pixels that the screen has for it; return the shown image as JPEG."""
-    state.require_workbench().widest_px = widest_px
-    return state.jpeg()
+    def solve_camera(self, source: str, fov_deg: float | None) -> photo.Photo:
+        """Solve the next frame of a live camera, which stays open."""
+        if self.camera is None:
+            self.camera = images.LiveCamera(source)
+        return self.show_photo(photo.solve_photo(images.monochrome(self.camera.frame()), fov_deg, None))
 
-
-def zoom(state: WorkerState, x: float, y: float) -> PixelWindow:
-    """The pixels of the shown image around (x, y)."""
-    frame = state.require_workbench().frame
-    assert frame is not None
-    return pixel_window(frame.image_dn if state.image is None else state.image, x, y)
-
-
-def simulate(state: WorkerState) -> MotionLog:
-    """Simulate the whole motion, for playback."""
-    state.playback = MotionPlayback.simulate(state.require_workbench(), state.report_progress)
-    return state.playback.curves
-
-
-def play(state: WorkerState, t_s: float, solve: bool) -> FrameView:
-    """Render the frame at time t_s of the motion. Raises InputError if none was simulated."""
-    if state.playback is None:
-        raise InputError("no motion has been simulated yet")
-    return state.show_frame(state.playback.render_at(state.require_workbench(), t_s, solve))
-
-
-def replay(state: WorkerState, study: str, folder: str, trial: int) -> photo.Photo:
-    """Repeat a study's trial; the page shows its frame."""
-    return state.show_photo(photo.photo_from_trial(study, Path(folder), trial))
-
-
-def export_files(state: WorkerState) -> dict[str, bytes]:
-    return export.frame_files(state.require_workbench(), state.scene, dict(state.overrides or {}))
-
-
-def solve_file(
-    state: WorkerState, name: str, data: bytes, fov_deg: float | None, stages: dict[str, str]
-) -> photo.Photo:
-    return state.show_photo(photo.photo_from_file(name, data, fov_deg, stages))
-
-
-def solve_camera(state: WorkerState, source: str, fov_deg: float | None, stages: dict[str, str]) -> photo.Photo:
-    """Solve the next frame of a live camera, which stays open."""
-    if state.camera is None:
-        state.camera = LiveCamera(source)
-    return state.show_photo(photo.photo_from_camera(state.camera, fov_deg, stages))
-
-
-def release(state: WorkerState) -> None:
-    """Close the live camera."""
-    if state.camera:
-        state.camera.close()
-    state.camera = None
-
-
-TASKS: dict[str, Callable[..., Any]] = {
-    "warm_up": warm_up,
-    "open": open_scene,
-    "render": render,
-    "point": point,
-    "move": move,
-    "show": show,
-    "fit": fit,
-    "zoom": zoom,
-    "simulate": simulate,
-    "play": play,
-    "replay": replay,
-    "export": export_files,
-    "solve_file": solve_file,
-    "solve_camera": solve_camera,
-    "release": release,
-}
+    def release(self) -> None:
+        """Close the live camera."""
+        if self.camera:
+            self.camera.close()
+        self.camera = None

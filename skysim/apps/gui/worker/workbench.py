@@ -15,25 +15,17 @@ from estimator.core.types import Attitude
 from estimator.trackers.dome_tracker import DomeTracker
 from estimator.trackers.pipeline import Clock, Report
 from estimator.trackers.star_tracker import StarTracker
-from skysim.apps.gui.messages import (
-    Detection,
-    FrameView,
-    Light,
-    PixelWindow,
-    SceneInfo,
-    TrackerResult,
-    Triple,
-)
-from skysim.apps.gui.worker import geometry, pointing
+from skysim.apps.gui.messages import Detection, FrameView, Light, PixelWindow, SceneInfo, TrackerResult
+from skysim.apps.gui.worker import geometry
 from skysim.core import quaternion
 from skysim.core.types import Floats, Frame, Trajectory, Truth
-from skysim.core.units import ARCSEC_RAD
-from skysim.results import metrics, scoring
+from skysim.results import scoring
 from skysim.results import stretch as contrast
 from skysim.scene.light import StarsConfig
 from skysim.scene.loader import load
 from skysim.scene.scene import Scene
 from skysim.simulation import exposure
+from skysim.simulation.run import FrameResult
 from skysim.simulation.testbed import MARGIN_S, Testbed, build_testbed, build_tracker, exposure_window
 from skysim.tracking import factory
 from skysim.tracking import settings as tracker_settings
@@ -106,14 +98,6 @@ class Workbench:
             geometry.lab_geometry(self.testbed),
         )
 
-    def point(self, angles_deg: Triple) -> None:
-        """Set the attitude. Raises InputError."""
-        self.lab_from_body = pointing.from_angles(self.scene, self.testbed.mount, angles_deg)
-
-    def move(self, right: float, up: float, roll_deg: float) -> None:
-        """Change the attitude by a step. Raises InputError."""
-        self.lab_from_body = pointing.moved(self.scene, self.testbed.mount, self.lab_from_body, right, up, roll_deg)
-
     def render_at_rest(self, solve: bool = False) -> FrameView:
         """Render a frame at the current attitude at rest, with independent noise; solve it if `solve`."""
         self.rendered_count += 1
@@ -125,9 +109,9 @@ class Workbench:
     @property
     def result(self) -> TrackerResult | None:
         """The tracker's solution of the newest frame; None if it was not solved."""
-        if self.report is None or self.truth is None:
+        if self.frame is None or self.truth is None or self.report is None:
             return None
-        return tracker_result(self.testbed, self.estimator, self.report, self.truth)
+        return tracker_result(self.testbed, self.estimator, FrameResult(self.frame, self.truth, self.report, {}))
 
     def render(self, testbed: Testbed, solve: bool) -> FrameView:
         """Render frame 0 of a testbed, solve it if `solve`, and return the view for the page."""
@@ -159,10 +143,7 @@ def true_lights(truth: Truth, magnitude: Mapping[int, float]) -> tuple[Light, ..
     sources = truth.sources
     rows = np.argsort(-sources.electrons)
     columns = zip(
-        sources.id[rows].tolist(),
-        sources.flux_xy_px[rows].tolist(),
-        sources.electrons[rows].tolist(),
-        strict=True,
+        sources.id[rows].tolist(), sources.flux_xy_px[rows].tolist(), sources.electrons[rows].tolist(), strict=True
     )
     return tuple(Light(id, x, y, e, magnitude.get(id, math.nan)) for id, (x, y), e in columns)
 
@@ -172,23 +153,19 @@ def magnitude_by_id(testbed: Testbed) -> dict[int, float]:
     return dict(zip(testbed.sources.id.tolist(), testbed.sources.magnitude.tolist(), strict=True))
 
 
-def tracker_result(testbed: Testbed, estimator: factory.Estimator, report: Report, truth: Truth) -> TrackerResult:
+def tracker_result(testbed: Testbed, estimator: factory.Estimator, result: FrameResult) -> TrackerResult:
     """The tracker's report with its errors relative to the truth."""
-    attitude, ms = report.attitude, 1e3 * sum(report.seconds.values())
-    detections = detection_views(report, matches_by_row(estimator, attitude, report.centroids.xy_px))
-    if attitude.cam_from_ref is None:
-        return TrackerResult(attitude.status, detections, ms)
-    cross, roll = metrics.cross_and_roll_rad(attitude.cam_from_ref, truth.cam_from_lab)
+    row, report = scoring.row(result, testbed.scene, testbed.mount), result.report
     return TrackerResult(
-        attitude.status,
-        detections,
-        ms,
-        scoring.angles_deg(attitude.cam_from_ref, testbed.scene, testbed.mount),
-        cross / ARCSEC_RAD,
-        roll / ARCSEC_RAD,
-        estimated_sigma_arcsec(attitude),
-        metrics.is_wrong(attitude.cam_from_ref, truth.cam_from_lab),
-        search_windows_px(estimator, attitude),
+        row.status,
+        detection_views(report, matches_by_row(estimator, report.attitude, report.centroids.xy_px)),
+        row.time_ms,
+        row.estimate_deg,
+        row.cross_arcsec,
+        row.roll_arcsec,
+        (row.cross_sigma_arcsec, row.roll_sigma_arcsec),
+        row.wrong,
+        search_windows_px(estimator, report.attitude),
     )
 
 
@@ -208,14 +185,6 @@ def pixel_window(image: NDArray, x: float, y: float) -> PixelWindow:
     y0 = min(max(round(y) - down // 2, 0), max(height - down, 0))
     values = np.rint(image[y0 : y0 + down, x0 : x0 + across]).astype(int)
     return PixelWindow(x0, y0, tuple(map(tuple, values.tolist())))
-
-
-def estimated_sigma_arcsec(attitude: Attitude) -> tuple[float, float]:
-    """Estimated standard errors across the boresight (both axes) and about it, arcsec; NaN without a covariance."""
-    if attitude.covariance_rad2 is None:
-        return math.nan, math.nan
-    variance = np.diag(attitude.covariance_rad2)
-    return float(np.sqrt(variance[:2].sum())) / ARCSEC_RAD, float(np.sqrt(variance[2])) / ARCSEC_RAD
 
 
 def predicted_lights(estimator: DomeTracker | StarTracker, attitude: Attitude) -> tuple[NDArray[np.int64], Floats]:
@@ -244,7 +213,7 @@ def matches_by_row(estimator: factory.Estimator, attitude: Attitude, xy_px: Floa
 
 def search_windows_px(estimator: factory.Estimator, attitude: Attitude) -> tuple[tuple[float, float], ...]:
     """Predicted pixels of up to 200 lights in the field: where tracking mode would search in the next frame."""
-    if isinstance(estimator, ExternalTracker):
+    if attitude.cam_from_ref is None or isinstance(estimator, ExternalTracker):
         return ()
     _, xy_px = predicted_lights(estimator, attitude)
     inside = estimator.camera.contains(np.nan_to_num(xy_px, nan=-1e9))

@@ -38,21 +38,16 @@ class AttitudeCard:
                 ui.label("error").classes("quiet")
                 self.errors = [ui.label("–").classes("mono num") for _ in range(3)]
             self.status = ui.label(" ").classes("mono ellipsis").style("margin-top: 6px").mark("status")
-        with (
-            ui.element("div").classes("lab-card"),
-            ui.element("div").classes("lab-stages"),
-        ):
+        with ui.element("div").classes("lab-card"), ui.element("div").classes("lab-stages"):
             self.stages = {
                 stage: self.stage_select(stage) for stage in ("detector", "centroider", "identifier", "solver")
             }
 
     def angle_input(self, n: int) -> ui.input:
-        """Input field of one angle."""
         field = ui.input().props(f'dense outlined input-class="text-right" aria-label="angle {n + 1}"')
         return field.classes("mono").mark(f"angle-{n}").on("keydown.enter", self.point)
 
     def stage_select(self, name: str) -> ui.select:
-        """List of one stage's algorithms."""
         label = f"{name} {STAGE_KEYS[name]}" if name in STAGE_KEYS else name
         field = ui.select([], label=label, on_change=partial(self.choose, name))
         field.on("popup-hide", js_handler=keys.BLUR_JS)
@@ -66,7 +61,6 @@ class AttitudeCard:
             field.set_options(list(scene_info.choices[name]), value=scene_info.stages[name])
 
     def set_headers(self, names: tuple[str, str, str]) -> None:
-        """Set the heads of the three angle columns."""
         for head, name in zip(self.heads, names, strict=True):
             head.set_text(f"{name}, deg")
 
@@ -77,7 +71,6 @@ class AttitudeCard:
             await self.tab.apply_overrides({f"tracker.{stage}": value})
 
     async def point(self) -> None:
-        """Point the camera at the typed attitude."""
         self.tab.stop_playback()
         self.tab.show_message("")
         try:
@@ -90,7 +83,6 @@ class AttitudeCard:
                 field.run_method("blur")  # so that the arrow keys move the camera again
 
     def show(self, view: FrameView) -> None:
-        """Display the newest frame's attitudes."""
         if self.shows_photo and self.tab.scene_info:
             self.shows_photo = False
             self.set_headers(self.tab.scene_info.names)
@@ -110,7 +102,6 @@ class AttitudeCard:
         self.show_result(photo.result)
 
     def set_placeholder(self, text: str) -> None:
-        """Set the placeholder of empty angle fields."""
         for field in self.inputs:
             field.props["placeholder"] = text
             field.update()

@@ -12,7 +12,7 @@ from nicegui import run, ui
 
 from skysim.apps.gui.page import keys
 from skysim.apps.gui.page.style import COLORS, TOOLTIP, format_number
-from skysim.apps.gui.worker.study_process import StudyProcess, StudyResults, finished, monte_carlo
+from skysim.apps.gui.worker.study_process import RESPONSES, StudyProcess, StudyResults, finished, monte_carlo
 from skysim.core import files
 from skysim.core.errors import InputError
 from skysim.experiments.study import loader, plan
@@ -22,15 +22,6 @@ if TYPE_CHECKING:
     from skysim.apps.gui.page.page import Tab
 
 POLL_S = 0.5
-RESPONSE_LABELS = {
-    "identified": "identified",
-    "wrong": "wrong",
-    "refused": "refused",
-    "cross_arcsec_rms": "cross rms, ″",
-    "roll_arcsec_rms": "roll rms, ″",
-    "angle_arcsec_mean": "angle mean, ″",
-    "time_ms_median": "ms per trial",
-}
 TRIAL_KINDS = {"centroids": "centroids", "frames": "rendered frames"}
 
 
@@ -45,13 +36,11 @@ class MonteCarloPanel:
             self.study_select = ui.select({}, value=None).props('dense outlined options-dense aria-label="Study"')
             self.study_select.classes("flex-grow").mark("study").on_value_change(self.study_chosen)
             self.study_select.on("popup-hide", js_handler=keys.BLUR_JS)
-            self.button = (
-                ui.button("Start", on_click=self.start_or_stop).props("dense outline size=sm").mark("monte-carlo")
-            )
+            self.button = ui.button("Start", on_click=self.start_or_stop).props("dense outline size=sm")
+            self.button.mark("monte-carlo")
         with ui.element("div").classes("lab-trial") as self.fields:
-            self.count = (
-                ui.number("runs, F8", value=200, min=1, max=100_000, precision=0).props("dense outlined").mark("runs")
-            )
+            self.count = ui.number("runs, F8", value=200, min=1, max=100_000, precision=0).props("dense outlined")
+            self.count.mark("runs")
             self.kind = ui.select(TRIAL_KINDS, value="centroids", label="of").props("dense outlined options-dense")
             self.kind.on("popup-hide", js_handler=keys.BLUR_JS)
             self.noise = ui.number("noise, px", value=0.1, min=0, max=10, step=0.05).props("dense outlined")
@@ -71,7 +60,6 @@ class MonteCarloPanel:
         self.list_reports()
 
     def set_scene(self) -> None:
-        """Take over a new scene."""
         options = {"": f"Monte Carlo of {Path(self.tab.scene).stem}"}
         options |= {path.stem: f"{path.stem}: {plan.title_of(path)}" for path in sorted(STUDIES.glob("*.yaml"))}
         self.study_select.set_options(options, value=self.study_select.value or "")
@@ -83,13 +71,11 @@ class MonteCarloPanel:
         self.fields.set_visibility(not self.study_select.value)
 
     async def set_field_of_view(self) -> None:
-        """Change the field of view, by the focal length."""
         scene_info = self.tab.scene_info
         if scene_info and self.field.value:
             await self.tab.set_field_of_view(float(self.field.value))
 
     async def start_or_stop(self) -> None:
-        """Handle the button: start a study or stop the running one."""
         if self.process.running:
             self.process.stop()
             self.stopped = True
@@ -132,21 +118,14 @@ class MonteCarloPanel:
             return STUDIES / f"{self.study_select.value}.yaml"
         trial: dict[str, Any] = {"kind": self.kind.value}
         if self.kind.value == "centroids":
-            trial |= {
-                "noise_px": float(self.noise.value or 0),
-                "false_lights": int(self.false_lights.value or 0),
-            }
+            trial |= {"noise_px": float(self.noise.value or 0), "false_lights": int(self.false_lights.value or 0)}
         if not (self.count.value and 1 <= self.count.value <= 100_000):
             raise InputError("runs: allowed: 1 to 100000")
         settings = self.tab.scene_path, self.tab.overrides, trial, int(self.count.value)
         # A stopped run with unchanged settings is resumed from its own file.
-        stopped_study = self.process.folder / "monte_carlo.yaml"
-        if (
-            self.stopped
-            and stopped_study.is_file()
-            and stopped_study.read_text() == monte_carlo(*settings, self.run_number)
-        ):
-            return stopped_study
+        before = self.process.folder / "monte_carlo.yaml"
+        if self.stopped and before.is_file() and before.read_text() == monte_carlo(*settings, self.run_number):
+            return before
         self.run_number += 1
         text = monte_carlo(*settings, self.run_number)
         folder = files.make_folder(self.tab.out / f"monte_carlo_{self.tab.id}_{self.run_number}")
@@ -154,7 +133,6 @@ class MonteCarloPanel:
         return folder / "monte_carlo.yaml"
 
     def show_end(self, fault: str) -> None:
-        """Display the final result of a study, or its error."""
         self.button.set_text("Start")
         results = self.process.results()
         if results:
@@ -178,7 +156,6 @@ class MonteCarloPanel:
                 self.note.set_text(f"{results.done} of {self.process.total} trials")
 
     def show(self, results: StudyResults) -> None:
-        """Display statistics, histogram and failed trials."""
         self.bar.set_value(results.done / max(self.process.total, 1))
         self.chart.options["xAxis"]["data"] = [format_number(center) for center in results.bins]
         self.chart.options["series"][0]["data"] = list(results.counts)
@@ -187,9 +164,7 @@ class MonteCarloPanel:
         self.table.clear()
         with self.table:
             ui.label(f"{'':16s}{'value':>8s}   95 % interval").classes("mono quiet")
-            lines = [
-                f"{RESPONSE_LABELS[name]:16s}{format_interval(*value)}" for name, value in results.statistics.items()
-            ]
+            lines = [f"{RESPONSES[name]:16s}{format_interval(*value)}" for name, value in results.statistics.items()]
             ui.label("\n".join(lines)).classes("mono")
         if results.failed == self.failed:
             return
@@ -216,7 +191,6 @@ class MonteCarloPanel:
             self.tab.log(f"replayed trial {number}: {photo.result.status}")
 
     def list_reports(self) -> None:
-        """List the reports of finished studies."""
         self.reports.clear()
         with self.reports:
             folders = finished(self.tab.out)
@@ -237,7 +211,6 @@ def report_title(folder: Path) -> str:
 
 
 def format_interval(value: float, low: float, high: float) -> str:
-    """Format a value with its interval."""
     if math.isnan(value):
         return "       –"
     text = f"{value:8.4g}"
@@ -247,29 +220,15 @@ def format_interval(value: float, low: float, high: float) -> str:
 def options() -> dict[str, Any]:
     """ECharts options of the histogram of the error angle."""
     text = {"color": COLORS["quiet"], "fontSize": 10}
+    title = {"text": "no trials yet", "left": "center", "top": "middle"}
+    axis = {"axisLabel": text, "nameTextStyle": text}
+    x_name = {"name": "error angle, ″", "nameLocation": "middle", "nameGap": 24}
     return {
         "animation": False,
-        "title": {
-            **{"text": "no trials yet", "left": "center", "top": "middle"},
-            "textStyle": text | {"fontWeight": "normal", "fontSize": 11},
-        },
+        "title": title | {"textStyle": text | {"fontWeight": "normal", "fontSize": 11}},
         "grid": {"left": 42, "right": 10, "top": 22, "bottom": 36},
-        "xAxis": {
-            "type": "category",
-            "data": [],
-            "axisLabel": text,
-            "name": "error angle, ″",
-            "nameLocation": "middle",
-            "nameGap": 24,
-            "nameTextStyle": text,
-        },
-        "yAxis": {
-            "type": "value",
-            "axisLabel": text,
-            "splitLine": {"lineStyle": {"color": COLORS["line"]}},
-            "name": "trials",
-            "nameTextStyle": text,
-        },
+        "xAxis": axis | x_name | {"type": "category", "data": []},
+        "yAxis": axis | {"name": "trials", "type": "value", "splitLine": {"lineStyle": {"color": COLORS["line"]}}},
         "tooltip": TOOLTIP,
         "series": [{"type": "bar", "data": [], "barCategoryGap": "8%", "itemStyle": {"color": COLORS["accent"]}}],
     }

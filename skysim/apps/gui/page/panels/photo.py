@@ -34,15 +34,10 @@ class PhotoPanel:
         with ui.row().classes("w-full no-wrap items-center gap-2"):
             self.source = ui.input("live camera: index, file or address").props("dense outlined").classes("flex-grow")
             self.button = ui.button("Watch", on_click=self.watch).props("dense outline size=sm").mark("camera")
-        self.result_text = (
-            ui.label("No image yet. Images are solved lost in space; uncertain matches are rejected.")
-            .classes("mono quiet")
-            .style("margin-top: 10px; white-space: pre-wrap")
-        )
-        self.result_text.mark("facts")
+        self.result_text = ui.label("No image yet. Images are solved lost in space; uncertain matches are rejected.")
+        self.result_text.classes("mono quiet").style("margin-top: 10px; white-space: pre-wrap").mark("facts")
 
     async def uploaded(self, event: Any) -> None:
-        """Solve an uploaded file."""
         data = await event.file.read()
         name = str(event.file.name)
         self.upload.reset()
@@ -51,10 +46,7 @@ class PhotoPanel:
             return
         self.tab.stop_playback()
         self.show_text(f"solving {name} …", "quiet")
-        self.show(
-            name,
-            await self.tab.run_task("solve_file", name, data, self.fov.value, {}, activity=f"solving {name} …"),
-        )
+        self.show(name, await self.tab.run_task("solve_file", name, data, self.fov.value, activity=f"solving {name} …"))
 
     def stop(self) -> None:
         """Stop the live camera after the current frame."""
@@ -71,7 +63,7 @@ class PhotoPanel:
         self.live, solved_count, source = True, 0, (self.source.value or "0").strip()
         self.button.set_text("Stop")
         while self.live:
-            photo = await self.tab.run_task("solve_camera", source, self.fov.value, {})
+            photo = await self.tab.run_task("solve_camera", source, self.fov.value)
             if not self.tab.is_open:
                 return
             if photo or not solved_count:  # a camera that ends keeps its last result on the page
@@ -84,12 +76,9 @@ class PhotoPanel:
         self.button.enable()
 
     def show(self, name: str, photo: Photo | None) -> None:
-        """Display the image with its marks, and the solution."""
         if photo is None:
-            self.show_text(
-                self.tab.message_text if self.tab.message_text.startswith(name) else f"{name}: {self.tab.message_text}",
-                "warn",
-            )
+            message = self.tab.message_text
+            self.show_text(message if message.startswith(name) else f"{name}: {message}", "warn")
             return
         self.tab.sensor.show_photo(photo)
         self.tab.attitude.show_photo(photo)
@@ -106,6 +95,5 @@ class PhotoPanel:
         self.show_text(f"{status_text}\n{pointing}\n{quality}", "good")
 
     def show_text(self, text: str, color: str) -> None:
-        """Set the result text."""
         self.result_text.set_text(text)
         self.result_text.classes(remove="quiet good warn", add=color)

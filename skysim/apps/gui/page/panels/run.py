@@ -40,9 +40,8 @@ class RunPanel:
         self.frame_curves: dict[str, list[list[float]]] = {}
         self.dragging, self.closed_scene, self.closed_overrides = False, "", dict[str, str]()
         with ui.row().classes("w-full no-wrap items-center gap-2"):
-            self.simulate_button = (
-                ui.button("Simulate", on_click=self.simulate).props("dense outline size=sm").mark("fly")
-            )
+            self.simulate_button = ui.button("Simulate", on_click=self.simulate).props("dense outline size=sm")
+            self.simulate_button.mark("fly")
             self.play = ui.button(icon="play_arrow", on_click=self.toggle).props('dense flat aria-label="Play"')
             self.play.mark("play").disable()
             self.speed = ui.select(list(SPEEDS), value="real time").props('dense borderless aria-label="Speed"')
@@ -79,15 +78,12 @@ class RunPanel:
         current, feedback = self.tab.feedback or "", str(self.loop.value or "")
         if self.closed_scene != self.tab.scene or feedback == current:
             return
-        other_overrides = {key: value for key, value in self.tab.overrides.items() if not key.startswith(CONTROL_KEYS)}
-        control_overrides = {key: value for key, value in self.closed_overrides.items() if key.startswith(CONTROL_KEYS)}
-        control = loop_overrides(self.tab.scene_path, {**other_overrides, **control_overrides}, feedback)
-        maneuver_key = CONTROL_KEYS[1]
-        maneuver_overrides = {
-            key: value for key, value in control_overrides.items() if key.startswith(maneuver_key) and feedback
-        }
+        others = {key: value for key, value in self.tab.overrides.items() if not key.startswith(CONTROL_KEYS)}
+        controls = {key: value for key, value in self.closed_overrides.items() if key.startswith(CONTROL_KEYS)}
+        maneuver = {key: value for key, value in controls.items() if feedback and key.startswith("motion.maneuver")}
+        control = loop_overrides(self.tab.scene_path, others | controls, feedback)
         self.loop.disable()  # no second change while this one runs
-        await self.tab.open(self.tab.scene, {**other_overrides, **maneuver_overrides, **control})
+        await self.tab.open(self.tab.scene, others | maneuver | control)
         if self.tab.is_open:
             self.loop.set_value(self.tab.feedback or "")  # the old value, if the scene refused the change
             self.loop.enable()
@@ -116,7 +112,6 @@ class RunPanel:
         self.start()
 
     def start(self) -> None:
-        """Start or continue playback."""
         self.tab.photo.stop()
         self.playing, self.started_s = True, time.monotonic()
         self.play.props("icon=pause")
@@ -131,7 +126,6 @@ class RunPanel:
         self.start()
 
     def pause(self) -> None:
-        """Pause at the current time."""
         self.from_s, self.playing = self.now_s, False
         self.play.props("icon=play_arrow")
 
@@ -148,7 +142,6 @@ class RunPanel:
         self.factor = SPEEDS[str(self.speed.value)]
 
     async def seek_to(self, event: Any) -> None:
-        """Jump to the slider's time."""
         if not self.log.t_s:
             return
         self.from_s, self.started_s = float(event.args), time.monotonic()
@@ -183,7 +176,6 @@ class RunPanel:
             self.busy = False
 
     def append_frame(self, view: FrameView) -> None:
-        """Append a frame's values to the curves."""
         result = view.result
         error_arcsec = math.hypot(result.cross_arcsec, result.roll_arcsec) if result and result.solved else math.nan
         for name, value in (
@@ -246,61 +238,42 @@ def curve_points(log: MotionLog, name: str) -> list[list[float]]:
 def line_series(name: str, chart_index: int, points: list[list[float]], color: str) -> dict[str, Any]:
     """ECharts series of a curve in one strip; values that exist per frame are drawn as dots."""
     dots = name in ("star tracker", "innovation")
-    return {
-        **{"name": name, "type": "scatter" if dots else "line", "data": points, "xAxisIndex": chart_index},
-        **{"yAxisIndex": chart_index, "showSymbol": dots, "symbolSize": 4, "animation": False},
-        **{"lineStyle": {"width": 1.4, "color": color}, "itemStyle": {"color": color}},
-    }
+    series = {"name": name, "type": "scatter" if dots else "line", "data": points, "animation": False}
+    look = {"lineStyle": {"width": 1.4, "color": color}, "itemStyle": {"color": color}}
+    return series | look | {"showSymbol": dots, "symbolSize": 4} | in_strip(chart_index)
 
 
 def time_marker(chart_index: int, now_s: float) -> dict[str, Any]:
     """ECharts series of a vertical line in a strip at a time."""
     line_style = {"color": COLORS["quiet"], "width": 1, "type": "solid"}
-    mark = {
-        **{"silent": True, "symbol": "none", "animation": False, "label": {"show": False}},
-        **{"lineStyle": line_style, "data": [{"xAxis": now_s}]},
-    }
-    return {
-        **{"type": "line", "data": [], "xAxisIndex": chart_index, "yAxisIndex": chart_index},
-        **{"animation": False, "markLine": mark},
-    }
+    mark = {"silent": True, "symbol": "none", "animation": False, "label": {"show": False}, "lineStyle": line_style}
+    series = {"type": "line", "data": [], "animation": False, "markLine": mark | {"data": [{"xAxis": now_s}]}}
+    return series | in_strip(chart_index)
+
+
+def in_strip(chart_index: int) -> dict[str, int]:
+    return {"xAxisIndex": chart_index, "yAxisIndex": chart_index}
 
 
 def options() -> dict[str, Any]:
     """ECharts options of four stacked strips with a common time axis; each has a title, a legend and an empty text."""
     text, rule = {"color": COLORS["quiet"], "fontSize": 10}, {"lineStyle": {"color": COLORS["line"]}}
-    title_style = text | {"fontWeight": "normal", "fontSize": 11}
-    last, slot = len(CHARTS) - 1, 24.2  # percent of the chart's height
-    tops = [1 + n * slot for n in range(last + 1)]
+    title = {"padding": 0, "textStyle": text | {"fontWeight": "normal", "fontSize": 11}}
+    strips, slot = range(len(CHARTS)), 24.2  # percent of the chart's height
+    tops = [1 + n * slot for n in strips]
+    x_axis = {"type": "value", "min": 0, "splitLine": {"show": False}}
+    y_axis = {"splitNumber": 3, "axisLabel": text, "splitLine": rule}
     legend = {"textStyle": text, "itemWidth": 12, "itemHeight": 6, "itemGap": 8, "right": 10, "padding": 0}
     return {
         "animation": False,
         "title": [
-            *(
-                {"text": name, "left": 0, "top": f"{top}%", "padding": 0, "textStyle": title_style}
-                for name, top in zip(CHARTS, tops, strict=True)
-            ),
-            *(
-                {"text": "", "left": "center", "top": f"{top + 11}%", "padding": 0, "textStyle": title_style}
-                for top in tops
-            ),
+            *(title | {"text": name, "left": 0, "top": f"{top}%"} for name, top in zip(CHARTS, tops, strict=True)),
+            *(title | {"text": "", "left": "center", "top": f"{top + 11}%"} for top in tops),
         ],
         "legend": [legend | {"top": f"{top}%", "data": []} for top in tops],
         "tooltip": TOOLTIP,
         "grid": [{"left": 50, "right": 12, "top": f"{top + 5.4}%", "height": "16.4%"} for top in tops],
-        "xAxis": [
-            {
-                **{"type": "value", "gridIndex": n, "min": 0, "splitLine": {"show": False}},
-                "axisLabel": {**text, "show": n == last},
-            }
-            for n in range(last + 1)
-        ],
-        "yAxis": [
-            {
-                **{"type": "log" if n in LOGARITHMIC else "value", "gridIndex": n, "splitNumber": 3},
-                **{"axisLabel": text, "splitLine": rule},
-            }
-            for n in range(last + 1)
-        ],
+        "xAxis": [x_axis | {"gridIndex": n, "axisLabel": text | {"show": n == strips[-1]}} for n in strips],
+        "yAxis": [y_axis | {"gridIndex": n, "type": "log" if n in LOGARITHMIC else "value"} for n in strips],
         "series": [],
     }

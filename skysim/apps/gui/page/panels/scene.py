@@ -25,10 +25,8 @@ class ScenePanel:
     def __init__(self, tab: Tab) -> None:
         self.tab = tab
         with ui.row().classes("w-full no-wrap items-center gap-2").style("margin-bottom: 8px"):
-            self.find = ui.input(placeholder="find a key", on_change=lambda: self.search()).props(
-                "dense outlined clearable"
-            )
-            self.find.classes("flex-grow").mark("find-key")
+            self.find = ui.input(placeholder="find a key", on_change=lambda: self.search())
+            self.find.props("dense outlined clearable").classes("flex-grow").mark("find-key")
             self.name = ui.input(placeholder="new-name").props('dense outlined aria-label="Name of the new scene"')
             self.name.classes("w-36").mark("save-name")
             ui.button("Save as", on_click=self.save).props("dense outline no-wrap size=sm").mark("save")
@@ -57,7 +55,6 @@ class ScenePanel:
         self.filter()
 
     def build(self, fields_by_key: Mapping[str, forms.Field]) -> None:
-        """Rebuild all fields."""
         open_now = {name for name, expansion in self.expansions.items() if expansion.value}
         self.sections.clear()
         for elements in (self.expansions, self.last_typed, self.rows, self.labels, self.inputs):
@@ -72,7 +69,6 @@ class ScenePanel:
                             self.row(field)
 
     def row(self, field: forms.Field) -> None:
-        """Build the row of one key."""
         key_in_section = field.key.removeprefix(f"{field.section}.")
         with ui.row().classes("w-full no-wrap items-start gap-2") as box:
             head = ui.label(key_in_section).classes("mono w-48 flex-none ellipsis").style("padding-top: 6px")
@@ -85,10 +81,8 @@ class ScenePanel:
                 entry = ui.input(value=field.text).props(f'dense outlined suffix="{field.unit}"')
                 leave = partial(self.edit, field.key)
                 entry.on("keydown.enter", leave).on("blur", leave)
-            entry.classes("flex-grow").style("width: 0; margin-bottom: 3px").props(
-                f'hide-bottom-space aria-label="{field.key}"'
-            )
-            entry.mark(f"key-{field.key}")
+            entry.classes("flex-grow").style("width: 0; margin-bottom: 3px").mark(f"key-{field.key}")
+            entry.props(f'hide-bottom-space aria-label="{field.key}"')
         self.rows[field.key], self.inputs[field.key], self.labels[field.key] = box, entry, head
 
     def style_class(self, field: forms.Field) -> str:
@@ -149,7 +143,6 @@ class ScenePanel:
             first.open()
 
     async def save(self) -> None:
-        """Save the scene as a new file in the tab's folder."""
         name = (self.name.value or "").strip()
         title_before = self.tab.scene_info.title.removesuffix(", changed") if self.tab.scene_info else ""
         title = f"{title_before}, changed" if title_before else name

@@ -72,7 +72,6 @@ class Sensor:
         self.wait_label.set_text("\n".join(lines))
 
     def build_controls(self) -> None:
-        """Build the controls: overlays, stretch, brightness."""
         with ui.element("div").classes("lab-bar"):
             for kind in overlay.KINDS:
                 box = ui.checkbox(kind, value=kind in self.shown).props("dense size=xs")
@@ -86,7 +85,6 @@ class Sensor:
             self.brightness.classes("w-24").on("change", self.restretch)
 
     def clear_zoom(self) -> None:
-        """Clear the enlarged pixels and the mouse position."""
         self.mouse_px, self.zoom_is_current = None, False
         self.magnified.set_content('<div class="lab-zoom">click a star to see its pixels</div>')
         self.magnified.classes(remove="stale")
@@ -137,7 +135,6 @@ class Sensor:
                 return
 
     def show(self, view: FrameView) -> None:
-        """Show a frame of the scene."""
         self.lights, self.result = view.lights, view.result
         self.prefix = self.tab.scene_info.prefix if self.tab.scene_info else "HIP"
         self.statistics = statistics_text(view.size_px, view.statistics, view.result, view, self.tab.scene_info)
@@ -160,10 +157,8 @@ class Sensor:
 
     def update_text(self) -> None:
         """Show data on what is under the mouse, or else the frame's numbers."""
-        if self.mouse_px is None:
-            self.hover.set_text(self.statistics)
-            return
-        self.hover.set_text(self.pixel_text(*self.mouse_px, *self.nearest(*self.mouse_px)))
+        at = self.mouse_px
+        self.hover.set_text(self.pixel_text(*at, *self.nearest(*at)) if at else self.statistics)
 
     def update_marks(self) -> None:
         """Send the frame's address and its marks to the canvas."""
@@ -182,7 +177,6 @@ class Sensor:
         return f"Sensor view: {len(self.lights)} true lights; identified: {', '.join(identified) or 'none'}"
 
     def name(self, id: int) -> str:
-        """Name of a light by its number."""
         return NAMES.get(id, f"HIP {id}") if self.prefix == "HIP" else f"{self.prefix} {id}"
 
     async def mouse(self, event: Any) -> None:
@@ -238,13 +232,8 @@ def statistics_text(
     scene_info: SceneInfo | None = None,
 ) -> str:
     """A frame's numbers in two columns; fewer for an image that is not of the scene (view is None)."""
-    rows = [
-        (
-            "frame",
-            f"{size_px[0]} × {size_px[1]} px",
-            *(("field", f"{scene_info.field_deg:.4g}°") if scene_info else ("", "")),
-        )
-    ]
+    field = ("field", f"{scene_info.field_deg:.4g}°") if scene_info else ("", "")
+    rows = [("frame", f"{size_px[0]} × {size_px[1]} px", *field)]
     if view:
         rows += [("exposure", f"{1e3 * view.exposure_s:.4g} ms", "rendering", f"{view.ms:.0f} ms")]
     rows += [
