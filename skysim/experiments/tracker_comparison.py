@@ -13,6 +13,7 @@ import numpy as np
 from skysim.core import files
 from skysim.core.errors import InputError
 from skysim.core.types import Frame, FrameRow, Truth
+from skysim.experiments.configs import with_config
 from skysim.results import metrics, scoring
 from skysim.scene.scene import Scene
 from skysim.simulation import run
@@ -53,13 +54,8 @@ def build_trackers(testbed: Testbed, names: Sequence[str]) -> dict[str, factory.
     repeated = [name for name, count in Counter(names).items() if count > 1]
     if repeated:
         raise InputError(f"--tracker {repeated[0]}: given twice; allowed: once")
-    return {name: build_tracker(with_tracker(testbed, name)) for name in names}
-
-
-def with_tracker(testbed: Testbed, name: str) -> Testbed:
-    """The same test bed with another tracker."""
-    config = testbed.scene.tracker.model_copy(update={"name": name})
-    return replace(testbed, scene=testbed.scene.model_copy(update={"tracker": config}))
+    scenes = {name: with_config(testbed.scene, "tracker", name=name) for name in names}
+    return {name: build_tracker(replace(testbed, scene=scene)) for name, scene in scenes.items()}
 
 
 def compare_frames(
