@@ -54,14 +54,13 @@ class Serial:
     name, workers = "serial", 1
 
     def run(self, spec: TrialSpec, chunks: Chunks) -> Iterator[list[Row]]:
-        """See `Engine`."""
         while chunk := chunks.next():
             rows, seconds = run_timed(spec, chunk)
             chunks.report_time(chunk, seconds)
             yield rows
 
     def close(self) -> None:
-        """See `Engine`."""
+        """Nothing is kept between runs."""
 
 
 class Pool:
@@ -80,7 +79,6 @@ class Pool:
         self._spec: TrialSpec | None = None
 
     def run(self, spec: TrialSpec, chunks: Chunks) -> Iterator[list[Row]]:
-        """See `Engine`."""
         retries: deque[Chunk] = deque()
         deaths: Counter[int] = Counter()  # by trial
         done = False
@@ -103,7 +101,6 @@ class Pool:
                     self._kill()
 
     def close(self) -> None:
-        """See `Engine`."""
         if self._pool is not None:
             self._pool.shutdown()
         self._pool = None
@@ -144,7 +141,6 @@ class Pool:
                 except BrokenProcessPool:  # a worker died while the caller stored rows
                     retries.appendleft(chunk)
                     raise
-                capacity = capacity if not retries else 1
             if not in_flight:
                 return
             for future in wait(in_flight, return_when=FIRST_COMPLETED).done:
