@@ -57,12 +57,6 @@ def scene_with_exposure(time_s: float) -> Scene:
     return with_config(scene, "light.led", intensity_cd=INTENSITY_CD * FRAME_TIME_S / time_s)
 
 
-def with_other_leds(testbed: Testbed, hardware_seed: int) -> Testbed:
-    """The same board with nine other LEDs, by another hardware seed."""
-    scene = with_config(testbed.scene, "light.layout", hardware_seed=hardware_seed)
-    return replace(testbed, scene=scene, sources=light_sources(scene, testbed.band))
-
-
 def take_board(testbed: Testbed, images: int, rng: np.random.Generator) -> Floats:
     """(n, 9) magnitudes of a board, sorted within each image, from images at each of the five attitudes.
 
@@ -82,8 +76,11 @@ def table_2(options: ExperimentOptions) -> ExperimentResult:
         options.watch(n, boards)
         hardware_seed = int(np.random.default_rng([options.seed, n]).integers(2**31))
         for stage, testbed in enumerate(stands):
+            # The same board with nine other LEDs, by another hardware seed.
+            scene = with_config(testbed.scene, "light.layout", hardware_seed=hardware_seed)
+            other_leds = replace(testbed, scene=scene, sources=light_sources(scene, testbed.band))
             rng = np.random.default_rng([options.seed, stage, n])
-            runs[stage].append(take_board(with_other_leds(testbed, hardware_seed), images, rng))
+            runs[stage].append(take_board(other_leds, images, rng))
     found_arcsec = lattice_angles(stands[0], options.trials(20, 2), np.random.default_rng([options.seed, 2]))
     drawings = (
         Drawing(

@@ -22,7 +22,7 @@ from skysim.experiments.papers.compare import Cause, Drawing, ExperimentOptions,
 from skysim.experiments.papers.intervals import bootstrap_interval, sample_std, symmetric_interval
 from skysim.experiments.papers.published import experiments, published_values
 from skysim.experiments.study.execution.trials import constant_rate, reseeded
-from skysim.results.metrics import WRONG_RAD, Summary, extremum, proportion, rms
+from skysim.results.metrics import WRONG_RAD, extremum, proportion, rms
 from skysim.results.plots import INK, MARKS
 from skysim.scene import loader
 from skysim.simulation import exposure, random_streams
@@ -147,7 +147,10 @@ def table_2(options: ExperimentOptions) -> ExperimentResult:
     }
     zenith_deg = zenith_distance_deg(calibrated.estimated_deg[0])
     results["zenith"] = RowResult(extremum(np.array([zenith_deg]), np.max))
-    results["rate"] = results["rate_fit"] = RowResult(right_ascension_rate(calibrated))
+    # Least-squares slope of the right ascension, with the 95 % interval from its residuals.
+    slope, covariance = np.polyfit(calibrated.minutes, calibrated.estimated_deg[:, 0], 1, cov=True)
+    rate = symmetric_interval(slope[0], 1.96 * np.sqrt(covariance[0, 0]), len(local))
+    results["rate"] = results["rate_fit"] = RowResult(rate)
     results |= scatter_results(calibrated, uncalibrated)
     error_rad = np.concatenate([solutions.error_rad for solutions in uncalibrated])
     for key, is_hit in (("failed", np.isnan(error_rad)), ("wrong", error_rad > WRONG_RAD)):
@@ -168,12 +171,6 @@ def scatter_results(calibrated: FrameSolutions, uncalibrated: list[FrameSolution
     cause = Cause(name, bootstrap_interval(means, np.mean))
     results["noise"] = RowResult(bootstrap_interval(norms, np.mean), cause=cause)
     return results
-
-
-def right_ascension_rate(solutions: FrameSolutions) -> Summary:
-    """Least-squares slope of the right ascension, deg/min, with the 95 % interval from its residuals."""
-    slope, covariance = np.polyfit(solutions.minutes, solutions.estimated_deg[:, 0], 1, cov=True)
-    return symmetric_interval(slope[0], 1.96 * np.sqrt(covariance[0, 0]), len(solutions.local))
 
 
 def zenith_distance_deg(angles_deg: Floats) -> float:

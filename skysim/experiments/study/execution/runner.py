@@ -20,7 +20,6 @@ from skysim.experiments.study.plan import Plan, resolve_point
 from skysim.experiments.study.store import Store
 
 CHUNK_S = 0.25  # run time of a chunk: long relative to its overhead, short in case a worker dies
-
 MAX_CHUNK = 5000  # maximum number of trials in a chunk
 
 

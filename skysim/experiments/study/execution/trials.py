@@ -323,7 +323,10 @@ def summarize_flight(testbed: Testbed, outcomes: list[Outcome], settle_s: float)
     solved = [outcome for outcome in outcomes if outcome.solved]
     x, y, roll = (_rms([getattr(one, name) for one in solved]) for name in ("x_arcsec", "y_arcsec", "roll_arcsec"))
     good = [bool(one.solved and not one.wrong) for one in outcomes]
-    error = filter_error_arcsec(testbed, settle_s)
+    # (K,) angular error of the filter at the ticks from settle_s on; empty without a filter.
+    log, error = testbed.log, np.empty(0)
+    if log.lab_from_filter is not None:
+        error = (log.lab_from_filter * log.lab_from_body.inv()).magnitude()[log.t_s >= settle_s] / ARCSEC_RAD
     quarter = len(error) // 4
     limit = metrics.WRONG_RAD / ARCSEC_RAD
     return Outcome(
@@ -343,15 +346,6 @@ def summarize_flight(testbed: Testbed, outcomes: list[Outcome], settle_s: float)
         float(error.max(initial=-np.inf)) if len(error) else math.nan,
         _rms(error[-quarter:]) - _rms(error[:quarter]) if quarter else math.nan,
     )
-
-
-def filter_error_arcsec(testbed: Testbed, settle_s: float) -> Floats:
-    """(K,) angular error of the filter at the ticks from `settle_s` on; empty without a filter."""
-    log = testbed.log
-    if log.lab_from_filter is None:
-        return np.empty(0)
-    error = (log.lab_from_filter * log.lab_from_body.inv()).magnitude() / ARCSEC_RAD
-    return np.asarray(error[log.t_s >= settle_s])
 
 
 def _rms(values: list[float] | NDArray[Any]) -> float:

@@ -293,7 +293,7 @@ def draw_indices(fig: Any, selected: Sequence[Index], response: str) -> None:
         (-0.19, "first order", INK[0], [one.first for one in selected]),
         (0.19, "total", GRAY, [one.total for one in selected]),
     ):
-        value, low, high = (np.array([one[n] for one in parts], dtype=float) for n in range(3))
+        value, low, high, _ = np.array(parts, dtype=float).reshape(-1, 4).T
         axes.barh(rows + shift, np.nan_to_num(value), 0.36, color=ink, label=name)
         axes.hlines(rows + shift, np.clip(low, -9, 9), np.clip(high, -9, 9), color="#333333", linewidth=1)
     bounds = np.array([end for one in selected for end in (*one.first[:3], *one.total[:3], 0.0)])
