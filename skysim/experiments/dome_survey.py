@@ -12,12 +12,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from estimator.attitude.dome_map import LedMap, Lever
 from estimator.calibration import dome_survey
 from estimator.calibration.dome_survey import DomeFrame, DomeSurvey
 from estimator.core.camera import Camera
@@ -28,6 +28,7 @@ from skysim.core.errors import InputError
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats, Frame, Trajectory, Truth
 from skysim.core.units import quantity
+from skysim.experiments.configs import with_config
 from skysim.experiments.dome_survey_naming import (
     CalibrationPrior,
     Correspondences,
@@ -92,26 +93,21 @@ def calibration_prior(testbed: Testbed) -> CalibrationPrior:
 
 def with_survey_errors(scene: Scene, uncertainty: SurveyUncertainty) -> Scene:
     """The scene with the onboard model before a survey: errors of this size, drawn with `tracker.survey.seed`."""
-    errors = {"led_sigma_m": uncertainty.led_sigma_m, "lever_sigma_m": uncertainty.lever_sigma_m}
-    updates = {
-        "survey": scene.tracker.survey.model_copy(update=errors),
-        "assumed_focal_length_m": scene.camera.focal_length_m * (1 + uncertainty.focal_error),
-        "assumed_camera_body_m": None,
-        "map": None,
-    }
-    return scene.model_copy(update={"tracker": scene.tracker.model_copy(update=updates)})
+    focal_length_m = scene.camera.focal_length_m * (1 + uncertainty.focal_error)
+    return with_onboard_model(scene, uncertainty.led_sigma_m, uncertainty.lever_sigma_m, focal_length_m, None)
 
 
 def with_map(scene: Scene, path: str) -> Scene:
     """The scene whose tracker uses the map file of a surveyed dome, and no other onboard errors."""
-    no_errors = {"led_sigma_m": 0.0, "lever_sigma_m": 0.0}
-    updates = {
-        "survey": scene.tracker.survey.model_copy(update=no_errors),
-        "assumed_focal_length_m": None,
-        "assumed_camera_body_m": None,
-        "map": path,
-    }
-    return scene.model_copy(update={"tracker": scene.tracker.model_copy(update=updates)})
+    return with_onboard_model(scene, 0.0, 0.0, None, path)
+
+
+def with_onboard_model(
+    scene: Scene, led_sigma_m: float, lever_sigma_m: float, focal_length_m: float | None, path: str | None
+) -> Scene:
+    """The scene whose tracker has survey errors of this size, and assumes this focal length or map file."""
+    scene = with_config(scene, "tracker.survey", led_sigma_m=led_sigma_m, lever_sigma_m=lever_sigma_m)
+    return with_config(scene, "tracker", assumed_focal_length_m=focal_length_m, assumed_camera_body_m=None, map=path)
 
 
 def stop_attitudes(scene: Scene, stream_name: str, count: int, tilt_deg: float) -> Rotation:
@@ -134,9 +130,7 @@ def render_stops(testbed: Testbed, lab_from_body: Rotation, first: int = 0) -> I
     selects its noise."""
     for n, attitude in enumerate(lab_from_body):
         end_s = exposure_window(testbed.scene, first + n).close_s(testbed.scene.camera.height_px) + MARGIN_S
-        attitudes = Rotation.concatenate([attitude, attitude])
-        trajectory = Trajectory(np.array([0.0, end_s]), attitudes, np.zeros((2, 3)))
-        yield exposure.render_frame(replace(testbed, trajectory=trajectory), first + n)
+        yield exposure.render_frame(replace(testbed, trajectory=Trajectory.at_rest(attitude, end_s)), first + n)
 
 
 def take_survey_frames(
@@ -147,7 +141,7 @@ def take_survey_frames(
     measured = imu_attitudes(testbed.scene, lab_from_body, uncertainty.imu_sigma_rad)
     settings = tracker_settings.assumed_settings(testbed.scene)
     for (frame, _), body_from_lab in zip(render_stops(testbed, lab_from_body), measured, strict=True):
-        yield SurveyFrame(detect_lights(settings, prior.camera, frame), body_from_lab)
+        yield SurveyFrame(detect_lights(settings, prior.camera, frame.image_dn), body_from_lab)
 
 
 def imu_attitudes(scene: Scene, lab_from_body: Rotation, sigma_rad: float) -> Rotation:
@@ -179,12 +173,10 @@ def run_survey(
         if survey:
             adjusted_prior = CalibrationPrior(survey.camera, survey.leds, survey.lever, floor_px)
             # The attitudes are adjusted now, so only the map's and the residual error remain in the predictions.
-            sigma_px = np.hypot(
-                led_sigma_m(survey, uncertainty) * adjusted_prior.px_per_m, max(survey.rms_px, floor_px)
-            )
-            frames = [
-                replace(frames[k], body_from_lab=survey.body_from_lab[k]) for k in np.flatnonzero(survey.tied).tolist()
-            ]
+            map_px = led_sigma_m(survey, uncertainty) * adjusted_prior.px_per_m
+            sigma_px = np.hypot(map_px, max(survey.rms_px, floor_px))
+            tied = np.flatnonzero(survey.tied).tolist()
+            frames = [replace(frames[k], body_from_lab=survey.body_from_lab[k]) for k in tied]
             matches = [match_by_survey(frame, adjusted_prior, sigma_px) for frame in frames]
             # Keep the map from before the survey: it enters each adjustment as a measurement.
             prior = replace(adjusted_prior, leds=prior.leds)
@@ -210,16 +202,21 @@ def adjust_connected(
     visible = led_visibility(frames, matches, prior)
     for min_shared in MIN_SHARED_LEDS:
         selected = largest_connected_group(visible, min_shared)
-        dome_frames = [
-            dome_frame(frames[k].lights, matches[k], frames[k].body_from_lab, prior.floor_px) for k in selected
-        ]
+        dome_frames = [dome_frame(frames[k], matches[k], prior.floor_px) for k in selected]
         try:
-            survey = robust_survey(
-                dome_frames, prior.leds, prior.lever, prior.camera, uncertainty.led_sigma_m, fit_distortion
+            # A robust loss, and the prior map as a measurement.
+            survey = dome_survey.survey(
+                dome_frames,
+                prior.leds,
+                prior.lever,
+                prior.camera,
+                fit_distortion=fit_distortion,
+                loss="cauchy",
+                leds_sigma_m=uncertainty.led_sigma_m,
             )
-        except InputError:
+        except ValueError as error:
             if min_shared == MIN_SHARED_LEDS[-1]:
-                raise
+                raise InputError(str(error)) from None
         else:
             break
     return [frames[k] for k in selected], survey
@@ -302,32 +299,15 @@ def dome_map(survey: DomeSurvey, uncertainty: SurveyUncertainty) -> DomeMap:
     )
 
 
-def detect_lights(settings: Settings, camera: Camera, frame: Frame) -> Centroids:
-    """Centroids of a frame; none if the tracker would reject the image."""
+def detect_lights(settings: Settings, camera: Camera, image_dn: NDArray[Any]) -> Centroids:
+    """Centroids of an image; none if the tracker would reject it."""
     try:
-        return detect_and_centroid(frame.image_dn, camera, settings, Clock())
+        return detect_and_centroid(image_dn, camera, settings, Clock())
     except ImageError:
         return Centroids.empty()
 
 
-def dome_frame(detections: Centroids, match: Correspondences, body_from_lab: Rotation, floor_px: float) -> DomeFrame:
+def dome_frame(frame: SurveyFrame, match: Correspondences, floor_px: float) -> DomeFrame:
     """Input frame of the adjustment: matched detections with their LEDs, and the start attitude."""
-    sigma_px = np.hypot(detections.sigma_px[match.light], floor_px)
-    return DomeFrame(match.led, detections.xy_px[match.light], sigma_px, body_from_lab)
-
-
-def robust_survey(
-    frames: list[DomeFrame],
-    leds: LedMap,
-    lever: Lever,
-    camera: Camera,
-    led_sigma_m: float,
-    fit_distortion: bool,
-) -> DomeSurvey:
-    """`dome_survey.survey` with a robust (Cauchy) loss and the prior map as a measurement. Raises InputError."""
-    try:
-        return dome_survey.survey(
-            frames, leds, lever, camera, None, fit_distortion, loss="cauchy", leds_sigma_m=led_sigma_m
-        )
-    except ValueError as error:
-        raise InputError(str(error)) from None
+    sigma_px = np.hypot(frame.lights.sigma_px[match.light], floor_px)
+    return DomeFrame(match.led, frame.lights.xy_px[match.light], sigma_px, frame.body_from_lab)

@@ -109,11 +109,7 @@ def match_by_imu(frame: SurveyFrame, prior: CalibrationPrior, uncertainty: Surve
 
 
 def common_shift_px(
-    detected_px: Floats,
-    predicted_px: Floats,
-    common_px: float,
-    individual_px: float,
-    center_px: tuple[float, float],
+    detected_px: Floats, predicted_px: Floats, common_px: float, individual_px: float, center_px: tuple[float, float]
 ) -> Floats:
     """(2,) most likely common shift of (P, 2) predictions onto (S, 2) detections, pixels.
 

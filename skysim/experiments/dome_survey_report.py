@@ -18,21 +18,13 @@ from skysim.simulation.testbed import Testbed
 from skysim.tracking import factory
 
 
-class TrackerErrors(NamedTuple):
-    """Result of a tracker at new stops: number of stops, and (S,) cross-boresight and roll errors of those solved."""
-
-    stops: int
-    cross_rad: Floats
-    roll_rad: Floats
-
-    def statistics(self) -> dict[str, float | int | None]:
-        """Median and worst errors in degrees; None if nothing was solved."""
-        statistics: dict[str, float | int | None] = {"stops": self.stops, "solved": len(self.cross_rad)}
-        for name, error in (("cross", self.cross_rad), ("roll", self.roll_rad)):
-            error_deg = np.degrees(np.abs(error))
-            statistics[f"{name}_deg_median"] = float(np.median(error_deg)) if len(error_deg) else None
-            statistics[f"{name}_deg_worst"] = float(error_deg.max()) if len(error_deg) else None
-        return statistics
+def error_statistics(stops: int, errors_rad: list[tuple[float, float]]) -> dict[str, float | int | None]:
+    """Median and worst cross-boresight and roll errors of a tracker in degrees; None if nothing was solved."""
+    statistics: dict[str, float | int | None] = {"stops": stops, "solved": len(errors_rad)}
+    for name, error_deg in zip(("cross", "roll"), np.degrees(np.abs(errors_rad)).reshape(-1, 2).T, strict=True):
+        statistics[f"{name}_deg_median"] = float(np.median(error_deg)) if len(error_deg) else None
+        statistics[f"{name}_deg_worst"] = float(error_deg.max()) if len(error_deg) else None
+    return statistics
 
 
 def compare_trackers(
@@ -47,9 +39,7 @@ def compare_trackers(
             cam_from_ref = factory.solve_frame(tracker, frame).attitude.cam_from_ref
             if cam_from_ref is not None:
                 errors[name].append(metrics.cross_and_roll_rad(cam_from_ref, truth.cam_from_lab))
-    return {
-        name: TrackerErrors(stops, *np.array(pairs).reshape(-1, 2).T).statistics() for name, pairs in errors.items()
-    }
+    return {name: error_statistics(stops, errors_rad) for name, errors_rad in errors.items()}
 
 
 class LedErrors(NamedTuple):
@@ -72,9 +62,8 @@ def led_errors(survey: DomeSurvey, prior: CalibrationPrior, testbed: Testbed) ->
     row = np.flatnonzero(survey.surveyed)
     position_m = survey.leds.position_m[row]
     _, nearest = cKDTree(true_m).query(position_m)
-    return LedErrors(
-        true_m[row], prior.leds.position_m[row] - true_m[row], position_m - true_m[nearest], nearest != row
-    )
+    before_m = prior.leds.position_m[row] - true_m[row]
+    return LedErrors(true_m[row], before_m, position_m - true_m[nearest], nearest != row)
 
 
 def survey_statistics(
@@ -129,21 +118,11 @@ def led_error_figure(errors: LedErrors) -> NDArray[np.uint8]:
         rms_mm = 1e3 * float(np.sqrt(np.mean(error_m**2)))
         scale_mm = 1e3 * float(np.quantile(np.linalg.norm(error_m, axis=1), 0.95)) or 1.0
         x_m, y_m, _ = errors.true_m.T
-        arrows = axes.quiver(
-            x_m,
-            y_m,
-            *(1e3 * error_m[:, :2].T),
-            1e3 * error_m[:, 2],
-            angles="xy",
-            scale=25 * scale_mm,
-            cmap="coolwarm",
-        )
+        arrows = axes.quiver(x_m, y_m, *(1e3 * error_m.T), angles="xy", scale=25 * scale_mm, cmap="coolwarm")
         arrows.set_clim(-scale_mm, scale_mm)
         axes.quiverkey(arrows, 0.9, 1.03, scale_mm, f"{scale_mm:.2g} mm", labelpos="E")
         axes.set_title(f"{title}: {rms_mm:.2g} mm rms an axis", loc="left")
-        axes.set_xlabel("x [m]")
-        axes.set_ylabel("y [m]")
-        axes.set_aspect("equal")
+        axes.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
         fig.colorbar(arrows, ax=axes, label="z error [mm]", shrink=0.8)
     canvas.draw()
     return np.ascontiguousarray(np.asarray(canvas.buffer_rgba())[:, :, 2::-1])

@@ -13,6 +13,7 @@ import numpy as np
 from skysim.core import files
 from skysim.core.errors import InputError
 from skysim.core.types import Frame, FrameRow, Truth
+from skysim.experiments.configs import with_config
 from skysim.results import metrics, scoring
 from skysim.scene.scene import Scene
 from skysim.simulation import run
@@ -53,13 +54,8 @@ def build_trackers(testbed: Testbed, names: Sequence[str]) -> dict[str, factory.
     repeated = [name for name, count in Counter(names).items() if count > 1]
     if repeated:
         raise InputError(f"--tracker {repeated[0]}: given twice; allowed: once")
-    return {name: build_tracker(with_tracker(testbed, name)) for name in names}
-
-
-def with_tracker(testbed: Testbed, name: str) -> Testbed:
-    """The same test bed with another tracker."""
-    config = testbed.scene.tracker.model_copy(update={"name": name})
-    return replace(testbed, scene=testbed.scene.model_copy(update={"tracker": config}))
+    scenes = {name: with_config(testbed.scene, "tracker", name=name) for name in names}
+    return {name: build_tracker(replace(testbed, scene=scene)) for name, scene in scenes.items()}
 
 
 def compare_frames(
@@ -111,11 +107,16 @@ def score_tracker(tracker: str, rows: Sequence[FrameRow]) -> TrackerScore:
 
 
 def write_scores(folder: Path, rows: Mapping[str, list[FrameRow]], scene: Scene) -> list[TrackerScore]:
-    """Write solutions.NAME.ecsv of every tracker and scoreboard.ecsv. Returns the statistics of each tracker."""
+    """Write solutions.NAME.ecsv of every tracker and scoreboard.ecsv, without `refusals`: the status of each frame is
+    in the solutions. Returns the statistics of each tracker."""
+    from astropy.table import Table
+
     scores = [score_tracker(name, tracker_rows) for name, tracker_rows in rows.items()]
     for name, tracker_rows in rows.items():
         files.write_table(folder / f"solutions.{name}.ecsv", scoring.table(tracker_rows, scoring.angle_names(scene)))
-    files.write_table(folder / "scoreboard.ecsv", score_table(scores))
+    score_rows = as_dicts(scores)
+    columns = {name: [row[name] for row in score_rows] for name in score_rows[0] if name != "refusals"}
+    files.write_table(folder / "scoreboard.ecsv", Table(columns))
     return scores
 
 
@@ -125,11 +126,3 @@ def as_dicts(scores: Sequence[TrackerScore]) -> list[dict[str, Any]]:
         asdict(score) | {"right": score.right.value, "right_low": score.right.low, "right_high": score.right.high}
         for score in scores
     ]
-
-
-def score_table(scores: Sequence[TrackerScore]) -> Any:
-    """One row per tracker as an astropy table, without `refusals`; the status of each frame is in the solutions."""
-    from astropy.table import Table
-
-    rows = as_dicts(scores)
-    return Table({name: [row[name] for row in rows] for name in rows[0] if name != "refusals"})

@@ -51,9 +51,9 @@ class RowResult(NamedTuple):
     cause: Cause | None = None
 
 
-def with_cause(cause: str, statistic: Callable[[Any], Summary], ours: Any, theirs: Any) -> RowResult:
+def with_cause(cause: str, statistic: Callable[[Any], Summary], ours: Any, theirs: Any, *, note: str = "") -> RowResult:
     """A statistic of our baseline's values, and of the values that were simulated with a cause too."""
-    return RowResult(statistic(ours), cause=Cause(cause, statistic(theirs)))
+    return RowResult(statistic(ours), note, Cause(cause, statistic(theirs)))
 
 
 class Drawing(NamedTuple):

@@ -16,22 +16,15 @@ from skysim.results.metrics import CONFIDENCE, RESAMPLES, Summary
 
 def confidence_interval(values: Sequence[float] | Floats) -> Summary:
     """The mean with Student's confidence interval: mean +- t s / sqrt(n)."""
-    return student_interval(values, 0.0)
+    return prediction_interval(values, own_variance=0.0)
 
 
-def prediction_interval(values: Sequence[float] | Floats, count: int = 0) -> Summary:
-    """The mean with Student's prediction interval: mean +- t s sqrt(1 + 1 / n).
+def prediction_interval(values: Sequence[float] | Floats, count: int = 0, own_variance: float = 1.0) -> Summary:
+    """The mean with Student's prediction interval: mean +- t s sqrt(1 + 1 / n), t for n - 1 degrees of freedom.
 
     For a published number that is itself a single draw.
     count : number of independent draws, if fewer than the values
-    """
-    return student_interval(values, 1.0, count)
-
-
-def student_interval(values: Sequence[float] | Floats, own_variance: float, count: int = 0) -> Summary:
-    """mean +- t s sqrt(own_variance + 1 / n), t for n - 1 degrees of freedom.
-
-    own_variance : variance of the predicted draw in units of s^2: 0 for a confidence, 1 for a prediction interval
+    own_variance : of the predicted draw in units of s^2, in place of 1
     """
     draws = np.asarray(values, float)
     count, mean = count or len(draws), float(np.mean(draws))

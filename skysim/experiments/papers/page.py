@@ -8,13 +8,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from skysim.core.files import make_folder, write_bytes, write_text
-from skysim.experiments.papers.compare import (
-    VERDICTS,
-    Comparison,
-    Reproduction,
-    format_summary,
-    format_with_source,
-)
+from skysim.experiments.papers.compare import VERDICTS, Comparison, Reproduction, format_summary, format_with_source
 from skysim.results.plots import png
 from skysim.results.report import embed, render_page
 

@@ -82,20 +82,16 @@ def one_at_a_time(design: Design, factors: Factors, seed: int) -> Iterator[Point
 
 def points_at(factors: Factors, coordinates: Floats) -> Iterator[Point]:
     """The points at (P, D) coordinates in the unit cube."""
-    for row in coordinates:
-        yield make_point(
-            {name: factor.value_at(float(u)) for (name, factor), u in zip(factors.items(), row, strict=True)}
-        )
+    for row in coordinates.tolist():
+        yield make_point({name: factors[name].value_at(u) for name, u in zip(factors, row, strict=True)})
 
 
-def lhs(design: Design, factors: Factors, seed: int) -> Iterator[Point]:
-    """A Latin hypercube: each factor's range is divided into as many strips as points, with one point in each."""
-    yield from points_at(factors, scipy.stats.qmc.LatinHypercube(len(factors), rng=seed).random(design.points or 0))
-
-
-def sobol(design: Design, factors: Factors, seed: int) -> Iterator[Point]:
-    """A Sobol sequence, scrambled by the seed."""
-    yield from points_at(factors, scipy.stats.qmc.Sobol(len(factors), rng=seed).random(design.points or 0))
+def sample(design: Design, factors: Factors, seed: int) -> Iterator[Point]:
+    """A Latin hypercube, in which each factor's range is divided into as many strips as points, with one point in each;
+    or a Sobol sequence, scrambled by the seed."""
+    qmc = scipy.stats.qmc
+    sampler = (qmc.LatinHypercube if design.kind == "lhs" else qmc.Sobol)(len(factors), rng=seed)
+    yield from points_at(factors, sampler.random(design.points or 0))
 
 
 def saltelli(design: Design, factors: Factors, seed: int) -> Iterator[Point]:
@@ -115,7 +111,7 @@ def saltelli(design: Design, factors: Factors, seed: int) -> Iterator[Point]:
 DESIGNS: dict[str, Callable[[Design, Factors, int], Iterator[Point]]] = {
     "factorial": factorial,
     "one_at_a_time": one_at_a_time,
-    "lhs": lhs,
-    "sobol": sobol,
+    "lhs": sample,
+    "sobol": sample,
     "saltelli": saltelli,
 }

@@ -40,18 +40,21 @@ def join_quantity(number: float, unit: str) -> Value:
     return int(number) if number == int(number) and abs(number) < 2**53 else float(f"{number:.12g}")
 
 
+def option_at(factor: Levels | Values, u: float) -> tuple[Value, Settings]:
+    """The level or value at u in [0, 1], which is divided equally among all options."""
+    options = factor.options()
+    return options[min(int(u * len(options)), len(options) - 1)]
+
+
 class Levels(ConfigModel):
     """Named levels, each of which sets any number of keys."""
 
     levels: Annotated[dict[str, Settings], Field(min_length=1)]
+    value_at = option_at
 
-    def options(self) -> list[tuple[str, Settings]]:
+    def options(self) -> list[tuple[Value, Settings]]:
         """Every level: its name in tables and its settings."""
         return list(self.levels.items())
-
-    def value_at(self, u: float) -> tuple[Value, Settings]:
-        """The level at u in [0, 1]; all levels are equally likely."""
-        return pick_option(self.options(), u)
 
 
 class KeyedFactor(ConfigModel):
@@ -75,14 +78,11 @@ class Values(KeyedFactor):
     """Explicit values of a key."""
 
     values: Annotated[tuple[Value, ...], Field(min_length=1)]
+    value_at = option_at
 
     def options(self) -> list[tuple[Value, Settings]]:
         """Every value with its settings."""
         return [(value, self.settings_for(value)) for value in self.values]
-
-    def value_at(self, u: float) -> tuple[Value, Settings]:
-        """The value at u in [0, 1]; all values are equally likely."""
-        return pick_option(self.options(), u)
 
 
 class Range(KeyedFactor):
@@ -185,18 +185,10 @@ QUANTILES: dict[str, Callable[..., Any]] = {
 }
 
 
-def pick_option(options: list[tuple[Any, Settings]], u: float) -> tuple[Value, Settings]:
-    """The option at u, with [0, 1] divided equally among the options."""
-    return options[min(int(u * len(options)), len(options) - 1)]
-
-
 def kind_of(value: Any) -> str:
     """Tag of the kind of factor, from its keys, so that error messages name the keys of that kind only."""
     keys = value if isinstance(value, dict) else getattr(value, "__dict__", {})
-    for name in ("levels", "values", "distribution"):
-        if name in keys:
-            return name
-    return "range"
+    return next((name for name in ("levels", "values", "distribution") if name in keys), "range")
 
 
 Factor = Annotated[

@@ -9,21 +9,11 @@ from pydantic import ValidationError
 
 from skysim.core.errors import InputError, unknown_name
 from skysim.core.yaml_reader import check_version, explain, line_of, read_yaml, set_key
+from skysim.experiments.study.designs import make_point
 from skysim.experiments.study.factors import Factor, Settings, Value
-from skysim.experiments.study.plan import (
-    CentroidTrial,
-    Curve,
-    FlightTrial,
-    FrameTrial,
-    Plan,
-    Study,
-    find,
-    make_plan,
-    resolve_point,
-)
+from skysim.experiments.study.plan import CentroidTrial, Curve, FlightTrial, Plan, Study, find, make_plan, resolve_point
 from skysim.results import metrics
 from skysim.scene.light import CollimatedDisplayConfig
-from skysim.scene.scene import Scene
 from skysim.tracking.external.interface import OWN, check_tracker_name
 
 
@@ -48,8 +38,11 @@ def load(
     try:
         plan = make_plan(path, study, tree["trial"], programs or {})
         check(plan, to_run=programs is not None)
-    except InputError as error:
-        raise InputError(add_location(str(error), path, text)) from None
+    except InputError as error:  # about a key of the study: add file and line
+        message = str(error)
+        line = line_of(text, message.partition(":")[0].split("."))[1]
+        where = f"{path}, line {line}" if line else path
+        raise InputError(f"{message.removesuffix(' (--set)')} ({where})") from None
     return plan
 
 
@@ -89,7 +82,10 @@ def check(plan: Plan, to_run: bool) -> None:
             if isinstance(scene.light, CollimatedDisplayConfig) and not isinstance(trial, FlightTrial):
                 raise InputError(f"trial.kind: {trial.kind} with a collimated display; allowed: flight")
             if to_run:
-                check_tracker(plan, scene, trial)
+                tracker = scene.tracker.name
+                check_tracker_name(tracker, plan.spec.programs)
+                if tracker != OWN and isinstance(trial, CentroidTrial):  # an external tracker takes images
+                    raise InputError(f"tracker.name: {tracker} needs frames; allowed: {OWN}, or another trial.kind")
         except InputError as error:
             key = str(error).partition(":")[0]
             owners = [other for other, factor in study.factors.items() if key in dict(factor.value_at(0.5)[1])]
@@ -98,26 +94,10 @@ def check(plan: Plan, to_run: bool) -> None:
             raise InputError(f"factors.{owner}: {value!r}: {error}") from None
 
 
-def check_tracker(plan: Plan, scene: Scene, trial: CentroidTrial | FrameTrial | FlightTrial) -> None:
-    """Raise InputError for an unknown tracker, and for an external tracker in a centroid trial (it takes images)."""
-    name = scene.tracker.name
-    check_tracker_name(name, plan.spec.programs)
-    if name != OWN and isinstance(trial, CentroidTrial):
-        raise InputError(f"tracker.name: {name} needs frames; allowed: {OWN}, or another trial.kind")
-
-
 def each_level(factors: Mapping[str, Factor]) -> Iterator[tuple[str, Value, Settings]]:
     """Every level of every factor with the other factors at their middle: factor, level, all settings."""
-    middle = {name: factor.value_at(0.5)[1] for name, factor in factors.items()}
+    middle = {name: factor.value_at(0.5) for name, factor in factors.items()}
     for name, factor in factors.items():
-        for level, settings in factor.options() or [factor.value_at(0.5)]:
-            others: Settings = {}
-            for other, level_settings in middle.items():
-                others |= level_settings if other != name else {}
+        others = make_point({other: chosen for other, chosen in middle.items() if other != name}).settings
+        for level, settings in factor.options() or [middle[name]]:
             yield name, level, others | settings
-
-
-def add_location(message: str, path: Path, text: str) -> str:
-    """An error message about a key of a study, with file and line added."""
-    line = line_of(text, message.partition(":")[0].split("."))[1]
-    return f"{message.removesuffix(' (--set)')} ({path}{f', line {line}' if line else ''})"

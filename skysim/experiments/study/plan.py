@@ -152,6 +152,12 @@ class Search(ConfigModel):
     candidates: Annotated[int, Field(ge=2, le=100_000)] = 60
     cost: Cost = Cost()
 
+    @property
+    def responses(self) -> list[str]:
+        """The responses of all objectives and constraints, each once."""
+        names = [one.response for one in self.objectives] + [one.response for one in self.constraints]
+        return list(dict.fromkeys(names))
+
 
 class Study(ConfigModel):
     """A study file: scene, trial, factors, design and responses.
@@ -245,37 +251,29 @@ def make_plan(path: Path, study: Study, trial: dict[str, Any], programs: Mapping
     return Plan(path, study, spec, chosen)
 
 
-def resolve_point(spec: TrialSpec, settings: Settings) -> tuple[Scene, CentroidTrial | FrameTrial | FlightTrial]:
+def resolve_point(spec: TrialSpec, settings: Settings) -> tuple[Scene, Trial]:
     """The scene and the trial at a point, with its settings applied. Raises InputError with one line."""
     values = spec.base | settings
-    name = str(values.get("scene", spec.scene))
+    name = str(values.pop("scene", spec.scene))
     tree: dict[str, Any] = {"trial": dict(spec.trial)}
-    scene_keys = {}
-    for key, value in values.items():
+    # Each value as YAML on one line.
+    dumped = {key: yaml.safe_dump(value, default_flow_style=True, width=1_000_000) for key, value in values.items()}
+    texts = {key: text.removesuffix("\n...\n") for key, text in dumped.items()}
+    for key, text in texts.items():
         if key.startswith(TRIAL):
-            set_key(tree, key, to_yaml(value))
-        elif key != "scene":
-            scene_keys[key] = to_yaml(value)
+            set_key(tree, key, text)
     try:
         trial = TrialSection.model_validate(tree).trial
     except ValidationError as error:
-        raise InputError(error_text(error, tree)) from None
+        # One line without file and line number; the caller adds the factor.
+        message = explain(error, TrialSection, tree, [(Path(), "")], {})
+        raise InputError(message.removesuffix(f" ({Path()})")) from None
     local = Path(spec.folder) / name
     path = local if local.suffix in {".yaml", ".yml"} and is_file(local) else find_scene(name)
-    return load_scene(path, scene_keys), trial
-
-
-def error_text(error: ValidationError, tree: dict[str, Any]) -> str:
-    """One-line message of a validation error in section `trial`, without file and line; the caller adds the factor."""
-    return explain(error, TrialSection, tree, [(Path(), "")], {}).removesuffix(f" ({Path()})")
+    return load_scene(path, {key: text for key, text in texts.items() if not key.startswith(TRIAL)}), trial
 
 
 class TrialSection(ConfigModel):
     """Wrapper that validates section `trial` alone."""
 
     trial: Trial
-
-
-def to_yaml(value: Value) -> str:
-    """A value as YAML on one line."""
-    return yaml.safe_dump(value, default_flow_style=True, width=1_000_000).removesuffix("\n...\n")

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import sqlite3
 import time
 from collections.abc import Iterable, Iterator
@@ -30,17 +29,7 @@ FORMAT = 1
 TEXT_FIELDS = {"status"}
 INTEGER_FIELDS = {"frames", "solved", "wrong"}
 
-COLUMNS = (
-    "trial",
-    "point",
-    "replicate",
-    "seed",
-    "scene",
-    "code",
-    *FIELDS,
-    "error",
-    "time_ms",
-)  # of `Store.columns`
+COLUMNS = ("trial", "point", "replicate", "seed", "scene", "code", *FIELDS, "error", "time_ms")  # of `Store.columns`
 
 SQL_TYPES = dict.fromkeys(TEXT_FIELDS, "TEXT") | dict.fromkeys(INTEGER_FIELDS, "INTEGER")
 OUTCOME_COLUMNS = ", ".join(f"{name} {SQL_TYPES.get(name, 'REAL')}" for name in FIELDS)
@@ -191,10 +180,6 @@ class Store:
         except (ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError) as error:
             raise InputError(f"{self.path}: not a valid study store: {' '.join(str(error).split())[:120]}") from None
 
-    def check(self) -> bool:
-        """Whether SQLite's integrity check passes."""
-        return bool(self.db.execute("PRAGMA integrity_check").fetchone()[0] == "ok")
-
 
 def to_sql(value: Any) -> Any:
     """A value as stored in SQLite: None for NaN, a Python float for a NumPy float."""
@@ -217,7 +202,10 @@ def open_store(path: Path) -> Iterator[Store]:
     """Open a store for reading; a run may write it at the same time. Raises InputError if it is missing or damaged."""
     if not path.is_file():
         raise InputError(f"{path}: no such store; allowed: a store written by skysim study run")
-    with sqlite_errors_as_input_error(path, "not a valid study store: "), open_connection(path) as db:
+    with (
+        sqlite_errors_as_input_error(path, "not a valid study store: "),
+        closing(sqlite3.connect(path, timeout=30)) as db,
+    ):
         store = Store(path, db)
         if store.meta("format") != str(FORMAT):
             raise InputError(f"{path}: format {store.meta('format')!r}; allowed: {FORMAT}")
@@ -248,8 +236,13 @@ def writing(path: Path) -> Iterator[Store]:
         sqlite_errors_as_input_error(path),
         closing(sqlite3.connect(lock_file, timeout=0, isolation_level=None)) as lock,
     ):
-        acquire_lock(lock, path)
-        with open_connection(path) as db:
+        try:
+            lock.execute("BEGIN EXCLUSIVE")
+        except sqlite3.OperationalError as error:
+            if error.sqlite_errorcode != sqlite3.SQLITE_BUSY:
+                raise
+            raise InputError(f"{path}: in use by another run; allowed: one run at a time, or another --out") from None
+        with closing(sqlite3.connect(path, timeout=30)) as db:
             db.execute("PRAGMA journal_mode = WAL")
             db.execute("PRAGMA synchronous = NORMAL")
             store = Store(path, db)
@@ -260,23 +253,3 @@ def writing(path: Path) -> Iterator[Store]:
             if store.meta("format") != str(FORMAT):
                 raise InputError(f"{path}: format {store.meta('format')!r}; allowed: {FORMAT}")
             yield store
-
-
-def acquire_lock(lock: sqlite3.Connection, path: Path) -> None:
-    """Hold the lock until its connection is closed. Raises InputError if another run holds it."""
-    try:
-        lock.execute("BEGIN EXCLUSIVE")
-    except sqlite3.OperationalError as error:
-        if error.sqlite_errorcode != sqlite3.SQLITE_BUSY:
-            raise
-        raise InputError(f"{path}: in use by another run; allowed: one run at a time, or another --out") from None
-
-
-@contextmanager
-def open_connection(path: Path) -> Iterator[sqlite3.Connection]:
-    """A database connection that is closed on exit."""
-    db = sqlite3.connect(os.fspath(path), timeout=30)
-    try:
-        yield db
-    finally:
-        db.close()

@@ -7,7 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from skysim.core.units import INCH_M
-from skysim.experiments.papers.afit import led_tests, surface, test1, test2, test_stand
+from skysim.experiments.configs import with_config
+from skysim.experiments.papers.afit import led_tests, surface, test1, test2
 from skysim.experiments.papers.afit.test2 import PAIR_M, Place, geometric_angle_arcsec
 from skysim.experiments.papers.afit.test_stand import (
     build_test_stand,
@@ -106,7 +107,7 @@ def test_one_led_of_nine_is_lit_at_any_time() -> None:
     """Whatever the phase: the nine share 100 ms, and each has eleven pulses of 1 ms or a twelfth or a part of it."""
     rng, level = np.random.default_rng(2), Rotation.identity()
     whole, frame = (
-        build_test_stand(test_stand.with_config(test1.scene_with_exposure(0.1), "exposure", time_s=time_s))
+        build_test_stand(with_config(test1.scene_with_exposure(0.1), "exposure", time_s=time_s))
         for time_s in (36e-3, 100e-3)
     )
     each_e = render_at_attitude(whole, level, rng)[1].sources.electrons  # of four pulses, 4 ms

@@ -198,7 +198,7 @@ def test_a_pool_killed_at_any_instant_resumes_with_any_number_of_workers(
         time.sleep(draw.uniform(0, 0.02))
         assert run.end(signal.SIGKILL) in (-signal.SIGKILL, 0)
         with store.writing(path) as stored:
-            assert stored.check()
+            assert stored.db.execute("PRAGMA integrity_check").fetchone()[0] == "ok"
             before = stored.counts()["done"]
         assert before > 0
         if before == plan_.trials:

@@ -15,17 +15,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from estimator.attitude.solvers import quest
-from estimator.calibration.home_position import Sighting
 from estimator.catalog.catalog import unit
 from estimator.catalog.pair_buckets import PairCatalog, build_pair_catalog, candidates
 from estimator.core.arrays import Ints
-from estimator.identification.published.saa_search import (
-    Gates,
-    SearchInput,
-    build_primary,
-    gate_rad,
-    match_assumptions,
-)
+from estimator.identification.published.saa_search import Gates, SearchInput, build_primary, gate_rad, match_assumptions
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
 from skysim.core.units import ARCSEC_RAD, INCH_M
@@ -58,12 +51,7 @@ HOLD_MIN = 0.75  # time at a position: fitted, see `draw_holds`
 HOLDS_MIN = (0.25, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0)
 SITE_AZIMUTH_DEG = "0"  # of the lab's x axis: fitted
 KNOT_S = 0.05  # the vehicle turns at 2 deg/s at most
-STATISTICS: dict[str, Callable[..., Any]] = {
-    "min": np.min,
-    "max": np.max,
-    "mean": np.mean,
-    "sd": sample_std,
-}
+STATISTICS: dict[str, Callable[..., Any]] = {"min": np.min, "max": np.max, "mean": np.mean, "sd": sample_std}
 CAUSE_CAMERA = "two LEDs under a rolling shutter"
 CAUSE_IMU = f"{CAUSE_CAMERA}, an LN-200 with {HOLD_MIN} min per position"
 CAUSE_BUMP = f"{CAUSE_IMU}, position 5 bumped"
@@ -112,19 +100,24 @@ def tables_10_to_15(options: ExperimentOptions) -> ExperimentResult:
     causes = combine_causes(camera.error_deg, drift_without_earth_deg, bump_deg, earth_deg)
     results = tables_10_to_14(clean.error_deg, causes) | table_15(clean.error_deg, causes)
     worst = [np.abs(one).max(axis=(1, 2)) for one in (clean.error_deg, causes.error_deg)]
-    results["worst"] = RowResult(
-        prediction_interval(worst[0]), cause=Cause(CAUSE_BUMP, prediction_interval(worst[1], causes.bumps))
-    )
-    results["named"] = RowResult(
-        percent(proportion(*clean.named)), cause=Cause(CAUSE_CAMERA, percent(proportion(*camera.named)))
-    )
+    results["worst"] = with_draws(CAUSE_BUMP, worst[0], worst[1], causes.bumps)
+    named, named_with_noise = (percent(proportion(*one.named)) for one in (clean, camera))
+    results["named"] = RowResult(named, cause=Cause(CAUSE_CAMERA, named_with_noise))
     yaw_change = [one[:, 3, 0] - one[:, 2, 0] for one in (clean.error_deg, causes.error_deg)]
-    results["turns_back"] = RowResult(
-        prediction_interval(yaw_change[0]),
-        earth_rate_note(yaw_change[1].mean() + earth_deg[3, 0] - earth_deg[2, 0]),
-        Cause(CAUSE_IMU, prediction_interval(yaw_change[1], causes.images)),
-    )
+    with_earth = yaw_change[1].mean() + earth_deg[3, 0] - earth_deg[2, 0]
+    results["turns_back"] = with_draws(CAUSE_IMU, yaw_change[0], yaw_change[1], causes.images, with_earth)
     return ExperimentResult(results, make_drawings(causes, drift_deg))
+
+
+def with_draws(
+    cause: str, clean: Floats, with_causes: Floats, draws: int, with_earth: float | None = None
+) -> RowResult:
+    """Prediction intervals of clean values, and of those with the causes, which have fewer independent `draws`.
+
+    with_earth : the value if the IMU also contained the Earth rate, for the note
+    """
+    note = "" if with_earth is None else f"with the Earth rate in the IMU too: {with_earth:.3f}"
+    return RowResult(prediction_interval(clean), note, Cause(cause, prediction_interval(with_causes, draws)))
 
 
 def combine_causes(camera_deg: Floats, drift_deg: Floats, bump_deg: Floats, earth_deg: Floats) -> AllCauses:
@@ -137,25 +130,19 @@ def combine_causes(camera_deg: Floats, drift_deg: Floats, bump_deg: Floats, eart
     return AllCauses(error_deg, min(counts[:2]), min(counts), earth_deg)
 
 
-def earth_rate_note(value: float) -> str:
-    """Note with the value if the IMU also contained the Earth rate."""
-    return f"with the Earth rate in the IMU too: {value:.3f}"
-
-
 def tables_10_to_14(clean: Floats, causes: AllCauses) -> dict[str, RowResult]:
     """Tables 10-14: the algorithm's angles minus the IMU's."""
     results = {}
-    for position in range(len(IMU_DEG)):
+    for position, axis in np.ndindex(clean.shape[1:]):
+        key, ours = f"position_{position + 1}_theta_{axis + 1}", clean[:, position, axis]
+        if position == HOME:
+            results[key] = RowResult(prediction_interval(ours))
+            continue
+        error_deg = causes.error_deg[:, position, axis]
+        with_earth = error_deg.mean() + causes.earth_deg[position, axis]
         last = position == len(IMU_DEG) - 1
-        name, count = (CAUSE_BUMP, causes.bumps) if last else (CAUSE_IMU, causes.images)
-        for axis in range(3):
-            error_deg = causes.error_deg[:, position, axis]
-            is_home = position == HOME
-            results[f"position_{position + 1}_theta_{axis + 1}"] = RowResult(
-                prediction_interval(clean[:, position, axis]),
-                "" if is_home else earth_rate_note(error_deg.mean() + causes.earth_deg[position, axis]),
-                None if is_home else Cause(name, prediction_interval(error_deg, count)),
-            )
+        name, draws = (CAUSE_BUMP, causes.bumps) if last else (CAUSE_IMU, causes.images)
+        results[key] = with_draws(name, ours, error_deg, draws, with_earth)
     return results
 
 
@@ -166,14 +153,11 @@ def table_15(clean: Floats, causes: AllCauses) -> dict[str, RowResult]:
         ours, with_causes, with_earth = (
             statistic(np.abs(one), axis=1) for one in (clean, causes.error_deg, causes.error_deg + causes.earth_deg)
         )
-        for column in range(4):
-            key = "averaged" if column == 3 else f"theta_{column + 1}"
-            values = [one.mean(axis=1) if column == 3 else one[:, column] for one in (ours, with_causes, with_earth)]
-            results[f"{name}_{key}"] = RowResult(
-                prediction_interval(values[0]),
-                earth_rate_note(values[2].mean()),
-                Cause(CAUSE_BUMP, prediction_interval(values[1], causes.bumps)),
+        for column, key in enumerate(("theta_1", "theta_2", "theta_3", "averaged")):
+            clean_deg, causes_deg, earth_deg = (
+                one.mean(axis=1) if column == 3 else one[:, column] for one in (ours, with_causes, with_earth)
             )
+            results[f"{name}_{key}"] = with_draws(CAUSE_BUMP, clean_deg, causes_deg, causes.bumps, earth_deg.mean())
     return results
 
 
@@ -189,8 +173,9 @@ def algorithm_errors(testbed: Testbed, images: int, lights: int, rng: np.random.
     sets = list(zip(*sightings, strict=False))
     error_deg, correct = np.empty((len(sets), len(IMU_DEG), 3)), 0
     for n_set, sightings_of_set in enumerate(sets):
-        # The home image is the map: all attitudes of a set are relative to it, as in the thesis.
-        catalog = home_catalog(testbed, sightings_of_set[HOME])
+        # The home image is the map: all attitudes of a set are relative to it, as in the thesis (3.6.4).
+        home = sightings_of_set[HOME]
+        catalog = build_pair_catalog(unit(light_positions_m(testbed, home.xy_px)), home.brightness)
         for n, sighting in enumerate(sightings_of_set):
             order = np.argsort(-sighting.brightness, kind="stable")
             vectors = unit(light_positions_m(testbed, sighting.xy_px[order]))
@@ -200,11 +185,6 @@ def algorithm_errors(testbed: Testbed, images: int, lights: int, rng: np.random.
             body_from_home = quest(vectors[:lights], catalog.vectors[rows], np.ones(lights))
             error_deg[n_set, n] = angles_deg(body_from_home.inv()) - IMU_DEG[n]
     return AlgorithmErrors(error_deg, (correct, len(sets) * len(IMU_DEG)))
-
-
-def home_catalog(testbed: Testbed, home: Sighting) -> PairCatalog:
-    """Catalog of section 3.6.4: the LEDs as seen from the home position, pairs in buckets of 100 arcsec."""
-    return build_pair_catalog(unit(light_positions_m(testbed, home.xy_px)), home.brightness)
 
 
 def identify_leds(vectors: Floats, magnitude: Floats, catalog: PairCatalog) -> Ints:
@@ -239,22 +219,15 @@ def imu_drift(hold_min: float, units: int, rng: np.random.Generator, earth: bool
     reference = guidance.plan(testbed.scene.motion.model_copy(update={"maneuver": tuple(timed_legs)}))
     t_s = np.arange(0, reference.duration_s, KNOT_S)
     wxyz, rate, _ = (np.array(column) for column in zip(*map(reference.state_at, t_s), strict=True))
+    earth_rad_s, vehicle = imu.earth_rate_lab_rad_s(testbed.scene.site) * earth, testbed.vehicle
     increments = imu.ideal_increments(
-        t_s,
-        wxyz,
-        rate,
-        t_s[1:],
-        KNOT_S,
-        imu_position_m(testbed.vehicle),
-        testbed.vehicle.gravity_m_s2,
-        imu.earth_rate_lab_rad_s(testbed.scene.site) * earth,
+        t_s, wxyz, rate, t_s[1:], KNOT_S, imu_position_m(vehicle), vehicle.gravity_m_s2, earth_rad_s
     )
-    hold_end_s = np.array(reference.start_s[::2])  # of home, then the ends of the holds
-    stops = np.searchsorted(t_s[1:], hold_end_s - KNOT_S)
+    # Every second start is the end of a hold, and the first that of home.
+    stops = np.searchsorted(t_s[1:], np.array(reference.start_s[::2]) - KNOT_S)
     configs = [config.model_copy(update={"hardware_seed": int(seed)}) for seed in rng.integers(2**31, size=units)]
-    return np.array(
-        [integrated_angles(imu.Imu.from_config(config, rng).measure(increments), stops) - IMU_DEG for config in configs]
-    )
+    measured = (imu.Imu.from_config(config, rng).measure(increments) for config in configs)
+    return np.array([integrated_angles(one, stops) - IMU_DEG for one in measured])
 
 
 def integrated_angles(measured: imu.Increments, stops: Ints) -> Floats:
@@ -292,20 +265,17 @@ def plot_quantiles(axes: Any, x: Any, values: Floats, **style: Any) -> None:
 
 
 def draw_differences(fig: Any, causes: AllCauses) -> None:
-    """Signed differences, one panel per angle."""
-    position = np.arange(1, len(IMU_DEG) + 1)
+    position, published_deg = np.arange(1, len(IMU_DEG) + 1), np.subtract(ALGORITHM_DEG, IMU_DEG)
     panels = fig.subplots(1, 3, sharey=True)
     for axis, axes in enumerate(panels):
         error_deg = causes.error_deg[:, :, axis]
         plot_quantiles(axes, position + 0.1, error_deg, fmt="s", ms=4, label="ours with the causes")
         earth = error_deg.mean(axis=0) + causes.earth_deg[:, axis]
         axes.plot(position + 0.25, earth, "D", ms=4, color=INK[5], label="and the Earth's turning")
-        published = np.subtract(ALGORITHM_DEG, IMU_DEG)[:, axis]
-        axes.plot(position - 0.1, published, "o", color=INK[1], label="published")
+        axes.plot(position - 0.1, published_deg[:, axis], "o", color=INK[1], label="published")
         axes.set(xlabel="position", xticks=position, title=f"theta_{axis + 1}")
     panels[0].set(ylabel="algorithm less IMU (deg)")
-    handles, labels = panels[0].get_legend_handles_labels()
-    fig.legend(handles, labels, loc="outside lower center", ncols=3)
+    fig.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
 
 
 def draw_holds(fig: Any, drift: dict[float, Floats]) -> None:
@@ -316,6 +286,5 @@ def draw_holds(fig: Any, drift: dict[float, Floats]) -> None:
         plot_quantiles(axes, list(drift), mean.T, fmt="s-", label="ours, 95 % of IMUs")
         axes.axhline(published[axis], color=INK[1], label="published")
         axes.set(xlabel="minutes at a position", title=f"theta_{axis + 1}")
-        if axis == 0:
-            axes.set(ylabel="mean difference (deg)")
-            axes.legend(loc="upper left")
+    fig.axes[0].set(ylabel="mean difference (deg)")
+    fig.axes[0].legend(loc="upper left")

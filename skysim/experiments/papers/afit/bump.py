@@ -6,7 +6,6 @@ error of the IMU alone is compared with Table 14; the errors of star tracker and
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,13 +13,7 @@ import numpy as np
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
 from skysim.experiments.papers.afit.test3_images import angles_deg
-from skysim.experiments.papers.compare import (
-    Drawing,
-    ExperimentOptions,
-    ExperimentResult,
-    RowResult,
-    with_cause,
-)
+from skysim.experiments.papers.compare import Drawing, ExperimentOptions, ExperimentResult, RowResult, with_cause
 from skysim.experiments.papers.intervals import prediction_interval
 from skysim.experiments.papers.published import experiments
 from skysim.results.plots import INK
@@ -56,22 +49,16 @@ def bump(options: ExperimentOptions) -> ExperimentResult:
     for n, bump_deg_s in enumerate((None, FITTED_BUMP, ASSUMED_BUMP)):
         options.watch(n, 3)
         runs.append(simulate_bumps(bump_deg_s, options.trials(10, 2), options.seed))
-    without_bump, with_fitted, with_assumed = runs
-
-    def row_result(
-        statistic: Callable[[BumpRun], float], bumped_runs: list[BumpRun] = with_fitted, cause: str = CAUSE
-    ) -> RowResult:
-        ours, theirs = ([statistic(one) for one in runs] for runs in (without_bump, bumped_runs))
-        return with_cause(cause, prediction_interval, ours, theirs)
-
+    with_fitted = runs[1]
+    # Absolute errors of the IMU's angles at the end, (runs, 3).
+    without_deg, fitted_deg, assumed_deg = (np.abs([run.imu_deg[-1] for run in imus]) for imus in runs)
     results = {
-        f"theta_{axis + 1}": row_result(lambda run, axis=axis: lost_angle_deg(run, axis))  # type: ignore[misc]
-        for axis in range(3)
+        f"theta_{n + 1}": with_cause(CAUSE, prediction_interval, without_deg[:, n], fitted_deg[:, n]) for n in range(3)
     }
-    results["order"] = row_result(
-        lambda run: lost_angle_deg(run, 2), with_assumed, f"the scene's bump of {ASSUMED_BUMP} deg/s"
-    )
-    results["limited"] = row_result(lambda run: run.saturated_s)
+    cause = f"the scene's bump of {ASSUMED_BUMP} deg/s"
+    results["order"] = with_cause(cause, prediction_interval, without_deg[:, 2], assumed_deg[:, 2])
+    saturated_s = [[run.saturated_s for run in imus] for imus in runs[:2]]
+    results["limited"] = with_cause(CAUSE, prediction_interval, *saturated_s)
     results["tracker"] = RowResult(prediction_interval([run.tracker_error_deg for run in with_fitted]))
     results["filter"] = RowResult(prediction_interval([filter_errors_after(run).max() for run in with_fitted]))
     caption = "The IMU loses 0.8 deg in the bump; the filter corrects it with the next image."
@@ -82,11 +69,6 @@ def simulate_bumps(bump_deg_s: BumpRate | None, imus: int, seed: int) -> list[Bu
     """Simulate the same motion with `imus` IMUs of random hardware seeds."""
     seeds = random_stream(seed, 14).integers(2**31, size=imus)
     return [simulate_bump(bump_deg_s, int(imu_seed)) for imu_seed in seeds]
-
-
-def lost_angle_deg(run: BumpRun, axis: int) -> float:
-    """Absolute error of one of the IMU's angles at the end."""
-    return float(abs(run.imu_deg[-1, axis]))
 
 
 def filter_errors_after(run: BumpRun) -> Floats:
@@ -131,17 +113,12 @@ def tracker_error_deg(testbed: Testbed) -> float:
 
 
 def draw(fig: Any, run: BumpRun) -> None:
-    """Errors against time."""
     axes, rows = fig.subplots(), experiments()["afit-bump"].rows
     for axis in range(3):
         axes.plot(run.t_s, np.abs(run.imu_deg[:, axis]), color=INK[(0, 2, 5)[axis]], label=f"IMU, theta_{axis + 1}")
-        axes.plot(
-            run.t_s[-1] + 0.15,
-            rows[f"theta_{axis + 1}"].published,
-            "os^"[axis],
-            color=INK[1],
-            label=f"published, theta_{axis + 1}",
-        )
+        published = rows[f"theta_{axis + 1}"].published
+        label = f"published, theta_{axis + 1}"
+        axes.plot(run.t_s[-1] + 0.15, published, "os^"[axis], color=INK[1], label=label)
     axes.plot(run.t_s, run.filter_deg, color=INK[6], ls="--", label="filter with star tracker")
     axes.set(xlabel="time (s)", ylabel="error (deg)")
     axes.legend(ncols=2)

@@ -9,11 +9,13 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.ndimage
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
 from skysim.core.units import INCH_M
+from skysim.experiments.configs import with_config
 from skysim.experiments.papers.afit.test2 import INTENSITY_CD, NOISE_E, ON_FRACTION
 from skysim.experiments.papers.afit.test_stand import (
     E_PER_GRAY,
@@ -22,20 +24,11 @@ from skysim.experiments.papers.afit.test_stand import (
     gray_levels,
     measure_lights,
     render_at_attitude,
-    with_config,
 )
-from skysim.experiments.papers.compare import (
-    Cause,
-    Drawing,
-    ExperimentOptions,
-    ExperimentResult,
-    RowResult,
-    with_cause,
-)
+from skysim.experiments.papers.compare import Drawing, ExperimentOptions, ExperimentResult, RowResult, with_cause
 from skysim.experiments.papers.intervals import confidence_interval
 from skysim.experiments.papers.published import published_values
-from skysim.results import metrics
-from skysim.results.metrics import Summary, exact
+from skysim.results.metrics import Summary, exact, proportion
 from skysim.results.plots import INK
 from skysim.scene.camera import MoffatPsfConfig
 from skysim.scene.leds import CosineLobeConfig, DirectConfig, ListedConfig
@@ -74,12 +67,7 @@ class LensSettings(NamedTuple):
 DEFAULT_LENS = LensSettings()
 
 
-def board_scene(
-    levels: Sequence[float],
-    distance_in: float = BOARD_DISTANCE_IN,
-    lens: LensSettings = DEFAULT_LENS,
-    **led_values: Any,
-) -> Scene:
+def board_scene(levels: Sequence[float], distance_in: float, lens: LensSettings, **led_values: Any) -> Scene:
     """Scene with a board of nine holes, the first len(levels) with LEDs, above the camera of a level vehicle."""
     height_in, across_mm = CAMERA_IN + distance_in, PITCH_MM * np.array([1.0, 0.0, -1.0])
     positions = [[f"{x} mm", f"{y} mm", f"{height_in} in"] for x in across_mm for y in across_mm]
@@ -90,8 +78,7 @@ def board_scene(
     panel = FlatSurfaceConfig.model_validate({"kind": "flat", "apex": f"{height_in} in"})
     scene = with_config(scene, "light", surface=panel, layout=listed, occlusion=False)
     scene = with_config(scene, "light.led", scatter=0.0, **led_values)
-    lens_values = {"f_number": lens.f_number, "focus_m": lens.focus_in * INCH_M}
-    scene = with_config(scene, "camera", **lens_values)
+    scene = with_config(scene, "camera", f_number=lens.f_number, focus_m=lens.focus_in * INCH_M)
     if lens.noise_e is not None:
         scene = with_config(scene, "camera.detector", read_noise_e=lens.noise_e)
     return scene
@@ -99,17 +86,10 @@ def board_scene(
 
 def color_board(lens: LensSettings = DEFAULT_LENS, **led_values: Any) -> Testbed:
     """Test stand with the first board: three colors by three resistors, always on."""
-    scene = board_scene(
-        BOARD,
-        BOARD_DISTANCE_IN,
-        lens,
-        drive=DirectConfig(kind="direct"),
-        intensity_cd=BOARD_INTENSITY_CD,
-        **led_values,
-    )
-    return build_test_stand(
-        with_config(with_config(scene, "camera", psf=WIDE_PSF), "exposure", time_s=BOARD_EXPOSURE_S)
-    )
+    drive = DirectConfig(kind="direct")
+    scene = board_scene(BOARD, BOARD_DISTANCE_IN, lens, drive=drive, intensity_cd=BOARD_INTENSITY_CD, **led_values)
+    scene = with_config(scene, "camera", psf=WIDE_PSF)
+    return build_test_stand(with_config(scene, "exposure", time_s=BOARD_EXPOSURE_S))
 
 
 def white_board(pulses_us: Sequence[float], saturation_fraction: float = 1.0) -> Testbed:
@@ -154,35 +134,45 @@ def count_above(image: GrayImage, xy_px: Floats, threshold: float) -> ThresholdC
     areas = np.bincount(label.ravel())
     areas[0] = 0
     x, y = np.rint(xy_px).astype(int).T
-    lit_px = np.argwhere(above)[:, ::-1]
-    distance_px = np.full(len(lit_px), np.inf)
-    for led_px in xy_px:
-        distance_px = np.minimum(distance_px, np.hypot(*(lit_px - led_px).T))
-    is_dark = distance_px > DARK_RADIUS_PX
-    return ThresholdCounts(
-        areas[label[y - y0, x - x0]].astype(float),
-        int(np.sum(distance_px > GLARE_RADIUS_PX) - is_dark.sum()),
-        int(is_dark.sum()),
-    )
+    distance_px, _ = cKDTree(xy_px).query(np.argwhere(above)[:, ::-1])  # of each lit pixel from the nearest LED
+    dark_px = int(np.sum(distance_px > DARK_RADIUS_PX))
+    glare_px = int(np.sum(distance_px > GLARE_RADIUS_PX)) - dark_px
+    return ThresholdCounts(areas[label[y - y0, x - x0]].astype(float), glare_px, dark_px)
 
 
 def led_tests(options: ExperimentOptions) -> ExperimentResult:
     """All numbers of section 3.4 that can be simulated."""
     images = options.trials(12, 2)
     rng = [random_stream(options.seed, stage) for stage in range(5)]
-    results = lobe_fraction(rng[0]) | duty_cycles(rng[1])
+    # Light of an LED tilted by 60 deg from the camera relative to one that faces it, in electrons (Fig. 44).
+    lobe_60 = led_electrons(60.0, rng[0]) / led_electrons(0.0, rng[0])
+    results = {"lobe_60": RowResult(exact(lobe_60))} | duty_cycles(rng[1])
     options.watch(1, 4)
     results |= thresholds(images, rng[2])
     options.watch(2, 4)
     results |= apertures(images, rng[3]) | viewing_angles(images, rng[3])
     options.watch(3, 4)
     pulses, magnitude = brightness(images, rng[4])
-    return ExperimentResult(results | pulses, drawings(magnitude, random_stream(options.seed, 5)))
-
-
-def lobe_fraction(rng: np.random.Generator) -> dict[str, RowResult]:
-    """Light of an LED tilted by 60 deg from the camera relative to one that faces it, in electrons (Fig. 44)."""
-    return {"lobe_60": RowResult(exact(led_electrons(60.0, rng) / led_electrons(0.0, rng)))}
+    rng_drawn = random_stream(options.seed, 5)
+    aperture_images = [take_image(color_board(lens), rng_drawn)[0] for lens in APERTURES.values()]
+    noise_images = [take_image(color_board(LensSettings(noise_e=one)), rng_drawn)[0] for one in (None, NOISE_E)]
+    drawings = (
+        Drawing(
+            "Fig. 36: our board, focused and wide, less focused and narrow, balanced.",
+            lambda fig: draw_apertures(fig, aperture_images),
+            (7.4, 2.8),
+        ),
+        Drawing(
+            "Figs 37 and 40: pixels above four thresholds, with the camera's own noise (top) and with that of Test 2.",
+            lambda fig: draw_thresholds(fig, noise_images),
+            (7.4, 4.0),
+        ),
+        Drawing(
+            "Pulses of five LEDs against their measured magnitude, beside Table 7's.",
+            lambda fig: draw_pulses(fig, magnitude),
+        ),
+    )
+    return ExperimentResult(results | pulses, drawings)
 
 
 def led_electrons(angle_deg: float, rng: np.random.Generator) -> float:
@@ -198,14 +188,11 @@ def duty_cycles(rng: np.random.Generator) -> dict[str, RowResult]:
     """Eq. 37: light of each of nine multiplexed LEDs relative to one that is always on."""
     pulses_us = [1000.0, 500.0, 400.0, 200.0, 1.0, 1000.0, 1000.0, 1000.0, 1000.0]
     testbed = with_exposure(white_board(pulses_us), 4 * 9 * SLOT_S)
-    always_on = with_exposure(
-        replace(testbed, sources=replace(testbed.sources, on_s=testbed.sources.period_s)), 4 * 9 * SLOT_S
+    always_on = replace(testbed, sources=replace(testbed.sources, on_s=testbed.sources.period_s))
+    pulsed, unpulsed = (
+        render_at_attitude(board, Rotation.identity(), rng)[1].sources for board in (testbed, always_on)
     )
-    pulsed_e, always_on_e = (
-        truth.sources.electrons[np.argsort(truth.sources.id)]
-        for truth in (render_at_attitude(board, Rotation.identity(), rng)[1] for board in (testbed, always_on))
-    )
-    fraction = pulsed_e / always_on_e
+    fraction = pulsed.electrons[np.argsort(pulsed.id)] / unpulsed.electrons[np.argsort(unpulsed.id)]
     return {f"duty_{int(pulses_us[n])}": RowResult(exact(100 * fraction[n])) for n in range(5)}
 
 
@@ -216,17 +203,15 @@ def thresholds(images: int, rng: np.random.Generator) -> dict[str, RowResult]:
         for testbed in (color_board(), color_board(LensSettings(noise_e=NOISE_E)))
     )
 
-    def both(statistic: Callable[[BoardImage], Any]) -> RowResult:
+    def both(statistic: Callable[[BoardImage], Any], note: str = "") -> RowResult:
         ours, theirs = ([float(statistic(one)) for one in images] for images in (own_noise, test2_noise))
-        return with_cause(CAUSE_NOISE, confidence_interval, ours, theirs)
+        return with_cause(CAUSE_NOISE, confidence_interval, ours, theirs, note=note)
 
     lens = LensSettings(noise_e=INTERMEDIATE_NOISE_GRAY * E_PER_GRAY)
     dark_px = apply_thresholds(*take_image(color_board(lens), rng)).at_2.dark_px
     return {
         "glare_2": both(lambda image: image.at_2.glare_px),
-        "noise_2": both(lambda image: image.at_2.dark_px)._replace(
-            note=f"{dark_px} with {INTERMEDIATE_NOISE_GRAY} gray levels"
-        ),
+        "noise_2": both(lambda image: image.at_2.dark_px, f"{dark_px} with {INTERMEDIATE_NOISE_GRAY} gray levels"),
         "left_10": both(lambda image: 100 * (outside_px(image.at_10) / max(outside_px(image.at_2), 1))),
         "found_10": both(lambda image: np.sum(image.at_10.area_px >= MIN_AREA_PX)),
         "fragments_4": both(lambda image: image.lights_4 - len(BOARD)),
@@ -260,23 +245,16 @@ def apertures(images: int, rng: np.random.Generator) -> dict[str, RowResult]:
     results: dict[str, RowResult] = {}
     for name, lens in APERTURES.items():
         testbed = color_board(lens)
-        images_taken = [take_image(testbed, rng) for _ in range(images)]
-        detected = [
-            float(np.sum(count_above(*image_and_px, 0.10).area_px >= MIN_AREA_PX)) for image_and_px in images_taken
-        ]
-        results[f"found_{name}"] = RowResult(confidence_interval(detected))
+        taken = [take_image(testbed, rng) for _ in range(images)]
+        found = [float(np.sum(count_above(*image_and_px, 0.10).area_px >= MIN_AREA_PX)) for image_and_px in taken]
+        results[f"found_{name}"] = RowResult(confidence_interval(found))
         if name == "wide":
-            results["full_wide"] = RowResult(
-                confidence_interval([float(np.sum(image == WHITE)) for image, _ in images_taken])
-            )
+            full_px = [float(np.sum(image == WHITE)) for image, _ in taken]
+            results["full_wide"] = RowResult(confidence_interval(full_px))
     return results
 
 
-APERTURES = {
-    "wide": LensSettings(4.0),
-    "narrow": LensSettings(16.0, 40.0),
-    "balanced": LensSettings(8.0, 38.0),
-}
+APERTURES = {"wide": LensSettings(4.0), "narrow": LensSettings(16.0, 40.0), "balanced": LensSettings(8.0, 38.0)}
 
 
 def viewing_angles(images: int, rng: np.random.Generator) -> dict[str, RowResult]:
@@ -291,13 +269,11 @@ def viewing_angles(images: int, rng: np.random.Generator) -> dict[str, RowResult
         for noise_e in (NOISE_E, INTERMEDIATE_NOISE_GRAY * E_PER_GRAY)
     )
     cause = f"LEDs soldered {MISALIGNMENT_DEG:g} deg askew"
+    note = f"{test2_percent:.2f} with {CAUSE_NOISE}; {intermediate_percent:.4f} with {INTERMEDIATE_NOISE_GRAY}"
     return {
         "directional": with_cause(cause, confidence_interval, *directional),
         "diffuse": RowResult(confidence_interval(areas.min(axis=1))),
-        "outside_4": RowResult(
-            confidence_interval(stray),
-            f"{test2_percent:.2f} with {CAUSE_NOISE}; {intermediate_percent:.4f} with {INTERMEDIATE_NOISE_GRAY}",
-        ),
+        "outside_4": RowResult(confidence_interval(stray), note),
     }
 
 
@@ -305,54 +281,44 @@ def area_variation(testbed: Testbed, threshold: float, images: int, rng: np.rand
     """(n, 9) smallest over largest area of each LED over the positions; (n,) percent of pixels outside LEDs."""
     ratio, stray = [], []
     for _ in range(images):
-        counted = [
-            (image, count_above(image, xy_px, threshold))
-            for image, xy_px in (take_image(testbed, rng, roll_pitch_deg) for roll_pitch_deg in VIEW_ANGLES_DEG)
-        ]
-        area = np.array([counts.area_px for _, counts in counted])
+        taken = [take_image(testbed, rng, roll_pitch_deg) for roll_pitch_deg in VIEW_ANGLES_DEG]
+        counted = [count_above(image, xy_px, threshold) for image, xy_px in taken]
+        area = np.array([counts.area_px for counts in counted])
         ratio.append(np.where(area.any(axis=0), area.min(axis=0) / np.maximum(area.max(axis=0), 1), 1.0))
-        stray.append(np.mean([100 * outside_px(counts) / image.size for image, counts in counted]))
+        stray.append(np.mean([100 * outside_px(counts) / taken[0][0].size for counts in counted]))
     return np.array(ratio), np.array(stray)
 
 
 def brightness(images: int, rng: np.random.Generator) -> tuple[dict[str, RowResult], Floats]:
     """Figs 43 and 46: magnitude of five LEDs against their pulse, and whether LEDs of 1 us are detected."""
-    testbed, long_pulse = white_board(PULSES_US), white_board((*PULSES_US[:-1], 1e6 * ON_FRACTION * SLOT_S))
+    long_us, pulses_us = 1e6 * ON_FRACTION * SLOT_S, np.array(PULSES_US[:4])
+    testbed, long_pulse = white_board(PULSES_US), white_board((*PULSES_US[:-1], long_us))
     magnitudes = np.array([led_magnitudes(long_pulse, rng) for _ in range(images)])
-    pulses_us = np.array(PULSES_US[:4])
     per_us = magnitudes[:, :4] / pulses_us
     saturating = white_board(PULSES_US, SATURATION_FRACTION)
     saturating_per_us = np.array([led_magnitudes(saturating, rng)[:4] for _ in range(images)]) / pulses_us
     mean = ", ".join(f"{magnitude:.1f}" for magnitude in magnitudes.mean(axis=0))
     note = f"ours with Test 2's intensity: {mean}; Table 7: {', '.join(map(str, table_7_magnitudes()))}"
     board = (1000.0, 500.0, 1.0) * 3
-    long_board = tuple(max(pulse, 1e6 * ON_FRACTION * SLOT_S) for pulse in board)
-    detected, detected_long = (
-        confidence_interval([len(measure_lights(take_image(board_testbed, rng)[0]).magnitude) for _ in range(images)])
-        for board_testbed in (white_board(board), white_board(long_board))
-    )
+    detected = [
+        [len(measure_lights(take_image(one, rng)[0]).magnitude) for _ in range(images)]
+        for one in (white_board(board), white_board(tuple(max(pulse, long_us) for pulse in board)))
+    ]
+    short_magnitudes = [led_magnitudes(testbed, rng) for _ in range(images)]
+    first_to_last = [values[:, 0] / values[:, 3] for values in (per_us, saturating_per_us)]
     return {
-        "order": RowResult(
-            fraction_in_order([led_magnitudes(testbed, rng) for _ in range(images)]),
-            cause=Cause(CAUSE_LONG_PULSE, fraction_in_order(magnitudes)),
-        ),
+        "order": with_cause(CAUSE_LONG_PULSE, fraction_in_order, short_magnitudes, magnitudes),
         "linear": RowResult(confidence_interval(per_us[:, 1] / per_us[:, 3]), note),
-        "saturating": with_cause(
-            CAUSE_SATURATION,
-            lambda values: confidence_interval(values[:, 0] / values[:, 3]),
-            per_us,
-            saturating_per_us,
-        ),
-        "found_46": RowResult(detected, cause=Cause(CAUSE_LONG_PULSE, detected_long)),
+        "saturating": with_cause(CAUSE_SATURATION, confidence_interval, *first_to_last),
+        "found_46": with_cause(CAUSE_LONG_PULSE, confidence_interval, *detected),
     }, magnitudes
 
 
 def fraction_in_order(images: Sequence[Floats] | Floats) -> Summary:
     """Fraction of images in which all LEDs are detected, with magnitudes in the order of their pulses."""
     magnitude = np.asarray(images)
-    return metrics.proportion(
-        np.sum(np.all(magnitude > 0, axis=1) & np.all(np.diff(magnitude) < 0, axis=1)), len(magnitude)
-    )
+    in_order = np.all(magnitude > 0, axis=1) & np.all(np.diff(magnitude) < 0, axis=1)
+    return proportion(np.sum(in_order), len(in_order))
 
 
 def table_7_magnitudes() -> list[float]:
@@ -367,27 +333,6 @@ def led_magnitudes(testbed: Testbed, rng: np.random.Generator) -> Floats:
     lights = measure_lights(image)
     distance_px = np.linalg.norm(xy_px[:, None] - lights.xy_px, axis=2)
     return np.where(distance_px.min(axis=1) < 10, lights.magnitude[distance_px.argmin(axis=1)], 0.0)
-
-
-def drawings(magnitude: Floats, rng: np.random.Generator) -> tuple[Drawing, ...]:
-    aperture_images = [take_image(color_board(lens), rng)[0] for lens in APERTURES.values()]
-    noise_images = [take_image(color_board(LensSettings(noise_e=noise_e)), rng)[0] for noise_e in (None, NOISE_E)]
-    return (
-        Drawing(
-            "Fig. 36: our board, focused and wide, less focused and narrow, balanced.",
-            lambda fig: draw_apertures(fig, aperture_images),
-            (7.4, 2.8),
-        ),
-        Drawing(
-            "Figs 37 and 40: pixels above four thresholds, with the camera's own noise (top) and with that of Test 2.",
-            lambda fig: draw_thresholds(fig, noise_images),
-            (7.4, 4.0),
-        ),
-        Drawing(
-            "Pulses of five LEDs against their measured magnitude, beside Table 7's.",
-            lambda fig: draw_pulses(fig, magnitude),
-        ),
-    )
 
 
 def crop_board(image: GrayImage) -> GrayImage:
@@ -415,15 +360,8 @@ def draw_pulses(fig: Any, magnitude: Floats) -> None:
     """Magnitude against pulse, ours scaled so that the 200 us LED has its published magnitude."""
     axes, published = fig.subplots(), np.array(table_7_magnitudes())
     ours = magnitude * published[3] / magnitude[:, 3].mean()
-    axes.errorbar(
-        PULSES_US,
-        ours.mean(axis=0),
-        ours.std(axis=0),
-        fmt="s",
-        color=INK[0],
-        capsize=2,
-        label=f"ours, {CAUSE_LONG_PULSE}",
-    )
+    style = {"fmt": "s", "color": INK[0], "capsize": 2, "label": f"ours, {CAUSE_LONG_PULSE}"}
+    axes.errorbar(PULSES_US, ours.mean(axis=0), ours.std(axis=0), **style)
     axes.plot(PULSES_US, published, "o", color=INK[1], label="published")
     axes.plot([0, 600], [0, 3 * published[3]], "--", color=INK[6], label="proportional")
     axes.set(xlabel="pulse (us)", ylabel="magnitude, 200 us as published")

@@ -11,9 +11,9 @@ from scipy.spatial.transform import Rotation
 
 from skysim.core.types import Floats
 from skysim.core.units import INCH_M
-from skysim.experiments.papers.compare import Cause, Drawing, ExperimentOptions, ExperimentResult, RowResult
+from skysim.experiments.papers.compare import Drawing, ExperimentOptions, ExperimentResult, RowResult, with_cause
 from skysim.experiments.papers.published import published_values
-from skysim.results.metrics import Summary, exact
+from skysim.results.metrics import exact
 from skysim.results.plots import INK
 from skysim.scene.light import FlatSurfaceConfig, SphereSurfaceConfig
 from skysim.sources.dome.point_cloud import fit_sphere
@@ -57,26 +57,18 @@ def table_1(options: ExperimentOptions) -> ExperimentResult:
         np.array([width_in(panel, height_in, angle) for angle in ANGLES_DEG])
         for height_in in (STATED_HEIGHT_IN, FITTED_HEIGHT_IN)
     )
-    cause = f"M = {FITTED_HEIGHT_IN} in"
-    results = {
-        f"width_{angle}": RowResult(exact(stated[n]), cause=Cause(cause, exact(fitted[n])))
-        for n, angle in enumerate(ANGLES_DEG)
-    }
-    results |= {
-        f"more_{angle}": RowResult(relative_increase(stated, n), cause=Cause(cause, relative_increase(fitted, n)))
-        for n, angle in enumerate(ANGLES_DEG[1:], 1)
-    }
+    results = {}
+    for n, angle in enumerate(ANGLES_DEG):
+        values = {"width": [width[n] for width in (stated, fitted)]}
+        if n:  # the difference from the first width, in percent of their mean (the thesis's definition)
+            values["more"] = [200 * (width[n] - width[0]) / (width[n] + width[0]) for width in (stated, fitted)]
+        for name, pair in values.items():
+            results[f"{name}_{angle}"] = with_cause(f"M = {FITTED_HEIGHT_IN} in", exact, *pair)
     dome = build_surface(SPHERE)
     chords = [chord_in(dome, STATED_HEIGHT_IN, angle) for angle in ANGLES_DEG]
     results["sphere"] = RowResult(exact(np.ptp(chords)))
-    return ExperimentResult(
-        results, (Drawing("Table 1: width of the image on a flat surface.", lambda fig: draw(fig, panel)),)
-    )
-
-
-def relative_increase(width: Floats, n: int) -> Summary:
-    """Difference of a width from the first, in percent of their mean (the thesis's definition)."""
-    return exact(200 * (width[n] - width[0]) / (width[n] + width[0]))
+    caption = "Table 1: width of the image on a flat surface."
+    return ExperimentResult(results, (Drawing(caption, lambda fig: draw(fig, panel)),))
 
 
 def chord_in(surface: Surface, height_in: float, angle_deg: float) -> float:
@@ -88,16 +80,11 @@ def chord_in(surface: Surface, height_in: float, angle_deg: float) -> float:
 
 
 def draw(fig: Any, panel: Surface) -> None:
-    """Widths against the angle for both mount heights, with the published ones."""
     axes = fig.subplots()
     angle = np.linspace(0, 30, 61)
     for height_in, ink in ((STATED_HEIGHT_IN, INK[0]), (FITTED_HEIGHT_IN, INK[2])):
-        axes.plot(
-            angle,
-            [width_in(panel, height_in, angle_deg) for angle_deg in angle],
-            color=ink,
-            label=f"ours, M = {height_in} in",
-        )
+        width = [width_in(panel, height_in, angle_deg) for angle_deg in angle]
+        axes.plot(angle, width, color=ink, label=f"ours, M = {height_in} in")
     published = published_values("afit-table-1", *(f"width_{angle}" for angle in ANGLES_DEG))
     axes.plot(ANGLES_DEG, published, "o", color=INK[1], label="published")
     axes.set(xlabel="angle (deg)", ylabel="width (in)")

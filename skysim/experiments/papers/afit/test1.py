@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from functools import partial
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -13,6 +14,7 @@ from estimator.calibration.home_position import pooled
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
 from skysim.dynamics import guidance
+from skysim.experiments.configs import with_config
 from skysim.experiments.papers.afit.test_stand import (
     build_test_stand,
     gray_levels,
@@ -20,15 +22,8 @@ from skysim.experiments.papers.afit.test_stand import (
     measure_lights,
     render_at_attitude,
     separations_arcsec,
-    with_config,
 )
-from skysim.experiments.papers.compare import (
-    Drawing,
-    ExperimentOptions,
-    ExperimentResult,
-    RowResult,
-    with_cause,
-)
+from skysim.experiments.papers.compare import Drawing, ExperimentOptions, ExperimentResult, RowResult, with_cause
 from skysim.experiments.papers.intervals import confidence_interval
 from skysim.experiments.papers.published import published_values
 from skysim.results.metrics import exact
@@ -51,13 +46,6 @@ CAUSE = "100 ms, 11 1/9 cycles: one LED has a twelfth pulse"
 GAP_ARCSEC = 100.0  # sorted angles with a larger gap are counted as distinct
 
 
-class Board(NamedTuple):
-    """A board's images: (n, 9) magnitudes, sorted within each image, and (n,) attitude number."""
-
-    magnitude: Floats
-    position: Floats
-
-
 def attitudes(scene: Scene) -> list[Rotation]:
     """The five attitudes of the scene's maneuver."""
     legs = [leg for leg in scene.motion.maneuver if isinstance(leg, SlewConfig)]
@@ -70,56 +58,62 @@ def scene_with_exposure(time_s: float) -> Scene:
     return with_config(scene, "light.led", intensity_cd=INTENSITY_CD * FRAME_TIME_S / time_s)
 
 
-def with_other_leds(testbed: Testbed, hardware_seed: int) -> Testbed:
-    """The same board with nine other LEDs, by another hardware seed."""
-    scene = with_config(testbed.scene, "light.layout", hardware_seed=hardware_seed)
-    return replace(testbed, scene=scene, sources=light_sources(scene, testbed.band))
+def take_board(testbed: Testbed, images: int, rng: np.random.Generator) -> Floats:
+    """(n, 9) magnitudes of a board, sorted within each image, from images at each of the five attitudes.
 
-
-def take_board(testbed: Testbed, images: int, rng: np.random.Generator) -> Board:
-    """Images from each of the five attitudes; those that do not show all nine LEDs are left out."""
-    magnitude, position = [], []
-    for n, lab_from_body in enumerate(attitudes(testbed.scene)):
-        for _ in range(images):
-            sorted_magnitudes = measure_frame(testbed, lab_from_body, rng).magnitude
-            if len(sorted_magnitudes) == LEDS:
-                magnitude.append(sorted_magnitudes)
-                position.append(n)
-    return Board(np.array(magnitude), np.array(position))
+    Images that do not show all nine LEDs are left out.
+    """
+    poses = [lab_from_body for lab_from_body in attitudes(testbed.scene) for _ in range(images)]
+    magnitudes = [measure_frame(testbed, lab_from_body, rng).magnitude for lab_from_body in poses]
+    return np.array([one for one in magnitudes if len(one) == LEDS])
 
 
 def table_2(options: ExperimentOptions) -> ExperimentResult:
     """Table 2, and the five angles of Fig. 66."""
     boards, images = options.trials(24, 3), options.trials(5, 2)
     stands = [build_test_stand(scene_with_exposure(time_s)) for time_s in (FULL_CYCLES_S, FRAME_TIME_S)]
-    full_cycles: list[Board] = []
-    frame_time: list[Board] = []
+    runs: tuple[list[Floats], list[Floats]] = ([], [])  # with full cycles, with the frame time
     for n in range(boards):
         options.watch(n, boards)
         hardware_seed = int(random_stream(options.seed, n).integers(2**31))
-        for stage, (testbed, runs) in enumerate(zip(stands, (full_cycles, frame_time), strict=True)):
+        for stage, testbed in enumerate(stands):
+            # The same board with nine other LEDs, by another hardware seed.
+            scene = with_config(testbed.scene, "light.layout", hardware_seed=hardware_seed)
+            other_leds = replace(testbed, scene=scene, sources=light_sources(scene, testbed.band))
             rng = random_stream(options.seed, stage, n)
-            runs.append(take_board(with_other_leds(testbed, hardware_seed), images, rng))
-    results = ranks(full_cycles, frame_time) | relative_spread(full_cycles)
+            runs[stage].append(take_board(other_leds, images, rng))
     found_arcsec = lattice_angles(stands[0], options.trials(20, 2), random_stream(options.seed, 2))
-    return ExperimentResult(results | separations(found_arcsec), drawings(full_cycles, frame_time, found_arcsec))
-
-
-def ranks(full_cycles: Sequence[Board], frame_time: Sequence[Board]) -> dict[str, RowResult]:
-    """Table 2: mean and pooled standard deviation of each rank, over boards; magnitudes scaled to published mean."""
-    published_mean = published_by_rank("mean").mean()
-    scales = [[published_mean / values.magnitude.mean() for values in runs] for runs in (full_cycles, frame_time)]
-    mean, std = (
-        [
-            np.array([scale * statistic(values) for scale, values in zip(run_scales, runs, strict=True)])
-            for run_scales, runs in zip(scales, (full_cycles, frame_time), strict=True)
-        ]
-        for statistic in (mean_by_rank, pooled_std_by_rank)
+    drawings = (
+        Drawing(
+            "Table 2: magnitude by rank; a bar is a rank's standard deviation over the images of a board.",
+            lambda fig: draw_ranks(fig, *runs),
+        ),
+        Drawing(
+            "Figs 64 and 65: magnitudes of one of our boards by rank, at an exposure of 100 ms.",
+            lambda fig: draw_board(fig, runs[1][0]),
+        ),
+        Drawing(
+            "Fig. 66: angles of all 36 pairs; dashed, a perfect lattice of 8 mm at 48 in.",
+            lambda fig: draw_angles(fig, found_arcsec),
+        ),
     )
+    return ExperimentResult(ranks(*runs) | separations(found_arcsec), drawings)
+
+
+def ranks(full_cycles: Sequence[Floats], frame_time: Sequence[Floats]) -> dict[str, RowResult]:
+    """Table 2: mean and pooled standard deviation of each rank, over boards, magnitudes scaled to the published mean;
+    and the relative standard deviation among the nine LEDs of a board, percent."""
+    published_mean = published_by_rank("mean").mean()
     results: dict[str, RowResult] = {}
-    for n in range(LEDS):
-        results[f"mean_{n + 1}"] = with_cause(CAUSE, confidence_interval, *(values[:, n] for values in mean))
-        results[f"sd_{n + 1}"] = with_cause(CAUSE, confidence_interval, *(values[:, n] for values in std))
+    for name, statistic in (("mean", partial(np.mean, axis=0)), ("sd", pooled_std_by_rank)):
+        ours, theirs = (
+            np.array([published_mean / board.mean() * statistic(board) for board in boards])
+            for boards in (full_cycles, frame_time)
+        )
+        for n in range(LEDS):
+            results[f"{name}_{n + 1}"] = with_cause(CAUSE, confidence_interval, ours[:, n], theirs[:, n])
+    mean = np.array([board.mean(axis=0) for board in full_cycles])
+    results["scatter"] = RowResult(confidence_interval(100 * mean.std(axis=1, ddof=1) / mean.mean(axis=1)))
     return results
 
 
@@ -128,21 +122,10 @@ def published_by_rank(statistic: str) -> Floats:
     return published_values("afit-table-2", *(f"{statistic}_{rank}" for rank in range(1, LEDS + 1)))
 
 
-def mean_by_rank(board: Board) -> Floats:
-    """(9,) mean magnitude of each rank over all images."""
-    return np.asarray(board.magnitude.mean(axis=0))
-
-
-def pooled_std_by_rank(board: Board) -> Floats:
+def pooled_std_by_rank(board: Floats) -> Floats:
     """(9,) standard deviation of each rank over all images."""
-    rank = np.tile(np.arange(LEDS), len(board.magnitude))
-    return pooled(board.magnitude.ravel(), rank, np.zeros_like(rank))
-
-
-def relative_spread(full_cycles: Sequence[Board]) -> dict[str, RowResult]:
-    """Relative standard deviation among the nine LEDs of a board, percent."""
-    mean = np.array([mean_by_rank(board) for board in full_cycles])
-    return {"scatter": RowResult(confidence_interval(100 * mean.std(axis=1, ddof=1) / mean.mean(axis=1)))}
+    rank = np.tile(np.arange(LEDS), len(board))
+    return pooled(board.ravel(), rank, np.zeros_like(rank))
 
 
 def lattice_angles(testbed: Testbed, images: int, rng: np.random.Generator) -> Floats:
@@ -173,31 +156,13 @@ def separations(angles_arcsec: Floats) -> dict[str, RowResult]:
     return results
 
 
-def drawings(full_cycles: Sequence[Board], frame_time: Sequence[Board], angles_arcsec: Floats) -> tuple[Drawing, ...]:
-    return (
-        Drawing(
-            "Table 2: magnitude by rank; a bar is a rank's standard deviation over the images of a board.",
-            lambda fig: draw_ranks(fig, full_cycles, frame_time),
-        ),
-        Drawing(
-            "Figs 64 and 65: magnitudes of one of our boards by rank, at an exposure of 100 ms.",
-            lambda fig: draw_board(fig, frame_time[0]),
-        ),
-        Drawing(
-            "Fig. 66: angles of all 36 pairs; dashed, a perfect lattice of 8 mm at 48 in.",
-            lambda fig: draw_angles(fig, angles_arcsec),
-        ),
-    )
-
-
-def draw_ranks(fig: Any, full_cycles: Sequence[Board], frame_time: Sequence[Board]) -> None:
-    """Published magnitudes by rank, and ours with whole cycles and with the frame time."""
+def draw_ranks(fig: Any, full_cycles: Sequence[Floats], frame_time: Sequence[Floats]) -> None:
     axes, rank, published = fig.subplots(), np.arange(1, LEDS + 1), published_by_rank("mean")
     for shift, ink, marker, name, boards in (
         (-0.15, INK[0], "s", "ours, whole cycles", full_cycles),
         (0.15, INK[2], "D", "ours, 100 ms", frame_time),
     ):
-        mean = np.mean([mean_by_rank(board) for board in boards], axis=0)
+        mean = np.mean([board.mean(axis=0) for board in boards], axis=0)
         std = np.mean([pooled_std_by_rank(board) for board in boards], axis=0)
         scale = published.mean() / mean.mean()
         axes.errorbar(rank + shift, scale * mean, scale * std, fmt=marker, color=ink, capsize=2, label=name)
@@ -206,12 +171,11 @@ def draw_ranks(fig: Any, full_cycles: Sequence[Board], frame_time: Sequence[Boar
     axes.legend()
 
 
-def draw_board(fig: Any, board: Board) -> None:
-    """Histograms of the magnitudes by rank."""
+def draw_board(fig: Any, board: Floats) -> None:
     axes = fig.subplots()
-    bins = np.linspace(board.magnitude.min(), board.magnitude.max(), 60)
+    bins = np.linspace(board.min(), board.max(), 60)
     colors = [*INK, "#bbbbbb"]
-    axes.hist(list(board.magnitude.T), bins, stacked=True, color=colors, label=[str(n + 1) for n in range(LEDS)])
+    axes.hist(list(board.T), bins, stacked=True, color=colors, label=[str(n + 1) for n in range(LEDS)])
     published = published_by_rank("mean")
     axes.plot(published, np.zeros(LEDS), "v", color="black", markersize=7, clip_on=False, label="published means")
     axes.set(xlabel="magnitude", ylabel="images")
@@ -219,20 +183,11 @@ def draw_board(fig: Any, board: Board) -> None:
 
 
 def draw_angles(fig: Any, angles_arcsec: Floats) -> None:
-    """Histogram of the angles, with those of a perfect lattice."""
     axes = fig.subplots()
     axes.hist(angles_arcsec.ravel(), np.arange(1200, 4000, 20), color=INK[0], label="ours")
-    for n, squared_distance in enumerate(SQUARED_DISTANCES):
-        axes.axvline(
-            lattice_angle_arcsec(squared_distance),
-            ls="--",
-            color=INK[1],
-            label="8 mm lattice" if n == 0 else None,
-        )
+    # Angles about the bearing of two LEDs of the lattice, in a board at 48 in.
+    for n, angle_rad in enumerate(2 * np.arctan(PITCH_M * np.sqrt(SQUARED_DISTANCES) / 2 / (48 * 0.0254))):
+        label = "8 mm lattice" if n == 0 else None
+        axes.axvline(np.degrees(angle_rad) * 3600, ls="--", color=INK[1], label=label)
     axes.set(xlabel="angle of a pair (arcsec)", ylabel="pairs in all images")
     axes.legend()
-
-
-def lattice_angle_arcsec(squared_distance: float) -> float:
-    """Angle about the bearing of two LEDs sqrt(squared) pitches apart in a board at 48 in."""
-    return float(np.degrees(2 * np.arctan(PITCH_M * np.sqrt(squared_distance) / 2 / (48 * 0.0254))) * 3600)

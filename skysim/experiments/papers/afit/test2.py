@@ -18,28 +18,11 @@ from estimator.attitude.dome_map import project
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
 from skysim.core.units import INCH_M
+from skysim.experiments.configs import with_config
 from skysim.experiments.papers.afit.surface import contour
-from skysim.experiments.papers.afit.test_stand import (
-    E_PER_GRAY,
-    build_test_stand,
-    measure_frame,
-    separations_arcsec,
-    with_config,
-)
-from skysim.experiments.papers.compare import (
-    Cause,
-    Drawing,
-    ExperimentOptions,
-    ExperimentResult,
-    RowResult,
-    with_cause,
-)
-from skysim.experiments.papers.intervals import (
-    bootstrap_interval,
-    confidence_interval,
-    sample_std,
-    symmetric_interval,
-)
+from skysim.experiments.papers.afit.test_stand import E_PER_GRAY, build_test_stand, measure_frame, separations_arcsec
+from skysim.experiments.papers.compare import Drawing, ExperimentOptions, ExperimentResult, RowResult, with_cause
+from skysim.experiments.papers.intervals import bootstrap_interval, confidence_interval, sample_std, symmetric_interval
 from skysim.experiments.papers.published import experiments
 from skysim.results.metrics import Summary, exact
 from skysim.results.plots import INK, MARKS
@@ -88,11 +71,6 @@ def scene(dim_fraction: float) -> Scene:
     return with_config(scene, "light.led", intensity_cd=INTENSITY_CD, scatter=0.0)
 
 
-def noisy_scene() -> Scene:
-    """The same scene with the read noise that gives Table 5's standard deviations."""
-    return with_config(scene(ON_FRACTION), "camera.detector", read_noise_e=NOISE_E)
-
-
 def measured_dome(scene: Scene, decenter_in: float = 0.0) -> Surface:
     """The measured dome, displaced along x."""
     assert isinstance(scene.light, DomeConfig)
@@ -107,11 +85,8 @@ def place_pair(testbed: Testbed, place: Place) -> Testbed:
     normal = board_tilt.apply(dome.inward(center_m[None])[0])
     meridian = np.cross(normal, [0.0, 1.0, 0.0])
     positions_m = center_m + np.outer([-PAIR_M / 2, PAIR_M / 2], meridian / np.linalg.norm(meridian))
-    pair = testbed.sources.take(np.arange(2))
-    return replace(
-        testbed,
-        sources=replace(pair, place=np.column_stack([positions_m, np.ones(2)]), normal=np.tile(normal, (2, 1))),
-    )
+    pair, homogeneous = testbed.sources.take(np.arange(2)), np.column_stack([positions_m, np.ones(2)])
+    return replace(testbed, sources=replace(pair, place=homogeneous, normal=np.tile(normal, (2, 1))))
 
 
 def point_at(place: Place) -> Rotation:
@@ -134,7 +109,9 @@ def series(testbed: Testbed, place: Place, images: int, rng: np.random.Generator
 def tables_3_to_5(options: ExperimentOptions) -> ExperimentResult:
     """Tables 3 to 5 and the dome's contour: with the camera's own noise, and with more noise as the cause."""
     images = options.trials(50, 10)
-    quiet_stand, noisy_stand = build_test_stand(scene(ON_FRACTION)), build_test_stand(noisy_scene())
+    quiet_stand = build_test_stand(scene(ON_FRACTION))
+    # The read noise that gives Table 5's standard deviations.
+    noisy_stand = build_test_stand(with_config(scene(ON_FRACTION), "camera.detector", read_noise_e=NOISE_E))
     rng = [random_stream(options.seed, stage) for stage in range(3)]
     runs = NoiseRuns([], [])
     for n, tilt_deg in enumerate(PLACES_DEG):
@@ -145,7 +122,19 @@ def tables_3_to_5(options: ExperimentOptions) -> ExperimentResult:
     options.watch(3, 4)
     results |= angles(quiet_stand, runs, options.trials(12, 2), rng[2])
     results |= contour(measured_dome(load("afit_test2")))
-    return ExperimentResult(results, drawings(quiet_stand, runs))
+    drawings = (
+        Drawing(
+            f"Figs 69 and 70: magnitudes of the two LEDs at three positions, ours with {CAUSE_NOISE}; published as"
+            " mean and standard deviation.",
+            lambda fig: draw_magnitudes(fig, runs.more),
+        ),
+        Drawing(
+            "Fig. 71 and Table 5: the pair's angle over the tilt of its board; the published bars are standard"
+            " deviations, their tilts 0 deg, as fitted and as assumed.",
+            lambda fig: draw_angles(fig, quiet_stand, runs.own),
+        ),
+    )
+    return ExperimentResult(results, drawings)
 
 
 def magnitudes(runs: NoiseRuns, images: int) -> dict[str, RowResult]:
@@ -153,29 +142,30 @@ def magnitudes(runs: NoiseRuns, images: int) -> dict[str, RowResult]:
     results: dict[str, RowResult] = {}
     counts = [f"{len(own.magnitude)} and {len(more.magnitude)}" for own, more in zip(*runs, strict=True)]
     for led, name in enumerate(("bright", "dim")):
-        ours, theirs = ([confidence_interval(one.magnitude[:, led]) for one in places] for places in runs)
+        ours, theirs = ([one.magnitude[:, led] for one in places] for places in runs)
         for n, (own, more) in enumerate(zip(ours, theirs, strict=True)):
             note = f"the pair is detected in {counts[n]} of {images} images"
-            results[f"{name}_{n + 1}"] = RowResult(own, note, Cause(CAUSE_NOISE, more))
+            results[f"{name}_{n + 1}"] = with_cause(CAUSE_NOISE, confidence_interval, own, more, note=note)
         results[f"{name}_avg"] = with_cause(CAUSE_NOISE, mean_of_places, ours, theirs)
         if led == BRIGHT:
             results["gain"] = with_cause(CAUSE_NOISE, relative_gain, ours, theirs)
     return results
 
 
-def relative_gain(places: Sequence[Summary]) -> Summary:
+def relative_gain(places: Sequence[Floats]) -> Summary:
     """Increase of the mean from the first place to the last in percent; independent errors add in quadrature."""
-    first, last = places[0], places[-1]
+    first, last = confidence_interval(places[0]), confidence_interval(places[-1])
     value = 100 * (last.value / first.value - 1)
     half = 100 * float(np.hypot(last.high - last.value, first.high - first.value)) / first.value
     return symmetric_interval(value, half, first.trials + last.trials)
 
 
-def mean_of_places(places: Sequence[Summary]) -> Summary:
+def mean_of_places(places: Sequence[Floats]) -> Summary:
     """Mean of the places' means; independent errors add in quadrature."""
-    value = float(np.mean([place.value for place in places]))
-    half = float(np.sqrt(sum((place.high - place.value) ** 2 for place in places)) / len(places))
-    return symmetric_interval(value, half, sum(place.trials for place in places))
+    means = [confidence_interval(values) for values in places]
+    value = float(np.mean([mean.value for mean in means]))
+    half = float(np.sqrt(sum((mean.high - mean.value) ** 2 for mean in means)) / len(means))
+    return symmetric_interval(value, half, sum(mean.trials for mean in means))
 
 
 def standard_deviations(runs: NoiseRuns) -> dict[str, RowResult]:
@@ -187,19 +177,15 @@ def standard_deviations(runs: NoiseRuns) -> dict[str, RowResult]:
         values[f"{name}_all"] = tuple(np.concatenate(column) for column in columns)
     for n, (own, more) in enumerate(zip(*runs, strict=True), 1):
         values[f"angle_{n}"] = own.angle_arcsec, more.angle_arcsec
+    std_interval = partial(bootstrap_interval, statistic=sample_std)
     return {f"sd_{key}": with_cause(CAUSE_NOISE, std_interval, *pair) for key, pair in values.items()}
-
-
-def std_interval(values: Floats) -> Summary:
-    """Standard deviation (n - 1) with its bootstrap interval."""
-    return bootstrap_interval(values, sample_std)
 
 
 def angles(testbed: Testbed, runs: NoiseRuns, images: int, rng: np.random.Generator) -> dict[str, RowResult]:
     """Table 5's means, with the effect of each cause on the last two."""
     edge = PLACES_DEG[2]
     halfway, decentered, tilted, tilted_decentered, more_tilted_decentered = (
-        confidence_interval(series(testbed, place, images, rng).angle_arcsec)
+        series(testbed, place, images, rng).angle_arcsec
         for place in (
             Place(HALFWAY_DEG),
             Place(edge, 0.0, DECENTER_IN),
@@ -212,29 +198,30 @@ def angles(testbed: Testbed, runs: NoiseRuns, images: int, rng: np.random.Genera
     noise_bias_arcsec = [
         float(more.angle_arcsec.mean() - own.angle_arcsec.mean()) for own, more in zip(*runs, strict=True)
     ]
-    means = [confidence_interval(own.angle_arcsec) for own in runs.own]
+    at_apex, at_halfway, at_edge = (own.angle_arcsec for own in runs.own)
     note = (
-        f'the dome {DECENTER_IN} in off center alone: {decentered.value:.1f}"; with that, tilted by'
-        f' {SMALLER_BOARD_TILT_DEG:g} deg: {tilted_decentered.value:.1f}", tilted by {BOARD_TILT_DEG:g} deg:'
-        f' {more_tilted_decentered.value:.1f}"; centroid bias of the dim LED, in the noise:'
+        f'the dome {DECENTER_IN} in off center alone: {decentered.mean():.1f}"; with that, tilted by'
+        f' {SMALLER_BOARD_TILT_DEG:g} deg: {tilted_decentered.mean():.1f}", tilted by {BOARD_TILT_DEG:g} deg:'
+        f' {more_tilted_decentered.mean():.1f}"; centroid bias of the dim LED, in the noise:'
         f' {noise_bias_arcsec[2] - noise_bias_arcsec[0]:+.1f}" from apex to edge, by glare of a lens with wide'
         f' wings: {glare_arcsec:+.1f}"'
     )
     cause = f"a board tilted by {BOARD_TILT_DEG:g} deg"
     smallest = min(geometric_angle_arcsec(testbed, Place(float(tilt))) for tilt in np.linspace(20, 34, 29))
     return {
-        "angle_1": RowResult(means[0]),
-        "angle_2": RowResult(means[1], cause=Cause(f"the board at {HALFWAY_DEG} deg", halfway)),
-        "angle_3": RowResult(means[2], note, Cause(cause, tilted)),
-        "fall": with_cause(cause, partial(relative_decrease, means[0].value), means[2], tilted),
+        "angle_1": RowResult(confidence_interval(at_apex)),
+        "angle_2": with_cause(f"the board at {HALFWAY_DEG} deg", confidence_interval, at_halfway, halfway),
+        "angle_3": with_cause(cause, confidence_interval, at_edge, tilted, note=note),
+        "fall": with_cause(cause, partial(relative_decrease, float(at_apex.mean())), at_edge, tilted),
         "least": RowResult(exact(smallest)),
     }
 
 
-def relative_decrease(reference: float, angle: Summary) -> Summary:
-    """Decrease of an angle relative to `reference` in percent; the error of `reference` is neglected."""
-    value, high, low = (100 * (1 - one / reference) for one in (angle.value, angle.low, angle.high))
-    return Summary(value, low, high, angle.trials)
+def relative_decrease(reference: float, angles: Floats) -> Summary:
+    """Decrease of a mean angle relative to `reference` in percent; the error of `reference` is neglected."""
+    *mean, trials = confidence_interval(angles)
+    value, high, low = (100 * (1 - one / reference) for one in mean)
+    return Summary(value, low, high, trials)
 
 
 def glare_bias_arcsec(testbed: Testbed, images: int, rng: np.random.Generator) -> float:
@@ -258,23 +245,7 @@ def geometric_angle_arcsec(testbed: Testbed, place: Place) -> float:
     return float(separations_arcsec(xy_px, testbed)[0])
 
 
-def drawings(testbed: Testbed, runs: NoiseRuns) -> tuple[Drawing, ...]:
-    return (
-        Drawing(
-            f"Figs 69 and 70: magnitudes of the two LEDs at three positions, ours with {CAUSE_NOISE}; published as"
-            " mean and standard deviation.",
-            lambda fig: draw_magnitudes(fig, runs.more),
-        ),
-        Drawing(
-            "Fig. 71 and Table 5: the pair's angle over the tilt of its board; the published bars are standard"
-            " deviations, their tilts 0 deg, as fitted and as assumed.",
-            lambda fig: draw_angles(fig, testbed, runs.own),
-        ),
-    )
-
-
 def draw_magnitudes(fig: Any, places: Sequence[Series]) -> None:
-    """Histograms of our magnitudes, with the published means and deviations."""
     rows = experiments()["afit-table-3-5"].rows
     panels = fig.subplots(1, 2)
     for column, name, axes in zip((DIM, BRIGHT), ("dim", "bright"), panels, strict=True):
@@ -294,7 +265,6 @@ def draw_magnitudes(fig: Any, places: Sequence[Series]) -> None:
 
 
 def draw_angles(fig: Any, testbed: Testbed, places: Sequence[Series]) -> None:
-    """Angles against the tilt: geometric curves, ours from images, and the published ones."""
     rows, axes = experiments()["afit-table-3-5"].rows, fig.subplots()
     tilt_deg = np.linspace(0, 32, 33)
     curves = (
@@ -303,29 +273,12 @@ def draw_angles(fig: Any, testbed: Testbed, places: Sequence[Series]) -> None:
         (f"leaning {BOARD_TILT_DEG:g} deg", Place(0, BOARD_TILT_DEG)),
     )
     for ink, style, (name, place) in zip((INK[0], INK[2], INK[4]), ("-", "--", "-."), curves, strict=True):
-        axes.plot(
-            tilt_deg,
-            [geometric_angle_arcsec(testbed, place._replace(tilt_deg=float(tilt))) for tilt in tilt_deg],
-            style,
-            color=ink,
-            label=name,
-        )
-    axes.plot(
-        PLACES_DEG,
-        [one.angle_arcsec.mean() for one in places],
-        "s",
-        color=INK[0],
-        label="ours, from images",
-    )
-    published = [(rows[f"angle_{n}"].published, rows[f"sd_angle_{n}"].published) for n in (1, 2, 3)]
-    axes.errorbar(
-        (0, HALFWAY_DEG, PLACES_DEG[2]),
-        [mean for mean, _ in published],
-        [sd for _, sd in published],
-        fmt="o",
-        capsize=3,
-        color=INK[1],
-        label="published",
-    )
+        angle = [geometric_angle_arcsec(testbed, place._replace(tilt_deg=float(tilt))) for tilt in tilt_deg]
+        axes.plot(tilt_deg, angle, style, color=ink, label=name)
+    ours = [one.angle_arcsec.mean() for one in places]
+    axes.plot(PLACES_DEG, ours, "s", color=INK[0], label="ours, from images")
+    mean, sd = ([rows[f"{key}_{n}"].published for n in (1, 2, 3)] for key in ("angle", "sd_angle"))
+    published_deg = (0, HALFWAY_DEG, PLACES_DEG[2])
+    axes.errorbar(published_deg, mean, sd, fmt="o", capsize=3, color=INK[1], label="published")
     axes.set(xlabel="tilt of the board (deg)", ylabel="angle of the pair (arcsec)")
     axes.legend()

@@ -8,6 +8,7 @@ faults of the camera, and with the IMU errors of Tables 10-14.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -29,7 +30,6 @@ from skysim.experiments.papers.afit.test3_images import (
     lab_from_body,
     measure,
     photograph,
-    replace_imu_attitude,
 )
 from skysim.experiments.papers.afit.test_stand import light_positions_m
 from skysim.experiments.papers.compare import Cause, Drawing, ExperimentOptions, ExperimentResult, RowResult
@@ -64,20 +64,29 @@ def tables_6_to_9(options: ExperimentOptions) -> ExperimentResult:
         "nominal": ({"light.layout.positions": NOMINAL_POSITIONS}, few_images),
         "stated levels": ({"light.layout.levels": "[1.0, 0.5, 0.4, 0.2, 0.001]"}, few_images),
     }
-    fitted_overrides = {"light.layout.positions": positions_yaml(fit_positions(build_test3()))}
+    positions = [f'["{x * 1e3:.4f} mm", "{y * 1e3:.4f} mm", "48 in"]' for x, y, _ in fit_positions(build_test3())]
+    fitted_overrides = {"light.layout.positions": f"[{', '.join(positions)}]"}
     series = {}
     for done, (name, (overrides, n_images)) in enumerate(plan.items()):
         options.watch(done, len(plan))
-        testbed = build_test3(fitted_overrides | overrides)
-        series[name] = ImageSeries(testbed, photograph_positions(testbed, n_images, random_stream(options.seed, done)))
+        testbed, rng = build_test3(fitted_overrides | overrides), random_stream(options.seed, done)
+        series[name] = ImageSeries(testbed, photograph_positions(testbed, n_images, rng))
     ours, with_faults, nominal = (series[name].measurements for name in ("ours", "camera faults", "nominal"))
     bumped = series["ours"].bumped(BUMPED_POSITION)
     drifted = series["ours"].bumped(*range(len(IMU_DEG)))
-    results = magnitudes(ours, with_faults, series["stated levels"])
-    results |= separations(ours, with_faults, nominal)
-    results |= epsilons(ours, with_faults, bumped, drifted)
-    results |= buckets()
-    return ExperimentResult(results, drawings(with_faults, bumped))
+    results = magnitudes(ours, with_faults, series["stated levels"]) | separations(ours, with_faults, nominal)
+    results |= epsilons(ours, with_faults, bumped, drifted) | buckets()
+    caption = f"Figs 74 and 75: magnitudes of 250 images, ours with {CAUSE}."
+    drawings = (
+        Drawing(caption, lambda fig: draw_magnitudes(fig, with_faults)),
+        Drawing(f"Fig. 76: angles of all pairs, ours with {CAUSE}.", lambda fig: draw_separations(fig, with_faults)),
+        Drawing(
+            "Figs 77 and 79: positions of the five LEDs; the IMU is correct except at the bumped position 5.",
+            lambda fig: draw_scatter(fig, bumped),
+            (6.4, 3.9),
+        ),
+    )
+    return ExperimentResult(results, drawings)
 
 
 class ImageSeries(NamedTuple):
@@ -97,10 +106,8 @@ class ImageSeries(NamedTuple):
             n: lab_from_body((np.add(TRUE_ANGLES_DEG[n], IMU_DEG[n]) - ALGORITHM_DEG[n]).tolist()) for n in positions
         }
         sightings = [
-            replace_imu_attitude([sighting], imu_attitudes[sighting.stop])[0]
-            if sighting.stop in imu_attitudes
-            else sighting
-            for sighting in self.sightings
+            replace(one, body_from_lab=imu_attitudes[one.stop].inv()) if one.stop in imu_attitudes else one
+            for one in self.sightings
         ]
         return measure(self.testbed, sightings)
 
@@ -146,12 +153,6 @@ def expected_angles_arcsec(testbed: Testbed, position_m: Floats) -> Floats:
     return Measurements(np.arange(len(body_m)), zeros, body_m, body_m).separation_arcsec.mean(axis=0)
 
 
-def positions_yaml(position_m: Floats) -> str:
-    """The positions in a scene's YAML syntax."""
-    items = [f'["{x * 1e3:.4f} mm", "{y * 1e3:.4f} mm", "48 in"]' for x, y, _ in position_m]
-    return f"[{', '.join(items)}]"
-
-
 # Statistics of the images, with intervals over the images.
 
 
@@ -173,6 +174,14 @@ def stratified_bootstrap(measurements: Measurements, values: Floats, statistic: 
         return statistic(table[chosen.astype(int)])
 
     return bootstrap_interval(rows.astype(float), statistic_of_draw)
+
+
+def with_camera_faults(
+    runs: tuple[Measurements, Measurements], quantity: str, columns: Any, statistic: Statistic, note: str = ""
+) -> RowResult:
+    """A statistic of columns of a quantity, of our images and of those with likely faults of the camera."""
+    ours, theirs = (stratified_bootstrap(one, getattr(one, quantity)[:, columns], statistic) for one in runs)
+    return RowResult(ours, note, Cause(CAUSE, theirs))
 
 
 def mean(values: Floats) -> Any:
@@ -204,10 +213,7 @@ def magnitudes(ours: Measurements, with_faults: Measurements, stated_levels: Ima
     results = {}
     for n in range(len(ON_US)):
         for key, statistic in (("magnitude", mean), ("magnitude_sd", largest_std)):
-            results[f"{key}_{n + 1}"] = RowResult(
-                stratified_bootstrap(ours, ours.magnitude[:, [n]], statistic),
-                cause=Cause(CAUSE, stratified_bootstrap(with_faults, with_faults.magnitude[:, [n]], statistic)),
-            )
+            results[f"{key}_{n + 1}"] = with_camera_faults((ours, with_faults), "magnitude", [n], statistic)
     # Only images with five LEDs are kept, so every one of `stated_levels` shows the LED of 1 us.
     dimmest = exact(stated_levels.measurements.magnitude[:, -1].mean() if stated_levels.sightings else 0.0)
     results["magnitude_5"] = RowResult(dimmest, cause=Cause("75 us of light (fitted)", results["magnitude_5"].ours))
@@ -220,14 +226,12 @@ def magnitudes(ours: Measurements, with_faults: Measurements, stated_levels: Ima
 def separations(ours: Measurements, with_faults: Measurements, nominal: Measurements) -> dict[str, RowResult]:
     """Table 8: separations of the pairs in ascending order."""
     order = np.argsort(ours.separation_arcsec.mean(axis=0))
-    angle, angle_with_faults = ours.separation_arcsec[:, order], with_faults.separation_arcsec[:, order]
+    angle = ours.separation_arcsec[:, order]
     results = {}
-    for n in range(len(order)):
-        results[f"separation_{n + 1}"] = RowResult(stratified_bootstrap(ours, angle[:, [n]], mean))
-        results[f"separation_sd_{n + 1}"] = RowResult(
-            stratified_bootstrap(ours, angle[:, [n]], largest_std),
-            cause=Cause(CAUSE, stratified_bootstrap(with_faults, angle_with_faults[:, [n]], largest_std)),
-        )
+    for n, pair in enumerate(order.tolist(), 1):
+        results[f"separation_{n}"] = RowResult(stratified_bootstrap(ours, angle[:, [n - 1]], mean))
+        spread = with_camera_faults((ours, with_faults), "separation_arcsec", [pair], largest_std)
+        results[f"separation_sd_{n}"] = spread
     nominal_angle = np.sort(nominal.separation_arcsec, axis=1)
     for n, (first, last) in enumerate(TABLE_8_GROUPS, 1):
         results[f"class_{n}"] = RowResult(stratified_bootstrap(nominal, nominal_angle[:, first:last], mean))
@@ -244,22 +248,18 @@ def epsilons(
         name: stratified_bootstrap(series, series.lab_m.reshape(len(series.lab_m), -1) * 1e3, largest_std)
         for name, series in (("ours", ours), ("bumped", bumped), ("drifted", drifted))
     }
+    at_one_position = f"{std_within_position(ours):.2g} for a pair at one position"
+    separation_note = f"{at_one_position}; the rest is the error of eq. 44 between positions"
     column_mm = np.sort(bumped.lab_m[bumped.position == BUMPED_POSITION, :, 0].mean(axis=0) * 1e3)
     return {
-        "epsilon_mag": RowResult(
-            stratified_bootstrap(ours, ours.magnitude, largest_std),
-            cause=Cause(CAUSE, stratified_bootstrap(with_faults, with_faults.magnitude, largest_std)),
-        ),
+        "epsilon_mag": with_camera_faults((ours, with_faults), "magnitude", slice(None), largest_std),
         "epsilon_pos": RowResult(
             position["ours"],
             f"with all differences of Tables 10-14 attributed to the IMU: {position['drifted'].value:.2f}",
             Cause("position 5 bumped", position["bumped"]),
         ),
-        "epsilon_sep": RowResult(
-            stratified_bootstrap(ours, ours.separation_arcsec, largest_std),
-            f"{std_within_position(ours):.2g} for a pair at one position; the rest is the error of eq. 44 between"
-            " positions",
-            Cause(CAUSE, stratified_bootstrap(with_faults, with_faults.separation_arcsec, largest_std)),
+        "epsilon_sep": with_camera_faults(
+            (ours, with_faults), "separation_arcsec", slice(None), largest_std, separation_note
         ),
         "columns": RowResult(extremum(column_mm, lambda x: (x[-1] - x[0]) / 2)),
         "height": RowResult(extremum(ours.lab_m[:, :, 2].ravel() * 1e3, np.ptp)),
@@ -294,36 +294,15 @@ def published(key: str, count: int) -> Floats:
     return published_values(ID, *(f"{key}_{n}" for n in range(1, count + 1)))
 
 
-def drawings(with_faults: Measurements, bumped: Measurements) -> tuple[Drawing, ...]:
-    cause = f"ours with {CAUSE}"
-    return (
-        Drawing(
-            f"Figs 74 and 75: magnitudes of 250 images, {cause}.",
-            lambda fig: draw_magnitudes(fig, with_faults),
-        ),
-        Drawing(f"Fig. 76: angles of all pairs, {cause}.", lambda fig: draw_separations(fig, with_faults)),
-        Drawing(
-            "Figs 77 and 79: positions of the five LEDs; the IMU is correct except at the bumped position 5.",
-            lambda fig: draw_scatter(fig, bumped),
-            (6.4, 3.9),
-        ),
-    )
-
-
 def draw_magnitudes(fig: Any, with_faults: Measurements) -> None:
     """A histogram for each LED, with Table 7's mean and deviation above."""
     axes = fig.subplots()
     edges = np.arange(0, 171, 2.0)
     heights = [axes.hist(magnitude, edges, color=INK[0], alpha=0.75)[0].max() for magnitude in with_faults.magnitude.T]
     axes.patches[0].set_label("ours")
-    axes.errorbar(
-        published("magnitude", len(ON_US)),
-        np.full(len(ON_US), 1.08 * max(heights)),
-        xerr=published("magnitude_sd", len(ON_US)),
-        fmt="o",
-        color=INK[1],
-        label="published, with 1 sd",
-    )
+    mean, sd = (published(key, len(ON_US)) for key in ("magnitude", "magnitude_sd"))
+    height = np.full(len(mean), 1.08 * max(heights))
+    axes.errorbar(mean, height, xerr=sd, fmt="o", color=INK[1], label="published, with 1 sd")
     axes.set(xlabel="instrument magnitude", ylabel="images", ylim=(0, 1.3 * max(heights)))
     axes.legend(loc="upper right", ncols=2)
 
@@ -331,22 +310,17 @@ def draw_magnitudes(fig: Any, with_faults: Measurements) -> None:
 def draw_separations(fig: Any, with_faults: Measurements) -> None:
     """The three groups of angles side by side, and Table 8's means and deviations."""
     angle = np.sort(with_faults.separation_arcsec, axis=1)
+    mean, sd = published("separation", 10), published("separation_sd", 10)
     panels = fig.subplots(1, len(TABLE_8_GROUPS), sharey=True)
-    for axes, (first, last) in zip(panels, TABLE_8_GROUPS, strict=True):
-        group = angle[:, first:last].ravel()
-        center = published("separation", 10)[first:last].mean()
-        axes.hist(group, np.arange(center - 60, center + 61, 4.0), color=INK[0], alpha=0.75, label="ours")
+    groups = [slice(*ends) for ends in TABLE_8_GROUPS]
+    for axes, group in zip(panels, groups, strict=True):
+        bins = np.arange(mean[group].mean() - 60, mean[group].mean() + 61, 4.0)
+        axes.hist(angle[:, group].ravel(), bins, color=INK[0], alpha=0.75, label="ours")
         axes.set(xlabel="angle (arcsec)")
     top = max(axes.get_ylim()[1] for axes in panels)
-    for axes, (first, last) in zip(panels, TABLE_8_GROUPS, strict=True):
-        axes.errorbar(
-            published("separation", 10)[first:last],
-            top * (1.05 + 0.06 * np.arange(last - first)),
-            xerr=published("separation_sd", 10)[first:last],
-            fmt="o",
-            color=INK[1],
-            label="published, with 1 sd",
-        )
+    for axes, group in zip(panels, groups, strict=True):
+        height = top * (1.05 + 0.06 * np.arange(len(mean[group])))
+        axes.errorbar(mean[group], height, xerr=sd[group], fmt="o", color=INK[1], label="published, with 1 sd")
         axes.set(ylim=(0, 1.4 * top))
     panels[0].set(ylabel="pairs in images")
     panels[-1].legend(loc="upper right", fontsize=8)

@@ -71,19 +71,15 @@ def angles_deg(lab_from_body: Rotation) -> Floats:
     return np.asarray(lab_from_body.as_euler("ZYX", degrees=True)[..., ::-1])
 
 
-def at_rest(testbed: Testbed, lab_from_body: Rotation) -> Testbed:
-    """The testbed with the vehicle at rest at an attitude."""
-    return replace(testbed, trajectory=Trajectory.at_rest(lab_from_body, HOLD_S))
-
-
 def photograph(
     testbed: Testbed, position: int, lab_from_body: Rotation, images: int, rng: np.random.Generator
 ) -> list[Sighting]:
     """Images from one attitude at random times; lights identified by the truth, in the order of the LEDs.
 
-    The IMU's attitude is the true one; see `replace_imu_attitude`. Images without all five LEDs are left out.
+    The IMU's attitude is the true one. Images without all five LEDs are left out.
     """
-    resting, camera = at_rest(testbed, lab_from_body), onboard_model.calibration(testbed.scene.camera)
+    resting = replace(testbed, trajectory=Trajectory.at_rest(lab_from_body, HOLD_S))
+    camera = onboard_model.calibration(testbed.scene.camera)
     settings = tracker_settings.assumed_settings(testbed.scene)
     sightings = []
     for index in rng.integers(MAX_FRAME_INDEX, size=images):
@@ -96,15 +92,9 @@ def photograph(
         magnitude = instrument_brightness(blobs.flux / blobs.area_px, blobs.area_px.astype(float))[inside]
         led, led_row = np.unique(truth.sources.id[nearest], return_index=True)
         if len(led) == LEDS:
-            sightings.append(
-                Sighting(position, lab_from_body.inv(), led, lights.xy_px[inside][led_row], magnitude[led_row])
-            )
+            xy_px = lights.xy_px[inside][led_row]
+            sightings.append(Sighting(position, lab_from_body.inv(), led, xy_px, magnitude[led_row]))
     return sightings
-
-
-def replace_imu_attitude(sightings: Sequence[Sighting], lab_from_body: Rotation) -> list[Sighting]:
-    """The same images with another IMU attitude."""
-    return [replace(one, body_from_lab=lab_from_body.inv()) for one in sightings]
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,8 +119,6 @@ class Measurements:
 def measure(testbed: Testbed, sightings: Sequence[Sighting]) -> Measurements:
     """Measure the images as in the thesis."""
     body_m = np.array([light_positions_m(testbed, sighting.xy_px) for sighting in sightings])
-    lab_m = [
-        sighting.body_from_lab.inv().apply(position_m) for sighting, position_m in zip(sightings, body_m, strict=True)
-    ]
-    position = np.array([sighting.stop for sighting in sightings])
-    return Measurements(position, np.array([sighting.brightness for sighting in sightings]), body_m, np.array(lab_m))
+    lab_m = np.array([one.body_from_lab.inv().apply(led_m) for one, led_m in zip(sightings, body_m, strict=True)])
+    position, magnitude = (np.array([getattr(one, name) for one in sightings]) for name in ("stop", "brightness"))
+    return Measurements(position, magnitude, body_m, lab_m)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,7 @@ from estimator.detection import detect
 from skysim.camera.optics import Optics
 from skysim.core.types import Floats, Frame, Trajectory, Truth
 from skysim.core.units import ARCSEC_RAD
+from skysim.experiments.configs import with_config
 from skysim.scene.light import DomeConfig
 from skysim.scene.loader import load
 from skysim.scene.scene import Scene
@@ -39,17 +40,6 @@ class MeasuredLights(NamedTuple):
     area_px: Floats
     mean_dn: Floats
     magnitude: Floats
-
-
-def with_config(scene: Scene, section: str, **values: Any) -> Scene:
-    """Copy a scene with values of a section replaced, without validation; `section` may be nested, as `light.led`."""
-    head, _, subsection = section.partition(".")
-    if subsection:
-        inner = getattr(scene, head)
-        return scene.model_copy(
-            update={head: inner.model_copy(update={subsection: getattr(inner, subsection).model_copy(update=values)})}
-        )
-    return scene.model_copy(update={head: getattr(scene, head).model_copy(update=values)})
 
 
 @cache
@@ -114,9 +104,8 @@ def light_positions_m(testbed: Testbed, xy_px: Floats, camera: Camera | None = N
     assert isinstance(testbed.scene.light, DomeConfig)
     leds = onboard_model.assumed_dome(testbed.scene, testbed.scene.light, testbed.sources)
     lever = onboard_model.assumed_lever(testbed.scene, testbed.mount)
-    points_m, _ = nearfield.thesis_points(
-        (camera or onboard_model.assumed_camera(testbed.scene)).rays(xy_px), leds, lever
-    )
+    rays = (camera or onboard_model.assumed_camera(testbed.scene)).rays(xy_px)
+    points_m, _ = nearfield.thesis_points(rays, leds, lever)
     return lever.cam_from_body.inv().apply(points_m) + lever.camera_body_m
 
 

@@ -12,11 +12,11 @@ import numpy as np
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
-from estimator.attitude.dome_map import Lever
 from skysim.camera.render import Poses, in_view, project
 from skysim.core.random_streams import random_stream
-from skysim.core.types import Floats
+from skysim.core.types import Floats, Sources
 from skysim.core.units import ARCSEC_RAD
+from skysim.experiments.configs import with_config
 from skysim.experiments.papers.compare import Drawing, ExperimentOptions, ExperimentResult, RowResult
 from skysim.experiments.papers.intervals import bootstrap_interval
 from skysim.experiments.papers.published import experiments
@@ -30,50 +30,23 @@ from skysim.sources import dome
 from skysim.sources.photometry import Band
 from skysim.tracking import onboard_model
 
-LARGE_OFFSET_M, SMALL_OFFSET_M = 0.05, 1e-3
+LARGE_OFFSET_M, SMALL_OFFSET_M, OFFSETS_M = 0.05, 1e-3, (1e-4, 1e-3, 1e-2, 5e-2, 1e-1)
 CIRCLE_DEG, MEAN_STARS = 10.0, 5.0
 MAX_TILT_DEG = 60.0  # greatest angle of the boresight from the zenith
 
 
 def shell_scene(radius_variation: float, seed: int) -> Scene:
     """The scene with another random variation of the shell's radius; the fibers keep their directions."""
-    return loader.load(
-        "apl_dome",
-        {
-            "light.layout.radius_variation": str(radius_variation),
-            "light.layout.points.hardware_seed": str(seed),
-        },
-    )
+    variation, hardware_seed = "light.layout.radius_variation", "light.layout.points.hardware_seed"
+    return loader.load("apl_dome", {variation: str(radius_variation), hardware_seed: str(seed)})
 
 
-class AplTestbed:
-    """The true dome seen by the scene's camera, with its pupil displaced across the boresight by offset_m."""
-
-    def __init__(self, scene: Scene, testbed: Testbed, offset_m: float) -> None:
-        assert isinstance(scene.light, DomeConfig)
-        self.true = dome.sources(scene.light, Band.from_efficiency(scene.camera.detector.quantum_efficiency))
-        perfect_light = scene.light.model_copy(
-            update={"layout": scene.light.layout.model_copy(update={"radius_variation": 0.0})}
-        )
-        self.perfect_m = dome.sources(perfect_light, testbed.band).place[:, :3]
-        self.testbed, self.camera = testbed, onboard_model.assumed_camera(scene)
-        self.offset_m = testbed.mount.cam_from_body.inv().apply([offset_m, 0.0, 0.0])
-
-    def discrepancies_arcsec(self, lab_from_body: Rotation, lever: Lever) -> Floats:
-        """(N,) angles between the observed rays of the fibers in view and the directions that the tracker expects.
-
-        The tracker assumes a perfect sphere and the pupil at the lever arm of `lever`.
-        """
-        cam_from_lab = lever.cam_from_body * lab_from_body.inv()
-        poses = Poses(cam_from_lab.as_matrix()[None], lab_from_body.apply(self.offset_m)[None])
-        visible = in_view(self.true, self.testbed.optics, poses)
-        xy_px = project(self.true.take(visible), self.testbed.optics, poses)[0][0]
-        size_px = [self.camera.width_px, self.camera.height_px]
-        on_detector = ((xy_px > -0.5) & (xy_px < np.array(size_px) - 0.5)).all(axis=1)
-        rays = self.camera.rays(xy_px[on_detector])
-        assumed_m = cam_from_lab.apply(self.perfect_m[visible[on_detector]] - lab_from_body.apply(lever.camera_body_m))
-        expected_rays = assumed_m / np.linalg.norm(assumed_m, axis=1, keepdims=True)
-        return np.asarray(np.arcsin(np.linalg.norm(np.cross(rays, expected_rays), axis=1)) / ARCSEC_RAD)
+def fibers(scene: Scene, testbed: Testbed) -> tuple[Sources, Floats]:
+    """The true fibers of a shell, and their (N, 3) positions on a perfect sphere."""
+    assert isinstance(scene.light, DomeConfig)
+    true = dome.sources(scene.light, Band.from_efficiency(scene.camera.detector.quantum_efficiency))
+    perfect_light = with_config(scene.light, "layout", radius_variation=0.0)
+    return true, dome.sources(perfect_light, testbed.band).place[:, :3]
 
 
 def random_attitudes(count: int, rng: np.random.Generator) -> list[Rotation]:
@@ -86,13 +59,30 @@ def random_attitudes(count: int, rng: np.random.Generator) -> list[Rotation]:
 def largest_discrepancies_arcsec(
     scene: Scene, testbed: Testbed, offset_m: float, corrected: bool, attitudes: list[Rotation]
 ) -> Floats:
-    """(K,) largest discrepancy of each attitude with a fiber in view. corrected : the pupil's offset is known."""
-    apl_testbed = AplTestbed(scene, testbed, offset_m)
-    lever = Lever(apl_testbed.offset_m if corrected else np.zeros(3), testbed.mount.cam_from_body)
-    boresight = testbed.mount.cam_from_body.inv().apply([0.0, 0.0, 1.0])
+    """(K,) largest angle between observed ray and expected direction of a fiber, for each attitude with one in view.
+
+    The pupil is displaced across the boresight by offset_m. The tracker assumes a perfect sphere, and the pupil in its
+    center unless `corrected`: then the offset is known.
+    """
+    true, perfect_m = fibers(scene, testbed)
+    camera, cam_from_body = onboard_model.assumed_camera(scene), testbed.mount.cam_from_body
+    pupil_m = cam_from_body.inv().apply([offset_m, 0.0, 0.0])
+    assumed_pupil_m = pupil_m if corrected else np.zeros(3)
+    boresight = cam_from_body.inv().apply([0.0, 0.0, 1.0])
     level_rotation, _ = Rotation.align_vectors([[0.0, 0.0, 1.0]], [boresight])
-    discrepancies = [apl_testbed.discrepancies_arcsec(attitude * level_rotation, lever) for attitude in attitudes]
-    return np.array([arcsec.max() for arcsec in discrepancies if len(arcsec)])
+    largest = []
+    for lab_from_body in (attitude * level_rotation for attitude in attitudes):
+        cam_from_lab = cam_from_body * lab_from_body.inv()
+        poses = Poses(cam_from_lab.as_matrix()[None], lab_from_body.apply(pupil_m)[None])
+        visible = in_view(true, testbed.optics, poses)
+        xy_px = project(true.take(visible), testbed.optics, poses)[0][0]
+        on_detector = camera.contains(xy_px)
+        assumed_m = cam_from_lab.apply(perfect_m[visible[on_detector]] - lab_from_body.apply(assumed_pupil_m))
+        expected_rays = assumed_m / np.linalg.norm(assumed_m, axis=1, keepdims=True)
+        sine = np.linalg.norm(np.cross(camera.rays(xy_px[on_detector]), expected_rays), axis=1)
+        if len(sine):
+            largest.append(np.arcsin(sine.max()) / ARCSEC_RAD)
+    return np.array(largest)
 
 
 def count_fibers(testbed: Testbed, diameter_deg: float, boresights: Floats) -> Floats:
@@ -118,11 +108,9 @@ def discrepancies_and_counts(options: ExperimentOptions) -> ExperimentResult:
         [largest_discrepancies_arcsec(scene, testbed, LARGE_OFFSET_M, True, attitudes) for scene in scenes]
     )
     small_offset = largest_discrepancies_arcsec(shell_scene(0.0, 1), testbed, SMALL_OFFSET_M, False, attitudes)
-    apl_testbed = AplTestbed(scenes[0], testbed, 0.0)
-    radius_m, perfect_m = (
-        np.linalg.norm(place, axis=1) for place in (apl_testbed.true.place[:, :3], apl_testbed.perfect_m)
-    )
-    radius_change = radius_m / perfect_m - 1
+    true, perfect_m = fibers(scenes[0], testbed)
+    radius_m, perfect_radius_m = (np.linalg.norm(place_m, axis=1) for place_m in (true.place[:, :3], perfect_m))
+    radius_change = radius_m / perfect_radius_m - 1
     boresights = random_boresights(options.trials(100_000, 20_000), rng)
     inner_boresights = boresights[boresights[:, 2] > np.sin(np.radians(20))]
 
@@ -137,27 +125,16 @@ def discrepancies_and_counts(options: ExperimentOptions) -> ExperimentResult:
         "stars_10deg": RowResult(bootstrap_interval(count_fibers(testbed, CIRCLE_DEG, boresights), np.mean)),
         "field_5stars": RowResult(extremum(np.array([brentq(excess_stars, 5, 90, xtol=0.05)]), np.max)),
     }
-    worst = [worst_before_and_after(testbed, scenes[0], attitudes, offset_m) for offset_m in OFFSETS_M]
+    # Worst discrepancies without and with the pupil's offset known.
+    worst = [
+        [largest_discrepancies_arcsec(scenes[0], testbed, offset_m, known, attitudes).max() for known in (False, True)]
+        for offset_m in OFFSETS_M
+    ]
     caption = "Largest angular discrepancy of a fiber against the camera's offset, with the offset unknown and known."
     return ExperimentResult(results, (Drawing(caption, lambda fig: draw(fig, np.array(worst))),))
 
 
-OFFSETS_M = (1e-4, 1e-3, 1e-2, 5e-2, 1e-1)
-
-
-def worst_before_and_after(
-    testbed: Testbed, scene: Scene, attitudes: list[Rotation], offset_m: float
-) -> tuple[float, float]:
-    """Worst discrepancies in arcsec: without and with the pupil's offset known."""
-    before, after = (
-        largest_discrepancies_arcsec(scene, testbed, offset_m, corrected, attitudes).max()
-        for corrected in (False, True)
-    )
-    return float(before), float(after)
-
-
 def draw(fig: Any, worst_arcsec: Floats) -> None:
-    """Both discrepancies against the offset, with the stated numbers."""
     axes, rows = fig.subplots(), experiments()["apl"].rows
     offset_mm = 1e3 * np.array(OFFSETS_M)
     for n, name in enumerate(("ours, place not told", "ours, place told: the shell is left")):

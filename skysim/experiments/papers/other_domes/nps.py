@@ -7,8 +7,9 @@ experiment shows how large the initial attitude error may be.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,7 +24,7 @@ from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
 from skysim.core.units import ARCSEC_RAD
 from skysim.experiments import dome_survey
-from skysim.experiments.papers.compare import Cause, Drawing, ExperimentOptions, ExperimentResult, RowResult
+from skysim.experiments.papers.compare import Drawing, ExperimentOptions, ExperimentResult, with_cause
 from skysim.experiments.papers.intervals import bootstrap_interval
 from skysim.experiments.study.execution.trials import reseeded
 from skysim.results.metrics import Summary, proportion
@@ -79,11 +80,8 @@ def build_model(camera_m: Floats | None, seed: int, frames: int) -> OnboardModel
         shift_m = camera_m - testbed.mount.camera_body_m
         position = testbed.sources.place + np.append(shift_m, 0.0)
         height_m += shift_m[2]
-        testbed = replace(
-            testbed,
-            sources=replace(testbed.sources, place=position),
-            mount=replace(testbed.mount, camera_body_m=np.asarray(camera_m)),
-        )
+        sources, mount = replace(testbed.sources, place=position), replace(testbed.mount, camera_body_m=camera_m)
+        testbed = replace(testbed, sources=sources, mount=mount)
     no_leds = np.empty(0, np.int64), np.empty((0, 3))
     panel = LedMap(*no_leds, np.zeros(3), np.array([np.inf, np.inf, height_m]))
     rays_of_frames = [rays_body(testbed, seed + n) for n in range(frames)]
@@ -98,7 +96,7 @@ def rays_body(testbed: Testbed, seed: int) -> Floats:
     """(N, 3) unit vectors in body axes to the stars of one frame from the level vehicle, brightest first."""
     frame, _ = exposure.render_frame(reseeded(testbed, seed), 0)
     camera = onboard_model.assumed_camera(testbed.scene)
-    lights = dome_survey.detect_lights(settings.assumed_settings(testbed.scene), camera, frame)
+    lights = dome_survey.detect_lights(settings.assumed_settings(testbed.scene), camera, frame.image_dn)
     return testbed.mount.cam_from_body.inv().apply(camera.rays(lights.xy_px))
 
 
@@ -146,7 +144,6 @@ class SolutionSeries(NamedTuple):
     solutions: dict[float, list[Solution]]
     iterated: list[Solution]
 
-    @property
     def matched(self) -> Summary:
         """Mean number of matched stars over the five trials."""
         counts = [[solution.matched for solution in self.solutions[error]] for error in INITIAL_DEG]
@@ -158,14 +155,10 @@ class SolutionSeries(NamedTuple):
         errors_deg = np.array([solution.error_deg for solution in self.solutions[error_deg]])
         return proportion(int(np.sum(errors_deg < APPROXIMATE_DEG)), len(errors_deg))
 
-    @property
     def mean_euler_angle(self) -> Summary:
         """Mean absolute Euler angle after the updates, deg; the true angles are zero."""
-        angles = [
-            np.abs(solution.body_from_lab.as_euler("ZYX", degrees=True)).mean()
-            for solution in self.iterated
-            if solution.body_from_lab
-        ]
+        attitudes = [solution.body_from_lab for solution in self.iterated if solution.body_from_lab]
+        angles = [np.abs(attitude.as_euler("ZYX", degrees=True)).mean() for attitude in attitudes]
         return bootstrap_interval(np.array(angles), np.mean)
 
 
@@ -193,28 +186,27 @@ def initial_error_trials(options: ExperimentOptions) -> ExperimentResult:
         solve_series(build_model(camera_m, seeds[n], catalog_frames), errors_deg, frames, seeds[n + 2], options)
         for n, camera_m in enumerate((None, FITTED_CAMERA_M))
     )
-    name = "the camera 0.30 m to the side and 0.20 m up, fitted"
-    results = {"matched": RowResult(scene_camera.matched, cause=Cause(name, fitted_camera.matched))}
-    for error in INITIAL_DEG:
-        results[f"from_{error}"] = RowResult(
-            scene_camera.fraction_near(error), cause=Cause(name, fitted_camera.fraction_near(error))
-        )
-    results["iterated"] = RowResult(scene_camera.mean_euler_angle, cause=Cause(name, fitted_camera.mean_euler_angle))
+    statistics: dict[str, Callable[[SolutionSeries], Summary]] = {
+        "matched": SolutionSeries.matched,
+        **{f"from_{error}": partial(SolutionSeries.fraction_near, error_deg=error) for error in INITIAL_DEG},
+        "iterated": SolutionSeries.mean_euler_angle,
+    }
+    cause = "the camera 0.30 m to the side and 0.20 m up, fitted"
+    results = {key: with_cause(cause, one, scene_camera, fitted_camera) for key, one in statistics.items()}
     caption = "Stars matched, and the solutions' error, by the initial attitude's error; shaded where NPS succeeded."
     series = {"scene's camera": scene_camera, "0.30 m to the side": fitted_camera}
     return ExperimentResult(results, (Drawing(caption, lambda fig: draw(fig, series), (7.4, 4.6)),))
 
 
 def draw(fig: Any, series_by_camera: dict[str, SolutionSeries]) -> None:
-    """Matched stars above, errors below."""
     above, below = fig.subplots(2, 1, sharex=True)
     for n, (name, series) in enumerate(series_by_camera.items()):
         errors = sorted(series.solutions)
-        counts = [np.mean([solution.matched for solution in series.solutions[error]]) for error in errors]
-        error_lists = [
-            [solution.error_deg for solution in series.solutions[error] if solution.body_from_lab] for error in errors
-        ]
-        mean_error_deg = [np.mean(errors_deg) if errors_deg else np.nan for errors_deg in error_lists]
+        counts, mean_error_deg = [], []
+        for error in errors:
+            counts.append(np.mean([one.matched for one in series.solutions[error]]))
+            errors_deg = [one.error_deg for one in series.solutions[error] if one.body_from_lab]
+            mean_error_deg.append(np.mean(errors_deg) if errors_deg else np.nan)
         style = {"color": INK[(0, 2)[n]], "marker": MARKS[n], "label": f"ours, {name}"}
         above.plot(errors, counts, **style)
         below.plot(errors, mean_error_deg, **style | {"label": None})

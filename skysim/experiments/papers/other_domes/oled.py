@@ -10,6 +10,7 @@ import numpy as np
 
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
+from skysim.experiments.configs import with_config
 from skysim.experiments.papers.compare import Cause, Drawing, ExperimentOptions, ExperimentResult, RowResult
 from skysim.experiments.papers.intervals import bootstrap_interval
 from skysim.experiments.papers.published import experiments
@@ -28,18 +29,14 @@ SPACING_MM = {10: 30, 20: 22, 40: 15.5, 80: 11}  # by number of lights; slightly
 ARCSEC_TICKS = (0.2, 0.5, 1, 2, 5, 10)
 MAX_TILT_DEG, CAP_DEG = 10.0, 18.0
 MEASURED = {"led_sigma": "0.2 mm", "lever_sigma": "0.2 mm"}  # of a laser tracker or a measuring arm
-BY_FRAMES = {
-    "led_sigma": "0.08 mm",
-    "lever_sigma": "0.09 mm",
-}  # left by `skysim survey`, docs/findings/dome.md
+BY_FRAMES = {"led_sigma": "0.08 mm", "lever_sigma": "0.09 mm"}  # left by `skysim survey`, docs/findings/dome.md
 LEVEL_SIGMA_DEG = 0.005  # orientation error of the survey's axes
 
 
 class AttitudeErrors(NamedTuple):
-    """(N, 3) attitude errors about the camera's axes of N solved attitudes, arcsec; and the number attempted."""
+    """(N, 3) attitude errors about the camera's axes of N solved attitudes, arcsec."""
 
     error_arcsec: Floats
-    attempted: int
 
     @property
     def cross_boresight(self) -> Summary:
@@ -65,15 +62,14 @@ def solve_random_attitudes(setup: Setup, seeds: Sequence[int]) -> AttitudeErrors
     """Errors of lost-in-space solutions from simulated centroids at random attitudes."""
     solutions = [run_centroid_trial(setup, seed) for seed in seeds]
     errors = np.array([[one.x_arcsec, one.y_arcsec, one.roll_arcsec] for one in solutions])
-    return AttitudeErrors(errors[np.isfinite(errors[:, 0])], len(solutions))
+    return AttitudeErrors(errors[np.isfinite(errors[:, 0])])
 
 
 def with_surveyed_map(setup: Setup, sigmas: dict[str, str], seed: int) -> Setup:
     """The same dome with a tracker whose map comes from a survey with position errors and slightly rotated axes."""
     rotation_deg = random_stream(seed, 2).normal(0, LEVEL_SIGMA_DEG, 3)
     survey_errors = SurveyErrorsConfig.model_validate(sigmas | {"rotation_deg": rotation_deg.tolist(), "seed": seed})
-    config = setup.testbed.scene.tracker.model_copy(update={"survey": survey_errors})
-    testbed = replace(setup.testbed, scene=setup.testbed.scene.model_copy(update={"tracker": config}))
+    testbed = replace(setup.testbed, scene=with_config(setup.testbed.scene, "tracker", survey=survey_errors))
     return setup._replace(testbed=testbed, estimator=build_tracker(testbed))
 
 
@@ -82,12 +78,11 @@ def mean_absolute_error_deg(setup: Setup, sigmas: dict[str, str], seeds: list[li
 
     seeds : one list per survey: its seed, then the seeds of its attitudes
     """
-    errors = [
-        solve_random_attitudes(with_surveyed_map(setup, sigmas, survey_seed), attitude_seeds).error_arcsec
-        for survey_seed, *attitude_seeds in seeds
-    ]
-    means_arcsec = np.array([np.mean(np.linalg.norm(errors_of_survey, axis=1)) for errors_of_survey in errors])
-    return bootstrap_interval(means_arcsec / 3600, np.mean)
+    means_arcsec = []
+    for survey_seed, *attitude_seeds in seeds:
+        errors = solve_random_attitudes(with_surveyed_map(setup, sigmas, survey_seed), attitude_seeds)
+        means_arcsec.append(np.mean(np.linalg.norm(errors.error_arcsec, axis=1)))
+    return bootstrap_interval(np.array(means_arcsec) / 3600, np.mean)
 
 
 def noise_and_absolute_error(options: ExperimentOptions) -> ExperimentResult:
@@ -96,9 +91,8 @@ def noise_and_absolute_error(options: ExperimentOptions) -> ExperimentResult:
     counts = [STATED_LIGHTS, MANY_LIGHTS] if options.quick else list(SPACING_MM)
     n_attitudes, errors_by_lights = options.trials(600, 60), {}
     for n, lights in enumerate(counts):
-        errors_by_lights[lights] = solve_random_attitudes(
-            build_setup(lights), rng.integers(2**31, size=n_attitudes).tolist()
-        )
+        seeds = rng.integers(2**31, size=n_attitudes).tolist()
+        errors_by_lights[lights] = solve_random_attitudes(build_setup(lights), seeds)
         options.watch(n + 1, len(counts) + 1)
     few, many = errors_by_lights[STATED_LIGHTS], errors_by_lights[MANY_LIGHTS]
     seeds = rng.integers(2**31, size=(options.trials(40, 6), options.trials(11, 5))).tolist()
@@ -123,9 +117,10 @@ def draw(fig: Any, errors_by_lights: dict[int, AttitudeErrors]) -> None:
     across, roll = [one.cross_boresight for one in errors], [one.roll for one in errors]
     curves = (("across", "across, one axis", across), ("roll", "roll", roll))
     for n, (key, name, summaries) in enumerate(curves):
-        value = np.array([summary.value for summary in summaries])
-        half_widths = np.array([[summary.value - summary.low, summary.high - summary.value] for summary in summaries]).T
-        axes.errorbar(lights, value, half_widths, fmt=MARKS[n], color=INK[n], capsize=3, label=f"ours, {name}")
+        value, low, high, _ = np.array(summaries).T
+        axes.errorbar(
+            lights, value, [value - low, high - value], fmt=MARKS[n], color=INK[n], capsize=3, label=f"ours, {name}"
+        )
         coefficient = np.exp(np.mean(np.log(value * np.sqrt(lights))))
         axes.plot(lights, coefficient / np.sqrt(lights), color=INK[n], lw=0.8)
         axes.axhline(rows[key].at_most, color=INK[n], ls="--", label=f"published bound, {name}")

@@ -17,17 +17,17 @@ from scipy.spatial.transform import Rotation
 
 from estimator.core.types import ra_dec_roll_rad
 from skysim.core.random_streams import JITTER, random_stream
-from skysim.core.types import Floats, Trajectory
+from skysim.core.types import Floats
 from skysim.dynamics.jitter import Vibration
 from skysim.experiments.papers.compare import Cause, Drawing, ExperimentOptions, ExperimentResult, RowResult
 from skysim.experiments.papers.intervals import bootstrap_interval, sample_std, symmetric_interval
 from skysim.experiments.papers.published import experiments, published_values
-from skysim.experiments.study.execution.trials import KNOTS, reseeded
-from skysim.results.metrics import WRONG_RAD, Summary, extremum, proportion, rms
+from skysim.experiments.study.execution.trials import constant_rate, reseeded
+from skysim.results.metrics import WRONG_RAD, extremum, proportion, rms
 from skysim.results.plots import INK, MARKS
 from skysim.scene import loader
 from skysim.simulation import exposure
-from skysim.simulation.testbed import MARGIN_S, Testbed, build_testbed, build_tracker, exposure_window
+from skysim.simulation.testbed import Testbed, build_testbed, build_tracker
 from skysim.sources import stars
 from skysim.tracking import factory
 
@@ -46,20 +46,16 @@ FITTED_JITTER = "[{kind: line, frequency_hz: 1, rms_arcsec: [22, 22, 22]}]"  # a
 
 def itrs_from_icrs(local: datetime.datetime) -> Rotation:
     """The Earth's attitude: precession, nutation and rotation (SOFA's c2t06a); polar motion is neglected."""
-    j2000, days = (
-        erfa.DJ00,
-        (local + UTC_LESS_LOCAL - datetime.datetime(2000, 1, 1, 12)) / datetime.timedelta(1),
-    )
+    days = (local + UTC_LESS_LOCAL - datetime.datetime(2000, 1, 1, 12)) / datetime.timedelta(1)
     tt, ut1 = days + TT_LESS_UTC_S / erfa.DAYSEC, days + UT1_LESS_UTC_S / erfa.DAYSEC
-    return Rotation.from_matrix(erfa.c2t06a(j2000, tt, j2000, ut1, 0.0, 0.0))
+    return Rotation.from_matrix(erfa.c2t06a(erfa.DJ00, tt, erfa.DJ00, ut1, 0.0, 0.0))
 
 
 def cam_from_itrs() -> Rotation:
     """Attitude of the camera on its tripod, fitted so that the mean of the table's rows is met at their mean time."""
     ra_deg, dec_deg, roll_deg = TABLE_2.mean(axis=0)
-    mean_time = LOCAL_TIMES[0] + sum((time - LOCAL_TIMES[0] for time in LOCAL_TIMES), datetime.timedelta()) / len(
-        LOCAL_TIMES
-    )
+    since_first = [time - LOCAL_TIMES[0] for time in LOCAL_TIMES]
+    mean_time = LOCAL_TIMES[0] + sum(since_first, datetime.timedelta()) / len(since_first)
     return stars.cam_from_icrs(ra_deg, dec_deg, -roll_deg) * itrs_from_icrs(mean_time).inv()
 
 
@@ -125,25 +121,20 @@ def photograph_and_solve(overrides: dict[str, str], local: list[datetime.datetim
 def earth_fixed(testbed: Testbed, cam_from_icrs: Rotation) -> Testbed:
     """Testbed with a motion around the first frame's exposure: the given attitude at mid-exposure, rotation at the
     sidereal rate, and the scene's vibration."""
-    window, rows = exposure_window(testbed.scene, 0), testbed.scene.camera.height_px
-    t_s = np.linspace(window.open_s - MARGIN_S, window.close_s(rows) + MARGIN_S, KNOTS)
     body_at_middle = cam_from_icrs.inv() * testbed.mount.cam_from_body
     earth_rad_s = 2 * np.pi * 1.00273781191135448 / erfa.DAYSEC
     # The sky turns at the sidereal rate about the celestial pole, the z axis of ICRS (precession neglected).
     rate_body = earth_rad_s * body_at_middle.inv().apply([0.0, 0.0, 1.0])
-    rotation = Rotation.from_rotvec(np.outer(t_s - window.middle_s(rows), rate_body))
-    path = Trajectory(t_s, body_at_middle * rotation, np.tile(rate_body, (KNOTS, 1)))
     vibration = Vibration.draw(testbed.scene.motion, random_stream(testbed.scene.seed, JITTER, 0))
-    return replace(testbed, trajectory=vibration.add_to(path))
+    return replace(testbed, trajectory=vibration.add_to(constant_rate(testbed.scene, body_at_middle, rate_body)))
 
 
 def table_2(options: ExperimentOptions) -> ExperimentResult:
     """Table 2: eighteen frames with a calibrated camera at rest, and as many with each of several decentered lenses."""
     rng = random_stream(options.seed, 2003)
-    interpolated = [
-        LOCAL_TIMES[0] + n / 13 * (LOCAL_TIMES[3] - LOCAL_TIMES[0]) for n in range(ATTEMPTS - len(LOCAL_TIMES))
-    ]
-    local, lenses = LOCAL_TIMES + interpolated, options.trials(10, 2)
+    span = LOCAL_TIMES[3] - LOCAL_TIMES[0]
+    local = LOCAL_TIMES + [LOCAL_TIMES[0] + n / 13 * span for n in range(ATTEMPTS - len(LOCAL_TIMES))]
+    lenses = options.trials(10, 2)
     calibrated = photograph_and_solve({}, local, int(rng.integers(2**31)))
     uncalibrated = []
     for n in range(lenses):
@@ -157,7 +148,10 @@ def table_2(options: ExperimentOptions) -> ExperimentResult:
     }
     zenith_deg = zenith_distance_deg(calibrated.estimated_deg[0])
     results["zenith"] = RowResult(extremum(np.array([zenith_deg]), np.max))
-    results["rate"] = results["rate_fit"] = RowResult(right_ascension_rate(calibrated))
+    # Least-squares slope of the right ascension, with the 95 % interval from its residuals.
+    slope, covariance = np.polyfit(calibrated.minutes, calibrated.estimated_deg[:, 0], 1, cov=True)
+    rate = symmetric_interval(slope[0], 1.96 * np.sqrt(covariance[0, 0]), len(local))
+    results["rate"] = results["rate_fit"] = RowResult(rate)
     results |= scatter_results(calibrated, uncalibrated)
     error_rad = np.concatenate([solutions.error_rad for solutions in uncalibrated])
     for key, is_hit in (("failed", np.isnan(error_rad)), ("wrong", error_rad > WRONG_RAD)):
@@ -171,21 +165,13 @@ def scatter_results(calibrated: FrameSolutions, uncalibrated: list[FrameSolution
     name, results = "optics decentered and not calibrated, and vibration, fitted", {}
     for axis, angle in enumerate(ANGLES):
         stds = np.array([sample_std(solutions.errors_arcsec[:, axis]) for solutions in uncalibrated])
-        cause = Cause(name, bootstrap_interval(stds, rms))
-        results[f"{angle}_sd"] = RowResult(
-            bootstrap_interval(calibrated.errors_arcsec[:, axis], sample_std), cause=cause
-        )
-    error_norms = [np.linalg.norm(solutions.errors_arcsec, axis=1) for solutions in (calibrated, *uncalibrated)]
-    means = np.array([norms.mean() for norms in error_norms[1:]])
+        ours = bootstrap_interval(calibrated.errors_arcsec[:, axis], sample_std)
+        results[f"{angle}_sd"] = RowResult(ours, cause=Cause(name, bootstrap_interval(stds, rms)))
+    norms, *uncalibrated_norms = (np.linalg.norm(one.errors_arcsec, axis=1) for one in (calibrated, *uncalibrated))
+    means = np.array([one.mean() for one in uncalibrated_norms])
     cause = Cause(name, bootstrap_interval(means, np.mean))
-    results["noise"] = RowResult(bootstrap_interval(error_norms[0], np.mean), cause=cause)
+    results["noise"] = RowResult(bootstrap_interval(norms, np.mean), cause=cause)
     return results
-
-
-def right_ascension_rate(solutions: FrameSolutions) -> Summary:
-    """Least-squares slope of the right ascension, deg/min, with the 95 % interval from its residuals."""
-    slope, covariance = np.polyfit(solutions.minutes, solutions.estimated_deg[:, 0], 1, cov=True)
-    return symmetric_interval(slope[0], 1.96 * np.sqrt(covariance[0, 0]), len(solutions.local))
 
 
 def zenith_distance_deg(angles_deg: Floats) -> float:
@@ -197,7 +183,6 @@ def zenith_distance_deg(angles_deg: Floats) -> float:
 
 
 def drawings(calibrated: FrameSolutions, uncalibrated: list[FrameSolutions]) -> tuple[Drawing, ...]:
-    """Figures: right ascension against time, and errors."""
     return (
         Drawing(
             "Right ascension of the fixed camera against time: Table 2 and ours.",
@@ -212,25 +197,18 @@ def drawings(calibrated: FrameSolutions, uncalibrated: list[FrameSolutions]) -> 
 
 
 def draw_rate(fig: Any, calibrated: FrameSolutions) -> None:
-    """Our right ascensions, the four published ones, and the sidereal line."""
     axes = fig.subplots()
     axes.plot(calibrated.minutes, calibrated.estimated_deg[:, 0], MARKS[0], color=INK[0], label="ours")
     axes.plot(calibrated.minutes[:4], TABLE_2[:, 0], "*", ms=11, color=INK[1], label="published")
     time_range = np.array([0, calibrated.minutes.max()])
     published_rate = experiments()["ptase-table-2"].rows["rate"].published or 0.0
-    axes.plot(
-        time_range,
-        calibrated.estimated_deg[0, 0] + published_rate * time_range,
-        color=INK[6],
-        lw=0.8,
-        label=f"{published_rate} deg/min",
-    )
+    sidereal_deg = calibrated.estimated_deg[0, 0] + published_rate * time_range
+    axes.plot(time_range, sidereal_deg, color=INK[6], lw=0.8, label=f"{published_rate} deg/min")
     axes.set(xlabel="minutes after 19:55:22", ylabel="right ascension (deg)")
     axes.legend()
 
 
 def draw_errors(fig: Any, calibrated: FrameSolutions, uncalibrated: list[FrameSolutions]) -> None:
-    """Errors of all three angles against time."""
     panels = fig.subplots(3, 1, sharex=True)
     minutes = calibrated.minutes[:4]
     published = (TABLE_2 - TABLE_2.mean(axis=0)) * 3600

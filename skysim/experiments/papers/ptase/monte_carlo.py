@@ -167,9 +167,8 @@ def run_version(index: PairIndex, parameters: SearchOptions, runs: int, seed: in
     is_solved = np.isfinite(estimated[:, 0, 0])
     all_errors = errors(true[is_solved], estimated[is_solved])
     is_wrong = all_errors.angle > WRONG_RAD / ARCSEC_RAD
-    return VersionRuns(
-        runs, int(is_solved.sum()), int(is_wrong.sum()), Errors(*(values[~is_wrong] for values in all_errors))
-    )
+    right = Errors(*(values[~is_wrong] for values in all_errors))
+    return VersionRuns(runs, int(is_solved.sum()), int(is_wrong.sum()), right)
 
 
 def table_1(options: ExperimentOptions) -> ExperimentResult:
@@ -186,13 +185,12 @@ def table_1(options: ExperimentOptions) -> ExperimentResult:
     results = {}
     for name, runs_of_version in by_version.items():
         number = name[-1]
-        results[f"success_{number}"] = RowResult(
-            success_percent(runs_of_version), cause=cause if number in "12" else None
-        )
+        success = success_percent(runs_of_version)
+        results[f"success_{number}"] = RowResult(success, cause=cause if number in "12" else None)
         for statistic, values in runs_of_version.right._asdict().items():
             results[f"{statistic}_{number}"] = RowResult(bootstrap_interval(values, np.mean))
-    wrong, total = (sum(getattr(one, name) for one in by_version.values()) for name in ("wrong", "runs"))
-    results["wrong"] = RowResult(proportion(wrong, total))
+    versions = by_version.values()
+    results["wrong"] = RowResult(proportion(sum(one.wrong for one in versions), sum(one.runs for one in versions)))
     results |= scatter(by_version["fialho_2"])
     return ExperimentResult(results, drawings(by_version))
 
@@ -204,24 +202,16 @@ def success_percent(runs_of_version: VersionRuns) -> Summary:
 
 def scatter(runs_of_version: VersionRuns) -> dict[str, RowResult]:
     """Standard deviation of a simulation's mean over 1000 runs: that of one run divided by sqrt(1000)."""
-    right = runs_of_version.right
-    success = np.where(np.arange(runs_of_version.runs) < runs_of_version.solved, 100.0, 0.0)
-    values: dict[str, Floats] = {
-        "success": success,
-        "attitude": right.attitude,
-        "roll": right.roll,
-        "axis": right.axis,
-    }
+    values = {name: getattr(runs_of_version.right, name) for name in ("attitude", "roll", "axis")}
+    values["success"] = np.where(np.arange(runs_of_version.runs) < runs_of_version.solved, 100.0, 0.0)
+
+    def std_of_mean(samples: Floats, axis: int = -1) -> Any:
+        return sample_std(samples, axis) / np.sqrt(SIMULATION_RUNS)
+
     return {f"{name}_sd": RowResult(bootstrap_interval(samples, std_of_mean)) for name, samples in values.items()}
 
 
-def std_of_mean(values: Floats, axis: int = -1) -> Any:
-    """Standard deviation of the mean of SIMULATION_RUNS values."""
-    return sample_std(values, axis) / np.sqrt(SIMULATION_RUNS)
-
-
 def drawings(by_version: dict[str, VersionRuns]) -> tuple[Drawing, ...]:
-    """Figures: histogram of the attitude error, and the simulations' means."""
     second = by_version["fialho_2"].right
     return (
         Drawing(

@@ -35,9 +35,8 @@ THRESHOLD_SIGMA, MIN_AREA_PX = 5.0, 3
 
 def scan_times(options: ExperimentOptions) -> ExperimentResult:
     """Fig. 3: run time of a single pass with a sorted table against one pass per object, on the same frames."""
-    images = [
-        frame.image_dn for _, frame, _ in render_frames(exposure_override(50), 0.0, options.trials(60, 8), options.seed)
-    ]
+    frames = render_frames(exposure_override(50), 0.0, options.trials(60, 8), options.seed)
+    images = [frame.image_dn for _, frame, _ in frames]
     times_s = np.array([[scan_time_s(scan, image) for scan in (sequential_scan, maximum_scan)] for image in images])
     table, all_objects = ([count_common(image, limit) for image in images] for limit in (MAX_CENTROIDS, MAX_OBJECTS))
     passes = np.array([min(objects + 1, MAX_CENTROIDS) for objects, _ in table])
@@ -83,14 +82,8 @@ def draw_scans(times_s: Floats, fig: Any) -> None:
     scale = 1e3 * float(np.median(times_s[:, 0])) / 9.9
     for published_ms in (9.9, 110):
         axes.axhline(published_ms * scale, color=PUBLISHED, ls="--")
-        axes.text(
-            0,
-            published_ms * scale,
-            f"published, {published_ms:g} ms there",
-            color=PUBLISHED,
-            va="bottom",
-            fontsize=8,
-        )
+        text = f"published, {published_ms:g} ms there"
+        axes.text(0, published_ms * scale, text, color=PUBLISHED, va="bottom", fontsize=8)
     axes.set(xlabel="frame", ylabel="time of a scan (ms)", ylim=(0, None))
     fig.legend(loc="outside upper center", ncols=2)
 
@@ -110,16 +103,9 @@ EIGHT_BITS = {
     "tracker.exposure_control": f"{{mean_dn: {COARSE_DN}}}",
 }
 DARK = {"camera.transmission": "1e-6"}
-CAMERAS: dict[str, dict[str, str]] = {
-    "ground": FULL_MOON,
-    "space": {},
-    "8 bits": FULL_MOON | EIGHT_BITS,
-}
-DISTURBANCES: dict[str, dict[str, Any]] = {
-    "planet": {"planets": 1},
-    "planets": {"planets": 4},
-    "glare": {"glare_e_s": GLARE_E_S},
-}
+CAMERAS: dict[str, dict[str, str]] = {"ground": FULL_MOON, "space": {}, "8 bits": FULL_MOON | EIGHT_BITS}
+PLANET, PLANETS, GLARE = {"planets": 1}, {"planets": 4}, {"glare_e_s": GLARE_E_S}
+DISTURBANCES: dict[str, dict[str, Any]] = {"planet": PLANET, "planets": PLANETS, "glare": GLARE}
 
 
 class ExposureLoop:
@@ -209,24 +195,19 @@ def exposure_control(options: ExperimentOptions) -> ExperimentResult:
             Cause("8 bits of 157 e-", bootstrap_interval(steady_ms["8 bits"], np.mean)),
         ),
         "space": RowResult(bootstrap_of_means(space_and_ground_ms, lambda m: m[..., 0] / m[..., 1])),
-        **{name: RowResult(mean_and_range(values)) for name, values in changes_ms.items()},
     }
-    return ExperimentResult(
-        results, (Drawing("Fig. 2: exposure, frame after frame.", partial(draw_control, attitudes[0])),)
-    )
-
-
-def mean_and_range(values: Floats) -> Summary:
-    """The mean, with minimum and maximum as the interval."""
-    return Summary(float(values.mean()), float(values.min()), float(values.max()), len(values))
+    for name, values in changes_ms.items():  # the mean, with minimum and maximum as the interval
+        results[name] = RowResult(Summary(float(values.mean()), float(values.min()), float(values.max()), len(values)))
+    drawing = Drawing("Fig. 2: exposure, frame after frame.", partial(draw_control, attitudes[0]))
+    return ExperimentResult(results, (drawing,))
 
 
 SEQUENCE: tuple[tuple[str, int, dict[str, Any]], ...] = (
     ("stars", 30, {}),
-    ("one planet", 8, {"planets": 1}),
-    ("four planets", 8, {"planets": 4}),
+    ("one planet", 8, PLANET),
+    ("four planets", 8, PLANETS),
     ("stars", 8, {}),
-    ("stray light", 8, {"glare_e_s": GLARE_E_S}),
+    ("stray light", 8, GLARE),
     ("stars", 16, {}),
 )
 

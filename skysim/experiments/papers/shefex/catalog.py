@@ -12,15 +12,9 @@ from estimator.catalog import pair_index, shefex
 from estimator.catalog.catalog import StarCatalog
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
-from skysim.experiments.papers.compare import Cause, Drawing, ExperimentOptions, ExperimentResult, RowResult
+from skysim.experiments.papers.compare import Drawing, ExperimentOptions, ExperimentResult, RowResult, with_cause
 from skysim.experiments.papers.intervals import bootstrap_of_means
-from skysim.experiments.papers.shefex.setup import (
-    PRINTED_FIELD_RAD,
-    PUBLISHED,
-    paper_catalog,
-    stars,
-    testbed_with,
-)
+from skysim.experiments.papers.shefex.setup import PRINTED_FIELD_RAD, PUBLISHED, paper_catalog, stars, testbed_with
 from skysim.experiments.study.execution import trials
 from skysim.results.metrics import exact
 from skysim.results.plots import INK
@@ -34,15 +28,14 @@ def catalog_statistics(options: ExperimentOptions) -> ExperimentResult:
     asymmetric, uniform, chosen = (paper_catalog(name) for name in ("asymmetric", "uniform", "chosen"))
     counts = count_in_fields((asymmetric, uniform), options)
     bright = stars().id[stars().v_mag <= BRIGHT_LIMIT_MAG]
-    asymmetric_faint = count_between(asymmetric, 5.2, 5.4)
-    thinned = Cause("the thinning of the chosen catalog", exact(count_between(chosen, 5.2, 5.4)))
+    faint = [count_between(one, 5.2, 5.4) for one in (asymmetric, chosen)]
     pool = stars().take(stars().v_mag <= FAINTEST_MAG)
     uniform_with_all_bright = shefex.uniform(pool, len(uniform), BRIGHT_LIMIT_MAG)
-    all_bright = Cause("all stars to 4.5 mag kept", exact(count_between(uniform_with_all_bright, 5.25, 5.75)))
+    uniform_faint = [count_between(one, 5.25, 5.75) for one in (uniform, uniform_with_all_bright)]
     results = {
-        "asymmetric_faint": RowResult(exact(asymmetric_faint), cause=thinned),
+        "asymmetric_faint": with_cause("the thinning of the chosen catalog", exact, *faint),
         "asymmetric_faintest": RowResult(exact(asymmetric.v_mag.max())),
-        "uniform_faint": RowResult(exact(count_between(uniform, 5.25, 5.75)), cause=all_bright),
+        "uniform_faint": with_cause("all stars to 4.5 mag kept", exact, *uniform_faint),
         "chosen_stars": RowResult(exact(len(chosen))),
         "chosen_pairs": RowResult(exact(count_pairs(chosen))),
         "chosen_bright": RowResult(exact(np.isin(bright, chosen.id).mean())),
@@ -50,14 +43,12 @@ def catalog_statistics(options: ExperimentOptions) -> ExperimentResult:
         "spread": RowResult(bootstrap_of_means(np.hstack([counts, counts**2]), relative_dispersion)),
         "poor": RowResult(bootstrap_of_means((counts < MIN_STARS).astype(float), lambda m: m[..., 1] - m[..., 0])),
     }
-    return ExperimentResult(
-        results,
-        (
-            Drawing("Fig. 4: the asymmetric catalog.", partial(draw, asymmetric), (7.4, 4.2)),
-            Drawing("Fig. 5: the uniform catalog.", partial(draw, uniform), (7.4, 4.2)),
-            Drawing("Stars in the field of 14.9 x 11.2 deg at random attitudes.", partial(draw_counts, counts)),
-        ),
+    drawings = (
+        Drawing("Fig. 4: the asymmetric catalog.", partial(draw, asymmetric), (7.4, 4.2)),
+        Drawing("Fig. 5: the uniform catalog.", partial(draw, uniform), (7.4, 4.2)),
+        Drawing("Stars in the field of 14.9 x 11.2 deg at random attitudes.", partial(draw_counts, counts)),
     )
+    return ExperimentResult(results, drawings)
 
 
 def count_between(star_catalog: StarCatalog, bright_mag: float, faint_mag: float) -> int:

@@ -7,12 +7,12 @@ angles compared, which does not depend on the computer.
 
 from __future__ import annotations
 
+import itertools
 from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from estimator.attitude.solvers import SOLVERS
 from estimator.catalog import pair_index
 from estimator.identification.chance import ACCEPT_LOG10_CHANCE
 from estimator.identification.published.shefex import FOURTH_STAR, angle_interval, cos_error, search
@@ -27,6 +27,7 @@ from skysim.experiments.papers.shefex.setup import (
     PRINTED_FIELD_RAD,
     PUBLISHED,
     Field,
+    identify_and_solve,
     pairs,
     plot_curve,
     random_fields,
@@ -79,14 +80,11 @@ def identify(
     xy_px = xy_px[:MAX_CENTROIDS]
     if len(xy_px) < 4:
         return Identification(np.nan, 0.0, 0.0, np.full(3, np.nan))
-    index, rays, counters = pairs(), camera.rays(xy_px), np.zeros(3, np.int64)
-    search_limits = search_options(index, cosine_error, len(xy_px), accept_log10_chance)
-    observed, star, _, _ = search(rays, index, search_limits, counters)
+    rays, sigma_rad, counters = camera.rays(xy_px), centroid_px / camera.focal_px, np.zeros(3, np.int64)
+    _, cam_from_ref = identify_and_solve(rays, pairs(), cosine_error, accept_log10_chance, sigma_rad, counters)
     work = float(counters[1] + 3 * counters[2])
-    if not len(observed):
+    if cam_from_ref is None:
         return Identification(work, 0.0, 0.0, np.full(3, np.nan))
-    sigma_rad = np.full(len(observed), centroid_px / camera.focal_px)
-    cam_from_ref = SOLVERS["esoq2"](rays[observed], index.vectors[star], sigma_rad)
     error_rad = (cam_from_ref * field.cam_from_ref.inv()).as_rotvec()
     if np.linalg.norm(error_rad) > WRONG_RAD:
         return Identification(work, 0.0, 1.0, np.full(3, np.nan))
@@ -113,46 +111,37 @@ class Curves(NamedTuple):
     has_four_stars: Floats
 
 
-class TrialSet:
-    """The attitudes of an experiment. Each has its own noise seed, the same at every point of a curve, so that points
-    differ by their parameters only."""
+def compute_curves(options: ExperimentOptions) -> Curves:
+    """Compute all curves.
 
-    def __init__(self, options: ExperimentOptions, count: int, points: int) -> None:
-        self.fields, self.seed = random_fields(count, options.seed), options.seed
-        self.watch, self.points, self.completed = options.watch, points, 0
+    Each attitude has its own noise seed, the same at every point of a curve, so that points differ by their
+    parameters only.
+    """
+    points = 4 * len(COS_ERRORS) + len(SPIKES) * (len(SPIKE_COS_ERRORS) + 1) + len(ERRORS_PX)
+    fields, completed = random_fields(options.trials(1000, 60), options.seed), itertools.count(1)
 
     def results_at(
-        self, centroid_px: float, cosine_error: float, spikes: int = 0, accept: float = FOURTH_STAR
-    ) -> dict[str, Floats]:
-        """Results of all attitudes at one point of a curve, as arrays by the field names of `Identification`."""
+        centroid_px: float, cosine_error: float, spikes: int = 0, accept: float = FOURTH_STAR
+    ) -> list[Floats]:
+        """Work, right, wrong and errors of all attitudes at one point of a curve."""
         results = [
-            identify(field, centroid_px, cosine_error, spikes, accept, random_stream(self.seed, 1, n))
-            for n, field in enumerate(self.fields)
+            identify(field, centroid_px, cosine_error, spikes, accept, random_stream(options.seed, 1, n))
+            for n, field in enumerate(fields)
         ]
-        self.completed += 1
-        self.watch(self.completed, self.points)
-        return {name: np.array([getattr(one, name) for one in results]) for name in Identification._fields}
+        options.watch(next(completed), points)
+        return [np.array(column) for column in zip(*results, strict=True)]
 
-
-def compute_curves(options: ExperimentOptions) -> Curves:
-    """Compute all curves."""
     significant = ACCEPT_LOG10_CHANCE
-    points = 4 * len(COS_ERRORS) + len(SPIKES) * (len(SPIKE_COS_ERRORS) + 1) + len(ERRORS_PX)
-    trials = TrialSet(options, options.trials(1000, 60), points)
-    curves = [[trials.results_at(px, error) for error in COS_ERRORS] for px in CENTROID_PX]
-    right = [trials.results_at(0.2, error, 0, significant)["right"] for error in COS_ERRORS]
-    wrong = [[trials.results_at(0.2, error, n)["wrong"] for error in SPIKE_COS_ERRORS] for n in SPIKES]
-    wrong_significant = [trials.results_at(0.2, CHOSEN_COS_ERROR, n, significant)["wrong"] for n in SPIKES]
-    error_deg = [trials.results_at(px, eq3_cos_error(px, EQ3_FACTOR))["error_deg"] for px in ERRORS_PX]
-    return Curves(
-        work=np.array([[point["work"] for point in row] for row in curves]),
-        right=np.array([[point["right"] for point in row] for row in curves]),
-        right_significant=np.array(right),
-        wrong=np.array(wrong),
-        wrong_significant=np.array(wrong_significant),
-        error_deg=np.array(error_deg),
-        has_four_stars=np.array([len(field.xy_px) >= 4 for field in trials.fields]),
+    work, right = np.array([[results_at(px, error)[:2] for error in COS_ERRORS] for px in CENTROID_PX]).transpose(
+        2, 0, 1, 3
     )
+    right_significant = [results_at(0.2, error, 0, significant)[1] for error in COS_ERRORS]
+    wrong = [[results_at(0.2, error, n)[2] for error in SPIKE_COS_ERRORS] for n in SPIKES]
+    wrong_significant = [results_at(0.2, CHOSEN_COS_ERROR, n, significant)[2] for n in SPIKES]
+    error_deg = [results_at(px, eq3_cos_error(px, EQ3_FACTOR))[3] for px in ERRORS_PX]
+    has_four_stars = [len(field.xy_px) >= 4 for field in fields]
+    columns = (work, right, right_significant, wrong, wrong_significant, error_deg, has_four_stars)
+    return Curves(*map(np.array, columns))
 
 
 def eq3_cos_error(centroid_px: float, factor: float) -> float:
@@ -178,17 +167,15 @@ def time_results(curves: Curves) -> dict[str, RowResult]:
     """Fig. 7: the ends of the curves relative to their minimum, and how far the minimum moves with centroid error."""
     low = [bootstrap_of_means(work.T, lambda m: m[..., 0] / m.min(axis=-1)) for work in curves.work]
     high = [bootstrap_of_means(work.T, lambda m: m[..., -1] / m.min(axis=-1)) for work in curves.work]
-    low_noise, high_noise = curves.work[0].T, curves.work[-1].T
-    count = len(COS_ERRORS)
 
     def moved(means: Floats) -> Floats:
-        first, last = means[..., :count].argmin(axis=-1), means[..., count:].argmin(axis=-1)
+        first, last = (half.argmin(axis=-1) for half in np.split(means, 2, axis=-1))
         return np.asarray(COS_ERRORS[last] / COS_ERRORS[first])
 
     return {
         "least_low": RowResult(min(low), "smallest of the three centroid errors"),
         "least_high": RowResult(min(high), "smallest of the three centroid errors"),
-        "optimum": RowResult(bootstrap_of_means(np.hstack([low_noise, high_noise]), moved)),
+        "optimum": RowResult(bootstrap_of_means(np.vstack([curves.work[0], curves.work[-1]]).T, moved)),
     }
 
 
@@ -198,8 +185,8 @@ def success_results(curves: Curves) -> dict[str, RowResult]:
     increase = chosen - curves.right[1, INDEX_OF[1e-5]]
     difference = curves.right[0, INDEX_OF[2e-5]] - curves.right[2, INDEX_OF[2e-5]]
     return {
-        "success_rises": RowResult(bootstrap_of_means(increase[:, None], lambda m: m[..., 0])),
-        "success_sharper": RowResult(bootstrap_of_means(difference[:, None], lambda m: m[..., 0])),
+        "success_rises": RowResult(bootstrap_of_mean(increase)),
+        "success_sharper": RowResult(bootstrap_of_mean(difference)),
         "success_chosen": RowResult(
             proportion(chosen[has_four_stars].sum(), has_four_stars.sum()),
             f"over all attitudes, {1 - has_four_stars.mean():.0%} with fewer than four stars: {chosen.mean():.3f}",
@@ -215,8 +202,8 @@ def wrong_results(curves: Curves) -> dict[str, RowResult]:
     wrong_by_our_rule = int(curves.wrong_significant.sum())
     note = f"our rule, which requires significance: {wrong_by_our_rule} wrong at any number of spikes"
     return {
-        "wrong_spikes": RowResult(bootstrap_of_means(by_spikes[:, None], lambda m: m[..., 0]), note),
-        "wrong_cos_error": RowResult(bootstrap_of_means(by_cos_error[:, None], lambda m: m[..., 0])),
+        "wrong_spikes": RowResult(bootstrap_of_mean(by_spikes), note),
+        "wrong_cos_error": RowResult(bootstrap_of_mean(by_cos_error)),
         "wrong_chosen": RowResult(proportion(curves.wrong[SPIKES.index(4), chosen].sum(), len(curves.has_four_stars))),
     }
 
@@ -224,33 +211,34 @@ def wrong_results(curves: Curves) -> dict[str, RowResult]:
 def attitude_results(curves: Curves) -> dict[str, RowResult]:
     """Fig. 10: errors at 0.45 px, and the centroid error at which yaw exceeds the limit, as rms and as 2 sigma."""
     yaw, cross = curves.error_deg[:, :, 2].T, np.hypot(curves.error_deg[:, :, 0], curves.error_deg[:, :, 1]).T
-    yaw_at_limit, yaw_squared = yaw[:, [LIMIT_INDEX]], yaw**2
-
-    def steps(means: Floats) -> Floats:
-        return np.asarray(np.diff(np.sqrt(means), axis=-1).min(axis=-1))
-
-    yaw_and_cross = np.hstack([yaw_squared[:, [LIMIT_INDEX]], cross[:, [LIMIT_INDEX]] ** 2 / 2])
-    two_sigma = bootstrap_of_means(yaw_squared, partial(error_at_limit, 2.0))
+    yaw_at_limit, yaw_squared = yaw[:, LIMIT_INDEX], yaw**2
+    yaw_and_cross = np.column_stack([yaw_at_limit**2, cross[:, LIMIT_INDEX] ** 2 / 2])
+    one_sigma, two_sigma = (bootstrap_of_means(yaw_squared, partial(error_at_limit, times)) for times in (1.0, 2.0))
     return {
-        "yaw_mean": RowResult(bootstrap_of_means(np.abs(yaw_at_limit), lambda m: m[..., 0])),
-        "yaw_rms": RowResult(bootstrap_of_means(yaw_at_limit**2, partial(scaled_rms, 1.0))),
-        "yaw_2_sigma": RowResult(bootstrap_of_means(yaw_at_limit**2, partial(scaled_rms, 2.0))),
-        "passes": RowResult(
-            bootstrap_of_means(yaw_squared, partial(error_at_limit, 1.0)),
-            cause=Cause("2 sigma drawn, not rms", two_sigma),
-        ),
-        "increasing": RowResult(bootstrap_of_means(yaw_squared, steps)),
+        "yaw_mean": RowResult(bootstrap_of_mean(np.abs(yaw_at_limit))),
+        "yaw_rms": RowResult(bootstrap_of_rms(yaw_at_limit)),
+        "yaw_2_sigma": RowResult(bootstrap_of_rms(yaw_at_limit, 2.0)),
+        "passes": RowResult(one_sigma, cause=Cause("2 sigma drawn, not rms", two_sigma)),
+        "increasing": RowResult(bootstrap_of_means(yaw_squared, lambda m: np.diff(np.sqrt(m), axis=-1).min(axis=-1))),
         "yaw_over_pitch": RowResult(bootstrap_of_means(yaw_and_cross, lambda m: np.sqrt(m[..., 0] / m[..., 1]))),
-        "pitch": RowResult(bootstrap_of_means(yaw_and_cross[:, 1:], partial(scaled_rms, 1.0))),
+        "pitch": RowResult(bootstrap_of_means(yaw_and_cross[:, 1:], lambda m: np.sqrt(m[..., 0]))),
     }
+
+
+def bootstrap_of_mean(values: Floats) -> Summary:
+    """The mean of (N,) values with its bootstrap interval; NaNs are left out."""
+    return bootstrap_of_means(values[:, None], lambda m: m[..., 0])
+
+
+def bootstrap_of_rms(values: Floats, times: float = 1.0) -> Summary:
+    """`times` times the rms of (N,) values with its bootstrap interval; NaNs are left out."""
+    return bootstrap_of_means(values[:, None] ** 2, lambda m: times * np.sqrt(m[..., 0]))
 
 
 def error_at_limit(times: float, squares: Floats) -> Floats:
     """Centroid error in px at which `times` times the rms reaches the limit; the largest one if it never does."""
     yaw_deg = times * np.sqrt(squares)
-    rows = yaw_deg.reshape(-1, yaw_deg.shape[-1])
-    crossings_px = [np.interp(LIMIT_DEG, row, ERRORS_PX) for row in rows]
-    return np.reshape(crossings_px, yaw_deg.shape[:-1])
+    return np.apply_along_axis(lambda row: np.interp(LIMIT_DEG, row, ERRORS_PX), -1, yaw_deg)
 
 
 def equation_results(rng: np.random.Generator) -> dict[str, RowResult]:
@@ -259,22 +247,19 @@ def equation_results(rng: np.random.Generator) -> dict[str, RowResult]:
         f"c_{n}": RowResult(exact(CHOSEN_COS_ERROR / eq3_cos_error(centroid_px, 1.0)))
         for n, centroid_px in enumerate(CENTROID_PX, 1)
     }
-    results |= {f"gate_{name}": RowResult(exact(gate_half_width_deg(angle))) for name, angle in GATE_ANGLES_DEG.items()}
+    # Half the range of catalog angles that a k-vector search returns for an angle (eqs 4, 5 corrected).
+    for name, angle_deg in GATE_ANGLES_DEG.items():
+        interval = angle_interval(np.radians(angle_deg), CHOSEN_COS_ERROR)
+        low, high = pair_index.pair_range(pairs(), *interval)
+        half_rad = (pairs().angle_rad[high - 1] - pairs().angle_rad[low]) / 2
+        results[f"gate_{name}"] = RowResult(exact(np.degrees(half_rad)))
     results["triangles"] = RowResult(exact(count_triangles(rng)))
-    outside_kvector, missed = eq5_failures(rng)
-    results["eq5_printed"] = RowResult(extremum(np.array([outside_kvector]), np.max))
-    results["eq5_mended"] = RowResult(extremum(np.array([missed]), np.max))
+    for key, failures in zip(("eq5_printed", "eq5_mended"), eq5_failures(rng), strict=True):
+        results[key] = RowResult(extremum(np.array([failures]), np.max))
     return results
 
 
 GATE_ANGLES_DEG = {"2": 2.0, "5": 5.0, "10": 10.0, "18": 18.4}
-
-
-def gate_half_width_deg(angle_deg: float) -> float:
-    """Half the range of catalog angles that a k-vector search returns for an angle, degrees (eqs 4, 5 corrected)."""
-    index = pairs()
-    low, high = pair_index.pair_range(index, *angle_interval(np.radians(angle_deg), CHOSEN_COS_ERROR))
-    return float(np.degrees(index.angle_rad[high - 1] - index.angle_rad[low]) / 2)
 
 
 def count_triangles(rng: np.random.Generator) -> int:
@@ -295,27 +280,30 @@ def eq5_failures(rng: np.random.Generator, count: int = 2000) -> tuple[int, int]
     measured = cosines[true_pair] + CHOSEN_COS_ERROR * rng.uniform(-1, 1, count)
     last = len(kvector) - 1
     printed_upper = np.ceil((measured - CHOSEN_COS_ERROR) / slope + offset / slope)
-    low, high = (
-        np.floor((measured - CHOSEN_COS_ERROR - offset) / slope),
-        np.ceil((measured + CHOSEN_COS_ERROR - offset) / slope),
-    )
+    low = np.floor((measured - CHOSEN_COS_ERROR - offset) / slope)
+    high = np.ceil((measured + CHOSEN_COS_ERROR - offset) / slope)
     begin = np.where(low < 0, 0, kvector[np.clip(low, 0, last).astype(int)])
     end = kvector[np.clip(high, 0, last).astype(int)]
-    return int(np.sum((printed_upper < 0) | (printed_upper > last))), int(
-        np.sum((true_pair < begin) | (true_pair >= end))
-    )
+    outside = (printed_upper < 0) | (printed_upper > last)
+    return int(np.sum(outside)), int(np.sum((true_pair < begin) | (true_pair >= end)))
 
 
 def draw_time(curves: Curves, fig: Any) -> None:
     axes = fig.subplots()
     for n, centroid_px in enumerate(CENTROID_PX):
-        summaries = [bootstrap_of_means(row[:, None], lambda m: m[..., 0]) for row in curves.work[n]]
+        summaries = [bootstrap_of_mean(row) for row in curves.work[n]]
         plot_curve(axes, COS_ERRORS, summaries, n, f"ours, centroid error {centroid_px} px")
+    set_up_cos_error_axis(axes)
+    logarithmic(axes, "y", 20, 1000)
+    axes.set(ylabel="angles an identification")
+    axes.legend()
+
+
+def set_up_cos_error_axis(axes: Any) -> None:
+    """A logarithmic x axis of cosError with the paper's choice."""
     axes.axvspan(5e-5, 6e-5, color=PUBLISHED, alpha=0.25, lw=0, label="published choice")
     logarithmic(axes, "x", 4e-6, 2.5e-4)
-    logarithmic(axes, "y", 20, 1000)
-    axes.set(xlabel="cosError", ylabel="angles an identification")
-    axes.legend()
+    axes.set(xlabel="cosError")
 
 
 def draw_success(curves: Curves, fig: Any) -> None:
@@ -323,9 +311,8 @@ def draw_success(curves: Curves, fig: Any) -> None:
     for n, centroid_px in enumerate(CENTROID_PX):
         plot_curve(axes, COS_ERRORS, fractions(curves.right[n]), n, f"ours, fourth star, {centroid_px} px")
     plot_curve(axes, COS_ERRORS, fractions(curves.right_significant), 4, "ours, beyond chance, 0.2 px")
-    axes.axvspan(5e-5, 6e-5, color=PUBLISHED, alpha=0.25, lw=0, label="published choice")
-    logarithmic(axes, "x", 4e-6, 2.5e-4)
-    axes.set(xlabel="cosError", ylabel="success rate", ylim=(0, 1.02))
+    set_up_cos_error_axis(axes)
+    axes.set(ylabel="success rate", ylim=(0, 1.02))
     axes.legend()
 
 
@@ -342,27 +329,13 @@ def draw_attitude(curves: Curves, fig: Any) -> None:
     axes = fig.subplots()
     for n, name in ((0, "roll or pitch"), (2, "yaw, about the boresight")):
         for times, style in ((2, "2 sigma"), (1, "rms")):
-            summaries = [
-                bootstrap_of_means(row[:, None] ** 2, partial(scaled_rms, times)) for row in curves.error_deg[:, :, n]
-            ]
+            summaries = [bootstrap_of_rms(row, times) for row in curves.error_deg[:, :, n]]
             plot_curve(axes, ERRORS_PX, summaries, n + 2 - times, f"ours, {style}, {name}")
     axes.axhline(LIMIT_DEG, color="#888888", lw=0.8, ls="--")
-    axes.plot(
-        [0.45],
-        [LIMIT_DEG],
-        "*",
-        color=PUBLISHED,
-        markersize=12,
-        zorder=5,
-        label="published: yaw passes 0.1 deg",
-    )
+    label = "published: yaw passes 0.1 deg"
+    axes.plot([0.45], [LIMIT_DEG], "*", color=PUBLISHED, markersize=12, zorder=5, label=label)
     axes.set(xlabel="centroid error (px)", ylabel="attitude error (deg)", ylim=(0, None))
     axes.legend()
-
-
-def scaled_rms(times: float, squares: Floats) -> Floats:
-    """`times` times the root of the mean square in the first column."""
-    return np.asarray(times * np.sqrt(squares[..., 0]))
 
 
 def fractions(rows: Floats) -> list[Summary]:

@@ -77,10 +77,9 @@ def render_frames(
     moon_direction, trial_seed, rendered = background.direction(*MOON_DEG), 1_000_000 * seed, 0
     while rendered < count:
         trial_seed += 1
-        boresight = (
-            trials.random_attitude(setup, trials.streams(setup, trial_seed)[0]) * testbed.mount.cam_from_body.inv()
-        )
-        if background.angular_separation_deg(boresight.apply([[0.0, 0.0, 1.0]]), moon_direction)[0] < FROM_MOON_DEG:
+        lab_from_body = trials.random_attitude(setup, trials.streams(setup, trial_seed)[0])
+        boresight = (lab_from_body * testbed.mount.cam_from_body.inv()).apply([[0.0, 0.0, 1.0]])
+        if background.angular_separation_deg(boresight, moon_direction)[0] < FROM_MOON_DEG:
             continue
         frame, truth, _ = trials.render_trial_frame(setup, trial_seed)
         rendered += 1
@@ -91,16 +90,16 @@ def process_frames(overrides: dict[str, str], rate_deg_s: float, count: int, see
     """Process frames with all chains."""
     rows = []
     for setup, frame, truth in render_frames(overrides, rate_deg_s, count, seed):
-        paper_result, low_threshold_result = (
+        paper, low_threshold = (
             processing_chain(CATALOG, sigma, setup.testbed.scene.camera.focal_px).solve(frame.image_dn)
             for sigma in (SIGMA, LOW_SIGMA)
         )
-        cam_from_ref = paper_result.cam_from_ref
-        right = is_right(cam_from_ref, truth)
-        wrong = cam_from_ref is not None and not right
-        right_low_threshold = is_right(low_threshold_result.cam_from_ref, truth)
-        ours = is_right(factory.solve_frame(setup.estimator, frame).attitude.cam_from_ref, truth)
-        rows.append((right, wrong, len(paper_result.centroids), right_low_threshold, ours))
+        ours = factory.solve_frame(setup.estimator, frame).attitude
+        right, right_low_threshold, ours_right = (
+            is_right(one.cam_from_ref, truth) for one in (paper, low_threshold, ours)
+        )
+        wrong = paper.cam_from_ref is not None and not right
+        rows.append((right, wrong, len(paper.centroids), right_low_threshold, ours_right))
     return NightResults(*np.array(rows, float).T)
 
 
@@ -112,14 +111,16 @@ def is_right(cam_from_ref: Rotation | None, truth: Truth) -> bool:
 def night_results(options: ExperimentOptions) -> ExperimentResult:
     """Success rates at rest (35 to 50 ms, in space), against the rate, and out of focus; and the camera's optics."""
     rates, space_rates = (QUICK_RATES, QUICK_RATES[:1]) if options.quick else (RATES, SPACE_RATES)
+    space = exposure_override(50)
+    ground = FULL_MOON | space
     conditions: dict[str, tuple[dict[str, str], float]] = {
-        **{f"ground {rate:g}": (FULL_MOON | exposure_override(50), rate) for rate in rates},
-        **{f"space {rate:g}": (exposure_override(50), rate) for rate in space_rates},
+        **{f"ground {rate:g}": (ground, rate) for rate in rates},
+        **{f"space {rate:g}": (space, rate) for rate in space_rates},
         "35 ms": (FULL_MOON | exposure_override(35), 0.0),
         "40 ms": (FULL_MOON | exposure_override(40), 0.0),
-        "moonless": (MOONLESS | exposure_override(50), 0.0),
-        "defocus": (FULL_MOON | exposure_override(50) | out_of_focus(DEFOCUS_M), 0.0),
-        "half defocus": (FULL_MOON | exposure_override(50) | out_of_focus(DEFOCUS_M / 2), 0.0),
+        "moonless": (MOONLESS | space, 0.0),
+        "defocus": (ground | out_of_focus(DEFOCUS_M), 0.0),
+        "half defocus": (ground | out_of_focus(DEFOCUS_M / 2), 0.0),
     }
     results: dict[str, NightResults] = {}
     for key, (overrides, rate) in conditions.items():
@@ -127,19 +128,14 @@ def night_results(options: ExperimentOptions) -> ExperimentResult:
         options.watch(len(results), len(conditions))
     drawings = (
         Drawing("Frames identified against the turning rate.", partial(draw_rates, results)),
-        Drawing(
-            "Fig. 11: a frame of 40 ms, its centroids and those identified.",
-            partial(draw_frame, options.seed),
-        ),
+        Drawing("Fig. 11: a frame of 40 ms, its centroids and those identified.", partial(draw_frame, options.seed)),
     )
     return ExperimentResult(frame_results(results) | optics_results(options), drawings)
 
 
 def frame_results(results: dict[str, NightResults]) -> dict[str, RowResult]:
     """Answers from the frames to the statements of sections 4 and 5."""
-    defocused, half_defocused, at_rest = results["defocus"], results["half defocus"], results["ground 0"]
-    moonless_note = f"without the Moon {results['moonless'].success.value:.2f}"
-    centroids = results["40 ms"].centroids
+    at_rest, centroids = results["ground 0"], results["40 ms"].centroids
     fewest, median, most = np.quantile(centroids, [0.025, 0.5, 0.975], method="nearest")
     by_exposure = {"35 ms": results["35 ms"], "40 ms": results["40 ms"], "50 ms": at_rest}
     by_exposure_note = ", ".join(f"{result.success.value:.2f} at {name}" for name, result in by_exposure.items())
@@ -147,18 +143,20 @@ def frame_results(results: dict[str, NightResults]) -> dict[str, RowResult]:
         bootstrap_interval(np.mean([getattr(result, name) for result in by_exposure.values()], axis=0), np.mean)
         for name in ("right", "right_low_threshold")
     )
+    cause = Cause(f"a threshold of {LOW_SIGMA:g} sigma", combined_low_threshold)
+
+    def success(key: str, other: str = "", name: str = "") -> RowResult:
+        """Success rate under a condition; its note begins with the rate under another one."""
+        note = f"{name} {results[other].success.value:.2f}; " if other else ""
+        return RowResult(results[key].success, note + results[key].note)
+
     return {
-        "ground_50": RowResult(at_rest.success, f"{moonless_note}; {at_rest.note}"),
-        "ground": RowResult(
-            combined, by_exposure_note, Cause(f"a threshold of {LOW_SIGMA:g} sigma", combined_low_threshold)
-        ),
-        "space": RowResult(results["space 0"].success, results["space 0"].note),
-        "rate_2": RowResult(results["ground 2"].success, results["ground 2"].note),
-        "rate_5": RowResult(
-            results["ground 5"].success,
-            f"at 4 deg/s {results['ground 4'].success.value:.2f}; {results['ground 5'].note}",
-        ),
-        "defocus": RowResult(defocused.success, f"at 0.05 mm {half_defocused.success.value:.2f}; {defocused.note}"),
+        "ground_50": success("ground 0", "moonless", "without the Moon"),
+        "ground": RowResult(combined, by_exposure_note, cause),
+        "space": success("space 0"),
+        "rate_2": success("ground 2"),
+        "rate_5": success("ground 5", "ground 4", "at 4 deg/s"),
+        "defocus": success("defocus", "half defocus", "at 0.05 mm"),
         "centroids": RowResult(Summary(float(median), float(fewest), float(most), len(centroids))),
     }
 

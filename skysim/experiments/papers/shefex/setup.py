@@ -15,13 +15,13 @@ from estimator.catalog import catalog, pair_index, shefex
 from estimator.catalog.catalog import StarCatalog
 from estimator.catalog.pair_index import PairIndex
 from estimator.core.arrays import Ints
-from estimator.core.errors import ImageError
 from estimator.core.types import Centroids
 from estimator.identification.published.shefex import FOURTH_STAR, SearchOptions, search
-from estimator.trackers.pipeline import Clock, Settings, detect_and_centroid
+from estimator.trackers.pipeline import Settings
 from skysim.core.paths import CATALOGS
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
+from skysim.experiments.dome_survey import detect_lights
 from skysim.experiments.study.execution import trials
 from skysim.results.metrics import Summary
 from skysim.results.plots import INK, MARKS
@@ -69,10 +69,8 @@ def apparent(star_catalog: StarCatalog) -> Floats:
 @cache
 def pairs() -> PairIndex:
     """Pair index of the chosen catalog, up to the field's diagonal."""
-    return pair_index.build(
-        apparent(paper_catalog("chosen")),
-        onboard_model.calibration(shefex_testbed().scene.camera).diagonal_rad,
-    )
+    camera = onboard_model.calibration(shefex_testbed().scene.camera)
+    return pair_index.build(apparent(paper_catalog("chosen")), camera.diagonal_rad)
 
 
 class ChainResult(NamedTuple):
@@ -103,37 +101,35 @@ class ProcessingChain:
 
     def solve(self, image: NDArray[Any]) -> ChainResult:
         """Solve a frame; by the paper's rule, a match with a fourth star is accepted."""
-        try:
-            centroids = detect_and_centroid(image, self.camera, self.settings, Clock())
-        except ImageError:
-            return ChainResult(Centroids.empty(), np.empty(0, np.int64), None)
+        centroids = detect_lights(self.settings, self.camera, image)
         if len(centroids) < 4:
             return ChainResult(centroids, np.empty(0, np.int64), None)
-        rays = self.camera.rays(centroids.xy_px)
-        search_limits = search_options(self.index, CHOSEN_COS_ERROR, len(centroids), FOURTH_STAR)
-        observed, star, _, _ = search(rays, self.index, search_limits, np.zeros(3, np.int64))
-        if not len(observed):
-            return ChainResult(centroids, observed, None)
-        sigma_rad = np.full(len(observed), 0.1 / self.camera.focal_px)
-        return ChainResult(centroids, observed, SOLVERS["esoq2"](rays[observed], self.index.vectors[star], sigma_rad))
+        rays, counters = self.camera.rays(centroids.xy_px), np.zeros(3, np.int64)
+        sigma_rad = 0.1 / self.camera.focal_px
+        solution = identify_and_solve(rays, self.index, CHOSEN_COS_ERROR, FOURTH_STAR, sigma_rad, counters)
+        return ChainResult(centroids, *solution)
 
 
-@cache
-def processing_chain(name: str, threshold_sigma: float, focal_px: float) -> ProcessingChain:
-    """The chain with one of the catalogs, cached."""
-    return ProcessingChain(name, threshold_sigma, focal_px)
-
-
-def angular_tolerance_rad(index: PairIndex, cos_error: float) -> float:
-    """Angular tolerance that corresponds to cosError at the index's largest angle (inverse of eq. 3), rad."""
-    max_angle_rad = index.max_angle_rad
-    return float(max_angle_rad - np.arccos(min(np.cos(max_angle_rad) + cos_error, 1.0)))
+processing_chain = cache(ProcessingChain)
 
 
 def search_options(index: PairIndex, cos_error: float, lights: int, accept_log10_chance: float) -> SearchOptions:
     """SearchOptions of the paper's identifier for a number of lights, without a limit on its work."""
-    tolerance_rad = angular_tolerance_rad(index, cos_error)
+    # The angular tolerance that corresponds to cosError at the index's largest angle (inverse of eq. 3).
+    max_angle_rad = index.max_angle_rad
+    tolerance_rad = float(max_angle_rad - np.arccos(min(np.cos(max_angle_rad) + cos_error, 1.0)))
     return SearchOptions(cos_error, tolerance_rad, UNLIMITED, UNLIMITED, lights, accept_log10_chance)
+
+
+def identify_and_solve(
+    rays: Floats, index: PairIndex, cos_error: float, accept_log10_chance: float, sigma_rad: float, counters: Ints
+) -> tuple[Ints, Rotation | None]:
+    """Rows of the identified rays, and cam_from_ref by ESOQ2; None if none is identified. `counters` count the work."""
+    options = search_options(index, cos_error, len(rays), accept_log10_chance)
+    observed, star, _, _ = search(rays, index, options, counters)
+    if not len(observed):
+        return observed, None
+    return observed, SOLVERS["esoq2"](rays[observed], index.vectors[star], np.full(len(observed), sigma_rad))
 
 
 class Field(NamedTuple):

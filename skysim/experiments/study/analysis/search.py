@@ -81,10 +81,9 @@ def check(study: Study) -> None:
         return
     for n, objective in enumerate(config.objectives):
         check_response(objective.response, f"optimize.objectives.{n}.response")
-    if len({one.response for one in config.objectives}) < len(config.objectives):
-        raise InputError(
-            f"optimize.objectives: {config.objectives[0].response} occurs twice; allowed: different responses"
-        )
+    first, *others = (one.response for one in config.objectives)
+    if first in others:
+        raise InputError(f"optimize.objectives: {first} occurs twice; allowed: different responses")
     for n, limit in enumerate(config.constraints):
         check_response(limit.response, f"optimize.constraints.{n}.response")
         if limit.at_least is None and limit.at_most is None:
@@ -109,9 +108,8 @@ def check_response(response: str, where: str) -> None:
     except InputError as error:
         raise InputError(f"{error}, or {COST}") from None
     if response.startswith("time_ms"):
-        raise InputError(
-            f"{where}: {response} is not reproducible; allowed: responses that a resumed search reproduces"
-        )
+        allowed = "responses that a resumed search reproduces"
+        raise InputError(f"{where}: {response} is not reproducible; allowed: {allowed}")
 
 
 def check_cost(study: Study, config: Search) -> None:
@@ -162,15 +160,15 @@ def evaluate_candidate(study: Study, number: int, point: Point, columns: Columns
     """The candidate computed from the columns of all its trials."""
     config = study.optimize
     assert config is not None
-    responses = [one.response for one in config.objectives] + [one.response for one in config.constraints]
-    figures = {name: metrics.response(name)(columns) for name in dict.fromkeys(responses) if name != COST}
+    figures = {name: metrics.response(name)(columns) for name in config.responses if name != COST}
     price = cost(config, point.levels)
     values = {name: figure.value for name, figure in figures.items()} | {COST: price}
     objectives = tuple(values[one.response] for one in config.objectives)
     violated = [one.response for one in config.constraints if violation(one, values[one.response]) > 0]
     violated += [f"no {one.response}" for one in config.objectives if math.isnan(values[one.response])]
     refused = scene_error(columns)
-    why = error_message(refused) or ", ".join(violated)
+    message = last_line(refused).partition(f"{InputError.__name__}: ")[2] if refused else ""
+    why = message or ", ".join(violated)
     return Candidate(number, point.levels, objectives, figures, price, not why, bool(refused), why)
 
 
@@ -188,17 +186,14 @@ def scene_error(columns: Columns) -> str:
 
     Trials of an invalid scene have an empty scene hash.
     """
-    refused = [
-        error
-        for scene, error in zip(columns["scene"], columns["error"], strict=True)
-        if not scene and error and InputError.__name__ in error.strip().splitlines()[-1]
-    ]
-    return refused[0] if refused else ""
+    errors = zip(columns["scene"], columns["error"], strict=True)
+    refused = (error for scene, error in errors if not scene and error and InputError.__name__ in last_line(error))
+    return next(refused, "")
 
 
-def error_message(error: str) -> str:
-    """Last line of a traceback without the exception's name."""
-    return error.strip().splitlines()[-1].partition(f"{InputError.__name__}: ")[2] if error else ""
+def last_line(traceback: str) -> str:
+    """Last line of a traceback."""
+    return traceback.strip().splitlines()[-1]
 
 
 def front(config: Search, candidates: Sequence[Candidate]) -> list[Candidate]:
@@ -209,9 +204,8 @@ def front(config: Search, candidates: Sequence[Candidate]) -> list[Candidate]:
     feasible = [one for one in candidates if one.feasible]
     sign = np.array([1.0 if one.better == "less" else -1.0 for one in config.objectives])
     values = np.array([one.objectives for one in feasible]).reshape(-1, len(sign)) * sign
-    best = [
-        n for n, one in enumerate(values) if not np.any(np.all(values <= one, axis=1) & np.any(values < one, axis=1))
-    ]
+    dominated = [np.any(np.all(values <= one, axis=1) & np.any(values < one, axis=1)) for one in values]
+    best = [n for n in range(len(feasible)) if not dominated[n]]
     return [feasible[n] for n in sorted(best, key=lambda n: tuple(values[n]))]
 
 
@@ -219,11 +213,10 @@ def collect_result(plan: Plan, store: Store) -> SearchResult:
     """The candidates in a store whose trials are complete, and their front; the search may be unfinished."""
     study, replicates = plan.study, plan.study.replicates
     assert study.optimize is not None
-    columns = ((n, point, store.point_columns(n)) for n, point in enumerate(store.points()))
     evaluated = [
-        evaluate_candidate(study, n, point, trials)
-        for n, point, trials in columns
-        if len(trials["trial"]) == replicates
+        evaluate_candidate(study, n, point, columns)
+        for n, point in enumerate(store.points())
+        if len((columns := store.point_columns(n))["trial"]) == replicates
     ]
     return SearchResult(evaluated, front(study.optimize, evaluated), len(evaluated) == study.optimize.candidates)
 
@@ -276,23 +269,10 @@ def create_sampler(study: Study) -> Any:
     sampler = optuna.samplers.TPESampler(seed=seed, n_startup_trials=STARTUP_CANDIDATES)
     directions = ["minimize" if one.better == "less" else "maximize" for one in study.optimize.objectives]
     optuna_study = optuna.create_study(sampler=sampler, directions=directions)
-    middle = {
-        name: 0.5 if isinstance(factor, Range) else len(factor.options()) // 2 for name, factor in study.factors.items()
-    }
+    factors = study.factors.items()
+    middle = {name: 0.5 if isinstance(factor, Range) else len(factor.options()) // 2 for name, factor in factors}
     optuna_study.enqueue_trial(middle)
     return optuna_study
-
-
-def search_space(study: Study) -> dict[str, Any]:
-    """Search space of the sampler: a number in [0, 1] for a range, an index for levels or values."""
-    from optuna.distributions import CategoricalDistribution, FloatDistribution
-
-    return {
-        name: FloatDistribution(0.0, 1.0)
-        if isinstance(factor, Range)
-        else CategoricalDistribution(tuple(range(len(factor.options()))))
-        for name, factor in study.factors.items()
-    }
 
 
 def propose(sampler: Any, study: Study, evaluated: dict[str, Candidate]) -> tuple[Any, Point | None]:
@@ -302,13 +282,14 @@ def propose(sampler: Any, study: Study, evaluated: dict[str, Candidate]) -> tupl
     """
     assert study.optimize is not None
     for _ in range(MAX_REPEATS):
-        proposal = sampler.ask(search_space(study))
-        chosen = {
-            name: factor.value_at(proposal.params[name])
-            if isinstance(factor, Range)
-            else factor.options()[proposal.params[name]]
-            for name, factor in study.factors.items()
-        }
+        # A number in [0, 1] for a range, an index for levels or values.
+        proposal, chosen = sampler.ask(), {}
+        for name, factor in study.factors.items():
+            if isinstance(factor, Range):
+                chosen[name] = factor.value_at(proposal.suggest_float(name, 0.0, 1.0))
+            else:
+                options = factor.options()
+                chosen[name] = options[proposal.suggest_categorical(name, range(len(options)))]
         point = make_point(chosen)
         if key_of(point) not in evaluated:
             return proposal, point
@@ -336,15 +317,9 @@ def report_to_sampler(sampler: Any, proposal: Any, config: Search, candidate: Ca
 
 
 def run_candidate(
-    plan: Plan,
-    store: Store,
-    engine: Engine,
-    number: int,
-    point: Point,
-    total: Progress,
-    refused: int,
+    plan: Plan, store: Store, engine: Engine, number: int, point: Point, total: Progress, refused: int,
     watch: Watch | None,
-) -> bool:
+) -> bool:  # fmt: skip
     """Run the missing replicates of a candidate. Returns False if the budget is spent before all are in the store.
 
     total   : progress of the whole search, passed to `watch`
@@ -355,9 +330,8 @@ def run_candidate(
     left_s = None if budget.time_s is None else budget.time_s - (time.perf_counter() - total.began)
     if left_s is not None and left_s <= 0:
         return False
-    budget = budget.model_copy(
-        update={"time_s": left_s, "failures": budget.failures and budget.failures + refused - before.failed}
-    )
+    failures = budget.failures and budget.failures + refused - before.failed
+    budget = budget.model_copy(update={"time_s": left_s, "failures": failures})
     limited = replace(plan, study=plan.study.model_copy(update={"budget": budget}))
 
     def watch_candidate(progress: Progress) -> None:
@@ -381,19 +355,8 @@ def run_candidate(
 def failed_rows(plan: Plan, store: Store, number: int) -> list[Row]:
     """Rows for the remaining trials of a candidate with an invalid scene: failed, with the error of the first one."""
     columns, replicates = store.point_columns(number), plan.study.replicates
-    why, stored = scene_error(columns), set(columns["replicate"].tolist())
+    missing = np.setdiff1d(np.arange(replicates), columns["replicate"]).tolist()
+    failed = Row(0, number, 0, 0, "", code_version(), FAILED, scene_error(columns), 0.0)
     return [
-        Row(
-            number * replicates + k,
-            number,
-            k,
-            seed_of(plan.spec, number, k),
-            "",
-            code_version(),
-            FAILED,
-            why,
-            0.0,
-        )
-        for k in range(replicates)
-        if k not in stored
+        failed._replace(trial=number * replicates + k, replicate=k, seed=seed_of(plan.spec, number, k)) for k in missing
     ]

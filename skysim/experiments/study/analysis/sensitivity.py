@@ -22,7 +22,7 @@ from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
 from skysim.experiments.study.plan import Plan
 from skysim.experiments.study.store import Store
-from skysim.results.metrics import CONFIDENCE, Summary
+from skysim.results.metrics import CONFIDENCE, NO_VALUE, Summary
 
 AXES = {"cross_arcsec": ("x_arcsec", "y_arcsec"), "roll_arcsec": ("roll_arcsec",)}
 RESAMPLES = 200
@@ -43,10 +43,9 @@ class Index(NamedTuple):
 
 def indices(plan: Plan, store: Store) -> list[Index]:
     """Indices of every factor for the cross-boresight and roll errors. Raises InputError for another design."""
-    if plan.study.design.kind != "saltelli" or plan.study.optimize:
-        raise InputError(
-            f"design.kind: {plan.study.design.kind}; allowed: saltelli, without optimize, for Sobol indices"
-        )
+    kind = plan.study.design.kind
+    if kind != "saltelli" or plan.study.optimize:
+        raise InputError(f"design.kind: {kind}; allowed: saltelli, without optimize, for Sobol indices")
     return [index for response in AXES for index in response_indices(plan, store, response)]
 
 
@@ -55,17 +54,12 @@ def response_indices(plan: Plan, store: Store, response: str) -> list[Index]:
     a, b, ab = sample_outputs(plan, store, AXES[response])
     names, count = list(plan.study.factors), a.shape[1]
     if not len(a):
-        no_index = Summary(np.nan, np.nan, np.nan, 0)
-        return [Index(name, response, no_index, no_index, np.nan) for name in names]
+        return [Index(name, response, NO_VALUE, NO_VALUE, np.nan) for name in names]
     estimate = generalized(a, b, ab)
     rng = random_stream(1)
     # Resample rows of A, B and AB together, so that each resample is a valid Saltelli sample.
-    resampled = np.array(
-        [
-            generalized(a[:, selection], b[:, selection], ab[:, :, selection])
-            for selection in rng.integers(count, size=(RESAMPLES, count))
-        ]
-    )
+    selections = rng.integers(count, size=(RESAMPLES, count))
+    resampled = np.array([generalized(a[:, rows], b[:, rows], ab[:, :, rows]) for rows in selections])
     low, high = np.quantile(resampled, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2], axis=0)
     first, total = (
         [Summary(float(v), float(lo), float(hi), count) for v, lo, hi in zip(*index, strict=True)]
@@ -73,16 +67,9 @@ def response_indices(plan: Plan, store: Store, response: str) -> list[Index]:
     )
     # The variance of the cross-boresight error is the sum of the variances about its two axes.
     sigma_arcsec = float(np.sqrt(np.var(np.concatenate([a, b], axis=1), axis=1).mean() * len(AXES[response])))
-    return [
-        Index(
-            name,
-            response,
-            first_index,
-            total_index,
-            sigma_arcsec * float(np.sqrt(max(first_index.value, 0.0))),
-        )
-        for name, first_index, total_index in zip(names, first, total, strict=True)
-    ]
+    rms_arcsec = [sigma_arcsec * float(np.sqrt(max(one.value, 0.0))) for one in first]
+    columns = zip(names, first, total, rms_arcsec, strict=True)
+    return [Index(name, response, one, other, rms) for name, one, other, rms in columns]
 
 
 def sample_outputs(plan: Plan, store: Store, axes: tuple[str, ...]) -> tuple[Floats, Floats, Floats]:
@@ -112,6 +99,5 @@ def generalized(a: Floats, b: Floats, ab: Floats) -> NDArray[np.float64]:
     if weight.sum() == 0:
         return np.zeros((2, len(ab)))
     varying = weight > 0
-    return np.stack(
-        [weight[varying] @ index[varying] / weight.sum() for index in (estimate.first_order, estimate.total_order)]
-    )
+    both = (estimate.first_order, estimate.total_order)
+    return np.stack([weight[varying] @ index[varying] / weight.sum() for index in both])

@@ -9,10 +9,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from skysim.experiments.study.designs import Point
 from skysim.experiments.study.store import Store
 from skysim.results import metrics
-from skysim.results.metrics import Columns, Summary
+from skysim.results.metrics import Summary
 
 LONG_QUANTITY = re.compile(r"(-?\d*\.\d{4,}(?:e[-+]?\d+)?)(\s\S.*)$")
 
@@ -27,8 +26,11 @@ class PointRow(NamedTuple):
 
 def table(store: Store, responses: Sequence[str]) -> list[PointRow]:
     """One row for every point of a store; responses of points without trials are NaN."""
-    functions = {name: metrics.response(name) for name in responses}
-    return [row(number, point, store.point_columns(number), functions) for number, point in enumerate(store.points())]
+    functions, rows = {name: metrics.response(name) for name in responses}, []
+    for number, point in enumerate(store.points()):
+        columns = store.point_columns(number)
+        rows.append(PointRow(number, point.levels, {name: response(columns) for name, response in functions.items()}))
+    return rows
 
 
 def select_responses(rows: Sequence[PointRow], responses: Sequence[str]) -> list[PointRow]:
@@ -36,25 +38,15 @@ def select_responses(rows: Sequence[PointRow], responses: Sequence[str]) -> list
     return [one._replace(responses={name: one.responses[name] for name in responses}) for one in rows]
 
 
-def row(number: int, point: Point, columns: Columns, functions: dict[str, metrics.Response]) -> PointRow:
-    """The row of one point."""
-    return PointRow(number, point.levels, {name: response(columns) for name, response in functions.items()})
-
-
 def cells(rows: Sequence[PointRow]) -> tuple[list[str], list[list[str]]]:
     """Column heads and cell texts of a table, such as `0.97 (0.95..0.98)`."""
     if not rows:
         return [], []
-    heads = ["point", *rows[0].levels, *rows[0].responses]
     texts = [
-        [
-            str(one.point),
-            *map(format_level, one.levels.values()),
-            *map(format_summary, one.responses.values()),
-        ]
+        [str(one.point), *map(format_level, one.levels.values()), *map(format_summary, one.responses.values())]
         for one in rows
     ]
-    return heads, texts
+    return ["point", *rows[0].levels, *rows[0].responses], texts
 
 
 def format_level(value: Any) -> str:

@@ -13,20 +13,13 @@ from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import CancelledError
 from contextlib import suppress
-from typing import Any, NamedTuple
+from typing import Any
 from uuid import uuid4
 
 import cv2
 
 from skysim.core.errors import InputError
-from skysim.experiments.study.execution.engines import (
-    AHEAD,
-    Chunk,
-    Chunks,
-    failed_row,
-    run_timed,
-    split_chunk,
-)
+from skysim.experiments.study.execution.engines import AHEAD, Chunk, Chunks, failed_row, run_timed, split_chunk
 from skysim.experiments.study.execution.setups import code_version
 from skysim.experiments.study.execution.trials import Row, Segment
 from skysim.experiments.study.plan import TrialSpec
@@ -38,17 +31,9 @@ except ImportError:
     raise InputError("engine: dask is not installed; allowed: pip install 'skysim[dask]', or another engine") from None
 
 WAIT_S = 10.0  # timeout for a reply
-
 POLL_S = 5.0  # interval between queries of the cluster's thread count, because workers join and leave
-
+Submission = tuple[Chunk, bool]  # a submitted chunk, and whether it is the only one in flight
 ALLOWED_ADDRESS = "allowed: a scheduler's address, such as tcp://10.0.0.1:8786"
-
-
-class Submission(NamedTuple):
-    """A submitted chunk, and whether it is the only one in flight."""
-
-    chunk: Chunk
-    alone: bool
 
 
 def connect(scheduler: str) -> Client:
@@ -78,42 +63,19 @@ def check_workers(client: Client, scheduler: str) -> None:
         client.wait_for_workers(1, WAIT_S)
         versions = client.run(code_version, on_error="return")
     except OSError:
-        raise InputError(
-            f"scheduler: no worker of {scheduler} replies; allowed: one started with dask worker {scheduler}"
-        ) from None
+        allowed = f"one started with dask worker {scheduler}"
+        raise InputError(f"scheduler: no worker of {scheduler} replies; allowed: {allowed}") from None
     for worker, code in versions.items():
+        where = f"scheduler: worker {worker}"
         if isinstance(code, Exception):
-            raise InputError(
-                f"scheduler: worker {worker} cannot run trials: {code}; allowed: a worker with this skysim"
-            )
+            raise InputError(f"{where} cannot run trials: {code}; allowed: a worker with this skysim")
         if code != code_version():
-            raise InputError(
-                f"scheduler: worker {worker} has skysim {code}; allowed: {code_version()}, the version here"
-            )
+            raise InputError(f"{where} has skysim {code}; allowed: {code_version()}, the version here")
 
 
 def thread_count(client: Client) -> int:
     """Number of trials that the cluster runs at a time."""
     return int(sum(client.nthreads().values()))
-
-
-def run(client: Client, spec: TrialSpec, chunks: Chunks) -> Iterator[list[Row]]:
-    """See `Engine`; the client is closed at the end. Raises InputError if the connection to the scheduler is lost."""
-    name, in_flight = f"skysim-{uuid4().hex}", dict[Future, Submission]()
-    try:
-        client.register_plugin(SpecPlugin(name, spec, code_version()), name)
-        yield from collect_rows(client, name, spec, chunks, in_flight)
-    except (CancelledError, OSError):
-        raise InputError(
-            "scheduler: connection lost, finished trials are stored; allowed: skysim study resume"
-        ) from None
-    finally:
-        # The connection itself may have failed, and a lost scheduler needs no cleanup.
-        with suppress(CancelledError, OSError, RuntimeError, ValueError):
-            if client.status == "running":
-                client.cancel(list(in_flight))
-                client.unregister_worker_plugin(name)
-        client.close()
 
 
 def collect_rows(
@@ -133,21 +95,21 @@ def collect_rows(
         alone = bool(retries)
         while len(in_flight) < (1 if alone else capacity) and (chunk := retries.popleft() if alone else chunks.next()):
             future = client.submit(run_encoded, name, encode_chunk(chunk), pure=False)
-            in_flight[future] = Submission(chunk, alone)
+            in_flight[future] = (chunk, alone)
             completed.add(future)
         if not in_flight:
             return
         future = next(completed)
-        submission = in_flight.pop(future)
+        chunk, was_alone = in_flight.pop(future)
         try:
             rows, seconds = future.result()
         except KilledWorker:
-            if submission.alone:
-                yield [failed_row(spec, submission.chunk[0])]
+            if was_alone:
+                yield [failed_row(spec, chunk[0])]
             else:
-                retries.extend(split_chunk(submission.chunk))
+                retries.extend(split_chunk(chunk))
         else:
-            chunks.report_time(submission.chunk, seconds)
+            chunks.report_time(chunk, seconds)
             yield rows
 
 
@@ -208,11 +170,23 @@ class Dask:
         self.workers = thread_count(self.client)
 
     def run(self, spec: TrialSpec, chunks: Chunks) -> Iterator[list[Row]]:
-        """See `Engine`."""
+        """See `Engine`; the client is closed at the end. Raises InputError if the scheduler's connection is lost."""
         if self.client.status != "running":  # a previous run closed it
             self.client = connect(self.scheduler)
-        yield from run(self.client, spec, chunks)
+        client, name, in_flight = self.client, f"skysim-{uuid4().hex}", dict[Future, Submission]()
+        try:
+            client.register_plugin(SpecPlugin(name, spec, code_version()), name)
+            yield from collect_rows(client, name, spec, chunks, in_flight)
+        except (CancelledError, OSError):
+            message = "connection lost, finished trials are stored; allowed: skysim study resume"
+            raise InputError(f"scheduler: {message}") from None
+        finally:
+            # The connection itself may have failed, and a lost scheduler needs no cleanup.
+            with suppress(CancelledError, OSError, RuntimeError, ValueError):
+                if client.status == "running":
+                    client.cancel(list(in_flight))
+                    client.unregister_worker_plugin(name)
+            client.close()
 
     def close(self) -> None:
-        """See `Engine`."""
         self.client.close()

@@ -23,10 +23,10 @@ from skysim.experiments.study.execution.trials import FAILED, Row, Segment, run_
 from skysim.experiments.study.plan import TrialSpec
 
 AHEAD = 1  # chunks queued for each worker in addition to the one it runs
-
 MAX_ATTEMPTS = 3  # attempts of a trial whose worker dies
 
 Chunk = tuple[Segment, ...]
+TimedRows = tuple[list[Row], float]  # rows of a chunk, and the seconds it took
 
 
 class Chunks(Protocol):
@@ -54,14 +54,13 @@ class Serial:
     name, workers = "serial", 1
 
     def run(self, spec: TrialSpec, chunks: Chunks) -> Iterator[list[Row]]:
-        """See `Engine`."""
         while chunk := chunks.next():
             rows, seconds = run_timed(spec, chunk)
             chunks.report_time(chunk, seconds)
             yield rows
 
     def close(self) -> None:
-        """See `Engine`."""
+        """Nothing is kept between runs."""
 
 
 class Pool:
@@ -80,12 +79,11 @@ class Pool:
         self._spec: TrialSpec | None = None
 
     def run(self, spec: TrialSpec, chunks: Chunks) -> Iterator[list[Row]]:
-        """See `Engine`."""
         retries: deque[Chunk] = deque()
         deaths: Counter[int] = Counter()  # by trial
         done = False
         while not done:
-            in_flight: dict[Future[tuple[list[Row], float]], Chunk] = {}
+            in_flight: dict[Future[TimedRows], Chunk] = {}
             try:
                 yield from self._run_until_death(self._pool_for(spec), chunks, retries, in_flight)
                 done = True
@@ -103,7 +101,6 @@ class Pool:
                     self._kill()
 
     def close(self) -> None:
-        """See `Engine`."""
         if self._pool is not None:
             self._pool.shutdown()
         self._pool = None
@@ -129,7 +126,7 @@ class Pool:
         pool: ProcessPoolExecutor,
         chunks: Chunks,
         retries: deque[Chunk],
-        in_flight: dict[Future[tuple[list[Row], float]], Chunk],
+        in_flight: dict[Future[TimedRows], Chunk],
     ) -> Iterator[list[Row]]:
         """Yield rows as chunks complete; retries first, each alone in flight. `in_flight` maps futures to their chunks.
 
@@ -144,7 +141,6 @@ class Pool:
                 except BrokenProcessPool:  # a worker died while the caller stored rows
                     retries.appendleft(chunk)
                     raise
-                capacity = capacity if not retries else 1
             if not in_flight:
                 return
             for future in wait(in_flight, return_when=FIRST_COMPLETED).done:
@@ -153,7 +149,7 @@ class Pool:
                 yield rows
 
 
-def run_timed(spec: TrialSpec, chunk: Chunk) -> tuple[list[Row], float]:
+def run_timed(spec: TrialSpec, chunk: Chunk) -> TimedRows:
     """Rows of a chunk and the seconds it took on the worker."""
     start_s = time.perf_counter()
     return run_segments(spec, chunk), time.perf_counter() - start_s
@@ -213,6 +209,6 @@ def exit_with_parent() -> None:
         os._exit(1)
 
 
-def run_chunk(chunk: Chunk) -> tuple[list[Row], float]:
+def run_chunk(chunk: Chunk) -> TimedRows:
     """`run_timed` with the trial specification with which this worker was started."""
     return run_timed(SPEC[0], chunk)

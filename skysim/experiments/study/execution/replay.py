@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from itertools import islice
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -14,15 +14,9 @@ from estimator.trackers.pipeline import Report
 from skysim.core import files as file_io
 from skysim.core.errors import InputError
 from skysim.core.types import Frame, Truth
+from skysim.experiments.study.execution import trials
 from skysim.experiments.study.execution.setups import Setup, prepared_setup
-from skysim.experiments.study.execution.trials import (
-    Row,
-    Segment,
-    render_trial_frame,
-    reseeded,
-    run_trial,
-    simulate_centroids,
-)
+from skysim.experiments.study.execution.trials import Row, Segment
 from skysim.experiments.study.plan import CentroidTrial, FlightTrial, FrameTrial, Plan
 from skysim.experiments.study.store import Store, to_sql
 from skysim.results.files import frames
@@ -58,7 +52,7 @@ def replay(plan: Plan, store: Store, trial: int, folder: Path) -> Replay:
     before it are written too.
     """
     segment = segment_of(plan, store, trial)
-    row = run_trial(plan.spec, segment, trial, segment.replicates[0])
+    row = trials.run_trial(plan.spec, segment, trial, segment.replicates[0])
     stored = store.trial(trial) if store.done(trial + 1)[trial] else {}
     now = {name: to_sql(getattr(row.outcome, name)) for name in row.outcome.__slots__}
     changed = [name for name, value in now.items() if stored and stored[name] != value]
@@ -71,18 +65,14 @@ def replay(plan: Plan, store: Store, trial: int, folder: Path) -> Replay:
                 frames.write_frame(folder, frame, truth, setup.testbed.scene)
                 files.append(folder / f"frame_{frame.index:04d}.fits")
                 pictures.append(folder / f"frame_{frame.index:04d}.annotated.png")
-                file_io.write_image(pictures[-1], annotated_image(frame, truth, report))
+                match, xy_px = report.attitude.match, report.centroids.xy_px
+                matched_px = xy_px[match.observed] if match else np.empty((0, 2))
+                picture = annotate(frame.image_dn, xy_px, matched_px, truth_px=truth.sources.xy_px)
+                file_io.write_image(pictures[-1], picture)
         except Exception:
             if row.error is None:
                 raise
     return Replay(row, changed, files, pictures)
-
-
-def annotated_image(frame: Frame, truth: Truth, report: Report) -> Any:
-    """The annotated frame: truth, detections and identified detections."""
-    match, xy_px = report.attitude.match, report.centroids.xy_px
-    matched_px = xy_px[match.observed] if match else np.empty((0, 2))
-    return annotate(frame.image_dn, xy_px, matched_px, truth_px=truth.sources.xy_px)
 
 
 def replayed_frames(setup: Setup, seed: int) -> Iterator[tuple[Frame, Truth, Report]]:
@@ -92,20 +82,16 @@ def replayed_frames(setup: Setup, seed: int) -> Iterator[tuple[Frame, Truth, Rep
     """
     trial = setup.trial
     if isinstance(trial, CentroidTrial):
-        _, _, centroids = simulate_centroids(setup, seed)
+        _, _, centroids = trials.simulate_centroids(setup, seed)
         frame_trial = FrameTrial(kind="frames", **{name: getattr(trial, name) for name in ("tilt_deg", "dec_deg")})
-        frame, truth, _ = render_trial_frame(setup._replace(trial=frame_trial), seed)
-        yield (
-            frame,
-            truth,
-            solve_or_failed(lambda: Report(setup.estimator.solve_centroids(centroids), centroids)),
-        )
+        frame, truth, _ = trials.render_trial_frame(setup._replace(trial=frame_trial), seed)
+        yield frame, truth, solve_or_failed(lambda: Report(setup.estimator.solve_centroids(centroids), centroids))
     elif isinstance(trial, FlightTrial):
-        testbed = run.simulate_motion(reseeded(setup.testbed, seed))
+        testbed = run.simulate_motion(trials.reseeded(setup.testbed, seed))
         for result in run.run(testbed, setup.estimator):
             yield result.frame, result.truth, result.report
     else:
-        frame, truth, streak_px = render_trial_frame(setup, seed)
+        frame, truth, streak_px = trials.render_trial_frame(setup, seed)
         yield frame, truth, solve_or_failed(lambda: factory.solve_frame(setup.estimator, frame, streak_px))
 
 

@@ -20,7 +20,6 @@ from skysim.experiments.study.plan import Plan, resolve_point
 from skysim.experiments.study.store import Store
 
 CHUNK_S = 0.25  # run time of a chunk: long relative to its overhead, short in case a worker dies
-
 MAX_CHUNK = 5000  # maximum number of trials in a chunk
 
 
@@ -97,22 +96,18 @@ def prepare_store(plan: Plan, store: Store, resume: bool, overrides: Mapping[str
 
     Raises InputError if the store holds another study or rows of another code version, or if `resume` does not fit.
     """
-    stored, done = store.meta("digest"), store.counts()["done"]
+    stored, done, fault = store.meta("digest"), store.counts()["done"], ""
     if stored and stored != plan.digest:
-        raise InputError(
-            f"{store.path}: contains another study, or an earlier version of this one; allowed: another --out"
-        )
-    if resume and not stored:
-        raise InputError(f"{store.path}: contains no trials to resume; allowed: skysim study run")
-    if done and not resume:
-        raise InputError(
-            f"{store.path}: already contains {done} trials; allowed: skysim study resume, or another --out"
-        )
-    if done and store.meta("code") != code_version():
-        raise InputError(
-            f"{store.path}: its {done} trials are of skysim {store.meta('code')}; allowed: {code_version()}, the"
-            " version here, or another --out"
-        )
+        fault = "contains another study, or an earlier version of this one; allowed: another --out"
+    elif resume and not stored:
+        fault = "contains no trials to resume; allowed: skysim study run"
+    elif done and not resume:
+        fault = f"already contains {done} trials; allowed: skysim study resume, or another --out"
+    elif done and store.meta("code") != code_version():
+        allowed = f"{code_version()}, the version here, or another --out"
+        fault = f"its {done} trials are of skysim {store.meta('code')}; allowed: {allowed}"
+    if fault:
+        raise InputError(f"{store.path}: {fault}")
     if done:
         check_scene(plan, store)
     else:

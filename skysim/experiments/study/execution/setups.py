@@ -14,14 +14,7 @@ import numpy as np
 
 from skysim.core.paths import DATA, ROOT
 from skysim.experiments.study.factors import Settings
-from skysim.experiments.study.plan import (
-    CentroidTrial,
-    FlightTrial,
-    FrameTrial,
-    TrialSpec,
-    digest,
-    resolve_point,
-)
+from skysim.experiments.study.plan import Trial, TrialSpec, digest, resolve_point
 from skysim.scene.loader import FILE_KEYS
 from skysim.scene.scene import Scene
 from skysim.simulation.testbed import Testbed, build_testbed, build_tracker
@@ -36,7 +29,7 @@ class Setup(NamedTuple):
 
     testbed: Testbed
     estimator: factory.Estimator
-    trial: CentroidTrial | FrameTrial | FlightTrial
+    trial: Trial
     scene_hash: str
 
 
@@ -69,20 +62,12 @@ def build_setup(spec: TrialSpec, settings: Settings) -> Setup:
     for setup in CACHE.setups.values():
         if setup.scene_hash == hash_ and setup.testbed.programs == spec.programs:
             return setup._replace(trial=trial)
-    testbed = reuse_hardware(scene) or build_testbed(scene, spec.programs)
-    testbed = replace(testbed, programs=spec.programs)
+    # A test bed whose scene differs only in section `tracker` has the same hardware.
+    cached = (setup.testbed for setup in CACHE.setups.values())
+    same = (one for one in cached if one.scene.model_copy(update={"tracker": scene.tracker}) == scene)
+    testbed = next(same, None) or build_testbed(scene, spec.programs)
+    testbed = replace(testbed, scene=scene, programs=spec.programs)
     return Setup(testbed, build_tracker(testbed), trial, hash_)
-
-
-def reuse_hardware(scene: Scene) -> Testbed | None:
-    """The test bed of a cached setup whose scene differs only in section `tracker`, so that the hardware is the same.
-
-    Returns None if there is none.
-    """
-    for setup in CACHE.setups.values():
-        if setup.testbed.scene.model_copy(update={"tracker": scene.tracker}) == scene:
-            return replace(setup.testbed, scene=scene)
-    return None
 
 
 def scene_hash(scene: Scene) -> str:
@@ -109,10 +94,8 @@ def code_version() -> str:
     """Hash of the source code of skysim and estimator and of their data; stored with each trial."""
     code = sha256()
     sources = [path for package in ("skysim", "estimator") for path in (ROOT / package).rglob("*.py")]
-    data = [
-        path for folder in ("qe", "led", "bands", "cameras") for path in (DATA / folder).rglob("*") if path.is_file()
-    ]
-    for path in sorted(sources + data):
+    data = [path for folder in ("qe", "led", "bands", "cameras") for path in (DATA / folder).rglob("*")]
+    for path in sorted(sources + [path for path in data if path.is_file()]):
         code.update(path.relative_to(ROOT).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
     return code.hexdigest()[:16]
 

@@ -22,7 +22,7 @@ from skysim.camera.render import Poses, image_tracks, in_view
 from skysim.core import quaternion
 from skysim.core.paths import ROOT
 from skysim.core.random_streams import random_stream
-from skysim.core.types import Floats, Frame, Sources, Trajectory, Truth
+from skysim.core.types import Floats, Frame, Trajectory, Truth
 from skysim.core.units import ARCSEC_RAD
 from skysim.dynamics import multibody
 from skysim.experiments.study.execution.setups import Setup, code_version, prepared_setup, seed_of
@@ -181,11 +181,8 @@ def flight_outcomes(testbed: Testbed, estimator: factory.Estimator) -> Iterator[
         window = exposure_window(testbed.scene, index, testbed.exposures_s[index])
         t_s = window.middle_s(testbed.scene.camera.height_px)
         lab_from_body = testbed.trajectory.attitude_at(t_s)
-        truth, stars = (
-            cam_from_lab_wxyz(testbed, lab_from_body),
-            len(visible_sources(testbed, lab_from_body)[0]),
-        )
-        yield t_s, score(report.attitude, truth, stars, len(report.centroids))
+        stars = len(visible_sources(testbed, lab_from_body)[0])
+        yield t_s, score(report.attitude, cam_from_lab_wxyz(testbed, lab_from_body), stars, len(report.centroids))
 
 
 TRIALS: dict[str, Callable[[Setup, int], Outcome]] = {
@@ -223,14 +220,8 @@ def zyz(first_rad: float, second_rad: float, third_rad: float) -> Floats:
     """(4,) wxyz of Rz(first) Ry(second) Rz(third), which rotates z to azimuth `first` and zenith angle `second`."""
     half, sum_, difference = second_rad / 2, (first_rad + third_rad) / 2, (first_rad - third_rad) / 2
     sine, cosine = math.sin(half), math.cos(half)
-    return np.array(
-        [
-            cosine * math.cos(sum_),
-            -sine * math.sin(difference),
-            sine * math.cos(difference),
-            cosine * math.sin(sum_),
-        ]
-    )
+    x, y = -sine * math.sin(difference), sine * math.cos(difference)
+    return np.array([cosine * math.cos(sum_), x, y, cosine * math.sin(sum_)])
 
 
 def cam_from_lab_wxyz(testbed: Testbed, lab_from_body: Rotation) -> Floats:
@@ -254,13 +245,9 @@ def visible_sources(testbed: Testbed, lab_from_body: Rotation) -> tuple[Floats, 
     visible = np.flatnonzero((x > -0.5) & (y > -0.5) & (x < width_px - 0.5) & (y < height_px - 0.5))
     if testbed.obstacles is not None:
         visible = visible[~multibody.occluded(testbed.obstacles, lab_from_body, near.take(visible))]
-    electrons = tracks.rate_e_s[0] * duty_cycle(near) * testbed.scene.exposure.time_s
+    duty_cycle = np.minimum(near.on_s / near.period_s, 1.0)
+    electrons = tracks.rate_e_s[0] * duty_cycle * testbed.scene.exposure.time_s
     return xy_px[visible], electrons[visible]
-
-
-def duty_cycle(sources: Sources) -> Floats:
-    """(N,) duty cycle of each source, at most 1."""
-    return np.minimum(sources.on_s / sources.period_s, 1.0)
 
 
 def simulate_detections(
@@ -294,15 +281,20 @@ def render_trial_frame(setup: Setup, seed: int) -> tuple[Frame, Truth, tuple[flo
     middle, azimuth = random_attitude(setup, attitude_rng), attitude_rng.uniform(0, 2 * math.pi)
     rate_cam = math.radians(trial.rate_deg_s) * np.array([math.cos(azimuth), math.sin(azimuth), 0.0])
     rate_body = testbed.mount.cam_from_body.inv().apply(rate_cam)
-    window, rows = exposure_window(testbed.scene, 0), testbed.scene.camera.height_px
-    # A trajectory at constant rate around the exposure, with the drawn attitude at mid-exposure.
-    t_s = np.linspace(window.open_s - MARGIN_S, window.close_s(rows) + MARGIN_S, KNOTS)
-    rotation = Rotation.from_rotvec(np.outer(t_s - window.middle_s(rows), rate_body))
-    path = Trajectory(t_s, middle * rotation, np.tile(rate_body, (KNOTS, 1)))
-    frame, truth = exposure.render_frame(replace(testbed, trajectory=path), 0)
-    streak_px = window.exposure_s * testbed.scene.camera.focal_px
+    frame, truth = exposure.render_frame(
+        replace(testbed, trajectory=constant_rate(testbed.scene, middle, rate_body)), 0
+    )
+    streak_px = exposure_window(testbed.scene, 0).exposure_s * testbed.scene.camera.focal_px
     # For a star on the boresight: d(x / z)/dt = -w_y, d(y / z)/dt = w_x.
     return frame, truth, (-rate_cam[1] * streak_px, rate_cam[0] * streak_px) if trial.gyro else None
+
+
+def constant_rate(scene: Scene, middle: Rotation, rate_body: Floats) -> Trajectory:
+    """A trajectory around the first frame's exposure: lab_from_body `middle` at mid-exposure, and a constant rate."""
+    window, rows = exposure_window(scene, 0), scene.camera.height_px
+    t_s = np.linspace(window.open_s - MARGIN_S, window.close_s(rows) + MARGIN_S, KNOTS)
+    rotation = Rotation.from_rotvec(np.outer(t_s - window.middle_s(rows), rate_body))
+    return Trajectory(t_s, middle * rotation, np.tile(rate_body, (KNOTS, 1)))
 
 
 def reseeded(testbed: Testbed, seed: int) -> Testbed:
@@ -320,11 +312,8 @@ def score(solution: Attitude, cam_from_lab_wxyz: Floats, stars: int, detected: i
         return Outcome(solution.status, 1, stars=stars, detected=detected, matched=matched)
     estimate = quaternion.from_rotation(solution.cam_from_ref)
     error = quaternion.to_rotvec(quaternion.multiply(estimate, quaternion.inverse(cam_from_lab_wxyz)))
-    nees = (
-        math.nan
-        if solution.covariance_rad2 is None
-        else float(error @ np.linalg.solve(solution.covariance_rad2, error))
-    )
+    covariance = solution.covariance_rad2
+    nees = math.nan if covariance is None else float(error @ np.linalg.solve(covariance, error))
     wrong = int(math.hypot(*error) > metrics.WRONG_RAD)
     x, y, roll = (error / ARCSEC_RAD).tolist()
     return Outcome("solved", 1, 1, wrong, x, y, roll, nees, stars, detected, matched)
@@ -335,7 +324,10 @@ def summarize_flight(testbed: Testbed, outcomes: list[Outcome], settle_s: float)
     solved = [outcome for outcome in outcomes if outcome.solved]
     x, y, roll = (_rms([getattr(one, name) for one in solved]) for name in ("x_arcsec", "y_arcsec", "roll_arcsec"))
     good = [bool(one.solved and not one.wrong) for one in outcomes]
-    error = filter_error_arcsec(testbed, settle_s)
+    # (K,) angular error of the filter at the ticks from settle_s on; empty without a filter.
+    log, error = testbed.log, np.empty(0)
+    if log.lab_from_filter is not None:
+        error = (log.lab_from_filter * log.lab_from_body.inv()).magnitude()[log.t_s >= settle_s] / ARCSEC_RAD
     quarter = len(error) // 4
     limit = metrics.WRONG_RAD / ARCSEC_RAD
     return Outcome(
@@ -355,15 +347,6 @@ def summarize_flight(testbed: Testbed, outcomes: list[Outcome], settle_s: float)
         float(error.max(initial=-np.inf)) if len(error) else math.nan,
         _rms(error[-quarter:]) - _rms(error[:quarter]) if quarter else math.nan,
     )
-
-
-def filter_error_arcsec(testbed: Testbed, settle_s: float) -> Floats:
-    """(K,) angular error of the filter at the ticks from `settle_s` on; empty without a filter."""
-    log = testbed.log
-    if log.lab_from_filter is None:
-        return np.empty(0)
-    error = (log.lab_from_filter * log.lab_from_body.inv()).magnitude() / ARCSEC_RAD
-    return np.asarray(error[log.t_s >= settle_s])
 
 
 def _rms(values: list[float] | NDArray[Any]) -> float:

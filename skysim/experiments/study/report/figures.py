@@ -13,15 +13,7 @@ from skysim.core.types import Floats
 from skysim.experiments.study.analysis.table import PointRow
 from skysim.experiments.study.plan import Curve, Figure, Heat, Study
 from skysim.experiments.study.report import layout
-from skysim.experiments.study.report.layout import (
-    MAX_POINTS_WITH_BARS,
-    Axis,
-    Grid,
-    Panel,
-    Series,
-    is_sampled,
-    label,
-)
+from skysim.experiments.study.report.layout import MAX_POINTS_WITH_BARS, Axis, Grid, Panel, Series, is_sampled, label
 from skysim.results.plots import INK, MARKS, png
 
 if TYPE_CHECKING:
@@ -130,15 +122,8 @@ def draw_bars(axes: Any, one: Series | Panel, ink: Any, where: Any, x: Floats | 
     low, high = drawn_interval(axes, one)
     axes.vlines(places, low, high, color=ink, alpha=0.6, linewidth=1, transform=where)
     for end in (one.low, one.high):
-        axes.plot(
-            places,
-            np.where(np.isfinite(end), end, np.nan),
-            "_",
-            color=ink,
-            alpha=0.6,
-            markersize=6,
-            transform=where,
-        )
+        finite = np.where(np.isfinite(end), end, np.nan)
+        axes.plot(places, finite, "_", color=ink, alpha=0.6, markersize=6, transform=where)
 
 
 def drawn_interval(axes: Any, one: Series | Panel) -> tuple[Floats, Floats]:
@@ -226,6 +211,8 @@ def ticks(low: float, high: float) -> tuple[Any, Any]:
 
 def draw_heat(fig: Any, cells: Grid, figure: Heat) -> None:
     """Draw one cell for each pair of levels, hatched if it has no value."""
+    from matplotlib.patches import Rectangle
+
     axes = fig.subplots()
     image = axes.imshow(
         np.ma.masked_invalid(cells.value),
@@ -235,15 +222,16 @@ def draw_heat(fig: Any, cells: Grid, figure: Heat) -> None:
         origin="lower" if cells.y.numeric else "upper",
     )
     rows, columns = cells.value.shape
+    hatched: Any = {"facecolor": "#eeeeee", "edgecolor": "#b8b8b8", "hatch": "////", "linewidth": 0}
     for row, column in np.argwhere(~np.isfinite(cells.value)):
-        coordinate = (column - 0.5, row - 0.5)
-        axes.add_patch(cell_patch(coordinate, facecolor="#eeeeee", edgecolor="#b8b8b8", hatch="////", linewidth=0))
+        axes.add_patch(Rectangle((column - 0.5, row - 0.5), 1, 1, **hatched))
     if max(rows, columns) <= MAX_CELLS_WITH_TEXT:
         for (row, column), value in np.ndenumerate(cells.value):
             if np.isfinite(value):
                 light = np.dot(image.to_rgba([value])[0][:3], (0.299, 0.587, 0.114)) > 0.5
                 ink = "#111111" if light else "white"
-                axes.text(column, row, format_cell(value), ha="center", va="center", color=ink, fontsize=8)
+                text = f"{value:.0f}" if 1000 <= abs(value) < 1e5 else f"{value:.3g}"
+                axes.text(column, row, text, ha="center", va="center", color=ink, fontsize=8)
     for which, one, most in (("x", cells.x, MAX_TICKS * 2 // 3), ("y", cells.y, MAX_TICKS)):
         step = max(math.ceil(len(one.levels) / most), 1) if len(one.levels) > MAX_CELLS_WITH_TEXT else 1
         names = [wrapped(one.tick_label(level), max(columns, 4) if which == "x" else 4) for level in one.levels[::step]]
@@ -267,18 +255,6 @@ def color_norm(values: Floats, log: bool) -> Any:
     low, high = (float(finite.min()), float(finite.max())) if len(finite) else (0.5, 1.0)
     high = high if high > low else low + (abs(low) or 1.0)
     return LogNorm(low, high, clip=True) if log else Normalize(low, high)
-
-
-def cell_patch(coordinate: tuple[float, float], **style: Any) -> Any:
-    """A rectangle of one heat map cell."""
-    from matplotlib.patches import Rectangle
-
-    return Rectangle(coordinate, 1, 1, **style)
-
-
-def format_cell(value: float) -> str:
-    """A number in a form short enough for a cell."""
-    return f"{value:.0f}" if 1000 <= abs(value) < 1e5 else f"{value:.3g}"
 
 
 def draw_scatter(fig: Any, lines: Sequence[PointRow], figure: Heat, study: Study) -> None:
@@ -317,7 +293,7 @@ def draw_indices(fig: Any, selected: Sequence[Index], response: str) -> None:
         (-0.19, "first order", INK[0], [one.first for one in selected]),
         (0.19, "total", GRAY, [one.total for one in selected]),
     ):
-        value, low, high = (np.array([one[n] for one in parts], dtype=float) for n in range(3))
+        value, low, high, _ = np.array(parts, dtype=float).reshape(-1, 4).T
         axes.barh(rows + shift, np.nan_to_num(value), 0.36, color=ink, label=name)
         axes.hlines(rows + shift, np.clip(low, -9, 9), np.clip(high, -9, 9), color="#333333", linewidth=1)
     bounds = np.array([end for one in selected for end in (*one.first[:3], *one.total[:3], 0.0)])
@@ -359,18 +335,13 @@ def pareto_png(one: Panel, other: Panel, points: Sequence[int], front: Sequence[
         axes, marked = fig.subplots(), np.flatnonzero(np.isin(points, front))
         axes.plot(one.value, other.value, "o", color=GRAY, label="candidate")
         marked = marked[np.argsort(one.value[marked], kind="stable")]
-        low, high = layout.limits([other.value], [other.low[marked], other.high[marked]], False, False)
-        axes.set_ylim(low, high)
+        axes.set_ylim(*layout.limits([other.value], [other.low[marked], other.high[marked]], False, False))
         low_m, high_m = drawn_interval(axes, Panel("", other.value, other.low, other.high, []))
         axes.vlines(one.value[marked], low_m[marked], high_m[marked], color=ORANGE, alpha=0.5, linewidth=1)
         axes.plot(one.value[marked], other.value[marked], "D--", color=ORANGE, label="front")
         for n in marked.tolist() if len(marked) <= MAX_LABELED_POINTS else ():
-            coordinate = (one.value[n], other.value[n])
-            style = {
-                "fontsize": 8,
-                "color": ORANGE,
-                "path_effects": [withStroke(linewidth=2.5, foreground="white")],
-            }
+            coordinate, halo = (one.value[n], other.value[n]), [withStroke(linewidth=2.5, foreground="white")]
+            style = {"fontsize": 8, "color": ORANGE, "path_effects": halo}
             axes.annotate(str(points[n]), coordinate, xytext=(5, 5), textcoords="offset points", **style)
         axes.set_xlabel(one.label)
         axes.set_ylabel(other.label)

@@ -126,16 +126,14 @@ def axis(study: Study, lines: Sequence[PointRow], name: str) -> Axis:
     numbers, own_unit = as_numbers(levels)
     if numbers is not None:
         levels = [levels[n] for n in np.argsort(numbers)]
-        log = isinstance(factor, Range) and factor.scale == "log"
-        log |= isinstance(factor, Distribution) and factor.distribution == "lognormal"
         # A range or distribution declares its own scale; explicit values are judged by their spacing.
-        declares_scale = isinstance(factor, Range | Distribution)
-        return Axis(
-            label(name, own_unit or unit),
-            levels,
-            True,
-            log or (not declares_scale and suits_log_scale(np.sort(numbers))),
-        )
+        if isinstance(factor, Range):
+            log = factor.scale == "log"
+        elif isinstance(factor, Distribution):
+            log = factor.distribution == "lognormal"
+        else:
+            log = suits_log_scale(np.sort(numbers))
+        return Axis(label(name, own_unit or unit), levels, True, log)
     order = [one for one, _ in factor.options()]
     levels.sort(key=lambda one: next((n for n, other in enumerate(order) if same(one, other)), len(order)))
     has_text = any(isinstance(one, str | bool) for one in levels)
@@ -250,13 +248,12 @@ def series(lines: Sequence[PointRow], figure: Curve, study: Study) -> list[Serie
     groups = {"": chosen}
     if figure.by is not None:
         groups = group_points(chosen, axis(study, lines, figure.by), figure.by, study)
-    return [one_series(name, group, figure, x_axis) for name, group in groups.items() if group]
-
-
-def one_series(name: str, lines: Sequence[PointRow], figure: Curve, x_axis: Axis) -> Series:
-    """Some table lines as one series, ascending in x."""
-    rows = [(x_axis.coordinate(line.levels[figure.x]), *line.responses[figure.y][:3]) for line in lines]
-    return Series(name, *np.array(sorted(rows, key=lambda row: row[0]), dtype=float).T)
+    found = []
+    for name, group in groups.items():
+        rows = [(x_axis.coordinate(line.levels[figure.x]), *line.responses[figure.y][:3]) for line in group]
+        if rows:
+            found.append(Series(name, *np.array(sorted(rows, key=lambda row: row[0]), dtype=float).T))
+    return found
 
 
 def group_points(lines: Sequence[PointRow], group_axis: Axis, name: str, study: Study) -> dict[str, list[PointRow]]:
@@ -277,12 +274,11 @@ def group_points(lines: Sequence[PointRow], group_axis: Axis, name: str, study: 
 def grid(lines: Sequence[PointRow], figure: Heat, study: Study) -> Grid:
     """The axes and cell values of a heat map."""
     x, y = axis(study, lines, figure.x), axis(study, lines, figure.y)
-    columns = {x.coordinate(one): n for n, one in enumerate(x.levels)}
-    rows = {y.coordinate(one): n for n, one in enumerate(y.levels)}
+    columns, rows = ({one.coordinate(level): n for n, level in enumerate(one.levels)} for one in (x, y))
     value = np.full((len(rows), len(columns)), np.nan)
     for line in shown_points(lines, figure, study):
-        coordinate = rows[y.coordinate(line.levels[figure.y])], columns[x.coordinate(line.levels[figure.x])]
-        value[coordinate] = line.responses[figure.value].value
+        cell = rows[y.coordinate(line.levels[figure.y])], columns[x.coordinate(line.levels[figure.x])]
+        value[cell] = line.responses[figure.value].value
     return Grid(x, y, value)
 
 
@@ -315,9 +311,8 @@ def limits(values: Sequence[Floats], bounds: Sequence[Floats], log: bool, share:
 
 def panels(lines: Sequence[PointRow], search: Search, costs: Mapping[int, float] | None) -> dict[str, Panel]:
     """One panel per objective, constrained response and, if costs are given, cost; by name."""
-    names = [one.response for one in search.objectives] + [one.response for one in search.constraints]
-    names += ["cost"] * (costs is not None)
-    return {name: panel(name, lines, search, costs or {}) for name in dict.fromkeys(names)}
+    names = dict.fromkeys(search.responses + ["cost"] * (costs is not None))
+    return {name: panel(name, lines, search, costs or {}) for name in names}
 
 
 def panel(name: str, lines: Sequence[PointRow], search: Search, costs: Mapping[int, float]) -> Panel:
@@ -327,13 +322,8 @@ def panel(name: str, lines: Sequence[PointRow], search: Search, costs: Mapping[i
         summaries: list[Any] = [(costs.get(line.point, nan), nan, nan) for line in lines]
     else:
         summaries = [line.responses[name][:3] for line in lines]
-    bounds = [
-        bound
-        for one in search.constraints
-        if one.response == name
-        for bound in (one.at_least, one.at_most)
-        if bound is not None
-    ]
+    ends = [(one.at_least, one.at_most) for one in search.constraints if one.response == name]
+    bounds = [bound for pair in ends for bound in pair if bound is not None]
     better = next((f", {one.better} is better" for one in search.objectives if one.response == name), "")
     value, low, high = np.array(summaries, dtype=float).reshape(-1, 3).T
     return Panel(label(name) + better, value, low, high, bounds)
@@ -344,19 +334,21 @@ def panel(name: str, lines: Sequence[PointRow], search: Search, costs: Mapping[i
 
 def caption(figure: Figure, study: Study, lines: Sequence[PointRow]) -> str:
     """Caption of a figure: its axes, the fixed levels, the number of trials per point, and the markers used."""
-    curve = isinstance(figure, Curve)
-    value = figure.y if isinstance(figure, Curve) else figure.value
-    other = (figure.by, "by") if isinstance(figure, Curve) else (figure.y, "and")
-    text = f"{value} against {figure.x}" + (f" {other[1]} {other[0]}" if other[0] else "")
-    levels = {name: one for name, one in fixed_levels(figure, study, lines).items() if varies(lines, name)}
-    text += f", at {', '.join(f'{name} = {format_level(one)}' for name, one in levels.items())}" if levels else ""
+    if isinstance(figure, Curve):
+        value, text = figure.y, f"{figure.y} against {figure.x}" + (f" by {figure.by}" if figure.by else "")
+    else:
+        value, text = figure.value, f"{figure.value} against {figure.x} and {figure.y}"
+    varied = {name for name in study.factors if len(distinct(line.levels[name] for line in lines)) > 1}
+    fixed = fixed_levels(figure, study, lines).items()
+    at = ", ".join(f"{name} = {format_level(one)}" for name, one in fixed if name in varied)
+    text += f", at {at}" if at else ""
     shown = [line.responses[value] for line in shown_points(lines, figure, study)]
     counts = [one.trials for one in shown if one.trials]
     if not counts:
         return f"{text}. No trial of it is in yet."
     text += f". n = {min(counts)}" + (f" to {max(counts)}" if max(counts) > min(counts) else "") + " a point"
     bounds = np.array([(one.low, one.high) for one in shown])
-    if not curve or np.isnan(bounds).all():
+    if isinstance(figure, Heat) or np.isnan(bounds).all():
         return text + "."
     text += f"; intervals of {100 * metrics.CONFIDENCE:g} %."
     x_axis = axis(study, lines, figure.x)
@@ -369,8 +361,3 @@ def caption(figure: Figure, study: Study, lines: Sequence[PointRow]) -> str:
     if figure.log and any(one.value <= 0 < one.high for one in shown):
         text += " Triangles: none was seen, and so much at most."
     return text
-
-
-def varies(lines: Sequence[PointRow], name: str) -> bool:
-    """Whether a factor has more than one level among the points."""
-    return len(distinct(line.levels[name] for line in lines)) > 1

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from skysim.core.files import write_text
 from skysim.experiments.study.analysis.table import PointRow, cells, format_summary
-from skysim.experiments.study.plan import Curve, Study
+from skysim.experiments.study.plan import Curve, Figure, Study
 from skysim.experiments.study.report import figures, layout
 from skysim.experiments.study.store import Store
 from skysim.results.report import embed, render_page
@@ -54,6 +54,7 @@ def write_page(
     Raises InputError if `where` of a figure names an unknown factor or level.
     """
     heads, rows = table_cells(lines, study, costs)
+    drawn = set(map(figure_response, layout.figures(study, lines)))
     text = render_page(
         "study.html",
         study=study,
@@ -62,16 +63,14 @@ def write_page(
         failures=store.failures()[:LISTED],
         runs=store.runs(),
         text=store.meta("study"),
-        pictures=[
-            *search_images(lines, study, front or (), costs),
-            *sobol_images(indices or ()),
-            *figure_images(lines, study),
-        ],
+        pictures=search_images(lines, study, front or (), costs)
+        + sobol_images(indices or ())
+        + figure_images(lines, study),
         indices=[(one, format_summary(one.first), format_summary(one.total)) for one in indices or ()],
         heads=heads,
         rows=rows[:ROWS],
         front=set(front or ()),
-        left=responses_without_figure(study, lines),
+        left=[name for name in study.responses if name not in drawn],
         more=max(len(rows) - ROWS, 0),
     )
     write_text(path, text)
@@ -82,11 +81,14 @@ def write_page(
 
 def responses(study: Study) -> list[str]:
     """The study's responses and those used by its figures, objectives and constraints, without `cost`."""
-    shown = [one.y if isinstance(one, Curve) else one.value for one in study.figures]
-    search = study.optimize
-    searched = [one.response for one in (search.objectives if search else ())]
-    searched += [one.response for one in (search.constraints if search else ())]
-    return [name for name in dict.fromkeys([*study.responses, *shown, *searched]) if name != "cost"]
+    searched = study.optimize.responses if study.optimize else []
+    names = dict.fromkeys([*study.responses, *map(figure_response, study.figures), *searched])
+    return [name for name in names if name != "cost"]
+
+
+def figure_response(figure: Figure) -> str:
+    """The response that a figure shows."""
+    return figure.y if isinstance(figure, Curve) else figure.value
 
 
 def facts(store: Store, study: Study) -> dict[str, Any]:
@@ -134,17 +136,10 @@ def sort_key(key: float) -> float | str:
 
 
 def figure_images(lines: Sequence[PointRow], study: Study) -> list[Picture]:
-    """The study's figures."""
     return [
         Picture(embed(figures.figure_png(lines, one, study)), layout.caption(one, study, lines))
         for one in layout.figures(study, lines)
     ]
-
-
-def responses_without_figure(study: Study, lines: Sequence[PointRow]) -> list[str]:
-    """Responses of the study that no figure shows."""
-    shown = {one.y if isinstance(one, Curve) else one.value for one in layout.figures(study, lines)}
-    return [name for name in study.responses if name not in shown]
 
 
 def sobol_images(indices: Sequence[Index]) -> list[Picture]:
