@@ -27,7 +27,7 @@ from skysim.tracking import factory
 from skysim.tracking.external.adapter import ExternalTracker
 from skysim.tracking.onboard_model import assumed_camera
 
-SPOT_SIGMA_PX = 1.0
+SPOT_SIGMA_PX = 2.0  # wide enough for every shipped scene's smallest area, or nothing after the detector is compiled
 NOISE_DN = 3.0
 MAX_SPOTS = 50
 

@@ -14,6 +14,8 @@ from estimator.core.types import StarMatch
 from estimator.identification.chance import ACCEPT_LOG10_CHANCE, MIN_MATCHES, log10_tail
 from estimator.identification.published.pyramid import pyramid
 
+pytestmark = pytest.mark.long  # an algorithm of the papers: compiles for fifteen seconds
+
 FILE = Path(__file__).parents[3] / "data/catalogs/hipparcos_hp6.5.ecsv"
 CAMERA = Camera.from_fov(659, 493, np.radians(14.87))  # SHEFEX-2's 14.87 x 11.15 degrees
 FIELD_SR = 659 * 493 / CAMERA.focal_px**2

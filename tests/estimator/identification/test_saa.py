@@ -18,6 +18,8 @@ from estimator.core.errors import ImageError
 from estimator.core.types import StarMatch
 from estimator.identification.published.saa import saa
 
+pytestmark = pytest.mark.long  # an algorithm of the papers: compiles for ten seconds
+
 RARE = 1e-4
 
 

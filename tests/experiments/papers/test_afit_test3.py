@@ -94,6 +94,7 @@ def test_another_draw_is_in_its_interval_as_often_as_it_says() -> None:
     assert low <= inside <= high
 
 
+@pytest.mark.long
 def test_an_image_against_the_catalog_of_itself_is_not_turned_at_all(testbed: Testbed) -> None:
     """Reference 1.2, item 14: the thesis has .0335 deg there."""
     found = attitude.algorithm_errors(testbed, 1, 2, np.random.default_rng(72))

@@ -308,7 +308,7 @@ def test_the_page_is_what_the_command_writes(tmp_path: Path) -> None:
 # Every experiment, quickly.
 
 TIMED = {"shefex-fig-3"}  # whose ratio another machine may double
-QUICK = ("afit-table-1", "ptase-table-1", "shefex-fig-3", "shefex-figs-4-5")  # about a second each, one of each paper
+QUICK = ("afit-table-1", "shefex-fig-3", "shefex-figs-4-5")  # about a second each
 
 
 @pytest.mark.parametrize(

@@ -17,6 +17,8 @@ from skysim.scene.loader import load
 from skysim.tracking import onboard_model
 from skysim.tracking.exposure_control import ExposureController
 
+pytestmark = pytest.mark.long  # compiles the paper's algorithms for ten seconds
+
 
 def test_the_bootstrap_of_means_is_that_of_theory_and_leaves_out_what_is_missing() -> None:
     """A mean's 95 % interval is 1.96 sigma / sqrt(N) to either side; a NaN is as if it had not been."""

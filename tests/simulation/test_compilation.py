@@ -1,0 +1,20 @@
+"""The tracker's compilation in a second process reaches every stage of it."""
+
+from __future__ import annotations
+
+import pytest
+
+from skysim.core.paths import SCENES
+from skysim.scene import loader
+from skysim.simulation.compilation import synthetic_frame
+from skysim.simulation.testbed import build_testbed, build_tracker
+from skysim.tracking import factory
+
+SYMMETRIC = {"afit_test1", "afit_test2", "afit_test3"}  # too few or too regular LEDs for an attitude
+
+
+@pytest.mark.parametrize("name", sorted(path.stem for path in SCENES.glob("*.yaml") if path.stem not in SYMMETRIC))
+def test_the_synthetic_frame_is_solved(name: str) -> None:
+    """A frame that is refused earlier would leave the later stages to be compiled in the first process."""
+    testbed = build_testbed(loader.load(name))
+    assert factory.solve_frame(build_tracker(testbed), synthetic_frame(testbed)).attitude.status == "solved"
