@@ -14,8 +14,8 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
@@ -413,4 +413,5 @@ def fit_camera(camera: Camera, cam_from_ref: Rotation, xy_px: Floats, vectors_re
         return np.nan_to_num(lens.pixels(rotation.apply(vectors_ref)) - xy_px, nan=1e3).ravel()
 
     scale = np.array([1e-3, 1e-3, 1e-3, 1e-2, 0.3])[: len(start)]
-    return model(least_squares(residual, start, loss="soft_l1", x_scale=scale, max_nfev=40).x)
+    fit = scipy.optimize.least_squares(residual, start, loss="soft_l1", x_scale=scale, max_nfev=40)
+    return model(fit.x)

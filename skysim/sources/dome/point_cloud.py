@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import least_squares
+import scipy
 
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
@@ -64,7 +64,7 @@ def fit_sphere(points_m: Floats) -> FittedSphere:
         return np.asarray(np.linalg.norm(scaled - parameters[:3], axis=1) - parameters[3])
 
     start = np.append(algebraic[:3], radius)
-    solution = least_squares(residual, start, method="lm", xtol=1e-12, ftol=1e-12, gtol=1e-12)
+    solution = scipy.optimize.least_squares(residual, start, method="lm", xtol=1e-12, ftol=1e-12, gtol=1e-12)
     rms_m = float(scale_m * np.sqrt(np.mean(solution.fun**2)))
     return FittedSphere(mean_m + scale_m * solution.x[:3], float(scale_m * solution.x[3]), rms_m)
 
@@ -82,7 +82,9 @@ def fit_ellipsoid(points_m: Floats) -> FittedEllipsoid:
         norm = np.linalg.norm(w, axis=1)
         return np.asarray((norm - 1) * norm / np.linalg.norm(w / axes, axis=1))
 
-    solution = least_squares(residual_m, np.zeros(6), method="lm", xtol=1e-13, ftol=1e-13, gtol=1e-13, max_nfev=4000)
+    solution = scipy.optimize.least_squares(
+        residual_m, np.zeros(6), method="lm", xtol=1e-13, ftol=1e-13, gtol=1e-13, max_nfev=4000
+    )
     center_m = sphere.center_m + sphere.radius_m * solution.x[:3]
     rms_m = float(np.sqrt(np.mean(solution.fun**2)))
     return FittedEllipsoid(center_m, np.exp(solution.x[3:]) * sphere.radius_m, rms_m)
