@@ -78,6 +78,7 @@ def lights(lens: CameraConfig, count: int, electrons: Floats, radius_px: float =
         one,
         zero,
         one,
+        np.zeros(count, int),
         zero,
     )
 

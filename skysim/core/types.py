@@ -130,7 +130,8 @@ class Sources:
     strength   : (N,) in photo-electrons, that is photons weighted with the chip's quantum efficiency at each
                  wavelength: star: e- s^-1 m^-2 at the aperture; LED: e- s^-1 sr^-1 along its normal. Its decrease
                  with angle and distance is given by `led.Emitter`
-    period_s, start_s, on_s : (N,) pulse train: lit from start_s for on_s in every period_s
+    period_s, start_s, on_s : (N,) pulse train: lit from start_s for on_s in every period_s, by its controller's clock
+    clock      : (N,) number of that clock, from 0; LEDs of one controller share it; 0 for a star
     magnitude  : (N,) V magnitude of a star; NaN for an LED
     """
 
@@ -142,6 +143,7 @@ class Sources:
     period_s: Floats
     start_s: Floats
     on_s: Floats
+    clock: NDArray[np.int64]
     magnitude: Floats
 
     def __len__(self) -> int:

@@ -368,10 +368,22 @@ class RefreshConfig(ConfigModel):
 Drive = Annotated[DirectConfig | PwmConfig | SequentialConfig | RefreshConfig, Field(discriminator="kind")]
 
 
+class ClockConfig(ConfigModel):
+    """Oscillators of the controllers: a crystal of tens of ppm, in a room whose temperature changes (assumed).
+
+    offset_ppm  : standard deviation of their frequency offsets, from the layout's hardware_seed
+    drift_ppm_h : standard deviation of the drift of the frequency per hour, from the scene's seed
+    """
+
+    offset_ppm: Annotated[Number, Field(ge=0, le=10_000)] = 50.0
+    drift_ppm_h: Annotated[Number, Field(ge=0, le=10_000)] = 1.0
+
+
 class LedConfig(ConfigModel):
     """The one LED type of the dome: intensity along its normal, in candela or in watts per steradian.
 
     drive : how its level is made; pwm_period belongs to the kind pwm
+    clock : the oscillators that time the pulses; every run starts with phases of its own
     """
 
     intensity_cd: Annotated[Intensity, Field(gt=0)] | None = None
@@ -382,6 +394,7 @@ class LedConfig(ConfigModel):
     spectrum: Literal["white"] | Annotated[Length, Field(ge=300e-9, le=1100e-9)] = "white"
     scatter: Annotated[Number, Field(ge=0, lt=0.5)] = 0.0
     drive: Drive = PwmConfig()
+    clock: ClockConfig = ClockConfig()
     pwm_period_s: Annotated[Time, Field(gt=0)] = 1e-3
 
     @model_validator(mode="after")

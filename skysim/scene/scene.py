@@ -32,17 +32,26 @@ def check_year(value: datetime.datetime) -> datetime.datetime:
 
 
 class ExposureConfig(ConfigModel):
-    """Exposure time, frame rate, number of frames, and the time of the first."""
+    """Exposure time, frame rate, number of frames, the time of the first, and the camera's timing errors.
+
+    trigger_jitter  : an exposure begins up to so much late, uniformly distributed
+    time_tag_offset : the time given to a frame minus the true time of mid-exposure, on average
+    time_tag_jitter : its standard deviation from frame to frame
+    """
 
     time_s: Annotated[Time, Field(ge=1e-6)]
     rate_hz: Annotated[Number, Field(gt=0)]
     frames: Annotated[int, Field(ge=1)]
     first_s: Annotated[Time, Field(ge=0)] = 0.0
+    trigger_jitter_s: Annotated[Time, Field(ge=0)] = 0.0
+    time_tag_offset_s: Annotated[Time, Field(ge=-1, le=1)] = 0.0
+    time_tag_jitter_s: Annotated[Time, Field(ge=0, le=1)] = 0.0
 
     @model_validator(mode="after")
     def check_period(self) -> ExposureConfig:
-        if self.time_s > 1 / self.rate_hz:
-            raise ValueError(f"time {self.time_s} s is longer than the frame period {1 / self.rate_hz} s")
+        if self.time_s + self.trigger_jitter_s > 1 / self.rate_hz:
+            jitter = f" plus trigger_jitter {self.trigger_jitter_s:g} s" if self.trigger_jitter_s else ""
+            raise ValueError(f"time {self.time_s} s{jitter} is longer than the frame period {1 / self.rate_hz} s")
         duration_s = self.first_s + self.frames / self.rate_hz
         if self.frames > MAX_FRAMES or duration_s > MAX_DURATION_S:
             raise ValueError(
@@ -95,7 +104,7 @@ class Scene(ConfigModel):
         control, period_s = self.tracker.exposure_control, 1 / self.exposure.rate_hz
         if control is None:
             return self
-        if control.longest_s > period_s:
+        if control.longest_s + self.exposure.trigger_jitter_s > period_s:
             raise ValueError(
                 f"tracker.exposure_control.longest: {control.longest_s:g} s is longer than the frame period"
                 f" {period_s:g} s"

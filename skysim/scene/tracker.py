@@ -128,6 +128,7 @@ class FilterConfig(ConfigModel):
     floor_arcsec : systematic error of a star tracker's solution, the same in every frame, added to its covariance
     gate_sigma   : a solution with a larger innovation is rejected
     latency      : from the end of an exposure to its solution
+    time_tag_sigma : standard deviation of a frame's time, which adds sigma^2 w w^T to the covariance at the rate w
     """
 
     arw_deg_sqrt_h: NotNegative = 0.07
@@ -138,3 +139,4 @@ class FilterConfig(ConfigModel):
     floor_arcsec: NotNegative = 1.0
     gate_sigma: Positive = 5.0
     latency_s: Annotated[Time, Field(ge=0)] = 0.0
+    time_tag_sigma_s: Annotated[Time, Field(ge=0)] = 0.0

@@ -26,7 +26,7 @@ from skysim.dynamics.jitter import Vibration
 from skysim.scene.scene import Scene
 from skysim.simulation.exposure import render_frame
 from skysim.simulation.telemetry import TelemetryRecorder
-from skysim.simulation.testbed import exposure_window
+from skysim.simulation.testbed import exposure_window, time_tag_error_s
 from skysim.tracking import factory
 from skysim.tracking.exposure_control import ExposureController
 from skysim.tracking.navigation import Navigation
@@ -142,8 +142,9 @@ class OnboardCamera:
         while self.index < loop.testbed.frames:
             window = exposure_window(scene, self.index, self.exposure_control.exposure_s)
             close_s = window.close_s(scene.camera.height_px)
-            # Not due yet: the exposure is not over, or the solution would still be in processing.
-            if close_s + self.latency_s > loop.simulation.now_s:
+            tagged_s = window.middle_s(scene.camera.height_px) + time_tag_error_s(scene, self.index)
+            # Not due yet: the exposure is not over, the solution still in processing, or its time still to come.
+            if max(close_s + self.latency_s, tagged_s) > loop.simulation.now_s:
                 return
             if self.selects and not self.selects(self.index, close_s):
                 self.index += 1

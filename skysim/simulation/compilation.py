@@ -84,7 +84,7 @@ def synthetic_frame(testbed: Testbed) -> Frame:
     """A frame at the initial attitude with equal Gaussian spots at the sources, drawn without the renderer."""
     camera = assumed_camera(testbed.scene)
     when = exposure_window(testbed.scene, 0)
-    lab_from_body = testbed.trajectory.attitude_at(when.open_s)
+    lab_from_body = testbed.trajectory.lab_from_body[0]
     toward = testbed.sources.place[:, :3] - testbed.sources.place[:, 3:] * lab_from_body.apply(
         testbed.mount.camera_body_m
     )

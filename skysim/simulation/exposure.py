@@ -19,7 +19,7 @@ from skysim.camera.render import Poses, in_view, project, render
 from skysim.core.random_streams import DETECTOR, random_stream
 from skysim.core.types import Frame, Truth
 from skysim.dynamics import multibody
-from skysim.simulation.testbed import Testbed, exposure_window
+from skysim.simulation.testbed import Testbed, exposure_window, time_tag_error_s
 
 
 def render_frame(
@@ -43,10 +43,11 @@ def render_frame(
     black_level = display_glow.black_glow(scene.light, testbed.optics, cam_from_lab, camera_m, testbed.band)
     if black_level is not None:
         light_e += black_level * window.exposure_s
+    light = testbed.clocks.pulses_at(testbed.sources, middle_s) if testbed.clocks else testbed.sources
     occludes = partial(multibody.occluded, testbed.obstacles, lab_from_body) if testbed.obstacles else None
     sources = render(
         light_e,
-        testbed.sources,
+        light,
         testbed.optics,
         testbed.trajectory,
         testbed.mount,
@@ -62,7 +63,8 @@ def render_frame(
     clock.lap("detector")
     rate_cam = testbed.mount.cam_from_body.apply(testbed.trajectory.rate_at(middle_s))
     truth = Truth(middle_s, lab_from_body, cam_from_lab, rate_cam, sources, occluded_ids(testbed, lab_from_body))
-    return Frame(index, image, middle_s, window.exposure_s, saturation_dn(camera.detector)), truth
+    tagged_s = middle_s + time_tag_error_s(scene, index)
+    return Frame(index, image, tagged_s, window.exposure_s, saturation_dn(camera.detector)), truth
 
 
 def occluded_ids(testbed: Testbed, lab_from_body: Rotation) -> NDArray[np.int64]:

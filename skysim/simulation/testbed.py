@@ -16,6 +16,7 @@ from skysim.camera.detector.detector import Detector
 from skysim.camera.optics import Optics
 from skysim.camera.psf.otf import EXTENT
 from skysim.camera.render import Window
+from skysim.core.random_streams import CAMERA_TIMING, random_stream
 from skysim.core.types import Mount, Sources, Telemetry, Trajectory
 from skysim.dynamics import guidance, imu, multibody
 from skysim.dynamics.multibody.view import mjcf_export
@@ -27,6 +28,7 @@ from skysim.sources import catalog, dome
 from skysim.sources import stars as star_sources
 from skysim.sources.catalog import require_catalog
 from skysim.sources.dome import display, surface
+from skysim.sources.dome.clocks import Clocks, build_clocks
 from skysim.sources.dome.led import Emitter
 from skysim.sources.photometry import Band
 from skysim.tracking import factory, settings
@@ -34,11 +36,22 @@ from skysim.tracking.external import interface
 
 
 def exposure_window(scene: Scene, index: int, exposure_s: float | None = None) -> Window:
-    """The exposure window of a frame; with the scene's exposure time if none is given."""
+    """The exposure window of a frame, opened late by its jitter; as long as the scene's if no time is given."""
     shutter = scene.camera.shutter
     row_time_s = shutter.row_time_s if isinstance(shutter, RollingShutterConfig) else 0.0
-    begin_s = scene.exposure.first_s + index / scene.exposure.rate_hz
+    late_s = scene.exposure.trigger_jitter_s
+    late_s *= random_stream(scene.seed, CAMERA_TIMING, index, 0).random() if late_s else 0.0
+    begin_s = scene.exposure.first_s + index / scene.exposure.rate_hz + late_s
     return Window(begin_s, scene.exposure.time_s if exposure_s is None else exposure_s, row_time_s)
+
+
+def time_tag_error_s(scene: Scene, index: int) -> float:
+    """The time that the camera gives to a frame minus the true time of mid-exposure."""
+    exposure = scene.exposure
+    if not exposure.time_tag_jitter_s:
+        return exposure.time_tag_offset_s
+    noise = random_stream(scene.seed, CAMERA_TIMING, index, 1).standard_normal()
+    return float(exposure.time_tag_offset_s + exposure.time_tag_jitter_s * noise)
 
 
 MARGIN_S = 2e-3  # simulated beyond the last exposure
@@ -51,6 +64,7 @@ class Testbed:
     canvas    : (H, W) array in which every frame's light is drawn; float64 where noise is off, since such a frame
                 is the expectation itself, and float32 otherwise
     trajectory: the simulated motion, jitter included; telemetry: what the vehicle's computers did in it
+    clocks    : the LED controllers' oscillators in this run; None where all light is steady
     obstacles : occluders of the sources; None where the scene has light.occlusion off
     imu_samples: every sample of the IMU; None without one
     reports   : the star tracker's reports on frames solved during the motion (for the filter), by frame index
@@ -70,6 +84,7 @@ class Testbed:
     band: Band
     canvas: NDArray[Any]
     trajectory: Trajectory
+    clocks: Clocks | None = None
     obstacles: multibody.Obstacles | None = None
     telemetry: Telemetry | None = None
     imu_samples: imu.Increments | None = None
@@ -113,24 +128,26 @@ def build_testbed(scene: Scene, programs: Mapping[str, str] = factory.NO_PROGRAM
     dtype = np.float32 if scene.camera.detector.noise else np.float64
     mount = multibody.camera_mount(vehicle)
     start = lab_from_body_start(scene, mount)
+    sources = light_sources(scene, band)
     return Testbed(
         scene,
         vehicle,
         mount,
-        light_sources(scene, band),
+        sources,
         Emitter.from_config(scene.light.led) if isinstance(scene.light, DomeConfig) else Emitter(),
         Optics.from_camera(scene.camera),
         Detector.from_camera(scene.camera),
         band,
         np.empty((scene.camera.height_px, scene.camera.width_px), dtype),
         Trajectory.at_rest(start, 1.0),
+        build_clocks(scene.light, sources, scene.seed) if isinstance(scene.light, DomeConfig) else None,
         build_obstacles(scene, vehicle),
         programs=programs,
     )
 
 
 def build_obstacles(scene: Scene, vehicle: multibody.VehicleModel) -> multibody.Obstacles | None:
-    """Occluders, or None if `light.occlusion` is off (always for a bench)."""
+    """Occluders, or None if `light.occlusion` is off (a collimated display has none)."""
     if not getattr(scene.light, "occlusion", False):
         return None
     return multibody.build_obstacles(

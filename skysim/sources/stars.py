@@ -86,6 +86,7 @@ def sources(stars: Catalog, time: datetime.datetime, limit_mag: float, lab_from_
         period_s=ones,
         start_s=zeros,
         on_s=ones,
+        clock=np.zeros(count, dtype=np.int64),
         magnitude=selected.v_mag,
     )
 

@@ -53,6 +53,7 @@ class Navigation:
         assumed = zeroed_attitude(lab_from_body, config.home_error_deg)
         self.navigator = imu.Navigator(assumed.as_quat(scalar_first=True), self.earth_compensated_rad_s)
         self.filter = build_filter(scene.filter, assumed) if scene.filter else None
+        self.time_tag_sigma_s = scene.filter.time_tag_sigma_s if scene.filter else 0.0
         self.keeps_samples, self.measured = keeps_samples, list[imu.Increments]()
         self.rate_rad_s = np.zeros(3)
         self.saturated = False
@@ -116,12 +117,15 @@ class Navigation:
     def update_filter(self, t_s: float, solution: Attitude) -> str:
         """Update the filter with a star tracker's attitude at mid-exposure t_s; return the status of the update.
 
-        Without filter, attitude or covariance the tracker's own status is returned.
+        Without filter, attitude or covariance the tracker's own status is returned. The time's standard deviation s
+        adds s^2 w w^T to the covariance, w the filter's rate: a late tag turns the attitude along the motion.
         """
         if self.filter is None or solution.cam_from_ref is None or solution.covariance_rad2 is None:
             return solution.status
         body_from_cam = self.body_from_cam.as_matrix()
         covariance = body_from_cam @ solution.covariance_rad2 @ body_from_cam.T
+        turn_rad = self.time_tag_sigma_s * self.filter.rate_rad_s
+        covariance += np.outer(turn_rad, turn_rad)
         return self.filter.update(t_s, self.body_from_cam * solution.cam_from_ref, covariance).status
 
     def attitude_wxyz(self, feedback: str) -> Floats:

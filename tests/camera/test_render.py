@@ -71,6 +71,7 @@ def light(**fields: object) -> Sources:
         "normal": np.zeros((1, 3)),
         "period_s": np.ones(1),
         "on_s": np.ones(1),
+        "clock": np.zeros(1, int),
         "strength": np.ones(1),
         "magnitude": np.full(1, np.nan),
     }

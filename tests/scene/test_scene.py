@@ -863,7 +863,8 @@ def test_a_missing_section_is_named(tmp_path: Path) -> None:
 
 def test_an_exposure_longer_than_its_period_is_refused(tmp_path: Path) -> None:
     message, place = spoilt(tmp_path, AFIT, 'time: "10 ms"', 'time: "10 s"')
-    assert message == f"exposure: time 10.0 s is longer than the frame period 0.5 s {place}"
+    late = "plus trigger_jitter 0.0001 s"
+    assert message == f"exposure: time 10.0 s {late} is longer than the frame period 0.5 s {place}"
 
 
 def test_a_maneuver_without_a_controller_is_refused(tmp_path: Path) -> None:

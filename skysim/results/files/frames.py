@@ -102,7 +102,7 @@ def write_truth(path: Path, frame: Frame, truth: Truth, scene: Scene) -> None:
         "scene": scene.name,
         "seed": scene.seed,
         "frame": frame.index,
-        "t_mid_s": frame.t_mid_s,
+        "t_mid_s": truth.t_s,
         "mid_utc": mid_time(scene, frame).isoformat(timespec="microseconds"),
         "exposure_s": frame.exposure_s,
         "lab_from_body_xyzw": truth.lab_from_body.as_quat().tolist(),

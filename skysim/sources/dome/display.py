@@ -152,6 +152,7 @@ def panel_sources(config: leds.LcdConfig, panel: Plane, led: leds.LedConfig, ban
         period_s=pulses.period_s,
         start_s=pulses.start_s,
         on_s=pulses.on_s,
+        clock=pulses.clock,
         magnitude=stars.magnitude[blocks.star],
     )
 
@@ -214,5 +215,6 @@ def beam_sources(config: light.CollimatedDisplayConfig, beam: Floats, flux_e_s_m
         period_s=ones,
         start_s=zeros,
         on_s=ones,
+        clock=np.zeros(len(beam), dtype=np.int64),
         magnitude=stars.v_mag,
     )

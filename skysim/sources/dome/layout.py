@@ -86,6 +86,7 @@ def led_sources(placed: PlacedLeds, led: leds.LedConfig, band: Band, rng: np.ran
         period_s=pulses.period_s,
         start_s=pulses.start_s,
         on_s=pulses.on_s,
+        clock=pulses.clock,
         magnitude=placed.magnitude,
     )
 

@@ -109,25 +109,33 @@ class DriveInput(NamedTuple):
 
 
 class PulseTrains(NamedTuple):
-    """Output of a drive per LED, (N,): lit from start_s for on_s in every period_s; relative strength while lit."""
+    """Output of a drive per LED, (N,): lit from start_s for on_s in every period_s; relative strength while lit.
+
+    The times are those of the LED's controller; `clock` is the number of its oscillator (sources/dome/clocks.py).
+    """
 
     period_s: Floats
     start_s: Floats
     on_s: Floats
     strength: Floats
+    clock: NDArray[np.int64]
 
 
 def direct(_led: LedConfig, inputs: DriveInput, _rng: np.random.Generator) -> PulseTrains:
     """Direct current: the LED is always lit, and its level scales its strength."""
     ones = np.ones(len(inputs.level))
-    return PulseTrains(ones, 0 * ones, ones, inputs.level)
+    return PulseTrains(ones, 0 * ones, ones, inputs.level, inputs.board)
 
 
 def pwm(led: LedConfig, inputs: DriveInput, rng: np.random.Generator) -> PulseTrains:
-    """Hardware PWM: V_avg = D V_max, D = t_on / T (thesis, eqs 35 and 36); random phases, T is led.pwm_period_s."""
+    """Hardware PWM: V_avg = D V_max, D = t_on / T (thesis, eqs 35 and 36); T is led.pwm_period_s.
+
+    The channels of a board have random phases and share its oscillator.
+    """
     count = len(inputs.level)
     start_s = rng.uniform(0, led.pwm_period_s, count)
-    return PulseTrains(np.full(count, led.pwm_period_s), start_s, inputs.level * led.pwm_period_s, np.ones(count))
+    on_s = inputs.level * led.pwm_period_s
+    return PulseTrains(np.full(count, led.pwm_period_s), start_s, on_s, np.ones(count), inputs.board)
 
 
 def sequential(led: LedConfig, inputs: DriveInput, rng: np.random.Generator) -> PulseTrains:
@@ -151,7 +159,7 @@ def sequential(led: LedConfig, inputs: DriveInput, rng: np.random.Generator) -> 
     slot[order] = np.arange(count) - np.repeat(np.cumsum(led_count) - led_count, led_count)
     cycle_s = led_count * np.float64(drive.slot_s)
     start_s = rng.uniform(0, cycle_s)[controller] + slot * drive.slot_s
-    return PulseTrains(cycle_s[controller], start_s, inputs.level * drive.slot_s, np.ones(count))
+    return PulseTrains(cycle_s[controller], start_s, inputs.level * drive.slot_s, np.ones(count), controller)
 
 
 def refresh(led: LedConfig, inputs: DriveInput, rng: np.random.Generator) -> PulseTrains:
@@ -170,6 +178,7 @@ def refresh(led: LedConfig, inputs: DriveInput, rng: np.random.Generator) -> Pul
         ones * (rng.random() + inputs.row) * period_s,
         ones * drive.duty * period_s,
         inputs.level,
+        np.zeros(len(ones), dtype=np.int64),
     )
 
 

@@ -1,0 +1,151 @@
+"""The LED controllers' oscillators, and the camera's timing: phases wander, and every run has its own."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from estimator.core.types import Attitude
+from estimator.filter.mekf import Update
+from skysim.core.types import Sources
+from skysim.core.units import ARCSEC_RAD
+from skysim.scene import loader
+from skysim.scene.leds import ClockConfig
+from skysim.simulation import exposure
+from skysim.simulation.closed_loop import ClosedLoop
+from skysim.simulation.testbed import build_testbed, exposure_window, time_tag_error_s
+from skysim.sources.dome.clocks import Clocks
+from skysim.sources.dome.led import lit_moments_s
+
+AT_REST = {"motion.maneuver": "[{kind: hold, duration: 60 s}]", "exposure.time": "10.5 ms"}
+
+
+def pulsed_sources(count: int) -> Sources:
+    """LEDs of three controllers, lit for a fifth to four fifths of a millisecond."""
+    rng, zeros = np.random.default_rng(1), np.zeros(count)
+    return Sources(
+        id=np.arange(count),
+        place=np.zeros((count, 4)),
+        normal=np.zeros((count, 3)),
+        radius_m=zeros,
+        strength=zeros + 1,
+        period_s=zeros + 1e-3,
+        start_s=rng.uniform(0, 1e-3, count),
+        on_s=rng.uniform(2e-4, 8e-4, count),
+        clock=np.arange(count) % 3,
+        magnitude=zeros,
+    )
+
+
+def test_an_led_is_lit_when_its_controller_s_own_time_says_so() -> None:
+    """Against tau(t) = tau_0 + (1 + y) t + d t^2 / 2, in steps of a microsecond."""
+    leds = pulsed_sources(12)
+    clocks = Clocks(np.array([10.0, 20.003, 1234.5]), np.array([5e-3, -2e-3, 0.0]), np.array([1e-6, 0.0, -3e-6]))
+    middle_s = 700.0
+    t_s = middle_s + np.arange(-5e-3, 5e-3, 1e-6)
+    tau = clocks.on_s + (1 + clocks.offset) * t_s[:, None] + clocks.drift_s * t_s[:, None] ** 2 / 2
+    lit = np.mod(tau[:, leds.clock] - leds.start_s, leds.period_s) < leds.on_s
+    trains = clocks.pulses_at(leds, middle_s)
+    for n in range(len(leds)):
+        on_s = lit_moments_s(t_s[0], t_s[-1], trains.period_s[n], trains.start_s[n], trains.on_s[n])[0]
+        # Ten pulses, each counted to a microsecond or so.
+        assert on_s == pytest.approx(lit[:, n].sum() * 1e-6, abs=1.5e-5)
+        states = (
+            np.array(
+                [
+                    lit_moments_s(t, t + 1e-9, *(x[n] for x in (trains.period_s, trains.start_s, trains.on_s)))[0]
+                    for t in t_s[::97]
+                ]
+            )
+            > 5e-10
+        )
+        assert np.mean(states == lit[::97, n]) > 0.98  # the others lie at an edge
+
+
+def test_offsets_are_hardware_and_phases_are_of_the_run() -> None:
+    config = ClockConfig(offset_ppm=40, drift_ppm_h=2)
+    first, again, other = (Clocks.draw(config, 5000, 7, seed) for seed in (1, 1, 2))
+    np.testing.assert_array_equal(first.on_s, again.on_s)
+    np.testing.assert_array_equal(first.offset, other.offset)
+    assert np.abs(first.on_s - other.on_s).min() > 1e-3
+    # Standard deviations of 5000 draws are known to 1 %.
+    assert first.offset.std() == pytest.approx(40e-6, rel=0.04)
+    assert first.drift_s.std() == pytest.approx(2e-6 / 3600, rel=0.04)
+
+
+def test_flicker_differs_from_frame_to_frame_and_from_run_to_run() -> None:
+    """10.5 ms of pulses of 1 ms: light varies by up to half a pulse in ten, in every LED that is dimmed."""
+    frames = []
+    for seed in ("1", "2"):
+        testbed = build_testbed(loader.load("afit_simsat", AT_REST | {"seed": seed}))
+        testbed = dataclasses.replace(testbed, trajectory=still(testbed, 60.0))
+        for index in (0, 40, 80):
+            sources = exposure.render_frame(testbed, index)[1].sources
+            frames.append(dict(zip(sources.id.tolist(), sources.electrons.tolist(), strict=True)))
+    ids = sorted(set.intersection(*map(set, frames)))
+    electrons = np.array([[frame[n] for n in ids] for frame in frames])
+    dimmed = electrons.std(axis=0) > 1e-6 * electrons.mean(axis=0)
+    assert dimmed.sum() >= 5
+    for a in range(len(frames)):
+        for b in range(a):
+            assert np.abs(electrons[a, dimmed] / electrons[b, dimmed] - 1).max() > 1e-3
+
+
+def still(testbed, duration_s):
+    """The test bed's first attitude, held."""
+    return type(testbed.trajectory).at_rest(testbed.trajectory.lab_from_body[0], duration_s)
+
+
+def test_exposures_begin_late_by_their_jitter_and_tags_err_as_the_scene_says() -> None:
+    keys = {"trigger_jitter": "400 us", "time_tag_offset": "1 ms", "time_tag_jitter": "200 us"}
+    scene = loader.load("afit_simsat", {f"exposure.{key}": value for key, value in keys.items()})
+    indices = range(2000)
+    late_s = np.array([exposure_window(scene, k).open_s - scene.exposure.first_s - k / 2 for k in indices])
+    assert 0 <= late_s.min() < 1e-6
+    assert 399e-6 < late_s.max() < 400e-6
+    assert late_s.mean() == pytest.approx(200e-6, abs=4 * 115e-6 / np.sqrt(2000))  # uniform: deviation 1 / sqrt 12
+    error_s = np.array([time_tag_error_s(scene, k) for k in indices])
+    assert error_s.mean() == pytest.approx(1e-3, abs=4 * 200e-6 / np.sqrt(2000))
+    assert error_s.std() == pytest.approx(200e-6, rel=0.07)
+    assert abs(np.corrcoef(late_s, error_s)[0, 1]) < 0.1
+    testbed = build_testbed(scene)
+    frame, truth = exposure.render_frame(dataclasses.replace(testbed, trajectory=still(testbed, 2.0)), 0)
+    assert frame.t_mid_s - truth.t_s == pytest.approx(time_tag_error_s(scene, 0), abs=1e-12)
+    assert truth.t_s == pytest.approx(exposure_window(scene, 0).middle_s(scene.camera.height_px), abs=1e-12)
+
+
+def test_the_filter_allows_for_the_tag_s_error_along_the_motion() -> None:
+    """sigma^2 w w^T: 1 ms at 5 deg/s is 18 arcseconds about the axis of rotation, and nothing about the others."""
+    overrides = {"filter.time_tag_sigma": "1 ms"}
+    covariance = []
+    for changes in (overrides, {}):
+        loop = ClosedLoop(build_testbed(loader.load("simsat_bump", {"filter.time_tag_sigma": "0 s"} | changes)))
+        navigation = loop.navigation
+        assert navigation is not None
+        assert navigation.filter is not None
+        given: list[np.ndarray] = []
+        navigation.filter = Recorder(np.radians([0.0, 0.0, 5.0]), given)
+        navigation.update_filter(0.0, solution(np.eye(3) * 1e-12))
+        covariance.append(given[0])
+    added = covariance[0] - covariance[1]
+    np.testing.assert_allclose(added, np.diag([0, 0, (np.radians(5) * 1e-3) ** 2]), rtol=0, atol=1e-20)
+    assert np.sqrt(added[2, 2]) / ARCSEC_RAD == pytest.approx(18, abs=0.01)
+
+
+class Recorder:
+    """A filter of a known rate that records the covariance it is given."""
+
+    def __init__(self, rate_rad_s: np.ndarray, given: list[np.ndarray]) -> None:
+        self.rate_rad_s, self.given = rate_rad_s, given
+
+    def update(self, _t_s: float, _measured: Rotation, covariance_rad2: np.ndarray) -> Update:
+        self.given.append(covariance_rad2)
+        return Update("used", np.zeros(3), 0.0)
+
+
+def solution(covariance_rad2: np.ndarray) -> Attitude:
+    """An attitude of that covariance in camera axes."""
+    return Attitude("solved", Rotation.identity(), covariance_rad2)
