@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -108,6 +108,11 @@ class Testbed:
         last = exposure_window(self.scene, self.scene.exposure.frames - 1, config.longest_s if config else None)
         return last.close_s(self.scene.camera.height_px) + MARGIN_S
 
+    def in_run(self, seed: int) -> Testbed:
+        """The same hardware in the run of another seed: other noise, jitter, timing and phases of the LEDs' clocks."""
+        scene = self.scene.model_copy(update={"seed": seed})
+        return replace(self, scene=scene, clocks=build_clocks(scene.light, self.sources, seed))
+
     @property
     def log(self) -> Telemetry:
         """The telemetry; only after `simulate_motion`."""
@@ -140,7 +145,7 @@ def build_testbed(scene: Scene, programs: Mapping[str, str] = factory.NO_PROGRAM
         band,
         np.empty((scene.camera.height_px, scene.camera.width_px), dtype),
         Trajectory.at_rest(start, 1.0),
-        build_clocks(scene.light, sources, scene.seed) if isinstance(scene.light, DomeConfig) else None,
+        build_clocks(scene.light, sources, scene.seed),
         build_obstacles(scene, vehicle),
         programs=programs,
     )

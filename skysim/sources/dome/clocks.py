@@ -18,10 +18,12 @@ import numpy as np
 from skysim.core.random_streams import LED_CLOCKS, random_stream
 from skysim.core.types import Floats, Sources
 from skysim.scene.leds import ClockConfig, DirectConfig, FibersConfig, Layout, LcdConfig
-from skysim.scene.light import DomeConfig
+from skysim.scene.light import CollimatedDisplayConfig, DomeConfig, StarsConfig
 
 LONGEST_ON_S = 3600.0  # a controller was switched on up to so long before the run; many times any period
 PPM = 1e-6
+
+Light = DomeConfig | StarsConfig | CollimatedDisplayConfig
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,11 +63,11 @@ class Clocks:
         )
 
 
-def build_clocks(dome: DomeConfig, sources: Sources, seed: int) -> Clocks | None:
-    """The clocks of a dome's controllers in the run of that seed; None if its LEDs are lit steadily."""
-    if isinstance(dome.led.drive, DirectConfig) or not len(sources):
+def build_clocks(light: Light, sources: Sources, seed: int) -> Clocks | None:
+    """The clocks of a dome's controllers in the run of that seed; None where all light is steady."""
+    if not isinstance(light, DomeConfig) or isinstance(light.led.drive, DirectConfig) or not len(sources):
         return None
-    return Clocks.draw(dome.led.clock, int(sources.clock.max()) + 1, hardware_seed(dome.layout), seed)
+    return Clocks.draw(light.led.clock, int(sources.clock.max()) + 1, hardware_seed(light.layout), seed)
 
 
 def hardware_seed(layout: Layout) -> int:

@@ -106,10 +106,8 @@ def test_a_threshold_parts_leds_glare_and_noise() -> None:
 def test_one_led_of_nine_is_lit_at_any_time() -> None:
     """Whatever the phase: the nine share 100 ms, and each has eleven pulses of 1 ms or a twelfth or a part of it."""
     rng, level = np.random.default_rng(2), Rotation.identity()
-    whole, frame = (
-        build_test_stand(with_config(test1.scene_with_exposure(0.1), "exposure", time_s=time_s))
-        for time_s in (36e-3, 100e-3)
-    )
+    exact = with_config(test1.scene_with_exposure(0.1), "light.led.clock", offset_ppm=0.0, drift_ppm_h=0.0)
+    whole, frame = (build_test_stand(with_config(exact, "exposure", time_s=time_s)) for time_s in (36e-3, 100e-3))
     each_e = render_at_attitude(whole, level, rng)[1].sources.electrons  # of four pulses, 4 ms
     for _ in range(3):
         lit_ms = 4 * render_at_attitude(frame, level, rng)[1].sources.electrons / each_e

@@ -41,15 +41,15 @@ def render_at(workbench: Workbench, moved: Testbed, t_s: float, solve: bool) -> 
     The noise seed depends on the time, so that the same time always gives the same frame.
     """
     scene = moved.scene
-    last_s = float(moved.trajectory.t_s[-1]) - MARGIN_S
+    last_s = float(moved.trajectory.t_s[-1]) - MARGIN_S - scene.exposure.trigger_jitter_s
     window = exposure_window(scene, 0)
     duration_s = window.close_s(scene.camera.height_px) - window.open_s
     begin_s = min(max(t_s, 0.0), last_s - duration_s)
     exposure = scene.exposure.model_copy(update={"first_s": begin_s})
     # The start time in units of 0.1 ms is part of the seed.
-    seed = scene.seed + 1 + round(begin_s * 1e4)
+    testbed = moved.in_run(scene.seed + 1 + round(begin_s * 1e4))
     workbench.lab_from_body = moved.trajectory.attitude_at(begin_s)
-    view = workbench.render(replace(moved, scene=scene.model_copy(update={"exposure": exposure, "seed": seed})), solve)
+    view = workbench.render(replace(testbed, scene=testbed.scene.model_copy(update={"exposure": exposure})), solve)
     filter_error, innovation = filter_errors(workbench, moved, begin_s)
     return replace(view, t_s=begin_s, filter_arcsec=filter_error, innovation_arcsec=innovation)
 

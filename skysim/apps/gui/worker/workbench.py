@@ -101,10 +101,9 @@ class Workbench:
     def render_at_rest(self, solve: bool = False) -> FrameView:
         """Render a frame at the current attitude at rest, with independent noise; solve it if `solve`."""
         self.rendered_count += 1
-        scene = self.scene.model_copy(update={"seed": self.scene.seed + self.rendered_count})
-        end_s = exposure_window(scene, 0).close_s(scene.camera.height_px) + MARGIN_S
-        at_rest = Trajectory.at_rest(self.lab_from_body, end_s)
-        return self.render(replace(self.testbed, scene=scene, trajectory=at_rest), solve)
+        testbed = self.testbed.in_run(self.scene.seed + self.rendered_count)
+        end_s = exposure_window(testbed.scene, 0).close_s(testbed.scene.camera.height_px) + MARGIN_S
+        return self.render(replace(testbed, trajectory=Trajectory.at_rest(self.lab_from_body, end_s)), solve)
 
     @property
     def result(self) -> TrackerResult | None:

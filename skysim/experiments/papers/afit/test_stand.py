@@ -19,18 +19,17 @@ from estimator.detection import detect
 from skysim.camera.optics import Optics
 from skysim.core.types import Floats, Frame, Trajectory, Truth
 from skysim.core.units import ARCSEC_RAD
-from skysim.experiments.configs import with_config
 from skysim.scene.light import DomeConfig
 from skysim.scene.loader import load
 from skysim.scene.scene import Scene
 from skysim.simulation import exposure
-from skysim.simulation.testbed import Testbed, build_obstacles, build_testbed, light_sources
+from skysim.simulation.testbed import Testbed, build_obstacles, build_testbed, exposure_window, light_sources
+from skysim.sources.dome.clocks import build_clocks
 from skysim.sources.dome.led import Emitter
 from skysim.tracking import onboard_model
 
 WHITE = 255  # white in the thesis's gray levels
 E_PER_GRAY = 40000 / WHITE  # electrons per gray level: the camera's full well is white
-MAX_START_S = 1.0  # the exposure starts at a random time within this
 
 
 class MeasuredLights(NamedTuple):
@@ -52,10 +51,12 @@ def build_test_stand(scene: Scene) -> Testbed:
     """Testbed of a scene with other lights, lens or electronics; the detector's fixed pattern is computed only once."""
     testbed = base_testbed()
     assert isinstance(scene.light, DomeConfig)
+    sources = light_sources(scene, testbed.band)
     return replace(
         testbed,
         scene=scene,
-        sources=light_sources(scene, testbed.band),
+        sources=sources,
+        clocks=build_clocks(scene.light, sources, scene.seed),
         emitter=Emitter.from_config(scene.light.led),
         optics=Optics.from_camera(scene.camera),
         detector=replace(testbed.detector, config=scene.camera.detector),
@@ -64,11 +65,10 @@ def build_test_stand(scene: Scene) -> Testbed:
 
 
 def render_at_attitude(testbed: Testbed, lab_from_body: Rotation, rng: np.random.Generator) -> tuple[Frame, Truth]:
-    """Render a frame at a fixed attitude, started at a random time of the LEDs' cycle."""
-    scene = with_config(testbed.scene, "exposure", first_s=rng.uniform(0, MAX_START_S))
-    scene = scene.model_copy(update={"seed": int(rng.integers(2**62))})
-    path = Trajectory.at_rest(lab_from_body, MAX_START_S + scene.exposure.time_s + 1)
-    return exposure.render_frame(replace(testbed, scene=scene, trajectory=path), 0)
+    """Render a frame at a fixed attitude, in a run of its own: the phase of the LEDs' cycle is random."""
+    testbed = testbed.in_run(int(rng.integers(2**62)))
+    path = Trajectory.at_rest(lab_from_body, exposure_window(testbed.scene, 0).close_s(testbed.scene.camera.height_px))
+    return exposure.render_frame(replace(testbed, trajectory=path), 0)
 
 
 def gray_levels(frame: Frame, testbed: Testbed) -> NDArray[np.uint8]:

@@ -26,7 +26,6 @@ from skysim.core.units import ARCSEC_RAD
 from skysim.experiments import dome_survey
 from skysim.experiments.papers.compare import Drawing, ExperimentOptions, ExperimentResult, with_cause
 from skysim.experiments.papers.intervals import bootstrap_interval
-from skysim.experiments.study.execution.trials import reseeded
 from skysim.results.metrics import Summary, proportion
 from skysim.results.plots import INK, MARKS
 from skysim.scene import loader
@@ -94,7 +93,7 @@ def build_model(camera_m: Floats | None, seed: int, frames: int) -> OnboardModel
 
 def rays_body(testbed: Testbed, seed: int) -> Floats:
     """(N, 3) unit vectors in body axes to the stars of one frame from the level vehicle, brightest first."""
-    frame, _ = exposure.render_frame(reseeded(testbed, seed), 0)
+    frame, _ = exposure.render_frame(testbed.in_run(seed), 0)
     camera = onboard_model.assumed_camera(testbed.scene)
     lights = dome_survey.detect_lights(settings.assumed_settings(testbed.scene), camera, frame.image_dn)
     return testbed.mount.cam_from_body.inv().apply(camera.rays(lights.xy_px))

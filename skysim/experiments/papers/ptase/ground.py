@@ -22,7 +22,7 @@ from skysim.dynamics.jitter import Vibration
 from skysim.experiments.papers.compare import Cause, Drawing, ExperimentOptions, ExperimentResult, RowResult
 from skysim.experiments.papers.intervals import bootstrap_interval, sample_std, symmetric_interval
 from skysim.experiments.papers.published import experiments, published_values
-from skysim.experiments.study.execution.trials import constant_rate, reseeded
+from skysim.experiments.study.execution.trials import constant_rate
 from skysim.results.metrics import WRONG_RAD, extremum, proportion, rms
 from skysim.results.plots import INK, MARKS
 from skysim.scene import loader
@@ -108,7 +108,7 @@ def photograph_and_solve(overrides: dict[str, str], local: list[datetime.datetim
     error_rad = np.full(len(local), np.nan)
     for n, time in enumerate(local):
         cam_from_icrs = tripod * itrs_from_icrs(time)
-        testbed_at_time = earth_fixed(reseeded(testbed, seed + n), cam_from_icrs)
+        testbed_at_time = earth_fixed(testbed.in_run(seed + n), cam_from_icrs)
         frame, _ = exposure.render_frame(testbed_at_time, 0)
         solution = factory.solve_frame(tracker, frame).attitude
         true_deg[n] = paper_angles_deg(cam_from_icrs)

@@ -164,7 +164,7 @@ def run_flight_trial(setup: Setup, seed: int) -> Outcome:
     """Flight trial: the complete scene with another seed."""
     trial = setup.trial
     assert isinstance(trial, FlightTrial)
-    testbed = run.simulate_motion(reseeded(setup.testbed, seed))
+    testbed = run.simulate_motion(setup.testbed.in_run(seed))
     outcomes = [one for t_s, one in flight_outcomes(testbed, setup.estimator) if t_s >= trial.settle_s]
     return summarize_flight(testbed, outcomes, trial.settle_s)
 
@@ -277,7 +277,7 @@ def render_trial_frame(setup: Setup, seed: int) -> tuple[Frame, Truth, tuple[flo
     """Frame of a frame trial, its truth and, with a gyro, the streak vector (dx, dy) in pixels at the image center."""
     trial, (attitude_rng, noise) = setup.trial, streams(setup, seed)
     assert isinstance(trial, FrameTrial)
-    testbed = reseeded(setup.testbed, int(noise.integers(2**62)))
+    testbed = setup.testbed.in_run(int(noise.integers(2**62)))
     middle, azimuth = random_attitude(setup, attitude_rng), attitude_rng.uniform(0, 2 * math.pi)
     rate_cam = math.radians(trial.rate_deg_s) * np.array([math.cos(azimuth), math.sin(azimuth), 0.0])
     rate_body = testbed.mount.cam_from_body.inv().apply(rate_cam)
@@ -295,11 +295,6 @@ def constant_rate(scene: Scene, middle: Rotation, rate_body: Floats) -> Trajecto
     t_s = np.linspace(window.open_s - MARGIN_S, window.close_s(rows) + MARGIN_S, KNOTS)
     rotation = Rotation.from_rotvec(np.outer(t_s - window.middle_s(rows), rate_body))
     return Trajectory(t_s, middle * rotation, np.tile(rate_body, (KNOTS, 1)))
-
-
-def reseeded(testbed: Testbed, seed: int) -> Testbed:
-    """The same hardware with another seed for noise, jitter and IMU."""
-    return replace(testbed, scene=testbed.scene.model_copy(update={"seed": seed}))
 
 
 def score(solution: Attitude, cam_from_lab_wxyz: Floats, stars: int, detected: int) -> Outcome:
