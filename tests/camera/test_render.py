@@ -536,6 +536,54 @@ def test_an_exposure_of_too_many_attitude_samples_is_refused() -> None:
         draw(light(), Window(0.1, 2.0), fine)
 
 
+# Fast motion between two samples of the attitude
+
+
+def test_a_star_that_crosses_the_field_between_two_poses_is_kept() -> None:
+    """A sweep of 0.2 rad from pose to pose, five fields wide: every star that is on the chip at any time is kept."""
+    rng = np.random.default_rng(8)
+    rays = Rotation.from_rotvec(np.outer(rng.uniform(-1.2, 1.2, 3000), [0, 1, 0])).apply([0.0, 0.0, 1.0])
+    rays = Rotation.from_rotvec(np.outer(rng.uniform(-1.2, 1.2, 3000), [1, 0, 0])).apply(rays)
+    stars = light().take(np.zeros(3000, int))
+    stars.place[:, :3] = rays
+    angles = np.linspace(-0.8, 0.8, 9)
+
+    def poses(angles_rad: Floats) -> rendering.Poses:
+        turns = Rotation.from_rotvec(np.outer(angles_rad, [0, 1, 0]))
+        return rendering.Poses(turns.as_matrix(), np.zeros((len(angles_rad), 3)))
+
+    fine = rendering.project(stars, LENS, poses(np.linspace(-0.8, 0.8, 201)))[0]
+    on_chip = np.flatnonzero(((fine > -0.5) & (fine < [63.5, 47.5])).all(axis=2).any(axis=0))
+    kept = rendering.in_view(stars, LENS, poses(angles))
+    assert len(on_chip) >= 10
+    assert set(on_chip) <= set(kept)
+    assert len(kept) < 600
+
+
+def test_a_patch_holds_the_bend_of_a_path_between_two_samples() -> None:
+    """A circle of 100 px sampled every 45 deg, none of them where it is widest: 7.6 px beyond the samples."""
+    angle = np.radians(22.5 + 45 * np.arange(9))
+    xy = 150 + 100 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    x0, x1, y0, y1 = rendering.patches(xy[:, None], np.array([3.0]), (300, 300))[0]
+    assert max(x0, y0) <= 150 - 100 - 3
+    assert min(x1, y1) > 150 + 100 + 3
+    assert x1 - x0 < 2 * (100 + 3) + 2 * 77 / 4 + 4  # and no more than a quarter of a chord of 77 px wider
+
+
+def test_a_cubic_path_is_followed_exactly_from_its_first_sample_to_its_last() -> None:
+    """A cubic through four samples is the path itself if that is cubic, in the first and last interval too."""
+
+    def path(t: Any) -> Any:
+        return np.stack([30 + 4 * t - 2 * t**2 + t**3, 20 - 3 * t + t**2 - 0.5 * t**3, 100 + t**3], axis=-1)
+
+    t_s = np.linspace(0.0, 4.0, 9)
+    samples = path(t_s)[:, None]
+    tracks = rendering.Tracks(0.0, 0.5, samples[:, :, :2].copy(), samples[:, :, 2].copy(), np.ones((1, 3)))
+    times = np.linspace(0.0, 4.0, 33)
+    found = np.array([rendering._interpolate(tracks, 0, t) for t in times])
+    np.testing.assert_allclose(found, path(times), rtol=0, atol=1e-11)
+
+
 # Lens
 
 

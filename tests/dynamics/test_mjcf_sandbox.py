@@ -118,6 +118,10 @@ def test_a_way_out_that_mujoco_takes_is_refused(tmp_path: Path, way: str) -> Non
         '<asset><hfield name="h" file="/h.png" size="1 1 1 1"/></asset>',
         '<worldbody><flexcomp name="f" type="gmsh" file="../x.msh"/></worldbody>',
         '<compiler texturedir="../out"/>',
+        *(
+            f'<asset><texture type="cube" name="t" file{side}="../out/x.png"/></asset>'
+            for side in ("right", "left", "up", "down", "front", "back")
+        ),
         '<compiler ASSETDIR="/"/>',
         '<asset><model name="c" file="../x.mjz"/></asset>',
         '<include file="round.xml"/>',

@@ -5,12 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from skysim.core.paths import SCENES
-from skysim.core.types import Floats
+from skysim.core.types import Floats, Sources
 from skysim.dynamics import multibody
 from skysim.dynamics.multibody.integrator import Simulation
 from skysim.dynamics.multibody.occlusion import behind_wall
@@ -158,6 +159,39 @@ def test_stars_are_hidden_by_the_body_that_they_are_behind() -> None:
     behind = (root >= 0) & (along > 0)
     np.testing.assert_array_equal(multibody.occluded(testbed.obstacles, turn, testbed.sources), behind)
     assert 100 < behind.sum() < len(behind) / 4
+
+
+def sources_at(place: Any) -> Sources:
+    """Sources at (N, 4) homogeneous places; all else is of no importance here."""
+    place = np.array(place, float)
+    count = np.zeros(len(place), np.int64)
+    number = np.zeros(len(place))
+    return Sources(count, place, np.zeros((len(place), 3)), *[number] * 5, count, number)
+
+
+def test_a_box_hides_what_is_beyond_its_face_and_within_its_edges() -> None:
+    """A box of the lab, whose face of 0.2 m is 1.9 m ahead of the pupil: LEDs by depth, and LEDs and stars by side.
+
+    Stars are farther than any thing, also beyond a meter, but not hidden by what is on the other side of the pupil.
+    """
+    box = '<geom type="box" size="0.1 0.1 0.1" pos="0.1 0 2.2"/>'
+    mjcf = f'<mujoco><worldbody>{box}<body name="bus" mocap="true"/></worldbody></mujoco>'
+    model = mujoco.MjModel.from_xml_string(mjcf)
+    obstacles = multibody.Obstacles(model, mujoco.MjData(model), np.array([0.1, 0.0, 0.2]), None)
+    # Depths beyond the pupil; the box is from 1.9 to 2.1 m.
+    led_z_m = 0.2 + np.array([0.5, 1.9 - 1e-6, 1.9 + 1e-6, 3.0, 1e3, -1.9, -3.0])
+    leds = [[0.1, 0.0, z, 1.0] for z in led_z_m]
+    np.testing.assert_array_equal(
+        multibody.occluded(obstacles, Rotation.identity(), sources_at(leds)),
+        [False, False, True, True, True, False, False],
+    )
+    edge = 0.1 / 1.9  # tangent of the angle to the edge of the face
+    for tangent, hidden in ((0.0, True), (edge - 1e-6, True), (edge + 1e-6, False)):
+        beside = [[0.1 + 3 * tangent, 0.0, 3.2, 1.0]]
+        star = np.array([tangent, 0.0, 1.0]) / np.hypot(tangent, 1)
+        stars = [[*star, 0.0], [*-star, 0.0]]
+        found = multibody.occluded(obstacles, Rotation.identity(), sources_at(beside + stars))
+        np.testing.assert_array_equal(found, [hidden, hidden, False])
 
 
 def test_gimbals_stand_where_they_are_at_the_start() -> None:

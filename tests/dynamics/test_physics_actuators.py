@@ -153,6 +153,32 @@ def test_shaking_by_hand() -> None:
     np.testing.assert_allclose(found, [1e-6 / 6, 1e-6 / 6.5, 0], rtol=0.01, atol=1e-10)
 
 
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_dynamic_imbalance_pulls_about_the_line_of_the_static_one(axis: int) -> None:
+    """Acceleration of the body at the start: J a = w^2 (U_s place x u + U_d u), u from the axle to the heavy side.
+
+    Two masses m at (+-d along the axle, -+r along v = axle x u) are a product of inertia U_d = 2 m d r, and their
+    centrifugal forces a torque 2 d m r w^2 (v x axle) = U_d w^2 u. A sign is not seen in the amplitudes of shaking.
+    """
+    w, heavy_kg_m, product_kg_m2 = 3000 * RPM, 1e-4, 1e-5
+    start = list(3000 * np.eye(3)[axis])
+    wheels = {"static_imbalance": f"{heavy_kg_m} kg m", "start_rpm": start}
+    torques = []
+    for dynamic in (0.0, product_kg_m2):
+        vehicle = multibody.build(
+            vehicle_config(mount="free", wheels=wheels | {"dynamic_imbalance": f"{dynamic} kg m2"})
+        )
+        data = mujoco.MjData(vehicle.model)
+        data.qvel[:] = multibody.Simulation(vehicle, LEVEL, STILL, 0.1).speeds_rad_s
+        mujoco.mj_forward(vehicle.model, data)
+        torques.append(data.qacc[:3] * (INERTIA - WHEEL_KG_M2))
+        wheel = vehicle.model.body(vehicle.model.jnt_bodyid[vehicle.model.joint(vehicle.wheels.names[axis]).id])
+        heavy_m = wheel.ipos - wheel.ipos @ np.eye(3)[axis] * np.eye(3)[axis]
+    line = heavy_m / np.linalg.norm(heavy_m)
+    largest = product_kg_m2 * w**2
+    np.testing.assert_allclose(torques[1] - torques[0], largest * line, rtol=0, atol=0.01 * largest)
+
+
 # --- gyroscopes ---------------------------------------------------------------------------------------------
 
 

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
 from skysim.results import metrics
@@ -71,3 +74,16 @@ def test_normalized_error_is_chi_square_of_three_for_a_true_covariance() -> None
     # Mean 3 and variance 6 of chi-square, to four sigmas of 3,000 draws.
     assert np.mean(nees) == pytest.approx(3, abs=4 * np.sqrt(6 / 3000))
     assert np.var(nees) == pytest.approx(6, abs=4 * np.sqrt(252 / 3000))
+
+
+def test_overconfident_begins_where_one_correct_error_in_1e8_lies() -> None:
+    """The tail of chi-square with three degrees of freedom, erfc(sqrt(x / 2)) + sqrt(2 x / pi) exp(-x / 2), is 1e-8."""
+
+    def tail(x: float) -> float:
+        return math.erfc(math.sqrt(x / 2)) + math.sqrt(2 * x / math.pi) * math.exp(-x / 2)
+
+    limit = float(brentq(lambda x: math.log(tail(x) / 1e-8), 10.0, 100.0))
+    nees = np.array([0.1, 0.99 * limit, 1.01 * limit, 2 * limit, np.nan, 2 * limit])
+    frames = np.array([1, 1, 1, 1, 1, 20])  # no solution in the fifth trial, a mean over many frames in the sixth
+    share = metrics.overconfident({"nees": nees, "frames": frames})
+    assert (share.value, share.trials) == (0.5, 4)

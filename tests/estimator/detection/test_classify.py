@@ -142,6 +142,21 @@ def test_smeared_stars_are_no_tracks_and_tell_their_streak() -> None:
     assert np.degrees(np.arctan(y / x)) == pytest.approx(np.degrees(np.arctan(-0.6)), abs=3)
 
 
+@pytest.mark.parametrize(("peak_sigma", "flag"), [(6.0, 0), (30.0, Flag.TRACK)])
+def test_only_a_clear_line_is_a_track_among_streaks(peak_sigma: float, flag: int) -> None:
+    """Lines across the streak that the gyros predict; the shape of a line of 6 sigma per pixel is mostly noise."""
+    rng, light = np.random.default_rng(51), np.zeros(SHAPE)
+    # The peak of a line of so much light per pixel of its length is that over sqrt(2 pi) sigma.
+    flux = peak_sigma * 12.0 * np.sqrt(2 * np.pi) * 0.7 * 0.25
+    line = sum(star(12 + 0.5 * t, 12 + 0.86 * t, flux, 0.7, (25, 25)) for t in np.arange(-6, 6, 0.25))
+    places = [(x, y) for x in (150, 300, 450) for y in (120, 360)]
+    for x, y in places:
+        light[y - 12 : y + 13, x - 12 : x + 13] += line
+    image = exposed(rng, light)
+    blobs = classify.classify(image, detect.default(image), FramePriors((10.0, -6.0)))
+    assert [flags_near(blobs, x, y) for x, y in places] == [flag] * len(places)
+
+
 @pytest.mark.parametrize("centroider", ["cog", "gaussian_window", "gaussian_fit"])
 @pytest.mark.parametrize("over", [2.0, 10.0])
 def test_saturated_stars_are_kept_with_a_sigma_that_covers_them(centroider: str, over: float) -> None:

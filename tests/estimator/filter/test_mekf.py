@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2, kstest
 
@@ -19,6 +20,7 @@ from estimator.filter.mekf import (
     GyroModel,
     Update,
 )
+from estimator.filter.propagate import transition
 
 ARCSEC_RAD = np.pi / 180 / 3600
 DEG_H_RAD_S = np.pi / 180 / 3600
@@ -146,6 +148,17 @@ def test_farrenkopf_s_steady_state(s_u: float, s_v: float, period_s: float) -> N
         [before.sigma_attitude_rad, after.sigma_attitude_rad, before.sigma_bias_rad_s, after.sigma_bias_rad_s]
     )
     assert np.abs(ours / oracle[:, None] - 1).max() < 1e-6
+
+
+@pytest.mark.parametrize("angle_rad", [5e-4, 1e-2, 0.5, 3.0])
+def test_the_transition_is_the_exponential_of_the_error_s_equation(angle_rad: float) -> None:
+    """e' = -[w] e - db with db constant: the matrix exponential, both where J is a series and where it is closed."""
+    rotation, step_s = angle_rad * np.array([0.48, -0.6, 0.64]), 0.2
+    slope = np.zeros((6, 6))
+    slope[:3, :3], slope[:3, 3:] = np.cross(rotation, np.eye(3), axisb=0, axisc=0) * -1, -step_s * np.eye(3)
+    rows = np.empty((3, 6))
+    transition(rotation, step_s, rows)
+    assert np.abs(rows - expm(slope)[:3]).max() < 1e-14
 
 
 def test_a_large_correction_leaves_the_solution_s_covariance() -> None:
@@ -554,6 +567,42 @@ def test_a_good_solution_between_ends_the_row() -> None:
     mekf, jump = turning(), wild(0.3, -0.2, 0.6)
     got = [after_turning(mekf, 3 + k, turn).status for k, turn in enumerate([jump, jump, HOME, jump, jump])]
     assert got == [OUTSIDE_GATE, OUTSIDE_GATE, USED, OUTSIDE_GATE, OUTSIDE_GATE]
+
+
+# ---- Refused solutions that confirm each other ----
+
+
+def refused_then(rate_rad_s: float, gap_s: float, spread: np.ndarray, sigma_bias: float, turns: list[Rotation]) -> str:
+    """Status of the last solution of a filter that the gyro turns about x, with one solution after each gap.
+
+    turns : error of each solution, applied to an attitude that is half a radian from the filter's
+    """
+    mekf = AttitudeFilter(GyroModel(0.0, sigma_bias, np.inf), 0.0, HOME, 1e-3, sigma_bias)
+    status = ""
+    for k, turn in enumerate(turns):
+        t_s = gap_s * (k + np.arange(1, 101) / 100)
+        mekf.propagate(t_s, np.tile([rate_rad_s * gap_s / 100, 0.0, 0.0], (100, 1)), np.zeros(100, bool))
+        attitude = Rotation.from_rotvec([-rate_rad_s * t_s[-1], 0.0, 0.0]) * wild(0.0, 0.5, 0.0)
+        status = mekf.update(t_s[-1], turn * attitude, spread).status
+    return status
+
+
+@pytest.mark.parametrize(("axis", "status"), [((0.0, 0.0, 4e-3), RESET), ((0.0, 4e-3, 0.0), OUTSIDE_GATE)])
+def test_an_earlier_error_turns_with_the_body_before_it_is_compared(axis: tuple[float, ...], status: str) -> None:
+    """The first solution is 4 sigma off in roll about z (allowed), or as much about y (400 sigma).
+
+    45 deg later its error is about an axis between y and z, where the second solution alone is 100 times as precise.
+    """
+    spread = np.diag([1e-5, 1e-5, 1e-3]) ** 2
+    assert refused_then(np.pi / 4, 1.0, spread, 0.0, [Rotation.from_rotvec(axis), HOME, HOME]) == status
+
+
+@pytest.mark.parametrize(("sigmas", "status"), [(4.0, RESET), (8.0, OUTSIDE_GATE)])
+def test_solutions_confirm_each_other_within_what_the_bias_turns(sigmas: float, status: str) -> None:
+    """A bias of b turns the prediction by 3 b in 3 s; the solutions themselves err by less than 1% of that."""
+    sigma_bias, gap_s = 1e-3, 3.0
+    drift = [wild(0.0, 0.0, sigmas * sigma_bias * gap_s * k) for k in range(3)]
+    assert refused_then(0.0, gap_s, 1e-10 * np.eye(3), sigma_bias, drift) == status
 
 
 # ---- Bad input ----

@@ -10,8 +10,9 @@ from scipy.special import erf
 from estimator.catalog import catalog
 from estimator.core.camera import Camera
 from estimator.core.errors import ImageError
+from estimator.core.types import Attitude, Centroids, StarMatch
 from estimator.detection.windows import in_windows
-from estimator.trackers.pipeline import Settings
+from estimator.trackers.pipeline import Clock, Settings
 from estimator.trackers.star_tracker import StarTracker
 from estimator.trackers.tracking_mode import Health, TrackingMode
 
@@ -57,8 +58,8 @@ def test_it_searches_once_and_follows_then(tracker: StarTracker) -> None:
     assert max(off_rad(r, attitude(n * STEP_S)) for n, r in enumerate(reports)) < 2e-4
     assert reports[0].expected == 0
     assert reports[0].health & Health.SEARCHED
-    # The second frame's prediction knows no rate: half a degree a second is 19 px in a tenth, beyond its windows.
-    assert all(r.expected >= 8 and not r.health & Health.SEARCHED for r in reports[2:])
+    # The second frame's prediction knows no rate, but 0.05 deg in a tenth of a second is 2 px, within its windows.
+    assert all(r.expected >= 8 and not r.health & Health.SEARCHED for r in reports[1:])
     assert all(r.log10_odds > 10 for r in reports)
     nees = [error(r, attitude(n * STEP_S)) for n, r in enumerate(reports)]
     assert np.mean(nees) < 3 + 4 * np.sqrt(6 / 8)  # chi-square of three degrees, eight times: four deviations
@@ -67,6 +68,42 @@ def test_it_searches_once_and_follows_then(tracker: StarTracker) -> None:
 def error(report, truth: Rotation) -> float:
     turn = (report.attitude.cam_from_ref * truth.inv()).as_rotvec()
     return float(turn @ np.linalg.solve(report.attitude.covariance_rad2, turn))
+
+
+def test_the_last_rate_leads_to_the_next_frame(tracker: StarTracker) -> None:
+    """At 5 deg/s the stars move 22 px a frame: a prediction without the rate, or with its inverse, misses them."""
+    follower, turns = TrackingMode(tracker), [Rotation.from_rotvec(n * STEP_S * 10 * RATE_RAD_S) for n in range(3)]
+    reports = [follower.solve(photograph(tracker, turn * START, n), n * STEP_S) for n, turn in enumerate(turns)]
+    assert [bool(r.health & Health.SEARCHED) for r in reports] == [True, True, False]
+    assert off_rad(reports[2], turns[2] * START) < 2e-4
+
+
+def test_a_prediction_adds_the_evidence_of_its_smaller_volume(tracker: StarTracker) -> None:
+    """The same detections lost in space and followed: the odds differ by the ratio of the volumes of attitudes.
+
+    8 pi^2, against a boresight within a square of 16 px and a roll of as much over the half field of 246.5 px.
+    """
+    follower = TrackingMode(tracker)
+    follower.solve(photograph(tracker, START), 0.0)
+    followed = follower.solve(photograph(tracker, START, 1), STEP_S)
+    assert not followed.health & Health.SEARCHED
+    lost = tracker.solve_centroids(followed.centroids).match
+    assert lost is not None
+    volume = (16 / CAMERA.focal_px) ** 2 * 16 / 246.5
+    gain = followed.log10_odds + lost.log10_chance
+    assert gain == pytest.approx(np.log10(8 * np.pi**2 / volume), abs=1e-3)  # the two fits differ by rounding
+
+
+def test_residuals_of_one_sigma_are_counted_over_2n_less_3(tracker: StarTracker) -> None:
+    """Three of the 2 N measured coordinates are spent on the attitude; two stars leave one degree of freedom."""
+    rows, pixels = tracker.in_field(CAMERA, START)
+    for count in (2, 4, 9):
+        xy, sigma = pixels[:count] + 0.1, np.full(count, 0.1)
+        match = StarMatch(np.arange(count), rows[:count], START, -9.0)
+        attitude = Attitude("solved", START, np.eye(3), match)
+        centroids = Centroids(xy, sigma, np.ones(count))
+        report = TrackingMode(tracker)._report(attitude, centroids, sigma, Clock(), 0, False, None)
+        assert report.chi2_per_dof == pytest.approx(2 * count / (2 * count - 3), rel=1e-6)
 
 
 def test_the_gyros_turn_is_followed_at_once(tracker: StarTracker) -> None:

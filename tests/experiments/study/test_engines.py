@@ -10,7 +10,10 @@ import subprocess
 import sys
 import time
 from collections.abc import Generator, Iterator
+from concurrent.futures import Future
+from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -149,6 +152,57 @@ def test_a_trial_that_kills_its_worker_fails_and_no_other(
     failed = np.isin(columns["trial"], bad)
     assert set(columns["status"][failed]) == {"failed"}
     assert np.array_equal(columns["stars"][~failed], columns["seed"][~failed] % 100)
+
+
+class FakePool:
+    """Stands in for a pool of processes: nothing is done until the engine waits, and a death loses all in flight.
+
+    deaths  : how many more times trial 2 kills its worker
+    retries : number of chunks in flight, itself among them, when a trial was submitted again
+    """
+
+    def __init__(self, deaths: int) -> None:
+        self.deaths, self.seen, self.retries = deaths, set[int](), list[int]()
+        self.pending, self._processes = dict[Future[engines.TimedRows], list[int]](), None
+
+    def submit(self, _: Any, chunk: engines.Chunk) -> Future[engines.TimedRows]:
+        future, first = Future[engines.TimedRows](), chunk[0].first
+        self.pending[future] = list(range(first, first + len(chunk[0].replicates)))
+        if not self.seen.isdisjoint(self.pending[future]):
+            self.retries.append(len(self.pending))
+        self.seen.update(self.pending[future])
+        return future
+
+    def wait(self, *_: Any, **__: Any) -> Any:
+        """One chunk is done, or a worker dies of trial 2."""
+        if self.deaths and any(2 in chunk for chunk in self.pending.values()):
+            self.deaths -= 1
+            for future in self.pending:
+                future.set_exception(BrokenProcessPool())
+        else:
+            future = next(iter(self.pending))
+            rows = [trials.Row(n, 0, n, 0, "", "", trials.Outcome("solved"), None, 0.0) for n in self.pending[future]]
+            del self.pending[future]
+            future.set_result((rows, 0.0))
+        return SimpleNamespace(done=[future])
+
+    def shutdown(self, **_: Any) -> None:
+        self.pending.clear()
+
+
+@pytest.mark.parametrize(("deaths", "failed"), [(0, []), (1, []), (3, []), (4, [2])])
+def test_trials_that_are_lost_with_a_worker_are_retried_alone(
+    plan_: plan.Plan, monkeypatch: pytest.MonkeyPatch, deaths: int, failed: list[int]
+) -> None:
+    """Four chunks of three trials. The first death is nobody's, as others are in flight; three more are trial 2's."""
+    pool, chunks = FakePool(deaths), [(trials.Segment(0, {}, n, range(n, n + 3)),) for n in range(0, 12, 3)]
+    queue = SimpleNamespace(next=lambda: chunks.pop(0) if chunks else (), report_time=lambda *_: None)
+    monkeypatch.setattr(engines, "start_pool", lambda *_: pool)
+    monkeypatch.setattr(engines, "wait", pool.wait)
+    rows = [row for batch in engines.Pool(2).run(plan_.spec, queue) for row in batch]
+    assert sorted(row.trial for row in rows) == list(range(12))
+    assert [row.trial for row in rows if row.error is not None] == failed
+    assert set(pool.retries) == ({1} if deaths else set())
 
 
 class Run:

@@ -1,0 +1,95 @@
+"""The Bayes factor of a candidate attitude under the stars: each of its terms against an integral or a closed form."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from scipy.special import betaln
+
+from estimator.catalog import sky_index
+from estimator.identification.stars import evidence
+
+FIELD = np.tan(np.radians([-5.0, 5.0, -4.0, 4.0]))
+AREA = float((FIELD[1] - FIELD[0]) * (FIELD[3] - FIELD[2]))
+SIGMA = 1e-4
+TRUTH = Rotation.from_rotvec([0.3, -0.8, 0.5])
+# Seven stars in the field, brightest first, and one far outside of it.
+TANGENT = np.array(
+    [[0.01, 0.02], [-0.06, 0.05], [0.07, -0.03], [-0.04, -0.05], [0.03, 0.06], [0.05, 0.01], [-0.02, 0.0], [0.5, 0.5]]
+)
+RAYS = np.column_stack([TANGENT, np.ones(len(TANGENT))])
+RAYS /= np.linalg.norm(RAYS, axis=1, keepdims=True)
+SKY = sky_index.build_without_pairs(TRUTH.inv().apply(RAYS), np.arange(1.0, 9.0))
+
+
+def seen(tangent: np.ndarray) -> evidence.Detections:
+    """Detections without magnitudes, as accurate along as across."""
+    sigma = np.full(len(tangent), SIGMA)
+    weight = np.column_stack([sigma**-2, sigma**-2, 0 * sigma])
+    return evidence.Detections(tangent.copy(), sigma, weight, np.full(len(tangent), np.nan), 0.25, FIELD, 0.0)
+
+
+def evaluated(tangent: np.ndarray) -> evidence.Hypothesis:
+    """The hypothesis of the true attitude; its evidence is not limited."""
+    gates = np.full(len(tangent), 0.01)
+    return evidence.evaluate(seen(tangent), SKY, TRUTH.as_matrix(), 1.0, gates, -np.inf)
+
+
+def test_evidence_is_the_integral_over_all_attitudes() -> None:
+    """Mean over the 8 pi^2 of attitudes of the likelihood of four matches, over that of any places on the sensor.
+
+    Summed here over a lattice of small turns about the best attitude; Laplace's approximation is an ellipsoid. The
+    four have no missing star, so that their counts give B(5, 1) = 1 / 5, and their places 4! / area^4.
+    """
+    stars = np.arange(4)
+    offset = SIGMA * np.array([[0.8, -0.3], [-0.5, 0.4], [0.1, 0.9], [-0.6, -0.7]])
+    hypothesis = evaluated(TANGENT[stars] + offset)
+    assert hypothesis.star.tolist() == stars.tolist()
+    # Turn about each axis to 6 sigma of it, in steps of half a sigma, along the principal axes of the information.
+    spread, axes = np.linalg.eigh(np.linalg.inv(hypothesis.info[:3, :3]))
+    step = np.arange(-6, 6.1, 0.5)
+    lattice = np.stack(np.meshgrid(step, step, step), axis=-1).reshape(-1, 3) * np.sqrt(spread) @ axes.T
+    rays = Rotation.from_matrix(hypothesis.R_cam_from_ref).apply(SKY.vectors[stars])
+    turned = np.einsum("nij,kj->nki", Rotation.from_rotvec(lattice).as_matrix(), rays)
+    residual = TANGENT[stars] + offset - turned[:, :, :2] / turned[:, :, 2:]
+    density = np.exp(-0.5 * np.sum((residual / SIGMA) ** 2, axis=2)) / (2 * np.pi * SIGMA**2)
+    volume = np.prod(0.5 * np.sqrt(spread))
+    mean = np.sum(np.prod(density, axis=1)) * volume / (8 * np.pi**2)
+    chance = 24 / AREA**4
+    assert hypothesis.dex == pytest.approx(np.log10(mean / chance / 5), abs=1e-3)
+
+
+@pytest.mark.parametrize("missing", [1, 2, 3])
+def test_missing_stars_cost_the_beta_function_of_the_counts(missing: int) -> None:
+    """Stars 0, 1, 2 and 6 are seen; of 3, 4 and 5, which are brighter than 6, some are not in the sky at all."""
+    tangent = TANGENT[[0, 1, 2, 6]]
+    gone = np.arange(3, 6)[missing:]
+    kept = np.setdiff1d(np.arange(len(TANGENT)), gone)
+    fewer = sky_index.build_without_pairs(SKY.vectors[kept], SKY.mag[kept])
+    gates = np.full(4, 0.01)
+    here = evidence.evaluate(seen(tangent), fewer, TRUTH.as_matrix(), 1.0, gates, -np.inf)
+    none = np.setdiff1d(np.arange(len(TANGENT)), [3, 4, 5])
+    bare = sky_index.build_without_pairs(SKY.vectors[none], SKY.mag[none])
+    whole = evidence.evaluate(seen(tangent), bare, TRUTH.as_matrix(), 1.0, gates, -np.inf)
+    toll = (betaln(5, missing + 1) - betaln(5, 1)) / np.log(10)
+    assert here.dex - whole.dex == pytest.approx(toll, abs=1e-9)
+
+
+def test_stars_outside_of_the_field_are_not_missed() -> None:
+    """The faintest match is fainter than all; the eighth star is out of the field, one more is behind the camera."""
+    behind = np.vstack([-SKY.vectors[:1], SKY.vectors[:7]])
+    sky = sky_index.build_without_pairs(behind, np.arange(1.0, 9.0))
+    hypothesis = evidence.evaluate(seen(TANGENT[:7]), sky, TRUTH.as_matrix(), 1.0, np.full(7, 0.01), -np.inf)
+    assert hypothesis.dex == pytest.approx(evaluated(TANGENT[:7]).dex, abs=1e-9)
+
+
+def test_bright_strays_cost_half_a_power_of_ten_each_beyond_the_matches() -> None:
+    """Four matches after 4, 5 and 7 strays, which also make the detections denser: by the ratio of the counts."""
+    places, dex = np.array([[0.01 * n, -0.06] for n in range(-3, 4)]), []
+    for strays in (4, 5, 7):
+        hypothesis = evaluated(np.concatenate([places[:strays], TANGENT[:4]]))
+        assert hypothesis.star.tolist() == [0, 1, 2, 3]
+        total = strays + 4
+        dex.append(hypothesis.dex + sum(np.log10(total - k) for k in range(4)))
+    np.testing.assert_allclose(np.diff(dex), [-0.5, -1.0], rtol=0, atol=1e-9)
