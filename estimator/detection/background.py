@@ -23,6 +23,7 @@ SAMPLE_ROWS = 6  # sampled per tile: some 370 filtered pixels, of which about 13
 INITIAL_SAMPLES = 33  # samples of the robust initial estimate; odd, as `_median_by_counting` needs
 CLIP_SIGMA = 3.0
 CLIPPED_VARIANCE = 0.9733  # of a unit Gaussian truncated at 3 sigma: 1 - 6 phi(3) / (2 Phi(3) - 1)
+FLOAT_STEPS = 65535  # quantization steps assumed over the range of an image of floats
 FILTERED_NOISE = 0.375  # the binomial filter reduces the deviation of white noise to (1 + 4 + 1) / 16
 
 
@@ -30,7 +31,9 @@ def estimate_background(image: NDArray, tile_px: int = TILE_PX) -> Background:
     """Estimate the sigma-clipped mean and standard deviation of the 3x3-filtered image, tile by tile.
 
     The noise is measured on the filtered image itself, so correlated noise (JPEG, demosaicing) is included. Its floor
-    is the quantization noise of an integer image, as a dark JPEG can have tiles without any noise.
+    is the quantization noise, as a dark JPEG can have tiles without any noise: that of an integer image's own step,
+    and of 16 bits for floats, a dynamic range that no sensor exceeds. In a simulated frame without noise a threshold
+    below that would join stars by the wings of their images and by readout smear.
     """
     tile_px = min(tile_px, *image.shape)
     sum_type = accumulator_type(image.dtype)
@@ -38,7 +41,7 @@ def estimate_background(image: NDArray, tile_px: int = TILE_PX) -> Background:
     sample_type = np.float64 if sum_type == np.float64 else np.float32
     samples: NDArray = np.empty(INITIAL_SAMPLES, sample_type)
     level, noise = _tiles(image, tile_px, np.empty(image.shape[1], sum_type), samples)
-    step = 1.0 if image.dtype.kind in "iu" else 0.0
+    step = 1.0 if image.dtype.kind in "iu" else float(image.max() - image.min()) / FLOAT_STEPS
     return Background(level, np.maximum(noise, FILTERED_NOISE * step / np.sqrt(12)), tile_px)
 
 

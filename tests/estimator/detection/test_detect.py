@@ -78,6 +78,14 @@ def test_the_sky_of_a_crowded_tile_is_the_sky_between_the_stars(dtype: str) -> N
     np.testing.assert_allclose(background.level, 60, rtol=0, atol=1.0)
 
 
+def test_the_noise_of_floats_has_the_floor_of_sixteen_bits() -> None:
+    """A step over the range of the image, uniform within: step / sqrt(12), which the binomial filter reduces to 3/8."""
+    image = np.full((128, 128), 40.0)
+    image[64, 64] = 40.0 + 65535 * 0.25
+    background = frame_background.estimate_background(image)
+    np.testing.assert_allclose(background.noise, 0.375 * 0.25 / np.sqrt(12), rtol=1e-12)
+
+
 def test_the_sky_between_tile_centers_is_bilinear() -> None:
     # Four tiles of a 128x128 frame have their centers at 31.5 and 95.5; half-way between is the mean.
     grid = np.array([[0.0, 8.0], [16.0, 40.0]])
