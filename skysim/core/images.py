@@ -14,6 +14,7 @@ import io
 import os
 import struct
 import sys
+import tempfile
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -27,10 +28,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skysim.core.errors import InputError
+from skysim.core.guarded import run_guarded
 
 FITS_SUFFIXES = (".fits", ".fit", ".fts")
 FITS_MAGIC = b"SIMPLE  ="  # start of every FITS file; a compressed one differs, which astropy would unpack
 MAX_HDUS = 1000  # that are searched for an image
+MAX_COLUMNS = 999  # of a table (FITS standard 4.0, section 7.3.1)
+TILES_CPU_S, TILES_BYTES = 10, 1 << 31  # for a compressed image
 
 
 @contextmanager
@@ -51,9 +55,14 @@ def read_fits(path: Path) -> NDArray:
     from astropy.io import fits
 
     try:
-        with open_fits(path) as file, fits.open(file, memmap=False) as hdus:
-            for hdu in islice(hdus, MAX_HDUS):
+        with open_fits(path) as file, fits.open(file, memmap=False, disable_image_compression=True) as hdus:
+            for number, hdu in enumerate(islice(hdus, MAX_HDUS)):
                 # From the header, before the data is read or skipped.
+                if (columns := hdu.header.get("TFIELDS", 0)) > MAX_COLUMNS:
+                    raise InputError(f"{path}: TFIELDS {columns}; allowed: up to {MAX_COLUMNS} columns")
+                if hdu.header.get("ZIMAGE"):
+                    check_pixels(path, *(int(hdu.header[f"ZNAXIS{n}"]) for n in range(hdu.header["ZNAXIS"], 0, -1)))
+                    return decode_tiles(path, number)
                 check_pixels(path, *map(int, getattr(hdu, "shape", ()) or ()))
                 check_pixels(path, int(hdu.size) // 8)
                 if getattr(hdu, "is_image", False) and hdu.header.get("NAXIS", 0) > 0:
@@ -63,6 +72,16 @@ def read_fits(path: Path) -> NDArray:
     except Exception as error:  # a damaged header makes astropy raise exceptions of many types, KeyError too
         raise InputError(f"{path}: not a complete FITS file: {' '.join(str(error).split())}") from None
     raise InputError(f"{path}: a FITS file without an image")
+
+
+def decode_tiles(path: Path, number: int) -> NDArray:
+    """The pixels of a compressed image, the HDU of this number. Raises InputError with one line."""
+    with tempfile.TemporaryDirectory(prefix="skysim-") as folder:
+        out = Path(folder) / "pixels.npy"
+        script = Path(__file__).parent / "fits_tiles.py"
+        if fault := run_guarded(script, str(path), str(number), str(out), cpu_s=TILES_CPU_S, memory_bytes=TILES_BYTES):
+            raise InputError(f"{path}: not a complete FITS file: {fault}")
+        return np.asarray(np.load(out))
 
 
 def read_date_obs(path: Path) -> datetime.datetime | None:

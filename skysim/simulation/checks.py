@@ -6,6 +6,7 @@ import numpy as np
 
 from skysim.camera import wcs
 from skysim.core.types import Mount, Sources
+from skysim.dynamics import guidance
 from skysim.scene.light import DomeConfig, StarsConfig, SurveyedSurfaceConfig
 from skysim.scene.scene import Scene
 from skysim.sources.dome import surface
@@ -26,6 +27,8 @@ def warnings(scene: Scene, sources: Sources, mount: Mount) -> list[str]:
         return [line for line in [wcs.accuracy_warning(scene.camera)] if line]
     if not isinstance(scene.light, DomeConfig):
         return []
+    if outside := camera_outside_warning(scene, mount):
+        return [outside]  # the others assume that it is inside
     inside = surface.build_surface(scene.light.surface)
     lines = [
         surface_fit_warning(scene.light, inside),
@@ -34,6 +37,17 @@ def warnings(scene: Scene, sources: Sources, mount: Mount) -> list[str]:
         exposure_warning(scene, sources),
     ]
     return [line for line in lines if line]
+
+
+def camera_outside_warning(scene: Scene, mount: Mount) -> str:
+    """Warn where the camera is outside of the dome at the start, so that its frames are probably black."""
+    camera_m = guidance.start_attitude(scene.motion).apply(mount.camera_body_m)
+    if not isinstance(scene.light, DomeConfig) or surface.build_surface(scene.light.surface).inside(camera_m):
+        return ""
+    return (
+        f"vehicle.camera: {np.linalg.norm(mount.camera_body_m):.3g} m from the bearing, outside of light.surface at the"
+        " start: a frame may show no LED; allowed: inside"
+    )
 
 
 def surface_fit_warning(light: DomeConfig, inside: Surface) -> str:

@@ -20,9 +20,10 @@ from skysim.core import files
 from skysim.core.errors import InputError, unknown_name
 from skysim.core.paths import CATALOGS
 from skysim.core.types import Floats
-from skysim.core.yaml_reader import parse_yaml
+from skysim.core.yaml_reader import excerpt, parse_yaml
 
 EPOCH_JYEAR = 1991.25
+EPOCHS_JYEAR = 1800, 2200  # allowed: the linear proper motions are good for a century or two
 MAS_RAD = np.pi / 180 / 3.6e6
 SUPPLEMENT = CATALOGS / "supplement.ecsv"
 SCHEMA = "schema: astropy-2.0"
@@ -241,14 +242,15 @@ def read_meta_and_lines(path: Path) -> tuple[dict[str, Any], list[str]]:
     header = next((n for n, line in enumerate(lines) if not line.startswith("#")), len(lines))
     try:
         meta = parse_yaml("\n".join(line[2:] for line in lines[1:header]))[1]["meta"]
-        valid = lines[header].split(",")[: len(COLUMN_NAMES)] == COLUMN_NAMES and {
-            "rows",
-            "epoch_jyear",
-        } <= set(meta)
+        epoch_jyear, _rows = meta["epoch_jyear"], meta["rows"]
+        valid = lines[header].split(",")[: len(COLUMN_NAMES)] == COLUMN_NAMES
     except (yaml.YAMLError, TypeError, KeyError, IndexError) as error:
         raise catalog_error(path, "not the header of a skysim catalog") from error
     if not valid:
         raise catalog_error(path, "not the header of a skysim catalog")
+    if not isinstance(epoch_jyear, int | float) or not EPOCHS_JYEAR[0] <= epoch_jyear <= EPOCHS_JYEAR[1]:
+        allowed = "a Julian year of {} to {}".format(*EPOCHS_JYEAR)
+        raise catalog_error(path, f"epoch_jyear {excerpt(repr(epoch_jyear))}; allowed: {allowed}")
     return meta, lines[header:]
 
 

@@ -1,4 +1,4 @@
-"""A stranger's vehicle reads no file outside of its folder, in whatever way it names one."""
+"""A stranger's vehicle reads no file outside of its folder, cannot crash skysim, and cannot fill memory or time."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import mujoco
 import pytest
 
 from skysim.core.errors import InputError
+from skysim.core.paths import SCENES
 from skysim.dynamics.multibody import mjcf, mjcf_sandbox
 from skysim.dynamics.multibody.mjcf_sandbox import xml_root
 
@@ -186,3 +187,59 @@ def test_the_parts_of_a_folder_are_let_in(tmp_path: Path) -> None:
     assert told.compile().nmesh == 1
     assert told.site("in") is not None
     assert told.body("psecret") is not None
+
+
+def nested(count: int) -> str:
+    """40,000 geoms by two levels of replication."""
+    opening = f'<replicate count="{count}" offset="1 0 0">'
+    return f'{opening}{opening}<geom size=".1"/></replicate></replicate>'
+
+
+def flexcomp(count: str) -> str:
+    return (
+        f'<body name="f"><flexcomp name="f" dim="2" count="{count}" spacing=".1 .1 .1" radius=".01" mass="1"/></body>'
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        (whole(ATTACHED.replace("c.xml", "v.xml").replace("secret", "bus")), r"crashes its reader \(SIGSEGV\)"),
+        (whole(f"<worldbody>{flexcomp('200 200 1')}</worldbody>"), "takes more than 1 s"),
+        (whole(f"<worldbody>{flexcomp('20 20 1')}</worldbody>"), "nv 1200; allowed: up to 1000"),
+        (whole(f"<worldbody>{nested(60)}</worldbody>"), "ngeom 3601; allowed: up to 2000"),
+        (
+            whole('<asset><hfield name="h" nrow="1000000" ncol="1000000" size="1 1 1 1"/></asset>'),
+            "more than 1024 MiB of memory",
+        ),
+        (whole('<size nuser_body="2147483647"/>'), "more than 1024 MiB of memory"),
+    ],
+    ids=["contains itself", "flexcomp", "joints", "replicate", "height field", "nuser_body"],
+)
+def test_a_model_that_would_crash_or_never_end_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str, told: str
+) -> None:
+    monkeypatch.setattr(mjcf, "TRIAL_CPU_S", 1)
+    (tmp_path / "v.xml").write_text(text)
+    with pytest.raises(InputError, match=rf"v\.xml: not a MuJoCo model that skysim reads: it .*{told}$"):
+        mjcf.load(tmp_path / "v.xml")
+
+
+@pytest.mark.parametrize("value", ["inf", "1 NaN 1", "-1e300", "Infinity"])
+def test_numbers_that_are_not_finite_or_excessive_are_refused(tmp_path: Path, value: str) -> None:
+    (tmp_path / "v.xml").write_text(whole("").replace('size=".1"', f'size=".1" pos="{value}"'))
+    with pytest.raises(InputError, match=r"v\.xml: geom pos='.*'; allowed: finite numbers up to 1e\+12$"):
+        mjcf.load(tmp_path / "v.xml")
+
+
+def test_a_shipped_vehicle_needs_no_child_and_another_file_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A second import of MuJoCo would lengthen the start of every run."""
+    tried = list[str]()
+    monkeypatch.setattr(mjcf, "run_guarded", lambda _script, path, **_limits: tried.append(path) or "")
+    for shipped in (SCENES / "vehicles").glob("*.xml"):
+        mjcf.load(shipped)
+    own = tmp_path / "v.xml"
+    own.write_text(whole(""))
+    mjcf.load(own)
+    mjcf.load(own)
+    assert tried == [str(own)]

@@ -104,6 +104,8 @@ def test_mass_less_than_what_the_bus_carries_is_refused() -> None:
         multibody.build(vehicle_config(mass="5 kg"))
     with pytest.raises(InputError, match=r"vehicle.inertia: .* impossible for a rigid body"):
         multibody.build(vehicle_config(inertia=["0.5 kg m2"] * 3))
+    with pytest.raises(InputError, match=r"vehicle.camera: with the camera 5 m .* impossible for a rigid body"):
+        multibody.build(vehicle_config(camera=["0 m", "3 m", "4 m"]))
 
 
 # --- actuators ----------------------------------------------------------------------------------------------

@@ -210,3 +210,14 @@ def test_a_damaged_file_is_refused_in_one_line(tmp_path: Path, how: str) -> None
 def test_a_missing_catalog_is_named() -> None:
     with pytest.raises(InputError, match=r"hipparcos_hp99\.ecsv: not found; build it with .*catalog build"):
         catalog.read("hipparcos_hp99")
+
+
+@pytest.mark.parametrize("value", ["last year", "null", "[1991.25]", "2016-01-01", "{a: 1}", ".nan", "1e300", "true"])
+def test_an_epoch_that_is_no_year_is_refused(tmp_path: Path, value: str) -> None:
+    path = tmp_path / "stars.ecsv"
+    path.write_text(
+        COMMITTED.read_text(encoding="utf-8").replace("epoch_jyear: 1991.25", f"epoch_jyear: {value}"), encoding="utf-8"
+    )
+    with pytest.raises(InputError, match=r"epoch_jyear .*; allowed: a Julian year of 1800 to 2200") as refusal:
+        catalog.info(path)
+    assert len(str(refusal.value).splitlines()) == 1

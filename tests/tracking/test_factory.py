@@ -285,6 +285,15 @@ def test_a_surface_that_is_no_upright_ellipsoid_is_doubted(surface: str, doubted
         assert 1 < missed_mm < 300 * np.radians(3)
 
 
+@pytest.mark.parametrize("scene", ["afit_simsat", "apl_dome"])
+def test_a_camera_outside_of_the_dome_is_doubted(scene: str) -> None:
+    """Its frames would be black, without a word."""
+    far = {"vehicle.camera": "[0 m, 1.3 m, 0 m]", "vehicle.inertia": "[120 kg m2, 120 kg m2, 120 kg m2]"}
+    (line,) = doubted_of(scene, far)
+    assert line.startswith("vehicle.camera: 1.3 m from the bearing, outside of light.surface")
+    assert not any("vehicle.camera" in line for line in doubted_of(scene, {}))
+
+
 def test_under_the_stars_there_is_no_surface_to_doubt() -> None:
     assert doubted_of("shefex2", {}) == []
 

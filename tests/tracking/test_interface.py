@@ -63,6 +63,7 @@ UNIT = [0.5, -0.5, 0.5, 0.5]
         (Answer("solved", UNIT, np.diag([1e-9, -1e-9, 1e-9])), "eigenvalues"),
         (Answer("solved", UNIT, None, [[1, 2, 3]]), "centroids_px has shape"),
         (Answer("solved", UNIT, None, 3.0), "centroids_px"),
+        (Answer("solved", UNIT, None, [[1, 2], [-1e300, 2]]), r"1e\+300; allowed: up to 1e\+06 px"),
         (Answer("solved", UNIT, None, None, -1.0), "allowed: 0 or more"),
         (Answer(""), "allowed: text"),
         (Answer(5), "allowed: text"),
@@ -160,6 +161,25 @@ def test_whatever_a_program_does_is_told_in_one_line_and_in_time(text: str, told
         runs.solve(PICTURE)
     assert "\n" not in str(raised.value)
     assert time.monotonic() - begin_s < 4
+    runs.close()
+
+
+@pytest.mark.parametrize("kind", ["png", "fits"])
+@pytest.mark.parametrize(
+    ("harm", "told"),
+    [
+        ("shutil.rmtree(sys.argv[1])", "No such file or directory"),
+        ("os.remove(h['file']); os.mkdir(h['file'])", r"Is a directory|Operation not permitted"),
+    ],
+)
+def test_a_program_that_harms_its_folder_is_blamed_and_begun_anew(kind: str, harm: str, told: str) -> None:
+    answer = 'print(\'{"frame": 7, "status": "x"}\', flush=True)'
+    text = f"import shutil\nfor line in g:\n    h = json.loads(line); {harm}; {answer}"
+    runs = program(READY + text, kind=kind)
+    assert runs.solve(PICTURE).status == "x"
+    with pytest.raises(ProgramError, match=f"the program's folder takes no frame: ({told})$"):
+        runs.solve(PICTURE)
+    assert runs.solve(PICTURE).status == "x"
     runs.close()
 
 

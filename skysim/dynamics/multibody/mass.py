@@ -14,6 +14,8 @@ from skysim.core.errors import InputError
 from skysim.core.types import Floats
 from skysim.scene.vehicle import VehicleConfig, WheelsConfig
 
+CAMERA = "star_camera"
+
 
 @dataclass(frozen=True, slots=True)
 class MassProperties:
@@ -65,9 +67,22 @@ def declare_mass(bus: Any, model: Any, vehicle: VehicleConfig, path: Path) -> Ma
         )
     # The bus's own center follows from the first moments: total minus carried, over the bus's mass.
     center_bus = (declared.mass_kg * declared.center_m - carried.mass_kg * carried.center_m) / mass
+    own_inertia = inertia - carried.inertia_kg_m2 - parallel_axis(mass, center_bus)
     subject = f"vehicle.inertia: less what the bus carries ({path}), its"
-    set_inertial(bus, mass, center_bus, inertia - carried.inertia_kg_m2 - parallel_axis(mass, center_bus), subject)
+    if vehicle.camera_m is not None and lever_is_to_blame(own_inertia, model, np.array(vehicle.camera_m)):
+        distance_m = np.linalg.norm(vehicle.camera_m)
+        subject = f"vehicle.camera: with the camera {distance_m:.3g} m from the bearing, the bus's ({path})"
+    set_inertial(bus, mass, center_bus, own_inertia, subject)
     return declared
+
+
+def lever_is_to_blame(bus_inertia_kg_m2: Floats, model: Any, camera_m: Floats) -> bool:
+    """Whether the bus's inertia is impossible only because the scene puts the camera's housing far from the bearing."""
+    carrier = model.cam_bodyid[model.camera(CAMERA).id]
+    if carrier == model.body("bus").id:
+        return False
+    without_lever: Floats = bus_inertia_kg_m2 + parallel_axis(model.body_subtreemass[carrier], camera_m)
+    return not is_possible(np.linalg.eigvalsh(bus_inertia_kg_m2)) and is_possible(np.linalg.eigvalsh(without_lever))
 
 
 def unbalance(model: Any, joints: list[Any], wheels: WheelsConfig, path: Path) -> None:
@@ -97,10 +112,15 @@ def unbalance(model: Any, joints: list[Any], wheels: WheelsConfig, path: Path) -
         )
 
 
+def is_possible(moments: Floats) -> bool:
+    """Whether a rigid body can have these principal moments, in ascending order."""
+    return bool(moments[0] > 0 and moments[2] <= (moments[0] + moments[1]) * (1 + 1e-12))
+
+
 def set_inertial(body: Any, mass_kg: float, center_m: Floats, inertia_kg_m2: Floats, subject: str) -> None:
     """Set mass, center and inertia (3, 3) about it in a body of a spec. Raises InputError for impossible inertia."""
     moments, axes = np.linalg.eigh(inertia_kg_m2)
-    if moments[0] <= 0 or moments[2] > (moments[0] + moments[1]) * (1 + 1e-12):
+    if not is_possible(moments):
         raise InputError(
             f"{subject} principal moments about its center of mass are"
             f" {', '.join(f'{m:.3g}' for m in moments)} kg m2, impossible for a rigid body"

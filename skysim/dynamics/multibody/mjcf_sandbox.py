@@ -1,4 +1,4 @@
-"""Check that an untrusted MJCF file and all it includes name only files within its own folder.
+"""Check that an untrusted MJCF file and all it includes name only files within its own folder, and only finite numbers.
 
 MuJoCo itself would read any file. The check must see the same names as MuJoCo's parser, so XML that two
 parsers could read differently is refused: encodings other than UTF-8, a DOCTYPE, namespaces. All paths where MuJoCo
@@ -7,6 +7,7 @@ may look for a name are checked.
 
 from __future__ import annotations
 
+import math
 import os.path
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -23,6 +24,7 @@ CUBE_SIDES = ("right", "left", "up", "down", "front", "back")
 FOLDER_ATTRIBUTES = {"meshdir", "texturedir", "assetdir"}
 FILE_ATTRIBUTES = {"file", *(f"file{side}" for side in CUBE_SIDES)}
 MAX_BYTES = 1 << 24  # of an XML file
+MAX_NUMBER = 1e12  # in any unit; squares and cubes of it are finite
 MAX_CANDIDATES = 100_000  # candidate paths of a model's files
 
 
@@ -140,7 +142,21 @@ def xml_root(path: Path) -> ElementTree.Element:
     names = [name for element in root.iter() for name in (element.tag, *element.attrib)]
     require(path, not any("{" in name for name in names), "XML without namespaces")
     require(path, root.tag.lower() != "robot", "MJCF, not URDF")
+    for element in root.iter():
+        for key, value in element.attrib.items():
+            if not all(map(is_moderate, value.split())):
+                raise InputError(
+                    f"{path}: {element.tag} {key}={excerpt(repr(value))}; allowed: finite numbers up to {MAX_NUMBER:g}"
+                )
     return root
+
+
+def is_moderate(word: str) -> bool:
+    """False for a number that is not finite or is beyond MAX_NUMBER. Any other word is moderate."""
+    try:
+        return math.isfinite(number := float(word)) and abs(number) <= MAX_NUMBER
+    except ValueError:
+        return True
 
 
 def unreadable(path: Path, error: Exception) -> InputError:

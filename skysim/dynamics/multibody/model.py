@@ -34,13 +34,12 @@ from skysim.dynamics.multibody.joints import (
     lock_unused,
     locked_joint_hint,
 )
-from skysim.dynamics.multibody.mass import MassProperties, declare_mass, tree_mass, unbalance
+from skysim.dynamics.multibody.mass import CAMERA, MassProperties, declare_mass, tree_mass, unbalance
 from skysim.dynamics.multibody.mjcf import compile_spec, load, mujoco_warnings, one_line
 from skysim.scene.vehicle import VehicleConfig
 
 GRAVITY_M_S2 = 9.80665
 STEP_S = 1e-3
-CAMERA = "star_camera"
 IMU = "imu"
 REQUIRED = f"body bus and camera {CAMERA}"
 

@@ -19,8 +19,9 @@ from skysim.core.paths import SCENES
 from skysim.core.types import Floats, Sources
 from skysim.dynamics.multibody.integrator import member_values
 from skysim.dynamics.multibody.joints import lock_unused
+from skysim.dynamics.multibody.mass import CAMERA
 from skysim.dynamics.multibody.mjcf import compile_spec, load, mujoco_warnings
-from skysim.dynamics.multibody.model import CAMERA, VehicleModel, camera_mount, place_camera, put_at_origin
+from skysim.dynamics.multibody.model import VehicleModel, camera_mount, place_camera, put_at_origin
 from skysim.sources.dome.surface import Surface
 
 OPAQUE, TRANSPARENT = 0, 5  # groups of geoms: those that block light, and the camera's own housing

@@ -29,6 +29,7 @@ EXTRAS = {
 }  # module and extra of the trackers in our own package
 MIN_RAD2 = 1e-24  # smallest eigenvalue: (0.2 micro-arcseconds)^2
 MAX_CENTROIDS = 100_000
+MAX_CENTROID_PX = 1e6  # distance from the first pixel along x and y
 MAX_STATUS_CHARS = 300  # characters of a status
 
 Floats = NDArray[np.float64]
@@ -228,11 +229,14 @@ def check_covariance(covariance: Floats) -> Floats:
 
 
 def check_centroids(centroids: Any) -> Floats:
-    """(N, 2) centroids as finite numbers; empty for None. Raises ValueError."""
+    """(N, 2) centroids as finite numbers, not far out of the frame; empty for None. Raises ValueError."""
     count = 0 if centroids is None else np.shape(centroids)[0] if np.ndim(centroids) else -1
     if count > MAX_CENTROIDS:
         raise ValueError(f"centroids_px has {count} rows; allowed: up to {MAX_CENTROIDS}")
-    return finite_array(centroids, "centroids_px", (count, 2)) if count else np.empty((0, 2))
+    xy_px = finite_array(centroids, "centroids_px", (count, 2)) if count else np.empty((0, 2))
+    if (farthest := np.abs(xy_px).max(initial=0.0)) > MAX_CENTROID_PX:
+        raise ValueError(f"centroids_px has {farthest:g}; allowed: up to {MAX_CENTROID_PX:g} px from the first pixel")
+    return xy_px
 
 
 def entry_points() -> dict[str, metadata.EntryPoint]:

@@ -231,7 +231,10 @@ class Program:
             raise ProgramError(str(error)) from None
 
     def frame_message(self, picture: Picture) -> list[bytes]:
-        """A frame's header and, unless it is written to the folder, its pixels, row by row, little-endian."""
+        """A frame's header and, unless it is written to the folder, its pixels, row by row, little-endian.
+
+        Raises ProgramError where the program has made its folder unusable.
+        """
         header: dict[str, Any] = {
             "frame": picture.frame,
             "t_s": picture.t_s,
@@ -241,10 +244,13 @@ class Program:
         if self.image_format:
             assert self.running is not None
             assert self.running.folder is not None
-            for previous in self.running.folder.glob("frame_*"):
-                previous.unlink(missing_ok=True)
             path = self.running.folder / f"frame_{picture.frame:04d}.{self.image_format}"
-            WRITERS[self.image_format](path, picture)
+            try:
+                for previous in self.running.folder.glob("frame_*"):
+                    previous.unlink(missing_ok=True)
+                WRITERS[self.image_format](path, picture)
+            except OSError as error:
+                raise self.fail(f"the program's folder takes no frame: {error.strerror or error}", 0.0) from None
             return [(json.dumps(header | {"file": str(path)}) + "\n").encode()]
         dtype = "<u2" if picture.image_dn.dtype == np.uint16 else "<f8"
         pixels = np.ascontiguousarray(picture.image_dn, dtype=dtype).tobytes()

@@ -141,6 +141,14 @@ def test_what_only_the_first_frame_shows_to_be_wrong_costs_no_earlier_results(sk
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
+def test_a_frame_of_a_camera_outside_of_the_dome_is_not_black_without_a_word(skysim: Skysim, tmp_path: Path) -> None:
+    words = ["render", "apl_dome", "--frames", "1", "--out", str(tmp_path)]
+    told = skysim(*words, "--set", "vehicle.camera=[0 m, 0 m, 5 m]")
+    assert told.code == 0
+    assert told.err.startswith("skysim: vehicle.camera: 5 m from the bearing, outside of light.surface")
+    assert told.err.count("\n") == 1
+
+
 def test_a_preview_is_a_picture_beside_the_frame(skysim: Skysim, tmp_path: Path) -> None:
     ran = skysim("render", "shefex2", "--frames", "1", "--preview", "--out", str(tmp_path))
     assert ran.code == 0

@@ -95,11 +95,16 @@ def render(
 ) -> None:
     """Simulate a scene and write its frames with their truth, without solving them."""
     from skysim.results.run import Recorder
+    from skysim.simulation import checks
     from skysim.simulation import run as simulation
+    from skysim.simulation.testbed import build_testbed
 
     loaded = load(scene, frames, seed, set_)
+    testbed = build_testbed(loaded)
+    if warning := checks.camera_outside_warning(loaded, testbed.mount):
+        terminal.print_error(warning)
     with terminal.progress_callback("simulating the motion") as update:
-        testbed = simulation.prepare(loaded, update)
+        testbed = simulation.simulate_motion(testbed, update)
     rendered = terminal.eager_first(simulation.render_frames(testbed))
     recorder = Recorder(output_folder(out, loaded.name), testbed)
     paths = [
