@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skysim.core.errors import InputError
-from skysim.core.guarded import run_guarded
+from skysim.core.guard.process import run_guarded
 
 FITS_SUFFIXES = (".fits", ".fit", ".fts")
 FITS_MAGIC = b"SIMPLE  ="  # start of every FITS file; a compressed one differs, which astropy would unpack
@@ -78,7 +78,7 @@ def decode_tiles(path: Path, number: int) -> NDArray:
     """The pixels of a compressed image, the HDU of this number. Raises InputError with one line."""
     with tempfile.TemporaryDirectory(prefix="skysim-") as folder:
         out = Path(folder) / "pixels.npy"
-        script = Path(__file__).parent / "fits_tiles.py"
+        script = Path(__file__).parent / "guard/fits_tiles.py"
         if fault := run_guarded(script, str(path), str(number), str(out), cpu_s=TILES_CPU_S, memory_bytes=TILES_BYTES):
             raise InputError(f"{path}: not a complete FITS file: {fault}")
         return np.asarray(np.load(out))

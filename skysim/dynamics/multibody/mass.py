@@ -8,6 +8,7 @@ from typing import Any
 
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError
@@ -69,14 +70,14 @@ def declare_mass(bus: Any, model: Any, vehicle: VehicleConfig, path: Path) -> Ma
     center_bus = (declared.mass_kg * declared.center_m - carried.mass_kg * carried.center_m) / mass
     own_inertia = inertia - carried.inertia_kg_m2 - parallel_axis(mass, center_bus)
     subject = f"vehicle.inertia: less what the bus carries ({path}), its"
-    if vehicle.camera_m is not None and lever_is_to_blame(own_inertia, model, np.array(vehicle.camera_m)):
+    if vehicle.camera_m is not None and is_lever_too_long(own_inertia, model, np.array(vehicle.camera_m)):
         distance_m = np.linalg.norm(vehicle.camera_m)
         subject = f"vehicle.camera: with the camera {distance_m:.3g} m from the bearing, the bus's ({path})"
     set_inertial(bus, mass, center_bus, own_inertia, subject)
     return declared
 
 
-def lever_is_to_blame(bus_inertia_kg_m2: Floats, model: Any, camera_m: Floats) -> bool:
+def is_lever_too_long(bus_inertia_kg_m2: Floats, model: Any, camera_m: Floats) -> bool:
     """Whether the bus's inertia is impossible only because the scene puts the camera's housing far from the bearing."""
     carrier = model.cam_bodyid[model.camera(CAMERA).id]
     if carrier == model.body("bus").id:
@@ -112,7 +113,7 @@ def unbalance(model: Any, joints: list[Any], wheels: WheelsConfig, path: Path) -
         )
 
 
-def is_possible(moments: Floats) -> bool:
+def is_possible(moments: NDArray[Any]) -> bool:
     """Whether a rigid body can have these principal moments, in ascending order."""
     return bool(moments[0] > 0 and moments[2] <= (moments[0] + moments[1]) * (1 + 1e-12))
 

@@ -1,13 +1,12 @@
 """Run a script on an untrusted file in a child process with limits: libraries in C may crash, hang or fill memory.
 
-The child is `python -m skysim.core.guarded CPU_S MEMORY_BYTES SCRIPT ARGUMENTS`. It imports this module, then the
+The child is `python -m skysim.core.guard.process CPU_S MEMORY_BYTES SCRIPT ARGUMENTS`. It imports this module, then the
 script as a file, without the packages that contain it.
 """
 
 from __future__ import annotations
 
 import os
-import resource
 import runpy
 import signal
 import subprocess
@@ -51,6 +50,8 @@ def run_guarded(script: Path, *arguments: str, cpu_s: int, memory_bytes: int) ->
 
 def main() -> None:
     """The child: set the limits, then run the script with its arguments."""
+    import resource  # not on every system, and the parent does without
+
     cpu_s, memory_bytes, script, *arguments = sys.argv[1:]
     with suppress(ValueError, OSError):  # a system without this limit, or with a lower one
         resource.setrlimit(resource.RLIMIT_AS, (int(memory_bytes),) * 2)
