@@ -8,6 +8,7 @@ from typing import Any
 
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError
@@ -81,7 +82,7 @@ def lever_is_to_blame(bus_inertia_kg_m2: Floats, model: Any, camera_m: Floats) -
     carrier = model.cam_bodyid[model.camera(CAMERA).id]
     if carrier == model.body("bus").id:
         return False
-    without_lever: Floats = bus_inertia_kg_m2 + parallel_axis(model.body_subtreemass[carrier], camera_m)
+    without_lever = bus_inertia_kg_m2 + parallel_axis(model.body_subtreemass[carrier], camera_m)
     return not is_possible(np.linalg.eigvalsh(bus_inertia_kg_m2)) and is_possible(np.linalg.eigvalsh(without_lever))
 
 
@@ -112,7 +113,7 @@ def unbalance(model: Any, joints: list[Any], wheels: WheelsConfig, path: Path) -
         )
 
 
-def is_possible(moments: Floats) -> bool:
+def is_possible(moments: NDArray[Any]) -> bool:
     """Whether a rigid body can have these principal moments, in ascending order."""
     return bool(moments[0] > 0 and moments[2] <= (moments[0] + moments[1]) * (1 + 1e-12))
 
