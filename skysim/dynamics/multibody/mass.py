@@ -82,7 +82,7 @@ def is_lever_too_long(bus_inertia_kg_m2: Floats, model: Any, camera_m: Floats) -
     carrier = model.cam_bodyid[model.camera(CAMERA).id]
     if carrier == model.body("bus").id:
         return False
-    without_lever: Floats = bus_inertia_kg_m2 + parallel_axis(model.body_subtreemass[carrier], camera_m)
+    without_lever = bus_inertia_kg_m2 + parallel_axis(model.body_subtreemass[carrier], camera_m)
     return not is_possible(np.linalg.eigvalsh(bus_inertia_kg_m2)) and is_possible(np.linalg.eigvalsh(without_lever))
 
 
