@@ -12,6 +12,7 @@ import contextlib
 import datetime
 import io
 import os
+import re
 import struct
 import sys
 import tempfile
@@ -33,6 +34,8 @@ from skysim.core.guard.process import run_guarded
 FITS_SUFFIXES = (".fits", ".fit", ".fts")
 FITS_MAGIC = b"SIMPLE  ="  # start of every FITS file; a compressed one differs, which astropy would unpack
 MAX_HDUS = 1000  # that are searched for an image
+CARD_BYTES, CARDS_READ = 80, 1 << 16  # of a header's line; lines that are searched together
+AXES, MAX_AXES = re.compile(rb"NAXIS *= *(\d+)"), 999  # FITS standard 4.0, section 4.4.1.1
 MAX_COLUMNS = 999  # of a table (FITS standard 4.0, section 7.3.1)
 TILES_CPU_S, TILES_BYTES = 10, 1 << 31  # for a compressed image
 
@@ -46,8 +49,22 @@ def open_fits(path: Path) -> Iterator[BinaryIO]:
         warnings.simplefilter("error", AstropyWarning)  # "file may have been truncated" is one
         if file.read(len(FITS_MAGIC)) != FITS_MAGIC:
             raise InputError(f"{path}: not a complete FITS file; allowed: one that begins with SIMPLE, not compressed")
+        check_axes(path, file)
         file.seek(0)
         yield file
+
+
+def check_axes(path: Path, file: BinaryIO) -> None:
+    """Raise InputError for a header of more axes than the standard has: astropy makes a list of as many as it says.
+
+    Every card of every header is at a multiple of 80 bytes; a hit among pixels is refused too, but is as good as
+    impossible.
+    """
+    file.seek(0)
+    while chunk := file.read(CARD_BYTES * CARDS_READ):
+        for hit in AXES.finditer(chunk):
+            if hit.start() % CARD_BYTES == 0 and int(hit[1]) > MAX_AXES:
+                raise InputError(f"{path}: NAXIS {int(hit[1])}; allowed: up to {MAX_AXES} axes")
 
 
 def read_fits(path: Path) -> NDArray:

@@ -70,6 +70,18 @@ def test_a_guarded_script_has_limits(tmp_path: Path, code: str, told: str) -> No
     assert guarded.run_guarded(tmp_path / "script.py", cpu_s=1, memory_bytes=1 << 29) == told
 
 
+@pytest.mark.parametrize("number", [0, 1])
+def test_more_axes_than_the_standard_has_are_refused_at_once(tmp_path: Path, number: int) -> None:
+    """astropy makes a list of as many entries as the header says."""
+    path = tmp_path / "axes.fits"
+    fits.HDUList([fits.PrimaryHDU(), fits.CompImageHDU(np.zeros((32, 32), np.int16))]).writeto(path)
+    data = path.read_bytes()
+    start = [hit.start() for hit in re.finditer(b"NAXIS   = ", data) if hit.start() % 80 == 0][number]
+    path.write_bytes(data[: start + 10] + b"2147483647".rjust(20) + data[start + 30 :])
+    with pytest.raises(InputError, match=r"axes\.fits: NAXIS 2147483647; allowed: up to 999 axes$"):
+        images.read_image(path)
+
+
 def test_a_guarded_script_that_waits_is_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(guarded, "WALL_S", 0.5)
     (tmp_path / "script.py").write_text("import time; time.sleep(60)")
