@@ -26,6 +26,7 @@ PARSERS = {  # by what it calls, whatever its name
 BYTES = ("read_text", "read_bytes")  # of any path
 OURS = "what skysim itself has written, for its own process or folder"
 SHIPPED = "a file that comes along, each of which a test reads"
+GUARDED = "runs in a child process with limits, whose end of any kind is an error of the file"
 SOURCES = "reads bytes for their digest alone"
 OUT_OF_REACH = {
     "skysim.apps.cli.commands.study.load_stored_plan": "the store is read by `open_store`, the study by `loader.load`",
@@ -34,6 +35,9 @@ OUT_OF_REACH = {
     "skysim.apps.gui.worker.export.frame_files": "copies a run's files",
     "skysim.apps.gui.page.panels.monte_carlo.MonteCarloPanel.study_file": OURS,
     "skysim.apps.gui.worker.study_process.monte_carlo": "values of the page's form, checked by `loader.load`",
+    "skysim.core.guard.fits_tiles.decode": GUARDED,
+    "skysim.dynamics.multibody.mjcf_trial.run_trial": GUARDED,
+    "skysim.core.images.decode_tiles": "what that child has written",
     "skysim.core.images.LiveCamera.__init__": "a device, decoded by OpenCV",
     "skysim.experiments.papers.published.read": SHIPPED,
     "skysim.sources.photometry.stellar_sequence": SHIPPED,
