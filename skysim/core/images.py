@@ -34,7 +34,7 @@ from skysim.core.guard.process import run_guarded
 FITS_SUFFIXES = (".fits", ".fit", ".fts")
 FITS_MAGIC = b"SIMPLE  ="  # start of every FITS file; a compressed one differs, which astropy would unpack
 MAX_HDUS = 1000  # that are searched for an image
-CARD_BYTES, CARDS_READ = 80, 1 << 16  # of a header's line; lines that are searched together
+CARD_BYTES = 80  # a line of a header
 AXES, MAX_AXES = re.compile(rb"NAXIS *= *(\d+)"), 999  # FITS standard 4.0, section 4.4.1.1
 MAX_COLUMNS = 999  # of a table (FITS standard 4.0, section 7.3.1)
 TILES_CPU_S, TILES_BYTES = 10, 1 << 31  # for a compressed image
@@ -49,22 +49,23 @@ def open_fits(path: Path) -> Iterator[BinaryIO]:
         warnings.simplefilter("error", AstropyWarning)  # "file may have been truncated" is one
         if file.read(len(FITS_MAGIC)) != FITS_MAGIC:
             raise InputError(f"{path}: not a complete FITS file; allowed: one that begins with SIMPLE, not compressed")
-        check_axes(path, file)
         file.seek(0)
+        check_axes(path, file)
         yield file
 
 
-def check_axes(path: Path, file: BinaryIO) -> None:
-    """Raise InputError for a header of more axes than the standard has: astropy makes a list of as many as it says.
+def check_axes(path: Path, file: BinaryIO, start: int = 0) -> None:
+    """Refuse the header that begins at `start` if it has more axes than the standard.
 
-    Every card of every header is at a multiple of 80 bytes; a hit among pixels is refused too, but is as good as
-    impossible.
+    astropy makes a list of as many entries as NAXIS says when it opens a header. Raises InputError; the file is left
+    where it was.
     """
-    file.seek(0)
-    while chunk := file.read(CARD_BYTES * CARDS_READ):
-        for hit in AXES.finditer(chunk):
-            if hit.start() % CARD_BYTES == 0 and int(hit[1]) > MAX_AXES:
-                raise InputError(f"{path}: NAXIS {int(hit[1])}; allowed: up to {MAX_AXES} axes")
+    before = file.tell()
+    file.seek(start)
+    while (card := file.read(CARD_BYTES)) and card.rstrip() != b"END":
+        if (hit := AXES.match(card)) and int(hit[1]) > MAX_AXES:
+            raise InputError(f"{path}: NAXIS {int(hit[1])}; allowed: up to {MAX_AXES} axes")
+    file.seek(before)
 
 
 def read_fits(path: Path) -> NDArray:
@@ -84,6 +85,8 @@ def read_fits(path: Path) -> NDArray:
                 check_pixels(path, int(hdu.size) // 8)
                 if getattr(hdu, "is_image", False) and hdu.header.get("NAXIS", 0) > 0:
                     return np.ascontiguousarray(hdu.data.astype(hdu.data.dtype.newbyteorder("=")))
+                place = hdu.fileinfo()
+                check_axes(path, file, place["datLoc"] + place["datSpan"])  # of the next header, before it is opened
     except InputError:
         raise
     except Exception as error:  # a damaged header makes astropy raise exceptions of many types, KeyError too

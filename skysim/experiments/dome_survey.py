@@ -26,7 +26,7 @@ from estimator.core.types import Centroids
 from estimator.trackers.pipeline import Clock, Settings, detect_and_centroid
 from skysim.core.errors import InputError
 from skysim.core.random_streams import random_stream
-from skysim.core.types import Floats, Frame, Trajectory, Truth
+from skysim.core.types import Floats, Frame, Truth
 from skysim.core.units import quantity
 from skysim.experiments.configs import with_config
 from skysim.experiments.dome_survey_naming import (
@@ -40,7 +40,7 @@ from skysim.experiments.dome_survey_naming import (
 from skysim.scene.light import DomeConfig
 from skysim.scene.scene import Scene
 from skysim.simulation import exposure
-from skysim.simulation.testbed import MARGIN_S, Testbed, exposure_window
+from skysim.simulation.testbed import Testbed
 from skysim.tracking import onboard_model
 from skysim.tracking import settings as tracker_settings
 from skysim.tracking.dome_map_file import DomeMap
@@ -129,8 +129,7 @@ def render_stops(testbed: Testbed, lab_from_body: Rotation, first: int = 0) -> I
     """Render a frame at each attitude with the vehicle at rest. `first` is the index of the first frame, which also
     selects its noise."""
     for n, attitude in enumerate(lab_from_body):
-        end_s = exposure_window(testbed.scene, first + n).close_s(testbed.scene.camera.height_px) + MARGIN_S
-        yield exposure.render_frame(replace(testbed, trajectory=Trajectory.at_rest(attitude, end_s)), first + n)
+        yield exposure.render_frame(testbed.at_rest(attitude, first + n), first + n)
 
 
 def take_survey_frames(

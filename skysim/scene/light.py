@@ -286,3 +286,6 @@ class StrayLightConfig(ConfigModel):
 
 
 Glow = Annotated[UniformGlowConfig | SkyGlowConfig | MoonGlowConfig | StrayLightConfig, Field(discriminator="kind")]
+
+
+Light = DomeConfig | StarsConfig | CollimatedDisplayConfig

@@ -14,7 +14,7 @@ from pydantic import AfterValidator, Field, model_validator
 
 from skysim.core.units import ConfigModel, Number, Time, in_utc
 from skysim.scene.camera import CameraConfig
-from skysim.scene.light import CollimatedDisplayConfig, DomeConfig, Glow, StarsConfig
+from skysim.scene.light import DomeConfig, Glow, Light
 from skysim.scene.motion import MotionConfig, PointingConfig
 from skysim.scene.tracker import FilterConfig, SurveyErrorsConfig, TrackerConfig
 from skysim.scene.vehicle import SiteConfig, VehicleConfig
@@ -71,7 +71,7 @@ class Scene(ConfigModel):
     site: SiteConfig = SiteConfig()
     vehicle: VehicleConfig
     motion: MotionConfig
-    light: Annotated[DomeConfig | StarsConfig | CollimatedDisplayConfig, Field(discriminator="kind")]
+    light: Annotated[Light, Field(discriminator="kind")]
     background: tuple[Glow, ...] = ()
     camera: CameraConfig
     exposure: ExposureConfig

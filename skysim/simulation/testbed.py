@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -39,19 +40,21 @@ def exposure_window(scene: Scene, index: int, exposure_s: float | None = None) -
     """The exposure window of a frame, opened late by its jitter; as long as the scene's if no time is given."""
     shutter = scene.camera.shutter
     row_time_s = shutter.row_time_s if isinstance(shutter, RollingShutterConfig) else 0.0
-    late_s = scene.exposure.trigger_jitter_s
-    late_s *= random_stream(scene.seed, CAMERA_TIMING, index, 0).random() if late_s else 0.0
+    late_s = scene.exposure.trigger_jitter_s * timing_draws(scene.seed, index)[0]
     begin_s = scene.exposure.first_s + index / scene.exposure.rate_hz + late_s
     return Window(begin_s, scene.exposure.time_s if exposure_s is None else exposure_s, row_time_s)
 
 
 def time_tag_error_s(scene: Scene, index: int) -> float:
     """The time that the camera gives to a frame minus the true time of mid-exposure."""
-    exposure = scene.exposure
-    if not exposure.time_tag_jitter_s:
-        return exposure.time_tag_offset_s
-    noise = random_stream(scene.seed, CAMERA_TIMING, index, 1).standard_normal()
-    return float(exposure.time_tag_offset_s + exposure.time_tag_jitter_s * noise)
+    return scene.exposure.time_tag_offset_s + scene.exposure.time_tag_jitter_s * timing_draws(scene.seed, index)[1]
+
+
+@lru_cache(maxsize=64)
+def timing_draws(seed: int, index: int) -> tuple[float, float]:
+    """The uniform number of a frame's trigger and the normal one of its time tag; asked for in every control period."""
+    trigger, tag = (random_stream(seed, CAMERA_TIMING, index, part) for part in range(2))
+    return trigger.random(), float(tag.standard_normal())
 
 
 MARGIN_S = 2e-3  # simulated beyond the last exposure
@@ -112,6 +115,11 @@ class Testbed:
         """The same hardware in the run of another seed: other noise, jitter, timing and phases of the LEDs' clocks."""
         scene = self.scene.model_copy(update={"seed": seed})
         return replace(self, scene=scene, clocks=build_clocks(scene.light, self.sources, seed))
+
+    def at_rest(self, lab_from_body: Rotation, index: int = 0) -> Testbed:
+        """The test bed with the vehicle at rest at this attitude, until after the exposure of a frame."""
+        end_s = exposure_window(self.scene, index).close_s(self.scene.camera.height_px) + MARGIN_S
+        return replace(self, trajectory=Trajectory.at_rest(lab_from_body, end_s))
 
     @property
     def log(self) -> Telemetry:

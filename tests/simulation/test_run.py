@@ -12,7 +12,7 @@ from estimator.core.types import Attitude, Centroids
 from skysim.camera.optics import Optics
 from skysim.core.errors import InputError
 from skysim.core.random_streams import DETECTOR, random_stream
-from skysim.core.types import Trajectory, Truth
+from skysim.core.types import Truth
 from skysim.results import metrics
 from skysim.scene import loader
 from skysim.simulation import exposure, run
@@ -98,8 +98,7 @@ def test_a_shipped_scene_without_noise_and_fixed_pattern_is_solved(name: str) ->
     """Nothing but light: the wings of the images and the readout smear must not join the lights to one blob."""
     off = {key: "0" for key in ("prnu", "dsnu", "hot_pixels")} | {"noise": "false"}
     testbed = build_testbed(loader.load(name, {f"camera.detector.{key}": value for key, value in off.items()}))
-    at_rest = Trajectory.at_rest(testbed.trajectory.lab_from_body[0], 2.0)
-    frame, truth = exposure.render_frame(replace(testbed, trajectory=at_rest), 0)
+    frame, truth = exposure.render_frame(testbed.at_rest(testbed.trajectory.lab_from_body[0]), 0)
     # 18": the tracker takes apl_dome's stretched shell for a sphere.
     assert error_deg(build_tracker(testbed).solve(frame.image_dn).attitude, truth) < 5e-3
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -81,9 +79,9 @@ def test_flicker_differs_from_frame_to_frame_and_from_run_to_run() -> None:
     frames = []
     for seed in ("1", "2"):
         testbed = build_testbed(loader.load("afit_simsat", AT_REST | {"seed": seed}))
-        testbed = dataclasses.replace(testbed, trajectory=still(testbed, 60.0))
         for index in (0, 40, 80):
-            sources = exposure.render_frame(testbed, index)[1].sources
+            at_rest = testbed.at_rest(testbed.trajectory.lab_from_body[0], index)
+            sources = exposure.render_frame(at_rest, index)[1].sources
             frames.append(dict(zip(sources.id.tolist(), sources.electrons.tolist(), strict=True)))
     ids = sorted(set.intersection(*map(set, frames)))
     electrons = np.array([[frame[n] for n in ids] for frame in frames])
@@ -92,11 +90,6 @@ def test_flicker_differs_from_frame_to_frame_and_from_run_to_run() -> None:
     for a in range(len(frames)):
         for b in range(a):
             assert np.abs(electrons[a, dimmed] / electrons[b, dimmed] - 1).max() > 1e-3
-
-
-def still(testbed, duration_s):
-    """The test bed's first attitude, held."""
-    return type(testbed.trajectory).at_rest(testbed.trajectory.lab_from_body[0], duration_s)
 
 
 def test_exposures_begin_late_by_their_jitter_and_tags_err_as_the_scene_says() -> None:
@@ -112,7 +105,7 @@ def test_exposures_begin_late_by_their_jitter_and_tags_err_as_the_scene_says() -
     assert error_s.std() == pytest.approx(200e-6, rel=0.07)
     assert abs(np.corrcoef(late_s, error_s)[0, 1]) < 0.1
     testbed = build_testbed(scene)
-    frame, truth = exposure.render_frame(dataclasses.replace(testbed, trajectory=still(testbed, 2.0)), 0)
+    frame, truth = exposure.render_frame(testbed.at_rest(testbed.trajectory.lab_from_body[0]), 0)
     assert frame.t_mid_s - truth.t_s == pytest.approx(time_tag_error_s(scene, 0), abs=1e-12)
     assert truth.t_s == pytest.approx(exposure_window(scene, 0).middle_s(scene.camera.height_px), abs=1e-12)
 

@@ -18,12 +18,10 @@ import numpy as np
 from skysim.core.random_streams import LED_CLOCKS, random_stream
 from skysim.core.types import Floats, Sources
 from skysim.scene.leds import ClockConfig, DirectConfig, FibersConfig, Layout, LcdConfig
-from skysim.scene.light import CollimatedDisplayConfig, DomeConfig, StarsConfig
+from skysim.scene.light import DomeConfig, Light
 
 LONGEST_ON_S = 3600.0  # a controller was switched on up to so long before the run; many times any period
 PPM = 1e-6
-
-Light = DomeConfig | StarsConfig | CollimatedDisplayConfig
 
 
 @dataclass(frozen=True, slots=True)

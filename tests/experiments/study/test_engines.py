@@ -194,7 +194,7 @@ class FakePool:
 def test_trials_that_are_lost_with_a_worker_are_retried_alone(
     plan_: plan.Plan, monkeypatch: pytest.MonkeyPatch, deaths: int, failed: list[int]
 ) -> None:
-    """Four chunks of three trials. The first death is nobody's, as others are in flight; three more are trial 2's."""
+    """Four chunks of three trials. The first death counts for no trial, as others run; the next three for trial 2."""
     pool, chunks = FakePool(deaths), [(trials.Segment(0, {}, n, range(n, n + 3)),) for n in range(0, 12, 3)]
     queue = SimpleNamespace(next=lambda: chunks.pop(0) if chunks else (), report_time=lambda *_: None)
     monkeypatch.setattr(engines, "start_pool", lambda *_: pool)

@@ -18,7 +18,7 @@ from estimator.trackers.star_tracker import StarTracker
 from skysim.apps.gui.messages import Detection, FrameView, Light, PixelWindow, SceneInfo, TrackerResult
 from skysim.apps.gui.worker import geometry
 from skysim.core import quaternion
-from skysim.core.types import Floats, Frame, Trajectory, Truth
+from skysim.core.types import Floats, Frame, Truth
 from skysim.results import scoring
 from skysim.results import stretch as contrast
 from skysim.scene.light import StarsConfig
@@ -26,7 +26,7 @@ from skysim.scene.loader import load
 from skysim.scene.scene import Scene
 from skysim.simulation import exposure
 from skysim.simulation.run import FrameResult
-from skysim.simulation.testbed import MARGIN_S, Testbed, build_testbed, build_tracker, exposure_window
+from skysim.simulation.testbed import Testbed, build_testbed, build_tracker
 from skysim.tracking import factory
 from skysim.tracking import settings as tracker_settings
 from skysim.tracking.external.adapter import ExternalTracker
@@ -102,8 +102,7 @@ class Workbench:
         """Render a frame at the current attitude at rest, with independent noise; solve it if `solve`."""
         self.rendered_count += 1
         testbed = self.testbed.in_run(self.scene.seed + self.rendered_count)
-        end_s = exposure_window(testbed.scene, 0).close_s(testbed.scene.camera.height_px) + MARGIN_S
-        return self.render(replace(testbed, trajectory=Trajectory.at_rest(self.lab_from_body, end_s)), solve)
+        return self.render(testbed.at_rest(self.lab_from_body), solve)
 
     @property
     def result(self) -> TrackerResult | None:

@@ -14,7 +14,7 @@ from estimator.centroiding.centroid import CENTROIDERS
 from estimator.core.arrays import Ints
 from estimator.core.types import FramePriors
 from estimator.detection.detect import DETECTORS
-from skysim.core.types import Floats, Mount, Trajectory
+from skysim.core.types import Floats, Mount
 from skysim.dynamics import guidance
 from skysim.experiments.papers.afit.test_stand import light_positions_m, pair_angles_arcsec
 from skysim.experiments.papers.published import experiments
@@ -49,7 +49,6 @@ FITTED_IMAGING = {  # rolling shutter, exposure of a non-integer number of LED c
     "exposure.time": "16.667 ms",
     "light.led.intensity": "73.5 mcd",
 }
-HOLD_S = 10.0
 
 
 def build_test3(overrides: Mapping[str, str] | None = None) -> Testbed:
@@ -77,12 +76,11 @@ def photograph(
 
     The IMU's attitude is the true one. Images without all five LEDs are left out.
     """
-    resting = replace(testbed, trajectory=Trajectory.at_rest(lab_from_body, HOLD_S))
     camera = onboard_model.calibration(testbed.scene.camera)
     settings = tracker_settings.assumed_settings(testbed.scene)
     sightings = []
     for seed in rng.integers(2**62, size=images):  # each image in a run of its own, for a random phase of the LEDs
-        frame, truth = exposure.render_frame(resting.in_run(int(seed)), 0)
+        frame, truth = exposure.render_frame(testbed.in_run(int(seed)).at_rest(lab_from_body), 0)
         priors = FramePriors(None, frame.saturation_dn)
         blobs = DETECTORS["thesis"](frame.image_dn, priors=priors)
         lights = CENTROIDERS["cog"](frame.image_dn, blobs, settings.gain_e_dn, priors)

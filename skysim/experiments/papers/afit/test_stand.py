@@ -17,13 +17,13 @@ from estimator.core.errors import ImageError
 from estimator.core.types import FramePriors
 from estimator.detection import detect
 from skysim.camera.optics import Optics
-from skysim.core.types import Floats, Frame, Trajectory, Truth
+from skysim.core.types import Floats, Frame, Truth
 from skysim.core.units import ARCSEC_RAD
 from skysim.scene.light import DomeConfig
 from skysim.scene.loader import load
 from skysim.scene.scene import Scene
 from skysim.simulation import exposure
-from skysim.simulation.testbed import Testbed, build_obstacles, build_testbed, exposure_window, light_sources
+from skysim.simulation.testbed import Testbed, build_obstacles, build_testbed, light_sources
 from skysim.sources.dome.clocks import build_clocks
 from skysim.sources.dome.led import Emitter
 from skysim.tracking import onboard_model
@@ -66,9 +66,7 @@ def build_test_stand(scene: Scene) -> Testbed:
 
 def render_at_attitude(testbed: Testbed, lab_from_body: Rotation, rng: np.random.Generator) -> tuple[Frame, Truth]:
     """Render a frame at a fixed attitude, in a run of its own: the phase of the LEDs' cycle is random."""
-    testbed = testbed.in_run(int(rng.integers(2**62)))
-    path = Trajectory.at_rest(lab_from_body, exposure_window(testbed.scene, 0).close_s(testbed.scene.camera.height_px))
-    return exposure.render_frame(replace(testbed, trajectory=path), 0)
+    return exposure.render_frame(testbed.in_run(int(rng.integers(2**62))).at_rest(lab_from_body), 0)
 
 
 def gray_levels(frame: Frame, testbed: Testbed) -> NDArray[np.uint8]:
