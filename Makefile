@@ -19,6 +19,7 @@ setup: $(READY)
 
 demo: $(READY)
 	$(BIN)/skysim run afit_simsat --out out/afit_simsat
+	$(BIN)/skysim run afit_simsat_ideal --frames 20 --out out/afit_simsat_ideal
 	$(BIN)/skysim run shefex2 --out out/shefex2
 
 test: $(READY)

@@ -44,7 +44,7 @@ def main(duration_s: float, rate_hz: float) -> None:
         late_s = max(late_s, abs(result.frame.t_mid_s - first_s - (n - 1) / rate_hz))
         attitude = result.report.attitude.cam_from_ref if result.report else None
         solved += attitude is not None
-        wrong += attitude is not None and metrics.is_wrong(attitude, result.truth.cam_from_lab)
+        wrong += attitude is not None and metrics.is_wrong((attitude * result.truth.cam_from_lab.inv()).magnitude())
         if n % round(60 * rate_hz) == 0 or n == frames:
             gc.collect()
             memory_mb.append(process.memory_info().rss / 1e6)

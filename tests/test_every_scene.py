@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import mujoco
 import numpy as np
 import pytest
@@ -10,12 +12,21 @@ from scipy.spatial.transform import Rotation
 from estimator.attitude.dome_map import project
 from skysim.core.paths import SCENES
 from skysim.dynamics import multibody
+from skysim.experiments.configs import with_config
+from skysim.experiments.study.execution.setups import Setup
+from skysim.experiments.study.execution.trials import run_frame_trial
+from skysim.experiments.study.plan import FrameTrial
+from skysim.results import metrics
 from skysim.scene import loader
+from skysim.scene.light import DomeConfig
 from skysim.scene.vehicle import VehicleConfig
 from skysim.simulation import exposure, run
-from skysim.simulation.testbed import Testbed, build_tracker, exposure_window
+from skysim.simulation.testbed import Testbed, build_testbed, build_tracker, exposure_window
+from skysim.tracking import onboard_model
 
-NAMES = sorted(path.stem for path in SCENES.glob("*.yaml"))
+ALL_NAMES = sorted(path.stem for path in SCENES.glob("*.yaml"))
+IDEAL = [name for name in ALL_NAMES if name.endswith("_ideal")]
+NAMES = [name for name in ALL_NAMES if name not in IDEAL]
 # What a published experiment shows instead of five sources and an attitude.
 PAIR, GRID = "afit_test2", "afit_test1"
 SHOWN = {PAIR: 2, GRID: 9}  # LEDs in its first frame
@@ -117,8 +128,26 @@ def test_its_first_frames_are_solved_and_right(testbed: Testbed) -> None:
             assert testbed.scene.name != PAIR or answer.status == "too few stars detected"
             continue
         assert answer.status == "solved"
-        error = (answer.cam_from_ref * shot.truth.cam_from_lab.inv()).magnitude()
-        assert np.degrees(error) < 10 / 60  # more is what the project calls wrong
+        true_attitude = shot.truth.cam_from_lab
+        error_rad = (answer.cam_from_ref * true_attitude.inv()).magnitude()
+        nees = metrics.normalized_error_squared(answer.cam_from_ref, true_attitude, answer.covariance_rad2)
+        assert not metrics.is_wrong(error_rad, nees)
+
+
+@pytest.mark.parametrize("name", IDEAL)
+def test_an_ideal_scene_s_tracker_knows_its_dome(name: str) -> None:
+    """It differs from its base in the tracker alone, whose map and lever are the true ones."""
+    ideal, base = loader.load(name), loader.load(name.removesuffix("_ideal"))
+    assert ideal.model_copy(update={"tracker": base.tracker, "title": base.title, "name": base.name}) == base
+    testbed = build_testbed(ideal)
+    leds, lever = (
+        onboard_model.assumed_dome(ideal, ideal.light, testbed.sources),
+        onboard_model.assumed_lever(ideal, testbed.mount),
+    )
+    np.testing.assert_array_equal(leds.position_m, testbed.sources.place[:, :3])
+    np.testing.assert_array_equal(lever.camera_body_m, testbed.mount.camera_body_m)
+    assert (leds.sigma_m, lever.sigma_m) == (0, 0)
+    assert onboard_model.assumed_lever(base, testbed.mount).sigma_m > 0
 
 
 def test_a_square_of_equal_leds_is_never_solved_wrong() -> None:
@@ -130,8 +159,45 @@ def test_a_square_of_equal_leds_is_never_solved_wrong() -> None:
             assert np.degrees((answer.cam_from_ref * shot.truth.cam_from_lab.inv()).magnitude()) < 10 / 60
 
 
+# Else its flight would render and solve.
+NO_EYES = {"simsat_bump": {"filter": "null", "motion.control.feedback": "truth"}}
+# Under a dome: range of the tilt in which the tracker has enough LEDs, where it is not 0 to 25.
+TILT_DEG = {"afit_test3": (0.0, 3.0), "nps_tas2": (0.0, 4.0), "apl_dome": (0.0, 60.0)}
+BENCH_DEG = (87.0, 90.0)  # elevation of the camera below the collimated display
+SURVEYS, FRAMES = 100, 3
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", [name for name in ALL_NAMES if name.removesuffix("_ideal") not in SHOWN])
+def test_its_claimed_error_is_the_one_it_makes(name: str) -> None:
+    """NEES e^T P^-1 e is 3 on average where the claimed covariance P is that of the errors e.
+
+    300 frames at random attitudes and the median rate of the scene's motion; under a dome with a new survey every
+    three, as survey and lever are the same in all frames of one laboratory.
+    """
+    flown = run.prepare(loader.load(name, NO_EYES.get(name)))
+    t_s = [exposure_window(flown.scene, index).open_s for index in range(flown.scene.exposure.frames)]
+    turned = flown.trajectory.attitude_at(np.array(t_s)).inv() * flown.trajectory.attitude_at(np.array(t_s) + 0.01)
+    trial = FrameTrial(
+        kind="frames",
+        dec_deg=BENCH_DEG if flown.scene.light.kind == "collimated_display" else (-90.0, 90.0),
+        tilt_deg=TILT_DEG.get(name.removesuffix("_ideal"), (0.0, 25.0)),
+        rate_deg_s=float(np.degrees(np.median(turned.magnitude())) / 0.01),
+    )
+    testbed, outcomes = build_testbed(loader.load(name)), []
+    for survey in range(SURVEYS):
+        scene = with_config(testbed.scene, "tracker.survey", seed=survey)
+        if survey == 0 or isinstance(scene.light, DomeConfig):
+            tracker = build_tracker(replace(testbed, scene=scene))
+        setup = Setup(replace(testbed, scene=scene), tracker, trial, "")
+        outcomes += [run_frame_trial(setup, survey * FRAMES + frame) for frame in range(FRAMES)]
+    nees = np.array([one.nees for one in outcomes if one.solved])
+    assert sum(one.wrong for one in outcomes) == 0
+    assert len(nees) > 0.8 * len(outcomes)
+    assert 2.5 < nees.mean() < 3.5
+
+
 STEERED = [name for name in NAMES if loader.load(name).motion.control]
-NO_EYES = {"simsat_bump": {"filter": "null", "motion.control.feedback": "truth"}}  # which would render and solve
 
 
 @pytest.fixture(scope="module", params=STEERED)

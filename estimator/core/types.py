@@ -140,6 +140,7 @@ class Attitude:
     match           : the stars used; None unless solved
     rms_px          : RMS residual of the matched centroids; NaN unless solved
     camera          : the calibration used, fitted where it was uncertain; None unless solved
+    systematic_rad2 : (3, 3) the part of covariance_rad2 that is common to successive frames; None if there is none
     """
 
     status: str
@@ -148,6 +149,7 @@ class Attitude:
     match: StarMatch | None = None
     rms_px: float = float("nan")
     camera: Camera | None = None
+    systematic_rad2: Floats | None = None
 
     @property
     def solved(self) -> bool:
@@ -168,7 +170,8 @@ class FilterState:
 
     body_from_ref : reference (ICRS, or lab under the dome) to body
     bias_rad_s    : (3,) of the gyro, in body axes
-    covariance    : (6, 6) of the small rotation in body axes (rad^2), then of the bias (rad^2/s^2)
+    covariance    : (6, 6) of the small rotation in body axes (rad^2), then of the bias (rad^2/s^2), with the
+        systematic error of the last solution used
     """
 
     t_s: float

@@ -101,6 +101,7 @@ class _Solution(NamedTuple):
 
     body_from_ref: Rotation
     covariance_rad2: Floats
+    systematic_rad2: Floats
 
 
 class _Segment(NamedTuple):
@@ -131,6 +132,11 @@ class AttitudeFilter:
     sigma_attitude_rad, sigma_bias_rad_s : standard deviations at the start, one number or (3,) in body axes
     floor_rad          : added in quadrature to every solution's covariance, for errors common to its stars
     gate_sigma         : a solution is refused if its distance is less probable than so many sigma of a scalar Gaussian
+
+    Systematic errors. An error that all solutions share (of a survey, of a lever arm) does not average out: the
+    filter's attitude tends to it. Its covariance S is part of a solution's covariance, as if it were noise, so that
+    solutions of other stars pass the gate; and the S of the last solution is added to the covariance that `state`
+    reports. For many solutions of one attitude the sum tends to S, for a single one it is up to twice S.
 
     Saturation. While the gyro is at its rate limit, the true rate can be anything above it. The rate error is assumed
     constant throughout the saturation, with a standard deviation on each axis as large as the measured rate
@@ -172,12 +178,14 @@ class AttitudeFilter:
         self._segments = [_Segment(self._current, np.empty((0, 5)), None)]  # rows of _checked_samples
         self._refused: list[tuple[_State, _Solution]] = []  # in a row, each agrees with the one before
         self._measured_rad_s = np.zeros(3)
+        self._systematic_rad2 = np.zeros((3, 3))
 
     @property
     def state(self) -> FilterState:
-        """Attitude, bias and their covariance after the last gyro sample."""
-        state = self._current
-        return FilterState(state.t_s, state.body_from_ref, state.bias_rad_s.copy(), state.covariance.copy())
+        """Attitude, bias and their covariance after the last gyro sample, with the systematic error."""
+        state, covariance = self._current, self._current.covariance.copy()
+        covariance[:3, :3] += self._systematic_rad2
+        return FilterState(state.t_s, state.body_from_ref, state.bias_rad_s.copy(), covariance)
 
     @property
     def body_from_ref(self) -> Rotation:
@@ -217,15 +225,23 @@ class AttitudeFilter:
         self._segments[-1] = last._replace(samples=np.concatenate([last.samples, samples]))
         self._trim_history(float(samples[-1, 0]) - HISTORY_S)
 
-    def update(self, t_s: float, body_from_ref_measured: Rotation, covariance_rad2: ArrayLike) -> Update:
+    def update(
+        self,
+        t_s: float,
+        body_from_ref_measured: Rotation,
+        covariance_rad2: ArrayLike,
+        systematic_rad2: Floats | None = None,
+    ) -> Update:
         """Apply a star tracker's solution for the current or a past time, then repropagate from there to the present.
 
         covariance_rad2 : (3, 3) of the small rotation error of the solution, in body axes
+        systematic_rad2 : (3, 3) the part of it that is common to successive solutions; None for 0
 
         Raises ValueError for a covariance that is not symmetric and positive definite, or a time after the last sample.
         """
         covariance = _checked_covariance(covariance_rad2) + self._floor_rad2 * np.eye(3)
-        solution, now_s = _Solution(body_from_ref_measured, covariance), self._current.t_s
+        systematic = np.zeros((3, 3)) if systematic_rad2 is None else systematic_rad2
+        solution, now_s = _Solution(body_from_ref_measured, covariance, systematic), self._current.t_s
         if not t_s <= now_s + ROUNDING_S:
             raise ValueError(f"update: a solution at {t_s} s; allowed: up to the last gyro sample, {now_s} s")
         if t_s < self._segments[0].state.t_s:
@@ -252,6 +268,7 @@ class AttitudeFilter:
         else:
             return Update(OUTSIDE_GATE, residual, math.sqrt(distance2))
         self._refused = []
+        self._systematic_rad2 = (self._segments[-1].solution or solution).systematic_rad2
         self._current = self._propagate_state(self._segments[-1].state, self._segments[-1].samples)
         return Update(status, residual, math.sqrt(distance2))
 

@@ -145,13 +145,18 @@ class DomeTracker:
         cam_from_lab = self.lever.cam_from_body * body_from_lab
         R_cam_from_body = self.lever.cam_from_body.as_matrix()
         residual = self._residual_px(centroids, observed, star, body_from_lab)
+        covariance = misfit * R_cam_from_body @ covariance @ R_cam_from_body.T
+        lever_covariance = self._lever_covariance(cam_from_lab, star)
+        # The LEDs' share of the error variance of a ray: of the covariance too, if it is the same for all rays.
+        survey_share = float(np.mean(self.led_sigma_rad**2 / sigma_rad[observed] ** 2))
         return Attitude(
             "solved",
             cam_from_lab,
-            misfit * R_cam_from_body @ covariance @ R_cam_from_body.T + self._lever_covariance(cam_from_lab, star),
+            covariance + lever_covariance,
             StarMatch(observed, star, cam_from_lab, match.log10_chance),
             float(np.sqrt(np.mean(residual**2))),
             self.camera,
+            survey_share * covariance + lever_covariance,
         )
 
     def _sigma_rad(self, centroids: Centroids, rays: Floats, solver: str) -> Floats:

@@ -219,7 +219,7 @@ class FrameRow:
 
     truth_deg, estimate_deg : (RA, Dec, roll) of the camera under the stars, (roll, pitch, yaw) of the vehicle
         under the dome
-    wrong : solved, but with an error of more than ten arcminutes
+    wrong : solved, but off by more than ten arcminutes and by more than the tracker claims (`metrics.is_wrong`)
     cross_sigma_arcsec, roll_sigma_arcsec : standard deviations that the tracker claims;  log10_chance : of its
         matches
     filter : verdict of the attitude filter on the solution; empty without a filter

@@ -27,7 +27,7 @@ from skysim.tracking.external.interface import FAILED, SOLVED
 class TrackerScore:
     """Statistics of one tracker.
 
-    right    : fraction of all frames solved within ten arcminutes, with its 95% interval
+    right    : fraction of all frames solved and not wrong (`metrics.is_wrong`), with its 95% interval
     wrong    : solutions farther off;  refused : no solution;  failed : exception, timeout, crash or invalid output
     refusals : count of each status other than solved, most frequent first
     errors   : arcseconds, over correct solutions only; wrong ones are counted instead

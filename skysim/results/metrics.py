@@ -21,6 +21,9 @@ from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
 
 WRONG_RAD = np.radians(10 / 60)  # limit of PTASE for a wrong attitude: ten arcminutes
+WRONG_AS_CLAIMED_RAD = np.radians(1)  # limit for an error that the tracker's covariance allows
+OVERCONFIDENCE_PROBABILITY = 1e-8  # with which a correct covariance allows an error counted as overconfident
+OVERCONFIDENT_NEES = float(scipy.special.chdtri(3, OVERCONFIDENCE_PROBABILITY))
 
 
 def cross_and_roll_rad(cam_from_ref_estimate: Rotation, cam_from_ref_truth: Rotation) -> tuple[float, float]:
@@ -33,9 +36,16 @@ def cross_and_roll_rad(cam_from_ref_estimate: Rotation, cam_from_ref_truth: Rota
     return float(np.hypot(x, y)), float(z)
 
 
-def is_wrong(cam_from_ref_estimate: Rotation, cam_from_ref_truth: Rotation) -> bool:
-    """Whether the rotation angle between estimate and truth exceeds ten arcminutes: worse than no solution."""
-    return bool((cam_from_ref_estimate * cam_from_ref_truth.inv()).magnitude() > WRONG_RAD)
+def is_wrong(error_rad: float, nees: float = np.inf) -> bool:
+    """Whether an attitude is worse than none: off by more than ten arcminutes, and by more than the tracker claims.
+
+    error_rad : the rotation angle between estimate and truth
+    nees      : `normalized_error_squared` of the estimate; infinite without a covariance
+
+    A few LEDs of an imperfect survey give a roll that is uncertain by many arcminutes. If the covariance allows the
+    error (chi-square with three degrees of freedom, probability 1e-8), the limit is one degree.
+    """
+    return bool(error_rad > (WRONG_RAD if nees > OVERCONFIDENT_NEES else WRONG_AS_CLAIMED_RAD))
 
 
 def normalized_error_squared(
@@ -54,7 +64,6 @@ def normalized_error_squared(
 Columns = Mapping[str, NDArray[Any]]
 CONFIDENCE = 0.95
 RESAMPLES = 999
-OVERCONFIDENCE_PROBABILITY = 1e-8  # with which a correct covariance allows an error counted as overconfident
 DEFAULT_COVERAGE = 5  # "5 stars everywhere" (Padro 2012)
 
 
@@ -161,7 +170,7 @@ def overconfident(c: Columns) -> Summary:
     """
     # For a trial of many frames the column holds a mean NEES, which has another distribution.
     solved = np.isfinite(c["nees"]) & (c["frames"] == 1)
-    return proportion(np.sum(c["nees"][solved] > scipy.stats.chi2.isf(OVERCONFIDENCE_PROBABILITY, 3)), np.sum(solved))
+    return proportion(np.sum(c["nees"][solved] > OVERCONFIDENT_NEES), np.sum(solved))
 
 
 def proportion_of_frames(hits: NDArray[Any], frames: NDArray[Any]) -> Summary:
@@ -193,7 +202,7 @@ def response(name: str, where: str = "response") -> Response:
     """The function that computes the named statistic from the columns of trials. Raises InputError for other names.
 
     overconfident : proportion of the solutions with an error far outside their covariance
-    identified, wrong, refused : proportions of the frames: correct within ten arcminutes, wrong, without a solution
+    identified, wrong, refused : proportions of the frames: solved and not wrong (`is_wrong`), wrong, without a solution
     failed     : proportion of the trials that raised an exception
     coverage_N : proportion of the trials with at least N sources in the field of view; N is 5 if omitted
     otherwise a quantity and a statistic: stars_least, cross_arcsec_p95 (over all solutions, wrong ones included)

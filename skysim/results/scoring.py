@@ -45,8 +45,12 @@ def row(result: FrameResult, scene: Scene, mount: Mount, verdict: str = "") -> F
     if attitude.cam_from_ref is not None:
         cross, roll = metrics.cross_and_roll_rad(attitude.cam_from_ref, truth.cam_from_lab)
         estimate = angles_deg(attitude.cam_from_ref, scene, mount)
-        wrong = metrics.is_wrong(attitude.cam_from_ref, truth.cam_from_lab)
-        variance = np.diag(attitude.covariance_rad2) if attitude.covariance_rad2 is not None else np.full(3, np.nan)
+        covariance, nees = np.full((3, 3), np.nan), np.inf
+        if attitude.covariance_rad2 is not None:
+            covariance = attitude.covariance_rad2
+            nees = metrics.normalized_error_squared(attitude.cam_from_ref, truth.cam_from_lab, covariance)
+        wrong = metrics.is_wrong(np.hypot(cross, roll), nees)
+        variance = np.diag(covariance)
         cross_sigma, roll_sigma = float(np.sqrt(variance[:2].sum())), float(np.sqrt(variance[2]))
         chance = attitude.match.log10_chance if attitude.match else chance
     return FrameRow(

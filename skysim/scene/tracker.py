@@ -97,7 +97,7 @@ class TrackerConfig(ConfigModel):
     @model_validator(mode="after")
     def check_lever(self) -> TrackerConfig:
         if self.assumed_camera_body_m is not None and self.survey.lever_sigma_m:
-            raise ValueError("survey.lever_sigma: conflicts with assumed_camera_body; allowed: one of the two")
+            raise ValueError("survey.lever_sigma: conflicts with assumed_camera_body; allowed: 0, or the survey alone")
         return self
 
     @model_validator(mode="after")
@@ -111,7 +111,7 @@ class TrackerConfig(ConfigModel):
         }
         conflicts = [key for key, value in values.items() if value]
         if self.map and conflicts:
-            raise ValueError(f"{conflicts[0]}: conflicts with tracker.map, which contains it; allowed: one of the two")
+            raise ValueError(f"{conflicts[0]}: conflicts with tracker.map, which contains it; allowed: 0, or no map")
         return self
 
 

@@ -122,11 +122,14 @@ class Navigation:
         """
         if self.filter is None or solution.cam_from_ref is None or solution.covariance_rad2 is None:
             return solution.status
-        body_from_cam = self.body_from_cam.as_matrix()
-        covariance = body_from_cam @ solution.covariance_rad2 @ body_from_cam.T
+        R_body_from_cam = self.body_from_cam.as_matrix()
+        covariance = R_body_from_cam @ solution.covariance_rad2 @ R_body_from_cam.T
         turn_rad = self.time_tag_sigma_s * self.filter.rate_rad_s
         covariance += np.outer(turn_rad, turn_rad)
-        return self.filter.update(t_s, self.body_from_cam * solution.cam_from_ref, covariance).status
+        systematic = solution.systematic_rad2
+        if systematic is not None:
+            systematic = R_body_from_cam @ systematic @ R_body_from_cam.T
+        return self.filter.update(t_s, self.body_from_cam * solution.cam_from_ref, covariance, systematic).status
 
     def attitude_wxyz(self, feedback: str) -> Floats:
         """(4,) lab_from_body from the inertial navigator ("imu") or the filter."""

@@ -27,7 +27,7 @@ from skysim.tracking import dome_map_file, factory
 RARE = 1e-6  # the seeds are fixed: it fails for a wrong law alone
 SMALL = """
 schema: 1
-base: afit_simsat
+base: afit_simsat_ideal
 title: a small dome seen by a wide lens
 light:
   layout: {kind: poisson_disk, cap_deg: 24, spacing: "38 mm", hardware_seed: 3}

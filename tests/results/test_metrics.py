@@ -56,8 +56,19 @@ def test_error_does_not_depend_on_the_reference_frame(turn: tuple[float, float, 
 
 @pytest.mark.parametrize("axis", [(1, 0, 0), (0, 0.6, 0.8), (0, 0, -1)])
 def test_wrong_begins_at_ten_arc_minutes_about_any_axis(axis: tuple[float, ...]) -> None:
-    assert not metrics.is_wrong(turned(*(9.99 * ARCMIN_RAD * np.array(axis))), TRUTH)
-    assert metrics.is_wrong(turned(*(10.01 * ARCMIN_RAD * np.array(axis))), TRUTH)
+    for arcmin, wrong in ((9.99, False), (10.01, True)):
+        error = turned(*(arcmin * ARCMIN_RAD * np.array(axis))) * TRUTH.inv()
+        assert metrics.is_wrong(error.magnitude()) == wrong
+
+
+def test_an_error_that_the_tracker_claims_is_wrong_beyond_one_degree() -> None:
+    """Chi-square of 3 degrees of freedom exceeds x with probability erfc(sqrt(x / 2)) + sqrt(2 x / pi) e^(-x / 2)."""
+    limit = 40.13
+    tail = math.erfc(math.sqrt(limit / 2)) + math.sqrt(2 * limit / math.pi) * math.exp(-limit / 2)
+    assert tail == pytest.approx(1e-8, rel=1e-3)
+    cases = [(11, limit - 0.01, False), (11, limit + 0.01, True), (59.9, 3, False), (60.1, 3, True), (9, 1e9, False)]
+    for arcmin, nees, wrong in cases:
+        assert metrics.is_wrong(arcmin * ARCMIN_RAD, nees) == wrong
 
 
 def test_normalized_error_by_hand() -> None:

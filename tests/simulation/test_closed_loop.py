@@ -20,6 +20,7 @@ EARLY = {
     "motion.maneuver": f'[{{kind: hold, duration: "1.5 s"}}, {{{BUMP}}}, {{kind: hold, duration: "30 s"}}]',
     "exposure": '{time: "10 ms", rate_hz: 1, frames: 8, first: "0.4 s"}',
 }
+EXACT_MAP = {"tracker.survey.led_sigma": "0 mm", "tracker.survey.lever_sigma": "0 mm"}
 AFTER_S = 1.75  # the bump and the catch are over
 IMU_ALONE = {
     "filter": "null",
@@ -35,7 +36,7 @@ def prepared(name: str = "simsat_bump", **changes: str) -> Testbed:
 
 @pytest.fixture(scope="module")
 def bumped() -> Testbed:
-    return prepared(**EARLY)
+    return prepared(**EARLY | EXACT_MAP)
 
 
 def told(testbed: Testbed) -> Telemetry:
@@ -98,6 +99,16 @@ def test_the_filter_knows_what_it_does_not_know(bumped: Testbed) -> None:
     doubting = (telemetry.t_s > AFTER_S) & (telemetry.t_s < 2.4)
     assert (sigma_deg[doubting] > 0.5).all()
     assert (sigma_deg[telemetry.t_s > 2.45] < 0.01).all()
+
+
+def test_the_filter_allows_for_the_survey_s_error() -> None:
+    """An error of survey and lever that all solutions share does not average out, and the filter says so."""
+    telemetry = told(prepared(**EARLY))
+    late = telemetry.t_s > 7
+    assert in_sigma(telemetry)[late].max() < 4
+    assert telemetry.lab_from_filter is not None
+    error = (telemetry.lab_from_filter.inv() * telemetry.lab_from_body).magnitude()
+    assert np.degrees(error[late]).min() * 3600 > 60  # 0.5 mm of lever are 85 arcsec at 1.2 m
 
 
 def test_the_star_tracker_brings_attitude_and_bias_back(bumped: Testbed) -> None:

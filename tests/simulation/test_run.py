@@ -59,7 +59,7 @@ def prepared(name: str, **overrides: str) -> Testbed:
 
 
 def quiet(name: str, start: str) -> Testbed:
-    changes = {"afit_simsat": QUIET_DOME, "shefex2": QUIET_SKY}[name]
+    changes = {"afit_simsat_ideal": QUIET_DOME, "shefex2": QUIET_SKY}[name]
     return run.prepare(loader.load(name, changes | {"motion.start": start}))
 
 
@@ -84,7 +84,7 @@ def true_centroids(truth: Truth) -> Centroids:
 
 
 @pytest.mark.parametrize(
-    ("name", "start"), [("afit_simsat", s) for s in ATTITUDES] + [("shefex2", s) for s in POINTINGS]
+    ("name", "start"), [("afit_simsat_ideal", s) for s in ATTITUDES] + [("shefex2", s) for s in POINTINGS]
 )
 def test_a_noise_free_image_gives_the_true_attitude(name: str, start: str) -> None:
     testbed = quiet(name, start)
@@ -93,7 +93,7 @@ def test_a_noise_free_image_gives_the_true_attitude(name: str, start: str) -> No
     assert error_deg(build_tracker(testbed).solve(frame.image_dn).attitude, truth) < 1e-6
 
 
-@pytest.mark.parametrize("name", ["shefex2", "nps_tas2", "apl_dome"])
+@pytest.mark.parametrize("name", ["shefex2", "nps_tas2_ideal", "apl_dome_ideal"])
 def test_a_shipped_scene_without_noise_and_fixed_pattern_is_solved(name: str) -> None:
     """Nothing but light: the wings of the images and the readout smear must not join the lights to one blob."""
     off = {key: "0" for key in ("prnu", "dsnu", "hot_pixels")} | {"noise": "false"}
@@ -104,7 +104,7 @@ def test_a_shipped_scene_without_noise_and_fixed_pattern_is_solved(name: str) ->
 
 
 @pytest.mark.parametrize(
-    ("name", "start"), [("afit_simsat", s) for s in ATTITUDES] + [("shefex2", s) for s in POINTINGS]
+    ("name", "start"), [("afit_simsat_ideal", s) for s in ATTITUDES] + [("shefex2", s) for s in POINTINGS]
 )
 def test_true_centroids_give_the_true_attitude(name: str, start: str) -> None:
     testbed = quiet(name, start)
@@ -114,7 +114,7 @@ def test_true_centroids_give_the_true_attitude(name: str, start: str) -> None:
 
 def test_true_centroids_under_the_dome_give_the_attitude_to_machine_precision() -> None:
     # Reference §5: exact PnP noise-free, 1e-14 deg; here both sides know the very same LEDs.
-    testbed = quiet("afit_simsat", ATTITUDES[1])
+    testbed = quiet("afit_simsat_ideal", ATTITUDES[1])
     _, truth = exposure.render_frame(testbed, 0)
     assert error_deg(build_tracker(testbed).solve_centroids(true_centroids(truth)), truth) < 1e-12
 
@@ -145,7 +145,7 @@ def test_a_distorted_lens_that_the_tracker_knows_costs_nothing() -> None:
 def test_a_wrongly_believed_lever_costs_what_the_reference_says() -> None:
     """Reference §5: 1 mm of lateral lever is .047 deg across (5 LEDs); by geometry 1 mm / 1.22 m = .047 deg."""
     moved = {"tracker.assumed_camera_body": "['1 mm', '0 m', '381 mm']", "motion.start": "{roll_deg: 7}"}
-    testbed = run.prepare(loader.load("afit_simsat", QUIET_DOME | moved))
+    testbed = run.prepare(loader.load("afit_simsat_ideal", QUIET_DOME | moved))
     _, truth = exposure.render_frame(testbed, 0)
     error = error_deg(build_tracker(testbed).solve_centroids(true_centroids(truth)), truth)
     assert error == pytest.approx(np.degrees(1e-3 / 1.22), rel=0.15)

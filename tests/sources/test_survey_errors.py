@@ -209,7 +209,7 @@ def test_a_pupil_believed_aside_turns_the_attitude_by_its_shift_over_the_led_s_d
         (
             "afit_simsat",
             {"tracker.survey": "{lever_sigma: 1 mm}", "tracker.assumed_camera_body": "[0 m, 0 m, 0.4 m]"},
-            r"conflicts with assumed_camera_body; allowed: one of the two",
+            r"conflicts with assumed_camera_body; allowed: 0, or the survey alone",
         ),
     ],
 )

@@ -255,7 +255,7 @@ def test_the_filter_is_told_a_solution_in_its_own_axes() -> None:
 )
 def test_a_dome_that_no_tracker_can_work_under_is_told_in_one_line(changes: dict[str, str], why: str) -> None:
     """And it is rendered all the same: a lab may light one LED."""
-    testbed = build_testbed(loader.load("afit_simsat", changes))
+    testbed = build_testbed(loader.load("afit_simsat_ideal", changes))
     with pytest.raises(InputError, match=f"light: the star tracker cannot use .*: {why}") as refused:
         build_tracker(testbed)
     assert "\n" not in str(refused.value)

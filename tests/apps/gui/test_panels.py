@@ -128,7 +128,7 @@ def test_a_scene_s_file_outside_its_folder_is_refused(tmp_path: Path) -> None:
     outside = tmp_path / "secret.csv"
     outside.write_text("x")
     with pytest.raises(InputError, match=r"tracker\.map: .* allowed: a file in the scene's own folder"):
-        forms.validated_scene("afit_simsat", {"tracker.map": str(outside)})
+        forms.validated_scene("afit_simsat_ideal", {"tracker.map": str(outside)})
 
 
 def test_a_scene_is_saved_as_what_differs_and_nothing_is_overwritten(tmp_path: Path) -> None:

@@ -91,6 +91,21 @@ def test_the_rate_is_the_last_call_s_less_the_bias() -> None:
 # ---- The covariance ----
 
 
+def test_an_error_common_to_all_solutions_stays_and_is_claimed() -> None:
+    """Fifteen solutions with a common error of covariance S and noise of S / 9: NEES 3, less what S adds as noise."""
+    rng, common_rad2, nees = np.random.default_rng(15), TRACKER_RAD2, []
+    for _ in range(400):
+        mekf = AttitudeFilter(QUIET, 0.0, HOME, 1e-2, 0.0)
+        shifted = measured(HOME, common_rad2, rng)
+        for k in range(15):
+            mekf.propagate([k + 1.0], np.zeros((1, 3)), [False])
+            noisy = measured(shifted, common_rad2 / 9, rng)
+            assert mekf.update(k + 1.0, noisy, common_rad2 * 10 / 9, common_rad2).status == USED
+        error = error_rad(mekf.state, HOME)
+        nees.append(error @ np.linalg.solve(mekf.state.covariance[:3, :3], error))
+    assert np.mean(nees) == pytest.approx(3 * (1 + 1 / 135) / (1 + 10 / 135), abs=4 * np.sqrt(6 / 400))
+
+
 def test_the_covariance_obeys_riccati_s_equation_while_turning() -> None:
     gyro, rate = GyroModel(1e-4, 2e-4, 20.0), np.array([0.3, -0.8, 0.5])
     start = np.diag(np.array([1e-3, 2e-3, 3e-3, 1e-4, 2e-4, 3e-4]) ** 2)

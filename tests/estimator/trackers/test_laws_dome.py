@@ -216,6 +216,40 @@ def test_a_field_holds_its_inner_one(rng: np.random.Generator, factor: float, ma
     assert 0 <= index.cap_height(directions, 0.0) <= index.cap_height(directions, margin_rad) <= 2
 
 
+# The claimed error
+
+
+@pytest.mark.parametrize(("led_mm", "lever_mm", "noise_px"), [(0.5, 0.0, 0.5), (0.0, 1.0, 0.5), (0.4, 0.5, 0.2)])
+def test_the_mean_of_many_frames_errs_by_what_is_claimed_as_systematic(
+    led_mm: float, lever_mm: float, noise_px: float
+) -> None:
+    """A survey drawn once: over K frames of one attitude the mean error has covariance S + (P - S) / K."""
+    frames, nees, single = 6, [], []
+    arm, body_from_lab = Lever(np.array([0.01, 0.0, 0.3]), Rotation.identity()), Rotation.from_rotvec([0.1, -0.1, 0.5])
+    dome = even(300)
+    px = np.nan_to_num(dome_map.project(body_from_lab, dome.position_m, arm, CAMERA), nan=-1e9)
+    px = px[CAMERA.contains(px, 3)]
+    settings = replace(dome_tracker.SETTINGS, centroid_sigma_px=1e-6)
+    for survey in range(60):
+        rng = np.random.default_rng([led_mm > 0, lever_mm > 0, survey])
+        position_m = dome.position_m + rng.normal(0, led_mm / 1e3, (len(dome.id), 3))
+        camera_m = arm.camera_body_m + rng.normal(0, lever_mm / 1e3, 3)
+        leds = replace(dome, position_m=position_m, sigma_m=led_mm / 1e3)
+        tracker = DomeTracker(CAMERA, leds, replace(arm, camera_body_m=camera_m, sigma_m=lever_mm / 1e3), settings)
+        noise, flux = np.full(len(px), noise_px), np.linspace(2, 1, len(px))
+        draws_px = px + rng.normal(0, noise_px, (frames, *px.shape))
+        found = [tracker.solve_centroids(Centroids(one_px, noise, flux)) for one_px in draws_px]
+        assert all(one.solved for one in found)
+        errors = np.array([(one.cam_from_ref * body_from_lab.inv()).as_rotvec() for one in found])
+        total, common = found[0].covariance_rad2, found[0].systematic_rad2
+        mean = errors.mean(axis=0)
+        nees.append(mean @ np.linalg.solve(common + (total - common) / frames, mean))
+        single.append(errors[0] @ np.linalg.solve(total, errors[0]))
+    spread = 4 * np.sqrt(6 / 60)
+    assert np.mean(nees) == pytest.approx(3, abs=spread)
+    assert np.mean(single) == pytest.approx(3, abs=spread)
+
+
 # The thesis's catalog
 
 

@@ -211,7 +211,7 @@ def imu_drift(hold_min: float, units: int, rng: np.random.Generator, earth: bool
     The vehicle follows Test 3's commanded attitudes exactly; each IMU has its own hardware seed.
     earth : measure the Earth rate and do not correct for it
     """
-    testbed = build_testbed(loader.load("afit_test3", {"site.x_azimuth_deg": SITE_AZIMUTH_DEG}))
+    testbed = build_testbed(loader.load("afit_test3_ideal", {"site.x_azimuth_deg": SITE_AZIMUTH_DEG}))
     config = testbed.scene.vehicle.imu
     assert config is not None
     legs = testbed.scene.motion.maneuver[1:]  # the IMU is zeroed as the vehicle leaves home

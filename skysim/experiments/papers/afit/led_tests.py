@@ -74,7 +74,7 @@ def board_scene(levels: Sequence[float], distance_in: float, lens: LensSettings,
     listed = ListedConfig.model_validate(
         {"kind": "listed", "cap_deg": 27, "levels": list(levels), "positions": positions[: len(levels)]}
     )
-    scene = load("afit_test1")
+    scene = load("afit_test1_ideal")
     panel = FlatSurfaceConfig.model_validate({"kind": "flat", "apex": f"{height_in} in"})
     scene = with_config(scene, "light", surface=panel, layout=listed, occlusion=False)
     scene = with_config(scene, "light.led", scatter=0.0, **led_values)

@@ -54,7 +54,7 @@ def attitudes(scene: Scene) -> list[Rotation]:
 
 def scene_with_exposure(time_s: float) -> Scene:
     """The scene with another exposure time, its LEDs scaled so that a frame has the same light."""
-    scene = with_config(load("afit_test1"), "exposure", time_s=time_s)
+    scene = with_config(load("afit_test1_ideal"), "exposure", time_s=time_s)
     return with_config(scene, "light.led", intensity_cd=INTENSITY_CD * FRAME_TIME_S / time_s)
 
 

@@ -66,7 +66,7 @@ class NoiseRuns(NamedTuple):
 
 def scene(dim_fraction: float) -> Scene:
     """The scene with intensities that give Table 3's bright LED; the dim LED is on for a fraction of its slot."""
-    scene = with_config(load("afit_test2"), "exposure", time_s=EXPOSURE_S)
+    scene = with_config(load("afit_test2_ideal"), "exposure", time_s=EXPOSURE_S)
     scene = with_config(scene, "light.layout", levels=(1.0, dim_fraction) * len(PLACES_DEG))
     return with_config(scene, "light.led", intensity_cd=INTENSITY_CD, scatter=0.0)
 
@@ -121,7 +121,7 @@ def tables_3_to_5(options: ExperimentOptions) -> ExperimentResult:
     results = magnitudes(runs, images) | standard_deviations(runs)
     options.watch(3, 4)
     results |= angles(quiet_stand, runs, options.trials(12, 2), rng[2])
-    results |= contour(measured_dome(load("afit_test2")))
+    results |= contour(measured_dome(load("afit_test2_ideal")))
     drawings = (
         Drawing(
             f"Figs 69 and 70: magnitudes of the two LEDs at three positions, ours with {CAUSE_NOISE}; published as"

@@ -53,7 +53,7 @@ FITTED_IMAGING = {  # rolling shutter, exposure of a non-integer number of LED c
 
 def build_test3(overrides: Mapping[str, str] | None = None) -> Testbed:
     """Test 3's testbed, with the camera turned so that all five positions are on the detector."""
-    testbed = build_testbed(loader.load("afit_test3", STATED_IMAGING | dict(overrides or {})))
+    testbed = build_testbed(loader.load("afit_test3_ideal", STATED_IMAGING | dict(overrides or {})))
     cam_from_body = Rotation.from_euler("z", CAMERA_ROTATION_DEG, degrees=True) * testbed.mount.cam_from_body
     return replace(testbed, mount=Mount(testbed.mount.camera_body_m, cam_from_body))
 

@@ -44,7 +44,7 @@ class MeasuredLights(NamedTuple):
 @cache
 def base_testbed() -> Testbed:
     """Testbed of Test 1, whose vehicle and detector all AFIT scenes share."""
-    return build_testbed(load("afit_test1"))
+    return build_testbed(load("afit_test1_ideal"))
 
 
 def build_test_stand(scene: Scene) -> Testbed:

@@ -38,7 +38,7 @@ MAX_TILT_DEG = 60.0  # greatest angle of the boresight from the zenith
 def shell_scene(radius_variation: float, seed: int) -> Scene:
     """The scene with another random variation of the shell's radius; the fibers keep their directions."""
     variation, hardware_seed = "light.layout.radius_variation", "light.layout.points.hardware_seed"
-    return loader.load("apl_dome", {variation: str(radius_variation), hardware_seed: str(seed)})
+    return loader.load("apl_dome_ideal", {variation: str(radius_variation), hardware_seed: str(seed)})
 
 
 def fibers(scene: Scene, testbed: Testbed) -> tuple[Sources, Floats]:
@@ -101,7 +101,7 @@ def random_boresights(count: int, rng: np.random.Generator) -> Floats:
 def discrepancies_and_counts(options: ExperimentOptions) -> ExperimentResult:
     """Discrepancies over shells and attitudes, and the number of fibers in a field."""
     rng = random_stream(options.seed, 2005)
-    testbed = build_testbed(loader.load("apl_dome"))
+    testbed = build_testbed(loader.load("apl_dome_ideal"))
     scenes = [shell_scene(0.004, int(seed)) for seed in rng.integers(2**31, size=options.trials(30, 5))]
     attitudes = random_attitudes(options.trials(60, 20), rng)
     large_offset = np.concatenate(

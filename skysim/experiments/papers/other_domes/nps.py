@@ -70,7 +70,7 @@ def build_model(camera_m: Floats | None, seed: int, frames: int) -> OnboardModel
 
     The catalog is the mean of `frames` frames from the level vehicle.
     """
-    scene = loader.load("nps_tas2")
+    scene = loader.load("nps_tas2_ideal")
     testbed = build_testbed(scene)
     assert isinstance(scene.light, DomeConfig)
     assert isinstance(scene.light.surface, FlatSurfaceConfig)

@@ -105,7 +105,7 @@ def process_frames(overrides: dict[str, str], rate_deg_s: float, count: int, see
 
 def is_right(cam_from_ref: Rotation | None, truth: Truth) -> bool:
     """Return True if a frame is solved with an error below ten arc-minutes."""
-    return cam_from_ref is not None and not metrics.is_wrong(cam_from_ref, truth.cam_from_lab)
+    return cam_from_ref is not None and not metrics.is_wrong((cam_from_ref * truth.cam_from_lab.inv()).magnitude())
 
 
 def night_results(options: ExperimentOptions) -> ExperimentResult:

@@ -44,7 +44,7 @@ class Outcome:
     """Result of a trial. For a flight trial, errors are RMS over the solved frames and counts are sums unless noted.
 
     status   : "solved", the reason why there is no attitude, or "failed" if the trial raised an exception
-    frames, solved, wrong : number of frames, of solved frames, and of solutions more than ten arcminutes off
+    frames, solved, wrong : number of frames, of solved frames, and of wrong solutions (`metrics.is_wrong`)
     x_arcsec, y_arcsec, roll_arcsec : error in camera axes, signed (RMS for a flight); NaN without a solution
     nees     : e^T P^-1 e with three degrees of freedom and the tracker's covariance P; mean for a flight
     stars    : true sources on the detector, minimum for a flight.  detected, matched : numbers, means for a flight
@@ -309,7 +309,7 @@ def score(solution: Attitude, cam_from_lab_wxyz: Floats, stars: int, detected: i
     error = quaternion.to_rotvec(quaternion.multiply(estimate, quaternion.inverse(cam_from_lab_wxyz)))
     covariance = solution.covariance_rad2
     nees = math.nan if covariance is None else float(error @ np.linalg.solve(covariance, error))
-    wrong = int(math.hypot(*error) > metrics.WRONG_RAD)
+    wrong = int(metrics.is_wrong(math.hypot(*error), math.inf if covariance is None else nees))
     x, y, roll = (error / ARCSEC_RAD).tolist()
     return Outcome("solved", 1, 1, wrong, x, y, roll, nees, stars, detected, matched)
 
