@@ -14,7 +14,7 @@ $(READY): pyproject.toml
 	$(PIP) -e '.[dev,catalog]'
 	touch $@
 
-.PHONY: bench demo test test-long oracle test-browser test-lowest lock fuzz fuzzer lint pictures studies papers docs figures gui recompile setup clean
+.PHONY: bench demo test test-long oracle test-browser test-lowest lock fuzz fuzzer mutants lint pictures studies papers docs figures gui recompile setup clean
 setup: $(READY)
 
 demo: $(READY)
@@ -85,6 +85,14 @@ fuzz: fuzzer
 
 fuzzer: $(READY)
 	-$(BIN)/pip install --quiet --disable-pip-version-check -e '.[fuzz]'
+
+# How many of MUTANTS random small changes of the code the tests notice: docs/findings/mutants.md. It takes hours, and
+# goes on where it was stopped; `AGAIN=--again` tries the survivors once more, after tests were added.
+MUTANTS ?= 300
+SEED ?= 1
+mutants: $(READY)
+	$(PIP) -e '.[mutants]'
+	$(BIN)/python -m benchmarks.mutants $(MUTANTS) $(SEED) $(AGAIN)
 
 lint: $(READY)
 	$(BIN)/ruff check .

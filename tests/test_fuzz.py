@@ -18,6 +18,7 @@ import pytest
 from astropy.io import fits
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as some
+from PIL import Image
 
 from benchmarks.hostilefiles import promise
 from fuzz.__main__ import NAMES, TOKENS, mutate, seeds
@@ -186,7 +187,7 @@ def test_a_header_of_gigapixels_is_refused_by_itself(tmp_path: Path, suffix: str
 def test_sizes_are_read_as_opencv_writes_them(suffix: str, tmp_path: Path) -> None:
     data = cv2.imencode(suffix, np.zeros((30, 41), np.uint8))[1].tobytes()
     read = next(told for magic, told in images.FORMATS.items() if data.startswith(magic))
-    assert list(read(data)) == [(41, 30)]
+    assert list(read(data)) == [((41, 30), 1)]
 
 
 def test_every_sample_of_a_tiff_s_pixels_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -200,6 +201,43 @@ def test_every_sample_of_a_tiff_s_pixels_counts(tmp_path: Path, monkeypatch: pyt
         images.read_image(path)
 
 
+def pillow_bytes(mode: str, kind: str, **options: Any) -> bytes:
+    """An image of 41 x 30 pixels as Pillow writes it."""
+    told = streams.BytesIO()
+    Image.new(mode, (41, 30)).save(told, kind, **options)
+    return told.getvalue()
+
+
+ENCODED = [
+    *(cv2.imencode(suffix, np.zeros((30, 41, 4), of))[1].tobytes() for suffix in (".png", ".tiff") for of in "BH"),
+    *(cv2.imencode(".tiff", np.zeros((30, 41), of))[1].tobytes() for of in "Bfd"),
+    *(pillow_bytes(mode, "PNG") for mode in ("1", "L", "LA", "P", "RGB", "RGBA", "I;16")),
+    *(pillow_bytes(mode, "TIFF") for mode in ("1", "L", "RGB", "RGBA", "I;16", "F")),
+    *(pillow_bytes(mode, "JPEG") for mode in ("L", "RGB", "CMYK")),
+    *(pillow_bytes("RGB", kind, **options) for kind, options in (("BMP", {}), ("TIFF", {"big_tiff": True}))),
+]
+
+
+@pytest.mark.parametrize("data", ENCODED)
+def test_no_image_takes_more_memory_than_its_header_says(data: bytes) -> None:
+    """And at most twice less: OpenCV may add an alpha channel to a palette, and leave one out."""
+    read = next(told for magic, told in images.FORMATS.items() if data.startswith(magic))
+    ((sides, each_bytes),) = read(data)
+    decoded = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    assert decoded.nbytes <= np.prod(sides) * each_bytes <= 2 * decoded.nbytes
+
+
+def test_a_png_of_zeros_that_unpacks_to_gigabytes_is_refused(tmp_path: Path) -> None:
+    """16384 x 16384 pixels of 8 bytes in 2 MB; read, they took 4.3 GB and half a minute."""
+    header = struct.pack(">IIBBBBB", 16384, 16384, 16, 6, 0, 0, 0)
+    chunks = ((b"IHDR", header), (b"IDAT", bytes(2_100_000)), (b"IEND", b""))
+    packed = (struct.pack(">I", len(data)) + kind + data + bytes(4) for kind, data in chunks)
+    path = tmp_path / "x.png"
+    path.write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(packed))
+    with pytest.raises(InputError, match=r"16384x16384 pixels of 2147483648 bytes by its header; allowed: up to"):
+        images.read_image(path)
+
+
 @pytest.mark.parametrize("kind", [6, 8, 9, 17])
 def test_a_tiff_s_sides_count_as_libtiff_reads_them(tmp_path: Path, kind: int) -> None:
     """Signed, and the first of two; here a BigTIFF, whose entries hold any type."""
@@ -210,7 +248,7 @@ def test_a_tiff_s_sides_count_as_libtiff_reads_them(tmp_path: Path, kind: int) -
 
     sides = b"".join(entry(tag, of, value) for tag in (256, 257) for of, value in ((kind, side), (4, 2)))
     data = b"II" + struct.pack("<HHHQQ", 43, 8, 0, 16, 4) + sides
-    assert list(images.tiff_size(data)) == [(side, side)]
+    assert list(images.tiff_size(data)) == [((side, side), 1)]
 
 
 @pytest.mark.parametrize("between", [b"\xff\xd0", b"\xff\x01", b"\xff\x00"])

@@ -79,9 +79,11 @@ def read_fits(path: Path) -> NDArray:
                 if (columns := hdu.header.get("TFIELDS", 0)) > MAX_COLUMNS:
                     raise InputError(f"{path}: TFIELDS {columns}; allowed: up to {MAX_COLUMNS} columns")
                 if hdu.header.get("ZIMAGE"):
-                    check_pixels(path, *(int(hdu.header[f"ZNAXIS{n}"]) for n in range(hdu.header["ZNAXIS"], 0, -1)))
+                    sides = (int(hdu.header[f"ZNAXIS{n}"]) for n in range(hdu.header["ZNAXIS"], 0, -1))
+                    check_pixels(path, *sides, each_bytes=abs(int(hdu.header.get("ZBITPIX", 8))) // 8)
                     return decode_tiles(path, number)
-                check_pixels(path, *map(int, getattr(hdu, "shape", ()) or ()))
+                item_bytes = abs(int(hdu.header.get("BITPIX", 8))) // 8
+                check_pixels(path, *map(int, getattr(hdu, "shape", ()) or ()), each_bytes=item_bytes)
                 check_pixels(path, int(hdu.size) // 8)
                 if getattr(hdu, "is_image", False) and hdu.header.get("NAXIS", 0) > 0:
                     return np.ascontiguousarray(hdu.data.astype(hdu.data.dtype.newbyteorder("=")))
@@ -160,13 +162,13 @@ def silent_opencv() -> Iterator[None]:
 
 
 MAX_PIXELS = 1 << 28
-MAX_BYTES = 8 * MAX_PIXELS  # of a file: each pixel a double
+MAX_BYTES = 600 << 20  # of a file, and of its pixels when decoded: 2^28 of 16 bits, and a header
 MAX_DEFLATE_RATIO = 1032  # greatest compression ratio of deflate (zlib's technical details)
 
 # TIFF: integer types of 8, 16, 32 and 64 bits. libtiff accepts signed types for a size too. All are read as unsigned,
-# so a negative size, which libtiff rejects, is a huge one here. Tags of width, height and samples per pixel.
+# so a negative size, which libtiff rejects, is a huge one here. Tags of width, height, samples and bits per sample.
 INTEGER_TYPES = {1: "B", 3: "H", 4: "I", 16: "Q", 6: "B", 8: "H", 9: "I", 17: "Q"}
-WIDTH_TAG, HEIGHT_TAG, SAMPLES_TAG = 256, 257, 277
+WIDTH_TAG, HEIGHT_TAG, SAMPLES_TAG, BITS_TAG = 256, 257, 277, 258
 
 
 def decode_image(path: Path) -> NDArray:
@@ -197,11 +199,13 @@ def silent_stderr() -> Iterator[None]:
         os.close(devnull)
 
 
-def check_pixels(path: Path, *sides: int) -> None:
-    """Raise InputError for more pixels than MAX_PIXELS."""
+def check_pixels(path: Path, *sides: int, each_bytes: int = 1) -> None:
+    """Raise InputError for more pixels than MAX_PIXELS, or more than MAX_BYTES when decoded."""
+    size = "x".join(map(str, sides)) if len(sides) < 5 else f"{prod(sides):.3g}"
     if prod(sides) > MAX_PIXELS:
-        size = "x".join(map(str, sides)) if len(sides) < 5 else f"{prod(sides):.3g}"
         raise InputError(f"{path}: {size} pixels by its header; allowed: up to {MAX_PIXELS}")
+    if (size_bytes := prod(sides) * each_bytes) > MAX_BYTES:
+        raise InputError(f"{path}: {size} pixels of {size_bytes} bytes by its header; allowed: up to {MAX_BYTES} bytes")
 
 
 def check_bytes(path: Path) -> None:
@@ -220,11 +224,12 @@ def check_encoded_size(path: Path, data: bytes) -> None:
         sizes = []
     if not sizes:
         raise InputError(f"{path}: cannot be decoded; it may be truncated or not an image")
-    for sides in sizes:
-        check_pixels(path, *sides)
+    for sides, each_bytes in sizes:
+        check_pixels(path, *sides, each_bytes=each_bytes)
 
 
-Sizes = Iterator[tuple[int, ...]]
+Sizes = Iterator[tuple[tuple[int, ...], int]]  # width and height, and the bytes of each pixel as OpenCV decodes it
+PNG_SAMPLES = {0: 1, 2: 3, 3: 4, 4: 4, 6: 4}  # by color type: OpenCV adds colors to gray with alpha, alpha to a palette
 
 
 def png_size(data: bytes) -> Sizes:
@@ -233,14 +238,14 @@ def png_size(data: bytes) -> Sizes:
     OpenCV allocates memory for a chunk before it reads it, so every chunk must end within the file, and the rows must
     be no more than the file can hold at deflate's greatest compression.
     """
-    width, height, bits = struct.unpack_from(">IIB", data, 16)
+    width, height, bits, color = struct.unpack_from(">IIBB", data, 16)
     at, kind = 8, b""
     while kind != b"IEND" and at < len(data):
         length, kind = struct.unpack_from(">I4s", data, at)
         at += 12 + length
     complete = at <= len(data) and height * (1 + width * bits // 8) <= MAX_DEFLATE_RATIO * len(data)
     if complete or width * height > MAX_PIXELS:  # the caller reports an excessive size
-        yield width, height
+        yield (width, height), PNG_SAMPLES.get(color, 4) * max(bits // 8, 1)
 
 
 def pillow_size(data: bytes) -> Sizes:
@@ -249,30 +254,35 @@ def pillow_size(data: bytes) -> Sizes:
 
     plugin = BmpImagePlugin.BmpImageFile if data.startswith(b"BM") else JpegImagePlugin.JpegImageFile
     with plugin(io.BytesIO(data)) as image:  # the class, not Image.open: that has a limit of its own
-        yield image.size
+        yield image.size, 1 if image.mode in ("1", "L") else 4
 
 
 def tiff_size(data: bytes) -> Sizes:
     """Size from the first directory (TIFF 6.0, section 2), or BigTIFF's; the greatest value of a repeated tag.
 
-    Only here are samples counted as well, because a TIFF sample may have eight bytes, as many as a whole pixel of the
-    other formats.
+    Only here are samples counted as pixels, because each may have eight bytes. Colors of a palette are not.
     """
     order = "<" if data.startswith(b"II") else ">"
     big = struct.unpack_from(order + "H", data, 2)[0] == 43
     (at,) = struct.unpack_from(order + ("Q" if big else "I"), data, 8 if big else 4)
     (count,) = struct.unpack_from(order + ("Q" if big else "H"), data, at)
     entry, head, value = (20, 8, 12) if big else (12, 2, 8)
-    sides = {WIDTH_TAG: 0, HEIGHT_TAG: 0, SAMPLES_TAG: 1}
+    sides, bits = {WIDTH_TAG: 0, HEIGHT_TAG: 0, SAMPLES_TAG: 1}, 8
     for n in range(min(count, 1 << 16)):
         begin = at + head + n * entry
         tag, kind = struct.unpack_from(order + "HH", data, begin)
         if tag in sides and kind in INTEGER_TYPES:
             number = struct.unpack_from(order + INTEGER_TYPES[kind], data, begin + value)[0]
             sides[tag] = max(sides[tag], number)
+        elif tag == BITS_TAG:
+            # One per sample: in the entry itself, or where it points to.
+            length = struct.unpack_from(order + ("Q" if big else "I"), data, begin + 4)[0]
+            place = struct.unpack_from(order + ("Q" if big else "I"), data, begin + value)[0]
+            at_bits = begin + value if length * 2 <= entry - value else place
+            bits = max(bits, struct.unpack_from(order + "H", data, at_bits)[0])
     if all(sides.values()):
         width, height, samples = sides.values()
-        yield (width, height, samples) if samples > 1 else (width, height)
+        yield (width, height, samples) if samples > 1 else (width, height), min(bits // 8, 8)
 
 
 FORMATS: dict[bytes, Callable[[bytes], Sizes]] = {

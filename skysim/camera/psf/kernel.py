@@ -54,6 +54,13 @@ class Kernel:
             return self.grid.shape[2] / 2
         return (len(self.radial) - 2) / PER_PX if len(self.radial) else REACH_SIGMA * self.sigma_px + 0.5
 
+    @property
+    def peak(self) -> float:
+        """Share of the light in the brightest pixel of a centered image."""
+        if len(self.grid):
+            return float(self.grid.max())
+        return float(self.radial[0, 0] if len(self.radial) else special.erf(np.sqrt(0.125) / self.sigma_px) ** 2)
+
 
 def build_kernel(
     psf: Psf,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -133,6 +134,24 @@ def test_an_adjustment_comes_to_rest_where_the_pixels_are(rng: np.random.Generat
     by_led, by_rotation, shared = ba.covariance(terms, found, *gauge.constraints(found, part))
     for matrix in (*by_led, *by_rotation, shared):
         assert_covariance(matrix)
+
+
+def test_no_step_of_an_adjustment_raises_the_cost(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Levenberg-Marquardt takes a step only if the cost falls; from this far off the first steps often overshoot."""
+    normal_equations, costs = ba.normal_equations, list[float]()
+
+    def recorded(bundle: Bundle, sightings: Sightings, weight: Floats) -> Any:
+        costs.append(bundle.cost(sightings, np.inf)[0])
+        return normal_equations(bundle, sightings, weight)
+
+    monkeypatch.setattr(ba, "normal_equations", recorded)
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        true, seen = dome(rng, 0.1)
+        costs.clear()
+        ba.adjust(nudged(rng, true, 0.1), seen, np.inf)
+        assert len(costs) > 2
+        assert (np.diff(costs) <= 1e-9 * np.array(costs[:-1])).all()
 
 
 @law(Gauge.check, Gauge.transform, Gauge.constraints, Subset.insert_into)

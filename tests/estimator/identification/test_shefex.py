@@ -7,9 +7,10 @@ from scipy.spatial.transform import Rotation
 from estimator.catalog import catalog, pair_index
 from estimator.core.arrays import Floats
 from estimator.identification.published.master_star import master_star
-from estimator.identification.published.shefex import angle_interval, cos_error
+from estimator.identification.published.shefex import SearchOptions, angle_interval, cos_error, search
 
 ARCSEC_RAD = np.pi / 648_000
+SCREEN_CORNERS = catalog.unit(np.array([[0.1, 0.1, 1], [-0.1, 0.1, 1], [0.1, -0.1, 1], [-0.1, -0.1, 1]]))
 PIXEL_RAD = np.radians(0.02)  # "the angle per pixel, computed from the FOV and the CCD size (0.02 deg)"
 
 
@@ -34,6 +35,15 @@ def test_the_gate_s_ends_are_off_by_cos_error_in_the_cosine() -> None:
         np.testing.assert_allclose(np.cos(angle) - np.cos(high), 5.5e-5, rtol=0, atol=1e-15)
     # Closer than that to zero every smaller angle is alike.
     assert angle_interval(0.001, 5.5e-5)[0] == 0
+
+
+@pytest.mark.parametrize(("triangles", "checks", "begun"), [(3, 10**6, 3), (100, 0, 0), (100, 10**6, 20)])
+def test_no_triangle_is_begun_once_the_effort_is_used_up(triangles: int, checks: int, begun: int) -> None:
+    """Six stars have 20 triangles; no star of the catalog is near theirs, so that none is found."""
+    seen, index = catalog.unit(screen(np.random.default_rng(5))[:6]), pair_index.build(SCREEN_CORNERS, 0.5)
+    tried = np.zeros(3, np.int64)
+    search(seen, index, SearchOptions(1e-9, 1e-7, triangles, checks, base=6), tried)
+    assert tried[2] == begun
 
 
 # ---- the master star: nine stars on a screen of .30 x .22 m a meter away (reference section 5) -----------------------

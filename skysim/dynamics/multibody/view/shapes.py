@@ -45,7 +45,9 @@ def shapes(vehicle: VehicleModel) -> list[Shape]:
             continue
         mesh = model.geom_type[n] == mujoco.mjtGeom.mjGEOM_MESH
         size = model.geom_aabb[n, 3:] if mesh else model.geom_size[n]
-        body_from_shape_wxyz = Rotation.from_matrix(data.geom_xmat[n].reshape(3, 3)).as_quat(scalar_first=True)
-        fields = (size, data.geom_xpos[n], body_from_shape_wxyz, model.geom_rgba[n])
+        body_from_shape = Rotation.from_matrix(data.geom_xmat[n].reshape(3, 3))
+        # The box of a mesh is not about the geom's origin, which is the mesh's center of mass; of other geoms it is.
+        position_m = data.geom_xpos[n] + body_from_shape.apply(model.geom_aabb[n, :3])
+        fields = (size, position_m, body_from_shape.as_quat(scalar_first=True), model.geom_rgba[n])
         result.append(Shape(kind, *(tuple(np.asarray(value, float).tolist()) for value in fields)))
     return result
