@@ -94,8 +94,8 @@ def test_every_star_of_the_tracker_shines_near_its_place_and_no_other_of_that_li
     assert not strangers.any()
 
 
-# Separation (arcsec) and position angle (deg) of the fainter star in 2016.0, from the Washington Double Star Catalog and
-# its sixth catalog of orbits.
+# Separation (arcsec) and position angle (deg) of the fainter star in 2016.0: Washington Double Star Catalog and its
+# sixth catalog of orbits.
 DOUBLES = {
     71683: ("alpha Cen", 4.0, 302),
     36850: ("Castor", 5.1, 53),
