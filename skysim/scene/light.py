@@ -11,6 +11,7 @@ from pydantic import BeforeValidator, Field, ModelWrapValidatorHandler, field_va
 from skysim.core.units import Ascending, ConfigModel, Fraction, Length, Number, SemiAxis, check_table
 from skysim.scene.leds import Layout, LedConfig, PixelsConfig
 
+SKY = "gaia_v8.0"  # as faint as any camera of a shipped scene detects
 Tilt = Annotated[Number, Field(ge=-45, le=45)]
 
 
@@ -197,12 +198,14 @@ class DomeConfig(ConfigModel):
 class StarsConfig(ConfigModel):
     """The real sky as the light source.
 
+    catalog   : a name in data/catalogs, or a file of `skysim catalog build`; the tracker has its own
+    limit_mag : faintest V; all stars of the catalog if left out
     occlusion : whether the vehicle's parts hide stars
     """
 
     kind: Literal["stars"]
-    catalog: str = "hipparcos_hp6.5"
-    limit_mag: Annotated[Number, Field(ge=0, le=15)] = 6.5
+    catalog: str = SKY
+    limit_mag: Annotated[Number, Field(ge=0, le=15)] | None = None
     occlusion: bool = True
 
 
@@ -214,7 +217,7 @@ class CollimatedDisplayConfig(PixelsConfig):
     neglected.
 
     focal_length : of the collimator
-    catalog, limit_mag : the stars shown, to this V, at the scene's start_time
+    catalog, limit_mag : the stars shown, to this V (all if left out), at the scene's start_time
     axis_ra_deg, axis_dec_deg, roll_deg : the direction at the display's center, and the position angle there of the
         lab's -y (a level camera's up), as `ra_deg`, `dec_deg`, `roll_deg` of a camera that looks up
     brightest_mag : V of a white block for the camera, in the Sun's color; brighter stars are limited to it
@@ -223,8 +226,8 @@ class CollimatedDisplayConfig(PixelsConfig):
 
     kind: Literal["collimated_display"]
     focal_length_m: Annotated[Length, Field(gt=0)]
-    catalog: str = "hipparcos_hp6.5"
-    limit_mag: Annotated[Number, Field(ge=-2, le=15)] = 6.5
+    catalog: str = SKY
+    limit_mag: Annotated[Number, Field(ge=-2, le=15)] | None = None
     axis_ra_deg: Annotated[Number, Field(ge=0, lt=360)]
     axis_dec_deg: Annotated[Number, Field(ge=-90, le=90)]
     roll_deg: Number = 0.0

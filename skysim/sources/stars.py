@@ -65,15 +65,17 @@ def days_since_j2000_tt(time: datetime.datetime) -> float:
     return (in_utc(time) + TT_MINUS_UTC - J2000_TT) / DAY
 
 
-def sources(stars: Catalog, time: datetime.datetime, limit_mag: float, lab_from_icrs: Rotation, band: Band) -> Sources:
+def sources(
+    stars: Catalog, time: datetime.datetime, limit_mag: float | None, lab_from_icrs: Rotation, band: Band
+) -> Sources:
     """The stars to a limiting magnitude as steady points at infinity.
 
-    limit_mag     : faintest Johnson V kept
+    limit_mag     : faintest Johnson V kept; None: all
     lab_from_icrs : orientation of the lab's axes in the ICRS at that time
     band          : quantum efficiency of the chip
     Returns Sources in lab axes: place is (direction, 0), strength photo-electrons s^-1 m^-2 from V and both colors.
     """
-    selected = stars.take(stars.v_mag <= limit_mag)
+    selected = stars.to_limit(limit_mag)
     count = len(selected)
     direction = lab_from_icrs.apply(apparent(selected, time)) if count else np.zeros((0, 3))
     zeros, ones = np.zeros(count), np.ones(count)

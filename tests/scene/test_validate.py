@@ -113,10 +113,11 @@ def test_each_kind_of_file_is_told_and_each_fault_is_a_line(tmp_path: Path) -> N
     broken, xml = tmp_path / "broken.ecsv", tmp_path / "a.xml"
     broken.write_text("# %ECSV 1.0\nnothing\n")
     for path, what in (
-        (SCENES / "shefex2.yaml", "a scene of 7955 lights and 40 frames"),
+        (SCENES / "shefex2.yaml", "a scene of 45735 lights and 40 frames"),
         (SCENES / "studies" / "end_to_end.yaml", "a study of 6 trials"),
         (DATA / "cameras" / "aps.yaml", "a camera of "),
         (DATA / "catalogs" / "hipparcos_hp6.5.ecsv", "a catalog of 7996 stars"),
+        (DATA / "catalogs" / "gaia_v8.0.ecsv", "a catalog of 45735 stars"),
     ):
         told = check_file(path)
         assert (told.fault, told.what[: len(what)]) == ("", what)
@@ -131,7 +132,7 @@ def test_whatever_skysim_reads_is_taken(tmp_path: Path) -> None:
     lens.write_text(opencv_calibration.text(load("shefex2").camera.calibration()))
     for path, what in (
         (lens, "a calibration of 659 x 493 pixels"),
-        (Path("shefex2"), "a scene of 7955 lights"),
+        (Path("shefex2"), "a scene of 45735 lights"),
         (Path("end_to_end"), "a study of 6 trials"),
         (SCENES / "vehicles/simsat.xml", "a vehicle of 73.35 kg"),
     ):

@@ -265,7 +265,7 @@ def test_on_the_frame_rows_are_dark_whose_turn_is_not_in_the_exposure() -> None:
 def test_a_bench_shows_its_stars_on_its_pixels_in_their_place_in_the_sky() -> None:
     """Gnomonic about the axis by spherical trigonometry, lab -y at position angle roll; rounded to a pixel."""
     made = shown()
-    stars = catalog.read("hipparcos_hp6.5")
+    stars = catalog.read("gaia_v8.0")
     stars = stars.take(np.array([np.flatnonzero(stars.hip == hip)[0] for hip in made.id]))
     x, y, z = star_sources.apparent(stars, TIME).T
     ra, dec, axis, roll = np.arctan2(y, x) - np.radians(83), np.arcsin(z), np.radians(2), np.radians(20)
@@ -465,7 +465,7 @@ def test_a_wrong_panel_is_told_in_one_line(overrides: dict[str, str], says: str)
         (
             "collimated_display",
             {"light.limit_mag": "-2"},
-            "light.limit_mag: no star to -2 mag on the display",
+            "light.limit_mag: no star of the catalog is on the display",
         ),
         ("collimated_display", {"light.gray_levels": "8"}, "are black on 8 gray levels; allowed: to 6.3"),
         ("collimated_display", {"light.catalog": "gaia"}, "light.catalog: unknown catalog 'gaia'; allowed:"),

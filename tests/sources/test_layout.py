@@ -492,7 +492,10 @@ def test_a_wrong_layout_is_told_in_one_line(layout: str, says: str) -> None:
         ("count: 5, limit_mag: 3", "celestial takes either count or limit_mag"),
         ("limit_mag: -2", "light.layout.limit_mag: no star to -2 mag on the dome"),
         ("count: 90000", "light.layout.count: 90000 LEDs, but the catalog gives "),
-        ("count: 5, catalog: gaia", "light.layout.catalog: unknown catalog 'gaia'; allowed: hipparcos_hp6.5"),
+        (
+            "count: 5, catalog: gaia",
+            "light.layout.catalog: unknown catalog 'gaia'; allowed: gaia_v8.0, hipparcos_hp6.5",
+        ),
         ("count: 5, epoch: 1700-01-01T00:00:00", "epoch: 1700-01-01T00:00:00 is outside 1900 to 2100"),
         (
             "count: 5, camera: [0 m, 0 m, 2 m]",

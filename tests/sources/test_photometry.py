@@ -214,15 +214,6 @@ def test_a_whole_catalog_takes_no_time() -> None:
     assert time.perf_counter() - begin < 1.0  # 25 ms on a quiet machine
 
 
-def test_hp_serves_as_well_as_v() -> None:
-    stars = catalog.read("hipparcos_hp6.5")
-    by_v = star_flux_e_s_m2(stars.v_mag, stars.b_v, stars.v_i, ALL)
-    by_hp = star_flux_e_s_m2(catalog.v_from_hp(stars.hp_mag, stars.v_i), stars.b_v, stars.v_i, ALL)
-    # The catalog's own V is that formula, but for the supplement and three bright stars; printed to .001 mag.
-    assert np.percentile(np.abs(-2.5 * np.log10(by_hp / by_v)), 99) < 0.001
-    assert np.all(by_v > 0)
-
-
 def test_a_sky_of_a_star_a_square_arcsecond() -> None:
     # 4 pi sr are 5.3464e11 square arcseconds.
     whole_sky = 4 * np.pi * sky_radiance_e_s_m2_sr(21.5, ALL)

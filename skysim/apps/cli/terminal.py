@@ -255,7 +255,8 @@ def print_catalog(catalog: dict[str, Any], json: bool) -> None:
     if json:
         print_json(catalog)
         return
-    print(f"{catalog['path']}: {catalog['stars']} stars, {catalog['supplied']} of them added from other sources")
+    sources = ", ".join(f"{count} {name}" for name, count in catalog["sources"].items())
+    print(f"{catalog['path']}: {catalog['stars']} stars ({sources}), epoch J{catalog['meta']['epoch_jyear']}")
     print("  ".join(f"V<{limit}: {count}" for limit, count in catalog["brighter_than"].items()))
     for key, value in catalog["meta"].items():
         print(f"  {key}: {printable(value)}")

@@ -18,7 +18,6 @@ from skysim.core.types import Floats
 from skysim.scene import leds
 from skysim.sources import catalog
 from skysim.sources import stars as star_sources
-from skysim.sources.catalog import require_catalog
 from skysim.sources.dome.led import Emitter, irradiance_e_s_m2
 from skysim.sources.dome.surface import Surface
 from skysim.sources.photometry import Band, synthetic_mag
@@ -49,7 +48,7 @@ def project_stars(config: leds.CelestialConfig, surface: Surface, led: leds.LedC
         raise InputError(
             f"light.layout.camera: {distance_m:g} m from the bearing's center, outside of the dome; allowed: inside"
         )
-    stars = catalog.read(require_catalog("light.layout.catalog", config.catalog))
+    stars = catalog.read_for("light.layout.catalog", config.catalog)
     lab_from_icrs = star_sources.cam_from_icrs(config.zenith_ra_deg, config.zenith_dec_deg, config.roll_deg)
     direction = lab_from_icrs.apply(star_sources.apparent(stars, config.epoch))
     above_horizon = direction[:, 2] > 0

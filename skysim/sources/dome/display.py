@@ -173,7 +173,7 @@ def display_sources(
     Sun's color, times the gray level; magnitude is the catalog's. Pixels are not resolved.
     Raises InputError if no star is in the field, and for a star nearer to black than to the first gray level.
     """
-    stars = stars.take(stars.v_mag <= config.limit_mag)
+    stars = stars.to_limit(config.limit_mag)
     direction = lab_from_icrs(config).apply(star_sources.apparent(stars, time)) if len(stars) else np.zeros((0, 3))
     in_front = direction[:, 2] > 0
     stars, direction = stars.take(in_front), direction[in_front]
@@ -183,7 +183,7 @@ def display_sources(
     stars, on_display_m = stars.take(within), on_display_m[within]
     if not len(stars):
         raise InputError(
-            f"light.limit_mag: no star to {config.limit_mag:g} mag on the display; allowed: a fainter limit"
+            "light.limit_mag: no star of the catalog is on the display to this limit; allowed: a fainter one"
         )
     level = np.minimum(10 ** (-0.4 * (stars.v_mag - config.brightest_mag)), 1.0)
     blocks = draw_blocks(config, on_display_m, level)

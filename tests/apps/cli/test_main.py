@@ -324,7 +324,7 @@ def test_exposures_are_told_frame_by_frame(skysim: Skysim, tmp_path: Path) -> No
         (["shefex2", "--set", "tracker.solver=rotation_only"], "unknown solver 'rotation_only'; allowed: "),
         (
             ["shefex2", "--set", "light.catalog=nosuch"],
-            "light.catalog: unknown catalog 'nosuch'; allowed: hipparcos_hp6.5",
+            "light.catalog: unknown catalog 'nosuch'; allowed: gaia_v8.0, hipparcos_hp6.5",
         ),
         (["shefex2", "--set", "vehicle.model=nosuch.xml"], "nosuch.xml: no such file"),
         (

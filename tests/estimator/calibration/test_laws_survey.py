@@ -279,7 +279,7 @@ class Namer:
 
     def __init__(self, frames: list[StarFrame], seen: bool) -> None:
         vectors, count = np.concatenate([frame.vectors_ref for frame in frames]), 25 * len(frames)
-        self.stars = StarCatalog(np.arange(count), vectors, 0 * vectors, np.zeros(count), np.zeros(count))
+        self.stars = StarCatalog(np.arange(count), vectors, 0 * vectors, np.zeros(count), np.zeros(count), 2000.0)
         self.seen = seen
 
     def solve_centroids(self, centroids: Centroids) -> Attitude:

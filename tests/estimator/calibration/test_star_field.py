@@ -299,7 +299,7 @@ def test_each_round_names_more_stars_until_none_are_gained() -> None:
     field = drawn(np.random.default_rng(98), frames=40)
     vectors = np.concatenate([one.vectors_ref for one in field.frames])
     v_mag = np.linspace(2, 6, len(vectors))
-    stars = StarCatalog(np.arange(800), vectors, np.zeros((800, 3)), np.zeros(800), v_mag)
+    stars = StarCatalog(np.arange(800), vectors, np.zeros((800, 3)), np.zeros(800), v_mag, 2000.0)
     frames = [
         Centroids(one.xy_px, one.sigma_px, 2.0 * 10 ** (-0.4 * (v_mag[20 * k : 20 * k + 20] - 12.5)))
         for k, one in enumerate(field.frames)
@@ -324,7 +324,7 @@ def test_no_frame_identified_is_refused() -> None:
     frames = [Centroids(np.zeros((9, 2)), np.ones(9), np.ones(9))] * 3
 
     class Blind:
-        stars = catalog.from_columns(np.arange(1), *np.zeros((6, 1)))
+        stars = catalog.from_columns(np.arange(1), *np.zeros((6, 1)), 2000.0)
 
         def solve_centroids(self, centroids: Centroids) -> Attitude:
             return Attitude("no identification beyond chance")

@@ -19,7 +19,9 @@ FILE = Path(__file__).parents[3] / "data/catalogs/hipparcos_hp6.5.ecsv"
 ARCSEC_RAD = np.pi / 180 / 3600
 MAS_RAD = ARCSEC_RAD / 1000
 DATES = [datetime.datetime(1995, 1, 3), datetime.datetime(2016, 6, 21, 7, 30), datetime.datetime(2027, 10, 9)]
-HEADER = b"hip,ra_deg,dec_deg,pm_ra_mas_yr,pm_dec_mas_yr,parallax_mas,v_mag"
+EPOCH_YR = 1991.25
+EPOCH = b"#   epoch_jyear: 1991.25\n"
+HEADER = EPOCH + b"hip,ra_deg,dec_deg,pm_ra_mas_yr,pm_dec_mas_yr,parallax_mas,v_mag"
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +32,7 @@ def stars() -> StarCatalog:
 def made_up(*rows: tuple[float, ...]) -> StarCatalog:
     """Stars of (id, ra deg, dec deg, pm_ra, pm_dec mas/yr, parallax mas, V)."""
     hip, ra, dec, *rest = np.array(rows).T
-    return catalog.from_columns(hip.astype(int), np.radians(ra), np.radians(dec), *rest)
+    return catalog.from_columns(hip.astype(int), np.radians(ra), np.radians(dec), *rest, EPOCH_YR)
 
 
 def separation_rad(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -90,6 +92,7 @@ def test_the_classical_aberration_differs_by_half_a_thousandth_at_most() -> None
         np.zeros((37, 3)),
         np.zeros(37),
         np.zeros(37),
+        EPOCH_YR,
     )
     beta = 29_800 / 299_792_458
     far = Observer(1991.25, np.array([0.0, 0.0, 1e9]), np.array([29_800.0, 0.0, 0.0]))  # where no Sun bends light
@@ -222,8 +225,9 @@ def test_the_file_is_read_whole_brightest_first(stars: StarCatalog) -> None:
 
 def test_a_file_parted_by_blanks_is_read_too(tmp_path: Path) -> None:
     path = tmp_path / "blanks.ecsv"
-    header = HEADER.replace(b",", b" ")
-    path.write_bytes(b"# %ECSV 1.0\n" + header + b"\n1 10.0 20.0 0 0 0 5.5\n2 30.0 40.0 0 0 0 1.5\n")
+    path.write_bytes(
+        b"# %ECSV 1.0\n" + HEADER.replace(b",", b" ") + b"\n1 10.0 20.0 0 0 0 5.5\n2 30.0 40.0 0 0 0 1.5\n"
+    )
     assert catalog.read(path).id.tolist() == [2, 1]
 
 
@@ -231,7 +235,7 @@ UNREADABLE = {
     "empty.ecsv": b"",
     "comments.ecsv": b"# %ECSV 1.0\n",
     "header_only.ecsv": HEADER + b"\n",
-    "no_magnitude.ecsv": b"hip,ra_deg,dec_deg\n1,2,3\n",
+    "no_magnitude.ecsv": EPOCH + b"hip,ra_deg,dec_deg\n1,2,3\n",
     "words.ecsv": HEADER + b"\n1,2,3,0,0,0,bright\n",
     "gap.ecsv": HEADER + b"\n1,2,3,0,0,,5\n",
     "short.ecsv": HEADER + b"\n1,2,3,0,0,0,5\n1,2,3\n",
@@ -247,6 +251,26 @@ def test_what_is_no_catalog_is_refused_in_one_line(tmp_path: Path, name: str) ->
     with pytest.raises(ImageError, match=r"not a star catalog .*allowed: ECSV with hip, ra_deg") as refusal:
         catalog.read(path)
     assert "\n" not in str(refusal.value)
+
+
+@pytest.mark.parametrize(
+    "epoch", ["", "#   epoch_jyear: last year\n", "#   epoch_jyear: 1e9\n", "#   epoch_jyear: 16\n"]
+)
+def test_a_file_without_an_epoch_is_refused(tmp_path: Path, epoch: str) -> None:
+    path = tmp_path / "stars.ecsv"
+    path.write_bytes(epoch.encode() + HEADER.removeprefix(EPOCH) + b"\n1,2,3,0,0,0,5\n")
+    with pytest.raises(ImageError, match=r"its header has no epoch_jyear of 1800 to 2200"):
+        catalog.read(path)
+
+
+def test_stars_move_from_the_epoch_of_their_file(tmp_path: Path) -> None:
+    # 1"/yr north from 2016.0 to 2012.0 is 4" south; from J1991.25 it would be 20.75" north.
+    path = tmp_path / "stars.ecsv"
+    path.write_bytes(HEADER.replace(b"1991.25", b"2016.0") + b"\n1,0,0,0,1000,0,5\n")
+    stars = catalog.read(path)
+    assert stars.epoch_yr == 2016.0
+    for kept in (stars, stars.take(np.array([0])), catalog.merge_doubles(stars, 1e-4)):
+        assert catalog.at_epoch(kept, 2012.0)[0, 2] / ARCSEC_RAD == pytest.approx(-4, abs=1e-6)
 
 
 @pytest.mark.parametrize("name", [".", "no_such_file.ecsv"])

@@ -37,7 +37,7 @@ def apart(a: NDArray, b: NDArray) -> NDArray:
 def test_stars_move_across_the_sky_and_no_farther_than_they_can(rng: np.random.Generator, year: float) -> None:
     stars = drawn(rng)
     np.testing.assert_allclose(np.sum(stars.vectors * stars.drift_rad_yr, axis=1), 0, rtol=0, atol=1e-15)
-    np.testing.assert_allclose(catalog.at_epoch(stars, catalog.EPOCH_YR), stars.vectors, rtol=0, atol=1e-15)
+    np.testing.assert_allclose(catalog.at_epoch(stars, stars.epoch_yr), stars.vectors, rtol=0, atol=1e-15)
     np.testing.assert_allclose(catalog.unit(stars.vectors * 7.0), stars.vectors, rtol=0, atol=1e-15)
     there = catalog.Observer(year, units(rng, 1)[0], 3e4 * units(rng, 1)[0])
     seen = catalog.apparent(stars, there)
@@ -121,13 +121,15 @@ def test_any_table_is_a_catalog_or_is_none(
     tmp_path_factory: pytest.TempPathFactory, rows: list[list[object]], rng: np.random.Generator
 ) -> None:
     path = tmp_path_factory.mktemp("catalog") / "x.ecsv"
-    head = ",".join(catalog.COLUMNS)
+    head = "# epoch_jyear: 2016.0\n" + ",".join(catalog.COLUMNS)
     path.write_text("\n".join([head, *(",".join(map(str, row)) for row in rows)]), encoding="utf-8")
     answered(lambda: catalog.read(path), ImageError)
     answered(lambda: ptase.read_cat(path, 5.0), ImageError)
     table = rng.uniform(1, 50, (4, 7))
     path.write_text("\n".join([head, *(",".join(map(repr, row)) for row in table.tolist())]))
-    np.testing.assert_array_equal(catalog.columns(path, catalog.COLUMNS), table.T)
+    numbers, epoch_yr = catalog.columns(path, catalog.COLUMNS)
+    np.testing.assert_array_equal(numbers, table.T)
+    assert epoch_yr == 2016.0
     assert catalog.read(path).v_mag.tolist() == sorted(table[:, 6])
     assert len(ptase.read_cat(path, 60.0)) == 4
 

@@ -12,7 +12,7 @@ from estimator.core.errors import ImageError
 
 FILE = Path(__file__).parents[3] / "data/catalogs/hipparcos_hp6.5.ecsv"
 ARCSEC_RAD = np.pi / 648_000
-HEADER = "hip,ra_deg,dec_deg,pm_ra_mas_yr,pm_dec_mas_yr,parallax_mas,v_mag,b_v,v_i\n"
+HEADER = "# epoch_jyear: 1991.25\nhip,ra_deg,dec_deg,pm_ra_mas_yr,pm_dec_mas_yr,parallax_mas,v_mag,b_v,v_i\n"
 
 
 def made_up(ra_arcsec: list[float], magnitude: list[float]) -> OnBoard:
@@ -116,7 +116,7 @@ def test_the_log_has_the_histogram_the_memory_and_every_star() -> None:
 
 def test_what_is_no_catalog_and_a_limit_without_stars_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "no_colors.ecsv"
-    path.write_text("hip,ra_deg,dec_deg,pm_ra_mas_yr,pm_dec_mas_yr,parallax_mas,v_mag\n1,0,0,0,0,0,4\n")
+    path.write_text(HEADER.replace(",b_v,v_i", "") + "1,0,0,0,0,0,4\n")
     assert len(read_cat(path, 6.0)) == 1
     with pytest.raises(ImageError, match=r"not a star catalog .*v_mag, b_v, v_i"):
         read_cat(path, 6.0, color=Color(0.1))

