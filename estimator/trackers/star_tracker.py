@@ -38,7 +38,7 @@ from estimator.trackers.pipeline import Clock, Report, Settings, brightest, dire
 
 NO_STARS = "too few stars detected"
 NO_MATCH = "no identification beyond chance"
-MIN_ERROR_PX = 0.02  # least centroid error of a star, for uncalibrated effects
+MIN_ERROR_PX = 0.005  # least centroid error of a star: a calibrated lens, a catalog's places
 
 
 class SearchModel(NamedTuple):
