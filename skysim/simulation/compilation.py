@@ -81,13 +81,14 @@ def compile_tracker(scene: str, overrides: Sequence[str] = ()) -> None:
 
 
 def synthetic_frame(testbed: Testbed) -> Frame:
-    """A frame at the initial attitude with equal Gaussian spots at the sources, drawn without the renderer."""
+    """A frame at the initial attitude with equal Gaussian spots at the LEDs or the brightest stars, drawn without the
+    renderer.
+    """
     camera = assumed_camera(testbed.scene)
     when = exposure_window(testbed.scene, 0)
     lab_from_body = testbed.trajectory.lab_from_body[0]
-    toward = testbed.sources.place[:, :3] - testbed.sources.place[:, 3:] * lab_from_body.apply(
-        testbed.mount.camera_body_m
-    )
+    place = testbed.sources.place[np.argsort(testbed.sources.magnitude, kind="stable")]
+    toward = place[:, :3] - place[:, 3:] * lab_from_body.apply(testbed.mount.camera_body_m)
     vectors_cam = (testbed.mount.cam_from_body * lab_from_body.inv()).apply(toward)
     xy_px = camera.pixels(vectors_cam[vectors_cam[:, 2] > 0])
     xy_px = xy_px[camera.contains(xy_px)][:MAX_SPOTS]

@@ -39,9 +39,10 @@ QUIET_DOME = PERFECT_CHIP | {
     "exposure.frames": "1",
 }
 # Stars too faint for the catalog are light in their neighbors' fitting windows (some 10 arcsec of bias), so the
-# bar of 1e-6 deg is for a sky of isolated stars that are all on board.
+# bar of 1e-6 deg is for a sky of isolated stars that are all on board, where the tracker believes them.
 QUIET_SKY = PERFECT_CHIP | {
     "motion.rate_deg_s": "[0, 0, 0]",
+    "light.catalog": "hipparcos_hp6.5",
     "light.limit_mag": "5",
     "tracker.limit_mag": "5",
     "exposure.frames": "1",
