@@ -23,6 +23,7 @@ from skysim.core.errors import InputError
 from skysim.core.paths import SCENES
 from skysim.core.types import Mount
 from skysim.dynamics import multibody
+from skysim.experiments.study import loader as study_loader
 from skysim.results import stretch
 from skysim.scene import loader
 from skysim.sources import catalog, stars
@@ -305,7 +306,7 @@ def test_monte_carlo_is_a_study_that_runs_and_its_results_is_the_store_s(tmp_pat
     text = study_process.monte_carlo("shefex2", {"camera.f_number": "2"}, {"kind": "centroids", "noise_px": 0.2}, 40, 7)
     path = tmp_path / "monte_carlo.yaml"
     path.write_text(text)
-    values = loader.load(path)
+    values = study_loader.load(path)
     assert values.trials == 40
     assert values.study.seed == 7
 
