@@ -52,7 +52,7 @@ class AttitudeErrors(NamedTuple):
 def build_setup(lights: int) -> Setup:
     """AFIT's camera under its measured dome with randomly placed lights, of which at most `lights` are used."""
     layout = f'{{kind: poisson_disk, spacing: "{SPACING_MM[lights]} mm", cap_deg: {CAP_DEG}}}'
-    scene = loader.load("afit_simsat", {"light.layout": layout, "tracker.centroid_sigma_px": str(NOISE_PX)})
+    scene = loader.load("afit_simsat_ideal", {"light.layout": layout, "tracker.centroid_sigma_px": str(NOISE_PX)})
     testbed = build_testbed(scene)
     trial = CentroidTrial(kind="centroids", noise_px=NOISE_PX, lights=lights, tilt_deg=(0, MAX_TILT_DEG))
     return Setup(testbed, build_tracker(testbed), trial, "")
