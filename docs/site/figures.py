@@ -110,6 +110,7 @@ def pixels(path: Path) -> None:
         ones,
         0 * ones,
         ones,
+        np.zeros(1, np.int64),
         0 * ones,
     )
     visible = render(image, star, optics, still, Mount(np.zeros(3), Rotation.identity()), Window(0.0, 1.0))
