@@ -16,13 +16,14 @@ import ast
 import json
 import os
 import re
+import resource
 import shutil
 import signal
 import subprocess
 import sys
 import time
 from collections import Counter, defaultdict
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from random import Random
 from typing import Any
@@ -157,16 +158,24 @@ def forget(folder: Path, module: str) -> None:
 
 
 def run_tests(files: list[str], limit_s: float) -> str:
-    """`survived`, `timeout`, or the first test that fails."""
+    """`survived`, `timeout`, or the first test that fails. The limit is of processor time: the machine may be busy."""
     command = [sys.executable, *PYTEST, "--tb=no", *files]
     process = subprocess.Popen(
-        command, cwd=TREE, env=environment(SCRATCH), stdout=subprocess.PIPE, text=True, start_new_session=True
+        command,
+        cwd=TREE,
+        env=environment(SCRATCH),
+        stdout=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+        preexec_fn=partial(resource.setrlimit, resource.RLIMIT_CPU, (int(limit_s), int(limit_s) + 5)),
     )
     try:
-        said, _ = process.communicate(timeout=limit_s)
+        said, _ = process.communicate(timeout=10 * limit_s)
     except subprocess.TimeoutExpired:
         os.killpg(process.pid, signal.SIGKILL)
         process.communicate()
+        return "timeout"
+    if process.returncode == -signal.SIGXCPU:
         return "timeout"
     if process.returncode in (4, 5):  # pytest's codes of a wrong command and of no tests
         raise SystemExit(said)

@@ -115,3 +115,9 @@ def test_an_image_of_another_size_is_refused_with_both_sizes() -> None:
     with pytest.raises(ImageError, match="the image is 20x10 pixels; this camera's are 1600x1200"):
         check_shape((10, 20), DISTORTED)
     check_shape((1200, 1600), DISTORTED)
+
+
+@pytest.mark.parametrize("given", [{}, {"fov_rad": 0.3, "fov_deg": 17.0}])
+def test_a_field_of_view_is_given_once(given: dict[str, float]) -> None:
+    with pytest.raises(ImageError, match="takes either fov_rad or fov_deg"):
+        Camera.from_fov(640, 480, **given)

@@ -12,7 +12,7 @@ from estimator.core.arrays import Floats
 from estimator.core.camera import Camera
 from estimator.core.types import StarMatch
 from estimator.identification.chance import ACCEPT_LOG10_CHANCE, MIN_MATCHES, log10_tail
-from estimator.identification.published.pyramid import pyramid
+from estimator.identification.published.pyramid import _scale_tangents, pyramid
 
 pytestmark = pytest.mark.long  # an algorithm of the papers: compiles for fifteen seconds
 
@@ -203,3 +203,11 @@ def test_the_tail_is_scipy_s_binomial(trials: int, p: float) -> None:
 
 def test_more_hits_than_trials_cannot_be() -> None:
     assert log10_tail(3, 4, 0.5) == -300
+
+
+def test_directions_of_a_longer_lens_are_unit_vectors_of_scaled_tangents() -> None:
+    rays = np.array([[0.3, -0.2, 0.9], [-0.1, 0.4, 0.7], [0.0, 0.0, 1.0]])
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    scaled = _scale_tangents(rays, 1.2)
+    np.testing.assert_allclose(np.linalg.norm(scaled, axis=1), 1, rtol=1e-14)
+    np.testing.assert_allclose(scaled[:, :2] / scaled[:, 2:], 1.2 * rays[:, :2] / rays[:, 2:], rtol=1e-14)
