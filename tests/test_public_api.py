@@ -1,5 +1,7 @@
 """The public functions of `import skysim` and `import estimator`: names, laziness, and agreement with the commands."""
 
+import dataclasses
+import re
 import subprocess
 import sys
 
@@ -69,6 +71,14 @@ def test_a_saved_run_is_what_the_command_writes(run, tmp_path) -> None:
     for name in names:
         if name not in ("report.html", "solutions.ecsv"):  # which hold seconds of wall clock
             assert (ours / name).read_bytes() == (tmp_path / "theirs" / name).read_bytes(), name
+
+
+def test_only_a_report_of_several_frames_has_plots_against_time(run, tmp_path) -> None:
+    one = dataclasses.replace(run, frames=run.frames[:1]).save(tmp_path / "one")
+    three = run.save(tmp_path / "three")
+    headings = [re.findall("<h2>(.*?)</h2>", (folder / "report.html").read_text("utf-8")) for folder in (three, one)]
+    assert headings[0][:2] == ["Errors", "Motion"]
+    assert headings[1] == headings[0][2:]
 
 
 def test_a_table_has_one_row_a_frame(run) -> None:

@@ -147,7 +147,9 @@ def write_page(
     """Write one HTML file with its images embedded: statistics, plots, an annotated frame, the table, the command.
 
     angles : names of the three angles of a row;  stages_ms : median time by stage
-    flight : telemetry plot, PNG;  scene_3d : image files of the laboratory
+    flight : telemetry plot, PNG, or empty;  scene_3d : image files of the laboratory
+
+    A single frame has no plot against time.
     """
     text = render_page(
         "run.html",
@@ -158,9 +160,9 @@ def write_page(
         summary=summary(rows),
         stages_ms=stages_ms,
         picture=embed(cv2.imencode(".png", annotated)[1].tobytes()),
-        flight=embed(flight),
+        flight=embed(flight) if flight else "",
         scene_3d=[embed(path.read_bytes(), path.suffix[1:]) for path in scene_3d],
-        figure=embed(error_figure(rows)),
+        figure=embed(error_figure(rows)) if len(rows) > 1 else "",
     )
     write_text(path, text)
 

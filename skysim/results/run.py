@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from astropy.table import Table
 
 Progress = Callable[[float, float], None]
+SHORT_S = 1.0  # the report of a single frame after a shorter motion has no plots against time
 
 
 @dataclass(frozen=True, slots=True, repr=False)
@@ -189,7 +190,7 @@ class Recorder:
         annotated, page = self.shown.annotated(), self.folder / "report.html"
         write_image(self.folder / "annotated.png", annotated)
         stages_ms = {stage: 1e3 * float(np.median(seconds)) for stage, seconds in self.seconds.items()}
-        flight = telemetry_report.figure(log)
+        flight = telemetry_report.figure(log) if len(self.rows) > 1 or log.t_s[-1] > SHORT_S else b""
         report.write_page(page, scene.title, command, names, self.rows, stages_ms, annotated, flight, pictures)
         return report.summary(self.rows) | {
             "stages_ms": stages_ms,
