@@ -14,7 +14,7 @@ $(READY): pyproject.toml
 	$(PIP) -e '.[dev,catalog]'
 	touch $@
 
-.PHONY: bench demo test test-long oracle test-browser test-lowest lock fuzz fuzzer mutants lint pictures studies papers docs figures gui recompile setup clean
+.PHONY: reference bench demo test test-long oracle test-browser test-lowest lock fuzz fuzzer mutants lint pictures studies papers docs figures gui recompile setup clean
 setup: $(READY)
 
 demo: $(READY)
@@ -23,10 +23,10 @@ demo: $(READY)
 	$(BIN)/skysim run shefex2 --out out/shefex2
 
 test: $(READY)
-	NUMBA_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist loadfile -m "not long and not browser"
+	NUMBA_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist worksteal -m "not long and not browser"
 
 test-long: $(READY)
-	NUMBA_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist loadfile -m long
+	NUMBA_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist worksteal -m long
 
 # Other people's instruments. astrometry.net is no Python package: docs/findings/oracles.md tells how to get it.
 oracle: $(READY)
@@ -58,13 +58,18 @@ docs: $(READY)
 	$(PIP) -e '.[docs]'
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
+# The pages of commands and keys, from the code.
+reference: $(READY)
+	$(BIN)/python docs/site/commands.py
+	$(BIN)/python docs/site/keys.py
+
 figures: $(READY)
 	$(BIN)/python docs/site/figures.py
 
 # The lab's page in Chromium. Where that is missing the tests say so and are skipped.
 test-browser: $(READY)
 	$(PIP) -e '.[browser]'
-	$(BIN)/pytest -m browser tests/apps/gui -rs
+	$(BIN)/pytest -m browser tests/apps/gui tests/docs -rs
 
 # Versions that resolve today, for CI; and the tests on the lowest that pyproject.toml allows.
 lock: $(READY)
@@ -75,7 +80,7 @@ test-lowest:
 	$(PYTHON) -m venv $(LOWEST)
 	$(LOWEST)/bin/pip install --quiet --disable-pip-version-check uv
 	$(LOWEST)/bin/uv pip install --quiet --python $(LOWEST)/bin/python --resolution lowest-direct -e '.[dev,catalog]'
-	NUMBA_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(LOWEST)/bin/python -m pytest -n 2 --dist loadfile -m "not long and not browser"
+	NUMBA_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(LOWEST)/bin/python -m pytest -n 2 --dist worksteal -m "not long and not browser"
 
 # Files that nobody wrote by hand, for every parser; findings are kept in out/fuzz. Where the extra cannot be had it goes
 # on by mutation alone, and says so.

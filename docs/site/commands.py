@@ -1,4 +1,4 @@
-"""MkDocs hook: write the reference page of the command line from the commands themselves."""
+"""Write the reference page of the command line from the commands: `make reference`; a test compares the two."""
 
 from __future__ import annotations
 
@@ -8,14 +8,20 @@ from typing import Any
 import typer
 
 from skysim.apps.cli.main import app
+from skysim.core.paths import ROOT
 
-PAGE = "reference/commands.md"
-MARK = "<!-- commands -->"
+PAGE = ROOT / "docs" / "reference" / "commands.md"
+HEAD = """# Commands
+
+Every command with its arguments and options, as printed by `skysim COMMAND --help`. Exit code 0 means success, 2
+invalid input (with a one-line message on standard error), and 130 an interruption by Ctrl-C. Output is written to
+`out/NAME` unless `--out` names another folder. This page is written by `make reference`.
+"""
 
 
-def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
-    """Replace the mark on the page by the commands."""
-    return markdown.replace(MARK, commands_markdown()) if page.file.src_uri == PAGE else markdown
+def page() -> str:
+    """The text of the page."""
+    return f"{HEAD}\n{commands_markdown()}\n"
 
 
 def commands_markdown() -> str:
@@ -57,3 +63,7 @@ def row(parameter: Any, context: Any) -> str:
 def escape_cell(text: str) -> str:
     """Escape a text for a cell of a Markdown table."""
     return " ".join(text.split()).replace("|", "\\|").replace("*", "\\*")
+
+
+if __name__ == "__main__":
+    PAGE.write_text(page(), encoding="utf-8")

@@ -1,47 +1,144 @@
-"""Tables of the keys of scene and study files, from the models that check them: allowed values and defaults."""
+"""Write the reference pages of the keys of scene and study files from the models that check them.
+
+`make reference` writes docs/reference/scene_keys.md and study_keys.md; a test compares them with the models.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import inspect
+import sys
+import typing
+from collections.abc import Iterable, Iterator
+from pathlib import Path
 from typing import Any
 
 from pydantic import BaseModel
 
+sys.path.insert(0, str(Path(__file__).parent))
+from docstring_text import to_markdown
+
+from estimator.attitude.nearfield import SOLVERS as DOME_SOLVERS
+from estimator.attitude.solvers import SOLVERS as STAR_SOLVERS
+from estimator.centroiding.centroid import CENTROIDERS
+from estimator.detection.detect import DETECTORS
+from estimator.identification.registry import IDENTIFIERS as STAR_IDENTIFIERS
+from estimator.trackers.dome_tracker import IDENTIFIERS as DOME_IDENTIFIERS
 from skysim.apps.gui.page.forms import file_value, si_unit, yaml_line
+from skysim.core.paths import CATALOGS, ROOT
 from skysim.core.units import ConfigModel
-from skysim.experiments.study.plan import Study  # noqa: F401  so that `subclasses` finds its sections
-from skysim.scene.scene import NAME_ALIAS
+from skysim.experiments.study.plan import Study
+from skysim.scene.camera import CURVE_FOLDER
+from skysim.scene.loader import PRESETS
+from skysim.scene.scene import NAME_ALIAS, Scene
 
 BOUNDS = {"ge": "≥", "minimum": "≥", "gt": ">", "exclusiveMinimum": ">", "le": "≤", "maximum": "≤", "lt": "<"}
 BOUNDS["exclusiveMaximum"] = "<"
 WORDS = {"number": "number", "integer": "whole number", "string": "text", "boolean": "true or false"}
 WORDS |= {"null": "null", "object": "a section", "array": "list"}
 
+HEAD = """# Keys of a {what}
 
-def sections() -> dict[str, type[BaseModel]]:
-    """Every section of scene and study files by its full name."""
-    return {f"{section.__module__}.{section.__qualname__}": section for section in subclasses(ConfigModel)}
+Every key with its allowed values and its default, written by `make reference` from the models that check the files. A
+quantity has its unit (`"35 mm"`); the key of a bare number ends in the unit. `skysim validate --schema {what}` prints
+the same as JSON Schema, for editors.{more}
+"""
+MORE = """
+
+Two keys are applied before the others: `base`, the name or file of a scene whose keys this one overrides, and
+`camera.preset`, a camera whose keys the section overrides: {presets}."""
 
 
-def subclasses(model: type[BaseModel]) -> Iterator[type[BaseModel]]:
-    for subclass in model.__subclasses__():
-        yield subclass
-        yield from subclasses(subclass)
+def names(options: Iterable[str]) -> str:
+    return ", ".join(f"`{option}`" for option in options)
 
 
-def table(model: type[BaseModel]) -> str:
+def stems(folder: Path, ending: str) -> str:
+    return names(sorted(path.stem for path in folder.glob(f"*.{ending}")))
+
+
+CATALOG = f"{stems(CATALOGS, 'ecsv')}, or an `.ecsv` file of `skysim catalog build`"
+# What a text may be, where the model does not say it.
+TEXTS = {
+    "title": "any text",
+    "tracker.name": "`own`, or a tracker of `skysim trackers` or `--program`",
+    "tracker.options": "a section; its keys are the tracker's",
+    "tracker.detector": names(DETECTORS),
+    "tracker.centroider": names(CENTROIDERS),
+    "tracker.identifier": f"under stars {names(STAR_IDENTIFIERS)}; under a dome {names(DOME_IDENTIFIERS)}",
+    "tracker.solver": f"under stars {names(STAR_SOLVERS)}; under a dome {names(DOME_SOLVERS)}",
+    "tracker.catalog": CATALOG,
+    "tracker.map": "a file of `skysim survey`",
+    "light.catalog": CATALOG,
+    "light.layout.catalog": CATALOG,
+    "light.layout.file": "a CSV file",
+    "light.surface.file": "a file of points",
+    "camera.psf.file": "a table of numbers",
+    "camera.detector.quantum_efficiency": f"a number to 1, or {stems(CURVE_FOLDER, 'csv')}, or a CSV file",
+    "vehicle.model": "an MJCF file",
+    "vehicle.boxes.name": "any text",
+    "vehicle.surroundings.name": "any text",
+    "scene": "a name of `skysim scenes`, or a file",
+    "factors.key": "a dotted key of the scene, or of the trial (`trial.noise_px`)",
+    "factors.keys": "a list of such keys, which all take the value",
+    "figures.x": "a factor",
+    "figures.by": "a factor",
+    "figures.y": "a response, of a heat map a factor",
+    "figures.value": "a response",
+    "optimize.objectives.response": "a response, or `cost`",
+    "optimize.constraints.response": "a response, or `cost`",
+    "set": "a section: dotted keys of the scene and their values",
+    "responses": "a list of names, see [`skysim.results.metrics.response`](running.md)",
+}
+
+
+class Section(typing.NamedTuple):
+    """A model and the paths of the sections that it checks."""
+
+    model: type[BaseModel]
+    paths: list[str]
+
+
+def models(annotation: Any) -> Iterator[type[BaseModel]]:
+    """The models within a type, in its order."""
+    if isinstance(annotation, type) and issubclass(annotation, ConfigModel):
+        yield annotation
+    for argument in typing.get_args(annotation):
+        if not isinstance(argument, str):
+            yield from models(argument)
+
+
+def sections(root: type[BaseModel]) -> dict[str, Section]:
+    """The sections beneath a file's model by the model's name, a section before those beneath it."""
+    found = {root.__name__: Section(root, [])}
+
+    def visit(model: type[BaseModel], path: str) -> None:
+        for name, field in model.model_fields.items():
+            below = f"{path}.{field.alias or name}".lstrip(".")
+            for inner in (one for one in models(field.annotation) for one in (one, *one.__subclasses__())):
+                known = inner.__name__ in found
+                section = found.setdefault(inner.__name__, Section(inner, []))
+                if below not in section.paths:
+                    section.paths.append(below)
+                if not known:
+                    visit(inner, below)
+
+    visit(root, "")
+    return found
+
+
+def table(model: type[BaseModel], paths: Iterable[str] = (), links: Iterable[str] = ()) -> str:
     """Markdown table of a section's keys; "" for a section without keys."""
-    schema = model.model_json_schema(by_alias=True)
-    names = {section.__name__: name for name, section in sections().items()}
-    rows = []
+    schema, rows = model.model_json_schema(by_alias=True), []
     for name, field in model.model_fields.items():
         key = field.alias or name
         if key == NAME_ALIAS:
             continue
         unit = si_unit(name)
         default = "required" if field.is_required() else f"`{yaml_line(file_value(default_in_file(field), unit))}`"
-        description = describe(schema["properties"][key], unit, names).replace("|", "\\|")
-        rows.append(f"| `{key}` | {description} | {default} |")
+        described = describe(schema["properties"][key], unit, links)
+        texts = [TEXTS[path] for path in (f"{path}.{key}".lstrip(".") for path in paths or [""]) if path in TEXTS]
+        allowed = texts[0] + (" or null" if described.endswith(" or null") else "") if texts else described
+        rows.append(f"| `{key}` | {allowed.replace('|', chr(92) + '|')} | {default} |")
     return "\n".join(["| key | allowed | default |", "|---|---|---|", *rows]) if rows else ""
 
 
@@ -53,30 +150,32 @@ def default_in_file(field: Any) -> Any:
     )
 
 
-def describe(node: dict[str, Any], unit: str, names: dict[str, str]) -> str:
-    """Describe the values that a key allows."""
+def describe(node: dict[str, Any], unit: str, links: Iterable[str]) -> str:
+    """Describe the values that a key allows. links : names of the models that have a heading on the page"""
     choice = node.get("anyOf") or node.get("oneOf") or node.get("allOf")
     if choice:
-        return " or ".join(dict.fromkeys(describe(option, unit, names) for option in choice))
+        return " or ".join(dict.fromkeys(describe(option, unit, links) for option in choice))
     if "$ref" in node:
         name = node["$ref"].rpartition("/")[2]
-        return f"[{name}][{names[name]}]" if name in names else name
+        return f"[{name}](#{name.lower()})" if name in links else name
     if "const" in node or "enum" in node:
-        return ", ".join(f"`{option}`" for option in node.get("enum", [node.get("const")]))
+        return names(node.get("enum", [node.get("const")]))
     if node.get("type") == "array":
-        return describe_list(node, unit, names)
+        return describe_list(node, unit, links)
+    if node.get("format") == "date-time":
+        return "a date and time in UTC, such as 2012-06-22T21:00:00"
     description = node.get("description") or WORDS[node.get("type", "object")]
     return ", ".join([description, *bounds(node, unit)])
 
 
-def describe_list(node: dict[str, Any], unit: str, names: dict[str, str]) -> str:
+def describe_list(node: dict[str, Any], unit: str, links: Iterable[str]) -> str:
     """Describe a list of fixed or of any length."""
-    items = list(dict.fromkeys(describe(item, unit, names) for item in node.get("prefixItems", [])))
+    items = list(dict.fromkeys(describe(item, unit, links) for item in node.get("prefixItems", [])))
     if len(items) == 1:
         return f"list of {len(node['prefixItems'])}: {items[0]}"
     if items:
         return f"list: {'; '.join(items)}"
-    return f"list of any length: {describe(node['items'], unit, names)}" if node.get("items") else "list"
+    return f"list of any length: {describe(node['items'], unit, links)}" if node.get("items") else "list"
 
 
 def bounds(node: dict[str, Any], unit: str) -> Iterator[str]:
@@ -85,3 +184,29 @@ def bounds(node: dict[str, Any], unit: str) -> Iterator[str]:
     for keyword, symbol in BOUNDS.items():
         if keyword in node:
             yield f"{symbol} {node[keyword]:g}{suffix}"
+
+
+def page(root: type[BaseModel], what: str, more: str = "") -> str:
+    """The page of a kind of file: one heading per model."""
+    found, parts = sections(root), [HEAD.format(what=what, more=more)]
+    for name, (model, paths) in found.items():
+        kind = model.model_fields.get("kind")
+        kinds = names(typing.get_args(kind.annotation)) if kind else ""
+        where = f"Section {names(paths)}" + (f" of kind {kinds}." if kinds else ".") if paths else ""
+        parts += [f"## {name}", where, to_markdown(inspect.cleandoc(model.__doc__ or ""))]
+        parts.append(table(model, paths, found))
+    return "\n\n".join(part.strip() for part in parts if part.strip()) + "\n"
+
+
+def pages() -> dict[Path, str]:
+    """The text of every generated page by its path."""
+    folder, presets = ROOT / "docs" / "reference", stems(PRESETS, "yaml")
+    return {
+        folder / "scene_keys.md": page(Scene, "scene", MORE.format(presets=presets)),
+        folder / "study_keys.md": page(Study, "study"),
+    }
+
+
+if __name__ == "__main__":
+    for path, text in pages().items():
+        path.write_text(text, encoding="utf-8")

@@ -1,4 +1,4 @@
-"""What the site writes by itself: the page of the commands, the tables of keys; and what pages tell to make."""
+"""What the site writes by itself: the pages of the commands and of the keys; and what pages tell to make."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 
 from skysim.apps.cli import main
 from skysim.core.paths import ROOT
-from skysim.scene.scene import ExposureConfig, Scene
+from skysim.scene.scene import ExposureConfig
 from skysim.scene.tracker import SurveyErrorsConfig
 
 
@@ -65,18 +65,50 @@ def test_a_key_s_row_says_what_it_takes_and_what_stands_for_it() -> None:
     assert "| `rate_hz` | number, > 0 | required |" in exposure
     assert '| `led_sigma` | a length such as "35 mm" or "48 in", ≥ 0 m, ≤ 0.1 m | `0 m` |' in survey
     assert "| `surface_seed` | whole number, ≥ 0 or null | `null` |" in survey
-    assert "| `exposure` | [ExposureConfig][skysim.scene.scene.ExposureConfig] | required |" in keys.table(Scene)
 
 
-def test_every_section_of_a_file_has_a_page_to_stand_on() -> None:
-    """A table links to the sections beneath: the reference holds all their modules."""
-    pages = "".join(path.read_text(encoding="utf-8") for path in (ROOT / "docs/reference").glob("*.md"))
-    held = set(re.findall(r"^::: (\S+)$", pages, re.MULTILINE))
-    linked = {
-        target for model in keys.sections().values() for target in re.findall(r"\]\[([\w.]+)\]", keys.table(model))
-    }
-    assert len(linked) > 60
-    assert {target.rpartition(".")[0] for target in linked} <= held
+GENERATED = keys.pages() | {commands.PAGE: commands.page()}
+
+
+@pytest.mark.parametrize("path", GENERATED, ids=lambda path: path.stem)
+def test_a_committed_reference_page_is_that_of_the_code(path: Path) -> None:
+    """`make reference` writes these pages anew."""
+    assert path.read_text(encoding="utf-8") == GENERATED[path]
+
+
+@pytest.mark.parametrize("path", keys.pages(), ids=lambda path: path.stem)
+def test_a_page_of_keys_links_to_its_sections_and_names_what_a_text_may_be(path: Path) -> None:
+    page = GENERATED[path]
+    linked, headings = set(re.findall(r"\]\(#(\w+)\)", page)), set(re.findall(r"^## (\w+)$", page, re.MULTILINE))
+    assert len(linked) > 10
+    assert linked <= {heading.lower() for heading in headings}
+    assert re.findall(r".*\| (?:list of any length: )?text(?: or null)? \|.*", page) == []
+
+
+def test_names_that_a_key_allows_are_on_its_row() -> None:
+    rows = dict(
+        re.findall(r"^\| `(\w+)` \| (.*) \|.*\|$", GENERATED[commands.PAGE.with_name("scene_keys.md")], re.MULTILINE)
+    )
+    assert {"`sequential`", "`local`"} <= set(rows["detector"].split(", "))
+    assert "`default`" in rows["identifier"]
+    assert "`led_pairs`" in rows["identifier"]
+    assert "`hipparcos_hp6.5`" in rows["catalog"]
+
+
+@pytest.mark.browser
+def test_the_site_s_search_needs_no_server(tmp_path: Path) -> None:
+    """Chromium opens the site of `make docs` as a file, with a search in its address."""
+    chromium, site = shutil.which("chromium"), ROOT / "out" / "site" / "index.html"
+    if chromium is None or not site.exists():
+        pytest.skip("needs Chromium and the site of `make docs`")
+    words = ["--headless", "--no-sandbox", "--disable-gpu", "--virtual-time-budget=10000", "--dump-dom"]
+    done = subprocess.run(
+        [chromium, *words, f"--user-data-dir={tmp_path}", f"{site.as_uri()}?q=parallax"],
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert re.search(r"md-search-result__meta\">[0-9]+ matching documents", done.stdout)
 
 
 def test_what_a_page_tells_to_make_is_a_target() -> None:

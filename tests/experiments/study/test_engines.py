@@ -138,6 +138,7 @@ def deaths(plan_: plan.Plan) -> list[int]:
     return bad
 
 
+@pytest.mark.long
 def test_a_trial_that_kills_its_worker_fails_and_no_other(
     plan_: plan.Plan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stubs: Any
 ) -> None:
@@ -360,6 +361,7 @@ def test_a_chunk_travels_as_text_and_comes_back_bit_for_bit() -> None:
     assert dask_engine.decode_chunk(dask_engine.encode_chunk(chunk)) == chunk
 
 
+@pytest.mark.long
 def test_a_run_that_is_stopped_leaves_nothing_on_the_cluster(cluster: Cluster, plan_: plan.Plan) -> None:
     engine = on_dask(cluster, 2)
     rows = engine.run(plan_.spec, runner.ChunkQueue(plan_.points, 150, np.arange(plan_.trials)))
