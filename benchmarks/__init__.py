@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from benchmarks import attitude, detect, dynamics, identify, instrument
+from benchmarks import attitude, detect, dynamics, identify, instrument, start
 
 AREAS: dict[str, Callable[[], list[dict[str, Any]]]] = {
     "instrument": instrument.measure,
@@ -16,6 +16,7 @@ AREAS: dict[str, Callable[[], list[dict[str, Any]]]] = {
     "identify": identify.measure,
     "attitude": attitude.measure,
     "dynamics": dynamics.measure,
+    "start": start.measure,
 }
 
 
