@@ -10,11 +10,12 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from skysim.apps.cli.study_summary import trial_count
+from skysim.core.paths import STUDIES
 from skysim.experiments.study import store
 from skysim.experiments.study.analysis import search, sensitivity, table
 from skysim.experiments.study.analysis.table import PointRow
 from skysim.experiments.study.loader import load
-from skysim.experiments.study.plan import STUDIES, Curve, Figure, Plan
+from skysim.experiments.study.plan import Curve, Figure, Plan
 from skysim.experiments.study.report import figures as study_figures
 from skysim.experiments.study.report import layout
 from skysim.experiments.study.store import STORE, Store

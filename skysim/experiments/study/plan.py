@@ -14,16 +14,15 @@ from pydantic import Field, ValidationError
 
 from skysim.core import yaml_reader
 from skysim.core.errors import InputError
-from skysim.core.paths import SCENES
+from skysim.core.paths import STUDIES
 from skysim.core.units import ConfigModel, Fraction, NotNegative, Number, Time
-from skysim.core.yaml_reader import explain, is_file, read_yaml, set_key
+from skysim.core.yaml_reader import explain, is_file, set_key
 from skysim.experiments.study.designs import Design, Point, points
 from skysim.experiments.study.factors import Factor, Settings, Value
 from skysim.scene.loader import find as find_scene
 from skysim.scene.loader import load as load_scene
 from skysim.scene.scene import Scene
 
-STUDIES = SCENES / "studies"
 TRIAL = "trial."
 Declination = Annotated[Number, Field(ge=-90, le=90)]
 Tilt = Annotated[Number, Field(ge=0, le=90)]
@@ -236,11 +235,6 @@ def digest(value: Any) -> str:
 def find(name: str) -> Path:
     """Path of a study that is given by path or by its name in scenes/studies/."""
     return yaml_reader.find_file(name, STUDIES, "study")
-
-
-def title_of(path: Path) -> str:
-    """Title of a study file; the rest is not validated."""
-    return str(read_yaml(path)[0].get("title", ""))
 
 
 def make_plan(path: Path, study: Study, trial: dict[str, Any], programs: Mapping[str, str]) -> Plan:

@@ -20,9 +20,8 @@ def scenes(context: typer.Context, json: Json = False) -> None:
     if context.invoked_subcommand:
         return
     from skysim.core.paths import SCENES
-    from skysim.scene.loader import load as load_scene
 
-    print_titles(SCENES, lambda path: load_scene(path).title, json)
+    print_titles(SCENES, json)
 
 
 @scenes_app.command("export")

@@ -35,9 +35,9 @@ def studies(context: typer.Context, json: Json = False) -> None:
     """List the studies that come with skysim."""
     if context.invoked_subcommand:
         return
-    from skysim.experiments.study import plan
+    from skysim.core.paths import STUDIES
 
-    print_titles(plan.STUDIES, plan.title_of, json)
+    print_titles(STUDIES, json)
 
 
 @app.command(help="Run all trials of a study and write its report. After Ctrl-C, `resume` continues.")

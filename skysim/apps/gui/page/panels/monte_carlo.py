@@ -15,8 +15,8 @@ from skysim.apps.gui.page.style import COLORS, TOOLTIP, format_number
 from skysim.apps.gui.worker.study_process import RESPONSES, StudyProcess, StudyResults, finished, monte_carlo
 from skysim.core import files
 from skysim.core.errors import InputError
-from skysim.experiments.study import loader, plan
-from skysim.experiments.study.plan import STUDIES
+from skysim.core.paths import STUDIES, title_of
+from skysim.experiments.study import loader
 
 if TYPE_CHECKING:
     from skysim.apps.gui.page.page import Tab
@@ -61,7 +61,7 @@ class MonteCarloPanel:
 
     def set_scene(self) -> None:
         options = {"": f"Monte Carlo of {Path(self.tab.scene).stem}"}
-        options |= {path.stem: f"{path.stem}: {plan.title_of(path)}" for path in sorted(STUDIES.glob("*.yaml"))}
+        options |= {path.stem: f"{path.stem}: {title_of(path)}" for path in sorted(STUDIES.glob("*.yaml"))}
         self.study_select.set_options(options, value=self.study_select.value or "")
         if self.tab.scene_info:
             self.field.set_value(round(self.tab.scene_info.field_deg, 3))
@@ -207,7 +207,7 @@ class MonteCarloPanel:
 def report_title(folder: Path) -> str:
     """The study's title if its file is in the report's folder, else the folder's name."""
     file = next(iter(sorted(folder.glob("*.yaml"))), None)
-    return (plan.title_of(file) if file else "") or folder.name
+    return (title_of(file) if file else "") or folder.name
 
 
 def format_interval(value: float, low: float, high: float) -> str:
