@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 
 from estimator.calibration.dome_survey import DomeSurvey
 from skysim.core.types import Floats, Frame, Truth
+from skysim.core.units import ARCSEC_RAD
 from skysim.experiments.dome_survey import led_sigma_m, lens_sigma
 from skysim.experiments.dome_survey_naming import CalibrationPrior, SurveyUncertainty
 from skysim.results import metrics
@@ -19,11 +20,12 @@ from skysim.tracking import factory
 
 
 def error_statistics(stops: int, errors_rad: list[tuple[float, float]]) -> dict[str, float | int | None]:
-    """Median and worst cross-boresight and roll errors of a tracker in degrees; None if nothing was solved."""
+    """Median and worst cross-boresight and roll errors of a tracker in arcseconds; None if nothing was solved."""
     statistics: dict[str, float | int | None] = {"stops": stops, "solved": len(errors_rad)}
-    for name, error_deg in zip(("cross", "roll"), np.degrees(np.abs(errors_rad)).reshape(-1, 2).T, strict=True):
-        statistics[f"{name}_deg_median"] = float(np.median(error_deg)) if len(error_deg) else None
-        statistics[f"{name}_deg_worst"] = float(error_deg.max()) if len(error_deg) else None
+    errors_arcsec = np.abs(errors_rad).reshape(-1, 2) / ARCSEC_RAD
+    for name, error_arcsec in zip(("cross", "roll"), errors_arcsec.T, strict=True):
+        statistics[f"{name}_arcsec_median"] = float(np.median(error_arcsec)) if len(error_arcsec) else None
+        statistics[f"{name}_arcsec_worst"] = float(error_arcsec.max()) if len(error_arcsec) else None
     return statistics
 
 

@@ -211,7 +211,7 @@ def print_survey(survey: dict[str, Any]) -> None:
     for when in ("before", "after"):
         result = survey[when]
         errors = [
-            f"{name} median {result[f'{name}_deg_median']:.2g}° worst {result[f'{name}_deg_worst']:.2g}°"
+            f"{name} median {result[f'{name}_arcsec_median']:.3g}″ worst {result[f'{name}_arcsec_worst']:.3g}″"
             for name in ("cross", "roll")
             if result["solved"]
         ]
