@@ -23,7 +23,7 @@ from skysim.apps.cli.terminal import print_error
 from skysim.core import errors
 from skysim.core.errors import InputError
 
-app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
+app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False)
 for command in (run, render, stream, compare, trackers, solve, survey, camera, reproduce, gui, validate, export):
     app.command()(command)
 app.add_typer(scenes_app, name="scenes")

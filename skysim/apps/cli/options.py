@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -16,7 +17,34 @@ if TYPE_CHECKING:
 # Loaded scenes: name and command-line overrides, for the locations in error messages.
 LOADED: list[tuple[str, dict[str, str]]] = []
 
-SceneArg = Annotated[str, typer.Argument(metavar="SCENE", help="Scene file (.yaml), or name of a scene in scenes/.")]
+
+def complete_scene(incomplete: str) -> list[str]:
+    """Names of shipped scenes, and YAML files and folders, that begin with what was typed."""
+    from skysim.core.paths import SCENES
+
+    return complete_yaml(SCENES, incomplete)
+
+
+def complete_study(incomplete: str) -> list[str]:
+    """Names of shipped studies, and YAML files and folders, that begin with what was typed."""
+    from skysim.core.paths import STUDIES
+
+    return complete_yaml(STUDIES, incomplete)
+
+
+def complete_yaml(folder: Path, incomplete: str) -> list[str]:
+    names = [path.stem for path in folder.glob("*.yaml")]
+    found = Path(incomplete if incomplete.endswith("/") else os.path.dirname(incomplete)).glob("*")
+    files = [f"{path}/" if path.is_dir() else str(path) for path in found if path.is_dir() or path.suffix == ".yaml"]
+    return sorted(name for name in names + files if name.startswith(incomplete))
+
+
+SceneArg = Annotated[
+    str,
+    typer.Argument(
+        metavar="SCENE", help="Scene file (.yaml), or name of a scene in scenes/.", autocompletion=complete_scene
+    ),
+]
 Frames = Annotated[int | None, typer.Option(help="Number of frames; default: the scene's.")]
 Seed = Annotated[int | None, typer.Option(help="Seed of all random streams; default: the scene's.")]
 Out = Annotated[Path | None, typer.Option(help="Output folder; default: out/NAME.")]

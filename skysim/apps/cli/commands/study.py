@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from skysim.apps.cli.options import Json, Out, Overrides, Programs, output_folder
+from skysim.apps.cli.options import Json, Out, Overrides, Programs, complete_study, output_folder
 from skysim.apps.cli.study_summary import print_points, print_replay, print_study_status, study_status, trial_count
 from skysim.apps.cli.terminal import print_error, print_json, print_titles, trial_progress
 from skysim.core.errors import InputError, printable, unknown_name
@@ -23,7 +23,12 @@ if TYPE_CHECKING:
 app = typer.Typer(invoke_without_command=True, help="Run Monte Carlo studies: many trials of a scene with varied keys.")
 
 StudyArg = Annotated[
-    str, typer.Argument(metavar="STUDY", help="Study file (.yaml), or name of a study in scenes/studies/.")
+    str,
+    typer.Argument(
+        metavar="STUDY",
+        help="Study file (.yaml), or name of a study in scenes/studies/.",
+        autocompletion=complete_study,
+    ),
 ]
 Workers = Annotated[int | None, typer.Option(min=1, help="Number of worker processes; default: number of cores.")]
 EngineName = Annotated[str, typer.Option("--engine", help="How trials are run: pool, serial or dask.")]

@@ -1,0 +1,32 @@
+"""Completion in a shell: commands, names of scenes and studies, and files."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from skysim.apps.cli.options import complete_scene, complete_study
+
+
+def test_a_shell_completes_a_scene_s_name() -> None:
+    environment = os.environ | {
+        "_SKYSIM_COMPLETE": "complete_bash",
+        "COMP_WORDS": "skysim run ptase",
+        "COMP_CWORD": "2",
+    }
+    code = "import sys; sys.argv[0] = 'skysim'; from skysim.apps.cli.main import main; main()"
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
+    assert (done.stdout.split(), done.stderr) == (["ptase_2003"], "")
+
+
+def test_files_and_folders_complete_beside_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "shed").mkdir()
+    for name in ("shed/lab.yaml", "shefex_mine.yaml", "notes.txt"):
+        (tmp_path / name).touch()
+    monkeypatch.chdir(tmp_path)
+    assert complete_scene("she") == ["shed/", "shefex2", "shefex_mine.yaml"]
+    assert complete_scene("shed/") == ["shed/lab.yaml"]
+    assert complete_scene("no") == []
+    assert complete_study("led") == ["led_count"]
