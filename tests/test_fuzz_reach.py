@@ -32,6 +32,7 @@ OUT_OF_REACH = {
     "skysim.apps.cli.commands.study.load_stored_plan": "the store is read by `open_store`, the study by `loader.load`",
     "skysim.apps.cli.options.load": "hands a scene's name on to `loader.load`",
     "skysim.scene.loader.load_scene": "the same",
+    "skysim.core.paths.title_of": "two lines of a file that lies in a folder of ours",
     "skysim.apps.gui.worker.export.frame_files": "copies a run's files",
     "skysim.apps.gui.page.panels.monte_carlo.MonteCarloPanel.study_file": OURS,
     "skysim.apps.gui.worker.study_process.monte_carlo": "values of the page's form, checked by `loader.load`",

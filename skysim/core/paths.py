@@ -18,12 +18,16 @@ CATALOGS = DATA / "catalogs"
 
 
 def title_of(path: Path) -> str:
-    """Title of a scene or study file, or of the base of a scene without one; "" if there is none.
+    """Title of a scene or study file, or of the base of a scene without one; "" if there is none that can be read.
 
     Only its line is parsed: a list of all scenes would otherwise take a second.
     """
-    lines = dict(re.findall(r"^(title|base):(.*)", path.read_text(encoding="utf-8"), re.MULTILINE))
-    if "title" in lines:
-        return str(yaml.safe_load(lines["title"]) or "")
-    base = path.with_name(f"{str(yaml.safe_load(lines.get('base', '')) or '').removesuffix('.yaml')}.yaml")
-    return title_of(base) if "base" in lines and base.is_file() else ""
+    lines = dict(re.findall(r"^(title|base):(.*)", path.read_text(encoding="utf-8", errors="replace"), re.MULTILINE))
+    try:
+        values = {key: str(yaml.safe_load(text) or "") for key, text in lines.items()}
+    except yaml.YAMLError:
+        return ""
+    if "title" in values:
+        return values["title"]
+    base = path.with_name(f"{values.get('base', '').removesuffix('.yaml')}.yaml")
+    return title_of(base) if "base" in values and base.is_file() and base != path else ""

@@ -17,6 +17,7 @@ from skysim.core.paths import title_of
         ("base: lab\ntitle: My lab\n", "My lab"),
         ("base: elsewhere\n", ""),
         ("light:\n  title: within a section\n", ""),
+        ('title: "open\n', ""),
     ],
 )
 def test_a_title_is_the_file_s_or_its_base_s(tmp_path: Path, text: str, title: str) -> None:
