@@ -1,15 +1,14 @@
-"""Attitude error metrics, and statistics over many trials with confidence intervals. Pure functions.
+"""Attitude error metrics, and the responses of studies: named statistics over many trials. Pure functions.
 
-A statistic is named by a string (`response`), for example `cross_arcsec_p95` or `coverage_5`. Each is computed from
-the columns of a table of trials and returned with a 95% confidence interval: Wilson's interval for proportions, the
-percentile bootstrap for means and RMS, and the distribution-free binomial interval for quantiles.
+A response is named by a string (`response`), for example `cross_arcsec_p95` or `coverage_5`. It is computed from the
+columns of a table of trials and returned with a 95% confidence interval (`skysim.results.statistics`).
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import scipy
@@ -17,8 +16,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError, unknown_name
-from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
+from skysim.results.statistics import NO_VALUE, Summary, extremum, proportion, quantile, resampled, rms
 
 WRONG_RAD = np.radians(10 / 60)  # limit of PTASE for a wrong attitude: ten arcminutes
 WRONG_AS_CLAIMED_RAD = np.radians(1)  # limit for an error that the tracker's covariance allows
@@ -62,80 +61,8 @@ def normalized_error_squared(
 # Statistics over many trials. Each trial is a row; the columns are arrays, NaN where a trial has no such value.
 
 Columns = Mapping[str, NDArray[Any]]
-CONFIDENCE = 0.95
-RESAMPLES = 999
 DEFAULT_COVERAGE = 5  # "5 stars everywhere" (Padro 2012)
-
-
-class Summary(NamedTuple):
-    """A statistic, its confidence interval at CONFIDENCE (NaN if it has none) and the number of trials."""
-
-    value: float
-    low: float
-    high: float
-    trials: int
-
-
-NO_VALUE = Summary(float("nan"), float("nan"), float("nan"), 0)
 Response = Callable[[Columns], Summary]
-
-
-def exact(value: float) -> Summary:
-    """Summary of a deterministic value: an interval of zero width."""
-    return Summary(float(value), float(value), float(value), 1)
-
-
-def proportion(hits: Any, total: Any) -> Summary:
-    """The proportion hits / total with Wilson's interval (Wilson 1927), which is valid at 0 and at 1 too."""
-    if total < 1:
-        return NO_VALUE
-    interval = scipy.stats.binomtest(int(hits), int(total)).proportion_ci(CONFIDENCE, "wilson")
-    return Summary(float(hits / total), float(interval.low), float(interval.high), int(total))
-
-
-def resampled(values: Floats, statistic: Callable[..., Any]) -> Summary:
-    """A mean or similar statistic with the percentile bootstrap interval (Efron 1979); the resampling seed is fixed.
-
-    Equal values have an interval of zero width; a single value has none.
-    """
-    value = float(statistic(values))
-    if len(values) < 2 or np.ptp(values) == 0:
-        bound = value if len(values) > 1 else np.nan
-        return Summary(value, bound, bound, len(values))
-    batch = max(1, 2_000_000 // len(values))  # limits the memory of a batch to two million values
-    result = scipy.stats.bootstrap(
-        (values,),
-        statistic,
-        n_resamples=RESAMPLES,
-        batch=batch,
-        confidence_level=CONFIDENCE,
-        method="percentile",
-        rng=random_stream(1),
-    )
-    low, high = map(float, result.confidence_interval)
-    return Summary(value, low, high, len(values))
-
-
-def quantile(values: Floats, probability: float) -> Summary:
-    """The quantile at the given probability with a distribution-free interval.
-
-    The interval is between two order statistics whose ranks follow from the binomial distribution (Conover 1999,
-    section 3.2). A bound is infinite where there are too few values for it.
-    """
-    low, high = scipy.stats.quantile_test(values, p=probability).confidence_interval(CONFIDENCE)
-    bounds = (float(low) if np.isfinite(low) else -np.inf, float(high) if np.isfinite(high) else np.inf)
-    return Summary(float(np.quantile(values, probability)), *bounds, len(values))
-
-
-def extremum(values: Floats, reduce: Callable[[Floats], Any]) -> Summary:
-    """The largest or smallest value of these trials, without an interval."""
-    return Summary(float(reduce(values)), float("nan"), float("nan"), len(values))
-
-
-def rms(values: Floats, axis: int = -1) -> Any:
-    """sqrt(mean(x^2)) along the last axis."""
-    return np.sqrt(np.mean(np.square(values), axis=axis))
-
 
 # The ending of a response name such as `cross_arcsec_p95`.
 STATISTICS: dict[str, Callable[[Floats], Summary]] = {
@@ -156,11 +83,15 @@ QUANTITIES: dict[str, Callable[[Columns], NDArray[Any]]] = {
     **{
         name: lambda c, name=name: np.asarray(c[name])  # type: ignore[misc]
         for name in (
-            *("nees", "stars", "detected", "matched", "availability"),
+            *("nees", "stars", "detected", "matched", "centroid_px", "streak_px", "availability"),
             *("filter_arcsec", "filter_worst_arcsec", "drift_arcsec", "time_ms"),
         )
     },
 }
+
+
+# Quantities that are responses by themselves, with the statistic that this name stands for.
+DEFAULT_STATISTICS = {"nees": "mean", "centroid_px": "rms", "streak_px": "median"}
 
 
 def overconfident(c: Columns) -> Summary:
@@ -179,6 +110,8 @@ def proportion_of_frames(hits: NDArray[Any], frames: NDArray[Any]) -> Summary:
     The frames of one simulated run are correlated. Where trials have many frames, the interval is therefore that of
     as many independent samples as there are runs, widened if necessary to include the value.
     """
+    known = np.isfinite(hits)  # an external tracker does not say which lights it identified
+    hits, frames = hits[known], frames[known]
     summary = proportion(np.sum(hits), np.sum(frames))
     if not len(frames) or np.max(frames) <= 1:
         return summary
@@ -193,6 +126,9 @@ PROPORTIONS: dict[str, Response] = {
     "identified": lambda c: proportion_of_frames(c["solved"] - c["wrong"], c["frames"]),
     "wrong": lambda c: proportion_of_frames(c["wrong"], c["frames"]),
     "refused": lambda c: proportion_of_frames(c["frames"] - c["solved"], c["frames"]),
+    "ambiguous": lambda c: proportion_of_frames(c["ambiguous"], c["frames"]),
+    "misidentified": lambda c: proportion_of_frames(c["misidentified"], c["frames"]),
+    "roll_noise": lambda c: proportion_of_frames(c["roll_noise"], c["frames"]),
     "failed": lambda c: proportion(np.sum(c["frames"] == 0), len(c["frames"])),
 }
 COVERAGE = re.compile(r"coverage(?:_(\d+))?$")
@@ -201,21 +137,27 @@ COVERAGE = re.compile(r"coverage(?:_(\d+))?$")
 def response(name: str, where: str = "response") -> Response:
     """The function that computes the named statistic from the columns of trials. Raises InputError for other names.
 
-    overconfident : proportion of the solutions with an error far outside their covariance
     identified, wrong, refused : proportions of the frames: solved and not wrong (`is_wrong`), wrong, without a solution
-    failed     : proportion of the trials that raised an exception
-    coverage_N : proportion of the trials with at least N sources in the field of view; N is 5 if omitted
+    ambiguous     : proportion of the frames refused because another attitude fits the lights as well (LEDs only)
+    misidentified : proportion of the frames solved with a light that is matched with a wrong star or LED
+    roll_noise    : proportion of the frames solved with the right lights and a roll error beyond ten arcminutes that
+                    the tracker's covariance allows
+    overconfident : proportion of the solutions with an error far outside their covariance
+    failed        : proportion of the trials that raised an exception
+    coverage_N    : proportion of the trials with at least N sources in the field of view; N is 5 if omitted
     otherwise a quantity and a statistic: stars_least, cross_arcsec_p95 (over all solutions, wrong ones included)
+    nees, centroid_px, streak_px : nees_mean, centroid_px_rms, streak_px_median
     """
     if name in PROPORTIONS:
         return PROPORTIONS[name]
     if match := COVERAGE.match(name):
         least = int(match[1] or DEFAULT_COVERAGE)
         return lambda c: proportion(np.sum(c["stars"][c["frames"] > 0] >= least), np.sum(c["frames"] > 0))
-    quantity, _, statistic = name.rpartition("_")
+    quantity, statistic = split_name(name)
     if quantity not in QUANTITIES or statistic not in STATISTICS:
         raise InputError(
-            f"{where}: {unknown_name('response', name, PROPORTIONS)}, coverage, coverage_N, or one of"
+            f"{where}: {unknown_name('response', name, PROPORTIONS)}, coverage, coverage_N,"
+            f" {', '.join(DEFAULT_STATISTICS)}, or one of"
             f" {', '.join(QUANTITIES)} with _{', _'.join(STATISTICS)}"
         )
 
@@ -225,3 +167,16 @@ def response(name: str, where: str = "response") -> Response:
         return STATISTICS[statistic](values) if len(values) else NO_VALUE
 
     return summarize
+
+
+def split_name(name: str) -> tuple[str, str]:
+    """Quantity and statistic of a response such as `cross_arcsec_p95`; empty quantity for a proportion."""
+    if name in DEFAULT_STATISTICS:
+        return name, DEFAULT_STATISTICS[name]
+    quantity, _, statistic = name.rpartition("_")
+    return quantity, statistic
+
+
+def is_proportion(name: str) -> bool:
+    """Whether a response is a proportion between 0 and 1."""
+    return name in PROPORTIONS or bool(COVERAGE.match(name)) or split_name(name)[0] == "availability"

@@ -22,12 +22,13 @@ from numpy.typing import NDArray
 from skysim.core.errors import InputError
 from skysim.core.files import make_folder
 from skysim.experiments.study.designs import Point
-from skysim.experiments.study.execution.trials import FIELDS, Row
+from skysim.experiments.study.execution.outcomes import FIELDS
+from skysim.experiments.study.execution.trials import Row
 
 STORE = "study.sqlite"  # file name in a study's results folder
-FORMAT = 1
+FORMAT = 2  # raised when the columns of `trials` change
 TEXT_FIELDS = {"status"}
-INTEGER_FIELDS = {"frames", "solved", "wrong"}
+INTEGER_FIELDS = {"frames", "solved", "wrong", "ambiguous"}
 
 COLUMNS = ("trial", "point", "replicate", "seed", "scene", "code", *FIELDS, "error", "time_ms")  # of `Store.columns`
 
@@ -207,9 +208,20 @@ def open_store(path: Path) -> Iterator[Store]:
         closing(sqlite3.connect(path, timeout=30)) as db,
     ):
         store = Store(path, db)
-        if store.meta("format") != str(FORMAT):
-            raise InputError(f"{path}: format {store.meta('format')!r}; allowed: {FORMAT}")
+        check_format(store)
         yield store
+
+
+def check_format(store: Store) -> None:
+    """Raise InputError for a store of another format."""
+    stored = store.meta("format")
+    if stored == "1":
+        raise InputError(
+            f"{store.path}: written by an earlier skysim, without the attitudes of the trials; allowed: run the study"
+            " again, with another --out"
+        )
+    if stored != str(FORMAT):
+        raise InputError(f"{store.path}: format {stored!r}; allowed: {FORMAT}")
 
 
 @contextmanager
@@ -250,6 +262,5 @@ def writing(path: Path) -> Iterator[Store]:
                 for statement in TABLES.split(";"):
                     db.execute(statement)
                 db.execute("INSERT OR IGNORE INTO meta VALUES ('format', ?)", (str(FORMAT),))
-            if store.meta("format") != str(FORMAT):
-                raise InputError(f"{path}: format {store.meta('format')!r}; allowed: {FORMAT}")
+            check_format(store)
             yield store

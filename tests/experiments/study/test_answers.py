@@ -14,9 +14,9 @@ from skysim.core.paths import SCENES
 from skysim.experiments.study import loader, store
 from skysim.experiments.study.analysis import sensitivity, table
 from skysim.experiments.study.execution import engines, replay, runner
-from skysim.experiments.study.execution.trials import FIELDS
+from skysim.experiments.study.execution.outcomes import FIELDS
 from skysim.experiments.study.report import export
-from skysim.results import metrics
+from skysim.results import metrics, statistics
 
 STUDY = """schema: 1
 title: a question
@@ -39,45 +39,6 @@ def columns(**given):
     return empty | {name: np.asarray(values, dtype=float) for name, values in given.items()}
 
 
-@pytest.mark.parametrize(("hits", "of"), [(0, 30), (15, 30), (30, 30), (999, 1000)])
-def test_a_share_has_wilsons_interval(hits, of):
-    """The roots of (p - x)^2 = z^2 x (1 - x) / n (Wilson 1927), solved here."""
-    z2 = stats.norm.ppf(0.975) ** 2
-    p = hits / of
-    roots = np.sort(np.roots([1 + z2 / of, -(2 * p + z2 / of), p**2]).real)
-    told = metrics.proportion(hits, of)
-    assert (told.low, told.high) == pytest.approx(tuple(roots), abs=1e-9)
-    assert (told.value, told.trials) == (p, of)
-
-
-@pytest.mark.long
-def test_intervals_hold_what_they_promise():
-    """Of 400 samples of 60 each: how often the truth is inside, within four standard errors of 95 % or above it."""
-    rng = np.random.default_rng(2)
-    truth = {
-        "mean": 1.0,
-        "rms": math.sqrt(2),
-        "median": math.log(2),
-        "p90": math.log(10),
-    }  # of an exponential
-    inside = dict.fromkeys(truth, 0)
-    for _ in range(400):
-        sample = rng.exponential(size=60)
-        for name, value in truth.items():
-            told = metrics.STATISTICS[name](sample)
-            inside[name] += told.low <= value <= told.high
-    error = math.sqrt(0.95 * 0.05 / 400)
-    assert min(inside["median"], inside["p90"]) / 400 > 0.95 - 4 * error  # at least, for they are ranks
-    assert 0.85 < inside["mean"] / 400 < 0.95 + 4 * error  # the bootstrap's is short on few of a skew law
-    assert 0.80 < inside["rms"] / 400 < 0.95 + 4 * error
-
-
-def test_too_few_trials_leave_an_end_open():
-    told = metrics.STATISTICS["p99"](np.arange(20.0))
-    assert math.isfinite(told.low)
-    assert told.high == math.inf
-
-
 def test_responses_are_of_what_their_names_say():
     c = columns(
         frames=[1, 1, 1, 1, 0],
@@ -96,7 +57,7 @@ def test_responses_are_of_what_their_names_say():
     }
     for name, value in said.items():
         assert metrics.response(name)(c).value == pytest.approx(value, rel=1e-12), name
-    assert metrics.response("filter_arcsec_rms")(c) == metrics.NO_VALUE
+    assert metrics.response("filter_arcsec_rms")(c) == statistics.NO_VALUE
 
 
 def test_honest_answers_are_not_called_overconfident():
@@ -295,7 +256,7 @@ def test_frames_of_a_flight_are_counted_as_one_another_s_like():
     c = columns(frames=[100, 100], solved=[100, 100], wrong=[0, 0], nees=[500, 500])
     told = metrics.response("identified")(c)
     assert (told.value, told.trials) == (1.0, 2)
-    assert told.low == pytest.approx(metrics.proportion(2, 2).low)
+    assert told.low == pytest.approx(statistics.proportion(2, 2).low)
     assert metrics.response("overconfident")(c).trials == 0  # a flight's NEES is a mean
 
 

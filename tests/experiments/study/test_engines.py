@@ -103,7 +103,7 @@ STUBS = """
 import os
 from skysim.experiments.study.execution import trials
 from skysim.experiments.study.execution import engines
-from skysim.experiments.study.execution.trials import Outcome
+from skysim.experiments.study.execution.outcomes import Outcome
 BEGIN = engines.initialize_worker
 def deadly(ready, seed):
     if seed % 200 == 5:

@@ -18,11 +18,12 @@ from skysim.experiments.study import designs, store
 from skysim.experiments.study.analysis.sensitivity import Index
 from skysim.experiments.study.analysis.table import PointRow, cells, table
 from skysim.experiments.study.designs import Point
-from skysim.experiments.study.execution.trials import Outcome, Row
+from skysim.experiments.study.execution.outcomes import Outcome
+from skysim.experiments.study.execution.trials import Row
 from skysim.experiments.study.plan import Curve, Heat, Study
 from skysim.experiments.study.report import figures, layout, page
-from skysim.results.metrics import Summary
 from skysim.results.plots import INK
+from skysim.results.statistics import Summary
 
 COMMAND = "skysim study run 'a <b> & \"c\".yaml' --set=x=</code><script>alert(1)</script>"
 TILT = {"key": "trial.tilt_deg", "values": [20, 0, 10]}

@@ -18,8 +18,9 @@ from skysim.experiments.study import loader, plan, store
 from skysim.experiments.study.analysis import search
 from skysim.experiments.study.designs import Point
 from skysim.experiments.study.execution import engines, runner
+from skysim.experiments.study.execution.outcomes import FAILED, Outcome
 from skysim.experiments.study.execution.setups import code_version, seed_of
-from skysim.experiments.study.execution.trials import FAILED, Outcome, Row
+from skysim.experiments.study.execution.trials import Row
 from skysim.experiments.study.factors import Settings
 
 pytest.importorskip("optuna")

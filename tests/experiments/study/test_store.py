@@ -21,8 +21,9 @@ from skysim.core.errors import InputError
 from skysim.experiments.study import loader, plan, store
 from skysim.experiments.study.designs import Point
 from skysim.experiments.study.execution import runner, setups, trials
+from skysim.experiments.study.execution.outcomes import Outcome
 from skysim.experiments.study.execution.setups import Setup
-from skysim.experiments.study.execution.trials import Outcome, Row
+from skysim.experiments.study.execution.trials import Row
 
 STUDY = """
 schema: 1

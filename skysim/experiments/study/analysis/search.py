@@ -20,14 +20,16 @@ from skysim.core.errors import InputError, unknown_name
 from skysim.core.units import in_si
 from skysim.experiments.study.designs import Point, make_point
 from skysim.experiments.study.execution.engines import Engine
+from skysim.experiments.study.execution.outcomes import FAILED
 from skysim.experiments.study.execution.runner import Progress, Watch, run_points
 from skysim.experiments.study.execution.setups import code_version, seed_of
-from skysim.experiments.study.execution.trials import FAILED, Row
+from skysim.experiments.study.execution.trials import Row
 from skysim.experiments.study.factors import Distribution, Factor, Levels, Range, Value, split_quantity
 from skysim.experiments.study.plan import Constraint, Plan, Search, Study
 from skysim.experiments.study.store import Store
 from skysim.results import metrics
-from skysim.results.metrics import Columns, Summary
+from skysim.results.metrics import Columns
+from skysim.results.statistics import Summary
 
 COST = "cost"
 STARTUP_CANDIDATES = 10  # random candidates before the sampler uses earlier results

@@ -18,8 +18,9 @@ from typing import Protocol
 
 from skysim.core.errors import InputError
 from skysim.experiments.study.execution import workers
+from skysim.experiments.study.execution.outcomes import FAILED
 from skysim.experiments.study.execution.setups import code_version, seed_of
-from skysim.experiments.study.execution.trials import FAILED, Row, Segment, run_segments
+from skysim.experiments.study.execution.trials import Row, Segment, run_segments
 from skysim.experiments.study.plan import TrialSpec
 
 AHEAD = 1  # chunks queued for each worker in addition to the one it runs

@@ -9,26 +9,33 @@ import math
 import time
 import traceback
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, fields, replace
-from typing import Any, NamedTuple
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from estimator.core.types import Attitude, Centroids
+from estimator.core.types import Centroids
 from estimator.trackers.pipeline import Report
+from skysim.camera import render
 from skysim.camera.render import Poses, image_tracks, in_view
 from skysim.core import quaternion
 from skysim.core.paths import ROOT
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats, Frame, Trajectory, Truth
-from skysim.core.units import ARCSEC_RAD
 from skysim.dynamics import multibody
+from skysim.experiments.study.execution.outcomes import (
+    FAILED,
+    Outcome,
+    TrueLights,
+    score,
+    summarize_flight,
+    true_lights,
+)
 from skysim.experiments.study.execution.setups import Setup, code_version, prepared_setup, seed_of
 from skysim.experiments.study.factors import Settings
 from skysim.experiments.study.plan import CentroidTrial, FlightTrial, FrameTrial, TrialSpec
-from skysim.results import metrics
 from skysim.scene.light import DomeConfig
 from skysim.scene.scene import Scene
 from skysim.simulation import exposure, run
@@ -36,43 +43,8 @@ from skysim.simulation.testbed import MARGIN_S, Testbed, exposure_window
 from skysim.tracking import factory
 
 KNOTS = 9  # samples of a frame trial's trajectory
+STREAK_POSES = 9  # poses along the streak of a frame that is not rendered
 ANY_TIME_S = np.array([0.0, 1.0])  # the pose does not change, so the times are arbitrary
-
-
-@dataclass(frozen=True, slots=True)
-class Outcome:
-    """Result of a trial. For a flight trial, errors are RMS over the solved frames and counts are sums unless noted.
-
-    status   : "solved", the reason why there is no attitude, or "failed" if the trial raised an exception
-    frames, solved, wrong : number of frames, of solved frames, and of wrong solutions (`metrics.is_wrong`)
-    x_arcsec, y_arcsec, roll_arcsec : error in camera axes, signed (RMS for a flight); NaN without a solution
-    nees     : e^T P^-1 e with three degrees of freedom and the tracker's covariance P; mean for a flight
-    stars    : true sources on the detector, minimum for a flight.  detected, matched : numbers, means for a flight
-    availability : fraction of a flight's ticks with a filter error below ten arcminutes; without a filter, fraction
-               of its frames solved correctly
-    filter_arcsec, filter_worst_arcsec : angular error of a flight's filter, RMS and worst
-    drift_arcsec : filter_arcsec of the last quarter of a flight minus that of the first quarter
-    """
-
-    status: str
-    frames: int = 0
-    solved: int = 0
-    wrong: int = 0
-    x_arcsec: float = math.nan
-    y_arcsec: float = math.nan
-    roll_arcsec: float = math.nan
-    nees: float = math.nan
-    stars: float = math.nan
-    detected: float = math.nan
-    matched: float = math.nan
-    availability: float = math.nan
-    filter_arcsec: float = math.nan
-    filter_worst_arcsec: float = math.nan
-    drift_arcsec: float = math.nan
-
-
-FIELDS = tuple(field.name for field in fields(Outcome))
-FAILED = Outcome("failed")
 
 
 class Row(NamedTuple):
@@ -127,9 +99,8 @@ def run_trial(spec: TrialSpec, segment: Segment, trial: int, replicate: int) -> 
 def run_centroid_trial(setup: Setup, seed: int) -> Outcome:
     """Centroid trial: random attitude, noisy true detections and false ones; identified and solved."""
     lab_from_body, xy_px, detections = simulate_centroids(setup, seed)
-    solution = setup.estimator.solve_centroids(detections)
-    truth = cam_from_lab_wxyz(setup.testbed, lab_from_body)
-    return score(solution, truth, len(xy_px), len(detections))
+    report = Report(setup.estimator.solve_centroids(detections), detections)
+    return score(setup.testbed, setup.estimator, report, TrueLights(lab_from_body, xy_px, xy_px, None))
 
 
 def simulate_centroids(setup: Setup, seed: int) -> tuple[Rotation, Floats, Centroids]:
@@ -151,13 +122,8 @@ def streams(setup: Setup, seed: int) -> tuple[np.random.Generator, np.random.Gen
 def run_frame_trial(setup: Setup, seed: int) -> Outcome:
     """Frame trial: random attitude, one rendered frame, solved."""
     frame, truth, streak_px = render_trial_frame(setup, seed)
-    return frame_outcome(factory.solve_frame(setup.estimator, frame, streak_px), truth)
-
-
-def frame_outcome(report: Report, truth: Truth) -> Outcome:
-    """Outcome of a frame from the tracker's report and the truth."""
-    cam_from_lab = quaternion.from_rotation(truth.cam_from_lab)
-    return score(report.attitude, cam_from_lab, len(truth.sources.id), len(report.centroids))
+    report = factory.solve_frame(setup.estimator, frame, streak_px)
+    return score(setup.testbed, setup.estimator, report, true_lights(truth))
 
 
 def run_flight_trial(setup: Setup, seed: int) -> Outcome:
@@ -176,13 +142,22 @@ def flight_outcomes(testbed: Testbed, estimator: factory.Estimator) -> Iterator[
     """
     if not testbed.reports:
         for result in run.run(testbed, estimator):
-            yield result.truth.t_s, frame_outcome(result.report, result.truth)
+            yield result.truth.t_s, score(testbed, estimator, result.report, true_lights(result.truth))
     for index, report in testbed.reports.items():
-        window = exposure_window(testbed.scene, index, testbed.exposures_s[index])
-        t_s = window.middle_s(testbed.scene.camera.height_px)
-        lab_from_body = testbed.trajectory.attitude_at(t_s)
-        stars = len(visible_sources(testbed, lab_from_body)[0])
-        yield t_s, score(report.attitude, cam_from_lab_wxyz(testbed, lab_from_body), stars, len(report.centroids))
+        lights, t_s = flown_lights(testbed, index)
+        yield t_s, score(testbed, estimator, report, lights)
+
+
+def flown_lights(testbed: Testbed, index: int) -> tuple[TrueLights, float]:
+    """The lights of a frame that was solved during the motion, from its trajectory, and its mid-exposure time."""
+    window, rows = exposure_window(testbed.scene, index, testbed.exposures_s[index]), testbed.scene.camera.height_px
+    middle_s, exposed_s = window.middle_s(rows), window.exposure_s * np.linspace(0, 1, STREAK_POSES)
+    lab_from_body = testbed.trajectory.attitude_at(middle_s)
+    visible, xy_px, _ = visible_rows(testbed, lab_from_body)
+    poses = render.poses(testbed.trajectory, testbed.mount, window.open_s + exposed_s)
+    path_px = render.project(testbed.sources.take(visible), testbed.optics, poses)[0]
+    streak_px = np.linalg.norm(np.diff(path_px, axis=0), axis=2).sum(axis=0)
+    return TrueLights(lab_from_body, xy_px, xy_px, streak_px), middle_s
 
 
 TRIALS: dict[str, Callable[[Setup, int], Outcome]] = {
@@ -224,21 +199,21 @@ def zyz(first_rad: float, second_rad: float, third_rad: float) -> Floats:
     return np.array([cosine * math.cos(sum_), x, y, cosine * math.sin(sum_)])
 
 
-def cam_from_lab_wxyz(testbed: Testbed, lab_from_body: Rotation) -> Floats:
-    """(4,) quaternion wxyz of cam_from_lab."""
-    cam_from_body = quaternion.from_rotation(testbed.mount.cam_from_body)
-    return quaternion.multiply(cam_from_body, quaternion.inverse(quaternion.from_rotation(lab_from_body)))
-
-
 def visible_sources(testbed: Testbed, lab_from_body: Rotation) -> tuple[Floats, Floats]:
     """(N, 2) pixel positions and (N,) photoelectrons of the visible sources whose center is on the detector.
 
     Occluded sources are left out.
     """
+    return visible_rows(testbed, lab_from_body)[1:]
+
+
+def visible_rows(testbed: Testbed, lab_from_body: Rotation) -> tuple[NDArray[np.int64], Floats, Floats]:
+    """As `visible_sources`, after the sources' (N,) rows in `testbed.sources`."""
     R_lab_from_body = lab_from_body.as_matrix()
     R_cam_from_lab = testbed.mount.cam_from_body.as_matrix() @ R_lab_from_body.T
     poses = Poses(R_cam_from_lab[None], (R_lab_from_body @ testbed.mount.camera_body_m)[None])
-    near = testbed.sources.take(in_view(testbed.sources, testbed.optics, poses))
+    rows = in_view(testbed.sources, testbed.optics, poses)
+    near = testbed.sources.take(rows)
     tracks, _, _ = image_tracks(near, testbed.optics, poses, ANY_TIME_S, testbed.emitter)
     xy_px, (width_px, height_px) = tracks.xy_px[0], testbed.canvas.shape[::-1]
     x, y = xy_px.T
@@ -247,7 +222,7 @@ def visible_sources(testbed: Testbed, lab_from_body: Rotation) -> tuple[Floats, 
         visible = visible[~multibody.occluded(testbed.obstacles, lab_from_body, near.take(visible))]
     duty_cycle = np.minimum(near.on_s / near.period_s, 1.0)
     electrons = tracks.rate_e_s[0] * duty_cycle * testbed.scene.exposure.time_s
-    return xy_px[visible], electrons[visible]
+    return rows[visible], xy_px[visible], electrons[visible]
 
 
 def simulate_detections(
@@ -295,58 +270,3 @@ def constant_rate(scene: Scene, middle: Rotation, rate_body: Floats) -> Trajecto
     t_s = np.linspace(window.open_s - MARGIN_S, window.close_s(rows) + MARGIN_S, KNOTS)
     rotation = Rotation.from_rotvec(np.outer(t_s - window.middle_s(rows), rate_body))
     return Trajectory(t_s, middle * rotation, np.tile(rate_body, (KNOTS, 1)))
-
-
-def score(solution: Attitude, cam_from_lab_wxyz: Floats, stars: int, detected: int) -> Outcome:
-    """Outcome of one solution compared with the truth, a quaternion wxyz.
-
-    Quaternions are NumPy arrays because SciPy's Rotation would take a tenth of a trial's time.
-    """
-    matched = len(solution.match.observed) if solution.match else 0
-    if solution.cam_from_ref is None:
-        return Outcome(solution.status, 1, stars=stars, detected=detected, matched=matched)
-    estimate = quaternion.from_rotation(solution.cam_from_ref)
-    error = quaternion.to_rotvec(quaternion.multiply(estimate, quaternion.inverse(cam_from_lab_wxyz)))
-    covariance = solution.covariance_rad2
-    nees = math.nan if covariance is None else float(error @ np.linalg.solve(covariance, error))
-    wrong = int(metrics.is_wrong(math.hypot(*error), math.inf if covariance is None else nees))
-    x, y, roll = (error / ARCSEC_RAD).tolist()
-    return Outcome("solved", 1, 1, wrong, x, y, roll, nees, stars, detected, matched)
-
-
-def summarize_flight(testbed: Testbed, outcomes: list[Outcome], settle_s: float) -> Outcome:
-    """Outcome of a flight trial from the outcomes of its frames and, with a filter, from its error at every tick."""
-    solved = [outcome for outcome in outcomes if outcome.solved]
-    x, y, roll = (_rms([getattr(one, name) for one in solved]) for name in ("x_arcsec", "y_arcsec", "roll_arcsec"))
-    good = [bool(one.solved and not one.wrong) for one in outcomes]
-    # (K,) angular error of the filter at the ticks from settle_s on; empty without a filter.
-    log, error = testbed.log, np.empty(0)
-    if log.lab_from_filter is not None:
-        error = (log.lab_from_filter * log.lab_from_body.inv()).magnitude()[log.t_s >= settle_s] / ARCSEC_RAD
-    quarter = len(error) // 4
-    limit = metrics.WRONG_RAD / ARCSEC_RAD
-    return Outcome(
-        "solved" if solved else outcomes[-1].status if outcomes else "no frame after it settled",
-        len(outcomes),
-        len(solved),
-        sum(one.wrong for one in outcomes),
-        x,
-        y,
-        roll,
-        _mean([one.nees for one in solved]),
-        min((one.stars for one in outcomes), default=math.nan),
-        _mean([one.detected for one in outcomes]),
-        _mean([one.matched for one in outcomes]),
-        _mean(error < limit) if len(error) else _mean(good),
-        _rms(error),
-        float(error.max(initial=-np.inf)) if len(error) else math.nan,
-        _rms(error[-quarter:]) - _rms(error[:quarter]) if quarter else math.nan,
-    )
-
-
-def _rms(values: list[float] | NDArray[Any]) -> float:
-    return float(metrics.rms(np.asarray(values))) if len(values) else math.nan
-
-
-def _mean(values: list[Any] | NDArray[Any]) -> float:
-    return float(np.mean(values)) if len(values) else math.nan

@@ -17,7 +17,7 @@ from skysim.core.types import Floats
 from skysim.experiments.study.analysis.table import PointRow, format_level
 from skysim.experiments.study.factors import Distribution, Levels, Range, Value, split_quantity
 from skysim.experiments.study.plan import Curve, Figure, Heat, Search, Study
-from skysim.results import metrics
+from skysim.results import metrics, statistics
 
 SAMPLED_DESIGNS = ("lhs", "sobol", "saltelli")  # sampled designs: no two points share a level
 MAX_X_WITH_BARS = 12  # maximum number of x values for error bars; with more, intervals are drawn as a band
@@ -115,7 +115,7 @@ def label(name: str, unit: str = "") -> str:
 
 def is_share(name: str) -> bool:
     """Whether a response is a proportion between 0 and 1."""
-    return name in metrics.PROPORTIONS or bool(metrics.COVERAGE.match(name)) or name.startswith("availability_")
+    return metrics.is_proportion(name)
 
 
 def axis(study: Study, lines: Sequence[PointRow], name: str) -> Axis:
@@ -350,7 +350,7 @@ def caption(figure: Figure, study: Study, lines: Sequence[PointRow]) -> str:
     bounds = np.array([(one.low, one.high) for one in shown])
     if isinstance(figure, Heat) or np.isnan(bounds).all():
         return text + "."
-    text += f"; intervals of {100 * metrics.CONFIDENCE:g} %."
+    text += f"; intervals of {100 * statistics.CONFIDENCE:g} %."
     x_axis = axis(study, lines, figure.x)
     if draws_medians(study, x_axis, len(shown)):
         return text.partition(";")[0] + f"; lines: {'running medians' if x_axis.numeric else 'medians'} of the points."

@@ -1,0 +1,294 @@
+"""Outcome of a trial: errors of its solution, whether the right lights were identified, and the attitude it had."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from estimator.core.types import Attitude, StarMatch
+from estimator.trackers.dome_tracker import DomeTracker
+from estimator.trackers.pipeline import Report
+from estimator.trackers.star_tracker import StarTracker
+from skysim.core import quaternion
+from skysim.core.types import Floats, Truth
+from skysim.core.units import ARCSEC_RAD
+from skysim.results import metrics, statistics
+from skysim.scene.light import DomeConfig
+from skysim.simulation.testbed import Testbed
+from skysim.tracking import factory
+
+# A centroid is a light's own if it is within this distance of its true image, and half of its streak. Errors of
+# centroids are below it even where two images touch; neighboring stars or LEDs are usually farther apart.
+SAME_LIGHT_PX = 3.0
+AMBIGUOUS = "ambiguous"  # beginning of the status of such a refusal
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """Result of a trial. For a flight trial, errors are RMS over the solved frames and counts are sums unless noted.
+
+    status   : "solved", the reason why there is no attitude, or "failed" if the trial raised an exception
+    frames, solved, wrong : number of frames, of solved frames, and of wrong solutions (`metrics.is_wrong`)
+    x_arcsec, y_arcsec, roll_arcsec : error in camera axes, signed (RMS for a flight); NaN without a solution
+    nees     : e^T P^-1 e with three degrees of freedom and the tracker's covariance P; mean for a flight
+    stars    : true sources on the detector, minimum for a flight.  detected, matched : numbers, means for a flight
+    availability : fraction of a flight's ticks with a filter error below ten arcminutes; without a filter, fraction
+               of its frames solved correctly
+    filter_arcsec, filter_worst_arcsec : angular error of a flight's filter, RMS and worst
+    drift_arcsec : filter_arcsec of the last quarter of a flight minus that of the first quarter
+    ambiguous : number of frames refused because another attitude fits the lights as well
+    misidentified : number of frames solved with a light that is matched with a wrong star or LED, more than
+               SAME_LIGHT_PX from the true image of that star or LED; NaN if the tracker does not name its lights
+    roll_noise : number of frames solved with the right lights and a roll error beyond ten arcminutes that the
+               covariance allows; NaN likewise
+    centroid_px : RMS error of the centroids about each axis, of those within SAME_LIGHT_PX of a true image
+    streak_px : length of the images of the lights, median of a frame and mean for a flight; NaN for centroid trials
+    lab_from_body_w, _x, _y, _z : true attitude at mid-exposure; of the worst frame for a flight (`worst_frame`)
+    body_tilt_deg, body_azimuth_deg : under a dome, of the body's z axis: from vertical, and from the lab's x toward y
+    boresight_ra_deg, boresight_dec_deg : under the stars, of the camera
+    """
+
+    status: str
+    frames: int = 0
+    solved: int = 0
+    wrong: int = 0
+    x_arcsec: float = math.nan
+    y_arcsec: float = math.nan
+    roll_arcsec: float = math.nan
+    nees: float = math.nan
+    stars: float = math.nan
+    detected: float = math.nan
+    matched: float = math.nan
+    availability: float = math.nan
+    filter_arcsec: float = math.nan
+    filter_worst_arcsec: float = math.nan
+    drift_arcsec: float = math.nan
+    ambiguous: int = 0
+    misidentified: float = math.nan
+    roll_noise: float = math.nan
+    centroid_px: float = math.nan
+    streak_px: float = math.nan
+    lab_from_body_w: float = math.nan
+    lab_from_body_x: float = math.nan
+    lab_from_body_y: float = math.nan
+    lab_from_body_z: float = math.nan
+    body_tilt_deg: float = math.nan
+    body_azimuth_deg: float = math.nan
+    boresight_ra_deg: float = math.nan
+    boresight_dec_deg: float = math.nan
+
+
+FIELDS = tuple(field.name for field in fields(Outcome))
+FAILED = Outcome("failed")
+DIRECTION = FIELDS[-8:]  # attitude and direction
+
+
+class TrueLights(NamedTuple):
+    """True state of a frame: attitude at mid-exposure, and N lights on the detector.
+
+    xy_px     : (N, 2) image at mid-exposure
+    flux_xy_px: (N, 2) flux-weighted mean of the image over the exposure, where a perfect centroid is
+    streak_px : (N,) length of its path over the exposure; None if there is no exposure
+    """
+
+    lab_from_body: Rotation
+    xy_px: Floats
+    flux_xy_px: Floats
+    streak_px: Floats | None
+
+
+def true_lights(truth: Truth) -> TrueLights:
+    """The lights of a rendered frame."""
+    sources = truth.sources
+    return TrueLights(truth.lab_from_body, sources.xy_px, sources.flux_xy_px, sources.streak_px)
+
+
+def score(testbed: Testbed, estimator: factory.Estimator, report: Report, lights: TrueLights) -> Outcome:
+    """Outcome of one frame from the tracker's report and the truth.
+
+    Quaternions are NumPy arrays because SciPy's Rotation would take a tenth of a trial's time.
+    """
+    solution, centroids_px = report.attitude, report.centroids.xy_px
+    lab_from_body = quaternion.from_rotation(lights.lab_from_body)
+    cam_from_body = quaternion.from_rotation(testbed.mount.cam_from_body)
+    cam_from_lab = quaternion.multiply(cam_from_body, quaternion.inverse(lab_from_body))
+    streak_px = math.nan
+    if lights.streak_px is not None and len(lights.streak_px):
+        streak_px = float(np.median(lights.streak_px))
+    reach_px = SAME_LIGHT_PX + (0.0 if math.isnan(streak_px) else streak_px / 2)
+    own_tracker = isinstance(estimator, StarTracker | DomeTracker)
+    common: dict[str, Any] = {
+        "stars": len(lights.xy_px),
+        "detected": len(centroids_px),
+        "matched": len(solution.match.observed) if solution.match else 0,
+        "ambiguous": int(solution.status.startswith(AMBIGUOUS)),
+        "misidentified": 0.0 if own_tracker else math.nan,
+        "roll_noise": 0.0 if own_tracker else math.nan,
+        "centroid_px": centroid_error_px(centroids_px, lights.flux_xy_px, reach_px),
+        "streak_px": streak_px,
+        **directions(testbed, lab_from_body, cam_from_lab),
+    }
+    if solution.cam_from_ref is None:
+        return Outcome(solution.status, 1, **common)
+    error, nees = error_and_nees(solution, cam_from_lab)
+    wrong = metrics.is_wrong(math.hypot(*error), math.inf if math.isnan(nees) else nees)
+    if solution.match is not None and own_tracker:
+        claimed_px = claimed_image_px(testbed, estimator, solution.match, lab_from_body, cam_from_lab)
+        observed_px = centroids_px[solution.match.observed]
+        misidentified = is_misidentified(observed_px, claimed_px, lights, reach_px)
+        allowed = nees <= metrics.OVERCONFIDENT_NEES
+        noise = not misidentified and abs(error[2]) > metrics.WRONG_RAD and allowed
+        common |= {"misidentified": float(misidentified), "roll_noise": float(noise)}
+    x, y, roll = (error / ARCSEC_RAD).tolist()
+    return Outcome("solved", 1, 1, int(wrong), x, y, roll, nees, **common)
+
+
+def error_and_nees(solution: Attitude, cam_from_lab: Floats) -> tuple[Floats, float]:
+    """(3,) error rotation vector in camera axes, rad, and its NEES, NaN without a covariance."""
+    estimate = quaternion.from_rotation(solution.cam_from_ref)
+    error = quaternion.to_rotvec(quaternion.multiply(estimate, quaternion.inverse(cam_from_lab)))
+    covariance = solution.covariance_rad2
+    return error, math.nan if covariance is None else float(error @ np.linalg.solve(covariance, error))
+
+
+# Identity of the lights.
+
+
+def claimed_image_px(
+    testbed: Testbed, estimator: factory.Estimator, match: StarMatch, lab_from_body: Floats, cam_from_lab: Floats
+) -> Floats:
+    """(K, 2) true images at mid-exposure of the stars or LEDs with which the tracker matched its lights.
+
+    They are projected with the true attitude and the true optics; LEDs from their true places. Stars are projected
+    from the tracker's catalog, which is independent of the simulated sky and may have merged a double.
+    """
+    if isinstance(estimator, DomeTracker):
+        order = np.argsort(testbed.sources.id)
+        rows = order[np.searchsorted(testbed.sources.id, estimator.leds.id[match.star], sorter=order)]
+        camera_m = quaternion.apply(lab_from_body, testbed.mount.camera_body_m)
+        offset_lab = testbed.sources.place[rows, :3] - camera_m
+    else:
+        assert isinstance(estimator, StarTracker)
+        offset_lab = estimator.stars.vectors[match.star]
+    return testbed.optics.project(quaternion.to_rotation(cam_from_lab).apply(offset_lab))
+
+
+def is_misidentified(observed_px: Floats, claimed_px: Floats, lights: TrueLights, reach_px: float) -> bool:
+    """Whether any of K lights is matched with a star or LED whose true image is farther than reach_px from it.
+
+    observed_px : (K, 2) centroids;  claimed_px : (K, 2) true images at mid-exposure of the matched stars or LEDs
+    The image of a pulsed LED, or under a rolling shutter, is displaced over the exposure: that of the light nearest to
+    the claimed image is added.
+    """
+    if not len(lights.xy_px):
+        return len(observed_px) > 0
+    nearest, _ = nearest_light(claimed_px, lights.xy_px)
+    expected_px = claimed_px + lights.flux_xy_px[nearest] - lights.xy_px[nearest]
+    return not bool(np.all(np.linalg.norm(observed_px - expected_px, axis=1) <= reach_px))
+
+
+def centroid_error_px(centroids_px: Floats, true_px: Floats, reach_px: float) -> float:
+    """RMS error of the centroids about each axis, of those within reach_px of a true image; NaN if there are none."""
+    if not len(centroids_px) or not len(true_px):
+        return math.nan
+    _, distance_px = nearest_light(centroids_px, true_px)
+    distance_px = distance_px[distance_px <= reach_px]
+    return rms(distance_px) / math.sqrt(2)
+
+
+def nearest_light(xy_px: Floats, lights_px: Floats) -> tuple[NDArray[np.int64], Floats]:
+    """(K,) row of the light nearest to each position, and its distance."""
+    distance_px2 = np.sum((xy_px[:, None] - lights_px) ** 2, axis=2)
+    distance_px2 = np.where(np.isnan(distance_px2), np.inf, distance_px2)  # a position behind the camera
+    nearest = distance_px2.argmin(axis=1)
+    return nearest, np.sqrt(distance_px2[np.arange(len(nearest)), nearest])
+
+
+# Attitudes.
+
+
+def directions(testbed: Testbed, lab_from_body: Floats, cam_from_lab: Floats) -> dict[str, float]:
+    """The columns DIRECTION of an attitude."""
+    values = dict(zip(DIRECTION[:4], lab_from_body.tolist(), strict=True))
+    z = np.array([0.0, 0.0, 1.0])
+    if isinstance(testbed.scene.light, DomeConfig):
+        x, y, z_lab = quaternion.apply(lab_from_body, z).tolist()
+        values["body_tilt_deg"] = math.degrees(math.atan2(math.hypot(x, y), z_lab))
+        values["body_azimuth_deg"] = math.degrees(math.atan2(y, x)) % 360
+    else:
+        x, y, z_lab = quaternion.apply(quaternion.inverse(cam_from_lab), z).tolist()
+        values["boresight_ra_deg"] = math.degrees(math.atan2(y, x)) % 360
+        values["boresight_dec_deg"] = math.degrees(math.atan2(z_lab, math.hypot(x, y)))
+    return values
+
+
+# Flights.
+
+
+def summarize_flight(testbed: Testbed, outcomes: list[Outcome], settle_s: float) -> Outcome:
+    """Outcome of a flight trial from the outcomes of its frames and, with a filter, from its error at every tick."""
+    solved = [outcome for outcome in outcomes if outcome.solved]
+    x, y, roll = (rms([getattr(one, name) for one in solved]) for name in ("x_arcsec", "y_arcsec", "roll_arcsec"))
+    good = [bool(one.solved and not one.wrong) for one in outcomes]
+    # (K,) angular error of the filter at the ticks from settle_s on; empty without a filter.
+    log, error = testbed.log, np.empty(0)
+    if log.lab_from_filter is not None:
+        error = (log.lab_from_filter * log.lab_from_body.inv()).magnitude()[log.t_s >= settle_s] / ARCSEC_RAD
+    quarter = len(error) // 4
+    limit = metrics.WRONG_RAD / ARCSEC_RAD
+    worst = worst_frame(outcomes)
+    return Outcome(
+        "solved" if solved else outcomes[-1].status if outcomes else "no frame after it settled",
+        len(outcomes),
+        len(solved),
+        sum(one.wrong for one in outcomes),
+        x,
+        y,
+        roll,
+        mean([one.nees for one in solved]),
+        min((one.stars for one in outcomes), default=math.nan),
+        mean([one.detected for one in outcomes]),
+        mean([one.matched for one in outcomes]),
+        mean(error < limit) if len(error) else mean(good),
+        rms(error),
+        float(error.max(initial=-np.inf)) if len(error) else math.nan,
+        rms(error[-quarter:]) - rms(error[:quarter]) if quarter else math.nan,
+        sum(one.ambiguous for one in outcomes),
+        sum(one.misidentified for one in outcomes) if outcomes else math.nan,
+        sum(one.roll_noise for one in outcomes) if outcomes else math.nan,
+        rms(finite([one.centroid_px for one in outcomes])),
+        mean(finite([one.streak_px for one in outcomes])),
+        **{name: getattr(worst, name) for name in DIRECTION},
+    )
+
+
+def worst_frame(outcomes: list[Outcome]) -> Outcome:
+    """The worst frame of a flight: a misidentified or wrong one, else the first without a solution, else the largest
+    error; FAILED if there is no frame."""
+
+    def badness(one: Outcome) -> tuple[bool, bool, float]:
+        error = math.hypot(one.x_arcsec, one.y_arcsec, one.roll_arcsec)
+        return bool(one.wrong or one.misidentified == 1), not one.solved, 0.0 if math.isnan(error) else error
+
+    return max(outcomes, key=badness, default=FAILED)
+
+
+def finite(values: list[float]) -> Floats:
+    """The finite values."""
+    array = np.asarray(values, dtype=float)
+    return array[np.isfinite(array)]
+
+
+def rms(values: list[float] | Floats) -> float:
+    """Root mean square; NaN without values."""
+    return float(statistics.rms(np.asarray(values))) if len(values) else math.nan
+
+
+def mean(values: list[Any] | NDArray[Any]) -> float:
+    """Mean; NaN without values."""
+    return float(np.mean(values)) if len(values) else math.nan
