@@ -12,16 +12,17 @@ from pathlib import Path
 from skysim.apps.cli.study_summary import trial_count
 from skysim.core.paths import STUDIES
 from skysim.experiments.study import store
-from skysim.experiments.study.analysis import search, sensitivity, table
+from skysim.experiments.study.analysis import answer, axes, search, sensitivity, table
 from skysim.experiments.study.analysis.table import PointRow
 from skysim.experiments.study.loader import load
-from skysim.experiments.study.plan import Curve, Figure, Plan
+from skysim.experiments.study.plan import Curve, Heat, Map, Plan
 from skysim.experiments.study.report import figures as study_figures
-from skysim.experiments.study.report import layout
+from skysim.experiments.study.report import layout, maps, overview
+from skysim.experiments.study.report import page as study_page
 from skysim.experiments.study.store import STORE, Store
 
 PAGES = Path(__file__).parents[1] / "findings" / "studies"
-MAX_TABLE_ROWS = 72  # longer tables are left out
+MAX_OPEN_ROWS = 72  # longer tables are folded
 
 
 def main(folder: Path) -> None:
@@ -57,33 +58,65 @@ def page(plan: Plan, trial_store: Store) -> Iterator[str]:
         f" `{study.scene}`, seed {study.seed}. What is varied:"
         f" [`{plan.path.name}`](../../../scenes/studies/{plan.path.name}). Intervals are of 95 %.\n"
     )
-    lines = table.table(trial_store, study.responses)
+    lines = table.table(trial_store, list(dict.fromkeys([*study_page.responses(study), *answer.RESPONSES])))
+    yield from opening(plan, lines)
+    lines = table.select_responses(lines, study_page.responses(study))
     if study.optimize:
         yield from search_section(plan, trial_store, lines)
     elif study.design.kind == "saltelli":
         yield from sobol_section(plan, trial_store)
     for n, figure in enumerate(study.figures):
-        picture = f"{name}_{n + 1}.png"
-        (PAGES / picture).write_bytes(study_figures.figure_png(lines, figure, study))
-        yield f"![{figure.kind}]({picture})\n\n*{layout.caption(figure, study, lines)}*\n"
+        picture = PAGES / f"{name}_{n + 1}.png"
+        if isinstance(figure, Map):
+            yield from map_section(figure, picture, plan, trial_store, lines)
+            continue
+        picture.write_bytes(study_figures.figure_png(lines, figure, study))
+        yield f"![{figure.kind}]({picture.name})\n\n*{layout.caption(figure, study, lines)}*\n"
         yield from pivot_table(figure, lines, plan)
-    if len(lines) <= MAX_TABLE_ROWS and study.design.kind != "saltelli" and not study.optimize:
-        yield from full_table(lines)
+    if study.design.kind != "saltelli" and not study.optimize:
+        yield from full_table(table.select_responses(lines, study.responses))
 
 
-def pivot_table(figure: Figure, lines: list[PointRow], plan: Plan) -> Iterator[str]:
+def opening(plan: Plan, lines: list[PointRow]) -> Iterator[str]:
+    """The scene as a table, what its checks find, and the answer in words."""
+    about = overview.overview(plan)
+    yield "| | |\n| --- | --- |"
+    yield from (markdown_row([name, text.replace("|", "\\|")]) for name, text in about.rows)
+    yield f"\nThe checks of this scene find{':' if about.findings else ' nothing to warn of.'}\n"
+    yield from (f"- {line}" for line in about.findings)
+    yield "\n## Answer\n"
+    yield from (f"- {line}" for line in answer.headline(plan.study, lines, about.may_be_ambiguous))
+    yield from (f"- {line}" for line in answer.ranges(plan.study, lines))
+    yield "\n## Figures\n" if plan.study.figures else ""
+
+
+def map_section(figure: Map, picture: Path, plan: Plan, trial_store: Store, lines: list[PointRow]) -> Iterator[str]:
+    """A map with its worst trials and the commands that repeat them."""
+    panels = maps.direction_maps(lines, figure, plan.study, trial_store.point_columns)
+    picture.write_bytes(maps.map_png(panels, figure))
+    yield f"![{figure.kind}]({picture.name})\n\n*{maps.caption(panels, figure, plan.study, lines)}*\n"
+    rows = study_page.worst_rows(panels, f"skysim study replay {plan.name}")
+    if rows:
+        yield markdown_row(["worst", "lights", "what happened", "repeat it"])
+        yield markdown_row(["---"] * 4)
+    for one in rows:
+        where = f"{one.panel}: {one.direction}" if one.panel else one.direction
+        yield markdown_row([where, str(one.lights), one.event, f"`{one.command}`"])
+    yield ""
+
+
+def pivot_table(figure: Curve | Heat, lines: list[PointRow], plan: Plan) -> Iterator[str]:
     """A figure's numbers: its x across, the other factor down."""
-    across = layout.axis(plan.study, lines, figure.x)
+    across = axes.axis(plan.study, lines, figure.x)
     other = figure.by if isinstance(figure, Curve) else figure.y
-    name = figure.y if isinstance(figure, Curve) else figure.value
-    chosen = layout.shown_points(lines, figure, plan.study)
-    down = layout.axis(plan.study, lines, other) if other else None
-    yield markdown_row([f"{name}: {across.label}", *(across.tick_label(x) for x in across.levels)])
+    chosen = axes.shown_points(lines, figure, plan.study)
+    down = axes.axis(plan.study, lines, other) if other else None
+    yield markdown_row([f"{figure.response}: {across.label}", *(across.tick_label(x) for x in across.levels)])
     yield markdown_row(["---"] * (1 + len(across.levels)))
     for level in down.levels if down else [None]:
-        row = [line for line in chosen if other is None or layout.same(line.levels[other], level)]
+        row = [line for line in chosen if other is None or axes.same(line.levels[other], level)]
         cells = [
-            next(table.format_summary(line.responses[name]) for line in row if layout.same(line.levels[figure.x], x))
+            next(table.format_response(line, figure.response) for line in row if axes.same(line.levels[figure.x], x))
             for x in across.levels
         ]
         yield markdown_row([down.tick_label(level) if down else "", *cells])
@@ -91,12 +124,14 @@ def pivot_table(figure: Figure, lines: list[PointRow], plan: Plan) -> Iterator[s
 
 
 def full_table(lines: list[PointRow]) -> Iterator[str]:
-    """The table of all points."""
+    """The table of all points; a long one is folded."""
     heads, cells = table.cells(lines)
-    yield markdown_row(heads[1:])
-    yield markdown_row(["---"] * (len(heads) - 1))
-    yield from (markdown_row(line[1:]) for line in cells[:MAX_TABLE_ROWS])
-    yield ""
+    folded = len(cells) > MAX_OPEN_ROWS
+    yield f'<details markdown="1"><summary>All {len(cells)} points</summary>\n' if folded else "## All points\n"
+    yield markdown_row(heads)
+    yield markdown_row(["---"] * len(heads))
+    yield from (markdown_row(line) for line in cells)
+    yield "\n</details>\n" if folded else ""
 
 
 def sobol_section(plan: Plan, trial_store: Store) -> Iterator[str]:

@@ -90,6 +90,7 @@ QUANTITIES: dict[str, Callable[[Columns], NDArray[Any]]] = {
 }
 
 
+MORE_IS_BETTER = ("stars", "detected", "matched", "availability")  # quantities; of others less is better
 # Quantities that are responses by themselves, with the statistic that this name stands for.
 DEFAULT_STATISTICS = {"nees": "mean", "centroid_px": "rms", "streak_px": "median"}
 

@@ -19,6 +19,7 @@ from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
 
 CONFIDENCE = 0.95
+SIGMAS = float(scipy.stats.norm.isf((1 - CONFIDENCE) / 2))  # half of the interval of a normal variable, in sigmas
 RESAMPLES = 999
 RANK_SIGMAS = 12  # ranks farther from their mean have a probability below 1e-30
 
@@ -48,8 +49,12 @@ def proportion(hits: Any, total: Any) -> Summary:
     """The proportion hits / total with Wilson's interval (Wilson 1927), which is valid at 0 and at 1 too."""
     if total < 1:
         return NO_VALUE
-    interval = scipy.stats.binomtest(int(hits), int(total)).proportion_ci(CONFIDENCE, "wilson")
-    return Summary(float(hits / total), float(interval.low), float(interval.high), int(total))
+    value, z2 = float(hits / total), SIGMAS**2
+    scale = 1 + z2 / total
+    middle = (value + z2 / (2 * total)) / scale
+    half = SIGMAS / scale * math.sqrt(value * (1 - value) / total + z2 / (4 * total**2))
+    low, high = (middle - half if hits else 0.0), (middle + half if hits < total else 1.0)
+    return Summary(value, low, high, int(total))
 
 
 def exact_bounds(hits: int, total: int, confidence: float = CONFIDENCE) -> tuple[float, float]:

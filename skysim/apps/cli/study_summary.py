@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import textwrap
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from skysim.apps.cli.terminal import print_error, print_table
+from skysim.apps.cli.terminal import print_error, print_table, terminal_width
 from skysim.core.errors import printable
 
 if TYPE_CHECKING:
+    from skysim.experiments.study.analysis.worst import WorstTrial
     from skysim.experiments.study.plan import Plan
     from skysim.experiments.study.store import Store
 
+COLUMN_GAP = 2  # characters between two columns of a table
 MAX_ROWS = 60  # printed rows of a table; the report has all
 REPLAYED = (
     *("trial", "point", "replicate", "seed", "status", "x_arcsec", "y_arcsec", "roll_arcsec"),
@@ -47,11 +50,52 @@ def print_study_status(status: dict[str, Any]) -> None:
     )
 
 
-def print_points(heads: Sequence[str], cells: Sequence[Sequence[str]]) -> None:
-    """Print the table of a study's results, the first MAX_ROWS rows of it."""
-    print_table("", heads, cells[:MAX_ROWS])
+def print_points(heads: Sequence[str], cells: Sequence[Sequence[str]], factors: int = 0) -> None:
+    """Print the table of a study's results, the first MAX_ROWS rows of it.
+
+    factors : number of columns after the first that are factors. A terminal that is too narrow for all columns gets
+              point and factors, and as many responses as fit.
+    """
+    shown = cells[:MAX_ROWS]
+    count = fitting_columns(heads, shown, 1 + factors, terminal_width())
+    print_table("", heads[:count], [row[:count] for row in shown])
+    if count < len(heads):
+        print_wrapped(f"in the report, or in a wider terminal: {', '.join(heads[count:])}")
     if len(cells) > MAX_ROWS:
         print(f"and {len(cells) - MAX_ROWS} more points in the report")
+
+
+def fitting_columns(heads: Sequence[str], cells: Sequence[Sequence[str]], kept: int, width: int) -> int:
+    """Number of columns, from the first, that fit into a width; at least the first `kept`."""
+    columns = zip(heads, *cells, strict=True)
+    widths = [max(map(len, column)) for column in columns]
+    total = 0
+    for count, one in enumerate(widths):
+        total += one + (COLUMN_GAP if count else 0)
+        if total > width and count >= kept:
+            return count
+    return len(widths)
+
+
+def print_answers(findings: Sequence[str], answers: Sequence[str]) -> None:
+    """Print what the checks of the scene found, and the answers of a study, wrapped at the terminal's width."""
+    for text in (*(f"check: {line}" for line in findings), *answers):
+        print_wrapped(text)
+
+
+def print_wrapped(text: str) -> None:
+    """Print a text in lines of the terminal's width."""
+    print(textwrap.fill(printable(text), max(terminal_width(), 40), subsequent_indent="  ", break_on_hyphens=False))
+
+
+def print_worst(response: str, found: Sequence[WorstTrial], levels: Sequence[Mapping[str, Any]], repeat: str) -> None:
+    """Print the worst attitudes by a response with the commands that repeat them. levels : of each trial's point"""
+    if not found:
+        print(f"no trial counts for {response}")
+    for rank, (one, level) in enumerate(zip(found, levels, strict=True), 1):
+        at = ", ".join(f"{name} = {value}" for name, value in level.items())
+        print(f"{rank}. {one.direction}, {one.lights:.0f} lights: {printable(one.event)} ({printable(at)})")
+        print(f"   {repeat} {one.trial}")
 
 
 def print_replay(replay: dict[str, Any]) -> None:

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from skysim.simulation.testbed import Testbed
 
 T = TypeVar("T")
+WIDE = 240  # characters in a line of a file
 ANIMATION_FRAMES = 60
 SURVEY_COLUMNS = ("believed", "found", "sigma", "truth")
 
@@ -72,8 +73,15 @@ def print_table(title: str, headers: Sequence[str], lines: Sequence[Sequence[str
         )
     for line in lines:
         table.add_row(*(Text(printable(cell)) if isinstance(cell, str) else cell for cell in line))
+    Console(width=terminal_width()).print(table)
+
+
+def terminal_width() -> int:
+    """Characters in a line: of the terminal, or WIDE if the output goes to a file."""
+    from rich.console import Console
+
     console = Console()
-    Console(width=max(console.width, 240) if not console.is_terminal else None).print(table)
+    return console.width if console.is_terminal else max(console.width, WIDE)
 
 
 def print_rows(rows: list[FrameRow], names: tuple[str, str, str], exposures_ms: list[float]) -> None:

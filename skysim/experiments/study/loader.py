@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+import re
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from pydantic import ValidationError
@@ -10,11 +11,32 @@ from pydantic import ValidationError
 from skysim.core.errors import InputError, unknown_name
 from skysim.core.yaml_reader import check_version, explain, line_of, read_yaml, set_key
 from skysim.experiments.study.designs import make_point
-from skysim.experiments.study.factors import Factor, Settings, Value
-from skysim.experiments.study.plan import CentroidTrial, Curve, FlightTrial, Plan, Study, find, make_plan, resolve_point
+from skysim.experiments.study.factors import Distribution, Factor, Levels, Settings, Value
+from skysim.experiments.study.plan import (
+    TRIAL,
+    CentroidTrial,
+    Figure,
+    FlightTrial,
+    Map,
+    Plan,
+    Study,
+    Threshold,
+    Trial,
+    find,
+    make_plan,
+    resolve_point,
+)
 from skysim.results import metrics
-from skysim.scene.light import CollimatedDisplayConfig
+from skysim.scene.light import CollimatedDisplayConfig, DomeConfig
+from skysim.scene.scene import Scene
 from skysim.tracking.external.interface import OWN, check_tracker_name
+
+HARDWARE_SEED = re.compile(r"(hardware_seed|survey\.(surface_)?seed)$")
+# Kinds of trial that measure a quantity; quantities that are not listed are measured by all.
+MEASURED_BY: dict[str, tuple[str, ...]] = {
+    **dict.fromkeys(("availability", "filter_arcsec", "filter_worst_arcsec", "drift_arcsec"), ("flight",)),
+    "streak_px": ("frames", "flight"),
+}
 
 
 def load(
@@ -52,21 +74,12 @@ def check(plan: Plan, to_run: bool) -> None:
     to_run : whether the trackers must be installed
     """
     from skysim.experiments.study.analysis import search
-    from skysim.experiments.study.analysis.table import PointRow
-    from skysim.experiments.study.report import layout
     from skysim.experiments.study.store import COLUMNS
 
     study = plan.study
     for n, name in enumerate(study.responses):
         metrics.response(name, f"responses.{n}")
-    for n, figure in enumerate(study.figures):
-        for key in ("x", "by") if isinstance(figure, Curve) else ("x", "y"):
-            axis = getattr(figure, key)
-            if axis is not None and axis not in study.factors:
-                raise InputError(f"figures.{n}.{key}: {unknown_name('factor', axis, study.factors)}")
-        metrics.response(figure.y if isinstance(figure, Curve) else figure.value, f"figures.{n}")
-        if plan.points:
-            layout.fixed_levels(figure, study, [PointRow(k, point.levels, {}) for k, point in enumerate(plan.points)])
+    check_figures(plan)
     if study.optimize:
         search.check(study)
     if study.budget.trials is not None and plan.trials > study.budget.trials:
@@ -76,22 +89,116 @@ def check(plan: Plan, to_run: bool) -> None:
     for name in study.factors:
         if name in COLUMNS or name in study.responses:
             raise InputError(f"factors.{name}: the name is that of a column of the trials; allowed: another name")
+    check_hardware(study)
+    scenes: list[Scene] = []
+    kinds: set[str] = set()
     for name, level, settings in each_level(study.factors):
         try:
-            scene, trial = resolve_point(plan.spec, settings)
-            if isinstance(scene.light, CollimatedDisplayConfig) and not isinstance(trial, FlightTrial):
-                raise InputError(f"trial.kind: {trial.kind} with a collimated display; allowed: flight")
-            if to_run:
-                tracker = scene.tracker.name
-                check_tracker_name(tracker, plan.spec.programs)
-                if tracker != OWN and isinstance(trial, CentroidTrial):  # an external tracker takes images
-                    raise InputError(f"tracker.name: {tracker} needs frames; allowed: {OWN}, or another trial.kind")
+            scene, trial = resolve_point(plan.spec, plan.spec.trial_settings(settings, 0))
+            check_trial(plan, scene, trial, to_run)
         except InputError as error:
-            key = str(error).partition(":")[0]
-            owners = [other for other, factor in study.factors.items() if key in dict(factor.value_at(0.5)[1])]
-            owner = name if name in owners or not owners else owners[0]
-            value = level if owner == name else study.factors[owner].value_at(0.5)[0]
-            raise InputError(f"factors.{owner}: {value!r}: {error}") from None
+            raise InputError(at_factor(study, name, level, error)) from None
+        scenes.append(scene)
+        kinds.add(trial.kind)
+    check_measured(study, kinds, scenes)
+
+
+def check_figures(plan: Plan) -> None:
+    """Raise InputError for a figure or threshold of an unknown factor, level or response."""
+    from skysim.experiments.study.analysis import axes, thresholds
+    from skysim.experiments.study.analysis.table import PointRow
+
+    study, rows = plan.study, [PointRow(k, point.levels, {}) for k, point in enumerate(plan.points)]
+    for where, one in named_sections(study):
+        for key, factor in one.axes.items():
+            if factor is not None and factor not in study.factors:
+                raise InputError(f"{where}.{key}: {unknown_name('factor', factor, study.factors)}")
+        metrics.response(one.response, where)
+        if isinstance(one, Map) and study.trial.kind == "flight":
+            raise InputError(f"{where}.kind: a map of flights, which have no single attitude; allowed: curve, heat")
+        if isinstance(one, Threshold):
+            thresholds.check(one, where, study, rows)
+        if plan.points:
+            try:
+                axes.fixed_levels(one, study, rows)
+            except InputError as error:
+                raise InputError(f"{where}.{error}") from None
+
+
+def named_sections(study: Study) -> Iterator[tuple[str, Figure | Threshold]]:
+    """Every figure and threshold with its key in the study file."""
+    for n, figure in enumerate(study.figures):
+        yield f"figures.{n}", figure
+    for n, threshold in enumerate(study.thresholds):
+        yield f"thresholds.{n}", threshold
+
+
+def check_hardware(study: Study) -> None:
+    """Raise InputError where draws of the hardware are levels of a factor, or keys that the factors set too."""
+    for n, key in enumerate(study.hardware):
+        if key.startswith(TRIAL):
+            raise InputError(f"hardware.{n}: {key} is no hardware; allowed: seeds of the scene's hardware")
+        for name, factor in study.factors.items():
+            if key in dict(factor.value_at(0.5)[1]):
+                raise InputError(f"hardware.{n}: {key} is set by factors.{name} too; allowed: one of the two")
+    for name, factor in study.factors.items():
+        keys = [] if isinstance(factor, Levels | Distribution) else list(factor.value_at(0.5)[1])
+        if keys and all(HARDWARE_SEED.search(key) for key in keys):
+            raise InputError(
+                f"factors.{name}: {keys[0]} numbers draws of the hardware; allowed: hardware: [{', '.join(keys)}],"
+                " which draws them anew in every replicate, or levels with a name for each unit"
+            )
+
+
+def check_trial(plan: Plan, scene: Scene, trial: Trial, to_run: bool) -> None:
+    """Raise InputError where the trial does not fit the scene of a level."""
+    if isinstance(scene.light, CollimatedDisplayConfig) and not isinstance(trial, FlightTrial):
+        raise InputError(f"trial.kind: {trial.kind} with a collimated display; allowed: flight")
+    survey, dome = scene.tracker.survey, scene.light if isinstance(scene.light, DomeConfig) else None
+    error_m = dome.surface.error_m if dome else 0.0
+    if "tracker.survey.seed" in plan.spec.hardware and not (survey.led_sigma_m or survey.lever_sigma_m or error_m):
+        raise InputError(
+            "hardware: tracker.survey.seed has no effect without errors of the survey; allowed: with"
+            " tracker.survey.led_sigma, lever_sigma or light.surface.error"
+        )
+    if to_run:
+        tracker = scene.tracker.name
+        check_tracker_name(tracker, plan.spec.programs)
+        if tracker != OWN and isinstance(trial, CentroidTrial):  # an external tracker takes images
+            raise InputError(f"tracker.name: {tracker} needs frames; allowed: {OWN}, or another trial.kind")
+
+
+def at_factor(study: Study, name: str, level: Value, error: InputError) -> str:
+    """The message of a level's error, with the factor that sets the key at fault and its value."""
+    if str(error).startswith("hardware"):
+        return str(error)
+    key = str(error).partition(":")[0]
+    owners = [other for other, factor in study.factors.items() if key in dict(factor.value_at(0.5)[1])]
+    owner = name if name in owners or not owners else owners[0]
+    value = level if owner == name else study.factors[owner].value_at(0.5)[0]
+    return f"factors.{owner}: {value!r}: {error}"
+
+
+def check_measured(study: Study, kinds: set[str], scenes: Sequence[Scene]) -> None:
+    """Raise InputError for a response that no trial of the study measures."""
+    where = {name: f"responses.{n}" for n, name in enumerate(study.responses)}
+    where |= {one.response: key for key, one in named_sections(study)}
+    for name, key in where.items():
+        measured = MEASURED_BY.get(metrics.split_name(name)[0], kinds)
+        if not kinds & set(measured):
+            raise InputError(f"{key}: {name} in trials of kind {', '.join(kinds)}; allowed: of {', '.join(measured)}")
+        if name == "ambiguous" and not any(map(may_report_ambiguity, scenes)):
+            raise InputError(
+                f"{key}: no tracker of this study reports ambiguity; allowed: under a dome, with the default identifier"
+            )
+
+
+def may_report_ambiguity(scene: Scene) -> bool:
+    """Whether the tracker of a scene can refuse a frame as ambiguous."""
+    from estimator.trackers.dome_tracker import SETTINGS
+
+    own = isinstance(scene.light, DomeConfig) and scene.tracker.identifier in (None, SETTINGS.identifier)
+    return own or scene.tracker.name != OWN
 
 
 def each_level(factors: Mapping[str, Factor]) -> Iterator[tuple[str, Value, Settings]]:

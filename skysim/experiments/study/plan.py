@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import numpy as np
 import yaml
 from pydantic import Field, ValidationError
 
@@ -24,7 +25,9 @@ from skysim.scene.loader import load as load_scene
 from skysim.scene.scene import Scene
 
 TRIAL = "trial."
+HARDWARE = 1  # first of the three numbers of a hardware seed's key; a trial's seed has one or two (`setups.seed_of`)
 Declination = Annotated[Number, Field(ge=-90, le=90)]
+SeedKey = Annotated[str, Field(pattern=r"^[a-z_]+(\.\w+)*[._]seed$")]
 Tilt = Annotated[Number, Field(ge=0, le=90)]
 
 
@@ -102,6 +105,40 @@ class Curve(ConfigModel):
     where: dict[str, Value] = Field(default_factory=dict)
     log: bool = False
 
+    @property
+    def response(self) -> str:
+        """The response that the figure shows."""
+        return self.y
+
+    @property
+    def axes(self) -> dict[str, str | None]:
+        """The factors that it shows, by key."""
+        return {"x": self.x, "by": self.by}
+
+
+class Map(ConfigModel):
+    """A figure: one response over the directions of the random attitudes, a panel for each level of another factor.
+
+    Under a dome the direction is that of the body's z axis, tilt as radius and azimuth as angle; under the stars it is
+    the boresight's, in a projection of the whole sky.
+    """
+
+    kind: Literal["map"]
+    value: str
+    by: str | None = None
+    where: dict[str, Value] = Field(default_factory=dict)
+    log: bool = False
+
+    @property
+    def response(self) -> str:
+        """The response that the figure shows."""
+        return self.value
+
+    @property
+    def axes(self) -> dict[str, str | None]:
+        """The factors that it shows, by key."""
+        return {"by": self.by}
+
 
 class Heat(ConfigModel):
     """A figure: one response over two factors."""
@@ -113,8 +150,37 @@ class Heat(ConfigModel):
     where: dict[str, Value] = Field(default_factory=dict)
     log: bool = False
 
+    @property
+    def response(self) -> str:
+        """The response that the figure shows."""
+        return self.value
 
-Figure = Annotated[Curve | Heat, Field(discriminator="kind")]
+    @property
+    def axes(self) -> dict[str, str | None]:
+        """The factors that it shows, by key."""
+        return {"x": self.x, "y": self.y}
+
+
+Figure = Annotated[Curve | Heat | Map, Field(discriminator="kind")]
+
+
+class Threshold(ConfigModel):
+    """Where along a factor a proportion crosses a limit, such as the rate at which 95 % of the frames are identified.
+
+    response : a proportion (`identified`, `coverage_4`, ...), rising or falling along the factor
+    along    : a factor with numeric levels;  by : one threshold for each level of this factor
+    """
+
+    response: str
+    limit: Annotated[Number, Field(gt=0, lt=1)]
+    along: str
+    by: str | None = None
+    where: dict[str, Value] = Field(default_factory=dict)
+
+    @property
+    def axes(self) -> dict[str, str | None]:
+        """The factors that it is about, by key."""
+        return {"along": self.along, "by": self.by}
 
 
 class Cost(ConfigModel):
@@ -163,6 +229,8 @@ class Study(ConfigModel):
 
     scene      : name, or path relative to the study file's folder; `set` overrides keys of it at all points
     paired     : use the same random attitudes and noise at every point for each replicate (common random numbers)
+    hardware   : keys of seeds, such as `light.layout.hardware_seed` and `tracker.survey.seed`, that are drawn anew in
+        every replicate: results then hold for all LED domes or surveys of the kind, not for one of them
     responses  : names that `metrics.response` accepts
     """
 
@@ -175,10 +243,12 @@ class Study(ConfigModel):
     factors: Annotated[dict[Annotated[str, Field(pattern=r"^[a-z]\w*$")], Factor], Field(min_length=1)]
     design: Design = Design()
     replicates: Annotated[int, Field(ge=1, le=10_000_000)] = 1
+    hardware: tuple[SeedKey, ...] = ()
     paired: bool = True
     responses: Annotated[tuple[str, ...], Field(min_length=1)]
     budget: Budget = Budget()
     figures: tuple[Figure, ...] = ()
+    thresholds: tuple[Threshold, ...] = ()
     optimize: Search | None = None
 
 
@@ -187,6 +257,7 @@ class TrialSpec:
     """The part of a study that a worker needs to run any of its trials.
 
     folder : folder of the study file, to which scene paths are relative
+    hardware : keys of the seeds that every replicate draws anew
     programs : commands of external trackers by name, from the command line; not part of the study's digest
     """
 
@@ -196,7 +267,18 @@ class TrialSpec:
     base: Settings
     trial: dict[str, Any]
     paired: bool
+    hardware: tuple[str, ...] = ()
     programs: Mapping[str, str] = field(default_factory=dict)
+
+    def trial_settings(self, settings: Settings, replicate: int) -> Settings:
+        """The settings of a point's trial: those of the point, and the replicate's draws of the hardware.
+
+        A replicate draws the same hardware at every point, so that points are compared on the same units.
+        """
+        if not self.hardware:
+            return settings
+        seeds = np.random.SeedSequence(self.seed, spawn_key=(HARDWARE, replicate, 0)).generate_state(len(self.hardware))
+        return settings | dict(zip(self.hardware, seeds.tolist(), strict=True))
 
 
 @dataclass(frozen=True, slots=True)
@@ -222,7 +304,7 @@ class Plan:
     def digest(self) -> str:
         """Hash of everything that affects a trial's outcome; title, figures, responses and budget may change."""
         tree = self.study.model_dump(mode="json", by_alias=True)
-        keys = ("scene", "seed", "set", "trial", "factors", "design", "replicates", "paired", "optimize")
+        keys = ("scene", "seed", "set", "trial", "factors", "design", "replicates", "paired", "hardware", "optimize")
         return digest({key: tree[key] for key in keys})
 
 
@@ -241,7 +323,7 @@ def make_plan(path: Path, study: Study, trial: dict[str, Any], programs: Mapping
     """The plan of a study; `trial` is the section as written in the file, with units."""
     chosen = [] if study.optimize else points(study.design, study.factors, study.seed)
     folder = str(path.resolve().parent)
-    spec = TrialSpec(study.scene, folder, study.seed, study.set, trial, study.paired, dict(programs))
+    spec = TrialSpec(study.scene, folder, study.seed, study.set, trial, study.paired, study.hardware, dict(programs))
     return Plan(path, study, spec, chosen)
 
 

@@ -79,9 +79,11 @@ class Store:
             self._insert_points(points)
             self.db.executemany("INSERT OR REPLACE INTO meta VALUES (?, ?)", values.items())
 
-    def scenes(self) -> list[tuple[int, str]]:
-        """Point and scene hash of the first and the last trial that did not fail."""
-        query = "SELECT point, scene FROM trials WHERE scene != '' AND error IS NULL ORDER BY trial {} LIMIT 1"
+    def scenes(self) -> list[tuple[int, int, str]]:
+        """Point, replicate and scene hash of the first and the last trial that did not fail."""
+        query = (
+            "SELECT point, replicate, scene FROM trials WHERE scene != '' AND error IS NULL ORDER BY trial {} LIMIT 1"
+        )
         return [row for order in ("ASC", "DESC") for row in self.db.execute(query.format(order))]
 
     def delete_failed(self) -> None:

@@ -15,6 +15,7 @@ import pytest
 
 from skysim.core.errors import InputError
 from skysim.experiments.study import designs, store
+from skysim.experiments.study.analysis import axes
 from skysim.experiments.study.analysis.sensitivity import Index
 from skysim.experiments.study.analysis.table import PointRow, cells, table
 from skysim.experiments.study.designs import Point
@@ -323,8 +324,8 @@ def test_a_heat_map_has_its_cells_in_order_and_nan_where_nothing_is(tmp_path: Pa
 
 
 def test_axes_know_numbers_quantities_names_and_lists() -> None:
-    def axis(factor: dict[str, Any], levels: list[Any]) -> layout.Axis:
-        return layout.axis(
+    def axis(factor: dict[str, Any], levels: list[Any]) -> axes.Axis:
+        return axes.axis(
             study(factors={"a": factor}), [PointRow(n, {"a": one}, {}) for n, one in enumerate(levels)], "a"
         )
 
@@ -348,10 +349,10 @@ def test_axes_know_numbers_quantities_names_and_lists() -> None:
 
 
 def test_two_levels_said_in_two_ways_are_one() -> None:
-    assert layout.same("5 m", "5.0 m")
-    assert layout.same([0, 10], [0.0, 10.0])
-    assert not layout.same("5 m", "5 ft")
-    assert not layout.same("5 m", 5)
+    assert axes.same("5 m", "5.0 m")
+    assert axes.same([0, 10], [0.0, 10.0])
+    assert not axes.same("5 m", "5 ft")
+    assert not axes.same("5 m", 5)
 
 
 def test_where_names_what_is_there() -> None:
@@ -362,7 +363,7 @@ def test_where_names_what_is_there() -> None:
         ({"x": 1}, "allowed: dome, tilt"),
     ):
         with pytest.raises(InputError, match=said):
-            layout.shown_points(lines, Curve(kind="curve", x="tilt", y="wrong", where=where), asked)
+            axes.shown_points(lines, Curve(kind="curve", x="tilt", y="wrong", where=where), asked)
 
 
 def test_figures_that_nobody_named_follow_from_the_factors() -> None:

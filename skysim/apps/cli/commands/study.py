@@ -11,7 +11,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from skysim.apps.cli.options import Json, Out, Overrides, Programs, complete_study, output_folder
-from skysim.apps.cli.study_summary import print_points, print_replay, print_study_status, study_status, trial_count
+from skysim.apps.cli.study_summary import (
+    print_answers,
+    print_points,
+    print_replay,
+    print_study_status,
+    print_worst,
+    study_status,
+    trial_count,
+)
 from skysim.apps.cli.terminal import print_error, print_json, print_titles, trial_progress
 from skysim.core.errors import InputError, printable, unknown_name
 
@@ -171,6 +179,48 @@ def replay(
         typer.launch(str(repeated.pictures[0]))
 
 
+@app.command()
+def worst(
+    study: StudyArg,
+    response: Annotated[
+        str, typer.Option(help="Response by which trials are ranked; default: the first of the study.")
+    ] = "",
+    where: Annotated[
+        list[str] | None,
+        typer.Option(metavar="FACTOR=LEVEL", help="Only points at this level; may be given several times."),
+    ] = None,
+    count: Annotated[int, typer.Option(min=1, max=100, help="Number of attitudes.")] = 3,
+    out: Out = None,
+    json: Json = False,
+) -> None:
+    """Name the attitudes of the worst trials, and the commands that repeat them."""
+    from skysim.experiments.study.analysis import worst as analysis
+    from skysim.results import metrics
+
+    plan, _ = load_stored_plan(study, out)
+    name = response or plan.study.responses[0]
+    metrics.response(name, "--response")
+    with open_store(study, out) as stored:
+        points = stored.points()
+        try:
+            found = analysis.worst_of_levels(plan.study, stored, name, parse_levels(where or []), count)
+        except InputError as error:
+            raise InputError(f"--{error}") from None
+    rows = [one._asdict() | {"levels": points[one.point].levels} for one in found]
+    repeat = command(study, out, "replay")
+    if json:
+        print_json([row | {"command": f"{repeat} {row['trial']}"} for row in rows])
+    else:
+        print_worst(name, found, [points[one.point].levels for one in found], repeat)
+
+
+def parse_levels(words: list[str]) -> dict[str, Any]:
+    """Levels by factor from FACTOR=LEVEL. Raises InputError."""
+    from skysim.core.yaml_reader import parse_overrides, parse_yaml
+
+    return {key: parse_yaml(text)[1] for key, text in parse_overrides(words, "--where").items()}
+
+
 # Registered last, so that it is the last in `skysim study --help`.
 SEARCH_HELP = (
     "Search a study's factors for the best point, or the Pareto front of two objectives. `resume` continues it."
@@ -229,20 +279,27 @@ def interruptible(resume_command: str, stored: Store) -> Iterator[None]:
 
 def write_report(plan: Plan, study: str, out: Path | None, overrides: dict[str, str], json: bool) -> None:
     """Write the HTML report and print the table of results."""
-    from skysim.experiments.study.analysis import table
+    from skysim.experiments.study.analysis import answer, table
     from skysim.experiments.study.report import page
+    from skysim.experiments.study.report.overview import overview
 
-    path = folder_of(study, out) / "report.html"
+    path, about = folder_of(study, out) / "report.html", overview(plan)
     with open_store(study, out) as stored:
         repeat = command(study, out, "optimize" if plan.study.optimize else "run", overrides)
-        lines = table.table(stored, page.responses(plan.study))
-        page.write_page(path, stored, plan.study, repeat, lines, **analysis(plan, stored))
+        lines = table.table(stored, list(dict.fromkeys([*page.responses(plan.study), *answer.RESPONSES])))
+        headline = answer.headline(plan.study, lines, about.may_be_ambiguous)
+        answers = headline + answer.ranges(plan.study, lines)
+        texts: dict[str, Any] = {"about": about, "answers": answers, "replay": command(study, out, "replay")}
+        shown = table.select_responses(lines, page.responses(plan.study))
+        page.write_page(path, stored, plan.study, repeat, shown, **texts, **analysis(plan, stored))
         lines = table.select_responses(lines, plan.study.responses)
         progress = study_status(plan, stored)
     if json:
-        print_json(progress | {"report": str(path), "points": table.to_columns(lines)})
+        points = table.to_columns(lines)
+        print_json(progress | {"report": str(path), "points": points, "answers": answers, "findings": about.findings})
         return
-    print_points(*table.cells(lines))
+    print_points(*table.cells(lines), factors=len(plan.study.factors))
+    print_answers(about.findings, headline)
     print_study_status(progress)
     print(f"report: {path}")
 

@@ -16,12 +16,16 @@ from skysim.results.statistics import Summary
 LONG_QUANTITY = re.compile(r"(-?\d*\.\d{4,}(?:e[-+]?\d+)?)(\s\S.*)$")
 
 
+MIN_VALUES = 10  # fewer values of more trials are few
+
+
 class PointRow(NamedTuple):
-    """One point: its number, factor levels, and the responses computed from its trials."""
+    """One point: its number, factor levels, the responses computed from its trials, and the number of these."""
 
     point: int
     levels: dict[str, Any]
     responses: dict[str, Summary]
+    trials: int = 0
 
 
 def table(store: Store, responses: Sequence[str]) -> list[PointRow]:
@@ -29,8 +33,18 @@ def table(store: Store, responses: Sequence[str]) -> list[PointRow]:
     functions, rows = {name: metrics.response(name) for name in responses}, []
     for number, point in enumerate(store.points()):
         columns = store.point_columns(number)
-        rows.append(PointRow(number, point.levels, {name: response(columns) for name, response in functions.items()}))
+        responses_ = {name: response(columns) for name, response in functions.items()}
+        rows.append(PointRow(number, point.levels, responses_, len(columns["trial"])))
     return rows
+
+
+def has_few_values(row: PointRow, response: str) -> bool:
+    """Whether few of a point's trials have a value of a response: less than half of them, or less than MIN_VALUES.
+
+    The error of a solution, for example, is that of the solved trials alone, which are the easy ones where few are.
+    """
+    values = row.responses[response].trials
+    return 0 < values < max(row.trials / 2, min(MIN_VALUES, row.trials))
 
 
 def select_responses(rows: Sequence[PointRow], responses: Sequence[str]) -> list[PointRow]:
@@ -43,7 +57,11 @@ def cells(rows: Sequence[PointRow]) -> tuple[list[str], list[list[str]]]:
     if not rows:
         return [], []
     texts = [
-        [str(one.point), *map(format_level, one.levels.values()), *map(format_summary, one.responses.values())]
+        [
+            str(one.point),
+            *map(format_level, one.levels.values()),
+            *(format_response(one, name) for name in one.responses),
+        ]
         for one in rows
     ]
     return ["point", *rows[0].levels, *rows[0].responses], texts
@@ -59,12 +77,20 @@ def format_level(value: Any) -> str:
 
 
 def format_summary(summary: Summary) -> str:
-    """Text of a statistic with its interval, if it has one."""
+    """Text of a statistic with its interval, or how many values more it needs to have one."""
     if np.isnan(summary.value):
         return "-"
+    if summary.needs:
+        return f"{summary.value:.3g} (needs {summary.needs} more)"
     if np.isnan(summary.low) or summary.low == summary.high:
         return f"{summary.value:.3g}"
     return f"{summary.value:.3g} ({summary.low:.3g}..{summary.high:.3g})"
+
+
+def format_response(row: PointRow, name: str) -> str:
+    """Text of a response, with the number of values where few of the point's trials have one."""
+    text = format_summary(row.responses[name])
+    return f"{text} n={row.responses[name].trials}" if has_few_values(row, name) else text
 
 
 def to_columns(rows: Sequence[PointRow]) -> dict[str, list[Any]]:

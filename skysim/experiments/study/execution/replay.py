@@ -42,7 +42,8 @@ def segment_of(plan: Plan, store: Store, trial: int) -> Segment:
     if not 0 <= trial < len(points) * each:
         raise InputError(f"trial {trial}: not in the study; allowed: 0 to {len(points) * each - 1}")
     point, replicate = divmod(trial, each)
-    return Segment(point, points[point].settings, trial, range(replicate, replicate + 1))
+    settings = plan.spec.trial_settings(points[point].settings, replicate)
+    return Segment(point, settings, trial, range(replicate, replicate + 1))
 
 
 def replay(plan: Plan, store: Store, trial: int, folder: Path) -> Replay:

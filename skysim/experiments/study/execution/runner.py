@@ -16,7 +16,7 @@ from skysim.experiments.study.designs import Point
 from skysim.experiments.study.execution.engines import Chunk, Engine, Pool, Serial
 from skysim.experiments.study.execution.setups import code_version, scene_hash
 from skysim.experiments.study.execution.trials import Row, Segment
-from skysim.experiments.study.plan import Plan, resolve_point
+from skysim.experiments.study.plan import Plan, TrialSpec, resolve_point
 from skysim.experiments.study.store import Store
 
 CHUNK_S = 0.25  # run time of a chunk: long relative to its overhead, short in case a worker dies
@@ -58,11 +58,18 @@ class ChunkQueue:
 
     Chunks larger than a point are extended to complete points, so that a point's setup is built on one worker only.
 
-    missing : (M,) trial numbers, ascending
+    missing : (M,) trial numbers, ascending;  spec : of the trials, if their hardware is drawn
     """
 
-    def __init__(self, points: Sequence[Point], replicates: int, missing: NDArray[np.int64], first: int = 0) -> None:
-        self.points, self.replicates, self.missing, self.first = points, replicates, missing, first
+    def __init__(
+        self,
+        points: Sequence[Point],
+        replicates: int,
+        missing: NDArray[np.int64],
+        first: int = 0,
+        spec: TrialSpec | None = None,
+    ) -> None:
+        self.points, self.replicates, self.missing, self.first, self.spec = points, replicates, missing, first, spec
         self.position, self.size = 0, 1
 
     def next(self) -> Chunk:
@@ -72,13 +79,16 @@ class ChunkQueue:
             last = self.missing[end - 1] // self.replicates
             end = int(np.searchsorted(self.missing, (last + 1) * self.replicates))
         chosen, self.position = self.missing[self.position : end], end
-        # A segment ends where the trial numbers are not consecutive or the next point begins.
-        breaks = np.flatnonzero((np.diff(chosen) != 1) | (chosen[1:] % self.replicates == 0)) + 1
+        # A segment ends where the trial numbers are not consecutive, the next point begins, or the hardware is another.
+        ends = (np.diff(chosen) != 1) | (chosen[1:] % self.replicates == 0) | bool(self.spec and self.spec.hardware)
+        breaks = np.flatnonzero(ends) + 1
         return tuple(self._segment(trials) for trials in np.split(chosen, breaks) if len(trials))
 
     def _segment(self, trials: NDArray[np.int64]) -> Segment:
         point, replicate = divmod(int(trials[0]), self.replicates)
         settings = self.points[point - self.first].settings
+        if self.spec:
+            settings = self.spec.trial_settings(settings, replicate)
         return Segment(point, settings, int(trials[0]), range(replicate, replicate + len(trials)))
 
     def report_time(self, chunk: Chunk, seconds: float) -> None:
@@ -119,8 +129,9 @@ def prepare_store(plan: Plan, store: Store, resume: bool, overrides: Mapping[str
 def check_scene(plan: Plan, store: Store) -> None:
     """Raise InputError if the scene of the first or the last stored point, or a file it names, has changed."""
     points = store.points()
-    for point, stored in store.scenes():
-        now = scene_hash(resolve_point(plan.spec, points[point].settings)[0])
+    for point, replicate, stored in store.scenes():
+        settings = plan.spec.trial_settings(points[point].settings, replicate)
+        now = scene_hash(resolve_point(plan.spec, settings)[0])
         if now != stored:
             raise InputError(
                 f"{store.path}: the scene of point {point} has changed (hash {stored} then, {now} now); allowed:"
@@ -146,7 +157,9 @@ def run_points(
     failed_before = store.counts()["failed"]
     progress = Progress(len(numbers), len(numbers) - len(missing), failed_before)
     budget = plan.study.budget
-    rows = engine.run(plan.spec, ChunkQueue(points, replicates, missing, first)) if len(missing) else iter(())
+    rows = (
+        engine.run(plan.spec, ChunkQueue(points, replicates, missing, first, plan.spec)) if len(missing) else iter(())
+    )
     try:
         for batch in rows:
             store.add(batch)

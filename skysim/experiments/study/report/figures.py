@@ -10,10 +10,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from skysim.core.types import Floats
+from skysim.experiments.study.analysis.axes import Axis, axis, is_sampled, is_share, label, shown_points
 from skysim.experiments.study.analysis.table import PointRow
-from skysim.experiments.study.plan import Curve, Figure, Heat, Study
+from skysim.experiments.study.analysis.thresholds import crossings, thresholds_of
+from skysim.experiments.study.plan import Curve, Heat, Study
 from skysim.experiments.study.report import layout
-from skysim.experiments.study.report.layout import MAX_POINTS_WITH_BARS, Axis, Grid, Panel, Series, is_sampled, label
+from skysim.experiments.study.report.layout import MAX_POINTS_WITH_BARS, Grid, Panel, Series
+from skysim.experiments.study.report.scales import HATCHED, add_color_bar, color_scale, ticks
 from skysim.results.plots import INK, MARKS, png
 
 if TYPE_CHECKING:
@@ -27,8 +30,8 @@ MAX_LABELED_POINTS = 12  # maximum number of Pareto points that are labeled
 GRAY, ORANGE = "#8fa1b3", "#d55e00"
 
 
-def figure_png(lines: Sequence[PointRow], figure: Figure, study: Study) -> bytes:
-    """A figure of a study as PNG. Raises InputError if its `where` names an unknown factor or level."""
+def figure_png(lines: Sequence[PointRow], figure: Curve | Heat, study: Study) -> bytes:
+    """A curve or heat map as PNG. Raises InputError if its `where` names an unknown factor or level."""
     if isinstance(figure, Curve):
         return png(lambda fig: draw_curve(fig, lines, figure, study), (7.4, 3.9))
     if is_sampled(study):
@@ -44,12 +47,12 @@ def figure_png(lines: Sequence[PointRow], figure: Figure, study: Study) -> bytes
 
 def draw_curve(fig: Any, lines: Sequence[PointRow], figure: Curve, study: Study) -> None:
     """Draw series with their intervals; sampled points as markers, with a running median if they are many."""
-    axes, x_axis, sampled = fig.subplots(), layout.axis(study, lines, figure.x), is_sampled(study)
+    axes, x_axis, sampled = fig.subplots(), axis(study, lines, figure.x), is_sampled(study)
     shown = layout.series(lines, figure, study)
     dots = layout.draws_medians(study, x_axis, sum(len(one.x) for one in shown))
     set_up_y_axis(axes, figure.y, shown, figure.log, not dots)
     set_up_x_axis(axes, x_axis)
-    group_axis = layout.axis(study, lines, figure.by) if figure.by is not None else None
+    group_axis = axis(study, lines, figure.by) if figure.by is not None else None
     for n, one in enumerate(shown):
         ink = color(n, len(shown), group_axis is not None and group_axis.numeric)
         wide_pt = min(3.0, 20 / len(shown)) if x_axis.numeric else min(6.0, 60 / len(shown))
@@ -58,6 +61,7 @@ def draw_curve(fig: Any, lines: Sequence[PointRow], figure: Curve, study: Study)
             draw_points(axes, one, ink, MARKS[n % len(MARKS)], x_axis.numeric, dots)
         else:
             draw_line(axes, one, ink, MARKS[n % len(MARKS)], x_axis, step_pt)
+    draw_thresholds(axes, figure, study, lines)
     if not any(np.isfinite(one.value).any() for one in shown):
         axes.text(0.5, 0.5, "nothing yet", transform=axes.transAxes, ha="center", color="#888888")
     if group_axis is not None and shown:
@@ -65,10 +69,26 @@ def draw_curve(fig: Any, lines: Sequence[PointRow], figure: Curve, study: Study)
         fig.legend(title=group_axis.label, loc="outside right upper", ncols=columns, alignment="left")
 
 
+def draw_thresholds(axes: Any, figure: Curve, study: Study, lines: Sequence[PointRow]) -> None:
+    """Draw the thresholds of this curve: the limit dashed, a tick at each crossing and a bar over its interval."""
+    for threshold in thresholds_of(figure, study, lines):
+        axes.axhline(threshold.limit, color="#777777", linestyle="--", linewidth=0.8)
+        found = crossings(threshold, study, lines)
+        group_axis = axis(study, lines, figure.by) if figure.by is not None else None
+        first, last = axes.get_xlim()
+        for n, one in enumerate(found.values()):
+            if one is None or not np.isfinite(one.value):
+                continue
+            ink = color(n, len(found), group_axis is not None and group_axis.numeric)
+            low, high = np.clip([one.low, one.high], first, last)
+            axes.hlines(threshold.limit, low, high, color=ink, linewidth=6, alpha=0.25)
+            axes.plot(one.value, threshold.limit, "|", color=ink, markersize=13, markeredgewidth=2)
+
+
 def set_up_y_axis(axes: Any, name: str, shown: Sequence[Series | Panel], log: bool, bars: bool = True) -> None:
     """Set up the y axis: limits that include all values and, if drawn, their error bars; label and scale."""
     bounds = [end for one in shown for end in (one.low, one.high)] if bars else []
-    low, high = layout.limits([one.value for one in shown], bounds, log, layout.is_share(name))
+    low, high = layout.limits([one.value for one in shown], bounds, log, is_share(name))
     if log:
         logarithmic(axes, "y", low, high)
     axes.set_ylim(low, high)
@@ -90,11 +110,24 @@ def draw_line(axes: Any, one: Series, ink: Any, mark: str, x_axis: Axis, step_pt
         axes.fill_between(one.x, low, high, color=ink, alpha=0.15, linewidth=0)
     else:
         draw_bars(axes, one, ink, offset)
-    style = {"marker": mark, "color": ink, "linestyle": "-" if x_axis.numeric else ":", "transform": offset}
-    axes.plot(one.x, one.value, label=one.label or None, **style)
+    # A line joins no point of few values, which is that of the easy trials alone.
+    style = {"color": ink, "transform": offset}
+    joined = np.where(one.few, np.nan, one.value)
+    line = "-" if x_axis.numeric else ":"
+    axes.plot(one.x, joined, label=one.label or None, marker=mark, linestyle=line, **style)
+    draw_few(axes, one, mark, **style)
     if axes.get_yscale() == "log":
         none = (one.value <= 0) & (one.high > 0)
         axes.plot(one.x[none], one.high[none], "v", color=ink, markerfacecolor="white", transform=offset)
+
+
+def draw_few(axes: Any, one: Series, mark: str, **style: Any) -> None:
+    """Draw the points of few values: hollow, with their number."""
+    axes.plot(one.x[one.few], one.value[one.few], mark, markerfacecolor="white", **style)
+    for x, value, count in zip(one.x[one.few], one.value[one.few], one.values[one.few], strict=True):
+        if np.isfinite(value):
+            place = {"xy": (x, value), "xytext": (4, 4), "textcoords": "offset points", "xycoords": style["transform"]}
+            axes.annotate(f"n={count}", **place, fontsize=6.5, color=style["color"])
 
 
 def draw_points(axes: Any, one: Series, ink: Any, mark: str, numeric: bool, dots: bool) -> None:
@@ -105,7 +138,8 @@ def draw_points(axes: Any, one: Series, ink: Any, mark: str, numeric: bool, dots
     style = {"marker": mark, "color": ink, "linestyle": "none"}
     if not dots:
         draw_bars(axes, one, ink, axes.transData)
-        axes.plot(one.x, one.value, label=one.label or None, **style)
+        axes.plot(one.x, np.where(one.few, np.nan, one.value), label=one.label or None, **style)
+        draw_few(axes, one, mark, color=ink, transform=axes.transData)
         return
     size = min(max(4.5 * (MAX_POINTS_WITH_BARS / len(one.x)) ** 0.3, 1.8), 4.5)
     axes.plot(one.x, one.value, markersize=size, markeredgewidth=0, alpha=0.5, **style)
@@ -194,18 +228,6 @@ def logarithmic(axes: Any, which: str, low: float, high: float) -> None:
     one.set_minor_formatter(NullFormatter())
 
 
-def ticks(low: float, high: float) -> tuple[Any, Any]:
-    """Tick locator and formatter of a logarithmic axis.
-
-    Ticks are at each decade over three decades or more, at 1, 2 and 5 of each decade over less, and at round numbers
-    if the range is a factor of 8 or less.
-    """
-    from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator
-
-    where = LogLocator(subs=(1, 2, 5) if high < 1000 * low else (1,)) if high > 8 * low else MaxNLocator(5)
-    return where, FuncFormatter(lambda value, _: f"{value:.6g}")
-
-
 # Heat maps and scatter plots of two factors.
 
 
@@ -216,21 +238,23 @@ def draw_heat(fig: Any, cells: Grid, figure: Heat) -> None:
     axes = fig.subplots()
     image = axes.imshow(
         np.ma.masked_invalid(cells.value),
-        cmap="cividis",
-        norm=color_norm(cells.value, figure.log),
+        **color_scale(cells.value, figure),
         aspect="auto",
         origin="lower" if cells.y.numeric else "upper",
     )
     rows, columns = cells.value.shape
-    hatched: Any = {"facecolor": "#eeeeee", "edgecolor": "#b8b8b8", "hatch": "////", "linewidth": 0}
     for row, column in np.argwhere(~np.isfinite(cells.value)):
-        axes.add_patch(Rectangle((column - 0.5, row - 0.5), 1, 1, **hatched))
+        axes.add_patch(Rectangle((column - 0.5, row - 0.5), 1, 1, **HATCHED))
+    for row, column in np.argwhere(cells.few & np.isfinite(cells.value)):
+        dotted: Any = {"fill": False, "edgecolor": "white", "hatch": "...", "linewidth": 0}
+        axes.add_patch(Rectangle((column - 0.5, row - 0.5), 1, 1, **dotted))
     if max(rows, columns) <= MAX_CELLS_WITH_TEXT:
         for (row, column), value in np.ndenumerate(cells.value):
             if np.isfinite(value):
                 light = np.dot(image.to_rgba([value])[0][:3], (0.299, 0.587, 0.114)) > 0.5
                 ink = "#111111" if light else "white"
                 text = f"{value:.0f}" if 1000 <= abs(value) < 1e5 else f"{value:.3g}"
+                text += f"\nn={cells.values[row, column]}" if cells.few[row, column] else ""
                 axes.text(column, row, text, ha="center", va="center", color=ink, fontsize=8)
     for which, one, most in (("x", cells.x, MAX_TICKS * 2 // 3), ("y", cells.y, MAX_TICKS)):
         step = max(math.ceil(len(one.levels) / most), 1) if len(one.levels) > MAX_CELLS_WITH_TEXT else 1
@@ -241,26 +265,10 @@ def draw_heat(fig: Any, cells: Grid, figure: Heat) -> None:
     add_color_bar(fig, image, figure)
 
 
-def add_color_bar(fig: Any, image: Any, figure: Heat) -> None:
-    """Add the color bar, labeled with the response."""
-    locator, formatter = ticks(image.norm.vmin, image.norm.vmax) if figure.log else (None, None)
-    fig.colorbar(image, label=label(figure.value), ticks=locator, format=formatter).minorticks_off()
-
-
-def color_norm(values: Floats, log: bool) -> Any:
-    """Color normalization over the finite values; a valid default range if all are equal or there are none."""
-    from matplotlib.colors import LogNorm, Normalize
-
-    finite = values[np.isfinite(values) & ((values > 0) | (not log))]
-    low, high = (float(finite.min()), float(finite.max())) if len(finite) else (0.5, 1.0)
-    high = high if high > low else low + (abs(low) or 1.0)
-    return LogNorm(low, high, clip=True) if log else Normalize(low, high)
-
-
 def draw_scatter(fig: Any, lines: Sequence[PointRow], figure: Heat, study: Study) -> None:
     """Draw sampled points over two factors, colored by response."""
-    axes, points = fig.subplots(), layout.shown_points(lines, figure, study)
-    x, y = (layout.axis(study, lines, name) for name in (figure.x, figure.y))
+    axes, points = fig.subplots(), shown_points(lines, figure, study)
+    x, y = (axis(study, lines, name) for name in (figure.x, figure.y))
     places = [(x.coordinate(line.levels[figure.x]), y.coordinate(line.levels[figure.y])) for line in points]
     values = np.array([line.responses[figure.value].value for line in points])
     xy = np.array(places).reshape(-1, 2)
@@ -271,7 +279,7 @@ def draw_scatter(fig: Any, lines: Sequence[PointRow], figure: Heat, study: Study
     elif not y.numeric:
         axes.set_yticks(range(len(y.levels)), [wrapped(y.tick_label(one), 4) for one in y.levels])
         axes.set_ylim(len(y.levels) - 0.5, -0.5)
-    dots = axes.scatter(*xy.T, c=values, s=size, cmap="cividis", norm=color_norm(values, figure.log))
+    dots = axes.scatter(*xy.T, c=values, s=size, **color_scale(values, figure))
     axes.set_ylabel(y.label)
     add_color_bar(fig, dots, figure)
 

@@ -8,24 +8,39 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from skysim.core.files import write_text
+from skysim.experiments.study.analysis.axes import axis
 from skysim.experiments.study.analysis.table import PointRow, cells, format_summary
-from skysim.experiments.study.plan import Curve, Figure, Study
-from skysim.experiments.study.report import figures, layout
+from skysim.experiments.study.analysis.worst import ColumnsOf
+from skysim.experiments.study.plan import Map, Study
+from skysim.experiments.study.report import figures, layout, maps
+from skysim.experiments.study.report.maps import DirectionMap
 from skysim.experiments.study.store import Store
 from skysim.results.report import embed, render_page
 
 if TYPE_CHECKING:
     from skysim.experiments.study.analysis.sensitivity import Index
+    from skysim.experiments.study.report.overview import Overview
 
 LISTED = 10  # maximum number of failures listed
 ROWS = 5000  # maximum number of rows in the table
 
 
+class WorstRow(NamedTuple):
+    """One of the worst trials of a map: the panel, where it is, what happened, lights in the field, replay command."""
+
+    panel: str
+    direction: str
+    event: str
+    lights: int
+    command: str
+
+
 class Picture(NamedTuple):
-    """An image of the page: a data URI and its caption."""
+    """An image of the page: a data URI, its caption and, of a map, the worst trials."""
 
     source: str
     caption: str
+    worst: Sequence[WorstRow] = ()
 
 
 class Cell(NamedTuple):
@@ -45,16 +60,20 @@ def write_page(
     indices: Sequence[Index] | None = None,
     front: Sequence[int] | None = None,
     costs: Mapping[int, float] | None = None,
+    about: Overview | None = None,
+    answers: Sequence[str] = (),
+    replay: str = "skysim study replay FILE",
 ) -> None:
     """Write the report as one self-contained HTML file.
 
     command : command that repeats the study;  lines : its table with all responses of `responses`
+    about   : scene table and findings;  answers : in words;  replay : command that repeats a trial, without its number
     indices : Sobol indices, for a study of design saltelli
     front   : Pareto-optimal points of an optimization;  costs : cost by point, if the study has costs
     Raises InputError if `where` of a figure names an unknown factor or level.
     """
     heads, rows = table_cells(lines, study, costs)
-    drawn = set(map(figure_response, layout.figures(study, lines)))
+    drawn = {one.response for one in layout.figures(study, lines)}
     text = render_page(
         "study.html",
         study=study,
@@ -65,7 +84,10 @@ def write_page(
         text=store.meta("study"),
         pictures=search_images(lines, study, front or (), costs)
         + sobol_images(indices or ())
-        + figure_images(lines, study),
+        + figure_images(lines, study, store.point_columns, replay),
+        about=about,
+        answers=answers,
+        replay=replay,
         indices=[(one, format_summary(one.first), format_summary(one.total)) for one in indices or ()],
         heads=heads,
         rows=rows[:ROWS],
@@ -80,15 +102,10 @@ def write_page(
 
 
 def responses(study: Study) -> list[str]:
-    """The study's responses and those used by its figures, objectives and constraints, without `cost`."""
+    """The study's responses and those used by its figures, thresholds, objectives and constraints, without `cost`."""
     searched = study.optimize.responses if study.optimize else []
-    names = dict.fromkeys([*study.responses, *map(figure_response, study.figures), *searched])
+    names = dict.fromkeys([*study.responses, *(one.response for one in (*study.figures, *study.thresholds)), *searched])
     return [name for name in names if name != "cost"]
-
-
-def figure_response(figure: Figure) -> str:
-    """The response that a figure shows."""
-    return figure.y if isinstance(figure, Curve) else figure.value
 
 
 def facts(store: Store, study: Study) -> dict[str, Any]:
@@ -113,7 +130,7 @@ def table_cells(
 ) -> tuple[list[str], list[list[Cell]]]:
     """Column heads and cells of the table. Named levels sort in the order of the study file."""
     heads, texts = cells(lines)
-    axes = {name: layout.axis(study, lines, name) for name in (lines[0].levels if lines else ())}
+    axes = {name: axis(study, lines, name) for name in (lines[0].levels if lines else ())}
     rows = []
     for line, row_texts in zip(lines[:ROWS], texts[:ROWS], strict=True):
         keys = [line.point, *(axes[name].coordinate(one) for name, one in line.levels.items())]
@@ -135,10 +152,25 @@ def sort_key(key: float) -> float | str:
 # Images.
 
 
-def figure_images(lines: Sequence[PointRow], study: Study) -> list[Picture]:
+def figure_images(lines: Sequence[PointRow], study: Study, columns_of: ColumnsOf, replay: str) -> list[Picture]:
+    """The study's figures; maps with their worst trials. columns_of : the trials of a point"""
+    found = []
+    for one in layout.figures(study, lines):
+        if isinstance(one, Map):
+            panels = maps.direction_maps(lines, one, study, columns_of)
+            picture, caption = maps.map_png(panels, one), maps.caption(panels, one, study, lines)
+            found.append(Picture(embed(picture), caption, worst_rows(panels, replay)))
+        else:
+            found.append(Picture(embed(figures.figure_png(lines, one, study)), layout.caption(one, study, lines)))
+    return found
+
+
+def worst_rows(panels: Sequence[DirectionMap], replay: str) -> list[WorstRow]:
+    """The worst trials of a map's panels with the commands that repeat them."""
     return [
-        Picture(embed(figures.figure_png(lines, one, study)), layout.caption(one, study, lines))
-        for one in layout.figures(study, lines)
+        WorstRow(panel.label, one.direction, one.event, round(one.lights), f"{replay} {one.trial}")
+        for panel in panels
+        for one in panel.worst
     ]
 
 

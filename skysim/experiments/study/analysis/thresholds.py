@@ -1,0 +1,193 @@
+"""Thresholds of a study: where along a factor a proportion crosses a limit, with an interval.
+
+The proportion is assumed to rise or to fall along the factor, and nothing else about its curve. The estimate is the
+place where its isotonic fit crosses the limit, linear between the levels. The interval has levels as its ends: it goes
+from the last level of which it is certain that it is on one side of the limit to the first that is certainly on the
+other, so more levels between the two make it shorter.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import scipy
+
+from skysim.core.errors import InputError
+from skysim.core.types import Floats
+from skysim.experiments.study.analysis import axes
+from skysim.experiments.study.analysis.axes import Axis
+from skysim.experiments.study.analysis.table import PointRow
+from skysim.experiments.study.plan import Curve, Study, Threshold
+from skysim.results import metrics, statistics
+
+TAIL = (1 - statistics.CONFIDENCE) / 2
+MISFIT_PROBABILITY = 1e-3  # of a monotonic curve that differs from its isotonic fit by more than the accepted deviance
+
+
+class Crossing(NamedTuple):
+    """Where a proportion crosses a limit along a factor.
+
+    value    : the estimate; -inf or inf if it is beyond the levels, NaN if the proportion neither rises nor falls
+    low, high: interval at CONFIDENCE; -inf or inf where no level is certain
+    rising   : whether the proportion rises along the factor
+    needs    : how many more trials at each level a certain level requires, if none of its trials fails
+    """
+
+    value: float
+    low: float
+    high: float
+    rising: bool
+    needs: int
+
+
+# Estimation.
+
+
+def crossing(x: Floats, hits: Floats, trials: Floats, limit: float, log: bool = False) -> Crossing:
+    """Where a monotonic proportion crosses a limit, from (L,) hits of (L,) trials at (L,) ascending levels.
+
+    log : interpolate between the levels in the logarithm of x
+
+    The isotonic fit is the maximum-likelihood estimate of a monotonic curve (Ayer et al. 1955). The interval's ends
+    are found by fixed-sequence tests (Maurer, Hothorn & Lehmacher 1995): from the side where the proportion is above
+    the limit, level after level as long as its exact lower bound (Clopper & Pearson 1934) is; from the other side
+    likewise with upper bounds. A wrong end requires a wrong test at the first level beyond the true crossing, so each
+    end is wrong with a probability of at most 2.5 %, for any monotonic curve.
+    """
+    fits = {rising: isotonic(hits / trials, trials, rising) for rising in (False, True)}
+    rising = log_likelihood(hits, trials, fits[True]) > log_likelihood(hits, trials, fits[False])
+    needed = math.ceil(math.log(TAIL) / math.log(limit))
+    needs = max(needed - int(trials.min()), 0)
+    deviance = 2 * (log_likelihood(hits, trials, hits / trials) - log_likelihood(hits, trials, fits[rising]))
+    if deviance > scipy.stats.chi2.isf(MISFIT_PROBABILITY, max(len(x) - 1, 1)):
+        return Crossing(math.nan, -math.inf, math.inf, rising, needs)
+    # In the order in which the proportion falls, `above` and `below` are certain levels.
+    order = slice(None, None, -1) if rising else slice(None)
+    sign = -1.0 if rising else 1.0
+    places, fit = (np.log(x) if log else x)[order], fits[rising][order]
+    value = sign * math.inf
+    below = np.flatnonzero(fit < limit)
+    if len(below):
+        n = int(below[0])
+        share = (fit[n - 1] - limit) / (fit[n - 1] - fit[n]) if n else 0.0
+        value = float(places[n - 1] + share * (places[n] - places[n - 1])) if n else -sign * math.inf
+        value = math.exp(value) if log and n else value
+    above, beneath = certain_levels(x[order], hits[order], trials[order], limit)
+    ends = (-sign * math.inf if above is None else above, sign * math.inf if beneath is None else beneath)
+    return Crossing(value, min(ends), max(ends), rising, needs)
+
+
+def isotonic(proportion: Floats, weight: Floats, rising: bool) -> Floats:
+    """(L,) isotonic fit of proportions, by pooling adjacent violators."""
+    return np.asarray(scipy.optimize.isotonic_regression(proportion, weights=weight, increasing=rising).x)
+
+
+def log_likelihood(hits: Floats, trials: Floats, proportion: Floats) -> float:
+    """Binomial log-likelihood of proportions, without the term that does not depend on them."""
+    return float(np.sum(scipy.special.xlogy(hits, proportion) + scipy.special.xlogy(trials - hits, 1 - proportion)))
+
+
+def certain_levels(x: Floats, hits: Floats, trials: Floats, limit: float) -> tuple[float | None, float | None]:
+    """The last level that is certainly above the limit and the first that is certainly below it, by fixed sequences.
+
+    x : (L,) levels in the order in which the proportion falls
+    """
+    counts = list(zip(x.tolist(), hits.astype(int).tolist(), trials.astype(int).tolist(), strict=True))
+    above = beneath = None
+    for place, count, total in counts:
+        if statistics.exact_bounds(count, total, 1 - TAIL)[0] < limit:
+            break
+        above = place
+    for place, count, total in reversed(counts):
+        if statistics.exact_bounds(count, total, 1 - TAIL)[1] >= limit:
+            break
+        beneath = place
+    return above, beneath
+
+
+# Thresholds of a study.
+
+
+def check(threshold: Threshold, where: str, study: Study, rows: Sequence[PointRow]) -> None:
+    """Raise InputError for a threshold of no proportion, or along a factor without numeric levels."""
+    name = threshold.response
+    if not metrics.is_proportion(name):
+        raise InputError(f"{where}.response: {name} is no proportion; allowed: identified, coverage_4, ...")
+    if axes.is_sampled(study):
+        raise InputError(f"{where}: points are sampled, without levels; allowed: design factorial or one_at_a_time")
+    axis = axes.axis(study, rows, threshold.along)
+    if not axis.numeric or len(axis.levels) < 2:
+        raise InputError(f"{where}.along: {threshold.along} has no two numeric levels; allowed: a factor with numbers")
+
+
+def thresholds_of(curve: Curve, study: Study, lines: Sequence[PointRow]) -> list[Threshold]:
+    """The study's thresholds of a curve's response, along its x, at its levels."""
+    levels, shown = axes.fixed_levels(curve, study, lines), (curve.y, curve.x, curve.by)
+    return [
+        one
+        for one in study.thresholds
+        if (one.response, one.along, one.by) == shown and axes.fixed_levels(one, study, lines) == levels
+    ]
+
+
+def crossings(threshold: Threshold, study: Study, lines: Sequence[PointRow]) -> dict[str, Crossing | None]:
+    """The crossing for each level of `by`, by its label, or by "" without `by`; None without trials at two levels."""
+    axis, chosen = axes.axis(study, lines, threshold.along), axes.shown_points(lines, threshold, study)
+    groups = {"": chosen}
+    if threshold.by is not None:
+        groups = axes.group_points(chosen, axes.axis(study, lines, threshold.by), threshold.by, study)
+    return {label: group_crossing(threshold, group, axis) for label, group in groups.items()}
+
+
+def group_crossing(threshold: Threshold, lines: Sequence[PointRow], axis: Axis) -> Crossing | None:
+    """The crossing along one series of points; None without trials at two levels."""
+    summaries = [(axis.coordinate(line.levels[threshold.along]), line.responses[threshold.response]) for line in lines]
+    rows = [(x, round(one.value * one.trials), one.trials) for x, one in summaries if one.trials]
+    if len(rows) < 2:
+        return None
+    x, hits, trials = np.array(sorted(rows), dtype=float).T
+    return crossing(x, hits, trials, threshold.limit, axis.log)
+
+
+def sentences(threshold: Threshold, study: Study, lines: Sequence[PointRow]) -> list[str]:
+    """The threshold in words, one sentence for each level of `by`."""
+    axis = axes.axis(study, lines, threshold.along)
+    return [
+        (f"{threshold.by} = {label}: " if label else "") + describe(one, threshold, axis)
+        for label, one in crossings(threshold, study, lines).items()
+    ]
+
+
+def describe(found: Crossing | None, threshold: Threshold, axis: Axis) -> str:
+    """A crossing in words, such as "identified falls below 95 % at rate = 6.2 deg/s (95 %: 4 to 8)"."""
+    response, limit, name = threshold.response, f"{100 * threshold.limit:g} %", threshold.along
+    if found is None:
+        return f"{response} has no trials at two levels of {name} yet."
+    unit = axis.label.partition(" [")[2].rstrip("]")
+    unit = f" {unit}" if unit else ""
+    if math.isnan(found.value):
+        return f"{response} neither rises nor falls along {name}, so no level of it is a threshold."
+    first, last = (axis.coordinate(one) for one in (axis.levels[0], axis.levels[-1]))
+    if math.isinf(found.value):
+        everywhere = (found.value > 0) != found.rising
+        text = f"{response} is {'at least' if everywhere else 'below'} {limit} at all levels of {name}, "
+        text += f"{first:.4g} to {last:.4g}{unit}"
+    else:
+        text = f"{response} {'reaches' if found.rising else 'falls below'} {limit} at {name} = {found.value:.3g}{unit}"
+    return f"{text} ({interval_text(found)})."
+
+
+def interval_text(found: Crossing) -> str:
+    """The interval of a crossing in words, and how many trials more it takes where an end is open."""
+    needs = f"; {found.needs} more trials at each level are needed" if found.needs else ""
+    low, high = (f"{end:.4g}" for end in (found.low, found.high))
+    if math.isinf(found.low) and math.isinf(found.high):
+        return f"{100 * statistics.CONFIDENCE:g} %: no level is certain{needs}"
+    if math.isinf(found.low):
+        return f"{100 * statistics.CONFIDENCE:g} %: below {high}{needs}"
+    if math.isinf(found.high):
+        return f"{100 * statistics.CONFIDENCE:g} %: above {low}{needs}"
+    return f"{100 * statistics.CONFIDENCE:g} %: {low} to {high}"

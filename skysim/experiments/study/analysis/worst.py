@@ -1,0 +1,130 @@
+"""The worst trials of a study by a response: where in the sky or in the dome they are, and which trials repeat them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skysim.core.types import Floats
+from skysim.experiments.study.analysis.axes import points_at
+from skysim.experiments.study.analysis.table import PointRow
+from skysim.experiments.study.plan import Study
+from skysim.experiments.study.store import Store
+from skysim.results import metrics
+from skysim.results.metrics import Columns
+
+COUNT = 3  # number of worst trials that a report lists
+DIRECTION = ("body_tilt_deg", "body_azimuth_deg", "boresight_ra_deg", "boresight_dec_deg", "stars")
+APART_DEG = 5.0  # least angle between the directions of two of them; nearer ones are one place
+# Column by which a trial counts for a proportion; for `identified` those that do not.
+FLAGS: dict[str, Callable[[Columns], NDArray[Any]]] = {
+    "identified": lambda c: c["frames"] - c["solved"] + c["wrong"],
+    "refused": lambda c: c["frames"] - c["solved"],
+    "overconfident": lambda c: np.nan_to_num(c["nees"]) > metrics.OVERCONFIDENT_NEES,
+    "failed": lambda c: c["frames"] == 0,
+}
+ColumnsOf = Callable[[int], Columns]  # the columns of a point's trials
+
+
+class WorstTrial(NamedTuple):
+    """One of the worst trials: its number, point and attitude, and what happened in it.
+
+    status : "misidentified" where it is solved with wrong lights
+    tilt_deg, azimuth_deg : of the body's z axis under a dome;  ra_deg, dec_deg : of the boresight under the stars
+    lights : in the field;  cross_arcsec, roll_arcsec : its errors, NaN without a solution
+    """
+
+    trial: int
+    point: int
+    status: str
+    cross_arcsec: float
+    roll_arcsec: float
+    tilt_deg: float
+    azimuth_deg: float
+    ra_deg: float
+    dec_deg: float
+    lights: float
+
+    @property
+    def direction(self) -> str:
+        """Its direction in words."""
+        if math.isfinite(self.tilt_deg):
+            return f"tilt {self.tilt_deg:.1f}°, azimuth {self.azimuth_deg:.0f}°"
+        return f"RA {self.ra_deg:.1f}°, Dec {self.dec_deg:+.1f}°"
+
+    @property
+    def event(self) -> str:
+        """What happened, in words."""
+        if math.isnan(self.cross_arcsec):
+            return self.status
+        status = "" if self.status == "solved" else f"{self.status}, "
+        return f"{status}cross {self.cross_arcsec:.3g}″, roll {self.roll_arcsec:.4g}″"
+
+
+def worst_trials(columns: Columns, response: str, count: int = COUNT) -> list[WorstTrial]:
+    """The worst trials by a response, worst first, of directions at least APART_DEG apart.
+
+    For a proportion they are trials that count for it (for `identified`, that do not), those without a solution before
+    those with one, then by error and by the number of lights; none if there is no such trial.
+    """
+    if not columns:
+        return []
+    rank, counted = ranking(columns, response)
+    order = [row for row in np.lexsort(rank[::-1]).tolist() if counted[row]]
+    axis, chosen = unit_directions(columns), list[int]()
+    for row in order:
+        if len(chosen) < count and not np.any(axis[chosen] @ axis[row] > math.cos(math.radians(APART_DEG))):
+            chosen.append(row)
+    errors = {name: metrics.QUANTITIES[name](columns) for name in ("cross_arcsec", "roll_arcsec")}
+    return [
+        WorstTrial(
+            int(columns["trial"][row]),
+            int(columns["point"][row]),
+            "misidentified" if columns["misidentified"][row] > 0 else str(columns["status"][row]),
+            *(float(error[row]) for error in errors.values()),
+            *(float(columns[name][row]) for name in DIRECTION),
+        )
+        for row in chosen
+    ]
+
+
+def unit_directions(columns: Columns) -> Floats:
+    """(N, 3) direction of each trial's attitude: the body's z axis in the lab, or the boresight on the sky."""
+    in_dome = np.isfinite(columns["body_tilt_deg"])
+    zenith = np.radians(np.where(in_dome, columns["body_tilt_deg"], 90 - columns["boresight_dec_deg"]))
+    azimuth = np.radians(np.where(in_dome, columns["body_azimuth_deg"], columns["boresight_ra_deg"]))
+    return np.stack([np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)], axis=1)
+
+
+def ranking(columns: Columns, response: str) -> tuple[list[Floats], NDArray[np.bool_]]:
+    """Sort keys, (N,) each, the first the most important and smaller the worse; and (N,) whether a trial qualifies."""
+    angle = metrics.QUANTITIES["angle_arcsec"](columns)
+    unsolved_first, fewest_first = np.where(np.isnan(angle), -np.inf, -angle), np.nan_to_num(columns["stars"], nan=0.0)
+    quantity, _ = metrics.split_name(response)
+    if metrics.COVERAGE.match(response):
+        return [fewest_first], columns["frames"] > 0
+    if quantity in metrics.QUANTITIES:
+        values = metrics.QUANTITIES[quantity](columns)
+        key = values if quantity in metrics.MORE_IS_BETTER else -values
+        return [key, fewest_first], np.isfinite(values)
+    flagged = np.nan_to_num(np.asarray(FLAGS.get(response, lambda c: c[response])(columns), dtype=float))
+    return [-flagged, unsolved_first, fewest_first], flagged > 0
+
+
+def worst_of_levels(
+    study: Study, store: Store, response: str, levels: Mapping[str, Any], count: int = COUNT
+) -> list[WorstTrial]:
+    """The worst trials of the points at some levels. Raises InputError for an unknown factor or level."""
+    rows = [PointRow(n, point.levels, {}) for n, point in enumerate(store.points())]
+    chosen = points_at(rows, study, levels)
+    return worst_trials(joined(store.point_columns(row.point) for row in chosen), response, count)
+
+
+def joined(columns: Iterable[Columns]) -> Columns:
+    """The columns of several points together."""
+    parts = list(columns)
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]} if parts else {}

@@ -1,0 +1,268 @@
+"""Maps of a study: a response over the directions of the random attitudes, in cells of about equal solid angle."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from skysim.core.errors import InputError
+from skysim.core.types import Floats
+from skysim.experiments.study.analysis.axes import axis, group_points, shown_points
+from skysim.experiments.study.analysis.table import PointRow
+from skysim.experiments.study.analysis.worst import ColumnsOf, WorstTrial, joined, worst_trials
+from skysim.experiments.study.plan import Map, Study
+from skysim.experiments.study.report.layout import caption_title, fixed_text
+from skysim.experiments.study.report.scales import HATCHED, add_color_bar, color_scale
+from skysim.results import metrics
+from skysim.results.metrics import Columns
+from skysim.results.plots import png
+
+CELL_TRIALS = 25  # mean number of trials in a cell
+MAX_CELLS = 240  # of a panel
+MIN_VALUES = 5  # a cell with fewer is hatched
+MAX_NUMBERED = 70  # cells of a panel up to which each has its number of trials written in it
+SKY_RANGE_DEG = (-90.0, 90.0)
+MARK = "#111111"  # of the worst trials
+EDGE_POINTS = 24  # points along each edge of a cell
+RING_LABEL_DEG = 67.5  # azimuth of the labels of the rings
+LABEL: Any = {"ha": "center", "va": "center", "fontsize": 7, "color": "#444444"}
+
+
+class Cell(NamedTuple):
+    """A cell: its range from the center (tilt, or declination) and around it (azimuth, or RA), in degrees.
+
+    value : the response, NaN without values;  values : number of trials with a value
+    """
+
+    low_deg: float
+    high_deg: float
+    left_deg: float
+    right_deg: float
+    value: float
+    values: int
+
+    @property
+    def shown(self) -> bool:
+        """Whether it has enough values to be drawn."""
+        return self.values >= MIN_VALUES and math.isfinite(self.value)
+
+
+class DirectionMap(NamedTuple):
+    """A panel of a map: the level of `by`, whether it is of the sky, its cells and the worst trials."""
+
+    label: str
+    sky: bool
+    cells: list[Cell]
+    worst: list[WorstTrial]
+
+
+# Contents.
+
+
+def direction_maps(lines: Sequence[PointRow], figure: Map, study: Study, columns_of: ColumnsOf) -> list[DirectionMap]:
+    """The panels of a map, one for each level of `by`. Raises InputError for points of dome and of sky."""
+    chosen = shown_points(lines, figure, study)
+    groups = {"": chosen}
+    if figure.by is not None:
+        groups = group_points(chosen, axis(study, lines, figure.by), figure.by, study)
+    panels = []
+    for label, group in groups.items():
+        columns = joined(columns_of(line.point) for line in group)
+        panels.append(direction_map(label, columns, figure.value))
+    return panels
+
+
+def direction_map(label: str, columns: Columns, response: str) -> DirectionMap:
+    """One panel, from the columns of its trials."""
+    in_dome, in_sky = (
+        np.isfinite(columns[name]) if columns else np.zeros(0, bool) for name in ("body_tilt_deg", "boresight_dec_deg")
+    )
+    if in_dome.any() and in_sky.any():
+        raise InputError(f"map of {response}: trials under a dome and under the stars; allowed: where, to choose one")
+    sky, known = bool(in_sky.any()), in_dome | in_sky
+    if not known.any():
+        return DirectionMap(label, sky, [], [])
+    radial, around = ("boresight_dec_deg", "boresight_ra_deg") if sky else ("body_tilt_deg", "body_azimuth_deg")
+    radial_deg, around_deg = columns[radial], columns[around]
+    summarize, cells = metrics.response(response), []
+    for low, high, left, right in partition(*radial_range(radial_deg[known], sky), int(known.sum()), sky):
+        inside = (radial_deg >= low) & (radial_deg < high) & ((around_deg - left) % 360 < right - left)
+        summary = summarize({name: column[inside] for name, column in columns.items()})
+        cells.append(Cell(low, high, left, right, summary.value, summary.trials))
+    return DirectionMap(label, sky, cells, worst_trials(columns, response))
+
+
+def radial_range(radial_deg: Floats, sky: bool) -> tuple[float, float]:
+    """Range of tilts or declinations to draw: that of the trials in whole degrees; to the poles if near them."""
+    low, high = math.floor(float(radial_deg.min())), math.floor(float(radial_deg.max())) + 1
+    if not sky:
+        return (0.0 if low <= 1 else float(low)), float(high)
+    bottom, top = SKY_RANGE_DEG
+    return (bottom if low < bottom + 5 else float(low)), (top if high > top - 5 else float(high))
+
+
+def partition(low_deg: float, high_deg: float, trials: int, sky: bool) -> Iterator[tuple[float, float, float, float]]:
+    """Cells of about equal solid angle, about as wide as high: low, high, left and right of each in degrees.
+
+    A ring between two tilts has the solid angle 2 pi (cos a - cos b), between two declinations 2 pi (sin b - sin a).
+    """
+    count = min(max(trials // CELL_TRIALS, 4), MAX_CELLS)
+
+    def height(deg: float) -> float:
+        return math.sin(math.radians(deg)) if sky else -math.cos(math.radians(deg))
+
+    cell_sr = 2 * math.pi * (height(high_deg) - height(low_deg)) / count
+    rings = max(round(math.radians(high_deg - low_deg) / math.sqrt(cell_sr)), 1)
+    edges = np.linspace(low_deg, high_deg, rings + 1).tolist()
+    for low, high in itertools.pairwise(edges):
+        sectors = max(round(2 * math.pi * (height(high) - height(low)) / cell_sr), 1)
+        # A cell of the sky begins at RA 180 deg, where the projection is cut.
+        bounds = np.linspace(180 if sky else 0, 540 if sky else 360, sectors + 1).tolist()
+        yield from ((low, high, left, right) for left, right in itertools.pairwise(bounds))
+
+
+# Drawing.
+
+
+def size_in(panels: Sequence[DirectionMap]) -> tuple[float, float]:
+    """Width and height of the figure in inches."""
+    count, sky = max(len(panels), 1), bool(panels) and panels[0].sky
+    width = min((6.5 if sky else 4.4) * count, 12.5)
+    return width + 1.0, width / count * (0.5 if sky else 1.0) + 0.25
+
+
+def map_png(panels: Sequence[DirectionMap], figure: Map) -> bytes:
+    """A map as PNG."""
+    return png(lambda fig: draw_maps(fig, panels, figure), size_in(panels))
+
+
+def draw_maps(fig: Any, panels: Sequence[DirectionMap], figure: Map) -> None:
+    """Draw the panels side by side with one color scale."""
+    from matplotlib.cm import ScalarMappable
+
+    stack = fig.subplots(1, len(panels), squeeze=False)[0]
+    values = np.array([cell.value for panel in panels for cell in panel.cells if cell.shown])
+    colors = ScalarMappable(**color_scale(values, figure))
+    for axes, panel in zip(stack, panels, strict=True):
+        axes.set_aspect("equal")
+        axes.set_axis_off()
+        draw_cells(axes, panel, colors)
+        (draw_sky_labels if panel.sky else draw_dome_labels)(axes, panel)
+        mark_worst(axes, panel)
+        axes.set_title(f"{figure.by} = {panel.label}" if panel.label else "", fontsize=9)
+    add_color_bar(fig, colors, figure, ax=list(stack), shrink=0.8)
+
+
+def place(radial_deg: Floats | float, around_deg: Floats | float, sky: bool) -> Floats:
+    """(..., 2) place of a direction in the drawing.
+
+    Under a dome: azimuthal equidistant, the tilt as radius and the azimuth as angle. Of the sky: Hammer's projection,
+    which keeps areas, with RA increasing to the left (Snyder 1987, p. 160):
+
+        x = 2 sqrt(2) cos(dec) sin(l / 2) / d,    y = sqrt(2) sin(dec) / d,    d = sqrt(1 + cos(dec) cos(l / 2)).
+
+    around_deg : azimuth, or RA from 180 to 540
+    """
+    around = np.radians(360.0 - np.asarray(around_deg)) if sky else np.radians(around_deg)
+    if not sky:
+        return np.stack(np.broadcast_arrays(radial_deg * np.cos(around), radial_deg * np.sin(around)), axis=-1)
+    dec = np.radians(radial_deg)
+    divisor = np.sqrt(1 + np.cos(dec) * np.cos(around / 2))
+    x, y = 2 * math.sqrt(2) * np.cos(dec) * np.sin(around / 2) / divisor, math.sqrt(2) * np.sin(dec) / divisor
+    return np.stack(np.broadcast_arrays(x, y), axis=-1)
+
+
+def draw_cells(axes: Any, panel: DirectionMap, colors: Any) -> None:
+    """Draw each cell in the color of its value, or hatched if it has too few; with their numbers if cells are few."""
+    from matplotlib.collections import PolyCollection
+
+    shown = [cell for cell in panel.cells if cell.shown]
+    faces = [colors.to_rgba(cell.value) for cell in shown]
+    style: Any = {"facecolors": faces, "edgecolors": "white", "linewidths": 0.4}
+    axes.add_collection(PolyCollection([outline(cell, panel.sky) for cell in shown], **style))
+    empty = [outline(cell, panel.sky) for cell in panel.cells if not cell.shown]
+    axes.add_collection(PolyCollection(empty, **HATCHED))
+    for cell in panel.cells if len(panel.cells) <= MAX_NUMBERED else ():
+        dark = cell.shown and np.dot(colors.to_rgba(cell.value)[:3], (0.299, 0.587, 0.114)) < 0.5
+        text = {"ha": "center", "va": "center", "fontsize": 6.5, "color": "#eeeeee" if dark else "#333333"}
+        around_deg = (cell.left_deg + cell.right_deg) / 2
+        axes.text(*place((cell.low_deg + cell.high_deg) / 2, around_deg, panel.sky), str(cell.values), **text)
+
+
+def outline(cell: Cell, sky: bool) -> Floats:
+    """(K, 2) outline of a cell in the drawing."""
+    left, right, low, high = cell.left_deg, cell.right_deg, cell.low_deg, cell.high_deg
+    around, radial = np.linspace(left, right, EDGE_POINTS), np.linspace(low, high, EDGE_POINTS)
+    bottom, end, top, begin = (
+        place(low, around, sky),
+        place(radial, right, sky),
+        place(high, around[::-1], sky),
+        place(radial[::-1], left, sky),
+    )
+    return np.concatenate([bottom, end, top, begin])
+
+
+def draw_dome_labels(axes: Any, panel: DirectionMap) -> None:
+    """Label azimuths around the map, and the tilts of its rings."""
+    edges = sorted({cell.high_deg for cell in panel.cells}) or [1.0]
+    limit = 1.17 * edges[-1]
+    axes.set(xlim=(-limit, limit), ylim=(-limit, limit))
+    for azimuth_deg in range(0, 360, 45):
+        text = f"{azimuth_deg}°" + {0: " (x)", 90: " (y)"}.get(azimuth_deg, "")
+        axes.text(*place(1.09 * edges[-1], azimuth_deg, False), text, **LABEL)
+    for edge in edges:
+        axes.text(*place(edge, RING_LABEL_DEG, False), f"{edge:.3g}°", path_effects=[halo()], **LABEL)
+
+
+def draw_sky_labels(axes: Any, panel: DirectionMap) -> None:
+    """Draw the sky's border, and label right ascensions along the equator and declinations at the left."""
+    dec_deg = np.linspace(-90, 90, 91)
+    for edge in (180.0, 540.0):
+        axes.plot(*place(dec_deg, edge, True).T, color="#888888", linewidth=1)
+    axes.set(xlim=(-3.2, 2.9), ylim=(-1.5, 1.5))
+    for ra_deg in (240, 300, 360, 420, 480):
+        axes.text(*place(0.0, ra_deg, True), f"{ra_deg % 360}°", path_effects=[halo()], **LABEL)
+    for dec in (-60.0, -30.0, 0.0, 30.0, 60.0):
+        axes.text(*place(dec, 540.0, True) - [0.22, 0.0], f"{dec:+.0f}°" if dec else "0°", **LABEL)
+
+
+def mark_worst(axes: Any, panel: DirectionMap) -> None:
+    """Mark the worst trials with their rank."""
+    for rank, one in enumerate(panel.worst, 1):
+        xy = place(one.tilt_deg, one.azimuth_deg, False)
+        if panel.sky:
+            xy = place(one.dec_deg, (one.ra_deg - 180) % 360 + 180, True)
+        axes.plot(*xy, "o", markersize=8, markerfacecolor="none", markeredgecolor=MARK, path_effects=[halo()])
+        text = {"fontsize": 8, "color": MARK, "path_effects": [halo()]}
+        axes.annotate(str(rank), xy, xytext=(5, 4), textcoords="offset points", **text)
+
+
+def halo() -> Any:
+    """A white outline that keeps text and marks readable on any color."""
+    from matplotlib.patheffects import withStroke
+
+    return withStroke(linewidth=2.2, foreground="white")
+
+
+# Caption.
+
+
+def caption(panels: Sequence[DirectionMap], figure: Map, study: Study, lines: Sequence[PointRow]) -> str:
+    """Caption of a map: its response, the fixed levels, what its directions are, and the numbers in its cells."""
+    text = caption_title(figure) + fixed_text(figure, study, lines)
+    cells = [cell for panel in panels for cell in panel.cells]
+    if not cells:
+        return f"{text}. No trial of it is in yet."
+    counts = [cell.values for cell in cells]
+    axis_text = (
+        "boresight, RA increasing to the left" if panels[0].sky else "body's z axis, tilt outward, seen from above"
+    )
+    text += f". Directions of the {axis_text}. n = {min(counts)} to {max(counts)} in a cell"
+    if max(len(panel.cells) for panel in panels) <= MAX_NUMBERED:
+        text += ", written in it"
+    text += f"; hatched: fewer than {MIN_VALUES}" if any(not cell.shown for cell in cells) else ""
+    return text + (". Circles: the worst." if any(panel.worst for panel in panels) else ".")

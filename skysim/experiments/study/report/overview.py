@@ -1,0 +1,151 @@
+"""The first part of a study's report: its scene as a table, and what the checks of the scene find."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import NamedTuple
+
+from skysim.core.errors import InputError
+from skysim.core.units import ARCSEC_RAD
+from skysim.experiments.study.analysis.table import format_level
+from skysim.experiments.study.designs import Point, make_point
+from skysim.experiments.study.factors import Distribution, Factor, Range
+from skysim.experiments.study.loader import may_report_ambiguity
+from skysim.experiments.study.plan import Plan, resolve_point
+from skysim.scene.camera import CameraConfig
+from skysim.scene.light import DomeConfig, StarsConfig
+from skysim.scene.scene import Scene
+from skysim.simulation import checks
+from skysim.simulation.testbed import Testbed, build_testbed
+
+MAX_CHECKED = 8  # scenes that are checked: building one takes up to a second
+
+
+class Overview(NamedTuple):
+    """What a report begins with.
+
+    rows     : names and texts of the scene table, for the first level of every factor
+    findings : of the checks, each with the levels at which it was found
+    may_be_ambiguous : whether the tracker can refuse a frame as ambiguous
+    """
+
+    rows: list[tuple[str, str]]
+    findings: list[str]
+    may_be_ambiguous: bool
+
+
+def overview(plan: Plan) -> Overview:
+    """The overview of a study; scenes that cannot be built are left out, as their trials tell why."""
+    rows: list[tuple[str, str]] = []
+    found: dict[str, list[str]] = {}
+    checked, may_be_ambiguous = 0, False
+    for levels, point in checked_points(plan):
+        if checked == MAX_CHECKED:
+            break
+        try:
+            scene, _ = resolve_point(plan.spec, plan.spec.trial_settings(point.settings, 0))
+            testbed = build_testbed(scene, plan.spec.programs)
+        except InputError:
+            continue
+        checked += 1
+        may_be_ambiguous |= may_report_ambiguity(scene)
+        rows = rows or scene_rows(plan, testbed)
+        for line in checks.warnings(scene, testbed.sources, testbed.mount):
+            found.setdefault(line, []).append(levels)
+    findings = [line if len(at) == checked else f"{line} [{'; '.join(at)}]" for line, at in found.items()]
+    return Overview(rows, findings, may_be_ambiguous)
+
+
+def checked_points(plan: Plan) -> Iterator[tuple[str, Point]]:
+    """The point of all first levels, then each other level of one factor that changes the scene, with its name."""
+    factors = plan.study.factors
+    first = {name: options(factor)[0] for name, factor in factors.items()}
+    yield "first levels", make_point(first)
+    for name, factor in factors.items():
+        for value, settings in options(factor)[1:]:
+            if any(not key.startswith("trial.") for key in settings):
+                yield f"{name} = {format_level(value)}", make_point(first | {name: (value, settings)})
+
+
+def options(factor: Factor) -> list[tuple[object, dict[str, object]]]:
+    """The levels of a factor; of a range its ends, of a distribution its median."""
+    if isinstance(factor, Range):
+        return [factor.value_at(0.0), factor.value_at(1.0)]
+    return [factor.value_at(0.5)] if isinstance(factor, Distribution) else list(factor.options())
+
+
+# The table.
+
+
+def scene_rows(plan: Plan, testbed: Testbed) -> list[tuple[str, str]]:
+    """The scene of a test bed, and how the study varies and repeats it."""
+    study, scene = plan.study, testbed.scene
+    changed = "; ".join(f"{key}: {format_setting(value)}" for key, value in study.set.items())
+    points = f"at each of {len(plan.points)} points" if plan.points else "a candidate"
+    attitudes = f"{'the same' if study.paired else 'other'} attitudes at every point"
+    return [
+        ("scene", study.scene + (f", with {changed}" if changed else "")),
+        ("light", light_text(scene, testbed)),
+        ("camera", camera_text(scene.camera)),
+        ("exposure", f"{1e3 * scene.exposure.time_s:.4g} ms"),
+        ("tracker", tracker_text(scene)),
+        ("trial", ", ".join(f"{key}: {format_setting(value)}" for key, value in plan.spec.trial.items())),
+        *((f"varied: {name}", factor_text(factor)) for name, factor in study.factors.items()),
+        ("trials", f"{study.replicates} {points}, {attitudes}; seed {study.seed}"),
+        *([("drawn in every trial", ", ".join(study.hardware))] if study.hardware else []),
+    ]
+
+
+def light_text(scene: Scene, testbed: Testbed) -> str:
+    """The light source in words."""
+    light = scene.light
+    if isinstance(light, DomeConfig):
+        surface, layout = light.surface, light.layout
+        apex_m = getattr(surface, "apex_m", None)
+        height = f", {apex_m:.4g} m above the bearing" if apex_m else ""
+        cap = f" within {layout.cap_deg:g}°" if getattr(layout, "cap_deg", None) else ""
+        return f"dome ({surface.kind}{height}) with {len(testbed.sources)} LEDs ({layout.kind}){cap}"
+    if isinstance(light, StarsConfig):
+        limit = f" to V = {light.limit_mag:g}" if light.limit_mag is not None else ""
+        return f"{len(testbed.sources)} stars of {light.catalog}{limit}"
+    return light.kind.replace("_", " ")
+
+
+def camera_text(camera: CameraConfig) -> str:
+    """The camera in words: pixels, field of view and scale."""
+    sides = (camera.width_px, camera.height_px)
+    field = " × ".join(f"{2 * math.degrees(math.atan(side / 2 / camera.focal_px)):.3g}°" for side in sides)
+    scale = 1 / camera.focal_px / ARCSEC_RAD
+    lens = f"{1e3 * camera.focal_length_m:.4g} mm f/{camera.f_number:.3g}"
+    return f"{sides[0]} × {sides[1]} px, {lens}, field {field}, {scale:.3g}″ a pixel"
+
+
+def tracker_text(scene: Scene) -> str:
+    """The tracker's chain, and what its map of the dome errs by."""
+    tracker, survey = scene.tracker, scene.tracker.survey
+    stages = ("detector", "centroider", "identifier", "solver")
+    chosen = [f"{name} {getattr(tracker, name)}" for name in stages if getattr(tracker, name)]
+    text = tracker.name + (f": {', '.join(chosen)}" if chosen else ", default chain")
+    errors = {"LEDs": survey.led_sigma_m, "camera": survey.lever_sigma_m}
+    known = [f"{what} to {1e3 * sigma_m:.3g} mm" for what, sigma_m in errors.items() if sigma_m]
+    if isinstance(scene.light, DomeConfig):
+        text += f"; knows {', '.join(known)}" if known else "; knows every LED exactly"
+    return text
+
+
+def factor_text(factor: Factor) -> str:
+    """The levels of a factor, or its range or distribution."""
+    keys = ", ".join(dict.fromkeys(key for _, settings in options(factor) for key in settings))
+    if isinstance(factor, Range):
+        return f"{factor.from_} to {factor.to} ({keys})"
+    if isinstance(factor, Distribution):
+        return f"{factor.distribution} ({keys})"
+    return ", ".join(format_level(value) for value, _ in factor.options()) + (f" ({keys})" if keys else "")
+
+
+def format_setting(value: object) -> str:
+    """A value of a key on one line."""
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{key}: {format_setting(inner)}" for key, inner in value.items()) + "}"
+    return f"[{', '.join(map(format_setting, value))}]" if isinstance(value, list | tuple) else str(value)
