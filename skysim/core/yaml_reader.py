@@ -101,13 +101,13 @@ def excerpt(value: object) -> str:
     return text if len(text) <= MAX_EXCERPT else f"{text[:MAX_EXCERPT]}…"
 
 
-def parse_overrides(sets: list[str] | None, option: str = "--set") -> dict[str, str]:
-    """Keys and values of `--set path.to.key=value`, or of another option. Raises InputError."""
+def parse_overrides(sets: list[str] | None, option: str = "--set", form: str = "path.to.key=value") -> dict[str, str]:
+    """Keys and values of `--set path.to.key=value`, or of another option and form. Raises InputError."""
     overrides = {}
     for item in sets or []:
         key, equals, value = item.partition("=")
         if not equals or not key:
-            raise InputError(f"{option} {excerpt(item)}: allowed: path.to.key=value")
+            raise InputError(f"{option} {excerpt(item)}: allowed: {form}")
         overrides[key] = value
     return overrides
 

@@ -19,7 +19,7 @@ from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
 
 CONFIDENCE = 0.95
-SIGMAS = float(scipy.stats.norm.isf((1 - CONFIDENCE) / 2))  # half of the interval of a normal variable, in sigmas
+SIGMAS = float(scipy.special.ndtri((1 + CONFIDENCE) / 2))  # half of the interval of a normal variable, in sigmas
 RESAMPLES = 999
 RANK_SIGMAS = 12  # ranks farther from their mean have a probability below 1e-30
 
@@ -57,6 +57,7 @@ def proportion(hits: Any, total: Any) -> Summary:
     return Summary(value, low, high, int(total))
 
 
+@lru_cache(maxsize=4096)
 def exact_bounds(hits: int, total: int, confidence: float = CONFIDENCE) -> tuple[float, float]:
     """One-sided bounds of a proportion, each at this confidence (Clopper & Pearson 1934).
 

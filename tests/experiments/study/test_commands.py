@@ -1,11 +1,13 @@
 """`skysim study` as it is typed: run, status, resume, report, export, replay, and what it says to a slip."""
 
 import json
+import re
+import sqlite3
 import sys
 
 import pytest
 
-from skysim.apps.cli import main
+from skysim.apps.cli import main, study_summary, terminal
 
 STUDY = """schema: 1
 title: a question
@@ -73,6 +75,80 @@ def test_what_was_overridden_is_remembered(typed):
     words = ("question.yaml", "--engine", "serial", "--out", "here")
     assert typed("study", "run", *words, "--set", "replicates=3")[0] == 0
     assert json.loads(typed("study", "status", "question.yaml", "--out", "here", "--json")[1])["trials"] == 6
+
+
+@pytest.mark.long
+def test_the_worst_are_named_with_what_repeats_them(typed):
+    assert typed("study", "run", "question.yaml", "--engine", "serial")[0] == 0
+    code, out, _ = typed("study", "worst", "question.yaml", "--response", "cross_arcsec_p95", "--json")
+    told = json.loads(out)
+    assert (code, len(told)) == (0, 3)
+    assert [one["cross_arcsec"] for one in told] == sorted((one["cross_arcsec"] for one in told), reverse=True)
+    assert told[0]["command"] == f"skysim study replay question.yaml {told[0]['trial']}"
+    again = json.loads(typed("study", "replay", "question.yaml", str(told[0]["trial"]), "--json")[1])
+    assert (again["boresight_ra_deg"], again["boresight_dec_deg"]) == (told[0]["ra_deg"], told[0]["dec_deg"])
+    words = ("study", "worst", "question.yaml", "--where", "strays=5", "--count", "2")
+    _, out, _ = typed(*words, "--response", "cross_arcsec_p95")
+    line = r"^1\. RA [\d.]+°, Dec [+-][\d.]+°, \d+ lights: cross .*″, roll .*″ \(strays = 5\)$"
+    assert re.search(line, out, re.MULTILINE)
+    assert "no trial counts for misidentified" in typed(*words, "--response", "misidentified")[1]
+    for wrong, complaint in (
+        (("--where", "strays=6"), "--where.strays: unknown level 6; allowed: 0, 5"),
+        (("--where", "star=6"), "--where: unknown factor 'star'; allowed: strays"),
+        (("--where", "strays"), "--where strays: allowed: FACTOR=LEVEL"),
+        (("--response", "stray"), "--response: unknown response 'stray'"),
+    ):
+        code, _, err = typed("study", "worst", "question.yaml", *wrong)
+        assert (code, len(err.strip().splitlines())) == (2, 1)
+        assert complaint in err
+
+
+def test_a_store_of_an_earlier_skysim_is_refused_in_one_line(typed, tmp_path):
+    """Format 1 has no attitudes. It is neither resumed nor reported."""
+    (tmp_path / "out/question").mkdir(parents=True)
+    path = tmp_path / "out/question/study.sqlite"
+    db = sqlite3.connect(path)
+    db.execute("CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT NOT NULL)")
+    db.execute("INSERT INTO meta VALUES ('format', '1')")
+    db.commit()
+    db.close()
+    for words in (
+        ("resume", "--engine", "serial"),
+        ("run", "--engine", "serial"),
+        ("report",),
+        ("worst",),
+        ("status",),
+    ):
+        code, _, err = typed("study", words[0], "question.yaml", *words[1:])
+        assert code == 2
+        assert err == (
+            "skysim: out/question/study.sqlite: written by an earlier skysim, without the attitudes of the trials;"
+            " allowed: run the study again, with another --out\n"
+        )
+
+
+HEADS = ["point", "leds", "placement", "identified", "coverage", "stars_least"]
+CELLS = [
+    ["0", "200", "poisson", "0.5 (0.45..0.55)", "0.9 (0.85..0.95)", "3"],
+    ["1", "2800", "a long name", "1", "1", "4"],
+]
+
+
+@pytest.mark.parametrize(("width", "count"), [(80, 6), (73, 6), (72, 5), (60, 5), (59, 4), (42, 4), (41, 3), (10, 3)])
+def test_a_narrow_terminal_keeps_the_factors_and_as_many_responses_as_fit(width, count):
+    """Columns of 5, 4, 11, 16, 16 and 11 characters, two between each: 24 with the factors, 42, 60 and 73 in all."""
+    assert study_summary.fitting_columns(HEADS, CELLS, 3, width) == count
+
+
+def test_a_table_at_80_columns_is_not_cut_and_names_what_it_drops(monkeypatch, capsys):
+    monkeypatch.setattr(study_summary, "terminal_width", lambda: 60)
+    monkeypatch.setattr(terminal, "terminal_width", lambda: 60)
+    study_summary.print_points(HEADS, CELLS, factors=2)
+    out = capsys.readouterr().out
+    assert max(map(len, out.splitlines())) <= 60
+    assert "…" not in out
+    assert "a long name" in out
+    assert "in the report, or in a wider terminal: stars_least" in out
 
 
 @pytest.mark.parametrize(

@@ -17,12 +17,13 @@ from skysim.core.errors import InputError
 from skysim.experiments.study import designs, store
 from skysim.experiments.study.analysis import axes
 from skysim.experiments.study.analysis.sensitivity import Index
-from skysim.experiments.study.analysis.table import PointRow, cells, table
+from skysim.experiments.study.analysis.table import PointRow, cells, has_few_values, table
 from skysim.experiments.study.designs import Point
 from skysim.experiments.study.execution.outcomes import Outcome
 from skysim.experiments.study.execution.trials import Row
 from skysim.experiments.study.plan import Curve, Heat, Study
 from skysim.experiments.study.report import figures, layout, page
+from skysim.experiments.study.report.scales import color_scale
 from skysim.results.plots import INK
 from skysim.results.statistics import Summary
 
@@ -137,7 +138,7 @@ def written(path: Path, asked: Study, **more: Any) -> tuple[str, Html]:
 @pytest.fixture
 def bare(monkeypatch: pytest.MonkeyPatch) -> None:
     """Pages without figures, which take the time."""
-    monkeypatch.setattr(page, "figure_images", lambda lines, study: [])
+    monkeypatch.setattr(page, "figure_images", lambda *_: [])
 
 
 # The page.
@@ -291,26 +292,72 @@ def test_what_is_drawn_is_what_was_arranged(tmp_path: Path) -> None:
     assert (axes.get_xlabel(), axes.get_ylabel()) == ("tilt [deg]", "cross median [arcsec]")
 
 
-def test_an_interval_without_an_end_leaves_the_picture_and_stretches_nothing() -> None:
+def test_a_point_without_an_interval_has_no_bar_and_the_caption_says_what_it_needs() -> None:
     from matplotlib.figure import Figure as Canvas
 
-    nan, inf = math.nan, math.inf
-    levels = zip([20, 0, 10], [(5, 4, inf), (3, -inf, 6), (8, nan, nan)], strict=True)
-    lines = [PointRow(n, {"tilt": one}, {"roll_arcsec_p95": Summary(*told, 9)}) for n, (one, told) in enumerate(levels)]
+    nan = math.nan
+    levels = zip([20, 0, 10], [(5, 4, 9, 70, 0), (3, 0, 6, 70, 0), (8, nan, nan, 40, 19)], strict=True)
+    lines = [
+        PointRow(n, {"tilt": one}, {"roll_arcsec_p95": Summary(*told)}, 70) for n, (one, told) in enumerate(levels)
+    ]
     for log in (False, True):
         fig = Canvas()
         curve = Curve(kind="curve", x="tilt", y="roll_arcsec_p95", log=log)
         figures.draw_curve(fig, lines, curve, study())
         (axes,) = fig.axes
-        low, high = axes.get_ylim()
-        assert high < 20
-        assert (0 < low < 3) if log else (-1 < low < 3)
+        low = axes.get_ylim()[0]
         ends = {round(one[0, 0]): sorted(one[:, 1]) for one in axes.collections[0].get_segments() if len(one)}
-        assert ends[20][0] == 4
-        assert ends[20][1] > high
-        assert ends[0][0] < low
-        assert ends[0][1] == 6
-        assert "has no end" in layout.caption(curve, study(), lines)
+        assert ends[20] == [4, 9]
+        assert ends[0][0] == (low / 10 if log else 0)
+        assert np.isnan(ends.get(10, [nan])).all()
+        assert "none where a point needs up to 19 more trials" in layout.caption(curve, study(), lines)
+
+
+def test_few_survivors_are_hollow_numbered_and_joined_to_nothing() -> None:
+    """Of 60 trials each, 60, 12 and 50 have a value: the middle one has a marker of its own and parts the line."""
+    from matplotlib.figure import Figure as Canvas
+
+    lines = [
+        PointRow(n, {"tilt": tilt}, {"cross_arcsec_median": Summary(3.0 + n, 2.0, 9.0, count)}, 60)
+        for n, (tilt, count) in enumerate([(0, 60), (10, 12), (20, 50)])
+    ]
+    curve = Curve(kind="curve", x="tilt", y="cross_arcsec_median")
+    fig = Canvas()
+    figures.draw_curve(fig, lines, curve, study())
+    (axes,) = fig.axes
+    joined = next(line for line in axes.lines if line.get_linestyle() == "-")
+    assert joined.get_ydata() == pytest.approx([3, np.nan, 5], nan_ok=True)
+    hollow = [line for line in axes.lines if line.get_markerfacecolor() == "white" and len(line.get_xdata())]
+    assert [(line.get_xdata().tolist(), line.get_ydata().tolist()) for line in hollow] == [([10], [4.0])]
+    assert [text.get_text() for text in axes.texts] == ["n=12"]
+    assert "Hollow, without a line: few trials" in layout.caption(curve, study(), lines)
+    heat = layout.grid(lines, Heat(kind="heat", x="tilt", y="tilt", value="cross_arcsec_median"), study())
+    assert [[bool(heat.few[n, n]), int(heat.values[n, n])] for n in range(3)] == [[False, 60], [True, 12], [False, 50]]
+
+
+@pytest.mark.parametrize(
+    ("values", "trials", "few"),
+    [(60, 60, False), (30, 60, False), (29, 60, True), (9, 10, False), (4, 6, True), (3, 3, False), (0, 60, False)],
+)
+def test_few_is_less_than_half_or_less_than_five_of_more(values: int, trials: int, few: bool) -> None:
+    row = PointRow(0, {}, {"nees_mean": Summary(1.0, 1.0, 1.0, values)}, trials)
+    assert has_few_values(row, "nees_mean") == few
+
+
+def test_shares_are_drawn_from_zero_to_one() -> None:
+    """Curves, heat maps and the panels of searches alike, whatever the values."""
+    from matplotlib.figure import Figure as Canvas
+
+    responses = {"identified": Summary(0.31, 0.3, 0.32, 99)}
+    lines = [PointRow(n, {"tilt": tilt}, responses, 99) for n, tilt in enumerate((0, 10, 20))]
+    fig = Canvas()
+    figures.draw_curve(fig, lines, Curve(kind="curve", x="tilt", y="identified"), study())
+    assert fig.axes[0].get_ylim() == (-0.03, 1.03)
+    heat = Heat(kind="heat", x="tilt", y="tilt", value="identified")
+    scales = [color_scale(np.array(values), heat) for values in ([0.3, 0.31], [0.9, 1.0], [])]
+    assert {(one["cmap"], one["norm"].vmin, one["norm"].vmax) for one in scales} == {("cividis", 0, 1)}
+    other = color_scale(np.array([3.0, 9.0]), heat.model_copy(update={"value": "nees_mean"}))
+    assert (other["cmap"] != "cividis", other["norm"].vmin, other["norm"].vmax) == (True, 3, 9)
 
 
 def test_a_heat_map_has_its_cells_in_order_and_nan_where_nothing_is(tmp_path: Path) -> None:

@@ -73,6 +73,18 @@ def test_an_override_changes_the_study(tmp_path):
             ("  strays:", "  stars:"),
             r"factors.stars: the name is that of a column of the trials; allowed: another name.*line 8\)",
         ),
+        (
+            ("cross_arcsec_p95", "streak_px"),
+            r"responses.1: streak_px in trials of kind centroids; allowed: of frames, flight.*line 11\)",
+        ),
+        (
+            ("cross_arcsec_p95", "availability_mean"),
+            "responses.1: availability_mean in trials of kind centroids; allowed: of",
+        ),
+        (
+            ("cross_arcsec_p95", "ambiguous"),
+            r"responses.1: no tracker of this study reports ambiguity; allowed: under a dome.*line 11\)",
+        ),
         (("scene: shefex2", "scene: collimated_display"), r"trial.kind: centroids with a collimated display"),
         (("scene: shefex2", "scene: shefex3"), r"shefex3: no such scene; allowed:"),
         (

@@ -218,7 +218,7 @@ def parse_levels(words: list[str]) -> dict[str, Any]:
     """Levels by factor from FACTOR=LEVEL. Raises InputError."""
     from skysim.core.yaml_reader import parse_overrides, parse_yaml
 
-    return {key: parse_yaml(text)[1] for key, text in parse_overrides(words, "--where").items()}
+    return {key: parse_yaml(text)[1] for key, text in parse_overrides(words, "--where", "FACTOR=LEVEL").items()}
 
 
 # Registered last, so that it is the last in `skysim study --help`.

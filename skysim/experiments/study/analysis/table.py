@@ -16,7 +16,7 @@ from skysim.results.statistics import Summary
 LONG_QUANTITY = re.compile(r"(-?\d*\.\d{4,}(?:e[-+]?\d+)?)(\s\S.*)$")
 
 
-MIN_VALUES = 10  # fewer values of more trials are few
+MIN_VALUES = 5  # fewer values of more trials are few
 
 
 class PointRow(NamedTuple):

@@ -106,7 +106,6 @@ def draw_line(axes: Any, one: Series, ink: Any, mark: str, x_axis: Axis, step_pt
     low, high = drawn_interval(axes, one)
     if layout.draws_bands(x_axis):
         offset = axes.transData
-        low, high = np.where(np.isinf(one.low), one.value, low), np.where(np.isinf(one.high), one.value, high)
         axes.fill_between(one.x, low, high, color=ink, alpha=0.15, linewidth=0)
     else:
         draw_bars(axes, one, ink, offset)
@@ -151,21 +150,19 @@ def draw_points(axes: Any, one: Series, ink: Any, mark: str, numeric: bool, dots
 
 
 def draw_bars(axes: Any, one: Series | Panel, ink: Any, where: Any, x: Floats | None = None) -> None:
-    """Draw intervals as bars; an infinite bound extends beyond the axis limits."""
+    """Draw intervals as bars with caps."""
     places = one.x if isinstance(one, Series) else x
-    low, high = drawn_interval(axes, one)
-    axes.vlines(places, low, high, color=ink, alpha=0.6, linewidth=1, transform=where)
+    axes.vlines(places, *drawn_interval(axes, one), color=ink, alpha=0.6, linewidth=1, transform=where)
     for end in (one.low, one.high):
-        finite = np.where(np.isfinite(end), end, np.nan)
-        axes.plot(places, finite, "_", color=ink, alpha=0.6, markersize=6, transform=where)
+        axes.plot(places, end, "_", color=ink, alpha=0.6, markersize=6, transform=where)
 
 
 def drawn_interval(axes: Any, one: Series | Panel) -> tuple[Floats, Floats]:
-    """Interval bounds for drawing; infinite bounds, and those <= 0 on a logarithmic axis, are moved to a point well
-    outside the axis limits."""
-    bottom, top = axes.get_ylim()
-    beyond = (bottom / 10, top * 10) if axes.get_yscale() == "log" else (2 * bottom - top, 2 * top - bottom)
-    return np.clip(one.low, *beyond), np.clip(one.high, *beyond)
+    """Interval bounds for drawing; those <= 0 on a logarithmic axis are moved to a point below its limits."""
+    if axes.get_yscale() != "log":
+        return one.low, one.high
+    below = axes.get_ylim()[0] / 10
+    return np.maximum(one.low, below), np.maximum(one.high, below)
 
 
 def running_median(one: Series) -> tuple[Floats, Floats]:
@@ -298,10 +295,10 @@ def draw_indices(fig: Any, selected: Sequence[Index], response: str) -> None:
     """Draw two bars per factor, with their intervals."""
     axes, rows = fig.subplots(), np.arange(len(selected))
     for shift, name, ink, parts in (
-        (-0.19, "first order", INK[0], [one.first for one in selected]),
-        (0.19, "total", GRAY, [one.total for one in selected]),
+        (-0.19, "first order", INK[0], [one.first[:3] for one in selected]),
+        (0.19, "total", GRAY, [one.total[:3] for one in selected]),
     ):
-        value, low, high, _ = np.array(parts, dtype=float).reshape(-1, 4).T
+        value, low, high = np.array(parts, dtype=float).reshape(-1, 3).T
         axes.barh(rows + shift, np.nan_to_num(value), 0.36, color=ink, label=name)
         axes.hlines(rows + shift, np.clip(low, -9, 9), np.clip(high, -9, 9), color="#333333", linewidth=1)
     bounds = np.array([end for one in selected for end in (*one.first[:3], *one.total[:3], 0.0)])

@@ -1,0 +1,151 @@
+"""The answers of a study in words, and what its report begins with."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from study_stores import done
+
+from skysim.experiments.study import loader, store
+from skysim.experiments.study.analysis import answer
+from skysim.experiments.study.analysis.table import PointRow, table
+from skysim.experiments.study.plan import Study
+from skysim.experiments.study.report import overview, page
+from skysim.results import statistics
+from skysim.results.statistics import Summary
+
+STUDY: dict[str, Any] = {
+    "schema": 1,
+    "title": "How many LEDs?",
+    "scene": "afit_simsat",
+    "seed": 1,
+    "set": {"light.layout": {"kind": "random", "count": 500, "cap_deg": 40}},
+    "trial": {"kind": "centroids", "noise_px": 0.2},
+    "factors": {"leds": {"key": "light.layout.count", "values": [500, 900]}},
+    "responses": ["identified", "roll_arcsec_p95", "misidentified"],
+}
+NEVER = {"misidentified": 0, "roll_noise": 0, "wrong": 0, "ambiguous": 0, "identified": 0}
+
+
+def study(**keys: Any) -> Study:
+    return Study.model_validate(STUDY | keys)
+
+
+def line(n: int, leds: int, trials: int, **hits: int) -> PointRow:
+    """A point with these counts of events, and a p95 of the roll of 100 arcsec times its number."""
+    responses = {name: statistics.proportion(count, trials) for name, count in (NEVER | hits).items()}
+    p95 = {"roll_arcsec_p95": Summary(100.0 * (n + 1), 90.0, 350.0, trials)}
+    return PointRow(n, {"leds": leds}, responses | p95, trials)
+
+
+def said(texts: list[str], start: str) -> str:
+    (text,) = [one for one in texts if one.startswith(start)]
+    return text
+
+
+def test_nowhere_ambiguous_has_a_confidence() -> None:
+    """1 - 0.05^(1 / 10,000) is 0.02995 %."""
+    texts = answer.headline(study(), [line(0, 500, 10_000)], True)
+    assert said(texts, "Is it ambiguous anywhere?") == (
+        "Is it ambiguous anywhere? No. Ambiguous or misidentified:"
+        " none in 10,000 (less than 0.03 % at 95 % confidence)."
+    )
+    assert pytest.approx(0.0002995, abs=1e-7) == 1 - 0.05 ** (1 / 10_000)
+    assert [one for one in answer.headline(study(), [line(0, 500, 10_000)], False) if "ambiguous" in one] == []
+
+
+def test_ambiguous_somewhere_says_where_and_how_sure_it_is_of_the_rest() -> None:
+    """Misidentified attitudes count as ambiguous ones that the tracker did not notice."""
+    lines = [line(0, 500, 200, ambiguous=20, misidentified=10), line(1, 900, 400)]
+    interval = statistics.proportion(30, 200)
+    text = said(answer.headline(study(), lines, True), "Is it ambiguous anywhere?")
+    assert text == (
+        "Is it ambiguous anywhere? Yes. Ambiguous or misidentified: at 1 of 2 points, most at leds = 500: 15 % of the"
+        f" frames ({100 * interval.low:.3g} to {100 * interval.high:.3g} %); none in 400 (less than 0.75 % at 95 %"
+        " confidence) at the other points."
+    )
+
+
+def test_misidentification_and_roll_noise_are_kept_apart() -> None:
+    texts = answer.headline(study(), [line(0, 500, 1000, roll_noise=50)], True)
+    assert said(texts, "Misidentified").endswith("none in 1,000 (less than 0.3 % at 95 % confidence).")
+    assert said(texts, "Roll noise").endswith("covariance allows): 5 % of the frames (3.81 to 6.53 %).")
+    assert said(texts, "Wrong attitudes").endswith("none in 1,000 (less than 0.3 % at 95 % confidence).")
+
+
+def test_the_fewest_trials_of_a_point_bound_what_was_never_seen() -> None:
+    texts = answer.headline(study(), [line(0, 500, 100), line(1, 900, 1000)], False)
+    assert said(texts, "Misidentified").endswith("none in 100 a point (less than 3 % at 95 % confidence).")
+
+
+def test_a_tracker_that_does_not_name_its_lights_is_not_called_right() -> None:
+    unknown = line(0, 500, 100)
+    unknown.responses["misidentified"] = statistics.NO_VALUE
+    assert said(answer.headline(study(), [unknown], False), "Misidentified").endswith("does not name its lights.")
+
+
+def test_ranges_name_the_points_of_the_extremes_and_pass_over_those_of_few_values() -> None:
+    lines = [line(0, 500, 200, identified=100), line(1, 900, 200, identified=200)]
+    few = line(2, 200, 200, identified=3)
+    few.responses["roll_arcsec_p95"] = Summary(1.0, math.nan, math.nan, 3, 56)
+    told = answer.ranges(study(), [*lines, few])
+    assert told == [
+        "identified: 0.015 (0.00511..0.0432) at leds = 200, to 1 (0.981..1) at leds = 900.",
+        "roll_arcsec_p95: 100 (90..350) at leds = 500, to 200 (90..350) at leds = 900.",
+    ]
+    assert answer.ranges(study(), [few])[1] == "roll_arcsec_p95: 1 (needs 56 more)."
+
+
+def test_before_the_first_trial_there_is_no_answer() -> None:
+    empty = [PointRow(0, {"leds": 500}, {})]
+    assert answer.headline(study(), empty, True) == answer.ranges(study(), empty) == []
+
+
+# What the report begins with.
+
+
+def loaded(folder: Path, **keys: Any) -> Any:
+    path = folder / "study.yaml"
+    path.write_text(yaml.safe_dump(STUDY | {"replicates": 2} | keys, sort_keys=False))
+    return loader.load(path)
+
+
+def test_the_scene_is_in_a_table(tmp_path: Path) -> None:
+    rows = dict(overview.overview(loaded(tmp_path, hardware=["light.layout.hardware_seed"])).rows)
+    assert rows["light"] == "dome (ellipsoid, 1.219 m above the bearing) with 500 LEDs (random) within 40°"
+    assert rows["camera"].endswith("f/8, field 10° × 7.52°, 22.6″ a pixel")
+    assert rows["trial"] == "kind: centroids, noise_px: 0.2"
+    assert rows["varied: leds"] == "500, 900 (light.layout.count)"
+    assert rows["trials"] == "2 at each of 2 points, the same attitudes at every point; seed 1"
+    assert rows["drawn in every trial"] == "light.layout.hardware_seed"
+
+
+def test_the_checks_are_made_at_every_level_and_say_where_they_found_something(tmp_path: Path) -> None:
+    """The image of a disk of 10 mm at 0.8 m is 110 px wide, which the detector takes for background."""
+    levels = {"small": {}, "large": {"light.led.disk_diameter": "10 mm"}}
+    told = overview.overview(loaded(tmp_path, factors={"disk": {"levels": levels}}))
+    wide = [one for one in told.findings if "px wide; local treats" in one]
+    assert len(wide) == 1
+    assert wide[0].endswith("[disk = large]")
+    assert told.may_be_ambiguous
+
+
+@pytest.mark.long
+def test_a_report_begins_with_scene_findings_and_answers(tmp_path: Path) -> None:
+    plan = loaded(tmp_path, figures=[{"kind": "map", "value": "stars_least"}])
+    assert done(plan, tmp_path / "study.sqlite").failed == 0
+    with store.open_store(tmp_path / "study.sqlite") as kept:
+        lines = table(kept, [*page.responses(plan.study), *answer.RESPONSES])
+        about, answers = overview.overview(plan), answer.headline(plan.study, lines, True)
+        said_first: dict[str, Any] = {"about": about, "answers": answers, "replay": "again"}
+        page.write_page(tmp_path / "r.html", kept, plan.study, "run", lines, **said_first)
+    text = (tmp_path / "r.html").read_text(encoding="utf-8")
+    parts = ('id="about"', 'id="findings"', 'id="answers"', 'id="done"', "<figure>", 'id="points"')
+    places = [text.index(part) for part in parts]
+    assert places == sorted(places)
+    assert "Is it ambiguous anywhere?" in text
+    assert text.count("<code>again ") == 2  # the worst trials of a map of two attitudes

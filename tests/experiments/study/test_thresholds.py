@@ -1,0 +1,183 @@
+"""Where a proportion crosses a limit: against curves that are known, and how often the interval holds the truth."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from scipy import stats
+
+from skysim.core.errors import InputError
+from skysim.experiments.study import loader
+from skysim.experiments.study.analysis import thresholds
+from skysim.experiments.study.analysis.table import PointRow
+from skysim.experiments.study.analysis.thresholds import Crossing, crossing
+from skysim.experiments.study.plan import Study, Threshold
+from skysim.results import statistics
+
+LEVELS = np.array([0.0, 1, 2, 3, 4, 6, 8, 10])
+STUDY: dict[str, Any] = {
+    "schema": 1,
+    "title": "How fast?",
+    "scene": "shefex2",
+    "seed": 1,
+    "trial": {"kind": "frames"},
+    "factors": {
+        "rate": {"key": "trial.rate_deg_s", "values": [0, 1, 2, 3, 4, 6, 8, 10]},
+        "chain": {"levels": {"slow": {}, "fast": {"trial.gyro": True}}},
+    },
+    "responses": ["identified", "nees"],
+    "thresholds": [{"response": "identified", "limit": 0.95, "along": "rate", "by": "chain"}],
+}
+
+
+def logistic(x: np.ndarray, middle: float, width: float) -> np.ndarray:
+    """A falling curve; it is 0.95 at middle - width ln 19."""
+    return 1 / (1 + np.exp((x - middle) / width))
+
+
+def counted(hits: list[int], trials: int = 400, limit: float = 0.95, log: bool = False) -> Crossing:
+    return crossing(LEVELS[: len(hits)] + log, np.array(hits, float), np.full(len(hits), float(trials)), limit, log)
+
+
+def test_a_line_between_two_levels_crosses_where_it_should() -> None:
+    """From 1 at 4 to 0.8 at 6: 0.95 at 4.5; rising, the same mirrored; in the logarithm, 5 (7 / 5)^(1 / 4)."""
+    falling = counted([400, 400, 400, 400, 400, 320, 200, 100])
+    assert falling.value == pytest.approx(4.5)
+    assert (falling.low, falling.high, falling.rising) == (4, 6, False)
+    hits = np.array([100, 200, 320, 400, 400], float)
+    rising = crossing(np.array([1.0, 2, 4, 6, 8]), hits, np.full(5, 400.0), 0.95)
+    assert rising.value == pytest.approx(4 + 2 * 0.75)
+    assert (rising.low, rising.high, rising.rising) == (4, 6, True)
+    assert counted([400, 400, 400, 400, 400, 320, 200, 100], log=True).value == pytest.approx(5 * (7 / 5) ** 0.25)
+
+
+def test_beyond_the_levels_there_is_no_number() -> None:
+    above, below = counted([400] * 8), counted([320, 300, 200, 100, 50, 20, 10, 0])
+    assert (above.value, above.low, above.high) == (math.inf, 10, math.inf)
+    assert (below.value, below.low, below.high) == (-math.inf, -math.inf, 0)
+
+
+def test_levels_that_are_not_certain_leave_the_end_open_and_say_what_they_need() -> None:
+    """All of 60: the exact lower bound is 0.025^(1/60) = 0.940; 72 trials would be enough, of which 12 are missing."""
+    found = counted([60, 60, 60, 60, 39, 12, 5, 2], trials=60)
+    assert statistics.exact_bounds(60, 60, 0.975)[0] == pytest.approx(0.025 ** (1 / 60))
+    assert (found.low, found.high, found.needs) == (-math.inf, 4, 12)
+    assert counted([72, 72, 72, 72, 40, 12, 5, 2], trials=72).low == 3
+
+
+def test_a_curve_that_falls_and_rises_has_no_threshold() -> None:
+    found = counted([400, 200, 400, 200, 400, 200, 400, 200])
+    assert math.isnan(found.value)
+    assert (found.low, found.high) == (-math.inf, math.inf)
+
+
+def test_noise_of_a_monotonic_curve_is_no_misfit() -> None:
+    """Of 500 falling curves drawn with 100 trials a level, at most one in a hundred is called not monotonic."""
+    rng, truth = np.random.default_rng(4), logistic(LEVELS, 5.0, 1.0)
+    draws = rng.binomial(100, truth, size=(500, 8)).astype(float)
+    missed = sum(math.isnan(crossing(LEVELS, hits, np.full(8, 100.0), 0.95).value) for hits in draws)
+    assert missed <= 5
+
+
+@pytest.mark.parametrize(("middle", "width"), [(6.0, 0.6), (7.0, 1.2), (9.0, 0.2)])
+def test_the_interval_holds_the_truth_as_often_as_promised(middle: float, width: float) -> None:
+    """Logistic curves cross 0.95 at middle - width ln 19. Of 600 draws each, at least 95 % to four standard errors."""
+    rng, truth = np.random.default_rng(7), middle - width * math.log(19)
+    draws = rng.binomial(100, logistic(LEVELS, middle, width), size=(600, 8)).astype(float)
+    found = [crossing(LEVELS, hits, np.full(8, 100.0), 0.95) for hits in draws]
+    inside = np.mean([one.low <= truth <= one.high for one in found])
+    assert inside >= 0.95 - 4 * math.sqrt(0.95 * 0.05 / 600)
+
+
+def test_the_interval_is_wrong_no_more_often_than_promised_where_a_level_is_just_below_the_limit() -> None:
+    """The hardest case, a level at 0.949: it is called certainly above in at most 2.5 % of 2,000 draws."""
+    rng = np.random.default_rng(8)
+    truth = np.array([1.0, 1.0, 0.949, 0.5, 0.1, 0, 0, 0])
+    draws = rng.binomial(300, truth, size=(2000, 8)).astype(float)
+    above = [thresholds.certain_levels(LEVELS, hits, np.full(8, 300.0), 0.95)[0] for hits in draws]
+    wrong = np.mean([level is not None and level >= 2 for level in above])
+    assert 0 < wrong <= 0.025 + 4 * math.sqrt(0.025 * 0.975 / 2000)
+
+
+def test_the_estimate_approaches_the_truth() -> None:
+    """With 10^5 trials and levels each tenth: to a third of a step."""
+    x = np.arange(0, 10, 0.1)
+    hits = np.random.default_rng(9).binomial(100_000, logistic(x, 6.0, 0.8)).astype(float)
+    assert crossing(x, hits, np.full(len(x), 1e5), 0.95).value == pytest.approx(6 - 0.8 * math.log(19), abs=0.03)
+
+
+def test_the_isotonic_fit_pools_neighbors_that_violate_the_order() -> None:
+    """By hand: 0.9 of 10 trials after 0.8 of 30 is pooled to 33 of 40."""
+    fit = thresholds.isotonic(np.array([1.0, 0.8, 0.9, 0.1]), np.array([10.0, 30, 10, 10]), rising=False)
+    assert fit == pytest.approx([1, 33 / 40, 33 / 40, 0.1])
+
+
+# In a study.
+
+
+def lines_of(study: Study, shares: dict[str, list[float]], trials: int) -> list[PointRow]:
+    return [
+        PointRow(n, {"rate": rate, "chain": chain}, {"identified": statistics.proportion(round(p * trials), trials)})
+        for chain, curve in shares.items()
+        for n, (rate, p) in enumerate(zip(LEVELS.astype(int).tolist(), curve, strict=True))
+    ]
+
+
+def test_a_study_says_the_rate_at_which_95_percent_are_identified() -> None:
+    study = Study.model_validate(STUDY)
+    curves = {"slow": [1, 1, 1, 0.9, 0.5, 0.1, 0, 0], "fast": [1.0] * 8}
+    said = thresholds.sentences(study.thresholds[0], study, lines_of(study, curves, 400))
+    assert said == [
+        "chain = slow: identified falls below 95 % at rate = 2.5 deg/s (95 %: 2 to 3).",
+        "chain = fast: identified is at least 95 % at all levels of rate, 0 to 10 deg/s (95 %: above 10).",
+    ]
+    few = thresholds.sentences(study.thresholds[0], study, lines_of(study, curves, 60))
+    assert few[0].endswith("(95 %: below 4; 12 more trials at each level are needed).")
+
+
+def test_its_interval_is_that_of_as_many_independent_trials_as_there_are() -> None:
+    """A point without trials is left out; two levels are the least."""
+    study = Study.model_validate(STUDY)
+    line = PointRow(0, {"rate": 0, "chain": "slow"}, {"identified": statistics.proportion(9, 10)})
+    other = line._replace(levels={"rate": 1, "chain": "slow"}, responses={"identified": statistics.NO_VALUE})
+    assert thresholds.sentences(study.thresholds[0], study, [line, other]) == [
+        "chain = slow: identified has no trials at two levels of rate yet."
+    ]
+
+
+@pytest.mark.parametrize(
+    ("change", "complaint"),
+    [
+        ({"response": "nees"}, r"thresholds.0.response: nees is no proportion; allowed: identified.*\(.*line 2\d\)"),
+        ({"along": "chain", "by": None}, "thresholds.0.along: chain has no two numeric levels"),
+        ({"along": "speed"}, "thresholds.0.along: unknown factor 'speed'; allowed: rate, chain"),
+        ({"limit": 1.5}, "thresholds.0.limit: 1.5 is not allowed"),
+        ({"where": {"rate": 99}}, "thresholds.0.where.rate: unknown level 99; allowed: 0, 1"),
+    ],
+)
+def test_a_threshold_that_cannot_be_is_refused(tmp_path: Path, change: dict[str, Any], complaint: str) -> None:
+    tree = STUDY | {"thresholds": [STUDY["thresholds"][0] | change]}
+    path = tmp_path / "study.yaml"
+    path.write_text(yaml.safe_dump(tree, sort_keys=False))
+    with pytest.raises(InputError, match=complaint):
+        loader.load(path)
+
+
+def test_a_limit_needs_as_many_trials_as_its_exact_bound() -> None:
+    """ceil(ln 0.025 / ln limit): 36 at 90 %, 72 at 95 %, 368 at 99 %; one fewer is not enough."""
+    for limit, needed in ((0.9, 36), (0.95, 72), (0.99, 368)):
+        found = crossing(np.array([0.0, 1.0]), np.array([1.0, 0.0]), np.array([1.0, 1.0]), limit)
+        assert found.needs == needed - 1
+        assert stats.binom.pmf(needed, needed, limit) <= 0.025 < stats.binom.pmf(needed - 1, needed - 1, limit)
+
+
+def test_a_threshold_is_one_of_a_proportion() -> None:
+    assert Threshold.model_validate({"response": "coverage_4", "limit": 0.9, "along": "x"}).axes == {
+        "along": "x",
+        "by": None,
+    }
