@@ -117,6 +117,7 @@ def test_a_study_runs_and_is_continued(tmp_path) -> None:
         "replicates": 1,
         "factors": {"rate_deg_s": {"key": "trial.rate_deg_s", "values": [0, 1]}},
         "figures": [],
+        "thresholds": [],
     }
     first = skysim.run_study("rate_smear", changes, out=tmp_path, workers=1)
     assert list(first.table()["rate_deg_s"]) == [0, 1]

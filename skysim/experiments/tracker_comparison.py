@@ -14,7 +14,7 @@ from skysim.core import files
 from skysim.core.errors import InputError
 from skysim.core.types import Frame, FrameRow, Truth
 from skysim.experiments.configs import with_config
-from skysim.results import scoring, statistics
+from skysim.results import metrics, scoring
 from skysim.scene.scene import Scene
 from skysim.simulation import run
 from skysim.simulation.run import FrameResult
@@ -36,7 +36,7 @@ class TrackerScore:
 
     tracker: str
     frames: int
-    right: statistics.Summary
+    right: metrics.Summary
     wrong: int
     refused: int
     failed: int
@@ -92,7 +92,7 @@ def score_tracker(tracker: str, rows: Sequence[FrameRow]) -> TrackerScore:
     return TrackerScore(
         tracker,
         len(rows),
-        statistics.proportion(len(right), len(rows)),
+        metrics.proportion(len(right), len(rows)),
         sum(row.wrong for row in rows),
         sum(unsolved.values()) - failed,
         failed,

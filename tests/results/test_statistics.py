@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy import stats
 from scipy.special import comb
 
-from skysim.results import metrics, statistics
+from skysim.results import metrics
 
 
 @pytest.mark.parametrize(("hits", "of"), [(0, 30), (15, 30), (30, 30), (999, 1000)])
@@ -20,7 +20,7 @@ def test_a_share_has_wilsons_interval(hits, of):
     z2 = stats.norm.ppf(0.975) ** 2
     p = hits / of
     roots = np.sort(np.roots([1 + z2 / of, -(2 * p + z2 / of), p**2]).real)
-    told = statistics.proportion(hits, of)
+    told = metrics.proportion(hits, of)
     assert (told.low, told.high) == pytest.approx(tuple(roots), abs=1e-9)
     assert (told.value, told.trials) == (p, of)
 
@@ -50,7 +50,7 @@ def test_intervals_hold_what_they_promise():
 @pytest.mark.parametrize(("hits", "total"), [(0, 10_000), (0, 100), (3, 40), (40, 40)])
 def test_exact_bounds_have_the_binomial_tail_of_their_confidence(hits: int, total: int) -> None:
     """Clopper and Pearson: at the upper bound, hits or fewer have the probability 5 %; at the lower one, or more."""
-    low, high = statistics.exact_bounds(hits, total)
+    low, high = metrics.exact_bounds(hits, total)
     if hits < total:
         tail = sum(comb(total, k) * high**k * (1 - high) ** (total - k) for k in range(hits + 1))
         assert tail == pytest.approx(0.05, rel=1e-6)
@@ -61,19 +61,19 @@ def test_exact_bounds_have_the_binomial_tail_of_their_confidence(hits: int, tota
 
 
 def test_none_in_ten_thousand_is_less_than_three_hundredths_of_a_percent() -> None:
-    assert 2.9e-4 < statistics.exact_bounds(0, 10_000)[1] < 3.0e-4
+    assert 2.9e-4 < metrics.exact_bounds(0, 10_000)[1] < 3.0e-4
 
 
 @pytest.mark.parametrize(("probability", "fewest"), [(0.5, 6), (0.9, 29), (0.95, 59), (0.99, 299)])
 def test_a_quantile_has_an_interval_from_as_many_values_as_wilks_asks_for(probability: float, fewest: int) -> None:
     """n with 1 - p^n >= 95 % (Wilks 1941: 59 and 299); at the median both ends count, 1 - 2 / 2^n."""
     values = np.arange(float(fewest))
-    enough, too_few = (statistics.quantile(values[:count], probability) for count in (fewest, fewest - 1))
+    enough, too_few = (metrics.quantile(values[:count], probability) for count in (fewest, fewest - 1))
     assert (enough.high, enough.needs) == (fewest - 1, 0)
     assert math.isnan(too_few.low)
     assert math.isnan(too_few.high)
     assert too_few.needs == 1
-    assert statistics.quantile(values[:5], probability).needs == fewest - 5
+    assert metrics.quantile(values[:5], probability).needs == fewest - 5
 
 
 @settings(max_examples=60, deadline=None)
@@ -82,7 +82,7 @@ def test_no_pair_of_ranks_with_the_confidence_is_closer(count: int, probability:
     """By enumeration of all pairs, with the binomial's own sum."""
     mass = stats.binom.pmf(np.arange(count + 1), count, probability)
     pairs = [(r, s) for r in range(1, count + 1) for s in range(r + 1, count + 1) if mass[r:s].sum() >= 0.95]
-    found = statistics.quantile_ranks(count, probability)
+    found = metrics.quantile_ranks(count, probability)
     assert (found is None) == (not pairs)
     if found is not None:
         low, high = found
@@ -101,6 +101,6 @@ def test_the_interval_of_a_p95_holds_it() -> None:
 
 
 def test_a_single_value_has_no_interval_and_says_what_it_needs() -> None:
-    one = statistics.resampled(np.array([3.0]), np.mean)
+    one = metrics.resampled(np.array([3.0]), np.mean)
     assert (one.value, one.trials, one.needs) == (3.0, 1, 1)
     assert math.isnan(one.low)

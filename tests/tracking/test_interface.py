@@ -29,7 +29,7 @@ from skysim.experiments.study import loader as study_loader
 from skysim.experiments.study import store
 from skysim.experiments.study.execution import runner, setups
 from skysim.experiments.study.execution.engines import Serial
-from skysim.results import statistics
+from skysim.results import metrics
 from skysim.scene import loader
 from skysim.simulation import run
 from skysim.simulation.testbed import build_testbed
@@ -306,7 +306,7 @@ def test_a_package_s_tracker_is_scored_by_the_error_that_it_makes(installed: Non
     assert [row.detected for row in rows] == [1, 0, 1]
     summed = tracker_comparison.score_tracker("offset", rows)
     assert (summed.frames, summed.wrong, summed.refused, summed.failed) == (3, 1, 0, 1)
-    assert summed.right == statistics.proportion(1, 3)
+    assert summed.right == metrics.proportion(1, 3)
     assert summed.cross_arcsec_worst == pytest.approx(36, abs=1e-6)  # of the right ones
 
 

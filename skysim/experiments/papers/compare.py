@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal, NamedTuple
 
 from skysim.experiments.papers.published import Experiment, Row
-from skysim.results.statistics import Summary
+from skysim.results.metrics import Summary
 
 Verdict = Literal["agrees", "explained", "disagrees"]
 VERDICTS: tuple[Verdict, ...] = ("agrees", "explained", "disagrees")

@@ -10,8 +10,8 @@ from scipy.special import stdtrit
 
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
-from skysim.results import statistics
-from skysim.results.statistics import CONFIDENCE, RESAMPLES, Summary
+from skysim.results import metrics
+from skysim.results.metrics import CONFIDENCE, RESAMPLES, Summary
 
 
 def confidence_interval(values: Sequence[float] | Floats) -> Summary:
@@ -49,7 +49,7 @@ def sample_std(values: Floats, axis: int = -1) -> Any:
 
 def bootstrap_interval(values: Floats, statistic: Callable[..., Any]) -> Summary:
     """A statistic with its bootstrap percentile interval, widened for small samples (see `widen_interval`)."""
-    return widen_interval(statistics.resampled(values, statistic))
+    return widen_interval(metrics.resampled(values, statistic))
 
 
 def widen_interval(summary: Summary) -> Summary:

@@ -21,8 +21,8 @@ from skysim.experiments.papers import compare, intervals, page, published
 from skysim.experiments.papers.compare import Cause, Drawing, ExperimentOptions, ExperimentResult, RowResult
 from skysim.experiments.papers.published import Experiment, Row
 from skysim.experiments.papers.registry import EXPERIMENTS, check_ids, reproduce
-from skysim.results import plots, statistics
-from skysim.results.statistics import Summary, exact, proportion
+from skysim.results import metrics, plots
+from skysim.results.metrics import Summary, exact, proportion
 
 # The law of the verdict.
 
@@ -130,7 +130,7 @@ def test_a_bootstrap_of_four_is_widened_to_what_it_promises() -> None:
 
 
 def both(values: np.ndarray) -> tuple[Summary, Summary]:
-    return statistics.resampled(values, np.mean), intervals.bootstrap_interval(values, np.mean)
+    return metrics.resampled(values, np.mean), intervals.bootstrap_interval(values, np.mean)
 
 
 # What was published.

@@ -13,7 +13,7 @@ from estimator.catalog.pair_index import PairIndex
 from skysim.apps.cli.main import app
 from skysim.core.units import ARCSEC_RAD
 from skysim.experiments.papers.ptase import ground, monte_carlo
-from skysim.results.statistics import rms
+from skysim.results.metrics import rms
 
 
 def test_the_paper_s_attitude_error_is_the_root_of_two_times_the_angle() -> None:

@@ -15,8 +15,8 @@ from skysim.experiments.study.analysis import answer
 from skysim.experiments.study.analysis.table import PointRow, table
 from skysim.experiments.study.plan import Study
 from skysim.experiments.study.report import overview, page
-from skysim.results import statistics
-from skysim.results.statistics import Summary
+from skysim.results import metrics
+from skysim.results.metrics import Summary
 
 STUDY: dict[str, Any] = {
     "schema": 1,
@@ -37,7 +37,7 @@ def study(**keys: Any) -> Study:
 
 def line(n: int, leds: int, trials: int, **hits: int) -> PointRow:
     """A point with these counts of events, and a p95 of the roll of 100 arcsec times its number."""
-    responses = {name: statistics.proportion(count, trials) for name, count in (NEVER | hits).items()}
+    responses = {name: metrics.proportion(count, trials) for name, count in (NEVER | hits).items()}
     p95 = {"roll_arcsec_p95": Summary(100.0 * (n + 1), 90.0, 350.0, trials)}
     return PointRow(n, {"leds": leds}, responses | p95, trials)
 
@@ -61,7 +61,7 @@ def test_nowhere_ambiguous_has_a_confidence() -> None:
 def test_ambiguous_somewhere_says_where_and_how_sure_it_is_of_the_rest() -> None:
     """Misidentified attitudes count as ambiguous ones that the tracker did not notice."""
     lines = [line(0, 500, 200, ambiguous=20, misidentified=10), line(1, 900, 400)]
-    interval = statistics.proportion(30, 200)
+    interval = metrics.proportion(30, 200)
     text = said(answer.headline(study(), lines, True), "Is it ambiguous anywhere?")
     assert text == (
         "Is it ambiguous anywhere? Yes. Ambiguous or misidentified: at 1 of 2 points, most at leds = 500: 15 % of the"
@@ -84,7 +84,7 @@ def test_the_fewest_trials_of_a_point_bound_what_was_never_seen() -> None:
 
 def test_a_tracker_that_does_not_name_its_lights_is_not_called_right() -> None:
     unknown = line(0, 500, 100)
-    unknown.responses["misidentified"] = statistics.NO_VALUE
+    unknown.responses["misidentified"] = metrics.NO_VALUE
     assert said(answer.headline(study(), [unknown], False), "Misidentified").endswith("does not name its lights.")
 
 

@@ -16,7 +16,7 @@ from skysim.experiments.study.analysis import sensitivity, table
 from skysim.experiments.study.execution import engines, replay, runner
 from skysim.experiments.study.execution.outcomes import FIELDS
 from skysim.experiments.study.report import export
-from skysim.results import metrics, statistics
+from skysim.results import metrics
 
 STUDY = """schema: 1
 title: a question
@@ -64,7 +64,7 @@ def test_responses_are_of_what_their_names_say():
     }
     for name, value in said.items():
         assert metrics.response(name)(c).value == pytest.approx(value, rel=1e-12), name
-    assert metrics.response("filter_arcsec_rms")(c) == statistics.NO_VALUE
+    assert metrics.response("filter_arcsec_rms")(c) == metrics.NO_VALUE
 
 
 def test_honest_answers_are_not_called_overconfident():
@@ -263,7 +263,7 @@ def test_frames_of_a_flight_are_counted_as_one_another_s_like():
     c = columns(frames=[100, 100], solved=[100, 100], wrong=[0, 0], nees=[500, 500])
     told = metrics.response("identified")(c)
     assert (told.value, told.trials) == (1.0, 2)
-    assert told.low == pytest.approx(statistics.proportion(2, 2).low)
+    assert told.low == pytest.approx(metrics.proportion(2, 2).low)
     assert metrics.response("overconfident")(c).trials == 0  # a flight's NEES is a mean
 
 

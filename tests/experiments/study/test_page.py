@@ -24,8 +24,8 @@ from skysim.experiments.study.execution.trials import Row
 from skysim.experiments.study.plan import Curve, Heat, Study
 from skysim.experiments.study.report import figures, layout, page
 from skysim.experiments.study.report.scales import color_scale
+from skysim.results.metrics import Summary
 from skysim.results.plots import INK
-from skysim.results.statistics import Summary
 
 COMMAND = "skysim study run 'a <b> & \"c\".yaml' --set=x=</code><script>alert(1)</script>"
 TILT = {"key": "trial.tilt_deg", "values": [20, 0, 10]}

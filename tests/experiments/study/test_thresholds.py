@@ -17,7 +17,7 @@ from skysim.experiments.study.analysis import thresholds
 from skysim.experiments.study.analysis.table import PointRow
 from skysim.experiments.study.analysis.thresholds import Crossing, crossing
 from skysim.experiments.study.plan import Study, Threshold
-from skysim.results import statistics
+from skysim.results import metrics
 
 LEVELS = np.array([0.0, 1, 2, 3, 4, 6, 8, 10])
 STUDY: dict[str, Any] = {
@@ -65,7 +65,7 @@ def test_beyond_the_levels_there_is_no_number() -> None:
 def test_levels_that_are_not_certain_leave_the_end_open_and_say_what_they_need() -> None:
     """All of 60: the exact lower bound is 0.025^(1/60) = 0.940; 72 trials would be enough, of which 12 are missing."""
     found = counted([60, 60, 60, 60, 39, 12, 5, 2], trials=60)
-    assert statistics.exact_bounds(60, 60, 0.975)[0] == pytest.approx(0.025 ** (1 / 60))
+    assert metrics.exact_bounds(60, 60, 0.975)[0] == pytest.approx(0.025 ** (1 / 60))
     assert (found.low, found.high, found.needs) == (-math.inf, 4, 12)
     assert counted([72, 72, 72, 72, 40, 12, 5, 2], trials=72).low == 3
 
@@ -122,7 +122,7 @@ def test_the_isotonic_fit_pools_neighbors_that_violate_the_order() -> None:
 
 def lines_of(study: Study, shares: dict[str, list[float]], trials: int) -> list[PointRow]:
     return [
-        PointRow(n, {"rate": rate, "chain": chain}, {"identified": statistics.proportion(round(p * trials), trials)})
+        PointRow(n, {"rate": rate, "chain": chain}, {"identified": metrics.proportion(round(p * trials), trials)})
         for chain, curve in shares.items()
         for n, (rate, p) in enumerate(zip(LEVELS.astype(int).tolist(), curve, strict=True))
     ]
@@ -143,8 +143,8 @@ def test_a_study_says_the_rate_at_which_95_percent_are_identified() -> None:
 def test_its_interval_is_that_of_as_many_independent_trials_as_there_are() -> None:
     """A point without trials is left out; two levels are the least."""
     study = Study.model_validate(STUDY)
-    line = PointRow(0, {"rate": 0, "chain": "slow"}, {"identified": statistics.proportion(9, 10)})
-    other = line._replace(levels={"rate": 1, "chain": "slow"}, responses={"identified": statistics.NO_VALUE})
+    line = PointRow(0, {"rate": 0, "chain": "slow"}, {"identified": metrics.proportion(9, 10)})
+    other = line._replace(levels={"rate": 1, "chain": "slow"}, responses={"identified": metrics.NO_VALUE})
     assert thresholds.sentences(study.thresholds[0], study, [line, other]) == [
         "chain = slow: identified has no trials at two levels of rate yet."
     ]

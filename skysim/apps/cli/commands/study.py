@@ -203,7 +203,7 @@ def worst(
     with open_store(study, out) as stored:
         points = stored.points()
         try:
-            found = analysis.worst_of_levels(plan.study, stored, name, parse_levels(where or []), count)
+            found = analysis.worst_of_levels(plan.study, stored, name, chosen_levels(where or []), count)
         except InputError as error:
             raise InputError(f"--{error}") from None
     rows = [one._asdict() | {"levels": points[one.point].levels} for one in found]
@@ -214,7 +214,7 @@ def worst(
         print_worst(name, found, [points[one.point].levels for one in found], repeat)
 
 
-def parse_levels(words: list[str]) -> dict[str, Any]:
+def chosen_levels(words: list[str]) -> dict[str, Any]:
     """Levels by factor from FACTOR=LEVEL. Raises InputError."""
     from skysim.core.yaml_reader import parse_overrides, parse_yaml
 

@@ -42,8 +42,8 @@ from skysim.experiments.papers.afit.test3_images import (
 from skysim.experiments.papers.afit.test_stand import light_positions_m
 from skysim.experiments.papers.compare import Cause, Drawing, ExperimentOptions, ExperimentResult, RowResult
 from skysim.experiments.papers.intervals import percent, prediction_interval, sample_std
+from skysim.results.metrics import proportion
 from skysim.results.plots import INK
-from skysim.results.statistics import proportion
 from skysim.scene import loader
 from skysim.simulation.testbed import Testbed, build_testbed
 

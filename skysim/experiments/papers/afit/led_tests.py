@@ -28,8 +28,8 @@ from skysim.experiments.papers.afit.test_stand import (
 from skysim.experiments.papers.compare import Drawing, ExperimentOptions, ExperimentResult, RowResult, with_cause
 from skysim.experiments.papers.intervals import confidence_interval
 from skysim.experiments.papers.published import published_values
+from skysim.results.metrics import Summary, exact, proportion
 from skysim.results.plots import INK
-from skysim.results.statistics import Summary, exact, proportion
 from skysim.scene.camera import MoffatPsfConfig
 from skysim.scene.leds import CosineLobeConfig, DirectConfig, ListedConfig
 from skysim.scene.light import FlatSurfaceConfig

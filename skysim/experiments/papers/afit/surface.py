@@ -13,8 +13,8 @@ from skysim.core.types import Floats
 from skysim.core.units import INCH_M
 from skysim.experiments.papers.compare import Drawing, ExperimentOptions, ExperimentResult, RowResult, with_cause
 from skysim.experiments.papers.published import published_values
+from skysim.results.metrics import exact
 from skysim.results.plots import INK
-from skysim.results.statistics import exact
 from skysim.scene.light import FlatSurfaceConfig, SphereSurfaceConfig
 from skysim.sources.dome.point_cloud import fit_sphere
 from skysim.sources.dome.surface import Rim, Surface, build_surface

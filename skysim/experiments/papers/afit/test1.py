@@ -26,8 +26,8 @@ from skysim.experiments.papers.afit.test_stand import (
 from skysim.experiments.papers.compare import Drawing, ExperimentOptions, ExperimentResult, RowResult, with_cause
 from skysim.experiments.papers.intervals import confidence_interval
 from skysim.experiments.papers.published import published_values
+from skysim.results.metrics import exact
 from skysim.results.plots import INK
-from skysim.results.statistics import exact
 from skysim.scene.loader import load
 from skysim.scene.motion import SlewConfig
 from skysim.scene.scene import Scene

@@ -24,8 +24,8 @@ from skysim.experiments.papers.afit.test_stand import E_PER_GRAY, build_test_sta
 from skysim.experiments.papers.compare import Drawing, ExperimentOptions, ExperimentResult, RowResult, with_cause
 from skysim.experiments.papers.intervals import bootstrap_interval, confidence_interval, sample_std, symmetric_interval
 from skysim.experiments.papers.published import experiments
+from skysim.results.metrics import Summary, exact
 from skysim.results.plots import INK, MARKS
-from skysim.results.statistics import Summary, exact
 from skysim.scene.camera import MoffatPsfConfig
 from skysim.scene.light import DomeConfig
 from skysim.scene.loader import load

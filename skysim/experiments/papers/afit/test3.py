@@ -35,8 +35,8 @@ from skysim.experiments.papers.afit.test_stand import light_positions_m
 from skysim.experiments.papers.compare import Cause, Drawing, ExperimentOptions, ExperimentResult, RowResult
 from skysim.experiments.papers.intervals import bootstrap_interval
 from skysim.experiments.papers.published import experiments, published_values
+from skysim.results.metrics import Summary, exact, extremum
 from skysim.results.plots import INK, MARKS
-from skysim.results.statistics import Summary, exact, extremum
 from skysim.simulation.testbed import Testbed
 from skysim.tracking import onboard_model
 

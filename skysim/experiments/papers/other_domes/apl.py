@@ -20,8 +20,8 @@ from skysim.experiments.configs import with_config
 from skysim.experiments.papers.compare import Drawing, ExperimentOptions, ExperimentResult, RowResult
 from skysim.experiments.papers.intervals import bootstrap_interval
 from skysim.experiments.papers.published import experiments
+from skysim.results.metrics import exact, extremum
 from skysim.results.plots import INK, MARKS
-from skysim.results.statistics import exact, extremum
 from skysim.scene import loader
 from skysim.scene.light import DomeConfig
 from skysim.scene.scene import Scene

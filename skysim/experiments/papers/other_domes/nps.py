@@ -26,8 +26,8 @@ from skysim.core.units import ARCSEC_RAD
 from skysim.experiments import dome_survey
 from skysim.experiments.papers.compare import Drawing, ExperimentOptions, ExperimentResult, with_cause
 from skysim.experiments.papers.intervals import bootstrap_interval
+from skysim.results.metrics import Summary, proportion
 from skysim.results.plots import INK, MARKS
-from skysim.results.statistics import Summary, proportion
 from skysim.scene import loader
 from skysim.scene.light import DomeConfig, FlatSurfaceConfig
 from skysim.simulation import exposure

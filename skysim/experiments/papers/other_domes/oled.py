@@ -17,8 +17,8 @@ from skysim.experiments.papers.published import experiments
 from skysim.experiments.study.execution.setups import Setup
 from skysim.experiments.study.execution.trials import run_centroid_trial
 from skysim.experiments.study.plan import CentroidTrial
+from skysim.results.metrics import Summary, rms
 from skysim.results.plots import INK, MARKS
-from skysim.results.statistics import Summary, rms
 from skysim.scene import loader
 from skysim.scene.tracker import SurveyErrorsConfig
 from skysim.simulation.testbed import build_testbed, build_tracker

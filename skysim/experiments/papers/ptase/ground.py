@@ -23,9 +23,8 @@ from skysim.experiments.papers.compare import Cause, Drawing, ExperimentOptions,
 from skysim.experiments.papers.intervals import bootstrap_interval, sample_std, symmetric_interval
 from skysim.experiments.papers.published import experiments, published_values
 from skysim.experiments.study.execution.trials import constant_rate
-from skysim.results.metrics import WRONG_RAD
+from skysim.results.metrics import WRONG_RAD, extremum, proportion, rms
 from skysim.results.plots import INK, MARKS
-from skysim.results.statistics import extremum, proportion, rms
 from skysim.scene import loader
 from skysim.simulation import exposure
 from skysim.simulation.testbed import Testbed, build_testbed, build_tracker

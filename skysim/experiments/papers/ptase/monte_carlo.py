@@ -32,9 +32,8 @@ from skysim.core.units import ARCSEC_RAD
 from skysim.experiments.papers.compare import Cause, Drawing, ExperimentOptions, ExperimentResult, RowResult
 from skysim.experiments.papers.intervals import bootstrap_interval, percent, sample_std
 from skysim.experiments.papers.published import experiments
-from skysim.results.metrics import WRONG_RAD
+from skysim.results.metrics import WRONG_RAD, Summary, proportion
 from skysim.results.plots import INK, MARKS
-from skysim.results.statistics import Summary, proportion
 
 HALF_FIELD_TAN = float(np.tan(np.radians(10)))
 SIGMA_RAD, SIGMA_MAG = 3 * ARCSEC_RAD, 0.25

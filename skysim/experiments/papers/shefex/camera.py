@@ -20,8 +20,8 @@ from skysim.experiments.papers.compare import Cause, Drawing, ExperimentOptions,
 from skysim.experiments.papers.intervals import bootstrap_interval, bootstrap_of_means
 from skysim.experiments.papers.shefex.nights import FULL_MOON, exposure_override, render_frames
 from skysim.experiments.papers.shefex.setup import MAX_CENTROIDS, PUBLISHED
+from skysim.results.metrics import Summary, exact, quantile
 from skysim.results.plots import INK, MARKS
-from skysim.results.statistics import Summary, exact, quantile
 from skysim.scene.light import UniformGlowConfig
 from skysim.scene.loader import load
 from skysim.simulation import exposure

@@ -16,8 +16,8 @@ from skysim.experiments.papers.compare import Drawing, ExperimentOptions, Experi
 from skysim.experiments.papers.intervals import bootstrap_of_means
 from skysim.experiments.papers.shefex.setup import PRINTED_FIELD_RAD, PUBLISHED, paper_catalog, stars, testbed_with
 from skysim.experiments.study.execution import trials
+from skysim.results.metrics import exact
 from skysim.results.plots import INK
-from skysim.results.statistics import exact
 
 BRIGHT_LIMIT_MAG, FAINTEST_MAG = 4.5, 5.75
 MIN_STARS = 4

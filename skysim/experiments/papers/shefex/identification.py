@@ -35,7 +35,7 @@ from skysim.experiments.papers.shefex.setup import (
     shefex_testbed,
 )
 from skysim.experiments.study.report.figures import logarithmic
-from skysim.results.statistics import Summary, exact, extremum, proportion
+from skysim.results.metrics import Summary, exact, extremum, proportion
 from skysim.tracking import onboard_model
 
 COS_ERRORS = np.array([5e-6, 1e-5, 1.5e-5, 2e-5, 3e-5, 4e-5, 5.5e-5, 8e-5, 1.2e-4, 2e-4])

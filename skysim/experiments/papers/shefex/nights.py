@@ -23,7 +23,7 @@ from skysim.experiments.study.execution import trials
 from skysim.experiments.study.execution.setups import Setup
 from skysim.experiments.study.plan import FrameTrial
 from skysim.results import metrics
-from skysim.results.statistics import Summary, proportion
+from skysim.results.metrics import Summary, proportion
 from skysim.scene.loader import load
 from skysim.simulation.testbed import build_testbed, build_tracker
 from skysim.tracking import factory

@@ -21,7 +21,7 @@ from skysim.experiments.papers.shefex.setup import apparent, shefex_testbed, sta
 from skysim.experiments.study.execution import trials
 from skysim.experiments.study.execution.setups import Setup
 from skysim.experiments.study.plan import FrameTrial
-from skysim.results.statistics import Summary, exact
+from skysim.results.metrics import Summary, exact
 from skysim.scene.loader import load
 from skysim.simulation.testbed import Testbed, build_testbed, build_tracker
 from skysim.tracking import onboard_model

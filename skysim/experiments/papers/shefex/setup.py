@@ -23,8 +23,8 @@ from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
 from skysim.experiments.dome_survey import detect_lights
 from skysim.experiments.study.execution import trials
+from skysim.results.metrics import Summary
 from skysim.results.plots import INK, MARKS
-from skysim.results.statistics import Summary
 from skysim.scene.loader import load
 from skysim.simulation.testbed import Testbed, build_testbed
 from skysim.tracking import onboard_model

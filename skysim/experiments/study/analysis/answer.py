@@ -14,8 +14,8 @@ from skysim.experiments.study.analysis import thresholds
 from skysim.experiments.study.analysis.axes import distinct
 from skysim.experiments.study.analysis.table import PointRow, format_level, format_summary, has_few_values
 from skysim.experiments.study.plan import Study
-from skysim.results import statistics
-from skysim.results.statistics import Summary
+from skysim.results import metrics
+from skysim.results.metrics import Summary
 
 EVENTS = {
     "misidentified": "Misidentified (a light matched with a wrong star or LED)",
@@ -93,7 +93,7 @@ def ambiguity(study: Study, lines: Sequence[PointRow], place: Place) -> str:
     for line in lines:
         refused, wrong = line.responses["ambiguous"], line.responses["misidentified"]
         either = refused.value + np.nan_to_num(wrong.value)
-        share = statistics.proportion(round(either * refused.trials), refused.trials)
+        share = metrics.proportion(round(either * refused.trials), refused.trials)
         shares.append(share._replace(value=either))
     unit = ", each with hardware of its own" if study.hardware else ""
     text = event("Ambiguous or misidentified", shares, lines, place)
@@ -105,8 +105,8 @@ def none_of(shares: Sequence[Summary]) -> str:
     """That an event was never seen, and the exact upper bound of its frequency (Clopper & Pearson 1934)."""
     fewest = min(share.trials for share in shares)
     each = " a point" if len(shares) > 1 else ""
-    bound = statistics.exact_bounds(0, fewest)[1] if fewest else 1.0
-    return f"none in {fewest:,}{each} (less than {100 * bound:.2g} % at {100 * statistics.CONFIDENCE:g} % confidence)"
+    bound = metrics.exact_bounds(0, fewest)[1] if fewest else 1.0
+    return f"none in {fewest:,}{each} (less than {100 * bound:.2g} % at {100 * metrics.CONFIDENCE:g} % confidence)"
 
 
 def interval(share: Summary) -> str:

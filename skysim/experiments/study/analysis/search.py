@@ -28,8 +28,7 @@ from skysim.experiments.study.factors import Distribution, Factor, Levels, Range
 from skysim.experiments.study.plan import Constraint, Plan, Search, Study
 from skysim.experiments.study.store import Store
 from skysim.results import metrics
-from skysim.results.metrics import Columns
-from skysim.results.statistics import Summary
+from skysim.results.metrics import Columns, Summary
 
 COST = "cost"
 STARTUP_CANDIDATES = 10  # random candidates before the sampler uses earlier results

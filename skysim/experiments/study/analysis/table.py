@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from skysim.experiments.study.store import Store
 from skysim.results import metrics
-from skysim.results.statistics import Summary
+from skysim.results.metrics import Summary
 
 LONG_QUANTITY = re.compile(r"(-?\d*\.\d{4,}(?:e[-+]?\d+)?)(\s\S.*)$")
 

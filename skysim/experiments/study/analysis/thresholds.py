@@ -21,9 +21,9 @@ from skysim.experiments.study.analysis import axes
 from skysim.experiments.study.analysis.axes import Axis
 from skysim.experiments.study.analysis.table import PointRow
 from skysim.experiments.study.plan import Curve, Study, Threshold
-from skysim.results import metrics, statistics
+from skysim.results import metrics
 
-TAIL = (1 - statistics.CONFIDENCE) / 2
+TAIL = (1 - metrics.CONFIDENCE) / 2
 MISFIT_PROBABILITY = 1e-3  # of a monotonic curve that differs from its isotonic fit by more than the accepted deviance
 
 
@@ -98,11 +98,11 @@ def certain_levels(x: Floats, hits: Floats, trials: Floats, limit: float) -> tup
     counts = list(zip(x.tolist(), hits.astype(int).tolist(), trials.astype(int).tolist(), strict=True))
     above = beneath = None
     for place, count, total in counts:
-        if statistics.exact_bounds(count, total, 1 - TAIL)[0] < limit:
+        if metrics.exact_bounds(count, total, 1 - TAIL)[0] < limit:
             break
         above = place
     for place, count, total in reversed(counts):
-        if statistics.exact_bounds(count, total, 1 - TAIL)[1] >= limit:
+        if metrics.exact_bounds(count, total, 1 - TAIL)[1] >= limit:
             break
         beneath = place
     return above, beneath
@@ -185,9 +185,9 @@ def interval_text(found: Crossing) -> str:
     needs = f"; {found.needs} more trials at each level are needed" if found.needs else ""
     low, high = (f"{end:.4g}" for end in (found.low, found.high))
     if math.isinf(found.low) and math.isinf(found.high):
-        return f"{100 * statistics.CONFIDENCE:g} %: no level is certain{needs}"
+        return f"{100 * metrics.CONFIDENCE:g} %: no level is certain{needs}"
     if math.isinf(found.low):
-        return f"{100 * statistics.CONFIDENCE:g} %: below {high}{needs}"
+        return f"{100 * metrics.CONFIDENCE:g} %: below {high}{needs}"
     if math.isinf(found.high):
-        return f"{100 * statistics.CONFIDENCE:g} %: above {low}{needs}"
-    return f"{100 * statistics.CONFIDENCE:g} %: {low} to {high}"
+        return f"{100 * metrics.CONFIDENCE:g} %: above {low}{needs}"
+    return f"{100 * metrics.CONFIDENCE:g} %: {low} to {high}"

@@ -17,7 +17,7 @@ from estimator.trackers.star_tracker import StarTracker
 from skysim.core import quaternion
 from skysim.core.types import Floats, Truth
 from skysim.core.units import ARCSEC_RAD
-from skysim.results import metrics, statistics
+from skysim.results import metrics
 from skysim.scene.light import DomeConfig
 from skysim.simulation.testbed import Testbed
 from skysim.tracking import factory
@@ -286,7 +286,7 @@ def finite(values: list[float]) -> Floats:
 
 def rms(values: list[float] | Floats) -> float:
     """Root mean square; NaN without values."""
-    return float(statistics.rms(np.asarray(values))) if len(values) else math.nan
+    return float(metrics.rms(np.asarray(values))) if len(values) else math.nan
 
 
 def mean(values: list[Any] | NDArray[Any]) -> float:

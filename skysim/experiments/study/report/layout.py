@@ -26,8 +26,8 @@ from skysim.experiments.study.analysis.axes import (
 from skysim.experiments.study.analysis.table import PointRow, format_level, has_few_values
 from skysim.experiments.study.analysis.thresholds import thresholds_of
 from skysim.experiments.study.plan import Curve, Figure, Heat, Search, Study
-from skysim.results import statistics
-from skysim.results.statistics import Summary
+from skysim.results import metrics
+from skysim.results.metrics import Summary
 
 MAX_X_WITH_BARS = 12  # maximum number of x values for error bars; with more, intervals are drawn as a band
 MAX_POINTS_WITH_BARS = 60  # sampled points with error bars; with more, a running median is drawn
@@ -253,6 +253,6 @@ def curve_note(figure: Curve, study: Study, lines: Sequence[PointRow], summaries
         return f"; lines: {'running medians' if x_axis.numeric else 'medians'} of the points"
     if np.isnan([one.low for one in summaries]).all():
         return ""
-    text = f"; intervals of {100 * statistics.CONFIDENCE:g} %"
+    text = f"; intervals of {100 * metrics.CONFIDENCE:g} %"
     needs = max(one.needs for one in summaries)
     return text + (f", none where a point needs up to {needs} more trials" if needs else "")
