@@ -330,7 +330,7 @@ def test_few_survivors_are_hollow_numbered_and_joined_to_nothing() -> None:
     hollow = [line for line in axes.lines if line.get_markerfacecolor() == "white" and len(line.get_xdata())]
     assert [(line.get_xdata().tolist(), line.get_ydata().tolist()) for line in hollow] == [([10], [4.0])]
     assert [text.get_text() for text in axes.texts] == ["n=12"]
-    assert "Hollow, without a line: few trials" in layout.caption(curve, study(), lines)
+    assert "Hollow, without a line: few of the point's trials" in layout.caption(curve, study(), lines)
     heat = layout.grid(lines, Heat(kind="heat", x="tilt", y="tilt", value="cross_arcsec_median"), study())
     assert [[bool(heat.few[n, n]), int(heat.values[n, n])] for n in range(3)] == [[False, 60], [True, 12], [False, 50]]
 

@@ -176,7 +176,7 @@ def describe(found: Crossing | None, threshold: Threshold, axis: Axis) -> str:
         text = f"{response} is {'at least' if everywhere else 'below'} {limit} at all levels of {name}, "
         text += f"{first:.4g} to {last:.4g}{unit}"
     else:
-        text = f"{response} {'reaches' if found.rising else 'falls below'} {limit} at {name} = {found.value:.3g}{unit}"
+        text = f"{response} {'reaches' if found.rising else 'falls below'} {limit} at {name} = {found.value:.4g}{unit}"
     return f"{text} ({interval_text(found)})."
 
 

@@ -16,7 +16,7 @@ from skysim.experiments.study.analysis.thresholds import crossings, thresholds_o
 from skysim.experiments.study.plan import Curve, Heat, Study
 from skysim.experiments.study.report import layout
 from skysim.experiments.study.report.layout import MAX_POINTS_WITH_BARS, Grid, Panel, Series
-from skysim.experiments.study.report.scales import HATCHED, add_color_bar, color_scale, ticks
+from skysim.experiments.study.report.scales import HATCHED, add_color_bar, color_scale, halo, ticks
 from skysim.results.plots import INK, MARKS, png
 
 if TYPE_CHECKING:
@@ -126,7 +126,7 @@ def draw_few(axes: Any, one: Series, mark: str, **style: Any) -> None:
     for x, value, count in zip(one.x[one.few], one.value[one.few], one.values[one.few], strict=True):
         if np.isfinite(value):
             place = {"xy": (x, value), "xytext": (4, 4), "textcoords": "offset points", "xycoords": style["transform"]}
-            axes.annotate(f"n={count}", **place, fontsize=6.5, color=style["color"])
+            axes.annotate(f"n={count}", **place, fontsize=6.5, color=style["color"], path_effects=[halo()])
 
 
 def draw_points(axes: Any, one: Series, ink: Any, mark: str, numeric: bool, dots: bool) -> None:

@@ -223,7 +223,7 @@ def caption(figure: Figure, study: Study, lines: Sequence[PointRow]) -> str:
         text += " Dashed: a limit; ticks and bars: where it is crossed, with intervals of 95 %."
     if any(has_few_values(line, value) for line in shown):
         mark = "Hollow, without a line" if isinstance(figure, Curve) else "Dotted"
-        text += f" {mark}: few trials of the point have a value, n of them; it is that of the easy ones."
+        text += f" {mark}: few of the point's trials have a value (n of them), and these are the easy ones."
     if figure.log and any(one.value <= 0 < one.high for one in summaries):
         text += " Triangles: none was seen, and so much at most."
     return text

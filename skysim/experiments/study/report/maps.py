@@ -16,7 +16,7 @@ from skysim.experiments.study.analysis.table import PointRow
 from skysim.experiments.study.analysis.worst import ColumnsOf, WorstTrial, joined, worst_trials
 from skysim.experiments.study.plan import Map, Study
 from skysim.experiments.study.report.layout import caption_title, fixed_text
-from skysim.experiments.study.report.scales import HATCHED, add_color_bar, color_scale
+from skysim.experiments.study.report.scales import HATCHED, add_color_bar, color_scale, halo
 from skysim.results import metrics
 from skysim.results.metrics import Columns
 from skysim.results.plots import png
@@ -239,13 +239,6 @@ def mark_worst(axes: Any, panel: DirectionMap) -> None:
         axes.plot(*xy, "o", markersize=8, markerfacecolor="none", markeredgecolor=MARK, path_effects=[halo()])
         text = {"fontsize": 8, "color": MARK, "path_effects": [halo()]}
         axes.annotate(str(rank), xy, xytext=(5, 4), textcoords="offset points", **text)
-
-
-def halo() -> Any:
-    """A white outline that keeps text and marks readable on any color."""
-    from matplotlib.patheffects import withStroke
-
-    return withStroke(linewidth=2.2, foreground="white")
 
 
 # Caption.

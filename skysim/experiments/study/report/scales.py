@@ -1,4 +1,4 @@
-"""Color scales of a study's figures, and ticks of logarithmic axes."""
+"""Color scales of a study's figures, outlines of texts, and ticks of logarithmic axes."""
 
 from __future__ import annotations
 
@@ -54,3 +54,10 @@ def ticks(low: float, high: float) -> tuple[Any, Any]:
 
     where = LogLocator(subs=(1, 2, 5) if high < 1000 * low else (1,)) if high > 8 * low else MaxNLocator(5)
     return where, FuncFormatter(lambda value, _: f"{value:.6g}")
+
+
+def halo() -> Any:
+    """A white outline that keeps text and marks readable on any color."""
+    from matplotlib.patheffects import withStroke
+
+    return withStroke(linewidth=2.2, foreground="white")
