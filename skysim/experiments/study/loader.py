@@ -9,12 +9,13 @@ from pydantic import ValidationError
 
 from skysim.core.errors import InputError, unknown_name
 from skysim.core.yaml_reader import check_version, explain, line_of, read_yaml, set_key
+from skysim.dynamics.controllers.interface import CONTROLLERS
 from skysim.experiments.study.designs import make_point
 from skysim.experiments.study.factors import Factor, Settings, Value
 from skysim.experiments.study.plan import CentroidTrial, Curve, FlightTrial, Plan, Study, find, make_plan, resolve_point
 from skysim.results import metrics
 from skysim.scene.light import CollimatedDisplayConfig
-from skysim.tracking.external.interface import OWN, check_tracker_name
+from skysim.tracking.external.interface import OWN, TRACKERS
 
 
 def load(
@@ -22,8 +23,8 @@ def load(
 ) -> Plan:
     """Read, override (`path.to.key` -> YAML value) and validate a study and every level of its factors.
 
-    programs : commands of external trackers by name, for `tracker.name`; None if the study will not be run, and its
-               trackers need not be installed
+    programs : commands of external trackers and controllers by name; None if the study will not be run, and its
+               trackers and controllers need not be installed
     Raises InputError with one line: the key, the fault, what is allowed, the file and line.
     """
     path = find(str(name))
@@ -49,7 +50,7 @@ def load(
 def check(plan: Plan, to_run: bool) -> None:
     """Validate responses, figures, budget and each level of each factor before the first trial. Raises InputError.
 
-    to_run : whether the trackers must be installed
+    to_run : whether the trackers and controllers must be installed
     """
     from skysim.experiments.study.analysis import search
     from skysim.experiments.study.analysis.table import PointRow
@@ -83,7 +84,9 @@ def check(plan: Plan, to_run: bool) -> None:
                 raise InputError(f"trial.kind: {trial.kind} with a collimated display; allowed: flight")
             if to_run:
                 tracker = scene.tracker.name
-                check_tracker_name(tracker, plan.spec.programs)
+                TRACKERS.check_name(tracker, plan.spec.programs)
+                if scene.motion.control:
+                    CONTROLLERS.check_name(scene.motion.control.law, plan.spec.programs)
                 if tracker != OWN and isinstance(trial, CentroidTrial):  # an external tracker takes images
                     raise InputError(f"tracker.name: {tracker} needs frames; allowed: {OWN}, or another trial.kind")
         except InputError as error:

@@ -1,0 +1,100 @@
+"""Text files of attitude samples: read within limits, numbers and epochs with the line of what is wrong."""
+
+from __future__ import annotations
+
+import datetime
+import re
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from skysim.core.errors import InputError, printable
+from skysim.core.types import Floats
+
+MAX_BYTES = 200_000_000  # of a file: a million lines of 200 characters
+MAX_EXCERPT = 40  # characters of a value in a message
+EPOCH = re.compile(r"\d{4}-(\d\d-\d\d|\d{3})[T ]\d\d:\d\d:\d\d(\.\d{0,15})?Z?", re.ASCII)
+SCALES = {"UTC": "utc", "TAI": "tai", "TT": "tt", "TDB": "tdb", "GPS": "tai"}  # astropy's, by CCSDS's time systems
+GPS_MINUS_TAI_S = -19.0
+DAY_S = 86_400.0
+
+Line = tuple[int, str]  # number from 1, and content
+
+
+def read_lines(path: Path) -> list[Line]:
+    """The numbered lines of a text file, without blank ones. Raises InputError for one too large or not UTF-8 text."""
+    try:
+        size = path.stat().st_size
+        if size > MAX_BYTES:
+            raise InputError(f"{path}: {size} bytes; allowed: up to {MAX_BYTES}")
+        text = path.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from None
+    return [(n, line.strip()) for n, line in enumerate(text.split("\n"), 1) if line.strip()]
+
+
+def excerpt(text: object) -> str:
+    """A value for a message, on one line and truncated."""
+    shown = printable(text)
+    return repr(shown if len(shown) <= MAX_EXCERPT else f"{shown[:MAX_EXCERPT]}…")
+
+
+def to_numbers(source: str, line: int, words: Sequence[str]) -> list[float]:
+    """The words as finite numbers. Raises InputError."""
+    numbers = []
+    for word in words:
+        try:
+            number = float(word)
+        except ValueError:
+            raise InputError(f"{source}, line {line}: {excerpt(word)} is not a number") from None
+        if not np.isfinite(number):
+            raise InputError(f"{source}, line {line}: {excerpt(word)} is not a finite number")
+        numbers.append(number)
+    return numbers
+
+
+def seconds_since(
+    source: str, places: Sequence[int], epochs: Sequence[str], start: datetime.datetime, system: str, unit: str = "line"
+) -> Floats:
+    """(N,) seconds from a start in UTC to epochs (ISO 8601, calendar or day of year) of a time system of SCALES.
+
+    UTC is taken as uniform, like the scene's own times: a leap second between the two is not counted. Raises
+    InputError for the first epoch that is not one.
+    """
+    from astropy.time import Time
+
+    bad = [n for n, epoch in enumerate(epochs) if not EPOCH.fullmatch(epoch)]
+    bad += [n for n, epoch in enumerate(epochs) if len(epoch.split("-")) != len(epochs[0].split("-"))]
+    if bad:
+        raise InputError(
+            f"{source}, {unit} {places[min(bad)]}: {excerpt(epochs[min(bad)])} is not an epoch; allowed:"
+            " 2012-06-22T21:00:00.5, or all of the form 2012-174T21:00:00.5"
+        )
+    texts = [epoch.rstrip("Z").replace(" ", "T") for epoch in epochs]
+    ordinal = bool(texts) and texts[0].count("-") == 1
+    kind, scale = ("yday" if ordinal else "isot"), SCALES[system]
+    if ordinal:
+        texts = [text.replace("-", ":", 1).replace("T", ":", 1) for text in texts]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # "dubious year": leap seconds of the future are unknown
+        try:
+            times = Time(texts, format=kind, scale=scale).utc
+        except ValueError:
+            n = next(n for n, text in enumerate(texts) if not is_time(text, kind, scale))
+            raise InputError(f"{source}, {unit} {places[n]}: {excerpt(epochs[n])} is not a date and time") from None
+        zero = Time(start, scale="utc")
+    seconds = ((times.jd1 - zero.jd1) + (times.jd2 - zero.jd2)) * DAY_S
+    return np.asarray(seconds - (GPS_MINUS_TAI_S if system == "GPS" else 0.0), dtype=np.float64)
+
+
+def is_time(text: str, kind: str, scale: str) -> bool:
+    """Whether astropy takes the text for a time."""
+    from astropy.time import Time
+
+    try:
+        Time(text, format=kind, scale=scale)
+    except ValueError:
+        return False
+    return True
