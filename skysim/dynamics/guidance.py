@@ -250,8 +250,8 @@ def profile(element: ProfileConfig, start: LegStart) -> Leg:
     if first_s - begin_s > step_s + 1e-9 or last_s <= begin_s:
         raise InputError(
             f"motion.maneuver: {spline.source}: attitudes from {first_s - begin_s:.6g} s to {last_s - begin_s:.6g} s"
-            f" after the maneuver's beginning; allowed: from {step_s:.3g} s at most, a step, to a time after it; or begin:"
-            " first_sample"
+            f" after the maneuver's beginning; allowed: from {step_s:.3g} s (a step) at most, to a time after it; or"
+            " begin: first_sample"
         )
     lab_from_ref, rate_rad_s, _ = spline.state_at(begin_s)
     jump = quaternion.multiply(quaternion.inverse(start.lab_from_ref_wxyz), lab_from_ref)

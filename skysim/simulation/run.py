@@ -19,7 +19,6 @@ from skysim.simulation.telemetry import TelemetryRecorder
 from skysim.simulation.testbed import Testbed, build_testbed, build_tracker
 from skysim.tracking import factory
 from skysim.tracking.exposure_control import ExposureController
-from skysim.tracking.external.adapter import ExternalTracker
 
 ProgressCallback = Callable[[float, float], None]
 
@@ -136,7 +135,7 @@ def warm_up(testbed: Testbed, estimator: factory.Estimator) -> None:
     External trackers are skipped: each frame must reach them once, in order.
     """
     frame, _ = render_frame(testbed, 0)
-    if not isinstance(estimator, ExternalTracker):
+    if not isinstance(estimator, factory.UserTracker):
         factory.solve_frame(estimator, frame)
 
 

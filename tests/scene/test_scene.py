@@ -342,7 +342,8 @@ def test_a_bad_override_is_one_line_and_blamed_on_the_option(key: str, value: st
         (
             '{kind: hold, duration: "1 s"}',
             '{kind: wait, duration: "1 s"}',
-            "motion.maneuver.0.kind: unknown kind 'wait'; allowed: hold, step, slew, rate, spin_up, sine, chirp, profile, jitter, bump",
+            "motion.maneuver.0.kind: unknown kind 'wait'; allowed: hold, step, slew, rate, spin_up, sine, chirp, "
+            "profile, jitter, bump",
         ),
         (
             "pitch_deg: 0",
