@@ -12,9 +12,20 @@ from skysim.core.yaml_reader import check_version, explain, line_of, read_yaml, 
 from skysim.dynamics.controllers.interface import CONTROLLERS
 from skysim.experiments.study.designs import make_point
 from skysim.experiments.study.factors import Factor, Settings, Value
-from skysim.experiments.study.plan import CentroidTrial, Curve, FlightTrial, Plan, Study, find, make_plan, resolve_point
+from skysim.experiments.study.plan import (
+    AttitudeRange,
+    CentroidTrial,
+    Curve,
+    FlightTrial,
+    Plan,
+    Study,
+    find,
+    make_plan,
+    resolve_point,
+)
 from skysim.results import metrics
-from skysim.scene.light import CollimatedDisplayConfig
+from skysim.scene.light import CollimatedDisplayConfig, DomeConfig
+from skysim.scene.scene import Scene
 from skysim.tracking.external.interface import OWN, TRACKERS
 
 
@@ -82,6 +93,8 @@ def check(plan: Plan, to_run: bool) -> None:
             scene, trial = resolve_point(plan.spec, settings)
             if isinstance(scene.light, CollimatedDisplayConfig) and not isinstance(trial, FlightTrial):
                 raise InputError(f"trial.kind: {trial.kind} with a collimated display; allowed: flight")
+            if isinstance(trial, FlightTrial) and trial.start:
+                check_random_start(scene, trial.start)
             if to_run:
                 tracker = scene.tracker.name
                 TRACKERS.check_name(tracker, plan.spec.programs)
@@ -95,6 +108,23 @@ def check(plan: Plan, to_run: bool) -> None:
             owner = name if name in owners or not owners else owners[0]
             value = level if owner == name else study.factors[owner].value_at(0.5)[0]
             raise InputError(f"factors.{owner}: {value!r}: {error}") from None
+
+
+def check_random_start(scene: Scene, start: AttitudeRange) -> None:
+    """Raise InputError for a random start that the scene cannot have, or whose keys have no effect in it."""
+    if isinstance(scene.light, CollimatedDisplayConfig) or scene.motion.start == "profile":
+        where = "a collimated display" if scene.motion.start != "profile" else "motion.start: profile"
+        raise InputError(f"trial.start: random with {where}; allowed: scene")
+    dome = isinstance(scene.light, DomeConfig)
+    unused = "dec_deg" if dome else "tilt_deg"
+    if unused in start.model_fields_set:
+        raise InputError(f"trial.start.{unused}: has no effect with light of kind {scene.light.kind}; allowed: none")
+    greatest_deg = max(start.tilt_deg) if isinstance(start.tilt_deg, tuple) else start.tilt_deg
+    vehicle = scene.vehicle
+    if dome and vehicle.mount == "air_bearing" and greatest_deg > vehicle.tilt_stop_deg:
+        raise InputError(
+            f"trial.start.tilt_deg: {greatest_deg:g}; allowed: up to vehicle.tilt_stop_deg {vehicle.tilt_stop_deg:g}"
+        )
 
 
 def each_level(factors: Mapping[str, Factor]) -> Iterator[tuple[str, Value, Settings]]:
