@@ -160,12 +160,11 @@ def join(first: Samples, second: Samples) -> Samples:
     """
     if not len(first.t_s) or not len(second.t_s):
         return first if len(first.t_s) else second
-    if second.direction != first.direction:
+    direction = second.direction
+    if direction != first.direction:
         second = second.inverted()
     if second.direction != first.direction:
-        raise second.error(
-            0, f"a segment of {second.direction} after one of {first.direction}; allowed: the same frames"
-        )
+        raise second.error(0, f"a segment of {direction} after one of {first.direction}; allowed: the same frames")
     gap_s = second.t_s[0] - first.t_s[-1]
     if gap_s == 0 and (first.a_from_b[-1].inv() * second.a_from_b[0]).magnitude() < SAME_ATTITUDE_RAD:
         second = take(second, slice(1, None))

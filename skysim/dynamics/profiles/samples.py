@@ -14,8 +14,8 @@ from skysim.core.types import Floats
 
 MIN_SAMPLES, MAX_SAMPLES = 4, 1_000_000  # a not-a-knot cubic takes four
 UNIT_TOLERANCE = 1e-3  # of a quaternion's norm
-# Largest rotation between two samples. The interpolated attitude of a constant rate errs by (angle / 2)^4 / 384: by
-# 0.03 arcsec at 10 deg, by half an arcsecond at 20.
+# Largest rotation between two samples. The interpolated attitude of a constant rate errs with the fifth power of it,
+# most in the first and the last step: by 0.04 arcsec at 10 deg, by 1.3 arcsec at 20 (measured).
 MAX_STEP_DEG = 10.0
 
 

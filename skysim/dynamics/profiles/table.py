@@ -78,6 +78,9 @@ def from_table(table: Any, source: str, start: datetime.datetime, rotation: str 
             raise InputError(f"{source}: column {name} is in {unit}; allowed: {UNITS.get(name) or 'no unit'}")
         values[name] = to_epochs(column) if name == "utc" else to_column(source, name, column)
     count = len(next(iter(values.values())))
+    for name, column in values.items():
+        if len(column) != count:
+            raise InputError(f"{source}: column {name} has {len(column)} values; allowed: {count}, as the first")
     return to_samples(source, "row", range(1, count + 1), values, start, rotation)
 
 

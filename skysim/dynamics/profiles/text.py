@@ -15,10 +15,9 @@ from skysim.core.types import Floats
 
 MAX_BYTES = 200_000_000  # of a file: a million lines of 200 characters
 MAX_EXCERPT = 40  # characters of a value in a message
-EPOCH = re.compile(r"\d{4}-(\d\d-\d\d|\d{3})[T ]\d\d:\d\d:\d\d(\.\d{0,15})?Z?", re.ASCII)
+EPOCH = re.compile(r"(?:19|20|21)\d\d-(\d\d-\d\d|\d{3})[T ]\d\d:\d\d:\d\d(\.\d{0,15})?Z?", re.ASCII)
 SCALES = {"UTC": "utc", "TAI": "tai", "TT": "tt", "TDB": "tdb", "GPS": "tai"}  # astropy's, by CCSDS's time systems
 GPS_MINUS_TAI_S = -19.0
-DAY_S = 86_400.0
 
 Line = tuple[int, str]  # number from 1, and content
 
@@ -84,9 +83,12 @@ def seconds_since(
         except ValueError:
             n = next(n for n, text in enumerate(texts) if not is_time(text, kind, scale))
             raise InputError(f"{source}, {unit} {places[n]}: {excerpt(epochs[n])} is not a date and time") from None
-        zero = Time(start, scale="utc")
-    seconds = ((times.jd1 - zero.jd1) + (times.jd2 - zero.jd2)) * DAY_S
-    return np.asarray(seconds - (GPS_MINUS_TAI_S if system == "GPS" else 0.0), dtype=np.float64)
+        times.precision = 9
+    try:
+        nanoseconds = np.array(times.isot, dtype="datetime64[ns]") - np.datetime64(start, "ns")
+    except ValueError:
+        raise InputError(f"{source}: an epoch within a leap second; allowed: other times") from None
+    return nanoseconds.astype(np.int64) / 1e9 - (GPS_MINUS_TAI_S if system == "GPS" else 0.0)
 
 
 def is_time(text: str, kind: str, scale: str) -> bool:
