@@ -258,14 +258,14 @@ def test_a_run_exported_and_flown_again_has_the_same_centroids(
     name: str, changes: dict[str, Any], file: str, tmp_path: Path
 ) -> None:
     """Every light of every frame to a thousandth of a pixel: at mid-exposure, and its smeared image."""
-    scene = skysim.load_scene(name, {"exposure.frames": 3} | changes)
+    scene = skysim.load_scene(name, {"exposure.frames": 4} | changes)
     flown = skysim.simulate(scene)
     folder = flown.save(tmp_path)
     export.export(recording.open_recording(folder), ["aem"], folder, lambda items, count, label: iter(items))
     profile = [{"kind": "profile", "file": str(folder / file)}]
     motion = {"motion.start": "profile", "motion.rate_deg_s": [0, 0, 0], "motion.maneuver": profile}
     again = skysim.simulate(
-        skysim.load_scene(name, {"exposure.frames": 3, "motion.control": "prescribed"} | changes | motion)
+        skysim.load_scene(name, {"exposure.frames": 4, "motion.control": "prescribed"} | changes | motion)
     )
     rates = [frame.row.rate_deg_s for frame in flown]
     assert max(rates) > 0.4
@@ -364,7 +364,7 @@ def test_a_function_s_attitudes_reach_the_filter_and_the_controller() -> None:
 
     log: Telemetry = skysim.simulate(scene, tracker=mine).telemetry
     assert log.lab_from_filter is not None
-    assert np.degrees(log.lab_from_filter[-1].as_rotvec()[2]) == pytest.approx(-0.5, abs=0.1)
+    assert np.degrees(log.lab_from_filter.as_rotvec()[:, 2].min()) == pytest.approx(-0.5, abs=0.05)
     assert np.degrees(log.lab_from_body[-1].as_rotvec()[2]) > 0.1
 
 
