@@ -221,7 +221,8 @@ SLIPS = [
     (GOOD.replace("1,1,0,0", "1,1,0"), r"line 3: 3 values; allowed: 4"),
     (GOOD.replace("2,2,0,0", "2,2,0,zero"), r"line 4: 'zero' is not a number"),
     (GOOD.replace("2,2,0,0", "2,2,0,nan"), r"line 4: 'nan' is not a finite number"),
-    (GOOD.replace("3,3,0,0", "2,3,0,0"), r"line 5: time 2 s is not after 2 s"),
+    (GOOD.replace("3,3,0,0", "2,3,0,0"), r"line 5: time 2 s is not after 2 s, by a microsecond at least"),
+    (GOOD.replace("3,3,0,0", "3e9,3,0,0"), r"line 5: time 3e\+09 s; allowed: within 1e\+09 s of the start"),
     (GOOD.replace("3,3,0,0", "3,30,0,0"), r"line 5: 28 deg from the attitude before it; allowed: up to 10 deg"),
     (GOOD.replace("3,3,0,0\n", ""), r"3 attitudes; allowed: 4 to 1000000"),
     (

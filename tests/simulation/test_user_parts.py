@@ -152,7 +152,10 @@ def test_a_slip_is_told_with_the_file_s_line_and_the_scene_s(tmp_path: Path) -> 
     with pytest.raises(InputError) as raised:
         build_testbed(loader.load(path))
     told = loader.with_location(str(raised.value), str(path), {})
-    assert re.fullmatch(rf"motion.maneuver.0: {table}, line 10: time 0.7 s is not after 0.7 s \({path}, line 7\)", told)
+    assert re.fullmatch(
+        rf"motion.maneuver.0: {table}, line 10: time 0.7 s is not after 0.7 s, by a microsecond at least \({path}, line 7\)",
+        told,
+    )
     table.unlink()
     with pytest.raises(InputError, match=r"motion.maneuver.0.file: .*swing.csv' is not a file; .*mine.yaml, line 7"):
         loader.load(path)

@@ -15,8 +15,10 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
+from skysim.core.errors import printable
 from skysim.core.plugins.kind import PluginKind
 from skysim.core.plugins.messages import Floats, finite_array, to_lists
+from skysim.core.plugins.program import MAX_STATUS_CHARS
 from skysim.scene.motion import BUILT_IN_LAWS, PRESCRIBED
 
 if TYPE_CHECKING:
@@ -137,12 +139,12 @@ def check_torque(torque_nm: Any, authority_nm: float) -> Floats:
 def torque_of_reply(reply: Any, tick: int, authority_nm: float) -> Floats:
     """The torque in a program's answer to a tick, a parsed JSON value. Raises ValueError."""
     if not isinstance(reply, dict) or reply.get("tick") != tick:
-        raise ValueError(f"no answer to tick {tick}, but {str(reply)[:80]!r}")
+        raise ValueError(f"no answer to tick {tick}, but {printable(reply)[:80]!r}")
     if "status" in reply:
-        raise ValueError(str(reply["status"]))
-    unknown = [name for name in reply if name not in ("tick", "torque_nm")]
+        raise ValueError(printable(reply["status"])[:MAX_STATUS_CHARS] or "a status without a text")
+    unknown = [printable(name) for name in reply if name not in ("tick", "torque_nm")]
     if unknown:
-        raise ValueError(f"unknown key {unknown[0]!r}; allowed: tick, torque_nm, status")
+        raise ValueError(f"unknown key {unknown[0][:80]!r}; allowed: tick, torque_nm, status")
     return check_torque(reply.get("torque_nm"), authority_nm)
 
 

@@ -14,6 +14,7 @@ from skysim.core.types import Floats
 
 MIN_SAMPLES, MAX_SAMPLES = 4, 1_000_000  # a not-a-knot cubic takes four
 UNIT_TOLERANCE = 1e-3  # of a quaternion's norm
+MAX_TIME_S, MIN_STEP_S = 1e9, 1e-6
 # Largest rotation between two samples. The interpolated attitude of a constant rate errs with the fifth power of it,
 # most in the first and the last step: by 0.04 arcsec at 10 deg, by 1.3 arcsec at 20 (measured).
 MAX_STEP_DEG = 10.0
@@ -81,10 +82,14 @@ def check_samples(samples: Samples) -> Samples:
     count = len(samples.t_s)
     if not MIN_SAMPLES <= count <= MAX_SAMPLES:
         raise InputError(f"{samples.source}: {count} attitudes; allowed: {MIN_SAMPLES} to {MAX_SAMPLES}")
-    steps_s = np.diff(samples.t_s)
-    if len(bad := np.flatnonzero(~(steps_s > 0))):
+    if len(bad := np.flatnonzero(~(np.abs(samples.t_s) <= MAX_TIME_S))):
+        raise samples.error(
+            int(bad[0]), f"time {samples.t_s[bad[0]]:.9g} s; allowed: within {MAX_TIME_S:g} s of the start"
+        )
+    if len(bad := np.flatnonzero(np.diff(samples.t_s) < MIN_STEP_S)):
         n = int(bad[0]) + 1
-        raise samples.error(n, f"time {samples.t_s[n]:.9g} s is not after {samples.t_s[n - 1]:.9g} s")
+        after, before = samples.t_s[n], samples.t_s[n - 1]
+        raise samples.error(n, f"time {after:.9g} s is not after {before:.9g} s, by a microsecond at least")
     angle_deg = np.degrees((samples.a_from_b[:-1].inv() * samples.a_from_b[1:]).magnitude())
     if len(bad := np.flatnonzero(angle_deg > MAX_STEP_DEG)):
         n = int(bad[0]) + 1
