@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import yaml
-from pydantic import BeforeValidator, Field, ValidationError, model_validator
+from pydantic import BeforeValidator, Discriminator, Field, Tag, ValidationError, model_validator
 
 from skysim.core import yaml_reader
 from skysim.core.errors import InputError
@@ -63,6 +63,17 @@ class AxisConfig(ConfigModel):
         return self
 
 
+def axis_tag(value: Any) -> str:
+    """Tag of an axis: a word, or a section; so that an error in one is not reported as one of the other."""
+    return "AxisConfig" if isinstance(value, dict | AxisConfig) else "name"
+
+
+RateAxis = Annotated[
+    Annotated[Literal["perpendicular", "boresight"], Tag("name")] | Annotated[AxisConfig, Tag("AxisConfig")],
+    Discriminator(axis_tag),
+]
+
+
 class CentroidTrial(RandomAttitude):
     """Identification and attitude from simulated centroids, without an image.
 
@@ -91,7 +102,7 @@ class FrameTrial(RandomAttitude):
 
     kind: Literal["frames"]
     rate_deg_s: NotNegative = 0.0
-    rate_axis: Literal["perpendicular", "boresight"] | AxisConfig = "perpendicular"
+    rate_axis: RateAxis = "perpendicular"
     gyro: bool = False
 
 
