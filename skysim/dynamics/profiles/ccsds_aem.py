@@ -108,7 +108,7 @@ def segment_samples(path: Path, version: str, segment: Segment, start: datetime.
         if len(words) != width + 1:
             raise InputError(f"{path}, line {n}: {len(words)} values; allowed: an epoch and {width} numbers")
     lines = [n for n, _ in segment.data]
-    numbers = np.array([to_numbers(source, n, words[1:]) for n, words in segment.data]).reshape(-1, width)
+    numbers = to_numbers(source, lines, [words[1:] for _, words in segment.data], width)
     t_s = seconds_since(source, lines, [words[0] for _, words in segment.data], start, system)
     last = one_of(path, metadata, "QUATERNION_TYPE", ORDERS) == "LAST" if "QUATERNION_TYPE" in metadata else True
     reverse = one_of(path, metadata, "ATTITUDE_DIR", DIRECTIONS) == "B2A" if "ATTITUDE_DIR" in metadata else False

@@ -11,8 +11,6 @@ import datetime
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-
 from skysim.core.errors import InputError, unknown_name
 from skysim.dynamics.profiles.frames import REFERENCES, icrs_from
 from skysim.dynamics.profiles.samples import Samples, from_quaternions
@@ -33,7 +31,7 @@ MONTHS = ("jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", 
 def read_stk(path: Path, lines: list[Line], start: datetime.datetime) -> Samples:
     """The samples of an attitude file. Raises InputError for other data than quaternions in ICRF, J2000 or LAB."""
     keywords: dict[str, Line] = {}
-    section, rows, inside = "", list[tuple[int, list[float]]](), False
+    section, rows, inside = "", list[tuple[int, list[str]]](), False
     for n, line in lines[1:]:  # the first has the version
         words = line.split()
         lower = line.lower()
@@ -46,7 +44,7 @@ def read_stk(path: Path, lines: list[Line], start: datetime.datetime) -> Samples
                 raise InputError(f"{path}, line {n}: {excerpt(line)}; allowed: BEGIN Attitude")
             inside = True
         elif section:
-            rows.append((n, to_numbers(str(path), n, words)))
+            rows.append((n, words))
         elif lower.startswith("attitudetime"):
             if lower not in SECTIONS:
                 raise InputError(f"{path}, line {n}: {unknown_name('data', words[0], SECTION_NAMES)}")
@@ -65,14 +63,11 @@ def to_samples(
     path: Path,
     keywords: dict[str, Line],
     section: str,
-    rows: list[tuple[int, list[float]]],
+    rows: list[tuple[int, list[str]]],
     start: datetime.datetime,
 ) -> Samples:
     """The samples of the rows, by the keywords. Raises InputError."""
     width, columns = SECTIONS[section]
-    for n, numbers in rows:
-        if len(numbers) != width:
-            raise InputError(f"{path}, line {n}: {len(numbers)} values; allowed: {width}")
     rows = rows[: point_count(path, keywords, len(rows))]
     for key, allowed in (("CentralBody", "Earth"), ("TimeFormat", "EpSec")):
         line, value = keywords.get(key, (0, allowed))
@@ -82,8 +77,9 @@ def to_samples(
     if axes.upper() not in REFERENCES:
         where = f"{path}, line {line}" if line else str(path)
         raise InputError(f"{where}: CoordinateAxes {excerpt(axes)}; allowed: {', '.join(REFERENCES)}")
-    values = np.array([numbers for _, numbers in rows]).reshape(-1, width)
-    t_s, places = values[:, 0], [n for n, _ in rows]
+    places = [n for n, _ in rows]
+    values = to_numbers(str(path), places, [words for _, words in rows], width)
+    t_s = values[:, 0]
     if "ScenarioEpoch" in keywords:
         t_s = t_s + (scenario_epoch(path, *keywords["ScenarioEpoch"]) - start).total_seconds()
     frames = (REFERENCES[axes.upper()], "body")

@@ -47,13 +47,14 @@ def read_csv(path: Path, lines: list[Line], start: datetime.datetime, rotation: 
     for n, cells in body:
         if len(cells) != len(names):
             raise InputError(f"{path}, line {n}: {len(cells)} values; allowed: {len(names)}, one for each column")
-    epochs = "utc" in names
-    numeric = [k for k, name in enumerate(names) if name != "utc"]
-    numbers = np.array([to_numbers(str(path), n, [cells[k] for k in numeric]) for n, cells in body])
-    columns: dict[str, Any] = dict(zip([names[k] for k in numeric], numbers.reshape(len(body), -1).T, strict=True))
-    if epochs:
-        columns["utc"] = [cells[names.index("utc")] for _, cells in body]
-    return to_samples(str(path), "line", [n for n, _ in body], columns, start, rotation)
+    places, columns = [n for n, _ in body], dict[str, Any]()
+    if "utc" in names:
+        date = names.index("utc")
+        columns["utc"] = [cells.pop(date) for _, cells in body]
+        names = names[:date] + names[date + 1 :]
+    numbers = to_numbers(str(path), places, [cells for _, cells in body], len(names))
+    columns |= dict(zip(names, numbers.T, strict=True))
+    return to_samples(str(path), "line", places, columns, start, rotation)
 
 
 def read_ecsv(path: Path, start: datetime.datetime, rotation: str | None) -> Samples:

@@ -40,18 +40,30 @@ def excerpt(text: object) -> str:
     return repr(shown if len(shown) <= MAX_EXCERPT else f"{shown[:MAX_EXCERPT]}…")
 
 
-def to_numbers(source: str, line: int, words: Sequence[str]) -> list[float]:
-    """The words as finite numbers. Raises InputError."""
-    numbers = []
+def to_numbers(source: str, places: Sequence[int], rows: Sequence[Sequence[str]], width: int) -> Floats:
+    """(N, width) finite numbers of the words of each line. Raises InputError for the first line that has others."""
+    for line, words in zip(places, rows, strict=True):
+        if len(words) != width:
+            raise InputError(f"{source}, line {line}: {len(words)} numbers; allowed: {width}")
+    try:
+        numbers = np.array(rows, dtype=np.float64).reshape(-1, width)
+    except ValueError:
+        numbers = np.full((1, width), np.nan)
+    if not np.isfinite(numbers).all():
+        for line, words in zip(places, rows, strict=True):
+            check_numbers(f"{source}, line {line}", words)
+    return numbers
+
+
+def check_numbers(where: str, words: Sequence[str]) -> None:
+    """Raise InputError for the first word that is not a finite number."""
     for word in words:
         try:
             number = float(word)
         except ValueError:
-            raise InputError(f"{source}, line {line}: {excerpt(word)} is not a number") from None
+            raise InputError(f"{where}: {excerpt(word)} is not a number") from None
         if not np.isfinite(number):
-            raise InputError(f"{source}, line {line}: {excerpt(word)} is not a finite number")
-        numbers.append(number)
-    return numbers
+            raise InputError(f"{where}: {excerpt(word)} is not a finite number")
 
 
 def seconds_since(
