@@ -40,6 +40,8 @@ TARGETS = {
     "vehicles": ("scenes/vehicles/*.xml",),
     "stores": (),
     "answers": (),
+    "profiles": (),
+    "torques": (),
     "packets": (),
     "quantities": (),
 }

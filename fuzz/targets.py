@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 import json
 import tempfile
 from collections.abc import Callable
@@ -18,7 +19,11 @@ from skysim.apps.stream import packet
 from skysim.camera.psf import otf
 from skysim.core import images, units, yaml_reader
 from skysim.core.errors import InputError
+from skysim.dynamics.controllers.interface import torque_of_reply
 from skysim.dynamics.multibody import mjcf
+from skysim.dynamics.profiles.load import read_profile
+from skysim.dynamics.profiles.samples import check_samples
+from skysim.dynamics.profiles.spline import fit_spline
 from skysim.experiments.study import loader as study_loader
 from skysim.experiments.study import store
 from skysim.results.files import recording
@@ -29,6 +34,7 @@ from skysim.sources.dome import layout, point_cloud
 from skysim.tracking import dome_map_file
 from skysim.tracking.external import interface
 
+START = datetime.datetime(2016, 12, 31)
 COLOR = ptase.Color(0.1, 0.2, 0.0)
 
 
@@ -145,7 +151,7 @@ def answers(data: bytes) -> None:
     """An external tracker's answer: parsed, checked, and printed without control characters."""
     try:
         tree = json.loads(data)
-    except (ValueError, RecursionError):  # as in tracking.external.process
+    except (ValueError, RecursionError):  # as in core.plugins.program
         return
     statuses: list[str] = []
     if rejects(lambda: statuses.append(interface.check_answer(interface.Answer.of_tree(tree)).status), ValueError):
@@ -156,6 +162,22 @@ def answers(data: bytes) -> None:
         printed = output.read()
     if statuses[0][:80] not in printed or not printed.removesuffix("\n").partition("\n")[2].isprintable():
         raise AssertionError(f"not printed as it is: {statuses[0]!r}")
+
+
+def profiles(data: bytes) -> None:
+    """An attitude file of any format, read as a scene's maneuver is."""
+    path = write_file(data, "profile.csv")
+    for rotation in (None, "lab_from_body"):
+        rejects(lambda rotation=rotation: fit_spline(check_samples(read_profile(path, START, rotation))), InputError)
+
+
+def torques(data: bytes) -> None:
+    """A controller's answer to a control period."""
+    try:
+        reply = json.loads(data)
+    except (ValueError, RecursionError):  # as in core.plugins.program
+        return
+    rejects(lambda: torque_of_reply(reply, 0, 1.0), ValueError)
 
 
 def packets(data: bytes) -> None:
@@ -171,6 +193,6 @@ TARGETS: dict[str, Callable[[bytes], None]] = {
     target.__name__: target
     for target in (
         *(scenes, studies, overrides, fits, pictures, catalogs, maps, truths, calibrations),
-        *(tables, vehicles, stores, answers, packets, quantities),
+        *(tables, vehicles, stores, answers, profiles, torques, packets, quantities),
     )
 }

@@ -84,6 +84,13 @@ def is_file(path: Path) -> bool:
         return False
 
 
+def existing_file(value: str) -> str:
+    """Validator of a key: the path of a file that exists. Raises ValueError."""
+    if not is_file(Path(value)):
+        raise ValueError(f"{value!r} is not a file; allowed: a path, or a file in the scene's folder")
+    return value
+
+
 def find_file(name: str, folder: Path, what: str) -> Path:
     """The path of a file given by path, or by its name in a folder. Raises InputError."""
     path, shipped = Path(name), folder / f"{name}.yaml"

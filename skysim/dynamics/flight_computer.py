@@ -16,9 +16,12 @@ import numpy as np
 from skysim.core.types import Floats
 from skysim.core.units import RPM_RAD_S
 from skysim.dynamics.actuators import CmgSet, Desaturator, FanSet, WheelSet
-from skysim.dynamics.attitude_control import build_controller
+from skysim.dynamics.attitude_control import Pid, build_controller
+from skysim.dynamics.controllers.adapter import NO_SOURCE, ControllerSource, ExternalLaw, external_law
+from skysim.dynamics.controllers.interface import ControllerSetup
 from skysim.dynamics.guidance import Reference
 from skysim.dynamics.multibody import VehicleModel
+from skysim.scene.motion import BUILT_IN_LAWS
 from skysim.scene.scene import Scene
 from skysim.scene.vehicle import CmgsConfig, FansConfig, WheelsConfig
 
@@ -49,9 +52,8 @@ class Actuators(Protocol):
         """(3,) stored angular momentum, in body axes."""
         ...
 
-    @property
-    def authority_nm(self) -> float:
-        """The torque available in every direction while no member is at its limit."""
+    def command_map(self) -> tuple[Floats, float]:
+        """(n, 3) commands per torque on the body with every gimbal at zero, and the limit of each command."""
         ...
 
 
@@ -65,9 +67,8 @@ class IdealTorque:
         control[self.motor] = achieved_nm = np.clip(torque_nm, -self.limit_nm, self.limit_nm)
         return achieved_nm
 
-    @property
-    def authority_nm(self) -> float:
-        return self.limit_nm
+    def command_map(self) -> tuple[Floats, float]:
+        return np.eye(3), self.limit_nm
 
     def momentum_nms(self, angles_rad: Floats, speeds_rad_s: Floats) -> Floats:
         return np.zeros(3)
@@ -86,9 +87,8 @@ class WheelActuator:
         control[self.joints.motor] = motor
         return -self.model.axes @ motor
 
-    @property
-    def authority_nm(self) -> float:
-        return torque_authority_nm(self.model.motor_from_torque, self.model.torque_limit_nm)
+    def command_map(self) -> tuple[Floats, float]:
+        return self.model.motor_from_torque, self.model.torque_limit_nm
 
     def momentum_nms(self, angles_rad: Floats, speeds_rad_s: Floats) -> Floats:
         return self.model.momentum(speeds_rad_s[self.joints.dof])
@@ -119,13 +119,9 @@ class CmgActuator:
             achieved_nm -= self.model.momentum(angle, torque / self.model.rotor_inertia_kg_m2)
         return achieved_nm
 
-    @property
-    def authority_nm(self) -> float:
-        """Torque available in every direction, with every gimbal at zero."""
+    def command_map(self) -> tuple[Floats, float]:
         jacobian = self.model.jacobian(np.zeros(len(self.gimbals)), np.full(len(self.rotors), self.rotor_rad_s))
-        return torque_authority_nm(
-            np.asarray(np.linalg.pinv(jacobian), dtype=np.float64), self.model.gimbal_rate_limit_rad_s
-        )
+        return np.asarray(np.linalg.pinv(jacobian), dtype=np.float64), self.model.gimbal_rate_limit_rad_s
 
     def momentum_nms(self, angles_rad: Floats, speeds_rad_s: Floats) -> Floats:
         return self.model.momentum(angles_rad[self.gimbals.qpos], speeds_rad_s[self.rotors.dof])
@@ -143,17 +139,23 @@ class FanActuator:
         control[self.motor] = thrust
         return self.model.torque(thrust)
 
-    @property
-    def authority_nm(self) -> float:
-        return torque_authority_nm(self.model.thrust_from_torque, self.model.thrust_limit_n)
+    def command_map(self) -> tuple[Floats, float]:
+        return self.model.thrust_from_torque, self.model.thrust_limit_n
 
     def momentum_nms(self, angles_rad: Floats, speeds_rad_s: Floats) -> Floats:
         return np.zeros(3)
 
 
-def torque_authority_nm(command_from_torque: Floats, limit: float) -> float:
-    """Torque available in every direction with each of n commands, rows of (n, 3), within its limit."""
+def authority_nm(actuators: Actuators) -> float:
+    """Torque available in every direction with every command within its limit."""
+    command_from_torque, limit = actuators.command_map()
     return float(limit / np.linalg.norm(command_from_torque, axis=1).max())
+
+
+def usage(actuators: Actuators, torque_nm: Floats) -> Floats:
+    """(N,) greatest command over its limit, for torques (N, 3) on the body."""
+    command_from_torque, limit = actuators.command_map()
+    return np.asarray(np.abs(torque_nm @ command_from_torque.T).max(axis=1) / limit)
 
 
 # The actuator set for each key of `vehicle` that switches one on.
@@ -184,12 +186,16 @@ class MomentumDump:
 class FlightComputer:
     """Attitude control with one set of actuators, and momentum dumping with the fans. Stateful: one motion each.
 
+    source            : of external controllers
     actuator_sets     : all actuators that are switched on, by their key in `vehicle`
     control_torque_nm : (3,) control torque of the last period, zeros without a controller
     """
 
-    def __init__(self, scene: Scene, vehicle: VehicleModel, reference: Reference) -> None:
-        self.config, self.period_s = scene.motion.control, 1 / scene.control_rate_hz
+    def __init__(
+        self, scene: Scene, vehicle: VehicleModel, reference: Reference, source: ControllerSource = NO_SOURCE
+    ) -> None:
+        self.config = None if scene.motion.is_prescribed else scene.motion.control
+        self.period_s = 1 / scene.control_rate_hz
         self.actuator_sets = {
             key: actuator_type(vehicle, config)
             for key, actuator_type in ACTUATORS.items()
@@ -203,10 +209,38 @@ class FlightComputer:
         self.actuator = (
             IdealTorque(vehicle) if self.config.actuators == "ideal" else self.actuator_sets[self.config.actuators]
         )
-        authority_nm, rate_limit_rad_s = self.actuator.authority_nm, return_rate_limit_rad_s(scene)
-        self.law = build_controller(reference, vehicle.inertia_kg_m2, self.config, authority_nm, rate_limit_rad_s)
+        self.law = self.build_law(scene, vehicle, reference, source)
         if self.config.desaturation:
             self.momentum_dump = MomentumDump(self.actuator_sets["fans"], Desaturator(self.config.desaturation))
+
+    def build_law(
+        self, scene: Scene, vehicle: VehicleModel, reference: Reference, source: ControllerSource
+    ) -> Pid | ExternalLaw:
+        """The control law that the scene names. Raises InputError if it is unknown or refuses the set-up."""
+        config = self.config
+        assert config is not None
+        torque_nm, rate_limit_rad_s = authority_nm(self.actuator), return_rate_limit_rad_s(scene)
+        if source.factory is None and config.law in BUILT_IN_LAWS:
+            return build_controller(reference, vehicle.inertia_kg_m2, config, torque_nm, rate_limit_rad_s)
+        setup = ControllerSetup(
+            self.period_s,
+            np.array(vehicle.inertia_kg_m2),
+            torque_nm,
+            rate_limit_rad_s if math.isfinite(rate_limit_rad_s) else None,
+            config.actuators,
+            config.feedback,
+            config.bandwidth_rad_s,
+            config.damping,
+            config.integral_rad_s,
+            scene.seed,
+            dict(config.options),
+        )
+        return external_law(reference, setup, config, source)
+
+    def close(self) -> None:
+        """End the process of an external controller."""
+        if self.config and isinstance(self.law, ExternalLaw):
+            self.law.close()
 
     def momentum_nms(self, angles_rad: Floats, speeds_rad_s: Floats) -> Floats:
         """(3,) stored in wheels and CMGs, in body axes; the arguments are all of qpos and qvel."""

@@ -10,7 +10,7 @@ from __future__ import annotations
 import bisect
 import itertools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
@@ -22,11 +22,17 @@ from skysim.core import quaternion
 from skysim.core.errors import InputError
 from skysim.core.jit import jit
 from skysim.core.types import Floats
+from skysim.dynamics.profiles.angle import AngleProfile, linear_sweep, log_sweep, rest_to_rest, steady, still
+from skysim.dynamics.profiles.rate_change import integrate_knots, rate_change_state
+from skysim.dynamics.profiles.spline import AttitudeSpline
 from skysim.scene.motion import (
     AttitudeConfig,
     BumpConfig,
+    ChirpConfig,
     JitterPart,
     MotionConfig,
+    PointingConfig,
+    ProfileConfig,
     RateConfig,
     SineConfig,
     SlewConfig,
@@ -35,11 +41,11 @@ from skysim.scene.motion import (
 )
 
 State = tuple[Floats, Floats, Floats]  # lab_from_ref_wxyz, rate_rad_s, acceleration_rad_s2
-AngleProfile = Callable[[float], tuple[float, float, float]]  # time to angle, rate and acceleration about one axis
 
 KNOT_RAD = 0.01  # a change of rate is integrated in steps of at most this rotation ...
 MIN_KNOTS = 128  # ... and at least this many: error 2e-10 rad, see `RateChangeLeg`
 MAX_KNOTS = 5_000_000
+MAX_JUMP_DEG, MAX_JUMP_DEG_S = 0.1, 0.1  # of attitude and rate where a profile begins
 
 
 def attitude(angles: AttitudeConfig) -> Rotation:
@@ -47,65 +53,23 @@ def attitude(angles: AttitudeConfig) -> Rotation:
     return Rotation.from_euler("ZYX", [angles.yaw_deg, angles.pitch_deg, angles.roll_deg], degrees=True)
 
 
-def start_attitude(motion: MotionConfig) -> Rotation:
+def start_attitude(motion: MotionConfig, profiles: Sequence[AttitudeSpline] = ()) -> Rotation:
     """lab_from_body at the start: the identity for a pointing, since then the lab is defined by the body."""
+    if motion.start == "profile":
+        return quaternion.to_rotation(profile_start(motion, profiles)[0])
     return attitude(motion.start) if isinstance(motion.start, AttitudeConfig) else Rotation.identity()
 
 
-# Profiles of one angle over time: rotation about a fixed axis.
+def start_rate_rad_s(motion: MotionConfig, profiles: Sequence[AttitudeSpline] = ()) -> Floats:
+    """(3,) rate at the start, in body axes."""
+    return profile_start(motion, profiles)[1] if motion.start == "profile" else np.radians(motion.rate_deg_s)
 
 
-def still(t_s: float) -> tuple[float, float, float]:
-    """No motion."""
-    return 0.0, 0.0, 0.0
-
-
-def steady(rate_rad_s: float, t_s: float) -> tuple[float, float, float]:
-    """A constant rate."""
-    return rate_rad_s * t_s, rate_rad_s, 0.0
-
-
-@jit
-def rest_to_rest(
-    angle_rad: float, rate_rad_s: float, ramp_s: float, duration_s: float, t_s: float
-) -> tuple[float, float, float]:
-    """The rate rises along the smoothstep 3x^2 - 2x^3 (x = t / ramp), cruises at rate_rad_s and falls likewise.
-
-    The acceleration is continuous: zero at both ends of a ramp and 1.5 rate / ramp at its middle.
-    """
-    # Symmetric profile: the braking half is the first half in reversed time.
-    braking = t_s > duration_s / 2  # the second half mirrors the first
-    ramp_time_s = duration_s - t_s if braking else t_s
-    x = min(ramp_time_s / ramp_s, 1.0)
-    angle = rate_rad_s * (ramp_s * x**3 * (1 - x / 2) + max(ramp_time_s - ramp_s, 0.0))
-    rate, acceleration = rate_rad_s * x**2 * (3 - 2 * x), rate_rad_s / ramp_s * 6 * x * (1 - x)
-    return (angle_rad - angle, rate, -acceleration) if braking else (angle, rate, acceleration)
-
-
-@jit
-def envelope(t_s: float, duration_s: float, growth_s: float) -> tuple[float, float, float]:
-    """1 in the middle, 0 at and beyond both ends, and its two derivatives (1/s, 1/s2), all three continuous.
-
-    It rises along 10x^3 - 15x^4 + 6x^5 (x = t / growth_s) and falls likewise; growth_s is at most half of
-    duration_s.
-    """
-    falling = t_s > duration_s / 2
-    x = min(max((duration_s - t_s if falling else t_s) / growth_s, 0.0), 1.0)
-    slope = 30 * x**2 * (1 - x) ** 2 / growth_s
-    curvature = 60 * x * (1 - x) * (1 - 2 * x) / growth_s**2
-    return x**3 * (10 - 15 * x + 6 * x**2), -slope if falling else slope, curvature
-
-
-@jit
-def oscillation(
-    amplitude_rad: float, omega_rad_s: float, duration_s: float, growth_s: float, t_s: float
-) -> tuple[float, float, float]:
-    """amplitude envelope(t) sin(omega t), and its two derivatives by the product rule."""
-    e, slope, curvature = envelope(t_s, duration_s, growth_s)
-    s, c = math.sin(omega_rad_s * t_s), math.cos(omega_rad_s * t_s)
-    rate = slope * s + e * omega_rad_s * c
-    acceleration = (curvature - e * omega_rad_s**2) * s + 2 * slope * omega_rad_s * c
-    return amplitude_rad * e * s, amplitude_rad * rate, amplitude_rad * acceleration
+def profile_start(motion: MotionConfig, profiles: Sequence[AttitudeSpline]) -> State:
+    """The state at the start of a first maneuver that is a profile."""
+    element = motion.maneuver[0]
+    assert isinstance(element, ProfileConfig)
+    return profiles[0].state_at(profiles[0].t_s[0] if element.begin == "first_sample" else 0.0)
 
 
 @jit
@@ -115,62 +79,6 @@ def rotated_state(
     """The state after a rotation by an angle about a unit axis, which is the same in lab and body axes."""
     lab_from_ref_wxyz = quaternion.multiply(lab_from_start_wxyz, quaternion.from_rotvec(angle_rad * axis))
     return lab_from_ref_wxyz, rate_rad_s * axis, acceleration_rad_s2 * axis
-
-
-# A smooth change of the rate, during which its axis may move.
-
-
-@jit
-def rate_at(t_s: float, duration_s: float, rate_rad_s: Floats, change_rad_s: Floats) -> Floats:
-    """(3,) rate + change (3x^2 - 2x^3), x = t / duration."""
-    x = t_s / duration_s
-    return rate_rad_s + x**2 * (3 - 2 * x) * change_rad_s
-
-
-@jit
-def magnus_rotvec(begin_s: float, step_s: float, duration_s: float, rate_rad_s: Floats, change_rad_s: Floats) -> Floats:
-    """(3,) rotation vector of the motion in a short step: Magnus' expansion to fourth order, two Gauss points.
-
-        phi = h (w1 + w2) / 2 + sqrt(3) / 12 h^2 w1 x w2
-
-    (Iserles & Norsett 1999, `assumed`; the sign is that of rates in moving axes). The first term is exact here, the
-    rate being a cubic of time; if the axis is fixed, the second term is zero for any step.
-    """
-    middle, offset = begin_s + step_s / 2, step_s / math.sqrt(12.0)
-    early = rate_at(middle - offset, duration_s, rate_rad_s, change_rad_s)
-    late = rate_at(middle + offset, duration_s, rate_rad_s, change_rad_s)
-    return step_s / 2 * (early + late) + math.sqrt(3.0) / 12 * step_s**2 * quaternion.cross(early, late)
-
-
-@jit
-def integrate_knots(
-    lab_from_start_wxyz: Floats, count: int, duration_s: float, rate_rad_s: Floats, change_rad_s: Floats
-) -> Floats:
-    """(count, 4) attitudes at 0, 1, ... count - 1 times duration / count."""
-    lab_from_knot_wxyz = np.empty((count, 4))
-    attitude, step_s = lab_from_start_wxyz, duration_s / count
-    for k in range(count):
-        lab_from_knot_wxyz[k] = attitude
-        rotvec = magnus_rotvec(k * step_s, step_s, duration_s, rate_rad_s, change_rad_s)
-        attitude = quaternion.multiply(attitude, quaternion.from_rotvec(rotvec))
-        attitude = attitude / math.sqrt((attitude**2).sum())  # prevents drift of the norm, 1e-16 a step
-    return lab_from_knot_wxyz
-
-
-@jit
-def rate_change_state(
-    lab_from_knot_wxyz: Floats, duration_s: float, rate_rad_s: Floats, change_rad_s: Floats, t_s: float
-) -> tuple[Floats, Floats, Floats]:
-    """The state within a change of rate, integrated from the previous knot by the rule that made the knots."""
-    step_s = duration_s / len(lab_from_knot_wxyz)
-    k = min(int(t_s / step_s), len(lab_from_knot_wxyz) - 1)
-    rotvec = magnus_rotvec(k * step_s, t_s - k * step_s, duration_s, rate_rad_s, change_rad_s)
-    x = t_s / duration_s
-    return (
-        quaternion.multiply(lab_from_knot_wxyz[k], quaternion.from_rotvec(rotvec)),
-        rate_at(t_s, duration_s, rate_rad_s, change_rad_s),
-        6 * x * (1 - x) / duration_s * change_rad_s,
-    )
 
 
 # Legs: one for each maneuver of the list, with a duration and the state at 0 <= t_s <= duration_s after its start.
@@ -206,15 +114,31 @@ class RateChangeLeg:
         return rate_change_state(self.lab_from_knot_wxyz, self.duration_s, self.rate_rad_s, self.change_rad_s, t_s)
 
 
-Leg = FixedAxisLeg | RateChangeLeg
+@dataclass(frozen=True, slots=True)
+class ProfileLeg:
+    """A profile of attitude samples, from its time begin_s on."""
+
+    spline: AttitudeSpline
+    begin_s: float
+    duration_s: float
+
+    def state_at(self, t_s: float) -> State:
+        return self.spline.state_at(self.begin_s + t_s)
+
+
+Leg = FixedAxisLeg | RateChangeLeg | ProfileLeg
 
 
 class LegStart(NamedTuple):
-    """Start of a leg: attitude and rate of the reference, and the frame of its Euler angles."""
+    """Start of a leg: attitude and rate of the reference, the frame of its Euler angles, the time since the start of
+    the motion, and the spline of a profile.
+    """
 
     lab_from_ref_wxyz: Floats
     rate_rad_s: Floats
     lab_from_home: Rotation
+    begin_s: float = 0.0
+    spline: AttitudeSpline | None = None
 
 
 def length_and_direction(vector: Floats) -> tuple[float, Floats]:
@@ -292,9 +216,53 @@ def sine(element: SineConfig, start: LegStart) -> Leg:
     duration_s, omega = element.duration_s, 2 * math.pi * element.frequency_hz
     growth_s = min(1 / element.frequency_hz, duration_s / 2)
     size, axis = length_and_direction(np.radians(element.amplitude_deg))
-    return FixedAxisLeg(
-        start.lab_from_ref_wxyz, axis, duration_s, partial(oscillation, size, omega, duration_s, growth_s)
-    )
+    profile = partial(linear_sweep, size, omega, 0.0, duration_s, growth_s, growth_s)
+    return FixedAxisLeg(start.lab_from_ref_wxyz, axis, duration_s, profile)
+
+
+def chirp(element: ChirpConfig, start: LegStart) -> Leg:
+    """Oscillate about the attitude as `sine` does, while the frequency sweeps from one to another.
+
+    linear: f = f0 + (f1 - f0) t / T;  log: f = f0 (f1 / f0)^(t / T). The envelope rises within a period of f0 and falls
+    within one of f1.
+    """
+    duration_s, omega = element.duration_s, 2 * math.pi * element.from_hz
+    size, axis = length_and_direction(np.radians(element.amplitude_deg))
+    if element.sweep == "log":
+        sweep, change = log_sweep, math.log(element.to_hz / element.from_hz) / duration_s
+    else:
+        sweep, change = linear_sweep, 2 * math.pi * (element.to_hz - element.from_hz) / duration_s
+    profile = partial(sweep, size, omega, change, duration_s, 1 / element.from_hz, 1 / element.to_hz)
+    return FixedAxisLeg(start.lab_from_ref_wxyz, axis, duration_s, profile)
+
+
+def profile(element: ProfileConfig, start: LegStart) -> Leg:
+    """The attitudes of a file or table. Between its first sample and the maneuver's beginning the first cubic is
+    continued, by one step at most.
+
+    Raises InputError (one line) for samples at other times, and where attitude or rate would jump.
+    """
+    spline = start.spline
+    assert spline is not None
+    first_s, last_s = float(spline.t_s[0]), float(spline.t_s[-1])
+    begin_s = first_s if element.begin == "first_sample" else start.begin_s * spline.absolute
+    step_s = float(spline.t_s[1]) - first_s
+    if first_s - begin_s > step_s + 1e-9 or last_s <= begin_s:
+        raise InputError(
+            f"motion.maneuver: {spline.source}: attitudes from {first_s - begin_s:.6g} s to {last_s - begin_s:.6g} s"
+            f" after the maneuver's beginning; allowed: from {step_s:.3g} s (a step) at most, to a time after it; or"
+            " begin: first_sample"
+        )
+    lab_from_ref, rate_rad_s, _ = spline.state_at(begin_s)
+    jump = quaternion.multiply(quaternion.inverse(start.lab_from_ref_wxyz), lab_from_ref)
+    jump_deg = math.degrees(float(np.linalg.norm(quaternion.to_rotvec(jump))))
+    jump_deg_s = math.degrees(float(np.linalg.norm(rate_rad_s - start.rate_rad_s)))
+    if jump_deg > MAX_JUMP_DEG or jump_deg_s > MAX_JUMP_DEG_S:
+        raise InputError(
+            f"motion.maneuver: {spline.source}: begins {jump_deg:.3g} deg and {jump_deg_s:.3g} deg/s away from the"
+            f" motion before it; allowed: {MAX_JUMP_DEG:g} deg and {MAX_JUMP_DEG_S:g} deg/s, or motion.start: profile"
+        )
+    return ProfileLeg(spline, begin_s, last_s - begin_s)
 
 
 # The leg of each kind of maneuver. To add one, add a class to scene/motion.py and a function here.
@@ -305,6 +273,8 @@ LEGS: dict[str, Callable[[Any, LegStart], Leg]] = {
     "rate": rate,
     "spin_up": spin_up,
     "sine": sine,
+    "chirp": chirp,
+    "profile": profile,
     "jitter": hold,
     "bump": hold,
 }
@@ -339,27 +309,32 @@ class Reference:
         return Rotation.from_quat(np.array([self.state_at(float(t))[0] for t in t_s]), scalar_first=True)
 
 
-def plan(motion: MotionConfig, lab_from_start: Rotation | None = None) -> Reference:
+def plan(
+    motion: MotionConfig, lab_from_start: Rotation | None = None, profiles: Sequence[AttitudeSpline] = ()
+) -> Reference:
     """The reference of the list of maneuvers; each begins where the previous one ended.
 
+    profiles : of the maneuvers of kind profile, in their order (`profiles.load.load_profiles`)
     lab_from_start defaults to motion.start, or to the identity where that is a pointing among the stars. The Euler
     angles of steps and slews are those of the body in the lab; where the start is a pointing they are relative to
     the attitude at the start, whatever axes lab_from_start is in. A spin_up begins at the rate at which the
-    previous maneuver ended, which is zero except after a rate or another spin_up; the first begins at the vehicle's
-    own, motion.rate_deg_s.
+    previous maneuver ended, which is zero except after a rate, a profile or another spin_up; the first begins at the
+    vehicle's own, motion.rate_deg_s.
 
-    After its end the reference continues as it ended: at rest, or at the rate of a last rate or spin_up. Between
-    maneuvers only a step lets the attitude jump. The rate jumps at the start of a rate, and where anything but a
-    spin_up follows a rate or spin_up.
+    After its end the reference continues as it ended: at rest, or at the rate of a last rate, spin_up or profile.
+    Between maneuvers only a step lets the attitude jump. The rate jumps at the start of a rate, and where anything but
+    a spin_up or profile follows a rate, spin_up or profile.
     """
-    first = lab_from_start if lab_from_start is not None else start_attitude(motion)
-    home = Rotation.identity() if isinstance(motion.start, AttitudeConfig) else first
-    leg_start = LegStart(quaternion.from_rotation(first), np.radians(motion.rate_deg_s), home)
+    first = lab_from_start if lab_from_start is not None else start_attitude(motion, profiles)
+    home = first if isinstance(motion.start, PointingConfig) else Rotation.identity()
+    leg_start = LegStart(quaternion.from_rotation(first), start_rate_rad_s(motion, profiles), home)
     legs: list[Leg] = []
+    splines = iter(profiles)
     for element in motion.maneuver:
-        legs.append(LEGS[element.kind](element, leg_start))
+        spline = next(splines) if element.kind == "profile" else None
+        legs.append(LEGS[element.kind](element, leg_start._replace(spline=spline)))
         lab_from_ref_wxyz, rate_rad_s, _ = legs[-1].state_at(legs[-1].duration_s)
-        leg_start = LegStart(lab_from_ref_wxyz, rate_rad_s, home)
+        leg_start = LegStart(lab_from_ref_wxyz, rate_rad_s, home, leg_start.begin_s + legs[-1].duration_s)
     size, axis = length_and_direction(leg_start.rate_rad_s if legs else np.zeros(3))
     final_leg = FixedAxisLeg(leg_start.lab_from_ref_wxyz, axis, math.inf, partial(steady, size))
     start_times_s = itertools.accumulate((leg.duration_s for leg in legs), initial=0.0)
@@ -386,10 +361,10 @@ class Impulse:
         return (math.cos(math.pi * a) - math.cos(math.pi * b)) / 2
 
 
-def impulses(motion: MotionConfig) -> tuple[Impulse, ...]:
+def impulses(motion: MotionConfig, reference: Reference) -> tuple[Impulse, ...]:
     """The impulses of the list's bumps in order of time; a caught bump is two, equal and opposite."""
     result: list[Impulse] = []
-    for begin_s, bump in zip(plan(motion).start_s, motion.maneuver, strict=False):
+    for begin_s, bump in zip(reference.start_s, motion.maneuver, strict=False):
         if isinstance(bump, BumpConfig):
             rate_rad_s = np.radians(bump.rate_deg_s)
             result.append(Impulse(begin_s, bump.duration_s, rate_rad_s))
@@ -398,9 +373,11 @@ def impulses(motion: MotionConfig) -> tuple[Impulse, ...]:
     return tuple(result)
 
 
-def vibration_intervals(motion: MotionConfig) -> tuple[tuple[float, float, tuple[JitterPart, ...]], ...]:
+def vibration_intervals(
+    motion: MotionConfig, reference: Reference
+) -> tuple[tuple[float, float, tuple[JitterPart, ...]], ...]:
     """(begin_s, end_s, parts) of the list's vibrations in order of time."""
-    start_times = zip(plan(motion).start_s, motion.maneuver, strict=False)
+    start_times = zip(reference.start_s, motion.maneuver, strict=False)
     return tuple(
         (begin_s, begin_s + element.duration_s, element.components)
         for begin_s, element in start_times

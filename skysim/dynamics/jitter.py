@@ -20,7 +20,8 @@ from scipy.spatial.transform import Rotation
 from skysim.core.errors import InputError
 from skysim.core.jit import jit
 from skysim.core.types import Floats, Trajectory
-from skysim.dynamics.guidance import envelope, vibration_intervals
+from skysim.dynamics.guidance import Reference, plan, vibration_intervals
+from skysim.dynamics.profiles.angle import envelope
 from skysim.scene.motion import JitterBandConfig, JitterLineConfig, JitterPart, MotionConfig
 
 SINES_PER_BAND = 128  # sines in a band; even a steep spectrum has tens of similar amplitude
@@ -134,10 +135,13 @@ class Vibration:
     components: tuple[VibrationComponent, ...]
 
     @classmethod
-    def draw(cls, motion: MotionConfig, rng: np.random.Generator) -> Vibration:
-        """The vibration of `motion.jitter`, always on, and of each jitter maneuver during its interval."""
+    def draw(cls, motion: MotionConfig, rng: np.random.Generator, reference: Reference | None = None) -> Vibration:
+        """The vibration of `motion.jitter`, always on, and of each jitter maneuver during its interval.
+
+        reference : that of the maneuvers; by default planned here, which a profile does not allow
+        """
         components = [draw_component(motion.jitter, rng, "motion.jitter")]
-        for begin_s, end_s, configs in vibration_intervals(motion):
+        for begin_s, end_s, configs in vibration_intervals(motion, reference or plan(motion)):
             components.append(draw_component(configs, rng, f"motion.maneuver jitter at {begin_s:g} s", begin_s, end_s))
         return cls(tuple(component for component in components if component))
 
@@ -247,7 +251,7 @@ def envelopes(t_s: Floats, duration_s: float, rise_s: float) -> tuple[Floats, Fl
     """(N, 1) envelope and (N, 1) its derivative."""
     gain, slope = np.empty((len(t_s), 1)), np.empty((len(t_s), 1))
     for n in range(len(t_s)):
-        gain[n, 0], slope[n, 0], _ = envelope(t_s[n], duration_s, rise_s)
+        gain[n, 0], slope[n, 0], _ = envelope(t_s[n], duration_s, rise_s, rise_s)
     return gain, slope
 
 

@@ -25,7 +25,8 @@ from skysim.results.files.frames import remove_results, write_frame
 from skysim.scene.scene import Scene
 from skysim.simulation import exposure
 from skysim.simulation import run as simulation
-from skysim.simulation.testbed import Testbed, build_testbed, build_tracker
+from skysim.simulation.testbed import Testbed, build_tracker
+from skysim.simulation.user_parts import build_testbed_with
 from skysim.tracking.factory import NO_PROGRAMS
 
 if TYPE_CHECKING:
@@ -208,15 +209,32 @@ def score_frames(testbed: Testbed) -> Iterator[ScoredFrame]:
         yield ScoredFrame(result, scoring.row(result, testbed.scene, testbed.mount, verdict))
 
 
-def simulate(scene: Scene, *, programs: Mapping[str, str] = NO_PROGRAMS, progress: Progress | None = None) -> Run:
+def simulate(
+    scene: Scene,
+    *,
+    controller: Any = None,
+    tracker: Any = None,
+    profile: Any = None,
+    programs: Mapping[str, str] = NO_PROGRAMS,
+    progress: Progress | None = None,
+) -> Run:
     """Simulate a scene's motion, render every frame, solve it and score the solution against the truth.
 
-    programs : commands of external trackers by name, for scenes whose `tracker.name` is one of these
+    controller : in place of the scene's: its name, or a callable that takes a `ControllerSetup` and returns the law, a
+        callable that takes a `ControllerInput` and returns the torque (3,) in N m (docs/howto/controller.md)
+    tracker  : in place of the scene's: its name, a `StarTracker` or `DomeTracker` of the estimator, or a function that
+        takes an image (H, W) and returns the attitude cam_from_ref as a Rotation, a unit quaternion (4,) scalar last or
+        an `Answer`, or None for no attitude. The reference is the ICRS under the stars, else the lab
+    profile  : in place of the scene's start and maneuvers: an attitude file, or an astropy Table, pandas DataFrame or
+        mapping of columns (docs/howto/profile.md). The scene's controller follows it; without one the vehicle moves
+        exactly along it
+    programs : commands of external trackers and controllers by name
     progress : called as progress(t_s, duration_s) during the motion simulation
 
     All frames are kept in memory; `skysim run` writes them one by one. Raises InputError.
     """
-    testbed = simulation.simulate_motion(build_testbed(scene, programs), progress)
+    testbed = build_testbed_with(scene, programs, controller, tracker, profile)
+    testbed = simulation.simulate_motion(testbed, progress)
     return Run(testbed, tuple(_with_own_image(frame) for frame in score_frames(testbed)))
 
 

@@ -9,7 +9,7 @@ one line with key, file and line.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -192,9 +192,10 @@ def apply_preset(tree: dict[str, Any], files: Files, overrides: Mapping[str, str
         raise InputError(f"{error} {location_of(key.split('.'), files, overrides)}") from None
 
 
-# Keys whose value may be a file in the scene's folder.
+# Keys whose value may be a file in the scene's folder; * is every item of a list.
 FILE_KEYS = (
     ("vehicle", "model"),
+    ("motion", "maneuver", "*", "file"),
     ("camera", "psf", "file"),
     ("camera", "calibration"),
     ("light", "catalog"),
@@ -214,14 +215,32 @@ def resolve_files(path: Path, tree: dict[str, Any]) -> dict[str, Any]:
     return tree
 
 
-def resolve_file(folder: Path, tree: dict[str, Any], key: str, *inner: str) -> dict[str, Any]:
-    """The mapping with the file name under these nested keys made absolute if the file is in the folder."""
-    value = tree.get(key)
-    if inner and isinstance(value, dict):
-        return tree | {key: resolve_file(folder, value, *inner)}
-    if not inner and isinstance(value, str) and is_file(folder / value):
-        return tree | {key: str(folder / value)}
-    return tree
+def resolve_file(folder: Path, tree: Any, *keys: str) -> Any:
+    """The tree with the file name under these nested keys made absolute if the file is in the folder."""
+    if not keys:
+        return str(folder / tree) if isinstance(tree, str) and is_file(folder / tree) else tree
+    if keys[0] == "*":
+        return [resolve_file(folder, item, *keys[1:]) for item in tree] if isinstance(tree, list) else tree
+    if not isinstance(tree, dict) or keys[0] not in tree:
+        return tree
+    return tree | {keys[0]: resolve_file(folder, tree[keys[0]], *keys[1:])}
+
+
+def file_names(tree: Any) -> Iterator[tuple[str, str]]:
+    """The dotted keys under which a scene may name files, with the text there."""
+
+    def below(node: Any, keys: tuple[str, ...], path: tuple[str, ...]) -> Iterator[tuple[str, str]]:
+        if not keys:
+            if isinstance(node, str):
+                yield ".".join(path), node
+        elif keys[0] == "*" and isinstance(node, list | tuple):
+            for n, item in enumerate(node):
+                yield from below(item, keys[1:], (*path, str(n)))
+        elif isinstance(node, dict) and keys[0] in node:
+            yield from below(node[keys[0]], keys[1:], (*path, keys[0]))
+
+    for keys in FILE_KEYS:
+        yield from below(tree, keys, ())
 
 
 def load_camera(path: Path, lens: Mapping[str, Any] | None = None) -> CameraConfig:

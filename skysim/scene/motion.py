@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Discriminator, Field, Tag, model_validator
+from pydantic import AfterValidator, BeforeValidator, Discriminator, Field, Tag, model_validator
 
 from skysim.core.units import ConfigModel, Momentum, NotNegative, Number, Positive, Spin, Time
+from skysim.core.yaml_reader import existing_file
 
 Duration = Annotated[Time, Field(gt=0)]
 Acceleration = Positive
 RatesDegS = tuple[Spin, Spin, Spin]
-Law = Literal["pid", "pd"]
+LawName = Annotated[str, Field(pattern=r"^\w[\w.-]*$", max_length=100)]
+BUILT_IN_LAWS = ("pid", "pd")  # of dynamics/attitude_control.py
+PRESCRIBED = "prescribed"  # no controller: the vehicle moves exactly along the maneuver
 
 
 class AttitudeConfig(ConfigModel):
@@ -32,13 +35,17 @@ class PointingConfig(ConfigModel):
 
 def start_tag(value: Any) -> str:
     """Tag of the kind of start, so that an error in one kind is not reported with the keys of the other."""
+    if isinstance(value, str):
+        return "profile"
     keys = value if isinstance(value, dict) else ()
     sky = isinstance(value, PointingConfig) or any(key in keys for key in ("ra_deg", "dec_deg"))
     return "PointingConfig" if sky else "AttitudeConfig"
 
 
 Start = Annotated[
-    Annotated[AttitudeConfig, Tag("AttitudeConfig")] | Annotated[PointingConfig, Tag("PointingConfig")],
+    Annotated[AttitudeConfig, Tag("AttitudeConfig")]
+    | Annotated[PointingConfig, Tag("PointingConfig")]
+    | Annotated[Literal["profile"], Tag("profile")],
     Discriminator(start_tag),
 ]
 
@@ -117,6 +124,50 @@ class SineConfig(ConfigModel):
     duration_s: Duration
 
 
+class ChirpConfig(ConfigModel):
+    """Oscillate about the attitude with a frequency that sweeps from from_hz to to_hz.
+
+    amplitude_deg : about body x, y, z, in phase; constant but for a smooth beginning and end of one period each
+    sweep         : linear: the frequency changes evenly with time; log: by equal factors in equal times
+    """
+
+    kind: Literal["chirp"]
+    amplitude_deg: tuple[Number, Number, Number]
+    from_hz: Positive
+    to_hz: Positive
+    duration_s: Duration
+    sweep: Literal["linear", "log"] = "linear"
+
+    @model_validator(mode="after")
+    def check_frequencies(self) -> ChirpConfig:
+        if self.from_hz == self.to_hz:
+            raise ValueError(f"from_hz and to_hz are both {self.from_hz:g}; allowed: different ones, or kind: sine")
+        if self.duration_s < 1 / self.from_hz + 1 / self.to_hz:
+            raise ValueError(
+                f"duration {self.duration_s:g} s is shorter than a period of from_hz and one of to_hz,"
+                f" {1 / self.from_hz + 1 / self.to_hz:g} s"
+            )
+        return self
+
+
+class ProfileConfig(ConfigModel):
+    """Follow the attitudes of a file, interpolated by a spline with continuous rate and acceleration.
+
+    file     : CSV or ECSV table, CCSDS AEM, or STK attitude file; its content tells which
+    begin    : the maneuver's beginning in the file: `zero`: t_s = 0; epochs apply as they are, with the scene's
+        start_time at its t = 0. `first_sample`: the first sample, whatever its time
+    rotation : which rotation columns q_x, q_y, q_z, q_w are; columns such as lab_from_body_qx name it themselves
+    """
+
+    kind: Literal["profile"]
+    file: Annotated[str, AfterValidator(existing_file)]
+    begin: Literal["zero", "first_sample"] = "zero"
+    rotation: (
+        Literal["lab_from_body", "body_from_lab", "icrs_from_body", "body_from_icrs", "icrs_from_cam", "cam_from_icrs"]
+        | None
+    ) = None
+
+
 class ShakeConfig(ConfigModel):
     """Hold while the vehicle vibrates, as `motion.jitter` but for this duration only."""
 
@@ -146,7 +197,16 @@ class BumpConfig(ConfigModel):
 
 
 Maneuver = Annotated[
-    HoldConfig | StepConfig | SlewConfig | RateConfig | SpinUpConfig | SineConfig | ShakeConfig | BumpConfig,
+    HoldConfig
+    | StepConfig
+    | SlewConfig
+    | RateConfig
+    | SpinUpConfig
+    | SineConfig
+    | ChirpConfig
+    | ProfileConfig
+    | ShakeConfig
+    | BumpConfig,
     Field(discriminator="kind"),
 ]
 
@@ -171,14 +231,19 @@ class DesaturationConfig(ConfigModel):
 class ControlConfig(ConfigModel):
     """The attitude controller on the vehicle's computer.
 
-    law       : pid, or pd, which leaves the offset caused by a constant torque
+    law       : pid, or pd, which leaves the offset caused by a constant torque; or your own: an entry point of the
+        group skysim.controllers, or a program given on the command line (`--program`). `prescribed` is no controller:
+        the vehicle moves exactly along the maneuver, without dynamics
+    options, time_limit : options of an external controller, and its time limit per control period
     actuators : ideal torques about the body's axes, or one of the sets that `vehicle` switches on
     feedback  : source of the attitude: truth, imu (the navigator), filter (star tracker and gyro)
     bandwidth_rad_s, damping : of the attitude loop;  integral_rad_s : the pole of the integral. Keep the bandwidth
         times the delay (a period of rate_hz, and the fans' time constant with fans) well below 1: 0.3 is fine
     """
 
-    law: Law = "pid"
+    law: LawName = "pid"
+    options: dict[str, bool | int | Number | str] = Field(default_factory=dict)
+    time_limit_s: Annotated[Time, Field(ge=1e-3, le=3600)] = 10.0
     actuators: Literal["ideal", "wheels", "fans", "cmgs"] = "ideal"
     feedback: Literal["truth", "imu", "filter"] = "truth"
     rate_hz: Annotated[Number, Field(ge=1, le=1000)] = 100.0
@@ -187,29 +252,73 @@ class ControlConfig(ConfigModel):
     integral_rad_s: Positive = 0.6
     desaturation: DesaturationConfig | None = None
 
+    @model_validator(mode="after")
+    def check_options(self) -> ControlConfig:
+        """Refuse keys that have no effect with the law."""
+        unused: tuple[str, ...] = ()
+        if self.law in BUILT_IN_LAWS:
+            unused = ("options", "time_limit_s")
+        elif self.law == PRESCRIBED:
+            unused = tuple(name for name in type(self).model_fields if name not in ("law", "rate_hz"))
+        given = [name.removesuffix("_s") for name in unused if getattr(self, name) != default_of(self, name)]
+        if given:
+            raise ValueError(f"{given[0]} has no effect with law {self.law}; allowed: none")
+        return self
+
+
+def default_of(config: ConfigModel, name: str) -> Any:
+    """The default of a key."""
+    return type(config).model_fields[name].get_default(call_default_factory=True)
+
 
 def expand_control(value: Any) -> Any:
-    """`control: pid` is short for {law: pid}, `none` for no controller."""
+    """`control: NAME` is short for {law: NAME}, `none` for no controller."""
     if value == "none":
         return None
     return {"law": value} if isinstance(value, str) else value
 
 
 class MotionConfig(ConfigModel):
-    """The vehicle's start, its maneuver, its controller and its jitter."""
+    """The vehicle's start, its maneuver, its controller and its jitter.
+
+    start : an attitude, or under the stars a pointing; `profile`: attitude and rate of the first maneuver, a profile
+    """
 
     start: Start = AttitudeConfig()
     rate_deg_s: RatesDegS = (0.0, 0.0, 0.0)
     control: Annotated[
         ControlConfig | None,
-        BeforeValidator(expand_control, json_schema_input_type=ControlConfig | Law | Literal["none"] | None),
+        BeforeValidator(expand_control, json_schema_input_type=ControlConfig | LawName | None),
     ] = None
     maneuver: tuple[Maneuver, ...] = ()
     jitter: tuple[JitterPart, ...] = ()
+
+    @property
+    def is_prescribed(self) -> bool:
+        """Whether the vehicle moves exactly along the maneuver, without dynamics."""
+        return self.control is not None and self.control.law == PRESCRIBED
 
     @model_validator(mode="after")
     def check_controller(self) -> MotionConfig:
         driven = any(leg.kind not in ("bump", "hold", "jitter") for leg in self.maneuver)
         if driven and self.control is None:
             raise ValueError("a maneuver requires a controller, such as control: pid")
+        return self
+
+    @model_validator(mode="after")
+    def check_prescribed(self) -> MotionConfig:
+        """A prescribed motion has no dynamics: nothing can hit the vehicle, and its attitude cannot jump."""
+        refused = [leg.kind for leg in self.maneuver if leg.kind in ("bump", "step")]
+        if self.is_prescribed and refused:
+            raise ValueError(f"maneuver: {refused[0]} is not possible with control: prescribed; allowed: control: pid")
+        return self
+
+    @model_validator(mode="after")
+    def check_start(self) -> MotionConfig:
+        if self.start != "profile":
+            return self
+        if not self.maneuver or self.maneuver[0].kind != "profile":
+            raise ValueError("start: profile requires a first maneuver of kind profile")
+        if any(self.rate_deg_s):
+            raise ValueError("rate_deg_s: has no effect with start: profile, which gives the rate; allowed: [0, 0, 0]")
         return self

@@ -87,7 +87,7 @@ class Scene(ConfigModel):
         if not isinstance(self.light, DomeConfig) and (tracker.survey != SurveyErrorsConfig() or tracker.map):
             key = "map" if tracker.map else "survey"
             raise ValueError(f"tracker.{key}: light of kind {self.light.kind} has no LEDs to survey; allowed: dome")
-        if sky != isinstance(self.motion.start, PointingConfig):
+        if self.motion.start != "profile" and sky != isinstance(self.motion.start, PointingConfig):
             keys = "ra_deg, dec_deg, roll_deg" if sky else "roll_deg, pitch_deg, yaw_deg"
             raise ValueError(f"motion.start: light of kind {self.light.kind} requires {keys}")
         read_s = getattr(self.camera.shutter, "row_time_s", 0.0) * (self.camera.height_px - 1)
@@ -146,10 +146,13 @@ class Scene(ConfigModel):
         imu = self.vehicle.imu
         if imu and self.filter and self.filter.bias_time_s < 10 / imu.rate_hz:
             raise ValueError(f"filter.bias_time: shorter than ten samples of the IMU, {10 / imu.rate_hz:g} s")
-        fastest_hz = max((leg.frequency_hz for leg in self.motion.maneuver if leg.kind == "sine"), default=0)
+        sines_hz = [leg.frequency_hz for leg in self.motion.maneuver if leg.kind == "sine"]
+        chirps_hz = [max(leg.from_hz, leg.to_hz) for leg in self.motion.maneuver if leg.kind == "chirp"]
+        fastest_hz = max((*sines_hz, *chirps_hz), default=0)
         if 2 * fastest_hz >= rate_hz:
+            kind = "sine" if fastest_hz in sines_hz else "chirp"
             raise ValueError(
-                f"motion.maneuver: a sine of {fastest_hz:g} Hz requires a motion.control.rate_hz above"
+                f"motion.maneuver: a {kind} of {fastest_hz:g} Hz requires a motion.control.rate_hz above"
                 f" {2 * fastest_hz:g}"
             )
         if imu and abs(imu.rate_hz / rate_hz - round(imu.rate_hz / rate_hz)) > 1e-9:

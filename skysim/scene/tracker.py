@@ -2,20 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated
 
 from pydantic import AfterValidator, Field, model_validator
 
 from skysim.core.units import ConfigModel, Length, NotNegative, Number, Positive, Spin, Time
-from skysim.core.yaml_reader import is_file
-
-
-def existing_file(value: str) -> str:
-    """A path that exists. Raises ValueError."""
-    if not is_file(Path(value)):
-        raise ValueError(f"{value!r} is not a file; allowed: a path, or a file in the scene's folder")
-    return value
+from skysim.core.yaml_reader import existing_file
 
 
 class SurveyErrorsConfig(ConfigModel):

@@ -11,6 +11,7 @@ from skysim.camera.optics import Optics, disk_image_axes
 from skysim.camera.psf.kernel import build_kernel
 from skysim.core.types import Floats, Mount, Sources
 from skysim.dynamics import guidance
+from skysim.dynamics.profiles.load import load_profiles
 from skysim.scene.light import DomeConfig, StarsConfig, SurveyedSurfaceConfig
 from skysim.scene.scene import Scene
 from skysim.sources.dome import surface
@@ -50,7 +51,8 @@ def warnings(scene: Scene, sources: Sources, mount: Mount) -> list[str]:
 
 def camera_outside_warning(scene: Scene, mount: Mount) -> str:
     """Warn where the camera is outside of the dome at the start, so that its frames are probably black."""
-    camera_m = guidance.start_attitude(scene.motion).apply(mount.camera_body_m)
+    start = guidance.start_attitude(scene.motion, load_profiles(scene, mount))
+    camera_m = start.apply(mount.camera_body_m)
     if not isinstance(scene.light, DomeConfig) or surface.build_surface(scene.light.surface).inside(camera_m):
         return ""
     return (
@@ -151,7 +153,8 @@ def led_views(scene: Scene, sources: Sources, mount: Mount) -> Floats:
     optics, chip_px = Optics.from_camera(scene.camera), np.array([scene.camera.width_px, scene.camera.height_px])
     end_s = scene.exposure.first_s + scene.exposure.frames / scene.exposure.rate_hz
     views = []
-    for lab_from_body in guidance.plan(scene.motion).attitudes(np.linspace(0, end_s, REFERENCE_POSES)):
+    reference = guidance.plan(scene.motion, profiles=load_profiles(scene, mount))
+    for lab_from_body in reference.attitudes(np.linspace(0, end_s, REFERENCE_POSES)):
         cam_from_lab = mount.cam_from_body * lab_from_body.inv()
         offset_m = cam_from_lab.apply(sources.place[:, :3] - lab_from_body.apply(mount.camera_body_m))
         normal, xy_px = cam_from_lab.apply(sources.normal), optics.project(offset_m)

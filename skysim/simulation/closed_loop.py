@@ -25,6 +25,7 @@ from skysim.dynamics.flight_computer import ControlInput, FlightComputer
 from skysim.dynamics.jitter import Vibration
 from skysim.scene.scene import Scene
 from skysim.simulation.exposure import render_frame
+from skysim.simulation.reference_limits import check_reference
 from skysim.simulation.telemetry import TelemetryRecorder
 from skysim.simulation.testbed import exposure_window, time_tag_error_s
 from skysim.tracking import factory
@@ -34,7 +35,6 @@ from skysim.tracking.navigation import Navigation
 if TYPE_CHECKING:
     from skysim.simulation.testbed import Testbed
 
-TILT_CHECK_S = 0.05  # sampling interval of a maneuver when its tilt is checked
 HISTORY_MARGIN_S = 0.05  # kept of past states beyond what a frame needs
 
 FrameSelector = Callable[[int, float], bool]
@@ -59,23 +59,28 @@ class ClosedLoop:
         scene, vehicle = testbed.scene, testbed.vehicle
         start = testbed.trajectory.lab_from_body[0]
         self.testbed, self.discards_history = testbed, discards_history
-        history = history_s(scene) if discards_history else None
-        self.simulation = multibody.Simulation(
-            vehicle, start, np.radians(scene.motion.rate_deg_s), testbed.duration_s, history
-        )
-        self.vibration = Vibration.draw(scene.motion, random_stream(scene.seed, JITTER, 0))
-        self.reference = guidance.plan(scene.motion, start)
-        self.flight_computer = FlightComputer(scene, vehicle, self.reference)
+        self.reference = guidance.plan(scene.motion, start, testbed.profiles)
+        self.simulation = build_simulation(testbed, self.reference, history_s(scene) if discards_history else None)
+        self.vibration = Vibration.draw(scene.motion, random_stream(scene.seed, JITTER, 0), self.reference)
+        self.flight_computer = FlightComputer(scene, vehicle, self.reference, testbed.controllers)
         self.navigation = build_navigation(testbed, start, not discards_history)
         self.disturbances = DisturbanceModel.from_config(
             scene.vehicle.disturbances,
             imu.earth_rate_lab_rad_s(scene.site),
-            guidance.impulses(scene.motion),
+            guidance.impulses(scene.motion, self.reference),
             vehicle.inertia_kg_m2,
             self.flight_computer.period_s,
             random_stream(scene.seed, AIR_CURRENT, 0),
         )
-        check_reference(self.reference, testbed)
+        try:
+            check_reference(self.reference, testbed, self.flight_computer)
+        except InputError:
+            self.close()
+            raise
+
+    def close(self) -> None:
+        """End the process of an external controller."""
+        self.flight_computer.close()
 
     @property
     def is_free_motion(self) -> bool:
@@ -101,7 +106,7 @@ class ClosedLoop:
         inputs = ControlInput(t_s, flight_computer.period_s, measured_rate, angles, speeds)
         control = np.empty((min(steps, simulation.steps_left), simulation.model.nu))
         control[:] = flight_computer.compute_controls(inputs, measured_attitude, momentum)
-        if not self.disturbances.inactive:
+        if not (self.disturbances.inactive or self.testbed.scene.motion.is_prescribed):
             times_s = simulation.times_s(simulation.step, simulation.step + len(control) + 1)
             disturbance = self.disturbances.torque_nm(times_s, attitude, rate, momentum)
             # Disturbances act through the model's ideal torque actuators, step by step; commands are constant.
@@ -172,19 +177,15 @@ def history_s(scene: Scene) -> float:
     )
 
 
-def check_reference(reference: guidance.Reference, testbed: Testbed) -> None:
-    """Raise InputError for a maneuver that commands a tilt beyond the stop: the controller would push against it."""
-    config = testbed.scene.vehicle
-    if config.mount != "air_bearing" or testbed.scene.motion.control is None:
-        return
-    t_s = np.arange(0, min(reference.duration_s, testbed.duration_s) + TILT_CHECK_S, TILT_CHECK_S)
-    tilt_deg = multibody.tilt_deg(reference.attitudes(t_s))
-    beyond = np.flatnonzero(tilt_deg > config.tilt_stop_deg)
-    if len(beyond):
-        raise InputError(
-            f"motion.maneuver: tilt of {tilt_deg[beyond[0]]:.3g} deg at {t_s[beyond[0]]:.3g} s; allowed: up to"
-            f" vehicle.tilt_stop_deg {config.tilt_stop_deg:g}"
+def build_simulation(testbed: Testbed, reference: guidance.Reference, history_s: float | None) -> multibody.Simulation:
+    """The simulation of the motion at its start: by dynamics, or along the reference if the motion is prescribed."""
+    motion = testbed.scene.motion
+    if motion.is_prescribed:
+        return multibody.PrescribedMotion(
+            testbed.vehicle, lambda t_s: reference.state_at(t_s)[:2], testbed.duration_s, history_s
         )
+    start, rate = testbed.trajectory.lab_from_body[0], guidance.start_rate_rad_s(motion, testbed.profiles)
+    return multibody.Simulation(testbed.vehicle, start, rate, testbed.duration_s, history_s)
 
 
 def recent_motion(simulation: multibody.Simulation, vibration: Vibration, steps: int) -> tuple[Floats, Floats, Floats]:

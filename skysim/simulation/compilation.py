@@ -24,7 +24,6 @@ from skysim.core.yaml_reader import parse_overrides
 from skysim.scene import loader
 from skysim.simulation.testbed import Testbed, build_testbed, build_tracker, exposure_window
 from skysim.tracking import factory
-from skysim.tracking.external.adapter import ExternalTracker
 from skysim.tracking.onboard_model import assumed_camera
 
 SPOT_SIGMA_PX = 2.0  # wide enough for every shipped scene's smallest area, or nothing after the detector is compiled
@@ -76,7 +75,7 @@ def compile_tracker(scene: str, overrides: Sequence[str] = ()) -> None:
     """
     testbed = build_testbed(loader.load(scene, parse_overrides(list(overrides))))
     tracker = build_tracker(testbed)
-    if not isinstance(tracker, ExternalTracker):
+    if not isinstance(tracker, factory.UserTracker):
         factory.solve_frame(tracker, synthetic_frame(testbed))
 
 

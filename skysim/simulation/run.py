@@ -19,7 +19,6 @@ from skysim.simulation.telemetry import TelemetryRecorder
 from skysim.simulation.testbed import Testbed, build_testbed, build_tracker
 from skysim.tracking import factory
 from skysim.tracking.exposure_control import ExposureController
-from skysim.tracking.external.adapter import ExternalTracker
 
 ProgressCallback = Callable[[float, float], None]
 
@@ -50,7 +49,29 @@ def simulate_motion(testbed: Testbed, watch: ProgressCallback | None = None) -> 
     filter (and with feedback: filter the controller) after the declared latency.
     """
     loop = ClosedLoop(testbed)
-    simulation = loop.simulation
+    try:
+        reports, update_statuses, exposures_s, recorder = fly(loop, watch)
+    finally:
+        loop.close()
+    return replace(
+        testbed,
+        trajectory=loop.vibration.add_to(loop.simulation.trajectory()),
+        telemetry=recorder.telemetry(loop.reference if testbed.scene.motion.control else None),
+        imu_samples=loop.navigation.imu_samples() if loop.navigation else None,
+        reports=reports,
+        update_statuses=update_statuses,
+        exposures_s=exposures_s,
+    )
+
+
+def fly(
+    loop: ClosedLoop, watch: ProgressCallback | None
+) -> tuple[dict[int, Report], dict[int, str], dict[int, float], TelemetryRecorder]:
+    """Simulate the whole motion; with a filter also its frames.
+
+    Returns the reports, the filter's statuses and the exposure times of these frames by index, and the telemetry.
+    """
+    testbed, simulation = loop.testbed, loop.simulation
     # Raises InputError for too fast vibration before any long work.
     loop.vibration.subdivisions(simulation.times_s(0, simulation.last_step + 1))
     camera = OnboardCamera(loop, build_tracker(testbed)) if testbed.scene.filter and loop.navigation else None
@@ -68,15 +89,7 @@ def simulate_motion(testbed: Testbed, watch: ProgressCallback | None = None) -> 
             exposures_s[index] = captured.frame.exposure_s
         if watch:
             watch(simulation.now_s, simulation.now_s + simulation.steps_left * simulation.step_s)
-    return replace(
-        testbed,
-        trajectory=loop.vibration.add_to(simulation.trajectory()),
-        telemetry=recorder.telemetry(loop.reference if testbed.scene.motion.control else None),
-        imu_samples=loop.navigation.imu_samples() if loop.navigation else None,
-        reports=reports,
-        update_statuses=update_statuses,
-        exposures_s=exposures_s,
-    )
+    return reports, update_statuses, exposures_s, recorder
 
 
 def live(
@@ -94,9 +107,12 @@ def live(
     simulation = loop.simulation
     camera = OnboardCamera(loop, estimator or (build_tracker(testbed) if testbed.scene.filter else None), selects)
     steps = round(loop.flight_computer.period_s / simulation.step_s)
-    while simulation.steps_left:
-        loop.tick(steps)
-        yield from camera.capture_due()
+    try:
+        while simulation.steps_left:
+            loop.tick(steps)
+            yield from camera.capture_due()
+    finally:
+        loop.close()
 
 
 def render_frames(testbed: Testbed) -> Iterator[tuple[Frame, Truth, dict[str, float]]]:
@@ -119,7 +135,7 @@ def warm_up(testbed: Testbed, estimator: factory.Estimator) -> None:
     External trackers are skipped: each frame must reach them once, in order.
     """
     frame, _ = render_frame(testbed, 0)
-    if not isinstance(estimator, ExternalTracker):
+    if not isinstance(estimator, factory.UserTracker):
         factory.solve_frame(estimator, frame)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Any
@@ -20,7 +20,11 @@ from skysim.camera.render import Window
 from skysim.core.random_streams import CAMERA_TIMING, random_stream
 from skysim.core.types import Mount, Sources, Telemetry, Trajectory
 from skysim.dynamics import guidance, imu, multibody
+from skysim.dynamics.controllers.adapter import ControllerSource
+from skysim.dynamics.controllers.interface import Factory
 from skysim.dynamics.multibody.view import mjcf_export
+from skysim.dynamics.profiles.load import load_profiles
+from skysim.dynamics.profiles.spline import AttitudeSpline
 from skysim.scene.camera import RollingShutterConfig
 from skysim.scene.light import CollimatedDisplayConfig, DomeConfig
 from skysim.scene.motion import PointingConfig
@@ -32,7 +36,7 @@ from skysim.sources.dome.clocks import Clocks, build_clocks
 from skysim.sources.dome.led import Emitter
 from skysim.sources.photometry import Band
 from skysim.tracking import factory, settings
-from skysim.tracking.external import interface
+from skysim.tracking.external.interface import TRACKERS
 
 
 def exposure_window(scene: Scene, index: int, exposure_s: float | None = None) -> Window:
@@ -72,7 +76,9 @@ class Testbed:
     reports   : the star tracker's reports on frames solved during the motion (for the filter), by frame index
     update_statuses: the filter's status of each of those updates
     exposures_s: exposure time of each of those frames
-    programs  : external tracker commands by name, for `tracker.name`; only the user's command line sets them
+    programs  : commands of external trackers and controllers by name; only the user's command line sets them
+    profiles  : attitude profiles of the maneuvers of that kind, in their order
+    controller, tracker : given to `skysim.simulate` in place of those that the scene names
     endless   : frames continue without end, whatever the scene's number; only for `live`
     """
 
@@ -94,6 +100,9 @@ class Testbed:
     update_statuses: dict[int, str] = field(default_factory=dict)
     exposures_s: dict[int, float] = field(default_factory=dict)
     programs: Mapping[str, str] = field(default_factory=dict)
+    profiles: tuple[AttitudeSpline, ...] = ()
+    controller: Factory | None = None
+    tracker: factory.Estimator | None = None
     endless: bool = False
 
     @property
@@ -109,6 +118,11 @@ class Testbed:
         config = self.scene.tracker.exposure_control
         last = exposure_window(self.scene, self.scene.exposure.frames - 1, config.longest_s if config else None)
         return last.close_s(self.scene.camera.height_px) + MARGIN_S
+
+    @property
+    def controllers(self) -> ControllerSource:
+        """Where external controllers come from, beside entry points."""
+        return ControllerSource(self.programs, self.controller)
 
     def in_run(self, seed: int) -> Testbed:
         """The same hardware in the run of another seed: other noise, jitter, timing and phases of the LEDs' clocks."""
@@ -127,21 +141,33 @@ class Testbed:
         return self.telemetry
 
 
-def build_testbed(scene: Scene, programs: Mapping[str, str] = factory.NO_PROGRAMS) -> Testbed:
+def build_testbed(
+    scene: Scene,
+    programs: Mapping[str, str] = factory.NO_PROGRAMS,
+    *,
+    controller: Factory | None = None,
+    tracker: factory.Estimator | None = None,
+    profile: Any = None,
+) -> Testbed:
     """Build hardware, sources and the initial attitude; do not simulate the motion.
 
-    Raises InputError for wrong names of algorithms, trackers or catalogs and for an unreadable PSF file, before any
-    long work.
+    controller, tracker : in place of those that the scene names
+    profile             : table of attitudes in place of the file of the first maneuver of kind profile
+    Raises InputError for wrong names of algorithms, trackers, controllers or catalogs and for an unreadable PSF or
+    profile, before any long work.
     """
     settings.assumed_settings(scene)  # raises for a wrong algorithm name
-    interface.check_tracker_name(scene.tracker.name, programs)  # raises for an unknown tracker
+    if tracker is None:
+        TRACKERS.check_name(scene.tracker.name, programs)
+    if scene.motion.control:
+        ControllerSource(programs, controller).check_name(scene.motion.control.law)
     catalog.require_catalog("tracker.catalog", scene.tracker.catalog)
     EXTENT[scene.camera.psf.kind](scene.camera.psf, scene.camera)  # raises for a bad PSF file
     vehicle = multibody.build(scene.vehicle)
     band = Band.from_efficiency(scene.camera.detector.quantum_efficiency)
     dtype = np.float32 if scene.camera.detector.noise else np.float64
     mount = multibody.camera_mount(vehicle)
-    start = lab_from_body_start(scene, mount)
+    profiles = load_profiles(scene, mount, profile)
     sources = light_sources(scene, band)
     return Testbed(
         scene,
@@ -153,10 +179,13 @@ def build_testbed(scene: Scene, programs: Mapping[str, str] = factory.NO_PROGRAM
         Detector.from_camera(scene.camera),
         band,
         np.empty((scene.camera.height_px, scene.camera.width_px), dtype),
-        Trajectory.at_rest(start, 1.0),
+        Trajectory.at_rest(lab_from_body_start(scene, mount, profiles), 1.0),
         build_clocks(scene.light, sources, scene.seed),
         build_obstacles(scene, vehicle),
         programs=programs,
+        profiles=profiles,
+        controller=controller,
+        tracker=tracker,
     )
 
 
@@ -174,12 +203,12 @@ def export_mjcf(testbed: Testbed) -> str:
     return mjcf_export.mjcf(testbed.vehicle, testbed.scene, testbed.sources, testbed.trajectory.lab_from_body[0])
 
 
-def lab_from_body_start(scene: Scene, mount: Mount) -> Rotation:
+def lab_from_body_start(scene: Scene, mount: Mount, profiles: Sequence[AttitudeSpline] = ()) -> Rotation:
     """The attitude at t = 0. For a star scene the lab frame is the ICRS."""
     start = scene.motion.start
     if isinstance(start, PointingConfig):
         return star_sources.cam_from_icrs(start.ra_deg, start.dec_deg, start.roll_deg).inv() * mount.cam_from_body
-    return guidance.attitude(start)
+    return guidance.start_attitude(scene.motion, profiles)
 
 
 def light_sources(scene: Scene, band: Band) -> Sources:
@@ -193,5 +222,7 @@ def light_sources(scene: Scene, band: Band) -> Sources:
 
 
 def build_tracker(testbed: Testbed) -> factory.Estimator:
-    """The star tracker with the hardware parameters that it assumes (see tracking/factory.py)."""
+    """The star tracker: the user's, or with the hardware parameters that it assumes (see tracking/factory.py)."""
+    if testbed.tracker is not None:
+        return testbed.tracker
     return factory.build_tracker(testbed.scene, testbed.mount, testbed.sources, testbed.programs)

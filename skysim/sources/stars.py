@@ -93,18 +93,18 @@ def sources(
     )
 
 
-def cam_from_icrs(ra_deg: float, dec_deg: float, roll_deg: float) -> Rotation:
+def cam_from_icrs(ra_deg: float | Floats, dec_deg: float | Floats, roll_deg: float | Floats) -> Rotation:
     """Camera attitude from the boresight's right ascension and declination and the position angle of the image's up.
 
-    ra_deg, dec_deg : ICRS direction of the boresight
+    ra_deg, dec_deg : ICRS direction of the boresight, a number or (N,) each
     roll_deg        : position angle of the image's up (-y) at the boresight, from north through east
     Returns cam_from_icrs; its matrix has the camera's x (right), y (down), z (boresight) as rows.
     Up is cos(roll) N + sin(roll) E and x = y × z, so that at roll 0 north is up and east is to the left: the
     sky is seen from inside. At the poles N and E are those of the meridian ra_deg.
     """
-    ra, dec, roll = np.radians([ra_deg, dec_deg, roll_deg])
-    east = np.array([-np.sin(ra), np.cos(ra), 0.0])
-    north = np.array([-np.sin(dec) * np.cos(ra), -np.sin(dec) * np.sin(ra), np.cos(dec)])
-    z = np.array([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
-    y = -(np.cos(roll) * north + np.sin(roll) * east)
-    return Rotation.from_matrix(np.array([np.cross(y, z), y, z]))
+    ra, dec, roll = (np.radians(angle) for angle in (ra_deg, dec_deg, roll_deg))
+    east = np.stack([-np.sin(ra), np.cos(ra), np.zeros_like(ra)], axis=-1)
+    north = np.stack([-np.sin(dec) * np.cos(ra), -np.sin(dec) * np.sin(ra), np.cos(dec)], axis=-1)
+    z = np.stack([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)], axis=-1)
+    y = -(np.cos(roll)[..., None] * north + np.sin(roll)[..., None] * east)
+    return Rotation.from_matrix(np.stack([np.cross(y, z), y, z], axis=-2))

@@ -24,11 +24,13 @@ from skysim.sources.catalog import require_catalog
 from skysim.sources.dome import display
 from skysim.tracking.external import adapter
 from skysim.tracking.external.adapter import ExternalTracker
+from skysim.tracking.external.function import FunctionTracker
 from skysim.tracking.external.interface import OWN
 from skysim.tracking.onboard_model import assumed_camera, assumed_dome, assumed_lever, surveyed_dome
 from skysim.tracking.settings import assumed_settings
 
-Estimator = StarTracker | DomeTracker | ExternalTracker
+UserTracker = ExternalTracker | FunctionTracker  # each frame must reach it once, in order
+Estimator = StarTracker | DomeTracker | UserTracker
 
 NO_PROGRAMS: Mapping[str, str] = {}
 
@@ -74,7 +76,7 @@ def solve_frame(estimator: Estimator, frame: Frame, streak_px: tuple[float, floa
 
     streak_px : (dx, dy) that lights move in the exposure, if a gyro measures it
     """
-    if isinstance(estimator, ExternalTracker):
+    if isinstance(estimator, UserTracker):
         return estimator.solve_frame(frame, streak_px)
     try:
         return estimator.solve(frame.image_dn, streak_px)

@@ -44,6 +44,7 @@ LONG = {
     "howto/cluster.md",
     "howto/dome.md",
     "howto/photo.md",
+    "howto/profile.md",
     "howto/tracker.md",
     "explanation/error_budget.md",
     "howto/stream.md",

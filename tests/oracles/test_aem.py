@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from skysim.core import files
 from skysim.core.errors import InputError
 from skysim.core.paths import ROOT
+from skysim.dynamics.profiles.load import read_profile
 from skysim.results.files import ccsds_aem
 
 ndm = pytest.importorskip("ccsds_ndm", reason="the package ccsds-ndm-py is not installed")
@@ -63,6 +64,22 @@ def test_their_reader_refuses_what_ours_never_writes() -> None:
             ndm.Aem.from_str(good.replace(old, new), "kvn")
     with pytest.raises(InputError):
         ccsds_aem.message("x", [], (ccsds_aem.LAB, ccsds_aem.BODY), utc(2)[::-1], Rotation.identity(2))
+
+
+def test_what_they_write_is_read_by_our_reader(tmp_path: Path) -> None:
+    """Both readers take the same numbers for the same epochs. Theirs does not know the keywords of version 1.0."""
+    meant = Rotation.from_rotvec(np.outer(np.arange(9.0), [0.01, -0.02, 0.005]))
+    text = ccsds_aem.message("x", ["of ours"], (ccsds_aem.ICRF, ccsds_aem.BODY), utc(9), meant)
+    theirs = ndm.Aem.from_str(text, "kvn")
+    path = tmp_path / "theirs.aem"
+    path.write_text(theirs.to_str("kvn"))
+    read = read_profile(path, START)
+    assert read.direction == "icrs_from_body"
+    np.testing.assert_allclose(read.t_s, np.arange(9) / 10, rtol=0, atol=1e-9)
+    (segment,) = theirs.segments
+    told = Rotation.from_quat(segment.data.attitude_states_numpy)
+    assert (read.a_from_b * told.inv()).magnitude().max() < 1e-14
+    assert (read.a_from_b * meant.inv()).magnitude().max() < 1e-14
 
 
 def test_the_page_s_code_reads_it(

@@ -78,4 +78,4 @@ def test_the_page_s_commands_do_what_it_says(command: str, tmp_path: Path) -> No
 
 
 def test_it_is_an_entry_point_of_skysim() -> None:
-    assert interface.entry_points()["tetra3rs"].load() is tetra3rs_tracker.Tetra3rs
+    assert interface.TRACKERS.entry_points()["tetra3rs"].load() is tetra3rs_tracker.Tetra3rs

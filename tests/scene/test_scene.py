@@ -264,8 +264,8 @@ def test_a_bad_override_is_one_line_and_blamed_on_the_option(key: str, value: st
         ),
         (
             "control: pid",
-            "control: lqr",
-            "motion.control: 'lqr' is not allowed; it should be 'pid' or 'pd'",
+            "control: l q r",
+            "motion.control: 'l q r' is not allowed; it should match pattern",
         ),
         (
             'apex: "48 in"',
@@ -342,7 +342,8 @@ def test_a_bad_override_is_one_line_and_blamed_on_the_option(key: str, value: st
         (
             '{kind: hold, duration: "1 s"}',
             '{kind: wait, duration: "1 s"}',
-            "motion.maneuver.0.kind: unknown kind 'wait'; allowed: hold, step, slew, rate, spin_up, sine, jitter, bump",
+            "motion.maneuver.0.kind: unknown kind 'wait'; allowed: hold, step, slew, rate, spin_up, sine, chirp, "
+            "profile, jitter, bump",
         ),
         (
             "pitch_deg: 0",
@@ -650,7 +651,8 @@ def test_a_free_vehicle_is_in_no_room(key: str, value: str, says: str) -> None:
         ),
         ("vehicle.imu", "{earth_rate: maybe}", "it should be 'none', 'uncompensated' or 'compensated'"),
         ("vehicle.imu", "{gyro: {arw: 3}}", "vehicle.imu.gyro.arw: unknown key; allowed: arw_deg_sqrt_h, "),
-        ("motion.control", "{law: lqr}", "motion.control.law: 'lqr' is not allowed; it should be 'pid' or"),
+        ("motion.control", "{law: pid, options: {a: 1}}", "motion.control: options has no effect with law pid; allo"),
+        ("motion.control", "{law: prescribed, damping: 1}", "motion.control: damping has no effect with law prescr"),
         ("motion.control", "{rate_hz: 0.5}", "motion.control.rate_hz: 0.5 is not allowed; it should be gr"),
         ("motion.control", "true", "motion.control: True is not allowed; it should be a mapping of keys to"),
         (

@@ -65,7 +65,7 @@ def test_the_published_schema_is_the_newest_and_takes_every_file_that_ships(kind
         {"camera": {"focal_length": 35}},
         {"camera": {"focal_length": "mm 35"}},
         {"light": {"kind": "candle"}},
-        {"motion": {"control": "ppid"}},
+        {"motion": {"control": 3}},
         {"exposure": {"frames": 0}},
         {"schema": 2},
     ],

@@ -23,6 +23,7 @@ from typer.testing import CliRunner
 from skysim.apps.cli import main
 from skysim.core.errors import InputError
 from skysim.core.paths import ROOT
+from skysim.core.plugins.program import ProgramError
 from skysim.core.units import ARCSEC_RAD
 from skysim.experiments import tracker_comparison
 from skysim.experiments.study import loader as study_loader
@@ -36,7 +37,6 @@ from skysim.simulation.testbed import build_testbed
 from skysim.sources import stars
 from skysim.tracking.external import interface, process
 from skysim.tracking.external.interface import Answer, Leds, Picture, Setup, Stars, check_answer
-from skysim.tracking.external.process import Program, ProgramError
 
 PAGE = (ROOT / "docs/howto/external_tracker.md").read_text(encoding="utf-8")
 SETUP = Setup("icrs", "2012-06-22T21:00:00", 8, 6, 100.0, (3.5, 2.5), (0.0,) * 5, 1.0, 4095.0, 1)
@@ -97,9 +97,9 @@ READY = "import json, sys, os, time; g = sys.stdin.buffer; g.readline(); print('
 FRAMES = READY + "for line in g:\n    h = json.loads(line); p = g.read(h['bytes'])\n    "
 
 
-def program(text: str, limit_s: float = 5.0, kind: str | None = None) -> Program:
+def program(text: str, limit_s: float = 5.0, kind: str | None = None) -> process.TrackerProgram:
     parts = [sys.executable, "-c", text, "{folder}"]
-    return Program("mine", parts, kind, SETUP, limit_s)
+    return process.TrackerProgram("mine", parts, kind, SETUP, limit_s)
 
 
 def test_a_program_sees_the_pixels_and_its_answer_is_ours() -> None:
@@ -279,9 +279,9 @@ def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_trial_of_another_release_of_a_tracker_is_another(installed: None, tmp_path: Path) -> None:
     told = loader.load("shefex2", {"tracker.name": "offset"})
     before = setups.scene_hash(told)
-    assert interface.package_release("offset") == "offset 1.0"
+    assert interface.TRACKERS.release("offset") == "offset 1.0"
     (tmp_path / "offset-1.0.dist-info" / "METADATA").write_text("Metadata-Version: 2.1\nName: offset\nVersion: 1.1\n")
-    assert interface.package_release("offset") == "offset 1.1"
+    assert interface.TRACKERS.release("offset") == "offset 1.1"
     assert setups.scene_hash(told) != before
 
 
@@ -466,7 +466,7 @@ def test_the_page_s_adapter_reads_lost_s_axes_and_quaternion(tmp_path: Path) -> 
         (lost / str(n)).write_text("".join(rows))
     (lost / str(len(POINTED))).write_text("attitude_known 0\n")
     words = [sys.executable, str(adapter), str(lost), "{folder}"]
-    runs = Program("lost", words, "png", replace(SETUP, saturation_dn=255.0), 20.0)
+    runs = process.TrackerProgram("lost", words, "png", replace(SETUP, saturation_dn=255.0), 20.0)
     answers = [
         check_answer(runs.solve(replace(PICTURE, frame=n, image_dn=np.full((6, 8), n, np.uint16))))
         for n in range(len(POINTED) + 1)

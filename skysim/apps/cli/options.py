@@ -59,9 +59,7 @@ SolverName = Annotated[str | None, typer.Option("--solver", help="Attitude algor
 TRACKER_HELP = "Tracker: own, or a name from `skysim trackers` or --program."
 Programs = Annotated[
     list[str] | None,
-    typer.Option(
-        "--program", metavar="NAME=COMMAND", help="External tracker: a program that reads frames; repeatable."
-    ),
+    typer.Option("--program", metavar="NAME=COMMAND", help="External tracker or controller: a program; repeatable."),
 ]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")]
 

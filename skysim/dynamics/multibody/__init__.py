@@ -1,5 +1,6 @@
 """Multibody dynamics of the vehicle on its bearing by MuJoCo. The only package that imports MuJoCo."""
 
+from skysim.dynamics.multibody.integrator import PrescribedMotion as PrescribedMotion
 from skysim.dynamics.multibody.integrator import Simulation as Simulation
 from skysim.dynamics.multibody.integrator import simulate as simulate
 from skysim.dynamics.multibody.integrator import tilt_deg as tilt_deg

@@ -168,6 +168,35 @@ class Simulation:
         return Trajectory(t_s, Rotation.from_quat(lab_from_body_wxyz, scalar_first=True), rate.copy())
 
 
+class PrescribedMotion(Simulation):
+    """A motion along given attitudes, without dynamics; wheels and gimbals stay as they are at the start.
+
+    state_at : time in s to lab_from_body_wxyz (4,) and rate (3,) in body axes
+    """
+
+    def __init__(
+        self,
+        vehicle: VehicleModel,
+        state_at: Callable[[float], tuple[Floats, Floats]],
+        duration_s: float,
+        history_s: float | None = None,
+    ) -> None:
+        self.state_at = state_at
+        wxyz, rate = state_at(0.0)
+        super().__init__(vehicle, Rotation.from_quat(wxyz, scalar_first=True), rate, duration_s, history_s)
+
+    def advance(self, control: Floats) -> None:
+        """Advance one step for each row of control (K, nu), whose values have no effect."""
+        self.discard_old(len(control))
+        rate_column = 1 + self.model.nq
+        for _ in range(len(control)):
+            state = self.states[self.row + 1]
+            state[:] = self.states[self.row]
+            self.step += 1
+            state[0] = self.now_s
+            state[1:5], state[rate_column : rate_column + 3] = self.state_at(self.now_s)
+
+
 def member_values(values: tuple[float, ...], count: int, key: str) -> Floats:
     """One value for each of `count` members; zeros if none are given. Raises InputError for another count."""
     if values and len(values) != count:

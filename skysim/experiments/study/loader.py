@@ -10,10 +10,12 @@ from pydantic import ValidationError
 
 from skysim.core.errors import InputError, unknown_name
 from skysim.core.yaml_reader import check_version, explain, line_of, read_yaml, set_key
+from skysim.dynamics.controllers.interface import CONTROLLERS
 from skysim.experiments.study.designs import make_point
 from skysim.experiments.study.factors import Distribution, Factor, Levels, Settings, Value
 from skysim.experiments.study.plan import (
     TRIAL,
+    AttitudeRange,
     CentroidTrial,
     Figure,
     FlightTrial,
@@ -29,7 +31,7 @@ from skysim.experiments.study.plan import (
 from skysim.results import metrics
 from skysim.scene.light import CollimatedDisplayConfig, DomeConfig
 from skysim.scene.scene import Scene
-from skysim.tracking.external.interface import OWN, check_tracker_name
+from skysim.tracking.external.interface import OWN, TRACKERS
 
 HARDWARE_SEED = re.compile(r"(hardware_seed|survey\.(surface_)?seed)$")
 # Kinds of trial that measure a quantity; quantities that are not listed are measured by all.
@@ -44,8 +46,8 @@ def load(
 ) -> Plan:
     """Read, override (`path.to.key` -> YAML value) and validate a study and every level of its factors.
 
-    programs : commands of external trackers by name, for `tracker.name`; None if the study will not be run, and its
-               trackers need not be installed
+    programs : commands of external trackers and controllers by name; None if the study will not be run, and its
+               trackers and controllers need not be installed
     Raises InputError with one line: the key, the fault, what is allowed, the file and line.
     """
     path = find(str(name))
@@ -71,7 +73,7 @@ def load(
 def check(plan: Plan, to_run: bool) -> None:
     """Validate responses, figures, budget and each level of each factor before the first trial. Raises InputError.
 
-    to_run : whether the trackers must be installed
+    to_run : whether the trackers and controllers must be installed
     """
     from skysim.experiments.study.analysis import search
     from skysim.experiments.study.store import COLUMNS
@@ -161,9 +163,13 @@ def check_trial(plan: Plan, scene: Scene, trial: Trial, to_run: bool) -> None:
             "hardware: tracker.survey.seed has no effect without errors of the survey; allowed: with"
             " tracker.survey.led_sigma, lever_sigma or light.surface.error"
         )
+    if isinstance(trial, FlightTrial) and trial.start:
+        check_random_start(scene, trial.start)
     if to_run:
         tracker = scene.tracker.name
-        check_tracker_name(tracker, plan.spec.programs)
+        TRACKERS.check_name(tracker, plan.spec.programs)
+        if scene.motion.control:
+            CONTROLLERS.check_name(scene.motion.control.law, plan.spec.programs)
         if tracker != OWN and isinstance(trial, CentroidTrial):  # an external tracker takes images
             raise InputError(f"tracker.name: {tracker} needs frames; allowed: {OWN}, or another trial.kind")
 
@@ -199,6 +205,23 @@ def may_report_ambiguity(scene: Scene) -> bool:
 
     own = isinstance(scene.light, DomeConfig) and scene.tracker.identifier in (None, SETTINGS.identifier)
     return own or scene.tracker.name != OWN
+
+
+def check_random_start(scene: Scene, start: AttitudeRange) -> None:
+    """Raise InputError for a random start that the scene cannot have, or whose keys have no effect in it."""
+    if isinstance(scene.light, CollimatedDisplayConfig) or scene.motion.start == "profile":
+        where = "a collimated display" if scene.motion.start != "profile" else "motion.start: profile"
+        raise InputError(f"trial.start: random with {where}; allowed: scene")
+    dome = isinstance(scene.light, DomeConfig)
+    unused = "dec_deg" if dome else "tilt_deg"
+    if unused in start.model_fields_set:
+        raise InputError(f"trial.start.{unused}: has no effect with light of kind {scene.light.kind}; allowed: none")
+    greatest_deg = max(start.tilt_deg) if isinstance(start.tilt_deg, tuple) else start.tilt_deg
+    vehicle = scene.vehicle
+    if dome and vehicle.mount == "air_bearing" and greatest_deg > vehicle.tilt_stop_deg:
+        raise InputError(
+            f"trial.start.tilt_deg: {greatest_deg:g}; allowed: up to vehicle.tilt_stop_deg {vehicle.tilt_stop_deg:g}"
+        )
 
 
 def each_level(factors: Mapping[str, Factor]) -> Iterator[tuple[str, Value, Settings]]:

@@ -11,12 +11,12 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 import yaml
-from pydantic import Field, ValidationError
+from pydantic import BeforeValidator, Discriminator, Field, Tag, ValidationError, model_validator
 
 from skysim.core import yaml_reader
 from skysim.core.errors import InputError
 from skysim.core.paths import STUDIES
-from skysim.core.units import ConfigModel, Fraction, NotNegative, Number, Time
+from skysim.core.units import ConfigModel, Fraction, NotNegative, Number, Time, Triple
 from skysim.core.yaml_reader import explain, is_file, set_key
 from skysim.experiments.study.designs import Design, Point, points
 from skysim.experiments.study.factors import Factor, Settings, Value
@@ -31,17 +31,49 @@ SeedKey = Annotated[str, Field(pattern=r"^[a-z_]+(\.\w+)*[._]seed$")]
 Tilt = Annotated[Number, Field(ge=0, le=90)]
 
 
-class RandomAttitude(ConfigModel):
+class AttitudeRange(ConfigModel):
     """A random attitude in every trial, roll or yaw uniform.
 
     tilt_deg : under a dome, tilt of the body from vertical: one angle, or uniform in solid angle between two
     dec_deg  : under the stars, the boresight is uniform over the sphere between two declinations
+    """
+
+    tilt_deg: Tilt | tuple[Tilt, Tilt] = (0.0, 30.0)
+    dec_deg: tuple[Declination, Declination] = (-90.0, 90.0)
+
+
+class RandomAttitude(AttitudeRange):
+    """A random attitude in every trial, and its noise.
+
     noise_seed : selects the noise at unchanged attitudes; as a factor it makes noise an input, as Sobol indices need
     """
 
     noise_seed: Annotated[int, Field(ge=0)] = 0
-    tilt_deg: Tilt | tuple[Tilt, Tilt] = (0.0, 30.0)
-    dec_deg: tuple[Declination, Declination] = (-90.0, 90.0)
+
+
+class AxisConfig(ConfigModel):
+    """An axis of rotation: a vector of any length in body axes, or in camera axes (+x right, +y down, +z boresight)."""
+
+    body: Triple | None = None
+    camera: Triple | None = None
+
+    @model_validator(mode="after")
+    def check_vector(self) -> AxisConfig:
+        given = [vector for vector in (self.body, self.camera) if vector is not None]
+        if len(given) != 1 or not any(given[0]):
+            raise ValueError("allowed: one of body and camera, a vector that is not zero")
+        return self
+
+
+def axis_tag(value: Any) -> str:
+    """Tag of an axis: a word, or a section; so that an error in one is not reported as one of the other."""
+    return "AxisConfig" if isinstance(value, dict | AxisConfig) else "name"
+
+
+RateAxis = Annotated[
+    Annotated[Literal["perpendicular", "boresight"], Tag("name")] | Annotated[AxisConfig, Tag("AxisConfig")],
+    Discriminator(axis_tag),
+]
 
 
 class CentroidTrial(RandomAttitude):
@@ -65,22 +97,36 @@ class CentroidTrial(RandomAttitude):
 class FrameTrial(RandomAttitude):
     """One frame, rendered with all camera noise, then solved.
 
-    rate_deg_s : rate about a random axis perpendicular to the boresight
+    rate_deg_s : rate about rate_axis
+    rate_axis  : perpendicular: a random axis perpendicular to the boresight; boresight; or an axis of body or camera
     gyro : whether the tracker receives the streak vector of the stars
     """
 
     kind: Literal["frames"]
     rate_deg_s: NotNegative = 0.0
+    rate_axis: RateAxis = "perpendicular"
     gyro: bool = False
+
+
+def expand_start(value: Any) -> Any:
+    """`start: scene` is short for none, `random` for a section of defaults."""
+    if isinstance(value, str):
+        return {"scene": None, "random": {}}.get(value, value)
+    return value
 
 
 class FlightTrial(ConfigModel):
     """The complete scene: motion simulated, frames rendered and solved, with the attitude filter if it has one.
 
     settle : frames before this time are not counted
+    start  : `scene`: that of the scene; `random`, or a section: a random attitude in every trial, at the scene's rate
     """
 
     kind: Literal["flight"]
+    start: Annotated[
+        AttitudeRange | None,
+        BeforeValidator(expand_start, json_schema_input_type=AttitudeRange | Literal["scene", "random"] | None),
+    ] = None
     settle_s: Annotated[Time, Field(ge=0)] = 0.0
 
 

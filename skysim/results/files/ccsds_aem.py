@@ -11,10 +11,10 @@ from scipy.spatial.transform import Rotation
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
 from skysim.core.units import in_utc
+from skysim.dynamics.profiles.frames import BODY, CAMERA, ICRF, LAB
 
 MOST_CHARACTERS = 254  # limit of a line, section 6.3 of the standard
 ORIGINATOR = "SKYSIM"  # not in the SANA registry; the standard leaves that to those who exchange the files
-ICRF, LAB, CAMERA, BODY = "ICRF", "LAB", "STARTRACKER_1", "SC_BODY_1"
 MEANING = {
     ICRF: "axes of the ICRS",
     LAB: "the laboratory: origin in the bearing's center, z up; known to this file's users only",

@@ -39,32 +39,42 @@ UNITS = {
 
 
 def to_aem(run: Recording, out: Path, bar: Bar) -> list[Path]:
-    """Write truth.aem, and solutions.aem if frames were solved. Returns the paths.
+    """Write truth.aem, solutions.aem if frames were solved, and motion.aem of a simulated motion. Returns the paths.
 
-    Attitudes are those of the camera in the ICRF under the stars, and of the body in the laboratory under a dome.
-    Raises InputError if a solution has no truth.
+    At mid-exposure, attitudes are those of the camera in the ICRF under the stars, and of the body in the laboratory
+    under a dome. The motion is that of the body at every tick of the vehicle's computer. Raises InputError if a
+    solution has no truth.
     """
     stars = run.is_celestial
     frames = (ccsds_aem.ICRF, ccsds_aem.CAMERA) if stars else (ccsds_aem.LAB, ccsds_aem.BODY)
-    true = [(truth.frame, truth.mid_utc, attitude(truth, stars)) for truth in truths(run, bar)]
+    true = [(truth.frame, truth.mid_utc, truth.t_mid_s, attitude(truth, stars)) for truth in truths(run, bar)]
     name, seed = str(run.meta["scene"]), run.meta["seed"]
-    epochs = {frame: utc for frame, utc, _ in true}
+    epochs = {frame: utc for frame, utc, _, _ in true}
 
-    def write(stem: str, content: str, utc: list[datetime.datetime], a_from_b: Rotation) -> Path:
-        comments = [f"{content} of skysim, scene {name}, seed {seed}; epochs are mid-exposure"]
+    def write(
+        stem: str, content: str, utc: list[datetime.datetime], a_from_b: Rotation, between: tuple[str, str] = frames
+    ) -> Path:
+        comments = [f"{content} of skysim, scene {name}, seed {seed}"]
         path = out / f"{stem}.aem"
-        files.write_text(path, ccsds_aem.message(name, comments, frames, utc, a_from_b))
+        files.write_text(path, ccsds_aem.message(name, comments, between, utc, a_from_b))
         return path
 
-    a_from_b = Rotation.concatenate([rotation for _, _, rotation in true])
-    written = [write("truth", "True attitude", list(epochs.values()), a_from_b)]
+    a_from_b = Rotation.concatenate([rotation for *_, rotation in true])
+    written = [write("truth", "True attitude at mid-exposure", list(epochs.values()), a_from_b)]
     solved = run.solved()
     if solved is not None:
         unknown = [frame for frame in solved[0].tolist() if frame not in epochs]
         if unknown:
             raise InputError(f"{run.folder / 'solutions.ecsv'}: unknown frame {unknown[0]}; allowed: frames with truth")
         utc = [epochs[frame] for frame in solved[0].tolist()]
-        written.append(write("solutions", "Attitude found by the star tracker", utc, solved[1]))
+        written.append(write("solutions", "Attitude found by the star tracker, at mid-exposure", utc, solved[1]))
+    motion = run.motion()
+    if motion is not None:
+        start = true[0][1] - datetime.timedelta(seconds=true[0][2])
+        utc = [start + datetime.timedelta(seconds=t_s) for t_s in motion[0].tolist()]
+        between = (ccsds_aem.ICRF if stars else ccsds_aem.LAB, ccsds_aem.BODY)
+        content = "True motion of the vehicle, without jitter,"
+        written.append(write("motion", content, utc, motion[1], between))
     return written
 
 

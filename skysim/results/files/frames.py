@@ -61,7 +61,7 @@ def write_fits(path: Path, frame: Frame, truth: Truth, scene: Scene) -> None:
 
     header = fits.Header()
     header["EXPTIME"] = (frame.exposure_s, "exposure [s]")
-    header["DATE-OBS"] = (mid_time(scene, frame).isoformat(timespec="microseconds"), "mid-exposure [UTC]")
+    header["DATE-OBS"] = (utc_text(scene, frame.t_mid_s), "mid-exposure [UTC]")
     header["TMID"] = (frame.t_mid_s, "mid-exposure since the scene's start [s]")
     header["SCENE"] = (scene.name, "scene")
     header["SEED"] = (scene.seed, "seed of every random stream")
@@ -76,8 +76,9 @@ def write_fits(path: Path, frame: Frame, truth: Truth, scene: Scene) -> None:
         fits.PrimaryHDU(frame.image_dn, header).writeto(temporary, overwrite=True)
 
 
-def mid_time(scene: Scene, frame: Frame) -> datetime.datetime:
-    return scene.start_time + datetime.timedelta(seconds=frame.t_mid_s)
+def utc_text(scene: Scene, t_s: float) -> str:
+    """A time since the scene's start as UTC, to a microsecond."""
+    return (scene.start_time + datetime.timedelta(seconds=t_s)).isoformat(timespec="microseconds")
 
 
 def write_truth(path: Path, frame: Frame, truth: Truth, scene: Scene) -> None:
@@ -103,7 +104,7 @@ def write_truth(path: Path, frame: Frame, truth: Truth, scene: Scene) -> None:
         "seed": scene.seed,
         "frame": frame.index,
         "t_mid_s": truth.t_s,
-        "mid_utc": mid_time(scene, frame).isoformat(timespec="microseconds"),
+        "mid_utc": utc_text(scene, truth.t_s),  # the true time; that of the FITS header is the camera's time tag
         "exposure_s": frame.exposure_s,
         "lab_from_body_xyzw": truth.lab_from_body.as_quat().tolist(),
         "cam_from_lab_xyzw": truth.cam_from_lab.as_quat().tolist(),

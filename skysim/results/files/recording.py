@@ -98,6 +98,23 @@ class Recording:
             return None
         return np.asarray(solutions["frame"], np.int64)[valid], attitudes(angles[valid], self.is_celestial)
 
+    def motion(self) -> tuple[Floats, Rotation] | None:
+        """(K,) times in s and lab_from_body at every tick of the vehicle's computer; None without telemetry.
+
+        Raises InputError if a column is missing.
+        """
+        telemetry = self.table("telemetry")
+        if telemetry is None:
+            return None
+        columns = [f"true_{name}" for name in LAB_ANGLES]
+        missing = [name for name in ("t_s", *columns) if name not in telemetry.colnames]
+        if missing:
+            raise InputError(
+                f"{self.folder / 'telemetry.ecsv'}: missing column {missing[0]}; allowed: a table of skysim run"
+            )
+        angles = np.column_stack([np.asarray(telemetry[name], dtype=float) for name in columns])
+        return np.asarray(telemetry["t_s"], dtype=float), attitudes(angles, is_celestial=False)
+
 
 def attitudes(angles_deg: Floats, is_celestial: bool) -> Rotation:
     """Rotations from (K, 3) angles in the convention of `scoring.angles_deg`.

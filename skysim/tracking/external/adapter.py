@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import sys
 from collections.abc import Mapping
 
 import numpy as np
@@ -15,17 +13,18 @@ from estimator.core.camera import Camera
 from estimator.core.types import Attitude, Centroids
 from estimator.trackers.pipeline import Report, Settings
 from skysim.core.errors import InputError
+from skysim.core.plugins.program import ProgramError, host_command
 from skysim.core.types import Floats, Frame
 from skysim.scene import scene as scenes
 from skysim.scene.light import StarsConfig
-from skysim.tracking.external import interface, process
-from skysim.tracking.external.interface import FAILED, OWN, Answer, Leds, Picture, Setup, Stars
+from skysim.tracking.external import process
+from skysim.tracking.external.interface import FAILED, OWN, TRACKERS, Answer, Leds, Picture, Setup, Stars
 
 
 class ExternalTracker:
     """A tracker in its own process. Every failure there becomes the status of a frame."""
 
-    def __init__(self, program: process.Program) -> None:
+    def __init__(self, program: process.TrackerProgram) -> None:
         self.program = program
 
     @classmethod
@@ -39,23 +38,20 @@ class ExternalTracker:
     ) -> ExternalTracker:
         """Start the tracker that the scene names. Raises InputError if it is unknown or refuses the set-up."""
         config, name = scene.tracker, scene.tracker.name
-        interface.check_tracker_name(name, commands)
+        TRACKERS.check_name(name, commands)
         setup = build_setup(scene, camera, settings, lights)
         if name in commands:
             arguments, image_format = process.split_command(name, commands[name])
-            return cls(process.Program(name, arguments, image_format, setup, config.time_limit_s))
-        host = [sys.executable, "-m", "skysim.tracking.external.host", name]
-        # The child gets this process's import path, so that it finds the same entry points.
-        path = os.pathsep.join(folder or os.getcwd() for folder in sys.path)
-        environment = {**os.environ, "PYTHONPATH": path}
-        return cls(process.Program(name, host, None, setup, config.time_limit_s, environment))
+            return cls(process.TrackerProgram(name, arguments, image_format, setup, config.time_limit_s))
+        host, environment = host_command("skysim.tracking.external.host", name)
+        return cls(process.TrackerProgram(name, host, None, setup, config.time_limit_s, environment))
 
     def solve_frame(self, frame: Frame, streak_px: tuple[float, float] | None = None) -> Report:
         """Send a frame; return the tracker's report."""
         picture = Picture(frame.image_dn, frame.index, frame.t_mid_s, frame.exposure_s, streak_px)
         try:
             return to_report(self.program.solve(picture))
-        except process.ProgramError as error:
+        except ProgramError as error:
             return Report(Attitude(f"{FAILED}{error}"), Centroids.empty())
 
     def solve_centroids(self, centroids: Centroids) -> Attitude:

@@ -1,30 +1,20 @@
 """The process in which an entry point's tracker runs: `python -m skysim.tracking.external.host NAME`.
 
-It speaks the protocol of docs/howto/external_tracker.md. Frames come on standard input and answers go to the
-original standard output; what the tracker itself prints goes to standard error.
+It speaks the protocol of docs/howto/external_tracker.md.
 """
 
 from __future__ import annotations
 
-import json
-import os
 import sys
 import time
 from dataclasses import replace
+from functools import partial
 from typing import IO, Any
 
 import numpy as np
 
-from skysim.core.errors import printable
-from skysim.tracking.external.interface import (
-    FAILED,
-    Answer,
-    Picture,
-    Setup,
-    Tracker,
-    check_answer,
-    entry_points,
-)
+from skysim.core.plugins.host import Respond, describe_error, serve
+from skysim.tracking.external.interface import FAILED, TRACKERS, Answer, Picture, Setup, Tracker, check_answer
 
 
 def receive_picture(header: dict[str, Any], frames: IO[bytes]) -> Picture:
@@ -34,11 +24,6 @@ def receive_picture(header: dict[str, Any], frames: IO[bytes]) -> Picture:
     streak = header["streak_px"]
     fields = (header["frame"], header["t_s"], header["exposure_s"])
     return Picture(image, *fields, None if streak is None else tuple(streak))
-
-
-def describe_error(error: Exception) -> str:
-    """An exception as one line."""
-    return printable(f"{type(error).__name__}: {error}")
 
 
 def solve_picture(tracker: Tracker, picture: Picture) -> Answer:
@@ -54,32 +39,21 @@ def solve_picture(tracker: Tracker, picture: Picture) -> Answer:
 
 def create_tracker(name: str, setup: Setup) -> Tracker:
     """Load an entry point and build its tracker."""
-    tracker = entry_points()[name].load()(setup)
+    tracker = TRACKERS.entry_points()[name].load()(setup)
     if not callable(getattr(tracker, "solve", None)):
         raise TypeError(f"{type(tracker).__name__} has no method solve")
     return tracker
 
 
-def main(name: str) -> None:
-    """Set up the tracker, then answer each frame until the input ends."""
-    frames, answers = sys.stdin.buffer, os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")
-    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
+def create(name: str, setup: dict[str, Any]) -> Respond:
+    """The function that answers frames, for `serve`."""
+    tracker = create_tracker(name, Setup.of_tree(setup))
 
-    def send(reply: dict[str, Any]) -> None:
-        answers.write(json.dumps(reply) + "\n")
-        answers.flush()
+    def respond(header: dict[str, Any], frames: IO[bytes]) -> dict[str, Any]:
+        return {"frame": header["frame"], **solve_picture(tracker, receive_picture(header, frames)).as_tree()}
 
-    try:
-        tracker = create_tracker(name, Setup.of_tree(json.loads(frames.readline())))
-    except Exception as error:
-        send({"ready": False, "status": describe_error(error)})
-        return
-    send({"ready": True})
-    while line := frames.readline():
-        header = json.loads(line)
-        answer = solve_picture(tracker, receive_picture(header, frames))
-        send({"frame": header["frame"], **answer.as_tree()})
+    return respond
 
 
 if __name__ == "__main__":
-    main(sys.argv[1])
+    serve(partial(create, sys.argv[1]))

@@ -15,10 +15,13 @@ from typing import Any, Literal, Protocol, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from skysim.core.errors import InputError, printable, unknown_name
+from skysim.core.errors import printable
+from skysim.core.plugins.kind import PluginKind
+from skysim.core.plugins.messages import finite_array, to_lists
+from skysim.core.plugins.program import MAX_STATUS_CHARS
 
-GROUP = "skysim.trackers"
 OWN = "own"  # the name of skysim's own estimator
+TRACKERS = PluginKind("tracker", "skysim.trackers", "tracker.name", (OWN,))
 SOLVED = "solved"
 FAILED = "failed: "  # start of the status after an exception, hang, crash or invalid answer
 PROTOCOL = 1  # version, the first key of the set-up
@@ -30,7 +33,6 @@ EXTRAS = {
 MIN_RAD2 = 1e-24  # smallest eigenvalue: (0.2 micro-arcseconds)^2
 MAX_CENTROIDS = 100_000
 MAX_CENTROID_PX = 1e6  # distance from the first pixel along x and y
-MAX_STATUS_CHARS = 300  # characters of a status
 
 Floats = NDArray[np.float64]
 
@@ -164,15 +166,6 @@ class Tracker(Protocol):
         ...
 
 
-def to_lists(value: Any) -> Any:
-    """Convert arrays to lists, in mappings and sequences at any depth."""
-    if isinstance(value, np.ndarray | np.generic):
-        return value.tolist()
-    if isinstance(value, Mapping):
-        return {name: to_lists(inner) for name, inner in value.items()}
-    return [to_lists(inner) for inner in value] if isinstance(value, list | tuple) else value
-
-
 def check_answer(answer: Any) -> Answer:
     """Check an answer (shapes of arrays, quaternion, covariance) and normalize its quaternion. Raises ValueError."""
     if not isinstance(answer, Answer):
@@ -192,19 +185,6 @@ def check_answer(answer: Any) -> Answer:
     if seconds is not None and seconds < 0:
         raise ValueError(f"seconds {seconds:g}; allowed: 0 or more")
     return Answer(status, quaternion, covariance, check_centroids(answer.centroids_px), seconds)
-
-
-def finite_array(value: Any, name: str, shape: tuple[int, ...]) -> Floats:
-    """An array of finite numbers of the given shape. Raises ValueError."""
-    try:
-        array = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError, OverflowError):
-        raise ValueError(f"{name} is not an array of numbers") from None
-    if array.shape != shape:
-        raise ValueError(f"{name} has shape {array.shape}; allowed: {shape}")
-    if not np.isfinite(array).all():
-        raise ValueError(f"{name} has a value that is not finite")
-    return array
 
 
 def normalize_quaternion(quaternion: Floats) -> Floats:
@@ -239,27 +219,7 @@ def check_centroids(centroids: Any) -> Floats:
     return xy_px
 
 
-def entry_points() -> dict[str, metadata.EntryPoint]:
-    """Trackers that installed packages offer, by name; none is loaded. The name `own` is reserved for skysim's."""
-    return {point.name: point for point in metadata.entry_points(group=GROUP) if point.name != OWN}
-
-
-def package_release(name: str) -> str:
-    """Name and version of the package that offers a tracker; empty for skysim's own and for programs."""
-    point = entry_points().get(name) if name != OWN else None
-    return f"{point.dist.name} {point.dist.version}" if point and point.dist else ""
-
-
 def missing_extra(point: metadata.EntryPoint) -> str:
     """The extra to install for one of skysim's own plug-ins, if it is missing; else empty. Imports nothing."""
     plugin = EXTRAS.get(point.value)
     return f"skysim[{plugin[1]}]" if plugin and find_spec(plugin[0]) is None else ""
-
-
-def check_tracker_name(name: str, commands: Mapping[str, str]) -> None:
-    """Raise InputError for an unknown tracker name."""
-    allowed = [OWN, *entry_points(), *commands]
-    if name not in allowed:
-        raise InputError(
-            f"tracker.name: {unknown_name('tracker', name, allowed)}; a program takes --program {name}=COMMAND"
-        )

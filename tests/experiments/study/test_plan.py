@@ -125,3 +125,52 @@ def test_every_study_that_comes_along_can_be_asked(path):
     told = loader.load(path)
     assert told.study.title
     assert told.trials or told.study.optimize
+
+
+FLIGHT = """schema: 1
+title: where from?
+scene: {scene}
+seed: 1
+set: {{exposure.frames: 1}}
+trial: {{kind: flight, start: {start}}}
+factors: {{hz: {{key: exposure.rate_hz, values: [1, 2]}}}}
+responses: [identified]
+"""
+
+
+@pytest.mark.parametrize(
+    ("scene", "start", "complaint"),
+    [
+        ("afit_simsat", "random", None),
+        ("afit_simsat", "scene", None),
+        ("shefex2", "{dec_deg: [0, 30]}", None),
+        ("afit_simsat", "{tilt_deg: 31}", "trial.start.tilt_deg: 31; allowed: up to vehicle.tilt_stop_deg 30"),
+        ("afit_simsat", "{dec_deg: [0, 30]}", "trial.start.dec_deg: has no effect with light of kind dome"),
+        ("shefex2", "{tilt_deg: 5}", "trial.start.tilt_deg: has no effect with light of kind stars"),
+        ("collimated_display", "random", "trial.start: random with a collimated display; allowed: scene"),
+        ("shefex2", "anywhere", r"trial\.flight\.start|trial\.start: 'anywhere' is not allowed"),
+    ],
+)
+def test_a_random_start_is_one_that_the_scene_can_have(scene, start, complaint, tmp_path):
+    path = written(tmp_path, FLIGHT.format(scene=scene, start=start))
+    if complaint is None:
+        assert loader.load(path).trials == 2
+    else:
+        with pytest.raises(InputError, match=complaint):
+            loader.load(path)
+
+
+@pytest.mark.parametrize(
+    ("axis", "complaint"),
+    [
+        ("sideways", "rate_axis: 'sideways' is not allowed"),
+        ("{body: [0, 0, 0]}", "rate_axis: allowed: one of body and camera, a vector that is not zero"),
+        ("{body: [1, 0, 0], camera: [1, 0, 0]}", "allowed: one of body and camera"),
+        ("{lab: [1, 0, 0]}", "rate_axis.lab: unknown key"),
+    ],
+)
+def test_an_axis_is_a_name_or_one_vector(axis, complaint, tmp_path):
+    trial = f"{{kind: frames, rate_deg_s: 1, rate_axis: {axis}}}"
+    text = STUDY.replace("{kind: centroids, noise_px: 0.1}", trial).replace("trial.false_lights", "seed")
+    with pytest.raises(InputError, match=complaint):
+        loader.load(written(tmp_path, text))

@@ -201,3 +201,74 @@ def test_the_scenes_hash_is_of_its_values_and_of_its_files(tmp_path):
     first = setups.scene_hash(plan.resolve_point(SKY, own)[0])
     model.write_text(text.replace("<mujoco", "<!-- other --><mujoco", 1))
     assert setups.scene_hash(plan.resolve_point(SKY, own)[0]) != first
+
+
+# --- the axis of the rate, and a flight's start ---------------------------------------------------------------
+
+FRAMES = TrialSpec("shefex2", ".", 1, {}, {"kind": "frames", "rate_deg_s": 2.0}, True)
+
+
+@pytest.mark.parametrize(
+    ("axis", "frame", "expected"),
+    [
+        ("boresight", "cam", [0, 0, 1]),
+        ({"camera": [0, 3, 0]}, "cam", [0, 1, 0]),
+        ({"body": [1, 2, -2]}, "body", [1 / 3, 2 / 3, -2 / 3]),
+    ],
+)
+def test_a_frame_turns_about_the_axis_that_is_named(axis, frame, expected):
+    """The truth's rate at mid-exposure, in that frame; the attitude and the noise are those of any other axis."""
+    usual = setups.prepared_setup(FRAMES, {})
+    ready = setups.prepared_setup(FRAMES, {"trial.rate_axis": axis})
+    _, before, _ = trials.render_trial_frame(usual, 7)
+    _, truth, _ = trials.render_trial_frame(ready, 7)
+    rate = truth.rate_cam_rad_s
+    if frame == "body":
+        rate = ready.testbed.mount.cam_from_body.inv().apply(rate)
+    np.testing.assert_allclose(rate, np.radians(2.0) * np.array(expected), rtol=0, atol=1e-12)
+    assert (truth.cam_from_lab * before.cam_from_lab.inv()).magnitude() < 1e-12
+    assert abs(before.rate_cam_rad_s[2]) < 1e-12  # perpendicular to the boresight
+
+
+def test_a_turn_about_the_boresight_leaves_its_star_where_it_is():
+    """Streaks grow with the distance from the image's center: rate x exposure x distance."""
+    ready = setups.prepared_setup(FRAMES, {"trial.rate_axis": "boresight", "trial.rate_deg_s": 20.0})
+    _, truth, streak_px = trials.render_trial_frame(ready, 3)
+    sources, camera = truth.sources, ready.testbed.scene.camera
+    distance_px = np.hypot(*(sources.xy_px - [(camera.width_px - 1) / 2, (camera.height_px - 1) / 2]).T)
+    swept = np.radians(20.0) * ready.testbed.scene.exposure.time_s * distance_px
+    near = distance_px < 150  # where tan is its angle
+    assert near.sum() > 3
+    np.testing.assert_allclose(sources.streak_px[near], swept[near], rtol=0.02, atol=0.02)
+    assert streak_px is None
+
+
+@pytest.mark.parametrize("name", ["shefex2", "afit_simsat"])
+def test_a_flight_starts_anywhere_and_the_same_for_the_same_seed(name):
+    """As evenly as the other trials' attitudes: drawn from the same stream."""
+    trial = {"kind": "flight", "start": "random"}
+    ready = setups.prepared_setup(TrialSpec(name, ".", 1, {"exposure.frames": 1}, trial, True), {})
+    kind = {"kind": "frames"}
+    other = setups.prepared_setup(TrialSpec(name, ".", 1, {"exposure.frames": 1}, kind, True), {})
+    starts = [trials.flight_testbed(ready, seed).trajectory.lab_from_body[0] for seed in (5, 6, 5)]
+    assert (starts[0].inv() * starts[2]).magnitude() == 0
+    assert (starts[0].inv() * starts[1]).magnitude() > 0.01
+    drawn = trials.random_attitude(other, trials.streams(other, 5)[0])
+    assert (starts[0].inv() * drawn).magnitude() == 0
+    scene_start = ready._replace(trial=plan.FlightTrial(kind="flight"))
+    fixed = trials.flight_testbed(scene_start, 5).trajectory.lab_from_body[0]
+    assert (fixed.inv() * ready.testbed.trajectory.lab_from_body[0]).magnitude() == 0
+
+
+def test_a_flight_from_a_random_start_is_flown_from_there():
+    changes = {"exposure.frames": 2, "exposure.first": "0.2 s"}
+    trial = {"kind": "flight", "start": {"tilt_deg": [5, 12]}}
+    spec = TrialSpec("afit_simsat", ".", 1, changes, trial, True)
+    ready = setups.prepared_setup(spec, {})
+    path = trials.run.simulate_motion(trials.flight_testbed(ready, 9)).trajectory
+    tilt_deg = np.degrees(np.arccos(path.lab_from_body.as_matrix()[:, 2, 2]))
+    assert 5 < tilt_deg[0] < 12
+    assert tilt_deg[-1] == pytest.approx(tilt_deg[0], abs=0.2)  # held for a second
+    (row,) = trials.run_segments(spec, (trials.Segment(0, {}, 0, range(1)),))
+    assert row.error is None
+    assert row.outcome.frames == 2

@@ -160,7 +160,7 @@ def trackers(json: Json = False) -> None:
     entries = [{"name": interface.OWN, "from": "skysim", "needs": ""}]
     entries += [
         {"name": name, "from": point.value, "needs": interface.missing_extra(point)}
-        for name, point in interface.entry_points().items()
+        for name, point in interface.TRACKERS.entry_points().items()
     ]
 
     def line(entry: dict[str, str]) -> str:

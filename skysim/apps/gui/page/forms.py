@@ -15,7 +15,7 @@ from skysim.core.errors import InputError
 from skysim.core.paths import SCENES
 from skysim.core.units import SI_SUFFIX
 from skysim.core.yaml_reader import read_yaml, set_key
-from skysim.scene.loader import FILE_KEYS, find, load, read
+from skysim.scene.loader import file_names, find, load, read
 from skysim.scene.motion import expand_control
 from skysim.scene.scene import NAME_ALIAS, Scene
 
@@ -131,13 +131,9 @@ def validated_scene(name: str, overrides: Mapping[str, str]) -> Scene:
     """Load the scene with the overrides. Raises InputError if it is invalid or names a file outside its folder."""
     scene = load(name, overrides)
     tree, folder = scene.model_dump(mode="json", by_alias=True), find(name).resolve().parent
-    for keys in FILE_KEYS:
-        node: Any = tree
-        for key in keys:
-            node = node.get(key) if isinstance(node, dict) else None
-        allowed = isinstance(node, str) and any((at / node).resolve().is_relative_to(at) for at in (folder, SCENES))
-        if isinstance(node, str) and not allowed:
-            raise InputError(f"{'.'.join(keys)}: {node!r}: allowed: a file in the scene's own folder")
+    for key, name in file_names(tree):
+        if not any((at / name).resolve().is_relative_to(at) for at in (folder, SCENES)):
+            raise InputError(f"{key}: {name!r}: allowed: a file in the scene's own folder")
     return scene
 
 

@@ -29,7 +29,6 @@ from skysim.simulation.run import FrameResult
 from skysim.simulation.testbed import Testbed, build_testbed, build_tracker
 from skysim.tracking import factory
 from skysim.tracking import settings as tracker_settings
-from skysim.tracking.external.adapter import ExternalTracker
 
 WINDOW_PX = (11, 7)  # enlarged pixels across and down; their values remain readable
 STAGES = ("detector", "centroider", "identifier", "solver")
@@ -201,7 +200,7 @@ def predicted_lights(estimator: DomeTracker | StarTracker, attitude: Attitude) -
 
 def matches_by_row(estimator: factory.Estimator, attitude: Attitude, xy_px: Floats) -> dict[int, tuple[int, float]]:
     """By centroid row: (id of the matched light, distance from its predicted position in pixels)."""
-    if attitude.match is None or attitude.cam_from_ref is None or isinstance(estimator, ExternalTracker):
+    if attitude.match is None or attitude.cam_from_ref is None or isinstance(estimator, factory.UserTracker):
         return {}
     ids, predicted_px = predicted_lights(estimator, attitude)
     rows, star = attitude.match.observed, attitude.match.star
@@ -211,7 +210,7 @@ def matches_by_row(estimator: factory.Estimator, attitude: Attitude, xy_px: Floa
 
 def search_windows_px(estimator: factory.Estimator, attitude: Attitude) -> tuple[tuple[float, float], ...]:
     """Predicted pixels of up to 200 lights in the field: where tracking mode would search in the next frame."""
-    if attitude.cam_from_ref is None or isinstance(estimator, ExternalTracker):
+    if attitude.cam_from_ref is None or isinstance(estimator, factory.UserTracker):
         return ()
     _, xy_px = predicted_lights(estimator, attitude)
     inside = estimator.camera.contains(np.nan_to_num(xy_px, nan=-1e9))

@@ -88,7 +88,7 @@ def replayed_frames(setup: Setup, seed: int) -> Iterator[tuple[Frame, Truth, Rep
         frame, truth, _ = trials.render_trial_frame(setup._replace(trial=frame_trial), seed)
         yield frame, truth, solve_or_failed(lambda: Report(setup.estimator.solve_centroids(centroids), centroids))
     elif isinstance(trial, FlightTrial):
-        testbed = run.simulate_motion(setup.testbed.in_run(seed))
+        testbed = run.simulate_motion(trials.flight_testbed(setup, seed))
         for result in run.run(testbed, setup.estimator):
             yield result.frame, result.truth, result.report
     else:

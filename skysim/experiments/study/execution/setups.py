@@ -8,18 +8,19 @@ from dataclasses import replace
 from functools import cache
 from hashlib import sha256
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from skysim.core.paths import DATA, ROOT
+from skysim.dynamics.controllers.interface import CONTROLLERS
 from skysim.experiments.study.factors import Settings
 from skysim.experiments.study.plan import Trial, TrialSpec, digest, resolve_point
-from skysim.scene.loader import FILE_KEYS
+from skysim.scene.loader import file_names
 from skysim.scene.scene import Scene
 from skysim.simulation.testbed import Testbed, build_testbed, build_tracker
 from skysim.tracking import factory
-from skysim.tracking.external import interface
+from skysim.tracking.external.interface import TRACKERS
 
 CACHE_SIZE = 4  # setups that a worker caches
 
@@ -71,22 +72,13 @@ def build_setup(spec: TrialSpec, settings: Settings) -> Setup:
 
 
 def scene_hash(scene: Scene) -> str:
-    """Hash of a scene, of the contents of the files it names, and of the release of an external tracker."""
+    """Hash of a scene, of the files it names, and of the releases of external tracker and controller."""
     tree = scene.model_dump(mode="json", by_alias=True)
-    contents = [sha256(Path(path).read_bytes()).hexdigest() for path in files_of(tree)]
-    return digest([tree, contents, interface.package_release(scene.tracker.name)])
-
-
-def files_of(tree: dict[str, Any]) -> list[str]:
-    """Paths of the files that a scene names in its keys, if they exist."""
-    paths = []
-    for keys in FILE_KEYS:
-        node: Any = tree
-        for key in keys:
-            node = node.get(key) if isinstance(node, dict) else None
-        if isinstance(node, str) and Path(node).is_file():
-            paths.append(node)
-    return paths
+    contents = [sha256(Path(path).read_bytes()).hexdigest() for _, path in file_names(tree) if Path(path).is_file()]
+    releases = [TRACKERS.release(scene.tracker.name)]
+    if scene.motion.control and (release := CONTROLLERS.release(scene.motion.control.law)):
+        releases.append(release)
+    return digest([tree, contents, *releases])
 
 
 @cache

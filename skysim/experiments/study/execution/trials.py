@@ -23,7 +23,7 @@ from skysim.camera.render import Poses, image_tracks, in_view
 from skysim.core import quaternion
 from skysim.core.paths import ROOT
 from skysim.core.random_streams import random_stream
-from skysim.core.types import Floats, Frame, Trajectory, Truth
+from skysim.core.types import Floats, Frame, Mount, Trajectory, Truth
 from skysim.dynamics import multibody
 from skysim.experiments.study.execution.outcomes import (
     FAILED,
@@ -35,7 +35,13 @@ from skysim.experiments.study.execution.outcomes import (
 )
 from skysim.experiments.study.execution.setups import Setup, code_version, prepared_setup, seed_of
 from skysim.experiments.study.factors import Settings
-from skysim.experiments.study.plan import CentroidTrial, FlightTrial, FrameTrial, TrialSpec
+from skysim.experiments.study.plan import (
+    AxisConfig,
+    CentroidTrial,
+    FlightTrial,
+    FrameTrial,
+    TrialSpec,
+)
 from skysim.scene.light import DomeConfig
 from skysim.scene.scene import Scene
 from skysim.simulation import exposure, run
@@ -127,12 +133,22 @@ def run_frame_trial(setup: Setup, seed: int) -> Outcome:
 
 
 def run_flight_trial(setup: Setup, seed: int) -> Outcome:
-    """Flight trial: the complete scene with another seed."""
+    """Flight trial: the complete scene with another seed, and with a random start if the trial has one."""
     trial = setup.trial
     assert isinstance(trial, FlightTrial)
-    testbed = run.simulate_motion(setup.testbed.in_run(seed))
+    testbed = run.simulate_motion(flight_testbed(setup, seed))
     outcomes = [one for t_s, one in flight_outcomes(testbed, setup.estimator) if t_s >= trial.settle_s]
     return summarize_flight(testbed, outcomes, trial.settle_s)
+
+
+def flight_testbed(setup: Setup, seed: int) -> Testbed:
+    """The test bed of a flight trial at its start."""
+    trial, testbed = setup.trial, setup.testbed.in_run(seed)
+    assert isinstance(trial, FlightTrial)
+    if trial.start is None:
+        return testbed
+    lab_from_body = random_attitude(setup, random_stream(seed, 0))
+    return replace(testbed, trajectory=Trajectory.at_rest(lab_from_body, 1.0))
 
 
 def flight_outcomes(testbed: Testbed, estimator: factory.Estimator) -> Iterator[tuple[float, Outcome]]:
@@ -176,18 +192,20 @@ def random_attitude(setup: Setup, rng: np.random.Generator) -> Rotation:
     Under a dome: tilt uniform in solid angle within `tilt_deg`, tilt direction and yaw uniform. Otherwise: boresight
     uniform over the sphere within `dec_deg`, roll uniform.
     """
-    trial = setup.trial
-    assert isinstance(trial, CentroidTrial | FrameTrial)
+    trial, testbed = setup.trial, setup.testbed
+    attitudes = trial.start if isinstance(trial, FlightTrial) else trial
+    assert attitudes is not None
     first, last = rng.uniform(0, 2 * math.pi, 2)
     # A uniform cosine of the tilt, or sine of the declination, is uniform in solid angle.
-    if isinstance(setup.testbed.scene.light, DomeConfig):
-        low, high = trial.tilt_deg if isinstance(trial.tilt_deg, tuple) else (trial.tilt_deg,) * 2
+    if isinstance(testbed.scene.light, DomeConfig):
+        tilt_deg = attitudes.tilt_deg
+        low, high = tilt_deg if isinstance(tilt_deg, tuple) else (tilt_deg,) * 2
         cosine = rng.uniform(math.cos(math.radians(high)), math.cos(math.radians(low)))
         return quaternion.to_rotation(zyz(first, math.acos(min(cosine, 1.0)), last - first))
-    low, high = (math.sin(math.radians(dec)) for dec in trial.dec_deg)
+    low, high = (math.sin(math.radians(dec)) for dec in attitudes.dec_deg)
     zenith = math.acos(min(max(rng.uniform(low, high), -1.0), 1.0))
     lab_from_cam = zyz(first, zenith, last)
-    cam_from_body = quaternion.from_rotation(setup.testbed.mount.cam_from_body)
+    cam_from_body = quaternion.from_rotation(testbed.mount.cam_from_body)
     return quaternion.to_rotation(quaternion.multiply(lab_from_cam, cam_from_body))
 
 
@@ -253,8 +271,9 @@ def render_trial_frame(setup: Setup, seed: int) -> tuple[Frame, Truth, tuple[flo
     trial, (attitude_rng, noise) = setup.trial, streams(setup, seed)
     assert isinstance(trial, FrameTrial)
     testbed = setup.testbed.in_run(int(noise.integers(2**62)))
-    middle, azimuth = random_attitude(setup, attitude_rng), attitude_rng.uniform(0, 2 * math.pi)
-    rate_cam = math.radians(trial.rate_deg_s) * np.array([math.cos(azimuth), math.sin(azimuth), 0.0])
+    middle = random_attitude(setup, attitude_rng)
+    axis_cam = rate_axis(trial.rate_axis, attitude_rng.uniform(0, 2 * math.pi), testbed.mount)
+    rate_cam = math.radians(trial.rate_deg_s) * axis_cam
     rate_body = testbed.mount.cam_from_body.inv().apply(rate_cam)
     frame, truth = exposure.render_frame(
         replace(testbed, trajectory=constant_rate(testbed.scene, middle, rate_body)), 0
@@ -262,6 +281,15 @@ def render_trial_frame(setup: Setup, seed: int) -> tuple[Frame, Truth, tuple[flo
     streak_px = exposure_window(testbed.scene, 0).exposure_s * testbed.scene.camera.focal_px
     # For a star on the boresight: d(x / z)/dt = -w_y, d(y / z)/dt = w_x.
     return frame, truth, (-rate_cam[1] * streak_px, rate_cam[0] * streak_px) if trial.gyro else None
+
+
+def rate_axis(axis: str | AxisConfig, azimuth_rad: float, mount: Mount) -> Floats:
+    """(3,) unit axis of rotation in camera axes; azimuth_rad is that of one perpendicular to the boresight."""
+    if not isinstance(axis, AxisConfig):
+        boresight = np.array([0.0, 0.0, 1.0])
+        return boresight if axis == "boresight" else np.array([math.cos(azimuth_rad), math.sin(azimuth_rad), 0.0])
+    vector = mount.cam_from_body.apply(axis.body) if axis.body is not None else np.array(axis.camera, dtype=float)
+    return np.asarray(vector / np.linalg.norm(vector))
 
 
 def constant_rate(scene: Scene, middle: Rotation, rate_body: Floats) -> Trajectory:

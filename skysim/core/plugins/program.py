@@ -1,0 +1,218 @@
+"""Run a program that a user brings: started once, it answers each message on standard input with a line of JSON.
+
+The program leads its own process group, which is killed when the program ends, when skysim ends, or after a timeout.
+External trackers and controllers both run so.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import re
+import selectors
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections import deque
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from multiprocessing.util import Finalize
+from pathlib import Path
+from typing import IO, Any
+
+from skysim.core.errors import InputError, printable
+
+START_LIMIT_S = 120.0  # for the program to report ready
+GRACE_S = 1.0  # for the program to exit after its input is closed
+MAX_ANSWER_BYTES = 16_000_000  # largest answer
+MAX_STATUS_CHARS = 300  # characters of a status
+CHUNK_BYTES = 1 << 20
+QUOTED_LINES = 3  # of standard error that an error message quotes
+FOLDER = re.compile(r"\{folder(?::(\w+))?\}")
+
+
+class ProgramError(Exception):
+    """The program hung, exited or sent an invalid answer; the message is one line."""
+
+
+@dataclass
+class RunningProcess:
+    """A running process with the last lines of its standard error and its folder; `stop` cleans up all of it."""
+
+    process: subprocess.Popen[bytes]
+    folder: Path | None
+    last_lines: deque[str] = field(default_factory=lambda: deque(maxlen=QUOTED_LINES))
+    stderr_reader: threading.Thread | None = None
+
+    def collect_stderr(self, errors: IO[bytes]) -> None:
+        """Read standard error and keep the last lines, so that a full pipe never blocks the program."""
+        with errors:
+            for line in iter(lambda: errors.readline(4096), b""):
+                text = printable(line.decode(errors="replace"))
+                if text:
+                    self.last_lines.append(text[: MAX_STATUS_CHARS // 2])
+
+    def stop(self, grace_s: float = GRACE_S) -> int:
+        """Wait for the process to exit, kill its group after grace_s, remove its folder; return the exit code."""
+        if self.process.returncode is not None:
+            return self.process.returncode
+        assert self.process.stdin is not None
+        assert self.process.stdout is not None
+        with contextlib.suppress(OSError):
+            self.process.stdin.close()
+        until_s = time.monotonic() + grace_s
+        # WNOWAIT leaves the process unreaped, so its id cannot be reused and killpg hits only this group.
+        flags = os.WEXITED | os.WNOWAIT | os.WNOHANG
+        while time.monotonic() < until_s and os.waitid(os.P_PID, self.process.pid, flags) is None:
+            time.sleep(0.005)
+        with contextlib.suppress(ProcessLookupError, PermissionError):
+            os.killpg(self.process.pid, signal.SIGKILL)
+        code = self.process.wait()
+        self.process.stdout.close()
+        if self.stderr_reader:
+            self.stderr_reader.join(GRACE_S)
+        if self.folder:
+            shutil.rmtree(self.folder, ignore_errors=True)
+        return code
+
+    def exit_message(self) -> str:
+        """How the process ended, with its last lines of standard error."""
+        code = self.stop()
+        reason = f"code {code}" if code >= 0 else signal.Signals(-code).name
+        return f"the program ended ({reason}): {' | '.join(self.last_lines) or 'nothing on standard error'}"
+
+
+class Program:
+    """A program that answers messages.
+
+    key, name      : key of the scene that names it, and its name, for error messages
+    arguments      : the command; `{folder}` in it becomes a temporary folder
+    setup          : JSON object that is sent first
+    limit_s        : time limit per answer
+    environment    : in place of this process's
+    Raises InputError where it cannot be started or refuses the set-up.
+    """
+
+    def __init__(
+        self,
+        key: str,
+        name: str,
+        arguments: Sequence[str],
+        setup: Mapping[str, Any],
+        limit_s: float,
+        environment: Mapping[str, str] | None = None,
+    ) -> None:
+        self.name, self.arguments, self.limit_s, self.environment = name, arguments, limit_s, environment
+        self.setup_message = (json.dumps(setup) + "\n").encode()
+        self.running: RunningProcess | None = None
+        self.received = bytearray()
+        self._finalizer: Finalize | None = None
+        try:
+            self.start()
+        except ProgramError as error:
+            raise InputError(f"{key}: {name}: {error}") from None
+
+    def start(self) -> None:
+        """Start the process and wait until it is ready. Raises ProgramError."""
+        has_folder = any(FOLDER.search(part) for part in self.arguments)
+        folder = Path(tempfile.mkdtemp(prefix="skysim-")) if has_folder else None
+        arguments = [FOLDER.sub(str(folder), part) for part in self.arguments]
+        pipe = subprocess.PIPE
+        try:
+            process = subprocess.Popen(
+                arguments,
+                stdin=pipe,
+                stdout=pipe,
+                stderr=pipe,
+                bufsize=0,
+                start_new_session=True,
+                env=self.environment,
+            )
+        except OSError as error:
+            if folder:
+                shutil.rmtree(folder, ignore_errors=True)
+            raise ProgramError(f"{arguments[0]!r} cannot be started: {error.strerror}") from None
+        running = RunningProcess(process, folder)
+        self.running, self.received = running, bytearray()
+        # Ends the program with this process; `atexit` does not run in a multiprocessing worker, Finalize does.
+        self._finalizer = Finalize(self, running.stop, (0.0,), exitpriority=10)
+        assert process.stdin is not None
+        assert process.stdout is not None
+        running.stderr_reader = threading.Thread(target=running.collect_stderr, args=(process.stderr,), daemon=True)
+        running.stderr_reader.start()
+        for pipe_end in (process.stdin, process.stdout):
+            os.set_blocking(pipe_end.fileno(), False)
+        reply = self.exchange([self.setup_message], START_LIMIT_S)
+        if not isinstance(reply, dict) or reply.get("ready") is not True:
+            status = reply.get("status") if isinstance(reply, dict) else reply
+            raise self.fail(printable(status if status else reply)[:MAX_STATUS_CHARS])
+
+    def exchange(self, message: list[bytes], limit_s: float) -> Any:
+        """Write a message and read one line of JSON within the time limit. Raises ProgramError."""
+        line = self.transfer(b"".join(message), time.monotonic() + limit_s, limit_s)
+        try:
+            return json.loads(line)
+        except (ValueError, RecursionError):
+            raise self.fail(f"{line[:80].decode(errors='replace')!r} is not JSON") from None
+
+    def transfer(self, message: bytes, until_s: float, limit_s: float) -> bytes:
+        """Serve both pipes at once: the program may answer before it has read everything, and must not deadlock."""
+        assert self.running is not None
+        process = self.running.process
+        assert process.stdin is not None
+        assert process.stdout is not None
+        unsent = memoryview(message)
+        with selectors.DefaultSelector() as pipes:
+            pipes.register(process.stdout, selectors.EVENT_READ)
+            pipes.register(process.stdin, selectors.EVENT_WRITE)
+            while unsent or b"\n" not in self.received:
+                ready = {key.fileobj for key, _ in pipes.select(max(until_s - time.monotonic(), 0.0))}
+                if time.monotonic() >= until_s:
+                    raise self.fail(f"no answer within {limit_s:g} s", 0.0)
+                if process.stdin in ready and unsent:
+                    try:
+                        unsent = unsent[os.write(process.stdin.fileno(), unsent[:CHUNK_BYTES]) :]
+                    except BrokenPipeError:
+                        unsent = unsent[:0]
+                    if not unsent:
+                        pipes.unregister(process.stdin)
+                if process.stdout in ready:
+                    self.receive(os.read(process.stdout.fileno(), CHUNK_BYTES))
+        line, _, rest = bytes(self.received).partition(b"\n")
+        self.received = bytearray(rest)
+        return line
+
+    def receive(self, chunk: bytes) -> None:
+        """Buffer what the program wrote. Raises ProgramError when it ends or when an answer is too long."""
+        if not chunk:
+            assert self.running is not None
+            raise self.fail(self.running.exit_message())
+        self.received += chunk
+        if len(self.received) > MAX_ANSWER_BYTES:
+            raise self.fail(f"answer of more than {MAX_ANSWER_BYTES} bytes", 0.0)
+
+    def fail(self, reason: str, grace_s: float = GRACE_S) -> ProgramError:
+        """End the process, since its next output could answer an earlier message; return the error to raise."""
+        self.close(grace_s)
+        return ProgramError(reason)
+
+    def close(self, grace_s: float = GRACE_S) -> None:
+        """End the process and its group, and remove its folder."""
+        if self._finalizer and self.running:
+            self._finalizer.cancel()
+            self.running.stop(grace_s)
+        self.running = None
+
+
+def host_command(module: str, name: str) -> tuple[list[str], dict[str, str]]:
+    """Command and environment of a Python process that hosts the plug-in `name` (see `host.serve`).
+
+    The child gets this process's import path, so that it finds the same entry points.
+    """
+    path = os.pathsep.join(folder or os.getcwd() for folder in sys.path)
+    return [sys.executable, "-m", module, name], {**os.environ, "PYTHONPATH": path}

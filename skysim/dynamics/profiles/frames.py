@@ -1,0 +1,35 @@
+"""Reference frames of attitude files by the names that CCSDS and STK give them."""
+
+from __future__ import annotations
+
+from scipy.spatial.transform import Rotation
+
+from skysim.core.errors import InputError
+from skysim.dynamics.profiles.text import excerpt
+
+ICRF, LAB, CAMERA, BODY = "ICRF", "LAB", "STARTRACKER_1", "SC_BODY_1"  # as skysim writes them
+EME2000 = ("EME2000", "J2000")
+REFERENCES = {ICRF: "icrs", "GCRF": "icrs", LAB: "lab", **dict.fromkeys(EME2000, "icrs")}  # frame of Samples, by name
+VEHICLES = {BODY: "body", "SC_BODY": "body", CAMERA: "cam", "STARTRACKER": "cam"}
+J2000_TT = 2451545.0, 0.0  # as a Julian date in two parts
+
+
+def frame_of(where: str, name: str) -> str:
+    """The frame (icrs, lab, body or cam) that a file's name stands for. Raises InputError."""
+    frames = REFERENCES | VEHICLES
+    if name.upper() not in frames:
+        raise InputError(f"{where}: unknown frame {excerpt(name)}; allowed: {', '.join(frames)}")
+    return frames[name.upper()]
+
+
+def icrs_from(name: str) -> Rotation:
+    """Rotation to the ICRS's axes from those of an inertial frame: the frame bias of 23 mas from EME2000, else none.
+
+    The bias is that of IAU 2006 (ERFA's bp06).
+    """
+    import erfa
+
+    if name.upper() not in EME2000:
+        return Rotation.identity()
+    mean_from_icrs, _, _ = erfa.bp06(*J2000_TT)
+    return Rotation.from_matrix(mean_from_icrs).inv()

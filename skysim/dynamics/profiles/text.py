@@ -1,0 +1,114 @@
+"""Text files of attitude samples: read within limits, numbers and epochs with the line of what is wrong."""
+
+from __future__ import annotations
+
+import datetime
+import re
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from skysim.core.errors import InputError, printable
+from skysim.core.types import Floats
+
+MAX_BYTES = 200_000_000  # of a file: a million lines of 200 characters
+MAX_EXCERPT = 40  # characters of a value in a message
+EPOCH = re.compile(r"(?:19|20|21)\d\d-(\d\d-\d\d|\d{3})[T ]\d\d:\d\d:\d\d(\.\d{0,15})?Z?", re.ASCII)
+SCALES = {"UTC": "utc", "TAI": "tai", "TT": "tt", "TDB": "tdb", "GPS": "tai"}  # astropy's, by CCSDS's time systems
+GPS_MINUS_TAI_S = -19.0
+
+Line = tuple[int, str]  # number from 1, and content
+
+
+def read_lines(path: Path) -> list[Line]:
+    """The numbered lines of a text file, without blank ones. Raises InputError for one too large or not UTF-8 text."""
+    try:
+        size = path.stat().st_size
+        if size > MAX_BYTES:
+            raise InputError(f"{path}: {size} bytes; allowed: up to {MAX_BYTES}")
+        text = path.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from None
+    return [(n, line.strip()) for n, line in enumerate(text.split("\n"), 1) if line.strip()]
+
+
+def excerpt(text: object) -> str:
+    """A value for a message, on one line and truncated."""
+    shown = printable(text)
+    return repr(shown if len(shown) <= MAX_EXCERPT else f"{shown[:MAX_EXCERPT]}…")
+
+
+def to_numbers(source: str, places: Sequence[int], rows: Sequence[Sequence[str]], width: int) -> Floats:
+    """(N, width) finite numbers of the words of each line. Raises InputError for the first line that has others."""
+    for line, words in zip(places, rows, strict=True):
+        if len(words) != width:
+            raise InputError(f"{source}, line {line}: {len(words)} numbers; allowed: {width}")
+    try:
+        numbers = np.array(rows, dtype=np.float64).reshape(-1, width)
+    except ValueError:
+        numbers = np.full((1, width), np.nan)
+    if not np.isfinite(numbers).all():
+        for line, words in zip(places, rows, strict=True):
+            check_numbers(f"{source}, line {line}", words)
+    return numbers
+
+
+def check_numbers(where: str, words: Sequence[str]) -> None:
+    """Raise InputError for the first word that is not a finite number."""
+    for word in words:
+        try:
+            number = float(word)
+        except ValueError:
+            raise InputError(f"{where}: {excerpt(word)} is not a number") from None
+        if not np.isfinite(number):
+            raise InputError(f"{where}: {excerpt(word)} is not a finite number")
+
+
+def seconds_since(
+    source: str, places: Sequence[int], epochs: Sequence[str], start: datetime.datetime, system: str, unit: str = "line"
+) -> Floats:
+    """(N,) seconds from a start in UTC to epochs (ISO 8601, calendar or day of year) of a time system of SCALES.
+
+    UTC is taken as uniform, like the scene's own times: a leap second between the two is not counted. Raises
+    InputError for the first epoch that is not one.
+    """
+    from astropy.time import Time
+
+    bad = [n for n, epoch in enumerate(epochs) if not EPOCH.fullmatch(epoch)]
+    bad += [n for n, epoch in enumerate(epochs) if len(epoch.split("-")) != len(epochs[0].split("-"))]
+    if bad:
+        raise InputError(
+            f"{source}, {unit} {places[min(bad)]}: {excerpt(epochs[min(bad)])} is not an epoch; allowed:"
+            " 2012-06-22T21:00:00.5, or all of the form 2012-174T21:00:00.5"
+        )
+    texts = [epoch.rstrip("Z").replace(" ", "T") for epoch in epochs]
+    ordinal = bool(texts) and texts[0].count("-") == 1
+    kind, scale = ("yday" if ordinal else "isot"), SCALES[system]
+    if ordinal:
+        texts = [text.replace("-", ":", 1).replace("T", ":", 1) for text in texts]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # "dubious year": leap seconds of the future are unknown
+        try:
+            times = Time(texts, format=kind, scale=scale).utc
+        except ValueError:
+            n = next(n for n, text in enumerate(texts) if not is_time(text, kind, scale))
+            raise InputError(f"{source}, {unit} {places[n]}: {excerpt(epochs[n])} is not a date and time") from None
+        times.precision = 9
+    try:
+        nanoseconds = np.array(times.isot, dtype="datetime64[ns]") - np.datetime64(start, "ns")
+    except ValueError:
+        raise InputError(f"{source}: an epoch within a leap second; allowed: other times") from None
+    return nanoseconds.astype(np.int64) / 1e9 - (GPS_MINUS_TAI_S if system == "GPS" else 0.0)
+
+
+def is_time(text: str, kind: str, scale: str) -> bool:
+    """Whether astropy takes the text for a time."""
+    from astropy.time import Time
+
+    try:
+        Time(text, format=kind, scale=scale)
+    except ValueError:
+        return False
+    return True

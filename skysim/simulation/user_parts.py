@@ -1,0 +1,89 @@
+"""A scene with parts that are given in Python: a controller, a star tracker, or an attitude profile."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from estimator.trackers.dome_tracker import DomeTracker
+from estimator.trackers.star_tracker import StarTracker
+from skysim.core.errors import InputError
+from skysim.core.yaml_reader import is_file
+from skysim.scene.motion import PRESCRIBED, ControlConfig, MotionConfig, ProfileConfig
+from skysim.scene.scene import Scene
+from skysim.simulation.testbed import Testbed, build_testbed
+from skysim.tracking import factory
+from skysim.tracking.external.function import FunctionTracker
+
+GIVEN_TABLE = "(table)"  # in place of a profile's file
+
+
+def build_testbed_with(
+    scene: Scene,
+    programs: Mapping[str, str] = factory.NO_PROGRAMS,
+    controller: Any = None,
+    tracker: Any = None,
+    profile: Any = None,
+) -> Testbed:
+    """The test bed of a scene in which these parts replace the scene's own; see `results.run.simulate`.
+
+    Raises InputError for a part of another type, and as `build_testbed` does.
+    """
+    motion, law, estimator = scene.motion, None, None
+    if controller is not None:
+        motion, law = with_controller(motion, controller)
+    if profile is not None:
+        motion = with_profile(motion, profile)
+    scene = scene.model_copy(update={"motion": motion})
+    if tracker is not None:
+        scene, estimator = with_tracker(scene, tracker)
+    table = None if isinstance(profile, str | Path) else profile
+    return build_testbed(scene, programs, controller=law, tracker=estimator, profile=table)
+
+
+def with_controller(motion: MotionConfig, controller: Any) -> tuple[MotionConfig, Any]:
+    """The motion with a controller, and the factory of one that is not given by name."""
+    config = motion.control or ControlConfig()
+    if not (isinstance(controller, str) or callable(controller)):
+        raise InputError(f"controller: {type(controller).__name__}; allowed: a name, or a callable that takes a set-up")
+    law = controller if isinstance(controller, str) else name_of(controller)
+    changed = motion.model_copy(update={"control": config.model_copy(update={"law": law})})
+    return changed, None if isinstance(controller, str) else controller
+
+
+def with_profile(motion: MotionConfig, profile: Any) -> MotionConfig:
+    """The motion along a profile only, from its own start; prescribed if there is no controller."""
+    if isinstance(profile, str | Path) and not is_file(Path(profile)):
+        raise InputError(f"profile: {profile} is not a file; allowed: a file, or a table")
+    file = str(profile) if isinstance(profile, str | Path) else GIVEN_TABLE
+    element = ProfileConfig.model_construct(kind="profile", file=file)
+    return motion.model_copy(
+        update={
+            "start": "profile",
+            "rate_deg_s": (0.0, 0.0, 0.0),
+            "maneuver": (element,),
+            "control": motion.control or ControlConfig(law=PRESCRIBED),
+        }
+    )
+
+
+def with_tracker(scene: Scene, tracker: Any) -> tuple[Scene, factory.Estimator | None]:
+    """The scene with a tracker, and the tracker if it is not given by name."""
+    estimator: factory.Estimator | None = None
+    if isinstance(tracker, StarTracker | DomeTracker):
+        estimator = tracker
+    elif callable(tracker) and not isinstance(tracker, type):
+        estimator = FunctionTracker(name_of(tracker), tracker)
+    elif not isinstance(tracker, str):
+        what = f"the class {tracker.__name__}" if isinstance(tracker, type) else type(tracker).__name__
+        raise InputError(f"tracker: {what}; allowed: a name, a function of an image, a StarTracker or a DomeTracker")
+    name = tracker if isinstance(tracker, str) else name_of(tracker)
+    config = scene.tracker.model_copy(update={"name": name})
+    return scene.model_copy(update={"tracker": config}), estimator
+
+
+def name_of(part: Any) -> str:
+    """Name of a function or class, or of an object's class, for messages and reports."""
+    return re.sub(r"\W", "", getattr(part, "__name__", type(part).__name__)) or "function"
