@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from functools import partial
 from pathlib import Path
 
 from pydantic import ValidationError
 
 from skysim.core.errors import InputError, unknown_name
 from skysim.core.yaml_reader import check_version, explain, line_of, read_yaml, set_key
+from skysim.experiments.study import unused_options
 from skysim.experiments.study.designs import make_point
 from skysim.experiments.study.factors import Factor, Settings, Value
 from skysim.experiments.study.plan import CentroidTrial, Curve, FlightTrial, Plan, Study, find, make_plan, resolve_point
@@ -76,9 +78,11 @@ def check(plan: Plan, to_run: bool) -> None:
     for name in study.factors:
         if name in COLUMNS or name in study.responses:
             raise InputError(f"factors.{name}: the name is that of a column of the trials; allowed: another name")
-    for name, level, settings in each_level(study.factors):
+    points = []
+    for name, level, own, settings in each_level(study.factors):
         try:
             scene, trial = resolve_point(plan.spec, settings)
+            points.append(unused_options.CheckedPoint(name, level, own, settings, scene, trial))
             if isinstance(scene.light, CollimatedDisplayConfig) and not isinstance(trial, FlightTrial):
                 raise InputError(f"trial.kind: {trial.kind} with a collimated display; allowed: flight")
             if to_run:
@@ -92,12 +96,13 @@ def check(plan: Plan, to_run: bool) -> None:
             owner = name if name in owners or not owners else owners[0]
             value = level if owner == name else study.factors[owner].value_at(0.5)[0]
             raise InputError(f"factors.{owner}: {value!r}: {error}") from None
+    unused_options.check(plan, points, partial(resolve_point, plan.spec))
 
 
-def each_level(factors: Mapping[str, Factor]) -> Iterator[tuple[str, Value, Settings]]:
-    """Every level of every factor with the other factors at their middle: factor, level, all settings."""
+def each_level(factors: Mapping[str, Factor]) -> Iterator[tuple[str, Value, Settings, Settings]]:
+    """Every level of every factor with the other factors at their middle: factor, level, its settings, all settings."""
     middle = {name: factor.value_at(0.5) for name, factor in factors.items()}
     for name, factor in factors.items():
         others = make_point({other: chosen for other, chosen in middle.items() if other != name}).settings
         for level, settings in factor.options() or [middle[name]]:
-            yield name, level, others | settings
+            yield name, level, settings, others | settings
