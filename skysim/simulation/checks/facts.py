@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from skysim.camera.psf.otf import blur_radius_px
 from skysim.core.types import Floats
@@ -19,6 +20,7 @@ from skysim.simulation.checks.expected_error import Expected, mean_root
 from skysim.simulation.checks.views import View
 
 GAUSSIAN_WIDTH = 4.0  # width of an image over its rms radius: D4sigma (ISO 11146), the diameter of a uniform disk
+SIDES = 12  # to which the greatest tilt is tried, and rays around the field
 MIN_SHARE = 0.005  # of the variance of a cause that is printed
 ARCSEC = "″"
 
@@ -150,8 +152,9 @@ class CapMargin(NamedTuple):
 def cap_margin(context: Context, samples: Samples) -> CapMargin | None:
     """How far the LEDs reach beyond the field at the greatest tilt; None without a layout that fills a cap.
 
-    The middles of the chip's edges are traced to the surface from the pupil at the most tilted attitudes; their angle
-    from the zenith, as seen from the bearing, is what `light.layout.cap_deg` is compared with.
+    The field is taken as the circle of half its longer side, since any side may point outward. Rays of that circle are
+    traced to the surface from the pupil, at the greatest tilt to all sides; their angle from the zenith, as seen from
+    the bearing, is what `light.layout.cap_deg` is compared with.
     """
     light, surface, camera = context.testbed.scene.light, context.surface, context.camera.optics.camera
     if not isinstance(light, DomeConfig) or surface is None:
@@ -159,19 +162,19 @@ def cap_margin(context: Context, samples: Samples) -> CapMargin | None:
     points = getattr(light.layout, "points", light.layout)
     if points.kind == "listed" or getattr(points, "boards", ()):
         return None
-    half_x, half_y = camera.width_px / 2 / camera.focal_px, camera.height_px / 2 / camera.focal_px
-    rays_cam = np.array([[half_x, 0, 1], [-half_x, 0, 1], [0, half_y, 1], [0, -half_y, 1]])
-    mount, reach = context.testbed.mount, samples.reach.attitudes
-    tilts = attitudes.tilts_rad(reach)
+    mount = context.testbed.mount
+    tilt_rad = attitudes.greatest_tilt_rad(context.testbed.scene, samples.frames.attitudes)
+    azimuth = 2 * np.pi * np.arange(SIDES) / SIDES
+    radius = max(camera.width_px, camera.height_px) / 2 / camera.focal_px
+    rays_cam = np.column_stack([radius * np.cos(azimuth), radius * np.sin(azimuth), np.ones(SIDES)])
     needed_deg = 0.0
-    for n in np.argsort(-tilts, kind="stable")[:8]:
-        lab_from_body = reach.lab_from_body[n]
+    for lab_from_body in Rotation.from_euler("ZYZ", np.column_stack([azimuth, np.full(SIDES, tilt_rad), -azimuth])):
         rays = lab_from_body.apply(mount.cam_from_body.inv().apply(rays_cam))
         met = surface.meet(lab_from_body.apply(mount.camera_body_m), rays)
         # A ray that misses the surface passes below its rim: its own direction is the least that it needs.
         met = np.where(np.isnan(met), rays, met)
         needed_deg = max(needed_deg, float(np.degrees(np.arctan2(np.hypot(*met.T[:2]), met[:, 2])).max()))
-    return CapMargin(float(points.cap_deg), float(np.degrees(tilts.max())), needed_deg)
+    return CapMargin(float(points.cap_deg), math.degrees(tilt_rad), needed_deg)
 
 
 def cap(context: Context, samples: Samples) -> Fact | None:

@@ -92,9 +92,9 @@ def density_key(layout: Layout) -> str:
 
 
 def denser(layout: Layout, mean: float) -> str:
-    """How to get at least twice the lights that an identification needs, from the mean number on the chip."""
+    """How to get a mean of three times the lights that an identification needs, from the mean number on the chip."""
     points = layout.points if isinstance(layout, FibersConfig | LcdConfig) else layout
-    factor = max(2 * MIN_LIGHTS / max(mean, 0.5), 1.5)
+    factor = max(3 * MIN_LIGHTS / max(mean, 0.5), 1.5)
     count, spacing_m = getattr(points, "count", None), getattr(points, "spacing_m", None)
     if count is not None:
         return f"change it to {math.ceil(factor * count)}"
@@ -147,8 +147,8 @@ def out_of_focus(context: Context, samples: Samples) -> str:
     sharp_px = GAUSSIAN_WIDTH * float(np.median(np.sqrt(np.maximum(sigma**2 - defocus**2 / 4, 0))))
     if blur_px <= max(MAX_DEFOCUS * sharp_px, MIN_DEFOCUS_PX):
         return ""
-    middle_m = 2 / float(1 / distance_m.min() + 1 / distance_m.max())  # infinite for stars
-    best = f"{middle_m:.3g} m" if math.isfinite(middle_m) else "infinity"
+    middle = float(1 / distance_m.min() + 1 / distance_m.max()) / 2  # 1/m; 0 for stars
+    best = f"{1 / middle:.3g} m" if middle else "infinity"
     text = f"images are {blur_px:.1f} px out of focus and would be {sharp_px:.1f} px wide"
     return f"camera.focus: {text}; change it to {best}"
 
