@@ -11,6 +11,7 @@ import pytest
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from skysim.core.errors import InputError
 from skysim.core.units import ARCSEC_RAD
 from skysim.dynamics import multibody
 from skysim.scene import loader
@@ -81,6 +82,18 @@ def test_without_a_controller_the_bearing_may_tilt_to_its_stop() -> None:
     testbed = bed("afit_simsat", motion__control="none", motion__maneuver="[]")
     frames = attitudes.of_frames(testbed.scene, testbed.trajectory.lab_from_body[0])
     assert math.degrees(attitudes.greatest_tilt_rad(testbed.scene, frames)) == pytest.approx(30)
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({"motion__start": "{pitch_deg: 40}", "motion__maneuver": "[]"}, "motion.start: tilt of 40.0 deg"),
+        ({"motion__maneuver": TILTED.replace("25", "35")}, "motion.maneuver: tilt of 3"),
+    ],
+)
+def test_a_tilt_beyond_the_stop_is_refused_as_by_a_run(changes: dict[str, str], told: str) -> None:
+    with pytest.raises(InputError, match=f"{told}.*allowed: up to vehicle.tilt_stop_deg 30"):
+        check(bed("afit_simsat", **changes))
 
 
 # Facts

@@ -10,7 +10,7 @@ Not refused is what is written to the results although the run does not use it: 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -311,12 +311,19 @@ def check(
     scene : with the overrides;  own : keys of its own file, not of its base;  files : for the location
     without_overrides : makes the scene of the file alone
     """
-    if broken := find(RULES, override_keys(overrides), scene):
-        raise InputError(f"{message(*broken)} {location_of(broken[0].split('.'), files, overrides)}")
+    check_overrides([scene], overrides)
     for key in set_keys(own):
         broken = find(RULES, [key], scene)
         if broken and (not overrides or useless_in_file(key, without_overrides)):
             raise InputError(f"{message(*broken)} {location_of(key.split('.'), files, {})}")
+
+
+def check_overrides(scenes: Sequence[Scene], overrides: Mapping[str, str]) -> None:
+    """Raise InputError for the first key of the overrides that has no effect in any of the scenes."""
+    for key in override_keys(overrides):
+        broken = [find(RULES, [key], scene) for scene in scenes]
+        if broken[0] and all(broken):
+            raise InputError(f"{message(*broken[0])} (--set)")
 
 
 def useless_in_file(key: str, without_overrides: Callable[[], Scene]) -> bool:

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from skysim.core.errors import InputError
 from skysim.core.types import Floats, Mount
 from skysim.dynamics import guidance, multibody
 from skysim.scene.light import StarsConfig
@@ -46,7 +47,25 @@ def of_frames(scene: Scene, lab_from_start: Rotation) -> Attitudes:
     chosen = set(np.linspace(0, len(index) - 1, min(len(index), FRAMES)).astype(int))
     chosen |= {int(np.linalg.norm(every.rate_body_rad_s, axis=1).argmax()), int(tilts_rad(every).argmax())}
     rows = np.array(sorted(chosen))
+    tilt_rad = tilts_rad(every)[rows]
+    if scene.vehicle.mount == "air_bearing":
+        check_stop(scene, t_s[rows], np.degrees(tilt_rad))
+        rows = rows[tilt_rad <= math.radians(scene.vehicle.tilt_stop_deg)]
     return Attitudes(every.lab_from_body[rows], every.rate_body_rad_s[rows], t_s[rows])
+
+
+def check_stop(scene: Scene, t_s: Floats, tilt_deg: Floats) -> None:
+    """Raise InputError for a start or a maneuver beyond the tilt stop, as a run would."""
+    stop_deg, beyond = scene.vehicle.tilt_stop_deg, np.flatnonzero(tilt_deg > scene.vehicle.tilt_stop_deg)
+    if len(beyond) == len(tilt_deg):
+        raise InputError(
+            f"motion.start: tilt of {tilt_deg[0]:.1f} deg; allowed: up to vehicle.tilt_stop_deg {stop_deg:g}"
+        )
+    if len(beyond) and scene.motion.control is not None:
+        raise InputError(
+            f"motion.maneuver: tilt of {tilt_deg[beyond[0]]:.3g} deg at {t_s[beyond[0]]:.3g} s; allowed: up to"
+            f" vehicle.tilt_stop_deg {stop_deg:g}"
+        )
 
 
 def attitudes_at(scene: Scene, lab_from_start: Rotation, t_s: Floats) -> Attitudes:

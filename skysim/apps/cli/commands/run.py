@@ -136,7 +136,7 @@ def compare(
     from skysim.simulation.testbed import build_testbed
     from skysim.tracking.external import process
 
-    loaded = load(scene, frames, seed, [*(set_ or []), f"tracker.name={tracker[0]}"])
+    loaded = load(scene, frames, seed, set_, tracker)
     testbed = build_testbed(loaded, process.program_commands(program))
     entrants = tracker_comparison.build_trackers(testbed, tracker)
     with terminal.progress_callback("simulating the motion", quiet=json) as update:
