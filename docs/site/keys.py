@@ -7,8 +7,8 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from skysim.apps.gui.page.forms import file_value, si_unit, yaml_line
-from skysim.core.units import ConfigModel
+from skysim.apps.gui.page.forms import file_value, yaml_line
+from skysim.core.units import ConfigModel, si_unit
 from skysim.experiments.study.plan import Study  # noqa: F401  so that `subclasses` finds its sections
 from skysim.scene.scene import NAME_ALIAS
 

@@ -93,7 +93,7 @@ def spoilt(tmp_path: Path, whole: Path, right: str, wrong: str) -> tuple[str, st
     ],
 )
 def test_a_quantity_becomes_si(key: str, quantity: str, value: float) -> None:
-    node: object = loader.load("afit_simsat", {key: quantity}, refuses_unused=False)
+    node: object = loader.load("afit_simsat", {key: quantity})
     for part in key.split("."):
         (name,) = [n for n in type(node).model_fields if SI_SUFFIX.sub("", n) == part]
         node = getattr(node, name)

@@ -17,7 +17,7 @@ from skysim.tracking.factory import solve_frame
 
 SMALL = {"exposure.frames": "1", "camera.width_px": "400", "camera.height_px": "300"}
 IMU = "{gyro: {bias_deg_h: 0}, accelerometer: {bias_ug: 0}}"
-WHEELS, CMGS = "{torque_limit: 1 N m}", "{gimbal_rate_limit_deg_s: 5, steering: pseudo_inverse}"
+CMGS = "{gimbal_rate_limit_deg_s: 5, steering: pseudo_inverse}"
 BOARDS = (
     "{kind: patch_boards, cap_deg: 27, pitch: 8 mm, boards: [{azimuth_deg: 0, tilt_deg: 1, leds: [0, 2, 4, 7, 8]}]}"
 )
@@ -97,10 +97,7 @@ CASES = [
     Case(DOME, {}, "camera.detector.anti_blooming", "0.5", {"camera.detector.blooming": "column"}),
     Case(DOME, {}, "site.latitude_deg", "10", {"vehicle.disturbances.earth_rotation": "true"}),
     Case(SKY, {}, "vehicle.tilt_stop_deg", "20", {"vehicle.mount": "air_bearing"}),
-    Case(SKY, {}, "vehicle.torque_limit", "3 N m", {"motion.control": "pid"}),
-    Case(DOME, {}, "vehicle.wheels", WHEELS, {"motion.control": "{actuators: wheels}"}),
     Case(DOME, {}, "vehicle.cmgs", CMGS, {"motion.control": "{actuators: cmgs}"}),
-    Case(DOME, {}, "vehicle.fans", "{}", {"motion.control": "{actuators: fans}"}),
     Case(DOME, {"vehicle.imu": IMU}, "vehicle.imu.gyro.bias_time", "9 s", {"vehicle.imu.gyro.bias_deg_h": "1"}),
     Case(
         DOME,
@@ -138,8 +135,7 @@ def test_a_key_without_effect_is_refused(case: Case) -> None:
 def test_every_rule_has_a_case() -> None:
     """But the one for a map, which needs a file (below)."""
     covered = {rule.reason for case in CASES for rule in unused.RULES if unused.section_of(case.key, rule)}
-    inner = ("vehicle.wheels.torque_limit", "vehicle.cmgs.steering")  # set by cases of the section
-    covered |= {rule.reason for rule in unused.RULES if set(inner) & set(rule.keys)}
+    covered |= {rule.reason for rule in unused.RULES if "vehicle.cmgs.steering" in rule.keys}  # set with its section
     missing = [rule.keys for rule in unused.RULES if rule.reason not in covered]
     assert missing == []
 
@@ -181,7 +177,7 @@ def test_no_other_refused_key_changes_anything(case: Case) -> None:
 
 def check_no_effect(case: Case) -> None:
     settings = SMALL | {"exposure.first": "50 ms"} | case.settings
-    if case.key in ("vehicle.wheels", "vehicle.cmgs"):  # switched on in both: only their limits differ
+    if case.key == "vehicle.cmgs":  # switched on in both: only the limit and the steering differ
         settings |= {case.key: "{}"}
     if case.key == "light.layout.lit":
         settings |= {"light.layout": BOARDS}

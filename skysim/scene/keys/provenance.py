@@ -16,17 +16,13 @@ from typing import Any, NamedTuple
 
 import yaml
 
-from skysim.core.units import SI_SUFFIX, ConfigModel
+from skysim.core.units import ConfigModel, si_unit
 from skysim.core.yaml_reader import parse_yaml, read_yaml
 from skysim.scene import loader
 from skysim.scene.keys import unused
 from skysim.scene.loader import CALIBRATED_KEYS, Layer, merge
 from skysim.scene.scene import NAME_ALIAS
 
-UNITS = {
-    **{"m": "m", "s": "s", "n": "N", "kg": "kg", "kg_m": "kg m", "kg_m2": "kg m2", "cd": "cd", "w_sr": "W / sr"},
-    **{"nm": "N m", "nm_rad": "N m / rad", "nms": "N m s", "nms2": "N m s2"},
-}  # unit of a field by the suffix of its name, as a scene writes it
 COMMENT_COLUMN = 44  # of the origins; longer lines have theirs at their end
 
 
@@ -179,9 +175,8 @@ def plain(value: Any, name: str) -> Any:
         return [plain(item, name) for item in value]
     if isinstance(value, dict) or value is None or isinstance(value, bool | datetime.datetime):
         return value
-    suffix = SI_SUFFIX.search(name)
-    if isinstance(value, float) and suffix:
-        return f"{tidy(value)} {UNITS[suffix[1]]}" if math.isfinite(value) else "infinity"
+    if isinstance(value, float) and (unit := si_unit(name)):
+        return f"{tidy(value)} {unit}" if math.isfinite(value) else "infinity"
     return tidy(value) if isinstance(value, float) else value
 
 

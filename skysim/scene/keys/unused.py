@@ -5,7 +5,8 @@ refused where it is written: in a scene's own file if it has no effect in the sc
 override (`--set`, a study's `set` or factor) if it has none in the resulting scene. Keys of a base scene or a preset
 are tolerated, and so are keys of the file that only an override makes useless, and values that equal the default.
 
-Not refused is what is written to the results although the run does not use it: the time tags of frames, `start_time`.
+Not refused is what is used elsewhere although a run does not use it: the time tags of frames and `start_time`, which
+are written to the results, and limits of actuators, which other controllers and the exported model obey.
 """
 
 from __future__ import annotations
@@ -255,28 +256,10 @@ RULES = (
         "vehicle.mount: air_bearing",
     ),
     Rule(
-        ("vehicle.torque_limit",),
-        lambda scene: actuators(scene) != "ideal",
-        "it limits the actuators ideal, which nothing commands",
-        "motion.control with actuators: ideal",
-    ),
-    Rule(
-        ("vehicle.wheels.torque_limit",),
-        lambda scene: actuators(scene) != "wheels",
-        "nothing commands the wheels",
-        "motion.control with actuators: wheels",
-    ),
-    Rule(
         ("vehicle.cmgs.gimbal_rate_limit_deg_s", "vehicle.cmgs.steering"),
         lambda scene: actuators(scene) != "cmgs",
         "nothing commands the CMGs",
         "motion.control with actuators: cmgs",
-    ),
-    Rule(
-        ("vehicle.fans",),
-        lambda scene: actuators(scene) != "fans" and not (scene.motion.control and scene.motion.control.desaturation),
-        "nothing commands the fans",
-        "motion.control with actuators: fans, or with desaturation",
     ),
     Rule(
         ("vehicle.imu.gyro.bias_time",),
